@@ -1,0 +1,75 @@
+"""Compiled kernels: the one decorator that marks them, and where their machine code is kept.
+
+numba notices an edit in the file of a kernel but not in the files of its callees, and an installed package may lie in a
+folder that cannot be written. The cache therefore lives in the user's cache folder under a hash of every source file of
+the three packages: any edit gives a new folder, and the old ones are swept away when they have not been used for a month.
+"""
+
+import hashlib
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterable
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+from numba.core import config as numba_config
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+PACKAGES = ("plant", "controller", "hil")
+STALE_AFTER_S = 30 * 24 * 3600.0
+
+
+def user_cache() -> Path:
+    """The folder for what gough builds on demand: `$GOUGH_CACHE`, else `gough` in the user's cache folder."""
+    if configured := os.environ.get("GOUGH_CACHE"):
+        return Path(configured)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gough"
+
+
+def hash_of_files(files: Iterable[Path], *extra: str) -> str:
+    """Twenty hexadecimal digits that change with the content of any of the files, or with `extra`."""
+    digest = hashlib.sha256("\0".join(extra).encode())
+    for file in files:
+        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:20]
+
+
+def keyed_folder(kind: str, key: str) -> Path:
+    """The cache folder of this kind and key, made and marked as used; folders long unused are removed."""
+    root = user_cache() / kind
+    folder = root / key
+    folder.mkdir(parents=True, exist_ok=True)
+    os.utime(folder)
+    for other in root.iterdir():
+        if other != folder and time.time() - other.stat().st_mtime > STALE_AFTER_S:
+            shutil.rmtree(other, ignore_errors=True)
+    return folder
+
+
+@cache
+def _kernel_folder() -> Path:
+    root = Path(__file__).resolve().parent.parent
+    sources = sorted(file for package in PACKAGES for file in (root / package).glob("*.py"))
+    return keyed_folder("kernels", hash_of_files(sources, numba.__version__))
+
+
+def _compile(function: F, **options: Any) -> F:
+    before = numba_config.CACHE_DIR
+    numba_config.CACHE_DIR = str(_kernel_folder())
+    try:
+        compiled: F = numba.njit(cache=True, error_model="numpy", **options)(function)
+    finally:
+        numba_config.CACHE_DIR = before
+    return compiled
+
+
+def kernel(function: F) -> F:
+    """Mark a function of the cycle: compiled, off the GIL, never raising, its machine code cached.
+
+    Division by zero gives inf or NaN as in NumPy, and fastmath stays off so that NaN checks mean something.
+    """
+    return _compile(function, nogil=True)

@@ -1,0 +1,37 @@
+"""The errors of gough: one hierarchy, each also the builtin kind that fits it.
+
+Every message names the offending value, the limit it breaks and the remedy. The compiled kernels never raise; they
+report by return code, and the public functions around them raise from here.
+"""
+
+
+class GoughError(Exception):
+    """Root of everything that gough raises on purpose."""
+
+
+class InputError(GoughError, ValueError):
+    """A value given by the user is malformed, out of range or not finite."""
+
+
+class UnknownNameError(GoughError, LookupError):
+    """A preset, motion or setting of that name does not exist."""
+
+
+class SingularConfigurationError(GoughError, ArithmeticError):
+    """The measurements do not determine the pose, or do not determine it uniquely."""
+
+
+class UnreachableError(GoughError, ValueError):
+    """A pose needs a leg outside its stroke."""
+
+
+class FmuError(GoughError, RuntimeError):
+    """An FMU cannot be read, lacks something, or reported a failure of its own."""
+
+
+class ToolchainError(GoughError, OSError):
+    """Something that building needs, such as the C compiler, is missing or failed."""
+
+
+class PlanningError(GoughError, RuntimeError):
+    """The trajectory generator found no motion within the limits."""

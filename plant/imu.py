@@ -1,0 +1,308 @@
+"""IMU imperfections: what lies between the ideal signals of a plant and the raw data that a controller reads.
+
+The raw reading is the inverse of the paper's (37), `a_cal = T S (a_u + b)`: with the mounting misalignment M,
+`a_u = S^-1 T^-1 M a - b + noise`, then low-pass, delay, range, resolution and dropouts. All noise comes from a
+counter-based generator keyed by (seed, IMU, cycle), so any cycle can be made again on its own.
+"""
+
+from dataclasses import dataclass, fields
+from math import inf, pi, radians, sqrt
+
+import numpy as np
+
+from plant.compiled import kernel
+from plant.errors import InputError, UnknownNameError
+from plant.fmu import Record
+from plant.pose import Array, rotation_from_vector
+from plant.variables import IMU_COUNT
+
+STANDARD_GRAVITY = 9.80665
+MILLI_G = 1e-3 * STANDARD_GRAVITY
+
+GYROSCOPE, ACCELEROMETER, MAGNETOMETER = 0, 1, 2
+"""First index of a measurement (3, 7, 3): [rad/s], [m/s^2], [uT]; the second is the IMU, the third its axis."""
+
+
+@dataclass(frozen=True)
+class SensorErrors:
+    """Errors of one three-axis sensor, in its own unit.
+
+    Attributes:
+        noise: white noise density [unit/sqrt(Hz)].
+        bias: least and greatest magnitude of the constant bias, whose direction is random [unit].
+        scale: greatest error of the scale of an axis, uniform and relative.
+        cross_axis: greatest element of the upper triangle of T, uniform.
+        drift: random walk of the bias [unit/sqrt(s)].
+        bandwidth: -3 dB frequency of the first-order low-pass [Hz].
+        reach: largest reading [unit].
+        resolution: step of the reading [unit]; 0 for none.
+    """
+
+    noise: float = 0.0
+    bias: tuple[float, float] = (0.0, 0.0)
+    scale: float = 0.0
+    cross_axis: float = 0.0
+    drift: float = 0.0
+    bandwidth: float = inf
+    reach: float = inf
+    resolution: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = np.asarray(getattr(self, field.name), dtype=float)
+            if not (value >= 0.0).all():
+                raise InputError(f"the {field.name} of a sensor is {getattr(self, field.name)}; it must not be negative")
+
+
+@dataclass(frozen=True)
+class ImuModel:
+    """The imperfections of one kind of IMU.
+
+    Attributes:
+        name: of the preset.
+        gyroscope, accelerometer, magnetometer: errors in rad/s, m/s^2, uT.
+        magnetometer_rate: samples per second; between them the last one stands [Hz].
+        misalignment: greatest angle of the mounting about each axis, uniform [rad].
+        delay: pure delay [s], rounded to whole cycles.
+        dropout: probability that a cycle repeats the sample before.
+    """
+
+    name: str
+    gyroscope: SensorErrors = SensorErrors()
+    accelerometer: SensorErrors = SensorErrors()
+    magnetometer: SensorErrors = SensorErrors()
+    magnetometer_rate: float = inf
+    misalignment: float = 0.0
+    delay: float = 0.0
+    dropout: float = 0.0
+
+
+_MPU9150_MAGNETOMETER = SensorErrors(noise=0.05, reach=1200.0, resolution=0.3)
+
+PRESETS = {
+    model.name: model
+    for model in (
+        ImuModel("ideal"),
+        # InvenSense MPU-9150, +-4 g, +-250 deg/s, widest filter; noise, bias and scale as its product specification has them.
+        ImuModel(
+            "mpu9150",
+            gyroscope=SensorErrors(
+                noise=radians(0.005), bias=(radians(20.0), radians(20.0)), scale=0.03, cross_axis=0.02,
+                bandwidth=256.0, reach=radians(250.0), resolution=radians(1.0 / 131.0),
+            ),
+            accelerometer=SensorErrors(
+                noise=0.4 * MILLI_G, bias=(50.0 * MILLI_G, 80.0 * MILLI_G), scale=0.03, cross_axis=0.02,
+                bandwidth=260.0, reach=4.0 * STANDARD_GRAVITY, resolution=STANDARD_GRAVITY / 8192.0,
+            ),
+            magnetometer=_MPU9150_MAGNETOMETER,
+            magnetometer_rate=100.0,
+            misalignment=radians(1.0),
+        ),
+        ImuModel(
+            "mpu9150-calibrated",
+            gyroscope=SensorErrors(
+                noise=radians(0.005), bias=(radians(0.2), radians(0.2)),
+                bandwidth=256.0, reach=radians(250.0), resolution=radians(1.0 / 131.0),
+            ),
+            accelerometer=SensorErrors(
+                noise=0.4 * MILLI_G, bias=(MILLI_G, MILLI_G), scale=1e-3,
+                bandwidth=260.0, reach=4.0 * STANDARD_GRAVITY, resolution=STANDARD_GRAVITY / 8192.0,
+            ),
+            magnetometer=_MPU9150_MAGNETOMETER,
+            magnetometer_rate=100.0,
+        ),
+        # TDK ICM-42688-P after the same calibration, without a magnetometer worth its name.
+        ImuModel(
+            "icm42688",
+            gyroscope=SensorErrors(
+                noise=radians(0.0028), bias=(radians(0.2), radians(0.2)),
+                bandwidth=400.0, reach=radians(250.0), resolution=radians(1.0 / 131.0),
+            ),
+            accelerometer=SensorErrors(
+                noise=0.07 * MILLI_G, bias=(MILLI_G, MILLI_G), scale=1e-3,
+                bandwidth=400.0, reach=4.0 * STANDARD_GRAVITY, resolution=STANDARD_GRAVITY / 8192.0,
+            ),
+            magnetometer=_MPU9150_MAGNETOMETER,
+            magnetometer_rate=100.0,
+        ),
+    )
+}  # fmt: skip
+
+_LONGEST_DELAY = 32
+
+IMU_STATE = np.dtype(
+    [
+        ("gain", np.float64, (3, IMU_COUNT, 3, 3)),
+        ("offset", np.float64, (3, IMU_COUNT, 3)),
+        ("noise", np.float64, 3),
+        ("drift", np.float64, 2),
+        ("smoothing", np.float64, 3),
+        ("reach", np.float64, 3),
+        ("resolution", np.float64, 3),
+        ("dropout", np.float64),
+        ("delay", np.int64),
+        ("magnetometer_every", np.int64),
+        ("seed", np.uint64),
+        ("cycle", np.int64),
+        ("bias_walk", np.float64, (2, IMU_COUNT, 3)),
+        ("smoothed", np.float64, (3, IMU_COUNT, 3)),
+        ("queue", np.float64, (_LONGEST_DELAY + 1, 3, IMU_COUNT, 3)),
+        ("reading", np.float64, (3, IMU_COUNT, 3)),
+    ],
+    align=True,
+)
+"""Constants and state of the imperfections of seven IMUs; a copy of it is a snapshot."""
+
+
+def load_imu(name: str) -> ImuModel:
+    """The preset of that name.
+
+    Raises:
+        UnknownNameError: there is none.
+    """
+    try:
+        return PRESETS[name]
+    except KeyError:
+        raise UnknownNameError(f"no IMU preset {name!r}; there are {', '.join(PRESETS)}") from None
+
+
+def imu_state(model: ImuModel, seed: int, period: float) -> Record:
+    """Draw the constant errors of seven IMUs and prepare their state for cycles of `period` [s].
+
+    Raises:
+        InputError: a negative seed, or a delay longer than 32 cycles.
+    """
+    if not 0 <= seed < 2**63:
+        raise InputError(f"the seed is {seed}; it must lie between 0 and 2^63 - 1")
+    state: Record = np.zeros((), IMU_STATE)
+    random = np.random.default_rng([seed, IMU_COUNT])
+    alignments = [
+        rotation_from_vector(random.uniform(-model.misalignment, model.misalignment, 3)) for _ in range(IMU_COUNT)
+    ]
+    for kind, sensor in enumerate((model.gyroscope, model.accelerometer, model.magnetometer)):
+        for imu in range(IMU_COUNT):
+            gain, offset = _constant_errors(sensor, random)
+            state["gain"][kind, imu] = gain @ alignments[imu]
+            state["offset"][kind, imu] = offset
+        state["noise"][kind] = sensor.noise * sqrt(0.5 / period)
+        state["smoothing"][kind] = 1.0 - np.exp(-2.0 * pi * sensor.bandwidth * period)
+        state["reach"][kind] = sensor.reach
+        state["resolution"][kind] = sensor.resolution
+        if kind != MAGNETOMETER:
+            state["drift"][kind] = sensor.drift * sqrt(period)
+    delay = round(model.delay / period)
+    if delay > _LONGEST_DELAY:
+        raise InputError(f"the delay of the IMUs is {delay} cycles; at most {_LONGEST_DELAY} are kept")
+    state["delay"] = delay
+    state["magnetometer_every"] = max(1, round(1.0 / (model.magnetometer_rate * period)))
+    state["dropout"] = model.dropout
+    state["seed"] = seed
+    return state
+
+
+def _constant_errors(sensor: SensorErrors, random: np.random.Generator) -> tuple[Array, Array]:
+    """The gain (3, 3), S^-1 T^-1, and the offset (3,), -b, of (37)."""
+    scale = np.diag(1.0 + random.uniform(-sensor.scale, sensor.scale, 3))
+    axes = np.eye(3) + np.triu(random.uniform(-sensor.cross_axis, sensor.cross_axis, (3, 3)), 1)
+    direction = random.normal(size=3)
+    bias = random.uniform(*sensor.bias) * direction / np.linalg.norm(direction)
+    return np.linalg.inv(axes @ scale), -bias
+
+
+@kernel
+def philox(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, int, int, int]:
+    """Philox4x32-10 of Salmon, Moraes, Dror, Shaw (2011): four random 32-bit words for a counter and a key."""
+    mask = np.uint64(0xFFFFFFFF)
+    a, b, c, d = np.uint64(c0), np.uint64(c1), np.uint64(c2), np.uint64(c3)
+    key0, key1 = np.uint64(k0), np.uint64(k1)
+    for _ in range(10):
+        product0 = np.uint64(0xD2511F53) * a
+        product1 = np.uint64(0xCD9E8D57) * c
+        a, c = (product1 >> np.uint64(32)) ^ b ^ key0, (product0 >> np.uint64(32)) ^ d ^ key1
+        b, d = product1 & mask, product0 & mask
+        key0 = (key0 + np.uint64(0x9E3779B9)) & mask
+        key1 = (key1 + np.uint64(0xBB67AE85)) & mask
+    return a, b, c, d
+
+
+@kernel
+def _normal_pair(word0: int, word1: int) -> tuple[float, float]:
+    """Two standard normal numbers of two 32-bit words (Box and Muller)."""
+    radius = np.sqrt(-2.0 * np.log((np.float64(word0) + 1.0) * 2.0**-32))
+    angle = np.float64(word1) * (2.0 * np.pi * 2.0**-32)
+    return radius * np.cos(angle), radius * np.sin(angle)
+
+
+@kernel
+def _draw(normals: Array, cycle: int, imu: int, purpose: int, seed: int) -> float:
+    """Fill `normals` (6,) with standard normal numbers; returns a further number, uniform in [0, 1)."""
+    mask = np.uint64(0xFFFFFFFF)
+    key0, key1 = np.uint64(seed) & mask, np.uint64(seed) >> np.uint64(32)
+    low, high = np.uint64(cycle) & mask, np.uint64(cycle) >> np.uint64(32)
+    a, b, c, d = philox(low, high, imu, 2 * purpose, key0, key1)
+    normals[0], normals[1] = _normal_pair(a, b)
+    normals[2], normals[3] = _normal_pair(c, d)
+    a, b, c, d = philox(low, high, imu, 2 * purpose + 1, key0, key1)
+    normals[4], normals[5] = _normal_pair(a, b)
+    return np.float64(c) * 2.0**-32
+
+
+_MEASURE, _MAGNETIC, _WALK = 0, 1, 2
+
+
+@kernel
+def measure(state: Record, ideal: Array, measurement: Array) -> None:
+    """Turn ideal signals (3, 7, 3) into what the IMUs read this cycle (3, 7, 3); advances `state` by one cycle."""
+    s = state[()]
+    first = s.cycle == 0
+    normals = np.empty(6)
+    fresh_field = s.cycle % s.magnetometer_every == 0
+    noisy = s.noise[GYROSCOPE] > 0.0 or s.noise[ACCELEROMETER] > 0.0 or s.dropout > 0.0
+    walking = s.drift[GYROSCOPE] > 0.0 or s.drift[ACCELEROMETER] > 0.0
+    slot = s.cycle % (s.delay + 1)
+    for imu in range(IMU_COUNT):
+        if walking:
+            _draw(normals, s.cycle, imu, _WALK, s.seed)
+            for axis in range(3):
+                s.bias_walk[GYROSCOPE, imu, axis] += s.drift[GYROSCOPE] * normals[axis]
+                s.bias_walk[ACCELEROMETER, imu, axis] += s.drift[ACCELEROMETER] * normals[3 + axis]
+        dropped = False
+        if noisy:
+            dropped = _draw(normals, s.cycle, imu, _MEASURE, s.seed) < s.dropout and not first
+        else:
+            normals[:] = 0.0
+        for kind in range(3):
+            if kind == MAGNETOMETER:
+                if not fresh_field:
+                    continue
+                if s.noise[kind] > 0.0:
+                    _draw(normals, s.cycle, imu, _MAGNETIC, s.seed)
+                else:
+                    normals[:] = 0.0
+            gain, signal = s.gain[kind, imu], ideal[kind, imu]
+            for axis in range(3):
+                value = s.offset[kind, imu, axis]
+                value += gain[axis, 0] * signal[0] + gain[axis, 1] * signal[1] + gain[axis, 2] * signal[2]
+                if kind == MAGNETOMETER:
+                    value += s.noise[kind] * normals[axis]
+                else:
+                    value += s.bias_walk[kind, imu, axis] + s.noise[kind] * normals[3 * kind + axis]
+                smoothed = value if first else s.smoothed[kind, imu, axis]
+                smoothed += s.smoothing[kind] * (value - smoothed)
+                s.smoothed[kind, imu, axis] = smoothed
+                delayed = smoothed
+                if s.delay > 0:
+                    if first:
+                        s.queue[:, kind, imu, axis] = smoothed
+                    s.queue[slot, kind, imu, axis] = smoothed
+                    delayed = s.queue[(slot + 1) % (s.delay + 1), kind, imu, axis]
+                delayed = min(max(delayed, -s.reach[kind]), s.reach[kind])
+                if s.resolution[kind] > 0.0:
+                    delayed = np.rint(delayed / s.resolution[kind]) * s.resolution[kind]
+                if not dropped:
+                    s.reading[kind, imu, axis] = delayed
+    s.cycle += 1
+    for kind in range(3):
+        for imu in range(IMU_COUNT):
+            for axis in range(3):
+                measurement[kind, imu, axis] = s.reading[kind, imu, axis]

@@ -1,0 +1,354 @@
+"""Mechanisms: the geometry of the legs, their limits, and the data of plant and controller that belong to one rig.
+
+Leg k joins base joint k, row k of an array (6, 3) in {1}, and platform joint k, row k of an array (6, 3) in {2}; a
+shared joint is a repeated row. The two arrays alone are enough for kinematics.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from importlib import resources
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from plant.errors import InputError, UnknownNameError, UnreachableError
+from plant.pose import (
+    Array,
+    Pose,
+    checked_array,
+    checked_rotation,
+    checked_unit,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
+from plant.variables import PARAMETERS, checked_parameters
+
+LEGS = 6
+SAME_JOINT_M = 1e-9
+"""Joints closer than this are one joint."""
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """What the actuators can do: `stroke` (6, 2), least and greatest length of each leg [m], and along each leg the
+    greatest `velocity` [m/s], `acceleration` [m/s^2] and `jerk` [m/s^3]. The end stops of the plant lie
+    `stop_clearance` [m] beyond the stroke.
+
+    Raises:
+        InputError: an empty or non-positive stroke, or a limit that is not positive.
+    """
+
+    stroke: Array
+    velocity: float = 0.25
+    acceleration: float = 3.0
+    jerk: float = 60.0
+    stop_clearance: float = 0.002
+
+    def __post_init__(self) -> None:
+        stroke = checked_array(self.stroke, (LEGS, 2), "stroke")
+        object.__setattr__(self, "stroke", stroke)
+        for leg, (least, greatest) in enumerate(stroke):
+            if not 0.0 < least < greatest:
+                raise InputError(
+                    f"the stroke of leg {leg} runs from {least:g} m to {greatest:g} m; it needs 0 < least < greatest length"
+                )
+        for name in ("velocity", "acceleration", "jerk", "stop_clearance"):
+            value = float(checked_array(getattr(self, name), (), f"limit of {name}"))
+            object.__setattr__(self, name, value)
+            if value <= 0.0:
+                raise InputError(f"the limit of {name} is {value:g}; it must be positive")
+
+
+@dataclass(frozen=True, eq=False)
+class Mechanism:
+    """A mechanism of six legs, checked when it is built and never changed.
+
+    Attributes:
+        name: what it is called in messages and reports.
+        base_joints: (6, 3) [m] in {1}.
+        platform_joints: (6, 3) [m] in {2}.
+        base_joint_axes: (6, 3), unit; the first axis of each universal joint, fixed in the base. At rest the axis of
+            leg k is perpendicular to the leg's home direction.
+        home_directions: (6, 3), unit; the leg directions at home, which span the leg frames together with the axes.
+        up_in_base: (3,), unit; the vertical seen in {1}.
+        home: the pose that strokes and targets are measured from, or None.
+        limits: the actuators' limits, or None.
+        plant: parameters of the dynamics by the names of `plant.variables`.
+        settings: the tables `control` and `fusion` of the preset, for the controller to read.
+    """
+
+    name: str
+    base_joints: Array
+    platform_joints: Array
+    base_joint_axes: Array
+    home_directions: Array
+    up_in_base: Array
+    home: Pose | None
+    limits: Limits | None
+    plant: Mapping[str, Array]
+    settings: Mapping[str, Mapping[str, Any]]
+
+    @classmethod
+    def from_legs(
+        cls,
+        base_joints: ArrayLike,
+        platform_joints: ArrayLike,
+        *,
+        name: str = "custom",
+        up_in_base: ArrayLike = (0.0, 0.0, 1.0),
+        base_joint_axes: ArrayLike | None = None,
+        home: Pose | None = None,
+        limits: Mapping[str, Any] | None = None,
+        plant: Mapping[str, ArrayLike] | None = None,
+        settings: Mapping[str, Mapping[str, Any]] | None = None,
+    ) -> "Mechanism":
+        """Build a mechanism from its two arrays of joints; all else may be left out.
+
+        Args:
+            base_joints: (6, 3) [m], in {1}.
+            platform_joints: (6, 3) [m], in {2}.
+            name: for messages and reports.
+            up_in_base: (3,), the unit vertical seen in {1}.
+            base_joint_axes: (6, 3), unit; by default e_z x (home direction), horizontal in {1}.
+            home: pose of reference; by default the joints' centroids lie above each other without rotation, which
+                settles the default axes but no length.
+            limits: the fields of `Limits`; a stroke of (2,) [m] counts from the home lengths, (6, 2) is absolute.
+            plant: parameters of the dynamics by name.
+            settings: the tables `control` and `fusion`.
+
+        Raises:
+            InputError: arrays of the wrong shape or not finite, legs that coincide, joints all on one line, an axis
+                along its leg, an empty stroke, a limit that is not positive, or a stroke about a home that is not given.
+            UnknownNameError: a plant parameter that does not exist.
+        """
+        base = checked_array(base_joints, (LEGS, 3), "base_joints")
+        platform = checked_array(platform_joints, (LEGS, 3), "platform_joints")
+        _check_joints(base, platform)
+        home = None if home is None else _checked_home(home)
+        directions = _home_directions(base, platform, home)
+        axes = _joint_axes(base_joint_axes, directions)
+        return cls(
+            name=name,
+            base_joints=base,
+            platform_joints=platform,
+            base_joint_axes=axes,
+            home_directions=directions,
+            up_in_base=checked_unit(up_in_base, 3, "up_in_base"),
+            home=home,
+            limits=None if limits is None else _checked_limits(limits, base, platform, home),
+            plant=MappingProxyType(checked_parameters(plant or {})),
+            settings=MappingProxyType({key: MappingProxyType(dict(table)) for key, table in (settings or {}).items()}),
+        )
+
+    @property
+    def joint_rotations(self) -> Array:
+        """(6, 3, 3): the rotation of each joint frame to {1}; x is the joint's first axis, z the home direction made
+        perpendicular to it. A leg's frame is `joint_rotation @ Rx(a) @ Ry(b)` with the leg along its z axis."""
+        x = self.base_joint_axes
+        z = self.home_directions - np.sum(self.home_directions * x, axis=1, keepdims=True) * x
+        z = z / np.linalg.norm(z, axis=1, keepdims=True)
+        return np.stack([x, np.cross(z, x), z], axis=2)
+
+    def check_lengths(self, lengths: Array, what: str) -> None:
+        """Check leg lengths (..., 6) [m] against the stroke.
+
+        Raises:
+            UnreachableError: names the leg that is furthest outside, its length, and by how much.
+            InputError: the mechanism has no stroke.
+        """
+        stroke = self.require_limits().stroke
+        excess = np.maximum(stroke[:, 0] - lengths, lengths - stroke[:, 1]).reshape(-1, LEGS)
+        row, leg = np.unravel_index(int(np.argmax(excess)), excess.shape)
+        if excess[row, leg] > 0.0:
+            length = np.reshape(lengths, (-1, LEGS))[row, leg]
+            raise UnreachableError(
+                f"{what} needs leg {leg} at {1e3 * length:.2f} mm, {1e3 * excess[row, leg]:.2f} mm outside its stroke of "
+                f"{1e3 * stroke[leg, 0]:.2f} to {1e3 * stroke[leg, 1]:.2f} mm: choose a smaller motion"
+            )
+
+    def require_home(self) -> Pose:
+        """The home pose.
+
+        Raises:
+            InputError: the mechanism has none.
+        """
+        if self.home is None:
+            raise InputError(f"the mechanism {self.name!r} has no home pose: give one")
+        return self.home
+
+    def require_limits(self) -> Limits:
+        """The actuators' limits.
+
+        Raises:
+            InputError: the mechanism has none.
+        """
+        if self.limits is None:
+            raise InputError(f"the mechanism {self.name!r} has no stroke: give one")
+        return self.limits
+
+    def plant_parameters(self, initial: Pose | None = None) -> dict[str, Array]:
+        """Every parameter of the plant by name, for a start at the pose `initial` (default: home).
+
+        Raises:
+            InputError: the mechanism lacks a parameter of the dynamics.
+        """
+        start = initial or self.require_home()
+        limits = self.require_limits()
+        values: dict[str, ArrayLike] = {
+            "base_joints": self.base_joints,
+            "platform_joints": self.platform_joints,
+            "base_joint_axes": self.base_joint_axes,
+            "stop.minimum_length": limits.stroke[:, 0] - limits.stop_clearance,
+            "stop.maximum_length": limits.stroke[:, 1] + limits.stop_clearance,
+            "initial_position": start.position,
+            "initial_quaternion": quaternion_from_rotation(start.rotation),
+            **self.plant,
+        }
+        missing = [variable.name for variable in PARAMETERS if variable.name not in values]
+        if missing:
+            raise InputError(f"the mechanism {self.name!r} lacks plant parameters: {', '.join(missing)}")
+        return {variable.name: checked_parameters({variable.name: values[variable.name]})[variable.name] for variable in PARAMETERS}
+
+
+def load_mechanism(name_or_path: str | Path) -> Mechanism:
+    """Load a preset by its name, or a mechanism from a TOML file.
+
+    Raises:
+        UnknownNameError: no such preset, and no such file.
+        InputError: the file is not TOML, or its content is not a mechanism.
+    """
+    folder = resources.files("plant") / "presets"
+    presets = sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+    if str(name_or_path) in presets:
+        return _from_toml((folder / f"{name_or_path}.toml").read_text(), str(name_or_path))
+    path = Path(name_or_path)
+    if not path.is_file():
+        raise UnknownNameError(f"no mechanism {str(name_or_path)!r}: neither a preset ({', '.join(presets)}) nor a file")
+    try:
+        text = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read {path}: {error}") from None
+    return _from_toml(text, str(path))
+
+
+_TABLES = {
+    "geometry": {"base_joints", "platform_joints", "base_joint_axes", "up_in_base"},
+    "home": {"position", "quaternion"},
+    "limits": {field.name for field in fields(Limits)},
+}
+
+
+def _from_toml(text: str, source: str) -> Mechanism:
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{source} is not valid TOML: {error}") from None
+    try:
+        return _from_document(document)
+    except (InputError, UnknownNameError) as error:
+        raise type(error)(f"{source}: {error}") from None
+
+
+def _from_document(document: dict[str, Any]) -> Mechanism:
+    for key, table in document.items():
+        if key not in {"name", *_TABLES, "plant", "control", "fusion"}:
+            raise InputError(f"unknown entry {key!r}; a mechanism has name, {', '.join(_TABLES)}, plant, control, fusion")
+        if key != "name" and not isinstance(table, dict):
+            raise InputError(f"{key!r} must be a table")
+        unknown = set(table) - _TABLES[key] if key in _TABLES else set()
+        if unknown:
+            raise InputError(f"[{key}] has no entry {sorted(unknown)[0]!r}; it has {', '.join(sorted(_TABLES[key]))}")
+    geometry = dict(document.get("geometry", {}))
+    for array in ("base_joints", "platform_joints"):
+        if array not in geometry:
+            raise InputError(f"[geometry] lacks {array}, an array of six rows of three numbers in metres")
+    home = None
+    if "home" in document:
+        quaternion = checked_unit(document["home"].get("quaternion", (1.0, 0.0, 0.0, 0.0)), 4, "home.quaternion")
+        position = checked_array(document["home"].get("position"), (3,), "home.position")
+        home = Pose(position, rotation_from_quaternion(quaternion))
+    return Mechanism.from_legs(
+        **geometry,
+        name=str(document.get("name", "custom")),
+        home=home,
+        limits=document.get("limits"),
+        plant=_flattened(document.get("plant", {})),
+        settings={key: document.get(key, {}) for key in ("control", "fusion")},
+    )
+
+
+def _flattened(tables: Mapping[str, Any], prefix: str = "") -> dict[str, ArrayLike]:
+    flat: dict[str, ArrayLike] = {}
+    for key, value in tables.items():
+        if isinstance(value, Mapping):
+            flat |= _flattened(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + key] = value
+    return flat
+
+
+def _check_joints(base: Array, platform: Array) -> None:
+    for leg in range(LEGS):
+        for other in range(leg):
+            apart = max(np.linalg.norm(base[leg] - base[other]), np.linalg.norm(platform[leg] - platform[other]))
+            if apart < SAME_JOINT_M:
+                raise InputError(f"legs {other} and {leg} coincide: they share both joints; move one of them")
+    for name, joints in (("base", base), ("platform", platform)):
+        spread = np.linalg.svd(joints - joints.mean(axis=0), compute_uv=False)
+        if spread[1] < 1e-6 * max(spread[0], SAME_JOINT_M):
+            raise InputError(f"the {name} joints all lie on one line: no pose of six legs can be told or held")
+
+
+def _checked_home(home: Pose) -> Pose:
+    return Pose(
+        checked_array(home.position, (3,), "home.position"),
+        checked_rotation(home.rotation, "home.rotation"),
+    )
+
+
+def _home_directions(base: Array, platform: Array, home: Pose | None) -> Array:
+    if home is None:
+        scale = float(np.linalg.norm(base - base.mean(axis=0), axis=1).max())
+        home = Pose(base.mean(axis=0) - platform.mean(axis=0) + [0.0, 0.0, scale], np.eye(3))
+    legs = home.position + platform @ home.rotation.T - base
+    lengths = np.linalg.norm(legs, axis=1, keepdims=True)
+    if lengths.min() < SAME_JOINT_M:
+        raise InputError(f"leg {int(lengths.argmin())} has no length at home: move the home pose")
+    directions: Array = legs / lengths
+    directions.setflags(write=False)
+    return directions
+
+
+def _joint_axes(given: ArrayLike | None, directions: Array) -> Array:
+    if given is None:
+        axes = np.cross([0.0, 0.0, 1.0], directions)
+        axes[np.linalg.norm(axes, axis=1) < 1e-6] = [1.0, 0.0, 0.0]
+    else:
+        axes = checked_array(given, (LEGS, 3), "base_joint_axes")
+        for leg in range(LEGS):
+            checked_unit(axes[leg], 3, f"base_joint_axes[{leg}]")
+    axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    along = np.abs(np.sum(axes * directions, axis=1))
+    if along.max() > 0.99:
+        raise InputError(
+            f"base_joint_axes[{int(along.argmax())}] lies within 8 deg of its leg at home, where a universal joint is "
+            "singular: turn the axis"
+        )
+    axes.setflags(write=False)
+    return axes
+
+
+def _checked_limits(limits: Mapping[str, Any], base: Array, platform: Array, home: Pose | None) -> Limits:
+    if "stroke" not in limits:
+        raise InputError("the limits lack the stroke: two numbers in metres about the home lengths, or (6, 2) lengths")
+    stroke = limits["stroke"]
+    if np.shape(stroke) == (2,):
+        if home is None:
+            raise InputError("a stroke of two numbers counts from the home lengths: give a home pose, or (6, 2) lengths")
+        lengths = np.linalg.norm(home.position + platform @ home.rotation.T - base, axis=1)
+        stroke = lengths[:, None] + checked_array(stroke, (2,), "stroke")
+    return Limits(**{**limits, "stroke": stroke})

@@ -1,0 +1,173 @@
+"""Poses and rotations: what every other room says positions and attitudes with.
+
+A pose is `position` (3,) [m], the origin of the platform frame {2} seen in the base frame {1}, and `rotation` (3, 3),
+which maps vectors of {2} to {1}. Quaternions are unit and w first. The paper's (14), (15) and (32) print the transposes
+of the rotations that its (1) needs; here every rotation is the active one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from plant.compiled import kernel
+from plant.errors import InputError
+
+Array = NDArray[np.float64]
+
+UNIT_TOLERANCE = 1e-3
+"""How far a unit quaternion or direction given by a user may be off unit length before it is refused."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Position (3,) [m] of {2} in {1} and the rotation (3, 3) that maps {2} to {1}."""
+
+    position: Array
+    rotation: Array
+
+
+def checked_array(value: ArrayLike, shape: tuple[int, ...], name: str, *, allow_nan: bool = False) -> Array:
+    """Return a read-only float copy of `value` after checking its shape and that it is finite.
+
+    Raises:
+        InputError: wrong shape, not numeric, or not finite (NaN passes with `allow_nan`; infinity never).
+    """
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be an array of numbers of shape {shape}, got {value!r}") from None
+    if array.shape != shape:
+        raise InputError(f"{name} must have shape {shape}, got {array.shape}")
+    bad = np.isinf(array) if allow_nan else ~np.isfinite(array)
+    if bad.any():
+        where = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise InputError(f"{name}{list(where) if where else ''} is {array[where]}; it must be finite")
+    array.setflags(write=False)
+    return array
+
+
+def checked_unit(value: ArrayLike, size: int, name: str) -> Array:
+    """Return a unit vector after checking that it was within 1e-3 of unit length; the rest is normalised away.
+
+    Raises:
+        InputError: wrong shape, not finite, or off unit length by more than 1e-3.
+    """
+    array = checked_array(value, (size,), name)
+    norm = float(np.linalg.norm(array))
+    if abs(norm - 1.0) > UNIT_TOLERANCE:
+        raise InputError(f"{name} has length {norm:.6g}; it must be 1 within {UNIT_TOLERANCE:g}: normalise it")
+    return array / norm
+
+
+def checked_rotation(value: ArrayLike, name: str) -> Array:
+    """Return a proper rotation matrix (3, 3) after checking that the given one is orthogonal within 1e-3.
+
+    Raises:
+        InputError: wrong shape, not finite, not orthogonal, or a reflection (determinant -1).
+    """
+    array = checked_array(value, (3, 3), name)
+    error = float(np.abs(array.T @ array - np.eye(3)).max())
+    if error > UNIT_TOLERANCE:
+        raise InputError(f"{name} is off orthogonal by {error:.3g}, more than {UNIT_TOLERANCE:g}: give a rotation matrix")
+    if np.linalg.det(array) < 0.0:
+        raise InputError(f"{name} is a reflection (determinant -1); the frames of a pose are both right-handed")
+    return nearest_rotation(array)
+
+
+def nearest_rotation(matrix: Array) -> Array:
+    """The rotation (3, 3) closest to `matrix` (3, 3) in the Frobenius norm."""
+    u, _, vt = np.linalg.svd(matrix)
+    u[:, 2] *= np.sign(np.linalg.det(u @ vt))
+    rotation: Array = u @ vt
+    return rotation
+
+
+def skew(vector: Array) -> Array:
+    """The matrix (3, 3) of `vector x` (the paper's tilde, (22) and (23))."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+@kernel
+def rotation_from_quaternion(quaternion: Array) -> Array:
+    """The rotation (3, 3) of a unit quaternion (4,), w first."""
+    w, x, y, z = quaternion
+    rotation = np.empty((3, 3))
+    rotation[0, 0] = 1.0 - 2.0 * (y * y + z * z)
+    rotation[0, 1] = 2.0 * (x * y - w * z)
+    rotation[0, 2] = 2.0 * (x * z + w * y)
+    rotation[1, 0] = 2.0 * (x * y + w * z)
+    rotation[1, 1] = 1.0 - 2.0 * (x * x + z * z)
+    rotation[1, 2] = 2.0 * (y * z - w * x)
+    rotation[2, 0] = 2.0 * (x * z - w * y)
+    rotation[2, 1] = 2.0 * (y * z + w * x)
+    rotation[2, 2] = 1.0 - 2.0 * (x * x + y * y)
+    return rotation
+
+
+@kernel
+def rotations_from_quaternions(quaternions: Array) -> Array:
+    """The rotations (N, 3, 3) of unit quaternions (N, 4), w first."""
+    rotations = np.empty((quaternions.shape[0], 3, 3))
+    for i in range(quaternions.shape[0]):
+        rotations[i] = rotation_from_quaternion(quaternions[i])
+    return rotations
+
+
+def quaternion_from_rotation(rotation: Array) -> Array:
+    """The unit quaternion (4,), w first and w >= 0, of a rotation (3, 3)."""
+    # The eigenvector of Bar-Itzhack's symmetric matrix is the quaternion, without a case per quadrant.
+    m = rotation
+    k = np.array(
+        [
+            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+            [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
+            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
+            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]],
+        ]
+    )
+    quaternion: Array = np.linalg.eigh(k)[1][:, -1]
+    return quaternion if quaternion[0] >= 0.0 else -quaternion
+
+
+@kernel
+def rotate_by_vector(rotation: Array, vector: Array) -> None:
+    """Replace `rotation` (3, 3) by exp(skew(`vector`)) @ `rotation`, with `vector` (3,) [rad] seen in {1}."""
+    angle2 = vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]
+    if angle2 > 1e-8:
+        angle = np.sqrt(angle2)
+        a = np.sin(angle) / angle
+        b = (1.0 - np.cos(angle)) / angle2
+    else:
+        a = 1.0 - angle2 / 6.0
+        b = 0.5 - angle2 / 24.0
+    v0, v1, v2 = vector[0], vector[1], vector[2]
+    for j in range(3):
+        x, y, z = rotation[0, j], rotation[1, j], rotation[2, j]
+        c0, c1, c2 = v1 * z - v2 * y, v2 * x - v0 * z, v0 * y - v1 * x
+        rotation[0, j] = x + a * c0 + b * (v1 * c2 - v2 * c1)
+        rotation[1, j] = y + a * c1 + b * (v2 * c0 - v0 * c2)
+        rotation[2, j] = z + a * c2 + b * (v0 * c1 - v1 * c0)
+
+
+def rotation_from_vector(vector: ArrayLike) -> Array:
+    """The rotation (3, 3) about `vector` (3,) by its length [rad] (Rodrigues)."""
+    rotation = np.eye(3)
+    rotate_by_vector(rotation, np.asarray(vector, dtype=np.float64))
+    return rotation
+
+
+def rotation_angle(first: Array, second: Array) -> Array:
+    """The angle [rad] between rotations (..., 3, 3) and (..., 3, 3); shape (...)."""
+    relative = first @ np.swapaxes(second, -1, -2)
+    axis = np.stack(
+        [
+            relative[..., 2, 1] - relative[..., 1, 2],
+            relative[..., 0, 2] - relative[..., 2, 0],
+            relative[..., 1, 0] - relative[..., 0, 1],
+        ],
+        axis=-1,
+    )
+    angle: Array = np.arctan2(np.linalg.norm(axis, axis=-1), np.trace(relative, axis1=-2, axis2=-1) - 1.0)
+    return angle
