@@ -1,0 +1,81 @@
+"""Inverse kinematics: from the pose of the platform to the legs (the paper's (1)), and the Jacobian of their lengths."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from plant.compiled import kernel
+from plant.mechanism import LEGS, Mechanism
+from plant.pose import Array, Pose, checked_array, checked_rotation
+
+
+@dataclass(frozen=True, eq=False)
+class Legs:
+    """The legs at a pose; leg k joins base joint k and platform joint k.
+
+    Attributes:
+        vectors: (6, 3) [m] from base to platform joint, in {1}.
+        lengths: (6,) [m].
+        directions: (6, 3), unit.
+        jacobian: (6, 6); maps the twist (velocity [m/s] of the origin of {2}, angular velocity [rad/s]; both in {1}) to
+            the rates of the lengths [m/s].
+    """
+
+    vectors: Array
+    lengths: Array
+    directions: Array
+    jacobian: Array
+
+
+def inverse_kinematics(mechanism: Mechanism, pose: Pose) -> Legs:
+    """The legs of `mechanism` at `pose`.
+
+    Raises:
+        InputError: the pose is not finite, or its rotation is not one.
+    """
+    position = checked_array(pose.position, (3,), "position")
+    rotation = checked_rotation(pose.rotation, "rotation")
+    arms = mechanism.platform_joints @ rotation.T
+    vectors = position + arms - mechanism.base_joints
+    lengths = np.linalg.norm(vectors, axis=1)
+    directions = vectors / lengths[:, None]
+    return Legs(vectors, lengths, directions, np.hstack([directions, np.cross(arms, directions)]))
+
+
+def leg_lengths(mechanism: Mechanism, positions: Array, rotations: Array) -> Array:
+    """The lengths (..., 6) [m] at positions (..., 3) [m] and rotations (..., 3, 3); unchecked."""
+    arms = np.einsum("...ij,kj->...ki", rotations, mechanism.platform_joints)
+    lengths: Array = np.linalg.norm(positions[..., None, :] + arms - mechanism.base_joints, axis=-1)
+    return lengths
+
+
+@kernel
+def legs_at(
+    base_joints: Array, platform_joints: Array, position: Array, rotation: Array, arms: Array, directions: Array, lengths: Array
+) -> None:
+    """Compiled twin of `inverse_kinematics`: writes arms (6, 3), the turned platform joints, directions and lengths."""
+    for k in range(LEGS):
+        square = 0.0
+        for i in range(3):
+            arm = (
+                rotation[i, 0] * platform_joints[k, 0]
+                + rotation[i, 1] * platform_joints[k, 1]
+                + rotation[i, 2] * platform_joints[k, 2]
+            )
+            arms[k, i] = arm
+            component = position[i] + arm - base_joints[k, i]
+            directions[k, i] = component
+            square += component * component
+        lengths[k] = np.sqrt(square)
+        for i in range(3):
+            directions[k, i] /= lengths[k]
+
+
+@kernel
+def jacobian_at(arms: Array, directions: Array, jacobian: Array) -> None:
+    """Write the Jacobian (6, 6) of the lengths from arms (6, 3) and directions (6, 3)."""
+    for k in range(LEGS):
+        a0, a1, a2 = arms[k, 0], arms[k, 1], arms[k, 2]
+        d0, d1, d2 = directions[k, 0], directions[k, 1], directions[k, 2]
+        jacobian[k, 0], jacobian[k, 1], jacobian[k, 2] = d0, d1, d2
+        jacobian[k, 3], jacobian[k, 4], jacobian[k, 5] = a1 * d2 - a2 * d1, a2 * d0 - a0 * d2, a0 * d1 - a1 * d0
