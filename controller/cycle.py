@@ -1,0 +1,435 @@
+"""The cycle: everything between raw IMU data and the six commands, the paper's Figure 4, as one compiled function.
+
+    measurement -> leg filters, platform filter -> direct kinematics -> inverse kinematics -> PID against the reference
+
+It allocates nothing, raises nothing and knows no clock: whatever happens every n-th cycle counts cycles. Constants lie in
+one structured array (dtype `PARAMETERS`), all state in another (dtype `STATE`); a copy of that is a snapshot.
+"""
+
+from collections.abc import Collection
+
+import numpy as np
+
+from controller.direct_kinematics import joint_plane, pose_from_legs, pose_from_vector, refine
+from controller.inverse_kinematics import jacobian_at, legs_at, sample_workspace
+from controller.leg_filter import leg_direction, predict_leg, start_leg, update_leg
+from controller.least_squares import RANK_TOLERANCE, solve_least_squares
+from controller.pid import step_pid
+from controller.platform_filter import start_platform, step_platform
+from controller.reference import evaluate_reference
+from controller.settings import ControlSettings, FusionSettings
+from plant.compiled import kernel
+from plant.errors import InputError
+from plant.fmu import Record
+from plant.imu import ACCELEROMETER, GYROSCOPE, STANDARD_GRAVITY
+from plant.mechanism import LEGS, Mechanism
+from plant.pose import Array
+from plant.variables import IMU_COUNT, PLATFORM_IMU
+
+OK, POSE_LOST, NOT_FINITE = 0, 1, 2
+"""What a cycle reports: all well; the directions no longer determine a pose; an estimate or command is not finite."""
+
+ALL_IMUS = tuple(range(IMU_COUNT))
+LEG_IMUS = tuple(range(LEGS))
+
+_WORST_CONDITIONING = 1e-4
+
+PARAMETERS = np.dtype(
+    [
+        ("period", np.float64),
+        ("hold_cycles", np.int64),
+        ("base_joints", np.float64, (LEGS, 3)),
+        ("platform_joints", np.float64, (LEGS, 3)),
+        ("joint_rotations", np.float64, (LEGS, 3, 3)),
+        ("up_in_joint", np.float64, (LEGS, 3)),
+        ("up_in_base", np.float64, (1, 3)),
+        ("plane_center", np.float64, 3),
+        ("plane_axes", np.float64, (3, 3)),
+        ("leg_imu_position", np.float64, (LEGS, 3)),
+        ("platform_imu_position", np.float64, 3),
+        ("gravity", np.float64),
+        ("leg_used", np.float64, LEGS),
+        ("platform_used", np.int64),
+        ("leg_jerk", np.float64),
+        ("bias_walk", np.float64),
+        ("bias_sigma", np.float64),
+        ("gyroscope_density", np.float64),
+        ("gyroscope_variance", np.float64),
+        ("leg_force_variance", np.float64),
+        ("vertical_variance", np.float64),
+        ("leg_weights", np.float64, LEGS),
+        ("vertical_weight", np.float64, 1),
+        ("acceleration_rate", np.float64),
+        ("gains", np.float64, 4),
+        ("command_limit", np.float64),
+        ("droop", np.float64),
+        ("moving_mass", np.float64),
+        ("mass", np.float64),
+        ("first_moment", np.float64, 3),
+        ("lower_moment", np.float64),
+        ("rod_mass", np.float64),
+        ("rod_center", np.float64),
+    ],
+    align=True,
+)
+"""Constants of the cycle, in SI units; `moving_mass` and `droop` belong to the load feed-forward."""
+
+STATE = np.dtype(
+    [
+        ("cycle", np.int64),
+        ("leg_x", np.float64, (LEGS, 9)),
+        ("leg_covariance", np.float64, (LEGS, 9, 9)),
+        ("platform_x", np.float64, 6),
+        ("platform_covariance", np.float64, (6, 6)),
+        ("directions", np.float64, (LEGS, 3)),
+        ("rates", np.float64, (LEGS, 3)),
+        ("vertical", np.float64, (1, 3)),
+        ("platform_rate", np.float64, 3),
+        ("position", np.float64, 3),
+        ("rotation", np.float64, (3, 3)),
+        ("twist", np.float64, 6),
+        ("smooth_twist", np.float64, 6),
+        ("acceleration", np.float64, 6),
+        ("conditioning", np.float64),
+        ("information", np.float64, (6, 6)),
+        ("lengths", np.float64, LEGS),
+        ("reference_index", np.int64, LEGS),
+        ("reference", np.float64, (LEGS, 3)),
+        ("feed_forward", np.float64, LEGS),
+        ("error", np.float64, LEGS),
+        ("integral", np.float64, LEGS),
+        ("previous_error", np.float64, LEGS),
+        ("derivative", np.float64, LEGS),
+        ("command", np.float64, LEGS),
+        # Scratch, here so that the cycle allocates nothing.
+        ("arms", np.float64, (LEGS, 3)),
+        ("predicted", np.float64, (LEGS, 3)),
+        ("angular_velocity", np.float64, 3),
+        ("imu_acceleration", np.float64, 3),
+        ("measurement_6", np.float64, 6),
+        ("jacobian_6_9", np.float64, (6, 9)),
+        ("vectors_9", np.float64, (2, 9)),
+        ("matrices_6_6", np.float64, (2, 6, 6)),
+        ("vectors_6", np.float64, (2, 6)),
+        ("matrix_12_9", np.float64, (2 * LEGS, 9)),
+        ("right_12", np.float64, 2 * LEGS),
+        ("unknowns_9", np.float64, 9),
+    ],
+    align=True,
+)
+"""State of the cycle: filters, pose, controllers, and what the last cycle found.
+
+`twist` is velocity and angular velocity in {1}; `vertical` and `platform_rate` are seen in {2}; `information` is the inverse of the pose's
+covariance (lower triangle); `reference` holds length, rate and acceleration of each leg.
+"""
+
+
+def cycle_parameters(
+    mechanism: Mechanism,
+    rate: float,
+    control: ControlSettings,
+    fusion: FusionSettings,
+    imus: Collection[int] = ALL_IMUS,
+) -> Record:
+    """Work out the constants of the cycle.
+
+    Args:
+        mechanism: with home, limits and plant data.
+        rate: cycles per second [Hz].
+        control, fusion: settings.
+        imus: which IMUs there are, 0-5 on the legs and 6 on the platform.
+
+    Raises:
+        InputError: an IMU that cannot be, or IMUs that do not determine the pose.
+    """
+    check_imus(mechanism, imus)
+    plant = mechanism.plant_parameters()
+    plane = joint_plane(mechanism)
+    parameters: Record = np.zeros((), PARAMETERS)
+    used = np.array([float(leg in imus) for leg in range(LEGS)])
+    turns = 2.0 * np.pi / plant["motor.screw_lead"]
+    force_constant = turns * plant["motor.torque_constant"]
+    nominal = plant["drive.nominal_resistance"]
+    mass = plant["platform.mass"] + plant["payload.mass"]
+    sliding_mass = plant["leg.upper.mass"] + plant["motor.rotor_inertia"] * turns**2
+    values = {
+        "period": 1.0 / rate,
+        "hold_cycles": int(np.ceil(control.hold * rate - 1e-9)),
+        "base_joints": mechanism.base_joints,
+        "platform_joints": mechanism.platform_joints,
+        "joint_rotations": mechanism.joint_rotations,
+        "up_in_joint": np.swapaxes(mechanism.joint_rotations, 1, 2) @ mechanism.up_in_base,
+        "up_in_base": mechanism.up_in_base,
+        "plane_center": plane.center,
+        "plane_axes": plane.axes,
+        "leg_imu_position": plant["leg_imu_position"],
+        "platform_imu_position": plant["platform_imu_position"],
+        "gravity": np.linalg.norm(plant["gravity"]) or STANDARD_GRAVITY,
+        "leg_used": used,
+        "platform_used": PLATFORM_IMU in imus,
+        "leg_jerk": fusion.leg_jerk**2,
+        "bias_walk": fusion.bias_walk**2,
+        "bias_sigma": fusion.bias_sigma,
+        "gyroscope_density": fusion.gyroscope_noise**2,
+        "gyroscope_variance": fusion.gyroscope_noise**2 * rate / 2.0,
+        "leg_force_variance": fusion.leg_accelerometer_noise**2 * rate / 2.0,
+        "vertical_variance": (fusion.platform_accelerometer_noise / STANDARD_GRAVITY) ** 2 * rate / 2.0,
+        "leg_weights": used / fusion.leg_sigma**2,
+        "vertical_weight": (PLATFORM_IMU in imus) / fusion.tilt_sigma**2,
+        "acceleration_rate": 1.0 / fusion.acceleration_time,
+        "gains": (control.proportional, control.integral, control.derivative, control.derivative_bandwidth),
+        "command_limit": control.command_reserve * mechanism.require_limits().velocity,
+        "droop": nominal * (1.0 - plant["drive.compensation"]) / force_constant**2,
+        "moving_mass": sliding_mass + mass / LEGS,
+        "mass": mass,
+        "first_moment": (
+            plant["platform.mass"] * plant["platform.center_of_mass"]
+            + plant["payload.mass"] * plant["payload.center_of_mass"]
+        ),
+        "lower_moment": plant["leg.lower.mass"] * plant["leg.lower.center"],
+        "rod_mass": plant["leg.upper.mass"],
+        "rod_center": plant["leg.upper.center"],
+    }
+    for name, value in values.items():
+        parameters[name] = value
+    return parameters
+
+
+def check_imus(mechanism: Mechanism, imus: Collection[int]) -> None:
+    """Check that these IMUs determine the pose, at home and over the workspace.
+
+    Raises:
+        InputError: an IMU outside 0 to 6, or the set does not determine the pose.
+    """
+    for imu in imus:
+        if imu not in ALL_IMUS:
+            raise InputError(f"there is no IMU {imu}; 0 to 5 sit on the legs, 6 on the platform")
+    plane = joint_plane(mechanism)
+    positions, rotations = sample_workspace(mechanism, 50, seed=0)
+    parameters, state = np.zeros((), PARAMETERS), np.zeros((), STATE)
+    parameters["base_joints"], parameters["platform_joints"] = mechanism.base_joints, mechanism.platform_joints
+    parameters["plane_center"], parameters["plane_axes"] = plane.center, plane.axes
+    parameters["up_in_base"], parameters["platform_used"] = mechanism.up_in_base, PLATFORM_IMU in imus
+    parameters["leg_used"] = [leg in imus for leg in range(LEGS)]
+    worst = np.inf
+    if PLATFORM_IMU not in imus and plane.flatness > 1e-6:
+        worst = 0.0
+    for position, rotation in zip(positions, rotations, strict=True):
+        legs = position + mechanism.platform_joints @ rotation.T - mechanism.base_joints
+        state["directions"] = legs / np.linalg.norm(legs, axis=1, keepdims=True)
+        state["vertical"] = rotation.T @ mechanism.up_in_base
+        worst = min(worst, find_pose(parameters, state))
+    if worst < _WORST_CONDITIONING:
+        names = ", ".join(str(imu) for imu in sorted(imus)) or "none"
+        raise InputError(
+            f"the IMUs {names} do not determine the pose of {mechanism.name!r} everywhere in its workspace (conditioning "
+            f"{worst:.1e}, at least {_WORST_CONDITIONING:g} is needed): add legs, or the platform's IMU (6)"
+        )
+
+
+@kernel
+def cycle(parameters: Record, state: Record, measurement: Array, segments: Array) -> int:
+    """One cycle: from raw IMU data to the commands, which are left in `state`.
+
+    Args:
+        parameters: dtype `PARAMETERS`.
+        state: dtype `STATE`; zeros before the first cycle.
+        measurement: (3, 7, 3), angular velocity [rad/s], specific force [m/s^2], magnetic field [uT] of the seven IMUs.
+        segments: (6, n, 5), the reference as `controller.reference` has it.
+
+    Returns:
+        `OK`, or why the estimate cannot be used.
+    """
+    fuse_legs(parameters, state, measurement)
+    return control(parameters, state, measurement, segments)
+
+
+@kernel
+def control(parameters: Record, state: Record, measurement: Array, segments: Array) -> int:
+    """The cycle from the leg directions on, for leg filters of another kind."""
+    fuse_platform(parameters, state, measurement)
+    if find_pose(parameters, state) < RANK_TOLERANCE or not refine_pose(parameters, state):
+        return POSE_LOST
+    deviate(parameters, state, segments)
+    regulate(parameters, state)
+    s = state[()]
+    s.cycle += 1
+    for k in range(LEGS):
+        if not (np.isfinite(s.command[k]) and np.isfinite(s.lengths[k])):
+            return NOT_FINITE
+    return OK
+
+
+@kernel
+def fuse_legs(parameters: Record, state: Record, measurement: Array) -> None:
+    """Step the leg filters."""
+    p, s = parameters[()], state[()]
+    for k in range(LEGS):
+        if p.leg_used[k] == 0.0:
+            continue
+        x, covariance, up = s.leg_x[k], s.leg_covariance[k], p.up_in_joint[k]
+        rate, force = measurement[GYROSCOPE, k], measurement[ACCELEROMETER, k]
+        if s.cycle == 0:
+            start_leg(x, covariance, rate, force, up, p.bias_sigma)
+        else:
+            predict_leg(x, covariance, p.period, p.leg_jerk, p.bias_walk)
+        update_leg(
+            x, covariance, rate, force, up, p.leg_imu_position[k], p.gravity, p.gyroscope_variance, p.leg_force_variance,
+            s.measurement_6, s.jacobian_6_9, s.vectors_9[0], s.vectors_9[1],
+        )  # fmt: skip
+    point_legs(parameters, state)
+
+
+@kernel
+def point_legs(parameters: Record, state: Record) -> None:
+    """Directions of the legs and their rates from the states of the leg filters."""
+    p, s = parameters[()], state[()]
+    for k in range(LEGS):
+        leg_direction(s.leg_x[k], p.joint_rotations[k], s.directions[k], s.rates[k])
+
+
+@kernel
+def fuse_platform(parameters: Record, state: Record, measurement: Array) -> None:
+    """Step the platform's filter, with its own acceleration, known from the legs, taken out of the reading."""
+    p, s = parameters[()], state[()]
+    if p.platform_used == 0:
+        return
+    rate, force = measurement[GYROSCOPE, PLATFORM_IMU], measurement[ACCELEROMETER, PLATFORM_IMU]
+    if s.cycle == 0:
+        start_platform(s.platform_x, s.platform_covariance, force, p.bias_sigma)
+    # Acceleration of the IMU: that of the origin, and what turning adds at the IMU's place d.
+    d = p.platform_imu_position
+    w0, w1, w2 = rate[0] - s.platform_x[3], rate[1] - s.platform_x[4], rate[2] - s.platform_x[5]
+    wd = w0 * d[0] + w1 * d[1] + w2 * d[2]
+    ww = w0 * w0 + w1 * w1 + w2 * w2
+    a = s.angular_velocity
+    for i in range(3):
+        s.imu_acceleration[i] = 0.0
+        a[i] = 0.0
+        for j in range(3):
+            s.imu_acceleration[i] += s.rotation[j, i] * s.acceleration[j]
+            a[i] += s.rotation[j, i] * s.acceleration[3 + j]
+    s.imu_acceleration[0] += a[1] * d[2] - a[2] * d[1] + w0 * wd - d[0] * ww
+    s.imu_acceleration[1] += a[2] * d[0] - a[0] * d[2] + w1 * wd - d[1] * ww
+    s.imu_acceleration[2] += a[0] * d[1] - a[1] * d[0] + w2 * wd - d[2] * ww
+    step_platform(
+        s.platform_x, s.platform_covariance, rate, force, s.imu_acceleration, p.period, p.gravity, p.gyroscope_density,
+        p.bias_walk, p.vertical_variance, s.matrices_6_6[0], s.matrices_6_6[1], s.vectors_6[0], s.vectors_6[1],
+    )  # fmt: skip
+    for i in range(3):
+        s.vertical[0, i] = s.platform_x[i]
+        s.platform_rate[i] = rate[i] - s.platform_x[3 + i]
+
+
+@kernel
+def find_pose(parameters: Record, state: Record) -> float:
+    """The pose in closed form from the leg directions, and the vertical if the platform has an IMU; returns the
+    conditioning."""
+    p, s = parameters[()], state[()]
+    if p.platform_used != 0:
+        s.conditioning = pose_from_vector(
+            p.base_joints, p.platform_joints, s.directions, p.leg_used, p.up_in_base[0], s.vertical[0], s.position, s.rotation,
+            s.matrix_12_9, s.right_12, s.unknowns_9, s.vectors_9[0], s.vectors_9[1],
+        )  # fmt: skip
+    else:
+        s.conditioning = pose_from_legs(
+            p.base_joints, p.platform_joints, s.directions, p.leg_used, p.plane_center, p.plane_axes, s.position, s.rotation,
+            s.matrix_12_9, s.right_12, s.unknowns_9, s.vectors_9[0], s.vectors_9[1],
+        )  # fmt: skip
+    return s.conditioning
+
+
+@kernel
+def refine_pose(parameters: Record, state: Record) -> bool:
+    """Two Gauss-Newton steps for the pose; the twist comes with them, and the acceleration is its derivative."""
+    p, s = parameters[()], state[()]
+    measured_rate = s.angular_velocity
+    for step in range(2):
+        for i in range(3):
+            measured_rate[i] = 0.0
+            for j in range(3):
+                measured_rate[i] += s.rotation[i, j] * s.platform_rate[j]
+        if not refine(
+            p.base_joints, p.platform_joints, s.directions, s.rates, p.leg_weights, p.up_in_base, s.vertical,
+            p.vertical_weight, measured_rate, s.position, s.rotation, s.arms, s.predicted, s.lengths, s.information,
+            s.vectors_6[0], s.twist, s.matrices_6_6[0],
+        ):  # fmt: skip
+            return False
+    if s.cycle == 0:
+        s.smooth_twist[:] = s.twist
+    for i in range(6):
+        s.acceleration[i] = (s.twist[i] - s.smooth_twist[i]) * p.acceleration_rate
+        s.smooth_twist[i] += min(1.0, p.period * p.acceleration_rate) * (s.twist[i] - s.smooth_twist[i])
+    return True
+
+
+@kernel
+def deviate(parameters: Record, state: Record, segments: Array) -> None:
+    """Inverse kinematics of the estimated pose, the reference of this cycle, and the length deviations."""
+    p, s = parameters[()], state[()]
+    legs_at(p.base_joints, p.platform_joints, s.position, s.rotation, s.arms, s.predicted, s.lengths)
+    time = max(s.cycle - p.hold_cycles, 0) * p.period
+    evaluate_reference(segments, time, s.reference_index, s.reference)
+    for k in range(LEGS):
+        s.error[k] = s.reference[k, 0] - s.lengths[k]
+
+
+@kernel
+def regulate(parameters: Record, state: Record) -> None:
+    """The six commands: nothing during the hold, then feed-forward and PID."""
+    p, s = parameters[()], state[()]
+    if s.cycle < p.hold_cycles:
+        for k in range(LEGS):
+            s.command[k] = 0.0
+            s.previous_error[k] = s.error[k]
+        return
+    feed_load_forward(parameters, state)
+    step_pid(
+        s.error, s.feed_forward, p.gains, p.command_limit, p.period, s.integral, s.previous_error, s.derivative, s.command
+    )
+
+
+@kernel
+def feed_load_forward(parameters: Record, state: Record) -> None:
+    """The reference speed, and what the drives need beyond it for weight and acceleration.
+
+    An encoderless drive falls short of its command by `droop` x force. Static leg forces follow from the known weight by
+    virtual work: `J^T f` balances the weight of platform and payload, of each leg's lower part and rod through the
+    moment about its base joint, and each rod's own weight along its leg.
+    """
+    p, s = parameters[()], state[()]
+    up = p.up_in_base[0]
+    wrench, force = s.vectors_6[0], s.vectors_6[1]
+    jacobian, transposed = s.matrices_6_6[0], s.matrices_6_6[1]
+    jacobian_at(s.arms, s.predicted, jacobian)
+    for i in range(6):
+        wrench[i] = p.mass * p.gravity * up[i] if i < 3 else 0.0
+        for j in range(6):
+            transposed[i, j] = jacobian[j, i]
+    m0 = m1 = m2 = 0.0
+    for j in range(3):
+        m0 += s.rotation[0, j] * p.first_moment[j]
+        m1 += s.rotation[1, j] * p.first_moment[j]
+        m2 += s.rotation[2, j] * p.first_moment[j]
+    wrench[3] = p.gravity * (m1 * up[2] - m2 * up[1])
+    wrench[4] = p.gravity * (m2 * up[0] - m0 * up[2])
+    wrench[5] = p.gravity * (m0 * up[1] - m1 * up[0])
+    for k in range(LEGS):
+        d, a = s.predicted[k], s.arms[k]
+        along = d[0] * up[0] + d[1] * up[1] + d[2] * up[2]
+        lever = (p.lower_moment + p.rod_mass * (s.lengths[k] - p.rod_center)) * p.gravity / s.lengths[k]
+        f0, f1, f2 = lever * (up[0] - along * d[0]), lever * (up[1] - along * d[1]), lever * (up[2] - along * d[2])
+        wrench[0] += f0
+        wrench[1] += f1
+        wrench[2] += f2
+        wrench[3] += a[1] * f2 - a[2] * f1
+        wrench[4] += a[2] * f0 - a[0] * f2
+        wrench[5] += a[0] * f1 - a[1] * f0
+    if solve_least_squares(transposed, wrench, force, s.vectors_9[0, :6], s.vectors_9[1, :6]) < RANK_TOLERANCE:
+        for k in range(LEGS):
+            force[k] = 0.0
+    for k in range(LEGS):
+        d = s.predicted[k]
+        own = p.rod_mass * p.gravity * (d[0] * up[0] + d[1] * up[1] + d[2] * up[2])
+        load = force[k] + own + p.moving_mass * s.reference[k, 2]
+        s.feed_forward[k] = s.reference[k, 1] + p.droop * load

@@ -1,0 +1,186 @@
+"""The constrained leg filter: an extended Kalman filter for a leg on its universal joint.
+
+The leg frame is `R_joint Rx(a) Ry(b)`, the leg its z axis. State (9): angles a, b [rad], their rates, their
+accelerations, and the gyroscope's bias (3) [rad/s]. The IMU sits at `d` in the leg frame, so that, whatever the platform
+does, it measures exactly
+
+    rate  = omega + bias,                     omega = (a' cos b, b', a' sin b)
+    force = g up + alpha x d + omega x (omega x d),   up = Ry(b)^T Rx(a)^T up_in_joint
+
+The motion model is a random walk of the accelerations. The six measurements are taken one after the other, linearised
+once, which equals the joint update. `filterpy_fusion` is the slow clear twin.
+"""
+
+import numpy as np
+
+from plant.compiled import kernel
+from plant.pose import Array
+
+STATES = 9
+ANGLE_SIGMA, RATE_SIGMA, ACCELERATION_SIGMA = 0.15, 0.05, 40.0
+"""What is known of the state after the first sample [rad, rad/s, rad/s^2]."""
+
+
+@kernel
+def start_leg(
+    x: Array, covariance: Array, gyroscope: Array, accelerometer: Array, up_in_joint: Array, bias_sigma: float
+) -> None:
+    """Start the filter from its first sample, taking the force for gravity.
+
+    Of the two pairs of angles that agree with a vertical, the one nearer to the joint's rest is taken.
+    """
+    p, q, r = up_in_joint[0], up_in_joint[1], up_in_joint[2]
+    norm = np.sqrt(accelerometer[0] ** 2 + accelerometer[1] ** 2 + accelerometer[2] ** 2)
+    u0, u1, u2 = accelerometer[0] / norm, accelerometer[1] / norm, accelerometer[2] / norm
+    middle = np.arctan2(r, q)
+    spread = np.arccos(min(1.0, max(-1.0, u1 / np.sqrt(q * q + r * r))))
+    best = np.inf
+    for sign in (-1.0, 1.0):
+        a = middle + sign * spread
+        a -= 2.0 * np.pi * np.rint(a / (2.0 * np.pi))
+        z = r * np.cos(a) - q * np.sin(a)
+        b = np.arctan2(p * u2 - z * u0, p * u0 + z * u2)
+        if abs(a) + abs(b) < best:
+            best = abs(a) + abs(b)
+            x[0], x[1] = a, b
+    x[2] = gyroscope[0] * np.cos(x[1]) + gyroscope[2] * np.sin(x[1])
+    x[3] = gyroscope[1]
+    for i in range(4, STATES):
+        x[i] = 0.0
+    for i in range(STATES):
+        for j in range(STATES):
+            covariance[i, j] = 0.0
+    for i in range(2):
+        covariance[i, i] = ANGLE_SIGMA**2
+        covariance[2 + i, 2 + i] = RATE_SIGMA**2
+        covariance[4 + i, 4 + i] = ACCELERATION_SIGMA**2
+    for i in range(6, STATES):
+        covariance[i, i] = bias_sigma**2
+
+
+@kernel
+def predict_leg(x: Array, covariance: Array, period: float, jerk: float, bias_walk: float) -> None:
+    """Carry state and covariance over one period [s]; `jerk` and `bias_walk` are spectral densities."""
+    t, half = period, 0.5 * period * period
+    for i in range(2):
+        x[i] += t * x[2 + i] + half * x[4 + i]
+        x[2 + i] += t * x[4 + i]
+    for j in range(STATES):
+        for i in range(2):
+            covariance[i, j] += t * covariance[2 + i, j] + half * covariance[4 + i, j]
+            covariance[2 + i, j] += t * covariance[4 + i, j]
+    for i in range(STATES):
+        for j in range(2):
+            covariance[i, j] += t * covariance[i, 2 + j] + half * covariance[i, 4 + j]
+            covariance[i, 2 + j] += t * covariance[i, 4 + j]
+    t3 = t * t * t
+    q00, q01, q02 = jerk * t3 * t * t / 20.0, jerk * t3 * t / 8.0, jerk * t3 / 6.0
+    q11, q12, q22 = jerk * t3 / 3.0, jerk * t * t / 2.0, jerk * t
+    for i in range(2):
+        covariance[i, i] += q00
+        covariance[2 + i, 2 + i] += q11
+        covariance[4 + i, 4 + i] += q22
+        covariance[i, 2 + i] += q01
+        covariance[2 + i, i] += q01
+        covariance[i, 4 + i] += q02
+        covariance[4 + i, i] += q02
+        covariance[2 + i, 4 + i] += q12
+        covariance[4 + i, 2 + i] += q12
+    for i in range(6, STATES):
+        covariance[i, i] += bias_walk * t
+
+
+@kernel
+def predict_measurement(x: Array, up_in_joint: Array, d: Array, gravity: float, h: Array, jacobian: Array) -> None:
+    """Write the expected measurement `h` (6,), rate then force, and its Jacobian (6, 9), whose other elements stay 0."""
+    ca, sa, cb, sb = np.cos(x[0]), np.sin(x[0]), np.cos(x[1]), np.sin(x[1])
+    da, db, dda, ddb = x[2], x[3], x[4], x[5]
+    d0, d1, d2 = d[0], d[1], d[2]
+    w0, w1, w2 = da * cb, db, da * sb
+    a0, a1, a2 = dda * cb - da * db * sb, ddb, dda * sb + da * db * cb
+    # The vertical after the first turn; its derivative with respect to a is (0, r, -q).
+    p = up_in_joint[0]
+    q = up_in_joint[1] * ca + up_in_joint[2] * sa
+    r = up_in_joint[2] * ca - up_in_joint[1] * sa
+    wd = w0 * d0 + w1 * d1 + w2 * d2
+    ww = w0 * w0 + w1 * w1 + w2 * w2
+    h[0], h[1], h[2] = w0 + x[6], w1 + x[7], w2 + x[8]
+    h[3] = gravity * (p * cb - r * sb) + a1 * d2 - a2 * d1 + w0 * wd - d0 * ww
+    h[4] = gravity * q + a2 * d0 - a0 * d2 + w1 * wd - d1 * ww
+    h[5] = gravity * (p * sb + r * cb) + a0 * d1 - a1 * d0 + w2 * wd - d2 * ww
+
+    jacobian[0, 1], jacobian[0, 2], jacobian[0, 6] = -w2, cb, 1.0
+    jacobian[1, 3], jacobian[1, 7] = 1.0, 1.0
+    jacobian[2, 1], jacobian[2, 2], jacobian[2, 8] = w0, sb, 1.0
+    # Derivative of omega x (omega x d) with respect to omega: (omega . d) I + omega d^T - 2 d omega^T.
+    m00, m01, m02 = wd + w0 * d0 - 2.0 * d0 * w0, w0 * d1 - 2.0 * d0 * w1, w0 * d2 - 2.0 * d0 * w2
+    m10, m11, m12 = w1 * d0 - 2.0 * d1 * w0, wd + w1 * d1 - 2.0 * d1 * w1, w1 * d2 - 2.0 * d1 * w2
+    m20, m21, m22 = w2 * d0 - 2.0 * d2 * w0, w2 * d1 - 2.0 * d2 * w1, wd + w2 * d2 - 2.0 * d2 * w2
+    jacobian[3, 0], jacobian[4, 0], jacobian[5, 0] = gravity * q * sb, gravity * r, -gravity * q * cb
+    a0b, a2b = -dda * sb - da * db * cb, dda * cb - da * db * sb
+    jacobian[3, 1] = -gravity * (p * sb + r * cb) - a2b * d1 - m00 * w2 + m02 * w0
+    jacobian[4, 1] = a2b * d0 - a0b * d2 - m10 * w2 + m12 * w0
+    jacobian[5, 1] = gravity * (p * cb - r * sb) + a0b * d1 - m20 * w2 + m22 * w0
+    a0d, a2d = -db * sb, db * cb
+    jacobian[3, 2] = -a2d * d1 + m00 * cb + m02 * sb
+    jacobian[4, 2] = a2d * d0 - a0d * d2 + m10 * cb + m12 * sb
+    jacobian[5, 2] = a0d * d1 + m20 * cb + m22 * sb
+    a0e, a2e = -da * sb, da * cb
+    jacobian[3, 3] = -a2e * d1 + m01
+    jacobian[4, 3] = a2e * d0 - a0e * d2 + m11
+    jacobian[5, 3] = a0e * d1 + m21
+    jacobian[3, 4], jacobian[4, 4], jacobian[5, 4] = -sb * d1, sb * d0 - cb * d2, cb * d1
+    jacobian[3, 5], jacobian[5, 5] = d2, -d0
+
+
+@kernel
+def update_leg(
+    x: Array, covariance: Array, gyroscope: Array, accelerometer: Array, up_in_joint: Array, d: Array, gravity: float,
+    rate_variance: float, force_variance: float, h: Array, jacobian: Array, gain: Array, change: Array,
+) -> None:  # fmt: skip
+    """Take one sample into state and covariance; the last four arguments are scratch (6,), (6, 9), (9,), (9,)."""
+    predict_measurement(x, up_in_joint, d, gravity, h, jacobian)
+    for i in range(STATES):
+        change[i] = 0.0
+    for m in range(6):
+        rate = m < 3
+        innovation = (gyroscope[m] if rate else accelerometer[m - 3]) - h[m]
+        variance = rate_variance if rate else force_variance
+        for i in range(STATES):
+            if rate:
+                gain[i] = (
+                    jacobian[m, 1] * covariance[1, i]
+                    + jacobian[m, 2] * covariance[2, i]
+                    + jacobian[m, 3] * covariance[3, i]
+                    + covariance[6 + m, i]
+                )
+            else:
+                total = jacobian[m, 0] * covariance[0, i]
+                for j in range(1, 6):
+                    total += jacobian[m, j] * covariance[j, i]
+                gain[i] = total
+        for j in range(STATES if rate else 6):
+            variance += jacobian[m, j] * gain[j]
+            innovation -= jacobian[m, j] * change[j]
+        inverse = 1.0 / variance
+        for i in range(STATES):
+            k = gain[i] * inverse
+            change[i] += k * innovation
+            for j in range(i + 1):
+                value = covariance[i, j] - k * gain[j]
+                covariance[i, j] = value
+                covariance[j, i] = value
+    for i in range(STATES):
+        x[i] += change[i]
+
+
+@kernel
+def leg_direction(x: Array, joint_rotation: Array, direction: Array, rate: Array) -> None:
+    """Write the leg's direction (3,) in {1} and its rate (3,) [1/s] from the filter's state."""
+    ca, sa, cb, sb = np.cos(x[0]), np.sin(x[0]), np.cos(x[1]), np.sin(x[1])
+    da, db = x[2], x[3]
+    v0, v1, v2 = sb, -sa * cb, ca * cb
+    r0, r1, r2 = cb * db, -ca * cb * da + sa * sb * db, -sa * cb * da - ca * sb * db
+    for i in range(3):
+        direction[i] = joint_rotation[i, 0] * v0 + joint_rotation[i, 1] * v1 + joint_rotation[i, 2] * v2
+        rate[i] = joint_rotation[i, 0] * r0 + joint_rotation[i, 1] * r1 + joint_rotation[i, 2] * r2

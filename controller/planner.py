@@ -1,0 +1,295 @@
+"""The planner: from target poses to a reference that no actuator has to leave its limits for.
+
+On every target sample ruckig plans anew, from the state of the reference to where the target will be 30 ms later, with
+its velocity and acceleration there. What is published are the cubic
+segments of those plans, so the limits on velocity, acceleration and jerk hold between samples too. ruckig does not know
+the stroke: a plan counts only if every leg could still stop inside its stroke after it, else a gentler one is taken, and
+at last the stop itself.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from ruckig import ControlInterface, InputParameter, Result, Ruckig, RuckigError, Synchronization, Trajectory
+
+from controller.inverse_kinematics import leg_lengths
+from controller.target import SAMPLE_PERIOD_S, Target
+from plant.compiled import kernel
+from plant.errors import PlanningError
+from plant.mechanism import LEGS, Limits, Mechanism
+from plant.pose import Array
+
+PREVIEW_S = 0.03
+_HALF_WINDOW = 3
+_SLACK = 1e-9
+"""Rounding that a limit may be exceeded by before it counts, relative to the limit, or in m for the stroke."""
+
+_SEGMENTS = 9
+"""A plan of ruckig has two braking segments and seven more."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A planned motion.
+
+    Attributes:
+        segments: (6, n, 5), as `controller.reference` evaluates them.
+        violations: how many segments leave a limit; the planner's promise is none.
+    """
+
+    segments: Array
+    violations: int
+
+
+def plan(mechanism: Mechanism, target: Target, duration: float) -> Reference:
+    """Plan a whole recorded motion before it starts, from rest at its first pose.
+
+    Raises:
+        UnreachableError: a target pose needs a leg outside its stroke.
+        PlanningError: ruckig found no motion, not even a stop.
+    """
+    limits = mechanism.require_limits()
+    lengths = leg_lengths(mechanism, target.positions, target.rotations)
+    mechanism.check_lengths(lengths, f"the target {target.name}")
+    planner = _Planner(limits, lengths[0])
+    knots = max(1, int(np.ceil(duration / SAMPLE_PERIOD_S - 1e-9)))
+    aims = np.arange(knots) * SAMPLE_PERIOD_S + (0.0 if target.held else PREVIEW_S)
+    positions, rates, accelerations = _aims(target, lengths, aims, limits)
+    for k in range(knots):
+        planner.advance(positions[k], rates[k], accelerations[k])
+    segments = planner.segments()
+    horizon = knots * SAMPLE_PERIOD_S
+    return Reference(segments, count_violations(segments, horizon, limits))
+
+
+def count_violations(segments: Array, horizon: float, limits: Limits) -> int:
+    """How many segments before `horizon` [s] leave the stroke or the limits of velocity, acceleration or jerk."""
+    return int(
+        _count_violations(segments, horizon, limits.stroke, np.array([limits.velocity, limits.acceleration, limits.jerk]))
+    )
+
+
+class _Planner:
+    """Extends a reference by one target sample at a time, holding the state that the next plan starts from."""
+
+    def __init__(self, limits: Limits, lengths: Array) -> None:
+        self._limits = limits
+        self._inner = np.array([limits.acceleration, limits.jerk])
+        self._state = (lengths.tolist(), [0.0] * LEGS, [0.0] * LEGS)
+        self._otg = Ruckig(LEGS, SAMPLE_PERIOD_S)
+        self._trajectory = Trajectory(LEGS)
+        self._follow = _input(limits, ControlInterface.Position, PREVIEW_S)
+        self._stop = _input(limits, ControlInterface.Velocity, None)
+        self._stop.synchronization = Synchronization.No
+        self._plans: list[list[float]] = []
+
+    def advance(self, positions: Array, rates: Array, accelerations: Array) -> None:
+        """Plan towards a state (6,) each, and keep the first sample period of the plan."""
+        rest = [0.0] * LEGS
+        target = positions.tolist()
+        for rate, acceleration in ((rates.tolist(), accelerations.tolist()), (rates.tolist(), rest), (rest, rest)):
+            self._follow.target_position = target
+            self._follow.target_velocity = rate
+            self._follow.target_acceleration = acceleration
+            if self._plan(self._follow) and self._can_stop_after():
+                break
+        else:
+            if not self._plan(self._stop):
+                raise PlanningError(f"ruckig finds no way to stop from lengths {self._state[0]}")
+        for profile in self._trajectory.profiles[0]:
+            brake = profile.brake
+            self._plans.append([*brake.t, *profile.t, *brake.p, *profile.p, *brake.v, *profile.v, *brake.a, *profile.a,
+                                *brake.j, *profile.j])  # fmt: skip
+        self._state = self._trajectory.at_time(SAMPLE_PERIOD_S)[:3]
+
+    def _plan(self, parameters: InputParameter) -> bool:
+        parameters.current_position, parameters.current_velocity, parameters.current_acceleration = self._state
+        try:
+            return self._otg.calculate(parameters, self._trajectory) in (Result.Working, Result.Finished)
+        except RuckigError:
+            return False
+
+    def _can_stop_after(self) -> bool:
+        reach = self._limits.velocity * SAMPLE_PERIOD_S
+        now = np.array(self._state[0])
+        stroke = self._limits.stroke
+        if (now - reach < stroke[:, 0]).any() or (now + reach > stroke[:, 1]).any():
+            for extrema, (least, greatest) in zip(self._trajectory.position_extrema, stroke, strict=True):
+                if extrema.min < least - _SLACK or extrema.max > greatest + _SLACK:
+                    return False
+        after = np.array(self._trajectory.at_time(SAMPLE_PERIOD_S)[:3])
+        return bool(_stops_inside(after, stroke, self._inner))
+
+    def segments(self) -> Array:
+        """All segments so far, (6, n, 5)."""
+        plans = np.array(self._plans).reshape(-1, LEGS, 2 * _SEGMENTS + 3 * (_SEGMENTS + 1) - 0)
+        durations = plans[..., :_SEGMENTS]
+        position, rate, acceleration = (
+            plans[..., _SEGMENTS + i * (_SEGMENTS + 1) :][..., :_SEGMENTS] for i in range(3)
+        )
+        jerk = plans[..., -_SEGMENTS:]
+        starts = np.cumsum(durations, axis=-1) - durations
+        kept = (durations > 0.0) & (starts < SAMPLE_PERIOD_S - 1e-12)
+        # A plan that ends within the sample, or does not move at all, rests in its last state.
+        ends = starts[..., -1] + durations[..., -1]
+        resting = ends < SAMPLE_PERIOD_S - 1e-12
+        offsets = (np.arange(len(plans)) * SAMPLE_PERIOD_S)[:, None]
+        legs = []
+        for k in range(LEGS):
+            rows = np.stack([starts[:, k] + offsets, position[:, k], rate[:, k], acceleration[:, k], jerk[:, k]], axis=-1)
+            last = plans[:, k]
+            rest = np.zeros((len(plans), 1, 5))
+            rest[:, 0, 0] = ends[:, k] + offsets[:, 0]
+            rest[:, 0, 1] = last[:, 2 * _SEGMENTS]
+            rest[:, 0, 2] = last[:, 3 * _SEGMENTS + 1]
+            keep = np.concatenate([kept[:, k], resting[:, k, None]], axis=1)
+            legs.append(np.concatenate([rows, rest], axis=1)[keep])
+        segments = np.zeros((LEGS, max(len(leg) for leg in legs), 5))
+        segments[:, :, 0] = np.inf
+        for k, leg in enumerate(legs):
+            segments[k, : len(leg)] = leg
+        return segments
+
+
+def _input(limits: Limits, interface: ControlInterface, minimum_duration: float | None) -> InputParameter:
+    parameters = InputParameter(LEGS)
+    parameters.control_interface = interface
+    parameters.minimum_duration = minimum_duration
+    parameters.max_velocity = [limits.velocity] * LEGS
+    parameters.max_acceleration = [limits.acceleration] * LEGS
+    parameters.max_jerk = [limits.jerk] * LEGS
+    return parameters
+
+
+def _aims(target: Target, lengths: Array, times: Array, limits: Limits) -> tuple[Array, Array, Array]:
+    """Lengths, rates and accelerations (M, 6) to aim at, within the limits; after the last sample, rest there."""
+    if target.held:
+        index = np.clip(np.searchsorted(target.times, times + 1e-9, side="right") - 1, 0, len(lengths) - 1)
+        positions = lengths[index]
+        return positions, np.zeros_like(positions), np.zeros_like(positions)
+    # A cubic fitted to seven samples about each aim: a spline's own derivatives would make ruckig's plans chatter.
+    window = np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1)
+    fit = np.linalg.pinv(np.vander(window * SAMPLE_PERIOD_S, 4, increasing=True))
+    at = times[:, None] + window * SAMPLE_PERIOD_S
+    samples = _spline(target.times, lengths, at.ravel()).reshape(*at.shape, LEGS)
+    positions, rates = (np.einsum("w,mwk->mk", fit[order], samples) for order in (0, 1))
+    accelerations = 2.0 * np.einsum("w,mwk->mk", fit[2], samples)
+    # A fit through a jump swings out; the samples themselves are inside the stroke.
+    positions = np.clip(positions, limits.stroke[:, 0], limits.stroke[:, 1])
+    rates = np.clip(rates, -0.999 * limits.velocity, 0.999 * limits.velocity)
+    accelerations = np.clip(accelerations, -0.9 * limits.acceleration, 0.9 * limits.acceleration)
+    too_fast = np.abs(rates) + accelerations**2 / (2.0 * limits.jerk) > 0.999 * limits.velocity
+    accelerations[too_fast] = 0.0
+    return positions, rates, accelerations
+
+
+def _spline(knots: Array, values: Array, times: Array) -> Array:
+    """The cubic spline through values (N, m) at knots (N,), evaluated at times (M,); before and after, the ends stand.
+
+    The slopes at both ends are those of the parabola through the three samples there.
+    """
+    h = np.diff(knots)
+    slopes = np.diff(values, axis=0) / h[:, None]
+    n = len(knots)
+    # Second derivatives from the tridiagonal system of a clamped spline (Thomas's algorithm).
+    diagonal, right = np.empty(n), np.empty_like(values)
+    diagonal[0], diagonal[-1] = 2.0 * h[0], 2.0 * h[-1]
+    diagonal[1:-1] = 2.0 * (h[:-1] + h[1:])
+    right[0], right[-1] = 0.0, 0.0
+    if n > 2:
+        bends = np.diff(slopes, axis=0) / (h[:-1] + h[1:])[:, None]
+        right[0], right[-1] = 6.0 * h[0] * bends[0], 6.0 * h[-1] * bends[-1]
+    right[1:-1] = 6.0 * np.diff(slopes, axis=0)
+    for i in range(1, n):
+        factor = h[i - 1] / diagonal[i - 1]
+        diagonal[i] -= factor * h[i - 1]
+        right[i] -= factor * right[i - 1]
+    second = np.empty_like(values)
+    second[-1] = right[-1] / diagonal[-1]
+    for i in range(n - 2, -1, -1):
+        second[i] = (right[i] - h[i] * second[i + 1]) / diagonal[i]
+
+    times = np.clip(times, knots[0], knots[-1])
+    index = np.clip(np.searchsorted(knots, times, side="right") - 1, 0, n - 2)
+    step, t = h[index][:, None], (times - knots[index])[:, None]
+    before, after = second[index], second[index + 1]
+    rate = slopes[index] - step * (2.0 * before + after) / 6.0
+    return values[index] + t * (rate + t * (before / 2.0 + t * (after - before) / (6.0 * step)))
+
+
+@kernel
+def _segment_extrema(p: float, v: float, a: float, j: float, t: float) -> tuple[float, float, float]:
+    """Least and greatest position, and greatest speed, over a cubic segment of duration t."""
+    end = p + t * (v + t * (a / 2.0 + t * j / 6.0))
+    least, greatest = min(p, end), max(p, end)
+    speed = max(abs(v), abs(v + t * (a + t * j / 2.0)))
+    # Positions peak where v + a s + j s^2 / 2 = 0, speeds where a + j s = 0.
+    if j == 0.0:
+        first = -v / a if a != 0.0 else -1.0
+        second = -1.0
+    else:
+        root = a * a - 2.0 * j * v
+        root = np.sqrt(root) if root > 0.0 else np.nan
+        first, second = (-a + root) / j, (-a - root) / j
+        s = -a / j
+        if 0.0 < s < t:
+            speed = max(speed, abs(v + s * (a + s * j / 2.0)))
+    for s in (first, second):
+        if 0.0 < s < t:
+            at = p + s * (v + s * (a / 2.0 + s * j / 6.0))
+            least, greatest = min(least, at), max(greatest, at)
+    return least, greatest, speed
+
+
+@kernel
+def _stops_inside(state: Array, stroke: Array, limits: Array) -> bool:
+    """Whether every leg, from its state (3, 6), can stop within its stroke (6, 2) at the limits of acceleration and jerk."""
+    acceleration_limit, jerk_limit = limits[0], limits[1]
+    for k in range(state.shape[1]):
+        p, v, a = state[0, k], state[1, k], state[2, k]
+        sign = 1.0 if v + a * abs(a) / (2.0 * jerk_limit) >= 0.0 else -1.0
+        # Seen in the direction in which the leg would go on: jerk down to -peak, stay there, jerk back up.
+        v, a = sign * v, sign * a
+        peak = np.sqrt(max(jerk_limit * v + a * a / 2.0, 0.0))
+        stay = 0.0
+        if peak > acceleration_limit:
+            peak = acceleration_limit
+            stay = (v + a * a / (2.0 * jerk_limit) - peak * peak / jerk_limit) / peak
+        least = greatest = at = 0.0
+        for jerk, duration in ((-jerk_limit, max((a + peak) / jerk_limit, 0.0)), (0.0, stay), (jerk_limit, peak / jerk_limit)):
+            low, high, _ = _segment_extrema(at, v, a, jerk, duration)
+            least, greatest = min(least, low), max(greatest, high)
+            at += duration * (v + duration * (a / 2.0 + duration * jerk / 6.0))
+            v += duration * (a + duration * jerk / 2.0)
+            a += duration * jerk
+        if sign < 0.0:
+            least, greatest = -greatest, -least
+        if p + least < stroke[k, 0] or p + greatest > stroke[k, 1]:
+            return False
+    return True
+
+
+@kernel
+def _count_violations(segments: Array, horizon: float, stroke: Array, limits: Array) -> int:
+    violations = 0
+    for k in range(segments.shape[0]):
+        for i in range(segments.shape[1]):
+            start = segments[k, i, 0]
+            if not start < horizon:
+                break
+            end = horizon
+            if i + 1 < segments.shape[1]:
+                end = min(end, segments[k, i + 1, 0])
+            t = end - start
+            p, v, a, j = segments[k, i, 1], segments[k, i, 2], segments[k, i, 3], segments[k, i, 4]
+            least, greatest, speed = _segment_extrema(p, v, a, j, t)
+            acceleration = max(abs(a), abs(a + t * j))
+            if (
+                least < stroke[k, 0] - _SLACK
+                or greatest > stroke[k, 1] + _SLACK
+                or speed > limits[0] * (1.0 + _SLACK)
+                or acceleration > limits[1] * (1.0 + _SLACK)
+                or abs(j) > limits[2] * (1.0 + _SLACK)
+            ):
+                violations += 1
+    return violations

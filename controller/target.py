@@ -1,0 +1,167 @@
+"""Target motions: poses over time, from a CSV file or by name."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from plant.errors import InputError, UnknownNameError
+from plant.mechanism import Mechanism
+from plant.pose import UNIT_TOLERANCE, Array, Pose, checked_unit, quaternion_from_rotation, rotation_from_vector, rotations_from_quaternions
+
+COLUMNS = ("time_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
+SAMPLE_PERIOD_S = 0.01
+MARGIN_S = 0.1
+"""How far a target goes on beyond the duration, for whoever looks ahead."""
+
+_FADE_S = 1.0
+_STEP_S = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """Poses to be reached at given times.
+
+    Attributes:
+        name: for messages and reports.
+        times: (N,) [s], increasing from 0.
+        positions: (N, 3) [m], origin of {2} in {1}.
+        rotations: (N, 3, 3), map {2} to {1}.
+        held: whether each pose stands until the next one's time, instead of being passed through.
+    """
+
+    name: str
+    times: Array
+    positions: Array
+    rotations: Array
+    held: bool = False
+
+    @property
+    def start(self) -> Pose:
+        """The first pose."""
+        return Pose(self.positions[0], self.rotations[0])
+
+    def at(self, times: Array) -> tuple[Array, Array]:
+        """Positions (M, 3) and rotations (M, 3, 3) at times (M,) [s], interpolated (linearly, and along the shortest
+        turn); before the first and after the last sample these stand."""
+        if self.held:
+            index = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 1)
+            return self.positions[index], self.rotations[index]
+        positions = np.stack([np.interp(times, self.times, column) for column in self.positions.T], axis=1)
+        # Linear interpolation of quaternions between close samples is the shortest turn to third order.
+        quaternions = np.array([quaternion_from_rotation(rotation) for rotation in self.rotations])
+        flips = np.where(np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0, -1.0, 1.0)
+        quaternions[1:] *= np.cumprod(flips)[:, None]
+        between = np.stack([np.interp(times, self.times, column) for column in quaternions.T], axis=1)
+        return positions, rotations_from_quaternions(between / np.linalg.norm(between, axis=1, keepdims=True))
+
+
+def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float) -> Target:
+    """A motion by its name, or the displacements from home in a CSV file, cut to `duration` [s].
+
+    Raises:
+        UnknownNameError: neither a motion nor a file.
+        InputError: the file is malformed, not finite, out of order, or its quaternions are off unit by more than 1e-3.
+    """
+    if not 0.0 < duration < np.inf:
+        raise InputError(f"the duration is {duration:g} s; it must be positive and finite")
+    if str(name_or_path) in MOTIONS:
+        return _named_motion(str(name_or_path), mechanism, duration)
+    path = Path(name_or_path)
+    if not path.is_file():
+        raise UnknownNameError(f"no target {str(name_or_path)!r}: neither a motion ({', '.join(MOTIONS)}) nor a CSV file")
+    return _cut(_read_csv(path, mechanism), duration)
+
+
+def _read_csv(path: Path, mechanism: Mechanism) -> Target:
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read {path}: {error}") from None
+    header = [name.strip() for name in lines[0].split(",")] if lines else []
+    if header != list(COLUMNS):
+        raise InputError(f"{path}, line 1: the header must be {','.join(COLUMNS)}")
+    rows = []
+    for number, line in enumerate(lines[1:], start=2):
+        if not line.strip():
+            continue
+        try:
+            row = [float(field) for field in line.split(",")]
+        except ValueError:
+            raise InputError(f"{path}, line {number}: {line.strip()!r} is not a row of {len(COLUMNS)} numbers") from None
+        if len(row) != len(COLUMNS):
+            raise InputError(f"{path}, line {number}: {len(row)} numbers instead of {len(COLUMNS)}")
+        if not np.isfinite(row).all():
+            raise InputError(f"{path}, line {number}: {line.strip()!r} is not finite")
+        if rows and row[0] <= rows[-1][0]:
+            raise InputError(f"{path}, line {number}: time {row[0]:g} s does not come after {rows[-1][0]:g} s")
+        norm = float(np.linalg.norm(row[4:]))
+        if abs(norm - 1.0) > UNIT_TOLERANCE:
+            raise InputError(f"{path}, line {number}: the quaternion has length {norm:.6g}, off unit by more than {UNIT_TOLERANCE:g}")
+        rows.append(row)
+    if len(rows) < 2:
+        raise InputError(f"{path} has {len(rows)} samples; a motion needs at least 2")
+    table = np.array(rows)
+    quaternions = np.array([checked_unit(quaternion, 4, "quaternion") for quaternion in table[:, 4:]])
+    home = mechanism.require_home()
+    return Target(
+        name=path.name,
+        times=table[:, 0] - table[0, 0],
+        positions=home.position + table[:, 1:4],
+        rotations=rotations_from_quaternions(quaternions) @ home.rotation,
+    )
+
+
+def _cut(target: Target, duration: float) -> Target:
+    kept = target.times <= duration + MARGIN_S
+    kept[:2] = True
+    return Target(target.name, target.times[kept], target.positions[kept], target.rotations[kept], target.held)
+
+
+def _named_motion(name: str, mechanism: Mechanism, duration: float) -> Target:
+    home = mechanism.require_home()
+    held = name == "steps"
+    period = _STEP_S if held else SAMPLE_PERIOD_S
+    times = np.arange(0.0, duration + MARGIN_S + period, period)
+    # The reach is in proportion to the stroke, so that every preset can make every motion.
+    stroke = mechanism.require_limits().stroke
+    displacements = MOTIONS[name](times) * float((stroke[:, 1] - stroke[:, 0]).min() / 0.12)
+    rotations = np.array([rotation_from_vector(vector) @ home.rotation for vector in displacements[:, 3:]])
+    return Target(name, times, home.position + displacements[:, :3], rotations, held)
+
+
+def _fade(times: Array) -> Array:
+    """From 0 to 1 within the first second, with continuous acceleration."""
+    x = np.clip(times / _FADE_S, 0.0, 1.0)
+    faded: Array = x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
+    return faded[:, None]
+
+
+def _hold(times: Array) -> Array:
+    return np.zeros((len(times), 6))
+
+
+def _circle(times: Array) -> Array:
+    angle = 2.0 * np.pi * 0.25 * times
+    motion = np.zeros((len(times), 6))
+    motion[:, 0], motion[:, 1] = 0.03 * np.cos(angle), 0.03 * np.sin(angle)
+    motion[:, 3], motion[:, 4] = np.radians(4.0) * np.sin(angle), -np.radians(4.0) * np.cos(angle)
+    return motion * _fade(times)
+
+
+def _sines(times: Array) -> Array:
+    frequencies = np.array([0.30, 0.37, 0.43, 0.50, 0.57, 0.63])
+    amplitudes = np.array([0.012, 0.012, 0.012, np.radians(3.0), np.radians(3.0), np.radians(5.0)])
+    return amplitudes * np.sin(2.0 * np.pi * frequencies * times[:, None]) * _fade(times)
+
+
+def _steps(times: Array) -> Array:
+    poses = np.zeros((7, 6))
+    for axis, size in enumerate((0.02, 0.02, 0.02, np.radians(4.0), np.radians(4.0), np.radians(8.0))):
+        poses[axis + 1, axis] = size
+    return poses[np.arange(len(times)) % len(poses)]
+
+
+MOTIONS: dict[str, Callable[[Array], Array]] = {"hold": _hold, "circle": _circle, "sines": _sines, "steps": _steps}
+"""Displacements from home (N, 6), position [m] and rotation vector [rad], at times (N,) [s]."""
