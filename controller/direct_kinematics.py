@@ -408,6 +408,21 @@ def pose_from_legs(
 
 
 @kernel
+def _add_leg(right: Array, measured: Array, direction: Array, arm: Array, scale: float) -> None:
+    """Add `scale` J^T P `measured` to a right side (6,), P = I - d d^T and J = [I, -skew(arm)]."""
+    d0, d1, d2 = direction[0], direction[1], direction[2]
+    a0, a1, a2 = arm[0], arm[1], arm[2]
+    along = d0 * measured[0] + d1 * measured[1] + d2 * measured[2]
+    g0, g1, g2 = scale * (measured[0] - along * d0), scale * (measured[1] - along * d1), scale * (measured[2] - along * d2)
+    right[0] += g0
+    right[1] += g1
+    right[2] += g2
+    right[3] += a1 * g2 - a2 * g1
+    right[4] += a2 * g0 - a0 * g2
+    right[5] += a0 * g1 - a1 * g0
+
+
+@kernel
 def normal_equations(
     base_joints: Array, platform_joints: Array, directions: Array, rates: Array, weights: Array,
     in_base: Array, in_platform: Array, vector_weights: Array, angular_velocity: Array, position: Array, rotation: Array,
@@ -463,16 +478,8 @@ def normal_equations(
         information[4, 4] += a2 * m10 - a0 * m12
         information[5, 4] += a2 * m20 - a0 * m22
         information[5, 5] += a0 * m21 - a1 * m20
-        for right, measured in ((correction, directions), (twist, rates)):
-            e0, e1, e2 = measured[k, 0], measured[k, 1], measured[k, 2]
-            along = d0 * e0 + d1 * e1 + d2 * e2
-            g0, g1, g2 = scale * (e0 - along * d0), scale * (e1 - along * d1), scale * (e2 - along * d2)
-            right[0] += g0
-            right[1] += g1
-            right[2] += g2
-            right[3] += a1 * g2 - a2 * g1
-            right[4] += a2 * g0 - a0 * g2
-            right[5] += a0 * g1 - a1 * g0
+        _add_leg(correction, directions[k], predicted[k], arms[k], scale)
+        _add_leg(twist, rates[k], predicted[k], arms[k], scale)
     o0, o1, o2 = angular_velocity[0], angular_velocity[1], angular_velocity[2]
     for k in range(vector_weights.shape[0]):
         w = vector_weights[k]

@@ -59,6 +59,10 @@ class FilterpyLeg:
     def step(self, gyroscope: Array, accelerometer: Array) -> None:
         """Predict over one period and take a sample [rad/s, m/s^2]."""
         self.filter.predict()
+        self.update(gyroscope, accelerometer)
+
+    def update(self, gyroscope: Array, accelerometer: Array) -> None:
+        """Take a sample [rad/s, m/s^2] without predicting."""
         sample = np.concatenate([gyroscope, accelerometer]).reshape(6, 1)
         self.filter.update(sample, self.measurement_jacobian, self.measurement)
 

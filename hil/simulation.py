@@ -1,0 +1,249 @@
+"""A closed-loop simulation: a mechanism follows a target on its FMU plant, as fast as it goes."""
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controller.cycle import ALL_IMUS, NOT_FINITE, OK, POSE_LOST, STATE, cycle_parameters, point_legs
+from controller.direct_kinematics import poses_from_lengths
+from controller.leg_filter import start_leg
+from controller.planner import Reference, plan
+from controller.settings import control_settings, fusion_settings
+from controller.target import Target, load_target
+from hil.loop import CYCLE_RECORD, PLANT_FAILED, LegFusion, Loop
+from plant.errors import GoughError, InputError, UnknownNameError
+from plant.export import default_fmu
+from plant.fmu import RATE_RANGE_HZ, FmuPlant, Record
+from plant.imu import ACCELEROMETER, GYROSCOPE, imu_state, load_imu
+from plant.mechanism import LEGS, Mechanism, load_mechanism
+from plant.pose import Array, rotation_angle, rotations_from_quaternions
+
+FUSIONS = ("compiled", "filterpy")
+_CHUNK_S = 0.25
+
+
+@dataclass(frozen=True)
+class SimulationConfig:
+    """What to simulate.
+
+    Attributes:
+        mechanism: preset or TOML file.
+        target: motion or CSV file.
+        duration: of the motion, after the hold on the brakes [s].
+        rate: cycles per second [Hz].
+        imu: preset of the imperfections.
+        seed: of the imperfections.
+        fusion: "compiled", or "filterpy" for the reference leg filters.
+        plant: an FMU to use instead of the one that gough builds.
+        imus: which IMUs there are, 0-5 on the legs and 6 on the platform.
+    """
+
+    mechanism: str = "hexapod"
+    target: str = "circle"
+    duration: float = 10.0
+    rate: float = 1000.0
+    imu: str = "mpu9150-calibrated"
+    seed: int = 0
+    fusion: str = "compiled"
+    plant: str | None = None
+    imus: tuple[int, ...] = ALL_IMUS
+
+    def __post_init__(self) -> None:
+        if not RATE_RANGE_HZ[0] <= self.rate <= RATE_RANGE_HZ[1]:
+            raise InputError(f"the rate is {self.rate:g} Hz; it must lie between {RATE_RANGE_HZ[0]:g} and {RATE_RANGE_HZ[1]:g} Hz")
+        if self.fusion not in FUSIONS:
+            raise UnknownNameError(f"no fusion {self.fusion!r}; there are {', '.join(FUSIONS)}")
+
+
+class SimulationStopped(GoughError, RuntimeError):
+    """The loop ended before its time; the message has the cause and the cycle, `result` what was recorded until then."""
+
+    def __init__(self, message: str, result: "SimulationResult") -> None:
+        super().__init__(message)
+        self.result = result
+
+
+@dataclass(frozen=True, eq=False)
+class SimulationResult:
+    """What a simulation found.
+
+    Attributes:
+        config: what was simulated.
+        mechanism, target, reference: what it was simulated with.
+        times: (N,) [s]; 0 is the end of the hold.
+        records: (N,), dtype `hil.loop.CYCLE_RECORD`.
+        reference_positions, reference_rotations: (N, 3) [m] and (N, 3, 3), the planned pose.
+        target_positions, target_rotations: (N, 3) [m] and (N, 3, 3), the raw target.
+        real_time_factor: simulated time over the time that planning and loop took.
+    """
+
+    config: SimulationConfig
+    mechanism: Mechanism
+    target: Target
+    reference: Reference
+    times: Array
+    records: NDArray[np.void]
+    reference_positions: Array
+    reference_rotations: Array
+    target_positions: Array
+    target_rotations: Array
+    real_time_factor: float
+
+    @property
+    def true_positions(self) -> Array:
+        """(N, 3) [m]."""
+        positions: Array = self.records["truth"][:, :3]
+        return positions
+
+    @property
+    def true_rotations(self) -> Array:
+        """(N, 3, 3)."""
+        return rotations_from_quaternions(np.ascontiguousarray(self.records["truth"][:, 3:7]))
+
+    def summary(self) -> dict[str, Any]:
+        """The figures, in SI units, over the time after the hold."""
+        moving = self.times >= 0.0
+        truth = (self.true_positions[moving], self.true_rotations[moving])
+        estimate = (self.records["position"][moving], self.records["rotation"][moving])
+        reference = (self.reference_positions[moving], self.reference_rotations[moving])
+        target = (self.target_positions[moving], self.target_rotations[moving])
+        cycle_us = self.records["cycle_ns"] / 1e3
+        return {
+            "estimation": _errors(estimate, truth),
+            "tracking": _errors(truth, reference),
+            "target": _errors(truth, target) | {f"reference_{key}": value for key, value in _errors(reference, target).items()},
+            "limits": {"violations": self.reference.violations},
+            "real_time_factor": self.real_time_factor,
+            "cycle_us": {
+                name: float(np.percentile(cycle_us, percent)) for name, percent in (("p50", 50), ("p99", 99), ("p999", 99.9))
+            },
+            "config": asdict(self.config),
+            "version": version("gough"),
+        }
+
+
+def simulate(config: SimulationConfig, progress: Callable[[float], None] = lambda share: None) -> SimulationResult:
+    """Run a simulation.
+
+    Args:
+        config: what to simulate.
+        progress: called now and then with the share of the run that is done.
+
+    Raises:
+        GoughError: something in the configuration cannot be used; nothing has run then.
+        SimulationStopped: the loop ended before its time.
+    """
+    mechanism = load_mechanism(config.mechanism)
+    target = load_target(config.target, mechanism, config.duration)
+    imu = imu_state(load_imu(config.imu), config.seed, 1.0 / config.rate)
+    control = control_settings(mechanism)
+    fusion = fusion_settings(mechanism)
+    parameters = cycle_parameters(mechanism, config.rate, control, fusion, config.imus)
+    hold = int(parameters["hold_cycles"])
+    count = hold + round(config.duration * config.rate)
+    with FmuPlant(
+        Path(config.plant) if config.plant else default_fmu(), mechanism.plant_parameters(target.start), 1.0 / config.rate
+    ) as plant:
+        began = time.perf_counter()
+        reference = plan(mechanism, target, config.duration)
+        planning = time.perf_counter() - began
+        loop = Loop(
+            calls=plant.calls,
+            imu=imu,
+            parameters=parameters,
+            state=np.zeros((), STATE),
+            segments=reference.segments,
+            records=np.zeros(count, CYCLE_RECORD),
+        )
+        _warm(loop)
+        fuse = _filterpy_legs(parameters) if config.fusion == "filterpy" else None
+        status, looping = OK, 0.0
+        chunk = max(1, round(_CHUNK_S * config.rate))
+        for last in range(chunk, count + chunk, chunk):
+            began = time.perf_counter()
+            status = loop.run(min(last, count), fuse)
+            looping += time.perf_counter() - began
+            if status != OK:
+                break
+            progress(min(last, count) / count)
+        done = int(loop.state["cycle"])
+        result = _result(config, mechanism, target, reference, loop, done, planning + looping)
+        if status != OK:
+            cause = str(plant.failure("the plant failed")) if status >= PLANT_FAILED else _CAUSES[status]
+            raise SimulationStopped(f"stopped on the brakes at cycle {done} of {count}: {cause}", result)
+    return result
+
+
+_CAUSES = {
+    POSE_LOST: "the estimated leg directions no longer determine a pose",
+    NOT_FINITE: "an estimate or a command is no longer finite",
+}
+
+
+def _warm(loop: Loop) -> None:
+    """Load the loop's machine code by running no cycle."""
+    loop.run(0)
+
+
+def _result(
+    config: SimulationConfig, mechanism: Mechanism, target: Target, reference: Reference, loop: Loop, done: int, took: float
+) -> SimulationResult:
+    records = loop.records[:done]
+    times = (np.arange(done) - int(loop.parameters["hold_cycles"])) / config.rate
+    positions, rotations = poses_from_lengths(mechanism, records["reference"][:, :, 0], target.start)
+    target_positions, target_rotations = target.at(times)
+    return SimulationResult(
+        config, mechanism, target, reference, times, records, positions, rotations, target_positions, target_rotations,
+        done / config.rate / took,
+    )  # fmt: skip
+
+
+def _filterpy_legs(parameters: Record) -> LegFusion:
+    from controller.filterpy_fusion import FilterpyLeg
+
+    legs = [
+        FilterpyLeg(
+            up_in_joint=parameters["up_in_joint"][k],
+            imu_position=parameters["leg_imu_position"][k],
+            gravity=float(parameters["gravity"]),
+            period=float(parameters["period"]),
+            jerk=float(parameters["leg_jerk"]),
+            bias_walk=float(parameters["bias_walk"]),
+            rate_variance=float(parameters["gyroscope_variance"]),
+            force_variance=float(parameters["leg_force_variance"]),
+        )
+        for k in range(LEGS)
+    ]
+
+    def fuse(state: Record, measurement: Array) -> None:
+        for k, leg in enumerate(legs):
+            if not parameters["leg_used"][k]:
+                continue
+            rate, force = measurement[GYROSCOPE, k], measurement[ACCELEROMETER, k]
+            if state["cycle"] == 0:
+                start_leg(state["leg_x"][k], state["leg_covariance"][k], rate, force, leg.up_in_joint, float(parameters["bias_sigma"]))
+                leg.start(state["leg_x"][k], state["leg_covariance"][k])
+                leg.update(rate, force)
+            else:
+                leg.step(rate, force)
+            state["leg_x"][k], state["leg_covariance"][k] = leg.state, leg.covariance
+        point_legs(parameters, state)
+
+    return fuse
+
+
+def _errors(first: tuple[Array, Array], second: tuple[Array, Array]) -> dict[str, float]:
+    distances = np.linalg.norm(first[0] - second[0], axis=1)
+    angles = rotation_angle(first[1], second[1])
+    return {
+        "position_rms": float(np.sqrt(np.mean(distances**2))),
+        "rotation_rms": float(np.sqrt(np.mean(angles**2))),
+        "position_max": float(distances.max()),
+        "rotation_max": float(angles.max()),
+    }
