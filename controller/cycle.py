@@ -12,15 +12,14 @@ import numpy as np
 
 from controller.direct_kinematics import joint_plane, pose_from_legs, pose_from_vector, refine
 from controller.inverse_kinematics import jacobian_at, legs_at, sample_workspace
-from controller.leg_filter import leg_direction, predict_leg, start_leg, update_leg
 from controller.least_squares import RANK_TOLERANCE, solve_least_squares
+from controller.leg_filter import leg_direction, predict_leg, start_leg, update_leg
 from controller.pid import step_pid
 from controller.platform_filter import start_platform, step_platform
 from controller.reference import evaluate_reference
 from controller.settings import ControlSettings, FusionSettings
-from plant.compiled import kernel
+from plant.compiled import Record, kernel
 from plant.errors import InputError
-from plant.fmu import Record
 from plant.imu import ACCELEROMETER, GYROSCOPE, STANDARD_GRAVITY
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array
@@ -183,8 +182,7 @@ def cycle_parameters(
         "moving_mass": sliding_mass + mass / LEGS,
         "mass": mass,
         "first_moment": (
-            plant["platform.mass"] * plant["platform.center_of_mass"]
-            + plant["payload.mass"] * plant["payload.center_of_mass"]
+            plant["platform.mass"] * plant["platform.center_of_mass"] + plant["payload.mass"] * plant["payload.center_of_mass"]
         ),
         "lower_moment": plant["leg.lower.mass"] * plant["leg.lower.center"],
         "rod_mass": plant["leg.upper.mass"],
@@ -324,7 +322,8 @@ def fuse_platform(parameters: Record, state: Record, measurement: Array) -> None
 @kernel
 def find_pose(parameters: Record, state: Record) -> float:
     """The pose in closed form from the leg directions, and the vertical if the platform has an IMU; returns the
-    conditioning."""
+    conditioning.
+    """
     p, s = parameters[()], state[()]
     if p.platform_used != 0:
         s.conditioning = pose_from_vector(
@@ -384,9 +383,7 @@ def regulate(parameters: Record, state: Record) -> None:
             s.previous_error[k] = s.error[k]
         return
     feed_load_forward(parameters, state)
-    step_pid(
-        s.error, s.feed_forward, p.gains, p.command_limit, p.period, s.integral, s.previous_error, s.derivative, s.command
-    )
+    step_pid(s.error, s.feed_forward, p.gains, p.command_limit, p.period, s.integral, s.previous_error, s.derivative, s.command)
 
 
 @kernel

@@ -74,7 +74,8 @@ class Solution:
 @dataclass(frozen=True, eq=False)
 class JointPlane:
     """The plane of the platform joints: `center` (3,) and `axes` (3, 3), whose columns span it and end with its normal;
-    `flatness` is the joints' distance from it relative to their spread."""
+    `flatness` is the joints' distance from it relative to their spread.
+    """
 
     center: Array
     axes: Array
@@ -225,7 +226,9 @@ def _checked_directions(leg_directions: ArrayLike) -> tuple[Array, Array]:
             raise InputError(f"leg_directions[{leg}] is partly NaN; a leg that is not measured has a row of NaN")
         norm = np.linalg.norm(row)
         if abs(norm - 1.0) > UNIT_TOLERANCE:
-            raise InputError(f"leg_directions[{leg}] has length {norm:.6g}; it must be 1 within {UNIT_TOLERANCE:g}: normalise it")
+            raise InputError(
+                f"leg_directions[{leg}] has length {norm:.6g}; it must be 1 within {UNIT_TOLERANCE:g}: normalise it"
+            )
         row /= norm
     return directions, measured
 
@@ -255,7 +258,11 @@ def rotation_between(from_vector: Array, to_vector: Array, rotation: Array) -> N
     f0, f1, f2 = from_vector[0], from_vector[1], from_vector[2]
     if flip:
         f0, f1, f2 = -f0, -f1, -f2
-    v0, v1, v2 = f1 * to_vector[2] - f2 * to_vector[1], f2 * to_vector[0] - f0 * to_vector[2], f0 * to_vector[1] - f1 * to_vector[0]
+    v0, v1, v2 = (
+        f1 * to_vector[2] - f2 * to_vector[1],
+        f2 * to_vector[0] - f0 * to_vector[2],
+        f0 * to_vector[1] - f1 * to_vector[0],
+    )
     cosine = f0 * to_vector[0] + f1 * to_vector[1] + f2 * to_vector[2]
     k = 1.0 / (1.0 + cosine)
     rotation[0, 0], rotation[0, 1], rotation[0, 2] = cosine + k * v0 * v0, k * v0 * v1 - v2, k * v0 * v2 + v1

@@ -85,7 +85,8 @@ def solve_least_squares(matrix: Array, right: Array, solution: Array, norms: Arr
 @kernel
 def factor_cholesky(matrix: Array) -> bool:
     """Replace the lower triangle of a symmetric `matrix` (n, n) by its Cholesky factor; False if it is not positive
-    definite beyond rounding."""
+    definite beyond rounding.
+    """
     n = matrix.shape[0]
     for j in range(n):
         before = matrix[j, j]

@@ -75,13 +75,18 @@ class _Planner:
     def __init__(self, limits: Limits, lengths: Array) -> None:
         self._limits = limits
         self._inner = np.array([limits.acceleration, limits.jerk])
-        self._state = (lengths.tolist(), [0.0] * LEGS, [0.0] * LEGS)
+        self._state: tuple[list[float], ...] = (lengths.tolist(), [0.0] * LEGS, [0.0] * LEGS)
+        self._after = self._state
         self._otg = Ruckig(LEGS, SAMPLE_PERIOD_S)
         self._trajectory = Trajectory(LEGS)
         self._follow = _input(limits, ControlInterface.Position, PREVIEW_S)
         self._stop = _input(limits, ControlInterface.Velocity, None)
         self._stop.synchronization = Synchronization.No
-        self._plans: list[list[float]] = []
+        self._plans: list[tuple[float, ...]] = []
+        self._states: list[tuple[list[float], ...]] = []
+        # Within a sample period no leg goes further than this, so that inside it the plan need not be looked at.
+        near = limits.velocity * SAMPLE_PERIOD_S
+        self._reach = [(least + near, greatest - near) for least, greatest in limits.stroke.tolist()]
 
     def advance(self, positions: Array, rates: Array, accelerations: Array) -> None:
         """Plan towards a state (6,) each, and keep the first sample period of the plan."""
@@ -98,57 +103,35 @@ class _Planner:
                 raise PlanningError(f"ruckig finds no way to stop from lengths {self._state[0]}")
         for profile in self._trajectory.profiles[0]:
             brake = profile.brake
-            self._plans.append([*brake.t, *profile.t, *brake.p, *profile.p, *brake.v, *profile.v, *brake.a, *profile.a,
-                                *brake.j, *profile.j])  # fmt: skip
-        self._state = self._trajectory.at_time(SAMPLE_PERIOD_S)[:3]
+            self._plans.append((*brake.t, *profile.t, *brake.j, *profile.j))
+        self._states.append(self._state)
+        self._state = self._after
 
     def _plan(self, parameters: InputParameter) -> bool:
         parameters.current_position, parameters.current_velocity, parameters.current_acceleration = self._state
         try:
-            return self._otg.calculate(parameters, self._trajectory) in (Result.Working, Result.Finished)
+            found = self._otg.calculate(parameters, self._trajectory) in (Result.Working, Result.Finished)
         except RuckigError:
             return False
+        self._after = self._trajectory.at_time(SAMPLE_PERIOD_S)[:3]
+        return found
 
     def _can_stop_after(self) -> bool:
-        reach = self._limits.velocity * SAMPLE_PERIOD_S
-        now = np.array(self._state[0])
-        stroke = self._limits.stroke
-        if (now - reach < stroke[:, 0]).any() or (now + reach > stroke[:, 1]).any():
-            for extrema, (least, greatest) in zip(self._trajectory.position_extrema, stroke, strict=True):
-                if extrema.min < least - _SLACK or extrema.max > greatest + _SLACK:
+        """Whether the first sample period of the plan, and a stop after it, stay inside the stroke."""
+        after = np.array(self._after)
+        if _near_end(self._state[0], self._reach):
+            for extrema, (least, greatest) in zip(self._trajectory.position_extrema, self._limits.stroke, strict=True):
+                if extrema.min < least or extrema.max > greatest:
                     return False
-        after = np.array(self._trajectory.at_time(SAMPLE_PERIOD_S)[:3])
-        return bool(_stops_inside(after, stroke, self._inner))
+        return bool(_stops_inside(after, self._limits.stroke, self._inner))
 
     def segments(self) -> Array:
         """All segments so far, (6, n, 5)."""
-        plans = np.array(self._plans).reshape(-1, LEGS, 2 * _SEGMENTS + 3 * (_SEGMENTS + 1) - 0)
-        durations = plans[..., :_SEGMENTS]
-        position, rate, acceleration = (
-            plans[..., _SEGMENTS + i * (_SEGMENTS + 1) :][..., :_SEGMENTS] for i in range(3)
-        )
-        jerk = plans[..., -_SEGMENTS:]
-        starts = np.cumsum(durations, axis=-1) - durations
-        kept = (durations > 0.0) & (starts < SAMPLE_PERIOD_S - 1e-12)
-        # A plan that ends within the sample, or does not move at all, rests in its last state.
-        ends = starts[..., -1] + durations[..., -1]
-        resting = ends < SAMPLE_PERIOD_S - 1e-12
-        offsets = (np.arange(len(plans)) * SAMPLE_PERIOD_S)[:, None]
-        legs = []
-        for k in range(LEGS):
-            rows = np.stack([starts[:, k] + offsets, position[:, k], rate[:, k], acceleration[:, k], jerk[:, k]], axis=-1)
-            last = plans[:, k]
-            rest = np.zeros((len(plans), 1, 5))
-            rest[:, 0, 0] = ends[:, k] + offsets[:, 0]
-            rest[:, 0, 1] = last[:, 2 * _SEGMENTS]
-            rest[:, 0, 2] = last[:, 3 * _SEGMENTS + 1]
-            keep = np.concatenate([kept[:, k], resting[:, k, None]], axis=1)
-            legs.append(np.concatenate([rows, rest], axis=1)[keep])
-        segments = np.zeros((LEGS, max(len(leg) for leg in legs), 5))
+        plans = np.array(self._plans).reshape(-1, LEGS, 2, _SEGMENTS)
+        segments = np.zeros((LEGS, len(plans) * (_SEGMENTS + 1), 5))
         segments[:, :, 0] = np.inf
-        for k, leg in enumerate(legs):
-            segments[k, : len(leg)] = leg
-        return segments
+        longest = _collect_segments(plans, np.array(self._states), SAMPLE_PERIOD_S, segments)
+        return segments[:, :longest].copy()
 
 
 def _input(limits: Limits, interface: ControlInterface, minimum_duration: float | None) -> InputParameter:
@@ -215,6 +198,43 @@ def _spline(knots: Array, values: Array, times: Array) -> Array:
     before, after = second[index], second[index + 1]
     rate = slopes[index] - step * (2.0 * before + after) / 6.0
     return values[index] + t * (rate + t * (before / 2.0 + t * (after - before) / (6.0 * step)))
+
+
+def _near_end(lengths: list[float], reach: list[tuple[float, float]]) -> bool:
+    return any(not least < length < greatest for length, (least, greatest) in zip(lengths, reach, strict=True))
+
+
+@kernel
+def _collect_segments(plans: Array, states: Array, period: float, segments: Array) -> int:
+    """Write the segments of the first `period` [s] of each plan, and return how many the longest row has.
+
+    Args:
+        plans: (n, 6, 2, 9), durations and jerks.
+        states: (n, 3, 6), from which the plans start.
+        segments: (6, m, 5), written.
+    """
+    longest = 0
+    for leg in range(plans.shape[1]):
+        row = 0
+        for i in range(plans.shape[0]):
+            durations, jerks = plans[i, leg, 0], plans[i, leg, 1]
+            p, v, a = states[i, 0, leg], states[i, 1, leg], states[i, 2, leg]
+            start = 0.0
+            for k in range(durations.shape[0] + 1):
+                # A plan that ends within the period rests in its last state.
+                last = k == durations.shape[0]
+                t = period if last else durations[k]
+                if t > 0.0 and start < period - 1e-12:
+                    j = 0.0 if last else jerks[k]
+                    segments[leg, row, 0] = i * period + start
+                    segments[leg, row, 1], segments[leg, row, 2], segments[leg, row, 3], segments[leg, row, 4] = p, v, a, j
+                    row += 1
+                    p += t * (v + t * (a / 2.0 + t * j / 6.0))
+                    v += t * (a + t * j / 2.0)
+                    a += t * j
+                    start += t
+        longest = max(longest, row)
+    return longest
 
 
 @kernel

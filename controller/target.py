@@ -8,7 +8,15 @@ import numpy as np
 
 from plant.errors import InputError, UnknownNameError
 from plant.mechanism import Mechanism
-from plant.pose import UNIT_TOLERANCE, Array, Pose, checked_unit, quaternion_from_rotation, rotation_from_vector, rotations_from_quaternions
+from plant.pose import (
+    UNIT_TOLERANCE,
+    Array,
+    Pose,
+    checked_unit,
+    quaternion_from_rotation,
+    rotation_from_vector,
+    rotations_from_quaternions,
+)
 
 COLUMNS = ("time_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 SAMPLE_PERIOD_S = 0.01
@@ -44,7 +52,8 @@ class Target:
 
     def at(self, times: Array) -> tuple[Array, Array]:
         """Positions (M, 3) and rotations (M, 3, 3) at times (M,) [s], interpolated (linearly, and along the shortest
-        turn); before the first and after the last sample these stand."""
+        turn); before the first and after the last sample these stand.
+        """
         if self.held:
             index = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 1)
             return self.positions[index], self.rotations[index]
@@ -98,7 +107,9 @@ def _read_csv(path: Path, mechanism: Mechanism) -> Target:
             raise InputError(f"{path}, line {number}: time {row[0]:g} s does not come after {rows[-1][0]:g} s")
         norm = float(np.linalg.norm(row[4:]))
         if abs(norm - 1.0) > UNIT_TOLERANCE:
-            raise InputError(f"{path}, line {number}: the quaternion has length {norm:.6g}, off unit by more than {UNIT_TOLERANCE:g}")
+            raise InputError(
+                f"{path}, line {number}: the quaternion has length {norm:.6g}, off unit by more than {UNIT_TOLERANCE:g}"
+            )
         rows.append(row)
     if len(rows) < 2:
         raise InputError(f"{path} has {len(rows)} samples; a motion needs at least 2")

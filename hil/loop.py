@@ -9,11 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import types
-from numpy.typing import NDArray
 
 from controller.cycle import OK, control, cycle
-from plant.compiled import kernel
-from plant.fmu import CALLS, Record, advance, read_imus, read_truth, write_command, write_drive_mode
+from plant.compiled import Record, kernel
+from plant.fmu import CALLS, advance, read_imus, read_truth, write_command, write_drive_mode
 from plant.imu import measure
 from plant.mechanism import LEGS
 from plant.pose import Array
@@ -61,7 +60,7 @@ class Loop:
     parameters: Record
     state: Record
     segments: Array
-    records: NDArray[np.void]
+    records: Record
 
     def __post_init__(self) -> None:
         self._measurement = np.zeros((3, IMU_COUNT, 3))

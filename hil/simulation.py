@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from controller.cycle import ALL_IMUS, NOT_FINITE, OK, POSE_LOST, STATE, cycle_parameters, point_legs
 from controller.direct_kinematics import poses_from_lengths
@@ -17,9 +16,10 @@ from controller.planner import Reference, plan
 from controller.settings import control_settings, fusion_settings
 from controller.target import Target, load_target
 from hil.loop import CYCLE_RECORD, PLANT_FAILED, LegFusion, Loop
+from plant.compiled import Record
 from plant.errors import GoughError, InputError, UnknownNameError
 from plant.export import default_fmu
-from plant.fmu import RATE_RANGE_HZ, FmuPlant, Record
+from plant.fmu import RATE_RANGE_HZ, FmuPlant
 from plant.imu import ACCELEROMETER, GYROSCOPE, imu_state, load_imu
 from plant.mechanism import LEGS, Mechanism, load_mechanism
 from plant.pose import Array, rotation_angle, rotations_from_quaternions
@@ -56,7 +56,9 @@ class SimulationConfig:
 
     def __post_init__(self) -> None:
         if not RATE_RANGE_HZ[0] <= self.rate <= RATE_RANGE_HZ[1]:
-            raise InputError(f"the rate is {self.rate:g} Hz; it must lie between {RATE_RANGE_HZ[0]:g} and {RATE_RANGE_HZ[1]:g} Hz")
+            raise InputError(
+                f"the rate is {self.rate:g} Hz; it must lie between {RATE_RANGE_HZ[0]:g} and {RATE_RANGE_HZ[1]:g} Hz"
+            )
         if self.fusion not in FUSIONS:
             raise UnknownNameError(f"no fusion {self.fusion!r}; there are {', '.join(FUSIONS)}")
 
@@ -88,7 +90,7 @@ class SimulationResult:
     target: Target
     reference: Reference
     times: Array
-    records: NDArray[np.void]
+    records: Record
     reference_positions: Array
     reference_rotations: Array
     target_positions: Array
@@ -227,7 +229,9 @@ def _filterpy_legs(parameters: Record) -> LegFusion:
                 continue
             rate, force = measurement[GYROSCOPE, k], measurement[ACCELEROMETER, k]
             if state["cycle"] == 0:
-                start_leg(state["leg_x"][k], state["leg_covariance"][k], rate, force, leg.up_in_joint, float(parameters["bias_sigma"]))
+                start_leg(
+                    state["leg_x"][k], state["leg_covariance"][k], rate, force, leg.up_in_joint, float(parameters["bias_sigma"])
+                )
                 leg.start(state["leg_x"][k], state["leg_covariance"][k])
                 leg.update(rate, force)
             else:

@@ -16,8 +16,12 @@ from typing import Any, TypeVar
 
 import numba
 from numba.core import config as numba_config
+from numpy.typing import NDArray
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+Record = NDArray[Any]
+"""A structured array of shape () or (N,); compiled code reads its fields as attributes of `record[()]`."""
 
 PACKAGES = ("plant", "controller", "hil")
 STALE_AFTER_S = 30 * 24 * 3600.0

@@ -17,8 +17,8 @@ from math import pi
 
 import casadi as ca
 
-from plant.variables import BRAKE, IMU_COUNT, INPUTS, OPEN, OUTPUTS, PARAMETERS, STATES, VELOCITY, Variable
 from plant.mechanism import LEGS
+from plant.variables import BRAKE, IMU_COUNT, INPUTS, OPEN, OUTPUTS, PARAMETERS, STATES, VELOCITY, Variable
 
 SX = ca.SX
 
@@ -148,8 +148,10 @@ def _leg(s: SX, velocity: SX, arm: SX, bias: SX, e1: SX, c: dict[str, SX]) -> _L
     Sliding with the mass m, swinging with the transverse inertia I(l), and turning about its axis with the rate
     `w = kappa q`, kappa = k / (l^3 - l k^2), q = (e1 x s) . s', which the universal joint imposes.
     """
-    length = ca.norm_2(s)
-    inverse = 1 / length
+    # One square root and no division: CasADi would turn every product with 1 / l into a division of its own.
+    square = ca.dot(s, s)
+    inverse = ca.sqrt(1 / square)
+    length = square * inverse
     n = s * inverse
     speed = ca.dot(n, velocity)
     across = velocity - speed * n
@@ -162,11 +164,9 @@ def _leg(s: SX, velocity: SX, arm: SX, bias: SX, e1: SX, c: dict[str, SX]) -> _L
     gravity_along = ca.dot(c["gravity"], n)
 
     k = ca.dot(e1, s)
-    inverse_cubic = 1 / (length * (length**2 - k**2))
+    inverse_cubic = inverse / (square - k**2)
     kappa = k * inverse_cubic
-    kappa_gradient = inverse_cubic**2 * (
-        length * (length**2 + k**2) * e1 - k * (3 * length**2 - k**2) * n
-    )  # fmt: skip
+    kappa_gradient = inverse_cubic**2 * (length * (square + k**2) * e1 - k * (3 * square - k**2) * n)
     turned = ca.cross(e1, s)
     q = ca.dot(turned, velocity)
     kappa_rate = ca.dot(kappa_gradient, velocity)
@@ -223,7 +223,8 @@ def _stop_force(length: SX, speed: SX, c: dict[str, SX], k: int) -> SX:
 
 def _brake_rate(deflection: SX, speed: SX, closed: SX, c: dict[str, SX]) -> SX:
     """Elasto-plastic bristle (Dupont, Hayward, Armstrong, Altpeter 2002): purely elastic below 70 % of the slipping
-    force, so that a closed brake holds without creep."""
+    force, so that a closed brake holds without creep.
+    """
     load = ca.fabs(deflection) / c["brake_slip"]
     share = ca.fmin(ca.fmax((load - 0.7) / 0.3, 0), 1)
     slipping = ca.if_else(deflection * speed > 0, share * share * (3 - 2 * share), 0)
@@ -231,24 +232,20 @@ def _brake_rate(deflection: SX, speed: SX, closed: SX, c: dict[str, SX]) -> SX:
 
 
 def _solve(matrix: SX, right: SX) -> SX:
-    """Solve a symmetric positive definite system by LDL^T, unrolled; only the lower triangle is read."""
+    """Solve a symmetric positive definite system by Cholesky's method, unrolled; only the lower triangle is read."""
     n = right.shape[0]
     lower = SX.zeros(n, n)
-    pivots: list[SX] = []
     inverses: list[SX] = []
     for j in range(n):
-        scaled = [lower[j, k] * pivots[k] for k in range(j)]
-        column = [matrix[i, j] - sum(lower[i, k] * scaled[k] for k in range(j)) for i in range(j, n)]
-        pivots.append(column[0])
-        inverses.append(1 / column[0])
+        column = [matrix[i, j] - sum(lower[i, k] * lower[j, k] for k in range(j)) for i in range(j, n)]
+        inverses.append(ca.sqrt(1 / column[0]))
         for i in range(j + 1, n):
             lower[i, j] = column[i - j] * inverses[j]
     z = [SX(0)] * n
     for i in range(n):
-        z[i] = right[i] - sum(lower[i, k] * z[k] for k in range(i))
-    z = [z[i] * inverses[i] for i in range(n)]
+        z[i] = (right[i] - sum(lower[i, k] * z[k] for k in range(i))) * inverses[i]
     for i in reversed(range(n)):
-        z[i] = z[i] - sum(lower[k, i] * z[k] for k in range(i + 1, n))
+        z[i] = (z[i] - sum(lower[k, i] * z[k] for k in range(i + 1, n))) * inverses[i]
     return ca.vertcat(*z)
 
 
@@ -264,7 +261,9 @@ def _plant(x: dict[str, SX], u: dict[str, SX], c: dict[str, SX]) -> tuple[SX, SX
     mode = u["drive_mode"]
     closed, driven = mode == BRAKE, mode == VELOCITY
     motor = c["force_constant"] * current
-    friction = c["friction.viscous"] * speeds + c["friction.coulomb"] * ca.tanh(speeds / c["friction.velocity"])
+    friction = c["friction.viscous"] * speeds + c["friction.coulomb"] * speeds / ca.sqrt(
+        speeds**2 + c["friction.velocity"] ** 2
+    )
     brake = -closed * (c["brake.stiffness"] * x["state.brake_deflection"] + c["brake.damping"] * speeds)
     stop = _stack([_stop_force(leg.length, leg.speed, c, k) for k, leg in enumerate(legs)])
     axial = motor - friction + brake + stop
@@ -327,9 +326,7 @@ def _plant(x: dict[str, SX], u: dict[str, SX], c: dict[str, SX]) -> tuple[SX, SX
             + ca.dot(omega, inertia @ omega) / 2
             + sum(leg.kinetic for leg in legs)
         ),
-        "potential_energy": (
-            -ca.dot(gravity, c["mass"] * x["state.position"] + moment) + sum(leg.potential for leg in legs)
-        ),
+        "potential_energy": (-ca.dot(gravity, c["mass"] * x["state.position"] + moment) + sum(leg.potential for leg in legs)),
         "power.drive": ca.dot(motor, speeds),
         "power.friction": -ca.dot(friction, speeds),
         "power.brake": ca.dot(brake, speeds),

@@ -242,7 +242,9 @@ def _model_description(starts: dict[str, Array], token: str, dependencies: dict[
     units = []
     for name, exponents in sorted(_UNITS.items()):
         attributes = " ".join(f'{base}="{exponent}"' for base, exponent in exponents.items())
-        units.append(f'<Unit name="{name}"><BaseUnit {attributes}/></Unit>' if exponents else f'<Unit name="{name}"><BaseUnit/></Unit>')
+        units.append(
+            f'<Unit name="{name}"><BaseUnit {attributes}/></Unit>' if exponents else f'<Unit name="{name}"><BaseUnit/></Unit>'
+        )
     items = "".join(f'<Item name="{name}" value="{value}"/>' for value, name in DRIVE_MODES.items())
     outputs = []
     unknowns = []

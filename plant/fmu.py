@@ -21,12 +21,10 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import ArrayLike, NDArray
 
-from plant.compiled import kernel
+from plant.compiled import Record, kernel
 from plant.errors import FmuError, InputError, UnknownNameError
 from plant.pose import Array
 from plant.variables import BY_NAME, IMU_COUNT, Variable
-
-Record = NDArray[np.void]
 
 _IMU_OUTPUTS = ("imu_angular_velocity", "imu_specific_force", "imu_magnetic_field")
 _TRUTH_OUTPUTS = ("position", "quaternion", "leg_length", "current")

@@ -10,9 +10,8 @@ from math import inf, pi, radians, sqrt
 
 import numpy as np
 
-from plant.compiled import kernel
+from plant.compiled import Record, kernel
 from plant.errors import InputError, UnknownNameError
-from plant.fmu import Record
 from plant.pose import Array, rotation_from_vector
 from plant.variables import IMU_COUNT
 
@@ -176,9 +175,7 @@ def imu_state(model: ImuModel, seed: int, period: float) -> Record:
         raise InputError(f"the seed is {seed}; it must lie between 0 and 2^63 - 1")
     state: Record = np.zeros((), IMU_STATE)
     random = np.random.default_rng([seed, IMU_COUNT])
-    alignments = [
-        rotation_from_vector(random.uniform(-model.misalignment, model.misalignment, 3)) for _ in range(IMU_COUNT)
-    ]
+    alignments = [rotation_from_vector(random.uniform(-model.misalignment, model.misalignment, 3)) for _ in range(IMU_COUNT)]
     for kind, sensor in enumerate((model.gyroscope, model.accelerometer, model.magnetometer)):
         for imu in range(IMU_COUNT):
             gain, offset = _constant_errors(sensor, random)

@@ -147,7 +147,8 @@ class Mechanism:
     @property
     def joint_rotations(self) -> Array:
         """(6, 3, 3): the rotation of each joint frame to {1}; x is the joint's first axis, z the home direction made
-        perpendicular to it. A leg's frame is `joint_rotation @ Rx(a) @ Ry(b)` with the leg along its z axis."""
+        perpendicular to it. A leg's frame is `joint_rotation @ Rx(a) @ Ry(b)` with the leg along its z axis.
+        """
         x = self.base_joint_axes
         z = self.home_directions - np.sum(self.home_directions * x, axis=1, keepdims=True) * x
         z = z / np.linalg.norm(z, axis=1, keepdims=True)
@@ -211,7 +212,9 @@ class Mechanism:
         missing = [variable.name for variable in PARAMETERS if variable.name not in values]
         if missing:
             raise InputError(f"the mechanism {self.name!r} lacks plant parameters: {', '.join(missing)}")
-        return {variable.name: checked_parameters({variable.name: values[variable.name]})[variable.name] for variable in PARAMETERS}
+        return {
+            variable.name: checked_parameters({variable.name: values[variable.name]})[variable.name] for variable in PARAMETERS
+        }
 
 
 def load_mechanism(name_or_path: str | Path) -> Mechanism:

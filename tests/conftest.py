@@ -1,0 +1,29 @@
+"""Fixtures that all rooms share."""
+
+from pathlib import Path
+
+import pytest
+
+from plant.export import default_fmu
+from plant.mechanism import Mechanism, load_mechanism
+
+SHARED_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def hexapod() -> Mechanism:
+    return load_mechanism("hexapod")
+
+
+@pytest.fixture(scope="session")
+def fmu_path() -> Path:
+    return default_fmu()
+
+
+@pytest.fixture(scope="session")
+def motion_capture() -> Path:
+    """A real motion, which lies beside the project and is not part of it."""
+    path = SHARED_DATA / "targets" / "motion_capture.csv"
+    if not path.exists():
+        pytest.skip("the motion capture data is not here")
+    return path
