@@ -118,8 +118,8 @@ STATE = np.dtype(
 )
 """State of the cycle: filters, pose, controllers, and what the last cycle found.
 
-`twist` is velocity and angular velocity in {1}; `vertical` and `platform_rate` are seen in {2}; `information` is the inverse of the pose's
-covariance (lower triangle); `reference` holds length, rate and acceleration of each leg.
+`twist` is velocity and angular velocity in {1}; `vertical` and `platform_rate` are seen in {2}; `information` is the
+inverse of the pose's covariance (lower triangle); `reference` holds length, rate and acceleration of each leg.
 """
 
 
@@ -248,7 +248,8 @@ def control(parameters: Record, state: Record, measurement: Array, segments: Arr
     fuse_platform(parameters, state, measurement)
     if find_pose(parameters, state) < RANK_TOLERANCE or not refine_pose(parameters, state):
         return POSE_LOST
-    deviate(parameters, state, segments)
+    invert(parameters, state)
+    refer(parameters, state, segments)
     regulate(parameters, state)
     s = state[()]
     s.cycle += 1
@@ -335,7 +336,7 @@ def find_pose(parameters: Record, state: Record) -> float:
             p.base_joints, p.platform_joints, s.directions, p.leg_used, p.plane_center, p.plane_axes, s.position, s.rotation,
             s.matrix_12_9, s.right_12, s.unknowns_9, s.vectors_9[0], s.vectors_9[1],
         )  # fmt: skip
-    return s.conditioning
+    return float(s.conditioning)
 
 
 @kernel
@@ -343,7 +344,7 @@ def refine_pose(parameters: Record, state: Record) -> bool:
     """Two Gauss-Newton steps for the pose; the twist comes with them, and the acceleration is its derivative."""
     p, s = parameters[()], state[()]
     measured_rate = s.angular_velocity
-    for step in range(2):
+    for _ in range(2):
         for i in range(3):
             measured_rate[i] = 0.0
             for j in range(3):
@@ -363,20 +364,25 @@ def refine_pose(parameters: Record, state: Record) -> bool:
 
 
 @kernel
-def deviate(parameters: Record, state: Record, segments: Array) -> None:
-    """Inverse kinematics of the estimated pose, the reference of this cycle, and the length deviations."""
+def invert(parameters: Record, state: Record) -> None:
+    """Inverse kinematics of the estimated pose."""
     p, s = parameters[()], state[()]
     legs_at(p.base_joints, p.platform_joints, s.position, s.rotation, s.arms, s.predicted, s.lengths)
-    time = max(s.cycle - p.hold_cycles, 0) * p.period
-    evaluate_reference(segments, time, s.reference_index, s.reference)
-    for k in range(LEGS):
-        s.error[k] = s.reference[k, 0] - s.lengths[k]
+
+
+@kernel
+def refer(parameters: Record, state: Record, segments: Array) -> None:
+    """The reference of this cycle, whose time begins at the end of the hold."""
+    p, s = parameters[()], state[()]
+    evaluate_reference(segments, max(s.cycle - p.hold_cycles, 0) * p.period, s.reference_index, s.reference)
 
 
 @kernel
 def regulate(parameters: Record, state: Record) -> None:
-    """The six commands: nothing during the hold, then feed-forward and PID."""
+    """The six commands from the length deviations: nothing during the hold, then feed-forward and PID."""
     p, s = parameters[()], state[()]
+    for k in range(LEGS):
+        s.error[k] = s.reference[k, 0] - s.lengths[k]
     if s.cycle < p.hold_cycles:
         for k in range(LEGS):
             s.command[k] = 0.0

@@ -128,8 +128,8 @@ def solve(
     known_rotation = None
     if rotation is not None:
         known_rotation = checked_rotation(rotation, "rotation")
-        level = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.8 else [0.0, 1.0, 0.0])
-        level /= np.linalg.norm(level)
+        across = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.8 else [0.0, 1.0, 0.0])
+        level: Array = across / np.linalg.norm(across)
         observed += [(up, known_rotation.T @ up, tilt_sigma), (level, known_rotation.T @ level, yaw_sigma)]
     if up_in_platform is not None:
         observed.append((up, checked_unit(up_in_platform, 3, "up_in_platform"), tilt_sigma))
@@ -173,9 +173,9 @@ def solve(
             "the pose that fits best has legs of negative length: the directions contradict each other, or point down the legs"
         )
     normal_equations(*joints, directions, work.no_rates, weights, *vectors, work.no_rate, position, found, *work.equations)
-    information = work.information + np.tril(work.information, -1).T
+    covariance: Array = np.linalg.inv(work.information + np.tril(work.information, -1).T)
     residuals = np.where(measured[:, None] > 0.0, directions - work.predicted, np.nan)
-    return Solution(position, found, np.linalg.inv(information), residuals, method, conditioning)
+    return Solution(position, found, covariance, residuals, method, conditioning)
 
 
 def pose_from_lengths(mechanism: Mechanism, lengths: ArrayLike, guess: Pose | None = None) -> Pose:

@@ -79,7 +79,7 @@ def solve_least_squares(matrix: Array, right: Array, solution: Array, norms: Arr
         norms[k] = value / matrix[k, k]
     for k in range(n):
         solution[int(order[k])] = norms[k]
-    return abs(matrix[n - 1, n - 1] / matrix[0, 0])
+    return float(abs(matrix[n - 1, n - 1] / matrix[0, 0]))
 
 
 @kernel

@@ -13,6 +13,10 @@ STATES = 6
 TILT_SIGMA = 0.15
 """What is known of the vertical after the first sample [rad]."""
 
+INNOVATION_LIMIT = 3.0
+"""Innovations are cut to this many standard deviations: a jolt between two samples, as when the brakes open, is in the
+accelerometer's reading but not in the acceleration known from the legs."""
+
 
 @kernel
 def start_platform(x: Array, covariance: Array, accelerometer: Array, bias_sigma: float) -> None:
@@ -80,7 +84,10 @@ def step_platform(
         covariance[3 + i, 3 + i] += bias_walk * t
     for m in range(3):
         innovation = (accelerometer[m] - acceleration[m]) / gravity - x[m] - change[m]
-        inverse = 1.0 / (covariance[m, m] + vertical_variance)
+        variance = covariance[m, m] + vertical_variance
+        bound = INNOVATION_LIMIT * np.sqrt(variance)
+        innovation = min(max(innovation, -bound), bound)
+        inverse = 1.0 / variance
         for i in range(STATES):
             gain[i] = covariance[i, m]
         for i in range(STATES):

@@ -91,7 +91,7 @@ def _read_csv(path: Path, mechanism: Mechanism) -> Target:
     header = [name.strip() for name in lines[0].split(",")] if lines else []
     if header != list(COLUMNS):
         raise InputError(f"{path}, line 1: the header must be {','.join(COLUMNS)}")
-    rows = []
+    rows: list[list[float]] = []
     for number, line in enumerate(lines[1:], start=2):
         if not line.strip():
             continue
@@ -108,7 +108,7 @@ def _read_csv(path: Path, mechanism: Mechanism) -> Target:
         norm = float(np.linalg.norm(row[4:]))
         if abs(norm - 1.0) > UNIT_TOLERANCE:
             raise InputError(
-                f"{path}, line {number}: the quaternion has length {norm:.6g}, off unit by more than {UNIT_TOLERANCE:g}"
+                f"{path}, line {number}: the quaternion has length {norm:.6g}; it must be 1 within {UNIT_TOLERANCE:g}"
             )
         rows.append(row)
     if len(rows) < 2:

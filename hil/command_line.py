@@ -1,0 +1,270 @@
+"""The command `gough`."""
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NoReturn
+
+from plant.errors import GoughError, InputError
+
+REFUSED, INTERRUPTED = 2, 130
+"""Exit statuses beside 0, and 1 for a run that ended before its time: bad input, with nothing done; Ctrl-C."""
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(REFUSED, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line and return its exit status."""
+    options = _parser().parse_args(arguments)
+    try:
+        status: int = options.run(options)
+    except GoughError as error:
+        print(f"gough: {error}", file=sys.stderr)
+        return getattr(error, "exit_status", REFUSED)
+    except KeyboardInterrupt:
+        print("gough: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    return status
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="gough", description="Pose control of parallel mechanisms from orientations.")
+    parser.add_argument("--version", action="version", version=f"gough {version('gough')}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
+    _add_simulate(commands)
+    _add_tune(commands)
+    _add_fmu(commands)
+    _add_bench(commands)
+    return parser
+
+
+def _add_simulate(commands: Any) -> None:
+    command = commands.add_parser(
+        "simulate",
+        help="follow a target on the FMU plant, as fast as it goes",
+        description="Simulate the closed loop: a mechanism follows a target motion on its FMU plant.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("--mechanism", default="hexapod", help="preset, or a TOML file")
+    command.add_argument(
+        "--target",
+        default="circle",
+        help="hold, circle, sines, steps, or a CSV file of displacements from home (time_s,x_m,y_m,z_m,qw,qx,qy,qz)",
+    )
+    command.add_argument("--duration", type=float, default=10.0, help="of the motion [s]")
+    command.add_argument("--rate", type=float, default=1000.0, help="cycles per second [Hz], 50 to 4000")
+    command.add_argument("--imu", default="mpu9150-calibrated", help="ideal, mpu9150, mpu9150-calibrated or icm42688")
+    command.add_argument("--imus", type=_imus, default="all", help="which IMUs there are: all, legs, or a list such as 0,2,4,6")
+    command.add_argument("--seed", type=int, default=0, help="of the IMUs' imperfections")
+    command.add_argument("--fusion", default="compiled", help="compiled, or filterpy for the reference leg filters (slow)")
+    command.add_argument("--plant", metavar="FILE.fmu", help="FMI 3.0 Co-Simulation FMU to use instead of the built one")
+    command.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots and a moving 3-D view")
+    _add_json(command)
+    command.set_defaults(run=_simulate)
+
+
+def _add_tune(commands: Any) -> None:
+    command = commands.add_parser(
+        "tune",
+        help="design the PID gains and show the margins",
+        description="Design the gains from the linearised plant and filters, and print them with their margins.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("--mechanism", default="hexapod", help="preset, or a TOML file")
+    command.add_argument("--rate", type=float, default=1000.0, help="cycles per second [Hz]")
+    _add_json(command)
+    command.set_defaults(run=_tune)
+
+
+def _add_fmu(commands: Any) -> None:
+    command = commands.add_parser("fmu", help="the plant as an FMU", description="The plant as an FMU.")
+    actions = command.add_subparsers(required=True, metavar="ACTION", parser_class=_Parser)
+    build = actions.add_parser(
+        "build", help="write the plant's FMU", description="Write the plant as an FMI 3.0 Co-Simulation FMU."
+    )
+    build.add_argument("--output", type=Path, metavar="FILE.fmu", help="default: fmus/gough_plant.fmu in a checkout, else here")
+    build.set_defaults(run=_build_fmu)
+
+
+def _add_bench(commands: Any) -> None:
+    command = commands.add_parser(
+        "bench",
+        help="measure speed",
+        description="Measure the loop's speed against real time, and the microseconds of each stage.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("--duration", type=float, default=60.0, help="of the simulated motion [s]")
+    command.add_argument("--target", default="sines", help="motion or CSV file")
+    _add_json(command)
+    command.set_defaults(run=_bench)
+
+
+def _add_json(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--json", type=Path, metavar="FILE", help="write the figures in SI units")
+
+
+def _imus(text: str) -> tuple[int, ...]:
+    named = {"all": (0, 1, 2, 3, 4, 5, 6), "legs": (0, 1, 2, 3, 4, 5)}
+    if text in named:
+        return named[text]
+    try:
+        return tuple(sorted({int(part) for part in text.split(",")}))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither all, legs, nor a list of numbers such as 0,2,4,6") from None
+
+
+def _simulate(options: argparse.Namespace) -> int:
+    from hil.simulation import SimulationConfig, SimulationStoppedError, simulate
+
+    for path in (options.json, options.report):
+        _check_writable(path)
+    names = ("mechanism", "target", "duration", "rate", "imu", "seed", "fusion", "plant", "imus")
+    config = SimulationConfig(**{name: getattr(options, name) for name in names})
+    stopped = None
+    with _progress(f"{config.mechanism} follows {config.target}") as progress:
+        try:
+            result = simulate(config, progress)
+        except SimulationStoppedError as error:
+            stopped, result = error, error.result
+    if stopped is None or result.moved:
+        _write_json(options.json, result.summary())
+        if options.report:
+            from hil.report import write_report
+
+            write_report(result, options.report)
+        _print_simulation(result.summary())
+    if stopped:
+        raise stopped
+    return 0
+
+
+def _print_simulation(summary: dict[str, Any]) -> None:
+    table = _table("", "position RMS [mm]", "max [mm]", "rotation RMS [deg]", "max [deg]")
+    for label, group, prefix in (
+        ("estimate - truth", "estimation", ""),
+        ("truth - reference", "tracking", ""),
+        ("truth - target", "target", ""),
+        ("reference - target", "target", "reference_"),
+    ):
+        errors = summary[group]
+        table.add_row(
+            label,
+            *(f"{1e3 * errors[f'{prefix}position_{kind}']:.4f}" for kind in ("rms", "max")),
+            *(f"{57.29577951308232 * errors[f'{prefix}rotation_{kind}']:.4f}" for kind in ("rms", "max")),
+        )
+    _print(table)
+    cycle = summary["cycle_us"]
+    print(
+        f"limits violated by the reference: {summary['limits']['violations']}; "
+        f"{summary['real_time_factor']:.1f} times real time; cycle p50/p99/p99.9 {cycle['p50']:.1f}/{cycle['p99']:.1f}/{cycle['p999']:.1f} us"
+    )
+
+
+def _tune(options: argparse.Namespace) -> int:
+    from controller.tuning import tune
+    from plant.mechanism import load_mechanism
+
+    _check_writable(options.json)
+    design = tune(load_mechanism(options.mechanism), options.rate)
+    _write_json(options.json, design.summary())
+    table = _table("", "value", "unit")
+    for label, value, unit in design.rows():
+        table.add_row(label, value, unit)
+    _print(table)
+    return 0
+
+
+def _build_fmu(options: argparse.Namespace) -> int:
+    from plant.export import MODEL, build_in_subprocess
+
+    folder = Path("fmus") if Path("fmus/fmi3.c").is_file() else Path()
+    path = options.output or folder / f"{MODEL}.fmu"
+    build_in_subprocess(path)
+    print(path)
+    return 0
+
+
+def _bench(options: argparse.Namespace) -> int:
+    from hil.bench import measure_speed
+
+    _check_writable(options.json)
+    with _progress("bench") as progress:
+        figures = measure_speed(options.target, options.duration, progress)
+    _write_json(options.json, figures)
+    table = _table("stage", "p50 [us]", "p99 [us]", "p99.9 [us]")
+    for label, percentiles in (*figures["stages_us"].items(), ("whole cycle", figures["cycle_us"])):
+        table.add_row(label, *(f"{percentiles[key]:.2f}" for key in ("p50", "p99", "p999")))
+    _print(table)
+    factor = figures["real_time_factor"]
+    print(
+        f"{factor['median']:.1f} times real time ({factor['least']:.1f} to {factor['greatest']:.1f}); "
+        f"with filterpy {figures['filterpy_real_time_factor']:.2f}, {figures['filterpy_slowdown']:.0f} times slower"
+    )
+    print(f"{figures['machine']}, {figures['date']}, gough {figures['version']}")
+    return 0
+
+
+def _table(*columns: str) -> Any:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for i, column in enumerate(columns):
+        table.add_column(column, justify="right" if i else "left")
+    return table
+
+
+def _print(table: Any) -> None:
+    from rich.console import Console
+
+    Console(width=None if sys.stdout.isatty() else 100).print(table)
+
+
+@contextmanager
+def _progress(label: str) -> Iterator[Callable[[float], None]]:
+    """A progress bar on the terminal, which goes when the work is done."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(label, total=1.0)
+        yield lambda share: bar.update(task, completed=share)
+
+
+def _check_writable(path: Path | None) -> None:
+    """Refuse a file that could not be written, before any work is done for it.
+
+    Raises:
+        InputError: the folder does not exist or cannot be written, or the path is a folder.
+    """
+    if path is None:
+        return
+    folder = path.absolute().parent
+    if path.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise InputError(f"cannot write {path}: {'it is a folder' if path.is_dir() else f'no writable folder {folder}'}")
+
+
+def _write_json(path: Path | None, content: dict[str, Any]) -> None:
+    if path is None:
+        return
+    with tempfile.NamedTemporaryFile("w", dir=path.absolute().parent, suffix=".part", delete=False) as part:
+        json.dump(content, part, indent=2)
+        part.write("\n")
+    Path(part.name).chmod(0o644)
+    Path(part.name).replace(path)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

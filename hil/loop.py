@@ -6,9 +6,11 @@ filters that are written in Python.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import types
+from numpy.typing import NDArray
 
 from controller.cycle import OK, control, cycle
 from plant.compiled import Record, kernel
@@ -40,7 +42,7 @@ LegFusion = Callable[[Record, Array], None]
 """Leg filters in Python: take the cycle's state and a measurement (3, 7, 3), and leave directions and rates in the state."""
 
 _CLOCK_MONOTONIC = 1
-_clock_gettime = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
+_clock_gettime: Any = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
 
 
 @dataclass(eq=False)
@@ -87,10 +89,10 @@ class Loop:
 
 
 @kernel
-def now(clock: Array) -> int:
+def now(clock: NDArray[np.int64]) -> int:
     """The monotonic clock [ns]; `clock` (2,) is scratch."""
     _clock_gettime(_CLOCK_MONOTONIC, clock.ctypes.data)
-    return clock[0] * 1_000_000_000 + clock[1]
+    return int(clock[0] * 1_000_000_000 + clock[1])
 
 
 @kernel
@@ -127,7 +129,7 @@ def _act(calls: Record, parameters: Record, state: Record, records: Record, dura
 @kernel
 def _run(
     calls: Record, imu: Record, parameters: Record, state: Record, segments: Array, records: Record, measurement: Array,
-    clock: Array, last: int,
+    clock: NDArray[np.int64], last: int,
 ) -> int:  # fmt: skip
     for k in range(state[()].cycle, last):
         status = _sense(calls, imu, parameters, state, measurement)

@@ -1,7 +1,8 @@
 """A closed-loop simulation: a mechanism follows a target on its FMU plant, as fast as it goes."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -56,15 +57,15 @@ class SimulationConfig:
 
     def __post_init__(self) -> None:
         if not RATE_RANGE_HZ[0] <= self.rate <= RATE_RANGE_HZ[1]:
-            raise InputError(
-                f"the rate is {self.rate:g} Hz; it must lie between {RATE_RANGE_HZ[0]:g} and {RATE_RANGE_HZ[1]:g} Hz"
-            )
+            raise InputError(f"the rate is {self.rate:g} Hz; it must be {RATE_RANGE_HZ[0]:g} to {RATE_RANGE_HZ[1]:g} Hz")
         if self.fusion not in FUSIONS:
             raise UnknownNameError(f"no fusion {self.fusion!r}; there are {', '.join(FUSIONS)}")
 
 
-class SimulationStopped(GoughError, RuntimeError):
+class SimulationStoppedError(GoughError, RuntimeError):
     """The loop ended before its time; the message has the cause and the cycle, `result` what was recorded until then."""
+
+    exit_status = 1
 
     def __init__(self, message: str, result: "SimulationResult") -> None:
         super().__init__(message)
@@ -96,6 +97,11 @@ class SimulationResult:
     target_positions: Array
     target_rotations: Array
     real_time_factor: float
+
+    @property
+    def moved(self) -> bool:
+        """Whether the run went beyond the hold on the brakes, so that there is something to sum up."""
+        return bool(len(self.times)) and bool(self.times[-1] >= 0.0)
 
     @property
     def true_positions(self) -> Array:
@@ -139,47 +145,78 @@ def simulate(config: SimulationConfig, progress: Callable[[float], None] = lambd
 
     Raises:
         GoughError: something in the configuration cannot be used; nothing has run then.
-        SimulationStopped: the loop ended before its time.
+        SimulationStoppedError: the loop ended before its time.
+    """
+    with prepared_loop(config) as loop:
+        count = len(loop.records)
+        fuse = _filterpy_legs(loop.parameters) if config.fusion == "filterpy" else None
+        status, took = OK, loop.planning_time
+        chunk = max(1, round(_CHUNK_S * config.rate))
+        for last in range(chunk, count + chunk, chunk):
+            began = time.perf_counter()
+            status = loop.run(min(last, count), fuse)
+            took += time.perf_counter() - began
+            if status != OK:
+                break
+            progress(min(last, count) / count)
+        done = int(loop.state["cycle"])
+        result = _result(config, loop, done, took)
+        if status != OK:
+            cause = str(loop.plant.failure("the plant failed")) if status >= PLANT_FAILED else _CAUSES[status]
+            raise SimulationStoppedError(f"stopped on the brakes at cycle {done} of {count}: {cause}", result)
+    return result
+
+
+@dataclass(eq=False)
+class PreparedLoop(Loop):
+    """A loop that is ready to run, with what it was prepared from.
+
+    Attributes:
+        plant: the FMU behind `calls`.
+        mechanism, target, reference: as in `SimulationResult`.
+        planning_time: what planning took [s].
+    """
+
+    plant: FmuPlant
+    mechanism: Mechanism
+    target: Target
+    reference: Reference
+    planning_time: float
+
+
+@contextmanager
+def prepared_loop(config: SimulationConfig) -> Iterator[PreparedLoop]:
+    """Check everything, load the plant, plan the motion, and load the machine code.
+
+    Raises:
+        GoughError: something in the configuration cannot be used.
     """
     mechanism = load_mechanism(config.mechanism)
     target = load_target(config.target, mechanism, config.duration)
-    imu = imu_state(load_imu(config.imu), config.seed, 1.0 / config.rate)
-    control = control_settings(mechanism)
-    fusion = fusion_settings(mechanism)
-    parameters = cycle_parameters(mechanism, config.rate, control, fusion, config.imus)
-    hold = int(parameters["hold_cycles"])
-    count = hold + round(config.duration * config.rate)
-    with FmuPlant(
-        Path(config.plant) if config.plant else default_fmu(), mechanism.plant_parameters(target.start), 1.0 / config.rate
-    ) as plant:
+    period = 1.0 / config.rate
+    imu = imu_state(load_imu(config.imu), config.seed, period)
+    parameters = cycle_parameters(mechanism, config.rate, control_settings(mechanism), fusion_settings(mechanism), config.imus)
+    count = int(parameters["hold_cycles"]) + round(config.duration * config.rate)
+    plan(mechanism, load_target("hold", mechanism, 0.1), 0.1)
+    fmu = Path(config.plant) if config.plant else default_fmu()
+    with FmuPlant(fmu, mechanism.plant_parameters(target.start), period) as plant:
         began = time.perf_counter()
         reference = plan(mechanism, target, config.duration)
-        planning = time.perf_counter() - began
-        loop = Loop(
+        loop = PreparedLoop(
             calls=plant.calls,
             imu=imu,
             parameters=parameters,
             state=np.zeros((), STATE),
             segments=reference.segments,
             records=np.zeros(count, CYCLE_RECORD),
+            plant=plant,
+            mechanism=mechanism,
+            target=target,
+            reference=reference,
+            planning_time=time.perf_counter() - began,
         )
-        _warm(loop)
-        fuse = _filterpy_legs(parameters) if config.fusion == "filterpy" else None
-        status, looping = OK, 0.0
-        chunk = max(1, round(_CHUNK_S * config.rate))
-        for last in range(chunk, count + chunk, chunk):
-            began = time.perf_counter()
-            status = loop.run(min(last, count), fuse)
-            looping += time.perf_counter() - began
-            if status != OK:
-                break
-            progress(min(last, count) / count)
-        done = int(loop.state["cycle"])
-        result = _result(config, mechanism, target, reference, loop, done, planning + looping)
-        if status != OK:
-            cause = str(plant.failure("the plant failed")) if status >= PLANT_FAILED else _CAUSES[status]
-            raise SimulationStopped(f"stopped on the brakes at cycle {done} of {count}: {cause}", result)
-    return result
+        loop.run(0)
+        yield loop
 
 
 _CAUSES = {
@@ -188,21 +225,14 @@ _CAUSES = {
 }
 
 
-def _warm(loop: Loop) -> None:
-    """Load the loop's machine code by running no cycle."""
-    loop.run(0)
-
-
-def _result(
-    config: SimulationConfig, mechanism: Mechanism, target: Target, reference: Reference, loop: Loop, done: int, took: float
-) -> SimulationResult:
+def _result(config: SimulationConfig, loop: PreparedLoop, done: int, took: float) -> SimulationResult:
     records = loop.records[:done]
     times = (np.arange(done) - int(loop.parameters["hold_cycles"])) / config.rate
-    positions, rotations = poses_from_lengths(mechanism, records["reference"][:, :, 0], target.start)
-    target_positions, target_rotations = target.at(times)
+    positions, rotations = poses_from_lengths(loop.mechanism, records["reference"][:, :, 0], loop.target.start)
+    target_positions, target_rotations = loop.target.at(times)
     return SimulationResult(
-        config, mechanism, target, reference, times, records, positions, rotations, target_positions, target_rotations,
-        done / config.rate / took,
+        config, loop.mechanism, loop.target, loop.reference, times, records, positions, rotations, target_positions,
+        target_rotations, done / config.rate / took,
     )  # fmt: skip
 
 

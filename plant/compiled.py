@@ -12,16 +12,15 @@ import time
 from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
-from numba.core import config as numba_config
-from numpy.typing import NDArray
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-Record = NDArray[Any]
-"""A structured array of shape () or (N,); compiled code reads its fields as attributes of `record[()]`."""
+Record = Any
+"""A structured array of shape () or (N,). Compiled code reads its fields as attributes of `record[()]`, which the types of
+NumPy cannot say."""
 
 PACKAGES = ("plant", "controller", "hil")
 STALE_AFTER_S = 30 * 24 * 3600.0
@@ -61,19 +60,16 @@ def _kernel_folder() -> Path:
     return keyed_folder("kernels", hash_of_files(sources, numba.__version__))
 
 
-def _compile(function: F, **options: Any) -> F:
-    before = numba_config.CACHE_DIR
-    numba_config.CACHE_DIR = str(_kernel_folder())
-    try:
-        compiled: F = numba.njit(cache=True, error_model="numpy", **options)(function)
-    finally:
-        numba_config.CACHE_DIR = before
-    return compiled
-
-
 def kernel(function: F) -> F:
     """Mark a function of the cycle: compiled, off the GIL, never raising, its machine code cached.
 
     Division by zero gives inf or NaN as in NumPy, and fastmath stays off so that NaN checks mean something.
     """
-    return _compile(function, nogil=True)
+    settings: Any = numba.config
+    before = settings.CACHE_DIR
+    settings.CACHE_DIR = str(_kernel_folder())
+    try:
+        compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    finally:
+        settings.CACHE_DIR = before
+    return cast(F, compiled)

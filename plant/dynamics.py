@@ -18,7 +18,7 @@ from math import pi
 import casadi as ca
 
 from plant.mechanism import LEGS
-from plant.variables import BRAKE, IMU_COUNT, INPUTS, OPEN, OUTPUTS, PARAMETERS, STATES, VELOCITY, Variable
+from plant.variables import BRAKE, INPUTS, OPEN, OUTPUTS, PARAMETERS, STATES, VELOCITY, Variable
 
 SX = ca.SX
 
@@ -264,7 +264,8 @@ def _plant(x: dict[str, SX], u: dict[str, SX], c: dict[str, SX]) -> tuple[SX, SX
     friction = c["friction.viscous"] * speeds + c["friction.coulomb"] * speeds / ca.sqrt(
         speeds**2 + c["friction.velocity"] ** 2
     )
-    brake = -closed * (c["brake.stiffness"] * x["state.brake_deflection"] + c["brake.damping"] * speeds)
+    # An opened brake lets go within its release time, while the drive takes over the load.
+    brake = -(c["brake.stiffness"] * x["state.brake_deflection"] + closed * c["brake.damping"] * speeds)
     stop = _stack([_stop_force(leg.length, leg.speed, c, k) for k, leg in enumerate(legs)])
     axial = motor - friction + brake + stop
 
@@ -356,7 +357,9 @@ def _imu_signals(legs: list[_Leg], rotation: SX, omega: SX, acceleration: SX, c:
     force = -frame.T @ gravity + ca.cross(angular, arm) + ca.cross(rate, ca.cross(rate, arm))
     leg_imu = ca.Function("leg_imu", [s, sd, sdd, e1, arm, gravity, field], [rate, force, frame.T @ field])
 
-    rates, forces, fields = [], [], []
+    rates: list[SX] = []
+    forces: list[SX] = []
+    fields: list[SX] = []
     for i, leg in enumerate(legs):
         arguments = (_row(c["base_joint_axes"], i), _row(c["leg_imu_position"], i), c["gravity"], c["magnetic_field"])
         signals = leg_imu(leg.s, leg.velocity, acceleration[:3] + ca.cross(acceleration[3:], leg.arm) + leg.bias, *arguments)
@@ -367,7 +370,6 @@ def _imu_signals(legs: list[_Leg], rotation: SX, omega: SX, acceleration: SX, c:
     rates.append((rotation.T @ omega).T)
     forces.append((rotation.T @ (at_imu - c["gravity"])).T)
     fields.append((rotation.T @ c["magnetic_field"]).T)
-    assert len(rates) == IMU_COUNT
     return {
         "imu_angular_velocity": ca.vertcat(*rates),
         "imu_specific_force": ca.vertcat(*forces),

@@ -34,7 +34,7 @@ C_FLAGS = (
 )  # fmt: skip
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 
-_UNITS = {
+_UNITS: dict[str, dict[str, int | str]] = {
     "m": {"m": 1}, "m/s": {"m": 1, "s": -1}, "m/s2": {"m": 1, "s": -2}, "rad/s": {"rad": 1, "s": -1}, "kg": {"kg": 1},
     "kg.m2": {"kg": 1, "m": 2}, "s": {"s": 1}, "s/m": {"s": 1, "m": -1}, "N": {"kg": 1, "m": 1, "s": -2},
     "N.s/m": {"kg": 1, "s": -1}, "N/m": {"kg": 1, "s": -2}, "Ohm": {"kg": 1, "m": 2, "s": -3, "A": -2},
@@ -116,10 +116,10 @@ def build(path: Path) -> None:
 def _write_archive(path: Path, contents: dict[str, bytes]) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as part:
-            with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
-                for name, data in contents.items():
-                    archive.writestr(zipfile.ZipInfo(name, _EPOCH), data, zipfile.ZIP_DEFLATED)
+        part = tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False)  # noqa: SIM115
+        with part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, data in contents.items():
+                archive.writestr(zipfile.ZipInfo(name, _EPOCH), data, zipfile.ZIP_DEFLATED)
         Path(part.name).chmod(0o644)
         Path(part.name).replace(path)
     except OSError as error:
@@ -290,7 +290,8 @@ def _scalar_or_array(reference: int, variable: Variable, starts: dict[str, Array
     dimensions = "".join(f'<Dimension start="{n}"/>' for n in variable.shape)
     return (
         f'<{tag} name="{variable.name}" valueReference="{reference}" causality="{variable.causality}"'
-        f' variability="{variability}"{initial}{extra}{start} description={quoteattr(variable.description)}>{dimensions}</{tag}>'
+        f' variability="{variability}"{initial}{extra}{start}'
+        f" description={quoteattr(variable.description)}>{dimensions}</{tag}>"
     )
 
 

@@ -8,7 +8,7 @@ import contextlib
 import ctypes
 import tempfile
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -274,10 +274,11 @@ def _calling(arguments: str) -> Any:
     """
     llvm = {"p": ir.IntType(64), "d": ir.DoubleType(), "b": ir.IntType(1)}
     numba_types = {"p": types.intp, "d": types.float64, "b": types.boolean}
+    tuple_of: Any = types.Tuple
 
     @intrinsic
     def call(typing_context: Any, address: Any, values: Any) -> Any:
-        signature = types.int32(types.intp, types.Tuple([numba_types[letter] for letter in arguments]))
+        signature = types.int32(types.intp, tuple_of([numba_types[letter] for letter in arguments]))
 
         def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
             function_type = ir.FunctionType(ir.IntType(32), [llvm[letter] for letter in arguments])
@@ -293,8 +294,8 @@ def _calling(arguments: str) -> Any:
     return call
 
 
-_access = _calling("ppppp")
-_do_step = _calling("pddbpppp")
+_access: Callable[..., int] = _calling("ppppp")
+_do_step: Callable[..., int] = _calling("pddbpppp")
 
 
 @kernel

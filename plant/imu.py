@@ -153,6 +153,10 @@ IMU_STATE = np.dtype(
 """Constants and state of the imperfections of seven IMUs; a copy of it is a snapshot."""
 
 
+Word = np.uint64 | int
+"""A 32-bit number, kept in 64 bits."""
+
+
 def load_imu(name: str) -> ImuModel:
     """The preset of that name.
 
@@ -203,11 +207,12 @@ def _constant_errors(sensor: SensorErrors, random: np.random.Generator) -> tuple
     axes = np.eye(3) + np.triu(random.uniform(-sensor.cross_axis, sensor.cross_axis, (3, 3)), 1)
     direction = random.normal(size=3)
     bias = random.uniform(*sensor.bias) * direction / np.linalg.norm(direction)
-    return np.linalg.inv(axes @ scale), -bias
+    gain: Array = np.linalg.inv(axes @ scale)
+    return gain, -bias
 
 
 @kernel
-def philox(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, int, int, int]:
+def philox(c0: Word, c1: Word, c2: Word, c3: Word, k0: Word, k1: Word) -> tuple[Word, Word, Word, Word]:
     """Philox4x32-10 of Salmon, Moraes, Dror, Shaw (2011): four random 32-bit words for a counter and a key."""
     mask = np.uint64(0xFFFFFFFF)
     a, b, c, d = np.uint64(c0), np.uint64(c1), np.uint64(c2), np.uint64(c3)
@@ -223,7 +228,7 @@ def philox(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, i
 
 
 @kernel
-def _normal_pair(word0: int, word1: int) -> tuple[float, float]:
+def _normal_pair(word0: Word, word1: Word) -> tuple[float, float]:
     """Two standard normal numbers of two 32-bit words (Box and Muller)."""
     radius = np.sqrt(-2.0 * np.log((np.float64(word0) + 1.0) * 2.0**-32))
     angle = np.float64(word1) * (2.0 * np.pi * 2.0**-32)

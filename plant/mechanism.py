@@ -334,15 +334,15 @@ def _joint_axes(given: ArrayLike | None, directions: Array) -> Array:
         axes = checked_array(given, (LEGS, 3), "base_joint_axes")
         for leg in range(LEGS):
             checked_unit(axes[leg], 3, f"base_joint_axes[{leg}]")
-    axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-    along = np.abs(np.sum(axes * directions, axis=1))
+    unit: Array = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    along = np.abs(np.sum(unit * directions, axis=1))
     if along.max() > 0.99:
         raise InputError(
             f"base_joint_axes[{int(along.argmax())}] lies within 8 deg of its leg at home, where a universal joint is "
             "singular: turn the axis"
         )
-    axes.setflags(write=False)
-    return axes
+    unit.setflags(write=False)
+    return unit
 
 
 def _checked_limits(limits: Mapping[str, Any], base: Array, platform: Array, home: Pose | None) -> Limits:

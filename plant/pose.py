@@ -6,6 +6,7 @@ of the rotations that its (1) needs; here every rotation is the active one.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from plant.compiled import kernel
 from plant.errors import InputError
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 
 UNIT_TOLERANCE = 1e-3
 """How far a unit quaternion or direction given by a user may be off unit length before it is refused."""

@@ -1,0 +1,48 @@
+# make demo | test | bench | lint: each sets up what it needs in .venv first.
+SHELL := /bin/bash
+PYTHON ?= python3
+BIN := .venv/bin
+OUT := out
+WORKERS ?= 2
+
+.PHONY: demo test bench lint clean
+.DELETE_ON_ERROR:
+
+demo: .venv/installed
+	@mkdir -p $(OUT)
+	$(BIN)/gough simulate --report $(OUT)/demo.html --json $(OUT)/demo.json
+	@echo "Open $(OUT)/demo.html in a browser to see it move."
+
+test: .venv/installed-test
+	$(BIN)/pytest -n $(WORKERS)
+
+bench: .venv/installed
+	@mkdir -p $(OUT)
+	$(BIN)/gough bench --json $(OUT)/bench.json $(BENCH)
+
+lint: .venv/installed-lint
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy --strict
+
+clean:
+	rm -rf .venv build dist $(OUT) *.egg-info
+
+.venv/installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
+		{ echo "gough needs Python 3.11 or newer as '$(PYTHON)': install it, or run 'make PYTHON=/path/to/python3.11'"; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || \
+		{ echo "Python's venv module is missing: install it, on Debian with 'apt install python3-venv'"; exit 1; }
+	@command -v cc >/dev/null || command -v gcc >/dev/null || command -v clang >/dev/null || \
+		{ echo "a C compiler is missing (it builds the plant): install one, on Debian with 'apt install gcc libc6-dev'"; exit 1; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable .
+	@touch $@
+
+.venv/installed-test: .venv/installed
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[test]'
+	@touch $@
+
+.venv/installed-lint: .venv/installed-test
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[test,lint]'
+	@touch $@

@@ -1,0 +1,144 @@
+"""The small solvers of the cycle against LAPACK, on well and badly conditioned systems."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from controller.least_squares import RANK_TOLERANCE, factor_cholesky, solve_cholesky, solve_least_squares
+
+
+def solve(matrix, right):
+    """The kernel with scratch, on copies, since it overwrites its arguments."""
+    n = matrix.shape[1]
+    solution = np.full(n, np.nan)
+    ratio = solve_least_squares(matrix.copy(), right.copy(), solution, np.zeros(n), np.zeros(n))
+    return solution, ratio
+
+
+def matrix_of_condition(random, rows, columns, condition):
+    u, _ = np.linalg.qr(random.normal(size=(rows, columns)))
+    v, _ = np.linalg.qr(random.normal(size=(columns, columns)))
+    return u @ np.diag(np.geomspace(1.0, 1.0 / condition, columns)) @ v.T
+
+
+shapes = st.integers(1, 9).flatmap(lambda n: st.tuples(st.integers(n, 14), st.just(n)))
+seeds = st.integers(0, 2**32 - 1)
+
+
+@settings(max_examples=150, deadline=None)
+@given(shapes, st.floats(0.0, 6.0), st.floats(-6.0, 6.0), seeds)
+def test_least_squares_agrees_with_lapack_at_any_condition_and_scale(shape, exponent, scale_exponent, seed):
+    random = np.random.default_rng(seed)
+    condition, scale = 10.0**exponent, 10.0**scale_exponent
+    matrix = scale * matrix_of_condition(random, *shape, condition)
+    right = random.normal(size=shape[0])
+    solution, _ = solve(matrix, right)
+    expected = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    # The solution of a least-squares problem moves by condition^2 times the residual (Wedin); its fitted values do not.
+    residual = np.linalg.norm(right - matrix @ expected)
+    moves = 1e-14 * condition * (np.linalg.norm(expected) + condition * residual / scale)
+    assert np.linalg.norm(solution - expected) <= moves
+    np.testing.assert_allclose(matrix @ solution, matrix @ expected, rtol=0.0, atol=1e-13 * condition * np.linalg.norm(right))
+
+
+def test_a_consistent_system_of_condition_a_million_keeps_ten_digits():
+    random = np.random.default_rng(1)
+    for _ in range(50):
+        matrix = matrix_of_condition(random, 12, 9, 1e6)
+        truth = random.normal(size=9)
+        solution, _ = solve(matrix, matrix @ truth)
+        np.testing.assert_allclose(solution, truth, rtol=0.0, atol=1e-9)
+        # What the module says of normal equations: they lose twice as many.
+        by_normal_equations = np.linalg.solve(matrix.T @ matrix, matrix.T @ (matrix @ truth))
+        assert np.abs(by_normal_equations - truth).max() > 100.0 * np.abs(solution - truth).max()
+
+
+@settings(max_examples=100, deadline=None)
+@given(shapes, st.floats(0.0, 8.0), seeds)
+def test_the_returned_ratio_bounds_the_reciprocal_condition(shape, exponent, seed):
+    random = np.random.default_rng(seed)
+    n = shape[1]
+    matrix = matrix_of_condition(random, *shape, 10.0**exponent)
+    _, ratio = solve(matrix, np.ones(shape[0]))
+    singular_values = np.linalg.svd(matrix, compute_uv=False)
+    reciprocal = singular_values[-1] / singular_values[0]
+    # For QR with column pivoting: |r_nn| >= sigma_n and |r_11| <= sigma_1, and at worst 2^n sqrt(n) apart from them.
+    assert reciprocal * (1.0 - 1e-6) <= ratio <= reciprocal * np.sqrt(n) * 2.0**n
+
+
+@pytest.mark.parametrize("columns", [1, 3, 5, 9])
+@pytest.mark.parametrize("defect", ["zero column", "equal columns", "combination", "zero matrix", "too few rows"])
+def test_dependent_columns_are_reported_below_the_tolerance(columns, defect):
+    random = np.random.default_rng(columns)
+    matrix = random.normal(size=(12, columns))
+    if defect == "zero matrix":
+        matrix[:] = 0.0
+    elif defect == "zero column" or columns == 1:
+        matrix[:, 0] = 0.0
+    elif defect == "equal columns":
+        matrix[:, -1] = matrix[:, 0]
+    elif defect == "too few rows":
+        matrix[columns - 1 :] = 0.0
+    else:
+        matrix[:, -1] = matrix[:, :-1] @ random.normal(size=columns - 1)
+    _, ratio = solve(matrix, random.normal(size=12))
+    assert ratio < RANK_TOLERANCE
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_what_is_not_finite_in_any_place_of_the_matrix_counts_as_dependent(bad):
+    random = np.random.default_rng(2)
+    for _ in range(30):
+        matrix = random.normal(size=(8, 4))
+        matrix[random.integers(8), random.integers(4)] = bad
+        _, ratio = solve(matrix, random.normal(size=8))
+        assert ratio < RANK_TOLERANCE
+
+
+def test_a_part_of_a_larger_scratch_array_gives_the_same_solution():
+    random = np.random.default_rng(3)
+    matrix, right = random.normal(size=(10, 5)), random.normal(size=10)
+    scratch, long_right = np.full((12, 9), np.nan), np.full(12, np.nan)
+    scratch[:10, :5], long_right[:10] = matrix, right
+    solution, norms, order = np.zeros(9), np.zeros(9), np.zeros(9)
+    solve_least_squares(scratch[:10, :5], long_right[:10], solution[:5], norms, order)
+    np.testing.assert_allclose(solution[:5], np.linalg.lstsq(matrix, right, rcond=None)[0], rtol=1e-12, atol=1e-13)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(1, 9), st.floats(0.0, 8.0), seeds)
+def test_cholesky_agrees_with_lapack_and_reads_the_lower_triangle_alone(n, exponent, seed):
+    random = np.random.default_rng(seed)
+    root = matrix_of_condition(random, n, n, 10.0 ** (exponent / 2.0))
+    matrix = root @ root.T
+    matrix = (matrix + matrix.T) / 2.0
+    factor = np.tril(matrix) + np.triu(np.full((n, n), np.nan), 1)
+    assert factor_cholesky(factor)
+    np.testing.assert_allclose(np.tril(factor), np.linalg.cholesky(matrix), rtol=0.0, atol=1e-15 * n * 10.0 ** (exponent / 2.0))
+    truth = random.normal(size=n)
+    right = matrix @ truth
+    solve_cholesky(factor, right)
+    np.testing.assert_allclose(right, truth, rtol=0.0, atol=1e-14 * n * 10.0**exponent * np.linalg.norm(truth))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(2, 6), st.floats(-3.0, 0.0), seeds)
+def test_cholesky_refuses_what_is_not_positive_definite(n, exponent, seed):
+    random = np.random.default_rng(seed)
+    v, _ = np.linalg.qr(random.normal(size=(n, n)))
+    eigenvalues = random.uniform(0.5, 1.0, n)
+    eigenvalues[random.integers(n)] = -(10.0**exponent)
+    matrix = v @ np.diag(eigenvalues) @ v.T
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.cholesky(matrix)
+    assert not factor_cholesky(matrix)
+
+
+@pytest.mark.parametrize("n", [1, 2, 6])
+def test_cholesky_refuses_a_singular_and_a_nan_matrix(n):
+    row = np.random.default_rng(n).normal(size=(n, n - 1))
+    assert not factor_cholesky(row @ row.T)
+    broken = np.eye(n)
+    broken[n - 1, n - 1] = np.nan
+    assert not factor_cholesky(broken)
