@@ -31,6 +31,8 @@ OK, POSE_LOST, NOT_FINITE = 0, 1, 2
 ALL_IMUS = tuple(range(IMU_COUNT))
 LEG_IMUS = tuple(range(LEGS))
 
+RATE_RANGE_HZ = (50.0, 4000.0)
+
 _WORST_CONDITIONING = 1e-4
 
 PARAMETERS = np.dtype(
@@ -139,8 +141,9 @@ def cycle_parameters(
         imus: which IMUs there are, 0-5 on the legs and 6 on the platform.
 
     Raises:
-        InputError: an IMU that cannot be, or IMUs that do not determine the pose.
+        InputError: a rate out of range, an IMU that cannot be, or IMUs that do not determine the pose.
     """
+    check_rate(rate)
     check_imus(mechanism, imus)
     plant = mechanism.plant_parameters()
     plane = joint_plane(mechanism)
@@ -191,6 +194,16 @@ def cycle_parameters(
     for name, value in values.items():
         parameters[name] = value
     return parameters
+
+
+def check_rate(rate: float) -> None:
+    """Check that the cycle can run at this rate [Hz].
+
+    Raises:
+        InputError: it is outside 50 to 4000 Hz.
+    """
+    if not RATE_RANGE_HZ[0] <= rate <= RATE_RANGE_HZ[1]:
+        raise InputError(f"the rate is {rate:g} Hz; it must be {RATE_RANGE_HZ[0]:g} to {RATE_RANGE_HZ[1]:g} Hz")
 
 
 def check_imus(mechanism: Mechanism, imus: Collection[int]) -> None:

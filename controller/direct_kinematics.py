@@ -125,7 +125,7 @@ def solve(
             raise InputError(f"{name} is {sigma}; it must be positive and finite [rad]")
     up = mechanism.up_in_base
     observed: list[tuple[Array, Array, float]] = []
-    known_rotation = None
+    known_rotation: Array | None = None
     if rotation is not None:
         known_rotation = checked_rotation(rotation, "rotation")
         across = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.8 else [0.0, 1.0, 0.0])
@@ -139,7 +139,8 @@ def solve(
 
     joints = (mechanism.base_joints, mechanism.platform_joints)
     work = Workspace()
-    position, found = np.zeros(3), np.eye(3)
+    position: Array = np.zeros(3)
+    found: Array = np.eye(3)
     if known_rotation is not None:
         method, found = "rotation", known_rotation.copy()
         conditioning = pose_from_rotation(*joints, directions, measured, found, position, *work.linear)

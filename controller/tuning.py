@@ -15,7 +15,7 @@ import casadi as ca
 import control
 import numpy as np
 
-from controller.cycle import STATE, cycle_parameters, find_pose, fuse_legs, fuse_platform, refine_pose
+from controller.cycle import STATE, check_rate, cycle_parameters, find_pose, fuse_legs, fuse_platform, refine_pose
 from controller.inverse_kinematics import leg_lengths
 from controller.settings import ControlSettings, control_settings, fusion_settings
 from plant.compiled import Record
@@ -112,6 +112,7 @@ def tune(mechanism: Mechanism, rate: float) -> Design:
         SingularConfigurationError: no gains have the margins asked for.
         InputError: the mechanism lacks data.
     """
+    check_rate(rate)
     loop = open_loop(mechanism, rate)
     response = frequency_response(loop, rate)
     preset = control_settings(mechanism)

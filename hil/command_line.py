@@ -167,7 +167,8 @@ def _print_simulation(summary: dict[str, Any]) -> None:
     cycle = summary["cycle_us"]
     print(
         f"limits violated by the reference: {summary['limits']['violations']}; "
-        f"{summary['real_time_factor']:.1f} times real time; cycle p50/p99/p99.9 {cycle['p50']:.1f}/{cycle['p99']:.1f}/{cycle['p999']:.1f} us"
+        f"{summary['real_time_factor']:.1f} times real time; "
+        f"cycle p50/p99/p99.9 {cycle['p50']:.1f}/{cycle['p99']:.1f}/{cycle['p999']:.1f} us"
     )
 
 
@@ -190,6 +191,7 @@ def _build_fmu(options: argparse.Namespace) -> int:
 
     folder = Path("fmus") if Path("fmus/fmi3.c").is_file() else Path()
     path = options.output or folder / f"{MODEL}.fmu"
+    _check_writable(path)
     build_in_subprocess(path)
     print(path)
     return 0
@@ -217,11 +219,12 @@ def _bench(options: argparse.Namespace) -> int:
 
 def _table(*columns: str) -> Any:
     from rich.box import SIMPLE_HEAD
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for i, column in enumerate(columns):
-        table.add_column(column, justify="right" if i else "left")
+        table.add_column(escape(column), justify="right" if i else "left")
     return table
 
 
@@ -238,7 +241,8 @@ def _progress(label: str) -> Iterator[Callable[[float], None]]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    terminal = sys.stderr.isatty()
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not terminal) as bar:
         task = bar.add_task(label, total=1.0)
         yield lambda share: bar.update(task, completed=share)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.cycle import ALL_IMUS, NOT_FINITE, OK, POSE_LOST, STATE, cycle_parameters, point_legs
+from controller.cycle import ALL_IMUS, NOT_FINITE, OK, POSE_LOST, STATE, check_rate, cycle_parameters, point_legs
 from controller.direct_kinematics import poses_from_lengths
 from controller.leg_filter import start_leg
 from controller.planner import Reference, plan
@@ -18,9 +18,9 @@ from controller.settings import control_settings, fusion_settings
 from controller.target import Target, load_target
 from hil.loop import CYCLE_RECORD, PLANT_FAILED, LegFusion, Loop
 from plant.compiled import Record
-from plant.errors import GoughError, InputError, UnknownNameError
+from plant.errors import GoughError, UnknownNameError
 from plant.export import default_fmu
-from plant.fmu import RATE_RANGE_HZ, FmuPlant
+from plant.fmu import FmuPlant
 from plant.imu import ACCELEROMETER, GYROSCOPE, imu_state, load_imu
 from plant.mechanism import LEGS, Mechanism, load_mechanism
 from plant.pose import Array, rotation_angle, rotations_from_quaternions
@@ -56,8 +56,7 @@ class SimulationConfig:
     imus: tuple[int, ...] = ALL_IMUS
 
     def __post_init__(self) -> None:
-        if not RATE_RANGE_HZ[0] <= self.rate <= RATE_RANGE_HZ[1]:
-            raise InputError(f"the rate is {self.rate:g} Hz; it must be {RATE_RANGE_HZ[0]:g} to {RATE_RANGE_HZ[1]:g} Hz")
+        check_rate(self.rate)
         if self.fusion not in FUSIONS:
             raise UnknownNameError(f"no fusion {self.fusion!r}; there are {', '.join(FUSIONS)}")
 

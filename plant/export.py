@@ -115,7 +115,6 @@ def build(path: Path) -> None:
 
 def _write_archive(path: Path, contents: dict[str, bytes]) -> None:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         part = tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False)  # noqa: SIM115
         with part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, data in contents.items():

@@ -30,9 +30,6 @@ _IMU_OUTPUTS = ("imu_angular_velocity", "imu_specific_force", "imu_magnetic_fiel
 _TRUTH_OUTPUTS = ("position", "quaternion", "leg_length", "current")
 _REQUIRED = (*_IMU_OUTPUTS, *_TRUTH_OUTPUTS, "velocity_command", "drive_mode", "external_wrench")
 
-RATE_RANGE_HZ = (50.0, 4000.0)
-"""Rates of the loop that gough supports."""
-
 CALLS = np.dtype(
     [
         ("instance", np.int64),
