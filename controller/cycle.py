@@ -33,7 +33,7 @@ LEG_IMUS = tuple(range(LEGS))
 
 RATE_RANGE_HZ = (50.0, 4000.0)
 
-_WORST_CONDITIONING = 1e-4
+_WORST_CONDITIONING = 1e-2
 
 PARAMETERS = np.dtype(
     [

@@ -70,11 +70,12 @@ def _page(result: SimulationResult) -> str:
     summary = result.summary()
     title = f"gough: {escape(result.mechanism.name)} follows {escape(result.target.name)}"
     view, speed = _mechanism_view(result)
+    pace = "in real time" if speed < 1.05 else f"at {speed:.2g} times real speed"
     series = "".join(_figure(*figure, "time") for figure in _time_figures(result))
     moving = _figure(
         "mechanism",
         "The mechanism",
-        f"True poses, at {speed:.2g} times real speed; in grey the path of the platform's origin. Drag to turn, scroll to zoom.",
+        f"True poses {pace}; the path of the origin in grey. Drag to turn, scroll to zoom.",
         view,
         "view",
     )
@@ -173,44 +174,35 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
     """Name, title, caption and figure of everything that is drawn over time."""
     records, times = result.records, result.times
     limits, home = result.mechanism.require_limits(), result.mechanism.require_home()
-    true_positions, true_rotations = result.true_positions, result.true_rotations
+    truth = (result.true_positions, result.true_rotations)
+    planned = (result.reference_positions, result.reference_rotations)
     true_lengths, currents = 1e3 * records["truth"][:, 7:13], records["truth"][:, 13:19]
-    lengths, rates, accelerations = np.moveaxis(records["reference"], 2, 0)
-    planned_lengths = 1e3 * lengths
-    stroke = 1e3 * limits.stroke
+    planned_lengths, rates, accelerations = np.moveaxis(records["reference"], 2, 0) * [[[1e3]], [[1e3]], [[1.0]]]
 
-    def errors(name: str, positions: Array, rotations: Array, to_positions: Array, to_rotations: Array) -> list[_Panel]:
-        return [
-            _Panel(f"{name} [mm]", AXIS_NAMES, 1e3 * (positions - to_positions)),
-            _Panel(f"{name} [deg]", AXIS_NAMES, _rotation_vectors(rotations, to_rotations)),
-        ]
-
+    true_pose, planned_pose = (
+        _differences(truth, (home.position, home.rotation)),
+        _differences(planned, (home.position, home.rotation)),
+    )
     pose = [
-        _Panel(
-            "position [mm]",
-            AXIS_NAMES,
-            1e3 * (true_positions - home.position),
-            1e3 * (result.reference_positions - home.position),
-        ),
-        _Panel(
-            "rotation vector [deg]",
-            AXIS_NAMES,
-            _rotation_vectors(true_rotations, home.rotation),
-            _rotation_vectors(result.reference_rotations, home.rotation),
-        ),
+        _Panel(label, AXIS_NAMES, true_pose[i], planned_pose[i])
+        for i, label in enumerate(("position [mm]", "rotation vector [deg]"))
     ]
-    estimation = errors("estimation", records["position"], records["rotation"], true_positions, true_rotations)
-    tracking = errors("tracking", true_positions, true_rotations, result.reference_positions, result.reference_rotations)
+    estimation, tracking = _differences((records["position"], records["rotation"]), truth), _differences(truth, planned)
+    errors = [
+        _Panel(f"{name} [{unit}]", AXIS_NAMES, error[i])
+        for i, unit in enumerate(("mm", "deg"))
+        for name, error in (("estimation", estimation), ("tracking", tracking))
+    ]
     legs = [
-        _Panel(f"{name} [mm]", (name,), true_lengths[:, k : k + 1], planned_lengths[:, k : k + 1], stroke[k])
+        _Panel(f"{name} [mm]", (name,), true_lengths[:, [k]], planned_lengths[:, [k]], 1e3 * limits.stroke[k])
         for k, name in enumerate(LEG_NAMES)
     ]
     motion = [
-        _Panel("speed [mm/s]", LEG_NAMES, 1e3 * rates, limits=(-1e3 * limits.velocity, 1e3 * limits.velocity)),
+        _Panel("speed [mm/s]", LEG_NAMES, rates, limits=(-1e3 * limits.velocity, 1e3 * limits.velocity)),
         _Panel("acceleration [m/s²]", LEG_NAMES, accelerations, limits=(-limits.acceleration, limits.acceleration)),
     ]
     drives = [
-        _Panel("true - planned length [mm]", LEG_NAMES, true_lengths - planned_lengths),
+        _Panel("length error [mm]", LEG_NAMES, true_lengths - planned_lengths),
         _Panel("command [mm/s]", LEG_NAMES, 1e3 * records["command"]),
         _Panel("motor current [A]", LEG_NAMES, currents),
     ]
@@ -224,9 +216,9 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
         (
             "errors",
             "Estimation and tracking error",
-            "Estimate minus truth, and truth minus planned reference, on the same scales, which are those of the motion: "
-            "while the filters settle in the hold (grey) the estimate may be further off.",
-            _plot(times, [estimation[0], tracking[0], estimation[1], tracking[1]], columns=2, shared_yaxes=True),
+            "Estimate minus truth, and truth minus planned reference. The scales are those of the motion: while the filters "
+            "settle in the hold (grey), the estimate may be further off.",
+            _plot(times, errors, columns=2, shared_yaxes=True),
         ),
         (
             "lengths",
@@ -235,7 +227,12 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
             _plot(times, legs, columns=3),
         ),
         ("motion", "Planned motion of the legs", "The reference against the limits of the actuators.", _plot(times, motion)),
-        ("drives", "Drives", "What is left to control, what the drives are told, and what that takes.", _plot(times, drives)),
+        (
+            "drives",
+            "Drives",
+            "True minus planned length of each leg, the speed that its drive is told, and the current that this takes.",
+            _plot(times, drives),
+        ),
     ]
 
 
@@ -262,12 +259,12 @@ def _plot(times: Array, panels: Sequence[_Panel], columns: int = 1, shared_yaxes
         place: dict[str, Any] = {"row": row + 1, "col": column + 1}
         peers = panels[row * columns : (row + 1) * columns] if shared_yaxes else [panel]
         unit = panel.label.partition("[")[2].rstrip("]")
+        for name, values in zip(panel.names, panel.planned.T if panel.planned is not None else (), strict=False):
+            line = {"color": "#c5ccd4", "width": 5}
+            figure.add_scatter(**_curve(times, values, f"{name} planned", unit), line=line, **legend("planned"), **place)
         for name, values in zip(panel.names, panel.values.T, strict=True):
             line = {"color": COLORS[name], "width": 1.5}
             figure.add_scatter(**_curve(times, values, name, unit), line=line, **legend(name), **place)
-        for name, values in zip(panel.names, panel.planned.T if panel.planned is not None else (), strict=False):
-            line = {"color": INK, "width": 1, "dash": "dot"}
-            figure.add_scatter(**_curve(times, values, f"{name} planned", unit), line=line, **legend("planned"), **place)
         for limit in panel.limits:
             figure.add_hline(limit, line={"color": INK, "width": 1, "dash": "dash"}, **legend("limit"), **place)
         figure.update_yaxes(title_text=panel.label, range=_span(peers, times >= 0.0), **place)
@@ -287,7 +284,8 @@ def _span(panels: Sequence[_Panel], moving: NDArray[np.bool_]) -> tuple[float, f
     """What an axis for all of `panels` shows: the motion and the limits, but not how the filters settle before it."""
     drawn = [curves[moving].ravel() for panel in panels for curves in (panel.values, panel.planned) if curves is not None]
     values = np.concatenate([*drawn, *(panel.limits for panel in panels)])
-    least, greatest = np.nanmin(values), np.nanmax(values)
+    finite = values[np.isfinite(values)]
+    least, greatest = (finite.min(), finite.max()) if finite.size else (0.0, 0.0)
     margin = 0.06 * (greatest - least) or 1.0
     return float(least - margin), float(greatest + margin)
 
@@ -306,132 +304,129 @@ def _extremes(values: Array, points: int = _POINTS) -> NDArray[np.intp]:
     """Indices of about `points` samples of `values` (N,), among them the least and the greatest of each bucket."""
     if len(values) <= points:
         return np.arange(len(values))
-    size = 2 * len(values) // points
+    size = -(-2 * len(values) // points)
     buckets = values[: len(values) // size * size].reshape(-1, size)
     starts = np.arange(0, buckets.size, size)
     rest = np.arange(buckets.size, len(values))
     return np.unique(np.concatenate([starts + buckets.argmin(axis=1), starts + buckets.argmax(axis=1), rest]))
 
 
-def _rotation_vectors(rotations: Array, references: Array) -> Array:
-    """The rotation vectors (N, 3) [deg], seen in {1}, from `references` to `rotations` (N, 3, 3)."""
-    relative = rotations @ np.swapaxes(references, -1, -2)
+def _differences(poses: tuple[Array, Array], origins: tuple[Array, Array]) -> tuple[Array, Array]:
+    """From the poses `origins` to `poses`: translation (N, 3) [mm] and rotation vector (N, 3) [deg], both seen in {1}."""
+    relative = poses[1] @ np.swapaxes(origins[1], -1, -2)
     skewed = relative - np.swapaxes(relative, 1, 2)
     sines = 0.5 * np.stack([skewed[:, 2, 1], skewed[:, 0, 2], skewed[:, 1, 0]], axis=1)
-    angles = rotation_angle(rotations, references)
-    vectors: Array = np.degrees(sines / np.sinc(angles / np.pi)[:, None])
-    return vectors
+    angles = rotation_angle(poses[1], origins[1])
+    return 1e3 * (poses[0] - origins[0]), np.degrees(sines / np.sinc(angles / np.pi)[:, None])
 
 
 def _mechanism_view(result: SimulationResult) -> tuple[go.Figure, float]:
     """The moving mechanism, and how many times faster than real it plays."""
     mechanism = result.mechanism
     moving = np.flatnonzero(result.times >= 0.0)
-    span = float(result.times[moving[-1]] - result.times[moving[0]])
-    shown = moving[np.linspace(0, len(moving) - 1, int(np.clip(span * _FRAME_RATE_HZ, 2, _FRAMES))).astype(int)]
-    frame_ms = min(1e3 * span / len(shown), 1e3 / _SLOWEST_HZ)
+    span = len(moving) / result.config.rate
+    count = int(np.clip(span * _FRAME_RATE_HZ, 1, _FRAMES))
+    frame_s = min(span / count, 1.0 / _SLOWEST_HZ)
+    shown = moving[np.linspace(0, len(moving) - 1, count).astype(int)]
     positions, rotations = 1e3 * result.true_positions[shown], result.true_rotations[shown]
-    base = 1e3 * mechanism.base_joints
-    joints = positions[:, None] + 1e3 * mechanism.platform_joints @ np.swapaxes(rotations, 1, 2)
     path = 1e3 * result.true_positions[moving[:: -(-len(moving) // _PATH_POINTS)]]
+    base, platform = 1e3 * mechanism.base_joints, 1e3 * mechanism.platform_joints
+    joints = positions[:, None] + platform @ np.swapaxes(rotations, 1, 2)
+    base_ring, platform_ring = _ring(base), _ring(platform)
+    numbers = base + 0.12 * (base - base.mean(axis=0))
     tube = _TUBE * 1e3 * mechanism.require_limits().stroke[:, :1]
-    ring, platform_ring = _ring(mechanism.base_joints), _ring(mechanism.platform_joints)
-    triad = 0.4 * np.linalg.norm(1e3 * mechanism.platform_joints, axis=1).max()
+    triad = 0.4 * np.linalg.norm(platform, axis=1).max()
 
-    def moving_parts(k: int) -> list[dict[str, Any]]:
+    def moving_parts(k: int) -> list[dict[str, Array]]:
         legs = joints[k] - base
         ends = base + tube * legs / np.linalg.norm(legs, axis=1, keepdims=True)
-        axes = positions[k] + triad * rotations[k].T
         return [
             _xyz(joints[k][platform_ring[:-1]]),
             _xyz(joints[k][platform_ring]),
-            _xyz(_strokes(base, ends)),
-            _xyz(_strokes(ends, joints[k])),
-            _xyz(_strokes(np.broadcast_to(positions[k], (3, 3)), axes)),
+            _xyz(_lines(base, ends)),
+            _xyz(_lines(ends, joints[k])),
+            _xyz(_lines(np.broadcast_to(positions[k], (3, 3)), positions[k] + triad * rotations[k].T)),
         ]
 
-    colors = [[color for name in names for color in 3 * [COLORS[name]]] for names in (LEG_NAMES, AXIS_NAMES)]
+    def frame(k: int) -> go.Frame:
+        plate, *lines = moving_parts(k)
+        data = [{"type": "mesh3d", **plate}, *({"type": "scatter3d", **line} for line in lines)]
+        return go.Frame(name=str(k), traces=list(range(len(data))), data=data)
+
     plate, outline, tubes, rods, axes = moving_parts(0)
     figure = go.Figure(
         [
             _plate(plate, "#6d87a3", 0.55),
             _line(outline, "#3d5670", 6),
-            _line(tubes, colors[0], 14),
+            _line(tubes, _line_colors(LEG_NAMES), 14),
             _line(rods, "#6b7683", 6),
-            _line(axes, colors[1], 5),
-            _plate(_xyz(base[ring[:-1]]), FAINT, 0.35),
-            _line(_xyz(base[ring]), "#5c6873", 6),
+            _line(axes, _line_colors(AXIS_NAMES), 5),
+            _plate(_xyz(base[base_ring[:-1]]), FAINT, 0.35),
+            _line(_xyz(base[base_ring]), "#5c6873", 6),
             _line(_xyz(path), FAINT, 2),
+            go.Scatter3d(_xyz(numbers), mode="text", text=[str(k) for k in range(LEGS)], hoverinfo="skip"),
         ],
-        frames=[
-            go.Frame(name=str(k), traces=[0, 1, 2, 3, 4], data=[
-                {"type": "scatter3d" if part else "mesh3d", **xyz} for part, xyz in enumerate(moving_parts(k))
-            ])
-            for k in range(len(shown))
-        ],
-    )  # fmt: skip
-    corners = np.concatenate([base, joints.reshape(-1, 3), path])
-    least, greatest = corners.min(axis=0), corners.max(axis=0)
-    margin = 0.05 * (greatest - least).max()
-    up = dict(zip(AXIS_NAMES, mechanism.up_in_base.tolist(), strict=True))
-    play = {"frame": {"duration": frame_ms, "redraw": True}, "transition": {"duration": 0}, "fromcurrent": True}
-    still = {"frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}, "mode": "immediate"}
+        frames=[frame(k) for k in range(count)],
+    )
     figure.update_layout(
         _LAYOUT,
         height=540,
         margin={"l": 0, "r": 0, "t": 0, "b": 10},
         showlegend=False,
         uirevision="kept",
-        scene={
-            **{
-                f"{name}axis": {
-                    "range": [least[i] - margin, greatest[i] + margin],
-                    "title": {"text": f"{name} [mm]"},
-                    "showbackground": False,
-                    "gridcolor": "#e3e7eb",
-                    "color": FAINT,
-                    "nticks": 5,
-                    "showspikes": False,
-                }
-                for i, name in enumerate(AXIS_NAMES)
-            },
-            "aspectmode": "data",
-            "camera": {"up": up, "eye": {"x": 1.05, "y": -1.2, "z": 0.55}, "projection": {"type": "perspective"}},
-        },
-        updatemenus=[
-            {
-                "type": "buttons",
-                "direction": "left",
-                "x": 0.0,
-                "xanchor": "left",
-                "y": 0.0,
-                "yanchor": "top",
-                "pad": {"t": 22, "l": 10},
-                "showactive": False,
-                "buttons": [
-                    {"label": "▶", "method": "animate", "args": [None, play]},
-                    {"label": "❚❚", "method": "animate", "args": [[None], still]},
-                ],
-            }
-        ],
-        sliders=[
-            {
-                "x": 0.16,
-                "len": 0.8,
-                "y": 0.0,
-                "pad": {"t": 10},
-                "ticklen": 0,
-                "minorticklen": 0,
-                "font": {"color": "rgba(0,0,0,0)", "size": 1},
-                "currentvalue": {"prefix": "time ", "suffix": " s", "xanchor": "right", "font": {"color": INK, "size": 13}},
-                "steps": [
-                    {"label": f"{time:.2f}", "method": "animate", "args": [[str(k)], still]}
-                    for k, time in enumerate(result.times[shown])
-                ],
-            }
-        ],
+        scene=_scene(np.concatenate([numbers, joints.reshape(-1, 3), path]), mechanism.up_in_base),
+        **_player(result.times[shown], frame_s),
     )
-    return figure, 1e3 * span / len(shown) / frame_ms
+    return figure, span / count / frame_s
+
+
+def _scene(points: Array, up: Array) -> dict[str, Any]:
+    """Fixed axes with equal scales that hold all `points` (N, 3), seen from aside and a little above."""
+    margin = 0.05 * np.ptp(points, axis=0).max()
+    ranges = np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin], axis=1)
+    aside = np.array([1.15, -1.4, 0.0])
+    looks = {"up": up, "eye": aside + (0.6 - aside @ up) * up, "center": -0.1 * up}
+    look = {"showbackground": False, "showspikes": False, "gridcolor": "#e3e7eb", "color": FAINT, "nticks": 5}
+    return {
+        **{
+            f"{name}axis": {"range": ends.tolist(), "title": {"text": f"{name} [mm]"}, **look}
+            for name, ends in zip(AXIS_NAMES, ranges, strict=True)
+        },
+        "aspectmode": "data",
+        "camera": {key: dict(zip(AXIS_NAMES, vector.tolist(), strict=True)) for key, vector in looks.items()},
+    }
+
+
+def _player(times: Array, frame_s: float) -> dict[str, Any]:
+    """Buttons to play and pause, and a slider with a step for each frame."""
+    play = {"frame": {"duration": 1e3 * frame_s, "redraw": True}, "transition": {"duration": 0}, "fromcurrent": True}
+    show = {"frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}, "mode": "immediate"}
+    buttons = {
+        "type": "buttons",
+        "direction": "left",
+        "showactive": False,
+        "x": 0.0,
+        "xanchor": "left",
+        "y": 0.0,
+        "yanchor": "top",
+        "pad": {"t": 22, "l": 10},
+        "buttons": [
+            {"label": "▶", "method": "animate", "args": [None, play]},
+            {"label": "❚❚", "method": "animate", "args": [[None], show]},
+        ],
+    }
+    slider = {
+        "x": 0.16,
+        "len": 0.8,
+        "y": 0.0,
+        "pad": {"t": 10},
+        "ticklen": 0,
+        "minorticklen": 0,
+        "font": {"color": "rgba(0,0,0,0)", "size": 1},
+        "currentvalue": {"prefix": "time ", "suffix": " s", "xanchor": "right", "font": {"color": INK, "size": 13}},
+        "steps": [{"label": f"{time:.2f}", "method": "animate", "args": [[str(k)], show]} for k, time in enumerate(times)],
+    }
+    return {"updatemenus": [buttons], "sliders": [slider]}
 
 
 def _ring(joints: Array) -> NDArray[np.intp]:
@@ -443,9 +438,14 @@ def _ring(joints: Array) -> NDArray[np.intp]:
     return np.append(order, order[0])
 
 
-def _strokes(starts: Array, ends: Array) -> Array:
+def _lines(starts: Array, ends: Array) -> Array:
     """Points (3 n, 3) of n separate lines: start, end, gap."""
     return np.stack([starts, ends, np.full_like(ends, np.nan)], axis=1).reshape(-1, 3)
+
+
+def _line_colors(names: Sequence[str]) -> list[str]:
+    """A color for each point of `_lines`."""
+    return [COLORS[name] for name in names for _ in range(3)]
 
 
 def _xyz(points: Array) -> dict[str, Array]:

@@ -147,6 +147,7 @@ IMU_STATE = np.dtype(
         ("smoothed", np.float64, (3, IMU_COUNT, 3)),
         ("queue", np.float64, (_LONGEST_DELAY + 1, 3, IMU_COUNT, 3)),
         ("reading", np.float64, (3, IMU_COUNT, 3)),
+        ("normals", np.float64, 6),
     ],
     align=True,
 )
@@ -257,7 +258,7 @@ def measure(state: Record, ideal: Array, measurement: Array) -> None:
     """Turn ideal signals (3, 7, 3) into what the IMUs read this cycle (3, 7, 3); advances `state` by one cycle."""
     s = state[()]
     first = s.cycle == 0
-    normals = np.empty(6)
+    normals = s.normals
     fresh_field = s.cycle % s.magnetometer_every == 0
     noisy = s.noise[GYROSCOPE] > 0.0 or s.noise[ACCELEROMETER] > 0.0 or s.dropout > 0.0
     walking = s.drift[GYROSCOPE] > 0.0 or s.drift[ACCELEROMETER] > 0.0
