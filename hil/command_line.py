@@ -236,15 +236,15 @@ def _print(table: Any) -> None:
 
 @contextmanager
 def _progress(label: str) -> Iterator[Callable[[float], None]]:
-    """A progress bar on the terminal, which goes when the work is done."""
+    """A progress bar on the terminal, which pulses while things are prepared and goes when the work is done."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     terminal = sys.stderr.isatty()
     with Progress(*columns, console=Console(stderr=True), transient=True, disable=not terminal) as bar:
-        task = bar.add_task(label, total=1.0)
-        yield lambda share: bar.update(task, completed=share)
+        task = bar.add_task(label, total=None)
+        yield lambda share: bar.update(task, total=1.0, completed=share)
 
 
 def _check_writable(path: Path | None) -> None:
