@@ -8,6 +8,7 @@ the three packages: any edit gives a new folder, and the old ones are swept away
 import hashlib
 import os
 import shutil
+import tempfile
 import time
 from collections.abc import Callable, Iterable
 from functools import cache
@@ -42,12 +43,18 @@ def hash_of_files(files: Iterable[Path], *extra: str) -> str:
 
 
 def keyed_folder(kind: str, key: str) -> Path:
-    """The cache folder of this kind and key, made and marked as used; folders long unused are removed."""
-    root = user_cache() / kind
-    folder = root / key
-    folder.mkdir(parents=True, exist_ok=True)
-    os.utime(folder)
-    for other in root.iterdir():
+    """The cache folder of this kind and key, made and marked as used; folders long unused are removed.
+
+    Where the user's cache cannot be written, the folder lies among the temporary files.
+    """
+    folder = user_cache() / kind / key
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        os.utime(folder)
+    except OSError:
+        folder = Path(tempfile.gettempdir()) / f"gough-{os.getuid()}" / kind / key
+        folder.mkdir(parents=True, exist_ok=True)
+    for other in folder.parent.iterdir():
         if other != folder and time.time() - other.stat().st_mtime > STALE_AFTER_S:
             shutil.rmtree(other, ignore_errors=True)
     return folder

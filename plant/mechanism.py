@@ -131,16 +131,19 @@ class Mechanism:
         home = None if home is None else _checked_home(home)
         directions = _home_directions(base, platform, home)
         axes = _joint_axes(base_joint_axes, directions)
+        up = checked_unit(up_in_base, 3, "up_in_base")
+        parameters = checked_parameters(plant or {})
+        _check_gravity(parameters, up)
         return cls(
             name=name,
             base_joints=base,
             platform_joints=platform,
             base_joint_axes=axes,
             home_directions=directions,
-            up_in_base=checked_unit(up_in_base, 3, "up_in_base"),
+            up_in_base=up,
             home=home,
             limits=None if limits is None else _checked_limits(limits, base, platform, home),
-            plant=MappingProxyType(checked_parameters(plant or {})),
+            plant=MappingProxyType(parameters),
             settings=MappingProxyType({key: MappingProxyType(dict(table)) for key, table in (settings or {}).items()}),
         )
 
@@ -304,6 +307,13 @@ def _check_joints(base: Array, platform: Array) -> None:
         spread = np.linalg.svd(joints - joints.mean(axis=0), compute_uv=False)
         if spread[1] < 1e-6 * max(spread[0], SAME_JOINT_M):
             raise InputError(f"the {name} joints all lie on one line: no pose of six legs can be told or held")
+
+
+def _check_gravity(parameters: Mapping[str, Array], up: Array) -> None:
+    gravity = parameters.get("gravity", np.zeros(3))
+    size = float(np.linalg.norm(gravity))
+    if size > 0.0 and np.linalg.norm(gravity / size + up) > 1e-3:
+        raise InputError(f"gravity {gravity.tolist()} does not point against up_in_base {up.tolist()}: make them agree")
 
 
 def _checked_home(home: Pose) -> Pose:
