@@ -43,6 +43,9 @@ TILT_SIGMA = np.radians(0.05)
 YAW_SIGMA = np.radians(1.5)
 """Standard deviation that `solve` assumes of a yaw that was measured magnetically [rad]."""
 
+LEAST_CONDITIONING = 1e-6
+"""Conditioning below which `solve` calls the measurements singular."""
+
 _COPLANAR = 1e-6
 """Platform joints count as coplanar if they leave their plane by less than this share of their spread."""
 
@@ -124,17 +127,20 @@ def solve(
         if not 0.0 < sigma < np.inf:
             raise InputError(f"{name} is {sigma}; it must be positive and finite [rad]")
     up = mechanism.up_in_base
+    tilt, yaw = 1.0 / tilt_sigma**2, 1.0 / yaw_sigma**2
     observed: list[tuple[Array, Array, float]] = []
     known_rotation: Array | None = None
     if rotation is not None:
         known_rotation = checked_rotation(rotation, "rotation")
         across = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.8 else [0.0, 1.0, 0.0])
         level: Array = across / np.linalg.norm(across)
-        observed += [(up, known_rotation.T @ up, tilt_sigma), (level, known_rotation.T @ level, yaw_sigma)]
+        # These weights add up to `yaw` about the vertical and to `tilt` about every level axis.
+        axes = ((up, tilt - yaw / 2.0), (level, yaw / 2.0), (np.cross(up, level), yaw / 2.0))
+        observed += [(axis, known_rotation.T @ axis, weight) for axis, weight in axes]
     if up_in_platform is not None:
-        observed.append((up, checked_unit(up_in_platform, 3, "up_in_platform"), tilt_sigma))
+        observed.append((up, checked_unit(up_in_platform, 3, "up_in_platform"), tilt))
     if normal is not None:
-        observed.append((checked_unit(normal, 3, "normal"), np.array([0.0, 0.0, 1.0]), tilt_sigma))
+        observed.append((checked_unit(normal, 3, "normal"), np.array([0.0, 0.0, 1.0]), tilt))
     vectors = _vector_observations(observed)
 
     joints = (mechanism.base_joints, mechanism.platform_joints)
@@ -157,7 +163,7 @@ def solve(
                 "a closed form for coplanar ones: measure up_in_platform too"
             )
         conditioning = pose_from_legs(*joints, directions, measured, plane.center, plane.axes, position, found, *work.linear)
-    if conditioning < RANK_TOLERANCE:
+    if conditioning < LEAST_CONDITIONING:
         raise SingularConfigurationError(
             f"{int(measured.sum())} leg directions{' and ' + method if observed else ''} do not determine the pose of "
             f"{mechanism.name!r} here: measure more legs, up_in_platform or the rotation"
@@ -183,12 +189,13 @@ def pose_from_lengths(mechanism: Mechanism, lengths: ArrayLike, guess: Pose | No
     """The pose at which the legs have these lengths, by Newton's method on SE(3) from a first guess (default: home).
 
     Raises:
-        InputError: wrong shape or not finite.
+        InputError: wrong shape or not finite, or the guess is no pose.
         SingularConfigurationError: no pose near the guess has these lengths.
     """
     start = guess or mechanism.require_home()
     target = checked_array(lengths, (LEGS,), "lengths")
-    position, rotation = start.position.copy(), start.rotation.copy()
+    position = checked_array(start.position, (3,), "guess.position").copy()
+    rotation = checked_rotation(start.rotation, "guess.rotation").copy()
     work = Workspace()
     error = newton_from_lengths(mechanism.base_joints, mechanism.platform_joints, target, position, rotation, *work.newton)
     if not error < 1e-10:
@@ -237,7 +244,7 @@ def _checked_directions(leg_directions: ArrayLike) -> tuple[Array, Array]:
 def _vector_observations(observed: list[tuple[Array, Array, float]]) -> tuple[Array, Array, Array]:
     in_base = np.array([base for base, _, _ in observed]).reshape(-1, 3)
     in_platform = np.array([platform for _, platform, _ in observed]).reshape(-1, 3)
-    return in_base, in_platform, np.array([1.0 / sigma**2 for _, _, sigma in observed])
+    return in_base, in_platform, np.array([weight for _, _, weight in observed])
 
 
 @kernel

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from plant.compiled import kernel
+from plant.errors import InputError
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, Pose, checked_array, checked_rotation, rotation_from_vector
 
@@ -81,6 +82,9 @@ def jacobian_at(arms: Array, directions: Array, jacobian: Array) -> None:
         jacobian[k, 3], jacobian[k, 4], jacobian[k, 5] = a1 * d2 - a2 * d1, a2 * d0 - a0 * d2, a0 * d1 - a1 * d0
 
 
+_MOST_DRAWS = 500
+
+
 def sample_workspace(mechanism: Mechanism, count: int, seed: int) -> tuple[Array, Array]:
     """Random poses at which every leg is inside its stroke: positions (count, 3) [m] and rotations (count, 3, 3).
 
@@ -88,16 +92,18 @@ def sample_workspace(mechanism: Mechanism, count: int, seed: int) -> tuple[Array
     the poses outside the strokes are thrown away.
 
     Raises:
-        InputError: no home or no stroke.
+        InputError: no home, no stroke, or hardly a pose inside the strokes.
     """
     home, limits = mechanism.require_home(), mechanism.require_limits()
     reach = 0.8 * float((limits.stroke[:, 1] - limits.stroke[:, 0]).max())
     random = np.random.default_rng(seed)
     positions, rotations = np.empty((0, 3)), np.empty((0, 3, 3))
-    while len(positions) < count:
+    for _ in range(_MOST_DRAWS):
+        if len(positions) >= count:
+            return positions[:count], rotations[:count]
         drawn = home.position + random.uniform(-reach, reach, (2000, 3))
         turned = np.array([rotation_from_vector(v) @ home.rotation for v in random.uniform(-0.35, 0.35, (2000, 3))])
         lengths = leg_lengths(mechanism, drawn, turned)
         inside = ((lengths > limits.stroke[:, 0]) & (lengths < limits.stroke[:, 1])).all(axis=1)
         positions, rotations = np.concatenate([positions, drawn[inside]]), np.concatenate([rotations, turned[inside]])
-    return positions[:count], rotations[:count]
+    raise InputError(f"the workspace of {mechanism.name!r} is too small to draw {count} poses: check the strokes")

@@ -21,8 +21,13 @@ from plant.pose import Array
 
 PREVIEW_S = 0.03
 _HALF_WINDOW = 3
+_STILL_M = 1e-9
+"""A target that moves no leg by more than this within the window stands still."""
 _SLACK = 1e-9
 """Rounding that a limit may be exceeded by before it counts, relative to the limit, or in m for the stroke."""
+
+_STROKE_SLACK = 1e-10
+"""Rounding that the planner itself allows at the ends of the stroke [m]."""
 
 _SEGMENTS = 9
 """A plan of ruckig has two braking segments and seven more."""
@@ -51,7 +56,7 @@ def plan(mechanism: Mechanism, target: Target, duration: float) -> Reference:
     limits = mechanism.require_limits()
     lengths = leg_lengths(mechanism, target.positions, target.rotations)
     mechanism.check_lengths(lengths, f"the target {target.name}")
-    planner = _Planner(limits, lengths[0])
+    planner = _Planner(limits, lengths[0], None if target.held else PREVIEW_S)
     knots = max(1, int(np.ceil(duration / SAMPLE_PERIOD_S - 1e-9)))
     aims = np.arange(knots) * SAMPLE_PERIOD_S + (0.0 if target.held else PREVIEW_S)
     positions, rates, accelerations = _aims(target, lengths, aims, limits)
@@ -70,67 +75,83 @@ def count_violations(segments: Array, horizon: float, limits: Limits) -> int:
 
 
 class _Planner:
-    """Extends a reference by one target sample at a time, holding the state that the next plan starts from."""
+    """Extends a reference by one sample period at a time, holding the state that the next plan starts from."""
 
-    def __init__(self, limits: Limits, lengths: Array) -> None:
+    def __init__(self, limits: Limits, lengths: Array, preview: float | None) -> None:
         self._limits = limits
-        self._inner = np.array([limits.acceleration, limits.jerk])
         self._state: tuple[list[float], ...] = (lengths.tolist(), [0.0] * LEGS, [0.0] * LEGS)
-        self._after = self._state
         self._otg = Ruckig(LEGS, SAMPLE_PERIOD_S)
         self._trajectory = Trajectory(LEGS)
-        self._follow = _input(limits, ControlInterface.Position, PREVIEW_S)
+        self._follow = _input(limits, ControlInterface.Position, preview)
         self._stop = _input(limits, ControlInterface.Velocity, None)
         self._stop.synchronization = Synchronization.No
+        self._goal: Array | None = None
+        self._knot = 0
         self._plans: list[tuple[float, ...]] = []
+        self._starts: list[int] = []
         self._states: list[tuple[list[float], ...]] = []
+        self._stop_limits = np.array([limits.acceleration, limits.jerk])
         # Within a sample period no leg goes further than this, so that inside it the plan need not be looked at.
         near = limits.velocity * SAMPLE_PERIOD_S
         self._reach = [(least + near, greatest - near) for least, greatest in limits.stroke.tolist()]
 
     def advance(self, positions: Array, rates: Array, accelerations: Array) -> None:
-        """Plan towards a state (6,) each, and keep the first sample period of the plan."""
+        """Go on for a sample period towards a state (6,) each; a plan that leads to rest there is kept."""
+        resting = not rates.any() and not accelerations.any()
+        if not (resting and self._goal is not None and np.abs(positions - self._goal).max() < _STILL_M):
+            kept = self._begin(positions.tolist(), rates.tolist(), accelerations.tolist())
+            self._goal = positions if resting and kept else None
+        self._knot += 1
+        self._state = self._trajectory.at_time((self._knot - self._starts[-1]) * SAMPLE_PERIOD_S)[:3]
+
+    def _begin(self, target: list[float], rates: list[float], accelerations: list[float]) -> bool:
+        """Begin a plan at the present state; return whether it leads to the target itself and is safe to its end."""
         rest = [0.0] * LEGS
-        target = positions.tolist()
-        for rate, acceleration in ((rates.tolist(), accelerations.tolist()), (rates.tolist(), rest), (rest, rest)):
-            self._follow.target_position = target
-            self._follow.target_velocity = rate
-            self._follow.target_acceleration = acceleration
-            if self._plan(self._follow) and self._can_stop_after():
+        self._follow.target_position = target
+        for rate, acceleration in ((rates, accelerations), (rates, rest), (rest, rest)):
+            self._follow.target_velocity, self._follow.target_acceleration = rate, acceleration
+            if self._calculate(self._follow) and self._is_safe():
+                kept = self._stays_inside()
                 break
         else:
-            if not self._plan(self._stop):
+            kept = False
+            if not self._calculate(self._stop):
                 raise PlanningError(f"ruckig finds no way to stop from lengths {self._state[0]}")
+        self._starts.append(self._knot)
+        self._states.append(self._state)
         for profile in self._trajectory.profiles[0]:
             brake = profile.brake
             self._plans.append((*brake.t, *profile.t, *brake.j, *profile.j))
-        self._states.append(self._state)
-        self._state = self._after
+        return kept
 
-    def _plan(self, parameters: InputParameter) -> bool:
+    def _calculate(self, parameters: InputParameter) -> bool:
         parameters.current_position, parameters.current_velocity, parameters.current_acceleration = self._state
         try:
-            found = self._otg.calculate(parameters, self._trajectory) in (Result.Working, Result.Finished)
+            return self._otg.calculate(parameters, self._trajectory) in (Result.Working, Result.Finished)
         except RuckigError:
             return False
-        self._after = self._trajectory.at_time(SAMPLE_PERIOD_S)[:3]
-        return found
 
-    def _can_stop_after(self) -> bool:
+    def _is_safe(self) -> bool:
         """Whether the first sample period of the plan, and a stop after it, stay inside the stroke."""
-        after = np.array(self._after)
-        if _near_end(self._state[0], self._reach):
-            for extrema, (least, greatest) in zip(self._trajectory.position_extrema, self._limits.stroke, strict=True):
-                if extrema.min < least or extrema.max > greatest:
-                    return False
-        return bool(_stops_inside(after, self._limits.stroke, self._inner))
+        near = any(not least < at < greatest for at, (least, greatest) in zip(self._state[0], self._reach, strict=True))
+        if near and not self._stays_inside():
+            return False
+        after = np.array(self._trajectory.at_time(SAMPLE_PERIOD_S)[:3])
+        return bool(_stops_inside(after, self._limits.stroke, self._stop_limits))
+
+    def _stays_inside(self) -> bool:
+        return all(
+            least - _STROKE_SLACK <= extrema.min and extrema.max <= greatest + _STROKE_SLACK
+            for extrema, (least, greatest) in zip(self._trajectory.position_extrema, self._limits.stroke, strict=True)
+        )
 
     def segments(self) -> Array:
         """All segments so far, (6, n, 5)."""
         plans = np.array(self._plans).reshape(-1, LEGS, 2, _SEGMENTS)
         segments = np.zeros((LEGS, len(plans) * (_SEGMENTS + 1), 5))
         segments[:, :, 0] = np.inf
-        longest = _collect_segments(plans, np.array(self._states), SAMPLE_PERIOD_S, segments)
+        starts = np.array([*self._starts, self._knot]) * SAMPLE_PERIOD_S
+        longest = _collect_segments(plans, np.array(self._states), starts, segments)
         return segments[:, :longest].copy()
 
 
@@ -157,6 +178,10 @@ def _aims(target: Target, lengths: Array, times: Array, limits: Limits) -> tuple
     samples = _spline(target.times, lengths, at.ravel()).reshape(*at.shape, LEGS)
     positions, rates = (np.einsum("w,mwk->mk", fit[order], samples) for order in (0, 1))
     accelerations = 2.0 * np.einsum("w,mwk->mk", fit[2], samples)
+    still = (np.ptp(samples, axis=1) < _STILL_M).all(axis=1)
+    ahead = np.searchsorted(target.times, times[still] + _HALF_WINDOW * SAMPLE_PERIOD_S)
+    positions[still] = lengths[np.minimum(ahead, len(lengths) - 1)]
+    rates[still], accelerations[still] = 0.0, 0.0
     # A fit through a jump swings out; the samples themselves are inside the stroke.
     positions = np.clip(positions, limits.stroke[:, 0], limits.stroke[:, 1])
     rates = np.clip(rates, -0.999 * limits.velocity, 0.999 * limits.velocity)
@@ -200,17 +225,14 @@ def _spline(knots: Array, values: Array, times: Array) -> Array:
     return values[index] + t * (rate + t * (before / 2.0 + t * (after - before) / (6.0 * step)))
 
 
-def _near_end(lengths: list[float], reach: list[tuple[float, float]]) -> bool:
-    return any(not least < length < greatest for length, (least, greatest) in zip(lengths, reach, strict=True))
-
-
 @kernel
-def _collect_segments(plans: Array, states: Array, period: float, segments: Array) -> int:
-    """Write the segments of the first `period` [s] of each plan, and return how many the longest row has.
+def _collect_segments(plans: Array, states: Array, starts: Array, segments: Array) -> int:
+    """Write the segments of each plan up to the start of the next, and return how many the longest row has.
 
     Args:
         plans: (n, 6, 2, 9), durations and jerks.
         states: (n, 3, 6), from which the plans start.
+        starts: (n + 1,) [s]; the last is the end of the last plan.
         segments: (6, m, 5), written.
     """
     longest = 0
@@ -219,20 +241,20 @@ def _collect_segments(plans: Array, states: Array, period: float, segments: Arra
         for i in range(plans.shape[0]):
             durations, jerks = plans[i, leg, 0], plans[i, leg, 1]
             p, v, a = states[i, 0, leg], states[i, 1, leg], states[i, 2, leg]
-            start = 0.0
+            at, end = starts[i], starts[i + 1]
             for k in range(durations.shape[0] + 1):
-                # A plan that ends within the period rests in its last state.
+                # A plan that ends before the next one begins rests in its last state.
                 last = k == durations.shape[0]
-                t = period if last else durations[k]
-                if t > 0.0 and start < period - 1e-12:
+                t = end - at if last else durations[k]
+                if t > 0.0 and at < end - 1e-12:
                     j = 0.0 if last else jerks[k]
-                    segments[leg, row, 0] = i * period + start
+                    segments[leg, row, 0] = at
                     segments[leg, row, 1], segments[leg, row, 2], segments[leg, row, 3], segments[leg, row, 4] = p, v, a, j
                     row += 1
                     p += t * (v + t * (a / 2.0 + t * j / 6.0))
                     v += t * (a + t * j / 2.0)
                     a += t * j
-                    start += t
+                    at += t
         longest = max(longest, row)
     return longest
 
@@ -284,7 +306,7 @@ def _stops_inside(state: Array, stroke: Array, limits: Array) -> bool:
             a += duration * jerk
         if sign < 0.0:
             least, greatest = -greatest, -least
-        if p + least < stroke[k, 0] or p + greatest > stroke[k, 1]:
+        if p + least < stroke[k, 0] - _STROKE_SLACK or p + greatest > stroke[k, 1] + _STROKE_SLACK:
             return False
     return True
 
@@ -304,12 +326,15 @@ def _count_violations(segments: Array, horizon: float, stroke: Array, limits: Ar
             p, v, a, j = segments[k, i, 1], segments[k, i, 2], segments[k, i, 3], segments[k, i, 4]
             least, greatest, speed = _segment_extrema(p, v, a, j, t)
             acceleration = max(abs(a), abs(a + t * j))
-            if (
-                least < stroke[k, 0] - _SLACK
-                or greatest > stroke[k, 1] + _SLACK
-                or speed > limits[0] * (1.0 + _SLACK)
-                or acceleration > limits[1] * (1.0 + _SLACK)
-                or abs(j) > limits[2] * (1.0 + _SLACK)
-            ):
+            # Written so that what is not a number is a violation.
+            inside = (
+                least >= stroke[k, 0] - _SLACK
+                and greatest <= stroke[k, 1] + _SLACK
+                and speed <= limits[0] * (1.0 + _SLACK)
+                and acceleration <= limits[1] * (1.0 + _SLACK)
+                and abs(j) <= limits[2] * (1.0 + _SLACK)
+                and np.isfinite(p + v + a + j)
+            )
+            if not inside:
                 violations += 1
     return violations

@@ -1,7 +1,7 @@
 """Settings of the controller: the tables `control` and `fusion` of a mechanism's preset, checked when they are read."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from math import radians
 from typing import Any, TypeVar
 
@@ -71,7 +71,7 @@ def control_settings(mechanism: Mechanism, **changes: float) -> ControlSettings:
     Raises:
         InputError: an unknown name, or a value that is not a positive number.
     """
-    return replace(_from_table(ControlSettings, "control", mechanism.settings.get("control", {})), **changes)
+    return _read(ControlSettings, "control", {**mechanism.settings.get("control", {}), **changes})
 
 
 def fusion_settings(mechanism: Mechanism, **changes: float) -> FusionSettings:
@@ -80,10 +80,10 @@ def fusion_settings(mechanism: Mechanism, **changes: float) -> FusionSettings:
     Raises:
         InputError: an unknown name, or a value that is not a positive number.
     """
-    return replace(_from_table(FusionSettings, "fusion", mechanism.settings.get("fusion", {})), **changes)
+    return _read(FusionSettings, "fusion", {**mechanism.settings.get("fusion", {}), **changes})
 
 
-def _from_table(kind: type[S], name: str, table: Mapping[str, Any]) -> S:
+def _read(kind: type[S], name: str, table: Mapping[str, Any]) -> S:
     known = {field.name for field in fields(kind)}
     for key, value in table.items():
         if key not in known:

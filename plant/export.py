@@ -114,6 +114,8 @@ def build(path: Path) -> None:
 
 
 def _write_archive(path: Path, contents: dict[str, bytes]) -> None:
+    if path.is_dir():
+        raise ToolchainError(f"cannot write {path}: it is a folder")
     try:
         part = tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False)  # noqa: SIM115
         with part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:

@@ -8,6 +8,7 @@ import contextlib
 import ctypes
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -85,6 +86,7 @@ class FmuPlant:
         self._check_variables()
         self._check_period(period)
         self._cleanup = contextlib.ExitStack()
+        self._closed = False
         try:
             self._fmu = self._load()
             self._initialize(parameters)
@@ -100,6 +102,7 @@ class FmuPlant:
 
     def close(self) -> None:
         """Free the instance and remove what was extracted; closing twice does no harm."""
+        self._closed = True
         self._cleanup.close()
 
     def get(self, name: str) -> Array:
@@ -125,7 +128,13 @@ class FmuPlant:
         """
         variable = self._known(name)
         discrete = variable.type == "Enumeration"
-        values = np.ascontiguousarray(value, np.int64 if discrete else np.float64).reshape(-1)
+        try:
+            numbers = np.array(value, np.float64).reshape(-1)
+        except (TypeError, ValueError):
+            raise InputError(f"{name} of {self.path.name} must be numbers, got {value!r}") from None
+        values = numbers.astype(np.int64) if discrete else numbers
+        if discrete and (values != numbers).any():
+            raise InputError(f"{name} of {self.path.name} must be whole numbers, got {value!r}")
         if values.size != _size_of(variable):
             raise InputError(f"{name} of {self.path.name} has {_size_of(variable)} elements, got {values.size}")
         reference = np.array([variable.valueReference], np.uint32)
@@ -138,6 +147,7 @@ class FmuPlant:
         Raises:
             FmuError: the FMU reports a failure.
         """
+        self._check_open()
         if advance(self.calls, duration):
             raise self.failure("a step failed")
 
@@ -145,7 +155,12 @@ class FmuPlant:
         """The error that says what went wrong in the FMU's own words."""
         return FmuError(f"{self.path.name}: {what}: {self.messages[-1] if self.messages else 'the FMU gives no reason'}")
 
+    def _check_open(self) -> None:
+        if self._closed:
+            raise FmuError(f"{self.path.name} has been closed: load it again")
+
     def _known(self, name: str) -> Any:
+        self._check_open()
         try:
             return self._variables[name]
         except KeyError:
@@ -187,16 +202,21 @@ class FmuPlant:
         folder = self._cleanup.enter_context(tempfile.TemporaryDirectory(prefix="gough-fmu-"))
         identifier = self._description.coSimulation.modelIdentifier
         library = Path(folder) / "binaries" / fmpy.platform_tuple / f"{identifier}{fmpy.sharedLibraryExtension}"
-        with zipfile.ZipFile(self.path) as archive:
-            for member in archive.namelist():
-                if not member.startswith(("sources/", "documentation/")):
-                    archive.extract(member, folder)
+        try:
+            with zipfile.ZipFile(self.path) as archive:
+                for member in archive.namelist():
+                    if not member.startswith(("sources/", "documentation/")):
+                        archive.extract(member, folder)
+        except (zipfile.BadZipFile, zlib.error, OSError) as error:
+            raise FmuError(f"{self.path.name} is not a usable FMU: {error}") from None
         if not library.is_file():
             raise FmuError(f"{self.path.name} holds no binary for {fmpy.platform_tuple}: build it for this machine")
         try:
-            fmu = fmpy.fmi3.FMU3Slave(
-                guid=self._description.guid, unzipDirectory=folder, modelIdentifier=identifier, instanceName="plant"
-            )
+            # FMPy stays in the library's folder when it cannot load it.
+            with contextlib.chdir("."):
+                fmu = fmpy.fmi3.FMU3Slave(
+                    guid=self._description.guid, unzipDirectory=folder, modelIdentifier=identifier, instanceName="plant"
+                )
             fmu.instantiate(logMessage=self._log)
         except Exception as error:
             reason = self.messages[-1] if self.messages else error

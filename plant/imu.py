@@ -7,6 +7,7 @@ counter-based generator keyed by (seed, IMU, cycle), so any cycle can be made ag
 
 from dataclasses import dataclass, fields
 from math import inf, pi, radians, sqrt
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,15 @@ MILLI_G = 1e-3 * STANDARD_GRAVITY
 
 GYROSCOPE, ACCELEROMETER, MAGNETOMETER = 0, 1, 2
 """First index of a measurement (3, 7, 3): [rad/s], [m/s^2], [uT]; the second is the IMU, the third its axis."""
+
+
+def _check_not_negative(what: str, value: Any) -> None:
+    try:
+        good = bool((np.asarray(value, dtype=float) >= 0.0).all())
+    except (TypeError, ValueError):
+        good = False
+    if not good:
+        raise InputError(f"{what} is {value}; it must be a number that is not negative")
 
 
 @dataclass(frozen=True)
@@ -48,9 +58,7 @@ class SensorErrors:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            value = np.asarray(getattr(self, field.name), dtype=float)
-            if not (value >= 0.0).all():
-                raise InputError(f"the {field.name} of a sensor is {getattr(self, field.name)}; it must not be negative")
+            _check_not_negative(f"the {field.name} of a sensor", getattr(self, field.name))
 
 
 @dataclass(frozen=True)
@@ -74,6 +82,16 @@ class ImuModel:
     misalignment: float = 0.0
     delay: float = 0.0
     dropout: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("magnetometer_rate", "misalignment", "delay", "dropout"):
+            _check_not_negative(f"the {name} of an IMU", getattr(self, name))
+        if self.magnetometer_rate == 0.0:
+            raise InputError("the magnetometer_rate of an IMU is 0; it must be positive")
+        if not self.delay < inf:
+            raise InputError("the delay of an IMU is infinite; it must be finite")
+        if self.dropout > 1.0:
+            raise InputError(f"the dropout of an IMU is {self.dropout}; it is a probability, at most 1")
 
 
 _MPU9150_MAGNETOMETER = SensorErrors(noise=0.05, reach=1200.0, resolution=0.3)
@@ -181,13 +199,15 @@ def imu_state(model: ImuModel, seed: int, period: float) -> Record:
     state: Record = np.zeros((), IMU_STATE)
     random = np.random.default_rng([seed, IMU_COUNT])
     alignments = [rotation_from_vector(random.uniform(-model.misalignment, model.misalignment, 3)) for _ in range(IMU_COUNT)]
+    every = max(1, round(1.0 / (model.magnetometer_rate * period)))
     for kind, sensor in enumerate((model.gyroscope, model.accelerometer, model.magnetometer)):
+        sampling = every * period if kind == MAGNETOMETER else period
         for imu in range(IMU_COUNT):
             gain, offset = _constant_errors(sensor, random)
             state["gain"][kind, imu] = gain @ alignments[imu]
             state["offset"][kind, imu] = offset
-        state["noise"][kind] = sensor.noise * sqrt(0.5 / period)
-        state["smoothing"][kind] = 1.0 - np.exp(-2.0 * pi * sensor.bandwidth * period)
+        state["noise"][kind] = sensor.noise * sqrt(0.5 / sampling)
+        state["smoothing"][kind] = 1.0 - np.exp(-2.0 * pi * sensor.bandwidth * sampling)
         state["reach"][kind] = sensor.reach
         state["resolution"][kind] = sensor.resolution
         if kind != MAGNETOMETER:
@@ -196,7 +216,7 @@ def imu_state(model: ImuModel, seed: int, period: float) -> Record:
     if delay > _LONGEST_DELAY:
         raise InputError(f"the delay of the IMUs is {delay} cycles; at most {_LONGEST_DELAY} are kept")
     state["delay"] = delay
-    state["magnetometer_every"] = max(1, round(1.0 / (model.magnetometer_rate * period)))
+    state["magnetometer_every"] = every
     state["dropout"] = model.dropout
     state["seed"] = seed
     return state
@@ -275,24 +295,23 @@ def measure(state: Record, ideal: Array, measurement: Array) -> None:
         else:
             normals[:] = 0.0
         for kind in range(3):
-            if kind == MAGNETOMETER:
-                if not fresh_field:
-                    continue
-                if s.noise[kind] > 0.0:
-                    _draw(normals, s.cycle, imu, _MAGNETIC, s.seed)
-                else:
-                    normals[:] = 0.0
+            magnetic = kind == MAGNETOMETER
+            stale = magnetic and not fresh_field
+            if magnetic and fresh_field and s.noise[kind] > 0.0:
+                _draw(normals, s.cycle, imu, _MAGNETIC, s.seed)
             gain, signal = s.gain[kind, imu], ideal[kind, imu]
             for axis in range(3):
-                value = s.offset[kind, imu, axis]
-                value += gain[axis, 0] * signal[0] + gain[axis, 1] * signal[1] + gain[axis, 2] * signal[2]
-                if kind == MAGNETOMETER:
-                    value += s.noise[kind] * normals[axis]
-                else:
-                    value += s.bias_walk[kind, imu, axis] + s.noise[kind] * normals[3 * kind + axis]
-                smoothed = value if first else s.smoothed[kind, imu, axis]
-                smoothed += s.smoothing[kind] * (value - smoothed)
-                s.smoothed[kind, imu, axis] = smoothed
+                smoothed = s.smoothed[kind, imu, axis]
+                if not stale:
+                    value = s.offset[kind, imu, axis]
+                    value += gain[axis, 0] * signal[0] + gain[axis, 1] * signal[1] + gain[axis, 2] * signal[2]
+                    if magnetic:
+                        value += s.noise[kind] * normals[axis]
+                    else:
+                        value += s.bias_walk[kind, imu, axis] + s.noise[kind] * normals[3 * kind + axis]
+                    share = 1.0 if first else s.smoothing[kind]
+                    smoothed = share * value + (1.0 - share) * smoothed
+                    s.smoothed[kind, imu, axis] = smoothed
                 delayed = smoothed
                 if s.delay > 0:
                     if first:

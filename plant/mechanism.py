@@ -22,6 +22,7 @@ from plant.pose import (
     checked_array,
     checked_rotation,
     checked_unit,
+    numbers,
     quaternion_from_rotation,
     rotation_from_quaternion,
 )
@@ -358,10 +359,22 @@ def _joint_axes(given: ArrayLike | None, directions: Array) -> Array:
 def _checked_limits(limits: Mapping[str, Any], base: Array, platform: Array, home: Pose | None) -> Limits:
     if "stroke" not in limits:
         raise InputError("the limits lack the stroke: two numbers in metres about the home lengths, or (6, 2) lengths")
-    stroke = limits["stroke"]
-    if np.shape(stroke) == (2,):
-        if home is None:
+    stroke = numbers(limits["stroke"], "stroke", "(2,) or (6, 2)")
+    lengths = None if home is None else np.linalg.norm(home.position + platform @ home.rotation.T - base, axis=1)
+    if stroke.shape == (2,):
+        if lengths is None:
             raise InputError("a stroke of two numbers counts from the home lengths: give a home pose, or (6, 2) lengths")
-        lengths = np.linalg.norm(home.position + platform @ home.rotation.T - base, axis=1)
         stroke = lengths[:, None] + checked_array(stroke, (2,), "stroke")
-    return Limits(**{**limits, "stroke": stroke})
+    unknown = set(limits) - {field.name for field in fields(Limits)}
+    if unknown:
+        raise InputError(f"the limits have no entry {sorted(unknown)[0]!r}")
+    checked = Limits(**{**limits, "stroke": stroke})
+    if lengths is not None:
+        leg = int(np.argmax(np.maximum(checked.stroke[:, 0] - lengths, lengths - checked.stroke[:, 1])))
+        least, greatest = checked.stroke[leg]
+        if not least <= lengths[leg] <= greatest:
+            raise InputError(
+                f"leg {leg} is {lengths[leg]:g} m long at home, outside its stroke of {least:g} to {greatest:g} m: "
+                "move the home pose or the stroke"
+            )
+    return checked

@@ -28,16 +28,25 @@ class Pose:
     rotation: Array
 
 
+def numbers(value: ArrayLike, name: str, shape: tuple[int, ...] | str) -> Array:
+    """A float copy of `value`; `shape` is only what an error says was expected.
+
+    Raises:
+        InputError: it is not an array of numbers.
+    """
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be an array of numbers of shape {shape}, got {value!r}") from None
+
+
 def checked_array(value: ArrayLike, shape: tuple[int, ...], name: str, *, allow_nan: bool = False) -> Array:
     """Return a read-only float copy of `value` after checking its shape and that it is finite.
 
     Raises:
         InputError: wrong shape, not numeric, or not finite (NaN passes with `allow_nan`; infinity never).
     """
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} must be an array of numbers of shape {shape}, got {value!r}") from None
+    array = numbers(value, name, shape)
     if array.shape != shape:
         raise InputError(f"{name} must have shape {shape}, got {array.shape}")
     bad = np.isinf(array) if allow_nan else ~np.isfinite(array)
@@ -58,7 +67,9 @@ def checked_unit(value: ArrayLike, size: int, name: str) -> Array:
     norm = float(np.linalg.norm(array))
     if abs(norm - 1.0) > UNIT_TOLERANCE:
         raise InputError(f"{name} has length {norm:.6g}; it must be 1 within {UNIT_TOLERANCE:g}: normalise it")
-    return array / norm
+    unit: Array = array / norm
+    unit.setflags(write=False)
+    return unit
 
 
 def checked_rotation(value: ArrayLike, name: str) -> Array:
@@ -73,7 +84,9 @@ def checked_rotation(value: ArrayLike, name: str) -> Array:
         raise InputError(f"{name} is off orthogonal by {error:.3g}, more than {UNIT_TOLERANCE:g}: give a rotation matrix")
     if np.linalg.det(array) < 0.0:
         raise InputError(f"{name} is a reflection (determinant -1); the frames of a pose are both right-handed")
-    return nearest_rotation(array)
+    rotation = nearest_rotation(array)
+    rotation.setflags(write=False)
+    return rotation
 
 
 def nearest_rotation(matrix: Array) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from plant.errors import InputError, UnknownNameError
-from plant.pose import Array, checked_array
+from plant.pose import Array, checked_array, numbers
 
 Causality = Literal["state", "input", "parameter", "output"]
 
@@ -159,9 +159,10 @@ def checked_parameters(values: Mapping[str, ArrayLike]) -> dict[str, Array]:
         if name not in known:
             raise UnknownNameError(f"the plant has no parameter {name!r}; it has {', '.join(known)}")
         variable = known[name]
-        if np.ndim(value) == 0 and variable.shape and len(variable.shape) == 1:
-            value = np.full(variable.shape, value)
-        array = checked_array(value, variable.shape, name)
+        given = numbers(value, name, variable.shape)
+        if given.ndim == 0 and len(variable.shape) == 1:
+            given = np.full(variable.shape, given)
+        array = checked_array(given, variable.shape, name)
         if variable.minimum is not None and (array < variable.minimum).any():
             raise InputError(f"{name} is {array.min():g} {variable.unit}; it must be at least {variable.minimum:g}")
         checked[name] = array
