@@ -5,12 +5,14 @@ folder that cannot be written. The cache therefore lives in the user's cache fol
 the three packages: any edit gives a new folder, and the old ones are swept away when they have not been used for a month.
 """
 
+import atexit
 import hashlib
 import os
 import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -45,18 +47,27 @@ def hash_of_files(files: Iterable[Path], *extra: str) -> str:
 def keyed_folder(kind: str, key: str) -> Path:
     """The cache folder of this kind and key, made and marked as used; folders long unused are removed.
 
-    Where the user's cache cannot be written, the folder lies among the temporary files.
+    Where the user's cache cannot be written, the folder lasts only as long as the process.
     """
     folder = user_cache() / kind / key
     try:
         folder.mkdir(parents=True, exist_ok=True)
         os.utime(folder)
     except OSError:
-        folder = Path(tempfile.gettempdir()) / f"gough-{os.getuid()}" / kind / key
+        folder = _passing_cache() / kind / key
         folder.mkdir(parents=True, exist_ok=True)
+        return folder
     for other in folder.parent.iterdir():
-        if other != folder and time.time() - other.stat().st_mtime > STALE_AFTER_S:
-            shutil.rmtree(other, ignore_errors=True)
+        with suppress(OSError):
+            if other != folder and time.time() - other.stat().st_mtime > STALE_AFTER_S:
+                shutil.rmtree(other, ignore_errors=True)
+    return folder
+
+
+@cache
+def _passing_cache() -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="gough-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
 
 

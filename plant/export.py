@@ -66,7 +66,7 @@ def build_in_subprocess(path: Path) -> None:
     Raises:
         ToolchainError: no C compiler, or it failed, or `path` cannot be written.
     """
-    run = subprocess.run([sys.executable, "-m", "plant.export", str(path)], capture_output=True, text=True, check=False)
+    run = subprocess.run([sys.executable, "-P", "-m", "plant.export", str(path)], capture_output=True, text=True, check=False)
     if run.returncode:
         last = (run.stderr.strip() or "no output").splitlines()[-1]
         raise ToolchainError(f"the plant's FMU could not be built: {last.removeprefix('plant.errors.ToolchainError: ')}")

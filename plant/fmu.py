@@ -10,6 +10,7 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
+from math import inf
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -184,6 +185,8 @@ class FmuPlant:
             raise FmuError(f"{self.path.name} {'; '.join(problems)}")
 
     def _check_period(self, period: float) -> None:
+        if not 0.0 < period < inf:
+            raise InputError(f"the communication step is {period:g} s; it must be positive and finite")
         co_simulation = self._description.coSimulation
         if co_simulation.canHandleVariableCommunicationStepSize:
             return

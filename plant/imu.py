@@ -310,7 +310,7 @@ def measure(state: Record, ideal: Array, measurement: Array) -> None:
                     else:
                         value += s.bias_walk[kind, imu, axis] + s.noise[kind] * normals[3 * kind + axis]
                     share = 1.0 if first else s.smoothing[kind]
-                    smoothed = share * value + (1.0 - share) * smoothed
+                    smoothed = value if share == 1.0 else smoothed + share * (value - smoothed)
                     s.smoothed[kind, imu, axis] = smoothed
                 delayed = smoothed
                 if s.delay > 0:

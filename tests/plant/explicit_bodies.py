@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from plant.pose import Array
 
-Path = Callable[[float], tuple[Array, Array]]
+PlatformPath = Callable[[float], tuple[Array, Array]]
 """Position (3,) and rotation (3, 3) of the platform against time [s]."""
 
 FIRST = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60.0
@@ -67,9 +67,7 @@ class Bodies:
 
 
 def masses(p: Mapping[str, Array]) -> Array:
-    return np.hstack(
-        [p["platform.mass"], p["payload.mass"], np.full(6, p["leg.lower.mass"]), np.full(6, p["leg.upper.mass"])]
-    )
+    return np.hstack([p["platform.mass"], p["payload.mass"], np.full(6, p["leg.lower.mass"]), np.full(6, p["leg.upper.mass"])])
 
 
 def inertias(p: Mapping[str, Array]) -> Array:
@@ -108,7 +106,7 @@ class Motion:
     length_acceleration: Array
 
 
-def motion_along(p: Mapping[str, Array], path: Path, step: float = 2e-3) -> Motion:
+def motion_along(p: Mapping[str, Array], path: PlatformPath, step: float = 2e-3) -> Motion:
     """The motion of all bodies at time 0 of a path of the platform."""
     samples = [bodies_at(p, *path(i * step)) for i in range(-3, 4)]
     velocity, acceleration = derivatives(np.array([b.places for b in samples]), step)
@@ -121,13 +119,11 @@ def motion_along(p: Mapping[str, Array], path: Path, step: float = 2e-3) -> Moti
     )
 
 
-def path_of(position: Array, rotation: Array, twist: Array, acceleration: Array | None = None) -> Path:
-    """A path through a pose with the twist (6,) and its rate (6,) at time 0."""
-    acceleration = np.zeros(6) if acceleration is None else acceleration
+def path_of(position: Array, rotation: Array, twist: Array) -> PlatformPath:
+    """The path through a pose with a constant twist (6,)."""
 
     def path(t: float) -> tuple[Array, Array]:
-        moved = twist * t + acceleration * t**2 / 2.0
-        return position + moved[:3], Rotation.from_rotvec(moved[3:]).as_matrix() @ rotation
+        return position + twist[:3] * t, Rotation.from_rotvec(twist[3:] * t).as_matrix() @ rotation
 
     return path
 
@@ -137,36 +133,57 @@ def reflected_mass(p: Mapping[str, Array]) -> float:
     return float(p["motor.rotor_inertia"] * (2.0 * pi / p["motor.screw_lead"]) ** 2)
 
 
-def momentum_change(p: Mapping[str, Array], position: Array, rotation: Array, twist: Array, acceleration: Array) -> Array:
-    """The generalised force (6,) that inertia and gravity together take: force and torque on the platform's origin."""
-    motion = motion_along(p, path_of(position, rotation, twist, acceleration))
+def _world_inertias(p: Mapping[str, Array], position: Array, rotation: Array) -> Array:
     attitudes = bodies_at(p, position, rotation).attitudes
-    tensors = attitudes @ inertias(p) @ np.swapaxes(attitudes, 1, 2)
+    return attitudes @ inertias(p) @ np.swapaxes(attitudes, 1, 2)
+
+
+def virtual_motions(p: Mapping[str, Array], position: Array, rotation: Array) -> list[Motion]:
+    """The motions that belong to the six unit twists of the platform."""
+    return [motion_along(p, path_of(position, rotation, unit)) for unit in np.eye(6)]
+
+
+def inertia_matrix(p: Mapping[str, Array], position: Array, rotation: Array) -> Array:
+    """(6, 6): twice the kinetic energy as a form in the twist."""
+    tensors = _world_inertias(p, position, rotation)
+    motions = virtual_motions(p, position, rotation)
+    velocity = np.array([m.velocity for m in motions])
+    spin = np.array([m.angular_velocity for m in motions])
+    rate = np.array([m.length_rate for m in motions])
+    return (
+        np.einsum("aki,k,bki->ab", velocity, masses(p), velocity)
+        + np.einsum("aki,kij,bkj->ab", spin, tensors, spin)
+        + reflected_mass(p) * rate @ rate.T
+    )
+
+
+def bias_force(p: Mapping[str, Array], position: Array, rotation: Array, twist: Array) -> Array:
+    """The generalised force (6,) that gravity and a constant twist take: force and torque on the platform's origin."""
+    motion = motion_along(p, path_of(position, rotation, twist))
+    tensors = _world_inertias(p, position, rotation)
     spin = np.einsum("kij,kj->ki", tensors, motion.angular_velocity)
     torque = np.einsum("kij,kj->ki", tensors, motion.angular_acceleration) + np.cross(motion.angular_velocity, spin)
     force = masses(p)[:, None] * (motion.acceleration - p["gravity"])
-    needed = np.empty(6)
-    for j, unit in enumerate(np.eye(6)):
-        virtual = motion_along(p, path_of(position, rotation, unit))
-        needed[j] = (
+    return np.array(
+        [
             np.sum(force * virtual.velocity)
             + np.sum(torque * virtual.angular_velocity)
             + reflected_mass(p) * motion.length_acceleration @ virtual.length_rate
-        )
-    return needed
+            for virtual in virtual_motions(p, position, rotation)
+        ]
+    )
 
 
 def energies(p: Mapping[str, Array], position: Array, rotation: Array, twist: Array) -> tuple[float, float]:
     """Kinetic and potential energy [J]."""
     motion = motion_along(p, path_of(position, rotation, twist))
-    bodies = bodies_at(p, position, rotation)
-    tensors = bodies.attitudes @ inertias(p) @ np.swapaxes(bodies.attitudes, 1, 2)
+    tensors = _world_inertias(p, position, rotation)
     kinetic = (
         masses(p) @ np.sum(motion.velocity**2, axis=1)
         + np.einsum("ki,kij,kj->", motion.angular_velocity, tensors, motion.angular_velocity)
         + reflected_mass(p) * np.sum(motion.length_rate**2)
     ) / 2.0
-    return float(kinetic), float(-masses(p) @ bodies.places @ p["gravity"])
+    return float(kinetic), float(-masses(p) @ bodies_at(p, position, rotation).places @ p["gravity"])
 
 
 def static_forces(p: Mapping[str, Array], position: Array, rotation: Array) -> Array:

@@ -1,0 +1,142 @@
+"""Compiled kernels and the cache that keeps them."""
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plant.compiled import STALE_AFTER_S, hash_of_files, kernel, keyed_folder, user_cache
+
+
+@kernel
+def _ratio(a: float, b: float) -> float:
+    return a / b
+
+
+@kernel
+def _is_nan(a: float) -> bool:
+    return a != a
+
+
+def test_a_kernel_divides_by_zero_as_numpy_does() -> None:
+    assert _ratio(1.0, 0.0) == np.inf
+    assert np.isnan(_ratio(0.0, 0.0))
+
+
+def test_a_kernel_can_tell_nan() -> None:
+    assert _is_nan(np.nan) and not _is_nan(np.inf)
+
+
+def test_the_cache_is_where_the_user_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    monkeypatch.setenv("GOUGH_CACHE", str(tmp_path / "own"))
+    assert user_cache() == tmp_path / "own"
+    monkeypatch.delenv("GOUGH_CACHE")
+    assert user_cache() == tmp_path / "xdg" / "gough"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert user_cache() == tmp_path / ".cache" / "gough"
+
+
+def test_the_hash_changes_with_content_name_order_and_extra(tmp_path: Path) -> None:
+    a, b, c = tmp_path / "a", tmp_path / "b", tmp_path / "c"
+    for file, text in ((a, "one"), (b, "two"), (c, "one")):
+        file.write_text(text)
+    key = hash_of_files([a, b], "1.0")
+    assert len(key) == 20 and int(key, 16) >= 0
+    assert key == hash_of_files([a, b], "1.0")
+    others = [[a, b], "1.1"], [[b, a], "1.0"], [[c, b], "1.0"], [[a], "1.0"]
+    assert len({key, *(hash_of_files(files, extra) for files, extra in others)}) == 5  # type: ignore[arg-type]
+    b.write_text("twp")
+    assert hash_of_files([a, b], "1.0") != key
+
+
+def test_folders_long_unused_are_swept_away(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("GOUGH_CACHE", str(tmp_path))
+    old, recent = keyed_folder("things", "old"), keyed_folder("things", "recent")
+    (old / "file").write_text("x")
+    elsewhere = keyed_folder("others", "old")
+    now = old.stat().st_mtime
+    os.utime(old, (now - STALE_AFTER_S - 60.0,) * 2)
+    os.utime(recent, (now - STALE_AFTER_S + 60.0,) * 2)
+    os.utime(elsewhere, (now - STALE_AFTER_S - 60.0,) * 2)
+    current = keyed_folder("things", "current")
+    assert not old.exists()
+    assert recent.exists() and current.exists() and elsewhere.exists()
+
+
+def test_use_keeps_a_folder_fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("GOUGH_CACHE", str(tmp_path))
+    folder = keyed_folder("things", "key")
+    (folder / "file").write_text("x")
+    os.utime(folder, (1.0, 1.0))
+    assert keyed_folder("things", "key") == folder
+    keyed_folder("things", "another")
+    assert (folder / "file").exists()
+
+
+def test_a_cache_that_cannot_be_written_gives_way_to_temporary_files(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setenv("GOUGH_CACHE", str(tmp_path / "file"))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    folder = keyed_folder("things", "key")
+    assert folder.is_relative_to(tmp_path / "temporary") and folder.is_dir()
+    assert keyed_folder("things", "key") == folder
+
+
+def test_machine_code_is_kept_in_the_cache_alone(tmp_path: Path) -> None:
+    """A fresh process compiles into the cache folder, and the next one compiles nothing."""
+    code = (
+        "import numpy as np; from plant.pose import rotation_from_quaternion as r; r(np.array([1.0, 0.0, 0.0, 0.0]));"
+        "print(sum(r.stats.cache_hits.values()), sum(r.stats.cache_misses.values()))"
+    )
+    package = Path(__file__).resolve().parents[2] / "plant"
+    before = sorted(package.rglob("*.nb?"))
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", code],
+            env=os.environ | {"GOUGH_CACHE": str(tmp_path)},
+            cwd=package.parent,
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout.split()
+        for _ in range(2)
+    ]
+    assert said == [["0", "1"], ["1", "0"]]
+    assert len(list((tmp_path / "kernels").iterdir())) == 1
+    assert list((tmp_path / "kernels").rglob("*.nbc"))
+    assert sorted(package.rglob("*.nb?")) == before
+
+
+def test_an_edit_in_any_package_gives_a_new_folder(tmp_path: Path) -> None:
+    """The sources are copied, one file is edited, and the kernels of another file move to another folder."""
+    root = Path(__file__).resolve().parents[2]
+    copy = tmp_path / "copy"
+    for package in ("plant", "controller", "hil"):
+        for file in (root / package).glob("*.py"):
+            (copy / package).mkdir(parents=True, exist_ok=True)
+            (copy / package / file.name).write_bytes(file.read_bytes())
+    code = "from plant.compiled import _kernel_folder; print(_kernel_folder().name)"
+
+    def key() -> str:
+        run = subprocess.run(
+            [sys.executable, "-c", code],
+            env=os.environ | {"GOUGH_CACHE": str(tmp_path / "cache"), "PYTHONPATH": str(copy)},
+            cwd=copy,
+            check=True,
+            capture_output=True,
+            text=True,
+        )
+        return run.stdout.strip()
+
+    first = key()
+    assert key() == first
+    edited = copy / "controller" / "pid.py"
+    edited.write_text(edited.read_text() + "# edited\n")
+    assert key() != first

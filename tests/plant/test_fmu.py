@@ -1,0 +1,458 @@
+"""Running an FMU: what is refused and why, what is left behind, and that compiled calls do what FMPy's methods do."""
+
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import fmpy
+import numpy as np
+import pytest
+
+from plant.errors import FmuError, InputError, UnknownNameError
+from plant.fmu import FmuPlant, advance, read_imus, read_truth, write_command, write_drive_mode
+from plant.mechanism import Mechanism
+from plant.pose import Array
+from plant.variables import BRAKE, OPEN, OUTPUTS, VELOCITY
+
+MakePlant = Callable[..., FmuPlant]
+BINARY = f"binaries/{fmpy.platform_tuple}/gough_plant{fmpy.sharedLibraryExtension}"
+
+
+def copy_of(fmu: Path, target: Path, description: dict[str, str] | None = None, members: dict[str, Any] | None = None) -> Path:
+    """A copy of an FMU with some text of its description and some members replaced (None: left out)."""
+    with zipfile.ZipFile(fmu) as archive:
+        contents: dict[str, Any] = {name: archive.read(name) for name in archive.namelist()}
+    text = contents["modelDescription.xml"].decode()
+    for pattern, replacement in (description or {}).items():
+        text, count = re.subn(pattern, replacement, text, flags=re.DOTALL)
+        assert count, f"{pattern} is not in the description"
+    contents |= {"modelDescription.xml": text} | (members or {})
+    with zipfile.ZipFile(target, "w") as archive:
+        for name, data in contents.items():
+            if data is not None:
+                archive.writestr(name, data)
+    return target
+
+
+def refused(path: Path, hexapod: Mechanism, period: float = 1e-3, parameters: dict[str, Any] | None = None) -> str:
+    """The message with which an FMU is refused; it names the file."""
+    with pytest.raises(FmuError) as caught:
+        FmuPlant(path, parameters or hexapod.plant_parameters(), period)
+    assert path.name in str(caught.value)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# ---- files that are refused ----
+
+
+def test_a_missing_file_is_named(hexapod: Mechanism, tmp_path: Path) -> None:
+    assert "there is no FMU at" in refused(tmp_path / "missing.fmu", hexapod)
+
+
+@pytest.mark.parametrize("content", [b"", b"no archive at all", b"PK\x03\x04 torn off"])
+def test_a_file_that_is_no_archive_is_refused(hexapod: Mechanism, tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "broken.fmu"
+    path.write_bytes(content)
+    assert "is not a usable FMU" in refused(path, hexapod)
+
+
+def test_a_folder_is_refused(hexapod: Mechanism, tmp_path: Path) -> None:
+    (tmp_path / "folder.fmu").mkdir()
+    refused(tmp_path / "folder.fmu", hexapod)
+
+
+def test_an_archive_cut_short_is_refused(hexapod: Mechanism, fmu_path: Path, tmp_path: Path) -> None:
+    path = tmp_path / "short.fmu"
+    path.write_bytes(fmu_path.read_bytes()[:-100])
+    assert "is not a usable FMU" in refused(path, hexapod)
+
+
+def test_a_damaged_member_is_refused(hexapod: Mechanism, fmu_path: Path, tmp_path: Path) -> None:
+    """The directory of the archive is whole, but the binary in it has a wrong checksum."""
+    data = bytearray(fmu_path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path = tmp_path / "damaged.fmu"
+    path.write_bytes(data)
+    refused(path, hexapod)
+
+
+def test_an_archive_without_a_description_is_refused(hexapod: Mechanism, tmp_path: Path) -> None:
+    path = tmp_path / "empty.fmu"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("readme.txt", "nothing here")
+    assert "is not a usable FMU" in refused(path, hexapod)
+
+
+def test_a_description_off_the_schema_is_refused(hexapod: Mechanism, fmu_path: Path, tmp_path: Path) -> None:
+    path = copy_of(fmu_path, tmp_path / "odd.fmu", {'causality="output"': 'causality="outcome"'})
+    assert "is not a usable FMU" in refused(path, hexapod)
+
+
+FMI2 = """<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="2.0" modelName="two" guid="{1}">
+<CoSimulation modelIdentifier="two"/><ModelVariables>
+<ScalarVariable name="x" valueReference="0" causality="output" variability="continuous"><Real/></ScalarVariable>
+</ModelVariables><ModelStructure><Outputs><Unknown index="1"/></Outputs></ModelStructure></fmiModelDescription>
+"""
+
+
+def test_an_fmu_of_fmi_2_is_refused(hexapod: Mechanism, tmp_path: Path) -> None:
+    path = tmp_path / "two.fmu"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("modelDescription.xml", FMI2)
+    assert "is not an FMI 3.0 Co-Simulation FMU (it declares FMI 2.0)" in refused(path, hexapod)
+
+
+def test_an_fmu_for_model_exchange_is_refused(hexapod: Mechanism, fmu_path: Path, tmp_path: Path) -> None:
+    changes = {"<CoSimulation[^>]*/>": '<ModelExchange modelIdentifier="gough_plant"/>'}
+    message = refused(copy_of(fmu_path, tmp_path / "exchange.fmu", changes), hexapod)
+    assert "is not an FMI 3.0 Co-Simulation FMU" in message
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("velocity_command", "lacks velocity_command[6]"),
+        ("drive_mode", "lacks drive_mode[6]"),
+        ("imu_specific_force", "lacks imu_specific_force[7, 3]"),
+        ("leg_length", "lacks leg_length[6]"),
+    ],
+)
+def test_an_fmu_without_a_needed_variable_is_refused(
+    hexapod: Mechanism, fmu_path: Path, tmp_path: Path, name: str, message: str
+) -> None:
+    path = copy_of(fmu_path, tmp_path / "lacking.fmu", {f'name="{name}"': f'name="other.{name}"'})
+    assert message in refused(path, hexapod)
+
+
+def test_all_that_is_wrong_with_the_variables_is_said_at_once(hexapod: Mechanism, fmu_path: Path, tmp_path: Path) -> None:
+    changes = {
+        r'(name="position"[^>]*>)<Dimension start="3"/>': r'\1<Dimension start="4"/>',
+        r'(name="imu_magnetic_field"[^>]*>)<Dimension start="7"/><Dimension start="3"/>': r'\1<Dimension start="21"/>',
+        'name="current"': 'name="currents"',
+    }
+    message = refused(copy_of(fmu_path, tmp_path / "wrong.fmu", changes), hexapod)
+    assert "has position as output Float64[4] instead of output Float64[3]" in message
+    assert "has imu_magnetic_field as output Float64[21] instead of output Float64[7, 3]" in message
+    assert "lacks current[6]" in message
+
+
+def test_a_variable_of_the_wrong_type_is_refused(hexapod: Mechanism, fmu_path: Path, tmp_path: Path) -> None:
+    enumeration = r'<Enumeration name="drive_mode"([^>]*) declaredType="DriveMode"([^>]*>.*?)</Enumeration>'
+    path = copy_of(fmu_path, tmp_path / "typed.fmu", {enumeration: r'<Float64 name="drive_mode"\1\2</Float64>'})
+    assert "has drive_mode as input Float64[6] instead of input Enumeration[6]" in refused(path, hexapod)
+
+
+def test_a_variable_of_the_wrong_causality_is_refused(hexapod: Mechanism, fmu_path: Path, tmp_path: Path) -> None:
+    changes = {r'(name="external_wrench" valueReference="2") causality="input" variability="continuous"': (
+        r'\1 causality="parameter" variability="tunable"'
+    )}  # fmt: skip
+    message = refused(copy_of(fmu_path, tmp_path / "causal.fmu", changes), hexapod)
+    assert "has external_wrench as parameter Float64[6] instead of input Float64[6]" in message
+
+
+def test_an_fmu_for_another_machine_is_refused(hexapod: Mechanism, fmu_path: Path, tmp_path: Path) -> None:
+    members = {BINARY: None, "binaries/riscv64-linux/gough_plant.so": b"elf"}
+    message = refused(copy_of(fmu_path, tmp_path / "foreign.fmu", members=members), hexapod)
+    assert f"holds no binary for {fmpy.platform_tuple}: build it for this machine" in message
+
+
+def test_a_binary_that_does_not_load_is_refused(hexapod: Mechanism, fmu_path: Path, tmp_path: Path) -> None:
+    path = copy_of(fmu_path, tmp_path / "noise.fmu", members={BINARY: b"not a library"})
+    before = Path.cwd()
+    try:
+        assert "cannot be loaded" in refused(path, hexapod)
+        assert Path.cwd() == before
+    finally:
+        os.chdir(before)
+
+
+def test_a_binary_of_another_build_is_refused(hexapod: Mechanism, fmu_path: Path, tmp_path: Path) -> None:
+    path = copy_of(fmu_path, tmp_path / "stale.fmu", {'instantiationToken="[^"]*"': 'instantiationToken="{0}"'})
+    assert "cannot be loaded: the instantiationToken is not that of modelDescription.xml" in refused(path, hexapod)
+
+
+# ---- parameters and inputs that are refused ----
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"platform.mass": np.array(-1.0)}, "parameter platform.mass is -1; it must be finite and at least 1e-09"),
+        ({"substep": np.array(0.0)}, "parameter substep is 0; it must be finite and at least 1e-06"),
+        ({"gravity": np.array([0.0, 0.0, np.nan])}, "parameter gravity is .*nan; it must be finite"),
+        ({"motor.resistance": np.array([0.6, 0.6, 0.6, np.inf, 0.6, 0.6])}, "parameter motor.resistance is inf"),
+        ({"initial_quaternion": np.array([1.0, 0.1, 0.0, 0.0])}, "initial_quaternion is not a unit quaternion; normalise it"),
+        ({"initial_quaternion": np.zeros(4)}, "initial_quaternion is not a unit quaternion"),
+    ],
+)
+def test_a_parameter_is_refused_in_the_words_of_the_fmu(
+    hexapod: Mechanism, fmu_path: Path, change: dict[str, Array], message: str
+) -> None:
+    said = refused(fmu_path, hexapod, parameters=hexapod.plant_parameters() | change)
+    assert re.search(f"gough_plant.fmu: initialisation failed: .*{message}", said)
+
+
+def test_a_parameter_of_another_name_or_size_is_refused(fmu_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match=r"gough_plant.fmu has no variable 'platform.weight'"):
+        FmuPlant(fmu_path, {"platform.weight": 1.0}, 1e-3)
+    with pytest.raises(InputError, match=r"gravity of gough_plant.fmu has 3 elements, got 2"):
+        FmuPlant(fmu_path, {"gravity": [0.0, 1.0]}, 1e-3)
+
+
+@pytest.mark.parametrize("value", ["fast", [[1.0], [1.0, 2.0]], None])
+def test_a_value_that_is_no_number_is_refused(make_plant: MakePlant, value: Any) -> None:
+    with pytest.raises(InputError, match="velocity_command"):
+        make_plant().set("velocity_command", value)
+
+
+def test_a_fractional_drive_mode_is_refused(make_plant: MakePlant) -> None:
+    with pytest.raises(InputError, match="drive_mode"):
+        make_plant().set("drive_mode", np.full(6, 1.5))
+
+
+@pytest.mark.parametrize("mode", [-1, 3])
+def test_a_drive_mode_that_does_not_exist_is_refused(make_plant: MakePlant, mode: int) -> None:
+    with pytest.raises(FmuError, match=re.escape("drive_mode must be 0 (open), 1 (brake) or 2 (velocity)")):
+        make_plant().set("drive_mode", np.full(6, mode))
+
+
+@pytest.mark.parametrize("name", ["velocity_command", "external_wrench"])
+def test_an_input_that_is_not_finite_stops_the_step(make_plant: MakePlant, name: str) -> None:
+    plant = make_plant()
+    plant.set(name, [0.0, 0.0, 0.0, np.nan, 0.0, 0.0])
+    with pytest.raises(FmuError, match="a step failed: an input is not finite"):
+        plant.step(1e-3)
+
+
+def test_a_motion_that_diverges_is_reported(make_plant: MakePlant) -> None:
+    plant = make_plant({"substep": 0.1, "brake.damping": 1e7})
+    with pytest.raises(FmuError, match="the state is no longer finite: reduce substep, or check the parameters"):
+        for _ in range(100):
+            plant.step(0.1)
+
+
+@pytest.mark.parametrize("duration", [0.0, -1e-3, np.nan, np.inf])
+def test_a_step_that_is_not_positive_is_refused(make_plant: MakePlant, duration: float) -> None:
+    with pytest.raises(FmuError, match="the communication step must be positive"):
+        make_plant().step(duration)
+
+
+def test_only_tunable_parameters_change_during_a_run(make_plant: MakePlant) -> None:
+    plant = make_plant()
+    plant.step(1e-3)
+    with pytest.raises(FmuError, match=r"platform.mass .* is fixed once initialisation has ended"):
+        plant.set("platform.mass", 4.0)
+    assert plant.get("platform.mass") == 3.0
+    before = plant.get("potential_energy")
+    plant.set("payload.mass", 11.0)
+    height = plant.get("position")[2] + 0.10
+    assert plant.get("potential_energy") - before == pytest.approx(9.81 * height, rel=1e-6)
+    with pytest.raises(FmuError, match=r"payload.mass is -1; it must be finite and at least 0"):
+        plant.set("payload.mass", -1.0)
+
+
+def test_outputs_cannot_be_set(make_plant: MakePlant) -> None:
+    with pytest.raises(FmuError, match=r"position .* is an output and cannot be set"):
+        make_plant().set("position", np.zeros(3))
+
+
+def test_unknown_names_are_refused(make_plant: MakePlant) -> None:
+    plant = make_plant()
+    for use in (plant.get, lambda name: plant.set(name, 0.0)):
+        with pytest.raises(UnknownNameError, match=r"gough_plant.fmu has no variable 'height'"):
+            use("height")
+
+
+# ---- fixed steps ----
+
+
+@pytest.fixture
+def fixed_step(fmu_path: Path, tmp_path: Path) -> Path:
+    changes = {
+        'canHandleVariableCommunicationStepSize="true"': (
+            'canHandleVariableCommunicationStepSize="false" fixedInternalStepSize="0.002"'
+        )
+    }
+    return copy_of(fmu_path, tmp_path / "fixed.fmu", changes)
+
+
+@pytest.mark.parametrize("period", [0.002, 0.004, 0.020])
+def test_a_fixed_step_fmu_takes_whole_multiples(hexapod: Mechanism, fixed_step: Path, period: float) -> None:
+    with FmuPlant(fixed_step, hexapod.plant_parameters(), period) as plant:
+        plant.step(period)
+        assert plant.get("time") == period
+
+
+@pytest.mark.parametrize("period", [0.001, 0.003, 0.0005])
+def test_a_fixed_step_fmu_refuses_other_rates(hexapod: Mechanism, fixed_step: Path, period: float) -> None:
+    message = f"fixed.fmu cannot take a rate of {1 / period:g} Hz: its step is fixed at 0.002 s, so .* 500 Hz divided by"
+    with pytest.raises(InputError, match=message):
+        FmuPlant(fixed_step, hexapod.plant_parameters(), period)
+
+
+@pytest.mark.parametrize("period", [0.0, -0.002, np.nan, np.inf])
+def test_a_period_that_is_no_time_is_refused(hexapod: Mechanism, fixed_step: Path, period: float) -> None:
+    with pytest.raises(InputError, match=r"fixed\.fmu cannot take"):
+        FmuPlant(fixed_step, hexapod.plant_parameters(), period)
+
+
+def test_without_a_fixed_step_the_default_step_counts(hexapod: Mechanism, fmu_path: Path, tmp_path: Path) -> None:
+    changes = {'canHandleVariableCommunicationStepSize="true"': ""}
+    path = copy_of(fmu_path, tmp_path / "default.fmu", changes)
+    with pytest.raises(InputError, match=r"its step is fixed at 0.001 s"):
+        FmuPlant(path, hexapod.plant_parameters(), 0.0015)
+    FmuPlant(path, hexapod.plant_parameters(), 0.002).close()
+
+
+# ---- nothing is left behind ----
+
+
+@pytest.fixture
+def temporary(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    return folder
+
+
+def test_closing_removes_what_was_extracted(hexapod: Mechanism, fmu_path: Path, temporary: Path) -> None:
+    with FmuPlant(fmu_path, hexapod.plant_parameters(), 1e-3) as plant:
+        assert len(list(temporary.iterdir())) == 1
+        plant.close()
+        assert list(temporary.iterdir()) == []
+    plant.close()
+
+
+@pytest.mark.parametrize("change", [{"platform.mass": -1.0}, {"no.such": 1.0}, {"gravity": 1.0}])
+def test_a_refused_start_leaves_nothing_behind(fmu_path: Path, temporary: Path, change: dict[str, float]) -> None:
+    with pytest.raises((FmuError, UnknownNameError, InputError)):
+        FmuPlant(fmu_path, change, 1e-3)
+    assert list(temporary.iterdir()) == []
+
+
+def test_loading_keeps_the_working_directory(hexapod: Mechanism, fmu_path: Path) -> None:
+    before = Path.cwd()
+    FmuPlant(fmu_path, hexapod.plant_parameters(), 1e-3).close()
+    assert Path.cwd() == before
+
+
+def test_a_closed_plant_refuses_and_does_not_crash(fmu_path: Path) -> None:
+    """In a process of its own, for a call into a freed library would end it."""
+    code = (
+        "import sys; from plant.errors import GoughError; from plant.fmu import FmuPlant\n"
+        "plant = FmuPlant(sys.argv[1], {}, 1e-3); plant.close()\n"
+        "for use in (lambda: plant.step(1e-3), lambda: plant.get('position'), lambda: plant.set('gravity', [0, 0, 0])):\n"
+        "    try: use()\n"
+        "    except GoughError as error: print(error)\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code, str(fmu_path)], capture_output=True, text=True, check=False)
+    assert run.returncode == 0
+    assert len(run.stdout.splitlines()) == 3
+
+
+# ---- compiled calls ----
+
+
+def commands(cycle: int) -> tuple[Array, int]:
+    return 0.1 * np.sin(0.05 * cycle + np.arange(6.0)), (BRAKE, VELOCITY, OPEN, VELOCITY)[cycle // 50]
+
+
+def test_compiled_calls_do_what_fmpys_methods_do(hexapod: Mechanism, fmu_path: Path, tmp_path: Path) -> None:
+    """The same motion through the kernels and through FMPy alone, bit for bit."""
+    folder = fmpy.extract(str(fmu_path), unzipdir=str(tmp_path))
+    description = fmpy.read_model_description(folder)
+    references = {variable.name: variable.valueReference for variable in description.modelVariables}
+    slow = fmpy.fmi3.FMU3Slave(
+        guid=description.guid,
+        unzipDirectory=folder,
+        modelIdentifier=description.coSimulation.modelIdentifier,
+        instanceName="slow",
+    )
+    slow.instantiate()
+    for name, value in hexapod.plant_parameters().items():
+        slow.setFloat64([references[name]], np.ravel(value).tolist())
+    slow.enterInitializationMode()
+    slow.exitInitializationMode()
+
+    imu = ("imu_angular_velocity", "imu_specific_force", "imu_magnetic_field")
+    truth = ("position", "quaternion", "leg_length", "current")
+    period, time = 1e-3, 0.0
+    with FmuPlant(fmu_path, hexapod.plant_parameters(), period) as plant:
+        for cycle in range(200):
+            command, mode = commands(cycle)
+            assert write_command(plant.calls, command) == 0
+            assert write_drive_mode(plant.calls, mode) == 0
+            slow.setFloat64([references["velocity_command"]], command.tolist())
+            slow.setInt64([references["drive_mode"]], [mode] * 6)
+            assert advance(plant.calls, period) == 0
+            slow.doStep(time, period)
+            time += period
+            assert read_imus(plant.calls) == 0
+            assert read_truth(plant.calls) == 0
+            expected = slow.getFloat64([references[name] for name in imu], nValues=63)
+            np.testing.assert_array_equal(plant.calls["imu"].ravel(), expected)
+            np.testing.assert_array_equal(plant.calls["truth"], slow.getFloat64([references[n] for n in truth], nValues=19))
+            assert plant.calls["time"] == plant.get("time") == slow.getFloat64([references["time"]])[0]
+        assert np.ptp(plant.get("leg_length")) > 1e-4
+        for variable in OUTPUTS:
+            one_by_one = slow.getFloat64([references[variable.name]], nValues=variable.size)
+            np.testing.assert_array_equal(plant.get(variable.name).ravel(), one_by_one)
+    slow.terminate()
+    slow.freeInstance()
+
+
+def test_setting_by_name_is_the_compiled_command(make_plant: MakePlant) -> None:
+    fast, slow = make_plant(), make_plant()
+    command = np.linspace(-0.1, 0.1, 6)
+    write_command(fast.calls, command)
+    write_drive_mode(fast.calls, VELOCITY)
+    slow.set("velocity_command", command)
+    slow.set("drive_mode", [VELOCITY] * 6)
+    for plant in (fast, slow):
+        plant.step(0.02)
+    np.testing.assert_array_equal(fast.get("current"), slow.get("current"))
+    assert np.abs(fast.get("current")).max() > 0.1
+
+
+def test_compiled_calls_report_a_failure_by_status(make_plant: MakePlant) -> None:
+    plant = make_plant()
+    assert write_command(plant.calls, np.full(6, np.inf)) == 0
+    assert advance(plant.calls, 1e-3) == 3
+    assert "an input is not finite" in str(plant.failure("stopped"))
+    plant.calls["imu_references"] = 10_000
+    assert read_imus(plant.calls) == 3
+
+
+def test_plants_do_not_share_their_state(make_plant: MakePlant) -> None:
+    moving, resting = make_plant(), make_plant({"gravity": [0.0, 0.0, 0.0]})
+    moving.set("drive_mode", [VELOCITY] * 6)
+    moving.set("velocity_command", [0.1] * 6)
+    before = resting.get("position")
+    for _ in range(100):
+        moving.step(1e-3)
+        resting.step(1e-3)
+    np.testing.assert_allclose(resting.get("position"), before, atol=1e-15)
+    assert moving.get("position")[2] - before[2] > 5e-3
+
+
+def test_a_reset_fmu_starts_over(make_plant: MakePlant, hexapod: Mechanism) -> None:
+    plant = make_plant({"payload.mass": 5.0})
+    first = plant.get("position")
+    plant.set("drive_mode", [OPEN] * 6)
+    for _ in range(10):
+        plant.step(1e-3)
+    plant._fmu.reset()
+    plant._fmu.enterInitializationMode()
+    plant._fmu.exitInitializationMode()
+    plant.calls["time"] = 0.0
+    np.testing.assert_array_equal(plant.get("position"), first)
+    assert plant.get("payload.mass") == hexapod.plant["payload.mass"]
+    plant.step(1e-3)
