@@ -2,16 +2,15 @@
 
 import argparse
 import json
-import os
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
 
-from plant.errors import GoughError, InputError
+from plant.errors import GoughError
+from plant.files import check_writable, write_whole
 
 REFUSED, INTERRUPTED = 2, 130
 """Exit statuses beside 0, and 1 for a run that ended before its time: bad input, with nothing done; Ctrl-C."""
@@ -127,8 +126,7 @@ def _imus(text: str) -> tuple[int, ...]:
 def _simulate(options: argparse.Namespace) -> int:
     from hil.simulation import SimulationConfig, SimulationStoppedError, simulate
 
-    for path in (options.json, options.report):
-        _check_writable(path)
+    _check_writable(options.json, options.report)
     names = ("mechanism", "target", "duration", "rate", "imu", "seed", "fusion", "plant", "imus")
     config = SimulationConfig(**{name: getattr(options, name) for name in names})
     stopped = None
@@ -247,27 +245,15 @@ def _progress(label: str) -> Iterator[Callable[[float], None]]:
         yield lambda share: bar.update(task, total=1.0, completed=share)
 
 
-def _check_writable(path: Path | None) -> None:
-    """Refuse a file that could not be written, before any work is done for it.
-
-    Raises:
-        InputError: the folder does not exist or cannot be written, or the path is a folder.
-    """
-    if path is None:
-        return
-    folder = path.absolute().parent
-    if path.is_dir() or not folder.is_dir() or not os.access(folder, os.W_OK):
-        raise InputError(f"cannot write {path}: {'it is a folder' if path.is_dir() else f'no writable folder {folder}'}")
+def _check_writable(*paths: Path | None) -> None:
+    for path in paths:
+        if path is not None:
+            check_writable(path)
 
 
 def _write_json(path: Path | None, content: dict[str, Any]) -> None:
-    if path is None:
-        return
-    with tempfile.NamedTemporaryFile("w", dir=path.absolute().parent, suffix=".part", delete=False) as part:
-        json.dump(content, part, indent=2)
-        part.write("\n")
-    Path(part.name).chmod(0o644)
-    Path(part.name).replace(path)
+    if path is not None:
+        write_whole(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ Run in a process of its own (`python -m plant.export FILE`), because CasADi must
 loop. The FMU is native and holds no Python.
 """
 
+import io
 import platform
 import re
 import shutil
@@ -20,6 +21,7 @@ import fmpy
 
 from plant.compiled import hash_of_files, keyed_folder
 from plant.errors import ToolchainError
+from plant.files import write_whole
 from plant.mechanism import load_mechanism
 from plant.pose import Array
 from plant.variables import BRAKE, DRIVE_MODES, INPUTS, OUTPUTS, PARAMETERS, STATES, Variable
@@ -69,7 +71,7 @@ def build_in_subprocess(path: Path) -> None:
     run = subprocess.run([sys.executable, "-P", "-m", "plant.export", str(path)], capture_output=True, text=True, check=False)
     if run.returncode:
         last = (run.stderr.strip() or "no output").splitlines()[-1]
-        raise ToolchainError(f"the plant's FMU could not be built: {last.removeprefix('plant.errors.ToolchainError: ')}")
+        raise ToolchainError(f"the plant's FMU could not be built: {last.split(': ', 1)[-1]}")
 
 
 def c_compiler() -> str:
@@ -88,7 +90,8 @@ def build(path: Path) -> None:
     """Write the plant as an FMI 3.0 Co-Simulation FMU; the file appears whole or not at all.
 
     Raises:
-        ToolchainError: no C compiler, or it failed, or `path` cannot be written.
+        ToolchainError: no C compiler, or it failed.
+        InputError: `path` cannot be written.
     """
     compiler = c_compiler()
     starts = load_mechanism("hexapod").plant_parameters()
@@ -110,21 +113,16 @@ def build(path: Path) -> None:
             raise ToolchainError(f"{compiler} could not compile the plant: {complaint}")
         description = _model_description(starts, token, dependencies)
         contents = {"modelDescription.xml": description.encode(), f"binaries/{_platform()}/{MODEL}.so": library.read_bytes()}
-        _write_archive(path, contents)
+        write_whole(path, _archive(contents))
 
 
-def _write_archive(path: Path, contents: dict[str, bytes]) -> None:
-    if path.is_dir():
-        raise ToolchainError(f"cannot write {path}: it is a folder")
-    try:
-        part = tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False)  # noqa: SIM115
-        with part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, data in contents.items():
-                archive.writestr(zipfile.ZipInfo(name, _EPOCH), data, zipfile.ZIP_DEFLATED)
-        Path(part.name).chmod(0o644)
-        Path(part.name).replace(path)
-    except OSError as error:
-        raise ToolchainError(f"cannot write {path}: {error.strerror}") from None
+def _archive(contents: dict[str, bytes]) -> bytes:
+    """A zip archive without the time of its making, so that the same sources give the same bytes."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in contents.items():
+            archive.writestr(zipfile.ZipInfo(name, _EPOCH), data, zipfile.ZIP_DEFLATED)
+    return buffer.getvalue()
 
 
 def _platform() -> str:

@@ -186,7 +186,7 @@ class FmuPlant:
 
     def _check_period(self, period: float) -> None:
         if not 0.0 < period < inf:
-            raise InputError(f"the communication step is {period:g} s; it must be positive and finite")
+            raise InputError(f"{self.path.name} cannot take a step of {period:g} s; it must be positive and finite")
         co_simulation = self._description.coSimulation
         if co_simulation.canHandleVariableCommunicationStepSize:
             return
