@@ -29,12 +29,13 @@ def angle_between(first, second):
 
 def random_rotation(random):
     """Uniform over all rotations."""
-    return Rotation.random(rng=random).as_matrix()
+    return Rotation.from_quat(random.normal(size=4)).as_matrix()
 
 
 def leg_vectors(mechanism, position, rotation):
     """The paper's (1), leg by leg."""
-    return np.array([position + rotation @ a - b for a, b in zip(mechanism.platform_joints, mechanism.base_joints, strict=True)])
+    joints = zip(mechanism.platform_joints, mechanism.base_joints, strict=True)
+    return np.array([position + rotation @ a - b for a, b in joints])
 
 
 def leg_directions(mechanism, position, rotation):
@@ -69,19 +70,16 @@ def random_mechanism(random, base_count=6, platform_count=6, *, coplanar=True, u
     return Mechanism.from_legs(base[[b for b, _ in legs]], platform[[p for _, p in legs]], up_in_base=up_in_base)
 
 
-def leg_frames(mechanism, directions):
-    """(6, 3, 3): the frames of legs on universal joints; z along the leg, y across the leg and the axis in the base."""
-    frames = []
-    for direction, axis in zip(directions, mechanism.base_joint_axes, strict=True):
-        second = unit(np.cross(direction, axis))
-        frames.append(np.column_stack([np.cross(second, direction), second, direction]))
-    return np.array(frames)
+def leg_frames(directions, axes):
+    """The frames (..., 3, 3) of legs on universal joints: z along the leg, y across the leg and the axis in the base."""
+    seconds = unit(np.cross(directions, axes))
+    return np.stack([np.cross(seconds, directions), seconds, directions], axis=-1)
 
 
 def static_signals(mechanism, position, rotation):
     """What the seven ideal IMUs read (3, 7, 3) on a mechanism at rest: no rate, and the reaction to gravity."""
     gravity = mechanism.plant["gravity"]
-    frames = [*leg_frames(mechanism, leg_directions(mechanism, position, rotation)), rotation]
+    frames = [*leg_frames(leg_directions(mechanism, position, rotation), mechanism.base_joint_axes), rotation]
     signals = np.zeros((3, 7, 3))
     signals[1] = [frame.T @ -gravity for frame in frames]
     signals[2] = [frame.T @ mechanism.plant["magnetic_field"] for frame in frames]

@@ -1,15 +1,18 @@
 """Inverse kinematics: the paper's (1) by hand, the Jacobian by finite differences, and the compiled twins."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from leg_geometry import leg_vectors, random_mechanism, random_rotation, rotation_of
 
 from controller.inverse_kinematics import inverse_kinematics, jacobian_at, leg_lengths, legs_at, sample_workspace
 from plant.errors import GoughError, InputError
 from plant.mechanism import Mechanism
 from plant.pose import Pose
+from tests.controller.leg_geometry import leg_vectors, random_mechanism, random_rotation, rotation_of
 
 TURNS = st.one_of(
     st.tuples(*[st.floats(-1.0, 1.0)] * 3),
@@ -26,8 +29,8 @@ def compiled_legs(mechanism, pose):
 
 def test_a_leg_by_hand():
     # A quarter turn about z carries (0.1, 0.2, 0) to (-0.2, 0.1, 0): p + R a - b = (-0.1, 0.3, 0.6) - (0.2, -0.1, 0).
-    base = np.array([[0.2, -0.1, 0.0], [0.3, 0.3, 0.0], [-0.3, 0.2, 0.0], [-0.3, -0.2, 0.0], [0.0, -0.3, 0.0], [0.1, 0.3, 0.0]])
-    platform = np.array([[0.1, 0.2, 0.0], [0.2, 0.1, 0.0], [-0.1, 0.2, 0.0], [-0.2, 0.0, 0.0], [0.0, -0.2, 0.0], [0.2, 0.0, 0.0]])
+    base = [[0.2, -0.1, 0.0], [0.3, 0.3, 0.0], [-0.3, 0.2, 0.0], [-0.3, -0.2, 0.0], [0.0, -0.3, 0.0], [0.1, 0.3, 0.0]]
+    platform = [[0.1, 0.2, 0.0], [0.2, 0.1, 0.0], [-0.1, 0.2, 0.0], [-0.2, 0.0, 0.0], [0.0, -0.2, 0.0], [0.2, 0.0, 0.0]]
     mechanism = Mechanism.from_legs(base, platform)
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     legs = inverse_kinematics(mechanism, Pose(np.array([0.1, 0.2, 0.6]), quarter))
@@ -139,3 +142,21 @@ def test_a_workspace_wants_home_and_stroke(hexapod):
     for mechanism, said in ((without_home, "home"), (without_stroke, "stroke")):
         with pytest.raises(InputError, match=said):
             sample_workspace(mechanism, 1, seed=0)
+
+
+def test_a_home_far_outside_the_stroke_is_an_error_and_not_an_endless_search(hexapod):
+    """In a process of its own, which can be ended: the stroke is in millimetres by mistake."""
+    program = (
+        "from controller.inverse_kinematics import sample_workspace\n"
+        "from plant.mechanism import Mechanism, load_mechanism\n"
+        "from plant.errors import InputError\n"
+        "h = load_mechanism('hexapod')\n"
+        "try:\n"
+        "    limits = {'stroke': [[334.0, 454.0]] * 6}\n"
+        "    m = Mechanism.from_legs(h.base_joints, h.platform_joints, home=h.home, limits=limits)\n"
+        "    sample_workspace(m, 1, seed=0)\n"
+        "except InputError:\n"
+        "    print('refused')\n"
+    )
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30, check=False)
+    assert run.stdout.strip() == "refused", run.stderr

@@ -1,0 +1,551 @@
+"""The cycle: from raw IMU data to commands, with every set of IMUs that it accepts, bit by bit the same again."""
+
+from itertools import combinations
+
+import numba
+import numpy as np
+import pytest
+from numba.core.runtime import _nrt_python, rtsys
+from scipy.spatial.transform import Rotation
+
+from controller.cycle import (
+    ALL_IMUS,
+    LEG_IMUS,
+    NOT_FINITE,
+    OK,
+    POSE_LOST,
+    STATE,
+    check_imus,
+    cycle,
+    cycle_parameters,
+    refine_pose,
+)
+from controller.direct_kinematics import solve
+from controller.inverse_kinematics import leg_lengths, sample_workspace
+from controller.settings import ControlSettings, FusionSettings, control_settings, fusion_settings
+from plant.errors import InputError
+from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER, imu_state, load_imu, measure
+from plant.mechanism import Mechanism
+from plant.pose import Pose
+from plant.variables import PLATFORM_IMU
+from tests.controller.leg_geometry import (
+    angle_between,
+    leg_directions,
+    leg_vectors,
+    rotation_of,
+    static_signals,
+    unit,
+)
+from tests.controller.leg_motion import observe_mechanism
+
+RATE_HZ = 1000.0
+PERIOD_S = 1.0 / RATE_HZ
+DEGREE = np.pi / 180.0
+
+
+def parameters_of(mechanism, imus=ALL_IMUS, rate=RATE_HZ, **control):
+    return cycle_parameters(mechanism, rate, control_settings(mechanism, **control), fusion_settings(mechanism), imus)
+
+
+def resting(lengths):
+    """Segments of a reference that stays at lengths (6,)."""
+    segments = np.zeros((6, 1, 5))
+    segments[:, 0, 1] = lengths
+    return segments
+
+
+def run(parameters, signals, segments, count, state=None):
+    """Cycles on measurements (3, 7, 3) that stay, or are made by a function of the cycle; all must be well."""
+    state = np.zeros((), STATE) if state is None else state
+    for k in range(count):
+        measurement = signals(k) if callable(signals) else signals
+        assert cycle(parameters, state, measurement, segments) == OK
+    return state
+
+
+def variant(mechanism, up_in_base=(0.0, 0.0, 1.0), **plant):
+    """The same mechanism with its base inclined, and with other data of the plant."""
+    up = unit(up_in_base)
+    return Mechanism.from_legs(
+        mechanism.base_joints,
+        mechanism.platform_joints,
+        up_in_base=up,
+        home=mechanism.home,
+        limits={"stroke": mechanism.limits.stroke},
+        plant={**mechanism.plant, "gravity": -9.81 * up, **plant},
+        settings=mechanism.settings,
+    )
+
+
+def wavy(mechanism, seed):
+    """A noisy measurement of a platform that sways, as a function of the cycle."""
+    random = np.random.default_rng(seed)
+    imu = imu_state(load_imu("mpu9150-calibrated"), seed, PERIOD_S)
+    signals = static_signals(mechanism, mechanism.home.position, mechanism.home.rotation)
+    frequencies = random.uniform(1.0, 6.0, signals.shape)
+    measurement = np.zeros((3, 7, 3))
+
+    def at(k):
+        sway = np.sin(frequencies * k * PERIOD_S) * np.array([0.1, 0.5, 0.0])[:, None, None]
+        measure(imu, signals + sway, measurement)
+        return measurement
+
+    return at
+
+
+# ------------------------------------------------------------------------------------------------------------ which IMUs
+
+
+@pytest.mark.parametrize(
+    "imus",
+    [
+        ALL_IMUS,
+        LEG_IMUS,
+        *((*legs, PLATFORM_IMU) for legs in combinations(range(6), 5)),
+        (0, 1, 2, 3, PLATFORM_IMU),
+        (1, 2, 4, 5, PLATFORM_IMU),
+        (0, 1, 2, PLATFORM_IMU),
+        (PLATFORM_IMU, 5, 0, 3),
+    ],
+)
+def test_ideal_signals_at_rest_give_the_exact_pose(hexapod, imus):
+    parameters = parameters_of(hexapod, imus)
+    for position, rotation in zip(*sample_workspace(hexapod, 10, seed=1), strict=True):
+        signals = static_signals(hexapod, position, rotation)
+        for missing in set(ALL_IMUS) - set(imus):
+            signals[:, missing] = np.nan
+        lengths = leg_lengths(hexapod, position, rotation)
+        state = run(parameters, signals, resting(lengths), 20)
+        assert np.linalg.norm(state["position"] - position) < 1e-9
+        assert angle_between(state["rotation"], rotation) < 1e-9
+        np.testing.assert_allclose(state["lengths"], lengths, rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(state["error"], 0.0, atol=1e-9)
+        np.testing.assert_allclose(state["twist"], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [3, 4, 5])
+@pytest.mark.parametrize("platform", [(), (PLATFORM_IMU,)])
+def test_every_subset_is_either_refused_or_gives_the_pose(hexapod, count, platform):
+    position, rotation = np.array([0.01, -0.02, 0.36]), rotation_of([0.05, -0.08, 0.1])
+    signals, segments = static_signals(hexapod, position, rotation), resting(np.full(6, 0.4))
+    accepted = 0
+    for legs in combinations(range(6), count):
+        try:
+            parameters = parameters_of(hexapod, (*legs, *platform))
+        except InputError as refusal:
+            assert ", ".join(str(leg) for leg in legs) in str(refusal)
+            continue
+        accepted += 1
+        state = run(parameters, signals, segments, 5)
+        assert np.linalg.norm(state["position"] - position) < 1e-9
+        assert angle_between(state["rotation"], rotation) < 1e-9
+    if platform:
+        assert accepted >= {3: 10, 4: 15, 5: 6}[count]
+    else:
+        # Nine unknowns want nine equations, and a leg gives two.
+        assert accepted == 0 or count == 5
+
+
+@pytest.mark.parametrize(
+    "imus", [(), (PLATFORM_IMU,), (0, 1, PLATFORM_IMU), (2,), (0, 1, 2, 3), (7,), (-1, *ALL_IMUS), (0, 1, 2, 3, 4, 5, 6, 70)]
+)
+def test_imus_that_cannot_be_or_do_not_suffice_are_refused(hexapod, imus):
+    with pytest.raises(InputError, match="IMU"):
+        check_imus(hexapod, imus)
+    with pytest.raises(InputError, match="IMU"):
+        parameters_of(hexapod, imus)
+
+
+def test_legs_alone_do_not_do_for_platform_joints_off_a_plane(hexapod):
+    bent = hexapod.platform_joints + [[0.0, 0.0, z] for z in (0.03, -0.03, 0.03, -0.03, 0.03, -0.03)]
+    mechanism = Mechanism.from_legs(hexapod.base_joints, bent, home=hexapod.home, limits={"stroke": (-0.06, 0.06)})
+    with pytest.raises(InputError, match="0, 1, 2, 3, 4, 5 do not determine"):
+        check_imus(mechanism, LEG_IMUS)
+    check_imus(mechanism, ALL_IMUS)
+    check_imus(hexapod, LEG_IMUS)
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, 49.0, 4001.0, np.nan, np.inf])
+def test_a_rate_out_of_range_is_refused(hexapod, rate):
+    with pytest.raises(InputError, match="rate"):
+        parameters_of(hexapod, rate=rate)
+
+
+@pytest.mark.parametrize("tilt_deg", [(0.0, 0.0), (15.0, 0.0), (-10.0, 20.0)])
+def test_an_inclined_base_makes_no_difference_to_the_estimate(hexapod, tilt_deg):
+    mechanism = variant(hexapod, rotation_of([*np.radians(tilt_deg), 0.0])[:, 2])
+    for imus in (ALL_IMUS, LEG_IMUS, (0, 2, 3, 5, PLATFORM_IMU)):
+        parameters = parameters_of(mechanism, imus)
+        for position, rotation in zip(*sample_workspace(mechanism, 10, seed=2), strict=True):
+            state = run(parameters, static_signals(mechanism, position, rotation), resting(np.full(6, 0.4)), 5)
+            assert np.linalg.norm(state["position"] - position) < 1e-9
+            assert angle_between(state["rotation"], rotation) < 1e-9
+
+
+# ------------------------------------------------------------------------------------------------------------- the estimate
+
+
+def test_from_an_unknown_pose_the_estimate_is_right_within_fifty_milliseconds(hexapod):
+    """100 poses anywhere in the workspace, each with calibrated MPU-9150s of its own; no first guess."""
+    parameters, model = parameters_of(hexapod), load_imu("mpu9150-calibrated")
+    measurement, errors = np.zeros((3, 7, 3)), []
+    for seed, (position, rotation) in enumerate(zip(*sample_workspace(hexapod, 100, seed=3), strict=True)):
+        imu, signals = imu_state(model, seed, PERIOD_S), static_signals(hexapod, position, rotation)
+
+        def read(k, imu=imu, signals=signals):
+            measure(imu, signals, measurement)
+            return measurement
+
+        state = run(parameters, read, resting(np.full(6, 0.4)), 50)
+        errors.append([np.linalg.norm(state["position"] - position), angle_between(state["rotation"], rotation)])
+    worst = np.max(errors, axis=0)
+    assert worst[0] < 2e-3
+    assert worst[1] < 0.5 * DEGREE
+    # The imperfections were there: a 1 mg bias alone is 0.06 deg.
+    assert np.median(errors, axis=0)[0] > 0.1e-3
+
+
+def swaying(mechanism, seed):
+    """Poses about home as a function of time: at rest, then within a second sines of 15 mm and 5 deg, up to 1.5 Hz."""
+    random = np.random.default_rng(seed)
+    frequencies, phases = 2.0 * np.pi * random.uniform(0.3, 1.5, 6), random.uniform(0.0, 2.0 * np.pi, 6)
+    sizes = np.array([0.015, 0.015, 0.01, 5.0 * DEGREE, 5.0 * DEGREE, 5.0 * DEGREE])
+
+    def pose_at(times):
+        x = np.clip(np.asarray(times)[:, None] - 0.3, 0.0, 1.0)
+        waves = x**4 * (35.0 - 84.0 * x + 70.0 * x**2 - 20.0 * x**3) * sizes * np.sin(frequencies * times[:, None] + phases)
+        return mechanism.home.position + waves[:, :3], Rotation.from_rotvec(waves[:, 3:]).as_matrix()
+
+    return pose_at
+
+
+@pytest.mark.parametrize("imus", [ALL_IMUS, LEG_IMUS, (0, 2, 3, 5, PLATFORM_IMU)])
+def test_a_moving_platform_is_followed_by_ideal_imus_wherever_they_sit(hexapod, imus):
+    """Its own acceleration, up to 2 m/s^2 and that of the turns, is not taken for gravity; nor are the legs'."""
+    places = hexapod.plant["leg_imu_position"] + np.random.default_rng(0).uniform(-0.03, 0.03, (6, 3))
+    mechanism = variant(hexapod, platform_imu_position=(0.10, -0.15, 0.12), leg_imu_position=places)
+    pose_at, times = swaying(mechanism, 0), PERIOD_S * np.arange(3000)
+    positions, rotations = pose_at(times)
+    (ahead, turned_ahead), (behind, turned_behind) = pose_at(times + 1e-5), pose_at(times - 1e-5)
+    turning = Rotation.from_matrix(turned_ahead @ turned_behind.transpose(0, 2, 1)).as_rotvec()
+    twists = np.hstack([ahead - behind, turning]) / 2e-5
+    signals = observe_mechanism(mechanism, pose_at, times)
+    parameters, state, errors = parameters_of(mechanism, imus), np.zeros((), STATE), []
+    for k in range(3000):
+        run(parameters, signals[k], resting(np.full(6, 0.394)), 1, state)
+        tilt = np.linalg.norm(np.cross(state["vertical"][0], rotations[k].T @ mechanism.up_in_base))
+        off = state["twist"] - twists[k]
+        apart = np.linalg.norm(state["position"] - positions[k]), angle_between(state["rotation"], rotations[k])
+        errors.append([*apart, tilt * (PLATFORM_IMU in imus), np.linalg.norm(off[:3]), np.linalg.norm(off[3:])])
+    position, rotation, tilt, velocity, turning = np.sqrt(np.mean(np.square(errors[1000:]), axis=0))
+    print(imus, position, rotation / DEGREE, tilt / DEGREE, velocity, turning)
+    assert position < 0.2e-3
+    assert rotation < 0.05 * DEGREE
+    assert tilt < 0.02 * DEGREE
+    assert velocity < 2e-3
+    assert turning < 0.5 * DEGREE
+
+
+@pytest.mark.parametrize("imus", [ALL_IMUS, LEG_IMUS, (0, 1, 3, 4, PLATFORM_IMU)])
+def test_the_estimate_is_the_public_solvers_for_the_same_directions(hexapod, imus):
+    """Two Gauss-Newton steps against as many as it takes, over noisy data; and the information against its covariance."""
+    parameters, fusion = parameters_of(hexapod, imus), FusionSettings()
+    at, segments, state = wavy(hexapod, 4), resting(np.full(6, 0.394)), np.zeros((), STATE)
+    for _ in range(10):
+        run(parameters, at, segments, 20, state)
+        directions = np.where(np.isin(np.arange(6), imus)[:, None], state["directions"], np.nan)
+        extra = {"up_in_platform": state["vertical"][0], "tilt_sigma": fusion.tilt_sigma} if PLATFORM_IMU in imus else {}
+        solution = solve(hexapod, directions, leg_sigma=fusion.leg_sigma, **extra)
+        # A thousandth of what the noise leaves uncertain.
+        assert np.linalg.norm(state["position"] - solution.position) < 1e-6
+        assert angle_between(state["rotation"], solution.rotation) < 1e-6
+        information = np.tril(state["information"]) + np.tril(state["information"], -1).T
+        root = np.linalg.cholesky(solution.covariance)
+        np.testing.assert_allclose(root.T @ information @ root, np.eye(6), atol=1e-3)
+
+
+@pytest.mark.parametrize("imus", [ALL_IMUS, LEG_IMUS, (0, 1, 2, 3, 4, PLATFORM_IMU)])
+def test_the_twist_is_the_motion_behind_the_rates_of_the_directions(hexapod, imus):
+    random = np.random.default_rng(5)
+    parameters = parameters_of(hexapod, imus)
+    for position, rotation in zip(*sample_workspace(hexapod, 20, seed=5), strict=True):
+        velocity, omega = random.uniform(-0.2, 0.2, 3), random.uniform(-1.0, 1.0, 3)
+        state, h = np.zeros((), STATE), 1e-6
+        ahead, behind = (
+            leg_directions(hexapod, position + sign * h * velocity, rotation_of(sign * h * omega) @ rotation)
+            for sign in (1, -1)
+        )
+        state["directions"], state["rates"] = leg_directions(hexapod, position, rotation), (ahead - behind) / (2.0 * h)
+        state["vertical"], state["platform_rate"] = rotation.T @ hexapod.up_in_base, rotation.T @ omega
+        state["position"], state["rotation"] = position, rotation
+        assert refine_pose(parameters, state)
+        np.testing.assert_allclose(state["twist"], [*velocity, *omega], rtol=0.0, atol=1e-7)
+        np.testing.assert_allclose(state["position"], position, rtol=0.0, atol=1e-12)
+
+
+def test_the_acceleration_is_the_derivative_of_the_twist_with_its_time_constant(hexapod):
+    parameters, tau = parameters_of(hexapod), FusionSettings().acceleration_time
+    position, rotation, acceleration = hexapod.home.position, np.eye(3), np.array([0.5, -0.3, 0.2])
+    state = np.zeros((), STATE)
+    state["directions"], state["vertical"] = leg_directions(hexapod, position, rotation), hexapod.up_in_base
+    found = []
+    for k in range(200):
+        velocity, h = acceleration * k * PERIOD_S, 1e-6
+        ahead, behind = (leg_directions(hexapod, position + sign * h * velocity, rotation) for sign in (1.0, -1.0))
+        state["rates"], state["position"], state["rotation"] = (ahead - behind) / (2.0 * h), position, rotation
+        assert refine_pose(parameters, state)
+        state["cycle"] += 1
+        found.append(state["acceleration"].copy())
+    found = np.array(found)
+    np.testing.assert_allclose(found[-1], [*acceleration, 0.0, 0.0, 0.0], atol=2e-3)
+    share = found[round(tau / PERIOD_S)][:3] / acceleration
+    np.testing.assert_allclose(share, 1.0 - np.exp(-1.0), atol=0.05)
+
+
+# ---------------------------------------------------------------------------------------------------------------- the state
+
+
+def test_a_copied_state_goes_on_bit_by_bit_as_the_original(hexapod):
+    parameters, segments = parameters_of(hexapod), resting(np.full(6, 0.396))
+    at = wavy(hexapod, 6)
+    measurements = [at(k).copy() for k in range(600)]
+    state = run(parameters, measurements.__getitem__, segments, 350)
+    snapshot = state.copy()
+    run(parameters, lambda k: measurements[350 + k], segments, 250, state)
+    run(parameters, lambda k: measurements[350 + k], segments, 250, snapshot)
+    assert state.tobytes() == snapshot.tobytes()
+    whole = run(parameters, measurements.__getitem__, segments, 600)
+    assert state.tobytes() == whole.tobytes()
+    assert np.abs(whole["command"]).max() > 0.0
+
+
+def test_cycles_allocate_nothing(hexapod):
+    @numba.njit
+    def repeat(parameters, state, measurement, segments, count):
+        status = 0
+        for _ in range(count):
+            status |= cycle(parameters, state, measurement, segments)
+        return status
+
+    parameters, state = parameters_of(hexapod), np.zeros((), STATE)
+    measurement, segments = wavy(hexapod, 7)(0), resting(np.full(6, 0.394))
+    assert repeat(parameters, state, measurement, segments, 1) == OK
+    _nrt_python.memsys_enable_stats()
+    allocated = []
+    for count in (1, 1000):
+        before = rtsys.get_allocation_stats()
+        assert repeat(parameters, state, measurement, segments, count) == OK
+        allocated.append(rtsys.get_allocation_stats().alloc - before.alloc)
+    _nrt_python.memsys_disable_stats()
+    # What remains belongs to the call from Python.
+    assert allocated[0] == allocated[1] > 0
+
+
+@pytest.mark.parametrize("kind", [GYROSCOPE, ACCELEROMETER])
+@pytest.mark.parametrize("imu", ALL_IMUS)
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_reading_that_is_no_number_stops_the_cycle_at_once(hexapod, kind, imu, bad):
+    parameters, segments = parameters_of(hexapod), resting(np.full(6, 0.394))
+    at = wavy(hexapod, 8)
+    for cycles in (0, 5, 250):
+        for axis in range(3):
+            state = run(parameters, at, segments, cycles)
+            before = state["position"].copy()
+            measurement = at(cycles).copy()
+            measurement[kind, imu, axis] = bad
+            status = cycle(parameters, state, measurement, segments)
+            if status == OK:
+                # A settled platform filter may cut an infinite force to what a sample might bring; nothing else passes.
+                assert (imu, kind) == (PLATFORM_IMU, ACCELEROMETER)
+                assert cycles > 0
+                assert np.isinf(bad)
+                assert np.isfinite(state["platform_x"]).all()
+                assert np.linalg.norm(state["position"] - before) < 3e-3
+            else:
+                assert status in (POSE_LOST, NOT_FINITE)
+
+
+def test_a_reading_that_is_not_used_may_be_no_number(hexapod):
+    position, rotation = hexapod.home.position, hexapod.home.rotation
+    signals = static_signals(hexapod, position, rotation)
+    signals[MAGNETOMETER] = np.nan
+    run(parameters_of(hexapod), signals, resting(np.full(6, 0.4)), 300)
+    signals[:, PLATFORM_IMU] = np.nan
+    run(parameters_of(hexapod, LEG_IMUS), signals, resting(np.full(6, 0.4)), 300)
+
+
+def test_a_reference_that_is_no_number_stops_the_cycle_and_not_the_hold(hexapod):
+    parameters, state = parameters_of(hexapod), np.zeros((), STATE)
+    signals, segments = static_signals(hexapod, hexapod.home.position, np.eye(3)), resting(np.full(6, np.nan))
+    statuses = [cycle(parameters, state, signals, segments) for _ in range(201)]
+    assert statuses == [OK] * 200 + [NOT_FINITE]
+
+
+def test_directions_that_no_longer_determine_a_pose_are_reported(hexapod):
+    """All legs read as if they stood upright: their lines are parallel."""
+    parameters, state = parameters_of(hexapod), np.zeros((), STATE)
+    signals = static_signals(hexapod, hexapod.home.position, np.eye(3))
+    signals[ACCELEROMETER, :6] = [0.0, 0.0, 9.81]
+    assert cycle(parameters, state, signals, resting(np.full(6, 0.4))) == POSE_LOST
+
+
+# -------------------------------------------------------------------------------------------------------------- the control
+
+
+def test_during_the_hold_all_commands_are_zero_and_nothing_winds_up(hexapod):
+    parameters = parameters_of(hexapod, hold=0.05)
+    signals = static_signals(hexapod, hexapod.home.position, np.eye(3))
+    home = leg_lengths(hexapod, hexapod.home.position, np.eye(3))
+    segments, state = resting(home + 0.001), np.zeros((), STATE)
+    for _ in range(50):
+        run(parameters, signals, segments, 1, state)
+        np.testing.assert_array_equal(state["command"], 0.0)
+        np.testing.assert_array_equal(state["integral"], 0.0)
+        np.testing.assert_allclose(state["error"], 0.001, atol=1e-9)
+    run(parameters, signals, segments, 1, state)
+    assert (state["command"] > 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("rate", "hold", "cycles"), [(1000.0, 0.2, 200), (250.0, 0.2, 50), (300.0, 0.011, 4), (4000.0, 1e-5, 1)]
+)
+def test_the_hold_lasts_as_long_as_it_should_at_every_rate(hexapod, rate, hold, cycles):
+    parameters = parameters_of(hexapod, rate=rate, hold=hold)
+    signals = static_signals(hexapod, hexapod.home.position, np.eye(3))
+    state, moving = np.zeros((), STATE), []
+    for _ in range(cycles + 5):
+        run(parameters, signals, resting(np.full(6, 0.396)), 1, state)
+        moving.append(np.abs(state["command"]).max() > 0.0)
+    assert moving == [False] * cycles + [True] * 5
+
+
+def test_the_references_time_begins_where_the_hold_ends(hexapod):
+    parameters = parameters_of(hexapod, hold=0.05)
+    signals = static_signals(hexapod, hexapod.home.position, np.eye(3))
+    segments = resting(np.full(6, 0.394))
+    segments[:, 0, 2] = 0.01
+    state = np.zeros((), STATE)
+    for k in range(80):
+        run(parameters, signals, segments, 1, state)
+        np.testing.assert_allclose(state["reference"][:, 0], 0.394 + 0.01 * PERIOD_S * max(k - 50, 0), rtol=1e-13)
+        np.testing.assert_allclose(state["reference"][:, 1:], [[0.01, 0.0]] * 6)
+
+
+def test_a_derivative_is_not_kicked_by_an_error_that_was_there_during_the_hold(hexapod):
+    signals = static_signals(hexapod, hexapod.home.position, np.eye(3))
+    home = leg_lengths(hexapod, hexapod.home.position, np.eye(3))
+    commands = []
+    for derivative in (0.0, 1.0):
+        parameters = parameters_of(hexapod, hold=0.05, derivative=derivative)
+        commands.append(run(parameters, signals, resting(home + 1e-4), 51)["command"].copy())
+    np.testing.assert_allclose(commands[1], commands[0], rtol=0.0, atol=1e-9)
+
+
+def test_a_command_drives_each_leg_towards_its_reference_within_the_limit(hexapod):
+    signals = static_signals(hexapod, hexapod.home.position, np.eye(3))
+    home = leg_lengths(hexapod, hexapod.home.position, np.eye(3))
+    control = control_settings(hexapod)
+    off = np.array([1e-3, -1e-3, 2e-3, -2e-3, 0.05, -0.05])
+    balanced = run(parameters_of(hexapod), signals, resting(home), 201)["command"].copy()
+    state = run(parameters_of(hexapod), signals, resting(home + off), 201)
+    np.testing.assert_allclose((state["command"] - balanced)[:4], control.proportional * off[:4], rtol=1e-6)
+    limit = control.command_reserve * hexapod.limits.velocity
+    np.testing.assert_allclose(state["command"][4:], [limit, -limit], rtol=1e-12)
+
+
+def potential_energy(mechanism, position, rotation):
+    """Of every body's centre of mass in the field of gravity."""
+    plant, vectors = mechanism.plant, leg_vectors(mechanism, position, rotation)
+    directions = unit(vectors)
+    joints = mechanism.base_joints + vectors
+    bodies = [
+        (plant["platform.mass"], [position + rotation @ plant["platform.center_of_mass"]]),
+        (plant["payload.mass"], [position + rotation @ plant["payload.center_of_mass"]]),
+        (plant["leg.lower.mass"], mechanism.base_joints + plant["leg.lower.center"] * directions),
+        (plant["leg.upper.mass"], joints - plant["leg.upper.center"] * directions),
+    ]
+    return -sum(mass * center @ plant["gravity"] for mass, centers in bodies for center in centers)
+
+
+def holding_forces(mechanism, position, rotation):
+    """Leg forces that hold the mechanism, by virtual work: the slope of the energy over the slope of the lengths."""
+    h = 1e-5
+    energy, lengths = np.zeros(6), np.zeros((6, 6))
+    for i, step in enumerate(h * np.eye(6)):
+        for sign in (1.0, -1.0):
+            pose = position + sign * step[:3], rotation_of(sign * step[3:]) @ rotation
+            energy[i] += sign * potential_energy(mechanism, *pose) / (2.0 * h)
+            lengths[:, i] += sign * leg_lengths(mechanism, *pose) / (2.0 * h)
+    return np.linalg.solve(lengths.T, energy)
+
+
+@pytest.mark.parametrize("case", ["as it is", "inclined base", "eccentric payload", "no payload"])
+def test_the_load_feed_forward_is_that_of_virtual_work(hexapod, case):
+    changes = {
+        "as it is": {},
+        "inclined base": {"up_in_base": (0.2, -0.1, 0.9)},
+        "eccentric payload": {"payload.center_of_mass": (0.05, -0.04, 0.15), "platform.center_of_mass": (0.0, 0.01, -0.02)},
+        "no payload": {"payload.mass": 0.0},
+    }[case]
+    mechanism = variant(hexapod, **changes)
+    plant, parameters = mechanism.plant, parameters_of(mechanism, hold=1e-3)
+    # A drive at rest: R i = n k u + kappa R i with the force n k i, n = 2 pi / lead.
+    turns = 2.0 * np.pi / plant["motor.screw_lead"]
+    force_constant = turns * plant["motor.torque_constant"]
+    speed_per_force = (1.0 - plant["drive.compensation"]) * plant["drive.nominal_resistance"] / force_constant**2
+    for position, rotation in zip(*sample_workspace(mechanism, 15, seed=9), strict=True):
+        forces = holding_forces(mechanism, position, rotation)
+        lengths = leg_lengths(mechanism, position, rotation)
+        state = run(parameters, static_signals(mechanism, position, rotation), resting(lengths), 3)
+        np.testing.assert_allclose(
+            state["feed_forward"], speed_per_force * forces, rtol=0.0, atol=1e-7 * speed_per_force * 200.0
+        )
+        np.testing.assert_allclose(state["command"], state["feed_forward"], rtol=0.0, atol=1e-8)
+        assert np.abs(forces).max() > 5.0
+
+
+def test_the_feed_forward_adds_the_references_speed_and_the_inertia_of_its_acceleration(hexapod):
+    plant, parameters = hexapod.plant, parameters_of(hexapod, hold=1e-3)
+    position = hexapod.home.position
+    signals, lengths = static_signals(hexapod, position, np.eye(3)), leg_lengths(hexapod, position, np.eye(3))
+    still = run(parameters, signals, resting(lengths), 2)["feed_forward"].copy()
+    segments = resting(lengths)
+    segments[:, 0, 2], segments[:, 0, 3] = np.linspace(-0.1, 0.1, 6), np.linspace(1.0, -2.0, 6)
+    moving = run(parameters, signals, segments, 2)
+    turns = 2.0 * np.pi / plant["motor.screw_lead"]
+    carried = (plant["platform.mass"] + plant["payload.mass"]) / 6.0
+    inertia = plant["leg.upper.mass"] + plant["motor.rotor_inertia"] * turns**2 + carried
+    speed_per_force = (1.0 - plant["drive.compensation"]) * plant["drive.nominal_resistance"]
+    speed_per_force /= (turns * plant["motor.torque_constant"]) ** 2
+    extra = segments[:, 0, 2] + speed_per_force * inertia * segments[:, 0, 3]
+    np.testing.assert_allclose(moving["feed_forward"] - still, extra, rtol=1e-9, atol=1e-12)
+
+
+def test_settings_reach_the_cycle(hexapod):
+    control = ControlSettings(proportional=11.0, integral=22.0, derivative=0.3, derivative_bandwidth=44.0, command_reserve=1.2)
+    parameters = cycle_parameters(hexapod, 500.0, control, FusionSettings(leg_sigma=2e-3), LEG_IMUS)
+    np.testing.assert_allclose(parameters["gains"], [11.0, 22.0, 0.3, 44.0])
+    np.testing.assert_allclose(parameters["command_limit"], 1.2 * hexapod.limits.velocity)
+    np.testing.assert_allclose(parameters["leg_weights"], 1.0 / 2e-3**2)
+    assert parameters["vertical_weight"] == 0.0
+    assert parameters["period"] == 1.0 / 500.0
+    # A white density d over samples at a rate f has the variance d^2 f / 2.
+    np.testing.assert_allclose(parameters["gyroscope_variance"], FusionSettings().gyroscope_noise ** 2 * 250.0)
+
+
+def test_a_turn_of_the_whole_world_about_the_vertical_turns_the_estimate_with_it(hexapod):
+    """Gravity does not tell north: joints turned about the vertical, readings unchanged, and the pose turns along."""
+    turn = rotation_of([0.0, 0.0, 0.7])
+    turned = Mechanism.from_legs(
+        hexapod.base_joints @ turn.T,
+        hexapod.platform_joints,
+        home=Pose(hexapod.home.position, turn),
+        limits={"stroke": (-0.06, 0.06)},
+        plant=hexapod.plant,
+    )
+    at = wavy(hexapod, 10)
+    measurements = [at(k).copy() for k in range(100)]
+    states = [run(parameters_of(m), measurements.__getitem__, resting(np.full(6, 0.394)), 100) for m in (hexapod, turned)]
+    np.testing.assert_allclose(states[1]["position"], turn @ states[0]["position"], rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(states[1]["rotation"], turn @ states[0]["rotation"], rtol=0.0, atol=1e-10)
+    assert Rotation.from_matrix(states[0]["rotation"]).magnitude() > 1e-4
