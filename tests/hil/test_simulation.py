@@ -161,7 +161,8 @@ def test_an_unreachable_pose_names_the_leg_and_by_how_much(tmp_path):
 def test_the_process_of_a_loop_loads_no_design_or_plotting_library():
     # numba loads a part of scipy by itself; nothing may be added to it.
     code = (
-        "import sys; from hil.simulation import SimulationConfig, simulate; import numba.np.arraymath; before = set(sys.modules);"
+        "import sys; from hil.simulation import SimulationConfig, simulate; import numba.np.arraymath;"
+        "before = set(sys.modules);"
         "simulate(SimulationConfig(duration=0.05));"
         "roots = {name.split('.')[0] for name in sys.modules};"
         "print(sorted(roots & {'control', 'casadi', 'filterpy', 'plotly', 'matplotlib'}),"
