@@ -25,8 +25,12 @@ from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array
 from plant.variables import IMU_COUNT, PLATFORM_IMU
 
-OK, POSE_LOST, NOT_FINITE = 0, 1, 2
-"""What a cycle reports: all well; the directions no longer determine a pose; an estimate or command is not finite."""
+OK, POSE_LOST, NOT_FINITE, IMPLAUSIBLE = range(4)
+"""What a cycle reports: all well; the directions no longer determine a pose; an estimate or command is not finite; after
+the hold, the estimated lengths are far outside the strokes."""
+
+_IMPLAUSIBLE_SHARE = 0.25
+"""How far outside its stroke, as a share of it, the estimate of a leg may lie."""
 
 ALL_IMUS = tuple(range(IMU_COUNT))
 LEG_IMUS = tuple(range(LEGS))
@@ -34,6 +38,10 @@ LEG_IMUS = tuple(range(LEGS))
 RATE_RANGE_HZ = (50.0, 4000.0)
 
 _WORST_CONDITIONING = 1e-2
+_LEAST_GRAVITY = 0.1
+_LEAST_OBSERVABILITY = 0.2
+"""Least component of the vertical across both axes of a universal joint at home; without one, gravity does not tell the
+joint's angles."""
 
 PARAMETERS = np.dtype(
     [
@@ -63,6 +71,7 @@ PARAMETERS = np.dtype(
         ("acceleration_rate", np.float64),
         ("gains", np.float64, 4),
         ("command_limit", np.float64),
+        ("plausible_lengths", np.float64, (LEGS, 2)),
         ("droop", np.float64),
         ("moving_mass", np.float64),
         ("mass", np.float64),
@@ -154,6 +163,13 @@ def cycle_parameters(
     nominal = plant["drive.nominal_resistance"]
     mass = plant["platform.mass"] + plant["payload.mass"]
     sliding_mass = plant["leg.upper.mass"] + plant["motor.rotor_inertia"] * turns**2
+    stroke = mechanism.require_limits().stroke
+    margin = _IMPLAUSIBLE_SHARE * (stroke[:, 1] - stroke[:, 0])
+    gravity = float(np.linalg.norm(plant["gravity"]))
+    if gravity < _LEAST_GRAVITY:
+        raise InputError(
+            f"gravity is {gravity:g} m/s2; the accelerometers need at least {_LEAST_GRAVITY:g} to tell a direction"
+        )
     values = {
         "period": 1.0 / rate,
         "hold_cycles": int(np.ceil(control.hold * rate - 1e-9)),
@@ -166,7 +182,7 @@ def cycle_parameters(
         "plane_axes": plane.axes,
         "leg_imu_position": plant["leg_imu_position"],
         "platform_imu_position": plant["platform_imu_position"],
-        "gravity": np.linalg.norm(plant["gravity"]) or STANDARD_GRAVITY,
+        "gravity": gravity,
         "leg_used": used,
         "platform_used": PLATFORM_IMU in imus,
         "leg_jerk": fusion.leg_jerk**2,
@@ -181,6 +197,7 @@ def cycle_parameters(
         "acceleration_rate": 1.0 / fusion.acceleration_time,
         "gains": (control.proportional, control.integral, control.derivative, control.derivative_bandwidth),
         "command_limit": control.command_reserve * mechanism.require_limits().velocity,
+        "plausible_lengths": np.stack([stroke[:, 0] - margin, stroke[:, 1] + margin], axis=1),
         "droop": nominal * (1.0 - plant["drive.compensation"]) / force_constant**2,
         "moving_mass": sliding_mass + mass / LEGS,
         "mass": mass,
@@ -215,6 +232,13 @@ def check_imus(mechanism: Mechanism, imus: Collection[int]) -> None:
     for imu in imus:
         if imu not in ALL_IMUS:
             raise InputError(f"there is no IMU {imu}; 0 to 5 sit on the legs, 6 on the platform")
+    across = np.abs(mechanism.joint_rotations[:, :, 2] @ mechanism.up_in_base)
+    for leg in range(LEGS):
+        if leg in imus and across[leg] < _LEAST_OBSERVABILITY:
+            raise InputError(
+                f"gravity hardly tells the angles of leg {leg}: of the vertical only {across[leg]:.2g} lies across the axes "
+                f"of its joint, and {_LEAST_OBSERVABILITY:g} is needed: turn base_joint_axes[{leg}], or leave its IMU out"
+            )
     plane = joint_plane(mechanism)
     positions, rotations = sample_workspace(mechanism, 50, seed=0)
     parameters, state = np.zeros((), PARAMETERS), np.zeros((), STATE)
@@ -234,7 +258,7 @@ def check_imus(mechanism: Mechanism, imus: Collection[int]) -> None:
         names = ", ".join(str(imu) for imu in sorted(imus)) or "none"
         raise InputError(
             f"the IMUs {names} do not determine the pose of {mechanism.name!r} everywhere in its workspace (conditioning "
-            f"{worst:.1e}, at least {_WORST_CONDITIONING:g} is needed): add legs, or the platform's IMU (6)"
+            f"{worst:.1e}; at least {_WORST_CONDITIONING:g} is needed): add legs, or the platform's IMU (6)"
         )
 
 
@@ -266,9 +290,12 @@ def control(parameters: Record, state: Record, measurement: Array, segments: Arr
     regulate(parameters, state)
     s = state[()]
     s.cycle += 1
+    p = parameters[()]
     for k in range(LEGS):
         if not (np.isfinite(s.command[k]) and np.isfinite(s.lengths[k])):
             return NOT_FINITE
+        if s.cycle > p.hold_cycles and not p.plausible_lengths[k, 0] <= s.lengths[k] <= p.plausible_lengths[k, 1]:
+            return IMPLAUSIBLE
     return OK
 
 

@@ -116,7 +116,8 @@ def solve(
         tilt_sigma: of roll and pitch, as the vertical, the normal or the rotation give them [rad].
         yaw_sigma: of the yaw in `rotation` [rad].
 
-    With several given, the closed form uses the first of rotation, vertical, normal; the refinement uses all.
+    With several given, the closed form uses the first of rotation, vertical, normal; the refinement uses all. Measurements
+    that contradict each other show in the residuals, which are to be compared with the sigmas.
 
     Raises:
         InputError: wrong shape, not finite, off unit length by more than 1e-3, a reflection, a sigma not positive.
@@ -124,7 +125,7 @@ def solve(
     """
     directions, measured = _checked_directions(leg_directions)
     for name, sigma in (("leg_sigma", leg_sigma), ("tilt_sigma", tilt_sigma), ("yaw_sigma", yaw_sigma)):
-        if not 0.0 < sigma < np.inf:
+        if not 0.0 < checked_array(sigma, (), name) < np.inf:
             raise InputError(f"{name} is {sigma}; it must be positive and finite [rad]")
     up = mechanism.up_in_base
     tilt, yaw = 1.0 / tilt_sigma**2, 1.0 / yaw_sigma**2
@@ -165,8 +166,8 @@ def solve(
         conditioning = pose_from_legs(*joints, directions, measured, plane.center, plane.axes, position, found, *work.linear)
     if conditioning < LEAST_CONDITIONING:
         raise SingularConfigurationError(
-            f"{int(measured.sum())} leg directions{' and ' + method if observed else ''} do not determine the pose of "
-            f"{mechanism.name!r} here: measure more legs, up_in_platform or the rotation"
+            f"{int(measured.sum())} leg directions{' and ' + method if observed else ''} do not give the pose of "
+            f"{mechanism.name!r} in closed form here: measure more legs, up_in_platform or the rotation"
         )
     weights = measured / leg_sigma**2
     for _ in range(_MAX_REFINEMENTS):
@@ -258,6 +259,25 @@ def _across(direction: Array) -> tuple[float, float, float, float, float, float]
 
 
 @kernel
+def _spread(joints: Array, measured: Array) -> float:
+    """Root mean square distance of the measured legs' joints (6, 3) from their centre [m]: the length in which columns for
+    a rotation are counted, so that the conditioning does not depend on the size of the mechanism.
+    """
+    count = c0 = c1 = c2 = total = 0.0
+    for k in range(LEGS):
+        if measured[k] != 0.0:
+            count += 1.0
+            c0 += joints[k, 0]
+            c1 += joints[k, 1]
+            c2 += joints[k, 2]
+            total += joints[k, 0] ** 2 + joints[k, 1] ** 2 + joints[k, 2] ** 2
+    if count == 0.0:
+        return 1.0
+    variance = (total - (c0 * c0 + c1 * c1 + c2 * c2) / count) / count
+    return np.sqrt(variance) if variance > 0.0 else 1.0
+
+
+@kernel
 def rotation_between(from_vector: Array, to_vector: Array, rotation: Array) -> None:
     """Write a rotation (3, 3) that carries one unit vector to another, opposite ones included."""
     flip = from_vector[0] * to_vector[0] + from_vector[1] * to_vector[1] + from_vector[2] * to_vector[2] < 0.0
@@ -320,6 +340,7 @@ def pose_from_vector(
     Returns the conditioning.
     """
     rotation_between(in_platform, in_base, rotation)
+    scale = 1.0 / _spread(platform_joints, measured)
     u0, u1, u2 = in_base[0], in_base[1], in_base[2]
     rows = 0
     for k in range(LEGS):
@@ -338,8 +359,8 @@ def pose_from_vector(
         t0, t1, t2, s0, s1, s2 = _across(directions[k])
         for row, w0, w1, w2 in ((rows, t0, t1, t2), (rows + 1, s0, s1, s2)):
             matrix[row, 0], matrix[row, 1], matrix[row, 2] = w0, w1, w2
-            matrix[row, 3] = w0 * x0 + w1 * x1 + w2 * x2
-            matrix[row, 4] = w0 * y0 + w1 * y1 + w2 * y2
+            matrix[row, 3] = scale * (w0 * x0 + w1 * x1 + w2 * x2)
+            matrix[row, 4] = scale * (w0 * y0 + w1 * y1 + w2 * y2)
             right[row] = w0 * c0 + w1 * c1 + w2 * c2
         rows += 2
     if rows < 5:
@@ -347,8 +368,9 @@ def pose_from_vector(
     conditioning = solve_least_squares(matrix[:rows, :5], right[:rows], unknowns[:5], norms, order)
     if conditioning < RANK_TOLERANCE:
         return conditioning
+    # Cosine and sine come multiplied by the spread of the joints.
     size = np.sqrt(unknowns[3] * unknowns[3] + unknowns[4] * unknowns[4])
-    if not size > RANK_TOLERANCE:
+    if not size * scale > RANK_TOLERANCE:
         return 0.0
     cosine, sine = unknowns[3] / size, unknowns[4] / size
     for j in range(3):
@@ -374,13 +396,14 @@ def pose_from_legs(
     the position again.
     """
     rows = 0
+    scale = 1.0 / _spread(platform_joints, measured)
     for k in range(LEGS):
         if measured[k] == 0.0:
             continue
         x = y = 0.0
         for j in range(3):
-            x += axes[j, 0] * (platform_joints[k, j] - center[j])
-            y += axes[j, 1] * (platform_joints[k, j] - center[j])
+            x += scale * axes[j, 0] * (platform_joints[k, j] - center[j])
+            y += scale * axes[j, 1] * (platform_joints[k, j] - center[j])
         t0, t1, t2, s0, s1, s2 = _across(directions[k])
         for row, w0, w1, w2 in ((rows, t0, t1, t2), (rows + 1, s0, s1, s2)):
             matrix[row, 0], matrix[row, 1], matrix[row, 2] = w0, w1, w2
@@ -400,7 +423,7 @@ def pose_from_legs(
         q += unknowns[j] * unknowns[j + 3]
         r += unknowns[j + 3] * unknowns[j + 3]
     root_det = np.sqrt(max(p * r - q * q, 0.0))
-    if not root_det > RANK_TOLERANCE:
+    if not root_det * scale * scale > RANK_TOLERANCE:
         return 0.0
     trace = np.sqrt(p + r + 2.0 * root_det)
     f = 1.0 / (root_det * trace)

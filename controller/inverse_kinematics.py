@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from plant.compiled import kernel
-from plant.errors import InputError
+from plant.errors import InputError, SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, Pose, checked_array, checked_rotation, rotation_from_vector
 
@@ -33,12 +33,15 @@ def inverse_kinematics(mechanism: Mechanism, pose: Pose) -> Legs:
 
     Raises:
         InputError: the pose is not finite, or its rotation is not one.
+        SingularConfigurationError: a leg has no length.
     """
     position = checked_array(pose.position, (3,), "position")
     rotation = checked_rotation(pose.rotation, "rotation")
     arms = mechanism.platform_joints @ rotation.T
     vectors = position + arms - mechanism.base_joints
     lengths = np.linalg.norm(vectors, axis=1)
+    if lengths.min() == 0.0:
+        raise SingularConfigurationError(f"leg {int(lengths.argmin())} has no length at this pose, and so no direction")
     directions = vectors / lengths[:, None]
     return Legs(vectors, lengths, directions, np.hstack([directions, np.cross(arms, directions)]))
 

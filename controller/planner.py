@@ -54,12 +54,11 @@ def plan(mechanism: Mechanism, target: Target, duration: float) -> Reference:
         PlanningError: ruckig found no motion, not even a stop.
     """
     limits = mechanism.require_limits()
-    lengths = leg_lengths(mechanism, target.positions, target.rotations)
-    mechanism.check_lengths(lengths, f"the target {target.name}")
-    planner = _Planner(limits, lengths[0], None if target.held else PREVIEW_S)
+    mechanism.check_lengths(leg_lengths(mechanism, target.positions, target.rotations), f"the target {target.name}")
     knots = max(1, int(np.ceil(duration / SAMPLE_PERIOD_S - 1e-9)))
-    aims = np.arange(knots) * SAMPLE_PERIOD_S + (0.0 if target.held else PREVIEW_S)
-    positions, rates, accelerations = _aims(target, lengths, aims, limits)
+    positions, rates, accelerations = _aims(mechanism, target, knots)
+    start = leg_lengths(mechanism, target.start.position, target.start.rotation)
+    planner = _Planner(limits, start, None if target.held else PREVIEW_S)
     for k in range(knots):
         planner.advance(positions[k], rates[k], accelerations[k])
     segments = planner.segments()
@@ -128,7 +127,8 @@ class _Planner:
         parameters.current_position, parameters.current_velocity, parameters.current_acceleration = self._state
         try:
             return self._otg.calculate(parameters, self._trajectory) in (Result.Working, Result.Finished)
-        except RuckigError:
+        except (RuckigError, ValueError):
+            # ValueError: a result code of ruckig that its own binding does not know.
             return False
 
     def _is_safe(self) -> bool:
@@ -165,23 +165,23 @@ def _input(limits: Limits, interface: ControlInterface, minimum_duration: float 
     return parameters
 
 
-def _aims(target: Target, lengths: Array, times: Array, limits: Limits) -> tuple[Array, Array, Array]:
-    """Lengths, rates and accelerations (M, 6) to aim at, within the limits; after the last sample, rest there."""
+def _aims(mechanism: Mechanism, target: Target, knots: int) -> tuple[Array, Array, Array]:
+    """Lengths, rates and accelerations (knots, 6) to aim at, within the limits."""
+    limits = mechanism.require_limits()
     if target.held:
-        index = np.clip(np.searchsorted(target.times, times + 1e-9, side="right") - 1, 0, len(lengths) - 1)
-        positions = lengths[index]
+        positions = leg_lengths(mechanism, *target.at(np.arange(knots) * SAMPLE_PERIOD_S + 1e-9))
         return positions, np.zeros_like(positions), np.zeros_like(positions)
-    # A cubic fitted to seven samples about each aim: a spline's own derivatives would make ruckig's plans chatter.
+    # A cubic fitted to seven samples about each aim: derivatives of the interpolation would make ruckig's plans chatter.
     window = np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1)
     fit = np.linalg.pinv(np.vander(window * SAMPLE_PERIOD_S, 4, increasing=True))
-    at = times[:, None] + window * SAMPLE_PERIOD_S
-    samples = _spline(target.times, lengths, at.ravel()).reshape(*at.shape, LEGS)
-    positions, rates = (np.einsum("w,mwk->mk", fit[order], samples) for order in (0, 1))
-    accelerations = 2.0 * np.einsum("w,mwk->mk", fit[2], samples)
-    still = (np.ptp(samples, axis=1) < _STILL_M).all(axis=1)
-    ahead = np.searchsorted(target.times, times[still] + _HALF_WINDOW * SAMPLE_PERIOD_S)
-    positions[still] = lengths[np.minimum(ahead, len(lengths) - 1)]
-    rates[still], accelerations[still] = 0.0, 0.0
+    ahead = round(PREVIEW_S / SAMPLE_PERIOD_S)
+    grid = np.arange(ahead - _HALF_WINDOW, knots + ahead + _HALF_WINDOW) * SAMPLE_PERIOD_S
+    lengths = np.clip(leg_lengths(mechanism, *target.at(grid)), limits.stroke[:, 0], limits.stroke[:, 1])
+    samples = np.lib.stride_tricks.sliding_window_view(lengths, len(window), axis=0)
+    positions, rates = (samples @ fit[order] for order in (0, 1))
+    accelerations = 2.0 * samples @ fit[2]
+    still = (np.ptp(samples, axis=2) < _STILL_M).all(axis=1)
+    positions[still], rates[still], accelerations[still] = samples[still, :, -1], 0.0, 0.0
     # A fit through a jump swings out; the samples themselves are inside the stroke.
     positions = np.clip(positions, limits.stroke[:, 0], limits.stroke[:, 1])
     rates = np.clip(rates, -0.999 * limits.velocity, 0.999 * limits.velocity)
@@ -189,40 +189,6 @@ def _aims(target: Target, lengths: Array, times: Array, limits: Limits) -> tuple
     too_fast = np.abs(rates) + accelerations**2 / (2.0 * limits.jerk) > 0.999 * limits.velocity
     accelerations[too_fast] = 0.0
     return positions, rates, accelerations
-
-
-def _spline(knots: Array, values: Array, times: Array) -> Array:
-    """The cubic spline through values (N, m) at knots (N,), evaluated at times (M,); before and after, the ends stand.
-
-    The slopes at both ends are those of the parabola through the three samples there.
-    """
-    h = np.diff(knots)
-    slopes = np.diff(values, axis=0) / h[:, None]
-    n = len(knots)
-    # Second derivatives from the tridiagonal system of a clamped spline (Thomas's algorithm).
-    diagonal, right = np.empty(n), np.empty_like(values)
-    diagonal[0], diagonal[-1] = 2.0 * h[0], 2.0 * h[-1]
-    diagonal[1:-1] = 2.0 * (h[:-1] + h[1:])
-    right[0], right[-1] = 0.0, 0.0
-    if n > 2:
-        bends = np.diff(slopes, axis=0) / (h[:-1] + h[1:])[:, None]
-        right[0], right[-1] = 6.0 * h[0] * bends[0], 6.0 * h[-1] * bends[-1]
-    right[1:-1] = 6.0 * np.diff(slopes, axis=0)
-    for i in range(1, n):
-        factor = h[i - 1] / diagonal[i - 1]
-        diagonal[i] -= factor * h[i - 1]
-        right[i] -= factor * right[i - 1]
-    second = np.empty_like(values)
-    second[-1] = right[-1] / diagonal[-1]
-    for i in range(n - 2, -1, -1):
-        second[i] = (right[i] - h[i] * second[i + 1]) / diagonal[i]
-
-    times = np.clip(times, knots[0], knots[-1])
-    index = np.clip(np.searchsorted(knots, times, side="right") - 1, 0, n - 2)
-    step, t = h[index][:, None], (times - knots[index])[:, None]
-    before, after = second[index], second[index + 1]
-    rate = slopes[index] - step * (2.0 * before + after) / 6.0
-    return values[index] + t * (rate + t * (before / 2.0 + t * (after - before) / (6.0 * step)))
 
 
 @kernel

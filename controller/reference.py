@@ -1,7 +1,7 @@
 """The reference that the cycle follows: per actuator, cubic segments in time, evaluated every cycle.
 
 `segments` (6, n, 5) holds for each actuator rows of start time [s], length [m], rate, acceleration and jerk at the start;
-unused rows start at infinity. After the last segment's start its cubic goes on, so a motion ends with a resting one.
+unused rows start at infinity. The last segment goes on for ever: a motion is planned for at least as long as it runs.
 """
 
 import numpy as np

@@ -59,7 +59,7 @@ class FusionSettings:
     platform_accelerometer_noise: float = 0.0134
     leg_sigma: float = radians(0.06)
     tilt_sigma: float = radians(0.06)
-    acceleration_time: float = 0.02
+    acceleration_time: float = 0.01
 
     def __post_init__(self) -> None:
         _check_positive(self, zero_allowed=set())
@@ -88,7 +88,7 @@ def _read(kind: type[S], name: str, table: Mapping[str, Any]) -> S:
     for key, value in table.items():
         if key not in known:
             raise InputError(f"[{name}] has no entry {key!r}; it has {', '.join(sorted(known))}")
-        if not isinstance(value, int | float):
+        if not isinstance(value, int | float) or isinstance(value, bool):
             raise InputError(f"[{name}] {key} must be a number, got {value!r}")
     return kind(**table)
 

@@ -57,13 +57,46 @@ class Target:
         if self.held:
             index = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 1)
             return self.positions[index], self.rotations[index]
-        positions = np.stack([np.interp(times, self.times, column) for column in self.positions.T], axis=1)
-        # Linear interpolation of quaternions between close samples is the shortest turn to third order.
-        quaternions = np.array([quaternion_from_rotation(rotation) for rotation in self.rotations])
+        quaternions = quaternion_from_rotation(self.rotations)
         flips = np.where(np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0, -1.0, 1.0)
         quaternions[1:] *= np.cumprod(flips)[:, None]
-        between = np.stack([np.interp(times, self.times, column) for column in quaternions.T], axis=1)
-        return positions, rotations_from_quaternions(between / np.linalg.norm(between, axis=1, keepdims=True))
+        between = _interpolate(self.times, np.hstack([self.positions, quaternions]), times)
+        turns = between[:, 3:] / np.linalg.norm(between[:, 3:], axis=1, keepdims=True)
+        return between[:, :3], rotations_from_quaternions(turns)
+
+
+def _interpolate(knots: Array, values: Array, times: Array) -> Array:
+    """Monotone cubic interpolation (Fritsch and Butland 1984) of values (N, m) at knots (N,), evaluated at times (M,).
+
+    It passes through the samples with a continuous slope and never swings beyond them; outside, the ends stand.
+    """
+    h = np.diff(knots)[:, None]
+    secants = np.diff(values, axis=0) / h
+    slopes = np.zeros_like(values)
+    if len(knots) > 2:
+        before, after = secants[:-1], secants[1:]
+        w1, w2 = 2.0 * h[1:] + h[:-1], h[1:] + 2.0 * h[:-1]
+        same_sense = before * after > 0.0
+        mean = (w1 + w2) / (w1 / np.where(same_sense, before, 1.0) + w2 / np.where(same_sense, after, 1.0))
+        slopes[1:-1] = np.where(same_sense, mean, 0.0)
+    slopes[0], slopes[-1] = secants[0], secants[-1]
+    times = np.clip(times, knots[0], knots[-1])
+    i = np.clip(np.searchsorted(knots, times, side="right") - 1, 0, len(knots) - 2)
+    step = h[i]
+    t = (times - knots[i])[:, None] / step
+    start = values[i] * (1.0 + 2.0 * t) * (1.0 - t) ** 2 + step * slopes[i] * t * (1.0 - t) ** 2
+    interpolated: Array = start + values[i + 1] * t * t * (3.0 - 2.0 * t) + step * slopes[i + 1] * t * t * (t - 1.0)
+    return interpolated
+
+
+def check_duration(duration: float) -> None:
+    """Check that a motion can last so long [s].
+
+    Raises:
+        InputError: it is not positive and finite.
+    """
+    if not 0.0 < duration < np.inf:
+        raise InputError(f"the duration is {duration:g} s; it must be positive and finite")
 
 
 def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float) -> Target:
@@ -73,8 +106,7 @@ def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float)
         UnknownNameError: neither a motion nor a file.
         InputError: the file is malformed, not finite, out of order, or its quaternions are off unit by more than 1e-3.
     """
-    if not 0.0 < duration < np.inf:
-        raise InputError(f"the duration is {duration:g} s; it must be positive and finite")
+    check_duration(duration)
     if str(name_or_path) in MOTIONS:
         return _named_motion(str(name_or_path), mechanism, duration)
     path = Path(name_or_path)
@@ -85,7 +117,7 @@ def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float)
 
 def _read_csv(path: Path, mechanism: Mechanism) -> Target:
     try:
-        lines = path.read_text().splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read {path}: {error}") from None
     header = [name.strip() for name in lines[0].split(",")] if lines else []
@@ -125,9 +157,9 @@ def _read_csv(path: Path, mechanism: Mechanism) -> Target:
 
 
 def _cut(target: Target, duration: float) -> Target:
-    kept = target.times <= duration + MARGIN_S
-    kept[:2] = True
-    return Target(target.name, target.times[kept], target.positions[kept], target.rotations[kept], target.held)
+    """Leave out what comes after the first sample past the duration, to which the motion is still heading."""
+    last = int(np.searchsorted(target.times, duration + MARGIN_S)) + 1
+    return Target(target.name, target.times[:last], target.positions[:last], target.rotations[:last], target.held)
 
 
 def _named_motion(name: str, mechanism: Mechanism, duration: float) -> Target:

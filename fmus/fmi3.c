@@ -33,10 +33,11 @@ typedef struct {
     State state;
     fmi3InstanceEnvironment environment;
     fmi3LogMessageCallback log;
+    fmi3Boolean logging;
 } Plant;
 
 static fmi3Status fail(Plant *plant, const char *message) {
-    if (plant->log) plant->log(plant->environment, fmi3Error, "logStatusError", message);
+    if (plant->log && plant->logging) plant->log(plant->environment, fmi3Error, "logStatusError", message);
     return fmi3Error;
 }
 
@@ -106,18 +107,20 @@ static int all_finite(const double *values, size_t n) {
     return 1;
 }
 
+static fmi3Status check_values(Plant *plant, int v, const double *values) {
+    char message[200];
+    for (int i = 0; i < length[v]; i++) {
+        if (isfinite(values[i]) && values[i] >= minimum[v]) continue;
+        snprintf(message, sizeof message, "parameter %s is %g; it must be finite and at least %g", names[v], values[i], minimum[v]);
+        return fail(plant, message);
+    }
+    return fmi3OK;
+}
+
 static fmi3Status check_parameters(Plant *plant) {
     const double *values = plant->state.values;
-    char message[200];
-    for (int v = 0; v < VARIABLES; v++) {
-        if (kind[v] != FIXED && kind[v] != TUNABLE) continue;
-        for (int i = 0; i < length[v]; i++) {
-            double value = values[offset[v] + i];
-            if (isfinite(value) && value >= minimum[v]) continue;
-            snprintf(message, sizeof message, "parameter %s is %g; it must be finite and at least %g", names[v], value, minimum[v]);
-            return fail(plant, message);
-        }
-    }
+    for (int v = 0; v < VARIABLES; v++)
+        if ((kind[v] == FIXED || kind[v] == TUNABLE) && check_values(plant, v, values + offset[v]) != fmi3OK) return fmi3Error;
     const double *q = values + INITIAL_QUATERNION_AT;
     if (fabs(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3] - 1) > 2e-3)
         return fail(plant, "parameter initial_quaternion is not a unit quaternion; normalise it");
@@ -129,7 +132,8 @@ static fmi3Status check_parameters(Plant *plant) {
 FMI3_Export const char *fmi3GetVersion(void) { return "3.0"; }
 
 FMI3_Export fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean on, size_t n, const fmi3String categories[]) {
-    (void)instance, (void)on, (void)n, (void)categories;
+    (void)n, (void)categories;
+    ((Plant *)instance)->logging = on;
     return fmi3OK;
 }
 
@@ -143,16 +147,17 @@ FMI3_Export fmi3Instance fmi3InstantiateCoSimulation(
     fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging, fmi3Boolean events,
     fmi3Boolean early_return, const fmi3ValueReference intermediate[], size_t n_intermediate,
     fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, fmi3IntermediateUpdateCallback update) {
-    (void)name, (void)resources, (void)visible, (void)logging, (void)events, (void)early_return;
+    (void)name, (void)resources, (void)visible, (void)events, (void)early_return;
     (void)intermediate, (void)n_intermediate, (void)update;
     if (!token || strcmp(token, TOKEN)) {
-        if (log) log(environment, fmi3Error, "logStatusError", "the instantiationToken is not that of modelDescription.xml");
+        if (log && logging) log(environment, fmi3Error, "logStatusError", "the instantiationToken is not that of modelDescription.xml");
         return 0;
     }
     Plant *plant = malloc(sizeof *plant);
     if (!plant) return 0;
     plant->environment = environment;
     plant->log = log;
+    plant->logging = logging;
     reset(&plant->state);
     return plant;
 }
@@ -257,11 +262,13 @@ FMI3_Export fmi3Status fmi3SetFloat64(
         fmi3ValueReference v = references[i];
         if (may_set(plant, v, 0) != fmi3OK) return fmi3Error;
         if (at + length[v] > n_values) return fail(plant, "fmi3SetFloat64: too few values");
+        /* Before the end of initialisation parameters may be set one after the other; then all are checked together. */
+        if (kind[v] == TUNABLE && plant->state.phase >= STEPPING && check_values(plant, v, values + at) != fmi3OK) return fmi3Error;
         memcpy(plant->state.values + offset[v], values + at, length[v] * sizeof(double));
         at += length[v];
         note_set(&plant->state, v);
     }
-    return plant->state.phase == STEPPING && !plant->state.constants_known ? check_parameters(plant) : fmi3OK;
+    return fmi3OK;
 }
 
 FMI3_Export fmi3Status fmi3GetInt64(

@@ -18,7 +18,7 @@ from plant.compiled import Record, kernel
 from plant.fmu import advance, read_imus, read_truth, write_command, write_drive_mode
 from plant.imu import measure
 from plant.pose import Array
-from plant.variables import IMU_COUNT, VELOCITY
+from plant.variables import BRAKE, IMU_COUNT, VELOCITY
 
 STAGES = (
     "FMU outputs",
@@ -112,6 +112,8 @@ def _run_stages(
     """The loop of `hil.loop`, with the clock read between the stages."""
     p, s = parameters[()], state[()]
     for k in range(nanoseconds.shape[0]):
+        if s.cycle == 0:
+            write_drive_mode(calls, BRAKE)
         if s.cycle == p.hold_cycles:
             write_drive_mode(calls, VELOCITY)
         row = nanoseconds[k]

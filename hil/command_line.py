@@ -9,7 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
 
-from plant.errors import GoughError
+from plant.errors import GoughError, InputError
 from plant.files import check_writable, write_whole
 
 REFUSED, INTERRUPTED = 2, 130
@@ -127,6 +127,8 @@ def _simulate(options: argparse.Namespace) -> int:
     from hil.simulation import SimulationConfig, SimulationStoppedError, simulate
 
     _check_writable(options.json, options.report)
+    if options.json and options.report and options.json.resolve() == options.report.resolve():
+        raise InputError(f"--json and --report both name {options.json}: give two files")
     names = ("mechanism", "target", "duration", "rate", "imu", "seed", "fusion", "plant", "imus")
     config = SimulationConfig(**{name: getattr(options, name) for name in names})
     stopped = None

@@ -97,8 +97,10 @@ def now(clock: NDArray[np.int64]) -> int:
 
 @kernel
 def _sense(calls: Record, imu: Record, parameters: Record, state: Record, measurement: Array) -> int:
-    """Read the plant through the IMUs' imperfections; the brakes open when the hold is over."""
+    """Read the plant through the IMUs' imperfections; the brakes hold from the first cycle to the end of the hold."""
     status = 0
+    if state[()].cycle == 0:
+        status |= write_drive_mode(calls, BRAKE)
     if state[()].cycle == parameters[()].hold_cycles:
         status |= write_drive_mode(calls, VELOCITY)
     status |= read_imus(calls)

@@ -1,6 +1,5 @@
 """The report of a simulation: one HTML file that opens offline, with summary, time series and the moving mechanism."""
 
-import os
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -15,7 +14,7 @@ from plotly.subplots import make_subplots
 
 from controller.cycle import ALL_IMUS
 from hil.simulation import SimulationResult
-from plant.errors import InputError
+from plant.files import write_whole
 from plant.mechanism import LEGS
 from plant.pose import Array, rotation_angle
 
@@ -52,18 +51,7 @@ def write_report(result: SimulationResult, path: Path) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    page = _page(result)
-    part = path.parent / f".{path.name}.{os.getpid()}.part"
-    try:
-        try:
-            part.write_text(page, encoding="utf-8")
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"cannot write the report {path}: {error.strerror}; give a file in a folder that is writable"
-        ) from None
+    write_whole(path, _page(result).encode())
 
 
 def _page(result: SimulationResult) -> str:

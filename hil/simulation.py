@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from controller.cycle import ALL_IMUS, NOT_FINITE, OK, POSE_LOST, STATE, check_rate, cycle_parameters, point_legs
+from controller.cycle import ALL_IMUS, IMPLAUSIBLE, NOT_FINITE, OK, POSE_LOST, STATE, check_rate, cycle_parameters, point_legs
 from controller.direct_kinematics import poses_from_lengths
 from controller.leg_filter import start_leg
 from controller.planner import Reference, plan
 from controller.settings import control_settings, fusion_settings
-from controller.target import Target, load_target
+from controller.target import Target, check_duration, load_target
 from hil.loop import CYCLE_RECORD, PLANT_FAILED, LegFusion, Loop
 from plant.compiled import Record
-from plant.errors import GoughError, UnknownNameError
+from plant.errors import GoughError, InputError, UnknownNameError
 from plant.export import default_fmu
 from plant.fmu import FmuPlant
 from plant.imu import ACCELEROMETER, GYROSCOPE, imu_state, load_imu
@@ -26,7 +26,10 @@ from plant.mechanism import LEGS, Mechanism, load_mechanism
 from plant.pose import Array, rotation_angle, rotations_from_quaternions
 
 FUSIONS = ("compiled", "filterpy")
+HOLD_RANGE_S = (0.2, 10.0)
 _CHUNK_S = 0.25
+MOST_RECORD_BYTES = 4 * 2**30
+"""The longest run that is kept in memory."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,15 @@ class SimulationConfig:
 
     def __post_init__(self) -> None:
         check_rate(self.rate)
+        check_duration(self.duration)
+        cycles = self.duration * self.rate
+        if round(cycles) < 1:
+            raise InputError(f"the duration is {self.duration:g} s, less than one cycle of {1.0 / self.rate:g} s")
+        if cycles * CYCLE_RECORD.itemsize > MOST_RECORD_BYTES:
+            raise InputError(
+                f"{self.duration:g} s at {self.rate:g} Hz would record {cycles * CYCLE_RECORD.itemsize / 2**30:.3g} GiB, "
+                f"more than {MOST_RECORD_BYTES / 2**30:g} GiB: choose a shorter duration or a lower rate"
+            )
         if self.fusion not in FUSIONS:
             raise UnknownNameError(f"no fusion {self.fusion!r}; there are {', '.join(FUSIONS)}")
 
@@ -194,10 +206,13 @@ def prepared_loop(config: SimulationConfig) -> Iterator[PreparedLoop]:
     target = load_target(config.target, mechanism, config.duration)
     period = 1.0 / config.rate
     imu = imu_state(load_imu(config.imu), config.seed, period)
-    parameters = cycle_parameters(mechanism, config.rate, control_settings(mechanism), fusion_settings(mechanism), config.imus)
+    control = control_settings(mechanism)
+    if not HOLD_RANGE_S[0] <= control.hold <= HOLD_RANGE_S[1]:
+        raise InputError(f"hold is {control.hold:g} s; the estimate settles in {HOLD_RANGE_S[0]:g} to {HOLD_RANGE_S[1]:g} s")
+    parameters = cycle_parameters(mechanism, config.rate, control, fusion_settings(mechanism), config.imus)
     count = int(parameters["hold_cycles"]) + round(config.duration * config.rate)
     plan(mechanism, load_target("hold", mechanism, 0.1), 0.1)
-    fmu = Path(config.plant) if config.plant else default_fmu()
+    fmu = default_fmu() if config.plant is None else Path(config.plant)
     with FmuPlant(fmu, mechanism.plant_parameters(target.start), period) as plant:
         began = time.perf_counter()
         reference = plan(mechanism, target, config.duration)
@@ -219,6 +234,10 @@ def prepared_loop(config: SimulationConfig) -> Iterator[PreparedLoop]:
 
 
 _CAUSES = {
+    IMPLAUSIBLE: (
+        "the estimated pose needs a leg far outside its stroke: the IMUs' errors are larger than the filters assume "
+        "(raw ones need a calibration)"
+    ),
     POSE_LOST: "the estimated leg directions no longer determine a pose",
     NOT_FINITE: "an estimate or a command is no longer finite",
 }

@@ -49,11 +49,12 @@ def keyed_folder(kind: str, key: str) -> Path:
 
     Where the user's cache cannot be written, the folder lasts only as long as the process.
     """
-    folder = user_cache() / kind / key
     try:
+        folder = user_cache() / kind / key
         folder.mkdir(parents=True, exist_ok=True)
         os.utime(folder)
-    except OSError:
+    except (OSError, RuntimeError):
+        # RuntimeError: there is no home folder.
         folder = _passing_cache() / kind / key
         folder.mkdir(parents=True, exist_ok=True)
         return folder

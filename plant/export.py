@@ -261,6 +261,7 @@ def _model_description(starts: dict[str, Array], token: str, dependencies: dict[
         ' canGetAndSetFMUState="true" canSerializeFMUState="true"/>',
         f"<UnitDefinitions>{''.join(units)}</UnitDefinitions>",
         f'<TypeDefinitions><EnumerationType name="DriveMode">{items}</EnumerationType></TypeDefinitions>',
+        '<LogCategories><Category name="logStatusError" description="why a call was refused or failed"/></LogCategories>',
         '<DefaultExperiment startTime="0" stopTime="10" stepSize="0.001"/>',
         "<ModelVariables>",
         f'<Float64 name="time" valueReference="{TIME_REFERENCE}" causality="independent" variability="continuous" unit="s"/>',

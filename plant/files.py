@@ -13,7 +13,7 @@ def check_writable(path: Path) -> None:
     Raises:
         InputError: the path is a folder, or its folder does not exist or cannot be written.
     """
-    folder = path.absolute().parent
+    folder = path.resolve().parent
     if path.is_dir():
         raise InputError(f"cannot write {path}: it is a folder")
     if not folder.is_dir() or not os.access(folder, os.W_OK):
@@ -21,15 +21,20 @@ def check_writable(path: Path) -> None:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write `content` to `path`; the file takes its place only when it is complete.
+    """Write `content` to `path`; the file takes its place only when it is complete. Links are followed, and what is no
+    regular file, such as a device, is written to and not replaced.
 
     Raises:
         InputError: the file cannot be written.
     """
     check_writable(path)
     part = None
+    path = path.resolve()
     try:
-        with tempfile.NamedTemporaryFile(dir=path.absolute().parent, prefix=f".{path.name}.", delete=False) as file:
+        if path.exists() and not path.is_file():
+            path.write_bytes(content)
+            return
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
             part = Path(file.name)
             file.write(content)
         part.chmod(0o644)

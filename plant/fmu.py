@@ -220,7 +220,7 @@ class FmuPlant:
                 fmu = fmpy.fmi3.FMU3Slave(
                     guid=self._description.guid, unzipDirectory=folder, modelIdentifier=identifier, instanceName="plant"
                 )
-            fmu.instantiate(logMessage=self._log)
+            fmu.instantiate(loggingOn=True, logMessage=self._log)
         except Exception as error:
             reason = self.messages[-1] if self.messages else error
             raise FmuError(f"{self.path.name} cannot be loaded: {reason}") from None

@@ -134,7 +134,7 @@ class Mechanism:
         axes = _joint_axes(base_joint_axes, directions)
         up = checked_unit(up_in_base, 3, "up_in_base")
         parameters = checked_parameters(plant or {})
-        _check_gravity(parameters, up)
+        _check_plant(parameters, up)
         return cls(
             name=name,
             base_joints=base,
@@ -310,7 +310,31 @@ def _check_joints(base: Array, platform: Array) -> None:
             raise InputError(f"the {name} joints all lie on one line: no pose of six legs can be told or held")
 
 
-def _check_gravity(parameters: Mapping[str, Array], up: Array) -> None:
+_DERIVED = (
+    "base_joints", "platform_joints", "base_joint_axes", "stop.minimum_length", "stop.maximum_length", "initial_position",
+    "initial_quaternion",
+)  # fmt: skip
+"""Plant parameters that follow from the rest of a mechanism."""
+
+
+def _check_plant(parameters: Mapping[str, Array], up: Array) -> None:
+    for name in _DERIVED:
+        if name in parameters:
+            raise InputError(f"the plant's {name} follows from the geometry, the home pose and the limits: leave it out")
+    for name in ("platform.inertia", "payload.inertia"):
+        inertia = parameters.get(name, np.eye(3))
+        if np.abs(inertia - inertia.T).max() > 1e-9 or np.linalg.eigvalsh(inertia).min() < 0.0:
+            raise InputError(
+                f"{name} {inertia.tolist()} is no inertia: it must be symmetric without negative principal moments"
+            )
+    if {"drive.compensation", "drive.nominal_resistance", "motor.resistance"} <= set(parameters):
+        made_up = float(parameters["drive.compensation"] * parameters["drive.nominal_resistance"])
+        least = float(parameters["motor.resistance"].min())
+        if made_up >= least:
+            raise InputError(
+                f"drive.compensation x nominal_resistance is {made_up:g} Ohm; the drive is stable only below the motors' "
+                f"resistance of {least:g} Ohm: choose a smaller compensation"
+            )
     gravity = parameters.get("gravity", np.zeros(3))
     size = float(np.linalg.norm(gravity))
     if size > 0.0 and np.linalg.norm(gravity / size + up) > 1e-3:

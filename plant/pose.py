@@ -35,9 +35,12 @@ def numbers(value: ArrayLike, name: str, shape: tuple[int, ...] | str) -> Array:
         InputError: it is not an array of numbers.
     """
     try:
-        return np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} must be an array of numbers of shape {shape}, got {value!r}") from None
+        given = np.asarray(value)
+    except ValueError:
+        given = np.empty((), object)
+    if given.dtype.kind not in "iuf":
+        raise InputError(f"{name} must be an array of numbers of shape {shape}, got {value!r}")
+    return np.array(given, dtype=np.float64)
 
 
 def checked_array(value: ArrayLike, shape: tuple[int, ...], name: str, *, allow_nan: bool = False) -> Array:
@@ -130,19 +133,17 @@ def rotations_from_quaternions(quaternions: Array) -> Array:
 
 
 def quaternion_from_rotation(rotation: Array) -> Array:
-    """The unit quaternion (4,), w first and w >= 0, of a rotation (3, 3)."""
+    """The unit quaternions (..., 4), w first and w >= 0, of rotations (..., 3, 3)."""
     # The eigenvector of Bar-Itzhack's symmetric matrix is the quaternion, without a case per quadrant.
-    m = rotation
-    k = np.array(
-        [
-            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-            [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
-            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
-            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]],
-        ]
-    )
-    quaternion: Array = np.linalg.eigh(k)[1][:, -1]
-    return quaternion if quaternion[0] >= 0.0 else -quaternion
+    m = np.moveaxis(rotation, (-2, -1), (0, 1))
+    rows = [
+        [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+        [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
+        [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
+        [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]],
+    ]
+    quaternion: Array = np.linalg.eigh(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))[1][..., -1]
+    return np.where(quaternion[..., :1] >= 0.0, quaternion, -quaternion)
 
 
 @kernel

@@ -86,7 +86,7 @@ def wavy(mechanism, seed):
     measurement = np.zeros((3, 7, 3))
 
     def at(k):
-        sway = np.sin(frequencies * k * PERIOD_S) * np.array([0.1, 0.5, 0.0])[:, None, None]
+        sway = np.sin(frequencies * k * PERIOD_S) * np.array([0.02, 0.1, 0.0])[:, None, None]
         measure(imu, signals + sway, measurement)
         return measurement
 

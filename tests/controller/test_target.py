@@ -4,9 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, Slerp
 
+from controller.direct_kinematics import poses_from_lengths
 from controller.inverse_kinematics import leg_lengths
+from controller.planner import plan
+from controller.reference import sample_reference
 from controller.target import COLUMNS, MARGIN_S, MOTIONS, SAMPLE_PERIOD_S, Target, load_target
 from plant.errors import GoughError, InputError, UnknownNameError
 from plant.mechanism import Mechanism
@@ -203,7 +207,7 @@ def test_a_quaternion_off_unit_within_the_tolerance_is_normalised(hexapod, tmp_p
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.5, 3.0, np.pi - 0.01, np.pi]))
-def test_between_samples_the_pose_is_on_the_line_and_the_shortest_turn(seed, start_angle):
+def test_between_samples_the_motion_is_smooth_and_never_swings_beyond_them(seed, start_angle):
     """Turning on through half a turn, where a quaternion with w >= 0 jumps to its negative."""
     random = np.random.default_rng(seed)
     times = np.concatenate([[0.0], np.cumsum(random.uniform(0.005, 0.02, 9))])
@@ -216,16 +220,50 @@ def test_between_samples_the_pose_is_on_the_line_and_the_shortest_turn(seed, sta
     target = Target("test", times, positions, rotations.as_matrix())
     wanted = random.uniform(times[0], times[-1], 40)
     found, turned = target.at(wanted)
-    expected = Slerp(times, rotations)(wanted).as_matrix()
     for k, time in enumerate(wanted):
         i = min(int(np.searchsorted(times, time, side="right")) - 1, 8)
-        share = (time - times[i]) / (times[i + 1] - times[i])
-        np.testing.assert_allclose(found[k], (1.0 - share) * positions[i] + share * positions[i + 1], atol=1e-14)
-        # A chord instead of an arc of at most 0.035 rad: off by less than its cube over a hundred.
-        assert angle_between(turned[k], expected[k]) < 0.035**3 / 100.0
+        least, greatest = np.minimum(positions[i], positions[i + 1]), np.maximum(positions[i], positions[i + 1])
+        assert (least - 1e-15 <= found[k]).all() and (found[k] <= greatest + 1e-15).all()
+        apart = angle_between(rotations[i].as_matrix(), rotations[i + 1].as_matrix())
+        assert angle_between(turned[k], rotations[i].as_matrix()) <= apart + 1e-6
     at_samples = target.at(times)
     np.testing.assert_allclose(at_samples[0], positions, atol=1e-15)
     np.testing.assert_allclose(at_samples[1], rotations.as_matrix(), atol=1e-13)
+    h = 1e-9
+    for time in times[1:-1]:
+        before, at, after = (target.at(np.array([t]))[0][0] for t in (time - h, time, time + h))
+        np.testing.assert_allclose((at - before) / h, (after - at) / h, atol=1e-4)
+
+
+def test_positions_between_samples_are_those_of_scipys_monotone_cubic():
+    random = np.random.default_rng(3)
+    times = np.concatenate([[0.0], np.cumsum(random.uniform(0.01, 0.3, 30))])
+    positions = random.normal(scale=0.02, size=(31, 3))
+    target = Target("test", times, positions, np.tile(np.eye(3), (31, 1, 1)))
+    # The ends differ: ours go off along the first and last secant.
+    inner = random.uniform(times[1], times[-2], 200)
+    np.testing.assert_allclose(target.at(inner)[0], PchipInterpolator(times, positions)(inner), atol=1e-15)
+
+
+def test_two_samples_are_joined_by_a_line_and_the_shortest_turn():
+    times, share = np.array([0.0, 0.4]), 0.3
+    rotations = Rotation.from_rotvec([[0.0, 0.0, 3.1], [0.0, 0.0, 3.2]])
+    target = Target("test", times, np.array([[0.0, 0.0, 0.35], [0.01, 0.0, 0.35]]), rotations.as_matrix())
+    position, rotation = target.at(np.array([share * 0.4]))
+    np.testing.assert_allclose(position[0], [share * 0.01, 0.0, 0.35], atol=1e-15)
+    assert angle_between(rotation[0], Slerp(times, rotations)(share * 0.4).as_matrix()) < 1e-5
+
+
+def test_coarse_waypoints_do_not_make_the_reference_swing(hexapod):
+    """Rows seconds apart: the reference stays between them, and close to the target."""
+    times = np.array([0.0, 2.0, 2.5, 4.5, 5.0, 7.0])
+    positions = np.tile(hexapod.home.position, (6, 1))
+    positions[2:4, 0] += 0.02
+    target = Target("test", times, positions, np.tile(np.eye(3), (6, 1, 1)))
+    lengths = sample_reference(plan(hexapod, target, 7.0).segments, 1e-3, 7000)[:, :, 0]
+    found, _ = poses_from_lengths(hexapod, lengths, target.start)
+    wanted, _ = target.at(np.arange(7000) * 1e-3)
+    assert np.linalg.norm(found - wanted, axis=1).max() < 0.5e-3
 
 
 def test_before_the_first_and_after_the_last_sample_these_stand(hexapod):
