@@ -3,8 +3,8 @@
 On every target sample ruckig plans anew, from the state of the reference to where the target will be 30 ms later, with
 its velocity and acceleration there. What is published are the cubic
 segments of those plans, so the limits on velocity, acceleration and jerk hold between samples too. ruckig does not know
-the stroke: a plan counts only if every leg could still stop inside its stroke after it, else a gentler one is taken, and
-at last the stop itself.
+the stroke: a plan counts only if every leg could still stop inside its stroke after it, and if it arrives in time; else a
+gentler one is taken, and at last the stop itself.
 """
 
 from dataclasses import dataclass
@@ -20,6 +20,7 @@ from plant.mechanism import LEGS, Limits, Mechanism
 from plant.pose import Array
 
 PREVIEW_S = 0.03
+_LATEST_S = 2.0 * PREVIEW_S
 _HALF_WINDOW = 3
 _STILL_M = 1e-9
 """A target that moves no leg by more than this within the window stands still."""
@@ -109,7 +110,7 @@ class _Planner:
         self._follow.target_position = target
         for rate, acceleration in ((rates, accelerations), (rates, rest), (rest, rest)):
             self._follow.target_velocity, self._follow.target_acceleration = rate, acceleration
-            if self._calculate(self._follow) and self._is_safe():
+            if self._calculate(self._follow) and self._is_timely(rate) and self._is_safe():
                 kept = self._stays_inside()
                 break
         else:
@@ -130,6 +131,12 @@ class _Planner:
         except (RuckigError, ValueError):
             # ValueError: a result code of ruckig that its own binding does not know.
             return False
+
+    def _is_timely(self, rate: list[float]) -> bool:
+        """Whether the plan arrives about when it should; one that is to arrive with a speed and cannot in time would swing
+        away from the target first, to gain that speed.
+        """
+        return self._trajectory.duration <= _LATEST_S or not any(rate)
 
     def _is_safe(self) -> bool:
         """Whether the first sample period of the plan, and a stop after it, stay inside the stroke."""
