@@ -1,10 +1,9 @@
 """The planner: from target poses to a reference that no actuator has to leave its limits for.
 
 On every target sample ruckig plans anew, from the state of the reference to where the target will be 30 ms later, with
-its velocity and acceleration there. What is published are the cubic
-segments of those plans, so the limits on velocity, acceleration and jerk hold between samples too. ruckig does not know
-the stroke: a plan counts only if every leg could still stop inside its stroke after it, and if it arrives in time; else a
-gentler one is taken, and at last the stop itself.
+its velocity and acceleration there. What is published are the cubic segments of those plans, so the limits on velocity,
+acceleration and jerk hold between samples too. ruckig does not know the stroke: a plan counts only if every leg could
+still stop inside its stroke after it, and if it arrives in time; else a gentler one is taken, and at last the stop itself.
 """
 
 from dataclasses import dataclass
@@ -133,8 +132,9 @@ class _Planner:
             return False
 
     def _is_timely(self, rate: list[float]) -> bool:
-        """Whether the plan arrives about when it should; one that is to arrive with a speed and cannot in time would swing
-        away from the target first, to gain that speed.
+        """Whether the plan arrives about when it should.
+
+        One that is to arrive with a speed, and cannot in time, would first swing away from the target to gain that speed.
         """
         return self._trajectory.duration <= _LATEST_S or not any(rate)
 
