@@ -161,19 +161,18 @@ def _figure(name: str, title: str, caption: str, figure: go.Figure, kind: str) -
 def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figure]]:
     """Name, title, caption and figure of everything that is drawn over time."""
     records, times = result.records, result.times
-    limits, home = result.mechanism.require_limits(), result.mechanism.require_home()
+    limits, home_pose = result.mechanism.require_limits(), result.mechanism.require_home()
     truth = (result.true_positions, result.true_rotations)
     planned = (result.reference_positions, result.reference_rotations)
     true_lengths, currents = 1e3 * records["truth"][:, 7:13], records["truth"][:, 13:19]
     planned_lengths, rates, accelerations = np.moveaxis(records["reference"], 2, 0) * [[[1e3]], [[1e3]], [[1.0]]]
 
-    true_pose, planned_pose = (
-        _differences(truth, (home.position, home.rotation)),
-        _differences(planned, (home.position, home.rotation)),
-    )
+    home = (home_pose.position, home_pose.rotation)
     pose = [
-        _Panel(label, AXIS_NAMES, true_pose[i], planned_pose[i])
-        for i, label in enumerate(("position [mm]", "rotation vector [deg]"))
+        _Panel(label, AXIS_NAMES, true, plan)
+        for label, true, plan in zip(
+            ("position [mm]", "rotation vector [deg]"), _differences(truth, home), _differences(planned, home), strict=True
+        )
     ]
     estimation, tracking = _differences((records["position"], records["rotation"]), truth), _differences(truth, planned)
     errors = [
@@ -381,6 +380,8 @@ def _scene(points: Array, up: Array) -> dict[str, Any]:
             for name, ends in zip(AXIS_NAMES, ranges, strict=True)
         },
         "aspectmode": "data",
+        # A turntable's axis is always z.
+        "dragmode": "turntable" if up[2] > 0.999 else "orbit",
         "camera": {key: dict(zip(AXIS_NAMES, vector.tolist(), strict=True)) for key, vector in looks.items()},
     }
 
