@@ -10,7 +10,9 @@ from collections.abc import Collection
 
 import numpy as np
 
-from controller.direct_kinematics import joint_plane, pose_from_legs, pose_from_vector, refine
+from controller.direct_kinematics.closed_forms import pose_from_legs, pose_from_vector
+from controller.direct_kinematics.refinement import refine
+from controller.direct_kinematics.spatial import joint_plane
 from controller.inverse_kinematics import jacobian_at, legs_at, sample_workspace
 from controller.least_squares import RANK_TOLERANCE, solve_least_squares
 from controller.leg_filter import leg_direction, predict_leg, start_leg, update_leg

@@ -75,7 +75,7 @@ def _passing_cache() -> Path:
 @cache
 def _kernel_folder() -> Path:
     root = Path(__file__).resolve().parent.parent
-    sources = sorted(file for package in PACKAGES for file in (root / package).glob("*.py"))
+    sources = sorted(file for package in PACKAGES for file in (root / package).rglob("*.py"))
     return keyed_folder("kernels", hash_of_files(sources, numba.__version__))
 
 

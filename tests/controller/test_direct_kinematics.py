@@ -12,18 +12,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from controller.direct_kinematics import (
-    Workspace,
-    joint_plane,
-    pose_difference,
-    pose_from_legs,
-    pose_from_lengths,
-    pose_from_rotation,
-    pose_from_vector,
-    poses_from_lengths,
-    rotation_between,
-    solve,
-)
+from controller.direct_kinematics import pose_difference, pose_from_lengths, poses_from_lengths, solve
+from controller.direct_kinematics.closed_forms import pose_from_legs, pose_from_rotation, pose_from_vector, rotation_between
+from controller.direct_kinematics.spatial import Workspace, joint_plane
 from controller.inverse_kinematics import leg_lengths, sample_workspace
 from controller.least_squares import RANK_TOLERANCE
 from plant.errors import GoughError, InputError, SingularConfigurationError

@@ -1,6 +1,7 @@
 """Compiled kernels and the cache that keeps them."""
 
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -119,9 +120,7 @@ def test_an_edit_in_any_package_gives_a_new_folder(tmp_path: Path) -> None:
     root = Path(__file__).resolve().parents[2]
     copy = tmp_path / "copy"
     for package in ("plant", "controller", "hil"):
-        for file in (root / package).glob("*.py"):
-            (copy / package).mkdir(parents=True, exist_ok=True)
-            (copy / package / file.name).write_bytes(file.read_bytes())
+        shutil.copytree(root / package, copy / package, ignore=shutil.ignore_patterns("__pycache__"))
     code = "from plant.compiled import _kernel_folder; print(_kernel_folder().name)"
 
     def key() -> str:

@@ -1,0 +1,95 @@
+"""Direct kinematics from six lengths, by Newton's method on SE(3) from a first guess, for rigs that have encoders."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from controller.direct_kinematics.spatial import Workspace
+from controller.inverse_kinematics import jacobian_at, legs_at
+from controller.least_squares import RANK_TOLERANCE, solve_least_squares
+from plant.compiled import kernel
+from plant.errors import SingularConfigurationError
+from plant.mechanism import LEGS, Mechanism
+from plant.pose import Array, Pose, checked_array, checked_rotation, rotate_by_vector
+
+_NEWTON_LIMIT = 50
+
+
+def pose_from_lengths(mechanism: Mechanism, lengths: ArrayLike, guess: Pose | None = None) -> Pose:
+    """The pose at which the legs have these lengths, by Newton's method on SE(3) from a first guess (default: home).
+
+    Raises:
+        InputError: wrong shape or not finite, or the guess is no pose.
+        SingularConfigurationError: no pose near the guess has these lengths.
+    """
+    start = guess or mechanism.require_home()
+    target = checked_array(lengths, (LEGS,), "lengths")
+    position = checked_array(start.position, (3,), "guess.position").copy()
+    rotation = checked_rotation(start.rotation, "guess.rotation").copy()
+    work = Workspace()
+    error = newton_from_lengths(mechanism.base_joints, mechanism.platform_joints, target, position, rotation, *work.newton)
+    if not error < 1e-10:
+        raise SingularConfigurationError(
+            f"no pose near the guess has these lengths (they are missed by {1e3 * error:.3g} mm): they are not reachable, or "
+            "the guess is too far"
+        )
+    return Pose(position, rotation)
+
+
+@kernel
+def newton_from_lengths(
+    base_joints: Array, platform_joints: Array, target: Array, position: Array, rotation: Array, arms: Array, directions: Array,
+    lengths: Array, jacobian: Array, correction: Array, norms: Array, order: Array,
+) -> float:  # fmt: skip
+    """Move a pose, in place, to where the legs have the lengths `target` (6,) [m]; returns the largest error left [m]."""
+    error = np.inf
+    for _ in range(_NEWTON_LIMIT):
+        legs_at(base_joints, platform_joints, position, rotation, arms, directions, lengths)
+        before, error = error, 0.0
+        for k in range(LEGS):
+            lengths[k] = target[k] - lengths[k]
+            error = max(error, abs(lengths[k]))
+        if error < 1e-15 or (error < 1e-11 and error >= before):
+            break
+        jacobian_at(arms, directions, jacobian)
+        if solve_least_squares(jacobian, lengths, correction, norms[:6], order[:6]) < RANK_TOLERANCE:
+            return np.inf
+        for i in range(3):
+            position[i] += correction[i]
+        rotate_by_vector(rotation, correction[3:])
+    return error
+
+
+@kernel
+def _poses_from_lengths(
+    base_joints: Array, platform_joints: Array, lengths: Array, position: Array, rotation: Array, positions: Array,
+    rotations: Array, arms: Array, directions: Array, scratch: Array, jacobian: Array, correction: Array, norms: Array,
+    order: Array,
+) -> int:  # fmt: skip
+    for i in range(lengths.shape[0]):
+        error = newton_from_lengths(
+            base_joints, platform_joints, lengths[i], position, rotation, arms, directions, scratch, jacobian, correction,
+            norms, order,
+        )  # fmt: skip
+        if not error < 1e-10:
+            return i
+        positions[i] = position
+        rotations[i] = rotation
+    return -1
+
+
+def poses_from_lengths(mechanism: Mechanism, lengths: Array, guess: Pose) -> tuple[Array, Array]:
+    """Positions (N, 3) [m] and rotations (N, 3, 3) of a motion given by lengths (N, 6) [m], each found from the one
+    before.
+
+    Raises:
+        SingularConfigurationError: the lengths of a row belong to no pose near the one before.
+    """
+    positions, rotations = np.empty((len(lengths), 3)), np.empty((len(lengths), 3, 3))
+    work = Workspace()
+    failed = _poses_from_lengths(
+        mechanism.base_joints, mechanism.platform_joints, np.ascontiguousarray(lengths), guess.position.copy(),
+        guess.rotation.copy(), positions, rotations, *work.newton,
+    )  # fmt: skip
+    if failed >= 0:
+        raise SingularConfigurationError(f"no pose near the one before has the lengths of row {failed}")
+    return positions, rotations

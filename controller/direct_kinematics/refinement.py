@@ -1,0 +1,132 @@
+"""Refinement: Gauss-Newton steps on SE(3) that weigh leg directions and vectors by their variances.
+
+The normal matrix is the inverse of the pose's covariance; the twist comes with the pose from the same matrix.
+"""
+
+from controller.inverse_kinematics import legs_at
+from controller.least_squares import factor_cholesky, solve_cholesky
+from plant.compiled import kernel
+from plant.mechanism import LEGS
+from plant.pose import Array, rotate_by_vector
+
+
+@kernel
+def _add_leg(right: Array, measured: Array, direction: Array, arm: Array, scale: float) -> None:
+    """Add `scale` J^T P `measured` to a right side (6,), P = I - d d^T and J = [I, -skew(arm)]."""
+    d0, d1, d2 = direction[0], direction[1], direction[2]
+    a0, a1, a2 = arm[0], arm[1], arm[2]
+    along = d0 * measured[0] + d1 * measured[1] + d2 * measured[2]
+    g0, g1, g2 = scale * (measured[0] - along * d0), scale * (measured[1] - along * d1), scale * (measured[2] - along * d2)
+    right[0] += g0
+    right[1] += g1
+    right[2] += g2
+    right[3] += a1 * g2 - a2 * g1
+    right[4] += a2 * g0 - a0 * g2
+    right[5] += a0 * g1 - a1 * g0
+
+
+@kernel
+def normal_equations(
+    base_joints: Array, platform_joints: Array, directions: Array, rates: Array, weights: Array,
+    in_base: Array, in_platform: Array, vector_weights: Array, angular_velocity: Array, position: Array, rotation: Array,
+    arms: Array, predicted: Array, lengths: Array, information: Array, correction: Array, twist: Array,
+) -> None:  # fmt: skip
+    """Weighted normal equations at a pose, for its correction and for the twist, which share one matrix.
+
+    Args:
+        directions: (6, 3), measured; `rates` (6, 3) are their derivatives [1/s].
+        weights: (6,), inverse variance of a component of a direction; 0 leaves a leg out.
+        in_base, in_platform: (m, 3), vectors known in both frames; `vector_weights` (m,) are their inverse variances.
+        angular_velocity: (3,) [rad/s] in {1}, which counts for the twist as the vectors do for the attitude.
+        information: (6, 6), lower triangle written; `correction` and `twist` (6,) are the right sides.
+    """
+    legs_at(base_joints, platform_joints, position, rotation, arms, predicted, lengths)
+    for i in range(6):
+        correction[i] = 0.0
+        twist[i] = 0.0
+        for j in range(6):
+            information[i, j] = 0.0
+    for k in range(LEGS):
+        w = weights[k]
+        if w == 0.0:
+            continue
+        d0, d1, d2 = predicted[k, 0], predicted[k, 1], predicted[k, 2]
+        a0, a1, a2 = arms[k, 0], arms[k, 1], arms[k, 2]
+        scale = w / lengths[k]
+        # P = I - d d^T makes the derivative of a direction P / l; [I, -skew(a)] is that of the leg vector.
+        w2 = scale / lengths[k]
+        p00, p01, p02 = w2 * (1.0 - d0 * d0), -w2 * d0 * d1, -w2 * d0 * d2
+        p11, p12, p22 = w2 * (1.0 - d1 * d1), -w2 * d1 * d2, w2 * (1.0 - d2 * d2)
+        information[0, 0] += p00
+        information[1, 0] += p01
+        information[1, 1] += p11
+        information[2, 0] += p02
+        information[2, 1] += p12
+        information[2, 2] += p22
+        m00, m01, m02 = a1 * p02 - a2 * p01, a1 * p12 - a2 * p11, a1 * p22 - a2 * p12
+        m10, m11, m12 = a2 * p00 - a0 * p02, a2 * p01 - a0 * p12, a2 * p02 - a0 * p22
+        m20, m21, m22 = a0 * p01 - a1 * p00, a0 * p11 - a1 * p01, a0 * p12 - a1 * p02
+        information[3, 0] += m00
+        information[3, 1] += m01
+        information[3, 2] += m02
+        information[4, 0] += m10
+        information[4, 1] += m11
+        information[4, 2] += m12
+        information[5, 0] += m20
+        information[5, 1] += m21
+        information[5, 2] += m22
+        information[3, 3] += a1 * m02 - a2 * m01
+        information[4, 3] += a1 * m12 - a2 * m11
+        information[5, 3] += a1 * m22 - a2 * m21
+        information[4, 4] += a2 * m10 - a0 * m12
+        information[5, 4] += a2 * m20 - a0 * m22
+        information[5, 5] += a0 * m21 - a1 * m20
+        _add_leg(correction, directions[k], predicted[k], arms[k], scale)
+        _add_leg(twist, rates[k], predicted[k], arms[k], scale)
+    o0, o1, o2 = angular_velocity[0], angular_velocity[1], angular_velocity[2]
+    for k in range(vector_weights.shape[0]):
+        w = vector_weights[k]
+        v0 = rotation[0, 0] * in_platform[k, 0] + rotation[0, 1] * in_platform[k, 1] + rotation[0, 2] * in_platform[k, 2]
+        v1 = rotation[1, 0] * in_platform[k, 0] + rotation[1, 1] * in_platform[k, 1] + rotation[1, 2] * in_platform[k, 2]
+        v2 = rotation[2, 0] * in_platform[k, 0] + rotation[2, 1] * in_platform[k, 1] + rotation[2, 2] * in_platform[k, 2]
+        b0, b1, b2 = in_base[k, 0], in_base[k, 1], in_base[k, 2]
+        information[3, 3] += w * (1.0 - v0 * v0)
+        information[4, 3] -= w * v0 * v1
+        information[5, 3] -= w * v0 * v2
+        information[4, 4] += w * (1.0 - v1 * v1)
+        information[5, 4] -= w * v1 * v2
+        information[5, 5] += w * (1.0 - v2 * v2)
+        correction[3] += w * (v1 * b2 - v2 * b1)
+        correction[4] += w * (v2 * b0 - v0 * b2)
+        correction[5] += w * (v0 * b1 - v1 * b0)
+        along = v0 * o0 + v1 * o1 + v2 * o2
+        twist[3] += w * (o0 - along * v0)
+        twist[4] += w * (o1 - along * v1)
+        twist[5] += w * (o2 - along * v2)
+
+
+@kernel
+def refine(
+    base_joints: Array, platform_joints: Array, directions: Array, rates: Array, weights: Array,
+    in_base: Array, in_platform: Array, vector_weights: Array, angular_velocity: Array, position: Array, rotation: Array,
+    arms: Array, predicted: Array, lengths: Array, information: Array, correction: Array, twist: Array, factor: Array,
+) -> bool:  # fmt: skip
+    """One Gauss-Newton step on SE(3) for the pose, in place, and the least-squares twist; False if singular.
+
+    The arguments are those of `normal_equations`; `correction` and `twist` hold the solutions afterwards.
+    """
+    normal_equations(
+        base_joints, platform_joints, directions, rates, weights, in_base, in_platform, vector_weights, angular_velocity,
+        position, rotation, arms, predicted, lengths, information, correction, twist,
+    )  # fmt: skip
+    for i in range(6):
+        for j in range(i + 1):
+            factor[i, j] = information[i, j]
+    if not factor_cholesky(factor):
+        return False
+    solve_cholesky(factor, correction)
+    solve_cholesky(factor, twist)
+    for i in range(3):
+        position[i] += correction[i]
+    rotate_by_vector(rotation, correction[3:])
+    return True
