@@ -10,9 +10,8 @@ from collections.abc import Collection
 
 import numpy as np
 
-from controller.direct_kinematics.closed_forms import pose_from_legs, pose_from_vector
-from controller.direct_kinematics.refinement import refine
-from controller.direct_kinematics.spatial import joint_plane
+from controller.direct_kinematics.closed_forms import Geometry, Scratch, geometry_of, pose_from_legs, pose_from_vector
+from controller.direct_kinematics.refinement import find_twist, refine_pose
 from controller.inverse_kinematics import jacobian_at, legs_at, sample_workspace
 from controller.least_squares import RANK_TOLERANCE, solve_least_squares
 from controller.leg_filter import leg_direction, predict_leg, start_leg, update_leg
@@ -49,13 +48,18 @@ PARAMETERS = np.dtype(
     [
         ("period", np.float64),
         ("hold_cycles", np.int64),
+        # Of `closed_forms.Geometry`.
         ("base_joints", np.float64, (LEGS, 3)),
         ("platform_joints", np.float64, (LEGS, 3)),
+        ("platform_numbers", np.int64, LEGS),
+        ("centers", np.float64, (64, 3)),
+        ("axes", np.float64, (64, 3, 3)),
+        ("spreads", np.float64, 64),
+        ("unknowns", np.int64, 64),
+        ("ranks", np.int64, 64),
         ("joint_rotations", np.float64, (LEGS, 3, 3)),
         ("up_in_joint", np.float64, (LEGS, 3)),
         ("up_in_base", np.float64, (1, 3)),
-        ("plane_center", np.float64, 3),
-        ("plane_axes", np.float64, (3, 3)),
         ("leg_imu_position", np.float64, (LEGS, 3)),
         ("platform_imu_position", np.float64, 3),
         ("gravity", np.float64),
@@ -123,9 +127,15 @@ STATE = np.dtype(
         ("vectors_9", np.float64, (2, 9)),
         ("matrices_6_6", np.float64, (2, 6, 6)),
         ("vectors_6", np.float64, (2, 6)),
-        ("matrix_12_9", np.float64, (2 * LEGS, 9)),
-        ("right_12", np.float64, 2 * LEGS),
-        ("unknowns_9", np.float64, 9),
+        # Of `closed_forms.Scratch`.
+        ("matrix", np.float64, (20, 20)),
+        ("right", np.float64, 20),
+        ("unknowns", np.float64, 20),
+        ("span", np.float64, (6, 12)),
+        ("norms", np.float64, 20),
+        ("order", np.float64, 20),
+        ("points", np.float64, (LEGS, 3)),
+        ("selected", np.float64, LEGS),
     ],
     align=True,
 )
@@ -157,7 +167,6 @@ def cycle_parameters(
     check_rate(rate)
     check_imus(mechanism, imus)
     plant = mechanism.plant_parameters()
-    plane = joint_plane(mechanism)
     parameters: Record = np.zeros((), PARAMETERS)
     used = np.array([float(leg in imus) for leg in range(LEGS)])
     turns = 2.0 * np.pi / plant["motor.screw_lead"]
@@ -175,13 +184,10 @@ def cycle_parameters(
     values = {
         "period": 1.0 / rate,
         "hold_cycles": int(np.ceil(control.hold * rate - 1e-9)),
-        "base_joints": mechanism.base_joints,
-        "platform_joints": mechanism.platform_joints,
+        **geometry_of(mechanism)._asdict(),
         "joint_rotations": mechanism.joint_rotations,
         "up_in_joint": np.swapaxes(mechanism.joint_rotations, 1, 2) @ mechanism.up_in_base,
         "up_in_base": mechanism.up_in_base,
-        "plane_center": plane.center,
-        "plane_axes": plane.axes,
         "leg_imu_position": plant["leg_imu_position"],
         "platform_imu_position": plant["platform_imu_position"],
         "gravity": gravity,
@@ -241,16 +247,13 @@ def check_imus(mechanism: Mechanism, imus: Collection[int]) -> None:
                 f"gravity hardly tells the angles of leg {leg}: of the vertical only {across[leg]:.2g} lies across the axes "
                 f"of its joint, and {_LEAST_OBSERVABILITY:g} is needed: turn base_joint_axes[{leg}], or leave its IMU out"
             )
-    plane = joint_plane(mechanism)
     positions, rotations = sample_workspace(mechanism, 50, seed=0)
     parameters, state = np.zeros((), PARAMETERS), np.zeros((), STATE)
-    parameters["base_joints"], parameters["platform_joints"] = mechanism.base_joints, mechanism.platform_joints
-    parameters["plane_center"], parameters["plane_axes"] = plane.center, plane.axes
+    for name, value in geometry_of(mechanism)._asdict().items():
+        parameters[name] = value
     parameters["up_in_base"], parameters["platform_used"] = mechanism.up_in_base, PLATFORM_IMU in imus
     parameters["leg_used"] = [leg in imus for leg in range(LEGS)]
     worst = np.inf
-    if PLATFORM_IMU not in imus and plane.flatness > 1e-6:
-        worst = 0.0
     for position, rotation in zip(positions, rotations, strict=True):
         legs = position + mechanism.platform_joints @ rotation.T - mechanism.base_joints
         state["directions"] = legs / np.linalg.norm(legs, axis=1, keepdims=True)
@@ -285,7 +288,7 @@ def cycle(parameters: Record, state: Record, measurement: Array, segments: Array
 def control(parameters: Record, state: Record, measurement: Array, segments: Array) -> int:
     """The cycle from the leg directions on, for leg filters of another kind."""
     fuse_platform(parameters, state, measurement)
-    if find_pose(parameters, state) < RANK_TOLERANCE or not refine_pose(parameters, state):
+    if find_pose(parameters, state) < RANK_TOLERANCE or not improve_pose(parameters, state):
         return POSE_LOST
     invert(parameters, state)
     refer(parameters, state, segments)
@@ -368,35 +371,38 @@ def find_pose(parameters: Record, state: Record) -> float:
     conditioning.
     """
     p, s = parameters[()], state[()]
+    geometry = Geometry(
+        p.base_joints, p.platform_joints, p.platform_numbers, p.centers, p.axes, p.spreads, p.unknowns, p.ranks
+    )  # fmt: skip
+    scratch = Scratch(s.matrix, s.right, s.unknowns, s.span, s.norms, s.order, s.points, s.selected)
     if p.platform_used != 0:
         s.conditioning = pose_from_vector(
-            p.base_joints, p.platform_joints, s.directions, p.leg_used, p.up_in_base[0], s.vertical[0], s.position, s.rotation,
-            s.matrix_12_9, s.right_12, s.unknowns_9, s.vectors_9[0], s.vectors_9[1],
-        )  # fmt: skip
+            geometry, s.directions, p.leg_used, p.up_in_base[0], s.vertical[0], s.position, s.rotation, scratch
+        )
     else:
-        s.conditioning = pose_from_legs(
-            p.base_joints, p.platform_joints, s.directions, p.leg_used, p.plane_center, p.plane_axes, s.position, s.rotation,
-            s.matrix_12_9, s.right_12, s.unknowns_9, s.vectors_9[0], s.vectors_9[1],
-        )  # fmt: skip
+        s.conditioning = pose_from_legs(geometry, s.directions, p.leg_used, s.position, s.rotation, scratch)
     return float(s.conditioning)
 
 
 @kernel
-def refine_pose(parameters: Record, state: Record) -> bool:
+def improve_pose(parameters: Record, state: Record) -> bool:
     """Two Gauss-Newton steps for the pose; the twist comes with them, and the acceleration is its derivative."""
     p, s = parameters[()], state[()]
-    measured_rate = s.angular_velocity
+    factor = s.matrices_6_6[0]
     for _ in range(2):
-        for i in range(3):
-            measured_rate[i] = 0.0
-            for j in range(3):
-                measured_rate[i] += s.rotation[i, j] * s.platform_rate[j]
-        if not refine(
-            p.base_joints, p.platform_joints, s.directions, s.rates, p.leg_weights, p.up_in_base, s.vertical,
-            p.vertical_weight, measured_rate, s.position, s.rotation, s.arms, s.predicted, s.lengths, s.information,
-            s.vectors_6[0], s.twist, s.matrices_6_6[0],
+        if not refine_pose(
+            p.base_joints, p.platform_joints, s.directions, p.leg_weights, p.up_in_base, s.vertical, p.vertical_weight,
+            s.position, s.rotation, s.arms, s.predicted, s.lengths, s.information, s.vectors_6[0], factor,
         ):  # fmt: skip
             return False
+    for i in range(3):
+        s.angular_velocity[i] = 0.0
+        for j in range(3):
+            s.angular_velocity[i] += s.rotation[i, j] * s.platform_rate[j]
+    find_twist(
+        s.rates, p.leg_weights, s.vertical, p.vertical_weight, s.angular_velocity, s.rotation, s.arms, s.predicted, s.lengths,
+        factor, s.twist,
+    )  # fmt: skip
     if s.cycle == 0:
         s.smooth_twist[:] = s.twist
     for i in range(6):

@@ -26,13 +26,58 @@ def solve_least_squares(matrix: Array, right: Array, solution: Array, norms: Arr
         The ratio of the least to the greatest diagonal element of R, an estimate of the reciprocal condition number;
         below `RANK_TOLERANCE` nothing is solved.
     """
-    m, n = matrix.shape[0], solution.shape[0]
+    n = solution.shape[0]
+    conditioning = _triangularise(matrix, right, n, norms, order)
+    if conditioning >= RANK_TOLERANCE:
+        _substitute_back(matrix, right, n)
+        for k in range(n):
+            solution[int(order[k])] = right[k]
+    return conditioning
+
+
+@kernel
+def solve_truncated(
+    matrix: Array, right: Array, rank: int, solution: Array, null_space: Array, norms: Array, order: Array
+) -> float:
+    """Solve a system of known rank: after `rank` pivots what is left of the rows counts as noise.
+
+    Args:
+        matrix, right, norms, order: as for `solve_least_squares`.
+        rank: of the system without noise, at most n.
+        solution: (n,), one solution, written.
+        null_space: (>= n - rank, n), whose rows may be added to it in any amount, written.
+
+    Returns:
+        The ratio of the last to the first pivot; below `RANK_TOLERANCE` nothing is solved.
+    """
+    n = solution.shape[0]
+    conditioning = _triangularise(matrix, right, rank, norms, order)
+    if conditioning < RANK_TOLERANCE:
+        return conditioning
+    _substitute_back(matrix, right, rank)
+    for k in range(n):
+        solution[int(order[k])] = right[k] if k < rank else 0.0
+    for free in range(rank, n):
+        for k in range(rank):
+            norms[k] = -matrix[k, free]
+        _substitute_back(matrix, norms, rank)
+        row = null_space[free - rank]
+        for k in range(n):
+            row[int(order[k])] = norms[k] if k < rank else 0.0
+        row[int(order[free])] = 1.0
+    return conditioning
+
+
+@kernel
+def _triangularise(matrix: Array, right: Array, rank: int, norms: Array, order: Array) -> float:
+    """Turn `matrix` (m, n) into R by `rank` pivots and `right` along with it; returns the ratio of last to first pivot."""
+    m, n = matrix.shape
     for j in range(n):
         order[j] = j
         norms[j] = 0.0
         for i in range(m):
             norms[j] += matrix[i, j] * matrix[i, j]
-    for k in range(n):
+    for k in range(rank):
         best = k
         for j in range(k + 1, n):
             if norms[j] > norms[best]:
@@ -72,14 +117,17 @@ def solve_least_squares(matrix: Array, right: Array, solution: Array, norms: Arr
         for i in range(k + 1, m):
             right[i] += dot * matrix[i, k]
         matrix[k, k] = alpha
-    for k in range(n - 1, -1, -1):
+    return float(abs(matrix[rank - 1, rank - 1] / matrix[0, 0]))
+
+
+@kernel
+def _substitute_back(matrix: Array, right: Array, rank: int) -> None:
+    """Replace the first `rank` elements of `right` by the solution of R's leading triangle."""
+    for k in range(rank - 1, -1, -1):
         value = right[k]
-        for j in range(k + 1, n):
-            value -= matrix[k, j] * norms[j]
-        norms[k] = value / matrix[k, k]
-    for k in range(n):
-        solution[int(order[k])] = norms[k]
-    return float(abs(matrix[n - 1, n - 1] / matrix[0, 0]))
+        for j in range(k + 1, rank):
+            value -= matrix[k, j] * right[j]
+        right[k] = value / matrix[k, k]
 
 
 @kernel

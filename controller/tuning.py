@@ -15,7 +15,7 @@ import casadi as ca
 import control
 import numpy as np
 
-from controller.cycle import STATE, check_rate, cycle_parameters, find_pose, fuse_legs, fuse_platform, refine_pose
+from controller.cycle import STATE, check_rate, cycle_parameters, find_pose, fuse_legs, fuse_platform, improve_pose
 from controller.inverse_kinematics import leg_lengths
 from controller.settings import ControlSettings, control_settings, fusion_settings
 from plant.compiled import Record
@@ -239,7 +239,7 @@ def linear_estimator(mechanism: Mechanism, rate: float, signals: Array) -> Linea
         fuse_legs(parameters, state, measurement)
         fuse_platform(parameters, state, measurement)
         find_pose(parameters, state)
-        refine_pose(parameters, state)
+        improve_pose(parameters, state)
         state["cycle"] += 1
 
     def flat(state: Record) -> Array:

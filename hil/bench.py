@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.cycle import find_pose, fuse_legs, fuse_platform, invert, refer, refine_pose, regulate
+from controller.cycle import find_pose, fuse_legs, fuse_platform, improve_pose, invert, refer, regulate
 from hil.loop import now
 from hil.simulation import SimulationConfig, prepared_loop, simulate
 from plant.compiled import Record, kernel
@@ -129,7 +129,7 @@ def _run_stages(
         row[3], t = now(clock) - t, now(clock)
         find_pose(parameters, state)
         row[4], t = now(clock) - t, now(clock)
-        refine_pose(parameters, state)
+        improve_pose(parameters, state)
         row[5], t = now(clock) - t, now(clock)
         invert(parameters, state)
         row[6], t = now(clock) - t, now(clock)

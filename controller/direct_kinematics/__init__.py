@@ -1,6 +1,26 @@
 """Direct kinematics: from the directions of the legs to the pose, in closed form and without a first guess."""
 
 from controller.direct_kinematics.lengths import pose_from_lengths, poses_from_lengths
-from controller.direct_kinematics.spatial import Solution, pose_difference, solve
+from controller.direct_kinematics.spatial import (
+    METHODS,
+    Requirement,
+    Solution,
+    Solutions,
+    pose_difference,
+    required_measurements,
+    solve,
+    solve_batch,
+)
 
-__all__ = ["Solution", "pose_difference", "pose_from_lengths", "poses_from_lengths", "solve"]
+__all__ = [
+    "METHODS",
+    "Requirement",
+    "Solution",
+    "Solutions",
+    "pose_difference",
+    "pose_from_lengths",
+    "poses_from_lengths",
+    "required_measurements",
+    "solve",
+    "solve_batch",
+]

@@ -1,11 +1,132 @@
-"""Closed forms: from leg directions to the pose, compiled, without a first guess."""
+"""Closed forms from all measured legs: from directions to the pose, compiled, without a first guess.
+
+Every leg gives `skew(r) (p + R a - b) = 0`, of rank two; written here with two unit vectors across the leg, which is the
+same least-squares problem with two rows a leg instead of three.
+
+- Rotation known (the paper's section 5): linear in p, the point where the lines through `b - R a` along r meet.
+- One vector known in both frames, `R v_platform = v_base`: the vertical seen by the platform's accelerometer, or the
+  platform's normal of the paper's section 4. `R = Rot(v_base, yaw) R_0` with any R_0 that carries the one to the other, so
+  the problem is linear in (p, cos yaw, sin yaw), for every class of mechanism. Legs from one base joint leave the scale
+  open, and `cos^2 + sin^2 = 1` settles it.
+- Legs alone: linear in p and R, of a rank that the graph of the legs tells. Rotations obey twenty quadratic equations,
+  which are linear in the parameters that the legs leave open and in the products of those: up to five parameters, hence
+  four legs or more, of every class, with coplanar platform joints or not.
+
+All return the conditioning: the ratio of the least to the greatest pivot of what was solved, with rotations counted in the
+joints' spread, so that it depends neither on size nor on frames; 0 where nothing was solved.
+"""
+
+from functools import lru_cache
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from controller.least_squares import RANK_TOLERANCE, solve_least_squares
+from controller.least_squares import RANK_TOLERANCE, solve_least_squares, solve_truncated
 from plant.compiled import kernel
-from plant.mechanism import LEGS
+from plant.mechanism import LEGS, SAME_JOINT_M, Mechanism
 from plant.pose import Array
+
+FLATNESS = 1e-3
+"""Platform joints count as coplanar if they leave their plane by less than this share of their spread; the refinement makes
+up for it."""
+
+_SETS = 1 << LEGS
+_MOST_FREE = 5
+_ROTATION_EQUATIONS = 20
+_COLUMN_EQUATIONS = 3
+_MOST_POLAR_STEPS = 30
+_POLAR_TOLERANCE = 1e-18
+"""Square of the last step; what is left is its square."""
+
+_LINEAR_RANK = 9
+"""Rank beyond which the legs' equations are left out: with three parameters open, the equations of a rotation settle those
+with a sixth of the error that the last three pivots of a 6-6 mechanism would bring."""
+
+
+class Geometry(NamedTuple):
+    """What the closed forms need of a mechanism.
+
+    Attributes:
+        base_joints, platform_joints: (6, 3) [m], in {1} and {2}.
+        platform_numbers: (6,), which legs share a platform joint.
+        centers: (64, 3), centre of the platform joints of a set of legs; leg k is in a set whose number has bit k.
+        axes: (64, 3, 3), whose columns span the plane of those joints and end with its normal.
+        spreads: (64,) [m], root mean square distance of the joints from their centre.
+        unknowns: (64,), 9 if they lie in that plane, so that two columns of R tell the third, else 12.
+        ranks: (64,), rank of the legs' equations in p and R.
+    """
+
+    base_joints: Array
+    platform_joints: Array
+    platform_numbers: NDArray[np.int64]
+    centers: Array
+    axes: Array
+    spreads: Array
+    unknowns: NDArray[np.int64]
+    ranks: NDArray[np.int64]
+
+
+class Scratch(NamedTuple):
+    """Memory for the closed forms, which allocate nothing."""
+
+    matrix: Array
+    right: Array
+    unknowns: Array
+    span: Array
+    norms: Array
+    order: Array
+    points: Array
+    selected: Array
+
+
+@kernel
+def scratch() -> Scratch:
+    """Memory for the closed forms."""
+    n = _ROTATION_EQUATIONS
+    return Scratch(
+        np.zeros((n, n)), np.zeros(n), np.zeros(n), np.zeros((1 + _MOST_FREE, 12)), np.zeros(n), np.zeros(n),
+        np.zeros((LEGS, 3)), np.zeros(LEGS),
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=256)
+def geometry_of(mechanism: Mechanism) -> Geometry:
+    """What the closed forms need of a mechanism."""
+    platform = mechanism.platform_joints
+    apart = np.linalg.norm(platform[:, None] - platform, axis=2)
+    geometry = Geometry(
+        mechanism.base_joints.copy(), platform.copy(), np.argmax(apart < SAME_JOINT_M, axis=1), np.zeros((_SETS, 3)),
+        np.zeros((_SETS, 3, 3)), np.ones(_SETS), np.full(_SETS, 9), np.zeros(_SETS, np.int64),
+    )  # fmt: skip
+    for number, bits in enumerate(product((False, True), repeat=LEGS)):
+        legs = np.flatnonzero(bits[::-1])
+        if len(legs) == 0:
+            continue
+        center = platform[legs].mean(axis=0)
+        _, spread, axes = np.linalg.svd(platform[legs] - center)
+        axes[2] *= np.sign(np.linalg.det(axes))
+        size = float(np.linalg.norm(spread))
+        geometry.centers[number], geometry.axes[number] = center, axes.T
+        if size > SAME_JOINT_M:
+            geometry.spreads[number] = size / np.sqrt(len(legs))
+            if len(spread) == 3 and spread[2] > FLATNESS * spread[0]:
+                geometry.unknowns[number] = 12
+        # A joint is a point as soon as two of its legs are known.
+        shared = np.bincount(geometry.platform_numbers[legs])
+        geometry.ranks[number] = min(_LINEAR_RANK, int(np.minimum(2 * shared, 3).sum()))
+    return geometry
+
+
+@kernel
+def set_number(measured: Array) -> int:
+    """Number of a set of legs, given as (6,) with 0 for the legs that are not in it."""
+    number = 0
+    for k in range(LEGS):
+        if measured[k] != 0.0:
+            number += 1 << k
+    return number
 
 
 @kernel
@@ -16,25 +137,6 @@ def _across(direction: Array) -> tuple[float, float, float, float, float, float]
     a = -1.0 / (sign + z)
     b = x * y * a
     return 1.0 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y
-
-
-@kernel
-def _spread(joints: Array, measured: Array) -> float:
-    """Root mean square distance of the measured legs' joints (6, 3) from their centre [m]: the length in which columns for
-    a rotation are counted, so that the conditioning does not depend on the size of the mechanism.
-    """
-    count = c0 = c1 = c2 = total = 0.0
-    for k in range(LEGS):
-        if measured[k] != 0.0:
-            count += 1.0
-            c0 += joints[k, 0]
-            c1 += joints[k, 1]
-            c2 += joints[k, 2]
-            total += joints[k, 0] ** 2 + joints[k, 1] ** 2 + joints[k, 2] ** 2
-    if count == 0.0:
-        return 1.0
-    variance = (total - (c0 * c0 + c1 * c1 + c2 * c2) / count) / count
-    return np.sqrt(variance) if variance > 0.0 else 1.0
 
 
 @kernel
@@ -65,57 +167,65 @@ def rotation_between(from_vector: Array, to_vector: Array, rotation: Array) -> N
 
 
 @kernel
-def pose_from_rotation(
-    base_joints: Array, platform_joints: Array, directions: Array, measured: Array, rotation: Array, position: Array,
-    matrix: Array, right: Array, unknowns: Array, norms: Array, order: Array,
-) -> float:  # fmt: skip
-    """Position from leg directions and the rotation (the paper's (25)-(28), by QR); returns the conditioning."""
+def meeting_point(origins: Array, directions: Array, selected: Array, point: Array, scratch: Scratch) -> float:
+    """The point (3,) nearest to the selected ones of six lines, by QR (the paper's (8) and (25)-(28))."""
+    matrix, right = scratch.matrix, scratch.right
     rows = 0
     for k in range(LEGS):
-        if measured[k] == 0.0:
+        if selected[k] == 0.0:
             continue
+        o0, o1, o2 = origins[k, 0], origins[k, 1], origins[k, 2]
         t0, t1, t2, s0, s1, s2 = _across(directions[k])
-        c0, c1, c2 = base_joints[k, 0], base_joints[k, 1], base_joints[k, 2]
-        for j in range(3):
-            c0 -= rotation[0, j] * platform_joints[k, j]
-            c1 -= rotation[1, j] * platform_joints[k, j]
-            c2 -= rotation[2, j] * platform_joints[k, j]
         matrix[rows, 0], matrix[rows, 1], matrix[rows, 2] = t0, t1, t2
-        right[rows] = t0 * c0 + t1 * c1 + t2 * c2
+        right[rows] = t0 * o0 + t1 * o1 + t2 * o2
         matrix[rows + 1, 0], matrix[rows + 1, 1], matrix[rows + 1, 2] = s0, s1, s2
-        right[rows + 1] = s0 * c0 + s1 * c1 + s2 * c2
+        right[rows + 1] = s0 * o0 + s1 * o1 + s2 * o2
         rows += 2
-    if rows < 3:
+    if rows < 4:
         return 0.0
-    return solve_least_squares(matrix[:rows, :3], right[:rows], position, norms, order)
+    return solve_least_squares(matrix[:rows, :3], right[:rows], point, scratch.norms, scratch.order)
+
+
+@kernel
+def pose_from_rotation(
+    geometry: Geometry, directions: Array, measured: Array, rotation: Array, position: Array, scratch: Scratch
+) -> float:
+    """Position from the rotation and two or more legs (the paper's section 5)."""
+    for k in range(LEGS):
+        a0, a1, a2 = geometry.platform_joints[k, 0], geometry.platform_joints[k, 1], geometry.platform_joints[k, 2]
+        for i in range(3):
+            arm = rotation[i, 0] * a0 + rotation[i, 1] * a1 + rotation[i, 2] * a2
+            scratch.points[k, i] = geometry.base_joints[k, i] - arm
+    return meeting_point(scratch.points, directions, measured, position, scratch)
 
 
 @kernel
 def pose_from_vector(
-    base_joints: Array, platform_joints: Array, directions: Array, measured: Array, in_base: Array, in_platform: Array,
-    position: Array, rotation: Array, matrix: Array, right: Array, unknowns: Array, norms: Array, order: Array,
+    geometry: Geometry, directions: Array, measured: Array, in_base: Array, in_platform: Array, position: Array,
+    rotation: Array, scratch: Scratch,
 ) -> float:  # fmt: skip
-    """Pose from leg directions and one vector known in both frames; linear in (p, cos yaw, sin yaw).
-
-    Returns the conditioning.
-    """
+    """Pose from one vector known in both frames, and three or more legs that end in two platform joints or more."""
     rotation_between(in_platform, in_base, rotation)
-    scale = 1.0 / _spread(platform_joints, measured)
+    matrix, right, unknowns = scratch.matrix, scratch.right, scratch.unknowns
+    legs = set_number(measured)
+    center, scale = geometry.centers[legs], 1.0 / geometry.spreads[legs]
     u0, u1, u2 = in_base[0], in_base[1], in_base[2]
     rows = 0
     for k in range(LEGS):
         if measured[k] == 0.0:
             continue
-        a0, a1, a2 = platform_joints[k, 0], platform_joints[k, 1], platform_joints[k, 2]
+        a0 = geometry.platform_joints[k, 0] - center[0]
+        a1 = geometry.platform_joints[k, 1] - center[1]
+        a2 = geometry.platform_joints[k, 2] - center[2]
         q0 = rotation[0, 0] * a0 + rotation[0, 1] * a1 + rotation[0, 2] * a2
         q1 = rotation[1, 0] * a0 + rotation[1, 1] * a1 + rotation[1, 2] * a2
         q2 = rotation[2, 0] * a0 + rotation[2, 1] * a1 + rotation[2, 2] * a2
         along = u0 * q0 + u1 * q1 + u2 * q2
         x0, x1, x2 = q0 - along * u0, q1 - along * u1, q2 - along * u2
         y0, y1, y2 = u1 * q2 - u2 * q1, u2 * q0 - u0 * q2, u0 * q1 - u1 * q0
-        c0 = base_joints[k, 0] - along * u0
-        c1 = base_joints[k, 1] - along * u1
-        c2 = base_joints[k, 2] - along * u2
+        c0 = geometry.base_joints[k, 0] - along * u0
+        c1 = geometry.base_joints[k, 1] - along * u1
+        c2 = geometry.base_joints[k, 2] - along * u2
         t0, t1, t2, s0, s1, s2 = _across(directions[k])
         for row, w0, w1, w2 in ((rows, t0, t1, t2), (rows + 1, s0, s1, s2)):
             matrix[row, 0], matrix[row, 1], matrix[row, 2] = w0, w1, w2
@@ -123,83 +233,265 @@ def pose_from_vector(
             matrix[row, 4] = scale * (w0 * y0 + w1 * y1 + w2 * y2)
             right[row] = w0 * c0 + w1 * c1 + w2 * c2
         rows += 2
-    if rows < 5:
+    if rows < 6:
         return 0.0
-    conditioning = solve_least_squares(matrix[:rows, :5], right[:rows], unknowns[:5], norms, order)
+    if _from_one_base_joint(geometry.base_joints, measured):
+        return _pose_to_scale(geometry, directions, measured, rows, in_base, in_platform, position, rotation, scratch)
+    conditioning = solve_least_squares(matrix[:rows, :5], right[:rows], unknowns[:5], scratch.norms, scratch.order)
+    if conditioning < RANK_TOLERANCE or not _turn(rotation, in_base, scale * unknowns[3], scale * unknowns[4]):
+        return 0.0
+    if pose_from_rotation(geometry, directions, measured, rotation, position, scratch) < RANK_TOLERANCE:
+        return 0.0
+    return conditioning
+
+
+@kernel
+def _from_one_base_joint(base_joints: Array, measured: Array) -> bool:
+    first = -1
+    for k in range(LEGS):
+        if measured[k] == 0.0:
+            continue
+        if first < 0:
+            first = k
+        for i in range(3):
+            if abs(base_joints[k, i] - base_joints[first, i]) > SAME_JOINT_M:
+                return False
+    return True
+
+
+@kernel
+def _pose_to_scale(
+    geometry: Geometry, directions: Array, measured: Array, rows: int, in_base: Array, in_platform: Array, position: Array,
+    rotation: Array, scratch: Scratch,
+) -> float:  # fmt: skip
+    """Pose from the system of `pose_from_vector` less its last pivot: `cos^2 + sin^2 = 1`, with two roots, stands in for it.
+
+    Seen from the one base joint, a level platform may be near and small or far and large, and to scale its mirror image
+    in that joint fits too: lengths are positive at one root only, or else the equations left out tell the roots apart.
+    """
+    matrix, right, span = scratch.matrix, scratch.right, scratch.span
+    conditioning = solve_truncated(
+        matrix[:rows, :5], right[:rows], 4, span[0, :5], span[1:2, :5], scratch.norms, scratch.order
+    )  # fmt: skip
     if conditioning < RANK_TOLERANCE:
-        return conditioning
-    # Cosine and sine come multiplied by the spread of the joints.
-    size = np.sqrt(unknowns[3] * unknowns[3] + unknowns[4] * unknowns[4])
-    if not size * scale > RANK_TOLERANCE:
         return 0.0
-    cosine, sine = unknowns[3] / size, unknowns[4] / size
+    scale = 1.0 / geometry.spreads[set_number(measured)]
+    c0, s0, c1, s1 = scale * span[0, 3], scale * span[0, 4], scale * span[1, 3], scale * span[1, 4]
+    a, b, c = c1 * c1 + s1 * s1, c0 * c1 + s0 * s1, c0 * c0 + s0 * s0 - 1.0
+    if not a * geometry.spreads[set_number(measured)] ** 2 > RANK_TOLERANCE:
+        return 0.0
+    root = np.sqrt(max(b * b - a * c, 0.0))
+    far = near = 0.0
+    for row in range(4, rows):
+        far += (right[row] - (root - b) / a * matrix[row, 4]) ** 2
+        near += (right[row] + (root + b) / a * matrix[row, 4]) ** 2
+    for step in (root, -root) if far < near else (-root, root):
+        t = (step - b) / a
+        rotation_between(in_platform, in_base, rotation)
+        if not _turn(rotation, in_base, c0 + t * c1, s0 + t * s1):
+            return 0.0
+        if pose_from_rotation(geometry, directions, measured, rotation, position, scratch) < RANK_TOLERANCE:
+            return 0.0
+        if _total_length(directions, measured, position, scratch) > 0.0:
+            return float(min(conditioning, root / np.sqrt(b * b + a)))
+    return 0.0
+
+
+@kernel
+def _total_length(directions: Array, measured: Array, position: Array, scratch: Scratch) -> float:
+    """Sum of the measured legs' lengths along their directions, after `pose_from_rotation`."""
+    total = 0.0
+    for k in range(LEGS):
+        if measured[k] != 0.0:
+            for i in range(3):
+                total += directions[k, i] * (position[i] - scratch.points[k, i])
+    return total
+
+
+@kernel
+def _turn(rotation: Array, axis: Array, cosine: float, sine: float) -> bool:
+    """Turn `rotation` about a unit axis seen in {1}, in place; cosine and sine need a common scale. False if they have none."""
+    size = np.sqrt(cosine * cosine + sine * sine)
+    if not size > RANK_TOLERANCE:
+        return False
+    cosine, sine = cosine / size, sine / size
+    u0, u1, u2 = axis[0], axis[1], axis[2]
     for j in range(3):
         r0, r1, r2 = rotation[0, j], rotation[1, j], rotation[2, j]
         along = (1.0 - cosine) * (u0 * r0 + u1 * r1 + u2 * r2)
         rotation[0, j] = cosine * r0 + sine * (u1 * r2 - u2 * r1) + along * u0
         rotation[1, j] = cosine * r1 + sine * (u2 * r0 - u0 * r2) + along * u1
         rotation[2, j] = cosine * r2 + sine * (u0 * r1 - u1 * r0) + along * u2
-    pose_from_rotation(
-        base_joints, platform_joints, directions, measured, rotation, position, matrix, right, unknowns, norms, order
-    )
-    return conditioning
+    return True
 
 
 @kernel
 def pose_from_legs(
-    base_joints: Array, platform_joints: Array, directions: Array, measured: Array, center: Array, axes: Array,
-    position: Array, rotation: Array, matrix: Array, right: Array, unknowns: Array, norms: Array, order: Array,
-) -> float:  # fmt: skip
-    """Pose from leg directions alone, for platform joints in the plane of `center` and `axes`; returns the conditioning.
-
-    Linear in the plane's origin and the two columns of the rotation that span it; the nearest rotation follows, then
-    the position again.
-    """
+    geometry: Geometry, directions: Array, measured: Array, position: Array, rotation: Array, scratch: Scratch
+) -> float:
+    """Pose from leg directions alone, four legs or more."""
+    matrix, right, span = scratch.matrix, scratch.right, scratch.span
+    legs = set_number(measured)
+    center, axes, scale = geometry.centers[legs], geometry.axes[legs], 1.0 / geometry.spreads[legs]
+    # Unknown are the joints' centre and the columns of R that turn the axes of the joints' plane, times the spread.
+    unknowns, rank = geometry.unknowns[legs], geometry.ranks[legs]
+    flat, free = unknowns == 9, unknowns - rank
+    if rank < 12 - _MOST_FREE:
+        return 0.0
     rows = 0
-    scale = 1.0 / _spread(platform_joints, measured)
     for k in range(LEGS):
         if measured[k] == 0.0:
             continue
-        x = y = 0.0
-        for j in range(3):
-            x += scale * axes[j, 0] * (platform_joints[k, j] - center[j])
-            y += scale * axes[j, 1] * (platform_joints[k, j] - center[j])
+        a0 = geometry.platform_joints[k, 0] - center[0]
+        a1 = geometry.platform_joints[k, 1] - center[1]
+        a2 = geometry.platform_joints[k, 2] - center[2]
         t0, t1, t2, s0, s1, s2 = _across(directions[k])
-        for row, w0, w1, w2 in ((rows, t0, t1, t2), (rows + 1, s0, s1, s2)):
-            matrix[row, 0], matrix[row, 1], matrix[row, 2] = w0, w1, w2
-            matrix[row, 3], matrix[row, 4], matrix[row, 5] = x * w0, x * w1, x * w2
-            matrix[row, 6], matrix[row, 7], matrix[row, 8] = y * w0, y * w1, y * w2
-            right[row] = w0 * base_joints[k, 0] + w1 * base_joints[k, 1] + w2 * base_joints[k, 2]
+        for i in range(unknowns // 3):
+            x = scale * (axes[0, i - 1] * a0 + axes[1, i - 1] * a1 + axes[2, i - 1] * a2) if i > 0 else 1.0
+            j = 3 * i
+            matrix[rows, j], matrix[rows, j + 1], matrix[rows, j + 2] = x * t0, x * t1, x * t2
+            matrix[rows + 1, j], matrix[rows + 1, j + 1], matrix[rows + 1, j + 2] = x * s0, x * s1, x * s2
+        b0, b1, b2 = geometry.base_joints[k, 0], geometry.base_joints[k, 1], geometry.base_joints[k, 2]
+        right[rows] = t0 * b0 + t1 * b1 + t2 * b2
+        right[rows + 1] = s0 * b0 + s1 * b1 + s2 * b2
         rows += 2
-    if rows < 9:
-        return 0.0
-    conditioning = solve_least_squares(matrix[:rows], right[:rows], unknowns, norms, order)
+    span[:] = 0.0
+    conditioning = solve_truncated(
+        matrix[:rows, :unknowns], right[:rows], rank, span[0, :unknowns], span[1:, :unknowns], scratch.norms, scratch.order
+    )  # fmt: skip
     if conditioning < RANK_TOLERANCE:
         return conditioning
-    # The nearest pair of orthonormal columns is M (M^T M)^(-1/2), and the root of a 2 x 2 matrix is in closed form.
-    p = q = r = 0.0
-    for j in range(3, 6):
-        p += unknowns[j] * unknowns[j]
-        q += unknowns[j] * unknowns[j + 3]
-        r += unknowns[j + 3] * unknowns[j + 3]
-    root_det = np.sqrt(max(p * r - q * q, 0.0))
-    if not root_det * scale * scale > RANK_TOLERANCE:
+    columns = span[0, 3:]
+    for i in range(9):
+        columns[i] *= scale
+    if free > 0:
+        equations = _COLUMN_EQUATIONS if flat and free == 1 else _ROTATION_EQUATIONS
+        if flat and equations == _ROTATION_EQUATIONS:
+            for i in range(3):
+                span[1 + free + i, 9 + i] = 1.0
+            free += 3
+        conditioning = min(conditioning, _settle_rotation(free, equations, scratch))
+        if conditioning < RANK_TOLERANCE:
+            return conditioning
+    if not orthonormalise(columns, flat):
         return 0.0
-    trace = np.sqrt(p + r + 2.0 * root_det)
-    f = 1.0 / (root_det * trace)
-    e00, e01, e11 = f * (r + root_det), -f * q, f * (p + root_det)
-    x0 = e00 * unknowns[3] + e01 * unknowns[6]
-    x1 = e00 * unknowns[4] + e01 * unknowns[7]
-    x2 = e00 * unknowns[5] + e01 * unknowns[8]
-    y0 = e01 * unknowns[3] + e11 * unknowns[6]
-    y1 = e01 * unknowns[4] + e11 * unknowns[7]
-    y2 = e01 * unknowns[5] + e11 * unknowns[8]
-    z0, z1, z2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
-    for j in range(3):
-        rotation[0, j] = x0 * axes[j, 0] + y0 * axes[j, 1] + z0 * axes[j, 2]
-        rotation[1, j] = x1 * axes[j, 0] + y1 * axes[j, 1] + z1 * axes[j, 2]
-        rotation[2, j] = x2 * axes[j, 0] + y2 * axes[j, 1] + z2 * axes[j, 2]
-    pose_from_rotation(
-        base_joints, platform_joints, directions, measured, rotation, position, matrix, right, unknowns, norms, order
-    )
+    for i in range(3):
+        for j in range(3):
+            rotation[i, j] = columns[i] * axes[j, 0] + columns[3 + i] * axes[j, 1] + columns[6 + i] * axes[j, 2]
+    if pose_from_rotation(geometry, directions, measured, rotation, position, scratch) < RANK_TOLERANCE:
+        return 0.0
     return conditioning
+
+
+@kernel
+def _settle_rotation(free: int, equations: int, scratch: Scratch) -> float:
+    """Find the rotation among `span[0, 3:] + sum of t_i span[i, 3:]`, i = 1..free, and write it to the former.
+
+    Linear in the parameters t and their products, of which there are `free (free + 3) / 2` together.
+    """
+    matrix, right, unknowns, span = scratch.matrix, scratch.right, scratch.unknowns, scratch.span
+    # Orthonormal parameters that start at the least matrix of the span.
+    for i in range(1, free + 1):
+        before = after = 0.0
+        for e in range(3, 12):
+            before += span[i, e] * span[i, e]
+        for j in range(1, i):
+            dot = 0.0
+            for e in range(3, 12):
+                dot += span[i, e] * span[j, e]
+            for e in range(3, 12):
+                span[i, e] -= dot * span[j, e]
+        for e in range(3, 12):
+            after += span[i, e] * span[i, e]
+        if not after > RANK_TOLERANCE**2 * before:
+            return 0.0
+        size = 1.0 / np.sqrt(after)
+        for e in range(3, 12):
+            span[i, e] *= size
+        dot = 0.0
+        for e in range(3, 12):
+            dot += span[0, e] * span[i, e]
+        for e in range(3, 12):
+            span[0, e] -= dot * span[i, e]
+    _write_equations(span[0, 3:], span[0, 3:], -1.0, 1.0, 1.0, equations, right)
+    column = free
+    for i in range(1, free + 1):
+        _write_equations(span[0, 3:], span[i, 3:], 2.0, -1.0, 0.0, equations, matrix[:, i - 1])
+        for j in range(i, free + 1):
+            _write_equations(span[i, 3:], span[j, 3:], 1.0 if i == j else 2.0, 0.0, 0.0, equations, matrix[:, column])
+            column += 1
+    conditioning = solve_least_squares(
+        matrix[:equations, :column], right[:equations], unknowns[:column], scratch.norms, scratch.order
+    )
+    if conditioning >= RANK_TOLERANCE:
+        for i in range(1, free + 1):
+            for e in range(3, 12):
+                span[0, e] += unknowns[i - 1] * span[i, e]
+    return conditioning
+
+
+@kernel
+def _write_equations(
+    a: Array, b: Array, quadratic: float, linear: float, constant: float, equations: int, out: Array
+) -> None:  # fmt: skip
+    """Write `quadratic` Q(a, b) + `linear` L(b) + `constant` c, where a rotation r of columns r1, r2, r3 (9,) obeys
+    Q(r, r) = L(r) + c: its columns are orthonormal, each is the cross product of the others, and R R^T = I.
+
+    The first three equations hold for the first two columns alone; the one left out follows from the others.
+    """
+    out[0] = quadratic * (a[0] * b[0] + a[1] * b[1] + a[2] * b[2]) + constant
+    out[1] = quadratic * 0.5 * (a[0] * b[3] + a[1] * b[4] + a[2] * b[5] + a[3] * b[0] + a[4] * b[1] + a[5] * b[2])
+    out[2] = quadratic * (a[3] * b[3] + a[4] * b[4] + a[5] * b[5]) + constant
+    if equations == _COLUMN_EQUATIONS:
+        return
+    out[3] = quadratic * 0.5 * (a[0] * b[6] + a[1] * b[7] + a[2] * b[8] + a[6] * b[0] + a[7] * b[1] + a[8] * b[2])
+    out[4] = quadratic * 0.5 * (a[3] * b[6] + a[4] * b[7] + a[5] * b[8] + a[6] * b[3] + a[7] * b[4] + a[8] * b[5])
+    out[5] = quadratic * (a[6] * b[6] + a[7] * b[7] + a[8] * b[8]) + constant
+    for column in range(3):
+        i, j, k = 3 * column, 3 * ((column + 1) % 3), 3 * ((column + 2) % 3)
+        for n in range(3):
+            m, o = (n + 1) % 3, (n + 2) % 3
+            cross = a[i + m] * b[j + o] - a[i + o] * b[j + m] + b[i + m] * a[j + o] - b[i + o] * a[j + m]
+            out[6 + i + n] = quadratic * 0.5 * cross + linear * b[k + n]
+    out[15] = quadratic * (a[0] * b[0] + a[3] * b[3] + a[6] * b[6]) + constant
+    out[16] = quadratic * 0.5 * (a[0] * b[1] + a[3] * b[4] + a[6] * b[7] + a[1] * b[0] + a[4] * b[3] + a[7] * b[6])
+    out[17] = quadratic * 0.5 * (a[0] * b[2] + a[3] * b[5] + a[6] * b[8] + a[2] * b[0] + a[5] * b[3] + a[8] * b[6])
+    out[18] = quadratic * (a[1] * b[1] + a[4] * b[4] + a[7] * b[7]) + constant
+    out[19] = quadratic * 0.5 * (a[1] * b[2] + a[4] * b[5] + a[7] * b[8] + a[2] * b[1] + a[5] * b[4] + a[8] * b[7])
+
+
+@kernel
+def orthonormalise(columns: Array, flat: bool) -> bool:
+    """Replace three columns (9,) by the nearest rotation, by Newton's iteration for the polar decomposition; `flat` means
+    that the third is still to be made from the others. False if there is none.
+    """
+    x0, x1, x2, y0, y1, y2, z0, z1, z2 = (
+        columns[0], columns[1], columns[2], columns[3], columns[4], columns[5], columns[6], columns[7], columns[8],
+    )  # fmt: skip
+    for _ in range(_MOST_POLAR_STEPS):
+        # The matrix of cofactors, which over the determinant is the inverse transposed.
+        c0, c1, c2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
+        if flat:
+            size = np.sqrt(c0 * c0 + c1 * c1 + c2 * c2)
+            if not size > RANK_TOLERANCE:
+                return False
+            z0, z1, z2 = c0 / size, c1 / size, c2 / size
+            flat = False
+        a0, a1, a2 = y1 * z2 - y2 * z1, y2 * z0 - y0 * z2, y0 * z1 - y1 * z0
+        b0, b1, b2 = z1 * x2 - z2 * x1, z2 * x0 - z0 * x2, z0 * x1 - z1 * x0
+        determinant = x0 * a0 + x1 * a1 + x2 * a2
+        if not determinant > RANK_TOLERANCE:
+            return False
+        f = 0.5 / determinant
+        dx0, dx1, dx2 = f * a0 - 0.5 * x0, f * a1 - 0.5 * x1, f * a2 - 0.5 * x2
+        dy0, dy1, dy2 = f * b0 - 0.5 * y0, f * b1 - 0.5 * y1, f * b2 - 0.5 * y2
+        dz0, dz1, dz2 = f * c0 - 0.5 * z0, f * c1 - 0.5 * z1, f * c2 - 0.5 * z2
+        x0, x1, x2, y0, y1, y2 = x0 + dx0, x1 + dx1, x2 + dx2, y0 + dy0, y1 + dy1, y2 + dy2
+        z0, z1, z2 = z0 + dz0, z1 + dz1, z2 + dz2
+        change = dx0 * dx0 + dx1 * dx1 + dx2 * dx2 + dy0 * dy0 + dy1 * dy1 + dy2 * dy2 + dz0 * dz0 + dz1 * dz1 + dz2 * dz2
+        if change < _POLAR_TOLERANCE:
+            break
+    columns[0], columns[1], columns[2] = x0, x1, x2
+    columns[3], columns[4], columns[5] = y0, y1, y2
+    columns[6], columns[7], columns[8] = z0, z1, z2
+    return True

@@ -3,7 +3,6 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from controller.direct_kinematics.spatial import Workspace
 from controller.inverse_kinematics import jacobian_at, legs_at
 from controller.least_squares import RANK_TOLERANCE, solve_least_squares
 from plant.compiled import kernel
@@ -25,14 +24,18 @@ def pose_from_lengths(mechanism: Mechanism, lengths: ArrayLike, guess: Pose | No
     target = checked_array(lengths, (LEGS,), "lengths")
     position = checked_array(start.position, (3,), "guess.position").copy()
     rotation = checked_rotation(start.rotation, "guess.rotation").copy()
-    work = Workspace()
-    error = newton_from_lengths(mechanism.base_joints, mechanism.platform_joints, target, position, rotation, *work.newton)
+    error = newton_from_lengths(mechanism.base_joints, mechanism.platform_joints, target, position, rotation, *_scratch())
     if not error < 1e-10:
         raise SingularConfigurationError(
             f"no pose near the guess has these lengths (they are missed by {1e3 * error:.3g} mm): they are not reachable, or "
             "the guess is too far"
         )
     return Pose(position, rotation)
+
+
+def _scratch() -> tuple[Array, ...]:
+    """Memory for `newton_from_lengths`, in the order in which it takes it."""
+    return tuple(np.zeros(shape) for shape in ((LEGS, 3), (LEGS, 3), LEGS, (6, 6), 6, 6, 6))
 
 
 @kernel
@@ -51,7 +54,7 @@ def newton_from_lengths(
         if error < 1e-15 or (error < 1e-11 and error >= before):
             break
         jacobian_at(arms, directions, jacobian)
-        if solve_least_squares(jacobian, lengths, correction, norms[:6], order[:6]) < RANK_TOLERANCE:
+        if solve_least_squares(jacobian, lengths, correction, norms, order) < RANK_TOLERANCE:
             return np.inf
         for i in range(3):
             position[i] += correction[i]
@@ -85,10 +88,9 @@ def poses_from_lengths(mechanism: Mechanism, lengths: Array, guess: Pose) -> tup
         SingularConfigurationError: the lengths of a row belong to no pose near the one before.
     """
     positions, rotations = np.empty((len(lengths), 3)), np.empty((len(lengths), 3, 3))
-    work = Workspace()
     failed = _poses_from_lengths(
         mechanism.base_joints, mechanism.platform_joints, np.ascontiguousarray(lengths), guess.position.copy(),
-        guess.rotation.copy(), positions, rotations, *work.newton,
+        guess.rotation.copy(), positions, rotations, *_scratch(),
     )  # fmt: skip
     if failed >= 0:
         raise SingularConfigurationError(f"no pose near the one before has the lengths of row {failed}")

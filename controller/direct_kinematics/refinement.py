@@ -1,6 +1,6 @@
 """Refinement: Gauss-Newton steps on SE(3) that weigh leg directions and vectors by their variances.
 
-The normal matrix is the inverse of the pose's covariance; the twist comes with the pose from the same matrix.
+The normal matrix is the inverse of the pose's covariance; the twist follows from the same matrix.
 """
 
 from controller.inverse_kinematics import legs_at
@@ -27,23 +27,22 @@ def _add_leg(right: Array, measured: Array, direction: Array, arm: Array, scale:
 
 @kernel
 def normal_equations(
-    base_joints: Array, platform_joints: Array, directions: Array, rates: Array, weights: Array,
-    in_base: Array, in_platform: Array, vector_weights: Array, angular_velocity: Array, position: Array, rotation: Array,
-    arms: Array, predicted: Array, lengths: Array, information: Array, correction: Array, twist: Array,
+    base_joints: Array, platform_joints: Array, directions: Array, weights: Array, in_base: Array, in_platform: Array,
+    vector_weights: Array, position: Array, rotation: Array, arms: Array, predicted: Array, lengths: Array,
+    information: Array, correction: Array,
 ) -> None:  # fmt: skip
-    """Weighted normal equations at a pose, for its correction and for the twist, which share one matrix.
+    """Weighted normal equations for the correction of a pose.
 
     Args:
-        directions: (6, 3), measured; `rates` (6, 3) are their derivatives [1/s].
+        directions: (6, 3), measured.
         weights: (6,), inverse variance of a component of a direction; 0 leaves a leg out.
         in_base, in_platform: (m, 3), vectors known in both frames; `vector_weights` (m,) are their inverse variances.
-        angular_velocity: (3,) [rad/s] in {1}, which counts for the twist as the vectors do for the attitude.
-        information: (6, 6), lower triangle written; `correction` and `twist` (6,) are the right sides.
+        arms, predicted, lengths: the legs at the pose, written.
+        information: (6, 6), lower triangle written; `correction` (6,) is the right side.
     """
     legs_at(base_joints, platform_joints, position, rotation, arms, predicted, lengths)
     for i in range(6):
         correction[i] = 0.0
-        twist[i] = 0.0
         for j in range(6):
             information[i, j] = 0.0
     for k in range(LEGS):
@@ -82,8 +81,6 @@ def normal_equations(
         information[5, 4] += a2 * m20 - a0 * m22
         information[5, 5] += a0 * m21 - a1 * m20
         _add_leg(correction, directions[k], predicted[k], arms[k], scale)
-        _add_leg(twist, rates[k], predicted[k], arms[k], scale)
-    o0, o1, o2 = angular_velocity[0], angular_velocity[1], angular_velocity[2]
     for k in range(vector_weights.shape[0]):
         w = vector_weights[k]
         v0 = rotation[0, 0] * in_platform[k, 0] + rotation[0, 1] * in_platform[k, 1] + rotation[0, 2] * in_platform[k, 2]
@@ -99,25 +96,22 @@ def normal_equations(
         correction[3] += w * (v1 * b2 - v2 * b1)
         correction[4] += w * (v2 * b0 - v0 * b2)
         correction[5] += w * (v0 * b1 - v1 * b0)
-        along = v0 * o0 + v1 * o1 + v2 * o2
-        twist[3] += w * (o0 - along * v0)
-        twist[4] += w * (o1 - along * v1)
-        twist[5] += w * (o2 - along * v2)
 
 
 @kernel
-def refine(
-    base_joints: Array, platform_joints: Array, directions: Array, rates: Array, weights: Array,
-    in_base: Array, in_platform: Array, vector_weights: Array, angular_velocity: Array, position: Array, rotation: Array,
-    arms: Array, predicted: Array, lengths: Array, information: Array, correction: Array, twist: Array, factor: Array,
+def refine_pose(
+    base_joints: Array, platform_joints: Array, directions: Array, weights: Array, in_base: Array, in_platform: Array,
+    vector_weights: Array, position: Array, rotation: Array, arms: Array, predicted: Array, lengths: Array,
+    information: Array, correction: Array, factor: Array,
 ) -> bool:  # fmt: skip
-    """One Gauss-Newton step on SE(3) for the pose, in place, and the least-squares twist; False if singular.
+    """One Gauss-Newton step on SE(3), in place; False if singular.
 
-    The arguments are those of `normal_equations`; `correction` and `twist` hold the solutions afterwards.
+    The arguments are those of `normal_equations`; afterwards `correction` holds the step and `factor` the Cholesky factor of
+    the information.
     """
     normal_equations(
-        base_joints, platform_joints, directions, rates, weights, in_base, in_platform, vector_weights, angular_velocity,
-        position, rotation, arms, predicted, lengths, information, correction, twist,
+        base_joints, platform_joints, directions, weights, in_base, in_platform, vector_weights, position, rotation, arms,
+        predicted, lengths, information, correction,
     )  # fmt: skip
     for i in range(6):
         for j in range(i + 1):
@@ -125,8 +119,36 @@ def refine(
     if not factor_cholesky(factor):
         return False
     solve_cholesky(factor, correction)
-    solve_cholesky(factor, twist)
     for i in range(3):
         position[i] += correction[i]
     rotate_by_vector(rotation, correction[3:])
     return True
+
+
+@kernel
+def find_twist(
+    rates: Array, weights: Array, in_platform: Array, vector_weights: Array, angular_velocity: Array, rotation: Array,
+    arms: Array, predicted: Array, lengths: Array, factor: Array, twist: Array,
+) -> None:  # fmt: skip
+    """The twist (6,) of least squares, from the legs and the factor of the last `refine_pose`.
+
+    Args:
+        rates: (6, 3), derivatives of the directions [1/s].
+        angular_velocity: (3,) [rad/s] in {1}, which counts for the twist as the vectors do for the attitude.
+    """
+    for i in range(6):
+        twist[i] = 0.0
+    for k in range(LEGS):
+        if weights[k] != 0.0:
+            _add_leg(twist, rates[k], predicted[k], arms[k], weights[k] / lengths[k])
+    o0, o1, o2 = angular_velocity[0], angular_velocity[1], angular_velocity[2]
+    for k in range(vector_weights.shape[0]):
+        w = vector_weights[k]
+        v0 = rotation[0, 0] * in_platform[k, 0] + rotation[0, 1] * in_platform[k, 1] + rotation[0, 2] * in_platform[k, 2]
+        v1 = rotation[1, 0] * in_platform[k, 0] + rotation[1, 1] * in_platform[k, 1] + rotation[1, 2] * in_platform[k, 2]
+        v2 = rotation[2, 0] * in_platform[k, 0] + rotation[2, 1] * in_platform[k, 1] + rotation[2, 2] * in_platform[k, 2]
+        along = v0 * o0 + v1 * o1 + v2 * o2
+        twist[3] += w * (o0 - along * v0)
+        twist[4] += w * (o1 - along * v1)
+        twist[5] += w * (o2 - along * v2)
+    solve_cholesky(factor, twist)

@@ -1,29 +1,36 @@
-"""Direct kinematics: from the directions of the legs to the pose, in closed form and without a first guess.
+"""Direct kinematics of six legs: the one face of every method, for one pose or many at once.
 
-Every leg gives `skew(r) (p + R a - b) = 0`, of rank two; written here with two unit vectors across the leg, which is the
-same least-squares problem with two rows a leg instead of three.
-
-- Rotation known (the paper's section 5, (21)-(28)): linear in p.
-- One vector known in both frames, `R v_platform = v_base`: the vertical seen by the platform's accelerometer, or the
-  platform's normal of the paper's section 4. `R = Rot(v_base, yaw) R_0` with any R_0 that carries the one to the other,
-  so the problem is linear in (p, cos yaw, sin yaw), for every class of mechanism.
-- Legs alone, coplanar platform joints: linear in p and the two columns of R that span the joints' plane.
-
-Each is followed by Gauss-Newton steps on SE(3) that weigh legs and vectors by their variances; the normal matrix gives
-the covariance. Lengths give the pose by Newton's method, from a first guess.
+A closed form gives the pose without a first guess. Gauss-Newton steps follow that weigh legs and platform by their
+variances, and whose normal matrix gives the covariance.
 """
 
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from controller.direct_kinematics.closed_forms import pose_from_legs, pose_from_rotation, pose_from_vector
-from controller.direct_kinematics.refinement import normal_equations, refine
+from controller.direct_kinematics.closed_forms import (
+    Geometry,
+    geometry_of,
+    orthonormalise,
+    pose_from_legs,
+    pose_from_rotation,
+    pose_from_vector,
+    scratch,
+)
+from controller.direct_kinematics.paper import section_3_1_1, section_4
+from controller.direct_kinematics.refinement import normal_equations, refine_pose
 from controller.inverse_kinematics import legs_at
-from plant.errors import InputError, SingularConfigurationError
+from controller.least_squares import factor_cholesky, solve_cholesky
+from plant.compiled import kernel
+from plant.errors import GoughError, InputError, SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
-from plant.pose import UNIT_TOLERANCE, Array, Pose, checked_array, checked_rotation, checked_unit, rotation_angle
+from plant.pose import UNIT_TOLERANCE, Array, Pose, numbers, rotation_angle, rotation_from_vector
 
 LEG_SIGMA = np.radians(0.05)
 """Standard deviation that `solve` assumes of each component of a leg's direction [rad]."""
@@ -35,52 +42,100 @@ YAW_SIGMA = np.radians(1.5)
 """Standard deviation that `solve` assumes of a yaw that was measured magnetically [rad]."""
 
 LEAST_CONDITIONING = 1e-6
-"""Conditioning below which `solve` calls the measurements singular."""
+"""Conditioning below which the measurements count as singular."""
 
-_COPLANAR = 1e-6
-"""Platform joints count as coplanar if they leave their plane by less than this share of their spread."""
+METHODS = ("section-5", "up", "normal", "legs", "section-3.1.1", "section-4")
+"""The closed forms: of the paper's sections, and from all legs with the vertical, the normal, or nothing else."""
 
-_MAX_REFINEMENTS = 10
+_SECTION_5, _UP, _NORMAL, _LEGS, _SECTION_3_1_1, _SECTION_4 = range(len(METHODS))
+_NEEDS = {"section-5": "rotation", "up": "up_in_platform", "normal": "normal", "section-4": "normal"}
+_AUTOMATIC = ("section-5", "up", "normal", "legs")
+_GOOD_CONDITIONING = 1e-2
+
+_MOST_REFINEMENTS = 20
+_REFINED = 1e-14
+"""Square of a step over its variance at which the pose has settled."""
+
+_CHUNK = 4096
+
+(
+    _SOLVED, _OPEN, _SINGULAR, _UNSETTLED, _NEGATIVE, _PARTLY_NAN, _INFINITE, _LEG_NOT_UNIT, _ROTATION_INFINITE,
+    _NOT_ORTHOGONAL, _REFLECTION, _UP_NOT_UNIT, _NORMAL_NOT_UNIT,
+) = range(13)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A pose found from leg directions.
+    """A pose found from leg directions. It is the only one that fits: where others would, none is given.
 
     Attributes:
         position: (3,) [m], origin of {2} in {1}.
         rotation: (3, 3), maps {2} to {1}.
-        covariance: (6, 6) of position [m] and of a small rotation seen in {1} [rad].
+        covariance: (6, 6) of position [m] and of a small rotation seen in {1} [rad], of the refined pose; one that was not
+            refined can be no better.
         residuals: (6, 3), measured minus predicted direction of each leg; NaN where a leg was not measured.
-        method: the closed form that it started from: "rotation", "up", "normal" or "legs".
-        conditioning: reciprocal condition of that closed form, as the ratio of the diagonal of R in its QR.
+        chi_square: sum of the squared residuals of legs and platform over their variances.
+        degrees_of_freedom: what `chi_square` is on average if the variances are right; 0 without redundancy.
+        method: the closed form that gave the pose, one of `METHODS`.
+        conditioning: reciprocal condition of that closed form, from the pivots of its QR.
     """
 
     position: Array
     rotation: Array
     covariance: Array
     residuals: Array
+    chi_square: float
+    degrees_of_freedom: int
     method: str
     conditioning: float
 
 
 @dataclass(frozen=True, eq=False)
-class JointPlane:
-    """The plane of the platform joints: `center` (3,) and `axes` (3, 3), whose columns span it and end with its normal;
-    `flatness` is the joints' distance from it relative to their spread.
+class Solutions:
+    """Many poses; `solutions[i]` is a `Solution`, or raises why there is none.
+
+    Attributes:
+        positions: (N, 3) [m]; NaN where there is no pose, as in the arrays below.
+        rotations: (N, 3, 3).
+        covariances: (N, 6, 6).
+        residuals: (N, 6, 3).
+        chi_squares: (N,).
+        degrees_of_freedom: (N,).
+        methods: (N,), indices into `METHODS`.
+        conditionings: (N,).
+        solved: (N,), whether there is a pose.
     """
 
-    center: Array
-    axes: Array
-    flatness: float
+    positions: Array
+    rotations: Array
+    covariances: Array
+    residuals: Array
+    chi_squares: Array
+    degrees_of_freedom: NDArray[np.int64]
+    methods: NDArray[np.int64]
+    conditionings: Array
+    solved: NDArray[np.bool_]
+    errors: dict[int, GoughError]
 
+    def __len__(self) -> int:
+        return len(self.solved)
 
-def joint_plane(mechanism: Mechanism) -> JointPlane:
-    """The plane through the platform joints of least squared distance."""
-    center = mechanism.platform_joints.mean(axis=0)
-    _, spread, axes = np.linalg.svd(mechanism.platform_joints - center)
-    axes[2] *= np.sign(np.linalg.det(axes))
-    return JointPlane(center, np.ascontiguousarray(axes.T), float(spread[2] / spread[0]))
+    def __iter__(self) -> Iterator[Solution]:
+        return (self[i] for i in range(len(self)))
+
+    def __getitem__(self, index: int) -> Solution:
+        """The solution of a row.
+
+        Raises:
+            SingularConfigurationError: there is none.
+        """
+        if not self.solved[index]:
+            raise self.errors[range(len(self))[index]]
+        return Solution(
+            self.positions[index], self.rotations[index], self.covariances[index], self.residuals[index],
+            float(self.chi_squares[index]), int(self.degrees_of_freedom[index]), METHODS[self.methods[index]],
+            float(self.conditionings[index]),
+        )  # fmt: skip
 
 
 def solve(
@@ -90,6 +145,8 @@ def solve(
     rotation: ArrayLike | None = None,
     normal: ArrayLike | None = None,
     up_in_platform: ArrayLike | None = None,
+    method: str = "auto",
+    refine: bool = True,
     leg_sigma: float = LEG_SIGMA,
     tilt_sigma: float = TILT_SIGMA,
     yaw_sigma: float = YAW_SIGMA,
@@ -102,122 +159,483 @@ def solve(
         rotation: (3, 3), measured roll-pitch-yaw; maps {2} to {1} (the paper's section 5).
         normal: (3,), the z axis of {2} seen in {1} (the paper's section 4).
         up_in_platform: (3,), the vertical seen in {2}: what an accelerometer at rest measures.
+        method: one of `METHODS`, or "auto": rotation, vertical, normal or legs alone, whichever comes first in this order,
+            is given, and determines the pose well.
+        refine: weigh all that is given by its variance; otherwise the pose is that of the closed form.
         leg_sigma: standard deviation of each component of a direction [rad].
         tilt_sigma: of roll and pitch, as the vertical, the normal or the rotation give them [rad].
         yaw_sigma: of the yaw in `rotation` [rad].
 
-    With several given, the closed form uses the first of rotation, vertical, normal; the refinement uses all. Measurements
-    that contradict each other show in the residuals, which are to be compared with the sigmas.
+    Measurements that contradict each other show in the residuals: `integrity` finds the one that is wrong.
 
     Raises:
-        InputError: wrong shape, not finite, off unit length by more than 1e-3, a reflection, a sigma not positive.
+        InputError: wrong shape, not finite, off unit length by more than 1e-3, a reflection, a sigma not positive, an unknown
+            method, or one whose measurement is not given.
         SingularConfigurationError: the measurements do not determine the pose.
     """
-    directions, measured = _checked_directions(leg_directions)
-    for name, sigma in (("leg_sigma", leg_sigma), ("tilt_sigma", tilt_sigma), ("yaw_sigma", yaw_sigma)):
-        if not 0.0 < checked_array(sigma, (), name) < np.inf:
-            raise InputError(f"{name} is {sigma}; it must be positive and finite [rad]")
-    up = mechanism.up_in_base
-    tilt, yaw = 1.0 / tilt_sigma**2, 1.0 / yaw_sigma**2
-    observed: list[tuple[Array, Array, float]] = []
-    known_rotation: Array | None = None
-    if rotation is not None:
-        known_rotation = checked_rotation(rotation, "rotation")
-        across = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.8 else [0.0, 1.0, 0.0])
-        level: Array = across / np.linalg.norm(across)
-        # These weights add up to `yaw` about the vertical and to `tilt` about every level axis.
-        axes = ((up, tilt - yaw / 2.0), (level, yaw / 2.0), (np.cross(up, level), yaw / 2.0))
-        observed += [(axis, known_rotation.T @ axis, weight) for axis, weight in axes]
-    if up_in_platform is not None:
-        observed.append((up, checked_unit(up_in_platform, 3, "up_in_platform"), tilt))
-    if normal is not None:
-        observed.append((checked_unit(normal, 3, "normal"), np.array([0.0, 0.0, 1.0]), tilt))
-    vectors = _vector_observations(observed)
-
-    joints = (mechanism.base_joints, mechanism.platform_joints)
-    work = Workspace()
-    position: Array = np.zeros(3)
-    found: Array = np.eye(3)
-    if known_rotation is not None:
-        method, found = "rotation", known_rotation.copy()
-        conditioning = pose_from_rotation(*joints, directions, measured, found, position, *work.linear)
-    elif observed:
-        method = "up" if up_in_platform is not None else "normal"
-        in_base, in_platform, _ = observed[0]
-        conditioning = pose_from_vector(*joints, directions, measured, in_base, in_platform, position, found, *work.linear)
-    else:
-        method = "legs"
-        plane = joint_plane(mechanism)
-        if plane.flatness > _COPLANAR:
-            raise SingularConfigurationError(
-                f"the platform joints leave their plane by {plane.flatness:.2g} of their spread, and leg directions alone give "
-                "a closed form for coplanar ones: measure up_in_platform too"
-            )
-        conditioning = pose_from_legs(*joints, directions, measured, plane.center, plane.axes, position, found, *work.linear)
-    if conditioning < LEAST_CONDITIONING:
-        raise SingularConfigurationError(
-            f"{int(measured.sum())} leg directions{' and ' + method if observed else ''} do not give the pose of "
-            f"{mechanism.name!r} in closed form here: measure more legs, up_in_platform or the rotation"
-        )
-    weights = measured / leg_sigma**2
-    for _ in range(_MAX_REFINEMENTS):
-        if not refine(*joints, directions, work.no_rates, weights, *vectors, work.no_rate, position, found, *work.refinement):
-            raise SingularConfigurationError("the pose that fits the measurements is singular: measure more")
-        if np.abs(work.correction).max() < 1e-14:
-            break
-    legs_at(*joints, position, found, work.arms, work.predicted, work.lengths)
-    if (np.sum(work.predicted * directions, axis=1)[measured > 0.0] <= 0.0).any():
-        raise SingularConfigurationError(
-            "the pose that fits best has legs of negative length: the directions contradict each other, or point down the legs"
-        )
-    normal_equations(*joints, directions, work.no_rates, weights, *vectors, work.no_rate, position, found, *work.equations)
-    covariance: Array = np.linalg.inv(work.information + np.tril(work.information, -1).T)
-    residuals = np.where(measured[:, None] > 0.0, directions - work.predicted, np.nan)
-    return Solution(position, found, covariance, residuals, method, conditioning)
+    given = {"rotation": rotation, "normal": normal, "up_in_platform": up_in_platform}
+    shapes = {"leg_directions": (LEGS, 3), "rotation": (3, 3), "normal": (3,), "up_in_platform": (3,)}
+    arrays = {
+        name: _shaped(value, shapes[name], name)[None]
+        for name, value in (("leg_directions", leg_directions), *given.items())
+        if value is not None
+    }
+    return _solve(mechanism, arrays, method, refine, (leg_sigma, tilt_sigma, yaw_sigma), 1, "")[0]
 
 
-class Workspace:
-    """Scratch for the compiled functions of this file, named in the order in which they take it."""
+def solve_batch(
+    mechanism: Mechanism,
+    leg_directions: ArrayLike,
+    *,
+    rotation: ArrayLike | None = None,
+    normal: ArrayLike | None = None,
+    up_in_platform: ArrayLike | None = None,
+    method: str = "auto",
+    refine: bool = True,
+    leg_sigma: float = LEG_SIGMA,
+    tilt_sigma: float = TILT_SIGMA,
+    yaw_sigma: float = YAW_SIGMA,
+    workers: int | None = None,
+) -> Solutions:
+    """`solve` for N poses, compiled and on all cores; measurements have the shapes (N, 6, 3), (N, 3, 3) and (N, 3).
 
-    def __init__(self) -> None:
-        self.matrix, self.right, self.unknowns = np.zeros((2 * LEGS, 9)), np.zeros(2 * LEGS), np.zeros(9)
-        self.norms, self.order = np.zeros(9), np.zeros(9)
-        self.arms, self.predicted, self.lengths = np.zeros((LEGS, 3)), np.zeros((LEGS, 3)), np.zeros(LEGS)
-        self.information, self.correction, self.twist = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
-        self.factor, self.jacobian = np.zeros((6, 6)), np.zeros((6, 6))
-        self.no_rates, self.no_rate = np.zeros((LEGS, 3)), np.zeros(3)
-        self.linear = (self.matrix, self.right, self.unknowns, self.norms, self.order)
-        self.equations = (self.arms, self.predicted, self.lengths, self.information, self.correction, self.twist)
-        self.refinement = (*self.equations, self.factor)
-        self.newton = (self.arms, self.predicted, self.lengths, self.jacobian, self.correction, self.norms, self.order)
+    Args:
+        workers: threads; by default one for each core that this process may use.
 
-
-def _checked_directions(leg_directions: ArrayLike) -> tuple[Array, Array]:
-    directions = checked_array(leg_directions, (LEGS, 3), "leg_directions", allow_nan=True).copy()
-    measured = np.ones(LEGS)
-    for leg, row in enumerate(directions):
-        if np.isnan(row).all():
-            measured[leg] = 0.0
-            row[:] = (0.0, 0.0, 1.0)
-            continue
-        if np.isnan(row).any():
-            raise InputError(f"leg_directions[{leg}] is partly NaN; a leg that is not measured has a row of NaN")
-        norm = np.linalg.norm(row)
-        if abs(norm - 1.0) > UNIT_TOLERANCE:
-            raise InputError(
-                f"leg_directions[{leg}] has length {norm:.6g}; it must be 1 within {UNIT_TOLERANCE:g}: normalise it"
-            )
-        row /= norm
-    return directions, measured
+    Raises:
+        InputError: as `solve`, naming the row. A row whose pose is not determined raises only when it is asked for.
+    """
+    directions = numbers(leg_directions, "leg_directions", "(N, 6, 3)")
+    count = len(directions) if directions.ndim else 0
+    given = {"rotation": (rotation, (3, 3)), "normal": (normal, (3,)), "up_in_platform": (up_in_platform, (3,))}
+    arrays = {"leg_directions": _shaped(directions, (count, LEGS, 3), "leg_directions")}
+    for name, (value, shape) in given.items():
+        if value is not None:
+            arrays[name] = _shaped(value, (count, *shape), name)
+    sigmas = (leg_sigma, tilt_sigma, yaw_sigma)
+    return _solve(mechanism, arrays, method, refine, sigmas, workers or _cores(), " of row {row}")
 
 
-def _vector_observations(observed: list[tuple[Array, Array, float]]) -> tuple[Array, Array, Array]:
-    in_base = np.array([base for base, _, _ in observed]).reshape(-1, 3)
-    in_platform = np.array([platform for _, platform, _ in observed]).reshape(-1, 3)
-    return in_base, in_platform, np.array([weight for _, _, weight in observed])
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def pose_difference(first: Solution | Pose, second: Solution | Pose) -> tuple[float, float]:
     """Distance [m] and angle [rad] between two poses."""
     distance = float(np.linalg.norm(first.position - second.position))
     return distance, float(rotation_angle(first.rotation, second.rotation))
+
+
+class _Measurements(NamedTuple):
+    """What was measured of N poses; arrays without rows were not."""
+
+    directions: Array
+    rotations: Array
+    ups: Array
+    normals: Array
+    axes: Array
+    leg_weight: float
+    tilt_weight: float
+    yaw_weight: float
+
+
+class _Results(NamedTuple):
+    positions: Array
+    rotations: Array
+    covariances: Array
+    residuals: Array
+    chi_squares: Array
+    degrees_of_freedom: NDArray[np.int64]
+    methods: NDArray[np.int64]
+    conditionings: Array
+    statuses: NDArray[np.int64]
+    legs: NDArray[np.int64]
+
+
+def _shaped(value: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
+    array = numbers(value, name, shape)
+    if array.shape != shape:
+        raise InputError(f"{name} must have shape {shape}, got {array.shape}")
+    return array
+
+
+def _solve(
+    mechanism: Mechanism,
+    arrays: dict[str, Array],
+    method: str,
+    refine: bool,
+    sigmas: tuple[float, float, float],
+    workers: int,
+    where: str,
+) -> Solutions:
+    candidates = _candidates(method, arrays)
+    weights = []
+    for name, sigma in zip(("leg_sigma", "tilt_sigma", "yaw_sigma"), sigmas, strict=True):
+        value = _shaped(sigma, (), name)
+        if not 0.0 < value < np.inf:
+            raise InputError(f"{name} is {sigma}; it must be positive and finite [rad]")
+        weights.append(float(value) ** -2)
+    count = len(arrays["leg_directions"])
+    measurements = _Measurements(
+        arrays["leg_directions"], arrays.get("rotation", np.empty((0, 3, 3))), arrays.get("up_in_platform", np.empty((0, 3))),
+        arrays.get("normal", np.empty((0, 3))), _axes_about(mechanism.up_in_base), *weights,
+    )  # fmt: skip
+    results = _Results(
+        np.empty((count, 3)), np.empty((count, 3, 3)), np.empty((count, 6, 6)), np.empty((count, LEGS, 3)), np.empty(count),
+        np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count), np.empty(count, np.int64),
+        np.empty(count, np.int64),
+    )  # fmt: skip
+    arguments = (geometry_of(mechanism), measurements, candidates, refine, results)
+    starts = range(0, count, _CHUNK)
+    if workers == 1 or len(starts) <= 1:
+        _solve_rows(*arguments, 0, count)
+    else:
+        with ThreadPoolExecutor(workers) as pool:
+            list(pool.map(lambda start: _solve_rows(*arguments, start, min(start + _CHUNK, count)), starts))
+    errors = {
+        int(row): _error(mechanism, arrays, method, int(results.statuses[row]), int(row), int(results.legs[row]), where)
+        for row in np.flatnonzero(results.statuses != _SOLVED)
+    }
+    for error in errors.values():
+        if isinstance(error, InputError):
+            raise error
+    return Solutions(*results[:-2], solved=results.statuses == _SOLVED, errors=errors)
+
+
+def _candidates(method: str, arrays: dict[str, Array]) -> NDArray[np.int64]:
+    if method == "auto":
+        names = [name for name in _AUTOMATIC if name not in _NEEDS or _NEEDS[name] in arrays]
+    elif method not in METHODS:
+        raise InputError(f"there is no method {method!r}; there are auto, {', '.join(METHODS)}")
+    elif _NEEDS.get(method, "leg_directions") not in arrays:
+        raise InputError(f"the method {method!r} needs {_NEEDS[method]}: give it, or choose another method")
+    else:
+        names = [method]
+    return np.array([METHODS.index(name) for name in names])
+
+
+def _axes_about(up: Array) -> Array:
+    """Orthonormal rows (3, 3), the first of which is the vertical."""
+    across = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.8 else [0.0, 1.0, 0.0])
+    level = across / np.linalg.norm(across)
+    return np.array([up, level, np.cross(up, level)])
+
+
+def _error(
+    mechanism: Mechanism, arrays: dict[str, Array], method: str, status: int, row: int, leg: int, where: str
+) -> GoughError:  # fmt: skip
+    where = where.format(row=row)
+    legs = arrays["leg_directions"][row]
+    if status == _PARTLY_NAN:
+        return InputError(f"leg_directions[{leg}]{where} is partly NaN; a leg that is not measured has a row of NaN")
+    if status == _INFINITE:
+        return InputError(f"leg_directions[{leg}]{where} is {legs[leg].tolist()}; it must be finite, or NaN if not measured")
+    if status == _ROTATION_INFINITE:
+        return InputError(f"rotation{where} is {arrays['rotation'][row].tolist()}; it must be finite")
+    if status == _REFLECTION:
+        return InputError(f"rotation{where} is a reflection (determinant -1); the frames of a pose are both right-handed")
+    if status == _NOT_ORTHOGONAL:
+        given = arrays["rotation"][row]
+        off = float(np.abs(given.T @ given - np.eye(3)).max())
+        return InputError(
+            f"rotation{where} is off orthogonal by {off:.3g}, more than {UNIT_TOLERANCE:g}: give a rotation matrix"
+        )
+    if status in (_LEG_NOT_UNIT, _UP_NOT_UNIT, _NORMAL_NOT_UNIT):
+        name, vector = {
+            _LEG_NOT_UNIT: (f"leg_directions[{leg}]", legs[leg]),
+            _UP_NOT_UNIT: ("up_in_platform", arrays.get("up_in_platform", legs)[row]),
+            _NORMAL_NOT_UNIT: ("normal", arrays.get("normal", legs)[row]),
+        }[status]
+        if not np.isfinite(vector).all():
+            return InputError(f"{name}{where} is {vector.tolist()}; it must be finite")
+        size = float(np.linalg.norm(vector))
+        return InputError(f"{name}{where} has length {size:.6g}; it must be 1 within {UNIT_TOLERANCE:g}: normalise it")
+    measured = [f"leg {k}" for k in range(LEGS) if np.isfinite(legs[k, 0])] + [n for n in arrays if n != "leg_directions"]
+    known = f"{', '.join(measured) or 'nothing'}{where}"
+    return SingularConfigurationError(
+        {
+            _OPEN: f"{known} do not give the pose of {mechanism.name!r} here" + ("" if method == "auto" else f" by {method}")
+            + f" (legs parallel or too few, joints in line or alike): {_remedy(arrays, method)}",
+            _SINGULAR: f"{known} leave the pose of {mechanism.name!r} open to a small motion: measure more",
+            _UNSETTLED: f"no pose fits {known}: the measurements contradict each other",
+            _NEGATIVE: "the pose that fits best has legs of negative length: the directions contradict each other, or point "
+            f"down the legs ({known})",
+        }[status]
+    )  # fmt: skip
+
+
+def _remedy(arrays: dict[str, Array], method: str) -> str:
+    if method != "auto":
+        return "choose the method auto, or measure more"
+    missing = [name for name in ("up_in_platform", "rotation") if name not in arrays]
+    return f"measure more legs{''.join(f', or {name}' for name in missing)}"
+
+
+@kernel
+def _solve_rows(
+    geometry: Geometry, measurements: _Measurements, candidates: NDArray[np.int64], refine: bool, results: _Results, start: int,
+    stop: int,
+) -> None:  # fmt: skip
+    """Solve the rows from `start` to `stop`; a row without a pose is filled with NaN and says why in its status."""
+    memory = scratch()
+    directions, measured, weights = np.empty((LEGS, 3)), np.empty(LEGS), np.empty(LEGS)
+    rotation, found_position, found_rotation = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    in_base, in_platform, vector_weights = np.empty((5, 3)), np.empty((5, 3)), np.empty(5)
+    e_z = np.array([0.0, 0.0, 1.0])
+    arms, predicted, lengths = np.empty((LEGS, 3)), np.empty((LEGS, 3)), np.empty(LEGS)
+    information, factor, correction, unit = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty(6)
+    for row in range(start, stop):
+        position, attitude = results.positions[row], results.rotations[row]
+        status, leg = _read_directions(measurements.directions[row], directions, measured)
+        results.legs[row] = leg
+        vectors = 0
+        if status == _SOLVED and measurements.rotations.shape[0] > 0:
+            status = _read_rotation(measurements.rotations[row], rotation)
+            # These weights add up to that of the yaw about the vertical, and to that of the tilt about every level axis.
+            for axis in range(3):
+                for i in range(3):
+                    in_base[axis, i] = measurements.axes[axis, i]
+                    in_platform[axis, i] = 0.0
+                    for j in range(3):
+                        in_platform[axis, i] += rotation[j, i] * measurements.axes[axis, j]
+                vector_weights[axis] = 0.5 * measurements.yaw_weight
+            vector_weights[0] = measurements.tilt_weight - vector_weights[0]
+            vectors = 3
+        up = vectors
+        if status == _SOLVED and measurements.ups.shape[0] > 0:
+            if not _read_unit(measurements.ups[row], in_platform[up]):
+                status = _UP_NOT_UNIT
+            in_base[up] = measurements.axes[0]
+            vector_weights[up] = measurements.tilt_weight
+            vectors += 1
+        normal = vectors
+        if status == _SOLVED and measurements.normals.shape[0] > 0:
+            if not _read_unit(measurements.normals[row], in_base[normal]):
+                status = _NORMAL_NOT_UNIT
+            in_platform[normal] = e_z
+            vector_weights[normal] = measurements.tilt_weight
+            vectors += 1
+        best = 0.0
+        if status == _SOLVED:
+            for method in candidates:
+                if method == _SECTION_5:
+                    found_rotation[:] = rotation
+                    conditioning = pose_from_rotation(geometry, directions, measured, found_rotation, found_position, memory)
+                elif method in (_UP, _NORMAL):
+                    k = up if method == _UP else normal
+                    conditioning = pose_from_vector(
+                        geometry, directions, measured, in_base[k], in_platform[k], found_position, found_rotation, memory
+                    )
+                elif method == _LEGS:
+                    conditioning = pose_from_legs(geometry, directions, measured, found_position, found_rotation, memory)
+                elif method == _SECTION_3_1_1:
+                    conditioning = section_3_1_1(geometry, directions, measured, found_position, found_rotation, memory)
+                else:
+                    conditioning = section_4(
+                        geometry, directions, measured, in_base[normal], e_z, found_position, found_rotation, memory
+                    )
+                if conditioning > best:
+                    best = conditioning
+                    results.methods[row] = method
+                    for i in range(3):
+                        position[i] = found_position[i]
+                        for j in range(3):
+                            attitude[i, j] = found_rotation[i, j]
+                if best > _GOOD_CONDITIONING:
+                    break
+            if not best > LEAST_CONDITIONING:
+                status = _OPEN
+        results.conditionings[row] = best
+        if status == _SOLVED:
+            for k in range(LEGS):
+                weights[k] = measured[k] * measurements.leg_weight
+            if refine:
+                status = _UNSETTLED
+                for _ in range(_MOST_REFINEMENTS):
+                    if not refine_pose(
+                        geometry.base_joints, geometry.platform_joints, directions, weights, in_base, in_platform,
+                        vector_weights[:vectors], position, attitude, arms, predicted, lengths, information, correction, factor,
+                    ):  # fmt: skip
+                        status = _SINGULAR
+                        break
+                    if _square_over_variance(factor, correction) < _REFINED:
+                        status = _SOLVED
+                        break
+            else:
+                normal_equations(
+                    geometry.base_joints, geometry.platform_joints, directions, weights, in_base, in_platform,
+                    vector_weights[:vectors], position, attitude, arms, predicted, lengths, information, correction,
+                )  # fmt: skip
+                factor[:] = information
+                if not factor_cholesky(factor):
+                    status = _SINGULAR
+        if status == _SOLVED:
+            legs_at(geometry.base_joints, geometry.platform_joints, position, attitude, arms, predicted, lengths)
+            chi_square, rows = 0.0, 0
+            for k in range(LEGS):
+                if measured[k] == 0.0:
+                    results.residuals[row, k] = np.nan
+                    continue
+                along = 0.0
+                for i in range(3):
+                    residual = directions[k, i] - predicted[k, i]
+                    results.residuals[row, k, i] = residual
+                    chi_square += weights[k] * residual * residual
+                    along += directions[k, i] * predicted[k, i]
+                if not along > 0.0:
+                    status = _NEGATIVE
+                rows += 2
+            for k in range(vectors):
+                for i in range(3):
+                    seen = 0.0
+                    for j in range(3):
+                        seen += attitude[i, j] * in_platform[k, j]
+                    chi_square += vector_weights[k] * (seen - in_base[k, i]) ** 2
+            # A rotation counts three times as a vector, and a vector twice.
+            rows += 2 * vectors if up < 3 else 2 * vectors - 3
+            results.chi_squares[row], results.degrees_of_freedom[row] = chi_square, rows - 6
+            for j in range(6):
+                unit[:] = 0.0
+                unit[j] = 1.0
+                solve_cholesky(factor, unit)
+                for i in range(6):
+                    results.covariances[row, i, j] = unit[i]
+        results.statuses[row] = status
+        if status != _SOLVED:
+            position[:] = np.nan
+            attitude[:] = np.nan
+            results.covariances[row] = np.nan
+            results.residuals[row] = np.nan
+            results.chi_squares[row] = np.nan
+            results.degrees_of_freedom[row] = 0
+            results.methods[row] = 0
+
+
+@kernel
+def _read_directions(given: Array, directions: Array, measured: Array) -> tuple[int, int]:
+    """Copy directions (6, 3) at unit length, and say which there are; returns a status and the leg that it is about."""
+    for k in range(LEGS):
+        missing = np.isnan(given[k, 0]) + np.isnan(given[k, 1]) + np.isnan(given[k, 2])
+        if missing == 3:
+            measured[k] = 0.0
+            directions[k, 0], directions[k, 1], directions[k, 2] = 0.0, 0.0, 1.0
+            continue
+        if missing > 0:
+            return _PARTLY_NAN, k
+        measured[k] = 1.0
+        if not _read_unit(given[k], directions[k]):
+            return (_LEG_NOT_UNIT if np.isfinite(given[k]).all() else _INFINITE), k
+    return _SOLVED, 0
+
+
+@kernel
+def _read_unit(given: Array, vector: Array) -> bool:
+    """Copy a vector (3,) at unit length; False if it was not nearly a unit vector."""
+    size = np.sqrt(given[0] * given[0] + given[1] * given[1] + given[2] * given[2])
+    for i in range(3):
+        vector[i] = given[i] / size
+    return bool(abs(size - 1.0) <= UNIT_TOLERANCE)
+
+
+@kernel
+def _read_rotation(given: Array, rotation: Array) -> int:
+    """Copy the rotation (3, 3) nearest to a matrix; returns a status."""
+    columns = rotation.reshape(9)
+    for i in range(3):
+        for j in range(3):
+            if not np.isfinite(given[i, j]):
+                return _ROTATION_INFINITE
+            dot = 0.0
+            for k in range(3):
+                dot += given[k, i] * given[k, j]
+            if abs(dot - (1.0 if i == j else 0.0)) > UNIT_TOLERANCE:
+                return _NOT_ORTHOGONAL
+            columns[3 * i + j] = given[i, j]
+    # The nearest rotation to the transposed is the transposed nearest rotation.
+    return _SOLVED if orthonormalise(columns, False) else _REFLECTION
+
+
+@kernel
+def _square_over_variance(factor: Array, step: Array) -> float:
+    """step^T A step for a matrix A whose Cholesky factor is the lower triangle of `factor`."""
+    square = 0.0
+    for j in range(6):
+        value = 0.0
+        for i in range(j, 6):
+            value += factor[i, j] * step[i]
+        square += value * value
+    return square
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """What a method needs on a mechanism.
+
+    Attributes:
+        method: one of `METHODS`.
+        platform: what it needs of the platform: "nothing", "up_in_platform", "normal" or "rotation".
+        fewest: the least number of legs with which the method gives the pose.
+        choices: the sets of so many legs that will do; no leg can be left out of one.
+        any_choice: the least number of legs with which every choice will do, or None if not even all legs will.
+    """
+
+    method: str
+    platform: str
+    fewest: int
+    choices: tuple[tuple[int, ...], ...]
+    any_choice: int
+
+
+_TRIAL_POSES = 8
+_TRIAL_TILT = 0.3
+
+
+def required_measurements(mechanism: Mechanism) -> tuple[Requirement, ...]:
+    """What each method needs on this mechanism, by trying every set of legs at poses about home; methods that cannot do are
+    left out.
+
+    A set of legs will do if it gives the pose at most of the poses: single poses may be singular.
+    """
+    poses = _trial_poses(mechanism)
+    sets = [legs for count in range(2, LEGS + 1) for legs in combinations(range(LEGS), count)]
+    directions = np.empty((len(sets), len(poses), LEGS, 3))
+    for i, pose in enumerate(poses):
+        vectors = pose.position + mechanism.platform_joints @ pose.rotation.T - mechanism.base_joints
+        directions[:, i] = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    for j, legs in enumerate(sets):
+        directions[j][:, [leg for leg in range(LEGS) if leg not in legs]] = np.nan
+    rotations = np.tile([pose.rotation for pose in poses], (len(sets), 1, 1))
+    given = {
+        "nothing": {},
+        "rotation": {"rotation": rotations},
+        "normal": {"normal": rotations[:, :, 2]},
+        "up_in_platform": {"up_in_platform": mechanism.up_in_base @ rotations},
+    }
+    requirements = []
+    for method in METHODS:
+        platform = _NEEDS.get(method, "nothing")
+        found = solve_batch(mechanism, directions.reshape(-1, LEGS, 3), method=method, **given[platform])
+        enough = found.solved.reshape(len(sets), len(poses)).mean(axis=1) > 0.5
+        if not enough.any():
+            continue
+        sufficient = [legs for legs, will_do in zip(sets, enough, strict=True) if will_do]
+        lacking = [len(legs) for legs, will_do in zip(sets, enough, strict=True) if not will_do]
+        fewest = min(len(legs) for legs in sufficient)
+        choices = tuple(legs for legs in sufficient if len(legs) == fewest)
+        requirements.append(Requirement(method, platform, fewest, choices, max(lacking, default=1) + 1))
+    return tuple(requirements)
+
+
+def _trial_poses(mechanism: Mechanism) -> list[Pose]:
+    random = np.random.default_rng(0)
+    size = float(np.linalg.norm(mechanism.base_joints - mechanism.base_joints.mean(axis=0), axis=1).max())
+    home = mechanism.home or Pose(
+        mechanism.base_joints.mean(axis=0) - mechanism.platform_joints.mean(axis=0) + size * mechanism.up_in_base, np.eye(3)
+    )
+    return [
+        Pose(
+            home.position + 0.2 * size * random.uniform(-1.0, 1.0, 3),
+            rotation_from_vector(_TRIAL_TILT * random.uniform(-1.0, 1.0, 3)) @ home.rotation,
+        )
+        for _ in range(_TRIAL_POSES)
+    ]

@@ -18,7 +18,7 @@ from controller.cycle import (
     check_imus,
     cycle,
     cycle_parameters,
-    refine_pose,
+    improve_pose,
 )
 from controller.direct_kinematics import solve
 from controller.inverse_kinematics import leg_lengths, sample_workspace
@@ -139,15 +139,11 @@ def test_every_subset_is_either_refused_or_gives_the_pose(hexapod, count, platfo
         state = run(parameters, signals, segments, 5)
         assert np.linalg.norm(state["position"] - position) < 1e-9
         assert angle_between(state["rotation"], rotation) < 1e-9
-    if platform:
-        assert accepted >= {3: 10, 4: 15, 5: 6}[count]
-    else:
-        # Nine unknowns want nine equations, and a leg gives two.
-        assert accepted == 0 or count == 5
+    assert accepted >= {3: 10, 4: 15, 5: 6}[count] if platform else accepted == {3: 0, 4: 15, 5: 6}[count]
 
 
 @pytest.mark.parametrize(
-    "imus", [(), (PLATFORM_IMU,), (0, 1, PLATFORM_IMU), (2,), (0, 1, 2, 3), (7,), (-1, *ALL_IMUS), (0, 1, 2, 3, 4, 5, 6, 70)]
+    "imus", [(), (PLATFORM_IMU,), (0, 1, PLATFORM_IMU), (2,), (0, 1, 2), (7,), (-1, *ALL_IMUS), (0, 1, 2, 3, 4, 5, 6, 70)]
 )
 def test_imus_that_cannot_be_or_do_not_suffice_are_refused(hexapod, imus):
     with pytest.raises(InputError, match="IMU"):
@@ -156,13 +152,11 @@ def test_imus_that_cannot_be_or_do_not_suffice_are_refused(hexapod, imus):
         parameters_of(hexapod, imus)
 
 
-def test_legs_alone_do_not_do_for_platform_joints_off_a_plane(hexapod):
+def test_legs_alone_do_for_platform_joints_off_a_plane_too(hexapod):
     bent = hexapod.platform_joints + [[0.0, 0.0, z] for z in (0.03, -0.03, 0.03, -0.03, 0.03, -0.03)]
     mechanism = Mechanism.from_legs(hexapod.base_joints, bent, home=hexapod.home, limits={"stroke": (-0.06, 0.06)})
-    with pytest.raises(InputError, match="0, 1, 2, 3, 4, 5 do not determine"):
-        check_imus(mechanism, LEG_IMUS)
-    check_imus(mechanism, ALL_IMUS)
-    check_imus(hexapod, LEG_IMUS)
+    for imus in (LEG_IMUS, ALL_IMUS, (0, 1, 3, 4)):
+        check_imus(mechanism, imus)
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0, 49.0, 4001.0, np.nan, np.inf])
@@ -291,7 +285,7 @@ def test_the_twist_is_the_motion_behind_the_rates_of_the_directions(hexapod, imu
         state["directions"], state["rates"] = leg_directions(hexapod, position, rotation), (ahead - behind) / (2.0 * h)
         state["vertical"], state["platform_rate"] = rotation.T @ hexapod.up_in_base, rotation.T @ omega
         state["position"], state["rotation"] = position, rotation
-        assert refine_pose(parameters, state)
+        assert improve_pose(parameters, state)
         np.testing.assert_allclose(state["twist"], [*velocity, *omega], rtol=0.0, atol=1e-7)
         np.testing.assert_allclose(state["position"], position, rtol=0.0, atol=1e-12)
 
@@ -306,7 +300,7 @@ def test_the_acceleration_is_the_derivative_of_the_twist_with_its_time_constant(
         velocity, h = acceleration * k * PERIOD_S, 1e-6
         ahead, behind = (leg_directions(hexapod, position + sign * h * velocity, rotation) for sign in (1.0, -1.0))
         state["rates"], state["position"], state["rotation"] = (ahead - behind) / (2.0 * h), position, rotation
-        assert refine_pose(parameters, state)
+        assert improve_pose(parameters, state)
         state["cycle"] += 1
         found.append(state["acceleration"].copy())
     found = np.array(found)
