@@ -1,4 +1,4 @@
-"""Small dense least squares for the cycle: pivoted Householder QR, and Cholesky for weighted normal equations.
+"""Small dense systems for the cycle: pivoted Householder QR, elimination, and Cholesky for weighted normal equations.
 
 Normal equations of the closed forms lose half the digits, so those use QR; the refinement's are well scaled.
 """
@@ -128,6 +128,38 @@ def _substitute_back(matrix: Array, right: Array, rank: int) -> None:
         for j in range(k + 1, rank):
             value -= matrix[k, j] * right[j]
         right[k] = value / matrix[k, k]
+
+
+@kernel
+def solve_square(matrix: Array, right: Array) -> float:
+    """Replace `right` (n,) by the solution of `matrix` (n, n) @ x = right, by elimination with row pivoting; overwrites `matrix`.
+
+    Returns:
+        The ratio of the least to the greatest pivot; below `RANK_TOLERANCE` nothing is solved.
+    """
+    n = right.shape[0]
+    least, greatest = np.inf, 0.0
+    for k in range(n):
+        best = k
+        for i in range(k + 1, n):
+            if abs(matrix[i, k]) > abs(matrix[best, k]):
+                best = i
+        if best != k:
+            right[k], right[best] = right[best], right[k]
+            for j in range(k, n):
+                matrix[k, j], matrix[best, j] = matrix[best, j], matrix[k, j]
+        pivot = abs(matrix[k, k])
+        least, greatest = min(least, pivot), max(greatest, pivot)
+        if not least > RANK_TOLERANCE * greatest:
+            return 0.0
+        inverse = 1.0 / matrix[k, k]
+        for i in range(k + 1, n):
+            factor = matrix[i, k] * inverse
+            right[i] -= factor * right[k]
+            for j in range(k + 1, n):
+                matrix[i, j] -= factor * matrix[k, j]
+    _substitute_back(matrix, right, n)
+    return least / greatest
 
 
 @kernel

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from controller.inverse_kinematics import jacobian_at, legs_at
-from controller.least_squares import RANK_TOLERANCE, solve_least_squares
+from controller.least_squares import RANK_TOLERANCE, solve_square
 from plant.compiled import kernel
 from plant.errors import SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
@@ -35,13 +35,13 @@ def pose_from_lengths(mechanism: Mechanism, lengths: ArrayLike, guess: Pose | No
 
 def _scratch() -> tuple[Array, ...]:
     """Memory for `newton_from_lengths`, in the order in which it takes it."""
-    return tuple(np.zeros(shape) for shape in ((LEGS, 3), (LEGS, 3), LEGS, (6, 6), 6, 6, 6))
+    return tuple(np.zeros(shape) for shape in ((LEGS, 3), (LEGS, 3), LEGS, (6, 6)))
 
 
 @kernel
 def newton_from_lengths(
     base_joints: Array, platform_joints: Array, target: Array, position: Array, rotation: Array, arms: Array, directions: Array,
-    lengths: Array, jacobian: Array, correction: Array, norms: Array, order: Array,
+    lengths: Array, jacobian: Array,
 ) -> float:  # fmt: skip
     """Move a pose, in place, to where the legs have the lengths `target` (6,) [m]; returns the largest error left [m]."""
     error = np.inf
@@ -54,25 +54,23 @@ def newton_from_lengths(
         if error < 1e-15 or (error < 1e-11 and error >= before):
             break
         jacobian_at(arms, directions, jacobian)
-        if solve_least_squares(jacobian, lengths, correction, norms, order) < RANK_TOLERANCE:
+        if solve_square(jacobian, lengths) < RANK_TOLERANCE:
             return np.inf
         for i in range(3):
-            position[i] += correction[i]
-        rotate_by_vector(rotation, correction[3:])
+            position[i] += lengths[i]
+        rotate_by_vector(rotation, lengths[3:])
     return error
 
 
 @kernel
 def _poses_from_lengths(
     base_joints: Array, platform_joints: Array, lengths: Array, position: Array, rotation: Array, positions: Array,
-    rotations: Array, arms: Array, directions: Array, scratch: Array, jacobian: Array, correction: Array, norms: Array,
-    order: Array,
+    rotations: Array, arms: Array, directions: Array, scratch: Array, jacobian: Array,
 ) -> int:  # fmt: skip
     for i in range(lengths.shape[0]):
         error = newton_from_lengths(
-            base_joints, platform_joints, lengths[i], position, rotation, arms, directions, scratch, jacobian, correction,
-            norms, order,
-        )  # fmt: skip
+            base_joints, platform_joints, lengths[i], position, rotation, arms, directions, scratch, jacobian
+        )
         if not error < 1e-10:
             return i
         positions[i] = position
