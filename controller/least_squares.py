@@ -132,7 +132,7 @@ def _substitute_back(matrix: Array, right: Array, rank: int) -> None:
 
 @kernel
 def solve_square(matrix: Array, right: Array) -> float:
-    """Replace `right` (n,) by the solution of `matrix` (n, n) @ x = right, by elimination with row pivoting; overwrites `matrix`.
+    """Replace `right` (n,) by the solution of `matrix` (n, n) @ x = right, by elimination with row pivots; overwrites `matrix`.
 
     Returns:
         The ratio of the least to the greatest pivot; below `RANK_TOLERANCE` nothing is solved.

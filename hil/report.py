@@ -8,23 +8,30 @@ from typing import Any, NamedTuple
 import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
-from plotly.io import to_html
-from plotly.offline import get_plotlyjs
 from plotly.subplots import make_subplots
 
 from controller.cycle import ALL_IMUS
+from hil.page import (
+    AXIS_NAMES,
+    COLORS,
+    FAINT,
+    INK,
+    LAYOUT,
+    LEG_NAMES,
+    coordinates,
+    figure_html,
+    line_trace,
+    page,
+    plate_trace,
+    ring,
+    scene,
+    segment_colors,
+    segments,
+)
 from hil.simulation import SimulationResult
 from plant.files import write_whole
 from plant.mechanism import LEGS
 from plant.pose import Array, rotation_angle
-
-AXIS_NAMES = ("x", "y", "z")
-LEG_NAMES = tuple(f"leg {k}" for k in range(LEGS))
-COLORS = {
-    **dict(zip(AXIS_NAMES, ("#d1495b", "#2a9d5c", "#2f6fb5"), strict=True)),
-    **dict(zip(LEG_NAMES, ("#3b6fb6", "#e8871e", "#3a9d6e", "#c8403f", "#8a5fb0", "#3fa7b8"), strict=True)),
-}
-INK, FAINT = "#26323d", "#9aa5b1"
 
 _POINTS = 3000
 _FRAMES = 150
@@ -59,37 +66,23 @@ def _page(result: SimulationResult) -> str:
     title = f"gough: {escape(result.mechanism.name)} follows {escape(result.target.name)}"
     view, speed = _mechanism_view(result)
     pace = "in real time" if speed < 1.05 else f"at {speed:.2g} times real speed"
-    series = "".join(_figure(*figure, "time") for figure in _time_figures(result))
-    moving = _figure(
+    series = "".join(figure_html(*figure, "time") for figure in _time_figures(result))
+    moving = figure_html(
         "mechanism",
         "The mechanism",
         f"True poses {pace}; the path of the origin in grey. Drag to turn, scroll to zoom.",
         view,
         "view",
     )
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>{_STYLE}</style>
-<script>{get_plotlyjs()}</script>
-</head>
-<body>
-<header><h1>{title}</h1><p>{_configuration(result, summary)}</p></header>
-<section class="overview">
+    body = f"""<section class="overview">
 <div>
 {_error_table(summary)}
 {_facts(summary)}
 </div>
 {moving}
 </section>
-{series}
-<script>{_SHARED_TIME}</script>
-</body>
-</html>
-"""
+{series}"""
+    return page(title, _configuration(result, summary), body, _SHARED_TIME)
 
 
 def _configuration(result: SimulationResult, summary: dict[str, Any]) -> str:
@@ -144,18 +137,6 @@ def _facts(summary: dict[str, Any]) -> str:
     return (
         "<dl>" + "".join(f'<div><dd class="{kind}">{value}</dd><dt>{name}</dt></div>' for name, value, kind in facts) + "</dl>"
     )
-
-
-def _figure(name: str, title: str, caption: str, figure: go.Figure, kind: str) -> str:
-    plot = to_html(
-        figure,
-        config={"displaylogo": False, "responsive": True, "doubleClick": "reset"},
-        auto_play=False,
-        include_plotlyjs=False,
-        full_html=False,
-        div_id=name,
-    )
-    return f'<figure class="{kind}"><h2>{title}</h2>\n{plot}\n<figcaption>{caption}</figcaption></figure>\n'
 
 
 def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figure]]:
@@ -260,7 +241,7 @@ def _plot(times: Array, panels: Sequence[_Panel], columns: int = 1, shared_yaxes
     figure.update_xaxes(range=[times[0], times[-1]])
     figure.update_xaxes(title_text="time [s]", row=rows)
     figure.update_layout(
-        _LAYOUT,
+        LAYOUT,
         height=60 + 210 * rows,
         legend={"orientation": "h", "x": 0.0, "y": 1.0, "yanchor": "bottom"},
     )
@@ -319,7 +300,7 @@ def _mechanism_view(result: SimulationResult) -> tuple[go.Figure, float]:
     path = 1e3 * result.true_positions[moving[:: -(-len(moving) // _PATH_POINTS)]]
     base, platform = 1e3 * mechanism.base_joints, 1e3 * mechanism.platform_joints
     joints = positions[:, None] + platform @ np.swapaxes(rotations, 1, 2)
-    base_ring, platform_ring = _ring(base), _ring(platform)
+    base_ring, platform_ring = ring(base), ring(platform)
     numbers = base + 0.12 * (base - base.mean(axis=0))
     tube = _TUBE * 1e3 * mechanism.require_limits().stroke[:, :1]
     triad = 0.4 * np.linalg.norm(platform, axis=1).max()
@@ -328,11 +309,11 @@ def _mechanism_view(result: SimulationResult) -> tuple[go.Figure, float]:
         legs = joints[k] - base
         ends = base + tube * legs / np.linalg.norm(legs, axis=1, keepdims=True)
         return [
-            _xyz(joints[k][platform_ring[:-1]]),
-            _xyz(joints[k][platform_ring]),
-            _xyz(_lines(base, ends)),
-            _xyz(_lines(ends, joints[k])),
-            _xyz(_lines(np.broadcast_to(positions[k], (3, 3)), positions[k] + triad * rotations[k].T)),
+            coordinates(joints[k][platform_ring[:-1]]),
+            coordinates(joints[k][platform_ring]),
+            coordinates(segments(base, ends)),
+            coordinates(segments(ends, joints[k])),
+            coordinates(segments(np.broadcast_to(positions[k], (3, 3)), positions[k] + triad * rotations[k].T)),
         ]
 
     def frame(k: int) -> go.Frame:
@@ -343,47 +324,28 @@ def _mechanism_view(result: SimulationResult) -> tuple[go.Figure, float]:
     plate, outline, tubes, rods, axes = moving_parts(0)
     figure = go.Figure(
         [
-            _plate(plate, "#6d87a3", 0.55),
-            _line(outline, "#3d5670", 6),
-            _line(tubes, _line_colors(LEG_NAMES), 14),
-            _line(rods, "#6b7683", 6),
-            _line(axes, _line_colors(AXIS_NAMES), 5),
-            _plate(_xyz(base[base_ring[:-1]]), FAINT, 0.35),
-            _line(_xyz(base[base_ring]), "#5c6873", 6),
-            _line(_xyz(path), FAINT, 2),
-            go.Scatter3d(_xyz(numbers), mode="text", text=[str(k) for k in range(LEGS)], hoverinfo="skip"),
+            plate_trace(plate, "#6d87a3", 0.55),
+            line_trace(outline, "#3d5670", 6),
+            line_trace(tubes, segment_colors(LEG_NAMES), 14),
+            line_trace(rods, "#6b7683", 6),
+            line_trace(axes, segment_colors(AXIS_NAMES), 5),
+            plate_trace(coordinates(base[base_ring[:-1]]), FAINT, 0.35),
+            line_trace(coordinates(base[base_ring]), "#5c6873", 6),
+            line_trace(coordinates(path), FAINT, 2),
+            go.Scatter3d(coordinates(numbers), mode="text", text=[str(k) for k in range(LEGS)], hoverinfo="skip"),
         ],
         frames=[frame(k) for k in range(count)],
     )
     figure.update_layout(
-        _LAYOUT,
+        LAYOUT,
         height=540,
         margin={"l": 0, "r": 0, "t": 0, "b": 10},
         showlegend=False,
         uirevision="kept",
-        scene=_scene(np.concatenate([numbers, joints.reshape(-1, 3), path]), mechanism.up_in_base),
+        scene=scene(np.concatenate([numbers, joints.reshape(-1, 3), path]), mechanism.up_in_base),
         **_player(result.times[shown], frame_s),
     )
     return figure, span / count / frame_s
-
-
-def _scene(points: Array, up: Array) -> dict[str, Any]:
-    """Fixed axes with equal scales that hold all `points` (N, 3), seen from aside and a little above."""
-    margin = 0.05 * np.ptp(points, axis=0).max()
-    ranges = np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin], axis=1)
-    aside = np.array([1.15, -1.4, 0.0])
-    looks = {"up": up, "eye": aside + (0.6 - aside @ up) * up, "center": -0.1 * up}
-    look = {"showbackground": False, "showspikes": False, "gridcolor": "#e3e7eb", "color": FAINT, "nticks": 5}
-    return {
-        **{
-            f"{name}axis": {"range": ends.tolist(), "title": {"text": f"{name} [mm]"}, **look}
-            for name, ends in zip(AXIS_NAMES, ranges, strict=True)
-        },
-        "aspectmode": "data",
-        # A turntable's axis is always z.
-        "dragmode": "turntable" if up[2] > 0.999 else "orbit",
-        "camera": {key: dict(zip(AXIS_NAMES, vector.tolist(), strict=True)) for key, vector in looks.items()},
-    }
 
 
 def _player(times: Array, frame_s: float) -> dict[str, Any]:
@@ -417,73 +379,6 @@ def _player(times: Array, frame_s: float) -> dict[str, Any]:
     }
     return {"updatemenus": [buttons], "sliders": [slider]}
 
-
-def _ring(joints: Array) -> NDArray[np.intp]:
-    """The indices that go round `joints` (6, 3) once, back to the first."""
-    center = joints - joints.mean(axis=0)
-    plane = np.linalg.svd(center)[2][:2]
-    x, y = plane @ center.T
-    order = np.argsort(np.arctan2(y, x))
-    return np.append(order, order[0])
-
-
-def _lines(starts: Array, ends: Array) -> Array:
-    """Points (3 n, 3) of n separate lines: start, end, gap."""
-    return np.stack([starts, ends, np.full_like(ends, np.nan)], axis=1).reshape(-1, 3)
-
-
-def _line_colors(names: Sequence[str]) -> list[str]:
-    """A color for each point of `_lines`."""
-    return [COLORS[name] for name in names for _ in range(3)]
-
-
-def _xyz(points: Array) -> dict[str, Array]:
-    return dict(zip(AXIS_NAMES, points.T.astype(np.float32), strict=True))
-
-
-def _line(xyz: dict[str, Array], color: str | list[str], width: float) -> go.Scatter3d:
-    return go.Scatter3d(xyz, mode="lines", line={"color": color, "width": width}, hoverinfo="skip")
-
-
-def _plate(xyz: dict[str, Array], color: str, opacity: float) -> go.Mesh3d:
-    fan = np.arange(1, len(xyz["x"]) - 1)
-    return go.Mesh3d(xyz, i=0 * fan, j=fan, k=fan + 1, color=color, opacity=opacity, flatshading=True, hoverinfo="skip")
-
-
-_LAYOUT = {
-    "template": "plotly_white",
-    "font": {"family": "system-ui, -apple-system, 'Segoe UI', 'Liberation Sans', sans-serif", "size": 12, "color": INK},
-    "margin": {"l": 70, "r": 15, "t": 30, "b": 45},
-}
-
-_STYLE = """
-:root { --ink: #26323d; --faint: #66727e; --line: #dfe4e9; --accent: #2f6fb5; }
-* { box-sizing: border-box; }
-body { margin: 0 auto; padding: 28px 24px 48px; max-width: 1240px; color: var(--ink); background: #fff;
-  font: 15px/1.45 system-ui, -apple-system, "Segoe UI", "Liberation Sans", sans-serif; }
-header { border-bottom: 2px solid var(--accent); padding-bottom: 12px; margin-bottom: 20px; }
-h1 { font-size: 26px; font-weight: 600; margin: 0; overflow-wrap: anywhere; }
-header p { margin: 4px 0 0; color: var(--faint); overflow-wrap: anywhere; }
-h2 { font-size: 18px; font-weight: 600; margin: 0 0 4px; }
-.overview { display: grid; grid-template-columns: minmax(380px, 5fr) minmax(480px, 7fr); gap: 28px; }
-table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
-th { font-weight: 500; text-align: right; padding: 3px 0 3px 10px; }
-thead th { color: var(--faint); font-size: 13px; }
-tbody th { text-align: left; padding-left: 0; }
-tbody tr { border-top: 1px solid var(--line); }
-th small { display: block; color: var(--faint); font-weight: 400; }
-td { text-align: right; padding: 8px 0 8px 10px; }
-dl { display: grid; gap: 10px; margin: 22px 0 0; }
-dl div { border-left: 3px solid var(--line); padding-left: 12px; }
-dd { margin: 0; font-size: 22px; font-variant-numeric: tabular-nums; }
-dd.good { color: #23864c; }
-dd.bad { color: #c02f3f; }
-dt { color: var(--faint); font-size: 13px; }
-figure { margin: 0; min-width: 0; }
-figure.time { margin-top: 32px; border-top: 1px solid var(--line); padding-top: 18px; }
-figcaption { color: var(--faint); font-size: 13px; }
-@media (max-width: 960px) { .overview { grid-template-columns: 1fr; } }
-"""
 
 _SHARED_TIME = """
 const plots = document.querySelectorAll(".time .plotly-graph-div");

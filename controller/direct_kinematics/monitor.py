@@ -163,7 +163,7 @@ def cross_check(
     measured = ~np.isnan(given)
     if not measured.any():
         raise InputError("no length was measured: give one at least")
-    if not 0.0 < checked_array(length_sigma, (), "length_sigma"):
+    if not checked_array(length_sigma, (), "length_sigma") > 0.0:
         raise InputError(f"length_sigma is {length_sigma}; it must be positive [m]")
     threshold = chi_square_quantile(int(measured.sum()), false_alarm_rate)
     legs = inverse_kinematics(mechanism, Pose(solution.position, solution.rotation))

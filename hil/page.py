@@ -1,0 +1,144 @@
+"""What every report is made of: one HTML page that opens offline, its look, and the parts of a mechanism in 3-D."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+from numpy.typing import NDArray
+from plotly.io import to_html
+from plotly.offline import get_plotlyjs
+
+from plant.mechanism import LEGS
+from plant.pose import Array
+
+AXIS_NAMES = ("x", "y", "z")
+LEG_NAMES = tuple(f"leg {k}" for k in range(LEGS))
+COLORS = {
+    **dict(zip(AXIS_NAMES, ("#d1495b", "#2a9d5c", "#2f6fb5"), strict=True)),
+    **dict(zip(LEG_NAMES, ("#3b6fb6", "#e8871e", "#3a9d6e", "#c8403f", "#8a5fb0", "#3fa7b8"), strict=True)),
+}
+INK, FAINT = "#26323d", "#9aa5b1"
+
+
+def page(title: str, subtitle: str, body: str, script: str = "") -> str:
+    """A whole page with the drawing library inside; `title`, `subtitle` and `body` are HTML."""
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>{_STYLE}</style>
+<script>{get_plotlyjs()}</script>
+</head>
+<body>
+<header><h1>{title}</h1><p>{subtitle}</p></header>
+{body}
+<script>{script}</script>
+</body>
+</html>
+"""
+
+
+def figure_html(name: str, title: str, caption: str, figure: go.Figure, kind: str) -> str:
+    """A figure with its title and caption; `kind` is its class, "time" for one of full width."""
+    plot = to_html(
+        figure,
+        config={"displaylogo": False, "responsive": True, "doubleClick": "reset"},
+        auto_play=False,
+        include_plotlyjs=False,
+        full_html=False,
+        div_id=name,
+    )
+    return f'<figure class="{kind}"><h2>{title}</h2>\n{plot}\n<figcaption>{caption}</figcaption></figure>\n'
+
+
+def scene(points: Array, up: Array) -> dict[str, Any]:
+    """Fixed axes with equal scales that hold all `points` (N, 3), seen from aside and a little above."""
+    margin = 0.05 * np.ptp(points, axis=0).max()
+    ranges = np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin], axis=1)
+    aside = np.array([1.15, -1.4, 0.0])
+    looks = {"up": up, "eye": aside + (0.6 - aside @ up) * up, "center": -0.1 * up}
+    look = {"showbackground": False, "showspikes": False, "gridcolor": "#e3e7eb", "color": FAINT, "nticks": 5}
+    return {
+        **{
+            f"{name}axis": {"range": ends.tolist(), "title": {"text": f"{name} [mm]"}, **look}
+            for name, ends in zip(AXIS_NAMES, ranges, strict=True)
+        },
+        "aspectmode": "data",
+        # A turntable's axis is always z.
+        "dragmode": "turntable" if up[2] > 0.999 else "orbit",
+        "camera": {key: dict(zip(AXIS_NAMES, vector.tolist(), strict=True)) for key, vector in looks.items()},
+    }
+
+
+def ring(joints: Array) -> NDArray[np.intp]:
+    """The indices that go round `joints` (6, 3) once, back to the first."""
+    center = joints - joints.mean(axis=0)
+    plane = np.linalg.svd(center)[2][:2]
+    x, y = plane @ center.T
+    order = np.argsort(np.arctan2(y, x))
+    return np.append(order, order[0])
+
+
+def segments(starts: Array, ends: Array) -> Array:
+    """Points (3 n, 3) of n separate lines: start, end, gap."""
+    return np.stack([starts, ends, np.full_like(ends, np.nan)], axis=1).reshape(-1, 3)
+
+
+def segment_colors(names: Sequence[str]) -> list[str]:
+    """A color for each point of `segments`."""
+    return [COLORS[name] for name in names for _ in range(3)]
+
+
+def coordinates(points: Array) -> dict[str, Array]:
+    """Points (n, 3) as the keywords of a trace."""
+    return dict(zip(AXIS_NAMES, points.T.astype(np.float32), strict=True))
+
+
+def line_trace(points: dict[str, Array], color: str | list[str], width: float) -> go.Scatter3d:
+    """A line through `coordinates`."""
+    return go.Scatter3d(points, mode="lines", line={"color": color, "width": width}, hoverinfo="skip")
+
+
+def plate_trace(corners: dict[str, Array], color: str, opacity: float) -> go.Mesh3d:
+    """A plate between `coordinates` that go round it."""
+    fan = np.arange(1, len(corners["x"]) - 1)
+    return go.Mesh3d(corners, i=0 * fan, j=fan, k=fan + 1, color=color, opacity=opacity, flatshading=True, hoverinfo="skip")
+
+
+LAYOUT = {
+    "template": "plotly_white",
+    "font": {"family": "system-ui, -apple-system, 'Segoe UI', 'Liberation Sans', sans-serif", "size": 12, "color": INK},
+    "margin": {"l": 70, "r": 15, "t": 30, "b": 45},
+}
+
+_STYLE = """
+:root { --ink: #26323d; --faint: #66727e; --line: #dfe4e9; --accent: #2f6fb5; }
+* { box-sizing: border-box; }
+body { margin: 0 auto; padding: 28px 24px 48px; max-width: 1240px; color: var(--ink); background: #fff;
+  font: 15px/1.45 system-ui, -apple-system, "Segoe UI", "Liberation Sans", sans-serif; }
+header { border-bottom: 2px solid var(--accent); padding-bottom: 12px; margin-bottom: 20px; }
+h1 { font-size: 26px; font-weight: 600; margin: 0; overflow-wrap: anywhere; }
+header p { margin: 4px 0 0; color: var(--faint); overflow-wrap: anywhere; }
+h2 { font-size: 18px; font-weight: 600; margin: 0 0 4px; }
+.overview { display: grid; grid-template-columns: minmax(380px, 5fr) minmax(480px, 7fr); gap: 28px; }
+table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
+th { font-weight: 500; text-align: right; padding: 3px 0 3px 10px; }
+thead th { color: var(--faint); font-size: 13px; }
+tbody th { text-align: left; padding-left: 0; }
+tbody tr { border-top: 1px solid var(--line); }
+th small { display: block; color: var(--faint); font-weight: 400; }
+td { text-align: right; padding: 8px 0 8px 10px; }
+dl { display: grid; gap: 10px; margin: 22px 0 0; }
+dl div { border-left: 3px solid var(--line); padding-left: 12px; }
+dd { margin: 0; font-size: 22px; font-variant-numeric: tabular-nums; }
+dd.good { color: #23864c; }
+dd.bad { color: #c02f3f; }
+dt { color: var(--faint); font-size: 13px; }
+figure { margin: 0; min-width: 0; }
+figure.time { margin-top: 32px; border-top: 1px solid var(--line); padding-top: 18px; }
+figcaption { color: var(--faint); font-size: 13px; }
+@media (max-width: 960px) { .overview { grid-template-columns: 1fr; } }
+"""
