@@ -30,17 +30,18 @@ INTEGRAL_TIME_S = 0.3
 SENSITIVITY_LIMIT = 2.0
 PHASE_MARGIN_DEG, GAIN_MARGIN_DB = 65.0, 12.0
 _SETTLE_S = 10.0
+_SMALL_STEP = 1e-3
 _SIGNALS = 2 * 7 * 3
 
 
 @dataclass(frozen=True)
 class Margins:
-    """Stability of the loop of one actuator with the others closed, and of all six together.
+    """Stability of the loop of one actuator with the others closed, of the worst one, and of all six together.
 
     Attributes:
         gain_db: gain margin [dB].
         phase_deg: phase margin [deg].
-        crossover_hz: where the loop gain falls below one [Hz].
+        crossover_hz: where the loop gain falls below one, at the latest [Hz].
         sensitivity_peak: greatest singular value of the sensitivity over frequency, all loops closed.
         stable: whether all poles lie inside the unit circle.
     """
@@ -191,7 +192,7 @@ def _slice(variables: Any, name: str) -> slice:
 
 
 def _equilibrium(rates: Any, x: Array, u: Array, constants: Any) -> tuple[Array, Array]:
-    """Currents and commands at which nothing accelerates; both enter linearly."""
+    """Currents and commands at which nothing accelerates; both enter linearly, as long as the drives do not saturate."""
     current, command = _slice(STATES, "state.current"), _slice(INPUTS, "velocity_command")
     acceleration = slice(_slice(STATES, "state.velocity").start, _slice(STATES, "state.angular_velocity").stop)
 
@@ -199,9 +200,9 @@ def _equilibrium(rates: Any, x: Array, u: Array, constants: Any) -> tuple[Array,
         base = np.array(rates(x, u, constants)).ravel()[rows]
         columns = []
         for k in range(LEGS):
-            vector[where.start + k] += 1.0
-            columns.append(np.array(rates(x, u, constants)).ravel()[rows] - base)
-            vector[where.start + k] -= 1.0
+            vector[where.start + k] += _SMALL_STEP
+            columns.append((np.array(rates(x, u, constants)).ravel()[rows] - base) / _SMALL_STEP)
+            vector[where.start + k] -= _SMALL_STEP
         return base, np.stack(columns, axis=1)
 
     base, slope = column(x, current, acceleration)
@@ -313,13 +314,13 @@ def margins(loop: Linear, response: tuple[Array, Any], gains: ControlSettings, r
     z = np.exp(2j * np.pi * frequencies / rate)
     controller = gains.proportional + gains.integral * period / (z - 1.0) + slope * (1.0 - 1.0 / z)
     sensitivity = np.linalg.inv(np.eye(LEGS) + controller[:, None, None] * plant)
-    # With the other five closed, 1 + L of actuator 0 is the inverse of its own sensitivity.
-    single = control.FRD(1.0 / sensitivity[:, 0, 0] - 1.0, 2.0 * np.pi * frequencies)
-    gain_margin, phase_margin, _, _, crossover, _ = control.stability_margins(single)
+    # With the other five closed, 1 + L of an actuator is the inverse of its own sensitivity.
+    singles = (control.FRD(1.0 / sensitivity[:, k, k] - 1.0, 2.0 * np.pi * frequencies) for k in range(LEGS))
+    gain_margins, phase_margins, _, _, crossovers, _ = zip(*map(control.stability_margins, singles), strict=True)
     return Margins(
-        gain_db=float(20.0 * np.log10(gain_margin)),
-        phase_deg=float(phase_margin),
-        crossover_hz=float(crossover / (2.0 * np.pi)),
+        gain_db=float(20.0 * np.log10(min(gain_margins))),
+        phase_deg=float(min(phase_margins)),
+        crossover_hz=float(max(crossovers) / (2.0 * np.pi)),
         sensitivity_peak=float(np.linalg.norm(sensitivity, 2, axis=(1, 2)).max()),
         stable=stable,
     )

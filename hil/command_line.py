@@ -174,10 +174,10 @@ def _print_simulation(summary: dict[str, Any]) -> None:
 
 def _tune(options: argparse.Namespace) -> int:
     from controller.tuning import tune
-    from plant.mechanism import load_mechanism
+    from plant.mechanism import load_spatial
 
     _check_writable(options.json)
-    design = tune(load_mechanism(options.mechanism), options.rate)
+    design = tune(load_spatial(options.mechanism), options.rate)
     _write_json(options.json, design.summary())
     table = _table("", "value", "unit")
     for label, value, unit in design.rows():

@@ -22,7 +22,7 @@ from plant.errors import GoughError, InputError, UnknownNameError
 from plant.export import default_fmu
 from plant.fmu import FmuPlant
 from plant.imu import ACCELEROMETER, GYROSCOPE, imu_state, load_imu
-from plant.mechanism import LEGS, Mechanism, load_mechanism
+from plant.mechanism import LEGS, Mechanism, load_spatial
 from plant.pose import Array, rotation_angle, rotations_from_quaternions
 
 FUSIONS = ("compiled", "filterpy")
@@ -202,7 +202,7 @@ def prepared_loop(config: SimulationConfig) -> Iterator[PreparedLoop]:
     Raises:
         GoughError: something in the configuration cannot be used.
     """
-    mechanism = load_mechanism(config.mechanism)
+    mechanism = load_spatial(config.mechanism)
     target = load_target(config.target, mechanism, config.duration)
     period = 1.0 / config.rate
     imu = imu_state(load_imu(config.imu), config.seed, period)

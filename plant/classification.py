@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plant.errors import InputError
-from plant.mechanism import LEGS, SAME_JOINT_M, Mechanism
-from plant.planar import PLANAR_LEGS
+from plant.mechanism import LEGS, Mechanism
+from plant.planar import PLANAR_LEGS, SAME_JOINT_M, PlanarMechanism
 from plant.pose import Array, numbers, rotation_from_vector
 
 MOST_LEGS = 3
@@ -217,6 +217,22 @@ def draw_mechanism(
     return Mechanism.from_legs(
         base[legs[:, 0]], platform[legs[:, 1]], name=f"a random {mechanism_class.label}", up_in_base=up_in_base
     )
+
+
+def draw_planar_mechanism(mechanism_class: MechanismClass, random: np.random.Generator) -> PlanarMechanism:
+    """A random mechanism of a planar class: base joints about a circle of 0.3 m, platform joints about one of 0.1 m.
+
+    Raises:
+        InputError: the class is spatial.
+    """
+    if not mechanism_class.planar:
+        raise InputError(f"{mechanism_class.label} has six legs in space; draw one of the planar classes")
+    base, platform = (
+        _ring(random.permutation(count), radius, 0.0, random)[:, :2]
+        for count, radius in ((mechanism_class.base_count, 0.3), (mechanism_class.platform_count, 0.1))
+    )
+    legs = random.permutation(mechanism_class.legs)
+    return PlanarMechanism.from_legs(base[legs[:, 0]], platform[legs[:, 1]], name=f"a random {mechanism_class.label}")
 
 
 def layout(mechanism_class: MechanismClass) -> tuple[Array, Array]:

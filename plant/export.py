@@ -22,7 +22,7 @@ import fmpy
 from plant.compiled import hash_of_files, keyed_folder
 from plant.errors import ToolchainError
 from plant.files import write_whole
-from plant.mechanism import load_mechanism
+from plant.mechanism import load_spatial
 from plant.pose import Array
 from plant.variables import BRAKE, DRIVE_MODES, INPUTS, OUTPUTS, PARAMETERS, STATES, Variable
 
@@ -94,7 +94,7 @@ def build(path: Path) -> None:
         InputError: `path` cannot be written.
     """
     compiler = c_compiler()
-    starts = load_mechanism("hexapod").plant_parameters()
+    starts = load_spatial("hexapod").plant_parameters()
     with tempfile.TemporaryDirectory(prefix="gough-fmu-") as folder:
         work = Path(folder)
         dependencies = _generate_c(work)

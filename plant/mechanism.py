@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from plant.errors import InputError, UnknownNameError, UnreachableError
+from plant.planar import SAME_JOINT_M, PlanarMechanism, check_legs_differ, check_tables, checked_stroke, planar_from_document
 from plant.pose import (
     Array,
     Pose,
@@ -29,8 +30,6 @@ from plant.pose import (
 from plant.variables import PARAMETERS, checked_parameters
 
 LEGS = 6
-SAME_JOINT_M = 1e-9
-"""Joints closer than this are one joint."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,13 +49,7 @@ class Limits:
     stop_clearance: float = 0.002
 
     def __post_init__(self) -> None:
-        stroke = checked_array(self.stroke, (LEGS, 2), "stroke")
-        object.__setattr__(self, "stroke", stroke)
-        for leg, (least, greatest) in enumerate(stroke):
-            if not 0.0 < least < greatest:
-                raise InputError(
-                    f"the stroke of leg {leg} runs from {least:g} m to {greatest:g} m; it needs 0 < least < greatest length"
-                )
+        object.__setattr__(self, "stroke", checked_stroke(self.stroke, LEGS))
         for name in ("velocity", "acceleration", "jerk", "stop_clearance"):
             value = float(checked_array(getattr(self, name), (), f"limit of {name}"))
             object.__setattr__(self, name, value)
@@ -221,54 +214,97 @@ class Mechanism:
         }
 
 
-def load_mechanism(name_or_path: str | Path) -> Mechanism:
-    """Load a preset by its name, or a mechanism from a TOML file.
+_PRESETS = resources.files("plant") / "presets"
+
+
+def load_spatial(name_or_path: str | Path) -> Mechanism:
+    """`load_mechanism` where only six legs will do.
+
+    Raises:
+        InputError: the mechanism is planar.
+    """
+    mechanism = load_mechanism(name_or_path)
+    if isinstance(mechanism, PlanarMechanism):
+        raise InputError(f"{name_or_path} has three legs in the plane; this needs six in space: choose another mechanism")
+    return mechanism
+
+
+def load_mechanism(name_or_path: str | Path) -> Mechanism | PlanarMechanism:
+    """Load a preset by its name, or a mechanism from a TOML file; rows of two numbers make it a planar one.
 
     Raises:
         UnknownNameError: no such preset, and no such file.
         InputError: the file is not TOML, or its content is not a mechanism.
     """
-    folder = resources.files("plant") / "presets"
-    presets = sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
-    if str(name_or_path) in presets:
-        return _from_toml((folder / f"{name_or_path}.toml").read_text(), str(name_or_path))
-    path = Path(name_or_path)
-    if not path.is_file():
-        raise UnknownNameError(f"no mechanism {str(name_or_path)!r}: neither a preset ({', '.join(presets)}) nor a file")
+    source = str(name_or_path)
+    document = _preset(source) if source in _preset_names() else _file(Path(name_or_path))
     try:
-        text = path.read_text()
+        return _from_document(_completed(document, source))
+    except (InputError, UnknownNameError) as error:
+        raise type(error)(f"{source}: {error}") from None
+
+
+def _preset_names() -> list[str]:
+    return sorted(entry.name.removesuffix(".toml") for entry in _PRESETS.iterdir() if entry.name.endswith(".toml"))
+
+
+def _preset(name: str) -> dict[str, Any]:
+    return tomllib.loads((_PRESETS / f"{name}.toml").read_text())
+
+
+def _file(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise UnknownNameError(f"no mechanism {str(path)!r}: neither a preset ({', '.join(_preset_names())}) nor a file")
+    try:
+        return tomllib.loads(path.read_text())
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path} is not valid TOML: {error}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read {path}: {error}") from None
-    return _from_toml(text, str(path))
+
+
+def _completed(document: dict[str, Any], source: str) -> dict[str, Any]:
+    """A document laid over the preset that it is based on, that one over its own, and so on; a name is not handed down."""
+    names = [source]
+    while "based_on" in document:
+        names.append(document.pop("based_on"))
+        if names[-1] not in _preset_names():
+            raise UnknownNameError(f"based_on names no preset: {names[-1]!r}; there are {', '.join(_preset_names())}")
+        if names[-1] in names[:-1]:
+            raise InputError(f"based_on goes round in a circle, {' -> '.join(names)}: leave one out")
+        preset = _preset(names[-1])
+        preset.pop("name", None)
+        document = _merged(preset, document)
+    return document
+
+
+def _merged(under: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Two nested tables as one; where both have an entry that is no table, `over` wins."""
+    shared = [key for key in under.keys() & over.keys() if isinstance(under[key], dict) and isinstance(over[key], dict)]
+    return under | over | {key: _merged(under[key], over[key]) for key in shared}
 
 
 _TABLES = {
     "geometry": {"base_joints", "platform_joints", "base_joint_axes", "up_in_base"},
     "home": {"position", "quaternion"},
     "limits": {field.name for field in fields(Limits)},
+    "plant": None,
+    "control": None,
+    "fusion": None,
 }
 
 
-def _from_toml(text: str, source: str) -> Mechanism:
+def _is_planar(document: dict[str, Any]) -> bool:
     try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{source} is not valid TOML: {error}") from None
-    try:
-        return _from_document(document)
-    except (InputError, UnknownNameError) as error:
-        raise type(error)(f"{source}: {error}") from None
+        return bool(np.shape(document["geometry"]["base_joints"])[-1:] == (2,))
+    except (LookupError, TypeError, ValueError):
+        return False
 
 
-def _from_document(document: dict[str, Any]) -> Mechanism:
-    for key, table in document.items():
-        if key not in {"name", *_TABLES, "plant", "control", "fusion"}:
-            raise InputError(f"unknown entry {key!r}; a mechanism has name, {', '.join(_TABLES)}, plant, control, fusion")
-        if key != "name" and not isinstance(table, dict):
-            raise InputError(f"{key!r} must be a table")
-        unknown = set(table) - _TABLES[key] if key in _TABLES else set()
-        if unknown:
-            raise InputError(f"[{key}] has no entry {sorted(unknown)[0]!r}; it has {', '.join(sorted(_TABLES[key]))}")
+def _from_document(document: dict[str, Any]) -> Mechanism | PlanarMechanism:
+    if _is_planar(document):
+        return planar_from_document(document)
+    check_tables(document, _TABLES)
     geometry = dict(document.get("geometry", {}))
     for array in ("base_joints", "platform_joints"):
         if array not in geometry:
@@ -299,11 +335,7 @@ def _flattened(tables: Mapping[str, Any], prefix: str = "") -> dict[str, ArrayLi
 
 
 def _check_joints(base: Array, platform: Array) -> None:
-    for leg in range(LEGS):
-        for other in range(leg):
-            apart = max(np.linalg.norm(base[leg] - base[other]), np.linalg.norm(platform[leg] - platform[other]))
-            if apart < SAME_JOINT_M:
-                raise InputError(f"legs {other} and {leg} coincide: they share both joints; move one of them")
+    check_legs_differ(base, platform)
     for name, joints in (("base", base), ("platform", platform)):
         spread = np.linalg.svd(joints - joints.mean(axis=0), compute_uv=False)
         if spread[1] < 1e-6 * max(spread[0], SAME_JOINT_M):

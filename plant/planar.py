@@ -103,7 +103,7 @@ def check_tables(document: Mapping[str, Any], tables: Mapping[str, Collection[st
         if key == "name":
             continue
         if key not in tables:
-            raise InputError(f"unknown entry {key!r}; a mechanism has name, {', '.join(tables)}")
+            raise InputError(f"unknown entry {key!r}; a mechanism has name, {', '.join(tables)}, based_on")
         if not isinstance(table, Mapping):
             raise InputError(f"{key!r} must be a table")
         allowed = tables[key]

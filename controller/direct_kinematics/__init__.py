@@ -2,6 +2,7 @@
 
 from controller.direct_kinematics.lengths import pose_from_lengths, poses_from_lengths
 from controller.direct_kinematics.monitor import Integrity, LengthCheck, cross_check, integrity
+from controller.direct_kinematics.planar import AssemblyMode, solve_planar
 from controller.direct_kinematics.spatial import (
     METHODS,
     Requirement,
@@ -15,6 +16,7 @@ from controller.direct_kinematics.spatial import (
 
 __all__ = [
     "METHODS",
+    "AssemblyMode",
     "Integrity",
     "LengthCheck",
     "Requirement",
@@ -28,4 +30,5 @@ __all__ = [
     "required_measurements",
     "solve",
     "solve_batch",
+    "solve_planar",
 ]

@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 
 from controller.least_squares import RANK_TOLERANCE, solve_least_squares, solve_truncated
 from plant.compiled import kernel
-from plant.mechanism import LEGS, SAME_JOINT_M, Mechanism
+from plant.mechanism import LEGS, Mechanism
+from plant.planar import SAME_JOINT_M
 from plant.pose import Array
 
 FLATNESS = 1e-3

@@ -200,11 +200,8 @@ def chi_square_quantile(degrees_of_freedom: int, rate: float) -> float:
 def _exceeded(degrees_of_freedom: int, value: float) -> float:
     """How often a chi-square sum of whole degrees of freedom exceeds a value; elementary, so that no loop loads SciPy."""
     half = 0.5 * value
+    if half == 0.0:
+        return 1.0
     total, start = (0.0, 0.0) if degrees_of_freedom % 2 == 0 else (math.erfc(math.sqrt(half)), 0.5)
-    term = math.exp(-half) * half**start / math.gamma(start + 1.0)
-    power = start
-    while power < 0.5 * degrees_of_freedom - 0.5:
-        total += term
-        power += 1.0
-        term *= half / power
-    return total
+    powers = (start + i for i in range((degrees_of_freedom - int(2.0 * start)) // 2))
+    return total + math.fsum(math.exp(power * math.log(half) - half - math.lgamma(power + 1.0)) for power in powers)

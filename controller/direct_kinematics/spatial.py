@@ -48,7 +48,9 @@ METHODS = ("section-5", "up", "normal", "legs", "section-3.1.1", "section-4")
 """The closed forms: of the paper's sections, and from all legs with the vertical, the normal, or nothing else."""
 
 _SECTION_5, _UP, _NORMAL, _LEGS, _SECTION_3_1_1, _SECTION_4 = range(len(METHODS))
-_NEEDS = {"section-5": "rotation", "up": "up_in_platform", "normal": "normal", "section-4": "normal"}
+NEEDS = {"section-5": "rotation", "up": "up_in_platform", "normal": "normal", "section-4": "normal"}
+"""What a method needs of the platform; the others need nothing."""
+
 _AUTOMATIC = ("section-5", "up", "normal", "legs")
 _GOOD_CONDITIONING = 1e-2
 
@@ -304,11 +306,11 @@ def _solve(
 
 def _candidates(method: str, arrays: dict[str, Array]) -> NDArray[np.int64]:
     if method == "auto":
-        names = [name for name in _AUTOMATIC if name not in _NEEDS or _NEEDS[name] in arrays]
+        names = [name for name in _AUTOMATIC if name not in NEEDS or NEEDS[name] in arrays]
     elif method not in METHODS:
         raise InputError(f"there is no method {method!r}; there are auto, {', '.join(METHODS)}")
-    elif _NEEDS.get(method, "leg_directions") not in arrays:
-        raise InputError(f"the method {method!r} needs {_NEEDS[method]}: give it, or choose another method")
+    elif NEEDS.get(method, "leg_directions") not in arrays:
+        raise InputError(f"the method {method!r} needs {NEEDS[method]}: give it, or choose another method")
     else:
         names = [method]
     return np.array([METHODS.index(name) for name in names])
@@ -613,7 +615,7 @@ def required_measurements(mechanism: Mechanism) -> tuple[Requirement, ...]:
     }
     requirements = []
     for method in METHODS:
-        platform = _NEEDS.get(method, "nothing")
+        platform = NEEDS.get(method, "nothing")
         found = solve_batch(mechanism, directions.reshape(-1, LEGS, 3), method=method, **given[platform])
         enough = found.solved.reshape(len(sets), len(poses)).mean(axis=1) > 0.5
         if not enough.any():

@@ -419,3 +419,59 @@ def test_an_unknown_preset_names_the_presets(tmp_path: Path) -> None:
         load_mechanism("hexapot")
     with pytest.raises(UnknownNameError, match="nor a file"):
         load_mechanism(tmp_path)
+
+
+# ---- based on a preset ----
+
+
+@pytest.fixture
+def presets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of presets with a good one, another based on it, and two based on each other."""
+    folder = tmp_path / "presets"
+    folder.mkdir()
+    stiffer = 'name = "stiffer"\nbased_on = "good"\n[control]\nintegral = 90.0\n[plant.payload]\nmass = 4.0\n'
+    for name, text in {"good": GOOD, "stiffer": stiffer, "egg": 'based_on = "hen"', "hen": 'based_on = "egg"'}.items():
+        (folder / f"{name}.toml").write_text(text)
+    monkeypatch.setattr("plant.mechanism._PRESETS", folder)
+    return folder
+
+
+def test_tables_are_laid_over_those_of_the_preset(tmp_path: Path, hexapod: Mechanism) -> None:
+    text = f'based_on = "hexapod"\n[geometry]\nbase_joints = {BASE}\n[plant.payload]\nmass = 4\n[control]\nhold = 0.5\n'
+    mechanism = load_mechanism(write(tmp_path, text))
+    np.testing.assert_array_equal(mechanism.base_joints, BASE)
+    np.testing.assert_array_equal(mechanism.platform_joints, hexapod.platform_joints)
+    lengths = lengths_at(mechanism, HOME.position, HOME.rotation)
+    np.testing.assert_allclose(mechanism.require_limits().stroke - lengths[:, None], np.tile([-0.06, 0.06], (6, 1)), atol=1e-15)
+    assert {name for name, value in hexapod.plant.items() if (mechanism.plant[name] != value).any()} == {"payload.mass"}
+    assert mechanism.settings["control"] == {**hexapod.settings["control"], "hold": 0.5}
+    assert mechanism.name == "custom"
+
+
+def test_a_preset_may_be_based_on_another(tmp_path: Path, presets: Path) -> None:
+    mechanism = load_mechanism(write(tmp_path, 'based_on = "stiffer"\n[plant.platform]\nmass = 3.0'))
+    np.testing.assert_array_equal(mechanism.base_joints, BASE)
+    assert mechanism.settings["control"] == {"proportional": 30.0, "integral": 90.0}
+    assert [mechanism.plant[f"{body}.mass"] for body in ("payload", "platform")] == [4.0, 3.0]
+    assert load_mechanism("stiffer").name == "stiffer"
+    assert load_mechanism("stiffer").plant["platform.mass"] == 2.5
+
+
+def test_only_presets_can_be_based_on(tmp_path: Path, presets: Path) -> None:
+    (tmp_path / "other.toml").write_text(GOOD)
+    message = r"mine.toml: based_on names no preset: .*; there are egg, good, hen, stiffer"
+    for base in ("'hexapod'", f"'{tmp_path / 'other.toml'}'", "3", "['good']"):
+        with pytest.raises(UnknownNameError, match=message):
+            load_mechanism(write(tmp_path, f"based_on = {base}"))
+
+
+def test_presets_based_on_each_other_are_refused(tmp_path: Path, presets: Path) -> None:
+    with pytest.raises(InputError, match="egg: based_on goes round in a circle, egg -> hen -> egg: leave one out"):
+        load_mechanism("egg")
+    with pytest.raises(InputError, match=r"circle, .*mine.toml -> hen -> egg -> hen"):
+        load_mechanism(write(tmp_path, "based_on = 'hen'"))
+
+
+def test_what_a_preset_has_as_a_table_must_stay_one(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="'limits' must be a table"):
+        load_mechanism(write(tmp_path, "based_on = 'hexapod'\nlimits = 3"))
