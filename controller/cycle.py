@@ -10,7 +10,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from controller.direct_kinematics.closed_forms import Geometry, Scratch, geometry_of, pose_from_legs, pose_from_vector
+from controller.direct_kinematics.closed_forms import GEOMETRY, SCRATCH, geometry_of, pose_from_legs, pose_from_vector
 from controller.direct_kinematics.refinement import find_twist, refine_pose
 from controller.inverse_kinematics import jacobian_at, legs_at, sample_workspace
 from controller.least_squares import RANK_TOLERANCE, solve_least_squares
@@ -48,15 +48,7 @@ PARAMETERS = np.dtype(
     [
         ("period", np.float64),
         ("hold_cycles", np.int64),
-        # Of `closed_forms.Geometry`.
-        ("base_joints", np.float64, (LEGS, 3)),
-        ("platform_joints", np.float64, (LEGS, 3)),
-        ("platform_numbers", np.int64, LEGS),
-        ("centers", np.float64, (64, 3)),
-        ("axes", np.float64, (64, 3, 3)),
-        ("spreads", np.float64, 64),
-        ("unknowns", np.int64, 64),
-        ("ranks", np.int64, 64),
+        ("geometry", GEOMETRY),
         ("joint_rotations", np.float64, (LEGS, 3, 3)),
         ("up_in_joint", np.float64, (LEGS, 3)),
         ("up_in_base", np.float64, (1, 3)),
@@ -127,15 +119,7 @@ STATE = np.dtype(
         ("vectors_9", np.float64, (2, 9)),
         ("matrices_6_6", np.float64, (2, 6, 6)),
         ("vectors_6", np.float64, (2, 6)),
-        # Of `closed_forms.Scratch`.
-        ("matrix", np.float64, (20, 20)),
-        ("right", np.float64, 20),
-        ("unknowns", np.float64, 20),
-        ("span", np.float64, (6, 12)),
-        ("norms", np.float64, 20),
-        ("order", np.float64, 20),
-        ("points", np.float64, (LEGS, 3)),
-        ("selected", np.float64, LEGS),
+        ("scratch", SCRATCH),
     ],
     align=True,
 )
@@ -184,7 +168,7 @@ def cycle_parameters(
     values = {
         "period": 1.0 / rate,
         "hold_cycles": int(np.ceil(control.hold * rate - 1e-9)),
-        **geometry_of(mechanism)._asdict(),
+        "geometry": geometry_of(mechanism),
         "joint_rotations": mechanism.joint_rotations,
         "up_in_joint": np.swapaxes(mechanism.joint_rotations, 1, 2) @ mechanism.up_in_base,
         "up_in_base": mechanism.up_in_base,
@@ -249,8 +233,7 @@ def check_imus(mechanism: Mechanism, imus: Collection[int]) -> None:
             )
     positions, rotations = sample_workspace(mechanism, 50, seed=0)
     parameters, state = np.zeros((), PARAMETERS), np.zeros((), STATE)
-    for name, value in geometry_of(mechanism)._asdict().items():
-        parameters[name] = value
+    parameters["geometry"] = geometry_of(mechanism)
     parameters["up_in_base"], parameters["platform_used"] = mechanism.up_in_base, PLATFORM_IMU in imus
     parameters["leg_used"] = [leg in imus for leg in range(LEGS)]
     worst = np.inf
@@ -371,16 +354,12 @@ def find_pose(parameters: Record, state: Record) -> float:
     conditioning.
     """
     p, s = parameters[()], state[()]
-    geometry = Geometry(
-        p.base_joints, p.platform_joints, p.platform_numbers, p.centers, p.axes, p.spreads, p.unknowns, p.ranks
-    )  # fmt: skip
-    scratch = Scratch(s.matrix, s.right, s.unknowns, s.span, s.norms, s.order, s.points, s.selected)
     if p.platform_used != 0:
         s.conditioning = pose_from_vector(
-            geometry, s.directions, p.leg_used, p.up_in_base[0], s.vertical[0], s.position, s.rotation, scratch
+            p.geometry, s.directions, p.leg_used, p.up_in_base[0], s.vertical[0], s.position, s.rotation, s.scratch
         )
     else:
-        s.conditioning = pose_from_legs(geometry, s.directions, p.leg_used, s.position, s.rotation, scratch)
+        s.conditioning = pose_from_legs(p.geometry, s.directions, p.leg_used, s.position, s.rotation, s.scratch)
     return float(s.conditioning)
 
 
@@ -391,8 +370,8 @@ def improve_pose(parameters: Record, state: Record) -> bool:
     factor = s.matrices_6_6[0]
     for _ in range(2):
         if not refine_pose(
-            p.base_joints, p.platform_joints, s.directions, p.leg_weights, p.up_in_base, s.vertical, p.vertical_weight,
-            s.position, s.rotation, s.arms, s.predicted, s.lengths, s.information, s.vectors_6[0], factor,
+            p.geometry.base_joints, p.geometry.platform_joints, s.directions, p.leg_weights, p.up_in_base, s.vertical,
+            p.vertical_weight, s.position, s.rotation, s.arms, s.predicted, s.lengths, s.information, s.vectors_6[0], factor,
         ):  # fmt: skip
             return False
     for i in range(3):
@@ -415,7 +394,7 @@ def improve_pose(parameters: Record, state: Record) -> bool:
 def invert(parameters: Record, state: Record) -> None:
     """Inverse kinematics of the estimated pose."""
     p, s = parameters[()], state[()]
-    legs_at(p.base_joints, p.platform_joints, s.position, s.rotation, s.arms, s.predicted, s.lengths)
+    legs_at(p.geometry.base_joints, p.geometry.platform_joints, s.position, s.rotation, s.arms, s.predicted, s.lengths)
 
 
 @kernel
@@ -476,7 +455,7 @@ def feed_load_forward(parameters: Record, state: Record) -> None:
         wrench[3] += a[1] * f2 - a[2] * f1
         wrench[4] += a[2] * f0 - a[0] * f2
         wrench[5] += a[0] * f1 - a[1] * f0
-    if solve_least_squares(transposed, wrench, force, s.vectors_9[0, :6], s.vectors_9[1, :6]) < RANK_TOLERANCE:
+    if solve_least_squares(transposed, wrench, 6, force, s.vectors_9[0, :6], s.vectors_9[1, :6]) < RANK_TOLERANCE:
         for k in range(LEGS):
             force[k] = 0.0
     for k in range(LEGS):

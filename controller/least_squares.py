@@ -13,21 +13,22 @@ RANK_TOLERANCE = 1e-9
 
 
 @kernel
-def solve_least_squares(matrix: Array, right: Array, solution: Array, norms: Array, order: Array) -> float:
-    """Minimise |matrix @ solution - right| by QR with column pivoting; overwrites `matrix` (m, n) and `right` (m,).
+def solve_least_squares(matrix: Array, right: Array, rows: int, solution: Array, norms: Array, order: Array) -> float:
+    """Minimise |matrix @ solution - right| by QR with column pivoting; overwrites `matrix` and `right`.
 
     Args:
-        matrix: (m, n), m >= n.
-        right: (m,).
+        matrix: (>= rows, >= n), whose corner counts; contiguous, so that rows are worked on at once.
+        right: (>= rows,).
+        rows: at least n.
         solution: (n,), written.
-        norms, order: (n,) scratch.
+        norms, order: (>= n,) scratch.
 
     Returns:
         The ratio of the least to the greatest diagonal element of R, an estimate of the reciprocal condition number;
         below `RANK_TOLERANCE` nothing is solved.
     """
     n = solution.shape[0]
-    conditioning = _triangularise(matrix, right, n, norms, order)
+    conditioning = _triangularise(matrix, right, rows, n, solution, norms, order)
     if conditioning >= RANK_TOLERANCE:
         _substitute_back(matrix, right, n)
         for k in range(n):
@@ -37,12 +38,12 @@ def solve_least_squares(matrix: Array, right: Array, solution: Array, norms: Arr
 
 @kernel
 def solve_truncated(
-    matrix: Array, right: Array, rank: int, solution: Array, null_space: Array, norms: Array, order: Array
+    matrix: Array, right: Array, rows: int, rank: int, solution: Array, null_space: Array, norms: Array, order: Array
 ) -> float:
     """Solve a system of known rank: after `rank` pivots what is left of the rows counts as noise.
 
     Args:
-        matrix, right, norms, order: as for `solve_least_squares`.
+        matrix, right, rows, norms, order: as for `solve_least_squares`.
         rank: of the system without noise, at most n.
         solution: (n,), one solution, written.
         null_space: (>= n - rank, n), whose rows may be added to it in any amount, written.
@@ -51,7 +52,7 @@ def solve_truncated(
         The ratio of the last to the first pivot; below `RANK_TOLERANCE` nothing is solved.
     """
     n = solution.shape[0]
-    conditioning = _triangularise(matrix, right, rank, norms, order)
+    conditioning = _triangularise(matrix, right, rows, rank, solution, norms, order)
     if conditioning < RANK_TOLERANCE:
         return conditioning
     _substitute_back(matrix, right, rank)
@@ -69,13 +70,18 @@ def solve_truncated(
 
 
 @kernel
-def _triangularise(matrix: Array, right: Array, rank: int, norms: Array, order: Array) -> float:
-    """Turn `matrix` (m, n) into R by `rank` pivots and `right` along with it; returns the ratio of last to first pivot."""
-    m, n = matrix.shape
+def _triangularise(
+    matrix: Array, right: Array, m: int, rank: int, dots: Array, norms: Array, order: Array
+) -> float:  # fmt: skip
+    """Turn the corner (m, n) of `matrix` into R by `rank` pivots, and `right` along with it; n is the size of `dots`, which is
+    scratch. Returns the ratio of the last to the first pivot.
+    """
+    n = dots.shape[0]
     for j in range(n):
         order[j] = j
         norms[j] = 0.0
-        for i in range(m):
+    for i in range(m):
+        for j in range(n):
             norms[j] += matrix[i, j] * matrix[i, j]
     for k in range(rank):
         best = k
@@ -98,24 +104,25 @@ def _triangularise(matrix: Array, right: Array, rank: int, norms: Array, order: 
         # Householder's vector is stored below the diagonal, its leading element apart.
         lead = matrix[k, k] - alpha
         scale = 1.0 / (alpha * lead)
-        for j in range(k + 1, n):
-            dot = lead * matrix[k, j]
-            for i in range(k + 1, m):
-                dot += matrix[i, k] * matrix[i, j]
-            dot *= scale
-            matrix[k, j] += dot * lead
-            for i in range(k + 1, m):
-                matrix[i, j] += dot * matrix[i, k]
-            norms[j] = 0.0
-            for i in range(k + 1, m):
-                norms[j] += matrix[i, j] * matrix[i, j]
         dot = lead * right[k]
+        for j in range(k + 1, n):
+            dots[j] = lead * matrix[k, j]
         for i in range(k + 1, m):
-            dot += matrix[i, k] * right[i]
+            element = matrix[i, k]
+            dot += element * right[i]
+            for j in range(k + 1, n):
+                dots[j] += element * matrix[i, j]
         dot *= scale
         right[k] += dot * lead
+        for j in range(k + 1, n):
+            dots[j] *= scale
+            matrix[k, j] += dots[j] * lead
+            norms[j] -= matrix[k, j] * matrix[k, j]
         for i in range(k + 1, m):
-            right[i] += dot * matrix[i, k]
+            element = matrix[i, k]
+            right[i] += dot * element
+            for j in range(k + 1, n):
+                matrix[i, j] += dots[j] * element
         matrix[k, k] = alpha
     return float(abs(matrix[rank - 1, rank - 1] / matrix[0, 0]))
 
@@ -182,6 +189,26 @@ def factor_cholesky(matrix: Array) -> bool:
         for i in range(j + 1, n):
             matrix[i, j] *= inverse
     return True
+
+
+@kernel
+def invert_cholesky(factor: Array, inverse: Array) -> None:
+    """Write the inverse (n, n) of the matrix whose Cholesky factor is the lower triangle of `factor`, which is overwritten."""
+    n = factor.shape[0]
+    for j in range(n):
+        factor[j, j] = 1.0 / factor[j, j]
+        for i in range(j + 1, n):
+            value = 0.0
+            for k in range(j, i):
+                value -= factor[i, k] * factor[k, j]
+            factor[i, j] = value / factor[i, i]
+    for i in range(n):
+        for j in range(i + 1):
+            value = 0.0
+            for k in range(i, n):
+                value += factor[k, i] * factor[k, j]
+            inverse[i, j] = value
+            inverse[j, i] = value
 
 
 @kernel

@@ -17,14 +17,11 @@ joints' spread, so that it depends neither on size nor on frames; 0 where nothin
 """
 
 from functools import lru_cache
-from itertools import product
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from controller.least_squares import RANK_TOLERANCE, solve_least_squares, solve_truncated
-from plant.compiled import kernel
+from plant.compiled import Record, kernel
 from plant.mechanism import LEGS, Mechanism
 from plant.planar import SAME_JOINT_M
 from plant.pose import Array
@@ -46,78 +43,69 @@ _LINEAR_RANK = 9
 with a sixth of the error that the last three pivots of a 6-6 mechanism would bring."""
 
 
-class Geometry(NamedTuple):
-    """What the closed forms need of a mechanism.
+GEOMETRY = np.dtype(
+    [
+        ("base_joints", np.float64, (LEGS, 3)),
+        ("platform_joints", np.float64, (LEGS, 3)),
+        ("platform_numbers", np.int64, LEGS),
+        ("centers", np.float64, (_SETS, 3)),
+        ("axes", np.float64, (_SETS, 3, 3)),
+        ("spreads", np.float64, _SETS),
+        ("unknowns", np.int64, _SETS),
+        ("ranks", np.int64, _SETS),
+    ],
+    align=True,
+)
+"""What the closed forms need of a mechanism: its joints [m], and the first leg of each leg's platform joint. Of each set of
+legs, in whose number leg k has bit k: the centre of its platform joints [m]; axes in columns, of which two span the joints'
+plane; their root mean square distance from the centre [m]; the unknowns, 9 if the joints lie in that plane, so that two
+columns of R tell the third, else 12; and the rank of the legs' equations for them.
+"""
 
-    Attributes:
-        base_joints, platform_joints: (6, 3) [m], in {1} and {2}.
-        platform_numbers: (6,), which legs share a platform joint.
-        centers: (64, 3), centre of the platform joints of a set of legs; leg k is in a set whose number has bit k.
-        axes: (64, 3, 3), whose columns span the plane of those joints and end with its normal.
-        spreads: (64,) [m], root mean square distance of the joints from their centre.
-        unknowns: (64,), 9 if they lie in that plane, so that two columns of R tell the third, else 12.
-        ranks: (64,), rank of the legs' equations in p and R.
-    """
-
-    base_joints: Array
-    platform_joints: Array
-    platform_numbers: NDArray[np.int64]
-    centers: Array
-    axes: Array
-    spreads: Array
-    unknowns: NDArray[np.int64]
-    ranks: NDArray[np.int64]
-
-
-class Scratch(NamedTuple):
-    """Memory for the closed forms, which allocate nothing."""
-
-    matrix: Array
-    right: Array
-    unknowns: Array
-    span: Array
-    norms: Array
-    order: Array
-    points: Array
-    selected: Array
-
-
-@kernel
-def scratch() -> Scratch:
-    """Memory for the closed forms."""
-    n = _ROTATION_EQUATIONS
-    return Scratch(
-        np.zeros((n, n)), np.zeros(n), np.zeros(n), np.zeros((1 + _MOST_FREE, 12)), np.zeros(n), np.zeros(n),
-        np.zeros((LEGS, 3)), np.zeros(LEGS),
-    )  # fmt: skip
+SCRATCH = np.dtype(
+    [
+        ("matrix", np.float64, (_ROTATION_EQUATIONS, _ROTATION_EQUATIONS)),
+        ("right", np.float64, _ROTATION_EQUATIONS),
+        ("unknowns", np.float64, _ROTATION_EQUATIONS),
+        ("span", np.float64, (1 + _MOST_FREE, 12)),
+        ("norms", np.float64, _ROTATION_EQUATIONS),
+        ("order", np.float64, _ROTATION_EQUATIONS),
+        ("points", np.float64, (LEGS, 3)),
+        ("selected", np.float64, LEGS),
+    ],
+    align=True,
+)
+"""Memory for the closed forms, which allocate nothing."""
 
 
 @lru_cache(maxsize=256)
-def geometry_of(mechanism: Mechanism) -> Geometry:
-    """What the closed forms need of a mechanism."""
+def geometry_of(mechanism: Mechanism) -> Record:
+    """What the closed forms need of a mechanism, a record of dtype `GEOMETRY`."""
+    geometry = np.zeros((), GEOMETRY)
     platform = mechanism.platform_joints
     apart = np.linalg.norm(platform[:, None] - platform, axis=2)
-    geometry = Geometry(
-        mechanism.base_joints.copy(), platform.copy(), np.argmax(apart < SAME_JOINT_M, axis=1), np.zeros((_SETS, 3)),
-        np.zeros((_SETS, 3, 3)), np.ones(_SETS), np.full(_SETS, 9), np.zeros(_SETS, np.int64),
-    )  # fmt: skip
-    for number, bits in enumerate(product((False, True), repeat=LEGS)):
-        legs = np.flatnonzero(bits[::-1])
-        if len(legs) == 0:
-            continue
+    geometry["base_joints"], geometry["platform_joints"] = mechanism.base_joints, platform
+    geometry["platform_numbers"] = numbers = np.argmax(apart < SAME_JOINT_M, axis=1)
+    geometry["spreads"], geometry["unknowns"] = 1.0, 9
+    for number in range(1, _SETS):
+        legs = [leg for leg in range(LEGS) if number >> leg & 1]
         center = platform[legs].mean(axis=0)
         _, spread, axes = np.linalg.svd(platform[legs] - center)
         axes[2] *= np.sign(np.linalg.det(axes))
         size = float(np.linalg.norm(spread))
-        geometry.centers[number], geometry.axes[number] = center, axes.T
+        geometry["centers"][number], geometry["axes"][number] = center, axes.T
         if size > SAME_JOINT_M:
-            geometry.spreads[number] = size / np.sqrt(len(legs))
+            geometry["spreads"][number] = size / np.sqrt(len(legs))
             if len(spread) == 3 and spread[2] > FLATNESS * spread[0]:
-                geometry.unknowns[number] = 12
+                geometry["unknowns"][number] = 12
         # A joint is a point as soon as two of its legs are known.
-        shared = np.bincount(geometry.platform_numbers[legs])
-        geometry.ranks[number] = min(_LINEAR_RANK, int(np.minimum(2 * shared, 3).sum()))
-    return geometry
+        geometry["ranks"][number] = min(_LINEAR_RANK, int(np.minimum(2 * np.bincount(numbers[legs]), 3).sum()))
+    return geometry[()]
+
+
+def new_scratch() -> Record:
+    """A record of dtype `SCRATCH`."""
+    return np.zeros((), SCRATCH)[()]
 
 
 @kernel
@@ -168,7 +156,7 @@ def rotation_between(from_vector: Array, to_vector: Array, rotation: Array) -> N
 
 
 @kernel
-def meeting_point(origins: Array, directions: Array, selected: Array, point: Array, scratch: Scratch) -> float:
+def meeting_point(origins: Array, directions: Array, selected: Array, point: Array, scratch: Record) -> float:
     """The point (3,) nearest to the selected ones of six lines, by QR (the paper's (8) and (25)-(28))."""
     matrix, right = scratch.matrix, scratch.right
     rows = 0
@@ -184,12 +172,12 @@ def meeting_point(origins: Array, directions: Array, selected: Array, point: Arr
         rows += 2
     if rows < 4:
         return 0.0
-    return solve_least_squares(matrix[:rows, :3], right[:rows], point, scratch.norms, scratch.order)
+    return solve_least_squares(matrix, right, rows, point, scratch.norms, scratch.order)
 
 
 @kernel
 def pose_from_rotation(
-    geometry: Geometry, directions: Array, measured: Array, rotation: Array, position: Array, scratch: Scratch
+    geometry: Record, directions: Array, measured: Array, rotation: Array, position: Array, scratch: Record
 ) -> float:
     """Position from the rotation and two or more legs (the paper's section 5)."""
     for k in range(LEGS):
@@ -202,8 +190,8 @@ def pose_from_rotation(
 
 @kernel
 def pose_from_vector(
-    geometry: Geometry, directions: Array, measured: Array, in_base: Array, in_platform: Array, position: Array,
-    rotation: Array, scratch: Scratch,
+    geometry: Record, directions: Array, measured: Array, in_base: Array, in_platform: Array, position: Array,
+    rotation: Array, scratch: Record,
 ) -> float:  # fmt: skip
     """Pose from one vector known in both frames, and three or more legs that end in two platform joints or more."""
     rotation_between(in_platform, in_base, rotation)
@@ -238,7 +226,7 @@ def pose_from_vector(
         return 0.0
     if _from_one_base_joint(geometry.base_joints, measured):
         return _pose_to_scale(geometry, directions, measured, rows, in_base, in_platform, position, rotation, scratch)
-    conditioning = solve_least_squares(matrix[:rows, :5], right[:rows], unknowns[:5], scratch.norms, scratch.order)
+    conditioning = solve_least_squares(matrix, right, rows, unknowns[:5], scratch.norms, scratch.order)
     if conditioning < RANK_TOLERANCE or not _turn(rotation, in_base, scale * unknowns[3], scale * unknowns[4]):
         return 0.0
     if pose_from_rotation(geometry, directions, measured, rotation, position, scratch) < RANK_TOLERANCE:
@@ -262,8 +250,8 @@ def _from_one_base_joint(base_joints: Array, measured: Array) -> bool:
 
 @kernel
 def _pose_to_scale(
-    geometry: Geometry, directions: Array, measured: Array, rows: int, in_base: Array, in_platform: Array, position: Array,
-    rotation: Array, scratch: Scratch,
+    geometry: Record, directions: Array, measured: Array, rows: int, in_base: Array, in_platform: Array, position: Array,
+    rotation: Array, scratch: Record,
 ) -> float:  # fmt: skip
     """Pose from the system of `pose_from_vector` less its last pivot: `cos^2 + sin^2 = 1`, with two roots, stands in for it.
 
@@ -271,9 +259,7 @@ def _pose_to_scale(
     in that joint fits too: lengths are positive at one root only, or else the equations left out tell the roots apart.
     """
     matrix, right, span = scratch.matrix, scratch.right, scratch.span
-    conditioning = solve_truncated(
-        matrix[:rows, :5], right[:rows], 4, span[0, :5], span[1:2, :5], scratch.norms, scratch.order
-    )  # fmt: skip
+    conditioning = solve_truncated(matrix, right, rows, 4, span[0, :5], span[1:, :5], scratch.norms, scratch.order)
     if conditioning < RANK_TOLERANCE:
         return 0.0
     scale = 1.0 / geometry.spreads[set_number(measured)]
@@ -299,7 +285,7 @@ def _pose_to_scale(
 
 
 @kernel
-def _total_length(directions: Array, measured: Array, position: Array, scratch: Scratch) -> float:
+def _total_length(directions: Array, measured: Array, position: Array, scratch: Record) -> float:
     """Sum of the measured legs' lengths along their directions, after `pose_from_rotation`."""
     total = 0.0
     for k in range(LEGS):
@@ -328,7 +314,7 @@ def _turn(rotation: Array, axis: Array, cosine: float, sine: float) -> bool:
 
 @kernel
 def pose_from_legs(
-    geometry: Geometry, directions: Array, measured: Array, position: Array, rotation: Array, scratch: Scratch
+    geometry: Record, directions: Array, measured: Array, position: Array, rotation: Array, scratch: Record
 ) -> float:
     """Pose from leg directions alone, four legs or more."""
     matrix, right, span = scratch.matrix, scratch.right, scratch.span
@@ -358,7 +344,7 @@ def pose_from_legs(
         rows += 2
     span[:] = 0.0
     conditioning = solve_truncated(
-        matrix[:rows, :unknowns], right[:rows], rank, span[0, :unknowns], span[1:, :unknowns], scratch.norms, scratch.order
+        matrix, right, rows, rank, span[0, :unknowns], span[1:, :unknowns], scratch.norms, scratch.order
     )  # fmt: skip
     if conditioning < RANK_TOLERANCE:
         return conditioning
@@ -385,7 +371,7 @@ def pose_from_legs(
 
 
 @kernel
-def _settle_rotation(free: int, equations: int, scratch: Scratch) -> float:
+def _settle_rotation(free: int, equations: int, scratch: Record) -> float:
     """Find the rotation among `span[0, 3:] + sum of t_i span[i, 3:]`, i = 1..free, and write it to the former.
 
     Linear in the parameters t and their products, of which there are `free (free + 3) / 2` together.
@@ -421,9 +407,7 @@ def _settle_rotation(free: int, equations: int, scratch: Scratch) -> float:
         for j in range(i, free + 1):
             _write_equations(span[i, 3:], span[j, 3:], 1.0 if i == j else 2.0, 0.0, 0.0, equations, matrix[:, column])
             column += 1
-    conditioning = solve_least_squares(
-        matrix[:equations, :column], right[:equations], unknowns[:column], scratch.norms, scratch.order
-    )
+    conditioning = solve_least_squares(matrix, right, equations, unknowns[:column], scratch.norms, scratch.order)
     if conditioning >= RANK_TOLERANCE:
         for i in range(1, free + 1):
             for e in range(3, 12):

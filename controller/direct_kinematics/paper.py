@@ -7,16 +7,16 @@ through its arccosines. Lines that do not meet count where they are nearest to e
 
 import numpy as np
 
-from controller.direct_kinematics.closed_forms import Geometry, Scratch, meeting_point, rotation_between, set_number
+from controller.direct_kinematics.closed_forms import meeting_point, rotation_between, set_number
 from controller.least_squares import RANK_TOLERANCE
-from plant.compiled import kernel
+from plant.compiled import Record, kernel
 from plant.mechanism import LEGS
 from plant.pose import Array
 
 
 @kernel
 def section_3_1_1(
-    geometry: Geometry, directions: Array, measured: Array, position: Array, rotation: Array, scratch: Scratch
+    geometry: Record, directions: Array, measured: Array, position: Array, rotation: Array, scratch: Record
 ) -> float:
     """Pose of an n-3-I mechanism from its leg directions: three pairs of lines meet in the three platform joints.
 
@@ -52,8 +52,8 @@ def section_3_1_1(
 
 @kernel
 def section_4(
-    geometry: Geometry, directions: Array, measured: Array, normal: Array, e_z: Array, position: Array, rotation: Array,
-    scratch: Scratch,
+    geometry: Record, directions: Array, measured: Array, normal: Array, e_z: Array, position: Array, rotation: Array,
+    scratch: Record,
 ) -> float:  # fmt: skip
     """Pose from the platform's normal in {1}: two legs or more meet in a joint, further legs cut the plane through it.
 
@@ -110,7 +110,7 @@ def section_4(
 
 
 @kernel
-def _select(geometry: Geometry, measured: Array, joint: int, selected: Array) -> int:
+def _select(geometry: Record, measured: Array, joint: int, selected: Array) -> int:
     """Select the measured legs of a platform joint; returns how many there are."""
     count = 0
     for k in range(LEGS):
@@ -142,7 +142,7 @@ def _triad(points: Array, axes: Array) -> float:
 
 
 @kernel
-def _place(geometry: Geometry, leg: int, joint: Array, rotation: Array, position: Array) -> None:
+def _place(geometry: Record, leg: int, joint: Array, rotation: Array, position: Array) -> None:
     """Position of the platform from that of a leg's platform joint in {1} (13)."""
     a = geometry.platform_joints[leg]
     for i in range(3):

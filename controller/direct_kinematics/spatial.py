@@ -15,19 +15,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controller.direct_kinematics.closed_forms import (
-    Geometry,
     geometry_of,
+    new_scratch,
     orthonormalise,
     pose_from_legs,
     pose_from_rotation,
     pose_from_vector,
-    scratch,
 )
 from controller.direct_kinematics.paper import section_3_1_1, section_4
 from controller.direct_kinematics.refinement import normal_equations, refine_pose
 from controller.inverse_kinematics import legs_at
-from controller.least_squares import factor_cholesky, solve_cholesky
-from plant.compiled import kernel
+from controller.least_squares import factor_cholesky, invert_cholesky
+from plant.compiled import Record, kernel
 from plant.errors import GoughError, InputError, SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import UNIT_TOLERANCE, Array, Pose, numbers, rotation_angle, rotation_from_vector
@@ -287,13 +286,18 @@ def _solve(
         np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count), np.empty(count, np.int64),
         np.empty(count, np.int64),
     )  # fmt: skip
-    arguments = (geometry_of(mechanism), measurements, candidates, refine, results)
+
+    def solve_chunk(start: int) -> None:
+        stop = min(start + _CHUNK, count)
+        _solve_rows(geometry_of(mechanism), new_scratch(), measurements, candidates, refine, results, start, stop)
+
     starts = range(0, count, _CHUNK)
     if workers == 1 or len(starts) <= 1:
-        _solve_rows(*arguments, 0, count)
+        for start in starts:
+            solve_chunk(start)
     else:
         with ThreadPoolExecutor(workers) as pool:
-            list(pool.map(lambda start: _solve_rows(*arguments, start, min(start + _CHUNK, count)), starts))
+            list(pool.map(solve_chunk, starts))
     errors = {
         int(row): _error(mechanism, arrays, method, int(results.statuses[row]), int(row), int(results.legs[row]), where)
         for row in np.flatnonzero(results.statuses != _SOLVED)
@@ -375,17 +379,16 @@ def _remedy(arrays: dict[str, Array], method: str) -> str:
 
 @kernel
 def _solve_rows(
-    geometry: Geometry, measurements: _Measurements, candidates: NDArray[np.int64], refine: bool, results: _Results, start: int,
-    stop: int,
+    geometry: Record, scratch: Record, measurements: _Measurements, candidates: NDArray[np.int64], refine: bool,
+    results: _Results, start: int, stop: int,
 ) -> None:  # fmt: skip
     """Solve the rows from `start` to `stop`; a row without a pose is filled with NaN and says why in its status."""
-    memory = scratch()
     directions, measured, weights = np.empty((LEGS, 3)), np.empty(LEGS), np.empty(LEGS)
     rotation, found_position, found_rotation = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     in_base, in_platform, vector_weights = np.empty((5, 3)), np.empty((5, 3)), np.empty(5)
     e_z = np.array([0.0, 0.0, 1.0])
     arms, predicted, lengths = np.empty((LEGS, 3)), np.empty((LEGS, 3)), np.empty(LEGS)
-    information, factor, correction, unit = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty(6)
+    information, factor, correction = np.empty((6, 6)), np.empty((6, 6)), np.empty(6)
     for row in range(start, stop):
         position, attitude = results.positions[row], results.rotations[row]
         status, leg = _read_directions(measurements.directions[row], directions, measured)
@@ -422,19 +425,19 @@ def _solve_rows(
             for method in candidates:
                 if method == _SECTION_5:
                     found_rotation[:] = rotation
-                    conditioning = pose_from_rotation(geometry, directions, measured, found_rotation, found_position, memory)
+                    conditioning = pose_from_rotation(geometry, directions, measured, found_rotation, found_position, scratch)
                 elif method in (_UP, _NORMAL):
                     k = up if method == _UP else normal
                     conditioning = pose_from_vector(
-                        geometry, directions, measured, in_base[k], in_platform[k], found_position, found_rotation, memory
+                        geometry, directions, measured, in_base[k], in_platform[k], found_position, found_rotation, scratch
                     )
                 elif method == _LEGS:
-                    conditioning = pose_from_legs(geometry, directions, measured, found_position, found_rotation, memory)
+                    conditioning = pose_from_legs(geometry, directions, measured, found_position, found_rotation, scratch)
                 elif method == _SECTION_3_1_1:
-                    conditioning = section_3_1_1(geometry, directions, measured, found_position, found_rotation, memory)
+                    conditioning = section_3_1_1(geometry, directions, measured, found_position, found_rotation, scratch)
                 else:
                     conditioning = section_4(
-                        geometry, directions, measured, in_base[normal], e_z, found_position, found_rotation, memory
+                        geometry, directions, measured, in_base[normal], e_z, found_position, found_rotation, scratch
                     )
                 if conditioning > best:
                     best = conditioning
@@ -496,12 +499,7 @@ def _solve_rows(
             # A rotation counts three times as a vector, and a vector twice.
             rows += 2 * vectors if up < 3 else 2 * vectors - 3
             results.chi_squares[row], results.degrees_of_freedom[row] = chi_square, rows - 6
-            for j in range(6):
-                unit[:] = 0.0
-                unit[j] = 1.0
-                solve_cholesky(factor, unit)
-                for i in range(6):
-                    results.covariances[row, i, j] = unit[i]
+            invert_cholesky(factor, results.covariances[row])
         results.statuses[row] = status
         if status != _SOLVED:
             position[:] = np.nan

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from controller.direct_kinematics import pose_difference, pose_from_lengths, poses_from_lengths, solve
-from controller.direct_kinematics.closed_forms import geometry_of, pose_from_rotation, rotation_between, scratch
+from controller.direct_kinematics.closed_forms import geometry_of, new_scratch, pose_from_rotation, rotation_between
 from controller.inverse_kinematics import leg_lengths, sample_workspace
 from controller.least_squares import RANK_TOLERANCE
 from plant.errors import GoughError, InputError, SingularConfigurationError
@@ -605,7 +605,7 @@ def test_directions_off_unit_within_the_tolerance_are_normalised(hexapod):
 
 
 def test_the_kernels_report_what_they_cannot_solve_below_the_tolerance(hexapod):
-    geometry, memory, position = geometry_of(hexapod), scratch(), np.zeros(3)
+    geometry, memory, position = geometry_of(hexapod), new_scratch(), np.zeros(3)
     for broken in (np.nan, np.inf):
         directions = home_directions(hexapod)
         directions[3, 0] = broken

@@ -12,7 +12,7 @@ def solve(matrix, right):
     """The kernel with scratch, on copies, since it overwrites its arguments."""
     n = matrix.shape[1]
     solution = np.full(n, np.nan)
-    ratio = solve_least_squares(matrix.copy(), right.copy(), solution, np.zeros(n), np.zeros(n))
+    ratio = solve_least_squares(matrix.copy(), right.copy(), len(matrix), solution, np.zeros(n), np.zeros(n))
     return solution, ratio
 
 
@@ -102,7 +102,7 @@ def test_a_part_of_a_larger_scratch_array_gives_the_same_solution():
     scratch, long_right = np.full((12, 9), np.nan), np.full(12, np.nan)
     scratch[:10, :5], long_right[:10] = matrix, right
     solution, norms, order = np.zeros(9), np.zeros(9), np.zeros(9)
-    solve_least_squares(scratch[:10, :5], long_right[:10], solution[:5], norms, order)
+    solve_least_squares(scratch, long_right, 10, solution[:5], norms, order)
     np.testing.assert_allclose(solution[:5], np.linalg.lstsq(matrix, right, rcond=None)[0], rtol=1e-12, atol=1e-13)
 
 
