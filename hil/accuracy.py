@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.direct_kinematics import Requirement, Solutions, required_measurements, solve_batch, solve_planar
+from controller.direct_kinematics import Solutions, required_measurements, solve_batch, solve_planar
 from controller.direct_kinematics.monitor import chi_square_quantile
 from controller.direct_kinematics.spatial import LEG_SIGMA, NEEDS, TILT_SIGMA, YAW_SIGMA
 from plant.classification import (
@@ -248,18 +248,12 @@ def _evaluate_class(mechanism_class: MechanismClass, random: np.random.Generator
             away = np.linalg.norm(found.positions - positions, axis=1)
             angles = rotation_angle(np.where(found.solved[:, None, None], found.rotations, np.eye(3)), rotations)
             errors[estimator.label].append(np.stack([away, angles], axis=1)[found.solved])
-    needs = {need.method: _needs(need) for need in required_measurements(mechanism)}
+    needs = {need.method: need.text for need in required_measurements(mechanism)}
     medians = {label: tuple(np.median(np.concatenate(parts), axis=0).tolist()) for label, parts in errors.items()}
     return ClassAccuracy(
         mechanism_class.label, mechanism_class.drawing, paper_needs, medians["paper"], needs["legs"], medians["legs"],
         needs["up"], medians["up"],
     )  # fmt: skip
-
-
-def _needs(need: Requirement) -> str:
-    if need.any_choice == need.fewest:
-        return f"any {need.fewest} legs"
-    return f"{need.fewest} legs (some choices; any {need.any_choice})" if need.any_choice <= LEGS else f"{need.fewest} legs"
 
 
 def _evaluate_planar_class(mechanism_class: MechanismClass, random: np.random.Generator) -> ClassAccuracy:
@@ -289,21 +283,28 @@ def _evaluate_planar_class(mechanism_class: MechanismClass, random: np.random.Ge
     )  # fmt: skip
 
 
-def markdown(rows: Sequence[ClassAccuracy]) -> str:
-    """The needs and errors of the classes as a table in Markdown."""
+COLUMNS = (
+    "class", "graph", "the paper needs", "its error", "gough needs", "six legs alone", "or + vertical", "six legs + vertical",
+)  # fmt: skip
+"""What `cells` holds."""
+
+
+def cells(row: ClassAccuracy) -> tuple[str, ...]:
+    """The needs and errors of a class, in words."""
 
     def errors(pair: tuple[float, float]) -> str:
         return f"{1e3 * pair[0]:.2f} mm, {np.degrees(pair[1]):.3f} deg"
 
-    lines = [
-        "| class | graph | the paper needs | its error | gough needs | six legs alone | or + vertical | six legs + vertical |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    return (
+        row.label, row.drawing, row.paper_needs, errors(row.paper_errors), row.alone_needs, errors(row.alone_errors),
+        row.vertical_needs, errors(row.vertical_errors),
+    )  # fmt: skip
+
+
+def markdown(rows: Sequence[ClassAccuracy]) -> str:
+    """The needs and errors of the classes as a table in Markdown."""
+    lines = [COLUMNS, ("---",) * len(COLUMNS)]
     for row in rows:
-        drawing = f"`{row.drawing.replace('|', chr(92) + '|')}`"
-        cells = (
-            row.label, drawing, row.paper_needs, errors(row.paper_errors), row.alone_needs, errors(row.alone_errors),
-            row.vertical_needs, errors(row.vertical_errors),
-        )  # fmt: skip
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        label, drawing, *others = cells(row)
+        lines.append((label, f"`{drawing.replace('|', chr(92) + '|')}`", *others))
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -41,7 +41,7 @@ def measure_speed(target: str, duration: float, progress: Callable[[float], None
 
     Returns:
         `real_time_factor` (median, least, greatest), `filterpy_real_time_factor`, `filterpy_slowdown`, `cycle_us` and
-        `stages_us` (p50, p99, p999, max, n), and what they were measured on.
+        `stages_us` (p50, p99, p999, max, n).
 
     Raises:
         GoughError: as `simulate`.
@@ -68,9 +68,15 @@ def measure_speed(target: str, duration: float, progress: Callable[[float], None
         "stages_us": {name: _percentiles(column) for name, column in zip(STAGES, stages.T, strict=True)},
         "duration": duration,
         "target": target,
-        "version": version("gough"),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def machine() -> dict[str, str]:
+    """What figures are measured on: machine, date and version."""
+    return {
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "version": version("gough"),
     }
 
 

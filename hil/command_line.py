@@ -45,6 +45,10 @@ def _parser() -> argparse.ArgumentParser:
     _add_tune(commands)
     _add_fmu(commands)
     _add_bench(commands)
+    _add_classify(commands)
+    _add_accuracy(commands)
+    _add_classes(commands)
+    _add_planar(commands)
     return parser
 
 
@@ -100,13 +104,72 @@ def _add_bench(commands: Any) -> None:
     command = commands.add_parser(
         "bench",
         help="measure speed",
-        description="Measure the loop's speed against real time, and the microseconds of each stage.",
+        description="Measure the loop's speed against real time and the microseconds of each stage, and direct kinematics: "
+        "microseconds per pose, against Newton's method from lengths, and whether both find the pose from cold.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     command.add_argument("--duration", type=float, default=60.0, help="of the simulated motion [s]")
     command.add_argument("--target", default="sines", help="motion or CSV file")
+    command.add_argument("--only", choices=("loop", "kinematics"), help="one section instead of both")
     _add_json(command)
     command.set_defaults(run=_bench)
+
+
+def _add_classify(commands: Any) -> None:
+    command = commands.add_parser(
+        "classify",
+        help="what class a mechanism is of, and which sensors it needs",
+        description="Tell the combinatorial class of a mechanism, and for each method of direct kinematics which sensors it "
+        "needs, whether its pose is unique, and its conditioning (1 is best, 0 singular) at home and at worst.",
+    )
+    command.add_argument("mechanism", metavar="PRESET|FILE.toml", help="preset, or a TOML file")
+    command.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with drawings")
+    _add_json(command)
+    command.set_defaults(run=_classify)
+
+
+def _add_accuracy(commands: Any) -> None:
+    command = commands.add_parser(
+        "accuracy",
+        help="errors of direct kinematics at a given noise",
+        description="Errors of the paper's algorithms and of all legs together, at random poses about home (50 mm, 15 deg on "
+        "hexapod), for noise of 0.05 deg on legs, roll and pitch, and 1.5 deg on a magnetic yaw.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("--mechanism", default="hexapod", help="preset, or a TOML file")
+    command.add_argument("--poses", type=int, default=2000, help="number of random poses")
+    command.add_argument("--seed", type=int, default=0, help="of poses and noise")
+    _add_json(command)
+    command.set_defaults(run=_accuracy)
+
+
+def _add_classes(commands: Any) -> None:
+    command = commands.add_parser(
+        "classes",
+        help="what every class of mechanism needs, and the errors",
+        description="For each of the 60 spatial and 4 planar classes: what the paper needs, what gough needs, and the median "
+        "errors of each over random mechanisms and poses, for the noise of 'gough accuracy'.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("--seed", type=int, default=0, help="of mechanisms, poses and noise")
+    command.add_argument("--markdown", action="store_true", help="print the table in Markdown, as docs/classes.md has it")
+    _add_json(command)
+    command.set_defaults(run=_classes)
+
+
+def _add_planar(commands: Any) -> None:
+    command = commands.add_parser(
+        "planar",
+        help="poses of a real planar rig from its measured leg angles",
+        description="Solve the measured leg angles of a planar rig at known static poses, given in files pose_*.csv with the true "
+        "pose in the first line. Prints the errors of the assembly mode that is nearest to the true pose.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("folder", type=Path, metavar="FOLDER", help="with the files pose_*.csv")
+    command.add_argument("--mechanism", default="planar-3rpr", help="preset, or a TOML file")
+    command.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots")
+    _add_json(command)
+    command.set_defaults(run=_planar)
 
 
 def _add_json(command: argparse.ArgumentParser) -> None:
@@ -198,12 +261,25 @@ def _build_fmu(options: argparse.Namespace) -> int:
 
 
 def _bench(options: argparse.Namespace) -> int:
-    from hil.bench import measure_speed
+    from hil.bench import machine, measure_speed
+    from hil.kinematics_bench import measure_kinematics
 
     _check_writable(options.json)
-    with _progress("bench") as progress:
-        figures = measure_speed(options.target, options.duration, progress)
+    figures: dict[str, Any] = machine()
+    if options.only != "kinematics":
+        with _progress("the loop") as progress:
+            figures |= measure_speed(options.target, options.duration, progress)
+        _print_speed(figures)
+    if options.only != "loop":
+        with _progress("direct kinematics") as progress:
+            figures["kinematics"] = measure_kinematics(progress)
+        _print_kinematics(figures["kinematics"])
     _write_json(options.json, figures)
+    print(f"{figures['machine']}, {figures['date']}, gough {figures['version']}")
+    return 0
+
+
+def _print_speed(figures: dict[str, Any]) -> None:
     table = _table("stage", "p50 [us]", "p99 [us]", "p99.9 [us]")
     for label, percentiles in (*figures["stages_us"].items(), ("whole cycle", figures["cycle_us"])):
         table.add_row(label, *(f"{percentiles[key]:.2f}" for key in ("p50", "p99", "p999")))
@@ -213,7 +289,137 @@ def _bench(options: argparse.Namespace) -> int:
         f"{factor['median']:.1f} times real time ({factor['least']:.1f} to {factor['greatest']:.1f}); "
         f"with filterpy {figures['filterpy_real_time_factor']:.2f}, {figures['filterpy_slowdown']:.0f} times slower"
     )
-    print(f"{figures['machine']}, {figures['date']}, gough {figures['version']}")
+
+
+def _print_kinematics(figures: dict[str, Any]) -> None:
+    from statistics import median
+
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for label, methods in figures["solve_us"].items():
+        groups.setdefault(label.rpartition(".")[0], []).append(methods)
+    groups["hexapod"] = [figures["hexapod_us"]]
+    names = list(dict.fromkeys(name for methods in groups.values() for name in methods[0]))
+    table = _table("us, closed / refined", *names)
+    for group, measured in groups.items():
+        cells = []
+        for name in names:
+            times = [methods[name] for methods in measured if name in methods]
+            kinds = [[time[kind] for time in times] for kind in ("closed_form", "refined")]
+            cells.append(" / ".join(f"{median(values):.2f}" for values in kinds) if times else "-")
+        table.add_row(group, *cells)
+    newton = figures["newton"]
+    ratios = [newton["ratios"][name] for name in names if name in newton["ratios"]]
+    known = [name for name in names if name in newton["ratios"]]
+    over = dict(zip(known, (f"{ratio['closed_form']:.1f} / {ratio['refined']:.1f}" for ratio in ratios), strict=True))
+    table.add_row("hexapod, over Newton", *(over.get(name, "-") for name in names))
+    _print(table)
+    rates = ", ".join(f"{name} {rate / 1e3:.0f}" for name, rate in figures["batch_per_s"].items())
+    print(f"refined poses per second on all cores [thousands]: {rates}; one call from Python {figures['call_us']:.0f} us")
+    print(f"Newton's method from lengths, warm: {newton['warm_us']:.2f} us per pose")
+    table = _table("cold starts [%]", "found by Newton", "mistaken", "found from directions", "mistaken")
+    for preset, ranges in figures["cold_starts"].items():
+        for where, rates in ranges.items():
+            shares = [rates[kind][key] for kind in ("newton", "directions") for key in ("success", "wrong")]
+            table.add_row(f"{preset}, {where}", *(f"{100.0 * share:.1f}" for share in shares))
+    _print(table)
+
+
+def _classify(options: argparse.Namespace) -> int:
+    from hil.classification import PAPER, describe, write_report
+    from plant.mechanism import load_mechanism
+
+    _check_writable(options.json, options.report)
+    description = describe(load_mechanism(options.mechanism))
+    _write_json(options.json, description.summary())
+    if options.report:
+        write_report(description, options.report)
+    mechanism_class = description.mechanism_class
+    print(f"{description.mechanism.name}: class {mechanism_class.label}, a {mechanism_class.name} with the graph")
+    print(f"  {mechanism_class.drawing}")
+    table = _table("method", "needs", "section", "poses", "conditioning: home", "worst")
+    for need in description.needs:
+        method = need.requirement.method
+        modes = "unique" if need.modes == 1 else f"{need.modes} modes"
+        row = (need.requirement.text, PAPER.get(method, "beyond"), modes, f"{need.home:.2g}", f"{need.worst:.2g}")
+        table.add_row(method, *row)
+    _print(table)
+    print(f"Worst over {description.where}. Sections are the paper's.")
+    return 0
+
+
+def _accuracy(options: argparse.Namespace) -> int:
+    from hil.accuracy import evaluate_accuracy
+    from plant.mechanism import load_spatial
+
+    _check_writable(options.json)
+    accuracy = evaluate_accuracy(load_spatial(options.mechanism), options.poses, options.seed)
+    _write_json(options.json, accuracy.summary())
+    table = _table("RMS errors", "position [mm]", "rotation [deg]", "over the bound", "NEES", "solved [%]")
+    for estimator, errors in accuracy.errors.items():
+        table.add_row(
+            estimator.label,
+            f"{1e3 * errors.position_rms:.3f}",
+            f"{57.29577951308232 * errors.rotation_rms:.3f}",
+            f"{errors.position_over_bound:.3f}, {errors.rotation_over_bound:.3f}",
+            f"{errors.nees:.2f}" if estimator.refine else "-",
+            f"{100.0 * errors.solved:.1f}",
+        )
+    _print(table)
+    least, greatest = accuracy.nees_bounds
+    print(
+        f"{accuracy.mechanism}, class {accuracy.mechanism_class.label}, {accuracy.poses} poses; the bound is Cramer and Rao's; "
+        f"NEES is 6 on average, {least:.2f} to {greatest:.2f} in 99 % of such runs, if the covariance is right"
+    )
+    return 0
+
+
+def _classes(options: argparse.Namespace) -> int:
+    from dataclasses import asdict
+
+    from hil.accuracy import COLUMNS, cells, evaluate_classes, markdown
+
+    _check_writable(options.json)
+    with _progress("classes") as progress:
+        rows = evaluate_classes(options.seed, progress)
+    _write_json(options.json, {"seed": options.seed, "version": version("gough"), "classes": [asdict(row) for row in rows]})
+    if options.markdown:
+        print(markdown(rows))
+        return 0
+    table = _table(*COLUMNS)
+    for row in rows:
+        table.add_row(*cells(row))
+    _print(table)
+    return 0
+
+
+def _planar(options: argparse.Namespace) -> int:
+    from hil.planar_rig import evaluate, write_report
+    from plant.mechanism import load_mechanism
+    from plant.planar import PlanarMechanism
+
+    _check_writable(options.json, options.report)
+    mechanism = load_mechanism(options.mechanism)
+    if not isinstance(mechanism, PlanarMechanism):
+        raise InputError(f"{options.mechanism} has six legs in space; this needs three in the plane: choose another mechanism")
+    result = evaluate(options.folder, mechanism)
+    summary = result.summary()
+    _write_json(options.json, summary)
+    if options.report:
+        write_report(result, options.report)
+    table = _table(
+        "RMS of the poses' mean errors", "x [mm]", "y [mm]", "angle [deg]", "leg angles [deg]", "true pose is a mode"
+    )
+    for source, figures in summary["sources"].items():
+        rms = figures["rms"]
+        table.add_row(
+            source,
+            f"{1e3 * rms['x']:.2f}",
+            f"{1e3 * rms['y']:.2f}",
+            f"{57.29577951308232 * rms['angle']:.2f}",
+            f"{57.29577951308232 * figures['leg_angles']['constant_error']:.2f}",
+            f"{figures['true_mode']['poses']} of {len(result.poses)} poses",
+        )
+    _print(table)
     return 0
 
 

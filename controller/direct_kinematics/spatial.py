@@ -576,7 +576,7 @@ class Requirement:
         platform: what it needs of the platform: "nothing", "up_in_platform", "normal" or "rotation".
         fewest: the least number of legs with which the method gives the pose.
         choices: the sets of so many legs that will do; no leg can be left out of one.
-        any_choice: the least number of legs with which every choice will do, or None if not even all legs will.
+        any_choice: the least number of legs with which every choice will do.
     """
 
     method: str
@@ -584,6 +584,17 @@ class Requirement:
     fewest: int
     choices: tuple[tuple[int, ...], ...]
     any_choice: int
+
+    @property
+    def text(self) -> str:
+        """The legs and what else is needed, in words."""
+        if len(self.choices) == 1:
+            legs = f"{self.fewest} legs"
+        elif self.any_choice == self.fewest:
+            legs = f"any {self.fewest} legs"
+        else:
+            legs = f"{self.fewest} legs, {len(self.choices)} choices"
+        return legs if self.platform == "nothing" else f"{legs} + {self.platform}"
 
 
 _TRIAL_POSES = 8
