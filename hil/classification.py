@@ -29,7 +29,7 @@ from hil.page import (
     segment_colors,
     segments,
 )  # fmt: skip
-from plant.classification import MechanismClass, classify, joint_numbers, layout
+from plant.classification import MechanismClass, canonical_legs, classify, joint_numbers, layout
 from plant.errors import SingularConfigurationError
 from plant.files import write_whole
 from plant.mechanism import Mechanism
@@ -174,7 +174,13 @@ def write_report(description: Description, path: Path) -> None:
         f"joints · graph {escape(mechanism_class.drawing)} · gough {version('gough')}"
     )
     view = _planar_view(mechanism) if isinstance(mechanism, PlanarMechanism) else _spatial_view(mechanism)
-    graph = figure_html("graph", "Graph of the legs", "Platform joints above, base joints below.", _graph(description), "view")
+    graph = figure_html(
+        "graph",
+        "Graph of the legs",
+        "Platform joints above, base joints below; legs in the colours of the mechanism.",
+        _graph(description),
+        "view",
+    )
     drawn = figure_html("mechanism", "The mechanism", "At home, in mm.", view, "view")
     spread = figure_html(
         "conditioning",
@@ -209,13 +215,12 @@ def _claim(need: Need) -> str:
 
 
 def _graph(description: Description) -> go.Figure:
-    mechanism_class = description.mechanism_class
-    base, platform = layout(mechanism_class)
+    base, platform = layout(description.mechanism_class)
     figure = go.Figure()
-    for number, (lower, upper) in enumerate(mechanism_class.legs):
+    for number, (lower, upper) in enumerate(canonical_legs(description.mechanism)):
         figure.add_scatter(
-            x=[base[lower], platform[upper]], y=[0.0, 1.0], mode="lines", showlegend=False, hoverinfo="skip",
-            line={"color": COLORS[LEG_NAMES[number]], "width": 4},
+            x=[base[lower], platform[upper]], y=[0.0, 1.0], mode="lines", showlegend=False, name=LEG_NAMES[number],
+            hoverinfo="name", line={"color": COLORS[LEG_NAMES[number]], "width": 4},
         )  # fmt: skip
     for x, y, name in ((base, 0.0, "base joint"), (platform, 1.0, "platform joint")):
         figure.add_scatter(

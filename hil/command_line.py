@@ -161,8 +161,8 @@ def _add_planar(commands: Any) -> None:
     command = commands.add_parser(
         "planar",
         help="poses of a real planar rig from its measured leg angles",
-        description="Solve the measured leg angles of a planar rig at known static poses, given in files pose_*.csv with the true "
-        "pose in the first line. Prints the errors of the assembly mode that is nearest to the true pose.",
+        description="Solve the measured leg angles of a planar rig at known static poses, given in files pose_*.csv with the "
+        "true pose in the first line. Prints the errors of the assembly mode that is nearest to the true pose.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     command.add_argument("folder", type=Path, metavar="FOLDER", help="with the files pose_*.csv")

@@ -139,6 +139,7 @@ dd.bad { color: #c02f3f; }
 dt { color: var(--faint); font-size: 13px; }
 figure { margin: 0; min-width: 0; }
 figure.time { margin-top: 32px; border-top: 1px solid var(--line); padding-top: 18px; }
+table + figure { margin-top: 22px; }
 figcaption { color: var(--faint); font-size: 13px; }
 @media (max-width: 960px) { .overview { grid-template-columns: 1fr; } }
 """

@@ -163,11 +163,26 @@ def classify(mechanism: Jointed) -> MechanismClass:
         InputError: joints of the wrong shape or not finite, two legs that share both joints, a joint of more than three
             legs, or too few joints.
     """
-    base = joint_numbers(mechanism.base_joints, "base_joints")
-    platform = joint_numbers(mechanism.platform_joints, "platform_joints")
-    if len(base) != len(platform):
-        raise InputError(f"{len(base)} legs start in base_joints and {len(platform)} end in platform_joints: give as many")
-    return MechanismClass(tuple(zip(base.tolist(), platform.tolist(), strict=True)))
+    return MechanismClass(_legs(mechanism))
+
+
+def canonical_legs(mechanism: Jointed) -> Legs:
+    """The joints of each leg of a mechanism, in the order of its legs and the numbers of its class.
+
+    Raises:
+        InputError: as `classify`.
+    """
+    own = _legs(mechanism)
+    bases, platforms = zip(*own, strict=True)
+
+    def same(legs: Legs) -> bool:
+        pairs = (
+            set(zip(mine, theirs, strict=True))
+            for mine, theirs in zip((bases, platforms), zip(*legs, strict=True), strict=True)
+        )
+        return [len(pair) for pair in pairs] == [len(set(bases)), len(set(platforms))]
+
+    return next(legs for legs in permutations(MechanismClass(own).legs) if same(legs))
 
 
 @cache
@@ -256,6 +271,14 @@ def layout(mechanism_class: MechanismClass) -> tuple[Array, Array]:
         left += width
     base, platform = ([x[joint] for joint in sorted(x) if joint[0] == side] for side in ("base", "platform"))
     return np.array(base), np.array(platform)
+
+
+def _legs(mechanism: Jointed) -> Legs:
+    base = joint_numbers(mechanism.base_joints, "base_joints")
+    platform = joint_numbers(mechanism.platform_joints, "platform_joints")
+    if len(base) != len(platform):
+        raise InputError(f"{len(base)} legs start in base_joints and {len(platform)} end in platform_joints: give as many")
+    return tuple(zip(base.tolist(), platform.tolist(), strict=True))
 
 
 def _check(legs: Legs) -> None:

@@ -14,8 +14,10 @@ from hypothesis import strategies as st
 from plant.classification import (
     Legs,
     MechanismClass,
+    canonical_legs,
     classify,
     draw_mechanism,
+    draw_planar_mechanism,
     joint_numbers,
     layout,
     planar_classes,
@@ -319,3 +321,22 @@ def test_another_number_of_legs_is_refused() -> None:
 def test_a_planar_class_is_not_drawn_in_space() -> None:
     with pytest.raises(InputError, match=r"planar n-2\.1 has three legs in the plane; draw one of the spatial classes"):
         draw_mechanism(PLANAR[0], np.random.default_rng(0))
+
+
+@spatial_class
+def test_each_leg_is_found_again_in_the_numbers_of_the_class(each: MechanismClass) -> None:
+    mechanism = draw_mechanism(each, np.random.default_rng(3))
+    legs = canonical_legs(mechanism)
+    assert sorted(legs) == list(each.legs)
+    for side, joints in ((0, mechanism.base_joints), (1, mechanism.platform_joints)):
+        numbers = [leg[side] for leg in legs]
+        for k, other in product(range(6), repeat=2):
+            assert (numbers[k] == numbers[other]) == (np.linalg.norm(joints[k] - joints[other]) < 1e-9)
+
+
+def test_planar_mechanisms_are_drawn_in_every_planar_class_and_no_other() -> None:
+    random = np.random.default_rng(4)
+    for each in PLANAR:
+        assert classify(draw_planar_mechanism(each, random)) == each
+    with pytest.raises(InputError, match="six legs"):
+        draw_planar_mechanism(SPATIAL[0], random)
