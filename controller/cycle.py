@@ -11,7 +11,7 @@ from collections.abc import Collection
 import numpy as np
 
 from controller.direct_kinematics.closed_forms import GEOMETRY, SCRATCH, geometry_of, pose_from_legs, pose_from_vector
-from controller.direct_kinematics.refinement import find_twist, refine_pose
+from controller.direct_kinematics.refinement import find_twist, move_pose, normal_equations, solve_normal_equations
 from controller.inverse_kinematics import jacobian_at, legs_at, sample_workspace
 from controller.least_squares import RANK_TOLERANCE, solve_least_squares
 from controller.leg_filter import leg_direction, predict_leg, start_leg, update_leg
@@ -359,7 +359,7 @@ def find_pose(parameters: Record, state: Record) -> float:
             p.geometry, s.directions, p.leg_used, p.up_in_base[0], s.vertical[0], s.position, s.rotation, s.scratch
         )
     else:
-        s.conditioning = pose_from_legs(p.geometry, s.directions, p.leg_used, s.position, s.rotation, s.scratch)
+        s.conditioning = pose_from_legs(p.geometry, s.directions, p.leg_used, 0, s.position, s.rotation, s.scratch)
     return float(s.conditioning)
 
 
@@ -369,11 +369,13 @@ def improve_pose(parameters: Record, state: Record) -> bool:
     p, s = parameters[()], state[()]
     factor = s.matrices_6_6[0]
     for _ in range(2):
-        if not refine_pose(
+        normal_equations(
             p.geometry.base_joints, p.geometry.platform_joints, s.directions, p.leg_weights, p.up_in_base, s.vertical,
-            p.vertical_weight, s.position, s.rotation, s.arms, s.predicted, s.lengths, s.information, s.vectors_6[0], factor,
-        ):  # fmt: skip
+            p.vertical_weight, s.position, s.rotation, s.arms, s.predicted, s.lengths, s.information, s.vectors_6[0],
+        )  # fmt: skip
+        if not solve_normal_equations(s.information, s.vectors_6[0], factor):
             return False
+        move_pose(s.vectors_6[0], s.position, s.rotation)
     for i in range(3):
         s.angular_velocity[i] = 0.0
         for j in range(3):

@@ -34,6 +34,7 @@ _SETS = 1 << LEGS
 _MOST_FREE = 5
 _ROTATION_EQUATIONS = 20
 _COLUMN_EQUATIONS = 3
+_COLUMN_STEPS = 5
 _MOST_POLAR_STEPS = 30
 _POLAR_TOLERANCE = 1e-18
 """Square of the last step; what is left is its square."""
@@ -72,10 +73,11 @@ SCRATCH = np.dtype(
         ("order", np.float64, _ROTATION_EQUATIONS),
         ("points", np.float64, (LEGS, 3)),
         ("selected", np.float64, LEGS),
+        ("misfit", np.float64),
     ],
     align=True,
 )
-"""Memory for the closed forms, which allocate nothing."""
+"""Memory for the closed forms, which allocate nothing; `misfit` is how far from a rotation `pose_from_legs` came out."""
 
 
 @lru_cache(maxsize=256)
@@ -314,9 +316,9 @@ def _turn(rotation: Array, axis: Array, cosine: float, sine: float) -> bool:
 
 @kernel
 def pose_from_legs(
-    geometry: Record, directions: Array, measured: Array, position: Array, rotation: Array, scratch: Record
+    geometry: Record, directions: Array, measured: Array, root: int, position: Array, rotation: Array, scratch: Record
 ) -> float:
-    """Pose from leg directions alone, four legs or more."""
+    """Pose from leg directions alone, four legs or more; `root` is 0, or 1 for the second best if `has_two_roots`."""
     matrix, right, span = scratch.matrix, scratch.right, scratch.span
     legs = set_number(measured)
     center, axes, scale = geometry.centers[legs], geometry.axes[legs], 1.0 / geometry.spreads[legs]
@@ -352,15 +354,18 @@ def pose_from_legs(
     for i in range(9):
         columns[i] *= scale
     if free > 0:
-        equations = _COLUMN_EQUATIONS if flat and free == 1 else _ROTATION_EQUATIONS
-        if flat and equations == _ROTATION_EQUATIONS:
+        if flat and free > 1:
             for i in range(3):
                 span[1 + free + i, 9 + i] = 1.0
             free += 3
-        conditioning = min(conditioning, _settle_rotation(free, equations, scratch))
+        if not _orthonormalise_span(free, span):
+            return 0.0
+        settled = _settle_columns(root, scratch) if free == 1 else _settle_rotation(free, scratch)
+        conditioning = min(conditioning, settled)
         if conditioning < RANK_TOLERANCE:
             return conditioning
-    if not orthonormalise(columns, flat):
+    scratch.misfit = orthonormalise(columns, flat)
+    if scratch.misfit < 0.0:
         return 0.0
     for i in range(3):
         for j in range(3):
@@ -371,13 +376,19 @@ def pose_from_legs(
 
 
 @kernel
-def _settle_rotation(free: int, equations: int, scratch: Record) -> float:
-    """Find the rotation among `span[0, 3:] + sum of t_i span[i, 3:]`, i = 1..free, and write it to the former.
-
-    Linear in the parameters t and their products, of which there are `free (free + 3) / 2` together.
+def has_two_roots(geometry: Record, measured: Array) -> bool:
+    """Whether the legs alone leave one parameter of coplanar joints open (class n-3-II): of two roots the right one is told by
+    how well it fits, which says little where they are alike.
     """
-    matrix, right, unknowns, span = scratch.matrix, scratch.right, scratch.unknowns, scratch.span
-    # Orthonormal parameters that start at the least matrix of the span.
+    legs = set_number(measured)
+    return bool(geometry.unknowns[legs] == 9 and geometry.ranks[legs] == 8)
+
+
+@kernel
+def _orthonormalise_span(free: int, span: Array) -> bool:
+    """Make the matrices `span[1:free + 1, 3:]` orthonormal and `span[0, 3:]` the least of those that differ by them; False if
+    they are linearly dependent.
+    """
     for i in range(1, free + 1):
         before = after = 0.0
         for e in range(3, 12):
@@ -391,15 +402,62 @@ def _settle_rotation(free: int, equations: int, scratch: Record) -> float:
         for e in range(3, 12):
             after += span[i, e] * span[i, e]
         if not after > RANK_TOLERANCE**2 * before:
-            return 0.0
+            return False
         size = 1.0 / np.sqrt(after)
-        for e in range(3, 12):
-            span[i, e] *= size
         dot = 0.0
         for e in range(3, 12):
+            span[i, e] *= size
             dot += span[0, e] * span[i, e]
         for e in range(3, 12):
             span[0, e] -= dot * span[i, e]
+    return True
+
+
+@kernel
+def _settle_columns(root: int, scratch: Record) -> float:
+    """Find two orthonormal columns among `span[0, 3:] + t span[1, 3:]`, and write them to the former.
+
+    Their three equations `a t^2 + b t + c = 0` have one root in common. Started from both roots of the equation in which they
+    are added up by their leading coefficients, Gauss-Newton steps meet it at least once; the better fit is root 0. Returns
+    the sine of the angle between a and b: if those are parallel, the other root fits as well.
+    """
+    span, c, b, a = scratch.span, scratch.right, scratch.norms, scratch.order
+    _write_equations(span[0, 3:], span[0, 3:], 1.0, -1.0, -1.0, _COLUMN_EQUATIONS, c)
+    _write_equations(span[0, 3:], span[1, 3:], 2.0, -1.0, 0.0, _COLUMN_EQUATIONS, b)
+    _write_equations(span[1, 3:], span[1, 3:], 1.0, 0.0, 0.0, _COLUMN_EQUATIONS, a)
+    aa, bb = a[0] * a[0] + a[1] * a[1] + a[2] * a[2], b[0] * b[0] + b[1] * b[1] + b[2] * b[2]
+    ab, ac = a[0] * b[0] + a[1] * b[1] + a[2] * b[2], a[0] * c[0] + a[1] * c[1] + a[2] * c[2]
+    step = np.sqrt(max(0.25 * ab * ab - aa * ac, 0.0)) / aa
+    least, best, other = np.inf, 0.0, 0.0
+    for start in (step - 0.5 * ab / aa, -step - 0.5 * ab / aa):
+        t, misfit = start, 0.0
+        for _ in range(_COLUMN_STEPS):
+            down = slope = misfit = 0.0
+            for i in range(_COLUMN_EQUATIONS):
+                value, rise = (a[i] * t + b[i]) * t + c[i], 2.0 * a[i] * t + b[i]
+                down += value * rise
+                slope += rise * rise
+                misfit += value * value
+            if slope > 0.0:
+                t -= down / slope
+        if misfit < least:
+            least, best, other = misfit, t, best
+        else:
+            other = t
+    t = best if root == 0 else other
+    for e in range(3, 12):
+        span[0, e] += t * span[1, e]
+    return float(np.sqrt(max(aa * bb - ab * ab, 0.0) / (aa * max(aa, bb))))
+
+
+@kernel
+def _settle_rotation(free: int, scratch: Record) -> float:
+    """Find the rotation among `span[0, 3:] + sum of t_i span[i, 3:]`, i = 1..free, and write it to the former.
+
+    Linear in the parameters t and their products, of which there are `free (free + 3) / 2` together.
+    """
+    matrix, right, unknowns, span = scratch.matrix, scratch.right, scratch.unknowns, scratch.span
+    equations = _ROTATION_EQUATIONS
     _write_equations(span[0, 3:], span[0, 3:], -1.0, 1.0, 1.0, equations, right)
     column = free
     for i in range(1, free + 1):
@@ -446,27 +504,28 @@ def _write_equations(
 
 
 @kernel
-def orthonormalise(columns: Array, flat: bool) -> bool:
+def orthonormalise(columns: Array, flat: bool) -> float:
     """Replace three columns (9,) by the nearest rotation, by Newton's iteration for the polar decomposition; `flat` means
-    that the third is still to be made from the others. False if there is none.
+    that the third is still to be made from the others. Returns how far they were from it, -1 if there is none.
     """
     x0, x1, x2, y0, y1, y2, z0, z1, z2 = (
         columns[0], columns[1], columns[2], columns[3], columns[4], columns[5], columns[6], columns[7], columns[8],
     )  # fmt: skip
+    if flat:
+        z0, z1, z2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
+        size = np.sqrt(z0 * z0 + z1 * z1 + z2 * z2)
+        if not size > RANK_TOLERANCE:
+            return -1.0
+        z0, z1, z2 = z0 / size, z1 / size, z2 / size
+        columns[6], columns[7], columns[8] = z0, z1, z2
     for _ in range(_MOST_POLAR_STEPS):
         # The matrix of cofactors, which over the determinant is the inverse transposed.
-        c0, c1, c2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
-        if flat:
-            size = np.sqrt(c0 * c0 + c1 * c1 + c2 * c2)
-            if not size > RANK_TOLERANCE:
-                return False
-            z0, z1, z2 = c0 / size, c1 / size, c2 / size
-            flat = False
         a0, a1, a2 = y1 * z2 - y2 * z1, y2 * z0 - y0 * z2, y0 * z1 - y1 * z0
         b0, b1, b2 = z1 * x2 - z2 * x1, z2 * x0 - z0 * x2, z0 * x1 - z1 * x0
+        c0, c1, c2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
         determinant = x0 * a0 + x1 * a1 + x2 * a2
         if not determinant > RANK_TOLERANCE:
-            return False
+            return -1.0
         f = 0.5 / determinant
         dx0, dx1, dx2 = f * a0 - 0.5 * x0, f * a1 - 0.5 * x1, f * a2 - 0.5 * x2
         dy0, dy1, dy2 = f * b0 - 0.5 * y0, f * b1 - 0.5 * y1, f * b2 - 0.5 * y2
@@ -476,7 +535,12 @@ def orthonormalise(columns: Array, flat: bool) -> bool:
         change = dx0 * dx0 + dx1 * dx1 + dx2 * dx2 + dy0 * dy0 + dy1 * dy1 + dy2 * dy2 + dz0 * dz0 + dz1 * dz1 + dz2 * dz2
         if change < _POLAR_TOLERANCE:
             break
+    distance = (
+        (columns[0] - x0) ** 2 + (columns[1] - x1) ** 2 + (columns[2] - x2) ** 2 + (columns[3] - y0) ** 2
+        + (columns[4] - y1) ** 2 + (columns[5] - y2) ** 2 + (columns[6] - z0) ** 2 + (columns[7] - z1) ** 2
+        + (columns[8] - z2) ** 2
+    )  # fmt: skip
     columns[0], columns[1], columns[2] = x0, x1, x2
     columns[3], columns[4], columns[5] = y0, y1, y2
     columns[6], columns[7], columns[8] = z0, z1, z2
-    return True
+    return float(np.sqrt(distance))

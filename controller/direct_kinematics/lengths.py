@@ -3,12 +3,13 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from controller.direct_kinematics.refinement import move_pose
 from controller.inverse_kinematics import jacobian_at, legs_at
 from controller.least_squares import RANK_TOLERANCE, solve_square
 from plant.compiled import kernel
 from plant.errors import SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
-from plant.pose import Array, Pose, checked_array, checked_rotation, rotate_by_vector
+from plant.pose import Array, Pose, checked_array, checked_rotation
 
 _NEWTON_LIMIT = 50
 
@@ -56,9 +57,7 @@ def newton_from_lengths(
         jacobian_at(arms, directions, jacobian)
         if solve_square(jacobian, lengths) < RANK_TOLERANCE:
             return np.inf
-        for i in range(3):
-            position[i] += lengths[i]
-        rotate_by_vector(rotation, lengths[3:])
+        move_pose(lengths, position, rotation)
     return error
 
 

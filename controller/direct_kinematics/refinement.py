@@ -99,30 +99,25 @@ def normal_equations(
 
 
 @kernel
-def refine_pose(
-    base_joints: Array, platform_joints: Array, directions: Array, weights: Array, in_base: Array, in_platform: Array,
-    vector_weights: Array, position: Array, rotation: Array, arms: Array, predicted: Array, lengths: Array,
-    information: Array, correction: Array, factor: Array,
-) -> bool:  # fmt: skip
-    """One Gauss-Newton step on SE(3), in place; False if singular.
-
-    The arguments are those of `normal_equations`; afterwards `correction` holds the step and `factor` the Cholesky factor of
-    the information.
+def solve_normal_equations(information: Array, correction: Array, factor: Array) -> bool:
+    """Replace `correction` (6,) by the Gauss-Newton step; `factor` becomes the Cholesky factor of the information. False if
+    that is singular.
     """
-    normal_equations(
-        base_joints, platform_joints, directions, weights, in_base, in_platform, vector_weights, position, rotation, arms,
-        predicted, lengths, information, correction,
-    )  # fmt: skip
     for i in range(6):
         for j in range(i + 1):
             factor[i, j] = information[i, j]
     if not factor_cholesky(factor):
         return False
     solve_cholesky(factor, correction)
-    for i in range(3):
-        position[i] += correction[i]
-    rotate_by_vector(rotation, correction[3:])
     return True
+
+
+@kernel
+def move_pose(step: Array, position: Array, rotation: Array) -> None:
+    """Move a pose, in place, by a step (6,) on SE(3): translation [m], then rotation vector [rad], both seen in {1}."""
+    for i in range(3):
+        position[i] += step[i]
+    rotate_by_vector(rotation, step[3:])
 
 
 @kernel
@@ -130,7 +125,7 @@ def find_twist(
     rates: Array, weights: Array, in_platform: Array, vector_weights: Array, angular_velocity: Array, rotation: Array,
     arms: Array, predicted: Array, lengths: Array, factor: Array, twist: Array,
 ) -> None:  # fmt: skip
-    """The twist (6,) of least squares, from the legs and the factor of the last `refine_pose`.
+    """The twist (6,) of least squares, from the legs and the factor of `solve_normal_equations`.
 
     Args:
         rates: (6, 3), derivatives of the directions [1/s].

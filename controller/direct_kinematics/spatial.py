@@ -15,17 +15,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controller.direct_kinematics.closed_forms import (
+    SCRATCH,
     geometry_of,
-    new_scratch,
+    has_two_roots,
     orthonormalise,
     pose_from_legs,
     pose_from_rotation,
     pose_from_vector,
 )
 from controller.direct_kinematics.paper import section_3_1_1, section_4
-from controller.direct_kinematics.refinement import normal_equations, refine_pose
+from controller.direct_kinematics.refinement import move_pose, normal_equations, solve_normal_equations
 from controller.inverse_kinematics import legs_at
-from controller.least_squares import factor_cholesky, invert_cholesky
+from controller.least_squares import invert_cholesky
 from plant.compiled import Record, kernel
 from plant.errors import GoughError, InputError, SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
@@ -53,6 +54,14 @@ NEEDS = {"section-5": "rotation", "up": "up_in_platform", "normal": "normal", "s
 _AUTOMATIC = ("section-5", "up", "normal", "legs")
 _GOOD_CONDITIONING = 1e-2
 
+_MOST_MISFIT = 0.2
+"""How far from a rotation, in its nine elements, `legs` may come out: further off it is noise that was solved for."""
+
+_DISTINCT, _DISTINCT_SHARE = 25.0, 400.0
+"""By how much the chi-square sums of two roots must differ for one to be the pose, which noise does to one in three million;
+or by how many times the better sum over its degrees of freedom, where noise is far below the sigmas."""
+
+_SAME_ROTATION = 1e-6
 _MOST_REFINEMENTS = 20
 _REFINED = 1e-14
 """Square of a step over its variance at which the pose has settled."""
@@ -61,8 +70,8 @@ _CHUNK = 4096
 
 (
     _SOLVED, _OPEN, _SINGULAR, _UNSETTLED, _NEGATIVE, _PARTLY_NAN, _INFINITE, _LEG_NOT_UNIT, _ROTATION_INFINITE,
-    _NOT_ORTHOGONAL, _REFLECTION, _UP_NOT_UNIT, _NORMAL_NOT_UNIT,
-) = range(13)  # fmt: skip
+    _NOT_ORTHOGONAL, _REFLECTION, _UP_NOT_UNIT, _NORMAL_NOT_UNIT, _AMBIGUOUS,
+) = range(14)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +298,7 @@ def _solve(
 
     def solve_chunk(start: int) -> None:
         stop = min(start + _CHUNK, count)
-        _solve_rows(geometry_of(mechanism), new_scratch(), measurements, candidates, refine, results, start, stop)
+        _solve_rows(geometry_of(mechanism), np.zeros((), _WORK), measurements, candidates, refine, results, start, stop)
 
     starts = range(0, count, _CHUNK)
     if workers == 1 or len(starts) <= 1:
@@ -363,6 +372,7 @@ def _error(
             _OPEN: f"{known} do not give the pose of {mechanism.name!r} here" + ("" if method == "auto" else f" by {method}")
             + f" (legs parallel or too few, joints in line or alike): {_remedy(arrays, method)}",
             _SINGULAR: f"{known} leave the pose of {mechanism.name!r} open to a small motion: measure more",
+            _AMBIGUOUS: f"two poses fit {known}, and noise cannot tell them apart: measure up_in_platform too",
             _UNSETTLED: f"no pose fits {known}: the measurements contradict each other",
             _NEGATIVE: "the pose that fits best has legs of negative length: the directions contradict each other, or point "
             f"down the legs ({known})",
@@ -377,138 +387,229 @@ def _remedy(arrays: dict[str, Array], method: str) -> str:
     return f"measure more legs{''.join(f', or {name}' for name in missing)}"
 
 
+_WORK = np.dtype(
+    [
+        ("scratch", SCRATCH),
+        ("directions", np.float64, (LEGS, 3)),
+        ("measured", np.float64, LEGS),
+        ("weights", np.float64, LEGS),
+        ("measured_rotation", np.float64, (3, 3)),
+        ("in_base", np.float64, (5, 3)),
+        ("in_platform", np.float64, (5, 3)),
+        ("vector_weights", np.float64, 5),
+        ("vectors", np.int64),
+        ("up", np.int64),
+        ("normal", np.int64),
+        ("equations", np.int64),
+        ("position", np.float64, 3),
+        ("rotation", np.float64, (3, 3)),
+        ("best_position", np.float64, 3),
+        ("best_rotation", np.float64, (3, 3)),
+        ("arms", np.float64, (LEGS, 3)),
+        ("predicted", np.float64, (LEGS, 3)),
+        ("lengths", np.float64, LEGS),
+        ("information", np.float64, (6, 6)),
+        ("factor", np.float64, (6, 6)),
+        ("correction", np.float64, 6),
+    ],
+    align=True,
+)
+"""Memory for one pose: what was measured, with `up` and `normal` as rows of the vectors known in both frames; the pose; and
+its fit."""
+
+
 @kernel
 def _solve_rows(
-    geometry: Record, scratch: Record, measurements: _Measurements, candidates: NDArray[np.int64], refine: bool,
+    geometry: Record, work_array: Record, measurements: _Measurements, candidates: NDArray[np.int64], refine: bool,
     results: _Results, start: int, stop: int,
 ) -> None:  # fmt: skip
     """Solve the rows from `start` to `stop`; a row without a pose is filled with NaN and says why in its status."""
-    directions, measured, weights = np.empty((LEGS, 3)), np.empty(LEGS), np.empty(LEGS)
-    rotation, found_position, found_rotation = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
-    in_base, in_platform, vector_weights = np.empty((5, 3)), np.empty((5, 3)), np.empty(5)
-    e_z = np.array([0.0, 0.0, 1.0])
-    arms, predicted, lengths = np.empty((LEGS, 3)), np.empty((LEGS, 3)), np.empty(LEGS)
-    information, factor, correction = np.empty((6, 6)), np.empty((6, 6)), np.empty(6)
+    work = work_array[()]
     for row in range(start, stop):
-        position, attitude = results.positions[row], results.rotations[row]
-        status, leg = _read_directions(measurements.directions[row], directions, measured)
-        results.legs[row] = leg
-        vectors = 0
-        if status == _SOLVED and measurements.rotations.shape[0] > 0:
-            status = _read_rotation(measurements.rotations[row], rotation)
-            # These weights add up to that of the yaw about the vertical, and to that of the tilt about every level axis.
-            for axis in range(3):
-                for i in range(3):
-                    in_base[axis, i] = measurements.axes[axis, i]
-                    in_platform[axis, i] = 0.0
-                    for j in range(3):
-                        in_platform[axis, i] += rotation[j, i] * measurements.axes[axis, j]
-                vector_weights[axis] = 0.5 * measurements.yaw_weight
-            vector_weights[0] = measurements.tilt_weight - vector_weights[0]
-            vectors = 3
-        up = vectors
-        if status == _SOLVED and measurements.ups.shape[0] > 0:
-            if not _read_unit(measurements.ups[row], in_platform[up]):
-                status = _UP_NOT_UNIT
-            in_base[up] = measurements.axes[0]
-            vector_weights[up] = measurements.tilt_weight
-            vectors += 1
-        normal = vectors
-        if status == _SOLVED and measurements.normals.shape[0] > 0:
-            if not _read_unit(measurements.normals[row], in_base[normal]):
-                status = _NORMAL_NOT_UNIT
-            in_platform[normal] = e_z
-            vector_weights[normal] = measurements.tilt_weight
-            vectors += 1
-        best = 0.0
+        status, results.legs[row] = _read(measurements, row, work)
+        results.conditionings[row] = 0.0
+        results.methods[row] = 0
         if status == _SOLVED:
-            for method in candidates:
-                if method == _SECTION_5:
-                    found_rotation[:] = rotation
-                    conditioning = pose_from_rotation(geometry, directions, measured, found_rotation, found_position, scratch)
-                elif method in (_UP, _NORMAL):
-                    k = up if method == _UP else normal
-                    conditioning = pose_from_vector(
-                        geometry, directions, measured, in_base[k], in_platform[k], found_position, found_rotation, scratch
-                    )
-                elif method == _LEGS:
-                    conditioning = pose_from_legs(geometry, directions, measured, found_position, found_rotation, scratch)
-                elif method == _SECTION_3_1_1:
-                    conditioning = section_3_1_1(geometry, directions, measured, found_position, found_rotation, scratch)
-                else:
-                    conditioning = section_4(
-                        geometry, directions, measured, in_base[normal], e_z, found_position, found_rotation, scratch
-                    )
-                if conditioning > best:
-                    best = conditioning
-                    results.methods[row] = method
-                    for i in range(3):
-                        position[i] = found_position[i]
-                        for j in range(3):
-                            attitude[i, j] = found_rotation[i, j]
-                if best > _GOOD_CONDITIONING:
-                    break
-            if not best > LEAST_CONDITIONING:
-                status = _OPEN
-        results.conditionings[row] = best
+            results.methods[row], results.conditionings[row] = _find(geometry, candidates, work)
+            status = _SOLVED if results.conditionings[row] > LEAST_CONDITIONING else _OPEN
         if status == _SOLVED:
-            for k in range(LEGS):
-                weights[k] = measured[k] * measurements.leg_weight
-            if refine:
-                status = _UNSETTLED
-                for _ in range(_MOST_REFINEMENTS):
-                    if not refine_pose(
-                        geometry.base_joints, geometry.platform_joints, directions, weights, in_base, in_platform,
-                        vector_weights[:vectors], position, attitude, arms, predicted, lengths, information, correction, factor,
-                    ):  # fmt: skip
-                        status = _SINGULAR
-                        break
-                    if _square_over_variance(factor, correction) < _REFINED:
-                        status = _SOLVED
-                        break
-            else:
-                normal_equations(
-                    geometry.base_joints, geometry.platform_joints, directions, weights, in_base, in_platform,
-                    vector_weights[:vectors], position, attitude, arms, predicted, lengths, information, correction,
-                )  # fmt: skip
-                factor[:] = information
-                if not factor_cholesky(factor):
-                    status = _SINGULAR
-        if status == _SOLVED:
-            legs_at(geometry.base_joints, geometry.platform_joints, position, attitude, arms, predicted, lengths)
-            chi_square, rows = 0.0, 0
-            for k in range(LEGS):
-                if measured[k] == 0.0:
-                    results.residuals[row, k] = np.nan
-                    continue
-                along = 0.0
-                for i in range(3):
-                    residual = directions[k, i] - predicted[k, i]
-                    results.residuals[row, k, i] = residual
-                    chi_square += weights[k] * residual * residual
-                    along += directions[k, i] * predicted[k, i]
-                if not along > 0.0:
-                    status = _NEGATIVE
-                rows += 2
-            for k in range(vectors):
-                for i in range(3):
-                    seen = 0.0
-                    for j in range(3):
-                        seen += attitude[i, j] * in_platform[k, j]
-                    chi_square += vector_weights[k] * (seen - in_base[k, i]) ** 2
-            # A rotation counts three times as a vector, and a vector twice.
-            rows += 2 * vectors if up < 3 else 2 * vectors - 3
-            results.chi_squares[row], results.degrees_of_freedom[row] = chi_square, rows - 6
-            invert_cholesky(factor, results.covariances[row])
+            status, chi_square = _fit(geometry, refine, work)
+            if refine and results.methods[row] == _LEGS and has_two_roots(geometry, work.measured):
+                status, chi_square = _choose(geometry, status, chi_square, work)
         results.statuses[row] = status
-        if status != _SOLVED:
-            position[:] = np.nan
-            attitude[:] = np.nan
+        if status == _SOLVED:
+            _write(work, chi_square, row, results)
+        else:
+            results.positions[row] = np.nan
+            results.rotations[row] = np.nan
             results.covariances[row] = np.nan
             results.residuals[row] = np.nan
             results.chi_squares[row] = np.nan
             results.degrees_of_freedom[row] = 0
-            results.methods[row] = 0
+
+
+@kernel
+def _read(measurements: _Measurements, row: int, work: Record) -> tuple[int, int]:
+    """Take in what was measured of a pose; returns a status and the leg that it is about."""
+    status, leg = _read_directions(measurements.directions[row], work.directions, work.measured)
+    if status != _SOLVED:
+        return status, leg
+    work.vectors = 0
+    work.equations = 0
+    for k in range(LEGS):
+        work.weights[k] = work.measured[k] * measurements.leg_weight
+        work.equations += 2 * int(work.measured[k])
+    if measurements.rotations.shape[0] > 0:
+        status = _read_rotation(measurements.rotations[row], work.measured_rotation)
+        if status != _SOLVED:
+            return status, leg
+        # These weights add up to that of the yaw about the vertical, and to that of the tilt about every level axis.
+        for axis in range(3):
+            work.vector_weights[axis] = 0.5 * measurements.yaw_weight
+            for i in range(3):
+                work.in_base[axis, i] = measurements.axes[axis, i]
+                work.in_platform[axis, i] = 0.0
+                for j in range(3):
+                    work.in_platform[axis, i] += work.measured_rotation[j, i] * measurements.axes[axis, j]
+        work.vector_weights[0] = measurements.tilt_weight - 0.5 * measurements.yaw_weight
+        work.vectors, work.equations = 3, work.equations + 3
+    work.up = work.vectors
+    if measurements.ups.shape[0] > 0:
+        if not _read_unit(measurements.ups[row], work.in_platform[work.up]):
+            return _UP_NOT_UNIT, leg
+        for i in range(3):
+            work.in_base[work.up, i] = measurements.axes[0, i]
+        work.vector_weights[work.up] = measurements.tilt_weight
+        work.vectors, work.equations = work.vectors + 1, work.equations + 2
+    work.normal = work.vectors
+    if measurements.normals.shape[0] > 0:
+        if not _read_unit(measurements.normals[row], work.in_base[work.normal]):
+            return _NORMAL_NOT_UNIT, leg
+        for i in range(3):
+            work.in_platform[work.normal, i] = 1.0 if i == 2 else 0.0
+        work.vector_weights[work.normal] = measurements.tilt_weight
+        work.vectors, work.equations = work.vectors + 1, work.equations + 2
+    return _SOLVED, leg
+
+
+@kernel
+def _find(geometry: Record, candidates: NDArray[np.int64], work: Record) -> tuple[int, float]:
+    """Leave the pose of the first method that is well conditioned, else of the best; returns that and its conditioning."""
+    best, chosen = 0.0, candidates[0]
+    for method in candidates:
+        conditioning = _apply(geometry, method, work)
+        if conditioning > best:
+            best, chosen = conditioning, method
+            work.best_position[:] = work.position
+            work.best_rotation[:] = work.rotation
+        if best > _GOOD_CONDITIONING:
+            break
+    work.position[:] = work.best_position
+    work.rotation[:] = work.best_rotation
+    return chosen, best
+
+
+@kernel
+def _apply(geometry: Record, method: int, work: Record) -> float:
+    """Find the pose by a closed form; returns the conditioning."""
+    directions, measured, position, rotation = work.directions, work.measured, work.position, work.rotation
+    if method == _SECTION_5:
+        rotation[:] = work.measured_rotation
+        return pose_from_rotation(geometry, directions, measured, rotation, position, work.scratch)
+    if method == _LEGS:
+        conditioning = pose_from_legs(geometry, directions, measured, 0, position, rotation, work.scratch)
+        return conditioning if work.scratch.misfit < _MOST_MISFIT else 0.0
+    if method == _SECTION_3_1_1:
+        return section_3_1_1(geometry, directions, measured, position, rotation, work.scratch)
+    k = work.up if method == _UP else work.normal
+    in_base, in_platform = work.in_base[k], work.in_platform[k]
+    if method == _SECTION_4:
+        return section_4(geometry, directions, measured, in_base, in_platform, position, rotation, work.scratch)
+    return pose_from_vector(geometry, directions, measured, in_base, in_platform, position, rotation, work.scratch)
+
+
+@kernel
+def _fit(geometry: Record, refine: bool, work: Record) -> tuple[int, float]:
+    """Refine the pose, if wanted, and weigh its residuals; returns a status and their chi-square sum."""
+    base_joints, platform_joints, position, rotation = (
+        geometry.base_joints,
+        geometry.platform_joints,
+        work.position,
+        work.rotation,
+    )
+    vectors = work.vectors
+    in_base, in_platform, vector_weights = work.in_base, work.in_platform, work.vector_weights[:vectors]
+    status = _UNSETTLED
+    for _ in range(_MOST_REFINEMENTS if refine else 1):
+        normal_equations(
+            base_joints, platform_joints, work.directions, work.weights, in_base, in_platform, vector_weights, position,
+            rotation, work.arms, work.predicted, work.lengths, work.information, work.correction,
+        )  # fmt: skip
+        if not solve_normal_equations(work.information, work.correction, work.factor):
+            return _SINGULAR, np.inf
+        if not refine:
+            status = _SOLVED
+            break
+        move_pose(work.correction, position, rotation)
+        if _square_over_variance(work.factor, work.correction) < _REFINED:
+            status = _SOLVED
+            break
+    legs_at(base_joints, platform_joints, position, rotation, work.arms, work.predicted, work.lengths)
+    chi_square = 0.0
+    for k in range(LEGS):
+        if work.measured[k] == 0.0:
+            continue
+        along = 0.0
+        for i in range(3):
+            chi_square += work.weights[k] * (work.directions[k, i] - work.predicted[k, i]) ** 2
+            along += work.directions[k, i] * work.predicted[k, i]
+        if status == _SOLVED and not along > 0.0:
+            status = _NEGATIVE
+    for k in range(vectors):
+        for i in range(3):
+            seen = rotation[i, 0] * in_platform[k, 0] + rotation[i, 1] * in_platform[k, 1] + rotation[i, 2] * in_platform[k, 2]
+            chi_square += vector_weights[k] * (seen - in_base[k, i]) ** 2
+    return status, chi_square
+
+
+@kernel
+def _choose(geometry: Record, first_status: int, first_chi_square: float, work: Record) -> tuple[int, float]:
+    """Fit the other root of the legs alone too and leave the better one, if it is better by far; returns its status and
+    chi-square sum.
+    """
+    work.best_position[:] = work.position
+    work.best_rotation[:] = work.rotation
+    pose_from_legs(geometry, work.directions, work.measured, 1, work.position, work.rotation, work.scratch)
+    status, chi_square = _fit(geometry, True, work)
+    apart = 0.0
+    for i in range(3):
+        for j in range(3):
+            apart = max(apart, abs(work.rotation[i, j] - work.best_rotation[i, j]))
+    if first_status == _SOLVED and status == _SOLVED and apart > _SAME_ROTATION:
+        least = min(chi_square, first_chi_square)
+        if abs(chi_square - first_chi_square) < min(_DISTINCT, _DISTINCT_SHARE * least / max(work.equations - 6, 1)):
+            return _AMBIGUOUS, chi_square
+        if chi_square < first_chi_square:
+            return _SOLVED, chi_square
+    elif first_status != _SOLVED and status == _SOLVED:
+        return _SOLVED, chi_square
+    work.position[:] = work.best_position
+    work.rotation[:] = work.best_rotation
+    _, chi_square = _fit(geometry, True, work)
+    return first_status, chi_square
+
+
+@kernel
+def _write(work: Record, chi_square: float, row: int, results: _Results) -> None:
+    results.positions[row] = work.position
+    results.rotations[row] = work.rotation
+    results.chi_squares[row] = chi_square
+    results.degrees_of_freedom[row] = work.equations - 6
+    for k in range(LEGS):
+        for i in range(3):
+            residual = work.directions[k, i] - work.predicted[k, i]
+            results.residuals[row, k, i] = residual if work.measured[k] != 0.0 else np.nan
+    invert_cholesky(work.factor, results.covariances[row])
 
 
 @kernel
@@ -552,7 +653,7 @@ def _read_rotation(given: Array, rotation: Array) -> int:
                 return _NOT_ORTHOGONAL
             columns[3 * i + j] = given[i, j]
     # The nearest rotation to the transposed is the transposed nearest rotation.
-    return _SOLVED if orthonormalise(columns, False) else _REFLECTION
+    return _SOLVED if orthonormalise(columns, False) >= 0.0 else _REFLECTION
 
 
 @kernel
