@@ -248,7 +248,7 @@ def _evaluate_class(mechanism_class: MechanismClass, random: np.random.Generator
             away = np.linalg.norm(found.positions - positions, axis=1)
             angles = rotation_angle(np.where(found.solved[:, None, None], found.rotations, np.eye(3)), rotations)
             errors[estimator.label].append(np.stack([away, angles], axis=1)[found.solved])
-    needs = {need.method: need.text for need in required_measurements(mechanism)}
+    needs = {need.method: need.text.partition(" + ")[0] for need in required_measurements(mechanism)}
     medians = {label: tuple(np.median(np.concatenate(parts), axis=0).tolist()) for label, parts in errors.items()}
     return ClassAccuracy(
         mechanism_class.label, mechanism_class.drawing, paper_needs, medians["paper"], needs["legs"], medians["legs"],
