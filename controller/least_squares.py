@@ -156,8 +156,10 @@ def solve_square(matrix: Array, right: Array) -> float:
             for j in range(k, n):
                 matrix[k, j], matrix[best, j] = matrix[best, j], matrix[k, j]
         pivot = abs(matrix[k, k])
+        if not pivot > RANK_TOLERANCE * greatest:
+            return 0.0
         least, greatest = min(least, pivot), max(greatest, pivot)
-        if not least > RANK_TOLERANCE * greatest:
+        if least <= RANK_TOLERANCE * greatest:
             return 0.0
         inverse = 1.0 / matrix[k, k]
         for i in range(k + 1, n):

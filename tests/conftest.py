@@ -3,9 +3,13 @@
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from plant.export import default_fmu
 from plant.mechanism import Mechanism, load_mechanism
+
+# For `--hypothesis-profile=thorough`: tests that follow the profile's number of examples take their time.
+settings.register_profile("thorough", max_examples=10_000, deadline=None)
 
 SHARED_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 

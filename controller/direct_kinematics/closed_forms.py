@@ -27,8 +27,11 @@ from plant.planar import SAME_JOINT_M
 from plant.pose import Array
 
 FLATNESS = 1e-3
-"""Platform joints count as coplanar if they leave their plane by less than this share of their spread; the refinement makes
-up for it."""
+"""Platform joints count as coplanar if they leave their plane by less than this share of their spread: the refinement makes
+up for it, where it starts near enough."""
+
+_LEAST_FLAT_CONDITIONING = 10.0
+"""Least conditioning over that share: further off than a tenth of a radian, the refinement may find another pose."""
 
 _SETS = 1 << LEGS
 _MOST_FREE = 5
@@ -52,15 +55,15 @@ GEOMETRY = np.dtype(
         ("centers", np.float64, (_SETS, 3)),
         ("axes", np.float64, (_SETS, 3, 3)),
         ("spreads", np.float64, _SETS),
-        ("unknowns", np.int64, _SETS),
+        ("bulges", np.float64, _SETS),
         ("ranks", np.int64, _SETS),
     ],
     align=True,
 )
 """What the closed forms need of a mechanism: its joints [m], and the first leg of each leg's platform joint. Of each set of
 legs, in whose number leg k has bit k: the centre of its platform joints [m]; axes in columns, of which two span the joints'
-plane; their root mean square distance from the centre [m]; the unknowns, 9 if the joints lie in that plane, so that two
-columns of R tell the third, else 12; and the rank of the legs' equations for them.
+plane; their root mean square distance from the centre [m]; the share of it by which they leave the plane; and the rank of the
+legs' equations for p and R.
 """
 
 SCRATCH = np.dtype(
@@ -88,7 +91,7 @@ def geometry_of(mechanism: Mechanism) -> Record:
     apart = np.linalg.norm(platform[:, None] - platform, axis=2)
     geometry["base_joints"], geometry["platform_joints"] = mechanism.base_joints, platform
     geometry["platform_numbers"] = numbers = np.argmax(apart < SAME_JOINT_M, axis=1)
-    geometry["spreads"], geometry["unknowns"] = 1.0, 9
+    geometry["spreads"] = 1.0
     for number in range(1, _SETS):
         legs = [leg for leg in range(LEGS) if number >> leg & 1]
         center = platform[legs].mean(axis=0)
@@ -98,8 +101,8 @@ def geometry_of(mechanism: Mechanism) -> Record:
         geometry["centers"][number], geometry["axes"][number] = center, axes.T
         if size > SAME_JOINT_M:
             geometry["spreads"][number] = size / np.sqrt(len(legs))
-            if len(spread) == 3 and spread[2] > FLATNESS * spread[0]:
-                geometry["unknowns"][number] = 12
+            if len(legs) > 3:
+                geometry["bulges"][number] = spread[2] / size
         # A joint is a point as soon as two of its legs are known.
         geometry["ranks"][number] = min(_LINEAR_RANK, int(np.minimum(2 * np.bincount(numbers[legs]), 3).sum()))
     return geometry[()]
@@ -319,14 +322,30 @@ def pose_from_legs(
     geometry: Record, directions: Array, measured: Array, root: int, position: Array, rotation: Array, scratch: Record
 ) -> float:
     """Pose from leg directions alone, four legs or more; `root` is 0, or 1 for the second best if `has_two_roots`."""
-    matrix, right, span = scratch.matrix, scratch.right, scratch.span
     legs = set_number(measured)
-    center, axes, scale = geometry.centers[legs], geometry.axes[legs], 1.0 / geometry.spreads[legs]
-    # Unknown are the joints' centre and the columns of R that turn the axes of the joints' plane, times the spread.
-    unknowns, rank = geometry.unknowns[legs], geometry.ranks[legs]
-    flat, free = unknowns == 9, unknowns - rank
-    if rank < 12 - _MOST_FREE:
+    if geometry.ranks[legs] < 12 - _MOST_FREE:
         return 0.0
+    bulge = geometry.bulges[legs]
+    if bulge <= FLATNESS:
+        conditioning = _pose_from_legs(geometry, directions, measured, legs, True, root, position, rotation, scratch)
+        if conditioning >= _LEAST_FLAT_CONDITIONING * bulge:
+            return conditioning
+    return _pose_from_legs(geometry, directions, measured, legs, False, root, position, rotation, scratch)
+
+
+@kernel
+def _pose_from_legs(
+    geometry: Record, directions: Array, measured: Array, legs: int, flat: bool, root: int, position: Array,
+    rotation: Array, scratch: Record,
+) -> float:  # fmt: skip
+    """Pose from the legs in a set, with coplanar joints or not.
+
+    Unknown are the joints' centre and the columns of R, times the spread, that turn the axes of the joints' plane, or all.
+    """
+    matrix, right, span = scratch.matrix, scratch.right, scratch.span
+    center, axes, scale = geometry.centers[legs], geometry.axes[legs], 1.0 / geometry.spreads[legs]
+    unknowns, rank = 9 if flat else 12, geometry.ranks[legs]
+    free = unknowns - rank
     rows = 0
     for k in range(LEGS):
         if measured[k] == 0.0:
@@ -370,9 +389,7 @@ def pose_from_legs(
     for i in range(3):
         for j in range(3):
             rotation[i, j] = columns[i] * axes[j, 0] + columns[3 + i] * axes[j, 1] + columns[6 + i] * axes[j, 2]
-    if pose_from_rotation(geometry, directions, measured, rotation, position, scratch) < RANK_TOLERANCE:
-        return 0.0
-    return conditioning
+    return min(conditioning, pose_from_rotation(geometry, directions, measured, rotation, position, scratch))
 
 
 @kernel
@@ -381,7 +398,7 @@ def has_two_roots(geometry: Record, measured: Array) -> bool:
     how well it fits, which says little where they are alike.
     """
     legs = set_number(measured)
-    return bool(geometry.unknowns[legs] == 9 and geometry.ranks[legs] == 8)
+    return bool(geometry.bulges[legs] <= FLATNESS and geometry.ranks[legs] == 8)
 
 
 @kernel

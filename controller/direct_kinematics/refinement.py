@@ -11,12 +11,22 @@ from plant.pose import Array, rotate_by_vector
 
 
 @kernel
+def _across(direction: Array, x0: float, x1: float, x2: float) -> tuple[float, float, float]:
+    """The part of a vector x that is across a unit vector, projected twice: where legs are nearly parallel, what rounding
+    leaves along them would weigh more than what they measure.
+    """
+    d0, d1, d2 = direction[0], direction[1], direction[2]
+    for _ in range(2):
+        along = d0 * x0 + d1 * x1 + d2 * x2
+        x0, x1, x2 = x0 - along * d0, x1 - along * d1, x2 - along * d2
+    return x0, x1, x2
+
+
+@kernel
 def _add_leg(right: Array, measured: Array, direction: Array, arm: Array, scale: float) -> None:
     """Add `scale` J^T P `measured` to a right side (6,), P = I - d d^T and J = [I, -skew(arm)]."""
-    d0, d1, d2 = direction[0], direction[1], direction[2]
     a0, a1, a2 = arm[0], arm[1], arm[2]
-    along = d0 * measured[0] + d1 * measured[1] + d2 * measured[2]
-    g0, g1, g2 = scale * (measured[0] - along * d0), scale * (measured[1] - along * d1), scale * (measured[2] - along * d2)
+    g0, g1, g2 = _across(direction, scale * measured[0], scale * measured[1], scale * measured[2])
     right[0] += g0
     right[1] += g1
     right[2] += g2

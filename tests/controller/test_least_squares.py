@@ -5,7 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.least_squares import RANK_TOLERANCE, factor_cholesky, solve_cholesky, solve_least_squares
+from controller.least_squares import (
+    RANK_TOLERANCE,
+    factor_cholesky,
+    invert_cholesky,
+    solve_cholesky,
+    solve_least_squares,
+    solve_square,
+    solve_truncated,
+)
 
 
 def solve(matrix, right):
@@ -142,3 +150,70 @@ def test_cholesky_refuses_a_singular_and_a_nan_matrix(n):
     broken = np.eye(n)
     broken[n - 1, n - 1] = np.nan
     assert not factor_cholesky(broken)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(1, 9), st.floats(0.0, 6.0), seeds)
+def test_the_inverse_of_a_cholesky_factor_is_lapacks(n, exponent, seed):
+    random = np.random.default_rng(seed)
+    matrix = matrix_of_condition(random, n, n, 10.0 ** (0.5 * exponent))
+    matrix = matrix @ matrix.T
+    factor, inverse = np.tril(matrix), np.full((n, n), np.nan)
+    assert factor_cholesky(factor)
+    invert_cholesky(factor, inverse)
+    np.testing.assert_array_equal(inverse, inverse.T)
+    expected = np.linalg.inv(matrix)
+    np.testing.assert_allclose(inverse, expected, rtol=0.0, atol=1e-13 * 10.0**exponent * np.abs(expected).max())
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(1, 12), st.floats(0.0, 6.0), st.floats(-6.0, 6.0), seeds)
+def test_elimination_agrees_with_lapack(n, exponent, scale_exponent, seed):
+    random = np.random.default_rng(seed)
+    matrix = 10.0**scale_exponent * matrix_of_condition(random, n, n, 10.0**exponent)
+    truth = random.normal(size=n)
+    solution = matrix @ truth
+    assert 0.0 < solve_square(matrix.copy(), solution) <= 1.0
+    np.testing.assert_allclose(solution, truth, rtol=0.0, atol=1e-13 * 10.0**exponent * np.abs(truth).max())
+
+
+@pytest.mark.parametrize("n", [1, 2, 6])
+def test_elimination_reports_a_singular_and_a_nan_matrix(n):
+    random = np.random.default_rng(4)
+    singular = random.normal(size=(n, n))
+    singular[-1] = 2.0 * singular[0] if n > 1 else 0.0
+    assert solve_square(singular, np.ones(n)) < RANK_TOLERANCE
+    for i in range(n):
+        for j in range(n):
+            matrix = random.normal(size=(n, n))
+            matrix[i, j] = np.nan
+            assert solve_square(matrix, np.ones(n)) < RANK_TOLERANCE
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(2, 12), st.data())
+def test_truncated_at_its_rank_a_system_gives_one_solution_and_all_that_may_be_added(n, data):
+    rank, rows = data.draw(st.integers(1, n)), data.draw(st.integers(n, 14))
+    random = np.random.default_rng(data.draw(seeds))
+    matrix = random.normal(size=(rows, rank)) @ np.linalg.qr(random.normal(size=(n, rank)))[0].T
+    right = matrix @ random.normal(size=n)
+    solution, null_space = np.full(n, np.nan), np.full((n, n), np.nan)
+    noise = 1e-7 * random.normal(size=(rows, n))
+    for disturbed, off in ((matrix, 1e-11), (matrix + noise, 1e-4)):
+        conditioning = solve_truncated(
+            disturbed.copy(), right.copy(), rows, rank, solution, null_space, np.zeros(n), np.zeros(n)
+        )
+        if conditioning < 1e-2:
+            return
+        open_directions = null_space[: n - rank]
+        np.testing.assert_allclose(matrix @ solution, right, rtol=0.0, atol=off * np.abs(right).max())
+        assert np.abs(matrix @ open_directions.T).max(initial=0.0) <= off * np.abs(open_directions).max(initial=1.0)
+        assert np.linalg.matrix_rank(open_directions) == n - rank if rank < n else len(open_directions) == 0
+
+
+def test_a_rank_that_is_not_there_is_reported():
+    matrix = np.outer(np.arange(1.0, 7.0), [1.0, 2.0, 3.0])
+    solution, null_space = np.zeros(3), np.zeros((3, 3))
+    args = (solution, null_space, np.zeros(3), np.zeros(3))
+    assert solve_truncated(matrix.copy(), matrix[:, 0].copy(), 6, 2, *args) < RANK_TOLERANCE
+    assert solve_truncated(matrix.copy(), matrix[:, 0].copy(), 6, 1, *args) == 1.0
