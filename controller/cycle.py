@@ -359,7 +359,7 @@ def find_pose(parameters: Record, state: Record) -> float:
             p.geometry, s.directions, p.leg_used, p.up_in_base[0], s.vertical[0], s.position, s.rotation, s.scratch
         )
     else:
-        s.conditioning = pose_from_legs(p.geometry, s.directions, p.leg_used, 0, s.position, s.rotation, s.scratch)
+        s.conditioning = pose_from_legs(p.geometry, s.directions, p.leg_used, s.position, s.rotation, s.scratch)
     return float(s.conditioning)
 
 

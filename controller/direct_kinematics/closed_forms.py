@@ -76,11 +76,15 @@ SCRATCH = np.dtype(
         ("order", np.float64, _ROTATION_EQUATIONS),
         ("points", np.float64, (LEGS, 3)),
         ("selected", np.float64, LEGS),
+        ("second_root", np.float64, 12),
+        ("roots", np.int64),
         ("misfit", np.float64),
     ],
     align=True,
 )
-"""Memory for the closed forms, which allocate nothing; `misfit` is how far from a rotation `pose_from_legs` came out."""
+"""Memory for the closed forms, which allocate nothing; `roots` is how many `pose_from_legs` found, 2 where one parameter of
+coplanar joints is open (class n-3-II), and `misfit` how far from a rotation it came out.
+"""
 
 
 @lru_cache(maxsize=256)
@@ -319,24 +323,35 @@ def _turn(rotation: Array, axis: Array, cosine: float, sine: float) -> bool:
 
 @kernel
 def pose_from_legs(
-    geometry: Record, directions: Array, measured: Array, root: int, position: Array, rotation: Array, scratch: Record
+    geometry: Record, directions: Array, measured: Array, position: Array, rotation: Array, scratch: Record
 ) -> float:
-    """Pose from leg directions alone, four legs or more; `root` is 0, or 1 for the second best if `has_two_roots`."""
+    """Pose from leg directions alone, four legs or more; the one that fits better if there are two roots."""
     legs = set_number(measured)
     if geometry.ranks[legs] < 12 - _MOST_FREE:
         return 0.0
     bulge = geometry.bulges[legs]
     if bulge <= FLATNESS:
-        conditioning = _pose_from_legs(geometry, directions, measured, legs, True, root, position, rotation, scratch)
+        conditioning = _pose_from_legs(geometry, directions, measured, legs, True, position, rotation, scratch)
         if conditioning >= _LEAST_FLAT_CONDITIONING * bulge:
             return conditioning
-    return _pose_from_legs(geometry, directions, measured, legs, False, root, position, rotation, scratch)
+    return _pose_from_legs(geometry, directions, measured, legs, False, position, rotation, scratch)
+
+
+@kernel
+def second_pose_from_legs(
+    geometry: Record, directions: Array, measured: Array, position: Array, rotation: Array, scratch: Record
+) -> float:
+    """The pose at the second of two roots, after `pose_from_legs` found both."""
+    legs = set_number(measured)
+    return _pose_from_columns(
+        geometry, directions, measured, legs, True, scratch.second_root[3:], position, rotation, scratch
+    )  # fmt: skip
 
 
 @kernel
 def _pose_from_legs(
-    geometry: Record, directions: Array, measured: Array, legs: int, flat: bool, root: int, position: Array,
-    rotation: Array, scratch: Record,
+    geometry: Record, directions: Array, measured: Array, legs: int, flat: bool, position: Array, rotation: Array,
+    scratch: Record,
 ) -> float:  # fmt: skip
     """Pose from the legs in a set, with coplanar joints or not.
 
@@ -372,6 +387,7 @@ def _pose_from_legs(
     columns = span[0, 3:]
     for i in range(9):
         columns[i] *= scale
+    scratch.roots = 1
     if free > 0:
         if flat and free > 1:
             for i in range(3):
@@ -379,26 +395,28 @@ def _pose_from_legs(
             free += 3
         if not _orthonormalise_span(free, span):
             return 0.0
-        settled = _settle_columns(root, scratch) if free == 1 else _settle_rotation(free, scratch)
+        settled = _settle_columns(scratch) if free == 1 else _settle_rotation(free, scratch)
         conditioning = min(conditioning, settled)
         if conditioning < RANK_TOLERANCE:
             return conditioning
-    scratch.misfit = orthonormalise(columns, flat)
-    if scratch.misfit < 0.0:
-        return 0.0
-    for i in range(3):
-        for j in range(3):
-            rotation[i, j] = columns[i] * axes[j, 0] + columns[3 + i] * axes[j, 1] + columns[6 + i] * axes[j, 2]
-    return min(conditioning, pose_from_rotation(geometry, directions, measured, rotation, position, scratch))
+    met = _pose_from_columns(geometry, directions, measured, legs, flat, columns, position, rotation, scratch)
+    return min(conditioning, met)
 
 
 @kernel
-def has_two_roots(geometry: Record, measured: Array) -> bool:
-    """Whether the legs alone leave one parameter of coplanar joints open (class n-3-II): of two roots the right one is told by
-    how well it fits, which says little where they are alike.
-    """
-    legs = set_number(measured)
-    return bool(geometry.bulges[legs] <= FLATNESS and geometry.ranks[legs] == 8)
+def _pose_from_columns(
+    geometry: Record, directions: Array, measured: Array, legs: int, flat: bool, columns: Array, position: Array,
+    rotation: Array, scratch: Record,
+) -> float:  # fmt: skip
+    """Pose from the columns (9,) of a matrix near the rotation that turns the axes of the joints' plane."""
+    scratch.misfit = orthonormalise(columns, flat)
+    if scratch.misfit < 0.0:
+        return 0.0
+    axes = geometry.axes[legs]
+    for i in range(3):
+        for j in range(3):
+            rotation[i, j] = columns[i] * axes[j, 0] + columns[3 + i] * axes[j, 1] + columns[6 + i] * axes[j, 2]
+    return pose_from_rotation(geometry, directions, measured, rotation, position, scratch)
 
 
 @kernel
@@ -431,12 +449,12 @@ def _orthonormalise_span(free: int, span: Array) -> bool:
 
 
 @kernel
-def _settle_columns(root: int, scratch: Record) -> float:
+def _settle_columns(scratch: Record) -> float:
     """Find two orthonormal columns among `span[0, 3:] + t span[1, 3:]`, and write them to the former.
 
     Their three equations `a t^2 + b t + c = 0` have one root in common. Started from both roots of the equation in which they
-    are added up by their leading coefficients, Gauss-Newton steps meet it at least once; the better fit is root 0. Returns
-    the sine of the angle between a and b: if those are parallel, the other root fits as well.
+    are added up by their leading coefficients, Gauss-Newton steps meet it at least once; the worse fit is the second root.
+    Returns the sine of the angle between a and b: if those are parallel, the other root fits as well.
     """
     span, c, b, a = scratch.span, scratch.right, scratch.norms, scratch.order
     _write_equations(span[0, 3:], span[0, 3:], 1.0, -1.0, -1.0, _COLUMN_EQUATIONS, c)
@@ -461,9 +479,10 @@ def _settle_columns(root: int, scratch: Record) -> float:
             least, best, other = misfit, t, best
         else:
             other = t
-    t = best if root == 0 else other
+    scratch.roots = 2
     for e in range(3, 12):
-        span[0, e] += t * span[1, e]
+        scratch.second_root[e] = span[0, e] + other * span[1, e]
+        span[0, e] += best * span[1, e]
     return float(np.sqrt(max(aa * bb - ab * ab, 0.0) / (aa * max(aa, bb))))
 
 

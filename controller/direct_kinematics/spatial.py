@@ -17,11 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from controller.direct_kinematics.closed_forms import (
     SCRATCH,
     geometry_of,
-    has_two_roots,
     orthonormalise,
     pose_from_legs,
     pose_from_rotation,
     pose_from_vector,
+    second_pose_from_legs,
 )
 from controller.direct_kinematics.paper import section_3_1_1, section_4
 from controller.direct_kinematics.refinement import move_pose, normal_equations, solve_normal_equations
@@ -405,6 +405,8 @@ _WORK = np.dtype(
         ("rotation", np.float64, (3, 3)),
         ("best_position", np.float64, 3),
         ("best_rotation", np.float64, (3, 3)),
+        ("second_position", np.float64, 3),
+        ("second_rotation", np.float64, (3, 3)),
         ("arms", np.float64, (LEGS, 3)),
         ("predicted", np.float64, (LEGS, 3)),
         ("lengths", np.float64, LEGS),
@@ -433,9 +435,8 @@ def _solve_rows(
             results.methods[row], results.conditionings[row] = _find(geometry, candidates, work)
             status = _SOLVED if results.conditionings[row] > LEAST_CONDITIONING else _OPEN
         if status == _SOLVED:
-            status, chi_square = _fit(geometry, refine, work)
-            if refine and results.methods[row] == _LEGS and has_two_roots(geometry, work.measured):
-                status, chi_square = _choose(geometry, status, chi_square, work)
+            two_roots = refine and results.methods[row] == _LEGS and work.scratch.roots == 2
+            status, chi_square = _fit_better(geometry, work) if two_roots else _fit(geometry, refine, work)
         results.statuses[row] = status
         if status == _SOLVED:
             _write(work, chi_square, row, results)
@@ -517,7 +518,7 @@ def _apply(geometry: Record, method: int, work: Record) -> float:
         rotation[:] = work.measured_rotation
         return pose_from_rotation(geometry, directions, measured, rotation, position, work.scratch)
     if method == _LEGS:
-        conditioning = pose_from_legs(geometry, directions, measured, 0, position, rotation, work.scratch)
+        conditioning = pose_from_legs(geometry, directions, measured, position, rotation, work.scratch)
         return conditioning if work.scratch.misfit < _MOST_MISFIT else 0.0
     if method == _SECTION_3_1_1:
         return section_3_1_1(geometry, directions, measured, position, rotation, work.scratch)
@@ -573,30 +574,42 @@ def _fit(geometry: Record, refine: bool, work: Record) -> tuple[int, float]:
 
 
 @kernel
-def _choose(geometry: Record, first_status: int, first_chi_square: float, work: Record) -> tuple[int, float]:
-    """Fit the other root of the legs alone too and leave the better one, if it is better by far; returns its status and
-    chi-square sum.
+def _fit_better(geometry: Record, work: Record) -> tuple[int, float]:
+    """Refine the pose at both roots of the legs alone and leave the better one, if it is better by far; returns its status
+    and chi-square sum.
     """
-    work.best_position[:] = work.position
-    work.best_rotation[:] = work.rotation
-    pose_from_legs(geometry, work.directions, work.measured, 1, work.position, work.rotation, work.scratch)
+    position, rotation, second_position, second_rotation = (
+        work.position,
+        work.rotation,
+        work.second_position,
+        work.second_rotation,
+    )
+    work.best_position[:] = position
+    work.best_rotation[:] = rotation
+    second_pose_from_legs(geometry, work.directions, work.measured, position, rotation, work.scratch)
+    second_status, second_chi_square = _fit(geometry, True, work)
+    second_position[:] = position
+    second_rotation[:] = rotation
+    position[:] = work.best_position
+    rotation[:] = work.best_rotation
     status, chi_square = _fit(geometry, True, work)
-    apart = 0.0
-    for i in range(3):
-        for j in range(3):
-            apart = max(apart, abs(work.rotation[i, j] - work.best_rotation[i, j]))
-    if first_status == _SOLVED and status == _SOLVED and apart > _SAME_ROTATION:
-        least = min(chi_square, first_chi_square)
-        if abs(chi_square - first_chi_square) < min(_DISTINCT, _DISTINCT_SHARE * least / max(work.equations - 6, 1)):
+    if second_status != _SOLVED:
+        return status, chi_square
+    if status == _SOLVED:
+        apart = 0.0
+        for i in range(3):
+            for j in range(3):
+                apart = max(apart, abs(rotation[i, j] - second_rotation[i, j]))
+        if apart <= _SAME_ROTATION:
+            return status, chi_square
+        least = min(chi_square, second_chi_square)
+        if abs(chi_square - second_chi_square) < min(_DISTINCT, _DISTINCT_SHARE * least / max(work.equations - 6, 1)):
             return _AMBIGUOUS, chi_square
-        if chi_square < first_chi_square:
-            return _SOLVED, chi_square
-    elif first_status != _SOLVED and status == _SOLVED:
-        return _SOLVED, chi_square
-    work.position[:] = work.best_position
-    work.rotation[:] = work.best_rotation
-    _, chi_square = _fit(geometry, True, work)
-    return first_status, chi_square
+        if chi_square < second_chi_square:
+            return status, chi_square
+    position[:] = second_position
+    rotation[:] = second_rotation
+    return _fit(geometry, True, work)
 
 
 @kernel
