@@ -2,7 +2,7 @@
 
     measurement -> leg filters, platform filter -> direct kinematics -> inverse kinematics -> PID against the reference
 
-It allocates nothing, raises nothing and knows no clock: whatever happens every n-th cycle counts cycles. Constants lie in
+It allocates nothing, raises nothing and knows no clock: time is counted in periods, missed ones included. Constants lie in
 one structured array (dtype `PARAMETERS`), all state in another (dtype `STATE`); a copy of that is a snapshot.
 """
 
@@ -17,7 +17,7 @@ from controller.least_squares import RANK_TOLERANCE, solve_least_squares
 from controller.leg_filter import leg_direction, predict_leg, start_leg, update_leg
 from controller.pid import step_pid
 from controller.platform_filter import start_platform, step_platform
-from controller.reference import evaluate_reference
+from controller.reference import STOP_SEGMENTS, evaluate_reference, plan_stop
 from controller.settings import ControlSettings, FusionSettings
 from plant.compiled import Record, kernel
 from plant.errors import InputError
@@ -37,6 +37,9 @@ ALL_IMUS = tuple(range(IMU_COUNT))
 LEG_IMUS = tuple(range(LEGS))
 
 RATE_RANGE_HZ = (50.0, 4000.0)
+
+STOP_SETTLING_S = 0.1
+"""How long a mechanism that has stopped is held by its drives before the brakes take over [s]."""
 
 _WORST_CONDITIONING = 1e-2
 _LEAST_GRAVITY = 0.1
@@ -69,6 +72,9 @@ PARAMETERS = np.dtype(
         ("acceleration_rate", np.float64),
         ("gains", np.float64, 4),
         ("command_limit", np.float64),
+        ("acceleration_limit", np.float64),
+        ("jerk_limit", np.float64),
+        ("settling_cycles", np.int64),
         ("plausible_lengths", np.float64, (LEGS, 2)),
         ("droop", np.float64),
         ("moving_mass", np.float64),
@@ -85,6 +91,7 @@ PARAMETERS = np.dtype(
 STATE = np.dtype(
     [
         ("cycle", np.int64),
+        ("missed", np.int64),
         ("leg_x", np.float64, (LEGS, 9)),
         ("leg_covariance", np.float64, (LEGS, 9, 9)),
         ("platform_x", np.float64, 6),
@@ -103,6 +110,12 @@ STATE = np.dtype(
         ("lengths", np.float64, LEGS),
         ("reference_index", np.int64, LEGS),
         ("reference", np.float64, (LEGS, 3)),
+        ("prepared", np.int64),
+        ("driving", np.int64),
+        ("stopping", np.int64),
+        ("stop_cycle", np.int64),
+        ("stopped_cycle", np.int64),
+        ("stop_segments", np.float64, (LEGS, STOP_SEGMENTS, 5)),
         ("feed_forward", np.float64, LEGS),
         ("error", np.float64, LEGS),
         ("integral", np.float64, LEGS),
@@ -125,8 +138,11 @@ STATE = np.dtype(
 )
 """State of the cycle: filters, pose, controllers, and what the last cycle found.
 
-`twist` is velocity and angular velocity in {1}; `vertical` and `platform_rate` are seen in {2}; `information` is the
-inverse of the pose's covariance (lower triangle); `reference` holds length, rate and acceleration of each leg.
+`cycle` counts periods, `missed` those since the last cycle that had none. `twist` is velocity and angular velocity in {1};
+`vertical` and `platform_rate` are seen in {2}; `information` is the inverse of the pose's covariance (lower triangle).
+`reference` holds length, rate and acceleration of each leg in the cycle before `prepared`. The drives are `driving` after the
+hold. A stop, `stopping` for a cause that the loop numbers, begins in `stop_cycle`, and from `stopped_cycle` on the brakes may
+hold.
 """
 
 
@@ -189,6 +205,9 @@ def cycle_parameters(
         "acceleration_rate": 1.0 / fusion.acceleration_time,
         "gains": (control.proportional, control.integral, control.derivative, control.derivative_bandwidth),
         "command_limit": control.command_reserve * mechanism.require_limits().velocity,
+        "acceleration_limit": mechanism.require_limits().acceleration,
+        "jerk_limit": mechanism.require_limits().jerk,
+        "settling_cycles": int(np.ceil(STOP_SETTLING_S * rate)),
         "plausible_lengths": np.stack([stroke[:, 0] - margin, stroke[:, 1] + margin], axis=1),
         "droop": nominal * (1.0 - plant["drive.compensation"]) / force_constant**2,
         "moving_mass": sliding_mass + mass / LEGS,
@@ -264,21 +283,72 @@ def cycle(parameters: Record, state: Record, measurement: Array, segments: Array
         `OK`, or why the estimate cannot be used.
     """
     fuse_legs(parameters, state, measurement)
-    return control(parameters, state, measurement, segments)
+    fuse_platform(parameters, state, measurement)
+    status = locate(parameters, state)
+    return control(parameters, state, segments) if status == OK else status
 
 
 @kernel
-def control(parameters: Record, state: Record, measurement: Array, segments: Array) -> int:
-    """The cycle from the leg directions on, for leg filters of another kind."""
-    fuse_platform(parameters, state, measurement)
+def skip(state: Record, missed: int) -> None:
+    """Before a cycle: say how many periods have been missed since the last one."""
+    s = state[()]
+    s.missed = missed
+    s.cycle += missed
+
+
+@kernel
+def prepare(parameters: Record, state: Record, segments: Array) -> None:
+    """After a cycle: what need not lie between measurement and command, the reference of the next one."""
+    refer(parameters, state, segments)
+
+
+@kernel
+def begin_stop(parameters: Record, state: Record, cause: int) -> None:
+    """Between cycles: leave the motion for the fastest stop within the limits, leg by leg; during the hold there is nothing to
+    stop. The first cause, not 0, counts.
+    """
+    p, s = parameters[()], state[()]
+    if s.stopping != 0:
+        return
+    s.stopping = cause
+    s.stop_cycle = s.stopped_cycle = s.cycle
+    if s.cycle > p.hold_cycles:
+        duration = plan_stop(s.reference, p.acceleration_limit, p.jerk_limit, s.stop_segments)
+        s.stopped_cycle += int(np.ceil(duration / p.period)) + p.settling_cycles
+        s.reference_index[:] = 0
+        s.prepared = 0
+
+
+@kernel
+def has_stopped(state: Record) -> bool:
+    """Whether a stop has come to its end, so that the brakes may hold."""
+    s = state[()]
+    return bool(s.stopping != 0 and s.cycle >= s.stopped_cycle)
+
+
+@kernel
+def elapsed(parameters: Record, state: Record) -> float:
+    """Time since the last cycle [s]."""
+    return float((1 + state[()].missed) * parameters[()].period)
+
+
+@kernel
+def locate(parameters: Record, state: Record) -> int:
+    """Direct kinematics and its refinement; returns `OK` or `POSE_LOST`."""
     if find_pose(parameters, state) < RANK_TOLERANCE or not improve_pose(parameters, state):
         return POSE_LOST
+    return OK
+
+
+@kernel
+def control(parameters: Record, state: Record, segments: Array) -> int:
+    """From the pose to the commands; returns a status."""
+    p, s = parameters[()], state[()]
     invert(parameters, state)
-    refer(parameters, state, segments)
+    if s.prepared != s.cycle + 1:
+        refer(parameters, state, segments)
     regulate(parameters, state)
-    s = state[()]
     s.cycle += 1
-    p = parameters[()]
     for k in range(LEGS):
         if not (np.isfinite(s.command[k]) and np.isfinite(s.lengths[k])):
             return NOT_FINITE
@@ -291,6 +361,7 @@ def control(parameters: Record, state: Record, measurement: Array, segments: Arr
 def fuse_legs(parameters: Record, state: Record, measurement: Array) -> None:
     """Step the leg filters."""
     p, s = parameters[()], state[()]
+    period = elapsed(parameters, state)
     for k in range(LEGS):
         if p.leg_used[k] == 0.0:
             continue
@@ -299,7 +370,7 @@ def fuse_legs(parameters: Record, state: Record, measurement: Array) -> None:
         if s.cycle == 0:
             start_leg(x, covariance, rate, force, up, p.bias_sigma)
         else:
-            predict_leg(x, covariance, p.period, p.leg_jerk, p.bias_walk)
+            predict_leg(x, covariance, period, p.leg_jerk, p.bias_walk)
         update_leg(
             x, covariance, rate, force, up, p.leg_imu_position[k], p.gravity, p.gyroscope_variance, p.leg_force_variance,
             s.measurement_6, s.jacobian_6_9, s.vectors_9[0], s.vectors_9[1],
@@ -339,8 +410,9 @@ def fuse_platform(parameters: Record, state: Record, measurement: Array) -> None
     s.imu_acceleration[0] += a[1] * d[2] - a[2] * d[1] + w0 * wd - d[0] * ww
     s.imu_acceleration[1] += a[2] * d[0] - a[0] * d[2] + w1 * wd - d[1] * ww
     s.imu_acceleration[2] += a[0] * d[1] - a[1] * d[0] + w2 * wd - d[2] * ww
+    period = elapsed(parameters, state)
     step_platform(
-        s.platform_x, s.platform_covariance, rate, force, s.imu_acceleration, p.period, p.gravity, p.gyroscope_density,
+        s.platform_x, s.platform_covariance, rate, force, s.imu_acceleration, period, p.gravity, p.gyroscope_density,
         p.bias_walk, p.vertical_variance, s.matrices_6_6[0], s.matrices_6_6[1], s.vectors_6[0], s.vectors_6[1],
     )  # fmt: skip
     for i in range(3):
@@ -386,9 +458,10 @@ def improve_pose(parameters: Record, state: Record) -> bool:
     )  # fmt: skip
     if s.cycle == 0:
         s.smooth_twist[:] = s.twist
+    share = min(1.0, elapsed(parameters, state) * p.acceleration_rate)
     for i in range(6):
         s.acceleration[i] = (s.twist[i] - s.smooth_twist[i]) * p.acceleration_rate
-        s.smooth_twist[i] += min(1.0, p.period * p.acceleration_rate) * (s.twist[i] - s.smooth_twist[i])
+        s.smooth_twist[i] += share * (s.twist[i] - s.smooth_twist[i])
     return True
 
 
@@ -401,9 +474,13 @@ def invert(parameters: Record, state: Record) -> None:
 
 @kernel
 def refer(parameters: Record, state: Record, segments: Array) -> None:
-    """The reference of this cycle, whose time begins at the end of the hold."""
+    """The reference of this cycle: of the motion, whose time begins at the end of the hold, or of a stop."""
     p, s = parameters[()], state[()]
-    evaluate_reference(segments, max(s.cycle - p.hold_cycles, 0) * p.period, s.reference_index, s.reference)
+    if s.stopping != 0 and s.stop_cycle > p.hold_cycles:
+        evaluate_reference(s.stop_segments, (s.cycle - s.stop_cycle) * p.period, s.reference_index, s.reference)
+    else:
+        evaluate_reference(segments, max(s.cycle - p.hold_cycles, 0) * p.period, s.reference_index, s.reference)
+    s.prepared = s.cycle + 1
 
 
 @kernel
@@ -418,7 +495,10 @@ def regulate(parameters: Record, state: Record) -> None:
             s.previous_error[k] = s.error[k]
         return
     feed_load_forward(parameters, state)
-    step_pid(s.error, s.feed_forward, p.gains, p.command_limit, p.period, s.integral, s.previous_error, s.derivative, s.command)
+    step_pid(
+        s.error, s.feed_forward, p.gains, p.command_limit, elapsed(parameters, state), s.integral, s.previous_error,
+        s.derivative, s.command,
+    )  # fmt: skip
 
 
 @kernel

@@ -12,6 +12,7 @@ import numpy as np
 from ruckig import ControlInterface, InputParameter, Result, Ruckig, RuckigError, Synchronization, Trajectory
 
 from controller.inverse_kinematics import leg_lengths
+from controller.reference import stop_phases
 from controller.target import SAMPLE_PERIOD_S, Target
 from plant.compiled import kernel
 from plant.errors import PlanningError
@@ -262,23 +263,14 @@ def _stops_inside(state: Array, stroke: Array, limits: Array) -> bool:
     acceleration_limit, jerk_limit = limits[0], limits[1]
     for k in range(state.shape[1]):
         p, v, a = state[0, k], state[1, k], state[2, k]
-        sign = 1.0 if v + a * abs(a) / (2.0 * jerk_limit) >= 0.0 else -1.0
-        # Seen in the direction in which the leg would go on: jerk down to -peak, stay there, jerk back up.
-        v, a = sign * v, sign * a
-        peak = np.sqrt(max(jerk_limit * v + a * a / 2.0, 0.0))
-        stay = 0.0
-        if peak > acceleration_limit:
-            peak = acceleration_limit
-            stay = (v + a * a / (2.0 * jerk_limit) - peak * peak / jerk_limit) / peak
+        stop_jerk, down, stay, up = stop_phases(v, a, acceleration_limit, jerk_limit)
         least = greatest = at = 0.0
-        for jerk, duration in ((-jerk_limit, max((a + peak) / jerk_limit, 0.0)), (0.0, stay), (jerk_limit, peak / jerk_limit)):
+        for jerk, duration in ((stop_jerk, down), (0.0, stay), (-stop_jerk, up)):
             low, high, _ = _segment_extrema(at, v, a, jerk, duration)
             least, greatest = min(least, low), max(greatest, high)
             at += duration * (v + duration * (a / 2.0 + duration * jerk / 6.0))
             v += duration * (a + duration * jerk / 2.0)
             a += duration * jerk
-        if sign < 0.0:
-            least, greatest = -greatest, -least
         if p + least < stroke[k, 0] - _STROKE_SLACK or p + greatest > stroke[k, 1] + _STROKE_SLACK:
             return False
     return True

@@ -1,18 +1,33 @@
-"""The loop around the cycle: read the plant, run the cycle, command the plant, record. Compiled, and without a clock.
+"""The loop around the cycle: wait for the clock, read the rig, run the cycle, command the rig, record. Compiled.
 
-All state lies in the arrays of `Loop`, so a run can be taken up again at any cycle. The same steps in Python serve leg
-filters that are written in Python.
+All state lies in the arrays of `Loop`, so a run can be taken up again at any cycle. The same steps in Python serve rigs, and
+leg filters, that are written in Python.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
 from numba import types
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from controller.cycle import OK, control, cycle
+from controller.cycle import (
+    OK,
+    POSE_LOST,
+    begin_stop,
+    control,
+    find_pose,
+    fuse_legs,
+    fuse_platform,
+    has_stopped,
+    improve_pose,
+    prepare,
+    skip,
+)
+from controller.least_squares import RANK_TOLERANCE, factor_cholesky, invert_cholesky
+from hil.clock import FREE, REAL, finish, new_clock, now, start, wait
 from plant.compiled import Record, kernel
 from plant.fmu import CALLS, advance, read_imus, read_truth, write_command, write_drive_mode
 from plant.imu import measure
@@ -20,29 +35,105 @@ from plant.mechanism import LEGS
 from plant.pose import Array
 from plant.variables import BRAKE, IMU_COUNT, VELOCITY
 
-PLANT_FAILED = 100
-"""Added to FMI's status when the plant reports a failure; below it are the statuses of the cycle."""
+STOPPED, CLOCK_FAILED = 50, 51
+"""Statuses beside those of the cycle: a controlled stop has ended on the brakes; the machine's clock wakes no one."""
 
-CYCLE_RECORD = np.dtype(
+RIG_FAILED = 100
+"""Added to the rig's own status (FMI's, for an FMU) when it reports a failure."""
+
+NO_STOP, END_OF_MOTION, ASKED_TO_STOP, MISSED_PERIODS, SUPERVISOR_GONE = range(5)
+"""Why a controlled stop began."""
+
+STAGES = (
+    "sense",
+    "leg filters",
+    "platform filter",
+    "direct kinematics",
+    "refinement",
+    "control",
+    "send",
+    "record",
+    "plant",
+)
+"""What a cycle is made of: `control` is inverse kinematics, PID and feed-forward; `record` is what comes after the command:
+telemetry and the next reference; `plant` is the simulated one's own time."""
+
+_SENSE, _LEGS, _PLATFORM, _POSE, _REFINEMENT, _CONTROL, _SEND, _RECORD, _PLANT = range(len(STAGES))
+COMPUTED, TO_COMMAND = slice(_LEGS, _SEND), slice(_SENSE, _RECORD)
+"""The stages of the paper's Figure 4, and all between the wake-up and the command."""
+
+RECORD = np.dtype(
     [
-        ("truth", np.float64, CALLS["truth"].shape),
+        ("cycle", np.int64),
+        ("time_ns", np.int64),
+        ("late_ns", np.int64),
+        ("stage_ns", np.int64, len(STAGES)),
+        ("cpu_ns", np.int64),
+        ("missed", np.int64),
+        ("status", np.int32),
+        ("stop", np.int32),
+        ("angular_velocity", np.float64, (IMU_COUNT, 3)),
+        ("specific_force", np.float64, (IMU_COUNT, 3)),
+        ("magnetic_field", np.float64, (IMU_COUNT, 3)),
         ("position", np.float64, 3),
         ("rotation", np.float64, (3, 3)),
+        ("covariance", np.float32, (6, 6)),
+        ("residuals", np.float32, (LEGS, 3)),
+        ("conditioning", np.float64),
         ("lengths", np.float64, LEGS),
         ("reference", np.float64, (LEGS, 3)),
         ("command", np.float64, LEGS),
-        ("conditioning", np.float64),
-        ("cycle_ns", np.int64),
+        ("truth", np.float64, CALLS["truth"].shape),
     ],
     align=True,
 )
-"""What is kept of a cycle: the truth as the plant's `truth` buffer has it, estimate, reference, command, duration."""
+"""What is kept of a cycle: the period that it ran in; when it woke [ns since the first] and how late; the stages' durations and
+the thread's CPU time; periods missed before it; its status and the cause of a stop; raw IMU data; the pose with covariance
+(translation, rotation; in {1}), residuals of the directions and conditioning; lengths, reference (length, rate, acceleration)
+and commands; and the truth as the plant's `truth` buffer has it.
+"""
+
+HEAD, STOP, DONE, TAIL, LOST, SUPERVISOR = range(6)
+LINK = 16
+"""Places in the array that the loop shares with other processes, int64 (16,): records written, whether it shall stop, whether
+it has ended; records taken out by the recorder, and lost to it; the process whose end ends the motion, 0 for none."""
 
 LegFusion = Callable[[Record, Array], None]
 """Leg filters in Python: take the cycle's state and a measurement (3, 7, 3), and leave directions and rates in the state."""
 
-_CLOCK_MONOTONIC = 1
-_clock_gettime: Any = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
+_ENDLESS = np.iinfo(np.int64).max
+_LOOK_NS = 100_000_000
+_SIGNALS = 1 << 1 | 1 << 14
+"""SIGINT and SIGTERM in a set of signals."""
+
+_WORK = np.dtype(
+    [
+        ("cycle", np.int64),
+        ("measurement", np.float64, (3, IMU_COUNT, 3)),
+        ("truth", np.float64, CALLS["truth"].shape),
+        ("factor", np.float64, (6, 6)),
+        ("covariance", np.float64, (6, 6)),
+        ("stage_ns", np.int64, len(STAGES)),
+        ("signals", np.int64, 16),
+    ],
+    align=True,
+)
+_getppid: Any = types.ExternalFunction("getppid", types.int32())
+_sigpending: Any = types.ExternalFunction("sigpending", types.int32(types.intp))
+
+
+def _store(typing_context: Any, link: Any, index: Any, value: Any) -> Any:
+    """Store a number in a shared int64 array after everything that was stored before it."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array = context.make_array(signature.args[0])(context, builder, arguments[0])
+        builder.store_atomic(arguments[2], builder.gep(array.data, [arguments[1]]), "release", 8)
+        return context.get_dummy_value()
+
+    return types.void(types.int64[::1], types.intp, types.int64), generate
+
+
+_publish: Any = intrinsic(_store)
 
 
 @dataclass(eq=False)
@@ -54,7 +145,11 @@ class Loop:
         imu: the IMUs' imperfections (dtype `plant.imu.IMU_STATE`).
         parameters, state: of the cycle.
         segments: the reference.
-        records: (N,), dtype `CYCLE_RECORD`, one for each cycle.
+        records: (N,), dtype `RECORD`, written round and round.
+        clock: dtype `hil.clock.CLOCK`; by default the loop runs as fast as it goes.
+        script: (n, 3), of a scripted clock.
+        link: (16,), what is shared with other processes.
+        most_missed: periods missed in a row that end in a controlled stop.
     """
 
     calls: Record
@@ -63,83 +158,286 @@ class Loop:
     state: Record
     segments: Array
     records: Record
+    clock: Record = field(default_factory=lambda: new_clock(FREE, 0))
+    script: NDArray[np.int64] = field(default_factory=lambda: np.zeros((1, 3), np.int64))
+    link: NDArray[np.int64] = field(default_factory=lambda: np.zeros(LINK, np.int64))
+    most_missed: int = 10
 
     def __post_init__(self) -> None:
-        self._measurement = np.zeros((3, IMU_COUNT, 3))
-        self._clock = np.zeros(2, np.int64)
+        self._work: Record = np.zeros((), _WORK)
+        self._work["truth"] = np.nan
 
     def run(self, last: int, fuse: LegFusion | None = None) -> int:
         """Run up to but not including cycle `last`; returns a status, 0 when all is well, and brakes when it is not."""
         if fuse is None:
-            return _run(
-                self.calls, self.imu, self.parameters, self.state, self.segments, self.records, self._measurement, self._clock,
-                last,
-            )  # fmt: skip
-        for k in range(int(self.state["cycle"]), last):
-            status = _sense(self.calls, self.imu, self.parameters, self.state, self._measurement)
-            began = now(self._clock)
-            if status == OK:
-                fuse(self.state, self._measurement)
-                status = control(self.parameters, self.state, self._measurement, self.segments)
-            duration = now(self._clock) - began
-            status = _act(self.calls, self.parameters, self.state, self.records[k : k + 1], duration, status)
+            return self._run(last, _ENDLESS)
+        return self.run_python(_FmuRig(self), last, _ENDLESS, fuse)
+
+    def follow(self, end: int, rig: "Rig | None" = None) -> int:
+        """Follow the motion to cycle `end`, stop there, or earlier for a cause, and brake; returns `STOPPED`, or what failed.
+
+        With a rig in Python the loop is one, too.
+        """
+        if rig is None:
+            return self._run(_ENDLESS, end)
+        return self.run_python(rig, _ENDLESS, end)
+
+    def _run(self, last: int, end: int) -> int:
+        return _run(
+            self.calls, self.imu, self.parameters, self.state, self.segments, self.records, self.clock, self.script, self.link,
+            self._work, self.most_missed, last, end,
+        )  # fmt: skip
+
+    def run_python(self, rig: "Rig", last: int, end: int, fuse: LegFusion | None = None) -> int:
+        """The loop of `_run`, in Python."""
+        parameters, state, clock, work = self.parameters, self.state, self.clock, self._work
+        measurement, stage_ns, timespec = work["measurement"], work["stage_ns"], clock["timespec"]
+        status = OK
+        while status == OK and state["cycle"] < last:
+            status = _begin(parameters, state, clock, self.script, self.link, work, self.most_missed, end)
             if status != OK:
-                return status
-        return OK
+                break
+            began = now(timespec)
+            status = rig.read(measurement, int(state["missed"]))
+            if status == OK and _is_due(parameters, state):
+                status = rig.release()
+            stage_ns[_SENSE] = now(timespec) - began
+            if status == OK and fuse is None:
+                status = _compute(parameters, state, self.segments, work, timespec)
+            elif status == OK and fuse is not None:
+                began = now(timespec)
+                fuse(state, measurement)
+                stage_ns[_LEGS] = now(timespec) - began
+                status = _compute_from_legs(parameters, state, self.segments, work, timespec)
+            began = now(timespec)
+            if status == OK:
+                status = rig.write(state["command"])
+            stage_ns[_SEND] = now(timespec) - began
+            _note(parameters, state, self.segments, self.records, clock, self.link, work, status)
+            began = now(timespec)
+            if status == OK:
+                status = rig.advance()
+            stage_ns[_PLANT] = now(timespec) - began
+            _end(self.records, clock, self.script, self.link, work)
+        if status != OK:
+            rig.brake()
+        return status
+
+
+class Rig(Protocol):
+    """What the loop needs of a rig. Every call returns a status, 0 when all is well, else `RIG_FAILED` plus the rig's own."""
+
+    def read(self, measurement: Array, missed: int) -> int:
+        """Write the latest IMU data (3, 7, 3), `missed` periods and one after the last."""
+
+    def release(self) -> int:
+        """Release the brakes: from now on the drives follow the commands."""
+
+    def write(self, command: Array) -> int:
+        """Command the drives' velocities (6,) [m/s]."""
+
+    def advance(self) -> int:
+        """After the command: what the rig does until the next period; a real one nothing."""
+
+    def brake(self) -> int:
+        """Stop the drives on their brakes, whatever has happened."""
+
+
+class _FmuRig:
+    """The plant behind a loop's `calls`, for loops in Python."""
+
+    def __init__(self, loop: Loop) -> None:
+        self._loop = loop
+
+    def read(self, measurement: Array, missed: int) -> int:
+        loop = self._loop
+        if loop.state["cycle"] == 0:
+            write_drive_mode(loop.calls, BRAKE)
+        status = _catch_up(loop.calls, loop.parameters, missed)
+        return status or _read(loop.calls, loop.imu, loop._work)
+
+    def release(self) -> int:
+        return _checked(write_drive_mode(self._loop.calls, VELOCITY))
+
+    def write(self, command: Array) -> int:
+        return _checked(write_command(self._loop.calls, command))
+
+    def advance(self) -> int:
+        return _checked(advance(self._loop.calls, float(self._loop.parameters["period"])))
+
+    def brake(self) -> int:
+        return _checked(write_drive_mode(self._loop.calls, BRAKE))
 
 
 @kernel
-def now(clock: NDArray[np.int64]) -> int:
-    """The monotonic clock [ns]; `clock` (2,) is scratch."""
-    _clock_gettime(_CLOCK_MONOTONIC, clock.ctypes.data)
-    return int(clock[0] * 1_000_000_000 + clock[1])
+def _checked(status: int) -> int:
+    return RIG_FAILED + status if status else OK
 
 
 @kernel
-def _sense(calls: Record, imu: Record, parameters: Record, state: Record, measurement: Array) -> int:
-    """Read the plant through the IMUs' imperfections; the brakes hold from the first cycle to the end of the hold."""
+def _begin(
+    parameters: Record, state: Record, clock: Record, script: NDArray[np.int64], link: NDArray[np.int64], work: Record,
+    most_missed: int, end: int,
+) -> int:  # fmt: skip
+    """Wait for the next period, take note of missed ones, and stop where that is due; returns a status."""
+    c, s = clock[()], state[()]
+    if c.cycles == 0:
+        start(clock)
+    missed = wait(clock, script)
+    if missed < 0:
+        return CLOCK_FAILED
+    skip(state, missed)
+    work[()].cycle = s.cycle
+    if s.cycle >= end:
+        begin_stop(parameters, state, END_OF_MOTION)
+    if link[STOP] != 0:
+        begin_stop(parameters, state, ASKED_TO_STOP)
+    if c.in_a_row >= most_missed:
+        begin_stop(parameters, state, MISSED_PERIODS)
+    if c.mode == REAL and c.cycles % max(_LOOK_NS // c.period, 1) == 0:
+        signals = work[()].signals
+        if _sigpending(signals.ctypes.data) == 0 and signals[0] & _SIGNALS != 0:
+            begin_stop(parameters, state, ASKED_TO_STOP)
+        if link[SUPERVISOR] != 0 and _getppid() != link[SUPERVISOR]:
+            begin_stop(parameters, state, SUPERVISOR_GONE)
+    return STOPPED if has_stopped(state) else OK
+
+
+@kernel
+def _catch_up(calls: Record, parameters: Record, missed: int) -> int:
+    """Let the plant move for the periods that were missed."""
     status = 0
-    if state[()].cycle == 0:
-        status |= write_drive_mode(calls, BRAKE)
-    if state[()].cycle == parameters[()].hold_cycles:
-        status |= write_drive_mode(calls, VELOCITY)
-    status |= read_imus(calls)
-    status |= read_truth(calls)
-    measure(imu, calls[()].imu, measurement)
-    return PLANT_FAILED + status if status else OK
+    for _ in range(missed):
+        status |= advance(calls, parameters[()].period)
+    return _checked(status)
 
 
 @kernel
-def _act(calls: Record, parameters: Record, state: Record, records: Record, duration: int, status: int) -> int:
-    """Record the cycle, command the plant and let it move for a period; brake it if the cycle failed."""
-    s, record = state[()], records[0]
-    record.truth[:] = calls[()].truth
+def _read(calls: Record, imu: Record, work: Record) -> int:
+    """Read the plant through the IMUs' imperfections."""
+    status = read_imus(calls) | read_truth(calls)
+    measure(imu, calls[()].imu, work[()].measurement)
+    work[()].truth[:] = calls[()].truth
+    return _checked(status)
+
+
+@kernel
+def _is_due(parameters: Record, state: Record) -> bool:
+    """Whether the drives are to be released in this cycle; said once."""
+    p, s = parameters[()], state[()]
+    due = s.driving == 0 and s.cycle >= p.hold_cycles
+    if due:
+        s.driving = 1
+    return bool(due)
+
+
+@kernel
+def _compute(parameters: Record, state: Record, segments: Array, work: Record, timespec: NDArray[np.int64]) -> int:
+    """The steps of `controller.cycle.cycle`, with the clock read in between."""
+    measurement, stage_ns = work[()].measurement, work[()].stage_ns
+    t = now(timespec)
+    fuse_legs(parameters, state, measurement)
+    stage_ns[_LEGS] = now(timespec) - t
+    return _compute_from_legs(parameters, state, segments, work, timespec)
+
+
+@kernel
+def _compute_from_legs(parameters: Record, state: Record, segments: Array, work: Record, timespec: NDArray[np.int64]) -> int:
+    measurement, stage_ns = work[()].measurement, work[()].stage_ns
+    t0 = now(timespec)
+    fuse_platform(parameters, state, measurement)
+    t1 = now(timespec)
+    conditioning = find_pose(parameters, state)
+    t2 = now(timespec)
+    found = conditioning >= RANK_TOLERANCE and improve_pose(parameters, state)
+    t3 = now(timespec)
+    status = control(parameters, state, segments) if found else POSE_LOST
+    t4 = now(timespec)
+    stage_ns[_PLATFORM], stage_ns[_POSE], stage_ns[_REFINEMENT], stage_ns[_CONTROL] = t1 - t0, t2 - t1, t3 - t2, t4 - t3
+    return status
+
+
+@kernel
+def _note(
+    parameters: Record, state: Record, segments: Array, records: Record, clock: Record, link: NDArray[np.int64], work: Record,
+    status: int,
+) -> None:  # fmt: skip
+    """After the command: record the cycle, and prepare the next reference."""
+    p, s, c, w = parameters[()], state[()], clock[()], work[()]
+    began = now(c.timespec)
+    head = link[HEAD]
+    record = records[head % records.shape[0]]
+    record.cycle = w.cycle
+    record.time_ns = c.woke - c.start if c.mode != FREE else np.int64(np.rint(1e9 * p.period * w.cycle))
+    record.late_ns = c.late
+    record.missed = s.missed
+    record.status = status
+    record.stop = s.stopping
+    record.angular_velocity[:] = w.measurement[0]
+    record.specific_force[:] = w.measurement[1]
+    record.magnetic_field[:] = w.measurement[2]
     record.position[:] = s.position
     record.rotation[:] = s.rotation
+    record.conditioning = s.conditioning
     record.lengths[:] = s.lengths
     record.reference[:] = s.reference
     record.command[:] = s.command
-    record.conditioning = s.conditioning
-    record.cycle_ns = duration
-    if status != OK:
-        write_drive_mode(calls, BRAKE)
-        return status
-    plant_status = write_command(calls, s.command) | advance(calls, parameters[()].period)
-    return PLANT_FAILED + plant_status if plant_status else OK
+    record.truth[:] = w.truth
+    for k in range(LEGS):
+        for i in range(3):
+            record.residuals[k, i] = s.directions[k, i] - s.predicted[k, i] if p.leg_used[k] != 0.0 else np.nan
+    w.factor[:] = s.information
+    if factor_cholesky(w.factor):
+        invert_cholesky(w.factor, w.covariance)
+        record.covariance[:] = w.covariance
+    else:
+        record.covariance[:] = np.nan
+    prepare(parameters, state, segments)
+    w.stage_ns[_RECORD] = now(c.timespec) - began
+
+
+@kernel
+def _end(records: Record, clock: Record, script: NDArray[np.int64], link: NDArray[np.int64], work: Record) -> None:
+    """End the cycle: set the next deadline, complete the record, and let others see it."""
+    head = link[HEAD]
+    record = records[head % records.shape[0]]
+    record.cpu_ns = finish(clock, script)
+    record.stage_ns[:] = work[()].stage_ns
+    _publish(link, HEAD, head + 1)
 
 
 @kernel
 def _run(
-    calls: Record, imu: Record, parameters: Record, state: Record, segments: Array, records: Record, measurement: Array,
-    clock: NDArray[np.int64], last: int,
+    calls: Record, imu: Record, parameters: Record, state: Record, segments: Array, records: Record, clock: Record,
+    script: NDArray[np.int64], link: NDArray[np.int64], work: Record, most_missed: int, last: int, end: int,
 ) -> int:  # fmt: skip
-    for k in range(state[()].cycle, last):
-        status = _sense(calls, imu, parameters, state, measurement)
-        began = now(clock)
-        if status == OK:
-            status = cycle(parameters, state, measurement, segments)
-        duration = now(clock) - began
-        status = _act(calls, parameters, state, records[k : k + 1], duration, status)
+    s, stage_ns, timespec = state[()], work[()].stage_ns, clock[()].timespec
+    status = OK
+    while status == OK and s.cycle < last:
+        status = _begin(parameters, state, clock, script, link, work, most_missed, end)
         if status != OK:
-            return status
-    return OK
+            break
+        began = now(timespec)
+        if s.cycle == 0:
+            write_drive_mode(calls, BRAKE)
+        status = _catch_up(calls, parameters, s.missed)
+        if status == OK:
+            status = _read(calls, imu, work)
+        if status == OK and _is_due(parameters, state):
+            status = _checked(write_drive_mode(calls, VELOCITY))
+        stage_ns[_SENSE] = now(timespec) - began
+        if status == OK:
+            status = _compute(parameters, state, segments, work, timespec)
+        began = now(timespec)
+        if status == OK:
+            status = _checked(write_command(calls, s.command))
+        stage_ns[_SEND] = now(timespec) - began
+        _note(parameters, state, segments, records, clock, link, work, status)
+        began = now(timespec)
+        if status == OK:
+            status = _checked(advance(calls, parameters[()].period))
+        stage_ns[_PLANT] = now(timespec) - began
+        _end(records, clock, script, link, work)
+    if status != OK:
+        write_drive_mode(calls, BRAKE)
+    return status

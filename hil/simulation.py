@@ -16,7 +16,7 @@ from controller.leg_filter import start_leg
 from controller.planner import Reference, plan
 from controller.settings import control_settings, fusion_settings
 from controller.target import Target, check_duration, load_target
-from hil.loop import CYCLE_RECORD, PLANT_FAILED, LegFusion, Loop
+from hil.loop import COMPUTED, RECORD, RIG_FAILED, LegFusion, Loop
 from plant.compiled import Record
 from plant.errors import GoughError, InputError, UnknownNameError
 from plant.export import default_fmu
@@ -64,9 +64,9 @@ class SimulationConfig:
         cycles = self.duration * self.rate
         if round(cycles) < 1:
             raise InputError(f"the duration is {self.duration:g} s, less than one cycle of {1.0 / self.rate:g} s")
-        if cycles * CYCLE_RECORD.itemsize > MOST_RECORD_BYTES:
+        if cycles * RECORD.itemsize > MOST_RECORD_BYTES:
             raise InputError(
-                f"{self.duration:g} s at {self.rate:g} Hz would record {cycles * CYCLE_RECORD.itemsize / 2**30:.3g} GiB, "
+                f"{self.duration:g} s at {self.rate:g} Hz would record {cycles * RECORD.itemsize / 2**30:.3g} GiB, "
                 f"more than {MOST_RECORD_BYTES / 2**30:g} GiB: choose a shorter duration or a lower rate"
             )
         if self.fusion not in FUSIONS:
@@ -91,7 +91,7 @@ class SimulationResult:
         config: what was simulated.
         mechanism, target, reference: what it was simulated with.
         times: (N,) [s]; 0 is the end of the hold.
-        records: (N,), dtype `hil.loop.CYCLE_RECORD`.
+        records: (N,), dtype `hil.loop.RECORD`.
         reference_positions, reference_rotations: (N, 3) [m] and (N, 3, 3), the planned pose.
         target_positions, target_rotations: (N, 3) [m] and (N, 3, 3), the raw target.
         real_time_factor: simulated time over the time that planning and loop took.
@@ -132,7 +132,7 @@ class SimulationResult:
         estimate = (self.records["position"][moving], self.records["rotation"][moving])
         reference = (self.reference_positions[moving], self.reference_rotations[moving])
         target = (self.target_positions[moving], self.target_rotations[moving])
-        cycle_us = self.records["cycle_ns"] / 1e3
+        cycle_us = self.records["stage_ns"][:, COMPUTED].sum(axis=1) / 1e3
         return {
             "estimation": _errors(estimate, truth),
             "tracking": _errors(truth, reference),
@@ -173,12 +173,12 @@ def simulate(config: SimulationConfig, progress: Callable[[float], None] = lambd
         done = int(loop.state["cycle"])
         result = _result(config, loop, done, took)
         if status != OK:
-            cause = str(loop.plant.failure("the plant failed")) if status >= PLANT_FAILED else _CAUSES[status]
+            cause = str(loop.plant.failure("the plant failed")) if status >= RIG_FAILED else _CAUSES[status]
             raise SimulationStoppedError(f"stopped on the brakes at cycle {done} of {count}: {cause}", result)
     return result
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, kw_only=True)
 class PreparedLoop(Loop):
     """A loop that is ready to run, with what it was prepared from.
 
@@ -222,7 +222,7 @@ def prepared_loop(config: SimulationConfig) -> Iterator[PreparedLoop]:
             parameters=parameters,
             state=np.zeros((), STATE),
             segments=reference.segments,
-            records=np.zeros(count, CYCLE_RECORD),
+            records=np.zeros(count, RECORD),
             plant=plant,
             mechanism=mechanism,
             target=target,

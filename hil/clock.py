@@ -1,0 +1,151 @@
+"""The clock of the loop: absolute deadlines, late wake-ups and long work told apart, missed periods skipped in phase.
+
+A wake-up that is late by whole periods, or work that lasts into the next ones, leaves those periods out and counts them; the
+deadlines stay where they are. A period is missed by own work if the thread computed for longer than a period, else by the
+host, which took the processor away. Time is CLOCK_MONOTONIC, which no one sets. In tests a script takes its place.
+"""
+
+from typing import Any
+
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from plant.compiled import Record, kernel
+
+FREE, REAL, SCRIPTED = range(3)
+"""Whether the loop runs as fast as it goes, on the machine's clock, or on a script."""
+
+CLOCK = np.dtype(
+    [
+        ("mode", np.int64),
+        ("period", np.int64),
+        ("start", np.int64),
+        ("deadline", np.int64),
+        ("woke", np.int64),
+        ("late", np.int64),
+        ("cpu", np.int64),
+        ("time", np.int64),
+        ("cycles", np.int64),
+        ("overrun", np.int64),
+        ("in_a_row", np.int64),
+        ("most_in_a_row", np.int64),
+        ("missed_late", np.int64),
+        ("missed_own", np.int64),
+        ("missed_host", np.int64),
+        ("timespec", np.int64, 2),
+    ],
+    align=True,
+)
+"""State of the clock, in ns: period, first and present deadline, when the cycle woke and how late, CPU time at the end of the
+last one, and the time of a script. `overrun` is how many periods the last cycle's work ran over, `in_a_row` how many were
+missed since a cycle last followed right upon another, and `most_in_a_row` the most ever. Missed ones are counted by cause:
+woken late, own work, and work that the host held up.
+"""
+
+_CLOCK_MONOTONIC, _CLOCK_THREAD_CPUTIME = 1, 3
+_TIMER_ABSTIME, _EINTR = 1, 4
+_LEAD_NS = 2_000_000
+
+_clock_gettime: Any = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
+_clock_nanosleep: Any = types.ExternalFunction("clock_nanosleep", types.int32(types.int32, types.int32, types.intp, types.intp))
+
+
+def new_clock(mode: int, period_ns: int) -> Record:
+    """A clock (dtype `CLOCK`) that has not started."""
+    clock = np.zeros((), CLOCK)
+    clock["mode"], clock["period"] = mode, period_ns
+    return clock
+
+
+@kernel
+def now(timespec: NDArray[np.int64]) -> int:
+    """The monotonic clock [ns]; `timespec` (2,) is scratch."""
+    _clock_gettime(_CLOCK_MONOTONIC, timespec.ctypes.data)
+    return int(timespec[0] * 1_000_000_000 + timespec[1])
+
+
+@kernel
+def _cpu_time(timespec: NDArray[np.int64]) -> int:
+    _clock_gettime(_CLOCK_THREAD_CPUTIME, timespec.ctypes.data)
+    return int(timespec[0] * 1_000_000_000 + timespec[1])
+
+
+@kernel
+def start(clock: Record) -> None:
+    """Set the first deadline, a moment from now."""
+    c = clock[()]
+    if c.mode == REAL:
+        c.deadline = now(c.timespec) + _LEAD_NS
+        c.cpu = _cpu_time(c.timespec)
+    else:
+        c.deadline = c.period
+    c.start = c.deadline
+
+
+@kernel
+def wait(clock: Record, script: NDArray[np.int64]) -> int:
+    """Sleep until the deadline.
+
+    Args:
+        clock: dtype `CLOCK`.
+        script: (n, 3) [ns], for each cycle of a scripted clock: lateness, duration of the work, CPU time of it.
+
+    Returns:
+        How many periods have been missed since the last cycle, -1 if the machine's clock refuses to wake anyone.
+    """
+    c = clock[()]
+    if c.mode == FREE:
+        c.woke = now(c.timespec)
+        return 0
+    if c.mode == SCRIPTED:
+        c.woke = max(c.time, c.deadline) + script[c.cycles % script.shape[0], 0]
+    else:
+        c.woke = now(c.timespec)
+        while c.woke < c.deadline:
+            c.timespec[0], c.timespec[1] = c.deadline // 1_000_000_000, c.deadline % 1_000_000_000
+            status = _clock_nanosleep(_CLOCK_MONOTONIC, _TIMER_ABSTIME, c.timespec.ctypes.data, 0)
+            if status != 0 and status != _EINTR:
+                return -1
+            c.woke = now(c.timespec)
+    c.late = c.woke - c.deadline
+    late = c.late // c.period
+    if c.cycles == 0:
+        # The phase begins with the first cycle; before it there is nothing to miss.
+        c.deadline += late * c.period
+        c.start = c.deadline
+        return 0
+    c.missed_late += late
+    c.deadline += late * c.period
+    missed = c.overrun + late
+    c.in_a_row = c.in_a_row + missed if missed > 0 else 0
+    c.most_in_a_row = max(c.most_in_a_row, c.in_a_row)
+    return int(missed)
+
+
+@kernel
+def finish(clock: Record, script: NDArray[np.int64]) -> int:
+    """End a cycle and set the next deadline; returns the CPU time of the cycle [ns]."""
+    c = clock[()]
+    if c.mode == FREE:
+        c.cycles += 1
+        return 0
+    if c.mode == SCRIPTED:
+        row = script[c.cycles % script.shape[0]]
+        done, used = c.woke + row[1], row[2]
+        c.time = done
+    else:
+        cpu = _cpu_time(c.timespec)
+        used, c.cpu = cpu - c.cpu, cpu
+        done = now(c.timespec)
+    c.cycles += 1
+    c.deadline += c.period
+    c.overrun = 0
+    if done > c.deadline:
+        c.overrun = -((c.deadline - done) // c.period)
+        c.deadline += c.overrun * c.period
+        if used > c.period:
+            c.missed_own += c.overrun
+        else:
+            c.missed_host += c.overrun
+    return int(used)
