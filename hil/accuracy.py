@@ -25,14 +25,12 @@ from plant.classification import (
 )
 from plant.errors import InputError, SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
-from plant.pose import Array, Pose, rotation_angle, rotation_from_vector
+from plant.pose import Array, checked_seed, rotation_angle, rotation_from_vector
 
 ALL_LEGS = tuple(range(LEGS))
 
 _REACH, _TILT = 1.0 / 6.0, np.radians(15.0)
 """Poses are drawn within this share of the base's radius and this angle about home: 50 mm and 15 deg on `hexapod`."""
-_HOME_HEIGHT = 7.0 / 6.0
-"""Height of home over the base's radius, for mechanisms without one."""
 _TWO_LEGS = (0, 3)
 _BOUND_SHARE = 0.99
 _CLASS_MECHANISMS, _CLASS_POSES = 20, 50
@@ -100,7 +98,7 @@ def evaluate_accuracy(mechanism: Mechanism, poses: int = 2000, seed: int = 0) ->
     """
     if poses < 1:
         raise InputError(f"{poses} poses were asked for; give 1 at least")
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(checked_seed(seed))
     positions, rotations = draw_poses(mechanism, poses, random)
     noisy = draw_measurements(mechanism, positions, rotations, random, 1.0)
     exact = draw_measurements(mechanism, positions, rotations, random, 0.0)
@@ -116,10 +114,8 @@ def evaluate_accuracy(mechanism: Mechanism, poses: int = 2000, seed: int = 0) ->
 
 def draw_poses(mechanism: Mechanism, count: int, random: np.random.Generator) -> tuple[Array, Array]:
     """Positions (count, 3) [m] and rotations (count, 3, 3), uniform about home by axes and by xyz angles."""
-    center = mechanism.base_joints.mean(axis=0)
-    radius = float(np.linalg.norm(mechanism.base_joints - center, axis=1).max())
-    level = center - mechanism.platform_joints.mean(axis=0) + [0.0, 0.0, _HOME_HEIGHT * radius]
-    home = mechanism.home or Pose(level, np.eye(3))
+    radius = float(np.linalg.norm(mechanism.base_joints - mechanism.base_joints.mean(axis=0), axis=1).max())
+    home = mechanism.nominal_home
     positions = home.position + random.uniform(-_REACH * radius, _REACH * radius, (count, 3))
     about_x, about_y, about_z = (
         np.array([rotation_from_vector(angle * axis) for angle in random.uniform(-_TILT, _TILT, count)]) for axis in np.eye(3)
@@ -220,6 +216,7 @@ class ClassAccuracy:
 
 def evaluate_classes(seed: int = 0, progress: Callable[[float], None] = lambda share: None) -> list[ClassAccuracy]:
     """The needs and errors of every class, spatial and planar."""
+    checked_seed(seed)
     rows = []
     for number, mechanism_class in enumerate(spatial_classes()):
         rows.append(_evaluate_class(mechanism_class, np.random.default_rng((seed, number))))

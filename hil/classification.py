@@ -106,8 +106,9 @@ def describe(mechanism: Mechanism | PlanarMechanism) -> Description:
     else:
         where = "poses within a sixth of the base's radius and 15 deg about home"
         poses = draw_poses(mechanism, _POSES, random)
-    home = (mechanism.home.position[None], mechanism.home.rotation[None]) if mechanism.home else (poses[0][:1], poses[1][:1])
-    positions, rotations = np.concatenate([home[0], poses[0]]), np.concatenate([home[1], poses[1]])
+    home = mechanism.nominal_home
+    positions = np.concatenate([home.position[None], poses[0]])
+    rotations = np.concatenate([home.rotation[None], poses[1]])
     exact = draw_measurements(mechanism, positions, rotations, random, 0.0)
     needs = []
     for requirement in required_measurements(mechanism):
@@ -197,7 +198,7 @@ def write_report(description: Description, path: Path) -> None:
 def _table(description: Description) -> str:
     rows = "".join(
         f"<tr><th>{escape(need.requirement.method)}<small>{_claim(need)}</small></th>"
-        f"<td>{escape(need.requirement.text)}</td><td>{need.home:.2g}</td><td>{need.worst:.2g}</td></tr>\n"
+        f"<td>{escape(need.requirement.text)}<small>{need.requirement.choice_text}</small></td><td>{need.home:.2g}</td><td>{need.worst:.2g}</td></tr>\n"
         for need in description.needs
     )
     return f"""<table>
@@ -234,14 +235,13 @@ def _graph(description: Description) -> go.Figure:
 
 def _spatial_view(mechanism: Mechanism) -> go.Figure:
     base = 1e3 * mechanism.base_joints
-    if mechanism.home is not None:
-        joints = 1e3 * (mechanism.home.position + mechanism.platform_joints @ mechanism.home.rotation.T)
-    else:
-        lengths = 1.0 + 0.0 * base[:, :1]
-        center = base.mean(axis=0) + np.linalg.norm(base - base.mean(axis=0), axis=1).max() * mechanism.up_in_base
-        joints = center + 1e3 * (mechanism.platform_joints - mechanism.platform_joints.mean(axis=0)) * lengths
+    home = mechanism.nominal_home
+    joints = 1e3 * (home.position + mechanism.platform_joints @ home.rotation.T)
     base_ring, platform_ring = ring(base), ring(joints)
-    labels = base + 0.12 * (base - base.mean(axis=0))
+    numbers = joint_numbers(mechanism.base_joints)
+    shared = [np.flatnonzero(numbers == number) for number in range(numbers.max() + 1)]
+    labels = np.array([base[legs[0]] + 0.12 * (base[legs[0]] - base.mean(axis=0)) for legs in shared])
+    texts = [", ".join(str(leg) for leg in legs) for legs in shared]
     figure = go.Figure(
         [
             plate_trace(coordinates(joints[platform_ring[:-1]]), "#6d87a3", 0.55),
@@ -249,7 +249,7 @@ def _spatial_view(mechanism: Mechanism) -> go.Figure:
             line_trace(coordinates(segments(base, joints)), segment_colors(LEG_NAMES), 10),
             plate_trace(coordinates(base[base_ring[:-1]]), FAINT, 0.35),
             line_trace(coordinates(base[base_ring]), "#5c6873", 6),
-            go.Scatter3d(coordinates(labels), mode="text", text=[str(k) for k in range(len(base))], hoverinfo="skip"),
+            go.Scatter3d(coordinates(labels), mode="text", text=texts, hoverinfo="skip"),
         ]
     )
     margin = {"l": 0, "r": 0, "t": 0, "b": 10}

@@ -343,6 +343,9 @@ def _classify(options: argparse.Namespace) -> int:
         row = (need.requirement.text, PAPER.get(method, "beyond"), modes, f"{need.home:.2g}", f"{need.worst:.2g}")
         table.add_row(method, *row)
     _print(table)
+    for need in description.needs:
+        if need.requirement.choice_text:
+            print(f"{need.requirement.method}: legs {need.requirement.choice_text}")
     print(f"Worst over {description.where}. Sections are the paper's.")
     return 0
 

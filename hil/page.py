@@ -129,7 +129,7 @@ th { font-weight: 500; text-align: right; padding: 3px 0 3px 10px; }
 thead th { color: var(--faint); font-size: 13px; }
 tbody th { text-align: left; padding-left: 0; }
 tbody tr { border-top: 1px solid var(--line); }
-th small { display: block; color: var(--faint); font-weight: 400; }
+th small, td small { display: block; color: var(--faint); font-weight: 400; }
 td { text-align: right; padding: 8px 0 8px 10px; }
 dl { display: grid; gap: 10px; margin: 22px 0 0; }
 dl div { border-left: 3px solid var(--line); padding-left: 12px; }

@@ -13,7 +13,7 @@ import numpy as np
 
 from plant.compiled import Record, kernel
 from plant.errors import InputError, UnknownNameError
-from plant.pose import Array, rotation_from_vector
+from plant.pose import Array, checked_seed, rotation_from_vector
 from plant.variables import IMU_COUNT
 
 STANDARD_GRAVITY = 9.80665
@@ -194,8 +194,7 @@ def imu_state(model: ImuModel, seed: int, period: float) -> Record:
     Raises:
         InputError: a negative seed, or a delay longer than 32 cycles.
     """
-    if not 0 <= seed < 2**63:
-        raise InputError(f"the seed is {seed}; it must lie between 0 and 2^63 - 1")
+    checked_seed(seed)
     state: Record = np.zeros((), IMU_STATE)
     random = np.random.default_rng([seed, IMU_COUNT])
     alignments = [rotation_from_vector(random.uniform(-model.misalignment, model.misalignment, 3)) for _ in range(IMU_COUNT)]

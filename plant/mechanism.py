@@ -57,6 +57,10 @@ class Limits:
                 raise InputError(f"the limit of {name} is {value:g}; it must be positive")
 
 
+_NOMINAL_HEIGHT = 7.0 / 6.0
+"""Height of a nominal home over the base's radius."""
+
+
 @dataclass(frozen=True, eq=False)
 class Mechanism:
     """A mechanism of six legs, checked when it is built and never changed.
@@ -108,8 +112,7 @@ class Mechanism:
             name: for messages and reports.
             up_in_base: (3,), the unit vertical seen in {1}.
             base_joint_axes: (6, 3), unit; by default e_z x (home direction), horizontal in {1}.
-            home: pose of reference; by default the joints' centroids lie above each other without rotation, which
-                settles the default axes but no length.
+            home: pose of reference; without one, `nominal_home` settles the default axes but no length.
             limits: the fields of `Limits`; a stroke of (2,) [m] counts from the home lengths, (6, 2) is absolute.
             plant: parameters of the dynamics by name.
             settings: the tables `control` and `fusion`.
@@ -123,9 +126,9 @@ class Mechanism:
         platform = checked_array(platform_joints, (LEGS, 3), "platform_joints")
         _check_joints(base, platform)
         home = None if home is None else _checked_home(home)
-        directions = _home_directions(base, platform, home)
-        axes = _joint_axes(base_joint_axes, directions)
         up = checked_unit(up_in_base, 3, "up_in_base")
+        directions = _home_directions(base, platform, home, up)
+        axes = _joint_axes(base_joint_axes, directions)
         parameters = checked_parameters(plant or {})
         _check_plant(parameters, up)
         return cls(
@@ -140,6 +143,11 @@ class Mechanism:
             plant=MappingProxyType(parameters),
             settings=MappingProxyType({key: MappingProxyType(dict(table)) for key, table in (settings or {}).items()}),
         )
+
+    @property
+    def nominal_home(self) -> Pose:
+        """Home, or for want of one a pose without rotation whose platform joints stand above the base's."""
+        return self.home or _nominal_home(self.base_joints, self.platform_joints, self.up_in_base)
 
     @property
     def joint_rotations(self) -> Array:
@@ -380,11 +388,16 @@ def _checked_home(home: Pose) -> Pose:
     )
 
 
-def _home_directions(base: Array, platform: Array, home: Pose | None) -> Array:
+def _nominal_home(base: Array, platform: Array, up: Array) -> Pose:
+    radius = float(np.linalg.norm(base - base.mean(axis=0), axis=1).max())
+    return Pose(base.mean(axis=0) - platform.mean(axis=0) + _NOMINAL_HEIGHT * radius * up, np.eye(3))
+
+
+def _home_directions(base: Array, platform: Array, home: Pose | None, up: Array) -> Array:
+    pose = home or _nominal_home(base, platform, up)
+    legs = pose.position + platform @ pose.rotation.T - base
     if home is None:
-        scale = float(np.linalg.norm(base - base.mean(axis=0), axis=1).max())
-        home = Pose(base.mean(axis=0) - platform.mean(axis=0) + [0.0, 0.0, scale], np.eye(3))
-    legs = home.position + platform @ home.rotation.T - base
+        legs[np.linalg.norm(legs, axis=1) < SAME_JOINT_M] = up
     lengths = np.linalg.norm(legs, axis=1, keepdims=True)
     if lengths.min() < SAME_JOINT_M:
         raise InputError(f"leg {int(lengths.argmin())} has no length at home: move the home pose")

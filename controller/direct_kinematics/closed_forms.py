@@ -30,6 +30,9 @@ FLATNESS = 1e-3
 """Platform joints count as coplanar if they leave their plane by less than this share of their spread: the refinement makes
 up for it, where it starts near enough."""
 
+_FLAT = 1e-13
+"""Such a share that is no more than rounding."""
+
 _LEAST_FLAT_CONDITIONING = 10.0
 """Least conditioning over that share: further off than a tenth of a radian, the refinement may find another pose."""
 
@@ -78,12 +81,14 @@ SCRATCH = np.dtype(
         ("selected", np.float64, LEGS),
         ("second_root", np.float64, 12),
         ("roots", np.int64),
+        ("approximate", np.int64),
         ("misfit", np.float64),
     ],
     align=True,
 )
 """Memory for the closed forms, which allocate nothing; `roots` is how many `pose_from_legs` found, 2 where one parameter of
-coplanar joints is open (class n-3-II), and `misfit` how far from a rotation it came out.
+coplanar joints is open (class n-3-II), whether it took joints for coplanar that are so but approximately, and `misfit` how far
+from a rotation it came out.
 """
 
 
@@ -110,11 +115,6 @@ def geometry_of(mechanism: Mechanism) -> Record:
         # A joint is a point as soon as two of its legs are known.
         geometry["ranks"][number] = min(_LINEAR_RANK, int(np.minimum(2 * np.bincount(numbers[legs]), 3).sum()))
     return geometry[()]
-
-
-def new_scratch() -> Record:
-    """A record of dtype `SCRATCH`."""
-    return np.zeros((), SCRATCH)[()]
 
 
 @kernel
@@ -333,7 +333,9 @@ def pose_from_legs(
     if bulge <= FLATNESS:
         conditioning = _pose_from_legs(geometry, directions, measured, legs, True, position, rotation, scratch)
         if conditioning >= _LEAST_FLAT_CONDITIONING * bulge:
+            scratch.approximate = 1 if bulge > _FLAT else 0
             return conditioning
+    scratch.approximate = 0
     return _pose_from_legs(geometry, directions, measured, legs, False, position, rotation, scratch)
 
 

@@ -9,7 +9,7 @@ from controller.least_squares import RANK_TOLERANCE, solve_square
 from plant.compiled import kernel
 from plant.errors import SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
-from plant.pose import Array, Pose, checked_array, checked_rotation
+from plant.pose import Array, Pose, checked_array, checked_rotation, numbers
 
 _NEWTON_LIMIT = 50
 
@@ -21,10 +21,8 @@ def pose_from_lengths(mechanism: Mechanism, lengths: ArrayLike, guess: Pose | No
         InputError: wrong shape or not finite, or the guess is no pose.
         SingularConfigurationError: no pose near the guess has these lengths.
     """
-    start = guess or mechanism.require_home()
     target = checked_array(lengths, (LEGS,), "lengths")
-    position = checked_array(start.position, (3,), "guess.position").copy()
-    rotation = checked_rotation(start.rotation, "guess.rotation").copy()
+    position, rotation = _copied(guess or mechanism.require_home())
     error = newton_from_lengths(mechanism.base_joints, mechanism.platform_joints, target, position, rotation, *_scratch())
     if not error < 1e-10:
         raise SingularConfigurationError(
@@ -32,6 +30,11 @@ def pose_from_lengths(mechanism: Mechanism, lengths: ArrayLike, guess: Pose | No
             "the guess is too far"
         )
     return Pose(position, rotation)
+
+
+def _copied(guess: Pose) -> tuple[Array, Array]:
+    position = checked_array(guess.position, (3,), "guess.position")
+    return position.copy(), checked_rotation(guess.rotation, "guess.rotation").copy()
 
 
 def _scratch() -> tuple[Array, ...]:
@@ -51,6 +54,8 @@ def newton_from_lengths(
         before, error = error, 0.0
         for k in range(LEGS):
             lengths[k] = target[k] - lengths[k]
+            if not np.isfinite(lengths[k]):
+                return np.inf
             error = max(error, abs(lengths[k]))
         if error < 1e-15 or (error < 1e-11 and error >= before):
             break
@@ -77,18 +82,21 @@ def _poses_from_lengths(
     return -1
 
 
-def poses_from_lengths(mechanism: Mechanism, lengths: Array, guess: Pose) -> tuple[Array, Array]:
+def poses_from_lengths(mechanism: Mechanism, lengths: ArrayLike, guess: Pose) -> tuple[Array, Array]:
     """Positions (N, 3) [m] and rotations (N, 3, 3) of a motion given by lengths (N, 6) [m], each found from the one
     before.
 
     Raises:
+        InputError: wrong shape or not finite, or the guess is no pose.
         SingularConfigurationError: the lengths of a row belong to no pose near the one before.
     """
-    positions, rotations = np.empty((len(lengths), 3)), np.empty((len(lengths), 3, 3))
+    given = numbers(lengths, "lengths", "(N, 6)")
+    given = checked_array(given, (len(given) if given.ndim else 0, LEGS), "lengths")
+    position, rotation = _copied(guess)
+    positions, rotations = np.empty((len(given), 3)), np.empty((len(given), 3, 3))
     failed = _poses_from_lengths(
-        mechanism.base_joints, mechanism.platform_joints, np.ascontiguousarray(lengths), guess.position.copy(),
-        guess.rotation.copy(), positions, rotations, *_scratch(),
-    )  # fmt: skip
+        mechanism.base_joints, mechanism.platform_joints, given, position, rotation, positions, rotations, *_scratch()
+    )
     if failed >= 0:
         raise SingularConfigurationError(f"no pose near the one before has the lengths of row {failed}")
     return positions, rotations

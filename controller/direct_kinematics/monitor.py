@@ -73,8 +73,14 @@ def integrity(
         SingularConfigurationError: the measurements do not determine the pose.
     """
     attitude = {"rotation": rotation, "normal": normal, "up_in_platform": up_in_platform}
-    given: dict[str, Any] = {name: np.asarray(value) for name, value in attitude.items() if value is not None}
-    directions = np.array(checked_array(leg_directions, (LEGS, 3), "leg_directions", allow_nan=True))
+    given: dict[str, Any] = {name: value for name, value in attitude.items() if value is not None}
+    fitted: Solution | None = None
+    no_pose: SingularConfigurationError | None = None
+    try:
+        fitted = solve(mechanism, leg_directions, **given, **options)
+    except SingularConfigurationError as error:
+        no_pose = error
+    directions = np.array(leg_directions, np.float64)
     measured = [leg for leg in range(LEGS) if np.isfinite(directions[leg, 0])]
     freedom = 2 * len(measured) + sum({"rotation": 3}.get(name, 2) for name in given) - 6
     if freedom <= 0:
@@ -85,15 +91,13 @@ def integrity(
     threshold = chi_square_quantile(freedom, false_alarm_rate)
     leave_one_out = np.repeat(directions[None], len(measured), axis=0)
     leave_one_out[range(len(measured)), measured] = np.nan
-    repeated: dict[str, Any] = {name: np.repeat(value[None], len(measured), axis=0) for name, value in given.items()}
+    repeated: dict[str, Any] = {
+        name: np.repeat(np.array(value, np.float64)[None], len(measured), axis=0) for name, value in given.items()
+    }
     without = solve_batch(mechanism, leave_one_out, **repeated, **options, workers=1)
     alone = {leg: without[i] for i, leg in enumerate(measured) if without.solved[i]}
-    fitted: Solution | None = None
-    try:
-        fitted = solve(mechanism, directions, **given, **options)
-    except SingularConfigurationError:
-        if not alone:
-            raise
+    if no_pose and not alone:
+        raise no_pose
     if given and options.get("method", "auto") == "auto":
         with suppress(SingularConfigurationError):
             alone[PLATFORM_IMU] = solve(mechanism, directions, **options)
@@ -186,7 +190,7 @@ def chi_square_quantile(degrees_of_freedom: int, rate: float) -> float:
     Raises:
         InputError: the rate is not between 0 and 1.
     """
-    if not 0.0 < rate < 1.0:
+    if not 0.0 < checked_array(rate, (), "the false-alarm rate", allow_nan=True) < 1.0:
         raise InputError(f"the false-alarm rate is {rate}; it must lie between 0 and 1")
     low, high = 0.0, 1.0
     while _exceeded(degrees_of_freedom, high) > rate:

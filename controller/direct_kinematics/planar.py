@@ -58,7 +58,7 @@ def solve_planar(
 ) -> tuple[AssemblyMode, ...]:
     """The poses that the angles of the legs allow: two, one if they merge, and one if the platform's roll is measured.
 
-    Those within the stroke come first, then those with the smaller angle.
+    Those within the stroke come first, then those whose angle is nearer to 0.
 
     Args:
         mechanism: two arrays of joints are enough.
@@ -71,6 +71,8 @@ def solve_planar(
         InputError: wrong shape, infinite, or a sigma that is not positive.
         SingularConfigurationError: the measurements do not determine the pose up to its assembly modes.
     """
+    if not isinstance(mechanism, PlanarMechanism):
+        raise InputError(f"the mechanism must be a PlanarMechanism of three legs, not a {type(mechanism).__name__}")
     angles = checked_array(leg_angles, (PLANAR_LEGS,), "leg_angles", allow_nan=True)
     for name, sigma in (("angle_sigma", angle_sigma), ("roll_sigma", roll_sigma)):
         if not checked_array(sigma, (), name) > 0.0:

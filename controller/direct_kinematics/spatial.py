@@ -4,6 +4,7 @@ A closed form gives the pose without a first guess. Gauss-Newton steps follow th
 variances, and whose normal matrix gives the covariance.
 """
 
+import operator
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -41,6 +42,9 @@ TILT_SIGMA = np.radians(0.05)
 YAW_SIGMA = np.radians(1.5)
 """Standard deviation that `solve` assumes of a yaw that was measured magnetically [rad]."""
 
+LEAST_SIGMA = 1e-9
+"""Least standard deviation that makes sense of directions in double precision [rad]."""
+
 LEAST_CONDITIONING = 1e-6
 """Conditioning below which the measurements count as singular."""
 
@@ -66,6 +70,9 @@ _MOST_REFINEMENTS = 20
 _REFINED = 1e-14
 """Square of a step over its variance at which the pose has settled."""
 
+_TINY = 1e-9
+"""Step, over the joints' spread or in radians, that may be no more than rounding."""
+
 _CHUNK = 4096
 
 (
@@ -76,7 +83,7 @@ _CHUNK = 4096
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A pose found from leg directions. It is the only one that fits: where others would, none is given.
+    """A pose found from leg directions. Where another would fit as well, none is given, as far as the refinement can tell.
 
     Attributes:
         position: (3,) [m], origin of {2} in {1}.
@@ -139,8 +146,9 @@ class Solutions:
         Raises:
             SingularConfigurationError: there is none.
         """
-        if not self.solved[index]:
-            raise self.errors[range(len(self))[index]]
+        row = range(len(self))[operator.index(index)]
+        if not self.solved[row]:
+            raise self.errors[row]
         return Solution(
             self.positions[index], self.rotations[index], self.covariances[index], self.residuals[index],
             float(self.chi_squares[index]), int(self.degrees_of_freedom[index]), METHODS[self.methods[index]],
@@ -184,12 +192,9 @@ def solve(
         SingularConfigurationError: the measurements do not determine the pose.
     """
     given = {"rotation": rotation, "normal": normal, "up_in_platform": up_in_platform}
-    shapes = {"leg_directions": (LEGS, 3), "rotation": (3, 3), "normal": (3,), "up_in_platform": (3,)}
-    arrays = {
-        name: _shaped(value, shapes[name], name)[None]
-        for name, value in (("leg_directions", leg_directions), *given.items())
-        if value is not None
-    }
+    shapes = {"rotation": (3, 3), "normal": (3,), "up_in_platform": (3,)}
+    arrays = {"leg_directions": _shaped(leg_directions, (LEGS, 3), "leg_directions")[None]}
+    arrays |= {name: _shaped(value, shapes[name], name)[None] for name, value in given.items() if value is not None}
     return _solve(mechanism, arrays, method, refine, (leg_sigma, tilt_sigma, yaw_sigma), 1, "")[0]
 
 
@@ -223,7 +228,7 @@ def solve_batch(
         if value is not None:
             arrays[name] = _shaped(value, (count, *shape), name)
     sigmas = (leg_sigma, tilt_sigma, yaw_sigma)
-    return _solve(mechanism, arrays, method, refine, sigmas, workers or _cores(), " of row {row}")
+    return _solve(mechanism, arrays, method, refine, sigmas, _cores() if workers is None else workers, " of row {row}")
 
 
 def _cores() -> int:
@@ -278,12 +283,17 @@ def _solve(
     workers: int,
     where: str,
 ) -> Solutions:
+    _check_spatial(mechanism)
+    if not isinstance(refine, bool | np.bool_):
+        raise InputError(f"refine must be True or False, got {refine!r}")
+    if not isinstance(workers, int) or workers < 1:
+        raise InputError(f"workers is {workers!r}; it must be a whole number of threads, 1 at least")
     candidates = _candidates(method, arrays)
     weights = []
     for name, sigma in zip(("leg_sigma", "tilt_sigma", "yaw_sigma"), sigmas, strict=True):
         value = _shaped(sigma, (), name)
-        if not 0.0 < value < np.inf:
-            raise InputError(f"{name} is {sigma}; it must be positive and finite [rad]")
+        if not LEAST_SIGMA <= value < np.inf:
+            raise InputError(f"{name} is {sigma}; it must be at least {LEAST_SIGMA:g} and finite [rad]")
         weights.append(float(value) ** -2)
     count = len(arrays["leg_directions"])
     measurements = _Measurements(
@@ -317,10 +327,15 @@ def _solve(
     return Solutions(*results[:-2], solved=results.statuses == _SOLVED, errors=errors)
 
 
+def _check_spatial(mechanism: Mechanism) -> None:
+    if not isinstance(mechanism, Mechanism):
+        raise InputError(f"the mechanism must be a Mechanism of six legs, not a {type(mechanism).__name__}")
+
+
 def _candidates(method: str, arrays: dict[str, Array]) -> NDArray[np.int64]:
-    if method == "auto":
+    if isinstance(method, str) and method == "auto":
         names = [name for name in _AUTOMATIC if name not in NEEDS or NEEDS[name] in arrays]
-    elif method not in METHODS:
+    elif not isinstance(method, str) or method not in METHODS:
         raise InputError(f"there is no method {method!r}; there are auto, {', '.join(METHODS)}")
     elif NEEDS.get(method, "leg_directions") not in arrays:
         raise InputError(f"the method {method!r} needs {NEEDS[method]}: give it, or choose another method")
@@ -435,8 +450,11 @@ def _solve_rows(
             results.methods[row], results.conditionings[row] = _find(geometry, candidates, work)
             status = _SOLVED if results.conditionings[row] > LEAST_CONDITIONING else _OPEN
         if status == _SOLVED:
-            two_roots = refine and results.methods[row] == _LEGS and work.scratch.roots == 2
-            status, chi_square = _fit_better(geometry, work) if two_roots else _fit(geometry, refine, work)
+            # A closed form that took joints for coplanar that hardly are is a start, not the pose.
+            by_legs = results.methods[row] == _LEGS
+            settle = refine or (by_legs and work.scratch.approximate != 0)
+            two_roots = settle and by_legs and work.scratch.roots == 2
+            status, chi_square = _fit_better(geometry, work) if two_roots else _fit(geometry, settle, work)
         results.statuses[row] = status
         if status == _SOLVED:
             _write(work, chi_square, row, results)
@@ -540,7 +558,7 @@ def _fit(geometry: Record, refine: bool, work: Record) -> tuple[int, float]:
     )
     vectors = work.vectors
     in_base, in_platform, vector_weights = work.in_base, work.in_platform, work.vector_weights[:vectors]
-    status = _UNSETTLED
+    status, before, spread = _UNSETTLED, np.inf, geometry.spreads[-1]
     for _ in range(_MOST_REFINEMENTS if refine else 1):
         normal_equations(
             base_joints, platform_joints, work.directions, work.weights, in_base, in_platform, vector_weights, position,
@@ -552,9 +570,11 @@ def _fit(geometry: Record, refine: bool, work: Record) -> tuple[int, float]:
             status = _SOLVED
             break
         move_pose(work.correction, position, rotation)
-        if _square_over_variance(work.factor, work.correction) < _REFINED:
+        square = _square_over_variance(work.factor, work.correction)
+        if square < _REFINED or (square >= before and _is_tiny(work.correction, spread)):
             status = _SOLVED
             break
+        before = square
     legs_at(base_joints, platform_joints, position, rotation, work.arms, work.predicted, work.lengths)
     chi_square = 0.0
     for k in range(LEGS):
@@ -670,6 +690,15 @@ def _read_rotation(given: Array, rotation: Array) -> int:
 
 
 @kernel
+def _is_tiny(step: Array, spread: float) -> bool:
+    """Whether a step that has stopped getting shorter does so for rounding alone."""
+    longest = 0.0
+    for i in range(3):
+        longest = max(longest, abs(step[i]) / spread, abs(step[3 + i]))
+    return longest < _TINY
+
+
+@kernel
 def _square_over_variance(factor: Array, step: Array) -> float:
     """step^T A step for a matrix A whose Cholesky factor is the lower triangle of `factor`."""
     square = 0.0
@@ -710,6 +739,13 @@ class Requirement:
             legs = f"{self.fewest} legs, {len(self.choices)} choices"
         return legs if self.platform == "nothing" else f"{legs} + {self.platform}"
 
+    @property
+    def choice_text(self) -> str:
+        """The choices as numbers of legs, "012, 024"; empty where any choice or only one will do."""
+        if len(self.choices) == 1 or self.any_choice == self.fewest:
+            return ""
+        return ", ".join("".join(str(leg) for leg in legs) for legs in self.choices)
+
 
 _TRIAL_POSES = 8
 _TRIAL_TILT = 0.3
@@ -721,6 +757,7 @@ def required_measurements(mechanism: Mechanism) -> tuple[Requirement, ...]:
 
     A set of legs will do if it gives the pose at most of the poses: single poses may be singular.
     """
+    _check_spatial(mechanism)
     poses = _trial_poses(mechanism)
     sets = [legs for count in range(2, LEGS + 1) for legs in combinations(range(LEGS), count)]
     directions = np.empty((len(sets), len(poses), LEGS, 3))
@@ -754,9 +791,7 @@ def required_measurements(mechanism: Mechanism) -> tuple[Requirement, ...]:
 def _trial_poses(mechanism: Mechanism) -> list[Pose]:
     random = np.random.default_rng(0)
     size = float(np.linalg.norm(mechanism.base_joints - mechanism.base_joints.mean(axis=0), axis=1).max())
-    home = mechanism.home or Pose(
-        mechanism.base_joints.mean(axis=0) - mechanism.platform_joints.mean(axis=0) + size * mechanism.up_in_base, np.eye(3)
-    )
+    home = mechanism.nominal_home
     return [
         Pose(
             home.position + 0.2 * size * random.uniform(-1.0, 1.0, 3),

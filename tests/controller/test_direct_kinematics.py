@@ -12,12 +12,20 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from controller.direct_kinematics import pose_difference, pose_from_lengths, poses_from_lengths, solve
-from controller.direct_kinematics.closed_forms import geometry_of, new_scratch, pose_from_rotation, rotation_between
+from controller.direct_kinematics import (
+    integrity,
+    pose_difference,
+    pose_from_lengths,
+    poses_from_lengths,
+    required_measurements,
+    solve,
+    solve_batch,
+)
+from controller.direct_kinematics.closed_forms import SCRATCH, geometry_of, pose_from_rotation, rotation_between
 from controller.inverse_kinematics import leg_lengths, sample_workspace
 from controller.least_squares import RANK_TOLERANCE
 from plant.errors import GoughError, InputError, SingularConfigurationError
-from plant.mechanism import Mechanism
+from plant.mechanism import Mechanism, load_mechanism
 from plant.pose import Pose
 from tests.controller.leg_geometry import (
     UP,
@@ -605,7 +613,7 @@ def test_directions_off_unit_within_the_tolerance_are_normalised(hexapod):
 
 
 def test_the_kernels_report_what_they_cannot_solve_below_the_tolerance(hexapod):
-    geometry, memory, position = geometry_of(hexapod), new_scratch(), np.zeros(3)
+    geometry, memory, position = geometry_of(hexapod), np.zeros((), SCRATCH)[()], np.zeros(3)
     for broken in (np.nan, np.inf):
         directions = home_directions(hexapod)
         directions[3, 0] = broken
@@ -686,3 +694,60 @@ def test_the_difference_of_poses_is_their_distance_and_angle(seed, angle):
     distance, turned = pose_difference(Pose(position, rotation), Pose(position + away, rotation_of(angle * axis) @ rotation))
     assert abs(distance - np.linalg.norm(away)) < 1e-14
     assert abs(turned - angle) < 1e-14
+
+
+@pytest.mark.parametrize("lengths", [np.full((3, 6), np.nan), np.full((3, 5), 0.4), np.full((3, 7), 0.4), np.full(6, 0.4), "x"])
+def test_a_motion_of_malformed_lengths_is_refused(hexapod, lengths):
+    with pytest.raises(InputError, match="lengths"):
+        poses_from_lengths(hexapod, lengths, hexapod.home)
+
+
+# -------------------------------------------------------------------------------------------------------- other wrong inputs
+
+
+def test_what_is_no_mechanism_option_or_number_is_refused_in_words(hexapod):
+    planar = load_mechanism("planar-3rpr")
+    directions = leg_directions(hexapod, hexapod.home.position, np.eye(3))
+    for call, said in (
+        (lambda: solve(hexapod, None), "leg_directions must be an array of numbers"),
+        (lambda: solve(planar, directions), "must be a Mechanism of six legs, not a PlanarMechanism"),
+        (lambda: solve("hexapod", directions), "must be a Mechanism of six legs, not a str"),
+        (lambda: required_measurements(planar), "must be a Mechanism of six legs, not a PlanarMechanism"),
+        (lambda: solve(hexapod, directions, refine="no"), "refine must be True or False, got 'no'"),
+        (lambda: solve(hexapod, directions, leg_sigma=1e-200), "leg_sigma is 1e-200; it must be at least 1e-09"),
+        (lambda: solve_batch(hexapod, [directions], workers=-1), "workers is -1; it must be a whole number of threads"),
+        (lambda: integrity(hexapod, directions, false_alarm_rate="a"), "the false-alarm rate must be"),
+        (lambda: integrity(hexapod, directions, rotation=UP), r"rotation must have shape \(3, 3\), got \(3,\)"),
+        (lambda: integrity(hexapod, 1.1 * directions), r"leg_directions\[0\] has length 1.1"),
+    ):
+        with pytest.raises(InputError, match=said):
+            call()
+
+
+# ----------------------------------------------------------------------------------------- joints that are coplanar but nearly
+
+
+@pytest.mark.parametrize("height", [1e-15, 1e-12, 1e-9, 1e-6, 2e-4, 2e-3])
+@pytest.mark.parametrize("refine", [True, False])
+def test_legs_alone_give_the_pose_of_joints_that_are_nearly_coplanar(hexapod, height, refine):
+    random = np.random.default_rng(29)
+    for _ in range(20):
+        bent = hexapod.platform_joints + height * random.uniform(-1.0, 1.0, (6, 1)) * UP
+        mechanism = Mechanism.from_legs(hexapod.base_joints, bent)
+        position, rotation = hexapod.home.position, rotation_of(random.uniform(-0.5, 0.5, 3))
+        directions = leg_directions(mechanism, position, rotation)
+        for missing in ([], [1], [1, 4]):
+            directions[missing] = np.nan
+            solution = solve(mechanism, directions, refine=refine)
+            np.testing.assert_allclose(solution.position, position, rtol=0.0, atol=1e-8)
+            np.testing.assert_allclose(solution.rotation, rotation, rtol=0.0, atol=1e-8)
+
+
+@pytest.mark.parametrize("sigma", [1e-9, 1e-7, 1e-3])
+def test_exact_measurements_agree_however_small_their_sigmas(hexapod, sigma):
+    random = np.random.default_rng(30)
+    for _ in range(50):
+        position, rotation = hexapod.home.position, rotation_of(random.uniform(-0.5, 0.5, 3))
+        known = {"up_in_platform": rotation.T @ UP}
+        solution = solve(hexapod, leg_directions(hexapod, position, rotation), leg_sigma=sigma, **known)
+        np.testing.assert_allclose(solution.position, position, rtol=0.0, atol=1e-9)
