@@ -42,6 +42,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"gough {version('gough')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
     _add_simulate(commands)
+    _add_run(commands)
+    _add_replay(commands)
     _add_tune(commands)
     _add_fmu(commands)
     _add_bench(commands)
@@ -59,6 +61,15 @@ def _add_simulate(commands: Any) -> None:
         description="Simulate the closed loop: a mechanism follows a target motion on its FMU plant.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
+    _add_motion(command)
+    command.add_argument("--fusion", default="compiled", help="compiled, or filterpy for the reference leg filters (slow)")
+    command.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots and a moving 3-D view")
+    _add_json(command)
+    command.set_defaults(run=_simulate)
+
+
+def _add_motion(command: argparse.ArgumentParser) -> None:
+    """What simulations and runs on the clock have in common."""
     command.add_argument("--mechanism", default="hexapod", help="preset, or a TOML file")
     command.add_argument(
         "--target",
@@ -70,11 +81,37 @@ def _add_simulate(commands: Any) -> None:
     command.add_argument("--imu", default="mpu9150-calibrated", help="ideal, mpu9150, mpu9150-calibrated or icm42688")
     command.add_argument("--imus", type=_imus, default="all", help="which IMUs there are: all, legs, or a list such as 0,2,4,6")
     command.add_argument("--seed", type=int, default=0, help="of the IMUs' imperfections")
-    command.add_argument("--fusion", default="compiled", help="compiled, or filterpy for the reference leg filters (slow)")
     command.add_argument("--plant", metavar="FILE.fmu", help="FMI 3.0 Co-Simulation FMU to use instead of the built one")
-    command.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots and a moving 3-D view")
+
+
+def _add_run(commands: Any) -> None:
+    command = commands.add_parser(
+        "run",
+        help="follow a target on the machine's clock",
+        description="Run the closed loop on the machine's clock: compiled, in a process of its own, with real-time priority "
+        "where the machine grants it. Ctrl-C or SIGTERM ends the motion by a controlled stop.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("--rig", choices=("fmu",), default="fmu", help="what is driven: the FMU plant")
+    _add_motion(command)
+    command.add_argument("--record", type=Path, metavar="FILE.mcap", help="record every cycle")
+    command.add_argument("--cpu", type=int, help="processor to stay on (default: the last one)")
+    command.add_argument("--priority", type=int, default=80, help="of SCHED_FIFO, 1 to 98")
+    command.add_argument("--strict", action="store_true", help="do not run if the machine refuses anything of real time")
+    command.add_argument("--most-missed", type=int, default=10, help="periods missed in a row that end in a controlled stop")
     _add_json(command)
-    command.set_defaults(run=_simulate)
+    command.set_defaults(run=_run)
+
+
+def _add_replay(commands: Any) -> None:
+    command = commands.add_parser(
+        "replay",
+        help="feed a recording's raw IMU data through the cycle again",
+        description="Feed the recorded raw IMU data through the same cycle and compare estimates and commands bit for bit.",
+    )
+    command.add_argument("files", type=Path, nargs="+", metavar="FILE.mcap", help="of one run, in their order")
+    _add_json(command)
+    command.set_defaults(run=_replay)
 
 
 def _add_tune(commands: Any) -> None:
@@ -233,6 +270,129 @@ def _print_simulation(summary: dict[str, Any]) -> None:
         f"{summary['real_time_factor']:.1f} times real time; "
         f"cycle p50/p99/p99.9 {cycle['p50']:.1f}/{cycle['p99']:.1f}/{cycle['p999']:.1f} us"
     )
+
+
+def _run(options: argparse.Namespace) -> int:
+    from hil.executive import RunStoppedError, run
+    from hil.realtime import RealTimeSettings
+    from hil.simulation import SimulationConfig
+
+    _check_writable(options.json, options.record)
+    names = ("mechanism", "target", "duration", "rate", "imu", "seed", "plant", "imus")
+    config = SimulationConfig(**{name: getattr(options, name) for name in names})
+    settings = RealTimeSettings(options.priority, options.cpu, options.strict, options.most_missed)
+    stopped = None
+    with _live_view(config.mechanism, config.target, config.rate) as show:
+        try:
+            summary = run(config, settings, options.record, show)
+        except RunStoppedError as error:
+            stopped = error
+            if error.summary is None:
+                raise
+            summary = error.summary
+    _write_json(options.json, summary)
+    _print_run(summary)
+    if stopped:
+        raise stopped
+    return 0
+
+
+def _print_run(summary: dict[str, Any]) -> None:
+    from hil.timing import budget
+
+    _print(_timing_table(summary["timing_us"], budget()))
+    for line in (*(f"over budget: {text}" for text in summary["over_budget"]), *summary["events"]):
+        print(line)
+    if not summary["over_budget"]:
+        print("within the timing budget (hil/budget.toml)")
+    for text in summary["refused"]:
+        print(f"without {text}")
+    used, errors = summary["usage"], summary["errors_m"]
+    print(
+        f"{summary['cycles']} cycles; periods missed: {summary['missed_own']} by own work, "
+        f"{summary['missed_late']} woken late, {summary['missed_host']} held up by the host"
+    )
+    print(
+        f"the loop's thread: {used['major_faults']} major and {used['minor_faults']} minor page faults, "
+        f"{used['involuntary_switches']} involuntary switches, {used['resident']} bytes of growth; "
+        f"first cycle {summary['start_up_s']:.2f} s after the start"
+    )
+    print(f"estimate - truth {1e3 * errors['estimation']:.3f} mm RMS; reference - length {1e3 * errors['tracking']:.3f} mm RMS")
+    for file in summary["recording"]["files"]:
+        print(f"recorded in {file}, {summary['recording']['lost']} cycles lost")
+    print(f"stopped on the brakes: {summary['cause']}")
+
+
+def _timing_table(timing: dict[str, dict[str, float]], budget: dict[str, dict[str, float]]) -> Any:
+    """Microseconds of each stage, with its budget where it has one, and marked where it exceeds that."""
+    names = ("p50", "p99", "p999", "max")
+    table = _table("us", *(f"{name} / budget" if name != "p999" else "p99.9 / budget" for name in names))
+    for stage, figures in timing.items():
+        limits = budget.get(stage, {})
+        cells = []
+        for name in names:
+            limit = limits.get(name)
+            over = limit is not None and figures[name] > limit
+            text = f"{figures[name]:.1f}" + (f" / {limit:g}" if limit is not None else " /  -")
+            cells.append(f"[bold red]{text}[/]" if over else text)
+        table.add_row(stage, *cells)
+    return table
+
+
+@contextmanager
+def _live_view(mechanism: str, target: str, rate: float) -> Iterator[Callable[[Any], None]]:
+    """The state of a run, ten times a second where there is a terminal."""
+    from rich.console import Console
+    from rich.live import Live
+
+    if not sys.stderr.isatty():
+        yield lambda progress: None
+        return
+    with Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live:
+        yield lambda progress: live.update(_view(mechanism, target, rate, progress), refresh=True)
+
+
+def _view(mechanism: str, target: str, rate: float, progress: Any) -> Any:
+    from math import asin, atan2
+
+    from hil.loop import STOP_CAUSES
+
+    table = _table(f"{mechanism} follows {target} at {rate:g} Hz", "")
+    latest = progress.latest
+    if latest is None:
+        table.add_row("state", "starting")
+        return table
+    position, r = 1e3 * latest["position"], latest["rotation"]
+    angles = (atan2(r[2, 1], r[2, 2]), asin(max(-1.0, min(1.0, -r[2, 0]))), atan2(r[1, 0], r[0, 0]))
+    wake, compute = progress.timing.histograms["wake"].figures(), progress.timing.histograms["compute"].figures()
+    errors = progress.errors()
+    state = f"stopping: {STOP_CAUSES[int(latest['stop'])]}" if latest["stop"] else "running"
+    rows = (
+        ("state", f"{state}, {latest['time_ns'] / 1e9:.1f} s"),
+        ("position [mm]", "  ".join(f"{value:9.3f}" for value in position)),
+        ("roll, pitch, yaw [deg]", "  ".join(f"{57.29577951308232 * angle:9.3f}" for angle in angles)),
+        ("estimate - truth, RMS [mm]", f"{1e3 * errors['estimation']:.3f}"),
+        ("reference - length, RMS [mm]", f"{1e3 * errors['tracking']:.3f}"),
+        ("woken late p50, p99.9, max [us]", "  ".join(f"{wake[name]:.0f}" for name in ("p50", "p999", "max"))),
+        ("computing p50, p99.9, max [us]", "  ".join(f"{compute[name]:.0f}" for name in ("p50", "p999", "max"))),
+        ("periods missed, cycles lost", f"{progress.missed}, {progress.lost}"),
+        *(("without", text) for text in progress.refused),
+        *(("", text) for text in progress.events),
+    )
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _replay(options: argparse.Namespace) -> int:
+    from hil.replay import replay
+
+    _check_writable(options.json)
+    result = replay(options.files)
+    _write_json(options.json, result.summary())
+    for line in result.lines():
+        print(line)
+    return 0 if result.same else 1
 
 
 def _tune(options: argparse.Namespace) -> int:

@@ -4,7 +4,8 @@ All state lies in the arrays of `Loop`, so a run can be taken up again at any cy
 leg filters, that are written in Python.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -14,6 +15,8 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from controller.cycle import (
+    IMPLAUSIBLE,
+    NOT_FINITE,
     OK,
     POSE_LOST,
     begin_stop,
@@ -42,7 +45,24 @@ RIG_FAILED = 100
 """Added to the rig's own status (FMI's, for an FMU) when it reports a failure."""
 
 NO_STOP, END_OF_MOTION, ASKED_TO_STOP, MISSED_PERIODS, SUPERVISOR_GONE = range(5)
+STOP_CAUSES = (
+    "none",
+    "end of the motion",
+    "asked for",
+    "too many periods missed in a row",
+    "the supervising process has gone",
+)
 """Why a controlled stop began."""
+
+_FAILURES = {
+    IMPLAUSIBLE: (
+        "the estimated pose needs a leg far outside its stroke: the IMUs' errors are larger than the filters assume "
+        "(raw ones need a calibration)"
+    ),
+    POSE_LOST: "the estimated leg directions no longer determine a pose",
+    NOT_FINITE: "an estimate or a command is no longer finite",
+    CLOCK_FAILED: "this machine's clock refuses to wake the loop",
+}
 
 STAGES = (
     "sense",
@@ -93,10 +113,17 @@ the thread's CPU time; periods missed before it; its status and the cause of a s
 and commands; and the truth as the plant's `truth` buffer has it.
 """
 
-HEAD, STOP, DONE, TAIL, LOST, SUPERVISOR = range(6)
+HEAD, STOP, DONE, TAIL, LOST, SUPERVISOR, START = range(7)
 LINK = 16
 """Places in the array that the loop shares with other processes, int64 (16,): records written, whether it shall stop, whether
-it has ended; records taken out by the recorder, and lost to it; the process whose end ends the motion, 0 for none."""
+it has ended; records taken out by the recorder, and lost to it; the process whose end ends the motion, 0 for none; and the
+first deadline [ns]."""
+
+
+def describe_status(status: int) -> str:
+    """What a status of the loop means, in words; what a rig has to say of its own, it must be asked."""
+    return _FAILURES.get(status, f"the rig reports failure {status - RIG_FAILED}")
+
 
 LegFusion = Callable[[Record, Array], None]
 """Leg filters in Python: take the cycle's state and a measurement (3, 7, 3), and leave directions and rates in the state."""
@@ -222,6 +249,20 @@ class Loop:
         if status != OK:
             rig.brake()
         return status
+
+
+@contextmanager
+def prevent_compilation() -> Iterator[None]:
+    """Make it an error, as long as the context lasts, if a kernel that is loaded would have to be compiled for other types."""
+    kernels: tuple[Any, ...] = (_run, _begin, _read, _catch_up, _is_due, _compute, _compute_from_legs, _note, _end)
+    loaded = [each for each in kernels if each.signatures]
+    for each in loaded:
+        each.disable_compile()
+    try:
+        yield
+    finally:
+        for each in loaded:
+            each.disable_compile(False)
 
 
 class Rig(Protocol):
@@ -400,6 +441,7 @@ def _note(
 def _end(records: Record, clock: Record, script: NDArray[np.int64], link: NDArray[np.int64], work: Record) -> None:
     """End the cycle: set the next deadline, complete the record, and let others see it."""
     head = link[HEAD]
+    link[START] = clock[()].start
     record = records[head % records.shape[0]]
     record.cpu_ns = finish(clock, script)
     record.stage_ns[:] = work[()].stage_ns

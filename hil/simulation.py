@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from controller.cycle import ALL_IMUS, IMPLAUSIBLE, NOT_FINITE, OK, POSE_LOST, STATE, check_rate, cycle_parameters, point_legs
+from controller.cycle import ALL_IMUS, OK, STATE, check_rate, cycle_parameters, point_legs
 from controller.direct_kinematics import poses_from_lengths
 from controller.leg_filter import start_leg
 from controller.planner import Reference, plan
 from controller.settings import control_settings, fusion_settings
 from controller.target import Target, check_duration, load_target
-from hil.loop import COMPUTED, RECORD, RIG_FAILED, LegFusion, Loop
+from hil.loop import COMPUTED, RECORD, RIG_FAILED, LegFusion, Loop, describe_status
 from plant.compiled import Record
 from plant.errors import GoughError, InputError, UnknownNameError
 from plant.export import default_fmu
@@ -173,7 +173,7 @@ def simulate(config: SimulationConfig, progress: Callable[[float], None] = lambd
         done = int(loop.state["cycle"])
         result = _result(config, loop, done, took)
         if status != OK:
-            cause = str(loop.plant.failure("the plant failed")) if status >= RIG_FAILED else _CAUSES[status]
+            cause = str(loop.plant.failure("the plant failed")) if status >= RIG_FAILED else describe_status(status)
             raise SimulationStoppedError(f"stopped on the brakes at cycle {done} of {count}: {cause}", result)
     return result
 
@@ -231,16 +231,6 @@ def prepared_loop(config: SimulationConfig) -> Iterator[PreparedLoop]:
         )
         loop.run(0)
         yield loop
-
-
-_CAUSES = {
-    IMPLAUSIBLE: (
-        "the estimated pose needs a leg far outside its stroke: the IMUs' errors are larger than the filters assume "
-        "(raw ones need a calibration)"
-    ),
-    POSE_LOST: "the estimated leg directions no longer determine a pose",
-    NOT_FINITE: "an estimate or a command is no longer finite",
-}
 
 
 def _result(config: SimulationConfig, loop: PreparedLoop, done: int, took: float) -> SimulationResult:

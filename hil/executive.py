@@ -1,0 +1,312 @@
+"""The executive: a loop on the clock in a process of its own, a recorder in another, and a supervisor that looks on.
+
+    supervisor --fork--> loop       plant or rig, compiled cycle, SCHED_FIFO; writes into shared memory and never waits
+               --fork--> recorder   takes the records to an MCAP file
+
+The three share two arrays, `records` and `link` (see `hil.loop`). Whoever else dies, the recorder completes its file; when the
+recorder dies, another takes over with a file of its own; when the supervisor dies, the loop comes to a controlled stop.
+"""
+
+import contextlib
+import mmap
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.clock import REAL, new_clock
+from hil.loop import (
+    DONE,
+    LINK,
+    LOST,
+    RECORD,
+    RIG_FAILED,
+    STOP,
+    STOP_CAUSES,
+    STOPPED,
+    SUPERVISOR,
+    describe_status,
+    prevent_compilation,
+)
+from hil.realtime import RealTimeSettings, real_time, since_process_start, usage
+from hil.recording import record, repair, take
+from hil.simulation import SimulationConfig, prepared_loop
+from hil.timing import Timing, over_budget
+from plant.compiled import Record
+from plant.errors import GoughError
+
+_BUFFER_S = 8.0
+_LEAST_RECORDS = 1024
+_LOOK_S = 0.1
+_PATIENCE_S = 30.0
+_FORK = multiprocessing.get_context("fork")
+
+
+class RunStoppedError(GoughError, RuntimeError):
+    """A run ended on the brakes before its time; `summary` has what was found until then, if the loop could still say."""
+
+    exit_status = 1
+
+    def __init__(self, message: str, summary: dict[str, Any] | None = None) -> None:
+        super().__init__(message)
+        self.summary = summary
+
+
+@dataclass(eq=False)
+class Progress:
+    """What the supervisor sees of a run, ten times a second.
+
+    Attributes:
+        latest: the last record, of dtype `RECORD`; None before the first.
+        timing: of all cycles so far.
+        squares: sums of the squared errors of the estimated position [m^2] and of the lengths against the reference [m^2], and
+            how many cycles they are of.
+        missed: periods missed so far.
+        refused: what the machine refuses of real time.
+        lost: cycles lost to the recorder.
+        events: what the supervisor has to tell, such as a recorder that died.
+    """
+
+    latest: Record | None = None
+    timing: Timing = field(default_factory=Timing)
+    squares: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    missed: int = 0
+    refused: list[str] = field(default_factory=list)
+    lost: int = 0
+    events: list[str] = field(default_factory=list)
+
+    def add(self, records: Record) -> None:
+        """Take note of records (n,)."""
+        if not len(records):
+            return
+        self.latest = records[-1]
+        self.timing.add(records)
+        self.missed += int(records["missed"].sum())
+        self.squares[0] += np.sum((records["position"] - records["truth"][:, :3]) ** 2)
+        self.squares[1] += np.mean((records["lengths"] - records["reference"][:, :, 0]) ** 2, axis=1).sum()
+        self.squares[2] += len(records)
+
+    def errors(self) -> dict[str, float]:
+        """RMS errors [m]: `estimation` of the position against the truth, `tracking` of a leg's length."""
+        position, lengths, count = self.squares
+        return {"estimation": float(np.sqrt(position / max(count, 1))), "tracking": float(np.sqrt(lengths / max(count, 1)))}
+
+
+def run(
+    config: SimulationConfig,
+    settings: RealTimeSettings,
+    recording: Path | None = None,
+    show: Callable[[Progress], None] = lambda progress: None,
+) -> dict[str, Any]:
+    """Run the closed loop against the FMU plant on the machine's clock, to the end of its motion or until it is asked to stop.
+
+    SIGINT and SIGTERM ask for a controlled stop. Must be called from the main thread of a process without others.
+
+    Args:
+        config: what to run.
+        settings: how.
+        recording: the MCAP file to write; None for none.
+        show: called ten times a second.
+
+    Returns:
+        The summary: `cause` of the stop, `cycles`, missed periods by cause, `timing_us` and what of it is `over_budget`,
+        `errors_m`, `usage` of the loop's thread, `start_up_s`, `recording` (files, cycles lost), `refused`, `events`, `config`,
+        `version`.
+
+    Raises:
+        GoughError: something in the configuration or the settings cannot be used; nothing has run then.
+        RunStoppedError: the run ended on the brakes before its time, or its process died.
+    """
+    records = _shared(max(_LEAST_RECORDS, round(_BUFFER_S * config.rate)), RECORD)
+    link: NDArray[np.int64] = _shared(LINK, np.dtype(np.int64))
+    link[SUPERVISOR] = os.getpid()
+    progress = Progress()
+    ours, theirs = _FORK.Pipe()
+    with _asked_to_stop(link), contextlib.ExitStack() as at_end:
+        loop = _FORK.Process(target=_loop_process, args=(config, settings, records, link, theirs))
+        loop.start()
+        theirs.close()
+        at_end.callback(_end, loop, link)
+        header, progress.refused = _received(ours, loop, show, progress)
+        recorders = _Recorders(recording, header, config.rate, records, link, progress.events)
+        at_end.callback(recorders.finish)
+        ours.send("go")
+        tail = 0
+        while not ours.poll(_LOOK_S):
+            taken, tail, _ = take(records, link, tail)
+            progress.add(taken)
+            progress.lost = int(link[LOST])
+            recorders.watch()
+            show(progress)
+            if not loop.is_alive() and not ours.poll():
+                break
+        outcome = _received(ours, loop, show, progress)
+        progress.add(take(records, link, tail)[0])
+    summary = _summary(config, progress, outcome, recorders.files, int(link[LOST]))
+    if outcome["status"] != STOPPED:
+        raise RunStoppedError(f"stopped on the brakes at cycle {outcome['cycle']}: {outcome['reason']}", summary)
+    return summary
+
+
+def _shared(count: int, dtype: np.dtype[Any]) -> Any:
+    """An array in memory that is shared with the processes forked later."""
+    return np.frombuffer(mmap.mmap(-1, count * dtype.itemsize), dtype)
+
+
+@contextmanager
+def _asked_to_stop(link: NDArray[np.int64]) -> Iterator[None]:
+    """Let SIGINT and SIGTERM ask for a controlled stop."""
+
+    def ask(number: int, frame: object) -> None:
+        del number, frame
+        link[STOP] = 1
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _received(ours: Connection, loop: BaseProcess, show: Callable[[Progress], None], progress: Progress) -> Any:
+    """What the loop's process sends; its error is raised here."""
+    while not ours.poll(_LOOK_S) and loop.is_alive():
+        show(progress)
+    try:
+        message = ours.recv()
+    except EOFError:
+        loop.join(_PATIENCE_S)
+        raise RunStoppedError(f"the loop's process has died (exit code {loop.exitcode}); nothing commands the rig") from None
+    if isinstance(message, GoughError):
+        raise message
+    return message
+
+
+def _end(loop: BaseProcess, link: NDArray[np.int64]) -> None:
+    """See the loop's process to its end, whatever has happened here."""
+    link[STOP] = 1
+    loop.join(_PATIENCE_S)
+    if loop.is_alive():
+        loop.kill()
+        loop.join()
+
+
+def _loop_process(
+    config: SimulationConfig, settings: RealTimeSettings, records: Record, link: NDArray[np.int64], pipe: Connection
+) -> None:  # fmt: skip
+    """The loop's process. SIGINT and SIGTERM, blocked, are seen by the loop itself."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    try:
+        with prepared_loop(config) as loop:
+            end = len(loop.records)
+            loop.records, loop.link, loop.most_missed = records, link, settings.most_missed
+            loop.clock = new_clock(REAL, round(1e9 / config.rate))
+            header = {
+                "config": {**asdict(config), "mechanism_name": loop.mechanism.name, "version": version("gough")},
+                "parameters": loop.parameters,
+                "reference": loop.segments,
+            }
+            with prevent_compilation(), real_time(settings) as refused:
+                pipe.send((header, refused))
+                pipe.recv()
+                before = usage()
+                status = loop.follow(end)
+                used = usage().since(before)
+            failed = status >= RIG_FAILED
+            reason = str(loop.plant.failure("the plant failed")) if failed else describe_status(status)
+            outcome = {
+                "status": status,
+                "reason": STOP_CAUSES[int(loop.state["stopping"])] if status == STOPPED else reason,
+                "cycle": int(loop.state["cycle"]),
+                "cycles": int(loop.clock["cycles"]),
+                "missed_late": int(loop.clock["missed_late"]),
+                "missed_own": int(loop.clock["missed_own"]),
+                "missed_host": int(loop.clock["missed_host"]),
+                "usage": used,
+                "first_cycle_ns": int(loop.clock["start"]),
+            }
+            pipe.send(outcome)
+    except GoughError as error:
+        pipe.send(error)
+
+
+class _Recorders:
+    """The process that records, and its successors if it dies."""
+
+    def __init__(
+        self,
+        path: Path | None,
+        header: dict[str, Any],
+        rate: float,
+        records: Record,
+        link: NDArray[np.int64],
+        events: list[str],
+    ) -> None:
+        self.files: list[Path] = []
+        self._path, self._arguments, self._link, self._events = path, (header, rate, records, link), link, events
+        self._process: BaseProcess | None = None
+        if path is not None:
+            self._start(path)
+
+    def _start(self, path: Path) -> None:
+        self.files.append(path)
+        self._process = _FORK.Process(target=_recorder_process, args=(path, *self._arguments))
+        self._process.start()
+
+    def watch(self) -> None:
+        """Start a successor, which writes a file of its own, if the recorder has died."""
+        if self._path is not None and self._process is not None and not self._process.is_alive():
+            path = self._path.with_stem(f"{self._path.stem}-{len(self.files) + 1}")
+            self._events.append(f"the recorder died (exit code {self._process.exitcode}); another goes on in {path}")
+            self._start(path)
+
+    def finish(self) -> None:
+        """Let the recorder write what is left, and complete the files of those that died."""
+        self._link[DONE] = 1
+        if self._process is None:
+            return
+        self._process.join(_PATIENCE_S)
+        if self._process.exitcode != 0:
+            self._events.append(
+                f"the recorder ended with exit code {self._process.exitcode}: {self.files[-1]} may lack its end"
+            )
+        for path in self.files:
+            if path.exists():
+                repair(path)
+
+
+def _recorder_process(path: Path, *arguments: Any) -> None:
+    signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    record(path, *arguments)
+
+
+def _summary(
+    config: SimulationConfig, progress: Progress, outcome: dict[str, Any], files: list[Path], lost: int
+) -> dict[str, Any]:  # fmt: skip
+    timing = progress.timing.figures()
+    first = outcome["first_cycle_ns"] / 1e9 if outcome["first_cycle_ns"] else time.monotonic()
+    return {
+        "cause": outcome["reason"],
+        **{name: outcome[name] for name in ("cycles", "missed_late", "missed_own", "missed_host", "usage")},
+        "timing_us": timing,
+        "over_budget": over_budget(timing),
+        "errors_m": progress.errors(),
+        "start_up_s": since_process_start() - (time.monotonic() - first),
+        "recording": {"files": [str(path) for path in files], "lost": lost},
+        "refused": progress.refused,
+        "events": progress.events,
+        "config": asdict(config),
+        "version": version("gough"),
+    }

@@ -1,0 +1,158 @@
+"""What a thread needs to keep its rate: priority, a processor, locked memory, a processor that does not doze; and what it used.
+
+Whatever the machine refuses is told by name with a remedy, and can be an error. Everything is put back at the end.
+"""
+
+import contextlib
+import ctypes
+import errno
+import gc
+import os
+import resource
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from plant.errors import GoughError, InputError
+
+PRIORITY_RANGE = (1, 98)
+"""Priorities of SCHED_FIFO; 99 is left to the kernel's own threads."""
+
+_DMA_LATENCY = Path("/dev/cpu_dma_latency")
+_MCL_CURRENT, _MCL_FUTURE = 1, 2
+
+
+@dataclass(frozen=True)
+class RealTimeSettings:
+    """How a loop is to be run.
+
+    Attributes:
+        priority: of SCHED_FIFO, 1 to 98.
+        cpu: the processor to stay on; by default the last of those that the process may use.
+        strict: whether anything that the machine refuses is an error.
+        most_missed: periods missed in a row that end in a controlled stop.
+    """
+
+    priority: int = 80
+    cpu: int | None = None
+    strict: bool = False
+    most_missed: int = 10
+
+    def __post_init__(self) -> None:
+        if not PRIORITY_RANGE[0] <= self.priority <= PRIORITY_RANGE[1]:
+            raise InputError(f"the priority is {self.priority}; it must be {PRIORITY_RANGE[0]} to {PRIORITY_RANGE[1]}")
+        if self.most_missed < 1:
+            raise InputError(f"most_missed is {self.most_missed}; it must be 1 at least")
+        allowed = sorted(os.sched_getaffinity(0))
+        if self.cpu is not None and self.cpu not in allowed:
+            raise InputError(f"there is no processor {self.cpu} for this process; there are {', '.join(map(str, allowed))}")
+
+    @property
+    def processor(self) -> int:
+        """The processor to stay on."""
+        return max(os.sched_getaffinity(0)) if self.cpu is None else self.cpu
+
+
+class RefusedError(GoughError, PermissionError):
+    """The machine refuses what real time needs, and the settings are strict."""
+
+
+@contextmanager
+def real_time(settings: RealTimeSettings) -> Iterator[list[str]]:
+    """Make the calling thread a real-time one for as long as the context lasts; gives what the machine refused, in words.
+
+    Raises:
+        RefusedError: something was refused, and the settings are strict.
+    """
+    refused = []
+    with contextlib.ExitStack() as restore:
+        for what, take, remedy in (
+            ("locked memory", _lock_memory, "run as root, or raise the limit 'memlock' in /etc/security/limits.conf"),
+            (f"staying on processor {settings.processor}", lambda: _stay_on(settings.processor), "choose another with --cpu"),
+            (f"a processor that does not doze ({_DMA_LATENCY})", _stay_awake, "run as root, or let your group write to it"),
+            (
+                f"SCHED_FIFO at priority {settings.priority}",
+                lambda: _take_priority(settings.priority),
+                "run as root, or raise the limit 'rtprio' in /etc/security/limits.conf",
+            ),
+        ):
+            try:
+                restore.callback(take())
+            except OSError as error:
+                refused.append(f"{what}: {os.strerror(error.errno or 0)}: {remedy}")
+        if refused and settings.strict:
+            raise RefusedError(f"this machine refuses {'; '.join(refused)}; or run without --strict")
+        gc.collect()
+        gc.disable()
+        restore.callback(gc.enable)
+        yield refused
+
+
+def _lock_memory() -> Callable[[], Any]:
+    library = ctypes.CDLL(None, use_errno=True)
+    if library.mlockall(_MCL_CURRENT | _MCL_FUTURE):
+        number = ctypes.get_errno()
+        library.munlockall()
+        raise OSError(errno.EPERM if number == errno.ENOMEM else number, "mlockall")
+    return lambda: library.munlockall()
+
+
+def _stay_on(cpu: int) -> Callable[[], Any]:
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {cpu})
+    return lambda: os.sched_setaffinity(0, before)
+
+
+def _stay_awake() -> Callable[[], Any]:
+    descriptor = os.open(_DMA_LATENCY, os.O_WRONLY)
+    os.write(descriptor, struct.pack("i", 0))
+    return lambda: os.close(descriptor)
+
+
+def _take_priority(priority: int) -> Callable[[], Any]:
+    policy, before = os.sched_getscheduler(0), os.sched_getparam(0)
+    os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+    return lambda: os.sched_setscheduler(0, policy, before)
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What the calling thread, and the memory of its process, have used.
+
+    Attributes:
+        major_faults, minor_faults: pages that had to be read in, or mapped.
+        voluntary_switches, involuntary_switches: waits, and times that the scheduler took the processor away.
+        resident: memory of the process [bytes].
+        cpu: processor time [s].
+    """
+
+    major_faults: int
+    minor_faults: int
+    voluntary_switches: int
+    involuntary_switches: int
+    resident: int
+    cpu: float
+
+    def since(self, before: "Usage") -> dict[str, float]:
+        """The differences, by name."""
+        first = asdict(before)
+        return {name: value - first[name] for name, value in asdict(self).items()}
+
+
+def usage() -> Usage:
+    """The calling thread's usage until now."""
+    used = resource.getrusage(resource.RUSAGE_THREAD)
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return Usage(
+        used.ru_majflt, used.ru_minflt, used.ru_nvcsw, used.ru_nivcsw, pages * resource.getpagesize(),
+        used.ru_utime + used.ru_stime,
+    )  # fmt: skip
+
+
+def since_process_start() -> float:
+    """Time since this process was started [s], to a hundredth."""
+    started = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
+    return float(Path("/proc/uptime").read_text().split()[0]) - started

@@ -1,0 +1,282 @@
+"""Recordings: every cycle of a run in an MCAP file, and the process that takes it there from memory shared with the loop.
+
+The loop writes its records round and round and never waits; the recorder takes them out and counts those that it came too late
+for. A record's layout is that of a ROS 2 message in CDR, so a message is the record's bytes, and the schema inside the file is
+made from its dtype: Foxglove and PlotJuggler open it. What a replay needs lies in the file's attachments.
+"""
+
+import io
+import json
+import os
+import struct
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import NonSeekingReader
+from mcap.records import Attachment, Channel, Footer, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
+from numpy.typing import NDArray
+
+from controller.cycle import OK
+from hil.loop import DONE, HEAD, LOST, NO_STOP, RECORD, START, STOP_CAUSES, TAIL, describe_status
+from plant.compiled import Record
+from plant.errors import GoughError
+
+_LITTLE_ENDIAN_CDR = b"\x00\x01\x00\x00"
+_CYCLE_TOPIC, _EVENT_TOPIC = "/cycle", "/event"
+_CYCLE_SCHEMA = "gough/Cycle"
+_CHUNK_S = 0.25
+_POLL_S = 0.05
+_MOST_BYTES = 1 << 20
+_CDR_TYPES = {"i4": "int32", "i8": "int64", "f4": "float32", "f8": "float64"}
+_EVENT_SCHEMA = "int64 cycle  # the period that it happened in\nstring text\n"
+_NOTES = {
+    "cycle": "periods since the first",
+    "time_ns": "when it woke, since the first deadline",
+    "late_ns": "how late it woke",
+    "stage_ns": "sense, leg filters, platform filter, direct kinematics, refinement, control, send, record, plant",
+    "cpu_ns": "processor time of the thread",
+    "missed": "periods missed before this one",
+    "status": "0: all well",
+    "stop": "cause of a controlled stop; 0: none",
+    "angular_velocity": "rad/s, seven IMUs by three axes: 0-5 on the legs, 6 on the platform",
+    "specific_force": "m/s^2",
+    "magnetic_field": "uT",
+    "position": "m, of {2} in {1}",
+    "rotation": "row by row, maps {2} to {1}",
+    "covariance": "row by row, of translation [m] and rotation [rad] in {1}",
+    "residuals": "measured less predicted direction, six legs by three",
+    "conditioning": "1 is best, 0 singular",
+    "lengths": "m",
+    "reference": "six legs by length [m], rate [m/s], acceleration [m/s^2]",
+    "command": "m/s",
+    "truth": "position [m], quaternion (w first), lengths [m], currents [A]",
+}
+
+
+class RecordingError(GoughError, ValueError):
+    """A file is no recording of gough, or one that this version cannot read."""
+
+
+def schema() -> str:
+    """The ROS 2 message definition of a cycle."""
+    lines = []
+    for name in RECORD.names or ():
+        base, shape = RECORD.fields[name][0].base, RECORD.fields[name][0].shape  # type: ignore[index]
+        count = f"[{int(np.prod(shape))}]" if shape else ""
+        lines.append(f"{_CDR_TYPES[base.str[1:]]}{count} {name}  # {_NOTES[name]}\n")
+    return "".join(lines)
+
+
+class Recorder:
+    """Writes cycles and events to an MCAP file.
+
+    Args:
+        path: the file, replaced if it exists.
+        header: what a replay needs: `config` (JSON) and arrays by name.
+        rate: cycles per second [Hz], from which the size of a chunk follows: what a crash may lose.
+        epoch_ns: Unix time of the first deadline [ns].
+    """
+
+    def __init__(self, path: Path, header: Mapping[str, Any], rate: float, epoch_ns: int) -> None:
+        self._file = path.open("wb")
+        self._epoch = epoch_ns
+        size = int(min(_MOST_BYTES, max(_CHUNK_S * rate, 1.0) * RECORD.itemsize))
+        self._writer = Writer(self._file, chunk_size=size)
+        self._writer.start(library=f"gough {header['config']['version']}")
+        self._cycles = self._channel(_CYCLE_TOPIC, _CYCLE_SCHEMA, schema())
+        self._events = self._channel(_EVENT_TOPIC, "gough/Event", _EVENT_SCHEMA)
+        self._writer.add_metadata("gough", {"config": json.dumps(header["config"])})
+        for name, array in header.items():
+            if name != "config":
+                content = io.BytesIO()
+                np.save(content, array)
+                self._writer.add_attachment(0, 0, f"{name}.npy", "application/x-npy", content.getvalue())
+        self._file.flush()
+        self._stopping = False
+
+    def _channel(self, topic: str, name: str, text: str) -> int:
+        number = self._writer.register_schema(name, "ros2msg", text.encode())
+        return int(self._writer.register_channel(topic, "cdr", number))
+
+    def write(self, records: Record) -> None:
+        """Append records (n,), dtype `RECORD`, and what is to be told of them."""
+        times = self._epoch + records["time_ns"]
+        for i in range(len(records)):
+            at = int(times[i])
+            self._writer.add_message(self._cycles, at, _LITTLE_ENDIAN_CDR + records[i].tobytes(), at, int(records["cycle"][i]))
+        for i in np.flatnonzero((records["missed"] > 0) | (records["status"] != OK) | (records["stop"] != NO_STOP)).tolist():
+            for text in self._tell(records[i]):
+                self.tell(int(records["cycle"][i]), text, int(times[i]))
+        self._file.flush()
+
+    def _tell(self, record: Record) -> Iterator[str]:
+        if record["missed"] > 0:
+            yield f"{record['missed']} periods missed"
+        if record["stop"] != NO_STOP and not self._stopping:
+            self._stopping = True
+            yield f"controlled stop: {STOP_CAUSES[int(record['stop'])]}"
+        if record["status"] != OK:
+            yield f"stopped on the brakes: {describe_status(int(record['status']))}"
+
+    def tell(self, cycle: int, text: str, time_ns: int | None = None) -> None:
+        """Append an event."""
+        at = time.time_ns() if time_ns is None else time_ns
+        encoded = text.encode() + b"\0"
+        data = _LITTLE_ENDIAN_CDR + cycle.to_bytes(8, "little", signed=True) + len(encoded).to_bytes(4, "little") + encoded
+        self._writer.add_message(self._events, at, data, at)
+
+    def close(self) -> None:
+        """Complete the file with its index."""
+        finish: Any = self._writer.finish
+        finish()
+        self._file.close()
+
+
+def take(records: Record, link: NDArray[np.int64], tail: int) -> tuple[Record, int, int]:
+    """Copy what the loop has written since record `tail`; returns it, the new tail, and how many were overwritten before."""
+    capacity = len(records)
+    head = int(link[HEAD])
+    first = max(tail, head - capacity)
+    taken = records[np.arange(first, head) % capacity]
+    # What the loop has begun to write over meanwhile is not to be trusted.
+    sound = max(first, int(link[HEAD]) - capacity + 1)
+    return taken[max(sound - first, 0) :], head, min(sound, head) - tail
+
+
+def record(path: Path, header: Mapping[str, Any], rate: float, records: Record, link: NDArray[np.int64]) -> None:
+    """Take the loop's records to a file until it is done; the body of the recorder's process."""
+    supervisor = os.getppid()
+    while not link[HEAD] and not link[DONE]:
+        time.sleep(_POLL_S)
+    epoch = time.time_ns() - time.monotonic_ns() + int(link[START])
+    recorder = Recorder(path, header, rate, epoch)
+    tail = int(link[TAIL])
+    while True:
+        done = bool(link[DONE]) or (os.getppid() != supervisor and _has_ended(link))
+        taken, head, lost = take(records, link, tail)
+        if lost:
+            recorder.tell(tail, f"{lost} cycles lost: the recorder came too late")
+            link[LOST] += lost
+        recorder.write(taken)
+        tail = head
+        link[TAIL] = tail
+        if done and head == link[HEAD]:
+            break
+        time.sleep(_POLL_S)
+    recorder.close()
+
+
+def _has_ended(link: NDArray[np.int64]) -> bool:
+    """Whether the loop has stopped writing, when there is no supervisor any more to say so."""
+    head = int(link[HEAD])
+    time.sleep(1.0)
+    return head == int(link[HEAD])
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What a file holds.
+
+    Attributes:
+        config: what was run.
+        arrays: what a replay needs, by name.
+        records: (N,), dtype `RECORD`.
+        events: cycle and text of each.
+        complete: whether the file was closed; if not, its end is what was last written out.
+    """
+
+    config: dict[str, Any]
+    arrays: dict[str, Record]
+    records: Record
+    events: list[tuple[int, str]]
+    complete: bool
+
+
+def read(path: Path | str) -> Recording:
+    """Read a recording, also one that was cut short.
+
+    Raises:
+        RecordingError: no such file, no recording of gough, or one of another layout.
+    """
+    config: dict[str, Any] | None = None
+    arrays: dict[str, Record] = {}
+    cycles = bytearray()
+    events: list[tuple[int, str]] = []
+    topics: dict[int, str] = {}
+    layout = ""
+    complete = True
+    try:
+        for item in _items(path):
+            if isinstance(item, Footer):
+                break
+            if isinstance(item, Schema) and item.name == _CYCLE_SCHEMA:
+                layout = item.data.decode()
+            elif isinstance(item, Channel):
+                topics[item.id] = item.topic
+            elif isinstance(item, Metadata) and item.name == "gough":
+                config = json.loads(item.metadata["config"])
+            elif isinstance(item, Attachment):
+                arrays[item.name.removesuffix(".npy")] = np.load(io.BytesIO(item.data))
+            elif isinstance(item, Message) and topics[item.channel_id] == _CYCLE_TOPIC:
+                cycles += item.data[len(_LITTLE_ENDIAN_CDR) :]
+            elif isinstance(item, Message):
+                text = item.data[len(_LITTLE_ENDIAN_CDR) :]
+                events.append((int.from_bytes(text[:8], "little", signed=True), text[12:-1].decode()))
+        else:
+            complete = False
+    except FileNotFoundError:
+        raise RecordingError(f"there is no recording at {path}") from None
+    except (McapError, ValueError, EOFError, OSError, struct.error):
+        # What follows the last chunk that was written out whole.
+        complete = False
+    if config is None:
+        raise RecordingError(f"{path} is no recording of gough")
+    if layout != schema():
+        raise RecordingError(
+            f"{path} was recorded by gough {config.get('version')}, whose records are of another layout: use that"
+        )
+    return Recording(config, arrays, np.frombuffer(cycles, RECORD), events, complete)
+
+
+def _items(path: Path | str) -> Iterator[Any]:
+    with Path(path).open("rb") as file:
+        yield from StreamReader(file).records
+
+
+def repair(path: Path) -> bool:
+    """Complete a file that was cut short, in its place; returns whether it needed that.
+
+    Raises:
+        RecordingError: as `read`.
+    """
+    recording = read(path)
+    if recording.complete:
+        return False
+    mended = path.with_name(f".{path.name}.mended")
+    epoch = _first_time(path)
+    recorder = Recorder(mended, {"config": recording.config, **recording.arrays}, recording.config["rate"], epoch)
+    recorder.write(recording.records)
+    recorder.close()
+    mended.replace(path)
+    return True
+
+
+def _first_time(path: Path) -> int:
+    with path.open("rb") as file:
+        for _, channel, message in NonSeekingReader(file).iter_messages(topics=[_CYCLE_TOPIC], log_time_order=False):
+            del channel
+            first: Record = np.frombuffer(message.data[len(_LITTLE_ENDIAN_CDR) :], RECORD)[0]
+            return int(message.log_time) - int(first["time_ns"])
+    return time.time_ns()
+
+
+def total(recordings: Iterable[Recording]) -> Record:
+    """The records of consecutive files, one after the other."""
+    return np.concatenate([recording.records for recording in recordings])
