@@ -141,13 +141,23 @@ def _add_bench(commands: Any) -> None:
     command = commands.add_parser(
         "bench",
         help="measure speed",
-        description="Measure the loop's speed against real time and the microseconds of each stage, and direct kinematics: "
-        "microseconds per pose, against Newton's method from lengths, and whether both find the pose from cold.",
+        description="Measure the loop on the clock: how late it wakes, beside cyclictest, and how long it computes, idle, under "
+        "load and with a busy supervisor; the loop's speed against real time and the microseconds of each stage; and direct "
+        "kinematics: microseconds per pose, against Newton's method from lengths, and whether both find the pose from cold.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     command.add_argument("--duration", type=float, default=60.0, help="of the simulated motion [s]")
     command.add_argument("--target", default="sines", help="motion or CSV file")
-    command.add_argument("--only", choices=("loop", "kinematics"), help="one section instead of both")
+    command.add_argument("--only", choices=("loop", "kinematics", "clock"), help="one section instead of all")
+    command.add_argument(
+        "--clock", type=float, default=10.0, help="seconds on the clock at 1 kHz, idle and again under load; 4 kHz gets a third"
+    )
+    command.add_argument("--cold", action="store_true", help="measure the start without caches, too (a minute)")
+    command.add_argument("--check", action="store_true", help="fail if the loop on the clock is off by more than any noise")
+    command.add_argument("--report", type=Path, metavar="FILE.html", help="write histograms of the loop on the clock")
+    command.add_argument(
+        "--history", type=Path, nargs="+", default=[], metavar="FILE.json", help="earlier figures for the report"
+    )
     _add_json(command)
     command.set_defaults(run=_bench)
 
@@ -421,22 +431,75 @@ def _build_fmu(options: argparse.Namespace) -> int:
 
 
 def _bench(options: argparse.Namespace) -> int:
-    from hil.bench import machine, measure_speed
+    from hil.bench import machine, measure_speed, write_report
     from hil.kinematics_bench import measure_kinematics
+    from hil.real_time_bench import gross_excess, measure_real_time, measure_start_up
 
-    _check_writable(options.json)
+    _check_writable(options.json, options.report)
+    if options.clock <= 0.0:
+        raise InputError(f"--clock is {options.clock:g} s; it must be positive")
     figures: dict[str, Any] = machine()
-    if options.only != "kinematics":
+    if options.only in (None, "clock"):
+        with _progress("the loop on the clock") as progress:
+            figures["start_up"] = measure_start_up(options.cold)
+            figures["real_time"] = measure_real_time({1000.0: options.clock, 4000.0: options.clock / 3.0}, progress)
+        _print_real_time(figures["real_time"], figures["start_up"])
+    if options.only in (None, "loop"):
         with _progress("the loop") as progress:
             figures |= measure_speed(options.target, options.duration, progress)
         _print_speed(figures)
-    if options.only != "loop":
+    if options.only in (None, "kinematics"):
         with _progress("direct kinematics") as progress:
             figures["kinematics"] = measure_kinematics(progress)
         _print_kinematics(figures["kinematics"])
     _write_json(options.json, figures)
+    if options.report:
+        write_report(figures, options.history, options.report)
     print(f"{figures['machine']}, {figures['date']}, gough {figures['version']}")
+    if options.check and (excess := gross_excess(figures.get("real_time", {"rates": {}}))):
+        raise InputError(f"in gross excess: {'; '.join(excess)}")
     return 0
+
+
+def _print_real_time(figures: dict[str, Any], start_up: dict[str, Any]) -> None:
+    rows = {
+        "computing": "compute_us",
+        "bare loop computing": "bare_us",
+        "wake-up to command": "latency_us",
+        "woken late": "wake_us",
+        "cyclictest": "cyclictest_us",
+    }
+    for rate, conditions in figures["rates"].items():
+        for condition, measured in conditions.items():
+            table = _table(f"{rate} Hz, {condition.replace('_', ' ')} [us]", "p50", "p99", "p99.9", "max", "cycles")
+            for label, name in rows.items():
+                if measured[name]:
+                    cells = [f"{measured[name][key]:.1f}" for key in ("p50", "p99", "p999", "max")]
+                    table.add_row(label, *cells, f"{measured[name]['n']}")
+            _print(table)
+            used, text = measured["usage"], ""
+            if measured["cyclictest_us"]:
+                ratios = [measured["wake_us"][key] / measured["cyclictest_us"][key] for key in ("p50", "p999")]
+                text = f"; woken late over cyclictest: p50 {ratios[0]:.2f}, p99.9 {ratios[1]:.2f}"
+            print(
+                f"periods missed by own work {measured['missed_own']}, by the host {measured['missed_host']}; page faults "
+                f"{used['major_faults']:g} major, {used['minor_faults']:g} minor; involuntary switches "
+                f"{used['involuntary_switches']:g}; growth {used['resident']:g} bytes{text}"
+            )
+        if "load" in conditions:
+            idle, load = conditions["idle"], conditions["load"]
+            ours, bare = ([load[name][key] / idle[name][key] for key in ("p50", "p999")] for name in ("compute_us", "bare_us"))
+            print(
+                f"load over idle at {rate} Hz: computing p50 {ours[0]:.2f}, p99.9 {ours[1]:.2f}; bare loop p50 {bare[0]:.2f}, "
+                f"p99.9 {bare[1]:.2f}"
+            )
+    cold = "" if start_up["cold_s"] is None else f", {start_up['cold_s']:.1f} s without caches"
+    print(f"first cycle {start_up['cached_s']:.2f} s after the start{cold}")
+    for name in figures["missing"]:
+        package = {"cyclictest": "rt-tests"}.get(name, name)
+        print(f"{name} is not installed (Debian: apt install {package}): nothing to compare with")
+    for text in figures["refused"]:
+        print(f"without {text}")
 
 
 def _print_speed(figures: dict[str, Any]) -> None:
