@@ -128,7 +128,7 @@ def _sentence(measured: dict[str, Any]) -> str:
     compute, latency = measured["compute_us"], measured["latency_us"]
     return (
         f"Computing p50 {compute['p50']:.1f} us, p99.9 {compute['p999']:.1f}; wake-up to command p50 {latency['p50']:.1f}, "
-        f"p99.9 {latency['p999']:.1f}; periods missed by own work {measured['missed_own']}, by the host {measured['missed_host']}."
+        f"p99.9 {latency['p999']:.1f}; missed by own work {measured['missed_own']}, by the host {measured['missed_host']}."
     )
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -141,8 +142,8 @@ def _add_bench(commands: Any) -> None:
     command = commands.add_parser(
         "bench",
         help="measure speed",
-        description="Measure the loop on the clock: how late it wakes, beside cyclictest, and how long it computes, idle, under "
-        "load and with a busy supervisor; the loop's speed against real time and the microseconds of each stage; and direct "
+        description="Measure the loop on the clock: how late it wakes, beside cyclictest, and how long it computes, idle, "
+        "under load and with a busy supervisor; its speed against real time and the microseconds of each stage; and direct "
         "kinematics: microseconds per pose, against Newton's method from lengths, and whether both find the pose from cold.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
@@ -283,6 +284,8 @@ def _print_simulation(summary: dict[str, Any]) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    # Before NumPy is loaded: its threads would live in the loop's process too.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from hil.executive import RunStoppedError, run
     from hil.realtime import RealTimeSettings
     from hil.simulation import SimulationConfig

@@ -12,6 +12,7 @@ import mmap
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -36,6 +37,8 @@ from hil.loop import (
     STOP_CAUSES,
     STOPPED,
     SUPERVISOR,
+    Loop,
+    Rig,
     describe_status,
     prevent_compilation,
 )
@@ -108,8 +111,9 @@ def run(
     settings: RealTimeSettings,
     recording: Path | None = None,
     show: Callable[[Progress], None] = lambda progress: None,
+    rig: Callable[[Loop], Rig] | None = None,
 ) -> dict[str, Any]:
-    """Run the closed loop against the FMU plant on the machine's clock, to the end of its motion or until it is asked to stop.
+    """Run the closed loop on the machine's clock, to the end of its motion or until it is asked to stop.
 
     SIGINT and SIGTERM ask for a controlled stop. Must be called from the main thread of a process without others.
 
@@ -118,6 +122,8 @@ def run(
         settings: how.
         recording: the MCAP file to write; None for none.
         show: called ten times a second.
+        rig: makes a rig in Python, in the loop's process, for a loop in Python; without it, the FMU plant is driven by the
+            compiled loop. Threads that it starts must have ended when it returns.
 
     Returns:
         The summary: `cause` of the stop, `cycles`, missed periods by cause, `timing_us` and what of it is `over_budget`,
@@ -134,7 +140,7 @@ def run(
     progress = Progress()
     ours, theirs = _FORK.Pipe()
     with _asked_to_stop(link), contextlib.ExitStack() as at_end:
-        loop = _FORK.Process(target=_loop_process, args=(config, settings, records, link, theirs))
+        loop = _FORK.Process(target=_loop_process, args=(config, settings, rig, records, link, theirs))
         loop.start()
         theirs.close()
         at_end.callback(_end, loop, link)
@@ -204,8 +210,13 @@ def _end(loop: BaseProcess, link: NDArray[np.int64]) -> None:
 
 
 def _loop_process(
-    config: SimulationConfig, settings: RealTimeSettings, records: Record, link: NDArray[np.int64], pipe: Connection
-) -> None:  # fmt: skip
+    config: SimulationConfig,
+    settings: RealTimeSettings,
+    make_rig: Callable[[Loop], Rig] | None,
+    records: Record,
+    link: NDArray[np.int64],
+    pipe: Connection,
+) -> None:
     """The loop's process. SIGINT and SIGTERM, blocked, are seen by the loop itself."""
     signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
     try:
@@ -218,11 +229,16 @@ def _loop_process(
                 "parameters": loop.parameters,
                 "reference": loop.segments,
             }
+            loop.load(python=make_rig is not None)
+            rig = None if make_rig is None else make_rig(loop)
+            if threading.active_count() > 1:
+                names = ", ".join(thread.name for thread in threading.enumerate()[1:])
+                raise GoughError(f"the rig has left threads running ({names}), which delay the loop: end them when it is open")
             with prevent_compilation(), real_time(settings) as refused:
                 pipe.send((header, refused))
                 pipe.recv()
                 before = usage()
-                status = loop.follow(end)
+                status = loop.follow(end, rig)
                 used = usage().since(before)
             failed = status >= RIG_FAILED
             reason = str(loop.plant.failure("the plant failed")) if failed else describe_status(status)

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
-from numba import types
+from numba import typeof, types
+from numba.core import event
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
@@ -198,7 +199,7 @@ class Loop:
         """Run up to but not including cycle `last`; returns a status, 0 when all is well, and brakes when it is not."""
         if fuse is None:
             return self._run(last, _ENDLESS)
-        return self.run_python(_FmuRig(self), last, _ENDLESS, fuse)
+        return self._run_python(FmuRig(self), last, _ENDLESS, fuse)
 
     def follow(self, end: int, rig: "Rig | None" = None) -> int:
         """Follow the motion to cycle `end`, stop there, or earlier for a cause, and brake; returns `STOPPED`, or what failed.
@@ -207,15 +208,39 @@ class Loop:
         """
         if rig is None:
             return self._run(_ENDLESS, end)
-        return self.run_python(rig, _ENDLESS, end)
+        return self._run_python(rig, _ENDLESS, end)
 
-    def _run(self, last: int, end: int) -> int:
-        return _run(
+    def load(self, python: bool = False) -> None:
+        """Load the machine code of the loop, or of the one in Python, so that nothing is compiled when it runs."""
+        parameters, state, clock, link, work = self.parameters, self.state, self.clock, self.link, self._work
+        if not python:
+            _load(_run, *self._arguments(0, 0))
+            return
+        timespec, calls = clock["timespec"], self.calls
+        _load(now, timespec)
+        _load(_begin, parameters, state, clock, self.script, link, work, 0, 0)
+        _load(_is_due, parameters, state)
+        _load(_compute, parameters, state, self.segments, work, timespec)
+        _load(_compute_from_legs, parameters, state, self.segments, work, timespec)
+        _load(_note, parameters, state, self.segments, self.records, clock, link, work, 0)
+        _load(_end, self.records, clock, self.script, link, work)
+        _load(_catch_up, calls, parameters, 0)
+        _load(_read, calls, self.imu, work)
+        _load(_checked, 0)
+        _load(write_drive_mode, calls, 0)
+        _load(write_command, calls, state["command"])
+        _load(advance, calls, 0.0)
+
+    def _arguments(self, last: int, end: int) -> tuple[Any, ...]:
+        return (
             self.calls, self.imu, self.parameters, self.state, self.segments, self.records, self.clock, self.script, self.link,
             self._work, self.most_missed, last, end,
         )  # fmt: skip
 
-    def run_python(self, rig: "Rig", last: int, end: int, fuse: LegFusion | None = None) -> int:
+    def _run(self, last: int, end: int) -> int:
+        return _run(*self._arguments(last, end))
+
+    def _run_python(self, rig: "Rig", last: int, end: int, fuse: LegFusion | None = None) -> int:
         """The loop of `_run`, in Python."""
         parameters, state, clock, work = self.parameters, self.state, self.clock, self._work
         measurement, stage_ns, timespec = work["measurement"], work["stage_ns"], clock["timespec"]
@@ -251,18 +276,25 @@ class Loop:
         return status
 
 
+def _load(kernel: Any, *arguments: Any) -> None:
+    """Load a kernel's machine code for arguments of these types, or compile it, without running it."""
+    type_of: Any = typeof
+    kernel.compile(tuple(type_of(argument) for argument in arguments))
+
+
 @contextmanager
 def prevent_compilation() -> Iterator[None]:
-    """Make it an error, as long as the context lasts, if a kernel that is loaded would have to be compiled for other types."""
-    kernels: tuple[Any, ...] = (_run, _begin, _read, _catch_up, _is_due, _compute, _compute_from_legs, _note, _end)
-    loaded = [each for each in kernels if each.signatures]
-    for each in loaded:
-        each.disable_compile()
-    try:
+    """Make it an error, as long as the context lasts, if anything would have to be compiled."""
+
+    class Listener(event.Listener):
+        def on_start(self, event: Any) -> None:
+            raise RuntimeError(f"{event.data['dispatcher']} was to be compiled while the loop is on the clock")
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    with event.install_listener("numba:compile", Listener()):
         yield
-    finally:
-        for each in loaded:
-            each.disable_compile(False)
 
 
 class Rig(Protocol):
@@ -284,13 +316,14 @@ class Rig(Protocol):
         """Stop the drives on their brakes, whatever has happened."""
 
 
-class _FmuRig:
+class FmuRig:
     """The plant behind a loop's `calls`, for loops in Python."""
 
     def __init__(self, loop: Loop) -> None:
         self._loop = loop
 
     def read(self, measurement: Array, missed: int) -> int:
+        """Let the plant move for missed periods, and read it."""
         loop = self._loop
         if loop.state["cycle"] == 0:
             write_drive_mode(loop.calls, BRAKE)
@@ -298,15 +331,19 @@ class _FmuRig:
         return status or _read(loop.calls, loop.imu, loop._work)
 
     def release(self) -> int:
+        """Release the drives."""
         return _checked(write_drive_mode(self._loop.calls, VELOCITY))
 
     def write(self, command: Array) -> int:
+        """Command the drives."""
         return _checked(write_command(self._loop.calls, command))
 
     def advance(self) -> int:
+        """Let the plant move for a period."""
         return _checked(advance(self._loop.calls, float(self._loop.parameters["period"])))
 
     def brake(self) -> int:
+        """Brake the drives."""
         return _checked(write_drive_mode(self._loop.calls, BRAKE))
 
 

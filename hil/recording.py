@@ -82,9 +82,14 @@ class Recorder:
         header: what a replay needs: `config` (JSON) and arrays by name.
         rate: cycles per second [Hz], from which the size of a chunk follows: what a crash may lose.
         epoch_ns: Unix time of the first deadline [ns].
+
+    Attributes:
+        count: records that were written.
+        kept: those that are in the file, whatever happens; the others wait for their chunk to be full.
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any], rate: float, epoch_ns: int) -> None:
+        self.count = self.kept = 0
         self._file = path.open("wb")
         self._epoch = epoch_ns
         size = int(min(_MOST_BYTES, max(_CHUNK_S * rate, 1.0) * RECORD.itemsize))
@@ -109,8 +114,11 @@ class Recorder:
         """Append records (n,), dtype `RECORD`, and what is to be told of them."""
         times = self._epoch + records["time_ns"]
         for i in range(len(records)):
-            at = int(times[i])
+            at, size = int(times[i]), self._file.tell()
             self._writer.add_message(self._cycles, at, _LITTLE_ENDIAN_CDR + records[i].tobytes(), at, int(records["cycle"][i]))
+            self.count += 1
+            if self._file.tell() > size:
+                self.kept = self.count
         for i in np.flatnonzero((records["missed"] > 0) | (records["status"] != OK) | (records["stop"] != NO_STOP)).tolist():
             for text in self._tell(records[i]):
                 self.tell(int(records["cycle"][i]), text, int(times[i]))
@@ -157,16 +165,17 @@ def record(path: Path, header: Mapping[str, Any], rate: float, records: Record, 
         time.sleep(_POLL_S)
     epoch = time.time_ns() - time.monotonic_ns() + int(link[START])
     recorder = Recorder(path, header, rate, epoch)
-    tail = int(link[TAIL])
+    first = tail = int(link[TAIL])
     while True:
         done = bool(link[DONE]) or (os.getppid() != supervisor and _has_ended(link))
         taken, head, lost = take(records, link, tail)
         if lost:
             recorder.tell(tail, f"{lost} cycles lost: the recorder came too late")
             link[LOST] += lost
+            first += lost
         recorder.write(taken)
         tail = head
-        link[TAIL] = tail
+        link[TAIL] = first + recorder.kept
         if done and head == link[HEAD]:
             break
         time.sleep(_POLL_S)
@@ -278,5 +287,10 @@ def _first_time(path: Path) -> int:
 
 
 def total(recordings: Iterable[Recording]) -> Record:
-    """The records of consecutive files, one after the other."""
-    return np.concatenate([recording.records for recording in recordings])
+    """The records of consecutive files; those that a recorder wrote just before it died may be in the next file again."""
+    parts: list[Record] = []
+    last = -1
+    for each in recordings:
+        parts.append(each.records[each.records["cycle"] > last])
+        last = max(last, *each.records["cycle"][-1:].tolist())
+    return np.concatenate(parts)

@@ -5,7 +5,7 @@ import pytest
 
 from controller.cycle import OK, STATE, cycle, prepare, skip
 from hil.clock import REAL, SCRIPTED, new_clock
-from hil.loop import ASKED_TO_STOP, END_OF_MOTION, HEAD, MISSED_PERIODS, RECORD, STAGES, STOP, STOPPED, Loop
+from hil.loop import ASKED_TO_STOP, END_OF_MOTION, HEAD, MISSED_PERIODS, RECORD, STAGES, STOP, STOPPED, FmuRig, Loop
 from hil.simulation import SimulationConfig, prepared_loop
 from plant.imu import imu_state, load_imu
 from plant.variables import BRAKE
@@ -219,15 +219,13 @@ def test_records_go_round_and_the_head_goes_on():
 
 
 def test_a_rig_in_python_runs_the_same_cycle_at_the_same_times():
-    from hil.loop import _FmuRig
-
     late, work = {300: 2_500_000}, {500: 1_700_000}
     with prepared_loop(CONFIG) as compiled, prepared_loop(CONFIG) as python:
         for loop in (compiled, python):
             scripted(loop, late=late, work=work)
         end = 1000
         assert compiled.follow(end) == STOPPED
-        assert python.follow(end, _FmuRig(python)) == STOPPED
+        assert python.follow(end, FmuRig(python)) == STOPPED
         assert compiled.link[HEAD] == python.link[HEAD]
         first, second = written(compiled), written(python)
         for name in set(first.dtype.names) - {"stage_ns"}:
