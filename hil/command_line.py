@@ -368,12 +368,14 @@ def _live_view(mechanism: str, target: str, rate: float) -> Iterator[Callable[[A
 def _view(mechanism: str, target: str, rate: float, progress: Any) -> Any:
     from math import asin, atan2
 
+    from rich.markup import escape
+
     from hil.loop import STOP_CAUSES
 
     table = _table(f"{mechanism} follows {target} at {rate:g} Hz", "")
     latest = progress.latest
     if latest is None:
-        table.add_row("state", "starting")
+        table.add_row("state", "preparing plan, plant and machine code, which the first time is compiled (under a minute)")
         return table
     position, r = 1e3 * latest["position"], latest["rotation"]
     angles = (atan2(r[2, 1], r[2, 2]), asin(max(-1.0, min(1.0, -r[2, 0]))), atan2(r[1, 0], r[0, 0]))
@@ -393,7 +395,7 @@ def _view(mechanism: str, target: str, rate: float, progress: Any) -> Any:
         *(("", text) for text in progress.events),
     )
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*(escape(cell) for cell in row))
     return table
 
 
@@ -439,8 +441,8 @@ def _bench(options: argparse.Namespace) -> int:
     from hil.real_time_bench import gross_excess, measure_real_time, measure_start_up
 
     _check_writable(options.json, options.report)
-    if options.clock <= 0.0:
-        raise InputError(f"--clock is {options.clock:g} s; it must be positive")
+    if not 0.0 < options.clock < float("inf"):
+        raise InputError(f"--clock is {options.clock:g} s; it must be positive and finite")
     figures: dict[str, Any] = machine()
     if options.only in (None, "clock"):
         with _progress("the loop on the clock") as progress:

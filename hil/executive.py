@@ -11,6 +11,7 @@ import contextlib
 import mmap
 import multiprocessing
 import os
+import shutil
 import signal
 import threading
 import time
@@ -143,7 +144,9 @@ def run(
         loop = _FORK.Process(target=_loop_process, args=(config, settings, rig, records, link, theirs))
         loop.start()
         theirs.close()
-        at_end.callback(_end, loop, link)
+        leftovers: list[Path] = []
+        at_end.callback(_end, loop, link, leftovers)
+        leftovers.append(_received(ours, loop, show, progress))
         header, progress.refused = _received(ours, loop, show, progress)
         recorders = _Recorders(recording, header, config.rate, records, link, progress.events)
         at_end.callback(recorders.finish)
@@ -200,13 +203,15 @@ def _received(ours: Connection, loop: BaseProcess, show: Callable[[Progress], No
     return message
 
 
-def _end(loop: BaseProcess, link: NDArray[np.int64]) -> None:
-    """See the loop's process to its end, whatever has happened here."""
+def _end(loop: BaseProcess, link: NDArray[np.int64], leftovers: list[Path]) -> None:
+    """See the loop's process to its end, whatever has happened here, and remove what a crash has left."""
     link[STOP] = 1
     loop.join(_PATIENCE_S)
     if loop.is_alive():
         loop.kill()
         loop.join()
+    for folder in leftovers:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _loop_process(
@@ -229,6 +234,7 @@ def _loop_process(
                 "parameters": loop.parameters,
                 "reference": loop.segments,
             }
+            pipe.send(loop.plant.folder)
             loop.load(python=make_rig is not None)
             rig = None if make_rig is None else make_rig(loop)
             if threading.active_count() > 1:

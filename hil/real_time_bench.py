@@ -302,12 +302,12 @@ def _figures_of_counts(counts: NDArray[np.int64], longest: float | None) -> dict
     return {**figures, "max": top if longest is None else longest, "n": n}
 
 
-def _bars(counts: NDArray[np.int64]) -> tuple[list[float], list[int]]:
+def _bars(counts: NDArray[np.int64]) -> list[list[float]]:
     """Counts by microseconds gathered into bins sixteen to the octave."""
     used = np.flatnonzero(counts)
     bins = np.floor(16.0 * np.log2(np.maximum(used, 0.5)))
     lower = np.unique(bins)
-    return (2.0 ** (lower / 16.0)).tolist(), [int(counts[used[bins == each]].sum()) for each in lower]
+    return [(2.0 ** (lower / 16.0)).tolist(), [int(counts[used[bins == each]].sum()) for each in lower]]
 
 
 def measure_start_up(cold: bool) -> dict[str, float | None]:

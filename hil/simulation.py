@@ -229,7 +229,7 @@ def prepared_loop(config: SimulationConfig) -> Iterator[PreparedLoop]:
             reference=reference,
             planning_time=time.perf_counter() - began,
         )
-        loop.load()
+        loop.load(python=config.fusion != "compiled")
         yield loop
 
 

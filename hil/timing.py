@@ -39,11 +39,11 @@ class Histogram:
         figures = {name: float(min(us, self.longest / 1e3)) for name, us in zip(QUANTILES, middles, strict=True)}
         return {**figures, "max": self.longest / 1e3, "n": n}
 
-    def bars(self) -> tuple[list[float], list[int]]:
+    def bars(self) -> list[list[float]]:
         """Lower ends of the bins that are not empty [us], sixteen to the octave, and their counts."""
         coarse = self.counts.reshape(-1, _PER_OCTAVE // 16).sum(axis=1)
         used = np.flatnonzero(coarse)
-        return (2.0 ** (used / 16.0) / 1e3).tolist(), coarse[used].tolist()
+        return [(2.0 ** (used / 16.0) / 1e3).tolist(), coarse[used].tolist()]
 
 
 class Timing:

@@ -71,6 +71,7 @@ class FmuPlant:
     Attributes:
         calls: the structured array (dtype `CALLS`) for `read_imus`, `read_truth`, `write_command` and `advance`.
         messages: what the FMU has logged.
+        folder: where it has been extracted to; removed by `close`, and for whoever survives a crash to remove.
 
     Raises:
         FmuError: the file is no FMU, is of another kind, lacks variables, has them in another shape or type, holds no
@@ -81,6 +82,7 @@ class FmuPlant:
     def __init__(self, path: Path | str, parameters: Mapping[str, ArrayLike], period: float) -> None:
         self.path = Path(path)
         self.messages: list[str] = []
+        self.folder = Path()
         self.calls: Record = np.zeros((), CALLS)
         self._description = _read_description(self.path)
         self._variables = {variable.name: variable for variable in self._description.modelVariables}
@@ -203,6 +205,7 @@ class FmuPlant:
 
     def _load(self) -> Any:
         folder = self._cleanup.enter_context(tempfile.TemporaryDirectory(prefix="gough-fmu-"))
+        self.folder = Path(folder)
         identifier = self._description.coSimulation.modelIdentifier
         library = Path(folder) / "binaries" / fmpy.platform_tuple / f"{identifier}{fmpy.sharedLibraryExtension}"
         try:

@@ -2,11 +2,13 @@
 
 import json
 import os
+import pty
 import shutil
 import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -37,11 +39,11 @@ def recorded(tmp_path_factory):
     return run(CONFIG, SETTINGS, path), path
 
 
-def gough(*arguments, **options):
+def gough(*arguments, terminal=subprocess.PIPE, **options):
+    command = [sys.executable, "-m", "hil.command_line", *map(str, arguments)]
     return subprocess.Popen(
-        [sys.executable, "-m", "hil.command_line", *map(str, arguments)],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options,
-    )  # fmt: skip
+        command, stdout=subprocess.DEVNULL if terminal > 0 else terminal, stderr=terminal, text=True, **options
+    )
 
 
 def children(pid):
@@ -64,9 +66,9 @@ def wait_for(condition, seconds=60.0):
         time.sleep(0.02)
 
 
-def started(path, *options, duration=60.0):
+def started(path, *options, **environment):
     """A run in a process of its own that is well under way: that, and the loop's and the recorder's process."""
-    process = gough("run", "--duration", duration, "--rate", 500, "--most-missed", 2000, "--record", path, *options)
+    process = gough("run", "--duration", 60, "--rate", 500, "--most-missed", 2000, "--record", path, *options, **environment)
     wait_for(lambda: recorded_cycles(path) > 300 or process.poll() is not None)
     assert process.poll() is None, process.communicate()
     loop, recorder = children(process.pid)
@@ -285,12 +287,14 @@ def test_when_the_supervisor_is_killed_the_loop_stops_by_itself_and_the_file_is_
 
 def test_when_the_loop_is_killed_its_file_is_complete_and_the_run_fails(tmp_path):
     path = tmp_path / "run.mcap"
-    process, loop, recorder = started(path)
+    process, loop, recorder = started(path, env={**os.environ, "TMPDIR": str(tmp_path)})
+    assert list(tmp_path.glob("gough-fmu-*"))
     os.kill(loop, signal.SIGKILL)
     _, errors = process.communicate(timeout=30.0)
     assert process.returncode == 1
     assert "the loop's process has died (exit code -9)" in errors
     assert not Path(f"/proc/{recorder}").exists()
+    assert not list(tmp_path.glob("gough-fmu-*"))
     found = read(path)
     assert found.complete
     assert accounted(found.records["cycle"], found.records["missed"])
@@ -443,3 +447,19 @@ def test_a_run_that_cannot_go_on_says_why_and_keeps_its_recording(tmp_path):
     assert stopped.value.summary["cycles"] == len(read(path).records)
     assert any("stopped on the brakes" in text for _, text in read(path).events)
     assert replay([path]).same
+
+
+def test_a_terminal_shows_the_run_as_it_goes():
+    main, terminal = pty.openpty()
+    try:
+        process = gough("run", "--duration", 1, "--rate", 200, "--most-missed", 2000, stdin=terminal, terminal=terminal)
+        os.close(terminal)
+        shown = b""
+        with suppress(OSError):
+            while part := os.read(main, 4096):
+                shown += part
+    finally:
+        os.close(main)
+    assert process.wait(30.0) == 0
+    for text in (b"hexapod follows circle at 200 Hz", b"roll, pitch, yaw [deg]", b"woken late p50", b"running"):
+        assert text in shown
