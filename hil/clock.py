@@ -1,8 +1,9 @@
 """The clock of the loop: absolute deadlines, late wake-ups and long work told apart, missed periods skipped in phase.
 
 A wake-up that is late by whole periods, or work that lasts into the next ones, leaves those periods out and counts them; the
-deadlines stay where they are. A period is missed by own work if the thread computed for longer than a period, else by the
-host, which took the processor away. Time is CLOCK_MONOTONIC, which no one sets. In tests a script takes its place.
+deadlines stay where they are. A period is missed by own work if the thread worked for longer than a period, by the clock as
+well as by its CPU time; else by the host, which took the processor away, or had it handle interrupts in the thread's name. Time
+is CLOCK_MONOTONIC, which no one sets. In tests a script takes its place.
 """
 
 from typing import Any
@@ -124,15 +125,15 @@ def wait(clock: Record, script: NDArray[np.int64]) -> int:
 
 
 @kernel
-def finish(clock: Record, script: NDArray[np.int64]) -> int:
-    """End a cycle and set the next deadline; returns the CPU time of the cycle [ns]."""
+def finish(clock: Record, script: NDArray[np.int64], worked: int) -> int:
+    """End a cycle that worked for so long [ns], and set the next deadline; returns the CPU time since the last [ns]."""
     c = clock[()]
     if c.mode == FREE:
         c.cycles += 1
         return 0
     if c.mode == SCRIPTED:
         row = script[c.cycles % script.shape[0]]
-        done, used = c.woke + row[1], row[2]
+        done, used, worked = c.woke + row[1], row[2], row[1]
         c.time = done
     else:
         cpu = _cpu_time(c.timespec)
@@ -144,7 +145,7 @@ def finish(clock: Record, script: NDArray[np.int64]) -> int:
     if done > c.deadline:
         c.overrun = -((c.deadline - done) // c.period)
         c.deadline += c.overrun * c.period
-        if used > c.period:
+        if min(used, worked) > c.period:
             c.missed_own += c.overrun
         else:
             c.missed_host += c.overrun

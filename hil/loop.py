@@ -480,8 +480,8 @@ def _end(records: Record, clock: Record, script: NDArray[np.int64], link: NDArra
     head = link[HEAD]
     link[START] = clock[()].start
     record = records[head % records.shape[0]]
-    record.cpu_ns = finish(clock, script)
     record.stage_ns[:] = work[()].stage_ns
+    record.cpu_ns = finish(clock, script, record.stage_ns.sum())
     _publish(link, HEAD, head + 1)
 
 

@@ -250,7 +250,7 @@ def _run_bare(clock: Record, cycles: int, turns: int, durations: NDArray[np.int6
         x += _compute_bare(turns)
         durations[i, 1] = now(c.timespec) - began
         durations[i, 0] = c.late
-        finish(clock, script)
+        finish(clock, script, durations[i, 1])
     return x
 
 
