@@ -496,10 +496,11 @@ def _run(
         status = _begin(parameters, state, clock, script, link, work, most_missed, end)
         if status != OK:
             break
-        began = now(timespec)
         if s.cycle == 0:
             write_drive_mode(calls, BRAKE)
+        # A real rig would have moved on by itself, so this is no stage of the cycle.
         status = _catch_up(calls, parameters, s.missed)
+        began = now(timespec)
         if status == OK:
             status = _read(calls, imu, work)
         if status == OK and _is_due(parameters, state):
