@@ -490,7 +490,7 @@ def _run(
     calls: Record, imu: Record, parameters: Record, state: Record, segments: Array, records: Record, clock: Record,
     script: NDArray[np.int64], link: NDArray[np.int64], work: Record, most_missed: int, last: int, end: int,
 ) -> int:  # fmt: skip
-    s, stage_ns, timespec = state[()], work[()].stage_ns, clock[()].timespec
+    s, c, stage_ns, timespec = state[()], clock[()], work[()].stage_ns, clock[()].timespec
     status = OK
     while status == OK and s.cycle < last:
         status = _begin(parameters, state, clock, script, link, work, most_missed, end)
@@ -500,7 +500,7 @@ def _run(
             write_drive_mode(calls, BRAKE)
         # A real rig would have moved on by itself, so this is no stage of the cycle.
         status = _catch_up(calls, parameters, s.missed)
-        began = now(timespec)
+        began = c.woke if c.mode == REAL and s.missed == 0 else now(timespec)
         if status == OK:
             status = _read(calls, imu, work)
         if status == OK and _is_due(parameters, state):
