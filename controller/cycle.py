@@ -41,6 +41,9 @@ RATE_RANGE_HZ = (50.0, 4000.0)
 STOP_SETTLING_S = 0.1
 """How long a mechanism that has stopped is held by its drives before the brakes take over [s]."""
 
+_GAP_S = 0.05
+"""Longest time for which a leg's angular acceleration is taken to last [s]."""
+
 _WORST_CONDITIONING = 1e-2
 _LEAST_GRAVITY = 0.1
 _LEAST_OBSERVABILITY = 0.2
@@ -72,6 +75,7 @@ PARAMETERS = np.dtype(
         ("acceleration_rate", np.float64),
         ("gains", np.float64, 4),
         ("command_limit", np.float64),
+        ("velocity_limit", np.float64),
         ("acceleration_limit", np.float64),
         ("jerk_limit", np.float64),
         ("settling_cycles", np.int64),
@@ -205,6 +209,7 @@ def cycle_parameters(
         "acceleration_rate": 1.0 / fusion.acceleration_time,
         "gains": (control.proportional, control.integral, control.derivative, control.derivative_bandwidth),
         "command_limit": control.command_reserve * mechanism.require_limits().velocity,
+        "velocity_limit": mechanism.require_limits().velocity,
         "acceleration_limit": mechanism.require_limits().acceleration,
         "jerk_limit": mechanism.require_limits().jerk,
         "settling_cycles": int(np.ceil(STOP_SETTLING_S * rate)),
@@ -305,7 +310,8 @@ def prepare(parameters: Record, state: Record, segments: Array) -> None:
 @kernel
 def begin_stop(parameters: Record, state: Record, cause: int) -> None:
     """Between cycles: leave the motion for the fastest stop within the limits, leg by leg; during the hold there is nothing to
-    stop. The first cause, not 0, counts.
+    stop. The first cause, not 0, counts. In periods that were missed the drives went on as they were last told, and the stop
+    begins from where that has led.
     """
     p, s = parameters[()], state[()]
     if s.stopping != 0:
@@ -313,6 +319,11 @@ def begin_stop(parameters: Record, state: Record, cause: int) -> None:
     s.stopping = cause
     s.stop_cycle = s.stopped_cycle = s.cycle
     if s.cycle > p.hold_cycles:
+        if s.missed > 0:
+            for k in range(LEGS):
+                speed = min(max(s.command[k], -p.velocity_limit), p.velocity_limit)
+                s.reference[k, 0] += s.missed * p.period * speed
+                s.reference[k, 1], s.reference[k, 2] = speed, 0.0
         duration = plan_stop(s.reference, p.acceleration_limit, p.jerk_limit, s.stop_segments)
         s.stopped_cycle += int(np.ceil(duration / p.period)) + p.settling_cycles
         s.reference_index[:] = 0
@@ -370,6 +381,8 @@ def fuse_legs(parameters: Record, state: Record, measurement: Array) -> None:
         if s.cycle == 0:
             start_leg(x, covariance, rate, force, up, p.bias_sigma)
         else:
+            if period > _GAP_S:
+                x[4:6] = 0.0
             predict_leg(x, covariance, period, p.leg_jerk, p.bias_walk)
         update_leg(
             x, covariance, rate, force, up, p.leg_imu_position[k], p.gravity, p.gyroscope_variance, p.leg_force_variance,

@@ -238,8 +238,6 @@ def _simulate(options: argparse.Namespace) -> int:
     from hil.simulation import SimulationConfig, SimulationStoppedError, simulate
 
     _check_writable(options.json, options.report)
-    if options.json and options.report and options.json.resolve() == options.report.resolve():
-        raise InputError(f"--json and --report both name {options.json}: give two files")
     names = ("mechanism", "target", "duration", "rate", "imu", "seed", "fusion", "plant", "imus")
     config = SimulationConfig(**{name: getattr(options, name) for name in names})
     stopped = None
@@ -331,8 +329,10 @@ def _print_run(summary: dict[str, Any]) -> None:
         f"first cycle {summary['start_up_s']:.2f} s after the start"
     )
     print(f"estimate - truth {1e3 * errors['estimation']:.3f} mm RMS; reference - length {1e3 * errors['tracking']:.3f} mm RMS")
-    for file in summary["recording"]["files"]:
-        print(f"recorded in {file}, {summary['recording']['lost']} cycles lost")
+    if summary["unseen"]:
+        print(f"{summary['unseen']} cycles are in none of these figures: the supervisor came too late")
+    if summary["recording"]["files"]:
+        print(f"recorded in {', '.join(summary['recording']['files'])}; {summary['recording']['lost']} cycles lost")
     print(f"stopped on the brakes: {summary['cause']}")
 
 
@@ -390,7 +390,7 @@ def _view(mechanism: str, target: str, rate: float, progress: Any) -> Any:
         ("reference - length, RMS [mm]", f"{1e3 * errors['tracking']:.3f}"),
         ("woken late p50, p99.9, max [us]", "  ".join(f"{wake[name]:.0f}" for name in ("p50", "p999", "max"))),
         ("computing p50, p99.9, max [us]", "  ".join(f"{compute[name]:.0f}" for name in ("p50", "p999", "max"))),
-        ("periods missed, cycles lost", f"{progress.missed}, {progress.lost}"),
+        ("periods missed", f"{progress.missed}"),
         *(("without", text) for text in progress.refused),
         *(("", text) for text in progress.events),
     )
@@ -402,6 +402,7 @@ def _view(mechanism: str, target: str, rate: float, progress: Any) -> Any:
 def _replay(options: argparse.Namespace) -> int:
     from hil.replay import replay
 
+    _check_distinct(options.json, *options.files)
     _check_writable(options.json)
     result = replay(options.files)
     _write_json(options.json, result.summary())
@@ -438,7 +439,7 @@ def _build_fmu(options: argparse.Namespace) -> int:
 def _bench(options: argparse.Namespace) -> int:
     from hil.bench import machine, measure_speed, write_report
     from hil.kinematics_bench import measure_kinematics
-    from hil.real_time_bench import gross_excess, measure_real_time, measure_start_up
+    from hil.real_time_bench import GrossExcessError, gross_excess, measure_real_time, measure_start_up
 
     _check_writable(options.json, options.report)
     if not 0.0 < options.clock < float("inf"):
@@ -462,7 +463,7 @@ def _bench(options: argparse.Namespace) -> int:
         write_report(figures, options.history, options.report)
     print(f"{figures['machine']}, {figures['date']}, gough {figures['version']}")
     if options.check and (excess := gross_excess(figures.get("real_time", {"rates": {}}))):
-        raise InputError(f"in gross excess: {'; '.join(excess)}")
+        raise GrossExcessError(f"in gross excess: {'; '.join(excess)}")
     return 0
 
 
@@ -685,9 +686,17 @@ def _progress(label: str) -> Iterator[Callable[[float], None]]:
 
 
 def _check_writable(*paths: Path | None) -> None:
+    _check_distinct(*paths)
     for path in paths:
         if path is not None:
             check_writable(path)
+
+
+def _check_distinct(*paths: Path | None) -> None:
+    named = [path.resolve() for path in paths if path is not None]
+    for path in named:
+        if named.count(path) > 1:
+            raise InputError(f"{path} is named twice: give two files")
 
 
 def _write_json(path: Path | None, content: dict[str, Any]) -> None:

@@ -8,6 +8,7 @@ recorder dies, another takes over with a file of its own; when the supervisor di
 """
 
 import contextlib
+import errno
 import mmap
 import multiprocessing
 import os
@@ -29,9 +30,12 @@ from numpy.typing import NDArray
 
 from hil.clock import REAL, new_clock
 from hil.loop import (
+    ASKED_TO_STOP,
     DONE,
+    END_OF_MOTION,
+    HEAD,
+    KEPT,
     LINK,
-    LOST,
     RECORD,
     RIG_FAILED,
     STOP,
@@ -48,12 +52,16 @@ from hil.recording import record, repair, take
 from hil.simulation import SimulationConfig, prepared_loop
 from hil.timing import Timing, over_budget
 from plant.compiled import Record
-from plant.errors import GoughError
+from plant.errors import GoughError, InputError
 
 _BUFFER_S = 8.0
 _LEAST_RECORDS = 1024
 _LOOK_S = 0.1
-_PATIENCE_S = 30.0
+_PATIENCE_S = 10.0
+_MOST_RECORDERS = 10
+_BLOCKED = (
+    signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU,
+)  # fmt: skip
 _FORK = multiprocessing.get_context("fork")
 
 
@@ -78,7 +86,7 @@ class Progress:
             how many cycles they are of.
         missed: periods missed so far.
         refused: what the machine refuses of real time.
-        lost: cycles lost to the recorder.
+        unseen: cycles that were overwritten before they could be looked at, and are in none of these figures.
         events: what the supervisor has to tell, such as a recorder that died.
     """
 
@@ -87,7 +95,7 @@ class Progress:
     squares: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     missed: int = 0
     refused: list[str] = field(default_factory=list)
-    lost: int = 0
+    unseen: int = 0
     events: list[str] = field(default_factory=list)
 
     def add(self, records: Record) -> None:
@@ -116,7 +124,7 @@ def run(
 ) -> dict[str, Any]:
     """Run the closed loop on the machine's clock, to the end of its motion or until it is asked to stop.
 
-    SIGINT and SIGTERM ask for a controlled stop. Must be called from the main thread of a process without others.
+    SIGINT, SIGTERM, SIGHUP and SIGQUIT ask for a controlled stop. Must be called from the main thread, with no other running.
 
     Args:
         config: what to run.
@@ -128,44 +136,61 @@ def run(
 
     Returns:
         The summary: `cause` of the stop, `cycles`, missed periods by cause, `timing_us` and what of it is `over_budget`,
-        `errors_m`, `usage` of the loop's thread, `start_up_s`, `recording` (files, cycles lost), `refused`, `events`, `config`,
-        `version`.
+        `errors_m`, cycles `unseen` by these three, `usage` of the loop's thread, `start_up_s`, `recording` (files, cycles
+        lost), `refused`, `events`, `config`, `version`.
 
     Raises:
         GoughError: something in the configuration or the settings cannot be used; nothing has run then.
         RunStoppedError: the run ended on the brakes before its time, or its process died.
     """
+    _check_recording(recording)
     records = _shared(max(_LEAST_RECORDS, round(_BUFFER_S * config.rate)), RECORD)
     link: NDArray[np.int64] = _shared(LINK, np.dtype(np.int64))
     link[SUPERVISOR] = os.getpid()
     progress = Progress()
     ours, theirs = _FORK.Pipe()
     with _asked_to_stop(link), contextlib.ExitStack() as at_end:
-        loop = _FORK.Process(target=_loop_process, args=(config, settings, rig, records, link, theirs))
+        recorders = _Recorders(recording, records, link, ours, progress.events)
+        at_end.callback(recorders.finish)
+        loop = _FORK.Process(target=_loop_process, args=(config, settings, rig, records, link, theirs, ours))
         loop.start()
         theirs.close()
         leftovers: list[Path] = []
         at_end.callback(_end, loop, link, leftovers)
-        leftovers.append(_received(ours, loop, show, progress))
-        header, progress.refused = _received(ours, loop, show, progress)
-        recorders = _Recorders(recording, header, config.rate, records, link, progress.events)
-        at_end.callback(recorders.finish)
-        ours.send("go")
-        tail = 0
-        while not ours.poll(_LOOK_S):
-            taken, tail, _ = take(records, link, tail)
+        leftovers.append(_prepared(ours, loop, link, show, progress))
+        header, progress.refused = _prepared(ours, loop, link, show, progress)
+        recorders.start(header)
+        with contextlib.suppress(BrokenPipeError):
+            ours.send("go")
+        tail, answered = 0, time.monotonic()
+        while not ours.poll(_LOOK_S) and loop.is_alive():
+            taken, tail, unseen = take(records, link, tail)
             progress.add(taken)
-            progress.lost = int(link[LOST])
+            progress.unseen += unseen
             recorders.watch()
             show(progress)
-            if not loop.is_alive() and not ours.poll():
-                break
-        outcome = _received(ours, loop, show, progress)
-        progress.add(take(records, link, tail)[0])
-    summary = _summary(config, progress, outcome, recorders.files, int(link[LOST]))
+            if len(taken) or not link[STOP]:
+                answered = time.monotonic()
+            elif time.monotonic() - answered > _PATIENCE_S:
+                progress.events.append(
+                    f"the loop has not answered for {_PATIENCE_S:g} s and was killed: the rig brakes by itself"
+                )
+                loop.kill()
+        outcome = _received(ours, loop)
+        taken, tail, unseen = take(records, link, tail)
+        progress.add(taken)
+        progress.unseen += unseen
+    summary = _summary(config, progress, outcome, recorders)
     if outcome["status"] != STOPPED:
         raise RunStoppedError(f"stopped on the brakes at cycle {outcome['cycle']}: {outcome['reason']}", summary)
+    if outcome["stop"] not in (END_OF_MOTION, ASKED_TO_STOP):
+        raise RunStoppedError(f"stopped before its time at cycle {outcome['cycle']}: {outcome['reason']}", summary)
     return summary
+
+
+def _check_recording(path: Path | None) -> None:
+    if path is not None and path.exists() and not path.is_file():
+        raise InputError(f"{path} is no file: name another for the recording")
 
 
 def _shared(count: int, dtype: np.dtype[Any]) -> Any:
@@ -175,13 +200,15 @@ def _shared(count: int, dtype: np.dtype[Any]) -> Any:
 
 @contextmanager
 def _asked_to_stop(link: NDArray[np.int64]) -> Iterator[None]:
-    """Let SIGINT and SIGTERM ask for a controlled stop."""
+    """Let the signals that would end this process ask for a controlled stop."""
 
     def ask(number: int, frame: object) -> None:
         del number, frame
         link[STOP] = 1
 
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM)
+    # What is ignored, as nohup has it, stays so.
+    before = {each: signal.signal(each, ask) for each in numbers if signal.getsignal(each) != signal.SIG_IGN}
     try:
         yield
     finally:
@@ -189,13 +216,23 @@ def _asked_to_stop(link: NDArray[np.int64]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _received(ours: Connection, loop: BaseProcess, show: Callable[[Progress], None], progress: Progress) -> Any:
-    """What the loop's process sends; its error is raised here."""
+def _prepared(
+    ours: Connection, loop: BaseProcess, link: NDArray[np.int64], show: Callable[[Progress], None], progress: Progress
+) -> Any:  # fmt: skip
+    """What the loop's process sends while it prepares; nothing moves yet, so it need not be let finish."""
     while not ours.poll(_LOOK_S) and loop.is_alive():
         show(progress)
+        if link[STOP]:
+            loop.kill()
+            raise RunStoppedError("asked to stop before anything has moved")
+    return _received(ours, loop)
+
+
+def _received(ours: Connection, loop: BaseProcess) -> Any:
+    """What the loop's process has sent; its error is raised here."""
     try:
         message = ours.recv()
-    except EOFError:
+    except (EOFError, ConnectionResetError):
         loop.join(_PATIENCE_S)
         raise RunStoppedError(f"the loop's process has died (exit code {loop.exitcode}); nothing commands the rig") from None
     if isinstance(message, GoughError):
@@ -221,101 +258,155 @@ def _loop_process(
     records: Record,
     link: NDArray[np.int64],
     pipe: Connection,
+    supervisors: Connection,
 ) -> None:
-    """The loop's process. SIGINT and SIGTERM, blocked, are seen by the loop itself."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
-    try:
-        with prepared_loop(config) as loop:
-            end = len(loop.records)
-            loop.records, loop.link, loop.most_missed = records, link, settings.most_missed
-            loop.clock = new_clock(REAL, round(1e9 / config.rate))
-            header = {
-                "config": {**asdict(config), "mechanism_name": loop.mechanism.name, "version": version("gough")},
-                "parameters": loop.parameters,
-                "reference": loop.segments,
-            }
-            pipe.send(loop.plant.folder)
-            loop.load(python=make_rig is not None)
-            rig = None if make_rig is None else make_rig(loop)
-            if threading.active_count() > 1:
-                names = ", ".join(thread.name for thread in threading.enumerate()[1:])
-                raise GoughError(f"the rig has left threads running ({names}), which delay the loop: end them when it is open")
-            with prevent_compilation(), real_time(settings) as refused:
-                pipe.send((header, refused))
-                pipe.recv()
-                before = usage()
-                status = loop.follow(end, rig)
-                used = usage().since(before)
-            failed = status >= RIG_FAILED
-            reason = str(loop.plant.failure("the plant failed")) if failed else describe_status(status)
-            outcome = {
+    """The loop's process. Signals that end others, blocked, are seen by the loop itself."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, _BLOCKED)
+    # Else the end of the supervisor would not show.
+    supervisors.close()
+    # Without a supervisor there is nobody to tell.
+    with contextlib.suppress(EOFError, BrokenPipeError):
+        try:
+            _prepare_and_follow(config, settings, make_rig, records, link, pipe)
+        except GoughError as error:
+            pipe.send(error)
+        except Exception as error:
+            pipe.send(RunStoppedError(f"stopped on the brakes: {type(error).__name__}: {error}"))
+            raise
+
+
+def _prepare_and_follow(
+    config: SimulationConfig,
+    settings: RealTimeSettings,
+    make_rig: Callable[[Loop], Rig] | None,
+    records: Record,
+    link: NDArray[np.int64],
+    pipe: Connection,
+) -> None:
+    with prepared_loop(config, records) as loop:
+        pipe.send(loop.plant.folder)
+        loop.link, loop.most_missed = link, settings.most_missed
+        loop.clock = new_clock(REAL, round(1e9 / config.rate))
+        run_id = f"{time.time_ns():x}-{os.getpid()}"
+        header = {
+            "config": {**asdict(config), "mechanism_name": loop.mechanism.name, "version": version("gough"), "run": run_id},
+            "parameters": loop.parameters,
+            "reference": loop.segments,
+        }
+        loop.load(python=make_rig is not None)
+        rig = None if make_rig is None else make_rig(loop)
+        if threading.active_count() > 1:
+            names = ", ".join(thread.name for thread in threading.enumerate()[1:])
+            raise GoughError(f"the rig has left threads running ({names}), which delay the loop: end them when it is open")
+        with prevent_compilation(), real_time(settings) as refused:
+            pipe.send((header, refused))
+            pipe.recv()
+            before = usage()
+            status = loop.follow(loop.end, rig)
+            used = usage().since(before)
+        if status == STOPPED:
+            reason = STOP_CAUSES[int(loop.state["stopping"])]
+        elif status >= RIG_FAILED and rig is None:
+            reason = str(loop.plant.failure("the plant failed"))
+        else:
+            reason = describe_status(status)
+        pipe.send(
+            {
                 "status": status,
-                "reason": STOP_CAUSES[int(loop.state["stopping"])] if status == STOPPED else reason,
+                "stop": int(loop.state["stopping"]),
+                "reason": reason,
                 "cycle": int(loop.state["cycle"]),
-                "cycles": int(loop.clock["cycles"]),
+                "cycles": int(link[HEAD]),
                 "missed_late": int(loop.clock["missed_late"]),
                 "missed_own": int(loop.clock["missed_own"]),
                 "missed_host": int(loop.clock["missed_host"]),
                 "usage": used,
                 "first_cycle_ns": int(loop.clock["start"]),
             }
-            pipe.send(outcome)
-    except GoughError as error:
-        pipe.send(error)
+        )
 
 
 class _Recorders:
     """The process that records, and its successors if it dies."""
 
     def __init__(
-        self,
-        path: Path | None,
-        header: dict[str, Any],
-        rate: float,
-        records: Record,
-        link: NDArray[np.int64],
-        events: list[str],
-    ) -> None:
+        self, path: Path | None, records: Record, link: NDArray[np.int64], supervisors: Connection, events: list[str]
+    ) -> None:  # fmt: skip
         self.files: list[Path] = []
-        self._path, self._arguments, self._link, self._events = path, (header, rate, records, link), link, events
+        self._path, self._records, self._link, self._supervisors, self._events = path, records, link, supervisors, events
+        self._header: dict[str, Any] = {}
         self._process: BaseProcess | None = None
-        if path is not None:
-            self._start(path)
+
+    @property
+    def lost(self) -> int:
+        """Cycles that are in no file."""
+        return int(self._link[HEAD] - self._link[KEPT]) if self.files else 0
+
+    def start(self, header: dict[str, Any]) -> None:
+        """Start the first recorder."""
+        self._header = header
+        if self._path is not None:
+            self._start(self._path)
 
     def _start(self, path: Path) -> None:
         self.files.append(path)
-        self._process = _FORK.Process(target=_recorder_process, args=(path, *self._arguments))
+        arguments = (path, self._header, self._records, self._link, self._supervisors)
+        self._process = _FORK.Process(target=_recorder_process, args=arguments)
         self._process.start()
 
     def watch(self) -> None:
-        """Start a successor, which writes a file of its own, if the recorder has died."""
-        if self._path is not None and self._process is not None and not self._process.is_alive():
-            path = self._path.with_stem(f"{self._path.stem}-{len(self.files) + 1}")
-            self._events.append(f"the recorder died (exit code {self._process.exitcode}); another goes on in {path}")
+        """Start a successor, with a file of its own, if the recorder has been killed; one that cannot write has none."""
+        if self._path is None or self._process is None or self._process.is_alive():
+            return
+        if self._process.exitcode != 0:
+            self._say_why()
+        killed = (self._process.exitcode or 0) < 0
+        self._process = None
+        if killed and len(self.files) < _MOST_RECORDERS:
+            numbers = range(len(self.files) + 1, 10_000)
+            path = next(each for n in numbers if not (each := self._path.with_stem(f"{self._path.stem}-{n}")).exists())
+            self._events.append(f"another recorder goes on in {path}")
             self._start(path)
+
+    def _say_why(self) -> None:
+        code = self._process.exitcode if self._process else 0
+        if code is not None and code > 0:
+            self._events.append(f"{self.files[-1]} cannot be written: {os.strerror(code)}: the rest is not recorded")
+        else:
+            self._events.append(f"the recorder died (exit code {code})")
 
     def finish(self) -> None:
         """Let the recorder write what is left, and complete the files of those that died."""
         self._link[DONE] = 1
-        if self._process is None:
-            return
-        self._process.join(_PATIENCE_S)
-        if self._process.exitcode != 0:
-            self._events.append(
-                f"the recorder ended with exit code {self._process.exitcode}: {self.files[-1]} may lack its end"
-            )
+        if self._process is not None:
+            self._process.join(_PATIENCE_S)
+            if self._process.is_alive():
+                self._process.kill()
+                self._process.join()
+            if self._process.exitcode != 0:
+                self._say_why()
         for path in self.files:
-            if path.exists():
-                repair(path)
+            try:
+                if path.exists():
+                    repair(path)
+            except (GoughError, OSError) as error:
+                self._events.append(f"{path} is incomplete: {error}")
 
 
-def _recorder_process(path: Path, *arguments: Any) -> None:
-    signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
-    record(path, *arguments)
+def _recorder_process(
+    path: Path, header: dict[str, Any], records: Record, link: NDArray[np.int64], supervisors: Connection
+) -> None:  # fmt: skip
+    signal.pthread_sigmask(signal.SIG_BLOCK, _BLOCKED)
+    supervisors.close()
+    try:
+        record(path, header, records, link)
+    except OSError as error:
+        # The writer would try again when it is collected.
+        os._exit(error.errno or errno.EIO)
 
 
 def _summary(
-    config: SimulationConfig, progress: Progress, outcome: dict[str, Any], files: list[Path], lost: int
+    config: SimulationConfig, progress: Progress, outcome: dict[str, Any], recorders: _Recorders
 ) -> dict[str, Any]:  # fmt: skip
     timing = progress.timing.figures()
     first = outcome["first_cycle_ns"] / 1e9 if outcome["first_cycle_ns"] else time.monotonic()
@@ -326,7 +417,8 @@ def _summary(
         "over_budget": over_budget(timing),
         "errors_m": progress.errors(),
         "start_up_s": since_process_start() - (time.monotonic() - first),
-        "recording": {"files": [str(path) for path in files], "lost": lost},
+        "unseen": progress.unseen,
+        "recording": {"files": [str(path) for path in recorders.files], "lost": recorders.lost},
         "refused": progress.refused,
         "events": progress.events,
         "config": asdict(config),

@@ -42,8 +42,8 @@ from plant.variables import BRAKE, IMU_COUNT, VELOCITY
 STOPPED, CLOCK_FAILED = 50, 51
 """Statuses beside those of the cycle: a controlled stop has ended on the brakes; the machine's clock wakes no one."""
 
-RIG_FAILED = 100
-"""Added to the rig's own status (FMI's, for an FMU) when it reports a failure."""
+RIG_FAILED, SEND_FAILED = 100, 200
+"""Added to the rig's own status (FMI's, for an FMU) when it reports a failure: before the cycle has computed, and after."""
 
 NO_STOP, END_OF_MOTION, ASKED_TO_STOP, MISSED_PERIODS, SUPERVISOR_GONE = range(5)
 STOP_CAUSES = (
@@ -114,16 +114,17 @@ the thread's CPU time; periods missed before it; its status and the cause of a s
 and commands; and the truth as the plant's `truth` buffer has it.
 """
 
-HEAD, STOP, DONE, TAIL, LOST, SUPERVISOR, START = range(7)
+HEAD, STOP, DONE, TAIL, KEPT, SUPERVISOR, START = range(7)
 LINK = 16
 """Places in the array that the loop shares with other processes, int64 (16,): records written, whether it shall stop, whether
-it has ended; records taken out by the recorder, and lost to it; the process whose end ends the motion, 0 for none; and the
-first deadline [ns]."""
+it has ended; where the next recorder goes on, and how many records are in files for good; the process whose end ends the
+motion, 0 for none; and the first deadline [ns]."""
 
 
 def describe_status(status: int) -> str:
     """What a status of the loop means, in words; what a rig has to say of its own, it must be asked."""
-    return _FAILURES.get(status, f"the rig reports failure {status - RIG_FAILED}")
+    own = status - (SEND_FAILED if status >= SEND_FAILED else RIG_FAILED)
+    return _FAILURES.get(status, f"the rig reports failure {own}")
 
 
 LegFusion = Callable[[Record, Array], None]
@@ -131,8 +132,8 @@ LegFusion = Callable[[Record, Array], None]
 
 _ENDLESS = np.iinfo(np.int64).max
 _LOOK_NS = 100_000_000
-_SIGNALS = 1 << 1 | 1 << 14
-"""SIGINT and SIGTERM in a set of signals."""
+_SIGNALS = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14
+"""SIGHUP, SIGINT, SIGQUIT and SIGTERM in a set of signals."""
 
 _WORK = np.dtype(
     [
@@ -208,7 +209,11 @@ class Loop:
         """
         if rig is None:
             return self._run(_ENDLESS, end)
-        return self._run_python(rig, _ENDLESS, end)
+        try:
+            return self._run_python(rig, _ENDLESS, end)
+        except BaseException:
+            rig.brake()
+            raise
 
     def load(self, python: bool = False) -> None:
         """Load the machine code of the loop, or of the one in Python, so that nothing is compiled when it runs."""
@@ -226,7 +231,7 @@ class Loop:
         _load(_end, self.records, clock, self.script, link, work)
         _load(_catch_up, calls, parameters, 0)
         _load(_read, calls, self.imu, work)
-        _load(_checked, 0)
+        _load(_checked, 0, 0)
         _load(write_drive_mode, calls, 0)
         _load(write_command, calls, state["command"])
         _load(advance, calls, 0.0)
@@ -262,13 +267,13 @@ class Loop:
                 stage_ns[_LEGS] = now(timespec) - began
                 status = _compute_from_legs(parameters, state, self.segments, work, timespec)
             began = now(timespec)
-            if status == OK:
-                status = rig.write(state["command"])
+            if status == OK and (failure := rig.write(state["command"])):
+                status = failure + SEND_FAILED - RIG_FAILED
             stage_ns[_SEND] = now(timespec) - began
             _note(parameters, state, self.segments, self.records, clock, self.link, work, status)
             began = now(timespec)
-            if status == OK:
-                status = rig.advance()
+            if status == OK and (failure := rig.advance()):
+                status = failure + SEND_FAILED - RIG_FAILED
             stage_ns[_PLANT] = now(timespec) - began
             _end(self.records, clock, self.script, self.link, work)
         if status != OK:
@@ -332,24 +337,24 @@ class FmuRig:
 
     def release(self) -> int:
         """Release the drives."""
-        return _checked(write_drive_mode(self._loop.calls, VELOCITY))
+        return _checked(write_drive_mode(self._loop.calls, VELOCITY), RIG_FAILED)
 
     def write(self, command: Array) -> int:
         """Command the drives."""
-        return _checked(write_command(self._loop.calls, command))
+        return _checked(write_command(self._loop.calls, command), RIG_FAILED)
 
     def advance(self) -> int:
         """Let the plant move for a period."""
-        return _checked(advance(self._loop.calls, float(self._loop.parameters["period"])))
+        return _checked(advance(self._loop.calls, float(self._loop.parameters["period"])), RIG_FAILED)
 
     def brake(self) -> int:
         """Brake the drives."""
-        return _checked(write_drive_mode(self._loop.calls, BRAKE))
+        return _checked(write_drive_mode(self._loop.calls, BRAKE), RIG_FAILED)
 
 
 @kernel
-def _checked(status: int) -> int:
-    return RIG_FAILED + status if status else OK
+def _checked(status: int, offset: int) -> int:
+    return offset + status if status else OK
 
 
 @kernel
@@ -366,8 +371,7 @@ def _begin(
         return CLOCK_FAILED
     skip(state, missed)
     work[()].cycle = s.cycle
-    if s.cycle >= end:
-        begin_stop(parameters, state, END_OF_MOTION)
+    work[()].stage_ns[:] = 0
     if link[STOP] != 0:
         begin_stop(parameters, state, ASKED_TO_STOP)
     if c.in_a_row >= most_missed:
@@ -378,6 +382,8 @@ def _begin(
             begin_stop(parameters, state, ASKED_TO_STOP)
         if link[SUPERVISOR] != 0 and _getppid() != link[SUPERVISOR]:
             begin_stop(parameters, state, SUPERVISOR_GONE)
+    if s.cycle >= end:
+        begin_stop(parameters, state, END_OF_MOTION)
     return STOPPED if has_stopped(state) else OK
 
 
@@ -387,7 +393,7 @@ def _catch_up(calls: Record, parameters: Record, missed: int) -> int:
     status = 0
     for _ in range(missed):
         status |= advance(calls, parameters[()].period)
-    return _checked(status)
+    return _checked(status, RIG_FAILED)
 
 
 @kernel
@@ -396,7 +402,7 @@ def _read(calls: Record, imu: Record, work: Record) -> int:
     status = read_imus(calls) | read_truth(calls)
     measure(imu, calls[()].imu, work[()].measurement)
     work[()].truth[:] = calls[()].truth
-    return _checked(status)
+    return _checked(status, RIG_FAILED)
 
 
 @kernel
@@ -504,18 +510,18 @@ def _run(
         if status == OK:
             status = _read(calls, imu, work)
         if status == OK and _is_due(parameters, state):
-            status = _checked(write_drive_mode(calls, VELOCITY))
+            status = _checked(write_drive_mode(calls, VELOCITY), RIG_FAILED)
         stage_ns[_SENSE] = now(timespec) - began
         if status == OK:
             status = _compute(parameters, state, segments, work, timespec)
         began = now(timespec)
         if status == OK:
-            status = _checked(write_command(calls, s.command))
+            status = _checked(write_command(calls, s.command), SEND_FAILED)
         stage_ns[_SEND] = now(timespec) - began
         _note(parameters, state, segments, records, clock, link, work, status)
         began = now(timespec)
         if status == OK:
-            status = _checked(advance(calls, parameters[()].period))
+            status = _checked(advance(calls, parameters[()].period), SEND_FAILED)
         stage_ns[_PLANT] = now(timespec) - began
         _end(records, clock, script, link, work)
     if status != OK:

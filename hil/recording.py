@@ -5,10 +5,10 @@ for. A record's layout is that of a ROS 2 message in CDR, so a message is the re
 made from its dtype: Foxglove and PlotJuggler open it. What a replay needs lies in the file's attachments.
 """
 
+import hashlib
 import io
 import json
 import os
-import struct
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -16,15 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.reader import NonSeekingReader
 from mcap.records import Attachment, Channel, Footer, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from numpy.typing import NDArray
 
 from controller.cycle import OK
-from hil.loop import DONE, HEAD, LOST, NO_STOP, RECORD, START, STOP_CAUSES, TAIL, describe_status
+from hil.loop import DONE, HEAD, KEPT, NO_STOP, RECORD, START, STOP_CAUSES, TAIL, describe_status
 from plant.compiled import Record
 from plant.errors import GoughError
 
@@ -80,49 +78,47 @@ class Recorder:
     Args:
         path: the file, replaced if it exists.
         header: what a replay needs: `config` (JSON) and arrays by name.
-        rate: cycles per second [Hz], from which the size of a chunk follows: what a crash may lose.
         epoch_ns: Unix time of the first deadline [ns].
-
-    Attributes:
-        count: records that were written.
-        kept: those that are in the file, whatever happens; the others wait for their chunk to be full.
     """
 
-    def __init__(self, path: Path, header: Mapping[str, Any], rate: float, epoch_ns: int) -> None:
-        self.count = self.kept = 0
+    def __init__(self, path: Path, header: Mapping[str, Any], epoch_ns: int) -> None:
         self._file = path.open("wb")
         self._epoch = epoch_ns
-        size = int(min(_MOST_BYTES, max(_CHUNK_S * rate, 1.0) * RECORD.itemsize))
-        self._writer = Writer(self._file, chunk_size=size)
+        self._writer = Writer(self._file, chunk_size=_MOST_BYTES)
         self._writer.start(library=f"gough {header['config']['version']}")
         self._cycles = self._channel(_CYCLE_TOPIC, _CYCLE_SCHEMA, schema())
         self._events = self._channel(_EVENT_TOPIC, "gough/Event", _EVENT_SCHEMA)
-        self._writer.add_metadata("gough", {"config": json.dumps(header["config"])})
-        for name, array in header.items():
-            if name != "config":
-                content = io.BytesIO()
-                np.save(content, array)
-                self._writer.add_attachment(0, 0, f"{name}.npy", "application/x-npy", content.getvalue())
-        self._file.flush()
+        contents = {name: _saved(array) for name, array in header.items() if name != "config"}
+        digests = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
+        self._writer.add_metadata("gough", {"config": json.dumps(header["config"]), **digests})
+        for name, content in contents.items():
+            self._writer.add_attachment(0, 0, f"{name}.npy", "application/x-npy", content)
         self._stopping = False
+        self.flush()
 
     def _channel(self, topic: str, name: str, text: str) -> int:
         number = self._writer.register_schema(name, "ros2msg", text.encode())
         return int(self._writer.register_channel(topic, "cdr", number))
 
+    def flush(self) -> None:
+        """Complete the chunk: what has been written until now is in the file, whatever happens."""
+        flush: Any = self._writer.flush
+        flush()
+        self._file.flush()
+
     def write(self, records: Record) -> None:
         """Append records (n,), dtype `RECORD`, and what is to be told of them."""
+        self.write_cycles(records)
         times = self._epoch + records["time_ns"]
-        for i in range(len(records)):
-            at, size = int(times[i]), self._file.tell()
-            self._writer.add_message(self._cycles, at, _LITTLE_ENDIAN_CDR + records[i].tobytes(), at, int(records["cycle"][i]))
-            self.count += 1
-            if self._file.tell() > size:
-                self.kept = self.count
         for i in np.flatnonzero((records["missed"] > 0) | (records["status"] != OK) | (records["stop"] != NO_STOP)).tolist():
             for text in self._tell(records[i]):
                 self.tell(int(records["cycle"][i]), text, int(times[i]))
-        self._file.flush()
+
+    def write_cycles(self, records: Record) -> None:
+        """Append records (n,) alone."""
+        times = (self._epoch + records["time_ns"]).tolist()
+        for i, at in enumerate(times):
+            self._writer.add_message(self._cycles, at, _LITTLE_ENDIAN_CDR + records[i].tobytes(), at, int(records["cycle"][i]))
 
     def _tell(self, record: Record) -> Iterator[str]:
         if record["missed"] > 0:
@@ -147,6 +143,12 @@ class Recorder:
         self._file.close()
 
 
+def _saved(array: Record) -> bytes:
+    content = io.BytesIO()
+    np.save(content, array)
+    return content.getvalue()
+
+
 def take(records: Record, link: NDArray[np.int64], tail: int) -> tuple[Record, int, int]:
     """Copy what the loop has written since record `tail`; returns it, the new tail, and how many were overwritten before."""
     capacity = len(records)
@@ -158,25 +160,29 @@ def take(records: Record, link: NDArray[np.int64], tail: int) -> tuple[Record, i
     return taken[max(sound - first, 0) :], head, min(sound, head) - tail
 
 
-def record(path: Path, header: Mapping[str, Any], rate: float, records: Record, link: NDArray[np.int64]) -> None:
+def record(path: Path, header: Mapping[str, Any], records: Record, link: NDArray[np.int64]) -> None:
     """Take the loop's records to a file until it is done; the body of the recorder's process."""
     supervisor = os.getppid()
     while not link[HEAD] and not link[DONE]:
         time.sleep(_POLL_S)
-    epoch = time.time_ns() - time.monotonic_ns() + int(link[START])
-    recorder = Recorder(path, header, rate, epoch)
-    first = tail = int(link[TAIL])
+        if os.getppid() != supervisor:
+            return
+    recorder = Recorder(path, header, time.time_ns() - time.monotonic_ns() + int(link[START]))
+    tail, before = int(link[TAIL]), int(link[KEPT])
+    count, flushed = 0, time.monotonic()
     while True:
         done = bool(link[DONE]) or (os.getppid() != supervisor and _has_ended(link))
-        taken, head, lost = take(records, link, tail)
+        taken, tail, lost = take(records, link, tail)
         if lost:
             recorder.tell(tail, f"{lost} cycles lost: the recorder came too late")
-            link[LOST] += lost
-            first += lost
         recorder.write(taken)
-        tail = head
-        link[TAIL] = first + recorder.kept
-        if done and head == link[HEAD]:
+        count += len(taken)
+        ended = done and tail == link[HEAD]
+        if ended or time.monotonic() - flushed > _CHUNK_S:
+            recorder.flush()
+            link[KEPT], link[TAIL] = before + count, tail
+            flushed = time.monotonic()
+        if ended:
             break
         time.sleep(_POLL_S)
     recorder.close()
@@ -198,6 +204,7 @@ class Recording:
         arrays: what a replay needs, by name.
         records: (N,), dtype `RECORD`.
         events: cycle and text of each.
+        epoch_ns: Unix time of the first deadline [ns].
         complete: whether the file was closed; if not, its end is what was last written out.
     """
 
@@ -205,6 +212,7 @@ class Recording:
     arrays: dict[str, Record]
     records: Record
     events: list[tuple[int, str]]
+    epoch_ns: int
     complete: bool
 
 
@@ -219,8 +227,8 @@ def read(path: Path | str) -> Recording:
     cycles = bytearray()
     events: list[tuple[int, str]] = []
     topics: dict[int, str] = {}
-    layout = ""
-    complete = True
+    digests: dict[str, str] = {}
+    layout, epoch, complete = "", 0, True
     try:
         for item in _items(path):
             if isinstance(item, Footer):
@@ -230,10 +238,14 @@ def read(path: Path | str) -> Recording:
             elif isinstance(item, Channel):
                 topics[item.id] = item.topic
             elif isinstance(item, Metadata) and item.name == "gough":
-                config = json.loads(item.metadata["config"])
+                config, digests = json.loads(item.metadata["config"]), item.metadata
             elif isinstance(item, Attachment):
-                arrays[item.name.removesuffix(".npy")] = np.load(io.BytesIO(item.data))
+                name = item.name.removesuffix(".npy")
+                if hashlib.sha256(item.data).hexdigest() == digests.get(name):
+                    arrays[name] = np.load(io.BytesIO(item.data))
             elif isinstance(item, Message) and topics[item.channel_id] == _CYCLE_TOPIC:
+                if not cycles:
+                    epoch = item.log_time - int(np.frombuffer(item.data[len(_LITTLE_ENDIAN_CDR) :], RECORD)[0]["time_ns"])
                 cycles += item.data[len(_LITTLE_ENDIAN_CDR) :]
             elif isinstance(item, Message):
                 text = item.data[len(_LITTLE_ENDIAN_CDR) :]
@@ -242,21 +254,23 @@ def read(path: Path | str) -> Recording:
             complete = False
     except FileNotFoundError:
         raise RecordingError(f"there is no recording at {path}") from None
-    except (McapError, ValueError, EOFError, OSError, struct.error):
-        # What follows the last chunk that was written out whole.
+    except IsADirectoryError:
+        raise RecordingError(f"{path} is a folder, no recording") from None
+    except Exception:
+        # Whatever the decoder says of what follows the last chunk that is whole.
         complete = False
     if config is None:
         raise RecordingError(f"{path} is no recording of gough")
-    if layout != schema():
+    if layout != schema() and (layout or cycles):
         raise RecordingError(
             f"{path} was recorded by gough {config.get('version')}, whose records are of another layout: use that"
         )
-    return Recording(config, arrays, np.frombuffer(cycles, RECORD), events, complete)
+    return Recording(config, arrays, np.frombuffer(cycles, RECORD), events, epoch, complete)
 
 
 def _items(path: Path | str) -> Iterator[Any]:
     with Path(path).open("rb") as file:
-        yield from StreamReader(file).records
+        yield from StreamReader(file, validate_crcs=True).records
 
 
 def repair(path: Path) -> bool:
@@ -269,21 +283,16 @@ def repair(path: Path) -> bool:
     if recording.complete:
         return False
     mended = path.with_name(f".{path.name}.mended")
-    epoch = _first_time(path)
-    recorder = Recorder(mended, {"config": recording.config, **recording.arrays}, recording.config["rate"], epoch)
-    recorder.write(recording.records)
-    recorder.close()
-    mended.replace(path)
+    try:
+        recorder = Recorder(mended, {"config": recording.config, **recording.arrays}, recording.epoch_ns)
+        recorder.write_cycles(recording.records)
+        for cycle, text in recording.events:
+            recorder.tell(cycle, text)
+        recorder.close()
+        mended.replace(path)
+    finally:
+        mended.unlink(missing_ok=True)
     return True
-
-
-def _first_time(path: Path) -> int:
-    with path.open("rb") as file:
-        for _, channel, message in NonSeekingReader(file).iter_messages(topics=[_CYCLE_TOPIC], log_time_order=False):
-            del channel
-            first: Record = np.frombuffer(message.data[len(_LITTLE_ENDIAN_CDR) :], RECORD)[0]
-            return int(message.log_time) - int(first["time_ns"])
-    return time.time_ns()
 
 
 def total(recordings: Iterable[Recording]) -> Record:
@@ -292,5 +301,5 @@ def total(recordings: Iterable[Recording]) -> Record:
     last = -1
     for each in recordings:
         parts.append(each.records[each.records["cycle"] > last])
-        last = max(last, *each.records["cycle"][-1:].tolist())
+        last = max([last, *each.records["cycle"][-1:].tolist()])
     return np.concatenate(parts)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from controller.cycle import OK, PARAMETERS, STATE, begin_stop, cycle, prepare, skip
-from hil.loop import RECORD, RIG_FAILED
+from hil.loop import RECORD, RIG_FAILED, SEND_FAILED
 from hil.recording import RecordingError, read, total
 from plant.compiled import Record, kernel
 from plant.pose import Array
@@ -72,6 +72,9 @@ def replay(paths: Sequence[Path | str]) -> Replay:
     """
     recordings = [read(path) for path in paths]
     first = recordings[0]
+    for path, each in zip(paths, recordings, strict=True):
+        if {"parameters", "reference"} - set(each.arrays):
+            raise RecordingError(f"{path} lacks what a replay needs: its beginning is damaged")
     parameters, segments = first.arrays["parameters"], first.arrays["reference"]
     if parameters.dtype != PARAMETERS:
         raise RecordingError(
@@ -81,10 +84,15 @@ def replay(paths: Sequence[Path | str]) -> Replay:
         if other.arrays["parameters"].tobytes() != parameters.tobytes() or other.config != first.config:
             raise RecordingError(f"{path} is of another run than {paths[0]}")
     records = total(recordings)
-    if not len(records) or records["cycle"][0] != 0:
+    if not len(records):
+        raise RecordingError(f"{paths[0]} holds no cycle: the run ended before its first one, or it is damaged")
+    if records["cycle"][0] != 0:
         raise RecordingError(f"{paths[0]} does not begin with the first cycle of its run: name the files in their order")
+    # As the loop had them: aligned, which a file does not say.
+    constants: Record = np.zeros((), PARAMETERS)
+    constants[()] = parameters
     again = np.zeros(len(records), RECORD)
-    count = int(_replay(parameters, np.zeros((), STATE), segments, records, again, np.zeros((3, IMU_COUNT, 3))))
+    count = int(_replay(constants, np.zeros((), STATE), segments, records, again, np.zeros((3, IMU_COUNT, 3))))
     differs = [np.any(_bits(records[name][:count]) != _bits(again[name][:count]), axis=1) for name in COMPARED]
     rows = np.flatnonzero(np.any(differs, axis=0))
     different, fields = None, {}
@@ -126,7 +134,7 @@ def _replay(parameters: Record, state: Record, segments: Array, records: Record,
         measurement[1] = recorded.specific_force
         measurement[2] = recorded.magnetic_field
         status = OK
-        if recorded.status < RIG_FAILED:
+        if not RIG_FAILED <= recorded.status < SEND_FAILED:
             status = cycle(parameters, state, measurement, segments)
         found.position[:] = s.position
         found.rotation[:] = s.rotation

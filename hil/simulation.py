@@ -64,11 +64,6 @@ class SimulationConfig:
         cycles = self.duration * self.rate
         if round(cycles) < 1:
             raise InputError(f"the duration is {self.duration:g} s, less than one cycle of {1.0 / self.rate:g} s")
-        if cycles * RECORD.itemsize > MOST_RECORD_BYTES:
-            raise InputError(
-                f"{self.duration:g} s at {self.rate:g} Hz would record {cycles * RECORD.itemsize / 2**30:.3g} GiB, "
-                f"more than {MOST_RECORD_BYTES / 2**30:g} GiB: choose a shorter duration or a lower rate"
-            )
         if self.fusion not in FUSIONS:
             raise UnknownNameError(f"no fusion {self.fusion!r}; there are {', '.join(FUSIONS)}")
 
@@ -185,6 +180,7 @@ class PreparedLoop(Loop):
     Attributes:
         plant: the FMU behind `calls`.
         mechanism, target, reference: as in `SimulationResult`.
+        end: the cycle after the last of the motion.
         planning_time: what planning took [s].
     """
 
@@ -192,12 +188,17 @@ class PreparedLoop(Loop):
     mechanism: Mechanism
     target: Target
     reference: Reference
+    end: int
     planning_time: float
 
 
 @contextmanager
-def prepared_loop(config: SimulationConfig) -> Iterator[PreparedLoop]:
+def prepared_loop(config: SimulationConfig, records: Record | None = None) -> Iterator[PreparedLoop]:
     """Check everything, load the plant, plan the motion, and load the machine code.
+
+    Args:
+        config: what to run.
+        records: where to record, round and round; by default there is room for every cycle.
 
     Raises:
         GoughError: something in the configuration cannot be used.
@@ -211,6 +212,11 @@ def prepared_loop(config: SimulationConfig) -> Iterator[PreparedLoop]:
         raise InputError(f"hold is {control.hold:g} s; the estimate settles in {HOLD_RANGE_S[0]:g} to {HOLD_RANGE_S[1]:g} s")
     parameters = cycle_parameters(mechanism, config.rate, control, fusion_settings(mechanism), config.imus)
     count = int(parameters["hold_cycles"]) + round(config.duration * config.rate)
+    if records is None and count * RECORD.itemsize > MOST_RECORD_BYTES:
+        raise InputError(
+            f"{config.duration:g} s at {config.rate:g} Hz would record {count * RECORD.itemsize / 2**30:.3g} GiB, more than "
+            f"{MOST_RECORD_BYTES / 2**30:g} GiB: choose a shorter duration or a lower rate, or 'gough run', which keeps seconds"
+        )
     plan(mechanism, load_target("hold", mechanism, 0.1), 0.1)
     fmu = default_fmu() if config.plant is None else Path(config.plant)
     with FmuPlant(fmu, mechanism.plant_parameters(target.start), period) as plant:
@@ -222,7 +228,8 @@ def prepared_loop(config: SimulationConfig) -> Iterator[PreparedLoop]:
             parameters=parameters,
             state=np.zeros((), STATE),
             segments=reference.segments,
-            records=np.zeros(count, RECORD),
+            records=np.zeros(count, RECORD) if records is None else records,
+            end=count,
             plant=plant,
             mechanism=mechanism,
             target=target,

@@ -1,6 +1,7 @@
 """The loop on the machine's clock, with its real processes: they record every cycle, stop when asked, outlive each other."""
 
 import json
+import mmap
 import os
 import pty
 import shutil
@@ -143,7 +144,7 @@ def rewritten(path, to, change):
     """A recording with its records changed."""
     found = read(path)
     records = change(found.records.copy())
-    recorder = recording.Recorder(to, {"config": found.config, **found.arrays}, 500.0, 0)
+    recorder = recording.Recorder(to, {"config": found.config, **found.arrays}, 0)
     recorder.write(records)
     recorder.close()
     return to
@@ -404,8 +405,8 @@ def test_nothing_is_compiled_on_the_clock():
 
 def test_usage_counts_what_a_thread_has_done():
     before = usage()
-    memory = bytearray(50_000_000)
-    memory[::4096] = b"x" * len(memory[::4096])
+    memory = mmap.mmap(-1, 50_000_000)
+    memory[:] = bytes(len(memory))
     time.sleep(0.01)
     used = usage().since(before)
     assert used["minor_faults"] > 10
@@ -447,6 +448,173 @@ def test_a_run_that_cannot_go_on_says_why_and_keeps_its_recording(tmp_path):
     assert stopped.value.summary["cycles"] == len(read(path).records)
     assert any("stopped on the brakes" in text for _, text in read(path).events)
     assert replay([path]).same
+
+
+# -------------------------------------------------------------------------------------------------------------- what goes wrong
+
+
+def gone(*pids):
+    def ended(pid):
+        try:
+            return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+        except OSError:
+            return True
+
+    return all(ended(pid) for pid in pids)
+
+
+def test_when_the_supervisor_is_killed_before_the_start_nothing_stays(tmp_path):
+    process = gough("run", "--duration", 60, "--rate", 500, "--record", tmp_path / "run.mcap")
+    wait_for(lambda: children(process.pid) or process.poll() is not None)
+    others = children(process.pid)
+    process.kill()
+    process.communicate()
+    wait_for(lambda: gone(*others))
+
+
+def test_a_signal_before_the_start_ends_it_at_once():
+    process = gough("run", "--duration", 60, "--rate", 500)
+    wait_for(lambda: children(process.pid) or process.poll() is not None)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=30.0)
+    assert process.returncode == 0 or "asked to stop before anything has moved" in errors
+
+
+def test_a_recorder_killed_at_once_costs_nothing(tmp_path):
+    path, figures = tmp_path / "run.mcap", tmp_path / "run.json"
+    process = gough("run", "--duration", 1.5, "--rate", 500, "--most-missed", 2000, "--record", path, "--json", figures)
+    wait_for(path.exists)
+    os.kill(children(process.pid)[1], signal.SIGKILL)
+    _, errors = process.communicate(timeout=60.0)
+    assert process.returncode == 0, errors
+    summary = json.loads(figures.read_text())
+    assert len(summary["recording"]["files"]) == 2
+    assert sum(recorded_cycles(each) for each in summary["recording"]["files"]) == summary["cycles"]
+    assert summary["recording"]["lost"] == 0
+
+
+def test_cycles_that_a_stopped_recorder_missed_are_counted(tmp_path):
+    path, figures = tmp_path / "run.mcap", tmp_path / "run.json"
+    process, _, recorder = started(path, "--json", figures)
+    os.kill(recorder, signal.SIGSTOP)
+    time.sleep(0.1)
+    process.send_signal(signal.SIGTERM)
+    output, errors = process.communicate(timeout=60.0)
+    assert process.returncode == 0, errors
+    summary = json.loads(figures.read_text())
+    assert 0 < summary["recording"]["lost"] == summary["cycles"] - len(read(path).records)
+    assert f"{summary['recording']['lost']} cycles lost" in output
+    assert gone(recorder)
+
+
+def test_a_loop_that_does_not_answer_is_ended(tmp_path):
+    process, loop, recorder = started(tmp_path / "run.mcap")
+    os.kill(loop, signal.SIGSTOP)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=60.0)
+    assert process.returncode == 1
+    assert "the loop's process has died (exit code -9)" in errors
+    assert gone(loop, recorder)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_what_is_no_file_is_refused_for_a_recording():
+    process = gough("run", "--duration", 1, "--record", "/dev/full")
+    assert "/dev/full is no file" in process.communicate(timeout=60.0)[1]
+    assert process.returncode == 2
+
+
+LIMITED = """
+import resource, signal, sys
+from hil.command_line import main
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (700_000, 700_000))
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_recording_that_cannot_go_on_is_told_in_a_line_and_the_run_goes_on(tmp_path):
+    """A limit on the size of files stands in for a full disk."""
+    path = tmp_path / "run.mcap"
+    arguments = ["run", "--duration", "2", "--rate", "500", "--most-missed", "2000", "--record", str(path)]
+    command = [sys.executable, "-c", LIMITED, *arguments]
+    process = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60.0)
+    assert process.returncode == 0, process.stderr
+    assert "cannot be written: File too large: the rest is not recorded" in process.stdout
+    assert "Traceback" not in process.stderr
+    assert [each.name for each in tmp_path.iterdir()] == ["run.mcap"]
+    assert int(process.stdout.partition("recorded in ")[2].partition("; ")[2].split()[0]) > 100
+
+
+class Raising(FmuRig):
+    """A rig that fails in motion, and leaves a mark when it is braked."""
+
+    mark = Path()
+
+    def write(self, command):
+        if self._loop.state["cycle"] > 60:
+            raise ValueError("the bus is gone")
+        return super().write(command)
+
+    def brake(self):
+        Raising.mark.touch()
+        return super().brake()
+
+
+def test_a_rig_that_raises_is_braked(tmp_path):
+    Raising.mark = tmp_path / "braked"
+    with pytest.raises(RunStoppedError, match="ValueError: the bus is gone"):
+        run(SimulationConfig(duration=1.0, rate=100.0), SETTINGS, rig=Raising)
+    assert Raising.mark.exists()
+
+
+class Refusing(FmuRig):
+    """A rig whose commands fail in motion."""
+
+    def write(self, command):
+        return 103 if self._loop.state["cycle"] > 60 else super().write(command)
+
+
+def test_a_command_that_fails_is_told_and_replayed(tmp_path):
+    path = tmp_path / "run.mcap"
+    with pytest.raises(RunStoppedError, match="the rig reports failure 3"):
+        run(SimulationConfig(duration=1.0, rate=100.0), SETTINGS, path, rig=Refusing)
+    assert replay([path]).same
+
+
+def test_too_many_missed_periods_are_a_failure(tmp_path):
+    path = tmp_path / "run.mcap"
+    process, loop, _ = started(path, "--most-missed", 50)
+    os.kill(loop, signal.SIGSTOP)
+    time.sleep(0.4)
+    os.kill(loop, signal.SIGCONT)
+    _, errors = process.communicate(timeout=60.0)
+    assert process.returncode == 1
+    assert "too many periods missed in a row" in errors
+    assert replay([path]).same
+
+
+def test_damage_never_passes_for_a_difference(recorded, tmp_path):
+    _, path = recorded
+    random, content = np.random.default_rng(7), path.read_bytes()
+    for _ in range(40):
+        damaged = bytearray(content)
+        damaged[random.integers(200, len(content))] ^= 1 << int(random.integers(8))
+        (tmp_path / "damaged.mcap").write_bytes(damaged)
+        try:
+            result = replay([tmp_path / "damaged.mcap"])
+        except RecordingError:
+            continue
+        assert result.different is None
+
+
+def test_no_file_is_named_twice(recorded, tmp_path):
+    _, path = recorded
+    for arguments in (["replay", path, "--json", path], ["run", "--json", tmp_path / "x", "--record", tmp_path / "x"]):
+        process = gough(*arguments)
+        assert "is named twice: give two files" in process.communicate(timeout=60.0)[1]
+        assert process.returncode == 2
+    assert read(path).complete
 
 
 def test_a_terminal_shows_the_run_as_it_goes():

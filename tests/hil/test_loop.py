@@ -138,15 +138,14 @@ def follow(loop, seconds=2.0):
 
 
 def stops_within_limits(loop, records, off=1e-3):
-    """The reference comes to rest within its limits, and the drives follow it there."""
+    """The reference goes on from where the mechanism is, comes to rest within its limits, and the drives follow it there."""
     limits = loop.mechanism.require_limits()
     stopping = records[records["stop"] > 0]
     reference = stopping["reference"]
     assert np.abs(reference[:, :, 1]).max() <= limits.velocity * (1.0 + 1e-9)
     assert np.abs(reference[:, :, 2]).max() <= limits.acceleration * (1.0 + 1e-9)
     assert (reference[:, :, 0] >= limits.stroke[:, 0]).all() and (reference[:, :, 0] <= limits.stroke[:, 1]).all()
-    before = records[records["stop"] == 0][-1]["reference"]
-    assert np.abs(reference[0, :, 0] - before[:, 0]).max() < 2.0 * limits.velocity * 1e-3
+    assert np.abs(reference[0, :, 0] - stopping["truth"][0, 7:13]).max() < off
     assert (reference[-1, :, 1:] == 0.0).all()
     lengths = stopping["truth"][:, 7:13]
     assert np.abs(lengths[-1] - reference[-1, :, 0]).max() < off
@@ -170,11 +169,11 @@ def test_too_many_missed_in_a_row_end_in_a_controlled_stop_and_fewer_do_not():
             assert status == STOPPED
             assert (loop.state["stopping"] == MISSED_PERIODS) == stops
             # In a long pause the drives go on as they were last told, and then have some way back.
-            stops_within_limits(loop, records, off=1e-3 if periods < 100 else 1e-2)
+            stops_within_limits(loop, records, off=1e-3 if periods < 100 else 2e-2)
             if stops:
                 assert records["cycle"][-1] < 900 + periods + 500
-                # However long the pause was, the reference goes on from where it was left.
-                assert np.abs(records["reference"][900] - records["reference"][899])[:, 0].max() < 5e-4
+                if periods < 100:
+                    assert np.abs(records["command"][900] - records["command"][899]).max() < 0.1
 
 
 def test_work_that_is_always_too_long_ends_in_a_controlled_stop():
