@@ -153,6 +153,9 @@ def _add_bench(commands: Any) -> None:
     command.add_argument(
         "--clock", type=float, default=10.0, help="seconds on the clock at 1 kHz, idle and again under load; 4 kHz gets a third"
     )
+    command.add_argument(
+        "--measures", type=float, metavar="SECONDS", help="also try the loop without each measure for real time, for so long"
+    )
     command.add_argument("--cold", action="store_true", help="measure the start without caches, too (a minute)")
     command.add_argument("--check", action="store_true", help="fail if the loop on the clock is off by more than any noise")
     command.add_argument("--report", type=Path, metavar="FILE.html", help="write histograms of the loop on the clock")
@@ -439,7 +442,7 @@ def _build_fmu(options: argparse.Namespace) -> int:
 def _bench(options: argparse.Namespace) -> int:
     from hil.bench import machine, measure_speed, write_report
     from hil.kinematics_bench import measure_kinematics
-    from hil.real_time_bench import GrossExcessError, gross_excess, measure_real_time, measure_start_up
+    from hil.real_time_bench import GrossExcessError, gross_excess, measure_measures, measure_real_time, measure_start_up
 
     _check_writable(options.json, options.report)
     if not 0.0 < options.clock < float("inf"):
@@ -450,6 +453,10 @@ def _bench(options: argparse.Namespace) -> int:
             figures["start_up"] = measure_start_up(options.cold)
             figures["real_time"] = measure_real_time({1000.0: options.clock, 4000.0: options.clock / 3.0}, progress)
         _print_real_time(figures["real_time"], figures["start_up"])
+        if options.measures:
+            with _progress("without each measure") as progress:
+                figures["measures"] = measure_measures(options.measures, progress)
+            _print_measures(figures["measures"])
     if options.only in (None, "loop"):
         with _progress("the loop") as progress:
             figures |= measure_speed(options.target, options.duration, progress)
@@ -492,6 +499,8 @@ def _print_real_time(figures: dict[str, Any], start_up: dict[str, Any]) -> None:
                 f"{used['major_faults']:g} major, {used['minor_faults']:g} minor; involuntary switches "
                 f"{used['involuntary_switches']:g}; growth {used['resident']:g} bytes{text}"
             )
+            over = ", ".join(measured["over_budget"])
+            print(f"over budget: {over}" if over else "within the timing budget (hil/budget.toml)")
         if "load" in conditions:
             idle, load = conditions["idle"], conditions["load"]
             ours, bare = ([load[name][key] / idle[name][key] for key in ("p50", "p999")] for name in ("compute_us", "bare_us"))
@@ -506,6 +515,15 @@ def _print_real_time(figures: dict[str, Any], start_up: dict[str, Any]) -> None:
         print(f"{name} is not installed (Debian: apt install {package}): nothing to compare with")
     for text in figures["refused"]:
         print(f"without {text}")
+
+
+def _print_measures(figures: dict[str, Any]) -> None:
+    table = _table("1 kHz, left out", "condition", "woken late p50 [us]", "p99", "p99.9", "max", "missed", "minor faults")
+    for case, conditions in figures.items():
+        for condition, measured in conditions.items():
+            late = [f"{measured['wake_us'][key]:.1f}" for key in ("p50", "p99", "p999", "max")]
+            table.add_row(case, condition, *late, f"{measured['missed']}", f"{measured['minor_faults']:g}")
+    _print(table)
 
 
 def _print_speed(figures: dict[str, Any]) -> None:

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from hil.clock import REAL, finish, new_clock, now, start, wait
 from hil.loop import HEAD, RECORD, STOPPED, prevent_compilation
-from hil.realtime import RealTimeSettings, real_time, usage
+from hil.realtime import MEASURES, RealTimeSettings, real_time, usage
 from hil.simulation import PreparedLoop, SimulationConfig, prepared_loop
-from hil.timing import QUANTILES, Histogram, Timing
+from hil.timing import QUANTILES, Histogram, Timing, over_budget
 from plant.compiled import Record, kernel
 from plant.errors import GoughError
 
@@ -53,8 +53,8 @@ def measure_real_time(seconds: dict[float, float], progress: Callable[[float], N
 
     Returns:
         By rate and condition: `compute_us`, `latency_us`, `wake_us`, `cyclictest_us` (None without cyclictest), `bare_us` (the
-        bare loop's computing) and `bare_wake_us`, each with p50, p99, p999, max and n; `stages_us`; `missed_own` and
-        `missed_host` periods; `usage` of the loop's thread; `histograms`. And what is `refused`, and `missing` on this machine.
+        bare loop's computing) and `bare_wake_us`, each with p50, p99, p999, max and n; `stages_us`, and what of all these is
+        `over_budget`; `missed_own` and `missed_host` periods; `usage` of the loop's thread; `histograms`. And what is `refused`, and `missing` on this machine.
 
     Raises:
         GoughError: the loop stopped for another cause than the end of its slice.
@@ -82,6 +82,45 @@ def measure_real_time(seconds: dict[float, float], progress: Callable[[float], N
     return {"rates": rates, "refused": refused, "missing": missing, "slice_s": _SLICE_S}
 
 
+def measure_measures(seconds: float, progress: Callable[[float], None] = lambda share: None) -> dict[str, Any]:
+    """What each measure of `hil.realtime` is good for: the loop at 1 kHz with all, without each, and without any.
+
+    Args:
+        seconds: how long for each, idle and again under load.
+        progress: called with the share that is done.
+
+    Returns:
+        By what is left out, "nothing" and "all" included, and condition: `wake_us` and `compute_us` with p50, p99, p999, max
+        and n, periods missed, and `minor_faults` of the loop's thread.
+    """
+    conditions = [IDLE] if shutil.which("stress-ng") is None else [IDLE, LOAD]
+    cases = {"nothing": (), **{measure: (measure,) for measure in MEASURES}, "all": MEASURES}
+    slices = max(1, round(seconds / _SLICE_S))
+    pools = {case: {condition: _Pool() for condition in conditions} for case in cases}
+    benches = {case: _Bench(1000.0, RealTimeSettings(without=left_out), False) for case, left_out in cases.items()}
+    done, whole = 0, slices * len(cases) * len(conditions)
+    for condition in conditions:
+        with _circumstances(condition):
+            # In turn, so that all meet the same machine.
+            for _ in range(slices):
+                for case, bench in benches.items():
+                    bench.add_slice(pools[case][condition], busy=False, bare=False)
+                    done += 1
+                    progress(done / whole)
+    return {
+        case: {
+            condition: {
+                "wake_us": pool.timing.histograms["wake"].figures(),
+                "compute_us": pool.timing.histograms["compute"].figures(),
+                "missed": sum(pool.missed.values()),
+                "minor_faults": pool.usage["minor_faults"],
+            }
+            for condition, pool in by_condition.items()
+        }
+        for case, by_condition in pools.items()
+    }
+
+
 class _Pool:
     """What the slices of one rate and condition have measured."""
 
@@ -95,6 +134,7 @@ class _Pool:
 
     def figures(self) -> dict[str, Any]:
         timing = self.timing.figures()
+        over = over_budget(timing)
         named = {"compute": "compute", "latency": "latency"}
         return {
             **{f"{name}_us": timing.pop(stage) for name, stage in named.items()},
@@ -103,6 +143,7 @@ class _Pool:
             "bare_us": self.bare.figures(),
             "bare_wake_us": self.bare_wake.figures(),
             "stages_us": timing,
+            "over_budget": over,
             "missed_own": self.missed["own"],
             "missed_host": self.missed["host"],
             "usage": self.usage,
@@ -127,8 +168,8 @@ class _Bench:
         self._work_ns = _shared(1, np.dtype(np.int64))
         _run_bare(new_clock(0, 1), 0, 0, np.zeros((1, 2), np.int64))
 
-    def add_slice(self, pool: _Pool, busy: bool) -> None:
-        """Run ours, cyclictest and the bare loop in turn."""
+    def add_slice(self, pool: _Pool, busy: bool, bare: bool = True) -> None:
+        """Run ours, cyclictest if wanted, and the bare loop in turn."""
         with _busy_thread() if busy else contextlib.nullcontext():
             count, missed, used = self._in_a_process(self._ours)
         records = self._records[:count]
@@ -140,10 +181,11 @@ class _Bench:
         if self._cyclictest:
             pool.cyclictest += self._run_cyclictest()
             pool.longest_us, self.longest_us = max(pool.longest_us, self.longest_us), 0
-        work = round(1e3 * pool.timing.histograms["compute"].figures()["p50"])
-        bare: Record = self._in_a_process(self._bare, work)
-        pool.bare_wake.add(bare[:, 0])
-        pool.bare.add(bare[:, 1])
+        if bare:
+            work = round(1e3 * pool.timing.histograms["compute"].figures()["p50"])
+            durations: Record = self._in_a_process(self._bare, work)
+            pool.bare_wake.add(durations[:, 0])
+            pool.bare.add(durations[:, 1])
 
     def _in_a_process(self, target: Callable[..., Any], *arguments: Any) -> Any:
         ours, theirs = _FORK.Pipe()

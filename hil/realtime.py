@@ -16,7 +16,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from plant.errors import GoughError, InputError
+from plant.errors import GoughError, InputError, UnknownNameError
+
+MEASURES = ("memory", "processor", "doze", "priority")
+"""What is done for real time, in this order: lock memory, stay on a processor, keep it from dozing, take a priority."""
 
 PRIORITY_RANGE = (1, 98)
 """Priorities of SCHED_FIFO; 99 is left to the kernel's own threads."""
@@ -34,18 +37,23 @@ class RealTimeSettings:
         cpu: the processor to stay on; by default the last of those that the process may use.
         strict: whether anything that the machine refuses is an error.
         most_missed: periods missed in a row that end in a controlled stop.
+        without: which of `MEASURES` are not wanted, to see what they are good for.
     """
 
     priority: int = 80
     cpu: int | None = None
     strict: bool = False
     most_missed: int = 10
+    without: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not PRIORITY_RANGE[0] <= self.priority <= PRIORITY_RANGE[1]:
             raise InputError(f"the priority is {self.priority}; it must be {PRIORITY_RANGE[0]} to {PRIORITY_RANGE[1]}")
         if self.most_missed < 1:
             raise InputError(f"most_missed is {self.most_missed}; it must be 1 at least")
+        for measure in self.without:
+            if measure not in MEASURES:
+                raise UnknownNameError(f"there is no measure {measure!r}; there are {', '.join(MEASURES)}")
         allowed = sorted(os.sched_getaffinity(0))
         if self.cpu is not None and self.cpu not in allowed:
             raise InputError(f"there is no processor {self.cpu} for this process; there are {', '.join(map(str, allowed))}")
@@ -69,16 +77,29 @@ def real_time(settings: RealTimeSettings) -> Iterator[list[str]]:
     """
     refused = []
     with contextlib.ExitStack() as restore:
-        for what, take, remedy in (
-            ("locked memory", _lock_memory, "run as root, or raise the limit 'memlock' in /etc/security/limits.conf"),
-            (f"staying on processor {settings.processor}", lambda: _stay_on(settings.processor), "choose another with --cpu"),
-            (f"a processor that does not doze ({_DMA_LATENCY})", _stay_awake, "run as root, or let your group write to it"),
+        for measure, what, take, remedy in (
+            ("memory", "locked memory", _lock_memory, "run as root, or raise the limit 'memlock' in /etc/security/limits.conf"),
             (
+                "processor",
+                f"staying on processor {settings.processor}",
+                lambda: _stay_on(settings.processor),
+                "choose another with --cpu",
+            ),
+            (
+                "doze",
+                f"a processor that does not doze ({_DMA_LATENCY})",
+                _stay_awake,
+                "run as root, or let your group write to it",
+            ),
+            (
+                "priority",
                 f"SCHED_FIFO at priority {settings.priority}",
                 lambda: _take_priority(settings.priority),
                 "run as root, or raise the limit 'rtprio' in /etc/security/limits.conf",
             ),
         ):
+            if measure in settings.without:
+                continue
             try:
                 restore.callback(take())
             except OSError as error:

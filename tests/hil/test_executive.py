@@ -20,7 +20,7 @@ from mcap_ros2.decoder import DecoderFactory
 from hil import recording
 from hil.executive import RunStoppedError, run
 from hil.loop import FmuRig, prevent_compilation
-from hil.realtime import RealTimeSettings, RefusedError, real_time, usage
+from hil.realtime import MEASURES, RealTimeSettings, RefusedError, real_time, usage
 from hil.recording import RecordingError, read, repair
 from hil.replay import COMPARED, replay
 from hil.simulation import SimulationConfig, prepared_loop
@@ -358,6 +358,15 @@ def test_what_was_taken_is_given_back():
             assert locked() > 0
     assert before == (os.sched_getscheduler(0), os.sched_getparam(0).sched_priority, os.sched_getaffinity(0), locked())
     assert open_files == len(list(Path("/proc/self/fd").iterdir()))
+
+
+def test_a_measure_that_is_not_wanted_is_not_taken():
+    before = (os.sched_getscheduler(0), os.sched_getaffinity(0), locked())
+    with real_time(RealTimeSettings(without=MEASURES, strict=True)) as refused:
+        assert refused == []
+        assert before == (os.sched_getscheduler(0), os.sched_getaffinity(0), locked())
+    with pytest.raises(GoughError, match="there is no measure 'magic'; there are memory, processor, doze, priority"):
+        RealTimeSettings(without=("magic",))
 
 
 def locked():
