@@ -54,8 +54,8 @@ def measure_real_time(seconds: dict[float, float], progress: Callable[[float], N
     Returns:
         By rate and condition: `compute_us`, `latency_us`, `wake_us`, `cyclictest_us` (None without cyclictest), `bare_us` (the
         bare loop's computing) and `bare_wake_us`, each with p50, p99, p999, max and n; `stages_us`, and what of all these is
-        `over_budget`; `missed_own` and `missed_host` periods; `usage` of the loop's thread; `histograms`. And what is `refused`,
-        and `missing` on this machine.
+        `over_budget`; `missed_own` and `missed_host` periods; `usage` of the loop's thread; `histograms`. And what is
+        `refused`, and `missing` on this machine.
 
     Raises:
         GoughError: the loop stopped for another cause than the end of its slice.
