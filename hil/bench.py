@@ -20,7 +20,6 @@ from hil.simulation import SimulationConfig, simulate
 from plant.errors import InputError
 from plant.files import write_whole
 
-_IDLE = "idle"
 _REPEATS = 3
 _FILTERPY_S = 2.0
 
@@ -78,23 +77,22 @@ def _percentiles(nanoseconds: NDArray[np.int64]) -> dict[str, float]:
     return {"p50": float(p50), "p99": float(p99), "p999": float(p999), "max": float(us.max()), "n": len(us)}
 
 
-def write_report(figures: dict[str, Any], history: Sequence[Path], path: Path) -> None:
+def write_report(figures: dict[str, Any], history: Sequence[dict[str, Any]], path: Path) -> None:
     """Write histograms of the loop on the clock, and how its figures have changed, as one HTML file.
 
     Args:
         figures: what `gough bench --json` writes, with the section `real_time`.
-        history: earlier such files.
+        history: earlier such figures.
         path: of the HTML file.
 
     Raises:
-        InputError: there is no such section, or an earlier file cannot be read.
+        InputError: there is no such section.
     """
     if "real_time" not in figures:
         raise InputError(
             "a report shows the loop on the clock, which was not measured: run it with --only clock, or without --only"
         )
-    runs = [*(_earlier(each) for each in history), figures]
-    runs.sort(key=lambda run: str(run["date"]))
+    runs = sorted([*history, figures], key=lambda run: str(run["date"]))
     sections = []
     for rate, conditions in figures["real_time"]["rates"].items():
         for condition, measured in conditions.items():
@@ -110,11 +108,8 @@ def write_report(figures: dict[str, Any], history: Sequence[Path], path: Path) -
         figure = go.Figure()
         for name in ("compute_us", "latency_us", "wake_us", "cyclictest_us"):
             for key in ("p50", "p999"):
-                points = [
-                    (run["date"], run["real_time"]["rates"][rate][_IDLE][name][key])
-                    for run in runs
-                    if rate in run.get("real_time", {}).get("rates", {}) and run["real_time"]["rates"][rate][_IDLE][name]
-                ]
+                measured = [(run["date"], _idle(run, rate).get(name)) for run in runs]
+                points = [(date, figures_of[key]) for date, figures_of in measured if figures_of]
                 label = f"{name.removesuffix('_us')} {key.replace('p999', 'p99.9')}"
                 figure.add_scatter(x=[at for at, _ in points], y=[us for _, us in points], name=label, mode="lines+markers")
         figure.update_layout(LAYOUT, height=380, yaxis={"title": "us", "type": "log"})
@@ -132,11 +127,22 @@ def _sentence(measured: dict[str, Any]) -> str:
     )
 
 
-def _earlier(path: Path) -> dict[str, Any]:
+def _idle(run: dict[str, Any], rate: str) -> dict[str, Any]:
+    """What a run has measured at a rate, idle; empty if it has not."""
+    found: dict[str, Any] = run.get("real_time", {}).get("rates", {}).get(rate, {}).get("idle", {})
+    return found
+
+
+def read_earlier(path: Path) -> dict[str, Any]:
+    """Figures that `gough bench --json` has written.
+
+    Raises:
+        InputError: it has not.
+    """
     try:
         figures: dict[str, Any] = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise InputError(f"{path} holds no earlier figures: {error}") from None
-    if "date" not in figures:
+    if not isinstance(figures, dict) or "date" not in figures:
         raise InputError(f"{path} holds no figures of 'gough bench': it has no date")
     return figures

@@ -440,13 +440,14 @@ def _build_fmu(options: argparse.Namespace) -> int:
 
 
 def _bench(options: argparse.Namespace) -> int:
-    from hil.bench import machine, measure_speed, write_report
+    from hil.bench import machine, measure_speed, read_earlier, write_report
     from hil.kinematics_bench import measure_kinematics
     from hil.real_time_bench import GrossExcessError, gross_excess, measure_measures, measure_real_time, measure_start_up
 
     _check_writable(options.json, options.report)
     if not 0.0 < options.clock < float("inf"):
         raise InputError(f"--clock is {options.clock:g} s; it must be positive and finite")
+    earlier = [read_earlier(path) for path in options.history]
     figures: dict[str, Any] = machine()
     if options.only in (None, "clock"):
         with _progress("the loop on the clock") as progress:
@@ -467,7 +468,7 @@ def _bench(options: argparse.Namespace) -> int:
         _print_kinematics(figures["kinematics"])
     _write_json(options.json, figures)
     if options.report:
-        write_report(figures, options.history, options.report)
+        write_report(figures, earlier, options.report)
     print(f"{figures['machine']}, {figures['date']}, gough {figures['version']}")
     if options.check and (excess := gross_excess(figures.get("real_time", {"rates": {}}))):
         raise GrossExcessError(f"in gross excess: {'; '.join(excess)}")

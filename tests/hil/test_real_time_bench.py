@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from hil.bench import write_report
+from hil.bench import read_earlier, write_report
 from hil.command_line import main
 from hil.loop import HEAD, LINK, RECORD
 from hil.real_time_bench import BUSY, CONDITIONS, IDLE, LOAD, _figures_of_counts, gross_excess, measure_real_time
@@ -69,12 +69,13 @@ def test_a_report_shows_histograms_and_earlier_figures(figures, tmp_path):
     earlier = tmp_path / "earlier.json"
     earlier.write_text(json.dumps({**figures, "date": "2026-11-01"}))
     path = tmp_path / "bench.html"
-    write_report(figures, [earlier], path)
+    write_report(figures, [read_earlier(earlier), {"date": "2026-11-02"}], path)
     text = path.read_text()
-    assert "500 Hz, idle" in text and "2 runs, idle" in text
-    (tmp_path / "other.json").write_text("[]")
-    with pytest.raises(InputError, match="holds no"):
-        write_report(figures, [tmp_path / "other.json"], path)
+    assert "500 Hz, idle" in text and "3 runs, idle" in text
+    for content in ("[]", "5", "{}", "none"):
+        (tmp_path / "other.json").write_text(content)
+        with pytest.raises(InputError, match="holds no"):
+            read_earlier(tmp_path / "other.json")
     with pytest.raises(InputError, match="was not measured"):
         write_report({"machine": "m"}, [], path)
 
