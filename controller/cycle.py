@@ -34,7 +34,6 @@ _IMPLAUSIBLE_SHARE = 0.25
 """How far outside its stroke, as a share of it, the estimate of a leg may lie."""
 
 ALL_IMUS = tuple(range(IMU_COUNT))
-LEG_IMUS = tuple(range(LEGS))
 
 RATE_RANGE_HZ = (50.0, 4000.0)
 

@@ -445,8 +445,9 @@ def _bench(options: argparse.Namespace) -> int:
     from hil.real_time_bench import GrossExcessError, gross_excess, measure_measures, measure_real_time, measure_start_up
 
     _check_writable(options.json, options.report)
-    if not 0.0 < options.clock < float("inf"):
-        raise InputError(f"--clock is {options.clock:g} s; it must be positive and finite")
+    for name, seconds in (("--clock", options.clock), ("--measures", options.measures)):
+        if seconds is not None and not 0.0 < seconds < float("inf"):
+            raise InputError(f"{name} is {seconds:g} s; it must be positive and finite")
     earlier = [read_earlier(path) for path in options.history]
     figures: dict[str, Any] = machine()
     if options.only in (None, "clock"):

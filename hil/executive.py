@@ -9,7 +9,6 @@ recorder dies, another takes over with a file of its own; when the supervisor di
 
 import contextlib
 import errno
-import mmap
 import multiprocessing
 import os
 import shutil
@@ -46,6 +45,7 @@ from hil.loop import (
     Rig,
     describe_status,
     prevent_compilation,
+    shared_array,
 )
 from hil.realtime import RealTimeSettings, real_time, since_process_start, usage
 from hil.recording import record, repair, take
@@ -144,15 +144,15 @@ def run(
         RunStoppedError: the run ended on the brakes before its time, or its process died.
     """
     _check_recording(recording)
-    records = _shared(max(_LEAST_RECORDS, round(_BUFFER_S * config.rate)), RECORD)
-    link: NDArray[np.int64] = _shared(LINK, np.dtype(np.int64))
+    records = shared_array(max(_LEAST_RECORDS, round(_BUFFER_S * config.rate)), RECORD)
+    link: NDArray[np.int64] = shared_array(LINK, np.dtype(np.int64))
     link[SUPERVISOR] = os.getpid()
     progress = Progress()
     ours, theirs = _FORK.Pipe()
     with _asked_to_stop(link), contextlib.ExitStack() as at_end:
         recorders = _Recorders(recording, records, link, ours, progress.events)
         at_end.callback(recorders.finish)
-        loop = _FORK.Process(target=_loop_process, args=(config, settings, rig, records, link, theirs, ours))
+        loop = _FORK.Process(target=_loop_process, args=(theirs, ours, config, settings, rig, records, link))
         loop.start()
         theirs.close()
         leftovers: list[Path] = []
@@ -191,11 +191,6 @@ def run(
 def _check_recording(path: Path | None) -> None:
     if path is not None and path.exists() and not path.is_file():
         raise InputError(f"{path} is no file: name another for the recording")
-
-
-def _shared(count: int, dtype: np.dtype[Any]) -> Any:
-    """An array in memory that is shared with the processes forked later."""
-    return np.frombuffer(mmap.mmap(-1, count * dtype.itemsize), dtype)
 
 
 @contextmanager
@@ -251,15 +246,7 @@ def _end(loop: BaseProcess, link: NDArray[np.int64], leftovers: list[Path]) -> N
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _loop_process(
-    config: SimulationConfig,
-    settings: RealTimeSettings,
-    make_rig: Callable[[Loop], Rig] | None,
-    records: Record,
-    link: NDArray[np.int64],
-    pipe: Connection,
-    supervisors: Connection,
-) -> None:
+def _loop_process(pipe: Connection, supervisors: Connection, *what: Any) -> None:
     """The loop's process. Signals that end others, blocked, are seen by the loop itself."""
     signal.pthread_sigmask(signal.SIG_BLOCK, _BLOCKED)
     # Else the end of the supervisor would not show.
@@ -267,7 +254,7 @@ def _loop_process(
     # Without a supervisor there is nobody to tell.
     with contextlib.suppress(EOFError, BrokenPipeError):
         try:
-            _prepare_and_follow(config, settings, make_rig, records, link, pipe)
+            _prepare_and_follow(pipe, *what)
         except GoughError as error:
             pipe.send(error)
         except Exception as error:
@@ -276,12 +263,12 @@ def _loop_process(
 
 
 def _prepare_and_follow(
+    pipe: Connection,
     config: SimulationConfig,
     settings: RealTimeSettings,
     make_rig: Callable[[Loop], Rig] | None,
     records: Record,
     link: NDArray[np.int64],
-    pipe: Connection,
 ) -> None:
     with prepared_loop(config, records) as loop:
         pipe.send(loop.plant.folder)

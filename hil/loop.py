@@ -4,6 +4,7 @@ All state lies in the arrays of `Loop`, so a run can be taken up again at any cy
 leg filters, that are written in Python.
 """
 
+import mmap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -285,6 +286,11 @@ def _load(kernel: Any, *arguments: Any) -> None:
     """Load a kernel's machine code for arguments of these types, or compile it, without running it."""
     type_of: Any = typeof
     kernel.compile(tuple(type_of(argument) for argument in arguments))
+
+
+def shared_array(count: int, dtype: np.dtype[Any]) -> Any:
+    """Zeros (count,) in memory that is shared with the processes forked later."""
+    return np.frombuffer(mmap.mmap(-1, count * dtype.itemsize), dtype)
 
 
 @contextmanager

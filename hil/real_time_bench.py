@@ -6,7 +6,6 @@ nothing but compute for as long as ours. What the machine does to every loop ali
 
 import contextlib
 import json
-import mmap
 import multiprocessing
 import os
 import shutil
@@ -24,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.clock import REAL, finish, new_clock, now, start, wait
-from hil.loop import HEAD, RECORD, STOPPED, prevent_compilation
+from hil.loop import HEAD, RECORD, STOPPED, prevent_compilation, shared_array
 from hil.realtime import MEASURES, RealTimeSettings, real_time, usage
 from hil.simulation import PreparedLoop, SimulationConfig, prepared_loop
 from hil.timing import QUANTILES, Histogram, Timing, over_budget
@@ -41,7 +40,6 @@ _BUSY_SHARE = 0.25
 _LONGEST_US = 20_000
 _ENDLESS = np.iinfo(np.int64).max
 _FORK = multiprocessing.get_context("fork")
-_NO_SCRIPT = np.zeros((1, 3), np.int64)
 
 
 def measure_real_time(seconds: dict[float, float], progress: Callable[[float], None] = lambda share: None) -> dict[str, Any]:
@@ -165,8 +163,7 @@ class _Bench:
         self._config = SimulationConfig(target="sines", duration=_SLICE_S, rate=rate)
         self._settings, self._cyclictest, self.longest_us = settings, cyclictest, 0
         with prepared_loop(self._config) as loop:
-            self._records = _shared(loop.end + round(rate), RECORD)
-        self._work_ns = _shared(1, np.dtype(np.int64))
+            self._records = shared_array(loop.end + round(rate), RECORD)
         _run_bare(new_clock(0, 1), 0, 0, np.zeros((1, 2), np.int64))
 
     def add_slice(self, pool: _Pool, busy: bool, bare: bool = True) -> None:
@@ -260,10 +257,6 @@ def _outcome(loop: PreparedLoop, status: int, used: dict[str, float]) -> tuple[i
     clock = loop.clock
     missed = {"own": int(clock["missed_own"]), "host": int(clock["missed_late"] + clock["missed_host"])}
     return int(loop.link[HEAD]), missed, used
-
-
-def _shared(count: int, dtype: np.dtype[Any]) -> Any:
-    return np.frombuffer(mmap.mmap(-1, count * dtype.itemsize), dtype)
 
 
 @kernel

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from controller.cycle import (
     ALL_IMUS,
-    LEG_IMUS,
     NOT_FINITE,
     OK,
     POSE_LOST,
@@ -40,6 +39,7 @@ from tests.controller.leg_motion import observe_mechanism
 
 RATE_HZ = 1000.0
 PERIOD_S = 1.0 / RATE_HZ
+LEG_IMUS = (0, 1, 2, 3, 4, 5)
 DEGREE = np.pi / 180.0
 
 

@@ -81,8 +81,9 @@ def test_a_report_shows_histograms_and_earlier_figures(figures, tmp_path):
 
 
 def test_a_bench_of_no_time_is_refused(capsys):
-    assert main(["bench", "--only", "clock", "--clock", "0"]) == 2
-    assert "--clock is 0 s; it must be positive and finite" in capsys.readouterr().err
+    for option, value in (("--clock", "0"), ("--measures", "-1"), ("--measures", "nan")):
+        assert main(["bench", "--only", "clock", option, value]) == 2
+        assert f"{option} is {value} s; it must be positive and finite" in capsys.readouterr().err
 
 
 def test_what_was_overwritten_before_it_was_taken_is_counted():
