@@ -10,18 +10,19 @@ from collections.abc import Collection
 
 import numpy as np
 
-from controller.direct_kinematics.closed_forms import GEOMETRY, SCRATCH, geometry_of, pose_from_legs, pose_from_vector
-from controller.direct_kinematics.refinement import find_twist, move_pose, normal_equations, solve_normal_equations
+from controller.calibration import Calibration
+from controller.direct_kinematics.closed_forms import GEOMETRY, SCRATCH, geometry_of
+from controller.fusion import calibrate, elapsed, find_pose, fuse_legs, fuse_platform, locate
 from controller.inverse_kinematics import jacobian_at, legs_at, sample_workspace
 from controller.least_squares import RANK_TOLERANCE, solve_least_squares
-from controller.leg_filter import leg_direction, predict_leg, start_leg, update_leg
+from controller.mechanism_filter import FILTER_PARAMETERS, FILTER_STATE, filter_parameters
 from controller.pid import step_pid
-from controller.platform_filter import start_platform, step_platform
+from controller.readings import SENSOR_GEOMETRY, sensor_geometry
 from controller.reference import STOP_SEGMENTS, evaluate_reference, plan_stop
 from controller.settings import ControlSettings, FusionSettings
 from plant.compiled import Record, kernel
 from plant.errors import InputError
-from plant.imu import ACCELEROMETER, GYROSCOPE, STANDARD_GRAVITY
+from plant.imu import STANDARD_GRAVITY
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array
 from plant.variables import IMU_COUNT, PLATFORM_IMU
@@ -40,8 +41,20 @@ RATE_RANGE_HZ = (50.0, 4000.0)
 STOP_SETTLING_S = 0.1
 """How long a mechanism that has stopped is held by its drives before the brakes take over [s]."""
 
-_GAP_S = 0.05
-"""Longest time for which a leg's angular acceleration is taken to last [s]."""
+_FROZEN_S = 0.01
+"""How long an IMU may stand still while others do not [s]."""
+
+_SOUND_S = 0.02
+"""How long an IMU that was left out must be sound to be taken back [s]."""
+
+_LEG_SETTLING_S = 0.1
+"""How long a leg filter that was started again is not relied upon [s]."""
+
+_FILTER_START_S, _FILTER_SETTLING_S = 0.3, 0.3
+"""When the whole-mechanism filter is started, and how long it is not relied upon [s]."""
+
+_PATIENCE_S = 0.05
+"""How long the leg filters may disagree with the whole-mechanism filter [s]."""
 
 _WORST_CONDITIONING = 1e-2
 _LEAST_GRAVITY = 0.1
@@ -54,14 +67,15 @@ PARAMETERS = np.dtype(
         ("period", np.float64),
         ("hold_cycles", np.int64),
         ("geometry", GEOMETRY),
-        ("joint_rotations", np.float64, (LEGS, 3, 3)),
-        ("up_in_joint", np.float64, (LEGS, 3)),
-        ("up_in_base", np.float64, (1, 3)),
-        ("leg_imu_position", np.float64, (LEGS, 3)),
-        ("platform_imu_position", np.float64, 3),
-        ("gravity", np.float64),
-        ("leg_used", np.float64, LEGS),
-        ("platform_used", np.int64),
+        ("sensors", SENSOR_GEOMETRY),
+        ("imu_present", np.int64, IMU_COUNT),
+        ("calibration_gain", np.float64, (3, IMU_COUNT, 3, 3)),
+        ("calibration_offset", np.float64, (3, IMU_COUNT, 3)),
+        ("reach", np.float64, 2),
+        ("frozen_cycles", np.int64),
+        ("sound_cycles", np.int64),
+        ("leg_settling_cycles", np.int64),
+        ("sensor_delay", np.float64),
         ("leg_jerk", np.float64),
         ("bias_walk", np.float64),
         ("bias_sigma", np.float64),
@@ -69,9 +83,14 @@ PARAMETERS = np.dtype(
         ("gyroscope_variance", np.float64),
         ("leg_force_variance", np.float64),
         ("vertical_variance", np.float64),
-        ("leg_weights", np.float64, LEGS),
-        ("vertical_weight", np.float64, 1),
+        ("leg_weight", np.float64),
+        ("vertical_weight", np.float64),
         ("acceleration_rate", np.float64),
+        ("filter", FILTER_PARAMETERS),
+        ("filter_start_cycles", np.int64),
+        ("filter_settling_cycles", np.int64),
+        ("disagreement", np.float64),
+        ("patience_cycles", np.int64),
         ("gains", np.float64, 4),
         ("command_limit", np.float64),
         ("velocity_limit", np.float64),
@@ -89,12 +108,24 @@ PARAMETERS = np.dtype(
     ],
     align=True,
 )
-"""Constants of the cycle, in SI units; `moving_mass` and `droop` belong to the load feed-forward."""
+"""Constants of the cycle, in SI units; a calibrated reading is gain times the raw one plus offset, and `moving_mass` and
+`droop` belong to the load feed-forward."""
 
 STATE = np.dtype(
     [
         ("cycle", np.int64),
         ("missed", np.int64),
+        ("raw", np.float64, (3, IMU_COUNT, 3)),
+        ("sample", np.float64, (3, IMU_COUNT, 3)),
+        ("same", np.int64, IMU_COUNT),
+        ("stands", np.int64, IMU_COUNT),
+        ("sound", np.int64, IMU_COUNT),
+        ("imu_used", np.int64, IMU_COUNT),
+        ("age", np.int64, IMU_COUNT),
+        ("leg_used", np.float64, LEGS),
+        ("leg_weights", np.float64, LEGS),
+        ("platform_used", np.int64),
+        ("vertical_weight", np.float64, 1),
         ("leg_x", np.float64, (LEGS, 9)),
         ("leg_covariance", np.float64, (LEGS, 9, 9)),
         ("platform_x", np.float64, 6),
@@ -110,6 +141,11 @@ STATE = np.dtype(
         ("acceleration", np.float64, 6),
         ("conditioning", np.float64),
         ("information", np.float64, (6, 6)),
+        ("filter", FILTER_STATE),
+        ("filter_due", np.int64),
+        ("filter_trusted", np.int64),
+        ("disagreeing", np.int64),
+        ("offset", np.float64, 6),
         ("lengths", np.float64, LEGS),
         ("reference_index", np.int64, LEGS),
         ("reference", np.float64, (LEGS, 3)),
@@ -128,6 +164,10 @@ STATE = np.dtype(
         # Scratch, here so that the cycle allocates nothing.
         ("arms", np.float64, (LEGS, 3)),
         ("predicted", np.float64, (LEGS, 3)),
+        ("found_position", np.float64, 3),
+        ("found_rotation", np.float64, (3, 3)),
+        ("filter_twist", np.float64, 6),
+        ("filter_acceleration", np.float64, 6),
         ("angular_velocity", np.float64, 3),
         ("imu_acceleration", np.float64, 3),
         ("measurement_6", np.float64, 6),
@@ -141,8 +181,14 @@ STATE = np.dtype(
 )
 """State of the cycle: filters, pose, controllers, and what the last cycle found.
 
-`cycle` counts periods, `missed` those since the last cycle that had none. `twist` is velocity and angular velocity in {1};
-`vertical` and `platform_rate` are seen in {2}; `information` is the inverse of the pose's covariance (lower triangle).
+`cycle` counts periods, `missed` those since the last cycle that had none. `sample` is the calibrated measurement. Of each IMU:
+whether it reads the `same` again, how often in a row it `stands` still while others do not, for how many cycles it has been
+`sound`, whether it is used, and the `age` of its filter. `twist` is velocity and angular velocity in {1}; `vertical` and
+`platform_rate` are seen in {2}; `information` is the inverse of the covariance of the refined pose (lower triangle).
+
+The whole-mechanism filter is to be started, or trusted, when it is `filter_due`; `offset` is what is left of the way from one
+source of the pose to the other, and the pose in closed form is `found`.
+
 `reference` holds length, rate and acceleration of each leg in the cycle before `prepared`. The drives are `driving` after the
 hold. A stop, `stopping` for a cause that the loop numbers, begins in `stop_cycle`, and from `stopped_cycle` on the brakes may
 hold.
@@ -155,6 +201,8 @@ def cycle_parameters(
     control: ControlSettings,
     fusion: FusionSettings,
     imus: Collection[int] = ALL_IMUS,
+    whole: str | None = None,
+    calibration: Calibration | None = None,
 ) -> Record:
     """Work out the constants of the cycle.
 
@@ -163,6 +211,9 @@ def cycle_parameters(
         rate: cycles per second [Hz].
         control, fusion: settings.
         imus: which IMUs there are, 0-5 on the legs and 6 on the platform.
+        whole: which errors of the IMUs the whole-mechanism filter estimates, a key of `mechanism_filter.BLOCKS`; None to do
+            without that filter.
+        calibration: of the IMUs; without one their readings are taken as they are.
 
     Raises:
         InputError: a rate out of range, an IMU that cannot be, or IMUs that do not determine the pose.
@@ -171,7 +222,7 @@ def cycle_parameters(
     check_imus(mechanism, imus)
     plant = mechanism.plant_parameters()
     parameters: Record = np.zeros((), PARAMETERS)
-    used = np.array([float(leg in imus) for leg in range(LEGS)])
+    calibration = calibration or Calibration()
     turns = 2.0 * np.pi / plant["motor.screw_lead"]
     force_constant = turns * plant["motor.torque_constant"]
     nominal = plant["drive.nominal_resistance"]
@@ -188,14 +239,15 @@ def cycle_parameters(
         "period": 1.0 / rate,
         "hold_cycles": int(np.ceil(control.hold * rate - 1e-9)),
         "geometry": geometry_of(mechanism),
-        "joint_rotations": mechanism.joint_rotations,
-        "up_in_joint": np.swapaxes(mechanism.joint_rotations, 1, 2) @ mechanism.up_in_base,
-        "up_in_base": mechanism.up_in_base,
-        "leg_imu_position": plant["leg_imu_position"],
-        "platform_imu_position": plant["platform_imu_position"],
-        "gravity": gravity,
-        "leg_used": used,
-        "platform_used": PLATFORM_IMU in imus,
+        "sensors": sensor_geometry(mechanism),
+        "imu_present": [imu in imus for imu in ALL_IMUS],
+        "calibration_gain": calibration.gain,
+        "calibration_offset": calibration.offset,
+        "reach": (fusion.gyroscope_range, fusion.accelerometer_range),
+        "frozen_cycles": max(3, round(_FROZEN_S * rate)),
+        "sound_cycles": round(_SOUND_S * rate),
+        "leg_settling_cycles": round(_LEG_SETTLING_S * rate),
+        "sensor_delay": fusion.sensor_delay,
         "leg_jerk": fusion.leg_jerk**2,
         "bias_walk": fusion.bias_walk**2,
         "bias_sigma": fusion.bias_sigma,
@@ -203,9 +255,14 @@ def cycle_parameters(
         "gyroscope_variance": fusion.gyroscope_noise**2 * rate / 2.0,
         "leg_force_variance": fusion.leg_accelerometer_noise**2 * rate / 2.0,
         "vertical_variance": (fusion.platform_accelerometer_noise / STANDARD_GRAVITY) ** 2 * rate / 2.0,
-        "leg_weights": used / fusion.leg_sigma**2,
-        "vertical_weight": (PLATFORM_IMU in imus) / fusion.tilt_sigma**2,
+        "leg_weight": 1.0 / fusion.leg_sigma**2,
+        "vertical_weight": 1.0 / fusion.tilt_sigma**2,
         "acceleration_rate": 1.0 / fusion.acceleration_time,
+        "filter": filter_parameters(fusion, rate, whole, calibration.covariance),
+        "filter_start_cycles": round(_FILTER_START_S * rate),
+        "filter_settling_cycles": round(_FILTER_SETTLING_S * rate),
+        "disagreement": fusion.disagreement,
+        "patience_cycles": round(_PATIENCE_S * rate),
         "gains": (control.proportional, control.integral, control.derivative, control.derivative_bandwidth),
         "command_limit": control.command_reserve * mechanism.require_limits().velocity,
         "velocity_limit": mechanism.require_limits().velocity,
@@ -257,8 +314,8 @@ def check_imus(mechanism: Mechanism, imus: Collection[int]) -> None:
     positions, rotations = sample_workspace(mechanism, 50, seed=0)
     parameters, state = np.zeros((), PARAMETERS), np.zeros((), STATE)
     parameters["geometry"] = geometry_of(mechanism)
-    parameters["up_in_base"], parameters["platform_used"] = mechanism.up_in_base, PLATFORM_IMU in imus
-    parameters["leg_used"] = [leg in imus for leg in range(LEGS)]
+    parameters["sensors"]["up_in_base"] = mechanism.up_in_base
+    state["platform_used"], state["leg_used"] = PLATFORM_IMU in imus, [leg in imus for leg in range(LEGS)]
     worst = np.inf
     for position, rotation in zip(positions, rotations, strict=True):
         legs = position + mechanism.platform_joints @ rotation.T - mechanism.base_joints
@@ -286,10 +343,10 @@ def cycle(parameters: Record, state: Record, measurement: Array, segments: Array
     Returns:
         `OK`, or why the estimate cannot be used.
     """
-    fuse_legs(parameters, state, measurement)
-    fuse_platform(parameters, state, measurement)
-    status = locate(parameters, state)
-    return control(parameters, state, segments) if status == OK else status
+    calibrate(parameters, state, measurement)
+    fuse_legs(parameters, state)
+    fuse_platform(parameters, state)
+    return control(parameters, state, segments) if locate(parameters, state) else POSE_LOST
 
 
 @kernel
@@ -337,20 +394,6 @@ def has_stopped(state: Record) -> bool:
 
 
 @kernel
-def elapsed(parameters: Record, state: Record) -> float:
-    """Time since the last cycle [s]."""
-    return float((1 + state[()].missed) * parameters[()].period)
-
-
-@kernel
-def locate(parameters: Record, state: Record) -> int:
-    """Direct kinematics and its refinement; returns `OK` or `POSE_LOST`."""
-    if find_pose(parameters, state) < RANK_TOLERANCE or not improve_pose(parameters, state):
-        return POSE_LOST
-    return OK
-
-
-@kernel
 def control(parameters: Record, state: Record, segments: Array) -> int:
     """From the pose to the commands; returns a status."""
     p, s = parameters[()], state[()]
@@ -365,116 +408,6 @@ def control(parameters: Record, state: Record, segments: Array) -> int:
         if s.cycle > p.hold_cycles and not p.plausible_lengths[k, 0] <= s.lengths[k] <= p.plausible_lengths[k, 1]:
             return IMPLAUSIBLE
     return OK
-
-
-@kernel
-def fuse_legs(parameters: Record, state: Record, measurement: Array) -> None:
-    """Step the leg filters."""
-    p, s = parameters[()], state[()]
-    period = elapsed(parameters, state)
-    for k in range(LEGS):
-        if p.leg_used[k] == 0.0:
-            continue
-        x, covariance, up = s.leg_x[k], s.leg_covariance[k], p.up_in_joint[k]
-        rate, force = measurement[GYROSCOPE, k], measurement[ACCELEROMETER, k]
-        if s.cycle == 0:
-            start_leg(x, covariance, rate, force, up, p.bias_sigma)
-        else:
-            if period > _GAP_S:
-                x[4:6] = 0.0
-            predict_leg(x, covariance, period, p.leg_jerk, p.bias_walk)
-        update_leg(
-            x, covariance, rate, force, up, p.leg_imu_position[k], p.gravity, p.gyroscope_variance, p.leg_force_variance,
-            s.measurement_6, s.jacobian_6_9, s.vectors_9[0], s.vectors_9[1],
-        )  # fmt: skip
-    point_legs(parameters, state)
-
-
-@kernel
-def point_legs(parameters: Record, state: Record) -> None:
-    """Directions of the legs and their rates from the states of the leg filters."""
-    p, s = parameters[()], state[()]
-    for k in range(LEGS):
-        leg_direction(s.leg_x[k], p.joint_rotations[k], s.directions[k], s.rates[k])
-
-
-@kernel
-def fuse_platform(parameters: Record, state: Record, measurement: Array) -> None:
-    """Step the platform's filter, with its own acceleration, known from the legs, taken out of the reading."""
-    p, s = parameters[()], state[()]
-    if p.platform_used == 0:
-        return
-    rate, force = measurement[GYROSCOPE, PLATFORM_IMU], measurement[ACCELEROMETER, PLATFORM_IMU]
-    if s.cycle == 0:
-        start_platform(s.platform_x, s.platform_covariance, force, p.bias_sigma)
-    # Acceleration of the IMU: that of the origin, and what turning adds at the IMU's place d.
-    d = p.platform_imu_position
-    w0, w1, w2 = rate[0] - s.platform_x[3], rate[1] - s.platform_x[4], rate[2] - s.platform_x[5]
-    wd = w0 * d[0] + w1 * d[1] + w2 * d[2]
-    ww = w0 * w0 + w1 * w1 + w2 * w2
-    a = s.angular_velocity
-    for i in range(3):
-        s.imu_acceleration[i] = 0.0
-        a[i] = 0.0
-        for j in range(3):
-            s.imu_acceleration[i] += s.rotation[j, i] * s.acceleration[j]
-            a[i] += s.rotation[j, i] * s.acceleration[3 + j]
-    s.imu_acceleration[0] += a[1] * d[2] - a[2] * d[1] + w0 * wd - d[0] * ww
-    s.imu_acceleration[1] += a[2] * d[0] - a[0] * d[2] + w1 * wd - d[1] * ww
-    s.imu_acceleration[2] += a[0] * d[1] - a[1] * d[0] + w2 * wd - d[2] * ww
-    period = elapsed(parameters, state)
-    step_platform(
-        s.platform_x, s.platform_covariance, rate, force, s.imu_acceleration, period, p.gravity, p.gyroscope_density,
-        p.bias_walk, p.vertical_variance, s.matrices_6_6[0], s.matrices_6_6[1], s.vectors_6[0], s.vectors_6[1],
-    )  # fmt: skip
-    for i in range(3):
-        s.vertical[0, i] = s.platform_x[i]
-        s.platform_rate[i] = rate[i] - s.platform_x[3 + i]
-
-
-@kernel
-def find_pose(parameters: Record, state: Record) -> float:
-    """The pose in closed form from the leg directions, and the vertical if the platform has an IMU; returns the
-    conditioning.
-    """
-    p, s = parameters[()], state[()]
-    if p.platform_used != 0:
-        s.conditioning = pose_from_vector(
-            p.geometry, s.directions, p.leg_used, p.up_in_base[0], s.vertical[0], s.position, s.rotation, s.scratch
-        )
-    else:
-        s.conditioning = pose_from_legs(p.geometry, s.directions, p.leg_used, s.position, s.rotation, s.scratch)
-    return float(s.conditioning)
-
-
-@kernel
-def improve_pose(parameters: Record, state: Record) -> bool:
-    """Two Gauss-Newton steps for the pose; the twist comes with them, and the acceleration is its derivative."""
-    p, s = parameters[()], state[()]
-    factor = s.matrices_6_6[0]
-    for _ in range(2):
-        normal_equations(
-            p.geometry.base_joints, p.geometry.platform_joints, s.directions, p.leg_weights, p.up_in_base, s.vertical,
-            p.vertical_weight, s.position, s.rotation, s.arms, s.predicted, s.lengths, s.information, s.vectors_6[0],
-        )  # fmt: skip
-        if not solve_normal_equations(s.information, s.vectors_6[0], factor):
-            return False
-        move_pose(s.vectors_6[0], s.position, s.rotation)
-    for i in range(3):
-        s.angular_velocity[i] = 0.0
-        for j in range(3):
-            s.angular_velocity[i] += s.rotation[i, j] * s.platform_rate[j]
-    find_twist(
-        s.rates, p.leg_weights, s.vertical, p.vertical_weight, s.angular_velocity, s.rotation, s.arms, s.predicted, s.lengths,
-        factor, s.twist,
-    )  # fmt: skip
-    if s.cycle == 0:
-        s.smooth_twist[:] = s.twist
-    share = min(1.0, elapsed(parameters, state) * p.acceleration_rate)
-    for i in range(6):
-        s.acceleration[i] = (s.twist[i] - s.smooth_twist[i]) * p.acceleration_rate
-        s.smooth_twist[i] += share * (s.twist[i] - s.smooth_twist[i])
-    return True
 
 
 @kernel
@@ -522,12 +455,12 @@ def feed_load_forward(parameters: Record, state: Record) -> None:
     moment about its base joint, and each rod's own weight along its leg.
     """
     p, s = parameters[()], state[()]
-    up = p.up_in_base[0]
+    up = p.sensors.up_in_base[0]
     wrench, force = s.vectors_6[0], s.vectors_6[1]
     jacobian, transposed = s.matrices_6_6[0], s.matrices_6_6[1]
     jacobian_at(s.arms, s.predicted, jacobian)
     for i in range(6):
-        wrench[i] = p.mass * p.gravity * up[i] if i < 3 else 0.0
+        wrench[i] = p.mass * p.sensors.gravity * up[i] if i < 3 else 0.0
         for j in range(6):
             transposed[i, j] = jacobian[j, i]
     m0 = m1 = m2 = 0.0
@@ -535,13 +468,13 @@ def feed_load_forward(parameters: Record, state: Record) -> None:
         m0 += s.rotation[0, j] * p.first_moment[j]
         m1 += s.rotation[1, j] * p.first_moment[j]
         m2 += s.rotation[2, j] * p.first_moment[j]
-    wrench[3] = p.gravity * (m1 * up[2] - m2 * up[1])
-    wrench[4] = p.gravity * (m2 * up[0] - m0 * up[2])
-    wrench[5] = p.gravity * (m0 * up[1] - m1 * up[0])
+    wrench[3] = p.sensors.gravity * (m1 * up[2] - m2 * up[1])
+    wrench[4] = p.sensors.gravity * (m2 * up[0] - m0 * up[2])
+    wrench[5] = p.sensors.gravity * (m0 * up[1] - m1 * up[0])
     for k in range(LEGS):
         d, a = s.predicted[k], s.arms[k]
         along = d[0] * up[0] + d[1] * up[1] + d[2] * up[2]
-        lever = (p.lower_moment + p.rod_mass * (s.lengths[k] - p.rod_center)) * p.gravity / s.lengths[k]
+        lever = (p.lower_moment + p.rod_mass * (s.lengths[k] - p.rod_center)) * p.sensors.gravity / s.lengths[k]
         f0, f1, f2 = lever * (up[0] - along * d[0]), lever * (up[1] - along * d[1]), lever * (up[2] - along * d[2])
         wrench[0] += f0
         wrench[1] += f1
@@ -554,6 +487,6 @@ def feed_load_forward(parameters: Record, state: Record) -> None:
             force[k] = 0.0
     for k in range(LEGS):
         d = s.predicted[k]
-        own = p.rod_mass * p.gravity * (d[0] * up[0] + d[1] * up[1] + d[2] * up[2])
+        own = p.rod_mass * p.sensors.gravity * (d[0] * up[0] + d[1] * up[1] + d[2] * up[2])
         load = force[k] + own + p.moving_mass * s.reference[k, 2]
         s.feed_forward[k] = s.reference[k, 1] + p.droop * load

@@ -175,10 +175,11 @@ def update_leg(
 
 
 @kernel
-def leg_direction(x: Array, joint_rotation: Array, direction: Array, rate: Array) -> None:
-    """Write the leg's direction (3,) in {1} and its rate (3,) [1/s] from the filter's state."""
-    ca, sa, cb, sb = np.cos(x[0]), np.sin(x[0]), np.cos(x[1]), np.sin(x[1])
-    da, db = x[2], x[3]
+def leg_direction(x: Array, joint_rotation: Array, delay: float, direction: Array, rate: Array) -> None:
+    """Write the leg's direction (3,) in {1} and its rate (3,) [1/s] from the filter's state, carried on by `delay` [s]."""
+    da, db = x[2] + delay * x[4], x[3] + delay * x[5]
+    a, b = x[0] + 0.5 * delay * (x[2] + da), x[1] + 0.5 * delay * (x[3] + db)
+    ca, sa, cb, sb = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
     v0, v1, v2 = sb, -sa * cb, ca * cb
     r0, r1, r2 = cb * db, -ca * cb * da + sa * sb * db, -sa * cb * da - ca * sb * db
     for i in range(3):

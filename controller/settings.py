@@ -6,7 +6,10 @@ from math import radians
 from typing import Any, TypeVar
 
 from plant.errors import InputError
+from plant.imu import STANDARD_GRAVITY, ImuModel
 from plant.mechanism import Mechanism
+
+_ENDLESS = 1e12
 
 S = TypeVar("S", "ControlSettings", "FusionSettings")
 
@@ -49,6 +52,16 @@ class FusionSettings:
         leg_sigma: of each component of a leg's direction, for the refinement [rad].
         tilt_sigma: of the platform's roll and pitch, for the refinement [rad].
         acceleration_time: time constant of the platform's acceleration, which is the derivative of its twist [s].
+        sensor_delay: by how much what the IMUs read is behind [s].
+        gyroscope_range, accelerometer_range: a reading this large is none [rad/s, m/s^2].
+        platform_jerk, platform_angular_jerk: density of the platform's jerk, for the whole-mechanism filter
+            [m/s^3/sqrt(Hz), rad/s^3/sqrt(Hz)].
+        mechanism_gyroscope_noise, mechanism_accelerometer_noise: for that filter [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]; above the
+            data sheet's, because of what joints and calibration leave.
+        accelerometer_bias_walk: random walk of the accelerometers' biases [m/s^2/sqrt(s)].
+        accelerometer_bias_sigma, scale_sigma, alignment_sigma, axes_sigma: what is known of IMUs without a calibration file
+            [m/s^2, 1, rad, rad].
+        disagreement: of the leg filters' directions with the whole-mechanism filter's pose, RMS, that ends its use [rad].
     """
 
     leg_jerk: float = 100.0
@@ -60,9 +73,22 @@ class FusionSettings:
     leg_sigma: float = radians(0.06)
     tilt_sigma: float = radians(0.06)
     acceleration_time: float = 0.01
+    sensor_delay: float = 0.0
+    gyroscope_range: float = radians(250.0)
+    accelerometer_range: float = 4.0 * STANDARD_GRAVITY
+    platform_jerk: float = 17.3
+    platform_angular_jerk: float = 100.0
+    mechanism_gyroscope_noise: float = radians(0.005)
+    mechanism_accelerometer_noise: float = 0.0124
+    accelerometer_bias_walk: float = 1e-5
+    accelerometer_bias_sigma: float = 0.015
+    scale_sigma: float = 1e-3
+    alignment_sigma: float = radians(0.1)
+    axes_sigma: float = 1e-3
+    disagreement: float = radians(1.0)
 
     def __post_init__(self) -> None:
-        _check_positive(self, zero_allowed=set())
+        _check_positive(self, zero_allowed={"sensor_delay"})
 
 
 def control_settings(mechanism: Mechanism, **changes: float) -> ControlSettings:
@@ -81,6 +107,17 @@ def fusion_settings(mechanism: Mechanism, **changes: float) -> FusionSettings:
         InputError: an unknown name, or a value that is not a positive number.
     """
     return _read(FusionSettings, "fusion", {**mechanism.settings.get("fusion", {}), **changes})
+
+
+def sensor_settings(mechanism: Mechanism, imu: ImuModel) -> FusionSettings:
+    """The fusion settings of a mechanism, with delay and ranges of its IMUs, where it does not say them itself."""
+    known = {
+        "sensor_delay": imu.latency,
+        "gyroscope_range": min(imu.gyroscope.reach, _ENDLESS),
+        "accelerometer_range": min(imu.accelerometer.reach, _ENDLESS),
+    }
+    own = mechanism.settings.get("fusion", {})
+    return fusion_settings(mechanism, **{name: value for name, value in known.items() if name not in own})
 
 
 def _read(kind: type[S], name: str, table: Mapping[str, Any]) -> S:

@@ -15,7 +15,8 @@ import casadi as ca
 import control
 import numpy as np
 
-from controller.cycle import STATE, check_rate, cycle_parameters, find_pose, fuse_legs, fuse_platform, improve_pose
+from controller.cycle import STATE, check_rate, cycle_parameters
+from controller.fusion import calibrate, fuse_legs, fuse_platform, locate
 from controller.inverse_kinematics import leg_lengths
 from controller.settings import ControlSettings, control_settings, fusion_settings
 from plant.compiled import Record
@@ -237,10 +238,10 @@ def linear_estimator(mechanism: Mechanism, rate: float, signals: Array) -> Linea
 
     def step(state: Record, sample: Array) -> None:
         measurement[GYROSCOPE], measurement[ACCELEROMETER] = sample.reshape(2, 7, 3)
-        fuse_legs(parameters, state, measurement)
-        fuse_platform(parameters, state, measurement)
-        find_pose(parameters, state)
-        improve_pose(parameters, state)
+        calibrate(parameters, state, measurement)
+        fuse_legs(parameters, state)
+        fuse_platform(parameters, state)
+        locate(parameters, state)
         state["cycle"] += 1
 
     def flat(state: Record) -> Array:

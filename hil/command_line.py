@@ -63,7 +63,6 @@ def _add_simulate(commands: Any) -> None:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     _add_motion(command)
-    command.add_argument("--fusion", default="compiled", help="compiled, or filterpy for the reference leg filters (slow)")
     command.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots and a moving 3-D view")
     _add_json(command)
     command.set_defaults(run=_simulate)
@@ -82,6 +81,13 @@ def _add_motion(command: argparse.ArgumentParser) -> None:
     command.add_argument("--imu", default="mpu9150-calibrated", help="ideal, mpu9150, mpu9150-calibrated or icm42688")
     command.add_argument("--imus", type=_imus, default="all", help="which IMUs there are: all, legs, or a list such as 0,2,4,6")
     command.add_argument("--seed", type=int, default=0, help="of the IMUs' imperfections")
+    command.add_argument("--calibration", metavar="FILE.toml", help="the IMUs' constants, as 'gough calibrate' writes them")
+    command.add_argument(
+        "--fusion",
+        default="compiled",
+        help="compiled: leg and platform filters; whole, whole-gyroscopes, whole-alignments: all IMUs together, with biases "
+        "of both sensors, of the gyroscopes, or with scales and alignments; filterpy: leg filters of filterpy (slow)",
+    )
     command.add_argument("--plant", metavar="FILE.fmu", help="FMI 3.0 Co-Simulation FMU to use instead of the built one")
 
 
@@ -241,7 +247,7 @@ def _simulate(options: argparse.Namespace) -> int:
     from hil.simulation import SimulationConfig, SimulationStoppedError, simulate
 
     _check_writable(options.json, options.report)
-    names = ("mechanism", "target", "duration", "rate", "imu", "seed", "fusion", "plant", "imus")
+    names = ("mechanism", "target", "duration", "rate", "imu", "seed", "fusion", "calibration", "plant", "imus")
     config = SimulationConfig(**{name: getattr(options, name) for name in names})
     stopped = None
     with _progress(f"{config.mechanism} follows {config.target}") as progress:
@@ -292,7 +298,7 @@ def _run(options: argparse.Namespace) -> int:
     from hil.simulation import SimulationConfig
 
     _check_writable(options.json, options.record)
-    names = ("mechanism", "target", "duration", "rate", "imu", "seed", "plant", "imus")
+    names = ("mechanism", "target", "duration", "rate", "imu", "seed", "fusion", "calibration", "plant", "imus")
     config = SimulationConfig(**{name: getattr(options, name) for name in names})
     settings = RealTimeSettings(options.priority, options.cpu, options.strict, options.most_missed)
     stopped = None

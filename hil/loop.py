@@ -23,14 +23,11 @@ from controller.cycle import (
     POSE_LOST,
     begin_stop,
     control,
-    find_pose,
-    fuse_legs,
-    fuse_platform,
     has_stopped,
-    improve_pose,
     prepare,
     skip,
 )
+from controller.fusion import calibrate, find_pose, fuse_legs, fuse_mechanism, fuse_platform, improve_pose
 from controller.least_squares import RANK_TOLERANCE, factor_cholesky, invert_cholesky
 from hil.clock import FREE, REAL, finish, new_clock, now, start, wait
 from plant.compiled import Record, kernel
@@ -72,15 +69,16 @@ STAGES = (
     "platform filter",
     "direct kinematics",
     "refinement",
+    "whole mechanism",
     "control",
     "send",
     "record",
     "plant",
 )
-"""What a cycle is made of: `control` is inverse kinematics, PID and feed-forward; `record` is what comes after the command:
-telemetry and the next reference; `plant` is the simulated one's own time."""
+"""What a cycle is made of: `leg filters` begin with the calibration; `control` is inverse kinematics, PID and feed-forward;
+`record` is what comes after the command: telemetry and the next reference; `plant` is the simulated one's own time."""
 
-_SENSE, _LEGS, _PLATFORM, _POSE, _REFINEMENT, _CONTROL, _SEND, _RECORD, _PLANT = range(len(STAGES))
+_SENSE, _LEGS, _PLATFORM, _POSE, _REFINEMENT, _MECHANISM, _CONTROL, _SEND, _RECORD, _PLANT = range(len(STAGES))
 COMPUTED, TO_COMMAND = slice(_LEGS, _SEND), slice(_SENSE, _RECORD)
 """The stages of the paper's Figure 4, and all between the wake-up and the command."""
 
@@ -94,6 +92,8 @@ RECORD = np.dtype(
         ("missed", np.int64),
         ("status", np.int32),
         ("stop", np.int32),
+        ("imus", np.int32),
+        ("trusted", np.int32),
         ("angular_velocity", np.float64, (IMU_COUNT, 3)),
         ("specific_force", np.float64, (IMU_COUNT, 3)),
         ("magnetic_field", np.float64, (IMU_COUNT, 3)),
@@ -110,7 +110,8 @@ RECORD = np.dtype(
     align=True,
 )
 """What is kept of a cycle: the period that it ran in; when it woke [ns since the first] and how late; the stages' durations and
-the thread's CPU time; periods missed before it; its status and the cause of a stop; raw IMU data; the pose with covariance
+the thread's CPU time; periods missed before it; its status and the cause of a stop; which IMUs were used (a bit each), and
+whether the pose is the whole-mechanism filter's; raw IMU data; the pose with covariance
 (translation, rotation; in {1}), residuals of the directions and conditioning; lengths, reference (length, rate, acceleration)
 and commands; and the truth as the plant's `truth` buffer has it.
 """
@@ -128,8 +129,8 @@ def describe_status(status: int) -> str:
     return _FAILURES.get(status, f"the rig reports failure {own}")
 
 
-LegFusion = Callable[[Record, Array], None]
-"""Leg filters in Python: take the cycle's state and a measurement (3, 7, 3), and leave directions and rates in the state."""
+LegFusion = Callable[[Record], None]
+"""Leg filters in Python: take the calibrated sample in the cycle's state, and leave directions and rates there."""
 
 _ENDLESS = np.iinfo(np.int64).max
 _LOOK_NS = 100_000_000
@@ -227,6 +228,7 @@ class Loop:
         _load(_begin, parameters, state, clock, self.script, link, work, 0, 0)
         _load(_is_due, parameters, state)
         _load(_compute, parameters, state, self.segments, work, timespec)
+        _load(calibrate, parameters, state, work["measurement"])
         _load(_compute_from_legs, parameters, state, self.segments, work, timespec)
         _load(_note, parameters, state, self.segments, self.records, clock, link, work, 0)
         _load(_end, self.records, clock, self.script, link, work)
@@ -264,7 +266,8 @@ class Loop:
                 status = _compute(parameters, state, self.segments, work, timespec)
             elif status == OK and fuse is not None:
                 began = now(timespec)
-                fuse(state, measurement)
+                calibrate(parameters, state, measurement)
+                fuse(state)
                 stage_ns[_LEGS] = now(timespec) - began
                 status = _compute_from_legs(parameters, state, self.segments, work, timespec)
             began = now(timespec)
@@ -426,24 +429,28 @@ def _compute(parameters: Record, state: Record, segments: Array, work: Record, t
     """The steps of `controller.cycle.cycle`, with the clock read in between."""
     measurement, stage_ns = work[()].measurement, work[()].stage_ns
     t = now(timespec)
-    fuse_legs(parameters, state, measurement)
+    calibrate(parameters, state, measurement)
+    fuse_legs(parameters, state)
     stage_ns[_LEGS] = now(timespec) - t
     return _compute_from_legs(parameters, state, segments, work, timespec)
 
 
 @kernel
 def _compute_from_legs(parameters: Record, state: Record, segments: Array, work: Record, timespec: NDArray[np.int64]) -> int:
-    measurement, stage_ns = work[()].measurement, work[()].stage_ns
+    stage_ns = work[()].stage_ns
     t0 = now(timespec)
-    fuse_platform(parameters, state, measurement)
+    fuse_platform(parameters, state)
     t1 = now(timespec)
     conditioning = find_pose(parameters, state)
     t2 = now(timespec)
     found = conditioning >= RANK_TOLERANCE and improve_pose(parameters, state)
     t3 = now(timespec)
-    status = control(parameters, state, segments) if found else POSE_LOST
+    known = fuse_mechanism(parameters, state, found)
     t4 = now(timespec)
-    stage_ns[_PLATFORM], stage_ns[_POSE], stage_ns[_REFINEMENT], stage_ns[_CONTROL] = t1 - t0, t2 - t1, t3 - t2, t4 - t3
+    status = control(parameters, state, segments) if known else POSE_LOST
+    t5 = now(timespec)
+    stage_ns[_PLATFORM], stage_ns[_POSE], stage_ns[_REFINEMENT] = t1 - t0, t2 - t1, t3 - t2
+    stage_ns[_MECHANISM], stage_ns[_CONTROL] = t4 - t3, t5 - t4
     return status
 
 
@@ -463,6 +470,10 @@ def _note(
     record.missed = s.missed
     record.status = status
     record.stop = s.stopping
+    record.imus = 0
+    for k in range(IMU_COUNT):
+        record.imus |= s.imu_used[k] << k
+    record.trusted = s.filter_trusted
     record.angular_velocity[:] = w.measurement[0]
     record.specific_force[:] = w.measurement[1]
     record.magnetic_field[:] = w.measurement[2]
@@ -475,9 +486,11 @@ def _note(
     record.truth[:] = w.truth
     for k in range(LEGS):
         for i in range(3):
-            record.residuals[k, i] = s.directions[k, i] - s.predicted[k, i] if p.leg_used[k] != 0.0 else np.nan
+            record.residuals[k, i] = s.directions[k, i] - s.predicted[k, i] if s.leg_used[k] != 0.0 else np.nan
     w.factor[:] = s.information
-    if factor_cholesky(w.factor):
+    if s.filter_trusted != 0:
+        record.covariance[:] = s.filter.known_covariance
+    elif factor_cholesky(w.factor):
         invert_cholesky(w.factor, w.covariance)
         record.covariance[:] = w.covariance
     else:

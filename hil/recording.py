@@ -22,9 +22,10 @@ from mcap.writer import Writer
 from numpy.typing import NDArray
 
 from controller.cycle import OK
-from hil.loop import DONE, HEAD, KEPT, NO_STOP, RECORD, START, STOP_CAUSES, TAIL, describe_status
+from hil.loop import DONE, HEAD, KEPT, NO_STOP, RECORD, STAGES, START, STOP_CAUSES, TAIL, describe_status
 from plant.compiled import Record
 from plant.errors import GoughError
+from plant.variables import IMU_COUNT
 
 _LITTLE_ENDIAN_CDR = b"\x00\x01\x00\x00"
 _CYCLE_TOPIC, _EVENT_TOPIC = "/cycle", "/event"
@@ -38,11 +39,13 @@ _NOTES = {
     "cycle": "periods since the first",
     "time_ns": "when it woke, since the first deadline",
     "late_ns": "how late it woke",
-    "stage_ns": "sense, leg filters, platform filter, direct kinematics, refinement, control, send, record, plant",
+    "stage_ns": ", ".join(STAGES),
     "cpu_ns": "processor time of the thread",
     "missed": "periods missed before this one",
     "status": "0: all well",
     "stop": "cause of a controlled stop; 0: none",
+    "imus": "which IMUs were used, a bit each",
+    "trusted": "1: the pose is the whole-mechanism filter's",
     "angular_velocity": "rad/s, seven IMUs by three axes: 0-5 on the legs, 6 on the platform",
     "specific_force": "m/s^2",
     "magnetic_field": "uT",
@@ -94,6 +97,7 @@ class Recorder:
         for name, content in contents.items():
             self._writer.add_attachment(0, 0, f"{name}.npy", "application/x-npy", content)
         self._stopping = False
+        self._fusion = {"imus": -1, "trusted": 0}
         self.flush()
 
     def _channel(self, topic: str, name: str, text: str) -> int:
@@ -110,7 +114,10 @@ class Recorder:
         """Append records (n,), dtype `RECORD`, and what is to be told of them."""
         self.write_cycles(records)
         times = self._epoch + records["time_ns"]
-        for i in np.flatnonzero((records["missed"] > 0) | (records["status"] != OK) | (records["stop"] != NO_STOP)).tolist():
+        told = (records["missed"] > 0) | (records["status"] != OK) | (records["stop"] != NO_STOP)
+        for name, before in self._fusion.items():
+            told |= np.diff(records[name], prepend=before) != 0
+        for i in np.flatnonzero(told).tolist():
             for text in self._tell(records[i]):
                 self.tell(int(records["cycle"][i]), text, int(times[i]))
 
@@ -123,11 +130,25 @@ class Recorder:
     def _tell(self, record: Record) -> Iterator[str]:
         if record["missed"] > 0:
             yield f"{record['missed']} periods missed"
+        yield from self._tell_fusion(int(record["imus"]), int(record["trusted"]))
         if record["stop"] != NO_STOP and not self._stopping:
             self._stopping = True
             yield f"controlled stop: {STOP_CAUSES[int(record['stop'])]}"
         if record["status"] != OK:
             yield f"stopped on the brakes: {describe_status(int(record['status']))}"
+
+    def _tell_fusion(self, imus: int, trusted: int) -> Iterator[str]:
+        for imu in range(IMU_COUNT):
+            used, was = imus >> imu & 1, self._fusion["imus"] >> imu & 1
+            if used != was and self._fusion["imus"] >= 0:
+                yield f"IMU {imu} is {'used again' if used else 'left out: it is lost, frozen or at the end of its range'}"
+        if trusted != self._fusion["trusted"]:
+            yield (
+                "the whole-mechanism filter is relied upon"
+                if trusted
+                else "the whole-mechanism filter is not relied upon: the leg filters disagree with it"
+            )
+        self._fusion = {"imus": imus, "trusted": trusted}
 
     def tell(self, cycle: int, text: str, time_ns: int | None = None) -> None:
         """Append an event."""

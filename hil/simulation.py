@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from controller.cycle import ALL_IMUS, OK, STATE, check_rate, cycle_parameters, point_legs
+from controller.calibration import load_calibration
+from controller.cycle import ALL_IMUS, OK, STATE, check_rate, cycle_parameters
 from controller.direct_kinematics import poses_from_lengths
+from controller.fusion import point_legs
 from controller.leg_filter import start_leg
 from controller.planner import Reference, plan
-from controller.settings import control_settings, fusion_settings
+from controller.settings import control_settings, sensor_settings
 from controller.target import Target, check_duration, load_target
 from hil.loop import COMPUTED, RECORD, RIG_FAILED, LegFusion, Loop, describe_status
 from plant.compiled import Record
@@ -25,7 +27,16 @@ from plant.imu import ACCELEROMETER, GYROSCOPE, imu_state, load_imu
 from plant.mechanism import LEGS, Mechanism, load_spatial
 from plant.pose import Array, rotation_angle, rotations_from_quaternions
 
-FUSIONS = ("compiled", "filterpy")
+FUSIONS = {
+    "compiled": None,
+    "filterpy": None,
+    "whole-gyroscopes": "gyroscopes",
+    "whole": "accelerometers",
+    "whole-alignments": "alignments",
+}
+"""Ways to fuse the IMUs: by leg and platform filters, in compiled code or filterpy's; or all together in the whole-mechanism
+filter, with the errors of the IMUs that it estimates."""
+
 HOLD_RANGE_S = (0.2, 10.0)
 _CHUNK_S = 0.25
 MOST_RECORD_BYTES = 4 * 2**30
@@ -43,7 +54,8 @@ class SimulationConfig:
         rate: cycles per second [Hz].
         imu: preset of the imperfections.
         seed: of the imperfections.
-        fusion: "compiled", or "filterpy" for the reference leg filters.
+        fusion: a key of `FUSIONS`.
+        calibration: file with the IMUs' constants; without one their readings are taken as they are.
         plant: an FMU to use instead of the one that gough builds.
         imus: which IMUs there are, 0-5 on the legs and 6 on the platform.
     """
@@ -55,6 +67,7 @@ class SimulationConfig:
     imu: str = "mpu9150-calibrated"
     seed: int = 0
     fusion: str = "compiled"
+    calibration: str | None = None
     plant: str | None = None
     imus: tuple[int, ...] = ALL_IMUS
 
@@ -206,11 +219,14 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
     mechanism = load_spatial(config.mechanism)
     target = load_target(config.target, mechanism, config.duration)
     period = 1.0 / config.rate
-    imu = imu_state(load_imu(config.imu), config.seed, period)
+    model = load_imu(config.imu)
+    imu = imu_state(model, config.seed, period)
     control = control_settings(mechanism)
     if not HOLD_RANGE_S[0] <= control.hold <= HOLD_RANGE_S[1]:
         raise InputError(f"hold is {control.hold:g} s; the estimate settles in {HOLD_RANGE_S[0]:g} to {HOLD_RANGE_S[1]:g} s")
-    parameters = cycle_parameters(mechanism, config.rate, control, fusion_settings(mechanism), config.imus)
+    calibration = None if config.calibration is None else load_calibration(config.calibration)
+    fusion = sensor_settings(mechanism, model)
+    parameters = cycle_parameters(mechanism, config.rate, control, fusion, config.imus, FUSIONS[config.fusion], calibration)
     count = int(parameters["hold_cycles"]) + round(config.duration * config.rate)
     if records is None and count * RECORD.itemsize > MOST_RECORD_BYTES:
         raise InputError(
@@ -236,7 +252,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             reference=reference,
             planning_time=time.perf_counter() - began,
         )
-        loop.load(python=config.fusion != "compiled")
+        loop.load(python=config.fusion == "filterpy")
         yield loop
 
 
@@ -256,9 +272,9 @@ def _filterpy_legs(parameters: Record) -> LegFusion:
 
     legs = [
         FilterpyLeg(
-            up_in_joint=parameters["up_in_joint"][k],
-            imu_position=parameters["leg_imu_position"][k],
-            gravity=float(parameters["gravity"]),
+            up_in_joint=parameters["sensors"]["up_in_joint"][k],
+            imu_position=parameters["sensors"]["leg_imu_position"][k],
+            gravity=float(parameters["sensors"]["gravity"]),
             period=float(parameters["period"]),
             jerk=float(parameters["leg_jerk"]),
             bias_walk=float(parameters["bias_walk"]),
@@ -268,12 +284,12 @@ def _filterpy_legs(parameters: Record) -> LegFusion:
         for k in range(LEGS)
     ]
 
-    def fuse(state: Record, measurement: Array) -> None:
+    def fuse(state: Record) -> None:
         for k, leg in enumerate(legs):
-            if not parameters["leg_used"][k]:
+            if not state["imu_used"][k]:
                 continue
-            rate, force = measurement[GYROSCOPE, k], measurement[ACCELEROMETER, k]
-            if state["cycle"] == 0:
+            rate, force = state["sample"][GYROSCOPE, k], state["sample"][ACCELEROMETER, k]
+            if state["age"][k] == 0:
                 start_leg(
                     state["leg_x"][k], state["leg_covariance"][k], rate, force, leg.up_in_joint, float(parameters["bias_sigma"])
                 )

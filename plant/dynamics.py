@@ -337,6 +337,27 @@ def _plant(x: dict[str, SX], u: dict[str, SX], c: dict[str, SX]) -> tuple[SX, SX
     return _in_table_order(rates, STATES), _in_table_order(outputs, OUTPUTS)
 
 
+def imu_signals(
+    position: SX, rotation: SX, velocity: SX, omega: SX, acceleration: SX, parameters: dict[str, SX]
+) -> dict[str, SX]:
+    """Ideal IMU signals by their names in the table, (7, 3) each, of a platform that moves as given, all seen in {1}.
+
+    Args:
+        position, rotation: (3, 1), (3, 3), of {2}.
+        velocity, omega: (3, 1), of the origin of {2}, and its angular velocity.
+        acceleration: (6, 1), their derivatives.
+        parameters: values by name, of all the table's parameters.
+    """
+    c = _constants(parameters)
+    motion = {"state.position": position, "state.velocity": velocity, "state.angular_velocity": omega}
+    return _imu_signals(_legs(motion, rotation, c), rotation, omega, acceleration, c)
+
+
+def parameter_symbols() -> dict[str, SX]:
+    """A symbol for each parameter of the table."""
+    return _symbols(PARAMETERS)
+
+
 def _in_table_order(values: dict[str, SX], variables: tuple[Variable, ...]) -> SX:
     return _flat({variable.name: values[variable.name] for variable in variables})
 

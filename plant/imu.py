@@ -1,12 +1,13 @@
 """IMU imperfections: what lies between the ideal signals of a plant and the raw data that a controller reads.
 
 The raw reading is the inverse of the paper's (37), `a_cal = T S (a_u + b)`: with the mounting misalignment M,
-`a_u = S^-1 T^-1 M a - b + noise`, then low-pass, delay, range, resolution and dropouts. All noise comes from a
+`a_u = S^-1 T^-1 M a - b + noise`, then low-pass (exact for a signal that is linear between samples, so that it delays by its
+time constant at any rate), delay, range, resolution and dropouts. All noise comes from a
 counter-based generator keyed by (seed, IMU, cycle), so any cycle can be made again on its own.
 """
 
 from dataclasses import dataclass, fields
-from math import inf, pi, radians, sqrt
+from math import exp, expm1, inf, pi, radians, sqrt
 from typing import Any
 
 import numpy as np
@@ -93,6 +94,11 @@ class ImuModel:
         if self.dropout > 1.0:
             raise InputError(f"the dropout of an IMU is {self.dropout}; it is a probability, at most 1")
 
+    @property
+    def latency(self) -> float:
+        """By how much gyroscope and accelerometer, on average, are behind [s]: the delay, and the low-pass's time constant."""
+        return self.delay + sum(0.5 / (2.0 * pi * sensor.bandwidth) for sensor in (self.gyroscope, self.accelerometer))
+
 
 _MPU9150_MAGNETOMETER = SensorErrors(noise=0.05, reach=1200.0, resolution=0.3)
 
@@ -153,7 +159,7 @@ IMU_STATE = np.dtype(
         ("offset", np.float64, (3, IMU_COUNT, 3)),
         ("noise", np.float64, 3),
         ("drift", np.float64, 2),
-        ("smoothing", np.float64, 3),
+        ("smoothing", np.float64, (3, 2)),
         ("reach", np.float64, 3),
         ("resolution", np.float64, 3),
         ("dropout", np.float64),
@@ -162,6 +168,7 @@ IMU_STATE = np.dtype(
         ("seed", np.uint64),
         ("cycle", np.int64),
         ("bias_walk", np.float64, (2, IMU_COUNT, 3)),
+        ("value", np.float64, (3, IMU_COUNT, 3)),
         ("smoothed", np.float64, (3, IMU_COUNT, 3)),
         ("queue", np.float64, (_LONGEST_DELAY + 1, 3, IMU_COUNT, 3)),
         ("reading", np.float64, (3, IMU_COUNT, 3)),
@@ -206,7 +213,7 @@ def imu_state(model: ImuModel, seed: int, period: float) -> Record:
             state["gain"][kind, imu] = gain @ alignments[imu]
             state["offset"][kind, imu] = offset
         state["noise"][kind] = sensor.noise * sqrt(0.5 / sampling)
-        state["smoothing"][kind] = 1.0 - np.exp(-2.0 * pi * sensor.bandwidth * sampling)
+        state["smoothing"][kind] = _smoothing(sensor.bandwidth, sampling)
         state["reach"][kind] = sensor.reach
         state["resolution"][kind] = sensor.resolution
         if kind != MAGNETOMETER:
@@ -229,6 +236,17 @@ def _constant_errors(sensor: SensorErrors, random: np.random.Generator) -> tuple
     bias = random.uniform(*sensor.bias) * direction / np.linalg.norm(direction)
     gain: Array = np.linalg.inv(axes @ scale)
     return gain, -bias
+
+
+def _smoothing(bandwidth: float, period: float) -> tuple[float, float]:
+    """What a first-order low-pass takes over a period of the value before, and of the new one, from what it had."""
+    if bandwidth == inf:
+        return 0.0, 1.0
+    ratio = 2.0 * pi * bandwidth * period
+    if ratio == 0.0:
+        return 0.0, 0.0
+    share = -expm1(-ratio)
+    return share / ratio - exp(-ratio), 1.0 - share / ratio
 
 
 @kernel
@@ -308,8 +326,12 @@ def measure(state: Record, ideal: Array, measurement: Array) -> None:
                         value += s.noise[kind] * normals[axis]
                     else:
                         value += s.bias_walk[kind, imu, axis] + s.noise[kind] * normals[3 * kind + axis]
-                    share = 1.0 if first else s.smoothing[kind]
-                    smoothed = value if share == 1.0 else smoothed + share * (value - smoothed)
+                    before, share = s.smoothing[kind, 0], s.smoothing[kind, 1]
+                    if first or share == 1.0:
+                        smoothed = value
+                    else:
+                        smoothed += before * (s.value[kind, imu, axis] - smoothed) + share * (value - smoothed)
+                    s.value[kind, imu, axis] = value
                     s.smoothed[kind, imu, axis] = smoothed
                 delayed = smoothed
                 if s.delay > 0:

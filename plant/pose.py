@@ -184,6 +184,15 @@ def rotation_from_vector(vector: ArrayLike) -> Array:
     return rotation
 
 
+def vector_from_rotation(rotation: Array) -> Array:
+    """The rotation vectors (..., 3) [rad], of at most half a turn, of rotations (..., 3, 3)."""
+    quaternion = quaternion_from_rotation(rotation)
+    half = np.linalg.norm(quaternion[..., 1:], axis=-1, keepdims=True)
+    turns = 2.0 * np.arctan2(half, quaternion[..., :1])
+    vector: Array = quaternion[..., 1:] * np.where(half > 0.0, turns / np.where(half > 0.0, half, 1.0), 2.0)
+    return vector
+
+
 def rotation_angle(first: Array, second: Array) -> Array:
     """The angle [rad] between rotations (..., 3, 3) and (..., 3, 3); shape (...)."""
     relative = first @ np.swapaxes(second, -1, -2)

@@ -108,7 +108,7 @@ def test_direction_and_rate_are_those_of_the_leg_frame(state, seed):
     random = np.random.default_rng(seed)
     joint, x = rotation_of(random.normal(size=3)), np.array(state)
     direction, rate = np.zeros(3), np.zeros(3)
-    leg_direction(x, joint, direction, rate)
+    leg_direction(x, joint, 0.0, direction, rate)
     np.testing.assert_allclose(direction, joint @ joint_to_leg(x[:2])[:, 2], rtol=0.0, atol=1e-15)
     h = 1e-6
     ahead, behind = (joint @ joint_to_leg(x[:2] + sign * h * x[2:4])[:, 2] for sign in (1.0, -1.0))
@@ -162,7 +162,7 @@ def test_the_start_finds_every_leg_of_the_workspace_on_a_level_and_a_tilted_base
             x, covariance, found = np.zeros(STATES), np.zeros((STATES, STATES)), np.zeros(3)
             force = GRAVITY * frames[leg].T @ mechanism.up_in_base
             start_leg(x, covariance, np.zeros(3), force, joint.T @ mechanism.up_in_base, 0.01)
-            leg_direction(x, joint, found, np.zeros(3))
+            leg_direction(x, joint, 0.0, found, np.zeros(3))
             np.testing.assert_allclose(found, directions[leg], rtol=0.0, atol=1e-9)
 
 

@@ -149,12 +149,30 @@ def test_a_low_pass_leaves_the_variance_of_its_bandwidth() -> None:
     bandwidth, cycles = 50.0, 6000
     model = one_sensor(SensorErrors(noise=1.0, bandwidth=bandwidth))
     noise = readings(imu_state(model, 4, PERIOD), constant(0.0, cycles))[200:]
-    pole = np.exp(-2.0 * pi * bandwidth * PERIOD)
-    expected = sqrt(RATE / 2.0 * (1.0 - pole) / (1.0 + pole))
+    ratio = 2.0 * pi * bandwidth * PERIOD
+    pole, share = np.exp(-ratio), -np.expm1(-ratio) / ratio
+    # Of y+ = pole y + old x + new x+, for a signal that is linear in between.
+    old, new = share - pole, 1.0 - share
+    expected = sqrt(RATE / 2.0 * (old**2 + new**2 + 2.0 * pole * old * new) / (1.0 - pole**2))
     # The samples are correlated over 1 / (1 - pole), which widens the tolerance.
     assert noise.std() == pytest.approx(expected, rel=0.03)
     # Well below half the rate that is a density over the filter's noise bandwidth of pi/2 times its corner.
-    assert noise.std() == pytest.approx(sqrt(bandwidth * pi / 2.0), rel=0.05)
+    assert noise.std() == pytest.approx(sqrt(bandwidth * pi / 2.0), rel=0.1)
+
+
+@pytest.mark.parametrize("rate", [250.0, 1000.0, 4000.0])
+def test_a_low_pass_lags_by_its_time_constant_at_any_rate(rate: float) -> None:
+    bandwidth = 20.0
+    state = imu_state(one_sensor(SensorErrors(bandwidth=bandwidth)), 0, 1.0 / rate)
+    times = np.arange(round(0.5 * rate)) / rate
+    response = readings(state, constant(1.0, len(times)) * times[:, None, None, None])
+    np.testing.assert_allclose(times[-1] - response[-1], 1.0 / (2.0 * pi * bandwidth), rtol=1e-9)
+
+
+def test_a_preset_is_late_by_its_low_pass_and_its_delay() -> None:
+    model = replace(load_imu("mpu9150"), delay=0.002)
+    assert model.latency == pytest.approx(0.002 + 0.5 / (2.0 * pi * 256.0) + 0.5 / (2.0 * pi * 260.0), rel=1e-12)
+    assert load_imu("ideal").latency == 0.0
 
 
 def test_a_step_comes_through_a_low_pass_in_its_time_constant() -> None:
@@ -162,9 +180,10 @@ def test_a_step_comes_through_a_low_pass_in_its_time_constant() -> None:
     state = imu_state(one_sensor(SensorErrors(bandwidth=bandwidth)), 0, PERIOD)
     signal = np.concatenate([constant(0.0, 10), constant(1.0, 100)])
     response = readings(state, signal)
-    after = PERIOD * np.arange(1, 101)
     np.testing.assert_array_equal(response[:10], 0.0)
-    expected = 1.0 - np.exp(-2.0 * pi * bandwidth * after)
+    # Between two samples the step is a ramp.
+    ratio = 2.0 * pi * bandwidth * PERIOD
+    expected = 1.0 + np.expm1(-ratio) / ratio * np.exp(-ratio * np.arange(100))
     np.testing.assert_allclose(response[10:], np.broadcast_to(expected[:, None, None, None], (100, 3, 7, 3)), atol=1e-12)
 
 

@@ -1,0 +1,289 @@
+"""Fusion: from raw IMU data to the pose of the platform, the left half of the paper's Figure 4, step by step.
+
+    calibration -> which IMUs are sound -> leg filters, platform filter -> closed form -> refinement -> whole-mechanism filter
+
+The leg filters and the closed form need no first guess; they start the whole-mechanism filter and watch over it. Every step
+works on the cycle's parameters and state (`controller.cycle`).
+"""
+
+import numpy as np
+
+from controller.direct_kinematics.closed_forms import pose_from_legs, pose_from_vector
+from controller.direct_kinematics.refinement import find_twist, move_pose, normal_equations, solve_normal_equations
+from controller.inverse_kinematics import legs_at
+from controller.least_squares import RANK_TOLERANCE
+from controller.leg_filter import leg_direction, predict_leg, start_leg, update_leg
+from controller.mechanism_filter import collect, extrapolate, start_filter, step_filter
+from controller.platform_filter import start_platform, step_platform
+from plant.compiled import Record, kernel
+from plant.imu import ACCELEROMETER, GYROSCOPE
+from plant.mechanism import LEGS
+from plant.pose import Array
+from plant.variables import IMU_COUNT, PLATFORM_IMU
+
+_GAP_S = 0.05
+"""Longest time for which a leg's angular acceleration is taken to last [s]."""
+
+_FADING_S = 0.1
+"""Time constant with which the step between two sources of the pose fades away [s]."""
+
+
+@kernel
+def elapsed(parameters: Record, state: Record) -> float:
+    """Time since the last cycle [s]."""
+    return float((1 + state[()].missed) * parameters[()].period)
+
+
+@kernel
+def calibrate(parameters: Record, state: Record, measurement: Array) -> None:
+    """Take the sensors' known errors out of a raw measurement (3, 7, 3), by (37), and find out which IMUs are sound.
+
+    An IMU that gives what is not finite, or is at the end of its range, or stands still while others do not, is left out, and
+    taken back when it has been sound for a while.
+    """
+    p, s = parameters[()], state[()]
+    changed = 0
+    for k in range(IMU_COUNT):
+        s.same[k] = 1
+        for kind in range(2):
+            for i in range(3):
+                raw = measurement[kind, k, i]
+                if np.isfinite(raw) and raw != s.raw[kind, k, i]:
+                    s.same[k] = 0
+        changed += p.imu_present[k] != 0 and s.same[k] == 0
+    for k in range(IMU_COUNT):
+        if s.same[k] == 0:
+            s.stands[k] = 0
+        elif changed > 0:
+            s.stands[k] += 1
+        sound = p.imu_present[k] != 0 and s.stands[k] < p.frozen_cycles
+        for kind in range(3):
+            for i in range(3):
+                raw = measurement[kind, k, i]
+                s.raw[kind, k, i] = raw
+                if kind < 2:
+                    # NaN is not below the limit either.
+                    sound = sound and abs(raw) < p.reach[kind]
+                total = p.calibration_offset[kind, k, i]
+                for j in range(3):
+                    total += p.calibration_gain[kind, k, i, j] * measurement[kind, k, j]
+                s.sample[kind, k, i] = total
+        s.sound[k] = s.sound[k] + 1 + s.missed if sound else 0
+        s.imu_used[k] = 1 if s.sound[k] > (0 if s.cycle == 0 else p.sound_cycles) or (sound and s.imu_used[k] != 0) else 0
+
+
+@kernel
+def fuse_legs(parameters: Record, state: Record) -> None:
+    """Step the leg filters of the IMUs that are sound."""
+    s = state[()]
+    for k in range(LEGS):
+        if s.imu_used[k] != 0:
+            fuse_leg(parameters, state, k)
+    point_legs(parameters, state)
+
+
+@kernel
+def fuse_leg(parameters: Record, state: Record, k: int) -> None:
+    """Start or step the filter of leg `k`."""
+    p, s = parameters[()], state[()]
+    x, covariance, up = s.leg_x[k], s.leg_covariance[k], p.sensors.up_in_joint[k]
+    rate, force = s.sample[GYROSCOPE, k], s.sample[ACCELEROMETER, k]
+    period = elapsed(parameters, state)
+    if s.age[k] == 0:
+        start_leg(x, covariance, rate, force, up, p.bias_sigma)
+    else:
+        if period > _GAP_S:
+            x[4:6] = 0.0
+        predict_leg(x, covariance, period, p.leg_jerk, p.bias_walk)
+    update_leg(
+        x, covariance, rate, force, up, p.sensors.leg_imu_position[k], p.sensors.gravity, p.gyroscope_variance,
+        p.leg_force_variance, s.measurement_6, s.jacobian_6_9, s.vectors_9[0], s.vectors_9[1],
+    )  # fmt: skip
+
+
+@kernel
+def point_legs(parameters: Record, state: Record) -> None:
+    """Directions of the legs and their rates from the states of the leg filters, and which of them are to be used: those whose
+    filter has settled, which is asked of all but the first.
+    """
+    p, s = parameters[()], state[()]
+    for k in range(LEGS):
+        s.age[k] = s.age[k] + 1 if s.imu_used[k] != 0 else 0
+        settled = s.age[k] > min(s.cycle, p.leg_settling_cycles)
+        s.leg_used[k] = 1.0 if settled else 0.0
+        s.leg_weights[k] = p.leg_weight if settled else 0.0
+        leg_direction(s.leg_x[k], p.sensors.joint_rotations[k], p.sensor_delay, s.directions[k], s.rates[k])
+
+
+@kernel
+def fuse_platform(parameters: Record, state: Record) -> None:
+    """Step the platform's filter, with its own acceleration, known from the legs, taken out of the reading."""
+    p, s = parameters[()], state[()]
+    age = s.age[PLATFORM_IMU]
+    s.age[PLATFORM_IMU] = age + 1 if s.imu_used[PLATFORM_IMU] != 0 else 0
+    s.platform_used = s.age[PLATFORM_IMU] > min(s.cycle, p.leg_settling_cycles)
+    s.vertical_weight[0] = p.vertical_weight if s.platform_used != 0 else 0.0
+    if s.imu_used[PLATFORM_IMU] == 0:
+        return
+    rate, force = s.sample[GYROSCOPE, PLATFORM_IMU], s.sample[ACCELEROMETER, PLATFORM_IMU]
+    if age == 0:
+        start_platform(s.platform_x, s.platform_covariance, force, p.bias_sigma)
+    # Acceleration of the IMU: that of the origin, and what turning adds at the IMU's place d.
+    d = p.sensors.platform_imu_position
+    w0, w1, w2 = rate[0] - s.platform_x[3], rate[1] - s.platform_x[4], rate[2] - s.platform_x[5]
+    wd = w0 * d[0] + w1 * d[1] + w2 * d[2]
+    ww = w0 * w0 + w1 * w1 + w2 * w2
+    a = s.angular_velocity
+    for i in range(3):
+        s.imu_acceleration[i] = 0.0
+        a[i] = 0.0
+        for j in range(3):
+            s.imu_acceleration[i] += s.rotation[j, i] * s.acceleration[j]
+            a[i] += s.rotation[j, i] * s.acceleration[3 + j]
+    s.imu_acceleration[0] += a[1] * d[2] - a[2] * d[1] + w0 * wd - d[0] * ww
+    s.imu_acceleration[1] += a[2] * d[0] - a[0] * d[2] + w1 * wd - d[1] * ww
+    s.imu_acceleration[2] += a[0] * d[1] - a[1] * d[0] + w2 * wd - d[2] * ww
+    period = elapsed(parameters, state)
+    step_platform(
+        s.platform_x, s.platform_covariance, rate, force, s.imu_acceleration, period, p.sensors.gravity, p.gyroscope_density,
+        p.bias_walk, p.vertical_variance, s.matrices_6_6[0], s.matrices_6_6[1], s.vectors_6[0], s.vectors_6[1],
+    )  # fmt: skip
+    w, u = s.platform_rate, s.platform_x
+    for i in range(3):
+        w[i] = rate[i] - u[3 + i]
+    # Carried on by the delay of the sensors; u' = u x w.
+    s.vertical[0, 0] = u[0] + p.sensor_delay * (u[1] * w[2] - u[2] * w[1])
+    s.vertical[0, 1] = u[1] + p.sensor_delay * (u[2] * w[0] - u[0] * w[2])
+    s.vertical[0, 2] = u[2] + p.sensor_delay * (u[0] * w[1] - u[1] * w[0])
+
+
+@kernel
+def find_pose(parameters: Record, state: Record) -> float:
+    """The pose in closed form from the leg directions, and the vertical if the platform has an IMU; returns the
+    conditioning.
+    """
+    p, s = parameters[()], state[()]
+    if s.platform_used != 0:
+        s.conditioning = pose_from_vector(
+            p.geometry, s.directions, s.leg_used, p.sensors.up_in_base[0], s.vertical[0], s.position, s.rotation, s.scratch
+        )
+    else:
+        s.conditioning = pose_from_legs(p.geometry, s.directions, s.leg_used, s.position, s.rotation, s.scratch)
+    return float(s.conditioning)
+
+
+@kernel
+def improve_pose(parameters: Record, state: Record) -> bool:
+    """Two Gauss-Newton steps for the pose; the twist comes with them, and the acceleration is its derivative."""
+    p, s = parameters[()], state[()]
+    factor = s.matrices_6_6[0]
+    for _ in range(2):
+        normal_equations(
+            p.geometry.base_joints, p.geometry.platform_joints, s.directions, s.leg_weights, p.sensors.up_in_base, s.vertical,
+            s.vertical_weight, s.position, s.rotation, s.arms, s.predicted, s.lengths, s.information, s.vectors_6[0],
+        )  # fmt: skip
+        if not solve_normal_equations(s.information, s.vectors_6[0], factor):
+            return False
+        move_pose(s.vectors_6[0], s.position, s.rotation)
+    for i in range(3):
+        s.angular_velocity[i] = 0.0
+        for j in range(3):
+            s.angular_velocity[i] += s.rotation[i, j] * s.platform_rate[j]
+    find_twist(
+        s.rates, s.leg_weights, s.vertical, s.vertical_weight, s.angular_velocity, s.rotation, s.arms, s.predicted, s.lengths,
+        factor, s.twist,
+    )  # fmt: skip
+    if s.cycle == 0:
+        s.smooth_twist[:] = s.twist
+    share = min(1.0, elapsed(parameters, state) * p.acceleration_rate)
+    for i in range(6):
+        s.acceleration[i] = (s.twist[i] - s.smooth_twist[i]) * p.acceleration_rate
+        s.smooth_twist[i] += share * (s.twist[i] - s.smooth_twist[i])
+    return True
+
+
+@kernel
+def locate(parameters: Record, state: Record) -> bool:
+    """Direct kinematics, its refinement and the whole-mechanism filter; returns whether there is a pose."""
+    found = find_pose(parameters, state) >= RANK_TOLERANCE and improve_pose(parameters, state)
+    return fuse_mechanism(parameters, state, found)
+
+
+@kernel
+def fuse_mechanism(parameters: Record, state: Record, found: bool) -> bool:
+    """Step the whole-mechanism filter, which is started from the pose `found` in closed form; returns whether there is a pose.
+
+    The filter's pose is used once it has settled, as long as the leg filters do not disagree with it; what the pose would jump
+    by when its source changes fades away.
+    """
+    p, s = parameters[()], state[()]
+    f = s.filter
+    if p.filter.errors == 0:
+        return found
+    time = s.cycle * p.period
+    if f.running == 0:
+        if not found or s.cycle < s.filter_due:
+            return found
+        start_filter(p.filter, f, time, s.position, s.rotation, s.twist)
+        s.filter_due = s.cycle + p.filter_settling_cycles
+        return found
+    collect(f, s.sample, s.imu_used, time - p.sensor_delay)
+    step_filter(p.filter, p.sensors, f)
+    s.found_position[:] = s.position
+    s.found_rotation[:] = s.rotation
+    extrapolate(f, time, s.position, s.rotation, s.filter_twist, s.filter_acceleration)
+    agree = _agree(parameters, state, found)
+    s.disagreeing = 0 if agree else s.disagreeing + 1 + s.missed
+    if s.disagreeing > p.patience_cycles:
+        f.running = 0
+        s.filter_due = s.cycle + p.filter_start_cycles
+    elif s.cycle >= s.filter_due and agree:
+        if s.filter_trusted == 0:
+            s.filter_trusted = 1
+            _bridge(s.found_position, s.found_rotation, s.position, s.rotation, s.offset)
+        s.twist[:] = s.filter_twist
+        s.acceleration[:] = s.filter_acceleration
+    if s.filter_trusted != 0 and f.running == 0:
+        s.filter_trusted = 0
+        _bridge(s.position, s.rotation, s.found_position, s.found_rotation, s.offset)
+    if s.filter_trusted == 0:
+        if not found:
+            return False
+        s.position[:] = s.found_position
+        s.rotation[:] = s.found_rotation
+    share = max(1.0 - elapsed(parameters, state) / _FADING_S, 0.0)
+    for i in range(6):
+        s.offset[i] *= share
+    move_pose(s.offset, s.position, s.rotation)
+    return True
+
+
+@kernel
+def _bridge(position: Array, rotation: Array, new_position: Array, new_rotation: Array, offset: Array) -> None:
+    """Add to `offset` (6,) the small way from the new pose to the one before."""
+    for i in range(3):
+        offset[i] += position[i] - new_position[i]
+        j, k = (i + 1) % 3, (i + 2) % 3
+        turn = 0.0
+        for m in range(3):
+            turn += 0.5 * (rotation[k, m] * new_rotation[j, m] - rotation[j, m] * new_rotation[k, m])
+        offset[3 + i] += turn
+    for i in range(6):
+        if not np.isfinite(offset[i]):
+            offset[:] = 0.0
+
+
+@kernel
+def _agree(parameters: Record, state: Record, found: bool) -> bool:
+    """Whether the leg filters' directions are near those of the whole-mechanism filter's pose, which is finite at least."""
+    p, s = parameters[()], state[()]
+    if not found:
+        return bool(np.isfinite(s.position.sum() + s.rotation.sum()))
+    legs_at(p.geometry.base_joints, p.geometry.platform_joints, s.position, s.rotation, s.arms, s.predicted, s.lengths)
+    total = legs = 0.0
+    for k in range(LEGS):
+        if s.leg_used[k] != 0.0:
+            legs += 1.0
+            for i in range(3):
+                total += (s.directions[k, i] - s.predicted[k, i]) ** 2
+    return bool(total <= legs * p.disagreement**2)

@@ -1,0 +1,448 @@
+"""The whole-mechanism filter: an error-state extended Kalman filter on the platform's motion, with all IMUs.
+
+Because the pose fixes every leg, the platform's motion predicts every reading (`controller.readings`), and motion tells the
+sensors' errors apart. Error state: of position, rotation (`R <- exp(skew(theta)) R`), velocity, angular velocity, acceleration
+and angular acceleration (18), driven by white jerk, then for each IMU the first parameters of `ERROR_NAMES`. An IMU reads
+
+    rate  = (I + diag(scale) + U(axes) - skew(alignment)) ideal + bias,   U upper triangular, and the force likewise
+
+Samples are averaged over a window of 5 ms; an update takes its 42 scalars one after the other, spread over the cycles until
+the next window is full, so that every cycle costs about the same. What is told of the motion is carried to the present by the
+motion model. The Jacobian is taken at a motion low-passed over 30 ms: at the noisy one, the noise would be taken for
+excitation, and the biases would drift at rest.
+"""
+
+import numpy as np
+
+from controller.readings import (
+    ACCELERATION,
+    ANGULAR_ACCELERATION,
+    MOTION_STATES,
+    RATE,
+    READINGS,
+    READINGS_SCRATCH,
+    VELOCITY,
+    predict_readings,
+)
+from controller.settings import FusionSettings
+from plant.compiled import Record, kernel
+from plant.errors import UnknownNameError
+from plant.pose import Array, rotate_by_vector
+from plant.variables import IMU_COUNT
+
+ERROR_NAMES = (
+    "gyroscope bias",
+    "accelerometer bias",
+    "accelerometer scale",
+    "gyroscope scale",
+    "alignment",
+    "accelerometer axes",
+    "gyroscope axes",
+)
+"""Errors of an IMU, three parameters each [rad/s, m/s^2, 1, 1, rad, rad, rad]; axes are the elements xy, xz, yz of U."""
+
+GYROSCOPE_BIAS, ACCELEROMETER_BIAS, ACCELEROMETER_SCALE, GYROSCOPE_SCALE, ALIGNMENT, ACCELEROMETER_AXES, GYROSCOPE_AXES = range(
+    0, 21, 3
+)
+ERRORS = 3 * len(ERROR_NAMES)
+BLOCKS = {"gyroscopes": 3, "accelerometers": 6, "alignments": 15, "axes": ERRORS}
+"""How many of an IMU's errors are estimated."""
+
+MOST_STATES = MOTION_STATES + IMU_COUNT * ERRORS
+_ROWS = IMU_COUNT * READINGS
+
+WINDOW_S = 0.005
+_SMOOTHING_S = 0.03
+_FIRST_SIGMAS = (0.01, 0.05, 0.1, 0.5, 5.0, 50.0)
+"""Of the motion at the start: position [m], rotation [rad], and their derivatives."""
+
+_PREPARING_ROWS = 14
+"""What prediction costs, in scalar updates."""
+
+FILTER_PARAMETERS = np.dtype(
+    [
+        ("window", np.int64),
+        ("errors", np.int64),
+        ("jerk", np.float64, 2),
+        ("bias_walk", np.float64, 2),
+        ("variance", np.float64, 2),
+        ("prior", np.float64, (IMU_COUNT * ERRORS, IMU_COUNT * ERRORS)),
+    ],
+    align=True,
+)
+"""Samples of a window; estimated errors of an IMU, 0 for no filter; spectral densities of the platform's jerk (linear,
+angular) and of the biases' walks (gyroscope, accelerometer); variances of one sample (rate, force); and the covariance of the
+errors."""
+
+FILTER_STATE = np.dtype(
+    [
+        ("running", np.int64),
+        ("time", np.float64),
+        ("position", np.float64, 3),
+        ("rotation", np.float64, (3, 3)),
+        ("motion", np.float64, (4, 3)),
+        ("smooth_motion", np.float64, (4, 3)),
+        ("errors", np.float64, (IMU_COUNT, ERRORS)),
+        ("covariance", np.float64, (MOST_STATES, MOST_STATES)),
+        ("known_time", np.float64),
+        ("known_position", np.float64, 3),
+        ("known_rotation", np.float64, (3, 3)),
+        ("known_motion", np.float64, (4, 3)),
+        ("known_covariance", np.float64, (6, 6)),
+        ("sum", np.float64, (IMU_COUNT, READINGS)),
+        ("sum_time", np.float64),
+        ("samples", np.int64, IMU_COUNT),
+        ("collected", np.int64),
+        ("sample", np.float64, (IMU_COUNT, READINGS)),
+        ("sample_used", np.int64, IMU_COUNT),
+        ("row", np.int64),
+        ("piece", np.int64),
+        ("surprise", np.float64),
+        ("surprises", np.int64),
+        ("change", np.float64, MOST_STATES),
+        ("gain", np.float64, MOST_STATES),
+        ("turn", np.float64, 3),
+        ("predicted", np.float64, (IMU_COUNT, READINGS)),
+        ("jacobian", np.float64, (IMU_COUNT, READINGS, MOTION_STATES)),
+        ("gradient", np.float64, ERRORS),
+        ("mixed", np.float64, (3, MOTION_STATES)),
+        ("readings_scratch", READINGS_SCRATCH),
+    ],
+    align=True,
+)
+"""State of the filter, whose update may be under way; `known` is what the last complete one has found.
+
+Times are in seconds since the first cycle. `sum` collects the samples of a window, `sample` is the mean of the last one;
+`row` is the next scalar to take, -1 when none is left. `surprise` is the mean squared normalised innovation of the last update.
+"""
+
+
+def filter_parameters(fusion: FusionSettings, rate: float, errors: str | None, covariance: Array | None) -> Record:
+    """Constants of the filter.
+
+    Args:
+        fusion: settings.
+        rate: samples per second [Hz].
+        errors: a key of `BLOCKS`; None for no filter.
+        covariance: (147, 147), of the errors that a calibration has left; None for what the settings say.
+
+    Raises:
+        UnknownNameError: no such block of errors.
+    """
+    if errors is not None and errors not in BLOCKS:
+        raise UnknownNameError(f"no block of errors {errors!r}; there are {', '.join(BLOCKS)}")
+    sigmas = np.repeat(
+        [
+            fusion.bias_sigma, fusion.accelerometer_bias_sigma, fusion.scale_sigma, fusion.scale_sigma, fusion.alignment_sigma,
+            fusion.axes_sigma, fusion.axes_sigma,
+        ],
+        3,
+    )  # fmt: skip
+    parameters: Record = np.zeros((), FILTER_PARAMETERS)
+    values = {
+        "window": max(1, round(WINDOW_S * rate)),
+        "errors": 0 if errors is None else BLOCKS[errors],
+        "jerk": (fusion.platform_jerk**2, fusion.platform_angular_jerk**2),
+        "bias_walk": (fusion.bias_walk**2, fusion.accelerometer_bias_walk**2),
+        "variance": (
+            fusion.mechanism_gyroscope_noise**2 * rate / 2.0,
+            fusion.mechanism_accelerometer_noise**2 * rate / 2.0,
+        ),
+        "prior": np.diag(np.tile(sigmas**2, IMU_COUNT)) if covariance is None else covariance,
+    }
+    for name, value in values.items():
+        parameters[name] = value
+    return parameters
+
+
+@kernel
+def start_filter(parameters: Record, state: Record, time: float, position: Array, rotation: Array, twist: Array) -> None:
+    """Start from a pose (3,), (3, 3) and twist (6,) at `time`."""
+    p, f = parameters, state
+    f.running = 1
+    f.time = f.known_time = time
+    f.position[:] = position
+    f.rotation[:] = rotation
+    f.motion[:] = 0.0
+    for i in range(3):
+        f.motion[VELOCITY, i] = twist[i]
+        f.motion[RATE, i] = twist[3 + i]
+    f.smooth_motion[:] = f.motion
+    f.errors[:] = 0.0
+    states = MOTION_STATES + IMU_COUNT * p.errors
+    for i in range(states):
+        for j in range(states):
+            f.covariance[i, j] = 0.0
+    for block in range(6):
+        for i in range(3):
+            f.covariance[3 * block + i, 3 * block + i] = _FIRST_SIGMAS[block] ** 2
+    for k in range(IMU_COUNT):
+        for i in range(p.errors):
+            for other in range(IMU_COUNT):
+                for j in range(p.errors):
+                    f.covariance[MOTION_STATES + k * p.errors + i, MOTION_STATES + other * p.errors + j] = p.prior[
+                        k * ERRORS + i, other * ERRORS + j
+                    ]
+    f.row = -1
+    f.collected = 0
+    _publish(state)
+
+
+@kernel
+def collect(state: Record, sample: Array, used: Array, time: float) -> None:
+    """Add a calibrated sample (3, 7, 3) of the IMUs that are `used` (7,) to the window."""
+    f = state
+    if f.collected == 0:
+        f.sum[:] = 0.0
+        f.samples[:] = 0
+        f.sum_time = 0.0
+    f.collected += 1
+    f.sum_time += time
+    for k in range(IMU_COUNT):
+        if used[k] == 0:
+            continue
+        f.samples[k] += 1
+        for i in range(3):
+            f.sum[k, i] += sample[0, k, i]
+            f.sum[k, 3 + i] += sample[1, k, i]
+
+
+@kernel
+def step_filter(parameters: Record, geometry: Record, state: Record) -> None:
+    """The share of this cycle in the update; a new one begins when the window is full."""
+    p, f = parameters, state
+    if f.collected >= p.window:
+        _begin_update(parameters, geometry, state)
+    if f.row < 0:
+        return
+    f.piece += 1
+    whole = _PREPARING_ROWS + _ROWS
+    last = min(max(-(-whole * f.piece // p.window) - _PREPARING_ROWS, 0), _ROWS)
+    while f.row < last:
+        _take(parameters, state, f.row)
+        f.row += 1
+    if f.row == _ROWS:
+        _end_update(parameters, state)
+
+
+@kernel
+def _begin_update(parameters: Record, geometry: Record, state: Record) -> None:
+    p, f = parameters, state
+    if f.row >= 0:
+        # The windows have overtaken the update, which happens when cycles are missed.
+        while f.row < _ROWS:
+            _take(parameters, state, f.row)
+            f.row += 1
+        _end_update(parameters, state)
+    time = f.sum_time / f.collected
+    for k in range(IMU_COUNT):
+        f.sample_used[k] = f.samples[k]
+        for i in range(READINGS):
+            f.sample[k, i] = f.sum[k, i] / max(f.samples[k], 1)
+    f.collected = 0
+    _predict(parameters, state, time - f.time)
+    f.time = time
+    f.change[:] = 0.0
+    f.surprise = 0.0
+    f.surprises = 0
+    f.row = f.piece = 0
+    predict_readings(geometry, f.position, f.rotation, f.smooth_motion, True, f.predicted, f.jacobian, f.readings_scratch)
+    predict_readings(geometry, f.position, f.rotation, f.motion, False, f.predicted, f.jacobian, f.readings_scratch)
+    if p.errors > ACCELEROMETER_SCALE:
+        for k in range(IMU_COUNT):
+            _distort_jacobian(f.errors[k], f.jacobian[k], f.mixed)
+
+
+@kernel
+def _predict(parameters: Record, state: Record, period: float) -> None:
+    """Carry motion and covariance on by `period` [s]."""
+    p, f = parameters, state
+    t, half = period, 0.5 * period * period
+    x, c = f.motion, f.covariance
+    for i in range(3):
+        f.position[i] += t * x[VELOCITY, i] + half * x[ACCELERATION, i]
+        f.turn[i] = t * x[RATE, i] + half * x[ANGULAR_ACCELERATION, i]
+        x[VELOCITY, i] += t * x[ACCELERATION, i]
+        x[RATE, i] += t * x[ANGULAR_ACCELERATION, i]
+    rotate_by_vector(f.rotation, f.turn)
+    share = min(t / (t + _SMOOTHING_S), 1.0)
+    for block in range(4):
+        for i in range(3):
+            f.smooth_motion[block, i] += share * (x[block, i] - f.smooth_motion[block, i])
+    # theta+ = (I + skew(turn)) theta + t d_omega + t^2/2 d_alpha, first by rows and then by columns.
+    states = MOTION_STATES + IMU_COUNT * p.errors
+    r0, r1, r2 = f.turn[0], f.turn[1], f.turn[2]
+    for j in range(states):
+        x0, x1, x2 = c[3, j], c[4, j], c[5, j]
+        c[3, j] += r1 * x2 - r2 * x1
+        c[4, j] += r2 * x0 - r0 * x2
+        c[5, j] += r0 * x1 - r1 * x0
+    for i in range(6):
+        for j in range(states):
+            c[i, j] += t * c[6 + i, j] + half * c[12 + i, j]
+            c[6 + i, j] += t * c[12 + i, j]
+    for i in range(states):
+        x0, x1, x2 = c[i, 3], c[i, 4], c[i, 5]
+        c[i, 3] += r1 * x2 - r2 * x1
+        c[i, 4] += r2 * x0 - r0 * x2
+        c[i, 5] += r0 * x1 - r1 * x0
+        for j in range(6):
+            c[i, j] += t * c[i, 6 + j] + half * c[i, 12 + j]
+            c[i, 6 + j] += t * c[i, 12 + j]
+    t3 = t * t * t
+    for i in range(6):
+        q = p.jerk[i // 3]
+        v, a = 6 + i, 12 + i
+        c[i, i] += q * t3 * t * t / 20.0
+        c[v, v] += q * t3 / 3.0
+        c[a, a] += q * t
+        for first, second, value in ((i, v, q * t3 * t / 8.0), (i, a, q * t3 / 6.0), (v, a, q * t * t / 2.0)):
+            c[first, second] += value
+            c[second, first] += value
+    for k in range(IMU_COUNT):
+        for i in range(min(p.errors, ACCELEROMETER_SCALE)):
+            at = MOTION_STATES + k * p.errors + i
+            c[at, at] += p.bias_walk[i // 3] * t
+    # The updates take the matrix for symmetric.
+    for i in range(states):
+        for j in range(i):
+            mean = 0.5 * (c[i, j] + c[j, i])
+            c[i, j] = mean
+            c[j, i] = mean
+
+
+@kernel
+def distort(errors: Array, first: int, x0: float, x1: float, x2: float) -> tuple[float, float, float]:
+    """What a sensor without bias makes of an ideal reading; `first` is 0 for the gyroscope, 3 for the accelerometer."""
+    scale = GYROSCOPE_SCALE if first == 0 else ACCELEROMETER_SCALE
+    axes = GYROSCOPE_AXES if first == 0 else ACCELEROMETER_AXES
+    a0, a1, a2 = errors[ALIGNMENT], errors[ALIGNMENT + 1], errors[ALIGNMENT + 2]
+    return (
+        x0 + errors[scale] * x0 + errors[axes] * x1 + errors[axes + 1] * x2 - (a1 * x2 - a2 * x1),
+        x1 + errors[scale + 1] * x1 + errors[axes + 2] * x2 - (a2 * x0 - a0 * x2),
+        x2 + errors[scale + 2] * x2 - (a0 * x1 - a1 * x0),
+    )
+
+
+@kernel
+def _distort_jacobian(errors: Array, jacobian: Array, mixed: Array) -> None:
+    """Turn derivatives of ideal readings (6, 18) into those of an IMU with these errors."""
+    for first in (0, 3):
+        for j in range(MOTION_STATES):
+            mixed[0, j], mixed[1, j], mixed[2, j] = distort(
+                errors, first, jacobian[first, j], jacobian[first + 1, j], jacobian[first + 2, j]
+            )
+        for i in range(3):
+            for j in range(MOTION_STATES):
+                jacobian[first + i, j] = mixed[i, j]
+
+
+@kernel
+def error_gradient(predicted: Array, m: int, gradient: Array) -> None:
+    """Write the derivative (21,) of reading `m`, 0-5, of an IMU by its errors; `predicted` (6,) is what an ideal one reads."""
+    gradient[:] = 0.0
+    rate = m < 3
+    i = m if rate else m - 3
+    first = 0 if rate else 3
+    x = predicted[first : first + 3]
+    scale, axes = (GYROSCOPE_SCALE, GYROSCOPE_AXES) if rate else (ACCELEROMETER_SCALE, ACCELEROMETER_AXES)
+    gradient[first + i] = 1.0
+    gradient[scale + i] = x[i]
+    # -alignment x ideal = skew(ideal) alignment
+    gradient[ALIGNMENT + (i + 1) % 3] = -x[(i + 2) % 3]
+    gradient[ALIGNMENT + (i + 2) % 3] = x[(i + 1) % 3]
+    if i == 0:
+        gradient[axes], gradient[axes + 1] = x[1], x[2]
+    elif i == 1:
+        gradient[axes + 2] = x[2]
+
+
+@kernel
+def _take(parameters: Record, state: Record, row: int) -> None:
+    """Take one scalar of the sample into covariance and change."""
+    p, f = parameters, state
+    k, m = row // READINGS, row % READINGS
+    if f.sample_used[k] == 0:
+        return
+    first = 0 if m < 3 else 3
+    states, start = MOTION_STATES + IMU_COUNT * p.errors, MOTION_STATES + k * p.errors
+    h, gain, change, c = f.jacobian[k, m], f.gain, f.change, f.covariance
+    x = f.predicted[k]
+    expected = distort(f.errors[k], first, x[first], x[first + 1], x[first + 2])
+    innovation = f.sample[k, m] - expected[m - first] - f.errors[k, m]
+    variance = p.variance[0 if m < 3 else 1] / f.sample_used[k]
+    for i in range(states):
+        gain[i] = 0.0
+    for j in range(MOTION_STATES):
+        weight = h[j]
+        innovation -= weight * change[j]
+        for i in range(states):
+            gain[i] += weight * c[j, i]
+    error_gradient(x, m, f.gradient)
+    for j in range(p.errors):
+        weight = f.gradient[j]
+        if weight != 0.0:
+            innovation -= weight * change[start + j]
+            for i in range(states):
+                gain[i] += weight * c[start + j, i]
+    for j in range(MOTION_STATES):
+        variance += h[j] * gain[j]
+    for j in range(p.errors):
+        variance += f.gradient[j] * gain[start + j]
+    inverse = 1.0 / variance
+    f.surprise += innovation * innovation * inverse
+    f.surprises += 1
+    for i in range(states):
+        weight = gain[i] * inverse
+        change[i] += weight * innovation
+        for j in range(states):
+            c[i, j] -= weight * gain[j]
+
+
+@kernel
+def _end_update(parameters: Record, state: Record) -> None:
+    """Put the change into the motion and the errors."""
+    p, f = parameters, state
+    f.row = -1
+    if f.surprises > 0:
+        f.surprise /= f.surprises
+    for i in range(3):
+        f.position[i] += f.change[i]
+        f.turn[i] = f.change[3 + i]
+        for block in range(4):
+            f.motion[block, i] += f.change[6 + 3 * block + i]
+    rotate_by_vector(f.rotation, f.turn)
+    for k in range(IMU_COUNT):
+        for i in range(p.errors):
+            f.errors[k, i] += f.change[MOTION_STATES + k * p.errors + i]
+    _publish(state)
+
+
+@kernel
+def extrapolate(state: Record, time: float, position: Array, rotation: Array, twist: Array, acceleration: Array) -> None:
+    """Carry what is known to `time`: write the pose (3,), (3, 3), twist (6,) and acceleration (6,)."""
+    f = state
+    t = time - f.known_time
+    x = f.known_motion
+    for i in range(3):
+        position[i] = f.known_position[i] + t * (x[VELOCITY, i] + 0.5 * t * x[ACCELERATION, i])
+        f.turn[i] = t * (x[RATE, i] + 0.5 * t * x[ANGULAR_ACCELERATION, i])
+        twist[i] = x[VELOCITY, i] + t * x[ACCELERATION, i]
+        twist[3 + i] = x[RATE, i] + t * x[ANGULAR_ACCELERATION, i]
+        acceleration[i] = x[ACCELERATION, i]
+        acceleration[3 + i] = x[ANGULAR_ACCELERATION, i]
+        for j in range(3):
+            rotation[i, j] = f.known_rotation[i, j]
+    rotate_by_vector(rotation, f.turn)
+
+
+@kernel
+def _publish(state: Record) -> None:
+    f = state
+    f.known_time = f.time
+    f.known_position[:] = f.position
+    f.known_rotation[:] = f.rotation
+    f.known_motion[:] = f.motion
+    for i in range(6):
+        for j in range(6):
+            f.known_covariance[i, j] = f.covariance[i, j]
