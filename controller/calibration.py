@@ -8,7 +8,7 @@ gain @ raw + offset. A file gives for each IMU what one would write on its box, 
 
 import json
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ class Calibration:
     Attributes:
         gain: (3, 7, 3, 3), by sensor (gyroscope, accelerometer, magnetometer) and IMU.
         offset: (3, 7, 3) [rad/s, m/s^2, uT].
+        tilt: (2,) [rad], by which the vertical is turned about the axes x and y of {1}.
         covariance: (147, 147), of what errors are left, in the order of `controller.mechanism_filter.ERROR_NAMES` for each IMU;
             None if it is not known.
         about: what is worth knowing: date, residuals, where the data came from.
@@ -40,6 +41,7 @@ class Calibration:
 
     gain: Array = field(default_factory=lambda: np.tile(np.eye(3), (3, IMU_COUNT, 1, 1)))
     offset: Array = field(default_factory=lambda: np.zeros((3, IMU_COUNT, 3)))
+    tilt: Array = field(default_factory=lambda: np.zeros(2))
     covariance: Array | None = None
     about: dict[str, Any] = field(default_factory=dict)
 
@@ -51,7 +53,9 @@ class Calibration:
     def then(self, gain: Array, offset: Array, **changes: Any) -> "Calibration":
         """This calibration followed by another."""
         whole = (gain @ self.offset[..., None])[..., 0] + offset
-        return Calibration(gain @ self.gain, whole, **{"covariance": self.covariance, "about": self.about, **changes})
+        return Calibration(
+            gain @ self.gain, whole, **{"tilt": self.tilt, "covariance": self.covariance, "about": self.about, **changes}
+        )
 
 
 def split_gain(gain: Array) -> tuple[Array, Array, Array]:
@@ -92,20 +96,23 @@ def load_calibration(path: Path | str) -> Calibration:
         raise InputError(f"{path} is no TOML file: {error}") from None
     calibration = Calibration(about=document.get("about", {}))
     for name, table in document.items():
-        if name in ("about", "covariance"):
+        if name in ("about", "base", "covariance"):
             continue
         imu = name.removeprefix("imu_")
         if not (name.startswith("imu_") and imu.isdigit() and int(imu) < IMU_COUNT):
             raise InputError(
-                f"{path}: there is no table {name!r} in a calibration; there are imu_0 to imu_6, about, covariance"
+                f"{path}: there is no table {name!r} in a calibration; there are imu_0 to imu_6, about, base, covariance"
             )
         for sensor, entries in table.items():
             if sensor not in SENSORS:
                 raise InputError(f"{path}: {name} has no sensor {sensor!r}; it has {', '.join(SENSORS)}")
             _read_sensor(calibration, SENSORS.index(sensor), int(imu), entries, f"{path}: {name}.{sensor}")
-    if "covariance" not in document:
-        return calibration
-    return Calibration(calibration.gain, calibration.offset, _read_covariance(document["covariance"], path), calibration.about)
+    changes: dict[str, Any] = {}
+    if "base" in document:
+        changes["tilt"] = checked_array(document["base"].get("tilt", (0.0, 0.0)), (2,), f"{path}: base.tilt")
+    if "covariance" in document:
+        changes["covariance"] = _read_covariance(document["covariance"], path)
+    return replace(calibration, **changes)
 
 
 def _read_sensor(calibration: Calibration, sensor: int, imu: int, entries: Any, where: str) -> None:
@@ -146,6 +153,11 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
         "# calibrated = R(mounting) T(axes) S(scale) (raw + bias)",
     ]
     lines += ["", "[about]", *(f"{name} = {_toml(value)}" for name, value in calibration.about.items())]
+    lines += [
+        "",
+        "[base]  # by which the vertical is turned about x and y, in rad",
+        f"tilt = {_toml(calibration.tilt.tolist())}",
+    ]
     for imu in range(IMU_COUNT):
         for sensor, name in enumerate(SENSORS):
             gain, offset = calibration.gain[sensor, imu], calibration.offset[sensor, imu]

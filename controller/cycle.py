@@ -182,8 +182,8 @@ STATE = np.dtype(
 """State of the cycle: filters, pose, controllers, and what the last cycle found.
 
 `cycle` counts periods, `missed` those since the last cycle that had none. `sample` is the calibrated measurement. Of each IMU:
-whether it reads the `same` again, how often in a row it `stands` still while others do not, for how many cycles it has been
-`sound`, whether it is used, and the `age` of its filter. `twist` is velocity and angular velocity in {1}; `vertical` and
+whether it reads the `same` again, how often in a row it `stands` still while others do not, for how long it has been `sound`,
+whether it is used, and the `age` of its filter, all in periods. `twist` is velocity and angular velocity in {1}; `vertical` and
 `platform_rate` are seen in {2}; `information` is the inverse of the covariance of the refined pose (lower triangle).
 
 The whole-mechanism filter is to be started, or trusted, when it is `filter_due`; `offset` is what is left of the way from one
@@ -239,7 +239,7 @@ def cycle_parameters(
         "period": 1.0 / rate,
         "hold_cycles": int(np.ceil(control.hold * rate - 1e-9)),
         "geometry": geometry_of(mechanism),
-        "sensors": sensor_geometry(mechanism),
+        "sensors": sensor_geometry(mechanism, calibration.tilt),
         "imu_present": [imu in imus for imu in ALL_IMUS],
         "calibration_gain": calibration.gain,
         "calibration_offset": calibration.offset,

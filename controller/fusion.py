@@ -69,7 +69,7 @@ def calibrate(parameters: Record, state: Record, measurement: Array) -> None:
                     total += p.calibration_gain[kind, k, i, j] * measurement[kind, k, j]
                 s.sample[kind, k, i] = total
         s.sound[k] = s.sound[k] + 1 + s.missed if sound else 0
-        s.imu_used[k] = 1 if s.sound[k] > (0 if s.cycle == 0 else p.sound_cycles) or (sound and s.imu_used[k] != 0) else 0
+        s.imu_used[k] = 1 if sound and (s.imu_used[k] != 0 or s.sound[k] > min(s.cycle, p.sound_cycles)) else 0
 
 
 @kernel
@@ -108,7 +108,7 @@ def point_legs(parameters: Record, state: Record) -> None:
     """
     p, s = parameters[()], state[()]
     for k in range(LEGS):
-        s.age[k] = s.age[k] + 1 if s.imu_used[k] != 0 else 0
+        s.age[k] = s.age[k] + 1 + s.missed if s.imu_used[k] != 0 else 0
         settled = s.age[k] > min(s.cycle, p.leg_settling_cycles)
         s.leg_used[k] = 1.0 if settled else 0.0
         s.leg_weights[k] = p.leg_weight if settled else 0.0
@@ -120,7 +120,7 @@ def fuse_platform(parameters: Record, state: Record) -> None:
     """Step the platform's filter, with its own acceleration, known from the legs, taken out of the reading."""
     p, s = parameters[()], state[()]
     age = s.age[PLATFORM_IMU]
-    s.age[PLATFORM_IMU] = age + 1 if s.imu_used[PLATFORM_IMU] != 0 else 0
+    s.age[PLATFORM_IMU] = age + 1 + s.missed if s.imu_used[PLATFORM_IMU] != 0 else 0
     s.platform_used = s.age[PLATFORM_IMU] > min(s.cycle, p.leg_settling_cycles)
     s.vertical_weight[0] = p.vertical_weight if s.platform_used != 0 else 0.0
     if s.imu_used[PLATFORM_IMU] == 0:

@@ -4,7 +4,7 @@ Because the pose fixes every leg, the platform's motion predicts every reading (
 sensors' errors apart. Error state: of position, rotation (`R <- exp(skew(theta)) R`), velocity, angular velocity, acceleration
 and angular acceleration (18), driven by white jerk, then for each IMU the first parameters of `ERROR_NAMES`. An IMU reads
 
-    rate  = (I + diag(scale) + U(axes) - skew(alignment)) ideal + bias,   U upper triangular, and the force likewise
+    rate  = (I + diag(scale) + U(axes)) R(-alignment) ideal + bias,   U upper triangular, R the rotation, the force likewise
 
 Samples are averaged over a window of 5 ms; an update takes its 42 scalars one after the other, spread over the cycles until
 the next window is full, so that every cycle costs about the same. What is told of the motion is carried to the present by the
@@ -63,6 +63,7 @@ FILTER_PARAMETERS = np.dtype(
     [
         ("window", np.int64),
         ("errors", np.int64),
+        ("smoothing", np.float64),
         ("jerk", np.float64, 2),
         ("bias_walk", np.float64, 2),
         ("variance", np.float64, 2),
@@ -70,7 +71,8 @@ FILTER_PARAMETERS = np.dtype(
     ],
     align=True,
 )
-"""Samples of a window; estimated errors of an IMU, 0 for no filter; spectral densities of the platform's jerk (linear,
+"""Samples of a window; estimated errors of an IMU, 0 for no filter; time constant of the motion at which the Jacobian is taken,
+infinite if that is set from outside; spectral densities of the platform's jerk (linear,
 angular) and of the biases' walks (gyroscope, accelerometer); variances of one sample (rate, force); and the covariance of the
 errors."""
 
@@ -103,6 +105,7 @@ FILTER_STATE = np.dtype(
         ("gain", np.float64, MOST_STATES),
         ("turn", np.float64, 3),
         ("predicted", np.float64, (IMU_COUNT, READINGS)),
+        ("smooth_predicted", np.float64, (IMU_COUNT, READINGS)),
         ("jacobian", np.float64, (IMU_COUNT, READINGS, MOTION_STATES)),
         ("gradient", np.float64, ERRORS),
         ("mixed", np.float64, (3, MOTION_STATES)),
@@ -142,6 +145,7 @@ def filter_parameters(fusion: FusionSettings, rate: float, errors: str | None, c
     values = {
         "window": max(1, round(WINDOW_S * rate)),
         "errors": 0 if errors is None else BLOCKS[errors],
+        "smoothing": _SMOOTHING_S,
         "jerk": (fusion.platform_jerk**2, fusion.platform_angular_jerk**2),
         "bias_walk": (fusion.bias_walk**2, fusion.accelerometer_bias_walk**2),
         "variance": (
@@ -246,7 +250,9 @@ def _begin_update(parameters: Record, geometry: Record, state: Record) -> None:
     f.surprise = 0.0
     f.surprises = 0
     f.row = f.piece = 0
-    predict_readings(geometry, f.position, f.rotation, f.smooth_motion, True, f.predicted, f.jacobian, f.readings_scratch)
+    predict_readings(
+        geometry, f.position, f.rotation, f.smooth_motion, True, f.smooth_predicted, f.jacobian, f.readings_scratch
+    )
     predict_readings(geometry, f.position, f.rotation, f.motion, False, f.predicted, f.jacobian, f.readings_scratch)
     if p.errors > ACCELEROMETER_SCALE:
         for k in range(IMU_COUNT):
@@ -265,7 +271,7 @@ def _predict(parameters: Record, state: Record, period: float) -> None:
         x[VELOCITY, i] += t * x[ACCELERATION, i]
         x[RATE, i] += t * x[ANGULAR_ACCELERATION, i]
     rotate_by_vector(f.rotation, f.turn)
-    share = min(t / (t + _SMOOTHING_S), 1.0)
+    share = t / (t + p.smoothing)
     for block in range(4):
         for i in range(3):
             f.smooth_motion[block, i] += share * (x[block, i] - f.smooth_motion[block, i])
@@ -312,25 +318,42 @@ def _predict(parameters: Record, state: Record, period: float) -> None:
 
 
 @kernel
-def distort(errors: Array, first: int, x0: float, x1: float, x2: float) -> tuple[float, float, float]:
-    """What a sensor without bias makes of an ideal reading; `first` is 0 for the gyroscope, 3 for the accelerometer."""
-    scale = GYROSCOPE_SCALE if first == 0 else ACCELEROMETER_SCALE
-    axes = GYROSCOPE_AXES if first == 0 else ACCELEROMETER_AXES
+def _turned_back(errors: Array, x0: float, x1: float, x2: float) -> tuple[float, float, float]:
+    """A vector seen from the mounted IMU: turned back by the alignment, to second order."""
     a0, a1, a2 = errors[ALIGNMENT], errors[ALIGNMENT + 1], errors[ALIGNMENT + 2]
+    c0, c1, c2 = a1 * x2 - a2 * x1, a2 * x0 - a0 * x2, a0 * x1 - a1 * x0
     return (
-        x0 + errors[scale] * x0 + errors[axes] * x1 + errors[axes + 1] * x2 - (a1 * x2 - a2 * x1),
-        x1 + errors[scale + 1] * x1 + errors[axes + 2] * x2 - (a2 * x0 - a0 * x2),
-        x2 + errors[scale + 2] * x2 - (a0 * x1 - a1 * x0),
+        x0 - c0 + 0.5 * (a1 * c2 - a2 * c1),
+        x1 - c1 + 0.5 * (a2 * c0 - a0 * c2),
+        x2 - c2 + 0.5 * (a0 * c1 - a1 * c0),
     )
+
+
+@kernel
+def distort(errors: Array, sensor: int, x0: float, x1: float, x2: float) -> tuple[float, float, float]:
+    """What a sensor without bias, 0 the gyroscope and 1 the accelerometer, makes of an ideal reading."""
+    scale, axes = (ACCELEROMETER_SCALE, ACCELEROMETER_AXES) if sensor else (GYROSCOPE_SCALE, GYROSCOPE_AXES)
+    y0, y1, y2 = _turned_back(errors, x0, x1, x2)
+    return (
+        y0 + errors[scale] * y0 + errors[axes] * y1 + errors[axes + 1] * y2,
+        y1 + errors[scale + 1] * y1 + errors[axes + 2] * y2,
+        y2 + errors[scale + 2] * y2,
+    )
+
+
+def error_matrix(errors: Array, sensor: int) -> Array:
+    """The matrix (3, 3) of `distort`."""
+    return np.array([distort(errors, sensor, *axis) for axis in np.eye(3)]).T
 
 
 @kernel
 def _distort_jacobian(errors: Array, jacobian: Array, mixed: Array) -> None:
     """Turn derivatives of ideal readings (6, 18) into those of an IMU with these errors."""
-    for first in (0, 3):
+    for sensor in range(2):
+        first = 3 * sensor
         for j in range(MOTION_STATES):
             mixed[0, j], mixed[1, j], mixed[2, j] = distort(
-                errors, first, jacobian[first, j], jacobian[first + 1, j], jacobian[first + 2, j]
+                errors, sensor, jacobian[first, j], jacobian[first + 1, j], jacobian[first + 2, j]
             )
         for i in range(3):
             for j in range(MOTION_STATES):
@@ -338,23 +361,28 @@ def _distort_jacobian(errors: Array, jacobian: Array, mixed: Array) -> None:
 
 
 @kernel
-def error_gradient(predicted: Array, m: int, gradient: Array) -> None:
-    """Write the derivative (21,) of reading `m`, 0-5, of an IMU by its errors; `predicted` (6,) is what an ideal one reads."""
+def error_gradient(errors: Array, ideal: Array, m: int, gradient: Array) -> None:
+    """Write the derivative (21,) of reading `m`, 0-5, of an IMU by its errors; `ideal` (6,) is what an ideal one reads."""
     gradient[:] = 0.0
-    rate = m < 3
-    i = m if rate else m - 3
-    first = 0 if rate else 3
-    x = predicted[first : first + 3]
-    scale, axes = (GYROSCOPE_SCALE, GYROSCOPE_AXES) if rate else (ACCELEROMETER_SCALE, ACCELEROMETER_AXES)
+    sensor, i = m // 3, m % 3
+    first = 3 * sensor
+    scale, axes = (ACCELEROMETER_SCALE, ACCELEROMETER_AXES) if sensor else (GYROSCOPE_SCALE, GYROSCOPE_AXES)
+    y0, y1, y2 = _turned_back(errors, ideal[first], ideal[first + 1], ideal[first + 2])
+    m0 = m1 = m2 = 0.0
     gradient[first + i] = 1.0
-    gradient[scale + i] = x[i]
-    # -alignment x ideal = skew(ideal) alignment
-    gradient[ALIGNMENT + (i + 1) % 3] = -x[(i + 2) % 3]
-    gradient[ALIGNMENT + (i + 2) % 3] = x[(i + 1) % 3]
     if i == 0:
-        gradient[axes], gradient[axes + 1] = x[1], x[2]
+        gradient[scale], gradient[axes], gradient[axes + 1] = y0, y1, y2
+        m0, m1, m2 = 1.0 + errors[scale], errors[axes], errors[axes + 1]
     elif i == 1:
-        gradient[axes + 2] = x[2]
+        gradient[scale + 1], gradient[axes + 2] = y1, y2
+        m1, m2 = 1.0 + errors[scale + 1], errors[axes + 2]
+    else:
+        gradient[scale + 2] = y2
+        m2 = 1.0 + errors[scale + 2]
+    # A further turn of the alignment adds skew(y) of it, before scale and axes.
+    gradient[ALIGNMENT] = m1 * y2 - m2 * y1
+    gradient[ALIGNMENT + 1] = m2 * y0 - m0 * y2
+    gradient[ALIGNMENT + 2] = m0 * y1 - m1 * y0
 
 
 @kernel
@@ -364,13 +392,13 @@ def _take(parameters: Record, state: Record, row: int) -> None:
     k, m = row // READINGS, row % READINGS
     if f.sample_used[k] == 0:
         return
-    first = 0 if m < 3 else 3
+    sensor = m // 3
     states, start = MOTION_STATES + IMU_COUNT * p.errors, MOTION_STATES + k * p.errors
     h, gain, change, c = f.jacobian[k, m], f.gain, f.change, f.covariance
     x = f.predicted[k]
-    expected = distort(f.errors[k], first, x[first], x[first + 1], x[first + 2])
-    innovation = f.sample[k, m] - expected[m - first] - f.errors[k, m]
-    variance = p.variance[0 if m < 3 else 1] / f.sample_used[k]
+    expected = distort(f.errors[k], sensor, x[3 * sensor], x[3 * sensor + 1], x[3 * sensor + 2])
+    innovation = f.sample[k, m] - expected[m % 3] - f.errors[k, m]
+    variance = p.variance[sensor] / f.sample_used[k]
     for i in range(states):
         gain[i] = 0.0
     for j in range(MOTION_STATES):
@@ -378,7 +406,7 @@ def _take(parameters: Record, state: Record, row: int) -> None:
         innovation -= weight * change[j]
         for i in range(states):
             gain[i] += weight * c[j, i]
-    error_gradient(x, m, f.gradient)
+    error_gradient(f.errors[k], f.smooth_predicted[k], m, f.gradient)
     for j in range(p.errors):
         weight = f.gradient[j]
         if weight != 0.0:

@@ -10,11 +10,12 @@ axes of {1}), velocity, angular velocity, acceleration and angular acceleration.
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from controller.leg_filter import predict_measurement
 from plant.compiled import Record, kernel
 from plant.mechanism import LEGS, Mechanism
-from plant.pose import Array
+from plant.pose import Array, rotation_from_vector
 from plant.variables import PLATFORM_IMU
 
 MOTION_STATES = 18
@@ -53,15 +54,23 @@ READINGS_SCRATCH = np.dtype(
 )
 
 
-def sensor_geometry(mechanism: Mechanism) -> Record:
-    """What the readings depend on, dtype `SENSOR_GEOMETRY`, of a mechanism with plant data."""
+def sensor_geometry(mechanism: Mechanism, tilt: ArrayLike = (0.0, 0.0), joints: Array | None = None) -> Record:
+    """What the readings depend on, dtype `SENSOR_GEOMETRY`.
+
+    Args:
+        mechanism: with plant data.
+        tilt: (2,) [rad], by which the vertical is turned about the axes x and y of {1}.
+        joints: (2, 6, 3) [m], what is added to base and platform joints.
+    """
     plant = mechanism.plant_parameters()
+    up = rotation_from_vector([*np.asarray(tilt), 0.0]) @ mechanism.up_in_base
+    moved = np.zeros((2, LEGS, 3)) if joints is None else joints
     values = {
-        "base_joints": mechanism.base_joints,
-        "platform_joints": mechanism.platform_joints,
+        "base_joints": mechanism.base_joints + moved[0],
+        "platform_joints": mechanism.platform_joints + moved[1],
         "joint_rotations": mechanism.joint_rotations,
-        "up_in_joint": np.swapaxes(mechanism.joint_rotations, 1, 2) @ mechanism.up_in_base,
-        "up_in_base": mechanism.up_in_base,
+        "up_in_joint": np.swapaxes(mechanism.joint_rotations, 1, 2) @ up,
+        "up_in_base": up,
         "leg_imu_position": plant["leg_imu_position"],
         "platform_imu_position": plant["platform_imu_position"],
         "gravity": float(np.linalg.norm(plant["gravity"])),

@@ -2,10 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from controller.inverse_kinematics import leg_lengths, sample_workspace
 from plant.errors import InputError, UnknownNameError
 from plant.mechanism import Mechanism
 from plant.pose import (
@@ -23,6 +25,12 @@ SAMPLE_PERIOD_S = 0.01
 MARGIN_S = 0.1
 """How far a target goes on beyond the duration, for whoever looks ahead."""
 
+REST_S = 2.5
+"""How long each pose of `rests` stands, the way to it included."""
+
+_REST_CHOICE = 2000
+_SHAKING_HZ = 0.8
+_SHAKING_SHARE = 0.85
 _FADE_S = 1.0
 _STEP_S = 2.0
 
@@ -107,11 +115,13 @@ def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float)
         InputError: the file is malformed, not finite, out of order, or its quaternions are off unit by more than 1e-3.
     """
     check_duration(duration)
-    if str(name_or_path) in MOTIONS:
+    if str(name_or_path) in (*MOTIONS, *_WIDE_MOTIONS):
         return _named_motion(str(name_or_path), mechanism, duration)
     path = Path(name_or_path)
     if not path.is_file():
-        raise UnknownNameError(f"no target {str(name_or_path)!r}: neither a motion ({', '.join(MOTIONS)}) nor a CSV file")
+        raise UnknownNameError(
+            f"no target {str(name_or_path)!r}: neither a motion ({', '.join((*MOTIONS, *_WIDE_MOTIONS))}) nor a CSV file"
+        )
     return _cut(_read_csv(path, mechanism), duration)
 
 
@@ -163,6 +173,8 @@ def _cut(target: Target, duration: float) -> Target:
 
 
 def _named_motion(name: str, mechanism: Mechanism, duration: float) -> Target:
+    if name in _WIDE_MOTIONS:
+        return _WIDE_MOTIONS[name](mechanism, duration)
     home = mechanism.require_home()
     held = name == "steps"
     period = _STEP_S if held else SAMPLE_PERIOD_S
@@ -205,6 +217,67 @@ def _steps(times: Array) -> Array:
         poses[axis + 1, axis] = size
     return poses[np.arange(len(times)) % len(poses)]
 
+
+def rests(mechanism: Mechanism, duration: float, share: float = 0.8) -> Target:
+    """Poses to rest at for `REST_S` each, home first, as different as this share of the strokes allows."""
+    limits, home = mechanism.require_limits(), mechanism.require_home()
+    lengths = leg_lengths(mechanism, home.position, home.rotation)
+    positions, rotations = sample_workspace(mechanism, _REST_CHOICE, seed=0)
+    drawn = leg_lengths(mechanism, positions, rotations)
+    middle, half = limits.stroke.mean(axis=1), 0.5 * (limits.stroke[:, 1] - limits.stroke[:, 0])
+    inside = (np.abs(drawn - middle) <= share * half).all(axis=1)
+    positions, rotations, drawn = positions[inside], rotations[inside], drawn[inside]
+    if not len(drawn):
+        raise InputError(f"the workspace of {mechanism.name!r} has no poses within {share:g} of the strokes")
+    # Each is the one that is farthest from all before.
+    chosen: list[int] = []
+    away = np.linalg.norm(drawn - lengths, axis=1)
+    for _ in range(int(np.ceil(duration / REST_S))):
+        chosen.append(int(away.argmax()))
+        away = np.minimum(away, np.linalg.norm(drawn - drawn[chosen[-1]], axis=1))
+    times = REST_S * np.arange(len(chosen) + 1)
+    return Target(
+        "rests",
+        times,
+        np.concatenate([home.position[None], positions[chosen]]),
+        np.concatenate([home.rotation[None], rotations[chosen]]),
+        held=True,
+    )
+
+
+def shaking(mechanism: Mechanism, duration: float) -> Target:
+    """Sines about home on all axes at once, about 0.8 Hz and a few percent apart, as wide as the limits allow."""
+    limits, home = mechanism.require_limits(), mechanism.require_home()
+    times = np.arange(0.0, duration + MARGIN_S + SAMPLE_PERIOD_S, SAMPLE_PERIOD_S)
+    spread = float(np.linalg.norm(mechanism.platform_joints, axis=1).mean())
+    frequencies = _SHAKING_HZ * (1.0 + 0.04 * (np.arange(6.0) - 2.5))
+    shape = np.sin(2.0 * np.pi * frequencies * times[:, None]) * _fade(times) * np.repeat([1.0, 1.0 / spread], 3)
+
+    def at(size: float) -> tuple[Array, Array]:
+        turned = np.array([rotation_from_vector(size * vector) @ home.rotation for vector in shape[:, 3:]])
+        return home.position + size * shape[:, :3], turned
+
+    low, high = 0.0, spread
+    for _ in range(20):
+        size = 0.5 * (low + high)
+        lengths = leg_lengths(mechanism, *at(size))
+        middle, half = limits.stroke.mean(axis=1), 0.5 * (limits.stroke[:, 1] - limits.stroke[:, 0])
+        rates = np.gradient(lengths, SAMPLE_PERIOD_S, axis=0)
+        use = max(
+            float((np.abs(lengths - middle) / half).max()),
+            float(np.abs(rates).max()) / limits.velocity,
+            float(np.abs(np.gradient(rates, SAMPLE_PERIOD_S, axis=0)).max()) / limits.acceleration,
+        )
+        low, high = (size, high) if use < _SHAKING_SHARE else (low, size)
+    return Target("shaking", times, *at(low))
+
+
+_WIDE_MOTIONS: dict[str, Callable[[Mechanism, float], Target]] = {
+    "near-rests": partial(rests, share=0.4),
+    "rests": rests,
+    "shaking": shaking,
+}
+"""Motions for the calibration, fitted to the limits of the mechanism."""
 
 MOTIONS: dict[str, Callable[[Array], Array]] = {"hold": _hold, "circle": _circle, "sines": _sines, "steps": _steps}
 """Displacements from home (N, 6), position [m] and rotation vector [rad], at times (N,) [s]."""

@@ -45,6 +45,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_simulate(commands)
     _add_run(commands)
     _add_replay(commands)
+    _add_calibrate(commands)
     _add_tune(commands)
     _add_fmu(commands)
     _add_bench(commands)
@@ -119,6 +120,28 @@ def _add_replay(commands: Any) -> None:
     command.add_argument("files", type=Path, nargs="+", metavar="FILE.mcap", help="of one run, in their order")
     _add_json(command)
     command.set_defaults(run=_replay)
+
+
+def _add_calibrate(commands: Any) -> None:
+    command = commands.add_parser("calibrate", help="find the IMUs' errors", description="Find the IMUs' errors.")
+    actions = command.add_subparsers(required=True, metavar="ACTION", parser_class=_Parser)
+    rig = actions.add_parser(
+        "rig",
+        help="on the mechanism, from its redundancy",
+        description="Calibrate the IMUs on the mechanism: it rests at wide poses, which need not be known, and shakes for "
+        "40 s. Writes bias, scale, axes and mounting of every sensor, with their covariance.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    rig.add_argument("output", type=Path, metavar="FILE.toml", help="the calibration to write")
+    rig.add_argument("--mechanism", default="hexapod", help="preset, or a TOML file")
+    rig.add_argument("--rate", type=float, default=1000.0, help="cycles per second [Hz]")
+    rig.add_argument("--imu", default="mpu9150", help="ideal, mpu9150, mpu9150-calibrated or icm42688")
+    rig.add_argument("--seed", type=int, default=0, help="of the IMUs' imperfections")
+    rig.add_argument("--home", action="store_true", help="the rig stands exactly at home when it begins")
+    rig.add_argument("--tilt", type=float, default=0.05, help="by how much the base may be off level [deg]")
+    rig.add_argument("--plant", metavar="FILE.fmu", help="FMI 3.0 Co-Simulation FMU to use instead of the built one")
+    _add_json(rig)
+    rig.set_defaults(run=_calibrate_rig)
 
 
 def _add_tune(commands: Any) -> None:
@@ -241,6 +264,48 @@ def _imus(text: str) -> tuple[int, ...]:
         return tuple(sorted({int(part) for part in text.split(",")}))
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is neither all, legs, nor a list of numbers such as 0,2,4,6") from None
+
+
+def _calibrate_rig(options: argparse.Namespace) -> int:
+    from math import radians
+
+    from controller.calibration import save_calibration
+    from controller.self_calibration import Prior
+    from hil.rig_calibration import calibrate_rig
+    from hil.simulation import SimulationConfig
+
+    _check_writable(options.output, options.json)
+    if not 0.0 < options.tilt < 45.0:
+        raise InputError(f"--tilt is {options.tilt:g} deg; it must be between 0 and 45")
+    config = SimulationConfig(**{name: getattr(options, name) for name in ("mechanism", "rate", "imu", "seed", "plant")})
+    with _progress(f"{config.mechanism} calibrates its IMUs") as progress:
+        result = calibrate_rig(config, Prior(tilt=radians(options.tilt)), options.home, progress)
+    save_calibration(options.output, result.calibration)
+    _write_json(options.json, result.summary)
+    _print_rig_calibration(result.summary)
+    print(f"written to {options.output}")
+    return 0
+
+
+def _print_rig_calibration(summary: dict[str, Any]) -> None:
+    names = {"before": "as they are", "rests": "calibrated at rest", "motion": "and in motion"}
+    table = _table(f"{summary['rests']} poses at rest", "residual [mg]", "predicted [mm]", "[deg]", "true [mm]", "[deg]")
+    for name, label in names.items():
+        cells = [f"{summary['residual_mg'][name]:.3f}"]
+        for kind in ("predicted", "true"):
+            errors = summary[kind].get(name)
+            cells += ["", ""] if errors is None else [_mm(errors["position_rms"]), _deg(errors["rotation_rms"])]
+        table.add_row(label, *cells)
+    _print(table)
+    print(f"the pose is known least {summary['weakest']}")
+
+
+def _mm(metres: float) -> str:
+    return f"{1e3 * metres:.3f}"
+
+
+def _deg(angle: float) -> str:
+    return f"{57.29577951308232 * angle:.3f}"
 
 
 def _simulate(options: argparse.Namespace) -> int:

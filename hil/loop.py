@@ -58,7 +58,7 @@ _FAILURES = {
         "the estimated pose needs a leg far outside its stroke: the IMUs' errors are larger than the filters assume "
         "(raw ones need a calibration)"
     ),
-    POSE_LOST: "the estimated leg directions no longer determine a pose",
+    POSE_LOST: "the IMUs that can be used no longer determine the pose",
     NOT_FINITE: "an estimate or a command is no longer finite",
     CLOCK_FAILED: "this machine's clock refuses to wake the loop",
 }

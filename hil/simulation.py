@@ -56,6 +56,7 @@ class SimulationConfig:
         seed: of the imperfections.
         fusion: a key of `FUSIONS`.
         calibration: file with the IMUs' constants; without one their readings are taken as they are.
+        hold: how long the brakes hold first [s]; None for what the mechanism's settings say.
         plant: an FMU to use instead of the one that gough builds.
         imus: which IMUs there are, 0-5 on the legs and 6 on the platform.
     """
@@ -68,6 +69,7 @@ class SimulationConfig:
     seed: int = 0
     fusion: str = "compiled"
     calibration: str | None = None
+    hold: float | None = None
     plant: str | None = None
     imus: tuple[int, ...] = ALL_IMUS
 
@@ -221,7 +223,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
     period = 1.0 / config.rate
     model = load_imu(config.imu)
     imu = imu_state(model, config.seed, period)
-    control = control_settings(mechanism)
+    control = control_settings(mechanism, **({} if config.hold is None else {"hold": config.hold}))
     if not HOLD_RANGE_S[0] <= control.hold <= HOLD_RANGE_S[1]:
         raise InputError(f"hold is {control.hold:g} s; the estimate settles in {HOLD_RANGE_S[0]:g} to {HOLD_RANGE_S[1]:g} s")
     calibration = None if config.calibration is None else load_calibration(config.calibration)

@@ -27,7 +27,13 @@ def of_true_errors(imu, random):
     gain = np.linalg.inv(imu["gain"])
     offset = -(gain @ imu["offset"][..., None])[..., 0]
     root = random.normal(size=(7 * ERRORS, 7 * ERRORS)) * 10.0 ** random.uniform(-6.0, 0.0, 7 * ERRORS)[:, None]
-    return Calibration(gain, offset, root @ root.T, {"date": "2026-11-21", "residuals": [0.1, 0.2], "poses_known": False})
+    return Calibration(
+        gain,
+        offset,
+        np.array([0.01, -0.02]),
+        root @ root.T,
+        {"date": "2026-11-21", "residuals": [0.1, 0.2], "poses_known": False},
+    )
 
 
 @given(scale=numbers(0.5, 2.0), axes=numbers(-0.3, 0.3), mounting=numbers(-1.5, 1.5))
@@ -63,6 +69,7 @@ def test_it_is_the_inverse_of_the_imperfections(tmp_path):
     scale = np.sqrt(np.diag(calibration.covariance))
     np.testing.assert_allclose((again.covariance - calibration.covariance) / np.outer(scale, scale), 0.0, atol=1e-4)
     assert again.about == calibration.about
+    np.testing.assert_array_equal(again.tilt, calibration.tilt)
     # What was measured by two, one after the other.
     gain, offset = np.tile(rotation_of([0.1, 0.0, 0.2]), (3, 7, 1, 1)), random.normal(size=(3, 7, 3))
     np.testing.assert_allclose(
@@ -74,7 +81,7 @@ def test_the_cycle_applies_it(hexapod):
     """With raw IMUs and their calibration the pose at rest is as with ideal ones."""
     imu = imu_state(replace(load_imu("mpu9150"), magnetometer_rate=1000.0), 5, 1e-3)
     imu["noise"], imu["resolution"], imu["smoothing"] = 0.0, 0.0, (0.0, 1.0)
-    calibration = of_true_errors(imu, np.random.default_rng(5))
+    calibration = replace(of_true_errors(imu, np.random.default_rng(5)), tilt=np.zeros(2))
     position, rotation = hexapod.home.position + [0.01, -0.02, 0.01], rotation_of([0.1, 0.05, -0.1])
     raw, segments = np.zeros((3, 7, 3)), np.zeros((6, 1, 5))
     segments[:, 0, 1] = 0.4
