@@ -9,7 +9,7 @@ from plant.errors import InputError
 from plant.imu import STANDARD_GRAVITY, ImuModel
 from plant.mechanism import Mechanism
 
-_ENDLESS = 1e12
+_ENDLESS = 1e300
 
 S = TypeVar("S", "ControlSettings", "FusionSettings")
 

@@ -5,7 +5,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
@@ -15,6 +15,12 @@ from plant.files import check_writable, write_whole
 
 REFUSED, INTERRUPTED = 2, 130
 """Exit statuses beside 0, and 1 for a run that ended before its time: bad input, with nothing done; Ctrl-C."""
+
+
+class OutputError(GoughError, OSError):
+    """Something was done, but not all of what it gave could be written."""
+
+    exit_status = 1
 
 
 class _Parser(argparse.ArgumentParser):
@@ -29,9 +35,17 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         status: int = options.run(options)
+        sys.stdout.flush()
     except GoughError as error:
-        print(f"gough: {error}", file=sys.stderr)
+        with suppress(OSError):
+            print(f"gough: {error}", file=sys.stderr)
         return getattr(error, "exit_status", REFUSED)
+    except OSError as error:
+        # Whoever reads the output has gone, or its disk is full; nothing more is to be flushed there.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        with suppress(OSError):
+            print(f"gough: the output cannot be written: {error.strerror}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("gough: interrupted", file=sys.stderr)
         return INTERRUPTED
@@ -375,10 +389,19 @@ def _run(options: argparse.Namespace) -> int:
             if error.summary is None:
                 raise
             summary = error.summary
+    trouble = None
+    try:
+        _print_run(summary)
+    except OSError as error:
+        trouble = error
     _write_json(options.json, summary)
-    _print_run(summary)
     if stopped:
         raise stopped
+    if trouble:
+        raise trouble
+    lost = summary["recording"]["lost"]
+    if lost:
+        raise OutputError(f"the run went to its end, but {lost} of {summary['cycles']} cycles are not recorded")
     return 0
 
 
@@ -406,7 +429,9 @@ def _print_run(summary: dict[str, Any]) -> None:
     if summary["unseen"]:
         print(f"{summary['unseen']} cycles are in none of these figures: the supervisor came too late")
     if summary["recording"]["files"]:
-        print(f"recorded in {', '.join(summary['recording']['files'])}; {summary['recording']['lost']} cycles lost")
+        kept = summary["cycles"] - summary["recording"]["lost"]
+        files = ", ".join(summary["recording"]["files"])
+        print(f"{kept} cycles recorded in {files}; {summary['recording']['lost']} cycles lost")
     print(f"stopped on the brakes: {summary['cause']}")
 
 
@@ -435,8 +460,19 @@ def _live_view(mechanism: str, target: str, rate: float) -> Iterator[Callable[[A
     if not sys.stderr.isatty():
         yield lambda progress: None
         return
-    with Live(console=Console(stderr=True), auto_refresh=False, transient=True) as live:
-        yield lambda progress: live.update(_view(mechanism, target, rate, progress), refresh=True)
+    live = Live(console=Console(stderr=True), auto_refresh=False, transient=True)
+
+    def show(progress: Any) -> None:
+        # A terminal that has gone is no reason to end a motion.
+        with suppress(OSError):
+            live.update(_view(mechanism, target, rate, progress), refresh=True)
+
+    live.start()
+    try:
+        yield show
+    finally:
+        with suppress(OSError):
+            live.stop()
 
 
 def _view(mechanism: str, target: str, rate: float, progress: Any) -> Any:

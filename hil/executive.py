@@ -9,6 +9,7 @@ recorder dies, another takes over with a file of its own; when the supervisor di
 
 import contextlib
 import errno
+import fcntl
 import multiprocessing
 import os
 import shutil
@@ -35,6 +36,7 @@ from hil.loop import (
     HEAD,
     KEPT,
     LINK,
+    MISSED_PERIODS,
     RECORD,
     RIG_FAILED,
     STOP,
@@ -58,6 +60,7 @@ _BUFFER_S = 8.0
 _LEAST_RECORDS = 1024
 _LOOK_S = 0.1
 _PATIENCE_S = 10.0
+_LEAST_FREE = 8 * 2**20
 _MOST_RECORDERS = 10
 _BLOCKED = (
     signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU,
@@ -143,14 +146,13 @@ def run(
         GoughError: something in the configuration or the settings cannot be used; nothing has run then.
         RunStoppedError: the run ended on the brakes before its time, or its process died.
     """
-    _check_recording(recording)
     records = shared_array(max(_LEAST_RECORDS, round(_BUFFER_S * config.rate)), RECORD)
     link: NDArray[np.int64] = shared_array(LINK, np.dtype(np.int64))
     link[SUPERVISOR] = os.getpid()
     progress = Progress()
     ours, theirs = _FORK.Pipe()
-    with _asked_to_stop(link), contextlib.ExitStack() as at_end:
-        recorders = _Recorders(recording, records, link, ours, progress.events)
+    recorders = _Recorders(recording, records, link, ours, progress.events)
+    with _asked_to_stop(link), _claimed(recording), _told(progress, recorders), contextlib.ExitStack() as at_end:
         at_end.callback(recorders.finish)
         loop = _FORK.Process(target=_loop_process, args=(theirs, ours, config, settings, rig, records, link))
         loop.start()
@@ -188,9 +190,45 @@ def run(
     return summary
 
 
-def _check_recording(path: Path | None) -> None:
-    if path is not None and path.exists() and not path.is_file():
+@contextmanager
+def _claimed(path: Path | None) -> Iterator[None]:
+    """Keep a recording's file for this run, after checking that it can be written."""
+    if path is None:
+        yield
+        return
+    if path.exists() and not path.is_file():
         raise InputError(f"{path} is no file: name another for the recording")
+    fresh = not path.exists()
+    try:
+        file = path.open("ab")
+    except OSError as error:
+        raise InputError(f"cannot record to {path}: {error.strerror}: name another file") from None
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"{path} is being recorded to by another run: name another file") from None
+        free = shutil.disk_usage(path.resolve().parent).free
+        try:
+            if free < _LEAST_FREE:
+                raise InputError(
+                    f"cannot record to {path}: {free / 2**20:.3g} MiB are free there, and {_LEAST_FREE / 2**20:g} MiB are "
+                    "needed to begin: make room, or name another file"
+                )
+            yield
+        finally:
+            if fresh and not path.stat().st_size:
+                path.unlink()
+
+
+@contextmanager
+def _told(progress: Progress, recorders: "_Recorders") -> Iterator[None]:
+    """When the loop's process has died, tell with it what else is known of the run."""
+    try:
+        yield
+    except RunStoppedError as error:
+        files = [f"recorded in {', '.join(map(str, recorders.files))}"] if recorders.files else []
+        raise RunStoppedError("; ".join([str(error), *progress.events, *files])) from None
 
 
 @contextmanager
@@ -297,6 +335,8 @@ def _prepare_and_follow(
             reason = str(loop.plant.failure("the plant failed"))
         else:
             reason = describe_status(status)
+        if status != STOPPED and loop.state["stopping"] == MISSED_PERIODS:
+            reason = f"{STOP_CAUSES[MISSED_PERIODS]}, and then: {reason}"
         pipe.send(
             {
                 "status": status,

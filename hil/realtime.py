@@ -77,6 +77,10 @@ def real_time(settings: RealTimeSettings) -> Iterator[list[str]]:
     """
     refused = []
     with contextlib.ExitStack() as restore:
+        # Before the priority is taken: another loop on this processor would have to wait for it.
+        gc.collect()
+        gc.disable()
+        restore.callback(gc.enable)
         for measure, what, take, remedy in (
             ("memory", "locked memory", _lock_memory, "run as root, or raise the limit 'memlock' in /etc/security/limits.conf"),
             (
@@ -106,9 +110,6 @@ def real_time(settings: RealTimeSettings) -> Iterator[list[str]]:
                 refused.append(f"{what}: {os.strerror(error.errno or 0)}: {remedy}")
         if refused and settings.strict:
             raise RefusedError(f"this machine refuses {'; '.join(refused)}; or run without --strict")
-        gc.collect()
-        gc.disable()
-        restore.callback(gc.enable)
         yield refused
 
 

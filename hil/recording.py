@@ -22,7 +22,7 @@ from mcap.writer import Writer
 from numpy.typing import NDArray
 
 from controller.cycle import OK
-from hil.loop import DONE, HEAD, KEPT, NO_STOP, RECORD, STAGES, START, STOP_CAUSES, TAIL, describe_status
+from hil.loop import DONE, HEAD, KEPT, NO_STOP, RECORD, STAGES, START, STOP_CAUSES, SUPERVISOR, TAIL, describe_status
 from plant.compiled import Record
 from plant.errors import GoughError
 from plant.variables import IMU_COUNT
@@ -183,7 +183,7 @@ def take(records: Record, link: NDArray[np.int64], tail: int) -> tuple[Record, i
 
 def record(path: Path, header: Mapping[str, Any], records: Record, link: NDArray[np.int64]) -> None:
     """Take the loop's records to a file until it is done; the body of the recorder's process."""
-    supervisor = os.getppid()
+    supervisor = int(link[SUPERVISOR])
     while not link[HEAD] and not link[DONE]:
         time.sleep(_POLL_S)
         if os.getppid() != supervisor:
@@ -277,6 +277,10 @@ def read(path: Path | str) -> Recording:
         raise RecordingError(f"there is no recording at {path}") from None
     except IsADirectoryError:
         raise RecordingError(f"{path} is a folder, no recording") from None
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror}") from None
+    except MemoryError:
+        raise
     except Exception:
         # Whatever the decoder says of what follows the last chunk that is whole.
         complete = False

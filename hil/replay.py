@@ -71,6 +71,9 @@ def replay(paths: Sequence[Path | str]) -> Replay:
         RecordingError: not a recording, one of another version whose cycle has other parameters, or files of different runs.
     """
     recordings = [read(path) for path in paths]
+    if len(recordings) > 1 and all(len(each.records) for each in recordings):
+        order = sorted(range(len(recordings)), key=lambda i: int(recordings[i].records["cycle"][0]))
+        paths, recordings = [paths[i] for i in order], [recordings[i] for i in order]
     first = recordings[0]
     for path, each in zip(paths, recordings, strict=True):
         if {"parameters", "reference"} - set(each.arrays):

@@ -155,19 +155,20 @@ class Twin:
         self.predict(time - self.time)
         self.time = time
         scratch, ideal, at_smooth = np.zeros((), READINGS_SCRATCH), np.zeros((7, 6)), np.zeros((7, 6, MOTION_STATES))
-        predict_readings(self.geometry, self.position, self.rotation, self.smooth, True, ideal, at_smooth, scratch[()])
+        smooth = np.zeros((7, 6))
+        predict_readings(self.geometry, self.position, self.rotation, self.smooth, True, smooth, at_smooth, scratch[()])
         predict_readings(self.geometry, self.position, self.rotation, self.motion, False, ideal, at_smooth.copy(), scratch[()])
         rows, innovations, variances = [], [], []
         for k in np.flatnonzero(used):
             matrices, back = self.matrices(self.errors[k])
             for sensor, matrix in enumerate(matrices):
                 part = slice(3 * sensor, 3 * sensor + 3)
-                x = back @ ideal[k, part]
+                x, y = back @ ideal[k, part], back @ smooth[k, part]
                 by_errors = np.zeros((3, ERRORS))
                 by_errors[:, part] = np.eye(3)
-                by_errors[:, (9, 6)[sensor] : (9, 6)[sensor] + 3] = np.diag(x)
-                by_errors[:, 12:15] = matrix @ skew(x)
-                by_errors[:, (18, 15)[sensor] : (18, 15)[sensor] + 3] = [[x[1], x[2], 0.0], [0.0, 0.0, x[2]], [0.0, 0.0, 0.0]]
+                by_errors[:, (9, 6)[sensor] : (9, 6)[sensor] + 3] = np.diag(y)
+                by_errors[:, 12:15] = matrix @ skew(y)
+                by_errors[:, (18, 15)[sensor] : (18, 15)[sensor] + 3] = [[y[1], y[2], 0.0], [0.0, 0.0, y[2]], [0.0, 0.0, 0.0]]
                 row = np.zeros((3, len(self.covariance)))
                 row[:, :18] = matrix @ back @ at_smooth[k, part]
                 row[:, 18 + k * self.n : 18 + (k + 1) * self.n] = by_errors[:, : self.n]

@@ -492,7 +492,7 @@ def test_a_signal_before_the_start_ends_it_at_once():
 def test_a_recorder_killed_at_once_costs_nothing(tmp_path):
     path, figures = tmp_path / "run.mcap", tmp_path / "run.json"
     process = gough("run", "--duration", 1.5, "--rate", 500, "--most-missed", 2000, "--record", path, "--json", figures)
-    wait_for(path.exists)
+    wait_for(lambda: path.exists() and path.stat().st_size)
     os.kill(children(process.pid)[1], signal.SIGKILL)
     _, errors = process.communicate(timeout=60.0)
     assert process.returncode == 0, errors
@@ -509,7 +509,8 @@ def test_cycles_that_a_stopped_recorder_missed_are_counted(tmp_path):
     time.sleep(0.1)
     process.send_signal(signal.SIGTERM)
     output, errors = process.communicate(timeout=60.0)
-    assert process.returncode == 0, errors
+    assert process.returncode == 1
+    assert "cycles are not recorded" in errors
     summary = json.loads(figures.read_text())
     assert 0 < summary["recording"]["lost"] == summary["cycles"] - len(read(path).records)
     assert f"{summary['recording']['lost']} cycles lost" in output
@@ -523,7 +524,44 @@ def test_a_loop_that_does_not_answer_is_ended(tmp_path):
     _, errors = process.communicate(timeout=60.0)
     assert process.returncode == 1
     assert "the loop's process has died (exit code -9)" in errors
+    assert "the loop has not answered for 10 s and was killed" in errors
+    assert f"recorded in {tmp_path / 'run.mcap'}" in errors
     assert gone(loop, recorder)
+
+
+def test_a_file_that_another_run_records_to_is_refused(tmp_path):
+    path = tmp_path / "run.mcap"
+    process, loop, recorder = started(path)
+    second = gough("run", "--duration", 1, "--record", path)
+    assert "is being recorded to by another run: name another file" in second.communicate(timeout=60.0)[1]
+    assert second.returncode == 2
+    process.send_signal(signal.SIGTERM)
+    assert process.communicate(timeout=60.0) and process.returncode == 0
+    assert len(read(path).records)
+    assert gone(loop, recorder)
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_anything_moves():
+    process = gough("run", "--duration", 1, "--record", "/proc/run.mcap")
+    errors = process.communicate(timeout=60.0)[1]
+    assert "/proc" in errors
+    assert errors.count("\n") == 1
+    assert process.returncode == 2
+
+
+def test_a_disk_without_room_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("hil.executive._LEAST_FREE", 2**60)
+    with pytest.raises(InputError, match=r"MiB are free there, and .* MiB are needed to begin: make room"):
+        run(SimulationConfig(duration=0.5), RealTimeSettings(), tmp_path / "run.mcap")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_terminal_that_has_gone_and_a_full_output_are_told_in_a_line():
+    command = [sys.executable, "-m", "hil.command_line", "tune"]
+    with Path("/dev/full").open("w") as full:
+        process = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=120.0)
+    assert process.returncode == 1
+    assert process.stderr == "gough: the output cannot be written: No space left on device\n"
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
@@ -548,11 +586,13 @@ def test_a_recording_that_cannot_go_on_is_told_in_a_line_and_the_run_goes_on(tmp
     arguments = ["run", "--duration", "2", "--rate", "500", "--most-missed", "2000", "--record", str(path)]
     command = [sys.executable, "-c", LIMITED, *arguments]
     process = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60.0)
-    assert process.returncode == 0, process.stderr
+    assert process.returncode == 1
+    assert "cycles are not recorded" in process.stderr
     assert "cannot be written: File too large: the rest is not recorded" in process.stdout
     assert "Traceback" not in process.stderr
     assert [each.name for each in tmp_path.iterdir()] == ["run.mcap"]
     assert int(process.stdout.partition("recorded in ")[2].partition("; ")[2].split()[0]) > 100
+    assert int(process.stdout.partition(" cycles recorded in ")[0].splitlines()[-1]) > 0
 
 
 class Raising(FmuRig):
