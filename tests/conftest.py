@@ -8,6 +8,10 @@ from hypothesis import settings
 from plant.export import default_fmu
 from plant.mechanism import Mechanism, load_mechanism
 
+# The first example of a property may compile kernels, so there is no deadline; and the same examples come every time.
+settings.register_profile("gough", deadline=None, derandomize=True)
+settings.load_profile("gough")
+
 # For `--hypothesis-profile=thorough`: tests that follow the profile's number of examples take their time.
 settings.register_profile("thorough", max_examples=10_000, deadline=None)
 

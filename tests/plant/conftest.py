@@ -5,16 +5,11 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
 from numpy.typing import ArrayLike
 
 from plant.fmu import FmuPlant
 from plant.mechanism import Mechanism
 from plant.variables import checked_parameters
-
-# The first example of a property may compile kernels, so there is no deadline; and the same examples come every time.
-settings.register_profile("gough", deadline=None, derandomize=True)
-settings.load_profile("gough")
 
 MakePlant = Callable[..., FmuPlant]
 
