@@ -549,6 +549,24 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_moves():
     assert process.returncode == 2
 
 
+def test_filters_in_python_are_refused_on_the_clock():
+    with pytest.raises(InputError, match="too slow for the clock: use them with 'gough simulate'"):
+        run(SimulationConfig(duration=0.5, fusion="filterpy"), RealTimeSettings())
+
+
+def test_the_whole_mechanism_filter_runs_on_the_clock_and_replays_bit_for_bit(tmp_path):
+    path = tmp_path / "run.mcap"
+    config = SimulationConfig(target="sines", duration=2.0, rate=500.0, fusion="whole")
+    summary = run(config, RealTimeSettings(most_missed=2000), path)
+    assert summary["cause"] == "end of the motion"
+    recorded = read(path)
+    assert recorded.records["trusted"][-1] == 1
+    assert "the whole-mechanism filter is relied upon" in [text for _, text in recorded.events]
+    again = replay([path])
+    assert again.same
+    assert again.cycles == summary["cycles"]
+
+
 def test_a_disk_without_room_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("hil.executive._LEAST_FREE", 2**60)
     with pytest.raises(InputError, match=r"MiB are free there, and .* MiB are needed to begin: make room"):
