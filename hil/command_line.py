@@ -60,6 +60,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_run(commands)
     _add_replay(commands)
     _add_calibrate(commands)
+    _add_compare(commands)
     _add_tune(commands)
     _add_fmu(commands)
     _add_bench(commands)
@@ -156,6 +157,27 @@ def _add_calibrate(commands: Any) -> None:
     rig.add_argument("--plant", metavar="FILE.fmu", help="FMI 3.0 Co-Simulation FMU to use instead of the built one")
     _add_json(rig)
     rig.set_defaults(run=_calibrate_rig)
+
+
+def _add_compare(commands: Any) -> None:
+    command = commands.add_parser(
+        "compare-fusion",
+        help="every way to fuse the IMUs on one motion",
+        description="Move the platform as prescribed, 30 mm and 10 deg along and about every axis, and compare every way to "
+        "fuse the IMUs: errors after the first 20 s, NEES (6 is consistent) and microseconds of a cycle.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("--mechanism", default="hexapod", help="preset, or a TOML file")
+    command.add_argument("--motion", default="1", help="static, mixed (0.1 to 1 Hz), or a frequency [Hz]")
+    command.add_argument("--duration", type=float, default=40.0, help="of which the first 20 s do not count [s]")
+    command.add_argument("--rate", type=float, default=1000.0, help="samples per second [Hz]")
+    command.add_argument("--imu", default="mpu9150-calibrated", help="ideal, mpu9150, mpu9150-calibrated or icm42688")
+    command.add_argument("--calibration", metavar="FILE.toml", help="the IMUs' constants, as 'gough calibrate' writes them")
+    command.add_argument(
+        "--seeds", type=_seeds, default="0,1,2,3,4,5", help="of the IMUs' imperfections, errors pooled over them"
+    )
+    _add_json(command)
+    command.set_defaults(run=_compare)
 
 
 def _add_tune(commands: Any) -> None:
@@ -280,6 +302,13 @@ def _imus(text: str) -> tuple[int, ...]:
         raise argparse.ArgumentTypeError(f"{text!r} is neither all, legs, nor a list of numbers such as 0,2,4,6") from None
 
 
+def _seeds(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers such as 0,1,2") from None
+
+
 def _calibrate_rig(options: argparse.Namespace) -> int:
     from math import radians
 
@@ -320,6 +349,24 @@ def _mm(metres: float) -> str:
 
 def _deg(angle: float) -> str:
     return f"{57.29577951308232 * angle:.3f}"
+
+
+def _compare(options: argparse.Namespace) -> int:
+    from hil.fusion_comparison import ComparisonConfig, compare
+
+    _check_writable(options.json)
+    names = ("mechanism", "motion", "duration", "rate", "imu", "calibration", "seeds")
+    config = ComparisonConfig(**{name: getattr(options, name) for name in names})
+    with _progress("every way to fuse") as progress:
+        figures = compare(config, progress)
+    _write_json(options.json, figures)
+    table = _table(f"{config.imu}, {config.motion}", "position RMS [mm]", "rotation RMS [deg]", "NEES", "us", "seeds")
+    for name, method in figures["methods"].items():
+        nees = "" if method["nees"] is None else f"{method['nees']:.1f}"
+        us = "" if method["us"] is None else f"{method['us']:.1f}"
+        table.add_row(name, _mm(method["position_rms"]), _deg(method["rotation_rms"]), nees, us, f"{method['seeds']}")
+    _print(table)
+    return 0
 
 
 def _simulate(options: argparse.Namespace) -> int:

@@ -170,7 +170,7 @@ def simulate(config: SimulationConfig, progress: Callable[[float], None] = lambd
     """
     with prepared_loop(config) as loop:
         count = len(loop.records)
-        fuse = _filterpy_legs(loop.parameters) if config.fusion == "filterpy" else None
+        fuse = filterpy_legs(loop.parameters) if config.fusion == "filterpy" else None
         status, took = OK, loop.planning_time
         chunk = max(1, round(_CHUNK_S * config.rate))
         for last in range(chunk, count + chunk, chunk):
@@ -269,7 +269,8 @@ def _result(config: SimulationConfig, loop: PreparedLoop, done: int, took: float
     )  # fmt: skip
 
 
-def _filterpy_legs(parameters: Record) -> LegFusion:
+def filterpy_legs(parameters: Record) -> LegFusion:
+    """The leg filters on filterpy, in the place of the compiled ones."""
     from controller.filterpy_fusion import FilterpyLeg
 
     legs = [

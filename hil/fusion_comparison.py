@@ -1,0 +1,319 @@
+"""Comparison of every way to fuse the IMUs on one imposed motion: errors, consistency and cost, side by side.
+
+The platform is moved as prescribed (`plant.imposed`), whatever actuators could follow; all methods get the same raw readings.
+The first twenty seconds do not count: the filters may learn.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from vqf import VQF
+
+from controller.calibration import Calibration, load_calibration
+from controller.cycle import ALL_IMUS, STATE, cycle_parameters
+from controller.direct_kinematics import solve_batch
+from controller.fusion import calibrate, find_pose, fuse_legs, fuse_mechanism, fuse_platform, improve_pose
+from controller.leg_filter import leg_direction, start_leg
+from controller.settings import control_settings, sensor_settings
+from hil.clock import now
+from hil.simulation import FUSIONS, filterpy_legs
+from plant.compiled import Record, kernel
+from plant.errors import InputError
+from plant.imposed import ImposedMotion, impose
+from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER, ImuModel, imu_state, load_imu, measure
+from plant.mechanism import LEGS, Mechanism, load_spatial
+from plant.pose import Array, vector_from_rotation
+from plant.variables import IMU_COUNT, PLATFORM_IMU
+
+LEARNING_S = 20.0
+_CLOSED, _REFINED, _WHOLE = range(3)
+
+
+@dataclass(frozen=True)
+class ComparisonConfig:
+    """What to compare on.
+
+    Attributes:
+        mechanism: preset or TOML file.
+        motion: "static", "mixed", or a frequency in Hz.
+        duration: [s], of which the first twenty seconds do not count.
+        rate: samples per second [Hz].
+        imu: preset of the imperfections.
+        calibration: file with the IMUs' constants.
+        seeds: of imperfections, motions and noise; errors are pooled over them.
+    """
+
+    mechanism: str = "hexapod"
+    motion: str = "1"
+    duration: float = 40.0
+    rate: float = 1000.0
+    imu: str = "mpu9150-calibrated"
+    calibration: str | None = None
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
+
+    def __post_init__(self) -> None:
+        if not LEARNING_S < self.duration < 3600.0:
+            raise InputError(f"the duration is {self.duration:g} s; it must be more than {LEARNING_S:g} s, which do not count")
+        if not self.seeds:
+            raise InputError("there must be a seed at least")
+
+
+@dataclass(eq=False)
+class _Errors:
+    """What a method has gathered, by seed: mean squares of position [m^2] and rotation [rad^2], NEES, cycle times [us]."""
+
+    squares: list[tuple[float, float]]
+    nees: list[float]
+    us: list[float]
+
+    def figures(self) -> dict[str, Any]:
+        position, rotation = np.sqrt(np.mean(self.squares, axis=0))
+        return {
+            "position_rms": float(position),
+            "rotation_rms": float(rotation),
+            "nees": float(np.mean(self.nees)) if self.nees else None,
+            "us": float(np.median(self.us)) if self.us else None,
+            "seeds": len(self.squares),
+        }
+
+
+def compare(config: ComparisonConfig, progress: Callable[[float], None] = lambda share: None) -> dict[str, Any]:
+    """Run every method.
+
+    Args:
+        config: what to compare on.
+        progress: called with the share that is done.
+
+    Returns:
+        `methods`: by name, `position_rms` [m], `rotation_rms` [rad], `nees` (6 is consistent; None without a covariance), `us`,
+        the median time of a cycle from raw sample to pose, and the number of `seeds`; `config` and `version`.
+
+    Raises:
+        GoughError: something in the configuration cannot be used.
+    """
+    mechanism, model = load_spatial(config.mechanism), load_imu(config.imu)
+    calibration = Calibration() if config.calibration is None else load_calibration(config.calibration)
+    errors: dict[str, _Errors] = {}
+    late = slice(round(LEARNING_S * config.rate), None)
+    for i, seed in enumerate(config.seeds):
+        motion = impose(mechanism, config.motion, config.duration, config.rate, seed)
+        readings = _Readings(mechanism, model, calibration, config.rate, seed, motion)
+        methods = {**METHODS, **(SLOW_METHODS if i == 0 else {})}
+        for k, (name, method) in enumerate(methods.items()):
+            run = method(readings)
+            each = errors.setdefault(name, _Errors([], [], []))
+            error = _pose_errors(run, motion)[late]
+            each.squares.append(
+                (float(np.mean(np.sum(error[:, :3] ** 2, axis=1))), float(np.mean(np.sum(error[:, 3:] ** 2, axis=1))))
+            )
+            if (nees := run.nees(error, late)) is not None:
+                each.nees.append(nees)
+            if run.us is not None:
+                each.us.append(run.us)
+            progress((i + (k + 1) / len(methods)) / len(config.seeds))
+    return {
+        "methods": {name: each.figures() for name, each in errors.items()},
+        "config": asdict(config),
+        "version": version("gough"),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """Poses (N, 3), (N, 3, 3), with their covariance (N, 6, 6) or its inverse, and the median time of a cycle [us], if any."""
+
+    positions: Array
+    rotations: Array
+    information: Array | None = None
+    covariance: Array | None = None
+    us: float | None = None
+
+    def nees(self, errors: Array, late: slice) -> float | None:
+        """Mean square of the late errors (n, 6) over their covariance; 6 is consistent."""
+        if self.information is not None:
+            information = self.information[late]
+        elif self.covariance is not None:
+            information = np.linalg.inv(self.covariance[late])
+        else:
+            return None
+        return float(np.einsum("ni,nij,nj->n", errors, information, errors).mean())
+
+
+def _pose_errors(run: _Run, motion: ImposedMotion) -> Array:
+    """(N, 6): of position, and rotation vectors in {1}."""
+    turned = vector_from_rotation(run.rotations @ np.swapaxes(motion.rotations, 1, 2))
+    return np.concatenate([run.positions - motion.positions, turned], axis=1)
+
+
+class _Readings:
+    """What all methods get: raw readings of one motion; and what the cycle makes of them, by the way to fuse."""
+
+    def __init__(
+        self, mechanism: Mechanism, model: ImuModel, calibration: Calibration, rate: float, seed: int, motion: ImposedMotion
+    ) -> None:
+        self.mechanism, self.rate, self.count = mechanism, rate, len(motion.times)
+        self._fusion, self._calibration = sensor_settings(mechanism, model), calibration
+        self.raw = np.empty_like(motion.signals)
+        _measure_all(imu_state(model, seed, 1.0 / rate), motion.signals, self.raw)
+        self.calibrated = calibration.apply(self.raw)
+        self._found: dict[str | None, _Found] = {}
+
+    def parameters(self, errors: str | None) -> Record:
+        """The cycle's constants."""
+        control = control_settings(self.mechanism)
+        return cycle_parameters(self.mechanism, self.rate, control, self._fusion, ALL_IMUS, errors, self._calibration)
+
+    def run(self, errors: str) -> "_Run":
+        """The poses of the whole-mechanism filter for these errors."""
+        return self.found(errors).run(_WHOLE)
+
+    def found(self, errors: str | None) -> "_Found":
+        """What the cycle finds with the whole-mechanism filter for these errors, or without it."""
+        if errors not in self._found:
+            found = _Found(self.count)
+            _follow(
+                self.parameters(errors), np.zeros((), STATE), self.raw, found.positions, found.rotations, found.information,
+                found.covariances, found.directions, found.verticals, found.ns, np.zeros(2, np.int64),
+            )  # fmt: skip
+            self._found[errors] = found
+        return self._found[errors]
+
+
+class _Found:
+    """By step (closed form, refined, whole mechanism) positions and rotations; the refined pose's inverse covariance and the
+    filter's covariance; the leg filters' directions, the platform's vertical, and nanoseconds until each step was done.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.positions, self.rotations = np.zeros((3, count, 3)), np.zeros((3, count, 3, 3))
+        self.information, self.covariances = np.zeros((count, 6, 6)), np.zeros((count, 6, 6))
+        self.directions, self.verticals = np.zeros((count, LEGS, 3)), np.zeros((count, 3))
+        self.ns = np.zeros((3, count), np.int64)
+
+    def run(self, step: int) -> _Run:
+        """One step's poses."""
+        information = self.information if step == _REFINED else None
+        covariance = self.covariances if step == _WHOLE else None
+        us = float(np.median(self.ns[step])) / 1e3
+        return _Run(self.positions[step], self.rotations[step], information, covariance, us)
+
+
+@kernel
+def _measure_all(imu: Record, signals: Array, raw: Array) -> None:
+    for i in range(signals.shape[0]):
+        measure(imu, signals[i], raw[i])
+
+
+@kernel
+def _follow(
+    parameters: Record, state: Record, raw: Array, positions: Array, rotations: Array, information: Array, covariances: Array,
+    directions: Array, verticals: Array, ns: NDArray[np.int64], timespec: NDArray[np.int64],
+) -> None:  # fmt: skip
+    """The fusing steps of the cycle over raw readings (N, 3, 7, 3)."""
+    s = state[()]
+    for i in range(raw.shape[0]):
+        began = now(timespec)
+        calibrate(parameters, state, raw[i])
+        fuse_legs(parameters, state)
+        fuse_platform(parameters, state)
+        find_pose(parameters, state)
+        ns[0, i] = now(timespec) - began
+        positions[0, i], rotations[0, i] = s.position, s.rotation
+        directions[i], verticals[i] = s.directions, s.vertical[0]
+        began = now(timespec)
+        improve_pose(parameters, state)
+        ns[1, i] = ns[0, i] + now(timespec) - began
+        positions[1, i], rotations[1, i] = s.position, s.rotation
+        for j in range(6):
+            for k in range(6):
+                information[i, j, k] = s.information[max(j, k), min(j, k)]
+        began = now(timespec)
+        fuse_mechanism(parameters, state, True)
+        ns[2, i] = ns[1, i] + now(timespec) - began
+        positions[2, i], rotations[2, i] = s.position, s.rotation
+        covariances[i] = s.filter.known_covariance
+        s.cycle += 1
+
+
+def _section_5(readings: _Readings) -> _Run:
+    """The paper's algorithm: leg directions, and all of the platform's orientation, with the heading of its magnetometer."""
+    found = readings.found(None)
+    mechanism = readings.mechanism
+    field = mechanism.plant_parameters()["magnetic_field"]
+    in_base = _triad(mechanism.up_in_base[None], field[None])
+    in_platform = _triad(found.verticals, readings.calibrated[:, MAGNETOMETER, PLATFORM_IMU])
+    solutions = solve_batch(
+        mechanism, found.directions, rotation=in_base @ np.swapaxes(in_platform, 1, 2), method="section-5", refine=False
+    )
+    return _Run(solutions.positions, solutions.rotations)
+
+
+def _triad(up: Array, field: Array) -> Array:
+    """Right-handed axes (N, 3, 3) of a vertical and a magnetic field (N, 3)."""
+    z = up / np.linalg.norm(up, axis=1, keepdims=True)
+    y = np.cross(z, field)
+    y /= np.linalg.norm(y, axis=1, keepdims=True)
+    return np.stack([np.cross(y, z), y, z], axis=2)
+
+
+def _vqf(readings: _Readings) -> _Run:
+    """The `vqf` package for each IMU by itself, which knows neither joints nor what the platform does; and the refinement."""
+    period, began = 1.0 / readings.rate, time.perf_counter()
+    ups = np.empty((IMU_COUNT, readings.count, 3))
+    for imu in range(IMU_COUNT):
+        rates, forces = (np.ascontiguousarray(readings.calibrated[:, sensor, imu]) for sensor in (GYROSCOPE, ACCELEROMETER))
+        w, x, y, z = VQF(period).updateBatch(rates, forces)["quat6D"].T
+        ups[imu] = np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)], axis=1)
+    us = 1e6 * (time.perf_counter() - began) / readings.count
+    directions = np.empty((readings.count, LEGS, 3))
+    _point(readings.parameters(None), ups, directions)
+    solutions = solve_batch(readings.mechanism, directions, up_in_platform=ups[PLATFORM_IMU])
+    return _Run(solutions.positions, solutions.rotations, us=us)
+
+
+@kernel
+def _point(parameters: Record, ups: Array, directions: Array) -> None:
+    """Directions (N, 6, 3) of legs on their joints that see the vertical as `ups` (7, N, 3)."""
+    sensors = parameters[()].sensors
+    x, covariance, still, rate = np.zeros(9), np.zeros((9, 9)), np.zeros(3), np.zeros(3)
+    for k in range(LEGS):
+        for i in range(directions.shape[0]):
+            start_leg(x, covariance, still, ups[k, i], sensors.up_in_joint[k], 1.0)
+            leg_direction(x, sensors.joint_rotations[k], 0.0, directions[i, k], rate)
+
+
+def _filterpy(readings: _Readings) -> _Run:
+    """The refined pose with the leg filters on filterpy."""
+    parameters, state = readings.parameters(None), np.zeros((), STATE)
+    fuse, found, ns = filterpy_legs(parameters), _Found(readings.count), np.zeros(readings.count, np.int64)
+    for i, raw in enumerate(readings.raw):
+        began = time.perf_counter_ns()
+        calibrate(parameters, state, raw)
+        fuse(state)
+        fuse_platform(parameters, state)
+        find_pose(parameters, state)
+        improve_pose(parameters, state)
+        ns[i] = time.perf_counter_ns() - began
+        found.positions[_REFINED, i], found.rotations[_REFINED, i] = state["position"], state["rotation"]
+        lower = np.tril(state["information"])
+        found.information[i] = lower + np.tril(lower, -1).T
+        state["cycle"] += 1
+    found.ns[_REFINED] = ns
+    return found.run(_REFINED)
+
+
+METHODS: dict[str, Callable[[_Readings], _Run]] = {
+    "section 5, magnetometer": _section_5,
+    "vqf per IMU, refined": _vqf,
+    "legs + vertical": lambda readings: readings.found(None).run(_CLOSED),
+    "refined (compiled)": lambda readings: readings.found(None).run(_REFINED),
+    **{name: partial(_Readings.run, errors=errors) for name, errors in FUSIONS.items() if errors is not None},
+}
+SLOW_METHODS: dict[str, Callable[[_Readings], _Run]] = {"refined (filterpy)": _filterpy}
+"""Ways to fuse; the slow ones are tried with the first seed only."""
