@@ -19,6 +19,7 @@ test: .venv/installed-test
 bench: .venv/installed
 	@mkdir -p $(OUT)
 	$(BIN)/gough bench --json $(OUT)/bench.json $(BENCH)
+	$(BIN)/gough compare-fusion --json $(OUT)/fusion.json $(FUSION)
 
 lint: .venv/installed-lint
 	$(BIN)/ruff check .

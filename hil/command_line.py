@@ -157,6 +157,26 @@ def _add_calibrate(commands: Any) -> None:
     rig.add_argument("--plant", metavar="FILE.fmu", help="FMI 3.0 Co-Simulation FMU to use instead of the built one")
     _add_json(rig)
     rig.set_defaults(run=_calibrate_rig)
+    _add_calibrate_imu(actions)
+
+
+def _add_calibrate_imu(actions: Any) -> None:
+    imu = actions.add_parser(
+        "imu",
+        help="a single one, turned by hand",
+        description="Calibrate a single IMU without equipment: it rests in ten or more orientations, every axis up and "
+        "down among them, half a second or longer each, and is turned by hand from one to the next. Refuses data that do not "
+        "tell the constants, and says which rest or turn is missing.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    imu.add_argument(
+        "data", type=Path, metavar="FILE", help="CSV with time_s,wx,wy,wz,ax,ay,az (rad/s, m/s2), or an MCAP recording"
+    )
+    imu.add_argument("output", type=Path, metavar="FILE.toml", help="the calibration to write, or to add this IMU to")
+    imu.add_argument("--number", type=int, default=0, choices=range(7), help="which IMU of the mechanism it is")
+    imu.add_argument("--gravity", type=float, default=9.80665, help="at the place [m/s2]")
+    _add_json(imu)
+    imu.set_defaults(run=_calibrate_imu)
 
 
 def _add_compare(commands: Any) -> None:
@@ -327,6 +347,46 @@ def _calibrate_rig(options: argparse.Namespace) -> int:
     _write_json(options.json, result.summary)
     _print_rig_calibration(result.summary)
     print(f"written to {options.output}")
+    return 0
+
+
+def _calibrate_imu(options: argparse.Namespace) -> int:
+    from dataclasses import replace
+
+    from controller.calibration import Calibration, load_calibration, save_calibration
+    from controller.imu_calibration import calibrate_imu
+    from hil.imu_data import read_imu
+
+    _check_writable(options.output, options.json)
+    if not 9.7 < options.gravity < 9.9:
+        raise InputError(f"--gravity is {options.gravity:g} m/s2; on the earth it is between 9.7 and 9.9")
+    calibration = load_calibration(options.output) if options.output.exists() else Calibration()
+    found = calibrate_imu(*read_imu(options.data, options.number), options.gravity)
+    calibration.gain[:2, options.number], calibration.offset[:2, options.number] = found.gain, found.offset
+    # What was known of the errors that are left was of other constants.
+    save_calibration(options.output, replace(calibration, covariance=None))
+    figures = {
+        "rests": found.rests,
+        "force_residual": found.force_residual,
+        "turn_residual": found.turn_residual,
+        "gain": found.gain.tolist(),
+        "offset": found.offset.tolist(),
+        "sigmas": found.sigmas.tolist(),
+    }
+    _write_json(options.json, figures)
+    table = _table(f"IMU {options.number}", "x", "y", "z")
+    rows = (("gyroscope", "offset [deg/s]", 57.29577951308232), ("accelerometer", "offset [mg]", 1e3 / 9.80665))
+    for sensor, (name, label, scale) in enumerate(rows):
+        offsets = zip(found.offset[sensor], found.sigmas[sensor, :3], strict=True)
+        table.add_row(f"{name}: {label}", *(f"{scale * value:.3f} +- {scale * sigma:.3f}" for value, sigma in offsets))
+        for axis, (gains, sigmas) in enumerate(zip(found.gain[sensor], found.sigmas[sensor, 3:].reshape(3, 3), strict=True)):
+            cells = (f"{value:.5f} +- {sigma:.5f}" for value, sigma in zip(gains, sigmas, strict=True))
+            table.add_row(f"{name}: gain, row {axis + 1}", *cells)
+    _print(table)
+    print(
+        f"{found.rests} rests; residuals: gravity {1e3 * found.force_residual / 9.80665:.3f} mg, "
+        f"turns {57.29577951308232 * found.turn_residual:.3f} deg; written to {options.output}"
+    )
     return 0
 
 
