@@ -99,8 +99,6 @@ FILTER_STATE = np.dtype(
         ("sample_used", np.int64, IMU_COUNT),
         ("row", np.int64),
         ("piece", np.int64),
-        ("surprise", np.float64),
-        ("surprises", np.int64),
         ("change", np.float64, MOST_STATES),
         ("gain", np.float64, MOST_STATES),
         ("turn", np.float64, 3),
@@ -116,7 +114,7 @@ FILTER_STATE = np.dtype(
 """State of the filter, whose update may be under way; `known` is what the last complete one has found.
 
 Times are in seconds since the first cycle. `sum` collects the samples of a window, `sample` is the mean of the last one;
-`row` is the next scalar to take, -1 when none is left. `surprise` is the mean squared normalised innovation of the last update.
+`row` is the next scalar to take, -1 when none is left.
 """
 
 
@@ -247,8 +245,6 @@ def _begin_update(parameters: Record, geometry: Record, state: Record) -> None:
     _predict(parameters, state, time - f.time)
     f.time = time
     f.change[:] = 0.0
-    f.surprise = 0.0
-    f.surprises = 0
     f.row = f.piece = 0
     predict_readings(
         geometry, f.position, f.rotation, f.smooth_motion, True, f.smooth_predicted, f.jacobian, f.readings_scratch
@@ -418,8 +414,6 @@ def _take(parameters: Record, state: Record, row: int) -> None:
     for j in range(p.errors):
         variance += f.gradient[j] * gain[start + j]
     inverse = 1.0 / variance
-    f.surprise += innovation * innovation * inverse
-    f.surprises += 1
     for i in range(states):
         weight = gain[i] * inverse
         change[i] += weight * innovation
@@ -432,8 +426,6 @@ def _end_update(parameters: Record, state: Record) -> None:
     """Put the change into the motion and the errors."""
     p, f = parameters, state
     f.row = -1
-    if f.surprises > 0:
-        f.surprise /= f.surprises
     for i in range(3):
         f.position[i] += f.change[i]
         f.turn[i] = f.change[3 + i]

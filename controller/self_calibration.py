@@ -9,7 +9,6 @@ whole-mechanism filter, with every error as a state and the first step's covaria
 
 from dataclasses import dataclass, replace
 from math import radians
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,9 +119,9 @@ class Found:
     rotations: Array
     residuals: Array
 
-    def calibration(self, about: dict[str, Any] | None = None) -> Calibration:
+    def calibration(self) -> Calibration:
         """The calibration that undoes the errors."""
-        return Calibration().then(*undo(self.errors), tilt=self.tilt, covariance=self.covariance, about=about or {})
+        return Calibration().then(*undo(self.errors), tilt=self.tilt, covariance=self.covariance)
 
 
 def undo(errors: Array) -> tuple[Array, Array]:
@@ -203,7 +202,7 @@ class _Problem:
     """MAP estimation: columns are the poses (6 each), the errors (147), the tilt (2) and, unless exact, the joints (36)."""
 
     def __init__(self, mechanism: Mechanism, rests: Rests, prior: Prior) -> None:
-        self._mechanism, self._rests, self._prior = mechanism, rests, prior
+        self._mechanism, self._rests = mechanism, rests
         self._count = len(rests.readings)
         self._rest = _Rest()
         self._weights = 1.0 / np.repeat([prior.reading_rate, prior.reading_force], 3)

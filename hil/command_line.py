@@ -90,7 +90,8 @@ def _add_motion(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--target",
         default="circle",
-        help="hold, circle, sines, steps, or a CSV file of displacements from home (time_s,x_m,y_m,z_m,qw,qx,qy,qz)",
+        help="hold, circle, sines, steps, near-rests, rests, shaking, or a CSV file of displacements from home "
+        "(time_s,x_m,y_m,z_m,qw,qx,qy,qz)",
     )
     command.add_argument("--duration", type=float, default=10.0, help="of the motion [s]")
     command.add_argument("--rate", type=float, default=1000.0, help="cycles per second [Hz], 50 to 4000")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from vqf import VQF
 
 from controller.calibration import Calibration, load_calibration
-from controller.cycle import ALL_IMUS, STATE, cycle_parameters
+from controller.cycle import ALL_IMUS, STATE, check_rate, cycle_parameters
 from controller.direct_kinematics import solve_batch
 from controller.fusion import calibrate, find_pose, fuse_legs, fuse_mechanism, fuse_platform, improve_pose
 from controller.leg_filter import leg_direction, start_leg
@@ -58,6 +58,7 @@ class ComparisonConfig:
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
 
     def __post_init__(self) -> None:
+        check_rate(self.rate)
         if not LEARNING_S < self.duration < 3600.0:
             raise InputError(f"the duration is {self.duration:g} s; it must be more than {LEARNING_S:g} s, which do not count")
         if not self.seeds:

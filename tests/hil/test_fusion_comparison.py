@@ -41,6 +41,7 @@ def test_covariances_are_of_the_size_of_the_errors(figures):
     ("arguments", "complaint"),
     [
         (["--duration", "20"], "it must be more than 20 s, which do not count"),
+        (["--rate", "nan"], "the rate is nan Hz"),
         (["--motion", "wobble"], "there is no imposed motion 'wobble'"),
         (["--imu", "best"], "no IMU preset 'best'"),
         (["--calibration", "none.toml"], "the calibration none.toml cannot be read"),
