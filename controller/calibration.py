@@ -18,12 +18,15 @@ from numpy.typing import ArrayLike
 from controller.mechanism_filter import ERRORS
 from plant.errors import InputError
 from plant.files import write_whole
+from plant.mechanism import LEGS
 from plant.pose import Array, checked_array, rotation_from_vector, vector_from_rotation
 from plant.variables import IMU_COUNT
 
 SENSORS = ("gyroscope", "accelerometer", "magnetometer")
 UNITS = ("rad/s", "m/s2", "uT")
 _FIELDS = ("bias", "scale", "axes", "mounting")
+_SIDES = ("base", "platform")
+_LEAST_MOVE_M = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +37,8 @@ class Calibration:
         gain: (3, 7, 3, 3), by sensor (gyroscope, accelerometer, magnetometer) and IMU.
         offset: (3, 7, 3) [rad/s, m/s^2, uT].
         tilt: (2,) [rad], by which the vertical is turned about the axes x and y of {1}.
+        joints: (2, 6, 3) [m], what must be added to the mechanism's base and platform joints.
+        floor: (6, 6), covariance of the pose at home, along [m] and about [rad] the axes of {1}, that tilt and joints leave.
         covariance: (147, 147), of what errors are left, in the order of `controller.mechanism_filter.ERROR_NAMES` for each IMU;
             None if it is not known.
         about: what is worth knowing: date, residuals, where the data came from.
@@ -42,6 +47,8 @@ class Calibration:
     gain: Array = field(default_factory=lambda: np.tile(np.eye(3), (3, IMU_COUNT, 1, 1)))
     offset: Array = field(default_factory=lambda: np.zeros((3, IMU_COUNT, 3)))
     tilt: Array = field(default_factory=lambda: np.zeros(2))
+    joints: Array = field(default_factory=lambda: np.zeros((2, LEGS, 3)))
+    floor: Array = field(default_factory=lambda: np.zeros((6, 6)))
     covariance: Array | None = None
     about: dict[str, Any] = field(default_factory=dict)
 
@@ -53,9 +60,7 @@ class Calibration:
     def then(self, gain: Array, offset: Array, **changes: Any) -> "Calibration":
         """This calibration followed by another."""
         whole = (gain @ self.offset[..., None])[..., 0] + offset
-        return Calibration(
-            gain @ self.gain, whole, **{"tilt": self.tilt, "covariance": self.covariance, "about": self.about, **changes}
-        )
+        return replace(self, gain=gain @ self.gain, offset=whole, **changes)
 
 
 def split_gain(gain: Array) -> tuple[Array, Array, Array]:
@@ -96,12 +101,12 @@ def load_calibration(path: Path | str) -> Calibration:
         raise InputError(f"{path} is no TOML file: {error}") from None
     calibration = Calibration(about=document.get("about", {}))
     for name, table in document.items():
-        if name in ("about", "base", "covariance"):
+        if name in ("about", "base", "joints", "covariance"):
             continue
         imu = name.removeprefix("imu_")
         if not (name.startswith("imu_") and imu.isdigit() and int(imu) < IMU_COUNT):
             raise InputError(
-                f"{path}: there is no table {name!r} in a calibration; there are imu_0 to imu_6, about, base, covariance"
+                f"{path}: there is no table {name!r} in a calibration; there are imu_0 to imu_6, about, base, joints, covariance"
             )
         for sensor, entries in table.items():
             if sensor not in SENSORS:
@@ -110,6 +115,11 @@ def load_calibration(path: Path | str) -> Calibration:
     changes: dict[str, Any] = {}
     if "base" in document:
         changes["tilt"] = checked_array(document["base"].get("tilt", (0.0, 0.0)), (2,), f"{path}: base.tilt")
+        changes["floor"] = checked_array(document["base"].get("floor", np.zeros((6, 6))), (6, 6), f"{path}: base.floor")
+    if "joints" in document:
+        sides = [document["joints"].get(side, np.zeros((LEGS, 3))) for side in _SIDES]
+        moves = [checked_array(moved, (LEGS, 3), f"{path}: joints.{side}") for side, moved in zip(_SIDES, sides, strict=True)]
+        changes["joints"] = np.stack(moves)
     if "covariance" in document:
         changes["covariance"] = _read_covariance(document["covariance"], path)
     return replace(calibration, **changes)
@@ -155,9 +165,14 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
     lines += ["", "[about]", *(f"{name} = {_toml(value)}" for name, value in calibration.about.items())]
     lines += [
         "",
-        "[base]  # by which the vertical is turned about x and y, in rad",
+        "# By which the vertical is turned about x and y, in rad, and the covariance of the pose that tilt and joints leave.",
+        "[base]",
         f"tilt = {_toml(calibration.tilt.tolist())}",
+        f"floor = {_toml(calibration.floor.tolist())}",
     ]
+    if np.abs(calibration.joints).max() >= _LEAST_MOVE_M:
+        lines += ["", "[joints]  # what must be added to their places, in m"]
+        lines += [f"{side} = {_toml(moves.tolist())}" for side, moves in zip(_SIDES, calibration.joints, strict=True)]
     for imu in range(IMU_COUNT):
         for sensor, name in enumerate(SENSORS):
             gain, offset = calibration.gain[sensor, imu], calibration.offset[sensor, imu]

@@ -207,7 +207,7 @@ def cycle_parameters(
     """Work out the constants of the cycle.
 
     Args:
-        mechanism: with home, limits and plant data.
+        mechanism: with home, limits and plant data, its joints where the calibration has moved them.
         rate: cycles per second [Hz].
         control, fusion: settings.
         imus: which IMUs there are, 0-5 on the legs and 6 on the platform.
@@ -258,7 +258,7 @@ def cycle_parameters(
         "leg_weight": 1.0 / fusion.leg_sigma**2,
         "vertical_weight": 1.0 / fusion.tilt_sigma**2,
         "acceleration_rate": 1.0 / fusion.acceleration_time,
-        "filter": filter_parameters(fusion, rate, whole, calibration.covariance),
+        "filter": filter_parameters(fusion, rate, whole, calibration.covariance, calibration.floor),
         "filter_start_cycles": round(_FILTER_START_S * rate),
         "filter_settling_cycles": round(_FILTER_SETTLING_S * rate),
         "disagreement": fusion.disagreement,

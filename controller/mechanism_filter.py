@@ -2,7 +2,8 @@
 
 Because the pose fixes every leg, the platform's motion predicts every reading (`controller.readings`), and motion tells the
 sensors' errors apart. Error state: of position, rotation (`R <- exp(skew(theta)) R`), velocity, angular velocity, acceleration
-and angular acceleration (18), driven by white jerk, then for each IMU the first parameters of `ERROR_NAMES`. An IMU reads
+and angular acceleration (18), driven by white jerk, then for each IMU the first parameters of `ERROR_NAMES`, and for a
+calibration the places of the joints (36) and the tilt of the base (2). An IMU reads
 
     rate  = (I + diag(scale) + U(axes)) R(-alignment) ideal + bias,   U upper triangular, R the rotation, the force likewise
 
@@ -22,11 +23,13 @@ from controller.readings import (
     READINGS,
     READINGS_SCRATCH,
     VELOCITY,
+    cross,
     predict_readings,
 )
 from controller.settings import FusionSettings
 from plant.compiled import Record, kernel
 from plant.errors import UnknownNameError
+from plant.mechanism import LEGS
 from plant.pose import Array, rotate_by_vector
 from plant.variables import IMU_COUNT
 
@@ -48,7 +51,9 @@ ERRORS = 3 * len(ERROR_NAMES)
 BLOCKS = {"gyroscopes": 3, "accelerometers": 6, "alignments": 15, "axes": ERRORS}
 """How many of an IMU's errors are estimated."""
 
-MOST_STATES = MOTION_STATES + IMU_COUNT * ERRORS
+ALL_ERRORS, JOINTS, TILT = IMU_COUNT * ERRORS, 2 * LEGS * 3, 2
+RIG = JOINTS + TILT
+MOST_STATES = MOTION_STATES + ALL_ERRORS + RIG
 _ROWS = IMU_COUNT * READINGS
 
 WINDOW_S = 0.005
@@ -63,18 +68,20 @@ FILTER_PARAMETERS = np.dtype(
     [
         ("window", np.int64),
         ("errors", np.int64),
+        ("rig", np.int64),
         ("smoothing", np.float64),
         ("jerk", np.float64, 2),
         ("bias_walk", np.float64, 2),
         ("variance", np.float64, 2),
-        ("prior", np.float64, (IMU_COUNT * ERRORS, IMU_COUNT * ERRORS)),
+        ("prior", np.float64, (ALL_ERRORS + RIG, ALL_ERRORS + RIG)),
+        ("floor", np.float64, (6, 6)),
     ],
     align=True,
 )
-"""Samples of a window; estimated errors of an IMU, 0 for no filter; time constant of the motion at which the Jacobian is taken,
-infinite if that is set from outside; spectral densities of the platform's jerk (linear,
-angular) and of the biases' walks (gyroscope, accelerometer); variances of one sample (rate, force); and the covariance of the
-errors."""
+"""Samples of a window; estimated errors of an IMU, 0 for no filter, and of the rig; time constant of the motion at which the
+Jacobian is taken, infinite if that is set from outside; spectral densities of the platform's jerk (linear, angular)
+and of the biases' walks (gyroscope, accelerometer); variances of one sample (rate, force); the covariance of these errors;
+and that of the pose which is left because the rig's are not estimated."""
 
 FILTER_STATE = np.dtype(
     [
@@ -85,6 +92,7 @@ FILTER_STATE = np.dtype(
         ("motion", np.float64, (4, 3)),
         ("smooth_motion", np.float64, (4, 3)),
         ("errors", np.float64, (IMU_COUNT, ERRORS)),
+        ("rig", np.float64, RIG),
         ("covariance", np.float64, (MOST_STATES, MOST_STATES)),
         ("known_time", np.float64),
         ("known_position", np.float64, 3),
@@ -102,9 +110,11 @@ FILTER_STATE = np.dtype(
         ("change", np.float64, MOST_STATES),
         ("gain", np.float64, MOST_STATES),
         ("turn", np.float64, 3),
+        ("frame", np.float64, (3, 3)),
         ("predicted", np.float64, (IMU_COUNT, READINGS)),
         ("smooth_predicted", np.float64, (IMU_COUNT, READINGS)),
         ("jacobian", np.float64, (IMU_COUNT, READINGS, MOTION_STATES)),
+        ("rig_jacobian", np.float64, (IMU_COUNT, READINGS, 8)),
         ("gradient", np.float64, ERRORS),
         ("mixed", np.float64, (3, MOTION_STATES)),
         ("readings_scratch", READINGS_SCRATCH),
@@ -114,18 +124,23 @@ FILTER_STATE = np.dtype(
 """State of the filter, whose update may be under way; `known` is what the last complete one has found.
 
 Times are in seconds since the first cycle. `sum` collects the samples of a window, `sample` is the mean of the last one;
-`row` is the next scalar to take, -1 when none is left.
+`row` is the next scalar to take, -1 when none is left; `rig` is by how much joints (2, 6, 3)
+and tilt (2) are off. The readings of a leg's IMU depend on eight of these: its two joints, and the tilt.
 """
 
 
-def filter_parameters(fusion: FusionSettings, rate: float, errors: str | None, covariance: Array | None) -> Record:
+def filter_parameters(
+    fusion: FusionSettings, rate: float, errors: str | None, covariance: Array | None, floor: Array | None = None
+) -> Record:
     """Constants of the filter.
 
     Args:
         fusion: settings.
         rate: samples per second [Hz].
         errors: a key of `BLOCKS`; None for no filter.
-        covariance: (147, 147), of the errors that a calibration has left; None for what the settings say.
+        covariance: (147, 147), of the errors that a calibration has left, or (185, 185), of joints and tilt, too, which are
+            estimated then; None for what the settings say.
+        floor: (6, 6), covariance of the pose that joints and tilt leave; None if they are exact.
 
     Raises:
         UnknownNameError: no such block of errors.
@@ -139,10 +154,15 @@ def filter_parameters(fusion: FusionSettings, rate: float, errors: str | None, c
         ],
         3,
     )  # fmt: skip
+    prior, known = np.zeros((ALL_ERRORS + RIG,) * 2), np.diag(np.tile(sigmas**2, IMU_COUNT))
+    if covariance is not None:
+        known = covariance
+    prior[: len(known), : len(known)] = known
     parameters: Record = np.zeros((), FILTER_PARAMETERS)
     values = {
         "window": max(1, round(WINDOW_S * rate)),
         "errors": 0 if errors is None else BLOCKS[errors],
+        "rig": len(known) - ALL_ERRORS,
         "smoothing": _SMOOTHING_S,
         "jerk": (fusion.platform_jerk**2, fusion.platform_angular_jerk**2),
         "bias_walk": (fusion.bias_walk**2, fusion.accelerometer_bias_walk**2),
@@ -150,11 +170,23 @@ def filter_parameters(fusion: FusionSettings, rate: float, errors: str | None, c
             fusion.mechanism_gyroscope_noise**2 * rate / 2.0,
             fusion.mechanism_accelerometer_noise**2 * rate / 2.0,
         ),
-        "prior": np.diag(np.tile(sigmas**2, IMU_COUNT)) if covariance is None else covariance,
+        "prior": prior,
+        "floor": np.zeros((6, 6)) if floor is None else floor,
     }
     for name, value in values.items():
         parameters[name] = value
     return parameters
+
+
+@kernel
+def _states(parameters: Record) -> int:
+    return int(MOTION_STATES + IMU_COUNT * parameters.errors + parameters.rig)
+
+
+@kernel
+def _rig_state(k: int, j: int) -> int:
+    """The place among the rig's errors of the one, 0 to 7, on which IMU `k` depends."""
+    return 3 * k + j if j < 3 else 3 * (LEGS + k - 1) + j if j < 6 else JOINTS + j - 6
 
 
 @kernel
@@ -171,7 +203,8 @@ def start_filter(parameters: Record, state: Record, time: float, position: Array
         f.motion[RATE, i] = twist[3 + i]
     f.smooth_motion[:] = f.motion
     f.errors[:] = 0.0
-    states = MOTION_STATES + IMU_COUNT * p.errors
+    f.rig[:] = 0.0
+    states = _states(p)
     for i in range(states):
         for j in range(states):
             f.covariance[i, j] = 0.0
@@ -185,9 +218,16 @@ def start_filter(parameters: Record, state: Record, time: float, position: Array
                     f.covariance[MOTION_STATES + k * p.errors + i, MOTION_STATES + other * p.errors + j] = p.prior[
                         k * ERRORS + i, other * ERRORS + j
                     ]
+            for j in range(p.rig):
+                covariance = p.prior[k * ERRORS + i, ALL_ERRORS + j]
+                f.covariance[MOTION_STATES + k * p.errors + i, states - RIG + j] = covariance
+                f.covariance[states - RIG + j, MOTION_STATES + k * p.errors + i] = covariance
+    for i in range(p.rig):
+        for j in range(p.rig):
+            f.covariance[states - RIG + i, states - RIG + j] = p.prior[ALL_ERRORS + i, ALL_ERRORS + j]
     f.row = -1
     f.collected = 0
-    _publish(state)
+    _publish(parameters, state)
 
 
 @kernel
@@ -253,6 +293,65 @@ def _begin_update(parameters: Record, geometry: Record, state: Record) -> None:
     if p.errors > ACCELEROMETER_SCALE:
         for k in range(IMU_COUNT):
             _distort_jacobian(f.errors[k], f.jacobian[k], f.mixed)
+    if p.rig > 0:
+        _find_rig_jacobian(geometry, state)
+
+
+@kernel
+def _find_rig_jacobian(geometry: Record, state: Record) -> None:
+    """Derivatives (7, 6, 8) of the readings by base joint, platform joint and tilt, from those by the motion (7, 6, 18).
+
+    A leg vector p + R A - B answers to a move of B like to the opposite one of p; and to one of A like to one of p by R A, of the
+    velocity by omega x R A, and of the acceleration by alpha x R A + omega x (omega x R A). The tilt turns the vertical.
+    """
+    g, f = geometry, state
+    w, alpha = f.smooth_motion[RATE], f.smooth_motion[ANGULAR_ACCELERATION]
+    for k in range(LEGS):
+        for m in range(READINGS):
+            h, by_rig = f.jacobian[k, m], f.rig_jacobian[k, m]
+            for i in range(3):
+                by_rig[i] = -h[i]
+                r0, r1, r2 = f.rotation[0, i], f.rotation[1, i], f.rotation[2, i]
+                v0, v1, v2 = cross(w[0], w[1], w[2], r0, r1, r2)
+                a0, a1, a2 = cross(alpha[0], alpha[1], alpha[2], r0, r1, r2)
+                c0, c1, c2 = cross(w[0], w[1], w[2], v0, v1, v2)
+                by_rig[3 + i] = h[0] * r0 + h[1] * r1 + h[2] * r2 + h[6] * v0 + h[7] * v1 + h[8] * v2
+                by_rig[3 + i] += h[12] * (a0 + c0) + h[13] * (a1 + c1) + h[14] * (a2 + c2)
+    up = g.up_in_base[0]
+    for j in range(TILT):
+        # e x up for the axes e = x, y.
+        u0, u1, u2 = (0.0, -up[2], up[1]) if j == 0 else (up[2], 0.0, -up[0])
+        for k in range(IMU_COUNT):
+            if k < LEGS:
+                _find_leg_frame(g.joint_rotations[k], g.base_joints[k], g.platform_joints[k], f.position, f.rotation, f.frame)
+            else:
+                f.frame[:] = f.rotation
+            for i in range(3):
+                f.rig_jacobian[k, i, 6 + j] = 0.0
+                f.turn[i] = g.gravity * (f.frame[0, i] * u0 + f.frame[1, i] * u1 + f.frame[2, i] * u2)
+            turned = distort(f.errors[k], 1, f.turn[0], f.turn[1], f.turn[2])
+            for i in range(3):
+                f.rig_jacobian[k, 3 + i, 6 + j] = turned[i]
+
+
+@kernel
+def _find_leg_frame(
+    joint_rotation: Array, base_joint: Array, platform_joint: Array, position: Array, rotation: Array, frame: Array
+) -> None:
+    """Write the axes of a leg's frame in {1} as columns (3, 3): z along the leg, y across the joint's first axis, too."""
+    for i in range(3):
+        frame[i, 2] = position[i] - base_joint[i]
+        for j in range(3):
+            frame[i, 2] += rotation[i, j] * platform_joint[j]
+    z0, z1, z2 = frame[0, 2], frame[1, 2], frame[2, 2]
+    y0, y1, y2 = cross(z0, z1, z2, joint_rotation[0, 0], joint_rotation[1, 0], joint_rotation[2, 0])
+    x0, x1, x2 = cross(y0, y1, y2, z0, z1, z2)
+    frame[0, 0], frame[1, 0], frame[2, 0] = x0, x1, x2
+    frame[0, 1], frame[1, 1], frame[2, 1] = y0, y1, y2
+    for j in range(3):
+        size = np.sqrt(frame[0, j] ** 2 + frame[1, j] ** 2 + frame[2, j] ** 2)
+        for i in range(3):
+            frame[i, j] /= size
 
 
 @kernel
@@ -272,7 +371,7 @@ def _predict(parameters: Record, state: Record, period: float) -> None:
         for i in range(3):
             f.smooth_motion[block, i] += share * (x[block, i] - f.smooth_motion[block, i])
     # theta+ = (I + skew(turn)) theta + t d_omega + t^2/2 d_alpha, first by rows and then by columns.
-    states = MOTION_STATES + IMU_COUNT * p.errors
+    states = _states(p)
     r0, r1, r2 = f.turn[0], f.turn[1], f.turn[2]
     for j in range(states):
         x0, x1, x2 = c[3, j], c[4, j], c[5, j]
@@ -389,7 +488,7 @@ def _take(parameters: Record, state: Record, row: int) -> None:
     if f.sample_used[k] == 0:
         return
     sensor = m // 3
-    states, start = MOTION_STATES + IMU_COUNT * p.errors, MOTION_STATES + k * p.errors
+    states, start = _states(p), MOTION_STATES + k * p.errors
     h, gain, change, c = f.jacobian[k, m], f.gain, f.change, f.covariance
     x = f.predicted[k]
     expected = distort(f.errors[k], sensor, x[3 * sensor], x[3 * sensor + 1], x[3 * sensor + 2])
@@ -409,10 +508,19 @@ def _take(parameters: Record, state: Record, row: int) -> None:
             innovation -= weight * change[start + j]
             for i in range(states):
                 gain[i] += weight * c[start + j, i]
+    first = 8 if p.rig == 0 else 0 if k < LEGS else 6
+    for j in range(first, 8):
+        weight, which = f.rig_jacobian[k, m, j], _rig_state(k, j)
+        at = states - RIG + which
+        innovation -= weight * (f.rig[which] + change[at])
+        for i in range(states):
+            gain[i] += weight * c[at, i]
     for j in range(MOTION_STATES):
         variance += h[j] * gain[j]
     for j in range(p.errors):
         variance += f.gradient[j] * gain[start + j]
+    for j in range(first, 8):
+        variance += f.rig_jacobian[k, m, j] * gain[states - RIG + _rig_state(k, j)]
     inverse = 1.0 / variance
     for i in range(states):
         weight = gain[i] * inverse
@@ -435,7 +543,9 @@ def _end_update(parameters: Record, state: Record) -> None:
     for k in range(IMU_COUNT):
         for i in range(p.errors):
             f.errors[k, i] += f.change[MOTION_STATES + k * p.errors + i]
-    _publish(state)
+    for i in range(p.rig):
+        f.rig[i] += f.change[_states(p) - RIG + i]
+    _publish(parameters, state)
 
 
 @kernel
@@ -457,7 +567,7 @@ def extrapolate(state: Record, time: float, position: Array, rotation: Array, tw
 
 
 @kernel
-def _publish(state: Record) -> None:
+def _publish(parameters: Record, state: Record) -> None:
     f = state
     f.known_time = f.time
     f.known_position[:] = f.position
@@ -465,4 +575,4 @@ def _publish(state: Record) -> None:
     f.known_motion[:] = f.motion
     for i in range(6):
         for j in range(6):
-            f.known_covariance[i, j] = f.covariance[i, j]
+            f.known_covariance[i, j] = f.covariance[i, j] + parameters.floor[i, j]

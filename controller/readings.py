@@ -54,20 +54,18 @@ READINGS_SCRATCH = np.dtype(
 )
 
 
-def sensor_geometry(mechanism: Mechanism, tilt: ArrayLike = (0.0, 0.0), joints: Array | None = None) -> Record:
+def sensor_geometry(mechanism: Mechanism, tilt: ArrayLike = (0.0, 0.0)) -> Record:
     """What the readings depend on, dtype `SENSOR_GEOMETRY`.
 
     Args:
         mechanism: with plant data.
         tilt: (2,) [rad], by which the vertical is turned about the axes x and y of {1}.
-        joints: (2, 6, 3) [m], what is added to base and platform joints.
     """
     plant = mechanism.plant_parameters()
     up = rotation_from_vector([*np.asarray(tilt), 0.0]) @ mechanism.up_in_base
-    moved = np.zeros((2, LEGS, 3)) if joints is None else joints
     values = {
-        "base_joints": mechanism.base_joints + moved[0],
-        "platform_joints": mechanism.platform_joints + moved[1],
+        "base_joints": mechanism.base_joints,
+        "platform_joints": mechanism.platform_joints,
         "joint_rotations": mechanism.joint_rotations,
         "up_in_joint": np.swapaxes(mechanism.joint_rotations, 1, 2) @ up,
         "up_in_base": up,
@@ -82,7 +80,7 @@ def sensor_geometry(mechanism: Mechanism, tilt: ArrayLike = (0.0, 0.0), joints: 
 
 
 @kernel
-def _cross(x0: float, x1: float, x2: float, y0: float, y1: float, y2: float) -> tuple[float, float, float]:
+def cross(x0: float, x1: float, x2: float, y0: float, y1: float, y2: float) -> tuple[float, float, float]:
     return x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
 
 
@@ -152,10 +150,10 @@ def predict_leg_readings(
         for j in range(3):
             arm[i] += rotation[i, j] * platform_joint[j]
     r0, r1, r2 = arm[0], arm[1], arm[2]
-    t0, t1, t2 = _cross(w0, w1, w2, r0, r1, r2)
+    t0, t1, t2 = cross(w0, w1, w2, r0, r1, r2)
     turning[0], turning[1], turning[2] = t0, t1, t2
-    c0, c1, c2 = _cross(w0, w1, w2, t0, t1, t2)
-    f0, f1, f2 = _cross(e0, e1, e2, r0, r1, r2)
+    c0, c1, c2 = cross(w0, w1, w2, t0, t1, t2)
+    f0, f1, f2 = cross(e0, e1, e2, r0, r1, r2)
     s0, s1, s2 = position[0] + r0 - base_joint[0], position[1] + r1 - base_joint[1], position[2] + r2 - base_joint[2]
     v0, v1, v2 = motion[VELOCITY, 0] + t0, motion[VELOCITY, 1] + t1, motion[VELOCITY, 2] + t2
     a0 = motion[ACCELERATION, 0] + f0 + c0
@@ -195,15 +193,15 @@ def predict_leg_readings(
         row[6], row[7], row[8] = by_v0, by_v1, by_v2
         row[12], row[13], row[14] = by_a0, by_a1, by_a2
         # s' = v + w x r and s'' = a + e x r + w x (w x r), with r turned by the rotation's error.
-        x0, x1, x2 = _cross(by_a0, by_a1, by_a2, w0, w1, w2)
-        y0, y1, y2 = _cross(x0, x1, x2, w0, w1, w2)
-        z0, z1, z2 = _cross(by_a0, by_a1, by_a2, e0, e1, e2)
-        u0, u1, u2 = _cross(by_v0, by_v1, by_v2, w0, w1, w2)
-        row[3], row[4], row[5] = _cross(r0, r1, r2, by_s0 + u0 + y0 + z0, by_s1 + u1 + y1 + z1, by_s2 + u2 + y2 + z2)
-        n0, n1, n2 = _cross(r0, r1, r2, by_v0 + x0, by_v1 + x1, by_v2 + x2)
-        o0, o1, o2 = _cross(t0, t1, t2, by_a0, by_a1, by_a2)
+        x0, x1, x2 = cross(by_a0, by_a1, by_a2, w0, w1, w2)
+        y0, y1, y2 = cross(x0, x1, x2, w0, w1, w2)
+        z0, z1, z2 = cross(by_a0, by_a1, by_a2, e0, e1, e2)
+        u0, u1, u2 = cross(by_v0, by_v1, by_v2, w0, w1, w2)
+        row[3], row[4], row[5] = cross(r0, r1, r2, by_s0 + u0 + y0 + z0, by_s1 + u1 + y1 + z1, by_s2 + u2 + y2 + z2)
+        n0, n1, n2 = cross(r0, r1, r2, by_v0 + x0, by_v1 + x1, by_v2 + x2)
+        o0, o1, o2 = cross(t0, t1, t2, by_a0, by_a1, by_a2)
         row[9], row[10], row[11] = n0 + o0, n1 + o1, n2 + o2
-        row[15], row[16], row[17] = _cross(r0, r1, r2, by_a0, by_a1, by_a2)
+        row[15], row[16], row[17] = cross(r0, r1, r2, by_a0, by_a1, by_a2)
 
 
 @kernel
@@ -218,9 +216,9 @@ def predict_platform_readings(
     r2 = rotation[2, 0] * d0 + rotation[2, 1] * d1 + rotation[2, 2] * d2
     w0, w1, w2 = motion[RATE, 0], motion[RATE, 1], motion[RATE, 2]
     e0, e1, e2 = motion[ANGULAR_ACCELERATION, 0], motion[ANGULAR_ACCELERATION, 1], motion[ANGULAR_ACCELERATION, 2]
-    t0, t1, t2 = _cross(w0, w1, w2, r0, r1, r2)
-    c0, c1, c2 = _cross(w0, w1, w2, t0, t1, t2)
-    a0, a1, a2 = _cross(e0, e1, e2, r0, r1, r2)
+    t0, t1, t2 = cross(w0, w1, w2, r0, r1, r2)
+    c0, c1, c2 = cross(w0, w1, w2, t0, t1, t2)
+    a0, a1, a2 = cross(e0, e1, e2, r0, r1, r2)
     f0 = motion[ACCELERATION, 0] + a0 + c0 + gravity * up_in_base[0]
     f1 = motion[ACCELERATION, 1] + a1 + c1 + gravity * up_in_base[1]
     f2 = motion[ACCELERATION, 2] + a2 + c2 + gravity * up_in_base[2]
@@ -234,19 +232,19 @@ def predict_platform_readings(
         rate[:] = 0.0
         force[:] = 0.0
         # An error of the rotation turns the axis g and the arm r.
-        rate[3], rate[4], rate[5] = _cross(g0, g1, g2, w0, w1, w2)
+        rate[3], rate[4], rate[5] = cross(g0, g1, g2, w0, w1, w2)
         rate[9], rate[10], rate[11] = g0, g1, g2
-        x0, x1, x2 = _cross(g0, g1, g2, w0, w1, w2)
-        y0, y1, y2 = _cross(x0, x1, x2, w0, w1, w2)
-        z0, z1, z2 = _cross(g0, g1, g2, e0, e1, e2)
-        p0, p1, p2 = _cross(g0, g1, g2, f0, f1, f2)
-        n0, n1, n2 = _cross(r0, r1, r2, y0 + z0, y1 + z1, y2 + z2)
+        x0, x1, x2 = cross(g0, g1, g2, w0, w1, w2)
+        y0, y1, y2 = cross(x0, x1, x2, w0, w1, w2)
+        z0, z1, z2 = cross(g0, g1, g2, e0, e1, e2)
+        p0, p1, p2 = cross(g0, g1, g2, f0, f1, f2)
+        n0, n1, n2 = cross(r0, r1, r2, y0 + z0, y1 + z1, y2 + z2)
         force[3], force[4], force[5] = p0 + n0, p1 + n1, p2 + n2
-        n0, n1, n2 = _cross(r0, r1, r2, x0, x1, x2)
-        o0, o1, o2 = _cross(t0, t1, t2, g0, g1, g2)
+        n0, n1, n2 = cross(r0, r1, r2, x0, x1, x2)
+        o0, o1, o2 = cross(t0, t1, t2, g0, g1, g2)
         force[9], force[10], force[11] = n0 + o0, n1 + o1, n2 + o2
         force[12], force[13], force[14] = g0, g1, g2
-        force[15], force[16], force[17] = _cross(r0, r1, r2, g0, g1, g2)
+        force[15], force[16], force[17] = cross(r0, r1, r2, g0, g1, g2)
 
 
 @kernel

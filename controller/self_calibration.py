@@ -17,8 +17,12 @@ from controller.calibration import Calibration
 from controller.inverse_kinematics import inverse_kinematics
 from controller.mechanism_filter import (
     ALIGNMENT,
+    ALL_ERRORS,
     ERRORS,
     FILTER_STATE,
+    JOINTS,
+    RIG,
+    TILT,
     collect,
     error_gradient,
     error_matrix,
@@ -36,13 +40,12 @@ from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, Pose, rotation_from_vector
 from plant.variables import IMU_COUNT
 
-ALL_ERRORS = IMU_COUNT * ERRORS
-TILT, JOINTS = 2, 6 * LEGS
 LEAST_POSES = 5
 
 _MOST_STEPS = 50
-_SMALL_STEP = 1e-7
+_TILT_STEP = 1e-7
 _LENGTH_STEP = 1e-6
+_EXACT_M = 1e-8
 
 
 class CalibrationError(GoughError, ValueError):
@@ -106,7 +109,7 @@ class Found:
         errors: (7, 21), of the raw IMUs.
         tilt: (2,) [rad], of the base about the axes x and y of {1}.
         joints: (2, 6, 3) [m], what must be added to base and platform joints.
-        covariance: (147, 147), of the errors.
+        covariance: (185, 185), of the errors, the joints and the tilt.
         positions, rotations: (N, 3), (N, 3, 3), of the rests.
         residuals: (N, 7, 6), of the readings.
     """
@@ -121,7 +124,8 @@ class Found:
 
     def calibration(self) -> Calibration:
         """The calibration that undoes the errors."""
-        return Calibration().then(*undo(self.errors), tilt=self.tilt, covariance=self.covariance)
+        of_errors = self.covariance[:ALL_ERRORS, :ALL_ERRORS]
+        return Calibration().then(*undo(self.errors), tilt=self.tilt, joints=self.joints, covariance=of_errors)
 
 
 def undo(errors: Array) -> tuple[Array, Array]:
@@ -149,6 +153,21 @@ class _Rest:
             geometry[()], position, rotation, self._motion, True, self._readings, self._jacobian, self._scratch[()]
         )
         return self._readings.copy(), self._jacobian[:, :, :6].copy()
+
+    def by_rig(self, mechanism: Mechanism, tilt: Array, position: Array, rotation: Array) -> Array:
+        """The derivative (7, 6, 38) of the readings by joints and tilt."""
+        ideal, _ = self(sensor_geometry(mechanism, tilt), position, rotation)
+        by_tilt = np.zeros((IMU_COUNT, READINGS, TILT))
+        for i, step in enumerate(_TILT_STEP * np.eye(TILT)):
+            by_tilt[:, :, i] = (self(sensor_geometry(mechanism, tilt + step), position, rotation)[0] - ideal) / _TILT_STEP
+        # A leg's readings depend on its own joints only.
+        legs, by_joints = np.arange(LEGS), np.zeros((IMU_COUNT, READINGS, 2, LEGS, 3))
+        for side, axis in np.ndindex(2, 3):
+            moves = np.zeros((2, LEGS, 3))
+            moves[side, :, axis] = _LENGTH_STEP
+            moved, _ = self(sensor_geometry(mechanism.moved_joints(moves), tilt), position, rotation)
+            by_joints[legs, :, side, legs, axis] = (moved - ideal)[:LEGS] / _LENGTH_STEP
+        return np.concatenate([by_joints.reshape(IMU_COUNT, READINGS, JOINTS), by_tilt], axis=2)
 
 
 def calibrate_at_rest(mechanism: Mechanism, rests: Rests, prior: Prior = Prior()) -> Found:
@@ -199,7 +218,7 @@ class _Unknowns:
 
 
 class _Problem:
-    """MAP estimation: columns are the poses (6 each), the errors (147), the tilt (2) and, unless exact, the joints (36)."""
+    """MAP estimation: columns are the poses (6 each), the errors (147), and of the rig the joints (3 each) and the tilt (2)."""
 
     def __init__(self, mechanism: Mechanism, rests: Rests, prior: Prior) -> None:
         self._mechanism, self._rests = mechanism, rests
@@ -208,12 +227,17 @@ class _Problem:
         self._weights = 1.0 / np.repeat([prior.reading_rate, prior.reading_force], 3)
         at = 6 * self._count
         self._errors = slice(at, at + ALL_ERRORS)
-        self._tilt = slice(at + ALL_ERRORS, at + ALL_ERRORS + TILT)
-        self._joints = slice(self._tilt.stop, self._tilt.stop + (JOINTS if prior.joints > 0.0 else 0))
+        self._places, joint_of = np.unique(LEGS * np.arange(2)[:, None] + mechanism.distinct_joints(), return_inverse=True)
+        places = len(self._places)
+        # Legs may share a joint: its coordinates are those of both.
+        self._rig_of = np.zeros((RIG, 3 * places + TILT))
+        self._rig_of[:JOINTS, : 3 * places] = np.kron(np.eye(places)[joint_of.ravel()], np.eye(3))
+        self._rig_of[JOINTS:, 3 * places :] = np.eye(TILT)
+        self._rig = slice(self._errors.stop, self._errors.stop + 3 * places + TILT)
         sigmas = [
             prior.error_sigmas(),
+            np.full(3 * places, max(prior.joints, _EXACT_M)),
             np.full(TILT, prior.tilt),
-            np.full(self._joints.stop - self._joints.start, prior.joints),
         ]
         self._prior_weights = 1.0 / np.concatenate(sigmas) ** 2
 
@@ -221,7 +245,7 @@ class _Problem:
         """No errors, and for each rest the pose that explains its forces best."""
         home = self._mechanism.require_home()
         positions, rotations = np.tile(home.position, (self._count, 1)), np.tile(home.rotation, (self._count, 1, 1))
-        geometry = sensor_geometry(self._mechanism, np.zeros(2), np.zeros((2, LEGS, 3)))
+        geometry = sensor_geometry(self._mechanism)
         errors = np.zeros((IMU_COUNT, ERRORS))
         errors[:, :3] = self._rests.readings[:, :, :3].mean(axis=0)
         for n in range(self._count):
@@ -230,9 +254,9 @@ class _Problem:
 
     def linearise(self, x: _Unknowns) -> tuple[float, Array, Array]:
         """The cost, the normal matrix and the right side at some unknowns."""
-        size = self._joints.stop
+        size = self._rig.stop
         matrix, right = np.zeros((size, size)), np.zeros(size)
-        deviations = np.concatenate([x.errors.ravel(), x.tilt, x.joints.ravel()[: self._joints.stop - self._joints.start]])
+        deviations = np.concatenate([x.errors.ravel(), x.joints.reshape(-1, 3)[self._places].ravel(), x.tilt])
         own = slice(self._errors.start, size)
         matrix[own, own] = np.diag(self._prior_weights)
         right[own] = -self._prior_weights * deviations
@@ -269,23 +293,10 @@ class _Problem:
 
     def _readings_rows(self, x: _Unknowns, n: int) -> tuple[Array, Array]:
         """Residuals (7, 6) of the readings of one rest, and the derivatives (7, 6, size) of what is expected."""
-        geometry = sensor_geometry(self._mechanism, x.tilt, x.joints)
-        ideal, by_pose = self._rest(geometry, x.positions[n], x.rotations[n])
-        jacobian = np.zeros((IMU_COUNT, READINGS, self._joints.stop))
-        by_others = np.zeros((IMU_COUNT, READINGS, self._joints.stop - self._tilt.start))
-        for i in range(TILT):
-            tilt = x.tilt.copy()
-            tilt[i] += _SMALL_STEP
-            by_others[:, :, i] = (self._changed(x, n, tilt, x.joints) - ideal) / _SMALL_STEP
-        if self._joints.stop > self._joints.start:
-            for side in range(2):
-                for i in range(3):
-                    joints = x.joints.copy()
-                    joints[side, :, i] += _LENGTH_STEP
-                    # A leg's readings depend on its own joints only.
-                    change = (self._changed(x, n, x.tilt, joints) - ideal) / _LENGTH_STEP
-                    for k in range(LEGS):
-                        by_others[k, :, TILT + (side * LEGS + k) * 3 + i] = change[k]
+        mechanism, pose = self._mechanism.moved_joints(x.joints), (x.positions[n], x.rotations[n])
+        ideal, by_pose = self._rest(sensor_geometry(mechanism, x.tilt), *pose)
+        jacobian = np.zeros((IMU_COUNT, READINGS, self._rig.stop))
+        by_rig = self._rest.by_rig(mechanism, x.tilt, *pose) @ self._rig_of
         gradient, expected = np.zeros(ERRORS), np.empty((IMU_COUNT, READINGS))
         for k in range(IMU_COUNT):
             for sensor in range(2):
@@ -293,35 +304,32 @@ class _Problem:
                 distortion = error_matrix(x.errors[k], sensor)
                 expected[k, part] = distortion @ ideal[k, part] + x.errors[k, part]
                 jacobian[k, part, 6 * n : 6 * n + 6] = distortion @ by_pose[k, part]
-                jacobian[k, part, self._tilt.start :] = distortion @ by_others[k, part]
+                jacobian[k, part, self._rig] = distortion @ by_rig[k, part]
             for m in range(READINGS):
                 error_gradient(x.errors[k], ideal[k], m, gradient)
                 jacobian[k, m, self._errors.start + ERRORS * k : self._errors.start + ERRORS * (k + 1)] = gradient
         return self._rests.readings[n] - expected, jacobian
 
-    def _changed(self, x: _Unknowns, n: int, tilt: Array, joints: Array) -> Array:
-        return self._rest(sensor_geometry(self._mechanism, tilt, joints), x.positions[n], x.rotations[n])[0]
-
     def moved(self, x: _Unknowns, step: Array) -> _Unknowns:
         """The unknowns after a step."""
         poses = step[: 6 * self._count].reshape(-1, 6)
+        rig = self._rig_of @ step[self._rig]
         turned = np.array([rotation_from_vector(turn) @ r for turn, r in zip(poses[:, 3:], x.rotations, strict=True)])
-        joints = x.joints
-        if self._joints.stop > self._joints.start:
-            joints = joints + step[self._joints].reshape(2, LEGS, 3)
         return _Unknowns(
             x.positions + poses[:, :3],
             turned,
             x.errors + step[self._errors].reshape(IMU_COUNT, ERRORS),
-            x.tilt + step[self._tilt],
-            joints,
+            x.tilt + rig[JOINTS:],
+            x.joints + rig[:JOINTS].reshape(2, LEGS, 3),
         )
 
     def found(self, x: _Unknowns, covariance: Array) -> Found:
         """The result."""
         residuals = np.array([self._readings_rows(x, n)[0] for n in range(self._count)])
-        of_errors = covariance[self._errors, self._errors]
-        return Found(x.errors, x.tilt, x.joints, of_errors, x.positions, x.rotations, residuals)
+        spread = np.zeros((ALL_ERRORS + RIG, self._rig.stop - self._errors.start))
+        spread[:ALL_ERRORS, :ALL_ERRORS], spread[ALL_ERRORS:, ALL_ERRORS:] = np.eye(ALL_ERRORS), self._rig_of
+        own = covariance[self._errors.start :, self._errors.start :]
+        return Found(x.errors, x.tilt, x.joints, spread @ own @ spread.T, x.positions, x.rotations, residuals)
 
 
 _HOME_SIGMAS = np.array([5e-5, 5e-5, 5e-5, 2e-4, 2e-4, 2e-4])
@@ -362,15 +370,19 @@ def expected_forces(geometry: Record, position: Array, rotation: Array) -> Array
     return _Rest()(geometry, position, rotation)[0][:, 3:]
 
 
-def pose_covariance(geometry: Record, position: Array, rotation: Array, covariance: Array) -> Array:
-    """The covariance (6, 6) of the pose at rest from seven accelerometers whose IMUs have errors of covariance (147, 147)."""
-    ideal, by_pose = _Rest()(geometry, position, rotation)
-    by_errors, gradient = np.zeros((IMU_COUNT, 3, ALL_ERRORS)), np.zeros(ERRORS)
+def pose_covariance(mechanism: Mechanism, tilt: Array, pose: tuple[Array, Array], covariance: Array) -> Array:
+    """The covariance (6, 6) of a pose at rest from seven accelerometers, if that of the IMUs' errors, the joints and the tilt
+    is `covariance` (185, 185).
+    """
+    rest = _Rest()
+    ideal, by_pose = rest(sensor_geometry(mechanism, tilt), *pose)
+    by_others, gradient = np.zeros((IMU_COUNT, 3, ALL_ERRORS + RIG)), np.zeros(ERRORS)
     for k in range(IMU_COUNT):
         for i in range(3):
             error_gradient(np.zeros(ERRORS), ideal[k], 3 + i, gradient)
-            by_errors[k, i, ERRORS * k : ERRORS * (k + 1)] = gradient
-    gain = np.linalg.pinv(by_pose[:, 3:].reshape(-1, 6)) @ by_errors.reshape(-1, ALL_ERRORS)
+            by_others[k, i, ERRORS * k : ERRORS * (k + 1)] = gradient
+    by_others[:, :, ALL_ERRORS:] = rest.by_rig(mechanism, tilt, *pose)[:, 3:]
+    gain = np.linalg.pinv(by_pose[:, 3:].reshape(-1, 6)) @ by_others.reshape(-1, ALL_ERRORS + RIG)
     found: Array = gain @ covariance @ gain.T
     return found
 
@@ -446,7 +458,7 @@ _GUIDE_SIGMA_S = 0.02
 
 def calibrate_in_motion(
     mechanism: Mechanism, found: Found, samples: Array, rate: float, start: tuple[Pose, Array], fusion: FusionSettings
-) -> Calibration:
+) -> tuple[Calibration, Array]:
     """Improve what was found at rest by a motion.
 
     The filter runs several times, each time linearised at the motion that the last one has found, smoothed to both sides: at
@@ -460,20 +472,34 @@ def calibrate_in_motion(
         start: pose and twist (6,) at the first sample.
         fusion: settings.
 
+    Returns:
+        The calibration, and the covariance (185, 185) of what is left of errors, joints and tilt.
+
     Raises:
         CalibrationError: the filter does not follow the motion.
     """
-    parameters = filter_parameters(fusion, rate, "axes", found.covariance)
-    geometry, used = sensor_geometry(mechanism, found.tilt, found.joints), np.ones((len(samples), IMU_COUNT), np.int64)
     calibration, guide = found.calibration(), None
+    parameters, used = filter_parameters(fusion, rate, "axes", found.covariance), np.ones((len(samples), IMU_COUNT), np.int64)
     for _ in range(_PASSES):
+        geometry = sensor_geometry(mechanism.moved_joints(calibration.joints), calibration.tilt)
         run = track(parameters, geometry, calibration.apply(samples), used, rate, fusion.sensor_delay, start, guide)
         if not (np.isfinite(run.state["errors"]).all() and np.isfinite(run.positions).all()):
             raise CalibrationError("the whole-mechanism filter does not follow the motion: check the calibration at rest")
-        calibration = calibration.then(*undo(run.state["errors"]))
+        rig = run.state["rig"]
+        calibration = calibration.then(
+            *undo(run.state["errors"]),
+            joints=calibration.joints + rig[:JOINTS].reshape(2, LEGS, 3),
+            tilt=calibration.tilt + rig[JOINTS:],
+        )
         guide = _smoothed(run.motions, _GUIDE_SIGMA_S * rate)
-    kept = slice(MOTION_STATES, MOTION_STATES + ALL_ERRORS)
-    return replace(calibration, covariance=run.state["covariance"][kept, kept].copy())
+    covariance: Array = run.state["covariance"][MOTION_STATES:, MOTION_STATES:].copy()
+    of_rig = covariance.copy()
+    of_rig[:ALL_ERRORS] = of_rig[:, :ALL_ERRORS] = 0.0
+    home = mechanism.require_home()
+    floor = pose_covariance(
+        mechanism.moved_joints(calibration.joints), calibration.tilt, (home.position, home.rotation), of_rig
+    )
+    return replace(calibration, covariance=covariance[:ALL_ERRORS, :ALL_ERRORS], floor=floor), covariance
 
 
 def _smoothed(motions: Array, sigma: float) -> Array:

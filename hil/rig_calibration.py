@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from controller.calibration import Calibration, save_calibration
+from controller.mechanism_filter import JOINTS, TILT
 from controller.readings import sensor_geometry
 from controller.self_calibration import (
     CalibrationError,
@@ -122,8 +123,8 @@ def calibrate_rig(
         calibration = found.calibration()
     records = _run(config, "shaking", SHAKING_S, calibration, _part(progress, done / whole, SHAKING_S / whole))
     samples, start = data.motion(records, found)
-    calibration = calibrate_in_motion(mechanism, found, samples, config.rate, start, fusion)
-    summary = data.summary(found, calibration, prior)
+    calibration, covariance = calibrate_in_motion(mechanism, found, samples, config.rate, start, fusion)
+    summary = data.summary(found, calibration, covariance, prior)
     about = {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "version": version("gough"),
@@ -185,32 +186,34 @@ class _Data:
         last = max(rests[0].stop - round(_MEAN_S * self._rate), 1)
         first = max(last - round(_SETTLED_S * self._rate), 0)
         mean = found.calibration().apply(samples[first:last].mean(axis=0))
-        geometry = sensor_geometry(self._mechanism, found.tilt, found.joints)
+        geometry = sensor_geometry(self._mechanism.moved_joints(found.joints), found.tilt)
         pose = Pose(*fit_pose(geometry, mean[1], self._mechanism.require_home()))
         return samples[last:], (pose, np.zeros(6))
 
-    def summary(self, found: Found, calibration: Calibration, prior: Prior) -> dict[str, Any]:
+    def summary(self, found: Found, calibration: Calibration, covariance: Array, prior: Prior) -> dict[str, Any]:
         """The figures: residuals of the forces at rest, and how well poses at rest are known, as predicted and, where the truth
         is known, in fact; before, with the calibration from the rests, and with that from the motion, too.
         """
-        nominal, tilted = sensor_geometry(self._mechanism), sensor_geometry(self._mechanism, found.tilt, found.joints)
-        cases: dict[str, tuple[Calibration, Record, Any]] = {
-            "before": (Calibration(), nominal, np.diag(prior.error_sigmas() ** 2)),
-            "rests": (found.calibration(), tilted, found.covariance),
-            "motion": (calibration, tilted, calibration.covariance),
+        unknown = np.concatenate([prior.error_sigmas(), np.full(JOINTS, prior.joints), np.full(TILT, prior.tilt)])
+        cases = {
+            "before": (Calibration(), np.diag(unknown**2)),
+            "rests": (found.calibration(), found.covariance),
+            "motion": (calibration, covariance),
         }
         figures: dict[str, Any] = {"rests": len(self.readings), "residual_mg": {}, "predicted": {}, "true": {}}
-        for name, (each, geometry, covariance) in cases.items():
+        for name, (each, left_over) in cases.items():
+            mechanism = self._mechanism.moved_joints(each.joints)
+            geometry = sensor_geometry(mechanism, each.tilt)
             poses = [fit_pose(geometry, forces, self._mechanism.require_home()) for forces in self._forces(each)]
             left = [forces - expected_forces(geometry, *pose) for forces, pose in zip(self._forces(each), poses, strict=True)]
             # Of twenty-one components six have gone into the pose.
             figures["residual_mg"][name] = float(np.sqrt(np.mean(np.square(left)) * 21.0 / 15.0)) / MILLI_G
-            of_poses = np.array([pose_covariance(geometry, *pose, covariance) for pose in poses])
+            of_poses = np.array([pose_covariance(mechanism, each.tilt, pose, left_over) for pose in poses])
             figures["predicted"][name] = _rms_of(of_poses.mean(axis=0))
             if np.isfinite(self._truth).all():
                 figures["true"][name] = self._true_errors(poses)
             figures["weakest"] = weakest_direction(of_poses.mean(axis=0), self._mechanism)
-        figures["tilt"] = found.tilt.tolist()
+        figures["tilt"] = calibration.tilt.tolist()
         return figures
 
     def _forces(self, calibration: Calibration) -> Array:

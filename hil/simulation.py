@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.calibration import load_calibration
+from controller.calibration import Calibration, load_calibration
 from controller.cycle import ALL_IMUS, OK, STATE, check_rate, cycle_parameters
 from controller.direct_kinematics import poses_from_lengths
 from controller.fusion import point_legs
@@ -59,6 +59,7 @@ class SimulationConfig:
         hold: how long the brakes hold first [s]; None for what the mechanism's settings say.
         plant: an FMU to use instead of the one that gough builds.
         imus: which IMUs there are, 0-5 on the legs and 6 on the platform.
+        joint_error: of each coordinate of the plant's joints, which the controller does not know: standard deviation [m].
     """
 
     mechanism: str = "hexapod"
@@ -72,6 +73,7 @@ class SimulationConfig:
     hold: float | None = None
     plant: str | None = None
     imus: tuple[int, ...] = ALL_IMUS
+    joint_error: float = 0.0
 
     def __post_init__(self) -> None:
         check_rate(self.rate)
@@ -218,7 +220,9 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
     Raises:
         GoughError: something in the configuration cannot be used.
     """
-    mechanism = load_spatial(config.mechanism)
+    nominal = load_spatial(config.mechanism)
+    calibration = Calibration() if config.calibration is None else load_calibration(config.calibration)
+    mechanism = nominal.moved_joints(calibration.joints)
     target = load_target(config.target, mechanism, config.duration)
     period = 1.0 / config.rate
     model = load_imu(config.imu)
@@ -226,7 +230,6 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
     control = control_settings(mechanism, **({} if config.hold is None else {"hold": config.hold}))
     if not HOLD_RANGE_S[0] <= control.hold <= HOLD_RANGE_S[1]:
         raise InputError(f"hold is {control.hold:g} s; the estimate settles in {HOLD_RANGE_S[0]:g} to {HOLD_RANGE_S[1]:g} s")
-    calibration = None if config.calibration is None else load_calibration(config.calibration)
     fusion = sensor_settings(mechanism, model)
     parameters = cycle_parameters(mechanism, config.rate, control, fusion, config.imus, FUSIONS[config.fusion], calibration)
     count = int(parameters["hold_cycles"]) + round(config.duration * config.rate)
@@ -237,7 +240,8 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         )
     plan(mechanism, load_target("hold", mechanism, 0.1), 0.1)
     fmu = default_fmu() if config.plant is None else Path(config.plant)
-    with FmuPlant(fmu, mechanism.plant_parameters(target.start), period) as plant:
+    built = nominal.built(config.joint_error, config.seed)
+    with FmuPlant(fmu, built.plant_parameters(target.start), period) as plant:
         began = time.perf_counter()
         reference = plan(mechanism, target, config.duration)
         loop = PreparedLoop(

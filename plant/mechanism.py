@@ -6,14 +6,14 @@ shared joint is a repeated row. The two arrays alone are enough for kinematics.
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from plant.errors import InputError, UnknownNameError, UnreachableError
 from plant.planar import SAME_JOINT_M, PlanarMechanism, check_legs_differ, check_tables, checked_stroke, planar_from_document
@@ -22,6 +22,7 @@ from plant.pose import (
     Pose,
     checked_array,
     checked_rotation,
+    checked_seed,
     checked_unit,
     numbers,
     quaternion_from_rotation,
@@ -59,6 +60,9 @@ class Limits:
 
 _NOMINAL_HEIGHT = 7.0 / 6.0
 """Height of a nominal home over the base's radius."""
+
+_BUILDING = 1
+"""Keeps the joint errors apart from whatever else a seed draws."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +162,30 @@ class Mechanism:
         z = self.home_directions - np.sum(self.home_directions * x, axis=1, keepdims=True) * x
         z = z / np.linalg.norm(z, axis=1, keepdims=True)
         return np.stack([x, np.cross(z, x), z], axis=2)
+
+    def moved_joints(self, moves: Array) -> "Mechanism":
+        """The same mechanism with its base and platform joints moved by (2, 6, 3) [m]."""
+        base, platform = self.base_joints + moves[0], self.platform_joints + moves[1]
+        _check_joints(base, platform)
+        return replace(self, base_joints=base, platform_joints=platform)
+
+    def distinct_joints(self) -> NDArray[np.int64]:
+        """(2, 6): for base and platform, the first leg that has the same joint as each leg."""
+        joints = np.stack([self.base_joints, self.platform_joints])
+        apart = np.linalg.norm(joints[:, :, None] - joints[:, None], axis=3)
+        return np.argmax(apart < SAME_JOINT_M, axis=2)
+
+    def built(self, joint_error: float, seed: int) -> "Mechanism":
+        """The mechanism as a workshop would build it, each joint's coordinates off by a standard deviation [m].
+
+        Raises:
+            InputError: the joint error is negative or not below a tenth of the base's radius.
+        """
+        most = 0.1 * float(np.linalg.norm(self.base_joints - self.base_joints.mean(axis=0), axis=1).max())
+        if not 0.0 <= joint_error < most:
+            raise InputError(f"the joint error is {1e3 * joint_error:g} mm; it must be at least 0 and below {1e3 * most:g} mm")
+        moves = joint_error * np.random.default_rng([checked_seed(seed), _BUILDING]).standard_normal((2, LEGS, 3))
+        return self.moved_joints(np.take_along_axis(moves, self.distinct_joints()[:, :, None], axis=1))
 
     def check_lengths(self, lengths: Array, what: str) -> None:
         """Check leg lengths (..., 6) [m] against the stroke.
