@@ -38,7 +38,7 @@ class Calibration:
         offset: (3, 7, 3) [rad/s, m/s^2, uT].
         tilt: (2,) [rad], by which the vertical is turned about the axes x and y of {1}.
         joints: (2, 6, 3) [m], what must be added to the mechanism's base and platform joints.
-        floor: (6, 6), covariance of the pose at home, along [m] and about [rad] the axes of {1}, that tilt and joints leave.
+        floor: (2,) [m, rad], standard deviations of position and rotation that tilt and joints leave.
         covariance: (147, 147), of what errors are left, in the order of `controller.mechanism_filter.ERROR_NAMES` for each IMU;
             None if it is not known.
         about: what is worth knowing: date, residuals, where the data came from.
@@ -48,7 +48,7 @@ class Calibration:
     offset: Array = field(default_factory=lambda: np.zeros((3, IMU_COUNT, 3)))
     tilt: Array = field(default_factory=lambda: np.zeros(2))
     joints: Array = field(default_factory=lambda: np.zeros((2, LEGS, 3)))
-    floor: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    floor: Array = field(default_factory=lambda: np.zeros(2))
     covariance: Array | None = None
     about: dict[str, Any] = field(default_factory=dict)
 
@@ -115,7 +115,7 @@ def load_calibration(path: Path | str) -> Calibration:
     changes: dict[str, Any] = {}
     if "base" in document:
         changes["tilt"] = checked_array(document["base"].get("tilt", (0.0, 0.0)), (2,), f"{path}: base.tilt")
-        changes["floor"] = checked_array(document["base"].get("floor", np.zeros((6, 6))), (6, 6), f"{path}: base.floor")
+        changes["floor"] = checked_array(document["base"].get("floor", (0.0, 0.0)), (2,), f"{path}: base.floor")
     if "joints" in document:
         sides = [document["joints"].get(side, np.zeros((LEGS, 3))) for side in _SIDES]
         moves = [checked_array(moved, (LEGS, 3), f"{path}: joints.{side}") for side, moved in zip(_SIDES, sides, strict=True)]
@@ -165,7 +165,7 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
     lines += ["", "[about]", *(f"{name} = {_toml(value)}" for name, value in calibration.about.items())]
     lines += [
         "",
-        "# By which the vertical is turned about x and y, in rad, and the covariance of the pose that tilt and joints leave.",
+        "# By which the vertical is turned about x and y, in rad; what tilt and joints leave of the pose, in m and rad.",
         "[base]",
         f"tilt = {_toml(calibration.tilt.tolist())}",
         f"floor = {_toml(calibration.floor.tolist())}",

@@ -74,14 +74,14 @@ FILTER_PARAMETERS = np.dtype(
         ("bias_walk", np.float64, 2),
         ("variance", np.float64, 2),
         ("prior", np.float64, (ALL_ERRORS + RIG, ALL_ERRORS + RIG)),
-        ("floor", np.float64, (6, 6)),
+        ("floor", np.float64, 2),
     ],
     align=True,
 )
 """Samples of a window; estimated errors of an IMU, 0 for no filter, and of the rig; time constant of the motion at which the
 Jacobian is taken, infinite if that is set from outside; spectral densities of the platform's jerk (linear, angular)
 and of the biases' walks (gyroscope, accelerometer); variances of one sample (rate, force); the covariance of these errors;
-and that of the pose which is left because the rig's are not estimated."""
+and the variances of position and rotation that are left because the rig's are not estimated."""
 
 FILTER_STATE = np.dtype(
     [
@@ -90,6 +90,7 @@ FILTER_STATE = np.dtype(
         ("position", np.float64, 3),
         ("rotation", np.float64, (3, 3)),
         ("motion", np.float64, (4, 3)),
+        ("low_passed", np.float64, (2, 4, 3)),
         ("smooth_motion", np.float64, (4, 3)),
         ("errors", np.float64, (IMU_COUNT, ERRORS)),
         ("rig", np.float64, RIG),
@@ -98,7 +99,7 @@ FILTER_STATE = np.dtype(
         ("known_position", np.float64, 3),
         ("known_rotation", np.float64, (3, 3)),
         ("known_motion", np.float64, (4, 3)),
-        ("known_covariance", np.float64, (6, 6)),
+        ("known_covariance", np.float64, (MOTION_STATES, MOTION_STATES)),
         ("sum", np.float64, (IMU_COUNT, READINGS)),
         ("sum_time", np.float64),
         ("samples", np.int64, IMU_COUNT),
@@ -140,7 +141,7 @@ def filter_parameters(
         errors: a key of `BLOCKS`; None for no filter.
         covariance: (147, 147), of the errors that a calibration has left, or (185, 185), of joints and tilt, too, which are
             estimated then; None for what the settings say.
-        floor: (6, 6), covariance of the pose that joints and tilt leave; None if they are exact.
+        floor: (2,) [m, rad], standard deviations of position and rotation that joints and tilt leave; None if they are exact.
 
     Raises:
         UnknownNameError: no such block of errors.
@@ -171,7 +172,7 @@ def filter_parameters(
             fusion.mechanism_accelerometer_noise**2 * rate / 2.0,
         ),
         "prior": prior,
-        "floor": np.zeros((6, 6)) if floor is None else floor,
+        "floor": np.zeros(2) if floor is None else floor**2 / 3.0,
     }
     for name, value in values.items():
         parameters[name] = value
@@ -201,6 +202,7 @@ def start_filter(parameters: Record, state: Record, time: float, position: Array
     for i in range(3):
         f.motion[VELOCITY, i] = twist[i]
         f.motion[RATE, i] = twist[3 + i]
+    f.low_passed[:] = f.motion
     f.smooth_motion[:] = f.motion
     f.errors[:] = 0.0
     f.rig[:] = 0.0
@@ -227,7 +229,7 @@ def start_filter(parameters: Record, state: Record, time: float, position: Array
             f.covariance[states - RIG + i, states - RIG + j] = p.prior[ALL_ERRORS + i, ALL_ERRORS + j]
     f.row = -1
     f.collected = 0
-    _publish(parameters, state)
+    _publish(state)
 
 
 @kernel
@@ -369,7 +371,10 @@ def _predict(parameters: Record, state: Record, period: float) -> None:
     share = t / (t + p.smoothing)
     for block in range(4):
         for i in range(3):
-            f.smooth_motion[block, i] += share * (x[block, i] - f.smooth_motion[block, i])
+            f.low_passed[0, block, i] += share * (x[block, i] - f.low_passed[0, block, i])
+            f.low_passed[1, block, i] += share * (f.low_passed[0, block, i] - f.low_passed[1, block, i])
+            # Low-passed once and twice, these have one and two lags.
+            f.smooth_motion[block, i] = 2.0 * f.low_passed[0, block, i] - f.low_passed[1, block, i]
     # theta+ = (I + skew(turn)) theta + t d_omega + t^2/2 d_alpha, first by rows and then by columns.
     states = _states(p)
     r0, r1, r2 = f.turn[0], f.turn[1], f.turn[2]
@@ -545,7 +550,7 @@ def _end_update(parameters: Record, state: Record) -> None:
             f.errors[k, i] += f.change[MOTION_STATES + k * p.errors + i]
     for i in range(p.rig):
         f.rig[i] += f.change[_states(p) - RIG + i]
-    _publish(parameters, state)
+    _publish(state)
 
 
 @kernel
@@ -567,12 +572,27 @@ def extrapolate(state: Record, time: float, position: Array, rotation: Array, tw
 
 
 @kernel
-def _publish(parameters: Record, state: Record) -> None:
+def extrapolate_covariance(parameters: Record, state: Record, time: float, covariance: Array) -> None:
+    """Write the covariance (6, 6) of the pose carried to `time`, with what is left because the rig's errors are not estimated."""
+    p, f = parameters, state
+    t = time - f.known_time
+    half, c = 0.5 * t * t, f.known_covariance
+    for i in range(6):
+        for j in range(6):
+            near = c[i, j] + t * c[i, 6 + j] + half * c[i, 12 + j]
+            rate = c[6 + i, j] + t * c[6 + i, 6 + j] + half * c[6 + i, 12 + j]
+            acceleration = c[12 + i, j] + t * c[12 + i, 6 + j] + half * c[12 + i, 12 + j]
+            covariance[i, j] = near + t * rate + half * acceleration
+        covariance[i, i] += p.jerk[i // 3] * t**5 / 20.0 + p.floor[i // 3]
+
+
+@kernel
+def _publish(state: Record) -> None:
     f = state
     f.known_time = f.time
     f.known_position[:] = f.position
     f.known_rotation[:] = f.rotation
     f.known_motion[:] = f.motion
-    for i in range(6):
-        for j in range(6):
-            f.known_covariance[i, j] = f.covariance[i, j] + parameters.floor[i, j]
+    for i in range(MOTION_STATES):
+        for j in range(MOTION_STATES):
+            f.known_covariance[i, j] = f.covariance[i, j]

@@ -27,6 +27,7 @@ from controller.mechanism_filter import (
     error_gradient,
     error_matrix,
     extrapolate,
+    extrapolate_covariance,
     filter_parameters,
     start_filter,
     step_filter,
@@ -441,18 +442,21 @@ def _track(
     twist, acceleration = np.zeros(6), np.zeros(6)
     for i in range(samples.shape[0]):
         if guide.shape[0] > 0:
-            state.smooth_motion[:] = guide[i]
+            state.low_passed[:] = guide[i]
         if i > 0:
             collect(state, samples[i], used[i], i * period - delay)
             step_filter(parameters, geometry, state)
         extrapolate(state, i * period, positions[i], rotations[i], twist, acceleration)
-        covariances[i] = state.known_covariance
+        extrapolate_covariance(parameters, state, i * period, covariances[i])
         for j in range(3):
             motions[i, 0, j], motions[i, 1, j] = twist[j], twist[3 + j]
             motions[i, 2, j], motions[i, 3, j] = acceleration[j], acceleration[3 + j]
 
 
 _PASSES = 3
+_CAUTION = 1.6
+"""What the model leaves out is the same in every swing and does not average out as noise does: so many times the noise."""
+
 _GUIDE_SIGMA_S = 0.02
 
 
@@ -479,7 +483,10 @@ def calibrate_in_motion(
         CalibrationError: the filter does not follow the motion.
     """
     calibration, guide = found.calibration(), None
-    parameters, used = filter_parameters(fusion, rate, "axes", found.covariance), np.ones((len(samples), IMU_COUNT), np.int64)
+    noises = ("platform_jerk", "platform_angular_jerk", "mechanism_gyroscope_noise", "mechanism_accelerometer_noise")
+    cautious = replace(fusion, **{name: _CAUTION * getattr(fusion, name) for name in noises})
+    parameters = filter_parameters(cautious, rate, "axes", found.covariance)
+    used = np.ones((len(samples), IMU_COUNT), np.int64)
     for _ in range(_PASSES):
         geometry = sensor_geometry(mechanism.moved_joints(calibration.joints), calibration.tilt)
         run = track(parameters, geometry, calibration.apply(samples), used, rate, fusion.sensor_delay, start, guide)
@@ -493,13 +500,19 @@ def calibrate_in_motion(
         )
         guide = _smoothed(run.motions, _GUIDE_SIGMA_S * rate)
     covariance: Array = run.state["covariance"][MOTION_STATES:, MOTION_STATES:].copy()
-    of_rig = covariance.copy()
-    of_rig[:ALL_ERRORS] = of_rig[:, :ALL_ERRORS] = 0.0
-    home = mechanism.require_home()
-    floor = pose_covariance(
-        mechanism.moved_joints(calibration.joints), calibration.tilt, (home.position, home.rotation), of_rig
+    # Of the errors if the rig's were known, and what the rig's add.
+    errors, across, rig = (
+        covariance[:ALL_ERRORS, :ALL_ERRORS],
+        covariance[ALL_ERRORS:, :ALL_ERRORS],
+        covariance[ALL_ERRORS:, ALL_ERRORS:],
     )
-    return replace(calibration, covariance=covariance[:ALL_ERRORS, :ALL_ERRORS], floor=floor), covariance
+    conditional, of_rig = errors - across.T @ np.linalg.pinv(rig, rcond=1e-12, hermitian=True) @ across, covariance.copy()
+    of_rig[:ALL_ERRORS, :ALL_ERRORS] -= conditional
+    built = mechanism.moved_joints(calibration.joints)
+    poses = zip(found.positions, found.rotations, strict=True)
+    variances = np.diag(np.mean([pose_covariance(built, calibration.tilt, pose, of_rig) for pose in poses], axis=0))
+    floor = np.sqrt(variances.reshape(2, 3).sum(axis=1))
+    return replace(calibration, covariance=conditional, floor=floor), covariance
 
 
 def _smoothed(motions: Array, sigma: float) -> Array:

@@ -76,10 +76,10 @@ class FusionSettings:
     sensor_delay: float = 0.0
     gyroscope_range: float = radians(250.0)
     accelerometer_range: float = 4.0 * STANDARD_GRAVITY
-    platform_jerk: float = 17.3
-    platform_angular_jerk: float = 100.0
-    mechanism_gyroscope_noise: float = radians(0.0085)
-    mechanism_accelerometer_noise: float = 0.0124
+    platform_jerk: float = 6.0
+    platform_angular_jerk: float = 35.0
+    mechanism_gyroscope_noise: float = radians(0.005)
+    mechanism_accelerometer_noise: float = 0.004
     accelerometer_bias_walk: float = 1e-5
     accelerometer_bias_sigma: float = 0.015
     scale_sigma: float = 1e-3

@@ -20,6 +20,7 @@ from controller.cycle import ALL_IMUS, STATE, check_rate, cycle_parameters
 from controller.direct_kinematics import solve_batch
 from controller.fusion import calibrate, find_pose, fuse_legs, fuse_mechanism, fuse_platform, improve_pose
 from controller.leg_filter import leg_direction, start_leg
+from controller.mechanism_filter import extrapolate_covariance
 from controller.settings import control_settings, sensor_settings
 from hil.clock import now
 from hil.simulation import FUSIONS, filterpy_legs
@@ -238,7 +239,7 @@ def _follow(
         fuse_mechanism(parameters, state, True)
         ns[2, i] = ns[1, i] + now(timespec) - began
         positions[2, i], rotations[2, i] = s.position, s.rotation
-        covariances[i] = s.filter.known_covariance
+        extrapolate_covariance(parameters[()].filter, s.filter, s.cycle * parameters[()].period, covariances[i])
         s.cycle += 1
 
 

@@ -29,6 +29,7 @@ from controller.cycle import (
 )
 from controller.fusion import calibrate, find_pose, fuse_legs, fuse_mechanism, fuse_platform, improve_pose
 from controller.least_squares import RANK_TOLERANCE, factor_cholesky, invert_cholesky
+from controller.mechanism_filter import extrapolate_covariance
 from hil.clock import FREE, REAL, finish, new_clock, now, start, wait
 from plant.compiled import Record, kernel
 from plant.fmu import CALLS, advance, read_imus, read_truth, write_command, write_drive_mode
@@ -489,7 +490,8 @@ def _note(
             record.residuals[k, i] = s.directions[k, i] - s.predicted[k, i] if s.leg_used[k] != 0.0 else np.nan
     w.factor[:] = s.information
     if s.filter_trusted != 0:
-        record.covariance[:] = s.filter.known_covariance
+        extrapolate_covariance(p.filter, s.filter, s.cycle * p.period, w.covariance)
+        record.covariance[:] = w.covariance
     elif factor_cholesky(w.factor):
         invert_cholesky(w.factor, w.covariance)
         record.covariance[:] = w.covariance
