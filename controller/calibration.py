@@ -106,7 +106,7 @@ def load_calibration(path: Path | str) -> Calibration:
         imu = name.removeprefix("imu_")
         if not (name.startswith("imu_") and imu.isdigit() and int(imu) < IMU_COUNT):
             raise InputError(
-                f"{path}: there is no table {name!r} in a calibration; there are imu_0 to imu_6, about, base, joints, covariance"
+                f"{path}: no table {name!r} belongs in a calibration; imu_0 to imu_6, about, base, joints, covariance do"
             )
         for sensor, entries in table.items():
             if sensor not in SENSORS:

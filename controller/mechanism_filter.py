@@ -303,8 +303,8 @@ def _begin_update(parameters: Record, geometry: Record, state: Record) -> None:
 def _find_rig_jacobian(geometry: Record, state: Record) -> None:
     """Derivatives (7, 6, 8) of the readings by base joint, platform joint and tilt, from those by the motion (7, 6, 18).
 
-    A leg vector p + R A - B answers to a move of B like to the opposite one of p; and to one of A like to one of p by R A, of the
-    velocity by omega x R A, and of the acceleration by alpha x R A + omega x (omega x R A). The tilt turns the vertical.
+    A leg vector p + R A - B answers to a move of B like to the opposite one of p; and to one of A like to one of p by R A, of
+    the velocity by omega x R A, and of the acceleration by alpha x R A + omega x (omega x R A). The tilt turns the vertical.
     """
     g, f = geometry, state
     w, alpha = f.smooth_motion[RATE], f.smooth_motion[ANGULAR_ACCELERATION]
@@ -573,7 +573,7 @@ def extrapolate(state: Record, time: float, position: Array, rotation: Array, tw
 
 @kernel
 def extrapolate_covariance(parameters: Record, state: Record, time: float, covariance: Array) -> None:
-    """Write the covariance (6, 6) of the pose carried to `time`, with what is left because the rig's errors are not estimated."""
+    """Write the covariance (6, 6) of the pose carried to `time`, and add what the rig's errors leave that are not estimated."""
     p, f = parameters, state
     t = time - f.known_time
     half, c = 0.5 * t * t, f.known_covariance

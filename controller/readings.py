@@ -81,6 +81,7 @@ def sensor_geometry(mechanism: Mechanism, tilt: ArrayLike = (0.0, 0.0)) -> Recor
 
 @kernel
 def cross(x0: float, x1: float, x2: float, y0: float, y1: float, y2: float) -> tuple[float, float, float]:
+    """The product x x y of two vectors."""
     return x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
 
 
