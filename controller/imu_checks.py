@@ -138,13 +138,18 @@ def _explained(fit: "_Fit", imu: int) -> str:
             f"{_idle(imu)}"
         )
     fitting = [[each for each in _axes() if fit.at(imu, imu, sensor, each.matrix)] for sensor in range(2)]
-    both = [each for each in fitting[ACCELEROMETER] if each in fitting[GYROSCOPE]]
+    plain = _axes()[0]
+    # No mounting mirrors: a sensor that can do without is not blamed.
+    mirrored = plain not in fitting[GYROSCOPE] and plain not in fitting[ACCELEROMETER]
+    both = [
+        each for each in fitting[ACCELEROMETER] if each in fitting[GYROSCOPE] and (mirrored or np.linalg.det(each.matrix) > 0.0)
+    ]
     if both:
         best = min(both, key=lambda each: sum(fit.misfit(imu, imu, sensor, each.matrix) for sensor in range(2)))
         return f"IMU {imu} reads {best.text}: mount it as it should be, or change the axes of both its sensors"
     told = []
     for sensor, name in enumerate(_SENSORS):
-        if _axes()[0] in fitting[sensor]:
+        if plain in fitting[sensor]:
             continue
         if fitting[sensor]:
             best = min(fitting[sensor], key=lambda each: fit.misfit(imu, imu, sensor, each.matrix))

@@ -416,7 +416,7 @@ def _calibrate_imu(options: argparse.Namespace) -> int:
 
 
 def _print_rig_calibration(summary: dict[str, Any]) -> None:
-    from hil.rig_calibration import STAGES, UNTOLD
+    from hil.rig_calibration import STAGES, weak_words
 
     columns = ("residual [mg]", "left out", "predicted [mm, deg]", "halves", "true")
     table = _table(f"{summary['rests']} poses at rest", *columns)
@@ -431,9 +431,8 @@ def _print_rig_calibration(summary: dict[str, Any]) -> None:
     if summary["validated"]:
         print("left out: residual at rests that the calibration had not seen; halves: by how much the poses differ that "
               "calibrations by disjoint halves of the data give")  # fmt: skip
-    print(f"the pose is known least {summary['weakest']}")
-    for name, imus in summary["untold"].items():
-        print(f"hardly told (more than {UNTOLD:g} of what was not known before): {name} of IMU {', '.join(map(str, imus))}")
+    for line in weak_words(summary):
+        print(line)
 
 
 def _mm(metres: float) -> str:

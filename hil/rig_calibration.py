@@ -487,16 +487,35 @@ class _Data:
             biases = [np.linalg.solve(calibration.gain[sensor, imu], calibration.offset[sensor, imu]) for sensor in range(2)]
             (gyroscope_scale, gyroscope_axes, _), (scale, axes, mounting) = parts
             values[imu] = [*biases, scale - 1.0, gyroscope_scale - 1.0, mounting, axes, gyroscope_axes]
-        untold: dict[str, list[int]] = {}
-        for imu, kind, axis in np.argwhere(sigmas > UNTOLD * before).tolist():
-            axes_of = ("xy", "xz", "yz") if ERROR_NAMES[kind].endswith("axes") else ("x", "y", "z")
-            untold.setdefault(f"{ERROR_NAMES[kind]} {axes_of[axis]}", []).append(imu)
+        shares, untold = sigmas / before, dict[str, list[int]]()
+        for imu, kind, axis in np.argwhere(shares > UNTOLD).tolist():
+            untold.setdefault(_constant(kind, axis), []).append(imu)
+        imu, kind, axis = (int(i) for i in np.unravel_index(shares.argmax(), shares.shape))
         return {
             "constants": {
                 name: {"values": values[:, i].tolist(), "sigmas": sigmas[:, i].tolist()} for i, name in enumerate(ERROR_NAMES)
             },
             "untold": untold,
+            "least_told": {"name": _constant(kind, axis), "imu": imu, "share": float(shares.max())},
         }
+
+
+def _constant(kind: int, axis: int) -> str:
+    name = ERROR_NAMES[kind]
+    return f"{name} {(('xy', 'xz', 'yz') if name.endswith('axes') else 'xyz')[axis]}"
+
+
+def weak_words(summary: dict[str, Any]) -> list[str]:
+    """What a calibration knows least, in plain words, from its summary."""
+    least = summary["least_told"]
+    return [
+        f"the pose is known least {summary['weakest']}",
+        *(
+            f"the data hardly told {name} of IMU {', '.join(map(str, imus))}: more than {UNTOLD:g} of its sigma before is left"
+            for name, imus in summary["untold"].items()
+        ),
+        f"the constant known least is {least['name']} of IMU {least['imu']}: {least['share']:.2g} of its sigma before is left",
+    ]
 
 
 def _differences(first: Sequence[tuple[Array, Array]], second: Sequence[tuple[Array, Array]]) -> dict[str, float]:
