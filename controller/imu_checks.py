@@ -11,15 +11,15 @@ from itertools import permutations, product
 import numpy as np
 
 from controller.self_calibration import CalibrationError
-from plant.imu import ACCELEROMETER, GYROSCOPE, STANDARD_GRAVITY
+from plant.imu import ACCELEROMETER, STANDARD_GRAVITY
 from plant.pose import Array, vector_from_rotation
 from plant.variables import IMU_COUNT, PLATFORM_IMU
 
 MOST_TILT = np.radians(15.0)
 """By how much the mean force may be off what is expected, as an angle of gravity [rad]: raw IMUs are off by 8 degrees."""
 
-MOST_MISFIT = 0.6
-"""How much of what the motion changes in a reading may be unexplained, RMS and relative: it is 0.2 of raw IMUs."""
+FAR_BETTER = 0.5
+"""What another place or other axes may leave unexplained, as a share of what the right ones do, to be believed."""
 
 LEAST_MOTION = 0.2
 """How much of the expected motion an IMU must read."""
@@ -30,6 +30,7 @@ LEAST_RATE = np.radians(1.0)
 LEAST_SPREAD = np.radians(3.0)
 """Of the verticals of an IMU over rests [rad]."""
 
+_RIGHT = np.eye(3)
 _SENSORS = ("gyroscope", "accelerometer")
 _GRAVITY_RANGE = (0.7 * STANDARD_GRAVITY, 1.3 * STANDARD_GRAVITY)
 
@@ -108,21 +109,19 @@ def check_places(readings: Array, expected: Array) -> None:
             explains its readings.
     """
     check_motion(expected[:, :, :3])
-    fit = _Fit(readings, expected)
-    wrong = [imu for imu in range(IMU_COUNT) if not all(fit.at(imu, imu, sensor, np.eye(3)) for sensor in range(2))]
-    if not wrong:
-        return
-    places = {imu: place for imu in wrong for place in wrong if imu != place and fit.sits_at(imu, place)}
-    swapped = [(a, b) for a, b in places.items() if places.get(b) == a and a < b]
-    found = [f"IMUs {a} and {b} are swapped: exchange their cables or numbers" for a, b in swapped]
-    for imu in wrong:
-        if any(imu in pair for pair in swapped):
-            continue
-        if imu in places:
-            found.append(f"IMU {imu} sits where IMU {places[imu]} should: put each on its own place")
+    fit, everywhere = _Fit(readings, expected), range(IMU_COUNT)
+    best = [min(everywhere, key=lambda place, imu=imu: fit.left(imu, place)) for imu in everywhere]  # type: ignore[misc]
+    found, moved = [], [imu for imu in everywhere if best[imu] != imu and fit.is_better(imu, fit.left(imu, best[imu]))]
+    for imu in everywhere:
+        place = best[imu]
+        if imu not in moved or not fit.moves(imu):
+            found += _explained(fit, imu)
+        elif place in moved and best[place] == imu:
+            found += [f"IMUs {imu} and {place} are swapped: exchange their cables or numbers"] if imu < place else []
         else:
-            found.append(_explained(fit, imu))
-    raise CalibrationError("; ".join(found))
+            found.append(f"IMU {imu} sits where IMU {place} should: put each on its own place")
+    if found:
+        raise CalibrationError("; ".join(found))
 
 
 def _idle(imu: int) -> str:
@@ -130,69 +129,88 @@ def _idle(imu: int) -> str:
     return f"{place} does not move, or the IMU is not fixed to it"
 
 
-def _explained(fit: "_Fit", imu: int) -> str:
+def _explained(fit: "_Fit", imu: int) -> list[str]:
+    """What is wrong with an IMU on its own place."""
     shares = [fit.share(imu, sensor) for sensor in range(2)]
     if max(shares) < LEAST_MOTION:
-        return (
+        return [
             f"IMU {imu} reads {max(shares):.2g} of the motion that is expected, and at least {LEAST_MOTION:g} is needed: "
             f"{_idle(imu)}"
-        )
-    fitting = [[each for each in _axes() if fit.at(imu, imu, sensor, each.matrix)] for sensor in range(2)]
-    plain = _axes()[0]
+        ]
+    misfits = [[fit.misfit(imu, imu, sensor, each.matrix) for each in _axes()] for sensor in range(2)]
+    best = [_axes()[int(np.argmin(each))] for each in misfits]
+    wrong = [min(each) < FAR_BETTER * each[0] for each in misfits]
+    both = min(_axes(), key=lambda each: fit.left(imu, imu, each.matrix))
+    left = fit.left(imu, imu, both.matrix)
+    alike = FAR_BETTER * left < np.linalg.norm([min(each) for each in misfits])
     # No mounting mirrors: a sensor that can do without is not blamed.
-    mirrored = plain not in fitting[GYROSCOPE] and plain not in fitting[ACCELEROMETER]
-    both = [
-        each for each in fitting[ACCELEROMETER] if each in fitting[GYROSCOPE] and (mirrored or np.linalg.det(each.matrix) > 0.0)
-    ]
-    if both:
-        best = min(both, key=lambda each: sum(fit.misfit(imu, imu, sensor, each.matrix) for sensor in range(2)))
-        return f"IMU {imu} reads {best.text}: mount it as it should be, or change the axes of both its sensors"
+    if fit.is_better(imu, left) and alike and (all(wrong) or both.turned):
+        return [f"IMU {imu} reads {both.text}: mount it as it should be, or change the axes of both its sensors"]
     told = []
     for sensor, name in enumerate(_SENSORS):
-        if plain in fitting[sensor]:
-            continue
-        if fitting[sensor]:
-            best = min(fitting[sensor], key=lambda each: fit.misfit(imu, imu, sensor, each.matrix))
-            told.append(f"the {name} of IMU {imu} reads {best.text}: change its axes")
+        if wrong[sensor]:
+            told.append(f"the {name} of IMU {imu} reads {best[sensor].text}: change its axes")
         elif shares[sensor] < LEAST_MOTION:
             told.append(
                 f"the {name} of IMU {imu} reads {shares[sensor]:.2g} of the changes that are expected, and at least "
                 f"{LEAST_MOTION:g} is needed: it is dead, or its range or unit is another"
             )
-        else:
-            told.append(
-                f"{fit.misfit(imu, imu, sensor, np.eye(3)):.2g} of what the {name} of IMU {imu} should read is unexplained; "
-                f"at most {MOST_MISFIT:g} may be, and no other place or axes explain it: check where it sits, and its unit"
-            )
-    return "; ".join(told)
+    if not told and (tilt := fit.tilt(imu)) > MOST_TILT:
+        told.append(
+            f"gravity at IMU {imu} is {np.degrees(tilt):.3g} deg off what is expected; at most {np.degrees(MOST_TILT):g} "
+            "deg are allowed, and no axes explain it: check how it is mounted, and whether the rig begins at home"
+        )
+    return told
 
 
 class _Fit:
-    """How well readings (N, 7, 6) are explained by what is expected (N, 7, 6) of a place with axes of its own."""
+    """How well readings (N, 7, 6) are explained by what is expected (N, 7, 6) of a place with axes of its own.
+
+    Trends are left out: with the loop open the platform sinks.
+    """
 
     def __init__(self, readings: Array, expected: Array) -> None:
+        trends = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, len(readings)), 3))[0]
+
+        def changes(values: Array) -> Array:
+            flat = values.reshape(len(values), -1)
+            left: Array = (flat - trends @ (trends.T @ flat)).reshape(-1, IMU_COUNT, 2, 3)
+            return left
+
         self._means = [each.mean(axis=0).reshape(IMU_COUNT, 2, 3) for each in (readings, expected)]
-        self._changes = [(each - each.mean(axis=0)).reshape(-1, IMU_COUNT, 2, 3) for each in (readings, expected)]
+        self._changes = [changes(each) for each in (readings, expected)]
 
     def share(self, imu: int, sensor: int) -> float:
         """How much changes in what a sensor reads, relative to what is expected."""
         read, expected = (np.sqrt(np.square(each[:, imu, sensor]).mean()) for each in self._changes)
         return float(read / expected)
 
+    def moves(self, imu: int) -> bool:
+        """Whether both sensors of an IMU read some motion."""
+        return min(self.share(imu, sensor) for sensor in range(2)) >= LEAST_MOTION
+
+    def tilt(self, imu: int) -> float:
+        """By how much gravity is off what is expected [rad]."""
+        read, expected = (each[imu, ACCELEROMETER] / np.linalg.norm(each[imu, ACCELEROMETER]) for each in self._means)
+        return float(np.arccos(np.clip(read @ expected, -1.0, 1.0)))
+
     def misfit(self, imu: int, place: int, sensor: int, axes: Array) -> float:
-        """RMS of what is left of a sensor's changes, relative to what is expected of them."""
+        """RMS of what is left of a sensor's changes, relative to what is expected of them, and of the mean of a force, relative
+        to what is allowed.
+        """
         read, expected = self._changes[0][:, imu, sensor], self._changes[1][:, place, sensor]
-        return float(np.sqrt(np.square(read - expected @ axes.T).mean() / np.square(expected).mean()))
+        changed = np.sqrt(np.square(read - expected @ axes.T).mean() / np.square(expected).mean())
+        mean, expected_mean = (each[at, sensor] for each, at in zip(self._means, (imu, place), strict=True))
+        off = np.linalg.norm(mean - axes @ expected_mean) / (MOST_TILT * STANDARD_GRAVITY) if sensor == ACCELEROMETER else 0.0
+        return float(np.hypot(changed, off))
 
-    def at(self, imu: int, place: int, sensor: int, axes: Array) -> bool:
-        """Whether a sensor reads what a place does."""
-        read, expected = (each[at, sensor] for each, at in zip(self._means, (imu, place), strict=True))
-        off = float(np.linalg.norm(read - axes @ expected)) if sensor == ACCELEROMETER else 0.0
-        return off < 2.0 * np.sin(0.5 * MOST_TILT) * STANDARD_GRAVITY and self.misfit(imu, place, sensor, axes) < MOST_MISFIT
+    def left(self, imu: int, place: int, axes: Array = _RIGHT) -> float:
+        """What is left of both sensors."""
+        return float(np.linalg.norm([self.misfit(imu, place, sensor, axes) for sensor in range(2)]))
 
-    def sits_at(self, imu: int, place: int) -> bool:
-        """Whether an IMU reads what another place does."""
-        return all(self.at(imu, place, sensor, np.eye(3)) for sensor in range(2))
+    def is_better(self, imu: int, left: float) -> bool:
+        """Whether that is far better than the right place with the right axes."""
+        return left < FAR_BETTER * self.left(imu, imu)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,6 +219,11 @@ class _Axes:
 
     text: str
     matrix: Array
+
+    @property
+    def turned(self) -> bool:
+        """Whether a mounting can do that, which no mirroring does."""
+        return bool(np.linalg.det(self.matrix) > 0.0)
 
 
 @cache

@@ -89,7 +89,6 @@ def test_recordings_tell_the_same_and_known_poses_less(recorded):
     turned = result.calibration.gain[1] @ imu["gain"][1]
     before = imu["gain"][1]
     skew = [np.linalg.norm(each - np.swapaxes(each, 1, 2)) for each in (before, turned)]
-    print(skew)
     assert skew[1] < 0.7 * skew[0]
 
 
