@@ -36,7 +36,7 @@ _GRAVITY_RANGE = (0.7 * STANDARD_GRAVITY, 1.3 * STANDARD_GRAVITY)
 
 
 def check_alive(samples: Array) -> None:
-    """Check that every IMU reads something that changes, and at rest gravity.
+    """Check that no IMU stands still while others do not, and that each reads gravity.
 
     Args:
         samples: (N, 3, 7, 3), raw, at rest.
@@ -44,12 +44,15 @@ def check_alive(samples: Array) -> None:
     Raises:
         CalibrationError: one does not; the message names it.
     """
+    stands = (samples[:, :2] == samples[0, :2]).all(axis=(0, 1, 3))
     for imu in range(IMU_COUNT):
         own = samples[:, :2, imu]
         if not np.isfinite(own).all():
             raise CalibrationError(f"IMU {imu} reads what is no number: check its cable and its supply")
-        if (own == own[0]).all():
-            raise CalibrationError(f"IMU {imu} is frozen: {len(own)} readings are the same: check its cable and its supply")
+        if stands[imu] and not stands.all():
+            raise CalibrationError(
+                f"IMU {imu} is frozen: {len(own)} readings are the same, and others' are not: check its cable and its supply"
+            )
         force = float(np.linalg.norm(own[:, ACCELEROMETER].mean(axis=0)))
         if not _GRAVITY_RANGE[0] <= force <= _GRAVITY_RANGE[1]:
             raise CalibrationError(

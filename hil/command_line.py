@@ -90,7 +90,7 @@ def _add_motion(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--target",
         default="circle",
-        help="hold, circle, sines, steps, near-rests, rests, shaking, or a CSV file of displacements from home "
+        help="hold, circle, sines, steps, near-rests, rests, shaking, probing, or a CSV file of displacements from home "
         "(time_s,x_m,y_m,z_m,qw,qx,qy,qz)",
     )
     command.add_argument("--duration", type=float, default=10.0, help="of the motion [s]")
@@ -354,11 +354,13 @@ def _calibrate_rig(options: argparse.Namespace) -> int:
     if not 0.0 < options.tilt < 45.0:
         raise InputError(f"--tilt is {options.tilt:g} deg; it must be between 0 and 45")
     knowledge = Knowledge(Prior(tilt=radians(options.tilt)), options.home, options.lengths, options.known_poses)
-    if options.recording:
-        result = calibrate_recordings(options.recording, knowledge)
-    else:
-        config = SimulationConfig(**{name: getattr(options, name) for name in ("mechanism", "rate", "imu", "seed", "plant")})
-        with _progress(f"{config.mechanism} calibrates its IMUs") as progress:
+    config = SimulationConfig(**{name: getattr(options, name) for name in ("mechanism", "rate", "imu", "seed", "plant")})
+    with _progress(
+        "recorded IMUs are calibrated" if options.recording else f"{config.mechanism} calibrates its IMUs"
+    ) as progress:
+        if options.recording:
+            result = calibrate_recordings(options.recording, knowledge)
+        else:
             result = calibrate_rig(config, knowledge, progress)
     save_calibration(options.output, result.calibration)
     _write_json(options.json, result.summary)

@@ -39,6 +39,7 @@ from controller.self_calibration import (
 )
 from controller.settings import sensor_settings
 from controller.target import REST_S
+from hil.loop import HEAD
 from hil.recording import Recording, RecordingError, read
 from hil.simulation import SimulationConfig, SimulationStoppedError, prepared_loop, simulate
 from plant.compiled import Record
@@ -181,7 +182,7 @@ def calibrate_recordings(paths: Sequence[Path], knowledge: Knowledge = Knowledge
     brakes hold in the first.
 
     Args:
-        paths: MCAP files; runs may be cut into several.
+        paths: MCAP files, each from the first cycle of its run on.
         knowledge: besides the readings.
 
     Raises:
@@ -232,7 +233,7 @@ def _run_open(config: SimulationConfig, blind: bool = False) -> Record:
             loop.parameters["droop"] = 0.0
             loop.parameters["plausible_lengths"] = -np.inf, np.inf
         loop.run(len(loop.records))
-        return loop.records[: int(loop.state["cycle"])].copy()
+        return loop.records[: int(loop.link[HEAD])].copy()
 
 
 @contextmanager
@@ -248,9 +249,7 @@ def _run(config: SimulationConfig, progress: Callable[[float], None]) -> Record:
     try:
         return simulate(config, progress).records
     except SimulationStoppedError as error:
-        raise CalibrationError(
-            f"the rig stopped at {config.target}: {error}: check which IMU sits where, and its signs"
-        ) from None
+        raise CalibrationError(f"the rig stopped at {config.target}: {error}: check the IMUs' errors and the drives") from None
 
 
 class _Data:
