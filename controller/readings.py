@@ -16,7 +16,7 @@ from controller.leg_filter import predict_measurement
 from plant.compiled import Record, kernel
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, rotation_from_vector
-from plant.variables import PLATFORM_IMU
+from plant.variables import IMU_COUNT, PLATFORM_IMU
 
 MOTION_STATES = 18
 READINGS = 6
@@ -270,3 +270,17 @@ def predict_readings(
         g.platform_imu_position, g.up_in_base[0], g.gravity, rotation, motion, derive, readings[PLATFORM_IMU],
         jacobian[PLATFORM_IMU],
     )  # fmt: skip
+
+
+def readings_along(geometry: Record, positions: Array, rotations: Array, rate: float) -> Array:
+    """What ideal IMUs read (N, 7, 6) along a motion, positions (N, 3) and rotations (N, 3, 3) at `rate` [Hz]."""
+    turns = np.gradient(rotations, axis=0) @ np.swapaxes(rotations, 1, 2) * rate
+    velocities, rates = np.gradient(positions, axis=0) * rate, turns[:, [2, 0, 1], [1, 2, 0]]
+    motions = np.stack(
+        [velocities, rates, np.gradient(velocities, axis=0) * rate, np.gradient(rates, axis=0) * rate], axis=1
+    )  # fmt: skip
+    readings, unused = np.empty((len(positions), IMU_COUNT, READINGS)), np.empty((IMU_COUNT, READINGS, MOTION_STATES))
+    scratch: Record = np.zeros((), READINGS_SCRATCH)
+    for position, rotation, motion, reading in zip(positions, rotations, motions, readings, strict=True):
+        predict_readings(geometry[()], position, rotation, motion, False, reading, unused, scratch[()])
+    return readings

@@ -86,6 +86,10 @@ class Prior:
         )  # fmt: skip
         return np.tile(np.repeat(each, 3), IMU_COUNT)
 
+    def sigmas(self) -> Array:
+        """(185,), of the errors, the joints and the tilt."""
+        return np.concatenate([self.error_sigmas(), np.full(JOINTS, max(self.joints, _EXACT_M)), np.full(TILT, self.tilt)])
+
 
 @dataclass(frozen=True, eq=False)
 class Rests:
@@ -235,12 +239,8 @@ class _Problem:
         self._rig_of[:JOINTS, : 3 * places] = np.kron(np.eye(places)[joint_of.ravel()], np.eye(3))
         self._rig_of[JOINTS:, 3 * places :] = np.eye(TILT)
         self._rig = slice(self._errors.stop, self._errors.stop + 3 * places + TILT)
-        sigmas = [
-            prior.error_sigmas(),
-            np.full(3 * places, max(prior.joints, _EXACT_M)),
-            np.full(TILT, prior.tilt),
-        ]
-        self._prior_weights = 1.0 / np.concatenate(sigmas) ** 2
+        rig_sigmas = prior.sigmas()[ALL_ERRORS:] @ self._rig_of / self._rig_of.sum(axis=0)
+        self._prior_weights = 1.0 / np.concatenate([prior.error_sigmas(), rig_sigmas]) ** 2
 
     def start(self) -> _Unknowns:
         """No errors, and for each rest the pose that explains its forces best."""

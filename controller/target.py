@@ -245,8 +245,8 @@ def rests(mechanism: Mechanism, duration: float, share: float = 0.8) -> Target:
     )
 
 
-def shaking(mechanism: Mechanism, duration: float) -> Target:
-    """Sines about home on all axes at once, about 0.8 Hz and a few percent apart, as wide as the limits allow."""
+def shaking(mechanism: Mechanism, duration: float, share: float = 1.0) -> Target:
+    """Sines about home on all axes at once, about 0.8 Hz and a few percent apart, at this share of what the limits allow."""
     limits, home = mechanism.require_limits(), mechanism.require_home()
     times = np.arange(0.0, duration + MARGIN_S + SAMPLE_PERIOD_S, SAMPLE_PERIOD_S)
     spread = float(np.linalg.norm(mechanism.platform_joints, axis=1).mean())
@@ -269,13 +269,14 @@ def shaking(mechanism: Mechanism, duration: float) -> Target:
             float(np.abs(np.gradient(rates, SAMPLE_PERIOD_S, axis=0)).max()) / limits.acceleration,
         )
         low, high = (size, high) if use < _SHAKING_SHARE else (low, size)
-    return Target("shaking", times, *at(low))
+    return Target("shaking", times, *at(share * low))
 
 
 _WIDE_MOTIONS: dict[str, Callable[[Mechanism, float], Target]] = {
     "near-rests": partial(rests, share=0.4),
     "rests": rests,
     "shaking": shaking,
+    "probing": partial(shaking, share=0.3),
 }
 """Motions for the calibration, fitted to the limits of the mechanism."""
 

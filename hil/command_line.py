@@ -90,7 +90,7 @@ def _add_motion(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--target",
         default="circle",
-        help="hold, circle, sines, steps, near-rests, rests, shaking, or a CSV file of displacements from home "
+        help="hold, circle, sines, steps, near-rests, rests, shaking, probing, or a CSV file of displacements from home "
         "(time_s,x_m,y_m,z_m,qw,qx,qy,qz)",
     )
     command.add_argument("--duration", type=float, default=10.0, help="of the motion [s]")
@@ -106,6 +106,16 @@ def _add_motion(command: argparse.ArgumentParser) -> None:
         "of both sensors, of the gyroscopes, or with scales and alignments; filterpy: leg filters of filterpy (slow)",
     )
     command.add_argument("--plant", metavar="FILE.fmu", help="FMI 3.0 Co-Simulation FMU to use instead of the built one")
+    _add_joint_error(command)
+
+
+def _add_joint_error(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--joint-error",
+        type=float,
+        default=0.0,
+        help="simulated: standard deviation of each coordinate of the joints from their places [mm]",
+    )
 
 
 def _add_run(commands: Any) -> None:
@@ -145,7 +155,8 @@ def _add_calibrate(commands: Any) -> None:
         "rig",
         help="on the mechanism, from its redundancy",
         description="Calibrate the IMUs on the mechanism: it rests at wide poses, which need not be known, and shakes for "
-        "40 s. Writes bias, scale, axes and mounting of every sensor, with their covariance.",
+        "40 s. Before that it finds out, with the loop open, whether each IMU lives, and sits and is wired as it should be. "
+        "Writes bias, scale, axes and mounting of every sensor, with their covariance.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     rig.add_argument("output", type=Path, metavar="FILE.toml", help="the calibration to write")
@@ -155,7 +166,22 @@ def _add_calibrate(commands: Any) -> None:
     rig.add_argument("--seed", type=int, default=0, help="of the IMUs' imperfections")
     rig.add_argument("--home", action="store_true", help="the rig stands exactly at home when it begins")
     rig.add_argument("--tilt", type=float, default=0.05, help="by how much the base may be off level [deg]")
+    rig.add_argument(
+        "--joints", type=float, default=0.0, help="by how much each coordinate of a joint may be off, then sought, too [mm]"
+    )
+    _add_joint_error(rig)
+    rig.add_argument(
+        "--recording", type=Path, nargs="+", metavar="FILE.mcap",
+        help="recordings of a rig that rested and shook, from which to take mechanism, IMUs, rate and data",
+    )  # fmt: skip
+    rig.add_argument("--lengths", action="store_true", help="the rig measures by how much its lengths change (to 50 um)")
+    rig.add_argument(
+        "--known-poses", action="store_true",
+        help="write the mounting alone, by comparing with the planned poses, as the paper's section 7 has it",
+    )  # fmt: skip
     rig.add_argument("--plant", metavar="FILE.fmu", help="FMI 3.0 Co-Simulation FMU to use instead of the built one")
+    rig.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots")
+    rig.add_argument("--picture", type=Path, metavar="FILE.svg", help="draw the accuracy of each stage")
     _add_json(rig)
     rig.set_defaults(run=_calibrate_rig)
     _add_calibrate_imu(actions)
@@ -335,17 +361,37 @@ def _calibrate_rig(options: argparse.Namespace) -> int:
 
     from controller.calibration import save_calibration
     from controller.self_calibration import Prior
-    from hil.rig_calibration import calibrate_rig
+    from hil.rig_calibration import Knowledge, calibrate_recordings, calibrate_rig
     from hil.simulation import SimulationConfig
 
-    _check_writable(options.output, options.json)
+    _check_writable(options.output, options.json, options.report, options.picture)
     if not 0.0 < options.tilt < 45.0:
         raise InputError(f"--tilt is {options.tilt:g} deg; it must be between 0 and 45")
-    config = SimulationConfig(**{name: getattr(options, name) for name in ("mechanism", "rate", "imu", "seed", "plant")})
-    with _progress(f"{config.mechanism} calibrates its IMUs") as progress:
-        result = calibrate_rig(config, Prior(tilt=radians(options.tilt)), options.home, progress)
+    if not 0.0 <= options.joints <= 10.0:
+        raise InputError(f"--joints is {options.joints:g} mm; it must be between 0 and 10")
+    prior = Prior(tilt=radians(options.tilt), joints=1e-3 * options.joints)
+    knowledge = Knowledge(prior, options.home, options.lengths, options.known_poses)
+    config = SimulationConfig(
+        **{name: getattr(options, name) for name in ("mechanism", "rate", "imu", "seed", "plant")},
+        joint_error=1e-3 * options.joint_error,
+    )
+    with _progress(
+        "recorded IMUs are calibrated" if options.recording else f"{config.mechanism} calibrates its IMUs"
+    ) as progress:
+        if options.recording:
+            result = calibrate_recordings(options.recording, knowledge)
+        else:
+            result = calibrate_rig(config, knowledge, progress)
     save_calibration(options.output, result.calibration)
     _write_json(options.json, result.summary)
+    if options.report:
+        from hil.calibration_report import write_report
+
+        write_report(result, options.report)
+    if options.picture:
+        from hil.calibration_picture import write_picture
+
+        write_picture(result.summary, options.picture)
     _print_rig_calibration(result.summary)
     print(f"written to {options.output}")
     return 0
@@ -392,16 +438,23 @@ def _calibrate_imu(options: argparse.Namespace) -> int:
 
 
 def _print_rig_calibration(summary: dict[str, Any]) -> None:
-    names = {"before": "as they are", "rests": "calibrated at rest", "motion": "and in motion"}
-    table = _table(f"{summary['rests']} poses at rest", "residual [mg]", "predicted [mm]", "[deg]", "true [mm]", "[deg]")
-    for name, label in names.items():
-        cells = [f"{summary['residual_mg'][name]:.3f}"]
-        for kind in ("predicted", "true"):
+    from hil.rig_calibration import STAGES, weak_words
+
+    columns = ("residual [mg]", "left out", "predicted [mm, deg]", "halves", "true")
+    table = _table(f"{summary['rests']} poses at rest", *columns)
+    for name, residual in summary["residual_mg"].items():
+        left_out = summary["validated"].get(name, {}).get("left_out_mg")
+        cells = [f"{residual:.3f}", "" if left_out is None else f"{left_out:.3f}"]
+        for kind in ("predicted", "validated", "true"):
             errors = summary[kind].get(name)
-            cells += ["", ""] if errors is None else [_mm(errors["position_rms"]), _deg(errors["rotation_rms"])]
-        table.add_row(label, *cells)
+            cells.append("" if errors is None else f"{_mm(errors['position_rms'])}, {_deg(errors['rotation_rms'])}")
+        table.add_row(STAGES[name], *cells)
     _print(table)
-    print(f"the pose is known least {summary['weakest']}")
+    if summary["validated"]:
+        print("left out: residual at rests that the calibration had not seen; halves: by how much the poses differ that "
+              "calibrations by disjoint halves of the data give")  # fmt: skip
+    for line in weak_words(summary):
+        print(line)
 
 
 def _mm(metres: float) -> str:
@@ -435,7 +488,7 @@ def _simulate(options: argparse.Namespace) -> int:
 
     _check_writable(options.json, options.report)
     names = ("mechanism", "target", "duration", "rate", "imu", "seed", "fusion", "calibration", "plant", "imus")
-    config = SimulationConfig(**{name: getattr(options, name) for name in names})
+    config = SimulationConfig(**{name: getattr(options, name) for name in names}, joint_error=1e-3 * options.joint_error)
     stopped = None
     with _progress(f"{config.mechanism} follows {config.target}") as progress:
         try:
@@ -486,7 +539,7 @@ def _run(options: argparse.Namespace) -> int:
 
     _check_writable(options.json, options.record)
     names = ("mechanism", "target", "duration", "rate", "imu", "seed", "fusion", "calibration", "plant", "imus")
-    config = SimulationConfig(**{name: getattr(options, name) for name in names})
+    config = SimulationConfig(**{name: getattr(options, name) for name in names}, joint_error=1e-3 * options.joint_error)
     settings = RealTimeSettings(options.priority, options.cpu, options.strict, options.most_missed)
     stopped = None
     with _live_view(config.mechanism, config.target, config.rate) as show:

@@ -23,7 +23,7 @@ from plant.compiled import Record
 from plant.errors import GoughError, InputError, UnknownNameError
 from plant.export import default_fmu
 from plant.fmu import FmuPlant
-from plant.imu import ACCELEROMETER, GYROSCOPE, imu_state, load_imu
+from plant.imu import ACCELEROMETER, GYROSCOPE, RIGHT_WIRING, Wiring, imu_state, load_imu
 from plant.mechanism import LEGS, Mechanism, load_spatial
 from plant.pose import Array, rotation_angle, rotations_from_quaternions
 
@@ -59,6 +59,7 @@ class SimulationConfig:
         hold: how long the brakes hold first [s]; None for what the mechanism's settings say.
         plant: an FMU to use instead of the one that gough builds.
         imus: which IMUs there are, 0-5 on the legs and 6 on the platform.
+        wiring: how they are mounted and wired.
         joint_error: of each coordinate of the plant's joints, which the controller does not know: standard deviation [m].
     """
 
@@ -73,6 +74,7 @@ class SimulationConfig:
     hold: float | None = None
     plant: str | None = None
     imus: tuple[int, ...] = ALL_IMUS
+    wiring: Wiring = RIGHT_WIRING
     joint_error: float = 0.0
 
     def __post_init__(self) -> None:
@@ -226,7 +228,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
     target = load_target(config.target, mechanism, config.duration)
     period = 1.0 / config.rate
     model = load_imu(config.imu)
-    imu = imu_state(model, config.seed, period)
+    imu = imu_state(model, config.seed, period, config.wiring)
     control = control_settings(mechanism, **({} if config.hold is None else {"hold": config.hold}))
     if not HOLD_RANGE_S[0] <= control.hold <= HOLD_RANGE_S[1]:
         raise InputError(f"hold is {control.hold:g} s; the estimate settles in {HOLD_RANGE_S[0]:g} to {HOLD_RANGE_S[1]:g} s")

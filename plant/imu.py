@@ -6,6 +6,7 @@ time constant at any rate), delay, range, resolution and dropouts. All noise com
 counter-based generator keyed by (seed, IMU, cycle), so any cycle can be made again on its own.
 """
 
+import re
 from dataclasses import dataclass, fields
 from math import exp, expm1, inf, pi, radians, sqrt
 from typing import Any
@@ -152,11 +153,50 @@ PRESETS = {
 }  # fmt: skip
 
 _LONGEST_DELAY = 32
+_RIGHT_AXES = ("+x+y+z",) * IMU_COUNT
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """How seven IMUs are mounted and wired; by default as they should be.
+
+    Attributes:
+        places: where each sits, 0-5 on the legs and 6 on the platform.
+        gyroscopes, accelerometers: what each reads for its x, y and z, such as "+y-x+z"; 0 for nothing.
+    """
+
+    places: tuple[int, ...] = tuple(range(IMU_COUNT))
+    gyroscopes: tuple[str, ...] = _RIGHT_AXES
+    accelerometers: tuple[str, ...] = _RIGHT_AXES
+
+    def __post_init__(self) -> None:
+        if sorted(self.places) != list(range(IMU_COUNT)):
+            raise InputError(f"the IMUs' places are {self.places}; they must be 0 to {IMU_COUNT - 1} in some order")
+        if {len(self.gyroscopes), len(self.accelerometers)} != {IMU_COUNT}:
+            raise InputError(f"a wiring has axes of {IMU_COUNT} gyroscopes and {IMU_COUNT} accelerometers")
+        for axes in (*self.gyroscopes, *self.accelerometers):
+            axes_matrix(axes)
+
+
+def axes_matrix(axes: str) -> Array:
+    """The matrix (3, 3) that gives the readings of axes such as "+y-x+z", 0 for one that reads nothing.
+
+    Raises:
+        InputError: no such axes.
+    """
+    if not re.fullmatch("([+-][xyz]|0){3}", axes):
+        raise InputError(f"there are no axes {axes!r}; give three such as +y-x+z, 0 for one that reads nothing")
+    units = dict(zip(("+x", "+y", "+z", "-x", "-y", "-z", "0"), (*np.eye(3), *-np.eye(3), np.zeros(3)), strict=True))
+    return np.array([units[axis] for axis in re.findall("[+-].|0", axes)])
+
+
+RIGHT_WIRING = Wiring()
 
 IMU_STATE = np.dtype(
     [
         ("gain", np.float64, (3, IMU_COUNT, 3, 3)),
         ("offset", np.float64, (3, IMU_COUNT, 3)),
+        ("place", np.int64, IMU_COUNT),
         ("noise", np.float64, 3),
         ("drift", np.float64, 2),
         ("smoothing", np.float64, (3, 2)),
@@ -195,7 +235,7 @@ def load_imu(name: str) -> ImuModel:
         raise UnknownNameError(f"no IMU preset {name!r}; there are {', '.join(PRESETS)}") from None
 
 
-def imu_state(model: ImuModel, seed: int, period: float) -> Record:
+def imu_state(model: ImuModel, seed: int, period: float, wiring: Wiring = RIGHT_WIRING) -> Record:
     """Draw the constant errors of seven IMUs and prepare their state for cycles of `period` [s].
 
     Raises:
@@ -221,6 +261,11 @@ def imu_state(model: ImuModel, seed: int, period: float) -> Record:
     delay = round(model.delay / period)
     if delay > _LONGEST_DELAY:
         raise InputError(f"the delay of the IMUs is {delay} cycles; at most {_LONGEST_DELAY} are kept")
+    for kind, axes in ((GYROSCOPE, wiring.gyroscopes), (ACCELEROMETER, wiring.accelerometers)):
+        for imu, matrix in enumerate(map(axes_matrix, axes)):
+            state["gain"][kind, imu] = matrix @ state["gain"][kind, imu]
+            state["offset"][kind, imu] = matrix @ state["offset"][kind, imu]
+    state["place"] = wiring.places
     state["delay"] = delay
     state["magnetometer_every"] = every
     state["dropout"] = model.dropout
@@ -316,7 +361,7 @@ def measure(state: Record, ideal: Array, measurement: Array) -> None:
             stale = magnetic and not fresh_field
             if magnetic and fresh_field and s.noise[kind] > 0.0:
                 _draw(normals, s.cycle, imu, _MAGNETIC, s.seed)
-            gain, signal = s.gain[kind, imu], ideal[kind, imu]
+            gain, signal = s.gain[kind, imu], ideal[kind, s.place[imu]]
             for axis in range(3):
                 smoothed = s.smoothed[kind, imu, axis]
                 if not stale:

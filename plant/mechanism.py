@@ -173,7 +173,8 @@ class Mechanism:
         """(2, 6): for base and platform, the first leg that has the same joint as each leg."""
         joints = np.stack([self.base_joints, self.platform_joints])
         apart = np.linalg.norm(joints[:, :, None] - joints[:, None], axis=3)
-        return np.argmax(apart < SAME_JOINT_M, axis=2)
+        first: NDArray[np.int64] = np.argmax(apart < SAME_JOINT_M, axis=2)
+        return first
 
     def built(self, joint_error: float, seed: int) -> "Mechanism":
         """The mechanism as a workshop would build it, each joint's coordinates off by a standard deviation [m].

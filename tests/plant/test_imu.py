@@ -19,6 +19,7 @@ from plant.imu import (
     PRESETS,
     ImuModel,
     SensorErrors,
+    Wiring,
     imu_state,
     load_imu,
     measure,
@@ -472,3 +473,16 @@ def test_the_rest_of_a_model_is_checked(values: dict[str, float]) -> None:
     (name,) = values
     with pytest.raises(InputError, match=name.split("_")[0]):
         imu_state(ImuModel("odd", **values), 0, PERIOD)  # type: ignore[arg-type]
+
+
+def test_imus_are_wired_as_told():
+    axes = ("+x+y+z",) * 7
+    wiring = Wiring((1, 0, 2, 3, 4, 5, 6), (*axes[:3], "+y-x+z", *axes[4:]), (*axes[:5], "-x-y-z", "0+y+z"))
+    signals = np.random.default_rng(0).normal(size=(1, 3, 7, 3))
+    (read,), right = readings(imu_state(load_imu("ideal"), 0, PERIOD, wiring), signals), signals[0]
+    np.testing.assert_array_equal(read[:, :3], right[:, [1, 0, 2]])
+    np.testing.assert_array_equal(read[0, 3], [right[0, 3, 1], -right[0, 3, 0], right[0, 3, 2]])
+    np.testing.assert_array_equal(read[1, 5:], [-right[1, 5], [0.0, *right[1, 6, 1:]]])
+    for wrong in ({"places": (0, 0, 2, 3, 4, 5, 6)}, {"gyroscopes": axes[:3]}, {"accelerometers": (*axes[:6], "+x+y")}):
+        with pytest.raises(InputError, match=r"places are|has axes of|no axes"):
+            Wiring(**wrong)
