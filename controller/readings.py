@@ -63,7 +63,7 @@ def sensor_geometry(mechanism: Mechanism, tilt: ArrayLike = (0.0, 0.0), joints: 
         joints: (2, 6, 3) [m], what is added to base and platform joints.
     """
     plant = mechanism.plant_parameters()
-    up = rotation_from_vector([*np.asarray(tilt), 0.0]) @ mechanism.up_in_base
+    up = tilt_rotation(tilt) @ mechanism.up_in_base
     moved = np.zeros((2, LEGS, 3)) if joints is None else joints
     values = {
         "base_joints": mechanism.base_joints + moved[0],
@@ -79,6 +79,11 @@ def sensor_geometry(mechanism: Mechanism, tilt: ArrayLike = (0.0, 0.0), joints: 
     for name, value in values.items():
         geometry[name] = value
     return geometry
+
+
+def tilt_rotation(tilt: ArrayLike) -> Array:
+    """The rotation (3, 3) by which a tilt (2,) [rad] about the axes x and y of {1} turns what is fixed in the world."""
+    return rotation_from_vector([*np.asarray(tilt), 0.0])
 
 
 @kernel
