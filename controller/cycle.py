@@ -24,11 +24,12 @@ from controller.fusion import (
 )
 from controller.heading_filter import ERRORS as HEADING_ERRORS
 from controller.heading_filter import STATES as HEADING_STATES
+from controller.heading_filter import field_of
 from controller.inverse_kinematics import jacobian_at, legs_at, sample_workspace
 from controller.least_squares import RANK_TOLERANCE, solve_least_squares
 from controller.mechanism_filter import FILTER_PARAMETERS, FILTER_STATE, filter_parameters
 from controller.pid import step_pid
-from controller.readings import SENSOR_GEOMETRY, sensor_geometry, tilt_rotation
+from controller.readings import SENSOR_GEOMETRY, sensor_geometry
 from controller.reference import STOP_SEGMENTS, evaluate_reference, plan_stop
 from controller.settings import ControlSettings, FusionSettings
 from plant.compiled import Record, kernel
@@ -154,6 +155,7 @@ STATE = np.dtype(
         ("heading_used", np.int64),
         ("field", np.float64, 3),
         ("field_stands", np.int64),
+        ("field_fresh", np.int64),
         ("vector_weights", np.float64, 2),
         ("leg_x", np.float64, (LEGS, 9)),
         ("leg_covariance", np.float64, (LEGS, 9, 9)),
@@ -214,9 +216,9 @@ STATE = np.dtype(
 
 `cycle` counts periods, `missed` those since the last cycle that had none. `sample` is the calibrated measurement. Of each IMU:
 whether it reads the `same` again, how often in a row it `stands` still while others do not, for how long it has been `sound`,
-whether it is used, and the `age` of its filter, all in periods; of the magnetometer's `field`, how long it stands. `twist` is
-velocity and angular velocity in {1}; `vectors`, vertical and horizontal field, and `platform_rate` are seen in {2};
-`information` is the inverse of the covariance of the refined pose (lower triangle).
+whether it is used, and the `age` of its filter, all in periods; of the magnetometer's `field`, how long it stands, and whether
+it is to be taken. `twist` is velocity and angular velocity in {1}; `vectors`, vertical and horizontal field, and
+`platform_rate` are seen in {2}; `information` is the inverse of the covariance of the refined pose (lower triangle).
 
 The whole-mechanism filter is to be started, or trusted, when it is `filter_due`; `offset` is what is left of the way from one
 source of the pose to the other, and the pose in closed form is `found`.
@@ -266,8 +268,7 @@ def cycle_parameters(
     sliding_mass = plant["leg.upper.mass"] + plant["motor.rotor_inertia"] * turns**2
     stroke = mechanism.require_limits().stroke
     margin = _IMPLAUSIBLE_SHARE * (stroke[:, 1] - stroke[:, 0])
-    vectors, horizontal_field = _vectors_in_base(mechanism)
-    magnetometer_rate = min(fusion.magnetometer_rate, rate)
+    field = field_of(mechanism, calibration.tilt)
     gravity = float(np.linalg.norm(plant["gravity"]))
     if gravity < _LEAST_GRAVITY:
         raise InputError(
@@ -278,7 +279,7 @@ def cycle_parameters(
         "hold_cycles": int(np.ceil(control.hold * rate - 1e-9)),
         "geometry": geometry_of(mechanism),
         "sensors": sensor_geometry(mechanism, calibration.tilt),
-        "vectors_in_base": vectors @ tilt_rotation(calibration.tilt).T,
+        "vectors_in_base": field.vectors,
         "imu_present": [imu in imus for imu in ALL_IMUS],
         "magnetometer": magnetometer,
         "section_5": section_5,
@@ -298,12 +299,12 @@ def cycle_parameters(
         "vertical_variance": (fusion.platform_accelerometer_noise / STANDARD_GRAVITY) ** 2 * rate / 2.0,
         "leg_weight": 1.0 / fusion.leg_sigma**2,
         "vertical_weight": 1.0 / fusion.tilt_sigma**2,
-        "field_strength": np.linalg.norm(plant["magnetic_field"]),
-        "field_cycles": round(rate / magnetometer_rate),
-        "heading_variance": fusion.magnetometer_noise**2 * magnetometer_rate / 2.0 / max(horizontal_field, _LEAST_FIELD) ** 2,
+        "field_strength": field.strength,
+        "field_cycles": max(1, round(rate / fusion.magnetometer_rate)),
+        "heading_variance": field.heading_variance(fusion, rate),
         "heading_floor": fusion.heading_sigma**2,
         "acceleration_rate": 1.0 / fusion.acceleration_time,
-        "filter": filter_parameters(fusion, rate, whole, calibration.covariance),
+        "filter": filter_parameters(fusion, rate, whole, calibration.covariance, field if magnetometer else None),
         "filter_start_cycles": round(_FILTER_START_S * rate),
         "filter_settling_cycles": round(_FILTER_SETTLING_S * rate),
         "disagreement": fusion.disagreement,
@@ -340,14 +341,6 @@ def check_rate(rate: float) -> None:
         raise InputError(f"the rate is {rate:g} Hz; it must be {RATE_RANGE_HZ[0]:g} to {RATE_RANGE_HZ[1]:g} Hz")
 
 
-def _vectors_in_base(mechanism: Mechanism) -> tuple[Array, float]:
-    """The vertical and the horizontal direction of the magnetic field (2, 3) in {1}, and that field's strength [uT]."""
-    up, field = mechanism.up_in_base, mechanism.plant.get("magnetic_field", np.zeros(3))
-    horizontal = field - (field @ up) * up
-    strength = float(np.linalg.norm(horizontal))
-    return np.stack([up, horizontal / max(strength, 1e-300)]), strength
-
-
 def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool = False, section_5: bool = False) -> float:
     """Check that these IMUs, and the platform's magnetometer, determine the pose, at home and over the workspace; returns the
     worst conditioning there.
@@ -358,12 +351,12 @@ def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool =
     for imu in imus:
         if imu not in ALL_IMUS:
             raise InputError(f"there is no IMU {imu}; 0 to 5 sit on the legs, 6 on the platform")
-    vectors, horizontal_field = _vectors_in_base(mechanism)
+    field = field_of(mechanism)
     if magnetometer and PLATFORM_IMU not in imus:
         raise InputError("the magnetometer is part of the platform's IMU, which is not there: add IMU 6")
-    if magnetometer and horizontal_field < _LEAST_FIELD:
+    if magnetometer and field.horizontal < _LEAST_FIELD:
         raise InputError(
-            f"the horizontal magnetic field is {horizontal_field:.3g} uT; a heading needs at least {_LEAST_FIELD:g}: do "
+            f"the horizontal magnetic field is {field.horizontal:.3g} uT; a heading needs at least {_LEAST_FIELD:g}: do "
             "without the magnetometer, or set the plant's magnetic_field"
         )
     if section_5 and not magnetometer:
@@ -378,14 +371,14 @@ def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool =
     positions, rotations = sample_workspace(mechanism, 50, seed=0)
     parameters, state = np.zeros((), PARAMETERS), np.zeros((), STATE)
     parameters["geometry"] = geometry_of(mechanism)
-    parameters["vectors_in_base"], parameters["section_5"] = vectors, section_5
+    parameters["vectors_in_base"], parameters["section_5"] = field.vectors, section_5
     state["platform_used"], state["leg_used"] = PLATFORM_IMU in imus, [leg in imus for leg in range(LEGS)]
     state["heading_used"] = magnetometer
     worst = np.inf
     for position, rotation in zip(positions, rotations, strict=True):
         legs = position + mechanism.platform_joints @ rotation.T - mechanism.base_joints
         state["directions"] = legs / np.linalg.norm(legs, axis=1, keepdims=True)
-        state["vectors"] = vectors @ rotation
+        state["vectors"] = field.vectors @ rotation
         worst = min(worst, find_pose(parameters, state))
     if worst < WORST_CONDITIONING:
         names = ", ".join(str(imu) for imu in sorted(imus)) or "none"

@@ -19,7 +19,7 @@ from controller.heading_filter import predict_heading, start_heading, update_hea
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import RANK_TOLERANCE
 from controller.leg_filter import leg_direction, predict_leg, start_leg, update_leg
-from controller.mechanism_filter import collect, extrapolate, start_filter, step_filter
+from controller.mechanism_filter import collect, collect_field, extrapolate, start_filter, step_filter
 from controller.platform_filter import start_platform, step_platform
 from plant.compiled import Record, kernel
 from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER
@@ -201,6 +201,7 @@ def fuse_heading(parameters: Record, state: Record) -> None:
     age = s.heading_age
     s.heading_age = age + 1 + s.missed if sound else 0
     s.heading_used = 1 if s.platform_used != 0 and s.heading_age > min(s.cycle, p.leg_settling_cycles) else 0
+    s.field_fresh = 1 if sound and s.field_stands % p.field_cycles == 0 else 0
     s.vector_weights[1] = 0.0
     if not sound:
         return
@@ -210,7 +211,7 @@ def fuse_heading(parameters: Record, state: Record) -> None:
     else:
         period = elapsed(parameters, state)
         predict_heading(x, covariance, up, s.platform_rate, period, p.gyroscope_density, p.bias_walk)
-        if s.field_stands % p.field_cycles == 0:
+        if s.field_fresh != 0:
             update_heading(x, covariance, field, up, p.heading_variance)
     _carry_on(x, s.platform_rate, p.sensor_delay, s.vectors[1])
     if s.heading_used != 0:
@@ -301,6 +302,8 @@ def fuse_mechanism(parameters: Record, state: Record, found: bool) -> bool:
         s.filter_due = s.cycle + p.filter_settling_cycles
         return found
     collect(f, s.sample, s.imu_used, time - p.sensor_delay)
+    if s.heading_used != 0 and s.field_fresh != 0:
+        collect_field(f, s.field, time - p.sensor_delay)
     step_filter(p.filter, p.sensors, f)
     s.found_position[:] = s.position
     s.found_rotation[:] = s.rotation

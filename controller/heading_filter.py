@@ -5,14 +5,54 @@ State (4): its unit vector n in {2}, across the vertical u, and what the platfor
 compensation. Errors (2) are the angle about u by which the true n is turned from the estimate, and that of the bias.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from controller.platform_filter import INNOVATION_LIMIT
+from controller.readings import tilt_rotation
+from controller.settings import FusionSettings
 from plant.compiled import kernel
+from plant.mechanism import Mechanism
 from plant.pose import Array
 
 STATES = 4
 ERRORS = 2
+_LEAST_HORIZONTAL = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class MagneticField:
+    """The magnetic field of the earth at a mechanism.
+
+    Attributes:
+        vectors: (2, 3), the vertical and the field's horizontal direction, as unit vectors in {1}.
+        horizontal, vertical: its components, the second positive upwards [uT].
+    """
+
+    vectors: Array
+    horizontal: float
+    vertical: float
+
+    @property
+    def strength(self) -> float:
+        """[uT]."""
+        return float(np.hypot(self.horizontal, self.vertical))
+
+    def heading_variance(self, fusion: FusionSettings, rate: float) -> float:
+        """Of the heading that a sample of the magnetometer tells, in cycles of this rate [Hz]; in rad^2."""
+        return fusion.magnetometer_noise**2 * min(fusion.magnetometer_rate, rate) / 2.0 / self.horizontal**2
+
+
+def field_of(mechanism: Mechanism, tilt: ArrayLike = (0.0, 0.0)) -> MagneticField:
+    """The field in the plant data of a mechanism, next to none without; `tilt` (2,) [rad] turns it with the vertical."""
+    up, field = mechanism.up_in_base, mechanism.plant.get("magnetic_field", np.zeros(3))
+    vertical = float(field @ up)
+    across = field - vertical * up
+    horizontal = max(float(np.linalg.norm(across)), _LEAST_HORIZONTAL)
+    vectors: Array = np.stack([up, across / horizontal]) @ tilt_rotation(tilt).T
+    return MagneticField(vectors, horizontal, vertical)
 
 
 @kernel

@@ -945,21 +945,25 @@ def _classes(options: argparse.Namespace) -> int:
 
 def _sensor_sets(options: argparse.Namespace) -> int:
     from dataclasses import asdict
+    from itertools import groupby
 
     from hil.sensor_sets import COLUMNS, MECHANISMS, cells, evaluate_sensor_sets, markdown, reasons
 
     _check_writable(options.json)
     with _progress("sets of sensors") as progress:
-        outcomes = evaluate_sensor_sets(options.mechanism or MECHANISMS, options.duration, options.seed, progress)
+        outcomes = evaluate_sensor_sets(
+            options.mechanism or MECHANISMS, duration=options.duration, seed=options.seed, progress=progress
+        )
     figures = {"duration": options.duration, "seed": options.seed, "version": version("gough")}
     _write_json(options.json, {**figures, "sets": [asdict(outcome) for outcome in outcomes]})
     if options.markdown:
         print(markdown(outcomes))
         return 0
-    table = _table(*COLUMNS)
-    for outcome in outcomes:
-        table.add_row(*cells(outcome))
-    _print(table)
+    for mechanism, group in groupby(outcomes, lambda outcome: outcome.mechanism):
+        table = _table(mechanism, *COLUMNS[2:])
+        for outcome in group:
+            table.add_row(*cells(outcome)[1:])
+        _print(table)
     for reason in reasons(outcomes):
         print(reason)
     return 0

@@ -201,6 +201,18 @@ def test_the_heading_counts_by_its_weight(hexapod):
     np.testing.assert_allclose(lower, np.tril(jacobian.T @ (weights[:, None] * jacobian)), rtol=1e-5, atol=1e-2)
 
 
+@pytest.mark.parametrize("angle_deg", [2.0, -1.0])
+def test_the_whole_mechanism_filter_finds_the_headings_offset_and_is_not_turned_by_it(hexapod, angle_deg):
+    parameters = parameters_of(hexapod, magnetometer=True, whole="accelerometers")
+    position, rotation = np.array([0.01, -0.02, 0.36]), rotation_of([0.15, -0.1, 0.2])
+    signals = static_signals(hexapod, position, rotation)
+    signals[MAGNETOMETER, PLATFORM_IMU] = rotation.T @ rotation_of([0.0, 0.0, np.radians(angle_deg)]) @ FIELD
+    state = run(parameters, signals, 3000)
+    assert state["filter_trusted"] == 1
+    assert np.degrees(state["filter"]["heading_offset"]) == pytest.approx(angle_deg, rel=0.1)
+    assert angle_between(state["rotation"], rotation) < np.radians(0.1)
+
+
 def test_sets_that_do_not_do_are_refused_with_the_remedy(hexapod):
     for legs in combinations(range(6), 2):
         with pytest.raises(InputError, match=r"add legs, or its magnetometer \(--magnetometer\)"):
