@@ -133,7 +133,7 @@ FILTER_STATE = np.dtype(
 """State of the filter, whose update may be under way; `known` is what the last complete one has found.
 
 Times are in seconds since the first cycle. `sum` collects the samples of a window, `sample` is the mean of the last one;
-`row` is the next scalar to take, -1 when none is left.
+`row` is the next scalar to take, -1 when none is left. `field` is the magnetometer's last sample, until it has been taken.
 """
 
 
