@@ -1,6 +1,6 @@
 """The cycle: everything between raw IMU data and the six commands, the paper's Figure 4, as one compiled function.
 
-    measurement -> leg filters, platform filter -> direct kinematics -> inverse kinematics -> PID against the reference
+    measurement -> leg, platform and heading filters -> direct kinematics -> inverse kinematics -> PID against the reference
 
 It allocates nothing, raises nothing and knows no clock: time is counted in periods, missed ones included. Constants lie in
 one structured array (dtype `PARAMETERS`), all state in another (dtype `STATE`); a copy of that is a snapshot.
@@ -12,7 +12,19 @@ import numpy as np
 
 from controller.calibration import Calibration
 from controller.direct_kinematics.closed_forms import GEOMETRY, SCRATCH, geometry_of
-from controller.fusion import calibrate, elapsed, find_pose, fuse_legs, fuse_platform, locate
+from controller.fusion import (
+    WORST_CONDITIONING,
+    calibrate,
+    elapsed,
+    find_pose,
+    fuse_heading,
+    fuse_legs,
+    fuse_platform,
+    locate,
+)
+from controller.heading_filter import ERRORS as HEADING_ERRORS
+from controller.heading_filter import STATES as HEADING_STATES
+from controller.heading_filter import field_of
 from controller.inverse_kinematics import jacobian_at, legs_at, sample_workspace
 from controller.least_squares import RANK_TOLERANCE, solve_least_squares
 from controller.mechanism_filter import FILTER_PARAMETERS, FILTER_STATE, filter_parameters
@@ -56,8 +68,10 @@ _FILTER_START_S, _FILTER_SETTLING_S = 0.3, 0.3
 _PATIENCE_S = 0.05
 """How long the leg filters may disagree with the whole-mechanism filter [s]."""
 
-_WORST_CONDITIONING = 1e-2
 _LEAST_GRAVITY = 0.1
+_LEAST_FIELD = 5.0
+"""Least horizontal magnetic field that tells a heading [uT]."""
+
 _LEAST_OBSERVABILITY = 0.2
 """Least component of the vertical across both axes of a universal joint at home; without one, gravity does not tell the
 joint's angles."""
@@ -68,7 +82,10 @@ PARAMETERS = np.dtype(
         ("hold_cycles", np.int64),
         ("geometry", GEOMETRY),
         ("sensors", SENSOR_GEOMETRY),
+        ("vectors_in_base", np.float64, (2, 3)),
         ("imu_present", np.int64, IMU_COUNT),
+        ("magnetometer", np.int64),
+        ("section_5", np.int64),
         ("calibration_gain", np.float64, (3, IMU_COUNT, 3, 3)),
         ("calibration_offset", np.float64, (3, IMU_COUNT, 3)),
         ("reach", np.float64, 2),
@@ -85,6 +102,10 @@ PARAMETERS = np.dtype(
         ("vertical_variance", np.float64),
         ("leg_weight", np.float64),
         ("vertical_weight", np.float64),
+        ("field_strength", np.float64),
+        ("field_cycles", np.int64),
+        ("heading_variance", np.float64),
+        ("heading_floor", np.float64),
         ("acceleration_rate", np.float64),
         ("filter", FILTER_PARAMETERS),
         ("filter_start_cycles", np.int64),
@@ -109,7 +130,12 @@ PARAMETERS = np.dtype(
     align=True,
 )
 """Constants of the cycle, in SI units; a calibrated reading is gain times the raw one plus offset, and `moving_mass` and
-`droop` belong to the load feed-forward."""
+`droop` belong to the load feed-forward.
+
+`vectors_in_base` are the vertical and the horizontal direction of the magnetic field, as unit vectors in {1}. A sample of the
+magnetometer stands for `field_cycles`; its heading has the `heading_variance`, and whatever is averaged at least the
+`heading_floor`.
+"""
 
 STATE = np.dtype(
     [
@@ -125,14 +151,21 @@ STATE = np.dtype(
         ("leg_used", np.float64, LEGS),
         ("leg_weights", np.float64, LEGS),
         ("platform_used", np.int64),
-        ("vertical_weight", np.float64, 1),
+        ("heading_age", np.int64),
+        ("heading_used", np.int64),
+        ("field", np.float64, 3),
+        ("field_stands", np.int64),
+        ("field_fresh", np.int64),
+        ("vector_weights", np.float64, 2),
         ("leg_x", np.float64, (LEGS, 9)),
         ("leg_covariance", np.float64, (LEGS, 9, 9)),
         ("platform_x", np.float64, 6),
         ("platform_covariance", np.float64, (6, 6)),
+        ("heading_x", np.float64, HEADING_STATES),
+        ("heading_covariance", np.float64, (HEADING_ERRORS, HEADING_ERRORS)),
         ("directions", np.float64, (LEGS, 3)),
         ("rates", np.float64, (LEGS, 3)),
-        ("vertical", np.float64, (1, 3)),
+        ("vectors", np.float64, (2, 3)),
         ("platform_rate", np.float64, 3),
         ("position", np.float64, 3),
         ("rotation", np.float64, (3, 3)),
@@ -183,7 +216,8 @@ STATE = np.dtype(
 
 `cycle` counts periods, `missed` those since the last cycle that had none. `sample` is the calibrated measurement. Of each IMU:
 whether it reads the `same` again, how often in a row it `stands` still while others do not, for how long it has been `sound`,
-whether it is used, and the `age` of its filter, all in periods. `twist` is velocity and angular velocity in {1}; `vertical` and
+whether it is used, and the `age` of its filter, all in periods; of the magnetometer's `field`, how long it stands, and whether
+it is to be taken. `twist` is velocity and angular velocity in {1}; `vectors`, vertical and horizontal field, and
 `platform_rate` are seen in {2}; `information` is the inverse of the covariance of the refined pose (lower triangle).
 
 The whole-mechanism filter is to be started, or trusted, when it is `filter_due`; `offset` is what is left of the way from one
@@ -203,6 +237,8 @@ def cycle_parameters(
     imus: Collection[int] = ALL_IMUS,
     whole: str | None = None,
     calibration: Calibration | None = None,
+    magnetometer: bool = False,
+    section_5: bool = False,
 ) -> Record:
     """Work out the constants of the cycle.
 
@@ -214,12 +250,14 @@ def cycle_parameters(
         whole: which errors of the IMUs the whole-mechanism filter estimates, a key of `mechanism_filter.BLOCKS`; None to do
             without that filter.
         calibration: of the IMUs; without one their readings are taken as they are.
+        magnetometer: whether the platform's magnetometer gives its heading.
+        section_5: whether the pose is that of the paper's section 5, unrefined; that needs the magnetometer.
 
     Raises:
         InputError: a rate out of range, an IMU that cannot be, or IMUs that do not determine the pose.
     """
     check_rate(rate)
-    check_imus(mechanism, imus)
+    check_imus(mechanism, imus, magnetometer, section_5)
     plant = mechanism.plant_parameters()
     parameters: Record = np.zeros((), PARAMETERS)
     calibration = calibration or Calibration()
@@ -230,6 +268,7 @@ def cycle_parameters(
     sliding_mass = plant["leg.upper.mass"] + plant["motor.rotor_inertia"] * turns**2
     stroke = mechanism.require_limits().stroke
     margin = _IMPLAUSIBLE_SHARE * (stroke[:, 1] - stroke[:, 0])
+    field = field_of(mechanism, calibration.tilt)
     gravity = float(np.linalg.norm(plant["gravity"]))
     if gravity < _LEAST_GRAVITY:
         raise InputError(
@@ -240,7 +279,10 @@ def cycle_parameters(
         "hold_cycles": int(np.ceil(control.hold * rate - 1e-9)),
         "geometry": geometry_of(mechanism),
         "sensors": sensor_geometry(mechanism, calibration.tilt),
+        "vectors_in_base": field.vectors,
         "imu_present": [imu in imus for imu in ALL_IMUS],
+        "magnetometer": magnetometer,
+        "section_5": section_5,
         "calibration_gain": calibration.gain,
         "calibration_offset": calibration.offset,
         "reach": (fusion.gyroscope_range, fusion.accelerometer_range),
@@ -257,8 +299,14 @@ def cycle_parameters(
         "vertical_variance": (fusion.platform_accelerometer_noise / STANDARD_GRAVITY) ** 2 * rate / 2.0,
         "leg_weight": 1.0 / fusion.leg_sigma**2,
         "vertical_weight": 1.0 / fusion.tilt_sigma**2,
+        "field_strength": field.strength,
+        "field_cycles": max(1, round(rate / fusion.magnetometer_rate)),
+        "heading_variance": field.heading_variance(fusion, rate),
+        "heading_floor": fusion.heading_sigma**2,
         "acceleration_rate": 1.0 / fusion.acceleration_time,
-        "filter": filter_parameters(fusion, rate, whole, calibration.covariance, calibration.floor),
+        "filter": filter_parameters(
+            fusion, rate, whole, calibration.covariance, calibration.floor, field if magnetometer else None
+        ),
         "filter_start_cycles": round(_FILTER_START_S * rate),
         "filter_settling_cycles": round(_FILTER_SETTLING_S * rate),
         "disagreement": fusion.disagreement,
@@ -295,15 +343,26 @@ def check_rate(rate: float) -> None:
         raise InputError(f"the rate is {rate:g} Hz; it must be {RATE_RANGE_HZ[0]:g} to {RATE_RANGE_HZ[1]:g} Hz")
 
 
-def check_imus(mechanism: Mechanism, imus: Collection[int]) -> None:
-    """Check that these IMUs determine the pose, at home and over the workspace.
+def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool = False, section_5: bool = False) -> float:
+    """Check that these IMUs, and the platform's magnetometer, determine the pose, at home and over the workspace; returns the
+    worst conditioning there.
 
     Raises:
-        InputError: an IMU outside 0 to 6, or the set does not determine the pose.
+        InputError: an IMU outside 0 to 6, no field for the magnetometer, or the set does not determine the pose.
     """
     for imu in imus:
         if imu not in ALL_IMUS:
             raise InputError(f"there is no IMU {imu}; 0 to 5 sit on the legs, 6 on the platform")
+    field = field_of(mechanism)
+    if magnetometer and PLATFORM_IMU not in imus:
+        raise InputError("the magnetometer is part of the platform's IMU, which is not there: add IMU 6")
+    if magnetometer and field.horizontal < _LEAST_FIELD:
+        raise InputError(
+            f"the horizontal magnetic field is {field.horizontal:.3g} uT; a heading needs at least {_LEAST_FIELD:g}: do "
+            "without the magnetometer, or set the plant's magnetic_field"
+        )
+    if section_5 and not magnetometer:
+        raise InputError("the paper's section 5 needs the platform's heading: add its magnetometer (--magnetometer)")
     across = np.abs(mechanism.joint_rotations[:, :, 2] @ mechanism.up_in_base)
     for leg in range(LEGS):
         if leg in imus and across[leg] < _LEAST_OBSERVABILITY:
@@ -314,20 +373,27 @@ def check_imus(mechanism: Mechanism, imus: Collection[int]) -> None:
     positions, rotations = sample_workspace(mechanism, 50, seed=0)
     parameters, state = np.zeros((), PARAMETERS), np.zeros((), STATE)
     parameters["geometry"] = geometry_of(mechanism)
-    parameters["sensors"]["up_in_base"] = mechanism.up_in_base
+    parameters["vectors_in_base"], parameters["section_5"] = field.vectors, section_5
     state["platform_used"], state["leg_used"] = PLATFORM_IMU in imus, [leg in imus for leg in range(LEGS)]
+    state["heading_used"] = magnetometer
     worst = np.inf
     for position, rotation in zip(positions, rotations, strict=True):
         legs = position + mechanism.platform_joints @ rotation.T - mechanism.base_joints
         state["directions"] = legs / np.linalg.norm(legs, axis=1, keepdims=True)
-        state["vertical"] = rotation.T @ mechanism.up_in_base
+        state["vectors"] = field.vectors @ rotation
         worst = min(worst, find_pose(parameters, state))
-    if worst < _WORST_CONDITIONING:
+    if worst < WORST_CONDITIONING:
         names = ", ".join(str(imu) for imu in sorted(imus)) or "none"
+        remedies = ["legs"]
+        if PLATFORM_IMU not in imus:
+            remedies.append("the platform's IMU (6)")
+        if not magnetometer:
+            remedies.append("its magnetometer (--magnetometer)")
         raise InputError(
             f"the IMUs {names} do not determine the pose of {mechanism.name!r} everywhere in its workspace (conditioning "
-            f"{worst:.1e}; at least {_WORST_CONDITIONING:g} is needed): add legs, or the platform's IMU (6)"
+            f"{worst:.1e}; at least {WORST_CONDITIONING:g} is needed): add {', or '.join(remedies)}"
         )
+    return worst
 
 
 @kernel
@@ -346,6 +412,7 @@ def cycle(parameters: Record, state: Record, measurement: Array, segments: Array
     calibrate(parameters, state, measurement)
     fuse_legs(parameters, state)
     fuse_platform(parameters, state)
+    fuse_heading(parameters, state)
     return control(parameters, state, segments) if locate(parameters, state) else POSE_LOST
 
 

@@ -1,6 +1,6 @@
 """Fusion: from raw IMU data to the pose of the platform, the left half of the paper's Figure 4, step by step.
 
-    calibration -> which IMUs are sound -> leg filters, platform filter -> closed form -> refinement -> whole-mechanism filter
+    calibration -> which IMUs are sound -> leg, platform, heading filters -> closed form -> refinement -> whole-mechanism filter
 
 The leg filters and the closed form need no first guess; they start the whole-mechanism filter and watch over it. Every step
 works on the cycle's parameters and state (`controller.cycle`).
@@ -8,18 +8,33 @@ works on the cycle's parameters and state (`controller.cycle`).
 
 import numpy as np
 
-from controller.direct_kinematics.closed_forms import pose_from_legs, pose_from_vector
+from controller.direct_kinematics.closed_forms import (
+    pose_from_legs,
+    pose_from_rotation,
+    pose_from_vector,
+    rotation_from_vectors,
+)
 from controller.direct_kinematics.refinement import find_twist, move_pose, normal_equations, solve_normal_equations
+from controller.heading_filter import predict_heading, start_heading, update_heading
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import RANK_TOLERANCE
 from controller.leg_filter import leg_direction, predict_leg, start_leg, update_leg
-from controller.mechanism_filter import collect, extrapolate, start_filter, step_filter
+from controller.mechanism_filter import collect, collect_field, extrapolate, start_filter, step_filter
 from controller.platform_filter import start_platform, step_platform
 from plant.compiled import Record, kernel
-from plant.imu import ACCELEROMETER, GYROSCOPE
+from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER
 from plant.mechanism import LEGS
 from plant.pose import Array
 from plant.variables import IMU_COUNT, PLATFORM_IMU
+
+WORST_CONDITIONING = 1e-2
+"""Least conditioning of a closed form that is relied upon where there is another one, or none."""
+
+_FIELD_SHARE = 0.3
+"""By how much of itself the magnetic field may differ from the earth's: beyond that something magnetic is near."""
+
+_FROZEN_FIELDS = 10
+"""How many samples in a row of a magnetometer may be the same while the rest of its IMU moves."""
 
 _GAP_S = 0.05
 """Longest time for which a leg's angular acceleration is taken to last [s]."""
@@ -122,7 +137,7 @@ def fuse_platform(parameters: Record, state: Record) -> None:
     age = s.age[PLATFORM_IMU]
     s.age[PLATFORM_IMU] = age + 1 + s.missed if s.imu_used[PLATFORM_IMU] != 0 else 0
     s.platform_used = s.age[PLATFORM_IMU] > min(s.cycle, p.leg_settling_cycles)
-    s.vertical_weight[0] = p.vertical_weight if s.platform_used != 0 else 0.0
+    s.vector_weights[0] = p.vertical_weight if s.platform_used != 0 else 0.0
     if s.imu_used[PLATFORM_IMU] == 0:
         return
     rate, force = s.sample[GYROSCOPE, PLATFORM_IMU], s.sample[ACCELEROMETER, PLATFORM_IMU]
@@ -151,46 +166,105 @@ def fuse_platform(parameters: Record, state: Record) -> None:
     w, u = s.platform_rate, s.platform_x
     for i in range(3):
         w[i] = rate[i] - u[3 + i]
-    # Carried on by the delay of the sensors; u' = u x w.
-    s.vertical[0, 0] = u[0] + p.sensor_delay * (u[1] * w[2] - u[2] * w[1])
-    s.vertical[0, 1] = u[1] + p.sensor_delay * (u[2] * w[0] - u[0] * w[2])
-    s.vertical[0, 2] = u[2] + p.sensor_delay * (u[0] * w[1] - u[1] * w[0])
+    _carry_on(u, w, p.sensor_delay, s.vectors[0])
+
+
+@kernel
+def _carry_on(x: Array, rate: Array, delay: float, carried: Array) -> None:
+    """Write a vector that is fixed in {1}, seen in {2}, carried on by the delay of the sensors; x' = x x rate."""
+    carried[0] = x[0] + delay * (x[1] * rate[2] - x[2] * rate[1])
+    carried[1] = x[1] + delay * (x[2] * rate[0] - x[0] * rate[2])
+    carried[2] = x[2] + delay * (x[0] * rate[1] - x[1] * rate[0])
+
+
+@kernel
+def fuse_heading(parameters: Record, state: Record) -> None:
+    """Step the heading filter, if the magnetometer is to be used and is sound: its field is about as strong as the earth's, and
+    does not stand still while the rest of its IMU moves. A sample that stands until the next one is taken once.
+    """
+    p, s = parameters[()], state[()]
+    if p.magnetometer == 0:
+        return
+    field = s.sample[MAGNETOMETER, PLATFORM_IMU]
+    if field[0] != s.field[0] or field[1] != s.field[1] or field[2] != s.field[2]:
+        s.field_stands = 0
+    elif s.same[PLATFORM_IMU] == 0:
+        s.field_stands += 1
+    s.field[:] = field
+    # NaN is not below the limit either.
+    strength = np.sqrt(field[0] * field[0] + field[1] * field[1] + field[2] * field[2])
+    sound = (
+        s.imu_used[PLATFORM_IMU] != 0
+        and abs(strength - p.field_strength) < _FIELD_SHARE * p.field_strength
+        and s.field_stands < _FROZEN_FIELDS * p.field_cycles
+    )
+    age = s.heading_age
+    s.heading_age = age + 1 + s.missed if sound else 0
+    s.heading_used = 1 if s.platform_used != 0 and s.heading_age > min(s.cycle, p.leg_settling_cycles) else 0
+    s.field_fresh = 1 if sound and s.field_stands % p.field_cycles == 0 else 0
+    s.vector_weights[1] = 0.0
+    if not sound:
+        return
+    x, covariance, up = s.heading_x, s.heading_covariance, s.platform_x
+    if age == 0:
+        start_heading(x, covariance, field, up, p.heading_variance, p.bias_sigma)
+    else:
+        period = elapsed(parameters, state)
+        predict_heading(x, covariance, up, s.platform_rate, period, p.gyroscope_density, p.bias_walk)
+        if s.field_fresh != 0:
+            update_heading(x, covariance, field, up, p.heading_variance)
+    _carry_on(x, s.platform_rate, p.sensor_delay, s.vectors[1])
+    if s.heading_used != 0:
+        s.vector_weights[1] = 1.0 / (covariance[0, 0] + p.heading_floor)
 
 
 @kernel
 def find_pose(parameters: Record, state: Record) -> float:
     """The pose in closed form from the leg directions, and the vertical if the platform has an IMU; returns the
-    conditioning.
+    conditioning. The platform's whole orientation, if it has a heading, stands in where those do not do, or is all that the
+    paper's section 5 takes from the platform.
     """
     p, s = parameters[()], state[()]
-    if s.platform_used != 0:
-        s.conditioning = pose_from_vector(
-            p.geometry, s.directions, s.leg_used, p.sensors.up_in_base[0], s.vertical[0], s.position, s.rotation, s.scratch
-        )
-    else:
+    if s.platform_used == 0:
         s.conditioning = pose_from_legs(p.geometry, s.directions, s.leg_used, s.position, s.rotation, s.scratch)
+        return float(s.conditioning)
+    s.conditioning = 0.0
+    if p.section_5 == 0:
+        s.conditioning = pose_from_vector(
+            p.geometry, s.directions, s.leg_used, p.vectors_in_base[0], s.vectors[0], s.position, s.rotation, s.scratch
+        )
+    if s.heading_used != 0 and s.conditioning < WORST_CONDITIONING:
+        s.conditioning = 0.0
+        if rotation_from_vectors(p.vectors_in_base, s.vectors, s.rotation):
+            s.conditioning = pose_from_rotation(p.geometry, s.directions, s.leg_used, s.rotation, s.position, s.scratch)
     return float(s.conditioning)
 
 
 @kernel
 def improve_pose(parameters: Record, state: Record) -> bool:
-    """Two Gauss-Newton steps for the pose; the twist comes with them, and the acceleration is its derivative."""
+    """Two Gauss-Newton steps for the pose; the twist comes with them, and the acceleration is its derivative.
+
+    The paper's section 5 does not move the pose, and tells no covariance.
+    """
     p, s = parameters[()], state[()]
     factor = s.matrices_6_6[0]
     for _ in range(2):
         normal_equations(
-            p.geometry.base_joints, p.geometry.platform_joints, s.directions, s.leg_weights, p.sensors.up_in_base, s.vertical,
-            s.vertical_weight, s.position, s.rotation, s.arms, s.predicted, s.lengths, s.information, s.vectors_6[0],
+            p.geometry.base_joints, p.geometry.platform_joints, s.directions, s.leg_weights, p.vectors_in_base, s.vectors,
+            s.vector_weights, s.position, s.rotation, s.arms, s.predicted, s.lengths, s.information, s.vectors_6[0],
         )  # fmt: skip
         if not solve_normal_equations(s.information, s.vectors_6[0], factor):
             return False
+        if p.section_5 != 0:
+            s.information[:] = 0.0
+            break
         move_pose(s.vectors_6[0], s.position, s.rotation)
     for i in range(3):
         s.angular_velocity[i] = 0.0
         for j in range(3):
             s.angular_velocity[i] += s.rotation[i, j] * s.platform_rate[j]
     find_twist(
-        s.rates, s.leg_weights, s.vertical, s.vertical_weight, s.angular_velocity, s.rotation, s.arms, s.predicted, s.lengths,
+        s.rates, s.leg_weights, s.vectors, s.vector_weights, s.angular_velocity, s.rotation, s.arms, s.predicted, s.lengths,
         factor, s.twist,
     )  # fmt: skip
     if s.cycle == 0:
@@ -228,6 +302,8 @@ def fuse_mechanism(parameters: Record, state: Record, found: bool) -> bool:
         s.filter_due = s.cycle + p.filter_settling_cycles
         return found
     collect(f, s.sample, s.imu_used, time - p.sensor_delay)
+    if s.heading_used != 0 and s.field_fresh != 0:
+        collect_field(f, s.field, time - p.sensor_delay)
     step_filter(p.filter, p.sensors, f)
     s.found_position[:] = s.position
     s.found_rotation[:] = s.rotation

@@ -22,7 +22,7 @@ _MARGIN_S = 0.1
 _MOST_RATE = np.radians(1.0)
 _MOST_SPREAD = 5.0
 _LEAST_SHARE = 0.75
-"""How much of gravity must lie along each half-axis in some rest."""
+"""How much of a unit vector must lie along each half-axis at some time."""
 
 _LEAST_TURN = np.pi
 """By how much it must be turned about each axis in all [rad]."""
@@ -138,10 +138,15 @@ def _fit_forces(at_rest: Array, gravity: float) -> tuple[Array, Array, Array, fl
 
 def _check_orientations(forces: Array, gravity: float) -> None:
     """Check that gravity has been along every half-axis in some rest."""
-    along = np.concatenate([forces.max(axis=0), -forces.min(axis=0)]).reshape(2, 3).T.ravel() / gravity
-    missing = [name for name, share in zip(_AXES, along, strict=True) if share < _LEAST_SHARE]
+    missing = missing_half_axes(forces / gravity)
     if missing:
         raise CalibrationError(f"no rest has {', '.join(missing)} up: rest in these orientations too")
+
+
+def missing_half_axes(vectors: Array) -> list[str]:
+    """The half-axes, such as "+x", that none of the unit vectors (n, 3) lies near."""
+    along = np.concatenate([vectors.max(axis=0), -vectors.min(axis=0)]).reshape(2, 3).T.ravel()
+    return [name for name, share in zip(_AXES, along, strict=True) if share < _LEAST_SHARE]
 
 
 def _check_turns(rates: Array, bias: Array, rests: list[slice], period: float) -> None:

@@ -7,6 +7,9 @@ calibration the places of the joints (36) and the tilt of the base (2). An IMU r
 
     rate  = (I + diag(scale) + U(axes)) R(-alignment) ideal + bias,   U upper triangular, R the rotation, the force likewise
 
+With the platform's magnetometer, the last error is a constant offset of its heading, so that what iron is left does not turn a
+pose that the other IMUs know better.
+
 Samples are averaged over a window of 5 ms; an update takes its 42 scalars one after the other, spread over the cycles until
 the next window is full, so that every cycle costs about the same. What is told of the motion is carried to the present by the
 motion model. The Jacobian is taken at a motion low-passed over 30 ms: at the noisy one, the noise would be taken for
@@ -15,6 +18,8 @@ excitation, and the biases would drift at rest.
 
 import numpy as np
 
+from controller.heading_filter import MagneticField
+from controller.platform_filter import INNOVATION_LIMIT
 from controller.readings import (
     ACCELERATION,
     ANGULAR_ACCELERATION,
@@ -53,13 +58,16 @@ BLOCKS = {"gyroscopes": 3, "accelerometers": 6, "alignments": 15, "axes": ERRORS
 
 ALL_ERRORS, JOINTS, TILT = IMU_COUNT * ERRORS, 2 * LEGS * 3, 2
 RIG = JOINTS + TILT
-MOST_STATES = MOTION_STATES + ALL_ERRORS + RIG
+MOST_STATES = MOTION_STATES + ALL_ERRORS + RIG + 1
 _ROWS = IMU_COUNT * READINGS
 
 WINDOW_S = 0.005
 _SMOOTHING_S = 0.03
 _FIRST_SIGMAS = (0.01, 0.05, 0.1, 0.5, 5.0, 50.0)
 """Of the motion at the start: position [m], rotation [rad], and their derivatives."""
+
+_OFFSET_LASTS_S = 100.0
+"""Time in which the offset of the heading may change by as much as is not known of it at the start."""
 
 _PREPARING_ROWS = 14
 """What prediction costs, in scalar updates."""
@@ -69,19 +77,27 @@ FILTER_PARAMETERS = np.dtype(
         ("window", np.int64),
         ("errors", np.int64),
         ("rig", np.int64),
+        ("states", np.int64),
         ("smoothing", np.float64),
         ("jerk", np.float64, 2),
         ("bias_walk", np.float64, 2),
         ("variance", np.float64, 2),
         ("prior", np.float64, (ALL_ERRORS + RIG, ALL_ERRORS + RIG)),
         ("floor", np.float64, 2),
+        ("heading", np.int64),
+        ("field_axes", np.float64, (3, 3)),
+        ("heading_variance", np.float64),
+        ("offset_variance", np.float64),
     ],
     align=True,
 )
-"""Samples of a window; estimated errors of an IMU, 0 for no filter, and of the rig; time constant of the motion at which the
-Jacobian is taken, infinite if that is set from outside; spectral densities of the platform's jerk (linear, angular)
-and of the biases' walks (gyroscope, accelerometer); variances of one sample (rate, force); the covariance of these errors;
-and the variances of position and rotation that are left because the rig's are not estimated."""
+"""Samples of a window; estimated errors of an IMU, 0 for no filter, and of the rig; all states; time constant of the motion at
+which the Jacobian is taken, infinite if that is set from outside; spectral densities of the platform's jerk (linear, angular)
+and of the biases' walks (gyroscope, accelerometer); variances of one sample (rate, force); the covariance of the errors; and
+the variances of position and rotation that are left because the rig's are not estimated. Then whether there is a heading; in {1}
+the horizontal direction of the magnetic field, that across it and the vertical, and the axis about which a small turn changes what
+the heading seems to be; and the variances of a sample's heading and of its offset.
+"""
 
 FILTER_STATE = np.dtype(
     [
@@ -104,6 +120,10 @@ FILTER_STATE = np.dtype(
         ("sum_time", np.float64),
         ("samples", np.int64, IMU_COUNT),
         ("collected", np.int64),
+        ("field", np.float64, 3),
+        ("field_time", np.float64),
+        ("field_used", np.int64),
+        ("heading_offset", np.float64),
         ("sample", np.float64, (IMU_COUNT, READINGS)),
         ("sample_used", np.int64, IMU_COUNT),
         ("row", np.int64),
@@ -125,14 +145,16 @@ FILTER_STATE = np.dtype(
 """State of the filter, whose update may be under way; `known` is what the last complete one has found.
 
 Times are in seconds since the first cycle. `sum` collects the samples of a window, `sample` is the mean of the last one;
-`row` is the next scalar to take, -1 when none is left; `rig` is by how much joints (2, 6, 3)
-and tilt (2) are off. The readings of a leg's IMU depend on eight of these: its two joints, and the tilt.
+`row` is the next scalar to take, -1 when none is left. `rig` is by how much joints (2, 6, 3) and tilt (2) are off; the readings
+of a leg's IMU depend on eight of these, its two joints and the tilt. `field` is the magnetometer's last sample, until it
+has been taken.
 """
 
 
 def filter_parameters(
-    fusion: FusionSettings, rate: float, errors: str | None, covariance: Array | None, floor: Array | None = None
-) -> Record:
+    fusion: FusionSettings, rate: float, errors: str | None, covariance: Array | None, floor: Array | None = None,
+    field: MagneticField | None = None,
+) -> Record:  # fmt: skip
     """Constants of the filter.
 
     Args:
@@ -142,6 +164,7 @@ def filter_parameters(
         covariance: (147, 147), of the errors that a calibration has left, or (185, 185), of joints and tilt, too, which are
             estimated then; None for what the settings say.
         floor: (2,) [m, rad], standard deviations of position and rotation that joints and tilt leave; None if they are exact.
+        field: of the earth, for the platform's magnetometer; None without one.
 
     Raises:
         UnknownNameError: no such block of errors.
@@ -159,11 +182,13 @@ def filter_parameters(
     if covariance is not None:
         known = covariance
     prior[: len(known), : len(known)] = known
+    estimated = 0 if errors is None else BLOCKS[errors]
     parameters: Record = np.zeros((), FILTER_PARAMETERS)
     values = {
         "window": max(1, round(WINDOW_S * rate)),
-        "errors": 0 if errors is None else BLOCKS[errors],
+        "errors": estimated,
         "rig": len(known) - ALL_ERRORS,
+        "states": MOTION_STATES + IMU_COUNT * estimated + len(known) - ALL_ERRORS + (field is not None),
         "smoothing": _SMOOTHING_S,
         "jerk": (fusion.platform_jerk**2, fusion.platform_angular_jerk**2),
         "bias_walk": (fusion.bias_walk**2, fusion.accelerometer_bias_walk**2),
@@ -174,14 +199,22 @@ def filter_parameters(
         "prior": prior,
         "floor": np.zeros(2) if floor is None else floor**2 / 3.0,
     }
+    if field is not None:
+        up, north = field.vectors
+        values |= {
+            "heading": 1,
+            "field_axes": (north, np.cross(up, north), up - field.vertical / field.horizontal * north),
+            "heading_variance": field.heading_variance(fusion, rate),
+            "offset_variance": fusion.heading_sigma**2,
+        }
     for name, value in values.items():
         parameters[name] = value
     return parameters
 
 
 @kernel
-def _states(parameters: Record) -> int:
-    return int(MOTION_STATES + IMU_COUNT * parameters.errors + parameters.rig)
+def _rig_start(parameters: Record) -> int:
+    return int(MOTION_STATES + IMU_COUNT * parameters.errors)
 
 
 @kernel
@@ -206,7 +239,9 @@ def start_filter(parameters: Record, state: Record, time: float, position: Array
     f.smooth_motion[:] = f.motion
     f.errors[:] = 0.0
     f.rig[:] = 0.0
-    states = _states(p)
+    f.heading_offset = 0.0
+    f.field_used = 0
+    states, rig = p.states, _rig_start(p)
     for i in range(states):
         for j in range(states):
             f.covariance[i, j] = 0.0
@@ -222,11 +257,13 @@ def start_filter(parameters: Record, state: Record, time: float, position: Array
                     ]
             for j in range(p.rig):
                 covariance = p.prior[k * ERRORS + i, ALL_ERRORS + j]
-                f.covariance[MOTION_STATES + k * p.errors + i, states - RIG + j] = covariance
-                f.covariance[states - RIG + j, MOTION_STATES + k * p.errors + i] = covariance
+                f.covariance[MOTION_STATES + k * p.errors + i, rig + j] = covariance
+                f.covariance[rig + j, MOTION_STATES + k * p.errors + i] = covariance
     for i in range(p.rig):
         for j in range(p.rig):
-            f.covariance[states - RIG + i, states - RIG + j] = p.prior[ALL_ERRORS + i, ALL_ERRORS + j]
+            f.covariance[rig + i, rig + j] = p.prior[ALL_ERRORS + i, ALL_ERRORS + j]
+    if p.heading != 0:
+        f.covariance[states - 1, states - 1] = p.offset_variance
     f.row = -1
     f.collected = 0
     _publish(state)
@@ -249,6 +286,15 @@ def collect(state: Record, sample: Array, used: Array, time: float) -> None:
         for i in range(3):
             f.sum[k, i] += sample[0, k, i]
             f.sum[k, 3 + i] += sample[1, k, i]
+
+
+@kernel
+def collect_field(state: Record, field: Array, time: float) -> None:
+    """Keep a calibrated sample (3,) of the platform's magnetometer for the next update."""
+    f = state
+    f.field[:] = field
+    f.field_time = time
+    f.field_used = 1
 
 
 @kernel
@@ -288,6 +334,8 @@ def _begin_update(parameters: Record, geometry: Record, state: Record) -> None:
     f.time = time
     f.change[:] = 0.0
     f.row = f.piece = 0
+    if f.field_used != 0:
+        _take_heading(parameters, state)
     predict_readings(
         geometry, f.position, f.rotation, f.smooth_motion, True, f.smooth_predicted, f.jacobian, f.readings_scratch
     )
@@ -376,7 +424,7 @@ def _predict(parameters: Record, state: Record, period: float) -> None:
             # Low-passed once and twice, these have one and two lags.
             f.smooth_motion[block, i] = 2.0 * f.low_passed[0, block, i] - f.low_passed[1, block, i]
     # theta+ = (I + skew(turn)) theta + t d_omega + t^2/2 d_alpha, first by rows and then by columns.
-    states = _states(p)
+    states = p.states
     r0, r1, r2 = f.turn[0], f.turn[1], f.turn[2]
     for j in range(states):
         x0, x1, x2 = c[3, j], c[4, j], c[5, j]
@@ -409,6 +457,8 @@ def _predict(parameters: Record, state: Record, period: float) -> None:
         for i in range(min(p.errors, ACCELEROMETER_SCALE)):
             at = MOTION_STATES + k * p.errors + i
             c[at, at] += p.bias_walk[i // 3] * t
+    if p.heading != 0:
+        c[states - 1, states - 1] += p.offset_variance * t / _OFFSET_LASTS_S
     # The updates take the matrix for symmetric.
     for i in range(states):
         for j in range(i):
@@ -493,7 +543,7 @@ def _take(parameters: Record, state: Record, row: int) -> None:
     if f.sample_used[k] == 0:
         return
     sensor = m // 3
-    states, start = _states(p), MOTION_STATES + k * p.errors
+    states, start = p.states, MOTION_STATES + k * p.errors
     h, gain, change, c = f.jacobian[k, m], f.gain, f.change, f.covariance
     x = f.predicted[k]
     expected = distort(f.errors[k], sensor, x[3 * sensor], x[3 * sensor + 1], x[3 * sensor + 2])
@@ -516,7 +566,7 @@ def _take(parameters: Record, state: Record, row: int) -> None:
     first = 8 if p.rig == 0 else 0 if k < LEGS else 6
     for j in range(first, 8):
         weight, which = f.rig_jacobian[k, m, j], _rig_state(k, j)
-        at = states - RIG + which
+        at = _rig_start(p) + which
         innovation -= weight * (f.rig[which] + change[at])
         for i in range(states):
             gain[i] += weight * c[at, i]
@@ -525,13 +575,44 @@ def _take(parameters: Record, state: Record, row: int) -> None:
     for j in range(p.errors):
         variance += f.gradient[j] * gain[start + j]
     for j in range(first, 8):
-        variance += f.rig_jacobian[k, m, j] * gain[states - RIG + _rig_state(k, j)]
+        variance += f.rig_jacobian[k, m, j] * gain[_rig_start(p) + _rig_state(k, j)]
+    _correct(state, states, innovation, variance)
+
+
+@kernel
+def _correct(state: Record, states: int, innovation: float, variance: float) -> None:
+    """Take a scalar into covariance and change; `gain` is the covariance with it."""
+    gain, change, c = state.gain, state.change, state.covariance
     inverse = 1.0 / variance
     for i in range(states):
         weight = gain[i] * inverse
         change[i] += weight * innovation
         for j in range(states):
             c[i, j] -= weight * gain[j]
+
+
+@kernel
+def _take_heading(parameters: Record, state: Record) -> None:
+    """Take the sample of the magnetometer, before all others: the angle about the vertical by which the field, turned into {1},
+    is off its direction. An error of the rotation turns it by -axis^T theta, and the offset adds to it.
+    """
+    p, f = parameters, state
+    f.field_used = 0
+    c, gain, states = f.covariance, f.gain, p.states
+    north, east, axis = p.field_axes[0], p.field_axes[1], p.field_axes[2]
+    along = aside = turned = 0.0
+    for i in range(3):
+        in_base = f.rotation[i, 0] * f.field[0] + f.rotation[i, 1] * f.field[1] + f.rotation[i, 2] * f.field[2]
+        along += north[i] * in_base
+        aside += east[i] * in_base
+        turned += axis[i] * f.motion[RATE, i]
+    for i in range(states):
+        gain[i] = c[states - 1, i] - axis[0] * c[3, i] - axis[1] * c[4, i] - axis[2] * c[5, i]
+    variance = gain[states - 1] - axis[0] * gain[3] - axis[1] * gain[4] - axis[2] * gain[5] + p.heading_variance
+    # The rotation is that at the time of the update.
+    innovation = np.arctan2(aside, along) + (f.field_time - f.time) * turned - f.heading_offset
+    bound = INNOVATION_LIMIT * np.sqrt(variance)
+    _correct(state, states, min(max(innovation, -bound), bound), variance)
 
 
 @kernel
@@ -549,7 +630,9 @@ def _end_update(parameters: Record, state: Record) -> None:
         for i in range(p.errors):
             f.errors[k, i] += f.change[MOTION_STATES + k * p.errors + i]
     for i in range(p.rig):
-        f.rig[i] += f.change[_states(p) - RIG + i]
+        f.rig[i] += f.change[_rig_start(p) + i]
+    if p.heading != 0:
+        f.heading_offset += f.change[p.states - 1]
     _publish(state)
 
 

@@ -62,7 +62,7 @@ def sensor_geometry(mechanism: Mechanism, tilt: ArrayLike = (0.0, 0.0)) -> Recor
         tilt: (2,) [rad], by which the vertical is turned about the axes x and y of {1}.
     """
     plant = mechanism.plant_parameters()
-    up = rotation_from_vector([*np.asarray(tilt), 0.0]) @ mechanism.up_in_base
+    up = tilt_rotation(tilt) @ mechanism.up_in_base
     values = {
         "base_joints": mechanism.base_joints,
         "platform_joints": mechanism.platform_joints,
@@ -77,6 +77,11 @@ def sensor_geometry(mechanism: Mechanism, tilt: ArrayLike = (0.0, 0.0)) -> Recor
     for name, value in values.items():
         geometry[name] = value
     return geometry
+
+
+def tilt_rotation(tilt: ArrayLike) -> Array:
+    """The rotation (3, 3) by which a tilt (2,) [rad] about the axes x and y of {1} turns what is fixed in the world."""
+    return rotation_from_vector([*np.asarray(tilt), 0.0])
 
 
 @kernel

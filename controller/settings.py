@@ -51,6 +51,9 @@ class FusionSettings:
             bias and scale, which the filters do not estimate, would otherwise be taken for motion.
         leg_sigma: of each component of a leg's direction, for the refinement [rad].
         tilt_sigma: of the platform's roll and pitch, for the refinement [rad].
+        magnetometer_noise: [uT/sqrt(Hz)]; its resolution counts as noise.
+        magnetometer_rate: samples per second; between them the last one stands [Hz].
+        heading_sigma: of the heading, for the refinement, what its calibration leaves [rad].
         acceleration_time: time constant of the platform's acceleration, which is the derivative of its twist [s].
         sensor_delay: by how much what the IMUs read is behind [s].
         gyroscope_range, accelerometer_range: a reading this large is none [rad/s, m/s^2].
@@ -72,6 +75,9 @@ class FusionSettings:
     platform_accelerometer_noise: float = 0.0134
     leg_sigma: float = radians(0.06)
     tilt_sigma: float = radians(0.06)
+    magnetometer_noise: float = 0.052
+    magnetometer_rate: float = 100.0
+    heading_sigma: float = radians(1.0)
     acceleration_time: float = 0.01
     sensor_delay: float = 0.0
     gyroscope_range: float = radians(250.0)
@@ -110,9 +116,12 @@ def fusion_settings(mechanism: Mechanism, **changes: float) -> FusionSettings:
 
 
 def sensor_settings(mechanism: Mechanism, imu: ImuModel) -> FusionSettings:
-    """The fusion settings of a mechanism, with delay and ranges of its IMUs, where it does not say them itself."""
+    """The fusion settings of a mechanism, with delay, rate of the magnetometer and ranges of its IMUs, where it does not say
+    them itself.
+    """
     known = {
         "sensor_delay": imu.latency,
+        "magnetometer_rate": min(imu.magnetometer_rate, _ENDLESS),
         "gyroscope_range": min(imu.gyroscope.reach, _ENDLESS),
         "accelerometer_range": min(imu.accelerometer.reach, _ENDLESS),
     }

@@ -67,6 +67,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_classify(commands)
     _add_accuracy(commands)
     _add_classes(commands)
+    _add_sensor_sets(commands)
     _add_planar(commands)
     return parser
 
@@ -97,13 +98,15 @@ def _add_motion(command: argparse.ArgumentParser) -> None:
     command.add_argument("--rate", type=float, default=1000.0, help="cycles per second [Hz], 50 to 4000")
     command.add_argument("--imu", default="mpu9150-calibrated", help="ideal, mpu9150, mpu9150-calibrated or icm42688")
     command.add_argument("--imus", type=_imus, default="all", help="which IMUs there are: all, legs, or a list such as 0,2,4,6")
+    command.add_argument("--magnetometer", action="store_true", help="the platform's magnetometer gives its heading")
     command.add_argument("--seed", type=int, default=0, help="of the IMUs' imperfections")
     command.add_argument("--calibration", metavar="FILE.toml", help="the IMUs' constants, as 'gough calibrate' writes them")
     command.add_argument(
         "--fusion",
         default="compiled",
         help="compiled: leg and platform filters; whole, whole-gyroscopes, whole-alignments: all IMUs together, with biases "
-        "of both sensors, of the gyroscopes, or with scales and alignments; filterpy: leg filters of filterpy (slow)",
+        "of both sensors, of the gyroscopes, or with scales and alignments; section-5: the paper's, the orientation from the "
+        "platform's IMU with --magnetometer, the position from the legs; filterpy: leg filters of filterpy (slow)",
     )
     command.add_argument("--plant", metavar="FILE.fmu", help="FMI 3.0 Co-Simulation FMU to use instead of the built one")
     _add_joint_error(command)
@@ -185,6 +188,7 @@ def _add_calibrate(commands: Any) -> None:
     _add_json(rig)
     rig.set_defaults(run=_calibrate_rig)
     _add_calibrate_imu(actions)
+    _add_calibrate_magnetometer(actions)
 
 
 def _add_calibrate_imu(actions: Any) -> None:
@@ -204,6 +208,29 @@ def _add_calibrate_imu(actions: Any) -> None:
     imu.add_argument("--gravity", type=float, default=9.80665, help="at the place [m/s2]")
     _add_json(imu)
     imu.set_defaults(run=_calibrate_imu)
+
+
+def _add_calibrate_magnetometer(actions: Any) -> None:
+    magnetometer = actions.add_parser(
+        "magnetometer",
+        help="a single one, turned by hand: hard and soft iron",
+        description="Calibrate a magnetometer without equipment: it is turned slowly every way round for half a minute or "
+        "longer, away from iron. With a calibrated accelerometer beside it, its axes count for both. Refuses data that do "
+        "not tell the constants, and says what is missing.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    magnetometer.add_argument(
+        "data",
+        type=Path,
+        metavar="FILE",
+        help="CSV with time_s,wx,wy,wz,ax,ay,az,mx,my,mz or time_s,mx,my,mz (rad/s, m/s2, uT), or an MCAP recording",
+    )
+    magnetometer.add_argument("output", type=Path, metavar="FILE.toml", help="the calibration to write, or to add this one to")
+    magnetometer.add_argument("--number", type=int, default=6, choices=range(7), help="which IMU of the mechanism it is in")
+    magnetometer.add_argument("--field", type=float, default=49.4, help="strength of the magnetic field at the place [uT]")
+    magnetometer.add_argument("--gravity", type=float, default=9.80665, help="at the place [m/s2]")
+    _add_json(magnetometer)
+    magnetometer.set_defaults(run=_calibrate_magnetometer)
 
 
 def _add_compare(commands: Any) -> None:
@@ -320,6 +347,23 @@ def _add_classes(commands: Any) -> None:
     command.set_defaults(run=_classes)
 
 
+def _add_sensor_sets(commands: Any) -> None:
+    command = commands.add_parser(
+        "sensor-sets",
+        help="the closed loop with fewer sensors, on every type of mechanism",
+        description="Follow the target sines with every set of sensors, from the paper's least to all: legs alone, with the "
+        "platform's roll and pitch, with its whole orientation (a magnetometer), by leg and platform filters and by the "
+        "whole-mechanism filter. Prints the errors of the estimate, and of direct kinematics the worst conditioning.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("--mechanism", nargs="+", metavar="NAME", help="presets or TOML files (default: one of each type)")
+    command.add_argument("--duration", type=float, default=10.0, help="of each motion [s]")
+    command.add_argument("--seed", type=int, default=0, help="of the IMUs' imperfections")
+    command.add_argument("--markdown", action="store_true", help="print the table in Markdown, as docs/sensor_sets.md has it")
+    _add_json(command)
+    command.set_defaults(run=_sensor_sets)
+
+
 def _add_planar(commands: Any) -> None:
     command = commands.add_parser(
         "planar",
@@ -405,8 +449,7 @@ def _calibrate_imu(options: argparse.Namespace) -> int:
     from hil.imu_data import read_imu
 
     _check_writable(options.output, options.json)
-    if not 9.7 < options.gravity < 9.9:
-        raise InputError(f"--gravity is {options.gravity:g} m/s2; on the earth it is between 9.7 and 9.9")
+    _check_gravity(options.gravity)
     calibration = load_calibration(options.output) if options.output.exists() else Calibration()
     found = calibrate_imu(*read_imu(options.data, options.number), options.gravity)
     calibration.gain[:2, options.number], calibration.offset[:2, options.number] = found.gain, found.offset
@@ -434,6 +477,47 @@ def _calibrate_imu(options: argparse.Namespace) -> int:
         f"{found.rests} rests; residuals: gravity {1e3 * found.force_residual / 9.80665:.3f} mg, "
         f"turns {57.29577951308232 * found.turn_residual:.3f} deg; written to {options.output}"
     )
+    return 0
+
+
+def _check_gravity(gravity: float) -> None:
+    if not 9.7 < gravity < 9.9:
+        raise InputError(f"--gravity is {gravity:g} m/s2; on the earth it is between 9.7 and 9.9")
+
+
+def _calibrate_magnetometer(options: argparse.Namespace) -> int:
+    from controller.calibration import Calibration, load_calibration, save_calibration
+    from controller.magnetometer_calibration import calibrate_magnetometer
+    from hil.imu_data import read_field
+    from plant.imu import ACCELEROMETER, MAGNETOMETER
+
+    _check_writable(options.output, options.json)
+    _check_gravity(options.gravity)
+    if not 20.0 < options.field < 70.0:
+        raise InputError(f"--field is {options.field:g} uT; on the earth it is between 20 and 70")
+    calibration = load_calibration(options.output) if options.output.exists() else Calibration()
+    fields, forces = read_field(options.data, options.number)
+    if forces is not None:
+        at = ACCELEROMETER, options.number
+        forces = forces @ calibration.gain[at].T + calibration.offset[at]
+    found = calibrate_magnetometer(fields, forces, options.field, options.gravity)
+    at = MAGNETOMETER, options.number
+    calibration.gain[at], calibration.offset[at] = found.gain, found.offset
+    save_calibration(options.output, calibration)
+    _write_json(
+        options.json, {name: getattr(value, "tolist", lambda value=value: value)() for name, value in vars(found).items()}
+    )
+    table = _table(f"magnetometer {options.number}", "x", "y", "z")
+    cells = zip(found.offset, found.sigmas[:3], strict=True)
+    table.add_row("offset [uT]", *(f"{value:.3f} +- {sigma:.3f}" for value, sigma in cells))
+    for axis, (gains, sigmas) in enumerate(zip(found.gain, found.sigmas[3:].reshape(3, 3), strict=True)):
+        cells = zip(gains, sigmas, strict=True)
+        table.add_row(f"gain, row {axis + 1}", *(f"{value:.5f} +- {sigma:.5f}" for value, sigma in cells))
+    _print(table)
+    residuals = f"strength {found.field_residual:.3f} uT"
+    if found.dip is not None and found.dip_residual is not None:
+        residuals += f", dip {_deg(found.dip_residual)} deg about {_deg(found.dip)} deg"
+    print(f"{found.samples} samples; residuals: {residuals}; written to {options.output}")
     return 0
 
 
@@ -487,7 +571,7 @@ def _simulate(options: argparse.Namespace) -> int:
     from hil.simulation import SimulationConfig, SimulationStoppedError, simulate
 
     _check_writable(options.json, options.report)
-    names = ("mechanism", "target", "duration", "rate", "imu", "seed", "fusion", "calibration", "plant", "imus")
+    names = ("mechanism", "target", "duration", "rate", "imu", "seed", "fusion", "calibration", "plant", "imus", "magnetometer")
     config = SimulationConfig(**{name: getattr(options, name) for name in names}, joint_error=1e-3 * options.joint_error)
     stopped = None
     with _progress(f"{config.mechanism} follows {config.target}") as progress:
@@ -538,7 +622,7 @@ def _run(options: argparse.Namespace) -> int:
     from hil.simulation import SimulationConfig
 
     _check_writable(options.json, options.record)
-    names = ("mechanism", "target", "duration", "rate", "imu", "seed", "fusion", "calibration", "plant", "imus")
+    names = ("mechanism", "target", "duration", "rate", "imu", "seed", "fusion", "calibration", "plant", "imus", "magnetometer")
     config = SimulationConfig(**{name: getattr(options, name) for name in names}, joint_error=1e-3 * options.joint_error)
     settings = RealTimeSettings(options.priority, options.cpu, options.strict, options.most_missed)
     stopped = None
@@ -909,6 +993,32 @@ def _classes(options: argparse.Namespace) -> int:
     for row in rows:
         table.add_row(*cells(row))
     _print(table)
+    return 0
+
+
+def _sensor_sets(options: argparse.Namespace) -> int:
+    from dataclasses import asdict
+    from itertools import groupby
+
+    from hil.sensor_sets import COLUMNS, MECHANISMS, cells, evaluate_sensor_sets, markdown, reasons
+
+    _check_writable(options.json)
+    with _progress("sets of sensors") as progress:
+        outcomes = evaluate_sensor_sets(
+            options.mechanism or MECHANISMS, duration=options.duration, seed=options.seed, progress=progress
+        )
+    figures = {"duration": options.duration, "seed": options.seed, "version": version("gough")}
+    _write_json(options.json, {**figures, "sets": [asdict(outcome) for outcome in outcomes]})
+    if options.markdown:
+        print(markdown(outcomes))
+        return 0
+    for mechanism, group in groupby(outcomes, lambda outcome: outcome.mechanism):
+        table = _table(mechanism, *COLUMNS[2:])
+        for outcome in group:
+            table.add_row(*cells(outcome)[1:])
+        _print(table)
+    for reason in reasons(outcomes):
+        print(reason)
     return 0
 
 

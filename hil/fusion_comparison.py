@@ -227,7 +227,7 @@ def _follow(
         find_pose(parameters, state)
         ns[0, i] = now(timespec) - began
         positions[0, i], rotations[0, i] = s.position, s.rotation
-        directions[i], verticals[i] = s.directions, s.vertical[0]
+        directions[i], verticals[i] = s.directions, s.vectors[0]
         began = now(timespec)
         improve_pose(parameters, state)
         ns[1, i] = ns[0, i] + now(timespec) - began

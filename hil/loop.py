@@ -27,7 +27,7 @@ from controller.cycle import (
     prepare,
     skip,
 )
-from controller.fusion import calibrate, find_pose, fuse_legs, fuse_mechanism, fuse_platform, improve_pose
+from controller.fusion import calibrate, find_pose, fuse_heading, fuse_legs, fuse_mechanism, fuse_platform, improve_pose
 from controller.least_squares import RANK_TOLERANCE, factor_cholesky, invert_cholesky
 from controller.mechanism_filter import extrapolate_covariance
 from hil.clock import FREE, REAL, finish, new_clock, now, start, wait
@@ -111,10 +111,10 @@ RECORD = np.dtype(
     align=True,
 )
 """What is kept of a cycle: the period that it ran in; when it woke [ns since the first] and how late; the stages' durations and
-the thread's CPU time; periods missed before it; its status and the cause of a stop; which IMUs were used (a bit each), and
-whether the pose is the whole-mechanism filter's; raw IMU data; the pose with covariance
-(translation, rotation; in {1}), residuals of the directions and conditioning; lengths, reference (length, rate, acceleration)
-and commands; and the truth as the plant's `truth` buffer has it.
+the thread's CPU time; periods missed before it; its status and the cause of a stop; which IMUs were used (a bit each, and
+the eighth for the platform's magnetometer), and whether the pose is the whole-mechanism filter's; raw IMU data; the pose with
+covariance (translation, rotation; in {1}), residuals of the directions and conditioning; lengths, reference (length, rate,
+acceleration) and commands; and the truth as the plant's `truth` buffer has it.
 """
 
 HEAD, STOP, DONE, TAIL, KEPT, SUPERVISOR, START = range(7)
@@ -441,6 +441,7 @@ def _compute_from_legs(parameters: Record, state: Record, segments: Array, work:
     stage_ns = work[()].stage_ns
     t0 = now(timespec)
     fuse_platform(parameters, state)
+    fuse_heading(parameters, state)
     t1 = now(timespec)
     conditioning = find_pose(parameters, state)
     t2 = now(timespec)
@@ -471,7 +472,7 @@ def _note(
     record.missed = s.missed
     record.status = status
     record.stop = s.stopping
-    record.imus = 0
+    record.imus = s.heading_used << IMU_COUNT
     for k in range(IMU_COUNT):
         record.imus |= s.imu_used[k] << k
     record.trusted = s.filter_trusted

@@ -44,7 +44,7 @@ _NOTES = {
     "missed": "periods missed before this one",
     "status": "0: all well",
     "stop": "cause of a controlled stop; 0: none",
-    "imus": "which IMUs were used, a bit each",
+    "imus": "which IMUs were used, a bit each, and the eighth for the platform's magnetometer",
     "trusted": "1: the pose is the whole-mechanism filter's",
     "angular_velocity": "rad/s, seven IMUs by three axes: 0-5 on the legs, 6 on the platform",
     "specific_force": "m/s^2",
@@ -138,10 +138,11 @@ class Recorder:
             yield f"stopped on the brakes: {describe_status(int(record['status']))}"
 
     def _tell_fusion(self, imus: int, trusted: int) -> Iterator[str]:
-        for imu in range(IMU_COUNT):
-            used, was = imus >> imu & 1, self._fusion["imus"] >> imu & 1
+        names = [*(f"IMU {imu}" for imu in range(IMU_COUNT)), "the magnetometer"]
+        for bit, name in enumerate(names):
+            used, was = imus >> bit & 1, self._fusion["imus"] >> bit & 1
             if used != was and self._fusion["imus"] >= 0:
-                yield f"IMU {imu} is {'used again' if used else 'left out: it is lost, frozen or at the end of its range'}"
+                yield f"{name} is {'used again' if used else 'left out: it is lost, frozen or at the end of its range'}"
         if trusted != self._fusion["trusted"]:
             yield (
                 "the whole-mechanism filter is relied upon"

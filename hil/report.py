@@ -92,7 +92,7 @@ def _configuration(result: SimulationResult, summary: dict[str, Any]) -> str:
         f"{config.duration:g} s" + (f", stopped after {ran:.3f} s" if ran < config.duration - 1.5 / config.rate else ""),
         f"{config.rate:g} Hz",
         f"IMU {config.imu}, seed {config.seed}",
-        f"{config.fusion} fusion",
+        f"{config.fusion} fusion" + (", magnetometer" if config.magnetometer else ""),
         f"gough {summary['version']}",
     ]
     if tuple(config.imus) != ALL_IMUS:

@@ -30,12 +30,13 @@ from plant.pose import Array, rotation_angle, rotations_from_quaternions
 FUSIONS = {
     "compiled": None,
     "filterpy": None,
+    "section-5": None,
     "whole-gyroscopes": "gyroscopes",
     "whole": "accelerometers",
     "whole-alignments": "alignments",
 }
-"""Ways to fuse the IMUs: by leg and platform filters, in compiled code or filterpy's; or all together in the whole-mechanism
-filter, with the errors of the IMUs that it estimates."""
+"""Ways to fuse the IMUs: by leg and platform filters, in compiled code or filterpy's, unrefined as in the paper's section 5; or
+all together in the whole-mechanism filter, with the errors of the IMUs that it estimates."""
 
 HOLD_RANGE_S = (0.2, 10.0)
 _CHUNK_S = 0.25
@@ -61,6 +62,7 @@ class SimulationConfig:
         imus: which IMUs there are, 0-5 on the legs and 6 on the platform.
         wiring: how they are mounted and wired.
         joint_error: of each coordinate of the plant's joints, which the controller does not know: standard deviation [m].
+        magnetometer: whether the platform's magnetometer gives its heading.
     """
 
     mechanism: str = "hexapod"
@@ -76,6 +78,7 @@ class SimulationConfig:
     imus: tuple[int, ...] = ALL_IMUS
     wiring: Wiring = RIGHT_WIRING
     joint_error: float = 0.0
+    magnetometer: bool = False
 
     def __post_init__(self) -> None:
         check_rate(self.rate)
@@ -233,7 +236,10 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
     if not HOLD_RANGE_S[0] <= control.hold <= HOLD_RANGE_S[1]:
         raise InputError(f"hold is {control.hold:g} s; the estimate settles in {HOLD_RANGE_S[0]:g} to {HOLD_RANGE_S[1]:g} s")
     fusion = sensor_settings(mechanism, model)
-    parameters = cycle_parameters(mechanism, config.rate, control, fusion, config.imus, FUSIONS[config.fusion], calibration)
+    parameters = cycle_parameters(
+        mechanism, config.rate, control, fusion, config.imus, FUSIONS[config.fusion], calibration, config.magnetometer,
+        config.fusion == "section-5",
+    )  # fmt: skip
     count = int(parameters["hold_cycles"]) + round(config.duration * config.rate)
     if records is None and count * RECORD.itemsize > MOST_RECORD_BYTES:
         raise InputError(

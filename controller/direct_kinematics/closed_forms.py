@@ -322,6 +322,23 @@ def _turn(rotation: Array, axis: Array, cosine: float, sine: float) -> bool:
 
 
 @kernel
+def rotation_from_vectors(in_base: Array, in_platform: Array, rotation: Array) -> bool:
+    """Write the rotation (3, 3) that carries the first of two vectors (2, 3), a unit vector, from {2} to {1} and brings the
+    second as near as it can; False if they do not tell one.
+    """
+    up, second = in_base[0], in_base[1]
+    rotation_between(in_platform[0], up, rotation)
+    m0, m1, m2 = in_platform[1, 0], in_platform[1, 1], in_platform[1, 2]
+    t0 = rotation[0, 0] * m0 + rotation[0, 1] * m1 + rotation[0, 2] * m2
+    t1 = rotation[1, 0] * m0 + rotation[1, 1] * m1 + rotation[1, 2] * m2
+    t2 = rotation[2, 0] * m0 + rotation[2, 1] * m1 + rotation[2, 2] * m2
+    c0, c1, c2 = t1 * second[2] - t2 * second[1], t2 * second[0] - t0 * second[2], t0 * second[1] - t1 * second[0]
+    along = (up[0] * t0 + up[1] * t1 + up[2] * t2) * (up[0] * second[0] + up[1] * second[1] + up[2] * second[2])
+    cosine = t0 * second[0] + t1 * second[1] + t2 * second[2] - along
+    return bool(_turn(rotation, up, cosine, up[0] * c0 + up[1] * c1 + up[2] * c2))
+
+
+@kernel
 def pose_from_legs(
     geometry: Record, directions: Array, measured: Array, position: Array, rotation: Array, scratch: Record
 ) -> float:

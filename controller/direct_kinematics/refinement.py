@@ -46,7 +46,8 @@ def normal_equations(
     Args:
         directions: (6, 3), measured.
         weights: (6,), inverse variance of a component of a direction; 0 leaves a leg out.
-        in_base, in_platform: (m, 3), vectors known in both frames; `vector_weights` (m,) are their inverse variances.
+        in_base, in_platform: (m, 3), vectors known in both frames; `vector_weights` (m,) are their inverse variances, and 0
+            leaves one out.
         arms, predicted, lengths: the legs at the pose, written.
         information: (6, 6), lower triangle written; `correction` (6,) is the right side.
     """
@@ -93,6 +94,8 @@ def normal_equations(
         _add_leg(correction, directions[k], predicted[k], arms[k], scale)
     for k in range(vector_weights.shape[0]):
         w = vector_weights[k]
+        if w == 0.0:
+            continue
         v0 = rotation[0, 0] * in_platform[k, 0] + rotation[0, 1] * in_platform[k, 1] + rotation[0, 2] * in_platform[k, 2]
         v1 = rotation[1, 0] * in_platform[k, 0] + rotation[1, 1] * in_platform[k, 1] + rotation[1, 2] * in_platform[k, 2]
         v2 = rotation[2, 0] * in_platform[k, 0] + rotation[2, 1] * in_platform[k, 1] + rotation[2, 2] * in_platform[k, 2]
@@ -149,6 +152,8 @@ def find_twist(
     o0, o1, o2 = angular_velocity[0], angular_velocity[1], angular_velocity[2]
     for k in range(vector_weights.shape[0]):
         w = vector_weights[k]
+        if w == 0.0:
+            continue
         v0 = rotation[0, 0] * in_platform[k, 0] + rotation[0, 1] * in_platform[k, 1] + rotation[0, 2] * in_platform[k, 2]
         v1 = rotation[1, 0] * in_platform[k, 0] + rotation[1, 1] * in_platform[k, 1] + rotation[1, 2] * in_platform[k, 2]
         v2 = rotation[2, 0] * in_platform[k, 0] + rotation[2, 1] * in_platform[k, 1] + rotation[2, 2] * in_platform[k, 2]

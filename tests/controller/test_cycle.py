@@ -234,7 +234,7 @@ def test_a_moving_platform_is_followed_by_ideal_imus_wherever_they_sit(hexapod, 
     parameters, state, errors = parameters_of(mechanism, imus), np.zeros((), STATE), []
     for k in range(3000):
         run(parameters, signals[k], resting(np.full(6, 0.394)), 1, state)
-        tilt = np.linalg.norm(np.cross(state["vertical"][0], rotations[k].T @ mechanism.up_in_base))
+        tilt = np.linalg.norm(np.cross(state["vectors"][0], rotations[k].T @ mechanism.up_in_base))
         off = state["twist"] - twists[k]
         apart = np.linalg.norm(state["position"] - positions[k]), angle_between(state["rotation"], rotations[k])
         errors.append([*apart, tilt * (PLATFORM_IMU in imus), np.linalg.norm(off[:3]), np.linalg.norm(off[3:])])
@@ -261,7 +261,7 @@ def test_the_estimate_is_the_public_solvers_for_the_same_directions(hexapod, imu
     for _ in range(10):
         run(parameters, at, segments, 20, state)
         directions = np.where(np.isin(np.arange(6), imus)[:, None], state["directions"], np.nan)
-        extra = {"up_in_platform": state["vertical"][0], "tilt_sigma": fusion.tilt_sigma} if PLATFORM_IMU in imus else {}
+        extra = {"up_in_platform": state["vectors"][0], "tilt_sigma": fusion.tilt_sigma} if PLATFORM_IMU in imus else {}
         solution = solve(hexapod, directions, leg_sigma=fusion.leg_sigma, **extra)
         # A thousandth of what the noise leaves uncertain.
         assert np.linalg.norm(state["position"] - solution.position) < 1e-6
@@ -274,7 +274,7 @@ def test_the_estimate_is_the_public_solvers_for_the_same_directions(hexapod, imu
 def weigh(state, imus):
     """Use these IMUs, all alike."""
     state["leg_used"] = state["leg_weights"] = [float(leg in imus) for leg in range(6)]
-    state["platform_used"] = state["vertical_weight"] = float(PLATFORM_IMU in imus)
+    state["platform_used"] = state["vector_weights"][0] = float(PLATFORM_IMU in imus)
 
 
 @pytest.mark.parametrize("imus", [ALL_IMUS, LEG_IMUS, (0, 1, 2, 3, 4, PLATFORM_IMU)])
@@ -289,7 +289,7 @@ def test_the_twist_is_the_motion_behind_the_rates_of_the_directions(hexapod, imu
             for sign in (1, -1)
         )
         state["directions"], state["rates"] = leg_directions(hexapod, position, rotation), (ahead - behind) / (2.0 * h)
-        state["vertical"], state["platform_rate"] = rotation.T @ hexapod.up_in_base, rotation.T @ omega
+        state["vectors"][0], state["platform_rate"] = rotation.T @ hexapod.up_in_base, rotation.T @ omega
         state["position"], state["rotation"] = position, rotation
         weigh(state, imus)
         assert improve_pose(parameters, state)
@@ -301,7 +301,7 @@ def test_the_acceleration_is_the_derivative_of_the_twist_with_its_time_constant(
     parameters, tau = parameters_of(hexapod), FusionSettings().acceleration_time
     position, rotation, acceleration = hexapod.home.position, np.eye(3), np.array([0.5, -0.3, 0.2])
     state = np.zeros((), STATE)
-    state["directions"], state["vertical"] = leg_directions(hexapod, position, rotation), hexapod.up_in_base
+    state["directions"], state["vectors"][0] = leg_directions(hexapod, position, rotation), hexapod.up_in_base
     weigh(state, ALL_IMUS)
     found = []
     for k in range(200):
