@@ -103,7 +103,7 @@ def _add_motion(command: argparse.ArgumentParser) -> None:
         "--fusion",
         default="compiled",
         help="compiled: leg and platform filters; whole, whole-gyroscopes, whole-alignments: all IMUs together, with biases "
-        "of both sensors, of the gyroscopes, or with scales and alignments; filterpy: leg filters of filterpy (slow)",
+        "of both sensors, of the gyroscopes, or with scales and alignments; filterpy: as compiled, but on filterpy (slow)",
     )
     command.add_argument("--plant", metavar="FILE.fmu", help="FMI 3.0 Co-Simulation FMU to use instead of the built one")
 

@@ -22,7 +22,7 @@ from controller.fusion import calibrate, find_pose, fuse_legs, fuse_mechanism, f
 from controller.leg_filter import leg_direction, start_leg
 from controller.settings import control_settings, sensor_settings
 from hil.clock import now
-from hil.simulation import FUSIONS, filterpy_legs
+from hil.simulation import FUSIONS, filterpy_filters
 from plant.compiled import Record, kernel
 from plant.errors import InputError
 from plant.imposed import ImposedMotion, impose
@@ -290,14 +290,14 @@ def _point(parameters: Record, ups: Array, directions: Array) -> None:
 
 
 def _filterpy(readings: _Readings) -> _Run:
-    """The refined pose with the leg filters on filterpy."""
+    """The refined pose with the filters of legs and platform on filterpy."""
     parameters, state = readings.parameters(None), np.zeros((), STATE)
-    fuse, found, ns = filterpy_legs(parameters), _Found(readings.count), np.zeros(readings.count, np.int64)
+    filters, found, ns = filterpy_filters(parameters), _Found(readings.count), np.zeros(readings.count, np.int64)
     for i, raw in enumerate(readings.raw):
         began = time.perf_counter_ns()
         calibrate(parameters, state, raw)
-        fuse(state)
-        fuse_platform(parameters, state)
+        filters.fuse_legs(state)
+        filters.fuse_platform(state)
         find_pose(parameters, state)
         improve_pose(parameters, state)
         ns[i] = time.perf_counter_ns() - began
