@@ -68,6 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_accuracy(commands)
     _add_classes(commands)
     _add_planar(commands)
+    _add_broad(commands)
     return parser
 
 
@@ -307,6 +308,32 @@ def _add_planar(commands: Any) -> None:
     command.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots")
     _add_json(command)
     command.set_defaults(run=_planar)
+
+
+def _add_broad(commands: Any) -> None:
+    command = commands.add_parser(
+        "broad",
+        help="the platform's filter by itself on real IMU data",
+        description="Run the platform's filter, and the vqf package, on trials of the BROAD benchmark: an IMU moved by hand, "
+        "with an optical reference. Prints the RMS of the inclination's error where the benchmark counts it.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("folder", type=Path, metavar="FOLDER", help="with the trials *.npz")
+    command.add_argument(
+        "--accelerometer-noise",
+        type=float,
+        default=0.25,
+        help="that the filter assumes [m/s2/sqrt(Hz)]; on a mechanism the legs tell the platform's acceleration, which here is "
+        "unknown and has to be taken for noise, far above the sensor's own",
+    )
+    command.add_argument(
+        "--bias-walk",
+        type=float,
+        default=1e-4,
+        help="random walk of the gyroscope's bias that the filter assumes [rad/s/sqrt(s)]",
+    )
+    _add_json(command)
+    command.set_defaults(run=_broad)
 
 
 def _add_json(command: argparse.ArgumentParser) -> None:
@@ -886,6 +913,23 @@ def _planar(options: argparse.Namespace) -> int:
             f"{57.29577951308232 * figures['leg_angles']['constant_error']:.2f}",
             f"{figures['true_mode']['poses']} of {len(result.poses)} poses",
         )
+    _print(table)
+    return 0
+
+
+def _broad(options: argparse.Namespace) -> int:
+    from controller.settings import FusionSettings
+    from hil.broad import evaluate
+
+    _check_writable(options.json)
+    fusion = FusionSettings(platform_accelerometer_noise=options.accelerometer_noise, bias_walk=options.bias_walk)
+    figures = evaluate(options.folder, fusion)
+    _write_json(options.json, figures)
+    table = _table("inclination RMS", "filter [deg]", "vqf [deg]", "filter [us]", "vqf [us]", "samples")
+    for name, trial in figures["trials"].items():
+        methods = trial["filter"], trial["vqf"]
+        errors, times = (_deg(method["inclination_rms"]) for method in methods), (f"{method['us']:.2f}" for method in methods)
+        table.add_row(name, *errors, *times, f"{trial['samples']}")
     _print(table)
     return 0
 

@@ -269,13 +269,18 @@ def _vqf(readings: _Readings) -> _Run:
     ups = np.empty((IMU_COUNT, readings.count, 3))
     for imu in range(IMU_COUNT):
         rates, forces = (np.ascontiguousarray(readings.calibrated[:, sensor, imu]) for sensor in (GYROSCOPE, ACCELEROMETER))
-        w, x, y, z = VQF(period).updateBatch(rates, forces)["quat6D"].T
-        ups[imu] = np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)], axis=1)
+        ups[imu] = vqf_verticals(period, rates, forces)
     us = 1e6 * (time.perf_counter() - began) / readings.count
     directions = np.empty((readings.count, LEGS, 3))
     _point(readings.parameters(None), ups, directions)
     solutions = solve_batch(readings.mechanism, directions, up_in_platform=ups[PLATFORM_IMU])
     return _Run(solutions.positions, solutions.rotations, us=us)
+
+
+def vqf_verticals(period: float, rates: Array, forces: Array) -> Array:
+    """The unit vertical (N, 3) in the IMU's frame, as `vqf` finds it from rates and forces (N, 3), `period` [s] apart."""
+    w, x, y, z = VQF(period).updateBatch(rates, forces)["quat6D"].T
+    return np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)], axis=1)
 
 
 @kernel
