@@ -62,6 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_calibrate(commands)
     _add_compare(commands)
     _add_tune(commands)
+    _add_tune_fusion(commands)
     _add_fmu(commands)
     _add_bench(commands)
     _add_classify(commands)
@@ -213,6 +214,24 @@ def _add_tune(commands: Any) -> None:
     command.add_argument("--rate", type=float, default=1000.0, help="cycles per second [Hz]")
     _add_json(command)
     command.set_defaults(run=_tune)
+
+
+def _add_tune_fusion(commands: Any) -> None:
+    command = commands.add_parser(
+        "tune-fusion",
+        help="find the noise that the fusion should assume",
+        description="Tune the noise that filters and refinement assume, by consistency: on simulated motions (at rest, mixed, "
+        "1 Hz) their errors shall be as large as their covariances say, which is a NEES of 2 for a leg's angles and the "
+        "platform's tilt, and of 6 for a pose. Writes the mechanism with the table [fusion] that was found.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("output", type=Path, metavar="FILE.toml", help="the mechanism to write, for --mechanism")
+    command.add_argument("--mechanism", default="hexapod", help="preset, or a TOML file")
+    command.add_argument("--imu", default="mpu9150-calibrated", help="ideal, mpu9150, mpu9150-calibrated or icm42688")
+    command.add_argument("--seeds", type=_seeds, default="0,1,2,3,4,5", help="of the IMUs' imperfections and the motions")
+    command.add_argument("--rate", type=float, default=1000.0, help="samples per second [Hz]")
+    _add_json(command)
+    command.set_defaults(run=_tune_fusion)
 
 
 def _add_fmu(commands: Any) -> None:
@@ -667,6 +686,35 @@ def _tune(options: argparse.Namespace) -> int:
     for label, value, unit in design.rows():
         table.add_row(label, value, unit)
     _print(table)
+    return 0
+
+
+def _tune_fusion(options: argparse.Namespace) -> int:
+    from hil.fusion_tuning import TuningConfig, tune_fusion, tuned_text
+
+    _check_writable(options.output, options.json)
+    config = TuningConfig(**{name: getattr(options, name) for name in ("mechanism", "imu", "seeds", "rate")})
+    with _progress(f"noise of {config.mechanism} with {config.imu}") as progress:
+        figures = tune_fusion(config, progress)
+    found = {name: values["after"] for name, values in figures["settings"].items()}
+    write_whole(options.output, tuned_text(config.mechanism, found).encode())
+    _write_json(options.json, figures)
+    table = _table("setting", "before", "after")
+    for name, values in figures["settings"].items():
+        table.add_row(name, f"{values['before']:.4g}", f"{values['after']:.4g}")
+    _print(table)
+    table = _table(f"{len(config.seeds)} seeds", "NEES before", "after", "95 % bounds", "RMS before", "after")
+    for name, estimator in figures["estimators"].items():
+        before, after = estimator["before"], estimator["after"]
+        least, greatest = estimator["bounds"]
+        units = ((_deg, "deg"),) if len(before["rms"]) == 1 else ((_mm, "mm"), (_deg, "deg"))
+        errors = (
+            ", ".join(f"{text(value)} {unit}" for (text, unit), value in zip(units, each["rms"], strict=True))
+            for each in (before, after)
+        )
+        table.add_row(name, f"{before['nees']:.2f}", f"{after['nees']:.2f}", f"{least:.2f} to {greatest:.2f}", *errors)
+    _print(table)
+    print(f"written to {options.output}")
     return 0
 
 
