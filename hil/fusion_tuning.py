@@ -215,7 +215,6 @@ def _seek_least_errors(evaluate: Evaluate, components: int) -> float:
 class _Motion:
     """A simulated motion: raw readings of its IMUs (N, 3, 7, 3), and the truth in the samples that count."""
 
-    kind: str
     raw: Array
     truth: ImposedMotion
 
@@ -235,15 +234,11 @@ class _Runs:
         for kind in MOTIONS:
             for seed in config.seeds:
                 motion = impose(mechanism, kind, DURATION_S, config.rate, seed)
-                self.motions.append(_Motion(kind, read(motion, model, config.rate, seed), _part(motion, self.late)))
+                self.motions.append(_Motion(read(motion, model, config.rate, seed), _part(motion, self.late)))
                 progress(len(self.motions) / count)
 
-    def evaluate(
-        self, fusion: FusionSettings, names: Sequence[str], whole: str | None, kinds: Sequence[str] = MOTIONS
-    ) -> dict[str, Consistency]:
-        """How estimators, by name, do with these settings, on motions of these kinds, with the whole-mechanism filter for these
-        errors of the IMUs, or without it.
-        """
+    def evaluate(self, fusion: FusionSettings, names: Sequence[str], whole: str | None) -> dict[str, Consistency]:
+        """How estimators, by name, do with these settings, with the whole-mechanism filter for these errors, or without it."""
         control = control_settings(self.mechanism)
         parameters = cycle_parameters(self.mechanism, self.rate, control, fusion, whole=whole)
 
@@ -252,7 +247,7 @@ class _Runs:
             return [ESTIMATORS[name].judge(self.mechanism, found, self.late, motion.truth) for name in names]
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            judged = zip(*pool.map(run, [motion for motion in self.motions if motion.kind in kinds]), strict=True)
+            judged = zip(*pool.map(run, self.motions), strict=True)
         return {name: Consistency.pooled(each) for name, each in zip(names, judged, strict=True)}
 
     def evaluate_all(self, fusion: FusionSettings) -> dict[str, Consistency]:
@@ -266,12 +261,11 @@ class _Runs:
 
 @dataclass(frozen=True)
 class _Step:
-    """What to look for, in which estimator, by the common change of which settings, on which motions."""
+    """What to look for, in which estimator, by the common change of which settings."""
 
     estimator: str
     seek: Callable[[Evaluate, int], float]
     settings: tuple[str, ...]
-    motions: tuple[str, ...] = MOTIONS
 
     def tuned(self, fusion: FusionSettings, runs: _Runs) -> FusionSettings:
         """The settings with what was found."""
@@ -280,7 +274,7 @@ class _Step:
         @cache
         def evaluate(change: float) -> Consistency:
             changed = _scaled(fusion, self.settings, change)
-            return runs.evaluate(changed, (self.estimator,), estimator.whole, self.motions)[self.estimator]
+            return runs.evaluate(changed, (self.estimator,), estimator.whole)[self.estimator]
 
         return _scaled(fusion, self.settings, self.seek(evaluate, estimator.components))
 
@@ -290,10 +284,7 @@ STEPS = (
     _Step("platform filter", _seek_consistency, ("platform_accelerometer_noise",)),
     _Step("refined pose", _seek_least_errors, ("tilt_sigma",)),
     _Step("refined pose", _seek_consistency, ("leg_sigma", "tilt_sigma")),
-    # At rest nothing tells a tilt from an accelerometer's bias, so that the errors are those of what is known of it.
-    _Step("whole mechanism", _seek_consistency, ("accelerometer_bias_sigma",), ("static",)),
-    _Step("whole mechanism", _seek_least_errors, ("mechanism_accelerometer_noise",)),
-    _Step("whole mechanism", _seek_consistency, ("mechanism_gyroscope_noise",)),
+    _Step("whole mechanism", _seek_consistency, ("mechanism_gyroscope_noise", "mechanism_accelerometer_noise")),
 )
 """In the order of the estimators, each of which builds upon the one before."""
 
