@@ -1,18 +1,49 @@
-"""The leg filter on filterpy's ExtendedKalmanFilter: the slow clear twin of `leg_filter`, selectable for the whole loop.
+"""The filters of legs and platform on filterpy's ExtendedKalmanFilter: the slow clear twins of `leg_filter` and
+`platform_filter`, selectable for the whole loop.
 
-The measurement is written with vectors and its Jacobian follows the product rule, term by term, so that it shares no line
-with the compiled filter.
+They are written with vectors, and the Jacobian of a leg's measurement follows the product rule, term by term, so that they
+share no line with the compiled filters.
 """
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
+from controller.platform_filter import INNOVATION_LIMIT
 from plant.pose import Array, skew
 
 STATES = 9
+PLATFORM_STATES = 6
 
 
-class FilterpyLeg:
+class _Filterpy:
+    """State and covariance of a filter of filterpy.
+
+    Args:
+        states, readings: how many there are of each.
+    """
+
+    def __init__(self, states: int, readings: int) -> None:
+        self.filter = ExtendedKalmanFilter(dim_x=states, dim_z=readings)
+
+    def start(self, x: Array, covariance: Array) -> None:
+        """Take over state (n,) and covariance (n, n)."""
+        self.filter.x = x.reshape(-1, 1).copy()
+        self.filter.P = covariance.copy()
+
+    @property
+    def state(self) -> Array:
+        """The state (n,)."""
+        state: Array = self.filter.x[:, 0]
+        return state
+
+    @property
+    def covariance(self) -> Array:
+        """The covariance (n, n)."""
+        covariance: Array = self.filter.P
+        return covariance
+
+
+class FilterpyLeg(_Filterpy):
     """One leg's filter on filterpy; the state is that of `leg_filter`.
 
     Args:
@@ -35,8 +66,8 @@ class FilterpyLeg:
         rate_variance: float,
         force_variance: float,
     ) -> None:
+        super().__init__(STATES, readings=6)
         self.up_in_joint, self.imu_position, self.gravity = up_in_joint, imu_position, gravity
-        self.filter = ExtendedKalmanFilter(dim_x=STATES, dim_z=6)
         pair = np.array([[1.0, period, period**2 / 2], [0.0, 1.0, period], [0.0, 0.0, 1.0]])
         self.filter.F = np.eye(STATES)
         self.filter.F[:6, :6] = np.kron(pair, np.eye(2))
@@ -51,11 +82,6 @@ class FilterpyLeg:
         self.filter.Q[:6, :6] += np.kron(noise, np.eye(2))
         self.filter.R = np.diag([rate_variance] * 3 + [force_variance] * 3)
 
-    def start(self, x: Array, covariance: Array) -> None:
-        """Take over state (9,) and covariance (9, 9)."""
-        self.filter.x = x.reshape(STATES, 1).copy()
-        self.filter.P = covariance.copy()
-
     def step(self, gyroscope: Array, accelerometer: Array) -> None:
         """Predict over one period and take a sample [rad/s, m/s^2]."""
         self.filter.predict()
@@ -65,18 +91,6 @@ class FilterpyLeg:
         """Take a sample [rad/s, m/s^2] without predicting."""
         sample = np.concatenate([gyroscope, accelerometer]).reshape(6, 1)
         self.filter.update(sample, self.measurement_jacobian, self.measurement)
-
-    @property
-    def state(self) -> Array:
-        """The state (9,)."""
-        state: Array = self.filter.x[:, 0]
-        return state
-
-    @property
-    def covariance(self) -> Array:
-        """The covariance (9, 9)."""
-        covariance: Array = self.filter.P
-        return covariance
 
     def measurement(self, x: Array) -> Array:
         """Expected rate and force (6, 1) at a state (9, 1)."""
@@ -117,3 +131,43 @@ class FilterpyLeg:
         up_x[:, 0] = turn_b.T @ turn_a_a.T @ self.up_in_joint
         up_x[:, 1] = turn_b_b.T @ turn_a.T @ self.up_in_joint
         return omega, alpha, up, omega_x, alpha_x, up_x
+
+
+class FilterpyPlatform(_Filterpy):
+    """The platform's filter on filterpy; the state is that of `platform_filter`.
+
+    Args:
+        gravity: [m/s^2].
+        period: [s].
+        rate_density, bias_walk: spectral densities of the gyroscope's noise and of its bias.
+        vertical_variance: of each component of the accelerometer's reading over g.
+    """
+
+    def __init__(self, gravity: float, period: float, rate_density: float, bias_walk: float, vertical_variance: float) -> None:
+        super().__init__(PLATFORM_STATES, readings=1)
+        self.gravity, self.period = gravity, period
+        self.filter.Q = period * np.diag([rate_density] * 3 + [bias_walk] * 3)
+        self.filter.R = np.array([[vertical_variance]])
+
+    def step(self, gyroscope: Array, accelerometer: Array, acceleration: Array) -> None:
+        """Predict over one period and take a sample [rad/s, m/s^2], without the IMU's own acceleration (3,) in {2}."""
+        self._predict(gyroscope)
+        for axis, reading in zip(np.eye(3, PLATFORM_STATES), (accelerometer - acceleration) / self.gravity, strict=True):
+            jacobian = axis[None]
+            self.filter.update(reading, lambda x, h: h, lambda x, h: h @ x, args=jacobian, hx_args=jacobian, residual=self._cut)
+        self.filter.x[:3] /= np.linalg.norm(self.filter.x[:3])
+
+    def _predict(self, gyroscope: Array) -> None:
+        """`u' = u x (rate - bias)`: the state to second order, its covariance to first."""
+        t, u, bias = self.period, self.state[:3], self.state[3:]
+        turn = -t * skew(gyroscope - bias)
+        turned = (np.eye(3) + turn + turn @ turn / 2.0) @ u
+        self.filter.F = np.eye(PLATFORM_STATES)
+        self.filter.F[:3] += np.hstack([turn, -t * skew(u)])
+        self.filter.predict()
+        self.filter.x = np.concatenate([turned, bias]).reshape(-1, 1)
+
+    def _cut(self, reading: Array, expected: Array) -> Array:
+        """The innovation, within `INNOVATION_LIMIT` standard deviations."""
+        bound = INNOVATION_LIMIT * np.sqrt(self.filter.S)
+        return np.clip(reading - expected, -bound, bound)

@@ -133,17 +133,33 @@ def point_legs(parameters: Record, state: Record) -> None:
 @kernel
 def fuse_platform(parameters: Record, state: Record) -> None:
     """Step the platform's filter, with its own acceleration, known from the legs, taken out of the reading."""
+    if not prepare_platform(parameters, state):
+        return
+    p, s = parameters[()], state[()]
+    step_platform(
+        s.platform_x, s.platform_covariance, s.sample[GYROSCOPE, PLATFORM_IMU], s.sample[ACCELEROMETER, PLATFORM_IMU],
+        s.imu_acceleration, elapsed(parameters, state), p.sensors.gravity, p.gyroscope_density, p.bias_walk,
+        p.vertical_variance, s.matrices_6_6[0], s.matrices_6_6[1], s.vectors_6[0], s.vectors_6[1],
+    )  # fmt: skip
+    find_vertical(parameters, state)
+
+
+@kernel
+def prepare_platform(parameters: Record, state: Record) -> bool:
+    """Before the step of the platform's filter: start it where that is due, and find the acceleration of its IMU, seen in {2};
+    returns whether there is a sample to take.
+    """
     p, s = parameters[()], state[()]
     age = s.age[PLATFORM_IMU]
     s.age[PLATFORM_IMU] = age + 1 + s.missed if s.imu_used[PLATFORM_IMU] != 0 else 0
     s.platform_used = s.age[PLATFORM_IMU] > min(s.cycle, p.leg_settling_cycles)
     s.vector_weights[0] = p.vertical_weight if s.platform_used != 0 else 0.0
     if s.imu_used[PLATFORM_IMU] == 0:
-        return
+        return False
     rate, force = s.sample[GYROSCOPE, PLATFORM_IMU], s.sample[ACCELEROMETER, PLATFORM_IMU]
     if age == 0:
         start_platform(s.platform_x, s.platform_covariance, force, p.bias_sigma)
-    # Acceleration of the IMU: that of the origin, and what turning adds at the IMU's place d.
+    # That of the origin, and what turning adds at the IMU's place d.
     d = p.sensors.platform_imu_position
     w0, w1, w2 = rate[0] - s.platform_x[3], rate[1] - s.platform_x[4], rate[2] - s.platform_x[5]
     wd = w0 * d[0] + w1 * d[1] + w2 * d[2]
@@ -158,12 +174,14 @@ def fuse_platform(parameters: Record, state: Record) -> None:
     s.imu_acceleration[0] += a[1] * d[2] - a[2] * d[1] + w0 * wd - d[0] * ww
     s.imu_acceleration[1] += a[2] * d[0] - a[0] * d[2] + w1 * wd - d[1] * ww
     s.imu_acceleration[2] += a[0] * d[1] - a[1] * d[0] + w2 * wd - d[2] * ww
-    period = elapsed(parameters, state)
-    step_platform(
-        s.platform_x, s.platform_covariance, rate, force, s.imu_acceleration, period, p.sensors.gravity, p.gyroscope_density,
-        p.bias_walk, p.vertical_variance, s.matrices_6_6[0], s.matrices_6_6[1], s.vectors_6[0], s.vectors_6[1],
-    )  # fmt: skip
-    w, u = s.platform_rate, s.platform_x
+    return True
+
+
+@kernel
+def find_vertical(parameters: Record, state: Record) -> None:
+    """After the step of the platform's filter: the platform's rate and the vertical in {2}, without the sensors' delay."""
+    p, s = parameters[()], state[()]
+    rate, w, u = s.sample[GYROSCOPE, PLATFORM_IMU], s.platform_rate, s.platform_x
     for i in range(3):
         w[i] = rate[i] - u[3 + i]
     _carry_on(u, w, p.sensor_delay, s.vectors[0])

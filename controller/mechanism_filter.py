@@ -92,11 +92,11 @@ FILTER_PARAMETERS = np.dtype(
     align=True,
 )
 """Samples of a window; estimated errors of an IMU, 0 for no filter, and of the rig; all states; time constant of the motion at
-which the Jacobian is taken, infinite if that is set from outside; spectral densities of the platform's jerk (linear, angular)
-and of the biases' walks (gyroscope, accelerometer); variances of one sample (rate, force); the covariance of the errors; and
-the variances of position and rotation that are left because the rig's are not estimated. Then whether there is a heading; in {1}
-the horizontal direction of the magnetic field, that across it and the vertical, and the axis about which a small turn changes what
-the heading seems to be; and the variances of a sample's heading and of its offset.
+which the Jacobian is taken, infinite if that is set from outside; spectral densities of the platform's jerk (linear,
+angular) and of the biases' walks (gyroscope, accelerometer); variances of one sample (rate, force); the covariance of the
+errors; and the variances of position and rotation that are left because the rig's are not estimated. Then whether there is a
+heading; in {1} the horizontal direction of the magnetic field, that across it and the vertical, and the axis about which a
+small turn changes what the heading seems to be; and the variances of a sample's heading and of its offset.
 """
 
 FILTER_STATE = np.dtype(

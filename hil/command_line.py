@@ -62,6 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_calibrate(commands)
     _add_compare(commands)
     _add_tune(commands)
+    _add_tune_fusion(commands)
     _add_fmu(commands)
     _add_bench(commands)
     _add_classify(commands)
@@ -69,6 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_classes(commands)
     _add_sensor_sets(commands)
     _add_planar(commands)
+    _add_broad(commands)
     return parser
 
 
@@ -106,7 +108,7 @@ def _add_motion(command: argparse.ArgumentParser) -> None:
         default="compiled",
         help="compiled: leg and platform filters; whole, whole-gyroscopes, whole-alignments: all IMUs together, with biases "
         "of both sensors, of the gyroscopes, or with scales and alignments; section-5: the paper's, the orientation from the "
-        "platform's IMU with --magnetometer, the position from the legs; filterpy: leg filters of filterpy (slow)",
+        "platform's IMU with --magnetometer, the position from the legs; filterpy: as compiled, but on filterpy (slow)",
     )
     command.add_argument("--plant", metavar="FILE.fmu", help="FMI 3.0 Co-Simulation FMU to use instead of the built one")
     _add_joint_error(command)
@@ -267,6 +269,24 @@ def _add_tune(commands: Any) -> None:
     command.set_defaults(run=_tune)
 
 
+def _add_tune_fusion(commands: Any) -> None:
+    command = commands.add_parser(
+        "tune-fusion",
+        help="find the noise that the fusion should assume",
+        description="Tune the noise that filters and refinement assume, by consistency: on simulated motions (at rest, mixed, "
+        "1 Hz) their errors shall be as large as their covariances say, which is a NEES of 2 for a leg's angles and the "
+        "platform's tilt, and of 6 for a pose. Writes the mechanism with the table [fusion] that was found.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("output", type=Path, metavar="FILE.toml", help="the mechanism to write, for --mechanism")
+    command.add_argument("--mechanism", default="hexapod", help="preset, or a TOML file")
+    command.add_argument("--imu", default="mpu9150-calibrated", help="ideal, mpu9150, mpu9150-calibrated or icm42688")
+    command.add_argument("--seeds", type=_seeds, default="0,1,2,3,4,5", help="of the IMUs' imperfections and the motions")
+    command.add_argument("--rate", type=float, default=1000.0, help="samples per second [Hz]")
+    _add_json(command)
+    command.set_defaults(run=_tune_fusion)
+
+
 def _add_fmu(commands: Any) -> None:
     command = commands.add_parser("fmu", help="the plant as an FMU", description="The plant as an FMU.")
     actions = command.add_subparsers(required=True, metavar="ACTION", parser_class=_Parser)
@@ -377,6 +397,32 @@ def _add_planar(commands: Any) -> None:
     command.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots")
     _add_json(command)
     command.set_defaults(run=_planar)
+
+
+def _add_broad(commands: Any) -> None:
+    command = commands.add_parser(
+        "broad",
+        help="the platform's filter by itself on real IMU data",
+        description="Run the platform's filter, and the vqf package, on trials of the BROAD benchmark: an IMU moved by hand, "
+        "with an optical reference. Prints the RMS of the inclination's error where the benchmark counts it.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("folder", type=Path, metavar="FOLDER", help="with the trials *.npz")
+    command.add_argument(
+        "--accelerometer-noise",
+        type=float,
+        default=0.25,
+        help="that the filter assumes [m/s2/sqrt(Hz)]; on a mechanism the legs tell the platform's acceleration, which here is "
+        "unknown and has to be taken for noise, far above the sensor's own",
+    )
+    command.add_argument(
+        "--bias-walk",
+        type=float,
+        default=1e-4,
+        help="random walk of the gyroscope's bias that the filter assumes [rad/s/sqrt(s)]",
+    )
+    _add_json(command)
+    command.set_defaults(run=_broad)
 
 
 def _add_json(command: argparse.ArgumentParser) -> None:
@@ -780,6 +826,35 @@ def _tune(options: argparse.Namespace) -> int:
     return 0
 
 
+def _tune_fusion(options: argparse.Namespace) -> int:
+    from hil.fusion_tuning import TuningConfig, tune_fusion, tuned_text
+
+    _check_writable(options.output, options.json)
+    config = TuningConfig(**{name: getattr(options, name) for name in ("mechanism", "imu", "seeds", "rate")})
+    with _progress(f"noise of {config.mechanism} with {config.imu}") as progress:
+        figures = tune_fusion(config, progress)
+    found = {name: values["after"] for name, values in figures["settings"].items()}
+    write_whole(options.output, tuned_text(config.mechanism, found).encode())
+    _write_json(options.json, figures)
+    table = _table("setting", "before", "after")
+    for name, values in figures["settings"].items():
+        table.add_row(name, f"{values['before']:.4g}", f"{values['after']:.4g}")
+    _print(table)
+    table = _table(f"{len(config.seeds)} seeds", "NEES before", "after", "95 % bounds", "RMS before", "after")
+    for name, estimator in figures["estimators"].items():
+        before, after = estimator["before"], estimator["after"]
+        least, greatest = estimator["bounds"]
+        units = ((_deg, "deg"),) if len(before["rms"]) == 1 else ((_mm, "mm"), (_deg, "deg"))
+        errors = (
+            ", ".join(f"{text(value)} {unit}" for (text, unit), value in zip(units, each["rms"], strict=True))
+            for each in (before, after)
+        )
+        table.add_row(name, f"{before['nees']:.2f}", f"{after['nees']:.2f}", f"{least:.2f} to {greatest:.2f}", *errors)
+    _print(table)
+    print(f"written to {options.output}")
+    return 0
+
+
 def _build_fmu(options: argparse.Namespace) -> int:
     from plant.export import MODEL, build_in_subprocess
 
@@ -1049,6 +1124,23 @@ def _planar(options: argparse.Namespace) -> int:
             f"{57.29577951308232 * figures['leg_angles']['constant_error']:.2f}",
             f"{figures['true_mode']['poses']} of {len(result.poses)} poses",
         )
+    _print(table)
+    return 0
+
+
+def _broad(options: argparse.Namespace) -> int:
+    from controller.settings import FusionSettings
+    from hil.broad import evaluate
+
+    _check_writable(options.json)
+    fusion = FusionSettings(platform_accelerometer_noise=options.accelerometer_noise, bias_walk=options.bias_walk)
+    figures = evaluate(options.folder, fusion)
+    _write_json(options.json, figures)
+    table = _table("inclination RMS", "filter [deg]", "vqf [deg]", "filter [us]", "vqf [us]", "samples")
+    for name, trial in figures["trials"].items():
+        methods = trial["filter"], trial["vqf"]
+        errors, times = (_deg(method["inclination_rms"]) for method in methods), (f"{method['us']:.2f}" for method in methods)
+        table.add_row(name, *errors, *times, f"{trial['samples']}")
     _print(table)
     return 0
 

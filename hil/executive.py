@@ -147,7 +147,7 @@ def run(
         RunStoppedError: the run ended on the brakes before its time, or its process died.
     """
     if config.fusion == "filterpy":
-        raise InputError("the leg filters of filterpy are too slow for the clock: use them with 'gough simulate'")
+        raise InputError("the filters of filterpy are too slow for the clock: use them with 'gough simulate'")
     records = shared_array(max(_LEAST_RECORDS, round(_BUFFER_S * config.rate)), RECORD)
     link: NDArray[np.int64] = shared_array(LINK, np.dtype(np.int64))
     link[SUPERVISOR] = os.getpid()

@@ -23,7 +23,7 @@ from controller.leg_filter import leg_direction, start_leg
 from controller.mechanism_filter import extrapolate_covariance
 from controller.settings import control_settings, sensor_settings
 from hil.clock import now
-from hil.simulation import FUSIONS, filterpy_legs
+from hil.simulation import FUSIONS, filterpy_filters
 from plant.compiled import Record, kernel
 from plant.errors import InputError
 from plant.imposed import ImposedMotion, impose
@@ -33,7 +33,8 @@ from plant.pose import Array, vector_from_rotation
 from plant.variables import IMU_COUNT, PLATFORM_IMU
 
 LEARNING_S = 20.0
-_CLOSED, _REFINED, _WHOLE = range(3)
+CLOSED, REFINED, WHOLE = range(3)
+"""Steps of `Found`."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ def compare(config: ComparisonConfig, progress: Callable[[float], None] = lambda
         for k, (name, method) in enumerate(methods.items()):
             run = method(readings)
             each = errors.setdefault(name, _Errors([], [], []))
-            error = _pose_errors(run, motion)[late]
+            error = pose_errors(run.positions, run.rotations, motion)[late]
             each.squares.append(
                 (float(np.mean(np.sum(error[:, :3] ** 2, axis=1))), float(np.mean(np.sum(error[:, 3:] ** 2, axis=1))))
             )
@@ -147,10 +148,10 @@ class _Run:
         return float(np.einsum("ni,nij,nj->n", errors, information, errors).mean())
 
 
-def _pose_errors(run: _Run, motion: ImposedMotion) -> Array:
-    """(N, 6): of position, and rotation vectors in {1}."""
-    turned = vector_from_rotation(run.rotations @ np.swapaxes(motion.rotations, 1, 2))
-    return np.concatenate([run.positions - motion.positions, turned], axis=1)
+def pose_errors(positions: Array, rotations: Array, motion: ImposedMotion) -> Array:
+    """Errors (N, 6) of poses (N, 3), (N, 3, 3): of position, and rotation vectors in {1}."""
+    turned = vector_from_rotation(rotations @ np.swapaxes(motion.rotations, 1, 2))
+    return np.concatenate([positions - motion.positions, turned], axis=1)
 
 
 class _Readings:
@@ -161,49 +162,64 @@ class _Readings:
     ) -> None:
         self.mechanism, self.rate, self.count = mechanism, rate, len(motion.times)
         self._fusion, self._calibration = sensor_settings(mechanism, model), calibration
-        self.raw = np.empty_like(motion.signals)
-        _measure_all(imu_state(model, seed, 1.0 / rate), motion.signals, self.raw)
+        self.raw = read(motion, model, rate, seed)
         self.calibrated = calibration.apply(self.raw)
-        self._found: dict[str | None, _Found] = {}
+        self._found: dict[str | None, Found] = {}
 
     def parameters(self, errors: str | None) -> Record:
         """The cycle's constants."""
         control = control_settings(self.mechanism)
         return cycle_parameters(self.mechanism, self.rate, control, self._fusion, ALL_IMUS, errors, self._calibration)
 
-    def run(self, errors: str) -> "_Run":
+    def run(self, errors: str) -> _Run:
         """The poses of the whole-mechanism filter for these errors."""
-        return self.found(errors).run(_WHOLE)
+        return self.found(errors).run(WHOLE)
 
-    def found(self, errors: str | None) -> "_Found":
+    def found(self, errors: str | None) -> "Found":
         """What the cycle finds with the whole-mechanism filter for these errors, or without it."""
         if errors not in self._found:
-            found = _Found(self.count)
-            _follow(
-                self.parameters(errors), np.zeros((), STATE), self.raw, found.positions, found.rotations, found.information,
-                found.covariances, found.directions, found.verticals, found.ns, np.zeros(2, np.int64),
-            )  # fmt: skip
-            self._found[errors] = found
+            self._found[errors] = fuse(self.parameters(errors), self.raw)
         return self._found[errors]
 
 
-class _Found:
-    """By step (closed form, refined, whole mechanism) positions and rotations; the refined pose's inverse covariance and the
-    filter's covariance; the leg filters' directions, the platform's vertical, and nanoseconds until each step was done.
+class Found:
+    """What the fusing steps find.
+
+    By step (closed form, refined, whole mechanism) positions and rotations; the refined pose's inverse covariance and the
+    filter's covariance; the leg filters' directions with the covariances (N, 6, 2, 2) of their angles, the platform's vertical
+    with its covariance, and nanoseconds until each step was done.
     """
 
     def __init__(self, count: int) -> None:
         self.positions, self.rotations = np.zeros((3, count, 3)), np.zeros((3, count, 3, 3))
         self.information, self.covariances = np.zeros((count, 6, 6)), np.zeros((count, 6, 6))
         self.directions, self.verticals = np.zeros((count, LEGS, 3)), np.zeros((count, 3))
+        self.leg_covariances, self.vertical_covariances = np.zeros((count, LEGS, 2, 2)), np.zeros((count, 3, 3))
         self.ns = np.zeros((3, count), np.int64)
 
     def run(self, step: int) -> _Run:
         """One step's poses."""
-        information = self.information if step == _REFINED else None
-        covariance = self.covariances if step == _WHOLE else None
+        information = self.information if step == REFINED else None
+        covariance = self.covariances if step == WHOLE else None
         us = float(np.median(self.ns[step])) / 1e3
         return _Run(self.positions[step], self.rotations[step], information, covariance, us)
+
+
+def read(motion: ImposedMotion, model: ImuModel, rate: float, seed: int) -> Array:
+    """What imperfect IMUs read on a motion (N, 3, 7, 3), at this rate [Hz]."""
+    raw = np.empty_like(motion.signals)
+    _measure_all(imu_state(model, seed, 1.0 / rate), motion.signals, raw)
+    return raw
+
+
+def fuse(parameters: Record, raw: Array) -> Found:
+    """The fusing steps of the cycle over raw readings (N, 3, 7, 3)."""
+    found = Found(len(raw))
+    _follow(
+        parameters, np.zeros((), STATE), raw, found.positions, found.rotations, found.information, found.covariances,
+        found.directions, found.leg_covariances, found.verticals, found.vertical_covariances, found.ns, np.zeros(2, np.int64),
+    )  # fmt: skip
+    return found
 
 
 @kernel
@@ -215,9 +231,9 @@ def _measure_all(imu: Record, signals: Array, raw: Array) -> None:
 @kernel
 def _follow(
     parameters: Record, state: Record, raw: Array, positions: Array, rotations: Array, information: Array, covariances: Array,
-    directions: Array, verticals: Array, ns: NDArray[np.int64], timespec: NDArray[np.int64],
+    directions: Array, leg_covariances: Array, verticals: Array, vertical_covariances: Array, ns: NDArray[np.int64],
+    timespec: NDArray[np.int64],
 ) -> None:  # fmt: skip
-    """The fusing steps of the cycle over raw readings (N, 3, 7, 3)."""
     s = state[()]
     for i in range(raw.shape[0]):
         began = now(timespec)
@@ -228,6 +244,7 @@ def _follow(
         ns[0, i] = now(timespec) - began
         positions[0, i], rotations[0, i] = s.position, s.rotation
         directions[i], verticals[i] = s.directions, s.vectors[0]
+        leg_covariances[i], vertical_covariances[i] = s.leg_covariance[:, :2, :2], s.platform_covariance[:3, :3]
         began = now(timespec)
         improve_pose(parameters, state)
         ns[1, i] = ns[0, i] + now(timespec) - began
@@ -270,13 +287,18 @@ def _vqf(readings: _Readings) -> _Run:
     ups = np.empty((IMU_COUNT, readings.count, 3))
     for imu in range(IMU_COUNT):
         rates, forces = (np.ascontiguousarray(readings.calibrated[:, sensor, imu]) for sensor in (GYROSCOPE, ACCELEROMETER))
-        w, x, y, z = VQF(period).updateBatch(rates, forces)["quat6D"].T
-        ups[imu] = np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)], axis=1)
+        ups[imu] = vqf_verticals(period, rates, forces)
     us = 1e6 * (time.perf_counter() - began) / readings.count
     directions = np.empty((readings.count, LEGS, 3))
     _point(readings.parameters(None), ups, directions)
     solutions = solve_batch(readings.mechanism, directions, up_in_platform=ups[PLATFORM_IMU])
     return _Run(solutions.positions, solutions.rotations, us=us)
+
+
+def vqf_verticals(period: float, rates: Array, forces: Array) -> Array:
+    """The unit vertical (N, 3) in the IMU's frame, as `vqf` finds it from rates and forces (N, 3), `period` [s] apart."""
+    w, x, y, z = VQF(period).updateBatch(rates, forces)["quat6D"].T
+    return np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)], axis=1)
 
 
 @kernel
@@ -291,30 +313,30 @@ def _point(parameters: Record, ups: Array, directions: Array) -> None:
 
 
 def _filterpy(readings: _Readings) -> _Run:
-    """The refined pose with the leg filters on filterpy."""
+    """The refined pose with the filters of legs and platform on filterpy."""
     parameters, state = readings.parameters(None), np.zeros((), STATE)
-    fuse, found, ns = filterpy_legs(parameters), _Found(readings.count), np.zeros(readings.count, np.int64)
+    filters, found, ns = filterpy_filters(parameters), Found(readings.count), np.zeros(readings.count, np.int64)
     for i, raw in enumerate(readings.raw):
         began = time.perf_counter_ns()
         calibrate(parameters, state, raw)
-        fuse(state)
-        fuse_platform(parameters, state)
+        filters.fuse_legs(state)
+        filters.fuse_platform(state)
         find_pose(parameters, state)
         improve_pose(parameters, state)
         ns[i] = time.perf_counter_ns() - began
-        found.positions[_REFINED, i], found.rotations[_REFINED, i] = state["position"], state["rotation"]
+        found.positions[REFINED, i], found.rotations[REFINED, i] = state["position"], state["rotation"]
         lower = np.tril(state["information"])
         found.information[i] = lower + np.tril(lower, -1).T
         state["cycle"] += 1
-    found.ns[_REFINED] = ns
-    return found.run(_REFINED)
+    found.ns[REFINED] = ns
+    return found.run(REFINED)
 
 
 METHODS: dict[str, Callable[[_Readings], _Run]] = {
     "section 5, magnetometer": _section_5,
     "vqf per IMU, refined": _vqf,
-    "legs + vertical": lambda readings: readings.found(None).run(_CLOSED),
-    "refined (compiled)": lambda readings: readings.found(None).run(_REFINED),
+    "legs + vertical": lambda readings: readings.found(None).run(CLOSED),
+    "refined (compiled)": lambda readings: readings.found(None).run(REFINED),
     **{name: partial(_Readings.run, errors=errors) for name, errors in FUSIONS.items() if errors is not None},
 }
 SLOW_METHODS: dict[str, Callable[[_Readings], _Run]] = {"refined (filterpy)": _filterpy}

@@ -1,14 +1,14 @@
 """The loop around the cycle: wait for the clock, read the rig, run the cycle, command the rig, record. Compiled.
 
 All state lies in the arrays of `Loop`, so a run can be taken up again at any cycle. The same steps in Python serve rigs, and
-leg filters, that are written in Python.
+filters, that are written in Python.
 """
 
 import mmap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numba import typeof, types
@@ -130,8 +130,16 @@ def describe_status(status: int) -> str:
     return _FAILURES.get(status, f"the rig reports failure {own}")
 
 
-LegFusion = Callable[[Record], None]
-"""Leg filters in Python: take the calibrated sample in the cycle's state, and leave directions and rates there."""
+class PythonFilters(NamedTuple):
+    """Filters in Python, which take the calibrated sample in the cycle's state and leave there what the compiled ones would.
+
+    Attributes:
+        fuse_legs, fuse_platform: in the place of those in `controller.fusion`.
+    """
+
+    fuse_legs: Callable[[Record], None]
+    fuse_platform: Callable[[Record], None]
+
 
 _ENDLESS = np.iinfo(np.int64).max
 _LOOK_NS = 100_000_000
@@ -199,11 +207,11 @@ class Loop:
         self._work: Record = np.zeros((), _WORK)
         self._work["truth"] = np.nan
 
-    def run(self, last: int, fuse: LegFusion | None = None) -> int:
+    def run(self, last: int, filters: PythonFilters | None = None) -> int:
         """Run up to but not including cycle `last`; returns a status, 0 when all is well, and brakes when it is not."""
-        if fuse is None:
+        if filters is None:
             return self._run(last, _ENDLESS)
-        return self._run_python(FmuRig(self), last, _ENDLESS, fuse)
+        return self._run_python(FmuRig(self), last, _ENDLESS, filters)
 
     def follow(self, end: int, rig: "Rig | None" = None) -> int:
         """Follow the motion to cycle `end`, stop there, or earlier for a cause, and brake; returns `STOPPED`, or what failed.
@@ -230,7 +238,7 @@ class Loop:
         _load(_is_due, parameters, state)
         _load(_compute, parameters, state, self.segments, work, timespec)
         _load(calibrate, parameters, state, work["measurement"])
-        _load(_compute_from_legs, parameters, state, self.segments, work, timespec)
+        _load(_locate_and_control, parameters, state, self.segments, work, timespec)
         _load(_note, parameters, state, self.segments, self.records, clock, link, work, 0)
         _load(_end, self.records, clock, self.script, link, work)
         _load(_catch_up, calls, parameters, 0)
@@ -249,7 +257,7 @@ class Loop:
     def _run(self, last: int, end: int) -> int:
         return _run(*self._arguments(last, end))
 
-    def _run_python(self, rig: "Rig", last: int, end: int, fuse: LegFusion | None = None) -> int:
+    def _run_python(self, rig: "Rig", last: int, end: int, filters: PythonFilters | None = None) -> int:
         """The loop of `_run`, in Python."""
         parameters, state, clock, work = self.parameters, self.state, self.clock, self._work
         measurement, stage_ns, timespec = work["measurement"], work["stage_ns"], clock["timespec"]
@@ -263,14 +271,16 @@ class Loop:
             if status == OK and _is_due(parameters, state):
                 status = rig.release()
             stage_ns[_SENSE] = now(timespec) - began
-            if status == OK and fuse is None:
+            if status == OK and filters is None:
                 status = _compute(parameters, state, self.segments, work, timespec)
-            elif status == OK and fuse is not None:
-                began = now(timespec)
+            elif status == OK and filters is not None:
+                t0 = now(timespec)
                 calibrate(parameters, state, measurement)
-                fuse(state)
-                stage_ns[_LEGS] = now(timespec) - began
-                status = _compute_from_legs(parameters, state, self.segments, work, timespec)
+                filters.fuse_legs(state)
+                t1 = now(timespec)
+                filters.fuse_platform(state)
+                stage_ns[_LEGS], stage_ns[_PLATFORM] = t1 - t0, now(timespec) - t1
+                status = _locate_and_control(parameters, state, self.segments, work, timespec)
             began = now(timespec)
             if status == OK and (failure := rig.write(state["command"])):
                 status = failure + SEND_FAILED - RIG_FAILED
@@ -429,30 +439,29 @@ def _is_due(parameters: Record, state: Record) -> bool:
 def _compute(parameters: Record, state: Record, segments: Array, work: Record, timespec: NDArray[np.int64]) -> int:
     """The steps of `controller.cycle.cycle`, with the clock read in between."""
     measurement, stage_ns = work[()].measurement, work[()].stage_ns
-    t = now(timespec)
+    t0 = now(timespec)
     calibrate(parameters, state, measurement)
     fuse_legs(parameters, state)
-    stage_ns[_LEGS] = now(timespec) - t
-    return _compute_from_legs(parameters, state, segments, work, timespec)
+    t1 = now(timespec)
+    fuse_platform(parameters, state)
+    fuse_heading(parameters, state)
+    stage_ns[_LEGS], stage_ns[_PLATFORM] = t1 - t0, now(timespec) - t1
+    return _locate_and_control(parameters, state, segments, work, timespec)
 
 
 @kernel
-def _compute_from_legs(parameters: Record, state: Record, segments: Array, work: Record, timespec: NDArray[np.int64]) -> int:
+def _locate_and_control(parameters: Record, state: Record, segments: Array, work: Record, timespec: NDArray[np.int64]) -> int:
     stage_ns = work[()].stage_ns
     t0 = now(timespec)
-    fuse_platform(parameters, state)
-    fuse_heading(parameters, state)
-    t1 = now(timespec)
     conditioning = find_pose(parameters, state)
-    t2 = now(timespec)
+    t1 = now(timespec)
     found = conditioning >= RANK_TOLERANCE and improve_pose(parameters, state)
-    t3 = now(timespec)
+    t2 = now(timespec)
     known = fuse_mechanism(parameters, state, found)
-    t4 = now(timespec)
+    t3 = now(timespec)
     status = control(parameters, state, segments) if known else POSE_LOST
-    t5 = now(timespec)
-    stage_ns[_PLATFORM], stage_ns[_POSE], stage_ns[_REFINEMENT] = t1 - t0, t2 - t1, t3 - t2
-    stage_ns[_MECHANISM], stage_ns[_CONTROL] = t4 - t3, t5 - t4
+    t4 = now(timespec)
+    stage_ns[_POSE], stage_ns[_REFINEMENT], stage_ns[_MECHANISM], stage_ns[_CONTROL] = t1 - t0, t2 - t1, t3 - t2, t4 - t3
     return status
 
 

@@ -13,12 +13,12 @@ import numpy as np
 from controller.calibration import Calibration, load_calibration
 from controller.cycle import ALL_IMUS, OK, STATE, check_rate, cycle_parameters
 from controller.direct_kinematics import poses_from_lengths
-from controller.fusion import point_legs
+from controller.fusion import find_vertical, fuse_heading, point_legs, prepare_platform
 from controller.leg_filter import start_leg
 from controller.planner import Reference, plan
 from controller.settings import control_settings, sensor_settings
 from controller.target import Target, check_duration, load_target
-from hil.loop import COMPUTED, RECORD, RIG_FAILED, LegFusion, Loop, describe_status
+from hil.loop import COMPUTED, RECORD, RIG_FAILED, Loop, PythonFilters, describe_status
 from plant.compiled import Record
 from plant.errors import GoughError, InputError, UnknownNameError
 from plant.export import default_fmu
@@ -26,6 +26,7 @@ from plant.fmu import FmuPlant
 from plant.imu import ACCELEROMETER, GYROSCOPE, RIGHT_WIRING, Wiring, imu_state, load_imu
 from plant.mechanism import LEGS, Mechanism, load_spatial
 from plant.pose import Array, rotation_angle, rotations_from_quaternions
+from plant.variables import PLATFORM_IMU
 
 FUSIONS = {
     "compiled": None,
@@ -177,12 +178,12 @@ def simulate(config: SimulationConfig, progress: Callable[[float], None] = lambd
     """
     with prepared_loop(config) as loop:
         count = len(loop.records)
-        fuse = filterpy_legs(loop.parameters) if config.fusion == "filterpy" else None
+        filters = filterpy_filters(loop.parameters) if config.fusion == "filterpy" else None
         status, took = OK, loop.planning_time
         chunk = max(1, round(_CHUNK_S * config.rate))
         for last in range(chunk, count + chunk, chunk):
             began = time.perf_counter()
-            status = loop.run(min(last, count), fuse)
+            status = loop.run(min(last, count), filters)
             took += time.perf_counter() - began
             if status != OK:
                 break
@@ -281,9 +282,9 @@ def _result(config: SimulationConfig, loop: PreparedLoop, done: int, took: float
     )  # fmt: skip
 
 
-def filterpy_legs(parameters: Record) -> LegFusion:
-    """The leg filters on filterpy, in the place of the compiled ones."""
-    from controller.filterpy_fusion import FilterpyLeg
+def filterpy_filters(parameters: Record) -> PythonFilters:
+    """The filters of legs and platform on filterpy, in the place of the compiled ones."""
+    from controller.filterpy_fusion import FilterpyLeg, FilterpyPlatform
 
     legs = [
         FilterpyLeg(
@@ -298,8 +299,15 @@ def filterpy_legs(parameters: Record) -> LegFusion:
         )
         for k in range(LEGS)
     ]
+    platform = FilterpyPlatform(
+        gravity=float(parameters["sensors"]["gravity"]),
+        period=float(parameters["period"]),
+        rate_density=float(parameters["gyroscope_density"]),
+        bias_walk=float(parameters["bias_walk"]),
+        vertical_variance=float(parameters["vertical_variance"]),
+    )
 
-    def fuse(state: Record) -> None:
+    def fuse_legs(state: Record) -> None:
         for k, leg in enumerate(legs):
             if not state["imu_used"][k]:
                 continue
@@ -315,7 +323,16 @@ def filterpy_legs(parameters: Record) -> LegFusion:
             state["leg_x"][k], state["leg_covariance"][k] = leg.state, leg.covariance
         point_legs(parameters, state)
 
-    return fuse
+    def fuse_platform(state: Record) -> None:
+        if prepare_platform(parameters, state):
+            platform.start(state["platform_x"], state["platform_covariance"])
+            rate, force = state["sample"][GYROSCOPE, PLATFORM_IMU], state["sample"][ACCELEROMETER, PLATFORM_IMU]
+            platform.step(rate, force, state["imu_acceleration"])
+            state["platform_x"], state["platform_covariance"] = platform.state, platform.covariance
+            find_vertical(parameters, state)
+        fuse_heading(parameters, state)
+
+    return PythonFilters(fuse_legs, fuse_platform)
 
 
 def _errors(first: tuple[Array, Array], second: tuple[Array, Array]) -> dict[str, float]:

@@ -274,30 +274,40 @@ def load_mechanism(name_or_path: str | Path) -> Mechanism | PlanarMechanism:
         InputError: the file is not TOML, or its content is not a mechanism.
     """
     source = str(name_or_path)
-    document = _preset(source) if source in _preset_names() else _file(Path(name_or_path))
+    try:
+        document = tomllib.loads(mechanism_text(name_or_path))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{source} is not valid TOML: {error}") from None
     try:
         return _from_document(_completed(document, source))
     except (InputError, UnknownNameError) as error:
         raise type(error)(f"{source}: {error}") from None
 
 
+def mechanism_text(name_or_path: str | Path) -> str:
+    """The TOML text of a preset, or of a file.
+
+    Raises:
+        UnknownNameError: no such preset, and no such file.
+        InputError: the file cannot be read.
+    """
+    if str(name_or_path) in _preset_names():
+        return _preset_text(str(name_or_path))
+    path = Path(name_or_path)
+    if not path.is_file():
+        raise UnknownNameError(f"no mechanism {str(path)!r}: neither a preset ({', '.join(_preset_names())}) nor a file")
+    try:
+        return path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read {path}: {error}") from None
+
+
 def _preset_names() -> list[str]:
     return sorted(entry.name.removesuffix(".toml") for entry in _PRESETS.iterdir() if entry.name.endswith(".toml"))
 
 
-def _preset(name: str) -> dict[str, Any]:
-    return tomllib.loads((_PRESETS / f"{name}.toml").read_text())
-
-
-def _file(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise UnknownNameError(f"no mechanism {str(path)!r}: neither a preset ({', '.join(_preset_names())}) nor a file")
-    try:
-        return tomllib.loads(path.read_text())
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path} is not valid TOML: {error}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read {path}: {error}") from None
+def _preset_text(name: str) -> str:
+    return (_PRESETS / f"{name}.toml").read_text()
 
 
 def _completed(document: dict[str, Any], source: str) -> dict[str, Any]:
@@ -309,7 +319,7 @@ def _completed(document: dict[str, Any], source: str) -> dict[str, Any]:
             raise UnknownNameError(f"based_on names no preset: {names[-1]!r}; there are {', '.join(_preset_names())}")
         if names[-1] in names[:-1]:
             raise InputError(f"based_on goes round in a circle, {' -> '.join(names)}: leave one out")
-        preset = _preset(names[-1])
+        preset = tomllib.loads(_preset_text(names[-1]))
         preset.pop("name", None)
         document = _merged(preset, document)
     return document

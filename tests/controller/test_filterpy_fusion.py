@@ -1,12 +1,13 @@
-"""The leg filter on filterpy agrees with the compiled one: over thousands of steps, and part by part at any state."""
+"""The filters on filterpy agree with the compiled ones: over thousands of steps, and the leg's part by part at any state."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.filterpy_fusion import STATES, FilterpyLeg
+from controller.filterpy_fusion import PLATFORM_STATES, STATES, FilterpyLeg, FilterpyPlatform
 from controller.leg_filter import predict_leg, predict_measurement, start_leg, update_leg
+from controller.platform_filter import INNOVATION_LIMIT, start_platform, step_platform
 from controller.settings import FusionSettings
 from tests.controller.leg_geometry import unit
 from tests.controller.leg_motion import observe, sines
@@ -94,3 +95,32 @@ def test_a_prediction_agrees_for_any_covariance_and_period(seed, exponent):
     predict_leg(x, covariance, period, jerk, bias_walk)
     np.testing.assert_allclose(x, reference.state, rtol=1e-13, atol=1e-13)
     np.testing.assert_allclose(covariance, reference.covariance, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize(("rate", "seed"), [(1000.0, 0), (250.0, 1), (4000.0, 2)])
+def test_five_thousand_steps_of_the_platform_agree_with_the_compiled_filter(rate, seed):
+    random, fusion = np.random.default_rng(seed), FusionSettings()
+    noise = (fusion.gyroscope_noise**2, fusion.bias_walk**2, 1e-3)
+    times = np.arange(5000)[:, None] / rate
+    gyroscope = 0.01 + 2.0 * np.sin(times * [3.0, 5.0, 7.0] + [0.0, 1.0, 2.0]) + random.normal(scale=2e-3, size=(5000, 3))
+    acceleration = random.normal(size=(5000, 3))
+    force = GRAVITY * unit([0.1, -0.2, 1.0]) + acceleration + random.normal(scale=0.3, size=(5000, 3))
+    jolts = random.random((5000, 3)) < 0.02
+    force[jolts] += 60.0
+    x, covariance = np.zeros(PLATFORM_STATES), np.zeros((PLATFORM_STATES, PLATFORM_STATES))
+    start_platform(x, covariance, force[0], fusion.bias_sigma)
+    reference = FilterpyPlatform(GRAVITY, 1.0 / rate, *noise)
+    reference.start(x, covariance)
+    scratch = (np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(6))
+    worst, cut = np.zeros(2), 0
+    for sample in zip(gyroscope, force, acceleration, strict=True):
+        reference.step(*sample)
+        step_platform(x, covariance, *sample, 1.0 / rate, GRAVITY, *noise, *scratch)
+        deviation = np.sqrt(np.diag(covariance))
+        off = (covariance - reference.covariance) / np.outer(deviation, deviation)
+        worst = np.maximum(worst, [np.abs(x - reference.state).max(), np.abs(off).max()])
+        innovation = reference.filter.y.item() / np.sqrt(reference.filter.S.item())
+        assert abs(innovation) < INNOVATION_LIMIT * (1.0 + 1e-12)
+        cut += abs(innovation) > INNOVATION_LIMIT * (1.0 - 1e-12)
+    assert worst.max() < 1e-12
+    assert cut > 50

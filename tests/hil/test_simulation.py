@@ -3,11 +3,13 @@
 import os
 import subprocess
 import sys
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from controller.filterpy_fusion import FilterpyLeg, FilterpyPlatform
 from controller.settings import control_settings
 from hil.simulation import SimulationConfig, SimulationStoppedError, prepared_loop, simulate
 from plant.errors import InputError, UnknownNameError, UnreachableError
@@ -87,9 +89,18 @@ def test_a_run_taken_up_from_its_arrays_goes_on_bit_for_bit():
         assert whole.imu.tobytes() == parts.imu.tobytes()
 
 
-def test_filterpy_closes_the_same_loop():
+def test_filterpy_closes_the_same_loop(monkeypatch):
+    taken = Counter()
+    for kind in (FilterpyLeg, FilterpyPlatform):
+
+        def step(self, *sample, kind=kind, whole=kind.step):
+            taken[kind] += 1
+            whole(self, *sample)
+
+        monkeypatch.setattr(kind, "step", step)
     compiled = simulate(SimulationConfig(target="sines", duration=0.8)).records
     filterpy = simulate(SimulationConfig(target="sines", duration=0.8, fusion="filterpy")).records
+    assert taken == {FilterpyLeg: 6 * (len(filterpy) - 1), FilterpyPlatform: len(filterpy)}
     np.testing.assert_allclose(filterpy["position"], compiled["position"], atol=1e-11)
     np.testing.assert_allclose(filterpy["command"], compiled["command"], atol=1e-9)
 
