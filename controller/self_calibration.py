@@ -499,7 +499,8 @@ def calibrate_in_motion(
             tilt=calibration.tilt + rig[JOINTS:],
         )
         guide = _smoothed(run.motions, _GUIDE_SIGMA_S * rate)
-    covariance: Array = run.state["covariance"][MOTION_STATES:, MOTION_STATES:].copy()
+    kept = slice(MOTION_STATES, MOTION_STATES + ALL_ERRORS + RIG)
+    covariance: Array = run.state["covariance"][kept, kept].copy()
     # Of the errors if the rig's were known, and what the rig's add.
     errors, across, rig = (
         covariance[:ALL_ERRORS, :ALL_ERRORS],

@@ -59,8 +59,8 @@ class FusionSettings:
         gyroscope_range, accelerometer_range: a reading this large is none [rad/s, m/s^2].
         platform_jerk, platform_angular_jerk: density of the platform's jerk, for the whole-mechanism filter
             [m/s^3/sqrt(Hz), rad/s^3/sqrt(Hz)].
-        mechanism_gyroscope_noise, mechanism_accelerometer_noise: for that filter [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]; above the
-            data sheet's, because of what joints and calibration leave.
+        mechanism_gyroscope_noise, mechanism_accelerometer_noise: for that filter [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)], for
+            calibrated IMUs; with the jerk such that its covariance is as large as its errors.
         accelerometer_bias_walk: random walk of the accelerometers' biases [m/s^2/sqrt(s)].
         accelerometer_bias_sigma, scale_sigma, alignment_sigma, axes_sigma: what is known of IMUs without a calibration file
             [m/s^2, 1, rad, rad].
@@ -84,7 +84,7 @@ class FusionSettings:
     accelerometer_range: float = 4.0 * STANDARD_GRAVITY
     platform_jerk: float = 6.0
     platform_angular_jerk: float = 35.0
-    mechanism_gyroscope_noise: float = radians(0.005)
+    mechanism_gyroscope_noise: float = radians(0.0042)
     mechanism_accelerometer_noise: float = 0.004
     accelerometer_bias_walk: float = 1e-5
     accelerometer_bias_sigma: float = 0.015

@@ -61,6 +61,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_replay(commands)
     _add_calibrate(commands)
     _add_compare(commands)
+    _add_evaluate(commands)
     _add_tune(commands)
     _add_tune_fusion(commands)
     _add_fmu(commands)
@@ -254,6 +255,33 @@ def _add_compare(commands: Any) -> None:
     )
     _add_json(command)
     command.set_defaults(run=_compare)
+
+
+def _add_evaluate(commands: Any) -> None:
+    command = commands.add_parser(
+        "evaluate-fusion",
+        help="what the whole-mechanism filter is worth after self-calibration",
+        description="Calibrate the raw IMUs of several rigs on themselves, then move their platforms as prescribed, 30 mm and "
+        "10 deg along and about every axis at 0.5, 1, 2 and 0.1 to 1 Hz, and still: errors after the first 20 s with exact and "
+        "with wrong joints, with a dead IMU, of starts in the middle of a motion, over minutes of standing still, and what a "
+        "cycle costs. The leg filters with the refined pose stand beside it. A quarter of an hour in all.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("--mechanism", default="hexapod", help="preset, or a TOML file")
+    command.add_argument("--imu", default="mpu9150", help="ideal, mpu9150, mpu9150-calibrated or icm42688")
+    command.add_argument("--fusion", default="whole-alignments", help="whole, whole-gyroscopes or whole-alignments")
+    command.add_argument("--rate", type=float, default=1000.0, help="samples per second [Hz]")
+    command.add_argument(
+        "--joint-error", type=float, default=0.1, help="standard deviation of each coordinate of wrong joints [mm]"
+    )
+    command.add_argument("--seeds", type=_seeds, default="0,1,2,3,4,5", help="one for each rig")
+    command.add_argument("--starts", type=int, default=100, help="number of starts in motion")
+    command.add_argument("--still", type=float, default=600.0, help="how long the platform stands still [s]")
+    command.add_argument(
+        "--only", choices=("motions", "faults", "start", "drift", "cost"), nargs="+", help="these sections instead of all"
+    )
+    _add_json(command)
+    command.set_defaults(run=_evaluate)
 
 
 def _add_tune(commands: Any) -> None:
@@ -611,6 +639,95 @@ def _compare(options: argparse.Namespace) -> int:
         table.add_row(name, _mm(method["position_rms"]), _deg(method["rotation_rms"]), nees, us, f"{method['seeds']}")
     _print(table)
     return 0
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    from hil.fusion_evaluation import SECTIONS, EvaluationConfig, evaluate
+
+    _check_writable(options.json)
+    names = ("mechanism", "imu", "fusion", "rate", "seeds", "starts", "still")
+    config = EvaluationConfig(
+        **{name: getattr(options, name) for name in names},
+        joint_error=1e-3 * options.joint_error,
+        only=tuple(options.only or SECTIONS),
+    )
+    with _progress("calibration") as progress:
+        figures = evaluate(config, lambda label, share: progress(share, label))
+    _write_json(options.json, figures)
+    for section, show in _EVALUATED.items():
+        if section in figures:
+            show(figures[section])
+    return 0
+
+
+def _joints(error: str) -> str:
+    return "exact joints" if error == "0" else f"joints {1e3 * float(error):g} mm off"
+
+
+def _print_calibrations(figures: dict[str, Any]) -> None:
+    table = _table("calibration, RMS [mm, deg]", "before", "after", "predicted", "least improvement")
+    for error, each in figures.items():
+        cells = (
+            f"{_mm(each[name]['position_rms'])}, {_deg(each[name]['rotation_rms'])}"
+            for name in ("before", "after", "predicted")
+        )
+        table.add_row(_joints(error), *cells, f"{each['least_improvement']:.0f} times")
+    _print(table)
+
+
+def _print_motions(figures: dict[str, Any]) -> None:
+    for error, motions in figures.items():
+        table = _table(f"{_joints(error)}, RMS [mm, deg]", "legs, refined", "NEES", "whole mechanism", "worst seed", "NEES")
+        for kind, each in motions.items():
+            refined, whole = each["refined"], each["whole"]
+            table.add_row(
+                kind if kind.isalpha() else f"{kind} Hz",
+                f"{_mm(refined['position_rms'])}, {_deg(refined['rotation_rms'])}",
+                f"{refined['nees']:.1f}",
+                f"{_mm(whole['position_rms'])}, {_deg(whole['rotation_rms'])}",
+                f"{_mm(whole['worst_position_rms'])}, {_deg(whole['worst_rotation_rms'])}",
+                f"{whole['nees']:.1f}",
+            )
+        _print(table)
+
+
+def _print_faults(figures: dict[str, Any]) -> None:
+    table = _table("IMU dead at 1 Hz", "position RMS [mm]", "times", "rotation RMS [deg]", "times")
+    for name, each in figures.items():
+        times = (f"{each[f'{key}_ratio']:.2f}" if name != "none" else "" for key in ("position_rms", "rotation_rms"))
+        table.add_row(name, _mm(each["position_rms"]), next(times), _deg(each["rotation_rms"]), next(times))
+    _print(table)
+
+
+def _print_starts(figures: dict[str, Any]) -> None:
+    print(
+        f"starts in motion up to 2 Hz: {figures['succeeded']} of {figures['starts']} within 1.5 s; largest error from then on "
+        f"{_mm(figures['position_max'])} mm, {_deg(figures['rotation_max'])} deg"
+    )
+
+
+def _print_drift(figures: dict[str, Any]) -> None:
+    table = _table("standing still", "position RMS [mm]", "rotation RMS [deg]", "NEES")
+    for minute, each in enumerate(figures["minutes"], start=1):
+        table.add_row(f"minute {minute}", _mm(each["position_rms"]), _deg(each["rotation_rms"]), f"{each['nees']:.1f}")
+    _print(table)
+
+
+def _print_cost(figures: dict[str, Any]) -> None:
+    table = _table("microseconds of a cycle", "mean", "most")
+    for name, each in figures.items():
+        table.add_row(name, f"{each['mean_us']:.1f}", f"{each['max_us']:.1f}")
+    _print(table)
+
+
+_EVALUATED: dict[str, Callable[[dict[str, Any]], None]] = {
+    "calibration": _print_calibrations,
+    "motions": _print_motions,
+    "faults": _print_faults,
+    "start": _print_starts,
+    "drift": _print_drift,
+    "cost": _print_cost,
+}
 
 
 def _simulate(options: argparse.Namespace) -> int:
@@ -1163,8 +1280,10 @@ def _print(table: Any) -> None:
 
 
 @contextmanager
-def _progress(label: str) -> Iterator[Callable[[float], None]]:
-    """A progress bar on the terminal, which pulses while things are prepared and goes when the work is done."""
+def _progress(label: str) -> Iterator[Callable[..., None]]:
+    """A progress bar on the terminal, which pulses while things are prepared and goes when the work is done; it is called with
+    the share that is done, and a new label if that changes.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -1172,7 +1291,7 @@ def _progress(label: str) -> Iterator[Callable[[float], None]]:
     terminal = sys.stderr.isatty()
     with Progress(*columns, console=Console(stderr=True), transient=True, disable=not terminal) as bar:
         task = bar.add_task(label, total=None)
-        yield lambda share: bar.update(task, total=1.0, completed=share)
+        yield lambda share, now=None: bar.update(task, total=1.0, completed=share, description=now)
 
 
 def _check_writable(*paths: Path | None) -> None:

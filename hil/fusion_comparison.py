@@ -33,7 +33,7 @@ from plant.pose import Array, vector_from_rotation
 from plant.variables import IMU_COUNT, PLATFORM_IMU
 
 LEARNING_S = 20.0
-CLOSED, REFINED, WHOLE = range(3)
+CLOSED, REFINED, WHOLE, LEGS_ALONE = range(4)
 """Steps of `Found`."""
 
 
@@ -187,7 +187,7 @@ class Found:
 
     By step (closed form, refined, whole mechanism) positions and rotations; the refined pose's inverse covariance and the
     filter's covariance; the leg filters' directions with the covariances (N, 6, 2, 2) of their angles, the platform's vertical
-    with its covariance, and nanoseconds until each step was done.
+    with its covariance; nanoseconds until each step was done, and of the leg filters alone.
     """
 
     def __init__(self, count: int) -> None:
@@ -195,7 +195,7 @@ class Found:
         self.information, self.covariances = np.zeros((count, 6, 6)), np.zeros((count, 6, 6))
         self.directions, self.verticals = np.zeros((count, LEGS, 3)), np.zeros((count, 3))
         self.leg_covariances, self.vertical_covariances = np.zeros((count, LEGS, 2, 2)), np.zeros((count, 3, 3))
-        self.ns = np.zeros((3, count), np.int64)
+        self.ns = np.zeros((4, count), np.int64)
 
     def run(self, step: int) -> _Run:
         """One step's poses."""
@@ -208,22 +208,23 @@ class Found:
 def read(motion: ImposedMotion, model: ImuModel, rate: float, seed: int) -> Array:
     """What imperfect IMUs read on a motion (N, 3, 7, 3), at this rate [Hz]."""
     raw = np.empty_like(motion.signals)
-    _measure_all(imu_state(model, seed, 1.0 / rate), motion.signals, raw)
+    measure_all(imu_state(model, seed, 1.0 / rate), motion.signals, raw)
     return raw
 
 
-def fuse(parameters: Record, raw: Array) -> Found:
-    """The fusing steps of the cycle over raw readings (N, 3, 7, 3)."""
-    found = Found(len(raw))
+def fuse(parameters: Record, raw: Array, state: Record | None = None) -> Found:
+    """The fusing steps of the cycle over raw readings (N, 3, 7, 3), going on from a state, if there is one."""
+    found, state = Found(len(raw)), np.zeros((), STATE) if state is None else state
     _follow(
-        parameters, np.zeros((), STATE), raw, found.positions, found.rotations, found.information, found.covariances,
-        found.directions, found.leg_covariances, found.verticals, found.vertical_covariances, found.ns, np.zeros(2, np.int64),
+        parameters, state, raw, found.positions, found.rotations, found.information, found.covariances, found.directions,
+        found.leg_covariances, found.verticals, found.vertical_covariances, found.ns, np.zeros(2, np.int64),
     )  # fmt: skip
     return found
 
 
 @kernel
-def _measure_all(imu: Record, signals: Array, raw: Array) -> None:
+def measure_all(imu: Record, signals: Array, raw: Array) -> None:
+    """Write what imperfect IMUs read (N, 3, 7, 3) for ideal signals."""
     for i in range(signals.shape[0]):
         measure(imu, signals[i], raw[i])
 
@@ -238,7 +239,9 @@ def _follow(
     for i in range(raw.shape[0]):
         began = now(timespec)
         calibrate(parameters, state, raw[i])
+        before_legs = now(timespec)
         fuse_legs(parameters, state)
+        ns[LEGS_ALONE, i] = now(timespec) - before_legs
         fuse_platform(parameters, state)
         find_pose(parameters, state)
         ns[0, i] = now(timespec) - began

@@ -147,6 +147,7 @@ def calibrate_rig(
     config: SimulationConfig,
     knowledge: Knowledge = Knowledge(),
     progress: Callable[[float], None] = lambda share: None,
+    validate: bool = True,
 ) -> RigCalibration:
     """Drive the rig and calibrate its IMUs.
 
@@ -154,6 +155,7 @@ def calibrate_rig(
         config: mechanism, IMUs, seed, rate and plant; its target and durations are the calibration's own.
         knowledge: besides the readings.
         progress: called with the share that is done.
+        validate: whether to find out, too, how well calibrations by parts of the data agree.
 
     Raises:
         CalibrationError: an IMU is not what it should be, or the data have no explanation, or do not suffice.
@@ -180,7 +182,7 @@ def calibrate_rig(
     first = calibrate_at_rest(data.mechanism, data.rests, knowledge.prior)
     data.add_rests(drive("rests", WIDE_POSES * REST_S, first.calibration()))
     found = calibrate_at_rest(data.mechanism, data.rests, knowledge.prior)
-    return data.evaluate(found, [drive("shaking", SHAKING_S, found.calibration())])
+    return data.evaluate(found, [drive("shaking", SHAKING_S, found.calibration())], validate)
 
 
 def calibrate_recordings(paths: Sequence[Path], knowledge: Knowledge = Knowledge()) -> RigCalibration:
@@ -361,7 +363,7 @@ class _Data:
         errors[:, GYROSCOPE_BIAS : GYROSCOPE_BIAS + 3] = self.zero
         return Calibration().then(*undo(errors), covariance=covariance)
 
-    def evaluate(self, found: Found, runs: Sequence[Record]) -> RigCalibration:
+    def evaluate(self, found: Found, runs: Sequence[Record], validate: bool = True) -> RigCalibration:
         """Calibrate in the longest motion of some runs, and say what has been found, and how well."""
         samples, start = self._motion(runs, found)
         calibration, covariance = self._in_motion(found, samples, start)
@@ -379,7 +381,7 @@ class _Data:
             del cases["known"]
         summary = self._summary(cases) | {
             "positions": found.positions.tolist(),
-            "validated": self._validate(calibration, samples, start),
+            "validated": self._validate(calibration, samples, start) if validate else {},
         }
         summary |= self._constants(calibration)
         about = {
