@@ -30,9 +30,11 @@ def of_true_errors(imu, random):
     return Calibration(
         gain,
         offset,
-        np.array([0.01, -0.02]),
-        root @ root.T,
-        {"date": "2026-11-21", "residuals": [0.1, 0.2], "poses_known": False},
+        tilt=np.array([0.01, -0.02]),
+        joints=random.normal(0.0, 1e-4, (2, 6, 3)),
+        floor=np.array([1e-4, 3e-4]),
+        covariance=root @ root.T,
+        about={"date": "2026-11-21", "residuals": [0.1, 0.2], "poses_known": False},
     )
 
 
@@ -69,7 +71,8 @@ def test_it_is_the_inverse_of_the_imperfections(tmp_path):
     scale = np.sqrt(np.diag(calibration.covariance))
     np.testing.assert_allclose((again.covariance - calibration.covariance) / np.outer(scale, scale), 0.0, atol=1e-4)
     assert again.about == calibration.about
-    np.testing.assert_array_equal(again.tilt, calibration.tilt)
+    for name in ("tilt", "joints", "floor"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(calibration, name))
     # What was measured by two, one after the other.
     gain, offset = np.tile(rotation_of([0.1, 0.0, 0.2]), (3, 7, 1, 1)), random.normal(size=(3, 7, 3))
     np.testing.assert_allclose(
@@ -105,7 +108,10 @@ def test_what_it_leaves_is_what_the_filter_knows_of_the_sensors(hexapod):
     parameters = cycle_parameters(
         hexapod, 1000.0, control_settings(hexapod), fusion_settings(hexapod), whole="alignments", calibration=calibration
     )
-    np.testing.assert_array_equal(parameters["filter"]["prior"], calibration.covariance)
+    prior = parameters["filter"]["prior"]
+    np.testing.assert_array_equal(prior[: 7 * ERRORS, : 7 * ERRORS], calibration.covariance)
+    assert not prior[7 * ERRORS :].any()
+    assert parameters["filter"]["rig"] == 0
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from plant.errors import InputError, UnknownNameError, UnreachableError
-from plant.mechanism import Limits, Mechanism, load_mechanism
+from plant.mechanism import Limits, Mechanism, load_mechanism, load_spatial
 from plant.pose import Array, Pose
 from plant.variables import PARAMETERS
 
@@ -475,3 +475,28 @@ def test_presets_based_on_each_other_are_refused(tmp_path: Path, presets: Path) 
 def test_what_a_preset_has_as_a_table_must_stay_one(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="'limits' must be a table"):
         load_mechanism(write(tmp_path, "based_on = 'hexapod'\nlimits = 3"))
+
+
+def test_a_built_mechanism_is_off_by_the_joint_error_and_shares_the_joints_it_shared() -> None:
+    nominal = load_spatial("hexapod")
+    moves = np.array(
+        [
+            np.stack([built.base_joints - nominal.base_joints, built.platform_joints - nominal.platform_joints])
+            for built in (nominal.built(1e-4, seed) for seed in range(50))
+        ]
+    )
+    assert 0.95e-4 < moves.std() < 1.05e-4
+    np.testing.assert_array_equal(nominal.built(1e-4, 3).base_joints, nominal.built(1e-4, 3).base_joints)
+    np.testing.assert_array_equal(nominal.built(0.0, 3).platform_joints, nominal.platform_joints)
+    for preset in ("6-3-I", "6-4-II", "6-5"):
+        shared = load_spatial(preset)
+        np.testing.assert_array_equal(shared.built(1e-4, 0).distinct_joints(), shared.distinct_joints())
+    with pytest.raises(InputError, match="the joint error is 100 mm; it must be at least 0 and below 30 mm"):
+        nominal.built(0.1, 0)
+
+
+def test_the_first_leg_with_the_same_joint_is_told() -> None:
+    base = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    platform = np.array([[0.5, 0.1 * k, 0.0] if k else [0.2, 0.0, 0.0] for k in range(6)])
+    mechanism = Mechanism.from_legs(base, platform)
+    assert mechanism.distinct_joints().tolist() == [[0, 0, 2, 3, 3, 5], [0, 1, 2, 3, 4, 5]]
