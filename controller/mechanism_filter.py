@@ -182,7 +182,7 @@ def filter_parameters(
     if covariance is not None:
         known = covariance
     prior[: len(known), : len(known)] = known
-    estimated = 0 if errors is None else BLOCKS[errors]
+    estimated, caution = 0 if errors is None else BLOCKS[errors], 1.0 if covariance is not None else fusion.caution**2
     parameters: Record = np.zeros((), FILTER_PARAMETERS)
     values = {
         "window": max(1, round(WINDOW_S * rate)),
@@ -190,11 +190,11 @@ def filter_parameters(
         "rig": len(known) - ALL_ERRORS,
         "states": MOTION_STATES + IMU_COUNT * estimated + len(known) - ALL_ERRORS + (field is not None),
         "smoothing": _SMOOTHING_S,
-        "jerk": (fusion.platform_jerk**2, fusion.platform_angular_jerk**2),
+        "jerk": (caution * fusion.platform_jerk**2, caution * fusion.platform_angular_jerk**2),
         "bias_walk": (fusion.bias_walk**2, fusion.accelerometer_bias_walk**2),
         "variance": (
-            fusion.mechanism_gyroscope_noise**2 * rate / 2.0,
-            fusion.mechanism_accelerometer_noise**2 * rate / 2.0,
+            caution * fusion.mechanism_gyroscope_noise**2 * rate / 2.0,
+            caution * fusion.mechanism_accelerometer_noise**2 * rate / 2.0,
         ),
         "prior": prior,
         "floor": np.zeros(2) if floor is None else floor**2 / 3.0,
