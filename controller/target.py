@@ -18,6 +18,7 @@ from plant.pose import (
     quaternion_from_rotation,
     rotation_from_vector,
     rotations_from_quaternions,
+    vector_from_rotation,
 )
 
 COLUMNS = ("time_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
@@ -223,6 +224,10 @@ def rests(mechanism: Mechanism, duration: float, share: float = 0.8) -> Target:
     limits, home = mechanism.require_limits(), mechanism.require_home()
     lengths = leg_lengths(mechanism, home.position, home.rotation)
     positions, rotations = sample_workspace(mechanism, _REST_CHOICE, seed=0)
+    # Nearer to home by the share: most of them are then inside.
+    positions = home.position + share * (positions - home.position)
+    turns = share * vector_from_rotation(rotations @ home.rotation.T)
+    rotations = np.array([rotation_from_vector(turn) @ home.rotation for turn in turns])
     drawn = leg_lengths(mechanism, positions, rotations)
     middle, half = limits.stroke.mean(axis=1), 0.5 * (limits.stroke[:, 1] - limits.stroke[:, 0])
     inside = (np.abs(drawn - middle) <= share * half).all(axis=1)

@@ -172,13 +172,16 @@ def calibrate_rig(
         with _calibrated(replace(config, target="rests", duration=WIDE_POSES * REST_S), zeroed) as run:
             data.known = data.mounting(_run_open(run))
 
+    with _calibrated(replace(config, target="near-rests", duration=FIRST_POSES * REST_S), zeroed) as run:
+        data.add_rests(_run_open(run))
+    done = FIRST_POSES * REST_S
+
     def drive(target: str, duration: float, calibration: Calibration) -> Record:
         nonlocal done
         start, done = done, done + duration
         with _calibrated(replace(config, target=target, duration=duration), calibration) as run:
             return _run(run, lambda share: progress((start + share * duration) / whole))
 
-    data.add_rests(drive("near-rests", FIRST_POSES * REST_S, zeroed))
     first = calibrate_at_rest(data.mechanism, data.rests, knowledge.prior)
     data.add_rests(drive("rests", WIDE_POSES * REST_S, first.calibration()))
     found = calibrate_at_rest(data.mechanism, data.rests, knowledge.prior)
@@ -234,14 +237,14 @@ def _every_cycle(records: Record) -> Record:
 
 
 def _run_open(config: SimulationConfig, blind: bool = False) -> Record:
-    """The records of a run with the loop open: the drives follow the planned speeds and what the load takes beyond them; when
-    `blind` the speeds alone, whatever the IMUs say, so that the platform sinks by some millimetres.
+    """The records of a run with the loop open, wherever the IMUs say the platform is: the drives follow the planned speeds and
+    what the load takes beyond them; when `blind` the speeds alone, so that the platform sinks by some millimetres.
     """
     with prepared_loop(config) as loop:
         loop.parameters["gains"] = 0.0
+        loop.parameters["plausible_lengths"] = -np.inf, np.inf
         if blind:
             loop.parameters["droop"] = 0.0
-            loop.parameters["plausible_lengths"] = -np.inf, np.inf
         loop.run(len(loop.records))
         return loop.records[: int(loop.link[HEAD])].copy()
 
