@@ -20,6 +20,7 @@ bench: .venv/installed
 	@mkdir -p $(OUT)
 	$(BIN)/gough bench --json $(OUT)/bench.json $(BENCH)
 	$(BIN)/gough compare-fusion --json $(OUT)/fusion.json $(FUSION)
+	$(BIN)/gough evaluate-fusion --json $(OUT)/evaluation.json $(EVALUATION)
 
 lint: .venv/installed-lint
 	$(BIN)/ruff check .

@@ -454,7 +454,7 @@ def _track(
 
 
 _PASSES = 3
-_CAUTION = 1.8
+_CAUTION = 1.6
 """What the model leaves out is the same in every swing and does not average out as noise does: so many times the noise."""
 
 _GUIDE_SIGMA_S = 0.02

@@ -263,8 +263,8 @@ def _add_evaluate(commands: Any) -> None:
         help="what the whole-mechanism filter is worth after self-calibration",
         description="Calibrate the raw IMUs of several rigs on themselves, then move their platforms as prescribed, 30 mm and "
         "10 deg along and about every axis at 0.5, 1, 2 and 0.1 to 1 Hz, and still: errors after the first 20 s with exact and "
-        "with wrong joints, with a dead IMU, of starts in the middle of a motion, over minutes of standing still, and what a "
-        "cycle costs. The leg filters with the refined pose stand beside it. A quarter of an hour in all.",
+        "with wrong joints, with a dead IMU, of starts in the middle of a motion, over minutes of standing still, in the "
+        "closed loop, and what a cycle costs. The leg filters with the refined pose stand beside it. Ten minutes in all.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     command.add_argument("--mechanism", default="hexapod", help="preset, or a TOML file")
@@ -277,8 +277,12 @@ def _add_evaluate(commands: Any) -> None:
     command.add_argument("--seeds", type=_seeds, default="0,1,2,3,4,5", help="one for each rig")
     command.add_argument("--starts", type=int, default=100, help="number of starts in motion")
     command.add_argument("--still", type=float, default=600.0, help="how long the platform stands still [s]")
+    command.add_argument("--target", default="sines", help="motion or CSV file for a minute in the closed loop")
     command.add_argument(
-        "--only", choices=("motions", "faults", "start", "drift", "cost"), nargs="+", help="these sections instead of all"
+        "--only",
+        choices=("motions", "faults", "start", "drift", "follow", "cost"),
+        nargs="+",
+        help="these sections instead of all",
     )
     _add_json(command)
     command.set_defaults(run=_evaluate)
@@ -645,7 +649,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     from hil.fusion_evaluation import SECTIONS, EvaluationConfig, evaluate
 
     _check_writable(options.json)
-    names = ("mechanism", "imu", "fusion", "rate", "seeds", "starts", "still")
+    names = ("mechanism", "imu", "fusion", "rate", "seeds", "starts", "still", "target")
     config = EvaluationConfig(
         **{name: getattr(options, name) for name in names},
         joint_error=1e-3 * options.joint_error,
@@ -713,6 +717,14 @@ def _print_drift(figures: dict[str, Any]) -> None:
     _print(table)
 
 
+def _print_following(figures: dict[str, Any]) -> None:
+    print(
+        f"closed loop, {figures['imu']}, {figures['fusion']}, {figures['target']}: RMS {_mm(figures['position_rms'])} mm, "
+        f"{_deg(figures['rotation_rms'])} deg, worst seed {_mm(figures['worst_position_rms'])} mm, "
+        f"{_deg(figures['worst_rotation_rms'])} deg, NEES {figures['nees']:.1f}"
+    )
+
+
 def _print_cost(figures: dict[str, Any]) -> None:
     table = _table("microseconds of a cycle", "mean", "most")
     for name, each in figures.items():
@@ -726,6 +738,7 @@ _EVALUATED: dict[str, Callable[[dict[str, Any]], None]] = {
     "faults": _print_faults,
     "start": _print_starts,
     "drift": _print_drift,
+    "follow": _print_following,
     "cost": _print_cost,
 }
 

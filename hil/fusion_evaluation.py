@@ -20,17 +20,17 @@ from controller.self_calibration import Prior
 from controller.settings import control_settings, sensor_settings
 from hil.fusion_comparison import LEARNING_S, LEGS_ALONE, REFINED, WHOLE, Found, fuse, measure_all, pose_errors, read
 from hil.rig_calibration import Knowledge, calibrate_rig
-from hil.simulation import FUSIONS, SimulationConfig
+from hil.simulation import FUSIONS, SimulationConfig, simulate
 from plant.compiled import Record
 from plant.errors import InputError, UnknownNameError
 from plant.imposed import ImposedMotion, impose
 from plant.imu import imu_state, load_imu
 from plant.mechanism import LEGS, Mechanism, load_spatial
-from plant.pose import Array
+from plant.pose import Array, vector_from_rotation
 from plant.variables import PLATFORM_IMU
 
 MOTIONS = ("static", "0.5", "1", "2", "mixed")
-SECTIONS = ("motions", "faults", "start", "drift", "cost")
+SECTIONS = ("motions", "faults", "start", "drift", "follow", "cost")
 
 _MOTION_S = LEARNING_S + 10.0
 _FAULT_S = 15.0
@@ -40,6 +40,7 @@ _STARTED_M, _STARTED_RAD = 1e-3, np.radians(0.2)
 """A start has succeeded if the errors stay below these from then on."""
 
 _CHUNK_S = 60.0
+_FOLLOW_S, _FOLLOWING = 60.0, "whole"
 _COST_S, _COST_REPEATS = 10.0, 7
 _CALIBRATED_IMU = "mpu9150-calibrated"
 
@@ -57,6 +58,7 @@ class EvaluationConfig:
         seeds: one for each rig.
         starts: number of starts in motion.
         still: of the platform that stands still [s].
+        target: motion or CSV file that calibrated IMUs follow in the closed loop.
         only: sections, of `SECTIONS`.
     """
 
@@ -68,6 +70,7 @@ class EvaluationConfig:
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
     starts: int = 100
     still: float = 600.0
+    target: str = "sines"
     only: tuple[str, ...] = SECTIONS
 
     def __post_init__(self) -> None:
@@ -123,13 +126,14 @@ def evaluate(config: EvaluationConfig, progress: Callable[[str, float], None] = 
         progress: called with what is under way and the share of it that is done.
 
     Returns:
-        By section (`calibration`, `motions`, `faults`, `start`, `drift`, `cost`) the figures in SI units; `config`, `version`.
+        The figures in SI units by section, those of `SECTIONS` and `calibration`; `config` and `version`.
 
     Raises:
         GoughError: something in the configuration cannot be used.
     """
     figures: dict[str, Any] = {}
-    if set(config.only) - {"cost"}:
+    load_spatial(config.mechanism).built(config.joint_error, 0)
+    if set(config.only) - {"follow", "cost"}:
         rigs = _calibrated_rigs(config, 0.0, progress)
         figures["calibration"] = {"0": _of_calibrations(rigs)}
         if "motions" in config.only:
@@ -141,6 +145,8 @@ def evaluate(config: EvaluationConfig, progress: Callable[[str, float], None] = 
         for section, of in {"faults": _of_faults, "start": _of_starts, "drift": _of_drift}.items():
             if section in config.only:
                 figures[section] = of(rigs, partial(progress, section))
+    if "follow" in config.only:
+        figures["follow"] = _of_following(config, partial(progress, "closed loop"))
     if "cost" in config.only:
         figures["cost"] = _of_cost(config, partial(progress, "cost"))
     return figures | {"config": asdict(config), "version": version("gough")}
@@ -285,6 +291,23 @@ def _of_drift(rigs: Sequence[_Rig], progress: Callable[[float], None]) -> dict[s
             pooled[chunk].add(errors, np.linalg.inv(found.covariances[late]))
             progress((i + (chunk + 1) / chunks) / len(rigs))
     return {"minutes": [errors.figures() for errors in pooled]}
+
+
+def _of_following(config: EvaluationConfig, progress: Callable[[float], None]) -> dict[str, Any]:
+    """Errors of the estimate with calibrated IMUs while the closed loop follows a target."""
+    pooled = _Errors()
+    for i, seed in enumerate(config.seeds):
+        run = simulate(
+            SimulationConfig(
+                config.mechanism, config.target, _FOLLOW_S, config.rate, _CALIBRATED_IMU, seed=seed, fusion=_FOLLOWING
+            )
+        )
+        late = run.times >= LEARNING_S
+        turned = vector_from_rotation(run.records["rotation"] @ np.swapaxes(run.true_rotations, 1, 2))
+        errors = np.concatenate([run.records["position"] - run.true_positions, turned], axis=1)[late]
+        pooled.add(errors, np.linalg.inv(run.records["covariance"][late].astype(float)))
+        progress((i + 1) / len(config.seeds))
+    return {"target": config.target, "fusion": _FOLLOWING, "imu": _CALIBRATED_IMU} | pooled.figures()
 
 
 def _of_cost(config: EvaluationConfig, progress: Callable[[float], None]) -> dict[str, Any]:

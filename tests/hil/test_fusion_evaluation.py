@@ -1,0 +1,65 @@
+"""The evaluation of the whole-mechanism filter, by its command, on one rig."""
+
+import json
+
+import numpy as np
+import pytest
+
+from hil.command_line import main
+
+
+@pytest.fixture(scope="module")
+def figures(tmp_path_factory):
+    file = tmp_path_factory.mktemp("evaluation") / "figures.json"
+    options = ("--rate", "500", "--seeds", "1", "--starts", "4", "--still", "80", "--json", str(file))
+    assert main(["evaluate-fusion", *options]) == 0
+    return json.loads(file.read_text())
+
+
+def test_raw_imus_come_to_tenths_of_a_millimetre(figures):
+    for error, (position, rotation) in {"0": (0.2, 0.03), "0.0001": (0.4, 0.1)}.items():
+        assert figures["calibration"][error]["least_improvement"] > 10.0
+        for motion, each in figures["motions"][error].items():
+            still = 2.0 if motion == "static" else 1.0
+            assert 1e3 * each["whole"]["position_rms"] < still * position
+            assert np.degrees(each["whole"]["rotation_rms"]) < still * rotation
+            assert 0.05 < each["whole"]["nees"] < 40.0
+            assert each["refined"]["position_rms"] < 1e-3
+
+
+def test_a_dead_imu_costs_little(figures):
+    faults = figures["faults"]
+    assert faults["leg"]["position_rms_ratio"] < 1.5
+    assert faults["platform"]["position_rms_ratio"] < 2.0
+    assert faults["leg"]["position_rms"] != faults["none"]["position_rms"] != faults["platform"]["position_rms"]
+
+
+def test_it_starts_in_motion_and_does_not_drift(figures):
+    assert figures["start"]["succeeded"] == figures["start"]["starts"] == 4
+    first, last = figures["drift"]["minutes"]
+    assert last["position_rms"] < 1.5 * first["position_rms"] + 1e-4
+    assert figures["follow"]["position_rms"] < 0.2e-3
+
+
+def test_what_a_cycle_costs_is_told(figures):
+    cost = figures["cost"]
+    assert 0.0 < cost["whole-gyroscopes"]["mean_us"] < cost["whole-alignments"]["mean_us"]
+    for each in cost.values():
+        assert each["mean_us"] <= each["max_us"]
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (
+            ("--fusion", "compiled"),
+            "no fusion of the whole mechanism 'compiled'; there are whole-gyroscopes, whole, whole-alignments",
+        ),
+        (("--still", "5"), "the platform is to stand still for 5 s; it can for 20 to 3600 s"),
+        (("--starts", "0"), "0 starts are asked for; there can be 1 to 10000"),
+        (("--joint-error", "-1"), "the joint error is -1 mm; it must be at least 0"),
+    ],
+)
+def test_what_cannot_be_evaluated_is_refused(options, complaint, capsys):
+    assert main(["evaluate-fusion", *options]) == 2
+    assert complaint in capsys.readouterr().err
