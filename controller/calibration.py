@@ -99,12 +99,15 @@ def load_calibration(path: Path | str) -> Calibration:
         raise InputError(f"the calibration {path} cannot be read: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is no TOML file: {error}") from None
+    for name, table in document.items():
+        if not isinstance(table, dict):
+            raise InputError(f"{path}: {name} must be a table, got {table!r}")
     calibration = Calibration(about=document.get("about", {}))
     for name, table in document.items():
         if name in ("about", "base", "joints", "covariance"):
             continue
         imu = name.removeprefix("imu_")
-        if not (name.startswith("imu_") and imu.isdigit() and int(imu) < IMU_COUNT):
+        if not (name.startswith("imu_") and imu in map(str, range(IMU_COUNT))):
             raise InputError(
                 f"{path}: no table {name!r} belongs in a calibration; imu_0 to imu_6, about, base, joints, covariance do"
             )
@@ -113,6 +116,9 @@ def load_calibration(path: Path | str) -> Calibration:
                 raise InputError(f"{path}: {name} has no sensor {sensor!r}; it has {', '.join(SENSORS)}")
             _read_sensor(calibration, SENSORS.index(sensor), int(imu), entries, f"{path}: {name}.{sensor}")
     changes: dict[str, Any] = {}
+    for name, entries in (("base", ("tilt", "floor")), ("joints", _SIDES), ("covariance", ("sigmas", "factor"))):
+        if unknown := sorted(set(document.get(name, {})) - set(entries)):
+            raise InputError(f"{path}: {name} has no entry {unknown[0]!r}; it has {', '.join(entries)}")
     if "base" in document:
         changes["tilt"] = checked_array(document["base"].get("tilt", (0.0, 0.0)), (2,), f"{path}: base.tilt")
         changes["floor"] = checked_array(document["base"].get("floor", (0.0, 0.0)), (2,), f"{path}: base.floor")

@@ -61,6 +61,20 @@ def check_alive(samples: Array) -> None:
             )
 
 
+def check_finite(samples: Array, rate: float) -> None:
+    """Check that every IMU reads numbers all along samples (N, 3, 7, 3) at this rate [Hz].
+
+    Raises:
+        CalibrationError: one does not; the message names it, and when.
+    """
+    lost = ~np.isfinite(samples[:, :2]).all(axis=(1, 3))
+    for imu in np.flatnonzero(lost.any(axis=0)).tolist():
+        raise CalibrationError(
+            f"IMU {imu} reads what is no number {lost[:, imu].argmax() / rate:.3g} s into a run, and in "
+            f"{np.count_nonzero(lost[:, imu])} of its {len(lost)} cycles: check its cable and its supply"
+        )
+
+
 def check_spread(forces: Array) -> None:
     """Check that rests are unlike enough, and that every leg takes part.
 

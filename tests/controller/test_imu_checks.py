@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from controller.imu_checks import check_alive, check_motion, check_places, check_spread
+from controller.imu_checks import check_alive, check_finite, check_motion, check_places, check_spread
 from controller.readings import readings_along, sensor_geometry
 from controller.self_calibration import CalibrationError
 from plant.imposed import impose
@@ -109,3 +109,12 @@ def test_rests_that_are_alike_and_legs_that_stand_are_named():
         check_spread(still)
     with pytest.raises(CalibrationError, match="too alike"):
         check_spread(np.array([0.0, 0.0, 9.81]) + 0.01 * (forces - forces.mean(axis=0)))
+
+
+def test_an_imu_that_is_lost_in_a_run_is_named_with_the_time():
+    samples = np.ones((1000, 3, 7, 3))
+    samples[:, 2] = np.nan
+    check_finite(samples, RATE)
+    samples[500:, 1, 2, 0] = np.nan
+    with pytest.raises(CalibrationError, match="IMU 2 reads what is no number 2 s into a run, and in 500 of its 1000 cycles"):
+        check_finite(samples, RATE)
