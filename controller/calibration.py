@@ -27,6 +27,7 @@ UNITS = ("rad/s", "m/s2", "uT")
 _FIELDS = ("bias", "scale", "axes", "mounting")
 _SIDES = ("base", "platform")
 _LEAST_MOVE_M = 1e-9
+_MOST_TILT = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,12 +100,15 @@ def load_calibration(path: Path | str) -> Calibration:
         raise InputError(f"the calibration {path} cannot be read: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is no TOML file: {error}") from None
+    for name, table in document.items():
+        if not isinstance(table, dict):
+            raise InputError(f"{path}: {name} must be a table, got {table!r}")
     calibration = Calibration(about=document.get("about", {}))
     for name, table in document.items():
         if name in ("about", "base", "joints", "covariance"):
             continue
         imu = name.removeprefix("imu_")
-        if not (name.startswith("imu_") and imu.isdigit() and int(imu) < IMU_COUNT):
+        if not (name.startswith("imu_") and imu in map(str, range(IMU_COUNT))):
             raise InputError(
                 f"{path}: no table {name!r} belongs in a calibration; imu_0 to imu_6, about, base, joints, covariance do"
             )
@@ -113,9 +117,14 @@ def load_calibration(path: Path | str) -> Calibration:
                 raise InputError(f"{path}: {name} has no sensor {sensor!r}; it has {', '.join(SENSORS)}")
             _read_sensor(calibration, SENSORS.index(sensor), int(imu), entries, f"{path}: {name}.{sensor}")
     changes: dict[str, Any] = {}
+    for name, entries in (("base", ("tilt", "floor")), ("joints", _SIDES), ("covariance", ("sigmas", "factor"))):
+        if unknown := sorted(set(document.get(name, {})) - set(entries)):
+            raise InputError(f"{path}: {name} has no entry {unknown[0]!r}; it has {', '.join(entries)}")
     if "base" in document:
         changes["tilt"] = checked_array(document["base"].get("tilt", (0.0, 0.0)), (2,), f"{path}: base.tilt")
         changes["floor"] = checked_array(document["base"].get("floor", (0.0, 0.0)), (2,), f"{path}: base.floor")
+        if np.abs(changes["tilt"]).max() > _MOST_TILT or (changes["floor"] < 0.0).any():
+            raise InputError(f"{path}: base.tilt must be within {_MOST_TILT:g} rad of level, and base.floor not negative")
     if "joints" in document:
         sides = [document["joints"].get(side, np.zeros((LEGS, 3))) for side in _SIDES]
         moves = [checked_array(moved, (LEGS, 3), f"{path}: joints.{side}") for side, moved in zip(_SIDES, sides, strict=True)]
@@ -133,6 +142,8 @@ def _read_sensor(calibration: Calibration, sensor: int, imu: int, entries: Any, 
         values[entry] = checked_array(value, (3,), f"{where}.{entry}")
     if (values["scale"] <= 0.0).any():
         raise InputError(f"{where}.scale is {values['scale'].tolist()}; it must be positive")
+    if np.abs(values["axes"]).max() > 1.0:
+        raise InputError(f"{where}.axes is {values['axes'].tolist()}; an axis is at most 1 off a right angle")
     calibration.gain[sensor, imu] = join_gain(values["scale"], values["axes"], values["mounting"])
     calibration.offset[sensor, imu] = calibration.gain[sensor, imu] @ values["bias"]
 

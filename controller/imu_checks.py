@@ -9,6 +9,8 @@ from functools import cache
 from itertools import permutations, product
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from controller.self_calibration import CalibrationError
 from plant.imu import ACCELEROMETER, STANDARD_GRAVITY
@@ -30,6 +32,7 @@ LEAST_RATE = np.radians(1.0)
 LEAST_SPREAD = np.radians(3.0)
 """Of the verticals of an IMU over rests [rad]."""
 
+_FROZEN_S = 0.1
 _RIGHT = np.eye(3)
 _SENSORS = ("gyroscope", "accelerometer")
 _GRAVITY_RANGE = (0.7 * STANDARD_GRAVITY, 1.3 * STANDARD_GRAVITY)
@@ -59,6 +62,29 @@ def check_alive(samples: Array) -> None:
                 f"the accelerometer of IMU {imu} reads {force:.3g} m/s2 at rest; gravity is {_GRAVITY_RANGE[0]:.3g} to "
                 f"{_GRAVITY_RANGE[1]:.3g}: it is dead, or its range or unit is another"
             )
+
+
+def check_all_along(samples: Array, rate: float) -> None:
+    """Check that every IMU reads numbers all along samples (N, 3, 7, 3) at this rate [Hz], and does not stand still for a tenth
+    of a second while others do not.
+
+    Raises:
+        CalibrationError: one does not; the message names it, and when.
+    """
+    readings = samples[:, :2]
+    lost = ~np.isfinite(readings).all(axis=(1, 3))
+    same = (readings[1:] == readings[:-1]).all(axis=(1, 3))
+    same &= ~same.all(axis=1, keepdims=True)
+    reach = max(round(_FROZEN_S * rate), 3)
+    frozen = sliding_window_view(same, min(reach, len(same)), axis=0).all(axis=2)
+    faults: dict[str, NDArray[np.bool_]] = {"reads what is no number": lost, "stands still while others do not": frozen}
+    for imu in range(IMU_COUNT):
+        for what, found in faults.items():
+            if found[:, imu].any():
+                first, whole = found[:, imu].argmax() / rate, found[:, imu].sum() / rate
+                raise CalibrationError(
+                    f"IMU {imu} {what} {first:.3g} s into a run, for {whole:.3g} s in all: check its cable and its supply"
+                )
 
 
 def check_spread(forces: Array) -> None:

@@ -482,38 +482,37 @@ def calibrate_in_motion(
     Raises:
         CalibrationError: the filter does not follow the motion.
     """
-    calibration, guide = found.calibration(), None
     noises = ("platform_jerk", "platform_angular_jerk", "mechanism_gyroscope_noise", "mechanism_accelerometer_noise")
     cautious = replace(fusion, **{name: _CAUTION * getattr(fusion, name) for name in noises})
     parameters = filter_parameters(cautious, rate, "axes", found.covariance)
     used = np.ones((len(samples), IMU_COUNT), np.int64)
+    geometry = sensor_geometry(mechanism.moved_joints(found.joints), found.tilt)
+    calibrated, guide = found.calibration().apply(samples), None
     for _ in range(_PASSES):
-        geometry = sensor_geometry(mechanism.moved_joints(calibration.joints), calibration.tilt)
-        run = track(parameters, geometry, calibration.apply(samples), used, rate, fusion.sensor_delay, start, guide)
+        run = track(parameters, geometry, calibrated, used, rate, fusion.sensor_delay, start, guide)
         if not (np.isfinite(run.state["errors"]).all() and np.isfinite(run.positions).all()):
             raise CalibrationError("the whole-mechanism filter does not follow the motion: check the calibration at rest")
-        rig = run.state["rig"]
-        calibration = calibration.then(
-            *undo(run.state["errors"]),
-            joints=calibration.joints + rig[:JOINTS].reshape(2, LEGS, 3),
-            tilt=calibration.tilt + rig[JOINTS:],
-        )
         guide = _smoothed(run.motions, _GUIDE_SIGMA_S * rate)
+    moved = run.state["rig"]
+    calibration = found.calibration().then(
+        *undo(run.state["errors"]),
+        joints=found.joints + moved[:JOINTS].reshape(2, LEGS, 3),
+        tilt=found.tilt + moved[JOINTS:],
+    )
     kept = slice(MOTION_STATES, MOTION_STATES + ALL_ERRORS + RIG)
     covariance: Array = run.state["covariance"][kept, kept].copy()
-    # Of the errors if the rig's were known, and what the rig's add.
-    errors, across, rig = (
+    of_errors, across, of_rig = (
         covariance[:ALL_ERRORS, :ALL_ERRORS],
         covariance[ALL_ERRORS:, :ALL_ERRORS],
-        covariance[ALL_ERRORS:, ALL_ERRORS:],
+        covariance[ALL_ERRORS:],
     )
-    conditional, of_rig = errors - across.T @ np.linalg.pinv(rig, rcond=1e-12, hermitian=True) @ across, covariance.copy()
-    of_rig[:ALL_ERRORS, :ALL_ERRORS] -= conditional
-    built = mechanism.moved_joints(calibration.joints)
-    poses = zip(found.positions, found.rotations, strict=True)
-    variances = np.diag(np.mean([pose_covariance(built, calibration.tilt, pose, of_rig) for pose in poses], axis=0))
-    floor = np.sqrt(variances.reshape(2, 3).sum(axis=1))
-    return replace(calibration, covariance=conditional, floor=floor), covariance
+    # Of the errors if the rig's were known, and what these add.
+    known = of_errors - across.T @ np.linalg.pinv(of_rig[:, ALL_ERRORS:], rcond=1e-12, hermitian=True) @ across
+    added = covariance.copy()
+    added[:ALL_ERRORS, :ALL_ERRORS] -= known
+    built, poses = mechanism.moved_joints(calibration.joints), zip(found.positions, found.rotations, strict=True)
+    variances = np.diag(np.mean([pose_covariance(built, calibration.tilt, pose, added) for pose in poses], axis=0))
+    return replace(calibration, covariance=known, floor=np.sqrt(variances.reshape(2, 3).sum(axis=1))), covariance
 
 
 def _smoothed(motions: Array, sigma: float) -> Array:

@@ -219,15 +219,19 @@ def _steps(times: Array) -> Array:
     return poses[np.arange(len(times)) % len(poses)]
 
 
-def rests(mechanism: Mechanism, duration: float, share: float = 0.8) -> Target:
-    """Poses to rest at for `REST_S` each, home first, as different as this share of the strokes allows."""
+def rests(mechanism: Mechanism, duration: float, share: float = 0.8, size: float = 1.0) -> Target:
+    """Poses to rest at for `REST_S` each, home first, as different as this share of the strokes allows.
+
+    They are chosen among random ones of the workspace, whose way from home is shortened to this `size`: of those that are not,
+    hardly any is within a small share.
+    """
     limits, home = mechanism.require_limits(), mechanism.require_home()
     lengths = leg_lengths(mechanism, home.position, home.rotation)
     positions, rotations = sample_workspace(mechanism, _REST_CHOICE, seed=0)
-    # Nearer to home by the share: most of them are then inside.
-    positions = home.position + share * (positions - home.position)
-    turns = share * vector_from_rotation(rotations @ home.rotation.T)
-    rotations = np.array([rotation_from_vector(turn) @ home.rotation for turn in turns])
+    if size < 1.0:
+        turns = size * vector_from_rotation(rotations @ home.rotation.T)
+        positions = home.position + size * (positions - home.position)
+        rotations = np.array([rotation_from_vector(turn) @ home.rotation for turn in turns])
     drawn = leg_lengths(mechanism, positions, rotations)
     middle, half = limits.stroke.mean(axis=1), 0.5 * (limits.stroke[:, 1] - limits.stroke[:, 0])
     inside = (np.abs(drawn - middle) <= share * half).all(axis=1)
@@ -278,7 +282,7 @@ def shaking(mechanism: Mechanism, duration: float, share: float = 1.0) -> Target
 
 
 _WIDE_MOTIONS: dict[str, Callable[[Mechanism, float], Target]] = {
-    "near-rests": partial(rests, share=0.4),
+    "near-rests": partial(rests, share=0.4, size=0.5),
     "rests": rests,
     "shaking": shaking,
     "probing": partial(shaking, share=0.3),

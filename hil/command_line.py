@@ -478,6 +478,10 @@ def _seeds(text: str) -> tuple[int, ...]:
         raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers such as 0,1,2") from None
 
 
+_RIG_SIMULATED = {"mechanism": "hexapod", "rate": 1000.0, "imu": "mpu9150", "seed": 0, "joint_error": 0.0, "plant": None}
+"""Options of the rig that is driven, with their defaults."""
+
+
 def _calibrate_rig(options: argparse.Namespace) -> int:
     from math import radians
 
@@ -491,6 +495,11 @@ def _calibrate_rig(options: argparse.Namespace) -> int:
         raise InputError(f"--tilt is {options.tilt:g} deg; it must be between 0 and 45")
     if not 0.0 <= options.joints <= 10.0:
         raise InputError(f"--joints is {options.joints:g} mm; it must be between 0 and 10")
+    if options.recording:
+        given = [name for name in _RIG_SIMULATED if getattr(options, name) != _RIG_SIMULATED[name]]
+        if given:
+            names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+            raise InputError(f"the recordings say what {names} would: leave it out with --recording")
     prior = Prior(tilt=radians(options.tilt), joints=1e-3 * options.joints)
     knowledge = Knowledge(prior, options.home, options.lengths, options.known_poses)
     config = SimulationConfig(

@@ -18,7 +18,7 @@ from vqf import VQF
 from controller.calibration import Calibration, load_calibration
 from controller.cycle import ALL_IMUS, STATE, check_rate, cycle_parameters
 from controller.direct_kinematics import solve_batch
-from controller.fusion import calibrate, find_pose, fuse_legs, fuse_mechanism, fuse_platform, improve_pose
+from controller.fusion import calibrate, find_pose, fuse_heading, fuse_legs, fuse_mechanism, fuse_platform, improve_pose
 from controller.leg_filter import leg_direction, start_leg
 from controller.mechanism_filter import extrapolate_covariance
 from controller.settings import control_settings, sensor_settings
@@ -27,7 +27,7 @@ from hil.simulation import FUSIONS, filterpy_filters
 from plant.compiled import Record, kernel
 from plant.errors import InputError
 from plant.imposed import ImposedMotion, impose
-from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER, ImuModel, imu_state, load_imu, measure
+from plant.imu import ACCELEROMETER, GYROSCOPE, ImuModel, imu_state, load_imu, measure
 from plant.mechanism import LEGS, Mechanism, load_spatial
 from plant.pose import Array, vector_from_rotation
 from plant.variables import IMU_COUNT, PLATFORM_IMU
@@ -106,7 +106,7 @@ def compare(config: ComparisonConfig, progress: Callable[[float], None] = lambda
     late = slice(round(LEARNING_S * config.rate), None)
     for i, seed in enumerate(config.seeds):
         motion = impose(mechanism, config.motion, config.duration, config.rate, seed)
-        readings = _Readings(mechanism, model, calibration, config.rate, seed, motion)
+        readings = _Readings(mechanism.moved_joints(calibration.joints), model, calibration, config.rate, seed, motion)
         methods = {**METHODS, **(SLOW_METHODS if i == 0 else {})}
         for k, (name, method) in enumerate(methods.items()):
             run = method(readings)
@@ -166,10 +166,12 @@ class _Readings:
         self.calibrated = calibration.apply(self.raw)
         self._found: dict[str | None, Found] = {}
 
-    def parameters(self, errors: str | None) -> Record:
+    def parameters(self, errors: str | None, section_5: bool = False) -> Record:
         """The cycle's constants."""
-        control = control_settings(self.mechanism)
-        return cycle_parameters(self.mechanism, self.rate, control, self._fusion, ALL_IMUS, errors, self._calibration)
+        control, imus = control_settings(self.mechanism), ALL_IMUS
+        return cycle_parameters(
+            self.mechanism, self.rate, control, self._fusion, imus, errors, self._calibration, section_5, section_5
+        )
 
     def run(self, errors: str) -> _Run:
         """The poses of the whole-mechanism filter for these errors."""
@@ -243,6 +245,7 @@ def _follow(
         fuse_legs(parameters, state)
         ns[LEGS_ALONE, i] = now(timespec) - before_legs
         fuse_platform(parameters, state)
+        fuse_heading(parameters, state)
         find_pose(parameters, state)
         ns[0, i] = now(timespec) - began
         positions[0, i], rotations[0, i] = s.position, s.rotation
@@ -265,23 +268,8 @@ def _follow(
 
 def _section_5(readings: _Readings) -> _Run:
     """The paper's algorithm: leg directions, and all of the platform's orientation, with the heading of its magnetometer."""
-    found = readings.found(None)
-    mechanism = readings.mechanism
-    field = mechanism.plant_parameters()["magnetic_field"]
-    in_base = _triad(mechanism.up_in_base[None], field[None])
-    in_platform = _triad(found.verticals, readings.calibrated[:, MAGNETOMETER, PLATFORM_IMU])
-    solutions = solve_batch(
-        mechanism, found.directions, rotation=in_base @ np.swapaxes(in_platform, 1, 2), method="section-5", refine=False
-    )
-    return _Run(solutions.positions, solutions.rotations)
-
-
-def _triad(up: Array, field: Array) -> Array:
-    """Right-handed axes (N, 3, 3) of a vertical and a magnetic field (N, 3)."""
-    z = up / np.linalg.norm(up, axis=1, keepdims=True)
-    y = np.cross(z, field)
-    y /= np.linalg.norm(y, axis=1, keepdims=True)
-    return np.stack([np.cross(y, z), y, z], axis=2)
+    run = fuse(readings.parameters(None, section_5=True), readings.raw).run(CLOSED)
+    return _Run(run.positions, run.rotations, us=run.us)
 
 
 def _vqf(readings: _Readings) -> _Run:

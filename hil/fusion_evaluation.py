@@ -80,6 +80,8 @@ class EvaluationConfig:
             raise UnknownNameError(f"no fusion of the whole mechanism {self.fusion!r}; there are {names}")
         if not self.seeds:
             raise InputError("there must be a seed at least")
+        if not 0.0 <= self.joint_error < np.inf:
+            raise InputError(f"the joint error is {1e3 * self.joint_error:g} mm; it must be at least 0 and finite")
         if not 1 <= self.starts <= 10000:
             raise InputError(f"{self.starts} starts are asked for; there can be 1 to 10000")
         if not LEARNING_S < self.still <= 3600.0:

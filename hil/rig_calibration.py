@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from controller.calibration import Calibration, save_calibration, split_gain
 from controller.direct_kinematics import poses_from_lengths
-from controller.imu_checks import check_alive, check_motion, check_places, check_spread
+from controller.imu_checks import check_alive, check_all_along, check_motion, check_places, check_spread
 from controller.mechanism_filter import (
     ACCELEROMETER_BIAS,
     ALIGNMENT,
@@ -282,10 +282,15 @@ class _Data:
         self._readings, self._truth, self._lengths = np.zeros((0, IMU_COUNT, 6)), np.zeros((0, 7)), np.zeros((0, LEGS))
 
     def begin(self, records: Record, hold: int) -> None:
-        """Zero the gyroscopes while the brakes hold, for the first so many cycles, and check that every IMU lives."""
+        """Zero the gyroscopes while the brakes hold, for the first so many cycles, and check that every IMU lives.
+
+        Where the rig begins at home, that is its rest there: a loop that closes over raw IMUs leaves it.
+        """
         samples = raw_samples(records[:hold])
         check_alive(samples)
         self.zero = samples[:, GYROSCOPE].mean(axis=0)
+        if self._knowledge.home:
+            self._add_rest(records[:hold])
 
     def check_places(self, records: Record) -> None:
         """Check that each IMU reads what its place does along the planned motion."""
@@ -312,14 +317,17 @@ class _Data:
 
     def add_rests(self, records: Record) -> None:
         """Take the rests out of records."""
+        check_all_along(raw_samples(records), self._rate)
         for rest in self._rests_in(records):
-            own = records[rest]
-            readings = np.concatenate([own["angular_velocity"], own["specific_force"]], axis=2).mean(axis=0)
-            truth = own["truth"][:, :13].mean(axis=0)
-            self._readings = np.append(self._readings, readings[None], axis=0)
-            self._truth = np.append(self._truth, truth[None, :7], axis=0)
-            measured = truth[7:] + self._random.normal(0.0, _LENGTH_NOISE, LEGS)
-            self._lengths = np.append(self._lengths, measured[None], axis=0)
+            self._add_rest(records[rest])
+
+    def _add_rest(self, own: Record) -> None:
+        readings = np.concatenate([own["angular_velocity"], own["specific_force"]], axis=2).mean(axis=0)
+        truth = own["truth"][:, :13].mean(axis=0)
+        self._readings = np.append(self._readings, readings[None], axis=0)
+        self._truth = np.append(self._truth, truth[None, :7], axis=0)
+        measured = truth[7:] + self._random.normal(0.0, _LENGTH_NOISE, LEGS)
+        self._lengths = np.append(self._lengths, measured[None], axis=0)
 
     @property
     def rests(self) -> Rests:
@@ -410,6 +418,7 @@ class _Data:
                 "are needed: record 'shaking' for 40 s"
             )
         samples = raw_samples(runs[number][whole])
+        check_all_along(samples, self._rate)
         last = max(len(samples) - length - round(_MEAN_S * self._rate), 1)
         check_motion(samples[last:, GYROSCOPE] - self.zero)
         first = max(last - round(_SETTLED_S * self._rate), 0)

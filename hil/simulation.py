@@ -25,7 +25,7 @@ from plant.export import default_fmu
 from plant.fmu import FmuPlant
 from plant.imu import ACCELEROMETER, GYROSCOPE, RIGHT_WIRING, Wiring, imu_state, load_imu
 from plant.mechanism import LEGS, Mechanism, load_spatial
-from plant.pose import Array, rotation_angle, rotations_from_quaternions
+from plant.pose import Array, checked_seed, rotation_angle, rotations_from_quaternions
 from plant.variables import PLATFORM_IMU
 
 FUSIONS = {
@@ -83,6 +83,7 @@ class SimulationConfig:
 
     def __post_init__(self) -> None:
         check_rate(self.rate)
+        checked_seed(self.seed)
         check_duration(self.duration)
         cycles = self.duration * self.rate
         if round(cycles) < 1:

@@ -14,6 +14,9 @@ from plant.pose import Array, checked_seed
 SIZE = (0.03, np.radians(10.0))
 """Of the motion along and about each axis [m, rad]."""
 
+MOST_HZ = 5.0
+"""With 10 degrees about every axis the IMUs' gyroscopes are then at the end of their range."""
+
 _MIXED_HZ = 0.5 * np.array([0.2, 0.45, 0.8, 1.3, 2.0])
 
 
@@ -76,8 +79,10 @@ def _frequencies(kind: str) -> Array:
         frequency = float(kind)
     except ValueError:
         frequency = np.nan
-    if not 0.0 < frequency < np.inf:
-        raise InputError(f"there is no imposed motion {kind!r}: give static, mixed, or a frequency in Hz such as 0.5")
+    if not 0.0 < frequency <= MOST_HZ:
+        raise InputError(
+            f"there is no imposed motion {kind!r}: give static, mixed, or a frequency such as 0.5, at most {MOST_HZ:g} Hz"
+        )
     return frequency * (1.0 + 0.04 * (np.arange(6.0) - 2.5))[:, None]
 
 

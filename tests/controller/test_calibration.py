@@ -125,6 +125,10 @@ def test_what_it_leaves_is_what_the_filter_knows_of_the_sensors(hexapod):
         ("[imu_0.gyroscope]\nbias = [0, nan, 0]", r"imu_0.gyroscope.bias\[1\] is nan; it must be finite"),
         ("[imu_0.gyroscope]\nscale = [1, 0, 1]", r"imu_0.gyroscope.scale is \[1.0, 0.0, 1.0\]; it must be positive"),
         ("[covariance]\nsigmas = [1.0]", r"covariance.sigmas must have shape \(147,\)"),
+        ("imu_0 = 3", "imu_0 must be a table, got 3"),
+        ("joints = [1]", r"joints must be a table, got \[1\]"),
+        ("[base]\ntitl = [0, 0]", "base has no entry 'titl'; it has tilt, floor"),
+        ('["imu_²"]', "no table 'imu_²'"),
         (f"[covariance]\nsigmas = {[1.0] * 147}\nfactor = [[1.0]]", "covariance.factor must have 147 rows"),
     ],
 )

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from controller.imu_checks import check_alive, check_motion, check_places, check_spread
+from controller.imu_checks import check_alive, check_all_along, check_motion, check_places, check_spread
 from controller.readings import readings_along, sensor_geometry
 from controller.self_calibration import CalibrationError
 from plant.imposed import impose
@@ -109,3 +109,18 @@ def test_rests_that_are_alike_and_legs_that_stand_are_named():
         check_spread(still)
     with pytest.raises(CalibrationError, match="too alike"):
         check_spread(np.array([0.0, 0.0, 9.81]) + 0.01 * (forces - forces.mean(axis=0)))
+
+
+def test_an_imu_that_is_lost_in_a_run_is_named_with_the_time():
+    samples = np.random.default_rng(0).normal(size=(1000, 3, 7, 3))
+    samples[:, 2] = np.nan
+    # A period that was missed: all stand.
+    samples[300:350] = samples[299]
+    check_all_along(samples, RATE)
+    frozen = samples.copy()
+    frozen[600:850, :, 4] = frozen[599, :, 4]
+    with pytest.raises(CalibrationError, match=r"IMU 4 stands still while others do not 2\.4 s into a run"):
+        check_all_along(frozen, RATE)
+    samples[500:, 1, 2, 0] = np.nan
+    with pytest.raises(CalibrationError, match="IMU 2 reads what is no number 2 s into a run, for 2 s in all"):
+        check_all_along(samples, RATE)

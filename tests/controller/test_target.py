@@ -11,9 +11,9 @@ from controller.direct_kinematics import poses_from_lengths
 from controller.inverse_kinematics import leg_lengths
 from controller.planner import plan
 from controller.reference import sample_reference
-from controller.target import COLUMNS, MARGIN_S, MOTIONS, SAMPLE_PERIOD_S, Target, load_target
+from controller.target import COLUMNS, MARGIN_S, MOTIONS, REST_S, SAMPLE_PERIOD_S, Target, load_target
 from plant.errors import GoughError, InputError, UnknownNameError
-from plant.mechanism import Mechanism
+from plant.mechanism import Mechanism, load_spatial
 from plant.pose import Pose
 from tests.controller.leg_geometry import angle_between, rotation_of, unit
 
@@ -282,3 +282,9 @@ def test_asking_for_poses_does_not_change_the_target(hexapod):
     np.testing.assert_array_equal(first[1], second[1])
     np.testing.assert_array_equal(target.rotations, kept)
     assert target.times[1] == SAMPLE_PERIOD_S
+
+
+@pytest.mark.parametrize("name", ["hexapod", "6-3-I", "6-3-II", "6-4-I", "6-4-II", "6-5", "genhexkins"])
+def test_no_two_rests_near_home_are_alike(name):
+    target = load_target("near-rests", load_spatial(name), 8 * REST_S)
+    assert len(np.unique(target.positions.round(6), axis=0)) == 9

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from controller.self_calibration import CalibrationError
+from hil import rig_calibration
 from hil.command_line import main
 from hil.recording import Recorder
 from hil.rig_calibration import Knowledge, calibrate_recordings, calibrate_rig, find_rests, is_long, weakest_direction
@@ -133,6 +134,15 @@ def test_raw_imus_follow_with_it_what_they_cannot_follow_without(calibrated):
     error = np.linalg.norm(result.records["position"] - result.true_positions, axis=1)[late]
     assert np.sqrt(np.mean(error**2)) < 0.25e-3
     assert result.records["trusted"][late].all()
+
+
+def test_the_rest_at_home_is_the_one_on_the_brakes():
+    config = SimulationConfig(imu="mpu9150", seed=7, target="hold", duration=0.1, hold=1.0)
+    mechanism = load_spatial(config.mechanism)
+    data = rig_calibration._Data(mechanism, config.imu, config.rate, Knowledge(home=True), config.seed)
+    data.begin(rig_calibration._run_open(config, blind=True), 1000)
+    assert data.rests.home and len(data.rests.readings) == 1
+    np.testing.assert_allclose(data._truth[0, :3], mechanism.home.position, atol=2e-5)
 
 
 def test_rests_are_where_nothing_turns():
