@@ -10,7 +10,6 @@ from itertools import permutations, product
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
 from controller.self_calibration import CalibrationError
 from plant.imu import ACCELEROMETER, STANDARD_GRAVITY
@@ -77,7 +76,7 @@ def check_all_along(samples: Array, rate: float) -> None:
     same &= ~same.all(axis=1, keepdims=True)
     reach = max(round(_FROZEN_S * rate), 3)
     frozen = sliding_window_view(same, min(reach, len(same)), axis=0).all(axis=2)
-    faults: dict[str, NDArray[np.bool_]] = {"reads what is no number": lost, "stands still while others do not": frozen}
+    faults = {"reads what is no number": np.atleast_2d(lost), "stands still while others do not": np.atleast_2d(frozen)}
     for imu in range(IMU_COUNT):
         for what, found in faults.items():
             if found[:, imu].any():

@@ -453,9 +453,9 @@ def _track(
             motions[i, 2, j], motions[i, 3, j] = acceleration[j], acceleration[3 + j]
 
 
-_PASSES = 3
 _CAUTION = 1.6
-"""What the model leaves out is the same in every swing and does not average out as noise does: so many times the noise."""
+"""What the model leaves out is the same in every swing and does not average out as noise does: the covariance that is told is
+that for so many times the noise."""
 
 _GUIDE_SIGMA_S = 0.02
 
@@ -465,8 +465,8 @@ def calibrate_in_motion(
 ) -> tuple[Calibration, Array]:
     """Improve what was found at rest by a motion.
 
-    The filter runs several times, each time linearised at the motion that the last one has found, smoothed to both sides: at
-    its own, the noise in it would be taken for excitation.
+    The filter runs twice, the second time linearised at the motion that the first one has found, smoothed to both sides: at its
+    own, the noise in it would be taken for excitation. A third run, with more noise, tells the covariance.
 
     Args:
         mechanism: as before.
@@ -484,23 +484,26 @@ def calibrate_in_motion(
     """
     noises = ("platform_jerk", "platform_angular_jerk", "mechanism_gyroscope_noise", "mechanism_accelerometer_noise")
     cautious = replace(fusion, **{name: _CAUTION * getattr(fusion, name) for name in noises})
-    parameters = filter_parameters(cautious, rate, "axes", found.covariance)
+    plain, careful = (filter_parameters(each, rate, "axes", found.covariance) for each in (fusion, cautious))
     used = np.ones((len(samples), IMU_COUNT), np.int64)
     geometry = sensor_geometry(mechanism.moved_joints(found.joints), found.tilt)
     calibrated, guide = found.calibration().apply(samples), None
-    for _ in range(_PASSES):
+    runs: list[Track] = []
+    for parameters in (plain, plain, careful):
         run = track(parameters, geometry, calibrated, used, rate, fusion.sensor_delay, start, guide)
         if not (np.isfinite(run.state["errors"]).all() and np.isfinite(run.positions).all()):
             raise CalibrationError("the whole-mechanism filter does not follow the motion: check the calibration at rest")
         guide = _smoothed(run.motions, _GUIDE_SIGMA_S * rate)
-    moved = run.state["rig"]
+        runs.append(run)
+    last = runs[-2].state
+    moved = last["rig"]
     calibration = found.calibration().then(
-        *undo(run.state["errors"]),
+        *undo(last["errors"]),
         joints=found.joints + moved[:JOINTS].reshape(2, LEGS, 3),
         tilt=found.tilt + moved[JOINTS:],
     )
     kept = slice(MOTION_STATES, MOTION_STATES + ALL_ERRORS + RIG)
-    covariance: Array = run.state["covariance"][kept, kept].copy()
+    covariance: Array = runs[-1].state["covariance"][kept, kept].copy()
     of_errors, across, of_rig = (
         covariance[:ALL_ERRORS, :ALL_ERRORS],
         covariance[ALL_ERRORS:, :ALL_ERRORS],

@@ -93,7 +93,7 @@ class FusionSettings:
     scale_sigma: float = 1e-3
     alignment_sigma: float = radians(0.1)
     axes_sigma: float = 1e-3
-    caution: float = 3.0
+    caution: float = 2.75
     disagreement: float = radians(1.0)
 
     def __post_init__(self) -> None:
