@@ -979,6 +979,7 @@ def _tune_fusion(options: argparse.Namespace) -> int:
     for name, values in figures["settings"].items():
         table.add_row(name, f"{values['before']:.4g}", f"{values['after']:.4g}")
     _print(table)
+    outside = []
     table = _table(f"{len(config.seeds)} seeds", "NEES before", "after", "95 % bounds", "RMS before", "after")
     for name, estimator in figures["estimators"].items():
         before, after = estimator["before"], estimator["after"]
@@ -989,7 +990,11 @@ def _tune_fusion(options: argparse.Namespace) -> int:
             for each in (before, after)
         )
         table.add_row(name, f"{before['nees']:.2f}", f"{after['nees']:.2f}", f"{least:.2f} to {greatest:.2f}", *errors)
+        if not least <= after["nees"] <= greatest:
+            outside.append(name)
     _print(table)
+    for name in outside:
+        print(f"{name}: NEES stays outside its bounds, as beyond this its errors would grow by more than 2 %")
     print(f"written to {options.output}")
     return 0
 
