@@ -453,7 +453,7 @@ def _track(
             motions[i, 2, j], motions[i, 3, j] = acceleration[j], acceleration[3 + j]
 
 
-_CAUTION = 1.6
+_CAUTION = 1.5
 """What the model leaves out is the same in every swing and does not average out as noise does: the covariance that is told is
 that for so many times the noise."""
 
