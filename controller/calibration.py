@@ -193,7 +193,8 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
             lines += [f"{entry} = {_toml(value.tolist())}" for entry, value in values.items()]
     if calibration.covariance is not None:
         sigmas = np.sqrt(np.diag(calibration.covariance))
-        factor = np.linalg.cholesky(calibration.covariance / np.outer(sigmas, sigmas))
+        # Positive definite whatever rounding has done to the correlation.
+        factor = np.linalg.cholesky(calibration.covariance / np.outer(sigmas, sigmas) + 1e-9 * np.eye(len(sigmas)))
         lines += [
             "",
             "# Of the errors that are left: standard deviations, and the Cholesky factor of their correlation.",
