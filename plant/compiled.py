@@ -82,8 +82,8 @@ def _kernel_folder() -> Path:
 def kernel(function: F) -> F:
     """Mark a function of the cycle: compiled, off the GIL, never raising, its machine code cached.
 
-    Division by zero gives inf or NaN as in NumPy, and fastmath stays off so that NaN checks mean something. Unlike numba, which
-    compiles a function anew for each constant that it is called with, one for all: that saves a quarter of a start without caches.
+    Division by zero gives inf or NaN as in NumPy, and fastmath stays off so that NaN checks mean something. By itself numba would
+    compile a function anew for each constant that it is called with; once for all saves a quarter of a start without caches.
     """
     settings: Any = numba.config
     before = settings.CACHE_DIR
@@ -92,8 +92,8 @@ def kernel(function: F) -> F:
         compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
     finally:
         settings.CACHE_DIR = before
-    template = compiled.get_call_template
+    template, unliteral = compiled.get_call_template, cast(Any, numba.types.unliteral)
     compiled.get_call_template = lambda args, kws: template(
-        tuple(numba.types.unliteral(each) for each in args), {name: numba.types.unliteral(each) for name, each in kws.items()}
+        tuple(unliteral(each) for each in args), {name: unliteral(each) for name, each in kws.items()}
     )
     return cast(F, compiled)
