@@ -82,8 +82,8 @@ def _kernel_folder() -> Path:
 def kernel(function: F) -> F:
     """Mark a function of the cycle: compiled, off the GIL, never raising, its machine code cached.
 
-    Division by zero gives inf or NaN as in NumPy, and fastmath stays off so that NaN checks mean something. By itself numba would
-    compile a function anew for each constant that it is called with; once for all saves a quarter of a start without caches.
+    Division by zero gives inf or NaN as in NumPy, and fastmath stays off so that NaN checks mean something. By itself numba
+    would compile a function anew for each constant that it is called with; once for all saves a quarter of a cold start.
     """
     settings: Any = numba.config
     before = settings.CACHE_DIR
