@@ -153,7 +153,7 @@ has been taken.
 
 def filter_parameters(
     fusion: FusionSettings, rate: float, errors: str | None, covariance: Array | None, floor: Array | None = None,
-    field: MagneticField | None = None,
+    field: MagneticField | None = None, inflation: float | None = None,
 ) -> Record:  # fmt: skip
     """Constants of the filter.
 
@@ -165,6 +165,7 @@ def filter_parameters(
             estimated then; None for what the settings say.
         floor: (2,) [m, rad], standard deviations of position and rotation that joints and tilt leave; None if they are exact.
         field: of the earth, for the platform's magnetometer; None without one.
+        inflation: times the noise and the jerk; None for 1 with a covariance, and what the settings say without.
 
     Raises:
         UnknownNameError: no such block of errors.
@@ -182,7 +183,11 @@ def filter_parameters(
     if covariance is not None:
         known = covariance
     prior[: len(known), : len(known)] = known
-    estimated, caution = 0 if errors is None else BLOCKS[errors], 1.0 if covariance is not None else fusion.caution**2
+    estimated = 0 if errors is None else BLOCKS[errors]
+    if inflation is None:
+        inflation = 1.0 if covariance is not None else fusion.noise_inflation
+    jerk = inflation * np.array([fusion.platform_jerk, fusion.platform_angular_jerk])
+    noise = inflation * np.array([fusion.mechanism_gyroscope_noise, fusion.mechanism_accelerometer_noise])
     parameters: Record = np.zeros((), FILTER_PARAMETERS)
     values = {
         "window": max(1, round(WINDOW_S * rate)),
@@ -190,12 +195,9 @@ def filter_parameters(
         "rig": len(known) - ALL_ERRORS,
         "states": MOTION_STATES + IMU_COUNT * estimated + len(known) - ALL_ERRORS + (field is not None),
         "smoothing": _SMOOTHING_S,
-        "jerk": (caution * fusion.platform_jerk**2, caution * fusion.platform_angular_jerk**2),
+        "jerk": jerk**2,
         "bias_walk": (fusion.bias_walk**2, fusion.accelerometer_bias_walk**2),
-        "variance": (
-            caution * fusion.mechanism_gyroscope_noise**2 * rate / 2.0,
-            caution * fusion.mechanism_accelerometer_noise**2 * rate / 2.0,
-        ),
+        "variance": noise**2 * rate / 2.0,
         "prior": prior,
         "floor": np.zeros(2) if floor is None else floor**2 / 3.0,
     }

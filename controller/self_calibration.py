@@ -453,7 +453,7 @@ def _track(
             motions[i, 2, j], motions[i, 3, j] = acceleration[j], acceleration[3 + j]
 
 
-_CAUTION = 1.5
+_INFLATION = 1.5
 """What the model leaves out is the same in every swing and does not average out as noise does: the covariance that is told is
 that for so many times the noise."""
 
@@ -482,14 +482,12 @@ def calibrate_in_motion(
     Raises:
         CalibrationError: the filter does not follow the motion.
     """
-    noises = ("platform_jerk", "platform_angular_jerk", "mechanism_gyroscope_noise", "mechanism_accelerometer_noise")
-    cautious = replace(fusion, **{name: _CAUTION * getattr(fusion, name) for name in noises})
-    plain, careful = (filter_parameters(each, rate, "axes", found.covariance) for each in (fusion, cautious))
+    plain, inflated = (filter_parameters(fusion, rate, "axes", found.covariance, inflation=by) for by in (1.0, _INFLATION))
     used = np.ones((len(samples), IMU_COUNT), np.int64)
     geometry = sensor_geometry(mechanism.moved_joints(found.joints), found.tilt)
     calibrated, guide = found.calibration().apply(samples), None
     runs: list[Track] = []
-    for parameters in (plain, plain, careful):
+    for parameters in (plain, plain, inflated):
         run = track(parameters, geometry, calibrated, used, rate, fusion.sensor_delay, start, guide)
         if not (np.isfinite(run.state["errors"]).all() and np.isfinite(run.positions).all()):
             raise CalibrationError("the whole-mechanism filter does not follow the motion: check the calibration at rest")

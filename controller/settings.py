@@ -64,8 +64,8 @@ class FusionSettings:
         accelerometer_bias_walk: random walk of the accelerometers' biases [m/s^2/sqrt(s)].
         accelerometer_bias_sigma, scale_sigma, alignment_sigma, axes_sigma: what is known of IMUs without a calibration file
             [m/s^2, 1, rad, rad].
-        caution: times these noises and the platform's jerk for IMUs without a calibration file, whose errors are more than the
-            filter estimates.
+        noise_inflation: times these noises and the platform's jerk for IMUs without a calibration file, whose errors are more
+            than the filter estimates.
         disagreement: of the leg filters' directions with the whole-mechanism filter's pose, RMS, that ends its use [rad].
     """
 
@@ -93,7 +93,7 @@ class FusionSettings:
     scale_sigma: float = 1e-3
     alignment_sigma: float = radians(0.1)
     axes_sigma: float = 1e-3
-    caution: float = 2.75
+    noise_inflation: float = 2.75
     disagreement: float = radians(1.0)
 
     def __post_init__(self) -> None:

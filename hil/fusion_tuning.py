@@ -284,7 +284,7 @@ STEPS = (
     _Step("platform filter", _seek_consistency, ("platform_accelerometer_noise",)),
     _Step("refined pose", _seek_least_errors, ("tilt_sigma",)),
     _Step("refined pose", _seek_consistency, ("leg_sigma", "tilt_sigma")),
-    _Step("whole mechanism", _seek_consistency, ("caution",)),
+    _Step("whole mechanism", _seek_consistency, ("noise_inflation",)),
 )
 """In the order of the estimators, each of which builds upon the one before."""
 

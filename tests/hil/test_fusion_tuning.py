@@ -16,7 +16,7 @@ from plant.pose import rotation_from_vector
 
 HEXAPOD = (resources.files("plant") / "presets" / "hexapod.toml").read_text()
 NAMES = [
-    "leg_accelerometer_noise", "platform_accelerometer_noise", "tilt_sigma", "leg_sigma", "caution",
+    "leg_accelerometer_noise", "platform_accelerometer_noise", "tilt_sigma", "leg_sigma", "noise_inflation",
 ]  # fmt: skip
 
 
