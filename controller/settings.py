@@ -1,7 +1,9 @@
-"""Settings of the controller: the tables `control` and `fusion` of a mechanism's preset, checked when they are read."""
+"""Settings of the controller: the tables `control`, `fusion` and `safety` of a mechanism's preset, checked when they are
+read.
+"""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from math import radians
 from typing import Any, TypeVar
 
@@ -10,8 +12,9 @@ from plant.imu import STANDARD_GRAVITY, ImuModel
 from plant.mechanism import Mechanism
 
 _ENDLESS = 1e300
+_RAW_M = 0.05
 
-S = TypeVar("S", "ControlSettings", "FusionSettings")
+S = TypeVar("S", "ControlSettings", "FusionSettings", "SafetySettings")
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,52 @@ class FusionSettings:
         _check_positive(self, zero_allowed={"sensor_delay"})
 
 
+@dataclass(frozen=True)
+class SafetySettings:
+    """Limits that are watched while the loop runs.
+
+    Attributes:
+        most_lost_imus: how many IMUs may be left out at once.
+        disagreement: of an IMU's direction with all others, beyond which it is left out [rad].
+        gyroscope_noise, accelerometer_noise: of an IMU that is left out, RMS [rad/s, m/s^2].
+        conditioning: least conditioning of the closed form.
+        stroke_margin: how far beyond its stroke a leg may be estimated [m].
+        velocity_margin: estimated speed of a leg that is too fast, in multiples of its limit.
+        following: largest deviation of a leg from its reference [m].
+        saturation: longest time for which a command may be at its limit [s].
+        drive_deviation: largest difference between a drive's command and its leg's estimated speed [m/s].
+        patience: for how long references and drives may be deviated from [s].
+        bus_patience: for how long the rig may give no answer [s].
+        arming_distance: largest distance of a leg from where the target begins [m].
+        arming_time: how long the checks before arming, and the drives, may take [s].
+        watch_imus: 0 if nothing is to be made of an IMU's disagreement.
+    """
+
+    most_lost_imus: float = 1.0
+    disagreement: float = radians(1.0)
+    gyroscope_noise: float = radians(5.0)
+    accelerometer_noise: float = 5.0
+    conditioning: float = 5e-3
+    stroke_margin: float = 0.003
+    velocity_margin: float = 2.0
+    following: float = 0.01
+    saturation: float = 0.25
+    drive_deviation: float = 0.15
+    patience: float = 0.05
+    bus_patience: float = 0.02
+    arming_distance: float = 0.01
+    arming_time: float = 1.0
+    watch_imus: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check_positive(self, zero_allowed={"most_lost_imus", "watch_imus"})
+
+    def for_raw_imus(self) -> "SafetySettings":
+        """The same for IMUs whose errors put the pose off by centimetres."""
+        wide = {name: max(getattr(self, name), _RAW_M) for name in ("stroke_margin", "following", "arming_distance")}
+        return replace(self, watch_imus=0.0, **wide)
+
+
 def control_settings(mechanism: Mechanism, **changes: float) -> ControlSettings:
     """The control settings of a mechanism, with changes by name.
 
@@ -116,6 +165,15 @@ def fusion_settings(mechanism: Mechanism, **changes: float) -> FusionSettings:
         InputError: an unknown name, or a value that is not a positive number.
     """
     return _read(FusionSettings, "fusion", {**mechanism.settings.get("fusion", {}), **changes})
+
+
+def safety_settings(mechanism: Mechanism, **changes: float) -> SafetySettings:
+    """The safety settings of a mechanism, with changes by name.
+
+    Raises:
+        InputError: an unknown name, or a value that is not a positive number.
+    """
+    return _read(SafetySettings, "safety", {**mechanism.settings.get("safety", {}), **changes})
 
 
 def sensor_settings(mechanism: Mechanism, imu: ImuModel) -> FusionSettings:
@@ -142,7 +200,7 @@ def _read(kind: type[S], name: str, table: Mapping[str, Any]) -> S:
     return kind(**table)
 
 
-def _check_positive(settings: ControlSettings | FusionSettings, zero_allowed: set[str]) -> None:
+def _check_positive(settings: ControlSettings | FusionSettings | SafetySettings, zero_allowed: set[str]) -> None:
     for field in fields(settings):
         value = getattr(settings, field.name)
         if not 0.0 <= value < float("inf") or (value == 0.0 and field.name not in zero_allowed):

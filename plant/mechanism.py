@@ -80,7 +80,7 @@ class Mechanism:
         home: the pose that strokes and targets are measured from, or None.
         limits: the actuators' limits, or None.
         plant: parameters of the dynamics by the names of `plant.variables`.
-        settings: the tables `control` and `fusion` of the preset, for the controller to read.
+        settings: the tables `control`, `fusion` and `safety` of the preset, for the controller to read.
     """
 
     name: str
@@ -119,7 +119,7 @@ class Mechanism:
             home: pose of reference; without one, `nominal_home` settles the default axes but no length.
             limits: the fields of `Limits`; a stroke of (2,) [m] counts from the home lengths, (6, 2) is absolute.
             plant: parameters of the dynamics by name.
-            settings: the tables `control` and `fusion`.
+            settings: the tables `control`, `fusion` and `safety`.
 
         Raises:
             InputError: arrays of the wrong shape or not finite, legs that coincide, joints all on one line, an axis
@@ -338,6 +338,7 @@ _TABLES = {
     "plant": None,
     "control": None,
     "fusion": None,
+    "safety": None,
 }
 
 
@@ -367,7 +368,7 @@ def _from_document(document: dict[str, Any]) -> Mechanism | PlanarMechanism:
         home=home,
         limits=document.get("limits"),
         plant=_flattened(document.get("plant", {})),
-        settings={key: document.get(key, {}) for key in ("control", "fusion")},
+        settings={key: document.get(key, {}) for key in ("control", "fusion", "safety")},
     )
 
 

@@ -1,0 +1,511 @@
+"""Safety: the states of a run, what is watched in every cycle, and how each cause ends or degrades it.
+
+    idle --checks pass, drives are asked for--> armed --all drives are ready--> running
+    running --> stopping --> stopped            a controlled stop, within the limits of the actuators
+    any --> fault                               a quick stop without the estimate, or the brakes at once
+
+Nothing is commanded before `RUNNING`. Every cause is told as an event: what, which leg or IMU, its value and the limit.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from controller.imu_monitor import MONITOR, contradiction, forget
+from controller.reference import plan_stop
+from controller.settings import SafetySettings
+from plant.compiled import Record, kernel
+from plant.mechanism import LEGS, Limits
+from plant.variables import IMU_COUNT
+
+IDLE, ARMED, RUNNING, STOPPING, STOPPED, FAULT = range(6)
+MODES = ("idle", "armed", "running", "stopping", "stopped", "fault")
+
+BRAKED, ENABLED, QUICK_STOP = range(3)
+"""What is asked of the drives: to hold on their brakes; to follow the commands; to stop by themselves and then to hold."""
+
+FOLLOWING, READY, OFF, QUICK_STOPPING, FAULTY = range(5)
+"""What a drive says of itself: it follows the commands, as one without a state of its own always does; it holds, and can be
+asked to follow; it has no power or is not ready; it stops by itself; it has a fault."""
+
+GO_ON, STOP, STOP_QUICKLY, BRAKE_AT_ONCE = range(4)
+REACTIONS = ("goes on", "controlled stop", "quick stop", "brakes at once")
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Why something happened: in words, the unit of its value and limit, what its index counts, and the reaction to it."""
+
+    text: str
+    reaction: int
+    unit: str = ""
+    of: str = ""
+
+
+(
+    NO_CAUSE, END_OF_MOTION, ASKED_TO_STOP, MISSED_PERIODS, SUPERVISOR_GONE, EMERGENCY_STOP, CLOCK_FAILED, RIG_FAILED,
+    IMU_STALE, IMU_FROZEN, IMU_NOT_FINITE, IMU_OUT_OF_RANGE, IMU_NOISY, IMU_DISAGREES, IMU_BACK, IMUS_LOST, IMUS_DISAGREE,
+    POSE_LOST, NOT_FINITE, IMPLAUSIBLE, ILL_CONDITIONED, BEYOND_STROKE, TOO_FAST, FOLLOWING_ERROR, SATURATED,
+    ANSWER_LATE, BUS_LOST, DRIVE_FAULT, DRIVE_OFF, DRIVE_DEVIATES,
+    ARMED_NOW, NO_SENSORS, NO_AGREEMENT, NO_WORKSPACE, NO_DRIVES, TARGET_LOST, TARGET_JUMPS, TARGET_NOT_FINITE,
+) = range(38)  # fmt: skip
+
+CAUSES = (
+    Cause("none", GO_ON),
+    Cause("end of the motion", STOP),
+    Cause("asked for", STOP),
+    Cause("too many periods missed in a row", STOP, "periods"),
+    Cause("the supervising process has gone", STOP),
+    Cause("emergency stop", STOP_QUICKLY),
+    Cause("this machine's clock refuses to wake the loop", BRAKE_AT_ONCE),
+    Cause("the rig reports failure", BRAKE_AT_ONCE),
+    Cause("IMU {} is left out: its samples are stale", GO_ON, "cycles", "IMU"),
+    Cause("IMU {} is left out: it is frozen", GO_ON, "cycles", "IMU"),
+    Cause("IMU {} is left out: it gives what is not finite", GO_ON, "", "IMU"),
+    Cause("IMU {} is left out: it is at the end of its range", GO_ON, "of the range", "IMU"),
+    Cause("IMU {} is left out: it is noisy", GO_ON, "of the limit", "IMU"),
+    Cause("IMU {} is left out: it disagrees with the others", GO_ON, "rad", "IMU"),
+    Cause("IMU {} is used again", GO_ON, "", "IMU"),
+    Cause("too many IMUs are lost", STOP, "IMUs"),
+    Cause("the IMUs contradict each other, the worst is IMU {}", STOP, "rad", "IMU"),
+    Cause("the IMUs that can be used no longer determine the pose", STOP_QUICKLY),
+    Cause("an estimate or a command is no longer finite", STOP_QUICKLY, "", "leg"),
+    Cause(
+        "the estimated pose needs leg {} far outside its stroke: the IMUs' errors are larger than the filters assume (raw ones "
+        "need a calibration)",
+        STOP_QUICKLY,
+        "m",
+        "leg",
+    ),
+    Cause("the pose is badly determined", STOP),
+    Cause("leg {} is beyond its stroke", STOP, "m", "leg"),
+    Cause("leg {} is too fast", STOP, "m/s", "leg"),
+    Cause("leg {} does not follow its reference", STOP, "m", "leg"),
+    Cause("the command of leg {} stays at its limit", STOP, "s", "leg"),
+    Cause("an exchange with the rig was late or its answer was refused", GO_ON),
+    Cause("the bus is lost: the rig does not answer", STOP_QUICKLY, "cycles"),
+    Cause("drive {} reports a fault", STOP_QUICKLY, "", "leg"),
+    Cause("drive {} has left its operation", STOP_QUICKLY, "", "leg"),
+    Cause("drive {} does not do what it is told", BRAKE_AT_ONCE, "m/s", "leg"),
+    Cause("armed", GO_ON),
+    Cause("not armed: IMU {} is not plausible", STOP, "rad", "IMU"),
+    Cause("not armed: leg {} is not where the target begins", STOP, "m", "leg"),
+    Cause("not armed: leg {} is outside its stroke", STOP, "m", "leg"),
+    Cause("not armed: drive {} is not ready", STOP, "", "leg"),
+    Cause("the target's stream has stopped", STOP, "s"),
+    Cause("the target jumps for leg {}", STOP, "m", "leg"),
+    Cause("the target is not finite, or its quaternion is none", STOP),
+)
+"""By number. Causes of `GO_ON` are told and end nothing."""
+
+EVENT_SLOTS = 8
+
+EVENTS = (
+    ("event_count", np.int64),
+    ("event_cause", np.int32, EVENT_SLOTS),
+    ("event_index", np.int32, EVENT_SLOTS),
+    ("event_value", np.float64, EVENT_SLOTS),
+    ("event_limit", np.float64, EVENT_SLOTS),
+)
+"""Fields of what happened in a cycle."""
+
+
+def describe_end(state: Record) -> str:
+    """Why a run has ended, in words."""
+    safety = state["safety"]
+    return describe_event(
+        int(state["stopping"]), int(safety["end_index"]), float(safety["end_value"]), float(safety["end_limit"])
+    )
+
+
+def describe_event(cause: int, index: int, value: float, limit: float) -> str:
+    """An event in words."""
+    known = CAUSES[cause]
+    text = known.text.format(index)
+    if np.isnan(value):
+        return text
+    unit = f" {known.unit}" if known.unit else ""
+    return f"{text} ({value:.4g}{unit})" if np.isnan(limit) else f"{text} ({value:.4g}{unit}, the limit is {limit:.4g}{unit})"
+
+
+SAFETY_PARAMETERS = np.dtype(
+    [
+        ("arm", np.int64),
+        ("most_lost_imus", np.int64),
+        ("watch_imus", np.int64),
+        ("noise", np.float64, 2),
+        ("noise_smoothing", np.float64),
+        ("disagreement", np.float64),
+        ("smoothing", np.float64),
+        ("conditioning", np.float64),
+        ("lengths", np.float64, (LEGS, 2)),
+        ("speed", np.float64),
+        ("following", np.float64),
+        ("saturation", np.float64),
+        ("drive_deviation", np.float64),
+        ("patience", np.float64),
+        ("bus_cycles", np.int64),
+        ("stale_cycles", np.int64),
+        ("arming_distance", np.float64),
+        ("arming_cycles", np.int64),
+    ],
+    align=True,
+)
+"""Constants of the watch; durations that are compared with sums of periods are in s."""
+
+SAFETY_STATE = np.dtype(
+    [
+        ("mode", np.int64),
+        ("request", np.int64),
+        ("waited", np.int64),
+        ("sample_age", np.int64, IMU_COUNT),
+        ("drive", np.int64, LEGS),
+        ("silent", np.int64),
+        ("excluded", np.int64, IMU_COUNT),
+        ("before", np.float64, (2, 2, IMU_COUNT, 3)),
+        ("noise", np.float64, (2, IMU_COUNT)),
+        ("monitor", MONITOR),
+        ("contradicted", np.float64),
+        ("astray", np.float64, LEGS),
+        ("deviating", np.float64, LEGS),
+        ("saturated", np.float64, LEGS),
+        ("speed", np.float64, LEGS),
+        ("end_index", np.int64),
+        ("end_value", np.float64),
+        ("end_limit", np.float64),
+        ("obstacle", np.int64),
+        ("obstacle_index", np.int64),
+        ("obstacle_value", np.float64),
+        ("obstacle_limit", np.float64),
+        *EVENTS,
+    ],
+    align=True,
+)
+"""State of the watch.
+
+`mode` and `request` are as above; arming `waited` for so many cycles beyond the hold. What the rig has said before the
+cycle: how many cycles old each IMU's sample is, the state of each drive, and for how many cycles it has been `silent`. IMUs
+that disagreed are `excluded` for good; the last two raw samples `before` tell the `noise`, as a variance. For how long [s]
+the IMUs have contradicted each other, each leg has been `astray` from its reference, each drive `deviating` from its
+command, each command `saturated`; the legs' estimated `speed` [m/s]; what made the run end; and what is in the way of
+arming.
+"""
+
+_CONTRADICTION_S = 0.03
+"""Time constant of the low-pass on an IMU's contradiction, and how long one must last [s]."""
+
+_NOISE_S = 0.02
+"""Time constant over which the noise of an IMU is averaged [s]."""
+
+_STALE_S = 0.01
+"""How old a sample may be while others are new [s]."""
+
+_CLEARER = 1.3
+"""How much more of the residuals the IMU that is named must explain than any other."""
+
+_REACTION = np.array([cause.reaction for cause in CAUSES])
+
+
+def safety_parameters(settings: SafetySettings, rate: float, limits: Limits, arm: bool) -> Record:
+    """Constants of the watch, at so many cycles per second [Hz]; the drives are asked for only if it is to `arm`."""
+    parameters: Record = np.zeros((), SAFETY_PARAMETERS)
+    values = {
+        "arm": arm,
+        "most_lost_imus": settings.most_lost_imus,
+        "watch_imus": settings.watch_imus,
+        "noise": (settings.gyroscope_noise, settings.accelerometer_noise),
+        "noise_smoothing": min(1.0, 1.0 / (rate * _NOISE_S)),
+        "disagreement": settings.disagreement,
+        # Each IMU's turn comes in every seventh cycle.
+        "smoothing": min(1.0, IMU_COUNT / (rate * _CONTRADICTION_S)),
+        "conditioning": settings.conditioning,
+        "lengths": limits.stroke + settings.stroke_margin * np.array([-1.0, 1.0]),
+        "speed": settings.velocity_margin * limits.velocity,
+        "following": settings.following,
+        "saturation": settings.saturation,
+        "drive_deviation": settings.drive_deviation,
+        "patience": settings.patience,
+        "bus_cycles": max(3, round(settings.bus_patience * rate)),
+        "stale_cycles": max(3, round(_STALE_S * rate)),
+        "arming_distance": settings.arming_distance,
+        "arming_cycles": np.ceil(settings.arming_time * rate),
+    }
+    for name, value in values.items():
+        parameters[name] = value
+    return parameters
+
+
+def watch_nothing(parameters: Record) -> None:
+    """Let the cycle with these parameters arm and go on whatever it finds, for motions that do not rely on the estimate."""
+    parameters["plausible_lengths"] = -np.inf, np.inf
+    safety = parameters["safety"]
+    safety["most_lost_imus"], safety["watch_imus"], safety["conditioning"] = IMU_COUNT, 0, 0.0
+    safety["lengths"] = -np.inf, np.inf
+    for name in ("noise", "speed", "following", "saturation", "drive_deviation", "arming_distance"):
+        safety[name] = np.inf
+
+
+@kernel
+def tell(state: Record, cause: int, index: int, value: float, limit: float) -> None:
+    """Take note of an event; what is more than there are slots for in a cycle is counted."""
+    e = state[()].safety
+    if e.event_count < EVENT_SLOTS:
+        e.event_cause[e.event_count] = cause
+        e.event_index[e.event_count] = index
+        e.event_value[e.event_count] = value
+        e.event_limit[e.event_count] = limit
+    e.event_count += 1
+
+
+@kernel
+def react(parameters: Record, state: Record, cause: int, index: int, value: float, limit: float) -> None:
+    """React to a cause as it is said in `CAUSES`, and tell it; of stops the first counts, of faults, too, and a fault more."""
+    s = state[()]
+    reaction = _REACTION[cause]
+    if s.safety.mode == FAULT or (reaction == STOP and s.stopping != 0):
+        return
+    tell(state, cause, index, value, limit)
+    if reaction != GO_ON:
+        s.safety.end_index, s.safety.end_value, s.safety.end_limit = index, value, limit
+    if reaction == STOP:
+        _begin_stop(parameters, state, cause)
+    elif reaction != GO_ON:
+        _fail(parameters, state, cause)
+
+
+@kernel
+def begin_stop(parameters: Record, state: Record, cause: int) -> None:
+    """Between cycles: react to a cause that has neither a value nor a limit."""
+    react(parameters, state, cause, -1, np.nan, np.nan)
+
+
+@kernel
+def _begin_stop(parameters: Record, state: Record, cause: int) -> None:
+    """Leave the motion for the fastest stop within the limits, leg by leg; before the motion there is nothing to stop. In
+    periods that were missed the drives went on as they were last told, and the stop begins from where that has led.
+    """
+    p, s = parameters[()], state[()]
+    s.stopping = cause
+    s.stop_cycle = s.stopped_cycle = s.cycle
+    if s.safety.mode == RUNNING:
+        if s.missed > 0:
+            for k in range(LEGS):
+                speed = min(max(s.command[k], -p.velocity_limit), p.velocity_limit)
+                s.reference[k, 0] += s.missed * p.period * speed
+                s.reference[k, 1], s.reference[k, 2] = speed, 0.0
+        duration = plan_stop(s.reference, p.acceleration_limit, p.jerk_limit, s.stop_segments)
+        s.stopped_cycle += int(np.ceil(duration / p.period)) + p.settling_cycles
+        s.reference_index[:] = 0
+        s.prepared = 0
+    s.safety.mode = STOPPING
+
+
+@kernel
+def _fail(parameters: Record, state: Record, cause: int) -> None:
+    """End without the estimate: the drives come to rest by themselves, or the brakes close at once."""
+    p, s = parameters[()], state[()]
+    moving = s.safety.request == ENABLED
+    s.stopping = cause
+    s.stop_cycle = s.stopped_cycle = s.cycle
+    s.safety.mode = FAULT
+    s.safety.request = BRAKED
+    if _REACTION[cause] == STOP_QUICKLY and moving:
+        s.safety.request = QUICK_STOP
+        fastest = 0.0
+        for k in range(LEGS):
+            if not np.isfinite(s.command[k]):
+                s.command[k] = 0.0
+            fastest = max(fastest, abs(s.command[k]))
+        s.stopped_cycle += int(np.ceil(fastest / (p.acceleration_limit * p.period)))
+    else:
+        s.command[:] = 0.0
+    if moving:
+        s.stopped_cycle += p.settling_cycles
+
+
+@kernel
+def coast(parameters: Record, state: Record) -> None:
+    """A cycle after a fault: every command comes to rest at the limit of acceleration, whatever is measured."""
+    p, s = parameters[()], state[()]
+    step = p.acceleration_limit * p.period * (1 + s.missed)
+    for k in range(LEGS):
+        s.command[k] -= min(max(s.command[k], -step), step)
+    s.cycle += 1
+
+
+@kernel
+def has_stopped(state: Record) -> bool:
+    """Whether a stop or a fault has come to its end, so that the brakes may hold; a stop is `STOPPED` then."""
+    s = state[()]
+    ended = s.stopping != 0 and s.cycle >= s.stopped_cycle
+    if ended:
+        s.safety.request = BRAKED
+        if s.safety.mode == STOPPING:
+            s.safety.mode = STOPPED
+    return bool(ended)
+
+
+@kernel
+def hear(parameters: Record, state: Record, sample_age: Record, drive: Record, silent: int) -> None:
+    """Before a cycle: take what the rig has said, and react to a bus that is lost and drives that do not do their duty."""
+    p, s = parameters[()], state[()]
+    w = s.safety
+    for k in range(IMU_COUNT):
+        w.sample_age[k] = sample_age[k]
+    for k in range(LEGS):
+        w.drive[k] = drive[k]
+    if silent > 0 and w.silent == 0:
+        tell(state, ANSWER_LATE, -1, np.nan, np.nan)
+    w.silent = silent
+    if w.mode == IDLE or w.mode == FAULT:
+        return
+    if silent >= p.safety.bus_cycles:
+        react(parameters, state, BUS_LOST, -1, silent, p.safety.bus_cycles)
+    for k in range(LEGS):
+        if drive[k] == FAULTY:
+            react(parameters, state, DRIVE_FAULT, k, np.nan, np.nan)
+        elif w.mode != ARMED and drive[k] != FOLLOWING:
+            react(parameters, state, DRIVE_OFF, k, np.nan, np.nan)
+
+
+@kernel
+def watch_imus(parameters: Record, state: Record) -> None:
+    """After the refinement: leave out an IMU that contradicts the others and can be named, once; else stop."""
+    p, s = parameters[()], state[()]
+    w, m = s.safety, s.safety.monitor
+    worst = 0
+    for k in range(1, IMU_COUNT):
+        if m.explained[k] > m.explained[worst]:
+            worst = k
+    off = contradiction(m, worst)
+    w.contradicted = w.contradicted + p.period if off > p.safety.disagreement else 0.0
+    if w.contradicted < _CONTRADICTION_S or w.mode != RUNNING:
+        return
+    second = 0.0
+    excluded = 0
+    for k in range(IMU_COUNT):
+        excluded += w.excluded[k]
+        if k != worst:
+            second = max(second, m.explained[k])
+    if excluded > 0 or m.explained[worst] < _CLEARER * second or p.safety.most_lost_imus == 0:
+        react(parameters, state, IMUS_DISAGREE, worst, off, p.safety.disagreement)
+        return
+    w.excluded[worst] = 1
+    w.contradicted = 0.0
+    for k in range(IMU_COUNT):
+        forget(m, k)
+    tell(state, IMU_DISAGREES, worst, off, p.safety.disagreement)
+
+
+@kernel
+def arm(parameters: Record, state: Record) -> None:
+    """Before the commands: from idle to armed, when the sensors are plausible, the pose is in the workspace and where the
+    target begins, and the drives are there; from armed to running, when all drives follow.
+    """
+    p, s = parameters[()], state[()]
+    w = s.safety
+    if s.cycle < p.hold_cycles or w.mode > ARMED:
+        return
+    if w.mode == IDLE:
+        _look_for_obstacle(parameters, state)
+        if w.obstacle == NO_CAUSE and p.safety.arm != 0:
+            w.mode, w.request = ARMED, ENABLED
+            tell(state, ARMED_NOW, -1, np.nan, np.nan)
+    if w.mode == ARMED:
+        w.obstacle = NO_CAUSE
+        for k in range(LEGS):
+            if w.drive[k] != FOLLOWING:
+                _obstruct(state, NO_DRIVES, k, np.nan, np.nan)
+        if w.obstacle == NO_CAUSE:
+            w.mode = RUNNING
+            return
+    if p.safety.arm == 0:
+        return
+    w.waited = s.cycle + 1 - p.hold_cycles
+    if w.waited > p.safety.arming_cycles:
+        react(parameters, state, w.obstacle, w.obstacle_index, w.obstacle_value, w.obstacle_limit)
+
+
+@kernel
+def _look_for_obstacle(parameters: Record, state: Record) -> None:
+    p, s = parameters[()], state[()]
+    w, limits = s.safety, p.safety
+    w.obstacle = NO_CAUSE
+    lost = 0
+    for k in range(IMU_COUNT):
+        off = contradiction(w.monitor, k)
+        if off > limits.disagreement:
+            _obstruct(state, NO_SENSORS, k, off, limits.disagreement)
+        if p.imu_present[k] != 0 and s.imu_used[k] == 0:
+            lost += 1
+            if lost > limits.most_lost_imus:
+                _obstruct(state, NO_SENSORS, k, np.nan, np.nan)
+    for k in range(LEGS):
+        low, high = limits.lengths[k, 0], limits.lengths[k, 1]
+        if not low <= s.lengths[k] <= high:
+            _obstruct(state, NO_WORKSPACE, k, s.lengths[k], low if s.lengths[k] < low else high)
+        if abs(s.error[k]) > limits.arming_distance:
+            _obstruct(state, NO_AGREEMENT, k, abs(s.error[k]), limits.arming_distance)
+        if w.drive[k] != READY and w.drive[k] != FOLLOWING:
+            _obstruct(state, NO_DRIVES, k, np.nan, np.nan)
+    if w.silent > 0:
+        _obstruct(state, BUS_LOST, -1, w.silent, 0)
+
+
+@kernel
+def _obstruct(state: Record, cause: int, index: int, value: float, limit: float) -> None:
+    """The first obstacle counts."""
+    w = state[()].safety
+    if w.obstacle == NO_CAUSE:
+        w.obstacle, w.obstacle_index, w.obstacle_value, w.obstacle_limit = cause, index, value, limit
+
+
+@kernel
+def watch(parameters: Record, state: Record) -> int:
+    """After the commands, while there is motion: everything has a limit, and each has its cause; returns that of a fault, or
+    0.
+    """
+    p, s = parameters[()], state[()]
+    w, limits = s.safety, p.safety
+    for k in range(LEGS):
+        if not (np.isfinite(s.command[k]) and np.isfinite(s.lengths[k])):
+            react(parameters, state, NOT_FINITE, k, np.nan, np.nan)
+            return NOT_FINITE
+    if w.mode < RUNNING:
+        return NO_CAUSE
+    lost = 0
+    for k in range(IMU_COUNT):
+        lost += p.imu_present[k] != 0 and s.imu_used[k] == 0
+    if lost > limits.most_lost_imus:
+        react(parameters, state, IMUS_LOST, -1, lost, limits.most_lost_imus)
+    if s.conditioning < limits.conditioning and s.filter_trusted == 0:
+        react(parameters, state, ILL_CONDITIONED, -1, s.conditioning, limits.conditioning)
+    for k in range(LEGS):
+        length, command, d, a = s.lengths[k], s.command[k], s.predicted[k], s.arms[k]
+        low, high = p.plausible_lengths[k, 0], p.plausible_lengths[k, 1]
+        if not low <= length <= high:
+            react(parameters, state, IMPLAUSIBLE, k, length, low if length < low else high)
+            return IMPLAUSIBLE
+        low, high = limits.lengths[k, 0], limits.lengths[k, 1]
+        if not low <= length <= high:
+            react(parameters, state, BEYOND_STROKE, k, length, low if length < low else high)
+        t = s.smooth_twist
+        w.speed[k] = (
+            d[0] * (t[0] + t[4] * a[2] - t[5] * a[1])
+            + d[1] * (t[1] + t[5] * a[0] - t[3] * a[2])
+            + d[2] * (t[2] + t[3] * a[1] - t[4] * a[0])
+        )
+        if abs(w.speed[k]) > limits.speed:
+            react(parameters, state, TOO_FAST, k, abs(w.speed[k]), limits.speed)
+        w.astray[k] = w.astray[k] + p.period if abs(s.error[k]) > limits.following else 0.0
+        if w.astray[k] > limits.patience:
+            react(parameters, state, FOLLOWING_ERROR, k, abs(s.error[k]), limits.following)
+        # A drive is behind its command, by less than what it may deviate by.
+        w.deviating[k] = w.deviating[k] + p.period if abs(w.speed[k] - command) > limits.drive_deviation else 0.0
+        if w.deviating[k] > limits.patience:
+            react(parameters, state, DRIVE_DEVIATES, k, abs(w.speed[k] - command), limits.drive_deviation)
+            return DRIVE_DEVIATES
+        w.saturated[k] = w.saturated[k] + p.period if abs(command) >= p.command_limit else 0.0
+        if w.saturated[k] > limits.saturation:
+            react(parameters, state, SATURATED, k, w.saturated[k], limits.saturation)
+    return NO_CAUSE
