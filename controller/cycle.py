@@ -30,8 +30,22 @@ from controller.least_squares import RANK_TOLERANCE, solve_least_squares
 from controller.mechanism_filter import FILTER_PARAMETERS, FILTER_STATE, filter_parameters
 from controller.pid import step_pid
 from controller.readings import SENSOR_GEOMETRY, sensor_geometry
-from controller.reference import STOP_SEGMENTS, evaluate_reference, plan_stop
-from controller.settings import ControlSettings, FusionSettings
+from controller.reference import STOP_SEGMENTS, evaluate_reference
+from controller.safety import (
+    ENABLED,
+    FAULT,
+    NO_CAUSE,
+    POSE_LOST,
+    RUNNING,
+    SAFETY_PARAMETERS,
+    SAFETY_STATE,
+    arm,
+    begin_stop,
+    coast,
+    safety_parameters,
+    watch,
+)
+from controller.settings import ControlSettings, FusionSettings, SafetySettings
 from plant.compiled import Record, kernel
 from plant.errors import InputError
 from plant.imu import STANDARD_GRAVITY
@@ -39,9 +53,8 @@ from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array
 from plant.variables import IMU_COUNT, PLATFORM_IMU
 
-OK, POSE_LOST, NOT_FINITE, IMPLAUSIBLE = range(4)
-"""What a cycle reports: all well; the directions no longer determine a pose; an estimate or command is not finite; after
-the hold, the estimated lengths are far outside the strokes."""
+OK = NO_CAUSE
+"""What a cycle reports if all is well; else it is the cause of a fault, by `controller.safety`."""
 
 _IMPLAUSIBLE_SHARE = 0.25
 """How far outside its stroke, as a share of it, the estimate of a leg may lie."""
@@ -80,6 +93,7 @@ PARAMETERS = np.dtype(
     [
         ("period", np.float64),
         ("hold_cycles", np.int64),
+        ("safety", SAFETY_PARAMETERS),
         ("geometry", GEOMETRY),
         ("sensors", SENSOR_GEOMETRY),
         ("vectors_in_base", np.float64, (2, 3)),
@@ -119,6 +133,7 @@ PARAMETERS = np.dtype(
         ("jerk_limit", np.float64),
         ("settling_cycles", np.int64),
         ("plausible_lengths", np.float64, (LEGS, 2)),
+        ("command_delay", np.float64),
         ("droop", np.float64),
         ("moving_mass", np.float64),
         ("mass", np.float64),
@@ -183,7 +198,7 @@ STATE = np.dtype(
         ("reference_index", np.int64, LEGS),
         ("reference", np.float64, (LEGS, 3)),
         ("prepared", np.int64),
-        ("driving", np.int64),
+        ("safety", SAFETY_STATE),
         ("stopping", np.int64),
         ("stop_cycle", np.int64),
         ("stopped_cycle", np.int64),
@@ -223,9 +238,8 @@ it is to be taken. `twist` is velocity and angular velocity in {1}; `vectors`, v
 The whole-mechanism filter is to be started, or trusted, when it is `filter_due`; `offset` is what is left of the way from one
 source of the pose to the other, and the pose in closed form is `found`.
 
-`reference` holds length, rate and acceleration of each leg in the cycle before `prepared`. The drives are `driving` after the
-hold. A stop, `stopping` for a cause that the loop numbers, begins in `stop_cycle`, and from `stopped_cycle` on the brakes may
-hold.
+`reference` holds length, rate and acceleration of each leg in the cycle before `prepared`. A stop or a fault, `stopping` for a
+cause by `controller.safety`, begins in `stop_cycle`, and from `stopped_cycle` on the brakes may hold.
 """
 
 
@@ -239,6 +253,9 @@ def cycle_parameters(
     calibration: Calibration | None = None,
     magnetometer: bool = False,
     section_5: bool = False,
+    safety: SafetySettings | None = None,
+    command_delay: float = 0.0,
+    to_arm: bool = True,
 ) -> Record:
     """Work out the constants of the cycle.
 
@@ -252,6 +269,9 @@ def cycle_parameters(
         calibration: of the IMUs; without one their readings are taken as they are.
         magnetometer: whether the platform's magnetometer gives its heading.
         section_5: whether the pose is that of the paper's section 5, unrefined; that needs the magnetometer.
+        safety: limits that are watched; by default those of `SafetySettings`.
+        command_delay: of the rig, from a sample to the command computed from it [s].
+        to_arm: whether the drives are asked for; else everything is read and nothing moves.
 
     Raises:
         InputError: a rate out of range, an IMU that cannot be, or IMUs that do not determine the pose.
@@ -277,6 +297,7 @@ def cycle_parameters(
     values = {
         "period": 1.0 / rate,
         "hold_cycles": int(np.ceil(control.hold * rate - 1e-9)),
+        "safety": safety_parameters(safety or SafetySettings(), rate, mechanism.require_limits(), to_arm),
         "geometry": geometry_of(mechanism),
         "sensors": sensor_geometry(mechanism, calibration.tilt),
         "vectors_in_base": field.vectors,
@@ -318,6 +339,7 @@ def cycle_parameters(
         "jerk_limit": mechanism.require_limits().jerk,
         "settling_cycles": int(np.ceil(STOP_SETTLING_S * rate)),
         "plausible_lengths": np.stack([stroke[:, 0] - margin, stroke[:, 1] + margin], axis=1),
+        "command_delay": command_delay,
         "droop": nominal * (1.0 - plant["drive.compensation"]) / force_constant**2,
         "moving_mass": sliding_mass + mass / LEGS,
         "mass": mass,
@@ -407,13 +429,24 @@ def cycle(parameters: Record, state: Record, measurement: Array, segments: Array
         segments: (6, n, 5), the reference as `controller.reference` has it.
 
     Returns:
-        `OK`, or why the estimate cannot be used.
+        `OK`, or the cause of a fault that has begun in this cycle.
     """
+    if state[()].safety.mode == FAULT:
+        coast(parameters, state)
+        return OK
     calibrate(parameters, state, measurement)
     fuse_legs(parameters, state)
     fuse_platform(parameters, state)
     fuse_heading(parameters, state)
-    return control(parameters, state, segments) if locate(parameters, state) else POSE_LOST
+    return control(parameters, state, segments) if locate(parameters, state) else lose_pose(parameters, state)
+
+
+@kernel
+def lose_pose(parameters: Record, state: Record) -> int:
+    """The rest of a cycle that has found no pose; returns the cause of the fault."""
+    begin_stop(parameters, state, POSE_LOST)
+    state[()].cycle += 1
+    return POSE_LOST
 
 
 @kernel
@@ -426,55 +459,25 @@ def skip(state: Record, missed: int) -> None:
 
 @kernel
 def prepare(parameters: Record, state: Record, segments: Array) -> None:
-    """After a cycle: what need not lie between measurement and command, the reference of the next one."""
-    refer(parameters, state, segments)
-
-
-@kernel
-def begin_stop(parameters: Record, state: Record, cause: int) -> None:
-    """Between cycles: leave the motion for the fastest stop within the limits, leg by leg; during the hold there is nothing to
-    stop. The first cause, not 0, counts. In periods that were missed the drives went on as they were last told, and the stop
-    begins from where that has led.
-    """
-    p, s = parameters[()], state[()]
-    if s.stopping != 0:
-        return
-    s.stopping = cause
-    s.stop_cycle = s.stopped_cycle = s.cycle
-    if s.cycle > p.hold_cycles:
-        if s.missed > 0:
-            for k in range(LEGS):
-                speed = min(max(s.command[k], -p.velocity_limit), p.velocity_limit)
-                s.reference[k, 0] += s.missed * p.period * speed
-                s.reference[k, 1], s.reference[k, 2] = speed, 0.0
-        duration = plan_stop(s.reference, p.acceleration_limit, p.jerk_limit, s.stop_segments)
-        s.stopped_cycle += int(np.ceil(duration / p.period)) + p.settling_cycles
-        s.reference_index[:] = 0
-        s.prepared = 0
-
-
-@kernel
-def has_stopped(state: Record) -> bool:
-    """Whether a stop has come to its end, so that the brakes may hold."""
-    s = state[()]
-    return bool(s.stopping != 0 and s.cycle >= s.stopped_cycle)
+    """After a cycle, when its events have been read: what need not lie between measurement and command, the next reference."""
+    state[()].safety.event_count = 0
+    if state[()].safety.mode != FAULT:
+        refer(parameters, state, segments)
 
 
 @kernel
 def control(parameters: Record, state: Record, segments: Array) -> int:
-    """From the pose to the commands; returns a status."""
-    p, s = parameters[()], state[()]
+    """From the pose to the commands; returns the cause of a fault, or `OK`."""
+    s = state[()]
     invert(parameters, state)
     if s.prepared != s.cycle + 1:
         refer(parameters, state, segments)
+    for k in range(LEGS):
+        s.error[k] = s.reference[k, 0] - s.lengths[k]
+    arm(parameters, state)
     regulate(parameters, state)
     s.cycle += 1
-    for k in range(LEGS):
-        if not (np.isfinite(s.command[k]) and np.isfinite(s.lengths[k])):
-            return NOT_FINITE
-        if s.cycle > p.hold_cycles and not p.plausible_lengths[k, 0] <= s.lengths[k] <= p.plausible_lengths[k, 1]:
-            return IMPLAUSIBLE
-    return OK
+    return watch(parameters, state)
 
 
 @kernel
@@ -486,22 +489,27 @@ def invert(parameters: Record, state: Record) -> None:
 
 @kernel
 def refer(parameters: Record, state: Record, segments: Array) -> None:
-    """The reference of this cycle: of the motion, whose time begins at the end of the hold, or of a stop."""
+    """The reference of this cycle: of the motion, whose time begins when the run does, or of a stop."""
     p, s = parameters[()], state[()]
-    if s.stopping != 0 and s.stop_cycle > p.hold_cycles:
+    if s.stopping != 0 and s.safety.request == ENABLED:
         evaluate_reference(s.stop_segments, (s.cycle - s.stop_cycle) * p.period, s.reference_index, s.reference)
     else:
-        evaluate_reference(segments, max(s.cycle - p.hold_cycles, 0) * p.period, s.reference_index, s.reference)
+        evaluate_reference(segments, motion_cycle(parameters, state) * p.period, s.reference_index, s.reference)
     s.prepared = s.cycle + 1
 
 
 @kernel
-def regulate(parameters: Record, state: Record) -> None:
-    """The six commands from the length deviations: nothing during the hold, then feed-forward and PID."""
+def motion_cycle(parameters: Record, state: Record) -> int:
+    """How many periods of the motion have passed; 0 before it begins."""
     p, s = parameters[()], state[()]
-    for k in range(LEGS):
-        s.error[k] = s.reference[k, 0] - s.lengths[k]
-    if s.cycle < p.hold_cycles:
+    return int(max(s.cycle - p.hold_cycles - s.safety.waited, 0))
+
+
+@kernel
+def regulate(parameters: Record, state: Record) -> None:
+    """The six commands from the length deviations: nothing before the motion, then feed-forward and PID."""
+    p, s = parameters[()], state[()]
+    if s.safety.request != ENABLED or s.safety.mode < RUNNING:
         for k in range(LEGS):
             s.command[k] = 0.0
             s.previous_error[k] = s.error[k]
@@ -515,7 +523,7 @@ def regulate(parameters: Record, state: Record) -> None:
 
 @kernel
 def feed_load_forward(parameters: Record, state: Record) -> None:
-    """The reference speed, and what the drives need beyond it for weight and acceleration.
+    """The reference speed when the command takes effect, and what the drives need beyond it for weight and acceleration.
 
     An encoderless drive falls short of its command by `droop` x force. Static leg forces follow from the known weight by
     virtual work: `J^T f` balances the weight of platform and payload, of each leg's lower part and rod through the
@@ -556,4 +564,4 @@ def feed_load_forward(parameters: Record, state: Record) -> None:
         d = s.predicted[k]
         own = p.rod_mass * p.sensors.gravity * (d[0] * up[0] + d[1] * up[1] + d[2] * up[2])
         load = force[k] + own + p.moving_mass * s.reference[k, 2]
-        s.feed_forward[k] = s.reference[k, 1] + p.droop * load
+        s.feed_forward[k] = s.reference[k, 1] + p.command_delay * s.reference[k, 2] + p.droop * load

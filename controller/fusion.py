@@ -16,11 +16,23 @@ from controller.direct_kinematics.closed_forms import (
 )
 from controller.direct_kinematics.refinement import find_twist, move_pose, normal_equations, solve_normal_equations
 from controller.heading_filter import predict_heading, start_heading, update_heading
+from controller.imu_monitor import look_at_next
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import RANK_TOLERANCE
 from controller.leg_filter import leg_direction, predict_leg, start_leg, update_leg
 from controller.mechanism_filter import collect, collect_field, extrapolate, start_filter, step_filter
 from controller.platform_filter import start_platform, step_platform
+from controller.safety import (
+    IMU_BACK,
+    IMU_FROZEN,
+    IMU_NOISY,
+    IMU_NOT_FINITE,
+    IMU_OUT_OF_RANGE,
+    IMU_STALE,
+    NO_CAUSE,
+    tell,
+    watch_imus,
+)
 from plant.compiled import Record, kernel
 from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER
 from plant.mechanism import LEGS
@@ -53,8 +65,8 @@ def elapsed(parameters: Record, state: Record) -> float:
 def calibrate(parameters: Record, state: Record, measurement: Array) -> None:
     """Take the sensors' known errors out of a raw measurement (3, 7, 3), by (37), and find out which IMUs are sound.
 
-    An IMU that gives what is not finite, or is at the end of its range, or stands still while others do not, is left out, and
-    taken back when it has been sound for a while.
+    An IMU that gives what is not finite, is at the end of its range, is noisy, or stands still or is stale while others are
+    not, is left out, and taken back when it has been sound for a while; one that contradicted the others is not.
     """
     p, s = parameters[()], state[()]
     changed = 0
@@ -71,20 +83,60 @@ def calibrate(parameters: Record, state: Record, measurement: Array) -> None:
             s.stands[k] = 0
         elif changed > 0:
             s.stands[k] += 1
-        sound = p.imu_present[k] != 0 and s.stands[k] < p.frozen_cycles
+        why = NO_CAUSE
+        value, limit = np.nan, np.nan
+        if s.safety.sample_age[k] >= p.safety.stale_cycles and s.safety.silent == 0:
+            why, value, limit = IMU_STALE, s.safety.sample_age[k], p.safety.stale_cycles
+        elif s.stands[k] >= p.frozen_cycles:
+            why, value, limit = IMU_FROZEN, s.stands[k], p.frozen_cycles
+        noise = noise_of(parameters, state, measurement, k)
+        if why == NO_CAUSE and noise > 1.0:
+            why, value, limit = IMU_NOISY, noise, 1.0
         for kind in range(3):
             for i in range(3):
                 raw = measurement[kind, k, i]
                 s.raw[kind, k, i] = raw
-                if kind < 2:
-                    # NaN is not below the limit either.
-                    sound = sound and abs(raw) < p.reach[kind]
+                # NaN is not below the limit either.
+                if kind < 2 and not abs(raw) < p.reach[kind]:
+                    why, value, limit = IMU_OUT_OF_RANGE, abs(raw) / p.reach[kind], 1.0
+                    if not np.isfinite(raw):
+                        why, value, limit = IMU_NOT_FINITE, np.nan, np.nan
                 total = p.calibration_offset[kind, k, i]
                 for j in range(3):
                     total += p.calibration_gain[kind, k, i, j] * measurement[kind, k, j]
                 s.sample[kind, k, i] = total
-        s.sound[k] = s.sound[k] + 1 + s.missed if sound else 0
-        s.imu_used[k] = 1 if sound and (s.imu_used[k] != 0 or s.sound[k] > min(s.cycle, p.sound_cycles)) else 0
+        if p.imu_present[k] == 0 or s.safety.excluded[k] != 0:
+            s.imu_used[k] = 0
+            continue
+        used = s.imu_used[k]
+        s.sound[k] = s.sound[k] + 1 + s.missed if why == NO_CAUSE else 0
+        s.imu_used[k] = 1 if why == NO_CAUSE and (used != 0 or s.sound[k] > min(s.cycle, p.sound_cycles)) else 0
+        if why != NO_CAUSE and (used != 0 or s.cycle == 0):
+            tell(state, why, k, value, limit)
+        elif s.imu_used[k] > used and s.cycle > 0:
+            tell(state, IMU_BACK, k, np.nan, np.nan)
+
+
+@kernel
+def noise_of(parameters: Record, state: Record, measurement: Array, k: int) -> float:
+    """The noise of IMU `k` over its limit, RMS: white noise of variance v has second differences of variance 6 v, to which
+    motion adds nearly nothing.
+    """
+    p, s = parameters[()], state[()]
+    w, worst = s.safety, 0.0
+    for kind in range(2):
+        total = 0.0
+        for i in range(3):
+            raw = measurement[kind, k, i]
+            change = raw - 2.0 * w.before[0, kind, k, i] + w.before[1, kind, k, i]
+            total += change * change / 18.0
+            w.before[1, kind, k, i] = w.before[0, kind, k, i]
+            w.before[0, kind, k, i] = raw
+        if s.cycle < 2 or not np.isfinite(total):
+            total = 0.0
+        w.noise[kind, k] += p.safety.noise_smoothing * (total - w.noise[kind, k])
+        worst = max(worst, np.sqrt(w.noise[kind, k]) / p.safety.noise[kind])
+    return worst
 
 
 @kernel
@@ -298,7 +350,22 @@ def improve_pose(parameters: Record, state: Record) -> bool:
 def locate(parameters: Record, state: Record) -> bool:
     """Direct kinematics, its refinement and the whole-mechanism filter; returns whether there is a pose."""
     found = find_pose(parameters, state) >= RANK_TOLERANCE and improve_pose(parameters, state)
+    if found:
+        monitor_imus(parameters, state)
     return fuse_mechanism(parameters, state, found)
+
+
+@kernel
+def monitor_imus(parameters: Record, state: Record) -> None:
+    """After the refinement: look at the next IMU's contradiction, and leave out one that is wrong."""
+    p, s = parameters[()], state[()]
+    if p.safety.watch_imus == 0 or p.section_5 != 0:
+        return
+    look_at_next(
+        s.safety.monitor, s.matrices_6_6[0], s.arms, s.predicted, s.lengths, s.directions, s.leg_weights, s.rotation,
+        p.vectors_in_base[0], s.vectors[0], s.vector_weights[0], p.safety.smoothing,
+    )  # fmt: skip
+    watch_imus(parameters, state)
 
 
 @kernel

@@ -58,6 +58,10 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
     _add_simulate(commands)
     _add_run(commands)
+    _add_emulate(commands)
+    _add_inject(commands)
+    _add_faults(commands)
+    _add_stream_target(commands)
     _add_replay(commands)
     _add_calibrate(commands)
     _add_compare(commands)
@@ -95,7 +99,7 @@ def _add_motion(command: argparse.ArgumentParser) -> None:
         "--target",
         default="circle",
         help="hold, circle, sines, steps, near-rests, rests, shaking, probing, or a CSV file of displacements from home "
-        "(time_s,x_m,y_m,z_m,qw,qx,qy,qz)",
+        "(time_s,x_m,y_m,z_m,qw,qx,qy,qz); for 'gough run' also stream or stream:HOST:PORT, as 'gough stream-target' sends",
     )
     command.add_argument("--duration", type=float, default=10.0, help="of the motion [s]")
     command.add_argument("--rate", type=float, default=1000.0, help="cycles per second [Hz], 50 to 4000")
@@ -129,10 +133,18 @@ def _add_run(commands: Any) -> None:
         "run",
         help="follow a target on the machine's clock",
         description="Run the closed loop on the machine's clock: compiled, in a process of its own, with real-time priority "
-        "where the machine grants it. Ctrl-C or SIGTERM ends the motion by a controlled stop.",
+        "where the machine grants it. Ctrl-C or SIGTERM ends the motion by a controlled stop, Ctrl-\\ (SIGQUIT) by an "
+        "emergency stop: the drives come to rest by themselves, whatever is measured.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    command.add_argument("--rig", choices=("fmu",), default="fmu", help="what is driven: the FMU plant")
+    command.add_argument(
+        "--rig", choices=("fmu", "udp", "canopen"), default="fmu", help="what is driven: the FMU plant, or a rig on a bus"
+    )
+    command.add_argument(
+        "--rig-at", metavar="ADDRESS|FILE.toml", help="where the rig is: HOST:PORT for udp (default: 127.0.0.1:47100), "
+        "settings of the bus for canopen",
+    )  # fmt: skip
+    command.add_argument("--no-arm", dest="arm", action="store_false", help="read everything, and move nothing")
     _add_motion(command)
     command.add_argument("--record", type=Path, metavar="FILE.mcap", help="record every cycle")
     command.add_argument("--cpu", type=int, help="processor to stay on (default: the last one)")
@@ -141,6 +153,79 @@ def _add_run(commands: Any) -> None:
     command.add_argument("--most-missed", type=int, default=10, help="periods missed in a row that end in a controlled stop")
     _add_json(command)
     command.set_defaults(run=_run)
+
+
+def _add_emulate(commands: Any) -> None:
+    command = commands.add_parser(
+        "emulate",
+        help="emulate a rig on a bus, for 'gough run' in another process",
+        description="Emulate a rig: the FMU plant, drives and IMUs on a clock of their own, behind a bus, until Ctrl-C.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("--bus", choices=("udp", "canopen"), default="udp", help="what it speaks")
+    command.add_argument("--at", metavar="ADDRESS|FILE.toml", help="as 'gough run' has it for --rig-at")
+    command.add_argument("--control", default="127.0.0.1:47101", metavar="HOST:PORT", help="where it takes faults")
+    command.add_argument(
+        "--fault", action="append", default=[], metavar="KIND[:N][,at=S][,for=S][,size=X]",
+        help="a fault from the start, or at a time after the drives were first enabled [s]; 'gough inject --list' lists them",
+    )  # fmt: skip
+    command.add_argument("--mechanism", default="hexapod", help="preset, or a TOML file")
+    command.add_argument("--target", default="circle", help="at whose first pose the platform stands")
+    command.add_argument("--imu", default="mpu9150-calibrated", help="ideal, mpu9150, mpu9150-calibrated or icm42688")
+    command.add_argument("--rate", type=float, default=1000.0, help="of the IMUs' samples on canopen; udp asks for it [Hz]")
+    command.add_argument("--seed", type=int, default=0, help="of the IMUs' imperfections and the faults")
+    command.add_argument("--plant", metavar="FILE.fmu", help="FMI 3.0 Co-Simulation FMU to use instead of the built one")
+    _add_joint_error(command)
+    command.add_argument("--cpu", type=int, default=0, help="processor to stay on")
+    command.add_argument("--priority", type=int, default=79, help="of SCHED_FIFO, 1 to 98")
+    command.set_defaults(run=_emulate)
+
+
+def _add_inject(commands: Any) -> None:
+    command = commands.add_parser(
+        "inject",
+        help="let something go wrong with an emulated rig",
+        description="Inject a fault into an emulated rig that is running, or ask how it is.",
+    )
+    command.add_argument("fault", nargs="?", metavar="KIND[:N][,for=S][,size=X]", help="the fault, from now on")
+    command.add_argument("--list", action="store_true", help="list the kinds of faults")
+    command.add_argument("--clear", action="store_true", help="take all faults away")
+    command.add_argument("--to", default="127.0.0.1:47101", metavar="HOST:PORT", help="the emulator's control channel")
+    command.set_defaults(run=_inject)
+
+
+def _add_faults(commands: Any) -> None:
+    command = commands.add_parser(
+        "faults",
+        help="let everything go wrong, many times, and compare with the reaction that is specified",
+        description="Run every case of the fault matrix on the emulated rig, on virtual time: what is told, how it ends, how "
+        "soon, and how far a leg gets off its reference. The exit status is 1 if any reaction is another than specified.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("--seeds", type=int, default=20, help="how often each case is tried")
+    command.add_argument("--only", metavar="TEXT", help="cases whose name has this in it")
+    command.add_argument("--markdown", action="store_true", help="print the table in Markdown, as docs/faults.md has it")
+    _add_json(command)
+    command.set_defaults(run=_faults)
+
+
+def _add_stream_target(commands: Any) -> None:
+    command = commands.add_parser(
+        "stream-target",
+        help="send a target, pose by pose in real time, to a run that follows a stream",
+        description="Send a motion as a stream of poses in real time, one UDP datagram each, to a run that follows a "
+        "stream. It can also go wrong on purpose, to see that the run then stops as it should.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    command.add_argument("--mechanism", default="hexapod", help="preset, or a TOML file")
+    command.add_argument("--target", default="circle", help="a motion's name, or a CSV file, as 'gough run' has them")
+    command.add_argument("--duration", type=float, default=10.0, help="of the motion [s]")
+    command.add_argument("--rate", type=float, default=100.0, help="poses per second [Hz], at most 10000")
+    command.add_argument("--to", type=_address, default="127.0.0.1:47200", metavar="HOST:PORT", help="where the run listens")
+    command.add_argument("--stop-at", type=float, metavar="SECONDS", help="fall silent at this time")
+    command.add_argument("--jump-at", type=float, metavar="SECONDS", help="jump up by 5 cm at this time")
+    command.add_argument("--nan-at", type=float, metavar="SECONDS", help="send what is no number from this time on")
+    command.set_defaults(run=_stream_target)
 
 
 def _add_replay(commands: Any) -> None:
@@ -478,6 +563,13 @@ def _seeds(text: str) -> tuple[int, ...]:
         raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers such as 0,1,2") from None
 
 
+def _address(text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise argparse.ArgumentTypeError(f"{text!r} is no address such as 127.0.0.1:47200")
+    return host.strip("[]"), int(port)
+
+
 _RIG_SIMULATED = {"mechanism": "hexapod", "rate": 1000.0, "imu": "mpu9150", "seed": 0, "joint_error": 0.0, "plant": None}
 """Options of the rig that is driven, with their defaults."""
 
@@ -807,7 +899,10 @@ def _run(options: argparse.Namespace) -> int:
     from hil.simulation import SimulationConfig
 
     _check_writable(options.json, options.record)
-    names = ("mechanism", "target", "duration", "rate", "imu", "seed", "fusion", "calibration", "plant", "imus", "magnetometer")
+    names = (
+        "mechanism", "target", "duration", "rate", "imu", "seed", "fusion", "calibration", "plant", "imus", "magnetometer",
+        "rig", "rig_at", "arm",
+    )  # fmt: skip
     config = SimulationConfig(**{name: getattr(options, name) for name in names}, joint_error=1e-3 * options.joint_error)
     settings = RealTimeSettings(options.priority, options.cpu, options.strict, options.most_missed)
     stopped = None
@@ -855,14 +950,38 @@ def _print_run(summary: dict[str, Any]) -> None:
         f"{used['involuntary_switches']} involuntary switches, {used['resident']} bytes of growth; "
         f"first cycle {summary['start_up_s']:.2f} s after the start"
     )
-    print(f"estimate - truth {1e3 * errors['estimation']:.3f} mm RMS; reference - length {1e3 * errors['tracking']:.3f} mm RMS")
+    truth = f"estimate - truth {1e3 * errors['estimation']:.3f} mm RMS" if errors["known"] else "the truth is not known"
+    print(f"{truth}; reference - length {1e3 * errors['tracking']:.3f} mm RMS")
+    if trip := summary["timing_us"].get("round trip"):
+        figures = ", ".join(f"{label} {trip[name]:.0f}" for label, name in _QUANTILES)
+        print(f"round trip to the rig {figures} us")
+        print(f"{summary['late']} exchanges late, {summary['refused_packets']} packets refused")
+        print(_bars(summary["round_trip_bars"]))
     if summary["unseen"]:
         print(f"{summary['unseen']} cycles are in none of these figures: the supervisor came too late")
     if summary["recording"]["files"]:
         kept = summary["cycles"] - summary["recording"]["lost"]
         files = ", ".join(summary["recording"]["files"])
         print(f"{kept} cycles recorded in {files}; {summary['recording']['lost']} cycles lost")
+    if summary["identity"]:
+        print(f"rig: {summary['identity']['name']} {summary['identity']['parts']}")
     print(f"stopped on the brakes: {summary['cause']}")
+
+
+_QUANTILES = (("p50", "p50"), ("p99", "p99"), ("p99.9", "p999"), ("max", "max"))
+
+
+def _bars(bars: list[list[float]]) -> str:
+    """A histogram as text: for each octave of microseconds, how many."""
+    counts: dict[int, float] = {}
+    for low, count in zip(*bars, strict=True):
+        octave = int(low).bit_length() - 1 if low >= 1.0 else 0
+        counts[octave] = counts.get(octave, 0) + count
+    most = max(counts.values(), default=1)
+    return "\n".join(
+        f"  {2**octave:6d} to {2 ** (octave + 1):6d} us {'#' * max(1, round(40 * count / most)):40s} {count:.0f}"
+        for octave, count in sorted(counts.items())
+    )
 
 
 def _timing_table(timing: dict[str, dict[str, float]], budget: dict[str, dict[str, float]]) -> Any:
@@ -910,7 +1029,7 @@ def _view(mechanism: str, target: str, rate: float, progress: Any) -> Any:
 
     from rich.markup import escape
 
-    from hil.loop import STOP_CAUSES
+    from controller.safety import CAUSES, MODES
 
     table = _table(f"{mechanism} follows {target} at {rate:g} Hz", "")
     latest = progress.latest
@@ -921,7 +1040,7 @@ def _view(mechanism: str, target: str, rate: float, progress: Any) -> Any:
     angles = (atan2(r[2, 1], r[2, 2]), asin(max(-1.0, min(1.0, -r[2, 0]))), atan2(r[1, 0], r[0, 0]))
     wake, compute = progress.timing.histograms["wake"].figures(), progress.timing.histograms["compute"].figures()
     errors = progress.errors()
-    state = f"stopping: {STOP_CAUSES[int(latest['stop'])]}" if latest["stop"] else "running"
+    state = MODES[int(latest["mode"])] + (f": {CAUSES[int(latest['stop'])].text}" if latest["stop"] else "")
     rows = (
         ("state", f"{state}, {latest['time_ns'] / 1e9:.1f} s"),
         ("position [mm]", "  ".join(f"{value:9.3f}" for value in position)),
@@ -930,13 +1049,83 @@ def _view(mechanism: str, target: str, rate: float, progress: Any) -> Any:
         ("reference - length, RMS [mm]", f"{1e3 * errors['tracking']:.3f}"),
         ("woken late p50, p99.9, max [us]", "  ".join(f"{wake[name]:.0f}" for name in ("p50", "p999", "max"))),
         ("computing p50, p99.9, max [us]", "  ".join(f"{compute[name]:.0f}" for name in ("p50", "p999", "max"))),
-        ("periods missed", f"{progress.missed}"),
+        ("periods missed, exchanges late", f"{progress.missed}, {progress.late}"),
+        *(("stop", "Ctrl-C: controlled; Ctrl-\\: emergency"),),
         *(("without", text) for text in progress.refused),
         *(("", text) for text in progress.events),
     )
     for row in rows:
         table.add_row(*(escape(cell) for cell in row))
     return table
+
+
+def _emulate(options: argparse.Namespace) -> int:
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from hil.emulator import EmulatorConfig, emulate
+    from hil.realtime import RealTimeSettings
+    from hil.simulation import SimulationConfig
+
+    names = ("mechanism", "target", "imu", "seed", "plant", "rate")
+    simulated = SimulationConfig(**{name: getattr(options, name) for name in names}, joint_error=1e-3 * options.joint_error)
+    config = EmulatorConfig(simulated, options.bus, options.at, options.control, tuple(options.fault))
+    emulate(config, RealTimeSettings(options.priority, options.cpu), lambda text: print(text, flush=True))
+    return 0
+
+
+def _inject(options: argparse.Namespace) -> int:
+    from hil.emulator import ask
+    from hil.rigs.faults import KINDS
+
+    if options.list:
+        table = _table("fault", "number", "size by default", "")
+        for name, kind in KINDS.items():
+            table.add_row(name, f"0 to {kind.count - 1}" if kind.count else "", f"{kind.default:g}", kind.text)
+        _print(table)
+        return 0
+    question = "clear" if options.clear else f"fault {options.fault}" if options.fault else "state"
+    for name, value in ask(options.to, question).items():
+        print(f"{name}: {value}")
+    return 0
+
+
+def _faults(options: argparse.Namespace) -> int:
+    from hil.fault_matrix import CASES, HEADINGS, run_matrix, summary, table
+
+    _check_writable(options.json)
+    if options.seeds < 1:
+        raise InputError(f"there are {options.seeds} seeds; at least 1 is needed")
+    cases = tuple(case for case in CASES if options.only is None or options.only in case.name)
+    if not cases:
+        raise InputError(f"no case has {options.only!r} in its name")
+    with _progress("faults") as progress:
+        outcomes = run_matrix(options.seeds, cases, progress)
+    rows = table(outcomes)
+    if options.markdown:
+        print("\n".join("| " + " | ".join(row) + " |" for row in (HEADINGS, ("---",) * len(HEADINGS), *rows)))
+    else:
+        shown = _table(*HEADINGS)
+        for row in rows:
+            shown.add_row(*row)
+        _print(shown)
+    _write_json(options.json, summary(outcomes, options.seeds))
+    findings = [finding for outcome in outcomes for finding in outcome.findings]
+    for finding in findings:
+        print(finding, file=sys.stderr)
+    return 1 if findings else 0
+
+
+def _stream_target(options: argparse.Namespace) -> int:
+    from controller.target import load_target
+    from hil.target_stream import Faults, send_target
+    from plant.mechanism import load_spatial
+
+    mechanism = load_spatial(options.mechanism)
+    target = load_target(options.target, mechanism, options.duration)
+    given = {name: getattr(options, name) for name in ("stop_at", "jump_at", "nan_at") if getattr(options, name) is not None}
+    host, port = options.to
+    sent = send_target(mechanism, target, options.rate, host, port, options.duration, Faults(**given))
+    print(f"{sent} poses of {target.name} sent to {host}:{port}")
+    return 0
 
 
 def _replay(options: argparse.Namespace) -> int:

@@ -28,33 +28,37 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from controller.inverse_kinematics import leg_lengths
+from controller.safety import ASKED_TO_STOP, CAUSES, END_OF_MOTION, STOP_QUICKLY
+from controller.stream import DONE as STREAM_DONE
+from controller.stream import STREAM
+from controller.stream_planner import StreamPlanner
 from hil.clock import REAL, new_clock
 from hil.loop import (
-    ASKED_TO_STOP,
+    CONTROLLED,
     DONE,
-    END_OF_MOTION,
     HEAD,
     KEPT,
     LINK,
-    MISSED_PERIODS,
+    QUICKLY,
     RECORD,
-    RIG_FAILED,
     STOP,
-    STOP_CAUSES,
-    STOPPED,
     SUPERVISOR,
+    UDP_RIG,
     Loop,
-    Rig,
-    describe_status,
     prevent_compilation,
     shared_array,
 )
 from hil.realtime import RealTimeSettings, real_time, since_process_start, usage
-from hil.recording import record, repair, take
+from hil.recording import events_of, record, repair, take
+from hil.rigs import Rig
+from hil.rigs.udp import DEFAULT_ADDRESS, UdpRig, parse_address
 from hil.simulation import SimulationConfig, prepared_loop
+from hil.target_stream import HOST, PORT, open_socket, receive
 from hil.timing import Timing, over_budget
 from plant.compiled import Record
 from plant.errors import GoughError, InputError
+from plant.mechanism import load_spatial
 
 _BUFFER_S = 8.0
 _LEAST_RECORDS = 1024
@@ -62,6 +66,7 @@ _LOOK_S = 0.1
 _PATIENCE_S = 10.0
 _LEAST_FREE = 8 * 2**20
 _MOST_RECORDERS = 10
+_MOST_EVENTS = 100
 _BLOCKED = (
     signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU,
 )  # fmt: skip
@@ -90,7 +95,10 @@ class Progress:
         missed: periods missed so far.
         refused: what the machine refuses of real time.
         unseen: cycles that were overwritten before they could be looked at, and are in none of these figures.
-        events: what the supervisor has to tell, such as a recorder that died.
+        events: what has happened, by cycle, and what the supervisor has to tell, such as a recorder that died.
+        late: exchanges that brought no answer in time.
+        known: cycles of which the truth is known.
+        refused_packets: by a rig on a bus.
     """
 
     latest: Record | None = None
@@ -100,6 +108,9 @@ class Progress:
     refused: list[str] = field(default_factory=list)
     unseen: int = 0
     events: list[str] = field(default_factory=list)
+    late: int = 0
+    known: int = 0
+    refused_packets: int = 0
 
     def add(self, records: Record) -> None:
         """Take note of records (n,)."""
@@ -108,14 +119,33 @@ class Progress:
         self.latest = records[-1]
         self.timing.add(records)
         self.missed += int(records["missed"].sum())
-        self.squares[0] += np.sum((records["position"] - records["truth"][:, :3]) ** 2)
+        self.late += int((records["silent"] > 0).sum())
+        for eventful in records[records["event_count"] > 0]:
+            for text in events_of(eventful):
+                self._note(int(eventful["cycle"]), text)
+        known = records[np.isfinite(records["truth"][:, 0])]
+        self.squares[0] += np.sum((known["position"] - known["truth"][:, :3]) ** 2)
         self.squares[1] += np.mean((records["lengths"] - records["reference"][:, :, 0]) ** 2, axis=1).sum()
         self.squares[2] += len(records)
+        self.known += len(known)
+        self.refused_packets = int(records["refused"][-1])
+
+    def _note(self, cycle: int, text: str) -> None:
+        if len(self.events) < _MOST_EVENTS:
+            self.events.append(f"cycle {cycle}: {text}")
+        elif len(self.events) == _MOST_EVENTS:
+            self.events.append("what happened then is told by the recording only")
 
     def errors(self) -> dict[str, float]:
-        """RMS errors [m]: `estimation` of the position against the truth, `tracking` of a leg's length."""
+        """RMS errors [m]: `estimation` of the position against the truth, in the cycles for which it is `known`; `tracking`
+        of a leg's length.
+        """
         position, lengths, count = self.squares
-        return {"estimation": float(np.sqrt(position / max(count, 1))), "tracking": float(np.sqrt(lengths / max(count, 1)))}
+        return {
+            "estimation": float(np.sqrt(position / max(self.known, 1))),
+            "tracking": float(np.sqrt(lengths / max(count, 1))),
+            "known": self.known,
+        }
 
 
 def run(
@@ -127,7 +157,8 @@ def run(
 ) -> dict[str, Any]:
     """Run the closed loop on the machine's clock, to the end of its motion or until it is asked to stop.
 
-    SIGINT, SIGTERM, SIGHUP and SIGQUIT ask for a controlled stop. Must be called from the main thread, with no other running.
+    SIGINT, SIGTERM and SIGHUP ask for a controlled stop, SIGQUIT for an emergency stop. Must be called from the main
+    thread, with no other running.
 
     Args:
         config: what to run.
@@ -156,10 +187,11 @@ def run(
     recorders = _Recorders(recording, records, link, ours, progress.events)
     with _asked_to_stop(link), _claimed(recording), _told(progress, recorders), contextlib.ExitStack() as at_end:
         at_end.callback(recorders.finish)
-        loop = _FORK.Process(target=_loop_process, args=(theirs, ours, config, settings, rig, records, link))
+        stream = at_end.enter_context(_receiver(config)) if config.streamed else None
+        loop = _FORK.Process(target=_loop_process, args=(theirs, ours, config, settings, rig, records, link, stream))
         loop.start()
         theirs.close()
-        leftovers: list[Path] = []
+        leftovers: list[Path | None] = []
         at_end.callback(_end, loop, link, leftovers)
         leftovers.append(_prepared(ours, loop, link, show, progress))
         header, progress.refused = _prepared(ours, loop, link, show, progress)
@@ -185,10 +217,10 @@ def run(
         progress.add(taken)
         progress.unseen += unseen
     summary = _summary(config, progress, outcome, recorders)
-    if outcome["status"] != STOPPED:
-        raise RunStoppedError(f"stopped on the brakes at cycle {outcome['cycle']}: {outcome['reason']}", summary)
     if outcome["stop"] not in (END_OF_MOTION, ASKED_TO_STOP):
-        raise RunStoppedError(f"stopped before its time at cycle {outcome['cycle']}: {outcome['reason']}", summary)
+        quickly = CAUSES[outcome["stop"]].reaction >= STOP_QUICKLY
+        how = "stopped on the brakes" if quickly else "stopped before its time"
+        raise RunStoppedError(f"{how} at cycle {outcome['cycle']}: {outcome['reason']}", summary)
     return summary
 
 
@@ -235,11 +267,11 @@ def _told(progress: Progress, recorders: "_Recorders") -> Iterator[None]:
 
 @contextmanager
 def _asked_to_stop(link: NDArray[np.int64]) -> Iterator[None]:
-    """Let the signals that would end this process ask for a controlled stop."""
+    """Let the signals that would end this process ask for a controlled stop, and SIGQUIT for an emergency stop."""
 
     def ask(number: int, frame: object) -> None:
-        del number, frame
-        link[STOP] = 1
+        del frame
+        link[STOP] = max(int(link[STOP]), QUICKLY if number == signal.SIGQUIT else CONTROLLED)
 
     numbers = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM)
     # What is ignored, as nohup has it, stays so.
@@ -249,6 +281,32 @@ def _asked_to_stop(link: NDArray[np.int64]) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def _receiver(config: SimulationConfig) -> Iterator[Record]:
+    """A process that receives a streamed target and plans it; gives what it shares with the loop."""
+    stream: Record = shared_array(1, STREAM).reshape(())
+    host, port = parse_address(config.target.partition(":")[2] or f"{HOST}:{PORT}")
+    mechanism = load_spatial(config.mechanism)
+    start = mechanism.require_home()
+    planner = StreamPlanner(mechanism, leg_lengths(mechanism, start.position, start.rotation))
+    with open_socket(host, port) as listener:
+        process = _FORK.Process(target=_receiver_process, args=(stream, planner, listener, 1.0 / config.rate))
+        process.start()
+        try:
+            yield stream
+        finally:
+            stream["shared"][STREAM_DONE] = 1
+            process.join(_PATIENCE_S)
+            if process.is_alive():
+                process.kill()
+                process.join()
+
+
+def _receiver_process(*what: Any) -> None:
+    signal.pthread_sigmask(signal.SIG_BLOCK, _BLOCKED)
+    receive(*what)
 
 
 def _prepared(
@@ -275,15 +333,16 @@ def _received(ours: Connection, loop: BaseProcess) -> Any:
     return message
 
 
-def _end(loop: BaseProcess, link: NDArray[np.int64], leftovers: list[Path]) -> None:
+def _end(loop: BaseProcess, link: NDArray[np.int64], leftovers: list[Path | None]) -> None:
     """See the loop's process to its end, whatever has happened here, and remove what a crash has left."""
-    link[STOP] = 1
+    link[STOP] = max(int(link[STOP]), CONTROLLED)
     loop.join(_PATIENCE_S)
     if loop.is_alive():
         loop.kill()
         loop.join()
     for folder in leftovers:
-        shutil.rmtree(folder, ignore_errors=True)
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _loop_process(pipe: Connection, supervisors: Connection, *what: Any) -> None:
@@ -309,10 +368,11 @@ def _prepare_and_follow(
     make_rig: Callable[[Loop], Rig] | None,
     records: Record,
     link: NDArray[np.int64],
+    stream: Record | None,
 ) -> None:
-    with prepared_loop(config, records) as loop:
-        pipe.send(loop.plant.folder)
-        loop.link, loop.most_missed = link, settings.most_missed
+    with prepared_loop(config, records) as loop, contextlib.ExitStack() as rigs:
+        pipe.send(None if loop.plant is None else loop.plant.folder)
+        loop.link, loop.most_missed, loop.stream = link, settings.most_missed, stream
         loop.clock = new_clock(REAL, round(1e9 / config.rate))
         run_id = f"{time.time_ns():x}-{os.getpid()}"
         header = {
@@ -320,8 +380,18 @@ def _prepare_and_follow(
             "parameters": loop.parameters,
             "reference": loop.segments,
         }
-        loop.load(python=make_rig is not None)
-        rig = None if make_rig is None else make_rig(loop)
+        rig = make_rig(loop) if make_rig is not None else _rig_of(config)
+        compiled = rig is None or isinstance(rig, UdpRig)
+        loop.load(python=not compiled)
+        if rig is not None:
+            rigs.callback(rig.close)
+            rig.open()
+            header["config"]["identity"] = asdict(rig.identify())
+            rigs.callback(rig.quick_stop)
+            if config.arm:
+                rig.arm()
+        if isinstance(rig, UdpRig):
+            loop.kind, loop.udp = UDP_RIG, rig.link
         if threading.active_count() > 1:
             names = ", ".join(thread.name for thread in threading.enumerate()[1:])
             raise GoughError(f"the rig has left threads running ({names}), which delay the loop: end them when it is open")
@@ -329,22 +399,14 @@ def _prepare_and_follow(
             pipe.send((header, refused))
             pipe.recv()
             before = usage()
-            status = loop.follow(loop.end, rig)
+            cause = loop.follow(loop.end, None if compiled else rig)
             used = usage().since(before)
-        if status == STOPPED:
-            reason = STOP_CAUSES[int(loop.state["stopping"])]
-        elif status >= RIG_FAILED and rig is None:
-            reason = str(loop.plant.failure("the plant failed"))
-        else:
-            reason = describe_status(status)
-        if status != STOPPED and loop.state["stopping"] == MISSED_PERIODS:
-            reason = f"{STOP_CAUSES[MISSED_PERIODS]}, and then: {reason}"
         pipe.send(
             {
-                "status": status,
-                "stop": int(loop.state["stopping"]),
-                "reason": reason,
-                "cycle": int(loop.state["cycle"]),
+                "stop": cause,
+                "identity": header["config"].get("identity"),
+                "reason": loop.reason(),
+                "cycle": int(loop.state["stop_cycle"]),
                 "cycles": int(link[HEAD]),
                 "missed_late": int(loop.clock["missed_late"]),
                 "missed_own": int(loop.clock["missed_own"]),
@@ -353,6 +415,19 @@ def _prepare_and_follow(
                 "first_cycle_ns": int(loop.clock["start"]),
             }
         )
+
+
+def _rig_of(config: SimulationConfig) -> Rig | None:
+    """The rig that a configuration names; None for the plant's FMU."""
+    if config.rig == "udp":
+        return UdpRig(config.rig_at or DEFAULT_ADDRESS, 1.0 / config.rate)
+    if config.rig == "canopen":
+        # Who does without a CAN bus does without its libraries.
+        from hil.rigs.canopen import CanopenRig
+        from hil.rigs.canopen_settings import DEFAULT_FILE, canopen_settings
+
+        return CanopenRig(canopen_settings(config.rig_at or DEFAULT_FILE), 1.0 / config.rate)
+    return None
 
 
 class _Recorders:
@@ -449,6 +524,10 @@ def _summary(
         "unseen": progress.unseen,
         "recording": {"files": [str(path) for path in recorders.files], "lost": recorders.lost},
         "refused": progress.refused,
+        "late": progress.late,
+        "refused_packets": progress.refused_packets,
+        "round_trip_bars": progress.timing.histograms["round trip"].bars(),
+        "identity": outcome["identity"],
         "events": progress.events,
         "config": asdict(config),
         "version": version("gough"),

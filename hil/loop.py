@@ -1,4 +1,4 @@
-"""The loop around the cycle: wait for the clock, read the rig, run the cycle, command the rig, record. Compiled.
+"""The loop around the cycle: wait for the clock, exchange with the rig, run the cycle, record. Compiled.
 
 All state lies in the arrays of `Loop`, so a run can be taken up again at any cycle. The same steps in Python serve rigs, and
 filters, that are written in Python.
@@ -8,61 +8,56 @@ import mmap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import typeof, types
 from numba.core import event
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from controller.cycle import (
-    IMPLAUSIBLE,
-    NOT_FINITE,
-    OK,
-    POSE_LOST,
-    begin_stop,
-    control,
-    has_stopped,
-    prepare,
-    skip,
+from controller.cycle import OK, control, lose_pose, motion_cycle, prepare, skip
+from controller.fusion import (
+    calibrate,
+    find_pose,
+    fuse_heading,
+    fuse_legs,
+    fuse_mechanism,
+    fuse_platform,
+    improve_pose,
+    monitor_imus,
 )
-from controller.fusion import calibrate, find_pose, fuse_heading, fuse_legs, fuse_mechanism, fuse_platform, improve_pose
 from controller.least_squares import RANK_TOLERANCE, factor_cholesky, invert_cholesky
 from controller.mechanism_filter import extrapolate_covariance
+from controller.safety import (
+    ASKED_TO_STOP,
+    BRAKED,
+    CLOCK_FAILED,
+    EMERGENCY_STOP,
+    END_OF_MOTION,
+    EVENT_SLOTS,
+    EVENTS,
+    FAULT,
+    MISSED_PERIODS,
+    RIG_FAILED,
+    SUPERVISOR_GONE,
+    begin_stop,
+    coast,
+    has_stopped,
+    hear,
+    react,
+)
+from controller.stream import STREAM, TAKER, stream_cause, take_plan
 from hil.clock import FREE, REAL, finish, new_clock, now, start, wait
-from plant.compiled import Record, kernel
+from hil.rigs import ANSWERED, FEEDBACK, SILENT, Identity, Rig, new_feedback
+from hil.rigs.emulated import EMULATED
+from hil.rigs.udp import UdpLink, encode_command, exchange_udp, new_link, send_datagram
+from hil.rigs.udp_emulator import UdpEmulator, exchange_in_memory, new_udp_emulator
+from plant.compiled import Record, kernel, store_release
 from plant.fmu import CALLS, advance, read_imus, read_truth, write_command, write_drive_mode
 from plant.imu import measure
 from plant.mechanism import LEGS
 from plant.pose import Array
 from plant.variables import BRAKE, IMU_COUNT, VELOCITY
-
-STOPPED, CLOCK_FAILED = 50, 51
-"""Statuses beside those of the cycle: a controlled stop has ended on the brakes; the machine's clock wakes no one."""
-
-RIG_FAILED, SEND_FAILED = 100, 200
-"""Added to the rig's own status (FMI's, for an FMU) when it reports a failure: before the cycle has computed, and after."""
-
-NO_STOP, END_OF_MOTION, ASKED_TO_STOP, MISSED_PERIODS, SUPERVISOR_GONE = range(5)
-STOP_CAUSES = (
-    "none",
-    "end of the motion",
-    "asked for",
-    "too many periods missed in a row",
-    "the supervising process has gone",
-)
-"""Why a controlled stop began."""
-
-_FAILURES = {
-    IMPLAUSIBLE: (
-        "the estimated pose needs a leg far outside its stroke: the IMUs' errors are larger than the filters assume "
-        "(raw ones need a calibration)"
-    ),
-    POSE_LOST: "the IMUs that can be used no longer determine the pose",
-    NOT_FINITE: "an estimate or a command is no longer finite",
-    CLOCK_FAILED: "this machine's clock refuses to wake the loop",
-}
 
 STAGES = (
     "sense",
@@ -72,15 +67,15 @@ STAGES = (
     "refinement",
     "whole mechanism",
     "control",
-    "send",
     "record",
     "plant",
 )
-"""What a cycle is made of: `leg filters` begin with the calibration; `control` is inverse kinematics, PID and feed-forward;
-`record` is what comes after the command: telemetry and the next reference; `plant` is the simulated one's own time."""
+"""What a cycle is made of: `sense` is the exchange with the rig, the last commands sent; `leg filters` begin with the
+calibration; `control` is inverse kinematics, PID, feed-forward and the watch; `record` is telemetry and the next reference;
+`plant` is the simulated one's own time."""
 
-_SENSE, _LEGS, _PLATFORM, _POSE, _REFINEMENT, _MECHANISM, _CONTROL, _SEND, _RECORD, _PLANT = range(len(STAGES))
-COMPUTED, TO_COMMAND = slice(_LEGS, _SEND), slice(_SENSE, _RECORD)
+_SENSE, _LEGS, _PLATFORM, _POSE, _REFINEMENT, _MECHANISM, _CONTROL, _RECORD, _PLANT = range(len(STAGES))
+COMPUTED, TO_COMMAND = slice(_LEGS, _RECORD), slice(_SENSE, _RECORD)
 """The stages of the paper's Figure 4, and all between the wake-up and the command."""
 
 RECORD = np.dtype(
@@ -93,8 +88,20 @@ RECORD = np.dtype(
         ("missed", np.int64),
         ("status", np.int32),
         ("stop", np.int32),
+        ("asked", np.int32),
+        ("mode", np.int32),
+        ("request", np.int32),
+        ("silent", np.int32),
+        ("drive", np.int32, LEGS),
+        ("drive_code", np.int32, LEGS),
+        ("sample_age", np.int32, IMU_COUNT),
         ("imus", np.int32),
         ("trusted", np.int32),
+        ("sample_ns", np.int64, IMU_COUNT),
+        ("round_trip_ns", np.int64),
+        ("refused", np.int64),
+        ("sent", np.float64, LEGS),
+        *EVENTS,
         ("angular_velocity", np.float64, (IMU_COUNT, 3)),
         ("specific_force", np.float64, (IMU_COUNT, 3)),
         ("magnetic_field", np.float64, (IMU_COUNT, 3)),
@@ -110,24 +117,24 @@ RECORD = np.dtype(
     ],
     align=True,
 )
-"""What is kept of a cycle: the period that it ran in; when it woke [ns since the first] and how late; the stages' durations and
-the thread's CPU time; periods missed before it; its status and the cause of a stop; which IMUs were used (a bit each, and
-the eighth for the platform's magnetometer), and whether the pose is the whole-mechanism filter's; raw IMU data; the pose with
-covariance (translation, rotation; in {1}), residuals of the directions and conditioning; lengths, reference (length, rate,
+"""What is kept of a cycle: the period that it ran in; when it woke [ns since the first] and how late; the stages' durations
+and the thread's CPU time; periods missed before it; the cause of a fault that began in it, and of the stop or fault that is
+on, and what was asked of it before it; mode and request to the drives (`controller.safety`); what the rig said
+(`hil.rigs.FEEDBACK`): for how many cycles it has been silent, the drives, how many cycles old the samples are, their time,
+round trip, refused packets, and what was really sent; what happened; which IMUs were used (a bit each, and the eighth for
+the platform's magnetometer), and whether the pose is the whole-mechanism filter's; raw IMU data; the pose with covariance
+(translation, rotation; in {1}), residuals of the directions and conditioning; lengths, reference (length, rate,
 acceleration) and commands; and the truth as the plant's `truth` buffer has it.
 """
 
 HEAD, STOP, DONE, TAIL, KEPT, SUPERVISOR, START = range(7)
 LINK = 16
-"""Places in the array that the loop shares with other processes, int64 (16,): records written, whether it shall stop, whether
-it has ended; where the next recorder goes on, and how many records are in files for good; the process whose end ends the
-motion, 0 for none; and the first deadline [ns]."""
+"""Places in the array that the loop shares with other processes, int64 (16,): records written, whether, and how,
+it shall stop; whether it has ended; where the next recorder goes on, and how many records are in files for good; the process
+whose end ends the motion, 0 for none; and the first deadline [ns]."""
 
-
-def describe_status(status: int) -> str:
-    """What a status of the loop means, in words; what a rig has to say of its own, it must be asked."""
-    own = status - (SEND_FAILED if status >= SEND_FAILED else RIG_FAILED)
-    return _FAILURES.get(status, f"the rig reports failure {own}")
+CONTROLLED, QUICKLY = 1, 2
+"""How the loop shall stop."""
 
 
 class PythonFilters(NamedTuple):
@@ -143,14 +150,18 @@ class PythonFilters(NamedTuple):
 
 _ENDLESS = np.iinfo(np.int64).max
 _LOOK_NS = 100_000_000
+_SIGQUIT = 1 << 2
 _SIGNALS = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14
 """SIGHUP, SIGINT, SIGQUIT and SIGTERM in a set of signals."""
 
 _WORK = np.dtype(
     [
         ("cycle", np.int64),
-        ("measurement", np.float64, (3, IMU_COUNT, 3)),
-        ("truth", np.float64, CALLS["truth"].shape),
+        ("asked", np.int64),
+        ("silent", np.int64),
+        ("sequence", np.int64, IMU_COUNT),
+        ("sample_age", np.int64, IMU_COUNT),
+        ("feedback", FEEDBACK),
         ("factor", np.float64, (6, 6)),
         ("covariance", np.float64, (6, 6)),
         ("stage_ns", np.int64, len(STAGES)),
@@ -162,18 +173,45 @@ _getppid: Any = types.ExternalFunction("getppid", types.int32())
 _sigpending: Any = types.ExternalFunction("sigpending", types.int32(types.intp))
 
 
-def _store(typing_context: Any, link: Any, index: Any, value: Any) -> Any:
-    """Store a number in a shared int64 array after everything that was stored before it."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        array = context.make_array(signature.args[0])(context, builder, arguments[0])
-        builder.store_atomic(arguments[2], builder.gep(array.data, [arguments[1]]), "release", 8)
-        return context.get_dummy_value()
-
-    return types.void(types.int64[::1], types.intp, types.int64), generate
+FMU_RIG, UDP_RIG, EMULATED_RIG = range(3)
+"""What the compiled loop exchanges with: the plant; a rig over UDP; an emulated one over UDP's datagrams, in memory."""
 
 
-_publish: Any = intrinsic(_store)
+class Port(NamedTuple):
+    """The rig as compiled code sees it: which of the three it is, and what each needs.
+
+    Attributes:
+        kind: `FMU_RIG`, `UDP_RIG` or `EMULATED_RIG`.
+        calls: the plant (dtype `plant.fmu.CALLS`).
+        imu: the IMUs' imperfections (dtype `plant.imu.IMU_STATE`).
+        link: the controller's side of UDP.
+        emulator: the rig's side, in memory.
+    """
+
+    kind: int
+    calls: Record
+    imu: Record
+    link: UdpLink
+    emulator: UdpEmulator
+
+
+class Streamed(NamedTuple):
+    """A streamed target as compiled code sees it.
+
+    Attributes:
+        active: whether there is one.
+        patience_ns: how long it may be silent.
+        stream, taker: dtypes `controller.stream.STREAM` and `TAKER`.
+    """
+
+    active: int
+    patience_ns: int
+    stream: Record
+    taker: Record
+
+
+STREAM_PATIENCE_S = 0.1
+"""How long a streamed target may be silent [s]."""
 
 
 @dataclass(eq=False)
@@ -184,6 +222,8 @@ class Loop:
         calls: the plant (dtype `plant.fmu.CALLS`).
         imu: the IMUs' imperfections (dtype `plant.imu.IMU_STATE`).
         parameters, state: of the cycle.
+        kind, udp, emulator: as in `Port`; by default the rig is the plant itself.
+        stream: of a streamed target (dtype `controller.stream.STREAM`), None without one.
         segments: the reference.
         records: (N,), dtype `RECORD`, written round and round.
         clock: dtype `hil.clock.CLOCK`; by default the loop runs as fast as it goes.
@@ -202,19 +242,24 @@ class Loop:
     script: NDArray[np.int64] = field(default_factory=lambda: np.zeros((1, 3), np.int64))
     link: NDArray[np.int64] = field(default_factory=lambda: np.zeros(LINK, np.int64))
     most_missed: int = 10
+    kind: int = FMU_RIG
+    udp: UdpLink = field(default_factory=new_link)
+    emulator: UdpEmulator | None = None
+    stream: Record | None = None
 
     def __post_init__(self) -> None:
+        self._taker: Record = np.zeros((), TAKER)
         self._work: Record = np.zeros((), _WORK)
-        self._work["truth"] = np.nan
+        self._work["feedback"] = new_feedback()
 
     def run(self, last: int, filters: PythonFilters | None = None) -> int:
-        """Run up to but not including cycle `last`; returns a status, 0 when all is well, and brakes when it is not."""
+        """Run up to but not including cycle `last`; returns 0, or the cause for which the run has ended on the brakes."""
         if filters is None:
             return self._run(last, _ENDLESS)
         return self._run_python(FmuRig(self), last, _ENDLESS, filters)
 
-    def follow(self, end: int, rig: "Rig | None" = None) -> int:
-        """Follow the motion to cycle `end`, stop there, or earlier for a cause, and brake; returns `STOPPED`, or what failed.
+    def follow(self, end: int, rig: Rig | None = None) -> int:
+        """Follow the motion to cycle `end`, stop there, or earlier for a cause, and brake; returns the cause.
 
         With a rig in Python the loop is one, too.
         """
@@ -223,7 +268,7 @@ class Loop:
         try:
             return self._run_python(rig, _ENDLESS, end)
         except BaseException:
-            rig.brake()
+            rig.quick_stop()
             raise
 
     def load(self, python: bool = False) -> None:
@@ -234,66 +279,63 @@ class Loop:
             return
         timespec, calls = clock["timespec"], self.calls
         _load(now, timespec)
-        _load(_begin, parameters, state, clock, self.script, link, work, 0, 0)
-        _load(_is_due, parameters, state)
+        _load(_begin, parameters, state, clock, self.script, link, work, self._streamed(), 0, 0)
+        _load(_hear, parameters, state, work, 0)
+        _load(coast, parameters, state)
         _load(_compute, parameters, state, self.segments, work, timespec)
-        _load(calibrate, parameters, state, work["measurement"])
+        _load(calibrate, parameters, state, work["feedback"]["measurement"])
         _load(_locate_and_control, parameters, state, self.segments, work, timespec)
-        _load(_note, parameters, state, self.segments, self.records, clock, link, work, 0)
+        _load(_note, parameters, state, self.segments, self.records, clock, link, work, self._streamed(), 0)
         _load(_end, self.records, clock, self.script, link, work)
-        _load(_catch_up, calls, parameters, 0)
-        _load(_read, calls, self.imu, work)
-        _load(_checked, 0, 0)
+        _load(periods_passed, state)
+        _load(drive_fmu, calls, state["command"], 0, 0, 0.0)
+        _load(read_fmu, calls, self.imu, state["command"], work["feedback"][()])
+        _load(_checked, 0)
         _load(write_drive_mode, calls, 0)
-        _load(write_command, calls, state["command"])
-        _load(advance, calls, 0.0)
 
     def _arguments(self, last: int, end: int) -> tuple[Any, ...]:
+        emulator = self.emulator or new_udp_emulator(self.calls, self.imu, np.zeros((), EMULATED))
         return (
-            self.calls, self.imu, self.parameters, self.state, self.segments, self.records, self.clock, self.script, self.link,
-            self._work, self.most_missed, last, end,
+            Port(self.kind, self.calls, self.imu, self.udp, emulator), self.parameters, self.state, self.segments, self.records,
+            self.clock, self.script, self.link, self._work, self._streamed(), self.most_missed, last, end,
         )  # fmt: skip
+
+    def _streamed(self) -> Streamed:
+        active = self.stream is not None
+        stream = self.stream if active else np.zeros((), STREAM)
+        return Streamed(int(active), round(1e9 * STREAM_PATIENCE_S), stream, self._taker)
 
     def _run(self, last: int, end: int) -> int:
         return _run(*self._arguments(last, end))
 
-    def _run_python(self, rig: "Rig", last: int, end: int, filters: PythonFilters | None = None) -> int:
+    def _run_python(self, rig: Rig, last: int, end: int, filters: PythonFilters | None = None) -> int:
         """The loop of `_run`, in Python."""
-        parameters, state, clock, work = self.parameters, self.state, self.clock, self._work
-        measurement, stage_ns, timespec = work["measurement"], work["stage_ns"], clock["timespec"]
-        status = OK
-        while status == OK and state["cycle"] < last:
-            status = _begin(parameters, state, clock, self.script, self.link, work, self.most_missed, end)
-            if status != OK:
+        parameters, state, clock, work, streamed = self.parameters, self.state, self.clock, self._work, self._streamed()
+        feedback, stage_ns, timespec, safety = work["feedback"][()], work["stage_ns"], clock["timespec"], state["safety"]
+        cause = OK
+        while cause == OK and state["cycle"] < last:
+            cause = _begin(parameters, state, clock, self.script, self.link, work, streamed, self.most_missed, end)
+            if cause != OK:
                 break
             began = now(timespec)
-            status = rig.read(measurement, int(state["missed"]))
-            if status == OK and _is_due(parameters, state):
-                status = rig.release()
+            status = rig.exchange(state["command"], int(safety["request"]), feedback)
             stage_ns[_SENSE] = now(timespec) - began
-            if status == OK and filters is None:
-                status = _compute(parameters, state, self.segments, work, timespec)
-            elif status == OK and filters is not None:
+            failed = _hear(parameters, state, work, status)
+            if not failed and filters is not None and safety["mode"] != FAULT:
                 t0 = now(timespec)
-                calibrate(parameters, state, measurement)
+                calibrate(parameters, state, feedback["measurement"])
                 filters.fuse_legs(state)
                 t1 = now(timespec)
                 filters.fuse_platform(state)
                 stage_ns[_LEGS], stage_ns[_PLATFORM] = t1 - t0, now(timespec) - t1
-                status = _locate_and_control(parameters, state, self.segments, work, timespec)
-            began = now(timespec)
-            if status == OK and (failure := rig.write(state["command"])):
-                status = failure + SEND_FAILED - RIG_FAILED
-            stage_ns[_SEND] = now(timespec) - began
-            _note(parameters, state, self.segments, self.records, clock, self.link, work, status)
-            began = now(timespec)
-            if status == OK and (failure := rig.advance()):
-                status = failure + SEND_FAILED - RIG_FAILED
-            stage_ns[_PLANT] = now(timespec) - began
+                failed = _locate_and_control(parameters, state, self.segments, work, timespec)
+            elif not failed:
+                failed = _compute(parameters, state, self.segments, work, timespec)
+            _note(parameters, state, self.segments, self.records, clock, self.link, work, streamed, failed)
             _end(self.records, clock, self.script, self.link, work)
-        if status != OK:
-            rig.brake()
-        return status
+        if cause != OK:
+            rig.quick_stop()
+        return cause
 
 
 def _load(kernel: Any, *arguments: Any) -> None:
@@ -322,123 +364,177 @@ def prevent_compilation() -> Iterator[None]:
         yield
 
 
-class Rig(Protocol):
-    """What the loop needs of a rig. Every call returns a status, 0 when all is well, else `RIG_FAILED` plus the rig's own."""
-
-    def read(self, measurement: Array, missed: int) -> int:
-        """Write the latest IMU data (3, 7, 3), `missed` periods and one after the last."""
-
-    def release(self) -> int:
-        """Release the brakes: from now on the drives follow the commands."""
-
-    def write(self, command: Array) -> int:
-        """Command the drives' velocities (6,) [m/s]."""
-
-    def advance(self) -> int:
-        """After the command: what the rig does until the next period; a real one nothing."""
-
-    def brake(self) -> int:
-        """Stop the drives on their brakes, whatever has happened."""
-
-
 class FmuRig:
     """The plant behind a loop's `calls`, for loops in Python."""
+
+    command_delay = 0.0
 
     def __init__(self, loop: Loop) -> None:
         self._loop = loop
 
-    def read(self, measurement: Array, missed: int) -> int:
-        """Let the plant move for missed periods, and read it."""
+    def open(self) -> None:
+        """Nothing: the plant is loaded."""
+
+    def identify(self) -> Identity:
+        """The plant has no parts."""
+        return Identity("FMU")
+
+    def arm(self) -> None:
+        """Nothing: the plant's drives are always ready."""
+
+    def exchange(self, command: Array, request: int, feedback: Record) -> int:
+        """Drive the plant for the periods that have passed since the last exchange, and read it."""
         loop = self._loop
-        if loop.state["cycle"] == 0:
-            write_drive_mode(loop.calls, BRAKE)
-        status = _catch_up(loop.calls, loop.parameters, missed)
-        return status or _read(loop.calls, loop.imu, loop._work)
+        status = drive_fmu(loop.calls, command, request, periods_passed(loop.state), float(loop.parameters["period"]))
+        return _checked(status or read_fmu(loop.calls, loop.imu, command, feedback))
 
-    def release(self) -> int:
-        """Release the drives."""
-        return _checked(write_drive_mode(self._loop.calls, VELOCITY), RIG_FAILED)
-
-    def write(self, command: Array) -> int:
-        """Command the drives."""
-        return _checked(write_command(self._loop.calls, command), RIG_FAILED)
-
-    def advance(self) -> int:
-        """Let the plant move for a period."""
-        return _checked(advance(self._loop.calls, float(self._loop.parameters["period"])), RIG_FAILED)
-
-    def brake(self) -> int:
+    def quick_stop(self) -> None:
         """Brake the drives."""
-        return _checked(write_drive_mode(self._loop.calls, BRAKE), RIG_FAILED)
+        write_drive_mode(self._loop.calls, BRAKE)
+
+    def close(self) -> None:
+        """Nothing."""
 
 
 @kernel
-def _checked(status: int, offset: int) -> int:
-    return offset + status if status else OK
+def drive_fmu(calls: Record, command: Array, request: int, periods: int, period: float) -> int:
+    """Let the plant move with the command for so many periods; returns FMI's status."""
+    status = write_drive_mode(calls, BRAKE if request == BRAKED else VELOCITY)
+    if periods > 0:
+        status |= write_command(calls, command)
+    for _ in range(periods):
+        status |= advance(calls, period)
+    return status
+
+
+@kernel
+def read_fmu(calls: Record, imu: Record, command: Array, feedback: Record) -> int:
+    """Read the plant through the IMUs' imperfections; returns FMI's status."""
+    status = read_imus(calls) | read_truth(calls)
+    measure(imu, calls[()].imu, feedback.measurement)
+    feedback.truth[:] = calls[()].truth
+    feedback.sent[:] = command
+    for k in range(IMU_COUNT):
+        feedback.sequence[k] += 1
+        feedback.sample_ns[k] = np.int64(np.rint(1e9 * calls[()].time))
+    return status
+
+
+@kernel
+def _exchange(port: Port, parameters: Record, state: Record, work: Record, timespec: NDArray[np.int64]) -> int:
+    """Send the commands of the cycle before, and read the sensors; returns the rig's status."""
+    s, w, period = state[()], work[()], parameters[()].period
+    t0 = t1 = now(timespec)
+    if port.kind == UDP_RIG:
+        status = exchange_udp(port.link, s.command, s.safety.request, w.feedback, timespec)
+    elif port.kind == EMULATED_RIG:
+        at = int(np.rint(1e9 * period * s.cycle))
+        status = exchange_in_memory(port.emulator, port.link, s.command, s.safety.request, w.feedback, at)
+    else:
+        status = drive_fmu(port.calls, s.command, s.safety.request, periods_passed(state), period)
+        t1 = now(timespec)
+        if status == 0:
+            status = read_fmu(port.calls, port.imu, s.command, w.feedback)
+        status = _checked(status)
+    w.stage_ns[_PLANT], w.stage_ns[_SENSE] = t1 - t0, now(timespec) - t1
+    return status
+
+
+@kernel
+def _hold(port: Port, parameters: Record, state: Record, work: Record, timespec: NDArray[np.int64]) -> None:
+    """At the end: the drives hold on their brakes."""
+    if port.kind == UDP_RIG:
+        encode_command(port.link, state[()].command, BRAKED, now(timespec))
+        send_datagram(port.link.socket, port.link.command_bytes, port.link.command_bytes.size)
+    elif port.kind == EMULATED_RIG:
+        at = int(np.rint(1e9 * parameters[()].period * state[()].cycle))
+        exchange_in_memory(port.emulator, port.link, state[()].command, BRAKED, work[()].feedback, at)
+    else:
+        write_drive_mode(port.calls, BRAKE)
+
+
+@kernel
+def _checked(status: int) -> int:
+    """FMI's status as that of an exchange."""
+    return SILENT + status if status != 0 else ANSWERED
+
+
+@kernel
+def periods_passed(state: Record) -> int:
+    """How many periods have passed since the last exchange; none before the first."""
+    s = state[()]
+    return 1 + s.missed if s.cycle > 0 else 0
 
 
 @kernel
 def _begin(
     parameters: Record, state: Record, clock: Record, script: NDArray[np.int64], link: NDArray[np.int64], work: Record,
-    most_missed: int, end: int,
+    streamed: Streamed, most_missed: int, end: int,
 ) -> int:  # fmt: skip
-    """Wait for the next period, take note of missed ones, and stop where that is due; returns a status."""
-    c, s = clock[()], state[()]
+    """Wait for the next period, take note of missed ones, and stop where that is due; returns the cause if the run has
+    ended.
+    """
+    c, s, w = clock[()], state[()], work[()]
     if c.cycles == 0:
         start(clock)
     missed = wait(clock, script)
+    w.asked = OK
     if missed < 0:
-        return CLOCK_FAILED
+        w.asked, missed = CLOCK_FAILED, 0
     skip(state, missed)
-    work[()].cycle = s.cycle
-    work[()].stage_ns[:] = 0
-    if link[STOP] != 0:
-        begin_stop(parameters, state, ASKED_TO_STOP)
-    if c.in_a_row >= most_missed:
-        begin_stop(parameters, state, MISSED_PERIODS)
+    w.cycle = s.cycle
+    w.stage_ns[:] = 0
+    if s.cycle - s.safety.waited >= end:
+        w.asked = END_OF_MOTION
     if c.mode == REAL and c.cycles % max(_LOOK_NS // c.period, 1) == 0:
-        signals = work[()].signals
+        signals = w.signals
         if _sigpending(signals.ctypes.data) == 0 and signals[0] & _SIGNALS != 0:
-            begin_stop(parameters, state, ASKED_TO_STOP)
+            w.asked = ASKED_TO_STOP if signals[0] & _SIGQUIT == 0 else EMERGENCY_STOP
         if link[SUPERVISOR] != 0 and _getppid() != link[SUPERVISOR]:
-            begin_stop(parameters, state, SUPERVISOR_GONE)
-    if s.cycle >= end:
-        begin_stop(parameters, state, END_OF_MOTION)
-    return STOPPED if has_stopped(state) else OK
+            w.asked = SUPERVISOR_GONE
+    if c.in_a_row >= most_missed:
+        w.asked = MISSED_PERIODS
+    if link[STOP] == CONTROLLED:
+        w.asked = ASKED_TO_STOP
+    elif link[STOP] == QUICKLY:
+        w.asked = EMERGENCY_STOP
+    if streamed.active != 0 and s.stopping == 0:
+        cause, leg, value, limit = stream_cause(streamed.stream, c.woke, streamed.patience_ns)
+        if cause != OK:
+            w.asked = cause
+            react(parameters, state, cause, leg, value, limit)
+    if w.asked != OK:
+        begin_stop(parameters, state, w.asked)
+    return int(s.stopping) if has_stopped(state) else OK
 
 
 @kernel
-def _catch_up(calls: Record, parameters: Record, missed: int) -> int:
-    """Let the plant move for the periods that were missed."""
-    status = 0
-    for _ in range(missed):
-        status |= advance(calls, parameters[()].period)
-    return _checked(status, RIG_FAILED)
-
-
-@kernel
-def _read(calls: Record, imu: Record, work: Record) -> int:
-    """Read the plant through the IMUs' imperfections."""
-    status = read_imus(calls) | read_truth(calls)
-    measure(imu, calls[()].imu, work[()].measurement)
-    work[()].truth[:] = calls[()].truth
-    return _checked(status, RIG_FAILED)
-
-
-@kernel
-def _is_due(parameters: Record, state: Record) -> bool:
-    """Whether the drives are to be released in this cycle; said once."""
-    p, s = parameters[()], state[()]
-    due = s.driving == 0 and s.cycle >= p.hold_cycles
-    if due:
-        s.driving = 1
-    return bool(due)
+def _hear(parameters: Record, state: Record, work: Record, status: int) -> int:
+    """After an exchange: note what is new, and react to what the rig has said; returns a cause if the cycle cannot be
+    computed.
+    """
+    w = work[()]
+    feedback = w.feedback
+    w.silent = w.silent + 1 + state[()].missed if status == SILENT else 0
+    for k in range(IMU_COUNT):
+        fresh = feedback.sequence[k] != w.sequence[k]
+        w.sample_age[k] = 0 if fresh else w.sample_age[k] + 1 + state[()].missed
+        w.sequence[k] = feedback.sequence[k]
+    if status > SILENT:
+        react(parameters, state, RIG_FAILED, -1, status, np.nan)
+        coast(parameters, state)
+        return RIG_FAILED
+    hear(parameters, state, w.sample_age, feedback.drive, w.silent)
+    return OK
 
 
 @kernel
 def _compute(parameters: Record, state: Record, segments: Array, work: Record, timespec: NDArray[np.int64]) -> int:
     """The steps of `controller.cycle.cycle`, with the clock read in between."""
-    measurement, stage_ns = work[()].measurement, work[()].stage_ns
+    measurement, stage_ns = work[()].feedback.measurement, work[()].stage_ns
+    if state[()].safety.mode == FAULT:
+        coast(parameters, state)
+        return OK
     t0 = now(timespec)
     calibrate(parameters, state, measurement)
     fuse_legs(parameters, state)
@@ -456,19 +552,21 @@ def _locate_and_control(parameters: Record, state: Record, segments: Array, work
     conditioning = find_pose(parameters, state)
     t1 = now(timespec)
     found = conditioning >= RANK_TOLERANCE and improve_pose(parameters, state)
+    if found:
+        monitor_imus(parameters, state)
     t2 = now(timespec)
     known = fuse_mechanism(parameters, state, found)
     t3 = now(timespec)
-    status = control(parameters, state, segments) if known else POSE_LOST
+    cause = control(parameters, state, segments) if known else lose_pose(parameters, state)
     t4 = now(timespec)
     stage_ns[_POSE], stage_ns[_REFINEMENT], stage_ns[_MECHANISM], stage_ns[_CONTROL] = t1 - t0, t2 - t1, t3 - t2, t4 - t3
-    return status
+    return cause
 
 
 @kernel
 def _note(
     parameters: Record, state: Record, segments: Array, records: Record, clock: Record, link: NDArray[np.int64], work: Record,
-    status: int,
+    streamed: Streamed, failed: int,
 ) -> None:  # fmt: skip
     """After the command: record the cycle, and prepare the next reference."""
     p, s, c, w = parameters[()], state[()], clock[()], work[()]
@@ -479,22 +577,38 @@ def _note(
     record.time_ns = c.woke - c.start if c.mode != FREE else np.int64(np.rint(1e9 * p.period * w.cycle))
     record.late_ns = c.late
     record.missed = s.missed
-    record.status = status
+    record.status = failed
     record.stop = s.stopping
+    record.asked = w.asked
+    record.mode, record.request = s.safety.mode, s.safety.request
+    record.silent = w.silent
+    record.drive[:] = w.feedback.drive
+    record.drive_code[:] = w.feedback.drive_code
+    record.sample_age[:] = w.sample_age
+    record.sample_ns[:] = w.feedback.sample_ns
+    record.round_trip_ns, record.refused = w.feedback.round_trip_ns, w.feedback.refused
+    record.sent[:] = w.feedback.sent
+    record.event_count = s.safety.event_count
+    for i in range(EVENT_SLOTS):
+        told = i < s.safety.event_count
+        record.event_cause[i] = s.safety.event_cause[i] if told else 0
+        record.event_index[i] = s.safety.event_index[i] if told else 0
+        record.event_value[i] = s.safety.event_value[i] if told else 0.0
+        record.event_limit[i] = s.safety.event_limit[i] if told else 0.0
     record.imus = s.heading_used << IMU_COUNT
     for k in range(IMU_COUNT):
         record.imus |= s.imu_used[k] << k
     record.trusted = s.filter_trusted
-    record.angular_velocity[:] = w.measurement[0]
-    record.specific_force[:] = w.measurement[1]
-    record.magnetic_field[:] = w.measurement[2]
+    record.angular_velocity[:] = w.feedback.measurement[0]
+    record.specific_force[:] = w.feedback.measurement[1]
+    record.magnetic_field[:] = w.feedback.measurement[2]
     record.position[:] = s.position
     record.rotation[:] = s.rotation
     record.conditioning = s.conditioning
     record.lengths[:] = s.lengths
     record.reference[:] = s.reference
     record.command[:] = s.command
-    record.truth[:] = w.truth
+    record.truth[:] = w.feedback.truth
     for k in range(LEGS):
         for i in range(3):
             record.residuals[k, i] = s.directions[k, i] - s.predicted[k, i] if s.leg_used[k] != 0.0 else np.nan
@@ -507,6 +621,8 @@ def _note(
         record.covariance[:] = w.covariance
     else:
         record.covariance[:] = np.nan
+    if streamed.active != 0 and s.stopping == 0:
+        take_plan(streamed.stream, streamed.taker, motion_cycle(parameters, state), p.period, segments, s.reference_index)
     prepare(parameters, state, segments)
     w.stage_ns[_RECORD] = now(c.timespec) - began
 
@@ -519,42 +635,26 @@ def _end(records: Record, clock: Record, script: NDArray[np.int64], link: NDArra
     record = records[head % records.shape[0]]
     record.stage_ns[:] = work[()].stage_ns
     record.cpu_ns = finish(clock, script, record.stage_ns.sum())
-    _publish(link, HEAD, head + 1)
+    store_release(link, HEAD, head + 1)
 
 
 @kernel
 def _run(
-    calls: Record, imu: Record, parameters: Record, state: Record, segments: Array, records: Record, clock: Record,
-    script: NDArray[np.int64], link: NDArray[np.int64], work: Record, most_missed: int, last: int, end: int,
+    port: Port, parameters: Record, state: Record, segments: Array, records: Record, clock: Record,
+    script: NDArray[np.int64], link: NDArray[np.int64], work: Record, streamed: Streamed, most_missed: int, last: int, end: int,
 ) -> int:  # fmt: skip
-    s, c, stage_ns, timespec = state[()], clock[()], work[()].stage_ns, clock[()].timespec
-    status = OK
-    while status == OK and s.cycle < last:
-        status = _begin(parameters, state, clock, script, link, work, most_missed, end)
-        if status != OK:
+    s, timespec = state[()], clock[()].timespec
+    cause = OK
+    while cause == OK and s.cycle < last:
+        cause = _begin(parameters, state, clock, script, link, work, streamed, most_missed, end)
+        if cause != OK:
             break
-        if s.cycle == 0:
-            write_drive_mode(calls, BRAKE)
-        # A real rig would have moved on by itself, so this is no stage of the cycle.
-        status = _catch_up(calls, parameters, s.missed)
-        began = c.woke if c.mode == REAL and s.missed == 0 else now(timespec)
-        if status == OK:
-            status = _read(calls, imu, work)
-        if status == OK and _is_due(parameters, state):
-            status = _checked(write_drive_mode(calls, VELOCITY), RIG_FAILED)
-        stage_ns[_SENSE] = now(timespec) - began
-        if status == OK:
-            status = _compute(parameters, state, segments, work, timespec)
-        began = now(timespec)
-        if status == OK:
-            status = _checked(write_command(calls, s.command), SEND_FAILED)
-        stage_ns[_SEND] = now(timespec) - began
-        _note(parameters, state, segments, records, clock, link, work, status)
-        began = now(timespec)
-        if status == OK:
-            status = _checked(advance(calls, parameters[()].period), SEND_FAILED)
-        stage_ns[_PLANT] = now(timespec) - began
+        status = _exchange(port, parameters, state, work, timespec)
+        failed = _hear(parameters, state, work, status)
+        if failed == OK:
+            failed = _compute(parameters, state, segments, work, timespec)
+        _note(parameters, state, segments, records, clock, link, work, streamed, failed)
         _end(records, clock, script, link, work)
-    if status != OK:
-        write_drive_mode(calls, BRAKE)
-    return status
+    if cause != OK:
+        _hold(port, parameters, state, work, timespec)
+    return cause

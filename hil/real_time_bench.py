@@ -22,8 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from controller.safety import CAUSES, STOP
 from hil.clock import REAL, finish, new_clock, now, start, wait
-from hil.loop import HEAD, RECORD, STOPPED, prevent_compilation, shared_array
+from hil.loop import HEAD, RECORD, prevent_compilation, shared_array
 from hil.realtime import MEASURES, RealTimeSettings, real_time, usage
 from hil.simulation import PreparedLoop, SimulationConfig, prepared_loop
 from hil.timing import QUANTILES, Histogram, Timing, over_budget
@@ -251,9 +252,9 @@ def _send(pipe: Any, target: Callable[..., Any], *arguments: Any) -> None:
         pipe.send(error)
 
 
-def _outcome(loop: PreparedLoop, status: int, used: dict[str, float]) -> tuple[int, dict[str, int], dict[str, float]]:
-    if status != STOPPED:
-        raise GoughError(f"the loop stopped in the benchmark with status {status}")
+def _outcome(loop: PreparedLoop, cause: int, used: dict[str, float]) -> tuple[int, dict[str, int], dict[str, float]]:
+    if CAUSES[cause].reaction != STOP:
+        raise GoughError(f"the loop stopped in the benchmark: {loop.reason()}")
     clock = loop.clock
     missed = {"own": int(clock["missed_own"]), "host": int(clock["missed_late"] + clock["missed_host"])}
     return int(loop.link[HEAD]), missed, used

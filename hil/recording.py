@@ -21,8 +21,8 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from numpy.typing import NDArray
 
-from controller.cycle import OK
-from hil.loop import DONE, HEAD, KEPT, NO_STOP, RECORD, STAGES, START, STOP_CAUSES, SUPERVISOR, TAIL, describe_status
+from controller.safety import CAUSES, EVENT_SLOTS, GO_ON, REACTIONS, describe_event
+from hil.loop import DONE, HEAD, KEPT, RECORD, STAGES, START, SUPERVISOR, TAIL
 from plant.compiled import Record
 from plant.errors import GoughError
 from plant.variables import IMU_COUNT
@@ -42,8 +42,24 @@ _NOTES = {
     "stage_ns": ", ".join(STAGES),
     "cpu_ns": "processor time of the thread",
     "missed": "periods missed before this one",
-    "status": "0: all well",
-    "stop": "cause of a controlled stop; 0: none",
+    "status": "cause of a fault that began in this cycle; 0: none",
+    "stop": "cause of the stop or fault that is under way; 0: none",
+    "asked": "cause that was asked for before the cycle; 0: none",
+    "mode": "0 idle, 1 armed, 2 running, 3 stopping, 4 stopped, 5 fault",
+    "request": "to the drives: 0 braked, 1 enabled, 2 quick stop",
+    "silent": "cycles since the rig has answered",
+    "drive": "0 following, 1 ready, 2 off, 3 stopping quickly, 4 faulty",
+    "drive_code": "the drives' own fault codes",
+    "sample_age": "cycles since each IMU's sample was new",
+    "sample_ns": "time of each IMU's sample on the rig's clock",
+    "round_trip_ns": "of the exchange",
+    "refused": "frames or packets that were refused since the start",
+    "sent": "m/s, what was really sent",
+    "event_count": "what happened in this cycle: how much, and of the first eight",
+    "event_cause": "by number, controller/safety.py",
+    "event_index": "which leg or IMU; -1: none",
+    "event_value": "in the unit of its cause; NaN: none",
+    "event_limit": "which it broke; NaN: none",
     "imus": "which IMUs were used, a bit each, and the eighth for the platform's magnetometer",
     "trusted": "1: the pose is the whole-mechanism filter's",
     "angular_velocity": "rad/s, seven IMUs by three axes: 0-5 on the legs, 6 on the platform",
@@ -96,8 +112,7 @@ class Recorder:
         self._writer.add_metadata("gough", {"config": json.dumps(header["config"]), **digests})
         for name, content in contents.items():
             self._writer.add_attachment(0, 0, f"{name}.npy", "application/x-npy", content)
-        self._stopping = False
-        self._fusion = {"imus": -1, "trusted": 0}
+        self._known = {"imus": -1, "trusted": 0}
         self.flush()
 
     def _channel(self, topic: str, name: str, text: str) -> int:
@@ -114,8 +129,8 @@ class Recorder:
         """Append records (n,), dtype `RECORD`, and what is to be told of them."""
         self.write_cycles(records)
         times = self._epoch + records["time_ns"]
-        told = (records["missed"] > 0) | (records["status"] != OK) | (records["stop"] != NO_STOP)
-        for name, before in self._fusion.items():
+        told = (records["missed"] > 0) | (records["event_count"] > 0)
+        for name, before in self._known.items():
             told |= np.diff(records[name], prepend=before) != 0
         for i in np.flatnonzero(told).tolist():
             for text in self._tell(records[i]):
@@ -130,26 +145,17 @@ class Recorder:
     def _tell(self, record: Record) -> Iterator[str]:
         if record["missed"] > 0:
             yield f"{record['missed']} periods missed"
-        yield from self._tell_fusion(int(record["imus"]), int(record["trusted"]))
-        if record["stop"] != NO_STOP and not self._stopping:
-            self._stopping = True
-            yield f"controlled stop: {STOP_CAUSES[int(record['stop'])]}"
-        if record["status"] != OK:
-            yield f"stopped on the brakes: {describe_status(int(record['status']))}"
-
-    def _tell_fusion(self, imus: int, trusted: int) -> Iterator[str]:
-        names = [*(f"IMU {imu}" for imu in range(IMU_COUNT)), "the magnetometer"]
-        for bit, name in enumerate(names):
-            used, was = imus >> bit & 1, self._fusion["imus"] >> bit & 1
-            if used != was and self._fusion["imus"] >= 0:
-                yield f"{name} is {'used again' if used else 'left out: it is lost, frozen or at the end of its range'}"
-        if trusted != self._fusion["trusted"]:
+        yield from events_of(record)
+        magnetometer, trusted = int(record["imus"]) >> IMU_COUNT & 1, int(record["trusted"])
+        if self._known["imus"] >= 0 and magnetometer != self._known["imus"] >> IMU_COUNT & 1:
+            yield f"the magnetometer is {'used again' if magnetometer else 'left out: it is lost, frozen or disturbed'}"
+        if trusted != self._known["trusted"]:
             yield (
                 "the whole-mechanism filter is relied upon"
                 if trusted
                 else "the whole-mechanism filter is not relied upon: the leg filters disagree with it"
             )
-        self._fusion = {"imus": imus, "trusted": trusted}
+        self._known = {"imus": int(record["imus"]), "trusted": trusted}
 
     def tell(self, cycle: int, text: str, time_ns: int | None = None) -> None:
         """Append an event."""
@@ -163,6 +169,18 @@ class Recorder:
         finish: Any = self._writer.finish
         finish()
         self._file.close()
+
+
+def events_of(record: Record) -> Iterator[str]:
+    """What happened in a cycle, in words."""
+    count = int(record["event_count"])
+    for i in range(min(count, EVENT_SLOTS)):
+        cause, index, value, limit = (record[f"event_{name}"][i] for name in ("cause", "index", "value", "limit"))
+        reaction = CAUSES[int(cause)].reaction
+        how = f"{REACTIONS[reaction]}: " if reaction != GO_ON else ""
+        yield how + describe_event(int(cause), int(index), float(value), float(limit))
+    if count > EVENT_SLOTS:
+        yield f"and {count - EVENT_SLOTS} events more"
 
 
 def _saved(array: Record) -> bytes:

@@ -8,14 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from controller.cycle import OK, PARAMETERS, STATE, begin_stop, cycle, prepare, skip
-from hil.loop import RECORD, RIG_FAILED, SEND_FAILED
+from controller.cycle import OK, PARAMETERS, STATE, cycle, prepare, skip
+from controller.safety import RIG_FAILED, begin_stop, coast, hear
+from hil.loop import RECORD
 from hil.recording import RecordingError, read, total
+from hil.simulation import STREAM_TARGET
 from plant.compiled import Record, kernel
 from plant.pose import Array
 from plant.variables import IMU_COUNT
 
-COMPARED = ("position", "rotation", "lengths", "reference", "command", "conditioning")
+COMPARED = ("position", "rotation", "lengths", "reference", "command", "conditioning", "mode", "stop")
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,9 @@ def replay(paths: Sequence[Path | str]) -> Replay:
     constants: Record = np.zeros((), PARAMETERS)
     constants[()] = parameters
     again = np.zeros(len(records), RECORD)
-    count = int(_replay(constants, np.zeros((), STATE), segments, records, again, np.zeros((3, IMU_COUNT, 3))))
+    streamed = str(first.config.get("target")).partition(":")[0] == STREAM_TARGET
+    measurement = np.zeros((3, IMU_COUNT, 3))
+    count = int(_replay(constants, np.zeros((), STATE), segments, records, again, measurement, streamed))
     differs = [np.any(_bits(records[name][:count]) != _bits(again[name][:count]), axis=1) for name in COMPARED]
     rows = np.flatnonzero(np.any(differs, axis=0))
     different, fields = None, {}
@@ -118,12 +122,15 @@ def replay(paths: Sequence[Path | str]) -> Replay:
 
 
 def _bits(values: Array) -> Any:
-    """Float64 values (n, ...) as integers (n, m), so that NaN equals NaN and 0 does not equal -0."""
-    return np.ascontiguousarray(values).reshape(len(values), -1).view(np.int64)
+    """Values (n, ...) as integers (n, m), so that NaN equals NaN and 0 does not equal -0."""
+    flat = np.ascontiguousarray(values).reshape(len(values), -1)
+    return flat.view(np.int64) if flat.dtype == np.float64 else flat
 
 
 @kernel
-def _replay(parameters: Record, state: Record, segments: Array, records: Record, again: Record, measurement: Array) -> int:
+def _replay(
+    parameters: Record, state: Record, segments: Array, records: Record, again: Record, measurement: Array, streamed: bool
+) -> int:  # fmt: skip
     """Run the cycle on the raw data of records (n,); returns how many it could, up to the first gap."""
     s = state[()]
     for k in range(records.shape[0]):
@@ -131,21 +138,26 @@ def _replay(parameters: Record, state: Record, segments: Array, records: Record,
         if recorded.cycle != s.cycle + recorded.missed:
             return k
         skip(state, recorded.missed)
-        if recorded.stop != 0:
-            begin_stop(parameters, state, recorded.stop)
+        if recorded.asked != OK:
+            begin_stop(parameters, state, recorded.asked)
         measurement[0] = recorded.angular_velocity
         measurement[1] = recorded.specific_force
         measurement[2] = recorded.magnetic_field
-        status = OK
-        if not RIG_FAILED <= recorded.status < SEND_FAILED:
-            status = cycle(parameters, state, measurement, segments)
+        if recorded.status == RIG_FAILED:
+            begin_stop(parameters, state, RIG_FAILED)
+            coast(parameters, state)
+        else:
+            if streamed and s.stopping == 0:
+                s.reference[:] = recorded.reference
+                s.prepared = s.cycle + 1
+            hear(parameters, state, recorded.sample_age, recorded.drive, recorded.silent)
+            cycle(parameters, state, measurement, segments)
         found.position[:] = s.position
         found.rotation[:] = s.rotation
         found.lengths[:] = s.lengths
         found.reference[:] = s.reference
         found.command[:] = s.command
         found.conditioning = s.conditioning
+        found.mode, found.stop = s.safety.mode, s.stopping
         prepare(parameters, state, segments)
-        if status != OK:
-            return k + 1
     return len(records)

@@ -31,6 +31,7 @@ from controller.mechanism_filter import (
     filter_parameters,
 )
 from controller.readings import RATE, VELOCITY, readings_along, sensor_geometry
+from controller.safety import watch_nothing
 from controller.self_calibration import (
     LEAST_POSES,
     CalibrationError,
@@ -161,6 +162,7 @@ def calibrate_rig(
         CalibrationError: an IMU is not what it should be, or the data have no explanation, or do not suffice.
         GoughError: something in the configuration cannot be used.
     """
+    config = replace(config, raw_imus=True)
     data = _Data(load_spatial(config.mechanism), config.imu, config.rate, knowledge, config.seed)
     probing = _run_open(replace(config, target="probing", duration=_PROBING_S, hold=_ZEROING_S), blind=True)
     data.begin(probing, round(_ZEROING_S * config.rate))
@@ -242,7 +244,7 @@ def _run_open(config: SimulationConfig, blind: bool = False) -> Record:
     """
     with prepared_loop(config) as loop:
         loop.parameters["gains"] = 0.0
-        loop.parameters["plausible_lengths"] = -np.inf, np.inf
+        watch_nothing(loop.parameters)
         if blind:
             loop.parameters["droop"] = 0.0
         loop.run(len(loop.records))

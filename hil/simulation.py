@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -14,18 +14,21 @@ from controller.calibration import Calibration, load_calibration
 from controller.cycle import ALL_IMUS, OK, STATE, check_rate, cycle_parameters
 from controller.direct_kinematics import poses_from_lengths
 from controller.fusion import find_vertical, fuse_heading, point_legs, prepare_platform
+from controller.inverse_kinematics import leg_lengths
 from controller.leg_filter import start_leg
 from controller.planner import Reference, plan
-from controller.settings import control_settings, sensor_settings
+from controller.safety import RIG_FAILED, describe_end
+from controller.settings import control_settings, safety_settings, sensor_settings
+from controller.stream import rest
 from controller.target import Target, check_duration, load_target
-from hil.loop import COMPUTED, RECORD, RIG_FAILED, Loop, PythonFilters, describe_status
+from hil.loop import COMPUTED, RECORD, Loop, PythonFilters
 from plant.compiled import Record
 from plant.errors import GoughError, InputError, UnknownNameError
 from plant.export import default_fmu
-from plant.fmu import FmuPlant
+from plant.fmu import CALLS, FmuPlant
 from plant.imu import ACCELEROMETER, GYROSCOPE, RIGHT_WIRING, Wiring, imu_state, load_imu
 from plant.mechanism import LEGS, Mechanism, load_spatial
-from plant.pose import Array, checked_seed, rotation_angle, rotations_from_quaternions
+from plant.pose import Array, Pose, checked_seed, rotation_angle, rotations_from_quaternions
 from plant.variables import PLATFORM_IMU
 
 FUSIONS = {
@@ -38,6 +41,10 @@ FUSIONS = {
 }
 """Ways to fuse the IMUs: by leg and platform filters, in compiled code or filterpy's, unrefined as in the paper's section 5; or
 all together in the whole-mechanism filter, with the errors of the IMUs that it estimates."""
+
+RIGS = ("fmu", "udp", "canopen")
+STREAM_TARGET = "stream"
+"""A target that is streamed, alone or with the address to listen at, such as stream:127.0.0.1:47200."""
 
 HOLD_RANGE_S = (0.2, 10.0)
 _CHUNK_S = 0.25
@@ -64,6 +71,10 @@ class SimulationConfig:
         wiring: how they are mounted and wired.
         joint_error: of each coordinate of the plant's joints, which the controller does not know: standard deviation [m].
         magnetometer: whether the platform's magnetometer gives its heading.
+        rig: what is driven: the plant's FMU ("fmu"), or a rig on a bus ("udp", "canopen").
+        rig_at: its address or its settings' file; None for its default.
+        arm: whether the drives are asked for; else everything is read and nothing moves.
+        raw_imus: whether the IMUs are known to be uncalibrated, so that their disagreement says nothing.
     """
 
     mechanism: str = "hexapod"
@@ -80,6 +91,10 @@ class SimulationConfig:
     wiring: Wiring = RIGHT_WIRING
     joint_error: float = 0.0
     magnetometer: bool = False
+    rig: str = "fmu"
+    rig_at: str | None = None
+    arm: bool = True
+    raw_imus: bool = False
 
     def __post_init__(self) -> None:
         check_rate(self.rate)
@@ -90,6 +105,13 @@ class SimulationConfig:
             raise InputError(f"the duration is {self.duration:g} s, less than one cycle of {1.0 / self.rate:g} s")
         if self.fusion not in FUSIONS:
             raise UnknownNameError(f"no fusion {self.fusion!r}; there are {', '.join(FUSIONS)}")
+        if self.rig not in RIGS:
+            raise UnknownNameError(f"no rig {self.rig!r}; there are {', '.join(RIGS)}")
+
+    @property
+    def streamed(self) -> bool:
+        """Whether the target is streamed while the loop runs."""
+        return self.target == STREAM_TARGET or self.target.startswith(f"{STREAM_TARGET}:")
 
 
 class SimulationStoppedError(GoughError, RuntimeError):
@@ -177,23 +199,25 @@ def simulate(config: SimulationConfig, progress: Callable[[float], None] = lambd
         GoughError: something in the configuration cannot be used; nothing has run then.
         SimulationStoppedError: the loop ended before its time.
     """
+    if config.streamed or config.rig != "fmu":
+        raise InputError("a streamed target and a rig on a bus have a clock of their own: use 'gough run'")
     with prepared_loop(config) as loop:
         count = len(loop.records)
         filters = filterpy_filters(loop.parameters) if config.fusion == "filterpy" else None
-        status, took = OK, loop.planning_time
+        cause, took = OK, loop.planning_time
         chunk = max(1, round(_CHUNK_S * config.rate))
         for last in range(chunk, count + chunk, chunk):
             began = time.perf_counter()
-            status = loop.run(min(last, count), filters)
+            cause = loop.run(min(last, count), filters)
             took += time.perf_counter() - began
-            if status != OK:
+            if cause != OK:
                 break
             progress(min(last, count) / count)
         done = int(loop.state["cycle"])
         result = _result(config, loop, done, took)
-        if status != OK:
-            cause = str(loop.plant.failure("the plant failed")) if status >= RIG_FAILED else describe_status(status)
-            raise SimulationStoppedError(f"stopped on the brakes at cycle {done} of {count}: {cause}", result)
+        if cause != OK:
+            at = int(loop.state["stop_cycle"])
+            raise SimulationStoppedError(f"stopped on the brakes at cycle {at} of {count}: {loop.reason()}", result)
     return result
 
 
@@ -208,12 +232,18 @@ class PreparedLoop(Loop):
         planning_time: what planning took [s].
     """
 
-    plant: FmuPlant
+    plant: FmuPlant | None
     mechanism: Mechanism
     target: Target
     reference: Reference
     end: int
     planning_time: float
+
+    def reason(self) -> str:
+        """Why the run has ended, in words; a plant that failed has its own."""
+        if self.plant is not None and self.state["stopping"] == RIG_FAILED and self.plant.messages:
+            return str(self.plant.failure("the plant failed"))
+        return describe_end(self.state)
 
 
 @contextmanager
@@ -230,17 +260,18 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
     nominal = load_spatial(config.mechanism)
     calibration = Calibration() if config.calibration is None else load_calibration(config.calibration)
     mechanism = nominal.moved_joints(calibration.joints)
-    target = load_target(config.target, mechanism, config.duration)
+    target = load_target("hold" if config.streamed else config.target, mechanism, config.duration)
     period = 1.0 / config.rate
     model = load_imu(config.imu)
     imu = imu_state(model, config.seed, period, config.wiring)
     control = control_settings(mechanism, **({} if config.hold is None else {"hold": config.hold}))
     if not HOLD_RANGE_S[0] <= control.hold <= HOLD_RANGE_S[1]:
         raise InputError(f"hold is {control.hold:g} s; the estimate settles in {HOLD_RANGE_S[0]:g} to {HOLD_RANGE_S[1]:g} s")
-    fusion = sensor_settings(mechanism, model)
+    fusion, safety = sensor_settings(mechanism, model), safety_settings(mechanism)
     parameters = cycle_parameters(
         mechanism, config.rate, control, fusion, config.imus, FUSIONS[config.fusion], calibration, config.magnetometer,
-        config.fusion == "section-5",
+        config.fusion == "section-5", safety.for_raw_imus() if config.raw_imus else safety,
+        0.0 if config.rig == "fmu" else period, config.arm,
     )  # fmt: skip
     count = int(parameters["hold_cycles"]) + round(config.duration * config.rate)
     if records is None and count * RECORD.itemsize > MOST_RECORD_BYTES:
@@ -249,13 +280,15 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             f"{MOST_RECORD_BYTES / 2**30:g} GiB: choose a shorter duration or a lower rate, or 'gough run', which keeps seconds"
         )
     plan(mechanism, load_target("hold", mechanism, 0.1), 0.1)
-    fmu = default_fmu() if config.plant is None else Path(config.plant)
-    built = nominal.built(config.joint_error, config.seed)
-    with FmuPlant(fmu, built.plant_parameters(target.start), period) as plant:
+    with simulated_plant(config, nominal, target.start) if config.rig == "fmu" else nullcontext() as plant:
         began = time.perf_counter()
-        reference = plan(mechanism, target, config.duration)
+        if config.streamed:
+            lengths = leg_lengths(mechanism, target.start.position, target.start.rotation)
+            reference = Reference(rest(lengths), 0)
+        else:
+            reference = plan(mechanism, target, config.duration)
         loop = PreparedLoop(
-            calls=plant.calls,
+            calls=np.zeros((), CALLS) if plant is None else plant.calls,
             imu=imu,
             parameters=parameters,
             state=np.zeros((), STATE),
@@ -270,6 +303,17 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         )
         loop.load(python=config.fusion == "filterpy")
         yield loop
+
+
+def simulated_plant(config: SimulationConfig, nominal: Mechanism, start: Pose) -> FmuPlant:
+    """The plant that a configuration describes, at rest at its start.
+
+    Raises:
+        GoughError: the FMU or the joint error cannot be used.
+    """
+    fmu = default_fmu() if config.plant is None else Path(config.plant)
+    built = nominal.built(config.joint_error, config.seed)
+    return FmuPlant(fmu, built.plant_parameters(start), 1.0 / config.rate)
 
 
 def _result(config: SimulationConfig, loop: PreparedLoop, done: int, took: float) -> SimulationResult:

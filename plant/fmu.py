@@ -45,9 +45,11 @@ CALLS = np.dtype(
         ("command_reference", np.uint32, 1),
         ("mode_reference", np.uint32, 1),
         ("wrench_reference", np.uint32, 1),
+        ("payload_reference", np.uint32, 1),
         ("imu", np.float64, (len(_IMU_OUTPUTS), IMU_COUNT, 3)),
         ("truth", np.float64, sum(BY_NAME[name].size for name in _TRUTH_OUTPUTS)),
         ("mode", np.int64, 6),
+        ("payload", np.float64, 1),
         ("reached", np.float64, 1),
         ("flags", np.uint8, 3),
     ],
@@ -245,6 +247,8 @@ class FmuPlant:
         calls["command_reference"] = self._variables["velocity_command"].valueReference
         calls["mode_reference"] = self._variables["drive_mode"].valueReference
         calls["wrench_reference"] = self._variables["external_wrench"].valueReference
+        if "payload.mass" in self._variables:
+            calls["payload_reference"] = self._variables["payload.mass"].valueReference
         for name, value in parameters.items():
             self.set(name, value)
         try:
@@ -347,9 +351,25 @@ def write_command(calls: Record, command: Array) -> int:
 @kernel
 def write_drive_mode(calls: Record, mode: int) -> int:
     """Set the mode of all six drives; returns FMI's status."""
+    calls[()].mode[:] = mode
+    return write_drive_modes(calls)
+
+
+@kernel
+def write_drive_modes(calls: Record) -> int:
+    """Set the modes of the drives to those in `mode`; returns FMI's status."""
     c = calls[()]
-    c.mode[:] = mode
     return _access(c.set_enumeration, (c.instance, c.mode_reference.ctypes.data, 1, c.mode.ctypes.data, c.mode.size))
+
+
+@kernel
+def write_payload_mass(calls: Record, mass: float) -> int:
+    """Set the mass of the payload [kg], if the plant has one; returns FMI's status."""
+    c = calls[()]
+    if c.payload_reference[0] == 0:
+        return 0
+    c.payload[0] = mass
+    return _access(c.set, (c.instance, c.payload_reference.ctypes.data, 1, c.payload.ctypes.data, 1))
 
 
 @kernel

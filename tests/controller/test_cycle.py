@@ -10,9 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from controller.cycle import (
     ALL_IMUS,
-    NOT_FINITE,
     OK,
-    POSE_LOST,
     STATE,
     check_imus,
     cycle,
@@ -21,7 +19,8 @@ from controller.cycle import (
 from controller.direct_kinematics import solve
 from controller.fusion import improve_pose
 from controller.inverse_kinematics import leg_lengths, sample_workspace
-from controller.settings import ControlSettings, FusionSettings, control_settings, fusion_settings
+from controller.safety import NOT_FINITE, POSE_LOST
+from controller.settings import ControlSettings, FusionSettings, SafetySettings, control_settings, fusion_settings
 from plant.errors import InputError
 from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER, imu_state, load_imu, measure
 from plant.mechanism import Mechanism
@@ -38,13 +37,18 @@ from tests.controller.leg_geometry import (
 from tests.controller.leg_motion import observe_mechanism
 
 RATE_HZ = 1000.0
+UNWATCHED = SafetySettings(
+    following=1e3, drive_deviation=1e3, saturation=1e3, velocity_margin=1e3, arming_distance=1e3, watch_imus=0.0
+)
+"""For signals that do not follow the commands."""
 PERIOD_S = 1.0 / RATE_HZ
 LEG_IMUS = (0, 1, 2, 3, 4, 5)
 DEGREE = np.pi / 180.0
 
 
 def parameters_of(mechanism, imus=ALL_IMUS, rate=RATE_HZ, **control):
-    return cycle_parameters(mechanism, rate, control_settings(mechanism, **control), fusion_settings(mechanism), imus)
+    settings = control_settings(mechanism, **control), fusion_settings(mechanism)
+    return cycle_parameters(mechanism, rate, *settings, imus, safety=UNWATCHED)
 
 
 def resting(lengths):

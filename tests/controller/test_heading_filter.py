@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from controller.cycle import ALL_IMUS, OK, POSE_LOST, STATE, check_imus, cycle, cycle_parameters
+from controller.cycle import ALL_IMUS, OK, STATE, check_imus, cycle, cycle_parameters
 from controller.direct_kinematics import solve
 from controller.heading_filter import ERRORS, STATES, predict_heading, start_heading, update_heading
 from controller.inverse_kinematics import leg_lengths, sample_workspace
-from controller.settings import FusionSettings, control_settings, fusion_settings
+from controller.safety import POSE_LOST
+from controller.settings import FusionSettings, SafetySettings, control_settings, fusion_settings
 from plant.errors import InputError
 from plant.imu import MAGNETOMETER, imu_state, load_imu, measure
 from plant.mechanism import Mechanism
@@ -97,9 +98,9 @@ def test_the_covariance_is_that_of_the_errors():
 
 
 def parameters_of(mechanism, imus=ALL_IMUS, **choices):
-    return cycle_parameters(
-        mechanism, 1.0 / PERIOD_S, control_settings(mechanism), fusion_settings(mechanism), imus, **choices
-    )  # fmt: skip
+    settings = control_settings(mechanism), fusion_settings(mechanism)
+    unwatched = SafetySettings(following=1e3, drive_deviation=1e3, saturation=1e3)
+    return cycle_parameters(mechanism, 1.0 / PERIOD_S, *settings, imus, safety=unwatched, **choices)
 
 
 def run(parameters, signals, count, state=None):

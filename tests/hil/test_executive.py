@@ -451,11 +451,11 @@ def test_what_is_over_the_budget_is_named(recorded):
 def test_a_run_that_cannot_go_on_says_why_and_keeps_its_recording(tmp_path):
     path = tmp_path / "raw.mcap"
     with pytest.raises(
-        RunStoppedError, match=r"stopped on the brakes at cycle \d+: the estimated pose needs a leg far"
+        RunStoppedError, match=r"stopped on the brakes at cycle \d+: the estimated pose needs leg \d far"
     ) as stopped:
         run(SimulationConfig(imu="mpu9150", duration=5.0, rate=500.0), SETTINGS, path)
     assert stopped.value.summary["cycles"] == len(read(path).records)
-    assert any("stopped on the brakes" in text for _, text in read(path).events)
+    assert any("quick stop" in text for _, text in read(path).events)
     assert replay([path]).same
 
 
@@ -614,18 +614,18 @@ def test_a_recording_that_cannot_go_on_is_told_in_a_line_and_the_run_goes_on(tmp
 
 
 class Raising(FmuRig):
-    """A rig that fails in motion, and leaves a mark when it is braked."""
+    """A rig that fails in motion, and leaves a mark when it is stopped."""
 
     mark = Path()
 
-    def write(self, command):
+    def exchange(self, command, request, feedback):
         if self._loop.state["cycle"] > 60:
             raise ValueError("the bus is gone")
-        return super().write(command)
+        return super().exchange(command, request, feedback)
 
-    def brake(self):
+    def quick_stop(self):
         Raising.mark.touch()
-        return super().brake()
+        super().quick_stop()
 
 
 def test_a_rig_that_raises_is_braked(tmp_path):
@@ -636,15 +636,15 @@ def test_a_rig_that_raises_is_braked(tmp_path):
 
 
 class Refusing(FmuRig):
-    """A rig whose commands fail in motion."""
+    """A rig whose exchanges fail in motion."""
 
-    def write(self, command):
-        return 103 if self._loop.state["cycle"] > 60 else super().write(command)
+    def exchange(self, command, request, feedback):
+        return 104 if self._loop.state["cycle"] > 60 else super().exchange(command, request, feedback)
 
 
-def test_a_command_that_fails_is_told_and_replayed(tmp_path):
+def test_an_exchange_that_fails_is_told_and_replayed(tmp_path):
     path = tmp_path / "run.mcap"
-    with pytest.raises(RunStoppedError, match="the rig reports failure 3"):
+    with pytest.raises(RunStoppedError, match=r"the rig reports failure \(104\)"):
         run(SimulationConfig(duration=1.0, rate=100.0), SETTINGS, path, rig=Refusing)
     assert replay([path]).same
 

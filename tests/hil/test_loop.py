@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from controller.cycle import OK, STATE, cycle, prepare, skip
+from controller.safety import ASKED_TO_STOP, END_OF_MOTION, MISSED_PERIODS
 from hil.clock import REAL, SCRIPTED, new_clock
-from hil.loop import ASKED_TO_STOP, END_OF_MOTION, HEAD, MISSED_PERIODS, RECORD, STAGES, STOP, STOPPED, FmuRig, Loop
+from hil.loop import HEAD, RECORD, STAGES, STOP, FmuRig, Loop
 from hil.simulation import SimulationConfig, prepared_loop
 from plant.imu import imu_state, load_imu
 from plant.variables import BRAKE
@@ -154,9 +155,8 @@ def stops_within_limits(loop, records, off=1e-3):
 
 def test_the_end_of_a_motion_is_a_stop_within_the_limits_and_the_brakes():
     with prepared_loop(CONFIG) as loop:
-        status, records = follow(scripted(loop), 1.234)
-        assert status == STOPPED
-        assert loop.state["stopping"] == END_OF_MOTION
+        cause, records = follow(scripted(loop), 1.234)
+        assert cause == loop.state["stopping"] == END_OF_MOTION
         assert records["stop"].nonzero()[0][0] == 1234 + loop.parameters["hold_cycles"]
         stops_within_limits(loop, records)
         assert (loop.calls["mode"] == BRAKE).all()
@@ -165,9 +165,8 @@ def test_the_end_of_a_motion_is_a_stop_within_the_limits_and_the_brakes():
 def test_too_many_missed_in_a_row_end_in_a_controlled_stop_and_fewer_do_not():
     for periods, stops in ((9, False), (10, True), (400, True)):
         with prepared_loop(CONFIG) as loop:
-            status, records = follow(scripted(loop, late={900: periods * MS}))
-            assert status == STOPPED
-            assert (loop.state["stopping"] == MISSED_PERIODS) == stops
+            cause, records = follow(scripted(loop, late={900: periods * MS}))
+            assert cause == (MISSED_PERIODS if stops else END_OF_MOTION)
             # In a long pause the drives go on as they were last told, and then have some way back.
             stops_within_limits(loop, records, off=1e-3 if periods < 100 else 2e-2)
             if stops:
@@ -180,9 +179,8 @@ def test_work_that_is_always_too_long_ends_in_a_controlled_stop():
     with prepared_loop(CONFIG) as loop:
         loop.most_missed = 25
         work = dict.fromkeys(range(800, 5000), 1_200_000)
-        status, records = follow(scripted(loop, work=work, cpu=work))
-        assert status == STOPPED
-        assert loop.state["stopping"] == MISSED_PERIODS
+        cause, records = follow(scripted(loop, work=work, cpu=work))
+        assert cause == MISSED_PERIODS
         assert records["stop"].nonzero()[0][0] == 825
         assert loop.clock["most_in_a_row"] >= 25
         stops_within_limits(loop, records)
@@ -192,16 +190,15 @@ def test_asked_to_stop_it_does_in_motion_at_once_and_in_the_hold_without_moving(
     with prepared_loop(CONFIG) as loop:
         scripted(loop).run(1000)
         loop.link[STOP] = 1
-        status, records = follow(loop)
-        assert status == STOPPED
-        assert loop.state["stopping"] == ASKED_TO_STOP
+        cause, records = follow(loop)
+        assert cause == ASKED_TO_STOP
         assert records["stop"].nonzero()[0][0] == 1000
         stops_within_limits(loop, records)
     with prepared_loop(CONFIG) as loop:
         scripted(loop).run(100)
         loop.link[STOP] = 1
-        status, records = follow(loop)
-        assert status == STOPPED
+        cause, records = follow(loop)
+        assert cause == ASKED_TO_STOP
         assert len(records) == 100
         assert (records["command"] == 0.0).all()
 
@@ -223,8 +220,8 @@ def test_a_rig_in_python_runs_the_same_cycle_at_the_same_times():
         for loop in (compiled, python):
             scripted(loop, late=late, work=work)
         end = 1000
-        assert compiled.follow(end) == STOPPED
-        assert python.follow(end, FmuRig(python)) == STOPPED
+        assert compiled.follow(end) == END_OF_MOTION
+        assert python.follow(end, FmuRig(python)) == END_OF_MOTION
         assert compiled.link[HEAD] == python.link[HEAD]
         first, second = written(compiled), written(python)
         for name in set(first.dtype.names) - {"stage_ns"}:
@@ -236,7 +233,7 @@ def test_a_clock_on_the_machine_wakes_at_every_deadline():
     with prepared_loop(SimulationConfig(target="hold", duration=0.5, rate=250.0)) as loop:
         loop.clock = new_clock(REAL, 4 * MS)
         loop.records = np.zeros(1000, RECORD)
-        assert loop.follow(175) == STOPPED
+        assert loop.follow(175) == END_OF_MOTION
         records = written(loop)
         assert (np.diff(records["cycle"]) == 1 + records["missed"][1:]).all()
         assert (records["late_ns"] >= 0).all()
