@@ -118,6 +118,14 @@ def describe_end(state: Record) -> str:
     )
 
 
+def describe_obstacle(state: Record) -> str:
+    """What is in the way of arming, in words; "" if nothing is."""
+    safety = state["safety"]
+    cause = int(safety["obstacle"])
+    values = int(safety["obstacle_index"]), float(safety["obstacle_value"]), float(safety["obstacle_limit"])
+    return describe_event(cause, *values) if cause != NO_CAUSE else ""
+
+
 def describe_event(cause: int, index: int, value: float, limit: float) -> str:
     """An event in words."""
     known = CAUSES[cause]

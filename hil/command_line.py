@@ -965,6 +965,8 @@ def _print_run(summary: dict[str, Any]) -> None:
         print(f"{kept} cycles recorded in {files}; {summary['recording']['lost']} cycles lost")
     if summary["identity"]:
         print(f"rig: {summary['identity']['name']} {summary['identity']['parts']}")
+    if summary["obstacle"] is not None:
+        print(summary["obstacle"] or "nothing was moved; all is well for arming")
     print(f"stopped on the brakes: {summary['cause']}")
 
 

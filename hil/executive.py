@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.inverse_kinematics import leg_lengths
-from controller.safety import ASKED_TO_STOP, CAUSES, END_OF_MOTION, STOP_QUICKLY
+from controller.safety import ASKED_TO_STOP, CAUSES, END_OF_MOTION, STOP_QUICKLY, describe_obstacle
 from controller.stream import DONE as STREAM_DONE
 from controller.stream import STREAM
 from controller.stream_planner import StreamPlanner
@@ -171,7 +171,8 @@ def run(
     Returns:
         The summary: `cause` of the stop, `cycles`, missed periods by cause, `timing_us` and what of it is `over_budget`,
         `errors_m`, cycles `unseen` by these three, `usage` of the loop's thread, `start_up_s`, `recording` (files, cycles
-        lost), `refused`, `events`, `config`, `version`.
+        lost), `refused`, `events`, `config`, `version`; of a rig on a bus `identity`, `late` exchanges, `refused_packets` and
+        `round_trip_bars`; and of a dry run the `obstacle` to arming, "" if there is none.
 
     Raises:
         GoughError: something in the configuration or the settings cannot be used; nothing has run then.
@@ -405,6 +406,7 @@ def _prepare_and_follow(
             {
                 "stop": cause,
                 "identity": header["config"].get("identity"),
+                "obstacle": None if config.arm else describe_obstacle(loop.state),
                 "reason": loop.reason(),
                 "cycle": int(loop.state["stop_cycle"]),
                 "cycles": int(link[HEAD]),
@@ -528,6 +530,7 @@ def _summary(
         "refused_packets": progress.refused_packets,
         "round_trip_bars": progress.timing.histograms["round trip"].bars(),
         "identity": outcome["identity"],
+        "obstacle": outcome["obstacle"],
         "events": progress.events,
         "config": asdict(config),
         "version": version("gough"),
