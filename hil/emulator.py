@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.safety import FOLLOWING
+from controller.safety import FOLLOWING, QUICK_STOPPING
 from controller.target import load_target
 from hil.loop import prevent_compilation
 from hil.realtime import RealTimeSettings, real_time
@@ -104,7 +104,7 @@ def emulate(config: EmulatorConfig, settings: RealTimeSettings, say: Callable[[s
                 control.answer(None)
             if opened in readable:
                 content, sender = opened.recvfrom(2048)
-                hello = decode(HELLO_DATAGRAM, HELLO, content)
+                hello = _hello(content)
                 if hello is not None:
                     _serve_sessions(opened, hello, sender, config, faults, control, say, stopped)
 
@@ -247,6 +247,12 @@ def _serve_sessions(
             say(f"end of the session; {int(emulator.port['refused'])} datagrams refused")
 
 
+def _hello(content: bytes) -> Record | None:
+    """A hello that begins a session, if these bytes are one."""
+    hello = decode(HELLO_DATAGRAM, HELLO, content)
+    return hello if hello is not None and hello["session"] != 0 and hello["period_us"] != 0 else None
+
+
 def _welcome(opened: socket.socket, hello: Record, sender: tuple[str, int]) -> None:
     name, firmware = (np.frombuffer(text.encode().ljust(size, b"\0"), np.uint8) for text, size in ((_NAME, 32), ("1", 16)))
     fields = {"session": hello["session"], "watchdog_us": round(1e6 * WATCHDOG_S), "truthful": 1, "name": name}
@@ -266,11 +272,11 @@ def _serve_session(
             if not met:
                 continue
             content = emulator.command_bytes[: HELLO_DATAGRAM.itemsize].tobytes()
-            hello = decode(HELLO_DATAGRAM, HELLO, content)
+            hello = _hello(content)
             address = bytes(emulator.socket["sender"])
             sender = (socket.inet_ntoa(address[4:8]), int.from_bytes(address[2:4], "big"))
             # A rig that moves has one controller.
-            if hello is None or (emulator.rig["drive"] == FOLLOWING).any():
+            if hello is None or np.isin(emulator.rig["drive"], (FOLLOWING, QUICK_STOPPING)).any():
                 emulator.port["refused"] += 1
             elif hello["session"] == emulator.port["session"]:
                 _welcome(opened, hello, sender)

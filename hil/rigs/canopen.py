@@ -17,6 +17,8 @@ from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
 from hil.rigs import ANSWERED, BRAKED, ENABLED, OFF, SILENT, Identity, RigError
 from hil.rigs.canopen_settings import CanopenSettings, object_dictionary
 from hil.rigs.cia402 import (
+    ABORT_CONNECTION_OPTION,
+    ABORT_QUICK_STOP,
     CONTROLWORD,
     CYCLIC_SYNCHRONOUS_VELOCITY,
     DISABLE_AT_ONCE,
@@ -24,7 +26,10 @@ from hil.rigs.cia402 import (
     DISABLE_VOLTAGE,
     ERROR_CODE,
     FAULT,
+    FAULT_RAMP,
+    FAULT_REACTION_OPTION,
     FAULT_RESET,
+    INTERPOLATION_PERIOD,
     MAX_MOTOR_SPEED,
     MODE,
     MODE_DISPLAY,
@@ -413,6 +418,7 @@ class CanopenRig:
 
     def _configure_drive(self, node: _Node) -> None:
         drives = self._settings.drives
+        units, exponent = interpolation_period(self.command_delay)
         for pdo in DRIVE_PDOS:
             node.map_pdo(pdo)
         node.configure(PRODUCER_HEARTBEAT, 0, round(drives.heartbeat * 1e3))
@@ -421,6 +427,10 @@ class CanopenRig:
             (DRIVE_PDOS[0].communication, EVENT_TIMER, round(drives.command_timeout * 1e3)),
             (SYNC_OVERFLOW_VALUE, 0, SYNC_OVERFLOW),
             (DISABLE_OPERATION_OPTION, 0, DISABLE_AT_ONCE),
+            (FAULT_REACTION_OPTION, 0, FAULT_RAMP),
+            (ABORT_CONNECTION_OPTION, 0, ABORT_QUICK_STOP),
+            (INTERPOLATION_PERIOD, 2, exponent),
+            (INTERPOLATION_PERIOD, 1, units),
             (MAX_MOTOR_SPEED, 0, round(drives.velocity_limit / drives.screw_lead * drives.gear_ratio * 60.0)),
         ):
             # Not every drive has these.
@@ -585,6 +595,16 @@ class CanopenRig:
         with suppress(Exception):
             self.decoder.begin(self._next_sync())
             self._bus.send(self._sync)
+
+
+def interpolation_period(period: float) -> tuple[int, int]:
+    """A period [s] as CiA 402's object 60C2h has it: so many (at most 255) times a power of ten of a second."""
+    exponents = range(-3, -7, -1)
+    exact = (each for each in exponents if abs(period * 10.0**-each - round(period * 10.0**-each)) < 1e-6)
+    exponent = next((each for each in exact if 1 <= round(period * 10.0**-each) <= 255), None)
+    if exponent is None:
+        exponent = min((each for each in exponents if period * 10.0**-each <= 255.0), default=-3)
+    return max(1, round(period * 10.0**-exponent)), exponent
 
 
 def _shown(value: Any) -> str:

@@ -251,10 +251,10 @@ class CanopenSettings:
         load = self.bus_load(rate)
         if self.bus.interface == "socketcan" and load > LARGEST_LOAD:
             remedy = "" if self.bus.fd else ", or use CAN FD"
-            highest = LARGEST_LOAD / self.bus_load(1.0)
+            highest = int(LARGEST_LOAD / self.bus_load(1.0))
             raise RigError(
                 f"at {rate:g} Hz the frames of a cycle take {load:.0%} of the bus' time, more than {LARGEST_LOAD:.0%}: "
-                f"lower the rate to {highest:.0f} Hz, raise the bit rate{remedy}"
+                f"lower the rate to {highest} Hz, raise the bit rate{remedy}"
             )
         return load
 

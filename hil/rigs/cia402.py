@@ -31,16 +31,20 @@ drive follows the target velocity."""
 
 (
     ERROR_CODE, CONTROLWORD, STATUSWORD, QUICK_STOP_OPTION, DISABLE_OPERATION_OPTION, MODE, MODE_DISPLAY, VELOCITY_ACTUAL,
-    MAX_MOTOR_SPEED, QUICK_STOP_DECELERATION, TARGET_VELOCITY,
-) = 0x603F, 0x6040, 0x6041, 0x605A, 0x605C, 0x6060, 0x6061, 0x606C, 0x6080, 0x6085, 0x60FF  # fmt: skip
+    MAX_MOTOR_SPEED, QUICK_STOP_DECELERATION, TARGET_VELOCITY, ABORT_CONNECTION_OPTION, FAULT_REACTION_OPTION,
+    INTERPOLATION_PERIOD,
+) = (
+    0x603F, 0x6040, 0x6041, 0x605A, 0x605C, 0x6060, 0x6061, 0x606C, 0x6080, 0x6085, 0x60FF, 0x6007, 0x605E, 0x60C2,
+)  # fmt: skip
 """Objects of a drive."""
 
 CYCLIC_SYNCHRONOUS_VELOCITY = 9
 """Mode of operation."""
 
-QUICK_STOP_RAMP, DISABLE_AT_ONCE = 2, 0
+QUICK_STOP_RAMP, DISABLE_AT_ONCE, FAULT_RAMP, ABORT_QUICK_STOP = 2, 0, 2, 3
 """Option codes: a quick stop slows down by the quick-stop deceleration and ends in Switch on disabled; "disable operation"
-takes the power off and so closes the brake at once."""
+takes the power off and so closes the brake at once; a fault slows down in the same way, and a lost connection is a quick
+stop."""
 
 HEARTBEAT_LOST, PDO_LOST = 0x8130, 0x8250
 """Error codes of a drive that misses its controller: no heartbeat, no RPDO in time."""

@@ -73,6 +73,9 @@ fault's, is at the drives' own `deceleration` [m/s^2].
 """
 
 
+POWER_LOST = 0x3220
+"""CiA 402's code for a voltage that was too low, which a drive reports when its power is back."""
+
 _SPEED_RESERVE = 1.5
 """What a drive can do beyond the limit of velocity, for control."""
 
@@ -213,6 +216,8 @@ def _step_drive(r: Record, k: int, period: float) -> None:
     if unpowered:
         r.drive[k], r.velocity[k] = OFF, 0.0
         return
+    if r.drive[k] == OFF:
+        r.drive[k], r.code[k] = FAULTY, POWER_LOST
     if broken and r.drive[k] != FAULTY:
         r.drive[k], r.code[k] = FAULTY, code
     if r.drive[k] == FAULTY:

@@ -16,7 +16,20 @@ from numba import types
 from numpy.typing import NDArray
 
 from hil.clock import now
-from hil.rigs import ANSWERED, BRAKED, FAULTY, FOLLOWING, OFF, QUICK_STOP, READY, SILENT, Identity, RigError, new_feedback
+from hil.rigs import (
+    ANSWERED,
+    BRAKED,
+    FAULTY,
+    FOLLOWING,
+    OFF,
+    QUICK_STOP,
+    QUICK_STOPPING,
+    READY,
+    SILENT,
+    Identity,
+    RigError,
+    new_feedback,
+)
 from hil.rigs.datagrams import (
     COMMAND,
     COMMAND_DATAGRAM,
@@ -46,9 +59,10 @@ DEFAULT_ADDRESS = "127.0.0.1:47100"
 TIMEOUT_SHARE = 0.5
 """How much of a period an exchange may last."""
 
-_HAND_SHAKES, _HAND_SHAKE_S = 10, 0.2
+_OPENING_S, _HAND_SHAKE_S = 2.0, 0.2
 _ARMING_S = 2.0
-_STOPS = 5
+_STOPPING_S = 0.5
+_FAREWELLS = 3
 
 SOCKET = np.dtype(
     [
@@ -237,7 +251,8 @@ class UdpRig:
         session = secrets.randbits(31) + 1
         hello = encode(HELLO_DATAGRAM, kind=HELLO, session=session, period_us=round(1e6 * self.command_delay))
         welcome = None
-        for _ in range(_HAND_SHAKES):
+        deadline = time.monotonic() + _OPENING_S
+        while time.monotonic() < deadline:
             try:
                 opened.sendto(hello, self.address)
                 content, sender = opened.recvfrom(2048)
@@ -305,18 +320,27 @@ class UdpRig:
         return exchange_udp(self.link, command, request, feedback, self._timespec)
 
     def quick_stop(self) -> None:
-        """Tell the drives to stop, several times, for a datagram may be lost."""
+        """Tell the drives to stop until they say that they have, or do not answer for half a second."""
         if self._socket is None:
             return
-        for _ in range(_STOPS):
-            encode_command(self.link, np.zeros(LEGS), QUICK_STOP, 0)
-            send_datagram(self.link.socket, self.link.command_bytes, COMMAND_DATAGRAM.itemsize)
+        feedback, deadline = new_feedback()[()], time.monotonic() + _STOPPING_S
+        self.link.socket["reset"] = 0
+        while time.monotonic() < deadline:
+            answered = self.exchange(np.zeros(LEGS), QUICK_STOP, feedback) == ANSWERED
+            if answered and not np.isin(feedback["drive"], (FOLLOWING, QUICK_STOPPING)).any():
+                return
+            time.sleep(self.command_delay)
 
     def close(self) -> None:
-        """Close the socket; the rig's watchdog does the rest."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
+        """Leave the drives on their brakes, and close the socket; if nothing comes through, the rig's watchdog does that."""
+        if self._socket is None:
+            return
+        if self._identity is not None:
+            for _ in range(_FAREWELLS):
+                encode_command(self.link, np.zeros(LEGS), BRAKED, 0)
+                send_datagram(self.link.socket, self.link.command_bytes, COMMAND_DATAGRAM.itemsize)
+        self._socket.close()
+        self._socket = None
 
 
 def parse_address(text: str, anywhere: bool = False) -> tuple[str, int]:
@@ -328,12 +352,14 @@ def parse_address(text: str, anywhere: bool = False) -> tuple[str, int]:
     host, _, port = text.rpartition(":")
     try:
         address = ipaddress.IPv4Address(host)
-        number = int(port)
+        # int would take blanks, signs and underscores too.
+        number = int(port) if port.isdecimal() else 0
     except ValueError:
         raise InputError(f"{text!r} is no address; give an IPv4 address and a port, such as {DEFAULT_ADDRESS}") from None
     if not 0 < number < 65536:
-        raise InputError(f"the port is {number}; it must be 1 to 65535")
-    if not (anywhere or address.is_loopback or address.is_private):
+        raise InputError(f"the port of {text!r} must be a number from 1 to 65535")
+    # 0.0.0.0, which is every interface, counts as private.
+    if not (anywhere or address.is_loopback or (address.is_private and not address.is_unspecified)):
         raise InputError(f"{host} is neither loopback nor of a private network: nothing is encrypted; use a dedicated link")
     return host, number
 

@@ -118,11 +118,23 @@ def new_udp_emulator(calls: Record, imu: Record, rig: Record, session: int = 0, 
 
 
 @kernel
+def is_later(sequence: int, last: int) -> bool:
+    """Whether a number that wraps at 2^32 comes after another."""
+    ahead = (np.int64(sequence) - np.int64(last)) & 0xFFFFFFFF
+    return bool(0 < ahead < 0x80000000)
+
+
+@kernel
 def answer(emulator: UdpEmulator, length: int, now_ns: int) -> int:
     """Do what the received datagram of `length` bytes says, and write the answer; returns its length, 0 if there is none."""
     rig, port, c, a = emulator.rig[()], emulator.port[()], emulator.command[0], emulator.answer[0]
     data, size = emulator.command_bytes, emulator.command.itemsize
-    if not is_sound(data, c, length, size, COMMAND) or c.session != port.session or c.session == 0 or c.sequence <= port.last:
+    if (
+        not is_sound(data, c, length, size, COMMAND)
+        or c.session != port.session
+        or c.session == 0
+        or not is_later(c.sequence, port.last)
+    ):
         port.refused += 1
         return 0
     finite = True
@@ -134,7 +146,8 @@ def answer(emulator: UdpEmulator, length: int, now_ns: int) -> int:
     move(emulator.calls, emulator.rig, now_ns)
     port.last, port.heard_ns = c.sequence, now_ns
     for k in range(LEGS):
-        rig.request[k], rig.target[k], rig.reset[k] = c.request, c.velocity[k], c.reset
+        rig.request[k], rig.target[k] = c.request, c.velocity[k]
+        rig.reset[k] = 1 if c.reset != 0 and c.request == BRAKED else 0
     # What is asked for takes effect in this instant.
     move(emulator.calls, emulator.rig, now_ns + 1)
     if sample(emulator.calls, emulator.imu, emulator.rig, now_ns + 1) != 0:
@@ -264,12 +277,15 @@ def serve(emulator: UdpEmulator, started_ns: int, duration_ns: int, timespec: ND
         if at - begin >= duration_ns:
             return 0
         time_ns = at - started_ns
+        # Also while datagrams come all the time: a flood of them must not hold the watchdog up.
+        if time_ns - emulator.rig[()].time_ns >= _IDLE_NS:
+            look_after(emulator, time_ns)
         length = receive_datagram(emulator.socket, emulator.command_bytes)
         if length == _HELLO_BYTES:
             return 1
-        if length >= 0 and emulator.socket[()].stranger != 0:
+        if length == 0 or (length > 0 and emulator.socket[()].stranger != 0):
             port.refused += 1
-        elif length >= 0:
+        elif length > 0:
             post(emulator, emulator.command_bytes, min(length, LONGEST), _IN, time_ns)
         i = next_due(emulator.port)
         if i >= 0 and port.packet[i].due_ns <= time_ns:
@@ -288,7 +304,6 @@ def serve(emulator: UdpEmulator, started_ns: int, duration_ns: int, timespec: ND
             continue
         if length >= 0:
             continue
-        look_after(emulator, time_ns)
         wait = _IDLE_NS
         if i >= 0 and port.packet[i].due_ns != _NEVER:
             wait = min(wait, max(port.packet[i].due_ns - time_ns, 1000))
