@@ -21,6 +21,7 @@ bench: .venv/installed
 	$(BIN)/gough bench --json $(OUT)/bench.json $(BENCH)
 	$(BIN)/gough compare-fusion --json $(OUT)/fusion.json $(FUSION)
 	$(BIN)/gough evaluate-fusion --json $(OUT)/evaluation.json $(EVALUATION)
+	$(BIN)/gough faults --json $(OUT)/faults.json $(FAULTS)
 
 lint: .venv/installed-lint
 	$(BIN)/ruff check .

@@ -502,7 +502,7 @@ def refer(parameters: Record, state: Record, segments: Array) -> None:
 def motion_cycle(parameters: Record, state: Record) -> int:
     """How many periods of the motion have passed; 0 before it begins."""
     p, s = parameters[()], state[()]
-    return int(max(s.cycle - p.hold_cycles - s.safety.waited, 0))
+    return int(max(s.cycle - p.hold_cycles - s.safety.waited, 0)) if s.safety.mode >= RUNNING else 0
 
 
 @kernel

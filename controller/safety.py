@@ -426,6 +426,7 @@ def arm(parameters: Record, state: Record) -> None:
                 _obstruct(state, NO_DRIVES, k, np.nan, np.nan)
         if w.obstacle == NO_CAUSE:
             w.mode = RUNNING
+            w.waited = s.cycle - p.hold_cycles
             return
     if p.safety.arm == 0:
         return

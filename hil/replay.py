@@ -138,6 +138,10 @@ def _replay(
         if recorded.cycle != s.cycle + recorded.missed:
             return k
         skip(state, recorded.missed)
+        if streamed and s.stopping == 0:
+            # What the stream's plans said is known from what was followed.
+            s.reference[:] = recorded.reference
+            s.prepared = s.cycle + 1
         if recorded.asked != OK:
             begin_stop(parameters, state, recorded.asked)
         measurement[0] = recorded.angular_velocity
@@ -147,9 +151,6 @@ def _replay(
             begin_stop(parameters, state, RIG_FAILED)
             coast(parameters, state)
         else:
-            if streamed and s.stopping == 0:
-                s.reference[:] = recorded.reference
-                s.prepared = s.cycle + 1
             hear(parameters, state, recorded.sample_age, recorded.drive, recorded.silent)
             cycle(parameters, state, measurement, segments)
         found.position[:] = s.position
