@@ -64,7 +64,7 @@ PACKET = np.dtype(
     align=True,
 )
 
-UDP_RIG = np.dtype(
+UDP_PORT = np.dtype(
     [
         ("session", np.uint32),
         ("last", np.uint32),
@@ -87,7 +87,7 @@ class UdpEmulator(NamedTuple):
     Attributes:
         calls, imu: the plant and its IMUs' imperfections.
         rig: dtype `hil.rigs.emulated.EMULATED`.
-        port: dtype `UDP_RIG`.
+        port: dtype `UDP_PORT`.
         socket: dtype `hil.rigs.udp.SOCKET`; without a descriptor the rig is in memory.
         command, command_bytes: what is received.
         answer, truth, answer_bytes: what is sent.
@@ -107,7 +107,7 @@ class UdpEmulator(NamedTuple):
 
 def new_udp_emulator(calls: Record, imu: Record, rig: Record, session: int = 0, watchdog_s: float = WATCHDOG_S) -> UdpEmulator:
     """An emulated rig on UDP that has not been spoken to."""
-    port: Record = np.zeros((), UDP_RIG)
+    port: Record = np.zeros((), UDP_PORT)
     port["session"], port["watchdog_ns"] = session, round(1e9 * watchdog_s)
     received, sent = np.zeros(LONGEST, np.uint8), np.zeros(LONGEST, np.uint8)
     size = MEASUREMENT_DATAGRAM.itemsize
