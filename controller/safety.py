@@ -34,12 +34,11 @@ REACTIONS = ("goes on", "controlled stop", "quick stop", "brakes at once")
 
 @dataclass(frozen=True)
 class Cause:
-    """Why something happened: in words, the unit of its value and limit, what its index counts, and the reaction to it."""
+    """Why something happened: in words, with the number of the leg or IMU, the reaction to it, the unit of its value and limit."""
 
     text: str
     reaction: int
     unit: str = ""
-    of: str = ""
 
 
 (
@@ -59,41 +58,40 @@ CAUSES = (
     Cause("emergency stop", STOP_QUICKLY),
     Cause("this machine's clock refuses to wake the loop", BRAKE_AT_ONCE),
     Cause("the rig reports failure", BRAKE_AT_ONCE),
-    Cause("IMU {} is left out: its samples are stale", GO_ON, "cycles", "IMU"),
-    Cause("IMU {} is left out: it is frozen", GO_ON, "cycles", "IMU"),
-    Cause("IMU {} is left out: it gives what is not finite", GO_ON, "", "IMU"),
-    Cause("IMU {} is left out: it is at the end of its range", GO_ON, "of the range", "IMU"),
-    Cause("IMU {} is left out: it is noisy", GO_ON, "of the limit", "IMU"),
-    Cause("IMU {} is left out: it disagrees with the others", GO_ON, "rad", "IMU"),
-    Cause("IMU {} is used again", GO_ON, "", "IMU"),
+    Cause("IMU {} is left out: its samples are stale", GO_ON, "cycles"),
+    Cause("IMU {} is left out: it is frozen", GO_ON, "cycles"),
+    Cause("IMU {} is left out: it gives what is not finite", GO_ON),
+    Cause("IMU {} is left out: it is at the end of its range", GO_ON, "of the range"),
+    Cause("IMU {} is left out: it is noisy", GO_ON, "of the limit"),
+    Cause("IMU {} is left out: it disagrees with the others", GO_ON, "rad"),
+    Cause("IMU {} is used again", GO_ON),
     Cause("too many IMUs are lost", STOP, "IMUs"),
-    Cause("the IMUs contradict each other, the worst is IMU {}", STOP, "rad", "IMU"),
+    Cause("the IMUs contradict each other, the worst is IMU {}", STOP, "rad"),
     Cause("the IMUs that can be used no longer determine the pose", STOP_QUICKLY),
-    Cause("an estimate or a command is no longer finite", STOP_QUICKLY, "", "leg"),
+    Cause("an estimate or a command is no longer finite", STOP_QUICKLY),
     Cause(
         "the estimated pose needs leg {} far outside its stroke: the IMUs' errors are larger than the filters assume (raw ones "
         "need a calibration)",
         STOP_QUICKLY,
         "m",
-        "leg",
     ),
     Cause("the pose is badly determined", STOP),
-    Cause("leg {} is beyond its stroke", STOP, "m", "leg"),
-    Cause("leg {} is too fast", STOP, "m/s", "leg"),
-    Cause("leg {} does not follow its reference", STOP, "m", "leg"),
-    Cause("the command of leg {} stays at its limit", STOP, "s", "leg"),
+    Cause("leg {} is beyond its stroke", STOP, "m"),
+    Cause("leg {} is too fast", STOP, "m/s"),
+    Cause("leg {} does not follow its reference", STOP, "m"),
+    Cause("the command of leg {} stays at its limit", STOP, "s"),
     Cause("an exchange with the rig was late or its answer was refused", GO_ON),
     Cause("the bus is lost: the rig does not answer", STOP_QUICKLY, "cycles"),
-    Cause("drive {} reports a fault", STOP_QUICKLY, "", "leg"),
-    Cause("drive {} has left its operation", STOP_QUICKLY, "", "leg"),
-    Cause("drive {} does not do what it is told", BRAKE_AT_ONCE, "m/s", "leg"),
+    Cause("drive {} reports a fault", STOP_QUICKLY),
+    Cause("drive {} has left its operation", STOP_QUICKLY),
+    Cause("drive {} does not do what it is told", BRAKE_AT_ONCE, "m/s"),
     Cause("armed", GO_ON),
-    Cause("not armed: IMU {} is not plausible", STOP, "rad", "IMU"),
-    Cause("not armed: leg {} is not where the target begins", STOP, "m", "leg"),
-    Cause("not armed: leg {} is outside its stroke", STOP, "m", "leg"),
-    Cause("not armed: drive {} is not ready", STOP, "", "leg"),
+    Cause("not armed: IMU {} is not plausible", STOP, "rad"),
+    Cause("not armed: leg {} is not where the target begins", STOP, "m"),
+    Cause("not armed: leg {} is outside its stroke", STOP, "m"),
+    Cause("not armed: drive {} is not ready", STOP),
     Cause("the target's stream has stopped", STOP, "s"),
-    Cause("the target jumps for leg {}", STOP, "m", "leg"),
+    Cause("the target jumps for leg {}", STOP, "m"),
     Cause("the target is not finite, or its quaternion is none", STOP),
 )
 """By number. Causes of `GO_ON` are told and end nothing."""
@@ -365,7 +363,7 @@ def hear(parameters: Record, state: Record, sample_age: Record, drive: Record, s
     if silent > 0 and w.silent == 0:
         tell(state, ANSWER_LATE, -1, np.nan, np.nan)
     w.silent = silent
-    if w.mode == IDLE or w.mode == FAULT:
+    if w.request != ENABLED:
         return
     if silent >= p.safety.bus_cycles:
         react(parameters, state, BUS_LOST, -1, silent, p.safety.bus_cycles)

@@ -503,7 +503,9 @@ def _begin(
         if cause != OK:
             w.asked = cause
             react(parameters, state, cause, leg, value, limit)
-    if w.asked != OK:
+    if w.asked == MISSED_PERIODS:
+        react(parameters, state, w.asked, -1, c.in_a_row, most_missed)
+    elif w.asked != OK:
         begin_stop(parameters, state, w.asked)
     return int(s.stopping) if has_stopped(state) else OK
 
