@@ -34,7 +34,7 @@ REACTIONS = ("goes on", "controlled stop", "quick stop", "brakes at once")
 
 @dataclass(frozen=True)
 class Cause:
-    """Why something happened: in words, with the number of the leg or IMU, the reaction to it, the unit of its value and limit."""
+    """Why something happened: in words, with the number of a leg or an IMU; the reaction; the unit of its value and limit."""
 
     text: str
     reaction: int

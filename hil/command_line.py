@@ -58,6 +58,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
     _add_simulate(commands)
     _add_run(commands)
+    _add_check_rig(commands)
     _add_emulate(commands)
     _add_inject(commands)
     _add_faults(commands)
@@ -137,13 +138,7 @@ def _add_run(commands: Any) -> None:
         "emergency stop: the drives come to rest by themselves, whatever is measured.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    command.add_argument(
-        "--rig", choices=("fmu", "udp", "canopen"), default="fmu", help="what is driven: the FMU plant, or a rig on a bus"
-    )
-    command.add_argument(
-        "--rig-at", metavar="ADDRESS|FILE.toml", help="where the rig is: HOST:PORT for udp (default: 127.0.0.1:47100), "
-        "settings of the bus for canopen",
-    )  # fmt: skip
+    _add_rig(command, default="fmu")
     command.add_argument("--no-arm", dest="arm", action="store_false", help="read everything, and move nothing")
     _add_motion(command)
     command.add_argument("--record", type=Path, metavar="FILE.mcap", help="record every cycle")
@@ -153,6 +148,37 @@ def _add_run(commands: Any) -> None:
     command.add_argument("--most-missed", type=int, default=10, help="periods missed in a row that end in a controlled stop")
     _add_json(command)
     command.set_defaults(run=_run)
+
+
+def _add_rig(command: argparse.ArgumentParser, **options: Any) -> None:
+    command.add_argument(
+        "--rig", metavar="RIG", **options, help="what is driven: fmu, the plant; udp or canopen, a rig on a bus; replay, a "
+        "recording; or python:MODULE:CLASS, a rig of your own, as hil/rigs/template.py is one",
+    )  # fmt: skip
+    command.add_argument(
+        "--rig-at", metavar="ADDRESS|FILE", help="where the rig is: HOST:PORT for udp (default: 127.0.0.1:47100), settings of "
+        "the bus for canopen, the recording (files of one run with commas in between) for replay",
+    )  # fmt: skip
+
+
+def _add_check_rig(commands: Any) -> None:
+    command = commands.add_parser(
+        "check-rig",
+        help="check that a rig does what the loop relies on",
+        description="Put a rig through the contract that the loop relies on, clause by clause. Nothing moves without --move. "
+        "Exit status 1 if anything is found.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    _add_rig(command, required=True)
+    command.add_argument("--mechanism", default="hexapod", help="preset, or a TOML file")
+    command.add_argument("--rate", type=float, default=200.0, help="exchanges per second [Hz], 50 to 4000")
+    command.add_argument("--move", action="store_true", help="enable the drives, and move all legs by 0.2 mm at 1 mm/s")
+    command.add_argument(
+        "--beyond", type=float, metavar="SPEED", help="with --move, a command beyond the limits to try [m/s]: for emulated "
+        "rigs only, never for hardware",
+    )  # fmt: skip
+    _add_json(command)
+    command.set_defaults(run=_check_rig)
 
 
 def _add_emulate(commands: Any) -> None:
@@ -1059,6 +1085,53 @@ def _view(mechanism: str, target: str, rate: float, progress: Any) -> Any:
     for row in rows:
         table.add_row(*(escape(cell) for cell in row))
     return table
+
+
+def _check_rig(options: argparse.Namespace) -> int:
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from dataclasses import asdict
+
+    from hil.executive import rig_of
+    from hil.rigs.contract import CLAUSES, examine_rig
+    from hil.simulation import SimulationConfig
+
+    _check_writable(options.json)
+    if options.beyond is not None and not options.move:
+        raise InputError("--beyond is a command to the drives: it needs --move")
+    config = SimulationConfig(mechanism=options.mechanism, rate=options.rate, rig=options.rig, rig_at=options.rig_at)
+
+    def made() -> Any:
+        rig = rig_of(config)
+        if rig is None:
+            raise InputError("the FMU plant is no rig of its own: choose udp, canopen, replay or python:MODULE:CLASS")
+        return rig
+
+    examination = examine_rig(made, 1.0 / options.rate, options.move, options.beyond)
+    table = _table("clause", "outcome", "what it asks for")
+    for clause, findings in examination.findings.items():
+        table.add_row(clause, f"[bold red]{len(findings)} found[/]" if findings else "ok", CLAUSES[clause])
+    table.columns[2].justify = "left"
+    _print(table)
+    found = examination.all_findings()
+    for text in found:
+        print(text)
+    if examination.exchange_us:
+        p50, p99, most, count = (examination.exchange_us[name] for name in ("p50", "p99", "max", "n"))
+        print(f"exchange p50/p99/max {p50:.0f}/{p99:.0f}/{most:.0f} us of {1e6 / options.rate:g}, {count:g} exchanges")
+    moved = "and the drives moved" if options.move else "and nothing was moved"
+    print(f"{len(examination.findings)} clauses checked, {len(found)} findings, {moved}")
+    _write_json(
+        options.json,
+        {
+            "rig": options.rig,
+            "rig_at": options.rig_at,
+            "rate": options.rate,
+            "moved": options.move,
+            **asdict(examination),
+            "version": version("gough"),
+        },
+    )
+    return 1 if found else 0
 
 
 def _emulate(options: argparse.Namespace) -> int:

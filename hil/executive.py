@@ -52,8 +52,10 @@ from hil.loop import (
 from hil.realtime import RealTimeSettings, real_time, since_process_start, usage
 from hil.recording import events_of, record, repair, take
 from hil.rigs import Rig
+from hil.rigs.contract import python_rig
+from hil.rigs.replay import ReplayRig
 from hil.rigs.udp import DEFAULT_ADDRESS, UdpRig, parse_address
-from hil.simulation import SimulationConfig, prepared_loop
+from hil.simulation import PYTHON_RIG, SimulationConfig, prepared_loop
 from hil.target_stream import HOST, PORT, open_socket, receive
 from hil.timing import Timing, over_budget
 from plant.compiled import Record
@@ -381,7 +383,7 @@ def _prepare_and_follow(
             "parameters": loop.parameters,
             "reference": loop.segments,
         }
-        rig = make_rig(loop) if make_rig is not None else _rig_of(config)
+        rig = make_rig(loop) if make_rig is not None else rig_of(config)
         compiled = rig is None or isinstance(rig, UdpRig)
         loop.load(python=not compiled)
         if rig is not None:
@@ -391,6 +393,7 @@ def _prepare_and_follow(
             rigs.callback(rig.quick_stop)
             if config.arm:
                 rig.arm()
+            loop.parameters["command_delay"] = rig.command_delay
         if isinstance(rig, UdpRig):
             loop.kind, loop.udp = UDP_RIG, rig.link
         if threading.active_count() > 1:
@@ -407,7 +410,7 @@ def _prepare_and_follow(
                 "stop": cause,
                 "identity": header["config"].get("identity"),
                 "obstacle": None if config.arm else describe_obstacle(loop.state),
-                "reason": loop.reason(),
+                "reason": ": ".join([loop.reason(), *([failure] if (failure := getattr(rig, "failure", "")) else [])]),
                 "cycle": int(loop.state["stop_cycle"]),
                 "cycles": int(link[HEAD]),
                 "missed_late": int(loop.clock["missed_late"]),
@@ -419,8 +422,12 @@ def _prepare_and_follow(
         )
 
 
-def _rig_of(config: SimulationConfig) -> Rig | None:
-    """The rig that a configuration names; None for the plant's FMU."""
+def rig_of(config: SimulationConfig) -> Rig | None:
+    """The rig that a configuration names; None for the plant's FMU.
+
+    Raises:
+        GoughError: it cannot be made.
+    """
     if config.rig == "udp":
         return UdpRig(config.rig_at or DEFAULT_ADDRESS, 1.0 / config.rate)
     if config.rig == "canopen":
@@ -429,6 +436,13 @@ def _rig_of(config: SimulationConfig) -> Rig | None:
         from hil.rigs.canopen_settings import DEFAULT_FILE, canopen_settings
 
         return CanopenRig(canopen_settings(config.rig_at or DEFAULT_FILE), 1.0 / config.rate)
+    if config.rig == "replay":
+        if not config.rig_at:
+            raise InputError("a replay needs its recording: name it with --rig-at FILE.mcap")
+        return ReplayRig(config.rig_at.split(","), 1.0 / config.rate, load_spatial(config.mechanism))
+    if config.rig.startswith(PYTHON_RIG):
+        name = config.rig.removeprefix(PYTHON_RIG)
+        return python_rig(name, load_spatial(config.mechanism), 1.0 / config.rate, config.rig_at)
     return None
 
 

@@ -42,7 +42,10 @@ FUSIONS = {
 """Ways to fuse the IMUs: by leg and platform filters, in compiled code or filterpy's, unrefined as in the paper's section 5; or
 all together in the whole-mechanism filter, with the errors of the IMUs that it estimates."""
 
-RIGS = ("fmu", "udp", "canopen")
+RIGS = ("fmu", "udp", "canopen", "replay")
+PYTHON_RIG = "python:"
+"""Begins the name of a rig of one's own, such as python:my_rig:MyRig: module and class."""
+
 STREAM_TARGET = "stream"
 """A target that is streamed, alone or with the address to listen at, such as stream:127.0.0.1:47200."""
 
@@ -71,8 +74,9 @@ class SimulationConfig:
         wiring: how they are mounted and wired.
         joint_error: of each coordinate of the plant's joints, which the controller does not know: standard deviation [m].
         magnetometer: whether the platform's magnetometer gives its heading.
-        rig: what is driven: the plant's FMU ("fmu"), or a rig on a bus ("udp", "canopen").
-        rig_at: its address or its settings' file; None for its default.
+        rig: what is driven: the plant's FMU ("fmu"), a rig on a bus ("udp", "canopen"), a recording ("replay"), or a class in
+            Python, such as "python:my_rig:MyRig" (see `hil.rigs.contract.python_rig`).
+        rig_at: its address, its settings' file, or the recording's files with commas in between; None for its default.
         arm: whether the drives are asked for; else everything is read and nothing moves.
         raw_imus: whether the IMUs are known to be uncalibrated, so that their disagreement says nothing.
     """
@@ -105,8 +109,8 @@ class SimulationConfig:
             raise InputError(f"the duration is {self.duration:g} s, less than one cycle of {1.0 / self.rate:g} s")
         if self.fusion not in FUSIONS:
             raise UnknownNameError(f"no fusion {self.fusion!r}; there are {', '.join(FUSIONS)}")
-        if self.rig not in RIGS:
-            raise UnknownNameError(f"no rig {self.rig!r}; there are {', '.join(RIGS)}")
+        if self.rig not in RIGS and not self.rig.startswith(PYTHON_RIG):
+            raise UnknownNameError(f"no rig {self.rig!r}; there are {', '.join(RIGS)} and {PYTHON_RIG}MODULE:CLASS")
 
     @property
     def streamed(self) -> bool:

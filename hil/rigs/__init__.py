@@ -83,6 +83,8 @@ class Rig(Protocol):
     Attributes:
         command_delay: from an exchange in which a sample is taken to the one by which the command computed from it takes effect
             [s]: one period, on a bus.
+
+    A rig may also have `failure`, a text that tells why an exchange has failed.
     """
 
     command_delay: float

@@ -1,0 +1,59 @@
+"""A hexapod without dynamics, in the place of the template's hardware: legs that follow at once, and ideal IMUs."""
+
+import casadi as ca
+import numpy as np
+
+from controller.direct_kinematics import pose_from_lengths
+from controller.inverse_kinematics import inverse_kinematics
+from plant.dynamics import imu_signals
+from plant.mechanism import LEGS, Mechanism
+from plant.pose import Array, quaternion_from_rotation
+from plant.variables import IMU_COUNT
+
+_WATCHDOG_S = 0.1
+"""How long the legs go on without a command, as drives have it."""
+
+
+class KinematicHexapod:
+    """A mechanism at rest at home, on a clock of its own.
+
+    Attributes:
+        time_ns: since the start [ns].
+        lengths, velocities: of the legs, (6,) [m] and [m/s].
+        pose: of the platform.
+        signals: (3, 7, 3), of the IMUs, as everywhere.
+    """
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        self.time_ns = 0
+        self.velocities: Array = np.zeros(LEGS)
+        self.pose = mechanism.require_home()
+        self.lengths: Array = inverse_kinematics(mechanism, self.pose).lengths
+        self.signals: Array = np.zeros((3, IMU_COUNT, 3))
+        self._mechanism = mechanism
+        self._twist: Array = np.zeros(6)
+        position, velocity, omega = (ca.SX.sym(name, 3) for name in ("position", "velocity", "omega"))
+        rotation, acceleration = ca.SX.sym("rotation", 3, 3), ca.SX.sym("acceleration", 6)
+        constants = {name: ca.SX(ca.DM(value)) for name, value in mechanism.plant_parameters().items()}
+        ideal = imu_signals(position, rotation, velocity, omega, acceleration, constants)
+        outputs = [ca.vec(ca.densify(value).T) for value in ideal.values()]
+        self._signals = ca.Function("signals", [position, rotation, velocity, omega, acceleration], outputs, {"cse": True})
+        self.advance(1)
+
+    def advance(self, time_ns: int) -> None:
+        """Go on to this time with the velocities that were commanded."""
+        duration = 1e-9 * (time_ns - self.time_ns)
+        self.time_ns = time_ns
+        if duration > _WATCHDOG_S:
+            self.lengths, duration = self.lengths + _WATCHDOG_S * self.velocities, duration - _WATCHDOG_S
+            self.velocities = np.zeros(LEGS)
+        self.lengths = self.lengths + duration * self.velocities
+        self.pose = pose_from_lengths(self._mechanism, self.lengths, self.pose)
+        twist = np.linalg.solve(inverse_kinematics(self._mechanism, self.pose).jacobian, self.velocities)
+        acceleration, self._twist = (twist - self._twist) / duration, twist
+        signals = self._signals(self.pose.position, self.pose.rotation, twist[:3], twist[3:], acceleration)
+        self.signals = np.array([np.array(kind).reshape(IMU_COUNT, 3) for kind in signals])
+
+    def truth(self) -> Array:
+        """Position, quaternion and lengths (13,), as the plant's `truth` buffer begins."""
+        return np.concatenate([self.pose.position, quaternion_from_rotation(self.pose.rotation), self.lengths])
