@@ -42,6 +42,7 @@ from controller.safety import (
     arm,
     begin_stop,
     coast,
+    is_held,
     safety_parameters,
     watch,
 )
@@ -429,7 +430,7 @@ def cycle(parameters: Record, state: Record, measurement: Array, segments: Array
         segments: (6, n, 5), the reference as `controller.reference` has it.
 
     Returns:
-        `OK`, or the cause of a fault that has begun in this cycle.
+        `OK`, or why there is no pose or the estimate cannot be used: the cause of a fault, unless nothing has been armed yet.
     """
     if state[()].safety.mode == FAULT:
         coast(parameters, state)
@@ -443,9 +444,11 @@ def cycle(parameters: Record, state: Record, measurement: Array, segments: Array
 
 @kernel
 def lose_pose(parameters: Record, state: Record) -> int:
-    """The rest of a cycle that has found no pose; returns the cause of the fault."""
-    begin_stop(parameters, state, POSE_LOST)
-    state[()].cycle += 1
+    """The rest of a cycle that has found no pose, which is a fault unless nothing has been armed; returns its cause."""
+    s = state[()]
+    if not is_held(parameters, state, POSE_LOST):
+        begin_stop(parameters, state, POSE_LOST)
+    s.cycle += 1
     return POSE_LOST
 
 

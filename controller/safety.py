@@ -434,6 +434,19 @@ def arm(parameters: Record, state: Record) -> None:
 
 
 @kernel
+def is_held(parameters: Record, state: Record, cause: int) -> bool:
+    """Whether a cause is no fault but in the way of arming: nothing has been armed, and there is still time."""
+    p, s = parameters[()], state[()]
+    w = s.safety
+    if w.mode != IDLE:
+        return False
+    w.obstacle, w.obstacle_index, w.obstacle_value, w.obstacle_limit = cause, -1, np.nan, np.nan
+    if s.cycle >= p.hold_cycles and p.safety.arm != 0:
+        w.waited = s.cycle + 1 - p.hold_cycles
+    return bool(w.waited <= p.safety.arming_cycles)
+
+
+@kernel
 def _look_for_obstacle(parameters: Record, state: Record) -> None:
     p, s = parameters[()], state[()]
     w, limits = s.safety, p.safety

@@ -191,7 +191,7 @@ def run(
     with _asked_to_stop(link), _claimed(recording), _told(progress, recorders), contextlib.ExitStack() as at_end:
         at_end.callback(recorders.finish)
         stream = at_end.enter_context(_receiver(config)) if config.streamed else None
-        loop = _FORK.Process(target=_loop_process, args=(theirs, ours, config, settings, rig, records, link, stream))
+        loop = _FORK.Process(target=_loop_process, args=(theirs, ours, link, config, settings, rig, records, stream))
         loop.start()
         theirs.close()
         leftovers: list[Path | None] = []
@@ -348,7 +348,7 @@ def _end(loop: BaseProcess, link: NDArray[np.int64], leftovers: list[Path | None
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _loop_process(pipe: Connection, supervisors: Connection, *what: Any) -> None:
+def _loop_process(pipe: Connection, supervisors: Connection, link: NDArray[np.int64], *what: Any) -> None:
     """The loop's process. Signals that end others, blocked, are seen by the loop itself."""
     signal.pthread_sigmask(signal.SIG_BLOCK, _BLOCKED)
     # Else the end of the supervisor would not show.
@@ -356,21 +356,22 @@ def _loop_process(pipe: Connection, supervisors: Connection, *what: Any) -> None
     # Without a supervisor there is nobody to tell.
     with contextlib.suppress(EOFError, BrokenPipeError):
         try:
-            _prepare_and_follow(pipe, *what)
+            _prepare_and_follow(pipe, link, *what)
         except GoughError as error:
             pipe.send(error)
         except Exception as error:
-            pipe.send(RunStoppedError(f"stopped on the brakes: {type(error).__name__}: {error}"))
+            how = "stopped on the brakes" if link[HEAD] else "nothing has moved"
+            pipe.send(RunStoppedError(f"{how}: {type(error).__name__}: {error}"))
             raise
 
 
 def _prepare_and_follow(
     pipe: Connection,
+    link: NDArray[np.int64],
     config: SimulationConfig,
     settings: RealTimeSettings,
     make_rig: Callable[[Loop], Rig] | None,
     records: Record,
-    link: NDArray[np.int64],
     stream: Record | None,
 ) -> None:
     with prepared_loop(config, records) as loop, contextlib.ExitStack() as rigs:

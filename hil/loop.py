@@ -250,7 +250,7 @@ class Loop:
     def __post_init__(self) -> None:
         self._taker: Record = np.zeros((), TAKER)
         self._work: Record = np.zeros((), _WORK)
-        self._work["feedback"] = new_feedback()
+        self._work["feedback"], self._work["sequence"] = new_feedback(), -1
 
     def run(self, last: int, filters: PythonFilters | None = None) -> int:
         """Run up to but not including cycle `last`; returns 0, or the cause for which the run has ended on the brakes."""
@@ -289,7 +289,7 @@ class Loop:
         _load(_end, self.records, clock, self.script, link, work)
         _load(periods_passed, state)
         _load(drive_fmu, calls, state["command"], 0, 0, 0.0)
-        _load(read_fmu, calls, self.imu, state["command"], work["feedback"][()])
+        _load(read_fmu, calls, self.imu, state["command"], 0, work["feedback"][()])
         _load(_checked, 0)
         _load(write_drive_mode, calls, 0)
 
@@ -386,7 +386,7 @@ class FmuRig:
         """Drive the plant for the periods that have passed since the last exchange, and read it."""
         loop = self._loop
         status = drive_fmu(loop.calls, command, request, periods_passed(loop.state), float(loop.parameters["period"]))
-        return _checked(status or read_fmu(loop.calls, loop.imu, command, feedback))
+        return _checked(status or read_fmu(loop.calls, loop.imu, command, request, feedback))
 
     def quick_stop(self) -> None:
         """Brake the drives."""
@@ -408,12 +408,13 @@ def drive_fmu(calls: Record, command: Array, request: int, periods: int, period:
 
 
 @kernel
-def read_fmu(calls: Record, imu: Record, command: Array, feedback: Record) -> int:
+def read_fmu(calls: Record, imu: Record, command: Array, request: int, feedback: Record) -> int:
     """Read the plant through the IMUs' imperfections; returns FMI's status."""
     status = read_imus(calls) | read_truth(calls)
     measure(imu, calls[()].imu, feedback.measurement)
     feedback.truth[:] = calls[()].truth
-    feedback.sent[:] = command
+    for k in range(LEGS):
+        feedback.sent[k] = 0.0 if request == BRAKED else command[k]
     for k in range(IMU_COUNT):
         feedback.sequence[k] += 1
         feedback.sample_ns[k] = np.int64(np.rint(1e9 * calls[()].time))
@@ -434,7 +435,7 @@ def _exchange(port: Port, parameters: Record, state: Record, work: Record, times
         status = drive_fmu(port.calls, s.command, s.safety.request, periods_passed(state), period)
         t1 = now(timespec)
         if status == 0:
-            status = read_fmu(port.calls, port.imu, s.command, w.feedback)
+            status = read_fmu(port.calls, port.imu, s.command, s.safety.request, w.feedback)
         status = _checked(status)
     w.stage_ns[_PLANT], w.stage_ns[_SENSE] = t1 - t0, now(timespec) - t1
     return status

@@ -204,7 +204,7 @@ def simulate(config: SimulationConfig, progress: Callable[[float], None] = lambd
         SimulationStoppedError: the loop ended before its time.
     """
     if config.streamed or config.rig != "fmu":
-        raise InputError("a streamed target and a rig on a bus have a clock of their own: use 'gough run'")
+        raise InputError("a streamed target, and any rig but the FMU, has a clock of its own: use 'gough run'")
     with prepared_loop(config) as loop:
         count = len(loop.records)
         filters = filterpy_filters(loop.parameters) if config.fusion == "filterpy" else None

@@ -25,8 +25,8 @@ __all__ = [
 ]  # fmt: skip
 
 ANSWERED, SILENT = 0, 1
-"""Statuses of an exchange: the feedback is of now; nothing (or nothing sound) has come in time, and the feedback is the last
-one. Any other is a failure of the rig's own that ends the run on the brakes.
+"""Statuses of an exchange: the feedback is of now; no sound sample has come in time, and the feedback is the last one, but for
+what drives may have said. Any other is a failure of the rig's own that ends the run on the brakes.
 """
 
 FEEDBACK = np.dtype(

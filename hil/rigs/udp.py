@@ -245,6 +245,7 @@ class UdpRig:
         Raises:
             RigError: nobody answers.
         """
+        self.close()
         host, port = self.address
         self._socket = opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         opened.settimeout(_HAND_SHAKE_S)
@@ -301,6 +302,8 @@ class UdpRig:
         Raises:
             RigError: one is not.
         """
+        if self._socket is None:
+            raise RigError("the rig is not open: open it first")
         feedback = new_feedback()[()]
         deadline = time.monotonic() + _ARMING_S
         self.link.socket["reset"] = 1
@@ -317,6 +320,8 @@ class UdpRig:
 
     def exchange(self, command: Array, request: int, feedback: Record) -> int:
         """One exchange, as `Rig` says."""
+        if self._socket is None:
+            return SILENT
         return exchange_udp(self.link, command, request, feedback, self._timespec)
 
     def quick_stop(self) -> None:
@@ -340,7 +345,8 @@ class UdpRig:
                 encode_command(self.link, np.zeros(LEGS), BRAKED, 0)
                 send_datagram(self.link.socket, self.link.command_bytes, COMMAND_DATAGRAM.itemsize)
         self._socket.close()
-        self._socket = None
+        self._socket, self._identity = None, None
+        self.link.socket["descriptor"] = -1
 
 
 def parse_address(text: str, anywhere: bool = False) -> tuple[str, int]:
