@@ -55,6 +55,10 @@ _FADING_S = 0.1
 """Time constant with which the step between two sources of the pose fades away [s]."""
 
 
+_NOISIER = 3.0
+"""How much noisier than the others an IMU must be: what shakes them all is no fault of one."""
+
+
 @kernel
 def elapsed(parameters: Record, state: Record) -> float:
     """Time since the last cycle [s]."""
@@ -69,7 +73,7 @@ def calibrate(parameters: Record, state: Record, measurement: Array) -> None:
     not, is left out, and taken back when it has been sound for a while; one that contradicted the others is not.
     """
     p, s = parameters[()], state[()]
-    changed = 0
+    changed, total_noise = 0, 0.0
     for k in range(IMU_COUNT):
         s.same[k] = 1
         for kind in range(2):
@@ -78,6 +82,8 @@ def calibrate(parameters: Record, state: Record, measurement: Array) -> None:
                 if np.isfinite(raw) and raw != s.raw[kind, k, i]:
                     s.same[k] = 0
         changed += p.imu_present[k] != 0 and s.same[k] == 0
+        find_noise(parameters, state, measurement, k)
+        total_noise += s.safety.noise[k]
     for k in range(IMU_COUNT):
         if s.same[k] == 0:
             s.stands[k] = 0
@@ -89,8 +95,8 @@ def calibrate(parameters: Record, state: Record, measurement: Array) -> None:
             why, value, limit = IMU_STALE, s.safety.sample_age[k], p.safety.stale_cycles
         elif s.stands[k] >= p.frozen_cycles:
             why, value, limit = IMU_FROZEN, s.stands[k], p.frozen_cycles
-        noise = noise_of(parameters, state, measurement, k)
-        if why == NO_CAUSE and noise > 1.0:
+        noise = s.safety.noise[k]
+        if why == NO_CAUSE and noise > max(1.0, _NOISIER * (total_noise - noise) / (IMU_COUNT - 1)):
             why, value, limit = IMU_NOISY, noise, 1.0
         for kind in range(3):
             for i in range(3):
@@ -118,9 +124,9 @@ def calibrate(parameters: Record, state: Record, measurement: Array) -> None:
 
 
 @kernel
-def noise_of(parameters: Record, state: Record, measurement: Array, k: int) -> float:
+def find_noise(parameters: Record, state: Record, measurement: Array, k: int) -> None:
     """The noise of IMU `k` over its limit, RMS: white noise of variance v has second differences of variance 6 v, to which
-    motion adds nearly nothing.
+    motion adds little.
     """
     p, s = parameters[()], state[()]
     w, worst = s.safety, 0.0
@@ -134,9 +140,9 @@ def noise_of(parameters: Record, state: Record, measurement: Array, k: int) -> f
             w.before[0, kind, k, i] = raw
         if s.cycle < 2 or not np.isfinite(total):
             total = 0.0
-        w.noise[kind, k] += p.safety.noise_smoothing * (total - w.noise[kind, k])
-        worst = max(worst, np.sqrt(w.noise[kind, k]) / p.safety.noise[kind])
-    return worst
+        w.variance[kind, k] += p.safety.noise_smoothing * (total - w.variance[kind, k])
+        worst = max(worst, w.variance[kind, k] / p.safety.noise[kind] ** 2)
+    w.noise[k] = np.sqrt(worst)
 
 
 @kernel

@@ -169,7 +169,8 @@ SAFETY_STATE = np.dtype(
         ("silent", np.int64),
         ("excluded", np.int64, IMU_COUNT),
         ("before", np.float64, (2, 2, IMU_COUNT, 3)),
-        ("noise", np.float64, (2, IMU_COUNT)),
+        ("variance", np.float64, (2, IMU_COUNT)),
+        ("noise", np.float64, IMU_COUNT),
         ("monitor", MONITOR),
         ("contradicted", np.float64),
         ("astray", np.float64, LEGS),
@@ -191,10 +192,10 @@ SAFETY_STATE = np.dtype(
 
 `mode` and `request` are as above; arming `waited` for so many cycles beyond the hold. What the rig has said before the
 cycle: how many cycles old each IMU's sample is, the state of each drive, and for how many cycles it has been `silent`. IMUs
-that disagreed are `excluded` for good; the last two raw samples `before` tell the `noise`, as a variance. For how long [s]
-the IMUs have contradicted each other, each leg has been `astray` from its reference, each drive `deviating` from its
-command, each command `saturated`; the legs' estimated `speed` [m/s]; what made the run end; and what is in the way of
-arming.
+that disagreed are `excluded` for good; the last two raw samples `before` tell the `variance` of each sensor, low-passed,
+and of that the `noise` of each IMU over its limit. For how long [s] the IMUs have contradicted each other, each leg has
+been `astray` from its reference, each drive `deviating` from its command, each command `saturated`; the legs' estimated
+`speed` [m/s]; what made the run end; and what is in the way of arming.
 """
 
 _CONTRADICTION_S = 0.03

@@ -1,4 +1,4 @@
-"""A hexapod without dynamics, in the place of the template's hardware: legs that follow at once, and ideal IMUs."""
+"""A hexapod without dynamics, in the place of the template's hardware: drives of the first order, and ideal IMUs."""
 
 import casadi as ca
 import numpy as np
@@ -10,6 +10,9 @@ from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, quaternion_from_rotation
 from plant.variables import IMU_COUNT
 
+_DRIVE_S = 0.02
+"""Time constant with which a drive's velocity follows its command [s]."""
+
 _WATCHDOG_S = 0.1
 """How long the legs go on without a command, as drives have it."""
 
@@ -20,6 +23,7 @@ class KinematicHexapod:
     Attributes:
         time_ns: since the start [ns].
         lengths, velocities: of the legs, (6,) [m] and [m/s].
+        commands: to the drives, (6,) [m/s].
         pose: of the platform.
         signals: (3, 7, 3), of the IMUs, as everywhere.
     """
@@ -27,6 +31,7 @@ class KinematicHexapod:
     def __init__(self, mechanism: Mechanism) -> None:
         self.time_ns = 0
         self.velocities: Array = np.zeros(LEGS)
+        self.commands: Array = np.zeros(LEGS)
         self.pose = mechanism.require_home()
         self.lengths: Array = inverse_kinematics(mechanism, self.pose).lengths
         self.signals: Array = np.zeros((3, IMU_COUNT, 3))
@@ -41,18 +46,26 @@ class KinematicHexapod:
         self.advance(1)
 
     def advance(self, time_ns: int) -> None:
-        """Go on to this time with the velocities that were commanded."""
+        """Go on to this time with the commands."""
         duration = 1e-9 * (time_ns - self.time_ns)
         self.time_ns = time_ns
         if duration > _WATCHDOG_S:
-            self.lengths, duration = self.lengths + _WATCHDOG_S * self.velocities, duration - _WATCHDOG_S
-            self.velocities = np.zeros(LEGS)
-        self.lengths = self.lengths + duration * self.velocities
+            self._follow(_WATCHDOG_S)
+            self.commands = np.zeros(LEGS)
+            self._follow(duration - _WATCHDOG_S)
+        else:
+            self._follow(duration)
         self.pose = pose_from_lengths(self._mechanism, self.lengths, self.pose)
         twist = np.linalg.solve(inverse_kinematics(self._mechanism, self.pose).jacobian, self.velocities)
         acceleration, self._twist = (twist - self._twist) / duration, twist
         signals = self._signals(self.pose.position, self.pose.rotation, twist[:3], twist[3:], acceleration)
         self.signals = np.array([np.array(kind).reshape(IMU_COUNT, 3) for kind in signals])
+
+    def _follow(self, duration: float) -> None:
+        lag = self.velocities - self.commands
+        left = np.exp(-duration / _DRIVE_S)
+        self.lengths = self.lengths + duration * self.commands + _DRIVE_S * (1.0 - left) * lag
+        self.velocities = self.commands + left * lag
 
     def truth(self) -> Array:
         """Position, quaternion and lengths (13,), as the plant's `truth` buffer begins."""

@@ -49,7 +49,7 @@ class TemplateRig:
         """Ask every part who it is, and refuse what is not as expected."""
         self._check_open()
         # 2: ask for serial numbers and firmware, and compare them.
-        return Identity("template", {"drives": "six that follow at once", "IMUs": "seven ideal ones"})
+        return Identity("template", {"drives": "six of the first order", "IMUs": "seven ideal ones"})
 
     def arm(self) -> None:
         """Reset faults and make the drives ready; they stay on their brakes."""
@@ -77,7 +77,7 @@ class TemplateRig:
     def quick_stop(self) -> None:
         """Stop the drives, whatever has happened: nothing may be raised here, also when they are gone."""
         if self._hardware is not None:
-            self._hardware.velocities = np.zeros(6)
+            self._hardware.commands = np.zeros(6)
 
     def close(self) -> None:
         """Leave the drives on their brakes, and let go of the hardware."""
@@ -91,7 +91,7 @@ class TemplateRig:
 
 def drive(hardware: KinematicHexapod, velocities: Array, feedback: Record) -> None:
     """4: Send the velocities (6,) [m/s], from now on, and note what was really sent after rounding."""
-    hardware.velocities = velocities
+    hardware.commands = velocities
     feedback["sent"] = velocities
 
 

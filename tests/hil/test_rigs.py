@@ -274,7 +274,7 @@ class HasNoLimit(TemplateRig):
 class TurnsTheWrongWay(TemplateRig):
     def exchange(self, command, request, feedback):
         status = super().exchange(command, request, feedback)
-        self._hardware.velocities[1] *= -1.0
+        self._hardware.commands[1] *= -1.0
         feedback["sent"] = command if request == ENABLED else 0.0
         return status
 
