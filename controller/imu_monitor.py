@@ -17,6 +17,7 @@ MONITOR = np.dtype(
         ("looked_at", np.int64),
         ("contradiction", np.float64, (IMU_COUNT, 3)),
         ("explained", np.float64, IMU_COUNT),
+        ("squares", np.float64, IMU_COUNT),
         ("across", np.float64, (2, 3)),
         ("jacobian", np.float64, (2, 6)),
         ("solved", np.float64, (2, 6)),
@@ -24,8 +25,8 @@ MONITOR = np.dtype(
     ],
     align=True,
 )
-"""Which IMU was looked at last; by how much each IMU's direction is off what the others say, as a vector in {1} [rad], and how
-much of the sum of squares that explains, both low-passed; and scratch."""
+"""Which IMU was looked at last; by how much each IMU's direction is off what the others say, as a vector in {1} [rad], how much
+of the sum of squares that explains, and its own part of that sum, all low-passed; and scratch."""
 
 _LEAST_SHARE = 0.08
 """How much of an error must show in the residuals for it to be told from those of others."""
@@ -81,6 +82,7 @@ def look_at_next(
     for i in range(3):
         m.contradiction[k, i] += smoothing * (f0 * m.across[0, i] + f1 * m.across[1, i] - m.contradiction[k, i])
     m.explained[k] += smoothing * (weight * (f0 * r0 + f1 * r1) - m.explained[k])
+    m.squares[k] += smoothing * (weight * (r0 * r0 + r1 * r1) - m.squares[k])
 
 
 @kernel
@@ -88,6 +90,7 @@ def forget(monitor: Record, k: int) -> None:
     """Begin anew with IMU `k`."""
     monitor.contradiction[k] = 0.0
     monitor.explained[k] = 0.0
+    monitor.squares[k] = 0.0
 
 
 @kernel

@@ -388,13 +388,16 @@ def watch_imus(parameters: Record, state: Record) -> None:
     w.contradicted = w.contradicted + p.period if off > p.safety.disagreement else 0.0
     if w.contradicted < _CONTRADICTION_S or w.mode != RUNNING:
         return
-    second = 0.0
+    second = left = 0.0
     excluded = 0
     for k in range(IMU_COUNT):
         excluded += w.excluded[k]
+        left += m.squares[k]
         if k != worst:
             second = max(second, m.explained[k])
-    if excluded > 0 or m.explained[worst] < _CLEARER * second or p.safety.most_lost_imus == 0:
+    # Without the one that is to blame, the others must agree.
+    disagree = left - m.explained[worst] > p.leg_weight * p.safety.disagreement**2
+    if disagree or excluded > 0 or m.explained[worst] < _CLEARER * second or p.safety.most_lost_imus == 0:
         react(parameters, state, IMUS_DISAGREE, worst, off, p.safety.disagreement)
         return
     w.excluded[worst] = 1

@@ -39,6 +39,7 @@ from controller.safety import (
     NO_SENSORS,
     QUICK_STOP,
     REACTIONS,
+    RUNNING,
     STOP,
     STOP_QUICKLY,
     STOPPING,
@@ -131,7 +132,10 @@ CASES = (
     Case("a leg's IMU is noisy", IMU_NOISY, GO_ON, 25, 2e-3, ("imu-noisy:{k},at={at}",)),
     Case("a leg's IMU is biased by 2 deg", IMU_DISAGREES, GO_ON, 2500, 10e-3, ("imu-biased:{k},at={at}",)),
     Case("a leg's IMU is biased by 2 deg from the start", NO_SENSORS, STOP, 1300, 1e-3, ("imu-biased:{k}",)),
-    Case("two legs' IMUs are swapped from the start", IMUS_DISAGREE, STOP, 4000, 25e-3, ("imu-swapped:{k},size={j}",)),
+    Case(
+        "two legs' IMUs are swapped from the start", IMUS_DISAGREE, STOP, 4000, 25e-3, ("imu-swapped:{k},size={j}",),
+        also=(DRIVE_DEVIATES,),
+    ),
     Case("the platform's IMU is frozen", IMU_FROZEN, GO_ON, 15, 2e-3, ("imu-frozen:6,at={at}",)),
     Case("the platform's IMU is dead", IMU_STALE, GO_ON, 15, 2e-3, ("imu-dead:6,at={at}",)),
     Case("the platform's IMU is biased by 2 deg", IMU_DISAGREES, GO_ON, 2500, 10e-3, ("imu-biased:6,at={at}",)),
@@ -346,7 +350,7 @@ def _judge(case: Case, seed: int, loop: PreparedLoop, cause: int, onset: int, ou
     off = np.abs(followed["truth"][:, 7:13] - followed["reference"][:, :, 0]).max(initial=0.0)
     outcome.peak.append(float(off))
     find(off > case.peak, f"a leg was {1e3 * off:.2f} mm off, and {1e3 * case.peak:g} are allowed")
-    after = moved[moved["cycle"] >= begin]
+    after = records[(records["mode"] >= RUNNING) & (records["cycle"] >= begin)]
     rested = np.vstack([after["truth"][:, 7:13], rig["truth"][7:13]]) if len(after) else np.zeros((1, LEGS))
     travel = np.abs(rested - rested[0]).max() if case.reaction != GO_ON else 0.0
     outcome.travel.append(float(travel))
