@@ -35,19 +35,6 @@ def evaluate_reference(segments: Array, time: float, index: Array, reference: Ar
 
 
 @kernel
-def _sample(segments: Array, period: float, index: Array, samples: Array) -> None:
-    for i in range(samples.shape[0]):
-        evaluate_reference(segments, i * period, index, samples[i])
-
-
-def sample_reference(segments: Array, period: float, count: int) -> Array:
-    """The reference (count, 6, 3) at the first `count` cycles of `period` [s]: lengths, rates, accelerations."""
-    samples = np.empty((count, LEGS, 3))
-    _sample(segments, period, np.zeros(LEGS, np.int64), samples)
-    return samples
-
-
-@kernel
 def stop_phases(
     rate: float, acceleration: float, most_acceleration: float, most_jerk: float
 ) -> tuple[float, float, float, float]:

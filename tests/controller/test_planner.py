@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 from controller.direct_kinematics import poses_from_lengths
 from controller.inverse_kinematics import leg_lengths, sample_workspace
 from controller.planner import Reference, count_violations, plan
-from controller.reference import sample_reference
 from controller.target import SAMPLE_PERIOD_S, Target, load_target
 from plant.errors import GoughError, InputError, UnreachableError
 from plant.mechanism import Mechanism
 from tests.controller.leg_geometry import leg_vectors
+from tests.controller.sampled_reference import sample_reference
 
 ROUNDING = 1e-9
 """Relative to a limit, as the planner's own count has it; for the stroke, in m."""

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.reference import evaluate_reference, sample_reference
+from controller.reference import evaluate_reference
+from tests.controller.sampled_reference import sample_reference
 
 
 def random_segments(random, count, longest=0.05):

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation, Slerp
 from controller.direct_kinematics import poses_from_lengths
 from controller.inverse_kinematics import leg_lengths
 from controller.planner import plan
-from controller.reference import sample_reference
 from controller.target import COLUMNS, MARGIN_S, MOTIONS, REST_S, SAMPLE_PERIOD_S, Target, load_target
 from plant.errors import GoughError, InputError, UnknownNameError
 from plant.mechanism import Mechanism, load_spatial
 from plant.pose import Pose
 from tests.controller.leg_geometry import angle_between, rotation_of, unit
+from tests.controller.sampled_reference import sample_reference
 
 HEADER = ",".join(COLUMNS)
 ROWS = ["0.00,0,0,0,1,0,0,0", "0.01,0.001,0,0,1,0,0,0", "0.02,0.002,0,-0.001,1,0,0,0"]
