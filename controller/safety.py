@@ -111,9 +111,10 @@ EVENTS = (
 def describe_end(state: Record) -> str:
     """Why a run has ended, in words."""
     safety = state["safety"]
-    return describe_event(
-        int(state["stopping"]), int(safety["end_index"]), float(safety["end_value"]), float(safety["end_limit"])
-    )
+    values = int(safety["end_index"]), float(safety["end_value"]), float(safety["end_limit"])
+    before = int(safety["stopped_for"])
+    first = f"{CAUSES[before].text.replace(' {}', '')}, and then: " if before != NO_CAUSE else ""
+    return first + describe_event(int(state["stopping"]), *values)
 
 
 def describe_obstacle(state: Record) -> str:
@@ -143,6 +144,7 @@ SAFETY_PARAMETERS = np.dtype(
         ("noise_smoothing", np.float64),
         ("disagreement", np.float64),
         ("smoothing", np.float64),
+        ("lasting", np.float64),
         ("conditioning", np.float64),
         ("lengths", np.float64, (LEGS, 2)),
         ("speed", np.float64),
@@ -180,6 +182,7 @@ SAFETY_STATE = np.dtype(
         ("end_index", np.int64),
         ("end_value", np.float64),
         ("end_limit", np.float64),
+        ("stopped_for", np.int64),
         ("obstacle", np.int64),
         ("obstacle_index", np.int64),
         ("obstacle_value", np.float64),
@@ -195,11 +198,17 @@ cycle: how many cycles old each IMU's sample is, the state of each drive, and fo
 that disagreed are `excluded` for good; the last two raw samples `before` tell the `variance` of each sensor, low-passed,
 and of that the `noise` of each IMU over its limit. For how long [s] the IMUs have contradicted each other, each leg has
 been `astray` from its reference, each drive `deviating` from its command, each command `saturated`; the legs' estimated
-`speed` [m/s]; what made the run end; and what is in the way of arming.
+`speed` [m/s]; what made the run end, and for what cause it was stopping before a fault; and what is in the way of arming.
 """
 
 _CONTRADICTION_S = 0.03
 """Time constant of the low-pass on an IMU's contradiction, and how long one must last [s]."""
+
+_LARGEST_SHARE, _LEAST_CYCLES = 0.25, 10
+"""At low rates: the largest share that one look has in the low-pass, and for how many cycles a deviation must last."""
+
+_SLOW_HZ = 150.0
+"""Below this rate motion shows in second differences, and the filters' directions are less exact."""
 
 _NOISE_S = 0.02
 """Time constant over which the noise of an IMU is averaged [s]."""
@@ -216,22 +225,24 @@ _REACTION = np.array([cause.reaction for cause in CAUSES])
 def safety_parameters(settings: SafetySettings, rate: float, limits: Limits, arm: bool) -> Record:
     """Constants of the watch, at so many cycles per second [Hz]; the drives are asked for only if it is to `arm`."""
     parameters: Record = np.zeros((), SAFETY_PARAMETERS)
+    slow = _SLOW_HZ / rate
     values = {
         "arm": arm,
         "most_lost_imus": settings.most_lost_imus,
         "watch_imus": settings.watch_imus,
-        "noise": (settings.gyroscope_noise, settings.accelerometer_noise),
+        "noise": np.array([settings.gyroscope_noise, settings.accelerometer_noise]) * max(1.0, slow**2),
         "noise_smoothing": min(1.0, 1.0 / (rate * _NOISE_S)),
-        "disagreement": settings.disagreement,
+        "disagreement": settings.disagreement * max(1.0, slow),
         # Each IMU's turn comes in every seventh cycle.
-        "smoothing": min(1.0, IMU_COUNT / (rate * _CONTRADICTION_S)),
+        "smoothing": min(IMU_COUNT / (rate * _CONTRADICTION_S), _LARGEST_SHARE),
+        "lasting": max(_CONTRADICTION_S, _LEAST_CYCLES / rate),
         "conditioning": settings.conditioning,
         "lengths": limits.stroke + settings.stroke_margin * np.array([-1.0, 1.0]),
         "speed": settings.velocity_margin * limits.velocity,
         "following": settings.following,
         "saturation": settings.saturation,
         "drive_deviation": settings.drive_deviation,
-        "patience": settings.patience,
+        "patience": max(settings.patience, _LEAST_CYCLES / rate),
         "bus_cycles": max(3, round(settings.bus_patience * rate)),
         "stale_cycles": max(3, round(_STALE_S * rate)),
         "arming_distance": settings.arming_distance,
@@ -312,6 +323,7 @@ def _fail(parameters: Record, state: Record, cause: int) -> None:
     """End without the estimate: the drives come to rest by themselves, or the brakes close at once."""
     p, s = parameters[()], state[()]
     moving = s.safety.request == ENABLED
+    s.safety.stopped_for = s.stopping
     s.stopping = cause
     s.stop_cycle = s.stopped_cycle = s.cycle
     s.safety.mode = FAULT
@@ -386,7 +398,7 @@ def watch_imus(parameters: Record, state: Record) -> None:
             worst = k
     off = contradiction(m, worst)
     w.contradicted = w.contradicted + p.period if off > p.safety.disagreement else 0.0
-    if w.contradicted < _CONTRADICTION_S or w.mode != RUNNING:
+    if w.contradicted < p.safety.lasting or w.mode != RUNNING:
         return
     second = left = 0.0
     excluded = 0

@@ -246,7 +246,7 @@ def test_a_jump_is_measured_by_the_time_since_the_last_sample(hexapod):
     planner.add(0.0, np.zeros(3), LEVEL)
     most = 1.5 * hexapod.limits.velocity * 0.1 + 1e-3
     planner.add(0.1, [0.0, 0.0, 0.95 * most], LEVEL)
-    with pytest.raises(TargetRefusedError, match=r"jumps \(.* the limit is 0.00475 m"):
+    with pytest.raises(TargetRefusedError, match=r"jumps for leg \d \(.* the limit is 0.00475 m"):
         planner.add(0.11, [0.0, 0.0, 0.5 * most], LEVEL)
 
 
