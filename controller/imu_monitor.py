@@ -78,6 +78,9 @@ def look_at_next(
         off = vertical_in_base[i] - m.direction[i] if platform else directions[k, i] - m.direction[i]
         r0 += m.across[0, i] * off
         r1 += m.across[1, i] * off
+    if not np.isfinite(r0 + r1):
+        forget(monitor, k)
+        return
     f0, f1 = (s11 * r0 - s01 * r1) / determinant, (s00 * r1 - s01 * r0) / determinant
     for i in range(3):
         m.contradiction[k, i] += smoothing * (f0 * m.across[0, i] + f1 * m.across[1, i] - m.contradiction[k, i])

@@ -86,7 +86,7 @@ CAUSES = (
     Cause("drive {} has left its operation", STOP_QUICKLY),
     Cause("drive {} does not do what it is told", BRAKE_AT_ONCE, "m/s"),
     Cause("armed", GO_ON),
-    Cause("not armed: IMU {} is not plausible", STOP, "rad"),
+    Cause("not armed: IMU {} is not plausible: a raw one needs a calibration, else check its place", STOP, "rad"),
     Cause("not armed: leg {} is not where the target begins", STOP, "m"),
     Cause("not armed: leg {} is outside its stroke", STOP, "m"),
     Cause("not armed: drive {} is not ready", STOP),
@@ -169,6 +169,7 @@ SAFETY_STATE = np.dtype(
         ("sample_age", np.int64, IMU_COUNT),
         ("drive", np.int64, LEGS),
         ("silent", np.int64),
+        ("unanswered", np.int64),
         ("excluded", np.int64, IMU_COUNT),
         ("before", np.float64, (2, 2, IMU_COUNT, 3)),
         ("variance", np.float64, (2, IMU_COUNT)),
@@ -194,21 +195,23 @@ SAFETY_STATE = np.dtype(
 """State of the watch.
 
 `mode` and `request` are as above; arming `waited` for so many cycles beyond the hold. What the rig has said before the
-cycle: how many cycles old each IMU's sample is, the state of each drive, and for how many cycles it has been `silent`. IMUs
-that disagreed are `excluded` for good; the last two raw samples `before` tell the `variance` of each sensor, low-passed,
-and of that the `noise` of each IMU over its limit. For how long [s] the IMUs have contradicted each other, each leg has
-been `astray` from its reference, each drive `deviating` from its command, each command `saturated`; the legs' estimated
-`speed` [m/s]; what made the run end, and for what cause it was stopping before a fault; and what is in the way of arming.
+cycle: how many cycles old each IMU's sample is, the state of each drive, and for how many cycles it has been `silent`, and
+how many more are `unanswered` than answered. IMUs that disagreed are `excluded` for good; the last two raw samples `before`
+tell the `variance` of each sensor, low-passed, and of that the `noise` of each IMU over its limit. For how long [s] the
+IMUs have contradicted each other, each leg has been `astray` from its reference, each drive `deviating` from its command,
+each command `saturated`; the legs' estimated `speed` [m/s]; what made the run end, and for what cause it was stopping
+before a fault; and what is in the way of arming.
 """
 
 _CONTRADICTION_S = 0.03
 """Time constant of the low-pass on an IMU's contradiction, and how long one must last [s]."""
 
-_LARGEST_SHARE, _LEAST_CYCLES = 0.25, 10
-"""At low rates: the largest share that one look has in the low-pass, and for how many cycles a deviation must last."""
+_LARGEST_SHARE, _LEAST_LOOKS, _LEAST_CYCLES = 0.25, 3, 10
+"""At low rates: the largest share that one look has in the low-pass, for how many looks a contradiction must last, and for how
+many cycles any other deviation."""
 
-_SLOW_HZ = 150.0
-"""Below this rate motion shows in second differences, and the filters' directions are less exact."""
+_SLOW_HZ, _SHAKEN_HZ = 300.0, 400.0
+"""Below these rates the filters' directions are less exact, and motion shows in second differences."""
 
 _NOISE_S = 0.02
 """Time constant over which the noise of an IMU is averaged [s]."""
@@ -219,23 +222,25 @@ _STALE_S = 0.01
 _CLEARER = 1.3
 """How much more of the residuals the IMU that is named must explain than any other."""
 
-_REACTION = np.array([cause.reaction for cause in CAUSES])
+REACTION = np.array([cause.reaction for cause in CAUSES])
+"""Of each cause."""
 
 
 def safety_parameters(settings: SafetySettings, rate: float, limits: Limits, arm: bool) -> Record:
     """Constants of the watch, at so many cycles per second [Hz]; the drives are asked for only if it is to `arm`."""
     parameters: Record = np.zeros((), SAFETY_PARAMETERS)
     slow = _SLOW_HZ / rate
+    shaken = _SHAKEN_HZ / rate
     values = {
         "arm": arm,
         "most_lost_imus": settings.most_lost_imus,
         "watch_imus": settings.watch_imus,
-        "noise": np.array([settings.gyroscope_noise, settings.accelerometer_noise]) * max(1.0, slow**2),
-        "noise_smoothing": min(1.0, 1.0 / (rate * _NOISE_S)),
+        "noise": np.array([settings.gyroscope_noise, settings.accelerometer_noise]) * max(1.0, shaken**2),
+        "noise_smoothing": min(0.05, 1.0 / (rate * _NOISE_S)),
         "disagreement": settings.disagreement * max(1.0, slow),
         # Each IMU's turn comes in every seventh cycle.
         "smoothing": min(IMU_COUNT / (rate * _CONTRADICTION_S), _LARGEST_SHARE),
-        "lasting": max(_CONTRADICTION_S, _LEAST_CYCLES / rate),
+        "lasting": max(_CONTRADICTION_S, _LEAST_LOOKS * IMU_COUNT / rate),
         "conditioning": settings.conditioning,
         "lengths": limits.stroke + settings.stroke_margin * np.array([-1.0, 1.0]),
         "speed": settings.velocity_margin * limits.velocity,
@@ -279,7 +284,7 @@ def tell(state: Record, cause: int, index: int, value: float, limit: float) -> N
 def react(parameters: Record, state: Record, cause: int, index: int, value: float, limit: float) -> None:
     """React to a cause as it is said in `CAUSES`, and tell it; of stops the first counts, of faults, too, and a fault more."""
     s = state[()]
-    reaction = _REACTION[cause]
+    reaction = REACTION[cause]
     if s.safety.mode == FAULT or (reaction == STOP and s.stopping != 0):
         return
     tell(state, cause, index, value, limit)
@@ -315,6 +320,8 @@ def _begin_stop(parameters: Record, state: Record, cause: int) -> None:
         s.stopped_cycle += int(np.ceil(duration / p.period)) + p.settling_cycles
         s.reference_index[:] = 0
         s.prepared = 0
+    else:
+        s.safety.request = BRAKED
     s.safety.mode = STOPPING
 
 
@@ -328,7 +335,7 @@ def _fail(parameters: Record, state: Record, cause: int) -> None:
     s.stop_cycle = s.stopped_cycle = s.cycle
     s.safety.mode = FAULT
     s.safety.request = BRAKED
-    if _REACTION[cause] == STOP_QUICKLY and moving:
+    if REACTION[cause] == STOP_QUICKLY and moving:
         s.safety.request = QUICK_STOP
         fastest = 0.0
         for k in range(LEGS):
@@ -376,10 +383,11 @@ def hear(parameters: Record, state: Record, sample_age: Record, drive: Record, s
     if silent > 0 and w.silent == 0:
         tell(state, ANSWER_LATE, -1, np.nan, np.nan)
     w.silent = silent
+    w.unanswered = max(w.unanswered + (1 if silent > 0 else -1), 0)
     if w.request != ENABLED:
         return
-    if silent >= p.safety.bus_cycles:
-        react(parameters, state, BUS_LOST, -1, silent, p.safety.bus_cycles)
+    if silent >= p.safety.bus_cycles or w.unanswered >= 2 * p.safety.bus_cycles:
+        react(parameters, state, BUS_LOST, -1, max(silent, w.unanswered), p.safety.bus_cycles)
     for k in range(LEGS):
         if drive[k] == FAULTY:
             react(parameters, state, DRIVE_FAULT, k, np.nan, np.nan)
@@ -434,7 +442,11 @@ def arm(parameters: Record, state: Record) -> None:
             w.mode, w.request = ARMED, ENABLED
             tell(state, ARMED_NOW, -1, np.nan, np.nan)
     if w.mode == ARMED:
-        w.obstacle = NO_CAUSE
+        _look_for_obstacle(parameters, state)
+        if w.obstacle != NO_CAUSE:
+            # The drives are enabled already: this does not wait.
+            react(parameters, state, w.obstacle, w.obstacle_index, w.obstacle_value, w.obstacle_limit)
+            return
         for k in range(LEGS):
             if w.drive[k] != FOLLOWING:
                 _obstruct(state, NO_DRIVES, k, np.nan, np.nan)
@@ -470,7 +482,7 @@ def _look_for_obstacle(parameters: Record, state: Record) -> None:
     lost = 0
     for k in range(IMU_COUNT):
         off = contradiction(w.monitor, k)
-        if off > limits.disagreement:
+        if not off <= limits.disagreement:
             _obstruct(state, NO_SENSORS, k, off, limits.disagreement)
         if p.imu_present[k] != 0 and s.imu_used[k] == 0:
             lost += 1
@@ -480,7 +492,7 @@ def _look_for_obstacle(parameters: Record, state: Record) -> None:
         low, high = limits.lengths[k, 0], limits.lengths[k, 1]
         if not low <= s.lengths[k] <= high:
             _obstruct(state, NO_WORKSPACE, k, s.lengths[k], low if s.lengths[k] < low else high)
-        if abs(s.error[k]) > limits.arming_distance:
+        if not abs(s.error[k]) <= limits.arming_distance:
             _obstruct(state, NO_AGREEMENT, k, abs(s.error[k]), limits.arming_distance)
         if w.drive[k] != READY and w.drive[k] != FOLLOWING:
             _obstruct(state, NO_DRIVES, k, np.nan, np.nan)
@@ -507,7 +519,7 @@ def watch(parameters: Record, state: Record) -> int:
         if not (np.isfinite(s.command[k]) and np.isfinite(s.lengths[k])):
             react(parameters, state, NOT_FINITE, k, np.nan, np.nan)
             return NOT_FINITE
-    if w.mode < RUNNING:
+    if w.mode < RUNNING or w.request != ENABLED:
         return NO_CAUSE
     lost = 0
     for k in range(IMU_COUNT):
@@ -531,7 +543,7 @@ def watch(parameters: Record, state: Record) -> int:
             + d[1] * (t[1] + t[5] * a[0] - t[3] * a[2])
             + d[2] * (t[2] + t[3] * a[1] - t[4] * a[0])
         )
-        if abs(w.speed[k]) > limits.speed:
+        if not abs(w.speed[k]) <= limits.speed:
             react(parameters, state, TOO_FAST, k, abs(w.speed[k]), limits.speed)
         w.astray[k] = w.astray[k] + p.period if abs(s.error[k]) > limits.following else 0.0
         if w.astray[k] > limits.patience:

@@ -950,6 +950,8 @@ def _run(options: argparse.Namespace) -> int:
         raise stopped
     if trouble:
         raise trouble
+    if summary["obstacle"]:
+        return 1
     lost = summary["recording"]["lost"]
     if lost:
         raise OutputError(f"the run went to its end, but {lost} of {summary['cycles']} cycles are not recorded")
@@ -1148,13 +1150,15 @@ def _emulate(options: argparse.Namespace) -> int:
 
 
 def _inject(options: argparse.Namespace) -> int:
+    from rich.markup import escape
+
     from hil.emulator import ask
     from hil.rigs.faults import KINDS
 
     if options.list:
         table = _table("fault", "number", "size by default", "")
         for name, kind in KINDS.items():
-            table.add_row(name, f"0 to {kind.count - 1}" if kind.count else "", f"{kind.default:g}", kind.text)
+            table.add_row(name, f"0 to {kind.count - 1}" if kind.count else "", f"{kind.default:g}", escape(kind.text))
         _print(table)
         return 0
     question = "clear" if options.clear else f"fault {options.fault}" if options.fault else "state"

@@ -239,7 +239,7 @@ def _serve_sessions(
         period = 1e-6 * int(hello["period_us"])
         plant, imu, rig = _rig_of(config, period, faults)
         with plant:
-            emulator = new_udp_emulator(plant.calls, imu, rig, int(hello["session"]))
+            emulator = new_udp_emulator(plant.calls, imu, rig, int(hello["session"]), _watchdog(hello))
             emulator.socket["descriptor"], emulator.socket["peer"] = opened.fileno(), socket_address(sender)
             _welcome(opened, hello, sender)
             say(f"session with {sender[0]}:{sender[1]} at {1.0 / period:g} Hz")
@@ -253,9 +253,14 @@ def _hello(content: bytes) -> Record | None:
     return hello if hello is not None and hello["session"] != 0 and hello["period_us"] != 0 else None
 
 
+def _watchdog(hello: Record) -> float:
+    """After how long without a command the drives stop [s]: three periods at least."""
+    return max(WATCHDOG_S, 3e-6 * int(hello["period_us"]))
+
+
 def _welcome(opened: socket.socket, hello: Record, sender: tuple[str, int]) -> None:
     name, firmware = (np.frombuffer(text.encode().ljust(size, b"\0"), np.uint8) for text, size in ((_NAME, 32), ("1", 16)))
-    fields = {"session": hello["session"], "watchdog_us": round(1e6 * WATCHDOG_S), "truthful": 1, "name": name}
+    fields = {"session": hello["session"], "watchdog_us": round(1e6 * _watchdog(hello)), "truthful": 1, "name": name}
     opened.sendto(encode(WELCOME_DATAGRAM, kind=WELCOME, firmware=firmware, **fields), sender)
 
 

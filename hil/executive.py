@@ -48,6 +48,7 @@ from hil.loop import (
     Loop,
     prevent_compilation,
     shared_array,
+    stop_quickly,
 )
 from hil.realtime import RealTimeSettings, real_time, since_process_start, usage
 from hil.recording import events_of, record, repair, take
@@ -125,10 +126,12 @@ class Progress:
         for eventful in records[records["event_count"] > 0]:
             for text in events_of(eventful):
                 self._note(int(eventful["cycle"]), text)
-        known = records[np.isfinite(records["truth"][:, 0])]
+        # Before anything is armed there may be cycles without a pose.
+        posed = records[records["status"] == 0]
+        known = posed[np.isfinite(posed["truth"][:, 0])]
         self.squares[0] += np.sum((known["position"] - known["truth"][:, :3]) ** 2)
-        self.squares[1] += np.mean((records["lengths"] - records["reference"][:, :, 0]) ** 2, axis=1).sum()
-        self.squares[2] += len(records)
+        self.squares[1] += np.mean((posed["lengths"] - posed["reference"][:, :, 0]) ** 2, axis=1).sum()
+        self.squares[2] += len(posed)
         self.known += len(known)
         self.refused_packets = int(records["refused"][-1])
 
@@ -391,7 +394,7 @@ def _prepare_and_follow(
             rigs.callback(rig.close)
             rig.open()
             header["config"]["identity"] = asdict(rig.identify())
-            rigs.callback(rig.quick_stop)
+            rigs.callback(stop_quickly, rig)
             if config.arm:
                 rig.arm()
             loop.parameters["command_delay"] = rig.command_delay
@@ -411,7 +414,7 @@ def _prepare_and_follow(
                 "stop": cause,
                 "identity": header["config"].get("identity"),
                 "obstacle": None if config.arm else describe_obstacle(loop.state),
-                "reason": ": ".join([loop.reason(), *([failure] if (failure := getattr(rig, "failure", "")) else [])]),
+                "reason": ": ".join(filter(None, [loop.reason(), loop.failure or getattr(rig, "failure", "")])),
                 "cycle": int(loop.state["stop_cycle"]),
                 "cycles": int(link[HEAD]),
                 "missed_late": int(loop.clock["missed_late"]),

@@ -6,7 +6,7 @@ filters, that are written in Python.
 
 import mmap
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -38,9 +38,9 @@ from controller.safety import (
     EVENTS,
     FAULT,
     MISSED_PERIODS,
+    REACTION,
     RIG_FAILED,
     SUPERVISOR_GONE,
-    begin_stop,
     coast,
     has_stopped,
     hear,
@@ -149,6 +149,7 @@ class PythonFilters(NamedTuple):
 
 
 _ENDLESS = np.iinfo(np.int64).max
+_RAISED = SILENT + 1
 _LOOK_NS = 100_000_000
 _SIGQUIT = 1 << 2
 _SIGNALS = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14
@@ -224,6 +225,7 @@ class Loop:
         parameters, state: of the cycle.
         kind, udp, emulator: as in `Port`; by default the rig is the plant itself.
         stream: of a streamed target (dtype `controller.stream.STREAM`), None without one.
+        failure: what a rig in Python has raised.
         segments: the reference.
         records: (N,), dtype `RECORD`, written round and round.
         clock: dtype `hil.clock.CLOCK`; by default the loop runs as fast as it goes.
@@ -246,6 +248,7 @@ class Loop:
     udp: UdpLink = field(default_factory=new_link)
     emulator: UdpEmulator | None = None
     stream: Record | None = None
+    failure: str = ""
 
     def __post_init__(self) -> None:
         self._taker: Record = np.zeros((), TAKER)
@@ -268,7 +271,7 @@ class Loop:
         try:
             return self._run_python(rig, _ENDLESS, end)
         except BaseException:
-            rig.quick_stop()
+            stop_quickly(rig)
             raise
 
     def load(self, python: bool = False) -> None:
@@ -318,7 +321,7 @@ class Loop:
             if cause != OK:
                 break
             began = now(timespec)
-            status = rig.exchange(state["command"], int(safety["request"]), feedback)
+            status = self._exchange(rig, int(safety["request"]), feedback)
             stage_ns[_SENSE] = now(timespec) - began
             failed = _hear(parameters, state, work, status)
             if not failed and filters is not None and safety["mode"] != FAULT:
@@ -334,8 +337,16 @@ class Loop:
             _note(parameters, state, self.segments, self.records, clock, self.link, work, streamed, failed)
             _end(self.records, clock, self.script, self.link, work)
         if cause != OK:
-            rig.quick_stop()
+            stop_quickly(rig)
         return cause
+
+    def _exchange(self, rig: Rig, request: int, feedback: Record) -> int:
+        """An exchange of a rig in Python; whatever it raises is a failure."""
+        try:
+            return int(rig.exchange(self.state["command"], request, feedback))
+        except Exception as error:
+            self.failure = f"{type(error).__name__}: {error}"
+            return _RAISED
 
 
 def _load(kernel: Any, *arguments: Any) -> None:
@@ -347,6 +358,12 @@ def _load(kernel: Any, *arguments: Any) -> None:
 def shared_array(count: int, dtype: np.dtype[Any]) -> Any:
     """Zeros (count,) in memory that is shared with the processes forked later."""
     return np.frombuffer(mmap.mmap(-1, count * dtype.itemsize), dtype)
+
+
+def stop_quickly(rig: Rig) -> None:
+    """Stop a rig's drives; one that raises here must not hide why."""
+    with suppress(Exception):
+        rig.quick_stop()
 
 
 @contextmanager
@@ -481,34 +498,39 @@ def _begin(
     missed = wait(clock, script)
     w.asked = OK
     if missed < 0:
-        w.asked, missed = CLOCK_FAILED, 0
+        _ask(work, CLOCK_FAILED)
+        missed = 0
     skip(state, missed)
     w.cycle = s.cycle
     w.stage_ns[:] = 0
     if s.cycle - s.safety.waited >= end:
-        w.asked = END_OF_MOTION
+        _ask(work, END_OF_MOTION)
     if c.mode == REAL and c.cycles % max(_LOOK_NS // c.period, 1) == 0:
         signals = w.signals
         if _sigpending(signals.ctypes.data) == 0 and signals[0] & _SIGNALS != 0:
-            w.asked = ASKED_TO_STOP if signals[0] & _SIGQUIT == 0 else EMERGENCY_STOP
+            _ask(work, ASKED_TO_STOP if signals[0] & _SIGQUIT == 0 else EMERGENCY_STOP)
         if link[SUPERVISOR] != 0 and _getppid() != link[SUPERVISOR]:
-            w.asked = SUPERVISOR_GONE
+            _ask(work, SUPERVISOR_GONE)
     if c.in_a_row >= most_missed:
-        w.asked = MISSED_PERIODS
-    if link[STOP] == CONTROLLED:
-        w.asked = ASKED_TO_STOP
-    elif link[STOP] == QUICKLY:
-        w.asked = EMERGENCY_STOP
-    if streamed.active != 0 and s.stopping == 0:
+        _ask(work, MISSED_PERIODS)
+    if link[STOP] != 0:
+        _ask(work, ASKED_TO_STOP if link[STOP] == CONTROLLED else EMERGENCY_STOP)
+    leg, value, limit = -1, np.nan, np.nan
+    if streamed.active != 0 and s.stopping == 0 and w.asked == OK:
         cause, leg, value, limit = stream_cause(streamed.stream, c.woke, streamed.patience_ns)
-        if cause != OK:
-            w.asked = cause
-            react(parameters, state, cause, leg, value, limit)
+        _ask(work, cause)
     if w.asked == MISSED_PERIODS:
-        react(parameters, state, w.asked, -1, c.in_a_row, most_missed)
-    elif w.asked != OK:
-        begin_stop(parameters, state, w.asked)
+        value, limit = float(c.in_a_row), float(most_missed)
+    if w.asked != OK:
+        react(parameters, state, w.asked, leg, value, limit)
     return int(s.stopping) if has_stopped(state) else OK
+
+
+@kernel
+def _ask(work: Record, cause: int) -> None:
+    """Ask for a reaction; of several causes the gravest counts, and of the same gravity the last."""
+    if REACTION[cause] >= REACTION[work[()].asked]:
+        work[()].asked = cause
 
 
 @kernel
@@ -523,7 +545,7 @@ def _hear(parameters: Record, state: Record, work: Record, status: int) -> int:
         fresh = feedback.sequence[k] != w.sequence[k]
         w.sample_age[k] = 0 if fresh else w.sample_age[k] + 1 + state[()].missed
         w.sequence[k] = feedback.sequence[k]
-    if status > SILENT:
+    if status != ANSWERED and status != SILENT:
         react(parameters, state, RIG_FAILED, -1, status, np.nan)
         coast(parameters, state)
         return RIG_FAILED

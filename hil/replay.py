@@ -143,7 +143,11 @@ def _replay(
             s.reference[:] = recorded.reference
             s.prepared = s.cycle + 1
         if recorded.asked != OK:
+            if streamed:
+                # What the stop made of missed periods is in the recorded reference.
+                s.missed = 0
             begin_stop(parameters, state, recorded.asked)
+            s.missed = recorded.missed
         measurement[0] = recorded.angular_velocity
         measurement[1] = recorded.specific_force
         measurement[2] = recorded.magnetic_field

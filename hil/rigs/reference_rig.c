@@ -152,6 +152,9 @@ static int take_hello(const struct gough_hello *hello, const struct sockaddr_in 
         rig.session = hello->head.session;
         rig.last = rig.refused = 0;
         rig.heard_ns = now;
+        /* Three periods at least, or slow controllers would not be served. */
+        if (rig.watchdog_ns < 3000 * (int64_t)hello->period_us)
+            rig.watchdog_ns = 3000 * (int64_t)hello->period_us;
     }
     struct gough_welcome welcome = {.watchdog_us = (uint32_t)(rig.watchdog_ns / 1000)};
     memcpy(welcome.name, "gough reference rig", sizeof "gough reference rig");

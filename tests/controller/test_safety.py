@@ -102,6 +102,26 @@ def test_from_idle_to_running_as_the_drives_are_ready(bench):
     assert bench.state["safety"]["waited"] == 7
 
 
+def test_what_goes_wrong_between_armed_and_running_ends_it_at_once(hexapod):
+    bench = Bench(hexapod)
+    bench.steps(bench.hold + 5, drive=READY)
+    assert bench.mode == ARMED
+    bench.segments[:, 0, 1] += 0.02
+    bench.step(drive=READY)
+    assert bench.state["stopping"] == NO_AGREEMENT
+    assert bench.request == BRAKED
+    assert (bench.state["command"] == 0.0).all()
+    assert has_stopped(bench.state)
+
+
+def test_a_bus_that_answers_now_and_then_is_lost(hexapod):
+    bench = running(hexapod)
+    for _ in range(20):
+        bench.steps(3, silent=1)
+        bench.step()
+    assert (bench.mode, bench.state["stopping"]) == (FAULT, BUS_LOST)
+
+
 @pytest.mark.parametrize("drive", [OFF, FAULTY, QUICK_STOPPING])
 def test_drives_that_are_not_ready_are_not_armed(bench, drive):
     told = bench.steps(bench.hold + round(1.1 * RATE_HZ), drive=[READY] * 3 + [drive] + [READY] * 2)

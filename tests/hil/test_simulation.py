@@ -57,6 +57,15 @@ def test_the_loop_follows_at_other_rates(rate):
     assert errors(result, "tracking") < (3.0, 0.6)
 
 
+@pytest.mark.parametrize("rate", [50.0, 70.0, 100.0, 150.0, 200.0, 300.0, 500.0, 2000.0])
+def test_no_watch_stops_a_sound_run_at_any_rate(rate):
+    for seed in range(4):
+        for target in ("circle", "sines"):
+            records = simulate(SimulationConfig(target=target, duration=3.0, rate=rate, seed=seed)).records
+            # Armed, and nothing else: no IMU is left out.
+            assert records["event_count"].sum() == 1, (seed, target)
+
+
 def test_a_target_faster_than_the_limits_is_followed_as_closely_as_they_allow(tmp_path):
     times = np.arange(0.0, 4.0, 0.01)
     x = 0.04 * np.sin(2.0 * np.pi * 3.0 * times) * np.minimum(times, 1.0)
