@@ -107,7 +107,7 @@ def test_what_goes_wrong_between_armed_and_running_ends_it_at_once(hexapod):
     bench.steps(bench.hold + 5, drive=READY)
     assert bench.mode == ARMED
     bench.segments[:, 0, 1] += 0.02
-    bench.step(drive=READY)
+    bench.steps(2, drive=READY)
     assert bench.state["stopping"] == NO_AGREEMENT
     assert bench.request == BRAKED
     assert (bench.state["command"] == 0.0).all()
