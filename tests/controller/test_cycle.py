@@ -19,7 +19,7 @@ from controller.cycle import (
 from controller.direct_kinematics import solve
 from controller.fusion import improve_pose
 from controller.inverse_kinematics import leg_lengths, sample_workspace
-from controller.safety import NOT_FINITE, POSE_LOST
+from controller.safety import IDLE, NOT_FINITE, POSE_LOST, RUNNING
 from controller.settings import ControlSettings, FusionSettings, SafetySettings, control_settings, fusion_settings
 from plant.errors import InputError
 from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER, imu_state, load_imu, measure
@@ -440,11 +440,16 @@ def test_a_reading_that_is_not_used_may_be_no_number(hexapod):
     run(parameters_of(hexapod, LEG_IMUS), signals, resting(np.full(6, 0.4)), 300)
 
 
-def test_a_reference_that_is_no_number_stops_the_cycle_and_not_the_hold(hexapod):
-    parameters, state = parameters_of(hexapod), np.zeros((), STATE)
-    signals, segments = static_signals(hexapod, hexapod.home.position, np.eye(3)), resting(np.full(6, np.nan))
-    statuses = [cycle(parameters, state, signals, segments) for _ in range(201)]
-    assert statuses == [OK] * 200 + [NOT_FINITE]
+def test_a_reference_that_is_no_number_is_not_armed_and_stops_the_cycle_in_motion(hexapod):
+    parameters, signals = parameters_of(hexapod), static_signals(hexapod, hexapod.home.position, np.eye(3))
+    lengths = leg_lengths(hexapod, hexapod.home.position, hexapod.home.rotation)
+    state = run(parameters, signals, resting(np.full(6, np.nan)), 250)
+    assert state["safety"]["mode"] == IDLE
+    assert (state["command"] == 0.0).all()
+    state = run(parameters, signals, resting(lengths), 250)
+    assert state["safety"]["mode"] == RUNNING
+    assert cycle(parameters, state, signals, resting(np.full(6, np.nan))) == NOT_FINITE
+    assert (np.isfinite(state["command"])).all()
 
 
 def test_directions_that_no_longer_determine_a_pose_are_reported(hexapod):
