@@ -198,6 +198,7 @@ def _add_emulate(commands: Any) -> None:
     command.add_argument("--mechanism", default="hexapod", help="preset, or a TOML file")
     command.add_argument("--target", default="circle", help="at whose first pose the platform stands")
     command.add_argument("--imu", default="mpu9150-calibrated", help="ideal, mpu9150, mpu9150-calibrated or icm42688")
+    command.add_argument("--watchdog", type=float, default=30.0, help="on udp: without a command for so long, drives stop [ms]")
     command.add_argument("--rate", type=float, default=1000.0, help="of the IMUs' samples on canopen; udp asks for it [Hz]")
     command.add_argument("--seed", type=int, default=0, help="of the IMUs' imperfections and the faults")
     command.add_argument("--plant", metavar="FILE.fmu", help="FMI 3.0 Co-Simulation FMU to use instead of the built one")
@@ -1144,7 +1145,9 @@ def _emulate(options: argparse.Namespace) -> int:
 
     names = ("mechanism", "target", "imu", "seed", "plant", "rate")
     simulated = SimulationConfig(**{name: getattr(options, name) for name in names}, joint_error=1e-3 * options.joint_error)
-    config = EmulatorConfig(simulated, options.bus, options.at, options.control, tuple(options.fault))
+    config = EmulatorConfig(
+        simulated, options.bus, options.at, options.control, tuple(options.fault), 1e-3 * options.watchdog
+    )  # fmt: skip
     emulate(config, RealTimeSettings(options.priority, options.cpu), lambda text: print(text, flush=True))
     return 0
 

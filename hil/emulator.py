@@ -52,6 +52,7 @@ class EmulatorConfig:
         at: the address, or the settings' file; None for the default.
         control: address of the control channel.
         faults: from the start, as `hil.rigs.faults.fault` reads them.
+        watchdog: after how long without a command the drives stop, on UDP [s].
     """
 
     simulated: SimulationConfig = field(default_factory=SimulationConfig)
@@ -59,6 +60,11 @@ class EmulatorConfig:
     at: str | None = None
     control: str = "127.0.0.1:47101"
     faults: tuple[str, ...] = ()
+    watchdog: float = WATCHDOG_S
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.watchdog < 60.0:
+            raise InputError(f"the watchdog is {1e3 * self.watchdog:g} ms; it must be more than 0 and less than a minute")
 
 
 class _Stopped:
@@ -239,11 +245,11 @@ def _serve_sessions(
         period = 1e-6 * int(hello["period_us"])
         plant, imu, rig = _rig_of(config, period, faults)
         with plant:
-            emulator = new_udp_emulator(plant.calls, imu, rig, int(hello["session"]), _watchdog(hello))
+            emulator = new_udp_emulator(plant.calls, imu, rig, int(hello["session"]), _watchdog(config, hello))
             emulator.socket["descriptor"], emulator.socket["peer"] = opened.fileno(), socket_address(sender)
-            _welcome(opened, hello, sender)
+            _welcome(opened, config, hello, sender)
             say(f"session with {sender[0]}:{sender[1]} at {1.0 / period:g} Hz")
-            following = _serve_session(opened, emulator, control, stopped)
+            following = _serve_session(opened, config, emulator, control, stopped)
             say(f"end of the session; {int(emulator.port['refused'])} datagrams refused")
 
 
@@ -253,19 +259,19 @@ def _hello(content: bytes) -> Record | None:
     return hello if hello is not None and hello["session"] != 0 and hello["period_us"] != 0 else None
 
 
-def _watchdog(hello: Record) -> float:
+def _watchdog(config: EmulatorConfig, hello: Record) -> float:
     """After how long without a command the drives stop [s]: three periods at least."""
-    return max(WATCHDOG_S, 3e-6 * int(hello["period_us"]))
+    return max(config.watchdog, 3e-6 * int(hello["period_us"]))
 
 
-def _welcome(opened: socket.socket, hello: Record, sender: tuple[str, int]) -> None:
+def _welcome(opened: socket.socket, config: EmulatorConfig, hello: Record, sender: tuple[str, int]) -> None:
     name, firmware = (np.frombuffer(text.encode().ljust(size, b"\0"), np.uint8) for text, size in ((_NAME, 32), ("1", 16)))
-    fields = {"session": hello["session"], "watchdog_us": round(1e6 * _watchdog(hello)), "truthful": 1, "name": name}
+    fields = {"session": hello["session"], "watchdog_us": round(1e6 * _watchdog(config, hello)), "truthful": 1, "name": name}
     opened.sendto(encode(WELCOME_DATAGRAM, kind=WELCOME, firmware=firmware, **fields), sender)
 
 
 def _serve_session(
-    opened: socket.socket, emulator: UdpEmulator, control: _Control, stopped: _Stopped
+    opened: socket.socket, config: EmulatorConfig, emulator: UdpEmulator, control: _Control, stopped: _Stopped
 ) -> tuple[Record, tuple[str, int]] | None:
     """Serve until the end; returns the hello that begins another session, and whose it is."""
     started, timespec = time.monotonic_ns(), np.zeros(2, np.int64)
@@ -284,7 +290,7 @@ def _serve_session(
             if hello is None or np.isin(emulator.rig["drive"], (FOLLOWING, QUICK_STOPPING)).any():
                 emulator.port["refused"] += 1
             elif hello["session"] == emulator.port["session"]:
-                _welcome(opened, hello, sender)
+                _welcome(opened, config, hello, sender)
             else:
                 return hello, sender
     return None
