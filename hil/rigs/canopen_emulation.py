@@ -11,16 +11,7 @@ from controller.safety import FOLLOWING, QUICK_STOPPING
 from hil.rigs.canopen_nodes import CanopenNodes
 from hil.rigs.canopen_settings import CanopenSettings
 from hil.rigs.emulated import EMULATED, move, sample
-from hil.rigs.faults import (
-    BUS_CORRUPTS,
-    BUS_DELAYS,
-    BUS_DOWN,
-    BUS_DROPS,
-    BUS_REORDERS,
-    BUS_REPEATS,
-    draw,
-    is_active,
-)
+from hil.rigs.faults import disturb
 from plant.compiled import Record
 from plant.errors import FmuError
 from plant.fmu import FmuPlant
@@ -90,24 +81,10 @@ class FaultyChannel:
     def __call__(self, frame: can.Message, outgoing: bool) -> Iterator[tuple[float, can.Message]]:
         """The frames that come of one, and how much later [s]."""
         del outgoing
-        rig, copies, delay = self._rig, 1, 0.0
-        for fault in rig["fault"][: int(rig["faults"])]:
-            kind, size = int(fault["kind"]), float(fault["size"])
-            if not is_active(fault, int(rig["enabled_ns"]), int(rig["time_ns"])):
-                continue
-            if kind == BUS_DOWN or (kind == BUS_DROPS and draw(rig["random"]) < size):
-                copies = 0
-            elif kind == BUS_DELAYS:
-                delay += 1e-9 * size
-            elif kind == BUS_REPEATS and draw(rig["random"]) < size:
-                copies = 2
-            elif kind == BUS_REORDERS and draw(rig["random"]) < size:
-                delay += _HELD_BACK_S
-            elif kind == BUS_CORRUPTS and draw(rig["random"]) < size:
-                # A frame's own CRC is part of CAN: controllers never hand on what is damaged.
-                copies = 0
-        for _ in range(copies):
-            yield delay, frame
+        copies, delay, damaged, held = disturb(self._rig[()], int(self._rig["time_ns"]))
+        # A frame's own CRC is part of CAN: controllers never hand on what is damaged.
+        for _ in range(0 if damaged else copies):
+            yield 1e-9 * delay + (_HELD_BACK_S if held else 0.0), frame
 
 
 def serve_canopen(

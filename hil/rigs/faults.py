@@ -105,6 +105,29 @@ def is_active(found: Record, enabled_ns: int, now_ns: int) -> bool:
 
 
 @kernel
+def disturb(rig: Record, now_ns: int) -> tuple[int, int, bool, bool]:
+    """What the faults of the bus do to a message of a rig (dtype `hil.rigs.emulated.EMULATED`): how many copies arrive, how
+    much later [ns], whether they are damaged, and whether they come after the next one.
+    """
+    copies, delay, damaged, held = 1, 0, False, False
+    for i in range(rig.faults):
+        f = rig.fault[i]
+        if not is_active(f, rig.enabled_ns, now_ns):
+            continue
+        if f.kind == BUS_DOWN or (f.kind == BUS_DROPS and draw(rig.random) < f.size):
+            copies = 0
+        elif f.kind == BUS_DELAYS:
+            delay += int(f.size)
+        elif f.kind == BUS_REPEATS and draw(rig.random) < f.size:
+            copies *= 2
+        elif f.kind == BUS_CORRUPTS and draw(rig.random) < f.size:
+            damaged = True
+        elif f.kind == BUS_REORDERS and draw(rig.random) < f.size:
+            held = True
+    return copies, delay, damaged, held
+
+
+@kernel
 def draw(random: Record) -> float:
     """A number in [0, 1) of the generator splitmix64, whose state (uint64, shape (1,)) goes on."""
     random[0] += np.uint64(0x9E3779B97F4A7C15)

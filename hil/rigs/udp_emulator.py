@@ -29,16 +29,7 @@ from hil.rigs.datagrams import (
     is_sound,
 )
 from hil.rigs.emulated import move, sample
-from hil.rigs.faults import (
-    BUS_CORRUPTS,
-    BUS_DELAYS,
-    BUS_DOWN,
-    BUS_DROPS,
-    BUS_REORDERS,
-    BUS_REPEATS,
-    draw,
-    is_active,
-)
+from hil.rigs.faults import disturb, draw
 from hil.rigs.udp import SOCKET, UdpLink, await_datagram, decode_answer, encode_command, receive_datagram, send_datagram
 from plant.compiled import Record, kernel
 from plant.mechanism import LEGS
@@ -185,22 +176,10 @@ def look_after(emulator: UdpEmulator, now_ns: int) -> None:
 @kernel
 def post(emulator: UdpEmulator, content: Bytes, length: int, way: int, now_ns: int) -> None:
     """Put a packet on its way, with what the faults of the bus do to it."""
-    rig, port = emulator.rig[()], emulator.port[()]
-    copies, delay, corrupt, held = 1, _LATENCY_NS if emulator.socket[()].descriptor == 0 else 0, False, False
-    for i in range(rig.faults):
-        f = rig.fault[i]
-        if not is_active(f, rig.enabled_ns, now_ns):
-            continue
-        if f.kind == BUS_DOWN or (f.kind == BUS_DROPS and draw(rig.random) < f.size):
-            copies = 0
-        elif f.kind == BUS_DELAYS:
-            delay += int(f.size)
-        elif f.kind == BUS_REPEATS and draw(rig.random) < f.size:
-            copies *= 2
-        elif f.kind == BUS_CORRUPTS and draw(rig.random) < f.size:
-            corrupt = True
-        elif f.kind == BUS_REORDERS and draw(rig.random) < f.size:
-            held = True
+    port = emulator.port[()]
+    copies, delay, corrupt, held = disturb(emulator.rig[()], now_ns)
+    if emulator.socket[()].descriptor == 0:
+        delay += _LATENCY_NS
     released = port.held_back[way] > 0 and not held
     for i in range(_PACKETS):
         p = port.packet[i]
@@ -212,7 +191,7 @@ def post(emulator: UdpEmulator, content: Bytes, length: int, way: int, now_ns: i
             for j in range(length):
                 p.content[j] = content[j]
             if corrupt:
-                bit = int(draw(rig.random) * 8 * length)
+                bit = int(draw(emulator.rig[()].random) * 8 * length)
                 p.content[bit // 8] ^= np.uint8(1 << (bit % 8))
             copies -= 1
     port.held_back[way] = 1 if held else 0
