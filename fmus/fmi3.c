@@ -1,171 +1,66 @@
-/* FMI 3.0 Co-Simulation around the generated dynamics of plant/dynamics.py.
- *
- * layout.h is generated from the table in plant/variables.py: all variables lie in one vector `values`, states first, and
- * each value reference names one variable of `length[]` scalars at `offset[]`. All state is one plain struct, so saving,
- * restoring and serialising it are copies. Integration is the classical Runge-Kutta method with equal substeps.
- */
+/* FMI 3.0, Co-Simulation and Model Exchange: every variable of the table is one array; a value reference is its index. */
 #include <math.h>
-#include <stdio.h>
 #include <stdlib.h>
-#include <string.h>
 
 #include "fmi3Functions.h"
-#include "layout.h"
-#include "plant.h"
-
-typedef enum { INSTANTIATED, INITIALIZING, STEPPING, TERMINATED } Phase;
+#include "model.h"
 
 typedef struct {
-    double time;
-    double values[VALUES];
-    double constants[CONSTANTS];
-    int constants_known;
-    int outputs_known;
-    Phase phase;
-} State;
-
-typedef struct {
-    unsigned long long layout;
-    State state;
-} Serialized;
-
-typedef struct {
-    State state;
     fmi3InstanceEnvironment environment;
     fmi3LogMessageCallback log;
-    fmi3Boolean logging;
-} Plant;
+} Importer;
 
-static fmi3Status fail(Plant *plant, const char *message) {
-    if (plant->log && plant->logging) plant->log(plant->environment, fmi3Error, "logStatusError", message);
-    return fmi3Error;
+static void tell(const Plant *plant, const char *message) {
+    const Importer *importer = plant->importer;
+    if (importer->log) importer->log(importer->environment, fmi3Error, "logStatusError", message);
 }
 
-/* ---- dynamics ---- */
+static Status fail(fmi3Instance instance, const char *message) { return model_fail(instance, "%s", message); }
 
-static void require_constants(State *s) {
-    if (s->constants_known) return;
-    const double *arguments[plant_constants_SZ_ARG] = {s->values + PARAMETERS_AT};
-    double *results[plant_constants_SZ_RES] = {s->constants}, work[plant_constants_SZ_W + 1];
-    casadi_int integers[plant_constants_SZ_IW + 1];
-    plant_constants(arguments, results, integers, work, 0);
-    s->constants_known = 1;
-}
-
-static void rates(const State *s, const double *x, double *dx) {
-    const double *arguments[plant_rates_SZ_ARG] = {x, s->values + INPUTS_AT, s->constants};
-    double *results[plant_rates_SZ_RES] = {dx}, work[plant_rates_SZ_W + 1];
-    casadi_int integers[plant_rates_SZ_IW + 1];
-    plant_rates(arguments, results, integers, work, 0);
-}
-
-static void require_outputs(State *s) {
-    if (s->outputs_known) return;
-    require_constants(s);
-    const double *arguments[plant_outputs_SZ_ARG] = {s->values, s->values + INPUTS_AT, s->constants};
-    double *results[plant_outputs_SZ_RES] = {s->values + OUTPUTS_AT}, work[plant_outputs_SZ_W + 1];
-    casadi_int integers[plant_outputs_SZ_IW + 1];
-    plant_outputs(arguments, results, integers, work, 0);
-    s->outputs_known = 1;
-}
-
-static void normalize_quaternion(double *q) {
-    double scale = 1 / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-    for (int i = 0; i < 4; i++) q[i] *= scale;
-}
-
-static void place_at_start(State *s) {
-    memset(s->values, 0, STATES * sizeof(double));
-    memcpy(s->values + POSITION_AT, s->values + INITIAL_POSITION_AT, 3 * sizeof(double));
-    memcpy(s->values + QUATERNION_AT, s->values + INITIAL_QUATERNION_AT, 4 * sizeof(double));
-    normalize_quaternion(s->values + QUATERNION_AT);
-    s->outputs_known = 0;
-}
-
-static void integrate(State *s, double duration) {
-    int steps = (int)ceil(duration / s->values[SUBSTEP_AT] - 1e-9);
-    if (steps < 1) steps = 1;
-    double h = duration / steps, *x = s->values, k[4][STATES], at[STATES];
-    require_constants(s);
-    for (int step = 0; step < steps; step++) {
-        rates(s, x, k[0]);
-        for (int i = 0; i < STATES; i++) at[i] = x[i] + h / 2 * k[0][i];
-        rates(s, at, k[1]);
-        for (int i = 0; i < STATES; i++) at[i] = x[i] + h / 2 * k[1][i];
-        rates(s, at, k[2]);
-        for (int i = 0; i < STATES; i++) at[i] = x[i] + h * k[2][i];
-        rates(s, at, k[3]);
-        for (int i = 0; i < STATES; i++) x[i] += h / 6 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i]);
-        normalize_quaternion(x + QUATERNION_AT);
-    }
-    s->outputs_known = 0;
-}
-
-static int all_finite(const double *values, size_t n) {
-    for (size_t i = 0; i < n; i++)
-        if (!isfinite(values[i])) return 0;
-    return 1;
-}
-
-static fmi3Status check_values(Plant *plant, int v, const double *values) {
-    char message[200];
-    for (int i = 0; i < length[v]; i++) {
-        if (isfinite(values[i]) && values[i] >= minimum[v]) continue;
-        snprintf(message, sizeof message, "parameter %s is %g; it must be finite and at least %g", names[v], values[i], minimum[v]);
-        return fail(plant, message);
-    }
-    return fmi3OK;
-}
-
-static fmi3Status check_parameters(Plant *plant) {
-    const double *values = plant->state.values;
-    for (int v = 0; v < VARIABLES; v++)
-        if ((kind[v] == FIXED || kind[v] == TUNABLE) && check_values(plant, v, values + offset[v]) != fmi3OK) return fmi3Error;
-    const double *q = values + INITIAL_QUATERNION_AT;
-    if (fabs(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3] - 1) > 2e-3)
-        return fail(plant, "parameter initial_quaternion is not a unit quaternion; normalise it");
-    return fmi3OK;
-}
-
-/* ---- FMI 3.0: life ---- */
+/* ---- life ---- */
 
 FMI3_Export const char *fmi3GetVersion(void) { return "3.0"; }
 
 FMI3_Export fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean on, size_t n, const fmi3String categories[]) {
-    (void)n, (void)categories;
-    ((Plant *)instance)->logging = on;
+    (void)instance, (void)on, (void)n, (void)categories; /* errors are always told, and there is nothing else */
     return fmi3OK;
 }
 
-static void reset(State *s) {
-    memset(s, 0, sizeof *s);
-    memcpy(s->values, start, sizeof start);
-    place_at_start(s);
+static fmi3Instance instantiate(Phase after, fmi3String token, fmi3InstanceEnvironment environment, fmi3LogMessageCallback log) {
+    Importer *importer = malloc(sizeof *importer);
+    if (!importer) return 0;
+    importer->environment = environment;
+    importer->log = log;
+    Plant *plant = model_new(after, token, tell, importer);
+    if (!plant) free(importer);
+    return plant;
 }
 
 FMI3_Export fmi3Instance fmi3InstantiateCoSimulation(
     fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging, fmi3Boolean events,
     fmi3Boolean early_return, const fmi3ValueReference intermediate[], size_t n_intermediate,
     fmi3InstanceEnvironment environment, fmi3LogMessageCallback log, fmi3IntermediateUpdateCallback update) {
-    (void)name, (void)resources, (void)visible, (void)events, (void)early_return;
+    (void)name, (void)resources, (void)visible, (void)logging, (void)events, (void)early_return;
     (void)intermediate, (void)n_intermediate, (void)update;
-    if (!token || strcmp(token, TOKEN)) {
-        if (log && logging) log(environment, fmi3Error, "logStatusError", "the instantiationToken is not that of modelDescription.xml");
-        return 0;
-    }
-    Plant *plant = malloc(sizeof *plant);
-    if (!plant) return 0;
-    plant->environment = environment;
-    plant->log = log;
-    plant->logging = logging;
-    reset(&plant->state);
-    return plant;
+    return instantiate(STEPPING, token, environment, log);
 }
 
-FMI3_Export void fmi3FreeInstance(fmi3Instance instance) { free(instance); }
+FMI3_Export fmi3Instance fmi3InstantiateModelExchange(
+    fmi3String name, fmi3String token, fmi3String resources, fmi3Boolean visible, fmi3Boolean logging,
+    fmi3InstanceEnvironment environment, fmi3LogMessageCallback log) {
+    (void)name, (void)resources, (void)visible, (void)logging;
+    return instantiate(EVENTS, token, environment, log);
+}
+
+FMI3_Export void fmi3FreeInstance(fmi3Instance instance) {
+    Plant *plant = instance;
+    if (!plant) return;
+    free((void *)plant->importer);
+    model_free(plant);
+}
 
 FMI3_Export fmi3Status fmi3Reset(fmi3Instance instance) {
-    reset(&((Plant *)instance)->state);
+    model_reset(instance);
     return fmi3OK;
 }
 
@@ -173,19 +68,11 @@ FMI3_Export fmi3Status fmi3EnterInitializationMode(
     fmi3Instance instance, fmi3Boolean tolerance_defined, fmi3Float64 tolerance, fmi3Float64 start_time,
     fmi3Boolean stop_defined, fmi3Float64 stop_time) {
     (void)tolerance_defined, (void)tolerance, (void)stop_defined, (void)stop_time;
-    Plant *plant = instance;
-    if (plant->state.phase != INSTANTIATED) return fail(plant, "initialisation can be entered only once after instantiation");
-    plant->state.phase = INITIALIZING;
-    plant->state.time = start_time;
-    return fmi3OK;
+    return (fmi3Status)model_enter_initialization(instance, start_time);
 }
 
 FMI3_Export fmi3Status fmi3ExitInitializationMode(fmi3Instance instance) {
-    Plant *plant = instance;
-    if (plant->state.phase != INITIALIZING) return fail(plant, "not in initialisation mode");
-    if (check_parameters(plant) != fmi3OK) return fmi3Error;
-    plant->state.phase = STEPPING;
-    return fmi3OK;
+    return (fmi3Status)model_exit_initialization(instance);
 }
 
 FMI3_Export fmi3Status fmi3Terminate(fmi3Instance instance) {
@@ -193,62 +80,126 @@ FMI3_Export fmi3Status fmi3Terminate(fmi3Instance instance) {
     return fmi3OK;
 }
 
+/* ---- Co-Simulation ---- */
+
 FMI3_Export fmi3Status fmi3DoStep(
     fmi3Instance instance, fmi3Float64 time, fmi3Float64 step, fmi3Boolean no_set_state, fmi3Boolean *event,
     fmi3Boolean *terminate, fmi3Boolean *early, fmi3Float64 *reached) {
     (void)no_set_state;
     Plant *plant = instance;
-    State *s = &plant->state;
     *event = *terminate = *early = fmi3False;
-    *reached = s->time;
-    if (s->phase != STEPPING) return fail(plant, "fmi3DoStep before the end of initialisation or after termination");
-    if (!(step > 0) || !isfinite(step)) return fail(plant, "the communication step must be positive");
-    if (fabs(time - s->time) > 1e-6 * step + 1e-9 * fabs(time)) return fail(plant, "the communication point is not where the last step ended");
-    if (!all_finite(s->values + INPUTS_AT, INPUTS)) return fail(plant, "an input is not finite");
-    integrate(s, step);
-    s->time = time + step;
-    if (!all_finite(s->values, STATES)) return fail(plant, "the state is no longer finite: reduce substep, or check the parameters");
-    *reached = s->time;
+    fmi3Status status = (fmi3Status)model_step(plant, time, step);
+    *reached = plant->state.time;
+    return status;
+}
+
+/* ---- Model Exchange ---- */
+
+FMI3_Export fmi3Status fmi3EnterEventMode(fmi3Instance instance) {
+    Plant *plant = instance;
+    if (plant->state.phase != CONTINUOUS) return (fmi3Status)fail(plant, "event mode follows continuous-time mode");
+    plant->state.phase = EVENTS;
     return fmi3OK;
 }
 
-/* ---- FMI 3.0: variables ---- */
-
-static fmi3Status may_set(Plant *plant, fmi3ValueReference v, int discrete) {
-    Phase phase = plant->state.phase;
-    char message[160];
-    const char *why = 0;
-    if (v >= VARIABLES || (kind[v] == DISCRETE_INPUT) != discrete) why = "is not a variable of this type";
-    else if (kind[v] == OUTPUT) why = "is an output and cannot be set";
-    else if (kind[v] == FIXED && phase >= STEPPING) why = "is fixed once initialisation has ended";
-    if (!why) return fmi3OK;
-    snprintf(message, sizeof message, "%s (value reference %u) %s", v < VARIABLES ? names[v] : "?", v, why);
-    return fail(plant, message);
+FMI3_Export fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance instance) {
+    Plant *plant = instance;
+    if (plant->state.phase != EVENTS) return (fmi3Status)fail(plant, "continuous-time mode follows event mode");
+    plant->state.phase = CONTINUOUS;
+    return fmi3OK;
 }
 
-static void note_set(State *s, fmi3ValueReference v) {
-    s->outputs_known = 0;
-    if (kind[v] != FIXED && kind[v] != TUNABLE) return;
-    s->constants_known = 0;
-    if (s->phase < STEPPING) place_at_start(s);
+FMI3_Export fmi3Status fmi3UpdateDiscreteStates(
+    fmi3Instance instance, fmi3Boolean *again, fmi3Boolean *terminate, fmi3Boolean *nominals_changed,
+    fmi3Boolean *values_changed, fmi3Boolean *next_event_defined, fmi3Float64 *next_event) {
+    (void)instance;
+    *again = *terminate = *nominals_changed = *values_changed = *next_event_defined = fmi3False;
+    *next_event = 0;
+    return fmi3OK;
+}
+
+FMI3_Export fmi3Status fmi3CompletedIntegratorStep(
+    fmi3Instance instance, fmi3Boolean no_set_state, fmi3Boolean *enter_events, fmi3Boolean *terminate) {
+    (void)instance, (void)no_set_state;
+    *enter_events = *terminate = fmi3False;
+    return fmi3OK;
+}
+
+FMI3_Export fmi3Status fmi3SetTime(fmi3Instance instance, fmi3Float64 time) {
+    ((Plant *)instance)->state.time = time;
+    return fmi3OK;
+}
+
+FMI3_Export fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance instance, size_t *n) {
+    (void)instance;
+    *n = STATES;
+    return fmi3OK;
+}
+
+FMI3_Export fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance instance, size_t *n) {
+    (void)instance;
+    *n = 0;
+    return fmi3OK;
+}
+
+FMI3_Export fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 indicators[], size_t n) {
+    (void)indicators;
+    return n ? (fmi3Status)fail(instance, "fmi3GetEventIndicators: there are none") : fmi3OK;
+}
+
+static int has_all_states(fmi3Instance instance, size_t n) {
+    if (n == STATES) return 1;
+    model_fail(instance, "there are %d continuous states, not %d", STATES, (int)n);
+    return 0;
+}
+
+FMI3_Export fmi3Status fmi3GetContinuousStates(fmi3Instance instance, fmi3Float64 states[], size_t n) {
+    if (!has_all_states(instance, n)) return fmi3Error;
+    for (size_t i = 0; i < n; i++) states[i] = ((Plant *)instance)->state.values[i];
+    return fmi3OK;
+}
+
+FMI3_Export fmi3Status fmi3SetContinuousStates(fmi3Instance instance, const fmi3Float64 states[], size_t n) {
+    if (!has_all_states(instance, n)) return fmi3Error;
+    for (size_t i = 0; i < n; i++) ((Plant *)instance)->state.values[i] = states[i];
+    model_changed(instance);
+    return fmi3OK;
+}
+
+FMI3_Export fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance instance, fmi3Float64 nominals[], size_t n) {
+    if (!has_all_states(instance, n)) return fmi3Error;
+    for (int v = 0; v < VARIABLES; v++)
+        for (int i = 0; kind[v] == STATE && i < length[v]; i++) nominals[offset[v] + i] = nominal[v];
+    return fmi3OK;
+}
+
+FMI3_Export fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance instance, fmi3Float64 derivatives[], size_t n) {
+    if (!has_all_states(instance, n)) return fmi3Error;
+    const double *rates;
+    Status status = model_rates(instance, &rates);
+    for (size_t i = 0; i < n; i++) derivatives[i] = rates[i];
+    return (fmi3Status)status;
+}
+
+/* ---- variables ---- */
+
+static int fits(fmi3Instance instance, fmi3ValueReference v, size_t at, size_t n_values) {
+    if (v >= VARIABLES || at + length[v] <= n_values) return 1;
+    model_fail(instance, "too few values: %s needs %d", names[v], length[v]);
+    return 0;
 }
 
 FMI3_Export fmi3Status fmi3GetFloat64(
     fmi3Instance instance, const fmi3ValueReference references[], size_t n, fmi3Float64 values[], size_t n_values) {
-    Plant *plant = instance;
-    State *s = &plant->state;
-    size_t at = 0;
-    for (size_t i = 0; i < n; i++) {
+    for (size_t i = 0, at = 0; i < n; i++) {
         fmi3ValueReference v = references[i];
-        if (v == TIME_REFERENCE) {
-            if (at + 1 > n_values) return fail(plant, "fmi3GetFloat64: too few values");
-            values[at++] = s->time;
+        if (v == VARIABLES) {
+            if (at + 1 > n_values) return (fmi3Status)fail(instance, "too few values: time needs 1");
+            values[at++] = ((Plant *)instance)->state.time;
             continue;
         }
-        if (v >= VARIABLES || kind[v] == DISCRETE_INPUT) return fail(plant, "fmi3GetFloat64: no Float64 variable has that value reference");
-        if (at + length[v] > n_values) return fail(plant, "fmi3GetFloat64: too few values");
-        if (kind[v] == OUTPUT) require_outputs(s);
-        memcpy(values + at, s->values + offset[v], length[v] * sizeof(double));
+        if (!fits(instance, v, at, n_values)) return fmi3Error;
+        if (model_get(instance, v, 0, v < VARIABLES ? length[v] : 0, 0, values + at) != OK) return fmi3Error;
         at += length[v];
     }
     return fmi3OK;
@@ -256,63 +207,97 @@ FMI3_Export fmi3Status fmi3GetFloat64(
 
 FMI3_Export fmi3Status fmi3SetFloat64(
     fmi3Instance instance, const fmi3ValueReference references[], size_t n, const fmi3Float64 values[], size_t n_values) {
-    Plant *plant = instance;
-    size_t at = 0;
-    for (size_t i = 0; i < n; i++) {
+    for (size_t i = 0, at = 0; i < n; i++) {
         fmi3ValueReference v = references[i];
-        if (may_set(plant, v, 0) != fmi3OK) return fmi3Error;
-        if (at + length[v] > n_values) return fail(plant, "fmi3SetFloat64: too few values");
-        /* Before the end of initialisation parameters may be set one after the other; then all are checked together. */
-        if (kind[v] == TUNABLE && plant->state.phase >= STEPPING && check_values(plant, v, values + at) != fmi3OK) return fmi3Error;
-        memcpy(plant->state.values + offset[v], values + at, length[v] * sizeof(double));
+        if (!fits(instance, v, at, n_values)) return fmi3Error;
+        if (model_set(instance, v, 0, v < VARIABLES ? length[v] : 0, 0, values + at) != OK) return fmi3Error;
         at += length[v];
-        note_set(&plant->state, v);
     }
     return fmi3OK;
 }
 
 FMI3_Export fmi3Status fmi3GetInt64(
     fmi3Instance instance, const fmi3ValueReference references[], size_t n, fmi3Int64 values[], size_t n_values) {
-    Plant *plant = instance;
-    size_t at = 0;
-    for (size_t i = 0; i < n; i++) {
+    double whole[LONGEST];
+    for (size_t i = 0, at = 0; i < n; i++) {
         fmi3ValueReference v = references[i];
-        if (v >= VARIABLES || kind[v] != DISCRETE_INPUT) return fail(plant, "fmi3GetInt64: no enumeration has that value reference");
-        if (at + length[v] > n_values) return fail(plant, "fmi3GetInt64: too few values");
-        for (int j = 0; j < length[v]; j++) values[at++] = (fmi3Int64)plant->state.values[offset[v] + j];
+        if (!fits(instance, v, at, n_values)) return fmi3Error;
+        if (model_get(instance, v, 0, v < VARIABLES ? length[v] : 0, 1, whole) != OK) return fmi3Error;
+        for (int j = 0; j < length[v]; j++) values[at++] = (fmi3Int64)whole[j];
     }
     return fmi3OK;
 }
 
 FMI3_Export fmi3Status fmi3SetInt64(
     fmi3Instance instance, const fmi3ValueReference references[], size_t n, const fmi3Int64 values[], size_t n_values) {
-    Plant *plant = instance;
-    size_t at = 0;
-    for (size_t i = 0; i < n; i++) {
+    double whole[LONGEST];
+    for (size_t i = 0, at = 0; i < n; i++) {
         fmi3ValueReference v = references[i];
-        if (may_set(plant, v, 1) != fmi3OK) return fmi3Error;
-        if (at + length[v] > n_values) return fail(plant, "fmi3SetInt64: too few values");
-        for (int j = 0; j < length[v]; j++, at++) {
-            if (values[at] < 0 || values[at] >= DRIVE_MODES) return fail(plant, "drive_mode must be 0 (open), 1 (brake) or 2 (velocity)");
-            plant->state.values[offset[v] + j] = (double)values[at];
-        }
-        note_set(&plant->state, v);
+        int count = v < VARIABLES ? length[v] : 0;
+        if (!fits(instance, v, at, n_values)) return fmi3Error;
+        for (int j = 0; j < count; j++) whole[j] = (double)values[at + j];
+        if (model_set(instance, v, 0, count, 1, whole) != OK) return fmi3Error;
+        at += count;
     }
     return fmi3OK;
 }
 
-/* ---- FMI 3.0: state ---- */
+/* ---- derivatives ---- */
 
-FMI3_Export fmi3Status fmi3GetFMUState(fmi3Instance instance, fmi3FMUState *saved) {
-    Plant *plant = instance;
-    if (!*saved) *saved = malloc(sizeof(State));
-    if (!*saved) return fail(plant, "out of memory");
-    memcpy(*saved, &plant->state, sizeof(State));
+static int scatter(
+    fmi3Instance instance, const fmi3ValueReference references[], size_t n, int unknown, const fmi3Float64 seed[], size_t n_seed,
+    double *vector) {
+    size_t at = 0;
+    for (size_t i = 0; i < n; i++) {
+        fmi3ValueReference v = references[i];
+        if (model_may_derive(instance, v, unknown) != OK) return 0;
+        for (int j = 0; seed && j < length[v] && at < n_seed; j++, at++) vector[offset[v] + j] = seed[at];
+    }
+    if (!seed || at == n_seed) return 1;
+    fail(instance, "the seed has more values than its variables");
+    return 0;
+}
+
+static fmi3Status gather(
+    fmi3Instance instance, const fmi3ValueReference references[], size_t n, const double *vector, fmi3Float64 sensitivity[],
+    size_t n_sensitivity) {
+    size_t at = 0;
+    for (size_t i = 0; i < n; i++) {
+        fmi3ValueReference v = references[i];
+        if (!fits(instance, v, at, n_sensitivity)) return fmi3Error;
+        for (int j = 0; j < length[v]; j++) sensitivity[at++] = vector[offset[v] + j];
+    }
     return fmi3OK;
 }
 
+FMI3_Export fmi3Status fmi3GetDirectionalDerivative(
+    fmi3Instance instance, const fmi3ValueReference unknowns[], size_t n_unknowns, const fmi3ValueReference knowns[],
+    size_t n_knowns, const fmi3Float64 seed[], size_t n_seed, fmi3Float64 sensitivity[], size_t n_sensitivity) {
+    double known[VALUES] = {0}, unknown[VALUES] = {0};
+    if (!scatter(instance, knowns, n_knowns, 0, seed, n_seed, known)) return fmi3Error;
+    if (!scatter(instance, unknowns, n_unknowns, 1, 0, 0, 0)) return fmi3Error;
+    model_forward(instance, known, unknown);
+    return gather(instance, unknowns, n_unknowns, unknown, sensitivity, n_sensitivity);
+}
+
+FMI3_Export fmi3Status fmi3GetAdjointDerivative(
+    fmi3Instance instance, const fmi3ValueReference unknowns[], size_t n_unknowns, const fmi3ValueReference knowns[],
+    size_t n_knowns, const fmi3Float64 seed[], size_t n_seed, fmi3Float64 sensitivity[], size_t n_sensitivity) {
+    double known[VALUES] = {0}, unknown[VALUES] = {0};
+    if (!scatter(instance, unknowns, n_unknowns, 1, seed, n_seed, unknown)) return fmi3Error;
+    if (!scatter(instance, knowns, n_knowns, 0, 0, 0, 0)) return fmi3Error;
+    model_reverse(instance, unknown, known);
+    return gather(instance, knowns, n_knowns, known, sensitivity, n_sensitivity);
+}
+
+/* ---- state ---- */
+
+FMI3_Export fmi3Status fmi3GetFMUState(fmi3Instance instance, fmi3FMUState *saved) {
+    return (fmi3Status)model_save(instance, saved);
+}
+
 FMI3_Export fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState saved) {
-    memcpy(&((Plant *)instance)->state, saved, sizeof(State));
+    model_restore(instance, saved);
     return fmi3OK;
 }
 
@@ -330,22 +315,9 @@ FMI3_Export fmi3Status fmi3SerializedFMUStateSize(fmi3Instance instance, fmi3FMU
 }
 
 FMI3_Export fmi3Status fmi3SerializeFMUState(fmi3Instance instance, fmi3FMUState saved, fmi3Byte bytes[], size_t size) {
-    if (size < sizeof(Serialized)) return fail(instance, "too few bytes for the serialised state");
-    Serialized blob;
-    memset(&blob, 0, sizeof blob);
-    blob.layout = LAYOUT;
-    memcpy(&blob.state, saved, sizeof(State));
-    memcpy(bytes, &blob, sizeof blob);
-    return fmi3OK;
+    return (fmi3Status)model_serialize(instance, saved, bytes, size);
 }
 
 FMI3_Export fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte bytes[], size_t size, fmi3FMUState *saved) {
-    Serialized blob;
-    if (size != sizeof blob) return fail(instance, "the serialised state has the wrong size");
-    memcpy(&blob, bytes, sizeof blob);
-    if (blob.layout != LAYOUT) return fail(instance, "the serialised state is from another build of this FMU");
-    if (!*saved) *saved = malloc(sizeof(State));
-    if (!*saved) return fail(instance, "out of memory");
-    memcpy(*saved, &blob.state, sizeof(State));
-    return fmi3OK;
+    return (fmi3Status)model_deserialize(instance, bytes, size, saved);
 }

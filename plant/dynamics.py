@@ -12,54 +12,107 @@ Each leg is driven through a screw by a DC motor on an encoderless drive that tu
 `n k u + kappa R_nominal i`, n = 2 pi / lead. Nothing here is integrated: the FMU's C code does that.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import pi
 
 import casadi as ca
 
 from plant.mechanism import LEGS
-from plant.variables import BRAKE, INPUTS, OPEN, OUTPUTS, PARAMETERS, STATES, VELOCITY, Variable
+from plant.variables import BRAKE, OPEN, SPATIAL, TINY, VELOCITY, Variable, VariableTable
 
 SX = ca.SX
 
 
 @dataclass(frozen=True)
-class Dynamics:
-    """The plant as CasADi functions of flat vectors in the order of the variable table.
+class Condition:
+    """`value` must not exceed `limit`; `text` names the value, and what to change."""
 
-    `constants(parameters)` is what the other two need of the parameters, worked out once; `rates(states, inputs,
-    constants)` is the time derivative of the states; `outputs(states, inputs, constants)` all outputs.
+    value: SX | float
+    limit: SX | float
+    text: str
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """A plant as CasADi functions of flat vectors in the order of its variable table.
+
+    `constants(parameters)` is what the others need of the parameters, worked out once; `start(parameters)` are the states
+    at the start; `conditions(parameters)` are two vectors, values and the limits that they must not exceed, for the
+    parameters to make sense, and `condition_texts` says so for each; `limits(states, constants)` and `limit_texts` are the
+    same for the motion; `rates(states, inputs, constants)` is the time
+    derivative of the states; `outputs(states, inputs, constants)` all outputs.
     """
 
     constants: ca.Function
+    start: ca.Function
+    conditions: ca.Function
+    condition_texts: tuple[str, ...]
+    limits: ca.Function
+    limit_texts: tuple[str, ...]
     rates: ca.Function
     outputs: ca.Function
 
 
 def build_dynamics() -> Dynamics:
     """Derive the plant's equations."""
-    parameters = _symbols(PARAMETERS)
-    states, inputs = _symbols(STATES), _symbols(INPUTS)
-    expressions = _constants(parameters)
+    p = variable_symbols(SPATIAL.parameters)
+    return assembled(SPATIAL, p, _constants(p), _start(p), _conditions(p), _limits, _plant)
+
+
+def assembled(
+    table: VariableTable,
+    parameters: dict[str, SX],
+    constants: dict[str, SX],
+    start: dict[str, SX],
+    conditions: list[Condition],
+    limits: Callable[[dict[str, SX], dict[str, SX]], list[Condition]],
+    plant: Callable[[dict[str, SX], dict[str, SX], dict[str, SX]], tuple[dict[str, SX], dict[str, SX]]],
+) -> Dynamics:
+    """The functions of a plant from its expressions.
+
+    Args:
+        table: its variables.
+        parameters: their symbols, of which the next three are made.
+        constants: by any names.
+        start: the states at the start, by name.
+        conditions: for the parameters to make sense.
+        limits: gives the conditions on the motion for states and constants by name.
+        plant: gives rates and outputs by name for states, inputs and constants by name.
+    """
     # The symbols stand for the worked-out constants inside `rates` and `outputs`.
-    constants = {name: SX.sym(name, *value.shape) for name, value in expressions.items()}
-    rates, outputs = _plant(states, inputs, constants)
-    arguments = [_flat(states), _flat(inputs), _flat(constants)]
+    stand_ins = {name: SX.sym(name, *value.shape) for name, value in constants.items()}
+    states, inputs = variable_symbols(table.states), variable_symbols(table.inputs)
+    rates, outputs = plant(states, inputs, stand_ins)
+    arguments = [_flat(states), _flat(inputs), _flat(stand_ins)]
+    given = [_flat(parameters)]
     options = {"cse": True}
+    watched = limits(states, stand_ins)
     return Dynamics(
-        constants=ca.Function("plant_constants", [_flat(parameters)], [_flat(expressions)], options),
-        rates=ca.Function("plant_rates", arguments, [ca.densify(rates)], options),
-        outputs=ca.Function("plant_outputs", arguments, [ca.densify(outputs)], options),
+        constants=ca.Function("plant_constants", given, [_flat(constants)], options),
+        start=ca.Function("plant_start", given, [_in_order(start, table.states)], options),
+        conditions=ca.Function("plant_conditions", given, _sides(conditions), options),
+        condition_texts=tuple(condition.text for condition in conditions),
+        limits=ca.Function("plant_limits", [_flat(states), _flat(stand_ins)], _sides(watched), options),
+        limit_texts=tuple(condition.text for condition in watched),
+        rates=ca.Function("plant_rates", arguments, [_in_order(rates, table.states)], options),
+        outputs=ca.Function("plant_outputs", arguments, [_in_order(outputs, table.outputs)], options),
     )
 
 
-def _symbols(variables: tuple[Variable, ...]) -> dict[str, SX]:
-    symbols = {}
+def _sides(conditions: list[Condition]) -> list[SX]:
+    values = [ca.densify(ca.vertcat(*side)) for side in zip(*((c.value, c.limit) for c in conditions), strict=True)]
+    return values or [SX.zeros(0), SX.zeros(0)]
+
+
+def variable_symbols(variables: tuple[Variable, ...]) -> dict[str, SX]:
+    """A symbol for each variable, in its shape."""
+    made = {}
     for variable in variables:
         rows, columns = (*variable.shape, 1, 1)[:2] if variable.shape else (1, 1)
         # CasADi stores columns first and the table rows first, so the symbol is made transposed.
-        symbols[variable.name] = SX.sym(variable.name, columns, rows).T
-    return symbols
+        made[variable.name] = SX.sym(variable.name, columns, rows).T
+    return made
 
 
 def _flat(values: dict[str, SX]) -> SX:
@@ -119,6 +172,138 @@ def _constants(p: dict[str, SX]) -> dict[str, SX]:
         "brake_slip": p["brake.force"] / p["brake.stiffness"],
         "release_rate": 1 / p["brake.release_time"],
     }
+
+
+def _start(p: dict[str, SX]) -> dict[str, SX]:
+    """At rest at the initial pose, without current, the brakes not deflected."""
+    q = p["initial_quaternion"]
+    resting = {variable.name: SX.zeros(variable.size) for variable in SPATIAL.states}
+    return resting | {"state.position": p["initial_position"], "state.quaternion": q / ca.norm_2(q)}
+
+
+_RUNGE_KUTTA_REACH = 2.5
+"""The classical Runge-Kutta method is stable for |eigenvalue| x step up to this, wherever the eigenvalue does not grow."""
+
+_CONTACT_REACH = 1.5
+"""The same for the end stops, which are not linear; found by 800 random sets of parameters."""
+
+
+def substep_conditions(p: dict[str, SX], sliding_mass: SX) -> list[Condition]:
+    """The substep is short enough for the fastest modes of the legs.
+
+    In coordinates whose squared length is the energy, what dissipates is on the diagonal of the linearised plant and what
+    stores is skew, so the larger of the one and the norm of the other bound every eigenvalue; what else moves with a leg
+    than its sliding mass only lowers them. A slipping brake forgets its deflection, and an end stop hits, the faster the leg
+    runs, which without load is the drive's voltage over its force constant.
+    """
+    constant = 2 * pi / p["motor.screw_lead"] * p["motor.torque_constant"]
+    speed = p["drive.voltage_limit"] / constant
+    slope = ca.mmax(p["friction.viscous"] + p["friction.coulomb"] / p["friction.velocity"]) + p["brake.damping"]
+    fading = ca.fmax(slope / sliding_mass, ca.mmax(p["motor.resistance"]) / p["motor.inductance"])
+    storing = (constant**2 / p["motor.inductance"] + p["brake.stiffness"]) / sliding_mass
+    bounce = ca.sqrt(p["stop.stiffness"] / sliding_mass)
+    rates = [
+        (
+            ca.sqrt(fading**2 + storing) / _RUNGE_KUTTA_REACH,
+            "motor, friction and brake: motor.resistance / motor.inductance, friction.coulomb / friction.velocity and "
+            "brake.damping over the sliding mass, and the square root of brake.stiffness over it",
+        ),
+        (1 / p["drive.current_time_constant"] / _RUNGE_KUTTA_REACH, "drive.current_time_constant"),
+        (1 / p["brake.release_time"] / _RUNGE_KUTTA_REACH, "brake.release_time"),
+        (
+            speed * p["brake.stiffness"] / p["brake.force"] / _RUNGE_KUTTA_REACH,
+            "a slipping brake, brake.stiffness / brake.force",
+        ),
+        (
+            bounce * (1 + p["stop.damping"] * speed) / _CONTACT_REACH,
+            "the end stops, the square root of stop.stiffness over the sliding mass, and stop.damping",
+        ),
+    ]
+    return [
+        Condition(p["substep"], 1 / rate, f"substep is %g s, and may be at most %g s because of {what}: reduce it")
+        for rate, what in rates
+    ]
+
+
+def inertia_conditions(inertia: SX, name: str) -> list[Condition]:
+    """A symmetric (3, 3) inertia that a body can have: `tr(I) / 2 E - I`, its second moments, is positive semidefinite."""
+    scale = ca.trace(inertia) + TINY
+    moments = (ca.trace(inertia) / 2 * SX.eye(3) - inertia) / scale
+    minors = [moments[i, i] for i in range(3)]
+    minors += [moments[i, i] * moments[j, j] - moments[i, j] ** 2 for i, j in ((0, 1), (0, 2), (1, 2))]
+    return [
+        Condition(
+            ca.norm_fro(inertia - inertia.T) / scale,
+            _ROUNDING,
+            f"{name} is not symmetric (relative difference %g, at most %g): make it so",
+        ),
+        Condition(
+            -ca.mmin(ca.vertcat(*minors, ca.det(moments))),
+            _ROUNDING,
+            f"{name} is of no real body (its second moments are negative by %g, at most %g): each principal moment must be at "
+            "most the sum of the other two",
+        ),
+    ]
+
+
+def stop_condition(p: dict[str, SX], k: int) -> Condition:
+    """The lower end stop of leg k lies below the upper one."""
+    return Condition(
+        p["stop.minimum_length"][k],
+        p["stop.maximum_length"][k],
+        f"stop.minimum_length of leg {k} is %g m, beyond its stop.maximum_length of %g m",
+    )
+
+
+_ROUNDING = 1e-6
+"""What rounded parameters may be off by, relatively."""
+
+_LEAST_LENGTH_M = 1e-6
+_MOST_ALONG_AT_START, _MOST_ALONG = 0.99, 0.9998
+"""Cosine between a leg and the first axis of its joint; at 1 the leg could not turn about itself without infinite inertia."""
+
+
+def _conditions(p: dict[str, SX]) -> list[Condition]:
+    q = p["initial_quaternion"]
+    conditions = [
+        Condition(
+            ca.fabs(ca.dot(q, q) - 1), 2e-3, "initial_quaternion is not of unit length (its square is off by %g, at most %g)"
+        ),
+        *inertia_conditions(p["platform.inertia"], "platform.inertia"),
+        *inertia_conditions(p["payload.inertia"], "payload.inertia"),
+    ]
+    rotation = _rotation(q / ca.norm_2(q))
+    sliding_mass = p["leg.upper.mass"] + p["motor.rotor_inertia"] * (2 * pi / p["motor.screw_lead"]) ** 2
+    for k in range(LEGS):
+        axis = _row(p["base_joint_axes"], k)
+        s = p["initial_position"] + rotation @ _row(p["platform_joints"], k) - _row(p["base_joints"], k)
+        conditions += [
+            Condition(
+                ca.fabs(ca.dot(axis, axis) - 1),
+                2e-3,
+                f"base_joint_axes of leg {k} is not of unit length (its square is off by %g, at most %g)",
+            ),
+            Condition(_LEAST_LENGTH_M, ca.norm_2(s), f"leg {k} needs a length of %g m at the start and has %g m"),
+            Condition(
+                ca.fabs(ca.dot(axis, s)) / ca.norm_2(s),
+                _MOST_ALONG_AT_START,
+                f"leg {k} starts along its base_joint_axes (cosine %g, at most %g): turn the axis",
+            ),
+            stop_condition(p, k),
+        ]
+    return conditions + substep_conditions(p, sliding_mass)
+
+
+def _limits(x: dict[str, SX], c: dict[str, SX]) -> list[Condition]:
+    """What must hold during the motion: no leg along the first axis of its joint."""
+    limits = []
+    rotation = _rotation(x["state.quaternion"])
+    for k in range(LEGS):
+        s = x["state.position"] + rotation @ _row(c["platform_joints"], k) - _row(c["base_joints"], k)
+        along = ca.fabs(ca.dot(_row(c["base_joint_axes"], k), s)) / ca.norm_2(s)
+        text = f"leg {k} has come to lie along the first axis of its base joint (cosine %g, at most %g): limit its stroke"
+        limits.append(Condition(along, _MOST_ALONG, text))
+    return limits
 
 
 @dataclass(frozen=True)
@@ -249,7 +434,7 @@ def _solve(matrix: SX, right: SX) -> SX:
     return ca.vertcat(*z)
 
 
-def _plant(x: dict[str, SX], u: dict[str, SX], c: dict[str, SX]) -> tuple[SX, SX]:
+def _plant(x: dict[str, SX], u: dict[str, SX], c: dict[str, SX]) -> tuple[dict[str, SX], dict[str, SX]]:
     rotation = _rotation(x["state.quaternion"])
     velocity, omega, current = x["state.velocity"], x["state.angular_velocity"], x["state.current"]
     gravity = c["gravity"]
@@ -270,7 +455,8 @@ def _plant(x: dict[str, SX], u: dict[str, SX], c: dict[str, SX]) -> tuple[SX, SX
     axial = motor - friction + brake + stop
 
     linear, coupling, angular = c["mass"] * SX.eye(3), _skew(moment), inertia
-    wrench = u["external_wrench"] + ca.vertcat(
+    external = ca.vertcat(u["external_wrench.force"], u["external_wrench.torque"])
+    wrench = external + ca.vertcat(
         c["mass"] * gravity - ca.cross(omega, ca.cross(omega, moment)),
         ca.cross(moment, gravity) - ca.cross(omega, inertia @ omega),
     )
@@ -332,9 +518,9 @@ def _plant(x: dict[str, SX], u: dict[str, SX], c: dict[str, SX]) -> tuple[SX, SX
         "power.friction": -ca.dot(friction, speeds),
         "power.brake": ca.dot(brake, speeds),
         "power.stop": ca.dot(stop, speeds),
-        "power.external": ca.dot(u["external_wrench"], ca.vertcat(velocity, omega)),
+        "power.external": ca.dot(external, ca.vertcat(velocity, omega)),
     }
-    return _in_table_order(rates, STATES), _in_table_order(outputs, OUTPUTS)
+    return rates, outputs
 
 
 def imu_signals(
@@ -353,12 +539,7 @@ def imu_signals(
     return _imu_signals(_legs(motion, rotation, c), rotation, omega, acceleration, c)
 
 
-def parameter_symbols() -> dict[str, SX]:
-    """A symbol for each parameter of the table."""
-    return _symbols(PARAMETERS)
-
-
-def _in_table_order(values: dict[str, SX], variables: tuple[Variable, ...]) -> SX:
+def _in_order(values: dict[str, SX], variables: tuple[Variable, ...]) -> SX:
     return _flat({variable.name: values[variable.name] for variable in variables})
 
 

@@ -1,6 +1,6 @@
-"""From the dynamics to an FMU: C code, layout, modelDescription.xml, a shared library, and the archive around them.
+"""From the dynamics of a plant to its FMU: C code, description, shared libraries, and the archive around them.
 
-Run in a process of its own (`python -m plant.export FILE`), because CasADi must not be loaded by a process that runs a
+Run in a process of its own (`python -m plant.export FILE ...`), because CasADi must not be loaded by a process that runs a
 loop. The FMU is native and holds no Python.
 """
 
@@ -8,115 +8,200 @@ import io
 import platform
 import re
 import shutil
+import struct
 import subprocess
 import sys
 import tempfile
 import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from importlib import resources
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
+from typing import Any
 
 import fmpy
 
 from plant.compiled import hash_of_files, keyed_folder
-from plant.errors import ToolchainError
+from plant.errors import InputError, ToolchainError
 from plant.files import write_whole
 from plant.mechanism import load_spatial
+from plant.model_description import Dependencies, Layout, build_description, model_description, start_of
 from plant.pose import Array
-from plant.variables import BRAKE, DRIVE_MODES, INPUTS, OUTPUTS, PARAMETERS, STATES, Variable
+from plant.variables import SPATIAL, Variable, VariableTable
 
-MODEL = "gough_plant"
-EXPOSED = (*INPUTS, *PARAMETERS, *OUTPUTS)
-"""The variables that the FMU shows; a value reference is an index into them."""
-
-TIME_REFERENCE = len(EXPOSED)
 C_FLAGS = (
-    "-std=c11", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math",
+    "-std=c11", "-fPIC", "-fvisibility=hidden", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math",
 )  # fmt: skip
+SOURCES = ("model.c", "plant.c", "derivatives.c", "unsupported.c")
+"""The C files of an FMU, beside `fmi2.c` or `fmi3.c`."""
+
 _EPOCH = (1980, 1, 1, 0, 0, 0)
-
-_UNITS: dict[str, dict[str, int | str]] = {
-    "m": {"m": 1}, "m/s": {"m": 1, "s": -1}, "m/s2": {"m": 1, "s": -2}, "rad/s": {"rad": 1, "s": -1}, "kg": {"kg": 1},
-    "kg.m2": {"kg": 1, "m": 2}, "s": {"s": 1}, "s/m": {"s": 1, "m": -1}, "N": {"kg": 1, "m": 1, "s": -2},
-    "N.s/m": {"kg": 1, "s": -1}, "N/m": {"kg": 1, "s": -2}, "Ohm": {"kg": 1, "m": 2, "s": -3, "A": -2},
-    "H": {"kg": 1, "m": 2, "s": -2, "A": -2}, "N.m/A": {"kg": 1, "m": 2, "s": -2, "A": -1},
-    "V": {"kg": 1, "m": 2, "s": -3, "A": -1}, "A": {"A": 1}, "J": {"kg": 1, "m": 2, "s": -2}, "W": {"kg": 1, "m": 2, "s": -3},
-    "uT": {"kg": 1, "s": -2, "A": -1, "factor": "1e-6"}, "1": {},
-}  # fmt: skip
+_FUNCTIONS = ("constants", "start", "conditions", "limits", "rates", "outputs")
 
 
-def default_fmu() -> Path:
-    """The plant's FMU for this machine, built on first use and kept under a hash of all that it is made from.
+@dataclass(frozen=True)
+class Model:
+    """A plant that can be exported.
+
+    Attributes:
+        identifier: of the FMU and its binaries.
+        description: one line about it.
+        table: its variables.
+        preset: the mechanism whose parameters are the default start values.
+        dynamics: derives its equations (`plant.dynamics.Dynamics`); loads CasADi.
+    """
+
+    identifier: str
+    description: str
+    table: VariableTable
+    preset: str
+    dynamics: Callable[[], Any]
+
+
+def _spatial_dynamics() -> Any:
+    from plant.dynamics import build_dynamics
+
+    return build_dynamics()
+
+
+SPATIAL_MODEL = Model(
+    "gough_plant", "Six-leg parallel mechanism with encoderless drives and ideal IMUs", SPATIAL, "hexapod", _spatial_dynamics
+)
+
+
+@dataclass(frozen=True)
+class Target:
+    """A platform that FMUs are compiled for: its folders in FMI 3.0 and 2.0, zig's name for it, and its libraries' suffix."""
+
+    folder: str
+    folder_2: str
+    zig: str
+    suffix: str
+
+
+TARGETS = {
+    "linux": (Target("x86_64-linux", "linux64", "x86_64-linux-gnu.2.17", ".so"),),
+    "windows": (Target("x86_64-windows", "win64", "x86_64-windows-gnu", ".dll"),),
+    "darwin": (
+        Target("x86_64-darwin", "darwin64", "x86_64-macos.11.0", ".dylib"),
+        Target("aarch64-darwin", "darwin64", "aarch64-macos.11.0", ".dylib"),
+    ),
+}
+"""What `--platforms` can name. In FMI 2.0 both processors of darwin share one universal library."""
+
+
+def default_fmu(model: Model = SPATIAL_MODEL) -> Path:
+    """A plant's FMU for this machine, built on first use and kept under a hash of all that it is made from.
 
     Raises:
         ToolchainError: no C compiler, or it failed.
     """
     here = Path(__file__).parent
-    sources = [here / name for name in ("dynamics.py", "variables.py", "export.py", "mechanism.py", "presets/hexapod.toml")]
-    with resources.as_file(resources.files("fmus") / "fmi3.c") as wrapper:
-        key = hash_of_files([*sources, wrapper], version("casadi"), platform.machine(), sys.platform)
-    path = keyed_folder("fmus", key) / f"{MODEL}.fmu"
+    names = (
+        "dynamics.py", "planar_dynamics.py", "planar_variables.py", "variables.py", "export.py", "model_description.py",
+        "mechanism.py", "planar.py", f"presets/{model.preset}.toml",
+    )  # fmt: skip
+    sources = [here / name for name in names if (here / name).exists()]
+    with resources.as_file(resources.files("fmus")) as folder:
+        wrappers = sorted([*folder.glob("*.c"), *folder.glob("*.h")])
+        key = hash_of_files([*sources, *wrappers], version("casadi"), platform.machine(), sys.platform)
+    path = keyed_folder("fmus", key) / f"{model.identifier}.fmu"
     if not path.exists():
-        build_in_subprocess(path)
+        build_in_subprocess(path, mechanism=model.preset)
     return path
 
 
-def build_in_subprocess(path: Path) -> None:
-    """Build the FMU at `path` without loading CasADi into this process.
+def build_in_subprocess(path: Path, fmi: int = 3, mechanism: str = "hexapod", platforms: Sequence[str] = ()) -> None:
+    """Build an FMU at `path` without loading CasADi into this process; arguments as for `build`.
 
     Raises:
         ToolchainError: no C compiler, or it failed, or `path` cannot be written.
     """
-    run = subprocess.run([sys.executable, "-P", "-m", "plant.export", str(path)], capture_output=True, text=True, check=False)
+    command = [sys.executable, "-P", "-m", "plant.export", str(path), str(fmi), mechanism, *platforms]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
     if run.returncode:
         last = (run.stderr.strip() or "no output").splitlines()[-1]
         raise ToolchainError(f"the plant's FMU could not be built: {last.split(': ', 1)[-1]}")
 
 
-def c_compiler() -> str:
-    """The path of a C compiler.
+def c_compiler() -> list[str]:
+    """The command of a C compiler for this machine.
 
     Raises:
         ToolchainError: none is installed.
     """
     for name in ("cc", "gcc", "clang"):
         if found := shutil.which(name):
-            return found
+            return [found]
     raise ToolchainError("no C compiler (cc, gcc or clang) was found: install one, on Debian with 'apt install gcc'")
 
 
-def build(path: Path) -> None:
-    """Write the plant as an FMI 3.0 Co-Simulation FMU; the file appears whole or not at all.
+def _zig() -> list[str]:
+    """The command of the compiler for other platforms.
+
+    Raises:
+        ToolchainError: it is not installed.
+    """
+    if find_spec("ziglang") is None:
+        raise ToolchainError("other platforms are compiled by zig, which is not installed: pip install 'gough[cross]'")
+    return [sys.executable, "-m", "ziglang", "cc"]
+
+
+def build(path: Path, fmi: int = 3, mechanism: str | Path = "hexapod", platforms: Sequence[str] = ()) -> None:
+    """Write the plant of a mechanism as an FMU; the file appears whole or not at all.
+
+    Args:
+        path: the file.
+        fmi: 3 for FMI 3.0, Co-Simulation and Model Exchange; 2 for FMI 2.0 Co-Simulation.
+        mechanism: preset or file whose parameters are the start values; a planar one gives the planar plant.
+        platforms: keys of `TARGETS`, compiled by zig; by default this machine's, by its C compiler.
 
     Raises:
         ToolchainError: no C compiler, or it failed.
-        InputError: `path` cannot be written.
+        InputError: a version or platform that does not exist, or `path` cannot be written.
     """
-    compiler = c_compiler()
-    starts = load_spatial("hexapod").plant_parameters()
-    with tempfile.TemporaryDirectory(prefix="gough-fmu-") as folder:
+    if fmi not in (2, 3):
+        raise InputError(f"there is no FMI {fmi} to export: choose 2 or 3")
+    if unknown := [name for name in platforms if name not in TARGETS]:
+        raise InputError(f"no platform {unknown[0]!r}; there are {', '.join(TARGETS)}")
+    loaded = load_spatial(mechanism)
+    model = model_of(loaded)
+    starts = loaded.plant_parameters()
+    layout = Layout(model.table)
+    with tempfile.TemporaryDirectory(prefix="gough-build-") as folder:
         work = Path(folder)
-        dependencies = _generate_c(work)
-        wrapper = (resources.files("fmus") / "fmi3.c").read_text()
-        (work / "fmi3.c").write_text(wrapper)
-        token = "{" + hash_of_files([work / "fmi3.c", work / "plant.c"], repr({k: v.tolist() for k, v in starts.items()})) + "}"
-        (work / "layout.h").write_text(_layout(starts, token))
-        (work / "unsupported.c").write_text(_unsupported(wrapper))
-        library = work / f"{MODEL}.so"
-        headers = Path(fmpy.__file__).parent / "c-code"
-        sources = [str(work / name) for name in ("fmi3.c", "plant.c", "unsupported.c")]
-        command = [compiler, *C_FLAGS, f"-I{headers}", f"-I{work}", *sources, "-o", str(library), "-lm", "-s"]
-        run = subprocess.run(command, capture_output=True, text=True, check=False)
-        if run.returncode:
-            complaint = next((line for line in run.stderr.splitlines() if "error" in line), run.stderr.strip())
-            raise ToolchainError(f"{compiler} could not compile the plant: {complaint}")
-        description = _model_description(starts, token, dependencies)
-        contents = {"modelDescription.xml": description.encode(), f"binaries/{_platform()}/{MODEL}.so": library.read_bytes()}
+        dynamics = model.dynamics()
+        _generate_c(dynamics, work)
+        dependencies = _dependencies(dynamics, layout)
+        wrapper = f"fmi{fmi}.c"
+        for name in ("model.h", "model.c", wrapper):
+            (work / name).write_text((resources.files("fmus") / name).read_text())
+        (work / "unsupported.c").write_text(_unsupported(fmi, (work / wrapper).read_text()))
+        values = repr({name: value.tolist() for name, value in starts.items()})
+        token = "{" + hash_of_files([work / name for name in (*SOURCES, wrapper, "model.h")], values) + "}"
+        (work / "layout.h").write_text(_layout_h(layout, starts, token, dynamics))
+        sources = [*SOURCES, wrapper]
+        contents = {
+            "modelDescription.xml": model_description(
+                fmi, model.identifier, model.description, layout, starts, token, dependencies, sources
+            ).encode(),
+            **{f"sources/{file.name}": file.read_bytes() for file in sorted(work.iterdir())},
+            "sources/buildDescription.xml": build_description(model.identifier, sources).encode(),
+        }
+        for name, library in _libraries(model, fmi, work, sources, platforms).items():
+            contents[f"binaries/{name}"] = library
         write_whole(path, _archive(contents))
 
 
-def _archive(contents: dict[str, bytes]) -> bytes:
+def model_of(mechanism: Any) -> Model:
+    """The plant that a mechanism is one of."""
+    return SPATIAL_MODEL
+
+
+def _archive(contents: Mapping[str, bytes]) -> bytes:
     """A zip archive without the time of its making, so that the same sources give the same bytes."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -125,175 +210,227 @@ def _archive(contents: dict[str, bytes]) -> bytes:
     return buffer.getvalue()
 
 
-def _platform() -> str:
-    machine = {"AMD64": "x86_64", "arm64": "aarch64"}.get(platform.machine(), platform.machine())
-    return f"{machine}-{ {'linux': 'linux', 'darwin': 'darwin', 'win32': 'windows'}[sys.platform] }"
+# ---- shared libraries ----
 
 
-def _generate_c(work: Path) -> dict[str, list[int]]:
-    """Write plant.c and plant.h; return the value references of the inputs that each output depends on directly."""
+def _libraries(model: Model, fmi: int, work: Path, sources: list[str], platforms: Sequence[str]) -> dict[str, bytes]:
+    """The shared libraries by their paths in the folder `binaries`."""
+    if not platforms:
+        library = _compile(c_compiler(), work, sources, fmpy.sharedLibraryExtension)
+        folder = fmpy.platform_tuple if fmi == 3 else fmpy.platform
+        return {f"{folder}/{model.identifier}{fmpy.sharedLibraryExtension}": library}
+    libraries: dict[str, bytes] = {}
+    for name in platforms:
+        compiled = []
+        for target in TARGETS[name]:
+            library = _compile([*_zig(), "-target", target.zig], work, sources, target.suffix)
+            compiled.append(library)
+            libraries[f"{target.folder if fmi == 3 else target.folder_2}/{model.identifier}{target.suffix}"] = library
+        if fmi == 2 and len(compiled) > 1:
+            libraries[f"{target.folder_2}/{model.identifier}{target.suffix}"] = _universal(compiled)
+    return libraries
+
+
+def _compile(compiler: list[str], work: Path, sources: list[str], suffix: str) -> bytes:
+    """A shared library; the derivatives are long and seldom used, and so compiled with less effort."""
+    headers = Path(fmpy.__file__).parent / "c-code"
+
+    def compile_one(source: str) -> str:
+        effort = "-O1" if source == "derivatives.c" else "-O2"
+        # The compilers run in the folder, so that no path of this machine gets into what they make.
+        _run([*compiler, *C_FLAGS, effort, f"-I{headers}", "-c", source, "-o", f"{source}.o"], work)
+        return f"{source}.o"
+
+    with ThreadPoolExecutor() as pool:
+        objects = list(pool.map(compile_one, sources))
+    _run([*compiler, "-shared", "-s", *objects, "-o", f"library{suffix}", "-lm"], work)
+    return (work / f"library{suffix}").read_bytes()
+
+
+def _run(command: list[str], folder: Path) -> None:
+    run = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    if run.returncode:
+        complaint = next((line for line in run.stderr.splitlines() if "error" in line), run.stderr.strip())
+        raise ToolchainError(f"{command[0]} could not compile the plant: {complaint}")
+
+
+def _universal(libraries: list[bytes]) -> bytes:
+    """Mach-O libraries of several processors in one file (the fat header of mach-o/fat.h)."""
+    alignment = 14
+    header, body = struct.pack(">2I", 0xCAFEBABE, len(libraries)), b""
+    at = 1 << alignment
+    for library in libraries:
+        _, processor, variant = struct.unpack_from("<3I", library)
+        header += struct.pack(">5I", processor, variant, at, len(library), alignment)
+        padded = library + bytes(-len(library) % (1 << alignment))
+        body += padded
+        at += len(padded)
+    return header.ljust(1 << alignment, b"\0") + body
+
+
+# ---- C code ----
+
+
+def _generate_c(dynamics: Any, work: Path) -> None:
+    """Write plant.c and derivatives.c with their headers."""
     import casadi as ca
 
-    from plant.dynamics import build_dynamics
-
-    dynamics = build_dynamics()
-    generator = ca.CodeGenerator("plant.c", {"with_header": True})
-    for function in (dynamics.constants, dynamics.rates, dynamics.outputs):
-        generator.add(function)
-    generator.generate(str(work) + "/")
-    with (work / "plant.h").open("a") as header:
-        header.write(f"#define CONSTANTS {dynamics.constants.size1_out(0)}\n")
-
-    pattern = dynamics.outputs.jac_sparsity(0, 1)
-    rows, columns = pattern.get_triplet()
-    pairs = set(zip(rows, columns, strict=True))
-    dependencies: dict[str, list[int]] = {}
-    row = 0
-    for output in OUTPUTS:
-        column = 0
-        touched = []
-        for reference, known in enumerate(INPUTS):
-            if any((r, c) in pairs for r in range(row, row + output.size) for c in range(column, column + known.size)):
-                touched.append(reference)
-            column += known.size
-        dependencies[output.name] = touched
-        row += output.size
-    return dependencies
+    functions_of = {"plant": [getattr(dynamics, name) for name in _FUNCTIONS], "derivatives": _derivatives(dynamics)}
+    for file, functions in functions_of.items():
+        generator = ca.CodeGenerator(f"{file}.c", {"with_header": True})
+        for function in functions:
+            generator.add(function)
+        generator.generate(f"{work}/")
 
 
-def _start_of(variable: Variable, starts: dict[str, Array]) -> list[float]:
-    if variable.discrete:
-        return [float(BRAKE)] * variable.size
-    if variable.causality == "parameter":
-        return [float(value) for value in starts[variable.name].reshape(-1)]
-    return [0.0] * variable.size
+def _derivatives(dynamics: Any) -> list[Any]:
+    """Functions for the products of vectors with the Jacobians of rates, outputs and constants, and their transposes."""
+    import casadi as ca
+
+    def product(name: str, function: Any, reverse: bool) -> Any:
+        arguments = [ca.SX.sym(f"i{i}", function.size1_in(i)) for i in range(function.n_in())]
+        results = function(*arguments)
+        results = results if isinstance(results, tuple) else (results,)
+        here, there = (results, arguments) if reverse else (arguments, results)
+        seeds = [ca.SX.sym(f"s{i}", value.shape[0]) for i, value in enumerate(here)]
+        derived = ca.jtimes(ca.vertcat(*results), ca.vertcat(*arguments), ca.vertcat(*seeds), reverse)
+        sides = ca.vertsplit(ca.densify(derived), [0, *_cumulated(value.shape[0] for value in there)])
+        return ca.Function(name, [*arguments, *seeds], sides, {"cse": True})
+
+    states, inputs, constants = (ca.SX.sym(n, dynamics.rates.size1_in(i)) for i, n in enumerate("xuc"))
+    both = ca.Function(
+        "both",
+        [states, inputs, constants],
+        [dynamics.rates(states, inputs, constants), dynamics.outputs(states, inputs, constants)],
+    )
+    return [
+        product(f"plant_{prefix}{name}", function, reverse)
+        for prefix, function in (("", both), ("constants_", dynamics.constants))
+        for name, reverse in (("forward", False), ("reverse", True))
+    ]
 
 
-def _kind(variable: Variable) -> str:
+def _cumulated(sizes: Any) -> list[int]:
+    total, sums = 0, []
+    for size in sizes:
+        total += size
+        sums.append(total)
+    return sums
+
+
+def _dependencies(dynamics: Any, layout: Layout) -> Dependencies:
+    """From the sparsity of the Jacobians."""
+    import casadi as ca
+
+    table = layout.table
+    p = ca.SX.sym("p", dynamics.constants.size1_in(0))
+    x, u, c = (ca.SX.sym(name, dynamics.rates.size1_in(i)) for i, name in enumerate("xuc"))
+    running = ca.Function("running", [ca.vertcat(x, u), c], [ca.vertcat(dynamics.rates(x, u, c), dynamics.outputs(x, u, c))])
+    started, constants = dynamics.start(p), dynamics.constants(p)
+    initial = ca.Function(
+        "initial",
+        [ca.vertcat(u, p)],
+        [ca.vertcat(dynamics.rates(started, u, constants), dynamics.outputs(started, u, constants), started)],
+    )
+
+    def places(variables: Sequence[Variable]) -> list[int]:
+        return [place for variable in variables for place in layout.places(variable)]
+
+    def found(function: Any, unknowns: list[int], knowns: list[int]) -> dict[int, frozenset[int]]:
+        touched: dict[int, set[int]] = {place: set() for place in unknowns}
+        for row, column in zip(*function.jac_sparsity(0, 0).get_triplet(), strict=True):
+            touched[unknowns[row]].add(knowns[column])
+        return {place: frozenset(known) for place, known in touched.items()}
+
+    unknowns = places([*layout.rates, *table.outputs])
+    return Dependencies(
+        running=found(running, unknowns, places([*table.states, *table.inputs])),
+        initial=found(initial, [*unknowns, *places(table.states)], places([*table.inputs, *table.parameters])),
+    )
+
+
+def _kind(layout: Layout, variable: Variable) -> str:
+    if layout.is_rate(variable):
+        return "RATE"
     if variable.causality == "parameter":
         return "TUNABLE" if variable.tunable else "FIXED"
     return ("DISCRETE_" if variable.discrete else "") + variable.causality.upper()
 
 
-def _layout(starts: dict[str, Array], token: str) -> str:
-    offsets, at = {}, 0
-    blocks = {}
-    for block, variables in (("STATES", STATES), ("INPUTS", INPUTS), ("PARAMETERS", PARAMETERS), ("OUTPUTS", OUTPUTS)):
-        blocks[block] = at
-        for variable in variables:
-            offsets[variable.name] = at
-            at += variable.size
+def _layout_h(layout: Layout, starts: Mapping[str, Array], token: str, dynamics: Any) -> str:
+    table = layout.table
+    blocks = {"INPUTS": table.inputs, "PARAMETERS": table.parameters, "OUTPUTS": table.outputs, "RATES": layout.rates}
+    exposed = layout.exposed
+    places = sorted((place, v) for v, variable in enumerate(exposed) for place in layout.places(variable))
 
-    def table(kind: str, name: str, values: list[str]) -> str:
+    def array(kind: str, name: str, values: list[str]) -> str:
         return f"static const {kind} {name}[] = {{{', '.join(values)}}};"
 
-    everything = (*STATES, *INPUTS, *PARAMETERS, *OUTPUTS)
+    macros = {
+        "VALUES": layout.size,
+        "CONSTANTS": dynamics.constants.size1_out(0),
+        "CONDITIONS": len(dynamics.condition_texts),
+        "LIMITS": len(dynamics.limit_texts),
+        "VARIABLES": len(exposed),
+        "STATES": sum(variable.size for variable in table.states),
+        "INPUTS": sum(variable.size for variable in table.inputs),
+        "LONGEST": max(variable.size for variable in exposed),
+        "TOKEN": f'"{token}"',
+        "LAYOUT": f"0x{token[1:17]}ULL",
+        **{f"{block}_AT": layout.offsets[variables[0].name] for block, variables in blocks.items()},
+        "SUBSTEP_AT": layout.offsets["substep"],
+    }
+    if "state.quaternion" in layout.offsets:
+        macros["QUATERNION_AT"] = layout.offsets["state.quaternion"]
     lines = [
         "#pragma once",
-        "enum { FIXED, TUNABLE, INPUT, DISCRETE_INPUT, OUTPUT };",
-        f"#define VALUES {at}",
-        f"#define VARIABLES {len(EXPOSED)}",
-        f"#define TIME_REFERENCE {TIME_REFERENCE}",
-        f"#define STATES {blocks['INPUTS']}",
-        f"#define INPUTS {blocks['PARAMETERS'] - blocks['INPUTS']}",
-        f"#define DRIVE_MODES {len(DRIVE_MODES)}",
-        f'#define TOKEN "{token}"',
-        f"#define LAYOUT 0x{token[1:17]}ULL",
-        *(f"#define {block}_AT {blocks[block]}" for block in ("INPUTS", "PARAMETERS", "OUTPUTS")),
-        *(
-            f"#define {macro}_AT {offsets[name]}"
-            for macro, name in (
-                ("POSITION", "state.position"),
-                ("QUATERNION", "state.quaternion"),
-                ("INITIAL_POSITION", "initial_position"),
-                ("INITIAL_QUATERNION", "initial_quaternion"),
-                ("SUBSTEP", "substep"),
-            )
-        ),
-        table("char *const", "names", [f'"{v.name}"' for v in EXPOSED]),
-        table("int", "kind", [_kind(v) for v in EXPOSED]),
-        table("int", "offset", [str(offsets[v.name]) for v in EXPOSED]),
-        table("int", "length", [str(v.size) for v in EXPOSED]),
-        table("double", "minimum", ["-INFINITY" if v.minimum is None else repr(v.minimum) for v in EXPOSED]),
-        table("double", "start", [value.hex() for v in everything for value in _start_of(v, starts)]),
+        # Every file includes all tables, and uses some.
+        "#if defined __GNUC__",
+        '#pragma GCC diagnostic ignored "-Wunused-variable"',
+        "#endif",
+        "enum { FIXED, TUNABLE, INPUT, DISCRETE_INPUT, OUTPUT, STATE, RATE };",
+        *(f"#define {name} {value}" for name, value in macros.items()),
+        array("char *const", "names", [f'"{v.name}"' for v in exposed]),
+        array("char *const", "condition_texts", [f'"{text}"' for text in dynamics.condition_texts]),
+        array("char *const", "limit_texts", [f'"{text}"' for text in (*dynamics.limit_texts, "")]),
+        array("int", "kind", [_kind(layout, v) for v in exposed]),
+        array("int", "offset", [str(layout.offsets[v.name]) for v in exposed]),
+        array("int", "length", [str(v.size) for v in exposed]),
+        array("unsigned", "variable_of", [str(v) for _, v in places]),
+        array("double", "minimum", [repr(float(v.minimum)) for v in exposed]),
+        array("double", "maximum", [repr(float(v.maximum)) for v in exposed]),
+        array("double", "nominal", [repr(float(v.nominal)) for v in exposed]),
+        array("double", "start", [value.hex() for v in layout.stored for value in start_of(v, starts)]),
         "",
     ]
     return "\n".join(lines)
 
 
-def _unsupported(wrapper: str) -> str:
+def _unsupported(fmi: int, wrapper: str) -> str:
     """C code of the FMI functions outside this FMU's capabilities: importers want every symbol, and each must fail."""
-    declared = re.findall(
-        r"FMI3_Export fmi3\w+TYPE\s+(fmi3\w+);",
-        (Path(fmpy.__file__).parent / "c-code" / "fmi3Functions.h").read_text(),
-    )
+    headers = (Path(fmpy.__file__).parent / "c-code" / f"fmi{fmi}Functions.h").read_text()
+    declared = re.findall(rf"FMI{fmi}_Export\s+fmi{fmi}\w+TYPE\s+(fmi{fmi}\w+);", headers)
     missing = [name for name in declared if not re.search(rf"\b{name}\(", wrapper)]
-    bodies = [
-        f"FMI3_Export void *{name}(void) {{ return 0; }}"
+    lines = [
+        f"EXPORT void *{name}(void) {{ return 0; }}"
         if "Instantiate" in name
-        else f"FMI3_Export int {name}(void) {{ return 3; /* fmi3Error */ }}"
+        else f"EXPORT int {name}(void) {{ return 3; /* fmi{fmi}Error */ }}"
         for name in missing
     ]
-    return "\n".join(['#define FMI3_Export __attribute__((visibility("default")))', *bodies, ""])
-
-
-def _model_description(starts: dict[str, Array], token: str, dependencies: dict[str, list[int]]) -> str:
-    units = []
-    for name, exponents in sorted(_UNITS.items()):
-        attributes = " ".join(f'{base}="{exponent}"' for base, exponent in exponents.items())
-        units.append(
-            f'<Unit name="{name}"><BaseUnit {attributes}/></Unit>' if exponents else f'<Unit name="{name}"><BaseUnit/></Unit>'
-        )
-    items = "".join(f'<Item name="{name}" value="{value}"/>' for value, name in DRIVE_MODES.items())
-    outputs = []
-    unknowns = []
-    for reference, variable in enumerate(EXPOSED):
-        if variable.causality == "output":
-            listed = " ".join(str(i) for i in dependencies[variable.name])
-            outputs.append(f'<Output valueReference="{reference}" dependencies="{listed}"/>')
-            unknowns.append(f'<InitialUnknown valueReference="{reference}"/>')
-    lines = [
-        '<?xml version="1.0" encoding="UTF-8"?>',
-        f'<fmiModelDescription fmiVersion="3.0" modelName="{MODEL}" instantiationToken="{token}"'
-        ' variableNamingConvention="structured" generationTool="gough"'
-        ' description="Six-leg parallel mechanism with encoderless drives and ideal IMUs">',
-        f'<CoSimulation modelIdentifier="{MODEL}" canHandleVariableCommunicationStepSize="true"'
-        ' canGetAndSetFMUState="true" canSerializeFMUState="true"/>',
-        f"<UnitDefinitions>{''.join(units)}</UnitDefinitions>",
-        f'<TypeDefinitions><EnumerationType name="DriveMode">{items}</EnumerationType></TypeDefinitions>',
-        '<LogCategories><Category name="logStatusError" description="why a call was refused or failed"/></LogCategories>',
-        '<DefaultExperiment startTime="0" stopTime="10" stepSize="0.001"/>',
-        "<ModelVariables>",
-        f'<Float64 name="time" valueReference="{TIME_REFERENCE}" causality="independent" variability="continuous" unit="s"/>',
-        *(_scalar_or_array(reference, variable, starts) for reference, variable in enumerate(EXPOSED)),
-        "</ModelVariables>",
-        f"<ModelStructure>{''.join(outputs + unknowns)}</ModelStructure>",
-        "</fmiModelDescription>",
-        "",
-    ]
-    return "\n".join(lines)
-
-
-def _scalar_or_array(reference: int, variable: Variable, starts: dict[str, Array]) -> str:
-    tag, extra = "Float64", f' unit="{variable.unit}"'
-    values = [repr(value) for value in _start_of(variable, starts)]
-    if variable.discrete:
-        tag, extra = "Enumeration", ' declaredType="DriveMode"'
-        values = [str(int(float(value))) for value in values]
-    if variable.minimum is not None:
-        extra += f' min="{variable.minimum!r}"'
-    variability = {
-        "FIXED": "fixed", "TUNABLE": "tunable", "DISCRETE_INPUT": "discrete", "INPUT": "continuous", "OUTPUT": "continuous",
-    }[_kind(variable)]  # fmt: skip
-    start = "" if variable.causality == "output" else f' start="{" ".join(values)}"'
-    initial = ' initial="calculated"' if variable.causality == "output" else ""
-    dimensions = "".join(f'<Dimension start="{n}"/>' for n in variable.shape)
-    return (
-        f'<{tag} name="{variable.name}" valueReference="{reference}" causality="{variable.causality}"'
-        f' variability="{variability}"{initial}{extra}{start}'
-        f" description={quoteattr(variable.description)}>{dimensions}</{tag}>"
+    return "\n".join(
+        [
+            "#if defined _WIN32 || defined __CYGWIN__",
+            "#define EXPORT __declspec(dllexport)",
+            "#elif defined __GNUC__",
+            '#define EXPORT __attribute__((visibility("default")))',
+            "#else",
+            "#define EXPORT",
+            "#endif",
+            *lines,
+            "",
+        ]
     )
 
 
 if __name__ == "__main__":
-    build(Path(sys.argv[1]))
+    build(Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3], sys.argv[4:])

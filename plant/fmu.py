@@ -30,7 +30,7 @@ from plant.variables import BY_NAME, IMU_COUNT, Variable
 
 _IMU_OUTPUTS = ("imu_angular_velocity", "imu_specific_force", "imu_magnetic_field")
 _TRUTH_OUTPUTS = ("position", "quaternion", "leg_length", "current")
-_REQUIRED = (*_IMU_OUTPUTS, *_TRUTH_OUTPUTS, "velocity_command", "drive_mode", "external_wrench")
+_REQUIRED = (*_IMU_OUTPUTS, *_TRUTH_OUTPUTS, "velocity_command", "drive_mode")
 
 CALLS = np.dtype(
     [
@@ -44,7 +44,6 @@ CALLS = np.dtype(
         ("truth_references", np.uint32, len(_TRUTH_OUTPUTS)),
         ("command_reference", np.uint32, 1),
         ("mode_reference", np.uint32, 1),
-        ("wrench_reference", np.uint32, 1),
         ("payload_reference", np.uint32, 1),
         ("imu", np.float64, (len(_IMU_OUTPUTS), IMU_COUNT, 3)),
         ("truth", np.float64, sum(BY_NAME[name].size for name in _TRUTH_OUTPUTS)),
@@ -246,7 +245,6 @@ class FmuPlant:
         calls["truth_references"] = [self._variables[name].valueReference for name in _TRUTH_OUTPUTS]
         calls["command_reference"] = self._variables["velocity_command"].valueReference
         calls["mode_reference"] = self._variables["drive_mode"].valueReference
-        calls["wrench_reference"] = self._variables["external_wrench"].valueReference
         if "payload.mass" in self._variables:
             calls["payload_reference"] = self._variables["payload.mass"].valueReference
         for name, value in parameters.items():

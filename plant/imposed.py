@@ -6,10 +6,11 @@ from functools import cache
 import casadi as ca
 import numpy as np
 
-from plant.dynamics import imu_signals, parameter_symbols
+from plant.dynamics import imu_signals, variable_symbols
 from plant.errors import InputError
 from plant.mechanism import Mechanism
 from plant.pose import Array, checked_seed
+from plant.variables import PARAMETERS
 
 SIZE = (0.03, np.radians(10.0))
 """Of the motion along and about each axis [m, rad]."""
@@ -101,7 +102,7 @@ def _signals() -> ca.Function:
     """Rotation and readings, row by row, from coordinates with their derivatives, the rotation at home, and the parameters."""
     q, qd, qdd = (ca.SX.sym(name, 6) for name in ("q", "qd", "qdd"))
     home = ca.SX.sym("home", 3, 3)
-    parameters = parameter_symbols()
+    parameters = variable_symbols(PARAMETERS)
     turn = _turn(2, q[5]) @ _turn(1, q[4]) @ _turn(0, q[3])
     turning = ca.reshape(ca.jtimes(ca.vec(turn), q, qd), 3, 3) @ turn.T
     omega = ca.vertcat(turning[2, 1], turning[0, 2], turning[1, 0])

@@ -50,7 +50,8 @@ def unit(random: Generator, size: int = 3) -> Array:
 
 def inertia_tensor(random: Generator) -> Array:
     root = random.normal(size=(3, 3))
-    return 0.02 * root @ root.T + 0.01 * np.eye(3)
+    moments = 0.02 * root @ root.T + 0.01 * np.eye(3)
+    return np.trace(moments) * np.eye(3) - moments
 
 
 def odd_mechanism(hexapod: Mechanism, random: Generator) -> Values:
@@ -88,9 +89,14 @@ def random_state(p: Values, random: Generator) -> tuple[Values, Values]:
     inputs = {
         "velocity_command": random.normal(0.0, 0.1, 6),
         "drive_mode": random.permutation([OPEN, BRAKE, VELOCITY, OPEN, BRAKE, VELOCITY]),
-        "external_wrench": random.normal(0.0, 20.0, 6),
+        "external_wrench.force": random.normal(0.0, 20.0, 3),
+        "external_wrench.torque": random.normal(0.0, 20.0, 3),
     }
     return states, inputs
+
+
+def external_wrench(inputs: Values) -> Array:
+    return np.hstack([inputs["external_wrench.force"], inputs["external_wrench.torque"]])
 
 
 def pose_and_twist(states: Values) -> tuple[Array, Array, Array]:
@@ -125,7 +131,7 @@ def test_the_equations_of_motion_agree_with_explicit_bodies(dynamics: Dynamics, 
     position, rotation, twist = pose_and_twist(states)
     acceleration = np.hstack([rates["state.velocity"], rates["state.angular_velocity"]])
 
-    applied = inputs["external_wrench"] + jacobian(p, position, rotation).T @ sum(axial_forces(p, states, inputs).values())
+    applied = external_wrench(inputs) + jacobian(p, position, rotation).T @ sum(axial_forces(p, states, inputs).values())
     inertia = inertia_matrix(p, position, rotation) @ acceleration
     bias = bias_force(p, position, rotation, twist)
     np.testing.assert_allclose(inertia + bias, applied, rtol=0.0, atol=1e-8 * np.abs(bias).max())
@@ -155,7 +161,7 @@ def test_energies_and_powers_agree_with_explicit_bodies(dynamics: Dynamics, hexa
     np.testing.assert_allclose(outputs["leg_length"], bodies_at(p, position, rotation).lengths, rtol=1e-14)
     for source, force in axial_forces(p, states, inputs).items():
         assert outputs[f"power.{source}"] == pytest.approx(force @ speed, rel=1e-11, abs=1e-11)
-    assert outputs["power.external"] == pytest.approx(inputs["external_wrench"] @ twist, rel=1e-12)
+    assert outputs["power.external"] == pytest.approx(external_wrench(inputs) @ twist, rel=1e-12)
 
 
 def start(plant: FmuPlant, position: Array, rotation: Array) -> None:
@@ -212,7 +218,8 @@ def test_the_fmu_integrates_the_derived_rates(dynamics: Dynamics, hexapod: Mecha
         inputs = {
             "velocity_command": 0.05 * np.sin(0.3 * cycle + np.arange(6)),
             "drive_mode": np.roll([VELOCITY, VELOCITY, VELOCITY, OPEN, BRAKE, VELOCITY], cycle // 20),
-            "external_wrench": random.normal(0.0, 10.0, 6),
+            "external_wrench.force": random.normal(0.0, 10.0, 3),
+            "external_wrench.torque": random.normal(0.0, 10.0, 3),
         }
         for name, value in inputs.items():
             plant.set(name, value)
@@ -232,7 +239,8 @@ def drive(plant: FmuPlant, duration: float, seed: int = 0) -> None:
     for cycle in range(round(duration / 1e-3)):
         t = 1e-3 * cycle
         plant.set("velocity_command", 0.08 * np.sin(2.0 * np.pi * frequencies * t + phases))
-        plant.set("external_wrench", wrench * np.sin(15.0 * t))
+        plant.set("external_wrench.force", wrench[:3] * np.sin(15.0 * t))
+        plant.set("external_wrench.torque", wrench[3:] * np.sin(15.0 * t))
         plant.step(1e-3)
 
 

@@ -17,13 +17,15 @@ from fmpy.validation import validate_fmu
 
 from plant import export
 from plant.errors import ToolchainError
-from plant.export import EXPOSED, build, build_in_subprocess, default_fmu
+from plant.export import build, build_in_subprocess, default_fmu
 from plant.fmu import FmuPlant
 from plant.mechanism import Mechanism
+from plant.model_description import QUANTITIES, Layout
 from plant.pose import Array
-from plant.variables import BRAKE, DRIVE_MODES, INPUTS, OUTPUTS, PARAMETERS, VELOCITY
+from plant.variables import BRAKE, DRIVE_MODES, OUTPUTS, SPATIAL, VELOCITY
 
 MakePlant = Callable[..., FmuPlant]
+EXPOSED = Layout(SPATIAL).exposed
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +37,7 @@ def description(fmu_path: Path) -> Any:
 
 
 def test_the_default_fmu_is_built_once(fmu_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def build_again(path: Path) -> None:
+    def build_again(path: Path, mechanism: str) -> None:
         raise AssertionError(f"{path} is there already")
 
     monkeypatch.setattr(export, "build_in_subprocess", build_again)
@@ -64,7 +66,7 @@ def test_a_build_is_the_same_to_the_byte_and_loads_no_casadi(fmu_path: Path, tmp
 def test_the_cache_key_follows_the_sources(monkeypatch: pytest.MonkeyPatch, fmu_path: Path, tmp_path: Path) -> None:
     monkeypatch.setenv("GOUGH_CACHE", str(tmp_path))
     monkeypatch.setattr(export, "version", lambda package: "0.0.0")
-    monkeypatch.setattr(export, "build_in_subprocess", lambda path: path.write_text("built"))
+    monkeypatch.setattr(export, "build_in_subprocess", lambda path, mechanism: path.write_text("built"))
     path = default_fmu()
     assert path.read_text() == "built"
     assert path.parent.name != fmu_path.parent.name
@@ -111,24 +113,31 @@ def test_fmpy_finds_no_problem(fmu_path: Path) -> None:
     assert validate_fmu(str(fmu_path)) == []
 
 
-def test_the_archive_holds_the_description_and_one_binary(fmu_path: Path) -> None:
+def test_the_archive_holds_description_sources_and_one_binary(fmu_path: Path) -> None:
     with zipfile.ZipFile(fmu_path) as archive:
-        binary = f"binaries/{fmpy.platform_tuple}/gough_plant{fmpy.sharedLibraryExtension}"
-        assert archive.namelist() == ["modelDescription.xml", binary]
+        names = archive.namelist()
+    assert names[0] == "modelDescription.xml"
+    assert {name for name in names if name.startswith("binaries/")} == {
+        f"binaries/{fmpy.platform_tuple}/gough_plant{fmpy.sharedLibraryExtension}"
+    }
+    assert {"sources/buildDescription.xml", "sources/model.c", "sources/fmi3.c", "sources/plant.c"} <= set(names)
 
 
 def test_the_description_has_every_variable_of_the_table(description: Any) -> None:
     described = {variable.name: variable for variable in description.modelVariables}
     assert list(described) == ["time", *(variable.name for variable in EXPOSED)]
-    assert set(EXPOSED) == {*INPUTS, *PARAMETERS, *OUTPUTS}
     for variable in EXPOSED:
         actual = described[variable.name]
         assert actual.description == variable.description
-        assert actual.causality == variable.causality
+        assert actual.causality == ("local" if variable.causality == "state" else variable.causality)
         assert tuple(int(dimension.start) for dimension in actual.dimensions) == variable.shape
         assert actual.type == ("Enumeration" if variable.discrete else "Float64")
         assert actual.unit == (None if variable.discrete else variable.unit)
-        assert (None if actual.min is None else float(actual.min)) == variable.minimum
+        assert (float(actual.min), float(actual.max)) == (variable.minimum, variable.maximum)
+        assert actual.nominal is None if variable.discrete else float(actual.nominal) == variable.nominal
+        assert (actual.quantity or actual.declaredType.name) == (
+            "DriveMode" if variable.discrete else QUANTITIES[variable.unit][0]
+        )
         if variable.causality == "parameter":
             assert actual.variability == ("tunable" if variable.tunable else "fixed")
 
@@ -193,12 +202,14 @@ def test_outputs_depend_on_the_listed_inputs_and_on_no_others(description: Any, 
     others: dict[str, Any] = {
         "velocity_command": [[0.05 * i for i in range(6)]],
         "drive_mode": [[mode] * 6 for mode in DRIVE_MODES],
-        "external_wrench": [[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]],
+        "external_wrench.force": [[1.0, 2.0, 3.0]],
+        "external_wrench.torque": [[4.0, 5.0, 6.0]],
     }
     held: dict[str, Any] = {
         "velocity_command": plant.get("velocity_command"),
         "drive_mode": [VELOCITY, BRAKE, BRAKE, VELOCITY, VELOCITY, VELOCITY],
-        "external_wrench": np.zeros(6),
+        "external_wrench.force": np.zeros(3),
+        "external_wrench.torque": np.zeros(3),
     }
     for changed, values in others.items():
         for value in values:
@@ -207,7 +218,10 @@ def test_outputs_depend_on_the_listed_inputs_and_on_no_others(description: Any, 
                 if (now != before[name]).any():
                     seen[name].add(changed)
         plant.set(changed, held[changed])
-    listed = {unknown.variable.name: {known.name for known in unknown.dependencies or []} for unknown in description.outputs}
+    listed = {
+        unknown.variable.name: {known.name for known in unknown.dependencies if known.causality == "input"}
+        for unknown in description.outputs
+    }
     assert listed == seen
 
 

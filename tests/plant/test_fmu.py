@@ -77,7 +77,8 @@ def test_an_archive_cut_short_is_refused(hexapod: Mechanism, fmu_path: Path, tmp
 def test_a_damaged_member_is_refused(hexapod: Mechanism, fmu_path: Path, tmp_path: Path) -> None:
     """The directory of the archive is whole, but the binary in it has a wrong checksum."""
     data = bytearray(fmu_path.read_bytes())
-    data[len(data) // 2] ^= 0xFF
+    with zipfile.ZipFile(fmu_path) as archive:
+        data[archive.getinfo(BINARY).header_offset + 1000] ^= 0xFF
     path = tmp_path / "damaged.fmu"
     path.write_bytes(data)
     refused(path, hexapod)
@@ -111,7 +112,7 @@ def test_an_fmu_of_fmi_2_is_refused(hexapod: Mechanism, tmp_path: Path) -> None:
 
 
 def test_an_fmu_for_model_exchange_is_refused(hexapod: Mechanism, fmu_path: Path, tmp_path: Path) -> None:
-    changes = {"<CoSimulation[^>]*/>": '<ModelExchange modelIdentifier="gough_plant"/>'}
+    changes = {"<CoSimulation[^>]*/>": ""}
     message = refused(copy_of(fmu_path, tmp_path / "exchange.fmu", changes), hexapod)
     assert "is not an FMI 3.0 Co-Simulation FMU" in message
 
@@ -151,11 +152,11 @@ def test_a_variable_of_the_wrong_type_is_refused(hexapod: Mechanism, fmu_path: P
 
 
 def test_a_variable_of_the_wrong_causality_is_refused(hexapod: Mechanism, fmu_path: Path, tmp_path: Path) -> None:
-    changes = {r'(name="external_wrench" valueReference="2") causality="input" variability="continuous"': (
+    changes = {r'(name="velocity_command" valueReference="0") causality="input" variability="continuous"': (
         r'\1 causality="parameter" variability="tunable"'
     )}  # fmt: skip
     message = refused(copy_of(fmu_path, tmp_path / "causal.fmu", changes), hexapod)
-    assert "has external_wrench as parameter Float64[6] instead of input Float64[6]" in message
+    assert "has velocity_command as parameter Float64[6] instead of input Float64[6]" in message
 
 
 def test_an_fmu_for_another_machine_is_refused(hexapod: Mechanism, fmu_path: Path, tmp_path: Path) -> None:
@@ -185,12 +186,12 @@ def test_a_binary_of_another_build_is_refused(hexapod: Mechanism, fmu_path: Path
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"platform.mass": np.array(-1.0)}, "parameter platform.mass is -1; it must be finite and at least 1e-09"),
-        ({"substep": np.array(0.0)}, "parameter substep is 0; it must be finite and at least 1e-06"),
-        ({"gravity": np.array([0.0, 0.0, np.nan])}, "parameter gravity is .*nan; it must be finite"),
+        ({"platform.mass": np.array(-1.0)}, "parameter platform.mass is -1; it must be 1e-09 to 1e.06"),
+        ({"substep": np.array(0.0)}, "parameter substep is 0; it must be 1e-06 to 0.1"),
+        ({"gravity": np.array([0.0, 0.0, np.nan])}, "parameter gravity is .*nan; it must be"),
         ({"motor.resistance": np.array([0.6, 0.6, 0.6, np.inf, 0.6, 0.6])}, "parameter motor.resistance is inf"),
-        ({"initial_quaternion": np.array([1.0, 0.1, 0.0, 0.0])}, "initial_quaternion is not a unit quaternion; normalise it"),
-        ({"initial_quaternion": np.zeros(4)}, "initial_quaternion is not a unit quaternion"),
+        ({"initial_quaternion": np.array([1.0, 0.1, 0.0, 0.0])}, "initial_quaternion is not of unit length"),
+        ({"initial_quaternion": np.zeros(4)}, "initial_quaternion is not of unit length"),
     ],
 )
 def test_a_parameter_is_refused_in_the_words_of_the_fmu(
@@ -220,23 +221,26 @@ def test_a_fractional_drive_mode_is_refused(make_plant: MakePlant) -> None:
 
 @pytest.mark.parametrize("mode", [-1, 3])
 def test_a_drive_mode_that_does_not_exist_is_refused(make_plant: MakePlant, mode: int) -> None:
-    with pytest.raises(FmuError, match=re.escape("drive_mode must be 0 (open), 1 (brake) or 2 (velocity)")):
+    with pytest.raises(FmuError, match=re.escape(f"drive_mode is {mode}; it must be 0 (open), 1 (brake) or 2 (velocity)")):
         make_plant().set("drive_mode", np.full(6, mode))
 
 
-@pytest.mark.parametrize("name", ["velocity_command", "external_wrench"])
+@pytest.mark.parametrize("name", ["velocity_command", "external_wrench.force"])
 def test_an_input_that_is_not_finite_stops_the_step(make_plant: MakePlant, name: str) -> None:
     plant = make_plant()
-    plant.set(name, [0.0, 0.0, 0.0, np.nan, 0.0, 0.0])
+    value = np.zeros_like(plant.get(name))
+    value[-1] = np.nan
+    plant.set(name, value)
     with pytest.raises(FmuError, match="a step failed: an input is not finite"):
         plant.step(1e-3)
 
 
 def test_a_motion_that_diverges_is_reported(make_plant: MakePlant) -> None:
-    plant = make_plant({"substep": 0.1, "brake.damping": 1e7})
+    plant = make_plant()
+    plant.set("external_wrench.force", [1e300, 0.0, 0.0])
     with pytest.raises(FmuError, match="the state is no longer finite: reduce substep, or check the parameters"):
         for _ in range(100):
-            plant.step(0.1)
+            plant.step(1e-3)
 
 
 @pytest.mark.parametrize("duration", [0.0, -1e-3, np.nan, np.inf])
@@ -248,19 +252,19 @@ def test_a_step_that_is_not_positive_is_refused(make_plant: MakePlant, duration:
 def test_only_tunable_parameters_change_during_a_run(make_plant: MakePlant) -> None:
     plant = make_plant()
     plant.step(1e-3)
-    with pytest.raises(FmuError, match=r"platform.mass .* is fixed once initialisation has ended"):
+    with pytest.raises(FmuError, match=r"platform.mass is fixed once initialisation has ended"):
         plant.set("platform.mass", 4.0)
     assert plant.get("platform.mass") == 3.0
     before = plant.get("potential_energy")
     plant.set("payload.mass", 11.0)
     height = plant.get("position")[2] + 0.10
     assert plant.get("potential_energy") - before == pytest.approx(9.81 * height, rel=1e-6)
-    with pytest.raises(FmuError, match=r"payload.mass is -1; it must be finite and at least 0"):
+    with pytest.raises(FmuError, match=r"payload.mass is -1; it must be 0 to"):
         plant.set("payload.mass", -1.0)
 
 
 def test_outputs_cannot_be_set(make_plant: MakePlant) -> None:
-    with pytest.raises(FmuError, match=r"position .* is an output and cannot be set"):
+    with pytest.raises(FmuError, match=r"position is calculated and cannot be set"):
         make_plant().set("position", np.zeros(3))
 
 

@@ -1,0 +1,285 @@
+#include "model.h"
+
+#include <math.h>
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+Status model_fail(const Plant *plant, const char *format, ...) {
+    char message[400];
+    va_list arguments;
+    va_start(arguments, format);
+    vsnprintf(message, sizeof message, format, arguments);
+    va_end(arguments);
+    plant->tell(plant, message);
+    return FAILED;
+}
+
+/* ---- dynamics ---- */
+
+/* Call a function of plant.h: its arguments, then its results, and what it needs to work. */
+#define CALL(function, inputs, outputs)                                         \
+    do {                                                                        \
+        const double *arguments[function##_SZ_ARG] = {UNPACK inputs};           \
+        double *results[function##_SZ_RES] = {UNPACK outputs};                  \
+        double work[function##_SZ_W + 1];                                       \
+        casadi_int integers[function##_SZ_IW + 1];                              \
+        function(arguments, results, integers, work, 0);                        \
+    } while (0)
+#define UNPACK(...) __VA_ARGS__
+
+static void require_constants(State *s) {
+    if (s->constants_known) return;
+    CALL(plant_constants, (s->values + PARAMETERS_AT), (s->constants));
+    s->constants_known = 1;
+}
+
+static void rates(const State *s, const double *x, double *dx) {
+    CALL(plant_rates, (x, s->values + INPUTS_AT, s->constants), (dx));
+}
+
+static void require_rates(State *s) {
+    if (s->rates_known) return;
+    require_constants(s);
+    rates(s, s->values, s->values + RATES_AT);
+    s->rates_known = 1;
+}
+
+static void require_outputs(State *s) {
+    if (s->outputs_known) return;
+    require_constants(s);
+    CALL(plant_outputs, (s->values, s->values + INPUTS_AT, s->constants), (s->values + OUTPUTS_AT));
+    s->outputs_known = 1;
+}
+
+static void forget(State *s) { s->outputs_known = s->rates_known = 0; }
+
+static void place_at_start(State *s) {
+    CALL(plant_start, (s->values + PARAMETERS_AT), (s->values));
+    forget(s);
+}
+
+/* The classical Runge-Kutta method with equal substeps. */
+static void integrate(State *s, double duration) {
+    int steps = (int)ceil(duration / s->values[SUBSTEP_AT] - 1e-9);
+    if (steps < 1) steps = 1;
+    double h = duration / steps, *x = s->values, k[4][STATES], at[STATES];
+    require_constants(s);
+    for (int step = 0; step < steps; step++) {
+        rates(s, x, k[0]);
+        for (int i = 0; i < STATES; i++) at[i] = x[i] + h / 2 * k[0][i];
+        rates(s, at, k[1]);
+        for (int i = 0; i < STATES; i++) at[i] = x[i] + h / 2 * k[1][i];
+        rates(s, at, k[2]);
+        for (int i = 0; i < STATES; i++) at[i] = x[i] + h * k[2][i];
+        rates(s, at, k[3]);
+        for (int i = 0; i < STATES; i++) x[i] += h / 6 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i]);
+#ifdef QUATERNION_AT
+        double *q = x + QUATERNION_AT, scale = 1 / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
+        for (int i = 0; i < 4; i++) q[i] *= scale;
+#endif
+    }
+    forget(s);
+}
+
+static int all_finite(const double *values, size_t n) {
+    for (size_t i = 0; i < n; i++)
+        if (!isfinite(values[i])) return 0;
+    return 1;
+}
+
+static int is_parameter(unsigned v) { return kind[v] == FIXED || kind[v] == TUNABLE; }
+
+static Status check_range(const Plant *plant, unsigned v, const double *values, int count) {
+    for (int i = 0; i < count; i++)
+        if (!(values[i] >= minimum[v] && values[i] <= maximum[v]))
+            return model_fail(plant, "parameter %s is %g; it must be %g to %g", names[v], values[i], minimum[v], maximum[v]);
+    return OK;
+}
+
+static Status check_conditions(const Plant *plant) {
+    double values[CONDITIONS], limits[CONDITIONS];
+    CALL(plant_conditions, (plant->state.values + PARAMETERS_AT), (values, limits));
+    for (int i = 0; i < CONDITIONS; i++)
+        if (!(values[i] <= limits[i])) return model_fail(plant, condition_texts[i], values[i], limits[i]);
+    return OK;
+}
+
+static Status check_limits(const Plant *plant) {
+    double values[LIMITS + 1], limits[LIMITS + 1];
+    CALL(plant_limits, (plant->state.values, plant->state.constants), (values, limits));
+    for (int i = 0; i < LIMITS; i++)
+        if (!(values[i] <= limits[i])) return model_fail(plant, limit_texts[i], values[i], limits[i]);
+    return OK;
+}
+
+/* ---- life ---- */
+
+Plant *model_new(
+    Phase after_initialization, const char *token, void (*tell)(const Plant *, const char *), const void *importer) {
+    Plant *plant = calloc(1, sizeof *plant);
+    if (!plant) return 0;
+    plant->after_initialization = after_initialization;
+    plant->tell = tell;
+    plant->importer = importer;
+    if (!token || strcmp(token, TOKEN)) {
+        model_fail(plant, "the instantiationToken is not that of modelDescription.xml");
+        free(plant);
+        return 0;
+    }
+    model_reset(plant);
+    return plant;
+}
+
+void model_free(Plant *plant) { free(plant); }
+
+void model_reset(Plant *plant) {
+    State *s = &plant->state;
+    memset(s, 0, sizeof *s);
+    memcpy(s->values, start, sizeof start);
+    place_at_start(s);
+}
+
+Status model_enter_initialization(Plant *plant, double start_time) {
+    if (plant->state.phase != INSTANTIATED) return model_fail(plant, "initialisation can be entered only once after instantiation");
+    plant->state.phase = INITIALIZING;
+    plant->state.time = start_time;
+    return OK;
+}
+
+Status model_exit_initialization(Plant *plant) {
+    State *s = &plant->state;
+    if (s->phase != INITIALIZING) return model_fail(plant, "not in initialisation mode");
+    for (unsigned v = 0; v < VARIABLES; v++)
+        if (is_parameter(v) && check_range(plant, v, s->values + offset[v], length[v]) != OK) return FAILED;
+    if (check_conditions(plant) != OK) return FAILED;
+    s->phase = plant->after_initialization;
+    return OK;
+}
+
+Status model_step(Plant *plant, double time, double step) {
+    State *s = &plant->state;
+    if (s->phase != STEPPING) return model_fail(plant, "a step before the end of initialisation or after termination");
+    if (!(step > 0) || !isfinite(step)) return model_fail(plant, "the communication step must be positive");
+    if (!(fabs(time - s->time) <= 1e-6 * step + 1e-9 * fabs(time)))
+        return model_fail(plant, "the communication point is %.9g s, but the last step ended at %.9g s", time, s->time);
+    if (!all_finite(s->values + INPUTS_AT, INPUTS)) return model_fail(plant, "an input is not finite");
+    integrate(s, step);
+    s->time = time + step;
+    if (!all_finite(s->values, STATES)) return model_fail(plant, "the state is no longer finite: reduce substep, or check the parameters");
+    return check_limits(plant);
+}
+
+void model_changed(Plant *plant) { forget(&plant->state); }
+
+Status model_rates(Plant *plant, const double **found) {
+    require_rates(&plant->state);
+    *found = plant->state.values + RATES_AT;
+    return all_finite(*found, STATES) ? OK : DISCARD;
+}
+
+/* ---- variables ---- */
+
+static Status check_type(const Plant *plant, unsigned v, int integer) {
+    if (v >= VARIABLES) return model_fail(plant, "there is no variable of value reference %u", v);
+    if ((kind[v] == DISCRETE_INPUT) != integer) return model_fail(plant, "%s is not a variable of this type", names[v]);
+    return OK;
+}
+
+Status model_get(Plant *plant, unsigned v, int first, int count, int integer, double *values) {
+    if (check_type(plant, v, integer) != OK) return FAILED;
+    if (kind[v] == OUTPUT) require_outputs(&plant->state);
+    if (kind[v] == RATE) require_rates(&plant->state);
+    memcpy(values, plant->state.values + offset[v] + first, count * sizeof(double));
+    return OK;
+}
+
+Status model_set(Plant *plant, unsigned v, int first, int count, int integer, const double *values) {
+    State *s = &plant->state;
+    if (check_type(plant, v, integer) != OK) return FAILED;
+    if (kind[v] == OUTPUT || kind[v] == STATE || kind[v] == RATE) return model_fail(plant, "%s is calculated and cannot be set", names[v]);
+    if (kind[v] == FIXED && s->phase >= STEPPING) return model_fail(plant, "%s is fixed once initialisation has ended", names[v]);
+    if (s->phase == CONTINUOUS && kind[v] != INPUT) return model_fail(plant, "%s can change in event mode only", names[v]);
+    double *place = s->values + offset[v] + first;
+    if (integer)
+        for (int i = 0; i < count; i++)
+            if (values[i] < minimum[v] || values[i] > maximum[v])
+                return model_fail(plant, "%s is %g; it must be 0 (open), 1 (brake) or 2 (velocity)", names[v], values[i]);
+    /* Before the end of initialisation parameters may be set one after the other; then all are checked together. */
+    if (kind[v] == TUNABLE && s->phase >= STEPPING) {
+        double before[LONGEST];
+        if (check_range(plant, v, values, count) != OK) return FAILED;
+        memcpy(before, place, count * sizeof(double));
+        memcpy(place, values, count * sizeof(double));
+        if (check_conditions(plant) != OK) {
+            memcpy(place, before, count * sizeof(double));
+            return FAILED;
+        }
+    }
+    memcpy(place, values, count * sizeof(double));
+    forget(s);
+    if (!is_parameter(v)) return OK;
+    s->constants_known = 0;
+    if (s->phase < STEPPING) place_at_start(s);
+    return OK;
+}
+
+/* ---- derivatives ---- */
+
+Status model_may_derive(const Plant *plant, unsigned v, int unknown) {
+    if (v >= VARIABLES) return model_fail(plant, "there is no variable of value reference %u", v);
+    int possible = unknown ? kind[v] == OUTPUT || kind[v] == RATE : kind[v] == INPUT || kind[v] == STATE || is_parameter(v);
+    if (!possible) return model_fail(plant, "%s cannot be %s of a derivative", names[v], unknown ? "an unknown" : "a known");
+    return OK;
+}
+
+void model_forward(Plant *plant, const double *seed, double *sensitivity) {
+    State *s = &plant->state;
+    double constants[CONSTANTS];
+    require_constants(s);
+    CALL(plant_constants_forward, (s->values + PARAMETERS_AT, seed + PARAMETERS_AT), (constants));
+    CALL(plant_forward, (s->values, s->values + INPUTS_AT, s->constants, seed, seed + INPUTS_AT, constants),
+         (sensitivity + RATES_AT, sensitivity + OUTPUTS_AT));
+}
+
+void model_reverse(Plant *plant, const double *seed, double *sensitivity) {
+    State *s = &plant->state;
+    double constants[CONSTANTS];
+    require_constants(s);
+    CALL(plant_reverse, (s->values, s->values + INPUTS_AT, s->constants, seed + RATES_AT, seed + OUTPUTS_AT),
+         (sensitivity, sensitivity + INPUTS_AT, constants));
+    CALL(plant_constants_reverse, (s->values + PARAMETERS_AT, constants), (sensitivity + PARAMETERS_AT));
+}
+
+/* ---- state ---- */
+
+Status model_save(const Plant *plant, void **saved) {
+    if (!*saved) *saved = malloc(sizeof(State));
+    if (!*saved) return model_fail(plant, "out of memory");
+    memcpy(*saved, &plant->state, sizeof(State));
+    return OK;
+}
+
+void model_restore(Plant *plant, const void *saved) { memcpy(&plant->state, saved, sizeof(State)); }
+
+Status model_serialize(const Plant *plant, const void *saved, void *bytes, size_t size) {
+    if (size < sizeof(Serialized)) return model_fail(plant, "too few bytes for the serialised state");
+    Serialized blob;
+    memset(&blob, 0, sizeof blob);
+    blob.layout = LAYOUT;
+    memcpy(&blob.state, saved, sizeof(State));
+    memcpy(bytes, &blob, sizeof blob);
+    return OK;
+}
+
+Status model_deserialize(const Plant *plant, const void *bytes, size_t size, void **saved) {
+    Serialized blob;
+    if (size != sizeof blob) return model_fail(plant, "the serialised state has the wrong size");
+    memcpy(&blob, bytes, sizeof blob);
+    if (blob.layout != LAYOUT) return model_fail(plant, "the serialised state is from another build of this FMU");
+    if (!*saved) *saved = malloc(sizeof(State));
+    if (!*saved) return model_fail(plant, "out of memory");
+    memcpy(*saved, &blob.state, sizeof(State));
+    return OK;
+}

@@ -1,0 +1,66 @@
+/* The plant behind both versions of FMI: one instance, its life, its variables, its derivatives.
+ *
+ * layout.h is generated from the plant's variable table. All variables lie in one vector `values`, states first and their
+ * derivatives last; variable v is `length[v]` scalars at `offset[v]`. All state is one plain struct, so saving, restoring
+ * and serialising it are copies. plant.h and derivatives.h are generated from the plant's dynamics.
+ */
+#pragma once
+#include <stddef.h>
+
+#include "derivatives.h"
+#include "layout.h"
+#include "plant.h"
+
+typedef enum { OK, WARNING, DISCARD, FAILED } Status; /* as both versions number them */
+
+typedef enum { INSTANTIATED, INITIALIZING, STEPPING, EVENTS, CONTINUOUS, TERMINATED } Phase;
+
+typedef struct {
+    double time;
+    double values[VALUES];
+    double constants[CONSTANTS];
+    int constants_known, outputs_known, rates_known;
+    Phase phase;
+} State;
+
+typedef struct {
+    unsigned long long layout;
+    State state;
+} Serialized;
+
+typedef struct Plant Plant;
+
+struct Plant {
+    State state;
+    Phase after_initialization; /* STEPPING for Co-Simulation, EVENTS for Model Exchange */
+    void (*tell)(const Plant *, const char *message);
+    const void *importer; /* for `tell` */
+};
+
+Status model_fail(const Plant *plant, const char *format, ...);
+Plant *model_new(
+    Phase after_initialization, const char *token, void (*tell)(const Plant *, const char *), const void *importer);
+void model_free(Plant *plant);
+void model_reset(Plant *plant);
+
+Status model_enter_initialization(Plant *plant, double start_time);
+Status model_exit_initialization(Plant *plant);
+Status model_step(Plant *plant, double time, double step);
+
+/* Elements first to first + count - 1 of a variable; `integer` is whether the importer treats it as one. */
+Status model_get(Plant *plant, unsigned variable, int first, int count, int integer, double *values);
+Status model_set(Plant *plant, unsigned variable, int first, int count, int integer, const double *values);
+
+void model_changed(Plant *plant); /* after the states or the time were set */
+Status model_rates(Plant *plant, const double **rates);
+
+/* Jacobian of outputs and derivatives by continuous inputs, states and parameters, times a vector, or transposed; all
+ * vectors have VALUES elements. `model_may_derive` tells whether a variable can be one side of it. */
+Status model_may_derive(const Plant *plant, unsigned variable, int unknown);
+void model_forward(Plant *plant, const double *seed, double *sensitivity);
+void model_reverse(Plant *plant, const double *seed, double *sensitivity);
+
+Status model_save(const Plant *plant, void **saved);
+Status model_serialize(const Plant *plant, const void *saved, void *bytes, size_t size);
+Status model_deserialize(const Plant *plant, const void *bytes, size_t size, void **saved);
+void model_restore(Plant *plant, const void *saved);
