@@ -28,6 +28,11 @@ _DMA_LATENCY = Path("/dev/cpu_dma_latency")
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 
 
+def keep_to_one_thread() -> None:
+    """Keep OpenBLAS from starting threads, which would live in the loop's process too; to be called before NumPy is loaded."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
 @dataclass(frozen=True)
 class RealTimeSettings:
     """How a loop is to be run.
