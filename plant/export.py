@@ -93,8 +93,8 @@ TARGETS = {
 """What `--platforms` can name. In FMI 2.0 both processors of darwin share one universal library."""
 
 
-def default_fmu(model: Model = SPATIAL_MODEL) -> Path:
-    """A plant's FMU for this machine, built on first use and kept under a hash of all that it is made from.
+def default_fmu(model: Model = SPATIAL_MODEL, fmi: int = 3) -> Path:
+    """A plant's FMU of FMI 2.0 or 3.0 for this machine, built on first use and kept under a hash of all that it is made from.
 
     Raises:
         ToolchainError: no C compiler, or it failed.
@@ -107,10 +107,10 @@ def default_fmu(model: Model = SPATIAL_MODEL) -> Path:
     sources = [here / name for name in names if (here / name).exists()]
     with resources.as_file(resources.files("fmus")) as folder:
         wrappers = sorted([*folder.glob("*.c"), *folder.glob("*.h")])
-        key = hash_of_files([*sources, *wrappers], version("casadi"), platform.machine(), sys.platform)
+        key = hash_of_files([*sources, *wrappers], version("casadi"), platform.machine(), sys.platform, str(fmi))
     path = keyed_folder("fmus", key) / f"{model.identifier}.fmu"
     if not path.exists():
-        build_in_subprocess(path, mechanism=model.preset)
+        build_in_subprocess(path, fmi, model.preset)
     return path
 
 
@@ -163,10 +163,7 @@ def build(path: Path, fmi: int = 3, mechanism: str | Path = "hexapod", platforms
         ToolchainError: no C compiler, or it failed.
         InputError: a version or platform that does not exist, or `path` cannot be written.
     """
-    if fmi not in (2, 3):
-        raise InputError(f"there is no FMI {fmi} to export: choose 2 or 3")
-    if unknown := [name for name in platforms if name not in TARGETS]:
-        raise InputError(f"no platform {unknown[0]!r}; there are {', '.join(TARGETS)}")
+    check_build(fmi, platforms)
     loaded = load_spatial(mechanism)
     model = model_of(loaded)
     starts = loaded.plant_parameters()
@@ -194,6 +191,23 @@ def build(path: Path, fmi: int = 3, mechanism: str | Path = "hexapod", platforms
         for name, library in _libraries(model, fmi, work, sources, platforms).items():
             contents[f"binaries/{name}"] = library
         write_whole(path, _archive(contents))
+
+
+def check_build(fmi: int, platforms: Sequence[str]) -> None:
+    """Check what an FMU is to be built for, and that there is a compiler for it.
+
+    Raises:
+        InputError: a version or platform that does not exist.
+        ToolchainError: no compiler.
+    """
+    if fmi not in (2, 3):
+        raise InputError(f"there is no FMI {fmi} to export: choose 2 or 3")
+    if unknown := [name for name in platforms if name not in TARGETS]:
+        raise InputError(f"no platform {unknown[0]!r}; there are {', '.join(TARGETS)}")
+    if platforms:
+        _zig()
+    else:
+        c_compiler()
 
 
 def model_of(mechanism: Any) -> Model:
@@ -244,7 +258,8 @@ def _compile(compiler: list[str], work: Path, sources: list[str], suffix: str) -
     with ThreadPoolExecutor() as pool:
         objects = list(pool.map(compile_one, sources))
     _run([*compiler, "-shared", "-s", *objects, "-o", f"library{suffix}", "-lm"], work)
-    return (work / f"library{suffix}").read_bytes()
+    library = (work / f"library{suffix}").read_bytes()
+    return _without_time(library) if suffix == ".dll" else library
 
 
 def _run(command: list[str], folder: Path) -> None:
@@ -252,6 +267,12 @@ def _run(command: list[str], folder: Path) -> None:
     if run.returncode:
         complaint = next((line for line in run.stderr.splitlines() if "error" in line), run.stderr.strip())
         raise ToolchainError(f"{command[0]} could not compile the plant: {complaint}")
+
+
+def _without_time(library: bytes) -> bytes:
+    """A library of Windows without the time of its making (TimeDateStamp in the header of its PE format)."""
+    stamp = struct.unpack_from("<I", library, 0x3C)[0] + 8
+    return library[:stamp] + bytes(4) + library[stamp + 4 :]
 
 
 def _universal(libraries: list[bytes]) -> bytes:

@@ -205,9 +205,9 @@ class _Writer:
         return variable.causality in ("state", "output")
 
     def attributes(self, variable: Variable) -> str:
-        """Type, quantity, unit and range."""
+        """Quantity, unit and range."""
         if variable.discrete:
-            return f' declaredType="DriveMode" min="{variable.minimum:d}" max="{variable.maximum:d}"'
+            return f' min="{variable.minimum:d}" max="{variable.maximum:d}"'
         quantity = QUANTITIES[variable.unit][0]
         bounds = f' min="{variable.minimum!r}" max="{variable.maximum!r}" nominal="{variable.nominal!r}"'
         return f' quantity="{quantity}" unit="{variable.unit}"{bounds}'
@@ -258,6 +258,8 @@ class _Fmi3(_Writer):
         tag = "Enumeration" if variable.discrete else "Float64"
         start = " ".join(self.start(variable))
         extra = f' start="{start}"' if start else ""
+        if variable.discrete:
+            extra += ' declaredType="DriveMode"'
         if self.calculated(variable):
             extra += ' initial="calculated"'
         if self.layout.is_rate(variable):
@@ -293,12 +295,9 @@ class _Fmi2(_Writer):
             ' canNotUseMemoryManagementFunctions="true" canGetAndSetFMUstate="true" canSerializeFMUstate="true"'
             f' providesDirectionalDerivative="true"><SourceFiles>{files}</SourceFiles></CoSimulation>',
             f"<UnitDefinitions>{self.units()}</UnitDefinitions>",
-            f'<TypeDefinitions><SimpleType name="DriveMode"><Enumeration>{_ITEMS}</Enumeration></SimpleType></TypeDefinitions>',
             f"<LogCategories>{_CATEGORY}</LogCategories>",
             _EXPERIMENT,
             "<ModelVariables>",
-            f'<ScalarVariable name="time" valueReference="{self.layout.size}" causality="independent"'
-            ' variability="continuous" description="simulation time"><Real quantity="Time" unit="s"/></ScalarVariable>',
             *(line for variable in self.layout.exposed for line in self._scalars(variable)),
             "</ModelVariables>",
             "<ModelStructure>",
@@ -309,12 +308,13 @@ class _Fmi2(_Writer):
 
     @cached_property
     def _index(self) -> dict[int, int]:
-        """The index of each scalar, from its place; that of time is 1."""
+        """The index of each scalar, from its place."""
         places = [place for variable in self.layout.exposed for place in self.layout.places(variable)]
-        return {place: index for index, place in enumerate(places, start=2)}
+        return {place: index for index, place in enumerate(places, start=1)}
 
     def _scalars(self, variable: Variable) -> Iterator[str]:
-        tag = "Enumeration" if variable.discrete else "Real"
+        # Not every importer can set an enumeration.
+        tag = "Integer" if variable.discrete else "Real"
         starts = self.start(variable)
         initial = ' initial="calculated"' if self.calculated(variable) else ""
         for i, (name, place) in enumerate(zip(element_names(variable), self.layout.places(variable), strict=True)):

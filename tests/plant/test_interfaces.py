@@ -1,0 +1,396 @@
+"""One plant behind several interfaces: FMI 3.0 Co-Simulation and Model Exchange, FMI 2.0, other importers, other compilers."""
+
+import ctypes
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import fmpy
+import numpy as np
+import pytest
+from fmpy.fmi1 import FMICallException
+from fmpy.fmi2 import FMU2Slave
+from fmpy.fmi3 import FMU3Model, FMU3Slave
+from fmpy.validation import validate_fmu
+from scipy.integrate import solve_ivp
+
+from plant.errors import InputError
+from plant.export import SPATIAL_MODEL, build, check_build, default_fmu
+from plant.fmu import FmuPlant
+from plant.mechanism import Mechanism
+from plant.model_description import Layout, element_names
+from plant.pose import Array
+from plant.variables import BY_NAME, SPATIAL, VELOCITY, Variable
+
+LAYOUT = Layout(SPATIAL)
+REFERENCE = {variable.name: reference for reference, variable in enumerate(LAYOUT.exposed)}
+SIZE = {variable.name: variable.size for variable in LAYOUT.exposed}
+
+
+@pytest.fixture(scope="session")
+def fmi2_path() -> Path:
+    return default_fmu(SPATIAL_MODEL, fmi=2)
+
+
+@contextmanager
+def opened(path: Path, kind: Any, log: Any = None) -> Iterator[Any]:
+    """An instance of an FMU through FMPy's own classes."""
+    folder = fmpy.extract(str(path))
+    description = fmpy.read_model_description(str(path))
+    fmu = kind(
+        guid=description.guid, unzipDirectory=folder, modelIdentifier=description.coSimulation.modelIdentifier, instanceName="p"
+    )
+    fmu.instantiate(**({} if log is None else {"logMessage": log}))
+    try:
+        yield fmu
+    finally:
+        fmu.freeInstance()
+        shutil.rmtree(folder)
+
+
+def values_of(fmu: Any, *names: str) -> Array:
+    return np.array(fmu.getFloat64([REFERENCE[n] for n in names], nValues=sum(SIZE[n] for n in names)))
+
+
+def command(t: float) -> Array:
+    """A lively motion of all legs, in steps of 20 ms."""
+    steps = np.floor(t / 0.02 + 0.5) * 0.02
+    command: Array = 0.06 * np.sin(2.0 * np.pi * (0.4 + 0.07 * np.arange(6)) * steps + np.arange(6))
+    return command
+
+
+def test_every_exported_fmu_is_clean(fmu_path: Path, fmi2_path: Path) -> None:
+    for path in (fmu_path, fmi2_path):
+        assert validate_fmu(str(path)) == []
+        run = subprocess.run(
+            [sys.executable, "-m", "fmu_manipulation_toolbox", "-input", str(path), "-check"],
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        said = run.stdout + run.stderr
+        assert "No semantic error" in said and "seems to be compliant" in said
+        assert "ERROR" not in said and "WARNING" not in said, said
+
+
+# ---- Model Exchange ----
+
+
+def exchange(path: Path, duration: float) -> Array:
+    """Pose (7,) after a motion, by an adaptive integrator of high order on the states of Model Exchange."""
+    with opened(path, FMU3Model) as fmu:
+        fmu.enterInitializationMode()
+        fmu.exitInitializationMode()
+        n = ctypes.c_size_t()
+        fmu.fmi3GetNumberOfContinuousStates(fmu.component, n)
+        assert n.value == sum(variable.size for variable in SPATIAL.states)
+        x, dx = np.zeros(n.value), np.zeros(n.value)
+        pointers = [array.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for array in (x, dx)]
+        fmu.setInt64([REFERENCE["drive_mode"]], [VELOCITY] * 6)
+        fmu.enterContinuousTimeMode()
+        fmu.fmi3GetContinuousStates(fmu.component, pointers[0], n)
+
+        def rates(t: float, state: Array) -> Array:
+            fmu.fmi3SetTime(fmu.component, t)
+            x[:] = state
+            fmu.fmi3SetContinuousStates(fmu.component, pointers[0], n)
+            fmu.fmi3GetContinuousStateDerivatives(fmu.component, pointers[1], n)
+            return dx.copy()
+
+        state, step = x.copy(), 0.02
+        for i in range(round(duration / step)):
+            fmu.setFloat64([REFERENCE["velocity_command"]], command(i * step))
+            state = solve_ivp(rates, (i * step, (i + 1) * step), state, "DOP853", rtol=1e-10, atol=1e-12).y[:, -1]
+        rates(duration, state)
+        return values_of(fmu, "position", "quaternion")
+
+
+def cosimulate(path: Path, duration: float, substep: float) -> Array:
+    with opened(path, FMU3Slave) as fmu:
+        fmu.setFloat64([REFERENCE["substep"]], [substep])
+        fmu.enterInitializationMode()
+        fmu.exitInitializationMode()
+        fmu.setInt64([REFERENCE["drive_mode"]], [VELOCITY] * 6)
+        for cycle in range(round(1000 * duration)):
+            fmu.setFloat64([REFERENCE["velocity_command"]], command(1e-3 * (cycle - cycle % 20)))
+            fmu.doStep(currentCommunicationPoint=1e-3 * cycle, communicationStepSize=1e-3)
+        return values_of(fmu, "position", "quaternion")
+
+
+def test_co_simulation_agrees_with_model_exchange_by_an_adaptive_integrator(fmu_path: Path, hexapod: Mechanism) -> None:
+    """10 s at a tolerance of 1e-10: within 1e-8 m and rad, with substeps of 0.25 ms."""
+    exact = exchange(fmu_path, 10.0)
+    error = np.abs(cosimulate(fmu_path, 10.0, 2.5e-4) - exact)
+    assert error[:3].max() < 1e-8 and 2.0 * error[3:].max() < 1e-8
+    coarse = np.abs(cosimulate(fmu_path, 10.0, 5e-4) - exact)
+    assert error[:3].max() < coarse[:3].max() < 1e-7
+    assert np.abs(exact[:3] - hexapod.require_home().position).max() > 1e-3
+
+
+def test_model_exchange_has_its_modes(fmu_path: Path) -> None:
+    messages: list[str] = []
+
+    def log(environment: Any, status: int, category: bytes, message: bytes) -> None:
+        messages.append(message.decode())
+
+    with opened(fmu_path, FMU3Model, log) as fmu:
+        fmu.enterInitializationMode()
+        fmu.exitInitializationMode()
+        assert fmu.updateDiscreteStates()[:5] == (False, False, False, False, False)
+        fmu.enterContinuousTimeMode()
+        for refused, said in (
+            (lambda: fmu.setInt64([REFERENCE["drive_mode"]], [0] * 6), "drive_mode can change in event mode only"),
+            (lambda: fmu.setFloat64([REFERENCE["payload.mass"]], [1.0]), "payload.mass can change in event mode only"),
+            (fmu.enterContinuousTimeMode, "continuous-time mode follows event mode"),
+        ):
+            with pytest.raises(FMICallException):
+                refused()
+            assert messages[-1] == said
+        fmu.enterEventMode()
+        fmu.setFloat64([REFERENCE["payload.mass"]], [1.0])
+
+
+# ---- FMI 2.0 ----
+
+
+def places(name: str) -> list[int]:
+    return list(LAYOUT.places(BY_NAME[name]))
+
+
+def drive_with_fmi2(path: Path, cycles: int) -> Array:
+    """Truth and IMU signals after every cycle, through FMPy."""
+    seen = []
+    with opened(path, FMU2Slave) as fmu:
+        fmu.setupExperiment()
+        fmu.enterInitializationMode()
+        fmu.exitInitializationMode()
+        fmu.setInteger(places("drive_mode"), [VELOCITY] * 6)
+        for cycle in range(cycles):
+            fmu.setReal(places("velocity_command"), command(1e-3 * cycle))
+            fmu.doStep(currentCommunicationPoint=1e-3 * cycle, communicationStepSize=1e-3)
+            seen.append(fmu.getReal([*places("position"), *places("quaternion"), *places("imu_specific_force")]))
+    return np.array(seen)
+
+
+def drive_with_fmi3(path: Path, cycles: int) -> Array:
+    seen = []
+    with opened(path, FMU3Slave) as fmu:
+        fmu.enterInitializationMode()
+        fmu.exitInitializationMode()
+        fmu.setInt64([REFERENCE["drive_mode"]], [VELOCITY] * 6)
+        for cycle in range(cycles):
+            fmu.setFloat64([REFERENCE["velocity_command"]], command(1e-3 * cycle))
+            fmu.doStep(currentCommunicationPoint=1e-3 * cycle, communicationStepSize=1e-3)
+            seen.append(values_of(fmu, "position", "quaternion", "imu_specific_force"))
+    return np.array(seen)
+
+
+def test_fmi_2_and_fmi_3_are_the_same_plant_to_the_bit(fmu_path: Path, fmi2_path: Path) -> None:
+    two, three = drive_with_fmi2(fmi2_path, 300), drive_with_fmi3(fmu_path, 300)
+    np.testing.assert_array_equal(two.view(np.uint64), three.view(np.uint64))
+    assert np.ptp(two[:, :3], axis=0).max() > 1e-4
+
+
+def test_fmi_2_has_every_element_by_its_name_with_unit_range_and_start(fmi2_path: Path, hexapod: Mechanism) -> None:
+    described = {v.name: v for v in fmpy.read_model_description(str(fmi2_path), validate=True).modelVariables}
+    starts = hexapod.plant_parameters()
+    assert len(described) == LAYOUT.size
+    for variable in LAYOUT.exposed:
+        for i, name in enumerate(element_names(variable)):
+            actual = described[name]
+            assert actual.valueReference == LAYOUT.offsets[variable.name] + i
+            assert actual.unit == (None if variable.discrete else variable.unit)
+            assert (float(actual.min), float(actual.max)) == (variable.minimum, variable.maximum)
+            if variable.causality == "parameter":
+                assert float(actual.start) == np.ravel(starts[variable.name])[i]
+    assert described["base_joints[2,3]"].valueReference == LAYOUT.offsets["base_joints"] + 5
+    assert described["der(state.velocity[2])"].derivative is described["state.velocity[2]"]
+
+
+def test_another_importer_runs_the_fmi_2_fmu(fmi2_path: Path) -> None:
+    """libcosim's own importer, over FMI Library: the trajectory within 1e-9 of FMPy's."""
+    libcosimpy = pytest.importorskip("libcosimpy.CosimExecution")
+    from libcosimpy.CosimManipulator import CosimManipulator
+    from libcosimpy.CosimObserver import CosimObserver
+    from libcosimpy.CosimSlave import CosimLocalSlave
+
+    execution = libcosimpy.CosimExecution.from_step_size(step_size=1_000_000)
+    slave = execution.add_local_slave(CosimLocalSlave(fmu_path=str(fmi2_path), instance_name="plant"))
+    manipulator, observer = CosimManipulator.create_override(), CosimObserver.create_last_value()
+    execution.add_manipulator(manipulator=manipulator)
+    execution.add_observer(observer=observer)
+    seen = []
+    for cycle in range(200):
+        assert manipulator.slave_integer_values(
+            slave_index=slave, variable_references=places("drive_mode"), values=[VELOCITY] * 6
+        )
+        assert manipulator.slave_real_values(
+            slave_index=slave, variable_references=places("velocity_command"), values=list(command(1e-3 * cycle))
+        )
+        assert execution.step()
+        seen.append(
+            observer.last_real_values(slave_index=slave, variable_references=[*places("position"), *places("quaternion")])
+        )
+    expected = drive_with_fmi2(fmi2_path, 200)[:, :7]
+    np.testing.assert_allclose(seen, expected, rtol=0.0, atol=1e-9)
+
+
+# ---- other compilers ----
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_the_recompiled_fmu_behaves_the_same(fmi: int, fmu_path: Path, fmi2_path: Path, tmp_path: Path) -> None:
+    """`fmpy compile`: CMake and its own flags instead of ours, from the sources inside."""
+    original, again = (fmi2_path if fmi == 2 else fmu_path), tmp_path / "again.fmu"
+    with zipfile.ZipFile(original) as archive, zipfile.ZipFile(again, "w") as stripped:
+        for name in archive.namelist():
+            if not name.startswith("binaries/"):
+                stripped.writestr(name, archive.read(name))
+    subprocess.run([sys.executable, "-m", "fmpy", "compile", str(again)], check=True, capture_output=True)
+    drive = drive_with_fmi2 if fmi == 2 else drive_with_fmi3
+    np.testing.assert_array_equal(drive(original, 100).view(np.uint64), drive(again, 100).view(np.uint64))
+
+
+def test_other_platforms_are_compiled_by_zig(tmp_path: Path) -> None:
+    pytest.importorskip("ziglang")
+    path = tmp_path / "everywhere.fmu"
+    build(path, 3, "planar-3rpr", ["linux", "windows", "darwin"])
+    with zipfile.ZipFile(path) as archive:
+        binaries = {name.split("/")[1]: archive.read(name) for name in archive.namelist() if name.startswith("binaries/")}
+    begins = {
+        "x86_64-linux": b"\x7fELF",
+        "x86_64-windows": b"MZ",
+        "x86_64-darwin": b"\xcf\xfa\xed\xfe\x07",
+        "aarch64-darwin": b"\xcf\xfa\xed\xfe\x0c",
+    }
+    assert set(binaries) == set(begins)
+    for platform, begin in begins.items():
+        assert binaries[platform].startswith(begin)
+        assert b"fmi3DoStep\0" in binaries[platform] and b"fmi3GetAdjointDerivative\0" in binaries[platform]
+        assert str(tmp_path.parent.parent).encode() not in binaries[platform]
+    # The one for this machine runs.
+    assert validate_fmu(str(path)) == []
+    assert np.isfinite(fmpy.simulate_fmu(str(path), stop_time=0.01, output=["kinetic_energy"])["kinetic_energy"]).all()
+
+
+@pytest.mark.parametrize(
+    ("fmi", "platforms", "said"),
+    [
+        (1, [], "there is no FMI 1 to export: choose 2 or 3"),
+        (3, ["amiga"], "no platform 'amiga'; there are linux, windows, darwin"),
+    ],
+)
+def test_what_cannot_be_built_is_refused(fmi: int, platforms: list[str], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        check_build(fmi, platforms)
+
+
+# ---- derivatives ----
+
+
+def live(stack: ExitStack, path: Path) -> Any:
+    """The FMU after a lively motion, so that nothing is at a corner."""
+    fmu = stack.enter_context(opened(path, FMU3Slave))
+    fmu.enterInitializationMode()
+    fmu.exitInitializationMode()
+    fmu.setInt64([REFERENCE["drive_mode"]], [VELOCITY] * 6)
+    fmu.setFloat64([REFERENCE["external_wrench.force"]], [3.0, -2.0, 5.0])
+    for cycle in range(150):
+        fmu.setFloat64([REFERENCE["velocity_command"]], command(1e-3 * cycle))
+        fmu.doStep(currentCommunicationPoint=1e-3 * cycle, communicationStepSize=1e-3)
+    return fmu
+
+
+def product(fmu: Any, function: str, unknowns: list[str], knowns: list[str], seed: Array) -> Array:
+    """`fmi3GetDirectionalDerivative` or `fmi3GetAdjointDerivative`."""
+    wanted = knowns if "Adjoint" in function else unknowns
+    result = np.zeros(sum(SIZE[name] for name in wanted))
+    arguments: list[Any] = []
+    for names in (unknowns, knowns):
+        references = (ctypes.c_uint32 * len(names))(*(REFERENCE[name] for name in names))
+        arguments += [references, len(names)]
+    for vector in (np.ascontiguousarray(seed), result):
+        arguments += [vector.ctypes.data_as(ctypes.POINTER(ctypes.c_double)), vector.size]
+    getattr(fmu, function)(fmu.component, *arguments)
+    return result
+
+
+KNOWNS = [variable.name for variable in (*SPATIAL.states, *SPATIAL.inputs) if not variable.discrete]
+UNKNOWNS = [variable.name for variable in (*LAYOUT.rates, *SPATIAL.outputs)]
+
+
+def test_directional_derivatives_are_casadis_own_jacobians(fmu_path: Path, hexapod: Mechanism) -> None:
+    import casadi as ca
+
+    from plant.dynamics import build_dynamics
+
+    dynamics = build_dynamics()
+    with ExitStack() as stack:
+        fmu = live(stack, fmu_path)
+
+        def flat(variables: tuple[Variable, ...]) -> Array:
+            return np.concatenate([values_of(fmu, v.name) if not v.discrete else np.full(6, VELOCITY) for v in variables])
+
+        x, u, p = flat(SPATIAL.states), flat(SPATIAL.inputs), flat(SPATIAL.parameters)
+        symbols = [ca.SX.sym(name, len(vector)) for name, vector in (("x", x), ("u", u), ("p", p))]
+        constants = dynamics.constants(symbols[2])
+        both = ca.vertcat(*(f(symbols[0], symbols[1], constants) for f in (dynamics.rates, dynamics.outputs)))
+        jacobians = ca.Function("jacobians", symbols, [ca.jacobian(both, symbol) for symbol in symbols])(x, u, p)
+        modes = [i for v, at in zip(SPATIAL.inputs, (0, 6, 12, 15), strict=True) if v.discrete for i in range(at, at + 6)]
+        by_input = np.delete(np.array(jacobians[1]), modes, axis=1)
+        expected = np.hstack([np.array(jacobians[0]), by_input, np.array(jacobians[2])])
+        knowns = KNOWNS + [variable.name for variable in SPATIAL.parameters]
+        scale = np.maximum(np.abs(expected).max(axis=1), 1.0)
+        found = np.stack(
+            [product(fmu, "fmi3GetDirectionalDerivative", UNKNOWNS, knowns, seed) for seed in np.eye(expected.shape[1])], axis=1
+        )
+        np.testing.assert_allclose(found / scale[:, None], expected / scale[:, None], rtol=1e-12, atol=1e-12)
+        for seed in np.random.default_rng(0).normal(size=(5, len(expected))):
+            adjoint = product(fmu, "fmi3GetAdjointDerivative", UNKNOWNS, knowns, seed)
+            wanted = seed @ expected
+            np.testing.assert_allclose(adjoint, wanted, rtol=1e-10, atol=1e-10 * np.abs(wanted).max())
+
+
+def test_fmi_2_has_the_same_derivatives(fmu_path: Path, fmi2_path: Path) -> None:
+    seed = np.random.default_rng(1).normal(size=6)
+    with opened(fmi2_path, FMU2Slave) as two, opened(fmu_path, FMU3Slave) as three:
+        two.setupExperiment()
+        for fmu in (two, three):
+            fmu.enterInitializationMode()
+            fmu.exitInitializationMode()
+        two.setInteger(places("drive_mode"), [VELOCITY] * 6)
+        three.setInt64([REFERENCE["drive_mode"]], [VELOCITY] * 6)
+        found = two.getDirectionalDerivative(places("voltage"), places("velocity_command"), seed)
+        np.testing.assert_array_equal(
+            found, product(three, "fmi3GetDirectionalDerivative", ["voltage"], ["velocity_command"], seed)
+        )
+        assert np.abs(found).min() > 0.0
+
+
+@pytest.mark.parametrize(
+    ("unknown", "known"), [("position", "drive_mode"), ("velocity_command", "state.current"), ("voltage", "position")]
+)
+def test_derivatives_that_do_not_exist_are_refused(fmu_path: Path, unknown: str, known: str) -> None:
+    messages: list[str] = []
+    with opened(fmu_path, FMU3Slave, lambda *said: messages.append(said[3].decode())) as fmu:
+        fmu.enterInitializationMode()
+        fmu.exitInitializationMode()
+        with pytest.raises(FMICallException):
+            product(fmu, "fmi3GetDirectionalDerivative", [unknown], [known], np.ones(SIZE[known]))
+    assert "of a derivative" in messages[-1]
+
+
+def test_the_sources_hold_no_path_of_this_machine(fmu_path: Path) -> None:
+    with zipfile.ZipFile(fmu_path) as archive:
+        for name in archive.namelist():
+            data = archive.read(name)
+            assert str(Path.home()).encode() + b"/" not in data and b"/tmp/" not in data, name
+
+
+def test_plants_of_fmi_3_start_as_fmu_plants(fmu_path: Path, hexapod: Mechanism) -> None:
+    with FmuPlant(fmu_path, hexapod.plant_parameters(), 1e-3) as plant, opened(fmu_path, FMU3Slave) as fmu:
+        fmu.enterInitializationMode()
+        np.testing.assert_array_equal(plant.get("imu_specific_force").ravel(), values_of(fmu, "imu_specific_force"))
