@@ -135,6 +135,11 @@ class Setting:
             raise InputError(f"{text!r} is no setting such as payload.mass=12, gravity=0,0,-9.8 or payload.mass=12@3.5")
         return cls(name.strip(), numbers, seconds)
 
+    @property
+    def text(self) -> str:
+        """As `parse` takes it."""
+        return f"{self.name}={','.join(f'{each:g}' for each in self.value)}" + ("" if self.at is None else f"@{self.at:g}")
+
 
 _SWITCHES = {"true": 1.0, "false": 0.0}
 
