@@ -70,7 +70,7 @@ def _page(result: SimulationResult) -> str:
     moving = figure_html(
         "mechanism",
         "The mechanism",
-        f"{'True' if result.truth_known else 'Estimated'} poses {pace}; the path of the origin in grey. Drag to turn, scroll to zoom.",
+        f"{_real(result)} poses {pace}; the path of the origin in grey. Drag to turn, scroll to zoom.",
         view,
         "view",
     )
@@ -153,7 +153,7 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
     records, times = result.records, result.times
     limits, home_pose = result.mechanism.require_limits(), result.mechanism.require_home()
     estimate = (records["position"], records["rotation"])
-    actual, real = _actual_poses(result), "True" if result.truth_known else "Estimated"
+    actual, real = _actual_poses(result), _real(result)
     planned = (result.reference_positions, result.reference_rotations)
     true_lengths, currents = records["truth"][:, 7:13], records["truth"][:, 13:19]
     lengths_known = bool(np.isfinite(true_lengths[:1]).all())
@@ -220,6 +220,11 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
             _plot(times, drives),
         ),
     ]
+
+
+def _real(result: SimulationResult) -> str:
+    """What the poses that are drawn are."""
+    return "True" if result.truth_known else "Estimated"
 
 
 def _actual_poses(result: SimulationResult) -> tuple[Array, Array]:

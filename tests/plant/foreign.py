@@ -74,7 +74,7 @@ def build_foreign(folder: Path, mechanism: Mechanism) -> Path:
     (folder / "geometry.h").write_text("\n".join(lines) + "\n")
     library, headers = folder / "foreign.so", Path(fmpy.__file__).parent / "c-code"
     command = [
-        c_compiler(),
+        *c_compiler(),
         "-O2",
         "-fPIC",
         "-shared",
