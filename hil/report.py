@@ -70,7 +70,7 @@ def _page(result: SimulationResult) -> str:
     moving = figure_html(
         "mechanism",
         "The mechanism",
-        f"True poses {pace}; the path of the origin in grey. Drag to turn, scroll to zoom.",
+        f"{_real(result)} poses {pace}; the path of the origin in grey. Drag to turn, scroll to zoom.",
         view,
         "view",
     )
@@ -98,16 +98,25 @@ def _configuration(result: SimulationResult, summary: dict[str, Any]) -> str:
     if tuple(config.imus) != ALL_IMUS:
         parts.insert(3, f"only IMUs {', '.join(map(str, config.imus))}")
     if config.plant:
-        parts.append(f"plant {config.plant}")
+        parts.append(f"plant {config.plant}" + (f" with {config.binding}" if config.binding else ""))
+    parts += [each.text for each in config.settings]
     return " · ".join(map(escape, parts))
 
 
 def _error_table(summary: dict[str, Any]) -> str:
+    reference = ("Reference", "planned reference - target", summary["target"], "reference_")
     lines = (
-        ("Estimation", "estimate - truth", summary["estimation"], ""),
-        ("Tracking", "truth - planned reference", summary["tracking"], ""),
-        ("Against the raw target", "truth - target", summary["target"], ""),
-        ("Reference", "planned reference - target", summary["target"], "reference_"),
+        (
+            ("Estimation", "estimate - truth", summary["estimation"], ""),
+            ("Tracking", "truth - planned reference", summary["tracking"], ""),
+            ("Against the raw target", "truth - target", summary["target"], ""),
+            reference,
+        )
+        if summary["truth_known"]
+        else (
+            ("Tracking", "estimate - planned reference; the truth is not known", summary["estimated_tracking"], ""),
+            reference,
+        )
     )
     rows = "".join(
         f"<tr><th>{name}<small>{meaning}</small></th>"
@@ -143,26 +152,32 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
     """Name, title, caption and figure of everything that is drawn over time."""
     records, times = result.records, result.times
     limits, home_pose = result.mechanism.require_limits(), result.mechanism.require_home()
-    truth = (result.true_positions, result.true_rotations)
+    estimate = (records["position"], records["rotation"])
+    actual, real = _actual_poses(result), _real(result)
     planned = (result.reference_positions, result.reference_rotations)
-    true_lengths, currents = 1e3 * records["truth"][:, 7:13], records["truth"][:, 13:19]
+    true_lengths, currents = records["truth"][:, 7:13], records["truth"][:, 13:19]
+    lengths_known = bool(np.isfinite(true_lengths[:1]).all())
+    lengths, real_length = (
+        1e3 * (true_lengths if lengths_known else records["lengths"]),
+        "True" if lengths_known else "Estimated",
+    )
     planned_lengths, rates, accelerations = np.moveaxis(records["reference"], 2, 0) * [[[1e3]], [[1e3]], [[1.0]]]
 
     home = (home_pose.position, home_pose.rotation)
     pose = [
         _Panel(label, AXIS_NAMES, true, plan)
         for label, true, plan in zip(
-            ("position [mm]", "rotation vector [deg]"), _differences(truth, home), _differences(planned, home), strict=True
+            ("position [mm]", "rotation vector [deg]"), _differences(actual, home), _differences(planned, home), strict=True
         )
     ]
-    estimation, tracking = _differences((records["position"], records["rotation"]), truth), _differences(truth, planned)
+    differences = [("tracking", _differences(actual, planned))]
+    if result.truth_known:
+        differences.insert(0, ("estimation", _differences(estimate, actual)))
     errors = [
-        _Panel(f"{name} [{unit}]", AXIS_NAMES, error[i])
-        for i, unit in enumerate(("mm", "deg"))
-        for name, error in (("estimation", estimation), ("tracking", tracking))
+        _Panel(f"{name} [{unit}]", AXIS_NAMES, error[i]) for i, unit in enumerate(("mm", "deg")) for name, error in differences
     ]
     legs = [
-        _Panel(f"{name} [mm]", (name,), true_lengths[:, [k]], planned_lengths[:, [k]], 1e3 * limits.stroke[k])
+        _Panel(f"{name} [mm]", (name,), lengths[:, [k]], planned_lengths[:, [k]], 1e3 * limits.stroke[k])
         for k, name in enumerate(LEG_NAMES)
     ]
     motion = [
@@ -170,38 +185,53 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
         _Panel("acceleration [m/s²]", LEG_NAMES, accelerations, limits=(-limits.acceleration, limits.acceleration)),
     ]
     drives = [
-        _Panel("length error [mm]", LEG_NAMES, true_lengths - planned_lengths),
+        _Panel("length error [mm]", LEG_NAMES, lengths - planned_lengths),
         _Panel("command [mm/s]", LEG_NAMES, 1e3 * records["command"]),
-        _Panel("motor current [A]", LEG_NAMES, currents),
     ]
+    if np.isfinite(currents[:1]).all():
+        drives.append(_Panel("motor current [A]", LEG_NAMES, currents))
     return [
         (
             "pose",
             "Pose",
-            "True pose of the platform and its planned reference, from home; the rotation vector is seen in the base.",
+            f"{real} pose of the platform and its planned reference, from home; the rotation vector is seen in the base.",
             _plot(times, pose),
         ),
         (
             "errors",
-            "Estimation and tracking error",
-            "Estimate minus truth, and truth minus planned reference. The scales are those of the motion: while the filters "
+            "Estimation and tracking error" if result.truth_known else "Tracking error",
+            ("Estimate minus truth, and truth" if result.truth_known else "The truth is not known: estimate")
+            + " minus planned reference. The scales are those of the motion: while the filters "
             "settle in the hold (grey), the estimate may be further off.",
-            _plot(times, errors, columns=2, shared_yaxes=True),
+            _plot(times, errors, columns=len(differences), shared_yaxes=True),
         ),
         (
             "lengths",
             "Leg lengths",
-            "True and planned length of each leg between the ends of its stroke.",
+            f"{real_length} and planned length of each leg between the ends of its stroke.",
             _plot(times, legs, columns=3),
         ),
         ("motion", "Planned motion of the legs", "The reference against the limits of the actuators.", _plot(times, motion)),
         (
             "drives",
             "Drives",
-            "True minus planned length of each leg, the speed that its drive is told, and the current that this takes.",
+            f"{real_length} minus planned length of each leg, the speed that its drive is told, and the current that this "
+            "takes, if the plant tells it.",
             _plot(times, drives),
         ),
     ]
+
+
+def _real(result: SimulationResult) -> str:
+    """What the poses that are drawn are."""
+    return "True" if result.truth_known else "Estimated"
+
+
+def _actual_poses(result: SimulationResult) -> tuple[Array, Array]:
+    """The true poses, or the estimated ones where the truth is not known."""
+    if result.truth_known:
+        return result.true_positions, result.true_rotations
+    return result.records["position"], result.records["rotation"]
 
 
 def _plot(times: Array, panels: Sequence[_Panel], columns: int = 1, shared_yaxes: bool = False) -> go.Figure:
@@ -296,8 +326,9 @@ def _mechanism_view(result: SimulationResult) -> tuple[go.Figure, float]:
     count = int(np.clip(span * _FRAME_RATE_HZ, 1, _FRAMES))
     frame_s = min(span / count, 1.0 / _SLOWEST_HZ)
     shown = moving[np.linspace(0, len(moving) - 1, count).astype(int)]
-    positions, rotations = 1e3 * result.true_positions[shown], result.true_rotations[shown]
-    path = 1e3 * result.true_positions[moving[:: -(-len(moving) // _PATH_POINTS)]]
+    all_positions, all_rotations = _actual_poses(result)
+    positions, rotations = 1e3 * all_positions[shown], all_rotations[shown]
+    path = 1e3 * all_positions[moving[:: -(-len(moving) // _PATH_POINTS)]]
     base, platform = 1e3 * mechanism.base_joints, 1e3 * mechanism.platform_joints
     joints = positions[:, None] + platform @ np.swapaxes(rotations, 1, 2)
     base_ring, platform_ring = ring(base), ring(platform)

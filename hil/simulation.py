@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from controller.settings import control_settings, safety_settings, sensor_settin
 from controller.stream import rest
 from controller.target import Target, check_duration, load_target
 from hil.loop import COMPUTED, RECORD, Loop, PythonFilters
+from plant.binding import OWN_BINDING, Setting, load_binding
 from plant.compiled import Record
 from plant.errors import GoughError, InputError, UnknownNameError
 from plant.export import default_fmu
@@ -70,6 +71,8 @@ class SimulationConfig:
         calibration: file with the IMUs' constants; without one their readings are taken as they are.
         hold: how long the brakes hold first [s]; None for what the mechanism's settings say.
         plant: an FMU to use instead of the one that gough builds.
+        binding: a TOML file that says which of its variables are which (docs/fmu.md).
+        settings: values for the FMU's parameters and inputs, from the start or from a time of the motion on.
         imus: which IMUs there are, 0-5 on the legs and 6 on the platform.
         wiring: how they are mounted and wired.
         joint_error: of each coordinate of the plant's joints, which the controller does not know: standard deviation [m].
@@ -91,6 +94,8 @@ class SimulationConfig:
     calibration: str | None = None
     hold: float | None = None
     plant: str | None = None
+    binding: str | None = None
+    settings: tuple[Setting, ...] = ()
     imus: tuple[int, ...] = ALL_IMUS
     wiring: Wiring = RIGHT_WIRING
     joint_error: float = 0.0
@@ -111,6 +116,10 @@ class SimulationConfig:
             raise UnknownNameError(f"no fusion {self.fusion!r}; there are {', '.join(FUSIONS)}")
         if self.rig not in RIGS and not self.rig.startswith(PYTHON_RIG):
             raise UnknownNameError(f"no rig {self.rig!r}; there are {', '.join(RIGS)} and {PYTHON_RIG}MODULE:CLASS")
+        if self.binding is not None and self.plant is None:
+            raise InputError(f"{self.binding} binds an FMU, and none is given: name it with --plant FILE.fmu")
+        if self.settings and self.rig != "fmu":
+            raise InputError(f"--set is for the plant's FMU, not for the rig {self.rig}: leave it out")
 
     @property
     def streamed(self) -> bool:
@@ -160,28 +169,36 @@ class SimulationResult:
         return bool(len(self.times)) and bool(self.times[-1] >= 0.0)
 
     @property
+    def truth_known(self) -> bool:
+        """Whether the plant tells its true pose."""
+        return bool(np.isfinite(self.records["truth"][:1, :7]).all())
+
+    @property
     def true_positions(self) -> Array:
-        """(N, 3) [m]."""
+        """(N, 3) [m]; NaN if the truth is not known."""
         positions: Array = self.records["truth"][:, :3]
         return positions
 
     @property
     def true_rotations(self) -> Array:
-        """(N, 3, 3)."""
+        """(N, 3, 3); NaN if the truth is not known."""
         return rotations_from_quaternions(np.ascontiguousarray(self.records["truth"][:, 3:7]))
 
     def summary(self) -> dict[str, Any]:
-        """The figures, in SI units, over the time after the hold."""
+        """The figures, in SI units, over the time after the hold; None for those that need the truth where it is not known."""
         moving = self.times >= 0.0
-        truth = (self.true_positions[moving], self.true_rotations[moving])
         estimate = (self.records["position"][moving], self.records["rotation"][moving])
         reference = (self.reference_positions[moving], self.reference_rotations[moving])
         target = (self.target_positions[moving], self.target_rotations[moving])
+        truth = (self.true_positions[moving], self.true_rotations[moving]) if self.truth_known else None
         cycle_us = self.records["stage_ns"][:, COMPUTED].sum(axis=1) / 1e3
         return {
-            "estimation": _errors(estimate, truth),
-            "tracking": _errors(truth, reference),
-            "target": _errors(truth, target) | {f"reference_{key}": value for key, value in _errors(reference, target).items()},
+            "truth_known": self.truth_known,
+            "estimation": None if truth is None else _errors(estimate, truth),
+            "tracking": None if truth is None else _errors(truth, reference),
+            "estimated_tracking": _errors(estimate, reference),
+            "target": ({} if truth is None else _errors(truth, target))
+            | {f"reference_{key}": value for key, value in _errors(reference, target).items()},
             "limits": {"violations": self.reference.violations},
             "real_time_factor": self.real_time_factor,
             "cycle_us": {
@@ -245,8 +262,8 @@ class PreparedLoop(Loop):
 
     def reason(self) -> str:
         """Why the run has ended, in words; a plant that failed has its own."""
-        if self.plant is not None and self.state["stopping"] == RIG_FAILED and self.plant.messages:
-            return str(self.plant.failure("the plant failed"))
+        if self.plant is not None and self.state["stopping"] == RIG_FAILED:
+            return str(self.plant.failure())
         return describe_end(self.state)
 
 
@@ -310,14 +327,42 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
 
 
 def simulated_plant(config: SimulationConfig, nominal: Mechanism, start: Pose) -> FmuPlant:
-    """The plant that a configuration describes, at rest at its start.
+    """The plant that a configuration describes, at rest at its start; one with a binding starts where it says.
 
     Raises:
-        GoughError: the FMU or the joint error cannot be used.
+        GoughError: the FMU, its binding, a setting or the joint error cannot be used.
     """
     fmu = default_fmu() if config.plant is None else Path(config.plant)
+    binding = OWN_BINDING if config.binding is None else load_binding(config.binding)
+    if config.joint_error and not binding.native:
+        raise InputError(f"{binding.source} binds an FMU with joints of its own, which have no joint error: leave it out")
     built = nominal.built(config.joint_error, config.seed)
-    return FmuPlant(fmu, built.plant_parameters(start), 1.0 / config.rate)
+    hold = control_settings(nominal).hold if config.hold is None else config.hold
+    settings = [each if each.at is None else replace(each, at=each.at + hold) for each in config.settings]
+    late = [each for each in config.settings if each.at is not None and each.at >= config.duration]
+    if late:
+        raise InputError(f"{late[0].name} is set at {late[0].at:g} s, when the motion of {config.duration:g} s is over")
+    parameters = built.plant_parameters(start) if binding.native else {}
+    plant = FmuPlant(fmu, parameters, 1.0 / config.rate, binding, settings)
+    try:
+        _check_plant(config, plant, nominal)
+    except GoughError:
+        plant.close()
+        raise
+    return plant
+
+
+def _check_plant(config: SimulationConfig, plant: FmuPlant, nominal: Mechanism) -> None:
+    """Check that a plant has what the loop is to drive and to read."""
+    name, bound = plant.path.name, plant.bound
+    if bound.legs != LEGS:
+        raise InputError(f"{name} has {bound.legs} legs, and {nominal.name} has {LEGS}: choose another mechanism")
+    absent = set(config.imus) - set(bound.imus)
+    if absent:
+        there = ",".join(map(str, bound.imus))
+        raise InputError(f"{name} has no IMU {', '.join(map(str, sorted(absent)))}: leave it out with --imus {there}")
+    if config.magnetometer and PLATFORM_IMU not in bound.magnetometers:
+        raise InputError(f"{name} has no magnetometer on the platform: bind imu_magnetic_field, or leave out --magnetometer")
 
 
 def _result(config: SimulationConfig, loop: PreparedLoop, done: int, took: float) -> SimulationResult:

@@ -1,10 +1,16 @@
-"""Writing files so that they appear whole or not at all."""
+"""Files that appear whole or not at all, and temporary folders that no crash leaves behind for long."""
 
+import fcntl
 import os
+import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from plant.errors import InputError
+
+_LOCK = "gough.lock"
 
 
 def check_writable(path: Path) -> None:
@@ -44,3 +50,27 @@ def write_whole(path: Path, content: bytes) -> None:
     finally:
         if part is not None:
             part.unlink(missing_ok=True)
+
+
+@contextmanager
+def temporary_folder(prefix: str) -> Iterator[Path]:
+    """A temporary folder, removed at the end; when its process has died, the next to ask for one with this prefix removes it.
+
+    A lock in it tells: it goes with the process, however that ends.
+    """
+    _sweep(prefix)
+    with tempfile.TemporaryDirectory(prefix=prefix, ignore_cleanup_errors=True) as name:
+        made = Path(name, f"{_LOCK}.new")
+        with made.open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            # Whoever sees a lock of this name sees one that is held.
+            made.rename(made.with_name(_LOCK))
+            yield made.parent
+
+
+def _sweep(prefix: str) -> None:
+    """Remove the temporary folders whose process is gone."""
+    for lock in Path(tempfile.gettempdir()).glob(f"{prefix}*/{_LOCK}"):
+        with suppress(OSError), lock.open("r+") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(lock.parent, ignore_errors=True)

@@ -1,101 +1,164 @@
-"""Running a plant FMU: checked when it is loaded, then called from compiled code by the addresses of its C functions.
+"""Running a plant FMU: checked when it is loaded, then called from compiled code by the addresses of its C functions."""
 
-FMPy reads the description and loads the library; it changes the working directory meanwhile, so load plants before
-threads start.
-"""
-
-import contextlib
-import ctypes
-import tempfile
-import zipfile
-import zlib
-from collections.abc import Callable, Mapping
+import struct
+from collections.abc import Callable, Mapping, Sequence
 from math import inf
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import fmpy
-import fmpy.fmi3
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 from numpy.typing import ArrayLike, NDArray
 
+from plant.binding import OWN_BINDING, TRUTH_SIZE, Binding, Modes, Scalars, Setting, bind, load_binding
 from plant.compiled import Record, kernel
-from plant.errors import FmuError, InputError, UnknownNameError
+from plant.errors import FmuError, InputError
+from plant.fmi import ASKS_TO_END, FATAL, NEEDS_EVENTS, OK, FmuDescription, FmuInstance, FmuVariable
+from plant.mechanism import LEGS
 from plant.pose import Array
-from plant.variables import BY_NAME, IMU_COUNT, Variable
+from plant.variables import DRIVE_MODES, IMU_COUNT, VELOCITY
 
-_IMU_OUTPUTS = ("imu_angular_velocity", "imu_specific_force", "imu_magnetic_field")
-_TRUTH_OUTPUTS = ("position", "quaternion", "leg_length", "current")
-_REQUIRED = (*_IMU_OUTPUTS, *_TRUTH_OUTPUTS, "velocity_command", "drive_mode")
+MOST_CHANGES = 32
+"""How many parameters may change during a run."""
 
-CALLS = np.dtype(
+_SENSED = 3 * IMU_COUNT * 3
+_READING, _TELLING, _COMMANDING, _SWITCHING, _LOADING, _CHANGING, _STEPPING = range(7)
+_CALLED = (
+    "reading the IMUs", "reading the truth", "setting the commands", "setting the drives' modes", "setting the payload",
+    "changing a parameter", "a step",
+)  # fmt: skip
+
+
+def _scalars(most: int) -> np.dtype[Any]:
+    """As `plant.binding.Scalars`, with room for so many, and the FMU's values."""
+    return np.dtype(
+        [
+            ("references", np.uint32, most),
+            ("reference_count", np.int64),
+            ("count", np.int64),
+            ("places", np.int64, most),
+            ("factors", np.float64, most),
+            ("offsets", np.float64, most),
+            ("raw", np.float64, most),
+        ],
+        align=True,
+    )
+
+
+_CHANGE = np.dtype(
     [
-        ("instance", np.int64),
-        ("get", np.int64),
-        ("set", np.int64),
-        ("set_enumeration", np.int64),
-        ("step", np.int64),
         ("time", np.float64),
-        ("imu_references", np.uint32, len(_IMU_OUTPUTS)),
-        ("truth_references", np.uint32, len(_TRUTH_OUTPUTS)),
-        ("command_reference", np.uint32, 1),
-        ("mode_reference", np.uint32, 1),
-        ("payload_reference", np.uint32, 1),
-        ("imu", np.float64, (len(_IMU_OUTPUTS), IMU_COUNT, 3)),
-        ("truth", np.float64, sum(BY_NAME[name].size for name in _TRUTH_OUTPUTS)),
-        ("mode", np.int64, 6),
-        ("payload", np.float64, 1),
-        ("reached", np.float64, 1),
-        ("flags", np.uint8, 3),
+        ("function", np.int64),
+        ("references", np.int64),
+        ("reference_count", np.int64),
+        ("values", np.int64),
+        ("count", np.int64),
     ],
     align=True,
 )
-"""One FMU as compiled code sees it: addresses, value references, and the buffers it reads into and writes from.
 
-`imu` is angular velocity, specific force, magnetic field of the seven IMUs; `truth` is position (3), quaternion (4),
-leg lengths (6) and currents (6).
+CALLS = np.dtype(
+    [
+        ("version", np.int64),
+        ("instance", np.int64),
+        ("get", np.int64),
+        ("set", np.int64),
+        ("set_mode", np.int64),
+        ("do_step", np.int64),
+        ("time", np.float64),
+        ("step", np.float64),
+        ("status", np.int64),
+        ("call", np.int64),
+        ("sensed", _scalars(_SENSED)),
+        ("known", _scalars(TRUTH_SIZE)),
+        ("commanded", _scalars(LEGS)),
+        ("loaded", _scalars(1)),
+        ("mode_references", np.uint32, LEGS),
+        ("mode_reference_count", np.int64),
+        ("mode_count", np.int64),
+        ("mode_bytes", np.int64),
+        ("mode_values", np.uint64, len(DRIVE_MODES)),
+        ("mode_raw", np.uint64, LEGS),
+        ("imu", np.float64, (3, IMU_COUNT, 3)),
+        ("truth", np.float64, TRUTH_SIZE),
+        ("planar_angle", np.int64),
+        ("legs", np.int64),
+        ("command", np.float64, LEGS),
+        ("mode", np.int64, LEGS),
+        ("payload", np.float64, 1),
+        ("reached", np.float64, 1),
+        ("flags", np.uint8, 3),
+        ("changes", _CHANGE, MOST_CHANGES),
+        ("change_count", np.int64),
+        ("changed", np.int64),
+    ],
+    align=True,
+)
+"""One FMU as compiled code sees it: addresses, value references with what makes the FMU's values the loop's, and buffers.
+
+`imu` is angular velocity [rad/s], specific force [m/s^2] and magnetic field [uT] of the seven IMUs; `truth` is position (3)
+[m], quaternion (4), leg lengths (6) [m] and currents (6) [A]; both are NaN where the FMU says nothing. A planar plant's truth
+has its pose in space, with z = 0, and its first three legs. `step` is the communication step [s], 0 for that of each call;
+`status` is how the first call that went wrong has ended, and `call` which that was.
 """
 
 
 class FmuPlant:
-    """An FMI 3.0 Co-Simulation FMU with the variables of `plant.variables`, initialised and ready to step.
+    """A plant FMU for Co-Simulation, of FMI 2.0 or 3.0, initialised and ready to step.
 
     Args:
         path: the FMU.
         parameters: start values by name; a name that the FMU does not have is an error.
-        period: communication step [s].
+        period: of control [s].
+        binding: a TOML file that says which variables are which; None where they have gough's own names.
+        settings: values that come after the parameters and the binding's, at the start or during the run.
 
     Attributes:
         calls: the structured array (dtype `CALLS`) for `read_imus`, `read_truth`, `write_command` and `advance`.
-        messages: what the FMU has logged.
-        folder: where it has been extracted to; removed by `close`, and for whoever survives a crash to remove.
+        bound: what its variables are to the loop.
+        folder: where it has been extracted to; removed by `close`, or after a crash when an FMU is next loaded.
 
     Raises:
-        FmuError: the file is no FMU, is of another kind, lacks variables, has them in another shape or type, holds no
-            binary for this machine, or refuses its parameters.
-        InputError: a period that the FMU cannot take.
+        FmuError: the file is no FMU, is of another kind, does not fit its binding, holds no binary for this machine, or refuses
+            its parameters.
+        UnknownNameError: a parameter or setting that the FMU does not have.
+        InputError: a period that the FMU cannot take, a binding that cannot be read, or a value that does not fit.
     """
 
-    def __init__(self, path: Path | str, parameters: Mapping[str, ArrayLike], period: float) -> None:
+    def __init__(
+        self,
+        path: Path | str,
+        parameters: Mapping[str, ArrayLike],
+        period: float,
+        binding: Path | str | Binding | None = None,
+        settings: Sequence[Setting] = (),
+    ) -> None:
         self.path = Path(path)
-        self.messages: list[str] = []
-        self.folder = Path()
         self.calls: Record = np.zeros((), CALLS)
-        self._description = _read_description(self.path)
-        self._variables = {variable.name: variable for variable in self._description.modelVariables}
-        self._check_variables()
-        self._check_period(period)
-        self._cleanup = contextlib.ExitStack()
-        self._closed = False
+        if not isinstance(binding, Binding):
+            binding = OWN_BINDING if binding is None else load_binding(binding)
+        self.description = FmuDescription(self.path)
+        self.bound = bind(binding, self.description)
+        self._check_period(period, binding.step)
+        self._kept: list[NDArray[Any]] = []
+        starts = {**parameters, **binding.start}
+        values = [self._values(name, value) for name, value in starts.items()]
+        values += [self._values(each.name, each.value, spread=True) for each in settings if each.at is None]
+        changes = sorted((each for each in settings if each.at is not None), key=lambda each: each.at or 0.0)
+        self._check_changes(changes)
+        self._instance = FmuInstance(self.description)
         try:
-            self._fmu = self._load()
-            self._initialize(parameters)
+            self._prepare_calls(binding.step)
+            for each in changes:
+                self._add_change(each)
+            for variable, numbers in values:
+                self._instance.set(variable, numbers)
+            self._instance.initialize()
         except BaseException:
-            self._cleanup.close()
+            self._instance.close()
             raise
 
     def __enter__(self) -> "FmuPlant":
@@ -104,46 +167,42 @@ class FmuPlant:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
 
+    @property
+    def folder(self) -> Path:
+        """Where the FMU has been extracted to."""
+        return self._instance.folder
+
+    @property
+    def messages(self) -> Sequence[str]:
+        """What the FMU has logged of late, but for what says that all is well."""
+        return self._instance.messages
+
     def close(self) -> None:
         """Free the instance and remove what was extracted; closing twice does no harm."""
-        self._closed = True
-        self._cleanup.close()
+        self._instance.broken = self._instance.broken or self.calls["status"] == FATAL
+        self._instance.close()
 
-    def get(self, name: str) -> Array:
-        """The value of a Float64 variable, in its own shape.
+    def get(self, name: str) -> NDArray[Any]:
+        """The value of a number, in its own shape.
 
         Raises:
             UnknownNameError: the FMU has no such variable.
+            InputError: it is no number.
             FmuError: the FMU refuses.
         """
-        variable = self._known(name)
-        values = np.zeros(_size_of(variable))
-        reference = np.array([variable.valueReference], np.uint32)
-        self._call("fmi3GetFloat64", _pointer(reference, ctypes.c_uint32), 1, _pointer(values, ctypes.c_double), values.size)
-        return values.reshape([int(dimension.start) for dimension in variable.dimensions])
+        self._instance.check_open()
+        return self._instance.get(self.description[name])
 
     def set(self, name: str, value: ArrayLike) -> None:
-        """Set a Float64 or enumeration variable.
+        """Set a number.
 
         Raises:
             UnknownNameError: the FMU has no such variable.
-            InputError: the value has the wrong number of elements.
+            InputError: the value has the wrong number of elements, or is none for this variable.
             FmuError: the FMU refuses.
         """
-        variable = self._known(name)
-        discrete = variable.type == "Enumeration"
-        try:
-            numbers = np.array(value, np.float64).reshape(-1)
-        except (TypeError, ValueError):
-            raise InputError(f"{name} of {self.path.name} must be numbers, got {value!r}") from None
-        values = numbers.astype(np.int64) if discrete else numbers
-        if discrete and (values != numbers).any():
-            raise InputError(f"{name} of {self.path.name} must be whole numbers, got {value!r}")
-        if values.size != _size_of(variable):
-            raise InputError(f"{name} of {self.path.name} has {_size_of(variable)} elements, got {values.size}")
-        reference = np.array([variable.valueReference], np.uint32)
-        function, c_type = ("fmi3SetInt64", ctypes.c_int64) if discrete else ("fmi3SetFloat64", ctypes.c_double)
-        self._call(function, _pointer(reference, ctypes.c_uint32), 1, _pointer(values, c_type), values.size)
+        self._instance.check_open()
+        self._instance.set(*self._values(name, value))
 
     def step(self, duration: float) -> None:
         """Advance by `duration` [s].
@@ -151,154 +210,143 @@ class FmuPlant:
         Raises:
             FmuError: the FMU reports a failure.
         """
-        self._check_open()
+        self._instance.check_open()
+        self.calls["status"] = OK
         if advance(self.calls, duration):
-            raise self.failure("a step failed")
+            raise self.failure()
 
-    def failure(self, what: str) -> FmuError:
-        """The error that says what went wrong in the FMU's own words."""
-        return FmuError(f"{self.path.name}: {what}: {self.messages[-1] if self.messages else 'the FMU gives no reason'}")
+    def state(self) -> bytes:
+        """All that the plant's future depends on, its clock included.
 
-    def _check_open(self) -> None:
-        if self._closed:
-            raise FmuError(f"{self.path.name} has been closed: load it again")
+        Raises:
+            FmuError: the FMU cannot save its state.
+        """
+        return struct.pack(_CLOCK, self.calls["time"], self.calls["changed"]) + self._instance.state()
 
-    def _known(self, name: str) -> Any:
-        self._check_open()
-        try:
-            return self._variables[name]
-        except KeyError:
-            raise UnknownNameError(f"{self.path.name} has no variable {name!r}") from None
+    def restore(self, state: bytes) -> None:
+        """Go back to a state of this plant, or of another with the same FMU and settings.
 
-    def _check_variables(self) -> None:
-        problems = []
-        for name in _REQUIRED:
-            expected = BY_NAME[name]
-            if name not in self._variables:
-                problems.append(f"lacks {name}{list(expected.shape)}")
-                continue
-            actual = self._variables[name]
-            shape = tuple(int(dimension.start or 0) for dimension in actual.dimensions)
-            if shape != expected.shape or actual.type != _type_of(expected) or actual.causality != expected.causality:
-                problems.append(
-                    f"has {name} as {actual.causality} {actual.type}{list(shape)} instead of "
-                    f"{expected.causality} {_type_of(expected)}{list(expected.shape)}"
-                )
-        if problems:
-            raise FmuError(f"{self.path.name} {'; '.join(problems)}")
+        Raises:
+            FmuError: the FMU cannot, or this is no state of it.
+        """
+        size = struct.calcsize(_CLOCK)
+        if len(state) < size:
+            raise FmuError(f"{self.path.name} cannot restore a state of {len(state)} bytes, for it is none of this plant")
+        self._instance.restore(state[size:])
+        self.calls["time"], self.calls["changed"] = struct.unpack(_CLOCK, state[:size])
 
-    def _check_period(self, period: float) -> None:
+    def failure(self) -> FmuError:
+        """The error that says what went wrong in the compiled calls, in the FMU's own words."""
+        return self._instance.failure(_CALLED[int(self.calls["call"])], int(self.calls["status"]))
+
+    def _values(self, name: str, value: ArrayLike, spread: bool = False) -> tuple[FmuVariable, NDArray[Any]]:
+        variable = self.description[name]
+        return variable, variable.values(value, self.path.name, spread)
+
+    def _check_period(self, period: float, step: float | None) -> None:
         if not 0.0 < period < inf:
             raise InputError(f"{self.path.name} cannot take a step of {period:g} s; it must be positive and finite")
-        co_simulation = self._description.coSimulation
+        if step is not None and not _is_multiple(period, step):
+            raise InputError(
+                f"{self.path.name} cannot take a rate of {1 / period:g} Hz: its binding sets a step of {step:g} s, so the rate "
+                f"must be {1 / step:g} Hz divided by a whole number"
+            )
+        co_simulation, experiment = self.description.co_simulation, self.description.experiment
         if co_simulation.canHandleVariableCommunicationStepSize:
             return
-        experiment = self._description.defaultExperiment
-        step = co_simulation.fixedInternalStepSize or (experiment.stepSize if experiment else None)
-        if step is None:
+        fixed = co_simulation.fixedInternalStepSize or (experiment.stepSize if experiment else None)
+        if fixed is None or _is_multiple(step or period, float(fixed)):
             return
-        multiple = period / float(step)
-        if round(multiple) < 1 or abs(multiple - round(multiple)) > 1e-6:
+        if step is not None:
             raise InputError(
-                f"{self.path.name} cannot take a rate of {1 / period:g} Hz: its step is fixed at {float(step):g} s, so the "
-                f"rate must be {1 / float(step):g} Hz divided by a whole number"
+                f"{self.path.name} cannot take a step of {step:g} s: its own is fixed at {float(fixed):g} s; set [fmu] step to "
+                "that, or to a multiple"
             )
+        raise InputError(
+            f"{self.path.name} cannot take a rate of {1 / period:g} Hz: its step is fixed at {float(fixed):g} s, so the "
+            f"rate must be {1 / float(fixed):g} Hz divided by a whole number"
+        )
 
-    def _load(self) -> Any:
-        folder = self._cleanup.enter_context(tempfile.TemporaryDirectory(prefix="gough-fmu-"))
-        self.folder = Path(folder)
-        identifier = self._description.coSimulation.modelIdentifier
-        library = Path(folder) / "binaries" / fmpy.platform_tuple / f"{identifier}{fmpy.sharedLibraryExtension}"
-        try:
-            with zipfile.ZipFile(self.path) as archive:
-                for member in archive.namelist():
-                    if not member.startswith(("sources/", "documentation/")):
-                        archive.extract(member, folder)
-        except (zipfile.BadZipFile, zlib.error, OSError) as error:
-            raise FmuError(f"{self.path.name} is not a usable FMU: {error}") from None
-        if not library.is_file():
-            raise FmuError(f"{self.path.name} holds no binary for {fmpy.platform_tuple}: build it for this machine")
-        try:
-            # FMPy stays in the library's folder when it cannot load it.
-            with contextlib.chdir("."):
-                fmu = fmpy.fmi3.FMU3Slave(
-                    guid=self._description.guid, unzipDirectory=folder, modelIdentifier=identifier, instanceName="plant"
+    def _check_changes(self, changes: Sequence[Setting]) -> None:
+        if len(changes) > MOST_CHANGES:
+            raise InputError(f"{len(changes)} settings change during the run, and at most {MOST_CHANGES} can")
+        for each in changes:
+            variable, values = self._values(each.name, each.value, spread=True)
+            if not variable.tunable:
+                raise InputError(
+                    f"{each.name} of {self.path.name} cannot change during the run, for it is neither an input nor a tunable "
+                    "parameter: set it without @"
                 )
-            fmu.instantiate(loggingOn=True, logMessage=self._log)
-        except Exception as error:
-            reason = self.messages[-1] if self.messages else error
-            raise FmuError(f"{self.path.name} cannot be loaded: {reason}") from None
-        self._cleanup.callback(fmu.freeInstance)
-        return fmu
+            if each.name in self.bound.driven:
+                raise InputError(f"{each.name} of {self.path.name} is set by the loop, and cannot be set besides")
+            if (values < variable.minimum).any() or (values > variable.maximum).any():
+                raise InputError(
+                    f"{each.name} of {self.path.name} is to be {','.join(f'{value:g}' for value in values)}; it must be from "
+                    f"{variable.minimum:g} to {variable.maximum:g}"
+                )
 
-    def _initialize(self, parameters: Mapping[str, ArrayLike]) -> None:
+    def _add_change(self, setting: Setting) -> None:
+        variable, values = self._values(setting.name, setting.value, spread=True)
+        references = np.array(variable.references, np.uint32)
+        self._kept += [references, values]
+        change = self.calls["changes"][self.calls["change_count"]]
+        change["time"], change["function"] = setting.at, self._instance.address(f"Set{variable.ending}")
+        change["references"], change["reference_count"] = references.ctypes.data, references.size
+        change["values"], change["count"] = values.ctypes.data, values.size
+        self.calls["change_count"] += 1
+
+    def _prepare_calls(self, step: float | None) -> None:
+        calls, bound, instance = self.calls, self.bound, self._instance
+        real = "Real" if self.description.version == 2 else "Float64"
+        calls["version"], calls["instance"] = self.description.version, instance.component()
+        calls["get"], calls["set"], calls["do_step"] = (
+            instance.address(each) for each in (f"Get{real}", f"Set{real}", "DoStep")
+        )  # fmt: skip
+        calls["step"] = step or 0.0
+        for group in ("sensed", "known", "commanded", "loaded"):
+            _fill(calls[group], getattr(bound, group))
+        if bound.modes.variable is not None:
+            self._prepare_modes(bound.modes, bound.modes.variable)
+        calls["imu"], calls["truth"] = np.nan, np.nan
+        calls["legs"], calls["planar_angle"] = bound.legs, bound.planar_angle
+        if bound.knows_pose and bound.legs < LEGS:
+            calls["truth"][2] = 0.0
+
+    def _prepare_modes(self, modes: Modes, variable: FmuVariable) -> None:
         calls = self.calls
-        calls["instance"] = self._fmu.component if isinstance(self._fmu.component, int) else self._fmu.component.value
-        for field, function in (
-            ("get", "fmi3GetFloat64"),
-            ("set", "fmi3SetFloat64"),
-            ("set_enumeration", "fmi3SetInt64"),
-            ("step", "fmi3DoStep"),
-        ):
-            calls[field] = ctypes.cast(getattr(self._fmu.dll, function), ctypes.c_void_p).value
-        calls["imu_references"] = [self._variables[name].valueReference for name in _IMU_OUTPUTS]
-        calls["truth_references"] = [self._variables[name].valueReference for name in _TRUTH_OUTPUTS]
-        calls["command_reference"] = self._variables["velocity_command"].valueReference
-        calls["mode_reference"] = self._variables["drive_mode"].valueReference
-        if "payload.mass" in self._variables:
-            calls["payload_reference"] = self._variables["payload.mass"].valueReference
-        for name, value in parameters.items():
-            self.set(name, value)
-        try:
-            self._fmu.enterInitializationMode(startTime=0.0)
-            self._fmu.exitInitializationMode()
-        except fmpy.fmi1.FMICallException:
-            raise self.failure("initialisation failed") from None
-
-    def _call(self, function: str, *arguments: Any) -> None:
-        try:
-            getattr(self._fmu, function)(self._fmu.component, *arguments)
-        except fmpy.fmi1.FMICallException:
-            raise self.failure(f"{function} failed") from None
-
-    def _log(self, environment: object, status: int, category: bytes, message: bytes) -> None:
-        del environment, category
-        if status:
-            self.messages.append(message.decode("utf-8", "replace"))
+        count = 1 if modes.common else self.bound.legs
+        calls["set_mode"] = self._instance.address(f"Set{variable.ending}")
+        calls["mode_references"][: modes.references.size] = modes.references
+        calls["mode_count"], calls["mode_bytes"] = count, variable.dtype.itemsize
+        calls["mode_reference_count"] = modes.references.size
+        for mode, value in enumerate(modes.values.astype(variable.dtype)):
+            calls["mode_values"][mode] = int.from_bytes(value.tobytes(), "little")
 
 
-def _read_description(path: Path) -> Any:
-    try:
-        description = fmpy.read_model_description(str(path), validate=True)
-    except FileNotFoundError:
-        raise FmuError(f"there is no FMU at {path}") from None
-    except Exception as error:
-        reason = " ".join(str(error).split())
-        raise FmuError(f"{path} is not a usable FMU: {reason}") from None
-    if not str(description.fmiVersion).startswith("3.") or description.coSimulation is None:
-        raise FmuError(f"{path.name} is not an FMI 3.0 Co-Simulation FMU (it declares FMI {description.fmiVersion})")
-    return description
+_CLOCK = "<dq"
 
 
-def _type_of(variable: Variable) -> str:
-    return "Enumeration" if variable.discrete else "Float64"
+def _is_multiple(duration: float, step: float) -> bool:
+    multiple = duration / step
+    return round(multiple) >= 1 and abs(multiple - round(multiple)) <= 1e-6
 
 
-def _size_of(variable: Any) -> int:
-    return int(np.prod([int(dimension.start) for dimension in variable.dimensions], dtype=int))
-
-
-def _pointer(array: NDArray[Any], c_type: Any) -> Any:
-    return array.ctypes.data_as(ctypes.POINTER(c_type))
+def _fill(record: Record, scalars: Scalars) -> None:
+    count = scalars.places.size
+    record["references"][: scalars.references.size] = scalars.references
+    record["reference_count"], record["count"] = scalars.references.size, count
+    record["places"][:count], record["factors"][:count], record["offsets"][:count] = (
+        scalars.places, scalars.factors, scalars.offsets,
+    )  # fmt: skip
 
 
 def _calling(arguments: str) -> Any:
     """An intrinsic that calls the C function at an address with a tuple of arguments and returns its int.
 
-    `arguments` has one letter each: p for a pointer or size (intp), d for a double, b for a bool.
+    `arguments` has one letter each: p for a pointer or size (intp), d for a double, b for a bool, i for an int.
     """
-    llvm = {"p": ir.IntType(64), "d": ir.DoubleType(), "b": ir.IntType(1)}
-    numba_types = {"p": types.intp, "d": types.float64, "b": types.boolean}
+    llvm = {"p": ir.IntType(64), "d": ir.DoubleType(), "b": ir.IntType(1), "i": ir.IntType(32)}
+    numba_types = {"p": types.intp, "d": types.float64, "b": types.boolean, "i": types.int32}
     tuple_of: Any = types.Tuple
 
     @intrinsic
@@ -319,62 +367,162 @@ def _calling(arguments: str) -> Any:
     return call
 
 
-_access: Callable[..., int] = _calling("ppppp")
-_do_step: Callable[..., int] = _calling("pddbpppp")
+_access_2: Callable[..., int] = _calling("pppp")
+_access_3: Callable[..., int] = _calling("ppppp")
+_do_step_2: Callable[..., int] = _calling("pddi")
+_do_step_3: Callable[..., int] = _calling("pddbpppp")
+
+
+@kernel
+def _ended(c: Record, call: int, status: int) -> int:
+    """Take note of the first call that goes wrong; returns its status."""
+    if status != OK and c.status == OK:
+        c.status, c.call = status, call
+    return status
+
+
+@kernel
+def _access(c: Record, call: int, function: int, references: int, reference_count: int, values: int, count: int) -> int:
+    """Get or set values, unless the FMU has failed for good; returns FMI's status."""
+    if c.status == FATAL:
+        return FATAL
+    if c.version == 2:
+        status = _access_2(function, (c.instance, references, reference_count, values))
+    else:
+        status = _access_3(function, (c.instance, references, reference_count, values, count))
+    return _ended(c, call, status)
+
+
+@kernel
+def _read(c: Record, call: int, scalars: Record, into: Array) -> int:
+    """Read scalars, each to its place."""
+    if scalars.count == 0:
+        return OK
+    raw, references = scalars.raw, scalars.references
+    status = _access(c, call, c.get, references.ctypes.data, scalars.reference_count, raw.ctypes.data, scalars.count)
+    places, factors, offsets = scalars.places, scalars.factors, scalars.offsets
+    for i in range(scalars.count):
+        into[places[i]] = factors[i] * raw[i] + offsets[i]
+    return status
+
+
+@kernel
+def _write(c: Record, call: int, scalars: Record, values: Array) -> int:
+    """Write scalars, each from its place."""
+    if scalars.count == 0:
+        return OK
+    raw, references = scalars.raw, scalars.references
+    places, factors, offsets = scalars.places, scalars.factors, scalars.offsets
+    for i in range(scalars.count):
+        raw[i] = (values[places[i]] - offsets[i]) / factors[i]
+    return _access(c, call, c.set, references.ctypes.data, scalars.reference_count, raw.ctypes.data, scalars.count)
 
 
 @kernel
 def read_imus(calls: Record) -> int:
     """Read the ideal IMU signals into `imu`; returns FMI's status, 0 when all is well."""
     c = calls[()]
-    return _access(c.get, (c.instance, c.imu_references.ctypes.data, c.imu_references.size, c.imu.ctypes.data, c.imu.size))
+    return _read(c, _READING, c.sensed, c.imu.reshape(-1))
 
 
 @kernel
 def read_truth(calls: Record) -> int:
-    """Read pose, lengths and currents into `truth`; returns FMI's status."""
+    """Read pose, lengths and currents into `truth`, as far as the FMU tells them; returns FMI's status."""
     c = calls[()]
-    return _access(
-        c.get, (c.instance, c.truth_references.ctypes.data, c.truth_references.size, c.truth.ctypes.data, c.truth.size)
-    )
+    truth = c.truth
+    status = _read(c, _TELLING, c.known, truth)
+    if c.planar_angle != 0:
+        half = 0.5 * truth[3]
+        truth[3], truth[4], truth[5], truth[6] = np.cos(half), 0.0, 0.0, np.sin(half)
+    return status
 
 
 @kernel
 def write_command(calls: Record, command: Array) -> int:
-    """Set the velocity commands (6,) [m/s]; returns FMI's status."""
+    """Set the velocity commands (6,) or (3,) [m/s]; returns FMI's status.
+
+    Where the drives have no modes, those that are not to move are told to stand.
+    """
     c = calls[()]
-    return _access(c.set, (c.instance, c.command_reference.ctypes.data, 1, command.ctypes.data, command.size))
+    sent = c.command
+    for k in range(c.legs):
+        sent[k] = command[k] if c.mode_count > 0 or c.mode[k] == VELOCITY else 0.0
+    return _write(c, _COMMANDING, c.commanded, sent)
 
 
 @kernel
 def write_drive_mode(calls: Record, mode: int) -> int:
-    """Set the mode of all six drives; returns FMI's status."""
+    """Set the mode of all drives; returns FMI's status."""
     calls[()].mode[:] = mode
     return write_drive_modes(calls)
 
 
 @kernel
 def write_drive_modes(calls: Record) -> int:
-    """Set the modes of the drives to those in `mode`; returns FMI's status."""
+    """Set the modes of the drives to those in `mode`; returns FMI's status.
+
+    A switch that the drives have in common is on while any of them is to move.
+    """
     c = calls[()]
-    return _access(c.set_enumeration, (c.instance, c.mode_reference.ctypes.data, 1, c.mode.ctypes.data, c.mode.size))
+    if c.mode_count == 0:
+        return write_command(calls, c.command)
+    raw = c.mode_raw
+    raw[:] = 0
+    for k in range(c.mode_count):
+        mode = c.mode[k]
+        if c.mode_count == 1:
+            for other in range(c.legs):
+                mode = max(mode, c.mode[other])
+        at = k * c.mode_bytes
+        raw[at >> 3] |= c.mode_values[mode] << np.uint64(8 * (at & 7))
+    references = c.mode_references
+    return _access(
+        c, _SWITCHING, c.set_mode, references.ctypes.data, c.mode_reference_count, raw.ctypes.data, c.mode_count
+    )  # fmt: skip
 
 
 @kernel
 def write_payload_mass(calls: Record, mass: float) -> int:
     """Set the mass of the payload [kg], if the plant has one; returns FMI's status."""
     c = calls[()]
-    if c.payload_reference[0] == 0:
-        return 0
     c.payload[0] = mass
-    return _access(c.set, (c.instance, c.payload_reference.ctypes.data, 1, c.payload.ctypes.data, 1))
+    return _write(c, _LOADING, c.loaded, c.payload)
 
 
 @kernel
 def advance(calls: Record, duration: float) -> int:
-    """Step the FMU by `duration` [s]; returns FMI's status."""
+    """Step the FMU by `duration` [s], in communication steps of its own if it has one; returns FMI's status."""
     c = calls[()]
-    flags = c.flags.ctypes.data
-    status = _do_step(c.step, (c.instance, c.time, duration, True, flags, flags + 1, flags + 2, c.reached.ctypes.data))
-    c.time += duration
+    steps = 1 if c.step == 0.0 else max(int(np.rint(duration / c.step)), 1)
+    status = OK
+    for _ in range(steps):
+        while c.changed < c.change_count and c.changes[c.changed].time <= c.time + _INSTANT_S:
+            change = c.changes[c.changed]
+            status |= _access(
+                c, _CHANGING, change.function, change.references, change.reference_count, change.values, change.count
+            )  # fmt: skip
+            c.changed += 1
+        status |= _step(c, duration / steps)
     return status
+
+
+_INSTANT_S = 1e-9
+"""What is due within this time is due now [s]."""
+
+
+@kernel
+def _step(c: Record, step: float) -> int:
+    if c.status == FATAL:
+        return FATAL
+    if c.version == 2:
+        status = _do_step_2(c.do_step, (c.instance, c.time, step, np.int32(1)))
+    else:
+        flags = c.flags
+        at = flags.ctypes.data
+        status = _do_step_3(c.do_step, (c.instance, c.time, step, True, at, at + 1, at + 2, c.reached.ctypes.data))
+        if status == OK and flags[1] != 0:
+            status = ASKS_TO_END
+        elif status == OK and (flags[0] != 0 or flags[2] != 0):
+            status = NEEDS_EVENTS
+    c.time += step
+    return _ended(c, _STEPPING, status)

@@ -52,7 +52,9 @@ def add_calibrate(commands: Any) -> None:
     _add_calibrate_magnetometer(actions)
 
 
-_RIG_SIMULATED = {"mechanism": "hexapod", "rate": 1000.0, "imu": "mpu9150", "seed": 0, "joint_error": 0.0, "plant": None}
+_RIG_SIMULATED = {
+    "mechanism": "hexapod", "rate": 1000.0, "imu": "mpu9150", "seed": 0, "joint_error": 0.0, "plant": None, "binding": None,
+}  # fmt: skip
 """Options of the rig that is driven, with their defaults."""
 
 
@@ -73,7 +75,7 @@ def _calibrate_rig(options: argparse.Namespace) -> int:
             raise InputError(f"the recordings say what {names} would: leave it out with --recording")
     prior = Prior(tilt=radians(options.tilt), joints=1e-3 * options.joints)
     knowledge = Knowledge(prior, options.home, options.lengths, options.known_poses)
-    config = simulation_config(options, "mechanism", "rate", "imu", "seed", "plant")
+    config = simulation_config(options, "mechanism", "rate", "imu", "seed", "plant", "binding")
     with progress_bar(
         "recorded IMUs are calibrated" if options.recording else f"{config.mechanism} calibrates its IMUs"
     ) as progress:

@@ -24,8 +24,11 @@ def add_calibration(command: argparse.ArgumentParser) -> None:
 
 
 def add_plant(command: argparse.ArgumentParser) -> None:
-    """Add the FMU that is used."""
-    command.add_argument("--plant", metavar="FILE.fmu", help="FMI 3.0 Co-Simulation FMU to use instead of the built one")
+    """Add the FMU that is used, and its binding."""
+    command.add_argument("--plant", metavar="FILE.fmu", help="Co-Simulation FMU (FMI 2.0 or 3.0) instead of the built one")
+    command.add_argument(
+        "--binding", metavar="FILE.toml", help="which of its variables are which, where they have not gough's names (docs/fmu.md)"
+    )  # fmt: skip
 
 
 def add_joint_error(command: argparse.ArgumentParser) -> None:
@@ -64,8 +67,12 @@ def simulation_config(options: argparse.Namespace, *names: str) -> "SimulationCo
     """Return the simulation that the options of these names and `--joint-error` describe.
 
     Raises:
-        InputError: an option is out of its range.
+        InputError: an option is out of its range, or no setting.
     """
     from hil.simulation import SimulationConfig
+    from plant.binding import Setting
 
-    return SimulationConfig(**chosen(options, *names), joint_error=1e-3 * options.joint_error)
+    values = chosen(options, *names)
+    if "settings" in values:
+        values["settings"] = tuple(map(Setting.parse, values["settings"]))
+    return SimulationConfig(**values, joint_error=1e-3 * options.joint_error)

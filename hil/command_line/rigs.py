@@ -115,7 +115,7 @@ def _emulate(options: argparse.Namespace) -> int:
     keep_to_one_thread()
     from hil.emulator import EmulatorConfig, emulate
 
-    simulated = simulation_config(options, "mechanism", "target", "imu", "seed", "plant", "rate")
+    simulated = simulation_config(options, "mechanism", "target", "imu", "seed", "plant", "binding", "rate")
     config = EmulatorConfig(
         simulated, options.bus, options.at, options.control, tuple(options.fault), 1e-3 * options.watchdog
     )  # fmt: skip

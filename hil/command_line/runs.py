@@ -57,10 +57,29 @@ def _add_motion(command: argparse.ArgumentParser) -> None:
         "platform's IMU with --magnetometer, the position from the legs; filterpy: as compiled, but on filterpy (slow)",
     )
     add_plant(command)
+    command.add_argument(
+        "--set", dest="settings", action="append", default=[], metavar="NAME=VALUE[@SECONDS]",
+        help="a parameter or input of the FMU, from the start or from a time of the motion on, such as payload.mass=12@3.5 or "
+        "gravity=0,0,-9.8; can be given several times",
+    )  # fmt: skip
     add_joint_error(command)
 
 
-_MOTION = ("mechanism", "target", "duration", "rate", "imu", "seed", "fusion", "calibration", "plant", "imus", "magnetometer")
+_MOTION = (
+    "mechanism",
+    "target",
+    "duration",
+    "rate",
+    "imu",
+    "seed",
+    "fusion",
+    "calibration",
+    "plant",
+    "binding",
+    "settings",
+    "imus",
+    "magnetometer",
+)
 """What `_add_motion` adds, beside the joints' error."""
 
 
@@ -99,12 +118,14 @@ def _simulate(options: argparse.Namespace) -> int:
 
 def _print_simulation(summary: dict[str, Any]) -> None:
     table = new_table("", "position RMS [mm]", "max [mm]", "rotation RMS [deg]", "max [deg]")
-    for label, group, prefix in (
-        ("estimate - truth", "estimation", ""),
-        ("truth - reference", "tracking", ""),
-        ("truth - target", "target", ""),
-        ("reference - target", "target", "reference_"),
-    ):
+    rows = [("estimate - reference", "estimated_tracking", ""), ("reference - target", "target", "reference_")]
+    if summary["truth_known"]:
+        rows[:1] = [
+            ("estimate - truth", "estimation", ""),
+            ("truth - reference", "tracking", ""),
+            ("truth - target", "target", ""),
+        ]
+    for label, group, prefix in rows:
         errors = summary[group]
         table.add_row(
             label,
@@ -112,6 +133,8 @@ def _print_simulation(summary: dict[str, Any]) -> None:
             *(deg(errors[f"{prefix}rotation_{kind}"], 4) for kind in ("rms", "max")),
         )
     print_table(table)
+    if not summary["truth_known"]:
+        print("the truth is not known: the plant does not tell its pose")
     cycle = summary["cycle_us"]
     print(
         f"limits violated by the reference: {summary['limits']['violations']}; "

@@ -13,7 +13,6 @@ from hil.rigs.canopen_settings import CanopenSettings
 from hil.rigs.emulated import EMULATED, move, sample
 from hil.rigs.faults import disturb
 from plant.compiled import Record
-from plant.errors import FmuError
 from plant.fmu import FmuPlant
 
 _HELD_BACK_S = 0.002
@@ -69,7 +68,7 @@ class PlantMachine:
 
     def _check(self, status: int) -> None:
         if status:
-            raise FmuError(str(self._plant.failure("the plant failed")))
+            raise self._plant.failure()
 
 
 class FaultyChannel:

@@ -12,11 +12,10 @@ from typing import Any
 import fmpy
 import numpy as np
 import pytest
-from fmpy.fmi1 import FMICallException
 from fmpy.validation import validate_fmu
 
 from plant import export
-from plant.errors import ToolchainError
+from plant.errors import FmuError, ToolchainError
 from plant.export import build, build_in_subprocess, default_fmu
 from plant.fmu import FmuPlant
 from plant.mechanism import Mechanism
@@ -256,43 +255,33 @@ def move(plant: FmuPlant, cycles: range) -> Array:
 def test_a_restored_state_goes_on_bit_for_bit(make_plant: MakePlant) -> None:
     plant = make_plant({"payload.mass": 4.0})
     move(plant, range(45))
-    saved, time = plant._fmu.getFMUState(), float(plant.calls["time"])
+    saved, time = plant.state(), float(plant.calls["time"])
     first = move(plant, range(45, 145))
     plant.set("payload.mass", 8.0)
     move(plant, range(145, 150))
-    plant._fmu.setFMUState(saved)
-    plant.calls["time"] = time
-    assert plant.get("time") == time
+    plant.restore(saved)
+    assert plant.get("time") == plant.calls["time"] == time
     assert plant.get("payload.mass") == 4.0
     np.testing.assert_array_equal(move(plant, range(45, 145)), first)
-    plant._fmu.freeFMUState(saved)
 
 
-def test_a_serialised_state_goes_on_in_another_instance(make_plant: MakePlant) -> None:
+def test_a_state_goes_on_in_another_instance(make_plant: MakePlant) -> None:
     plant = make_plant({"payload.mass": 4.0, "brake.force": 1200.0})
     move(plant, range(45))
-    saved = plant._fmu.getFMUState()
-    serialized = plant._fmu.serializeFMUState(saved)
+    saved = plant.state()
     first = move(plant, range(45, 145))
     other = make_plant()
-    state = other._fmu.deserializeFMUState(serialized)
-    other._fmu.setFMUState(state)
-    other.calls["time"] = other.get("time")
+    other.restore(saved)
     assert other.get("brake.force") == 1200.0
     np.testing.assert_array_equal(move(other, range(45, 145)), first)
-    for instance, kept in ((plant, saved), (other, state)):
-        instance._fmu.freeFMUState(kept)
 
 
 def test_a_state_of_another_build_is_refused(make_plant: MakePlant) -> None:
     plant = make_plant()
-    saved = plant._fmu.getFMUState()
-    serialized = plant._fmu.serializeFMUState(saved)
-    plant._fmu.freeFMUState(saved)
+    clock, saved = plant.state()[:16], plant.state()[16:]
     for broken, message in (
-        (bytes([serialized[0] ^ 1]) + serialized[1:], "from another build of this FMU"),
-        (serialized[:-1], "wrong size"),
+        (bytes([saved[0] ^ 1]) + saved[1:], "from another build of this FMU"),
+        (saved[:-1], "wrong size"),
     ):
-        with pytest.raises(FMICallException):
-            plant._fmu.deserializeFMUState(broken)
-        assert message in plant.messages[-1]
+        with pytest.raises(FmuError, match=f"gough_plant.fmu: restoring a state failed: .*{message}"):
+            plant.restore(clock + broken)
