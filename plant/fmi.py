@@ -11,12 +11,13 @@ import re
 import zipfile
 import zlib
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from math import prod
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import fmpy
 import fmpy.fmi2
@@ -26,6 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from plant.errors import FmuError, InputError, UnknownNameError
 from plant.files import temporary_folder
+from plant.pose import Array
 
 _FLOAT, _INTEGER = np.dtype(np.float64), np.dtype(np.int32)
 _SIZED = [f"{sign}{bits}" for sign in ("Int", "UInt") for bits in (8, 16, 32, 64)]
@@ -95,6 +97,11 @@ class FmuVariable:
         return prod(self.shape)
 
     @property
+    def element_names(self) -> list[str]:
+        """The names of its scalars, counted from 1 and row by row as in FMI 2.0."""
+        return element_names(self.name, self.shape)
+
+    @property
     def real(self) -> bool:
         """Whether its values are double-precision numbers."""
         return self.dtype == _FLOAT and bool(self.ending)
@@ -135,6 +142,15 @@ class FmuVariable:
         return numbers.astype(self.dtype)
 
 
+def element_names(name: str, shape: tuple[int, ...]) -> list[str]:
+    """The names of an array's elements in FMI 2.0, row by row and counted from 1; of a scalar its own name."""
+    if not shape:
+        return [name]
+    name, closing = (name[:-1], ")") if name.startswith("der(") else (name, "")
+    indices = itertools.product(*(range(1, n + 1) for n in shape))
+    return [f"{name}[{','.join(str(i) for i in index)}]{closing}" for index in indices]
+
+
 class FmuDescription:
     """What an FMU says of itself, checked.
 
@@ -144,7 +160,9 @@ class FmuDescription:
     Attributes:
         version: 2 or 3.
         co_simulation, experiment: FMPy's descriptions; `experiment` may be None.
+        abilities: in Co-Simulation, by FMI's names.
         token: that goes with the binary.
+        states: each continuous state that it shows, and the derivative of that.
 
     Raises:
         FmuError: the file is no FMU, or of another kind.
@@ -166,8 +184,19 @@ class FmuDescription:
         self.co_simulation, self.experiment, self.token, self.tool = (
             read.coSimulation, read.defaultExperiment, read.guid, read.generationTool,
         )  # fmt: skip
+        with zipfile.ZipFile(path) as archive:
+            # FMPy does not tell all of them for FMI 3.0.
+            element = ElementTree.fromstring(archive.read("modelDescription.xml")).find("CoSimulation")
+        self.abilities = frozenset(
+            name for name, value in ({} if element is None else element).items() if value in ("true", "1")
+        )
         self._variables = {each.name: self._variable(each) for each in read.modelVariables}
         self._elements: dict[str, dict[tuple[int, ...], FmuVariable]] = {}
+        self.states = tuple(
+            (self._variables[each.derivative.name], self._variables[each.name])
+            for each in read.modelVariables
+            if each.derivative
+        )
         for name, variable in self._variables.items():
             if variable.shape == () and (match := _ELEMENT.fullmatch(name)):
                 indices = tuple(int(index) for index in match[2].split(","))
@@ -185,6 +214,15 @@ class FmuDescription:
             return whole
         near = get_close_matches(name, [*self._variables, *self._elements], 1)
         raise UnknownNameError(f"{self.path.name} has no variable {name!r}{f'; did you mean {near[0]}?' if near else ''}")
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether it has directional derivatives."""
+        return not self.abilities.isdisjoint(("providesDirectionalDerivative", "providesDirectionalDerivatives"))
+
+    def __iter__(self) -> Iterator[FmuVariable]:
+        """All variables as they are listed."""
+        return iter(self._variables.values())
 
     def __contains__(self, name: str) -> bool:
         return name in self._variables or (name in self._elements and _assembled(name, self._elements[name]) is not None)
@@ -296,6 +334,33 @@ class FmuInstance:
             FmuError: the FMU refuses.
         """
         self._access("Set", variable, values)
+
+    def jacobian(self, unknowns: Sequence[FmuVariable], knowns: Sequence[FmuVariable]) -> Array:
+        """The partial derivatives (m, n) of the unknowns' m scalars by the knowns' n, from the FMU's directional derivatives.
+
+        Raises:
+            FmuError: the FMU has none, or not these.
+        """
+        self.check_open()
+        if not self.description.differentiable:
+            raise FmuError(f"{self.description.path.name} has no directional derivatives: export it with them")
+        rows, columns = sum(each.size for each in unknowns), sum(each.size for each in knowns)
+        jacobian, seed, product = np.zeros((rows, columns)), np.zeros(columns), np.zeros(rows)
+        function = self._function("GetDirectionalDerivative")
+        arguments: list[Any] = []
+        for side in (unknowns, knowns):
+            references = [reference for each in side for reference in each.references]
+            arguments += [(function.argtypes[1]._type_ * len(references))(*references), len(references)]
+        for vector in (seed, product):
+            arguments.append(vector.ctypes.data_as(ctypes.POINTER(ctypes.c_double)))
+            if self.description.version == 3:
+                arguments.append(vector.size)
+        for column in range(columns):
+            seed[:] = 0.0
+            seed[column] = 1.0
+            self._check(function(self.fmu.component, *arguments), "a directional derivative")
+            jacobian[:, column] = product
+        return jacobian
 
     def state(self) -> bytes:
         """The FMU's whole state.

@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 from types import TracebackType
@@ -104,6 +105,24 @@ CALLS = np.dtype(
 has its pose in space, with z = 0, and its first three legs. `step` is the communication step [s], 0 for that of each call;
 `status` is how the first call that went wrong has ended, and `call` which that was.
 """
+
+
+@dataclass(frozen=True, eq=False)
+class LinearPlant:
+    """A linear system `x' = A x + B u, y = C x + D u` of n states, m inputs and p outputs, all as differences.
+
+    Attributes:
+        a, b, c, d: (n, n), (n, m), (p, n), (p, m).
+        states, inputs, outputs: the names of the scalars.
+    """
+
+    a: Array
+    b: Array
+    c: Array
+    d: Array
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
 
 
 class FmuPlant:
@@ -214,6 +233,25 @@ class FmuPlant:
         self.calls["status"] = OK
         if advance(self.calls, duration):
             raise self.failure()
+
+    def linearize(self, inputs: Sequence[str], outputs: Sequence[str]) -> "LinearPlant":
+        """The plant's equations to first order about where it is, from the FMU's directional derivatives.
+
+        Args:
+            inputs, outputs: names of the variables between which the plant is wanted.
+
+        Raises:
+            UnknownNameError: the FMU has no such variable.
+            FmuError: the FMU has no directional derivatives, or shows no states.
+        """
+        states, rates = [state for state, _ in self.description.states], [rate for _, rate in self.description.states]
+        if not states:
+            raise FmuError(f"{self.path.name} shows no continuous states: export it with them")
+        u, y = [self.description[name] for name in inputs], [self.description[name] for name in outputs]
+        n = sum(each.size for each in states)
+        whole = self._instance.jacobian([*rates, *y], [*states, *u])
+        names = tuple(tuple(name for each in side for name in each.element_names) for side in (states, u, y))
+        return LinearPlant(whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:], *names)
 
     def state(self) -> bytes:
         """All that the plant's future depends on, its clock included.

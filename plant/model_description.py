@@ -8,9 +8,9 @@ is its place in the vector of all values (`Layout`).
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
 from xml.sax.saxutils import quoteattr
 
+from plant.fmi import element_names
 from plant.pose import Array
 from plant.variables import BRAKE, DRIVE_MODES, Variable, VariableTable
 
@@ -119,15 +119,6 @@ def start_of(variable: Variable, starts: Mapping[str, Array]) -> list[float]:
     if variable.causality == "parameter":
         return [float(value) for value in starts[variable.name].reshape(-1)]
     return [0.0] * variable.size
-
-
-def element_names(variable: Variable) -> list[str]:
-    """The names of a variable's elements in FMI 2.0, row by row and counted from 1; of a scalar its own name."""
-    if not variable.shape:
-        return [variable.name]
-    name, closing = (variable.name[:-1], ")") if variable.name.startswith("der(") else (variable.name, "")
-    indices = product(*(range(1, n + 1) for n in variable.shape))
-    return [f"{name}[{','.join(str(i) for i in index)}]{closing}" for index in indices]
 
 
 def build_description(identifier: str, sources: list[str]) -> str:
@@ -317,7 +308,9 @@ class _Fmi2(_Writer):
         tag = "Integer" if variable.discrete else "Real"
         starts = self.start(variable)
         initial = ' initial="calculated"' if self.calculated(variable) else ""
-        for i, (name, place) in enumerate(zip(element_names(variable), self.layout.places(variable), strict=True)):
+        for i, (name, place) in enumerate(
+            zip(element_names(variable.name, variable.shape), self.layout.places(variable), strict=True)
+        ):
             extra = f' start="{starts[i]}"' if starts else ""
             if self.layout.is_rate(variable):
                 extra += f' derivative="{self._index[self.layout.offsets[variable.name[4:-1]] + i]}"'

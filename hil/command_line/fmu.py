@@ -4,9 +4,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from hil.command_line.options import add_mechanism
-from hil.command_line.outputs import check_outputs
-from hil.command_line.printing import progress_bar
+from hil.command_line.options import add_json, add_mechanism
+from hil.command_line.outputs import check_outputs, write_json
+from hil.command_line.printing import new_table, print_table, progress_bar
+from plant.errors import GoughError
 
 
 def add_fmu(commands: Any) -> None:
@@ -30,6 +31,32 @@ def add_fmu(commands: Any) -> None:
         help="linux,windows,darwin: compiled by zig, 'pip install gough[cross]' (default: this machine's, by its C compiler)",
     )
     build.set_defaults(run=_build_fmu)
+    info = actions.add_parser(
+        "info",
+        help="what an FMU is, and its variables",
+        description="Tell what any FMU for Co-Simulation is, its variables, and whether the loop can use it as it is.",
+    )
+    validate = actions.add_parser(
+        "validate",
+        help="try whether an FMU keeps what it promises",
+        description="Validate the description of any FMU for Co-Simulation, load it, and try its steps, its saved states and "
+        "its derivatives. The exit status is 1 if something is wrong.",
+    )
+    linearize = actions.add_parser(
+        "linearize",
+        help="an FMU as a linear system",
+        description="Linearise a plant about its start, the drives following their commands, by its directional derivatives: "
+        "matrices of x' = A x + B u, y = C x + D u, and the poles.",
+    )
+    for action, run in ((info, _show), (validate, _validate), (linearize, _linearize)):
+        action.add_argument("file", type=Path, metavar="FILE.fmu", nargs="?" if action is linearize else None)
+        action.set_defaults(run=run)
+        add_json(action)
+    add_mechanism(linearize)
+    for side, default in (("inputs", "velocity_command"), ("outputs", "leg_length")):
+        linearize.add_argument(
+            f"--{side}", type=lambda text: text.split(","), default=[default], metavar="NAMES", help=f"default: {default}"
+        )
 
 
 def _build_fmu(options: argparse.Namespace) -> int:
@@ -44,4 +71,92 @@ def _build_fmu(options: argparse.Namespace) -> int:
     with progress_bar(f"compiling for {', '.join(options.platforms) or 'this machine'}"):
         build_in_subprocess(path, options.fmi, options.mechanism, options.platforms)
     print(path)
+    return 0
+
+
+def _show(options: argparse.Namespace) -> int:
+    from plant.binding import OWN_BINDING, bind
+    from plant.fmi import FmuDescription
+    from plant.fmu_check import platforms_of
+
+    description = FmuDescription(options.file)
+    try:
+        bind(OWN_BINDING, description)
+        fits = "runs in the loop as it is (gough simulate --plant)"
+    except GoughError:
+        fits = "runs in the loop with a binding (docs/fmu.md)"
+    facts = {
+        "file": str(options.file),
+        "FMI": f"{description.version}.0",
+        "made by": description.tool or "-",
+        "binaries for": ", ".join(platforms_of(options.file)) or "none",
+        "abilities": ", ".join(sorted(description.abilities)) or "none",
+        "states": str(sum(state.size for state, _ in description.states)),
+        "use": fits,
+    }
+    table = new_table("", "")
+    table.columns[1].justify = "left"
+    for fact in facts.items():
+        table.add_row(*fact)
+    print_table(table)
+    table = new_table("variable", "shape", "type", "unit", "what", "least", "greatest")
+    for each in description:
+        shape = "x".join(map(str, each.shape)) or "1"
+        kind = f"{each.variability} {each.causality}"
+        table.add_row(each.name, shape, each.type, each.unit or "-", kind, f"{each.minimum:g}", f"{each.maximum:g}")
+    print_table(table)
+    variables = [
+        {
+            "name": v.name,
+            "shape": v.shape,
+            "type": v.type,
+            "unit": v.unit,
+            "causality": v.causality,
+            "variability": v.variability,
+        }
+        for v in description
+    ]
+    write_json(options.json, facts | {"variables": variables})
+    return 0
+
+
+def _validate(options: argparse.Namespace) -> int:
+    from plant.fmu_check import check_fmu
+
+    with progress_bar(f"trying {options.file}"):
+        checks = check_fmu(options.file)
+    table = new_table("", "")
+    table.columns[1].justify = "left"
+    for check in checks:
+        table.add_row(check.name, "not promised" if check.problems is None else "; ".join(check.problems) or "ok")
+    print_table(table)
+    write_json(options.json, {"file": str(options.file), "checks": {check.name: check.problems for check in checks}})
+    return int(any(check.problems for check in checks))
+
+
+def _linearize(options: argparse.Namespace) -> int:
+    import numpy as np
+
+    from controller.linearization import state_space
+    from plant.export import default_fmu, model_of
+    from plant.fmu import FmuPlant, write_drive_mode
+    from plant.mechanism import load_mechanism
+    from plant.variables import VELOCITY
+
+    mechanism = load_mechanism(options.mechanism)
+    path = options.file or default_fmu(model_of(mechanism))
+    with FmuPlant(path, mechanism.plant_parameters(), 1e-3) as plant:
+        write_drive_mode(plant.calls, VELOCITY)
+        system = state_space(plant, options.inputs, options.outputs)
+    table = new_table("pole [1/s]", "frequency [Hz]", "damping")
+    poles = sorted(system.poles(), key=abs)
+    for pole in poles:
+        if pole.imag >= 0.0:
+            size = abs(pole)
+            table.add_row(f"{pole:.4g}", f"{size / (2.0 * np.pi):.4g}", f"{-pole.real / size:.3f}" if size > 0.0 else "-")
+    print_table(table)
+    print(f"{system.nstates} states, {system.ninputs} inputs, {system.noutputs} outputs")
+    matrices = {name: getattr(system, name).tolist() for name in "ABCD"}
+    names = {"states": system.state_labels, "inputs": system.input_labels, "outputs": system.output_labels}
+    write_json(options.json, matrices | names | {"poles": [[pole.real, pole.imag] for pole in poles]})
     return 0

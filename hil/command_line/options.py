@@ -27,7 +27,7 @@ def add_plant(command: argparse.ArgumentParser) -> None:
     """Add the FMU that is used, and its binding."""
     command.add_argument("--plant", metavar="FILE.fmu", help="Co-Simulation FMU (FMI 2.0 or 3.0) instead of the built one")
     command.add_argument(
-        "--binding", metavar="FILE.toml", help="which of its variables are which, where they have not gough's names (docs/fmu.md)"
+        "--binding", metavar="FILE.toml", help="which of its variables are which, if they have other names (docs/fmu.md)"
     )  # fmt: skip
 
 

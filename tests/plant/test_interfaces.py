@@ -21,9 +21,10 @@ from scipy.integrate import solve_ivp
 
 from plant.errors import InputError
 from plant.export import SPATIAL_MODEL, build, check_build, default_fmu
+from plant.fmi import element_names
 from plant.fmu import FmuPlant
 from plant.mechanism import Mechanism
-from plant.model_description import Layout, element_names
+from plant.model_description import Layout
 from plant.pose import Array
 from plant.variables import BY_NAME, SPATIAL, VELOCITY, Variable
 
@@ -199,7 +200,7 @@ def test_fmi_2_has_every_element_by_its_name_with_unit_range_and_start(fmi2_path
     starts = hexapod.plant_parameters()
     assert len(described) == LAYOUT.size
     for variable in LAYOUT.exposed:
-        for i, name in enumerate(element_names(variable)):
+        for i, name in enumerate(element_names(variable.name, variable.shape)):
             actual = described[name]
             assert actual.valueReference == LAYOUT.offsets[variable.name] + i
             assert actual.unit == (None if variable.discrete else variable.unit)
