@@ -27,8 +27,9 @@ import fmpy
 from plant.compiled import hash_of_files, keyed_folder
 from plant.errors import InputError, ToolchainError
 from plant.files import write_whole
-from plant.mechanism import load_spatial
+from plant.mechanism import Mechanism, load_in_space
 from plant.model_description import Dependencies, Layout, build_description, model_description, start_of
+from plant.planar_variables import PLANAR
 from plant.pose import Array
 from plant.variables import SPATIAL, Variable, VariableTable
 
@@ -61,6 +62,12 @@ class Model:
     dynamics: Callable[[], Any]
 
 
+def _planar_dynamics() -> Any:
+    from plant.planar_dynamics import build_planar_dynamics
+
+    return build_planar_dynamics()
+
+
 def _spatial_dynamics() -> Any:
     from plant.dynamics import build_dynamics
 
@@ -70,6 +77,10 @@ def _spatial_dynamics() -> Any:
 SPATIAL_MODEL = Model(
     "gough_plant", "Six-leg parallel mechanism with encoderless drives and ideal IMUs", SPATIAL, "hexapod", _spatial_dynamics
 )
+PLANAR_MODEL = Model(
+    "gough_planar_plant", "Planar three-leg mechanism with encoderless drives and ideal IMUs", PLANAR, "planar-3rpr",
+    _planar_dynamics,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -101,10 +112,10 @@ def default_fmu(model: Model = SPATIAL_MODEL, fmi: int = 3) -> Path:
     """
     here = Path(__file__).parent
     names = (
-        "dynamics.py", "planar_dynamics.py", "planar_variables.py", "variables.py", "export.py", "model_description.py",
-        "mechanism.py", "planar.py", f"presets/{model.preset}.toml",
+        "dynamics.py", "leg_dynamics.py", "planar_dynamics.py", "planar_variables.py", "variables.py", "export.py",
+        "model_description.py", "mechanism.py", "limits.py", "planar.py", f"presets/{model.preset}.toml",
     )  # fmt: skip
-    sources = [here / name for name in names if (here / name).exists()]
+    sources = [here / name for name in names]
     with resources.as_file(resources.files("fmus")) as folder:
         wrappers = sorted([*folder.glob("*.c"), *folder.glob("*.h")])
         key = hash_of_files([*sources, *wrappers], version("casadi"), platform.machine(), sys.platform, str(fmi))
@@ -164,7 +175,7 @@ def build(path: Path, fmi: int = 3, mechanism: str | Path = "hexapod", platforms
         InputError: a version or platform that does not exist, or `path` cannot be written.
     """
     check_build(fmi, platforms)
-    loaded = load_spatial(mechanism)
+    loaded = load_in_space(mechanism)
     model = model_of(loaded)
     starts = loaded.plant_parameters()
     layout = Layout(model.table)
@@ -210,9 +221,9 @@ def check_build(fmi: int, platforms: Sequence[str]) -> None:
         c_compiler()
 
 
-def model_of(mechanism: Any) -> Model:
+def model_of(mechanism: Mechanism) -> Model:
     """The plant that a mechanism is one of."""
-    return SPATIAL_MODEL
+    return PLANAR_MODEL if mechanism.planar else SPATIAL_MODEL
 
 
 def _archive(contents: Mapping[str, bytes]) -> bytes:

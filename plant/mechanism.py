@@ -16,7 +16,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plant.errors import InputError, UnknownNameError, UnreachableError
-from plant.planar import SAME_JOINT_M, PlanarMechanism, check_legs_differ, check_tables, checked_stroke, planar_from_document
+from plant.limits import Limits, checked_limits
+from plant.planar import (
+    PLANAR_LEGS,
+    SAME_JOINT_M,
+    PlanarMechanism,
+    check_drives,
+    check_legs_differ,
+    check_not_derived,
+    check_tables,
+    flattened,
+    planar_from_document,
+)
+from plant.planar_variables import PLANAR
 from plant.pose import (
     Array,
     Pose,
@@ -24,38 +36,13 @@ from plant.pose import (
     checked_rotation,
     checked_seed,
     checked_unit,
-    numbers,
     quaternion_from_rotation,
     rotation_from_quaternion,
+    rotation_from_vector,
 )
-from plant.variables import PARAMETERS, checked_parameters
+from plant.variables import SPATIAL, TINY, checked_parameters
 
 LEGS = 6
-
-
-@dataclass(frozen=True, eq=False)
-class Limits:
-    """What the actuators can do: `stroke` (6, 2), least and greatest length of each leg [m], and along each leg the
-    greatest `velocity` [m/s], `acceleration` [m/s^2] and `jerk` [m/s^3]. The end stops of the plant lie
-    `stop_clearance` [m] beyond the stroke.
-
-    Raises:
-        InputError: an empty or non-positive stroke, or a limit that is not positive.
-    """
-
-    stroke: Array
-    velocity: float = 0.25
-    acceleration: float = 3.0
-    jerk: float = 60.0
-    stop_clearance: float = 0.002
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "stroke", checked_stroke(self.stroke, LEGS))
-        for name in ("velocity", "acceleration", "jerk", "stop_clearance"):
-            value = float(checked_array(getattr(self, name), (), f"limit of {name}"))
-            object.__setattr__(self, name, value)
-            if value <= 0.0:
-                raise InputError(f"the limit of {name} is {value:g}; it must be positive")
 
 
 _NOMINAL_HEIGHT = 7.0 / 6.0
@@ -67,19 +54,19 @@ _BUILDING = 1
 
 @dataclass(frozen=True, eq=False)
 class Mechanism:
-    """A mechanism of six legs, checked when it is built and never changed.
+    """A mechanism of n = 6 legs, or a planar one of n = 3 seen in space; checked when it is built and never changed.
 
     Attributes:
         name: what it is called in messages and reports.
-        base_joints: (6, 3) [m] in {1}.
-        platform_joints: (6, 3) [m] in {2}.
-        base_joint_axes: (6, 3), unit; the first axis of each universal joint, fixed in the base. At rest the axis of
+        base_joints: (n, 3) [m] in {1}.
+        platform_joints: (n, 3) [m] in {2}.
+        base_joint_axes: (n, 3), unit; the first axis of each universal joint, fixed in the base. At rest the axis of
             leg k is perpendicular to the leg's home direction.
-        home_directions: (6, 3), unit; the leg directions at home, which span the leg frames together with the axes.
+        home_directions: (n, 3), unit; the leg directions at home, which span the leg frames together with the axes.
         up_in_base: (3,), unit; the vertical seen in {1}.
         home: the pose that strokes and targets are measured from, or None.
         limits: the actuators' limits, or None.
-        plant: parameters of the dynamics by the names of `plant.variables`.
+        plant: parameters of the dynamics by the names of `plant.variables`, or `plant.planar_variables`.
         settings: the tables `control`, `fusion` and `safety` of the preset, for the controller to read.
     """
 
@@ -135,6 +122,7 @@ class Mechanism:
         axes = _joint_axes(base_joint_axes, directions)
         parameters = checked_parameters(plant or {})
         _check_plant(parameters, up)
+        lengths = None if home is None else np.linalg.norm(home.position + platform @ home.rotation.T - base, axis=1)
         return cls(
             name=name,
             base_joints=base,
@@ -143,10 +131,50 @@ class Mechanism:
             home_directions=directions,
             up_in_base=up,
             home=home,
-            limits=None if limits is None else _checked_limits(limits, base, platform, home),
+            limits=None if limits is None else checked_limits(limits, LEGS, lengths),
             plant=MappingProxyType(parameters),
             settings=MappingProxyType({key: MappingProxyType(dict(table)) for key, table in (settings or {}).items()}),
         )
+
+    @classmethod
+    def from_planar(cls, planar: PlanarMechanism) -> "Mechanism":
+        """A planar mechanism in space: its plane is the xy-plane of {1}, whose normal is the first axis of every joint.
+
+        Raises:
+            InputError: it has no home pose, or a leg without length there.
+        """
+        if planar.home is None:
+            raise InputError(f"the mechanism {planar.name!r} has no home pose: give one")
+        home = Pose(np.append(planar.home.position, 0.0), rotation_from_vector([0.0, 0.0, planar.home.angle]))
+        base, platform = (np.pad(joints, ((0, 0), (0, 1))) for joints in (planar.base_joints, planar.platform_joints))
+        up = -planar.plant.get("gravity", np.array([0.0, -1.0, 0.0]))
+        return cls(
+            name=planar.name,
+            base_joints=base,
+            platform_joints=platform,
+            base_joint_axes=np.tile([0.0, 0.0, 1.0], (PLANAR_LEGS, 1)),
+            home_directions=_home_directions(base, platform, home, up),
+            up_in_base=up / max(float(np.linalg.norm(up)), TINY),
+            home=home,
+            limits=planar.limits,
+            plant=planar.plant,
+            settings=planar.settings,
+        )
+
+    @property
+    def legs(self) -> int:
+        """How many legs there are, 6 or 3."""
+        return len(self.base_joints)
+
+    @property
+    def planar(self) -> bool:
+        """Whether the platform moves in the xy-plane of {1} alone."""
+        return self.legs == PLANAR_LEGS
+
+    @property
+    def freedoms(self) -> list[int]:
+        """The components of a twist (6,) that the platform can have."""
+        return [0, 1, 5] if self.planar else list(range(6))
 
     @property
     def nominal_home(self) -> Pose:
@@ -155,7 +183,7 @@ class Mechanism:
 
     @property
     def joint_rotations(self) -> Array:
-        """(6, 3, 3): the rotation of each joint frame to {1}; x is the joint's first axis, z the home direction made
+        """(n, 3, 3): the rotation of each joint frame to {1}; x is the joint's first axis, z the home direction made
         perpendicular to it. A leg's frame is `joint_rotation @ Rx(a) @ Ry(b)` with the leg along its z axis.
         """
         x = self.base_joint_axes
@@ -164,13 +192,14 @@ class Mechanism:
         return np.stack([x, np.cross(z, x), z], axis=2)
 
     def moved_joints(self, moves: Array) -> "Mechanism":
-        """The same mechanism with its base and platform joints moved by (2, 6, 3) [m]."""
+        """The same mechanism with its base and platform joints moved by (2, n, 3) [m]."""
         base, platform = self.base_joints + moves[0], self.platform_joints + moves[1]
-        _check_joints(base, platform)
+        if not self.planar:
+            _check_joints(base, platform)
         return replace(self, base_joints=base, platform_joints=platform)
 
     def distinct_joints(self) -> NDArray[np.int64]:
-        """(2, 6): for base and platform, the first leg that has the same joint as each leg."""
+        """(2, n): for base and platform, the first leg that has the same joint as each leg."""
         joints = np.stack([self.base_joints, self.platform_joints])
         apart = np.linalg.norm(joints[:, :, None] - joints[:, None], axis=3)
         first: NDArray[np.int64] = np.argmax(apart < SAME_JOINT_M, axis=2)
@@ -185,21 +214,23 @@ class Mechanism:
         most = 0.1 * float(np.linalg.norm(self.base_joints - self.base_joints.mean(axis=0), axis=1).max())
         if not 0.0 <= joint_error < most:
             raise InputError(f"the joint error is {1e3 * joint_error:g} mm; it must be at least 0 and below {1e3 * most:g} mm")
-        moves = joint_error * np.random.default_rng([checked_seed(seed), _BUILDING]).standard_normal((2, LEGS, 3))
+        moves = joint_error * np.random.default_rng([checked_seed(seed), _BUILDING]).standard_normal((2, self.legs, 3))
+        if self.planar:
+            moves[:, :, 2] = 0.0
         return self.moved_joints(np.take_along_axis(moves, self.distinct_joints()[:, :, None], axis=1))
 
     def check_lengths(self, lengths: Array, what: str) -> None:
-        """Check leg lengths (..., 6) [m] against the stroke.
+        """Check leg lengths (..., n) [m] against the stroke.
 
         Raises:
             UnreachableError: names the leg that is furthest outside, its length, and by how much.
             InputError: the mechanism has no stroke.
         """
         stroke = self.require_limits().stroke
-        excess = np.maximum(stroke[:, 0] - lengths, lengths - stroke[:, 1]).reshape(-1, LEGS)
+        excess = np.maximum(stroke[:, 0] - lengths, lengths - stroke[:, 1]).reshape(-1, self.legs)
         row, leg = np.unravel_index(int(np.argmax(excess)), excess.shape)
         if excess[row, leg] > 0.0:
-            length = np.reshape(lengths, (-1, LEGS))[row, leg]
+            length = np.reshape(lengths, (-1, self.legs))[row, leg]
             raise UnreachableError(
                 f"{what} needs leg {leg} at {1e3 * length:.2f} mm, {1e3 * excess[row, leg]:.2f} mm outside its stroke of "
                 f"{1e3 * stroke[leg, 0]:.2f} to {1e3 * stroke[leg, 1]:.2f} mm: choose a smaller motion"
@@ -234,21 +265,31 @@ class Mechanism:
         start = initial or self.require_home()
         limits = self.require_limits()
         values: dict[str, ArrayLike] = {
-            "base_joints": self.base_joints,
-            "platform_joints": self.platform_joints,
-            "base_joint_axes": self.base_joint_axes,
             "stop.minimum_length": limits.stroke[:, 0] - limits.stop_clearance,
             "stop.maximum_length": limits.stroke[:, 1] + limits.stop_clearance,
-            "initial_position": start.position,
-            "initial_quaternion": quaternion_from_rotation(start.rotation),
             **self.plant,
         }
-        missing = [variable.name for variable in PARAMETERS if variable.name not in values]
+        if self.planar:
+            values |= {
+                "base_joints": self.base_joints[:, :2],
+                "platform_joints": self.platform_joints[:, :2],
+                "initial_position": start.position[:2],
+                "initial_angle": np.arctan2(start.rotation[1, 0], start.rotation[0, 0]),
+            }
+        else:
+            values |= {
+                "base_joints": self.base_joints,
+                "platform_joints": self.platform_joints,
+                "base_joint_axes": self.base_joint_axes,
+                "initial_position": start.position,
+                "initial_quaternion": quaternion_from_rotation(start.rotation),
+            }
+        table = PLANAR if self.planar else SPATIAL
+        names = [variable.name for variable in table.parameters]
+        missing = [name for name in names if name not in values]
         if missing:
             raise InputError(f"the mechanism {self.name!r} lacks plant parameters: {', '.join(missing)}")
-        return {
-            variable.name: checked_parameters({variable.name: values[variable.name]})[variable.name] for variable in PARAMETERS
-        }
+        return checked_parameters({name: values[name] for name in names}, table)
 
 
 _PRESETS = resources.files("plant") / "presets"
@@ -264,6 +305,16 @@ def load_spatial(name_or_path: str | Path) -> Mechanism:
     if isinstance(mechanism, PlanarMechanism):
         raise InputError(f"{name_or_path} has three legs in the plane; this needs six in space: choose another mechanism")
     return mechanism
+
+
+def load_in_space(name_or_path: str | Path) -> Mechanism:
+    """`load_mechanism` for the loop, with a planar mechanism seen in space.
+
+    Raises:
+        InputError: a planar mechanism has no home pose.
+    """
+    mechanism = load_mechanism(name_or_path)
+    return Mechanism.from_planar(mechanism) if isinstance(mechanism, PlanarMechanism) else mechanism
 
 
 def load_mechanism(name_or_path: str | Path) -> Mechanism | PlanarMechanism:
@@ -367,19 +418,9 @@ def _from_document(document: dict[str, Any]) -> Mechanism | PlanarMechanism:
         name=str(document.get("name", "custom")),
         home=home,
         limits=document.get("limits"),
-        plant=_flattened(document.get("plant", {})),
+        plant=flattened(document.get("plant", {})),
         settings={key: document.get(key, {}) for key in ("control", "fusion", "safety")},
     )
-
-
-def _flattened(tables: Mapping[str, Any], prefix: str = "") -> dict[str, ArrayLike]:
-    flat: dict[str, ArrayLike] = {}
-    for key, value in tables.items():
-        if isinstance(value, Mapping):
-            flat |= _flattened(value, f"{prefix}{key}.")
-        else:
-            flat[prefix + key] = value
-    return flat
 
 
 def _check_joints(base: Array, platform: Array) -> None:
@@ -398,23 +439,14 @@ _DERIVED = (
 
 
 def _check_plant(parameters: Mapping[str, Array], up: Array) -> None:
-    for name in _DERIVED:
-        if name in parameters:
-            raise InputError(f"the plant's {name} follows from the geometry, the home pose and the limits: leave it out")
+    check_not_derived(parameters, _DERIVED)
     for name in ("platform.inertia", "payload.inertia"):
         inertia = parameters.get(name, np.eye(3))
         if np.abs(inertia - inertia.T).max() > 1e-9 or np.linalg.eigvalsh(inertia).min() < 0.0:
             raise InputError(
                 f"{name} {inertia.tolist()} is no inertia: it must be symmetric without negative principal moments"
             )
-    if {"drive.compensation", "drive.nominal_resistance", "motor.resistance"} <= set(parameters):
-        made_up = float(parameters["drive.compensation"] * parameters["drive.nominal_resistance"])
-        least = float(parameters["motor.resistance"].min())
-        if made_up >= least:
-            raise InputError(
-                f"drive.compensation x nominal_resistance is {made_up:g} Ohm; the drive is stable only below the motors' "
-                f"resistance of {least:g} Ohm: choose a smaller compensation"
-            )
+    check_drives(parameters)
     gravity = parameters.get("gravity", np.zeros(3))
     size = float(np.linalg.norm(gravity))
     if size > 0.0 and np.linalg.norm(gravity / size + up) > 1e-3:
@@ -463,27 +495,3 @@ def _joint_axes(given: ArrayLike | None, directions: Array) -> Array:
         )
     unit.setflags(write=False)
     return unit
-
-
-def _checked_limits(limits: Mapping[str, Any], base: Array, platform: Array, home: Pose | None) -> Limits:
-    if "stroke" not in limits:
-        raise InputError("the limits lack the stroke: two numbers in metres about the home lengths, or (6, 2) lengths")
-    stroke = numbers(limits["stroke"], "stroke", "(2,) or (6, 2)")
-    lengths = None if home is None else np.linalg.norm(home.position + platform @ home.rotation.T - base, axis=1)
-    if stroke.shape == (2,):
-        if lengths is None:
-            raise InputError("a stroke of two numbers counts from the home lengths: give a home pose, or (6, 2) lengths")
-        stroke = lengths[:, None] + checked_array(stroke, (2,), "stroke")
-    unknown = set(limits) - {field.name for field in fields(Limits)}
-    if unknown:
-        raise InputError(f"the limits have no entry {sorted(unknown)[0]!r}")
-    checked = Limits(**{**limits, "stroke": stroke})
-    if lengths is not None:
-        leg = int(np.argmax(np.maximum(checked.stroke[:, 0] - lengths, lengths - checked.stroke[:, 1])))
-        least, greatest = checked.stroke[leg]
-        if not least <= lengths[leg] <= greatest:
-            raise InputError(
-                f"leg {leg} is {lengths[leg]:g} m long at home, outside its stroke of {least:g} to {greatest:g} m: "
-                "move the home pose or the stroke"
-            )
-    return checked

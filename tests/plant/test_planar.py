@@ -23,14 +23,18 @@ def test_the_preset_is_the_rig():
     text = (resources.files("plant") / "presets" / "planar-3rpr.toml").read_text()
     rig = planar_from_document(tomllib.loads(text))
     assert rig.name == "planar-3rpr"
-    assert rig.stroke is None
+    home, limits = rig.home, rig.limits
+    assert home is not None and limits is not None
+    np.testing.assert_array_equal(home.position, [0.1, 0.205])
+    lengths = rig.lengths_at(home.position, home.angle)
+    np.testing.assert_allclose(limits.stroke, lengths[:, None] + [-0.03, 0.03], atol=1e-15)
     np.testing.assert_array_equal(rig.base_joints, [[0.0, 0.0], [0.17, 0.0], [0.28, 0.0]])
     np.testing.assert_array_equal(rig.platform_joints, [[0.0, 0.0], [0.07, 0.0], [0.1, 0.0]])
 
 
 def test_a_document_says_the_same_as_two_arrays():
     mechanism = planar_from_document(document(limits={"stroke": STROKE}))
-    twin = PlanarMechanism.from_legs(np.array(BASE), np.array(PLATFORM), name="mine", stroke=STROKE)
+    twin = PlanarMechanism.from_legs(np.array(BASE), np.array(PLATFORM), name="mine", limits={"stroke": STROKE})
     for name in ("base_joints", "platform_joints", "stroke"):
         np.testing.assert_array_equal(getattr(mechanism, name), getattr(twin, name))
     assert mechanism.name == twin.name
@@ -39,7 +43,7 @@ def test_a_document_says_the_same_as_two_arrays():
 
 def test_arrays_are_copied_and_cannot_be_changed():
     base, stroke = np.array(BASE), np.array(STROKE)
-    mechanism = PlanarMechanism.from_legs(base, PLATFORM, stroke=stroke)
+    mechanism = PlanarMechanism.from_legs(base, PLATFORM, limits={"stroke": stroke})
     base[0], stroke[0] = 7.0, 7.0
     np.testing.assert_array_equal(mechanism.base_joints, BASE)
     np.testing.assert_array_equal(mechanism.stroke, STROKE)
@@ -88,9 +92,12 @@ def test_joints_are_turned_and_moved():
         ),
         ({"base_joints": [[0.1, 0.2]] * 3}, "the base joints are all one point, apart by 0 m and not by 1e-09 m: move one"),
         ({"platform_joints": [[0.1, 0.2], [0.1, 0.2 + 1e-10], [0.1, 0.2]]}, "the platform joints are all one point"),
-        ({"stroke": STROKE[:2]}, "stroke must have shape (3, 2), got (2, 2)"),
-        ({"stroke": [[0.1, 0.2], [0.3, 0.3], [0.1, 0.2]]}, "the stroke of leg 1 runs from 0.3 m to 0.3 m; it needs 0 < least"),
-        ({"stroke": [[0.1, 0.2], [0.1, 0.3], [0.0, 0.2]]}, "the stroke of leg 2 runs from 0 m to 0.2 m"),
+        ({"limits": {"stroke": STROKE[:2]}}, "stroke must have shape (3, 2), got (2, 2)"),
+        (
+            {"limits": {"stroke": [[0.1, 0.2], [0.3, 0.3], [0.1, 0.2]]}},
+            "the stroke of leg 1 runs from 0.3 m to 0.3 m",
+        ),
+        ({"limits": {"stroke": [[0.1, 0.2], [0.1, 0.3], [0.0, 0.2]]}}, "the stroke of leg 2 runs from 0 m to 0.2 m"),
     ],
 )
 def test_what_is_no_mechanism_is_refused(changes, said):
@@ -101,13 +108,25 @@ def test_what_is_no_mechanism_is_refused(changes, said):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (document(home={"position": [0.0, 0.0]}), "unknown entry 'home'; a mechanism has name, geometry, limits"),
+        (document(sensors={}), "unknown entry 'sensors'; a mechanism has name, geometry, home, limits, plant"),
+        (document(home={"angle": 0.1}), "position must be an array of numbers"),
+        (document(home={"position": [0.0, 0.2], "angle": np.inf}), "angle is inf; it must be finite"),
+        (document(limits={"stroke": STROKE, "speed": 1.0}), "[limits] has no entry 'speed'"),
+        (document(plant={"motor": {"resistance": 1.0}, "drive": {"compensation": 0.5, "nominal_resistance": 3.0}}), "1.5 Ohm"),
+        (document(plant={"initial_angle": 1.0}), "the plant's initial_angle follows from the geometry, the home pose"),
+        (document(plant={"platform": {"mass": -1.0}}), "platform.mass is -1 kg"),
         (document(limits=3.0), "'limits' must be a table"),
-        (document(limits={"velocity": 0.2}), "[limits] has no entry 'velocity'; it has stroke"),
+        (
+            document(limits={"velocity": 0.2}),
+            "the limits lack the stroke: two numbers in metres about the home lengths, or (3, 2)",
+        ),
         ({"geometry": {"base": BASE}}, "[geometry] has no entry 'base'; it has base_joints, platform_joints"),
         ({"geometry": {"base_joints": BASE}}, "[geometry] lacks platform_joints, an array of three rows of two numbers"),
         ({}, "[geometry] lacks base_joints"),
-        (document(limits={"stroke": [0.1, 0.2]}), "stroke must have shape (3, 2), got (2,)"),
+        (
+            document(limits={"stroke": [0.1, 0.2]}),
+            "counts from the home lengths: give a home pose, or (3, 2)",
+        ),
     ],
 )
 def test_what_is_no_document_of_a_mechanism_is_refused(content, said):

@@ -1,0 +1,81 @@
+"""What the actuators of a mechanism can do."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from plant.errors import InputError
+from plant.pose import Array, checked_array, numbers
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """What the actuators can do: `stroke` (n, 2), least and greatest length of each leg [m], and along each leg the
+    greatest `velocity` [m/s], `acceleration` [m/s^2] and `jerk` [m/s^3]. The end stops of the plant lie
+    `stop_clearance` [m] beyond the stroke.
+
+    Raises:
+        InputError: an empty or non-positive stroke, or a limit that is not positive.
+    """
+
+    stroke: Array
+    velocity: float = 0.25
+    acceleration: float = 3.0
+    jerk: float = 60.0
+    stop_clearance: float = 0.002
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "stroke", _checked_stroke(self.stroke))
+        for name in ("velocity", "acceleration", "jerk", "stop_clearance"):
+            value = float(checked_array(getattr(self, name), (), f"limit of {name}"))
+            object.__setattr__(self, name, value)
+            if value <= 0.0:
+                raise InputError(f"the limit of {name} is {value:g}; it must be positive")
+
+
+def _checked_stroke(value: ArrayLike) -> Array:
+    stroke = checked_array(value, (len(np.atleast_1d(value)), 2), "stroke")
+    for leg, (least, greatest) in enumerate(stroke):
+        if not 0.0 < least < greatest:
+            raise InputError(
+                f"the stroke of leg {leg} runs from {least:g} m to {greatest:g} m; it needs 0 < least < greatest length"
+            )
+    return stroke
+
+
+def checked_limits(limits: Mapping[str, Any], legs: int, lengths: Array | None) -> Limits:
+    """The limits of a mechanism of so many legs from the fields of `Limits`.
+
+    Args:
+        limits: a stroke of (2,) [m] counts from the home lengths, (legs, 2) is absolute.
+        legs: how many there are.
+        lengths: (legs,) [m] at home, None without one.
+
+    Raises:
+        InputError: an unknown entry, no stroke, one about a home that is not given, one that home is outside of, or a limit
+            that is not positive.
+    """
+    shape = f"({legs}, 2)"
+    if "stroke" not in limits:
+        raise InputError(f"the limits lack the stroke: two numbers in metres about the home lengths, or {shape} lengths")
+    stroke = numbers(limits["stroke"], "stroke", f"(2,) or {shape}")
+    if stroke.shape == (2,):
+        if lengths is None:
+            raise InputError(f"a stroke of two numbers counts from the home lengths: give a home pose, or {shape} lengths")
+        stroke = lengths[:, None] + checked_array(stroke, (2,), "stroke")
+    unknown = set(limits) - {field.name for field in fields(Limits)}
+    if unknown:
+        raise InputError(f"the limits have no entry {sorted(unknown)[0]!r}")
+    checked = Limits(**{**limits, "stroke": checked_array(stroke, (legs, 2), "stroke")})
+    if lengths is not None:
+        leg = int(np.argmax(np.maximum(checked.stroke[:, 0] - lengths, lengths - checked.stroke[:, 1])))
+        least, greatest = checked.stroke[leg]
+        if not least <= lengths[leg] <= greatest:
+            raise InputError(
+                f"leg {leg} is {lengths[leg]:g} m long at home, outside its stroke of {least:g} to {greatest:g} m: "
+                "move the home pose or the stroke"
+            )
+    return checked
