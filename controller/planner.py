@@ -16,7 +16,8 @@ from controller.reference import stop_phases
 from controller.target import SAMPLE_PERIOD_S, Target
 from plant.compiled import kernel
 from plant.errors import PlanningError
-from plant.mechanism import LEGS, Limits, Mechanism
+from plant.limits import Limits
+from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array
 
 PREVIEW_S = 0.03

@@ -15,7 +15,8 @@ from controller.imu_monitor import MONITOR, contradiction, forget
 from controller.reference import plan_stop
 from controller.settings import SafetySettings
 from plant.compiled import Record, kernel
-from plant.mechanism import LEGS, Limits
+from plant.limits import Limits
+from plant.mechanism import LEGS
 from plant.variables import IMU_COUNT
 
 IDLE, ARMED, RUNNING, STOPPING, STOPPED, FAULT = range(6)

@@ -61,9 +61,9 @@ def add_fmu(commands: Any) -> None:
 
 def _build_fmu(options: argparse.Namespace) -> int:
     from plant.export import build_in_subprocess, check_build, model_of
-    from plant.mechanism import load_mechanism
+    from plant.mechanism import load_in_space
 
-    model = model_of(load_mechanism(options.mechanism))
+    model = model_of(load_in_space(options.mechanism))
     check_build(options.fmi, options.platforms)
     folder = Path("fmus") if Path("fmus/fmi3.c").is_file() else Path()
     path = options.output or folder / f"{model.identifier}{'_fmi2' if options.fmi == 2 else ''}.fmu"
@@ -140,10 +140,10 @@ def _linearize(options: argparse.Namespace) -> int:
     from controller.linearization import state_space
     from plant.export import default_fmu, model_of
     from plant.fmu import FmuPlant, write_drive_mode
-    from plant.mechanism import load_mechanism
+    from plant.mechanism import load_in_space
     from plant.variables import VELOCITY
 
-    mechanism = load_mechanism(options.mechanism)
+    mechanism = load_in_space(options.mechanism)
     path = options.file or default_fmu(model_of(mechanism))
     with FmuPlant(path, mechanism.plant_parameters(), 1e-3) as plant:
         write_drive_mode(plant.calls, VELOCITY)
