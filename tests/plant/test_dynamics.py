@@ -329,15 +329,17 @@ def test_ideal_imu_signals_are_derivatives_of_the_trajectory(hexapod: Mechanism,
     np.testing.assert_allclose(signals["magnetic_field"], to_sensor @ p["magnetic_field"], rtol=0.0, atol=1e-12)
 
 
-def test_halving_the_substep_changes_ten_seconds_of_motion_by_less_than_a_micrometre(make_plant: MakePlant) -> None:
+def test_ten_seconds_of_motion_are_within_a_tenth_of_a_micrometre_of_fine_substeps(make_plant: MakePlant) -> None:
     def ends(substep: float) -> Array:
         plant = make_plant({"substep": substep})
         drive(plant, 10.0)
         return np.hstack([plant.get("position"), plant.get("leg_length")])
 
-    coarse, fine, finest = ends(5e-4), ends(2.5e-4), ends(1.25e-4)
-    assert np.abs(coarse - fine).max() < 1e-6
-    assert np.abs(fine - finest).max() < np.abs(coarse - fine).max() / 2.0
+    finest = ends(5e-4 / 16.0)
+    preset, fine = (np.abs(ends(substep) - finest).max() for substep in (5e-4, 1.25e-4))
+    assert preset < 1e-7
+    # The step of the first command touches the current limiter, whose corner costs the method its fourth order.
+    assert fine < preset / 2.0
 
 
 def test_the_quaternion_stays_of_unit_length(make_plant: MakePlant) -> None:
