@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from plant.classification import draw_mechanism, spatial_classes
 from plant.errors import FmuError
-from plant.fmu import FmuPlant, advance
+from plant.fmu import FmuPlant, advance, read_imus
 from plant.mechanism import Mechanism
 from plant.pose import Array, quaternion_from_rotation
 from plant.variables import BY_NAME, PARAMETERS, checked_parameters
@@ -113,7 +113,7 @@ def restart(plant: FmuPlant, parameters: Mapping[str, Array]) -> None:
 
 
 class Reader:
-    """Reads outputs of a plant by one call straight to its library, which FMPy's own method would make five times as slow."""
+    """Reads outputs of a plant by one call straight to its library, several times faster than FMPy's own method."""
 
     def __init__(self, plant: FmuPlant, names: tuple[str, ...]) -> None:
         self._references = np.array([plant._known(name).valueReference for name in names], np.uint32)
@@ -152,7 +152,8 @@ def run_at_random(plant: FmuPlant, random: Generator) -> tuple[Array, float]:
             assert advance(plant.calls, STEP_S) == 0, plant.messages[-1]
             rows.append(reader.read())
         values = np.array(rows)
-        assert np.isfinite(values).all()
+        assert read_imus(plant.calls) == 0
+        assert np.isfinite(values).all() and np.isfinite(plant.calls["imu"]).all()
         assert np.abs(np.linalg.norm(values[:, -4:], axis=1) - 1.0).max() < 1e-14
         energy, powers = values[:, :2].sum(axis=1), values[:, 2:-4]
         start = energy[0] if start is None else start
