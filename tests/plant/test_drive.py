@@ -6,6 +6,7 @@ from math import pi
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
+from scipy.integrate import cumulative_trapezoid, simpson
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
@@ -95,6 +96,27 @@ def test_an_end_stop_gives_back_no_more_than_it_took(make_plant: MakePlant) -> N
     assert np.abs(power).max() > 10.0
     assert kinetic.max() < thrown * (1.0 + 1e-9)
     assert kinetic[-100:].max() < 0.9 * thrown
+
+
+def test_end_stops_at_full_command_win_no_energy(make_plant: MakePlant) -> None:
+    """Up and down into the stops at full speed: they take energy and return less, and no energy comes from elsewhere."""
+    plant = make_plant({"substep": 1e-4})
+    sources = ("drive", "friction", "brake", "stop", "external")
+    names = ("kinetic_energy", "potential_energy", *(f"power.{source}" for source in sources))
+    before = float(plant.get("kinetic_energy") + plant.get("potential_energy"))
+    work, taken = 0.0, 0.0
+    for command in (0.25, -0.25, 0.25):
+        set_all(plant, VELOCITY, command)
+        kinetic, potential, *powers = run(plant, 0.8, *names, step=1e-4)
+        # Simpson's rule; the powers are smooth while inputs are held, but for the touch of a stop.
+        by_source = [simpson(power, dx=1e-4) for power in powers]
+        work += sum(by_source)
+        stop = cumulative_trapezoid(powers[sources.index("stop")], dx=1e-4, initial=0.0) + taken
+        assert stop.max() < 1e-6
+        assert stop[-1] < taken - 1.0
+        taken = float(stop[-1])
+        assert kinetic[-1] < 1e-8, "the stops hold"
+    assert float(kinetic[-1] + potential[-1]) - before == pytest.approx(work, abs=1e-2)
 
 
 def test_without_damping_a_bounce_keeps_its_energy(make_plant: MakePlant) -> None:
