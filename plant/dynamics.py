@@ -21,6 +21,7 @@ from plant.leg_dynamics import (
     leg_conditions,
     leg_constants,
     legs_at,
+    length_limits,
     lengths_of,
     row,
     solve,
@@ -223,9 +224,9 @@ def _leg_vectors(position: SX, rotation: SX, joints: dict[str, SX]) -> list[SX]:
 
 
 def _limits(x: dict[str, SX], c: dict[str, SX]) -> list[Condition]:
-    """What must hold during the motion: no leg along the first axis of its joint."""
-    limits = []
+    """What must hold during the motion: no leg of no length, or along the first axis of its joint."""
     vectors = _leg_vectors(x["state.position"], _rotation(x["state.quaternion"]), c)
+    limits = length_limits(stack([ca.norm_2(s) for s in vectors]))
     for k, s in enumerate(vectors):
         along = ca.fabs(ca.dot(row(c["base_joint_axes"], k), s)) / ca.norm_2(s)
         text = f"leg {k} has come to lie along the first axis of its base joint (cosine %g, at most %g): limit its stroke"

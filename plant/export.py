@@ -26,7 +26,7 @@ import fmpy
 
 from plant.compiled import hash_of_files, keyed_folder
 from plant.errors import InputError, ToolchainError
-from plant.files import write_whole
+from plant.files import check_writable, write_whole
 from plant.mechanism import Mechanism, load_in_space
 from plant.model_description import Dependencies, Layout, build_description, model_description, start_of
 from plant.planar_variables import PLANAR
@@ -175,6 +175,7 @@ def build(path: Path, fmi: int = 3, mechanism: str | Path = "hexapod", platforms
         InputError: a version or platform that does not exist, or `path` cannot be written.
     """
     check_build(fmi, platforms)
+    check_writable(path)
     loaded = load_in_space(mechanism)
     model = model_of(loaded)
     starts = loaded.plant_parameters()

@@ -64,7 +64,7 @@ class Condition:
     text: str
 
 
-_LEAST_LENGTH_M = 1e-6
+_LEAST_LENGTH_M = 1e-4
 
 
 def leg_conditions(p: dict[str, SX], lengths: SX) -> list[Condition]:
@@ -79,7 +79,16 @@ def leg_conditions(p: dict[str, SX], lengths: SX) -> list[Condition]:
                 f"stop.minimum_length of leg {k} is %g m, beyond its stop.maximum_length of %g m",
             ),
         ]
-    return conditions + _substep_conditions(p)
+    outside = ca.vertcat(p["stop.minimum_length"] - lengths, lengths - p["stop.maximum_length"])
+    return conditions + _substep_conditions(p, ca.fmax(ca.mmax(outside), 0))
+
+
+def length_limits(lengths: SX) -> list[Condition]:
+    """No leg may come to nothing during the motion; `lengths` (n, 1)."""
+    return [
+        Condition(_LEAST_LENGTH_M, lengths[k], f"leg {k} needs a length of %g m and has come down to %g m: limit its stroke")
+        for k in range(lengths.shape[0])
+    ]
 
 
 _RUNGE_KUTTA_REACH = 2.5
@@ -89,13 +98,14 @@ _CONTACT_REACH = 1.5
 """The same for the end stops, which are not linear; found by 800 random sets of parameters."""
 
 
-def _substep_conditions(p: dict[str, SX]) -> list[Condition]:
+def _substep_conditions(p: dict[str, SX], beyond_stop: SX) -> list[Condition]:
     """The substep is short enough for the fastest modes of the legs.
 
     In coordinates whose squared length is the energy, what dissipates is on the diagonal of the linearised plant and what
     stores is skew, so the larger of the one and the norm of the other bound every eigenvalue; what else moves with a leg
     than its sliding mass only lowers them. A slipping brake forgets its deflection, and an end stop hits, the faster the leg
-    runs, which without load is the drive's voltage over its force constant.
+    runs: without load at the drive's voltage over its force constant, or as an end stop throws it back that it begins
+    beyond, by `beyond_stop` [m].
     """
     turns = 2 * pi / p["motor.screw_lead"]
     sliding_mass = p["leg.upper.mass"] + p["motor.rotor_inertia"] * turns**2
@@ -118,7 +128,7 @@ def _substep_conditions(p: dict[str, SX]) -> list[Condition]:
             "a slipping brake, brake.stiffness / brake.force",
         ),
         (
-            bounce * (1 + p["stop.damping"] * speed) / _CONTACT_REACH,
+            bounce * (1 + p["stop.damping"] * ca.fmax(speed, beyond_stop * bounce)) / _CONTACT_REACH,
             "the end stops, the square root of stop.stiffness over the sliding mass, and stop.damping",
         ),
     ]

@@ -20,6 +20,7 @@ from plant.leg_dynamics import (
     leg_conditions,
     leg_constants,
     legs_at,
+    length_limits,
     lengths_of,
     solve,
     speeds_of,
@@ -60,14 +61,16 @@ def _start(p: dict[str, SX]) -> dict[str, SX]:
 
 
 def _conditions(p: dict[str, SX]) -> list[Condition]:
-    rotation = _rotation(p["initial_angle"])[:2, :2]
-    legs = (p["initial_position"] + rotation @ p["platform_joints"].T).T - p["base_joints"]
-    return leg_conditions(p, ca.sqrt(ca.sum2(legs**2)))
+    return leg_conditions(p, _lengths(p["initial_position"], p["initial_angle"], p))
 
 
 def _limits(x: dict[str, SX], c: dict[str, SX]) -> list[Condition]:
-    """Whatever the legs do, the equations hold."""
-    return []
+    return length_limits(_lengths(x["state.position"], x["state.angle"], c))
+
+
+def _lengths(position: SX, angle: SX, c: dict[str, SX]) -> SX:
+    legs = (position + _rotation(angle)[:2, :2] @ c["platform_joints"].T).T - c["base_joints"]
+    return ca.sqrt(ca.sum2(legs**2))
 
 
 def _rotation(angle: SX) -> SX:

@@ -224,7 +224,12 @@ def test_motors_in_equilibrium_push_as_virtual_work_demands_at_a_thousand_poses(
         pose = still | {"state.position": position, "state.quaternion": quaternion_from_rotation(rotation)}
         # At rest the accelerations are affine in the currents.
         states += [flat(pose | {"state.current": current}, STATES) for current in np.vstack([np.zeros(6), np.eye(6)])]
-        held = {"velocity_command": np.zeros(6), "drive_mode": np.full(6, OPEN), "external_wrench": wrench}
+        held = {
+            "velocity_command": np.zeros(6),
+            "drive_mode": np.full(6, OPEN),
+            "external_wrench.force": wrench[:3],
+            "external_wrench.torque": wrench[3:],
+        }
         inputs += [flat(held, INPUTS)] * 7
     constants = dynamics.constants(flat(p, PARAMETERS))
     columns = np.array(dynamics.rates(np.transpose(states), np.transpose(inputs), constants)).T
@@ -247,7 +252,9 @@ def test_forces_along_the_legs_that_hold_the_weight_leave_the_fmu_at_rest(
     p = hexapod.plant_parameters() | {"gravity": 9.81 * unit(random), "payload.center_of_mass": random.normal(0.0, 0.05, 3)}
     plant = make_plant(p | {"initial_position": position, "initial_quaternion": quaternion_from_rotation(rotation)})
     plant.set("drive_mode", np.full(6, OPEN))
-    plant.set("external_wrench", jacobian(p, position, rotation).T @ static_forces(p, position, rotation))
+    wrench = jacobian(p, position, rotation).T @ static_forces(p, position, rotation)
+    plant.set("external_wrench.force", wrench[:3])
+    plant.set("external_wrench.torque", wrench[3:])
     to_sensor = np.swapaxes(np.concatenate([leg_frames(p, position, rotation), rotation[None]]), 1, 2)
     np.testing.assert_allclose(plant.get("imu_specific_force"), -to_sensor @ p["gravity"], rtol=0.0, atol=9.81e-9)
     plant.step(0.1)

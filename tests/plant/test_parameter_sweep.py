@@ -107,20 +107,22 @@ def random_parameters(hexapod: Mechanism, random: Generator) -> Values:
 
 def restart(plant: FmuPlant, parameters: Mapping[str, Array]) -> None:
     """Initialise a loaded plant anew."""
-    plant._fmu.reset()
+    plant._instance.fmu.reset()
     plant.calls["time"] = 0.0
-    plant._initialize(parameters)
+    for name, value in parameters.items():
+        plant.set(name, value)
+    plant._instance.initialize()
 
 
 class Reader:
     """Reads outputs of a plant by one call straight to its library, several times faster than FMPy's own method."""
 
     def __init__(self, plant: FmuPlant, names: tuple[str, ...]) -> None:
-        self._references = np.array([plant._known(name).valueReference for name in names], np.uint32)
+        self._references = np.array([plant.description[name].references[0] for name in names], np.uint32)
         self._values = np.zeros(sum(BY_NAME[name].size for name in names))
-        self._read = plant._fmu.dll.fmi3GetFloat64
+        self._read = plant._instance.fmu.dll.fmi3GetFloat64
         self._arguments = (
-            plant._fmu.component,
+            plant._instance.fmu.component,
             self._references.ctypes.data_as(ctypes.POINTER(ctypes.c_uint32)), self._references.size,
             self._values.ctypes.data_as(ctypes.POINTER(ctypes.c_double)), self._values.size,
         )  # fmt: skip
@@ -146,7 +148,8 @@ def run_at_random(plant: FmuPlant, random: Generator) -> tuple[Array, float]:
         if random.random() < 0.1 or hold == 0:
             plant.set("drive_mode", random.integers(0, 3, 6) if random.random() < 0.5 else np.full(6, random.integers(1, 3)))
         plant.set("velocity_command", amplitude * np.sin(2.0 * pi * frequencies * t + phases))
-        plant.set("external_wrench", wrench * np.sin(17.0 * t))
+        plant.set("external_wrench.force", wrench[:3] * np.sin(17.0 * t))
+        plant.set("external_wrench.torque", wrench[3:] * np.sin(17.0 * t))
         rows = [reader.read()]
         for _ in range(held):
             assert advance(plant.calls, STEP_S) == 0, plant.messages[-1]

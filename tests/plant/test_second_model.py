@@ -69,7 +69,8 @@ def test_free_and_driven_motion_agree_with_maximal_coordinates(make_plant: MakeP
         for command, push in segments:
             plant.set("drive_mode", modes)
             plant.set("velocity_command", command)
-            plant.set("external_wrench", push)
+            plant.set("external_wrench.force", push[:3])
+            plant.set("external_wrench.torque", push[3:])
             plant.step(SEGMENT_S)
         moved = np.abs(plant.get("position") - p["initial_position"]).max()
         assert moved > 2e-3 and np.abs(plant.get("angular_velocity")).max() > 0.1
