@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from plant.errors import FmuError, InputError, UnknownNameError
+from plant.export import build_in_subprocess
 from plant.fmu import FmuPlant, advance, read_imus, read_truth, write_command, write_drive_mode
 from plant.mechanism import Mechanism
 from plant.pose import Array
@@ -391,6 +392,25 @@ def test_compiled_calls_do_what_fmpys_methods_do(hexapod: Mechanism, fmu_path: P
             np.testing.assert_array_equal(plant.get(variable.name).ravel(), one_by_one)
     slow.terminate()
     slow.freeInstance()
+
+
+def test_our_fmi_2_export_does_the_same_without_a_binding(make_plant: MakePlant, hexapod: Mechanism, tmp_path: Path) -> None:
+    path = tmp_path / "two.fmu"
+    build_in_subprocess(path, fmi=2)
+    with FmuPlant(path, hexapod.plant_parameters(), 1e-3) as scalars:
+        arrays = make_plant()
+        for cycle in range(200):
+            command, mode = commands(cycle)
+            for plant in (arrays, scalars):
+                write_drive_mode(plant.calls, mode)
+                write_command(plant.calls, command)
+                assert advance(plant.calls, 1e-3) == 0
+                assert read_imus(plant.calls) == read_truth(plant.calls) == 0
+            for buffer in ("imu", "truth"):
+                assert scalars.calls[buffer].tobytes() == arrays.calls[buffer].tobytes()
+        np.testing.assert_array_equal(scalars.get("platform.inertia"), arrays.get("platform.inertia"))
+        scalars.set("payload.center_of_mass", [0.0, 0.01, 0.1])
+        assert scalars.get("payload.center_of_mass[2]") == 0.01
 
 
 def test_setting_by_name_is_the_compiled_command(make_plant: MakePlant) -> None:
