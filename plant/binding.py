@@ -295,7 +295,7 @@ class Bound:
         modes: of the drives.
         knows_pose: whether the truth tells the pose.
         planar_angle: whether it tells an angle in the place of a quaternion.
-        driven: names of the FMU's variables that the loop sets.
+        driven: names of the FMU's variables that the loop sets in every cycle.
     """
 
     legs: int
@@ -349,7 +349,7 @@ class _Binder:
         if self._problems:
             with_binding = f" with {self._binding.source}" if self._binding.source else ""
             raise FmuError(f"{self._description.path.name}{with_binding}: {'; '.join(self._problems)}")
-        written = [each.name for name in _WRITTEN for each in self._found.get(name, ())]
+        written = [each.name for name in (COMMANDS, MODES) for each in self._found.get(name, ())]
         return Bound(
             legs=self._legs,
             imus=imus["imu_angular_velocity"],

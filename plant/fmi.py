@@ -269,7 +269,7 @@ class FmuInstance:
         messages: the last that the FMU has logged, but for those that say that all is well.
         folder: where it has been extracted to.
         initialized: whether initialisation has ended.
-        broken: whether it has failed for good; nothing of it may be called then.
+        status: how it has failed; FMI allows less to be called then.
 
     Raises:
         FmuError: it holds no binary for this machine, or cannot be loaded.
@@ -279,7 +279,8 @@ class FmuInstance:
         self.description = description
         self.messages: deque[str] = deque(maxlen=_MOST_MESSAGES)
         self.folder = Path()
-        self.initialized = self.broken = self.closed = False
+        self.initialized = self.closed = False
+        self.status = OK
         self._cleanup = contextlib.ExitStack()
         try:
             self.fmu = self._load()
@@ -392,7 +393,7 @@ class FmuInstance:
 
     def failure(self, what: str, status: int) -> FmuError:
         """The error that says how `what` has ended, in the FMU's own words."""
-        self.broken = self.broken or status == FATAL
+        self.status = status
         reason = self.messages[-1] if self.messages else "the FMU gives no reason"
         return FmuError(f"{self.description.path.name}: {what} {_ENDINGS.get(status, f'ended with status {status}')}: {reason}")
 
@@ -476,12 +477,10 @@ class FmuInstance:
         return fmu
 
     def _free(self, fmu: Any) -> None:
-        if self.broken:
-            return
-        with contextlib.suppress(fmpy.fmi1.FMICallException):
-            if self.initialized:
-                fmu.terminate()
-        fmu.freeInstance()
+        if self.initialized and self.status < ERROR:
+            self._call("Terminate")
+        if self.status != FATAL:
+            fmu.freeInstance()
 
     def _callbacks(self) -> Any:
         """What FMI 2.0 wants of its importer; FMPy's proxy fills in the placeholders of messages."""

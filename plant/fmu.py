@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from plant.binding import OWN_BINDING, TRUTH_SIZE, Binding, Modes, Scalars, Setting, bind, load_binding
 from plant.compiled import Record, kernel
 from plant.errors import FmuError, InputError
-from plant.fmi import ASKS_TO_END, FATAL, NEEDS_EVENTS, OK, FmuDescription, FmuInstance, FmuVariable
+from plant.fmi import ASKS_TO_END, ERROR, NEEDS_EVENTS, OK, FmuDescription, FmuInstance, FmuVariable
 from plant.mechanism import LEGS
 from plant.pose import Array
 from plant.variables import DRIVE_MODES, IMU_COUNT, VELOCITY
@@ -198,7 +198,7 @@ class FmuPlant:
 
     def close(self) -> None:
         """Free the instance and remove what was extracted; closing twice does no harm."""
-        self._instance.broken = self._instance.broken or self.calls["status"] == FATAL
+        self._instance.status = max(self._instance.status, int(self.calls["status"]))
         self._instance.close()
 
     def get(self, name: str) -> NDArray[Any]:
@@ -421,9 +421,9 @@ def _ended(c: Record, call: int, status: int) -> int:
 
 @kernel
 def _access(c: Record, call: int, function: int, references: int, reference_count: int, values: int, count: int) -> int:
-    """Get or set values, unless the FMU has failed for good; returns FMI's status."""
-    if c.status == FATAL:
-        return FATAL
+    """Get or set values, unless the FMU has failed before; returns FMI's status."""
+    if c.status >= ERROR:
+        return int(c.status)
     if c.version == 2:
         status = _access_2(function, (c.instance, references, reference_count, values))
     else:
@@ -550,8 +550,9 @@ _INSTANT_S = 1e-9
 
 @kernel
 def _step(c: Record, step: float) -> int:
-    if c.status == FATAL:
-        return FATAL
+    """Take a communication step, unless the FMU has failed before; returns FMI's status."""
+    if c.status >= ERROR:
+        return int(c.status)
     if c.version == 2:
         status = _do_step_2(c.do_step, (c.instance, c.time, step, np.int32(1)))
     else:

@@ -7,6 +7,7 @@ from hypothesis import settings
 
 from plant.export import default_fmu
 from plant.mechanism import Mechanism, load_mechanism
+from tests.plant.foreign import build_foreign
 
 # The first example of a property may compile kernels, so there is no deadline; and the same examples come every time.
 settings.register_profile("gough", deadline=None, derandomize=True)
@@ -26,6 +27,12 @@ def hexapod() -> Mechanism:
 @pytest.fixture(scope="session")
 def fmu_path() -> Path:
     return default_fmu()
+
+
+@pytest.fixture(scope="session")
+def foreign_fmu(hexapod: Mechanism, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An FMU of FMI 2.0 that shares nothing with gough's own (`tests/plant/foreign.c`)."""
+    return build_foreign(tmp_path_factory.mktemp("foreign"), hexapod)
 
 
 @pytest.fixture(scope="session")

@@ -52,7 +52,7 @@ def _view(mechanism: str, target: str, rate: float, progress: Any) -> Any:
         ("state", f"{state}, {latest['time_ns'] / 1e9:.1f} s"),
         ("position [mm]", "  ".join(f"{value:9.3f}" for value in position)),
         ("roll, pitch, yaw [deg]", "  ".join(f"{degrees(angle):9.3f}" for angle in angles)),
-        ("estimate - truth, RMS [mm]", mm(errors["estimation"])),
+        ("estimate - truth, RMS [mm]", mm(errors["estimation"]) if errors["known"] else "the truth is not known"),
         ("reference - length, RMS [mm]", mm(errors["tracking"])),
         ("woken late p50, p99.9, max [us]", "  ".join(f"{wake[name]:.0f}" for name in ("p50", "p999", "max"))),
         ("computing p50, p99.9, max [us]", "  ".join(f"{compute[name]:.0f}" for name in ("p50", "p999", "max"))),

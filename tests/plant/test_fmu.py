@@ -1,5 +1,6 @@
 """Running an FMU: what is refused and why, what is left behind, and that compiled calls do what FMPy's methods do."""
 
+import ctypes
 import os
 import re
 import subprocess
@@ -15,7 +16,8 @@ import numpy as np
 import pytest
 
 from plant.errors import FmuError, InputError, UnknownNameError
-from plant.fmu import FmuPlant, advance, read_imus, read_truth, write_command, write_drive_mode
+from plant.export import PLANAR_MODEL, default_fmu
+from plant.fmu import FmuPlant, advance, read_imus, read_truth, write_command, write_drive_mode, write_drive_modes
 from plant.mechanism import Mechanism
 from plant.pose import Array
 from plant.variables import BRAKE, OPEN, OUTPUTS, VELOCITY
@@ -391,6 +393,63 @@ def test_compiled_calls_do_what_fmpys_methods_do(hexapod: Mechanism, fmu_path: P
             np.testing.assert_array_equal(plant.get(variable.name).ravel(), one_by_one)
     slow.terminate()
     slow.freeInstance()
+
+
+def test_our_fmi_2_export_does_the_same_without_a_binding(make_plant: MakePlant, hexapod: Mechanism) -> None:
+    with FmuPlant(default_fmu(fmi=2), hexapod.plant_parameters(), 1e-3) as scalars:
+        arrays = make_plant()
+        for cycle in range(200):
+            command, mode = commands(cycle)
+            for plant in (arrays, scalars):
+                write_drive_mode(plant.calls, mode)
+                write_command(plant.calls, command)
+                assert advance(plant.calls, 1e-3) == 0
+                assert read_imus(plant.calls) == read_truth(plant.calls) == 0
+            for buffer in ("imu", "truth"):
+                assert scalars.calls[buffer].tobytes() == arrays.calls[buffer].tobytes()
+        np.testing.assert_array_equal(scalars.get("platform.inertia"), arrays.get("platform.inertia"))
+        scalars.set("payload.center_of_mass", [0.0, 0.01, 0.1])
+        assert scalars.get("payload.center_of_mass[2]") == 0.01
+
+
+def test_our_planar_plant_needs_no_binding_either() -> None:
+    with FmuPlant(default_fmu(PLANAR_MODEL), {}, 1e-3) as plant:
+        assert (plant.bound.legs, plant.bound.imus) == (3, (0, 1, 2, 6))
+        for _ in range(100):
+            write_drive_mode(plant.calls, VELOCITY)
+            write_command(plant.calls, np.array([0.02, -0.01, 0.0]))
+            assert advance(plant.calls, 1e-3) == read_imus(plant.calls) == read_truth(plant.calls) == 0
+        imus = plant.get("imu_angular_velocity"), plant.get("imu_specific_force"), plant.get("imu_magnetic_field")
+        np.testing.assert_array_equal(plant.calls["imu"][:, [0, 1, 2, 6]], imus)
+        assert np.isnan(plant.calls["imu"][:, 3:6]).all()
+        half = float(plant.get("angle")) / 2.0
+        pose = [*plant.get("position"), 0.0, np.cos(half), 0.0, 0.0, np.sin(half)]
+        np.testing.assert_allclose(plant.calls["truth"][:7], pose, rtol=1e-15)
+        np.testing.assert_array_equal(plant.calls["truth"][7:10], plant.get("leg_length"))
+        np.testing.assert_array_equal(plant.calls["truth"][13:16], plant.get("current"))
+        assert np.isnan(plant.calls["truth"][[10, 11, 12, 16, 17, 18]]).all()
+
+
+@pytest.mark.parametrize("kind", ["Boolean", "UInt8", "Int16", "Int32", "UInt64", "Float64", "Float32"])
+def test_drive_modes_of_any_type_are_packed_as_fmi_3_has_them(fmu_path: Path, tmp_path: Path, kind: str) -> None:
+    replacement = (
+        rf'<{kind} name="drive_mode" valueReference="\1" causality="input" start="0 0 0 0 0 0"><Dimension start="6"/></{kind}>'
+    )
+    pattern = r'<Enumeration name="drive_mode" valueReference="(\d+)".*?</Enumeration>'
+    path = copy_of(fmu_path, tmp_path / "modes.fmu", {pattern: replacement})
+    seen = []
+
+    def take(instance: int, references: int, count: int, values: int, size: int) -> int:
+        dtype = np.dtype({"Boolean": "bool"}.get(kind, kind.lower()))
+        seen.extend(np.frombuffer(ctypes.string_at(values, size * dtype.itemsize), dtype).astype(float))
+        return 0
+
+    function = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 5)(take)
+    with FmuPlant(path, {}, 1e-3) as plant:
+        plant.calls["set_mode"] = ctypes.cast(function, ctypes.c_void_p).value
+        plant.calls["mode"] = [OPEN, BRAKE, VELOCITY, VELOCITY, BRAKE, OPEN]
+        assert write_drive_modes(plant.calls) == 0
+    assert seen == ([0, 0, 1, 1, 0, 0] if kind == "Boolean" else [0, 1, 2, 2, 1, 0])
 
 
 def test_setting_by_name_is_the_compiled_command(make_plant: MakePlant) -> None:
