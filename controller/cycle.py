@@ -4,6 +4,9 @@
 
 It allocates nothing, raises nothing and knows no clock: time is counted in periods, missed ones included. Constants lie in
 one structured array (dtype `PARAMETERS`), all state in another (dtype `STATE`); a copy of that is a snapshot.
+
+A planar mechanism goes through the same cycle in the first three rows of all that is kept by leg; its leg filters, direct
+kinematics and refinement do not leave the plane.
 """
 
 from collections.abc import Collection
@@ -50,7 +53,7 @@ from controller.settings import ControlSettings, FusionSettings, SafetySettings
 from plant.compiled import Record, kernel
 from plant.errors import InputError
 from plant.imu import STANDARD_GRAVITY
-from plant.mechanism import LEGS, Mechanism
+from plant.mechanism import LEGS, Mechanism, six_rows
 from plant.pose import Array
 from plant.variables import IMU_COUNT, PLATFORM_IMU
 
@@ -92,6 +95,8 @@ joint's angles."""
 
 PARAMETERS = np.dtype(
     [
+        ("legs", np.int64),
+        ("planar", np.int64),
         ("period", np.float64),
         ("hold_cycles", np.int64),
         ("safety", SAFETY_PARAMETERS),
@@ -145,8 +150,8 @@ PARAMETERS = np.dtype(
     ],
     align=True,
 )
-"""Constants of the cycle, in SI units; a calibrated reading is gain times the raw one plus offset, and `moving_mass` and
-`droop` belong to the load feed-forward.
+"""Constants of the cycle, in SI units; of what is kept by leg the first `legs` rows count. A calibrated reading is gain times
+the raw one plus offset, and `moving_mass` and `droop` belong to the load feed-forward.
 
 `vectors_in_base` are the vertical and the horizontal direction of the magnetic field, as unit vectors in {1}. A sample of the
 magnetometer stands for `field_cycles`; its heading has the `heading_variance`, and whatever is averaged at least the
@@ -261,10 +266,10 @@ def cycle_parameters(
     """Work out the constants of the cycle.
 
     Args:
-        mechanism: with home, limits and plant data, its joints where the calibration has moved them.
+        mechanism: spatial or planar, with home, limits and plant data, its joints where the calibration has moved them.
         rate: cycles per second [Hz].
         control, fusion: settings.
-        imus: which IMUs there are, 0-5 on the legs and 6 on the platform.
+        imus: which IMUs there are, 0-5 on the legs and 6 on the platform; those of legs that there are not do not count.
         whole: which errors of the IMUs the whole-mechanism filter estimates, a key of `mechanism_filter.BLOCKS`; None to do
             without that filter.
         calibration: of the IMUs; without one their readings are taken as they are.
@@ -295,14 +300,17 @@ def cycle_parameters(
         raise InputError(
             f"gravity is {gravity:g} m/s2; the accelerometers need at least {_LEAST_GRAVITY:g} to tell a direction"
         )
+    moments = [plant[f"{body}.mass"] * plant[f"{body}.center_of_mass"] for body in ("platform", "payload")]
     values = {
+        "legs": mechanism.legs,
+        "planar": mechanism.planar,
         "period": 1.0 / rate,
         "hold_cycles": int(np.ceil(control.hold * rate - 1e-9)),
         "safety": safety_parameters(safety or SafetySettings(), rate, mechanism.require_limits(), to_arm),
         "geometry": geometry_of(mechanism),
         "sensors": sensor_geometry(mechanism, calibration.tilt),
         "vectors_in_base": field.vectors,
-        "imu_present": [imu in imus for imu in ALL_IMUS],
+        "imu_present": [imu in imus_of(mechanism, imus) for imu in ALL_IMUS],
         "magnetometer": magnetometer,
         "section_5": section_5,
         "calibration_gain": calibration.gain,
@@ -339,14 +347,12 @@ def cycle_parameters(
         "acceleration_limit": mechanism.require_limits().acceleration,
         "jerk_limit": mechanism.require_limits().jerk,
         "settling_cycles": int(np.ceil(STOP_SETTLING_S * rate)),
-        "plausible_lengths": np.stack([stroke[:, 0] - margin, stroke[:, 1] + margin], axis=1),
+        "plausible_lengths": six_rows(np.stack([stroke[:, 0] - margin, stroke[:, 1] + margin], axis=1)),
         "command_delay": command_delay,
         "droop": nominal * (1.0 - plant["drive.compensation"]) / force_constant**2,
-        "moving_mass": sliding_mass + mass / LEGS,
+        "moving_mass": sliding_mass + mass / mechanism.legs,
         "mass": mass,
-        "first_moment": (
-            plant["platform.mass"] * plant["platform.center_of_mass"] + plant["payload.mass"] * plant["payload.center_of_mass"]
-        ),
+        "first_moment": np.pad(moments[0] + moments[1], (0, 3 - moments[0].size)),
         "lower_moment": plant["leg.lower.mass"] * plant["leg.lower.center"],
         "rod_mass": plant["leg.upper.mass"],
         "rod_center": plant["leg.upper.center"],
@@ -354,6 +360,11 @@ def cycle_parameters(
     for name, value in values.items():
         parameters[name] = value
     return parameters
+
+
+def imus_of(mechanism: Mechanism, imus: Collection[int] = ALL_IMUS) -> tuple[int, ...]:
+    """Those of `imus` that the legs of a mechanism and its platform can have."""
+    return tuple(imu for imu in ALL_IMUS if imu in imus and (imu < mechanism.legs or imu == PLATFORM_IMU))
 
 
 def check_rate(rate: float) -> None:
@@ -377,6 +388,8 @@ def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool =
         if imu not in ALL_IMUS:
             raise InputError(f"there is no IMU {imu}; 0 to 5 sit on the legs, 6 on the platform")
     field = field_of(mechanism)
+    if mechanism.planar and (magnetometer or section_5):
+        raise InputError(f"{mechanism.name!r} is planar and has no heading: do without magnetometer and section 5")
     if magnetometer and PLATFORM_IMU not in imus:
         raise InputError("the magnetometer is part of the platform's IMU, which is not there: add IMU 6")
     if magnetometer and field.horizontal < _LEAST_FIELD:
@@ -386,9 +399,16 @@ def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool =
         )
     if section_5 and not magnetometer:
         raise InputError("the paper's section 5 needs the platform's heading: add its magnetometer (--magnetometer)")
+    # Of the one axis of a planar joint, gravity tells the angle wherever the leg points.
+    in_plane = float(np.linalg.norm(mechanism.up_in_base[:2]))
+    if mechanism.planar and in_plane < _LEAST_OBSERVABILITY:
+        raise InputError(
+            f"gravity hardly tells the angles in the plane of {mechanism.name!r}: of the vertical only {in_plane:.2g} lies in "
+            f"it, and {_LEAST_OBSERVABILITY:g} is needed: set the plant's gravity"
+        )
     across = np.abs(mechanism.joint_rotations[:, :, 2] @ mechanism.up_in_base)
-    for leg in range(LEGS):
-        if leg in imus and across[leg] < _LEAST_OBSERVABILITY:
+    for leg in range(mechanism.legs):
+        if not mechanism.planar and leg in imus and across[leg] < _LEAST_OBSERVABILITY:
             raise InputError(
                 f"gravity hardly tells the angles of leg {leg}: of the vertical only {across[leg]:.2g} lies across the axes "
                 f"of its joint, and {_LEAST_OBSERVABILITY:g} is needed: turn base_joint_axes[{leg}], or leave its IMU out"
@@ -397,20 +417,22 @@ def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool =
     parameters, state = np.zeros((), PARAMETERS), np.zeros((), STATE)
     parameters["geometry"] = geometry_of(mechanism)
     parameters["vectors_in_base"], parameters["section_5"] = field.vectors, section_5
-    state["platform_used"], state["leg_used"] = PLATFORM_IMU in imus, [leg in imus for leg in range(LEGS)]
+    parameters["planar"] = mechanism.planar
+    state["platform_used"] = PLATFORM_IMU in imus
+    state["leg_used"] = [leg in imus_of(mechanism, imus) for leg in range(LEGS)]
     state["heading_used"] = magnetometer
     worst = np.inf
     for position, rotation in zip(positions, rotations, strict=True):
         legs = position + mechanism.platform_joints @ rotation.T - mechanism.base_joints
-        state["directions"] = legs / np.linalg.norm(legs, axis=1, keepdims=True)
+        state["directions"] = six_rows(legs / np.linalg.norm(legs, axis=1, keepdims=True))
         state["vectors"] = field.vectors @ rotation
         worst = min(worst, find_pose(parameters, state))
     if worst < WORST_CONDITIONING:
-        names = ", ".join(str(imu) for imu in sorted(imus)) or "none"
+        names = ", ".join(str(imu) for imu in imus_of(mechanism, imus)) or "none"
         remedies = ["legs"]
         if PLATFORM_IMU not in imus:
             remedies.append("the platform's IMU (6)")
-        if not magnetometer:
+        if not (magnetometer or mechanism.planar):
             remedies.append("its magnetometer (--magnetometer)")
         raise InputError(
             f"the IMUs {names} do not determine the pose of {mechanism.name!r} everywhere in its workspace (conditioning "
@@ -471,11 +493,11 @@ def prepare(parameters: Record, state: Record, segments: Array) -> None:
 @kernel
 def control(parameters: Record, state: Record, segments: Array) -> int:
     """From the pose to the commands; returns the cause of a fault, or `OK`."""
-    s = state[()]
+    p, s = parameters[()], state[()]
     invert(parameters, state)
     if s.prepared != s.cycle + 1:
         refer(parameters, state, segments)
-    for k in range(LEGS):
+    for k in range(p.legs):
         s.error[k] = s.reference[k, 0] - s.lengths[k]
     arm(parameters, state)
     regulate(parameters, state)
@@ -488,6 +510,7 @@ def invert(parameters: Record, state: Record) -> None:
     """Inverse kinematics of the estimated pose."""
     p, s = parameters[()], state[()]
     legs_at(p.geometry.base_joints, p.geometry.platform_joints, s.position, s.rotation, s.arms, s.predicted, s.lengths)
+    s.lengths[p.legs :] = 0.0
 
 
 @kernel
@@ -513,7 +536,7 @@ def regulate(parameters: Record, state: Record) -> None:
     """The six commands from the length deviations: nothing before the motion, then feed-forward and PID."""
     p, s = parameters[()], state[()]
     if s.safety.request != ENABLED or s.safety.mode < RUNNING:
-        for k in range(LEGS):
+        for k in range(p.legs):
             s.command[k] = 0.0
             s.previous_error[k] = s.error[k]
         return
@@ -536,7 +559,7 @@ def feed_load_forward(parameters: Record, state: Record) -> None:
     up = p.sensors.up_in_base[0]
     wrench, force = s.vectors_6[0], s.vectors_6[1]
     jacobian, transposed = s.matrices_6_6[0], s.matrices_6_6[1]
-    jacobian_at(s.arms, s.predicted, jacobian)
+    jacobian_at(s.arms, s.predicted, p.legs, jacobian)
     for i in range(6):
         wrench[i] = p.mass * p.sensors.gravity * up[i] if i < 3 else 0.0
         for j in range(6):
@@ -549,7 +572,7 @@ def feed_load_forward(parameters: Record, state: Record) -> None:
     wrench[3] = p.sensors.gravity * (m1 * up[2] - m2 * up[1])
     wrench[4] = p.sensors.gravity * (m2 * up[0] - m0 * up[2])
     wrench[5] = p.sensors.gravity * (m0 * up[1] - m1 * up[0])
-    for k in range(LEGS):
+    for k in range(p.legs):
         d, a = s.predicted[k], s.arms[k]
         along = d[0] * up[0] + d[1] * up[1] + d[2] * up[2]
         lever = (p.lower_moment + p.rod_mass * (s.lengths[k] - p.rod_center)) * p.sensors.gravity / s.lengths[k]
@@ -561,9 +584,9 @@ def feed_load_forward(parameters: Record, state: Record) -> None:
         wrench[4] += a[2] * f0 - a[0] * f2
         wrench[5] += a[0] * f1 - a[1] * f0
     if solve_least_squares(transposed, wrench, 6, force, s.vectors_9[0, :6], s.vectors_9[1, :6]) < RANK_TOLERANCE:
-        for k in range(LEGS):
+        for k in range(p.legs):
             force[k] = 0.0
-    for k in range(LEGS):
+    for k in range(p.legs):
         d = s.predicted[k]
         own = p.rod_mass * p.sensors.gravity * (d[0] * up[0] + d[1] * up[1] + d[2] * up[2])
         load = force[k] + own + p.moving_mass * s.reference[k, 2]

@@ -10,16 +10,23 @@ import numpy as np
 
 from controller.direct_kinematics.closed_forms import (
     pose_from_legs,
+    pose_from_roll,
     pose_from_rotation,
     pose_from_vector,
     rotation_from_vectors,
 )
-from controller.direct_kinematics.refinement import find_twist, move_pose, normal_equations, solve_normal_equations
+from controller.direct_kinematics.refinement import (
+    find_twist,
+    move_pose,
+    normal_equations,
+    solve_normal_equations,
+    stay_in_plane,
+)
 from controller.heading_filter import predict_heading, start_heading, update_heading
 from controller.imu_monitor import look_at_next
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import RANK_TOLERANCE
-from controller.leg_filter import leg_direction, predict_leg, start_leg, update_leg
+from controller.leg_filter import leg_direction, lock_second_axis, predict_leg, start_leg, update_leg
 from controller.mechanism_filter import collect, collect_field, extrapolate, start_filter, step_filter
 from controller.platform_filter import start_platform, step_platform
 from controller.safety import (
@@ -96,7 +103,7 @@ def calibrate(parameters: Record, state: Record, measurement: Array) -> None:
         elif s.stands[k] >= p.frozen_cycles:
             why, value, limit = IMU_FROZEN, s.stands[k], p.frozen_cycles
         noise = s.safety.noise[k]
-        if why == NO_CAUSE and noise > max(1.0, _NOISIER * (total_noise - noise) / (IMU_COUNT - 1)):
+        if why == NO_CAUSE and noise > max(1.0, _NOISIER * (total_noise - noise) / p.legs):
             why, value, limit = IMU_NOISY, noise, 1.0
         for kind in range(3):
             for i in range(3):
@@ -168,6 +175,8 @@ def fuse_leg(parameters: Record, state: Record, k: int) -> None:
         if period > _GAP_S:
             x[4:6] = 0.0
         predict_leg(x, covariance, period, p.leg_jerk, p.bias_walk)
+    if p.planar != 0:
+        lock_second_axis(x, covariance)
     update_leg(
         x, covariance, rate, force, up, p.sensors.leg_imu_position[k], p.sensors.gravity, p.gyroscope_variance,
         p.leg_force_variance, s.measurement_6, s.jacobian_6_9, s.vectors_9[0], s.vectors_9[1],
@@ -298,9 +307,16 @@ def fuse_heading(parameters: Record, state: Record) -> None:
 def find_pose(parameters: Record, state: Record) -> float:
     """The pose in closed form from the leg directions, and the vertical if the platform has an IMU; returns the
     conditioning. The platform's whole orientation, if it has a heading, stands in where those do not do, or is all that the
-    paper's section 5 takes from the platform.
+    paper's section 5 takes from the platform. A planar mechanism's pose takes the platform's vertical for its roll (section 6).
     """
     p, s = parameters[()], state[()]
+    if p.planar != 0:
+        s.conditioning = 0.0
+        if s.platform_used != 0:
+            s.conditioning = pose_from_roll(
+                p.geometry, s.directions, s.leg_used, p.vectors_in_base[0], s.vectors[0], s.position, s.rotation
+            )
+        return float(s.conditioning)
     if s.platform_used == 0:
         s.conditioning = pose_from_legs(p.geometry, s.directions, s.leg_used, s.position, s.rotation, s.scratch)
         return float(s.conditioning)
@@ -329,6 +345,8 @@ def improve_pose(parameters: Record, state: Record) -> bool:
             p.geometry.base_joints, p.geometry.platform_joints, s.directions, s.leg_weights, p.vectors_in_base, s.vectors,
             s.vector_weights, s.position, s.rotation, s.arms, s.predicted, s.lengths, s.information, s.vectors_6[0],
         )  # fmt: skip
+        if p.planar != 0:
+            stay_in_plane(s.information, s.vectors_6[0])
         if not solve_normal_equations(s.information, s.vectors_6[0], factor):
             return False
         if p.section_5 != 0:

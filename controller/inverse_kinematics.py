@@ -47,7 +47,7 @@ def inverse_kinematics(mechanism: Mechanism, pose: Pose) -> Legs:
 
 
 def leg_lengths(mechanism: Mechanism, positions: Array, rotations: Array) -> Array:
-    """The lengths (..., 6) [m] at positions (..., 3) [m] and rotations (..., 3, 3); unchecked."""
+    """The lengths (..., n) [m] of n legs at positions (..., 3) [m] and rotations (..., 3, 3); unchecked."""
     arms = np.einsum("...ij,kj->...ki", rotations, mechanism.platform_joints)
     lengths: Array = np.linalg.norm(positions[..., None, :] + arms - mechanism.base_joints, axis=-1)
     return lengths
@@ -76,9 +76,15 @@ def legs_at(
 
 
 @kernel
-def jacobian_at(arms: Array, directions: Array, jacobian: Array) -> None:
-    """Write the Jacobian (6, 6) of the lengths from arms (6, 3) and directions (6, 3)."""
-    for k in range(LEGS):
+def jacobian_at(arms: Array, directions: Array, legs: int, jacobian: Array) -> None:
+    """Write the Jacobian (6, 6) of the lengths from arms (6, 3) and directions (6, 3).
+
+    In the place of legs that a planar mechanism has not, its plane allows no translation along z, and no turns about x and y.
+    """
+    for k in range(legs, LEGS):
+        for i in range(6):
+            jacobian[k, i] = 1.0 if i == k - 1 else 0.0
+    for k in range(legs):
         a0, a1, a2 = arms[k, 0], arms[k, 1], arms[k, 2]
         d0, d1, d2 = directions[k, 0], directions[k, 1], directions[k, 2]
         jacobian[k, 0], jacobian[k, 1], jacobian[k, 2] = d0, d1, d2
@@ -91,7 +97,8 @@ _MOST_DRAWS = 500
 def sample_workspace(mechanism: Mechanism, count: int, seed: int) -> tuple[Array, Array]:
     """Random poses at which every leg is inside its stroke: positions (count, 3) [m] and rotations (count, 3, 3).
 
-    Drawn uniformly from a box about home, four fifths of the stroke's range to either side and 0.35 rad about each axis;
+    Drawn uniformly from a box about home, four fifths of the stroke's range to either side and 0.35 rad about each axis, of a
+    planar mechanism within its plane;
     the poses outside the strokes are thrown away.
 
     Raises:
@@ -104,8 +111,11 @@ def sample_workspace(mechanism: Mechanism, count: int, seed: int) -> tuple[Array
     for _ in range(_MOST_DRAWS):
         if len(positions) >= count:
             return positions[:count], rotations[:count]
-        drawn = home.position + random.uniform(-reach, reach, (2000, 3))
-        turned = np.array([rotation_from_vector(v) @ home.rotation for v in random.uniform(-0.35, 0.35, (2000, 3))])
+        moves = np.hstack([random.uniform(-reach, reach, (2000, 3)), random.uniform(-0.35, 0.35, (2000, 3))])
+        if mechanism.planar:
+            moves[:, 2:5] = 0.0
+        drawn = home.position + moves[:, :3]
+        turned = np.array([rotation_from_vector(v) @ home.rotation for v in moves[:, 3:]])
         lengths = leg_lengths(mechanism, drawn, turned)
         inside = ((lengths > limits.stroke[:, 0]) & (lengths < limits.stroke[:, 1])).all(axis=1)
         positions, rotations = np.concatenate([positions, drawn[inside]]), np.concatenate([rotations, turned[inside]])

@@ -91,6 +91,18 @@ def predict_leg(x: Array, covariance: Array, period: float, jerk: float, bias_wa
 
 
 @kernel
+def lock_second_axis(x: Array, covariance: Array) -> None:
+    """Hold the joint's second angle at rest, without doubt, before an update: in a planar mechanism the first axis is all that
+    the joint has.
+    """
+    for i in range(1, 6, 2):
+        x[i] = 0.0
+        for j in range(STATES):
+            covariance[i, j] = 0.0
+            covariance[j, i] = 0.0
+
+
+@kernel
 def predict_measurement(x: Array, up_in_joint: Array, d: Array, gravity: float, h: Array, jacobian: Array) -> None:
     """Write the expected measurement `h` (6,), rate then force, and its Jacobian (6, 9), whose other elements stay 0."""
     ca, sa, cb, sb = np.cos(x[0]), np.sin(x[0]), np.cos(x[1]), np.sin(x[1])

@@ -17,7 +17,7 @@ from controller.target import SAMPLE_PERIOD_S, Target
 from plant.compiled import kernel
 from plant.errors import PlanningError
 from plant.limits import Limits
-from plant.mechanism import LEGS, Mechanism
+from plant.mechanism import Mechanism, six_rows
 from plant.pose import Array
 
 PREVIEW_S = 0.03
@@ -40,7 +40,7 @@ class Reference:
     """A planned motion.
 
     Attributes:
-        segments: (6, n, 5), as `controller.reference` evaluates them.
+        segments: (6, n, 5), as `controller.reference` evaluates them; legs that there are not rest at 0.
         violations: how many segments leave a limit; the planner's promise is none.
     """
 
@@ -65,7 +65,7 @@ def plan(mechanism: Mechanism, target: Target, duration: float) -> Reference:
         planner.advance(positions[k], rates[k], accelerations[k])
     segments = planner.segments()
     horizon = knots * SAMPLE_PERIOD_S
-    return Reference(segments, count_violations(segments, horizon, limits))
+    return Reference(six_rows(segments), count_violations(segments, horizon, limits))
 
 
 def count_violations(segments: Array, horizon: float, limits: Limits) -> int:
@@ -80,9 +80,10 @@ class _Planner:
 
     def __init__(self, limits: Limits, lengths: Array, preview: float | None) -> None:
         self._limits = limits
-        self._state: tuple[list[float], ...] = (lengths.tolist(), [0.0] * LEGS, [0.0] * LEGS)
-        self._otg = Ruckig(LEGS, SAMPLE_PERIOD_S)
-        self._trajectory = Trajectory(LEGS)
+        self._legs = len(lengths)
+        self._state: tuple[list[float], ...] = (lengths.tolist(), [0.0] * self._legs, [0.0] * self._legs)
+        self._otg = Ruckig(self._legs, SAMPLE_PERIOD_S)
+        self._trajectory = Trajectory(self._legs)
         self._follow = _input(limits, ControlInterface.Position, preview)
         self._stop = _input(limits, ControlInterface.Velocity, None)
         self._stop.synchronization = Synchronization.No
@@ -97,7 +98,7 @@ class _Planner:
         self._reach = [(least + near, greatest - near) for least, greatest in limits.stroke.tolist()]
 
     def advance(self, positions: Array, rates: Array, accelerations: Array) -> None:
-        """Go on for a sample period towards a state (6,) each; a plan that leads to rest there is kept."""
+        """Go on for a sample period towards a state (legs,) each; a plan that leads to rest there is kept."""
         resting = not rates.any() and not accelerations.any()
         if not (resting and self._goal is not None and np.abs(positions - self._goal).max() < _STILL_M):
             kept = self._begin(positions.tolist(), rates.tolist(), accelerations.tolist())
@@ -107,7 +108,7 @@ class _Planner:
 
     def _begin(self, target: list[float], rates: list[float], accelerations: list[float]) -> bool:
         """Begin a plan at the present state; return whether it leads to the target itself and is safe to its end."""
-        rest = [0.0] * LEGS
+        rest = [0.0] * self._legs
         self._follow.target_position = target
         for rate, acceleration in ((rates, accelerations), (rates, rest), (rest, rest)):
             self._follow.target_velocity, self._follow.target_acceleration = rate, acceleration
@@ -155,9 +156,9 @@ class _Planner:
         )
 
     def segments(self) -> Array:
-        """All segments so far, (6, n, 5)."""
-        plans = np.array(self._plans).reshape(-1, LEGS, 2, _SEGMENTS)
-        segments = np.zeros((LEGS, len(plans) * (_SEGMENTS + 1), 5))
+        """All segments so far, (legs, n, 5)."""
+        plans = np.array(self._plans).reshape(-1, self._legs, 2, _SEGMENTS)
+        segments = np.zeros((self._legs, len(plans) * (_SEGMENTS + 1), 5))
         segments[:, :, 0] = np.inf
         starts = np.array([*self._starts, self._knot]) * SAMPLE_PERIOD_S
         longest = _collect_segments(plans, np.array(self._states), starts, segments)
@@ -165,17 +166,18 @@ class _Planner:
 
 
 def _input(limits: Limits, interface: ControlInterface, minimum_duration: float | None) -> InputParameter:
-    parameters = InputParameter(LEGS)
+    legs = len(limits.stroke)
+    parameters = InputParameter(legs)
     parameters.control_interface = interface
     parameters.minimum_duration = minimum_duration
-    parameters.max_velocity = [limits.velocity] * LEGS
-    parameters.max_acceleration = [limits.acceleration] * LEGS
-    parameters.max_jerk = [limits.jerk] * LEGS
+    parameters.max_velocity = [limits.velocity] * legs
+    parameters.max_acceleration = [limits.acceleration] * legs
+    parameters.max_jerk = [limits.jerk] * legs
     return parameters
 
 
 def _aims(mechanism: Mechanism, target: Target, knots: int) -> tuple[Array, Array, Array]:
-    """Lengths, rates and accelerations (knots, 6) to aim at, within the limits."""
+    """Lengths, rates and accelerations (knots, legs) to aim at, within the limits."""
     limits = mechanism.require_limits()
     if target.held:
         positions = leg_lengths(mechanism, *target.at(np.arange(knots) * SAMPLE_PERIOD_S + 1e-9))
@@ -205,10 +207,10 @@ def _collect_segments(plans: Array, states: Array, starts: Array, segments: Arra
     """Write the segments of each plan up to the start of the next, and return how many the longest row has.
 
     Args:
-        plans: (n, 6, 2, 9), durations and jerks.
-        states: (n, 3, 6), from which the plans start.
+        plans: (n, legs, 2, 9), durations and jerks.
+        states: (n, 3, legs), from which the plans start.
         starts: (n + 1,) [s]; the last is the end of the last plan.
-        segments: (6, m, 5), written.
+        segments: (legs, m, 5), written.
     """
     longest = 0
     for leg in range(plans.shape[1]):
@@ -260,7 +262,9 @@ def _segment_extrema(p: float, v: float, a: float, j: float, t: float) -> tuple[
 
 @kernel
 def _stops_inside(state: Array, stroke: Array, limits: Array) -> bool:
-    """Whether every leg, from its state (3, 6), can stop within its stroke (6, 2) at the limits of acceleration and jerk."""
+    """Whether every leg, from its state (3, legs), can stop within the stroke (legs, 2) and the limits of acceleration and
+    jerk.
+    """
     acceleration_limit, jerk_limit = limits[0], limits[1]
     for k in range(state.shape[1]):
         p, v, a = state[0, k], state[1, k], state[2, k]

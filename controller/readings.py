@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from controller.leg_filter import predict_measurement
 from plant.compiled import Record, kernel
-from plant.mechanism import LEGS, Mechanism
+from plant.mechanism import LEGS, Mechanism, six_rows
 from plant.pose import Array, rotation_from_vector
 from plant.variables import IMU_COUNT, PLATFORM_IMU
 
@@ -64,12 +64,12 @@ def sensor_geometry(mechanism: Mechanism, tilt: ArrayLike = (0.0, 0.0)) -> Recor
     plant = mechanism.plant_parameters()
     up = tilt_rotation(tilt) @ mechanism.up_in_base
     values = {
-        "base_joints": mechanism.base_joints,
-        "platform_joints": mechanism.platform_joints,
-        "joint_rotations": mechanism.joint_rotations,
-        "up_in_joint": np.swapaxes(mechanism.joint_rotations, 1, 2) @ up,
+        "base_joints": six_rows(mechanism.base_joints),
+        "platform_joints": six_rows(mechanism.platform_joints),
+        "joint_rotations": six_rows(mechanism.joint_rotations),
+        "up_in_joint": six_rows(np.swapaxes(mechanism.joint_rotations, 1, 2) @ up),
         "up_in_base": up,
-        "leg_imu_position": plant["leg_imu_position"],
+        "leg_imu_position": six_rows(plant["leg_imu_position"]),
         "platform_imu_position": plant["platform_imu_position"],
         "gravity": float(np.linalg.norm(plant["gravity"])),
     }

@@ -16,7 +16,7 @@ from controller.reference import plan_stop
 from controller.settings import SafetySettings
 from plant.compiled import Record, kernel
 from plant.limits import Limits
-from plant.mechanism import LEGS
+from plant.mechanism import LEGS, six_rows
 from plant.variables import IMU_COUNT
 
 IDLE, ARMED, RUNNING, STOPPING, STOPPED, FAULT = range(6)
@@ -243,7 +243,7 @@ def safety_parameters(settings: SafetySettings, rate: float, limits: Limits, arm
         "smoothing": min(IMU_COUNT / (rate * _CONTRADICTION_S), _LARGEST_SHARE),
         "lasting": max(_CONTRADICTION_S, _LEAST_LOOKS * IMU_COUNT / rate),
         "conditioning": settings.conditioning,
-        "lengths": limits.stroke + settings.stroke_margin * np.array([-1.0, 1.0]),
+        "lengths": six_rows(limits.stroke + settings.stroke_margin * np.array([-1.0, 1.0])),
         "speed": settings.velocity_margin * limits.velocity,
         "following": settings.following,
         "saturation": settings.saturation,
@@ -313,7 +313,7 @@ def _begin_stop(parameters: Record, state: Record, cause: int) -> None:
     s.stop_cycle = s.stopped_cycle = s.cycle
     if s.safety.mode == RUNNING:
         if s.missed > 0:
-            for k in range(LEGS):
+            for k in range(p.legs):
                 speed = min(max(s.command[k], -p.velocity_limit), p.velocity_limit)
                 s.reference[k, 0] += s.missed * p.period * speed
                 s.reference[k, 1], s.reference[k, 2] = speed, 0.0
@@ -339,7 +339,7 @@ def _fail(parameters: Record, state: Record, cause: int) -> None:
     if REACTION[cause] == STOP_QUICKLY and moving:
         s.safety.request = QUICK_STOP
         fastest = 0.0
-        for k in range(LEGS):
+        for k in range(p.legs):
             if not np.isfinite(s.command[k]):
                 s.command[k] = 0.0
             fastest = max(fastest, abs(s.command[k]))
@@ -355,7 +355,7 @@ def coast(parameters: Record, state: Record) -> None:
     """A cycle after a fault: every command comes to rest at the limit of acceleration, whatever is measured."""
     p, s = parameters[()], state[()]
     step = p.acceleration_limit * p.period * (1 + s.missed)
-    for k in range(LEGS):
+    for k in range(p.legs):
         s.command[k] -= min(max(s.command[k], -step), step)
     s.cycle += 1
 
@@ -379,7 +379,7 @@ def hear(parameters: Record, state: Record, sample_age: Record, drive: Record, s
     w = s.safety
     for k in range(IMU_COUNT):
         w.sample_age[k] = sample_age[k]
-    for k in range(LEGS):
+    for k in range(p.legs):
         w.drive[k] = drive[k]
     if silent > 0 and w.silent == 0:
         tell(state, ANSWER_LATE, -1, np.nan, np.nan)
@@ -389,7 +389,7 @@ def hear(parameters: Record, state: Record, sample_age: Record, drive: Record, s
         return
     if silent >= p.safety.bus_cycles or w.unanswered >= 2 * p.safety.bus_cycles:
         react(parameters, state, BUS_LOST, -1, max(silent, w.unanswered), p.safety.bus_cycles)
-    for k in range(LEGS):
+    for k in range(p.legs):
         if drive[k] == FAULTY:
             react(parameters, state, DRIVE_FAULT, k, np.nan, np.nan)
         elif w.mode != ARMED and drive[k] != FOLLOWING:
@@ -448,7 +448,7 @@ def arm(parameters: Record, state: Record) -> None:
             # The drives are enabled already: this does not wait.
             react(parameters, state, w.obstacle, w.obstacle_index, w.obstacle_value, w.obstacle_limit)
             return
-        for k in range(LEGS):
+        for k in range(p.legs):
             if w.drive[k] != FOLLOWING:
                 _obstruct(state, NO_DRIVES, k, np.nan, np.nan)
         if w.obstacle == NO_CAUSE:
@@ -489,7 +489,7 @@ def _look_for_obstacle(parameters: Record, state: Record) -> None:
             lost += 1
             if lost > limits.most_lost_imus:
                 _obstruct(state, NO_SENSORS, k, np.nan, np.nan)
-    for k in range(LEGS):
+    for k in range(p.legs):
         low, high = limits.lengths[k, 0], limits.lengths[k, 1]
         if not low <= s.lengths[k] <= high:
             _obstruct(state, NO_WORKSPACE, k, s.lengths[k], low if s.lengths[k] < low else high)
@@ -516,7 +516,7 @@ def watch(parameters: Record, state: Record) -> int:
     """
     p, s = parameters[()], state[()]
     w, limits = s.safety, p.safety
-    for k in range(LEGS):
+    for k in range(p.legs):
         if not (np.isfinite(s.command[k]) and np.isfinite(s.lengths[k])):
             react(parameters, state, NOT_FINITE, k, np.nan, np.nan)
             return NOT_FINITE
@@ -529,7 +529,7 @@ def watch(parameters: Record, state: Record) -> int:
         react(parameters, state, IMUS_LOST, -1, lost, limits.most_lost_imus)
     if s.conditioning < limits.conditioning and s.filter_trusted == 0:
         react(parameters, state, ILL_CONDITIONED, -1, s.conditioning, limits.conditioning)
-    for k in range(LEGS):
+    for k in range(p.legs):
         length, command, d, a = s.lengths[k], s.command[k], s.predicted[k], s.arms[k]
         low, high = p.plausible_lengths[k, 0], p.plausible_lengths[k, 1]
         if not low <= length <= high:

@@ -35,6 +35,9 @@ _SHAKING_SHARE = 0.85
 _FADE_S = 1.0
 _STEP_S = 2.0
 
+_IN_PLANE_M, _IN_PLANE_RAD = 1e-9, 1e-6
+"""What counts as being in the plane."""
+
 
 @dataclass(frozen=True, eq=False)
 class Target:
@@ -113,7 +116,8 @@ def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float)
 
     Raises:
         UnknownNameError: neither a motion nor a file.
-        InputError: the file is malformed, not finite, out of order, or its quaternions are off unit by more than 1e-3.
+        InputError: the file is malformed, not finite, out of order, its quaternions are off unit by more than 1e-3, or it
+            leaves the plane of a planar mechanism.
     """
     check_duration(duration)
     if str(name_or_path) in (*MOTIONS, *_WIDE_MOTIONS):
@@ -123,7 +127,10 @@ def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float)
         raise UnknownNameError(
             f"no target {str(name_or_path)!r}: neither a motion ({', '.join((*MOTIONS, *_WIDE_MOTIONS))}) nor a CSV file"
         )
-    return _cut(_read_csv(path, mechanism), duration)
+    target = _cut(_read_csv(path, mechanism), duration)
+    if mechanism.planar:
+        _check_in_plane(target, mechanism)
+    return target
 
 
 def _read_csv(path: Path, mechanism: Mechanism) -> Target:
@@ -167,6 +174,18 @@ def _read_csv(path: Path, mechanism: Mechanism) -> Target:
     )
 
 
+def _check_in_plane(target: Target, mechanism: Mechanism) -> None:
+    off = np.abs(target.positions[:, 2])
+    tilts = np.arccos(np.clip(target.rotations[:, 2, 2], -1.0, 1.0))
+    out = np.flatnonzero((off > _IN_PLANE_M) | (tilts > _IN_PLANE_RAD))
+    if len(out):
+        first = out[0]
+        raise InputError(
+            f"the target {target.name} leaves the plane of {mechanism.name!r} at {target.times[first]:g} s by "
+            f"{1e3 * off[first]:.3g} mm and {np.degrees(tilts[first]):.3g} deg: give x, y and a turn about z alone"
+        )
+
+
 def _cut(target: Target, duration: float) -> Target:
     """Leave out what comes after the first sample past the duration, to which the motion is still heading."""
     last = int(np.searchsorted(target.times, duration + MARGIN_S)) + 1
@@ -182,7 +201,8 @@ def _named_motion(name: str, mechanism: Mechanism, duration: float) -> Target:
     times = np.arange(0.0, duration + MARGIN_S + period, period)
     # The reach is in proportion to the stroke, so that every preset can make every motion.
     stroke = mechanism.require_limits().stroke
-    displacements = MOTIONS[name](times) * float((stroke[:, 1] - stroke[:, 0]).min() / 0.12)
+    motions = PLANAR_MOTIONS if mechanism.planar else MOTIONS
+    displacements = motions[name](times) * float((stroke[:, 1] - stroke[:, 0]).min() / 0.12)
     rotations = np.array([rotation_from_vector(vector) @ home.rotation for vector in displacements[:, 3:]])
     return Target(name, times, home.position + displacements[:, :3], rotations, held)
 
@@ -216,6 +236,26 @@ def _steps(times: Array) -> Array:
     poses = np.zeros((7, 6))
     for axis, size in enumerate((0.02, 0.02, 0.02, np.radians(4.0), np.radians(4.0), np.radians(8.0))):
         poses[axis + 1, axis] = size
+    return poses[np.arange(len(times)) % len(poses)]
+
+
+def _planar_circle(times: Array) -> Array:
+    angle = 2.0 * np.pi * 0.25 * times
+    motion = np.zeros((len(times), 6))
+    motion[:, 0], motion[:, 1], motion[:, 5] = 0.03 * np.cos(angle), 0.03 * np.sin(angle), np.radians(10.0) * np.sin(angle)
+    return motion * _fade(times)
+
+
+def _planar_sines(times: Array) -> Array:
+    motion = _sines(times)
+    motion[:, 2:5] = 0.0
+    return motion
+
+
+def _planar_steps(times: Array) -> Array:
+    poses = np.zeros((4, 6))
+    for row, (axis, size) in enumerate(((0, 0.02), (1, 0.02), (5, np.radians(8.0)))):
+        poses[row + 1, axis] = size
     return poses[np.arange(len(times)) % len(poses)]
 
 
@@ -261,6 +301,8 @@ def shaking(mechanism: Mechanism, duration: float, share: float = 1.0) -> Target
     spread = float(np.linalg.norm(mechanism.platform_joints, axis=1).mean())
     frequencies = _SHAKING_HZ * (1.0 + 0.04 * (np.arange(6.0) - 2.5))
     shape = np.sin(2.0 * np.pi * frequencies * times[:, None]) * _fade(times) * np.repeat([1.0, 1.0 / spread], 3)
+    if mechanism.planar:
+        shape[:, 2:5] = 0.0
 
     def at(size: float) -> tuple[Array, Array]:
         turned = np.array([rotation_from_vector(size * vector) @ home.rotation for vector in shape[:, 3:]])
@@ -291,3 +333,8 @@ _WIDE_MOTIONS: dict[str, Callable[[Mechanism, float], Target]] = {
 
 MOTIONS: dict[str, Callable[[Array], Array]] = {"hold": _hold, "circle": _circle, "sines": _sines, "steps": _steps}
 """Displacements from home (N, 6), position [m] and rotation vector [rad], at times (N,) [s]."""
+
+PLANAR_MOTIONS: dict[str, Callable[[Array], Array]] = {
+    "hold": _hold, "circle": _planar_circle, "sines": _planar_sines, "steps": _planar_steps,
+}  # fmt: skip
+"""The same in the plane."""

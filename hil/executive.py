@@ -61,7 +61,7 @@ from hil.target_stream import HOST, PORT, open_socket, receive
 from hil.timing import Timing, over_budget
 from plant.compiled import Record
 from plant.errors import GoughError, InputError
-from plant.mechanism import load_spatial
+from plant.mechanism import load_in_space, load_spatial
 
 _BUFFER_S = 8.0
 _LEAST_RECORDS = 1024
@@ -130,7 +130,8 @@ class Progress:
         posed = records[records["status"] == 0]
         known = posed[np.isfinite(posed["truth"][:, 0])]
         self.squares[0] += np.sum((known["position"] - known["truth"][:, :3]) ** 2)
-        self.squares[1] += np.mean((posed["lengths"] - posed["reference"][:, :, 0]) ** 2, axis=1).sum()
+        errors = posed["lengths"] - posed["reference"][:, :, 0]
+        self.squares[1] += (np.sum(errors**2, axis=1) / np.count_nonzero(posed["lengths"], axis=1)).sum()
         self.squares[2] += len(posed)
         self.known += len(known)
         self.refused_packets = int(records["refused"][-1])
@@ -443,10 +444,10 @@ def rig_of(config: SimulationConfig) -> Rig | None:
     if config.rig == "replay":
         if not config.rig_at:
             raise InputError("a replay needs its recording: name it with --rig-at FILE.mcap")
-        return ReplayRig(config.rig_at.split(","), 1.0 / config.rate, load_spatial(config.mechanism))
+        return ReplayRig(config.rig_at.split(","), 1.0 / config.rate, load_in_space(config.mechanism))
     if config.rig.startswith(PYTHON_RIG):
         name = config.rig.removeprefix(PYTHON_RIG)
-        return python_rig(name, load_spatial(config.mechanism), 1.0 / config.rate, config.rig_at)
+        return python_rig(name, load_in_space(config.mechanism), 1.0 / config.rate, config.rig_at)
     return None
 
 

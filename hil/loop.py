@@ -124,7 +124,7 @@ on, and what was asked of it before it; mode and request to the drives (`control
 round trip, refused packets, and what was really sent; what happened; which IMUs were used (a bit each, and the eighth for
 the platform's magnetometer), and whether the pose is the whole-mechanism filter's; raw IMU data; the pose with covariance
 (translation, rotation; in {1}), residuals of the directions and conditioning; lengths, reference (length, rate,
-acceleration) and commands; and the truth as the plant's `truth` buffer has it.
+acceleration) and commands, 0 for legs that a planar mechanism has not; and the truth as the plant's `truth` buffer has it.
 """
 
 HEAD, STOP, DONE, TAIL, KEPT, SUPERVISOR, START = range(7)

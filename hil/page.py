@@ -54,12 +54,13 @@ def figure_html(name: str, title: str, caption: str, figure: go.Figure, kind: st
     return f'<figure class="{kind}"><h2>{title}</h2>\n{plot}\n<figcaption>{caption}</figcaption></figure>\n'
 
 
-def scene(points: Array, up: Array) -> dict[str, Any]:
-    """Fixed axes with equal scales that hold all `points` (N, 3), seen from aside and a little above."""
+def scene(points: Array, up: Array, front: Array | None = None) -> dict[str, Any]:
+    """Fixed axes with equal scales that hold all `points` (N, 3), seen from aside and above, or from a `front` (3,)."""
     margin = 0.05 * np.ptp(points, axis=0).max()
     ranges = np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin], axis=1)
     aside = np.array([1.15, -1.4, 0.0])
-    looks = {"up": up, "eye": aside + (0.6 - aside @ up) * up, "center": -0.1 * up}
+    eye = aside + (0.6 - aside @ up) * up if front is None else 1.9 * front
+    looks = {"up": up, "eye": eye, "center": -0.1 * up}
     look = {"showbackground": False, "showspikes": False, "gridcolor": "#e3e7eb", "color": FAINT, "nticks": 5}
     return {
         **{

@@ -70,7 +70,7 @@ _NOTES = {
     "covariance": "row by row, of translation [m] and rotation [rad] in {1}",
     "residuals": "measured less predicted direction, six legs by three",
     "conditioning": "1 is best, 0 singular",
-    "lengths": "m",
+    "lengths": "m; 0 for legs that there are not",
     "reference": "six legs by length [m], rate [m/s], acceleration [m/s^2]",
     "command": "m/s",
     "truth": "position [m], quaternion (w first), lengths [m], currents [A]",

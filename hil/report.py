@@ -30,7 +30,6 @@ from hil.page import (
 )
 from hil.simulation import SimulationResult
 from plant.files import write_whole
-from plant.mechanism import LEGS
 from plant.pose import Array, rotation_angle
 
 _POINTS = 3000
@@ -152,16 +151,17 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
     """Name, title, caption and figure of everything that is drawn over time."""
     records, times = result.records, result.times
     limits, home_pose = result.mechanism.require_limits(), result.mechanism.require_home()
+    names, legs_there = LEG_NAMES[: result.mechanism.legs], slice(result.mechanism.legs)
     estimate = (records["position"], records["rotation"])
     actual, real = _actual_poses(result), _real(result)
     planned = (result.reference_positions, result.reference_rotations)
-    true_lengths, currents = records["truth"][:, 7:13], records["truth"][:, 13:19]
+    true_lengths, currents = records["truth"][:, 7:13][:, legs_there], records["truth"][:, 13:19][:, legs_there]
     lengths_known = bool(np.isfinite(true_lengths[:1]).all())
     lengths, real_length = (
-        1e3 * (true_lengths if lengths_known else records["lengths"]),
+        1e3 * (true_lengths if lengths_known else records["lengths"][:, legs_there]),
         "True" if lengths_known else "Estimated",
     )
-    planned_lengths, rates, accelerations = np.moveaxis(records["reference"], 2, 0) * [[[1e3]], [[1e3]], [[1.0]]]
+    planned_lengths, rates, accelerations = np.moveaxis(records["reference"][:, legs_there], 2, 0) * [[[1e3]], [[1e3]], [[1.0]]]
 
     home = (home_pose.position, home_pose.rotation)
     pose = [
@@ -178,18 +178,18 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
     ]
     legs = [
         _Panel(f"{name} [mm]", (name,), lengths[:, [k]], planned_lengths[:, [k]], 1e3 * limits.stroke[k])
-        for k, name in enumerate(LEG_NAMES)
+        for k, name in enumerate(names)
     ]
     motion = [
-        _Panel("speed [mm/s]", LEG_NAMES, rates, limits=(-1e3 * limits.velocity, 1e3 * limits.velocity)),
-        _Panel("acceleration [m/s²]", LEG_NAMES, accelerations, limits=(-limits.acceleration, limits.acceleration)),
+        _Panel("speed [mm/s]", names, rates, limits=(-1e3 * limits.velocity, 1e3 * limits.velocity)),
+        _Panel("acceleration [m/s²]", names, accelerations, limits=(-limits.acceleration, limits.acceleration)),
     ]
     drives = [
-        _Panel("length error [mm]", LEG_NAMES, lengths - planned_lengths),
-        _Panel("command [mm/s]", LEG_NAMES, 1e3 * records["command"]),
+        _Panel("length error [mm]", names, lengths - planned_lengths),
+        _Panel("command [mm/s]", names, 1e3 * records["command"][:, legs_there]),
     ]
     if np.isfinite(currents[:1]).all():
-        drives.append(_Panel("motor current [A]", LEG_NAMES, currents))
+        drives.append(_Panel("motor current [A]", names, currents))
     return [
         (
             "pose",
@@ -334,6 +334,7 @@ def _mechanism_view(result: SimulationResult) -> tuple[go.Figure, float]:
     base_ring, platform_ring = ring(base), ring(platform)
     numbers = base + 0.12 * (base - base.mean(axis=0))
     tube = _TUBE * 1e3 * mechanism.require_limits().stroke[:, :1]
+    points = np.concatenate([numbers, joints.reshape(-1, 3), path])
     triad = 0.4 * np.linalg.norm(platform, axis=1).max()
 
     def moving_parts(k: int) -> list[dict[str, Array]]:
@@ -357,13 +358,13 @@ def _mechanism_view(result: SimulationResult) -> tuple[go.Figure, float]:
         [
             plate_trace(plate, "#6d87a3", 0.55),
             line_trace(outline, "#3d5670", 6),
-            line_trace(tubes, segment_colors(LEG_NAMES), 14),
+            line_trace(tubes, segment_colors(LEG_NAMES[: mechanism.legs]), 14),
             line_trace(rods, "#6b7683", 6),
             line_trace(axes, segment_colors(AXIS_NAMES), 5),
             plate_trace(coordinates(base[base_ring[:-1]]), FAINT, 0.35),
             line_trace(coordinates(base[base_ring]), "#5c6873", 6),
             line_trace(coordinates(path), FAINT, 2),
-            go.Scatter3d(coordinates(numbers), mode="text", text=[str(k) for k in range(LEGS)], hoverinfo="skip"),
+            go.Scatter3d(coordinates(numbers), mode="text", text=[str(k) for k in range(mechanism.legs)], hoverinfo="skip"),
         ],
         frames=[frame(k) for k in range(count)],
     )
@@ -373,7 +374,7 @@ def _mechanism_view(result: SimulationResult) -> tuple[go.Figure, float]:
         margin={"l": 0, "r": 0, "t": 0, "b": 10},
         showlegend=False,
         uirevision="kept",
-        scene=scene(np.concatenate([numbers, joints.reshape(-1, 3), path]), mechanism.up_in_base),
+        scene=scene(points, mechanism.up_in_base, np.array([0.0, 0.0, 1.0]) if mechanism.planar else None),
         **_player(result.times[shown], frame_s),
     )
     return figure, span / count / frame_s

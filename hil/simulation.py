@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from controller.calibration import Calibration, load_calibration
-from controller.cycle import ALL_IMUS, OK, STATE, check_rate, cycle_parameters
+from controller.cycle import ALL_IMUS, OK, STATE, check_rate, cycle_parameters, imus_of
 from controller.direct_kinematics import poses_from_lengths
 from controller.fusion import find_vertical, fuse_heading, point_legs, prepare_platform
 from controller.inverse_kinematics import leg_lengths
@@ -25,10 +25,10 @@ from hil.loop import COMPUTED, RECORD, Loop, PythonFilters
 from plant.binding import OWN_BINDING, Setting, load_binding
 from plant.compiled import Record
 from plant.errors import GoughError, InputError, UnknownNameError
-from plant.export import default_fmu
+from plant.export import default_fmu, model_of
 from plant.fmu import CALLS, FmuPlant
 from plant.imu import ACCELEROMETER, GYROSCOPE, RIGHT_WIRING, Wiring, imu_state, load_imu
-from plant.mechanism import LEGS, Mechanism, load_spatial
+from plant.mechanism import LEGS, Mechanism, load_in_space
 from plant.pose import Array, Pose, checked_seed, rotation_angle, rotations_from_quaternions
 from plant.variables import PLATFORM_IMU
 
@@ -278,9 +278,11 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
     Raises:
         GoughError: something in the configuration cannot be used.
     """
-    nominal = load_spatial(config.mechanism)
+    nominal = load_in_space(config.mechanism)
     calibration = Calibration() if config.calibration is None else load_calibration(config.calibration)
-    mechanism = nominal.moved_joints(calibration.joints)
+    if nominal.planar:
+        _check_planar(config, calibration)
+    mechanism = nominal.moved_joints(calibration.joints[:, : nominal.legs])
     target = load_target("hold" if config.streamed else config.target, mechanism, config.duration)
     period = 1.0 / config.rate
     model = load_imu(config.imu)
@@ -326,13 +328,25 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         yield loop
 
 
+def _check_planar(config: SimulationConfig, calibration: Calibration) -> None:
+    """Check that nothing is asked for that a planar mechanism cannot do."""
+    if config.fusion != "compiled":
+        raise InputError(f"fusion {config.fusion!r} is for six legs; for {config.mechanism}, which is planar, take 'compiled'")
+    if config.streamed:
+        raise InputError(f"a target can be streamed to six legs alone; {config.mechanism} is planar: give a motion or a file")
+    if config.rig in ("udp", "canopen"):
+        raise InputError(f"the rig {config.rig!r} has six legs, and {config.mechanism} has three: choose another rig")
+    if calibration.joints.any():
+        raise InputError(f"{config.calibration} moves the joints of six legs, and {config.mechanism} has three: leave them out")
+
+
 def simulated_plant(config: SimulationConfig, nominal: Mechanism, start: Pose) -> FmuPlant:
     """The plant that a configuration describes, at rest at its start; one with a binding starts where it says.
 
     Raises:
         GoughError: the FMU, its binding, a setting or the joint error cannot be used.
     """
-    fmu = default_fmu() if config.plant is None else Path(config.plant)
+    fmu = default_fmu(model_of(nominal)) if config.plant is None else Path(config.plant)
     binding = OWN_BINDING if config.binding is None else load_binding(config.binding)
     if config.joint_error and not binding.native:
         raise InputError(f"{binding.source} binds an FMU with joints of its own, which have no joint error: leave it out")
@@ -355,9 +369,9 @@ def simulated_plant(config: SimulationConfig, nominal: Mechanism, start: Pose) -
 def _check_plant(config: SimulationConfig, plant: FmuPlant, nominal: Mechanism) -> None:
     """Check that a plant has what the loop is to drive and to read."""
     name, bound = plant.path.name, plant.bound
-    if bound.legs != LEGS:
-        raise InputError(f"{name} has {bound.legs} legs, and {nominal.name} has {LEGS}: choose another mechanism")
-    absent = set(config.imus) - set(bound.imus)
+    if bound.legs != nominal.legs:
+        raise InputError(f"{name} has {bound.legs} legs, and {nominal.name} has {nominal.legs}: choose another mechanism")
+    absent = set(imus_of(nominal, config.imus)) - set(bound.imus)
     if absent:
         there = ",".join(map(str, bound.imus))
         raise InputError(f"{name} has no IMU {', '.join(map(str, sorted(absent)))}: leave it out with --imus {there}")
@@ -368,7 +382,9 @@ def _check_plant(config: SimulationConfig, plant: FmuPlant, nominal: Mechanism) 
 def _result(config: SimulationConfig, loop: PreparedLoop, done: int, took: float) -> SimulationResult:
     records = loop.records[:done]
     times = (np.arange(done) - int(loop.parameters["hold_cycles"])) / config.rate
-    positions, rotations = poses_from_lengths(loop.mechanism, records["reference"][:, :, 0], loop.target.start)
+    positions, rotations = poses_from_lengths(
+        loop.mechanism, records["reference"][:, : loop.mechanism.legs, 0], loop.target.start
+    )
     target_positions, target_rotations = loop.target.at(times)
     return SimulationResult(
         config, loop.mechanism, loop.target, loop.reference, times, records, positions, rotations, target_positions,

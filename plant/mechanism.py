@@ -45,6 +45,13 @@ from plant.variables import SPATIAL, TINY, checked_parameters
 LEGS = 6
 
 
+def six_rows(values: Array, filling: ArrayLike = 0.0) -> Array:
+    """Values by leg (n, ...) for arrays of six, with a filling in the rows of the legs that there are not."""
+    rows: Array = np.empty((LEGS, *values.shape[1:]))
+    rows[: len(values)], rows[len(values) :] = values, filling
+    return rows
+
+
 _NOMINAL_HEIGHT = 7.0 / 6.0
 """Height of a nominal home over the base's radius."""
 

@@ -11,6 +11,7 @@ same least-squares problem with two rows a leg instead of three.
 - Legs alone: linear in p and R, of a rank that the graph of the legs tells. Rotations obey twenty quadratic equations,
   which are linear in the parameters that the legs leave open and in the products of those: up to five parameters, hence
   four legs or more, of every class, with coplanar platform joints or not.
+- Planar, the roll known (the paper's section 6): linear in the position in the plane.
 
 All return the conditioning: the ratio of the least to the greatest pivot of what was solved, with rotations counted in the
 joints' spread, so that it depends neither on size nor on frames; 0 where nothing was solved.
@@ -22,7 +23,7 @@ import numpy as np
 
 from controller.least_squares import RANK_TOLERANCE, solve_least_squares, solve_truncated
 from plant.compiled import Record, kernel
-from plant.mechanism import LEGS, Mechanism
+from plant.mechanism import LEGS, Mechanism, six_rows
 from plant.planar import SAME_JOINT_M
 from plant.pose import Array
 
@@ -92,13 +93,17 @@ from a rotation it came out.
 """
 
 
+_OUT_OF_THE_WAY = (0.0, 0.0, -1.0)
+"""Base joint in the rows of legs that a planar mechanism has not, so that none of them has the length zero [m]."""
+
+
 @lru_cache(maxsize=256)
 def geometry_of(mechanism: Mechanism) -> Record:
     """What the closed forms need of a mechanism, a record of dtype `GEOMETRY`."""
     geometry = np.zeros((), GEOMETRY)
-    platform = mechanism.platform_joints
+    platform = six_rows(mechanism.platform_joints)
     apart = np.linalg.norm(platform[:, None] - platform, axis=2)
-    geometry["base_joints"], geometry["platform_joints"] = mechanism.base_joints, platform
+    geometry["base_joints"], geometry["platform_joints"] = six_rows(mechanism.base_joints, _OUT_OF_THE_WAY), platform
     geometry["platform_numbers"] = numbers = np.argmax(apart < SAME_JOINT_M, axis=1)
     geometry["spreads"] = 1.0
     for number in range(1, _SETS):
@@ -195,6 +200,43 @@ def pose_from_rotation(
             arm = rotation[i, 0] * a0 + rotation[i, 1] * a1 + rotation[i, 2] * a2
             scratch.points[k, i] = geometry.base_joints[k, i] - arm
     return meeting_point(scratch.points, directions, measured, position, scratch)
+
+
+@kernel
+def pose_from_roll(
+    geometry: Record, directions: Array, measured: Array, in_base: Array, in_platform: Array, position: Array, rotation: Array
+) -> float:
+    """Pose of a planar mechanism in the xy-plane of {1} from its roll and two or more legs (the paper's section 6).
+
+    The roll is the angle between one vector's parts in the plane, as it is known in {1} and in {2}, in the place of (30); the
+    position is that of least squares of all legs (31). Returns the conditioning of the position, which is what can fail.
+    """
+    b0, b1, v0, v1 = in_base[0], in_base[1], in_platform[0], in_platform[1]
+    cosine, sine = b0 * v0 + b1 * v1, b1 * v0 - b0 * v1
+    size = np.sqrt(cosine * cosine + sine * sine)
+    if not size > RANK_TOLERANCE:
+        return 0.0
+    cosine, sine = cosine / size, sine / size
+    n00 = n01 = n11 = r0 = r1 = 0.0
+    for k in range(LEGS):
+        if measured[k] == 0.0:
+            continue
+        n0, n1 = -directions[k, 1], directions[k, 0]
+        a0, a1 = geometry.platform_joints[k, 0], geometry.platform_joints[k, 1]
+        off = n0 * (geometry.base_joints[k, 0] - cosine * a0 + sine * a1)
+        off += n1 * (geometry.base_joints[k, 1] - sine * a0 - cosine * a1)
+        n00, n01, n11 = n00 + n0 * n0, n01 + n0 * n1, n11 + n1 * n1
+        r0, r1 = r0 + n0 * off, r1 + n1 * off
+    middle, swing = 0.5 * (n00 + n11), np.sqrt(0.25 * (n00 - n11) ** 2 + n01 * n01)
+    if not middle - swing > RANK_TOLERANCE**2 * middle:
+        return 0.0
+    determinant = n00 * n11 - n01 * n01
+    position[0], position[1], position[2] = (n11 * r0 - n01 * r1) / determinant, (n00 * r1 - n01 * r0) / determinant, 0.0
+    for i in range(3):
+        for j in range(3):
+            rotation[i, j] = 1.0 if i == j else 0.0
+    rotation[0, 0], rotation[0, 1], rotation[1, 0], rotation[1, 1] = cosine, -sine, sine, cosine
+    return float(np.sqrt((middle - swing) / (middle + swing)))
 
 
 @kernel

@@ -9,6 +9,9 @@ from plant.compiled import kernel
 from plant.mechanism import LEGS
 from plant.pose import Array, rotate_by_vector
 
+_BEYOND_DOUBT = 1e30
+"""Inverse variance of what is known."""
+
 
 @kernel
 def _across(direction: Array, x0: float, x1: float, x2: float) -> tuple[float, float, float]:
@@ -109,6 +112,17 @@ def normal_equations(
         correction[3] += w * (v1 * b2 - v2 * b1)
         correction[4] += w * (v2 * b0 - v0 * b2)
         correction[5] += w * (v0 * b1 - v1 * b0)
+
+
+@kernel
+def stay_in_plane(information: Array, correction: Array) -> None:
+    """Let normal equations move the pose in the xy-plane of {1} alone: beyond all doubt it does not leave it."""
+    for i in range(2, 5):
+        for j in range(6):
+            information[i, j] = 0.0
+            information[j, i] = 0.0
+        information[i, i] = _BEYOND_DOUBT
+        correction[i] = 0.0
 
 
 @kernel

@@ -23,7 +23,7 @@ TURNS = st.one_of(
 def compiled_legs(mechanism, pose):
     arms, directions, lengths, jacobian = np.zeros((6, 3)), np.zeros((6, 3)), np.zeros(6), np.zeros((6, 6))
     legs_at(mechanism.base_joints, mechanism.platform_joints, pose.position, pose.rotation, arms, directions, lengths)
-    jacobian_at(arms, directions, jacobian)
+    jacobian_at(arms, directions, 6, jacobian)
     return arms, directions, lengths, jacobian
 
 

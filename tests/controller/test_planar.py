@@ -80,7 +80,9 @@ def random_mechanism(random, joints=CLASSES["n-3, n = 3"], collinear=(False, Fal
         for flat in collinear
     )
     rows = ([int(k) for k in side] for side in joints)
-    return PlanarMechanism.from_legs(base[next(rows)], platform[next(rows)], stroke=stroke)
+    return PlanarMechanism.from_legs(
+        base[next(rows)], platform[next(rows)], limits=stroke if stroke is None else {"stroke": stroke}
+    )
 
 
 def rotation_of(angle):
@@ -239,7 +241,7 @@ def test_what_is_within_the_stroke_comes_first_and_then_the_smaller_angle(seed):
     modes = solve_planar(mechanism, leg_angles)
     for wanted in modes:
         lengths = np.abs(wanted.lengths)[:, None] * [0.99, 1.01]
-        limited = PlanarMechanism.from_legs(mechanism.base_joints, mechanism.platform_joints, stroke=lengths)
+        limited = PlanarMechanism.from_legs(mechanism.base_joints, mechanism.platform_joints, limits={"stroke": lengths})
         first, second = solve_planar(limited, leg_angles)
         positive = bool((wanted.lengths > 0.0).all())
         assert [mode.within_stroke for mode in (first, second)] == [positive, False]
@@ -252,7 +254,7 @@ def test_what_is_within_the_stroke_comes_first_and_then_the_smaller_angle(seed):
 @pytest.mark.parametrize(("least", "greatest", "within"), [(0.5, 1.5, True), (1.1, 1.5, False), (0.5, 0.9, False)])
 def test_every_leg_has_its_own_stroke(least, greatest, within):
     stroke = [[0.1, 9.0], [least, greatest], [0.1, 9.0]]
-    mechanism = PlanarMechanism.from_legs(RIG.base_joints, RIG.platform_joints, stroke=stroke)
+    mechanism = PlanarMechanism.from_legs(RIG.base_joints, RIG.platform_joints, limits={"stroke": stroke})
     position = np.array([0.2, np.sqrt(0.96)])  # legs 0 and 1 are 1 m long
     (mode,) = solve_planar(mechanism, legs_at(mechanism, position, 0.0)[0], roll=0.0)
     assert mode.within_stroke is within

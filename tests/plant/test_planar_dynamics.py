@@ -1,8 +1,4 @@
-"""The planar plant: equations of motion, energies and ideal IMU signals against a derivation of their own.
-
-Bodies with a place and an angle each, in the plane; their Jacobians by complex steps, and Lagrange's equations from the
-inertia matrix by differences. Nothing is shared with `plant.planar_dynamics`.
-"""
+"""The planar plant: equations of motion, energies, ideal IMU signals, conditions on its parameters, and its FMU."""
 
 from collections.abc import Callable, Mapping
 
@@ -12,15 +8,25 @@ from numpy.random import Generator
 from numpy.typing import ArrayLike
 
 from plant.dynamics import Dynamics
+from plant.errors import FmuError
+from plant.export import PLANAR_MODEL, default_fmu
+from plant.fmu import FmuPlant
 from plant.mechanism import Mechanism, load_in_space
 from plant.planar_dynamics import build_planar_dynamics
 from plant.planar_variables import PLANAR
 from plant.pose import Array
 from plant.variables import BRAKE, OPEN, VELOCITY, Variable, checked_parameters
-from tests.plant.explicit_bodies import derivatives, reflected_mass, vector_of
-
-Values = dict[str, Array]
-LEGS = 3
+from tests.plant.explicit_bodies import derivatives, vector_of
+from tests.plant.planar_bodies import (
+    LEGS,
+    Values,
+    bias_force,
+    coordinates,
+    frames_at,
+    inertia_matrix,
+    jacobian,
+    weight_force,
+)
 
 
 @pytest.fixture(scope="module")
@@ -76,56 +82,6 @@ def random_state(p: Values, random: Generator) -> tuple[Values, Values]:
         "external_wrench.torque": np.array(random.normal(0.0, 1.0)),
     }
     return states, inputs
-
-
-def coordinates(p: Values, q: Array) -> Array:
-    """(8, 3): x, y and angle of platform, payload, lower parts and rods at a pose (3,); and (3,) lengths, all in one."""
-    cosine, sine = np.cos(q[2]), np.sin(q[2])
-    turn = np.array([[cosine, -sine], [sine, cosine]])
-    legs = q[:2] + p["platform_joints"] @ turn.T - p["base_joints"]
-    lengths = np.sqrt(np.sum(legs * legs, axis=1))
-    along = legs / lengths[:, None]
-    # An angle whose derivative is exact for complex steps, too.
-    angles = np.arctan(legs[:, 1] / legs[:, 0])
-    bodies = [np.append(q[:2] + turn @ p[f"{body}.center_of_mass"], q[2]) for body in ("platform", "payload")]
-    bodies += [np.append(p["base_joints"][k] + p["leg.lower.center"] * along[k], angles[k]) for k in range(LEGS)]
-    bodies += [np.append(p["base_joints"][k] + legs[k] - p["leg.upper.center"] * along[k], angles[k]) for k in range(LEGS)]
-    return np.concatenate([*bodies, lengths])
-
-
-def jacobian(p: Values, q: Array) -> Array:
-    """(27, 3), of `coordinates`, exact to rounding."""
-    step = 1e-30
-    return np.array([coordinates(p, q + 1j * step * unit).imag / step for unit in np.eye(3)]).T
-
-
-def weights(p: Values) -> Array:
-    """(27,), the mass or inertia of each coordinate."""
-    parts = [(p[f"{body}.mass"], p[f"{body}.inertia"]) for body in ("platform", "payload")]
-    parts += [(p[f"leg.{part}.mass"], p[f"leg.{part}.inertia"]) for part in ("lower", "upper") for _ in range(LEGS)]
-    return np.concatenate([[m, m, i] for m, i in parts] + [np.full(LEGS, reflected_mass(p))])
-
-
-def inertia_matrix(p: Values, q: Array) -> Array:
-    j = jacobian(p, q)
-    return j.T @ (weights(p)[:, None] * j)
-
-
-def weight_force(p: Values, q: Array) -> Array:
-    """The generalised force (3,) of gravity."""
-    pull = np.concatenate([np.tile(np.append(p["gravity"][:2], 0.0), 8), np.zeros(LEGS)])
-    return jacobian(p, q).T @ (np.where(pull != 0.0, weights(p), 0.0) * pull)
-
-
-def bias_force(p: Values, q: Array, rate: Array) -> Array:
-    """`M' q' - d/dq (q' M q' / 2)`, by central differences of sixth order."""
-    step = 1e-3
-    along = derivatives(np.array([inertia_matrix(p, q + i * step * rate) for i in range(-3, 4)]), step)[0]
-    slopes = [
-        derivatives(np.array([rate @ inertia_matrix(p, q + i * step * unit) @ rate for i in range(-3, 4)]), step)[0]
-        for unit in np.eye(3)
-    ]
-    return along @ rate - 0.5 * np.array(slopes)
 
 
 def axial_forces(p: Values, states: Values, inputs: Values, length: Array, speed: Array) -> dict[str, Array]:
@@ -223,20 +179,6 @@ def test_energy_changes_by_the_work_of_all_forces(dynamics: Dynamics, rig: Mecha
     assert min(abs(work[f"power.{source}"]) for source in ("drive", "friction", "brake", "external")) > 1e-3
 
 
-def frames_at(p: Values, position: Array, angle: float) -> tuple[Array, Array]:
-    """Attitudes (4, 3, 3) and places (4, 3) of the IMUs: a leg's x axis is the plane's normal, its z axis the leg."""
-    turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
-    base = np.pad(p["base_joints"], ((0, 0), (0, 1)))
-    along = np.append(position, 0.0) + np.pad(p["platform_joints"], ((0, 0), (0, 1))) @ turn.T - base
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    normal = np.tile([0.0, 0.0, 1.0], (LEGS, 1))
-    frames = np.stack([normal, np.cross(along, normal), along], axis=2)
-    places = base + np.einsum("kij,kj->ki", frames, p["leg_imu_position"])
-    return np.concatenate([frames, turn[None]]), np.vstack(
-        [places, np.append(position, 0.0) + turn @ p["platform_imu_position"]]
-    )
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_ideal_imu_signals_are_derivatives_of_the_trajectory(dynamics: Dynamics, rig: Mechanism, seed: int) -> None:
     random = np.random.default_rng(50 + seed)
@@ -298,3 +240,34 @@ def test_parameters_that_make_no_sense_together_are_told(
     p = dict(rig.plant_parameters())
     assert broken(dynamics, p) == []
     assert any(said in text for text in broken(dynamics, p | checked_parameters(changes, PLANAR)))
+
+
+def test_the_fmu_integrates_the_derived_rates(dynamics: Dynamics, rig: Mechanism) -> None:
+    """The C code, its layout and its Runge-Kutta steps against the same method in Python, for odd parameters."""
+    random = np.random.default_rng(5)
+    p = odd_rig(rig, random)
+    substep = float(p["substep"])
+    advance = integrator(dynamics, p, substep)
+    x = np.array(dynamics.start(flat(p, PLANAR.parameters))).ravel()
+    with FmuPlant(default_fmu(PLANAR_MODEL), p, 2 * substep) as plant:
+        for cycle in range(60):
+            inputs = {
+                "velocity_command": 0.05 * np.sin(0.3 * cycle + np.arange(3)),
+                "drive_mode": np.roll([VELOCITY, OPEN, BRAKE], cycle // 20),
+                "external_wrench.force": random.normal(0.0, 3.0, 2),
+                "external_wrench.torque": np.array(random.normal(0.0, 0.1)),
+            }
+            for name, value in inputs.items():
+                plant.set(name, value)
+            plant.step(2 * substep)
+            for _ in range(2):
+                x = advance(x, flat(inputs, PLANAR.inputs))
+            states = named(x, PLANAR.states)
+            for name in ("position", "angle", "velocity", "angular_velocity", "current"):
+                np.testing.assert_allclose(plant.get(name), states[f"state.{name}"], rtol=1e-10, atol=1e-12)
+
+
+def test_the_fmu_refuses_parameters_that_make_no_sense_together(rig: Mechanism) -> None:
+    p = rig.plant_parameters() | {"stop.minimum_length": np.full(3, 0.3)}
+    with pytest.raises(FmuError, match=r"stop\.minimum_length of leg 0 is 0.3 m, beyond its stop\.maximum_length of 0\.26"):
+        FmuPlant(default_fmu(PLANAR_MODEL), p, 1e-3)
