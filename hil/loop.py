@@ -274,6 +274,10 @@ class Loop:
             stop_quickly(rig)
             raise
 
+    def memory(self) -> dict[str, Record]:
+        """All arrays on which the rest of a run depends and that it changes, but for those of the plant."""
+        return {"imu": self.imu, "state": self.state, "clock": self.clock, "link": self.link, "work": self._work}
+
     def load(self, python: bool = False) -> None:
         """Load the machine code of the loop, or of the one in Python, so that nothing is compiled when it runs."""
         parameters, state, clock, link, work = self.parameters, self.state, self.clock, self.link, self._work

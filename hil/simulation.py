@@ -1,7 +1,7 @@
 """A closed-loop simulation: a mechanism follows a target on its FMU plant, as fast as it goes."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
@@ -22,6 +22,7 @@ from controller.settings import control_settings, safety_settings, sensor_settin
 from controller.stream import rest
 from controller.target import Target, check_duration, load_target
 from hil.loop import COMPUTED, RECORD, Loop, PythonFilters
+from hil.snapshot import Snapshot, resume_snapshot, take_snapshot
 from plant.binding import OWN_BINDING, Setting, load_binding
 from plant.compiled import Record
 from plant.errors import GoughError, InputError, UnknownNameError
@@ -121,6 +122,18 @@ class SimulationConfig:
         if self.settings and self.rig != "fmu":
             raise InputError(f"--set is for the plant's FMU, not for the rig {self.rig}: leave it out")
 
+    @classmethod
+    def from_plain(cls, values: Mapping[str, Any]) -> "SimulationConfig":
+        """The configuration of which `dataclasses.asdict` has made these values, perhaps with lists for tuples."""
+
+        def tuples(value: Any) -> Any:
+            return tuple(map(tuples, value)) if isinstance(value, list | tuple) else value
+
+        plain = {name: tuples(value) for name, value in values.items()}
+        plain["wiring"] = Wiring(**{name: tuples(value) for name, value in values["wiring"].items()})
+        plain["settings"] = tuple(Setting(**each | {"value": tuples(each["value"])}) for each in values["settings"])
+        return cls(**plain)
+
     @property
     def streamed(self) -> bool:
         """Whether the target is streamed while the loop runs."""
@@ -149,6 +162,7 @@ class SimulationResult:
         reference_positions, reference_rotations: (N, 3) [m] and (N, 3, 3), the planned pose.
         target_positions, target_rotations: (N, 3) [m] and (N, 3, 3), the raw target.
         real_time_factor: simulated time over the time that planning and loop took.
+        snapshot: if one was asked for.
     """
 
     config: SimulationConfig
@@ -162,6 +176,7 @@ class SimulationResult:
     target_positions: Array
     target_rotations: Array
     real_time_factor: float
+    snapshot: Snapshot | None
 
     @property
     def moved(self) -> bool:
@@ -209,12 +224,19 @@ class SimulationResult:
         }
 
 
-def simulate(config: SimulationConfig, progress: Callable[[float], None] = lambda share: None) -> SimulationResult:
+def simulate(
+    config: SimulationConfig,
+    progress: Callable[[float], None] = lambda share: None,
+    resumed: Snapshot | None = None,
+    save_at: float | None = None,
+) -> SimulationResult:
     """Run a simulation.
 
     Args:
         config: what to simulate.
         progress: called now and then with the share of the run that is done.
+        resumed: where to go on; then the result is of the rest.
+        save_at: when to take a snapshot [s] of the motion, its duration for the end; None for never.
 
     Raises:
         GoughError: something in the configuration cannot be used; nothing has run then.
@@ -222,20 +244,28 @@ def simulate(config: SimulationConfig, progress: Callable[[float], None] = lambd
     """
     if config.streamed or config.rig != "fmu":
         raise InputError("a streamed target, and any rig but the FMU, has a clock of its own: use 'gough run'")
+    if config.fusion == "filterpy" and (resumed is not None or save_at is not None):
+        raise InputError("filters on filterpy cannot be saved: choose another fusion")
     with prepared_loop(config) as loop:
         count = len(loop.records)
+        if resumed is not None:
+            resume_snapshot(resumed, loop, loop.simulated)
+        first = int(loop.state["cycle"])
+        saved = None if save_at is None else _cycle_at(save_at, loop, first)
+        snapshot = None
         filters = filterpy_filters(loop.parameters) if config.fusion == "filterpy" else None
         cause, took = OK, loop.planning_time
         chunk = max(1, round(_CHUNK_S * config.rate))
-        for last in range(chunk, count + chunk, chunk):
+        for last in sorted({*range(first + chunk, count, chunk), count, *([] if saved is None else [saved])}):
             began = time.perf_counter()
-            cause = loop.run(min(last, count), filters)
+            cause = loop.run(last, filters)
             took += time.perf_counter() - began
             if cause != OK:
                 break
-            progress(min(last, count) / count)
-        done = int(loop.state["cycle"])
-        result = _result(config, loop, done, took)
+            if last == saved:
+                snapshot = take_snapshot(asdict(config), loop, loop.simulated)
+            progress((last - first) / (count - first))
+        result = _result(config, loop, first, snapshot, took)
         if cause != OK:
             at = int(loop.state["stop_cycle"])
             raise SimulationStoppedError(f"stopped on the brakes at cycle {at} of {count}: {loop.reason()}", result)
@@ -259,6 +289,13 @@ class PreparedLoop(Loop):
     reference: Reference
     end: int
     planning_time: float
+
+    @property
+    def simulated(self) -> FmuPlant:
+        """The FMU of a simulation."""
+        if self.plant is None:
+            raise InputError("this loop has no FMU")
+        return self.plant
 
     def reason(self) -> str:
         """Why the run has ended, in words; a plant that failed has its own."""
@@ -379,16 +416,30 @@ def _check_plant(config: SimulationConfig, plant: FmuPlant, nominal: Mechanism) 
         raise InputError(f"{name} has no magnetometer on the platform: bind imu_magnetic_field, or leave out --magnetometer")
 
 
-def _result(config: SimulationConfig, loop: PreparedLoop, done: int, took: float) -> SimulationResult:
-    records = loop.records[:done]
-    times = (np.arange(done) - int(loop.parameters["hold_cycles"])) / config.rate
+def _cycle_at(at: float, loop: PreparedLoop, first: int) -> int:
+    """The cycle of a time [s] of the motion at which a snapshot is to be taken."""
+    period, hold = float(loop.parameters["period"]), int(loop.parameters["hold_cycles"])
+    cycle = hold + round(at / period) if np.isfinite(at) else -1
+    if not first < cycle <= len(loop.records):
+        least, most = ((cycle - hold) * period for cycle in (first, len(loop.records)))
+        raise InputError(f"a snapshot at {at:g} s is not within the motion: choose more than {least:g}, and at most {most:g} s")
+    return cycle
+
+
+def _result(
+    config: SimulationConfig, loop: PreparedLoop, first: int, snapshot: Snapshot | None, took: float
+) -> SimulationResult:
+    """What has been found from a cycle on."""
+    done = int(loop.state["cycle"])
+    records = loop.records[first:done]
+    times = (np.arange(first, done) - int(loop.parameters["hold_cycles"])) / config.rate
     positions, rotations = poses_from_lengths(
         loop.mechanism, records["reference"][:, : loop.mechanism.legs, 0], loop.target.start
     )
     target_positions, target_rotations = loop.target.at(times)
     return SimulationResult(
         config, loop.mechanism, loop.target, loop.reference, times, records, positions, rotations, target_positions,
-        target_rotations, done / config.rate / took,
+        target_rotations, (done - first) / config.rate / took, snapshot,
     )  # fmt: skip
 
 

@@ -59,8 +59,8 @@ def add_json(command: argparse.ArgumentParser) -> None:
 
 
 def chosen(options: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """Return the options of these names."""
-    return {name: getattr(options, name) for name in names}
+    """Return the options of these names, without those that are not given and have no default."""
+    return {name: getattr(options, name) for name in names if hasattr(options, name)}
 
 
 def simulation_config(options: argparse.Namespace, *names: str) -> "SimulationConfig":

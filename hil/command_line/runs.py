@@ -1,8 +1,9 @@
 """The commands that run the loop: simulate, run, replay."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hil.command_line.live_view import live_view
 from hil.command_line.options import (
@@ -17,6 +18,11 @@ from hil.command_line.options import (
 )
 from hil.command_line.outputs import OutputError, check_distinct, check_outputs, write_json
 from hil.command_line.printing import deg, mm, new_table, print_table, progress_bar
+from plant.errors import InputError
+
+if TYPE_CHECKING:
+    from hil.simulation import SimulationConfig
+    from hil.snapshot import Snapshot
 
 
 def add_simulate(commands: Any) -> None:
@@ -30,6 +36,14 @@ def add_simulate(commands: Any) -> None:
     _add_motion(command)
     command.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots and a moving 3-D view")
     add_json(command)
+    command.add_argument("--save-state", type=Path, metavar="FILE", help="write a snapshot, from which it can go on")
+    command.add_argument(
+        "--save-at", type=float, default=argparse.SUPPRESS, metavar="SECONDS", help="when, of the motion (default: at its end)"
+    )
+    command.add_argument(
+        "--load-state", type=Path, metavar="FILE",
+        help="go on from a snapshot, bit for bit as if there had been none; nothing but --duration can be changed",
+    )  # fmt: skip
     command.set_defaults(run=_simulate)
 
 
@@ -42,7 +56,7 @@ def _add_motion(command: argparse.ArgumentParser) -> None:
         help="hold, circle, sines, steps, near-rests, rests, shaking, probing, or a CSV file of displacements from home "
         "(time_s,x_m,y_m,z_m,qw,qx,qy,qz); for 'gough run' also stream or stream:HOST:PORT, as 'gough stream-target' sends",
     )
-    command.add_argument("--duration", type=float, default=10.0, help="of the motion [s]")
+    command.add_argument("--duration", type=float, default=argparse.SUPPRESS, help="of the motion [s] (default: 10.0)")
     command.add_argument("--rate", type=float, default=1000.0, help="cycles per second [Hz], 50 to 4000")
     add_imu(command)
     command.add_argument("--imus", type=_imus, default="all", help="which IMUs there are: all, legs, or a list such as 0,2,4,6")
@@ -95,15 +109,24 @@ def _imus(text: str) -> tuple[int, ...]:
 
 def _simulate(options: argparse.Namespace) -> int:
     from hil.simulation import SimulationStoppedError, simulate
+    from hil.snapshot import read_snapshot, write_snapshot
 
-    check_outputs(options.json, options.report)
-    config = simulation_config(options, *_MOTION)
+    check_outputs(options.json, options.report, options.save_state)
+    config, resumed = simulation_config(options, *_MOTION), None
+    if options.load_state is not None:
+        resumed = read_snapshot(options.load_state)
+        config = _resumed_config(options, config, resumed)
+    save_at = getattr(options, "save_at", config.duration) if options.save_state is not None else None
+    if save_at is None and hasattr(options, "save_at"):
+        raise InputError("--save-at says when to write a snapshot, but not where to: add --save-state FILE")
     stopped = None
     with progress_bar(f"{config.mechanism} follows {config.target}") as progress:
         try:
-            result = simulate(config, progress)
+            result = simulate(config, progress, resumed, save_at)
         except SimulationStoppedError as error:
             stopped, result = error, error.result
+    if result.snapshot is not None and options.save_state is not None:
+        write_snapshot(result.snapshot, options.save_state)
     if stopped is None or result.moved:
         write_json(options.json, result.summary())
         if options.report:
@@ -114,6 +137,18 @@ def _simulate(options: argparse.Namespace) -> int:
     if stopped:
         raise stopped
     return 0
+
+
+def _resumed_config(options: argparse.Namespace, config: "SimulationConfig", resumed: "Snapshot") -> "SimulationConfig":
+    """The configuration of a snapshot, with another duration if one is given."""
+    from hil.simulation import SimulationConfig
+
+    kept = SimulationConfig.from_plain(resumed.config)
+    for name in (*_MOTION, "joint_error"):
+        given, was = getattr(config, name), getattr(kept, name)
+        if name != "duration" and given not in (was, getattr(SimulationConfig(), name)):
+            raise InputError(f"the snapshot was taken with {name} {was}, and cannot go on with {given}: leave it out")
+    return replace(kept, duration=getattr(options, "duration", kept.duration))
 
 
 def _print_simulation(summary: dict[str, Any]) -> None:
