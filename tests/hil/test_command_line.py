@@ -123,7 +123,7 @@ def test_a_corrupt_fmu_and_one_that_lacks_a_variable_are_one_clear_line(tmp_path
             if name == "modelDescription.xml":
                 data = data.replace(b'name="imu_specific_force"', b'name="imu_force"')
             archive.writestr(name, data)
-    assert "lacks imu_specific_force" in refused(gough("simulate", "--plant", poor))
+    assert "has no variable 'imu_specific_force'; did you mean imu_force?" in refused(gough("simulate", "--plant", poor))
 
 
 def test_fmu_build_writes_an_fmu_that_simulate_takes(tmp_path):
