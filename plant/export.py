@@ -262,9 +262,10 @@ def _compile(compiler: list[str], work: Path, sources: list[str], suffix: str) -
     headers = Path(fmpy.__file__).parent / "c-code"
 
     def compile_one(source: str) -> str:
-        effort = "-O1" if source == "derivatives.c" else "-O2"
+        # The equations are one long block of scalars, which GCC then keeps in registers; other compilers ignore this.
+        effort = ["-O1"] if source == "derivatives.c" else ["-O2", "-frename-registers", "-fno-tree-slp-vectorize"]
         # The compilers run in the folder, so that no path of this machine gets into what they make.
-        _run([*compiler, *C_FLAGS, effort, f"-I{headers}", "-c", source, "-o", f"{source}.o"], work)
+        _run([*compiler, *C_FLAGS, *effort, f"-I{headers}", "-c", source, "-o", f"{source}.o"], work)
         return f"{source}.o"
 
     with ThreadPoolExecutor() as pool:

@@ -340,6 +340,28 @@ def solve(matrix: SX, right: SX) -> SX:
     return ca.vertcat(*z)
 
 
+def _leg_turning(s: SX, velocity: SX, acceleration: SX, e1: SX) -> tuple[SX, SX, SX]:
+    """The leg frame (3, 3), and the leg's angular velocity and acceleration (3, 1) in {1}, from the leg vector and its
+    derivatives.
+
+    With `h = k q / d`, `k = e1 . s`, `q = e1 . (s x s')` and `d = s . s - k^2 = |s x e1|^2`, the angular velocity of the
+    module's text is `omega = (s x s' + h s) / (s . s)`.
+    """
+    square, k = ca.dot(s, s), ca.dot(e1, s)
+    across = square - k**2
+    # As in `_leg`, square roots keep CasADi from dividing again and again.
+    inverse, inverse_across = ca.sqrt(1 / square), ca.sqrt(1 / across)
+    n, e2 = s * inverse, ca.cross(s, e1) * inverse_across
+    swing, swing_rate = ca.cross(s, velocity), ca.cross(s, acceleration)
+    k_rate, q, q_rate = ca.dot(e1, velocity), ca.dot(e1, swing), ca.dot(e1, swing_rate)
+    growth = ca.dot(s, velocity)
+    h = k * q * inverse_across**2
+    h_rate = (k_rate * q + k * q_rate - 2 * h * (growth - k * k_rate)) * inverse_across**2
+    turning = (swing + h * s) * inverse**2
+    angular = (swing_rate + h_rate * s + h * velocity - 2 * growth * turning) * inverse**2
+    return ca.horzcat(ca.cross(e2, n), e2, n), turning, angular
+
+
 def imu_signals_of(legs: list[Leg], axes: SX, rotation: SX, omega: SX, acceleration: SX, c: dict[str, SX]) -> dict[str, SX]:
     """Ideal IMU signals by their names in the table, (n + 1, 3) each, of the legs and the platform.
 
@@ -351,28 +373,19 @@ def imu_signals_of(legs: list[Leg], axes: SX, rotation: SX, omega: SX, accelerat
         omega: (3, 1), its angular velocity.
         acceleration: (6, 1), of the origin of {2}, then angular.
     """
-    s, sd, sdd, e1, arm = (SX.sym(name, 3) for name in ("s", "sd", "sdd", "e1", "d"))
-    gravity, field = SX.sym("g", 3), SX.sym("m", 3)
-    length = ca.norm_2(s)
-    n = s / length
-    e2 = ca.cross(n, e1)
-    e2 = e2 / ca.norm_2(e2)
-    frame = ca.horzcat(ca.cross(e2, n), e2, n)
-    k = ca.dot(e1, s)
-    axial_rate = k * ca.dot(e1, ca.cross(s, sd)) / (length * (length**2 - k**2))
-    rate = frame.T @ (ca.cross(s, sd) / length**2 + axial_rate * n)
-    angular = ca.jtimes(rate, s, sd) + ca.jtimes(rate, sd, sdd)
-    force = -frame.T @ gravity + ca.cross(angular, arm) + ca.cross(rate, ca.cross(rate, arm))
-    leg_imu = ca.Function("leg_imu", [s, sd, sdd, e1, arm, gravity, field], [rate, force, frame.T @ field])
-
     rates: list[SX] = []
     forces: list[SX] = []
     fields: list[SX] = []
     for i, leg in enumerate(legs):
-        arguments = (row(axes, i), row(c["leg_imu_position"], i), c["gravity"], c["magnetic_field"])
-        signals = leg_imu(leg.s, leg.velocity, acceleration[:3] + ca.cross(acceleration[3:], leg.arm) + leg.bias, *arguments)
-        for collected, signal in zip((rates, forces, fields), signals, strict=True):
-            collected.append(signal.T)
+        e1, arm = row(axes, i), row(c["leg_imu_position"], i)
+        frame, turning, angular = _leg_turning(
+            leg.s, leg.velocity, acceleration[:3] + ca.cross(acceleration[3:], leg.arm) + leg.bias, e1
+        )
+        rate = frame.T @ turning
+        rates.append(rate.T)
+        force = ca.cross(frame.T @ angular, arm) + ca.cross(rate, ca.cross(rate, arm)) - frame.T @ c["gravity"]
+        forces.append(force.T)
+        fields.append((frame.T @ c["magnetic_field"]).T)
     place = rotation @ c["platform_imu_position"]
     at_imu = acceleration[:3] + ca.cross(acceleration[3:], place) + ca.cross(omega, ca.cross(omega, place))
     rates.append((rotation.T @ omega).T)
