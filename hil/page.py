@@ -59,7 +59,11 @@ def scene(points: Array, up: Array, front: Array | None = None) -> dict[str, Any
     margin = 0.05 * np.ptp(points, axis=0).max()
     ranges = np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin], axis=1)
     aside = np.array([1.15, -1.4, 0.0])
-    eye = aside + (0.6 - aside @ up) * up if front is None else 1.9 * front
+    eye = aside + (0.6 - aside @ up) * up
+    if front is not None:
+        # The camera's unit is the edge of a cube of the same volume.
+        spans = np.ptp(ranges, axis=1)
+        eye = 1.2 * spans.max() / np.cbrt(spans.prod()) * front
     looks = {"up": up, "eye": eye, "center": -0.1 * up}
     look = {"showbackground": False, "showspikes": False, "gridcolor": "#e3e7eb", "color": FAINT, "nticks": 5}
     return {

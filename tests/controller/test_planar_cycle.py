@@ -110,7 +110,8 @@ def test_the_refined_pose_is_the_optimum_in_the_plane(planar, rig):
         angles = leg_angles(planar, random.uniform((0.08, 0.19), (0.12, 0.22)), angle) + 1e-3 * random.normal(size=3)
         roll = angle + 1e-3 * random.normal()
         state = np.zeros((), STATE)
-        state["directions"], state["vectors"][0] = directions_at(angles), np.array([0.0, 1.0, 0.0]) @ turned(roll)
+        # The vertical seems to lean out of the plane, as a biased accelerometer has it, and the pose must not follow.
+        state["directions"], state["vectors"][0] = directions_at(angles), np.array([0.0, 1.0, 0.005]) @ turned(roll)
         state["leg_used"][:3], state["leg_weights"][:3] = 1.0, parameters["leg_weight"]
         state["platform_used"], state["vector_weights"][0] = 1, parameters["vertical_weight"]
         assert find_pose(parameters, state) > 0.1
@@ -121,7 +122,7 @@ def test_the_refined_pose_is_the_optimum_in_the_plane(planar, rig):
 
         best = least_squares(residuals, [*state["position"][:2], roll], x_scale=[1e-2, 1e-2, 0.1], xtol=1e-15, ftol=1e-15)
         found = np.append(state["position"][:2], np.arctan2(state["rotation"][1, 0], state["rotation"][0, 0]))
-        np.testing.assert_allclose(found, best.x, rtol=0.0, atol=2e-8)
+        np.testing.assert_allclose(found, best.x, rtol=0.0, atol=1e-7)
         lower = state["information"]
         information = np.tril(lower) + np.tril(lower, -1).T
         covariance = np.linalg.inv(information)[np.ix_([0, 1, 5], [0, 1, 5])]

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 
+from controller.cycle import OK
 from controller.safety import (
     CAUSES,
     END_OF_MOTION,
@@ -21,6 +22,7 @@ from hil.simulation import SimulationConfig, prepared_loop, simulate
 from plant.errors import InputError
 from plant.export import PLANAR_MODEL, default_fmu
 from plant.variables import PLATFORM_IMU
+from tests.hil.test_loop import replayed
 from tests.hil.test_simulation import errors
 
 RIG = "planar-3rpr"
@@ -53,6 +55,14 @@ def test_the_plant_may_be_of_fmi_2_and_the_records_are_the_same():
         np.testing.assert_array_equal(ours[name], other[name])
     assert np.isfinite(ours["truth"][:, :10]).all()
     assert not ours["lengths"][:, 3:].any() and not ours["command"][:, 3:].any()
+
+
+def test_a_cycle_that_is_replayed_finds_the_same():
+    with prepared_loop(config()) as loop:
+        assert loop.run(1000) == OK
+        found = replayed(loop, loop.records[:1000])
+        for name in ("position", "rotation", "lengths", "command", "conditioning"):
+            np.testing.assert_array_equal(found[name], loop.records[name][:1000])
 
 
 class Disturbed(FmuRig):
