@@ -145,7 +145,8 @@ class FmuPlant:
         FmuError: the file is no FMU, is of another kind, does not fit its binding, holds no binary for this machine, or refuses
             its parameters.
         UnknownNameError: a parameter or setting that the FMU does not have.
-        InputError: another number of legs, a period that the FMU cannot take, a binding that cannot be read, or a value that does not fit.
+        InputError: another number of legs, a period that the FMU cannot take, a binding that cannot be read, or a value that
+            does not fit.
     """
 
     def __init__(
