@@ -33,10 +33,10 @@ def measure_plant(duration: float, progress: Callable[[float], None] = lambda sh
         progress: called now and then with the share that is done.
 
     Returns:
-        `step_us`: of a 1 ms step from compiled code, by FMI's version; `calls_us`: of each of the calls of a cycle (FMI 3.0), of
-        which the first and the last only copy numbers; `cycle_us`: of all of them, and `fmpy_us` of the same through FMPy's
-        methods, medians; `fmpy_slowdown`: how many times longer these take; `error_m`: greatest distance from the positions
-        with substeps 16 times shorter; `substep` [s].
+        `step_us`: of a 1 ms step from compiled code, by FMI's version; `calls_us`: of each of the calls of a cycle (FMI 3.0),
+        of which the first and the last only copy numbers; `cycle_us`: of all of them, and `fmpy_us` of the same through FMPy's
+        methods, medians; `fmpy_slowdown`: how many times longer these take; `error_m`: greatest distance from where shorter
+        substeps lead; `substep` [s].
     """
     commands = _commands(duration)
     parameters = load_spatial("hexapod").plant_parameters()

@@ -135,11 +135,7 @@ def _show(options: argparse.Namespace) -> int:
         "states": str(sum(state.size for state, _ in description.states)),
         "use": fits,
     }
-    table = new_table("", "")
-    table.columns[1].justify = "left"
-    for fact in facts.items():
-        table.add_row(*fact)
-    print_table(table)
+    _print_pairs(facts)
     table = new_table("variable", "shape", "type", "unit", "what", "least", "greatest")
     for each in description:
         kind = f"{each.variability} {each.causality}"
@@ -167,13 +163,17 @@ def _validate(options: argparse.Namespace) -> int:
 
     with progress_bar(f"trying {options.file}"):
         checks = check_fmu(options.file)
-    table = new_table("", "")
-    table.columns[1].justify = "left"
-    for check in checks:
-        table.add_row(check.name, "not promised" if check.problems is None else "; ".join(check.problems) or "ok")
-    print_table(table)
+    _print_pairs(
+        {check.name: "not promised" if check.problems is None else "; ".join(check.problems) or "ok" for check in checks}
+    )
     write_json(options.json, {"file": str(options.file), "checks": {check.name: check.problems for check in checks}})
     return int(any(check.problems for check in checks))
+
+
+def _print_pairs(pairs: dict[str, str]) -> None:
+    width = max(map(len, pairs))
+    for name, value in pairs.items():
+        print(f"{name:{width}}  {value}")
 
 
 def _linearize(options: argparse.Namespace) -> int:

@@ -20,9 +20,10 @@ from fmpy.validation import validate_fmu
 from scipy.integrate import solve_ivp
 
 from plant.errors import InputError
-from plant.export import SPATIAL_MODEL, build, check_build, default_fmu
+from plant.export import PLANAR_MODEL, SPATIAL_MODEL, Model, build, check_build, default_fmu
 from plant.fmi import element_names
 from plant.fmu import FmuPlant
+from plant.fmu_check import check_fmu
 from plant.mechanism import Mechanism
 from plant.model_description import Layout
 from plant.pose import Array
@@ -65,9 +66,11 @@ def command(t: float) -> Array:
     return command
 
 
-def test_every_exported_fmu_is_clean(fmu_path: Path, fmi2_path: Path) -> None:
-    for path in (fmu_path, fmi2_path):
+@pytest.mark.parametrize("model", [SPATIAL_MODEL, PLANAR_MODEL], ids=lambda model: model.identifier)
+def test_every_exported_fmu_is_clean_and_keeps_its_promises(model: Model) -> None:
+    for path in (default_fmu(model), default_fmu(model, fmi=2)):
         assert validate_fmu(str(path)) == []
+        assert [(check.name, check.problems) for check in check_fmu(path) if check.problems != ()] == []
         run = subprocess.run(
             [sys.executable, "-m", "fmu_manipulation_toolbox", "-input", str(path), "-check"],
             capture_output=True, text=True, check=True,
@@ -395,3 +398,20 @@ def test_plants_of_fmi_3_start_as_fmu_plants(fmu_path: Path, hexapod: Mechanism)
     with FmuPlant(fmu_path, hexapod.plant_parameters(), 1e-3) as plant, opened(fmu_path, FMU3Slave) as fmu:
         fmu.enterInitializationMode()
         np.testing.assert_array_equal(plant.get("imu_specific_force").ravel(), values_of(fmu, "imu_specific_force"))
+
+
+# ---- trying an FMU ----
+
+
+def test_an_fmu_that_does_not_keep_its_promises_is_found_out(foreign_fmu: Path, fmu_path: Path, tmp_path: Path) -> None:
+    """A foreign one has no derivatives to try; one whose binary is of another build cannot be tried."""
+    found = {check.name: check.problems for check in check_fmu(foreign_fmu)}
+    assert found["10 steps with finite outputs"] == ()
+    assert found["derivatives agree with differences"] is None and found["a saved state goes on the same"] == ()
+    path = tmp_path / "stale.fmu"
+    with zipfile.ZipFile(fmu_path) as archive, zipfile.ZipFile(path, "w") as changed:
+        for name in archive.namelist():
+            content = archive.read(name)
+            changed.writestr(name, content.replace(b'instantiationToken="{', b'instantiationToken="{0'))
+    for check in check_fmu(path)[1:]:
+        assert check.problems and "the instantiationToken is not that of modelDescription.xml" in check.problems[0]
