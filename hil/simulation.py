@@ -394,7 +394,7 @@ def simulated_plant(config: SimulationConfig, nominal: Mechanism, start: Pose) -
     if late:
         raise InputError(f"{late[0].name} is set at {late[0].at:g} s, when the motion of {config.duration:g} s is over")
     parameters = built.plant_parameters(start) if binding.native else {}
-    plant = FmuPlant(fmu, parameters, 1.0 / config.rate, binding, settings)
+    plant = FmuPlant(fmu, parameters, 1.0 / config.rate, binding, settings, nominal.legs)
     try:
         _check_plant(config, plant, nominal)
     except GoughError:
@@ -406,8 +406,6 @@ def simulated_plant(config: SimulationConfig, nominal: Mechanism, start: Pose) -
 def _check_plant(config: SimulationConfig, plant: FmuPlant, nominal: Mechanism) -> None:
     """Check that a plant has what the loop is to drive and to read."""
     name, bound = plant.path.name, plant.bound
-    if bound.legs != nominal.legs:
-        raise InputError(f"{name} has {bound.legs} legs, and {nominal.name} has {nominal.legs}: choose another mechanism")
     absent = set(imus_of(nominal, config.imus)) - set(bound.imus)
     if absent:
         there = ",".join(map(str, bound.imus))

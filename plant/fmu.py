@@ -134,6 +134,7 @@ class FmuPlant:
         period: of control [s].
         binding: a TOML file that says which variables are which; None where they have gough's own names.
         settings: values that come after the parameters and the binding's, at the start or during the run.
+        legs: that it must have; None for any number.
 
     Attributes:
         calls: the structured array (dtype `CALLS`) for `read_imus`, `read_truth`, `write_command` and `advance`.
@@ -144,7 +145,7 @@ class FmuPlant:
         FmuError: the file is no FMU, is of another kind, does not fit its binding, holds no binary for this machine, or refuses
             its parameters.
         UnknownNameError: a parameter or setting that the FMU does not have.
-        InputError: a period that the FMU cannot take, a binding that cannot be read, or a value that does not fit.
+        InputError: another number of legs, a period that the FMU cannot take, a binding that cannot be read, or a value that does not fit.
     """
 
     def __init__(
@@ -154,6 +155,7 @@ class FmuPlant:
         period: float,
         binding: Path | str | Binding | None = None,
         settings: Sequence[Setting] = (),
+        legs: int | None = None,
     ) -> None:
         self.path = Path(path)
         self.calls: Record = np.zeros((), CALLS)
@@ -161,6 +163,8 @@ class FmuPlant:
             binding = OWN_BINDING if binding is None else load_binding(binding)
         self.description = FmuDescription(self.path)
         self.bound = bind(binding, self.description)
+        if legs not in (None, self.bound.legs):
+            raise InputError(f"{self.path.name} has {self.bound.legs} legs, and the mechanism has {legs}: choose another one")
         self._check_period(period, binding.step)
         self._kept: list[NDArray[Any]] = []
         starts = {**parameters, **binding.start}
