@@ -44,7 +44,8 @@ def run(heading: str, number: int = 0) -> dict[str, Any]:
 def grown_legs(interface: str = "CoSimulation") -> Array:
     """Lengths after 0.5 s at 20 mm/s with a payload of 12 kg, by FMPy."""
     result = fmpy.simulate_fmu(
-        "gough_plant.fmu", fmi_type=interface, stop_time=0.5, output_interval=1e-3, relative_tolerance=1e-8, output=["leg_length"],
+        "gough_plant.fmu", fmi_type=interface, stop_time=0.5, output_interval=1e-3, relative_tolerance=1e-8,
+        output=["leg_length"],
         start_values={"drive_mode": [VELOCITY] * 6, "velocity_command": [0.02] * 6, "payload.mass": 12.0},
     )  # fmt: skip
     lengths: Array = result["leg_length"][-1]
