@@ -15,6 +15,7 @@ import numpy as np
 from controller.direct_kinematics import Solutions, required_measurements, solve_batch, solve_planar
 from controller.direct_kinematics.monitor import chi_square_quantile
 from controller.direct_kinematics.spatial import LEG_SIGMA, NEEDS, TILT_SIGMA, YAW_SIGMA
+from hil.markdown import markdown_table
 from plant.classification import (
     MechanismClass,
     classify,
@@ -300,8 +301,8 @@ def cells(row: ClassAccuracy) -> tuple[str, ...]:
 
 def markdown(rows: Sequence[ClassAccuracy]) -> str:
     """The needs and errors of the classes as a table in Markdown."""
-    lines = [COLUMNS, ("---",) * len(COLUMNS)]
+    lines = []
     for row in rows:
         label, drawing, *others = cells(row)
         lines.append((label, f"`{drawing.replace('|', chr(92) + '|')}`", *others))
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return markdown_table(COLUMNS, lines)

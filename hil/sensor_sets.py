@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from controller.cycle import check_imus
+from hil.markdown import markdown_table
 from hil.simulation import SimulationConfig, SimulationStoppedError, simulate
 from plant.classification import MechanismClass, classify, joint_numbers
 from plant.errors import InputError
@@ -194,6 +195,5 @@ def reasons(outcomes: Sequence[Outcome]) -> list[str]:
 
 def markdown(outcomes: Sequence[Outcome]) -> str:
     """The outcomes as a table in Markdown, and why some were refused or stopped."""
-    lines = [COLUMNS, ("---",) * len(COLUMNS), *map(cells, outcomes)]
-    table = [f"| {' | '.join(line)} |" for line in lines]
-    return "\n".join([*table, "", *(f"- {reason}" for reason in reasons(outcomes))])
+    table = markdown_table(COLUMNS, map(cells, outcomes))
+    return "\n".join([table, "", *(f"- {reason}" for reason in reasons(outcomes))])

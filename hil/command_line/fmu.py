@@ -2,12 +2,15 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hil.command_line.options import add_json, add_mechanism
 from hil.command_line.outputs import check_outputs, write_json
 from hil.command_line.printing import new_table, print_table, progress_bar
 from plant.errors import GoughError
+
+if TYPE_CHECKING:
+    from plant.variables import Variable
 
 
 def add_fmu(commands: Any) -> None:
@@ -31,6 +34,13 @@ def add_fmu(commands: Any) -> None:
         help="linux,windows,darwin: compiled by zig, 'pip install gough[cross]' (default: this machine's, by its C compiler)",
     )
     build.set_defaults(run=_build_fmu)
+    table = actions.add_parser(
+        "table",
+        help="the variables of gough's own plants",
+        description="Print the variables of both plants, for six legs and for three in the plane, as docs/fmu.md has them: "
+        "tables in Markdown.",
+    )
+    table.set_defaults(run=_print_tables)
     info = actions.add_parser(
         "info",
         help="what an FMU is, and its variables",
@@ -74,6 +84,37 @@ def _build_fmu(options: argparse.Namespace) -> int:
     return 0
 
 
+def _print_tables(options: argparse.Namespace) -> int:
+    from hil.markdown import markdown_table
+    from plant.export import PLANAR_MODEL, SPATIAL_MODEL
+
+    del options
+    headings = ("variable", "shape", "unit", "role", "range", "nominal", "description")
+    sections = []
+    for model in (SPATIAL_MODEL, PLANAR_MODEL):
+        table = model.table
+        rows = map(_cells, (*table.inputs, *table.parameters, *table.outputs, *table.states))
+        sections += [f"### {model.identifier}", f"{model.description}.", markdown_table(headings, rows)]
+    print("\n\n".join(sections))
+    return 0
+
+
+def _cells(variable: "Variable") -> tuple[str, ...]:
+    """A variable's row in the table."""
+    role: str = variable.causality
+    if variable.causality == "parameter":
+        role = f"{'tunable' if variable.tunable else 'fixed'} parameter"
+    elif variable.discrete:
+        role = f"discrete {role}"
+    least_and_greatest = f"{variable.minimum:g} to {variable.maximum:g}"
+    unit, nominal = ("-", "-") if variable.discrete else (variable.unit, f"{variable.nominal:g}")
+    return f"`{variable.name}`", _shape(variable.shape), unit, role, least_and_greatest, nominal, variable.description
+
+
+def _shape(shape: tuple[int, ...]) -> str:
+    return "x".join(map(str, shape)) or "1"
+
+
 def _show(options: argparse.Namespace) -> int:
     from plant.binding import OWN_BINDING, bind
     from plant.fmi import FmuDescription
@@ -97,9 +138,10 @@ def _show(options: argparse.Namespace) -> int:
     _print_pairs(facts)
     table = new_table("variable", "shape", "type", "unit", "what", "least", "greatest")
     for each in description:
-        shape = "x".join(map(str, each.shape)) or "1"
         kind = f"{each.variability} {each.causality}"
-        table.add_row(each.name, shape, each.type, each.unit or "-", kind, f"{each.minimum:g}", f"{each.maximum:g}")
+        table.add_row(
+            each.name, _shape(each.shape), each.type, each.unit or "-", kind, f"{each.minimum:g}", f"{each.maximum:g}"
+        )
     print_table(table)
     variables = [
         {

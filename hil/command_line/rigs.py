@@ -173,6 +173,7 @@ def add_faults(commands: Any) -> None:
 
 def _faults(options: argparse.Namespace) -> int:
     from hil.fault_matrix import CASES, HEADINGS, run_matrix, summary, table
+    from hil.markdown import markdown_table
 
     check_outputs(options.json)
     if options.seeds < 1:
@@ -184,7 +185,7 @@ def _faults(options: argparse.Namespace) -> int:
         outcomes = run_matrix(options.seeds, cases, progress)
     rows = table(outcomes)
     if options.markdown:
-        print("\n".join("| " + " | ".join(row) + " |" for row in (HEADINGS, ("---",) * len(HEADINGS), *rows)))
+        print(markdown_table(HEADINGS, rows))
     else:
         shown = new_table(*HEADINGS)
         for row in rows:
