@@ -5,6 +5,7 @@ The binding of gough's own plants is that every signal is the variable of its na
 (docs/fmu.md).
 """
 
+import sys
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,7 +22,7 @@ from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER
 from plant.mechanism import LEGS
 from plant.planar import PLANAR_LEGS
 from plant.pose import Array
-from plant.variables import DRIVE_MODES, IMU_COUNT, PLATFORM_IMU
+from plant.variables import BRAKE, DRIVE_MODES, IMU_COUNT, OPEN, PLATFORM_IMU, VELOCITY
 
 IMU_SIGNALS = {"imu_angular_velocity": GYROSCOPE, "imu_specific_force": ACCELEROMETER, "imu_magnetic_field": MAGNETOMETER}
 TRUTH_PLACES = {"position": 0, "quaternion": 3, "angle": 3, "leg_length": 7, "current": 13}
@@ -54,6 +55,9 @@ _WRITTEN = (COMMANDS, MODES, PAYLOAD)
 _MODE_NAMES = tuple(DRIVE_MODES.values())
 _ENTRIES = {"variables", "unit", "sign", "offset"}
 
+LEAST_STEP_S = 1e-6
+"""The shortest communication step [s]."""
+
 
 @dataclass(frozen=True)
 class SignalBinding:
@@ -65,7 +69,7 @@ class SignalBinding:
         sign: factors of 1 or -1, one, or one for each axis, or for each element.
         offset: added to the value after that, in the loop's unit: one, or one for each element.
         imus: whose signals these are; None for all.
-        modes: the FMU's values for a drive that is open, braked, and driven at its velocity.
+        modes: the FMU's values for a drive that is open, braked, and driven at its velocity; None for the usual one.
     """
 
     variables: tuple[str, ...]
@@ -73,7 +77,7 @@ class SignalBinding:
     sign: tuple[float, ...] = (1.0,)
     offset: tuple[float, ...] = (0.0,)
     imus: tuple[int, ...] | None = None
-    modes: tuple[float, ...] | None = None
+    modes: tuple[float | None, ...] = (None,) * len(DRIVE_MODES)
 
 
 @dataclass(frozen=True)
@@ -183,8 +187,8 @@ class _Reader:
     def step(self, table: Mapping[str, Any]) -> float | None:
         self._check_entries("fmu", table, {"step"})
         step = table.get("step")
-        if step is not None and not (_is_number(step) and step > 0.0):
-            self.problems.append(f"[fmu] step is {step!r}; it must be a number of seconds")
+        if step is not None and not (_is_number(step) and step >= LEAST_STEP_S):
+            self.problems.append(f"[fmu] step is {step!r}; it must be a number of seconds, at least {LEAST_STEP_S:g}")
             return None
         return None if step is None else float(step)
 
@@ -198,15 +202,12 @@ class _Reader:
             self.problems.append(f"[{name}] variables is {variables!r}; it must be the name of a variable, or a list of names")
             variables = []
         unit = table.get("unit")
-        if unit is not None and unit not in UNITS[SIGNAL_UNITS[name]]:
+        if unit is not None and not (isinstance(unit, str) and unit in UNITS[SIGNAL_UNITS[name]]):
             self.problems.append(f"[{name}] unit is {unit!r}; it must be one of {_unit_names(name)}")
             unit = None
-        modes = None
-        if any(mode in table for mode in _MODE_NAMES):
-            modes = self._numbers(name, "modes", [table.get(mode, table.get("brake")) for mode in _MODE_NAMES])
         return SignalBinding(
             tuple(variables), unit, self._signs(name, table), self._numbers(name, "offset", table.get("offset", 0.0)),
-            self._imus(name, table.get("imus")), modes,
+            self._imus(name, table.get("imus")), tuple(self._mode(name, mode, table.get(mode)) for mode in _MODE_NAMES),
         )  # fmt: skip
 
     def _check_entries(self, name: str, table: Mapping[str, Any], known: set[str]) -> None:
@@ -219,6 +220,12 @@ class _Reader:
             return tuple(map(float, values))
         self.problems.append(f"[{name}] {entry} is {value!r}; it must be a number, or a list of numbers")
         return (0.0,) * len(values or [0.0])
+
+    def _mode(self, name: str, mode: str, value: Any) -> float | None:
+        if value is None or _is_number(value) or isinstance(value, bool):
+            return None if value is None else float(value)
+        self.problems.append(f"[{name}] {mode} is {value!r}; it must be a number, true or false")
+        return None
 
     def _signs(self, name: str, table: Mapping[str, Any]) -> tuple[float, ...]:
         signs = self._numbers(name, "sign", table.get("sign", 1))
@@ -233,8 +240,8 @@ class _Reader:
         if (
             isinstance(value, list)
             and value
-            and len(set(map(repr, value))) == len(value)
-            and all(each in range(IMU_COUNT) for each in value)
+            and all(type(each) is int and each in range(IMU_COUNT) for each in value)
+            and len(set(value)) == len(value)
         ):
             return tuple(value)
         self.problems.append(f"[{name}] imus is {value!r}; it must be a list of different numbers from 0 to {PLATFORM_IMU}")
@@ -242,7 +249,7 @@ class _Reader:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 def _unit_names(signal: str) -> str:
@@ -295,7 +302,7 @@ class Bound:
         modes: of the drives.
         knows_pose: whether the truth tells the pose.
         planar_angle: whether it tells an angle in the place of a quaternion.
-        driven: names of the FMU's variables that the loop sets in every cycle.
+        driven: names of the FMU's scalars that the loop sets in every cycle.
     """
 
     legs: int
@@ -309,6 +316,35 @@ class Bound:
     knows_pose: bool
     planar_angle: bool
     driven: frozenset[str]
+
+
+def check_start(variable: FmuVariable, owner: str, driven: frozenset[str]) -> None:
+    """Check that a variable may be given a start value.
+
+    Args:
+        variable: of the FMU.
+        owner: the FMU's file, for messages.
+        driven: as in `Bound`.
+
+    Raises:
+        InputError: it may not.
+    """
+    if not variable.startable:
+        raise InputError(
+            f"{variable.name} of {owner} is a {variable.variability} {variable.causality} variable, which takes no start "
+            "value: set parameters and inputs"
+        )
+    check_free(variable, owner, driven)
+
+
+def check_free(variable: FmuVariable, owner: str, driven: frozenset[str]) -> None:
+    """Check that the loop leaves a variable to others, with arguments as for `check_start`.
+
+    Raises:
+        InputError: it does not.
+    """
+    if not driven.isdisjoint(variable.element_names):
+        raise InputError(f"{variable.name} of {owner} is set by the loop, and cannot be set besides")
 
 
 def bind(binding: Binding, description: FmuDescription) -> Bound:
@@ -333,7 +369,7 @@ class _Binder:
             if name not in self._binding.signals:
                 self._problems.append(f"there is no table [{name}], which is needed")
         imus = {name: self._imus(name) for name in IMU_SIGNALS if name in self._found}
-        if len({imus[name] for name in REQUIRED[1:] if name in imus}) > 1:
+        if len({frozenset(imus[name]) for name in REQUIRED[1:] if name in imus}) > 1:
             self._problems.append("imu_angular_velocity and imu_specific_force are of different imus, and must be of the same")
         groups = {
             "sensed": self._group({name: self._imu_places(name, each) for name, each in imus.items()}),
@@ -345,20 +381,25 @@ class _Binder:
         knows = "position" in self._found, "quaternion" in self._found or "angle" in self._found
         if any(knows) and not all(knows):
             self._problems.append("position, and quaternion or angle, are the pose only together: give both, or neither")
+        self._check_once()
         self._check_start()
         if self._problems:
             with_binding = f" with {self._binding.source}" if self._binding.source else ""
             raise FmuError(f"{self._description.path.name}{with_binding}: {'; '.join(self._problems)}")
-        written = [each.name for name in (COMMANDS, MODES) for each in self._found.get(name, ())]
         return Bound(
             legs=self._legs,
-            imus=imus["imu_angular_velocity"],
-            magnetometers=imus.get("imu_magnetic_field", ()),
+            imus=tuple(sorted(imus["imu_angular_velocity"])),
+            magnetometers=tuple(sorted(imus.get("imu_magnetic_field", ()))),
             **groups,
             modes=modes,
             knows_pose=all(knows),
             planar_angle="angle" in self._found,
-            driven=frozenset(written),
+            driven=self._driven(),
+        )
+
+    def _driven(self) -> frozenset[str]:
+        return frozenset(
+            scalar for name in (COMMANDS, MODES) for each in self._found.get(name, ()) for scalar in each.element_names
         )
 
     def _present(self) -> dict[str, SignalBinding]:
@@ -469,7 +510,13 @@ class _Binder:
                 f"{MODES}: {', '.join(each.name for each in found)} are of different types and must be of one"
             )
         switch = first.type == "Boolean"
-        values = self._binding.signals[MODES].modes or ((0.0, 0.0, 1.0) if switch else tuple(map(float, DRIVE_MODES)))
+        usual = (0.0, 0.0, 1.0) if switch else tuple(map(float, DRIVE_MODES))
+        told = self._binding.signals[MODES].modes
+        values = [each if mode is None else mode for each, mode in zip(usual, told, strict=True)]
+        if told[OPEN] is None and told[BRAKE] is not None:
+            values[OPEN] = values[BRAKE]
+        if values[BRAKE] == values[VELOCITY]:
+            self._problems.append(f"{MODES}: brake and velocity are both {values[BRAKE]:g} and must differ: give them both")
         if first.ending:
             try:
                 for value in values:
@@ -478,9 +525,24 @@ class _Binder:
                 self._problems.append(f"{MODES}: {error}")
         return Modes(references, np.array(values), first, size == 1)
 
+    def _check_once(self) -> None:
+        """Check that no scalar of the FMU is bound twice."""
+        signals: dict[str, list[str]] = {}
+        for name, found in self._found.items():
+            for scalar in (scalar for each in found for scalar in each.element_names):
+                signals.setdefault(scalar, []).append(name)
+        doubled: dict[str, list[str]] = {}
+        for scalar, names in signals.items():
+            if len(names) > 1:
+                doubled.setdefault(" and ".join(dict.fromkeys(names)), []).append(scalar)
+        for where, scalars in doubled.items():
+            self._problems.append(f"{where}: {', '.join(scalars)} must be bound once, and not more often")
+
     def _check_start(self) -> None:
         for name, value in self._binding.start.items():
             try:
-                self._description[name].values(value, self._description.path.name)
+                variable, owner = self._description[name], self._description.path.name
+                variable.values(value, owner)
+                check_start(variable, owner, self._driven())
             except GoughError as error:
                 self._problems.append(f"[start] {error}")

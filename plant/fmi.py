@@ -12,7 +12,7 @@ import zipfile
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from math import prod
 from pathlib import Path
@@ -64,7 +64,7 @@ _MOST_MESSAGES = 100
 _ELEMENT = re.compile(r"(.+)\[(\d+(?:, ?\d+)*)\]")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FmuVariable:
     """A variable of an FMU; in FMI 2.0 also the scalars `name[1,1]`, `name[1,2]`, ... together, as the array that they are.
 
@@ -73,7 +73,8 @@ class FmuVariable:
         shape: () for a scalar.
         type, causality, variability: as FMI names them.
         unit: None if the FMU declares none.
-        minimum, maximum: as the FMU declares them.
+        minimum, maximum: () as the FMU declares them, or (size,) where its scalars have declared their own.
+        startable: whether it may be set before initialisation.
         references: value references, of an array's scalars row by row.
         ending: how the names of its functions end, such as Float64 in `fmi3GetFloat64`; "" if it is no number.
         dtype: what these take.
@@ -85,8 +86,9 @@ class FmuVariable:
     causality: str
     variability: str
     unit: str | None
-    minimum: float
-    maximum: float
+    minimum: Array
+    maximum: Array
+    startable: bool
     references: tuple[int, ...]
     ending: str
     dtype: np.dtype[Any]
@@ -126,7 +128,7 @@ class FmuVariable:
             raise InputError(f"{self.name} of {owner} is a {self.type} and takes no numbers")
         try:
             numbers = np.array(given, np.float64).reshape(-1)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise InputError(f"{self.name} of {owner} must be numbers, got {given!r}") from None
         if spread and numbers.size == 1:
             numbers = np.repeat(numbers, self.size)
@@ -170,6 +172,8 @@ class FmuDescription:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        if path.is_dir():
+            raise FmuError(f"{path} is a folder: name the FMU's file")
         try:
             read = fmpy.read_model_description(str(path), validate=True)
         except FileNotFoundError:
@@ -216,6 +220,12 @@ class FmuDescription:
         raise UnknownNameError(f"{self.path.name} has no variable {name!r}{f'; did you mean {near[0]}?' if near else ''}")
 
     @property
+    def saves_state(self) -> bool:
+        """Whether its state can be saved as bytes, and restored."""
+        can = self.co_simulation
+        return bool(can.canGetAndSetFMUstate and can.canSerializeFMUstate)
+
+    @property
     def differentiable(self) -> bool:
         """Whether it has directional derivatives."""
         return not self.abilities.isdisjoint(("providesDirectionalDerivative", "providesDirectionalDerivatives"))
@@ -229,10 +239,12 @@ class FmuDescription:
 
     def _variable(self, each: Any) -> FmuVariable:
         ending, dtype = _TYPES[self.version].get(each.type, ("", _FLOAT))
-        least, most = (None if limit is None else float(limit) for limit in (each.min, each.max))
+        least, most = -np.inf if each.min is None else each.min, np.inf if each.max is None else each.max
+        startable = each.causality in ("input", "parameter") or each.initial in ("exact", "approx")
         return FmuVariable(
             each.name, tuple(each.shape), each.type, each.causality, each.variability, each.unit or _declared_unit(each),
-            -np.inf if least is None else least, np.inf if most is None else most, (each.valueReference,), ending, dtype,
+            np.array(float(least)), np.array(float(most)), startable and each.variability != "constant",
+            (each.valueReference,), ending, dtype,
         )  # fmt: skip
 
 
@@ -249,13 +261,17 @@ def _assembled(name: str, elements: dict[tuple[int, ...], FmuVariable]) -> FmuVa
     order = list(itertools.product(*(range(1, length + 1) for length in shape)))
     if set(order) != set(elements):
         return None
-    kinds = {(each.type, each.causality, each.variability, each.unit) for each in elements.values()}
-    references = tuple(elements[indices].references[0] for indices in order)
-    limits = first.minimum, first.maximum
+    kinds = {(each.type, each.causality, each.variability, each.unit, each.startable) for each in elements.values()}
     if len(kinds) > 1:
         return None
-    return FmuVariable(
-        name, shape, first.type, first.causality, first.variability, first.unit, *limits, references, first.ending, first.dtype
+    scalars = [elements[indices] for indices in order]
+    return replace(
+        first,
+        name=name,
+        shape=shape,
+        minimum=np.array([each.minimum for each in scalars]),
+        maximum=np.array([each.maximum for each in scalars]),
+        references=tuple(each.references[0] for each in scalars),
     )
 
 
@@ -292,6 +308,15 @@ class FmuInstance:
         """Free the instance and remove what was extracted; closing twice does no harm."""
         self.closed = True
         self._cleanup.close()
+
+    def check_open(self) -> None:
+        """Check that it has not been closed.
+
+        Raises:
+            FmuError: it has.
+        """
+        if self.closed:
+            raise FmuError(f"{self.description.path.name} has been closed: load it again")
 
     def address(self, function: str) -> int:
         """Of a C function, without its prefix, such as `DoStep`."""
@@ -341,10 +366,17 @@ class FmuInstance:
 
         Raises:
             FmuError: the FMU has none, or not these.
+            InputError: a variable is no real.
         """
         self.check_open()
         if not self.description.differentiable:
             raise FmuError(f"{self.description.path.name} has no directional derivatives: export it with them")
+        for each in (*unknowns, *knowns):
+            if not each.real:
+                raise InputError(
+                    f"{each.name} of {self.description.path.name} is of type {each.type} and has no derivatives: choose real "
+                    "variables"
+                )
         rows, columns = sum(each.size for each in unknowns), sum(each.size for each in knowns)
         jacobian, seed, product = np.zeros((rows, columns)), np.zeros(columns), np.zeros(rows)
         function = self._function("GetDirectionalDerivative")
@@ -362,6 +394,15 @@ class FmuInstance:
             self._check(function(self.fmu.component, *arguments), "a directional derivative")
             jacobian[:, column] = product
         return jacobian
+
+    def step(self, time: float, duration: float) -> None:
+        """Take a communication step from `time` [s].
+
+        Raises:
+            FmuError: the FMU fails.
+        """
+        with self._calling("a step"):
+            self.fmu.doStep(time, duration, not self.description.saves_state)
 
     def state(self) -> bytes:
         """The FMU's whole state.
@@ -403,18 +444,8 @@ class FmuInstance:
 
     def _check_saves(self) -> None:
         self.check_open()
-        can = self.description.co_simulation
-        if not (can.canGetAndSetFMUstate and can.canSerializeFMUstate):
+        if not self.description.saves_state:
             raise FmuError(f"{self.description.path.name} cannot save its state: export it with canSerializeFMUState")
-
-    def check_open(self) -> None:
-        """Check that it has not been closed.
-
-        Raises:
-            FmuError: it has.
-        """
-        if self.closed:
-            raise FmuError(f"{self.description.path.name} has been closed: load it again")
 
     @contextlib.contextmanager
     def _calling(self, what: str) -> Any:

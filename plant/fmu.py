@@ -14,7 +14,7 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import ArrayLike, NDArray
 
-from plant.binding import OWN_BINDING, TRUTH_SIZE, Binding, Modes, Scalars, Setting, bind, load_binding
+from plant.binding import OWN_BINDING, TRUTH_SIZE, Binding, Modes, Scalars, Setting, bind, check_free, check_start, load_binding
 from plant.compiled import Record, kernel
 from plant.errors import FmuError, InputError
 from plant.fmi import ASKS_TO_END, ERROR, NEEDS_EVENTS, OK, FmuDescription, FmuInstance, FmuVariable
@@ -70,7 +70,11 @@ CALLS = np.dtype(
         ("set_mode", np.int64),
         ("do_step", np.int64),
         ("time", np.float64),
+        ("since", np.float64),
+        ("length", np.float64),
+        ("steps", np.int64),
         ("step", np.float64),
+        ("final", np.uint8),
         ("status", np.int64),
         ("call", np.int64),
         ("sensed", _scalars(_SENSED)),
@@ -102,8 +106,9 @@ CALLS = np.dtype(
 
 `imu` is angular velocity [rad/s], specific force [m/s^2] and magnetic field [uT] of the seven IMUs; `truth` is position (3)
 [m], quaternion (4), leg lengths (6) [m] and currents (6) [A]; both are NaN where the FMU says nothing. A planar plant's truth
-has its pose in space, with z = 0, and its first three legs. `step` is the communication step [s], 0 for that of each call;
-`status` is how the first call that went wrong has ended, and `call` which that was.
+has its pose in space, with z = 0, and its first three legs. `step` is the communication step [s], 0 for that of each call.
+`time` is `steps` steps of one `length` [s] after `since` [s]: counted, for a sum would drift. `final` is whether no earlier
+state will be restored. `status` is how the first call that went wrong has ended, and `call` which that was.
 """
 
 
@@ -170,7 +175,7 @@ class FmuPlant:
         self._kept: list[NDArray[Any]] = []
         starts = {**parameters, **binding.start}
         values = [self._values(name, value) for name, value in starts.items()]
-        values += [self._values(each.name, each.value, spread=True) for each in settings if each.at is None]
+        values += [self._start_values(each) for each in settings if each.at is None]
         changes = sorted((each for each in settings if each.at is not None), key=lambda each: each.at or 0.0)
         self._check_changes(changes)
         self._instance = FmuInstance(self.description)
@@ -214,7 +219,6 @@ class FmuPlant:
             InputError: it is no number.
             FmuError: the FMU refuses.
         """
-        self._instance.check_open()
         return self._instance.get(self.description[name])
 
     def set(self, name: str, value: ArrayLike) -> None:
@@ -225,7 +229,6 @@ class FmuPlant:
             InputError: the value has the wrong number of elements, or is none for this variable.
             FmuError: the FMU refuses.
         """
-        self._instance.check_open()
         self._instance.set(*self._values(name, value))
 
     def step(self, duration: float) -> None:
@@ -264,7 +267,7 @@ class FmuPlant:
         Raises:
             FmuError: the FMU cannot save its state.
         """
-        return struct.pack(_CLOCK, self.calls["time"], self.calls["changed"]) + self._instance.state()
+        return struct.pack(_CLOCK, *(self.calls[name] for name in _CLOCKED)) + self._instance.state()
 
     def restore(self, state: bytes) -> None:
         """Go back to a state of this plant, or of another with the same FMU and settings.
@@ -276,7 +279,8 @@ class FmuPlant:
         if len(state) < size:
             raise FmuError(f"{self.path.name} cannot restore a state of {len(state)} bytes, for it is none of this plant")
         self._instance.restore(state[size:])
-        self.calls["time"], self.calls["changed"] = struct.unpack(_CLOCK, state[:size])
+        for name, value in zip(_CLOCKED, struct.unpack(_CLOCK, state[:size]), strict=True):
+            self.calls[name] = value
 
     def failure(self) -> FmuError:
         """The error that says what went wrong in the compiled calls, in the FMU's own words."""
@@ -285,6 +289,11 @@ class FmuPlant:
     def _values(self, name: str, value: ArrayLike, spread: bool = False) -> tuple[FmuVariable, NDArray[Any]]:
         variable = self.description[name]
         return variable, variable.values(value, self.path.name, spread)
+
+    def _start_values(self, setting: Setting) -> tuple[FmuVariable, NDArray[Any]]:
+        variable, values = self._values(setting.name, setting.value, spread=True)
+        check_start(variable, self.path.name, self.bound.driven)
+        return variable, values
 
     def _check_period(self, period: float, step: float | None) -> None:
         if not 0.0 < period < inf:
@@ -297,17 +306,17 @@ class FmuPlant:
         co_simulation, experiment = self.description.co_simulation, self.description.experiment
         if co_simulation.canHandleVariableCommunicationStepSize:
             return
-        fixed = co_simulation.fixedInternalStepSize or (experiment.stepSize if experiment else None)
-        if fixed is None or _is_multiple(step or period, float(fixed)):
+        fixed = float(co_simulation.fixedInternalStepSize or (experiment and experiment.stepSize) or 0.0)
+        if fixed <= 0.0 or _is_multiple(step or period, fixed):
             return
         if step is not None:
             raise InputError(
-                f"{self.path.name} cannot take a step of {step:g} s: its own is fixed at {float(fixed):g} s; set [fmu] step to "
+                f"{self.path.name} cannot take a step of {step:g} s: its own is fixed at {fixed:g} s; set [fmu] step to "
                 "that, or to a multiple"
             )
         raise InputError(
-            f"{self.path.name} cannot take a rate of {1 / period:g} Hz: its step is fixed at {float(fixed):g} s, so the "
-            f"rate must be {1 / float(fixed):g} Hz divided by a whole number"
+            f"{self.path.name} cannot take a rate of {1 / period:g} Hz: its step is fixed at {fixed:g} s, so the "
+            f"rate must be {1 / fixed:g} Hz divided by a whole number"
         )
 
     def _check_changes(self, changes: Sequence[Setting]) -> None:
@@ -320,13 +329,11 @@ class FmuPlant:
                     f"{each.name} of {self.path.name} cannot change during the run, for it is neither an input nor a tunable "
                     "parameter: set it without @"
                 )
-            if each.name in self.bound.driven:
-                raise InputError(f"{each.name} of {self.path.name} is set by the loop, and cannot be set besides")
-            if (values < variable.minimum).any() or (values > variable.maximum).any():
-                raise InputError(
-                    f"{each.name} of {self.path.name} is to be {','.join(f'{value:g}' for value in values)}; it must be from "
-                    f"{variable.minimum:g} to {variable.maximum:g}"
-                )
+            check_free(variable, self.path.name, self.bound.driven)
+            limits = np.broadcast_to(variable.minimum, values.shape), np.broadcast_to(variable.maximum, values.shape)
+            for name, value, least, most in zip(variable.element_names, values, *limits, strict=True):
+                if not least <= value <= most:
+                    raise InputError(f"{name} of {self.path.name} is to be {value:g}; it must be from {least:g} to {most:g}")
 
     def _add_change(self, setting: Setting) -> None:
         variable, values = self._values(setting.name, setting.value, spread=True)
@@ -345,7 +352,7 @@ class FmuPlant:
         calls["get"], calls["set"], calls["do_step"] = (
             instance.address(each) for each in (f"Get{real}", f"Set{real}", "DoStep")
         )  # fmt: skip
-        calls["step"] = step or 0.0
+        calls["step"], calls["final"] = step or 0.0, not self.description.saves_state
         for group in ("sensed", "known", "commanded", "loaded"):
             _fill(calls[group], getattr(bound, group))
         if bound.modes.variable is not None:
@@ -366,12 +373,13 @@ class FmuPlant:
             calls["mode_values"][mode] = int.from_bytes(value.tobytes(), "little")
 
 
-_CLOCK = "<dq"
+_CLOCKED = ("time", "since", "length", "steps", "changed")
+_CLOCK = "<dddqq"
 
 
 def _is_multiple(duration: float, step: float) -> bool:
     multiple = duration / step
-    return round(multiple) >= 1 and abs(multiple - round(multiple)) <= 1e-6
+    return 0.5 < multiple < inf and abs(multiple - round(multiple)) <= 1e-6
 
 
 def _fill(record: Record, scalars: Scalars) -> None:
@@ -386,10 +394,10 @@ def _fill(record: Record, scalars: Scalars) -> None:
 def _calling(arguments: str) -> Any:
     """An intrinsic that calls the C function at an address with a tuple of arguments and returns its int.
 
-    `arguments` has one letter each: p for a pointer or size (intp), d for a double, b for a bool, i for an int.
+    `arguments` has one letter each: p for a pointer or size (intp), d for a double, b for a bool (uint8), i for an int.
     """
-    llvm = {"p": ir.IntType(64), "d": ir.DoubleType(), "b": ir.IntType(1), "i": ir.IntType(32)}
-    numba_types = {"p": types.intp, "d": types.float64, "b": types.boolean, "i": types.int32}
+    llvm = {"p": ir.IntType(64), "d": ir.DoubleType(), "b": ir.IntType(8), "i": ir.IntType(32)}
+    numba_types = {"p": types.intp, "d": types.float64, "b": types.uint8, "i": types.int32}
     tuple_of: Any = types.Tuple
 
     @intrinsic
@@ -399,11 +407,10 @@ def _calling(arguments: str) -> Any:
         def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
             function_type = ir.FunctionType(ir.IntType(32), [llvm[letter] for letter in arguments])
             function = builder.inttoptr(args[0], function_type.as_pointer())
-            unpacked = []
-            for i, letter in enumerate(arguments):
-                value = builder.extract_value(args[1], i)
-                unpacked.append(builder.trunc(value, llvm["b"]) if letter == "b" else value)
-            return builder.call(function, unpacked)
+            unpacked = [builder.extract_value(args[1], i) for i in range(len(arguments))]
+            # Callees may count on a bool that fills its register.
+            extended = {i: ("zeroext",) for i, letter in enumerate(arguments) if letter == "b"}
+            return builder.call(function, unpacked, arg_attrs=extended)
 
         return signature, generate
 
@@ -559,14 +566,17 @@ def _step(c: Record, step: float) -> int:
     if c.status >= ERROR:
         return int(c.status)
     if c.version == 2:
-        status = _do_step_2(c.do_step, (c.instance, c.time, step, np.int32(1)))
+        status = _do_step_2(c.do_step, (c.instance, c.time, step, np.int32(c.final)))
     else:
         flags = c.flags
         at = flags.ctypes.data
-        status = _do_step_3(c.do_step, (c.instance, c.time, step, True, at, at + 1, at + 2, c.reached.ctypes.data))
+        status = _do_step_3(c.do_step, (c.instance, c.time, step, c.final, at, at + 1, at + 2, c.reached.ctypes.data))
         if status == OK and flags[1] != 0:
             status = ASKS_TO_END
         elif status == OK and (flags[0] != 0 or flags[2] != 0):
             status = NEEDS_EVENTS
-    c.time += step
+    if step != c.length:
+        c.since, c.length, c.steps = c.time, step, 0
+    c.steps += 1
+    c.time = c.since + c.steps * step
     return _ended(c, _STEPPING, status)

@@ -4,14 +4,17 @@ FMPy validates the description; the rest is found by loading the FMU and trying 
 """
 
 import contextlib
+import functools
 import io
+import multiprocessing
+import os
 import zipfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-import fmpy
 import numpy as np
 from fmpy.validation import validate_fmu
 
@@ -23,13 +26,16 @@ _SMALL = 1e-4
 _ROUGHLY = 1e-4
 """Of an input, a step for central differences; and how well they must agree with derivatives, relative to the largest."""
 
+Found = tuple[str, ...] | None
+"""Problems, none if all is well; None if there was nothing to look at."""
+
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was looked at: `problems` is empty if all is well, and None if there was nothing to look at."""
+    """One thing that was looked at, and what was found."""
 
     name: str
-    problems: tuple[str, ...] | None
+    problems: Found
 
 
 def platforms_of(path: Path) -> list[str]:
@@ -40,25 +46,55 @@ def platforms_of(path: Path) -> list[str]:
 
 
 def check_fmu(path: Path) -> list[Check]:
-    """Validate an FMU, and try it on this machine.
+    """Validate an FMU, and try it on this machine, in a process of its own, which may crash.
 
     Raises:
         FmuError: the file is no FMU for Co-Simulation.
     """
+    FmuDescription(path)
+    found = {"description and units (FMPy)": _found(lambda: validate_fmu(str(path)))}
+    found |= zip(_TRIALS, _try_apart(path), strict=True)
+    return [Check(name, problems) for name, problems in found.items()]
+
+
+def _try_apart(path: Path) -> list[Found]:
+    """What each trial finds; after a crash, the rest go on in another process."""
+    found: list[Found] = []
+    context = multiprocessing.get_context("spawn")
+    while len(found) < len(_TRIALS):
+        receiver, sender = context.Pipe(duplex=False)
+        process = context.Process(target=_try, args=(path, len(found), sender), daemon=True)
+        process.start()
+        sender.close()
+        with receiver, contextlib.suppress(EOFError):
+            while True:
+                found.append(receiver.recv())
+        process.join()
+        if len(found) < len(_TRIALS):
+            found.append((_ending(process.exitcode or 0),))
+    return found
+
+
+def _try(path: Path, first: int, sender: Connection) -> None:
+    """Make the trials from one on, in the process that is there for them."""
+    # Many an FMU prints.
+    silence = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        os.dup2(silence, stream)
     description = FmuDescription(path)
-    trials: dict[str, Callable[[], Iterable[str] | None]] = {
-        "description and units (FMPy)": lambda: validate_fmu(str(path)),
-        f"{_STEPS} steps with finite outputs": lambda: _step(description),
-        "a saved state goes on the same": lambda: _restore(description),
-        "derivatives agree with differences": lambda: _differentiate(description),
-    }
-    return [Check(name, _found(trial)) for name, trial in trials.items()]
+    for trial in list(_TRIALS.values())[first:]:
+        sender.send(_found(functools.partial(trial, description)))
 
 
-def _found(trial: Callable[[], Iterable[str] | None]) -> tuple[str, ...] | None:
+def _ending(status: int) -> str:
+    """How a process ended that should not have."""
+    return f"crashed with signal {-status}" if status < 0 else f"ended its process with status {status}"
+
+
+def _found(trial: Callable[[], Iterable[str] | None]) -> Found:
     """What a trial finds; what it raises is a finding, too."""
     try:
-        # FMPy and many an FMU print.
+        # FMPy prints.
         with contextlib.redirect_stdout(io.StringIO()), contextlib.chdir("."):
             problems = trial()
     except Exception as error:
@@ -74,7 +110,7 @@ def _advance(fmu: FmuInstance) -> None:
     experiment = fmu.description.experiment
     step = float(experiment.stepSize if experiment and experiment.stepSize else 1e-3)
     for i in range(_STEPS):
-        fmu.fmu.doStep(currentCommunicationPoint=i * step, communicationStepSize=step)
+        fmu.step(i * step, step)
 
 
 def _outputs(fmu: FmuInstance) -> list[Array]:
@@ -90,8 +126,7 @@ def _step(description: FmuDescription) -> list[str]:
 
 
 def _restore(description: FmuDescription) -> list[str] | None:
-    can = description.co_simulation
-    if not (can.canGetAndSetFMUstate and can.canSerializeFMUstate):
+    if not description.saves_state:
         return None
     with contextlib.closing(FmuInstance(description)) as fmu:
         fmu.initialize()
@@ -130,6 +165,8 @@ def _differentiate(description: FmuDescription) -> list[str] | None:
     return problems
 
 
-def this_machine(description: FmuDescription) -> str:
-    """The name of this machine's folder of binaries, in the FMU's version of FMI."""
-    return str(fmpy.platform if description.version == 2 else fmpy.platform_tuple)
+_TRIALS: dict[str, Callable[[FmuDescription], Iterable[str] | None]] = {
+    f"{_STEPS} steps with finite outputs": _step,
+    "a saved state goes on the same": _restore,
+    "derivatives agree with differences": _differentiate,
+}

@@ -7,7 +7,7 @@ from hypothesis import settings
 
 from plant.export import default_fmu
 from plant.mechanism import Mechanism, load_mechanism
-from tests.plant.foreign import build_foreign
+from tests.plant.foreign import build_foreign, build_foreign_3
 
 # The first example of a property may compile kernels, so there is no deadline; and the same examples come every time.
 settings.register_profile("gough", deadline=None, derandomize=True)
@@ -33,6 +33,12 @@ def fmu_path() -> Path:
 def foreign_fmu(hexapod: Mechanism, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An FMU of FMI 2.0 that shares nothing with gough's own (`tests/plant/foreign.c`)."""
     return build_foreign(tmp_path_factory.mktemp("foreign"), hexapod)
+
+
+@pytest.fixture(scope="session")
+def foreign_fmu_3(hexapod: Mechanism, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same hexapod in FMI 3.0, with other names and units (`tests/plant/foreign3.c`)."""
+    return build_foreign_3(tmp_path_factory.mktemp("foreign3"), hexapod)
 
 
 @pytest.fixture(scope="session")

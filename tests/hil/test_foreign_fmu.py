@@ -11,7 +11,7 @@ import pytest
 from hil.simulation import SimulationConfig, SimulationStoppedError, simulate
 from plant.binding import Setting
 from plant.errors import InputError
-from tests.plant.foreign import BINDING, TRUTH
+from tests.plant.foreign import BINDING, BINDING_3, TRUTH
 
 MM, DEG = 1e-3, np.radians(1.0)
 
@@ -20,6 +20,13 @@ MM, DEG = 1e-3, np.radians(1.0)
 def binding(tmp_path):
     path = tmp_path / "foreign.toml"
     path.write_text(BINDING + TRUTH)
+    return path
+
+
+@pytest.fixture
+def binding_3(tmp_path):
+    path = tmp_path / "foreign3.toml"
+    path.write_text(BINDING_3)
     return path
 
 
@@ -47,6 +54,17 @@ def test_a_foreign_fmu_follows_the_target(foreign_fmu, binding, tmp_path):
         assert found[group]["position_rms"] < 0.05 * MM
         assert found[group]["rotation_rms"] < 0.05 * DEG
     assert [each["at"] for each in found["config"]["settings"]] == [None, 1.5]
+
+
+def test_fmi_3_in_other_units_is_the_same_motion(foreign_fmu, foreign_fmu_3, binding, binding_3):
+    two, three = (
+        simulate(SimulationConfig(plant=str(fmu), binding=str(text), target="sines", duration=1.0, imu="ideal"))
+        for fmu, text in ((foreign_fmu, binding), (foreign_fmu_3, binding_3))
+    )
+    assert three.summary()["tracking"]["position_rms"] < 0.05 * MM
+    for field in ("position", "rotation", "command", "truth"):
+        np.testing.assert_allclose(three.records[field], two.records[field], atol=1e-9)
+    assert np.ptp(three.true_positions, axis=0).max() > 5.0 * MM
 
 
 def test_low_cost_imus_follow_on_a_foreign_fmu(foreign_fmu, binding):
@@ -96,6 +114,25 @@ def test_a_status_other_than_ok_ends_a_simulation_with_the_message_of_the_fmu(fo
         simulate(config)
     assert len(stopped.value.result.records) > 500
     assert np.isfinite(stopped.value.result.summary()["tracking"]["position_rms"])
+
+
+EVENT = "met an event, which needs event mode: export the FMU so that it handles its events itself"
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        (1, "gave a warning: servo 3 is at 91.5 degrees after a while"),
+        (10, "asked for the end of the simulation: the FMU gives no reason"),
+        (11, f"{EVENT}: the FMU gives no reason"),
+        (12, f"{EVENT}: the FMU gives no reason"),
+    ],
+)
+def test_a_warning_and_every_flag_of_fmi_3_end_a_simulation(foreign_fmu_3, binding_3, kind, words):
+    settings = tuple(map(Setting.parse, (f"trouble.kind={kind}", "trouble.time=0.3")))
+    config = SimulationConfig(plant=str(foreign_fmu_3), binding=str(binding_3), settings=settings, duration=0.5, imu="ideal")
+    with pytest.raises(SimulationStoppedError, match=rf"cycle 301 of 700: foreign3.fmu: a step {re.escape(words)}$"):
+        simulate(config)
 
 
 def test_a_run_on_the_clock_ends_with_the_message_of_the_fmu(foreign_fmu, bare):

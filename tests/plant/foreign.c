@@ -5,6 +5,8 @@
  * geometry.h has BASE[6][3], PLATFORM[6][3], AXES[6][3], LEG_IMU[6][3], PLATFORM_IMU[3], HOME[3] and GRAVITY[3] in millimetres.
  */
 #include <math.h>
+#include <signal.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -12,7 +14,7 @@
 #include "geometry.h"
 
 enum { RETRACT = 0, LAG = 6, FAULT_AT = 7, LEG_GYRO = 8, LEG_ACC = 26, TOP_GYRO = 44, TOP_ACC = 47, POSE = 50, ATTITUDE = 53,
-       EXTENSION = 57, REALS = 63 };
+       EXTENSION = 57, REALS = 63, CRASH = 99 };
 #define FIRST_REAL 1000
 #define TUBE 300.0
 #define G 9806.65
@@ -177,14 +179,15 @@ fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t n, const 
 
 fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, fmi2String resources,
                               const fmi2CallbackFunctions *functions, fmi2Boolean visible, fmi2Boolean logging) {
-    (void)type, (void)guid, (void)resources, (void)visible, (void)logging;
+    (void)type, (void)resources, (void)visible, (void)logging;
     Hexapod *h = functions->allocateMemory(1, sizeof *h);
     if (!h) return 0;
     h->call = *functions;
     strncpy(h->name, name, sizeof h->name - 1);
     State *s = &h->state;
     s->reals[LAG] = 0.02;
-    s->reals[FAULT_AT] = 1e9;
+    /* A fault can be built in. */
+    s->reals[FAULT_AT] = sscanf(guid, "{fault %d}", &s->fault_status) == 1 ? 0.003 : 1e9;
     for (int i = 0; i < 3; i++) s->pose.p[i] = HOME[i], s->pose.R[i][i] = 1;
     double leg[6][3], arm[6][3];
     legs(&s->pose, leg, arm);
@@ -240,11 +243,13 @@ fmi2Status fmi2SetBoolean(fmi2Component c, const fmi2ValueReference vr[], size_t
 }
 
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real step, fmi2Boolean no_set) {
-    (void)no_set;
     Hexapod *h = c;
     State *s = &h->state;
     double length[6], speed[6];
+    /* This FMU can save its state, and wants to know that an earlier one may come back. */
+    if (no_set) return fmi2Error;
     if (time >= s->reals[FAULT_AT]) {
+        if (s->fault_status == CRASH) raise(SIGSEGV);
         h->call.logger(h->call.componentEnvironment, h->name, s->fault_status, "servo", "servo %d is at %.1f degrees after %s", 3, 91.5, "a while");
         return (fmi2Status)s->fault_status;
     }

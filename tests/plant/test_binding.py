@@ -18,7 +18,7 @@ from plant.errors import FmuError, InputError, UnknownNameError
 from plant.fmu import MOST_CHANGES, FmuPlant, advance, read_imus, read_truth, write_command, write_drive_mode, write_drive_modes
 from plant.pose import Array
 from plant.variables import BRAKE, VELOCITY
-from tests.plant.foreign import BINDING, TRUTH
+from tests.plant.foreign import BINDING, TRUTH, edited
 
 Load = Callable[..., FmuPlant]
 SPEEDS = np.linspace(-0.02, 0.03, 6)
@@ -115,6 +115,20 @@ def test_imus_that_are_not_there_read_nothing(load: Load) -> None:
     assert np.isnan(plant.calls["imu"][:, 6]).all()
 
 
+def test_imus_may_come_in_any_order(load: Load) -> None:
+    turned = re.sub(r"('leg1\.acc\.x'.*?), ('leg2\.acc\.x'.*?), ('leg3)", r"\2, \1, \3", BINDING)
+    assert turned != BINDING
+    turned = turned.replace("[imu_specific_force]", "[imu_specific_force]\nimus = [1, 0, 2, 3, 4, 5, 6]")
+    plant, straight = load(turned), load(BINDING)
+    assert move(plant, 20)[:42].tobytes() == move(straight, 20)[:42].tobytes()
+    assert plant.bound.imus == (0, 1, 2, 3, 4, 5, 6)
+    for imus in ("[true, 0]", "[1.0, 0]", "[0, 0]"):
+        with pytest.raises(
+            FmuError, match=r"\[imu_specific_force\] imus is .*; it must be a list of different numbers from 0 to 6"
+        ):
+            load(BINDING.replace("[imu_specific_force]", f"[imu_specific_force]\nimus = {imus}"))
+
+
 def test_a_planar_plant_has_its_pose_in_space(load: Load) -> None:
     imus = {
         signal: [f"{place}.{kind}.{axis}" for place in ("leg1", "leg2", "leg3", "top") for axis in "xyz"]
@@ -135,8 +149,12 @@ def test_a_planar_plant_has_its_pose_in_space(load: Load) -> None:
 
 def test_the_communication_step_divides_the_period(load: Load, foreign_fmu: Path) -> None:
     plant = load()
+    for _ in range(5000):
+        plant.step(1e-3)
+    # A sum of so many steps would be off by 1e-12 s.
+    assert plant.calls["time"] == 10_000 * 0.0005
     plant.step(2e-3)
-    assert plant.calls["time"] == pytest.approx(2e-3, rel=1e-15)
+    assert plant.calls["time"] == 10_004 * 0.0005
     message = (
         r"foreign.fmu cannot take a rate of 800 Hz: its binding sets a step of 0.0005 s, so the rate must be 2000 Hz divided"
     )
@@ -169,6 +187,14 @@ def test_the_communication_step_divides_the_period(load: Load, foreign_fmu: Path
         (('variables = "servo.on"', "variables = 3"), r"\[drive_mode\] variables is 3; it must be the name of a variable"),
         (("offset = 0.3", "offset = 'far'"), r"\[leg_length\] offset is 'far'; it must be a number"),
         (("offset = 0.3", "unit = 'A'"), r"\[leg_length\] unit is 'A'; it must be one of m, dm, cm, mm"),
+        (('unit = "g"', 'unit = ["g"]'), r"\[imu_specific_force\] unit is \['g'\]; it must be one of"),
+        (("step = 0.0005", "step = 1e-320"), r"\[fmu\] step is 1e-320; it must be a number of seconds, at least 1e-06"),
+        (("step = 0.0005", f"step = 1{'0' * 400}"), r"\[fmu\] step is 10+; it must be a number of seconds"),
+        (("'servo6.retract'", "'servo5.retract'"), "velocity_command: servo5.retract must be bound once, and not more often"),
+        (("'leg1.acc.x'", "'leg1.gyro.x'"), "imu_angular_velocity and imu_specific_force: leg1.gyro.x must be bound once"),
+        (('"servo.lag" = 0.015', '"servo1.retract" = 1'), r"\[start\] servo1.retract of foreign.fmu is set by the loop"),
+        (("velocity = true\n", "velocity = false\n"), "drive_mode: brake and velocity are both 0 and must differ"),
+        (("brake = false", "brake = [0]"), r"\[drive_mode\] brake is \[0\]; it must be a number, true or false"),
     ],
 )  # fmt: skip
 def test_a_binding_that_does_not_fit_is_refused_with_its_one_error(load: Load, change: tuple[str, str], message: str) -> None:
@@ -215,20 +241,6 @@ def test_start_values_that_the_fmu_refuses_come_with_its_message(load: Load) -> 
         load(BINDING, "servo.lag=-1")
 
 
-def edited(fmu: Path, path: Path, *changes: tuple[str, str]) -> Path:
-    """A copy of an FMU with another text in its description."""
-    with zipfile.ZipFile(fmu) as archive:
-        contents = {name: archive.read(name) for name in archive.namelist()}
-    text = contents["modelDescription.xml"].decode()
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, data in {**contents, "modelDescription.xml": text.encode()}.items():
-            archive.writestr(name, data)
-    return path
-
-
 def test_an_fmu_whose_tool_is_missing_says_so(load: Load, foreign_fmu: Path, tmp_path: Path) -> None:
     changes = ('modelIdentifier="foreign"', 'modelIdentifier="foreign" needsExecutionTool="true"'), ("<Real/>", "<Real/>")
     path = edited(foreign_fmu, tmp_path / "tool.fmu", *changes)
@@ -263,6 +275,8 @@ def test_settings_come_after_the_binding_and_at_their_time(load: Load) -> None:
         (["servo.lag=1,2@3"], InputError, "servo.lag of foreign.fmu has 1 elements, got 2"),
         (["fault.status=1@3"], InputError, "neither an input nor a tunable parameter: set it without @"),
         (["servo1.retract=1@3"], InputError, "servo1.retract of foreign.fmu is set by the loop"),
+        (["servo1.retract=1"], InputError, "servo1.retract of foreign.fmu is set by the loop"),
+        (["pose.x=1"], InputError, "pose.x of foreign.fmu is a continuous output variable, which takes no start value"),
         (["servo.lag=0@3"], InputError, "servo.lag of foreign.fmu is to be 0; it must be from 0.001 to inf"),
         (["fault.status=0.5"], InputError, "fault.status of foreign.fmu must be whole numbers"),
         ([f"servo.lag=1@{n}" for n in range(MOST_CHANGES + 1)], InputError, f"at most {MOST_CHANGES} can"),
@@ -271,6 +285,28 @@ def test_settings_come_after_the_binding_and_at_their_time(load: Load) -> None:
 def test_settings_that_do_not_fit_are_refused(load: Load, settings: list[str], error: type, message: str) -> None:
     with pytest.raises(error, match=re.escape(message)):
         load(BINDING, *settings)
+
+
+def test_each_scalar_of_an_array_keeps_its_own_limits(load: Load, foreign_fmu: Path, tmp_path: Path) -> None:
+    limits = 'valueReference="1007" causality="parameter" variability="tunable"><Real start="1" min="0.001"'
+    path = edited(
+        foreign_fmu,
+        tmp_path / "array.fmu",
+        ("servo.lag", "set[1]"),
+        ("fault.at", "set[2]"),
+        (limits, limits.replace("0.001", "5")),
+    )
+    plant = load(without("start"), "set=0.02,7", "set=0.05,8@0.001", fmu=path)
+    for _ in range(2):
+        plant.step(1e-3)
+    np.testing.assert_array_equal(plant.get("set"), [0.05, 8.0])
+    with pytest.raises(InputError, match=r"set\[2\] of array.fmu is to be 0.05; it must be from 5 to inf"):
+        load(without("start"), "set=0.05@0.001", fmu=path)
+
+
+def test_a_binding_may_leave_what_is_usual(load: Load) -> None:
+    plant = load(BINDING.replace("velocity = true\nbrake = false\n", "velocity = 1\n"))
+    np.testing.assert_array_equal(plant.bound.modes.values, [0.0, 0.0, 1.0])
 
 
 def test_settings_are_read_from_text() -> None:
@@ -327,11 +363,12 @@ def test_a_restored_state_goes_on_bit_for_bit(load: Load) -> None:
     saved = plant.state()
     first = move(plant, 60)
     plant.restore(saved)
-    assert plant.calls["time"] == pytest.approx(0.05)
+    assert plant.calls["time"] == 100 * 0.0005
     np.testing.assert_array_equal(move(plant, 60), first)
     other = load(BINDING, "servo.lag=0.1@0.08")
     other.restore(saved)
     np.testing.assert_array_equal(move(other, 60), first)
+    assert other.calls["time"] == 220 * 0.0005
 
 
 def test_a_state_that_cannot_be_saved_or_is_none_is_an_error(load: Load, foreign_fmu: Path, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import fmpy
 import numpy as np
 import pytest
 
+from plant.binding import Setting
 from plant.errors import FmuError, InputError, UnknownNameError
 from plant.export import PLANAR_MODEL, default_fmu
 from plant.fmu import FmuPlant, advance, read_imus, read_truth, write_command, write_drive_mode, write_drive_modes
@@ -67,7 +68,7 @@ def test_a_file_that_is_no_archive_is_refused(hexapod: Mechanism, tmp_path: Path
 
 def test_a_folder_is_refused(hexapod: Mechanism, tmp_path: Path) -> None:
     (tmp_path / "folder.fmu").mkdir()
-    refused(tmp_path / "folder.fmu", hexapod)
+    assert "folder.fmu is a folder: name the FMU's file" in refused(tmp_path / "folder.fmu", hexapod)
 
 
 def test_an_archive_cut_short_is_refused(hexapod: Mechanism, fmu_path: Path, tmp_path: Path) -> None:
@@ -245,6 +246,19 @@ def test_only_tunable_parameters_change_during_a_run(make_plant: MakePlant) -> N
         plant.set("payload.mass", -1.0)
 
 
+def test_only_parameters_and_inputs_have_start_values(fmu_path: Path) -> None:
+    message = "time of gough_plant.fmu is a continuous independent variable, which takes no start value"
+    with pytest.raises(InputError, match=message):
+        FmuPlant(fmu_path, {}, 1e-3, settings=[Setting.parse("time=1")])
+    with pytest.raises(InputError, match=r"drive_mode of gough_plant.fmu is set by the loop"):
+        FmuPlant(fmu_path, {}, 1e-3, settings=[Setting.parse("drive_mode=2")])
+
+
+def test_only_reals_have_derivatives(make_plant: MakePlant) -> None:
+    with pytest.raises(InputError, match=r"drive_mode of gough_plant.fmu is of type Enumeration and has no derivatives"):
+        make_plant().linearize(["drive_mode"], ["position"])
+
+
 def test_outputs_cannot_be_set(make_plant: MakePlant) -> None:
     with pytest.raises(FmuError, match=r"position is calculated and cannot be set"):
         make_plant().set("position", np.zeros(3))
@@ -370,7 +384,7 @@ def test_compiled_calls_do_what_fmpys_methods_do(hexapod: Mechanism, fmu_path: P
 
     imu = ("imu_angular_velocity", "imu_specific_force", "imu_magnetic_field")
     truth = ("position", "quaternion", "leg_length", "current")
-    period, time = 1e-3, 0.0
+    period = 1e-3
     with FmuPlant(fmu_path, hexapod.plant_parameters(), period) as plant:
         for cycle in range(200):
             command, mode = commands(cycle)
@@ -379,14 +393,14 @@ def test_compiled_calls_do_what_fmpys_methods_do(hexapod: Mechanism, fmu_path: P
             slow.setFloat64([references["velocity_command"]], command.tolist())
             slow.setInt64([references["drive_mode"]], [mode] * 6)
             assert advance(plant.calls, period) == 0
-            slow.doStep(time, period)
-            time += period
+            slow.doStep(cycle * period, period)
             assert read_imus(plant.calls) == 0
             assert read_truth(plant.calls) == 0
             expected = slow.getFloat64([references[name] for name in imu], nValues=63)
             np.testing.assert_array_equal(plant.calls["imu"].ravel(), expected)
             np.testing.assert_array_equal(plant.calls["truth"], slow.getFloat64([references[n] for n in truth], nValues=19))
-            assert plant.calls["time"] == plant.get("time") == slow.getFloat64([references["time"]])[0]
+            assert plant.calls["time"] == (cycle + 1) * period
+            assert plant.get("time") == slow.getFloat64([references["time"]])[0]
         assert np.ptp(plant.get("leg_length")) > 1e-4
         for variable in OUTPUTS:
             one_by_one = slow.getFloat64([references[variable.name]], nValues=variable.size)
