@@ -401,6 +401,7 @@ class FmuInstance:
         Raises:
             FmuError: the FMU fails.
         """
+        self.check_open()
         with self._calling("a step"):
             self.fmu.doStep(time, duration, not self.description.saves_state)
 
