@@ -124,15 +124,22 @@ class SimulationConfig:
 
     @classmethod
     def from_plain(cls, values: Mapping[str, Any]) -> "SimulationConfig":
-        """The configuration of which `dataclasses.asdict` has made these values, perhaps with lists for tuples."""
+        """The configuration of which `dataclasses.asdict` has made these values, perhaps with lists for tuples.
+
+        Raises:
+            InputError: it has made no such values.
+        """
 
         def tuples(value: Any) -> Any:
             return tuple(map(tuples, value)) if isinstance(value, list | tuple) else value
 
-        plain = {name: tuples(value) for name, value in values.items()}
-        plain["wiring"] = Wiring(**{name: tuples(value) for name, value in values["wiring"].items()})
-        plain["settings"] = tuple(Setting(**each | {"value": tuples(each["value"])}) for each in values["settings"])
-        return cls(**plain)
+        try:
+            plain = {name: tuples(value) for name, value in values.items()}
+            plain["wiring"] = Wiring(**{name: tuples(value) for name, value in values["wiring"].items()})
+            plain["settings"] = tuple(Setting(**each | {"value": tuples(each["value"])}) for each in values["settings"])
+            return cls(**plain)
+        except (TypeError, KeyError, AttributeError) as error:
+            raise InputError(f"these values are no configuration of a simulation: {error}") from None
 
     @property
     def streamed(self) -> bool:
@@ -262,13 +269,16 @@ def simulate(
             took += time.perf_counter() - began
             if cause != OK:
                 break
-            if last == saved:
+            if last == saved and loop.state["stopping"] == OK:
                 snapshot = take_snapshot(asdict(config), loop, loop.simulated)
             progress((last - first) / (count - first))
         result = _result(config, loop, first, snapshot, took)
-        if cause != OK:
-            at = int(loop.state["stop_cycle"])
-            raise SimulationStoppedError(f"stopped on the brakes at cycle {at} of {count}: {loop.reason()}", result)
+        if loop.state["stopping"] != OK:
+            at, held = (
+                int(loop.state["stop_cycle"]),
+                "stopped on the brakes" if cause != OK else "still stopping at the end, from",
+            )
+            raise SimulationStoppedError(f"{held} at cycle {at} of {count}: {loop.reason()}", result)
     return result
 
 
