@@ -22,6 +22,7 @@ from controller.settings import control_settings, safety_settings, sensor_settin
 from controller.stream import rest
 from controller.target import Target, check_duration, load_target
 from hil.loop import COMPUTED, RECORD, Loop, PythonFilters
+from hil.rigs.contract import check_legs
 from hil.snapshot import Snapshot, resume_snapshot, take_snapshot
 from plant.binding import OWN_BINDING, Setting, load_binding
 from plant.compiled import Record
@@ -328,6 +329,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
     nominal = load_in_space(config.mechanism)
     calibration = Calibration() if config.calibration is None else load_calibration(config.calibration)
     if nominal.planar:
+        check_legs(config.rig, nominal)
         _check_planar(config, calibration)
     mechanism = nominal.moved_joints(calibration.joints[:, : nominal.legs])
     target = load_target("hold" if config.streamed else config.target, mechanism, config.duration)
@@ -381,8 +383,6 @@ def _check_planar(config: SimulationConfig, calibration: Calibration) -> None:
         raise InputError(f"fusion {config.fusion!r} is for six legs; for {config.mechanism}, which is planar, take 'compiled'")
     if config.streamed:
         raise InputError(f"a target can be streamed to six legs alone; {config.mechanism} is planar: give a motion or a file")
-    if config.rig in ("udp", "canopen"):
-        raise InputError(f"the rig {config.rig!r} has six legs, and {config.mechanism} has three: choose another rig")
     if calibration.joints.any():
         raise InputError(f"{config.calibration} moves the joints of six legs, and {config.mechanism} has three: leave them out")
 
