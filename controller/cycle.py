@@ -413,6 +413,12 @@ def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool =
                 f"gravity hardly tells the angles of leg {leg}: of the vertical only {across[leg]:.2g} lies across the axes "
                 f"of its joint, and {_LEAST_OBSERVABILITY:g} is needed: turn base_joint_axes[{leg}], or leave its IMU out"
             )
+    names = ", ".join(str(imu) for imu in imus_of(mechanism, imus)) or "none"
+    if mechanism.planar and PLATFORM_IMU not in imus:
+        raise InputError(
+            f"the IMUs {names} determine the pose of {mechanism.name!r} up to its two assembly modes at best, which the loop "
+            "cannot tell apart: add the platform's IMU (6), whose roll does"
+        )
     positions, rotations = sample_workspace(mechanism, 50, seed=0)
     parameters, state = np.zeros((), PARAMETERS), np.zeros((), STATE)
     parameters["geometry"] = geometry_of(mechanism)
@@ -428,7 +434,6 @@ def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool =
         state["vectors"] = field.vectors @ rotation
         worst = min(worst, find_pose(parameters, state))
     if worst < WORST_CONDITIONING:
-        names = ", ".join(str(imu) for imu in imus_of(mechanism, imus)) or "none"
         remedies = ["legs"]
         if PLATFORM_IMU not in imus:
             remedies.append("the platform's IMU (6)")

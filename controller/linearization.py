@@ -10,10 +10,10 @@ from plant.fmu import FmuPlant
 def state_space(
     plant: FmuPlant, inputs: Sequence[str] = ("velocity_command",), outputs: Sequence[str] = ("leg_length",)
 ) -> control.StateSpace:
-    """The plant about where it is, from the FMU's directional derivatives, its signals by their names in FMI 2.0.
+    """The plant about where it is, from the FMU's directional derivatives.
 
-    gough's own plants have a quaternion among their states, so one state more than they have coordinates: along it, in the
-    direction of its own length, nothing moves.
+    Signals have their names of FMI 2.0, with underscores for points, which python-control does not allow. gough's spatial
+    plant has a quaternion among its states, so one state more than it has coordinates: its length, which nothing sees.
 
     Args:
         plant: any that has directional derivatives and shows its states.
@@ -25,6 +25,10 @@ def state_space(
     """
     linear = plant.linearize(inputs, outputs)
     return control.StateSpace(
-        linear.a, linear.b, linear.c, linear.d, name=plant.path.stem, states=list(linear.states), inputs=list(linear.inputs),
-        outputs=list(linear.outputs),
+        linear.a, linear.b, linear.c, linear.d, name=_label(plant.path.stem),
+        **{side: [_label(name) for name in getattr(linear, side)] for side in ("states", "inputs", "outputs")},
     )  # fmt: skip
+
+
+def _label(name: str) -> str:
+    return name.replace(".", "_")

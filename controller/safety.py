@@ -33,6 +33,9 @@ GO_ON, STOP, STOP_QUICKLY, BRAKE_AT_ONCE = range(4)
 REACTIONS = ("goes on", "controlled stop", "quick stop", "brakes at once")
 
 
+_WORST = ", the worst is IMU {}"
+
+
 @dataclass(frozen=True)
 class Cause:
     """Why something happened: in words, with the number of a leg or an IMU; the reaction; the unit of its value and limit."""
@@ -67,7 +70,7 @@ CAUSES = (
     Cause("IMU {} is left out: it disagrees with the others", GO_ON, "rad"),
     Cause("IMU {} is used again", GO_ON),
     Cause("too many IMUs are lost", STOP, "IMUs"),
-    Cause("the IMUs contradict each other, the worst is IMU {}", STOP, "rad"),
+    Cause(f"the IMUs contradict each other{_WORST}", STOP, "rad"),
     Cause("the IMUs that can be used no longer determine the pose", STOP_QUICKLY),
     Cause("an estimate or a command is no longer finite", STOP_QUICKLY),
     Cause(
@@ -114,7 +117,7 @@ def describe_end(state: Record) -> str:
     safety = state["safety"]
     values = int(safety["end_index"]), float(safety["end_value"]), float(safety["end_limit"])
     before = int(safety["stopped_for"])
-    first = f"{CAUSES[before].text.replace(' {}', '')}, and then: " if before != NO_CAUSE else ""
+    first = f"{CAUSES[before].text.replace(_WORST, '').replace(' {}', '')}, and then: " if before != NO_CAUSE else ""
     return first + describe_event(int(state["stopping"]), *values)
 
 
@@ -127,9 +130,9 @@ def describe_obstacle(state: Record) -> str:
 
 
 def describe_event(cause: int, index: int, value: float, limit: float) -> str:
-    """An event in words."""
+    """An event in words; the worst IMU is not named where the index, -1, tells none."""
     known = CAUSES[cause]
-    text = known.text.format(index)
+    text = (known.text if index >= 0 else known.text.replace(_WORST, "")).format(index)
     if np.isnan(value):
         return text
     unit = f" {known.unit}" if known.unit else ""
@@ -398,7 +401,9 @@ def hear(parameters: Record, state: Record, sample_age: Record, drive: Record, s
 
 @kernel
 def watch_imus(parameters: Record, state: Record) -> None:
-    """After the refinement: leave out an IMU that contradicts the others and can be named, once; else stop."""
+    """After the refinement: leave out an IMU that contradicts the others and can be named, once; else stop. Three legs and the
+    roll of a planar mechanism are one measurement more than its pose needs: they tell that one is wrong, not which.
+    """
     p, s = parameters[()], state[()]
     w, m = s.safety, s.safety.monitor
     worst = 0
@@ -419,7 +424,7 @@ def watch_imus(parameters: Record, state: Record) -> None:
     # Without the one that is to blame, the others must agree.
     disagree = left - m.explained[worst] > p.leg_weight * p.safety.disagreement**2
     if disagree or excluded > 0 or m.explained[worst] < _CLEARER * second or p.safety.most_lost_imus == 0:
-        react(parameters, state, IMUS_DISAGREE, worst, off, p.safety.disagreement)
+        react(parameters, state, IMUS_DISAGREE, worst if p.planar == 0 else -1, off, p.safety.disagreement)
         return
     w.excluded[worst] = 1
     w.contradicted = 0.0

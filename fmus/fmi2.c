@@ -37,7 +37,7 @@ FMI2_Export fmi2Component fmi2Instantiate(
     if (!importer) return 0;
     importer->callbacks = callbacks;
     strcpy(importer->name, name);
-    Plant *plant = type == fmi2CoSimulation ? model_new(STEPPING, token, tell, importer) : 0;
+    Plant *plant = model_new(type == fmi2CoSimulation ? STEPPING : 0, token, tell, importer);
     if (!plant) free(importer);
     return plant;
 }
@@ -58,6 +58,7 @@ FMI2_Export fmi2Status fmi2SetupExperiment(
     fmi2Component c, fmi2Boolean tolerance_defined, fmi2Real tolerance, fmi2Real start_time, fmi2Boolean stop_defined,
     fmi2Real stop_time) {
     (void)tolerance_defined, (void)tolerance, (void)stop_defined, (void)stop_time;
+    if (model_require(c, INSTANTIATED, __func__) != OK) return fmi2Error;
     ((Plant *)c)->state.time = start_time;
     return fmi2OK;
 }
@@ -68,10 +69,7 @@ FMI2_Export fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
 
 FMI2_Export fmi2Status fmi2ExitInitializationMode(fmi2Component c) { return (fmi2Status)model_exit_initialization(c); }
 
-FMI2_Export fmi2Status fmi2Terminate(fmi2Component c) {
-    ((Plant *)c)->state.phase = TERMINATED;
-    return fmi2OK;
-}
+FMI2_Export fmi2Status fmi2Terminate(fmi2Component c) { return (fmi2Status)model_terminate(c); }
 
 FMI2_Export fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real step, fmi2Boolean no_set_state) {
     (void)no_set_state;
@@ -99,9 +97,9 @@ FMI2_Export fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference ref
 }
 
 FMI2_Export fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference references[], size_t n, const fmi2Real values[]) {
-    for (size_t i = 0; i < n; i++)
-        if (set(c, references[i], 0, values[i]) != OK) return fmi2Error;
-    return fmi2OK;
+    Status status = OK;
+    for (size_t i = 0; i < n && status == OK; i++) status = set(c, references[i], 0, values[i]);
+    return (fmi2Status)model_end_set(c, status);
 }
 
 FMI2_Export fmi2Status fmi2GetInteger(fmi2Component c, const fmi2ValueReference references[], size_t n, fmi2Integer values[]) {
@@ -120,30 +118,6 @@ FMI2_Export fmi2Status fmi2SetInteger(
     return fmi2OK;
 }
 
-static fmi2Status none_of(fmi2Component c, size_t n, const char *type) {
-    return n ? (fmi2Status)model_fail(c, "there are no variables of type %s", type) : fmi2OK;
-}
-
-FMI2_Export fmi2Status fmi2GetBoolean(fmi2Component c, const fmi2ValueReference v[], size_t n, fmi2Boolean values[]) {
-    (void)v, (void)values;
-    return none_of(c, n, "Boolean");
-}
-
-FMI2_Export fmi2Status fmi2SetBoolean(fmi2Component c, const fmi2ValueReference v[], size_t n, const fmi2Boolean values[]) {
-    (void)v, (void)values;
-    return none_of(c, n, "Boolean");
-}
-
-FMI2_Export fmi2Status fmi2GetString(fmi2Component c, const fmi2ValueReference v[], size_t n, fmi2String values[]) {
-    (void)v, (void)values;
-    return none_of(c, n, "String");
-}
-
-FMI2_Export fmi2Status fmi2SetString(fmi2Component c, const fmi2ValueReference v[], size_t n, const fmi2String values[]) {
-    (void)v, (void)values;
-    return none_of(c, n, "String");
-}
-
 /* ---- derivatives ---- */
 
 FMI2_Export fmi2Status fmi2GetDirectionalDerivative(
@@ -154,7 +128,7 @@ FMI2_Export fmi2Status fmi2GetDirectionalDerivative(
         if (model_may_derive(c, variable_at(unknowns[i]), 1) != OK) return fmi2Error;
     for (size_t i = 0; i < n_knowns; i++) {
         if (model_may_derive(c, variable_at(knowns[i]), 0) != OK) return fmi2Error;
-        known[knowns[i]] = seed[i];
+        known[knowns[i]] += seed[i];
     }
     model_forward(c, known, unknown);
     for (size_t i = 0; i < n_unknowns; i++) sensitivity[i] = unknown[unknowns[i]];
@@ -166,12 +140,12 @@ FMI2_Export fmi2Status fmi2GetDirectionalDerivative(
 FMI2_Export fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *saved) { return (fmi2Status)model_save(c, saved); }
 
 FMI2_Export fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate saved) {
-    model_restore(c, saved);
-    return fmi2OK;
+    return (fmi2Status)model_restore(c, saved);
 }
 
 FMI2_Export fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *saved) {
     (void)c;
+    if (!saved) return fmi2OK;
     free(*saved);
     *saved = 0;
     return fmi2OK;

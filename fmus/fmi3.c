@@ -15,8 +15,6 @@ static void tell(const Plant *plant, const char *message) {
     if (importer->log) importer->log(importer->environment, fmi3Error, "logStatusError", message);
 }
 
-static Status fail(fmi3Instance instance, const char *message) { return model_fail(instance, "%s", message); }
-
 /* ---- life ---- */
 
 FMI3_Export const char *fmi3GetVersion(void) { return "3.0"; }
@@ -75,10 +73,7 @@ FMI3_Export fmi3Status fmi3ExitInitializationMode(fmi3Instance instance) {
     return (fmi3Status)model_exit_initialization(instance);
 }
 
-FMI3_Export fmi3Status fmi3Terminate(fmi3Instance instance) {
-    ((Plant *)instance)->state.phase = TERMINATED;
-    return fmi3OK;
-}
+FMI3_Export fmi3Status fmi3Terminate(fmi3Instance instance) { return (fmi3Status)model_terminate(instance); }
 
 /* ---- Co-Simulation ---- */
 
@@ -95,24 +90,27 @@ FMI3_Export fmi3Status fmi3DoStep(
 
 /* ---- Model Exchange ---- */
 
+#define REQUIRE(phases)                                                                \
+    do {                                                                               \
+        if (model_require(instance, phases, __func__) != OK) return fmi3Error;         \
+    } while (0)
+
 FMI3_Export fmi3Status fmi3EnterEventMode(fmi3Instance instance) {
-    Plant *plant = instance;
-    if (plant->state.phase != CONTINUOUS) return (fmi3Status)fail(plant, "event mode follows continuous-time mode");
-    plant->state.phase = EVENTS;
+    REQUIRE(CONTINUOUS);
+    ((Plant *)instance)->state.phase = EVENTS;
     return fmi3OK;
 }
 
 FMI3_Export fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance instance) {
-    Plant *plant = instance;
-    if (plant->state.phase != EVENTS) return (fmi3Status)fail(plant, "continuous-time mode follows event mode");
-    plant->state.phase = CONTINUOUS;
+    REQUIRE(EVENTS);
+    ((Plant *)instance)->state.phase = CONTINUOUS;
     return fmi3OK;
 }
 
 FMI3_Export fmi3Status fmi3UpdateDiscreteStates(
     fmi3Instance instance, fmi3Boolean *again, fmi3Boolean *terminate, fmi3Boolean *nominals_changed,
     fmi3Boolean *values_changed, fmi3Boolean *next_event_defined, fmi3Float64 *next_event) {
-    (void)instance;
+    REQUIRE(EVENTS);
     *again = *terminate = *nominals_changed = *values_changed = *next_event_defined = fmi3False;
     *next_event = 0;
     return fmi3OK;
@@ -120,12 +118,14 @@ FMI3_Export fmi3Status fmi3UpdateDiscreteStates(
 
 FMI3_Export fmi3Status fmi3CompletedIntegratorStep(
     fmi3Instance instance, fmi3Boolean no_set_state, fmi3Boolean *enter_events, fmi3Boolean *terminate) {
-    (void)instance, (void)no_set_state;
+    (void)no_set_state;
+    REQUIRE(CONTINUOUS);
     *enter_events = *terminate = fmi3False;
     return fmi3OK;
 }
 
 FMI3_Export fmi3Status fmi3SetTime(fmi3Instance instance, fmi3Float64 time) {
+    REQUIRE(EVENTS | CONTINUOUS);
     ((Plant *)instance)->state.time = time;
     return fmi3OK;
 }
@@ -144,7 +144,7 @@ FMI3_Export fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance instance, siz
 
 FMI3_Export fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 indicators[], size_t n) {
     (void)indicators;
-    return n ? (fmi3Status)fail(instance, "fmi3GetEventIndicators: there are none") : fmi3OK;
+    return (fmi3Status)model_absent(instance, __func__, n);
 }
 
 static int has_all_states(fmi3Instance instance, size_t n) {
@@ -160,9 +160,9 @@ FMI3_Export fmi3Status fmi3GetContinuousStates(fmi3Instance instance, fmi3Float6
 }
 
 FMI3_Export fmi3Status fmi3SetContinuousStates(fmi3Instance instance, const fmi3Float64 states[], size_t n) {
+    REQUIRE(CONTINUOUS);
     if (!has_all_states(instance, n)) return fmi3Error;
-    for (size_t i = 0; i < n; i++) ((Plant *)instance)->state.values[i] = states[i];
-    model_changed(instance);
+    model_set_states(instance, states);
     return fmi3OK;
 }
 
@@ -174,17 +174,16 @@ FMI3_Export fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance instance, 
 }
 
 FMI3_Export fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance instance, fmi3Float64 derivatives[], size_t n) {
-    if (!has_all_states(instance, n)) return fmi3Error;
-    const double *rates;
-    Status status = model_rates(instance, &rates);
-    for (size_t i = 0; i < n; i++) derivatives[i] = rates[i];
-    return (fmi3Status)status;
+    REQUIRE(INITIALIZING | EVENTS | CONTINUOUS);
+    return has_all_states(instance, n) ? (fmi3Status)model_rates(instance, derivatives) : fmi3Error;
 }
 
 /* ---- variables ---- */
 
+static int length_of(fmi3ValueReference v) { return v < VARIABLES ? length[v] : 0; }
+
 static int fits(fmi3Instance instance, fmi3ValueReference v, size_t at, size_t n_values) {
-    if (v >= VARIABLES || at + length[v] <= n_values) return 1;
+    if (at + length_of(v) <= n_values) return 1;
     model_fail(instance, "too few values: %s needs %d", names[v], length[v]);
     return 0;
 }
@@ -194,26 +193,26 @@ FMI3_Export fmi3Status fmi3GetFloat64(
     for (size_t i = 0, at = 0; i < n; i++) {
         fmi3ValueReference v = references[i];
         if (v == VARIABLES) {
-            if (at + 1 > n_values) return (fmi3Status)fail(instance, "too few values: time needs 1");
+            if (at + 1 > n_values) return (fmi3Status)model_fail(instance, "too few values: time needs 1");
             values[at++] = ((Plant *)instance)->state.time;
             continue;
         }
         if (!fits(instance, v, at, n_values)) return fmi3Error;
-        if (model_get(instance, v, 0, v < VARIABLES ? length[v] : 0, 0, values + at) != OK) return fmi3Error;
-        at += length[v];
+        if (model_get(instance, v, 0, length_of(v), 0, values + at) != OK) return fmi3Error;
+        at += length_of(v);
     }
     return fmi3OK;
 }
 
 FMI3_Export fmi3Status fmi3SetFloat64(
     fmi3Instance instance, const fmi3ValueReference references[], size_t n, const fmi3Float64 values[], size_t n_values) {
-    for (size_t i = 0, at = 0; i < n; i++) {
+    Status status = OK;
+    for (size_t i = 0, at = 0; i < n && status == OK; i++) {
         fmi3ValueReference v = references[i];
-        if (!fits(instance, v, at, n_values)) return fmi3Error;
-        if (model_set(instance, v, 0, v < VARIABLES ? length[v] : 0, 0, values + at) != OK) return fmi3Error;
-        at += length[v];
+        status = fits(instance, v, at, n_values) ? model_set(instance, v, 0, length_of(v), 0, values + at) : FAILED;
+        at += length_of(v);
     }
-    return fmi3OK;
+    return (fmi3Status)model_end_set(instance, status);
 }
 
 FMI3_Export fmi3Status fmi3GetInt64(
@@ -222,8 +221,8 @@ FMI3_Export fmi3Status fmi3GetInt64(
     for (size_t i = 0, at = 0; i < n; i++) {
         fmi3ValueReference v = references[i];
         if (!fits(instance, v, at, n_values)) return fmi3Error;
-        if (model_get(instance, v, 0, v < VARIABLES ? length[v] : 0, 1, whole) != OK) return fmi3Error;
-        for (int j = 0; j < length[v]; j++) values[at++] = (fmi3Int64)whole[j];
+        if (model_get(instance, v, 0, length_of(v), 1, whole) != OK) return fmi3Error;
+        for (int j = 0; j < length_of(v); j++) values[at++] = (fmi3Int64)whole[j];
     }
     return fmi3OK;
 }
@@ -233,7 +232,7 @@ FMI3_Export fmi3Status fmi3SetInt64(
     double whole[LONGEST];
     for (size_t i = 0, at = 0; i < n; i++) {
         fmi3ValueReference v = references[i];
-        int count = v < VARIABLES ? length[v] : 0;
+        int count = length_of(v);
         if (!fits(instance, v, at, n_values)) return fmi3Error;
         for (int j = 0; j < count; j++) whole[j] = (double)values[at + j];
         if (model_set(instance, v, 0, count, 1, whole) != OK) return fmi3Error;
@@ -244,30 +243,26 @@ FMI3_Export fmi3Status fmi3SetInt64(
 
 /* ---- derivatives ---- */
 
+/* Check one side of a derivative, and add its values, if there are any, to their places. */
 static int scatter(
-    fmi3Instance instance, const fmi3ValueReference references[], size_t n, int unknown, const fmi3Float64 seed[], size_t n_seed,
-    double *vector) {
+    fmi3Instance instance, const fmi3ValueReference references[], size_t n, int unknown, const fmi3Float64 values[],
+    size_t n_values, double *vector) {
     size_t at = 0;
     for (size_t i = 0; i < n; i++) {
         fmi3ValueReference v = references[i];
         if (model_may_derive(instance, v, unknown) != OK) return 0;
-        for (int j = 0; seed && j < length[v] && at < n_seed; j++, at++) vector[offset[v] + j] = seed[at];
+        if (values && !fits(instance, v, at, n_values)) return 0;
+        for (int j = 0; values && j < length[v]; j++) vector[offset[v] + j] += values[at + j];
+        at += length[v];
     }
-    if (!seed || at == n_seed) return 1;
-    fail(instance, "the seed has more values than its variables");
+    if (at == n_values) return 1;
+    model_fail(instance, "the variables have %d values, and not %d", (int)at, (int)n_values);
     return 0;
 }
 
-static fmi3Status gather(
-    fmi3Instance instance, const fmi3ValueReference references[], size_t n, const double *vector, fmi3Float64 sensitivity[],
-    size_t n_sensitivity) {
-    size_t at = 0;
-    for (size_t i = 0; i < n; i++) {
-        fmi3ValueReference v = references[i];
-        if (!fits(instance, v, at, n_sensitivity)) return fmi3Error;
-        for (int j = 0; j < length[v]; j++) sensitivity[at++] = vector[offset[v] + j];
-    }
-    return fmi3OK;
+static void gather(const fmi3ValueReference references[], size_t n, const double *vector, fmi3Float64 sensitivity[]) {
+    for (size_t i = 0; i < n; i++)
+        for (int j = 0; j < length[references[i]]; j++) *sensitivity++ = vector[offset[references[i]] + j];
 }
 
 FMI3_Export fmi3Status fmi3GetDirectionalDerivative(
@@ -275,9 +270,10 @@ FMI3_Export fmi3Status fmi3GetDirectionalDerivative(
     size_t n_knowns, const fmi3Float64 seed[], size_t n_seed, fmi3Float64 sensitivity[], size_t n_sensitivity) {
     double known[VALUES] = {0}, unknown[VALUES] = {0};
     if (!scatter(instance, knowns, n_knowns, 0, seed, n_seed, known)) return fmi3Error;
-    if (!scatter(instance, unknowns, n_unknowns, 1, 0, 0, 0)) return fmi3Error;
+    if (!scatter(instance, unknowns, n_unknowns, 1, 0, n_sensitivity, 0)) return fmi3Error;
     model_forward(instance, known, unknown);
-    return gather(instance, unknowns, n_unknowns, unknown, sensitivity, n_sensitivity);
+    gather(unknowns, n_unknowns, unknown, sensitivity);
+    return fmi3OK;
 }
 
 FMI3_Export fmi3Status fmi3GetAdjointDerivative(
@@ -285,9 +281,10 @@ FMI3_Export fmi3Status fmi3GetAdjointDerivative(
     size_t n_knowns, const fmi3Float64 seed[], size_t n_seed, fmi3Float64 sensitivity[], size_t n_sensitivity) {
     double known[VALUES] = {0}, unknown[VALUES] = {0};
     if (!scatter(instance, unknowns, n_unknowns, 1, seed, n_seed, unknown)) return fmi3Error;
-    if (!scatter(instance, knowns, n_knowns, 0, 0, 0, 0)) return fmi3Error;
+    if (!scatter(instance, knowns, n_knowns, 0, 0, n_sensitivity, 0)) return fmi3Error;
     model_reverse(instance, unknown, known);
-    return gather(instance, knowns, n_knowns, known, sensitivity, n_sensitivity);
+    gather(knowns, n_knowns, known, sensitivity);
+    return fmi3OK;
 }
 
 /* ---- state ---- */
@@ -297,12 +294,12 @@ FMI3_Export fmi3Status fmi3GetFMUState(fmi3Instance instance, fmi3FMUState *save
 }
 
 FMI3_Export fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState saved) {
-    model_restore(instance, saved);
-    return fmi3OK;
+    return (fmi3Status)model_restore(instance, saved);
 }
 
 FMI3_Export fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *saved) {
     (void)instance;
+    if (!saved) return fmi3OK;
     free(*saved);
     *saved = 0;
     return fmi3OK;

@@ -16,6 +16,15 @@ Status model_fail(const Plant *plant, const char *format, ...) {
     return FAILED;
 }
 
+Status model_absent(const Plant *plant, const char *function, size_t n) {
+    return n ? model_fail(plant, "%s: this FMU has nothing for it", function) : OK;
+}
+
+Status model_require(const Plant *plant, int phases, const char *function) {
+    if (plant->state.phase & phases) return OK;
+    return model_fail(plant, "%s cannot be called in this mode", function);
+}
+
 /* ---- dynamics ---- */
 
 /* Call a function of plant.h: its arguments, then its results, and what it needs to work. */
@@ -61,12 +70,10 @@ static void place_at_start(State *s) {
 }
 
 /* The classical Runge-Kutta method with equal substeps. */
-static void integrate(State *s, double duration) {
-    int steps = (int)ceil(duration / s->values[SUBSTEP_AT] - 1e-9);
-    if (steps < 1) steps = 1;
+static void integrate(State *s, double duration, long steps) {
     double h = duration / steps, *x = s->values, k[4][STATES], at[STATES];
     require_constants(s);
-    for (int step = 0; step < steps; step++) {
+    for (long step = 0; step < steps; step++) {
         rates(s, x, k[0]);
         for (int i = 0; i < STATES; i++) at[i] = x[i] + h / 2 * k[0][i];
         rates(s, at, k[1]);
@@ -123,8 +130,10 @@ Plant *model_new(
     plant->after_initialization = after_initialization;
     plant->tell = tell;
     plant->importer = importer;
-    if (!token || strcmp(token, TOKEN)) {
-        model_fail(plant, "the instantiationToken is not that of modelDescription.xml");
+    Status status = OK;
+    if (!after_initialization) status = model_fail(plant, "this FMU is for Co-Simulation alone");
+    else if (!token || strcmp(token, TOKEN)) status = model_fail(plant, "the instantiationToken is not that of modelDescription.xml");
+    if (status != OK) {
         free(plant);
         return 0;
     }
@@ -137,12 +146,14 @@ void model_free(Plant *plant) { free(plant); }
 void model_reset(Plant *plant) {
     State *s = &plant->state;
     memset(s, 0, sizeof *s);
+    s->phase = INSTANTIATED;
     memcpy(s->values, start, sizeof start);
     place_at_start(s);
 }
 
 Status model_enter_initialization(Plant *plant, double start_time) {
     if (plant->state.phase != INSTANTIATED) return model_fail(plant, "initialisation can be entered only once after instantiation");
+    if (!isfinite(start_time)) return model_fail(plant, "the start time is not finite");
     plant->state.phase = INITIALIZING;
     plant->state.time = start_time;
     return OK;
@@ -158,6 +169,14 @@ Status model_exit_initialization(Plant *plant) {
     return OK;
 }
 
+Status model_terminate(Plant *plant) {
+    if (model_require(plant, STEPPING | EVENTS | CONTINUOUS, "terminate") != OK) return FAILED;
+    plant->state.phase = TERMINATED;
+    return OK;
+}
+
+#define MOST_SUBSTEPS 1e8
+
 Status model_step(Plant *plant, double time, double step) {
     State *s = &plant->state;
     if (s->phase != STEPPING) return model_fail(plant, "a step before the end of initialisation or after termination");
@@ -165,18 +184,27 @@ Status model_step(Plant *plant, double time, double step) {
     if (!(fabs(time - s->time) <= 1e-6 * step + 1e-9 * fabs(time)))
         return model_fail(plant, "the communication point is %.9g s, but the last step ended at %.9g s", time, s->time);
     if (!all_finite(s->values + INPUTS_AT, INPUTS)) return model_fail(plant, "an input is not finite");
-    integrate(s, step);
+    double steps = ceil(step / s->values[SUBSTEP_AT] - 1e-9);
+    if (steps > MOST_SUBSTEPS) return model_fail(plant, "a communication step of %g s takes more than %g substeps", step, MOST_SUBSTEPS);
+    integrate(s, step, steps < 1 ? 1 : (long)steps);
     s->time = time + step;
     if (!all_finite(s->values, STATES)) return model_fail(plant, "the state is no longer finite: reduce substep, or check the parameters");
     return check_limits(plant);
 }
 
-void model_changed(Plant *plant) { forget(&plant->state); }
+void model_set_states(Plant *plant, const double *states) {
+    memcpy(plant->state.values, states, STATES * sizeof(double));
+    forget(&plant->state);
+}
 
-Status model_rates(Plant *plant, const double **found) {
-    require_rates(&plant->state);
-    *found = plant->state.values + RATES_AT;
-    return all_finite(*found, STATES) ? OK : DISCARD;
+Status model_rates(Plant *plant, double *found) {
+    State *s = &plant->state;
+    require_rates(s);
+    memcpy(found, s->values + RATES_AT, STATES * sizeof(double));
+    if (check_limits(plant) != OK) return DISCARD;
+    if (all_finite(found, STATES)) return OK;
+    model_fail(plant, "a derivative is not finite");
+    return DISCARD;
 }
 
 /* ---- variables ---- */
@@ -208,14 +236,9 @@ Status model_set(Plant *plant, unsigned v, int first, int count, int integer, co
                 return model_fail(plant, "%s is %g; it must be 0 (open), 1 (brake) or 2 (velocity)", names[v], values[i]);
     /* Before the end of initialisation parameters may be set one after the other; then all are checked together. */
     if (kind[v] == TUNABLE && s->phase >= STEPPING) {
-        double before[LONGEST];
         if (check_range(plant, v, values, count) != OK) return FAILED;
-        memcpy(before, place, count * sizeof(double));
-        memcpy(place, values, count * sizeof(double));
-        if (check_conditions(plant) != OK) {
-            memcpy(place, before, count * sizeof(double));
-            return FAILED;
-        }
+        if (!plant->tuned) memcpy(plant->untuned, s->values + PARAMETERS_AT, sizeof plant->untuned);
+        plant->tuned = 1;
     }
     memcpy(place, values, count * sizeof(double));
     forget(s);
@@ -225,11 +248,21 @@ Status model_set(Plant *plant, unsigned v, int first, int count, int integer, co
     return OK;
 }
 
+Status model_end_set(Plant *plant, Status so_far) {
+    if (!plant->tuned) return so_far;
+    plant->tuned = 0;
+    if (so_far == OK && check_conditions(plant) == OK) return OK;
+    memcpy(plant->state.values + PARAMETERS_AT, plant->untuned, sizeof plant->untuned);
+    return FAILED;
+}
+
 /* ---- derivatives ---- */
 
 Status model_may_derive(const Plant *plant, unsigned v, int unknown) {
     if (v >= VARIABLES) return model_fail(plant, "there is no variable of value reference %u", v);
-    int possible = unknown ? kind[v] == OUTPUT || kind[v] == RATE : kind[v] == INPUT || kind[v] == STATE || is_parameter(v);
+    int state_follows = plant->state.phase < STEPPING;
+    int possible = unknown ? kind[v] == OUTPUT || kind[v] == RATE || (kind[v] == STATE && state_follows)
+                           : kind[v] == INPUT || is_parameter(v) || (kind[v] == STATE && !state_follows);
     if (!possible) return model_fail(plant, "%s cannot be %s of a derivative", names[v], unknown ? "an unknown" : "a known");
     return OK;
 }
@@ -237,9 +270,14 @@ Status model_may_derive(const Plant *plant, unsigned v, int unknown) {
 void model_forward(Plant *plant, const double *seed, double *sensitivity) {
     State *s = &plant->state;
     double constants[CONSTANTS];
+    const double *states = seed;
     require_constants(s);
     CALL(plant_constants_forward, (s->values + PARAMETERS_AT, seed + PARAMETERS_AT), (constants));
-    CALL(plant_forward, (s->values, s->values + INPUTS_AT, s->constants, seed, seed + INPUTS_AT, constants),
+    if (s->phase < STEPPING) {
+        CALL(plant_start_forward, (s->values + PARAMETERS_AT, seed + PARAMETERS_AT), (sensitivity));
+        states = sensitivity;
+    }
+    CALL(plant_forward, (s->values, s->values + INPUTS_AT, s->constants, states, seed + INPUTS_AT, constants),
          (sensitivity + RATES_AT, sensitivity + OUTPUTS_AT));
 }
 
@@ -250,6 +288,12 @@ void model_reverse(Plant *plant, const double *seed, double *sensitivity) {
     CALL(plant_reverse, (s->values, s->values + INPUTS_AT, s->constants, seed + RATES_AT, seed + OUTPUTS_AT),
          (sensitivity, sensitivity + INPUTS_AT, constants));
     CALL(plant_constants_reverse, (s->values + PARAMETERS_AT, constants), (sensitivity + PARAMETERS_AT));
+    if (s->phase < STEPPING) {
+        double through_start[PARAMETERS];
+        for (int i = 0; i < STATES; i++) sensitivity[i] += seed[i];
+        CALL(plant_start_reverse, (s->values + PARAMETERS_AT, sensitivity), (through_start));
+        for (int i = 0; i < PARAMETERS; i++) sensitivity[PARAMETERS_AT + i] += through_start[i];
+    }
 }
 
 /* ---- state ---- */
@@ -261,7 +305,13 @@ Status model_save(const Plant *plant, void **saved) {
     return OK;
 }
 
-void model_restore(Plant *plant, const void *saved) { memcpy(&plant->state, saved, sizeof(State)); }
+Status model_restore(Plant *plant, const void *saved) {
+    int running = plant->after_initialization == STEPPING ? STEPPING : EVENTS | CONTINUOUS;
+    if (!(((const State *)saved)->phase & (INSTANTIATED | INITIALIZING | TERMINATED | running)))
+        return model_fail(plant, "the saved state is of an instance for the other interface");
+    memcpy(&plant->state, saved, sizeof(State));
+    return OK;
+}
 
 Status model_serialize(const Plant *plant, const void *saved, void *bytes, size_t size) {
     if (size < sizeof(Serialized)) return model_fail(plant, "too few bytes for the serialised state");

@@ -13,7 +13,8 @@
 
 typedef enum { OK, WARNING, DISCARD, FAILED } Status; /* as both versions number them */
 
-typedef enum { INSTANTIATED, INITIALIZING, STEPPING, EVENTS, CONTINUOUS, TERMINATED } Phase;
+/* In order, and a bit each. */
+typedef enum { INSTANTIATED = 1, INITIALIZING = 2, STEPPING = 4, EVENTS = 8, CONTINUOUS = 16, TERMINATED = 32 } Phase;
 
 typedef struct {
     double time;
@@ -33,11 +34,15 @@ typedef struct Plant Plant;
 struct Plant {
     State state;
     Phase after_initialization; /* STEPPING for Co-Simulation, EVENTS for Model Exchange */
+    int tuned;                  /* whether parameters have been set since `model_end_set`, and what they were before */
+    double untuned[PARAMETERS];
     void (*tell)(const Plant *, const char *message);
     const void *importer; /* for `tell` */
 };
 
 Status model_fail(const Plant *plant, const char *format, ...);
+Status model_absent(const Plant *plant, const char *function, size_t n); /* fails unless nothing was asked for */
+Status model_require(const Plant *plant, int phases, const char *function);
 Plant *model_new(
     Phase after_initialization, const char *token, void (*tell)(const Plant *, const char *), const void *importer);
 void model_free(Plant *plant);
@@ -45,17 +50,21 @@ void model_reset(Plant *plant);
 
 Status model_enter_initialization(Plant *plant, double start_time);
 Status model_exit_initialization(Plant *plant);
+Status model_terminate(Plant *plant);
 Status model_step(Plant *plant, double time, double step);
 
-/* Elements first to first + count - 1 of a variable; `integer` is whether the importer treats it as one. */
+/* Elements first to first + count - 1 of a variable; `integer` is whether the importer treats it as one. What has been set is
+ * checked together by `model_end_set`, which undoes it if it, or `so_far`, is no success. */
 Status model_get(Plant *plant, unsigned variable, int first, int count, int integer, double *values);
 Status model_set(Plant *plant, unsigned variable, int first, int count, int integer, const double *values);
+Status model_end_set(Plant *plant, Status so_far);
 
-void model_changed(Plant *plant); /* after the states or the time were set */
-Status model_rates(Plant *plant, const double **rates);
+void model_set_states(Plant *plant, const double *states);
+Status model_rates(Plant *plant, double *rates);
 
 /* Jacobian of outputs and derivatives by continuous inputs, states and parameters, times a vector, or transposed; all
- * vectors have VALUES elements. `model_may_derive` tells whether a variable can be one side of it. */
+ * vectors have VALUES elements. Until initialisation ends, states are outputs of it and follow from the parameters.
+ * `model_may_derive` tells whether a variable can be one side of it. */
 Status model_may_derive(const Plant *plant, unsigned variable, int unknown);
 void model_forward(Plant *plant, const double *seed, double *sensitivity);
 void model_reverse(Plant *plant, const double *seed, double *sensitivity);
@@ -63,4 +72,4 @@ void model_reverse(Plant *plant, const double *seed, double *sensitivity);
 Status model_save(const Plant *plant, void **saved);
 Status model_serialize(const Plant *plant, const void *saved, void *bytes, size_t size);
 Status model_deserialize(const Plant *plant, const void *bytes, size_t size, void **saved);
-void model_restore(Plant *plant, const void *saved);
+Status model_restore(Plant *plant, const void *saved);

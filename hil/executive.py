@@ -53,7 +53,7 @@ from hil.loop import (
 from hil.realtime import RealTimeSettings, real_time, since_process_start, usage
 from hil.recording import events_of, record, repair, take
 from hil.rigs import Rig
-from hil.rigs.contract import python_rig
+from hil.rigs.contract import check_legs, python_rig
 from hil.rigs.replay import ReplayRig
 from hil.rigs.udp import DEFAULT_ADDRESS, UdpRig, parse_address
 from hil.simulation import PYTHON_RIG, SimulationConfig, prepared_loop
@@ -431,8 +431,10 @@ def rig_of(config: SimulationConfig) -> Rig | None:
     """The rig that a configuration names; None for the plant's FMU.
 
     Raises:
-        GoughError: it cannot be made.
+        GoughError: it cannot be made, or has another number of legs than the mechanism.
     """
+    mechanism = load_in_space(config.mechanism)
+    check_legs(config.rig, mechanism)
     if config.rig == "udp":
         return UdpRig(config.rig_at or DEFAULT_ADDRESS, 1.0 / config.rate)
     if config.rig == "canopen":
@@ -444,10 +446,10 @@ def rig_of(config: SimulationConfig) -> Rig | None:
     if config.rig == "replay":
         if not config.rig_at:
             raise InputError("a replay needs its recording: name it with --rig-at FILE.mcap")
-        return ReplayRig(config.rig_at.split(","), 1.0 / config.rate, load_in_space(config.mechanism))
+        return ReplayRig(config.rig_at.split(","), 1.0 / config.rate, mechanism)
     if config.rig.startswith(PYTHON_RIG):
         name = config.rig.removeprefix(PYTHON_RIG)
-        return python_rig(name, load_in_space(config.mechanism), 1.0 / config.rate, config.rig_at)
+        return python_rig(name, mechanism, 1.0 / config.rate, config.rig_at)
     return None
 
 

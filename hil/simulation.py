@@ -22,6 +22,7 @@ from controller.settings import control_settings, safety_settings, sensor_settin
 from controller.stream import rest
 from controller.target import Target, check_duration, load_target
 from hil.loop import COMPUTED, RECORD, Loop, PythonFilters
+from hil.rigs.contract import check_legs
 from hil.snapshot import Snapshot, resume_snapshot, take_snapshot
 from plant.binding import OWN_BINDING, Setting, load_binding
 from plant.compiled import Record
@@ -124,15 +125,22 @@ class SimulationConfig:
 
     @classmethod
     def from_plain(cls, values: Mapping[str, Any]) -> "SimulationConfig":
-        """The configuration of which `dataclasses.asdict` has made these values, perhaps with lists for tuples."""
+        """The configuration of which `dataclasses.asdict` has made these values, perhaps with lists for tuples.
+
+        Raises:
+            InputError: it has made no such values.
+        """
 
         def tuples(value: Any) -> Any:
             return tuple(map(tuples, value)) if isinstance(value, list | tuple) else value
 
-        plain = {name: tuples(value) for name, value in values.items()}
-        plain["wiring"] = Wiring(**{name: tuples(value) for name, value in values["wiring"].items()})
-        plain["settings"] = tuple(Setting(**each | {"value": tuples(each["value"])}) for each in values["settings"])
-        return cls(**plain)
+        try:
+            plain = {name: tuples(value) for name, value in values.items()}
+            plain["wiring"] = Wiring(**{name: tuples(value) for name, value in values["wiring"].items()})
+            plain["settings"] = tuple(Setting(**each | {"value": tuples(each["value"])}) for each in values["settings"])
+            return cls(**plain)
+        except (TypeError, KeyError, AttributeError) as error:
+            raise InputError(f"these values are no configuration of a simulation: {error}") from None
 
     @property
     def streamed(self) -> bool:
@@ -262,13 +270,16 @@ def simulate(
             took += time.perf_counter() - began
             if cause != OK:
                 break
-            if last == saved:
+            if last == saved and loop.state["stopping"] == OK:
                 snapshot = take_snapshot(asdict(config), loop, loop.simulated)
             progress((last - first) / (count - first))
         result = _result(config, loop, first, snapshot, took)
-        if cause != OK:
-            at = int(loop.state["stop_cycle"])
-            raise SimulationStoppedError(f"stopped on the brakes at cycle {at} of {count}: {loop.reason()}", result)
+        if loop.state["stopping"] != OK:
+            at, held = (
+                int(loop.state["stop_cycle"]),
+                "stopped on the brakes" if cause != OK else "still stopping at the end, from",
+            )
+            raise SimulationStoppedError(f"{held} at cycle {at} of {count}: {loop.reason()}", result)
     return result
 
 
@@ -318,6 +329,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
     nominal = load_in_space(config.mechanism)
     calibration = Calibration() if config.calibration is None else load_calibration(config.calibration)
     if nominal.planar:
+        check_legs(config.rig, nominal)
         _check_planar(config, calibration)
     mechanism = nominal.moved_joints(calibration.joints[:, : nominal.legs])
     target = load_target("hold" if config.streamed else config.target, mechanism, config.duration)
@@ -371,8 +383,6 @@ def _check_planar(config: SimulationConfig, calibration: Calibration) -> None:
         raise InputError(f"fusion {config.fusion!r} is for six legs; for {config.mechanism}, which is planar, take 'compiled'")
     if config.streamed:
         raise InputError(f"a target can be streamed to six legs alone; {config.mechanism} is planar: give a motion or a file")
-    if config.rig in ("udp", "canopen"):
-        raise InputError(f"the rig {config.rig!r} has six legs, and {config.mechanism} has three: choose another rig")
     if calibration.joints.any():
         raise InputError(f"{config.calibration} moves the joints of six legs, and {config.mechanism} has three: leave them out")
 

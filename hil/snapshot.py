@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
+from numpy.typing import NDArray
 
 from controller.reference import START
 from hil.loop import Loop
@@ -21,10 +22,6 @@ from plant.fmu import FmuPlant
 from plant.pose import Array
 
 _KIND = "gough snapshot"
-_ENTRIES = {
-    "kind": str, "version": str, "config": dict, "cycle": int, "layout": bytes, "parameters": bytes, "motion": bytes,
-    "memory": dict, "plant": bytes,
-}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +31,7 @@ class Snapshot:
     Attributes:
         config: of the simulation, as plain values.
         cycle: the next to run.
-        layout: of the loop's arrays, a hash.
-        parameters: of the cycle, a hash.
+        settings: a hash of what does not change: the cycle's parameters, the FMU and its binding.
         motion: that was planned until then, a hash.
         memory: the loop's arrays by name.
         plant: the state of the FMU and its clock.
@@ -43,8 +39,7 @@ class Snapshot:
 
     config: Mapping[str, Any]
     cycle: int
-    layout: bytes
-    parameters: bytes
+    settings: bytes
     motion: bytes
     memory: Mapping[str, bytes]
     plant: bytes
@@ -58,7 +53,7 @@ def take_snapshot(config: Mapping[str, Any], loop: Loop, plant: FmuPlant) -> Sna
     """
     cycle = int(loop.state["cycle"])
     memory = {name: array.tobytes() for name, array in loop.memory().items()}
-    return Snapshot(config, cycle, _layout(loop), _hash(loop.parameters.tobytes()), _motion(loop, cycle), memory, plant.state())
+    return Snapshot(config, cycle, _settings(loop, plant), _motion(loop, cycle), memory, plant.state())
 
 
 def resume_snapshot(snapshot: Snapshot, loop: Loop, plant: FmuPlant) -> None:
@@ -68,21 +63,24 @@ def resume_snapshot(snapshot: Snapshot, loop: Loop, plant: FmuPlant) -> None:
         InputError: the loop is not the one that the snapshot is of, or has no cycle left.
         FmuError: the FMU is another one, or cannot restore its state.
     """
-    for name, kept, now in (
-        ("the loop's memory is laid out in another way: it is of another version of gough", snapshot.layout, _layout(loop)),
-        ("the controller is set in another way: mechanism or calibration have changed", snapshot.parameters,
-         _hash(loop.parameters.tobytes())),
-        ("until then another motion was planned: take it within a run that is as long, with --save-at", snapshot.motion,
-         _motion(loop, snapshot.cycle)),
-    ):  # fmt: skip
-        if kept != now:
-            raise InputError(f"this simulation cannot go on from the snapshot, for {name}")
+    if snapshot.settings != _settings(loop, plant):
+        raise InputError(
+            "this simulation cannot go on from the snapshot, for its mechanism, calibration, FMU or binding have changed since"
+        )
+    if snapshot.motion != _motion(loop, snapshot.cycle):
+        raise InputError(
+            "this simulation cannot go on from the snapshot, for until then another motion was planned: take the snapshot in a "
+            "run that is as long, with --save-at"
+        )
     if snapshot.cycle >= len(loop.records):
         raise InputError(
             f"the snapshot is of the end of its motion of {snapshot.config['duration']:g} s: go on with a longer --duration"
         )
+    memory = loop.memory()
+    if {name: len(kept) for name, kept in snapshot.memory.items()} != {name: array.nbytes for name, array in memory.items()}:
+        raise InputError("this simulation cannot go on from the snapshot, for its memory is laid out in another way")
     plant.restore(snapshot.plant)
-    for name, array in loop.memory().items():
+    for name, array in memory.items():
         array.reshape(-1).view("u1")[:] = memoryview(snapshot.memory[name])
 
 
@@ -108,22 +106,32 @@ def read_snapshot(path: Path) -> Snapshot:
         raise InputError(f"cannot read the snapshot {path}: {error.strerror}") from None
     except Exception:
         content = None
-    if (
-        not isinstance(content, dict)
-        or content.pop("kind", None) != _KIND
-        or any(not isinstance(content.get(name), kind) for name, kind in _ENTRIES.items() if name != "kind")
-    ):
+    if not isinstance(content, dict) or content.pop("kind", None) != _KIND:
         raise InputError(f"{path} is no snapshot of 'gough simulate --save-state'")
-    del content["version"]
-    return Snapshot(**content)
+    if (of := content.pop("version", None)) != version("gough"):
+        raise InputError(f"{path} is of gough {of}, and this is gough {version('gough')}: go on with the version that it is of")
+    try:
+        return Snapshot(**content)
+    except TypeError:
+        raise InputError(f"{path} is a snapshot that lacks something, or has something unknown") from None
 
 
 def _hash(content: bytes) -> bytes:
     return hashlib.sha256(content).digest()
 
 
-def _layout(loop: Loop) -> bytes:
-    return _hash(repr({name: (array.shape, array.dtype) for name, array in loop.memory().items()}).encode())
+def _settings(loop: Loop, plant: FmuPlant) -> bytes:
+    """A hash of what does not change in a run; the arrays are those that the loop reads and writes the FMU by."""
+    bound = plant.bound
+    arrays: list[NDArray[Any]] = [
+        *bound.sensed,
+        *bound.known,
+        *bound.commanded,
+        *bound.loaded,
+        bound.modes.references,
+        bound.modes.values,
+    ]
+    return _hash(b"".join([loop.parameters.tobytes(), plant.path.read_bytes(), *(array.tobytes() for array in arrays)]))
 
 
 def _motion(loop: Loop, cycle: int) -> bytes:

@@ -37,10 +37,10 @@ class Dynamics:
     """A plant as CasADi functions of flat vectors in the order of its variable table.
 
     `constants(parameters)` is what the others need of the parameters, worked out once; `start(parameters)` are the states
-    at the start; `conditions(parameters)` are two vectors, values and the limits that they must not exceed, for the
-    parameters to make sense, and `condition_texts` says so for each; `limits(states, constants)` and `limit_texts` are the
-    same for the motion; `rates(states, inputs, constants)` is the time
-    derivative of the states; `outputs(states, inputs, constants)` all outputs.
+    at the start; `conditions(parameters)` are two vectors, values and the limits that they must not exceed for the
+    parameters to make sense, and `condition_texts` say so of each; `limits(states, constants)` and `limit_texts` are the
+    same for the motion; `rates(states, inputs, constants)` is the time derivative of the states; `outputs(states, inputs,
+    constants)` all outputs.
     """
 
     constants: ca.Function
@@ -186,6 +186,9 @@ def inertia_conditions(inertia: SX, name: str) -> list[Condition]:
 _ROUNDING = 1e-6
 """What rounded parameters may be off by, relatively."""
 
+_NORM_RATE = 5.0
+"""How fast the quaternion's length returns to one [1/s]."""
+
 _MOST_ALONG_AT_START, _MOST_ALONG = 0.99, 0.9998
 """Cosine between a leg and the first axis of its joint; at 1 the leg could not turn about itself without infinite inertia."""
 
@@ -273,6 +276,8 @@ def _plant(x: dict[str, SX], u: dict[str, SX], c: dict[str, SX]) -> tuple[dict[s
         w * oy + oz * q1 - ox * q3,
         w * oz + ox * q2 - oy * q1,
     )
+    # An integrator of Model Exchange may let the length drift, which the equations would take for another rotation.
+    quaternion_rate += _NORM_RATE * (1 - ca.dot(x["state.quaternion"], x["state.quaternion"])) * x["state.quaternion"]
     rates = {
         "state.position": velocity,
         "state.quaternion": quaternion_rate,

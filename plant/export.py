@@ -232,7 +232,9 @@ def _archive(contents: Mapping[str, bytes]) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in contents.items():
-            archive.writestr(zipfile.ZipInfo(name, _EPOCH), data, zipfile.ZIP_DEFLATED)
+            entry = zipfile.ZipInfo(name, _EPOCH)
+            entry.external_attr = 0o644 << 16
+            archive.writestr(entry, data, zipfile.ZIP_DEFLATED)
     return buffer.getvalue()
 
 
@@ -339,7 +341,7 @@ def _derivatives(dynamics: Any) -> list[Any]:
     )
     return [
         product(f"plant_{prefix}{name}", function, reverse)
-        for prefix, function in (("", both), ("constants_", dynamics.constants))
+        for prefix, function in (("", both), ("constants_", dynamics.constants), ("start_", dynamics.start))
         for name, reverse in (("forward", False), ("reverse", True))
     ]
 
@@ -384,7 +386,7 @@ def _dependencies(dynamics: Any, layout: Layout) -> Dependencies:
 
 
 def _kind(layout: Layout, variable: Variable) -> str:
-    if layout.is_rate(variable):
+    if variable in layout.rates:
         return "RATE"
     if variable.causality == "parameter":
         return "TUNABLE" if variable.tunable else "FIXED"
@@ -408,6 +410,7 @@ def _layout_h(layout: Layout, starts: Mapping[str, Array], token: str, dynamics:
         "VARIABLES": len(exposed),
         "STATES": sum(variable.size for variable in table.states),
         "INPUTS": sum(variable.size for variable in table.inputs),
+        "PARAMETERS": sum(variable.size for variable in table.parameters),
         "LONGEST": max(variable.size for variable in exposed),
         "TOKEN": f'"{token}"',
         "LAYOUT": f"0x{token[1:17]}ULL",
@@ -445,12 +448,17 @@ def _unsupported(fmi: int, wrapper: str) -> str:
     headers = (Path(fmpy.__file__).parent / "c-code" / f"fmi{fmi}Functions.h").read_text()
     declared = re.findall(rf"FMI{fmi}_Export\s+fmi{fmi}\w+TYPE\s+(fmi{fmi}\w+);", headers)
     missing = [name for name in declared if not re.search(rf"\b{name}\(", wrapper)]
-    lines = [
-        f"EXPORT void *{name}(void) {{ return 0; }}"
-        if "Instantiate" in name
-        else f"EXPORT int {name}(void) {{ return 3; /* fmi{fmi}Error */ }}"
-        for name in missing
-    ]
+    lines = []
+    for name in missing:
+        if "Instantiate" in name:
+            lines.append(f"EXPORT void *{name}(void) {{ return 0; }}")
+        elif re.search(r"[GS]et(U?Int|Float|Real|Integer|Boolean|String|Binary|Clock)\w*$", name):
+            lines.append(
+                f"EXPORT int {name}(void *instance, const unsigned *references, size_t n) "
+                f'{{ (void)references; return model_absent(instance, "{name}", n); }}'
+            )
+        else:
+            lines.append(f'EXPORT int {name}(void *instance) {{ return model_absent(instance, "{name}", 1); }}')
     return "\n".join(
         [
             "#if defined _WIN32 || defined __CYGWIN__",
@@ -460,6 +468,7 @@ def _unsupported(fmi: int, wrapper: str) -> str:
             "#else",
             "#define EXPORT",
             "#endif",
+            '#include "model.h"',
             *lines,
             "",
         ]

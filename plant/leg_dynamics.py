@@ -349,7 +349,7 @@ def _leg_turning(s: SX, velocity: SX, acceleration: SX, e1: SX) -> tuple[SX, SX,
     """
     square, k = ca.dot(s, s), ca.dot(e1, s)
     across = square - k**2
-    # As in `_leg`, square roots keep CasADi from dividing again and again.
+    # As in `_leg_at`, square roots keep CasADi from dividing again and again.
     inverse, inverse_across = ca.sqrt(1 / square), ca.sqrt(1 / across)
     n, e2 = s * inverse, ca.cross(s, e1) * inverse_across
     swing, swing_rate = ca.cross(s, velocity), ca.cross(s, acceleration)

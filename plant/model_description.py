@@ -90,9 +90,9 @@ class Layout:
         """The number of values."""
         return sum(variable.size for variable in self.stored)
 
-    def is_rate(self, variable: Variable) -> bool:
-        """Whether the variable is the derivative of a state."""
-        return variable in self.rates
+    def state_of(self, variable: Variable) -> Variable | None:
+        """The state that a variable is the derivative of, or None."""
+        return self.table.states[self.rates.index(variable)] if variable in self.rates else None
 
     def places(self, variable: Variable) -> range:
         """Where the values of a variable are."""
@@ -155,7 +155,7 @@ def model_description(
         dependencies: what depends on what.
         sources: names of the C files.
     """
-    writer = _Fmi3(layout, starts, dependencies) if fmi == 3 else _Fmi2(layout, starts, dependencies)
+    writer = (_Fmi3 if fmi == 3 else _Fmi2)(layout, starts, dependencies)
     head = (
         f"modelName={quoteattr(identifier)} description={quoteattr(description)}"
         ' generationTool="gough" variableNamingConvention="structured"'
@@ -222,8 +222,7 @@ class _Writer:
 
 
 class _Fmi3(_Writer):
-    def document(self, head: str, identifier: str, token: str, sources: list[str]) -> list[str]:
-        del sources
+    def document(self, head: str, identifier: str, token: str, _: list[str]) -> list[str]:
         able = (
             f'modelIdentifier="{identifier}" canGetAndSetFMUState="true" canSerializeFMUState="true"'
             ' providesDirectionalDerivatives="true" providesAdjointDerivatives="true"'
@@ -253,17 +252,14 @@ class _Fmi3(_Writer):
             extra += ' declaredType="DriveMode"'
         if self.calculated(variable):
             extra += ' initial="calculated"'
-        if self.layout.is_rate(variable):
-            extra += f' derivative="{self.layout.exposed.index(self._state_of(variable))}"'
+        if (state := self.layout.state_of(variable)) is not None:
+            extra += f' derivative="{self.layout.exposed.index(state)}"'
         dimensions = "".join(f'<Dimension start="{n}"/>' for n in variable.shape)
         return (
             f'<{tag} name="{variable.name}" valueReference="{reference}" causality="{self.causality(variable)}"'
             f' variability="{self.variability(variable)}"{self.attributes(variable)}{extra}'
             f" description={quoteattr(variable.description)}>{dimensions}</{tag}>"
         )
-
-    def _state_of(self, rate: Variable) -> Variable:
-        return self.layout.table.states[self.layout.rates.index(rate)]
 
     def _unknowns(self) -> Iterator[str]:
         references = {place: i for i, v in enumerate(self.layout.exposed) for place in self.layout.places(v)}
@@ -312,8 +308,8 @@ class _Fmi2(_Writer):
             zip(element_names(variable.name, variable.shape), self.layout.places(variable), strict=True)
         ):
             extra = f' start="{starts[i]}"' if starts else ""
-            if self.layout.is_rate(variable):
-                extra += f' derivative="{self._index[self.layout.offsets[variable.name[4:-1]] + i]}"'
+            if (state := self.layout.state_of(variable)) is not None:
+                extra += f' derivative="{self._index[self.layout.offsets[state.name] + i]}"'
             yield (
                 f'<ScalarVariable name="{name}" valueReference="{place}" causality="{self.causality(variable)}"'
                 f' variability="{self.variability(variable)}"{initial} description={quoteattr(variable.description)}>'

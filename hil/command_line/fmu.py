@@ -1,16 +1,21 @@
 """The command fmu."""
 
 import argparse
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hil.command_line.options import add_json, add_mechanism
+from hil.command_line.options import add_binding, add_json, add_mechanism
 from hil.command_line.outputs import check_outputs, write_json
 from hil.command_line.printing import new_table, print_table, progress_bar
 from plant.errors import GoughError
 
 if TYPE_CHECKING:
     from plant.variables import Variable
+
+
+_PERIOD_S = 1e-3
+"""What a plant is asked to step by when it is only looked at."""
 
 
 def add_fmu(commands: Any) -> None:
@@ -63,6 +68,7 @@ def add_fmu(commands: Any) -> None:
         action.set_defaults(run=run)
         add_json(action)
     add_mechanism(linearize)
+    add_binding(linearize)
     for side, default in (("inputs", "velocity_command"), ("outputs", "leg_length")):
         linearize.add_argument(
             f"--{side}", type=lambda text: text.split(","), default=[default], metavar="NAMES", help=f"default: {default}"
@@ -132,7 +138,7 @@ def _show(options: argparse.Namespace) -> int:
         "made by": description.tool or "-",
         "binaries for": ", ".join(platforms_of(options.file)) or "none",
         "abilities": ", ".join(sorted(description.abilities)) or "none",
-        "states": str(sum(state.size for state, _ in description.states)),
+        "states": sum(state.size for state, _ in description.states),
         "use": fits,
     }
     _print_pairs(facts)
@@ -145,14 +151,11 @@ def _show(options: argparse.Namespace) -> int:
     print_table(table)
     variables = [
         {
-            "name": v.name,
-            "shape": v.shape,
-            "type": v.type,
-            "unit": v.unit,
-            "causality": v.causality,
-            "variability": v.variability,
+            **{name: getattr(each, name) for name in ("name", "shape", "type", "unit", "causality", "variability")},
+            "minimum": _finite(each.minimum),
+            "maximum": _finite(each.maximum),
         }
-        for v in description
+        for each in description
     ]
     write_json(options.json, facts | {"variables": variables})
     return 0
@@ -170,7 +173,11 @@ def _validate(options: argparse.Namespace) -> int:
     return int(any(check.problems for check in checks))
 
 
-def _print_pairs(pairs: dict[str, str]) -> None:
+def _finite(limit: float) -> float | None:
+    return limit if isfinite(limit) else None
+
+
+def _print_pairs(pairs: dict[str, Any]) -> None:
     width = max(map(len, pairs))
     for name, value in pairs.items():
         print(f"{name:{width}}  {value}")
@@ -187,7 +194,8 @@ def _linearize(options: argparse.Namespace) -> int:
 
     mechanism = load_in_space(options.mechanism)
     path = options.file or default_fmu(model_of(mechanism))
-    with FmuPlant(path, mechanism.plant_parameters(), 1e-3) as plant:
+    parameters = mechanism.plant_parameters() if options.binding is None else {}
+    with FmuPlant(path, parameters, _PERIOD_S, options.binding) as plant:
         write_drive_mode(plant.calls, VELOCITY)
         system = state_space(plant, options.inputs, options.outputs)
     table = new_table("pole [1/s]", "frequency [Hz]", "damping")

@@ -26,6 +26,11 @@ def add_calibration(command: argparse.ArgumentParser) -> None:
 def add_plant(command: argparse.ArgumentParser) -> None:
     """Add the FMU that is used, and its binding."""
     command.add_argument("--plant", metavar="FILE.fmu", help="Co-Simulation FMU (FMI 2.0 or 3.0) instead of the built one")
+    add_binding(command)
+
+
+def add_binding(command: argparse.ArgumentParser) -> None:
+    """Add the binding of the FMU that is used."""
     command.add_argument(
         "--binding", metavar="FILE.toml", help="which of its variables are which, if they have other names (docs/fmu.md)"
     )  # fmt: skip

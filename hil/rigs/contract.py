@@ -500,6 +500,16 @@ def missing_calls(rig: object) -> list[str]:
     return calls if isinstance(rig, type) or hasattr(rig, "command_delay") else [*calls, "command_delay"]
 
 
+def check_legs(rig: str, mechanism: Mechanism) -> None:
+    """Check that the rig of this name has as many legs as a mechanism; the buses of `udp` and `canopen` are laid out for six.
+
+    Raises:
+        InputError: it has not.
+    """
+    if rig in ("udp", "canopen") and mechanism.legs != LEGS:
+        raise InputError(f"the rig {rig!r} has six legs, and {mechanism.name} has three: choose another rig")
+
+
 def python_rig(name: str, mechanism: Mechanism, period: float, rig_at: str | None) -> Rig:
     """A rig of the user's own: its class, called with mechanism, period [s] and `rig_at`.
 

@@ -45,9 +45,20 @@ def test_the_linear_plant_is_casadis(model: Model, fmi: int) -> None:
     for name, matrix in expected.items():
         wanted = np.array(ca.Function(name, [xs, us], [matrix])(x, u))
         np.testing.assert_allclose(getattr(system, name), wanted, rtol=1e-12, atol=1e-12 * max(np.abs(wanted).max(), 1.0))
-    assert system.state_labels[:2] == ["state.position[1]", "state.position[2]"]
+    assert system.state_labels[:2] == ["state_position[1]", "state_position[2]"]
     assert system.input_labels == [f"velocity_command[{k + 1}]" for k in range(legs)]
     assert system.output_labels[legs] == "imu_specific_force[1,1]"
+
+
+def test_names_with_points_are_told_with_underscores(fmu_path: Path, hexapod: Mechanism) -> None:
+    with FmuPlant(fmu_path, hexapod.plant_parameters(), 1e-3) as plant:
+        system = state_space(plant, ("external_wrench.force", "payload.mass"), ("power.drive",))
+    assert system.input_labels == [*(f"external_wrench_force[{k}]" for k in (1, 2, 3)), "payload_mass"]
+    assert system.output_labels == ["power_drive"]
+    # A force pushes the platform, and more weight pulls it down.
+    assert np.linalg.matrix_rank(system.B[:, :3]) == 3
+    falling = system.state_labels.index("state_velocity[3]")
+    assert system.B[falling, 3] < 0.0 < system.B[falling, 2]
 
 
 def test_what_cannot_be_linearised_is_refused(fmu_path: Path, hexapod: Mechanism) -> None:

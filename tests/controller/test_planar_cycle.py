@@ -197,7 +197,9 @@ def test_a_level_leg_is_no_worse_than_others(planar):
 @pytest.mark.parametrize(
     ("changes", "asked", "said"),
     [
-        ({}, {"imus": (0, 1, 2)}, "the IMUs 0, 1, 2 do not determine the pose of 'custom' everywhere in its workspace"),
+        ({}, {"imus": (0, 1, 2)}, "the IMUs 0, 1, 2 determine the pose of 'custom' up to its two assembly modes at best"),
+        ({}, {"imus": (0, 2)}, "which the loop cannot tell apart: add the platform's IMU (6), whose roll does"),
+        ({}, {"imus": (1, 6)}, "the IMUs 1, 6 do not determine the pose of 'custom' everywhere in its workspace"),
         ({}, {"imus": (1, 6)}, "add legs"),
         ({}, {"magnetometer": True}, "'custom' is planar and has no heading"),
         ({"gravity": [0.0, 0.0, -9.81]}, {}, "of the vertical only 0 lies in it, and 0.2 is needed"),

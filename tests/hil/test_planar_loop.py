@@ -16,6 +16,7 @@ from controller.safety import (
     STOPPED,
     describe_end,
 )
+from hil.command_line import main
 from hil.loop import FmuRig
 from hil.report import write_report
 from hil.simulation import SimulationConfig, prepared_loop, simulate
@@ -26,6 +27,7 @@ from tests.hil.test_loop import replayed
 from tests.hil.test_simulation import errors
 
 RIG = "planar-3rpr"
+OF_SIX_LEGS = "the rig 'udp' has six legs, and planar-3rpr has three: choose another rig"
 
 
 def config(**changes):
@@ -122,9 +124,10 @@ def test_a_pose_that_is_lost_ends_on_the_brakes_with_its_cause(frozen):
 
 @pytest.mark.parametrize("leg", range(3))
 def test_a_leg_imu_that_lies_contradicts_the_others_and_the_motion_stops(leg):
-    """Three legs and the roll tell that one of them is wrong, not which."""
+    """Three legs and the roll tell that one of them is wrong, not which: none is named."""
     cause, state, records, speed = run_disturbed(turned={leg: np.radians(2.0)})
     assert cause == IMUS_DISAGREE and state["safety"]["mode"] == STOPPED
+    assert describe_end(state).startswith("the IMUs contradict each other (0.0")
     assert IMUS_DISAGREE in told(records)
     assert speed < 1e-6
 
@@ -134,8 +137,8 @@ def test_a_leg_imu_that_lies_contradicts_the_others_and_the_motion_stops(leg):
     [
         ({"fusion": "whole"}, "fusion 'whole' is for six legs; for planar-3rpr, which is planar, take 'compiled'"),
         ({"magnetometer": True}, "'planar-3rpr' is planar and has no heading"),
-        ({"imus": (0, 1, 2)}, "the IMUs 0, 1, 2 do not determine the pose of 'planar-3rpr'"),
-        ({"plant": str(default_fmu())}, "base_joints of gough_plant.fmu has 18 elements, got 6"),
+        ({"imus": (0, 1, 2)}, "the IMUs 0, 1, 2 determine the pose of 'planar-3rpr' up to its two assembly modes at best"),
+        ({"plant": str(default_fmu())}, "gough_plant.fmu has 6 legs, and the mechanism has 3"),
     ],
 )
 def test_what_a_planar_mechanism_cannot_do_is_refused(changes, said):
@@ -147,12 +150,18 @@ def test_what_a_planar_mechanism_cannot_do_is_refused(changes, said):
     ("changes", "said"),
     [
         ({"target": "stream"}, "a target can be streamed to six legs alone; planar-3rpr is planar"),
-        ({"rig": "udp"}, "the rig 'udp' has six legs, and planar-3rpr has three"),
+        ({"rig": "udp"}, OF_SIX_LEGS),
     ],
 )
 def test_runs_that_are_for_six_legs_are_refused(changes, said):
     with pytest.raises(InputError, match=re.escape(said)), prepared_loop(config(**changes)):
         pass
+
+
+@pytest.mark.parametrize("rig", ["udp", "canopen"])
+def test_a_rig_of_six_legs_is_refused_before_it_is_asked(rig, capsys):
+    assert main(["check-rig", "--mechanism", RIG, "--rig", rig]) == 2
+    assert OF_SIX_LEGS.replace("udp", rig) in capsys.readouterr().err
 
 
 def test_the_report_draws_three_legs(tmp_path):

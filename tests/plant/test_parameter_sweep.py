@@ -1,28 +1,30 @@
-"""Two hundred random mechanisms of all classes, with random bodies, drives, frictions, stops, bases and commands."""
+"""Random mechanisms of all classes, spatial and planar, with random bodies, drives, frictions, stops, bases and commands."""
 
 import ctypes
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from math import pi
-from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.random import Generator
 from numpy.typing import ArrayLike
 from scipy.integrate import cumulative_simpson
 from scipy.spatial.transform import Rotation
 
-from plant.classification import draw_mechanism, spatial_classes
+from plant.classification import draw_mechanism, draw_planar_mechanism, planar_classes, spatial_classes
 from plant.errors import FmuError
+from plant.export import PLANAR_MODEL, SPATIAL_MODEL, Model, default_fmu
 from plant.fmu import FmuPlant, advance, read_imus
-from plant.mechanism import Mechanism
+from plant.mechanism import load_in_space
 from plant.pose import Array, quaternion_from_rotation
-from plant.variables import BY_NAME, PARAMETERS, checked_parameters
+from plant.variables import PLATFORM_IMU, SPATIAL, VariableTable, checked_parameters
 from tests.plant.explicit_bodies import jacobian, leg_vectors
 
 Values = dict[str, Array]
 
-SETS, DURATION_S, HOLD_S, STEP_S = 200, 2.0, 0.02, 1e-3
+DURATION_S, HOLD_S, STEP_S = 2.0, 0.02, 1e-3
 
 POWERS = ("drive", "friction", "brake", "stop", "external")
 
@@ -33,7 +35,7 @@ SPREADS = {
     "friction.velocity": 3.0, "brake.force": 2.0, "brake.stiffness": 3.0, "brake.damping": 3.0, "brake.release_time": 5.0,
     "stop.stiffness": 3.0, "stop.damping": 2.0, "substep": 1.5,
 }  # fmt: skip
-"""Parameters of the hexapod that are multiplied or divided by up to these."""
+"""Parameters of the presets that are multiplied or divided by up to these."""
 
 
 def spread(random: Generator, factor: float) -> float:
@@ -75,24 +77,52 @@ def regular_start(random: Generator) -> Values:
             }
 
 
-def random_parameters(hexapod: Mechanism, random: Generator) -> Values:
-    p = hexapod.plant_parameters() | regular_start(random)
+def regular_planar_start(random: Generator) -> Values:
+    """The geometry of a random planar class at a pose that is clear of singularities, the plane turned anyhow in gravity."""
+    classes = planar_classes()
+    while True:
+        mechanism = draw_planar_mechanism(classes[random.integers(len(classes))], random)
+        position, angle = random.uniform(-0.1, 0.1, 2), np.array(random.uniform(-0.7, 0.7))
+        joints = mechanism.joints_at(position, angle)
+        legs, arms = joints - mechanism.base_joints, joints - position
+        lengths = np.linalg.norm(legs, axis=1)
+        x, y = (legs / lengths[:, None]).T
+        if lengths.min() > 0.1 and np.linalg.cond(np.column_stack([x, y, (arms[:, 0] * y - arms[:, 1] * x) / 0.1])) < 20.0:
+            return {
+                "base_joints": mechanism.base_joints,
+                "platform_joints": mechanism.platform_joints,
+                "gravity": 9.81 * unit(random),
+                "initial_position": position,
+                "initial_angle": angle,
+                "stop.minimum_length": lengths - random.uniform(0.01, 0.04, 3),
+                "stop.maximum_length": lengths + random.uniform(0.01, 0.04, 3),
+            }
+
+
+def random_parameters(p: Values, random: Generator, table: VariableTable) -> Values:
+    """Parameters about those of a preset on a random geometry."""
+    legs, dimensions = p["base_joints"].shape
     changes: dict[str, ArrayLike] = {name: float(p[name]) * spread(random, factor) for name, factor in SPREADS.items()}
-    payload = random.choice([0.0, 10.0 * spread(random, 5.0)])
-    resistance = 0.6 * spread(random, 2.5)
+    payload = random.choice([0.0, p["payload.mass"] * spread(random, 5.0)])
+    resistance = p["drive.nominal_resistance"] * spread(random, 2.5)
+
+    def inertia(mass: ArrayLike, size: float) -> Array:
+        drawn = inertia_of_an_ellipsoid(random, float(mass), size)
+        return drawn if dimensions == 3 else drawn[2, 2]
+
     changes |= {
         "payload.mass": payload,
-        "payload.center_of_mass": random.uniform(-0.1, 0.1, 3),
-        "payload.inertia": inertia_of_an_ellipsoid(random, payload, 0.1),
-        "platform.center_of_mass": random.uniform(-0.03, 0.03, 3),
-        "platform.inertia": inertia_of_an_ellipsoid(random, changes["platform.mass"], 0.2),
-        "motor.resistance": resistance * random.uniform(0.8, 1.2, 6),
+        "payload.center_of_mass": random.uniform(-0.1, 0.1, dimensions),
+        "payload.inertia": inertia(payload, 0.1),
+        "platform.center_of_mass": random.uniform(-0.03, 0.03, dimensions),
+        "platform.inertia": inertia(changes["platform.mass"], 0.2),
+        "motor.resistance": resistance * random.uniform(0.8, 1.2, legs),
         "drive.nominal_resistance": resistance,
         "drive.compensation": random.uniform(0.0, 0.75),
-        "friction.coulomb": random.choice([0.0, 15.0]) * spread(random, 3.0) * random.uniform(0.5, 1.5, 6),
-        "friction.viscous": 50.0 * spread(random, 5.0) * random.uniform(0.5, 1.5, 6),
+        "friction.coulomb": p["friction.coulomb"] * random.choice([0, 1]) * spread(random, 3) * random.uniform(0.5, 1.5, legs),
+        "friction.viscous": p["friction.viscous"] * spread(random, 5.0) * random.uniform(0.5, 1.5, legs),
         "magnetic_field": 50.0 * unit(random),
-        "leg_imu_position": random.normal(0.0, 0.1, (6, 3)),
+        "leg_imu_position": random.normal(0.0, 0.1, (legs, 3)),
         "platform_imu_position": random.normal(0.0, 0.1, 3),
     }
     for part in ("lower", "upper"):
@@ -102,7 +132,28 @@ def random_parameters(hexapod: Mechanism, random: Generator) -> Values:
             f"leg.{part}.inertia": across,
             f"leg.{part}.axial_inertia": across * random.uniform(0.0, 1.0),
         }
-    return p | checked_parameters(changes)
+    known = [variable.name for variable in table.parameters]
+    return p | checked_parameters({name: value for name, value in changes.items() if name in known}, table)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A plant, how many random sets it is tried with, and their usual size: speed of the legs [m/s], force on the platform [N],
+    whose torque is a tenth [N.m], and the energy that is too little to tell where it comes from [J].
+    """
+
+    model: Model
+    start: Callable[[Generator], Values]
+    sets: int
+    speed: float
+    force: float
+    energy: float
+
+
+SWEEPS = (
+    Sweep(SPATIAL_MODEL, regular_start, sets=200, speed=0.1, force=20.0, energy=0.1),
+    Sweep(PLANAR_MODEL, regular_planar_start, sets=100, speed=0.05, force=3.0, energy=0.01),
+)
 
 
 def restart(plant: FmuPlant, parameters: Mapping[str, Array]) -> None:
@@ -117,9 +168,10 @@ def restart(plant: FmuPlant, parameters: Mapping[str, Array]) -> None:
 class Reader:
     """Reads outputs of a plant by one call straight to its library, several times faster than FMPy's own method."""
 
-    def __init__(self, plant: FmuPlant, names: tuple[str, ...]) -> None:
+    def __init__(self, plant: FmuPlant, table: VariableTable, names: tuple[str, ...]) -> None:
+        sizes = {variable.name: variable.size for variable in table.outputs}
         self._references = np.array([plant.description[name].references[0] for name in names], np.uint32)
-        self._values = np.zeros(sum(BY_NAME[name].size for name in names))
+        self._values = np.zeros(sum(sizes[name] for name in names))
         self._read = plant._instance.fmu.dll.fmi3GetFloat64
         self._arguments = (
             plant._instance.fmu.component,
@@ -132,33 +184,43 @@ class Reader:
         return self._values.copy()
 
 
-def run_at_random(plant: FmuPlant, random: Generator) -> tuple[Array, float]:
+def run_at_random(plant: FmuPlant, random: Generator, sweep: Sweep) -> tuple[Array, float]:
     """Two seconds of commands, modes and wrenches that are held for 20 ms each, modes mostly for longer.
 
     Returns:
         What the energy has grown by beyond the work of all forces after each hold [J], and the energy that has been moved [J].
     """
-    reader = Reader(plant, ("kinetic_energy", "potential_energy", *(f"power.{name}" for name in POWERS), "quaternion"))
-    amplitude, frequencies, phases = 0.1 * spread(random, 4.0), random.uniform(0.3, 6.0, 6), random.uniform(0.0, 2.0 * pi, 6)
-    wrench = random.normal(0.0, 20.0, 6) * [1.0, 1.0, 1.0, 0.1, 0.1, 0.1]
+    table = sweep.model.table
+    energies = ("kinetic_energy", "potential_energy", *(f"power.{name}" for name in POWERS))
+    reader = Reader(plant, table, (*energies, "quaternion" if table is SPATIAL else "angle"))
+    _, modes, force, torque = table.inputs
+    legs, forces = modes.size, force.size
+    sensed = [*range(legs), PLATFORM_IMU]
+    amplitude = sweep.speed * spread(random, 4.0)
+    frequencies, phases = random.uniform(0.3, 6.0, legs), random.uniform(0.0, 2.0 * pi, legs)
+    wrench = sweep.force * random.normal(size=forces + torque.size)
+    wrench[forces:] *= 0.1
     held = round(HOLD_S / STEP_S)
     start, work, moved, gaps = None, 0.0, 0.0, []
     for hold in range(round(DURATION_S / HOLD_S)):
         t = HOLD_S * hold
         if random.random() < 0.1 or hold == 0:
-            plant.set("drive_mode", random.integers(0, 3, 6) if random.random() < 0.5 else np.full(6, random.integers(1, 3)))
+            plant.set(
+                "drive_mode", random.integers(0, 3, legs) if random.random() < 0.5 else np.full(legs, random.integers(1, 3))
+            )
         plant.set("velocity_command", amplitude * np.sin(2.0 * pi * frequencies * t + phases))
-        plant.set("external_wrench.force", wrench[:3] * np.sin(17.0 * t))
-        plant.set("external_wrench.torque", wrench[3:] * np.sin(17.0 * t))
+        plant.set("external_wrench.force", wrench[:forces] * np.sin(17.0 * t))
+        plant.set("external_wrench.torque", wrench[forces:].reshape(torque.shape) * np.sin(17.0 * t))
         rows = [reader.read()]
         for _ in range(held):
             assert advance(plant.calls, STEP_S) == 0, plant.messages[-1]
             rows.append(reader.read())
         values = np.array(rows)
         assert read_imus(plant.calls) == 0
-        assert np.isfinite(values).all() and np.isfinite(plant.calls["imu"]).all()
-        assert np.abs(np.linalg.norm(values[:, -4:], axis=1) - 1.0).max() < 1e-14
-        energy, powers = values[:, :2].sum(axis=1), values[:, 2:-4]
+        assert np.isfinite(values).all() and np.isfinite(plant.calls["imu"][:, sensed]).all()
+        if table is SPATIAL:
+            assert np.abs(np.linalg.norm(values[:, len(energies) :], axis=1) - 1.0).max() < 1e-14
+        energy, powers = values[:, :2].sum(axis=1), values[:, 2 : len(energies)]
         start = energy[0] if start is None else start
         work += float(cumulative_simpson(powers.sum(axis=1), dx=STEP_S)[-1])
         moved += float(np.abs(powers).sum() * STEP_S)
@@ -166,20 +228,22 @@ def run_at_random(plant: FmuPlant, random: Generator) -> tuple[Array, float]:
     return np.array(gaps), moved
 
 
-def test_random_mechanisms_run_without_energy_from_nowhere_or_are_refused(hexapod: Mechanism, fmu_path: Path) -> None:
+@pytest.mark.parametrize("sweep", SWEEPS, ids=lambda sweep: sweep.model.preset)
+def test_random_mechanisms_run_without_energy_from_nowhere_or_are_refused(sweep: Sweep) -> None:
     """Powers are sampled at 1 kHz, which misses part of what brakes and stops take in a blow: hence the tolerance."""
     refused: list[str] = []
-    a_parameter = "|".join(re.escape(variable.name) for variable in PARAMETERS)
-    with FmuPlant(fmu_path, hexapod.plant_parameters(), STEP_S) as plant:
-        for number in range(SETS):
+    table, preset = sweep.model.table, load_in_space(sweep.model.preset).plant_parameters()
+    a_parameter = "|".join(re.escape(variable.name) for variable in table.parameters)
+    with FmuPlant(default_fmu(sweep.model), preset, STEP_S) as plant:
+        for number in range(sweep.sets):
             random = np.random.default_rng([7, number])
             try:
-                restart(plant, random_parameters(hexapod, random))
+                restart(plant, random_parameters(preset | sweep.start(random), random, table))
             except FmuError as refusal:
                 assert re.search(a_parameter, str(refusal)), f"set {number}: {refusal}"
                 refused.append(str(refusal))
                 continue
-            gaps, moved = run_at_random(plant, random)
-            assert gaps.max() < 0.05 * moved + 0.1, f"set {number}"
+            gaps, moved = run_at_random(plant, random, sweep)
+            assert gaps.max() < 0.05 * moved + sweep.energy, f"set {number}"
     # Drives and brakes that are too fast for the substep are bound to be among so many, but not as a rule.
-    assert 0 < len(refused) < SETS / 3, refused
+    assert 0 < len(refused) < sweep.sets / 3, refused

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from plant.dynamics import Dynamics
 from plant.errors import FmuError
-from plant.export import PLANAR_MODEL, default_fmu
+from plant.export import PLANAR_MODEL, SPATIAL_MODEL, Model, default_fmu
 from plant.fmu import FmuPlant
 from plant.mechanism import Mechanism, load_in_space
 from plant.planar_dynamics import build_planar_dynamics
@@ -240,6 +240,16 @@ def test_parameters_that_make_no_sense_together_are_told(
     p = dict(rig.plant_parameters())
     assert broken(dynamics, p) == []
     assert any(said in text for text in broken(dynamics, p | checked_parameters(changes, PLANAR)))
+
+
+@pytest.mark.parametrize("model", [SPATIAL_MODEL, PLANAR_MODEL], ids=lambda model: model.identifier)
+def test_every_text_of_a_condition_tells_a_value_and_its_limit(model: Model) -> None:
+    """The FMU's C code gives just these two to `printf`."""
+    built = model.dynamics()
+    for texts, function in ((built.condition_texts, built.conditions), (built.limit_texts, built.limits)):
+        assert len(texts) == function.size1_out(0) == function.size1_out(1) > 0
+        for text in texts:
+            assert text.count("%g") == text.count("%") == 2, text
 
 
 def test_the_fmu_integrates_the_derived_rates(dynamics: Dynamics, rig: Mechanism) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from plant.errors import InputError, UnknownNameError
+from plant.planar_variables import PLANAR
 from plant.variables import BY_NAME, DRIVE_MODES, INPUTS, OUTPUTS, PARAMETERS, STATES, checked_parameters
 
 
@@ -21,6 +22,17 @@ def test_payload_friction_and_gravity_are_what_may_change_during_a_run() -> None
     tunable = {v.name.split(".")[0] for v in PARAMETERS if v.tunable}
     assert tunable == {"payload", "friction", "gravity"}
     assert all(v.tunable for v in PARAMETERS if v.name.startswith(("payload.", "friction.", "gravity")))
+
+
+def test_both_plants_mean_the_same_by_a_name() -> None:
+    planar = (*PLANAR.states, *PLANAR.inputs, *PLANAR.parameters, *PLANAR.outputs)
+    shared = [(variable, BY_NAME[variable.name]) for variable in planar if variable.name in BY_NAME]
+    assert {variable.name for variable in planar} - set(BY_NAME) == {"state.angle", "initial_angle", "angle"}
+    for variable, other in shared:
+        for field in ("unit", "causality", "maximum", "nominal", "tunable", "discrete"):
+            assert getattr(variable, field) == getattr(other, field), variable.name
+        # Products of inertia, which a scalar has none of, may be negative.
+        assert variable.minimum == other.minimum or variable.name in ("platform.inertia", "payload.inertia"), variable.name
 
 
 def test_the_description_of_the_drive_mode_names_every_mode() -> None:
