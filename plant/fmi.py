@@ -64,7 +64,7 @@ _MOST_MESSAGES = 100
 _ELEMENT = re.compile(r"(.+)\[(\d+(?:, ?\d+)*)\]")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class FmuVariable:
     """A variable of an FMU; in FMI 2.0 also the scalars `name[1,1]`, `name[1,2]`, ... together, as the array that they are.
 
@@ -73,7 +73,7 @@ class FmuVariable:
         shape: () for a scalar.
         type, causality, variability: as FMI names them.
         unit: None if the FMU declares none.
-        minimum, maximum: () as the FMU declares them, or (size,) where its scalars have declared their own.
+        limits: least and greatest value of each scalar, as the FMU declares them.
         startable: whether it may be set before initialisation.
         references: value references, of an array's scalars row by row.
         ending: how the names of its functions end, such as Float64 in `fmi3GetFloat64`; "" if it is no number.
@@ -86,8 +86,7 @@ class FmuVariable:
     causality: str
     variability: str
     unit: str | None
-    minimum: Array
-    maximum: Array
+    limits: tuple[tuple[float, float], ...]
     startable: bool
     references: tuple[int, ...]
     ending: str
@@ -97,6 +96,16 @@ class FmuVariable:
     def size(self) -> int:
         """The number of scalars."""
         return prod(self.shape)
+
+    @property
+    def minimum(self) -> float:
+        """The least value that any of its scalars may have."""
+        return min((least for least, _ in self.limits), default=-np.inf)
+
+    @property
+    def maximum(self) -> float:
+        """The greatest value that any of its scalars may have."""
+        return max((most for _, most in self.limits), default=np.inf)
 
     @property
     def element_names(self) -> list[str]:
@@ -239,12 +248,11 @@ class FmuDescription:
 
     def _variable(self, each: Any) -> FmuVariable:
         ending, dtype = _TYPES[self.version].get(each.type, ("", _FLOAT))
-        least, most = -np.inf if each.min is None else each.min, np.inf if each.max is None else each.max
+        limits = float(-np.inf if each.min is None else each.min), float(np.inf if each.max is None else each.max)
         startable = each.causality in ("input", "parameter") or each.initial in ("exact", "approx")
         return FmuVariable(
             each.name, tuple(each.shape), each.type, each.causality, each.variability, each.unit or _declared_unit(each),
-            np.array(float(least)), np.array(float(most)), startable and each.variability != "constant",
-            (each.valueReference,), ending, dtype,
+            (limits,) * prod(each.shape), startable and each.variability != "constant", (each.valueReference,), ending, dtype,
         )  # fmt: skip
 
 
@@ -269,8 +277,7 @@ def _assembled(name: str, elements: dict[tuple[int, ...], FmuVariable]) -> FmuVa
         first,
         name=name,
         shape=shape,
-        minimum=np.array([each.minimum for each in scalars]),
-        maximum=np.array([each.maximum for each in scalars]),
+        limits=tuple(each.limits[0] for each in scalars),
         references=tuple(each.references[0] for each in scalars),
     )
 

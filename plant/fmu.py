@@ -254,8 +254,7 @@ class FmuPlant:
                     "parameter: set it without @"
                 )
             check_free(variable, self.path.name, self.bound.driven)
-            limits = np.broadcast_to(variable.minimum, values.shape), np.broadcast_to(variable.maximum, values.shape)
-            for name, value, least, most in zip(variable.element_names, values, *limits, strict=True):
+            for name, value, (least, most) in zip(variable.element_names, values, variable.limits, strict=True):
                 if not least <= value <= most:
                     raise InputError(f"{name} of {self.path.name} is to be {value:g}; it must be from {least:g} to {most:g}")
 
