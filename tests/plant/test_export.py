@@ -16,7 +16,7 @@ from fmpy.validation import validate_fmu
 
 from plant import export
 from plant.errors import FmuError, ToolchainError
-from plant.export import build, build_in_subprocess, default_fmu
+from plant.export import build_in_subprocess, default_fmu
 from plant.fmu import FmuPlant
 from plant.mechanism import Mechanism
 from plant.model_description import QUANTITIES, Layout
@@ -46,7 +46,7 @@ def test_the_default_fmu_is_built_once(fmu_path: Path, monkeypatch: pytest.Monke
 
 
 def test_a_build_is_the_same_to_the_byte_and_loads_no_casadi(fmu_path: Path, tmp_path: Path) -> None:
-    """A fresh process with an empty cache builds the FMU in a process of its own; here it is built once more."""
+    """A fresh process with an empty cache builds the FMU again, in a process of its own."""
     code = "import sys, plant.export; path = plant.export.default_fmu(); print(path); print('casadi' in sys.modules)"
     run = subprocess.run(
         [sys.executable, "-c", code],
@@ -58,8 +58,7 @@ def test_a_build_is_the_same_to_the_byte_and_loads_no_casadi(fmu_path: Path, tmp
     path, casadi = run.stdout.splitlines()
     assert casadi == "False"
     assert Path(path).is_relative_to(tmp_path / "cache" / "fmus") and Path(path).parent.name == fmu_path.parent.name
-    build(tmp_path / "again.fmu")
-    assert Path(path).read_bytes() == (tmp_path / "again.fmu").read_bytes() == fmu_path.read_bytes()
+    assert Path(path).read_bytes() == fmu_path.read_bytes()
 
 
 def test_the_cache_key_follows_the_sources(monkeypatch: pytest.MonkeyPatch, fmu_path: Path, tmp_path: Path) -> None:
