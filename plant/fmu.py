@@ -174,6 +174,7 @@ class FmuPlant:
 
         Raises:
             UnknownNameError: the FMU has no such variable.
+            InputError: it is no real variable.
             FmuError: the FMU has no directional derivatives, or shows no states.
         """
         states, rates = [state for state, _ in self.description.states], [rate for _, rate in self.description.states]

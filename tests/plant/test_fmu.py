@@ -254,11 +254,6 @@ def test_only_parameters_and_inputs_have_start_values(fmu_path: Path) -> None:
         FmuPlant(fmu_path, {}, 1e-3, settings=[Setting.parse("drive_mode=2")])
 
 
-def test_only_reals_have_derivatives(make_plant: MakePlant) -> None:
-    with pytest.raises(InputError, match=r"drive_mode of gough_plant.fmu is of type Enumeration and has no derivatives"):
-        make_plant().linearize(["drive_mode"], ["position"])
-
-
 def test_outputs_cannot_be_set(make_plant: MakePlant) -> None:
     with pytest.raises(FmuError, match=r"position is calculated and cannot be set"):
         make_plant().set("position", np.zeros(3))
