@@ -17,7 +17,7 @@ from controller.fusion import find_vertical, fuse_heading, point_legs, prepare_p
 from controller.inverse_kinematics import leg_lengths
 from controller.leg_filter import start_leg
 from controller.planner import Reference, plan
-from controller.safety import RIG_FAILED, describe_end
+from controller.safety import describe_end
 from controller.settings import control_settings, safety_settings, sensor_settings
 from controller.stream import rest
 from controller.target import Target, check_duration, load_target
@@ -310,7 +310,7 @@ class PreparedLoop(Loop):
 
     def reason(self) -> str:
         """Why the run has ended, in words; a plant that failed has its own."""
-        if self.plant is not None and self.state["stopping"] == RIG_FAILED:
+        if self.plant is not None and self.plant.calls["status"] != OK:
             return str(self.plant.failure())
         return describe_end(self.state)
 

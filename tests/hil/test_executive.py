@@ -364,7 +364,7 @@ def test_what_was_taken_is_given_back():
             assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
             assert locked() > 0
     assert before == (os.sched_getscheduler(0), os.sched_getparam(0).sched_priority, os.sched_getaffinity(0), locked())
-    assert open_files == len(list(Path("/proc/self/fd").iterdir()))
+    assert len(list(Path("/proc/self/fd").iterdir())) <= open_files
 
 
 def test_a_measure_that_is_not_wanted_is_not_taken():
