@@ -159,7 +159,8 @@ SWEEPS = (
 def restart(plant: FmuPlant, parameters: Mapping[str, Array]) -> None:
     """Initialise a loaded plant anew."""
     plant._instance.fmu.reset()
-    plant.calls["time"] = 0.0
+    plant.calls["time"] = plant.calls["since"] = 0.0
+    plant.calls["steps"] = 0
     for name, value in parameters.items():
         plant.set(name, value)
     plant._instance.initialize()
