@@ -179,11 +179,6 @@ class Mechanism:
         return self.legs == PLANAR_LEGS
 
     @property
-    def freedoms(self) -> list[int]:
-        """The components of a twist (6,) that the platform can have."""
-        return [0, 1, 5] if self.planar else list(range(6))
-
-    @property
     def nominal_home(self) -> Pose:
         """Home, or for want of one a pose without rotation whose platform joints stand above the base's."""
         return self.home or _nominal_home(self.base_joints, self.platform_joints, self.up_in_base)

@@ -248,8 +248,6 @@ OUTPUTS = (
 
 SPATIAL = VariableTable(STATES, INPUTS, PARAMETERS, OUTPUTS)
 
-BY_NAME = {variable.name: variable for variable in (*STATES, *INPUTS, *PARAMETERS, *OUTPUTS)}
-
 
 def checked_parameters(values: Mapping[str, ArrayLike], table: VariableTable = SPATIAL) -> dict[str, Array]:
     """Check parameter values against a table; scalars are spread over arrays.

@@ -27,7 +27,7 @@ from plant.fmu_check import check_fmu
 from plant.mechanism import Mechanism
 from plant.model_description import Layout
 from plant.pose import Array
-from plant.variables import BY_NAME, SPATIAL, VELOCITY, Variable
+from plant.variables import SPATIAL, VELOCITY, Variable
 
 LAYOUT = Layout(SPATIAL)
 REFERENCE = {variable.name: reference for reference, variable in enumerate(LAYOUT.exposed)}
@@ -165,7 +165,7 @@ def test_model_exchange_has_its_modes(fmu_path: Path) -> None:
 
 
 def places(name: str) -> list[int]:
-    return list(LAYOUT.places(BY_NAME[name]))
+    return list(LAYOUT.places(VARIABLE[name]))
 
 
 def drive_with_fmi2(path: Path, cycles: int) -> Array:

@@ -7,7 +7,9 @@ import pytest
 
 from plant.errors import InputError, UnknownNameError
 from plant.planar_variables import PLANAR
-from plant.variables import BY_NAME, DRIVE_MODES, INPUTS, OUTPUTS, PARAMETERS, STATES, checked_parameters
+from plant.variables import DRIVE_MODES, INPUTS, OUTPUTS, PARAMETERS, STATES, checked_parameters
+
+BY_NAME = {variable.name: variable for variable in (*STATES, *INPUTS, *PARAMETERS, *OUTPUTS)}
 
 
 def test_every_variable_has_one_entry_with_unit_and_description() -> None:
