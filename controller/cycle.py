@@ -13,9 +13,9 @@ from collections.abc import Collection
 
 import numpy as np
 
-from controller.calibration import Calibration
+from controller.calibration.file import Calibration
 from controller.direct_kinematics.closed_forms import GEOMETRY, SCRATCH, geometry_of
-from controller.fusion import (
+from controller.estimation.fusion import (
     WORST_CONDITIONING,
     calibrate,
     elapsed,
@@ -25,16 +25,16 @@ from controller.fusion import (
     fuse_platform,
     locate,
 )
-from controller.heading_filter import ERRORS as HEADING_ERRORS
-from controller.heading_filter import STATES as HEADING_STATES
-from controller.heading_filter import field_of
+from controller.estimation.heading_filter import ERRORS as HEADING_ERRORS
+from controller.estimation.heading_filter import STATES as HEADING_STATES
+from controller.estimation.heading_filter import field_of
+from controller.estimation.mechanism_filter import FILTER_PARAMETERS, FILTER_STATE, filter_parameters
+from controller.estimation.readings import SENSOR_GEOMETRY, sensor_geometry
 from controller.inverse_kinematics import jacobian_at, legs_at, sample_workspace
 from controller.least_squares import RANK_TOLERANCE, solve_least_squares
-from controller.mechanism_filter import FILTER_PARAMETERS, FILTER_STATE, filter_parameters
 from controller.pid import step_pid
-from controller.readings import SENSOR_GEOMETRY, sensor_geometry
-from controller.reference import STOP_SEGMENTS, evaluate_reference
-from controller.safety import (
+from controller.planning.segments import STOP_SEGMENTS, evaluate_reference
+from controller.safety.watch import (
     ENABLED,
     FAULT,
     NO_CAUSE,
@@ -51,14 +51,14 @@ from controller.safety import (
 )
 from controller.settings import ControlSettings, FusionSettings, SafetySettings
 from plant.compiled import Record, kernel
+from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
 from plant.errors import InputError
 from plant.imu import STANDARD_GRAVITY
 from plant.mechanism import LEGS, Mechanism, six_rows
 from plant.pose import Array
-from plant.variables import IMU_COUNT, PLATFORM_IMU
 
 OK = NO_CAUSE
-"""What a cycle reports if all is well; else it is the cause of a fault, by `controller.safety`."""
+"""What a cycle reports if all is well; else it is the cause of a fault, by `controller.safety.watch`."""
 
 _IMPLAUSIBLE_SHARE = 0.25
 """How far outside its stroke, as a share of it, the estimate of a leg may lie."""
@@ -245,7 +245,7 @@ The whole-mechanism filter is to be started, or trusted, when it is `filter_due`
 source of the pose to the other, and the pose in closed form is `found`.
 
 `reference` holds length, rate and acceleration of each leg in the cycle before `prepared`. A stop or a fault, `stopping` for a
-cause by `controller.safety`, begins in `stop_cycle`, and from `stopped_cycle` on the brakes may hold.
+cause by `controller.safety.watch`, begins in `stop_cycle`, and from `stopped_cycle` on the brakes may hold.
 """
 
 
@@ -454,7 +454,7 @@ def cycle(parameters: Record, state: Record, measurement: Array, segments: Array
         parameters: dtype `PARAMETERS`.
         state: dtype `STATE`; zeros before the first cycle.
         measurement: (3, 7, 3), angular velocity [rad/s], specific force [m/s^2], magnetic field [uT] of the seven IMUs.
-        segments: (6, n, 5), the reference as `controller.reference` has it.
+        segments: (6, n, 5), the reference as `controller.planning.segments` has it.
 
     Returns:
         `OK`, or why there is no pose or the estimate cannot be used: the cause of a fault, unless nothing has been armed yet.

@@ -19,7 +19,7 @@ S = TypeVar("S", "ControlSettings", "FusionSettings", "SafetySettings")
 
 @dataclass(frozen=True)
 class ControlSettings:
-    """Gains of the six PID controllers, designed by `controller.tuning`, and when feedback closes.
+    """Gains of the six PID controllers, designed by `controller.design.tuning`, and when feedback closes.
 
     Attributes:
         proportional: [1/s].

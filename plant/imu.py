@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from plant.compiled import Record, kernel
+from plant.dynamics.variables import IMU_COUNT
 from plant.errors import InputError, UnknownNameError
 from plant.pose import Array, checked_seed, rotation_from_vector
-from plant.variables import IMU_COUNT
 
 STANDARD_GRAVITY = 9.80665
 MILLI_G = 1e-3 * STANDARD_GRAVITY

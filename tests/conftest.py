@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from plant.export import default_fmu
+from plant.fmu.build import default_fmu
 from plant.mechanism import Mechanism, load_mechanism
-from tests.plant.foreign import build_foreign, build_foreign_3
+from tests.plant.fmu.foreign import build_foreign, build_foreign_3
 
 # The first example of a property may compile kernels, so there is no deadline; and the same examples come every time.
 settings.register_profile("gough", deadline=None, derandomize=True)

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from hil.command_line import _parser, main
-from plant.export import SPATIAL_MODEL, default_fmu
+from plant.dynamics.variables import VELOCITY
+from plant.fmu.build import SPATIAL_MODEL, default_fmu
 from plant.mechanism import load_mechanism
 from plant.pose import Array
-from plant.variables import VELOCITY
 
 PAGE = (Path(__file__).parent.parent / "docs" / "fmu.md").read_text()
 EXAMPLES = {

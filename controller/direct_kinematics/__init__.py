@@ -1,7 +1,7 @@
 """Direct kinematics: from the directions of the legs to the pose, in closed form and without a first guess."""
 
+from controller.direct_kinematics.consistency import Integrity, LengthCheck, cross_check, integrity
 from controller.direct_kinematics.lengths import pose_from_lengths, poses_from_lengths
-from controller.direct_kinematics.monitor import Integrity, LengthCheck, cross_check, integrity
 from controller.direct_kinematics.planar import AssemblyMode, solve_planar
 from controller.direct_kinematics.spatial import (
     METHODS,

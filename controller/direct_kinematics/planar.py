@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from controller.direct_kinematics.spatial import LEAST_CONDITIONING, LEG_SIGMA, TILT_SIGMA
 from plant.errors import InputError, SingularConfigurationError
-from plant.planar import PLANAR_LEGS, PlanarMechanism
+from plant.mechanism.planar import PLANAR_LEGS, PlanarMechanism
 from plant.pose import Array, checked_array
 
 

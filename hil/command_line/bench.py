@@ -41,10 +41,10 @@ def add_bench(commands: Any) -> None:
 
 
 def _bench(options: argparse.Namespace) -> int:
-    from hil.bench import machine, measure_speed, read_earlier, write_report
-    from hil.kinematics_bench import measure_kinematics
-    from hil.plant_bench import measure_plant
-    from hil.real_time_bench import GrossExcessError, gross_excess, measure_measures, measure_real_time, measure_start_up
+    from hil.benchmarks.clock import GrossExcessError, gross_excess, measure_measures, measure_real_time, measure_start_up
+    from hil.benchmarks.kinematics import measure_kinematics
+    from hil.benchmarks.loop import machine, measure_speed, read_earlier, write_report
+    from hil.benchmarks.plant import measure_plant
 
     check_outputs(options.json, options.report)
     for name, seconds in (("--clock", options.clock), ("--measures", options.measures)):
@@ -108,7 +108,7 @@ def _print_real_time(figures: dict[str, Any], start_up: dict[str, Any]) -> None:
                 f"{used['involuntary_switches']:g}; growth {used['resident']:g} bytes{text}"
             )
             over = ", ".join(measured["over_budget"])
-            print(f"over budget: {over}" if over else "within the timing budget (hil/budget.toml)")
+            print(f"over budget: {over}" if over else "within the timing budget (hil/loop/budget.toml)")
         if "load" in conditions:
             idle, load = conditions["idle"], conditions["load"]
             ours, bare = ([load[name][key] / idle[name][key] for key in ("p50", "p999")] for name in ("compute_us", "bare_us"))

@@ -59,9 +59,9 @@ _RIG_SIMULATED = {
 
 
 def _calibrate_rig(options: argparse.Namespace) -> int:
-    from controller.calibration import save_calibration
-    from controller.self_calibration import Prior
-    from hil.rig_calibration import Knowledge, calibrate_recordings, calibrate_rig
+    from controller.calibration.at_rest import Prior
+    from controller.calibration.file import save_calibration
+    from hil.calibration.rig_calibration import Knowledge, calibrate_recordings, calibrate_rig
 
     check_outputs(options.output, options.json, options.report, options.picture)
     if not 0.0 < options.tilt < 45.0:
@@ -86,11 +86,11 @@ def _calibrate_rig(options: argparse.Namespace) -> int:
     save_calibration(options.output, result.calibration)
     write_json(options.json, result.summary)
     if options.report:
-        from hil.calibration_report import write_report
+        from hil.reports.calibration import write_report
 
         write_report(result, options.report)
     if options.picture:
-        from hil.calibration_picture import write_picture
+        from hil.reports.calibration_picture import write_picture
 
         write_picture(result.summary, options.picture)
     _print_rig_calibration(result.summary)
@@ -99,7 +99,7 @@ def _calibrate_rig(options: argparse.Namespace) -> int:
 
 
 def _print_rig_calibration(summary: dict[str, Any]) -> None:
-    from hil.rig_calibration import STAGES, weak_words
+    from hil.calibration.rig_calibration import STAGES, weak_words
 
     columns = ("residual [mg]", "left out", "predicted [mm, deg]", "halves", "true")
     table = new_table(f"{summary['rests']} poses at rest", *columns)
@@ -140,9 +140,9 @@ def _add_calibrate_imu(actions: Any) -> None:
 def _calibrate_imu(options: argparse.Namespace) -> int:
     from dataclasses import replace
 
-    from controller.calibration import Calibration, load_calibration, save_calibration
-    from controller.imu_calibration import calibrate_imu
-    from hil.imu_data import read_imu
+    from controller.calibration.file import Calibration, load_calibration, save_calibration
+    from controller.calibration.single_imu import calibrate_imu
+    from hil.recording.imu_data import read_imu
     from plant.imu import STANDARD_GRAVITY
 
     check_outputs(options.output, options.json)
@@ -221,9 +221,9 @@ def _add_calibrate_magnetometer(actions: Any) -> None:
 
 
 def _calibrate_magnetometer(options: argparse.Namespace) -> int:
-    from controller.calibration import Calibration, load_calibration, save_calibration
-    from controller.magnetometer_calibration import calibrate_magnetometer
-    from hil.imu_data import read_field
+    from controller.calibration.file import Calibration, load_calibration, save_calibration
+    from controller.calibration.magnetometer import calibrate_magnetometer
+    from hil.recording.imu_data import read_field
     from plant.imu import ACCELEROMETER, MAGNETOMETER
 
     check_outputs(options.output, options.json)

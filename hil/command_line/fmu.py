@@ -11,7 +11,7 @@ from hil.command_line.printing import new_table, print_table, progress_bar
 from plant.errors import GoughError
 
 if TYPE_CHECKING:
-    from plant.variables import Variable
+    from plant.dynamics.variables import Variable
 
 
 _PERIOD_S = 1e-3
@@ -76,7 +76,7 @@ def add_fmu(commands: Any) -> None:
 
 
 def _build_fmu(options: argparse.Namespace) -> int:
-    from plant.export import build_in_subprocess, check_build, model_of
+    from plant.fmu.build import build_in_subprocess, check_build, model_of
     from plant.mechanism import load_in_space
 
     model = model_of(load_in_space(options.mechanism))
@@ -91,8 +91,8 @@ def _build_fmu(options: argparse.Namespace) -> int:
 
 
 def _print_tables(options: argparse.Namespace) -> int:
-    from hil.markdown import markdown_table
-    from plant.export import PLANAR_MODEL, SPATIAL_MODEL
+    from hil.reports.markdown import markdown_table
+    from plant.fmu.build import PLANAR_MODEL, SPATIAL_MODEL
 
     del options
     headings = ("variable", "shape", "unit", "role", "range", "nominal", "description")
@@ -122,9 +122,9 @@ def _shape(shape: tuple[int, ...]) -> str:
 
 
 def _show(options: argparse.Namespace) -> int:
-    from plant.binding import OWN_BINDING, bind
-    from plant.fmi import FmuDescription
-    from plant.fmu_check import platforms_of
+    from plant.fmu.binding import OWN_BINDING, bind
+    from plant.fmu.check import platforms_of
+    from plant.fmu.importer import FmuDescription
 
     description = FmuDescription(options.file)
     try:
@@ -162,7 +162,7 @@ def _show(options: argparse.Namespace) -> int:
 
 
 def _validate(options: argparse.Namespace) -> int:
-    from plant.fmu_check import check_fmu
+    from plant.fmu.check import check_fmu
 
     with progress_bar(f"trying {options.file}"):
         checks = check_fmu(options.file)
@@ -186,11 +186,11 @@ def _print_pairs(pairs: dict[str, Any]) -> None:
 def _linearize(options: argparse.Namespace) -> int:
     import numpy as np
 
-    from controller.linearization import state_space
-    from plant.export import default_fmu, model_of
-    from plant.fmu import FmuPlant, write_drive_mode
+    from controller.design.linearization import state_space
+    from plant.dynamics.variables import VELOCITY
+    from plant.fmu.build import default_fmu, model_of
+    from plant.fmu.plant import FmuPlant, write_drive_mode
     from plant.mechanism import load_in_space
-    from plant.variables import VELOCITY
 
     mechanism = load_in_space(options.mechanism)
     path = options.file or default_fmu(model_of(mechanism))

@@ -41,7 +41,7 @@ def add_compare(commands: Any) -> None:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    from hil.fusion_comparison import ComparisonConfig, compare
+    from hil.studies.fusion_comparison import ComparisonConfig, compare
 
     check_outputs(options.json)
     config = ComparisonConfig(**chosen(options, "mechanism", "motion", "duration", "rate", "imu", "calibration", "seeds"))
@@ -90,7 +90,7 @@ def add_evaluate(commands: Any) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    from hil.fusion_evaluation import SECTIONS, EvaluationConfig, evaluate
+    from hil.studies.fusion_evaluation import SECTIONS, EvaluationConfig, evaluate
 
     check_outputs(options.json)
     config = EvaluationConfig(
@@ -205,7 +205,7 @@ def add_tune_fusion(commands: Any) -> None:
 
 
 def _tune_fusion(options: argparse.Namespace) -> int:
-    from hil.fusion_tuning import TuningConfig, tune_fusion, tuned_text
+    from hil.studies.fusion_tuning import TuningConfig, tune_fusion, tuned_text
 
     check_outputs(options.output, options.json)
     config = TuningConfig(**chosen(options, "mechanism", "imu", "seeds", "rate"))
@@ -267,7 +267,7 @@ def add_broad(commands: Any) -> None:
 
 def _broad(options: argparse.Namespace) -> int:
     from controller.settings import FusionSettings
-    from hil.broad import evaluate
+    from hil.studies.broad import evaluate
 
     check_outputs(options.json)
     fusion = FusionSettings(platform_accelerometer_noise=options.accelerometer_noise, bias_walk=options.bias_walk)

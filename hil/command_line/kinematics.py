@@ -26,7 +26,7 @@ def add_classify(commands: Any) -> None:
 
 
 def _classify(options: argparse.Namespace) -> int:
-    from hil.classification import PAPER, describe, write_report
+    from hil.studies.classification import PAPER, describe, write_report
     from plant.mechanism import load_mechanism
 
     check_outputs(options.json, options.report)
@@ -68,7 +68,7 @@ def add_accuracy(commands: Any) -> None:
 
 
 def _accuracy(options: argparse.Namespace) -> int:
-    from hil.accuracy import evaluate_accuracy
+    from hil.studies.accuracy import evaluate_accuracy
     from plant.mechanism import load_spatial
 
     check_outputs(options.json)
@@ -111,7 +111,7 @@ def add_classes(commands: Any) -> None:
 def _classes(options: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from hil.accuracy import COLUMNS, cells, evaluate_classes, markdown
+    from hil.studies.accuracy import COLUMNS, cells, evaluate_classes, markdown
 
     check_outputs(options.json)
     with progress_bar("classes") as progress:
@@ -149,7 +149,7 @@ def _sensor_sets(options: argparse.Namespace) -> int:
     from dataclasses import asdict
     from itertools import groupby
 
-    from hil.sensor_sets import COLUMNS, MECHANISMS, cells, evaluate_sensor_sets, markdown, reasons
+    from hil.studies.sensor_sets import COLUMNS, MECHANISMS, cells, evaluate_sensor_sets, markdown, reasons
 
     check_outputs(options.json)
     with progress_bar("sets of sensors") as progress:
@@ -188,9 +188,9 @@ def add_planar(commands: Any) -> None:
 
 
 def _planar(options: argparse.Namespace) -> int:
-    from hil.planar_rig import evaluate, write_report
+    from hil.studies.planar_rig import evaluate, write_report
     from plant.mechanism import load_mechanism
-    from plant.planar import PlanarMechanism
+    from plant.mechanism.planar import PlanarMechanism
 
     check_outputs(options.json, options.report)
     mechanism = load_mechanism(options.mechanism)

@@ -36,7 +36,7 @@ def live_view(mechanism: str, target: str, rate: float) -> Iterator[Callable[[An
 def _view(mechanism: str, target: str, rate: float, progress: Any) -> Any:
     from rich.markup import escape
 
-    from controller.safety import CAUSES, MODES
+    from controller.safety.watch import CAUSES, MODES
 
     table = new_table(f"{mechanism} follows {target} at {rate:g} Hz", "")
     latest = progress.latest

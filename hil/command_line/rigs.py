@@ -35,12 +35,12 @@ def add_check_rig(commands: Any) -> None:
 def _check_rig(options: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from hil.realtime import keep_to_one_thread
+    from hil.realtime.scheduling import keep_to_one_thread
 
     keep_to_one_thread()
-    from hil.executive import rig_of
     from hil.rigs.contract import CLAUSES, examine_rig
-    from hil.simulation import SimulationConfig
+    from hil.runs.executive import rig_of
+    from hil.runs.simulation import SimulationConfig
 
     check_outputs(options.json)
     if options.beyond is not None and not options.move:
@@ -110,10 +110,10 @@ def add_emulate(commands: Any) -> None:
 
 
 def _emulate(options: argparse.Namespace) -> int:
-    from hil.realtime import RealTimeSettings, keep_to_one_thread
+    from hil.realtime.scheduling import RealTimeSettings, keep_to_one_thread
 
     keep_to_one_thread()
-    from hil.emulator import EmulatorConfig, emulate
+    from hil.runs.emulator import EmulatorConfig, emulate
 
     simulated = simulation_config(options, "mechanism", "target", "imu", "seed", "plant", "binding", "rate")
     config = EmulatorConfig(
@@ -140,8 +140,8 @@ def add_inject(commands: Any) -> None:
 def _inject(options: argparse.Namespace) -> int:
     from rich.markup import escape
 
-    from hil.emulator import ask
-    from hil.rigs.faults import KINDS
+    from hil.rigs.emulation.faults import KINDS
+    from hil.runs.emulator import ask
 
     if options.list:
         table = new_table("fault", "number", "size by default", "")
@@ -172,8 +172,8 @@ def add_faults(commands: Any) -> None:
 
 
 def _faults(options: argparse.Namespace) -> int:
-    from hil.fault_matrix import CASES, HEADINGS, run_matrix, summary, table
-    from hil.markdown import markdown_table
+    from hil.reports.markdown import markdown_table
+    from hil.studies.fault_matrix import CASES, HEADINGS, run_matrix, summary, table
 
     check_outputs(options.json)
     if options.seeds < 1:
@@ -226,8 +226,8 @@ def _address(text: str) -> tuple[str, int]:
 
 
 def _stream_target(options: argparse.Namespace) -> int:
-    from controller.target import load_target
-    from hil.target_stream import Faults, send_target
+    from controller.planning.target import load_target
+    from hil.runs.target_stream import Faults, send_target
     from plant.mechanism import load_spatial
 
     mechanism = load_spatial(options.mechanism)

@@ -21,8 +21,8 @@ from hil.command_line.printing import deg, mm, new_table, print_table, progress_
 from plant.errors import InputError
 
 if TYPE_CHECKING:
-    from hil.simulation import SimulationConfig
-    from hil.snapshot import Snapshot
+    from hil.runs.simulation import SimulationConfig
+    from hil.runs.snapshot import Snapshot
 
 
 def add_simulate(commands: Any) -> None:
@@ -108,8 +108,8 @@ def _imus(text: str) -> tuple[int, ...]:
 
 
 def _simulate(options: argparse.Namespace) -> int:
-    from hil.simulation import SimulationStoppedError, simulate
-    from hil.snapshot import read_snapshot, write_snapshot
+    from hil.runs.simulation import SimulationStoppedError, simulate
+    from hil.runs.snapshot import read_snapshot, write_snapshot
 
     check_outputs(options.json, options.report, options.save_state)
     config, resumed = simulation_config(options, *_MOTION), None
@@ -130,7 +130,7 @@ def _simulate(options: argparse.Namespace) -> int:
     if stopped is None or result.moved:
         write_json(options.json, result.summary())
         if options.report:
-            from hil.report import write_report
+            from hil.reports.run import write_report
 
             write_report(result, options.report)
         _print_simulation(result.summary())
@@ -141,7 +141,7 @@ def _simulate(options: argparse.Namespace) -> int:
 
 def _resumed_config(options: argparse.Namespace, config: "SimulationConfig", resumed: "Snapshot") -> "SimulationConfig":
     """The configuration of a snapshot, with another duration if one is given."""
-    from hil.simulation import SimulationConfig
+    from hil.runs.simulation import SimulationConfig
 
     kept = SimulationConfig.from_plain(resumed.config)
     for name in (*_MOTION, "joint_error"):
@@ -201,10 +201,10 @@ def add_run(commands: Any) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from hil.realtime import RealTimeSettings, keep_to_one_thread
+    from hil.realtime.scheduling import RealTimeSettings, keep_to_one_thread
 
     keep_to_one_thread()
-    from hil.executive import RunStoppedError, run
+    from hil.runs.executive import RunStoppedError, run
 
     check_outputs(options.json, options.record)
     config = simulation_config(options, *_MOTION, "rig", "rig_at", "arm")
@@ -237,13 +237,13 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _print_run(summary: dict[str, Any]) -> None:
-    from hil.timing import budget
+    from hil.loop.timing import budget
 
     print_table(_timing_table(summary["timing_us"], budget()))
     for line in (*(f"over budget: {text}" for text in summary["over_budget"]), *summary["events"]):
         print(line)
     if not summary["over_budget"]:
-        print("within the timing budget (hil/budget.toml)")
+        print("within the timing budget (hil/loop/budget.toml)")
     for text in summary["refused"]:
         print(f"without {text}")
     used, errors = summary["usage"], summary["errors_m"]
@@ -321,7 +321,7 @@ def add_replay(commands: Any) -> None:
 
 
 def _replay(options: argparse.Namespace) -> int:
-    from hil.replay import replay
+    from hil.recording.replay import replay
 
     check_distinct(options.json, *options.files)
     check_outputs(options.json)

@@ -23,7 +23,7 @@ def add_tune(commands: Any) -> None:
 
 
 def _tune(options: argparse.Namespace) -> int:
-    from controller.tuning import tune
+    from controller.design.tuning import tune
     from plant.mechanism import load_spatial
 
     check_outputs(options.json)

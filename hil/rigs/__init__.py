@@ -11,13 +11,13 @@ from typing import Protocol
 
 import numpy as np
 
-from controller.safety import BRAKED, ENABLED, FAULTY, FOLLOWING, OFF, QUICK_STOP, QUICK_STOPPING, READY
+from controller.safety.watch import BRAKED, ENABLED, FAULTY, FOLLOWING, OFF, QUICK_STOP, QUICK_STOPPING, READY
 from plant.compiled import Record
+from plant.dynamics.variables import IMU_COUNT
 from plant.errors import GoughError
-from plant.fmu import CALLS
+from plant.fmu.plant import CALLS
 from plant.mechanism import LEGS
 from plant.pose import Array
-from plant.variables import IMU_COUNT
 
 __all__ = [
     "ANSWERED", "BRAKED", "ENABLED", "FAULTY", "FEEDBACK", "FOLLOWING", "OFF", "QUICK_STOP", "QUICK_STOPPING", "READY",

@@ -33,10 +33,10 @@ from hil.rigs import (
     new_feedback,
 )  # fmt: skip
 from plant.compiled import Record
+from plant.dynamics.variables import IMU_COUNT
 from plant.errors import GoughError, InputError, UnknownNameError
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array
-from plant.variables import IMU_COUNT
 
 CALLS = ("open", "identify", "arm", "exchange", "quick_stop", "close")
 """What can be called of a rig."""

@@ -5,10 +5,10 @@ import numpy as np
 
 from controller.direct_kinematics import pose_from_lengths
 from controller.inverse_kinematics import inverse_kinematics
-from plant.dynamics import imu_signals
+from plant.dynamics.spatial import imu_signals
+from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, quaternion_from_rotation
-from plant.variables import IMU_COUNT
 
 _DRIVE_S = 0.02
 """Time constant with which a drive's velocity follows its command [s]."""

@@ -17,15 +17,15 @@ from controller.cycle import (
     cycle_parameters,
 )
 from controller.direct_kinematics import solve
-from controller.fusion import improve_pose
+from controller.estimation.fusion import improve_pose
 from controller.inverse_kinematics import leg_lengths, sample_workspace
-from controller.safety import IDLE, NOT_FINITE, POSE_LOST, RUNNING
+from controller.safety.watch import IDLE, NOT_FINITE, POSE_LOST, RUNNING
 from controller.settings import ControlSettings, FusionSettings, SafetySettings, control_settings, fusion_settings
+from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import InputError
 from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER, imu_state, load_imu, measure
 from plant.mechanism import Mechanism
 from plant.pose import Pose
-from plant.variables import PLATFORM_IMU
 from tests.controller.leg_geometry import (
     angle_between,
     leg_directions,

@@ -10,14 +10,14 @@ from controller.cycle import ALL_IMUS, STATE, check_imus, cycle, cycle_parameter
 from controller.direct_kinematics import poses_from_lengths
 from controller.direct_kinematics.closed_forms import geometry_of, pose_from_roll
 from controller.direct_kinematics.planar import solve_planar
-from controller.fusion import find_pose, improve_pose
+from controller.estimation.fusion import find_pose, improve_pose
 from controller.inverse_kinematics import leg_lengths, sample_workspace
+from controller.planning.target import load_target
 from controller.settings import control_settings, fusion_settings
-from controller.target import load_target
 from plant.errors import InputError
 from plant.mechanism import Mechanism, load_in_space, load_mechanism
 from plant.pose import rotation_from_vector
-from tests.plant.planar_bodies import coordinates, frames_at, jacobian, weight_force
+from tests.plant.dynamics.planar_bodies import coordinates, frames_at, jacobian, weight_force
 
 RATE_HZ = 1000.0
 PLATFORM = 6

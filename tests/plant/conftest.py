@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from numpy.typing import ArrayLike
 
-from plant.fmu import FmuPlant
+from plant.dynamics.variables import checked_parameters
+from plant.fmu.plant import FmuPlant
 from plant.mechanism import Mechanism
-from plant.variables import checked_parameters
 
 MakePlant = Callable[..., FmuPlant]
 

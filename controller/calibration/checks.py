@@ -1,0 +1,278 @@
+"""Whether each IMU lives, sits where it should, and is turned and wired as it should be: to be known before a loop is closed.
+
+While the drives follow a plan, whatever the IMUs say, each must read what its place does. One that does not is tried at the
+places of the others, and with the 48 signed permutations of its axes, 24 turns and 24 mirrored ones.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import permutations, product
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from controller.calibration.at_rest import CalibrationError
+from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
+from plant.imu import ACCELEROMETER, STANDARD_GRAVITY
+from plant.pose import Array, vector_from_rotation
+
+MOST_TILT = np.radians(15.0)
+"""By how much the mean force may be off what is expected, as an angle of gravity [rad]: raw IMUs are off by 8 degrees."""
+
+FAR_BETTER = 0.5
+"""What another place or other axes may leave unexplained, as a share of what the right ones do, to be believed."""
+
+LEAST_MOTION = 0.2
+"""How much of the expected motion an IMU must read."""
+
+LEAST_RATE = np.radians(1.0)
+"""Of the turning of any IMU in a motion, RMS [rad/s]."""
+
+LEAST_SPREAD = np.radians(3.0)
+"""Of the verticals of an IMU over rests [rad]."""
+
+_FROZEN_S = 0.1
+_RIGHT = np.eye(3)
+_SENSORS = ("gyroscope", "accelerometer")
+_GRAVITY_RANGE = (0.7 * STANDARD_GRAVITY, 1.3 * STANDARD_GRAVITY)
+
+
+def check_alive(samples: Array) -> None:
+    """Check that no IMU stands still while others do not, and that each reads gravity.
+
+    Args:
+        samples: (N, 3, 7, 3), raw, at rest.
+
+    Raises:
+        CalibrationError: one does not; the message names it.
+    """
+    stands = (samples[:, :2] == samples[0, :2]).all(axis=(0, 1, 3))
+    for imu in range(IMU_COUNT):
+        own = samples[:, :2, imu]
+        if not np.isfinite(own).all():
+            raise CalibrationError(f"IMU {imu} reads what is no number: check its cable and its supply")
+        if stands[imu] and not stands.all():
+            raise CalibrationError(
+                f"IMU {imu} is frozen: {len(own)} readings are the same, and others' are not: check its cable and its supply"
+            )
+        force = float(np.linalg.norm(own[:, ACCELEROMETER].mean(axis=0)))
+        if not _GRAVITY_RANGE[0] <= force <= _GRAVITY_RANGE[1]:
+            raise CalibrationError(
+                f"the accelerometer of IMU {imu} reads {force:.3g} m/s2 at rest; gravity is {_GRAVITY_RANGE[0]:.3g} to "
+                f"{_GRAVITY_RANGE[1]:.3g}: it is dead, or its range or unit is another"
+            )
+
+
+def check_all_along(samples: Array, rate: float) -> None:
+    """Check that every IMU reads numbers all along samples (N, 3, 7, 3) at this rate [Hz], and does not stand still for a tenth
+    of a second while others do not.
+
+    Raises:
+        CalibrationError: one does not; the message names it, and when.
+    """
+    readings = samples[:, :2]
+    lost = ~np.isfinite(readings).all(axis=(1, 3))
+    same = (readings[1:] == readings[:-1]).all(axis=(1, 3))
+    same &= ~same.all(axis=1, keepdims=True)
+    reach = max(round(_FROZEN_S * rate), 3)
+    frozen = sliding_window_view(same, min(reach, len(same)), axis=0).all(axis=2)
+    faults = {"reads what is no number": np.atleast_2d(lost), "stands still while others do not": np.atleast_2d(frozen)}
+    for imu in range(IMU_COUNT):
+        for what, found in faults.items():
+            if found[:, imu].any():
+                first, whole = found[:, imu].argmax() / rate, found[:, imu].sum() / rate
+                raise CalibrationError(
+                    f"IMU {imu} {what} {first:.3g} s into a run, for {whole:.3g} s in all: check its cable and its supply"
+                )
+
+
+def check_spread(forces: Array) -> None:
+    """Check that rests are unlike enough, and that every leg takes part.
+
+    Args:
+        forces: (N, 7, 3), raw means at rest.
+
+    Raises:
+        CalibrationError: they are not, or one does not.
+    """
+    verticals = forces / np.linalg.norm(forces, axis=2, keepdims=True)
+    cosines = np.einsum("nki,mki->knm", verticals, verticals).min(axis=(1, 2))
+    spreads = np.arccos(np.clip(cosines, -1.0, 1.0))
+    if spreads.max() < LEAST_SPREAD:
+        raise CalibrationError(
+            f"the poses are too alike: between any two of {len(forces)} rests no IMU turns by more than "
+            f"{np.degrees(spreads.max()):.2g} deg; at least {np.degrees(LEAST_SPREAD):g} deg are needed: rest at wider poses"
+        )
+    least = LEAST_MOTION * float(np.median(spreads))
+    for imu in np.flatnonzero(spreads < least).tolist():
+        raise CalibrationError(
+            f"IMU {imu} turns by {np.degrees(spreads[imu]):.2g} deg between rests, and the others by "
+            f"{np.degrees(np.median(spreads)):.2g}; at least {np.degrees(least):.2g} are needed: {_idle(imu)}"
+        )
+
+
+def check_motion(rates: Array) -> None:
+    """Check that there is a motion in rates (N, 7, 3) [rad/s] without their zeros.
+
+    Raises:
+        CalibrationError: there is none.
+    """
+    most = float(np.sqrt(np.square(rates).sum(axis=2).mean(axis=0)).max())
+    if most < LEAST_RATE:
+        raise CalibrationError(
+            f"the rig hardly moves: no IMU turns at more than {np.degrees(most):.2g} deg/s RMS; at least "
+            f"{np.degrees(LEAST_RATE):g} are needed: record 'shaking' for 20 s or longer"
+        )
+
+
+def check_places(readings: Array, expected: Array) -> None:
+    """Check that each IMU reads what its place does along a planned motion, roughly.
+
+    Args:
+        readings: (N, 7, 6), raw, the rates without their zeros.
+        expected: (N, 7, 6), of ideal IMUs.
+
+    Raises:
+        CalibrationError: one or more do not; the message names each, and where it sits or how it is turned or wired, if that
+            explains its readings.
+    """
+    check_motion(expected[:, :, :3])
+    fit, everywhere = _Fit(readings, expected), range(IMU_COUNT)
+    best = [min(everywhere, key=lambda place, imu=imu: fit.left(imu, place)) for imu in everywhere]  # type: ignore[misc]
+    found, moved = [], [imu for imu in everywhere if best[imu] != imu and fit.is_better(imu, fit.left(imu, best[imu]))]
+    for imu in everywhere:
+        place = best[imu]
+        if imu not in moved or not fit.moves(imu):
+            found += _explained(fit, imu)
+        elif place in moved and best[place] == imu:
+            found += [f"IMUs {imu} and {place} are swapped: exchange their cables or numbers"] if imu < place else []
+        else:
+            found.append(f"IMU {imu} sits where IMU {place} should: put each on its own place")
+    if found:
+        raise CalibrationError("; ".join(found))
+
+
+def _idle(imu: int) -> str:
+    place = "the platform" if imu == PLATFORM_IMU else f"leg {imu}"
+    return f"{place} does not move, or the IMU is not fixed to it"
+
+
+def _explained(fit: "_Fit", imu: int) -> list[str]:
+    """What is wrong with an IMU on its own place."""
+    shares = [fit.share(imu, sensor) for sensor in range(2)]
+    if max(shares) < LEAST_MOTION:
+        return [
+            f"IMU {imu} reads {max(shares):.2g} of the motion that is expected, and at least {LEAST_MOTION:g} is needed: "
+            f"{_idle(imu)}"
+        ]
+    misfits = [[fit.misfit(imu, imu, sensor, each.matrix) for each in _axes()] for sensor in range(2)]
+    best = [_axes()[int(np.argmin(each))] for each in misfits]
+    wrong = [min(each) < FAR_BETTER * each[0] for each in misfits]
+    both = min(_axes(), key=lambda each: fit.left(imu, imu, each.matrix))
+    left = fit.left(imu, imu, both.matrix)
+    alike = FAR_BETTER * left < np.linalg.norm([min(each) for each in misfits])
+    # No mounting mirrors: a sensor that can do without is not blamed.
+    if fit.is_better(imu, left) and alike and (all(wrong) or both.turned):
+        return [f"IMU {imu} reads {both.text}: mount it as it should be, or change the axes of both its sensors"]
+    told = []
+    for sensor, name in enumerate(_SENSORS):
+        if wrong[sensor]:
+            told.append(f"the {name} of IMU {imu} reads {best[sensor].text}: change its axes")
+        elif shares[sensor] < LEAST_MOTION:
+            told.append(
+                f"the {name} of IMU {imu} reads {shares[sensor]:.2g} of the changes that are expected, and at least "
+                f"{LEAST_MOTION:g} is needed: it is dead, or its range or unit is another"
+            )
+    if not told and (tilt := fit.tilt(imu)) > MOST_TILT:
+        told.append(
+            f"gravity at IMU {imu} is {np.degrees(tilt):.3g} deg off what is expected; at most {np.degrees(MOST_TILT):g} "
+            "deg are allowed, and no axes explain it: check how it is mounted, and whether the rig begins at home"
+        )
+    return told
+
+
+class _Fit:
+    """How well readings (N, 7, 6) are explained by what is expected (N, 7, 6) of a place with axes of its own.
+
+    Trends are left out: with the loop open the platform sinks.
+    """
+
+    def __init__(self, readings: Array, expected: Array) -> None:
+        trends = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, len(readings)), 3))[0]
+
+        def changes(values: Array) -> Array:
+            flat = values.reshape(len(values), -1)
+            left: Array = (flat - trends @ (trends.T @ flat)).reshape(-1, IMU_COUNT, 2, 3)
+            return left
+
+        self._means = [each.mean(axis=0).reshape(IMU_COUNT, 2, 3) for each in (readings, expected)]
+        self._changes = [changes(each) for each in (readings, expected)]
+
+    def share(self, imu: int, sensor: int) -> float:
+        """How much changes in what a sensor reads, relative to what is expected."""
+        read, expected = (np.sqrt(np.square(each[:, imu, sensor]).mean()) for each in self._changes)
+        return float(read / expected)
+
+    def moves(self, imu: int) -> bool:
+        """Whether both sensors of an IMU read some motion."""
+        return min(self.share(imu, sensor) for sensor in range(2)) >= LEAST_MOTION
+
+    def tilt(self, imu: int) -> float:
+        """By how much gravity is off what is expected [rad]."""
+        read, expected = (each[imu, ACCELEROMETER] / np.linalg.norm(each[imu, ACCELEROMETER]) for each in self._means)
+        return float(np.arccos(np.clip(read @ expected, -1.0, 1.0)))
+
+    def misfit(self, imu: int, place: int, sensor: int, axes: Array) -> float:
+        """RMS of what is left of a sensor's changes, relative to what is expected of them, and of the mean of a force, relative
+        to what is allowed.
+        """
+        read, expected = self._changes[0][:, imu, sensor], self._changes[1][:, place, sensor]
+        changed = np.sqrt(np.square(read - expected @ axes.T).mean() / np.square(expected).mean())
+        mean, expected_mean = (each[at, sensor] for each, at in zip(self._means, (imu, place), strict=True))
+        off = np.linalg.norm(mean - axes @ expected_mean) / (MOST_TILT * STANDARD_GRAVITY) if sensor == ACCELEROMETER else 0.0
+        return float(np.hypot(changed, off))
+
+    def left(self, imu: int, place: int, axes: Array = _RIGHT) -> float:
+        """What is left of both sensors."""
+        return float(np.linalg.norm([self.misfit(imu, place, sensor, axes) for sensor in range(2)]))
+
+    def is_better(self, imu: int, left: float) -> bool:
+        """Whether that is far better than the right place with the right axes."""
+        return left < FAR_BETTER * self.left(imu, imu)
+
+
+@dataclass(frozen=True, eq=False)
+class _Axes:
+    """What an IMU reads for its x, y and z: in words, and as a matrix (3, 3)."""
+
+    text: str
+    matrix: Array
+
+    @property
+    def turned(self) -> bool:
+        """Whether a mounting can do that, which no mirroring does."""
+        return bool(np.linalg.det(self.matrix) > 0.0)
+
+
+@cache
+def _axes() -> list[_Axes]:
+    """All 48, those as they should be first."""
+    found = []
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        matrix: Array = np.array(signs)[:, None] * np.eye(3)[list(order)]
+        name = "".join(f"{'-' if sign < 0.0 else '+'}{'xyz'[axis]}" for sign, axis in zip(signs, order, strict=True))
+        found.append(_Axes(f"{name} for its x, y and z, {_words(matrix)}", matrix))
+    return found
+
+
+def _words(matrix: Array) -> str:
+    if np.linalg.det(matrix) > 0.0:
+        # What is turned reads the world turned the other way.
+        turn = vector_from_rotation(matrix.T)
+        angle, about = np.degrees(np.linalg.norm(turn)), turn / np.abs(turn).max(initial=1e-9)
+        names = "".join(f"{'-' if x < 0.0 else '+'}{name}" for name, x in zip("xyz", about, strict=True) if abs(x) > 0.5)
+        return f"as if turned by {angle:.0f} deg about {names}"
+    wrong = [name for name, value in zip("xyz", np.diag(matrix), strict=True) if value < 0.0]
+    if np.count_nonzero(np.diag(matrix)) < 3:
+        return "mirrored"
+    return "all signs wrong" if len(wrong) == 3 else f"the sign of {wrong[0]} wrong"

@@ -1,0 +1,214 @@
+"""Calibration of the IMUs: the paper's (37), `a_cal = T S (a_u + b)`, for every sensor, and the file that keeps it.
+
+Here `T S` is kept as one matrix, the gain, with the mounting in it, and `T S b` as the offset, so that a calibrated reading is
+gain @ raw + offset. A file gives for each IMU what one would write on its box, bias, scale, axes and mounting of each sensor:
+
+    gain = R(mounting) T(axes) diag(scale),  T = I + upper triangle (xy, xz, yz),  R that of a rotation vector
+"""
+
+import json
+import tomllib
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from controller.estimation.mechanism_filter import ERRORS
+from plant.dynamics.variables import IMU_COUNT
+from plant.errors import InputError
+from plant.files import write_whole
+from plant.mechanism import LEGS
+from plant.pose import Array, checked_array, rotation_from_vector, vector_from_rotation
+
+SENSORS = ("gyroscope", "accelerometer", "magnetometer")
+UNITS = ("rad/s", "m/s2", "uT")
+_FIELDS = ("bias", "scale", "axes", "mounting")
+_SIDES = ("base", "platform")
+_LEAST_MOVE_M = 1e-9
+_MOST_TILT = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Constants of the seven IMUs.
+
+    Attributes:
+        gain: (3, 7, 3, 3), by sensor (gyroscope, accelerometer, magnetometer) and IMU.
+        offset: (3, 7, 3) [rad/s, m/s^2, uT].
+        tilt: (2,) [rad], by which the vertical is turned about the axes x and y of {1}.
+        joints: (2, 6, 3) [m], what must be added to the mechanism's base and platform joints.
+        floor: (2,) [m, rad], standard deviations of position and rotation that tilt and joints leave.
+        covariance: (147, 147), of what errors are left, in the order of `controller.estimation.mechanism_filter.ERROR_NAMES`
+            for each IMU; None if it is not known.
+        about: what is worth knowing: date, residuals, where the data came from.
+    """
+
+    gain: Array = field(default_factory=lambda: np.tile(np.eye(3), (3, IMU_COUNT, 1, 1)))
+    offset: Array = field(default_factory=lambda: np.zeros((3, IMU_COUNT, 3)))
+    tilt: Array = field(default_factory=lambda: np.zeros(2))
+    joints: Array = field(default_factory=lambda: np.zeros((2, LEGS, 3)))
+    floor: Array = field(default_factory=lambda: np.zeros(2))
+    covariance: Array | None = None
+    about: dict[str, Any] = field(default_factory=dict)
+
+    def apply(self, measurements: Array) -> Array:
+        """Calibrated measurements (..., 3, 7, 3) of raw ones."""
+        calibrated: Array = (self.gain @ measurements[..., None])[..., 0] + self.offset
+        return calibrated
+
+    def then(self, gain: Array, offset: Array, **changes: Any) -> "Calibration":
+        """This calibration followed by another."""
+        whole = (gain @ self.offset[..., None])[..., 0] + offset
+        return replace(self, gain=gain @ self.gain, offset=whole, **changes)
+
+
+def split_gain(gain: Array) -> tuple[Array, Array, Array]:
+    """The scale (3,), axes (3,) and mounting (3,) [rad] of a gain (3, 3).
+
+    Raises:
+        InputError: the gain is singular, or mirrors the axes.
+    """
+    if not (np.isfinite(gain).all() and np.linalg.det(gain) > 0.0):
+        raise InputError("the gain of a sensor is singular or mirrors its axes, which no mounting does")
+    rotation, triangle = np.linalg.qr(gain)
+    signs = np.sign(np.diag(triangle))
+    rotation, triangle = rotation * signs, triangle * signs[:, None]
+    scale = np.diag(triangle).copy()
+    axes = (triangle / scale)[[0, 0, 1], [1, 2, 2]]
+    return scale, axes, vector_from_rotation(rotation)
+
+
+def join_gain(scale: Array, axes: Array, mounting: Array) -> Array:
+    """The gain (3, 3) of scale (3,), axes (3,) and mounting (3,) [rad]."""
+    triangle = np.eye(3)
+    triangle[[0, 0, 1], [1, 2, 2]] = axes
+    gain: Array = rotation_from_vector(mounting) @ triangle @ np.diag(scale)
+    return gain
+
+
+def load_calibration(path: Path | str) -> Calibration:
+    """Read a calibration file.
+
+    Raises:
+        InputError: there is no such file, or it is malformed; the message names the entry.
+    """
+    try:
+        document = tomllib.loads(Path(path).read_text())
+    except OSError as error:
+        raise InputError(f"the calibration {path} cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is no TOML file: {error}") from None
+    for name, table in document.items():
+        if not isinstance(table, dict):
+            raise InputError(f"{path}: {name} must be a table, got {table!r}")
+    calibration = Calibration(about=document.get("about", {}))
+    for name, table in document.items():
+        if name in ("about", "base", "joints", "covariance"):
+            continue
+        imu = name.removeprefix("imu_")
+        if not (name.startswith("imu_") and imu in map(str, range(IMU_COUNT))):
+            raise InputError(
+                f"{path}: no table {name!r} belongs in a calibration; imu_0 to imu_6, about, base, joints, covariance do"
+            )
+        for sensor, entries in table.items():
+            if sensor not in SENSORS:
+                raise InputError(f"{path}: {name} has no sensor {sensor!r}; it has {', '.join(SENSORS)}")
+            _read_sensor(calibration, SENSORS.index(sensor), int(imu), entries, f"{path}: {name}.{sensor}")
+    changes: dict[str, Any] = {}
+    for name, entries in (("base", ("tilt", "floor")), ("joints", _SIDES), ("covariance", ("sigmas", "factor"))):
+        if unknown := sorted(set(document.get(name, {})) - set(entries)):
+            raise InputError(f"{path}: {name} has no entry {unknown[0]!r}; it has {', '.join(entries)}")
+    if "base" in document:
+        changes["tilt"] = checked_array(document["base"].get("tilt", (0.0, 0.0)), (2,), f"{path}: base.tilt")
+        changes["floor"] = checked_array(document["base"].get("floor", (0.0, 0.0)), (2,), f"{path}: base.floor")
+        if np.abs(changes["tilt"]).max() > _MOST_TILT or (changes["floor"] < 0.0).any():
+            raise InputError(f"{path}: base.tilt must be within {_MOST_TILT:g} rad of level, and base.floor not negative")
+    if "joints" in document:
+        sides = [document["joints"].get(side, np.zeros((LEGS, 3))) for side in _SIDES]
+        moves = [checked_array(moved, (LEGS, 3), f"{path}: joints.{side}") for side, moved in zip(_SIDES, sides, strict=True)]
+        changes["joints"] = np.stack(moves)
+    if "covariance" in document:
+        changes["covariance"] = _read_covariance(document["covariance"], path)
+    return replace(calibration, **changes)
+
+
+def _read_sensor(calibration: Calibration, sensor: int, imu: int, entries: Any, where: str) -> None:
+    if not isinstance(entries, dict) or set(entries) - set(_FIELDS):
+        raise InputError(f"{where} must be a table of {', '.join(_FIELDS)}")
+    values: dict[str, Array] = {"bias": np.zeros(3), "scale": np.ones(3), "axes": np.zeros(3), "mounting": np.zeros(3)}
+    for entry, value in entries.items():
+        values[entry] = checked_array(value, (3,), f"{where}.{entry}")
+    if (values["scale"] <= 0.0).any():
+        raise InputError(f"{where}.scale is {values['scale'].tolist()}; it must be positive")
+    if np.abs(values["axes"]).max() > 1.0:
+        raise InputError(f"{where}.axes is {values['axes'].tolist()}; an axis is at most 1 off a right angle")
+    calibration.gain[sensor, imu] = join_gain(values["scale"], values["axes"], values["mounting"])
+    calibration.offset[sensor, imu] = calibration.gain[sensor, imu] @ values["bias"]
+
+
+def _read_covariance(table: dict[str, ArrayLike], path: Path | str) -> Array:
+    size = IMU_COUNT * ERRORS
+    sigmas = checked_array(table.get("sigmas", ()), (size,), f"{path}: covariance.sigmas")
+    rows = table.get("factor", ())
+    factor = np.zeros((size, size))
+    if not isinstance(rows, list) or len(rows) != size:
+        raise InputError(f"{path}: covariance.factor must have {size} rows")
+    for i, row in enumerate(rows):
+        factor[i, : i + 1] = checked_array(row, (i + 1,), f"{path}: covariance.factor[{i}]")
+    scaled = sigmas[:, None] * factor
+    covariance: Array = scaled @ scaled.T
+    return covariance
+
+
+def save_calibration(path: Path, calibration: Calibration) -> None:
+    """Write a calibration file.
+
+    Raises:
+        InputError: a gain that no sensor has.
+        OSError: it cannot be written.
+    """
+    lines = [
+        "# Calibration of the IMUs: 0 to 5 on the legs, 6 on the platform.",
+        "# calibrated = R(mounting) T(axes) S(scale) (raw + bias)",
+    ]
+    lines += ["", "[about]", *(f"{name} = {_toml(value)}" for name, value in calibration.about.items())]
+    lines += [
+        "",
+        "# By which the vertical is turned about x and y, in rad; what tilt and joints leave of the pose, in m and rad.",
+        "[base]",
+        f"tilt = {_toml(calibration.tilt.tolist())}",
+        f"floor = {_toml(calibration.floor.tolist())}",
+    ]
+    if np.abs(calibration.joints).max() >= _LEAST_MOVE_M:
+        lines += ["", "[joints]  # what must be added to their places, in m"]
+        lines += [f"{side} = {_toml(moves.tolist())}" for side, moves in zip(_SIDES, calibration.joints, strict=True)]
+    for imu in range(IMU_COUNT):
+        for sensor, name in enumerate(SENSORS):
+            gain, offset = calibration.gain[sensor, imu], calibration.offset[sensor, imu]
+            scale, axes, mounting = split_gain(gain)
+            values = {"bias": np.linalg.solve(gain, offset), "scale": scale, "axes": axes, "mounting": mounting}
+            lines += ["", f"[imu_{imu}.{name}]  # bias in {UNITS[sensor]}, mounting in rad"]
+            lines += [f"{entry} = {_toml(value.tolist())}" for entry, value in values.items()]
+    if calibration.covariance is not None:
+        sigmas = np.sqrt(np.diag(calibration.covariance))
+        # Positive definite whatever rounding has done to the correlation.
+        factor = np.linalg.cholesky(calibration.covariance / np.outer(sigmas, sigmas) + 1e-9 * np.eye(len(sigmas)))
+        lines += [
+            "",
+            "# Of the errors that are left: standard deviations, and the Cholesky factor of their correlation.",
+            "[covariance]",
+        ]
+        lines += [f"sigmas = {_toml(sigmas.tolist())}", "factor = ["]
+        lines += [f"    [{', '.join(f'{value:.6g}' for value in row[: i + 1])}]," for i, row in enumerate(factor)]
+        lines += ["]"]
+    write_whole(path, ("\n".join(lines) + "\n").encode())
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, list):
+        return f"[{', '.join(_toml(each) for each in value)}]"
+    return f"{value!r}".lower()

@@ -1,0 +1,327 @@
+"""Design of the PID gains from the linearised loop: plant, filters, kinematics and one controller per actuator.
+
+The plant is linearised at home, at rest under its load, by CasADi, with Coulomb friction that does not change sign: a
+moving leg, the less damped case. The estimator is linearised from the compiled cycle itself, its covariances settled.
+python-control makes the plant discrete and finds the margins of one actuator's loop with the other five closed.
+
+The rule: an integral time of 0.3 s, and the largest proportional gain at which the multivariable sensitivity peak stays
+at 2 with 65 deg of phase margin and 12 dB of gain margin.
+"""
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import casadi as ca
+import control
+import numpy as np
+
+from controller.cycle import STATE, check_rate, cycle_parameters
+from controller.estimation.fusion import calibrate, fuse_legs, fuse_platform, locate
+from controller.inverse_kinematics import leg_lengths
+from controller.settings import ControlSettings, control_settings, fusion_settings
+from plant.compiled import Record
+from plant.dynamics.spatial import build_dynamics
+from plant.dynamics.variables import INPUTS, PARAMETERS, STATES, VELOCITY
+from plant.errors import SingularConfigurationError
+from plant.imu import ACCELEROMETER, GYROSCOPE
+from plant.mechanism import LEGS, Mechanism
+from plant.pose import Array
+
+INTEGRAL_TIME_S = 0.3
+SENSITIVITY_LIMIT = 2.0
+PHASE_MARGIN_DEG, GAIN_MARGIN_DB = 65.0, 12.0
+_SETTLE_S = 10.0
+_SMALL_STEP = 1e-3
+_SIGNALS = 2 * 7 * 3
+
+
+@dataclass(frozen=True)
+class Margins:
+    """Stability of the loop of one actuator with the others closed, of the worst one, and of all six together.
+
+    Attributes:
+        gain_db: gain margin [dB].
+        phase_deg: phase margin [deg].
+        crossover_hz: where the loop gain falls below one, at the latest [Hz].
+        sensitivity_peak: greatest singular value of the sensitivity over frequency, all loops closed.
+        stable: whether all poles lie inside the unit circle.
+    """
+
+    gain_db: float
+    phase_deg: float
+    crossover_hz: float
+    sensitivity_peak: float
+    stable: bool
+
+    @property
+    def sound(self) -> bool:
+        """Whether the design rule holds."""
+        return (
+            self.stable
+            and self.sensitivity_peak <= SENSITIVITY_LIMIT
+            and self.phase_deg >= PHASE_MARGIN_DEG
+            and self.gain_db >= GAIN_MARGIN_DB
+        )
+
+
+@dataclass(frozen=True)
+class Design:
+    """Gains and the margins that they have, beside those of the preset's gains."""
+
+    rate: float
+    gains: ControlSettings
+    margins: Margins
+    preset: ControlSettings
+    preset_margins: Margins
+
+    def summary(self) -> dict[str, Any]:
+        """Everything, for JSON."""
+        figures = asdict(self)
+        for found in (figures["margins"], figures["preset_margins"]):
+            found["gain_db"] = found["gain_db"] if np.isfinite(found["gain_db"]) else None
+        return figures
+
+    def rows(self) -> list[tuple[str, str, str]]:
+        """Label, value and unit of each figure."""
+        rows = []
+        for name, gains, margins in (("designed", self.gains, self.margins), ("preset", self.preset, self.preset_margins)):
+            rows += [
+                (f"{name}: proportional", f"{gains.proportional:.1f}", "1/s"),
+                (f"{name}: integral", f"{gains.integral:.1f}", "1/s2"),
+                (f"{name}: derivative", f"{gains.derivative:g}", "-"),
+                (f"{name}: gain margin", f"{margins.gain_db:.1f}", "dB"),
+                (f"{name}: phase margin", f"{margins.phase_deg:.1f}", "deg"),
+                (f"{name}: crossover", f"{margins.crossover_hz:.2f}", "Hz"),
+                (f"{name}: sensitivity peak, all loops", f"{margins.sensitivity_peak:.2f}", "-"),
+            ]
+        return rows
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """A discrete linear system x+ = A x + B u, y = C x + D u."""
+
+    a: Array
+    b: Array
+    c: Array
+    d: Array
+
+
+def tune(mechanism: Mechanism, rate: float) -> Design:
+    """Design the gains for cycles of 1 / `rate`.
+
+    Raises:
+        SingularConfigurationError: no gains have the margins asked for.
+        InputError: the mechanism lacks data.
+    """
+    check_rate(rate)
+    loop = open_loop(mechanism, rate)
+    response = frequency_response(loop, rate)
+    preset = control_settings(mechanism)
+
+    def with_proportional(proportional: float) -> ControlSettings:
+        return replace(preset, proportional=proportional, integral=proportional / INTEGRAL_TIME_S, derivative=0.0)
+
+    # Small gains are not sound either, because the integral time is fixed: look from above.
+    steps = np.geomspace(0.5 * rate, 1.0, 40)
+    sound = [margins(loop, response, with_proportional(float(step)), rate).sound for step in steps]
+    if True not in sound:
+        raise SingularConfigurationError(f"no gains have these margins at {rate:g} Hz: raise the rate")
+    low, high = float(steps[sound.index(True)]), float(steps[max(sound.index(True) - 1, 0)])
+    while high / low > 1.002:
+        middle = float(np.sqrt(low * high))
+        low, high = (middle, high) if margins(loop, response, with_proportional(middle), rate).sound else (low, middle)
+    gains = with_proportional(round(low, 1))
+    return Design(rate, gains, margins(loop, response, gains, rate), preset, margins(loop, response, preset, rate))
+
+
+def open_loop(mechanism: Mechanism, rate: float) -> Linear:
+    """From the six velocity commands [m/s] to the six estimated lengths [m], plant and estimator in series."""
+    plant, signals = linear_plant(mechanism, rate)
+    estimator = linear_estimator(mechanism, rate, signals)
+    return Linear(
+        a=np.block([[plant.a, np.zeros((len(plant.a), len(estimator.a)))], [estimator.b @ plant.c, estimator.a]]),
+        b=np.vstack([plant.b, np.zeros((len(estimator.a), LEGS))]),
+        c=np.hstack([estimator.d @ plant.c, estimator.c]),
+        d=np.zeros((LEGS, LEGS)),
+    )
+
+
+def linear_plant(mechanism: Mechanism, rate: float) -> tuple[Linear, Array]:
+    """The plant at home under its load, from velocity commands to ideal IMU signals (42,), and those signals there.
+
+    The signals are angular velocities of the seven IMUs, then specific forces. The attitude's state is a rotation vector.
+    """
+    values = mechanism.plant_parameters()
+    friction = {"friction.coulomb": np.zeros(LEGS)}
+    flat = np.concatenate([np.ravel((values | friction)[variable.name]) for variable in PARAMETERS])
+    dynamics = build_dynamics()
+    constants = dynamics.constants(flat)
+    x = np.concatenate(
+        [np.concatenate([values["initial_position"], values["initial_quaternion"]]), np.zeros(sum(v.size for v in STATES) - 7)]
+    )
+    u = np.zeros(sum(variable.size for variable in INPUTS))
+    u[_slice(INPUTS, "drive_mode")] = VELOCITY
+    x[_slice(STATES, "state.current")], u[_slice(INPUTS, "velocity_command")] = _equilibrium(dynamics.rates, x, u, constants)
+
+    states, inputs = ca.SX.sym("x", len(x)), ca.SX.sym("u", len(u))
+    symbols = [states, inputs]
+    point = (x, u)
+    rates = dynamics.rates(states, inputs, constants)
+    signals = dynamics.outputs(states, inputs, constants)[:_SIGNALS]
+    a, b, c = (
+        np.array(ca.Function("jacobian", symbols, [ca.jacobian(of, by)])(*point))
+        for of, by in ((rates, states), (rates, inputs), (signals, states))
+    )
+    reduce = _reduction(values["initial_quaternion"])
+    expand = np.linalg.pinv(reduce)
+    continuous = control.ss(
+        reduce @ a @ expand, reduce @ b[:, _slice(INPUTS, "velocity_command")], c @ expand, np.zeros((_SIGNALS, LEGS))
+    )
+    discrete = control.sample_system(continuous, 1.0 / rate, method="zoh")
+    at_rest = np.array(dynamics.outputs(x, u, constants)[:_SIGNALS]).ravel()
+    return Linear(discrete.A, discrete.B, discrete.C, discrete.D), at_rest
+
+
+def _slice(variables: Any, name: str) -> slice:
+    at = 0
+    for variable in variables:
+        if variable.name == name:
+            return slice(at, at + variable.size)
+        at += variable.size
+    raise KeyError(name)
+
+
+def _equilibrium(rates: Any, x: Array, u: Array, constants: Any) -> tuple[Array, Array]:
+    """Currents and commands at which nothing accelerates; both enter linearly, as long as the drives do not saturate."""
+    current, command = _slice(STATES, "state.current"), _slice(INPUTS, "velocity_command")
+    acceleration = slice(_slice(STATES, "state.velocity").start, _slice(STATES, "state.angular_velocity").stop)
+
+    def column(vector: Array, where: slice, rows: slice) -> tuple[Array, Array]:
+        base = np.array(rates(x, u, constants)).ravel()[rows]
+        columns = []
+        for k in range(LEGS):
+            vector[where.start + k] += _SMALL_STEP
+            columns.append((np.array(rates(x, u, constants)).ravel()[rows] - base) / _SMALL_STEP)
+            vector[where.start + k] -= _SMALL_STEP
+        return base, np.stack(columns, axis=1)
+
+    base, slope = column(x, current, acceleration)
+    x[current] = -np.linalg.solve(slope, base)
+    base, slope = column(u, command, current)
+    u[command] = -np.linalg.solve(slope, base)
+    return x[current], u[command]
+
+
+def _reduction(quaternion: Array) -> Array:
+    """The map (18, n) from the plant's states, less the brakes' deflections, to those with a rotation vector in {1}."""
+    w, x, y, z = quaternion
+    from_rotation = 0.5 * np.array([[-x, -y, -z], [w, z, -y], [-z, w, x], [y, -x, w]])
+    size = sum(variable.size for variable in STATES)
+    attitude = _slice(STATES, "state.quaternion")
+    kept = [i for i in range(_slice(STATES, "state.brake_deflection").start) if not attitude.start <= i < attitude.stop]
+    reduce = np.zeros((len(kept) + 3, size))
+    for row, i in enumerate(kept):
+        reduce[row, i] = 1.0
+    reduce[len(kept) :, attitude] = np.linalg.pinv(from_rotation)
+    return reduce
+
+
+_ESTIMATOR_STATE = ("leg_x", "platform_x", "smooth_twist", "acceleration")
+
+
+def linear_estimator(mechanism: Mechanism, rate: float, signals: Array) -> Linear:
+    """The estimator, from IMU signals (42,) to the six lengths [m], with settled covariances."""
+    parameters = cycle_parameters(mechanism, rate, control_settings(mechanism), fusion_settings(mechanism))
+    measurement = np.zeros((3, 7, 3))
+    settled: Record = np.zeros((), STATE)
+
+    def step(state: Record, sample: Array) -> None:
+        measurement[GYROSCOPE], measurement[ACCELEROMETER] = sample.reshape(2, 7, 3)
+        calibrate(parameters, state, measurement)
+        fuse_legs(parameters, state)
+        fuse_platform(parameters, state)
+        locate(parameters, state)
+        state["cycle"] += 1
+
+    def flat(state: Record) -> Array:
+        return np.concatenate([np.ravel(state[name]) for name in _ESTIMATOR_STATE])
+
+    for _ in range(round(_SETTLE_S * rate)):
+        step(settled, signals)
+    size = len(flat(settled))
+
+    def response(change: Array, sample: Array) -> tuple[Array, Array]:
+        state = settled.copy()
+        at = 0
+        for name in _ESTIMATOR_STATE:
+            count = state[name].size
+            state[name] += change[at : at + count].reshape(state[name].shape)
+            at += count
+        step(state, signals + sample)
+        lengths = leg_lengths(mechanism, state["position"], state["rotation"])
+        return flat(state), lengths
+
+    def derivative(count: int, along_state: bool) -> tuple[Array, Array]:
+        columns_x, columns_y = [], []
+        for i in range(count):
+            ends = []
+            for sign in (1.0, -1.0):
+                change, sample = np.zeros(size), np.zeros(_SIGNALS)
+                (change if along_state else sample)[i] = sign * 1e-6
+                ends.append(response(change, sample))
+            columns_x.append((ends[0][0] - ends[1][0]) / 2e-6)
+            columns_y.append((ends[0][1] - ends[1][1]) / 2e-6)
+        return np.stack(columns_x, axis=1), np.stack(columns_y, axis=1)
+
+    a, c = derivative(size, True)
+    b, d = derivative(_SIGNALS, False)
+    return Linear(a, b, c, d)
+
+
+def frequency_response(loop: Linear, rate: float) -> tuple[Array, Any]:
+    """Frequencies (F,) [Hz] up to half the rate, and the response (F, 6, 6) of a discrete system there."""
+    frequencies = np.geomspace(0.05, 0.499 * rate, 800)
+    identity = np.eye(len(loop.a))
+    response = [loop.c @ np.linalg.solve(z * identity - loop.a, loop.b) for z in np.exp(2j * np.pi * frequencies / rate)]
+    return frequencies, np.array(response)
+
+
+def margins(loop: Linear, response: tuple[Array, Any], gains: ControlSettings, rate: float) -> Margins:
+    """Margins of the loop closed by six PID controllers; the low-pass of their derivative is left out.
+
+    Args:
+        loop: from commands to estimated lengths.
+        response: of `loop`, from `frequency_response`.
+        gains: of the controllers.
+        rate: cycles per second [Hz].
+    """
+    n, period = len(loop.a), 1.0 / rate
+    # Two further states per actuator close the loop: the integral of the error, and the error before.
+    a = np.block(
+        [
+            [loop.a, np.zeros((n, 2 * LEGS))],
+            [period * loop.c, np.eye(LEGS), np.zeros((LEGS, LEGS))],
+            [loop.c, np.zeros((LEGS, 2 * LEGS))],
+        ]
+    )
+    b = np.vstack([loop.b, np.zeros((2 * LEGS, LEGS))])
+    slope = gains.derivative * rate
+    c = np.hstack([(gains.proportional + slope) * loop.c, gains.integral * np.eye(LEGS), -slope * np.eye(LEGS)])
+    # The bias of a gyroscope that nothing sees neither decays nor matters: its pole stays at one.
+    stable = bool(np.abs(np.linalg.eigvals(a - b @ c)).max() < 1.0 + 1e-6)
+
+    frequencies, plant = response
+    z = np.exp(2j * np.pi * frequencies / rate)
+    controller = gains.proportional + gains.integral * period / (z - 1.0) + slope * (1.0 - 1.0 / z)
+    sensitivity = np.linalg.inv(np.eye(LEGS) + controller[:, None, None] * plant)
+    # With the other five closed, 1 + L of an actuator is the inverse of its own sensitivity.
+    singles = (control.FRD(1.0 / sensitivity[:, k, k] - 1.0, 2.0 * np.pi * frequencies) for k in range(LEGS))
+    gain_margins, phase_margins, _, _, crossovers, _ = zip(*map(control.stability_margins, singles), strict=True)
+    return Margins(
+        gain_db=float(20.0 * np.log10(min(gain_margins))),
+        phase_deg=float(min(phase_margins)),
+        crossover_hz=float(max(crossovers) / (2.0 * np.pi)),
+        sensitivity_peak=float(np.linalg.norm(sensitivity, 2, axis=(1, 2)).max()),
+        stable=stable,
+    )

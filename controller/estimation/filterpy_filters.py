@@ -1,0 +1,173 @@
+"""The filters of legs and platform on filterpy's ExtendedKalmanFilter: the slow clear twins of `leg_filter` and
+`platform_filter`, selectable for the whole loop.
+
+They are written with vectors, and the Jacobian of a leg's measurement follows the product rule, term by term, so that they
+share no line with the compiled filters.
+"""
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+
+from controller.estimation.platform_filter import INNOVATION_LIMIT
+from plant.pose import Array, skew
+
+STATES = 9
+PLATFORM_STATES = 6
+
+
+class _Filterpy:
+    """State and covariance of a filter of filterpy.
+
+    Args:
+        states, readings: how many there are of each.
+    """
+
+    def __init__(self, states: int, readings: int) -> None:
+        self.filter = ExtendedKalmanFilter(dim_x=states, dim_z=readings)
+
+    def start(self, x: Array, covariance: Array) -> None:
+        """Take over state (n,) and covariance (n, n)."""
+        self.filter.x = x.reshape(-1, 1).copy()
+        self.filter.P = covariance.copy()
+
+    @property
+    def state(self) -> Array:
+        """The state (n,)."""
+        state: Array = self.filter.x[:, 0]
+        return state
+
+    @property
+    def covariance(self) -> Array:
+        """The covariance (n, n)."""
+        covariance: Array = self.filter.P
+        return covariance
+
+
+class FilterpyLeg(_Filterpy):
+    """One leg's filter on filterpy; the state is that of `leg_filter`.
+
+    Args:
+        up_in_joint: (3,), the vertical in the joint frame.
+        imu_position: (3,) [m], in the leg frame.
+        gravity: [m/s^2].
+        period: [s].
+        jerk, bias_walk: spectral densities of the angles' jerk and of the gyroscope's bias.
+        rate_variance, force_variance: of the gyroscope [(rad/s)^2] and the accelerometer [(m/s^2)^2].
+    """
+
+    def __init__(
+        self,
+        up_in_joint: Array,
+        imu_position: Array,
+        gravity: float,
+        period: float,
+        jerk: float,
+        bias_walk: float,
+        rate_variance: float,
+        force_variance: float,
+    ) -> None:
+        super().__init__(STATES, readings=6)
+        self.up_in_joint, self.imu_position, self.gravity = up_in_joint, imu_position, gravity
+        pair = np.array([[1.0, period, period**2 / 2], [0.0, 1.0, period], [0.0, 0.0, 1.0]])
+        self.filter.F = np.eye(STATES)
+        self.filter.F[:6, :6] = np.kron(pair, np.eye(2))
+        noise = jerk * np.array(
+            [
+                [period**5 / 20, period**4 / 8, period**3 / 6],
+                [period**4 / 8, period**3 / 3, period**2 / 2],
+                [period**3 / 6, period**2 / 2, period],
+            ]
+        )
+        self.filter.Q = np.diag([0.0] * 6 + [bias_walk * period] * 3)
+        self.filter.Q[:6, :6] += np.kron(noise, np.eye(2))
+        self.filter.R = np.diag([rate_variance] * 3 + [force_variance] * 3)
+
+    def step(self, gyroscope: Array, accelerometer: Array) -> None:
+        """Predict over one period and take a sample [rad/s, m/s^2]."""
+        self.filter.predict()
+        self.update(gyroscope, accelerometer)
+
+    def update(self, gyroscope: Array, accelerometer: Array) -> None:
+        """Take a sample [rad/s, m/s^2] without predicting."""
+        sample = np.concatenate([gyroscope, accelerometer]).reshape(6, 1)
+        self.filter.update(sample, self.measurement_jacobian, self.measurement)
+
+    def measurement(self, x: Array) -> Array:
+        """Expected rate and force (6, 1) at a state (9, 1)."""
+        omega, alpha, up, *_ = self._motion(x[:, 0])
+        d = self.imu_position
+        force = self.gravity * up + np.cross(alpha, d) + np.cross(omega, np.cross(omega, d))
+        return np.concatenate([omega + x[6:, 0], force]).reshape(6, 1)
+
+    def measurement_jacobian(self, x: Array) -> Array:
+        """Derivative (6, 9) of `measurement`."""
+        omega, _, _, omega_x, alpha_x, up_x = self._motion(x[:, 0])
+        d = self.imu_position
+        centripetal = -skew(np.cross(omega, d)) - skew(omega) @ skew(d)
+        jacobian = np.zeros((6, STATES))
+        jacobian[:3] = omega_x
+        jacobian[:3, 6:] += np.eye(3)
+        jacobian[3:] = self.gravity * up_x - skew(d) @ alpha_x + centripetal @ omega_x
+        return jacobian
+
+    def _motion(self, x: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
+        """Rate, angular acceleration and vertical in the leg frame, and their derivatives (3, 9)."""
+        a, b, da, db, dda, ddb = x[:6]
+        turn_a = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(a), -np.sin(a)], [0.0, np.sin(a), np.cos(a)]])
+        turn_b = np.array([[np.cos(b), 0.0, np.sin(b)], [0.0, 1.0, 0.0], [-np.sin(b), 0.0, np.cos(b)]])
+        turn_a_a = turn_a @ skew(np.array([1.0, 0.0, 0.0]))
+        turn_b_b = turn_b @ skew(np.array([0.0, 1.0, 0.0]))
+        # The first axis seen in the leg frame, and its derivatives with respect to b.
+        axis = np.array([np.cos(b), 0.0, np.sin(b)])
+        axis_b = np.array([-np.sin(b), 0.0, np.cos(b)])
+        second = np.array([0.0, 1.0, 0.0])
+        omega = da * axis + db * second
+        alpha = dda * axis + da * db * axis_b + ddb * second
+        up = turn_b.T @ turn_a.T @ self.up_in_joint
+        omega_x, alpha_x, up_x = np.zeros((3, STATES)), np.zeros((3, STATES)), np.zeros((3, STATES))
+        omega_x[:, 1], omega_x[:, 2], omega_x[:, 3] = da * axis_b, axis, second
+        alpha_x[:, 1] = dda * axis_b - da * db * axis
+        alpha_x[:, 2], alpha_x[:, 3], alpha_x[:, 4], alpha_x[:, 5] = db * axis_b, da * axis_b, axis, second
+        up_x[:, 0] = turn_b.T @ turn_a_a.T @ self.up_in_joint
+        up_x[:, 1] = turn_b_b.T @ turn_a.T @ self.up_in_joint
+        return omega, alpha, up, omega_x, alpha_x, up_x
+
+
+class FilterpyPlatform(_Filterpy):
+    """The platform's filter on filterpy; the state is that of `platform_filter`.
+
+    Args:
+        gravity: [m/s^2].
+        period: [s].
+        rate_density, bias_walk: spectral densities of the gyroscope's noise and of its bias.
+        vertical_variance: of each component of the accelerometer's reading over g.
+    """
+
+    def __init__(self, gravity: float, period: float, rate_density: float, bias_walk: float, vertical_variance: float) -> None:
+        super().__init__(PLATFORM_STATES, readings=1)
+        self.gravity, self.period = gravity, period
+        self.filter.Q = period * np.diag([rate_density] * 3 + [bias_walk] * 3)
+        self.filter.R = np.array([[vertical_variance]])
+
+    def step(self, gyroscope: Array, accelerometer: Array, acceleration: Array) -> None:
+        """Predict over one period and take a sample [rad/s, m/s^2], without the IMU's own acceleration (3,) in {2}."""
+        self._predict(gyroscope)
+        for axis, reading in zip(np.eye(3, PLATFORM_STATES), (accelerometer - acceleration) / self.gravity, strict=True):
+            jacobian = axis[None]
+            self.filter.update(reading, lambda x, h: h, lambda x, h: h @ x, args=jacobian, hx_args=jacobian, residual=self._cut)
+        self.filter.x[:3] /= np.linalg.norm(self.filter.x[:3])
+
+    def _predict(self, gyroscope: Array) -> None:
+        """`u' = u x (rate - bias)`: the state to second order, its covariance to first."""
+        t, u, bias = self.period, self.state[:3], self.state[3:]
+        turn = -t * skew(gyroscope - bias)
+        turned = (np.eye(3) + turn + turn @ turn / 2.0) @ u
+        self.filter.F = np.eye(PLATFORM_STATES)
+        self.filter.F[:3] += np.hstack([turn, -t * skew(u)])
+        self.filter.predict()
+        self.filter.x = np.concatenate([turned, bias]).reshape(-1, 1)
+
+    def _cut(self, reading: Array, expected: Array) -> Array:
+        """The innovation, within `INNOVATION_LIMIT` standard deviations."""
+        bound = INNOVATION_LIMIT * np.sqrt(self.filter.S)
+        return np.clip(reading - expected, -bound, bound)

@@ -1,0 +1,185 @@
+"""A streamed reference: plans that one process makes while the loop of another follows them, and why a stream has failed.
+
+The two share one record () of dtype `STREAM`, and neither ever waits for the other. A plan begins at a time in the future,
+exactly in the state that the plan before it has then. The loop takes it only if that time has not gone by and if it follows
+the plan before, and says what has become of it; so whatever is late or lost, the reference is continuous. Every plan ends at
+rest.
+"""
+
+import numpy as np
+
+from controller.planning.segments import LENGTH, START
+from controller.safety.watch import NO_CAUSE, TARGET_LOST
+from plant.compiled import Record, fence, kernel, load_acquire, store_release
+from plant.mechanism import LEGS
+from plant.pose import Array
+
+PLAN_SEGMENTS = 24
+"""Rows of a plan for each leg: ten of ruckig's, a moment at constant speed, a stop of four, and room."""
+
+FOLLOWED_SEGMENTS = 2 * PLAN_SEGMENTS
+"""Rows of the array that the cycle follows: what is left of the plan before, and the new one."""
+
+CYCLE, LATEST, SEEN, TAKEN, CAUSE, SAMPLE_NS, DONE = range(7)
+"""Places in `shared`: cycles since the motion began, the number
+of the latest plan, of the last one that the loop has looked at and of the one that it follows, why the stream has failed,
+when the last sample came [ns of CLOCK_MONOTONIC, 0 before the first], and whether the planner's process shall end."""
+
+STREAM = np.dtype(
+    [
+        ("shared", np.int64, 8),
+        ("guards", np.int64, 2),
+        ("bases", np.int64, 2),
+        ("begins", np.float64, 2),
+        ("plans", np.float64, (2, LEGS, PLAN_SEGMENTS, 5)),
+        ("index", np.int64),
+        ("value", np.float64),
+        ("limit", np.float64),
+        ("accepted", np.int64),
+        ("malformed", np.int64),
+        ("stale", np.int64),
+        ("strange", np.int64),
+        ("planned", np.int64),
+        ("late", np.int64),
+    ],
+    align=True,
+)
+"""What planner and loop share. `shared` as above: the loop writes `CYCLE`, `SEEN` and `TAKEN`, the planner the others, and
+whoever ends it `DONE`. Plans lie in two slots by turns: which one is in it (0 while it is written), the plan that it follows,
+when it begins [s], and its segments. Then leg, value and limit of the failure; and the planner's counts: samples accepted;
+datagrams that were malformed, came late or twice, or from another sender; plans made, and those that the loop could not take
+in time.
+"""
+
+TAKER = np.dtype([("seen", np.int64), ("taken", np.int64), ("plan", np.float64, (LEGS, PLAN_SEGMENTS, 5))], align=True)
+"""The loop's own side of a stream: the last plan that it has looked at, the one that it follows, and scratch."""
+
+
+def rest(lengths: Array, rows: int = FOLLOWED_SEGMENTS) -> Array:
+    """Segments (6, rows, 5) that stay at lengths (6,) [m] for ever: what a stream begins with."""
+    segments = np.zeros((LEGS, rows, 5))
+    segments[:, 1:, START] = np.inf
+    segments[:, 0, LENGTH] = lengths
+    return segments
+
+
+@kernel
+def publish_plan(stream: Record, plan: Array, begin: float, base: int) -> int:
+    """Let the loop see a plan (6, 24, 5) that begins at `begin` [s] and follows plan `base`; returns its number."""
+    s = stream[()]
+    number = load_acquire(s.shared, LATEST) + 1
+    slot = number % 2
+    store_release(s.guards, slot, 0)
+    fence()
+    s.plans[slot, :, :, :] = plan
+    s.begins[slot] = begin
+    s.bases[slot] = base
+    store_release(s.guards, slot, number)
+    store_release(s.shared, LATEST, number)
+    return int(number)
+
+
+@kernel
+def take_plan(stream: Record, taker: Record, cycle: int, period: float, segments: Array, index: Array) -> bool:
+    """Take over the latest plan, if there is a new one that can still be taken, without ever waiting.
+
+    Args:
+        stream: dtype `STREAM`.
+        taker: dtype `TAKER`.
+        cycle: of the motion, whose reference is evaluated next.
+        period: of a cycle [s].
+        segments: (6, n, 5), what the cycle follows; the new plan is put after what is left of the one before.
+        index: (6,), the cycle's place in the segments.
+
+    Returns:
+        Whether a plan was taken.
+    """
+    s, t = stream[()], taker[()]
+    store_release(s.shared, CYCLE, cycle)
+    latest = load_acquire(s.shared, LATEST)
+    if latest == t.seen:
+        return False
+    slot = latest % 2
+    if load_acquire(s.guards, slot) != latest:
+        return False
+    begin, base = s.begins[slot], s.bases[slot]
+    t.plan[:, :, :] = s.plans[slot]
+    fence()
+    if load_acquire(s.guards, slot) != latest:
+        return False
+    t.seen = latest
+    taken = base == t.taken and begin >= cycle * period and _append(t.plan, begin, segments, index)
+    if taken:
+        t.taken = latest
+        store_release(s.shared, TAKEN, latest)
+    store_release(s.shared, SEEN, latest)
+    return taken
+
+
+@kernel
+def _append(plan: Array, begin: float, segments: Array, index: Array) -> bool:
+    """Put a plan in the place of what the segments have after its begin; false, and nothing done, if there is no room."""
+    rows = segments.shape[1]
+    for leg in range(LEGS):
+        if _kept(segments[leg], begin, index[leg]) + _used(plan[leg]) > rows:
+            return False
+    for leg in range(LEGS):
+        kept, used, first = _kept(segments[leg], begin, index[leg]), _used(plan[leg]), index[leg]
+        for row in range(rows):
+            for column in range(5):
+                if row < kept:
+                    segments[leg, row, column] = segments[leg, first + row, column]
+                elif row < kept + used:
+                    segments[leg, row, column] = plan[leg, row - kept, column]
+                else:
+                    segments[leg, row, column] = np.inf if column == START else 0.0
+        index[leg] = 0
+    return True
+
+
+@kernel
+def _kept(rows: Array, begin: float, first: int) -> int:
+    """How many rows (n, 5) from the present one on start before a time."""
+    last = first
+    while last < rows.shape[0] and rows[last, START] < begin:
+        last += 1
+    return int(last - first)
+
+
+@kernel
+def _used(rows: Array) -> int:
+    used = 0
+    while used < rows.shape[0] and rows[used, START] < np.inf:
+        used += 1
+    return used
+
+
+@kernel
+def fail_stream(stream: Record, cause: int, index: int, value: float, limit: float) -> None:
+    """Say why the stream has failed, a cause of `controller.safety.watch`; the first one counts."""
+    s = stream[()]
+    if load_acquire(s.shared, CAUSE) == NO_CAUSE:
+        s.index, s.value, s.limit = index, value, limit
+        store_release(s.shared, CAUSE, cause)
+
+
+@kernel
+def note_sample(stream: Record, time_ns: int) -> None:
+    """Say when the last sample came [ns of CLOCK_MONOTONIC]."""
+    store_release(stream[()].shared, SAMPLE_NS, time_ns)
+
+
+@kernel
+def stream_cause(stream: Record, now_ns: int, patience_ns: int) -> tuple[int, int, float, float]:
+    """Why the stream has failed: cause, leg, value and limit; `NO_CAUSE` as long as it has not.
+
+    It is lost when no sample has come for longer than the patience; before the first it cannot be.
+    """
+    s = stream[()]
+    cause = load_acquire(s.shared, CAUSE)
+    if cause != NO_CAUSE:
+        return cause, s.index, s.value, s.limit
+    last = load_acquire(s.shared, SAMPLE_NS)
+    if last != 0 and now_ns - last > patience_ns:
+        return TARGET_LOST, 0, 1e-9 * (now_ns - last), 1e-9 * patience_ns
+    return NO_CAUSE, 0, np.nan, np.nan

@@ -1,0 +1,396 @@
+"""Benchmarks of the loop on the clock: how late it wakes, beside cyclictest, and how long it computes, idle and under load.
+
+Short slices of three loops take turns, so that all meet the same machine: ours, cyclictest, and a bare compiled loop that does
+nothing but compute for as long as ours. What the machine does to every loop alike shows in all.
+"""
+
+import contextlib
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controller.safety.watch import CAUSES, STOP
+from hil.loop.driver import HEAD, RECORD, prevent_compilation, shared_array
+from hil.loop.timing import QUANTILES, Histogram, Timing, over_budget
+from hil.realtime.clock import REAL, finish, new_clock, now, start, wait
+from hil.realtime.scheduling import MEASURES, RealTimeSettings, real_time, usage
+from hil.runs.simulation import PreparedLoop, SimulationConfig, prepared_loop
+from plant.compiled import Record, kernel
+from plant.errors import GoughError
+
+IDLE, LOAD, BUSY = "idle", "load", "busy_supervisor"
+CONDITIONS = (IDLE, LOAD, BUSY)
+"""Nothing else to do; stress-ng on every processor; and a Python thread of the supervising process that never rests."""
+
+_SLICE_S = 2.0
+_BARE_SHARE = 0.25
+_BUSY_SHARE = 0.25
+_LONGEST_US = 20_000
+_ENDLESS = np.iinfo(np.int64).max
+_FORK = multiprocessing.get_context("fork")
+
+
+def measure_real_time(seconds: dict[float, float], progress: Callable[[float], None] = lambda share: None) -> dict[str, Any]:
+    """Time loops on the clock.
+
+    Args:
+        seconds: how long for each rate [Hz], pooled over slices, idle and again under load.
+        progress: called with the share that is done.
+
+    Returns:
+        By rate and condition: `compute_us`, `latency_us`, `wake_us`, `cyclictest_us` (None without cyclictest), `bare_us` (the
+        bare loop's computing) and `bare_wake_us`, each with p50, p99, p999, max and n; `stages_us`, and what of all these is
+        `over_budget`; `missed_own` and `missed_host` periods; `usage` of the loop's thread; `histograms`. And what is
+        `refused`, and `missing` on this machine.
+
+    Raises:
+        GoughError: the loop stopped for another cause than the end of its slice.
+    """
+    settings = RealTimeSettings()
+    missing = [name for name in ("cyclictest", "stress-ng") if shutil.which(name) is None]
+    with real_time(settings) as refused:
+        pass
+    conditions = [each for each in CONDITIONS if each != LOAD or "stress-ng" not in missing]
+    shares = {condition: _BUSY_SHARE if condition == BUSY else 1.0 for condition in conditions}
+    whole, done = sum(shares.values()) * sum(seconds.values()), 0.0
+    rates: dict[str, Any] = {}
+    for rate, duration in seconds.items():
+        bench = _Bench(rate, settings, cyclictest="cyclictest" not in missing)
+        rates[f"{rate:g}"] = {}
+        for condition in conditions:
+            pooled = _Pool()
+            slices = max(1, round(duration * shares[condition] / _SLICE_S))
+            with _circumstances(condition):
+                for _ in range(slices):
+                    bench.add_slice(pooled, busy=condition == BUSY)
+                    done += _SLICE_S
+                    progress(min(done / whole, 1.0))
+            rates[f"{rate:g}"][condition] = pooled.figures()
+    return {"rates": rates, "refused": refused, "missing": missing, "slice_s": _SLICE_S}
+
+
+def measure_measures(seconds: float, progress: Callable[[float], None] = lambda share: None) -> dict[str, Any]:
+    """What each measure of `hil.realtime.scheduling` is good for: the loop at 1 kHz with all, without each, and without any.
+
+    Args:
+        seconds: how long for each, idle and again under load.
+        progress: called with the share that is done.
+
+    Returns:
+        By what is left out, "nothing" and "all" included, and condition: `wake_us` and `compute_us` with p50, p99, p999, max
+        and n, periods missed, and `minor_faults` of the loop's thread.
+    """
+    conditions = [IDLE] if shutil.which("stress-ng") is None else [IDLE, LOAD]
+    cases = {"nothing": (), **{measure: (measure,) for measure in MEASURES}, "all": MEASURES}
+    slices = max(1, round(seconds / _SLICE_S))
+    pools = {case: {condition: _Pool() for condition in conditions} for case in cases}
+    benches = {case: _Bench(1000.0, RealTimeSettings(without=left_out), False) for case, left_out in cases.items()}
+    done, whole = 0, slices * len(cases) * len(conditions)
+    for condition in conditions:
+        with _circumstances(condition):
+            # In turn, so that all meet the same machine.
+            for _ in range(slices):
+                for case, bench in benches.items():
+                    bench.add_slice(pools[case][condition], busy=False, bare=False)
+                    done += 1
+                    progress(done / whole)
+    return {
+        case: {
+            condition: {
+                "wake_us": pool.timing.histograms["wake"].figures(),
+                "compute_us": pool.timing.histograms["compute"].figures(),
+                "missed": sum(pool.missed.values()),
+                "minor_faults": pool.usage["minor_faults"],
+            }
+            for condition, pool in by_condition.items()
+        }
+        for case, by_condition in pools.items()
+    }
+
+
+class _Pool:
+    """What the slices of one rate and condition have measured."""
+
+    def __init__(self) -> None:
+        self.timing, self.cyclictest = Timing(), np.zeros(_LONGEST_US + 1, np.int64)
+        self.bare, self.bare_wake = Histogram(), Histogram()
+        self.late = np.zeros(_LONGEST_US + 1, np.int64)
+        self.longest_us = 0
+        self.missed: dict[str, int] = {}
+        self.usage: dict[str, float] = {}
+
+    def figures(self) -> dict[str, Any]:
+        timing = self.timing.figures()
+        over = over_budget(timing)
+        named = {"compute": "compute", "latency": "latency"}
+        return {
+            **{f"{name}_us": timing.pop(stage) for name, stage in named.items()},
+            "wake_us": _figures_of_counts(self.late, timing.pop("wake")["max"]),
+            "cyclictest_us": _figures_of_counts(self.cyclictest, self.longest_us) if self.cyclictest.any() else None,
+            "bare_us": self.bare.figures(),
+            "bare_wake_us": self.bare_wake.figures(),
+            "stages_us": timing,
+            "over_budget": over,
+            "missed_own": self.missed["own"],
+            "missed_host": self.missed["host"],
+            "usage": self.usage,
+            "histograms": {
+                "compute": self.timing.histograms["compute"].bars(),
+                "latency": self.timing.histograms["latency"].bars(),
+                "wake": _bars(self.late),
+                "cyclictest": _bars(self.cyclictest),
+                "bare": self.bare.bars(),
+            },
+        }
+
+
+class _Bench:
+    """The loops of one rate, prepared once and run in a process of their own for every slice."""
+
+    def __init__(self, rate: float, settings: RealTimeSettings, cyclictest: bool) -> None:
+        self._config = SimulationConfig(target="sines", duration=_SLICE_S, rate=rate)
+        self._settings, self._cyclictest, self.longest_us = settings, cyclictest, 0
+        with prepared_loop(self._config) as loop:
+            self._records = shared_array(loop.end + round(rate), RECORD)
+        _run_bare(new_clock(0, 1), 0, 0, np.zeros((1, 2), np.int64))
+
+    def add_slice(self, pool: _Pool, busy: bool, bare: bool = True) -> None:
+        """Run ours, cyclictest if wanted, and the bare loop in turn."""
+        with _busy_thread() if busy else contextlib.nullcontext():
+            count, missed, used = self._in_a_process(self._ours)
+        records = self._records[:count]
+        pool.timing.add(records)
+        pool.late += np.bincount(np.minimum(records["late_ns"] // 1000, _LONGEST_US), minlength=len(pool.late))
+        for total, new in ((pool.missed, missed), (pool.usage, used)):
+            for name, value in new.items():
+                total[name] = total.get(name, 0) + value
+        if self._cyclictest:
+            pool.cyclictest += self._run_cyclictest()
+            pool.longest_us, self.longest_us = max(pool.longest_us, self.longest_us), 0
+        if bare:
+            work = round(1e3 * pool.timing.histograms["compute"].figures()["p50"])
+            durations: Record = self._in_a_process(self._bare, work)
+            pool.bare_wake.add(durations[:, 0])
+            pool.bare.add(durations[:, 1])
+
+    def _in_a_process(self, target: Callable[..., Any], *arguments: Any) -> Any:
+        ours, theirs = _FORK.Pipe()
+        process = _FORK.Process(target=_send, args=(theirs, target, *arguments))
+        process.start()
+        theirs.close()
+        try:
+            result = ours.recv()
+        except EOFError:
+            raise GoughError("a loop's process has died in the benchmark") from None
+        process.join()
+        if isinstance(result, GoughError):
+            raise result
+        return result
+
+    def _ours(self) -> tuple[int, dict[str, int], dict[str, float]]:
+        with prepared_loop(self._config, self._records) as loop:
+            loop.clock, loop.most_missed = self._clock(), _ENDLESS
+            with prevent_compilation(), real_time(self._settings):
+                before = usage()
+                status = loop.follow(loop.end)
+                used = usage().since(before)
+            return _outcome(loop, status, used)
+
+    def _bare(self, work_ns: int) -> NDArray[np.int64]:
+        durations = np.zeros((round(_BARE_SHARE * _SLICE_S * self._config.rate), 2), np.int64)
+        clock = self._clock()
+        turns = max(1, work_ns * 1000 // max(_time_bare(np.zeros(2, np.int64)), 1))
+        with real_time(self._settings):
+            _run_bare(clock, len(durations), turns, durations)
+        return durations
+
+    def _clock(self) -> Record:
+        return new_clock(REAL, round(1e9 / self._config.rate))
+
+    def _run_cyclictest(self) -> NDArray[np.int64]:
+        """Counts of cyclictest's wake-ups by whole microseconds."""
+        period_us, loops = round(1e6 / self._config.rate), round(_SLICE_S * self._config.rate)
+        settings = self._settings
+        command = ["cyclictest", "-q", "-m", "-t1", f"-a{settings.processor}", f"-p{settings.priority}", f"-i{period_us}"]
+        output = subprocess.run(
+            [*command, f"-l{loops}", f"-h{_LONGEST_US}"], capture_output=True, text=True, check=False, timeout=60.0
+        )
+        counts = np.zeros(_LONGEST_US + 1, np.int64)
+        if output.returncode:
+            # Without privileges it does not run; then there is nothing to compare with.
+            self._cyclictest = False
+            return counts
+        for line in output.stdout.splitlines():
+            if line.startswith("# Histogram Overflows:"):
+                counts[-1] += int(line.split(":")[1])
+            elif line.startswith("# Max Latencies:"):
+                self.longest_us = max(self.longest_us, int(line.split(":")[1]))
+            elif line and not line.startswith("#"):
+                us, count = line.split()
+                counts[int(us)] += int(count)
+        return counts
+
+
+def _send(pipe: Any, target: Callable[..., Any], *arguments: Any) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        pipe.send(target(*arguments))
+    except GoughError as error:
+        pipe.send(error)
+
+
+def _outcome(loop: PreparedLoop, cause: int, used: dict[str, float]) -> tuple[int, dict[str, int], dict[str, float]]:
+    if CAUSES[cause].reaction != STOP:
+        raise GoughError(f"the loop stopped in the benchmark: {loop.reason()}")
+    clock = loop.clock
+    missed = {"own": int(clock["missed_own"]), "host": int(clock["missed_late"] + clock["missed_host"])}
+    return int(loop.link[HEAD]), missed, used
+
+
+@kernel
+def _compute_bare(turns: int) -> float:
+    """Work that needs no memory: a logistic map."""
+    x = 0.3
+    for _ in range(turns):
+        x = 3.7 * x * (1.0 - x)
+    return x
+
+
+@kernel
+def _time_bare(timespec: NDArray[np.int64]) -> int:
+    """Nanoseconds of a thousand turns."""
+    least, x = 1_000_000_000, 0.0
+    for _ in range(20):
+        began = now(timespec)
+        x += _compute_bare(1000)
+        least = min(least, now(timespec) - began)
+    # Work of which nothing came would not be done.
+    return least if x > 0.0 else 0
+
+
+@kernel
+def _run_bare(clock: Record, cycles: int, turns: int, durations: NDArray[np.int64]) -> float:
+    """The bare loop: for each cycle, how late it woke and how long it computed [ns]."""
+    c, x = clock[()], 0.0
+    script = np.zeros((1, 3), np.int64)
+    if cycles > 0:
+        start(clock)
+    for i in range(cycles):
+        wait(clock, script)
+        began = now(c.timespec)
+        x += _compute_bare(turns)
+        durations[i, 1] = now(c.timespec) - began
+        durations[i, 0] = c.late
+        finish(clock, script, durations[i, 1])
+    return x
+
+
+@contextmanager
+def _circumstances(condition: str) -> Iterator[None]:
+    if condition != LOAD:
+        yield
+        return
+    cores = str(os.cpu_count() or 1)
+    command = ["stress-ng", "--cpu", cores, "--vm", "1", "--vm-bytes", "128M", "--hdd", "1", "--hdd-bytes", "16M", "--quiet"]
+    with (
+        tempfile.TemporaryDirectory(prefix="gough-load-") as folder,
+        subprocess.Popen([*command, "--temp-path", folder]) as load,
+    ):
+        try:
+            yield
+        finally:
+            load.terminate()
+
+
+@contextmanager
+def _busy_thread() -> Iterator[None]:
+    """A Python thread that never rests, started once the process that is measured has been forked."""
+    over = threading.Event()
+
+    def turn() -> None:
+        while not over.is_set():
+            sum(range(1000))
+
+    starter = threading.Timer(0.2, turn)
+    starter.start()
+    try:
+        yield
+    finally:
+        over.set()
+        starter.join()
+
+
+def _figures_of_counts(counts: NDArray[np.int64], longest: float) -> dict[str, float]:
+    """Figures [us] of counts by whole microseconds, as cyclictest rounds them: down."""
+    n = int(counts.sum())
+    sums = np.cumsum(counts)
+    figures = {}
+    for name, share in QUANTILES.items():
+        us = int(np.searchsorted(sums, share * n))
+        # Within a microsecond all durations are taken for equally likely.
+        figures[name] = us + 1.0 - float(sums[us] - share * n) / float(counts[us])
+    return {**figures, "max": float(longest), "n": n}
+
+
+def _bars(counts: NDArray[np.int64]) -> list[list[float]]:
+    """Counts by microseconds gathered into bins sixteen to the octave."""
+    used = np.flatnonzero(counts)
+    bins = np.floor(16.0 * np.log2(np.maximum(used, 0.5)))
+    lower = np.unique(bins)
+    return [(2.0 ** (lower / 16.0)).tolist(), [int(counts[used[bins == each]].sum()) for each in lower]]
+
+
+def measure_start_up(cold: bool) -> dict[str, float | None]:
+    """Seconds from the start of `gough run` to its first cycle: with caches, and, if wanted, without."""
+
+    def first_cycle(cache: str | None) -> float:
+        environment = dict(os.environ) if cache is None else {**os.environ, "GOUGH_CACHE": cache}
+        with tempfile.TemporaryDirectory(prefix="gough-start-") as folder:
+            path = Path(folder) / "run.json"
+            command = [sys.executable, "-m", "hil.command_line", "run", "--target", "hold", "--duration", "0.1", "--json"]
+            subprocess.run([*command, str(path)], env=environment, check=True, capture_output=True)
+            return float(json.loads(path.read_text())["start_up_s"])
+
+    figures: dict[str, float | None] = {"cold_s": None}
+    if cold:
+        with tempfile.TemporaryDirectory(prefix="gough-cold-") as cache:
+            figures["cold_s"] = first_cycle(cache)
+    first_cycle(None)
+    return {**figures, "cached_s": min(first_cycle(None) for _ in range(3))}
+
+
+class GrossExcessError(GoughError, RuntimeError):
+    """The loop on the clock is off by more than any noise."""
+
+    exit_status = 1
+
+
+def gross_excess(figures: dict[str, Any]) -> list[str]:
+    """What is wrong beyond the noise of any machine, in words: for continuous integration."""
+    found = []
+    for rate, conditions in figures["rates"].items():
+        for condition, measured in conditions.items():
+            where = f"{rate} Hz, {condition}"
+            if measured["missed_own"]:
+                found.append(f"{where}: {measured['missed_own']} periods missed by our own work")
+            if not figures["refused"] and measured["usage"]["major_faults"]:
+                found.append(f"{where}: {measured['usage']['major_faults']:g} major page faults in the loop")
+            if condition == IDLE and measured["compute_us"]["p50"] > 100.0:
+                found.append(f"{where}: computing takes {measured['compute_us']['p50']:.0f} us")
+            slow = measured["compute_us"]["p50"] / max(measured["bare_us"]["p50"], 1.0)
+            if slow > 10.0:
+                found.append(f"{where}: computing takes {slow:.0f} times as long as a bare loop of the same work")
+    return found

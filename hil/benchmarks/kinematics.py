@@ -1,0 +1,168 @@
+"""Benchmarks of direct kinematics: time per pose by class and method, and whether the right pose is found from cold."""
+
+from collections.abc import Callable, Sequence
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from controller.direct_kinematics import METHODS, pose_difference, pose_from_lengths, poses_from_lengths, solve, solve_batch
+from controller.direct_kinematics.spatial import NEEDS
+from controller.inverse_kinematics import leg_lengths, sample_workspace
+from hil.studies.accuracy import draw_measurements, draw_poses
+from plant.errors import SingularConfigurationError
+from plant.mechanism import Mechanism, load_spatial
+from plant.mechanism.classification import draw_mechanism, spatial_classes
+from plant.pose import Array, Pose, rotation_from_vector
+
+PRESETS = ("hexapod", "6-3-I", "6-3-II", "6-4-I", "6-4-II", "6-5", "genhexkins")
+
+_ROWS = 1000
+_REPEATS = 5
+_BATCH_ROWS = 100_000
+_MOTION_S = 10.0
+_COLD_STARTS = 1000
+_WIDE_TILT = np.radians(60.0)
+_SAME_POSE_M, _SAME_POSE = 1e-6, 1e-6
+
+
+def measure_kinematics(progress: Callable[[float], None] = lambda share: None) -> dict[str, Any]:
+    """Time direct kinematics and try it from cold.
+
+    Returns:
+        `solve_us`: by class and method, `closed_form` and `refined`, which includes the covariance: microseconds per pose on
+        one core, compiled. `call_us`: one call of `solve` from Python. `batch_per_s`: poses per second on all cores.
+        `newton`: microseconds per pose of Newton's method from lengths along a motion at 1 kHz, and how many times longer
+        each method takes on the same mechanism. `cold_starts`: by preset, over the `workspace` and over `wide` poses (60 deg
+        of tilt, any yaw), the shares of poses found (`success`) and mistaken (`wrong`) by Newton's method from home and by
+        direct kinematics from the leg directions.
+    """
+    classes = spatial_classes()
+    steps = len(classes) + len(PRESETS) + 2
+    solve_us: dict[str, Any] = {}
+    for number, mechanism_class in enumerate(classes):
+        mechanism = draw_mechanism(mechanism_class, np.random.default_rng(number))
+        solve_us[mechanism_class.label] = _time_methods(mechanism)
+        progress((number + 1) / steps)
+    hexapod = load_spatial("hexapod")
+    newton = _time_newton(hexapod)
+    progress((len(classes) + 1) / steps)
+    on_hexapod = _time_methods(hexapod)
+    batch, call = _time_batch(hexapod)
+    progress((len(classes) + 2) / steps)
+    cold = {}
+    for number, name in enumerate(PRESETS):
+        cold[name] = _start_cold(load_spatial(name), np.random.default_rng(number))
+        progress((len(classes) + 3 + number) / steps)
+    return {
+        "solve_us": solve_us,
+        "hexapod_us": on_hexapod,
+        "call_us": call,
+        "batch_per_s": batch,
+        "newton": {
+            "warm_us": newton,
+            "ratios": {method: {kind: us / newton for kind, us in times.items()} for method, times in on_hexapod.items()},
+        },
+        "cold_starts": cold,
+    }
+
+
+def _time_methods(mechanism: Mechanism) -> dict[str, dict[str, float]]:
+    """Microseconds per pose of every method that works on the mechanism with all its legs."""
+    measurements = _measure(mechanism, _ROWS)
+    times = {}
+    for method in METHODS:
+        kinds: dict[str, float] = {}
+        for kind, refine in (("closed_form", False), ("refined", True)):
+            given = _given(measurements, method)
+            runs = []
+            for _ in range(_REPEATS):
+                start = perf_counter()
+                found = solve_batch(mechanism, **given, method=method, refine=refine, workers=1)
+                runs.append(perf_counter() - start)
+            if found.solved.mean() > 0.5:
+                kinds[kind] = 1e6 * float(np.median(runs)) / _ROWS
+        if kinds:
+            times[method] = kinds
+    return times
+
+
+def _measure(mechanism: Mechanism, count: int) -> dict[str, Array]:
+    random = np.random.default_rng(0)
+    return draw_measurements(mechanism, *draw_poses(mechanism, count, random), random, 1.0)
+
+
+def _given(measurements: dict[str, Array], method: str) -> dict[str, Any]:
+    return {name: measurements[name] for name in ("leg_directions", NEEDS.get(method)) if name}
+
+
+def _time_batch(mechanism: Mechanism) -> tuple[dict[str, float], float]:
+    """Poses per second of a refined batch on all cores by method, and microseconds of one call of `solve`."""
+    measurements = _measure(mechanism, _BATCH_ROWS)
+    rates = {}
+    for method in ("section-5", "up", "normal", "legs"):
+        runs = []
+        for _ in range(_REPEATS):
+            start = perf_counter()
+            solve_batch(mechanism, **_given(measurements, method), method=method)
+            runs.append(perf_counter() - start)
+        rates[method] = _BATCH_ROWS / float(np.median(runs))
+    calls = []
+    for directions, up in zip(measurements["leg_directions"][:_ROWS], measurements["up_in_platform"], strict=False):
+        start = perf_counter()
+        solve(mechanism, directions, up_in_platform=up)
+        calls.append(perf_counter() - start)
+    return rates, 1e6 * float(np.median(calls))
+
+
+def _time_newton(mechanism: Mechanism) -> float:
+    """Microseconds per pose of Newton's method along a motion at 1 kHz, each started from the pose before."""
+    times = np.arange(0.0, _MOTION_S, 1e-3)
+    home = mechanism.require_home()
+    swings = np.sin(2.0 * np.pi * times[:, None] * [0.9, 0.7, 0.5, 0.8, 0.6, 1.0])
+    positions = home.position + 0.02 * swings[:, :3]
+    rotations = np.array([rotation_from_vector(0.05 * swing) for swing in swings[:, 3:]]) @ home.rotation
+    lengths = leg_lengths(mechanism, positions, rotations)
+    start_pose = Pose(positions[0], rotations[0])
+    runs = []
+    for _ in range(_REPEATS):
+        start = perf_counter()
+        poses_from_lengths(mechanism, lengths, start_pose)
+        runs.append(perf_counter() - start)
+    return 1e6 * float(np.median(runs)) / len(times)
+
+
+def _start_cold(mechanism: Mechanism, random: np.random.Generator) -> dict[str, Any]:
+    home = mechanism.require_home()
+    turns = np.array(
+        [
+            rotation_from_vector([0.0, 0.0, yaw]) @ rotation_from_vector([tilt * np.cos(way), tilt * np.sin(way), 0.0])
+            for tilt, way, yaw in random.uniform([0.0, -np.pi, -np.pi], [_WIDE_TILT, np.pi, np.pi], (_COLD_STARTS, 3))
+        ]
+    )
+    reach = 0.3 * float(np.median(np.linalg.norm(home.position + mechanism.platform_joints - mechanism.base_joints, axis=1)))
+    wide = home.position + random.uniform(-reach, reach, (_COLD_STARTS, 3)), turns @ home.rotation
+    figures = {}
+    for name, (positions, rotations) in (("workspace", sample_workspace(mechanism, _COLD_STARTS, seed=0)), ("wide", wide)):
+        exact = draw_measurements(mechanism, positions, rotations, random, 0.0)
+        found = solve_batch(mechanism, exact["leg_directions"])
+        ours = [found[i] if found.solved[i] else None for i in range(_COLD_STARTS)]
+        newton: list[Pose | None] = []
+        for lengths in leg_lengths(mechanism, positions, rotations):
+            try:
+                newton.append(pose_from_lengths(mechanism, lengths))
+            except SingularConfigurationError:
+                newton.append(None)
+        truth = [Pose(position, rotation) for position, rotation in zip(positions, rotations, strict=True)]
+        figures[name] = {"newton": _score(newton, truth), "directions": _score(ours, truth)}
+    return figures
+
+
+def _score(found: Sequence[Any], truth: Sequence[Pose]) -> dict[str, float]:
+    right = wrong = 0
+    for pose, true_pose in zip(found, truth, strict=True):
+        if pose is not None:
+            distance, angle = pose_difference(pose, true_pose)
+            right += distance < _SAME_POSE_M and angle < _SAME_POSE
+            wrong += not (distance < _SAME_POSE_M and angle < _SAME_POSE)
+    return {"success": right / len(truth), "wrong": wrong / len(truth)}

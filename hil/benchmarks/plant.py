@@ -1,0 +1,135 @@
+"""Benchmark of the plant: what a step costs through compiled calls and through FMPy's own methods, and how exact it is."""
+
+from collections.abc import Callable
+from time import perf_counter_ns
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.realtime.clock import now
+from plant.compiled import Record, kernel
+from plant.dynamics.variables import VELOCITY
+from plant.fmu.build import SPATIAL_MODEL, default_fmu
+from plant.fmu.importer import FmuDescription, FmuInstance
+from plant.fmu.plant import FmuPlant, advance, read_imus, read_truth, write_command, write_drive_mode
+from plant.mechanism import load_spatial
+from plant.pose import Array
+
+PERIOD_S = 1e-3
+FINER = 16
+"""How many times shorter the substeps are that the error is measured against."""
+
+_PARTS = ("set modes and commands", "step", "read IMUs", "read truth")
+_FMPY_CYCLES = 2000
+_BLOCK = 50
+
+
+def measure_plant(duration: float, progress: Callable[[float], None] = lambda share: None) -> dict[str, Any]:
+    """Drive the plant of the hexapod with sines of all legs.
+
+    Args:
+        duration: of the motion [s].
+        progress: called now and then with the share that is done.
+
+    Returns:
+        `step_us`: of a 1 ms step from compiled code, by FMI's version; `calls_us`: of each of the calls of a cycle (FMI 3.0),
+        of which the first and the last only copy numbers; `cycle_us`: of all of them, and `fmpy_us` of the same through FMPy's
+        methods, medians; `fmpy_slowdown`: how many times longer these take; `error_m`: greatest distance from where shorter
+        substeps lead; `substep` [s].
+    """
+    commands = _commands(duration)
+    parameters = load_spatial("hexapod").plant_parameters()
+    driven = {}
+    for fmi in (3, 2):
+        with FmuPlant(default_fmu(SPATIAL_MODEL, fmi), parameters, PERIOD_S) as plant:
+            driven[fmi] = _drive(plant, commands)
+        progress(0.2 * (4 - fmi))
+    with FmuPlant(default_fmu(), parameters | {"substep": parameters["substep"] / FINER}, PERIOD_S) as plant:
+        _, exact = _drive(plant, commands)
+    progress(0.9)
+    fmpy_us = _drive_with_fmpy(commands[:_FMPY_CYCLES])
+    progress(1.0)
+    times, positions = driven[3]
+    cycle_us = float(np.median(times.sum(axis=1))) / 1e3
+    return {
+        "step_us": {f"FMI {fmi}": _percentiles(parts[:, _PARTS.index("step")]) for fmi, (parts, _) in driven.items()},
+        "calls_us": {name: _percentiles(times[:, i]) for i, name in enumerate(_PARTS)},
+        "cycle_us": cycle_us,
+        "fmpy_us": fmpy_us,
+        "fmpy_slowdown": fmpy_us / cycle_us,
+        "error_m": float(np.linalg.norm(positions - exact, axis=1).max()),
+        "substep": float(parameters["substep"]),
+        "duration": duration,
+    }
+
+
+def _commands(duration: float) -> Array:
+    """Velocity commands (n, 6) [m/s] of every cycle."""
+    times = PERIOD_S * np.arange(round(duration / PERIOD_S))[:, None]
+    legs = np.arange(6)
+    commands: Array = 0.06 * np.sin(2.0 * np.pi * (0.4 + 0.07 * legs) * times + legs)
+    return commands
+
+
+def _drive(plant: FmuPlant, commands: Array) -> tuple[Array, Array]:
+    """Durations of the parts [ns], means over blocks of cycles (m, 4), and positions (n, 3) [m]."""
+    durations, positions = np.zeros((len(commands), len(_PARTS)), np.int64), np.zeros((len(commands), 3))
+    if _run(plant.calls, commands, durations, positions, np.zeros(2, np.int64)):
+        raise plant.failure()
+    whole = len(commands) // _BLOCK * _BLOCK
+    return durations[:whole].reshape(-1, _BLOCK, len(_PARTS)).mean(axis=1), positions
+
+
+@kernel
+def _run(calls: Record, commands: Array, durations: NDArray[np.int64], positions: Array, timespec: NDArray[np.int64]) -> int:
+    for i in range(commands.shape[0]):
+        t0 = now(timespec)
+        status = write_drive_mode(calls, VELOCITY) | write_command(calls, commands[i])
+        t1 = now(timespec)
+        status |= advance(calls, PERIOD_S)
+        t2 = now(timespec)
+        status |= read_imus(calls)
+        t3 = now(timespec)
+        status |= read_truth(calls)
+        t4 = now(timespec)
+        durations[i, 0], durations[i, 1], durations[i, 2], durations[i, 3] = t1 - t0, t2 - t1, t3 - t2, t4 - t3
+        positions[i] = calls[()].truth[:3]
+        if status != 0:
+            return status
+    return 0
+
+
+def _percentiles(nanoseconds: Array) -> dict[str, float]:
+    p50, p99 = np.percentile(nanoseconds / 1e3, (50.0, 99.0))
+    return {"p50": float(p50), "p99": float(p99)}
+
+
+def _drive_with_fmpy(commands: Array) -> float:
+    """Median duration of a cycle [us] through FMPy's own methods."""
+    description = FmuDescription(default_fmu())
+    instance = FmuInstance(description)
+    try:
+        instance.initialize()
+        fmu = instance.fmu
+        reference = {name: description[name].references[0] for name in ("velocity_command", "drive_mode")}
+        imus, truth = (
+            [description[name] for name in names]
+            for names in (
+                ("imu_angular_velocity", "imu_specific_force", "imu_magnetic_field"),
+                ("position", "quaternion", "leg_length", "current"),
+            )
+        )
+        groups = [([v.references[0] for v in group], sum(v.size for v in group)) for group in (imus, truth)]
+        took = []
+        for i, command in enumerate(commands.tolist()):
+            began = perf_counter_ns()
+            fmu.setInt64([reference["drive_mode"]], [VELOCITY] * 6)
+            fmu.setFloat64([reference["velocity_command"]], command)
+            fmu.doStep(currentCommunicationPoint=PERIOD_S * i, communicationStepSize=PERIOD_S)
+            for references, size in groups:
+                fmu.getFloat64(references, nValues=size)
+            took.append(perf_counter_ns() - began)
+    finally:
+        instance.close()
+    return float(np.median(took)) / 1e3

@@ -1,0 +1,131 @@
+"""A recording as a rig: the loop runs on the clock on what was recorded, and nothing moves."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from controller.safety.watch import RIG_FAILED
+from hil.loop.driver import RECORD
+from hil.recording.mcap import RecordingError, read, total
+from hil.rigs import ANSWERED, SILENT, Identity, RigError
+from plant.compiled import Record
+from plant.dynamics.variables import IMU_COUNT
+from plant.mechanism import Mechanism
+from plant.pose import Array
+
+ENDED, FAILED = 2, 3
+"""Statuses of an exchange: the recording has come to its end; the rig failed when it was recorded."""
+
+_FAILURES = {ENDED: "the recording has come to its end", FAILED: "it did so when it was recorded"}
+
+
+class ReplayRig:
+    """A recording as a rig; each exchange is that of the next period. What is commanded goes nowhere.
+
+    A period that was missed when it was recorded is one in which nothing answers. A run of another target or duration than the
+    recorded one sees drives that do not follow, and stops; without arming it goes on.
+
+    Args:
+        path: the recording, or the consecutive files of one run.
+        period: of the exchanges [s]; it must be the recording's.
+        mechanism: which must be the recording's, too; None for any.
+
+    Attributes:
+        command_delay: of the rig that was recorded [s], as soon as this is open.
+        failure: why an exchange has failed.
+    """
+
+    def __init__(self, path: Path | str | Sequence[Path | str], period: float, mechanism: Mechanism | None = None) -> None:
+        self.command_delay = period
+        self.failure = ""
+        self._paths = [path] if isinstance(path, str | Path) else list(path)
+        self._period, self._mechanism = period, mechanism
+        self._identity: Identity | None = None
+        self._records, self._rows, self._numbers = (
+            np.zeros(0, RECORD),
+            np.zeros(0, np.int64),
+            np.zeros((0, IMU_COUNT), np.int64),
+        )
+        self._cycle = 0
+
+    def open(self) -> None:
+        """Read the recording.
+
+        Raises:
+            RigError: there is none, or it is of another rate, mechanism or run.
+        """
+        try:
+            recordings = sorted((read(path) for path in self._paths), key=lambda each: each.records["cycle"][:1].tolist())
+        except RecordingError as error:
+            raise RigError(str(error)) from None
+        where = ", ".join(map(str, self._paths))
+        config = recordings[0].config
+        if any(each.config != config for each in recordings):
+            raise RigError(f"{where} are of different runs: give the files of one")
+        records = total(recordings)
+        if not len(records):
+            raise RigError(f"{where} holds no cycle: the run ended before its first one, or it is damaged")
+        if records["cycle"][0] != 0:
+            raise RigError(f"{where} does not begin with the first cycle of its run: give all of its files")
+        rate = float(config["rate"])
+        if abs(rate * self._period - 1.0) > 1e-9:
+            raise RigError(
+                f"{where} was recorded at {rate:g} Hz and cannot be replayed at {1.0 / self._period:g} Hz: give its rate"
+            )
+        name = config["mechanism_name"]
+        if self._mechanism is not None and self._mechanism.name != name:
+            raise RigError(f"{where} was recorded on the mechanism {name}, not on {self._mechanism.name}: give that")
+        self._records = records
+        self._rows = np.full(int(records["cycle"][-1]) + 1, -1)
+        self._rows[records["cycle"]] = np.arange(len(records))
+        self._numbers = np.cumsum(records["sample_age"] == 0, axis=0)
+        self._cycle, self.failure = 0, ""
+        if "parameters" in recordings[0].arrays:
+            self.command_delay = float(recordings[0].arrays["parameters"]["command_delay"])
+        parts = {"rig": str(config.get("rig")), "run": str(config.get("run")), "recorded by": f"gough {config['version']}"}
+        self._identity = Identity(f"recording {where}", parts)
+
+    def identify(self) -> Identity:
+        """Which run it is of.
+
+        Raises:
+            RigError: it is not open.
+        """
+        if self._identity is None:
+            raise RigError("the recording is not open: open it first")
+        return self._identity
+
+    def arm(self) -> None:
+        """Nothing: the recorded drives are as they were."""
+
+    def exchange(self, command: Array, request: int, feedback: Record) -> int:
+        """What was recorded of the next period, as `Rig` says."""
+        del command, request
+        cycle = self._cycle
+        self._cycle += 1
+        if cycle >= len(self._rows):
+            return self._fail(ENDED)
+        row = self._rows[cycle]
+        if row < 0:
+            return SILENT
+        record, measurement = self._records[row], feedback["measurement"]
+        measurement[0], measurement[1] = record["angular_velocity"], record["specific_force"]
+        measurement[2] = record["magnetic_field"]
+        feedback["sequence"] = self._numbers[row]
+        for name in ("sample_ns", "drive", "drive_code", "sent", "truth", "round_trip_ns", "refused"):
+            feedback[name] = record[name]
+        if record["status"] == RIG_FAILED:
+            return self._fail(FAILED)
+        return SILENT if record["silent"] > 0 else ANSWERED
+
+    def _fail(self, status: int) -> int:
+        self.failure = _FAILURES[status]
+        return status
+
+    def quick_stop(self) -> None:
+        """Nothing: nothing moves."""
+
+    def close(self) -> None:
+        """Let go of the recording."""
+        self._identity, self._records, self._rows = None, self._records[:0], self._rows[:0]

@@ -1,0 +1,423 @@
+"""The report of a simulation: one HTML file that opens offline, with summary, time series and the moving mechanism."""
+
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import plotly.graph_objects as go
+from numpy.typing import NDArray
+from plotly.subplots import make_subplots
+
+from controller.cycle import ALL_IMUS
+from hil.reports.page import (
+    AXIS_NAMES,
+    COLORS,
+    FAINT,
+    INK,
+    LAYOUT,
+    LEG_NAMES,
+    coordinates,
+    figure_html,
+    line_trace,
+    page,
+    plate_trace,
+    ring,
+    scene,
+    segment_colors,
+    segments,
+)
+from hil.runs.simulation import SimulationResult
+from plant.files import write_whole
+from plant.pose import Array, rotation_angle
+
+_POINTS = 3000
+_FRAMES = 150
+_FRAME_RATE_HZ = 25.0
+_SLOWEST_HZ = 15.0
+_PATH_POINTS = 600
+_TUBE = 0.62
+"""The drawn length of a leg's lower part, relative to the least length of the leg."""
+
+
+class _Panel(NamedTuple):
+    """One pair of axes over time: `values` (N, k) of the curves `names`, their plan (N, k), and dashed limits."""
+
+    label: str
+    names: Sequence[str]
+    values: Array
+    planned: Array | None = None
+    limits: Sequence[float] = ()
+
+
+def write_report(result: SimulationResult, path: Path) -> None:
+    """Write the report of a simulation as one HTML file, which takes its place only when it is complete.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    write_whole(path, _page(result).encode())
+
+
+def _page(result: SimulationResult) -> str:
+    summary = result.summary()
+    title = f"gough: {escape(result.mechanism.name)} follows {escape(result.target.name)}"
+    view, speed = _mechanism_view(result)
+    pace = "in real time" if speed < 1.05 else f"at {speed:.2g} times real speed"
+    series = "".join(figure_html(*figure, "time") for figure in _time_figures(result))
+    moving = figure_html(
+        "mechanism",
+        "The mechanism",
+        f"{_real(result)} poses {pace}; the path of the origin in grey. Drag to turn, scroll to zoom.",
+        view,
+        "view",
+    )
+    body = f"""<section class="overview">
+<div>
+{_error_table(summary)}
+{_facts(summary)}
+</div>
+{moving}
+</section>
+{series}"""
+    return page(title, _configuration(result, summary), body, _SHARED_TIME)
+
+
+def _configuration(result: SimulationResult, summary: dict[str, Any]) -> str:
+    config = result.config
+    ran = result.times[-1] + 1.0 / config.rate
+    parts = [
+        f"{config.duration:g} s" + (f", stopped after {ran:.3f} s" if ran < config.duration - 1.5 / config.rate else ""),
+        f"{config.rate:g} Hz",
+        f"IMU {config.imu}, seed {config.seed}",
+        f"{config.fusion} fusion" + (", magnetometer" if config.magnetometer else ""),
+        f"gough {summary['version']}",
+    ]
+    if tuple(config.imus) != ALL_IMUS:
+        parts.insert(3, f"only IMUs {', '.join(map(str, config.imus))}")
+    if config.plant:
+        parts.append(f"plant {config.plant}" + (f" with {config.binding}" if config.binding else ""))
+    parts += [each.text for each in config.settings]
+    return " · ".join(map(escape, parts))
+
+
+def _error_table(summary: dict[str, Any]) -> str:
+    reference = ("Reference", "planned reference - target", summary["target"], "reference_")
+    lines = (
+        (
+            ("Estimation", "estimate - truth", summary["estimation"], ""),
+            ("Tracking", "truth - planned reference", summary["tracking"], ""),
+            ("Against the raw target", "truth - target", summary["target"], ""),
+            reference,
+        )
+        if summary["truth_known"]
+        else (
+            ("Tracking", "estimate - planned reference; the truth is not known", summary["estimated_tracking"], ""),
+            reference,
+        )
+    )
+    rows = "".join(
+        f"<tr><th>{name}<small>{meaning}</small></th>"
+        + "".join(f"<td>{1e3 * errors[prefix + key]:.3f}</td>" for key in ("position_rms", "position_max"))
+        + "".join(f"<td>{np.degrees(errors[prefix + key]):.3f}</td>" for key in ("rotation_rms", "rotation_max"))
+        + "</tr>\n"
+        for name, meaning, errors, prefix in lines
+    )
+    return f"""<table>
+<thead>
+<tr><th rowspan="2"></th><th colspan="2">position [mm]</th><th colspan="2">rotation [deg]</th></tr>
+<tr><th>RMS</th><th>max</th><th>RMS</th><th>max</th></tr>
+</thead>
+<tbody>
+{rows}</tbody>
+</table>"""
+
+
+def _facts(summary: dict[str, Any]) -> str:
+    cycle = summary["cycle_us"]
+    violations = summary["limits"]["violations"]
+    facts = (
+        ("violations of limits by the reference", f"{violations}", "good" if violations == 0 else "bad"),
+        ("real-time factor", f"{summary['real_time_factor']:.1f}", ""),
+        ("cycle [µs], p50 / p99 / p99.9", " / ".join(f"{cycle[name]:.1f}" for name in ("p50", "p99", "p999")), ""),
+    )
+    return (
+        "<dl>" + "".join(f'<div><dd class="{kind}">{value}</dd><dt>{name}</dt></div>' for name, value, kind in facts) + "</dl>"
+    )
+
+
+def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figure]]:
+    """Name, title, caption and figure of everything that is drawn over time."""
+    records, times = result.records, result.times
+    limits, home_pose = result.mechanism.require_limits(), result.mechanism.require_home()
+    names, legs_there = LEG_NAMES[: result.mechanism.legs], slice(result.mechanism.legs)
+    estimate = (records["position"], records["rotation"])
+    actual, real = _actual_poses(result), _real(result)
+    planned = (result.reference_positions, result.reference_rotations)
+    true_lengths, currents = records["truth"][:, 7:13][:, legs_there], records["truth"][:, 13:19][:, legs_there]
+    lengths_known = bool(np.isfinite(true_lengths[:1]).all())
+    lengths, real_length = (
+        1e3 * (true_lengths if lengths_known else records["lengths"][:, legs_there]),
+        "True" if lengths_known else "Estimated",
+    )
+    planned_lengths, rates, accelerations = np.moveaxis(records["reference"][:, legs_there], 2, 0) * [[[1e3]], [[1e3]], [[1.0]]]
+
+    home = (home_pose.position, home_pose.rotation)
+    pose = [
+        _Panel(label, AXIS_NAMES, true, plan)
+        for label, true, plan in zip(
+            ("position [mm]", "rotation vector [deg]"), _differences(actual, home), _differences(planned, home), strict=True
+        )
+    ]
+    differences = [("tracking", _differences(actual, planned))]
+    if result.truth_known:
+        differences.insert(0, ("estimation", _differences(estimate, actual)))
+    errors = [
+        _Panel(f"{name} [{unit}]", AXIS_NAMES, error[i]) for i, unit in enumerate(("mm", "deg")) for name, error in differences
+    ]
+    legs = [
+        _Panel(f"{name} [mm]", (name,), lengths[:, [k]], planned_lengths[:, [k]], 1e3 * limits.stroke[k])
+        for k, name in enumerate(names)
+    ]
+    motion = [
+        _Panel("speed [mm/s]", names, rates, limits=(-1e3 * limits.velocity, 1e3 * limits.velocity)),
+        _Panel("acceleration [m/s²]", names, accelerations, limits=(-limits.acceleration, limits.acceleration)),
+    ]
+    drives = [
+        _Panel("length error [mm]", names, lengths - planned_lengths),
+        _Panel("command [mm/s]", names, 1e3 * records["command"][:, legs_there]),
+    ]
+    if np.isfinite(currents[:1]).all():
+        drives.append(_Panel("motor current [A]", names, currents))
+    return [
+        (
+            "pose",
+            "Pose",
+            f"{real} pose of the platform and its planned reference, from home; the rotation vector is seen in the base.",
+            _plot(times, pose),
+        ),
+        (
+            "errors",
+            "Estimation and tracking error" if result.truth_known else "Tracking error",
+            ("Estimate minus truth, and truth" if result.truth_known else "The truth is not known: estimate")
+            + " minus planned reference. The scales are those of the motion: while the filters "
+            "settle in the hold (grey), the estimate may be further off.",
+            _plot(times, errors, columns=len(differences), shared_yaxes=True),
+        ),
+        (
+            "lengths",
+            "Leg lengths",
+            f"{real_length} and planned length of each leg between the ends of its stroke.",
+            _plot(times, legs, columns=3),
+        ),
+        ("motion", "Planned motion of the legs", "The reference against the limits of the actuators.", _plot(times, motion)),
+        (
+            "drives",
+            "Drives",
+            f"{real_length} minus planned length of each leg, the speed that its drive is told, and the current that this "
+            "takes, if the plant tells it.",
+            _plot(times, drives),
+        ),
+    ]
+
+
+def _real(result: SimulationResult) -> str:
+    """What the poses that are drawn are."""
+    return "True" if result.truth_known else "Estimated"
+
+
+def _actual_poses(result: SimulationResult) -> tuple[Array, Array]:
+    """The true poses, or the estimated ones where the truth is not known."""
+    if result.truth_known:
+        return result.true_positions, result.true_rotations
+    return result.records["position"], result.records["rotation"]
+
+
+def _plot(times: Array, panels: Sequence[_Panel], columns: int = 1, shared_yaxes: bool = False) -> go.Figure:
+    """A figure of panels over one time axis, filled row by row; each name is once in the legend."""
+    rows = len(panels) // columns
+    figure = make_subplots(
+        rows,
+        columns,
+        shared_xaxes="all",
+        shared_yaxes="rows" if shared_yaxes else False,
+        horizontal_spacing=0.07 if columns > 1 else 0.0,
+        vertical_spacing=0.05,
+    )
+    known: set[str] = set()
+
+    def legend(name: str) -> dict[str, Any]:
+        first = name not in known
+        known.add(name)
+        return {"name": name, "legendgroup": name, "showlegend": first, "legendrank": 1 if name in COLORS else 2}
+
+    for number, panel in enumerate(panels):
+        row, column = divmod(number, columns)
+        place: dict[str, Any] = {"row": row + 1, "col": column + 1}
+        peers = panels[row * columns : (row + 1) * columns] if shared_yaxes else [panel]
+        unit = panel.label.partition("[")[2].rstrip("]")
+        for name, values in zip(panel.names, panel.planned.T if panel.planned is not None else (), strict=False):
+            line = {"color": "#c5ccd4", "width": 5}
+            figure.add_scatter(**_curve(times, values, f"{name} planned", unit), line=line, **legend("planned"), **place)
+        for name, values in zip(panel.names, panel.values.T, strict=True):
+            line = {"color": COLORS[name], "width": 1.5}
+            figure.add_scatter(**_curve(times, values, name, unit), line=line, **legend(name), **place)
+        for limit in panel.limits:
+            figure.add_hline(limit, line={"color": INK, "width": 1, "dash": "dash"}, **legend("limit"), **place)
+        figure.update_yaxes(title_text=panel.label, range=_span(peers, times >= 0.0), **place)
+    if times[0] < 0.0:
+        figure.add_vrect(times[0], min(0.0, times[-1]), fillcolor=FAINT, opacity=0.2, line_width=0, layer="below")
+    figure.update_xaxes(range=[times[0], times[-1]])
+    figure.update_xaxes(title_text="time [s]", row=rows)
+    figure.update_layout(
+        LAYOUT,
+        height=60 + 210 * rows,
+        legend={"orientation": "h", "x": 0.0, "y": 1.0, "yanchor": "bottom"},
+    )
+    return figure
+
+
+def _span(panels: Sequence[_Panel], moving: NDArray[np.bool_]) -> tuple[float, float]:
+    """What an axis for all of `panels` shows: the motion and the limits, but not how the filters settle before it."""
+    drawn = [curves[moving].ravel() for panel in panels for curves in (panel.values, panel.planned) if curves is not None]
+    values = np.concatenate([*drawn, *(panel.limits for panel in panels)])
+    finite = values[np.isfinite(values)]
+    least, greatest = (finite.min(), finite.max()) if finite.size else (0.0, 0.0)
+    margin = 0.06 * (greatest - least) or 1.0
+    return float(least - margin), float(greatest + margin)
+
+
+def _curve(times: Array, values: Array, name: str, unit: str) -> dict[str, Any]:
+    kept = _extremes(values)
+    return {
+        "x": times[kept].astype(np.float32),
+        "y": values[kept].astype(np.float32),
+        "mode": "lines",
+        "hovertemplate": f"{name}: %{{y:.4~g}} {unit} at %{{x:.3f}} s<extra></extra>",
+    }
+
+
+def _extremes(values: Array, points: int = _POINTS) -> NDArray[np.intp]:
+    """Indices of about `points` samples of `values` (N,), among them the least and the greatest of each bucket."""
+    if len(values) <= points:
+        return np.arange(len(values))
+    size = -(-2 * len(values) // points)
+    buckets = values[: len(values) // size * size].reshape(-1, size)
+    starts = np.arange(0, buckets.size, size)
+    rest = np.arange(buckets.size, len(values))
+    return np.unique(np.concatenate([starts + buckets.argmin(axis=1), starts + buckets.argmax(axis=1), rest]))
+
+
+def _differences(poses: tuple[Array, Array], origins: tuple[Array, Array]) -> tuple[Array, Array]:
+    """From the poses `origins` to `poses`: translation (N, 3) [mm] and rotation vector (N, 3) [deg], both seen in {1}."""
+    relative = poses[1] @ np.swapaxes(origins[1], -1, -2)
+    skewed = relative - np.swapaxes(relative, 1, 2)
+    sines = 0.5 * np.stack([skewed[:, 2, 1], skewed[:, 0, 2], skewed[:, 1, 0]], axis=1)
+    angles = rotation_angle(poses[1], origins[1])
+    return 1e3 * (poses[0] - origins[0]), np.degrees(sines / np.sinc(angles / np.pi)[:, None])
+
+
+def _mechanism_view(result: SimulationResult) -> tuple[go.Figure, float]:
+    """The moving mechanism, and how many times faster than real it plays."""
+    mechanism = result.mechanism
+    moving = np.flatnonzero(result.times >= 0.0)
+    span = len(moving) / result.config.rate
+    count = int(np.clip(span * _FRAME_RATE_HZ, 1, _FRAMES))
+    frame_s = min(span / count, 1.0 / _SLOWEST_HZ)
+    shown = moving[np.linspace(0, len(moving) - 1, count).astype(int)]
+    all_positions, all_rotations = _actual_poses(result)
+    positions, rotations = 1e3 * all_positions[shown], all_rotations[shown]
+    path = 1e3 * all_positions[moving[:: -(-len(moving) // _PATH_POINTS)]]
+    base, platform = 1e3 * mechanism.base_joints, 1e3 * mechanism.platform_joints
+    joints = positions[:, None] + platform @ np.swapaxes(rotations, 1, 2)
+    base_ring, platform_ring = ring(base), ring(platform)
+    numbers = base + 0.12 * (base - base.mean(axis=0))
+    tube = _TUBE * 1e3 * mechanism.require_limits().stroke[:, :1]
+    points = np.concatenate([numbers, joints.reshape(-1, 3), path])
+    triad = 0.4 * np.linalg.norm(platform, axis=1).max()
+
+    def moving_parts(k: int) -> list[dict[str, Array]]:
+        legs = joints[k] - base
+        ends = base + tube * legs / np.linalg.norm(legs, axis=1, keepdims=True)
+        return [
+            coordinates(joints[k][platform_ring[:-1]]),
+            coordinates(joints[k][platform_ring]),
+            coordinates(segments(base, ends)),
+            coordinates(segments(ends, joints[k])),
+            coordinates(segments(np.broadcast_to(positions[k], (3, 3)), positions[k] + triad * rotations[k].T)),
+        ]
+
+    def frame(k: int) -> go.Frame:
+        plate, *lines = moving_parts(k)
+        data = [{"type": "mesh3d", **plate}, *({"type": "scatter3d", **line} for line in lines)]
+        return go.Frame(name=str(k), traces=list(range(len(data))), data=data)
+
+    plate, outline, tubes, rods, axes = moving_parts(0)
+    figure = go.Figure(
+        [
+            plate_trace(plate, "#6d87a3", 0.55),
+            line_trace(outline, "#3d5670", 6),
+            line_trace(tubes, segment_colors(LEG_NAMES[: mechanism.legs]), 14),
+            line_trace(rods, "#6b7683", 6),
+            line_trace(axes, segment_colors(AXIS_NAMES), 5),
+            plate_trace(coordinates(base[base_ring[:-1]]), FAINT, 0.35),
+            line_trace(coordinates(base[base_ring]), "#5c6873", 6),
+            line_trace(coordinates(path), FAINT, 2),
+            go.Scatter3d(coordinates(numbers), mode="text", text=[str(k) for k in range(mechanism.legs)], hoverinfo="skip"),
+        ],
+        frames=[frame(k) for k in range(count)],
+    )
+    figure.update_layout(
+        LAYOUT,
+        height=540,
+        margin={"l": 0, "r": 0, "t": 0, "b": 10},
+        showlegend=False,
+        uirevision="kept",
+        scene=scene(points, mechanism.up_in_base, np.array([0.0, 0.0, 1.0]) if mechanism.planar else None),
+        **_player(result.times[shown], frame_s),
+    )
+    return figure, span / count / frame_s
+
+
+def _player(times: Array, frame_s: float) -> dict[str, Any]:
+    """Buttons to play and pause, and a slider with a step for each frame."""
+    play = {"frame": {"duration": 1e3 * frame_s, "redraw": True}, "transition": {"duration": 0}, "fromcurrent": True}
+    show = {"frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}, "mode": "immediate"}
+    buttons = {
+        "type": "buttons",
+        "direction": "left",
+        "showactive": False,
+        "x": 0.0,
+        "xanchor": "left",
+        "y": 0.0,
+        "yanchor": "top",
+        "pad": {"t": 22, "l": 10},
+        "buttons": [
+            {"label": "▶", "method": "animate", "args": [None, play]},
+            {"label": "❚❚", "method": "animate", "args": [[None], show]},
+        ],
+    }
+    slider = {
+        "x": 0.16,
+        "len": 0.8,
+        "y": 0.0,
+        "pad": {"t": 10},
+        "ticklen": 0,
+        "minorticklen": 0,
+        "font": {"color": "rgba(0,0,0,0)", "size": 1},
+        "currentvalue": {"prefix": "time ", "suffix": " s", "xanchor": "right", "font": {"color": INK, "size": 13}},
+        "steps": [{"label": f"{time:.2f}", "method": "animate", "args": [[str(k)], show]} for k, time in enumerate(times)],
+    }
+    return {"updatemenus": [buttons], "sliders": [slider]}
+
+
+_SHARED_TIME = """
+const plots = document.querySelectorAll(".time .plotly-graph-div");
+plots.forEach(plot => plot.on("plotly_relayout", () => {
+  const range = plot.layout.xaxis.range;
+  plots.forEach(other => {
+    if (String(other.layout.xaxis.range) !== String(range)) Plotly.relayout(other, {"xaxis.range": [...range]});
+  });
+}));
+"""

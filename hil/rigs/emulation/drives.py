@@ -1,0 +1,249 @@
+"""The emulated rig: the plant with drives and IMUs as hardware has them, on a clock of its own, and without any bus. Compiled.
+
+What speaks a bus is around it (`hil.rigs.udp.emulator`, `hil.rigs.canopen.nodes`): it sets each drive's `request` and
+`target`, and takes a `sample`, for which the plant moves on to the present. Faults of IMUs, drives and load are done here,
+those of the bus there.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from controller.safety.watch import BRAKED, ENABLED, FAULTY, FOLLOWING, OFF, QUICK_STOP, QUICK_STOPPING, READY
+from hil.rigs.emulation.faults import (
+    DRIVE_FAULTS,
+    DRIVE_IGNORES,
+    DRIVE_RUNS_AWAY,
+    DRIVE_STUCK,
+    DRIVE_UNPOWERED,
+    FAULT,
+    IMU_BIASED,
+    IMU_DEAD,
+    IMU_FROZEN,
+    IMU_NOISY,
+    IMU_SWAPPED,
+    MOST_FAULTS,
+    PAYLOAD_JUMPS,
+    draw_normal,
+    is_active,
+)
+from plant.compiled import Record, kernel
+from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
+from plant.errors import InputError
+from plant.fmu.plant import CALLS, advance, read_imus, read_truth, write_command, write_drive_modes, write_payload_mass
+from plant.imu import measure
+from plant.mechanism import LEGS, Mechanism
+from plant.pose import rotate_by_vector
+
+EMULATED = np.dtype(
+    [
+        ("time_ns", np.int64),
+        ("step_ns", np.int64),
+        ("enabled_ns", np.int64),
+        ("deceleration", np.float64),
+        ("speed_limit", np.float64),
+        ("payload", np.float64),
+        ("added", np.float64),
+        ("request", np.int64, LEGS),
+        ("target", np.float64, LEGS),
+        ("reset", np.int64, LEGS),
+        ("drive", np.int64, LEGS),
+        ("code", np.int64, LEGS),
+        ("velocity", np.float64, LEGS),
+        ("measurement", np.float64, (3, IMU_COUNT, 3)),
+        ("sample_ns", np.int64, IMU_COUNT),
+        ("sequence", np.int64, IMU_COUNT),
+        ("truth", np.float64, CALLS["truth"].shape),
+        ("fault", FAULT, MOST_FAULTS),
+        ("faults", np.int64),
+        ("random", np.uint64, 1),
+        ("ideal", np.float64, (3, IMU_COUNT, 3)),
+        ("turn", np.float64, (3, 3)),
+        ("turned", np.float64, (3, 3)),
+        ("axis", np.float64, 3),
+    ],
+    align=True,
+)
+"""State of an emulated rig: its clock, the plant's largest step, when the drives were first enabled (negative before).
+
+What a bus sets: of each drive its `request` (`BRAKED`, `ENABLED`, `QUICK_STOP`) and `target` velocity [m/s], and a `reset` of
+its fault. What it reads: each drive's state (`OFF`, `READY`, `FOLLOWING`, `QUICK_STOPPING`, `FAULTY`) with its fault code and
+what it does just now (`velocity`, [m/s]), and of each IMU the last sample, its time and its number. A quick stop, and a
+fault's, is at the drives' own `deceleration` [m/s^2].
+"""
+
+
+POWER_LOST = 0x3220
+"""CiA 402's code for a voltage that was too low, which a drive reports when its power is back."""
+
+_SPEED_RESERVE = 1.5
+"""What a drive can do beyond the limit of velocity, for control."""
+
+
+def new_emulated(mechanism: Mechanism, step_ns: int, seed: int, faults: Iterable[Record] = ()) -> Record:
+    """An emulated rig (dtype `EMULATED`) whose drives are ready, with the limits and the payload of a mechanism.
+
+    Args:
+        mechanism: with limits.
+        step_ns: largest step of the plant [ns].
+        seed: of what the faults draw.
+        faults: each of dtype `FAULT`.
+    """
+    rig: Record = np.zeros((), EMULATED)
+    limits = mechanism.require_limits()
+    rig["step_ns"], rig["deceleration"], rig["speed_limit"] = step_ns, limits.acceleration, _SPEED_RESERVE * limits.velocity
+    rig["payload"] = mechanism.plant_parameters()["payload.mass"]
+    rig["enabled_ns"], rig["drive"], rig["random"] = -1, READY, seed + 1
+    for each in faults:
+        add_fault(rig, each)
+    return rig
+
+
+def add_fault(rig: Record, fault: Record) -> None:
+    """Schedule another fault.
+
+    Raises:
+        InputError: there are too many.
+    """
+    count = int(rig["faults"])
+    if count == MOST_FAULTS:
+        raise InputError(f"there are {count} faults already, and no more can be")
+    rig["fault"][count] = fault
+    rig["faults"] = count + 1
+
+
+@kernel
+def sample(calls: Record, imu: Record, rig: Record, now_ns: int) -> int:
+    """Let the plant move on to `now_ns` on the rig's clock, and read the IMUs; returns FMI's status."""
+    r, c = rig[()], calls[()]
+    status = move(calls, rig, now_ns)
+    status |= read_imus(calls) | read_truth(calls)
+    r.truth[:] = c.truth
+    r.ideal[:] = c.imu
+    for i in range(r.faults):
+        f = r.fault[i]
+        if not is_active(f, r.enabled_ns, r.time_ns):
+            continue
+        if f.kind == IMU_SWAPPED:
+            k, m = f.index, min(max(int(f.size), 0), IMU_COUNT - 1)
+            for kind in range(3):
+                for j in range(3):
+                    r.ideal[kind, k, j], r.ideal[kind, m, j] = r.ideal[kind, m, j], r.ideal[kind, k, j]
+        elif f.kind == IMU_BIASED:
+            _turn(r, f.index, f.size)
+    measure(imu, r.ideal, c.imu)
+    for k in range(IMU_COUNT):
+        silent = frozen = False
+        noise = 0.0
+        for i in range(r.faults):
+            f = r.fault[i]
+            if f.index == k and is_active(f, r.enabled_ns, r.time_ns):
+                silent = silent or f.kind == IMU_DEAD
+                frozen = frozen or f.kind == IMU_FROZEN
+                noise = f.size if f.kind == IMU_NOISY else noise
+        if silent:
+            continue
+        r.sequence[k] += 1
+        r.sample_ns[k] = r.time_ns
+        if frozen:
+            continue
+        for kind in range(3):
+            for j in range(3):
+                r.measurement[kind, k, j] = c.imu[kind, k, j]
+                if noise > 0.0 and kind < 2:
+                    r.measurement[kind, k, j] += draw_normal(r.random) * noise * (np.pi / 180.0 if kind == 0 else 0.1)
+    return status
+
+
+@kernel
+def _turn(r: Record, k: int, angle: float) -> None:
+    """Turn an IMU by an angle about its x axis; what it reads turns the other way."""
+    for i in range(3):
+        for j in range(3):
+            r.turn[i, j] = 1.0 if i == j else 0.0
+        r.axis[i] = 0.0
+    r.axis[0] = -angle
+    rotate_by_vector(r.turn, r.axis)
+    for kind in range(3):
+        for i in range(3):
+            r.turned[kind, i] = 0.0
+            for j in range(3):
+                r.turned[kind, i] += r.turn[i, j] * r.ideal[kind, k, j]
+    for kind in range(3):
+        r.ideal[kind, k] = r.turned[kind]
+
+
+@kernel
+def move(calls: Record, rig: Record, now_ns: int) -> int:
+    """Let the plant and the drives move on to `now_ns`; returns FMI's status."""
+    r, c = rig[()], calls[()]
+    status = 0
+    while r.time_ns < now_ns:
+        step = min(r.step_ns, now_ns - r.time_ns)
+        added = 0.0
+        for i in range(r.faults):
+            if r.fault[i].kind == PAYLOAD_JUMPS and is_active(r.fault[i], r.enabled_ns, r.time_ns):
+                added += r.fault[i].size
+        if added != r.added:
+            status |= write_payload_mass(calls, r.payload + added)
+            r.added = added
+        for k in range(LEGS):
+            _step_drive(r, k, 1e-9 * step)
+            moving = r.drive[k] == FOLLOWING or r.drive[k] == QUICK_STOPPING or r.velocity[k] != 0.0
+            c.mode[k] = VELOCITY if moving else BRAKE
+        status |= write_drive_modes(calls) | write_command(calls, r.velocity)
+        status |= advance(calls, 1e-9 * step)
+        r.time_ns += step
+    return status
+
+
+@kernel
+def _step_drive(r: Record, k: int, period: float) -> None:
+    """A drive's state and what it does, for a step of so long [s]."""
+    broken = unpowered = ignoring = stuck = running = False
+    runaway = 0.0
+    code = 0
+    for i in range(r.faults):
+        f = r.fault[i]
+        if f.index == k and is_active(f, r.enabled_ns, r.time_ns):
+            unpowered = unpowered or f.kind == DRIVE_UNPOWERED
+            ignoring = ignoring or f.kind == DRIVE_IGNORES
+            stuck = stuck or f.kind == DRIVE_STUCK
+            if f.kind == DRIVE_FAULTS:
+                broken, code = True, int(f.size)
+            if f.kind == DRIVE_RUNS_AWAY:
+                running, runaway = True, f.size
+    if unpowered:
+        r.drive[k], r.velocity[k] = OFF, 0.0
+        return
+    if r.drive[k] == OFF:
+        r.drive[k], r.code[k] = FAULTY, POWER_LOST
+    if broken and r.drive[k] != FAULTY:
+        r.drive[k], r.code[k] = FAULTY, code
+    if r.drive[k] == FAULTY:
+        if r.reset[k] != 0 and not broken and r.velocity[k] == 0.0:
+            r.drive[k], r.code[k] = READY, 0
+    elif r.request[k] == BRAKED:
+        r.drive[k] = READY
+    elif r.request[k] == ENABLED and r.drive[k] != QUICK_STOPPING:
+        if r.enabled_ns < 0:
+            r.enabled_ns = r.time_ns
+        r.drive[k] = FOLLOWING
+    elif r.request[k] == QUICK_STOP and r.drive[k] == FOLLOWING:
+        r.drive[k] = QUICK_STOPPING
+    r.reset[k] = 0
+    if stuck:
+        r.velocity[k] = 0.0
+    elif running and r.request[k] != BRAKED:
+        r.velocity[k] = runaway
+    elif ignoring and r.request[k] != BRAKED:
+        return
+    elif r.drive[k] == FOLLOWING:
+        r.velocity[k] = min(max(r.target[k], -r.speed_limit), r.speed_limit)
+    elif r.drive[k] == READY and r.request[k] == BRAKED:
+        r.velocity[k] = 0.0
+    else:
+        slower = r.deceleration * period
+        r.velocity[k] -= min(max(r.velocity[k], -slower), slower)
+        if r.velocity[k] == 0.0 and r.drive[k] == QUICK_STOPPING:
+            r.drive[k] = READY

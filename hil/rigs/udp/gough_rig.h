@@ -1,0 +1,155 @@
+/* Datagrams of gough's UDP rig, version 1, for firmware: C11, freestanding, for little-endian machines. docs/rigs.md describes
+ * the protocol, and hil/rigs/udp/reference_rig.c is a rig to start from.
+ *
+ * Every field is aligned to its size, so the structures need no packing. Some are longer in memory than on the wire, by padding
+ * at their end: a datagram ends with `crc`, and its length is GOUGH_..._LENGTH, not sizeof. SI units.
+ */
+#ifndef GOUGH_RIG_H
+#define GOUGH_RIG_H
+
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+#if defined(__BYTE_ORDER__) && __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
+#error "the datagrams are little-endian: swap the bytes of every field on this machine"
+#endif
+
+#define GOUGH_LEGS 6
+#define GOUGH_IMUS 7
+
+#define GOUGH_MAGIC 0x48475547u /* the bytes "GUGH" */
+#define GOUGH_VERSION 1u
+#define GOUGH_PORT 47100
+
+enum gough_kind { GOUGH_HELLO = 1, GOUGH_WELCOME, GOUGH_COMMAND, GOUGH_MEASUREMENT };
+
+/* What is asked of the drives: to hold on their brakes, to follow the velocities, to stop by themselves and then to hold. */
+enum gough_request { GOUGH_BRAKED, GOUGH_ENABLED, GOUGH_QUICK_STOP };
+
+/* What a drive says of itself. */
+enum gough_drive { GOUGH_FOLLOWING, GOUGH_READY, GOUGH_OFF, GOUGH_QUICK_STOPPING, GOUGH_FAULTY };
+
+#define GOUGH_WATCHDOG_CODE 0x8130u /* fault code: no command has come for too long (CiA 402: life guarding) */
+
+struct gough_head {
+    uint32_t magic;
+    uint16_t version;
+    uint16_t kind;
+    uint32_t session;  /* chosen by the controller, never 0 */
+    uint32_t sequence; /* of commands, from 1; an answer has its command's */
+    int64_t time_ns;   /* on the sender's own clock */
+};
+
+/* From the controller: begin a session. */
+struct gough_hello {
+    struct gough_head head;
+    uint32_t period_us; /* between commands, never 0 */
+    uint32_t reserved;
+    uint32_t crc;
+};
+
+/* From the rig: who it is. */
+struct gough_welcome {
+    struct gough_head head;
+    uint32_t watchdog_us; /* after how long without a command the drives stop; three periods at least */
+    uint32_t truthful;    /* 0; 1 of an emulated rig, which appends a struct gough_truth to its measurements */
+    uint8_t name[32];     /* ASCII, zeros behind */
+    uint8_t firmware[16];
+    uint32_t crc;
+};
+
+/* From the controller, once per period. */
+struct gough_command {
+    struct gough_head head;
+    uint32_t request;           /* enum gough_request */
+    uint32_t reset;             /* not 0: reset the drives' faults */
+    float velocity[GOUGH_LEGS]; /* positive extends the leg [m/s] */
+    uint32_t reserved;
+    uint32_t crc;
+};
+
+/* From the rig, once per command. */
+struct gough_measurement {
+    struct gough_head head;
+    int64_t sample_ns[GOUGH_IMUS];      /* when each IMU's sample was taken, on the rig's clock */
+    uint32_t sample_number[GOUGH_IMUS]; /* stands when a sample is repeated */
+    uint32_t refused;                   /* datagrams, since the session began */
+    uint8_t drive[GOUGH_LEGS];          /* enum gough_drive */
+    uint8_t reserved[2];
+    uint16_t code[GOUGH_LEGS];  /* fault codes, 0 without a fault */
+    float velocity[GOUGH_LEGS]; /* that the drives were really given [m/s] */
+    /* Angular velocity [rad/s], specific force [m/s^2], magnetic field [uT]; NaN where there is none. The last IMU is the
+     * platform's. */
+    float measurement[3][GOUGH_IMUS][3];
+    uint32_t crc;
+};
+
+/* What an emulated rig appends to a measurement. */
+struct gough_truth {
+    double truth[19];
+    uint32_t reserved;
+    uint32_t crc;
+};
+
+#define GOUGH_LENGTH(type) (offsetof(struct type, crc) + sizeof(uint32_t))
+#define GOUGH_HELLO_LENGTH GOUGH_LENGTH(gough_hello)
+#define GOUGH_WELCOME_LENGTH GOUGH_LENGTH(gough_welcome)
+#define GOUGH_COMMAND_LENGTH GOUGH_LENGTH(gough_command)
+#define GOUGH_MEASUREMENT_LENGTH GOUGH_LENGTH(gough_measurement)
+#define GOUGH_TRUTH_LENGTH GOUGH_LENGTH(gough_truth)
+
+_Static_assert(sizeof(float) == 4 && sizeof(double) == 8, "IEEE 754");
+_Static_assert(sizeof(struct gough_head) == 24, "head");
+_Static_assert(offsetof(struct gough_head, time_ns) == 16, "head.time_ns");
+_Static_assert(offsetof(struct gough_hello, period_us) == 24, "hello.period_us");
+_Static_assert(GOUGH_HELLO_LENGTH == 36, "hello");
+_Static_assert(offsetof(struct gough_welcome, name) == 32, "welcome.name");
+_Static_assert(offsetof(struct gough_welcome, firmware) == 64, "welcome.firmware");
+_Static_assert(GOUGH_WELCOME_LENGTH == 84, "welcome");
+_Static_assert(offsetof(struct gough_command, velocity) == 32, "command.velocity");
+_Static_assert(GOUGH_COMMAND_LENGTH == 64, "command");
+_Static_assert(offsetof(struct gough_measurement, sample_ns) == 24, "measurement.sample_ns");
+_Static_assert(offsetof(struct gough_measurement, sample_number) == 80, "measurement.sample_number");
+_Static_assert(offsetof(struct gough_measurement, refused) == 108, "measurement.refused");
+_Static_assert(offsetof(struct gough_measurement, drive) == 112, "measurement.drive");
+_Static_assert(offsetof(struct gough_measurement, code) == 120, "measurement.code");
+_Static_assert(offsetof(struct gough_measurement, velocity) == 132, "measurement.velocity");
+_Static_assert(offsetof(struct gough_measurement, measurement) == 156, "measurement.measurement");
+_Static_assert(GOUGH_MEASUREMENT_LENGTH == 412, "measurement");
+_Static_assert(GOUGH_TRUTH_LENGTH == 160, "truth");
+
+/* CRC-32 (IEEE 802.3, as in zlib), without a table: 8 steps a byte. */
+static inline uint32_t gough_crc32(const void *data, size_t length) {
+    const uint8_t *byte = data;
+    uint32_t crc = 0xFFFFFFFFu;
+    for (size_t i = 0; i < length; i++) {
+        crc ^= byte[i];
+        for (int bit = 0; bit < 8; bit++)
+            crc = crc & 1u ? crc >> 1 ^ 0xEDB88320u : crc >> 1;
+    }
+    return crc ^ 0xFFFFFFFFu;
+}
+
+/* Whether the `received` bytes are a datagram of this kind and length. */
+static inline int gough_check(const void *data, size_t received, size_t length, enum gough_kind kind) {
+    struct gough_head head;
+    uint32_t crc;
+    if (received != length)
+        return 0;
+    memcpy(&head, data, sizeof head);
+    memcpy(&crc, (const uint8_t *)data + length - sizeof crc, sizeof crc);
+    return head.magic == GOUGH_MAGIC && head.version == GOUGH_VERSION && head.kind == kind &&
+           crc == gough_crc32(data, length - sizeof crc);
+}
+
+/* Write the head and the CRC of a datagram of this kind and length, whose other fields have been written. */
+static inline void gough_finish(void *data, size_t length, enum gough_kind kind, uint32_t session, uint32_t sequence,
+                                int64_t time_ns) {
+    struct gough_head head = {GOUGH_MAGIC, GOUGH_VERSION, (uint16_t)kind, session, sequence, time_ns};
+    memcpy(data, &head, sizeof head);
+    uint32_t crc = gough_crc32(data, length - sizeof crc);
+    memcpy((uint8_t *)data + length - sizeof crc, &crc, sizeof crc);
+}
+
+#endif

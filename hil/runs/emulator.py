@@ -1,0 +1,296 @@
+"""An emulated rig in a process of its own: the plant on the machine's clock, behind a bus, with faults on demand.
+
+It speaks the bus as hardware would, and knows nothing of the controller. A session begins with the platform at its start. A
+control channel, one text datagram per question and answer, injects faults and tells the state.
+"""
+
+import json
+import select
+import signal
+import socket
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from controller.planning.target import load_target
+from controller.safety.watch import FOLLOWING, QUICK_STOPPING
+from hil.loop.driver import prevent_compilation
+from hil.realtime.scheduling import RealTimeSettings, real_time
+from hil.rigs.emulation.drives import add_fault, new_emulated
+from hil.rigs.emulation.faults import fault
+from hil.rigs.udp.datagrams import HELLO, HELLO_DATAGRAM, WELCOME, WELCOME_DATAGRAM, decode, encode
+from hil.rigs.udp.emulator import WATCHDOG_S, UdpEmulator, new_udp_emulator, serve
+from hil.rigs.udp.rig import DEFAULT_ADDRESS, parse_address, socket_address
+from hil.runs.simulation import SimulationConfig, simulated_plant
+from plant.compiled import Record
+from plant.errors import GoughError, InputError
+from plant.fmu.plant import FmuPlant
+from plant.imu import imu_state, load_imu
+from plant.mechanism import load_spatial
+
+_STEP_NS = 1_000_000
+_TURN_NS = 20_000_000
+_IDLE_S = 0.1
+_NAME = "gough emulated hexapod"
+
+
+class BusyError(GoughError, OSError):
+    """An address cannot be had."""
+
+
+@dataclass(frozen=True)
+class EmulatorConfig:
+    """What is emulated.
+
+    Attributes:
+        simulated: mechanism, IMUs, seed, and the target at whose first pose the platform stands.
+        bus: "udp" or "canopen".
+        at: the address, or the settings' file; None for the default.
+        control: address of the control channel.
+        faults: from the start, as `hil.rigs.emulation.faults.fault` reads them.
+        watchdog: after how long without a command the drives stop, on UDP [s].
+    """
+
+    simulated: SimulationConfig = field(default_factory=SimulationConfig)
+    bus: str = "udp"
+    at: str | None = None
+    control: str = "127.0.0.1:47101"
+    faults: tuple[str, ...] = ()
+    watchdog: float = WATCHDOG_S
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.watchdog < 60.0:
+            raise InputError(f"the watchdog is {1e3 * self.watchdog:g} ms; it must be more than 0 and less than a minute")
+
+
+class _Stopped:
+    """Whether a signal has asked to end."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, self._ask)
+
+    def _ask(self, number: int, frame: object) -> None:
+        del number, frame
+        self.asked = True
+
+
+def emulate(config: EmulatorConfig, settings: RealTimeSettings, say: Callable[[str], None]) -> None:
+    """Emulate a rig until SIGINT, SIGTERM or SIGHUP, or `stop` on the control channel.
+
+    Args:
+        config: what to emulate.
+        settings: of the process: priority and processor.
+        say: is told what is going on.
+
+    Raises:
+        GoughError: something in the configuration cannot be used, or an address cannot be had.
+    """
+    faults = [fault(text) for text in config.faults]
+    stopped = _Stopped()
+    with ExitStack() as stack:
+        control = _Control(stack.enter_context(_bound(config.control)), stopped)
+        if config.bus == "canopen":
+            _emulate_canopen(config, faults, settings, say, control, stopped)
+            return
+        opened = stack.enter_context(_bound(config.at or DEFAULT_ADDRESS))
+        _load(config)
+        refused = stack.enter_context(real_time(settings))
+        for text in refused:
+            say(f"without {text}")
+        say(f"the rig {config.simulated.mechanism} listens at {config.at or DEFAULT_ADDRESS}, its control at {config.control}")
+        while not stopped.asked:
+            readable, _, _ = select.select([opened, control.socket], [], [], _IDLE_S)
+            if control.socket in readable:
+                control.answer(None)
+            if opened in readable:
+                content, sender = opened.recvfrom(2048)
+                hello = _hello(content)
+                if hello is not None:
+                    _serve_sessions(opened, hello, sender, config, faults, control, say, stopped)
+
+
+def _emulate_canopen(
+    config: EmulatorConfig, faults: list[Record], settings: RealTimeSettings, say: Callable[[str], None], control: "_Control",
+    stopped: _Stopped,
+) -> None:  # fmt: skip
+    from hil.rigs.canopen.emulator import PlantMachine, serve_canopen
+    from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings
+
+    bus = canopen_settings(config.at or DEFAULT_FILE)
+    machine = PlantMachine(lambda: _rig_of(config, 1.0 / config.simulated.rate, faults))
+    try:
+        machine.sample(time.monotonic_ns())
+        with real_time(settings) as refused:
+            for text in refused:
+                say(f"without {text}")
+            where = f"{bus.bus.interface} {bus.bus.channel}"
+            say(f"the rig {config.simulated.mechanism} listens at {where}, its control at {config.control}")
+            serve_canopen(bus, machine, lambda: stopped.asked, control.answer)
+    finally:
+        machine.close()
+
+
+def _bound(address: str) -> socket.socket:
+    host, port = parse_address(address)
+    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        opened.bind((host, port))
+    except OSError as error:
+        opened.close()
+        raise BusyError(f"cannot listen at {address}: {error.strerror}: is another emulator running there?") from None
+    return opened
+
+
+class _Control:
+    """The control channel."""
+
+    def __init__(self, opened: socket.socket, stopped: _Stopped) -> None:
+        self.socket = opened
+        self._stopped = stopped
+        opened.setblocking(False)
+
+    def answer(self, rig: Record | None, told: dict[str, Any] | None = None) -> None:
+        """Answer what has been asked; without a rig there is no session."""
+        while True:
+            try:
+                content, sender = self.socket.recvfrom(4096)
+            except OSError:
+                return
+            command, _, argument = content.decode("utf-8", "replace").strip().partition(" ")
+            try:
+                reply = self._do(command, argument.strip(), rig, told or {})
+            except GoughError as error:
+                reply = {"error": str(error)}
+            self.socket.sendto(json.dumps(reply).encode(), sender)
+
+    def _do(self, command: str, argument: str, rig: Record | None, told: dict[str, Any]) -> dict[str, Any]:
+        if command == "stop":
+            self._stopped.asked = True
+            return {"stopping": True}
+        if rig is None:
+            raise InputError("no controller has begun a session: there is nothing to ask or to disturb")
+        if command == "fault":
+            made = fault(argument)
+            if made["begin_ns"] < 0 and rig["enabled_ns"] >= 0:
+                passed = int(rig["time_ns"] - rig["enabled_ns"])
+                made["begin_ns"], made["end_ns"] = passed, min(int(made["end_ns"]), 2**62) + passed
+            add_fault(rig, made)
+            return {"fault": argument}
+        if command == "clear":
+            rig["faults"] = 0
+            return {"faults": 0}
+        if command == "state":
+            return {
+                "time_s": 1e-9 * int(rig["time_ns"]),
+                "drive": rig["drive"].tolist(),
+                "code": rig["code"].tolist(),
+                "velocity": rig["velocity"].tolist(),
+                "lengths": rig["truth"][7:13].tolist(),
+                **told,
+            }
+        raise InputError(f"the control channel knows fault, clear, state and stop, not {command!r}")
+
+
+def ask(address: str, question: str, patience: float = 2.0) -> dict[str, Any]:
+    """Ask an emulator's control channel.
+
+    Raises:
+        GoughError: nobody answers, or the emulator refuses.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+        opened.settimeout(patience)
+        try:
+            opened.sendto(question.encode(), parse_address(address))
+            reply: dict[str, Any] = json.loads(opened.recv(65536))
+        except OSError:
+            raise BusyError(f"no emulator answers at {address}: start one with 'gough emulate'") from None
+    if "error" in reply:
+        raise InputError(reply["error"])
+    return reply
+
+
+def _rig_of(config: EmulatorConfig, period: float, faults: list[Record]) -> tuple[FmuPlant, Record, Record]:
+    """The plant at its start, the IMUs and the drives."""
+    simulated = config.simulated
+    mechanism = load_spatial(simulated.mechanism)
+    start = load_target(simulated.target, mechanism, 1.0).start
+    plant = simulated_plant(simulated, mechanism, start)
+    imu = imu_state(load_imu(simulated.imu), simulated.seed, period, simulated.wiring)
+    return plant, imu, new_emulated(mechanism, _STEP_NS, simulated.seed, faults)
+
+
+def _load(config: EmulatorConfig) -> None:
+    """Load or compile the machine code before anyone waits for it."""
+    plant, imu, rig = _rig_of(config, 1e-3, [])
+    with plant, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as scratch:
+        emulator = new_udp_emulator(plant.calls, imu, rig)
+        emulator.socket["descriptor"] = scratch.fileno()
+        serve(emulator, time.monotonic_ns(), 0, np.zeros(2, np.int64))
+
+
+def _serve_sessions(
+    opened: socket.socket, hello: Record, sender: tuple[str, int], config: EmulatorConfig, faults: list[Record],
+    control: _Control, say: Callable[[str], None], stopped: _Stopped,
+) -> None:  # fmt: skip
+    """Serve one session after the other."""
+    following: tuple[Record, tuple[str, int]] | None = (hello, sender)
+    while following is not None and not stopped.asked:
+        hello, sender = following
+        period = 1e-6 * int(hello["period_us"])
+        plant, imu, rig = _rig_of(config, period, faults)
+        with plant:
+            emulator = new_udp_emulator(plant.calls, imu, rig, int(hello["session"]), _watchdog(config, hello))
+            emulator.socket["descriptor"], emulator.socket["peer"] = opened.fileno(), socket_address(sender)
+            _welcome(opened, config, hello, sender)
+            say(f"session with {sender[0]}:{sender[1]} at {1.0 / period:g} Hz")
+            following = _serve_session(opened, config, emulator, control, stopped)
+            say(f"end of the session; {int(emulator.port['refused'])} datagrams refused")
+
+
+def _hello(content: bytes) -> Record | None:
+    """A hello that begins a session, if these bytes are one."""
+    hello = decode(HELLO_DATAGRAM, HELLO, content)
+    return hello if hello is not None and hello["session"] != 0 and hello["period_us"] != 0 else None
+
+
+def _watchdog(config: EmulatorConfig, hello: Record) -> float:
+    """After how long without a command the drives stop [s]: three periods at least."""
+    return max(config.watchdog, 3e-6 * int(hello["period_us"]))
+
+
+def _welcome(opened: socket.socket, config: EmulatorConfig, hello: Record, sender: tuple[str, int]) -> None:
+    name, firmware = (np.frombuffer(text.encode().ljust(size, b"\0"), np.uint8) for text, size in ((_NAME, 32), ("1", 16)))
+    fields = {"session": hello["session"], "watchdog_us": round(1e6 * _watchdog(config, hello)), "truthful": 1, "name": name}
+    opened.sendto(encode(WELCOME_DATAGRAM, kind=WELCOME, firmware=firmware, **fields), sender)
+
+
+def _serve_session(
+    opened: socket.socket, config: EmulatorConfig, emulator: UdpEmulator, control: _Control, stopped: _Stopped
+) -> tuple[Record, tuple[str, int]] | None:
+    """Serve until the end; returns the hello that begins another session, and whose it is."""
+    started, timespec = time.monotonic_ns(), np.zeros(2, np.int64)
+    emulator.port["heard_ns"] = 0
+    with prevent_compilation():
+        while not stopped.asked:
+            met = serve(emulator, started, _TURN_NS, timespec)
+            control.answer(emulator.rig, {"refused": int(emulator.port["refused"])})
+            if not met:
+                continue
+            content = emulator.command_bytes[: HELLO_DATAGRAM.itemsize].tobytes()
+            hello = _hello(content)
+            address = bytes(emulator.socket["sender"])
+            sender = (socket.inet_ntoa(address[4:8]), int.from_bytes(address[2:4], "big"))
+            # A rig that moves has one controller.
+            if hello is None or np.isin(emulator.rig["drive"], (FOLLOWING, QUICK_STOPPING)).any():
+                emulator.port["refused"] += 1
+            elif hello["session"] == emulator.port["session"]:
+                _welcome(opened, config, hello, sender)
+            else:
+                return hello, sender
+    return None

@@ -1,0 +1,141 @@
+"""Snapshots: all that the future of a simulation depends on, in a file, from which it goes on bit for bit.
+
+That is the plant's own state, and every array that the loop changes: the cycle's state, the IMUs' noise, the clock. What
+follows from the configuration, such as the motion and the gains, is made anew and must be the same as it was.
+"""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import msgpack
+from numpy.typing import NDArray
+
+from controller.planning.segments import START
+from hil.loop.driver import Loop
+from plant.errors import InputError
+from plant.files import write_whole
+from plant.fmu.plant import FmuPlant
+from plant.pose import Array
+
+_KIND = "gough snapshot"
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """A simulation between two cycles.
+
+    Attributes:
+        config: of the simulation, as plain values.
+        cycle: the next to run.
+        settings: a hash of what does not change: the cycle's parameters, the FMU and its binding.
+        motion: that was planned until then, a hash.
+        memory: the loop's arrays by name.
+        plant: the state of the FMU and its clock.
+    """
+
+    config: Mapping[str, Any]
+    cycle: int
+    settings: bytes
+    motion: bytes
+    memory: Mapping[str, bytes]
+    plant: bytes
+
+
+def take_snapshot(config: Mapping[str, Any], loop: Loop, plant: FmuPlant) -> Snapshot:
+    """Keep a simulation as it is between two cycles.
+
+    Raises:
+        FmuError: the FMU cannot save its state.
+    """
+    cycle = int(loop.state["cycle"])
+    memory = {name: array.tobytes() for name, array in loop.memory().items()}
+    return Snapshot(config, cycle, _settings(loop, plant), _motion(loop, cycle), memory, plant.state())
+
+
+def resume_snapshot(snapshot: Snapshot, loop: Loop, plant: FmuPlant) -> None:
+    """Go on from a snapshot, in a loop that has just been prepared from its configuration.
+
+    Raises:
+        InputError: the loop is not the one that the snapshot is of, or has no cycle left.
+        FmuError: the FMU is another one, or cannot restore its state.
+    """
+    if snapshot.settings != _settings(loop, plant):
+        raise InputError(
+            "this simulation cannot go on from the snapshot, for its mechanism, calibration, FMU or binding have changed since"
+        )
+    if snapshot.motion != _motion(loop, snapshot.cycle):
+        raise InputError(
+            "this simulation cannot go on from the snapshot, for until then another motion was planned: take the snapshot in a "
+            "run that is as long, with --save-at"
+        )
+    if snapshot.cycle >= len(loop.records):
+        raise InputError(
+            f"the snapshot is of the end of its motion of {snapshot.config['duration']:g} s: go on with a longer --duration"
+        )
+    memory = loop.memory()
+    if {name: len(kept) for name, kept in snapshot.memory.items()} != {name: array.nbytes for name, array in memory.items()}:
+        raise InputError("this simulation cannot go on from the snapshot, for its memory is laid out in another way")
+    plant.restore(snapshot.plant)
+    for name, array in memory.items():
+        array.reshape(-1).view("u1")[:] = memoryview(snapshot.memory[name])
+
+
+def write_snapshot(snapshot: Snapshot, path: Path) -> None:
+    """Write a snapshot's file, which takes its place only when it is complete.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    content = {"kind": _KIND, "version": version("gough"), **vars(snapshot)}
+    write_whole(path, msgpack.packb(content))
+
+
+def read_snapshot(path: Path) -> Snapshot:
+    """Read a snapshot's file.
+
+    Raises:
+        InputError: it cannot be read, or is no snapshot.
+    """
+    try:
+        content = msgpack.unpackb(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"cannot read the snapshot {path}: {error.strerror}") from None
+    except Exception:
+        content = None
+    if not isinstance(content, dict) or content.pop("kind", None) != _KIND:
+        raise InputError(f"{path} is no snapshot of 'gough simulate --save-state'")
+    if (of := content.pop("version", None)) != version("gough"):
+        raise InputError(f"{path} is of gough {of}, and this is gough {version('gough')}: go on with the version that it is of")
+    try:
+        return Snapshot(**content)
+    except TypeError:
+        raise InputError(f"{path} is a snapshot that lacks something, or has something unknown") from None
+
+
+def _hash(content: bytes) -> bytes:
+    return hashlib.sha256(content).digest()
+
+
+def _settings(loop: Loop, plant: FmuPlant) -> bytes:
+    """A hash of what does not change in a run; the arrays are those that the loop reads and writes the FMU by."""
+    bound = plant.bound
+    arrays: list[NDArray[Any]] = [
+        *bound.sensed,
+        *bound.known,
+        *bound.commanded,
+        *bound.loaded,
+        bound.modes.references,
+        bound.modes.values,
+    ]
+    return _hash(b"".join([loop.parameters.tobytes(), plant.path.read_bytes(), *(array.tobytes() for array in arrays)]))
+
+
+def _motion(loop: Loop, cycle: int) -> bytes:
+    """The segments that have begun by a cycle."""
+    segments: Array = loop.segments
+    begun = segments[:, :, START] <= cycle * float(loop.parameters["period"])
+    return _hash(segments[begun].tobytes())

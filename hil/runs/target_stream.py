@@ -1,0 +1,308 @@
+"""Streamed targets: poses come as UDP datagrams, about 100 a second, and a process of its own plans how to follow them.
+
+    sender --UDP--> receiver   checks each pose, plans, writes into shared memory and never waits for the loop
+                      loop     takes the plans as they come (see `controller.planning.stream`)
+
+A datagram of version 1 is little endian and packed, 78 bytes: `GGHT`, version (2 bytes), sequence number (4), time of the
+pose on the sender's clock [ns] (8), displacement from home x, y, z [m] and turn from home as a unit quaternion, w first (7
+doubles), and the CRC-32 of all that (4). UDP tells nobody who sends: by default only this machine is listened to, and only
+the first sender.
+"""
+
+import math
+import os
+import select
+import socket
+import struct
+import time
+import zlib
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from statistics import median
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from controller.planning.stream import CAUSE, CYCLE, DONE, SEEN, STREAM, TAKEN, fail_stream, note_sample, publish_plan
+from controller.planning.stream_planner import Plan, StreamPlanner, TargetRefusedError
+from controller.planning.target import Target
+from controller.safety.watch import NO_CAUSE
+from plant.compiled import Record
+from plant.errors import GoughError, InputError
+from plant.mechanism import Mechanism
+from plant.pose import Array, quaternion_from_rotation
+
+HOST, PORT = "127.0.0.1", 47200
+MAGIC, VERSION = b"GGHT", 1
+_BODY = struct.Struct("<4sHIQ7d")
+_SUM = struct.Struct("<I")
+DATAGRAM_BYTES = _BODY.size + _SUM.size
+_SEQUENCES = 1 << 32
+
+LEAD_S = 0.01
+"""How long before it begins a plan is made: what planner and loop may be late by together."""
+
+_POLL_S = 0.02
+_SETTLE_S = 1e-3
+"""How long the receiver sleeps at most while it waits for a sample, and for what the loop does with a plan."""
+
+_CLOCK_SAMPLES = 15
+"""Over how many samples the sender's clock is compared with the motion's time, against the jitter of the way."""
+
+_BATCH = 64
+
+
+class StreamError(GoughError, OSError):
+    """The network refuses what a stream needs."""
+
+
+class Sample(NamedTuple):
+    """A pose of the target: number, time on the sender's clock [ns], displacement (3,) [m], quaternion (4,), w first."""
+
+    sequence: int
+    time_ns: int
+    displacement: tuple[float, ...]
+    quaternion: tuple[float, ...]
+
+
+def encode(sample: Sample) -> bytes:
+    """The datagram of a sample."""
+    body = _BODY.pack(
+        MAGIC, VERSION, sample.sequence % _SEQUENCES, sample.time_ns, *sample.displacement, *sample.quaternion
+    )  # fmt: skip
+    return body + _SUM.pack(zlib.crc32(body))
+
+
+def decode(datagram: bytes) -> Sample | None:
+    """The sample of a datagram; None if it is malformed, damaged, or of another version."""
+    if len(datagram) != DATAGRAM_BYTES:
+        return None
+    body = datagram[: _BODY.size]
+    if _SUM.unpack(datagram[_BODY.size :])[0] != zlib.crc32(body):
+        return None
+    magic, version, sequence, time_ns, *pose = _BODY.unpack(body)
+    if magic != MAGIC or version != VERSION:
+        return None
+    return Sample(sequence, time_ns, tuple(pose[:3]), tuple(pose[3:]))
+
+
+def open_socket(host: str = HOST, port: int = PORT) -> socket.socket:
+    """A socket that receives a stream; port 0 takes a free one.
+
+    Raises:
+        StreamError: the address is not to be had.
+    """
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        receiver = socket.socket(family, socket.SOCK_DGRAM)
+        try:
+            receiver.bind(address)
+        except OSError:
+            receiver.close()
+            raise
+    except (OSError, OverflowError) as error:
+        raise StreamError(f"cannot receive a target at {host}:{port}: {error}: choose another address or port") from None
+    receiver.setblocking(False)
+    return receiver
+
+
+def receive(
+    stream: Record,
+    planner: StreamPlanner,
+    receiver: socket.socket,
+    period: float,
+    lead: float = LEAD_S,
+    ended: Callable[[], bool] = lambda: False,
+) -> None:
+    """Receive a stream and plan, until `DONE` is set or the process that started this one is gone; a process's body.
+
+    A sample that cannot be followed fails the stream for good: no more is planned, and the last plan ends at rest.
+
+    Args:
+        stream: dtype `controller.planning.stream.STREAM`, shared with the loop.
+        planner: at the lengths where the loop's reference rests.
+        receiver: from `open_socket`.
+        period: of a cycle [s].
+        lead: how long before it begins a plan is made [s].
+        ended: whether to end for another reason.
+    """
+    parent = os.getppid()
+    _load_kernels()
+    reception = Reception(stream, planner, period, lead)
+    while not (stream["shared"][DONE] or ended() or os.getppid() != parent):
+        select.select([receiver], [], [], _SETTLE_S if reception.waits else _POLL_S)
+        for _ in range(_BATCH):
+            try:
+                datagram, sender = receiver.recvfrom(DATAGRAM_BYTES + 1)
+            except BlockingIOError:
+                break
+            except OSError:
+                # What the network says of an earlier datagram is none of the stream's.
+                continue
+            reception.take(datagram, sender)
+        reception.plan()
+
+
+def _load_kernels() -> None:
+    """Run the kernels once on scratch, so that none has to be loaded or compiled when a sample has come."""
+    scratch = np.zeros((), STREAM)
+    publish_plan(scratch, np.zeros(STREAM["plans"].shape[1:]), 0.0, 0)
+    note_sample(scratch, 1)
+    fail_stream(scratch, NO_CAUSE, 0, 0.0, 0.0)
+
+
+class Reception:
+    """What the receiver knows: who sends, the last sample, the sender's clock, and the plan that the loop may yet take."""
+
+    def __init__(self, stream: Record, planner: StreamPlanner, period: float, lead: float) -> None:
+        self._stream, self._planner, self._period = stream, planner, period
+        self._shared = stream["shared"]
+        self._lead = math.ceil(lead / period - 1e-9)
+        self._sender: object = None
+        self._last: Sample | None = None
+        self._first, self._at = 0, 0.0
+        self._offsets: deque[float] = deque(maxlen=_CLOCK_SAMPLES)
+        self._pending: tuple[int, Plan] | None = None
+        self._fresh = False
+
+    @property
+    def waits(self) -> bool:
+        """Whether it is for the loop to say what becomes of a plan."""
+        return self._pending is not None
+
+    def take(self, datagram: bytes, sender: object) -> None:
+        """Check a datagram, and keep its sample."""
+        stream, sample = self._stream, decode(datagram)
+        if sample is None:
+            stream["malformed"] += 1
+            return
+        if self._last is not None:
+            if sender != self._sender:
+                stream["strange"] += 1
+                return
+            newer = 0 < (sample.sequence - self._last.sequence) % _SEQUENCES < _SEQUENCES // 2
+            if not (newer and sample.time_ns > self._last.time_ns):
+                stream["stale"] += 1
+                return
+        if self._shared[CAUSE] != NO_CAUSE:
+            return
+        if self._last is None:
+            self._first = sample.time_ns
+        at = 1e-9 * (sample.time_ns - self._first)
+        try:
+            self._planner.add(at, sample.displacement, sample.quaternion)
+        except TargetRefusedError as refusal:
+            fail_stream(stream, refusal.cause, refusal.index, refusal.value, refusal.limit)
+            return
+        self._sender, self._last, self._at, self._fresh = sender, sample, at, True
+        cycle = int(self._shared[CYCLE])
+        if cycle == 0:
+            # The motion's time stands still until it begins.
+            self._offsets.clear()
+        self._offsets.append(cycle * self._period - at)
+        stream["accepted"] += 1
+        note_sample(stream, time.monotonic_ns())
+
+    def plan(self) -> None:
+        """See what has become of the last plan, and make one for the newest sample."""
+        stream, shared = self._stream, self._shared
+        if self._pending is not None:
+            number, plan = self._pending
+            if shared[SEEN] < number:
+                return
+            self._pending = None
+            if shared[TAKEN] == number:
+                self._planner.follow(plan)
+            else:
+                stream["late"] += 1
+        if not self._fresh or shared[CAUSE] != NO_CAUSE:
+            return
+        self._fresh = False
+        begin = max((int(shared[CYCLE]) + self._lead) * self._period, self._planner.current.begin)
+        made = self._planner.plan(begin, begin - (self._at + median(self._offsets)))
+        if made is not None:
+            self._pending = publish_plan(stream, made.segments, made.begin, int(shared[TAKEN])), made
+            stream["planned"] += 1
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What a sender may do wrong on purpose, at a time of its motion [s]: fall silent, jump by 5 cm, send what is no number."""
+
+    stop_at: float = math.inf
+    jump_at: float = math.inf
+    nan_at: float = math.inf
+
+
+_JUMP_M = 0.05
+
+
+def send_target(
+    mechanism: Mechanism,
+    target: Target,
+    rate: float = 100.0,
+    host: str = HOST,
+    port: int = PORT,
+    duration: float | None = None,
+    faults: Faults | None = None,
+) -> int:
+    """Stream a target in real time, each pose at its time; returns how many were sent.
+
+    Args:
+        mechanism: whose home the displacements are from.
+        target: the motion.
+        rate: poses per second [Hz].
+        host: where to.
+        port: where to.
+        duration: of the motion [s]; None for all of it.
+        faults: what to do wrong.
+
+    Raises:
+        InputError: the rate or the duration is not positive and finite, or the rate above 10 kHz.
+        StreamError: there is no such address.
+    """
+    duration = float(target.times[-1]) if duration is None else duration
+    if not 0.0 < rate <= 10_000.0:
+        raise InputError(f"the rate is {rate:g} Hz; it must be positive and at most 10000: choose another")
+    if not 0.0 < duration < math.inf:
+        raise InputError(f"the duration is {duration:g} s; it must be positive and finite")
+    times = np.arange(math.floor(duration * rate) + 1) / rate
+    displacements, quaternions = _streamed(mechanism, target, times, faults or Faults())
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        with socket.socket(family, socket.SOCK_DGRAM) as sender:
+            return _send(sender, address, rate, displacements, quaternions)
+    except (OSError, OverflowError) as error:
+        raise StreamError(f"cannot send a target to {host}:{port}: {error}: choose another address or port") from None
+
+
+def _streamed(mechanism: Mechanism, target: Target, times: Array, faults: Faults) -> tuple[Array, Array]:
+    """Displacements (n, 3) and quaternions (n, 4) from home at times (n,), with what is to be wrong."""
+    home = mechanism.require_home()
+    times = times[times < faults.stop_at]
+    positions, rotations = target.at(times)
+    displacements = positions - home.position
+    displacements[times >= faults.jump_at] += [0.0, 0.0, _JUMP_M]
+    displacements[times >= faults.nan_at] = np.nan
+    return displacements, quaternion_from_rotation(rotations @ home.rotation.T)
+
+
+def _send(sender: socket.socket, address: tuple[Any, ...], rate: float, displacements: Array, quaternions: Array) -> int:
+    began, sent = time.monotonic_ns(), 0
+    for k, (displacement, quaternion) in enumerate(zip(displacements.tolist(), quaternions.tolist(), strict=True)):
+        due = began + round(1e9 * k / rate)
+        late = time.monotonic_ns() - due
+        if late > 1e9 / rate:
+            # As with any sender that is held up: what is past is not sent any more.
+            continue
+        if late < 0:
+            time.sleep(-1e-9 * late)
+        datagram = encode(Sample(k, due, tuple(displacement), tuple(quaternion)))
+        try:
+            sender.sendto(datagram, address)
+        except ConnectionRefusedError:
+            # Nobody listens yet, or any more.
+            continue
+        sent += 1
+    return sent

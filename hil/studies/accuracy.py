@@ -1,0 +1,308 @@
+"""How accurate direct kinematics is: Monte Carlo runs against the Cramér-Rao bound, for a mechanism and for every class.
+
+Noise is that of the sigmas of `controller.direct_kinematics.spatial`: 0.05 deg on each component of a leg's direction and on
+roll and pitch, 1.5 deg on a magnetic yaw.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from controller.direct_kinematics import Solutions, required_measurements, solve_batch, solve_planar
+from controller.direct_kinematics.consistency import chi_square_quantile
+from controller.direct_kinematics.spatial import LEG_SIGMA, NEEDS, TILT_SIGMA, YAW_SIGMA
+from hil.reports.markdown import markdown_table
+from plant.errors import InputError, SingularConfigurationError
+from plant.mechanism import LEGS, Mechanism
+from plant.mechanism.classification import (
+    MechanismClass,
+    classify,
+    draw_mechanism,
+    draw_planar_mechanism,
+    planar_classes,
+    spatial_classes,
+)
+from plant.pose import Array, checked_seed, rotation_angle, rotation_from_vector
+
+ALL_LEGS = tuple(range(LEGS))
+
+_REACH, _TILT = 1.0 / 6.0, np.radians(15.0)
+"""Poses are drawn within this share of the base's radius and this angle about home: 50 mm and 15 deg on `hexapod`."""
+_TWO_LEGS = (0, 3)
+_BOUND_SHARE = 0.99
+_CLASS_MECHANISMS, _CLASS_POSES = 20, 50
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """A way to the pose: a method of direct kinematics, the legs it is given, and whether it is refined."""
+
+    label: str
+    method: str
+    legs: tuple[int, ...]
+    refine: bool
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of an estimator over many noisy poses.
+
+    Attributes:
+        position_rms, rotation_rms: root mean square error [m], [rad].
+        position_over_bound, rotation_over_bound: the same over the Cramér-Rao bound of what the estimator is given.
+        nees: mean normalised squared error by the covariance that is stated; 6 if that is right and the pose refined.
+        solved: share of the poses that were found.
+    """
+
+    position_rms: float
+    rotation_rms: float
+    position_over_bound: float
+    rotation_over_bound: float
+    nees: float
+    solved: float
+
+
+@dataclass(frozen=True, eq=False)
+class Accuracy:
+    """The errors of every estimator on a mechanism; `nees_bounds` hold 99 % of the means of sound covariances."""
+
+    mechanism: str
+    mechanism_class: MechanismClass
+    errors: dict[Estimator, Errors]
+    poses: int
+    seed: int
+    nees_bounds: tuple[float, float]
+
+    def summary(self) -> dict[str, Any]:
+        """Configuration and figures, in SI units."""
+        return {
+            "mechanism": self.mechanism,
+            "class": self.mechanism_class.label,
+            "poses": self.poses,
+            "seed": self.seed,
+            "sigmas": {"leg": LEG_SIGMA, "tilt": TILT_SIGMA, "yaw": YAW_SIGMA},
+            "nees_bounds": self.nees_bounds,
+            "errors": [{**asdict(estimator), **asdict(errors)} for estimator, errors in self.errors.items()],
+            "version": version("gough"),
+        }
+
+
+def evaluate_accuracy(mechanism: Mechanism, poses: int = 2000, seed: int = 0) -> Accuracy:
+    """Errors of the paper's algorithms and of the closed forms from all legs, at random poses about home.
+
+    Raises:
+        InputError: no poses, or the mechanism is in no class.
+    """
+    if poses < 1:
+        raise InputError(f"{poses} poses were asked for; give 1 at least")
+    random = np.random.default_rng(checked_seed(seed))
+    positions, rotations = draw_poses(mechanism, poses, random)
+    noisy = draw_measurements(mechanism, positions, rotations, random, 1.0)
+    exact = draw_measurements(mechanism, positions, rotations, random, 0.0)
+    errors = {}
+    for estimator in _estimators(mechanism):
+        found = _run(mechanism, estimator, noisy)
+        bound = _run(mechanism, estimator, exact).covariances
+        errors[estimator] = _errors(found, positions, rotations, bound)
+    share = 0.5 * (1.0 - _BOUND_SHARE)
+    bounds = (chi_square_quantile(6 * poses, 1.0 - share) / poses, chi_square_quantile(6 * poses, share) / poses)
+    return Accuracy(mechanism.name, classify(mechanism), errors, poses, seed, bounds)
+
+
+def draw_poses(mechanism: Mechanism, count: int, random: np.random.Generator) -> tuple[Array, Array]:
+    """Positions (count, 3) [m] and rotations (count, 3, 3), uniform about home by axes and by xyz angles."""
+    radius = float(np.linalg.norm(mechanism.base_joints - mechanism.base_joints.mean(axis=0), axis=1).max())
+    home = mechanism.nominal_home
+    positions = home.position + random.uniform(-_REACH * radius, _REACH * radius, (count, 3))
+    about_x, about_y, about_z = (
+        np.array([rotation_from_vector(angle * axis) for angle in random.uniform(-_TILT, _TILT, count)]) for axis in np.eye(3)
+    )
+    return positions, about_z @ about_y @ about_x @ home.rotation
+
+
+def draw_measurements(
+    mechanism: Mechanism, positions: Array, rotations: Array, random: np.random.Generator, noise: float
+) -> dict[str, Array]:
+    """What the IMUs tell at these poses, by the names of `solve_batch`, with `noise` times its sigmas."""
+    up, count = mechanism.up_in_base, len(positions)
+    vectors = positions[:, None] + mechanism.platform_joints @ np.swapaxes(rotations, 1, 2) - mechanism.base_joints
+    level = np.linalg.svd(up[None])[2][1:]
+    turns = random.normal(size=(count, 3)) * [TILT_SIGMA, TILT_SIGMA, YAW_SIGMA] @ np.array([*level, up])
+    return {
+        "leg_directions": _unit(_unit(vectors) + noise * random.normal(scale=LEG_SIGMA, size=vectors.shape)),
+        "up_in_platform": _unit(up @ rotations + noise * random.normal(scale=TILT_SIGMA, size=(count, 3))),
+        "normal": _unit(rotations[:, :, 2] + noise * random.normal(scale=TILT_SIGMA, size=(count, 3))),
+        "rotation": np.array([rotation_from_vector(noise * turn) for turn in turns]) @ rotations,
+    }
+
+
+def _unit(vectors: Array) -> Array:
+    unit: Array = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return unit
+
+
+def _estimators(mechanism: Mechanism) -> list[Estimator]:
+    estimators = [
+        Estimator("paper, section 5: two legs + magnetic yaw", "section-5", _TWO_LEGS, False),
+        Estimator("section 5, six legs + magnetic yaw", "section-5", ALL_LEGS, False),
+    ]
+    if classify(mechanism).platform_count < LEGS:
+        four = _best_legs(mechanism, "section-4", 4)
+        estimators.append(Estimator("paper, section 4: four legs + normal", "section-4", four, False))
+    if classify(mechanism).group == "n-3-I":
+        estimators.append(Estimator("paper, section 3.1.1: six legs alone", "section-3.1.1", ALL_LEGS, False))
+    return [
+        *estimators,
+        Estimator("six legs alone", "legs", ALL_LEGS, False),
+        Estimator("six legs alone, refined", "legs", ALL_LEGS, True),
+        Estimator("six legs + vertical", "up", ALL_LEGS, False),
+        Estimator("six legs + vertical, refined", "up", ALL_LEGS, True),
+    ]
+
+
+def _best_legs(mechanism: Mechanism, method: str, count: int) -> tuple[int, ...]:
+    """The legs, so many, with which the method is conditioned best near home."""
+    choices = list(combinations(ALL_LEGS, count))
+    random = np.random.default_rng(0)
+    measurements = draw_measurements(mechanism, *draw_poses(mechanism, 10, random), random, 0.0)
+    best = [
+        float(np.median(_run(mechanism, Estimator("", method, legs, False), measurements).conditionings)) for legs in choices
+    ]
+    return choices[int(np.argmax(best))]
+
+
+def _run(mechanism: Mechanism, estimator: Estimator, measurements: dict[str, Array]) -> Solutions:
+    directions = measurements["leg_directions"].copy()
+    directions[:, [leg for leg in ALL_LEGS if leg not in estimator.legs]] = np.nan
+    needed: dict[str, Any] = {name: measurements[name] for method, name in NEEDS.items() if method == estimator.method}
+    return solve_batch(mechanism, directions, method=estimator.method, refine=estimator.refine, **needed)
+
+
+def _errors(found: Solutions, positions: Array, rotations: Array, bounds: Array) -> Errors:
+    kept = found.solved & np.isfinite(bounds[:, 0, 0])
+    moved = found.positions[kept] - positions[kept]
+    relative = found.rotations[kept] @ np.swapaxes(rotations[kept], 1, 2)
+    angles = rotation_angle(found.rotations[kept], rotations[kept])
+    sines = np.stack([relative[:, i, j] - relative[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1)
+    turned = 0.5 * sines / np.sinc(angles / np.pi)[:, None]
+    error = np.concatenate([moved, turned], axis=1)
+    nees = np.einsum("ni,ni->n", error, np.linalg.solve(found.covariances[kept], error[..., None])[..., 0])
+    variances = np.diagonal(bounds[kept], axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=2).mean(axis=0)
+    rms = np.sqrt([np.mean(np.sum(moved**2, axis=1)), np.mean(angles**2)])
+    over = rms / np.sqrt(variances)
+    return Errors(*(float(value) for value in (*rms, *over, nees.mean(), kept.mean())))
+
+
+@dataclass(frozen=True)
+class ClassAccuracy:
+    """What the paper and what gough needs on a class of mechanisms, and the errors of each.
+
+    Errors are medians over random mechanisms and poses, position [m] and angle [rad]; those of the paper are of its
+    algorithm on the legs that suit it best, those of gough are refined and use all legs.
+    """
+
+    label: str
+    drawing: str
+    paper_needs: str
+    paper_errors: tuple[float, float]
+    alone_needs: str
+    alone_errors: tuple[float, float]
+    vertical_needs: str
+    vertical_errors: tuple[float, float]
+
+
+def evaluate_classes(seed: int = 0, progress: Callable[[float], None] = lambda share: None) -> list[ClassAccuracy]:
+    """The needs and errors of every class, spatial and planar."""
+    checked_seed(seed)
+    rows = []
+    for number, mechanism_class in enumerate(spatial_classes()):
+        rows.append(_evaluate_class(mechanism_class, np.random.default_rng((seed, number))))
+        progress((number + 1) / (len(spatial_classes()) + len(planar_classes())))
+    for number, mechanism_class in enumerate(planar_classes()):
+        rows.append(_evaluate_planar_class(mechanism_class, np.random.default_rng((seed, LEGS * LEGS * LEGS + number))))
+    progress(1.0)
+    return rows
+
+
+def _evaluate_class(mechanism_class: MechanismClass, random: np.random.Generator) -> ClassAccuracy:
+    if mechanism_class.group == "n-3-I":
+        paper_method, paper_legs, paper_needs = "section-3.1.1", 6, "6 legs"
+    elif mechanism_class.platform_count < LEGS:
+        paper_method, paper_legs, paper_needs = "section-4", 4, "4 legs + normal"
+    else:
+        paper_method, paper_legs, paper_needs = "section-5", 2, "2 legs + rotation"
+    errors: dict[str, list[Array]] = {"paper": [], "legs": [], "up": []}
+    for _ in range(_CLASS_MECHANISMS):
+        mechanism = draw_mechanism(mechanism_class, random)
+        positions, rotations = draw_poses(mechanism, _CLASS_POSES, random)
+        measurements = draw_measurements(mechanism, positions, rotations, random, 1.0)
+        paper = Estimator("paper", paper_method, _best_legs(mechanism, paper_method, paper_legs), False)
+        for estimator in (paper, Estimator("legs", "legs", ALL_LEGS, True), Estimator("up", "up", ALL_LEGS, True)):
+            found = _run(mechanism, estimator, measurements)
+            away = np.linalg.norm(found.positions - positions, axis=1)
+            angles = rotation_angle(np.where(found.solved[:, None, None], found.rotations, np.eye(3)), rotations)
+            errors[estimator.label].append(np.stack([away, angles], axis=1)[found.solved])
+    needs = {need.method: need.text.partition(" + ")[0] for need in required_measurements(mechanism)}
+    medians = {label: tuple(np.median(np.concatenate(parts), axis=0).tolist()) for label, parts in errors.items()}
+    return ClassAccuracy(
+        mechanism_class.label, mechanism_class.drawing, paper_needs, medians["paper"], needs["legs"], medians["legs"],
+        needs["up"], medians["up"],
+    )  # fmt: skip
+
+
+def _evaluate_planar_class(mechanism_class: MechanismClass, random: np.random.Generator) -> ClassAccuracy:
+    errors: dict[str, list[tuple[float, float]]] = {"paper": [], "alone": [], "roll": []}
+    for _ in range(_CLASS_MECHANISMS):
+        mechanism = draw_planar_mechanism(mechanism_class, random)
+        for _ in range(_CLASS_POSES):
+            position, angle = random.uniform(-0.05, 0.05, 2), random.uniform(-_TILT, _TILT)
+            x, y = (mechanism.joints_at(position, angle) - mechanism.base_joints).T
+            angles = np.arctan2(y, x) + random.normal(scale=LEG_SIGMA, size=3)
+            roll = angle + random.normal(scale=TILT_SIGMA)
+            apart = np.abs(np.sin(angles - np.roll(angles, 1)))
+            two = angles.copy()
+            two[(int(np.argmax(apart)) + 1) % 3] = np.nan
+            for label, given, known in (("paper", two, roll), ("alone", angles, None), ("roll", angles, roll)):
+                try:
+                    modes = solve_planar(mechanism, given, roll=known)
+                except SingularConfigurationError:
+                    continue
+                errors[label].append(
+                    min((float(np.linalg.norm(mode.position - position)), abs(mode.angle - angle)) for mode in modes)
+                )
+    medians = {label: tuple(np.median(parts, axis=0).tolist()) for label, parts in errors.items()}
+    return ClassAccuracy(
+        mechanism_class.label, mechanism_class.drawing, "2 legs + roll", medians["paper"], "3 legs, two modes",
+        medians["alone"], "any 2 legs", medians["roll"],
+    )  # fmt: skip
+
+
+COLUMNS = (
+    "class", "graph", "the paper needs", "its error", "gough needs", "six legs alone", "or + vertical", "six legs + vertical",
+)  # fmt: skip
+"""What `cells` holds."""
+
+
+def cells(row: ClassAccuracy) -> tuple[str, ...]:
+    """The needs and errors of a class, in words."""
+
+    def errors(pair: tuple[float, float]) -> str:
+        return f"{1e3 * pair[0]:.2f} mm, {np.degrees(pair[1]):.3f} deg"
+
+    return (
+        row.label, row.drawing, row.paper_needs, errors(row.paper_errors), row.alone_needs, errors(row.alone_errors),
+        row.vertical_needs, errors(row.vertical_errors),
+    )  # fmt: skip
+
+
+def markdown(rows: Sequence[ClassAccuracy]) -> str:
+    """The needs and errors of the classes as a table in Markdown."""
+    lines = []
+    for row in rows:
+        label, drawing, *others = cells(row)
+        lines.append((label, f"`{drawing.replace('|', chr(92) + '|')}`", *others))
+    return markdown_table(COLUMNS, lines)

@@ -1,0 +1,169 @@
+"""The platform's filter by itself on trials of the BROAD benchmark: a real IMU, moved by hand, with an optical reference.
+
+D. Laidig, M. Caruso, A. Cereatti, T. Seel, *BROAD - A Benchmark for Robust Inertial Orientation Estimation*, Data 6(7), 2021,
+doi 10.3390/data6070072. A trial is a NumPy archive with the rates `imu_gyr` (N, 3) [rad/s], the forces `imu_acc` (N, 3)
+[m/s^2], the reference `opt_quat` (N, 4), which turns the sensor's frame to one with z up and is NaN where the optics lost the
+sensor, `movement` (N,), which samples count, and `sampling_rate` [Hz]. The score is the RMS of the inclination's error.
+"""
+
+import time
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controller.estimation.platform_filter import STATES, start_platform, step_platform
+from controller.settings import FusionSettings
+from hil.studies.fusion_comparison import vqf_verticals
+from plant.compiled import kernel
+from plant.errors import InputError
+from plant.imu import STANDARD_GRAVITY
+from plant.pose import Array, rotations_from_quaternions
+
+SHAPES = {"imu_gyr": (3,), "imu_acc": (3,), "opt_quat": (4,), "movement": ()}
+"""Arrays of a trial, and the shape of a sample of each."""
+
+_REPEATS = 5
+_UNIT_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A trial.
+
+    Attributes:
+        name: of its file.
+        rate: samples per second [Hz].
+        rates, forces: (N, 3) [rad/s, m/s^2], of the IMU.
+        verticals: (N, 3), the unit vertical in the sensor's frame, by the optics.
+        counts: (N,), which samples do: those of the movement that the optics saw.
+    """
+
+    name: str
+    rate: float
+    rates: Array
+    forces: Array
+    verticals: Array
+    counts: NDArray[np.bool_]
+
+    def inclination_rms(self, verticals: Array) -> float:
+        """RMS of the angle between verticals (N, 3) and the true ones [rad], over the samples that count."""
+        found, true = verticals[self.counts], self.verticals[self.counts]
+        angles = np.arctan2(np.linalg.norm(np.cross(found, true), axis=1), np.sum(found * true, axis=1))
+        return float(np.sqrt(np.mean(angles**2)))
+
+
+def evaluate(folder: str | Path, fusion: FusionSettings) -> dict[str, Any]:
+    """Run the platform's filter and the `vqf` package on every trial `*.npz` of a folder.
+
+    Args:
+        folder: with the trials.
+        fusion: what the filter assumes; the platform's own acceleration, which nothing tells it here, is for it the
+            accelerometer's noise.
+
+    Returns:
+        `trials`: by name and method (`filter`, `vqf`) the `inclination_rms` [rad] and `us`, microseconds per sample; the noise
+        that the filter assumed [m/s^2/sqrt(Hz), rad/s/sqrt(s)], and the `version`.
+
+    Raises:
+        InputError: the folder is missing or has no trial, or a file is none.
+    """
+    paths = sorted(Path(folder).glob("*.npz"))
+    if not paths:
+        raise InputError(f"{folder} is no folder with trials *.npz: give one with trials of BROAD")
+    trials = [load_trial(path) for path in paths]
+    return {
+        "trials": {
+            trial.name: {
+                "filter": _score(trial, partial(_filter, trial, fusion)),
+                "vqf": _score(trial, partial(vqf_verticals, 1.0 / trial.rate, trial.rates, trial.forces)),
+                "samples": len(trial.rates),
+                "rate": trial.rate,
+            }
+            for trial in trials
+        },
+        "accelerometer_noise": fusion.platform_accelerometer_noise,
+        "bias_walk": fusion.bias_walk,
+        "version": version("gough"),
+    }
+
+
+def load_trial(path: Path) -> Trial:
+    """Read a trial.
+
+    Raises:
+        InputError: the file cannot be read, lacks an array, or has one of another shape or with what is not finite.
+    """
+    try:
+        with np.load(path) as file:
+            arrays = {name: np.asarray(file[name], dtype=float) for name in file.files if name in {*SHAPES, "sampling_rate"}}
+    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path} is no NumPy archive that can be read: {error}") from None
+    if missing := [name for name in (*SHAPES, "sampling_rate") if name not in arrays]:
+        raise InputError(f"{path} lacks {', '.join(missing)}: a trial of BROAD has {', '.join(SHAPES)} and sampling_rate")
+    count = len(np.atleast_1d(arrays["imu_gyr"]))
+    for name, shape in SHAPES.items():
+        if arrays[name].shape != (count, *shape):
+            raise InputError(
+                f"{path}: {name} has shape {arrays[name].shape}; with imu_gyr of {count} it must be {(count, *shape)}"
+            )
+    for name in ("imu_gyr", "imu_acc", "movement"):
+        bad = np.flatnonzero(~np.isfinite(arrays[name].reshape(count, -1)).all(axis=1))
+        if len(bad):
+            raise InputError(f"{path}: {name} is not finite in sample {bad[0]}: cut the trial there")
+    rate = arrays["sampling_rate"]
+    if rate.shape != () or not 0.0 < rate < np.inf:
+        raise InputError(f"{path}: sampling_rate is {rate}; it must be one positive number")
+    seen = np.isfinite(arrays["opt_quat"]).all(axis=1)
+    counts = seen & (arrays["movement"] != 0.0)
+    if not counts.any():
+        raise InputError(f"{path}: no sample counts: movement must mark some that opt_quat is known of")
+    lengths = np.linalg.norm(arrays["opt_quat"], axis=1)
+    crooked = np.flatnonzero(seen & (abs(lengths - 1.0) > _UNIT_TOLERANCE))
+    if len(crooked):
+        raise InputError(f"{path}: opt_quat has length {lengths[crooked[0]]:g} in sample {crooked[0]}; it must be 1")
+    verticals = rotations_from_quaternions(arrays["opt_quat"] / lengths[:, None])[:, 2]
+    return Trial(path.stem, float(rate), arrays["imu_gyr"], arrays["imu_acc"], verticals, counts)
+
+
+def _score(trial: Trial, method: Callable[[], Array]) -> dict[str, float]:
+    """The error of a method, and the median time that it takes."""
+    verticals, took = method(), []
+    for _ in range(_REPEATS):
+        began = time.perf_counter()
+        method()
+        took.append(time.perf_counter() - began)
+    return {"inclination_rms": trial.inclination_rms(verticals), "us": 1e6 * float(np.median(took)) / len(verticals)}
+
+
+def _filter(trial: Trial, fusion: FusionSettings) -> Array:
+    verticals = np.empty_like(trial.forces)
+    vertical_variance = (fusion.platform_accelerometer_noise / STANDARD_GRAVITY) ** 2 * trial.rate / 2.0
+    _follow(
+        trial.rates, trial.forces, 1.0 / trial.rate, fusion.gyroscope_noise**2, fusion.bias_walk**2, vertical_variance,
+        fusion.bias_sigma, verticals,
+    )  # fmt: skip
+    return verticals
+
+
+@kernel
+def _follow(
+    rates: Array, forces: Array, period: float, rate_density: float, bias_walk: float, vertical_variance: float,
+    bias_sigma: float, verticals: Array,
+) -> None:  # fmt: skip
+    """Write the verticals (N, 3) that the platform's filter finds, told of no acceleration."""
+    x, covariance, acceleration = np.zeros(STATES), np.zeros((STATES, STATES)), np.zeros(3)
+    transition, work, gain, change = np.zeros((STATES, STATES)), np.zeros((STATES, STATES)), np.zeros(STATES), np.zeros(STATES)
+    start_platform(x, covariance, forces[0], bias_sigma)
+    for i in range(rates.shape[0]):
+        step_platform(
+            x, covariance, rates[i], forces[i], acceleration, period, STANDARD_GRAVITY, rate_density, bias_walk,
+            vertical_variance, transition, work, gain, change,
+        )  # fmt: skip
+        verticals[i] = x[:3]

@@ -1,0 +1,382 @@
+"""What happens when something goes wrong: every case of a table, with many seeds, against the reaction specified for it.
+
+The loop, its messages and the emulated rig are the real ones, but joined through memory and on virtual time, so that a case
+comes out the same every time. What needs processes of their own is in the tests of emulator and rigs.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from controller.inverse_kinematics import leg_lengths
+from controller.planning.stream import STREAM, note_sample, rest
+from controller.planning.stream_planner import StreamPlanner
+from controller.safety.watch import (
+    ASKED_TO_STOP,
+    BRAKE_AT_ONCE,
+    BRAKED,
+    BUS_LOST,
+    CAUSES,
+    DRIVE_DEVIATES,
+    DRIVE_FAULT,
+    DRIVE_OFF,
+    EMERGENCY_STOP,
+    END_OF_MOTION,
+    FAULT,
+    FOLLOWING,
+    FOLLOWING_ERROR,
+    GO_ON,
+    IMU_DISAGREES,
+    IMU_FROZEN,
+    IMU_NOISY,
+    IMU_STALE,
+    IMUS_DISAGREE,
+    IMUS_LOST,
+    MISSED_PERIODS,
+    NO_CAUSE,
+    NO_SENSORS,
+    QUICK_STOP,
+    REACTIONS,
+    RUNNING,
+    STOP,
+    STOP_QUICKLY,
+    STOPPING,
+    TARGET_JUMPS,
+    TARGET_LOST,
+    TARGET_NOT_FINITE,
+)
+from hil.loop.driver import CONTROLLED, EMULATED_RIG, HEAD, QUICKLY, RECORD
+from hil.loop.driver import STOP as STOP_PLACE
+from hil.realtime.clock import SCRIPTED, new_clock
+from hil.rigs.emulation.drives import new_emulated, sample
+from hil.rigs.emulation.faults import fault
+from hil.rigs.udp.emulator import look_after, new_udp_emulator
+from hil.rigs.udp.rig import TIMEOUT_SHARE
+from hil.runs.simulation import PreparedLoop, SimulationConfig, prepared_loop
+from hil.runs.target_stream import LEAD_S, Reception, Sample, encode
+from plant.compiled import Record
+from plant.mechanism import LEGS
+from plant.pose import quaternion_from_rotation
+
+RATE_HZ = 1000.0
+MOTION_S = 4.5
+_FIRST_S, _SPREAD_S = 1.5, 1.0
+_SESSION = 1
+_SMOOTH = 20
+"""Cycles over which a true acceleration is averaged: what the noise of the IMUs does to the commands is no motion."""
+
+MOST_TRAVEL_M = 0.03
+"""How far a leg may go on to rest, whatever has happened."""
+
+_SLACK = 1.001
+
+
+@dataclass(frozen=True)
+class Case:
+    """A case: what goes wrong, and what is to be done about it.
+
+    Attributes:
+        name: of the table.
+        expected: the cause that is to be told; `NO_CAUSE` if nothing is.
+        reaction: `GO_ON`, `STOP`, `STOP_QUICKLY` or `BRAKE_AT_ONCE`.
+        within: cycles from the fault to the first event with that cause.
+        peak: largest deviation of a leg from its reference until it is over [m].
+        faults: as `hil.rigs.emulation.faults.fault` reads them, with {k} an IMU, {j} another one, {d} a drive, {at} a time [s].
+        act: called with the loop when the time has come, for what no fault of the rig is.
+        streamed: what goes wrong with a streamed target.
+        hardness: largest true deceleration of a controlled stop, over the limit of acceleration.
+        also: causes that may end it as well.
+    """
+
+    name: str
+    expected: int
+    reaction: int
+    within: int
+    peak: float
+    faults: tuple[str, ...] = ()
+    act: Callable[[PreparedLoop], None] | None = None
+    streamed: str = ""
+    also: tuple[int, ...] = ()
+    hardness: float = 1.5
+
+
+def _ask(how: int) -> Callable[[PreparedLoop], None]:
+    def act(loop: PreparedLoop) -> None:
+        loop.link[STOP_PLACE] = how
+
+    return act
+
+
+def _miss(periods: int) -> Callable[[PreparedLoop], None]:
+    def act(loop: PreparedLoop) -> None:
+        cycle, period = int(loop.clock["cycles"]), int(loop.clock["period"])
+        loop.script[cycle % len(loop.script), 0] = periods * period
+
+    return act
+
+
+def _kill_rig(loop: PreparedLoop) -> None:
+    """A rig that has been killed and started again knows no session, and its drives hold."""
+    assert loop.emulator is not None
+    loop.emulator.port["session"] = 0
+    loop.emulator.rig["request"], loop.emulator.rig["velocity"] = 0, 0.0
+
+
+CASES = (
+    Case("a leg's IMU is frozen", IMU_FROZEN, GO_ON, 15, 2e-3, ("imu-frozen:{k},at={at}",)),
+    Case("a leg's IMU is dead", IMU_STALE, GO_ON, 15, 2e-3, ("imu-dead:{k},at={at}",)),
+    Case("a leg's IMU is noisy", IMU_NOISY, GO_ON, 25, 2e-3, ("imu-noisy:{k},at={at}",)),
+    Case("a leg's IMU is biased by 2 deg", IMU_DISAGREES, GO_ON, 2500, 10e-3, ("imu-biased:{k},at={at}",)),
+    Case("a leg's IMU is biased by 2 deg from the start", NO_SENSORS, STOP, 1300, 1e-3, ("imu-biased:{k}",)),
+    Case(
+        "two legs' IMUs are swapped from the start", IMUS_DISAGREE, STOP, 4000, 25e-3, ("imu-swapped:{k},size={j}",),
+        also=(DRIVE_DEVIATES,),
+    ),
+    Case("the platform's IMU is frozen", IMU_FROZEN, GO_ON, 15, 2e-3, ("imu-frozen:6,at={at}",)),
+    Case("the platform's IMU is dead", IMU_STALE, GO_ON, 15, 2e-3, ("imu-dead:6,at={at}",)),
+    Case("the platform's IMU is biased by 2 deg", IMU_DISAGREES, GO_ON, 2500, 10e-3, ("imu-biased:6,at={at}",)),
+    Case("two IMUs are dead", IMUS_LOST, STOP, 15, 4e-3, ("imu-dead:{k},at={at}", "imu-dead:{j},at={at}")),
+    Case(
+        "two IMUs are biased by 2 deg", IMUS_DISAGREE, STOP, 2500, 30e-3,
+        ("imu-biased:{k},at={at}", "imu-biased:{j},at={at}"),
+    ),
+    Case("1 % of the packets are lost", NO_CAUSE, GO_ON, 0, 2e-3, ("bus-drops,at={at},size=0.01",)),
+    Case("10 % of the packets are lost", NO_CAUSE, GO_ON, 0, 2e-3, ("bus-drops,at={at},size=0.1",)),
+    Case("50 packets in a row are lost", BUS_LOST, STOP_QUICKLY, 21, 5e-3, ("bus-down,at={at},for=0.05",)),
+    Case("packets come 0.2 ms late", NO_CAUSE, GO_ON, 0, 2e-3, ("bus-delays,at={at},size=0.2",)),
+    Case("packets come 5 ms late", BUS_LOST, STOP_QUICKLY, 21, 5e-3, ("bus-delays,at={at},size=5",)),
+    Case("10 % of the packets are out of order", NO_CAUSE, GO_ON, 0, 2e-3, ("bus-reorders,at={at}",)),
+    Case("10 % of the packets come twice", NO_CAUSE, GO_ON, 0, 2e-3, ("bus-repeats,at={at}",)),
+    Case("10 % of the packets are damaged", NO_CAUSE, GO_ON, 0, 2e-3, ("bus-corrupts,at={at}",)),
+    Case("the bus is down", BUS_LOST, STOP_QUICKLY, 21, 5e-3, ("bus-down,at={at}",)),
+    Case("the rig is killed and started again", BUS_LOST, STOP_QUICKLY, 21, 20e-3, act=_kill_rig),
+    Case("a drive has a fault", DRIVE_FAULT, STOP_QUICKLY, 3, 5e-3, ("drive-faults:{d},at={at}",)),
+    Case("a drive loses its power", DRIVE_OFF, STOP_QUICKLY, 3, 5e-3, ("drive-unpowered:{d},at={at}",)),
+    Case(
+        "a drive ignores its commands", FOLLOWING_ERROR, BRAKE_AT_ONCE, 1500, 25e-3, ("drive-ignores:{d},at={at}",),
+        also=(DRIVE_DEVIATES,),
+    ),
+    Case(
+        "a drive stands still", FOLLOWING_ERROR, BRAKE_AT_ONCE, 1500, 25e-3, ("drive-stuck:{d},at={at}",),
+        also=(DRIVE_DEVIATES,),
+    ),
+    Case(
+        "a drive runs away", DRIVE_DEVIATES, BRAKE_AT_ONCE, 250, 30e-3, ("drive-runs-away:{d},at={at}",),
+        also=(FOLLOWING_ERROR,),
+    ),
+    Case("the payload gains 5 kg", NO_CAUSE, GO_ON, 0, 3e-3, ("payload-jumps,at={at}",)),
+    Case("the payload loses 8 kg", NO_CAUSE, GO_ON, 0, 3e-3, ("payload-jumps,at={at},size=-8",)),
+    Case("5 periods are missed", NO_CAUSE, GO_ON, 0, 3e-3, act=_miss(5)),
+    Case("20 periods are missed", MISSED_PERIODS, STOP, 22, 15e-3, act=_miss(20)),
+    Case("50 periods are missed", DRIVE_FAULT, STOP_QUICKLY, 52, 15e-3, act=_miss(50), also=(MISSED_PERIODS,)),
+    Case("a stop is asked for", ASKED_TO_STOP, STOP, 2, 2e-3, act=_ask(CONTROLLED)),
+    Case("an emergency stop is asked for", EMERGENCY_STOP, STOP_QUICKLY, 2, 5e-3, act=_ask(QUICKLY)),
+    Case("the target's stream stops", TARGET_LOST, STOP, 112, 2e-3, streamed="stops"),
+    Case("the target's stream jumps", TARGET_JUMPS, STOP, 12, 2e-3, streamed="jumps"),
+    Case("the target's stream turns NaN", TARGET_NOT_FINITE, STOP, 12, 2e-3, streamed="is not finite"),
+)  # fmt: skip
+
+
+HEADINGS = ("case", "told", "reaction", "cycles until told", "peak deviation [mm]", "travel to rest [mm]")
+
+
+@dataclass
+class Outcome:
+    """What came of a case.
+
+    Attributes:
+        reactions: how often each reaction was found.
+        cycles: from the fault to its event, of each seed; empty if none was expected.
+        peak: largest deviation of a leg from its reference since the fault, as long as it has one, of each seed [m].
+        travel: how far a leg went on from being told to rest, of each seed [m].
+        findings: what is not as it should be, in words.
+    """
+
+    case: Case
+    reactions: dict[str, int] = field(default_factory=dict)
+    cycles: list[int] = field(default_factory=list)
+    peak: list[float] = field(default_factory=list)
+    travel: list[float] = field(default_factory=list)
+    findings: list[str] = field(default_factory=list)
+
+    def summary(self) -> dict[str, Any]:
+        """The figures, for JSON."""
+        return {
+            "case": self.case.name,
+            "expected": CAUSES[self.case.expected].text,
+            "reactions": self.reactions,
+            "cycles": self.cycles,
+            "peak_m": self.peak,
+            "travel_m": self.travel,
+            "findings": self.findings,
+        }
+
+
+def run_matrix(
+    seeds: int, cases: tuple[Case, ...] = CASES, progress: Callable[[float], None] = lambda share: None
+) -> list[Outcome]:
+    """Run every case with so many seeds.
+
+    Args:
+        seeds: of IMUs, faults, when and where they are.
+        cases: of the table.
+        progress: called with the share that is done.
+    """
+    outcomes = []
+    for n, case in enumerate(cases):
+        outcome = Outcome(case)
+        for seed in range(seeds):
+            _try(case, seed, outcome)
+            progress((n + (seed + 1) / seeds) / len(cases))
+        outcomes.append(outcome)
+    return outcomes
+
+
+def summary(outcomes: list[Outcome], seeds: int) -> dict[str, Any]:
+    """Everything, for JSON."""
+    return {"cases": [each.summary() for each in outcomes], "seeds": seeds, "rate_hz": RATE_HZ, "version": version("gough")}
+
+
+def table(outcomes: list[Outcome]) -> list[tuple[str, ...]]:
+    """Rows under the `HEADINGS`; figures are median and most of the seeds."""
+    rows: list[tuple[str, ...]] = []
+    for each in outcomes:
+        told = CAUSES[each.case.expected].text.format("k") if each.case.expected else "-"
+        cycles = f"{np.median(each.cycles):.0f}, {max(each.cycles)}" if each.cycles else "-"
+        peaks, travels = 1e3 * np.array(each.peak), 1e3 * np.array(each.travel)
+        travel = f"{np.median(travels):.1f}, {travels.max():.1f}" if travels.any() else "-"
+        rows.append(
+            (each.case.name, told, ", ".join(each.reactions), cycles, f"{np.median(peaks):.2f}, {peaks.max():.2f}", travel)
+        )
+    return rows
+
+
+def _try(case: Case, seed: int, outcome: Outcome) -> None:
+    random = np.random.default_rng([seed, len(case.name), 6])
+    at = _FIRST_S + _SPREAD_S * random.random()
+    k, j = (int(each) for each in random.permutation(6)[:2])
+    names = {"k": k, "j": j, "d": k, "at": round(at, 4)}
+    config = SimulationConfig(target="sines", duration=MOTION_S, rate=RATE_HZ, seed=seed)
+    with prepared_loop(config) as loop:
+        _join(loop, [fault(text.format(**names)) for text in case.faults], seed)
+        hold = int(loop.parameters["hold_cycles"])
+        onset = hold + round(at * RATE_HZ) if "{at}" in "".join(case.faults) or not case.faults else hold
+        if case.streamed:
+            onset -= onset % _SAMPLE_CYCLES
+            _follow_stream(loop, case.streamed, onset)
+        elif case.act is not None:
+            loop.run(onset)
+            case.act(loop)
+        cause = loop.follow(hold + round(MOTION_S * RATE_HZ))
+        _stand(loop)
+        _judge(case, seed, loop, cause, onset, outcome)
+
+
+def _join(loop: PreparedLoop, faults: list[Record], seed: int) -> None:
+    """Put the emulated rig between the loop and its plant, and both on a script's clock."""
+    rig = new_emulated(loop.mechanism, round(1e9 / RATE_HZ), seed, faults)
+    loop.emulator = new_udp_emulator(loop.calls, loop.imu, rig, _SESSION)
+    loop.kind = EMULATED_RIG
+    loop.udp.socket["session"], loop.udp.socket["timeout_ns"] = _SESSION, round(1e9 * TIMEOUT_SHARE / RATE_HZ)
+    loop.parameters["command_delay"] = 1.0 / RATE_HZ
+    loop.clock = new_clock(SCRIPTED, round(1e9 / RATE_HZ))
+    loop.script = np.zeros((1 << 14, 3), np.int64)
+    loop.records = np.zeros(1 << 14, RECORD)
+
+
+def _stand(loop: PreparedLoop) -> None:
+    """After the run: what the rig does by itself when it hears nothing any more."""
+    assert loop.emulator is not None
+    begin = int(loop.emulator.rig["time_ns"])
+    for passed in range(0, 500_000_000, 10_000_000):
+        look_after(loop.emulator, begin + passed)
+    sample(loop.calls, loop.imu, loop.emulator.rig, int(loop.emulator.rig["time_ns"]))
+
+
+_SAMPLE_CYCLES = 10
+
+
+def _follow_stream(loop: PreparedLoop, what: str, onset: int) -> None:
+    """Stream the target until something goes wrong with it."""
+    target, mechanism, hold = loop.target, loop.mechanism, int(loop.parameters["hold_cycles"])
+    home, start = mechanism.require_home(), leg_lengths(mechanism, target.start.position, target.start.rotation)
+    loop.stream, loop.segments = np.zeros((), STREAM), rest(start)
+    reception = Reception(loop.stream, StreamPlanner(mechanism, start), 1.0 / RATE_HZ, LEAD_S)
+    for n, cycle in enumerate(range(hold + _SAMPLE_CYCLES - hold % _SAMPLE_CYCLES, onset + 1, _SAMPLE_CYCLES)):
+        loop.run(cycle)
+        time = (cycle - hold) / RATE_HZ
+        position, rotation = (each[0] for each in target.at(np.array([time])))
+        displacement = position - home.position
+        if cycle == onset:
+            if what == "stops":
+                return
+            displacement = displacement + (0.012 if what == "jumps" else np.nan) * np.array([0.0, 0.0, 1.0])
+        sample = Sample(n, round(1e9 * time), tuple(displacement), tuple(quaternion_from_rotation(rotation @ home.rotation.T)))
+        reception.take(encode(sample), "here")
+        note_sample(loop.stream, int(loop.clock["woke"]))
+        reception.plan()
+
+
+def _judge(case: Case, seed: int, loop: PreparedLoop, cause: int, onset: int, outcome: Outcome) -> None:
+    """Compare what has happened with what should have."""
+    assert loop.emulator is not None
+    count, limits, period = int(loop.link[HEAD]), loop.mechanism.require_limits(), 1.0 / RATE_HZ
+    records, rig = loop.records[:count], loop.emulator.rig
+    find = partial(_find, outcome, case, seed)
+    moved = records[records["request"] != BRAKED]
+    # What ended it counts, not what was told on the way.
+    reaction = GO_ON if cause == END_OF_MOTION else CAUSES[cause].reaction
+    outcome.reactions[REACTIONS[reaction]] = outcome.reactions.get(REACTIONS[reaction], 0) + 1
+    accepted = (case.expected, *case.also)
+    if case.reaction == GO_ON:
+        find(cause != END_OF_MOTION, f"ended: {loop.reason()}")
+    else:
+        find(cause not in accepted, f"ended for another cause: {loop.reason()}")
+    begin = onset
+    if case.expected != NO_CAUSE:
+        told = np.isin(records["event_cause"], accepted).any(axis=1)
+        cycles = records["cycle"][told] - onset
+        find(not len(cycles), "was not told")
+        if len(cycles):
+            begin += int(cycles[0])
+            outcome.cycles.append(int(cycles[0]))
+            find(cycles[0] > case.within, f"took {cycles[0]} cycles, and {case.within} are allowed")
+    since = moved[moved["cycle"] >= onset]
+    followed = since[since["mode"] != FAULT]
+    off = np.abs(followed["truth"][:, 7:13] - followed["reference"][:, :, 0]).max(initial=0.0)
+    outcome.peak.append(float(off))
+    find(off > case.peak, f"a leg was {1e3 * off:.2f} mm off, and {1e3 * case.peak:g} are allowed")
+    after = records[(records["mode"] >= RUNNING) & (records["cycle"] >= begin)]
+    rested = np.vstack([after["truth"][:, 7:13], rig["truth"][7:13]]) if len(after) else np.zeros((1, LEGS))
+    travel = np.abs(rested - rested[0]).max() if case.reaction != GO_ON else 0.0
+    outcome.travel.append(float(travel))
+    find(travel > MOST_TRAVEL_M, f"a leg went on for {1e3 * travel:.1f} mm, and {1e3 * MOST_TRAVEL_M:g} are allowed")
+    allowed = {case.reaction, *(CAUSES[each].reaction for each in case.also)}
+    find(reaction not in allowed, f"the reaction was: {REACTIONS[reaction]}")
+    # Our own commands, and references, within the limits; a fault comes to rest as fast as the limit of acceleration allows.
+    find(np.abs(records["command"]).max() > _SLACK * float(loop.parameters["command_limit"]), "a command was above its limit")
+    find(np.abs(moved["reference"][:, :, 1]).max(initial=0.0) > _SLACK * limits.velocity, "a reference was too fast")
+    find(
+        np.abs(moved["reference"][:, :, 2]).max(initial=0.0) > _SLACK * limits.acceleration,
+        "a reference was beyond the limit of acceleration",
+    )
+    coasting = records[records["request"] == QUICK_STOP]["command"]
+    steps = np.abs(np.diff(coasting, axis=0)).max(initial=0.0)
+    find(steps > _SLACK * limits.acceleration * period * (1 + int(records["missed"].max())), "a quick stop was too hard")
+    if case.reaction == STOP and len(moved):
+        stopping = records[records["mode"] == STOPPING]["truth"][:, 7:13]
+        smooth = np.diff(stopping[::_SMOOTH], n=2, axis=0) / (_SMOOTH * period) ** 2
+        hard = np.abs(smooth).max(initial=0.0)
+        find(hard > case.hardness * limits.acceleration, f"the legs stopped at {hard:.3g} m/s2")
+    find(bool(np.abs(rig["velocity"]).max() > 0.0 or (rig["drive"] == FOLLOWING).any()), "a drive still moves")
+    expected_cycles = np.arange(count) + np.cumsum(records["missed"])
+    find(not np.array_equal(records["cycle"], expected_cycles), "a cycle is not recorded")
+
+
+def _find(outcome: Outcome, case: Case, seed: int, wrong: bool, what: str) -> None:
+    if wrong:
+        outcome.findings.append(f"{case.name}, seed {seed}: {what}")

@@ -1,0 +1,364 @@
+"""Tuning of the noise that the fusion assumes, by the consistency of its estimators on simulated motions.
+
+An estimator is consistent if its errors are as large as its covariance says: their normalised square (NEES) is then on average
+the number of their components. The noise of each estimator is scaled until it is, but not further than its errors stay as
+small as they were; what consistency leaves open is chosen for the least errors. The simulated joints are where the mechanism's
+file says, so what a rig's joints are off by is not in what is found.
+"""
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cache
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+import tomlkit
+from filterpy.stats import NEES
+from scipy.optimize import brentq, minimize_scalar
+from scipy.stats import chi2
+
+from controller.cycle import check_rate, cycle_parameters
+from controller.settings import FusionSettings, control_settings, sensor_settings
+from hil.runs.simulation import FUSIONS
+from hil.studies.fusion_comparison import REFINED, WHOLE, Found, fuse, pose_errors, read
+from plant.dynamics.imposed import ImposedMotion, impose
+from plant.errors import InputError
+from plant.imu import load_imu
+from plant.mechanism import LEGS, Mechanism, load_spatial, mechanism_text
+from plant.pose import Array
+
+MOTIONS = ("static", "mixed", "1")
+"""As `plant.dynamics.imposed.impose` has them."""
+
+DURATION_S, SETTLING_S = 16.0, 8.0
+"""Of a run, and of its first part, which does not count."""
+
+_SAMPLE_S = 0.05
+"""Between the samples that count; errors are nearly the same from one cycle to the next."""
+
+_MOST_WORSE = 1.02
+"""By which share errors may grow for consistency's sake."""
+
+_REACH = np.log(4.0)
+_COARSE, _FINE = 0.3, 0.02
+"""How far a noise is looked for, and how exactly: coarsely where errors are least and so flat; logarithms of factors."""
+
+_DIGITS = 4
+
+_MOST_LEG_ERROR = np.radians(5.0)
+"""RMS beyond which errors are not those of noise."""
+
+
+@dataclass(frozen=True)
+class TuningConfig:
+    """What to tune.
+
+    Attributes:
+        mechanism: preset or TOML file.
+        imu: preset of the imperfections.
+        seeds: of imperfections, motions and noise.
+        rate: samples per second [Hz].
+    """
+
+    mechanism: str = "hexapod"
+    imu: str = "mpu9150-calibrated"
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
+    rate: float = 1000.0
+
+    def __post_init__(self) -> None:
+        check_rate(self.rate)
+        if not self.seeds:
+            raise InputError("there must be a seed at least")
+
+
+@dataclass(frozen=True, eq=False)
+class Consistency:
+    """How an estimator did in M runs.
+
+    Attributes:
+        nees: (M,), the mean of each run.
+        rms: of the error's parts over all runs, angles [rad] or position [m] and rotation [rad].
+    """
+
+    nees: Array
+    rms: Array
+
+    @classmethod
+    def pooled(cls, runs: Sequence[tuple[float, Array]]) -> "Consistency":
+        """Of runs with these mean NEES and mean squares."""
+        nees, squares = zip(*runs, strict=True)
+        return cls(np.array(nees), np.sqrt(np.mean(squares, axis=0)))
+
+    def summary(self) -> dict[str, Any]:
+        """The figures in SI units."""
+        return {"nees": float(self.nees.mean()), "rms": self.rms.tolist()}
+
+
+Errors = Callable[[Mechanism, Found, slice, ImposedMotion], tuple[Array, Array]]
+"""Errors (N, s, n) of s independent estimates with n components, and their covariances (N, s, n, n), in the samples that count,
+at which the true motion is given."""
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """What is to be consistent.
+
+    Attributes:
+        errors: what it gets wrong.
+        components: of an error, and so the NEES that is consistent.
+        parts: how many components in a row have a common RMS.
+        series: independent estimates in a run.
+        whole: which errors of the IMUs the whole-mechanism filter estimates, where it is the one; else None.
+    """
+
+    errors: Errors
+    components: int
+    parts: int
+    series: int = 1
+    whole: str | None = None
+
+    def judge(self, mechanism: Mechanism, found: Found, late: slice, truth: ImposedMotion) -> tuple[float, Array]:
+        """Mean NEES and mean squares of the parts in a run."""
+        errors, covariances = self.errors(mechanism, found, late, truth)
+        n = self.components
+        nees = NEES(errors.reshape(-1, n), np.zeros(n), covariances.reshape(-1, n, n))
+        squares = np.sum(errors.reshape(*errors.shape[:2], self.parts, -1) ** 2, axis=3)
+        return float(np.mean(nees)), squares.mean(axis=(0, 1))
+
+    def bounds(self, runs: int) -> tuple[float, float]:
+        """Between which the mean NEES of so many runs is with 95 %, if the estimator is consistent.
+
+        A run counts once, however long it is: the IMUs' constant errors are the same all along.
+        """
+        count = self.series * runs
+        low, high = chi2.ppf((0.025, 0.975), self.components * count) / count
+        return float(low), float(high)
+
+
+def _leg_errors(mechanism: Mechanism, found: Found, late: slice, truth: ImposedMotion) -> tuple[Array, Array]:
+    """Of the two angles of each leg [rad]."""
+    vectors = truth.positions[:, None] + mechanism.platform_joints @ np.swapaxes(truth.rotations, 1, 2) - mechanism.base_joints
+    return _joint_angles(mechanism, found.directions[late]) - _joint_angles(mechanism, vectors), found.leg_covariances[late]
+
+
+def _joint_angles(mechanism: Mechanism, vectors: Array) -> Array:
+    """The angles (N, 6, 2) [rad] of legs along vectors (N, 6, 3), on their universal joints."""
+    x, y, z = np.einsum("kji,nkj->ikn", mechanism.joint_rotations, vectors)
+    return np.stack([np.arctan2(-y, z), np.arctan2(x, np.hypot(y, z))]).T
+
+
+def _tilt_errors(mechanism: Mechanism, found: Found, late: slice, truth: ImposedMotion) -> tuple[Array, Array]:
+    """Of the vertical, along two axes across it [rad]."""
+    verticals = found.verticals[late] / np.linalg.norm(found.verticals[late], axis=1, keepdims=True)
+    across = np.linalg.svd(verticals[:, None])[2][:, 1:]
+    errors = across @ (mechanism.up_in_base @ truth.rotations - verticals)[:, :, None]
+    covariances = across @ found.vertical_covariances[late] @ np.swapaxes(across, 1, 2)
+    return errors[:, None, :, 0], covariances[:, None]
+
+
+def _refined_errors(mechanism: Mechanism, found: Found, late: slice, truth: ImposedMotion) -> tuple[Array, Array]:
+    """Of the refined pose [m, rad]."""
+    errors = pose_errors(found.positions[REFINED, late], found.rotations[REFINED, late], truth)
+    return errors[:, None], np.linalg.inv(found.information[late])[:, None]
+
+
+def _whole_errors(mechanism: Mechanism, found: Found, late: slice, truth: ImposedMotion) -> tuple[Array, Array]:
+    """Of the whole-mechanism filter's pose [m, rad]."""
+    errors = pose_errors(found.positions[WHOLE, late], found.rotations[WHOLE, late], truth)
+    return errors[:, None], found.covariances[late][:, None]
+
+
+ESTIMATORS = {
+    "leg filters": Estimator(_leg_errors, components=2, parts=1, series=LEGS),
+    "platform filter": Estimator(_tilt_errors, components=2, parts=1),
+    "refined pose": Estimator(_refined_errors, components=6, parts=2),
+    "whole mechanism": Estimator(_whole_errors, components=6, parts=2, whole=FUSIONS["whole"]),
+}
+
+Evaluate = Callable[[float], Consistency]
+"""What becomes of an estimator if its noise is multiplied by exp of the argument."""
+
+
+def _seek_consistency(evaluate: Evaluate, components: int) -> float:
+    """Where the mean NEES is right, or on the way there the errors become too large, or the reach ends."""
+    start = evaluate(0.0)
+    side = 1.0 if start.nees.mean() > components else -1.0
+
+    def excess(change: float) -> float:
+        """Negative as long as there is further to go."""
+        there = evaluate(change)
+        beyond = side * np.log(components / there.nees.mean())
+        worse = np.log((there.rms / start.rms).max() / _MOST_WORSE)
+        left = max(beyond, worse)
+        # That is the end of the search.
+        return 0.0 if abs(left) < _FINE / 2.0 else float(left)
+
+    end = side * _REACH
+    return end if excess(end) <= 0.0 else float(brentq(excess, 0.0, end, xtol=_FINE))
+
+
+def _seek_least_errors(evaluate: Evaluate, components: int) -> float:
+    """Where the product of the errors' RMS is least."""
+    found = minimize_scalar(
+        lambda change: np.log(evaluate(change).rms).sum(),
+        bounds=(-_REACH, _REACH),
+        method="bounded",
+        options={"xatol": _COARSE},
+    )
+    return float(found.x)
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """A simulated motion: raw readings of its IMUs (N, 3, 7, 3), and the truth in the samples that count."""
+
+    raw: Array
+    truth: ImposedMotion
+
+
+def _part(motion: ImposedMotion, samples: slice) -> ImposedMotion:
+    return ImposedMotion(*(getattr(motion, field.name)[samples].copy() for field in fields(motion)))
+
+
+class _Runs:
+    """Every kind of motion, as often as there are seeds."""
+
+    def __init__(self, config: TuningConfig, mechanism: Mechanism, progress: Callable[[float], None]) -> None:
+        self.mechanism, self.rate = mechanism, config.rate
+        self.late = slice(round(SETTLING_S * config.rate), None, max(1, round(_SAMPLE_S * config.rate)))
+        self.motions: list[_Motion] = []
+        model, count = load_imu(config.imu), len(MOTIONS) * len(config.seeds)
+        for kind in MOTIONS:
+            for seed in config.seeds:
+                motion = impose(mechanism, kind, DURATION_S, config.rate, seed)
+                self.motions.append(_Motion(read(motion, model, config.rate, seed), _part(motion, self.late)))
+                progress(len(self.motions) / count)
+
+    def evaluate(self, fusion: FusionSettings, names: Sequence[str], whole: str | None) -> dict[str, Consistency]:
+        """How estimators, by name, do with these settings, with the whole-mechanism filter for these errors, or without it."""
+        control = control_settings(self.mechanism)
+        parameters = cycle_parameters(self.mechanism, self.rate, control, fusion, whole=whole)
+
+        def run(motion: _Motion) -> list[tuple[float, Array]]:
+            found = fuse(parameters, motion.raw)
+            return [ESTIMATORS[name].judge(self.mechanism, found, self.late, motion.truth) for name in names]
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            judged = zip(*pool.map(run, self.motions), strict=True)
+        return {name: Consistency.pooled(each) for name, each in zip(names, judged, strict=True)}
+
+    def evaluate_all(self, fusion: FusionSettings) -> dict[str, Consistency]:
+        """How every estimator does with these settings."""
+        figures: dict[str, Consistency] = {}
+        for whole in dict.fromkeys(estimator.whole for estimator in ESTIMATORS.values()):
+            names = [name for name, estimator in ESTIMATORS.items() if estimator.whole == whole]
+            figures |= self.evaluate(fusion, names, whole)
+        return figures
+
+
+@dataclass(frozen=True)
+class _Step:
+    """What to look for, in which estimator, by the common change of which settings."""
+
+    estimator: str
+    seek: Callable[[Evaluate, int], float]
+    settings: tuple[str, ...]
+
+    def tuned(self, fusion: FusionSettings, runs: _Runs) -> FusionSettings:
+        """The settings with what was found."""
+        estimator = ESTIMATORS[self.estimator]
+
+        @cache
+        def evaluate(change: float) -> Consistency:
+            changed = _scaled(fusion, self.settings, change)
+            return runs.evaluate(changed, (self.estimator,), estimator.whole)[self.estimator]
+
+        return _scaled(fusion, self.settings, self.seek(evaluate, estimator.components))
+
+
+STEPS = (
+    _Step("leg filters", _seek_consistency, ("leg_accelerometer_noise",)),
+    _Step("platform filter", _seek_consistency, ("platform_accelerometer_noise",)),
+    _Step("refined pose", _seek_least_errors, ("tilt_sigma",)),
+    _Step("refined pose", _seek_consistency, ("leg_sigma", "tilt_sigma")),
+    _Step("whole mechanism", _seek_consistency, ("noise_inflation",)),
+)
+"""In the order of the estimators, each of which builds upon the one before."""
+
+
+def tune_fusion(config: TuningConfig, progress: Callable[[float], None] = lambda share: None) -> dict[str, Any]:
+    """Find the noise with which the estimators are consistent.
+
+    Args:
+        config: what to tune.
+        progress: called with the share that is done.
+
+    Returns:
+        `settings`: by name, their value `before` and `after`; `estimators`: by name, the `settings` that were found by it, the
+        `consistent` NEES with its 95 % `bounds`, and `before` and `after` the mean `nees` and the `rms` of angles [rad], or of
+        position [m] and rotation [rad]; `config` and `version`.
+
+    Raises:
+        GoughError: something in the configuration cannot be used, or the IMUs' errors are not those of noise.
+    """
+    mechanism = load_spatial(config.mechanism)
+    before = fusion = sensor_settings(mechanism, load_imu(config.imu))
+    stages = len(STEPS) + 3  # Before them the motions and the figures as they are, after them those that are found.
+
+    def report(stage: int, share: float = 0.0) -> None:
+        progress((stage + share) / stages)
+
+    runs = _Runs(config, mechanism, lambda share: report(0, share))
+    figures_before = runs.evaluate_all(before)
+    worst = float(figures_before["leg filters"].rms[0])
+    if not worst < _MOST_LEG_ERROR:
+        raise InputError(
+            f"the IMUs {config.imu} put the leg filters off by {np.degrees(worst):.3g} deg RMS, and beyond "
+            f"{np.degrees(_MOST_LEG_ERROR):g} deg no noise accounts for it: tune for calibrated ones"
+        )
+    for i, step in enumerate(STEPS):
+        report(2 + i)
+        fusion = step.tuned(fusion, runs)
+    report(stages - 1)
+    figures_after = runs.evaluate_all(fusion)
+    names = {
+        name: tuple(dict.fromkeys(s for step in STEPS if step.estimator == name for s in step.settings)) for name in ESTIMATORS
+    }
+    return {
+        "settings": {
+            setting: {"before": getattr(before, setting), "after": getattr(fusion, setting)}
+            for settings in names.values()
+            for setting in settings
+        },
+        "estimators": {
+            name: {
+                "settings": names[name],
+                "consistent": estimator.components,
+                "bounds": estimator.bounds(len(runs.motions)),
+                "before": figures_before[name].summary(),
+                "after": figures_after[name].summary(),
+            }
+            for name, estimator in ESTIMATORS.items()
+        },
+        "config": asdict(config),
+        "version": version("gough"),
+    }
+
+
+def _scaled(fusion: FusionSettings, settings: Sequence[str], change: float) -> FusionSettings:
+    return replace(fusion, **{name: float(f"{getattr(fusion, name) * np.exp(change):.{_DIGITS}g}") for name in settings})
+
+
+def tuned_text(mechanism: str, settings: Mapping[str, float]) -> str:
+    """The TOML text of a mechanism, preset or file, with these entries in its table `fusion` and else as it is.
+
+    Raises:
+        GoughError: no such mechanism, or its file cannot be read.
+    """
+    document = tomlkit.parse(mechanism_text(mechanism))
+    table = document.setdefault("fusion", tomlkit.table())
+    table.update(settings)
+    return tomlkit.dumps(document)

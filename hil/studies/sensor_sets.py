@@ -1,0 +1,200 @@
+"""The closed loop with fewer sensors: which sets close it, on a mechanism of each type of the paper, and how accurate they are.
+
+Each set runs with leg and platform filters and with the whole-mechanism filter. Of the legs that may carry the IMUs of a set,
+those are taken with which the pose is determined best at the worst pose of the workspace.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from controller.cycle import check_imus
+from hil.reports.markdown import markdown_table
+from hil.runs.simulation import SimulationConfig, SimulationStoppedError, simulate
+from plant.dynamics.variables import PLATFORM_IMU
+from plant.errors import InputError
+from plant.mechanism import LEGS, Mechanism, load_spatial
+from plant.mechanism.classification import MechanismClass, classify, joint_numbers
+
+MECHANISMS = ("6-3-I", "6-3-II", "6-4-I", "6-4-II", "6-5", "hexapod", "genhexkins")
+"""A preset of each type of the paper's section 2, and a second one of type n-6."""
+
+_SECTION_5 = ("section-5",)
+
+
+@dataclass(frozen=True)
+class SensorSet:
+    """Sensors of a mechanism.
+
+    Attributes:
+        label: in words.
+        legs: how many legs have an IMU.
+        platform: whether the platform has one, which gives its roll and pitch.
+        magnetometer: whether that gives its heading as well.
+        fusions: ways to fuse, keys of `hil.runs.simulation.FUSIONS`.
+    """
+
+    label: str
+    legs: int
+    platform: bool = True
+    magnetometer: bool = False
+    fusions: tuple[str, ...] = ("compiled", "whole")
+
+    def choices(self) -> Iterator[tuple[int, ...]]:
+        """The IMUs that these may be."""
+        for legs in combinations(range(LEGS), self.legs):
+            yield (*legs, PLATFORM_IMU) if self.platform else legs
+
+
+SETS = (
+    SensorSet("6 legs", 6, platform=False),
+    SensorSet("4 legs", 4, platform=False),
+    SensorSet("2 legs + yaw, section 5", 2, magnetometer=True, fusions=_SECTION_5),
+    SensorSet("2 legs + yaw", 2, magnetometer=True),
+    SensorSet("3 legs + tilt", 3),
+    SensorSet("4 legs + tilt", 4),
+    SensorSet("6 legs + tilt", 6),
+    SensorSet("6 legs + yaw, section 5", 6, magnetometer=True, fusions=_SECTION_5),
+    SensorSet("6 legs + yaw", 6, magnetometer=True),
+)
+"""From the fewest to all; the tilt is the platform's roll and pitch, and with the yaw it is the whole orientation."""
+
+
+def paper_set(mechanism_class: MechanismClass) -> str:
+    """The label of the sensors that the paper needs for this class (sections 3 to 5)."""
+    if mechanism_class.group == "n-3-I":
+        return "6 legs"
+    return "4 legs + tilt" if mechanism_class.platform_count < LEGS else "2 legs + yaw, section 5"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How the closed loop does with a set of sensors.
+
+    Attributes:
+        mechanism, sensors: labels.
+        paper: whether the paper needs just these.
+        imus: which IMUs there were; empty if every choice was refused.
+        conditioning: of direct kinematics at the worst pose of the workspace.
+        refused: why no choice can be used; empty if one can.
+        runs: by fusion, `estimation` and `tracking` as `hil.runs.simulation.SimulationResult.summary` has them, or `stopped`,
+            why.
+    """
+
+    mechanism: str
+    sensors: str
+    paper: bool
+    imus: tuple[int, ...]
+    conditioning: float
+    refused: str
+    runs: dict[str, dict[str, Any]]
+
+
+def evaluate_sensor_sets(
+    mechanisms: Sequence[str] = MECHANISMS,
+    sets: Sequence[SensorSet] = SETS,
+    duration: float = 10.0,
+    seed: int = 0,
+    progress: Callable[[float], None] = lambda share: None,
+) -> list[Outcome]:
+    """Follow `sines` with every set of sensors.
+
+    Args:
+        mechanisms: presets or TOML files.
+        sets: of sensors.
+        duration: of each motion [s].
+        seed: of the imperfections of the IMUs, calibrated MPU-9150s.
+        progress: called with the share that is done.
+
+    Raises:
+        GoughError: a mechanism, the duration or the seed cannot be used.
+    """
+    outcomes = []
+    for name in mechanisms:
+        mechanism = load_spatial(name)
+        minimum = paper_set(classify(mechanism))
+        for sensors in sets:
+            outcomes.append(_evaluate(name, mechanism, sensors, sensors.label == minimum, duration, seed))
+            progress(len(outcomes) / (len(mechanisms) * len(sets)))
+    return outcomes
+
+
+def choose_imus(mechanism: Mechanism, sensors: SensorSet, paper: bool) -> tuple[tuple[int, ...], float, str]:
+    """The IMUs of a set, the worst conditioning with them, and why there are none; for the paper's set, such as it takes."""
+    best, refused = 0.0, ""
+    imus: tuple[int, ...] = ()
+    joints = joint_numbers(mechanism.platform_joints)
+    for choice in sensors.choices():
+        if paper and sensors.legs == 4 and len({int(joints[leg]) for leg in choice[:4]}) != 3:
+            # The paper's section 4 takes two legs that meet, and two that end elsewhere.
+            continue
+        try:
+            conditioning = check_imus(mechanism, choice, sensors.magnetometer, sensors.fusions == _SECTION_5)
+        except InputError as error:
+            refused = str(error)
+            continue
+        if conditioning > best:
+            best, imus = conditioning, choice
+    return imus, best, "" if imus else refused
+
+
+def _evaluate(name: str, mechanism: Mechanism, sensors: SensorSet, paper: bool, duration: float, seed: int) -> Outcome:
+    imus, conditioning, refused = choose_imus(mechanism, sensors, paper)
+    runs: dict[str, dict[str, Any]] = {}
+    for fusion in sensors.fusions if imus else ():
+        config = SimulationConfig(
+            mechanism=name, target="sines", duration=duration, seed=seed, fusion=fusion, imus=imus,
+            magnetometer=sensors.magnetometer,
+        )  # fmt: skip
+        try:
+            summary = simulate(config).summary()
+            runs[fusion] = {group: summary[group] for group in ("estimation", "tracking")}
+        except SimulationStoppedError as error:
+            runs[fusion] = {"stopped": str(error)}
+    return Outcome(name, sensors.label, paper, imus, conditioning, refused, runs)
+
+
+COLUMNS = ("mechanism", "sensors", "IMUs", "conditioning", "filters [mm / deg]", "at most", "whole [mm / deg]", "at most")
+"""What `cells` holds."""
+
+
+def cells(outcome: Outcome) -> tuple[str, ...]:
+    """A set, and its RMS and greatest errors, estimate against truth, in words; the paper's set has a star."""
+    label = f"{outcome.sensors} *" if outcome.paper else outcome.sensors
+    if outcome.refused:
+        return (outcome.mechanism, label, "refused", "", "", "", "", "")
+    errors = [cell for run in outcome.runs.values() for cell in _errors(run)]
+    errors += [""] * (4 - len(errors))
+    return (outcome.mechanism, label, "".join(map(str, outcome.imus)), f"{outcome.conditioning:.2f}", *errors)
+
+
+def _errors(run: dict[str, Any]) -> tuple[str, str]:
+    """RMS and greatest error of a run, or that it stopped."""
+    if "stopped" in run:
+        return "stopped", ""
+    found = run["estimation"]
+    rms, most = (
+        f"{1e3 * found[f'position_{kind}']:.2f} / {np.degrees(found[f'rotation_{kind}']):.2f}" for kind in ("rms", "max")
+    )
+    return rms, most
+
+
+def reasons(outcomes: Sequence[Outcome]) -> list[str]:
+    """Why sets were refused, or stopped, in a line each."""
+    lines = [f"{each.mechanism}, {each.sensors}: {each.refused}" for each in outcomes if each.refused]
+    lines += [
+        f"{each.mechanism}, {each.sensors}, {fusion}: {run['stopped']}"
+        for each in outcomes
+        for fusion, run in each.runs.items()
+        if "stopped" in run
+    ]
+    return lines
+
+
+def markdown(outcomes: Sequence[Outcome]) -> str:
+    """The outcomes as a table in Markdown, and why some were refused or stopped."""
+    table = markdown_table(COLUMNS, map(cells, outcomes))
+    return "\n".join([table, "", *(f"- {reason}" for reason in reasons(outcomes))])

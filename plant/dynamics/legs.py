@@ -1,0 +1,398 @@
+"""The legs of a mechanism and their actuators, as CasADi expressions that the spatial and the planar plant share.
+
+A leg is a universal joint (first axis e1 fixed in the base, second e2 = n x e1 / |n x e1|) that carries a lower part and
+a rod, both symmetric about the leg's axis n = s / l. Since the leg's angular velocity lies in the plane of e1 and e2,
+`omega = n x s' / l + omega_n n` with `omega_n = k e1 . (s x s') / (l (l^2 - k^2))`, k = e1 . s. In a planar mechanism e1 is
+the plane's normal, and k and omega_n are zero.
+
+Each leg is driven through a screw by a DC motor on an encoderless drive that turns a velocity command u into the voltage
+`n k u + kappa R_nominal i`, n = 2 pi / lead.
+"""
+
+from dataclasses import dataclass
+from math import pi
+
+import casadi as ca
+
+from plant.dynamics.variables import BRAKE, OPEN, VELOCITY
+
+SX = ca.SX
+
+
+def row(matrix: SX, k: int) -> SX:
+    """Row k as a column."""
+    return matrix[k, :].T
+
+
+def stack(values: list[SX]) -> SX:
+    """Scalars in a column."""
+    return ca.vertcat(*values)
+
+
+_UNCHANGED = (
+    "motor.resistance", "drive.voltage_limit", "drive.current_limit", "friction.coulomb", "friction.viscous",
+    "friction.velocity", "brake.stiffness", "brake.damping", "stop.minimum_length", "stop.maximum_length", "stop.stiffness",
+    "stop.damping", "gravity", "magnetic_field", "leg_imu_position", "platform_imu_position",
+)  # fmt: skip
+
+
+def leg_constants(p: dict[str, SX]) -> dict[str, SX]:
+    """What legs, actuators and IMUs need of the parameters, but for the joints and inertia about the legs' axes."""
+    turns = 2 * pi / p["motor.screw_lead"]
+    lower, upper = "leg.lower.", "leg.upper."
+    return {name: p[name] for name in _UNCHANGED} | {
+        "transverse_inertia": p[lower + "inertia"] + p[upper + "inertia"] + p[lower + "mass"] * p[lower + "center"] ** 2,
+        "lower_moment": p[lower + "mass"] * p[lower + "center"],
+        "rod_mass": p[upper + "mass"],
+        "rod_center": p[upper + "center"],
+        "sliding_mass": p[upper + "mass"] + p["motor.rotor_inertia"] * turns**2,
+        "force_constant": turns * p["motor.torque_constant"],
+        "compensating_resistance": p["drive.compensation"] * p["drive.nominal_resistance"],
+        "inverse_inductance": 1 / p["motor.inductance"],
+        "limiter_rate": 1 / p["drive.current_time_constant"],
+        "brake_slip": p["brake.force"] / p["brake.stiffness"],
+        "release_rate": 1 / p["brake.release_time"],
+    }
+
+
+@dataclass(frozen=True)
+class Condition:
+    """`value` must not exceed `limit`; `text` names the value, and what to change."""
+
+    value: SX | float
+    limit: SX | float
+    text: str
+
+
+_LEAST_LENGTH_M = 1e-4
+
+
+def leg_conditions(p: dict[str, SX], lengths: SX) -> list[Condition]:
+    """For the parameters of legs and actuators to make sense; `lengths` (n, 1) are those at the start."""
+    conditions = []
+    for k in range(lengths.shape[0]):
+        conditions += [
+            Condition(_LEAST_LENGTH_M, lengths[k], f"leg {k} needs a length of %g m at the start and has %g m"),
+            Condition(
+                p["stop.minimum_length"][k],
+                p["stop.maximum_length"][k],
+                f"stop.minimum_length of leg {k} is %g m, beyond its stop.maximum_length of %g m",
+            ),
+        ]
+    outside = ca.vertcat(p["stop.minimum_length"] - lengths, lengths - p["stop.maximum_length"])
+    return conditions + _substep_conditions(p, ca.fmax(ca.mmax(outside), 0))
+
+
+def length_limits(lengths: SX) -> list[Condition]:
+    """No leg may come to nothing during the motion; `lengths` (n, 1)."""
+    return [
+        Condition(_LEAST_LENGTH_M, lengths[k], f"leg {k} needs a length of %g m and has come down to %g m: limit its stroke")
+        for k in range(lengths.shape[0])
+    ]
+
+
+_RUNGE_KUTTA_REACH = 2.5
+"""The classical Runge-Kutta method is stable for |eigenvalue| x step up to this, wherever the eigenvalue does not grow."""
+
+_CONTACT_REACH = 1.5
+"""The same for the end stops, which are not linear; found by 800 random sets of parameters."""
+
+
+def _substep_conditions(p: dict[str, SX], beyond_stop: SX) -> list[Condition]:
+    """The substep is short enough for the fastest modes of the legs.
+
+    In coordinates whose squared length is the energy, what dissipates is on the diagonal of the linearised plant and what
+    stores is skew, so the larger of the one and the norm of the other bound every eigenvalue; what else moves with a leg
+    than its sliding mass only lowers them. A slipping brake forgets its deflection, and an end stop hits, the faster the leg
+    runs: without load at the drive's voltage over its force constant, or as an end stop throws it back that it begins
+    beyond, by `beyond_stop` [m].
+    """
+    turns = 2 * pi / p["motor.screw_lead"]
+    sliding_mass = p["leg.upper.mass"] + p["motor.rotor_inertia"] * turns**2
+    constant = turns * p["motor.torque_constant"]
+    speed = p["drive.voltage_limit"] / constant
+    slope = ca.mmax(p["friction.viscous"] + p["friction.coulomb"] / p["friction.velocity"]) + p["brake.damping"]
+    fading = ca.fmax(slope / sliding_mass, ca.mmax(p["motor.resistance"]) / p["motor.inductance"])
+    storing = (constant**2 / p["motor.inductance"] + p["brake.stiffness"]) / sliding_mass
+    bounce = ca.sqrt(p["stop.stiffness"] / sliding_mass)
+    rates = [
+        (
+            ca.sqrt(fading**2 + storing) / _RUNGE_KUTTA_REACH,
+            "motor, friction and brake: motor.resistance / motor.inductance, friction.coulomb / friction.velocity and "
+            "brake.damping over the sliding mass, and the square root of brake.stiffness over it",
+        ),
+        (1 / p["drive.current_time_constant"] / _RUNGE_KUTTA_REACH, "drive.current_time_constant"),
+        (1 / p["brake.release_time"] / _RUNGE_KUTTA_REACH, "brake.release_time"),
+        (
+            speed * p["brake.stiffness"] / p["brake.force"] / _RUNGE_KUTTA_REACH,
+            "a slipping brake, brake.stiffness / brake.force",
+        ),
+        (
+            bounce * (1 + p["stop.damping"] * ca.fmax(speed, beyond_stop * bounce)) / _CONTACT_REACH,
+            "the end stops, the square root of stop.stiffness over the sliding mass, and stop.damping",
+        ),
+    ]
+    return [
+        Condition(p["substep"], 1 / rate, f"substep is %g s, and may be at most %g s because of {what}: reduce it")
+        for rate, what in rates
+    ]
+
+
+@dataclass(frozen=True)
+class Leg:
+    """One leg at one instant; vectors (3, 1) seen in {1}.
+
+    `mass` (3, 3) and `force` (3, 1) are M_s and h in `M_s s'' + h = F`, F the force on the platform joint; `arm` leads from
+    the platform's origin to that joint, and `bias` is what s'' is without acceleration of the platform.
+    """
+
+    s: SX
+    velocity: SX
+    arm: SX
+    bias: SX
+    length: SX
+    speed: SX
+    direction: SX
+    mass: SX
+    force: SX
+    kinetic: SX
+    potential: SX
+
+
+def _leg_at(s: SX, velocity: SX, arm: SX, bias: SX, e1: SX, c: dict[str, SX]) -> Leg:
+    """Lagrange's equations of one leg, its motor included, worked out for its three ways to move.
+
+    Sliding with the mass m, swinging with the transverse inertia I(l), and turning about its axis with the rate
+    `w = kappa q`, kappa = k / (l^3 - l k^2), q = (e1 x s) . s', which the universal joint imposes.
+    """
+    # One square root and no division: CasADi would turn every product with 1 / l into a division of its own.
+    square = ca.dot(s, s)
+    inverse = ca.sqrt(1 / square)
+    length = square * inverse
+    n = s * inverse
+    speed = ca.dot(n, velocity)
+    across = velocity - speed * n
+    swing2 = ca.dot(across, across) * inverse**2
+
+    lever = length - c["rod_center"]
+    inertia = c["transverse_inertia"] + c["rod_mass"] * lever**2
+    inertia_slope = 2 * c["rod_mass"] * lever
+    weight_lever = c["lower_moment"] + c["rod_mass"] * lever
+    gravity_along = ca.dot(c["gravity"], n)
+
+    k = ca.dot(e1, s)
+    inverse_cubic = inverse / (square - k**2)
+    kappa = k * inverse_cubic
+    kappa_gradient = inverse_cubic**2 * (length * (square + k**2) * e1 - k * (3 * square - k**2) * n)
+    turned = ca.cross(e1, s)
+    q = ca.dot(turned, velocity)
+    kappa_rate = ca.dot(kappa_gradient, velocity)
+    axial = c["axial_inertia"]
+    gyroscopic = kappa_rate * q * kappa * turned + kappa * q * (
+        kappa_rate * turned + 2 * kappa * ca.cross(e1, velocity) - q * kappa_gradient
+    )
+
+    swing_mass = inertia * inverse**2
+    sliding_mass = c["sliding_mass"]
+    return Leg(
+        s=s,
+        velocity=velocity,
+        arm=arm,
+        bias=bias,
+        length=length,
+        speed=speed,
+        direction=n,
+        mass=swing_mass * SX.eye(3) + (sliding_mass - swing_mass) * n @ n.T + axial * kappa**2 * turned @ turned.T,
+        force=(
+            (sliding_mass * length * swing2 - inertia_slope * swing2 / 2 - c["rod_mass"] * gravity_along) * n
+            + (inertia_slope - 2 * inertia * inverse) * speed * inverse**2 * across
+            - weight_lever * inverse * (c["gravity"] - gravity_along * n)
+            + axial * gyroscopic
+        ),
+        kinetic=(inertia * swing2 + sliding_mass * speed**2 + axial * (kappa * q) ** 2) / 2,
+        potential=-gravity_along * weight_lever,
+    )
+
+
+def legs_at(
+    position: SX, rotation: SX, velocity: SX, omega: SX, base_joints: SX, platform_joints: SX, axes: SX, c: dict[str, SX]
+) -> list[Leg]:
+    """The legs of a platform that moves as given.
+
+    Args:
+        position, rotation: (3, 1), (3, 3), of {2}.
+        velocity, omega: (3, 1), of the origin of {2}, and its angular velocity.
+        base_joints, platform_joints, axes: (n, 3).
+        c: the constants, of `leg_constants` and `axial_inertia`.
+    """
+    legs = []
+    for k in range(base_joints.shape[0]):
+        arm = rotation @ row(platform_joints, k)
+        s = position + arm - row(base_joints, k)
+        turning = ca.cross(omega, arm)
+        legs.append(_leg_at(s, velocity + turning, arm, ca.cross(omega, turning), row(axes, k), c))
+    return legs
+
+
+@dataclass(frozen=True)
+class Actuators:
+    """What the actuators of n legs do at one instant; (n, 1) each.
+
+    Forces along the legs, positive when they push; the voltages that are asked for; and the rates of the motors' currents and
+    of the brakes' deflections.
+    """
+
+    motor: SX
+    friction: SX
+    brake: SX
+    stop: SX
+    voltage: SX
+    current_rate: SX
+    brake_rate: SX
+
+    @property
+    def force(self) -> SX:
+        """All of them together."""
+        return self.motor - self.friction + self.brake + self.stop
+
+    def powers(self, speeds: SX) -> dict[str, SX]:
+        """Their powers by their names in the table, at speeds (n, 1)."""
+        return {
+            "power.drive": ca.dot(self.motor, speeds),
+            "power.friction": -ca.dot(self.friction, speeds),
+            "power.brake": ca.dot(self.brake, speeds),
+            "power.stop": ca.dot(self.stop, speeds),
+        }
+
+
+def actuators_at(legs: list[Leg], x: dict[str, SX], u: dict[str, SX], c: dict[str, SX]) -> Actuators:
+    """What the actuators do, from states, inputs and constants."""
+    speeds, current = speeds_of(legs), x["state.current"]
+    mode = u["drive_mode"]
+    closed, driven = mode == BRAKE, mode == VELOCITY
+    friction = c["friction.viscous"] * speeds + c["friction.coulomb"] * speeds / ca.sqrt(
+        speeds**2 + c["friction.velocity"] ** 2
+    )
+    back_emf = c["force_constant"] * speeds
+    asked = driven * (c["force_constant"] * u["velocity_command"] + c["compensating_resistance"] * current)
+    voltage = ca.fmax(ca.fmin(asked, c["drive.voltage_limit"]), -c["drive.voltage_limit"])
+    # An open motor has no back-EMF current to drive; a braked one is short-circuited.
+    free = (voltage - c["motor.resistance"] * current - (mode != OPEN) * back_emf) * c["inverse_inductance"]
+    deflections = x["state.brake_deflection"]
+    return Actuators(
+        motor=c["force_constant"] * current,
+        friction=friction,
+        # An opened brake lets go within its release time, while the drive takes over the load.
+        brake=-(c["brake.stiffness"] * deflections + closed * c["brake.damping"] * speeds),
+        stop=stack([_stop_force(leg.length, leg.speed, c, k) for k, leg in enumerate(legs)]),
+        voltage=voltage,
+        current_rate=ca.fmax(
+            ca.fmin(free, c["limiter_rate"] * (c["drive.current_limit"] - current)),
+            c["limiter_rate"] * (-c["drive.current_limit"] - current),
+        ),
+        brake_rate=stack([_brake_rate(deflections[k], leg.speed, closed[k], c) for k, leg in enumerate(legs)]),
+    )
+
+
+def lengths_of(legs: list[Leg]) -> SX:
+    """(n, 1)."""
+    return stack([leg.length for leg in legs])
+
+
+def speeds_of(legs: list[Leg]) -> SX:
+    """(n, 1), the rates of the lengths."""
+    return stack([leg.speed for leg in legs])
+
+
+def _stop_force(length: SX, speed: SX, c: dict[str, SX], k: int) -> SX:
+    """Hunt and Crossley's contact: the damping is in proportion to the elastic force, and nothing ever pulls."""
+    below = ca.fmax(c["stop.minimum_length"][k] - length, 0)
+    above = ca.fmax(length - c["stop.maximum_length"][k], 0)
+    stiffness, damping = c["stop.stiffness"], c["stop.damping"]
+    return stiffness * (below * ca.fmax(1 - damping * speed, 0) - above * ca.fmax(1 + damping * speed, 0))
+
+
+def _brake_rate(deflection: SX, speed: SX, closed: SX, c: dict[str, SX]) -> SX:
+    """Elasto-plastic bristle (Dupont, Hayward, Armstrong, Altpeter 2002): purely elastic below 70 % of the slipping
+    force, so that a closed brake holds without creep.
+    """
+    load = ca.fabs(deflection) / c["brake_slip"]
+    share = ca.fmin(ca.fmax((load - 0.7) / 0.3, 0), 1)
+    slipping = ca.if_else(deflection * speed > 0, share * share * (3 - 2 * share), 0)
+    return closed * speed * (1 - slipping * load) - (1 - closed) * c["release_rate"] * deflection
+
+
+def solve(matrix: SX, right: SX) -> SX:
+    """Solve a symmetric positive definite system by Cholesky's method, unrolled; only the lower triangle is read."""
+    n = right.shape[0]
+    lower = SX.zeros(n, n)
+    inverses: list[SX] = []
+    for j in range(n):
+        column = [matrix[i, j] - sum(lower[i, k] * lower[j, k] for k in range(j)) for i in range(j, n)]
+        inverses.append(ca.sqrt(1 / column[0]))
+        for i in range(j + 1, n):
+            lower[i, j] = column[i - j] * inverses[j]
+    z = [SX(0)] * n
+    for i in range(n):
+        z[i] = (right[i] - sum(lower[i, k] * z[k] for k in range(i))) * inverses[i]
+    for i in reversed(range(n)):
+        z[i] = (z[i] - sum(lower[k, i] * z[k] for k in range(i + 1, n))) * inverses[i]
+    return ca.vertcat(*z)
+
+
+def _leg_turning(s: SX, velocity: SX, acceleration: SX, e1: SX) -> tuple[SX, SX, SX]:
+    """The leg frame (3, 3), and the leg's angular velocity and acceleration (3, 1) in {1}, from the leg vector and its
+    derivatives.
+
+    With `h = k q / d`, `k = e1 . s`, `q = e1 . (s x s')` and `d = s . s - k^2 = |s x e1|^2`, the angular velocity of the
+    module's text is `omega = (s x s' + h s) / (s . s)`.
+    """
+    square, k = ca.dot(s, s), ca.dot(e1, s)
+    across = square - k**2
+    # As in `_leg_at`, square roots keep CasADi from dividing again and again.
+    inverse, inverse_across = ca.sqrt(1 / square), ca.sqrt(1 / across)
+    n, e2 = s * inverse, ca.cross(s, e1) * inverse_across
+    swing, swing_rate = ca.cross(s, velocity), ca.cross(s, acceleration)
+    k_rate, q, q_rate = ca.dot(e1, velocity), ca.dot(e1, swing), ca.dot(e1, swing_rate)
+    growth = ca.dot(s, velocity)
+    h = k * q * inverse_across**2
+    h_rate = (k_rate * q + k * q_rate - 2 * h * (growth - k * k_rate)) * inverse_across**2
+    turning = (swing + h * s) * inverse**2
+    angular = (swing_rate + h_rate * s + h * velocity - 2 * growth * turning) * inverse**2
+    return ca.horzcat(ca.cross(e2, n), e2, n), turning, angular
+
+
+def imu_signals_of(legs: list[Leg], axes: SX, rotation: SX, omega: SX, acceleration: SX, c: dict[str, SX]) -> dict[str, SX]:
+    """Ideal IMU signals by their names in the table, (n + 1, 3) each, of the legs and the platform.
+
+    A leg's are seen in the leg frame, whose z axis is the leg and whose y axis is e2; the platform's in {2}.
+
+    Args:
+        axes: (n, 3), e1 of each leg.
+        rotation: (3, 3), of {2}.
+        omega: (3, 1), its angular velocity.
+        acceleration: (6, 1), of the origin of {2}, then angular.
+    """
+    rates: list[SX] = []
+    forces: list[SX] = []
+    fields: list[SX] = []
+    for i, leg in enumerate(legs):
+        e1, arm = row(axes, i), row(c["leg_imu_position"], i)
+        frame, turning, angular = _leg_turning(
+            leg.s, leg.velocity, acceleration[:3] + ca.cross(acceleration[3:], leg.arm) + leg.bias, e1
+        )
+        rate = frame.T @ turning
+        rates.append(rate.T)
+        force = ca.cross(frame.T @ angular, arm) + ca.cross(rate, ca.cross(rate, arm)) - frame.T @ c["gravity"]
+        forces.append(force.T)
+        fields.append((frame.T @ c["magnetic_field"]).T)
+    place = rotation @ c["platform_imu_position"]
+    at_imu = acceleration[:3] + ca.cross(acceleration[3:], place) + ca.cross(omega, ca.cross(omega, place))
+    rates.append((rotation.T @ omega).T)
+    forces.append((rotation.T @ (at_imu - c["gravity"])).T)
+    fields.append((rotation.T @ c["magnetic_field"]).T)
+    return {
+        "imu_angular_velocity": ca.vertcat(*rates),
+        "imu_specific_force": ca.vertcat(*forces),
+        "imu_magnetic_field": ca.vertcat(*fields),
+    }

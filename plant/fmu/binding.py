@@ -1,0 +1,548 @@
+"""What an FMU's variables are to the loop: which of them take commands, which are the IMUs' signals and which tell the truth.
+
+A signal has the name of gough's own variable (`plant.dynamics.variables`), and its values lie in one variable of the FMU or in
+several. The binding of gough's own plants is that every signal is the variable of its name; one for other FMUs comes from a
+TOML file (docs/fmu.md).
+"""
+
+import sys
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from math import isfinite
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plant.dynamics.variables import BRAKE, DRIVE_MODES, IMU_COUNT, OPEN, PLATFORM_IMU, VELOCITY
+from plant.errors import FmuError, GoughError, InputError
+from plant.fmu.importer import FmuDescription, FmuVariable
+from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER
+from plant.mechanism import LEGS
+from plant.mechanism.planar import PLANAR_LEGS
+from plant.pose import Array
+
+IMU_SIGNALS = {"imu_angular_velocity": GYROSCOPE, "imu_specific_force": ACCELEROMETER, "imu_magnetic_field": MAGNETOMETER}
+TRUTH_PLACES = {"position": 0, "quaternion": 3, "angle": 3, "leg_length": 7, "current": 13}
+"""Where a signal begins in the truth (19,): position, quaternion, lengths and currents of six legs."""
+
+TRUTH_SIZE = 19
+COMMANDS, MODES, PAYLOAD = "velocity_command", "drive_mode", "payload.mass"
+
+UNITS: dict[str, dict[str, float]] = {
+    "m": {"m": 1.0, "dm": 0.1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254},
+    "m/s": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "um/s": 1e-6, "m/min": 1 / 60, "mm/min": 1e-3 / 60, "in/s": 0.0254},
+    "m/s2": {"m/s2": 1.0, "m/s^2": 1.0, "mm/s2": 1e-3, "mm/s^2": 1e-3, "g": 9.80665, "mg": 9.80665e-3},
+    "rad": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180},
+    "rad/s": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": np.pi / 180, "rpm": np.pi / 30, "1/min": np.pi / 30},
+    "uT": {"uT": 1.0, "nT": 1e-3, "mT": 1e3, "T": 1e6, "G": 100.0, "mG": 0.1},
+    "A": {"A": 1.0, "mA": 1e-3},
+    "kg": {"kg": 1.0, "g": 1e-3, "t": 1e3},
+    "1": {"1": 1.0, "": 1.0},
+}
+"""Names of units by what the loop reckons in, with the factor from one to the other."""
+
+SIGNAL_UNITS = {
+    COMMANDS: "m/s", MODES: "1", "imu_angular_velocity": "rad/s", "imu_specific_force": "m/s2", "imu_magnetic_field": "uT",
+    "position": "m", "quaternion": "1", "angle": "rad", "leg_length": "m", "current": "A", PAYLOAD: "kg",
+}  # fmt: skip
+"""Every signal, and what the loop reckons it in."""
+
+REQUIRED = (COMMANDS, "imu_angular_velocity", "imu_specific_force")
+_WRITTEN = (COMMANDS, MODES, PAYLOAD)
+_MODE_NAMES = tuple(DRIVE_MODES.values())
+_ENTRIES = {"variables", "unit", "sign", "offset"}
+
+LEAST_STEP_S = 1e-6
+"""The shortest communication step [s]."""
+
+
+@dataclass(frozen=True)
+class SignalBinding:
+    """One signal: the FMU's variables that hold it, in their order, and how their values become the loop's.
+
+    Attributes:
+        variables: names in the FMU.
+        unit: of the FMU's values; None for what the FMU declares, or else the loop's own.
+        sign: factors of 1 or -1, one, or one for each axis, or for each element.
+        offset: added to the value after that, in the loop's unit: one, or one for each element.
+        imus: whose signals these are; None for all.
+        modes: the FMU's values for a drive that is open, braked, and driven at its velocity; None for the usual one.
+    """
+
+    variables: tuple[str, ...]
+    unit: str | None = None
+    sign: tuple[float, ...] = (1.0,)
+    offset: tuple[float, ...] = (0.0,)
+    imus: tuple[int, ...] | None = None
+    modes: tuple[float | None, ...] = (None,) * len(DRIVE_MODES)
+
+
+@dataclass(frozen=True)
+class Binding:
+    """A binding, which still has to be checked against its FMU.
+
+    Attributes:
+        source: its file, for messages; "" for gough's own.
+        signals: by name.
+        step: communication step [s]; None for the control period.
+        start: start values by the FMU's own names.
+        native: whether the signals are those of gough's own plants, which then have gough's parameters, too.
+        problems: what is wrong with the file.
+    """
+
+    source: str
+    signals: Mapping[str, SignalBinding]
+    step: float | None = None
+    start: Mapping[str, Any] = field(default_factory=dict)
+    native: bool = False
+    problems: tuple[str, ...] = ()
+
+
+_OWN_SIGNALS = {name: SignalBinding((name,)) for name in SIGNAL_UNITS}
+OWN_BINDING = Binding("", _OWN_SIGNALS, native=True)
+"""Of gough's own plants, spatial and planar."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A value for a parameter or input of the FMU, from the start or from a time on.
+
+    Attributes:
+        name: in the FMU.
+        value: one number for all elements, or one for each.
+        at: [s]; None for the start.
+    """
+
+    name: str
+    value: tuple[float, ...]
+    at: float | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> "Setting":
+        """From text such as `payload.mass=12`, `gravity=0,0,-9.8` or `payload.mass=12@3.5`.
+
+        Raises:
+            InputError: the text is no setting.
+        """
+        name, equals, rest = text.partition("=")
+        value, at, time = rest.partition("@")
+        try:
+            numbers = tuple(float(_SWITCHES.get(part.strip(), part)) for part in value.split(","))
+            seconds = float(time) if at else None
+        except ValueError:
+            numbers, seconds = (), None
+        sound = all(map(isfinite, numbers)) and (seconds is None or (isfinite(seconds) and seconds >= 0.0))
+        if not (name.strip() and equals and numbers and sound):
+            raise InputError(f"{text!r} is no setting such as payload.mass=12, gravity=0,0,-9.8 or payload.mass=12@3.5")
+        return cls(name.strip(), numbers, seconds)
+
+    @property
+    def text(self) -> str:
+        """As `parse` takes it."""
+        return f"{self.name}={','.join(f'{each:g}' for each in self.value)}" + ("" if self.at is None else f"@{self.at:g}")
+
+
+_SWITCHES = {"true": 1.0, "false": 0.0}
+
+
+def load_binding(path: Path | str) -> Binding:
+    """Read a binding; what is wrong with its entries is said together with what is wrong about the FMU.
+
+    Raises:
+        InputError: there is no such file, or it is not TOML.
+    """
+    try:
+        document = tomllib.loads(Path(path).read_text())
+    except OSError as error:
+        raise InputError(f"cannot read the binding {path}: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is not a TOML file: {error}") from None
+    reader = _Reader()
+    tables = {name: reader.table(name, content) for name, content in document.items()}
+    for name in tables.keys() - SIGNAL_UNITS.keys() - {"fmu", "start"}:
+        reader.problems.append(f"there is no table [{name}]; there are fmu, start, {', '.join(SIGNAL_UNITS)}")
+    step = reader.step(tables.get("fmu", {}))
+    signals = {name: reader.signal(name, tables[name]) for name in SIGNAL_UNITS if name in tables}
+    native = not signals
+    return Binding(
+        Path(path).name, signals or _OWN_SIGNALS, step, tables.get("start", {}), native, tuple(reader.problems)
+    )  # fmt: skip
+
+
+class _Reader:
+    """Reads entries of a binding and keeps what is wrong with them."""
+
+    def __init__(self) -> None:
+        self.problems: list[str] = []
+
+    def table(self, name: str, content: Any) -> dict[str, Any]:
+        if isinstance(content, dict):
+            return content
+        self.problems.append(f"{name} must be a table [{name}]")
+        return {}
+
+    def step(self, table: Mapping[str, Any]) -> float | None:
+        self._check_entries("fmu", table, {"step"})
+        step = table.get("step")
+        if step is not None and not (_is_number(step) and step >= LEAST_STEP_S):
+            self.problems.append(f"[fmu] step is {step!r}; it must be a number of seconds, at least {LEAST_STEP_S:g}")
+            return None
+        return None if step is None else float(step)
+
+    def signal(self, name: str, table: Mapping[str, Any]) -> SignalBinding:
+        entries = _ENTRIES if name != MODES else {"variables", *_MODE_NAMES}
+        self._check_entries(name, table, entries | {"imus"} if name in IMU_SIGNALS else entries)
+        variables = table.get("variables", [])
+        if isinstance(variables, str):
+            variables = [variables]
+        if not (isinstance(variables, list) and variables and all(isinstance(each, str) for each in variables)):
+            self.problems.append(f"[{name}] variables is {variables!r}; it must be the name of a variable, or a list of names")
+            variables = []
+        unit = table.get("unit")
+        if unit is not None and not (isinstance(unit, str) and unit in UNITS[SIGNAL_UNITS[name]]):
+            self.problems.append(f"[{name}] unit is {unit!r}; it must be one of {_unit_names(name)}")
+            unit = None
+        return SignalBinding(
+            tuple(variables), unit, self._signs(name, table), self._numbers(name, "offset", table.get("offset", 0.0)),
+            self._imus(name, table.get("imus")), tuple(self._mode(name, mode, table.get(mode)) for mode in _MODE_NAMES),
+        )  # fmt: skip
+
+    def _check_entries(self, name: str, table: Mapping[str, Any], known: set[str]) -> None:
+        for entry in table.keys() - known:
+            self.problems.append(f"[{name}] has no entry {entry!r}; it has {', '.join(sorted(known))}")
+
+    def _numbers(self, name: str, entry: str, value: Any) -> tuple[float, ...]:
+        values = value if isinstance(value, list) else [value]
+        if values and all(_is_number(each) or isinstance(each, bool) for each in values):
+            return tuple(map(float, values))
+        self.problems.append(f"[{name}] {entry} is {value!r}; it must be a number, or a list of numbers")
+        return (0.0,) * len(values or [0.0])
+
+    def _mode(self, name: str, mode: str, value: Any) -> float | None:
+        if value is None or _is_number(value) or isinstance(value, bool):
+            return None if value is None else float(value)
+        self.problems.append(f"[{name}] {mode} is {value!r}; it must be a number, true or false")
+        return None
+
+    def _signs(self, name: str, table: Mapping[str, Any]) -> tuple[float, ...]:
+        signs = self._numbers(name, "sign", table.get("sign", 1))
+        if set(signs) <= {1.0, -1.0}:
+            return signs
+        self.problems.append(f"[{name}] sign is {table['sign']!r}; it must be 1 or -1, or a list of these")
+        return (1.0,)
+
+    def _imus(self, name: str, value: Any) -> tuple[int, ...] | None:
+        if value is None:
+            return None
+        if (
+            isinstance(value, list)
+            and value
+            and all(type(each) is int and each in range(IMU_COUNT) for each in value)
+            and len(set(value)) == len(value)
+        ):
+            return tuple(value)
+        self.problems.append(f"[{name}] imus is {value!r}; it must be a list of different numbers from 0 to {PLATFORM_IMU}")
+        return None
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+
+
+def _unit_names(signal: str) -> str:
+    return ", ".join(name for name in UNITS[SIGNAL_UNITS[signal]] if name)
+
+
+class Scalars(NamedTuple):
+    """Scalars that go between FMU and loop in one call: `loop = factor * fmu + offset`.
+
+    Attributes:
+        references: value references, in the order of the scalars.
+        places: of each scalar in the loop's array.
+        factors, offsets: of each scalar.
+    """
+
+    references: NDArray[np.uint32]
+    places: NDArray[np.int64]
+    factors: Array
+    offsets: Array
+
+
+class Modes(NamedTuple):
+    """How the drives are switched.
+
+    Attributes:
+        references: value references.
+        values: of the FMU for each of `OPEN`, `BRAKE`, `VELOCITY`.
+        variable: one of them, for its type; None if the FMU cannot be told.
+        common: whether there is one for all drives.
+    """
+
+    references: NDArray[np.uint32]
+    values: Array
+    variable: FmuVariable | None
+    common: bool
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A binding that fits its FMU.
+
+    Attributes:
+        legs: 6, or 3 of a planar plant.
+        imus: that there are, and those of them that have a magnetometer.
+        magnetometers: as `imus`.
+        sensed: the IMUs' signals, in (3, 7, 3).
+        known: the truth, in (19,).
+        commanded: the velocity commands, in (legs,).
+        loaded: the payload's mass, in (1,), or nothing.
+        modes: of the drives.
+        knows_pose: whether the truth tells the pose.
+        planar_angle: whether it tells an angle in the place of a quaternion.
+        driven: names of the FMU's scalars that the loop sets in every cycle.
+    """
+
+    legs: int
+    imus: tuple[int, ...]
+    magnetometers: tuple[int, ...]
+    sensed: Scalars
+    known: Scalars
+    commanded: Scalars
+    loaded: Scalars
+    modes: Modes
+    knows_pose: bool
+    planar_angle: bool
+    driven: frozenset[str]
+
+
+def check_start(variable: FmuVariable, owner: str, driven: frozenset[str]) -> None:
+    """Check that a variable may be given a start value.
+
+    Args:
+        variable: of the FMU.
+        owner: the FMU's file, for messages.
+        driven: as in `Bound`.
+
+    Raises:
+        InputError: it may not.
+    """
+    if not variable.startable:
+        raise InputError(
+            f"{variable.name} of {owner} is a {variable.variability} {variable.causality} variable, which takes no start "
+            "value: set parameters and inputs"
+        )
+    check_free(variable, owner, driven)
+
+
+def check_free(variable: FmuVariable, owner: str, driven: frozenset[str]) -> None:
+    """Check that the loop leaves a variable to others, with arguments as for `check_start`.
+
+    Raises:
+        InputError: it does not.
+    """
+    if not driven.isdisjoint(variable.element_names):
+        raise InputError(f"{variable.name} of {owner} is set by the loop, and cannot be set besides")
+
+
+def bind(binding: Binding, description: FmuDescription) -> Bound:
+    """Find a binding's variables in its FMU.
+
+    Raises:
+        FmuError: all that is wrong, with the file or with the FMU's variables.
+    """
+    return _Binder(binding, description).bound()
+
+
+class _Binder:
+    def __init__(self, binding: Binding, description: FmuDescription) -> None:
+        self._binding, self._description = binding, description
+        self._problems = list(binding.problems)
+        self._found = {name: self._variables(name, each) for name, each in self._present().items()}
+        commands = self._size(COMMANDS)
+        self._legs = PLANAR_LEGS if commands == PLANAR_LEGS else LEGS
+
+    def bound(self) -> Bound:
+        for name in REQUIRED:
+            if name not in self._binding.signals:
+                self._problems.append(f"there is no table [{name}], which is needed")
+        imus = {name: self._imus(name) for name in IMU_SIGNALS if name in self._found}
+        if len({frozenset(imus[name]) for name in REQUIRED[1:] if name in imus}) > 1:
+            self._problems.append("imu_angular_velocity and imu_specific_force are of different imus, and must be of the same")
+        groups = {
+            "sensed": self._group({name: self._imu_places(name, each) for name, each in imus.items()}),
+            "known": self._group({name: self._truth_places(name) for name in TRUTH_PLACES if name in self._found}),
+            "commanded": self._group({name: range(self._legs) for name in (COMMANDS,) if name in self._found}),
+            "loaded": self._group({name: range(1) for name in (PAYLOAD,) if name in self._found}),
+        }
+        modes = self._modes()
+        knows = "position" in self._found, "quaternion" in self._found or "angle" in self._found
+        if any(knows) and not all(knows):
+            self._problems.append("position, and quaternion or angle, are the pose only together: give both, or neither")
+        self._check_once()
+        self._check_start()
+        if self._problems:
+            with_binding = f" with {self._binding.source}" if self._binding.source else ""
+            raise FmuError(f"{self._description.path.name}{with_binding}: {'; '.join(self._problems)}")
+        return Bound(
+            legs=self._legs,
+            imus=tuple(sorted(imus["imu_angular_velocity"])),
+            magnetometers=tuple(sorted(imus.get("imu_magnetic_field", ()))),
+            **groups,
+            modes=modes,
+            knows_pose=all(knows),
+            planar_angle="angle" in self._found,
+            driven=self._driven(),
+        )
+
+    def _driven(self) -> frozenset[str]:
+        return frozenset(
+            scalar for name in (COMMANDS, MODES) for each in self._found.get(name, ()) for scalar in each.element_names
+        )
+
+    def _present(self) -> dict[str, SignalBinding]:
+        """The signals to look for: of gough's own binding, those that are needed or there."""
+        signals = self._binding.signals
+        if not self._binding.native:
+            return dict(signals)
+        return {name: each for name, each in signals.items() if name in REQUIRED or name in self._description}
+
+    def _variables(self, name: str, signal: SignalBinding) -> list[FmuVariable]:
+        found = []
+        for wanted in signal.variables:
+            try:
+                variable = self._description[wanted]
+            except GoughError as error:
+                self._problems.append(f"{name}: {str(error).removeprefix(f'{self._description.path.name} ')}")
+                continue
+            found.append(variable)
+            written = name in _WRITTEN
+            fits = variable.tunable if written else variable.causality in ("output", "local")
+            if not fits:
+                kind = (
+                    f"{variable.variability} {variable.causality}" if variable.causality == "parameter" else variable.causality
+                )
+                self._problems.append(f"{name}: {wanted} is of causality {kind} and must be {'input' if written else 'output'}")
+            if name == MODES and variable.ending and variable.dtype.itemsize <= 8:
+                continue
+            if not variable.real:
+                needed = "a number or a Boolean" if name == MODES else "double-precision real"
+                self._problems.append(f"{name}: {wanted} is of type {variable.type} and must be {needed}")
+        return found
+
+    def _size(self, name: str) -> int:
+        return sum(each.size for each in self._found.get(name, ()))
+
+    def _whole(self, name: str) -> bool:
+        """Whether all variables of a signal have been found."""
+        return len(self._found[name]) == len(self._binding.signals[name].variables) > 0
+
+    def _all_imus(self) -> tuple[int, ...]:
+        return (*range(self._legs), PLATFORM_IMU)
+
+    def _imus(self, name: str) -> tuple[int, ...]:
+        return self._binding.signals[name].imus or self._all_imus()
+
+    def _imu_places(self, name: str, imus: Sequence[int]) -> list[int]:
+        beyond = sorted(set(imus) - set(self._all_imus()))
+        if beyond:
+            self._problems.append(f"{name}: there is no imu {beyond[0]} on {self._legs} legs; there are {self._all_imus()}")
+        return [(IMU_SIGNALS[name] * IMU_COUNT + imu) * 3 + axis for imu in imus for axis in range(3)]
+
+    def _truth_places(self, name: str) -> range:
+        sizes = {"position": 2 if self._legs == PLANAR_LEGS else 3, "quaternion": 4, "angle": 1}
+        if name == "angle" and self._legs != PLANAR_LEGS:
+            self._problems.append("angle: only a planar plant, with three commands, has one: give its quaternion")
+        return range(TRUTH_PLACES[name], TRUTH_PLACES[name] + sizes.get(name, self._legs))
+
+    def _group(self, places: Mapping[str, Sequence[int]]) -> Scalars:
+        """The scalars of some signals, from the places of their elements."""
+        references: list[int] = []
+        factors: list[float] = []
+        offsets: list[float] = []
+        for name, elements in places.items():
+            if not self._whole(name):
+                continue
+            found, signal, count = self._found[name], self._binding.signals[name], len(elements)
+            references += [reference for each in found for reference in each.references]
+            if self._size(name) != count:
+                names = ", ".join(each.name for each in found)
+                have = "has" if len(found) == 1 else "together have"
+                remedy = "; if there are fewer imus, name them with imus" if name in IMU_SIGNALS and signal.imus is None else ""
+                self._problems.append(f"{name}: {names} {have} {self._size(name)} elements and must have {count}{remedy}")
+                continue
+            units = np.array([self._factor(name, each) for each in found for _ in range(each.size)])
+            factors += list(units * self._spread(name, "sign", signal.sign, count))
+            offsets += list(self._spread(name, "offset", signal.offset, count))
+        return Scalars(
+            np.array(references, np.uint32), np.array([place for elements in places.values() for place in elements], np.int64),
+            np.array(factors, np.float64), np.array(offsets, np.float64),
+        )  # fmt: skip
+
+    def _factor(self, name: str, variable: FmuVariable) -> float:
+        known, unit = UNITS[SIGNAL_UNITS[name]], self._binding.signals[name].unit
+        if unit is None:
+            unit = SIGNAL_UNITS[name] if variable.unit is None else variable.unit
+        if unit not in known:
+            self._problems.append(f"{name}: {variable.name} is in {unit}: say with unit which of {_unit_names(name)} that is")
+        return known.get(unit, 1.0)
+
+    def _spread(self, name: str, entry: str, values: tuple[float, ...], count: int) -> Array:
+        if len(values) in (1, count) or (len(values) == 3 and name in IMU_SIGNALS):
+            return np.resize(np.array(values), count)
+        per_axis = ", 3" if name in IMU_SIGNALS else ""
+        self._problems.append(f"[{name}] {entry} has {len(values)} numbers and must have 1{per_axis} or {count}")
+        return np.ones(count)
+
+    def _modes(self) -> Modes:
+        found = self._found.get(MODES, [])
+        references = np.array([reference for each in found for reference in each.references], np.uint32)
+        if not found or not self._whole(MODES):
+            return Modes(references[:0], np.zeros(len(DRIVE_MODES)), None, False)
+        size, first = self._size(MODES), found[0]
+        if size not in (1, self._legs):
+            names = ", ".join(each.name for each in found)
+            self._problems.append(f"{MODES}: {names} together have {size} elements and must have 1, or {self._legs}")
+        if len({(each.ending, each.dtype) for each in found}) > 1:
+            self._problems.append(
+                f"{MODES}: {', '.join(each.name for each in found)} are of different types and must be of one"
+            )
+        switch = first.type == "Boolean"
+        usual = (0.0, 0.0, 1.0) if switch else tuple(map(float, DRIVE_MODES))
+        told = self._binding.signals[MODES].modes
+        values = [each if mode is None else mode for each, mode in zip(usual, told, strict=True)]
+        if told[OPEN] is None and told[BRAKE] is not None:
+            values[OPEN] = values[BRAKE]
+        if values[BRAKE] == values[VELOCITY]:
+            self._problems.append(f"{MODES}: brake and velocity are both {values[BRAKE]:g} and must differ: give them both")
+        if first.ending:
+            try:
+                for value in values:
+                    first.values([value] * first.size, self._description.path.name)
+            except GoughError as error:
+                self._problems.append(f"{MODES}: {error}")
+        return Modes(references, np.array(values), first, size == 1)
+
+    def _check_once(self) -> None:
+        """Check that no scalar of the FMU is bound twice."""
+        signals: dict[str, list[str]] = {}
+        for name, found in self._found.items():
+            for scalar in (scalar for each in found for scalar in each.element_names):
+                signals.setdefault(scalar, []).append(name)
+        doubled: dict[str, list[str]] = {}
+        for scalar, names in signals.items():
+            if len(names) > 1:
+                doubled.setdefault(" and ".join(dict.fromkeys(names)), []).append(scalar)
+        for where, scalars in doubled.items():
+            self._problems.append(f"{where}: {', '.join(scalars)} must be bound once, and not more often")
+
+    def _check_start(self) -> None:
+        for name, value in self._binding.start.items():
+            try:
+                variable, owner = self._description[name], self._description.path.name
+                variable.values(value, owner)
+                check_start(variable, owner, self._driven())
+            except GoughError as error:
+                self._problems.append(f"[start] {error}")

@@ -1,0 +1,475 @@
+"""From the dynamics of a plant to its FMU: C code, description, shared libraries, and the archive around them.
+
+Run in a process of its own (`python -m plant.fmu.build FILE ...`), because CasADi must not be loaded by a process that runs a
+loop. The FMU is native and holds no Python.
+"""
+
+import io
+import platform
+import re
+import shutil
+import struct
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib import resources
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import fmpy
+
+from plant.compiled import hash_of_files, keyed_folder
+from plant.dynamics.planar_variables import PLANAR
+from plant.dynamics.variables import SPATIAL, Variable, VariableTable
+from plant.errors import InputError, ToolchainError
+from plant.files import check_writable, write_whole
+from plant.fmu.description import Dependencies, Layout, build_description, model_description, start_of
+from plant.mechanism import Mechanism, load_in_space
+from plant.pose import Array
+
+C_FLAGS = (
+    "-std=c11", "-fPIC", "-fvisibility=hidden", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math",
+)  # fmt: skip
+SOURCES = ("model.c", "plant.c", "derivatives.c", "unsupported.c")
+"""The C files of an FMU, beside `fmi2.c` or `fmi3.c`."""
+
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+_FUNCTIONS = ("constants", "start", "conditions", "limits", "rates", "outputs")
+
+
+@dataclass(frozen=True)
+class Model:
+    """A plant that can be exported.
+
+    Attributes:
+        identifier: of the FMU and its binaries.
+        description: one line about it.
+        table: its variables.
+        preset: the mechanism whose parameters are the default start values.
+        dynamics: derives its equations (`plant.dynamics.spatial.Dynamics`); loads CasADi.
+    """
+
+    identifier: str
+    description: str
+    table: VariableTable
+    preset: str
+    dynamics: Callable[[], Any]
+
+
+def _planar_dynamics() -> Any:
+    from plant.dynamics.planar import build_planar_dynamics
+
+    return build_planar_dynamics()
+
+
+def _spatial_dynamics() -> Any:
+    from plant.dynamics.spatial import build_dynamics
+
+    return build_dynamics()
+
+
+SPATIAL_MODEL = Model(
+    "gough_plant", "Six-leg parallel mechanism with encoderless drives and ideal IMUs", SPATIAL, "hexapod", _spatial_dynamics
+)
+PLANAR_MODEL = Model(
+    "gough_planar_plant", "Planar three-leg mechanism with encoderless drives and ideal IMUs", PLANAR, "planar-3rpr",
+    _planar_dynamics,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Target:
+    """A platform that FMUs are compiled for: its folders in FMI 3.0 and 2.0, zig's name for it, and its libraries' suffix."""
+
+    folder: str
+    folder_2: str
+    zig: str
+    suffix: str
+
+
+TARGETS = {
+    "linux": (Target("x86_64-linux", "linux64", "x86_64-linux-gnu.2.17", ".so"),),
+    "windows": (Target("x86_64-windows", "win64", "x86_64-windows-gnu", ".dll"),),
+    "darwin": (
+        Target("x86_64-darwin", "darwin64", "x86_64-macos.11.0", ".dylib"),
+        Target("aarch64-darwin", "darwin64", "aarch64-macos.11.0", ".dylib"),
+    ),
+}
+"""What `--platforms` can name. In FMI 2.0 both processors of darwin share one universal library."""
+
+
+def default_fmu(model: Model = SPATIAL_MODEL, fmi: int = 3) -> Path:
+    """A plant's FMU of FMI 2.0 or 3.0 for this machine, built on first use and kept under a hash of all that it is made from.
+
+    Raises:
+        ToolchainError: no C compiler, or it failed.
+    """
+    package = Path(__file__).resolve().parent.parent
+    sources = [*sorted(package.rglob("*.py")), package / "mechanism" / "presets" / f"{model.preset}.toml"]
+    with resources.as_file(resources.files("fmus")) as folder:
+        wrappers = sorted([*folder.glob("*.c"), *folder.glob("*.h")])
+        key = hash_of_files([*sources, *wrappers], version("casadi"), platform.machine(), sys.platform, str(fmi))
+    path = keyed_folder("fmus", key) / f"{model.identifier}.fmu"
+    if not path.exists():
+        build_in_subprocess(path, fmi, model.preset)
+    return path
+
+
+def build_in_subprocess(path: Path, fmi: int = 3, mechanism: str = "hexapod", platforms: Sequence[str] = ()) -> None:
+    """Build an FMU at `path` without loading CasADi into this process; arguments as for `build`.
+
+    Raises:
+        ToolchainError: no C compiler, or it failed, or `path` cannot be written.
+    """
+    command = [sys.executable, "-P", "-m", "plant.fmu.build", str(path), str(fmi), mechanism, *platforms]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    if run.returncode:
+        last = (run.stderr.strip() or "no output").splitlines()[-1]
+        raise ToolchainError(f"the plant's FMU could not be built: {last.split(': ', 1)[-1]}")
+
+
+def c_compiler() -> list[str]:
+    """The command of a C compiler for this machine.
+
+    Raises:
+        ToolchainError: none is installed.
+    """
+    for name in ("cc", "gcc", "clang"):
+        if found := shutil.which(name):
+            return [found]
+    raise ToolchainError("no C compiler (cc, gcc or clang) was found: install one, on Debian with 'apt install gcc'")
+
+
+def _zig() -> list[str]:
+    """The command of the compiler for other platforms.
+
+    Raises:
+        ToolchainError: it is not installed.
+    """
+    if find_spec("ziglang") is None:
+        raise ToolchainError("other platforms are compiled by zig, which is not installed: pip install 'gough[cross]'")
+    return [sys.executable, "-m", "ziglang", "cc"]
+
+
+def build(path: Path, fmi: int = 3, mechanism: str | Path = "hexapod", platforms: Sequence[str] = ()) -> None:
+    """Write the plant of a mechanism as an FMU; the file appears whole or not at all.
+
+    Args:
+        path: the file.
+        fmi: 3 for FMI 3.0, Co-Simulation and Model Exchange; 2 for FMI 2.0 Co-Simulation.
+        mechanism: preset or file whose parameters are the start values; a planar one gives the planar plant.
+        platforms: keys of `TARGETS`, compiled by zig; by default this machine's, by its C compiler.
+
+    Raises:
+        ToolchainError: no C compiler, or it failed.
+        InputError: a version or platform that does not exist, or `path` cannot be written.
+    """
+    check_build(fmi, platforms)
+    check_writable(path)
+    loaded = load_in_space(mechanism)
+    model = model_of(loaded)
+    starts = loaded.plant_parameters()
+    layout = Layout(model.table)
+    with tempfile.TemporaryDirectory(prefix="gough-build-") as folder:
+        work = Path(folder)
+        dynamics = model.dynamics()
+        _generate_c(dynamics, work)
+        dependencies = _dependencies(dynamics, layout)
+        wrapper = f"fmi{fmi}.c"
+        for name in ("model.h", "model.c", wrapper):
+            (work / name).write_text((resources.files("fmus") / name).read_text())
+        (work / "unsupported.c").write_text(_unsupported(fmi, (work / wrapper).read_text()))
+        values = repr({name: value.tolist() for name, value in starts.items()})
+        token = "{" + hash_of_files([work / name for name in (*SOURCES, wrapper, "model.h")], values) + "}"
+        (work / "layout.h").write_text(_layout_h(layout, starts, token, dynamics))
+        sources = [*SOURCES, wrapper]
+        contents = {
+            "modelDescription.xml": model_description(
+                fmi, model.identifier, model.description, layout, starts, token, dependencies, sources
+            ).encode(),
+            **{f"sources/{file.name}": file.read_bytes() for file in sorted(work.iterdir())},
+            "sources/buildDescription.xml": build_description(model.identifier, sources).encode(),
+        }
+        for name, library in _libraries(model, fmi, work, sources, platforms).items():
+            contents[f"binaries/{name}"] = library
+        write_whole(path, _archive(contents))
+
+
+def check_build(fmi: int, platforms: Sequence[str]) -> None:
+    """Check what an FMU is to be built for, and that there is a compiler for it.
+
+    Raises:
+        InputError: a version or platform that does not exist.
+        ToolchainError: no compiler.
+    """
+    if fmi not in (2, 3):
+        raise InputError(f"there is no FMI {fmi} to export: choose 2 or 3")
+    if unknown := [name for name in platforms if name not in TARGETS]:
+        raise InputError(f"no platform {unknown[0]!r}; there are {', '.join(TARGETS)}")
+    if platforms:
+        _zig()
+    else:
+        c_compiler()
+
+
+def model_of(mechanism: Mechanism) -> Model:
+    """The plant that a mechanism is one of."""
+    return PLANAR_MODEL if mechanism.planar else SPATIAL_MODEL
+
+
+def _archive(contents: Mapping[str, bytes]) -> bytes:
+    """A zip archive without the time of its making, so that the same sources give the same bytes."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in contents.items():
+            entry = zipfile.ZipInfo(name, _EPOCH)
+            entry.external_attr = 0o644 << 16
+            archive.writestr(entry, data, zipfile.ZIP_DEFLATED)
+    return buffer.getvalue()
+
+
+# ---- shared libraries ----
+
+
+def _libraries(model: Model, fmi: int, work: Path, sources: list[str], platforms: Sequence[str]) -> dict[str, bytes]:
+    """The shared libraries by their paths in the folder `binaries`."""
+    if not platforms:
+        library = _compile(c_compiler(), work, sources, fmpy.sharedLibraryExtension)
+        folder = fmpy.platform_tuple if fmi == 3 else fmpy.platform
+        return {f"{folder}/{model.identifier}{fmpy.sharedLibraryExtension}": library}
+    libraries: dict[str, bytes] = {}
+    for name in platforms:
+        compiled = []
+        for target in TARGETS[name]:
+            library = _compile([*_zig(), "-target", target.zig], work, sources, target.suffix)
+            compiled.append(library)
+            libraries[f"{target.folder if fmi == 3 else target.folder_2}/{model.identifier}{target.suffix}"] = library
+        if fmi == 2 and len(compiled) > 1:
+            libraries[f"{target.folder_2}/{model.identifier}{target.suffix}"] = _universal(compiled)
+    return libraries
+
+
+def _compile(compiler: list[str], work: Path, sources: list[str], suffix: str) -> bytes:
+    """A shared library; the derivatives are long and seldom used, and so compiled with less effort."""
+    headers = Path(fmpy.__file__).parent / "c-code"
+
+    def compile_one(source: str) -> str:
+        # The equations are one long block of scalars, which GCC then keeps in registers; other compilers ignore this.
+        effort = ["-O1"] if source == "derivatives.c" else ["-O2", "-frename-registers", "-fno-tree-slp-vectorize"]
+        # The compilers run in the folder, so that no path of this machine gets into what they make.
+        _run([*compiler, *C_FLAGS, *effort, f"-I{headers}", "-c", source, "-o", f"{source}.o"], work)
+        return f"{source}.o"
+
+    with ThreadPoolExecutor() as pool:
+        objects = list(pool.map(compile_one, sources))
+    _run([*compiler, "-shared", "-s", *objects, "-o", f"library{suffix}", "-lm"], work)
+    library = (work / f"library{suffix}").read_bytes()
+    return _without_time(library) if suffix == ".dll" else library
+
+
+def _run(command: list[str], folder: Path) -> None:
+    run = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    if run.returncode:
+        complaint = next((line for line in run.stderr.splitlines() if "error" in line), run.stderr.strip())
+        raise ToolchainError(f"{command[0]} could not compile the plant: {complaint}")
+
+
+def _without_time(library: bytes) -> bytes:
+    """A library of Windows without the time of its making (TimeDateStamp in the header of its PE format)."""
+    stamp = struct.unpack_from("<I", library, 0x3C)[0] + 8
+    return library[:stamp] + bytes(4) + library[stamp + 4 :]
+
+
+def _universal(libraries: list[bytes]) -> bytes:
+    """Mach-O libraries of several processors in one file (the fat header of mach-o/fat.h)."""
+    alignment = 14
+    header, body = struct.pack(">2I", 0xCAFEBABE, len(libraries)), b""
+    at = 1 << alignment
+    for library in libraries:
+        _, processor, variant = struct.unpack_from("<3I", library)
+        header += struct.pack(">5I", processor, variant, at, len(library), alignment)
+        padded = library + bytes(-len(library) % (1 << alignment))
+        body += padded
+        at += len(padded)
+    return header.ljust(1 << alignment, b"\0") + body
+
+
+# ---- C code ----
+
+
+def _generate_c(dynamics: Any, work: Path) -> None:
+    """Write plant.c and derivatives.c with their headers."""
+    import casadi as ca
+
+    functions_of = {"plant": [getattr(dynamics, name) for name in _FUNCTIONS], "derivatives": _derivatives(dynamics)}
+    for file, functions in functions_of.items():
+        generator = ca.CodeGenerator(f"{file}.c", {"with_header": True})
+        for function in functions:
+            generator.add(function)
+        generator.generate(f"{work}/")
+
+
+def _derivatives(dynamics: Any) -> list[Any]:
+    """Functions for the products of vectors with the Jacobians of rates, outputs and constants, and their transposes."""
+    import casadi as ca
+
+    def product(name: str, function: Any, reverse: bool) -> Any:
+        arguments = [ca.SX.sym(f"i{i}", function.size1_in(i)) for i in range(function.n_in())]
+        results = function(*arguments)
+        results = results if isinstance(results, tuple) else (results,)
+        here, there = (results, arguments) if reverse else (arguments, results)
+        seeds = [ca.SX.sym(f"s{i}", value.shape[0]) for i, value in enumerate(here)]
+        derived = ca.jtimes(ca.vertcat(*results), ca.vertcat(*arguments), ca.vertcat(*seeds), reverse)
+        sides = ca.vertsplit(ca.densify(derived), [0, *_cumulated(value.shape[0] for value in there)])
+        return ca.Function(name, [*arguments, *seeds], sides, {"cse": True})
+
+    states, inputs, constants = (ca.SX.sym(n, dynamics.rates.size1_in(i)) for i, n in enumerate("xuc"))
+    both = ca.Function(
+        "both",
+        [states, inputs, constants],
+        [dynamics.rates(states, inputs, constants), dynamics.outputs(states, inputs, constants)],
+    )
+    return [
+        product(f"plant_{prefix}{name}", function, reverse)
+        for prefix, function in (("", both), ("constants_", dynamics.constants), ("start_", dynamics.start))
+        for name, reverse in (("forward", False), ("reverse", True))
+    ]
+
+
+def _cumulated(sizes: Any) -> list[int]:
+    total, sums = 0, []
+    for size in sizes:
+        total += size
+        sums.append(total)
+    return sums
+
+
+def _dependencies(dynamics: Any, layout: Layout) -> Dependencies:
+    """From the sparsity of the Jacobians."""
+    import casadi as ca
+
+    table = layout.table
+    p = ca.SX.sym("p", dynamics.constants.size1_in(0))
+    x, u, c = (ca.SX.sym(name, dynamics.rates.size1_in(i)) for i, name in enumerate("xuc"))
+    running = ca.Function("running", [ca.vertcat(x, u), c], [ca.vertcat(dynamics.rates(x, u, c), dynamics.outputs(x, u, c))])
+    started, constants = dynamics.start(p), dynamics.constants(p)
+    initial = ca.Function(
+        "initial",
+        [ca.vertcat(u, p)],
+        [ca.vertcat(dynamics.rates(started, u, constants), dynamics.outputs(started, u, constants), started)],
+    )
+
+    def places(variables: Sequence[Variable]) -> list[int]:
+        return [place for variable in variables for place in layout.places(variable)]
+
+    def found(function: Any, unknowns: list[int], knowns: list[int]) -> dict[int, frozenset[int]]:
+        touched: dict[int, set[int]] = {place: set() for place in unknowns}
+        for row, column in zip(*function.jac_sparsity(0, 0).get_triplet(), strict=True):
+            touched[unknowns[row]].add(knowns[column])
+        return {place: frozenset(known) for place, known in touched.items()}
+
+    unknowns = places([*layout.rates, *table.outputs])
+    return Dependencies(
+        running=found(running, unknowns, places([*table.states, *table.inputs])),
+        initial=found(initial, [*unknowns, *places(table.states)], places([*table.inputs, *table.parameters])),
+    )
+
+
+def _kind(layout: Layout, variable: Variable) -> str:
+    if variable in layout.rates:
+        return "RATE"
+    if variable.causality == "parameter":
+        return "TUNABLE" if variable.tunable else "FIXED"
+    return ("DISCRETE_" if variable.discrete else "") + variable.causality.upper()
+
+
+def _layout_h(layout: Layout, starts: Mapping[str, Array], token: str, dynamics: Any) -> str:
+    table = layout.table
+    blocks = {"INPUTS": table.inputs, "PARAMETERS": table.parameters, "OUTPUTS": table.outputs, "RATES": layout.rates}
+    exposed = layout.exposed
+    places = sorted((place, v) for v, variable in enumerate(exposed) for place in layout.places(variable))
+
+    def array(kind: str, name: str, values: list[str]) -> str:
+        return f"static const {kind} {name}[] = {{{', '.join(values)}}};"
+
+    macros = {
+        "VALUES": layout.size,
+        "CONSTANTS": dynamics.constants.size1_out(0),
+        "CONDITIONS": len(dynamics.condition_texts),
+        "LIMITS": len(dynamics.limit_texts),
+        "VARIABLES": len(exposed),
+        "STATES": sum(variable.size for variable in table.states),
+        "INPUTS": sum(variable.size for variable in table.inputs),
+        "PARAMETERS": sum(variable.size for variable in table.parameters),
+        "LONGEST": max(variable.size for variable in exposed),
+        "TOKEN": f'"{token}"',
+        "LAYOUT": f"0x{token[1:17]}ULL",
+        **{f"{block}_AT": layout.offsets[variables[0].name] for block, variables in blocks.items()},
+        "SUBSTEP_AT": layout.offsets["substep"],
+    }
+    if "state.quaternion" in layout.offsets:
+        macros["QUATERNION_AT"] = layout.offsets["state.quaternion"]
+    lines = [
+        "#pragma once",
+        # Every file includes all tables, and uses some.
+        "#if defined __GNUC__",
+        '#pragma GCC diagnostic ignored "-Wunused-variable"',
+        "#endif",
+        "enum { FIXED, TUNABLE, INPUT, DISCRETE_INPUT, OUTPUT, STATE, RATE };",
+        *(f"#define {name} {value}" for name, value in macros.items()),
+        array("char *const", "names", [f'"{v.name}"' for v in exposed]),
+        array("char *const", "condition_texts", [f'"{text}"' for text in dynamics.condition_texts]),
+        array("char *const", "limit_texts", [f'"{text}"' for text in (*dynamics.limit_texts, "")]),
+        array("int", "kind", [_kind(layout, v) for v in exposed]),
+        array("int", "offset", [str(layout.offsets[v.name]) for v in exposed]),
+        array("int", "length", [str(v.size) for v in exposed]),
+        array("unsigned", "variable_of", [str(v) for _, v in places]),
+        array("double", "minimum", [repr(float(v.minimum)) for v in exposed]),
+        array("double", "maximum", [repr(float(v.maximum)) for v in exposed]),
+        array("double", "nominal", [repr(float(v.nominal)) for v in exposed]),
+        array("double", "start", [value.hex() for v in layout.stored for value in start_of(v, starts)]),
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _unsupported(fmi: int, wrapper: str) -> str:
+    """C code of the FMI functions outside this FMU's capabilities: importers want every symbol, and each must fail."""
+    headers = (Path(fmpy.__file__).parent / "c-code" / f"fmi{fmi}Functions.h").read_text()
+    declared = re.findall(rf"FMI{fmi}_Export\s+fmi{fmi}\w+TYPE\s+(fmi{fmi}\w+);", headers)
+    missing = [name for name in declared if not re.search(rf"\b{name}\(", wrapper)]
+    lines = []
+    for name in missing:
+        if "Instantiate" in name:
+            lines.append(f"EXPORT void *{name}(void) {{ return 0; }}")
+        elif re.search(r"[GS]et(U?Int|Float|Real|Integer|Boolean|String|Binary|Clock)\w*$", name):
+            lines.append(
+                f"EXPORT int {name}(void *instance, const unsigned *references, size_t n) "
+                f'{{ (void)references; return model_absent(instance, "{name}", n); }}'
+            )
+        else:
+            lines.append(f'EXPORT int {name}(void *instance) {{ return model_absent(instance, "{name}", 1); }}')
+    return "\n".join(
+        [
+            "#if defined _WIN32 || defined __CYGWIN__",
+            "#define EXPORT __declspec(dllexport)",
+            "#elif defined __GNUC__",
+            '#define EXPORT __attribute__((visibility("default")))',
+            "#else",
+            "#define EXPORT",
+            "#endif",
+            '#include "model.h"',
+            *lines,
+            "",
+        ]
+    )
+
+
+if __name__ == "__main__":
+    build(Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3], sys.argv[4:])

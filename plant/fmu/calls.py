@@ -1,0 +1,297 @@
+"""Calling an FMU from compiled code, by the addresses of its C functions."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+from plant.compiled import Record, kernel
+from plant.dynamics.variables import DRIVE_MODES, IMU_COUNT, VELOCITY
+from plant.fmu.binding import TRUTH_SIZE
+from plant.fmu.importer import ASKS_TO_END, ERROR, NEEDS_EVENTS, OK
+from plant.mechanism import LEGS
+from plant.pose import Array
+
+MOST_CHANGES = 32
+"""How many parameters may change during a run."""
+
+_SENSED = 3 * IMU_COUNT * 3
+_READING, _TELLING, _COMMANDING, _SWITCHING, _LOADING, _CHANGING, _STEPPING = range(7)
+CALLED = (
+    "reading the IMUs", "reading the truth", "setting the commands", "setting the drives' modes", "setting the payload",
+    "changing a parameter", "a step",
+)  # fmt: skip
+"""What a call is, for messages, by the `call` of `CALLS`."""
+
+
+def _scalars(most: int) -> np.dtype[Any]:
+    """As `plant.fmu.binding.Scalars`, with room for so many, and the FMU's values."""
+    return np.dtype(
+        [
+            ("references", np.uint32, most),
+            ("reference_count", np.int64),
+            ("count", np.int64),
+            ("places", np.int64, most),
+            ("factors", np.float64, most),
+            ("offsets", np.float64, most),
+            ("raw", np.float64, most),
+        ],
+        align=True,
+    )
+
+
+_CHANGE = np.dtype(
+    [
+        ("time", np.float64),
+        ("function", np.int64),
+        ("references", np.int64),
+        ("reference_count", np.int64),
+        ("values", np.int64),
+        ("count", np.int64),
+    ],
+    align=True,
+)
+
+CALLS = np.dtype(
+    [
+        ("version", np.int64),
+        ("instance", np.int64),
+        ("get", np.int64),
+        ("set", np.int64),
+        ("set_mode", np.int64),
+        ("do_step", np.int64),
+        ("time", np.float64),
+        ("since", np.float64),
+        ("length", np.float64),
+        ("steps", np.int64),
+        ("step", np.float64),
+        ("final", np.uint8),
+        ("status", np.int64),
+        ("call", np.int64),
+        ("sensed", _scalars(_SENSED)),
+        ("known", _scalars(TRUTH_SIZE)),
+        ("commanded", _scalars(LEGS)),
+        ("loaded", _scalars(1)),
+        ("mode_references", np.uint32, LEGS),
+        ("mode_reference_count", np.int64),
+        ("mode_count", np.int64),
+        ("mode_bytes", np.int64),
+        ("mode_values", np.uint64, len(DRIVE_MODES)),
+        ("mode_raw", np.uint64, LEGS),
+        ("imu", np.float64, (3, IMU_COUNT, 3)),
+        ("truth", np.float64, TRUTH_SIZE),
+        ("planar_angle", np.int64),
+        ("legs", np.int64),
+        ("command", np.float64, LEGS),
+        ("mode", np.int64, LEGS),
+        ("payload", np.float64, 1),
+        ("reached", np.float64, 1),
+        ("flags", np.uint8, 3),
+        ("changes", _CHANGE, MOST_CHANGES),
+        ("change_count", np.int64),
+        ("changed", np.int64),
+    ],
+    align=True,
+)
+"""One FMU as compiled code sees it: addresses, value references with what makes the FMU's values the loop's, and buffers.
+
+`imu` is angular velocity [rad/s], specific force [m/s^2] and magnetic field [uT] of the seven IMUs; `truth` is position (3)
+[m], quaternion (4), leg lengths (6) [m] and currents (6) [A]; both are NaN where the FMU says nothing. A planar plant's truth
+has its pose in space, with z = 0, and its first three legs. `step` is the communication step [s], 0 for that of each call.
+`time` is `steps` steps of one `length` [s] after `since` [s]: counted, for a sum would drift. `final` is whether no earlier
+state will be restored. `status` is how the first call that went wrong has ended, and `call` which that was.
+"""
+
+
+def _calling(arguments: str) -> Any:
+    """An intrinsic that calls the C function at an address with a tuple of arguments and returns its int.
+
+    `arguments` has one letter each: p for a pointer or size (intp), d for a double, b for a bool (uint8), i for an int.
+    """
+    llvm = {"p": ir.IntType(64), "d": ir.DoubleType(), "b": ir.IntType(8), "i": ir.IntType(32)}
+    numba_types = {"p": types.intp, "d": types.float64, "b": types.uint8, "i": types.int32}
+    tuple_of: Any = types.Tuple
+
+    @intrinsic
+    def call(typing_context: Any, address: Any, values: Any) -> Any:
+        signature = types.int32(types.intp, tuple_of([numba_types[letter] for letter in arguments]))
+
+        def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            function_type = ir.FunctionType(ir.IntType(32), [llvm[letter] for letter in arguments])
+            function = builder.inttoptr(args[0], function_type.as_pointer())
+            unpacked = [builder.extract_value(args[1], i) for i in range(len(arguments))]
+            # Callees may count on a bool that fills its register.
+            extended = {i: ("zeroext",) for i, letter in enumerate(arguments) if letter == "b"}
+            return builder.call(function, unpacked, arg_attrs=extended)
+
+        return signature, generate
+
+    return call
+
+
+_access_2: Callable[..., int] = _calling("pppp")
+_access_3: Callable[..., int] = _calling("ppppp")
+_do_step_2: Callable[..., int] = _calling("pddi")
+_do_step_3: Callable[..., int] = _calling("pddbpppp")
+
+
+@kernel
+def _ended(c: Record, call: int, status: int) -> int:
+    """Take note of the first call that goes wrong; returns its status."""
+    if status != OK and c.status == OK:
+        c.status, c.call = status, call
+    return status
+
+
+@kernel
+def _access(c: Record, call: int, function: int, references: int, reference_count: int, values: int, count: int) -> int:
+    """Get or set values, unless the FMU has failed before; returns FMI's status."""
+    if c.status >= ERROR:
+        return int(c.status)
+    if c.version == 2:
+        status = _access_2(function, (c.instance, references, reference_count, values))
+    else:
+        status = _access_3(function, (c.instance, references, reference_count, values, count))
+    return _ended(c, call, status)
+
+
+@kernel
+def _read(c: Record, call: int, scalars: Record, into: Array) -> int:
+    """Read scalars, each to its place."""
+    if scalars.count == 0:
+        return OK
+    raw, references = scalars.raw, scalars.references
+    status = _access(c, call, c.get, references.ctypes.data, scalars.reference_count, raw.ctypes.data, scalars.count)
+    places, factors, offsets = scalars.places, scalars.factors, scalars.offsets
+    for i in range(scalars.count):
+        into[places[i]] = factors[i] * raw[i] + offsets[i]
+    return status
+
+
+@kernel
+def _write(c: Record, call: int, scalars: Record, values: Array) -> int:
+    """Write scalars, each from its place."""
+    if scalars.count == 0:
+        return OK
+    raw, references = scalars.raw, scalars.references
+    places, factors, offsets = scalars.places, scalars.factors, scalars.offsets
+    for i in range(scalars.count):
+        raw[i] = (values[places[i]] - offsets[i]) / factors[i]
+    return _access(c, call, c.set, references.ctypes.data, scalars.reference_count, raw.ctypes.data, scalars.count)
+
+
+@kernel
+def read_imus(calls: Record) -> int:
+    """Read the ideal IMU signals into `imu`; returns FMI's status, 0 when all is well."""
+    c = calls[()]
+    return _read(c, _READING, c.sensed, c.imu.reshape(-1))
+
+
+@kernel
+def read_truth(calls: Record) -> int:
+    """Read pose, lengths and currents into `truth`, as far as the FMU tells them; returns FMI's status."""
+    c = calls[()]
+    truth = c.truth
+    status = _read(c, _TELLING, c.known, truth)
+    if c.planar_angle != 0:
+        half = 0.5 * truth[3]
+        truth[3], truth[4], truth[5], truth[6] = np.cos(half), 0.0, 0.0, np.sin(half)
+    return status
+
+
+@kernel
+def write_command(calls: Record, command: Array) -> int:
+    """Set the velocity commands (6,) or (3,) [m/s]; returns FMI's status.
+
+    Where the drives have no modes, those that are not to move are told to stand.
+    """
+    c = calls[()]
+    sent = c.command
+    for k in range(c.legs):
+        sent[k] = command[k] if c.mode_count > 0 or c.mode[k] == VELOCITY else 0.0
+    return _write(c, _COMMANDING, c.commanded, sent)
+
+
+@kernel
+def write_drive_mode(calls: Record, mode: int) -> int:
+    """Set the mode of all drives; returns FMI's status."""
+    calls[()].mode[:] = mode
+    return write_drive_modes(calls)
+
+
+@kernel
+def write_drive_modes(calls: Record) -> int:
+    """Set the modes of the drives to those in `mode`; returns FMI's status.
+
+    A switch that the drives have in common is on while any of them is to move.
+    """
+    c = calls[()]
+    if c.mode_count == 0:
+        return write_command(calls, c.command)
+    raw = c.mode_raw
+    raw[:] = 0
+    for k in range(c.mode_count):
+        mode = c.mode[k]
+        if c.mode_count == 1:
+            for other in range(c.legs):
+                mode = max(mode, c.mode[other])
+        at = k * c.mode_bytes
+        raw[at >> 3] |= c.mode_values[mode] << np.uint64(8 * (at & 7))
+    references = c.mode_references
+    return _access(
+        c, _SWITCHING, c.set_mode, references.ctypes.data, c.mode_reference_count, raw.ctypes.data, c.mode_count
+    )  # fmt: skip
+
+
+@kernel
+def write_payload_mass(calls: Record, mass: float) -> int:
+    """Set the mass of the payload [kg], if the plant has one; returns FMI's status."""
+    c = calls[()]
+    c.payload[0] = mass
+    return _write(c, _LOADING, c.loaded, c.payload)
+
+
+@kernel
+def advance(calls: Record, duration: float) -> int:
+    """Step the FMU by `duration` [s], in communication steps of its own if it has one; returns FMI's status."""
+    c = calls[()]
+    steps = 1 if c.step == 0.0 else max(int(np.rint(duration / c.step)), 1)
+    status = OK
+    for _ in range(steps):
+        while c.changed < c.change_count and c.changes[c.changed].time <= c.time + _INSTANT_S:
+            change = c.changes[c.changed]
+            status |= _access(
+                c, _CHANGING, change.function, change.references, change.reference_count, change.values, change.count
+            )  # fmt: skip
+            c.changed += 1
+        status |= _step(c, duration / steps)
+    return status
+
+
+_INSTANT_S = 1e-9
+"""What is due within this time is due now [s]."""
+
+
+@kernel
+def _step(c: Record, step: float) -> int:
+    """Take a communication step, unless the FMU has failed before; returns FMI's status."""
+    if c.status >= ERROR:
+        return int(c.status)
+    if c.version == 2:
+        status = _do_step_2(c.do_step, (c.instance, c.time, step, np.int32(c.final)))
+    else:
+        flags = c.flags
+        at = flags.ctypes.data
+        status = _do_step_3(c.do_step, (c.instance, c.time, step, c.final, at, at + 1, at + 2, c.reached.ctypes.data))
+        if status == OK and flags[1] != 0:
+            status = ASKS_TO_END
+        elif status == OK and (flags[0] != 0 or flags[2] != 0):
+            status = NEEDS_EVENTS
+    if step != c.length:
+        c.since, c.length, c.steps = c.time, step, 0
+    c.steps += 1
+    c.time = c.since + c.steps * step
+    return _ended(c, _STEPPING, status)

@@ -1,0 +1,172 @@
+"""Whether an FMU keeps what it promises: for any FMU of FMI 2.0 or 3.0 for Co-Simulation, ours or another's.
+
+FMPy validates the description; the rest is found by loading the FMU and trying it.
+"""
+
+import contextlib
+import functools
+import io
+import multiprocessing
+import os
+import zipfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fmpy.validation import validate_fmu
+
+from plant.fmu.importer import FmuDescription, FmuInstance, FmuVariable
+from plant.pose import Array
+
+_STEPS = 10
+_SMALL = 1e-4
+_ROUGHLY = 1e-4
+"""Of an input, a step for central differences; and how well they must agree with derivatives, relative to the largest."""
+
+Found = tuple[str, ...] | None
+"""Problems, none if all is well; None if there was nothing to look at."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that was looked at, and what was found."""
+
+    name: str
+    problems: Found
+
+
+def platforms_of(path: Path) -> list[str]:
+    """The platforms that an FMU has binaries for."""
+    with zipfile.ZipFile(path) as archive:
+        names = [name.split("/") for name in archive.namelist()]
+    return sorted({parts[1] for parts in names if parts[0] == "binaries" and len(parts) > 2 and parts[2]})
+
+
+def check_fmu(path: Path) -> list[Check]:
+    """Validate an FMU, and try it on this machine, in a process of its own, which may crash.
+
+    Raises:
+        FmuError: the file is no FMU for Co-Simulation.
+    """
+    FmuDescription(path)
+    found = {"description and units (FMPy)": _found(lambda: validate_fmu(str(path)))}
+    found |= zip(_TRIALS, _try_apart(path), strict=True)
+    return [Check(name, problems) for name, problems in found.items()]
+
+
+def _try_apart(path: Path) -> list[Found]:
+    """What each trial finds; after a crash, the rest go on in another process."""
+    found: list[Found] = []
+    context = multiprocessing.get_context("spawn")
+    while len(found) < len(_TRIALS):
+        receiver, sender = context.Pipe(duplex=False)
+        process = context.Process(target=_try, args=(path, len(found), sender), daemon=True)
+        process.start()
+        sender.close()
+        with receiver, contextlib.suppress(EOFError):
+            while True:
+                found.append(receiver.recv())
+        process.join()
+        if len(found) < len(_TRIALS):
+            found.append((_ending(process.exitcode or 0),))
+    return found
+
+
+def _try(path: Path, first: int, sender: Connection) -> None:
+    """Make the trials from one on, in the process that is there for them."""
+    # Many an FMU prints.
+    silence = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        os.dup2(silence, stream)
+    description = FmuDescription(path)
+    for trial in list(_TRIALS.values())[first:]:
+        sender.send(_found(functools.partial(trial, description)))
+
+
+def _ending(status: int) -> str:
+    """How a process ended that should not have."""
+    return f"crashed with signal {-status}" if status < 0 else f"ended its process with status {status}"
+
+
+def _found(trial: Callable[[], Iterable[str] | None]) -> Found:
+    """What a trial finds; what it raises is a finding, too."""
+    try:
+        # FMPy prints.
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.chdir("."):
+            problems = trial()
+    except Exception as error:
+        return (" ".join(str(error).split()) or type(error).__name__,)
+    return None if problems is None else tuple(str(problem) for problem in problems)
+
+
+def _reals(description: FmuDescription, causality: str) -> list[FmuVariable]:
+    return [each for each in description if each.causality == causality and each.real and each.variability == "continuous"]
+
+
+def _advance(fmu: FmuInstance) -> None:
+    experiment = fmu.description.experiment
+    step = float(experiment.stepSize if experiment and experiment.stepSize else 1e-3)
+    for i in range(_STEPS):
+        fmu.step(i * step, step)
+
+
+def _outputs(fmu: FmuInstance) -> list[Array]:
+    return [fmu.get(each).ravel() for each in _reals(fmu.description, "output")]
+
+
+def _step(description: FmuDescription) -> list[str]:
+    with contextlib.closing(FmuInstance(description)) as fmu:
+        fmu.initialize()
+        _advance(fmu)
+        outputs = _reals(description, "output")
+        return [f"{each.name} is not finite" for each in outputs if not np.isfinite(fmu.get(each)).all()]
+
+
+def _restore(description: FmuDescription) -> list[str] | None:
+    if not description.saves_state:
+        return None
+    with contextlib.closing(FmuInstance(description)) as fmu:
+        fmu.initialize()
+        saved = fmu.state()
+        _advance(fmu)
+        once = _outputs(fmu)
+        fmu.restore(saved)
+        _advance(fmu)
+        again = _outputs(fmu)
+    same = all(np.array_equal(a, b, equal_nan=True) for a, b in zip(once, again, strict=True))
+    return [] if same else ["a restored state takes another course"]
+
+
+def _differentiate(description: FmuDescription) -> list[str] | None:
+    inputs, outputs = _reals(description, "input"), _reals(description, "output")
+    if not (description.differentiable and inputs and outputs):
+        return None
+    problems = []
+    with contextlib.closing(FmuInstance(description)) as fmu:
+        fmu.initialize()
+        for known in inputs:
+            derivatives = fmu.jacobian(outputs, [known])
+            middle = fmu.get(known).ravel()
+            for i, column in enumerate(derivatives.T):
+                ends: list[Array] = []
+                for sign in (1.0, -1.0):
+                    moved: Any = middle.copy()
+                    moved[i] += sign * _SMALL
+                    fmu.set(known, moved)
+                    ends.append(np.concatenate(_outputs(fmu)))
+                fmu.set(known, middle)
+                differences = (ends[0] - ends[1]) / (2.0 * _SMALL)
+                size = max(float(np.abs(column).max()), float(np.abs(differences).max()))
+                if np.abs(column - differences).max() > _ROUGHLY * size:
+                    problems.append(f"those by {known.element_names[i]} are off their differences")
+    return problems
+
+
+_TRIALS: dict[str, Callable[[FmuDescription], Iterable[str] | None]] = {
+    f"{_STEPS} steps with finite outputs": _step,
+    "a saved state goes on the same": _restore,
+    "derivatives agree with differences": _differentiate,
+}

@@ -1,0 +1,315 @@
+"""Running a plant FMU: checked when it is loaded, then called from compiled code (`plant.fmu.calls`)."""
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import inf
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from plant.compiled import Record
+from plant.errors import FmuError, InputError
+from plant.fmu.binding import OWN_BINDING, Binding, Modes, Scalars, Setting, bind, check_free, check_start, load_binding
+from plant.fmu.calls import (
+    CALLED,
+    CALLS,
+    MOST_CHANGES,
+    advance,
+    read_imus,
+    read_truth,
+    write_command,
+    write_drive_mode,
+    write_drive_modes,
+    write_payload_mass,
+)  # fmt: skip
+from plant.fmu.importer import OK, FmuDescription, FmuInstance, FmuVariable
+from plant.mechanism import LEGS
+from plant.pose import Array
+
+__all__ = [
+    "CALLS", "MOST_CHANGES", "FmuPlant", "LinearPlant", "advance", "read_imus", "read_truth", "write_command",
+    "write_drive_mode", "write_drive_modes", "write_payload_mass",
+]  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class LinearPlant:
+    """A linear system `x' = A x + B u, y = C x + D u` of n states, m inputs and p outputs, all as differences.
+
+    Attributes:
+        a, b, c, d: (n, n), (n, m), (p, n), (p, m).
+        states, inputs, outputs: the names of the scalars.
+    """
+
+    a: Array
+    b: Array
+    c: Array
+    d: Array
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+
+class FmuPlant:
+    """A plant FMU for Co-Simulation, of FMI 2.0 or 3.0, initialised and ready to step.
+
+    Args:
+        path: the FMU.
+        parameters: start values by name; a name that the FMU does not have is an error.
+        period: of control [s].
+        binding: a TOML file that says which variables are which; None where they have gough's own names.
+        settings: values that come after the parameters and the binding's, at the start or during the run.
+        legs: that it must have; None for any number.
+
+    Attributes:
+        calls: the structured array (dtype `CALLS`) for `read_imus`, `read_truth`, `write_command` and `advance`.
+        bound: what its variables are to the loop.
+        folder: where it has been extracted to; removed by `close`, or after a crash when an FMU is next loaded.
+
+    Raises:
+        FmuError: the file is no FMU, is of another kind, does not fit its binding, holds no binary for this machine, or refuses
+            its parameters.
+        UnknownNameError: a parameter or setting that the FMU does not have.
+        InputError: another number of legs, a period that the FMU cannot take, a binding that cannot be read, or a value that
+            does not fit.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        parameters: Mapping[str, ArrayLike],
+        period: float,
+        binding: Path | str | Binding | None = None,
+        settings: Sequence[Setting] = (),
+        legs: int | None = None,
+    ) -> None:
+        self.path = Path(path)
+        self.calls: Record = np.zeros((), CALLS)
+        if not isinstance(binding, Binding):
+            binding = OWN_BINDING if binding is None else load_binding(binding)
+        self.description = FmuDescription(self.path)
+        self.bound = bind(binding, self.description)
+        if legs not in (None, self.bound.legs):
+            raise InputError(f"{self.path.name} has {self.bound.legs} legs, and the mechanism has {legs}: choose another one")
+        self._check_period(period, binding.step)
+        self._kept: list[NDArray[Any]] = []
+        starts = {**parameters, **binding.start}
+        values = [self._values(name, value) for name, value in starts.items()]
+        values += [self._start_values(each) for each in settings if each.at is None]
+        changes = sorted((each for each in settings if each.at is not None), key=lambda each: each.at or 0.0)
+        self._check_changes(changes)
+        self._instance = FmuInstance(self.description)
+        try:
+            self._prepare_calls(binding.step)
+            for each in changes:
+                self._add_change(each)
+            for variable, numbers in values:
+                self._instance.set(variable, numbers)
+            self._instance.initialize()
+        except BaseException:
+            self._instance.close()
+            raise
+
+    def __enter__(self) -> "FmuPlant":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    @property
+    def folder(self) -> Path:
+        """Where the FMU has been extracted to."""
+        return self._instance.folder
+
+    @property
+    def messages(self) -> Sequence[str]:
+        """What the FMU has logged of late, but for what says that all is well."""
+        return self._instance.messages
+
+    def close(self) -> None:
+        """Free the instance and remove what was extracted; closing twice does no harm."""
+        self._instance.status = max(self._instance.status, int(self.calls["status"]))
+        self._instance.close()
+
+    def get(self, name: str) -> NDArray[Any]:
+        """The value of a number, in its own shape.
+
+        Raises:
+            UnknownNameError: the FMU has no such variable.
+            InputError: it is no number.
+            FmuError: the FMU refuses.
+        """
+        return self._instance.get(self.description[name])
+
+    def set(self, name: str, value: ArrayLike) -> None:
+        """Set a number.
+
+        Raises:
+            UnknownNameError: the FMU has no such variable.
+            InputError: the value has the wrong number of elements, or is none for this variable.
+            FmuError: the FMU refuses.
+        """
+        self._instance.set(*self._values(name, value))
+
+    def step(self, duration: float) -> None:
+        """Advance by `duration` [s].
+
+        Raises:
+            FmuError: the FMU reports a failure.
+        """
+        self._instance.check_open()
+        self.calls["status"] = OK
+        if advance(self.calls, duration):
+            raise self.failure()
+
+    def linearize(self, inputs: Sequence[str], outputs: Sequence[str]) -> "LinearPlant":
+        """The plant's equations to first order about where it is, from the FMU's directional derivatives.
+
+        Args:
+            inputs, outputs: names of the variables between which the plant is wanted.
+
+        Raises:
+            UnknownNameError: the FMU has no such variable.
+            InputError: it is no real variable.
+            FmuError: the FMU has no directional derivatives, or shows no states.
+        """
+        states, rates = [state for state, _ in self.description.states], [rate for _, rate in self.description.states]
+        if not states:
+            raise FmuError(f"{self.path.name} shows no continuous states: export it with them")
+        u, y = [self.description[name] for name in inputs], [self.description[name] for name in outputs]
+        n = sum(each.size for each in states)
+        whole = self._instance.jacobian([*rates, *y], [*states, *u])
+        names = tuple(tuple(name for each in side for name in each.element_names) for side in (states, u, y))
+        return LinearPlant(whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:], *names)
+
+    def state(self) -> bytes:
+        """All that the plant's future depends on, its clock included.
+
+        Raises:
+            FmuError: the FMU cannot save its state.
+        """
+        return struct.pack(_CLOCK, *(self.calls[name] for name in _CLOCKED)) + self._instance.state()
+
+    def restore(self, state: bytes) -> None:
+        """Go back to a state of this plant, or of another with the same FMU and settings.
+
+        Raises:
+            FmuError: the FMU cannot, or this is no state of it.
+        """
+        size = struct.calcsize(_CLOCK)
+        if len(state) < size:
+            raise FmuError(f"{self.path.name} cannot restore a state of {len(state)} bytes, for it is none of this plant")
+        self._instance.restore(state[size:])
+        for name, value in zip(_CLOCKED, struct.unpack(_CLOCK, state[:size]), strict=True):
+            self.calls[name] = value
+
+    def failure(self) -> FmuError:
+        """The error that says what went wrong in the compiled calls, in the FMU's own words."""
+        return self._instance.failure(CALLED[int(self.calls["call"])], int(self.calls["status"]))
+
+    def _values(self, name: str, value: ArrayLike, spread: bool = False) -> tuple[FmuVariable, NDArray[Any]]:
+        variable = self.description[name]
+        return variable, variable.values(value, self.path.name, spread)
+
+    def _start_values(self, setting: Setting) -> tuple[FmuVariable, NDArray[Any]]:
+        variable, values = self._values(setting.name, setting.value, spread=True)
+        check_start(variable, self.path.name, self.bound.driven)
+        return variable, values
+
+    def _check_period(self, period: float, step: float | None) -> None:
+        if not 0.0 < period < inf:
+            raise InputError(f"{self.path.name} cannot take a step of {period:g} s; it must be positive and finite")
+        if step is not None and not _is_multiple(period, step):
+            raise InputError(
+                f"{self.path.name} cannot take a rate of {1 / period:g} Hz: its binding sets a step of {step:g} s, so the rate "
+                f"must be {1 / step:g} Hz divided by a whole number"
+            )
+        co_simulation, experiment = self.description.co_simulation, self.description.experiment
+        if co_simulation.canHandleVariableCommunicationStepSize:
+            return
+        fixed = float(co_simulation.fixedInternalStepSize or (experiment and experiment.stepSize) or 0.0)
+        if fixed <= 0.0 or _is_multiple(step or period, fixed):
+            return
+        if step is not None:
+            raise InputError(
+                f"{self.path.name} cannot take a step of {step:g} s: its own is fixed at {fixed:g} s; set [fmu] step to "
+                "that, or to a multiple"
+            )
+        raise InputError(
+            f"{self.path.name} cannot take a rate of {1 / period:g} Hz: its step is fixed at {fixed:g} s, so the "
+            f"rate must be {1 / fixed:g} Hz divided by a whole number"
+        )
+
+    def _check_changes(self, changes: Sequence[Setting]) -> None:
+        if len(changes) > MOST_CHANGES:
+            raise InputError(f"{len(changes)} settings change during the run, and at most {MOST_CHANGES} can")
+        for each in changes:
+            variable, values = self._values(each.name, each.value, spread=True)
+            if not variable.tunable:
+                raise InputError(
+                    f"{each.name} of {self.path.name} cannot change during the run, for it is neither an input nor a tunable "
+                    "parameter: set it without @"
+                )
+            check_free(variable, self.path.name, self.bound.driven)
+            for name, value, (least, most) in zip(variable.element_names, values, variable.limits, strict=True):
+                if not least <= value <= most:
+                    raise InputError(f"{name} of {self.path.name} is to be {value:g}; it must be from {least:g} to {most:g}")
+
+    def _add_change(self, setting: Setting) -> None:
+        variable, values = self._values(setting.name, setting.value, spread=True)
+        references = np.array(variable.references, np.uint32)
+        self._kept += [references, values]
+        change = self.calls["changes"][self.calls["change_count"]]
+        change["time"], change["function"] = setting.at, self._instance.address(f"Set{variable.ending}")
+        change["references"], change["reference_count"] = references.ctypes.data, references.size
+        change["values"], change["count"] = values.ctypes.data, values.size
+        self.calls["change_count"] += 1
+
+    def _prepare_calls(self, step: float | None) -> None:
+        calls, bound, instance = self.calls, self.bound, self._instance
+        real = "Real" if self.description.version == 2 else "Float64"
+        calls["version"], calls["instance"] = self.description.version, instance.component()
+        calls["get"], calls["set"], calls["do_step"] = (
+            instance.address(each) for each in (f"Get{real}", f"Set{real}", "DoStep")
+        )  # fmt: skip
+        calls["step"], calls["final"] = step or 0.0, not self.description.saves_state
+        for group in ("sensed", "known", "commanded", "loaded"):
+            _fill(calls[group], getattr(bound, group))
+        if bound.modes.variable is not None:
+            self._prepare_modes(bound.modes, bound.modes.variable)
+        calls["imu"], calls["truth"] = np.nan, np.nan
+        calls["legs"], calls["planar_angle"] = bound.legs, bound.planar_angle
+        if bound.knows_pose and bound.legs < LEGS:
+            calls["truth"][2] = 0.0
+
+    def _prepare_modes(self, modes: Modes, variable: FmuVariable) -> None:
+        calls = self.calls
+        count = 1 if modes.common else self.bound.legs
+        calls["set_mode"] = self._instance.address(f"Set{variable.ending}")
+        calls["mode_references"][: modes.references.size] = modes.references
+        calls["mode_count"], calls["mode_bytes"] = count, variable.dtype.itemsize
+        calls["mode_reference_count"] = modes.references.size
+        for mode, value in enumerate(modes.values.astype(variable.dtype)):
+            calls["mode_values"][mode] = int.from_bytes(value.tobytes(), "little")
+
+
+_CLOCKED = ("time", "since", "length", "steps", "changed")
+_CLOCK = "<dddqq"
+
+
+def _is_multiple(duration: float, step: float) -> bool:
+    multiple = duration / step
+    return 0.5 < multiple < inf and abs(multiple - round(multiple)) <= 1e-6
+
+
+def _fill(record: Record, scalars: Scalars) -> None:
+    count = scalars.places.size
+    record["references"][: scalars.references.size] = scalars.references
+    record["reference_count"], record["count"] = scalars.references.size, count
+    record["places"][:count], record["factors"][:count], record["offsets"][:count] = (
+        scalars.places, scalars.factors, scalars.offsets,
+    )  # fmt: skip

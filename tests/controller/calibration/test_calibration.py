@@ -1,0 +1,155 @@
+"""The calibration of IMUs: its model, its file, and the cycle that applies it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
+
+from controller.calibration.file import Calibration, join_gain, load_calibration, save_calibration, split_gain
+from controller.cycle import OK, STATE, cycle, cycle_parameters
+from controller.estimation.mechanism_filter import ERRORS
+from controller.settings import control_settings, fusion_settings
+from plant.errors import InputError
+from plant.imu import imu_state, load_imu, measure
+from tests.controller.leg_geometry import angle_between, rotation_of, static_signals
+
+
+def numbers(low, high):
+    return arrays(np.float64, 3, elements=st.floats(low, high))
+
+
+def of_true_errors(imu, random):
+    """The calibration that undoes an IMU layer's constant errors, with a covariance."""
+    gain = np.linalg.inv(imu["gain"])
+    offset = -(gain @ imu["offset"][..., None])[..., 0]
+    root = random.normal(size=(7 * ERRORS, 7 * ERRORS)) * 10.0 ** random.uniform(-6.0, 0.0, 7 * ERRORS)[:, None]
+    return Calibration(
+        gain,
+        offset,
+        tilt=np.array([0.01, -0.02]),
+        joints=random.normal(0.0, 1e-4, (2, 6, 3)),
+        floor=np.array([1e-4, 3e-4]),
+        covariance=root @ root.T,
+        about={"date": "2026-11-21", "residuals": [0.1, 0.2], "poses_known": False},
+    )
+
+
+@given(scale=numbers(0.5, 2.0), axes=numbers(-0.3, 0.3), mounting=numbers(-1.5, 1.5))
+def test_a_gain_splits_into_what_it_is_made_of(scale, axes, mounting):
+    gain = join_gain(scale, axes, mounting)
+    triangle = np.array([[1.0, axes[0], axes[1]], [0.0, 1.0, axes[2]], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(gain, Rotation.from_rotvec(mounting).as_matrix() @ triangle @ np.diag(scale), atol=1e-12)
+    for found, given_ in zip(split_gain(gain), (scale, axes, mounting), strict=True):
+        np.testing.assert_allclose(found, given_, atol=1e-9)
+
+
+@pytest.mark.parametrize("gain", [np.zeros((3, 3)), np.diag([1.0, 1.0, -1.0]), np.full((3, 3), -np.inf)])
+def test_a_gain_that_no_sensor_has_is_refused(gain):
+    with pytest.raises(InputError, match="singular or mirrors"):
+        split_gain(gain)
+
+
+def test_it_is_the_inverse_of_the_imperfections(tmp_path):
+    model = load_imu("mpu9150")
+    still = {
+        name: replace(getattr(model, name), noise=0.0, resolution=0.0)
+        for name in ("gyroscope", "accelerometer", "magnetometer")
+    }
+    imu = imu_state(replace(model, **still), 3, 1e-3)
+    random = np.random.default_rng(3)
+    ideal, raw = random.normal(0.0, 1.0, (3, 7, 3)), np.zeros((3, 7, 3))
+    measure(imu, ideal, raw)
+    calibration = of_true_errors(imu, random)
+    np.testing.assert_allclose(calibration.apply(raw), ideal, atol=1e-12)
+    save_calibration(tmp_path / "c.toml", calibration)
+    again = load_calibration(tmp_path / "c.toml")
+    np.testing.assert_allclose(again.apply(raw), ideal, atol=1e-12)
+    scale = np.sqrt(np.diag(calibration.covariance))
+    np.testing.assert_allclose((again.covariance - calibration.covariance) / np.outer(scale, scale), 0.0, atol=1e-4)
+    assert again.about == calibration.about
+    for name in ("tilt", "joints", "floor"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(calibration, name))
+    # What was measured by two, one after the other.
+    gain, offset = np.tile(rotation_of([0.1, 0.0, 0.2]), (3, 7, 1, 1)), random.normal(size=(3, 7, 3))
+    np.testing.assert_allclose(
+        again.then(gain, offset).apply(raw), Calibration(gain, offset).apply(calibration.apply(raw)), atol=1e-12
+    )
+
+
+def test_the_cycle_applies_it(hexapod):
+    """With raw IMUs and their calibration the pose at rest is as with ideal ones."""
+    imu = imu_state(replace(load_imu("mpu9150"), magnetometer_rate=1000.0), 5, 1e-3)
+    imu["noise"], imu["resolution"], imu["smoothing"] = 0.0, 0.0, (0.0, 1.0)
+    calibration = replace(of_true_errors(imu, np.random.default_rng(5)), tilt=np.zeros(2))
+    position, rotation = hexapod.home.position + [0.01, -0.02, 0.01], rotation_of([0.1, 0.05, -0.1])
+    raw, segments = np.zeros((3, 7, 3)), np.zeros((6, 1, 5))
+    segments[:, 0, 1] = 0.4
+    settings = control_settings(hexapod), fusion_settings(hexapod)
+    errors = []
+    for each in (None, calibration):
+        imu["cycle"] = 0
+        parameters = cycle_parameters(hexapod, 1000.0, *settings, calibration=each)
+        state = np.zeros((), STATE)
+        for _ in range(100):
+            measure(imu, static_signals(hexapod, position, rotation), raw)
+            assert cycle(parameters, state, raw, segments) == OK
+        errors.append((np.linalg.norm(state["position"] - position), angle_between(state["rotation"], rotation)))
+    assert errors[1][0] < 1e-9
+    assert errors[1][1] < 1e-9
+    assert errors[0][0] > 5e-3
+
+
+def test_what_it_leaves_is_what_the_filter_knows_of_the_sensors(hexapod):
+    calibration = Calibration(covariance=np.diag(np.linspace(1.0, 2.0, 7 * ERRORS)))
+    parameters = cycle_parameters(
+        hexapod, 1000.0, control_settings(hexapod), fusion_settings(hexapod), whole="alignments", calibration=calibration
+    )
+    prior = parameters["filter"]["prior"]
+    np.testing.assert_array_equal(prior[: 7 * ERRORS, : 7 * ERRORS], calibration.covariance)
+    assert not prior[7 * ERRORS :].any()
+    assert parameters["filter"]["rig"] == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("imu_0 = [", "is no TOML file"),
+        ("[imu_7.gyroscope]\nbias = [0, 0, 0]", "no table 'imu_7'"),
+        ("[imu_0.compass]\nbias = [0, 0, 0]", "has no sensor 'compass'; it has gyroscope, accelerometer, magnetometer"),
+        ("[imu_0.gyroscope]\noffset = [0, 0, 0]", "imu_0.gyroscope must be a table of bias, scale, axes, mounting"),
+        ("[imu_0.gyroscope]\nbias = [0, 0]", r"imu_0.gyroscope.bias must have shape \(3,\)"),
+        ("[imu_0.gyroscope]\nbias = [0, nan, 0]", r"imu_0.gyroscope.bias\[1\] is nan; it must be finite"),
+        ("[imu_0.gyroscope]\nscale = [1, 0, 1]", r"imu_0.gyroscope.scale is \[1.0, 0.0, 1.0\]; it must be positive"),
+        ("[covariance]\nsigmas = [1.0]", r"covariance.sigmas must have shape \(147,\)"),
+        ("imu_0 = 3", "imu_0 must be a table, got 3"),
+        ("joints = [1]", r"joints must be a table, got \[1\]"),
+        ("[base]\ntitl = [0, 0]", "base has no entry 'titl'; it has tilt, floor"),
+        ('["imu_²"]', "no table 'imu_²'"),
+        (f"[covariance]\nsigmas = {[1.0] * 147}\nfactor = [[1.0]]", "covariance.factor must have 147 rows"),
+    ],
+)
+def test_a_malformed_file_is_refused_by_its_entry(tmp_path, text, complaint):
+    path = tmp_path / "c.toml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=complaint):
+        load_calibration(path)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"none\.toml cannot be read: No such file"):
+        load_calibration(tmp_path / "none.toml")
+
+
+def test_what_a_file_does_not_say_stays_as_it_is(tmp_path):
+    path = tmp_path / "c.toml"
+    path.write_text("[imu_2.accelerometer]\nbias = [0.1, 0.0, 0.0]\n")
+    calibration = load_calibration(path)
+    expected = np.zeros((3, 7, 3))
+    expected[1, 2, 0] = 0.1
+    np.testing.assert_array_equal(calibration.offset, expected)
+    np.testing.assert_array_equal(calibration.gain, np.tile(np.eye(3), (3, 7, 1, 1)))
+    assert calibration.covariance is None

@@ -1,0 +1,126 @@
+"""The filters on filterpy agree with the compiled ones: over thousands of steps, and the leg's part by part at any state."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from controller.estimation.filterpy_filters import PLATFORM_STATES, STATES, FilterpyLeg, FilterpyPlatform
+from controller.estimation.leg_filter import predict_leg, predict_measurement, start_leg, update_leg
+from controller.estimation.platform_filter import INNOVATION_LIMIT, start_platform, step_platform
+from controller.settings import FusionSettings
+from tests.controller.leg_geometry import unit
+from tests.controller.leg_motion import observe, sines
+
+GRAVITY = 9.81
+IMU_POSITION = np.array([0.03, -0.01, 0.10])
+UP_IN_JOINT = unit([0.05, 0.45, 0.9])
+
+
+class Twins:
+    """Both filters of one leg with the same noise."""
+
+    def __init__(self, rate, up=UP_IN_JOINT, d=IMU_POSITION):
+        fusion = FusionSettings()
+        self.noise = (1.0 / rate, fusion.leg_jerk**2, fusion.bias_walk**2)
+        variances = (fusion.gyroscope_noise**2 * rate / 2.0, fusion.leg_accelerometer_noise**2 * rate / 2.0)
+        self.arguments = (up, d, GRAVITY, *variances)
+        self.reference = FilterpyLeg(up, d, GRAVITY, *self.noise, *variances)
+        self.x, self.covariance = np.zeros(STATES), np.zeros((STATES, STATES))
+        self.scratch = (np.zeros(6), np.zeros((6, STATES)), np.zeros(STATES), np.zeros(STATES))
+
+    def start(self, gyroscope, accelerometer):
+        start_leg(self.x, self.covariance, gyroscope, accelerometer, self.arguments[0], FusionSettings().bias_sigma)
+        self.reference.start(self.x, self.covariance)
+        self.reference.update(gyroscope, accelerometer)
+        update_leg(self.x, self.covariance, gyroscope, accelerometer, *self.arguments, *self.scratch)
+
+    def step(self, gyroscope, accelerometer):
+        self.reference.step(gyroscope, accelerometer)
+        predict_leg(self.x, self.covariance, *self.noise)
+        update_leg(self.x, self.covariance, gyroscope, accelerometer, *self.arguments, *self.scratch)
+
+
+@pytest.mark.parametrize(("rate", "seed"), [(1000.0, 0), (1000.0, 1), (250.0, 2), (4000.0, 3)])
+def test_five_thousand_steps_agree_with_the_compiled_filter(rate, seed):
+    random = np.random.default_rng(seed)
+    motion = observe(sines(random, size=0.3), np.arange(5000) / rate, UP_IN_JOINT, IMU_POSITION, GRAVITY)
+    gyroscope = motion.gyroscope + 0.004 + random.normal(scale=2e-3, size=(5000, 3))
+    accelerometer = motion.accelerometer + random.normal(scale=0.4, size=(5000, 3))
+    twins = Twins(rate)
+    twins.start(gyroscope[0], accelerometer[0])
+    # Relative to the size of each state in this motion, a bias being part of a rate, and of each covariance to its variances.
+    size = np.abs(motion.states).max(axis=0)
+    size[6:] = size[2:4].min()
+    worst = np.zeros(2)
+    for sample in zip(gyroscope[1:], accelerometer[1:], strict=True):
+        twins.step(*sample)
+        deviation = np.sqrt(np.diag(twins.covariance))
+        off = twins.covariance - twins.reference.covariance
+        worst = np.maximum(
+            worst, [np.abs((twins.x - twins.reference.state) / size).max(), np.abs(off / np.outer(deviation, deviation)).max()]
+        )
+    assert worst[0] < 1e-12
+    assert worst[1] < 5e-12
+    # The motion was followed, so the agreement is not that of two filters at rest.
+    assert np.ptp(motion.angles, axis=0).min() > 0.1
+    assert np.abs(twins.x[:2] - motion.angles[-1]).max() < 0.01
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.tuples(*[st.floats(-size, size) for size in (1.5, 1.5, 5.0, 5.0, 80.0, 80.0, 0.4, 0.4, 0.4)]),
+    st.integers(0, 2**32 - 1),
+)
+def test_measurement_and_jacobian_agree_at_any_state(state, seed):
+    random = np.random.default_rng(seed)
+    up, d, x = unit(random.normal(size=3)), random.uniform(-0.1, 0.1, 3), np.array(state)
+    reference = FilterpyLeg(up, d, GRAVITY, 1e-3, 1.0, 1.0, 1.0, 1.0)
+    h, jacobian = np.zeros(6), np.zeros((6, STATES))
+    predict_measurement(x, up, d, GRAVITY, h, jacobian)
+    np.testing.assert_allclose(reference.measurement(x[:, None])[:, 0], h, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(reference.measurement_jacobian(x[:, None]), jacobian, rtol=0.0, atol=1e-12)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(-4.0, -1.0))
+def test_a_prediction_agrees_for_any_covariance_and_period(seed, exponent):
+    random = np.random.default_rng(seed)
+    period, jerk, bias_walk = 10.0**exponent, 10.0 ** random.uniform(0.0, 4.0), 10.0 ** random.uniform(-10.0, 0.0)
+    reference = FilterpyLeg(UP_IN_JOINT, IMU_POSITION, GRAVITY, period, jerk, bias_walk, 1.0, 1.0)
+    root, x = random.normal(size=(STATES, STATES)), random.normal(size=STATES)
+    covariance = root @ root.T
+    reference.start(x, covariance)
+    reference.filter.predict()
+    predict_leg(x, covariance, period, jerk, bias_walk)
+    np.testing.assert_allclose(x, reference.state, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(covariance, reference.covariance, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize(("rate", "seed"), [(1000.0, 0), (250.0, 1), (4000.0, 2)])
+def test_five_thousand_steps_of_the_platform_agree_with_the_compiled_filter(rate, seed):
+    random, fusion = np.random.default_rng(seed), FusionSettings()
+    noise = (fusion.gyroscope_noise**2, fusion.bias_walk**2, 1e-3)
+    times = np.arange(5000)[:, None] / rate
+    gyroscope = 0.01 + 2.0 * np.sin(times * [3.0, 5.0, 7.0] + [0.0, 1.0, 2.0]) + random.normal(scale=2e-3, size=(5000, 3))
+    acceleration = random.normal(size=(5000, 3))
+    force = GRAVITY * unit([0.1, -0.2, 1.0]) + acceleration + random.normal(scale=0.3, size=(5000, 3))
+    jolts = random.random((5000, 3)) < 0.02
+    force[jolts] += 60.0
+    x, covariance = np.zeros(PLATFORM_STATES), np.zeros((PLATFORM_STATES, PLATFORM_STATES))
+    start_platform(x, covariance, force[0], fusion.bias_sigma)
+    reference = FilterpyPlatform(GRAVITY, 1.0 / rate, *noise)
+    reference.start(x, covariance)
+    scratch = (np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(6))
+    worst, cut = np.zeros(2), 0
+    for sample in zip(gyroscope, force, acceleration, strict=True):
+        reference.step(*sample)
+        step_platform(x, covariance, *sample, 1.0 / rate, GRAVITY, *noise, *scratch)
+        deviation = np.sqrt(np.diag(covariance))
+        off = (covariance - reference.covariance) / np.outer(deviation, deviation)
+        worst = np.maximum(worst, [np.abs(x - reference.state).max(), np.abs(off).max()])
+        innovation = reference.filter.y.item() / np.sqrt(reference.filter.S.item())
+        assert abs(innovation) < INNOVATION_LIMIT * (1.0 + 1e-12)
+        cut += abs(innovation) > INNOVATION_LIMIT * (1.0 - 1e-12)
+    assert worst.max() < 1e-12
+    assert cut > 50

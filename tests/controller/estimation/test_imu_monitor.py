@@ -1,0 +1,107 @@
+"""What contradicts the others, beside the pose that is solved without it."""
+
+import numpy as np
+import pytest
+
+from controller.cycle import ALL_IMUS, STATE, cycle_parameters
+from controller.direct_kinematics import integrity, solve
+from controller.direct_kinematics.refinement import normal_equations, solve_normal_equations
+from controller.estimation.imu_monitor import MONITOR, contradiction, look_at_next
+from controller.inverse_kinematics import inverse_kinematics, sample_workspace
+from controller.settings import control_settings, fusion_settings
+from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
+from plant.mechanism import load_mechanism
+from plant.pose import Pose, rotation_from_vector
+
+UP = np.array([0.0, 0.0, 1.0])
+DEGREE = np.pi / 180.0
+
+
+def monitored(mechanism, pose, directions, vertical, used=range(6), turns=1):
+    """The monitor after it has looked at every IMU so many times, without a low-pass."""
+    fusion = fusion_settings(mechanism)
+    weights = np.zeros(6)
+    weights[list(used)] = 1.0 / fusion.leg_sigma**2
+    in_base, in_platform = np.array([UP, UP]), np.array([vertical, vertical])
+    vector_weights = np.array([1.0 / fusion.tilt_sigma**2, 0.0])
+    arms, predicted, lengths = np.zeros((6, 3)), np.zeros((6, 3)), np.zeros(6)
+    information, right, factor = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
+    normal_equations(
+        mechanism.base_joints, mechanism.platform_joints, directions, weights, in_base, in_platform, vector_weights,
+        np.array(pose.position), np.array(pose.rotation), arms, predicted, lengths, information, right,
+    )  # fmt: skip
+    assert solve_normal_equations(information, right, factor)
+    monitor = np.zeros((), MONITOR)
+    for _ in range(turns * IMU_COUNT):
+        look_at_next(
+            monitor[()], factor, arms, predicted, lengths, directions, weights, np.array(pose.rotation), UP, vertical,
+            vector_weights[0], 1.0,
+        )  # fmt: skip
+    return monitor
+
+
+def measured(mechanism, seed, faulty, angle):
+    """Directions and vertical at a random pose, with noise and one IMU that is off by an angle, and the true pose."""
+    random = np.random.default_rng(seed)
+    position, rotation = (each[0] for each in sample_workspace(mechanism, 1, seed=seed))
+    directions = np.array(inverse_kinematics(mechanism, Pose(position, rotation)).directions)
+    vertical = rotation[2].copy()
+    for k in range(6):
+        directions[k] = rotation_from_vector(random.normal(0.0, 0.03 * DEGREE, 3)) @ directions[k]
+    across = np.cross(vertical if faulty == PLATFORM_IMU else directions[faulty], random.normal(size=3))
+    turn = rotation_from_vector(angle * across / np.linalg.norm(across))
+    if faulty == PLATFORM_IMU:
+        vertical = turn @ vertical
+    else:
+        directions[faulty] = turn @ directions[faulty]
+    return directions, vertical
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_contradiction_is_the_difference_to_the_pose_solved_without_the_imu(hexapod, seed):
+    # To the first order, for which the fault is small.
+    directions, vertical = measured(hexapod, seed, seed % 7, 0.02 * DEGREE)
+    fitted = solve(hexapod, directions, up_in_platform=vertical)
+    monitor = monitored(hexapod, fitted, directions, vertical)
+    for k in range(6):
+        without = directions.copy()
+        without[k] = np.nan
+        pose = solve(hexapod, without, up_in_platform=vertical)
+        off = directions[k] - inverse_kinematics(hexapod, Pose(pose.position, pose.rotation)).directions[k]
+        np.testing.assert_allclose(monitor["contradiction"][k], off, atol=0.03 * np.linalg.norm(off) + 1e-6)
+    pose = solve(hexapod, directions)
+    off = UP - pose.rotation @ vertical
+    np.testing.assert_allclose(
+        monitor["contradiction"][PLATFORM_IMU], off - UP * (UP @ off), atol=0.03 * np.linalg.norm(off) + 1e-6
+    )
+
+
+@pytest.mark.parametrize("mechanism", ["hexapod", "6-4-I", "genhexkins"])
+@pytest.mark.parametrize("faulty", range(7))
+def test_the_imu_that_explains_most_is_the_one_that_is_wrong_and_the_slow_twin_names_it_too(mechanism, faulty):
+    mechanism = load_mechanism(mechanism)
+    named = agreed = 0
+    for seed in range(20):
+        directions, vertical = measured(mechanism, seed, faulty, 2.0 * DEGREE)
+        monitor = monitored(mechanism, solve(mechanism, directions, up_in_platform=vertical), directions, vertical)
+        named += int(np.argmax(monitor["explained"])) == faulty
+        agreed += integrity(mechanism, directions, up_in_platform=vertical).faulty in (faulty, None)
+        assert contradiction(monitor[()], faulty) == pytest.approx(2.0 * DEGREE, rel=0.5)
+    assert named >= 19
+    assert agreed >= 19
+
+
+def test_what_the_pose_needs_contradicts_nothing(hexapod):
+    # Four legs alone have two degrees of freedom to spare; three with the vertical as well: none is decidable for sure.
+    directions, vertical = measured(hexapod, 1, 0, 2.0 * DEGREE)
+    fitted = solve(hexapod, np.where(np.isin(np.arange(6), (0, 2, 4))[:, None], directions, np.nan), up_in_platform=vertical)
+    monitor = monitored(hexapod, fitted, directions, vertical, used=(0, 2, 4))
+    assert np.isfinite(monitor["contradiction"]).all()
+    for k in (1, 3, 5):
+        assert contradiction(monitor[()], k) == 0.0
+
+
+def test_in_the_cycle_it_is_off_for_raw_imus(hexapod):
+    settings = control_settings(hexapod), fusion_settings(hexapod)
+    assert cycle_parameters(hexapod, 1000.0, *settings, ALL_IMUS)["safety"]["watch_imus"] == 1
+    assert np.zeros((), STATE)["safety"]["monitor"]["looked_at"] == 0

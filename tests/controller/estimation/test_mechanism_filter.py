@@ -1,0 +1,321 @@
+"""The whole-mechanism filter: against its dense twin, and on imposed motion."""
+
+import numpy as np
+import pytest
+from numba import njit
+
+from controller.estimation.mechanism_filter import (
+    ALL_ERRORS,
+    BLOCKS,
+    ERRORS,
+    FILTER_STATE,
+    JOINTS,
+    MOTION_STATES,
+    RIG,
+    TILT,
+    collect,
+    distort,
+    error_gradient,
+    extrapolate,
+    extrapolate_covariance,
+    filter_parameters,
+    start_filter,
+    step_filter,
+)
+from controller.estimation.readings import READINGS_SCRATCH, predict_readings, sensor_geometry
+from controller.settings import FusionSettings, fusion_settings
+from plant.dynamics.imposed import impose
+from plant.errors import UnknownNameError
+from plant.imu import imu_state, load_imu, measure
+from plant.pose import rotation_angle, skew
+from tests.controller.leg_geometry import rotation_of
+
+RATE_HZ = 1000.0
+
+
+@njit
+def follow(parameters, geometry, state, imu, signals, used, delay, start, position, rotation, twist, positions, rotations):
+    """Run the filter over signals (N, 3, 7, 3), from a pose and twist; `used` (N, 7)."""
+    measurement, rate, acceleration = np.zeros((3, 7, 3)), np.zeros(6), np.zeros(6)
+    for i in range(signals.shape[0]):
+        measure(imu, signals[i], measurement)
+        time = i / RATE_HZ
+        if i == start:
+            start_filter(parameters, state, time, position, rotation, twist)
+        if i > start:
+            collect(state, measurement, used[i], time - delay)
+            step_filter(parameters, geometry, state)
+        extrapolate(state, time, positions[i], rotations[i], rate, acceleration)
+
+
+class Run:
+    """The filter on an imposed motion: its poses (N, 3), (N, 3, 3), errors, state."""
+
+    def __init__(self, mechanism, kind, errors, seconds=6.0, seed=0, used=None, imu="mpu9150-calibrated", **settings):
+        self.motion = impose(mechanism, kind, seconds, RATE_HZ, seed)
+        count = len(self.motion.times)
+        model = load_imu(imu)
+        self.parameters = filter_parameters(fusion_settings(mechanism, **settings), RATE_HZ, errors, None)
+        self.state = np.zeros((), FILTER_STATE)
+        self.positions, self.rotations = np.zeros((count, 3)), np.zeros((count, 3, 3))
+        used = np.ones((count, 7), np.int64) if used is None else used
+        turn = (self.motion.rotations[1] @ self.motion.rotations[0].T - np.eye(3)) * RATE_HZ
+        twist = [*(self.motion.positions[1] - self.motion.positions[0]) * RATE_HZ, turn[2, 1], turn[0, 2], turn[1, 0]]
+        follow(
+            self.parameters[()], sensor_geometry(mechanism)[()], self.state[()], imu_state(model, seed, 1.0 / RATE_HZ),
+            self.motion.signals, used, model.latency, 0, self.motion.positions[0] + 2e-3, self.motion.rotations[0],
+            np.array(twist), self.positions, self.rotations,
+        )  # fmt: skip
+
+    def rms(self, first=0.5):
+        """Position [mm] and rotation [deg] from this share of the run on."""
+        late = slice(round(first * len(self.positions)), None)
+        distance = np.linalg.norm(self.positions - self.motion.positions, axis=1)[late]
+        angle = rotation_angle(self.rotations, self.motion.rotations)[late]
+        return 1e3 * np.sqrt(np.mean(distance**2)), np.degrees(np.sqrt(np.mean(angle**2)))
+
+
+@pytest.mark.parametrize("errors", ["gyroscopes", "accelerometers", "alignments"])
+@pytest.mark.parametrize(
+    ("kind", "limits"), [("0.5", (0.2, 0.03)), ("1", (0.15, 0.03)), ("2", (0.1, 0.03)), ("mixed", (0.5, 0.1))]
+)
+def test_a_motion_is_followed_to_a_tenth_of_a_millimetre(hexapod, errors, kind, limits):
+    position, rotation = Run(hexapod, kind, errors, seconds=20.0).rms()
+    assert position < limits[0]
+    assert rotation < limits[1]
+
+
+def test_ideal_imus_give_the_motion_itself(hexapod):
+    position, rotation = Run(hexapod, "1", "accelerometers", seconds=4.0, imu="ideal").rms()
+    assert position < 5e-3
+    assert rotation < 2e-3
+
+
+def test_the_biases_of_the_gyroscopes_are_found(hexapod):
+    run = Run(hexapod, "1", "accelerometers", seconds=20.0)
+    true = imu_state(load_imu("mpu9150-calibrated"), 0, 1.0 / RATE_HZ)["offset"][0]
+    assert np.degrees(np.abs(run.state["errors"][:, :3] - true)).max() < 0.01
+
+
+def test_at_rest_it_does_not_drift(hexapod):
+    run = Run(hexapod, "static", "accelerometers", seconds=40.0)
+    distance = 1e3 * np.linalg.norm(run.positions - run.motion.positions, axis=1)
+    assert distance[-5000:].max() < 0.6
+    assert distance[-5000:].mean() < 1.5 * distance[10_000:15_000].mean() + 0.1
+
+
+# -------------------------------------------------------------------------------------------------------- the slow clear twin
+
+
+class Twin:
+    """The same filter with dense matrices and one joint update."""
+
+    def __init__(self, parameters, mechanism, errors, position, rotation, twist):
+        self.p, self.mechanism, self.n = parameters, mechanism, BLOCKS[errors]
+        self.geometry, self.rig = sensor_geometry(mechanism)[()], np.zeros(int(parameters["rig"]))
+        self.position, self.rotation = position.copy(), rotation.copy()
+        self.motion = np.array([twist[:3], twist[3:], np.zeros(3), np.zeros(3)])
+        self.low_passed = [self.motion.copy(), self.motion.copy()]
+        self.smooth = self.motion.copy()
+        self.errors, self.time = np.zeros((7, ERRORS)), 0.0
+        kept = [*(k * ERRORS + i for k in range(7) for i in range(self.n)), *range(ALL_ERRORS, ALL_ERRORS + len(self.rig))]
+        self.covariance = np.zeros((18 + len(kept), 18 + len(kept)))
+        self.covariance[:18, :18] = np.diag(np.repeat(np.square([0.01, 0.05, 0.1, 0.5, 5.0, 50.0]), 3))
+        self.covariance[18:, 18:] = parameters["prior"][np.ix_(kept, kept)]
+
+    def matrices(self, errors):
+        """Of gyroscope and accelerometer: I + diag(scale) + U(axes); and the alignment, turned back, to second order."""
+        found = []
+        for scale, axes in ((9, 18), (6, 15)):
+            matrix = np.eye(3) + np.diag(errors[scale : scale + 3])
+            matrix[[0, 0, 1], [1, 2, 2]] += errors[axes : axes + 3]
+            found.append(matrix)
+        back = -skew(errors[12:15])
+        return found, np.eye(3) + back + back @ back / 2.0
+
+    def predict(self, t):
+        v, w, a, e = self.motion
+        turn = w * t + e * t * t / 2.0
+        transition = np.eye(len(self.covariance))
+        for i in range(3):
+            for block in (0, 3):
+                transition[block + i, 6 + block + i] = t
+                transition[block + i, 12 + block + i] = t * t / 2.0
+                transition[6 + block + i, 12 + block + i] = t
+        transition[3:6, 3:6] += skew(turn)
+        noise = np.zeros_like(transition)
+        shape = np.array([[t**5 / 20, t**4 / 8, t**3 / 6], [t**4 / 8, t**3 / 3, t**2 / 2], [t**3 / 6, t**2 / 2, t]])
+        for block, jerk in zip((0, 3), self.p["jerk"], strict=True):
+            for i in range(3):
+                at = [block + i, 6 + block + i, 12 + block + i]
+                noise[np.ix_(at, at)] = jerk * shape
+        for k in range(7):
+            for i in range(min(self.n, 6)):
+                noise[18 + k * self.n + i, 18 + k * self.n + i] = self.p["bias_walk"][i // 3] * t
+        self.covariance = transition @ self.covariance @ transition.T + noise
+        self.position = self.position + v * t + a * t * t / 2.0
+        self.rotation = rotation_of(turn) @ self.rotation
+        self.motion = np.array([v + a * t, w + e * t, a, e])
+        first, second = self.low_passed
+        first = first + t / (t + 0.03) * (self.motion - first)
+        second = second + t / (t + 0.03) * (first - second)
+        self.low_passed, self.smooth = [first, second], 2.0 * first - second
+
+    def by_rig(self):
+        """Derivatives (7, 6, 38) of ideal readings by joints and tilt, by differences."""
+
+        def ideal(rig):
+            readings, scratch = np.zeros((7, 6)), np.zeros((), READINGS_SCRATCH)
+            geometry = sensor_geometry(self.mechanism.moved_joints(rig[:36].reshape(2, 6, 3)), rig[36:])
+            args = (self.position, self.rotation, self.smooth, False, readings, np.zeros((7, 6, MOTION_STATES)), scratch[()])
+            predict_readings(geometry[()], *args)
+            return readings
+
+        steps = 1e-6 * np.eye(len(self.rig))
+        return np.stack([(ideal(step) - ideal(-step)) / 2e-6 for step in steps], axis=2) if len(steps) else np.zeros((7, 6, 0))
+
+    def update(self, samples, used, count, time):
+        self.predict(time - self.time)
+        self.time = time
+        scratch, ideal, at_smooth = np.zeros((), READINGS_SCRATCH), np.zeros((7, 6)), np.zeros((7, 6, MOTION_STATES))
+        smooth = np.zeros((7, 6))
+        predict_readings(self.geometry, self.position, self.rotation, self.smooth, True, smooth, at_smooth, scratch[()])
+        predict_readings(self.geometry, self.position, self.rotation, self.motion, False, ideal, at_smooth.copy(), scratch[()])
+        by_rig = self.by_rig()
+        rows, innovations, variances = [], [], []
+        for k in np.flatnonzero(used):
+            matrices, back = self.matrices(self.errors[k])
+            for sensor, matrix in enumerate(matrices):
+                part = slice(3 * sensor, 3 * sensor + 3)
+                x, y = back @ ideal[k, part], back @ smooth[k, part]
+                by_errors = np.zeros((3, ERRORS))
+                by_errors[:, part] = np.eye(3)
+                by_errors[:, (9, 6)[sensor] : (9, 6)[sensor] + 3] = np.diag(y)
+                by_errors[:, 12:15] = matrix @ skew(y)
+                by_errors[:, (18, 15)[sensor] : (18, 15)[sensor] + 3] = [[y[1], y[2], 0.0], [0.0, 0.0, y[2]], [0.0, 0.0, 0.0]]
+                row = np.zeros((3, len(self.covariance)))
+                row[:, :18] = matrix @ back @ at_smooth[k, part]
+                row[:, 18 + k * self.n : 18 + (k + 1) * self.n] = by_errors[:, : self.n]
+                row[:, 18 + 7 * self.n :] = matrix @ back @ by_rig[k, part]
+                rows.append(row)
+                innovations.append(samples[k, part] - matrix @ x - self.errors[k, part] - row[:, 18 + 7 * self.n :] @ self.rig)
+                variances += [self.p["variance"][sensor] / count] * 3
+        h, innovation = np.vstack(rows), np.concatenate(innovations)
+        gain = np.linalg.solve(h @ self.covariance @ h.T + np.diag(variances), h @ self.covariance).T
+        change = gain @ innovation
+        self.covariance = self.covariance - gain @ h @ self.covariance
+        self.covariance = (self.covariance + self.covariance.T) / 2.0
+        self.position = self.position + change[:3]
+        self.rotation = rotation_of(change[3:6]) @ self.rotation
+        self.motion = self.motion + change[6:18].reshape(4, 3)
+        self.errors[:, : self.n] += change[18 : 18 + 7 * self.n].reshape(7, self.n)
+        self.rig = self.rig + change[18 + 7 * self.n :]
+
+
+@pytest.mark.parametrize(("errors", "rig", "tolerance"), [*((name, False, 1.0) for name in BLOCKS), ("axes", True, 300.0)])
+def test_taken_bit_by_bit_it_equals_its_dense_twin(hexapod, errors, rig, tolerance):
+    motion = impose(hexapod, "1", 0.5, RATE_HZ, 4)
+    random = np.random.default_rng(4)
+    samples = motion.signals + random.normal(0.0, 1.0, motion.signals.shape) * np.array([0.002, 0.02, 0.0])[:, None, None]
+    used = np.ones((len(samples), 7), np.int64)
+    used[101:201, 2] = used[151:251, 6] = 0
+    settings = FusionSettings(accelerometer_bias_sigma=0.1, scale_sigma=0.02, alignment_sigma=0.02, axes_sigma=0.02)
+    parameters = filter_parameters(settings, RATE_HZ, errors, None)
+    if rig:
+        # Correlated, as rests leave it; the twin's derivatives are differences.
+        prior, mixed = parameters["prior"][:ALL_ERRORS, :ALL_ERRORS], random.normal(size=(ALL_ERRORS + RIG, ALL_ERRORS + RIG))
+        spread = np.diag(np.sqrt(np.concatenate([np.diag(prior), np.full(JOINTS, 1e-8), np.full(TILT, 1e-6)])))
+        covariance = spread @ (np.eye(len(mixed)) + mixed @ mixed.T / len(mixed)) @ spread
+        parameters = filter_parameters(settings, RATE_HZ, errors, covariance)
+    geometry, state = sensor_geometry(hexapod)[()], np.zeros((), FILTER_STATE)
+    turn = (motion.rotations[1] @ motion.rotations[0].T - np.eye(3)) * RATE_HZ
+    velocity = (motion.positions[1] - motion.positions[0]) * RATE_HZ
+    twist = np.array([*velocity, turn[2, 1], turn[0, 2], turn[1, 0]])
+    start = motion.positions[0] + 1e-3, rotation_of([0.003, -0.002, 0.004]) @ motion.rotations[0], twist
+    twin = Twin(parameters, hexapod, errors, *start)
+    start_filter(parameters[()], state[()], 0.0, *start)
+    window = 5
+    for i in range(1, len(samples)):
+        collect(state[()], samples[i], used[i], i / RATE_HZ)
+        step_filter(parameters[()], geometry, state[()])
+        if i % window == 0:
+            block = samples[i - window + 1 : i + 1].mean(axis=0)
+            mean = np.concatenate([block[0], block[1]], axis=1)
+            twin.update(mean, used[i], window, (i - (window - 1) / 2.0) / RATE_HZ)
+        if i % window == window - 1 and i > window:
+            # The update that began four cycles ago is complete.
+            assert state["row"] == -1
+            np.testing.assert_allclose(state["position"], twin.position, rtol=0.0, atol=1e-9 * tolerance)
+            np.testing.assert_allclose(state["rotation"], twin.rotation, rtol=0.0, atol=1e-9 * tolerance)
+            np.testing.assert_allclose(state["motion"], twin.motion, rtol=1e-8, atol=1e-7 * tolerance)
+            np.testing.assert_allclose(state["errors"], twin.errors, rtol=0.0, atol=1e-9 * tolerance)
+            np.testing.assert_allclose(state["rig"][: len(twin.rig)], twin.rig, rtol=0.0, atol=1e-9)
+            n = len(twin.covariance)
+            scale = np.sqrt(np.diag(twin.covariance))
+            difference = (state["covariance"][:n, :n] - twin.covariance) / np.outer(scale, scale)
+            assert np.abs(difference).max() < 1e-6 * tolerance
+
+
+def test_what_is_known_grows_less_sure_on_the_way_to_the_present(hexapod):
+    random, time = np.random.default_rng(6), 0.0117
+    parameters, state = (
+        filter_parameters(FusionSettings(), RATE_HZ, "axes", None, np.array([3e-4, 6e-4])),
+        np.zeros((), FILTER_STATE),
+    )
+    mixed, found = random.normal(0.0, 1e-3, (18, 18)), np.zeros((6, 6))
+    state["known_covariance"] = mixed @ mixed.T
+    extrapolate_covariance(parameters[()], state[()], time, found)
+    carried = np.hstack([np.eye(6), time * np.eye(6), time**2 / 2.0 * np.eye(6)])
+    jerk = np.repeat(parameters["jerk"], 3) * time**5 / 20.0
+    floor = np.repeat([3e-8, 12e-8], 3)
+    np.testing.assert_allclose(found, carried @ mixed @ mixed.T @ carried.T + np.diag(jerk + floor), rtol=1e-12, atol=1e-20)
+
+
+def test_the_gradient_of_the_errors_is_that_of_the_reading():
+    random = np.random.default_rng(5)
+    errors, ideal = random.normal(0.0, 0.02, ERRORS), random.normal(0.0, 5.0, 6)
+
+    def read(errors):
+        sensors = ((sensor, slice(3 * sensor, 3 * sensor + 3)) for sensor in range(2))
+        return np.concatenate([np.array(distort(errors, sensor, *ideal[part])) + errors[part] for sensor, part in sensors])
+
+    for m in range(6):
+        gradient = np.zeros(ERRORS)
+        error_gradient(errors, ideal, m, gradient)
+        for i in range(ERRORS):
+            change = np.zeros(ERRORS)
+            change[i] = 1e-6
+            # That of the alignment is to first order in it.
+            tolerance = 0.02 * np.linalg.norm(ideal) if 12 <= i < 15 else 1e-8
+            assert gradient[i] == pytest.approx((read(errors + change)[m] - read(errors - change)[m]) / 2e-6, abs=tolerance)
+
+
+def test_a_dead_imu_costs_little_in_motion(hexapod):
+    count = 10_000
+    used = np.ones((count, 7), np.int64)
+    whole = Run(hexapod, "1", "accelerometers", seconds=10.0).rms()[0]
+    for dead in (0, 4):
+        used[:] = 1
+        used[2000:, dead] = 0
+        assert Run(hexapod, "1", "accelerometers", seconds=10.0, used=used).rms()[0] < 1.5 * whole + 0.02
+
+
+def test_every_cycle_of_a_window_takes_its_share(hexapod):
+    parameters = filter_parameters(FusionSettings(), RATE_HZ, "accelerometers", None)
+    geometry, state = sensor_geometry(hexapod)[()], np.zeros((), FILTER_STATE)
+    start_filter(parameters[()], state[()], 0.0, hexapod.home.position, np.eye(3), np.zeros(6))
+    signals = impose(hexapod, "static", 0.1, RATE_HZ, 0).signals[0]
+    rows = []
+    for i in range(1, 21):
+        collect(state[()], signals, np.ones(7, np.int64), i / RATE_HZ)
+        step_filter(parameters[()], geometry, state[()])
+        rows.append(int(state["row"]))
+    assert rows[4:9] == [0, 9, 20, 31, -1]
+    assert rows[9:14] == rows[4:9]
+
+
+def test_an_unknown_block_of_errors_is_refused():
+    with pytest.raises(
+        UnknownNameError, match="no block of errors 'all'; there are gyroscopes, accelerometers, alignments, axes"
+    ):
+        filter_parameters(FusionSettings(), RATE_HZ, "all", None)

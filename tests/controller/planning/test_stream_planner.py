@@ -1,0 +1,352 @@
+"""Streamed targets: whatever comes, and whenever it ends, no limit is left and plans join; what can be followed is."""
+
+import multiprocessing
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from controller.inverse_kinematics import leg_lengths
+from controller.planning.planner import count_violations
+from controller.planning.segments import LENGTH, START, evaluate_reference
+from controller.planning.stream import (
+    LATEST,
+    PLAN_SEGMENTS,
+    SEEN,
+    STREAM,
+    TAKEN,
+    TAKER,
+    fail_stream,
+    note_sample,
+    publish_plan,
+    rest,
+    stream_cause,
+    take_plan,
+)
+from controller.planning.stream_planner import StreamPlanner, TargetRefusedError
+from controller.planning.target import load_target
+from controller.safety.watch import BEYOND_STROKE, NO_CAUSE, TARGET_JUMPS, TARGET_LOST, TARGET_NOT_FINITE
+from hil.loop.driver import shared_array
+from plant.errors import InputError, UnreachableError
+from plant.pose import quaternion_from_rotation
+
+ROUNDING = 1e-9
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+PERIOD = 1e-3
+
+
+def home_lengths(mechanism):
+    return leg_lengths(mechanism, mechanism.home.position, mechanism.home.rotation)
+
+
+def new_stream():
+    return shared_array(1, STREAM).reshape(())
+
+
+class Follower:
+    """A planner and a loop that takes its plans as they come; it keeps the joined reference, finely sampled."""
+
+    def __init__(self, mechanism, lengths=None):
+        lengths = home_lengths(mechanism) if lengths is None else lengths
+        self.planner = StreamPlanner(mechanism, lengths)
+        self.stream, self.taker = new_stream(), np.zeros((), TAKER)
+        self.segments, self.index = rest(lengths), np.zeros(6, np.int64)
+        self.cycle, self.taken, self.refused = 0, 0, 0
+        self.pieces = []
+
+    def add(self, at, displacement, quaternion=LEVEL):
+        try:
+            self.planner.add(at, displacement, quaternion)
+        except TargetRefusedError:
+            self.refused += 1
+
+    def plan(self, at, ahead, late=0):
+        """Plan from a cycle on; the loop looks when it has come `late` cycles beyond it."""
+        plan = self.planner.plan(at * PERIOD, ahead)
+        if plan is None:
+            return
+        number = publish_plan(self.stream, plan.segments, plan.begin, self.taker["taken"])
+        if late > 0:
+            self.run(at + late)
+        take_plan(self.stream, self.taker, self.cycle, PERIOD, self.segments, self.index)
+        assert self.stream["shared"][SEEN] == number
+        if self.stream["shared"][TAKEN] == number:
+            self.taken += 1
+            self.planner.follow(plan)
+
+    def run(self, cycle, points=8):
+        """Follow the segments up to a cycle, sampled at several points of each."""
+        reference = np.zeros((6, 3))
+        while self.cycle < cycle:
+            index = self.index.copy()
+            for point in range(points):
+                evaluate_reference(self.segments, (self.cycle + point / points) * PERIOD, index, reference)
+                self.pieces.append(reference.copy())
+                if point == 0:
+                    self.index[:] = index
+            self.cycle += 1
+
+    def check(self, limits):
+        """The limits, on the samples alone: differences show the jumps that rates and accelerations would hide."""
+        sampled, step = np.array(self.pieces), PERIOD / 8
+        lengths, rates, accelerations = np.moveaxis(sampled, 2, 0)
+        assert (lengths >= limits.stroke[:, 0] - ROUNDING).all() and (lengths <= limits.stroke[:, 1] + ROUNDING).all()
+        assert np.abs(rates).max() <= limits.velocity * (1.0 + ROUNDING)
+        assert np.abs(accelerations).max() <= limits.acceleration * (1.0 + ROUNDING)
+        assert np.abs(np.diff(accelerations, axis=0)).max() <= limits.jerk * step * (1.0 + 1e-6)
+        # The mean of a rate is within what the jerk can make of its ends' mean.
+        for value, rate, bend in ((lengths, rates, limits.acceleration), (rates, accelerations, limits.jerk)):
+            gap = np.diff(value, axis=0) - step * 0.5 * (rate[1:] + rate[:-1])
+            assert np.abs(gap).max() <= 0.26 * bend * step**2 + 1e-12
+
+
+def displacements(random, kind, count):
+    scale = np.array([0.03, 0.03, 0.02])
+    times = np.arange(count) * 0.01
+    waves = np.sin(2.0 * np.pi * random.uniform(0.2, 3.0, 3) * times[:, None]) * scale * random.uniform(0.1, 1.5)
+    if kind == "noise":
+        return waves * 0.5 + random.normal(size=(count, 3)) * 10.0 ** random.uniform(-6, -2.5)
+    if kind == "steps":
+        return np.cumsum(random.choice([0.0, 0.0, 0.004], (count, 1)) * random.choice([-1.0, 1.0], (count, 3)), axis=0)
+    if kind == "leaps":
+        poses = np.repeat(random.normal(size=(count // 10 + 1, 3)) * scale, 10, axis=0)[:count]
+        return poses - poses[0]
+    if kind == "ramps":
+        return np.clip(times[:, None] * random.uniform(-0.4, 0.4, 3), -0.06, 0.06)
+    return waves
+
+
+@pytest.mark.parametrize("kind", ["waves", "noise", "steps", "leaps", "ramps"])
+@given(seed=st.integers(0, 2**32 - 1))
+def test_no_limit_is_left_whatever_comes(hexapod, kind, seed):
+    random = np.random.default_rng(seed)
+    follower = Follower(hexapod)
+    follower.add(-0.01, np.zeros(3))
+    bend = random.uniform(0.0, 0.1)
+    cycle = int(random.integers(10_000_000)) if random.random() < 0.3 else 0
+    follower.cycle = cycle
+    for k, displacement in enumerate(displacements(random, kind, 60)):
+        if k > 0 and random.random() < 0.1:
+            continue
+        turn = bend * np.sin(0.05 * k)
+        follower.add(0.01 * k, displacement, np.array([np.cos(turn), np.sin(turn), 0.0, 0.0]))
+        at = cycle + 10 * k + int(random.integers(1, 25))
+        if follower.planner.current.begin <= at * PERIOD and at >= follower.cycle:
+            follower.plan(at, random.uniform(0.0, 0.03), late=int(random.integers(1, 4)) if random.random() < 0.1 else 0)
+        follower.run(cycle + 10 * (k + 1))
+    assert follower.taken > 0
+    # And now silence.
+    follower.run(follower.cycle + 2000)
+    follower.check(hexapod.limits)
+    assert (follower.pieces[-1][:, 1:] == 0.0).all()
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_each_plan_is_within_the_limits_to_its_end_and_begins_where_the_one_before_is(hexapod, seed):
+    random = np.random.default_rng(seed)
+    planner = StreamPlanner(hexapod, home_lengths(hexapod))
+    at = 0.0
+    for k, displacement in enumerate(displacements(random, random.choice(["waves", "noise", "steps"]), 40)):
+        try:
+            planner.add(0.01 * k, displacement, LEVEL)
+        except TargetRefusedError:
+            continue
+        at += random.uniform(0.0, 0.02)
+        plan = planner.plan(at, 0.01)
+        if plan is None:
+            continue
+        before, after = np.zeros((6, 3)), np.zeros((6, 3))
+        evaluate_reference(planner.current.segments, at, np.zeros(6, np.int64), before)
+        evaluate_reference(plan.segments, at, np.zeros(6, np.int64), after)
+        np.testing.assert_array_equal(after, before)
+        assert plan.segments.shape == (6, PLAN_SEGMENTS, 5)
+        assert count_violations(plan.segments, at + 3.0, hexapod.limits) == 0
+        for rows in plan.segments:
+            last = rows[np.isfinite(rows[:, START])][-1]
+            assert (last[2:] == 0.0).all() and last[START] < at + 2.0
+        if random.random() < 0.9:
+            planner.follow(plan)
+
+
+def followed(mechanism, name, noise=0.0, rate=100, duration=4.0, kept=lambda k: True):
+    """Errors (n, 6) [m] of the reference against the target at the same time, streamed with 10 ms from sample to plan."""
+    target = load_target(name, mechanism, duration)
+    times = np.arange(0.0, duration, 1.0 / rate)
+    positions, rotations = target.at(times)
+    moved = positions - mechanism.home.position + np.random.default_rng(0).normal(size=positions.shape) * noise
+    turned = quaternion_from_rotation(rotations @ mechanism.home.rotation.T)
+    follower = Follower(mechanism, leg_lengths(mechanism, positions[0], rotations[0]))
+    for k, at in enumerate(times):
+        follower.run(round(at / PERIOD))
+        if kept(k):
+            follower.add(at, moved[k], turned[k])
+            follower.plan(follower.cycle + 10, 0.01)
+    follower.check(mechanism.limits)
+    assert follower.refused == 0
+    sampled = np.array(follower.pieces)[::8, :, 0]
+    return sampled - leg_lengths(mechanism, *target.at(np.arange(len(sampled)) * PERIOD))
+
+
+@pytest.mark.parametrize(
+    ("name", "how", "most"),
+    [
+        ("hold", {}, 1e-12),
+        ("circle", {}, 0.02e-3),
+        ("sines", {}, 0.05e-3),
+        ("shaking", {}, 0.6e-3),
+        ("sines", {"noise": 2e-5}, 0.2e-3),
+        ("sines", {"rate": 30}, 0.3e-3),
+        ("sines", {"rate": 500}, 0.06e-3),
+        ("sines", {"kept": lambda k: k % 7 not in (2, 3)}, 0.2e-3),
+    ],
+)
+def test_a_target_is_followed_without_lag(hexapod, name, how, most):
+    assert np.sqrt(np.mean(followed(hexapod, name, **how) ** 2)) < most
+
+
+def test_a_standing_target_is_reached_exactly_and_planned_for_once(hexapod):
+    follower = Follower(hexapod)
+    for k in range(60):
+        follower.add(0.01 * k, [0.02, 0.01, 0.0])
+        follower.plan(follower.cycle + 10, 0.01)
+        follower.run(follower.cycle + 10)
+    expected = leg_lengths(hexapod, hexapod.home.position + [0.02, 0.01, 0.0], hexapod.home.rotation)
+    np.testing.assert_allclose(follower.pieces[-1][:, 0], expected, atol=1e-12)
+    assert follower.taken == 1
+
+
+@pytest.mark.parametrize(
+    ("sample", "cause"),
+    [
+        (([np.nan, 0.0, 0.0], LEVEL), TARGET_NOT_FINITE),
+        (([0.0, 0.0, np.inf], LEVEL), TARGET_NOT_FINITE),
+        (([0.0, 0.0, 0.0], [np.nan, 0.0, 0.0, 0.0]), TARGET_NOT_FINITE),
+        (([0.0, 0.0, 0.0], 1.002 * LEVEL), TARGET_NOT_FINITE),
+        (([0.0, 0.0, 0.0], 0.0 * LEVEL), TARGET_NOT_FINITE),
+        (([0.0, 0.0, 0.5], LEVEL), BEYOND_STROKE),
+        (([0.0, 0.0, -0.5], LEVEL), BEYOND_STROKE),
+        (([0.0, 0.0, 0.01], LEVEL), TARGET_JUMPS),
+    ],
+)
+def test_what_cannot_be_followed_is_refused_with_its_cause(hexapod, sample, cause):
+    planner = StreamPlanner(hexapod, home_lengths(hexapod))
+    planner.add(0.0, np.zeros(3), LEVEL)
+    with pytest.raises(TargetRefusedError) as refusal:
+        planner.add(0.01, *sample)
+    assert refusal.value.cause == cause
+    assert not abs(refusal.value.value) <= refusal.value.limit or cause == BEYOND_STROKE
+    # What was refused is forgotten.
+    planner.add(0.01, [1e-4, 0.0, 0.0], 1.0005 * LEVEL)
+
+
+def test_a_jump_is_measured_by_the_time_since_the_last_sample(hexapod):
+    planner = StreamPlanner(hexapod, home_lengths(hexapod))
+    planner.add(0.0, np.zeros(3), LEVEL)
+    most = 1.5 * hexapod.limits.velocity * 0.1 + 1e-3
+    planner.add(0.1, [0.0, 0.0, 0.95 * most], LEVEL)
+    with pytest.raises(TargetRefusedError, match=r"jumps for leg \d \(.* the limit is 0.00475 m"):
+        planner.add(0.11, [0.0, 0.0, 0.5 * most], LEVEL)
+
+
+def test_misuse_is_refused(hexapod):
+    planner = StreamPlanner(hexapod, home_lengths(hexapod))
+    with pytest.raises(InputError, match="no sample"):
+        planner.plan(0.0, 0.0)
+    planner.add(1.0, np.zeros(3), LEVEL)
+    with pytest.raises(InputError, match="does not come after"):
+        planner.add(1.0, np.zeros(3), LEVEL)
+    plan = planner.plan(1.0, 0.0)
+    planner.follow(plan)
+    with pytest.raises(InputError, match="precede"):
+        planner.plan(0.9, 0.0)
+    with pytest.raises(UnreachableError):
+        StreamPlanner(hexapod, home_lengths(hexapod) + 1.0)
+
+
+def moved(value, begin=0.0, rows=PLAN_SEGMENTS):
+    """A plan all of whose numbers tell its value."""
+    plan = np.full((6, rows, 5), float(value))
+    plan[:, :, START] = begin + np.arange(rows) * 1e-6
+    return plan
+
+
+def looked(stream, taker, segments, index, cycle=0):
+    return take_plan(stream, taker, cycle, PERIOD, segments, index)
+
+
+def test_a_plan_is_taken_once_and_only_in_time_and_after_the_one_before():
+    stream, taker = new_stream(), np.zeros((), TAKER)
+    segments, index = rest(np.full(6, 7.0)), np.zeros(6, np.int64)
+    assert not looked(stream, taker, segments, index)
+    assert publish_plan(stream, moved(1.0, 0.005), 0.005, 0) == 1
+    assert looked(stream, taker, segments, index, 5)
+    assert not looked(stream, taker, segments, index, 5)
+    assert segments[0, 0, LENGTH] == 7.0 and segments[0, 1, LENGTH] == 1.0
+    # Too late; then one that follows it; then one that follows the plan that was taken.
+    publish_plan(stream, moved(2.0, 0.009), 0.009, 1)
+    assert not looked(stream, taker, segments, index, 10)
+    publish_plan(stream, moved(3.0, 0.02), 0.02, 2)
+    assert not looked(stream, taker, segments, index, 11)
+    index[:] = PLAN_SEGMENTS
+    publish_plan(stream, moved(4.0, 0.02), 0.02, 1)
+    assert looked(stream, taker, segments, index, 12)
+    assert list(stream["shared"][[LATEST, SEEN, TAKEN]]) == [4, 4, 4]
+    assert segments[0, 0, LENGTH] == 1.0 and segments[0, 1, LENGTH] == 4.0
+    assert (index == 0).all()
+
+
+def test_a_plan_that_has_no_room_is_left():
+    stream, taker = new_stream(), np.zeros((), TAKER)
+    segments, index = rest(np.full(6, 7.0), PLAN_SEGMENTS), np.zeros(6, np.int64)
+    publish_plan(stream, moved(1.0, 0.005), 0.005, 0)
+    before = segments.copy()
+    assert not looked(stream, taker, segments, index)
+    np.testing.assert_array_equal(segments, before)
+    assert stream["shared"][SEEN] == 1 and stream["shared"][TAKEN] == 0
+
+
+def hammer(stream, until):
+    value = 0
+    while time.monotonic() < until:
+        value += 1
+        # The base is always what the loop has taken, so that each may be.
+        publish_plan(stream, moved(value), 1e9, int(stream["shared"][TAKEN]))
+
+
+def test_no_plan_is_ever_torn():
+    stream, taker = new_stream(), np.zeros((), TAKER)
+    segments, index = rest(np.full(6, 7.0)), np.zeros(6, np.int64)
+    publish_plan(stream, moved(0.0), 1e9, 0)
+    looked(stream, taker, segments, index)
+    until = time.monotonic() + 2.0
+    writer = multiprocessing.get_context("fork").Process(target=hammer, args=(stream, until))
+    writer.start()
+    seen, last = 0, 0.0
+    while time.monotonic() < until:
+        before = int(taker["seen"])
+        looked(stream, taker, segments, index)
+        if taker["seen"] == before:
+            continue
+        seen += 1
+        values = taker["plan"][:, :, 1:]
+        assert (values == values[0, 0, 0]).all()
+        assert values[0, 0, 0] > last
+        last = values[0, 0, 0]
+    writer.join()
+    assert writer.exitcode == 0
+    assert seen > 1000
+
+
+def test_a_stream_is_lost_when_no_sample_comes_for_longer_than_the_patience():
+    stream = new_stream()
+    assert stream_cause(stream, 10**12, 10**8)[0] == NO_CAUSE
+    note_sample(stream, 10**9)
+    assert stream_cause(stream, 11 * 10**8, 10**8)[0] == NO_CAUSE
+    cause, index, value, limit = stream_cause(stream, 12 * 10**8, 10**8)
+    assert (cause, index) == (TARGET_LOST, 0)
+    assert value == pytest.approx(0.2) and limit == pytest.approx(0.1)
+    fail_stream(stream, TARGET_JUMPS, 3, 0.02, 0.005)
+    fail_stream(stream, TARGET_NOT_FINITE, 0, np.nan, np.nan)
+    assert stream_cause(stream, 10**9, 10**8) == (TARGET_JUMPS, 3, 0.02, 0.005)

@@ -1,0 +1,264 @@
+"""The loop around the cycle: what it records, and how it keeps time, on a scripted clock: late, long, many in a row, a stop."""
+
+import numpy as np
+import pytest
+
+from controller.cycle import OK, STATE, cycle, prepare, skip
+from controller.safety.watch import ASKED_TO_STOP, END_OF_MOTION, MISSED_PERIODS
+from hil.loop.driver import HEAD, RECORD, STAGES, STOP, FmuRig, Loop
+from hil.realtime.clock import REAL, SCRIPTED, new_clock
+from hil.runs.simulation import SimulationConfig, prepared_loop
+from plant.dynamics.variables import BRAKE
+from plant.imu import imu_state, load_imu
+
+MS = 1_000_000
+CONFIG = SimulationConfig(target="sines", duration=2.0)
+SENSORS = ("angular_velocity", "specific_force", "magnetic_field")
+FOUND = ("position", "rotation", "lengths", "command", "conditioning")
+
+
+def scripted(loop, late=(), work=(), cpu=(), cycles=5000):
+    """Put a loop on a clock on which cycles are late, or their work takes long, by dicts from cycle number to ns."""
+    loop.script = np.zeros((cycles, 3), np.int64)
+    loop.script[:, 1:] = 100_000
+    for column, values in enumerate((late, work, cpu)):
+        for index, value in dict(values).items():
+            loop.script[index, column] = value
+    loop.clock = new_clock(SCRIPTED, MS)
+    return loop
+
+
+def written(loop):
+    return loop.records[: int(loop.link[HEAD])]
+
+
+def replayed(loop, records):
+    """What `controller.cycle.cycle` finds from the raw data of records, in its own words."""
+    state, measurement = np.zeros((), STATE), np.zeros((3, 7, 3))
+    found = np.zeros_like(records)
+    for record, again in zip(records, found, strict=True):
+        skip(state, int(record["missed"]))
+        for i, name in enumerate(SENSORS):
+            measurement[i] = record[name]
+        assert cycle(loop.parameters, state, measurement, loop.segments) == OK
+        for name in FOUND:
+            again[name] = state[name]
+        prepare(loop.parameters, state, loop.segments)
+    return found
+
+
+def test_the_stages_that_are_timed_are_the_cycle():
+    with prepared_loop(CONFIG) as loop:
+        assert loop.run(1500) == OK
+        found = replayed(loop, written(loop))
+        for name in FOUND:
+            np.testing.assert_array_equal(found[name], written(loop)[name])
+        assert (written(loop)["stage_ns"] >= 0).all()
+        assert (np.median(written(loop)["stage_ns"], axis=0) > 0).all()
+        assert len(STAGES) == written(loop)["stage_ns"].shape[1]
+
+
+def test_without_disturbance_a_clock_changes_nothing():
+    with prepared_loop(CONFIG) as free, prepared_loop(CONFIG) as timed:
+        free.run(1000)
+        scripted(timed).run(1000)
+        for name in (*SENSORS, *FOUND, "truth", "reference", "missed", "time_ns"):
+            np.testing.assert_array_equal(written(timed)[name], written(free)[name])
+        assert (written(timed)["late_ns"] == 0).all()
+        assert (written(timed)["cpu_ns"] == 100_000).all()
+        assert free.state.tobytes() == timed.state.tobytes()
+
+
+def test_a_wake_up_late_by_less_than_a_period_misses_nothing():
+    with prepared_loop(CONFIG) as loop:
+        scripted(loop, late={10: 999_999, 500: 300_000}).run(1000)
+        records = written(loop)
+        assert records["late_ns"][10] == 999_999
+        # What came late ends late, and the next one is on time again unless it had to wait.
+        assert records["late_ns"][11] == 0 or records["missed"][11] > 0
+        assert records["late_ns"][500] == 300_000 and records["late_ns"][501] == 0
+        assert loop.clock["missed_late"] == 0
+
+
+@pytest.mark.parametrize("periods", [1, 3, 8])
+def test_a_late_wake_up_skips_whole_periods_and_keeps_the_phase(periods):
+    with prepared_loop(CONFIG) as loop:
+        scripted(loop, late={400: periods * MS + 200_000}).run(1500)
+        records = written(loop)
+        assert records["cycle"].tolist() == [*range(400), *range(400 + periods, 1500)]
+        assert records["missed"][400] == periods and records["missed"].sum() == periods
+        assert records["late_ns"][400] == periods * MS + 200_000
+        expected = records["cycle"] * MS
+        expected[400] += 200_000
+        np.testing.assert_array_equal(records["time_ns"], expected)
+        clock = loop.clock
+        assert (clock["missed_late"], clock["missed_own"], clock["missed_host"]) == (periods, 0, 0)
+        # The reference goes by time, the plant has moved on, and the estimate follows.
+        on_time = np.isin(np.arange(1500), records["cycle"])
+        with prepared_loop(CONFIG) as undisturbed:
+            undisturbed.run(1500)
+            np.testing.assert_array_equal(records["reference"], written(undisturbed)["reference"][on_time])
+        errors = np.linalg.norm(records["position"] - records["truth"][:, :3], axis=1)
+        assert errors[401:].max() < 2e-3
+        found = replayed(loop, records)
+        np.testing.assert_array_equal(found["command"], records["command"])
+
+
+def test_long_work_of_our_own_is_told_from_work_that_the_host_held_up():
+    with prepared_loop(CONFIG) as loop:
+        scripted(loop, work={300: 1_500_000, 600: 4_200_000}, cpu={300: 1_400_000, 600: 150_000}).run(1200)
+        records = written(loop)
+        assert records["cycle"].tolist() == [*range(301), *range(302, 602), *range(606, 1200)]
+        assert records["missed"][301] == 1 and records["missed"].sum() == 5
+        assert (records["late_ns"] == 0).all()
+        clock = loop.clock
+        assert (clock["missed_late"], clock["missed_own"], clock["missed_host"]) == (0, 1, 4)
+        assert records["cpu_ns"][300] == 1_400_000
+
+
+def test_work_that_lasts_just_a_period_misses_none():
+    with prepared_loop(CONFIG) as loop:
+        scripted(loop, work={300: MS, 301: MS + 1}, cpu={301: MS + 1}).run(600)
+        assert written(loop)["missed"].nonzero()[0].tolist() == [302]
+        assert loop.clock["missed_own"] == 1
+
+
+def test_a_late_start_sets_the_phase_and_misses_nothing():
+    with prepared_loop(CONFIG) as loop:
+        scripted(loop, late={0: 7 * MS + 300_000}).run(500)
+        records = written(loop)
+        assert records["cycle"].tolist() == list(range(500))
+        assert records["missed"].sum() == 0
+        assert records["time_ns"][:2].tolist() == [300_000, MS]
+
+
+def follow(loop, seconds=2.0):
+    loop.records = np.concatenate([loop.records, np.zeros(1000, RECORD)])
+    end = round(seconds * 1000) + int(loop.parameters["hold_cycles"])
+    return loop.follow(end), written(loop)
+
+
+def stops_within_limits(loop, records, off=1e-3):
+    """The reference goes on from where the mechanism is, comes to rest within its limits, and the drives follow it there."""
+    limits = loop.mechanism.require_limits()
+    stopping = records[records["stop"] > 0]
+    reference = stopping["reference"]
+    assert np.abs(reference[:, :, 1]).max() <= limits.velocity * (1.0 + 1e-9)
+    assert np.abs(reference[:, :, 2]).max() <= limits.acceleration * (1.0 + 1e-9)
+    assert (reference[:, :, 0] >= limits.stroke[:, 0]).all() and (reference[:, :, 0] <= limits.stroke[:, 1]).all()
+    assert np.abs(reference[0, :, 0] - stopping["truth"][0, 7:13]).max() < off
+    assert (reference[-1, :, 1:] == 0.0).all()
+    lengths = stopping["truth"][:, 7:13]
+    assert np.abs(lengths[-1] - reference[-1, :, 0]).max() < off
+    assert np.abs(lengths[-1] - lengths[-10]).max() < 0.1 * off
+
+
+def test_the_end_of_a_motion_is_a_stop_within_the_limits_and_the_brakes():
+    with prepared_loop(CONFIG) as loop:
+        cause, records = follow(scripted(loop), 1.234)
+        assert cause == loop.state["stopping"] == END_OF_MOTION
+        assert records["stop"].nonzero()[0][0] == 1234 + loop.parameters["hold_cycles"]
+        stops_within_limits(loop, records)
+        assert (loop.calls["mode"] == BRAKE).all()
+
+
+def test_too_many_missed_in_a_row_end_in_a_controlled_stop_and_fewer_do_not():
+    for periods, stops in ((9, False), (10, True), (400, True)):
+        with prepared_loop(CONFIG) as loop:
+            cause, records = follow(scripted(loop, late={900: periods * MS}))
+            assert cause == (MISSED_PERIODS if stops else END_OF_MOTION)
+            # In a long pause the drives go on as they were last told, and then have some way back.
+            stops_within_limits(loop, records, off=1e-3 if periods < 100 else 2e-2)
+            if stops:
+                assert records["cycle"][-1] < 900 + periods + 500
+                if periods < 100:
+                    assert np.abs(records["command"][900] - records["command"][899]).max() < 0.1
+
+
+def test_work_that_is_always_too_long_ends_in_a_controlled_stop():
+    with prepared_loop(CONFIG) as loop:
+        loop.most_missed = 25
+        work = dict.fromkeys(range(800, 5000), 1_200_000)
+        cause, records = follow(scripted(loop, work=work, cpu=work))
+        assert cause == MISSED_PERIODS
+        assert records["stop"].nonzero()[0][0] == 825
+        assert loop.clock["most_in_a_row"] >= 25
+        stops_within_limits(loop, records)
+
+
+def test_asked_to_stop_it_does_in_motion_at_once_and_in_the_hold_without_moving():
+    with prepared_loop(CONFIG) as loop:
+        scripted(loop).run(1000)
+        loop.link[STOP] = 1
+        cause, records = follow(loop)
+        assert cause == ASKED_TO_STOP
+        assert records["stop"].nonzero()[0][0] == 1000
+        stops_within_limits(loop, records)
+    with prepared_loop(CONFIG) as loop:
+        scripted(loop).run(100)
+        loop.link[STOP] = 1
+        cause, records = follow(loop)
+        assert cause == ASKED_TO_STOP
+        assert len(records) == 100
+        assert (records["command"] == 0.0).all()
+
+
+def test_records_go_round_and_the_head_goes_on():
+    with prepared_loop(CONFIG) as loop, prepared_loop(CONFIG) as whole:
+        loop.records = loop.records[:128].copy()
+        loop.run(1000)
+        whole.run(1000)
+        assert loop.link[HEAD] == 1000
+        for k in range(872, 1000):
+            assert loop.records[k % 128]["cycle"] == k
+            np.testing.assert_array_equal(loop.records[k % 128]["command"], whole.records[k]["command"])
+
+
+def test_a_rig_in_python_runs_the_same_cycle_at_the_same_times():
+    late, work = {300: 2_500_000}, {500: 1_700_000}
+    with prepared_loop(CONFIG) as compiled, prepared_loop(CONFIG) as python:
+        for loop in (compiled, python):
+            scripted(loop, late=late, work=work)
+        end = 1000
+        assert compiled.follow(end) == END_OF_MOTION
+        assert python.follow(end, FmuRig(python)) == END_OF_MOTION
+        assert compiled.link[HEAD] == python.link[HEAD]
+        first, second = written(compiled), written(python)
+        for name in set(first.dtype.names) - {"stage_ns"}:
+            np.testing.assert_array_equal(first[name], second[name])
+        assert compiled.state.tobytes() == python.state.tobytes()
+
+
+def test_a_clock_on_the_machine_wakes_at_every_deadline():
+    with prepared_loop(SimulationConfig(target="hold", duration=0.5, rate=250.0)) as loop:
+        loop.clock = new_clock(REAL, 4 * MS)
+        loop.records = np.zeros(1000, RECORD)
+        assert loop.follow(175) == END_OF_MOTION
+        records = written(loop)
+        assert (np.diff(records["cycle"]) == 1 + records["missed"][1:]).all()
+        assert (records["late_ns"] >= 0).all()
+        deadlines = records["time_ns"] - records["late_ns"] % (4 * MS)
+        np.testing.assert_array_equal(deadlines, 4 * MS * records["cycle"])
+        assert (records["cpu_ns"] > 0).all()
+        assert loop.clock["missed_own"] == 0
+
+
+def test_loops_of_other_imus_record_what_the_cycle_was_given():
+    with prepared_loop(SimulationConfig(target="circle", duration=1.0, imus=(0, 1, 3, 4))) as loop:
+        assert isinstance(loop, Loop)
+        loop.imu[()] = imu_state(load_imu("ideal"), 0, 1e-3)
+        loop.run(600)
+        records = written(loop)
+        assert np.isnan(records["residuals"][:, [2, 5]]).all()
+        assert np.isfinite(records["residuals"][:, [0, 1, 3, 4]]).all()
+        found = replayed(loop, records)
+        np.testing.assert_array_equal(found["position"], records["position"])
+
+
+def test_recorded_covariance_is_that_of_the_errors_at_rest():
+    with prepared_loop(SimulationConfig(target="hold", duration=1.0, imu="ideal")) as loop:
+        loop.run(800)
+        covariance = written(loop)["covariance"][-1].astype(float)
+        np.testing.assert_array_equal(covariance, covariance.T)
+        expected = np.linalg.inv(np.tril(loop.state["information"]) + np.tril(loop.state["information"], -1).T)
+        np.testing.assert_allclose(covariance, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())

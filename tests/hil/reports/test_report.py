@@ -1,0 +1,166 @@
+"""The report of a simulation: what a browser would draw is read back from the file."""
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hil.reports.run import write_report
+from hil.runs.simulation import SimulationConfig, simulate
+from plant.errors import InputError
+from plant.pose import rotation_angle, rotation_from_vector
+
+CURVES = {"pose": 12, "errors": 12, "lengths": 12, "motion": 12, "drives": 18}
+FIGURES = ["mechanism", *CURVES]
+
+
+@pytest.fixture(scope="module")
+def result():
+    return simulate(SimulationConfig(target="circle", duration=1.0, rate=4000.0))
+
+
+@pytest.fixture(scope="module")
+def report(result, tmp_path_factory):
+    path = tmp_path_factory.mktemp("report") / "report.html"
+    write_report(result, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def page(report):
+    return report.read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def traces(page):
+    return {name: json_after(page, f'"{name}",') for name in FIGURES}
+
+
+def json_after(page, start):
+    text = page[page.rindex(start) + len(start) :].lstrip()
+    return json.JSONDecoder().raw_decode(text)[0]
+
+
+def numbers(packed):
+    return np.frombuffer(base64.b64decode(packed["bdata"]), packed["dtype"]).astype(float)
+
+
+def points(trace):
+    return np.stack([numbers(trace[axis]) for axis in "xyz"], axis=1)
+
+
+def curves(traces, name):
+    return [(numbers(trace["x"]), numbers(trace["y"])) for trace in traces if trace["name"] == name]
+
+
+def test_the_file_is_complete_in_itself_and_small(report, page):
+    assert page.count("* plotly.js v") == 1
+    markup = re.sub(r"(<script\b[^>]*>).*?</script>", r"\1", page, flags=re.DOTALL)
+    assert not re.search(r"<link\b|\b(src|href)\s*=|url\(|@import", markup)
+    assert report.stat().st_size < 8e6
+    assert list(report.parent.iterdir()) == [report]
+
+
+def test_every_figure_is_there_once(page, traces):
+    assert re.findall(r'<div id="(\w+)" class="plotly-graph-div"', page) == FIGURES
+    assert page.count("<figcaption>") == len(FIGURES)
+    assert {name: len(traces[name]) for name in CURVES} == CURVES
+
+
+def test_the_header_says_what_was_simulated(page, result):
+    header = page[page.index("<header>") : page.index("</header>")]
+    version = result.summary()["version"]
+    for part in ("gough: hexapod follows circle", "1 s", "4000 Hz", "mpu9150-calibrated", "seed 0", "compiled", version):
+        assert part in header
+
+
+def test_the_table_has_the_figures_of_the_summary(page, result):
+    summary = result.summary()
+    body = page[page.index("<tbody>") : page.index("</tbody>")]
+    rows = (("estimation", ""), ("tracking", ""), ("target", ""), ("target", "reference_"))
+    columns = (("position_rms", 1e3), ("position_max", 1e3), ("rotation_rms", 180 / np.pi), ("rotation_max", 180 / np.pi))
+    expected = [[summary[group][prefix + key] * unit for key, unit in columns] for group, prefix in rows]
+    table = np.array(re.findall(r"<td>(.*?)</td>", body), dtype=float).reshape(4, 4)
+    np.testing.assert_allclose(table, expected, rtol=0.0, atol=0.501e-3)
+    violations, factor, cycle = re.findall(r"<dd[^>]*>(.*?)</dd>", page)
+    assert int(violations) == summary["limits"]["violations"]
+    assert float(factor) == pytest.approx(summary["real_time_factor"], abs=0.0501)
+    assert [float(value) for value in cycle.split("/")] == pytest.approx(list(summary["cycle_us"].values()), abs=0.0501)
+
+
+def test_curves_are_thinned_but_keep_their_extremes(traces, result):
+    records = result.records
+    panels = (
+        1e3 * (records["truth"][:, 7:13] - records["reference"][:, :, 0]),
+        1e3 * records["command"],
+        records["truth"][:, 13:19],
+    )
+    for leg in range(6):
+        for (times, drawn), values in zip(curves(traces["drives"], f"leg {leg}"), panels, strict=True):
+            assert len(drawn) <= 4000 < len(values)
+            assert (np.diff(times) > 0.0).all()
+            expected = values[np.searchsorted(result.times, times - 1e-5), leg]
+            np.testing.assert_allclose(drawn, expected, rtol=1e-6, atol=1e-9)
+            assert (drawn.min(), drawn.max()) == pytest.approx((values[:, leg].min(), values[:, leg].max()), rel=1e-6)
+
+
+def test_the_pose_is_drawn_from_home_in_mm_and_deg(traces, result):
+    home = result.mechanism.require_home()
+    moment = len(result.times) - 500
+    position, vector = np.transpose(
+        [[np.interp(result.times[moment], *curve) for curve in curves(traces["pose"], axis)] for axis in "xyz"]
+    )
+    np.testing.assert_allclose(position, 1e3 * (result.true_positions[moment] - home.position), atol=1e-3)
+    assert np.linalg.norm(vector) > 1.0
+    drawn = rotation_from_vector(np.radians(vector)) @ home.rotation
+    assert rotation_angle(drawn, result.true_rotations[moment]) < 1e-5
+
+
+def test_the_mechanism_moves_on_legs_of_the_true_length(page, traces, result):
+    frames = json_after(page, "Plotly.addFrames('mechanism',")
+    assert 20 <= len(frames) <= 150
+    moments = np.linspace(np.argmax(result.times >= 0.0), len(result.times) - 1, len(frames)).astype(int)
+    for number, (frame, moment) in enumerate(zip(frames, moments, strict=True)):
+        assert frame["name"] == str(number)
+        assert [part["type"] for part in frame["data"]] == [traces["mechanism"][k]["type"] for k in frame["traces"]]
+        tubes, rods = points(frame["data"][2]), points(frame["data"][3])
+        np.testing.assert_allclose(tubes[0::3], 1e3 * result.mechanism.base_joints, atol=1e-4)
+        np.testing.assert_array_equal(tubes[1::3], rods[0::3])
+        lengths = np.linalg.norm(rods[1::3] - tubes[0::3], axis=1)
+        np.testing.assert_allclose(lengths, 1e3 * result.records["truth"][moment, 7:13], atol=1e-2)
+
+
+def test_a_browser_draws_every_figure_without_an_error(report):
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if not browser:
+        pytest.skip("no browser here")
+    flags = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-component-update"
+    run = subprocess.run(
+        [browser, *flags.split(), "--virtual-time-budget=10000", f"--user-data-dir={report.parent.parent / 'profile'}",
+         "--dump-dom", f"file://{report}"], capture_output=True, text=True, check=False, timeout=120,
+    )  # fmt: skip
+    drawn = re.findall(r'class="[^"]*js-plotly-plot', run.stdout)
+    assert len(drawn) >= len(FIGURES), run.stderr[-2000:]
+    assert "Uncaught" not in run.stderr
+
+
+def test_names_are_escaped_and_a_stop_is_told(result, tmp_path):
+    path = tmp_path / "report.html"
+    config = replace(result.config, duration=2.0)
+    write_report(replace(result, mechanism=replace(result.mechanism, name="<b>&"), config=config), path)
+    header = re.search(r"<header>.*</header>", path.read_text(encoding="utf-8"))[0]
+    assert "<h1>gough: &lt;b&gt;&amp; follows circle</h1>" in header
+    assert "2 s, stopped after 1.000 s" in header
+
+
+def test_a_file_that_cannot_be_written_is_refused(result, tmp_path):
+    (tmp_path / "folder").mkdir()
+    for path in (tmp_path / "missing" / "report.html", tmp_path / "folder"):
+        with pytest.raises(InputError, match=re.escape(str(path))):
+            write_report(result, path)
+    assert [file.name for file in tmp_path.iterdir()] == ["folder"]

@@ -1,0 +1,300 @@
+"""Hardware in the loop with its real processes: the emulated rig in one, the run in others, a bus between them."""
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from controller.safety.watch import BUS_LOST, FAULTY, FOLLOWING, RUNNING
+from hil.recording.mcap import read
+from hil.recording.replay import replay
+from hil.rigs.canopen.settings import DEFAULT_FILE
+from hil.rigs.udp.emulator import WATCHDOG_CODE
+from hil.runs.emulator import BusyError, ask
+from plant.errors import GoughError
+
+MOTION = ("--target", "sines", "--rate", "500")
+PATIENT = ("--most-missed", "2000", "--mechanism", str(Path(__file__).with_name("patient.toml")))
+"""Other tests want the processors too, which holds up loops and rigs: the watch is patient with the bus."""
+
+
+def gough(*arguments, **options):
+    command = [sys.executable, "-m", "hil.command_line", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def wait_for(condition, seconds=120.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it takes too long"
+        time.sleep(0.02)
+
+
+@contextmanager
+def emulated(*options, at=None, control=None):
+    """An emulator that listens: its process, where its rig is, and where its control."""
+    at, control = at or f"127.0.0.1:{free_port()}", control or f"127.0.0.1:{free_port()}"
+    process = gough("emulate", "--at", at, "--control", control, "--watchdog", 300, *MOTION, *options)
+    try:
+        for line in process.stdout:
+            if "listens" in line:
+                break
+        assert process.poll() is None, process.communicate()
+        yield process, at, control
+    finally:
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=30.0)
+
+
+def state_of(control):
+    with suppress(GoughError):
+        return ask(control, "state", patience=0.5)
+    return {"drive": [-1] * 6, "velocity": [0.0] * 6, "code": [0] * 6, "lengths": [0.0] * 6}
+
+
+def started(at, control, *options, rig="udp"):
+    """A run whose drives follow."""
+    process = gough("run", "--rig", rig, "--rig-at", at, *MOTION, *PATIENT, "--duration", 60, *options)
+    wait_for(lambda: process.poll() is not None or state_of(control)["drive"] == [FOLLOWING] * 6)
+    assert process.poll() is None, process.communicate()
+    time.sleep(1.0)
+    return process
+
+
+def finished(process):
+    output, errors = process.communicate(timeout=120.0)
+    return process.returncode, output, errors
+
+
+@pytest.fixture(scope="module")
+def canopen_file(tmp_path_factory):
+    """Settings of a CAN bus of its own."""
+    file = tmp_path_factory.mktemp("canopen") / "bus.toml"
+    text = DEFAULT_FILE.read_text()
+    for name in ("drive.eds", "imu.eds"):
+        text = text.replace(f'"{name}"', f'"{DEFAULT_FILE.with_name(name)}"')
+    for name, value in (("heartbeat_timeout", 0.5), ("command_timeout", 0.5), ("silence", 1.0)):
+        text = re.sub(rf"^{name} = [0-9.]+", f"{name} = {value}", text, flags=re.MULTILINE)
+    file.write_text(text.replace("port = 43113", f"port = {free_port()}"))
+    return file
+
+
+# --------------------------------------------------------------------------------------------------------------- it follows
+
+
+def test_over_udp_it_follows_as_with_the_plant_itself_and_says_how_the_bus_was(tmp_path):
+    figures = {}
+    direct = gough("run", *MOTION, *PATIENT, "--duration", 5, "--json", tmp_path / "fmu.json")
+    assert finished(direct)[0] == 0
+    with emulated() as (_, at, _):
+        run = gough(
+            "run", "--rig", "udp", "--rig-at", at, *MOTION, *PATIENT, "--duration", 5, "--record", tmp_path / "udp.mcap",
+            "--json", tmp_path / "udp.json",
+        )  # fmt: skip
+        status, output, errors = finished(run)
+        assert status == 0, errors
+    for name in ("fmu", "udp"):
+        figures[name] = json.loads((tmp_path / f"{name}.json").read_text())
+    for error in ("estimation", "tracking"):
+        assert figures["udp"]["errors_m"][error] < 1.5 * figures["fmu"]["errors_m"][error] + 5e-5
+    assert "round trip to the rig p50" in output and " us #" in output and "exchanges late" in output
+    assert figures["udp"]["identity"]["name"] == "gough emulated hexapod"
+    assert 0.0 < figures["udp"]["timing_us"]["round trip"]["p50"] < 2000.0
+    records = read(tmp_path / "udp.mcap").records
+    assert len(records) == figures["udp"]["cycles"]
+    # What is sent takes effect one exchange later, in single precision.
+    answered = records["silent"][1:] == 0
+    sent, told = records["command"][:-1][answered], records["sent"][1:][answered]
+    following = (records["drive"][1:][answered] == FOLLOWING).all(axis=1) & (records["mode"][1:][answered] == RUNNING)
+    np.testing.assert_allclose(told[following], sent[following].astype(np.float32), rtol=1e-6)
+    assert replay([tmp_path / "udp.mcap"]).same
+
+
+def test_over_canopen_it_follows_and_replays(tmp_path, canopen_file):
+    with emulated("--bus", "canopen", at=str(canopen_file)) as (_, at, _):
+        run = gough(
+            "run", "--rig", "canopen", "--rig-at", at, "--target", "sines", "--rate", 250, *PATIENT, "--duration", 4,
+            "--record", tmp_path / "can.mcap", "--json", tmp_path / "can.json",
+        )  # fmt: skip
+        status, _, errors = finished(run)
+        if "ip route add" in errors:
+            pytest.skip("this machine has no multicast")
+        assert status == 0, errors
+    figures = json.loads((tmp_path / "can.json").read_text())
+    assert len(figures["identity"]["parts"]) == 13
+    assert figures["errors_m"]["known"] > 900
+    assert figures["errors_m"]["estimation"] < 2e-3
+    assert figures["errors_m"]["tracking"] < 1e-3
+    assert replay([tmp_path / "can.mcap"]).same
+
+
+def test_a_dry_run_reads_everything_and_moves_nothing(tmp_path):
+    with emulated() as (_, at, control):
+        run = gough(
+            "run",
+            "--rig",
+            "udp",
+            "--rig-at",
+            at,
+            *MOTION,
+            *PATIENT,
+            "--duration",
+            2,
+            "--no-arm",
+            "--record",
+            tmp_path / "x.mcap",
+        )
+        status, output, errors = finished(run)
+        assert status == 0, errors
+        assert "nothing was moved; all is well for arming" in output
+        lengths = state_of(control)["lengths"]
+    records = read(tmp_path / "x.mcap").records
+    assert (records["command"] == 0.0).all() and (records["mode"] == 0).all() and (records["drive"] != FOLLOWING).all()
+    assert np.isfinite(records["position"]).all()
+    assert np.abs(records["truth"][0, 7:13] - lengths).max() < 1e-4
+
+
+# ------------------------------------------------------------------------------------------------------------ it ends safely
+
+
+def test_when_the_loop_is_killed_the_drives_stop_by_themselves(tmp_path):
+    with emulated() as (_, at, control):
+        run = started(at, control)
+        loop = int(subprocess.run(["pgrep", "-P", str(run.pid)], capture_output=True, text=True).stdout.split()[0])
+        os.kill(loop, signal.SIGKILL)
+        wait_for(lambda: state_of(control)["drive"] == [FAULTY] * 6, 10.0)
+        time.sleep(0.2)
+        state = state_of(control)
+        assert state["velocity"] == [0.0] * 6
+        assert state["code"] == [WATCHDOG_CODE] * 6
+        assert finished(run)[0] == 1
+        # And the next controller resets the fault and goes on.
+        assert finished(gough("run", "--rig", "udp", "--rig-at", at, *MOTION, *PATIENT, "--duration", 0.5))[0] == 0
+
+
+def test_when_the_loop_is_killed_canopen_drives_stop_by_their_heartbeat(canopen_file):
+    with emulated("--bus", "canopen", at=str(canopen_file)) as (_, at, control):
+        run = started(at, control, "--rate", 250, rig="canopen")
+        loop = int(subprocess.run(["pgrep", "-P", str(run.pid)], capture_output=True, text=True).stdout.split()[0])
+        os.kill(loop, signal.SIGKILL)
+        wait_for(lambda: FOLLOWING not in state_of(control)["drive"], 10.0)
+        time.sleep(0.5)
+        state = state_of(control)
+        assert state["velocity"] == [0.0] * 6
+        assert finished(run)[0] == 1
+
+
+def test_when_the_rig_is_killed_the_run_ends_and_a_new_one_serves_the_next(tmp_path):
+    with emulated() as (process, at, control):
+        run = started(at, control, "--record", tmp_path / "x.mcap", "--mechanism", "hexapod")
+        process.kill()
+        status, _, errors = finished(run)
+        assert status == 1
+        assert "the bus is lost" in errors
+        with pytest.raises(BusyError):
+            ask(control, "state", patience=0.2)
+    found = read(tmp_path / "x.mcap")
+    assert found.complete and found.records["stop"][-1] == BUS_LOST
+    with emulated(at=at, control=control):
+        assert finished(gough("run", "--rig", "udp", "--rig-at", at, *MOTION, *PATIENT, "--duration", 0.5))[0] == 0
+
+
+def test_a_fault_that_is_injected_is_told_and_the_run_goes_on_without_the_imu(tmp_path):
+    with emulated() as (_, at, control):
+        run = started(at, control)
+        assert finished(gough("inject", "imu-dead:3", "--to", control))[0] == 0
+        time.sleep(1.0)
+        run.send_signal(signal.SIGINT)
+        status, output, errors = finished(run)
+        assert status == 0, errors
+        assert "IMU 3 is left out: its samples are stale" in output
+        status, _, errors = finished(gough("inject", "imu-dead:7", "--to", control))
+        assert status == 2 and "0 to 6" in errors
+
+
+def test_the_emergency_key_stops_the_drives_quickly():
+    with emulated() as (_, at, control):
+        run = started(at, control)
+        run.send_signal(signal.SIGQUIT)
+        status, _, errors = finished(run)
+        assert status == 1
+        assert "emergency stop" in errors
+        wait_for(lambda: FOLLOWING not in state_of(control)["drive"], 10.0)
+
+
+def test_a_rig_that_is_not_there_or_stands_elsewhere_is_not_driven():
+    status, _, errors = finished(gough("run", "--rig", "udp", "--rig-at", f"127.0.0.1:{free_port()}", "--duration", 1))
+    assert status == 2 and "no rig answers" in errors
+    with emulated("--target", "hold") as (_, at, _):
+        # A target that begins 15 mm beside where the platform stands.
+        aside = Path(__file__).with_name("aside.csv")
+        try:
+            aside.write_text(
+                "time_s,x_m,y_m,z_m,qw,qx,qy,qz\n" + "".join(f"{t},0.02,0,0.02,1,0,0,0\n" for t in (0.0, 1.0, 2.0))
+            )
+            options = ("--target", aside, "--rate", 500, "--duration", 1)
+            status, _, errors = finished(gough("run", "--rig", "udp", "--rig-at", at, *options, *PATIENT))
+        finally:
+            aside.unlink()
+        assert status == 1
+        assert "not armed" in errors and "is not where the target begins" in errors
+
+
+# ---------------------------------------------------------------------------------------------------------- a streamed target
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--duration", 3), "the target's stream has stopped"),
+        (("--jump-at", 2), "the target"),
+        (("--nan-at", 2), "the target is not finite"),
+    ],
+)
+def test_a_streamed_target_is_followed_until_it_goes_wrong(tmp_path, options, words):
+    port = free_port()
+    run = gough(
+        "run",
+        "--target",
+        f"stream:127.0.0.1:{port}",
+        "--rate",
+        500,
+        "--duration",
+        60,
+        *PATIENT,
+        "--record",
+        tmp_path / "x.mcap",
+    )
+    wait_for(lambda: run.poll() is not None or ((tmp_path / "x.mcap").exists() and moving(tmp_path / "x.mcap")))
+    assert run.poll() is None, run.communicate()
+    sender = gough("stream-target", "--target", "sines", "--to", f"127.0.0.1:{port}", *options)
+    status, _, errors = finished(run)
+    finished(sender)
+    assert status == 1
+    assert words in errors
+    records = read(tmp_path / "x.mcap").records
+    assert np.ptp(records["truth"][:, :3], axis=0).max() > 2e-3
+    moved = records[records["mode"] == RUNNING]
+    assert np.abs(moved["truth"][:, 7:13] - moved["reference"][:, :, 0]).max() < 3e-3
+    assert replay([tmp_path / "x.mcap"]).same
+
+
+def moving(path):
+    with suppress(GoughError):
+        return bool((read(path).records["mode"] == RUNNING).any())
+    return False

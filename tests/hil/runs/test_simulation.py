@@ -1,0 +1,204 @@
+"""The main job: a hexapod follows a motion on its FMU plant."""
+
+import os
+import subprocess
+import sys
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from controller.estimation.filterpy_filters import FilterpyLeg, FilterpyPlatform
+from controller.settings import control_settings
+from hil.runs.simulation import SimulationConfig, SimulationStoppedError, prepared_loop, simulate
+from plant.errors import InputError, UnknownNameError, UnreachableError
+from plant.fmu.binding import Setting
+from plant.mechanism import load_mechanism
+
+MM, DEG = 1e-3, np.radians(1.0)
+
+
+def errors(result, group):
+    figures = result.summary()[group]
+    return figures["position_rms"] / MM, figures["rotation_rms"] / DEG
+
+
+def test_low_cost_imus_follow_a_real_motion_within_the_promise(motion_capture):
+    estimation, tracking = [], []
+    for seed in range(20):
+        result = simulate(SimulationConfig(target=str(motion_capture), duration=60.0, seed=seed))
+        assert result.summary()["limits"]["violations"] == 0
+        estimation.append(errors(result, "estimation"))
+        tracking.append(errors(result, "tracking"))
+    assert (np.max(estimation, axis=0) <= (0.7, 0.12)).all()
+    assert np.sqrt(np.mean(np.square(estimation), axis=0))[0] <= 0.4
+    assert (np.max(tracking, axis=0) <= (0.75, 0.12)).all()
+
+
+def test_ideal_imus_follow_a_real_motion_within_the_promise(motion_capture):
+    result = simulate(SimulationConfig(target=str(motion_capture), duration=60.0, imu="ideal"))
+    assert errors(result, "estimation") < (0.02, 0.01)
+    assert errors(result, "estimation")[1] < 0.01
+    assert errors(result, "tracking") < (0.05, 0.01)
+    assert errors(result, "tracking")[1] < 0.01
+    assert result.summary()["target"]["reference_position_rms"] <= 0.02 * MM
+
+
+@pytest.mark.parametrize("target", ["hold", "circle", "sines", "steps"])
+def test_every_named_motion_is_followed(target):
+    result = simulate(SimulationConfig(target=target, duration=4.0, imu="ideal"))
+    assert errors(result, "tracking")[0] < 0.15
+    assert result.reference.violations == 0
+
+
+@pytest.mark.parametrize("rate", [50.0, 250.0, 4000.0])
+def test_the_loop_follows_at_other_rates(rate):
+    result = simulate(SimulationConfig(target="sines", duration=4.0, rate=rate))
+    assert errors(result, "tracking") < (3.0, 0.6)
+
+
+@pytest.mark.parametrize("rate", [50.0, 70.0, 100.0, 150.0, 200.0, 300.0, 500.0, 2000.0])
+def test_no_watch_stops_a_sound_run_at_any_rate(rate):
+    for seed in range(4):
+        for target in ("circle", "sines"):
+            records = simulate(SimulationConfig(target=target, duration=3.0, rate=rate, seed=seed)).records
+            # Armed, and nothing else: no IMU is left out.
+            assert records["event_count"].sum() == 1, (seed, target)
+
+
+def test_a_target_faster_than_the_limits_is_followed_as_closely_as_they_allow(tmp_path):
+    times = np.arange(0.0, 4.0, 0.01)
+    x = 0.04 * np.sin(2.0 * np.pi * 3.0 * times) * np.minimum(times, 1.0)
+    rows = [f"{t:.2f},{value:.6f},0,0,1,0,0,0" for t, value in zip(times, x, strict=True)]
+    path = tmp_path / "fast.csv"
+    path.write_text("\n".join(["time_s,x_m,y_m,z_m,qw,qx,qy,qz", *rows]))
+    result = simulate(SimulationConfig(target=str(path), duration=4.0, imu="ideal"))
+    assert result.reference.violations == 0
+    assert result.summary()["target"]["reference_position_rms"] > 2.0 * MM
+    speeds = np.abs(result.records["reference"][:, :, 1])
+    assert speeds.max() > 0.5 * result.mechanism.limits.velocity
+    assert errors(result, "tracking")[0] < 1.0
+
+
+def test_one_seed_gives_one_result_bit_for_bit_and_another_seed_another():
+    first, second, other = (simulate(SimulationConfig(duration=1.0, seed=seed)).records for seed in (3, 3, 4))
+    for field in set(first.dtype.names) - {"stage_ns"}:
+        assert first[field].tobytes() == second[field].tobytes(), field
+    assert first["command"].tobytes() != other["command"].tobytes()
+
+
+def test_a_run_taken_up_from_its_arrays_goes_on_bit_for_bit():
+    config = SimulationConfig(duration=0.5)
+    with prepared_loop(config) as whole, prepared_loop(config) as parts:
+        assert whole.run(700) == 0
+        assert parts.run(333) == 0
+        parts.state, parts.imu = parts.state.copy(), parts.imu.copy()
+        assert parts.run(700) == 0
+        assert whole.state.tobytes() == parts.state.tobytes()
+        assert whole.imu.tobytes() == parts.imu.tobytes()
+
+
+def test_filterpy_closes_the_same_loop(monkeypatch):
+    taken = Counter()
+    for kind in (FilterpyLeg, FilterpyPlatform):
+
+        def step(self, *sample, kind=kind, whole=kind.step):
+            taken[kind] += 1
+            whole(self, *sample)
+
+        monkeypatch.setattr(kind, "step", step)
+    compiled = simulate(SimulationConfig(target="sines", duration=0.8)).records
+    filterpy = simulate(SimulationConfig(target="sines", duration=0.8, fusion="filterpy")).records
+    assert taken == {FilterpyLeg: 6 * (len(filterpy) - 1), FilterpyPlatform: len(filterpy)}
+    np.testing.assert_allclose(filterpy["position"], compiled["position"], atol=1e-11)
+    np.testing.assert_allclose(filterpy["command"], compiled["command"], atol=1e-9)
+
+
+@pytest.mark.parametrize("imus", [(0, 1, 2, 3, 4, 5), (0, 1, 2, 6), (0, 1, 2, 3, 4), (1, 2, 3, 4, 5, 6)])
+def test_any_imus_that_determine_the_pose_close_the_loop(imus):
+    result = simulate(SimulationConfig(target="circle", duration=3.0, imus=imus))
+    assert errors(result, "tracking") < (3.0, 1.0)
+
+
+def test_imus_that_do_not_determine_the_pose_are_refused():
+    for imus in ((0, 1, 6), (0, 1, 2), (0, 2, 4, 6), (), (7,)):
+        with pytest.raises(InputError):
+            simulate(SimulationConfig(imus=imus))
+
+
+def test_nothing_moves_while_the_brakes_hold():
+    result = simulate(SimulationConfig(target="sines", duration=0.2))
+    hold = result.times < 0.0
+    assert hold.sum() == 200
+    assert (result.records["command"][hold] == 0.0).all()
+    moved = np.linalg.norm(result.true_positions[hold] - result.true_positions[0], axis=1)
+    assert moved.max() < 20e-6
+
+
+def test_settings_of_the_preset_are_those_of_the_design():
+    gains = control_settings(load_mechanism("hexapod"))
+    assert gains == replace(gains, proportional=60.0, integral=200.0, derivative=0.0, hold=0.2)
+
+
+def test_a_plant_that_fails_in_motion_ends_the_run_with_its_reason_and_its_record():
+    # Friction that steep is too stiff for the substep, which the FMU tells when it is set.
+    steep = Setting("friction.velocity", (1e-9,), 0.5)
+    with pytest.raises(
+        SimulationStoppedError, match=r"cycle \d+ of \d+.*changing a parameter failed: substep is 0.0005"
+    ) as stopped:
+        simulate(SimulationConfig(duration=1.0, settings=(steep,)))
+    assert 600 < len(stopped.value.result.records) < 1200
+
+
+def test_what_cannot_be_used_is_refused():
+    for changes, error in (
+        ({"rate": 10.0}, InputError),
+        ({"rate": float("nan")}, InputError),
+        ({"fusion": "magic"}, UnknownNameError),
+        ({"imu": "magic"}, UnknownNameError),
+        ({"mechanism": "magic"}, UnknownNameError),
+        ({"target": "magic"}, UnknownNameError),
+        ({"duration": 0.0}, InputError),
+        ({"seed": -1}, InputError),
+    ):
+        with pytest.raises(error):
+            simulate(SimulationConfig(**changes))
+
+
+def test_an_unreachable_pose_names_the_leg_and_by_how_much(tmp_path):
+    path = tmp_path / "far.csv"
+    path.write_text("time_s,x_m,y_m,z_m,qw,qx,qy,qz\n0,0,0,0,1,0,0,0\n1,0,0,0.09,1,0,0,0\n")
+    with pytest.raises(UnreachableError, match=r"leg \d at .* mm, .* mm outside its stroke"):
+        simulate(SimulationConfig(target=str(path)))
+
+
+def test_the_process_of_a_loop_loads_no_design_or_plotting_library():
+    # numba loads a part of scipy by itself; nothing may be added to it.
+    code = (
+        "import sys; from hil.runs.simulation import SimulationConfig, simulate; import numba.np.arraymath;"
+        "before = set(sys.modules);"
+        "simulate(SimulationConfig(duration=0.05));"
+        "roots = {name.split('.')[0] for name in sys.modules};"
+        "print(sorted(roots & {'control', 'casadi', 'filterpy', 'plotly', 'matplotlib'}),"
+        "sorted(name for name in set(sys.modules) - before if name.startswith('scipy')))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[] []"
+
+
+def test_the_loop_allocates_nothing_per_cycle():
+    code = (
+        "from hil.runs.simulation import SimulationConfig, prepared_loop\n"
+        "from numba.core.runtime import rtsys\n"
+        "with prepared_loop(SimulationConfig(target='sines', duration=1.0)) as loop:\n"
+        "    counts = [rtsys.get_allocation_stats().alloc]\n"
+        "    for last in (210, 220, 1200):\n"
+        "        loop.run(last)\n"
+        "        counts.append(rtsys.get_allocation_stats().alloc)\n"
+        "print(counts[2] - counts[1], counts[3] - counts[2])\n"
+    )
+    environment = os.environ | {"NUMBA_NRT_STATS": "1"}
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    ten_cycles, many_cycles = map(int, run.stdout.split())
+    assert ten_cycles == many_cycles

@@ -1,0 +1,159 @@
+"""A simulation that goes on from a snapshot is the one that was never interrupted, to the bit."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import pytest
+
+from controller.cycle import STATE
+from hil.command_line import main
+from hil.runs.simulation import SimulationConfig, SimulationStoppedError, simulate
+from hil.runs.snapshot import read_snapshot, write_snapshot
+from plant.errors import GoughError, InputError
+from plant.fmu.binding import Setting
+from tests.plant.fmu.foreign import BINDING, TRUTH
+
+TIMED = ("time_ns", "late_ns", "stage_ns", "cpu_ns")
+"""What of a record the machine's own time is in."""
+
+
+def bits(records: np.ndarray) -> dict[str, bytes]:
+    return {name: records[name].tobytes() for name in records.dtype.names if name not in TIMED}
+
+
+LIVELY = SimulationConfig(
+    target="sines", duration=2.0, seed=3, fusion="whole", magnetometer=True, settings=(Setting("payload.mass", (12.0,), 1.2),)
+)
+
+
+@pytest.mark.parametrize(
+    ("config", "save_at"),
+    [
+        (LIVELY, 0.7),
+        (replace(LIVELY, fusion="compiled", rate=250.0, imu="icm42688"), 1.5),
+        (replace(LIVELY, joint_error=1e-4), -0.1),
+        (SimulationConfig(mechanism="planar-3rpr", duration=1.0), 0.4),
+    ],
+)
+def test_a_simulation_goes_on_to_the_bit(config: SimulationConfig, save_at: float, tmp_path: Path) -> None:
+    """Before and after a payload changes, within the hold, and on the planar plant; through a file."""
+    whole = simulate(config)
+    first = simulate(config, save_at=save_at)
+    assert first.snapshot is not None
+    write_snapshot(first.snapshot, tmp_path / "state")
+    kept = read_snapshot(tmp_path / "state")
+    rest = simulate(SimulationConfig.from_plain(kept.config), resumed=kept)
+    assert SimulationConfig.from_plain(kept.config) == config
+    assert len(rest.records) == len(whole.records) - kept.cycle and 0 < kept.cycle < len(whole.records)
+    assert bits(first.records) == bits(whole.records)
+    assert bits(rest.records) == bits(whole.records[kept.cycle :])
+    np.testing.assert_array_equal(rest.times, whole.times[kept.cycle :])
+    assert rest.summary()["limits"]["violations"] == 0
+
+
+def test_a_finished_run_goes_on_for_longer(tmp_path: Path) -> None:
+    """The command line: what 'gough simulate --duration 1.5' would have done from 1 s on."""
+    path = tmp_path / "state"
+    assert main(["simulate", "--target", "hold", "--duration", "1", "--save-state", str(path)]) == 0
+    assert main(["simulate", "--load-state", str(path), "--duration", "1.5", "--json", str(tmp_path / "rest.json")]) == 0
+    snapshot = read_snapshot(path)
+    rest = simulate(replace(SimulationConfig.from_plain(snapshot.config), duration=1.5), resumed=snapshot)
+    whole = simulate(SimulationConfig(target="hold", duration=1.5))
+    assert bits(rest.records) == bits(whole.records[snapshot.cycle :])
+
+
+def refused(config: SimulationConfig, path: Path) -> str:
+    with pytest.raises(GoughError) as caught:
+        simulate(config, resumed=read_snapshot(path))
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulationConfig, Path]:
+    config, path = SimulationConfig(target="hold", duration=0.5), tmp_path_factory.mktemp("snapshot") / "state"
+    snapshot = simulate(config, save_at=0.5).snapshot
+    assert snapshot is not None
+    write_snapshot(snapshot, path)
+    return config, path
+
+
+def test_what_does_not_go_together_is_refused(saved: tuple[SimulationConfig, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    config, path = saved
+    assert "the end of its motion of 0.5 s: go on with a longer --duration" in refused(config, path)
+    assert "mechanism, calibration, FMU or binding have changed" in refused(
+        replace(config, mechanism="6-3-I", duration=1.0), path
+    )
+    assert "another motion was planned" in refused(replace(config, target="sines", duration=1.0), path)
+    assert main(["simulate", "--load-state", str(path), "--rate", "500"]) == 2
+    assert "the snapshot was taken with rate 1000.0, and cannot go on with 500.0: leave it out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("save_at", [-1.0, 0.6, np.nan])
+def test_a_snapshot_beyond_the_motion_is_refused(save_at: float) -> None:
+    with pytest.raises(InputError, match=f"a snapshot at {save_at:g} s is not within the motion: choose more than"):
+        simulate(SimulationConfig(duration=0.5), save_at=save_at)
+
+
+def test_other_files_are_refused(saved: tuple[SimulationConfig, Path], tmp_path: Path) -> None:
+    content = saved[1].read_bytes()
+    for broken in (b"", b"no snapshot", content[:-1], msgpack.packb([1, 2])):
+        (tmp_path / "broken").write_bytes(broken)
+        with pytest.raises(InputError, match="is no snapshot of 'gough simulate --save-state'"):
+            read_snapshot(tmp_path / "broken")
+    whole = msgpack.unpackb(content)
+    for changes, said in (
+        ({"version": "0.0.1"}, "is of gough 0.0.1, and this is gough"),
+        ({"more": 1}, "lacks something, or has something unknown"),
+        ({"memory": whole["memory"] | {"imu": b""}}, "memory is laid out in another way"),
+        ({"config": whole["config"] | {"speed": 1}}, "no configuration of a simulation"),
+        ({"plant": whole["plant"][:-1]}, "wrong size"),
+    ):
+        (tmp_path / "broken").write_bytes(msgpack.packb(whole | changes))
+        with pytest.raises(GoughError, match=said):
+            snapshot = read_snapshot(tmp_path / "broken")
+            simulate(replace(SimulationConfig.from_plain(snapshot.config), duration=0.6), resumed=snapshot)
+    with pytest.raises(InputError, match="cannot read the snapshot"):
+        read_snapshot(tmp_path / "missing")
+
+
+def test_a_time_without_a_file_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", "--save-at", "1"]) == 2
+    assert "add --save-state FILE" in capsys.readouterr().err
+    with pytest.raises(InputError, match="filters on filterpy cannot be saved"):
+        simulate(SimulationConfig(fusion="filterpy", duration=0.5), save_at=0.2)
+
+
+def test_a_snapshot_goes_on_in_another_process_and_with_a_foreign_fmu(foreign_fmu: Path, tmp_path: Path) -> None:
+    (tmp_path / "foreign.toml").write_text(BINDING + TRUTH)
+    config = SimulationConfig(duration=0.6, plant=str(foreign_fmu), binding=str(tmp_path / "foreign.toml"))
+    whole = simulate(config)
+    snapshot = simulate(config, save_at=0.3).snapshot
+    assert snapshot is not None
+    write_snapshot(snapshot, tmp_path / "state")
+    subprocess.run(
+        [sys.executable, "-m", "hil.command_line", "simulate", "--load-state", "state", "--save-state", "end"],
+        cwd=tmp_path, check=True, env=os.environ | {"PYTHONPATH": str(Path.cwd())},
+    )  # fmt: skip
+    end = read_snapshot(tmp_path / "end")
+    assert end.cycle == len(whole.records)
+    uninterrupted = simulate(config, save_at=0.6).snapshot
+    assert uninterrupted is not None
+    state = np.frombuffer(end.memory["state"], STATE)
+    assert state.tobytes() == uninterrupted.memory["state"] and end.plant == uninterrupted.plant
+    (tmp_path / "foreign.toml").write_text((BINDING + TRUTH).replace("sign = -1\n\n[drive_mode]", "sign = 1\n\n[drive_mode]"))
+    with pytest.raises(InputError, match="FMU or binding have changed"):
+        simulate(config, resumed=snapshot)
+
+
+def test_a_run_that_fails_near_its_end_fails_and_gives_no_snapshot(tmp_path: Path) -> None:
+    """A body that cannot be, so late that the loop has not stopped yet when the time is over."""
+    impossible = Setting("payload.inertia", (1.0,), 0.05)
+    with pytest.raises(SimulationStoppedError, match=r"changing a parameter failed: payload\.inertia is of no") as stopped:
+        simulate(SimulationConfig(duration=0.1, settings=(impossible,)), save_at=0.1)
+    assert stopped.value.result.snapshot is None

@@ -1,0 +1,240 @@
+"""Streams of targets over real sockets, to a process of its own, followed by a loop on the machine's clock."""
+
+import multiprocessing
+import socket
+import struct
+import time
+import zlib
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from controller.inverse_kinematics import leg_lengths
+from controller.planning.segments import evaluate_reference
+from controller.planning.stream import CAUSE, DONE, STREAM, TAKEN, TAKER, rest, stream_cause, take_plan
+from controller.planning.stream_planner import StreamPlanner
+from controller.planning.target import load_target
+from controller.safety.watch import BEYOND_STROKE, NO_CAUSE, TARGET_JUMPS, TARGET_LOST, TARGET_NOT_FINITE
+from hil.loop.driver import shared_array
+from hil.runs.target_stream import (
+    DATAGRAM_BYTES,
+    Faults,
+    Sample,
+    StreamError,
+    decode,
+    encode,
+    open_socket,
+    receive,
+    send_target,
+)
+from plant.errors import InputError
+from tests.hil.command_line.test_command_line import gough, refused
+
+FORK = multiprocessing.get_context("fork")
+PERIOD = 1e-3
+PATIENCE_NS = 100_000_000
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+HERE = (0.0, 0.0, 0.0)
+
+
+def home_lengths(mechanism):
+    return leg_lengths(mechanism, mechanism.home.position, mechanism.home.rotation)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _loaded():
+    """What the loop runs is loaded before it is on the clock."""
+    follow(np.zeros((), STREAM), np.ones(6), PERIOD)
+
+
+@contextmanager
+def receiving(mechanism, period=PERIOD):
+    """A receiver in a process of its own: its stream and its port."""
+    stream = shared_array(1, STREAM).reshape(())
+    with open_socket(port=0) as listener:
+        port = listener.getsockname()[1]
+        planner = StreamPlanner(mechanism, home_lengths(mechanism))
+        process = FORK.Process(target=receive, args=(stream, planner, listener, period))
+        process.start()
+        try:
+            yield stream, port
+        finally:
+            stream["shared"][DONE] = 1
+            process.join(5.0)
+            ended = process.exitcode
+            process.kill()
+    assert ended == 0
+
+
+def follow(stream, lengths, duration):
+    """A loop at 1 kHz that follows a stream: times [ns], references (n, 6, 3), and the cause of each cycle."""
+    taker, segments, index = np.zeros((), TAKER), rest(lengths), np.zeros(6, np.int64)
+    reference = np.zeros((6, 3))
+    times, references, causes = [], [], []
+    began = time.monotonic_ns()
+    for cycle in range(round(duration / PERIOD)):
+        due = began + round(1e9 * PERIOD * cycle)
+        time.sleep(max(0.0, 1e-9 * (due - time.monotonic_ns())))
+        take_plan(stream, taker, cycle, PERIOD, segments, index)
+        evaluate_reference(segments, cycle * PERIOD, index, reference)
+        times.append(due)
+        references.append(reference.copy())
+        causes.append(stream_cause(stream, time.monotonic_ns(), PATIENCE_NS))
+    return np.array(times), np.array(references), causes
+
+
+def check(references, limits):
+    assert (references[:, :, 0] >= limits.stroke[:, 0] - 1e-9).all()
+    assert (references[:, :, 0] <= limits.stroke[:, 1] + 1e-9).all()
+    assert np.abs(references[:, :, 1]).max() <= limits.velocity * (1.0 + 1e-9)
+    assert np.abs(references[:, :, 2]).max() <= limits.acceleration * (1.0 + 1e-9)
+    assert np.abs(np.diff(references[:, :, 2], axis=0)).max() <= limits.jerk * PERIOD * (1.0 + 1e-6)
+    assert np.abs(np.diff(references[:, :, 0], axis=0)).max() <= limits.velocity * PERIOD * (1.0 + 1e-6)
+
+
+def wait_for(condition):
+    until = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.002)
+
+
+def streamed(mechanism, faults=None, duration=1.5, watched=2.5, name="circle"):
+    """What a loop makes of a motion that another process sends."""
+    target = load_target(name, mechanism, duration)
+    with receiving(mechanism) as (stream, port):
+        sender = FORK.Process(target=send_target, args=(mechanism, target, 100.0, "127.0.0.1", port, duration, faults))
+        sender.start()
+        wait_for(lambda: stream["accepted"] > 0)
+        times, references, causes = follow(stream, home_lengths(mechanism), watched)
+        sender.join()
+        assert sender.exitcode == 0
+        return target, times, references, causes, stream.copy()
+
+
+def test_a_streamed_motion_is_followed_and_ends_at_rest_when_the_stream_does(hexapod):
+    target, _, references, causes, stream = streamed(hexapod, duration=2.5, watched=3.5)
+    check(references, hexapod.limits)
+    sent = leg_lengths(hexapod, *target.at(np.arange(3500) * PERIOD))
+    # Whether the sender or whoever watches began first, and by how much, is not known to a millisecond: the best of all shifts.
+    pairs = [(references[max(s, 0) :, :, 0], sent[max(-s, 0) :]) for s in range(-400, 400)]
+    errors = [np.sqrt(np.mean((ours[:2300] - theirs[:2300]) ** 2)) for ours, theirs in pairs]
+    assert min(errors) < 0.3e-3
+    assert stream["accepted"] >= 200 and stream["planned"] > 100
+    assert stream["late"] < stream["planned"] / 4
+    assert (references[-1, :, 1:] == 0.0).all()
+    # After its end the stream is lost, and not before.
+    assert causes[-1][0] == TARGET_LOST and causes[-1][2] > causes[-1][3] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("faults", "cause"),
+    [
+        (Faults(stop_at=0.7), TARGET_LOST),
+        (Faults(jump_at=0.7), TARGET_JUMPS),
+        (Faults(nan_at=0.7), TARGET_NOT_FINITE),
+    ],
+)
+def test_a_stream_that_goes_wrong_fails_with_its_cause_and_ends_at_rest(hexapod, faults, cause):
+    _, _, references, causes, stream = streamed(hexapod, faults)
+    check(references, hexapod.limits)
+    assert causes[-1][0] == cause
+    assert NO_CAUSE in {each[0] for each in causes}
+    assert (references[-1, :, 1:] == 0.0).all()
+    assert np.abs(references[:, :, 1]).max() > 1e-3
+    assert 20 <= stream["accepted"] <= 71
+
+
+def test_malformed_stale_repeated_and_strange_datagrams_are_counted_and_refused(hexapod):
+    with receiving(hexapod) as (stream, port), socket.socket(type=socket.SOCK_DGRAM) as ours:
+        ours.connect(("127.0.0.1", port))
+        # The sequence wraps round.
+        ours.send(encode(Sample(2**32 - 2, 1_000_000_000, HERE, LEVEL)))
+        ours.send(encode(Sample(2**32 - 1, 1_010_000_000, HERE, LEVEL)))
+        ours.send(encode(Sample(2**32, 1_020_000_000, HERE, LEVEL)))
+        wait_for(lambda: stream["accepted"] == 3)
+        for sequence, at in ((0, 1_030_000_000), (2**32 - 1, 1_030_000_000), (1, 1_020_000_000)):
+            ours.send(encode(Sample(sequence, at, HERE, LEVEL)))
+        wait_for(lambda: stream["stale"] == 3)
+        good = encode(Sample(1, 1_030_000_000, HERE, LEVEL))
+        for bad in (b"", good[:-1], good + b"\0", bytes(DATAGRAM_BYTES), good[:20] + b"\x55" + good[21:], 50_000 * b"x"):
+            ours.send(bad)
+        wait_for(lambda: stream["malformed"] == 6)
+        with socket.socket(type=socket.SOCK_DGRAM) as other:
+            other.sendto(good, ("127.0.0.1", port))
+            wait_for(lambda: stream["strange"] == 1)
+        assert stream["accepted"] == 3
+        ours.send(good)
+        wait_for(lambda: stream["accepted"] == 4)
+        assert stream["shared"][CAUSE] == NO_CAUSE
+        ours.send(encode(Sample(2, 1_040_000_000, (0.0, 0.0, 0.4), LEVEL)))
+        wait_for(lambda: stream["shared"][CAUSE] == BEYOND_STROKE)
+        ours.send(encode(Sample(3, 1_050_000_000, HERE, LEVEL)))
+        time.sleep(0.1)
+        assert stream["accepted"] == 4
+
+
+def test_a_loop_that_does_not_look_gets_no_second_plan(hexapod):
+    with receiving(hexapod) as (stream, port), socket.socket(type=socket.SOCK_DGRAM) as ours:
+        for k in range(20):
+            ours.sendto(encode(Sample(k, 10_000_000 * k, (0.0, 0.0, 1e-3 * k), LEVEL)), ("127.0.0.1", port))
+        wait_for(lambda: stream["accepted"] == 20)
+        time.sleep(0.1)
+        assert stream["planned"] == 1 and stream["shared"][TAKEN] == 0
+        _, references, _ = follow(stream, home_lengths(hexapod), 0.5)
+        assert stream["planned"] >= 1 and stream["shared"][TAKEN] >= 1
+        assert np.abs(references[-1, :, 0] - references[0, :, 0]).max() > 0.0
+
+
+def test_a_datagram_is_what_was_packed():
+    sample = Sample(7, 123_456_789_012, (0.1, -0.2, 0.3), (0.5, -0.5, 0.5, -0.5))
+    datagram = encode(sample)
+    assert len(datagram) == DATAGRAM_BYTES == 78
+    assert datagram[:6] == b"GGHT\x01\x00"
+    assert decode(datagram) == sample
+    for bit in range(8 * len(datagram)):
+        damaged = bytearray(datagram)
+        damaged[bit // 8] ^= 1 << bit % 8
+        assert decode(bytes(damaged)) is None
+    for version in (0, 2):
+        body = datagram[:4] + struct.pack("<H", version) + datagram[6:-4]
+        assert decode(body + struct.pack("<I", zlib.crc32(body))) is None
+
+
+def test_an_address_that_is_not_to_be_had_is_refused(hexapod):
+    with open_socket(port=0) as taken, pytest.raises(StreamError, match="choose another"):
+        open_socket(port=taken.getsockname()[1])
+    with pytest.raises(StreamError, match=r"no\.such\.host\.invalid"):
+        open_socket("no.such.host.invalid")
+    target = load_target("hold", hexapod, 0.1)
+    with pytest.raises(StreamError, match="cannot send"):
+        send_target(hexapod, target, host="no.such.host.invalid")
+    for rate in (0.0, -1.0, np.nan, 1e5):
+        with pytest.raises(InputError, match="rate"):
+            send_target(hexapod, target, rate)
+    with pytest.raises(InputError, match="duration"):
+        send_target(hexapod, target, duration=-1.0)
+
+
+def test_the_command_streams_a_file_in_real_time(tmp_path, hexapod):
+    file = tmp_path / "motion.csv"
+    rows = [f"{0.1 * k},0,0,{1e-3 * k},1,0,0,0" for k in range(11)]
+    file.write_text("\n".join(["time_s,x_m,y_m,z_m,qw,qx,qy,qz", *rows]) + "\n")
+    with open_socket(port=0) as listener:
+        port = listener.getsockname()[1]
+        run = gough("stream-target", "--target", file, "--rate", 50, "--duration", 0.5, "--to", f"127.0.0.1:{port}")
+        assert run.returncode == 0, run.stderr
+        assert f"26 poses of motion.csv sent to 127.0.0.1:{port}" in run.stdout
+        samples = [decode(listener.recv(100)) for _ in range(26)]
+    assert [sample.sequence for sample in samples] == list(range(26))
+    assert np.diff([sample.time_ns for sample in samples]) == pytest.approx(20_000_000)
+    assert samples[-1].displacement == pytest.approx((0.0, 0.0, 5e-3), abs=1e-9)
+    assert samples[-1].quaternion == pytest.approx(LEVEL)
+
+
+def test_the_command_refuses_what_it_cannot_send():
+    assert "no address" in refused(gough("stream-target", "--to", "nowhere"))
+    assert "no address" in refused(gough("stream-target", "--to", "127.0.0.1:99999"))
+    assert "rate" in refused(gough("stream-target", "--rate", 0))
+    assert "no target" in refused(gough("stream-target", "--target", "nothing"))

@@ -1,0 +1,99 @@
+"""Accuracy by Monte Carlo: the design's table, consistent covariances for every type, and the documented table of classes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.studies.accuracy import cells, draw_measurements, draw_poses, evaluate_accuracy, evaluate_classes, markdown
+from plant.errors import InputError
+from plant.mechanism import load_spatial
+
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "classes.md"
+TYPES = ["6-3-I", "6-3-II", "6-4-I", "6-4-II", "6-5", "hexapod"]
+
+
+def errors_of(accuracy):
+    return {estimator.label: errors for estimator, errors in accuracy.errors.items()}
+
+
+def test_the_table_of_the_design_is_reproduced():
+    """Design 5.3, RMS in mm and deg."""
+    found = errors_of(evaluate_accuracy(load_spatial("hexapod")))
+    expected = {
+        "paper, section 5: two legs + magnetic yaw": (6.28, 1.48),
+        "section 5, six legs + magnetic yaw": (1.31, 1.48),
+        "six legs alone": (0.386, 0.195),
+        "six legs + vertical": (0.374, 0.083),
+        "six legs + vertical, refined": (0.373, 0.078),
+    }
+    for label, figures in expected.items():
+        rms = (1e3 * found[label].position_rms, np.degrees(found[label].rotation_rms))
+        np.testing.assert_allclose(rms, figures, rtol=0.1, err_msg=label)
+
+
+@pytest.mark.parametrize("name", TYPES)
+def test_refined_poses_are_consistent_and_at_the_bound(name):
+    accuracy = evaluate_accuracy(load_spatial(name), 2000, seed=0)
+    least, greatest = accuracy.nees_bounds
+    assert least < 6.0 < greatest < 6.25
+    for estimator, errors in accuracy.errors.items():
+        if estimator.refine:
+            assert least < errors.nees < greatest, estimator.label
+            assert 0.95 < errors.position_over_bound < 1.05, estimator.label
+            assert 0.95 < errors.rotation_over_bound < 1.05, estimator.label
+            assert errors.solved == 1.0 or (name, estimator.method) == ("6-3-II", "legs")
+        else:
+            assert errors.position_over_bound > 0.97, estimator.label
+
+
+def test_seeds_settle_the_figures():
+    mechanism = load_spatial("6-4-I")
+    first, again, other = (evaluate_accuracy(mechanism, 50, seed).summary() for seed in (3, 3, 4))
+    assert first == again
+    assert first["errors"] != other["errors"]
+    with pytest.raises(InputError, match="poses"):
+        evaluate_accuracy(mechanism, 0)
+
+
+def test_measurements_have_the_sigmas_that_are_stated():
+    mechanism, random = load_spatial("hexapod"), np.random.default_rng(1)
+    positions, rotations = draw_poses(mechanism, 20_000, random)
+    exact = draw_measurements(mechanism, positions, rotations, random, 0.0)
+    noisy = draw_measurements(mechanism, positions, rotations, random, 1.0)
+    np.testing.assert_allclose(exact["normal"], rotations[:, :, 2], atol=1e-15)
+    np.testing.assert_allclose(exact["rotation"], rotations, atol=1e-15)
+    np.testing.assert_allclose(exact["up_in_platform"], rotations[:, 2], atol=1e-15)
+    vectors = positions[:, None] + np.einsum("nij,kj->nki", rotations, mechanism.platform_joints) - mechanism.base_joints
+    np.testing.assert_allclose(np.cross(exact["leg_directions"], vectors), 0.0, atol=1e-15)
+    for name in ("leg_directions", "up_in_platform", "normal"):
+        across = np.sum((noisy[name] - exact[name]) ** 2, axis=-1).mean() / 2.0
+        np.testing.assert_allclose(np.degrees(np.sqrt(across)), 0.05, rtol=0.03, err_msg=name)
+    turns = noisy["rotation"] @ np.swapaxes(rotations, 1, 2)
+    sines = 0.5 * np.stack([turns[:, 2, 1] - turns[:, 1, 2], turns[:, 0, 2] - turns[:, 2, 0], turns[:, 1, 0] - turns[:, 0, 1]])
+    np.testing.assert_allclose(np.degrees(sines.std(axis=1)), [0.05, 0.05, 1.5], rtol=0.03)
+    assert np.abs(positions - mechanism.home.position).max() == pytest.approx(0.05, rel=0.01)
+
+
+def test_in_every_class_gough_is_more_accurate_and_the_documented_table_is_what_the_command_prints():
+    classes = evaluate_classes()
+    assert len(classes) == 64
+    for row in classes:
+        if not row.label.startswith("planar"):
+            assert row.vertical_errors[0] < row.paper_errors[0], row.label
+            assert row.vertical_errors[1] < row.paper_errors[1], row.label
+            assert row.alone_needs.startswith(("any 4 legs", "4 legs")), row.label
+
+    lines = DOCUMENT.read_text(encoding="utf-8").splitlines()
+    documented = [line for line in lines if line.startswith(("| n-", "| planar"))]
+    assert len(markdown(classes).splitlines()) == 2 + len(documented)
+    for line, row in zip(documented, classes, strict=True):
+        for field, value in zip(line.strip("| ").split(" | "), cells(row), strict=True):
+            if " mm, " in value:
+                np.testing.assert_allclose(figures(field), figures(value), rtol=0.05, atol=0.011)
+            else:
+                assert field.strip("`").replace("\\|", "|") == value
+
+
+def figures(cell):
+    return [float(part.split()[0]) for part in cell.split(",")]

@@ -1,0 +1,58 @@
+"""The fault matrix: every reaction is the one that is specified, and the table in the docs is of these cases."""
+
+from pathlib import Path
+
+import pytest
+
+from controller.safety.watch import CAUSES, GO_ON, IMU_FROZEN, REACTIONS, STOP
+from hil.command_line import main
+from hil.studies.fault_matrix import CASES, HEADINGS, Case, run_matrix, table
+
+DOCS = Path(__file__).parents[3] / "docs" / "faults.md"
+
+
+@pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
+def test_the_reaction_is_the_specified_one(case):
+    (outcome,) = run_matrix(2, (case,))
+    assert outcome.findings == []
+    assert sum(outcome.reactions.values()) == 2
+    assert len(outcome.cycles) == (2 if case.expected else 0)
+
+
+@pytest.mark.parametrize(
+    ("case", "finding"),
+    [
+        (Case("frozen", IMU_FROZEN, STOP, 15, 2e-3, ("imu-frozen:2,at={at}",)), "ended for another cause: end of the motion"),
+        (Case("frozen", IMU_FROZEN, GO_ON, 3, 2e-3, ("imu-frozen:2,at={at}",)), "took 10 cycles, and 3 are allowed"),
+        (Case("frozen", IMU_FROZEN, GO_ON, 15, 1e-5, ("imu-frozen:2,at={at}",)), "mm off, and 0.01 are allowed"),
+        (Case("nothing", IMU_FROZEN, GO_ON, 15, 2e-3), "was not told"),
+    ],
+)
+def test_what_is_not_as_specified_is_found(case, finding):
+    (outcome,) = run_matrix(1, (case,))
+    assert any(finding in each for each in outcome.findings)
+
+
+def test_a_case_comes_out_the_same_every_time():
+    first, again = (run_matrix(2, CASES[3:4])[0].summary() for _ in range(2))
+    assert first == again
+
+
+def test_the_table_in_the_docs_is_of_these_cases():
+    lines = DOCS.read_text().splitlines()
+    rows = lines[lines.index(next(line for line in lines if line.startswith("| case"))) :]
+    assert rows[0] == "| " + " | ".join(HEADINGS) + " |"
+    told = {case.name: CAUSES[case.expected].text.format("k") if case.expected else "-" for case in CASES}
+    assert {row.split(" | ")[0][2:]: row.split(" | ")[1] for row in rows[2:]} == told
+    for case, row in zip(CASES, rows[2:], strict=True):
+        allowed = {REACTIONS[case.reaction], *(REACTIONS[CAUSES[each].reaction] for each in case.also)}
+        assert set(row.split(" | ")[2].split(", ")) <= allowed
+
+
+def test_the_command_prints_the_table_and_its_status_says_whether_all_is_well(capsys, tmp_path):
+    assert main(["faults", "--seeds", "1", "--only", "emergency", "--markdown", "--json", str(tmp_path / "x.json")]) == 0
+    assert "| an emergency stop is asked for | emergency stop | quick stop | 0, 0 |" in capsys.readouterr().out
+    assert (tmp_path / "x.json").exists()
+    assert main(["faults", "--only", "nothing like this"]) == 2
+    assert main(["faults", "--seeds", "0"]) == 2
+    assert table([]) == []

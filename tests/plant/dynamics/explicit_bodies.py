@@ -1,0 +1,207 @@
+"""A second derivation of the mechanism, body by body and by finite differences, that the plant must agree with.
+
+Every body has a mass, a place, an attitude and an inertia tensor; the leg frames are built from the angles of their
+universal joints. Velocities and accelerations are differences along a path of the platform, and the equations of motion
+are d'Alembert's principle with virtual displacements that are differences too. Nothing is shared with `plant.dynamics.spatial`.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from plant.pose import Array
+
+PlatformPath = Callable[[float], tuple[Array, Array]]
+"""Position (3,) and rotation (3, 3) of the platform against time [s]."""
+
+FIRST = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60.0
+SECOND = np.array([2.0, -27.0, 270.0, -490.0, 270.0, -27.0, 2.0]) / 180.0
+"""Central differences of sixth order over seven samples."""
+
+
+def derivatives(samples: Array, step: float) -> tuple[Array, Array]:
+    """First and second derivative at the middle of seven samples (7, ...)."""
+    return np.tensordot(FIRST, samples, 1) / step, np.tensordot(SECOND, samples, 1) / step**2
+
+
+def vector_of(skew: Array) -> Array:
+    """The vectors (..., 3) of the skew-symmetric parts of matrices (..., 3, 3)."""
+    s = (skew - np.swapaxes(skew, -1, -2)) / 2.0
+    return np.stack([s[..., 2, 1], s[..., 0, 2], s[..., 1, 0]], axis=-1)
+
+
+def leg_vectors(parameters: Mapping[str, Array], position: Array, rotation: Array) -> Array:
+    return position + parameters["platform_joints"] @ rotation.T - parameters["base_joints"]
+
+
+def leg_frames(parameters: Mapping[str, Array], position: Array, rotation: Array) -> Array:
+    """(6, 3, 3): R_joint Rx(a) Ry(b), with the angles a and b that put the z axis on the leg."""
+    frames = []
+    for axis, leg in zip(parameters["base_joint_axes"], leg_vectors(parameters, position, rotation), strict=True):
+        # Any joint frame with x along the first axis gives the same leg frame.
+        across = np.cross(axis, [0.36, -0.48, 0.8])
+        across /= np.linalg.norm(across)
+        joint = np.column_stack([axis, across, np.cross(axis, across)])
+        x, y, z = joint.T @ leg / np.linalg.norm(leg)
+        frames.append(joint @ Rotation.from_euler("XY", [np.arctan2(-y, z), np.arcsin(x)]).as_matrix())
+    return np.array(frames)
+
+
+def jacobian(parameters: Mapping[str, Array], position: Array, rotation: Array) -> Array:
+    """(6, 6): from the platform's twist to the rates of the lengths."""
+    directions = leg_vectors(parameters, position, rotation)
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.hstack([directions, np.cross(parameters["platform_joints"] @ rotation.T, directions)])
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """Platform, payload, six lower parts and six rods: places (14, 3), attitudes (14, 3, 3); and leg lengths (6,)."""
+
+    places: Array
+    attitudes: Array
+    lengths: Array
+
+
+def masses(p: Mapping[str, Array]) -> Array:
+    return np.hstack([p["platform.mass"], p["payload.mass"], np.full(6, p["leg.lower.mass"]), np.full(6, p["leg.upper.mass"])])
+
+
+def inertias(p: Mapping[str, Array]) -> Array:
+    """(14, 3, 3), each body's about its centre in its own frame."""
+    parts = [
+        np.diag([p[f"leg.{part}.inertia"], p[f"leg.{part}.inertia"], p[f"leg.{part}.axial_inertia"]])
+        for part in ("lower", "upper")
+    ]
+    return np.array([p["platform.inertia"], p["payload.inertia"], *[parts[0]] * 6, *[parts[1]] * 6])
+
+
+def bodies_at(p: Mapping[str, Array], position: Array, rotation: Array) -> Bodies:
+    legs = leg_vectors(p, position, rotation)
+    lengths = np.linalg.norm(legs, axis=1)
+    frames = leg_frames(p, position, rotation)
+    along = frames[:, :, 2]
+    places = [
+        [position + rotation @ p["platform.center_of_mass"], position + rotation @ p["payload.center_of_mass"]],
+        p["base_joints"] + p["leg.lower.center"] * along,
+        p["base_joints"] + legs - p["leg.upper.center"] * along,
+    ]
+    return Bodies(np.vstack(places), np.concatenate([[rotation, rotation], frames, frames]), lengths)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """First and second derivatives of the bodies: velocity, acceleration, angular velocity and acceleration (14, 3) in
+    {1}, and rates and accelerations of the leg lengths (6,).
+    """
+
+    velocity: Array
+    acceleration: Array
+    angular_velocity: Array
+    angular_acceleration: Array
+    length_rate: Array
+    length_acceleration: Array
+
+
+def motion_along(p: Mapping[str, Array], path: PlatformPath, step: float = 2e-3) -> Motion:
+    """The motion of all bodies at time 0 of a path of the platform."""
+    samples = [bodies_at(p, *path(i * step)) for i in range(-3, 4)]
+    velocity, acceleration = derivatives(np.array([b.places for b in samples]), step)
+    rate, rate_change = derivatives(np.array([b.attitudes for b in samples]), step)
+    back = np.swapaxes(samples[3].attitudes, 1, 2)
+    length_rate, length_acceleration = derivatives(np.array([b.lengths for b in samples]), step)
+    # R'' R^T = skew(alpha) + skew(omega)^2, and the square is symmetric.
+    return Motion(
+        velocity, acceleration, vector_of(rate @ back), vector_of(rate_change @ back), length_rate, length_acceleration
+    )
+
+
+def path_of(position: Array, rotation: Array, twist: Array) -> PlatformPath:
+    """The path through a pose with a constant twist (6,)."""
+
+    def path(t: float) -> tuple[Array, Array]:
+        return position + twist[:3] * t, Rotation.from_rotvec(twist[3:] * t).as_matrix() @ rotation
+
+    return path
+
+
+def reflected_mass(p: Mapping[str, Array]) -> float:
+    """Inertia of rotor and screw, as a mass that moves with the leg's length."""
+    return float(p["motor.rotor_inertia"] * (2.0 * pi / p["motor.screw_lead"]) ** 2)
+
+
+def _world_inertias(p: Mapping[str, Array], position: Array, rotation: Array) -> Array:
+    attitudes = bodies_at(p, position, rotation).attitudes
+    return attitudes @ inertias(p) @ np.swapaxes(attitudes, 1, 2)
+
+
+def virtual_motions(p: Mapping[str, Array], position: Array, rotation: Array) -> list[Motion]:
+    """The motions that belong to the six unit twists of the platform."""
+    return [motion_along(p, path_of(position, rotation, unit)) for unit in np.eye(6)]
+
+
+def inertia_matrix(p: Mapping[str, Array], position: Array, rotation: Array) -> Array:
+    """(6, 6): twice the kinetic energy as a form in the twist."""
+    tensors = _world_inertias(p, position, rotation)
+    motions = virtual_motions(p, position, rotation)
+    velocity = np.array([m.velocity for m in motions])
+    spin = np.array([m.angular_velocity for m in motions])
+    rate = np.array([m.length_rate for m in motions])
+    return (
+        np.einsum("aki,k,bki->ab", velocity, masses(p), velocity)
+        + np.einsum("aki,kij,bkj->ab", spin, tensors, spin)
+        + reflected_mass(p) * rate @ rate.T
+    )
+
+
+def bias_force(p: Mapping[str, Array], position: Array, rotation: Array, twist: Array) -> Array:
+    """The generalised force (6,) that gravity and a constant twist take: force and torque on the platform's origin."""
+    motion = motion_along(p, path_of(position, rotation, twist))
+    tensors = _world_inertias(p, position, rotation)
+    spin = np.einsum("kij,kj->ki", tensors, motion.angular_velocity)
+    torque = np.einsum("kij,kj->ki", tensors, motion.angular_acceleration) + np.cross(motion.angular_velocity, spin)
+    force = masses(p)[:, None] * (motion.acceleration - p["gravity"])
+    return np.array(
+        [
+            np.sum(force * virtual.velocity)
+            + np.sum(torque * virtual.angular_velocity)
+            + reflected_mass(p) * motion.length_acceleration @ virtual.length_rate
+            for virtual in virtual_motions(p, position, rotation)
+        ]
+    )
+
+
+def energies(p: Mapping[str, Array], position: Array, rotation: Array, twist: Array) -> tuple[float, float]:
+    """Kinetic and potential energy [J]."""
+    motion = motion_along(p, path_of(position, rotation, twist))
+    tensors = _world_inertias(p, position, rotation)
+    kinetic = (
+        masses(p) @ np.sum(motion.velocity**2, axis=1)
+        + np.einsum("ki,kij,kj->", motion.angular_velocity, tensors, motion.angular_velocity)
+        + reflected_mass(p) * np.sum(motion.length_rate**2)
+    ) / 2.0
+    return float(kinetic), float(-masses(p) @ bodies_at(p, position, rotation).places @ p["gravity"])
+
+
+def static_forces(p: Mapping[str, Array], position: Array, rotation: Array) -> Array:
+    """Forces (6,) [N] that the legs must push with to hold all weights, by the equilibrium of each body.
+
+    A leg bears its parts' weight across on the base joint and the platform joint like a beam on two supports, and the rod
+    slides on it, so that its weight along the leg comes on the platform.
+    """
+    legs = leg_vectors(p, position, rotation)
+    lengths = np.linalg.norm(legs, axis=1, keepdims=True)
+    along = legs / lengths
+    arms = p["platform_joints"] @ rotation.T
+    gravity_along = (along @ p["gravity"])[:, None] * along
+    lever = p["leg.lower.mass"] * p["leg.lower.center"] + p["leg.upper.mass"] * (lengths - p["leg.upper.center"])
+    on_joints = p["leg.upper.mass"] * gravity_along + lever / lengths * (p["gravity"] - gravity_along)
+    force, torque = on_joints.sum(axis=0), np.cross(arms, on_joints).sum(axis=0)
+    for body in ("platform", "payload"):
+        weight = p[f"{body}.mass"] * p["gravity"]
+        force = force + weight
+        torque = torque + np.cross(rotation @ p[f"{body}.center_of_mass"], weight)
+    return -np.linalg.solve(jacobian(p, position, rotation).T, np.hstack([force, torque]))

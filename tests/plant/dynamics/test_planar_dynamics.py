@@ -1,0 +1,283 @@
+"""The planar plant: equations of motion, energies, ideal IMU signals, conditions on its parameters, and its FMU."""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import pytest
+from numpy.random import Generator
+from numpy.typing import ArrayLike
+
+from plant.dynamics.planar import build_planar_dynamics
+from plant.dynamics.planar_variables import PLANAR
+from plant.dynamics.spatial import Dynamics
+from plant.dynamics.variables import BRAKE, OPEN, VELOCITY, Variable, checked_parameters
+from plant.errors import FmuError
+from plant.fmu.build import PLANAR_MODEL, SPATIAL_MODEL, Model, default_fmu
+from plant.fmu.plant import FmuPlant
+from plant.mechanism import Mechanism, load_in_space
+from plant.pose import Array
+from tests.plant.dynamics.explicit_bodies import derivatives, vector_of
+from tests.plant.dynamics.planar_bodies import (
+    LEGS,
+    Values,
+    bias_force,
+    coordinates,
+    frames_at,
+    inertia_matrix,
+    jacobian,
+    weight_force,
+)
+
+
+@pytest.fixture(scope="module")
+def dynamics() -> Dynamics:
+    return build_planar_dynamics()
+
+
+@pytest.fixture(scope="module")
+def rig() -> Mechanism:
+    return load_in_space("planar-3rpr")
+
+
+def flat(values: Mapping[str, Array], table: tuple[Variable, ...]) -> Array:
+    return np.concatenate([np.ravel(values[variable.name]) for variable in table])
+
+
+def named(vector: Array, table: tuple[Variable, ...]) -> Values:
+    ends = np.cumsum([variable.size for variable in table])
+    parts = np.split(np.array(vector).ravel(), ends[:-1])
+    return {variable.name: part.reshape(variable.shape) for variable, part in zip(table, parts, strict=True)}
+
+
+def odd_rig(rig: Mechanism, random: Generator) -> Values:
+    """Parameters without any symmetry, gravity and IMUs out of the plane included."""
+    p = dict(rig.plant_parameters())
+    p["base_joints"] = p["base_joints"] + random.normal(0.0, 0.02, (3, 2))
+    p["platform_joints"] = p["platform_joints"] + random.normal(0.0, 0.02, (3, 2))
+    for body in ("platform", "payload"):
+        p[f"{body}.center_of_mass"] = random.normal(0.0, 0.05, 2)
+        p[f"{body}.inertia"] = np.array(random.uniform(1e-3, 5e-3))
+    p["leg.lower.inertia"], p["leg.upper.inertia"] = random.uniform(1e-3, 5e-3, 2)
+    p["gravity"] = random.normal(0.0, 6.0, 3)
+    p["magnetic_field"] = random.normal(0.0, 30.0, 3)
+    p["leg_imu_position"] = random.normal(0.0, 0.05, (3, 3))
+    p["platform_imu_position"] = random.normal(0.0, 0.05, 3)
+    p["brake.stiffness"], p["brake.damping"], p["stop.stiffness"] = np.array(1e4), np.array(50.0), np.array(1e4)
+    return p
+
+
+def random_state(p: Values, random: Generator) -> tuple[Values, Values]:
+    states = {
+        "state.position": p["initial_position"] + random.normal(0.0, 0.03, 2),
+        "state.angle": p["initial_angle"] + random.normal(0.0, 0.2),
+        "state.velocity": random.normal(0.0, 0.3, 2),
+        "state.angular_velocity": np.array(random.normal(0.0, 3.0)),
+        "state.current": random.normal(0.0, 1.0, 3),
+        "state.brake_deflection": random.normal(0.0, 1e-4, 3),
+    }
+    inputs = {
+        "velocity_command": random.normal(0.0, 0.05, 3),
+        "drive_mode": random.permutation([OPEN, BRAKE, VELOCITY]),
+        "external_wrench.force": random.normal(0.0, 10.0, 2),
+        "external_wrench.torque": np.array(random.normal(0.0, 1.0)),
+    }
+    return states, inputs
+
+
+def axial_forces(p: Values, states: Values, inputs: Values, length: Array, speed: Array) -> dict[str, Array]:
+    """What motor, friction, brake and end stop push with along each leg [N]."""
+    below = np.maximum(p["stop.minimum_length"] - length, 0.0)
+    above = np.maximum(length - p["stop.maximum_length"], 0.0)
+    give = p["stop.damping"] * speed
+    return {
+        "drive": 2.0 * np.pi / p["motor.screw_lead"] * p["motor.torque_constant"] * states["state.current"],
+        "friction": -p["friction.viscous"] * speed - p["friction.coulomb"] * speed / np.hypot(speed, p["friction.velocity"]),
+        "brake": (
+            -p["brake.stiffness"] * states["state.brake_deflection"]
+            - (inputs["drive_mode"] == BRAKE) * p["brake.damping"] * speed
+        ),
+        "stop": p["stop.stiffness"] * (below * np.maximum(1.0 - give, 0.0) - above * np.maximum(1.0 + give, 0.0)),
+    }
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_motion_energies_and_powers_agree_with_explicit_bodies(dynamics: Dynamics, rig: Mechanism, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    p = odd_rig(rig, random)
+    states, inputs = random_state(p, random)
+    held = (flat(states, PLANAR.states), flat(inputs, PLANAR.inputs), dynamics.constants(flat(p, PLANAR.parameters)))
+    rates, outputs = named(dynamics.rates(*held), PLANAR.states), named(dynamics.outputs(*held), PLANAR.outputs)
+    q = np.append(states["state.position"], states["state.angle"])
+    rate = np.append(states["state.velocity"], states["state.angular_velocity"])
+    acceleration = np.append(rates["state.velocity"], rates["state.angular_velocity"])
+    length, to_lengths = coordinates(p, q)[-LEGS:], jacobian(p, q)[-LEGS:]
+    speed = to_lengths @ rate
+    forces = axial_forces(p, states, inputs, length, speed)
+    wrench = np.append(inputs["external_wrench.force"], inputs["external_wrench.torque"])
+    applied = wrench + weight_force(p, q) + to_lengths.T @ sum(forces.values(), np.zeros(LEGS))
+    inertia = inertia_matrix(p, q)
+    np.testing.assert_allclose(inertia @ acceleration + bias_force(p, q, rate), applied, rtol=0.0, atol=1e-8)
+
+    assert outputs["kinetic_energy"] == pytest.approx(0.5 * rate @ inertia @ rate, rel=1e-12)
+    np.testing.assert_allclose(outputs["leg_length"], length, rtol=1e-14)
+    np.testing.assert_allclose(outputs["leg_velocity"], speed, rtol=1e-12, atol=1e-14)
+    for source, force in forces.items():
+        assert outputs[f"power.{source}"] == pytest.approx(force @ speed, rel=1e-11, abs=1e-11)
+    assert outputs["power.external"] == pytest.approx(wrench @ rate, rel=1e-12)
+
+    def potential(q: Array) -> float:
+        moved = states | {"state.position": q[:2], "state.angle": q[2]}
+        return float(named(dynamics.outputs(flat(moved, PLANAR.states), *held[1:]), PLANAR.outputs)["potential_energy"])
+
+    step = 1e-3
+    gradient = [derivatives(np.array([potential(q + i * step * unit) for i in range(-3, 4)]), step)[0] for unit in np.eye(3)]
+    np.testing.assert_allclose(-np.array(gradient), weight_force(p, q), rtol=0.0, atol=1e-9)
+
+
+def integrator(dynamics: Dynamics, p: Values, step: float) -> Callable[[Array, Array], Array]:
+    """Steps of Runge and Kutta's method for states and inputs as flat vectors."""
+    constants = dynamics.constants(flat(p, PLANAR.parameters))
+
+    def advance(x: Array, u: Array) -> Array:
+        def rate(x: Array) -> Array:
+            return np.array(dynamics.rates(x, u, constants)).ravel()
+
+        k1 = rate(x)
+        k2 = rate(x + step / 2.0 * k1)
+        k3 = rate(x + step / 2.0 * k2)
+        k4 = rate(x + step * k3)
+        return x + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+
+    return advance
+
+
+def test_energy_changes_by_the_work_of_all_forces(dynamics: Dynamics, rig: Mechanism) -> None:
+    """0.3 s of sines as commands and a wrench, with brakes that fall in: Simpson's rule over every pair of steps."""
+    p = rig.plant_parameters()
+    constants, step = dynamics.constants(flat(p, PLANAR.parameters)), 5e-5
+    advance = integrator(dynamics, p, step)
+    x = np.array(dynamics.start(flat(p, PLANAR.parameters))).ravel()
+    sources = [f"power.{source}" for source in ("drive", "friction", "brake", "stop", "external")]
+    work = dict.fromkeys(sources, 0.0)
+    energies = []
+    for pair in range(3000):
+        t = 2.0 * step * pair
+        inputs = {
+            "velocity_command": 0.06 * np.sin(25.0 * t + np.arange(3)),
+            "drive_mode": np.full(3, BRAKE if 0.2 <= t < 0.25 else VELOCITY),
+            "external_wrench.force": 5.0 * np.sin([20.0 * t, 30.0 * t]),
+            "external_wrench.torque": np.array(0.1 * np.sin(40.0 * t)),
+        }
+        u = flat(inputs, PLANAR.inputs)
+        for sample, weight in enumerate((1.0, 4.0, 1.0)):
+            x = advance(x, u) if sample else x
+            outputs = named(dynamics.outputs(x, u, constants), PLANAR.outputs)
+            energies.append(float(outputs["kinetic_energy"] + outputs["potential_energy"]))
+            for source in sources:
+                work[source] += weight * step / 3.0 * float(outputs[source])
+    assert energies[-1] - energies[0] == pytest.approx(sum(work.values()), abs=1e-7)
+    assert min(abs(work[f"power.{source}"]) for source in ("drive", "friction", "brake", "external")) > 1e-3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_ideal_imu_signals_are_derivatives_of_the_trajectory(dynamics: Dynamics, rig: Mechanism, seed: int) -> None:
+    random = np.random.default_rng(50 + seed)
+    p = odd_rig(rig, random)
+    states, inputs = random_state(p, random)
+    inputs["drive_mode"][:] = VELOCITY
+    step = 2.5e-5
+    advance, u = integrator(dynamics, p, step), flat(inputs, PLANAR.inputs)
+    samples = [flat(states, PLANAR.states)]
+    for _ in range(200):
+        samples.append(advance(samples[-1], u))
+    poses = [named(x, PLANAR.states) for x in samples[-7:]]
+    found = [frames_at(p, pose["state.position"], float(pose["state.angle"])) for pose in poses]
+    attitudes, places = (np.array(values) for values in zip(*found, strict=True))
+    to_sensor = np.swapaxes(attitudes[3], 1, 2)
+    acceleration = derivatives(places, step)[1]
+    assert np.abs(acceleration).max() > 0.5
+    outputs = named(dynamics.outputs(samples[-4], u, dynamics.constants(flat(p, PLANAR.parameters))), PLANAR.outputs)
+    rate = vector_of(to_sensor @ derivatives(attitudes, step)[0])
+    force = np.einsum("kij,kj->ki", to_sensor, acceleration - p["gravity"])
+    np.testing.assert_allclose(outputs["imu_angular_velocity"], rate, rtol=0.0, atol=1e-7)
+    np.testing.assert_allclose(outputs["imu_specific_force"], force, rtol=0.0, atol=1e-5)
+    np.testing.assert_allclose(outputs["imu_magnetic_field"], to_sensor @ p["magnetic_field"], rtol=0.0, atol=1e-12)
+
+
+def test_the_start_is_the_initial_pose_at_rest(dynamics: Dynamics, rig: Mechanism) -> None:
+    start = named(dynamics.start(flat(rig.plant_parameters(), PLANAR.parameters)), PLANAR.states)
+    np.testing.assert_array_equal(start["state.position"], [0.1, 0.205])
+    assert start["state.angle"] == pytest.approx(-0.4, abs=1e-15)
+    for name in ("velocity", "angular_velocity", "current", "brake_deflection"):
+        assert not start[f"state.{name}"].any()
+
+
+def broken(dynamics: Dynamics, p: Values) -> list[str]:
+    """What the conditions on the parameters say."""
+    values, limits = (np.array(side).ravel() for side in dynamics.conditions(flat(p, PLANAR.parameters)))
+    told = zip(dynamics.condition_texts, values, limits, strict=True)
+    return [text % (value, limit) for text, value, limit in told if not value <= limit]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (
+            {"base_joints": [[0.0, 0.0], [0.1, 0.205], [0.3, 0.0]], "platform_joints": [[0.1, 0.0], [0.0, 0.0], [0.0, 0.1]]},
+            "leg 1 needs",
+        ),
+        ({"stop.minimum_length": [0.1, 0.1, 0.3]}, "stop.minimum_length of leg 2 is 0.3 m, beyond"),
+        ({"motor.inductance": 1e-4}, "motor, friction and brake"),
+        ({"friction.velocity": 1e-5}, "motor, friction and brake"),
+        ({"brake.release_time": 1e-5}, "brake.release_time"),
+        ({"stop.stiffness": 1e9}, "the end stops"),
+        ({"substep": 0.01}, "drive.current_time_constant"),
+    ],
+)
+def test_parameters_that_make_no_sense_together_are_told(
+    dynamics: Dynamics, rig: Mechanism, changes: dict[str, ArrayLike], said: str
+) -> None:
+    p = dict(rig.plant_parameters())
+    assert broken(dynamics, p) == []
+    assert any(said in text for text in broken(dynamics, p | checked_parameters(changes, PLANAR)))
+
+
+@pytest.mark.parametrize("model", [SPATIAL_MODEL, PLANAR_MODEL], ids=lambda model: model.identifier)
+def test_every_text_of_a_condition_tells_a_value_and_its_limit(model: Model) -> None:
+    """The FMU's C code gives just these two to `printf`."""
+    built = model.dynamics()
+    for texts, function in ((built.condition_texts, built.conditions), (built.limit_texts, built.limits)):
+        assert len(texts) == function.size1_out(0) == function.size1_out(1) > 0
+        for text in texts:
+            assert text.count("%g") == text.count("%") == 2, text
+
+
+def test_the_fmu_integrates_the_derived_rates(dynamics: Dynamics, rig: Mechanism) -> None:
+    """The C code, its layout and its Runge-Kutta steps against the same method in Python, for odd parameters."""
+    random = np.random.default_rng(5)
+    p = odd_rig(rig, random)
+    substep = float(p["substep"])
+    advance = integrator(dynamics, p, substep)
+    x = np.array(dynamics.start(flat(p, PLANAR.parameters))).ravel()
+    with FmuPlant(default_fmu(PLANAR_MODEL), p, 2 * substep) as plant:
+        for cycle in range(60):
+            inputs = {
+                "velocity_command": 0.05 * np.sin(0.3 * cycle + np.arange(3)),
+                "drive_mode": np.roll([VELOCITY, OPEN, BRAKE], cycle // 20),
+                "external_wrench.force": random.normal(0.0, 3.0, 2),
+                "external_wrench.torque": np.array(random.normal(0.0, 0.1)),
+            }
+            for name, value in inputs.items():
+                plant.set(name, value)
+            plant.step(2 * substep)
+            for _ in range(2):
+                x = advance(x, flat(inputs, PLANAR.inputs))
+            states = named(x, PLANAR.states)
+            for name in ("position", "angle", "velocity", "angular_velocity", "current"):
+                np.testing.assert_allclose(plant.get(name), states[f"state.{name}"], rtol=1e-10, atol=1e-12)
+
+
+def test_the_fmu_refuses_parameters_that_make_no_sense_together(rig: Mechanism) -> None:
+    p = rig.plant_parameters() | {"stop.minimum_length": np.full(3, 0.3)}
+    with pytest.raises(FmuError, match=r"stop\.minimum_length of leg 0 is 0.3 m, beyond its stop\.maximum_length of 0\.26"):
+        FmuPlant(default_fmu(PLANAR_MODEL), p, 1e-3)

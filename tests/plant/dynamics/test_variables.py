@@ -1,0 +1,69 @@
+"""The table of the plant's variables and the check of parameters against it."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from plant.dynamics.planar_variables import PLANAR
+from plant.dynamics.variables import DRIVE_MODES, INPUTS, OUTPUTS, PARAMETERS, STATES, checked_parameters
+from plant.errors import InputError, UnknownNameError
+
+BY_NAME = {variable.name: variable for variable in (*STATES, *INPUTS, *PARAMETERS, *OUTPUTS)}
+
+
+def test_every_variable_has_one_entry_with_unit_and_description() -> None:
+    table = (*STATES, *INPUTS, *PARAMETERS, *OUTPUTS)
+    assert len(BY_NAME) == len(table)
+    assert all(variable.unit and variable.description for variable in table)
+    assert {v.causality for v in STATES} == {"state"} and {v.causality for v in OUTPUTS} == {"output"}
+    assert {v.causality for v in INPUTS} == {"input"} and {v.causality for v in PARAMETERS} == {"parameter"}
+
+
+def test_payload_friction_and_gravity_are_what_may_change_during_a_run() -> None:
+    tunable = {v.name.split(".")[0] for v in PARAMETERS if v.tunable}
+    assert tunable == {"payload", "friction", "gravity"}
+    assert all(v.tunable for v in PARAMETERS if v.name.startswith(("payload.", "friction.", "gravity")))
+
+
+def test_both_plants_mean_the_same_by_a_name() -> None:
+    planar = (*PLANAR.states, *PLANAR.inputs, *PLANAR.parameters, *PLANAR.outputs)
+    shared = [(variable, BY_NAME[variable.name]) for variable in planar if variable.name in BY_NAME]
+    assert {variable.name for variable in planar} - set(BY_NAME) == {"state.angle", "initial_angle", "angle"}
+    for variable, other in shared:
+        for field in ("unit", "causality", "maximum", "nominal", "tunable", "discrete"):
+            assert getattr(variable, field) == getattr(other, field), variable.name
+        # Products of inertia, which a scalar has none of, may be negative.
+        assert variable.minimum == other.minimum or variable.name in ("platform.inertia", "payload.inertia"), variable.name
+
+
+def test_the_description_of_the_drive_mode_names_every_mode() -> None:
+    for value, name in DRIVE_MODES.items():
+        assert f"{value} {name}" in BY_NAME["drive_mode"].description
+
+
+def test_a_scalar_is_spread_over_the_legs() -> None:
+    checked = checked_parameters({"friction.coulomb": 12, "motor.resistance": [1, 2, 3, 4, 5, 6], "payload.mass": 0})
+    np.testing.assert_array_equal(checked["friction.coulomb"], np.full(6, 12.0))
+    np.testing.assert_array_equal(checked["motor.resistance"], np.arange(1.0, 7.0))
+    assert checked["payload.mass"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("values", "kind", "message"),
+    [
+        ({"platform.weight": 1.0}, UnknownNameError, "the plant has no parameter 'platform.weight'; it has base_joints, "),
+        ({"velocity_command": 0.0}, UnknownNameError, "no parameter 'velocity_command'"),
+        ({"platform.mass": -1.0}, InputError, "platform.mass is -1 kg; it must be 1e-09 to"),
+        ({"motor.resistance": [1, 1, 0, 1, 1, 1]}, InputError, "motor.resistance is 0 Ohm; it must be 1e-09 to"),
+        ({"platform.inertia": 1.0}, InputError, r"platform.inertia must have shape \(3, 3\), got \(\)"),
+        ({"friction.coulomb": [1.0] * 5}, InputError, r"friction.coulomb must have shape \(6,\), got \(5,\)"),
+        ({"gravity": [0.0, 0.0, np.nan]}, InputError, r"gravity\[2\] is nan"),
+        ({"substep": "short"}, InputError, "substep must be an array of numbers"),
+        ({"friction.coulomb": "much"}, InputError, "friction.coulomb must be an array of numbers"),
+        ({"substep": 1e-7}, InputError, "substep is 1e-07 s; it must be 1e-06 to"),
+    ],
+)
+def test_parameters_that_cannot_be_used_are_refused(values: dict[str, Any], kind: type[Exception], message: str) -> None:
+    with pytest.raises(kind, match=message):
+        checked_parameters(values)

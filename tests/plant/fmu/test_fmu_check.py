@@ -1,0 +1,26 @@
+"""Trying FMUs: those that keep what they promise, and those that fail or crash."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from plant.fmu.check import check_fmu
+from tests.plant.fmu.foreign import edited
+
+
+@pytest.mark.parametrize("fixture", ["foreign_fmu", "foreign_fmu_3"])
+def test_foreign_fmus_keep_their_promises(fixture: str, request: pytest.FixtureRequest) -> None:
+    assert [check.problems for check in check_fmu(request.getfixturevalue(fixture))] == [(), (), (), None]
+
+
+@pytest.mark.parametrize(
+    ("fault", "finding"), [(3, "a step failed: servo 3 is at 91.5 degrees after a while"), (99, "crashed with signal 11")]
+)
+def test_a_failure_and_a_crash_are_findings(foreign_fmu: Path, tmp_path: Path, fault: int, finding: str) -> None:
+    path = edited(foreign_fmu, tmp_path / "faulty.fmu", ('guid="{foreign}"', f'guid="{{fault {fault}}}"'))
+    checks = check_fmu(path)
+    assert [check.problems for check in checks[::3]] == [(), None]
+    for check in checks[1:3]:
+        assert check.problems is not None and len(check.problems) == 1
+        assert re.search(finding, check.problems[0])

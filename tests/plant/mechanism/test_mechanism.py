@@ -1,0 +1,502 @@
+"""Mechanisms: what a preset says, what two arrays are enough for, and what is refused."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
+
+from plant.dynamics.variables import PARAMETERS
+from plant.errors import InputError, UnknownNameError, UnreachableError
+from plant.mechanism import Limits, Mechanism, load_mechanism, load_spatial
+from plant.pose import Array, Pose
+
+BASE = [[0.3, -0.05, 0.0], [0.3, 0.05, 0.0], [-0.1, 0.28, 0.0], [-0.2, 0.23, 0.0], [-0.2, -0.23, 0.0], [-0.1, -0.28, 0.0]]
+PLATFORM = [
+    [0.13, -0.15, 0.0],
+    [0.13, 0.15, 0.0],
+    [0.06, 0.19, 0.0],
+    [-0.19, 0.04, 0.0],
+    [-0.19, -0.04, 0.0],
+    [0.06, -0.19, 0.0],
+]
+HOME = Pose(np.array([0.0, 0.0, 0.35]), np.eye(3))
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def lengths_at(mechanism: Mechanism, position: Array, rotation: Array) -> Array:
+    return np.linalg.norm(position + mechanism.platform_joints @ rotation.T - mechanism.base_joints, axis=1)
+
+
+def changed(rows: list[list[float]], row: int, value: list[float]) -> list[list[float]]:
+    return [value if i == row else old for i, old in enumerate(rows)]
+
+
+# ---- the preset ----
+
+
+def test_the_preset_has_the_geometry_of_the_reference(hexapod: Mechanism) -> None:
+    def polar(radius: float, degrees: list[float]) -> Array:
+        angles = np.radians(degrees)
+        return radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(6)])
+
+    np.testing.assert_allclose(hexapod.base_joints, polar(0.30, [-12, 12, 108, 132, 228, 252]), atol=1e-15)
+    np.testing.assert_allclose(hexapod.platform_joints, polar(0.20, [312, 48, 72, 168, 192, 288]), atol=1e-15)
+    np.testing.assert_array_equal(hexapod.up_in_base, [0.0, 0.0, 1.0])
+
+
+def test_the_preset_has_the_lengths_and_limits_of_the_reference(hexapod: Mechanism) -> None:
+    home, limits = hexapod.require_home(), hexapod.require_limits()
+    np.testing.assert_array_equal(home.position, [0.0, 0.0, 0.35])
+    np.testing.assert_array_equal(home.rotation, np.eye(3))
+    lengths = lengths_at(hexapod, home.position, home.rotation)
+    np.testing.assert_allclose(lengths, 0.394, atol=5e-4)
+    np.testing.assert_allclose(limits.stroke - lengths[:, None], np.tile([-0.06, 0.06], (6, 1)), atol=1e-15)
+    assert (limits.velocity, limits.acceleration, limits.jerk) == (0.25, 3.0, 60.0)
+
+
+def test_the_preset_reaches_what_the_reference_reaches(hexapod: Mechanism) -> None:
+    home, stroke = hexapod.require_home(), hexapod.require_limits().stroke
+
+    def reach(direction: Array, greatest: float) -> float:
+        """How far the platform goes along or about an axis until the first leg comes to its end."""
+
+        def room(amount: float) -> float:
+            turned = Rotation.from_rotvec(amount * direction[3:]).as_matrix()
+            lengths = lengths_at(hexapod, home.position + amount * direction[:3], turned)
+            return float(np.minimum(lengths - stroke[:, 0], stroke[:, 1] - lengths).min())
+
+        # No leg leaves its stroke and comes back before.
+        found = float(brentq(room, 0.0, greatest))
+        assert min(room(found * share) for share in np.linspace(0.0, 0.999, 200)) > 0.0
+        return found
+
+    axes = np.eye(6)
+
+    def either_way(axis: Array, greatest: float) -> float:
+        return min(reach(axis, greatest), reach(-axis, greatest))
+
+    assert either_way(axes[0], 0.15) == pytest.approx(0.117, abs=1e-3)
+    assert either_way(axes[1], 0.15) == pytest.approx(0.108, abs=1e-3)
+    assert reach(axes[2], 0.15) == pytest.approx(0.066, abs=1e-3)
+    assert reach(-axes[2], 0.15) == pytest.approx(0.069, abs=1e-3)
+    tilt = min(either_way(axes[3], 0.6), either_way(axes[4], 0.6))
+    np.testing.assert_allclose(np.degrees([tilt, either_way(axes[5], 0.8)]), [19.6, 31.4], atol=0.05)
+
+
+def test_the_preset_has_every_parameter_of_the_plant(hexapod: Mechanism) -> None:
+    parameters = hexapod.plant_parameters()
+    assert list(parameters) == [variable.name for variable in PARAMETERS]
+    assert {name: value.shape for name, value in parameters.items()} == {v.name: v.shape for v in PARAMETERS}
+    stroke = hexapod.require_limits().stroke
+    np.testing.assert_allclose(parameters["stop.minimum_length"], stroke[:, 0] - 0.002)
+    np.testing.assert_allclose(parameters["stop.maximum_length"], stroke[:, 1] + 0.002)
+    assert parameters["payload.mass"] == 10.0
+    np.testing.assert_array_equal(parameters["friction.coulomb"], np.full(6, 15.0))
+
+
+def test_the_plant_starts_at_the_pose_asked_for(hexapod: Mechanism) -> None:
+    start = Pose(np.array([0.01, 0.02, 0.36]), Rotation.from_rotvec([0.0, 0.0, 0.2]).as_matrix())
+    parameters = hexapod.plant_parameters(start)
+    np.testing.assert_array_equal(parameters["initial_position"], start.position)
+    np.testing.assert_allclose(parameters["initial_quaternion"], [np.cos(0.1), 0.0, 0.0, np.sin(0.1)], atol=1e-15)
+
+
+# ---- two arrays ----
+
+
+def random_legs(seed: int) -> tuple[Array, Array]:
+    """Joints anywhere on two discs, not flat, sometimes shared."""
+    random = np.random.default_rng(seed)
+    angles = np.sort(random.uniform(0.0, 2.0 * np.pi, 6))
+    ring = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(6)])
+    base = 0.3 * ring + random.normal(0.0, 0.02, (6, 3))
+    platform = 0.2 * ring + random.normal(0.0, 0.02, (6, 3))
+    if seed % 2:
+        platform[[1, 3, 5]] = platform[[0, 2, 4]]
+    return base, platform
+
+
+@given(seeds)
+def test_two_arrays_are_enough(seed: int) -> None:
+    base, platform = random_legs(seed)
+    mechanism = Mechanism.from_legs(base, platform)
+    np.testing.assert_array_equal(mechanism.base_joints, base)
+    np.testing.assert_array_equal(mechanism.platform_joints, platform)
+    assert mechanism.home is None and mechanism.limits is None
+    # The default axis is horizontal and across the leg.
+    np.testing.assert_allclose(np.linalg.norm(mechanism.base_joint_axes, axis=1), 1.0, atol=1e-14)
+    np.testing.assert_allclose(mechanism.base_joint_axes[:, 2], 0.0, atol=1e-14)
+    np.testing.assert_allclose(np.sum(mechanism.base_joint_axes * mechanism.home_directions, axis=1), 0.0, atol=1e-14)
+
+
+@given(seeds)
+def test_a_base_may_have_any_attitude(seed: int) -> None:
+    """The same mechanism in a turned frame {1}: directions of a given home turn with it, and frames stay frames."""
+    base, platform = random_legs(seed)
+    turn = Rotation.random(random_state=seed).as_matrix()
+    height = np.array([0.0, 0.0, 0.35])
+    level = Mechanism.from_legs(base, platform, home=Pose(height, np.eye(3)))
+    turned = Mechanism.from_legs(base @ turn.T, platform, up_in_base=turn[:, 2], home=Pose(turn @ height, turn))
+    np.testing.assert_allclose(turned.home_directions, level.home_directions @ turn.T, atol=1e-12)
+    np.testing.assert_allclose(turned.up_in_base, turn[:, 2], atol=1e-15)
+    falling = {"gravity": -9.81 * turn[:, 2]}
+    without_home = Mechanism.from_legs(base @ turn.T, platform, up_in_base=turn[:, 2], plant=falling)
+    for mechanism in (turned, without_home):
+        across = np.sum(mechanism.base_joint_axes * mechanism.home_directions, axis=1)
+        np.testing.assert_allclose(across, 0.0, atol=1e-12)
+
+
+@given(seeds)
+def test_joint_frames_are_rotations_with_z_nearest_the_home_direction(seed: int) -> None:
+    base, platform = random_legs(seed)
+    home = Pose(np.array([0.0, 0.0, 0.35]), np.eye(3))
+    default = Mechanism.from_legs(base, platform, home=home)
+    random = np.random.default_rng(seed)
+    axes = random.normal(size=(6, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    along = np.abs(np.sum(axes * default.home_directions, axis=1)) > 0.9
+    axes[along] = default.base_joint_axes[along]
+    mechanism = Mechanism.from_legs(base, platform, base_joint_axes=axes, home=home)
+    frames = mechanism.joint_rotations
+    np.testing.assert_allclose(frames @ np.swapaxes(frames, 1, 2), np.tile(np.eye(3), (6, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(frames), 1.0, atol=1e-12)
+    np.testing.assert_allclose(frames[:, :, 0], axes, atol=1e-12)
+    # Of all directions across the axis, z has the greatest component along the leg.
+    for angle in np.linspace(0.0, 2.0 * np.pi, 25):
+        other = np.cos(angle) * frames[:, :, 2] + np.sin(angle) * frames[:, :, 1]
+        dots = np.sum(other * mechanism.home_directions, axis=1)
+        assert (dots <= np.sum(frames[:, :, 2] * mechanism.home_directions, axis=1) + 1e-12).all()
+
+
+def test_upright_legs_have_a_first_axis_too() -> None:
+    mechanism = Mechanism.from_legs(BASE, BASE)
+    np.testing.assert_allclose(mechanism.home_directions, np.tile([0.0, 0.0, 1.0], (6, 1)), atol=1e-15)
+    np.testing.assert_array_equal(mechanism.base_joint_axes, np.tile([1.0, 0.0, 0.0], (6, 1)))
+
+
+def test_a_stroke_of_two_numbers_counts_from_home_and_of_twelve_is_absolute() -> None:
+    relative = Mechanism.from_legs(BASE, PLATFORM, home=HOME, limits={"stroke": (-0.05, 0.04)})
+    lengths = lengths_at(relative, HOME.position, HOME.rotation)
+    np.testing.assert_allclose(relative.require_limits().stroke, np.column_stack([lengths - 0.05, lengths + 0.04]))
+    rows = np.tile([0.3, 0.5], (6, 1))
+    absolute = Mechanism.from_legs(BASE, PLATFORM, limits={"stroke": rows, "velocity": 1})
+    np.testing.assert_array_equal(absolute.require_limits().stroke, rows)
+    assert absolute.require_limits().velocity == 1.0
+
+
+# ---- never changed ----
+
+
+def arrays_of(mechanism: Mechanism) -> dict[str, Array]:
+    home, limits = mechanism.require_home(), mechanism.require_limits()
+    return {
+        "base_joints": mechanism.base_joints,
+        "platform_joints": mechanism.platform_joints,
+        "base_joint_axes": mechanism.base_joint_axes,
+        "home_directions": mechanism.home_directions,
+        "up_in_base": mechanism.up_in_base,
+        "home.position": home.position,
+        "home.rotation": home.rotation,
+        "limits.stroke": limits.stroke,
+        "plant.gravity": mechanism.plant["gravity"],
+    }
+
+
+@pytest.mark.parametrize("name", list(arrays_of(load_mechanism("hexapod"))))
+def test_arrays_of_a_mechanism_are_read_only(name: str) -> None:
+    own = load_mechanism("hexapod")
+    with pytest.raises(ValueError, match="read-only"):
+        arrays_of(own)[name][...] = 0.0
+
+
+def test_a_mechanism_does_not_follow_the_arrays_it_was_made_from() -> None:
+    base = np.array(BASE)
+    mechanism = Mechanism.from_legs(base, PLATFORM)
+    base[:] = 0.0
+    np.testing.assert_array_equal(mechanism.base_joints, BASE)
+
+
+def test_fields_and_tables_of_a_mechanism_are_frozen(hexapod: Mechanism) -> None:
+    with pytest.raises(AttributeError):
+        hexapod.name = "other"  # type: ignore[misc]
+    with pytest.raises(AttributeError):
+        hexapod.require_limits().velocity = 1.0  # type: ignore[misc]
+    with pytest.raises(TypeError):
+        hexapod.plant["gravity"] = np.zeros(3)  # type: ignore[index]
+    with pytest.raises(TypeError):
+        hexapod.settings["control"]["hold"] = 0.0  # type: ignore[index]
+
+
+# ---- refusals ----
+
+
+@pytest.mark.parametrize(
+    ("base", "platform", "message"),
+    [
+        (BASE[:5], PLATFORM, r"base_joints must have shape \(6, 3\), got \(5, 3\)"),
+        (BASE, np.zeros((6, 2)), r"platform_joints must have shape \(6, 3\), got \(6, 2\)"),
+        (changed(BASE, 2, [0.0, np.nan, 0.0]), PLATFORM, r"base_joints\[2, 1\] is nan; it must be finite"),
+        (BASE, changed(PLATFORM, 4, [np.inf, 0.0, 0.0]), r"platform_joints\[4, 0\] is inf; it must be finite"),
+        ("six joints", PLATFORM, "base_joints must be an array of numbers .* got 'six joints'"),
+        ([[1.0], [2.0, 3.0]], PLATFORM, "base_joints must be an array of numbers"),
+        (changed(BASE, 3, BASE[1]), changed(PLATFORM, 3, PLATFORM[1]), "legs 1 and 3 coincide: .* move one of them"),
+        (np.outer(range(6), [1.0, 2.0, 3.0]), PLATFORM, "base joints all lie on one line"),
+        (BASE, np.outer(range(6), [0.1, 0.0, 0.1]), "platform joints all lie on one line"),
+    ],
+)
+def test_joints_that_cannot_be_used_are_refused(base: Any, platform: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Mechanism.from_legs(base, platform)
+
+
+REFLECTION = np.diag([1.0, 1.0, -1.0])
+ALONG = Mechanism.from_legs(BASE, PLATFORM, home=HOME).home_directions
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"up_in_base": [0.0, 0.0, 1.1]}, "up_in_base has length 1.1; it must be 1 within 0.001: normalise it"),
+        ({"up_in_base": [0.0, 1.0]}, r"up_in_base must have shape \(3,\)"),
+        ({"base_joint_axes": ALONG}, r"base_joint_axes\[\d\] lies within 8 deg of its leg .* turn the axis"),
+        ({"base_joint_axes": 2.0 * np.eye(6)[:, :3]}, r"base_joint_axes\[0\] has length 2"),
+        ({"base_joint_axes": np.ones(6)}, r"base_joint_axes must have shape \(6, 3\), got \(6,\)"),
+        ({"home": Pose(HOME.position, REFLECTION)}, "home.rotation is a reflection"),
+        ({"home": Pose(HOME.position, 1.01 * np.eye(3))}, "home.rotation is off orthogonal by 0.0201"),
+        ({"home": Pose(np.full(3, np.nan), np.eye(3))}, r"home.position\[0\] is nan"),
+        ({"home": Pose(np.array(BASE[2]) - PLATFORM[2], np.eye(3))}, "leg 2 has no length at home: move the home pose"),
+        ({"limits": {"velocity": 1.0}}, "the limits lack the stroke"),
+        ({"limits": {"stroke": [-0.1, 0.1]}}, "counts from the home lengths: give a home pose"),
+        ({"home": HOME, "limits": {"stroke": [0.06, -0.06]}}, "the stroke of leg 0 runs from .* 0 < least < greatest"),
+        ({"home": HOME, "limits": {"stroke": [-0.06, np.nan]}}, r"stroke\[.*1\] is nan"),
+        ({"limits": {"stroke": np.tile([-0.1, 0.5], (6, 1))}}, "the stroke of leg 0 runs from -0.1 m to 0.5 m"),
+        ({"home": HOME, "limits": {"stroke": [0.01, 0.06]}}, r"leg \d is 0.\d+ m long at home, outside its stroke"),
+        ({"limits": {"stroke": np.ones((3, 2))}}, r"stroke must have shape \(6, 2\), got \(3, 2\)"),
+        ({"home": HOME, "limits": {"stroke": [-0.1, 0.1], "velocity": 0.0}}, "limit of velocity is 0; it must be positive"),
+        ({"home": HOME, "limits": {"stroke": [-0.1, 0.1], "jerk": "fast"}}, "limit of jerk must be .* got 'fast'"),
+        ({"home": HOME, "limits": {"stroke": [-0.1, 0.1], "acceleration": np.inf}}, "acceleration is inf"),
+        ({"plant": {"platform.mass": 0.0}}, "platform.mass is 0 kg; it must be 1e-09 to"),
+        ({"plant": {"gravity": [0.0, -9.81]}}, r"gravity must have shape \(3,\)"),
+        ({"plant": {"gravity": [0.0, 0.1, -9.81]}}, r"gravity .* does not point against up_in_base .*: make them agree"),
+        ({"plant": {"gravity": [0.0, 0.0, 9.81]}}, "does not point against up_in_base"),
+        ({"plant": {"motor.lead": 0.005}}, "no parameter 'motor.lead'; it has base_joints"),
+    ],
+)
+def test_options_that_cannot_be_used_are_refused(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises((InputError, UnknownNameError), match=message):
+        Mechanism.from_legs(BASE, PLATFORM, **arguments)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"home": HOME, "limits": {"stroke": [-0.1, 0.1], "speed": 1.0}},
+        {"home": HOME, "limits": {"stroke": [[-0.1], [0.1, 0.2]]}},
+        {"plant": {"platform.inertia": [[1.0], [1.0, 2.0]]}},
+    ],
+)
+def test_unknown_limits_and_ragged_arrays_are_input_errors(arguments: dict[str, Any]) -> None:
+    with pytest.raises(InputError):
+        Mechanism.from_legs(BASE, PLATFORM, **arguments)
+
+
+def test_what_a_mechanism_lacks_is_named() -> None:
+    bare = Mechanism.from_legs(BASE, PLATFORM, name="bare")
+    with pytest.raises(InputError, match="'bare' has no home pose: give one"):
+        bare.require_home()
+    with pytest.raises(InputError, match="'bare' has no stroke: give one"):
+        bare.require_limits()
+    with pytest.raises(InputError, match="'bare' has no stroke"):
+        bare.check_lengths(np.full(6, 0.4), "home")
+    incomplete = Mechanism.from_legs(BASE, PLATFORM, home=HOME, limits={"stroke": [-0.1, 0.1]}, plant={"payload.mass": 1.0})
+    with pytest.raises(InputError, match=r"lacks plant parameters: platform\.mass, .*substep") as caught:
+        incomplete.plant_parameters()
+    assert "payload.mass" not in str(caught.value)
+
+
+def test_limits_do_not_accept_an_empty_stroke_on_their_own() -> None:
+    with pytest.raises(InputError, match=r"the stroke of leg 5 runs from 0.4 m to 0.4 m"):
+        Limits(np.vstack([np.tile([0.3, 0.5], (5, 1)), [0.4, 0.4]]))
+
+
+def test_lengths_outside_the_stroke_name_leg_and_excess(hexapod: Mechanism) -> None:
+    stroke = hexapod.require_limits().stroke
+    inside = np.array([stroke[:, 0], stroke.mean(axis=1), stroke[:, 1]])
+    hexapod.check_lengths(inside, "the target")
+    too_long, too_short = inside.copy(), inside.copy()
+    too_long[1, 4] = stroke[4, 1] + 0.0123
+    too_long[2, 1] = stroke[1, 1] + 0.0100
+    with pytest.raises(UnreachableError, match=r"the target needs leg 4 at 466\.\d\d mm, 12\.30 mm outside its stroke"):
+        hexapod.check_lengths(too_long, "the target")
+    too_short[0, 2] = stroke[2, 0] - 1e-4
+    with pytest.raises(UnreachableError, match=r"the end needs leg 2 at .*, 0\.10 mm outside .* choose a smaller motion"):
+        hexapod.check_lengths(too_short, "the end")
+
+
+# ---- files ----
+
+
+GOOD = f"""
+name = "mine"
+[geometry]
+base_joints = {BASE}
+platform_joints = {PLATFORM}
+up_in_base = [0.0, 0.6, 0.8]
+[home]
+position = [0.0, 0.0, 0.35]
+[limits]
+stroke = [-0.05, 0.05]
+[plant.platform]
+mass = 2.5
+[control]
+proportional = 30.0
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "mine.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_mechanism_is_loaded_from_a_file(tmp_path: Path) -> None:
+    mechanism = load_mechanism(write(tmp_path, GOOD))
+    assert mechanism.name == "mine"
+    np.testing.assert_array_equal(mechanism.base_joints, BASE)
+    np.testing.assert_allclose(mechanism.up_in_base, [0.0, 0.6, 0.8])
+    assert mechanism.plant["platform.mass"] == 2.5
+    assert mechanism.settings["control"] == {"proportional": 30.0}
+    np.testing.assert_allclose(np.ptp(mechanism.require_limits().stroke, axis=1), 0.1)
+
+
+def replaced(old: str, new: str) -> str:
+    assert old in GOOD
+    return GOOD.replace(old, new)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (replaced("[home]", "[home"), "mine.toml is not valid TOML: .*line"),
+        (replaced("[control]", "[kontrol]"), "unknown entry 'kontrol'; a mechanism has name, geometry, home, limits, plant"),
+        (replaced("[home]\n", "[home]\nattitude = 1\n"), r"\[home\] has no entry 'attitude'; it has position, quaternion"),
+        (replaced("stroke = ", "strokes = "), r"\[limits\] has no entry 'strokes'"),
+        (replaced("base_joints = ", "joints = "), r"\[geometry\] has no entry 'joints'"),
+        ("name = 'empty'", r"\[geometry\] lacks base_joints, an array of six rows"),
+        (f"[geometry]\nbase_joints = {BASE}", r"\[geometry\] lacks platform_joints"),
+        (replaced("[control]", "[home2]"), "unknown entry 'home2'"),
+        ("geometry = 3", "'geometry' must be a table"),
+        (replaced("[0.0, 0.0, 0.35]", "'here'"), "home.position must be an array of numbers .* got 'here'"),
+        (replaced("position = [0.0, 0.0, 0.35]", ""), r"home.position must be an array .* got None"),
+        (replaced("0.35]", "0.35]\nquaternion = [1.0, 0.1, 0.0, 0.0]"), "home.quaternion has length 1.00499; .* normalise it"),
+        (replaced("[0.0, 0.6, 0.8]", "[0.0, 0.6, 0.9]"), "up_in_base has length 1.08"),
+        (replaced("mass = 2.5", "mass = -2.5"), "platform.mass is -2.5 kg; it must be 1e-09 to"),
+        (replaced("mass = 2.5", "weight = 2.5"), "no parameter 'platform.weight'"),
+        (replaced("mass = 2.5", "mass = 'heavy'"), "platform.mass must be an array of numbers .* got 'heavy'"),
+    ],
+)
+def test_a_file_that_is_no_mechanism_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises((InputError, UnknownNameError), match=message) as caught:
+        load_mechanism(write(tmp_path, text))
+    assert "mine.toml" in str(caught.value)
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "binary.toml"
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match=r"cannot read .*binary.toml"):
+        load_mechanism(path)
+
+
+def test_an_unknown_preset_names_the_presets(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match=r"no mechanism 'hexapot': neither a preset .*hexapod.* nor a file"):
+        load_mechanism("hexapot")
+    with pytest.raises(UnknownNameError, match="nor a file"):
+        load_mechanism(tmp_path)
+
+
+# ---- based on a preset ----
+
+
+@pytest.fixture
+def presets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of presets with a good one, another based on it, and two based on each other."""
+    folder = tmp_path / "presets"
+    folder.mkdir()
+    stiffer = 'name = "stiffer"\nbased_on = "good"\n[control]\nintegral = 90.0\n[plant.payload]\nmass = 4.0\n'
+    for name, text in {"good": GOOD, "stiffer": stiffer, "egg": 'based_on = "hen"', "hen": 'based_on = "egg"'}.items():
+        (folder / f"{name}.toml").write_text(text)
+    monkeypatch.setattr("plant.mechanism._PRESETS", folder)
+    return folder
+
+
+def test_tables_are_laid_over_those_of_the_preset(tmp_path: Path, hexapod: Mechanism) -> None:
+    text = f'based_on = "hexapod"\n[geometry]\nbase_joints = {BASE}\n[plant.payload]\nmass = 4\n[control]\nhold = 0.5\n'
+    mechanism = load_mechanism(write(tmp_path, text))
+    np.testing.assert_array_equal(mechanism.base_joints, BASE)
+    np.testing.assert_array_equal(mechanism.platform_joints, hexapod.platform_joints)
+    lengths = lengths_at(mechanism, HOME.position, HOME.rotation)
+    np.testing.assert_allclose(mechanism.require_limits().stroke - lengths[:, None], np.tile([-0.06, 0.06], (6, 1)), atol=1e-15)
+    assert {name for name, value in hexapod.plant.items() if (mechanism.plant[name] != value).any()} == {"payload.mass"}
+    assert mechanism.settings["control"] == {**hexapod.settings["control"], "hold": 0.5}
+    assert mechanism.name == "custom"
+
+
+def test_a_preset_may_be_based_on_another(tmp_path: Path, presets: Path) -> None:
+    mechanism = load_mechanism(write(tmp_path, 'based_on = "stiffer"\n[plant.platform]\nmass = 3.0'))
+    np.testing.assert_array_equal(mechanism.base_joints, BASE)
+    assert mechanism.settings["control"] == {"proportional": 30.0, "integral": 90.0}
+    assert [mechanism.plant[f"{body}.mass"] for body in ("payload", "platform")] == [4.0, 3.0]
+    assert load_mechanism("stiffer").name == "stiffer"
+    assert load_mechanism("stiffer").plant["platform.mass"] == 2.5
+
+
+def test_only_presets_can_be_based_on(tmp_path: Path, presets: Path) -> None:
+    (tmp_path / "other.toml").write_text(GOOD)
+    message = r"mine.toml: based_on names no preset: .*; there are egg, good, hen, stiffer"
+    for base in ("'hexapod'", f"'{tmp_path / 'other.toml'}'", "3", "['good']"):
+        with pytest.raises(UnknownNameError, match=message):
+            load_mechanism(write(tmp_path, f"based_on = {base}"))
+
+
+def test_presets_based_on_each_other_are_refused(tmp_path: Path, presets: Path) -> None:
+    with pytest.raises(InputError, match="egg: based_on goes round in a circle, egg -> hen -> egg: leave one out"):
+        load_mechanism("egg")
+    with pytest.raises(InputError, match=r"circle, .*mine.toml -> hen -> egg -> hen"):
+        load_mechanism(write(tmp_path, "based_on = 'hen'"))
+
+
+def test_what_a_preset_has_as_a_table_must_stay_one(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="'limits' must be a table"):
+        load_mechanism(write(tmp_path, "based_on = 'hexapod'\nlimits = 3"))
+
+
+def test_a_built_mechanism_is_off_by_the_joint_error_and_shares_the_joints_it_shared() -> None:
+    nominal = load_spatial("hexapod")
+    moves = np.array(
+        [
+            np.stack([built.base_joints - nominal.base_joints, built.platform_joints - nominal.platform_joints])
+            for built in (nominal.built(1e-4, seed) for seed in range(50))
+        ]
+    )
+    assert 0.95e-4 < moves.std() < 1.05e-4
+    np.testing.assert_array_equal(nominal.built(1e-4, 3).base_joints, nominal.built(1e-4, 3).base_joints)
+    np.testing.assert_array_equal(nominal.built(0.0, 3).platform_joints, nominal.platform_joints)
+    for preset in ("6-3-I", "6-4-II", "6-5"):
+        shared = load_spatial(preset)
+        np.testing.assert_array_equal(shared.built(1e-4, 0).distinct_joints(), shared.distinct_joints())
+    with pytest.raises(InputError, match="the joint error is 100 mm; it must be at least 0 and below 30 mm"):
+        nominal.built(0.1, 0)
+
+
+def test_the_first_leg_with_the_same_joint_is_told() -> None:
+    base = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    platform = np.array([[0.5, 0.1 * k, 0.0] if k else [0.2, 0.0, 0.0] for k in range(6)])
+    mechanism = Mechanism.from_legs(base, platform)
+    assert mechanism.distinct_joints().tolist() == [[0, 0, 2, 3, 3, 5], [0, 1, 2, 3, 4, 5]]
