@@ -27,6 +27,7 @@ lint: .venv/installed-lint
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy --strict
+	$(BIN)/lint-imports
 
 clean:
 	rm -rf .venv build dist $(OUT) *.egg-info
