@@ -1,9 +1,9 @@
 """Rigs: what a loop reads and drives, behind one small interface.
 
-A rig is a simulated plant, an emulated rig in another process, a recording, or hardware. Once per cycle the loop *exchanges*:
-the commands of the cycle before go out, to take effect now, and what the sensors read now comes in. That is a SYNC on a CANopen
-bus, and one datagram in each direction on UDP. `hil.rigs.template` is a rig to start from, and `hil.rigs.contract` checks any
-rig.
+A rig is a simulated plant, an emulated rig in another process, a recording, or hardware. Once per cycle the loop *exchanges*
+data with it: the commands of the previous cycle go out and take effect at once, and the sensors' present readings come in. On
+a CANopen bus an exchange is a SYNC, on UDP it is one datagram in each direction. `hil.rigs.template` is a rig to start from,
+and `hil.rigs.contract` checks any rig.
 """
 
 from dataclasses import dataclass, field
@@ -25,8 +25,9 @@ __all__ = [
 ]  # fmt: skip
 
 ANSWERED, SILENT = 0, 1
-"""Statuses of an exchange: the feedback is of now; no sound sample has come in time, and the feedback is the last one, but for
-what drives may have said. Any other is a failure of the rig's own that ends the run on the brakes.
+"""Statuses of an exchange. `ANSWERED`: the feedback is new. `SILENT`: no valid sample has arrived in time, and the feedback
+still holds the last one, although the drives' states may be new. Any other status is a failure of the rig; it ends the run on
+the brakes.
 """
 
 FEEDBACK = np.dtype(
@@ -43,25 +44,29 @@ FEEDBACK = np.dtype(
     ],
     align=True,
 )
-"""What an exchange brings.
+"""The result of an exchange.
 
-Raw IMU data as everywhere: angular velocity [rad/s], specific force [m/s^2], magnetic field [uT] of the seven IMUs, NaN where
-there is none; the time of each IMU's sample on the rig's own clock [ns], and its number, which stands when a sample is
-repeated; what each drive says (`OFF`, `READY`, `FOLLOWING`, `QUICK_STOPPING`, `FAULTY`) and its own fault code; the velocities
-that were really sent, after rounding and limits [m/s]; the truth as the plant's `truth` buffer has it, NaN unless the rig is
-emulated; from the request to the answer [ns]; and how many frames or packets have been refused since the rig was opened.
+- `measurement`: angular velocity [rad/s], specific force [m/s^2] and magnetic field [uT] of the seven IMUs, raw; NaN without
+  an IMU.
+- `sample_ns`, `sequence`: time of each IMU's sample on the rig's own clock [ns], and its number. The number does not change
+  when a sample is repeated.
+- `drive`, `drive_code`: state of each drive (`OFF`, `READY`, `FOLLOWING`, `QUICK_STOPPING`, `FAULTY`), and its fault code.
+- `sent`: the velocities that were really sent, after rounding and limits [m/s].
+- `truth`: as the plant's `truth` buffer has it; NaN unless the rig is emulated.
+- `round_trip_ns`: from the request to the answer [ns].
+- `refused`: how many frames or packets the rig has refused since it was opened.
 """
 
 
 def new_feedback() -> Record:
-    """Feedback (dtype `FEEDBACK`) of a rig that has not said anything."""
+    """Feedback (dtype `FEEDBACK`) of a rig that has sent nothing yet."""
     feedback: Record = np.zeros((), FEEDBACK)
     feedback["measurement"], feedback["truth"], feedback["sequence"] = np.nan, np.nan, -1
     return feedback
 
 
 class RigError(GoughError, RuntimeError):
-    """A rig cannot be opened, is not what the configuration says, or cannot be armed; nothing has moved then."""
+    """A rig cannot be opened, differs from its configuration, or cannot be armed; nothing has moved then."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,7 @@ class Identity:
 
     Attributes:
         name: of the rig, for messages.
-        parts: its parts, such as drives and IMUs with their versions, for the record.
+        parts: its parts, such as drives and IMUs with their versions, for the recording.
     """
 
     name: str
@@ -81,45 +86,53 @@ class Rig(Protocol):
     """A rig. The order of calls is `open`, `identify`, `arm`, then `exchange` once per cycle, `quick_stop`, `close`.
 
     Attributes:
-        command_delay: from an exchange in which a sample is taken to the one by which the command computed from it takes effect
-            [s]: one period, on a bus.
+        command_delay: time from the exchange that takes a sample to the exchange at which the command computed from it takes
+            effect [s]; on a bus, one period.
 
-    A rig may also have `failure`, a text that tells why an exchange has failed.
+    A rig may also have an attribute `failure`: a text that says why an exchange has failed.
     """
 
     command_delay: float
 
     def open(self) -> None:
-        """Take hold of the bus and prepare the nodes; nothing moves and no brake opens.
+        """Open the bus and prepare the nodes. Nothing moves and no brake opens.
 
         Raises:
-            RigError: it cannot be reached.
+            RigError: the rig cannot be reached.
         """
 
     def identify(self) -> Identity:
-        """Ask every part who it is.
+        """Ask every part for its identity.
 
         Raises:
-            RigError: a part is missing, or another than the configuration says.
+            RigError: a part is missing, or differs from the configuration.
         """
 
     def arm(self) -> None:
-        """Make the drives ready to be asked for by an exchange; they stay on their brakes.
+        """Make the drives ready to be enabled by an exchange. They stay on their brakes.
 
         Raises:
-            RigError: a drive cannot be made ready, its own reason in the message.
+            RigError: a drive cannot be made ready; the message gives the drive's own reason.
         """
 
     def exchange(self, command: Array, request: int, feedback: Record) -> int:
-        """Send the commands (6,) [m/s] and what is asked of the drives (`BRAKED`, `ENABLED`, `QUICK_STOP`), and fill in the
-        `feedback` (dtype `FEEDBACK`); returns `ANSWERED`, `SILENT`, or a failure. It must return within the period, and
-        allocate as little as it can.
+        """Send the commands (6,) [m/s] and the request to the drives (`BRAKED`, `ENABLED`, `QUICK_STOP`), and fill in the
+        `feedback` (dtype `FEEDBACK`). Returns `ANSWERED`, `SILENT`, or a failure. It must return within the period, and
+        should allocate little memory.
         """
 
     def quick_stop(self) -> None:
-        """Stop all drives and let them hold, whatever has happened. It cannot raise, and may be called at any time, twice
-        too.
-        """
+        """Stop all drives and let them hold. It must not raise, and may be called at any time and repeatedly."""
 
     def close(self) -> None:
-        """Let go of the bus, the drives on their brakes. It cannot raise, and may be called twice."""
+        """Leave the drives on their brakes, and release the bus. It must not raise, and may be called twice."""
+
+
+METHODS = ("open", "identify", "arm", "exchange", "quick_stop", "close")
+"""The methods of a rig."""
+
+
+def missing_members(rig: object) -> list[str]:
+    """The methods and attributes of `Rig` that an object lacks; of a class, the methods."""
+    missing = [name for name in METHODS if not callable(getattr(rig, name, None))]
+    return missing if isinstance(rig, type) or hasattr(rig, "command_delay") else [*missing, "command_delay"]

@@ -56,7 +56,7 @@ from hil.realtime.scheduling import RealTimeSettings, real_time, since_process_s
 from hil.recording.mcap import events_of, record, repair, take
 from hil.recording.replay_rig import ReplayRig
 from hil.rigs import Rig
-from hil.rigs.contract import check_legs, python_rig
+from hil.rigs.by_name import check_legs, python_rig
 from hil.rigs.udp.rig import DEFAULT_ADDRESS, UdpRig, parse_address
 from hil.runs.simulation import PYTHON_RIG, SimulationConfig, prepared_loop
 from hil.runs.target_stream import HOST, PORT, open_socket, receive

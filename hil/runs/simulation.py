@@ -22,7 +22,7 @@ from controller.planning.target import Target, check_duration, load_target
 from controller.safety.watch import describe_end
 from controller.settings import control_settings, safety_settings, sensor_settings
 from hil.loop.driver import COMPUTED, RECORD, Loop, PythonFilters
-from hil.rigs.contract import check_legs
+from hil.rigs.by_name import check_legs
 from hil.runs.snapshot import Snapshot, resume_snapshot, take_snapshot
 from plant.compiled import Record
 from plant.dynamics.variables import PLATFORM_IMU
@@ -80,7 +80,7 @@ class SimulationConfig:
         joint_error: of each coordinate of the plant's joints, which the controller does not know: standard deviation [m].
         magnetometer: whether the platform's magnetometer gives its heading.
         rig: what is driven: the plant's FMU ("fmu"), a rig on a bus ("udp", "canopen"), a recording ("replay"), or a class in
-            Python, such as "python:my_rig:MyRig" (see `hil.rigs.contract.python_rig`).
+            Python, such as "python:my_rig:MyRig" (see `hil.rigs.by_name.python_rig`).
         rig_at: its address, its settings' file, or the recording's files with commas in between; None for its default.
         arm: whether the drives are asked for; else everything is read and nothing moves.
         raw_imus: whether the IMUs are known to be uncalibrated, so that their disagreement says nothing.

@@ -23,9 +23,10 @@ from hil.realtime.scheduling import RealTimeSettings
 from hil.recording.mcap import Recorder, read
 from hil.recording.replay_rig import ENDED, FAILED, ReplayRig
 from hil.rigs import ANSWERED, BRAKED, ENABLED, FOLLOWING, READY, SILENT, Identity, RigError, new_feedback
+from hil.rigs.by_name import python_rig
 from hil.rigs.canopen.rig import CanopenRig
 from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings
-from hil.rigs.contract import CLAUSES, check_rig, examine_rig, python_rig
+from hil.rigs.contract import CLAUSES, check_rig, examine_rig
 from hil.rigs.emulation.drives import new_emulated
 from hil.rigs.emulation.faults import fault
 from hil.rigs.template import TemplateRig
@@ -389,7 +390,7 @@ def test_a_rig_that_is_not_there_must_say_so():
     (text,) = check_rig(template, PERIOD, moving=False, absent=template)
     assert text == "A rig that is not there is opened and identified as if it were."
     (text,) = check_rig(template, PERIOD, moving=False, absent=lambda: CannotBeOpened(HEXAPOD, PERIOD, None))
-    assert "raises FileNotFoundError: /dev/ttyUSB0; a RigError is due" in text
+    assert "raises FileNotFoundError: /dev/ttyUSB0; it must raise a RigError" in text
 
 
 def test_what_is_no_rig():
@@ -566,16 +567,20 @@ def test_a_class_in_the_present_folder(tmp_path, monkeypatch):
     (tmp_path / "broken_rig.py").write_text("import no_such_library\n")
     (tmp_path / "worse_rig.py").write_text("1 / 0\n")
     for name, error, message in (
-        ("nothing", InputError, "'nothing' names no rig in Python: give module and class, such as python:my_rig:MyRig"),
-        ("own_rig:", InputError, "names no rig"),
-        (":Own", InputError, "names no rig"),
+        (
+            "nothing",
+            InputError,
+            "'nothing' is not the name of a rig in Python: give module and class, such as python:my_rig:MyRig",
+        ),
+        ("own_rig:", InputError, "is not the name of a rig"),
+        (":Own", InputError, "is not the name of a rig"),
         ("no_such_rig:Rig", UnknownNameError, "there is no module no_such_rig: start gough in its folder"),
         ("own_rig.deeper:Rig", UnknownNameError, "there is no module own_rig.deeper"),
         ("broken_rig:Rig", InputError, "module broken_rig cannot be imported: No module named 'no_such_library'"),
         ("worse_rig:Rig", InputError, "module worse_rig cannot be imported: ZeroDivisionError"),
         ("own_rig:Owm", UnknownNameError, "module own_rig has no class Owm; there is TemplateRig, Own"),
-        ("own_rig:something", InputError, "something of module own_rig is no class"),
-        ("own_rig:Half", InputError, "Half of module own_rig is no rig: it lacks identify, arm, quick_stop"),
+        ("own_rig:something", InputError, "something of module own_rig is not a class"),
+        ("own_rig:Half", InputError, "Half of module own_rig is not a rig: it lacks identify, arm, quick_stop"),
         ("own_rig:NoDelay", InputError, "it lacks command_delay"),
         ("own_rig:Greedy", InputError, "cannot be called with mechanism, period and rig_at: TypeError"),
         ("own_rig:Refuses", RigError, "no rig at there"),

@@ -26,10 +26,10 @@ from hil.rigs import (
     QUICK_STOPPING,
     READY,
     RigError,
-    datagrams,
     new_feedback,
 )
 from hil.rigs.canopen.settings import LARGEST_LOAD, canopen_settings
+from hil.rigs.udp import datagrams
 from hil.rigs.udp.datagrams import (
     COMMAND,
     COMMAND_DATAGRAM,

@@ -1,0 +1,427 @@
+"""The examiner: runs a rig through the clauses of `hil.rigs.contract`, call by call, and notes what it finds."""
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from hil.rigs import (
+    ANSWERED,
+    BRAKED,
+    ENABLED,
+    FAULTY,
+    FEEDBACK,
+    FOLLOWING,
+    QUICK_STOP,
+    QUICK_STOPPING,
+    READY,
+    SILENT,
+    Identity,
+    Rig,
+    RigError,
+    missing_members,
+    new_feedback,
+)  # fmt: skip
+from plant.compiled import Record
+from plant.dynamics.variables import IMU_COUNT
+from plant.errors import GoughError
+from plant.mechanism import LEGS
+from plant.pose import Array
+
+FOLLOWED_WITHIN = 20
+"""Exchanges within which the drives must do what is requested."""
+
+SENT_WITHIN = 2
+"""Exchanges within which the feedback must report a command as sent."""
+
+SPEED, STROKE_S = 1e-3, 0.2
+"""Speed of the moving legs [m/s], and duration of the motion each way [s]."""
+
+_ROUNDING = 1e-5
+_STANDSTILL_S = 0.5
+_MOST_SILENT = 0.1
+_STALE_S = 0.01
+_REST_FORCE, _REST_RATE = (5.0, 15.0), 0.5
+_CLOSED_WITHIN_S = 1.0
+_REQUESTS = ("to hold on their brakes", "to follow", "to stop quickly")
+_DRIVES = ("following", "ready", "not ready", "stopping quickly", "faulty")
+_GUARD, _GUARD_BYTES = 0xA5, 64
+
+
+@dataclass
+class Examination:
+    """The result of an examination.
+
+    Attributes:
+        findings: by clause, of the clauses that were checked.
+        exchange_us: durations of the exchanges, p50, p99 and max [us], and their number n.
+        identity: of the rig.
+    """
+
+    findings: dict[str, list[str]] = field(default_factory=dict)
+    exchange_us: dict[str, float] = field(default_factory=dict)
+    identity: Identity | None = None
+
+    def all_findings(self) -> list[str]:
+        """The findings of all clauses."""
+        return [text for each in self.findings.values() for text in each]
+
+
+class _BrokenOffError(Exception):
+    """The examination cannot go on; the reason is among the findings."""
+
+
+class Examiner:
+    """One examination; the arguments are those of `hil.rigs.contract.examine_rig`."""
+
+    def __init__(
+        self, make_rig: Callable[[], Rig], period: float, moving: bool, beyond: float | None, absent: Callable[[], Rig] | None
+    ) -> None:  # fmt: skip
+        self._make, self._period, self._moving, self._beyond, self._absent = make_rig, period, moving, beyond, absent
+        self._result = Examination()
+        self._noted: set[tuple[str, str]] = set()
+        self._rig: Rig = make_rig()
+        self._memory = np.full(FEEDBACK.itemsize + 2 * _GUARD_BYTES, _GUARD, np.uint8)
+        inner = self._memory[_GUARD_BYTES:-_GUARD_BYTES].view(FEEDBACK)
+        inner[0] = new_feedback()
+        self._feedback: Record = inner[0]
+        self._before: Record = new_feedback()
+        self._durations: list[int] = []
+        self._due = 0.0
+        self._statuses: dict[int, int] = {}
+        self._commands: list[Array] = []
+        self._age, self._stateless = np.zeros(IMU_COUNT, np.int64), np.zeros(LEGS, bool)
+
+    def examine(self) -> Examination:
+        """Check all clauses in order. In the end the drives are stopped and the rig is closed, whatever has happened."""
+        threads = set(threading.enumerate())
+        try:
+            self._check_interface()
+            for name in ("quick_stop", "close"):
+                self._call(name, "stops at any time", "before open ")
+            self._call("open", "opens")
+            self._identify()
+            if self._moving:
+                self._call("arm", "arms")
+            self._check_threads(threads, "run when it is open")
+            self._check_at_rest()
+            if self._moving:
+                self._check_moving()
+                for _ in range(2):
+                    self._call("quick_stop", "stops at any time", "while the drives are enabled ")
+                self._request(QUICK_STOP, np.zeros(LEGS), (QUICK_STOPPING, READY))
+                self._request(BRAKED, np.zeros(LEGS), (READY,))
+        except _BrokenOffError:
+            pass
+        finally:
+            self._stop()
+        with suppress(_BrokenOffError):
+            self._check_threads(threads, "are left when it is closed", _CLOSED_WITHIN_S)
+            self._sum_up()
+            if self._result.identity is not None:
+                self._open_again()
+            self._check_absent()
+        return self._result
+
+    # ------------------------------------------------------------------------------------------------------- findings
+
+    def _begin(self, *clauses: str) -> None:
+        for clause in clauses:
+            self._result.findings.setdefault(clause, [])
+
+    def _find(self, clause: str, text: str, kind: str = "") -> None:
+        """Note a finding; of each kind only the first is kept."""
+        self._begin(clause)
+        if (clause, kind or text) not in self._noted:
+            self._noted.add((clause, kind or text))
+            self._result.findings[clause].append(text)
+
+    def _call(self, name: str, clause: str, when: str = "") -> Any:
+        """Call a method of the rig. Any error is a finding, and ends the examination unless the method stops the rig."""
+        self._begin(clause)
+        try:
+            return getattr(self._rig, name)()
+        except Exception as error:
+            raised = f"{name} {when}raised {type(error).__name__}"
+            if name in ("quick_stop", "close"):
+                self._find(clause, f"{raised}: {error}; it must not raise anything.")
+                return None
+            if not isinstance(error, GoughError):
+                self._find(clause, f"{raised}: {error}; it must raise a RigError with a message.")
+            else:
+                self._find(clause, f"{name} refused: {error}" if str(error) else f"{raised} without a message.")
+            raise _BrokenOffError from None
+
+    # -------------------------------------------------------------------------------------------- before the exchanges
+
+    def _check_interface(self) -> None:
+        self._begin("interface")
+        missing = missing_members(self._rig)
+        if missing:
+            self._find("interface", f"It lacks {', '.join(missing)}.")
+            raise _BrokenOffError
+        delay = self._rig.command_delay
+        if not (isinstance(delay, int | float) and 0.0 <= delay <= 10.0 * self._period):
+            self._find("interface", f"Its command_delay is {delay!r}; it must be 0 to 10 periods [s], one on a bus.")
+
+    def _identify(self) -> None:
+        identity = self._call("identify", "identifies")
+        if not isinstance(identity, Identity) or not identity.name:
+            self._find("identifies", f"identify returned {identity!r}; it must return an Identity with a name.")
+            raise _BrokenOffError
+        self._result.identity = identity
+        if not all(isinstance(each, str) for pair in identity.parts.items() for each in pair):
+            self._find("identifies", "The identity's parts must be texts by name, for they are recorded.")
+
+    def _check_threads(self, before: set[threading.Thread], when: str, patience: float = 0.0) -> None:
+        self._begin("threads")
+        deadline = time.monotonic() + patience
+        while (more := [each for each in threading.enumerate() if each not in before]) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        if more:
+            self._find("threads", f"Threads {when} ({', '.join(each.name for each in more)}); they delay the loop: end them.")
+
+    # --------------------------------------------------------------------------------------------------- rest and motion
+
+    def _check_at_rest(self) -> None:
+        zero = np.zeros(LEGS)
+        self._restart()
+        count = max(FOLLOWED_WITHIN, round(_STANDSTILL_S / self._period))
+        for i in range(count):
+            self._exchange(zero, BRAKED)
+            if i == 0:
+                self._stateless = self._feedback["drive"] == FOLLOWING
+            if self._moving and i >= FOLLOWED_WITHIN and not self._are((READY,)):
+                self._find_wrong_drives(BRAKED, i + 1)
+        self._check_contents()
+        silent = self._statuses.get(SILENT, 0)
+        if silent > _MOST_SILENT * count:
+            self._find("exchanges", f"{silent} of {count} exchanges on the brakes brought no answer.")
+
+    def _check_moving(self) -> None:
+        zero, up = np.zeros(LEGS), np.full(LEGS, SPEED)
+        count = max(3, round(STROKE_S / self._period))
+        self._request(ENABLED, zero, (FOLLOWING,))
+        lengths = [self._feedback["truth"][7:13].copy()]
+        for command in (up, -up):
+            for _ in range(count):
+                self._exchange(command, ENABLED)
+            lengths.append(self._feedback["truth"][7:13].copy())
+        self._check_motion(lengths, count)
+        if self._beyond is not None:
+            self._check_limit(self._beyond)
+            self._exchange(np.full(LEGS, np.nan), ENABLED)
+        self._request(QUICK_STOP, zero, (QUICK_STOPPING, READY))
+        self._request(BRAKED, zero, (READY,))
+        self._request(ENABLED, zero, (FOLLOWING,))
+        self._exchange(up, ENABLED)
+
+    def _check_motion(self, lengths: list[Array], count: int) -> None:
+        """Check the lengths at the motion's start, turn and end. The mean of both ways cancels a drive's sag under load."""
+        start, turn, end = lengths
+        moved = 0.5 * ((turn - start) - (end - turn))
+        if not np.isfinite(moved).all():
+            return
+        self._begin("motion")
+        due = count * self._period * SPEED
+        for leg in np.flatnonzero(abs(moved - due) > 0.5 * due).tolist():
+            self._find(
+                "motion",
+                f"Leg {leg} moved by {1e3 * moved[leg]:.3f} mm, commanded were {1e3 * due:.3f} mm: check its sign and scale.",
+            )
+
+    def _check_limit(self, beyond: float) -> None:
+        most = 0.0
+        for command in (beyond, *[0.0] * SENT_WITHIN):
+            self._exchange(np.full(LEGS, command), ENABLED)
+            most = max(most, float(abs(self._feedback["sent"]).max()))
+        if most >= abs(beyond):
+            self._find("sent", f"A command of {beyond:g} m/s was sent as it is: limit it.")
+
+    def _request(self, request: int, command: Array, states: tuple[int, ...]) -> None:
+        """Request something of the drives, for as many exchanges as they may take to do it."""
+        self._begin("drives")
+        for _ in range(FOLLOWED_WITHIN):
+            self._exchange(command, request)
+        if not self._are(states):
+            self._find_wrong_drives(request, FOLLOWED_WITHIN)
+
+    def _are(self, states: tuple[int, ...]) -> bool:
+        """Whether the drives are in one of these states; a drive without states of its own always follows."""
+        return bool((np.isin(self._feedback["drive"], states) | self._stateless).all())
+
+    def _find_wrong_drives(self, request: int, count: int) -> None:
+        drives = self._feedback["drive"]
+        states = ", ".join(_DRIVES[state] if 0 <= state < len(_DRIVES) else str(state) for state in drives)
+        codes = ", ".join(f"{int(code):#x}" for code in self._feedback["drive_code"])
+        text = f"Asked {_REQUESTS[request]}, the drives are {states} after {count} exchanges (fault codes {codes})."
+        self._find("drives", text, str(request))
+        if (drives == FAULTY).any():
+            raise _BrokenOffError
+
+    # ------------------------------------------------------------------------------------------------------ exchanges
+
+    def _restart(self) -> None:
+        """Let the next exchange be due one period from now."""
+        self._due = time.monotonic() + self._period
+
+    def _exchange(self, command: Array, request: int) -> None:
+        """Run an exchange when it is due, and check what each exchange must keep."""
+        self._begin("exchanges", "feedback", "order in time", "sample age", "sent")
+        late = time.monotonic() - self._due
+        if late < 0.0:
+            time.sleep(-late)
+        elif late > self._period:
+            self._restart()
+        self._due += self._period
+        feedback, given = self._feedback, command.copy()
+        self._before[()] = feedback
+        began = time.perf_counter_ns()
+        try:
+            status = self._rig.exchange(given, request, feedback)
+        except Exception as error:
+            self._find("exchanges", f"exchange raised {type(error).__name__}: {error}; it must report a failure by its status.")
+            raise _BrokenOffError from None
+        self._durations.append(time.perf_counter_ns() - began)
+        if not isinstance(status, int | np.integer) or isinstance(status, bool) or status < 0:
+            self._find("exchanges", f"exchange returned {status!r}; it must return ANSWERED, SILENT, or a failure above.")
+            raise _BrokenOffError
+        self._statuses[int(status)] = self._statuses.get(int(status), 0) + 1
+        if status > SILENT:
+            text = getattr(self._rig, "failure", "")
+            at = len(self._durations)
+            self._find("exchanges", f"Exchange {at} failed with status {status}{f': {text}' if text else ''}.")
+            raise _BrokenOffError
+        if not np.array_equal(given, command, equal_nan=True):
+            self._find("exchanges", "exchange changed the commands; they belong to the loop.")
+        self._commands = [*self._commands[-SENT_WITHIN:], command if request == ENABLED else np.zeros(LEGS)]
+        self._check_layout()
+        self._check_order()
+        if status == ANSWERED:
+            self._check_sent()
+
+    def _check_layout(self) -> None:
+        if self._feedback.dtype != FEEDBACK:
+            self._find("feedback", "exchange changed the feedback's dtype.")
+            raise _BrokenOffError
+        if (self._memory[:_GUARD_BYTES] != _GUARD).any() or (self._memory[-_GUARD_BYTES:] != _GUARD).any():
+            self._find("feedback", "exchange wrote beyond the feedback into other memory.")
+            raise _BrokenOffError
+
+    def _check_order(self) -> None:
+        now, before, nth = self._feedback, self._before, len(self._durations)
+        for name, what in (("sequence", "number"), ("sample_ns", "time")):
+            for imu in np.flatnonzero(now[name] < before[name]).tolist():
+                values = f"{before[name][imu]}, {now[name][imu]}"
+                self._find("order in time", f"The {what} of IMU {imu}'s samples went back in exchange {nth}: {values}.", name)
+        fresh = now["sequence"] != before["sequence"]
+        for imu in np.flatnonzero(fresh & (now["sample_ns"] == before["sample_ns"]) & (before["sequence"] >= 0)).tolist():
+            self._find(
+                "order in time", f"IMU {imu} has a new sample with the time of the last, in exchange {nth}.", "same time"
+            )
+        if now["refused"] < before["refused"]:
+            self._find("order in time", f"The count of refused packets went back in exchange {nth}.", "refused")
+        self._age = np.where(fresh, 0, self._age + 1)
+        most = max(3, round(_STALE_S / self._period))
+        for imu in np.flatnonzero((self._age > most) & self._present()).tolist():
+            text = f"IMU {imu} has no new sample in {most + 1} exchanges: the loop would leave it out."
+            self._find("sample age", text, f"{imu}")
+
+    def _present(self) -> Any:
+        """Which IMUs have given readings."""
+        return np.isfinite(self._feedback["measurement"][:2]).any(axis=(0, 2))
+
+    def _check_sent(self) -> None:
+        sent = self._feedback["sent"]
+        if not np.isfinite(sent).all():
+            self._find("sent", f"What was sent is not finite: {sent.tolist()}.", "finite")
+            return
+        recent = np.array(self._commands)
+        steady = len(recent) > SENT_WITHIN and np.isfinite(recent).all() and np.ptp(recent, axis=0).max() == 0.0
+        if steady and abs(recent).max() <= SPEED:
+            drive = int(abs(sent - recent[-1]).argmax())
+            if abs(sent[drive] - recent[-1][drive]) > _ROUNDING:
+                self._find(
+                    "sent", f"Drive {drive} was commanded {recent[-1][drive]:g} m/s, and {sent[drive]:g} m/s is reported as "
+                    f"sent, after {len(recent)} exchanges.", f"{recent[-1][drive]}",
+                )  # fmt: skip
+
+    def _check_contents(self) -> None:
+        """Check the feedback's values after a while at rest."""
+        feedback = self._feedback
+        measurement, present = feedback["measurement"], self._present()
+        if not present.any():
+            self._find("feedback", "No IMU has given readings: the measurement is NaN.")
+        for imu in np.flatnonzero(present).tolist():
+            if not np.isfinite(measurement[:2, imu]).all():
+                self._find("feedback", f"IMU {imu} gives some axes that are not finite; NaN is for an IMU that is not there.")
+                continue
+            rate, force = (float(np.linalg.norm(measurement[kind, imu])) for kind in range(2))
+            if not _REST_FORCE[0] <= force <= _REST_FORCE[1]:
+                self._find("feedback", f"IMU {imu} reads {force:.3g} m/s^2 at rest instead of gravity: check its unit.")
+            if rate > _REST_RATE:
+                self._find("feedback", f"IMU {imu} reads {rate:.3g} rad/s at rest: check its unit.")
+            field = measurement[2, imu]
+            if np.isinf(field).any() or np.isnan(field).any() != np.isnan(field).all():
+                self._find("feedback", f"The magnetic field of IMU {imu} must be finite, or NaN on all axes.")
+            if feedback["sequence"][imu] < 0:
+                self._find("feedback", f"IMU {imu} has readings, but its samples have no number.")
+        if not np.isin(feedback["drive"], range(len(_DRIVES))).all():
+            states = feedback["drive"].tolist()
+            self._find("feedback", f"The drives' states are {states}; they must be 0 to {len(_DRIVES) - 1}.")
+        if feedback["round_trip_ns"] < 0:
+            self._find("feedback", f"The round trip is {feedback['round_trip_ns']} ns.")
+        pose = feedback["truth"][:13]
+        if np.isnan(pose).any() != np.isnan(pose).all() or np.isinf(pose).any():
+            self._find("feedback", "The truth must have position, quaternion and lengths, or be NaN where it is not known.")
+
+    # ------------------------------------------------------------------------------------------------------------ end
+
+    def _stop(self) -> None:
+        """Call quick stop and close, each twice and in any order."""
+        if missing_members(self._rig):
+            return
+        for name, when in (("quick_stop", ""), ("close", ""), ("close", "a second time "), ("quick_stop", "after close ")):
+            self._call(name, "stops at any time", when)
+
+    def _sum_up(self) -> None:
+        if not self._durations:
+            return
+        durations = np.array(self._durations) / 1e3
+        p50, p99 = (float(np.percentile(durations, share)) for share in (50, 99))
+        self._result.exchange_us = {"p50": p50, "p99": p99, "max": float(durations.max()), "n": len(durations)}
+        self._begin("period")
+        if p99 > 1e6 * self._period:
+            took = f"{p99 / 1e3:.3g} ms (p99 of {len(durations)})"
+            self._find("period", f"An exchange takes {took}, longer than the period of {1e3 * self._period:g} ms.")
+
+    def _open_again(self) -> None:
+        self._rig = self._make()
+        try:
+            self._call("open", "opens again")
+            self._call("identify", "opens again")
+        finally:
+            self._stop()
+
+    def _check_absent(self) -> None:
+        if self._absent is None:
+            return
+        self._begin("absent")
+        rig = self._absent()
+        try:
+            rig.open()
+            rig.identify()
+        except RigError as error:
+            if not str(error):
+                self._find("absent", "A rig that is not there raises a RigError without a message.")
+        except Exception as error:
+            self._find("absent", f"A rig that is not there raises {type(error).__name__}: {error}; it must raise a RigError.")
+        else:
+            self._find("absent", "A rig that is not there is opened and identified as if it were.")
+        finally:
+            with suppress(Exception):
+                rig.close()
