@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.safety.watch import CAUSES, STOP
-from hil.loop.driver import HEAD, RECORD, prevent_compilation, shared_array
+from hil.loop.driver import prevent_compilation
+from hil.loop.records import RECORD, Link, shared_array
 from hil.loop.timing import QUANTILES, Histogram, Timing, over_budget
 from hil.realtime.clock import REAL, finish, new_clock, now, start, wait
 from hil.realtime.scheduling import MEASURES, RealTimeSettings, real_time, usage
@@ -257,7 +258,7 @@ def _outcome(loop: PreparedLoop, cause: int, used: dict[str, float]) -> tuple[in
         raise GoughError(f"the loop stopped in the benchmark: {loop.reason()}")
     clock = loop.clock
     missed = {"own": int(clock["missed_own"]), "host": int(clock["missed_late"] + clock["missed_host"])}
-    return int(loop.link[HEAD]), missed, used
+    return int(loop.link[Link.HEAD]), missed, used
 
 
 @kernel

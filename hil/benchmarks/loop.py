@@ -14,7 +14,7 @@ import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
 
-from hil.loop.driver import COMPUTED, STAGES
+from hil.loop.records import COMPUTED, STAGES
 from hil.reports.page import LAYOUT, figure_html, page
 from hil.runs.simulation import SimulationConfig, simulate
 from plant.errors import InputError

@@ -48,7 +48,7 @@ from controller.estimation.readings import RATE, VELOCITY, readings_along, senso
 from controller.planning.target import REST_S
 from controller.safety.watch import watch_nothing
 from controller.settings import sensor_settings
-from hil.loop.driver import HEAD
+from hil.loop.records import Link
 from hil.recording.mcap import Recording, RecordingError, read
 from hil.runs.simulation import SimulationConfig, SimulationStoppedError, prepared_loop, simulate
 from plant.compiled import Record
@@ -248,7 +248,7 @@ def _run_open(config: SimulationConfig, blind: bool = False) -> Record:
         if blind:
             loop.parameters["droop"] = 0.0
         loop.run(len(loop.records))
-        return loop.records[: int(loop.link[HEAD])].copy()
+        return loop.records[: int(loop.link[Link.HEAD])].copy()
 
 
 @contextmanager

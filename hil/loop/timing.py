@@ -8,7 +8,7 @@ from importlib.resources import files
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.loop.driver import COMPUTED, STAGES, TO_COMMAND
+from hil.loop.records import COMPUTED, STAGES, TO_COMMAND
 from plant.compiled import Record
 
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}

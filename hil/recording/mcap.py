@@ -22,7 +22,7 @@ from mcap.writer import Writer
 from numpy.typing import NDArray
 
 from controller.safety.watch import CAUSES, EVENT_SLOTS, GO_ON, REACTIONS, describe_event
-from hil.loop.driver import DONE, HEAD, KEPT, RECORD, STAGES, START, SUPERVISOR, TAIL
+from hil.loop.records import RECORD, STAGES, Link
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import GoughError
@@ -192,35 +192,35 @@ def _saved(array: Record) -> bytes:
 def take(records: Record, link: NDArray[np.int64], tail: int) -> tuple[Record, int, int]:
     """Copy what the loop has written since record `tail`; returns it, the new tail, and how many were overwritten before."""
     capacity = len(records)
-    head = int(link[HEAD])
+    head = int(link[Link.HEAD])
     first = max(tail, head - capacity)
     taken = records[np.arange(first, head) % capacity]
     # What the loop has begun to write over meanwhile is not to be trusted.
-    sound = max(first, int(link[HEAD]) - capacity + 1)
+    sound = max(first, int(link[Link.HEAD]) - capacity + 1)
     return taken[max(sound - first, 0) :], head, min(sound, head) - tail
 
 
 def record(path: Path, header: Mapping[str, Any], records: Record, link: NDArray[np.int64]) -> None:
     """Take the loop's records to a file until it is done; the body of the recorder's process."""
-    supervisor = int(link[SUPERVISOR])
-    while not link[HEAD] and not link[DONE]:
+    supervisor = int(link[Link.SUPERVISOR])
+    while not link[Link.HEAD] and not link[Link.DONE]:
         time.sleep(_POLL_S)
         if os.getppid() != supervisor:
             return
-    recorder = Recorder(path, header, time.time_ns() - time.monotonic_ns() + int(link[START]))
-    tail, before = int(link[TAIL]), int(link[KEPT])
+    recorder = Recorder(path, header, time.time_ns() - time.monotonic_ns() + int(link[Link.START]))
+    tail, before = int(link[Link.TAIL]), int(link[Link.KEPT])
     count, flushed = 0, time.monotonic()
     while True:
-        done = bool(link[DONE]) or (os.getppid() != supervisor and _has_ended(link))
+        done = bool(link[Link.DONE]) or (os.getppid() != supervisor and _has_ended(link))
         taken, tail, lost = take(records, link, tail)
         if lost:
             recorder.tell(tail, f"{lost} cycles lost: the recorder came too late")
         recorder.write(taken)
         count += len(taken)
-        ended = done and tail == link[HEAD]
+        ended = done and tail == link[Link.HEAD]
         if ended or time.monotonic() - flushed > _CHUNK_S:
             recorder.flush()
-            link[KEPT], link[TAIL] = before + count, tail
+            link[Link.KEPT], link[Link.TAIL] = before + count, tail
             flushed = time.monotonic()
         if ended:
             break
@@ -230,9 +230,9 @@ def record(path: Path, header: Mapping[str, Any], records: Record, link: NDArray
 
 def _has_ended(link: NDArray[np.int64]) -> bool:
     """Whether the loop has stopped writing, when there is no supervisor any more to say so."""
-    head = int(link[HEAD])
+    head = int(link[Link.HEAD])
     time.sleep(1.0)
-    return head == int(link[HEAD])
+    return head == int(link[Link.HEAD])
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import numpy as np
 
 from controller.cycle import OK, PARAMETERS, STATE, cycle, prepare, skip
 from controller.safety.watch import RIG_FAILED, begin_stop, coast, hear
-from hil.loop.driver import RECORD
+from hil.loop.records import RECORD
 from hil.recording.mcap import RecordingError, read, total
 from hil.runs.simulation import STREAM_TARGET
 from plant.compiled import Record, kernel

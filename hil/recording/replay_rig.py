@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from controller.safety.watch import RIG_FAILED
-from hil.loop.driver import RECORD
+from hil.loop.records import RECORD
 from hil.recording.mcap import RecordingError, read, total
 from hil.rigs import ANSWERED, SILENT, Identity, RigError
 from plant.compiled import Record

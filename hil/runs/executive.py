@@ -3,7 +3,7 @@
     supervisor --fork--> loop       plant or rig, compiled cycle, SCHED_FIFO; writes into shared memory and never waits
                --fork--> recorder   takes the records to an MCAP file
 
-The three share two arrays, `records` and `link` (see `hil.loop.driver`). Whoever else dies, the recorder completes its file;
+The three share two arrays, `records` and `link` (see `hil.loop.records`). Whoever else dies, the recorder completes its file;
 when the recorder dies, another takes over with a file of its own; when the supervisor dies, the loop comes to a controlled
 stop.
 """
@@ -34,22 +34,8 @@ from controller.planning.stream import DONE as STREAM_DONE
 from controller.planning.stream import STREAM
 from controller.planning.stream_planner import StreamPlanner
 from controller.safety.watch import ASKED_TO_STOP, CAUSES, END_OF_MOTION, STOP_QUICKLY, describe_obstacle
-from hil.loop.driver import (
-    CONTROLLED,
-    DONE,
-    HEAD,
-    KEPT,
-    LINK,
-    QUICKLY,
-    RECORD,
-    STOP,
-    SUPERVISOR,
-    UDP_RIG,
-    Loop,
-    prevent_compilation,
-    shared_array,
-    stop_quickly,
-)
+from hil.loop.driver import Loop, prevent_compilation, stop_quickly
+from hil.loop.records import LINK_SIZE, RECORD, UDP_RIG, Link, StopRequest, shared_array
 from hil.loop.timing import Timing, over_budget
 from hil.realtime.clock import REAL, new_clock
 from hil.realtime.scheduling import RealTimeSettings, real_time, since_process_start, usage
@@ -188,8 +174,8 @@ def run(
     if config.fusion == "filterpy":
         raise InputError("the filters of filterpy are too slow for the clock: use them with 'gough simulate'")
     records = shared_array(max(_LEAST_RECORDS, round(_BUFFER_S * config.rate)), RECORD)
-    link: NDArray[np.int64] = shared_array(LINK, np.dtype(np.int64))
-    link[SUPERVISOR] = os.getpid()
+    link: NDArray[np.int64] = shared_array(LINK_SIZE, np.dtype(np.int64))
+    link[Link.SUPERVISOR] = os.getpid()
     progress = Progress()
     ours, theirs = _FORK.Pipe()
     recorders = _Recorders(recording, records, link, ours, progress.events)
@@ -213,7 +199,7 @@ def run(
             progress.unseen += unseen
             recorders.watch()
             show(progress)
-            if len(taken) or not link[STOP]:
+            if len(taken) or not link[Link.STOP]:
                 answered = time.monotonic()
             elif time.monotonic() - answered > _PATIENCE_S:
                 progress.events.append(
@@ -279,7 +265,7 @@ def _asked_to_stop(link: NDArray[np.int64]) -> Iterator[None]:
 
     def ask(number: int, frame: object) -> None:
         del frame
-        link[STOP] = max(int(link[STOP]), QUICKLY if number == signal.SIGQUIT else CONTROLLED)
+        link[Link.STOP] = max(int(link[Link.STOP]), StopRequest.QUICK if number == signal.SIGQUIT else StopRequest.CONTROLLED)
 
     numbers = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM)
     # What is ignored, as nohup has it, stays so.
@@ -323,7 +309,7 @@ def _prepared(
     """What the loop's process sends while it prepares; nothing moves yet, so it need not be let finish."""
     while not ours.poll(_LOOK_S) and loop.is_alive():
         show(progress)
-        if link[STOP]:
+        if link[Link.STOP]:
             loop.kill()
             raise RunStoppedError("asked to stop before anything has moved")
     return _received(ours, loop)
@@ -343,7 +329,7 @@ def _received(ours: Connection, loop: BaseProcess) -> Any:
 
 def _end(loop: BaseProcess, link: NDArray[np.int64], leftovers: list[Path | None]) -> None:
     """See the loop's process to its end, whatever has happened here, and remove what a crash has left."""
-    link[STOP] = max(int(link[STOP]), CONTROLLED)
+    link[Link.STOP] = max(int(link[Link.STOP]), StopRequest.CONTROLLED)
     loop.join(_PATIENCE_S)
     if loop.is_alive():
         loop.kill()
@@ -365,7 +351,7 @@ def _loop_process(pipe: Connection, supervisors: Connection, link: NDArray[np.in
         except GoughError as error:
             pipe.send(error)
         except Exception as error:
-            how = "stopped on the brakes" if link[HEAD] else "nothing has moved"
+            how = "stopped on the brakes" if link[Link.HEAD] else "nothing has moved"
             pipe.send(RunStoppedError(f"{how}: {type(error).__name__}: {error}"))
             raise
 
@@ -418,7 +404,7 @@ def _prepare_and_follow(
                 "obstacle": None if config.arm else describe_obstacle(loop.state),
                 "reason": ": ".join(filter(None, [loop.reason(), loop.failure or getattr(rig, "failure", "")])),
                 "cycle": int(loop.state["stop_cycle"]),
-                "cycles": int(link[HEAD]),
+                "cycles": int(link[Link.HEAD]),
                 "missed_late": int(loop.clock["missed_late"]),
                 "missed_own": int(loop.clock["missed_own"]),
                 "missed_host": int(loop.clock["missed_host"]),
@@ -468,7 +454,7 @@ class _Recorders:
     @property
     def lost(self) -> int:
         """Cycles that are in no file."""
-        return int(self._link[HEAD] - self._link[KEPT]) if self.files else 0
+        return int(self._link[Link.HEAD] - self._link[Link.KEPT]) if self.files else 0
 
     def start(self, header: dict[str, Any]) -> None:
         """Start the first recorder."""
@@ -505,7 +491,7 @@ class _Recorders:
 
     def finish(self) -> None:
         """Let the recorder write what is left, and complete the files of those that died."""
-        self._link[DONE] = 1
+        self._link[Link.DONE] = 1
         if self._process is not None:
             self._process.join(_PATIENCE_S)
             if self._process.is_alive():

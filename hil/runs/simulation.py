@@ -21,7 +21,8 @@ from controller.planning.stream import rest
 from controller.planning.target import Target, check_duration, load_target
 from controller.safety.watch import describe_end
 from controller.settings import control_settings, safety_settings, sensor_settings
-from hil.loop.driver import COMPUTED, RECORD, Loop, PythonFilters
+from hil.loop.driver import Loop, PythonFilters
+from hil.loop.records import COMPUTED, RECORD
 from hil.rigs.by_name import check_legs
 from hil.runs.snapshot import Snapshot, resume_snapshot, take_snapshot
 from plant.compiled import Record
@@ -166,7 +167,7 @@ class SimulationResult:
         config: what was simulated.
         mechanism, target, reference: what it was simulated with.
         times: (N,) [s]; 0 is the end of the hold.
-        records: (N,), dtype `hil.loop.driver.RECORD`.
+        records: (N,), dtype `hil.loop.records.RECORD`.
         reference_positions, reference_rotations: (N, 3) [m] and (N, 3, 3), the planned pose.
         target_positions, target_rotations: (N, 3) [m] and (N, 3, 3), the raw target.
         real_time_factor: simulated time over the time that planning and loop took.

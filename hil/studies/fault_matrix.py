@@ -49,8 +49,7 @@ from controller.safety.watch import (
     TARGET_LOST,
     TARGET_NOT_FINITE,
 )
-from hil.loop.driver import CONTROLLED, EMULATED_RIG, HEAD, QUICKLY, RECORD
-from hil.loop.driver import STOP as STOP_PLACE
+from hil.loop.records import EMULATED_RIG, RECORD, Link, StopRequest
 from hil.realtime.clock import SCRIPTED, new_clock
 from hil.rigs.emulation.drives import new_emulated, sample
 from hil.rigs.emulation.faults import fault
@@ -106,7 +105,7 @@ class Case:
 
 def _ask(how: int) -> Callable[[PreparedLoop], None]:
     def act(loop: PreparedLoop) -> None:
-        loop.link[STOP_PLACE] = how
+        loop.link[Link.STOP] = how
 
     return act
 
@@ -173,8 +172,8 @@ CASES = (
     Case("5 periods are missed", NO_CAUSE, GO_ON, 0, 3e-3, act=_miss(5)),
     Case("20 periods are missed", MISSED_PERIODS, STOP, 22, 15e-3, act=_miss(20)),
     Case("50 periods are missed", DRIVE_FAULT, STOP_QUICKLY, 52, 15e-3, act=_miss(50), also=(MISSED_PERIODS,)),
-    Case("a stop is asked for", ASKED_TO_STOP, STOP, 2, 2e-3, act=_ask(CONTROLLED)),
-    Case("an emergency stop is asked for", EMERGENCY_STOP, STOP_QUICKLY, 2, 5e-3, act=_ask(QUICKLY)),
+    Case("a stop is asked for", ASKED_TO_STOP, STOP, 2, 2e-3, act=_ask(StopRequest.CONTROLLED)),
+    Case("an emergency stop is asked for", EMERGENCY_STOP, STOP_QUICKLY, 2, 5e-3, act=_ask(StopRequest.QUICK)),
     Case("the target's stream stops", TARGET_LOST, STOP, 112, 2e-3, streamed="stops"),
     Case("the target's stream jumps", TARGET_JUMPS, STOP, 12, 2e-3, streamed="jumps"),
     Case("the target's stream turns NaN", TARGET_NOT_FINITE, STOP, 12, 2e-3, streamed="is not finite"),
@@ -324,7 +323,7 @@ def _follow_stream(loop: PreparedLoop, what: str, onset: int) -> None:
 def _judge(case: Case, seed: int, loop: PreparedLoop, cause: int, onset: int, outcome: Outcome) -> None:
     """Compare what has happened with what should have."""
     assert loop.emulator is not None
-    count, limits, period = int(loop.link[HEAD]), loop.mechanism.require_limits(), 1.0 / RATE_HZ
+    count, limits, period = int(loop.link[Link.HEAD]), loop.mechanism.require_limits(), 1.0 / RATE_HZ
     records, rig = loop.records[:count], loop.emulator.rig
     find = partial(_find, outcome, case, seed)
     moved = records[records["request"] != BRAKED]

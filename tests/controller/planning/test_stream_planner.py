@@ -28,7 +28,7 @@ from controller.planning.stream import (
 from controller.planning.stream_planner import StreamPlanner, TargetRefusedError
 from controller.planning.target import load_target
 from controller.safety.watch import BEYOND_STROKE, NO_CAUSE, TARGET_JUMPS, TARGET_LOST, TARGET_NOT_FINITE
-from hil.loop.driver import shared_array
+from hil.loop.records import shared_array
 from plant.errors import InputError, UnreachableError
 from plant.pose import quaternion_from_rotation
 

@@ -9,7 +9,7 @@ import pytest
 from hil.benchmarks.clock import BUSY, CONDITIONS, IDLE, LOAD, _figures_of_counts, gross_excess, measure_real_time
 from hil.benchmarks.loop import read_earlier, write_report
 from hil.command_line import main
-from hil.loop.driver import HEAD, LINK, RECORD
+from hil.loop.records import LINK_SIZE, RECORD, Link
 from hil.recording.mcap import take
 from plant.errors import InputError
 
@@ -87,12 +87,12 @@ def test_a_bench_of_no_time_is_refused(capsys):
 
 
 def test_what_was_overwritten_before_it_was_taken_is_counted():
-    records, link = np.zeros(8, RECORD), np.zeros(LINK, np.int64)
+    records, link = np.zeros(8, RECORD), np.zeros(LINK_SIZE, np.int64)
 
     def write(count):
         for _ in range(count):
-            records["cycle"][link[HEAD] % 8] = link[HEAD]
-            link[HEAD] += 1
+            records["cycle"][link[Link.HEAD] % 8] = link[Link.HEAD]
+            link[Link.HEAD] += 1
 
     write(5)
     taken, tail, lost = take(records, link, 0)

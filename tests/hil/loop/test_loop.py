@@ -5,7 +5,8 @@ import pytest
 
 from controller.cycle import OK, STATE, cycle, prepare, skip
 from controller.safety.watch import ASKED_TO_STOP, END_OF_MOTION, MISSED_PERIODS
-from hil.loop.driver import HEAD, RECORD, STAGES, STOP, FmuRig, Loop
+from hil.loop.driver import FmuRig, Loop
+from hil.loop.records import RECORD, STAGES, Link
 from hil.realtime.clock import REAL, SCRIPTED, new_clock
 from hil.runs.simulation import SimulationConfig, prepared_loop
 from plant.dynamics.variables import BRAKE
@@ -29,7 +30,7 @@ def scripted(loop, late=(), work=(), cpu=(), cycles=5000):
 
 
 def written(loop):
-    return loop.records[: int(loop.link[HEAD])]
+    return loop.records[: int(loop.link[Link.HEAD])]
 
 
 def replayed(loop, records):
@@ -189,14 +190,14 @@ def test_work_that_is_always_too_long_ends_in_a_controlled_stop():
 def test_asked_to_stop_it_does_in_motion_at_once_and_in_the_hold_without_moving():
     with prepared_loop(CONFIG) as loop:
         scripted(loop).run(1000)
-        loop.link[STOP] = 1
+        loop.link[Link.STOP] = 1
         cause, records = follow(loop)
         assert cause == ASKED_TO_STOP
         assert records["stop"].nonzero()[0][0] == 1000
         stops_within_limits(loop, records)
     with prepared_loop(CONFIG) as loop:
         scripted(loop).run(100)
-        loop.link[STOP] = 1
+        loop.link[Link.STOP] = 1
         cause, records = follow(loop)
         assert cause == ASKED_TO_STOP
         assert len(records) == 100
@@ -208,7 +209,7 @@ def test_records_go_round_and_the_head_goes_on():
         loop.records = loop.records[:128].copy()
         loop.run(1000)
         whole.run(1000)
-        assert loop.link[HEAD] == 1000
+        assert loop.link[Link.HEAD] == 1000
         for k in range(872, 1000):
             assert loop.records[k % 128]["cycle"] == k
             np.testing.assert_array_equal(loop.records[k % 128]["command"], whole.records[k]["command"])
@@ -222,7 +223,7 @@ def test_a_rig_in_python_runs_the_same_cycle_at_the_same_times():
         end = 1000
         assert compiled.follow(end) == END_OF_MOTION
         assert python.follow(end, FmuRig(python)) == END_OF_MOTION
-        assert compiled.link[HEAD] == python.link[HEAD]
+        assert compiled.link[Link.HEAD] == python.link[Link.HEAD]
         first, second = written(compiled), written(python)
         for name in set(first.dtype.names) - {"stage_ns"}:
             np.testing.assert_array_equal(first[name], second[name])

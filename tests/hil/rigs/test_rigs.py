@@ -18,7 +18,8 @@ import pytest
 
 from controller.safety.watch import END_OF_MOTION, RIG_FAILED
 from hil.command_line import main
-from hil.loop.driver import EMULATED_RIG, RECORD, FmuRig
+from hil.loop.driver import FmuRig
+from hil.loop.records import EMULATED_RIG, RECORD
 from hil.realtime.scheduling import RealTimeSettings
 from hil.recording.mcap import Recorder, read
 from hil.recording.replay_rig import ENDED, FAILED, ReplayRig

@@ -16,7 +16,7 @@ from controller.planning.stream import CAUSE, DONE, STREAM, TAKEN, TAKER, rest, 
 from controller.planning.stream_planner import StreamPlanner
 from controller.planning.target import load_target
 from controller.safety.watch import BEYOND_STROKE, NO_CAUSE, TARGET_JUMPS, TARGET_LOST, TARGET_NOT_FINITE
-from hil.loop.driver import shared_array
+from hil.loop.records import shared_array
 from hil.runs.target_stream import (
     DATAGRAM_BYTES,
     Faults,

@@ -1,0 +1,338 @@
+"""The compiled loop: wait for the clock, exchange with the rig, run the cycle, record."""
+
+from typing import Any
+
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from controller.cycle import OK, control, lose_pose, motion_cycle, prepare, skip
+from controller.estimation.fusion import (
+    calibrate,
+    find_pose,
+    fuse_heading,
+    fuse_legs,
+    fuse_mechanism,
+    fuse_platform,
+    improve_pose,
+    monitor_imus,
+)
+from controller.estimation.mechanism_filter import extrapolate_covariance
+from controller.least_squares import RANK_TOLERANCE, factor_cholesky, invert_cholesky
+from controller.planning.stream import stream_cause, take_plan
+from controller.safety.watch import (
+    ASKED_TO_STOP,
+    BRAKED,
+    CLOCK_FAILED,
+    EMERGENCY_STOP,
+    END_OF_MOTION,
+    EVENT_SLOTS,
+    FAULT,
+    MISSED_PERIODS,
+    REACTION,
+    RIG_FAILED,
+    SUPERVISOR_GONE,
+    coast,
+    has_stopped,
+    hear,
+    react,
+)
+from hil.loop.records import EMULATED_RIG, UDP_RIG, Link, RigHandle, Stage, StopRequest, TargetStream
+from hil.realtime.clock import FREE, REAL, finish, now, start, wait
+from hil.rigs import ANSWERED, SILENT
+from hil.rigs.udp.emulator import exchange_in_memory
+from hil.rigs.udp.rig import encode_command, exchange_udp, send_datagram
+from plant.compiled import Record, kernel, store_release
+from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
+from plant.fmu.plant import advance, read_imus, read_truth, write_command, write_drive_mode
+from plant.imu import measure
+from plant.mechanism import LEGS
+from plant.pose import Array
+
+_LOOK_NS = 100_000_000
+_SIGQUIT = 1 << 2
+_SIGNALS = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14
+"""SIGHUP, SIGINT, SIGQUIT and SIGTERM in a set of signals."""
+
+_getppid: Any = types.ExternalFunction("getppid", types.int32())
+_sigpending: Any = types.ExternalFunction("sigpending", types.int32(types.intp))
+
+
+@kernel
+def drive_fmu(calls: Record, command: Array, request: int, periods: int, period: float) -> int:
+    """Let the plant move with the command for so many periods; returns FMI's status."""
+    status = write_drive_mode(calls, BRAKE if request == BRAKED else VELOCITY)
+    if periods > 0:
+        status |= write_command(calls, command)
+    for _ in range(periods):
+        status |= advance(calls, period)
+    return status
+
+
+@kernel
+def read_fmu(calls: Record, imu: Record, command: Array, request: int, feedback: Record) -> int:
+    """Read the plant through the IMUs' imperfections; returns FMI's status."""
+    status = read_imus(calls) | read_truth(calls)
+    measure(imu, calls[()].imu, feedback.measurement)
+    feedback.truth[:] = calls[()].truth
+    for k in range(LEGS):
+        feedback.sent[k] = 0.0 if request == BRAKED else command[k]
+    for k in range(IMU_COUNT):
+        feedback.sequence[k] += 1
+        feedback.sample_ns[k] = np.int64(np.rint(1e9 * calls[()].time))
+    return status
+
+
+@kernel
+def exchange(rig: RigHandle, parameters: Record, state: Record, work: Record, timespec: NDArray[np.int64]) -> int:
+    """Send the commands of the cycle before, and read the sensors; returns the rig's status."""
+    s, w, period = state[()], work[()], parameters[()].period
+    t0 = t1 = now(timespec)
+    if rig.kind == UDP_RIG:
+        status = exchange_udp(rig.link, s.command, s.safety.request, w.feedback, timespec)
+    elif rig.kind == EMULATED_RIG:
+        at = int(np.rint(1e9 * period * s.cycle))
+        status = exchange_in_memory(rig.emulator, rig.link, s.command, s.safety.request, w.feedback, at)
+    else:
+        status = drive_fmu(rig.calls, s.command, s.safety.request, periods_passed(state), period)
+        t1 = now(timespec)
+        if status == 0:
+            status = read_fmu(rig.calls, rig.imu, s.command, s.safety.request, w.feedback)
+        status = exchange_status(status)
+    w.stage_ns[Stage.PLANT], w.stage_ns[Stage.SENSE] = t1 - t0, now(timespec) - t1
+    return status
+
+
+@kernel
+def hold_brakes(rig: RigHandle, parameters: Record, state: Record, work: Record, timespec: NDArray[np.int64]) -> None:
+    """At the end: the drives hold on their brakes."""
+    if rig.kind == UDP_RIG:
+        encode_command(rig.link, state[()].command, BRAKED, now(timespec))
+        send_datagram(rig.link.socket, rig.link.command_bytes, rig.link.command_bytes.size)
+    elif rig.kind == EMULATED_RIG:
+        at = int(np.rint(1e9 * parameters[()].period * state[()].cycle))
+        exchange_in_memory(rig.emulator, rig.link, state[()].command, BRAKED, work[()].feedback, at)
+    else:
+        write_drive_mode(rig.calls, BRAKE)
+
+
+@kernel
+def exchange_status(status: int) -> int:
+    """FMI's status as that of an exchange."""
+    return SILENT + status if status != 0 else ANSWERED
+
+
+@kernel
+def periods_passed(state: Record) -> int:
+    """How many periods have passed since the last exchange; none before the first."""
+    s = state[()]
+    return 1 + s.missed if s.cycle > 0 else 0
+
+
+@kernel
+def begin_cycle(
+    parameters: Record, state: Record, clock: Record, script: NDArray[np.int64], link: NDArray[np.int64], work: Record,
+    streamed: TargetStream, most_missed: int, end: int,
+) -> int:  # fmt: skip
+    """Wait for the next period, take note of missed ones, and stop where that is due; returns the cause if the run has
+    ended.
+    """
+    c, s, w = clock[()], state[()], work[()]
+    if c.cycles == 0:
+        start(clock)
+    missed = wait(clock, script)
+    w.asked = OK
+    if missed < 0:
+        _ask(work, CLOCK_FAILED)
+        missed = 0
+    skip(state, missed)
+    w.cycle = s.cycle
+    w.stage_ns[:] = 0
+    if s.cycle - s.safety.waited >= end:
+        _ask(work, END_OF_MOTION)
+    if c.mode == REAL and c.cycles % max(_LOOK_NS // c.period, 1) == 0:
+        signals = w.signals
+        if _sigpending(signals.ctypes.data) == 0 and signals[0] & _SIGNALS != 0:
+            _ask(work, ASKED_TO_STOP if signals[0] & _SIGQUIT == 0 else EMERGENCY_STOP)
+        if link[Link.SUPERVISOR] != 0 and _getppid() != link[Link.SUPERVISOR]:
+            _ask(work, SUPERVISOR_GONE)
+    if c.in_a_row >= most_missed:
+        _ask(work, MISSED_PERIODS)
+    if link[Link.STOP] != 0:
+        _ask(work, ASKED_TO_STOP if link[Link.STOP] == StopRequest.CONTROLLED else EMERGENCY_STOP)
+    leg, value, limit = -1, np.nan, np.nan
+    if streamed.active != 0 and s.stopping == 0 and w.asked == OK:
+        cause, leg, value, limit = stream_cause(streamed.stream, c.woke, streamed.patience_ns)
+        _ask(work, cause)
+    if w.asked == MISSED_PERIODS:
+        value, limit = float(c.in_a_row), float(most_missed)
+    if w.asked != OK:
+        react(parameters, state, w.asked, leg, value, limit)
+    return int(s.stopping) if has_stopped(state) else OK
+
+
+@kernel
+def _ask(work: Record, cause: int) -> None:
+    """Ask for a reaction; of several causes the gravest counts, and of the same gravity the last."""
+    if REACTION[cause] >= REACTION[work[()].asked]:
+        work[()].asked = cause
+
+
+@kernel
+def process_feedback(parameters: Record, state: Record, work: Record, status: int) -> int:
+    """After an exchange: note what is new, and react to what the rig has said; returns a cause if the cycle cannot be
+    computed.
+    """
+    w = work[()]
+    feedback = w.feedback
+    w.silent = w.silent + 1 + state[()].missed if status == SILENT else 0
+    for k in range(IMU_COUNT):
+        fresh = feedback.sequence[k] != w.sequence[k]
+        w.sample_age[k] = 0 if fresh else w.sample_age[k] + 1 + state[()].missed
+        w.sequence[k] = feedback.sequence[k]
+    if status != ANSWERED and status != SILENT:
+        react(parameters, state, RIG_FAILED, -1, status, np.nan)
+        coast(parameters, state)
+        return RIG_FAILED
+    hear(parameters, state, w.sample_age, feedback.drive, w.silent)
+    return OK
+
+
+@kernel
+def compute(parameters: Record, state: Record, segments: Array, work: Record, timespec: NDArray[np.int64]) -> int:
+    """The steps of `controller.cycle.cycle`, with the clock read in between."""
+    measurement, stage_ns = work[()].feedback.measurement, work[()].stage_ns
+    if state[()].safety.mode == FAULT:
+        coast(parameters, state)
+        return OK
+    t0 = now(timespec)
+    calibrate(parameters, state, measurement)
+    fuse_legs(parameters, state)
+    t1 = now(timespec)
+    fuse_platform(parameters, state)
+    fuse_heading(parameters, state)
+    stage_ns[Stage.LEGS], stage_ns[Stage.PLATFORM] = t1 - t0, now(timespec) - t1
+    return locate_and_control(parameters, state, segments, work, timespec)
+
+
+@kernel
+def locate_and_control(parameters: Record, state: Record, segments: Array, work: Record, timespec: NDArray[np.int64]) -> int:
+    """The steps from the filtered samples to the commands, with the clock read in between."""
+    stage_ns = work[()].stage_ns
+    t0 = now(timespec)
+    conditioning = find_pose(parameters, state)
+    t1 = now(timespec)
+    found = conditioning >= RANK_TOLERANCE and improve_pose(parameters, state)
+    if found:
+        monitor_imus(parameters, state)
+    t2 = now(timespec)
+    known = fuse_mechanism(parameters, state, found)
+    t3 = now(timespec)
+    cause = control(parameters, state, segments) if known else lose_pose(parameters, state)
+    t4 = now(timespec)
+    stage_ns[Stage.POSE], stage_ns[Stage.REFINEMENT], stage_ns[Stage.MECHANISM], stage_ns[Stage.CONTROL] = (
+        t1 - t0,
+        t2 - t1,
+        t3 - t2,
+        t4 - t3,
+    )
+    return cause
+
+
+@kernel
+def record_cycle(
+    parameters: Record, state: Record, segments: Array, records: Record, clock: Record, link: NDArray[np.int64], work: Record,
+    streamed: TargetStream, failed: int,
+) -> None:  # fmt: skip
+    """After the command: record the cycle, and prepare the next reference."""
+    p, s, c, w = parameters[()], state[()], clock[()], work[()]
+    began = now(c.timespec)
+    head = link[Link.HEAD]
+    record = records[head % records.shape[0]]
+    record.cycle = w.cycle
+    record.time_ns = c.woke - c.start if c.mode != FREE else np.int64(np.rint(1e9 * p.period * w.cycle))
+    record.late_ns = c.late
+    record.missed = s.missed
+    record.status = failed
+    record.stop = s.stopping
+    record.asked = w.asked
+    record.mode, record.request = s.safety.mode, s.safety.request
+    record.silent = w.silent
+    record.drive[:] = w.feedback.drive
+    record.drive_code[:] = w.feedback.drive_code
+    record.sample_age[:] = w.sample_age
+    record.sample_ns[:] = w.feedback.sample_ns
+    record.round_trip_ns, record.refused = w.feedback.round_trip_ns, w.feedback.refused
+    record.sent[:] = w.feedback.sent
+    record.event_count = s.safety.event_count
+    for i in range(EVENT_SLOTS):
+        told = i < s.safety.event_count
+        record.event_cause[i] = s.safety.event_cause[i] if told else 0
+        record.event_index[i] = s.safety.event_index[i] if told else 0
+        record.event_value[i] = s.safety.event_value[i] if told else 0.0
+        record.event_limit[i] = s.safety.event_limit[i] if told else 0.0
+    record.imus = s.heading_used << IMU_COUNT
+    for k in range(IMU_COUNT):
+        record.imus |= s.imu_used[k] << k
+    record.trusted = s.filter_trusted
+    record.angular_velocity[:] = w.feedback.measurement[0]
+    record.specific_force[:] = w.feedback.measurement[1]
+    record.magnetic_field[:] = w.feedback.measurement[2]
+    record.position[:] = s.position
+    record.rotation[:] = s.rotation
+    record.conditioning = s.conditioning
+    record.lengths[:] = s.lengths
+    record.reference[:] = s.reference
+    record.command[:] = s.command
+    record.truth[:] = w.feedback.truth
+    for k in range(LEGS):
+        for i in range(3):
+            record.residuals[k, i] = s.directions[k, i] - s.predicted[k, i] if s.leg_used[k] != 0.0 else np.nan
+    w.factor[:] = s.information
+    if s.filter_trusted != 0:
+        extrapolate_covariance(p.filter, s.filter, s.cycle * p.period, w.covariance)
+        record.covariance[:] = w.covariance
+    elif factor_cholesky(w.factor):
+        invert_cholesky(w.factor, w.covariance)
+        record.covariance[:] = w.covariance
+    else:
+        record.covariance[:] = np.nan
+    if streamed.active != 0 and s.stopping == 0:
+        take_plan(streamed.stream, streamed.taker, motion_cycle(parameters, state), p.period, segments, s.reference_index)
+    prepare(parameters, state, segments)
+    w.stage_ns[Stage.RECORD] = now(c.timespec) - began
+
+
+@kernel
+def end_cycle(records: Record, clock: Record, script: NDArray[np.int64], link: NDArray[np.int64], work: Record) -> None:
+    """End the cycle: set the next deadline, complete the record, and let others see it."""
+    head = link[Link.HEAD]
+    link[Link.START] = clock[()].start
+    record = records[head % records.shape[0]]
+    record.stage_ns[:] = work[()].stage_ns
+    record.cpu_ns = finish(clock, script, record.stage_ns.sum())
+    store_release(link, Link.HEAD, head + 1)
+
+
+@kernel
+def run_loop(
+    rig: RigHandle, parameters: Record, state: Record, segments: Array, records: Record, clock: Record,
+    script: NDArray[np.int64], link: NDArray[np.int64], work: Record, streamed: TargetStream, most_missed: int, last: int,
+    end: int,
+) -> int:  # fmt: skip
+    """Run cycles up to `last`, or until a stop that begins at `end` or earlier is over; returns its cause, or `OK`."""
+    s, timespec = state[()], clock[()].timespec
+    cause = OK
+    while cause == OK and s.cycle < last:
+        cause = begin_cycle(parameters, state, clock, script, link, work, streamed, most_missed, end)
+        if cause != OK:
+            break
+        status = exchange(rig, parameters, state, work, timespec)
+        failed = process_feedback(parameters, state, work, status)
+        if failed == OK:
+            failed = compute(parameters, state, segments, work, timespec)
+        record_cycle(parameters, state, segments, records, clock, link, work, streamed, failed)
+        end_cycle(records, clock, script, link, work)
+    if cause != OK:
+        hold_brakes(rig, parameters, state, work, timespec)
+    return cause
