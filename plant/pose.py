@@ -206,3 +206,18 @@ def rotation_angle(first: Array, second: Array) -> Array:
     )
     angle: Array = np.arctan2(np.linalg.norm(axis, axis=-1), np.trace(relative, axis1=-2, axis2=-1) - 1.0)
     return angle
+
+
+def pose_errors(positions: Array, rotations: Array, true_positions: Array, true_rotations: Array) -> Array:
+    """Errors (..., 6) of poses, less than half a turn: translation [m] and rotation vector [rad], both seen in {1}."""
+    relative = rotations @ np.swapaxes(true_rotations, -1, -2)
+    skewed = relative - np.swapaxes(relative, -1, -2)
+    sines = 0.5 * np.stack([skewed[..., 2, 1], skewed[..., 0, 2], skewed[..., 1, 0]], axis=-1)
+    vectors = sines / np.sinc(rotation_angle(rotations, true_rotations) / np.pi)[..., None]
+    return np.concatenate([positions - true_positions, vectors], axis=-1)
+
+
+def rms_figures(errors: Array) -> dict[str, float]:
+    """Root mean squares of the distance [m] and the angle [rad] of pose errors (N, 6)."""
+    position, rotation = np.sqrt(np.mean(np.sum(errors.reshape(-1, 2, 3) ** 2, axis=2), axis=0))
+    return {"position_rms": float(position), "rotation_rms": float(rotation)}

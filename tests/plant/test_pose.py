@@ -16,7 +16,9 @@ from plant.pose import (
     checked_rotation,
     checked_unit,
     nearest_rotation,
+    pose_errors,
     quaternion_from_rotation,
+    rms_figures,
     rotate_by_vector,
     rotation_angle,
     rotation_from_quaternion,
@@ -204,3 +206,17 @@ def test_a_rotation_with_rounding_errors_is_made_proper(seed: int) -> None:
 def test_what_is_no_rotation_is_refused(value: Array, message: str) -> None:
     with pytest.raises(InputError, match=message):
         checked_rotation(value, "thing")
+
+
+def test_pose_errors_are_translations_and_rotation_vectors_in_the_base():
+    random = np.random.default_rng(0)
+    true, vectors = Rotation.random(50, random_state=0).as_matrix(), random.uniform(-1.5, 1.5, (50, 3))
+    vectors[0] = 0.0
+    turned = np.array([rotation_from_vector(vector) for vector in vectors]) @ true
+    positions, offsets = random.normal(size=(2, 50, 3))
+    errors = pose_errors(positions + offsets, turned, positions, true)
+    np.testing.assert_allclose(errors, np.concatenate([offsets, vectors], axis=1), atol=1e-13)
+    np.testing.assert_allclose(pose_errors(positions[1], turned[1], np.zeros(3), true[1])[3:], vectors[1], atol=1e-13)
+    figures = rms_figures(errors)
+    assert figures["position_rms"] == pytest.approx(np.sqrt(np.mean(np.sum(offsets**2, axis=1))))
+    assert figures["rotation_rms"] == pytest.approx(np.sqrt(np.mean(rotation_angle(turned, true) ** 2)))
