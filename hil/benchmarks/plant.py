@@ -75,26 +75,26 @@ def _commands(duration: float) -> Array:
 def _drive(plant: FmuPlant, commands: Array) -> tuple[Array, Array]:
     """Durations of the parts [ns], means over blocks of cycles (m, 4), and positions (n, 3) [m]."""
     durations, positions = np.zeros((len(commands), len(_PARTS)), np.int64), np.zeros((len(commands), 3))
-    if _run(plant.calls, commands, durations, positions, np.zeros(2, np.int64)):
+    if _run(plant.handle, commands, durations, positions, np.zeros(2, np.int64)):
         raise plant.failure()
     whole = len(commands) // _BLOCK * _BLOCK
     return durations[:whole].reshape(-1, _BLOCK, len(_PARTS)).mean(axis=1), positions
 
 
 @kernel
-def _run(calls: Record, commands: Array, durations: NDArray[np.int64], positions: Array, timespec: NDArray[np.int64]) -> int:
+def _run(fmu: Record, commands: Array, durations: NDArray[np.int64], positions: Array, timespec: NDArray[np.int64]) -> int:
     for i in range(commands.shape[0]):
         t0 = now(timespec)
-        status = write_drive_mode(calls, VELOCITY) | write_command(calls, commands[i])
+        status = write_drive_mode(fmu, VELOCITY) | write_command(fmu, commands[i])
         t1 = now(timespec)
-        status |= advance(calls, PERIOD_S)
+        status |= advance(fmu, PERIOD_S)
         t2 = now(timespec)
-        status |= read_imus(calls)
+        status |= read_imus(fmu)
         t3 = now(timespec)
-        status |= read_truth(calls)
+        status |= read_truth(fmu)
         t4 = now(timespec)
         durations[i, 0], durations[i, 1], durations[i, 2], durations[i, 3] = t1 - t0, t2 - t1, t3 - t2, t4 - t3
-        positions[i] = calls[()].truth[:3]
+        positions[i] = fmu[()].truth[:3]
         if status != 0:
             return status
     return 0

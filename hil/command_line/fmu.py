@@ -196,7 +196,7 @@ def _linearize(options: argparse.Namespace) -> int:
     path = options.file or default_fmu(model_of(mechanism))
     parameters = mechanism.plant_parameters() if options.binding is None else {}
     with FmuPlant(path, parameters, _PERIOD_S, options.binding) as plant:
-        write_drive_mode(plant.calls, VELOCITY)
+        write_drive_mode(plant.handle, VELOCITY)
         system = state_space(plant, options.inputs, options.outputs)
     table = new_table("pole [1/s]", "frequency [Hz]", "damping")
     poles = sorted(system.poles(), key=abs)

@@ -70,7 +70,7 @@ class Loop:
     """Everything that a run changes or reads.
 
     Attributes:
-        calls: the plant (dtype `plant.fmu.plant.CALLS`).
+        fmu: the plant (dtype `plant.fmu.plant.FMU_HANDLE`).
         imu: the IMUs' imperfections (dtype `plant.imu.IMU_STATE`).
         parameters, state: of the cycle.
         kind, udp, emulator: as in `RigHandle`; by default the rig is the plant itself.
@@ -84,7 +84,7 @@ class Loop:
         most_missed: periods missed in a row that end in a controlled stop.
     """
 
-    calls: Record
+    fmu: Record
     imu: Record
     parameters: Record
     state: Record
@@ -134,7 +134,7 @@ class Loop:
         if not python:
             _load(run_loop, *self._arguments(0, 0))
             return
-        timespec, calls = clock["timespec"], self.calls
+        timespec, fmu = clock["timespec"], self.fmu
         _load(now, timespec)
         _load(begin_cycle, parameters, state, clock, self.script, link, work, self._streamed(), 0, 0)
         _load(process_feedback, parameters, state, work, 0)
@@ -145,15 +145,15 @@ class Loop:
         _load(record_cycle, parameters, state, self.segments, self.records, clock, link, work, self._streamed(), 0)
         _load(end_cycle, self.records, clock, self.script, link, work)
         _load(periods_passed, state)
-        _load(drive_fmu, calls, state["command"], 0, 0, 0.0)
-        _load(read_fmu, calls, self.imu, state["command"], 0, work["feedback"][()])
+        _load(drive_fmu, fmu, state["command"], 0, 0, 0.0)
+        _load(read_fmu, fmu, self.imu, state["command"], 0, work["feedback"][()])
         _load(exchange_status, 0)
-        _load(write_drive_mode, calls, 0)
+        _load(write_drive_mode, fmu, 0)
 
     def _arguments(self, last: int, end: int) -> tuple[Any, ...]:
-        emulator = self.emulator or new_udp_emulator(self.calls, self.imu, np.zeros((), EMULATED))
+        emulator = self.emulator or new_udp_emulator(self.fmu, self.imu, np.zeros((), EMULATED))
         return (
-            RigHandle(self.kind, self.calls, self.imu, self.udp, emulator), self.parameters, self.state, self.segments,
+            RigHandle(self.kind, self.fmu, self.imu, self.udp, emulator), self.parameters, self.state, self.segments,
             self.records, self.clock, self.script, self.link, self._work, self._streamed(), self.most_missed, last, end,
         )  # fmt: skip
 
@@ -231,7 +231,7 @@ def prevent_compilation() -> Iterator[None]:
 
 
 class FmuRig:
-    """The plant behind a loop's `calls`, for loops in Python."""
+    """The plant behind a loop's `fmu`, for loops in Python."""
 
     command_delay = 0.0
 
@@ -251,12 +251,12 @@ class FmuRig:
     def exchange(self, command: Array, request: int, feedback: Record) -> int:
         """Drive the plant for the periods that have passed since the last exchange, and read it."""
         loop = self._loop
-        status = drive_fmu(loop.calls, command, request, periods_passed(loop.state), float(loop.parameters["period"]))
-        return exchange_status(status or read_fmu(loop.calls, loop.imu, command, request, feedback))
+        status = drive_fmu(loop.fmu, command, request, periods_passed(loop.state), float(loop.parameters["period"]))
+        return exchange_status(status or read_fmu(loop.fmu, loop.imu, command, request, feedback))
 
     def quick_stop(self) -> None:
         """Brake the drives."""
-        write_drive_mode(self._loop.calls, BRAKE)
+        write_drive_mode(self._loop.fmu, BRAKE)
 
     def close(self) -> None:
         """Nothing."""

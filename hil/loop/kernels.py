@@ -59,27 +59,27 @@ _sigpending: Any = types.ExternalFunction("sigpending", types.int32(types.intp))
 
 
 @kernel
-def drive_fmu(calls: Record, command: Array, request: int, periods: int, period: float) -> int:
+def drive_fmu(fmu: Record, command: Array, request: int, periods: int, period: float) -> int:
     """Let the plant move with the command for so many periods; returns FMI's status."""
-    status = write_drive_mode(calls, BRAKE if request == BRAKED else VELOCITY)
+    status = write_drive_mode(fmu, BRAKE if request == BRAKED else VELOCITY)
     if periods > 0:
-        status |= write_command(calls, command)
+        status |= write_command(fmu, command)
     for _ in range(periods):
-        status |= advance(calls, period)
+        status |= advance(fmu, period)
     return status
 
 
 @kernel
-def read_fmu(calls: Record, imu: Record, command: Array, request: int, feedback: Record) -> int:
+def read_fmu(fmu: Record, imu: Record, command: Array, request: int, feedback: Record) -> int:
     """Read the plant through the IMUs' imperfections; returns FMI's status."""
-    status = read_imus(calls) | read_truth(calls)
-    measure(imu, calls[()].imu, feedback.measurement)
-    feedback.truth[:] = calls[()].truth
+    status = read_imus(fmu) | read_truth(fmu)
+    measure(imu, fmu[()].imu, feedback.measurement)
+    feedback.truth[:] = fmu[()].truth
     for k in range(LEGS):
         feedback.sent[k] = 0.0 if request == BRAKED else command[k]
     for k in range(IMU_COUNT):
         feedback.sequence[k] += 1
-        feedback.sample_ns[k] = np.int64(np.rint(1e9 * calls[()].time))
+        feedback.sample_ns[k] = np.int64(np.rint(1e9 * fmu[()].time))
     return status
 
 
@@ -94,10 +94,10 @@ def exchange(rig: RigHandle, parameters: Record, state: Record, work: Record, ti
         at = int(np.rint(1e9 * period * s.cycle))
         status = exchange_in_memory(rig.emulator, rig.link, s.command, s.safety.request, w.feedback, at)
     else:
-        status = drive_fmu(rig.calls, s.command, s.safety.request, periods_passed(state), period)
+        status = drive_fmu(rig.fmu, s.command, s.safety.request, periods_passed(state), period)
         t1 = now(timespec)
         if status == 0:
-            status = read_fmu(rig.calls, rig.imu, s.command, s.safety.request, w.feedback)
+            status = read_fmu(rig.fmu, rig.imu, s.command, s.safety.request, w.feedback)
         status = exchange_status(status)
     w.stage_ns[Stage.PLANT], w.stage_ns[Stage.SENSE] = t1 - t0, now(timespec) - t1
     return status
@@ -113,7 +113,7 @@ def hold_brakes(rig: RigHandle, parameters: Record, state: Record, work: Record,
         at = int(np.rint(1e9 * parameters[()].period * state[()].cycle))
         exchange_in_memory(rig.emulator, rig.link, state[()].command, BRAKED, work[()].feedback, at)
     else:
-        write_drive_mode(rig.calls, BRAKE)
+        write_drive_mode(rig.fmu, BRAKE)
 
 
 @kernel

@@ -12,8 +12,8 @@ from hil.rigs.udp.emulator import UdpEmulator
 from hil.rigs.udp.rig import UdpLink
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
-from plant.fmu.plant import CALLS
 from plant.mechanism import LEGS
+from plant.truth import TRUTH_SIZE
 
 STAGES = (
     "sense",
@@ -83,7 +83,7 @@ RECORD = np.dtype(
         ("lengths", np.float64, LEGS),
         ("reference", np.float64, (LEGS, 3)),
         ("command", np.float64, LEGS),
-        ("truth", np.float64, CALLS["truth"].shape),
+        ("truth", np.float64, TRUTH_SIZE),
     ],
     align=True,
 )
@@ -134,14 +134,14 @@ class RigHandle(NamedTuple):
 
     Attributes:
         kind: `FMU_RIG`, `UDP_RIG` or `EMULATED_RIG`.
-        calls: the plant (dtype `plant.fmu.plant.CALLS`).
+        fmu: the plant (dtype `plant.fmu.plant.FMU_HANDLE`).
         imu: the IMUs' imperfections (dtype `plant.imu.IMU_STATE`).
         link: the controller's side of UDP.
         emulator: the rig's side, in memory.
     """
 
     kind: int
-    calls: Record
+    fmu: Record
     imu: Record
     link: UdpLink
     emulator: UdpEmulator

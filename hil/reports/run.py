@@ -31,6 +31,7 @@ from hil.reports.page import (
 from hil.runs.simulation import SimulationResult
 from plant.files import write_whole
 from plant.pose import Array, rotation_angle
+from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS
 
 _POINTS = 3000
 _FRAMES = 150
@@ -155,7 +156,10 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
     estimate = (records["position"], records["rotation"])
     actual, real = _actual_poses(result), _real(result)
     planned = (result.reference_positions, result.reference_rotations)
-    true_lengths, currents = records["truth"][:, 7:13][:, legs_there], records["truth"][:, 13:19][:, legs_there]
+    true_lengths, currents = (
+        records["truth"][:, TRUTH_LENGTHS][:, legs_there],
+        records["truth"][:, TRUTH_CURRENTS][:, legs_there],
+    )
     lengths_known = bool(np.isfinite(true_lengths[:1]).all())
     lengths, real_length = (
         1e3 * (true_lengths if lengths_known else records["lengths"][:, legs_there]),

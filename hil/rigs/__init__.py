@@ -15,9 +15,9 @@ from controller.safety.watch import BRAKED, ENABLED, FAULTY, FOLLOWING, OFF, QUI
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import GoughError
-from plant.fmu.plant import CALLS
 from plant.mechanism import LEGS
 from plant.pose import Array
+from plant.truth import TRUTH_SIZE
 
 __all__ = [
     "ANSWERED", "BRAKED", "ENABLED", "FAULTY", "FEEDBACK", "FOLLOWING", "OFF", "QUICK_STOP", "QUICK_STOPPING", "READY",
@@ -38,7 +38,7 @@ FEEDBACK = np.dtype(
         ("drive", np.int64, LEGS),
         ("drive_code", np.int64, LEGS),
         ("sent", np.float64, LEGS),
-        ("truth", np.float64, CALLS["truth"].shape),
+        ("truth", np.float64, TRUTH_SIZE),
         ("round_trip_ns", np.int64),
         ("refused", np.int64),
     ],

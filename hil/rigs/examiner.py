@@ -31,6 +31,7 @@ from plant.dynamics.variables import IMU_COUNT
 from plant.errors import GoughError
 from plant.mechanism import LEGS
 from plant.pose import Array
+from plant.truth import TRUTH_LENGTHS
 
 FOLLOWED_WITHIN = 20
 """Exchanges within which the drives must do what is requested."""
@@ -206,11 +207,11 @@ class Examiner:
         zero, up = np.zeros(LEGS), np.full(LEGS, SPEED)
         count = max(3, round(STROKE_S / self._period))
         self._request(ENABLED, zero, (FOLLOWING,))
-        lengths = [self._feedback["truth"][7:13].copy()]
+        lengths = [self._feedback["truth"][TRUTH_LENGTHS].copy()]
         for command in (up, -up):
             for _ in range(count):
                 self._exchange(command, ENABLED)
-            lengths.append(self._feedback["truth"][7:13].copy())
+            lengths.append(self._feedback["truth"][TRUTH_LENGTHS].copy())
         self._check_motion(lengths, count)
         if self._beyond is not None:
             self._check_limit(self._beyond)

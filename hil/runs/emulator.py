@@ -31,6 +31,7 @@ from plant.errors import GoughError, InputError
 from plant.fmu.plant import FmuPlant
 from plant.imu import imu_state, load_imu
 from plant.mechanism import load_spatial
+from plant.truth import TRUTH_LENGTHS
 
 _STEP_NS = 1_000_000
 _TURN_NS = 20_000_000
@@ -191,7 +192,7 @@ class _Control:
                 "drive": rig["drive"].tolist(),
                 "code": rig["code"].tolist(),
                 "velocity": rig["velocity"].tolist(),
-                "lengths": rig["truth"][7:13].tolist(),
+                "lengths": rig["truth"][TRUTH_LENGTHS].tolist(),
                 **told,
             }
         raise InputError(f"the control channel knows fault, clear, state and stop, not {command!r}")
@@ -229,7 +230,7 @@ def _load(config: EmulatorConfig) -> None:
     """Load or compile the machine code before anyone waits for it."""
     plant, imu, rig = _rig_of(config, 1e-3, [])
     with plant, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as scratch:
-        emulator = new_udp_emulator(plant.calls, imu, rig)
+        emulator = new_udp_emulator(plant.handle, imu, rig)
         emulator.socket["descriptor"] = scratch.fileno()
         serve(emulator, time.monotonic_ns(), 0, np.zeros(2, np.int64))
 
@@ -245,7 +246,7 @@ def _serve_sessions(
         period = 1e-6 * int(hello["period_us"])
         plant, imu, rig = _rig_of(config, period, faults)
         with plant:
-            emulator = new_udp_emulator(plant.calls, imu, rig, int(hello["session"]), _watchdog(config, hello))
+            emulator = new_udp_emulator(plant.handle, imu, rig, int(hello["session"]), _watchdog(config, hello))
             emulator.socket["descriptor"], emulator.socket["peer"] = opened.fileno(), socket_address(sender)
             _welcome(opened, config, hello, sender)
             say(f"session with {sender[0]}:{sender[1]} at {1.0 / period:g} Hz")

@@ -49,6 +49,7 @@ from hil.runs.target_stream import HOST, PORT, open_socket, receive
 from plant.compiled import Record
 from plant.errors import GoughError, InputError
 from plant.mechanism import load_in_space, load_spatial
+from plant.truth import TRUTH_POSITION
 
 _BUFFER_S = 8.0
 _LEAST_RECORDS = 1024
@@ -116,7 +117,7 @@ class Progress:
         # Before anything is armed there may be cycles without a pose.
         posed = records[records["status"] == 0]
         known = posed[np.isfinite(posed["truth"][:, 0])]
-        self.squares[0] += np.sum((known["position"] - known["truth"][:, :3]) ** 2)
+        self.squares[0] += np.sum((known["position"] - known["truth"][:, TRUTH_POSITION]) ** 2)
         errors = posed["lengths"] - posed["reference"][:, :, 0]
         self.squares[1] += (np.sum(errors**2, axis=1) / np.count_nonzero(posed["lengths"], axis=1)).sum()
         self.squares[2] += len(posed)

@@ -30,10 +30,11 @@ from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import GoughError, InputError, UnknownNameError
 from plant.fmu.binding import OWN_BINDING, Setting, load_binding
 from plant.fmu.build import default_fmu, model_of
-from plant.fmu.plant import CALLS, FmuPlant
+from plant.fmu.plant import FMU_HANDLE, FmuPlant
 from plant.imu import ACCELEROMETER, GYROSCOPE, RIGHT_WIRING, Wiring, imu_state, load_imu
 from plant.mechanism import LEGS, Mechanism, load_in_space
 from plant.pose import Array, Pose, checked_seed, rotation_angle, rotations_from_quaternions
+from plant.truth import TRUTH_POSITION, TRUTH_QUATERNION
 
 FUSIONS = {
     "compiled": None,
@@ -200,13 +201,13 @@ class SimulationResult:
     @property
     def true_positions(self) -> Array:
         """(N, 3) [m]; NaN if the truth is not known."""
-        positions: Array = self.records["truth"][:, :3]
+        positions: Array = self.records["truth"][:, TRUTH_POSITION]
         return positions
 
     @property
     def true_rotations(self) -> Array:
         """(N, 3, 3); NaN if the truth is not known."""
-        return rotations_from_quaternions(np.ascontiguousarray(self.records["truth"][:, 3:7]))
+        return rotations_from_quaternions(np.ascontiguousarray(self.records["truth"][:, TRUTH_QUATERNION]))
 
     def summary(self) -> dict[str, Any]:
         """The figures, in SI units, over the time after the hold; None for those that need the truth where it is not known."""
@@ -289,7 +290,7 @@ class PreparedLoop(Loop):
     """A loop that is ready to run, with what it was prepared from.
 
     Attributes:
-        plant: the FMU behind `calls`.
+        plant: the FMU behind `fmu`.
         mechanism, target, reference: as in `SimulationResult`.
         end: the cycle after the last of the motion.
         planning_time: what planning took [s].
@@ -311,7 +312,7 @@ class PreparedLoop(Loop):
 
     def reason(self) -> str:
         """Why the run has ended, in words; a plant that failed has its own."""
-        if self.plant is not None and self.plant.calls["status"] != OK:
+        if self.plant is not None and self.plant.handle["status"] != OK:
             return str(self.plant.failure())
         return describe_end(self.state)
 
@@ -361,7 +362,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         else:
             reference = plan(mechanism, target, config.duration)
         loop = PreparedLoop(
-            calls=np.zeros((), CALLS) if plant is None else plant.calls,
+            fmu=np.zeros((), FMU_HANDLE) if plant is None else plant.handle,
             imu=imu,
             parameters=parameters,
             state=np.zeros((), STATE),

@@ -60,6 +60,7 @@ from hil.runs.target_stream import LEAD_S, Reception, Sample, encode
 from plant.compiled import Record
 from plant.mechanism import LEGS
 from plant.pose import quaternion_from_rotation
+from plant.truth import TRUTH_LENGTHS
 
 RATE_HZ = 1000.0
 MOTION_S = 4.5
@@ -278,7 +279,7 @@ def _try(case: Case, seed: int, outcome: Outcome) -> None:
 def _join(loop: PreparedLoop, faults: list[Record], seed: int) -> None:
     """Put the emulated rig between the loop and its plant, and both on a script's clock."""
     rig = new_emulated(loop.mechanism, round(1e9 / RATE_HZ), seed, faults)
-    loop.emulator = new_udp_emulator(loop.calls, loop.imu, rig, _SESSION)
+    loop.emulator = new_udp_emulator(loop.fmu, loop.imu, rig, _SESSION)
     loop.kind = EMULATED_RIG
     loop.udp.socket["session"], loop.udp.socket["timeout_ns"] = _SESSION, round(1e9 * TIMEOUT_SHARE / RATE_HZ)
     loop.parameters["command_delay"] = 1.0 / RATE_HZ
@@ -293,7 +294,7 @@ def _stand(loop: PreparedLoop) -> None:
     begin = int(loop.emulator.rig["time_ns"])
     for passed in range(0, 500_000_000, 10_000_000):
         look_after(loop.emulator, begin + passed)
-    sample(loop.calls, loop.imu, loop.emulator.rig, int(loop.emulator.rig["time_ns"]))
+    sample(loop.fmu, loop.imu, loop.emulator.rig, int(loop.emulator.rig["time_ns"]))
 
 
 _SAMPLE_CYCLES = 10
@@ -346,11 +347,11 @@ def _judge(case: Case, seed: int, loop: PreparedLoop, cause: int, onset: int, ou
             find(cycles[0] > case.within, f"took {cycles[0]} cycles, and {case.within} are allowed")
     since = moved[moved["cycle"] >= onset]
     followed = since[since["mode"] != FAULT]
-    off = np.abs(followed["truth"][:, 7:13] - followed["reference"][:, :, 0]).max(initial=0.0)
+    off = np.abs(followed["truth"][:, TRUTH_LENGTHS] - followed["reference"][:, :, 0]).max(initial=0.0)
     outcome.peak.append(float(off))
     find(off > case.peak, f"a leg was {1e3 * off:.2f} mm off, and {1e3 * case.peak:g} are allowed")
     after = records[(records["mode"] >= RUNNING) & (records["cycle"] >= begin)]
-    rested = np.vstack([after["truth"][:, 7:13], rig["truth"][7:13]]) if len(after) else np.zeros((1, LEGS))
+    rested = np.vstack([after["truth"][:, TRUTH_LENGTHS], rig["truth"][TRUTH_LENGTHS]]) if len(after) else np.zeros((1, LEGS))
     travel = np.abs(rested - rested[0]).max() if case.reaction != GO_ON else 0.0
     outcome.travel.append(float(travel))
     find(travel > MOST_TRAVEL_M, f"a leg went on for {1e3 * travel:.1f} mm, and {1e3 * MOST_TRAVEL_M:g} are allowed")
@@ -367,7 +368,7 @@ def _judge(case: Case, seed: int, loop: PreparedLoop, cause: int, onset: int, ou
     steps = np.abs(np.diff(coasting, axis=0)).max(initial=0.0)
     find(steps > _SLACK * limits.acceleration * period * (1 + int(records["missed"].max())), "a quick stop was too hard")
     if case.reaction == STOP and len(moved):
-        stopping = records[records["mode"] == STOPPING]["truth"][:, 7:13]
+        stopping = records[records["mode"] == STOPPING]["truth"][:, TRUTH_LENGTHS]
         smooth = np.diff(stopping[::_SMOOTH], n=2, axis=0) / (_SMOOTH * period) ** 2
         hard = np.abs(smooth).max(initial=0.0)
         find(hard > case.hardness * limits.acceleration, f"the legs stopped at {hard:.3g} m/s2")

@@ -23,12 +23,15 @@ from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER
 from plant.mechanism import LEGS
 from plant.mechanism.planar import PLANAR_LEGS
 from plant.pose import Array
+from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS, TRUTH_POSITION, TRUTH_QUATERNION
 
 IMU_SIGNALS = {"imu_angular_velocity": GYROSCOPE, "imu_specific_force": ACCELEROMETER, "imu_magnetic_field": MAGNETOMETER}
-TRUTH_PLACES = {"position": 0, "quaternion": 3, "angle": 3, "leg_length": 7, "current": 13}
-"""Where a signal begins in the truth (19,): position, quaternion, lengths and currents of six legs."""
+TRUTH_PLACES = {
+    "position": TRUTH_POSITION, "quaternion": TRUTH_QUATERNION, "angle": TRUTH_QUATERNION, "leg_length": TRUTH_LENGTHS,
+    "current": TRUTH_CURRENTS,
+}  # fmt: skip
+"""Where a signal lies in the truth (`plant.truth`). A planar plant tells its angle in the first place of the quaternion."""
 
-TRUTH_SIZE = 19
 COMMANDS, MODES, PAYLOAD = "velocity_command", "drive_mode", "payload.mass"
 
 UNITS: dict[str, dict[str, float]] = {
@@ -455,7 +458,8 @@ class _Binder:
         sizes = {"position": 2 if self._legs == PLANAR_LEGS else 3, "quaternion": 4, "angle": 1}
         if name == "angle" and self._legs != PLANAR_LEGS:
             self._problems.append("angle: only a planar plant, with three commands, has one: give its quaternion")
-        return range(TRUTH_PLACES[name], TRUTH_PLACES[name] + sizes.get(name, self._legs))
+        first = TRUTH_PLACES[name].start
+        return range(first, first + sizes.get(name, self._legs))
 
     def _group(self, places: Mapping[str, Sequence[int]]) -> Scalars:
         """The scalars of some signals, from the places of their elements."""

@@ -84,7 +84,7 @@ PLANAR_MODEL = Model(
 
 
 @dataclass(frozen=True)
-class Target:
+class Platform:
     """A platform that FMUs are compiled for: its folders in FMI 3.0 and 2.0, zig's name for it, and its libraries' suffix."""
 
     folder: str
@@ -93,12 +93,12 @@ class Target:
     suffix: str
 
 
-TARGETS = {
-    "linux": (Target("x86_64-linux", "linux64", "x86_64-linux-gnu.2.17", ".so"),),
-    "windows": (Target("x86_64-windows", "win64", "x86_64-windows-gnu", ".dll"),),
+PLATFORMS = {
+    "linux": (Platform("x86_64-linux", "linux64", "x86_64-linux-gnu.2.17", ".so"),),
+    "windows": (Platform("x86_64-windows", "win64", "x86_64-windows-gnu", ".dll"),),
     "darwin": (
-        Target("x86_64-darwin", "darwin64", "x86_64-macos.11.0", ".dylib"),
-        Target("aarch64-darwin", "darwin64", "aarch64-macos.11.0", ".dylib"),
+        Platform("x86_64-darwin", "darwin64", "x86_64-macos.11.0", ".dylib"),
+        Platform("aarch64-darwin", "darwin64", "aarch64-macos.11.0", ".dylib"),
     ),
 }
 """What `--platforms` can name. In FMI 2.0 both processors of darwin share one universal library."""
@@ -164,7 +164,7 @@ def build(path: Path, fmi: int = 3, mechanism: str | Path = "hexapod", platforms
         path: the file.
         fmi: 3 for FMI 3.0, Co-Simulation and Model Exchange; 2 for FMI 2.0 Co-Simulation.
         mechanism: preset or file whose parameters are the start values; a planar one gives the planar plant.
-        platforms: keys of `TARGETS`, compiled by zig; by default this machine's, by its C compiler.
+        platforms: keys of `PLATFORMS`, compiled by zig; by default this machine's, by its C compiler.
 
     Raises:
         ToolchainError: no C compiler, or it failed.
@@ -210,8 +210,8 @@ def check_build(fmi: int, platforms: Sequence[str]) -> None:
     """
     if fmi not in (2, 3):
         raise InputError(f"there is no FMI {fmi} to export: choose 2 or 3")
-    if unknown := [name for name in platforms if name not in TARGETS]:
-        raise InputError(f"no platform {unknown[0]!r}; there are {', '.join(TARGETS)}")
+    if unknown := [name for name in platforms if name not in PLATFORMS]:
+        raise InputError(f"no platform {unknown[0]!r}; there are {', '.join(PLATFORMS)}")
     if platforms:
         _zig()
     else:
@@ -246,12 +246,12 @@ def _libraries(model: Model, fmi: int, work: Path, sources: list[str], platforms
     libraries: dict[str, bytes] = {}
     for name in platforms:
         compiled = []
-        for target in TARGETS[name]:
-            library = _compile([*_zig(), "-target", target.zig], work, sources, target.suffix)
+        for each in PLATFORMS[name]:
+            library = _compile([*_zig(), "-target", each.zig], work, sources, each.suffix)
             compiled.append(library)
-            libraries[f"{target.folder if fmi == 3 else target.folder_2}/{model.identifier}{target.suffix}"] = library
+            libraries[f"{each.folder if fmi == 3 else each.folder_2}/{model.identifier}{each.suffix}"] = library
         if fmi == 2 and len(compiled) > 1:
-            libraries[f"{target.folder_2}/{model.identifier}{target.suffix}"] = _universal(compiled)
+            libraries[f"{each.folder_2}/{model.identifier}{each.suffix}"] = _universal(compiled)
     return libraries
 
 

@@ -10,10 +10,10 @@ from numba.extending import intrinsic
 
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import DRIVE_MODES, IMU_COUNT, VELOCITY
-from plant.fmu.binding import TRUTH_SIZE
 from plant.fmu.importer import ASKS_TO_END, ERROR, NEEDS_EVENTS, OK
 from plant.mechanism import LEGS
 from plant.pose import Array
+from plant.truth import TRUTH_SIZE
 
 MOST_CHANGES = 32
 """How many parameters may change during a run."""
@@ -24,7 +24,7 @@ CALLED = (
     "reading the IMUs", "reading the truth", "setting the commands", "setting the drives' modes", "setting the payload",
     "changing a parameter", "a step",
 )  # fmt: skip
-"""What a call is, for messages, by the `call` of `CALLS`."""
+"""What a call is, for messages, by the `call` of `FMU_HANDLE`."""
 
 
 def _scalars(most: int) -> np.dtype[Any]:
@@ -55,7 +55,7 @@ _CHANGE = np.dtype(
     align=True,
 )
 
-CALLS = np.dtype(
+FMU_HANDLE = np.dtype(
     [
         ("version", np.int64),
         ("instance", np.int64),
@@ -184,16 +184,16 @@ def _write(c: Record, call: int, scalars: Record, values: Array) -> int:
 
 
 @kernel
-def read_imus(calls: Record) -> int:
+def read_imus(fmu: Record) -> int:
     """Read the ideal IMU signals into `imu`; returns FMI's status, 0 when all is well."""
-    c = calls[()]
+    c = fmu[()]
     return _read(c, _READING, c.sensed, c.imu.reshape(-1))
 
 
 @kernel
-def read_truth(calls: Record) -> int:
+def read_truth(fmu: Record) -> int:
     """Read pose, lengths and currents into `truth`, as far as the FMU tells them; returns FMI's status."""
-    c = calls[()]
+    c = fmu[()]
     truth = c.truth
     status = _read(c, _TELLING, c.known, truth)
     if c.planar_angle != 0:
@@ -203,12 +203,12 @@ def read_truth(calls: Record) -> int:
 
 
 @kernel
-def write_command(calls: Record, command: Array) -> int:
+def write_command(fmu: Record, command: Array) -> int:
     """Set the velocity commands (6,) or (3,) [m/s]; returns FMI's status.
 
     Where the drives have no modes, those that are not to move are told to stand.
     """
-    c = calls[()]
+    c = fmu[()]
     sent = c.command
     for k in range(c.legs):
         sent[k] = command[k] if c.mode_count > 0 or c.mode[k] == VELOCITY else 0.0
@@ -216,21 +216,21 @@ def write_command(calls: Record, command: Array) -> int:
 
 
 @kernel
-def write_drive_mode(calls: Record, mode: int) -> int:
+def write_drive_mode(fmu: Record, mode: int) -> int:
     """Set the mode of all drives; returns FMI's status."""
-    calls[()].mode[:] = mode
-    return write_drive_modes(calls)
+    fmu[()].mode[:] = mode
+    return write_drive_modes(fmu)
 
 
 @kernel
-def write_drive_modes(calls: Record) -> int:
+def write_drive_modes(fmu: Record) -> int:
     """Set the modes of the drives to those in `mode`; returns FMI's status.
 
     A switch that the drives have in common is on while any of them is to move.
     """
-    c = calls[()]
+    c = fmu[()]
     if c.mode_count == 0:
-        return write_command(calls, c.command)
+        return write_command(fmu, c.command)
     raw = c.mode_raw
     raw[:] = 0
     for k in range(c.mode_count):
@@ -247,17 +247,17 @@ def write_drive_modes(calls: Record) -> int:
 
 
 @kernel
-def write_payload_mass(calls: Record, mass: float) -> int:
+def write_payload_mass(fmu: Record, mass: float) -> int:
     """Set the mass of the payload [kg], if the plant has one; returns FMI's status."""
-    c = calls[()]
+    c = fmu[()]
     c.payload[0] = mass
     return _write(c, _LOADING, c.loaded, c.payload)
 
 
 @kernel
-def advance(calls: Record, duration: float) -> int:
+def advance(fmu: Record, duration: float) -> int:
     """Step the FMU by `duration` [s], in communication steps of its own if it has one; returns FMI's status."""
-    c = calls[()]
+    c = fmu[()]
     steps = 1 if c.step == 0.0 else max(int(np.rint(duration / c.step)), 1)
     status = OK
     for _ in range(steps):

@@ -16,7 +16,7 @@ from plant.errors import FmuError, InputError
 from plant.fmu.binding import OWN_BINDING, Binding, Modes, Scalars, Setting, bind, check_free, check_start, load_binding
 from plant.fmu.calls import (
     CALLED,
-    CALLS,
+    FMU_HANDLE,
     MOST_CHANGES,
     advance,
     read_imus,
@@ -31,7 +31,7 @@ from plant.mechanism import LEGS
 from plant.pose import Array
 
 __all__ = [
-    "CALLS", "MOST_CHANGES", "FmuPlant", "LinearPlant", "advance", "read_imus", "read_truth", "write_command",
+    "FMU_HANDLE", "MOST_CHANGES", "FmuPlant", "LinearPlant", "advance", "read_imus", "read_truth", "write_command",
     "write_drive_mode", "write_drive_modes", "write_payload_mass",
 ]  # fmt: skip
 
@@ -66,7 +66,7 @@ class FmuPlant:
         legs: that it must have; None for any number.
 
     Attributes:
-        calls: the structured array (dtype `CALLS`) for `read_imus`, `read_truth`, `write_command` and `advance`.
+        handle: the structured array (dtype `FMU_HANDLE`) for `read_imus`, `read_truth`, `write_command` and `advance`.
         bound: what its variables are to the loop.
         folder: where it has been extracted to; removed by `close`, or after a crash when an FMU is next loaded.
 
@@ -88,7 +88,7 @@ class FmuPlant:
         legs: int | None = None,
     ) -> None:
         self.path = Path(path)
-        self.calls: Record = np.zeros((), CALLS)
+        self.handle: Record = np.zeros((), FMU_HANDLE)
         if not isinstance(binding, Binding):
             binding = OWN_BINDING if binding is None else load_binding(binding)
         self.description = FmuDescription(self.path)
@@ -132,7 +132,7 @@ class FmuPlant:
 
     def close(self) -> None:
         """Free the instance and remove what was extracted; closing twice does no harm."""
-        self._instance.status = max(self._instance.status, int(self.calls["status"]))
+        self._instance.status = max(self._instance.status, int(self.handle["status"]))
         self._instance.close()
 
     def get(self, name: str) -> NDArray[Any]:
@@ -162,8 +162,8 @@ class FmuPlant:
             FmuError: the FMU reports a failure.
         """
         self._instance.check_open()
-        self.calls["status"] = OK
-        if advance(self.calls, duration):
+        self.handle["status"] = OK
+        if advance(self.handle, duration):
             raise self.failure()
 
     def linearize(self, inputs: Sequence[str], outputs: Sequence[str]) -> "LinearPlant":
@@ -192,7 +192,7 @@ class FmuPlant:
         Raises:
             FmuError: the FMU cannot save its state.
         """
-        return struct.pack(_CLOCK, *(self.calls[name] for name in _CLOCKED)) + self._instance.state()
+        return struct.pack(_CLOCK, *(self.handle[name] for name in _CLOCKED)) + self._instance.state()
 
     def restore(self, state: bytes) -> None:
         """Go back to a state of this plant, or of another with the same FMU and settings.
@@ -205,11 +205,11 @@ class FmuPlant:
             raise FmuError(f"{self.path.name} cannot restore a state of {len(state)} bytes, for it is none of this plant")
         self._instance.restore(state[size:])
         for name, value in zip(_CLOCKED, struct.unpack(_CLOCK, state[:size]), strict=True):
-            self.calls[name] = value
+            self.handle[name] = value
 
     def failure(self) -> FmuError:
         """The error that says what went wrong in the compiled calls, in the FMU's own words."""
-        return self._instance.failure(CALLED[int(self.calls["call"])], int(self.calls["status"]))
+        return self._instance.failure(CALLED[int(self.handle["call"])], int(self.handle["status"]))
 
     def _values(self, name: str, value: ArrayLike, spread: bool = False) -> tuple[FmuVariable, NDArray[Any]]:
         variable = self.description[name]
@@ -263,38 +263,38 @@ class FmuPlant:
         variable, values = self._values(setting.name, setting.value, spread=True)
         references = np.array(variable.references, np.uint32)
         self._kept += [references, values]
-        change = self.calls["changes"][self.calls["change_count"]]
+        change = self.handle["changes"][self.handle["change_count"]]
         change["time"], change["function"] = setting.at, self._instance.address(f"Set{variable.ending}")
         change["references"], change["reference_count"] = references.ctypes.data, references.size
         change["values"], change["count"] = values.ctypes.data, values.size
-        self.calls["change_count"] += 1
+        self.handle["change_count"] += 1
 
     def _prepare_calls(self, step: float | None) -> None:
-        calls, bound, instance = self.calls, self.bound, self._instance
+        handle, bound, instance = self.handle, self.bound, self._instance
         real = "Real" if self.description.version == 2 else "Float64"
-        calls["version"], calls["instance"] = self.description.version, instance.component()
-        calls["get"], calls["set"], calls["do_step"] = (
+        handle["version"], handle["instance"] = self.description.version, instance.component()
+        handle["get"], handle["set"], handle["do_step"] = (
             instance.address(each) for each in (f"Get{real}", f"Set{real}", "DoStep")
         )  # fmt: skip
-        calls["step"], calls["final"] = step or 0.0, not self.description.saves_state
+        handle["step"], handle["final"] = step or 0.0, not self.description.saves_state
         for group in ("sensed", "known", "commanded", "loaded"):
-            _fill(calls[group], getattr(bound, group))
+            _fill(handle[group], getattr(bound, group))
         if bound.modes.variable is not None:
             self._prepare_modes(bound.modes, bound.modes.variable)
-        calls["imu"], calls["truth"] = np.nan, np.nan
-        calls["legs"], calls["planar_angle"] = bound.legs, bound.planar_angle
+        handle["imu"], handle["truth"] = np.nan, np.nan
+        handle["legs"], handle["planar_angle"] = bound.legs, bound.planar_angle
         if bound.knows_pose and bound.legs < LEGS:
-            calls["truth"][2] = 0.0
+            handle["truth"][2] = 0.0
 
     def _prepare_modes(self, modes: Modes, variable: FmuVariable) -> None:
-        calls = self.calls
+        handle = self.handle
         count = 1 if modes.common else self.bound.legs
-        calls["set_mode"] = self._instance.address(f"Set{variable.ending}")
-        calls["mode_references"][: modes.references.size] = modes.references
-        calls["mode_count"], calls["mode_bytes"] = count, variable.dtype.itemsize
-        calls["mode_reference_count"] = modes.references.size
+        handle["set_mode"] = self._instance.address(f"Set{variable.ending}")
+        handle["mode_references"][: modes.references.size] = modes.references
+        handle["mode_count"], handle["mode_bytes"] = count, variable.dtype.itemsize
+        handle["mode_reference_count"] = modes.references.size
         for mode, value in enumerate(modes.values.astype(variable.dtype)):
-            calls["mode_values"][mode] = int.from_bytes(value.tobytes(), "little")
+            handle["mode_values"][mode] = int.from_bytes(value.tobytes(), "little")
 
 
 _CLOCKED = ("time", "since", "length", "steps", "changed")

@@ -42,16 +42,16 @@ class PlantMachine:
 
     def advance(self, now_ns: int) -> None:
         """Let the plant move on to this time of the machine's clock."""
-        self._check(move(self._plant.calls, self.rig, now_ns - self._started))
+        self._check(move(self._plant.handle, self.rig, now_ns - self._started))
 
     def sample(self, now_ns: int) -> None:
         """Read the IMUs."""
-        self._check(sample(self._plant.calls, self._imu, self.rig, now_ns - self._started))
+        self._check(sample(self._plant.handle, self._imu, self.rig, now_ns - self._started))
 
     def reset(self, drive: int) -> None:
         """Reset a drive's fault."""
         self.rig["reset"][drive] = 1
-        self._check(move(self._plant.calls, self.rig, int(self.rig["time_ns"]) + 1))
+        self._check(move(self._plant.handle, self.rig, int(self.rig["time_ns"]) + 1))
 
     def restart(self) -> None:
         """All nodes are started anew: the platform is put back to its start, unless it moves."""

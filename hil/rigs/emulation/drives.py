@@ -30,10 +30,11 @@ from hil.rigs.emulation.faults import (
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
 from plant.errors import InputError
-from plant.fmu.plant import CALLS, advance, read_imus, read_truth, write_command, write_drive_modes, write_payload_mass
+from plant.fmu.plant import advance, read_imus, read_truth, write_command, write_drive_modes, write_payload_mass
 from plant.imu import measure
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import rotate_by_vector
+from plant.truth import TRUTH_SIZE
 
 EMULATED = np.dtype(
     [
@@ -53,7 +54,7 @@ EMULATED = np.dtype(
         ("measurement", np.float64, (3, IMU_COUNT, 3)),
         ("sample_ns", np.int64, IMU_COUNT),
         ("sequence", np.int64, IMU_COUNT),
-        ("truth", np.float64, CALLS["truth"].shape),
+        ("truth", np.float64, TRUTH_SIZE),
         ("fault", FAULT, MOST_FAULTS),
         ("faults", np.int64),
         ("random", np.uint64, 1),
@@ -113,11 +114,11 @@ def add_fault(rig: Record, fault: Record) -> None:
 
 
 @kernel
-def sample(calls: Record, imu: Record, rig: Record, now_ns: int) -> int:
+def sample(fmu: Record, imu: Record, rig: Record, now_ns: int) -> int:
     """Let the plant move on to `now_ns` on the rig's clock, and read the IMUs; returns FMI's status."""
-    r, c = rig[()], calls[()]
-    status = move(calls, rig, now_ns)
-    status |= read_imus(calls) | read_truth(calls)
+    r, c = rig[()], fmu[()]
+    status = move(fmu, rig, now_ns)
+    status |= read_imus(fmu) | read_truth(fmu)
     r.truth[:] = c.truth
     r.ideal[:] = c.imu
     for i in range(r.faults):
@@ -174,9 +175,9 @@ def _turn(r: Record, k: int, angle: float) -> None:
 
 
 @kernel
-def move(calls: Record, rig: Record, now_ns: int) -> int:
+def move(fmu: Record, rig: Record, now_ns: int) -> int:
     """Let the plant and the drives move on to `now_ns`; returns FMI's status."""
-    r, c = rig[()], calls[()]
+    r, c = rig[()], fmu[()]
     status = 0
     while r.time_ns < now_ns:
         step = min(r.step_ns, now_ns - r.time_ns)
@@ -185,14 +186,14 @@ def move(calls: Record, rig: Record, now_ns: int) -> int:
             if r.fault[i].kind == PAYLOAD_JUMPS and is_active(r.fault[i], r.enabled_ns, r.time_ns):
                 added += r.fault[i].size
         if added != r.added:
-            status |= write_payload_mass(calls, r.payload + added)
+            status |= write_payload_mass(fmu, r.payload + added)
             r.added = added
         for k in range(LEGS):
             _step_drive(r, k, 1e-9 * step)
             moving = r.drive[k] == FOLLOWING or r.drive[k] == QUICK_STOPPING or r.velocity[k] != 0.0
             c.mode[k] = VELOCITY if moving else BRAKE
-        status |= write_drive_modes(calls) | write_command(calls, r.velocity)
-        status |= advance(calls, 1e-9 * step)
+        status |= write_drive_modes(fmu) | write_command(fmu, r.velocity)
+        status |= advance(fmu, 1e-9 * step)
         r.time_ns += step
     return status
 

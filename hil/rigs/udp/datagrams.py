@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import IMU_COUNT
-from plant.fmu.plant import CALLS
 from plant.mechanism import LEGS
+from plant.truth import TRUTH_SIZE
 
 MAGIC = 0x48475547
 """The bytes "GUGH"."""
@@ -78,7 +78,7 @@ MEASUREMENT_DATAGRAM = np.dtype(
 many datagrams it has refused; of each drive its state (0 following, 1 ready, 2 off, 3 quick stop, 4 fault), its fault code and
 the velocity that it was really given [m/s]; and the raw IMU data [rad/s, m/s^2, uT], NaN where there is none."""
 
-TRUTH_DATAGRAM = np.dtype([("truth", np.float64, CALLS["truth"].shape), ("reserved", np.uint32), ("crc", np.uint32)])
+TRUTH_DATAGRAM = np.dtype([("truth", np.float64, TRUTH_SIZE), ("reserved", np.uint32), ("crc", np.uint32)])
 """What an emulated rig appends to a measurement."""
 
 LONGEST = MEASUREMENT_DATAGRAM.itemsize + TRUTH_DATAGRAM.itemsize

@@ -76,7 +76,7 @@ class UdpEmulator(NamedTuple):
     """An emulated rig on UDP, as compiled code takes it.
 
     Attributes:
-        calls, imu: the plant and its IMUs' imperfections.
+        fmu, imu: the plant and its IMUs' imperfections.
         rig: dtype `hil.rigs.emulation.drives.EMULATED`.
         port: dtype `UDP_PORT`.
         socket: dtype `hil.rigs.udp.rig.SOCKET`; without a descriptor the rig is in memory.
@@ -84,7 +84,7 @@ class UdpEmulator(NamedTuple):
         answer, truth, answer_bytes: what is sent.
     """
 
-    calls: Record
+    fmu: Record
     imu: Record
     rig: Record
     port: Record
@@ -96,14 +96,14 @@ class UdpEmulator(NamedTuple):
     answer_bytes: Bytes
 
 
-def new_udp_emulator(calls: Record, imu: Record, rig: Record, session: int = 0, watchdog_s: float = WATCHDOG_S) -> UdpEmulator:
+def new_udp_emulator(fmu: Record, imu: Record, rig: Record, session: int = 0, watchdog_s: float = WATCHDOG_S) -> UdpEmulator:
     """An emulated rig on UDP that has not been spoken to."""
     port: Record = np.zeros((), UDP_PORT)
     port["session"], port["watchdog_ns"] = session, round(1e9 * watchdog_s)
     received, sent = np.zeros(LONGEST, np.uint8), np.zeros(LONGEST, np.uint8)
     size = MEASUREMENT_DATAGRAM.itemsize
     return UdpEmulator(
-        calls, imu, rig, port, np.zeros((), SOCKET), received[: COMMAND_DATAGRAM.itemsize].view(COMMAND_DATAGRAM), received,
+        fmu, imu, rig, port, np.zeros((), SOCKET), received[: COMMAND_DATAGRAM.itemsize].view(COMMAND_DATAGRAM), received,
         sent[:size].view(MEASUREMENT_DATAGRAM), sent[size:].view(TRUTH_DATAGRAM), sent,
     )  # fmt: skip
 
@@ -134,14 +134,14 @@ def answer(emulator: UdpEmulator, length: int, now_ns: int) -> int:
     if c.request > QUICK_STOP or not finite:
         port.refused += 1
         return 0
-    move(emulator.calls, emulator.rig, now_ns)
+    move(emulator.fmu, emulator.rig, now_ns)
     port.last, port.heard_ns = c.sequence, now_ns
     for k in range(LEGS):
         rig.request[k], rig.target[k] = c.request, c.velocity[k]
         rig.reset[k] = 1 if c.reset != 0 and c.request == BRAKED else 0
     # What is asked for takes effect in this instant.
-    move(emulator.calls, emulator.rig, now_ns + 1)
-    if sample(emulator.calls, emulator.imu, emulator.rig, now_ns + 1) != 0:
+    move(emulator.fmu, emulator.rig, now_ns + 1)
+    if sample(emulator.fmu, emulator.imu, emulator.rig, now_ns + 1) != 0:
         return 0
     a.magic, a.version, a.kind = MAGIC, VERSION, MEASUREMENT
     a.session, a.sequence, a.time_ns = c.session, c.sequence, now_ns
@@ -165,7 +165,7 @@ def answer(emulator: UdpEmulator, length: int, now_ns: int) -> int:
 def look_after(emulator: UdpEmulator, now_ns: int) -> None:
     """Let the plant move on, and stop the drives with a fault if no command has come for too long."""
     rig, port = emulator.rig[()], emulator.port[()]
-    move(emulator.calls, emulator.rig, now_ns)
+    move(emulator.fmu, emulator.rig, now_ns)
     if now_ns - port.heard_ns <= port.watchdog_ns:
         return
     for k in range(LEGS):

@@ -20,7 +20,7 @@ def test_the_linear_plant_is_casadis(model: Model, fmi: int) -> None:
     """About a lively state, as python-control gets it; poles and matrices by their names."""
     dynamics, table = model.dynamics(), model.table
     with FmuPlant(default_fmu(model, fmi), {}, 1e-3) as plant:
-        write_drive_mode(plant.calls, VELOCITY)
+        write_drive_mode(plant.handle, VELOCITY)
         legs = plant.bound.legs
         for cycle in range(100):
             plant.set("velocity_command", 0.02 * np.sin(0.01 * cycle + np.arange(legs)))

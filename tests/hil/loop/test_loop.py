@@ -11,6 +11,7 @@ from hil.realtime.clock import REAL, SCRIPTED, new_clock
 from hil.runs.simulation import SimulationConfig, prepared_loop
 from plant.dynamics.variables import BRAKE
 from plant.imu import imu_state, load_imu
+from plant.truth import TRUTH_LENGTHS
 
 MS = 1_000_000
 CONFIG = SimulationConfig(target="sines", duration=2.0)
@@ -147,9 +148,9 @@ def stops_within_limits(loop, records, off=1e-3):
     assert np.abs(reference[:, :, 1]).max() <= limits.velocity * (1.0 + 1e-9)
     assert np.abs(reference[:, :, 2]).max() <= limits.acceleration * (1.0 + 1e-9)
     assert (reference[:, :, 0] >= limits.stroke[:, 0]).all() and (reference[:, :, 0] <= limits.stroke[:, 1]).all()
-    assert np.abs(reference[0, :, 0] - stopping["truth"][0, 7:13]).max() < off
+    assert np.abs(reference[0, :, 0] - stopping["truth"][0, TRUTH_LENGTHS]).max() < off
     assert (reference[-1, :, 1:] == 0.0).all()
-    lengths = stopping["truth"][:, 7:13]
+    lengths = stopping["truth"][:, TRUTH_LENGTHS]
     assert np.abs(lengths[-1] - reference[-1, :, 0]).max() < off
     assert np.abs(lengths[-1] - lengths[-10]).max() < 0.1 * off
 
@@ -160,7 +161,7 @@ def test_the_end_of_a_motion_is_a_stop_within_the_limits_and_the_brakes():
         assert cause == loop.state["stopping"] == END_OF_MOTION
         assert records["stop"].nonzero()[0][0] == 1234 + loop.parameters["hold_cycles"]
         stops_within_limits(loop, records)
-        assert (loop.calls["mode"] == BRAKE).all()
+        assert (loop.fmu["mode"] == BRAKE).all()
 
 
 def test_too_many_missed_in_a_row_end_in_a_controlled_stop_and_fewer_do_not():

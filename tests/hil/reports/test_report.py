@@ -14,6 +14,7 @@ from hil.reports.run import write_report
 from hil.runs.simulation import SimulationConfig, simulate
 from plant.errors import InputError
 from plant.pose import rotation_angle, rotation_from_vector
+from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS
 
 CURVES = {"pose": 12, "errors": 12, "lengths": 12, "motion": 12, "drives": 18}
 FIGURES = ["mechanism", *CURVES]
@@ -96,9 +97,9 @@ def test_the_table_has_the_figures_of_the_summary(page, result):
 def test_curves_are_thinned_but_keep_their_extremes(traces, result):
     records = result.records
     panels = (
-        1e3 * (records["truth"][:, 7:13] - records["reference"][:, :, 0]),
+        1e3 * (records["truth"][:, TRUTH_LENGTHS] - records["reference"][:, :, 0]),
         1e3 * records["command"],
-        records["truth"][:, 13:19],
+        records["truth"][:, TRUTH_CURRENTS],
     )
     for leg in range(6):
         for (times, drawn), values in zip(curves(traces["drives"], f"leg {leg}"), panels, strict=True):
@@ -132,7 +133,7 @@ def test_the_mechanism_moves_on_legs_of_the_true_length(page, traces, result):
         np.testing.assert_allclose(tubes[0::3], 1e3 * result.mechanism.base_joints, atol=1e-4)
         np.testing.assert_array_equal(tubes[1::3], rods[0::3])
         lengths = np.linalg.norm(rods[1::3] - tubes[0::3], axis=1)
-        np.testing.assert_allclose(lengths, 1e3 * result.records["truth"][moment, 7:13], atol=1e-2)
+        np.testing.assert_allclose(lengths, 1e3 * result.records["truth"][moment, TRUTH_LENGTHS], atol=1e-2)
 
 
 def test_a_browser_draws_every_figure_without_an_error(report):

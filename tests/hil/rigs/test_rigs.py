@@ -410,7 +410,7 @@ def recording(path, faults=None, **changes):
     with prepared_loop(replace(CONFIG, **changes), np.zeros(4000, RECORD)) as loop:
         if faults is not None:
             rig = new_emulated(loop.mechanism, 1_000_000, 0, [fault(text) for text in faults])
-            loop.kind, loop.emulator = EMULATED_RIG, new_udp_emulator(loop.calls, loop.imu, rig, 1)
+            loop.kind, loop.emulator = EMULATED_RIG, new_udp_emulator(loop.fmu, loop.imu, rig, 1)
             loop.udp.socket["session"], loop.udp.socket["timeout_ns"] = 1, 1_000_000
             loop.parameters["command_delay"] = 1.0 / CONFIG.rate
         assert loop.follow(loop.end) == END_OF_MOTION

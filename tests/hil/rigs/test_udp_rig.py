@@ -606,7 +606,7 @@ def test_the_controller_takes_nothing_that_is_wrong(truthful):
 def test_the_rig_does_nothing_that_is_wrong():
     plant, imu, rig = _rig_of(EmulatorConfig(SimulationConfig(imu="ideal")), PERIOD, [])
     with plant:
-        emulator = new_udp_emulator(plant.calls, imu, rig, session=7)
+        emulator = new_udp_emulator(plant.handle, imu, rig, session=7)
         content = encode(COMMAND_DATAGRAM, kind=COMMAND, session=7, sequence=1, request=ENABLED, velocity=SPEEDS)
         emulator.command_bytes[: len(content)] = np.frombuffer(content, np.uint8)
         assert answer(emulator, len(content), 1_000_000) > 0

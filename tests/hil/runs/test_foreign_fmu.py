@@ -11,6 +11,7 @@ import pytest
 from hil.runs.simulation import SimulationConfig, SimulationStoppedError, simulate
 from plant.errors import InputError
 from plant.fmu.binding import Setting
+from plant.truth import TRUTH_CURRENTS
 from tests.plant.fmu.foreign import BINDING, BINDING_3, TRUTH
 
 MM, DEG = 1e-3, np.radians(1.0)
@@ -162,7 +163,7 @@ def test_the_payload_of_our_own_plant_changes_during_a_run():
     heavier = simulate(
         SimulationConfig(duration=1.0, imu="ideal", target="hold", settings=(Setting.parse("payload.mass=15@0.5"),))
     )
-    currents = np.abs(heavier.records["truth"][:, 13:19]).mean(axis=1)
+    currents = np.abs(heavier.records["truth"][:, TRUTH_CURRENTS]).mean(axis=1)
     before, after = (currents[np.abs(heavier.times - at) < 0.05].mean() for at in (0.4, 0.9))
     # The legs carry 13 kg and their own weight, and then 5 kg more.
     assert 1.25 < after / before < 5.0 / 13.0 + 1.05

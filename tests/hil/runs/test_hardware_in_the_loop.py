@@ -21,6 +21,7 @@ from hil.rigs.canopen.settings import DEFAULT_FILE
 from hil.rigs.udp.emulator import WATCHDOG_CODE
 from hil.runs.emulator import BusyError, ask
 from plant.errors import GoughError
+from plant.truth import TRUTH_LENGTHS
 
 MOTION = ("--target", "sines", "--rate", "500")
 PATIENT = ("--most-missed", "2000", "--mechanism", str(Path(__file__).with_name("patient.toml")))
@@ -166,7 +167,7 @@ def test_a_dry_run_reads_everything_and_moves_nothing(tmp_path):
     records = read(tmp_path / "x.mcap").records
     assert (records["command"] == 0.0).all() and (records["mode"] == 0).all() and (records["drive"] != FOLLOWING).all()
     assert np.isfinite(records["position"]).all()
-    assert np.abs(records["truth"][0, 7:13] - lengths).max() < 1e-4
+    assert np.abs(records["truth"][0, TRUTH_LENGTHS] - lengths).max() < 1e-4
 
 
 # ------------------------------------------------------------------------------------------------------------ it ends safely
@@ -290,7 +291,7 @@ def test_a_streamed_target_is_followed_until_it_goes_wrong(tmp_path, options, wo
     records = read(tmp_path / "x.mcap").records
     assert np.ptp(records["truth"][:, :3], axis=0).max() > 2e-3
     moved = records[records["mode"] == RUNNING]
-    assert np.abs(moved["truth"][:, 7:13] - moved["reference"][:, :, 0]).max() < 3e-3
+    assert np.abs(moved["truth"][:, TRUTH_LENGTHS] - moved["reference"][:, :, 0]).max() < 3e-3
     assert replay([tmp_path / "x.mcap"]).same
 
 

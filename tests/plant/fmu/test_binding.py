@@ -27,6 +27,7 @@ from plant.fmu.plant import (
     write_drive_modes,
 )
 from plant.pose import Array
+from plant.truth import TRUTH_LENGTHS
 from tests.plant.fmu.foreign import BINDING, TRUTH, edited
 
 Load = Callable[..., FmuPlant]
@@ -49,12 +50,12 @@ def load(foreign_fmu: Path, tmp_path: Path) -> Iterator[Load]:
 def move(plant: FmuPlant, cycles: int, period: float = 1e-3, mode: int = VELOCITY) -> Array:
     """Drive the plant; returns what its IMUs and the truth then are."""
     for _ in range(cycles):
-        assert write_drive_mode(plant.calls, mode) == 0
-        assert write_command(plant.calls, SPEEDS) == 0
-        assert advance(plant.calls, period) == 0
-    assert read_imus(plant.calls) == 0
-    assert read_truth(plant.calls) == 0
-    return np.hstack([plant.calls["imu"].ravel(), plant.calls["truth"]])
+        assert write_drive_mode(plant.handle, mode) == 0
+        assert write_command(plant.handle, SPEEDS) == 0
+        assert advance(plant.handle, period) == 0
+    assert read_imus(plant.handle) == 0
+    assert read_truth(plant.handle) == 0
+    return np.hstack([plant.handle["imu"].ravel(), plant.handle["truth"]])
 
 
 def without(table: str, text: str = BINDING) -> str:
@@ -70,20 +71,20 @@ def without(table: str, text: str = BINDING) -> str:
 def test_units_signs_and_order_are_the_loops(load: Load) -> None:
     plant = load()
     move(plant, 200)
-    calls = plant.calls
+    handle = plant.handle
     for imu in range(7):
         name = "top" if imu == 6 else f"leg{imu + 1}"
         for axis, letter in enumerate("xyz"):
             flipped = -1.0 if letter == "y" and imu < 6 else 1.0
             rate = flipped * np.radians(float(plant.get(f"{name}.gyro.{letter}")))
-            assert calls["imu"][0, imu, axis] == pytest.approx(rate, rel=1e-14, abs=1e-16)
-            assert calls["imu"][1, imu, axis] == pytest.approx(-9.80665 * float(plant.get(f"{name}.acc.{letter}")), rel=1e-14)
-    assert np.isnan(calls["imu"][2]).all()
-    np.testing.assert_allclose(calls["truth"][:3], [1e-3 * float(plant.get(f"pose.{axis}")) for axis in "xyz"], rtol=1e-14)
+            assert handle["imu"][0, imu, axis] == pytest.approx(rate, rel=1e-14, abs=1e-16)
+            assert handle["imu"][1, imu, axis] == pytest.approx(-9.80665 * float(plant.get(f"{name}.acc.{letter}")), rel=1e-14)
+    assert np.isnan(handle["imu"][2]).all()
+    np.testing.assert_allclose(handle["truth"][:3], [1e-3 * float(plant.get(f"pose.{axis}")) for axis in "xyz"], rtol=1e-14)
     # The extension declares its unit itself, and the binding adds the tube's 300 mm.
     lengths = [0.3 + 1e-3 * float(plant.get(f"servo{k}.extension")) for k in range(1, 7)]
-    np.testing.assert_allclose(calls["truth"][7:13], lengths, rtol=1e-14)
-    assert np.isnan(calls["truth"][13:]).all()
+    np.testing.assert_allclose(handle["truth"][TRUTH_LENGTHS], lengths, rtol=1e-14)
+    assert np.isnan(handle["truth"][13:]).all()
 
 
 def test_commands_reach_the_drives_and_the_pose_follows(load: Load) -> None:
@@ -92,24 +93,24 @@ def test_commands_reach_the_drives_and_the_pose_follows(load: Load) -> None:
     after = move(plant, 500)[-12:-6]
     # With its lag of 15 ms a drive is behind by 15 ms.
     np.testing.assert_allclose(after - before, (0.5 - 0.015) * SPEEDS, rtol=1e-9)
-    assert np.linalg.norm(plant.calls["imu"][1, 6]) == pytest.approx(9.81, abs=0.5)
+    assert np.linalg.norm(plant.handle["imu"][1, 6]) == pytest.approx(9.81, abs=0.5)
 
 
 def test_a_common_switch_is_on_while_any_drive_moves(load: Load) -> None:
     plant = load()
     for modes, expected in (([BRAKE] * 6, 0), ([VELOCITY] * 6, 1), ([BRAKE] * 5 + [VELOCITY], 1)):
-        plant.calls["mode"] = modes
-        assert write_drive_modes(plant.calls) == 0
+        plant.handle["mode"] = modes
+        assert write_drive_modes(plant.handle) == 0
         assert plant.get("servo.on") == expected
 
 
 def test_drives_without_a_switch_are_told_to_stand(load: Load) -> None:
     plant = load(without("drive_mode"))
     told = [f"servo{k}.retract" for k in range(1, 7)]
-    write_drive_mode(plant.calls, VELOCITY)
-    write_command(plant.calls, SPEEDS)
+    write_drive_mode(plant.handle, VELOCITY)
+    write_command(plant.handle, SPEEDS)
     np.testing.assert_allclose([float(plant.get(name)) for name in told], -1e3 * SPEEDS)
-    write_drive_mode(plant.calls, BRAKE)
+    write_drive_mode(plant.handle, BRAKE)
     assert [float(plant.get(name)) for name in told] == [0.0] * 6
 
 
@@ -120,8 +121,8 @@ def test_imus_that_are_not_there_read_nothing(load: Load) -> None:
     whole = load()
     move(plant, 10), move(whole, 10)
     assert plant.bound.imus == (0, 1, 2, 3, 4, 5)
-    np.testing.assert_array_equal(plant.calls["imu"][:2, :6], whole.calls["imu"][:2, :6])
-    assert np.isnan(plant.calls["imu"][:, 6]).all()
+    np.testing.assert_array_equal(plant.handle["imu"][:2, :6], whole.handle["imu"][:2, :6])
+    assert np.isnan(plant.handle["imu"][:, 6]).all()
 
 
 def test_imus_may_come_in_any_order(load: Load) -> None:
@@ -149,11 +150,11 @@ def test_a_planar_plant_has_its_pose_in_space(load: Load) -> None:
     tables.append("[position]\nvariables = ['pose.x', 'pose.y']\nunit = 'mm'")
     tables.append("[angle]\nvariables = 'pose.z'\nunit = 'deg'")
     plant = load("\n".join(tables))
-    read_imus(plant.calls), read_truth(plant.calls)
+    read_imus(plant.handle), read_truth(plant.handle)
     assert (plant.bound.legs, plant.bound.imus) == (3, (0, 1, 2, 6))
-    assert np.isfinite(plant.calls["imu"][:2, [0, 1, 2, 6]]).all() and np.isnan(plant.calls["imu"][:2, 3:6]).all()
+    assert np.isfinite(plant.handle["imu"][:2, [0, 1, 2, 6]]).all() and np.isnan(plant.handle["imu"][:2, 3:6]).all()
     half = np.radians(float(plant.get("pose.z"))) / 2.0
-    np.testing.assert_allclose(plant.calls["truth"][:7], [0, 0, 0, np.cos(half), 0, 0, np.sin(half)], atol=1e-15)
+    np.testing.assert_allclose(plant.handle["truth"][:7], [0, 0, 0, np.cos(half), 0, 0, np.sin(half)], atol=1e-15)
 
 
 def test_the_communication_step_divides_the_period(load: Load, foreign_fmu: Path) -> None:
@@ -161,9 +162,9 @@ def test_the_communication_step_divides_the_period(load: Load, foreign_fmu: Path
     for _ in range(5000):
         plant.step(1e-3)
     # A sum of so many steps would be off by 1e-12 s.
-    assert plant.calls["time"] == 10_000 * 0.0005
+    assert plant.handle["time"] == 10_000 * 0.0005
     plant.step(2e-3)
-    assert plant.calls["time"] == 10_004 * 0.0005
+    assert plant.handle["time"] == 10_004 * 0.0005
     message = (
         r"foreign.fmu cannot take a rate of 800 Hz: its binding sets a step of 0.0005 s, so the rate must be 2000 Hz divided"
     )
@@ -271,7 +272,7 @@ def test_settings_come_after_the_binding_and_at_their_time(load: Load) -> None:
     assert plant.get("servo.lag") == 0.03
     seen = []
     for _ in range(12):
-        assert advance(plant.calls, 1e-3) == 0
+        assert advance(plant.handle, 1e-3) == 0
         seen.append(float(plant.get("servo.lag")))
     assert seen == [0.03] * 4 + [0.05] * 6 + [0.5] * 2
 
@@ -343,13 +344,13 @@ def test_settings_are_read_from_text() -> None:
 def test_every_status_but_ok_ends_with_the_message_of_the_fmu(load: Load, status: int, ending: str) -> None:
     plant = load(BINDING, f"fault.status={status}", "fault.at=0.003")
     for _ in range(3):
-        assert advance(plant.calls, 1e-3) == 0
-    assert advance(plant.calls, 1e-3) & status
+        assert advance(plant.handle, 1e-3) == 0
+    assert advance(plant.handle, 1e-3) & status
     # The placeholders of the message are filled in.
     message = rf"foreign.fmu: a step {ending}: servo 3 is at 91.5 degrees after a while"
     assert re.fullmatch(message, str(plant.failure()))
     # After an error FMI allows nothing but the end, and after a fatal one not even that.
-    assert (read_imus(plant.calls) == 0) == (status < 3)
+    assert (read_imus(plant.handle) == 0) == (status < 3)
     plant.close()
 
 
@@ -372,12 +373,12 @@ def test_a_restored_state_goes_on_bit_for_bit(load: Load) -> None:
     saved = plant.state()
     first = move(plant, 60)
     plant.restore(saved)
-    assert plant.calls["time"] == 100 * 0.0005
+    assert plant.handle["time"] == 100 * 0.0005
     np.testing.assert_array_equal(move(plant, 60), first)
     other = load(BINDING, "servo.lag=0.1@0.08")
     other.restore(saved)
     np.testing.assert_array_equal(move(other, 60), first)
-    assert other.calls["time"] == 220 * 0.0005
+    assert other.handle["time"] == 220 * 0.0005
 
 
 def test_a_state_that_cannot_be_saved_or_is_none_is_an_error(load: Load, foreign_fmu: Path, tmp_path: Path) -> None:

@@ -383,18 +383,18 @@ def test_compiled_calls_do_what_fmpys_methods_do(hexapod: Mechanism, fmu_path: P
     with FmuPlant(fmu_path, hexapod.plant_parameters(), period) as plant:
         for cycle in range(200):
             command, mode = commands(cycle)
-            assert write_command(plant.calls, command) == 0
-            assert write_drive_mode(plant.calls, mode) == 0
+            assert write_command(plant.handle, command) == 0
+            assert write_drive_mode(plant.handle, mode) == 0
             slow.setFloat64([references["velocity_command"]], command.tolist())
             slow.setInt64([references["drive_mode"]], [mode] * 6)
-            assert advance(plant.calls, period) == 0
+            assert advance(plant.handle, period) == 0
             slow.doStep(cycle * period, period)
-            assert read_imus(plant.calls) == 0
-            assert read_truth(plant.calls) == 0
+            assert read_imus(plant.handle) == 0
+            assert read_truth(plant.handle) == 0
             expected = slow.getFloat64([references[name] for name in imu], nValues=63)
-            np.testing.assert_array_equal(plant.calls["imu"].ravel(), expected)
-            np.testing.assert_array_equal(plant.calls["truth"], slow.getFloat64([references[n] for n in truth], nValues=19))
-            assert plant.calls["time"] == (cycle + 1) * period
+            np.testing.assert_array_equal(plant.handle["imu"].ravel(), expected)
+            np.testing.assert_array_equal(plant.handle["truth"], slow.getFloat64([references[n] for n in truth], nValues=19))
+            assert plant.handle["time"] == (cycle + 1) * period
             assert plant.get("time") == slow.getFloat64([references["time"]])[0]
         assert np.ptp(plant.get("leg_length")) > 1e-4
         for variable in OUTPUTS:
@@ -410,12 +410,12 @@ def test_our_fmi_2_export_does_the_same_without_a_binding(make_plant: MakePlant,
         for cycle in range(200):
             command, mode = commands(cycle)
             for plant in (arrays, scalars):
-                write_drive_mode(plant.calls, mode)
-                write_command(plant.calls, command)
-                assert advance(plant.calls, 1e-3) == 0
-                assert read_imus(plant.calls) == read_truth(plant.calls) == 0
+                write_drive_mode(plant.handle, mode)
+                write_command(plant.handle, command)
+                assert advance(plant.handle, 1e-3) == 0
+                assert read_imus(plant.handle) == read_truth(plant.handle) == 0
             for buffer in ("imu", "truth"):
-                assert scalars.calls[buffer].tobytes() == arrays.calls[buffer].tobytes()
+                assert scalars.handle[buffer].tobytes() == arrays.handle[buffer].tobytes()
         np.testing.assert_array_equal(scalars.get("platform.inertia"), arrays.get("platform.inertia"))
         scalars.set("payload.center_of_mass", [0.0, 0.01, 0.1])
         assert scalars.get("payload.center_of_mass[2]") == 0.01
@@ -425,18 +425,18 @@ def test_our_planar_plant_needs_no_binding_either() -> None:
     with FmuPlant(default_fmu(PLANAR_MODEL), {}, 1e-3) as plant:
         assert (plant.bound.legs, plant.bound.imus) == (3, (0, 1, 2, 6))
         for _ in range(100):
-            write_drive_mode(plant.calls, VELOCITY)
-            write_command(plant.calls, np.array([0.02, -0.01, 0.0]))
-            assert advance(plant.calls, 1e-3) == read_imus(plant.calls) == read_truth(plant.calls) == 0
+            write_drive_mode(plant.handle, VELOCITY)
+            write_command(plant.handle, np.array([0.02, -0.01, 0.0]))
+            assert advance(plant.handle, 1e-3) == read_imus(plant.handle) == read_truth(plant.handle) == 0
         imus = plant.get("imu_angular_velocity"), plant.get("imu_specific_force"), plant.get("imu_magnetic_field")
-        np.testing.assert_array_equal(plant.calls["imu"][:, [0, 1, 2, 6]], imus)
-        assert np.isnan(plant.calls["imu"][:, 3:6]).all()
+        np.testing.assert_array_equal(plant.handle["imu"][:, [0, 1, 2, 6]], imus)
+        assert np.isnan(plant.handle["imu"][:, 3:6]).all()
         half = float(plant.get("angle")) / 2.0
         pose = [*plant.get("position"), 0.0, np.cos(half), 0.0, 0.0, np.sin(half)]
-        np.testing.assert_allclose(plant.calls["truth"][:7], pose, rtol=1e-15)
-        np.testing.assert_array_equal(plant.calls["truth"][7:10], plant.get("leg_length"))
-        np.testing.assert_array_equal(plant.calls["truth"][13:16], plant.get("current"))
-        assert np.isnan(plant.calls["truth"][[10, 11, 12, 16, 17, 18]]).all()
+        np.testing.assert_allclose(plant.handle["truth"][:7], pose, rtol=1e-15)
+        np.testing.assert_array_equal(plant.handle["truth"][7:10], plant.get("leg_length"))
+        np.testing.assert_array_equal(plant.handle["truth"][13:16], plant.get("current"))
+        assert np.isnan(plant.handle["truth"][[10, 11, 12, 16, 17, 18]]).all()
 
 
 @pytest.mark.parametrize("kind", ["Boolean", "UInt8", "Int16", "Int32", "UInt64", "Float64", "Float32"])
@@ -455,17 +455,17 @@ def test_drive_modes_of_any_type_are_packed_as_fmi_3_has_them(fmu_path: Path, tm
 
     function = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 5)(take)
     with FmuPlant(path, {}, 1e-3) as plant:
-        plant.calls["set_mode"] = ctypes.cast(function, ctypes.c_void_p).value
-        plant.calls["mode"] = [OPEN, BRAKE, VELOCITY, VELOCITY, BRAKE, OPEN]
-        assert write_drive_modes(plant.calls) == 0
+        plant.handle["set_mode"] = ctypes.cast(function, ctypes.c_void_p).value
+        plant.handle["mode"] = [OPEN, BRAKE, VELOCITY, VELOCITY, BRAKE, OPEN]
+        assert write_drive_modes(plant.handle) == 0
     assert seen == ([0, 0, 1, 1, 0, 0] if kind == "Boolean" else [0, 1, 2, 2, 1, 0])
 
 
 def test_setting_by_name_is_the_compiled_command(make_plant: MakePlant) -> None:
     fast, slow = make_plant(), make_plant()
     command = np.linspace(-0.1, 0.1, 6)
-    write_command(fast.calls, command)
-    write_drive_mode(fast.calls, VELOCITY)
+    write_command(fast.handle, command)
+    write_drive_mode(fast.handle, VELOCITY)
     slow.set("velocity_command", command)
     slow.set("drive_mode", [VELOCITY] * 6)
     for plant in (fast, slow):
@@ -476,11 +476,11 @@ def test_setting_by_name_is_the_compiled_command(make_plant: MakePlant) -> None:
 
 def test_compiled_calls_report_a_failure_by_status(make_plant: MakePlant) -> None:
     plant = make_plant()
-    assert write_command(plant.calls, np.full(6, np.inf)) == 0
-    assert advance(plant.calls, 1e-3) == 3
+    assert write_command(plant.handle, np.full(6, np.inf)) == 0
+    assert advance(plant.handle, 1e-3) == 3
     assert str(plant.failure()) == "gough_plant.fmu: a step failed: an input is not finite"
-    plant.calls["sensed"]["references"] = 10_000
-    assert read_imus(plant.calls) == 3
+    plant.handle["sensed"]["references"] = 10_000
+    assert read_imus(plant.handle) == 3
 
 
 def test_plants_do_not_share_their_state(make_plant: MakePlant) -> None:
@@ -504,7 +504,7 @@ def test_a_reset_fmu_starts_over(make_plant: MakePlant, hexapod: Mechanism) -> N
     plant._instance.fmu.reset()
     plant._instance.fmu.enterInitializationMode()
     plant._instance.fmu.exitInitializationMode()
-    plant.calls["time"] = 0.0
+    plant.handle["time"] = 0.0
     np.testing.assert_array_equal(plant.get("position"), first)
     assert plant.get("payload.mass") == hexapod.plant["payload.mass"]
     plant.step(1e-3)

@@ -159,8 +159,8 @@ SWEEPS = (
 def restart(plant: FmuPlant, parameters: Mapping[str, Array]) -> None:
     """Initialise a loaded plant anew."""
     plant._instance.fmu.reset()
-    plant.calls["time"] = plant.calls["since"] = 0.0
-    plant.calls["steps"] = 0
+    plant.handle["time"] = plant.handle["since"] = 0.0
+    plant.handle["steps"] = 0
     for name, value in parameters.items():
         plant.set(name, value)
     plant._instance.initialize()
@@ -214,11 +214,11 @@ def run_at_random(plant: FmuPlant, random: Generator, sweep: Sweep) -> tuple[Arr
         plant.set("external_wrench.torque", wrench[forces:].reshape(torque.shape) * np.sin(17.0 * t))
         rows = [reader.read()]
         for _ in range(held):
-            assert advance(plant.calls, STEP_S) == 0, plant.messages[-1]
+            assert advance(plant.handle, STEP_S) == 0, plant.messages[-1]
             rows.append(reader.read())
         values = np.array(rows)
-        assert read_imus(plant.calls) == 0
-        assert np.isfinite(values).all() and np.isfinite(plant.calls["imu"][:, sensed]).all()
+        assert read_imus(plant.handle) == 0
+        assert np.isfinite(values).all() and np.isfinite(plant.handle["imu"][:, sensed]).all()
         if table is SPATIAL:
             assert np.abs(np.linalg.norm(values[:, len(energies) :], axis=1) - 1.0).max() < 1e-14
         energy, powers = values[:, :2].sum(axis=1), values[:, 2 : len(energies)]
