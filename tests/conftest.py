@@ -1,5 +1,6 @@
 """Fixtures that all rooms share."""
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,10 @@ settings.load_profile("gough")
 
 # For `--hypothesis-profile=thorough`: tests that follow the profile's number of examples take their time.
 settings.register_profile("thorough", max_examples=10_000, deadline=None)
+
+# A session in the background ignores these, and so would the processes of its tests.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGQUIT, signal.SIG_DFL)
 
 SHARED_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 

@@ -69,12 +69,22 @@ def state_of(control):
 
 
 def started(at, control, *options, rig="udp"):
-    """A run whose drives follow."""
+    """A run whose drives follow, and move."""
     process = gough("run", "--rig", rig, "--rig-at", at, *MOTION, *PATIENT, "--duration", 60, *options)
-    wait_for(lambda: process.poll() is not None or state_of(control)["drive"] == [FOLLOWING] * 6)
+    wait_for(lambda: process.poll() is not None or moves(state_of(control)))
     assert process.poll() is None, process.communicate()
-    time.sleep(1.0)
     return process
+
+
+def moves(state):
+    return state["drive"] == [FOLLOWING] * 6 and np.abs(state["velocity"]).max() > 2e-3
+
+
+def loop_of(run):
+    """The process of a run's loop: the first one that it has started."""
+    children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
+    assert children, finished(run)
+    return int(children[0])
 
 
 def finished(process):
@@ -176,8 +186,7 @@ def test_a_dry_run_reads_everything_and_moves_nothing(tmp_path):
 def test_when_the_loop_is_killed_the_drives_stop_by_themselves(tmp_path):
     with emulated() as (_, at, control):
         run = started(at, control)
-        loop = int(subprocess.run(["pgrep", "-P", str(run.pid)], capture_output=True, text=True).stdout.split()[0])
-        os.kill(loop, signal.SIGKILL)
+        os.kill(loop_of(run), signal.SIGKILL)
         wait_for(lambda: state_of(control)["drive"] == [FAULTY] * 6, 10.0)
         time.sleep(0.2)
         state = state_of(control)
@@ -191,8 +200,7 @@ def test_when_the_loop_is_killed_the_drives_stop_by_themselves(tmp_path):
 def test_when_the_loop_is_killed_canopen_drives_stop_by_their_heartbeat(canopen_file):
     with emulated("--bus", "canopen", at=str(canopen_file)) as (_, at, control):
         run = started(at, control, "--rate", 250, rig="canopen")
-        loop = int(subprocess.run(["pgrep", "-P", str(run.pid)], capture_output=True, text=True).stdout.split()[0])
-        os.kill(loop, signal.SIGKILL)
+        os.kill(loop_of(run), signal.SIGKILL)
         wait_for(lambda: FOLLOWING not in state_of(control)["drive"], 10.0)
         time.sleep(0.5)
         state = state_of(control)
