@@ -1,8 +1,7 @@
-"""What the whole-mechanism filter is worth after a self-calibration from raw IMUs, beside leg filters and refined pose.
+"""Evaluation of the whole-mechanism filter after a self-calibration from raw IMUs, beside leg filters and refined pose.
 
-Every seed is a rig of its own: its IMUs are calibrated on it (`hil.calibration.rig_calibration`), and then its platform is
-moved as prescribed (`plant.dynamics.imposed`), beyond what the actuators could follow. The estimator knows the joints as the
-calibration has found them.
+Every seed is a rig of its own. Its IMUs are calibrated on it (`hil.calibration.drive`). Then its platform moves as prescribed
+(`plant.dynamics.imposed`), beyond what the actuators could follow. The estimator uses the joints that the calibration found.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,14 +19,25 @@ from controller.cycle import ALL_IMUS, STATE, check_rate, cycle_parameters
 from controller.settings import control_settings, sensor_settings
 from hil.calibration.rig_calibration import Knowledge, calibrate_rig
 from hil.runs.simulation import FUSIONS, SimulationConfig, simulate
-from hil.studies.fusion_comparison import LEARNING_S, LEGS_ALONE, REFINED, WHOLE, Found, fuse, measure_all, pose_errors, read
+from hil.studies.fused_track import (
+    LEARNING_S,
+    LEGS_ALONE,
+    REFINED,
+    WHOLE,
+    PoseErrors,
+    PoseTrack,
+    fuse,
+    measure_all,
+    poses_of,
+    read,
+)
 from plant.compiled import Record
 from plant.dynamics.imposed import ImposedMotion, impose
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import InputError, UnknownNameError
 from plant.imu import imu_state, load_imu
 from plant.mechanism import LEGS, Mechanism, load_spatial
-from plant.pose import Array, vector_from_rotation
+from plant.pose import Array
 
 MOTIONS = ("static", "0.5", "1", "2", "mixed")
 SECTIONS = ("motions", "faults", "start", "drift", "follow", "cost")
@@ -37,7 +47,7 @@ _FAULT_S = 15.0
 _START_S, _WATCHED_S = 1.5, 3.0
 _START_HZ = (0.2, 2.0)
 _STARTED_M, _STARTED_RAD = 1e-3, np.radians(0.2)
-"""A start has succeeded if the errors stay below these from then on."""
+"""A start succeeds if the errors stay below these after `_START_S`."""
 
 _CHUNK_S = 60.0
 _FOLLOW_S, _FOLLOWING = 60.0, "whole"
@@ -47,19 +57,19 @@ _CALIBRATED_IMU = "mpu9150-calibrated"
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """What to evaluate.
+    """Configuration of an evaluation.
 
     Attributes:
         mechanism: preset or TOML file.
         imu: preset of the raw IMUs' imperfections.
         fusion: a key of `FUSIONS` with a whole-mechanism filter.
         rate: samples per second [Hz].
-        joint_error: standard deviation of each coordinate of the joints [m], in half of the motions; in the others it is 0.
+        joint_error: standard deviation of each coordinate of the joints [m] in half of the motions; 0 in the others.
         seeds: one for each rig.
         starts: number of starts in motion.
-        still: of the platform that stands still [s].
-        target: motion or CSV file that calibrated IMUs follow in the closed loop.
-        only: sections, of `SECTIONS`.
+        still: time for which the platform stands still [s].
+        target: motion or CSV file that the closed loop follows with calibrated IMUs.
+        only: sections to run, of `SECTIONS`.
     """
 
     mechanism: str = "hexapod"
@@ -90,7 +100,7 @@ class EvaluationConfig:
 
 @dataclass(frozen=True, eq=False)
 class _Rig:
-    """A rig that has been calibrated: the mechanism as it is built and as the controller knows it."""
+    """A calibrated rig: its mechanism as built, and as the controller knows it."""
 
     config: EvaluationConfig
     seed: int
@@ -106,7 +116,7 @@ class _Rig:
         return cycle_parameters(self.known, self.config.rate, control, fusion, ALL_IMUS, errors, self.calibration)
 
     def move(self, kind: str, duration: float, seed: int) -> tuple[ImposedMotion, Array]:
-        """A motion of this rig, and what its raw IMUs read."""
+        """A motion of this rig, and the samples of its raw IMUs."""
         motion = impose(self.built, kind, duration, self.config.rate, seed)
         return motion, read(motion, load_imu(self.config.imu), self.config.rate, self.seed)
 
@@ -124,11 +134,11 @@ def evaluate(config: EvaluationConfig, progress: Callable[[str, float], None] = 
     """Evaluate the fusion.
 
     Args:
-        config: what to evaluate.
-        progress: called with what is under way and the share of it that is done.
+        config: of the evaluation.
+        progress: called with the name of what is under way and the share of it that is done.
 
     Returns:
-        The figures in SI units by section, those of `SECTIONS` and `calibration`; `config` and `version`.
+        The figures in SI units by section (`SECTIONS` and `calibration`), and `config` and `version`.
 
     Raises:
         GoughError: something in the configuration cannot be used.
@@ -180,71 +190,49 @@ def _of_calibrations(rigs: Sequence[_Rig]) -> dict[str, Any]:
     return figures | {"least_improvement": least}
 
 
-class _Errors:
-    """Mean squares and NEES of runs, pooled."""
-
-    def __init__(self) -> None:
-        self._rows: list[tuple[float, float, float]] = []
-
-    def add(self, errors: Array, information: Array) -> None:
-        """Errors (N, 6) of poses, and the inverse (N, 6, 6) of their covariances."""
-        squares = errors.reshape(-1, 2, 3) ** 2
-        nees = float(np.einsum("ni,nij,nj->n", errors, information, errors).mean())
-        self._rows.append((*squares.sum(axis=2).mean(axis=0), nees))
-
-    def figures(self) -> dict[str, float]:
-        """RMS over all, that of the worst run, and mean NEES."""
-        squares, nees = np.array(self._rows)[:, :2], np.array(self._rows)[:, 2]
-        position, rotation = np.sqrt(squares.mean(axis=0))
-        worst_position, worst_rotation = np.sqrt(squares.max(axis=0))
-        return {
-            "position_rms": float(position),
-            "rotation_rms": float(rotation),
-            "worst_position_rms": float(worst_position),
-            "worst_rotation_rms": float(worst_rotation),
-            "nees": float(nees.mean()),
-        }
+def _figures(errors: PoseErrors) -> dict[str, Any]:
+    return errors.figures() | errors.worst()
 
 
-def _add_late(found: Found, motion: ImposedMotion, rate: float, refined: _Errors, whole: _Errors) -> None:
-    """Add the errors after the time to learn."""
-    late = slice(round(LEARNING_S * rate), None)
-    information = found.information[late], np.linalg.inv(found.covariances[late])
-    for step, errors, inverse in zip((REFINED, WHOLE), (refined, whole), information, strict=True):
-        errors.add(pose_errors(found.positions[step], found.rotations[step], motion)[late], inverse)
+def _late(rate: float) -> slice:
+    """The samples after the time to learn."""
+    return slice(round(LEARNING_S * rate), None)
 
 
 def _of_motions(rigs: Sequence[_Rig], progress: Callable[[float], None]) -> dict[str, Any]:
-    """By motion, errors of the refined pose and of the whole-mechanism filter."""
+    """Errors of the refined pose and of the whole-mechanism filter, by motion."""
     figures: dict[str, Any] = {}
     for m, kind in enumerate(MOTIONS):
-        refined, whole = _Errors(), _Errors()
+        pooled = {"refined": PoseErrors(), "whole": PoseErrors()}
         for i, rig in enumerate(rigs):
             motion, raw = rig.move(kind, _MOTION_S, rig.seed)
-            _add_late(fuse(rig.parameters(), raw), motion, rig.config.rate, refined, whole)
+            fused, late = fuse(rig.parameters(), raw), _late(rig.config.rate)
+            for name, step in (("refined", REFINED), ("whole", WHOLE)):
+                pooled[name].add(fused.track(step).at(late), poses_of(motion, late))
             progress((m + (i + 1) / len(rigs)) / len(MOTIONS))
-        figures[kind] = {"refined": refined.figures(), "whole": whole.figures()}
+        figures[kind] = {name: _figures(errors) for name, errors in pooled.items()}
     return figures
 
 
 def _of_faults(rigs: Sequence[_Rig], progress: Callable[[float], None]) -> dict[str, Any]:
-    """At 1 Hz, errors of the whole-mechanism filter with all IMUs, without one of a leg, another one for each seed, and without
-    the platform's; and their ratios to that with all.
+    """Errors of the whole-mechanism filter at 1 Hz with all IMUs, without one leg's (another one for each seed), and without
+    the platform's; and their ratios to those with all.
     """
     cases: dict[str, Callable[[_Rig], list[int]]] = {
         "none": lambda rig: [],
         "leg": lambda rig: [rig.seed % LEGS],
         "platform": lambda rig: [PLATFORM_IMU],
     }
-    pooled = {name: _Errors() for name in cases}
+    pooled = {name: PoseErrors() for name in cases}
     for i, rig in enumerate(rigs):
         motion, raw = rig.move("1", _MOTION_S, rig.seed)
+        late = _late(rig.config.rate)
         for name, dead in cases.items():
             broken = raw.copy()
             broken[round(_FAULT_S * rig.config.rate) :, :, dead(rig)] = np.nan
-            _add_late(fuse(rig.parameters(), broken), motion, rig.config.rate, _Errors(), pooled[name])
+            pooled[name].add(fuse(rig.parameters(), broken).track(WHOLE).at(late), poses_of(motion, late))
         progress((i + 1) / len(rigs))
-    figures: dict[str, Any] = {name: errors.figures() for name, errors in pooled.items()}
+    figures: dict[str, Any] = {name: _figures(errors) for name, errors in pooled.items()}
     for name in ("leg", "platform"):
         for key in ("position_rms", "rotation_rms"):
             figures[name][f"{key}_ratio"] = figures[name][key] / figures["none"][key]
@@ -252,69 +240,63 @@ def _of_faults(rigs: Sequence[_Rig], progress: Callable[[float], None]) -> dict[
 
 
 def _of_starts(rigs: Sequence[_Rig], progress: Callable[[float], None]) -> dict[str, Any]:
-    """Starts in the middle of a motion at a random frequency: how many have the whole-mechanism filter's pose in time."""
+    """How many starts in the middle of a motion, at a random frequency, give the whole-mechanism filter's pose in time."""
     config, random = rigs[0].config, np.random.default_rng(0)
-    starts, succeeded, largest = config.starts, 0, np.zeros(2)
-    for n in range(starts):
+    due, succeeded, largest = round(_START_S * config.rate), 0, np.zeros(2)
+    for n in range(config.starts):
         rig, frequency = rigs[n % len(rigs)], random.uniform(*_START_HZ)
         motion, raw = rig.move(f"{frequency:.3f}", _WATCHED_S, n)
-        due = round(_START_S * config.rate)
-        state: Record = np.zeros((), STATE)
-        parameters = rig.parameters()
+        state, parameters = np.zeros((), STATE), rig.parameters()
         fuse(parameters, raw[:due], state)
         in_time = bool(state["filter_trusted"])
-        after = fuse(parameters, raw[due:], state)
-        errors = pose_errors(after.positions[WHOLE], after.rotations[WHOLE], _part(motion, due))
+        track = fuse(parameters, raw[due:], state).track(WHOLE)
+        errors = track.errors(poses_of(motion, slice(due, None)))
         worst = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2).max(axis=0)
         largest = np.maximum(largest, worst)
         succeeded += in_time and bool(state["filter_trusted"]) and bool((worst < (_STARTED_M, _STARTED_RAD)).all())
-        progress((n + 1) / starts)
-    return {"starts": starts, "succeeded": succeeded, "position_max": float(largest[0]), "rotation_max": float(largest[1])}
-
-
-def _part(motion: ImposedMotion, first: int) -> ImposedMotion:
-    return ImposedMotion(motion.times[first:], motion.positions[first:], motion.rotations[first:], motion.signals[first:])
+        progress((n + 1) / config.starts)
+    position, rotation = largest.tolist()
+    return {"starts": config.starts, "succeeded": succeeded, "position_max": position, "rotation_max": rotation}
 
 
 def _of_drift(rigs: Sequence[_Rig], progress: Callable[[float], None]) -> dict[str, Any]:
-    """A platform that stands still for long: errors by minute."""
+    """Errors by minute while the platform stands still for long."""
     config = rigs[0].config
     chunks = int(np.ceil(config.still / _CHUNK_S))
-    pooled = [_Errors() for _ in range(chunks)]
+    pooled = [PoseErrors() for _ in range(chunks)]
     for i, rig in enumerate(rigs):
         motion = impose(rig.built, "static", min(_CHUNK_S, config.still), config.rate, rig.seed)
         imu, raw = imu_state(load_imu(config.imu), rig.seed, 1.0 / config.rate), np.empty_like(motion.signals)
         parameters, state = rig.parameters(), np.zeros((), STATE)
         for chunk in range(chunks):
             measure_all(imu, motion.signals, raw)
-            found = fuse(parameters, raw, state)
-            late = slice(round(LEARNING_S * config.rate) if chunk == 0 else 0, None)
-            errors = pose_errors(found.positions[WHOLE], found.rotations[WHOLE], motion)[late]
-            pooled[chunk].add(errors, np.linalg.inv(found.covariances[late]))
+            counted = slice(None) if chunk else _late(config.rate)
+            pooled[chunk].add(fuse(parameters, raw, state).track(WHOLE).at(counted), poses_of(motion, counted))
             progress((i + (chunk + 1) / chunks) / len(rigs))
-    return {"minutes": [errors.figures() for errors in pooled]}
+    return {"minutes": [_figures(errors) for errors in pooled]}
 
 
 def _of_following(config: EvaluationConfig, progress: Callable[[float], None]) -> dict[str, Any]:
     """Errors of the estimate with calibrated IMUs while the closed loop follows a target."""
-    pooled = _Errors()
+    pooled = PoseErrors()
     for i, seed in enumerate(config.seeds):
         run = simulate(
             SimulationConfig(
                 config.mechanism, config.target, _FOLLOW_S, config.rate, _CALIBRATED_IMU, seed=seed, fusion=_FOLLOWING
             )
         )
-        late = run.times >= LEARNING_S
-        turned = vector_from_rotation(run.records["rotation"] @ np.swapaxes(run.true_rotations, 1, 2))
-        errors = np.concatenate([run.records["position"] - run.true_positions, turned], axis=1)[late]
-        pooled.add(errors, np.linalg.inv(run.records["covariance"][late].astype(float)))
+        late, records = run.times >= LEARNING_S, run.records
+        covariances = records["covariance"].astype(float)
+        track = PoseTrack(records["position"], records["rotation"], covariances=covariances)
+        pooled.add(track.at(late), PoseTrack(run.true_positions, run.true_rotations).at(late))
         progress((i + 1) / len(config.seeds))
-    return {"target": config.target, "fusion": _FOLLOWING, "imu": _CALIBRATED_IMU} | pooled.figures()
+    return {"target": config.target, "fusion": _FOLLOWING, "imu": _CALIBRATED_IMU} | _figures(pooled)
 
 
 def _of_cost(config: EvaluationConfig, progress: Callable[[float], None]) -> dict[str, Any]:
-    """Microseconds of the leg filters and of each whole-mechanism filter in a cycle: mean, and the most that a cycle takes
-    because of it, which is the greatest over the cycles of the least over repetitions; what is more is the machine's.
+    """Microseconds that the leg filters and each whole-mechanism filter take in a cycle, mean and greatest.
+
+    The least of several repetitions counts for each cycle: all beyond it comes from the machine.
     """
     mechanism, model = load_spatial(config.mechanism), load_imu(_CALIBRATED_IMU)
     motion = impose(mechanism, "1", _COST_S, config.rate, 0)

@@ -1,15 +1,15 @@
 """Tuning of the noise that the fusion assumes, by the consistency of its estimators on simulated motions.
 
-An estimator is consistent if its errors are as large as its covariance says: their normalised square (NEES) is then on average
-the number of their components. The noise of each estimator is scaled until it is, but not further than its errors stay as
-small as they were; what consistency leaves open is chosen for the least errors. The simulated joints are where the mechanism's
-file says, so what a rig's joints are off by is not in what is found.
+An estimator is consistent if its errors are as large as its covariance says: the mean of their normalised square (NEES) then
+equals the number of their components. The noise of each estimator is scaled until it is consistent, unless its errors grow
+before. Settings that consistency leaves open minimise the errors. The simulated joints lie exactly where the mechanism's file
+says, so the result does not allow for wrong joints.
 """
 
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib.metadata import version
 from typing import Any
@@ -23,8 +23,8 @@ from scipy.stats import chi2
 from controller.cycle import check_rate, cycle_parameters
 from controller.settings import FusionSettings, control_settings, sensor_settings
 from hil.runs.simulation import FUSIONS
-from hil.studies.fusion_comparison import REFINED, WHOLE, Found, fuse, pose_errors, read
-from plant.dynamics.imposed import ImposedMotion, impose
+from hil.studies.fused_track import REFINED, WHOLE, FusedTrack, PoseTrack, fuse, poses_of, read
+from plant.dynamics.imposed import impose
 from plant.errors import InputError
 from plant.imu import load_imu
 from plant.mechanism import LEGS, Mechanism, load_spatial, mechanism_text
@@ -34,27 +34,27 @@ MOTIONS = ("static", "mixed", "1")
 """As `plant.dynamics.imposed.impose` has them."""
 
 DURATION_S, SETTLING_S = 16.0, 8.0
-"""Of a run, and of its first part, which does not count."""
+"""Durations of a run, and of its first part, which does not count."""
 
 _SAMPLE_S = 0.05
-"""Between the samples that count; errors are nearly the same from one cycle to the next."""
+"""Time between the samples that count; errors hardly change from one cycle to the next."""
 
 _MOST_WORSE = 1.02
-"""By which share errors may grow for consistency's sake."""
+"""Factor up to which errors may grow for the sake of consistency."""
 
 _REACH = np.log(4.0)
 _COARSE, _FINE = 0.3, 0.02
-"""How far a noise is looked for, and how exactly: coarsely where errors are least and so flat; logarithms of factors."""
+"""Range and tolerances of a search for a noise, as logarithms of factors; coarse at the least errors, where they are flat."""
 
 _DIGITS = 4
 
 _MOST_LEG_ERROR = np.radians(5.0)
-"""RMS beyond which errors are not those of noise."""
+"""RMS up to which noise can explain the errors."""
 
 
 @dataclass(frozen=True)
 class TuningConfig:
-    """What to tune.
+    """Configuration of a tuning.
 
     Attributes:
         mechanism: preset or TOML file.
@@ -76,7 +76,7 @@ class TuningConfig:
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """How an estimator did in M runs.
+    """Errors and consistency of an estimator in M runs.
 
     Attributes:
         nees: (M,), the mean of each run.
@@ -88,7 +88,7 @@ class Consistency:
 
     @classmethod
     def pooled(cls, runs: Sequence[tuple[float, Array]]) -> "Consistency":
-        """Of runs with these mean NEES and mean squares."""
+        """Pool runs, each given by its mean NEES and its mean squares."""
         nees, squares = zip(*runs, strict=True)
         return cls(np.array(nees), np.sqrt(np.mean(squares, axis=0)))
 
@@ -97,21 +97,22 @@ class Consistency:
         return {"nees": float(self.nees.mean()), "rms": self.rms.tolist()}
 
 
-Errors = Callable[[Mechanism, Found, slice, ImposedMotion], tuple[Array, Array]]
-"""Errors (N, s, n) of s independent estimates with n components, and their covariances (N, s, n, n), in the samples that count,
-at which the true motion is given."""
+Errors = Callable[[Mechanism, FusedTrack, slice, PoseTrack], tuple[Array, Array]]
+"""A function of mechanism, fused track, counted samples and true poses in these.
+
+Returns errors (N, s, n) of s independent estimates with n components, and their covariances (N, s, n, n)."""
 
 
 @dataclass(frozen=True)
 class Estimator:
-    """What is to be consistent.
+    """An estimator that is tuned.
 
     Attributes:
-        errors: what it gets wrong.
-        components: of an error, and so the NEES that is consistent.
-        parts: how many components in a row have a common RMS.
-        series: independent estimates in a run.
-        whole: which errors of the IMUs the whole-mechanism filter estimates, where it is the one; else None.
+        errors: its errors and covariances.
+        components: of an error; a consistent NEES equals this number.
+        parts: number of groups of components that have an RMS each.
+        series: number of independent estimates in a run.
+        whole: errors of the IMUs that the whole-mechanism filter estimates; None for other estimators.
     """
 
     errors: Errors
@@ -120,28 +121,28 @@ class Estimator:
     series: int = 1
     whole: str | None = None
 
-    def judge(self, mechanism: Mechanism, found: Found, late: slice, truth: ImposedMotion) -> tuple[float, Array]:
+    def judge(self, mechanism: Mechanism, fused: FusedTrack, late: slice, truth: PoseTrack) -> tuple[float, Array]:
         """Mean NEES and mean squares of the parts in a run."""
-        errors, covariances = self.errors(mechanism, found, late, truth)
+        errors, covariances = self.errors(mechanism, fused, late, truth)
         n = self.components
         nees = NEES(errors.reshape(-1, n), np.zeros(n), covariances.reshape(-1, n, n))
         squares = np.sum(errors.reshape(*errors.shape[:2], self.parts, -1) ** 2, axis=3)
         return float(np.mean(nees)), squares.mean(axis=(0, 1))
 
     def bounds(self, runs: int) -> tuple[float, float]:
-        """Between which the mean NEES of so many runs is with 95 %, if the estimator is consistent.
+        """Bounds that hold the mean NEES of so many runs with 95 % if the estimator is consistent.
 
-        A run counts once, however long it is: the IMUs' constant errors are the same all along.
+        A run counts once, however long it is: the IMUs' errors are constant in it.
         """
         count = self.series * runs
         low, high = chi2.ppf((0.025, 0.975), self.components * count) / count
         return float(low), float(high)
 
 
-def _leg_errors(mechanism: Mechanism, found: Found, late: slice, truth: ImposedMotion) -> tuple[Array, Array]:
+def _leg_errors(mechanism: Mechanism, fused: FusedTrack, late: slice, truth: PoseTrack) -> tuple[Array, Array]:
     """Of the two angles of each leg [rad]."""
     vectors = truth.positions[:, None] + mechanism.platform_joints @ np.swapaxes(truth.rotations, 1, 2) - mechanism.base_joints
-    return _joint_angles(mechanism, found.directions[late]) - _joint_angles(mechanism, vectors), found.leg_covariances[late]
+    return _joint_angles(mechanism, fused.directions[late]) - _joint_angles(mechanism, vectors), fused.leg_covariances[late]
 
 
 def _joint_angles(mechanism: Mechanism, vectors: Array) -> Array:
@@ -150,25 +151,23 @@ def _joint_angles(mechanism: Mechanism, vectors: Array) -> Array:
     return np.stack([np.arctan2(-y, z), np.arctan2(x, np.hypot(y, z))]).T
 
 
-def _tilt_errors(mechanism: Mechanism, found: Found, late: slice, truth: ImposedMotion) -> tuple[Array, Array]:
+def _tilt_errors(mechanism: Mechanism, fused: FusedTrack, late: slice, truth: PoseTrack) -> tuple[Array, Array]:
     """Of the vertical, along two axes across it [rad]."""
-    verticals = found.verticals[late] / np.linalg.norm(found.verticals[late], axis=1, keepdims=True)
+    verticals = fused.verticals[late] / np.linalg.norm(fused.verticals[late], axis=1, keepdims=True)
     across = np.linalg.svd(verticals[:, None])[2][:, 1:]
     errors = across @ (mechanism.up_in_base @ truth.rotations - verticals)[:, :, None]
-    covariances = across @ found.vertical_covariances[late] @ np.swapaxes(across, 1, 2)
+    covariances = across @ fused.vertical_covariances[late] @ np.swapaxes(across, 1, 2)
     return errors[:, None, :, 0], covariances[:, None]
 
 
-def _refined_errors(mechanism: Mechanism, found: Found, late: slice, truth: ImposedMotion) -> tuple[Array, Array]:
+def _refined_errors(mechanism: Mechanism, fused: FusedTrack, late: slice, truth: PoseTrack) -> tuple[Array, Array]:
     """Of the refined pose [m, rad]."""
-    errors = pose_errors(found.positions[REFINED, late], found.rotations[REFINED, late], truth)
-    return errors[:, None], np.linalg.inv(found.information[late])[:, None]
+    return fused.track(REFINED).at(late).errors(truth)[:, None], np.linalg.inv(fused.information[late])[:, None]
 
 
-def _whole_errors(mechanism: Mechanism, found: Found, late: slice, truth: ImposedMotion) -> tuple[Array, Array]:
+def _whole_errors(mechanism: Mechanism, fused: FusedTrack, late: slice, truth: PoseTrack) -> tuple[Array, Array]:
     """Of the whole-mechanism filter's pose [m, rad]."""
-    errors = pose_errors(found.positions[WHOLE, late], found.rotations[WHOLE, late], truth)
-    return errors[:, None], found.covariances[late][:, None]
+    return fused.track(WHOLE).at(late).errors(truth)[:, None], fused.covariances[late][:, None]
 
 
 ESTIMATORS = {
@@ -179,21 +178,21 @@ ESTIMATORS = {
 }
 
 Evaluate = Callable[[float], Consistency]
-"""What becomes of an estimator if its noise is multiplied by exp of the argument."""
+"""Consistency of an estimator whose noise is multiplied by exp of the argument."""
 
 
 def _seek_consistency(evaluate: Evaluate, components: int) -> float:
-    """Where the mean NEES is right, or on the way there the errors become too large, or the reach ends."""
+    """The change that makes the mean NEES right, or a smaller one where errors grow too large or the reach ends before."""
     start = evaluate(0.0)
     side = 1.0 if start.nees.mean() > components else -1.0
 
     def excess(change: float) -> float:
-        """Negative as long as there is further to go."""
+        """Negative while the search should go further."""
         there = evaluate(change)
         beyond = side * np.log(components / there.nees.mean())
         worse = np.log((there.rms / start.rms).max() / _MOST_WORSE)
         left = max(beyond, worse)
-        # That is the end of the search.
+        # Close enough: zero ends the search.
         return 0.0 if abs(left) < _FINE / 2.0 else float(left)
 
     end = side * _REACH
@@ -201,7 +200,7 @@ def _seek_consistency(evaluate: Evaluate, components: int) -> float:
 
 
 def _seek_least_errors(evaluate: Evaluate, components: int) -> float:
-    """Where the product of the errors' RMS is least."""
+    """The change with the least product of the errors' RMS."""
     found = minimize_scalar(
         lambda change: np.log(evaluate(change).rms).sum(),
         bounds=(-_REACH, _REACH),
@@ -213,18 +212,14 @@ def _seek_least_errors(evaluate: Evaluate, components: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """A simulated motion: raw readings of its IMUs (N, 3, 7, 3), and the truth in the samples that count."""
+    """A simulated motion: the raw samples of its IMUs (N, 3, 7, 3), and the true poses in the samples that count."""
 
     raw: Array
-    truth: ImposedMotion
-
-
-def _part(motion: ImposedMotion, samples: slice) -> ImposedMotion:
-    return ImposedMotion(*(getattr(motion, field.name)[samples].copy() for field in fields(motion)))
+    truth: PoseTrack
 
 
 class _Runs:
-    """Every kind of motion, as often as there are seeds."""
+    """Every kind of motion with every seed."""
 
     def __init__(self, config: TuningConfig, mechanism: Mechanism, progress: Callable[[float], None]) -> None:
         self.mechanism, self.rate = mechanism, config.rate
@@ -234,24 +229,24 @@ class _Runs:
         for kind in MOTIONS:
             for seed in config.seeds:
                 motion = impose(mechanism, kind, DURATION_S, config.rate, seed)
-                self.motions.append(_Motion(read(motion, model, config.rate, seed), _part(motion, self.late)))
+                self.motions.append(_Motion(read(motion, model, config.rate, seed), poses_of(motion, self.late)))
                 progress(len(self.motions) / count)
 
     def evaluate(self, fusion: FusionSettings, names: Sequence[str], whole: str | None) -> dict[str, Consistency]:
-        """How estimators, by name, do with these settings, with the whole-mechanism filter for these errors, or without it."""
+        """Consistency of estimators by name with these settings; `whole` as in `Estimator`."""
         control = control_settings(self.mechanism)
         parameters = cycle_parameters(self.mechanism, self.rate, control, fusion, whole=whole)
 
         def run(motion: _Motion) -> list[tuple[float, Array]]:
-            found = fuse(parameters, motion.raw)
-            return [ESTIMATORS[name].judge(self.mechanism, found, self.late, motion.truth) for name in names]
+            fused = fuse(parameters, motion.raw)
+            return [ESTIMATORS[name].judge(self.mechanism, fused, self.late, motion.truth) for name in names]
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             judged = zip(*pool.map(run, self.motions), strict=True)
         return {name: Consistency.pooled(each) for name, each in zip(names, judged, strict=True)}
 
     def evaluate_all(self, fusion: FusionSettings) -> dict[str, Consistency]:
-        """How every estimator does with these settings."""
+        """Consistency of every estimator with these settings."""
         figures: dict[str, Consistency] = {}
         for whole in dict.fromkeys(estimator.whole for estimator in ESTIMATORS.values()):
             names = [name for name, estimator in ESTIMATORS.items() if estimator.whole == whole]
@@ -261,14 +256,14 @@ class _Runs:
 
 @dataclass(frozen=True)
 class _Step:
-    """What to look for, in which estimator, by the common change of which settings."""
+    """A search: which estimator it improves, how, and the settings that it scales by a common factor."""
 
     estimator: str
     seek: Callable[[Evaluate, int], float]
     settings: tuple[str, ...]
 
     def tuned(self, fusion: FusionSettings, runs: _Runs) -> FusionSettings:
-        """The settings with what was found."""
+        """The settings with the result of the search."""
         estimator = ESTIMATORS[self.estimator]
 
         @cache
@@ -286,18 +281,18 @@ STEPS = (
     _Step("refined pose", _seek_consistency, ("leg_sigma", "tilt_sigma")),
     _Step("whole mechanism", _seek_consistency, ("noise_inflation",)),
 )
-"""In the order of the estimators, each of which builds upon the one before."""
+"""In the order of the estimators: each builds upon the one before."""
 
 
 def tune_fusion(config: TuningConfig, progress: Callable[[float], None] = lambda share: None) -> dict[str, Any]:
-    """Find the noise with which the estimators are consistent.
+    """Find the noise that makes the estimators consistent.
 
     Args:
-        config: what to tune.
+        config: of the tuning.
         progress: called with the share that is done.
 
     Returns:
-        `settings`: by name, their value `before` and `after`; `estimators`: by name, the `settings` that were found by it, the
+        `settings`: by name, their value `before` and `after`; `estimators`: by name, the `settings` found by it, the
         `consistent` NEES with its 95 % `bounds`, and `before` and `after` the mean `nees` and the `rms` of angles [rad], or of
         position [m] and rotation [rad]; `config` and `version`.
 
@@ -353,7 +348,7 @@ def _scaled(fusion: FusionSettings, settings: Sequence[str], change: float) -> F
 
 
 def tuned_text(mechanism: str, settings: Mapping[str, float]) -> str:
-    """The TOML text of a mechanism, preset or file, with these entries in its table `fusion` and else as it is.
+    """The TOML text of a mechanism, preset or file, with these entries in its table `fusion` and no other change.
 
     Raises:
         GoughError: no such mechanism, or its file cannot be read.

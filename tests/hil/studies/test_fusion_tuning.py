@@ -2,14 +2,13 @@
 
 import json
 from importlib import resources
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from controller.settings import fusion_settings
 from hil.command_line import main
-from hil.studies.fusion_comparison import REFINED, WHOLE, Found
+from hil.studies.fused_track import REFINED, WHOLE, FusedTrack, PoseTrack
 from hil.studies.fusion_tuning import ESTIMATORS, Consistency, _seek_consistency, _seek_least_errors, tuned_text
 from plant.mechanism import load_mechanism
 from plant.pose import rotation_from_vector
@@ -62,7 +61,7 @@ def test_errors_drawn_from_a_covariance_have_as_much_nees_as_components(hexapod,
     covariances = roots @ np.swapaxes(roots, 2, 3)
     positions = hexapod.home.position + random.normal(scale=0.02, size=(count, 3))
     rotations = np.array([about(random, 0.1) for _ in range(count)])
-    found = Found(count)
+    fused = FusedTrack(count)
     for i in range(count):
         if name == "leg filters":
             vectors = positions[i] + hexapod.platform_joints @ rotations[i].T - hexapod.base_joints
@@ -70,21 +69,21 @@ def test_errors_drawn_from_a_covariance_have_as_much_nees_as_components(hexapod,
                 x, y, z = joint.T @ vector / np.linalg.norm(vector)
                 b = np.arcsin(x) + noise[i, k, 1]
                 a = np.arctan2(-y, z) + noise[i, k, 0]
-                found.directions[i, k] = joint @ [np.sin(b), -np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)]
+                fused.directions[i, k] = joint @ [np.sin(b), -np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)]
         elif name == "platform filter":
             vertical = rotations[i].T @ hexapod.up_in_base
             across = np.linalg.qr(np.column_stack([vertical, np.eye(3)[:, :2]]))[0][:, 1:]
-            found.verticals[i] = vertical + across @ noise[i, 0]
-            found.vertical_covariances[i] = across @ covariances[i, 0] @ across.T
+            fused.verticals[i] = vertical + across @ noise[i, 0]
+            fused.vertical_covariances[i] = across @ covariances[i, 0] @ across.T
         else:
             step = REFINED if name == "refined pose" else WHOLE
-            found.positions[step, i] = positions[i] + noise[i, 0, :3]
-            found.rotations[step, i] = rotation_from_vector(noise[i, 0, 3:]) @ rotations[i]
-    found.leg_covariances[...] = covariances if name == "leg filters" else 0.0
+            fused.positions[step, i] = positions[i] + noise[i, 0, :3]
+            fused.rotations[step, i] = rotation_from_vector(noise[i, 0, 3:]) @ rotations[i]
+    fused.leg_covariances[...] = covariances if name == "leg filters" else 0.0
     if n == 6:
-        found.information[:], found.covariances[:] = np.linalg.inv(covariances[:, 0]), covariances[:, 0]
-    truth = SimpleNamespace(positions=positions, rotations=rotations)
-    nees, squares = estimator.judge(hexapod, found, slice(None), truth)
+        fused.information[:], fused.covariances[:] = np.linalg.inv(covariances[:, 0]), covariances[:, 0]
+    truth = PoseTrack(positions, rotations)
+    nees, squares = estimator.judge(hexapod, fused, slice(None), truth)
     low, high = estimator.bounds(count)
     assert low < n < high
     assert nees == pytest.approx(np.mean(np.sum(np.linalg.solve(roots, noise[..., None]) ** 2, axis=(2, 3))), rel=2e-3)
