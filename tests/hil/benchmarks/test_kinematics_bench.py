@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hil import kinematics_bench
+from hil.benchmarks import kinematics as kinematics_bench
 from hil.benchmarks.kinematics import measure_kinematics
 from plant.mechanism.classification import spatial_classes
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from controller.calibration.at_rest import CalibrationError
-from hil import rig_calibration
+from hil.calibration import rig_calibration
 from hil.calibration.rig_calibration import (
     Knowledge,
     calibrate_recordings,

@@ -17,10 +17,10 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from hil import recording
 from hil.loop.driver import FmuRig, prevent_compilation
 from hil.loop.timing import Histogram, over_budget
 from hil.realtime.scheduling import MEASURES, RealTimeSettings, RefusedError, real_time, usage
+from hil.recording import mcap as recording
 from hil.recording.mcap import RecordingError, read, repair
 from hil.recording.replay import COMPARED, replay
 from hil.runs.executive import RunStoppedError, run

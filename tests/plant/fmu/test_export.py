@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
 
-from plant import export
 from plant.dynamics.variables import BRAKE, DRIVE_MODES, OUTPUTS, SPATIAL, VELOCITY
 from plant.errors import FmuError, ToolchainError
+from plant.fmu import build as export
 from plant.fmu.build import build_in_subprocess, default_fmu
 from plant.fmu.description import QUANTITIES, Layout
 from plant.fmu.plant import FmuPlant
