@@ -140,13 +140,13 @@ def add_inject(commands: Any) -> None:
 def _inject(options: argparse.Namespace) -> int:
     from rich.markup import escape
 
-    from hil.rigs.emulation.faults import KINDS
+    from hil.rigs.emulation.faults import FaultKind
     from hil.runs.emulator import ask
 
     if options.list:
         table = new_table("fault", "number", "size by default", "")
-        for name, kind in KINDS.items():
-            table.add_row(name, f"0 to {kind.count - 1}" if kind.count else "", f"{kind.default:g}", escape(kind.text))
+        for kind in FaultKind:
+            table.add_row(kind.label, f"0 to {kind.count - 1}" if kind.count else "", f"{kind.default:g}", escape(kind.text))
         print_table(table)
         return 0
     question = "clear" if options.clear else f"fault {options.fault}" if options.fault else "state"

@@ -41,7 +41,7 @@ from hil.realtime.clock import FREE, new_clock, now
 from hil.rigs import SILENT, Identity, Rig, new_feedback
 from hil.rigs.emulation.drives import EMULATED
 from hil.rigs.udp.emulator import UdpEmulator, new_udp_emulator
-from hil.rigs.udp.rig import UdpLink, new_link
+from hil.rigs.udp.link import UdpLink, new_link
 from plant.compiled import Record
 from plant.dynamics.variables import BRAKE
 from plant.fmu.plant import write_drive_mode

@@ -41,7 +41,7 @@ from hil.loop.records import EMULATED_RIG, UDP_RIG, Link, RigHandle, Stage, Stop
 from hil.realtime.clock import FREE, REAL, finish, now, start, wait
 from hil.rigs import ANSWERED, SILENT
 from hil.rigs.udp.emulator import exchange_in_memory
-from hil.rigs.udp.rig import encode_command, exchange_udp, send_datagram
+from hil.rigs.udp.link import exchange_udp, send_command
 from plant.compiled import Record, kernel, store_release
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
 from plant.fmu.plant import advance, read_imus, read_truth, write_command, write_drive_mode
@@ -107,8 +107,7 @@ def exchange(rig: RigHandle, parameters: Record, state: Record, work: Record, ti
 def hold_brakes(rig: RigHandle, parameters: Record, state: Record, work: Record, timespec: NDArray[np.int64]) -> None:
     """At the end: the drives hold on their brakes."""
     if rig.kind == UDP_RIG:
-        encode_command(rig.link, state[()].command, BRAKED, now(timespec))
-        send_datagram(rig.link.socket, rig.link.command_bytes, rig.link.command_bytes.size)
+        send_command(rig.link, state[()].command, BRAKED, now(timespec))
     elif rig.kind == EMULATED_RIG:
         at = int(np.rint(1e9 * parameters[()].period * state[()].cycle))
         exchange_in_memory(rig.emulator, rig.link, state[()].command, BRAKED, work[()].feedback, at)

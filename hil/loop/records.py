@@ -9,7 +9,7 @@ import numpy as np
 from controller.safety.watch import EVENTS
 from hil.rigs import FEEDBACK
 from hil.rigs.udp.emulator import UdpEmulator
-from hil.rigs.udp.rig import UdpLink
+from hil.rigs.udp.link import UdpLink
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS

@@ -1,7 +1,7 @@
 """An emulated rig in a process of its own: the plant on the machine's clock, behind a bus, with faults on demand.
 
-It speaks the bus as hardware would, and knows nothing of the controller. A session begins with the platform at its start. A
-control channel, one text datagram per question and answer, injects faults and tells the state.
+It uses the bus as hardware would, and knows nothing of the controller. A session begins with the platform at its start. A
+control channel, with one text datagram per question and answer, injects faults and reports the rig's state.
 """
 
 import json
@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 
 from controller.planning.target import load_target
-from controller.safety.watch import FOLLOWING, QUICK_STOPPING
 from hil.loop.driver import prevent_compilation
 from hil.realtime.scheduling import RealTimeSettings, real_time
+from hil.rigs import FOLLOWING, QUICK_STOPPING
 from hil.rigs.emulation.drives import add_fault, new_emulated
 from hil.rigs.emulation.faults import fault
-from hil.rigs.udp.datagrams import HELLO, HELLO_DATAGRAM, WELCOME, WELCOME_DATAGRAM, decode, encode
+from hil.rigs.udp.datagrams import HELLO_DATAGRAM, WELCOME_DATAGRAM, DatagramKind, decode, encode
 from hil.rigs.udp.emulator import WATCHDOG_S, UdpEmulator, new_udp_emulator, serve
-from hil.rigs.udp.rig import DEFAULT_ADDRESS, parse_address, socket_address
+from hil.rigs.udp.link import DEFAULT_ADDRESS, bound_socket, parse_address, socket_address
 from hil.runs.simulation import SimulationConfig, simulated_plant
 from plant.compiled import Record
 from plant.errors import GoughError, InputError
@@ -36,11 +36,13 @@ from plant.truth import TRUTH_LENGTHS
 _STEP_NS = 1_000_000
 _TURN_NS = 20_000_000
 _IDLE_S = 0.1
-_NAME = "gough emulated hexapod"
+_NAME, _FIRMWARE = "gough emulated hexapod", "1"
+
+_Address = tuple[str, int]
 
 
 class BusyError(GoughError, OSError):
-    """An address cannot be had."""
+    """An address is taken, or nobody answers there."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +50,12 @@ class EmulatorConfig:
     """What is emulated.
 
     Attributes:
-        simulated: mechanism, IMUs, seed, and the target at whose first pose the platform stands.
+        simulated: mechanism, IMUs, seed, and the target whose first pose is the platform's start.
         bus: "udp" or "canopen".
         at: the address, or the settings' file; None for the default.
         control: address of the control channel.
         faults: from the start, as `hil.rigs.emulation.faults.fault` reads them.
-        watchdog: after how long without a command the drives stop, on UDP [s].
+        watchdog: time without a command after which the drives stop, on UDP [s].
     """
 
     simulated: SimulationConfig = field(default_factory=SimulationConfig)
@@ -66,6 +68,10 @@ class EmulatorConfig:
     def __post_init__(self) -> None:
         if not 0.0 < self.watchdog < 60.0:
             raise InputError(f"the watchdog is {1e3 * self.watchdog:g} ms; it must be more than 0 and less than a minute")
+
+    def watchdog_for(self, hello: Record) -> float:
+        """The watchdog of a session [s]: three periods at least."""
+        return max(self.watchdog, 3e-6 * int(hello["period_us"]))
 
 
 class _Stopped:
@@ -86,25 +92,25 @@ def emulate(config: EmulatorConfig, settings: RealTimeSettings, say: Callable[[s
 
     Args:
         config: what to emulate.
-        settings: of the process: priority and processor.
-        say: is told what is going on.
+        settings: priority and processor of the process.
+        say: is called with each message.
 
     Raises:
-        GoughError: something in the configuration cannot be used, or an address cannot be had.
+        GoughError: something in the configuration cannot be used, or an address is taken.
     """
     faults = [fault(text) for text in config.faults]
     stopped = _Stopped()
     with ExitStack() as stack:
-        control = _Control(stack.enter_context(_bound(config.control)), stopped)
+        control = _Control(stack.enter_context(_listen(config.control)), stopped)
         if config.bus == "canopen":
             _emulate_canopen(config, faults, settings, say, control, stopped)
             return
-        opened = stack.enter_context(_bound(config.at or DEFAULT_ADDRESS))
+        where = config.at or DEFAULT_ADDRESS
+        opened = stack.enter_context(_listen(where))
         _load(config)
-        refused = stack.enter_context(real_time(settings))
-        for text in refused:
+        for text in stack.enter_context(real_time(settings)):
             say(f"without {text}")
-        say(f"the rig {config.simulated.mechanism} listens at {config.at or DEFAULT_ADDRESS}, its control at {config.control}")
+        say(f"the rig {config.simulated.mechanism} listens at {where}, its control at {config.control}")
         while not stopped.asked:
             readable, _, _ = select.select([opened, control.socket], [], [], _IDLE_S)
             if control.socket in readable:
@@ -137,15 +143,11 @@ def _emulate_canopen(
         machine.close()
 
 
-def _bound(address: str) -> socket.socket:
-    host, port = parse_address(address)
-    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+def _listen(address: str) -> socket.socket:
     try:
-        opened.bind((host, port))
+        return bound_socket(*parse_address(address))
     except OSError as error:
-        opened.close()
         raise BusyError(f"cannot listen at {address}: {error.strerror}: is another emulator running there?") from None
-    return opened
 
 
 class _Control:
@@ -156,8 +158,13 @@ class _Control:
         self._stopped = stopped
         opened.setblocking(False)
 
-    def answer(self, rig: Record | None, told: dict[str, Any] | None = None) -> None:
-        """Answer what has been asked; without a rig there is no session."""
+    def answer(self, rig: Record | None, bus: dict[str, Any] | None = None) -> None:
+        """Answer all questions that have arrived.
+
+        Args:
+            rig: dtype `EMULATED`; None without a session.
+            bus: figures of the bus, which become part of the state.
+        """
         while True:
             try:
                 content, sender = self.socket.recvfrom(4096)
@@ -165,17 +172,17 @@ class _Control:
                 return
             command, _, argument = content.decode("utf-8", "replace").strip().partition(" ")
             try:
-                reply = self._do(command, argument.strip(), rig, told or {})
+                reply = self._do(command, argument.strip(), rig, bus or {})
             except GoughError as error:
                 reply = {"error": str(error)}
             self.socket.sendto(json.dumps(reply).encode(), sender)
 
-    def _do(self, command: str, argument: str, rig: Record | None, told: dict[str, Any]) -> dict[str, Any]:
+    def _do(self, command: str, argument: str, rig: Record | None, bus: dict[str, Any]) -> dict[str, Any]:
         if command == "stop":
             self._stopped.asked = True
             return {"stopping": True}
         if rig is None:
-            raise InputError("no controller has begun a session: there is nothing to ask or to disturb")
+            raise InputError("no controller has begun a session: the rig has no state and cannot be disturbed")
         if command == "fault":
             made = fault(argument)
             if made["begin_ns"] < 0 and rig["enabled_ns"] >= 0:
@@ -193,9 +200,9 @@ class _Control:
                 "code": rig["code"].tolist(),
                 "velocity": rig["velocity"].tolist(),
                 "lengths": rig["truth"][TRUTH_LENGTHS].tolist(),
-                **told,
+                **bus,
             }
-        raise InputError(f"the control channel knows fault, clear, state and stop, not {command!r}")
+        raise InputError(f"the control channel has the commands fault, clear, state and stop, not {command!r}")
 
 
 def ask(address: str, question: str, patience: float = 2.0) -> dict[str, Any]:
@@ -227,70 +234,69 @@ def _rig_of(config: EmulatorConfig, period: float, faults: list[Record]) -> tupl
 
 
 def _load(config: EmulatorConfig) -> None:
-    """Load or compile the machine code before anyone waits for it."""
+    """Load or compile the machine code before the first session."""
     plant, imu, rig = _rig_of(config, 1e-3, [])
     with plant, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as scratch:
         emulator = new_udp_emulator(plant.handle, imu, rig)
-        emulator.socket["descriptor"] = scratch.fileno()
+        emulator.link.socket["descriptor"] = scratch.fileno()
         serve(emulator, time.monotonic_ns(), 0, np.zeros(2, np.int64))
 
 
 def _serve_sessions(
-    opened: socket.socket, hello: Record, sender: tuple[str, int], config: EmulatorConfig, faults: list[Record],
-    control: _Control, say: Callable[[str], None], stopped: _Stopped,
+    opened: socket.socket, hello: Record, sender: _Address, config: EmulatorConfig, faults: list[Record], control: _Control,
+    say: Callable[[str], None], stopped: _Stopped,
 ) -> None:  # fmt: skip
     """Serve one session after the other."""
-    following: tuple[Record, tuple[str, int]] | None = (hello, sender)
+    following: tuple[Record, _Address] | None = (hello, sender)
     while following is not None and not stopped.asked:
         hello, sender = following
         period = 1e-6 * int(hello["period_us"])
         plant, imu, rig = _rig_of(config, period, faults)
         with plant:
-            emulator = new_udp_emulator(plant.handle, imu, rig, int(hello["session"]), _watchdog(config, hello))
-            emulator.socket["descriptor"], emulator.socket["peer"] = opened.fileno(), socket_address(sender)
+            emulator = new_udp_emulator(plant.handle, imu, rig, int(hello["session"]), config.watchdog_for(hello))
+            link = emulator.link.socket
+            link["descriptor"], link["peer"] = opened.fileno(), socket_address(sender)
             _welcome(opened, config, hello, sender)
             say(f"session with {sender[0]}:{sender[1]} at {1.0 / period:g} Hz")
             following = _serve_session(opened, config, emulator, control, stopped)
-            say(f"end of the session; {int(emulator.port['refused'])} datagrams refused")
+            say(f"end of the session; {int(emulator.session['refused'])} datagrams refused")
 
 
 def _hello(content: bytes) -> Record | None:
-    """A hello that begins a session, if these bytes are one."""
-    hello = decode(HELLO_DATAGRAM, HELLO, content)
+    """The hello that begins a session, if these bytes are one."""
+    hello = decode(HELLO_DATAGRAM, content, kind=DatagramKind.HELLO)
     return hello if hello is not None and hello["session"] != 0 and hello["period_us"] != 0 else None
 
 
-def _watchdog(config: EmulatorConfig, hello: Record) -> float:
-    """After how long without a command the drives stop [s]: three periods at least."""
-    return max(config.watchdog, 3e-6 * int(hello["period_us"]))
-
-
-def _welcome(opened: socket.socket, config: EmulatorConfig, hello: Record, sender: tuple[str, int]) -> None:
-    name, firmware = (np.frombuffer(text.encode().ljust(size, b"\0"), np.uint8) for text, size in ((_NAME, 32), ("1", 16)))
-    fields = {"session": hello["session"], "watchdog_us": round(1e6 * _watchdog(config, hello)), "truthful": 1, "name": name}
-    opened.sendto(encode(WELCOME_DATAGRAM, kind=WELCOME, firmware=firmware, **fields), sender)
+def _welcome(opened: socket.socket, config: EmulatorConfig, hello: Record, sender: _Address) -> None:
+    name, firmware = (np.frombuffer(text.encode().ljust(n, b"\0"), np.uint8) for text, n in ((_NAME, 32), (_FIRMWARE, 16)))
+    watchdog_us = round(1e6 * config.watchdog_for(hello))
+    welcome = encode(
+        WELCOME_DATAGRAM, kind=DatagramKind.WELCOME, session=hello["session"], watchdog_us=watchdog_us, truthful=1, name=name,
+        firmware=firmware,
+    )  # fmt: skip
+    opened.sendto(welcome, sender)
 
 
 def _serve_session(
     opened: socket.socket, config: EmulatorConfig, emulator: UdpEmulator, control: _Control, stopped: _Stopped
-) -> tuple[Record, tuple[str, int]] | None:
-    """Serve until the end; returns the hello that begins another session, and whose it is."""
+) -> tuple[Record, _Address] | None:
+    """Serve a session to its end; returns the hello that begins the next one, and its sender."""
     started, timespec = time.monotonic_ns(), np.zeros(2, np.int64)
-    emulator.port["heard_ns"] = 0
+    rig, session, link = emulator.rig, emulator.session, emulator.link
     with prevent_compilation():
         while not stopped.asked:
             met = serve(emulator, started, _TURN_NS, timespec)
-            control.answer(emulator.rig, {"refused": int(emulator.port["refused"])})
+            control.answer(rig, {"refused": int(session["refused"])})
             if not met:
                 continue
-            content = emulator.command_bytes[: HELLO_DATAGRAM.itemsize].tobytes()
-            hello = _hello(content)
-            address = bytes(emulator.socket["sender"])
+            hello = _hello(link.command_bytes[: HELLO_DATAGRAM.itemsize].tobytes())
+            address = bytes(link.socket["sender"])
             sender = (socket.inet_ntoa(address[4:8]), int.from_bytes(address[2:4], "big"))
-            # A rig that moves has one controller.
-            if hello is None or np.isin(emulator.rig["drive"], (FOLLOWING, QUICK_STOPPING)).any():
-                emulator.port["refused"] += 1
-            elif hello["session"] == emulator.port["session"]:
+            # A moving rig has one controller.
+            if hello is None or np.isin(rig["drive"], (FOLLOWING, QUICK_STOPPING)).any():
+                session["refused"] += 1
+            elif hello["session"] == session["id"]:
                 _welcome(opened, config, hello, sender)
             else:
                 return hello, sender

@@ -43,7 +43,8 @@ from hil.recording.mcap import events_of, record, repair, take
 from hil.recording.replay_rig import ReplayRig
 from hil.rigs import Rig
 from hil.rigs.by_name import check_legs, python_rig
-from hil.rigs.udp.rig import DEFAULT_ADDRESS, UdpRig, parse_address
+from hil.rigs.udp.link import DEFAULT_ADDRESS, parse_address
+from hil.rigs.udp.rig import UdpRig
 from hil.runs.simulation import PYTHON_RIG, SimulationConfig, prepared_loop
 from hil.runs.target_stream import HOST, PORT, open_socket, receive
 from plant.compiled import Record

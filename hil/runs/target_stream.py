@@ -1,21 +1,19 @@
-"""Streamed targets: poses come as UDP datagrams, about 100 a second, and a process of its own plans how to follow them.
+"""Streamed targets: poses arrive as UDP datagrams, about 100 a second, and a process of its own plans how to follow them.
 
     sender --UDP--> receiver   checks each pose, plans, writes into shared memory and never waits for the loop
                       loop     takes the plans as they come (see `controller.planning.stream`)
 
-A datagram of version 1 is little endian and packed, 78 bytes: `GGHT`, version (2 bytes), sequence number (4), time of the
-pose on the sender's clock [ns] (8), displacement from home x, y, z [m] and turn from home as a unit quaternion, w first (7
-doubles), and the CRC-32 of all that (4). UDP tells nobody who sends: by default only this machine is listened to, and only
-the first sender.
+A datagram of version 1 is little-endian and packed, 78 bytes: `GGHT`, version (2 bytes), sequence number (4), time of the pose
+on the sender's clock [ns] (8), displacement from home x, y, z [m] and rotation from home as a unit quaternion, w first (7
+doubles), and the CRC-32 of all these bytes (4). UDP does not authenticate senders: by default the receiver listens only to this
+machine, and only to the first sender.
 """
 
 import math
 import os
 import select
 import socket
-import struct
 import time
-import zlib
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,27 +26,39 @@ from controller.planning.stream import CAUSE, CYCLE, DONE, SEEN, STREAM, TAKEN, 
 from controller.planning.stream_planner import Plan, StreamPlanner, TargetRefusedError
 from controller.planning.target import Target
 from controller.safety.watch import NO_CAUSE
+from hil.rigs.udp import datagrams
+from hil.rigs.udp.link import bound_socket
 from plant.compiled import Record
 from plant.errors import GoughError, InputError
 from plant.mechanism import Mechanism
 from plant.pose import Array, quaternion_from_rotation
 
 HOST, PORT = "127.0.0.1", 47200
-MAGIC, VERSION = b"GGHT", 1
-_BODY = struct.Struct("<4sHIQ7d")
-_SUM = struct.Struct("<I")
-DATAGRAM_BYTES = _BODY.size + _SUM.size
+MAGIC, VERSION = int.from_bytes(b"GGHT", "little"), 1
+
+TARGET_DATAGRAM = np.dtype(
+    [
+        ("magic", np.uint32),
+        ("version", np.uint16),
+        ("sequence", np.uint32),
+        ("time_ns", np.uint64),
+        ("displacement", np.float64, 3),
+        ("quaternion", np.float64, 4),
+        ("crc", np.uint32),
+    ]
+)
+DATAGRAM_BYTES = TARGET_DATAGRAM.itemsize
 _SEQUENCES = 1 << 32
 
 LEAD_S = 0.01
-"""How long before it begins a plan is made: what planner and loop may be late by together."""
+"""How long before its start a plan is made: the delay that planner and loop together may have [s]."""
 
 _POLL_S = 0.02
 _SETTLE_S = 1e-3
-"""How long the receiver sleeps at most while it waits for a sample, and for what the loop does with a plan."""
+"""The receiver's longest sleep while it waits for a sample, and while the loop decides on a plan."""
 
 _CLOCK_SAMPLES = 15
-"""Over how many samples the sender's clock is compared with the motion's time, against the jitter of the way."""
+"""Number of samples over which the sender's clock is compared with the motion's time, against the network's jitter."""
 
 _BATCH = 64
 
@@ -68,39 +78,27 @@ class Sample(NamedTuple):
 
 def encode(sample: Sample) -> bytes:
     """The datagram of a sample."""
-    body = _BODY.pack(
-        MAGIC, VERSION, sample.sequence % _SEQUENCES, sample.time_ns, *sample.displacement, *sample.quaternion
-    )  # fmt: skip
-    return body + _SUM.pack(zlib.crc32(body))
+    fields = sample._asdict() | {"sequence": sample.sequence % _SEQUENCES}
+    return datagrams.encode(TARGET_DATAGRAM, magic=MAGIC, version=VERSION, **fields)
 
 
-def decode(datagram: bytes) -> Sample | None:
+def decode(content: bytes) -> Sample | None:
     """The sample of a datagram; None if it is malformed, damaged, or of another version."""
-    if len(datagram) != DATAGRAM_BYTES:
+    datagram = datagrams.decode(TARGET_DATAGRAM, content, magic=MAGIC, version=VERSION)
+    if datagram is None:
         return None
-    body = datagram[: _BODY.size]
-    if _SUM.unpack(datagram[_BODY.size :])[0] != zlib.crc32(body):
-        return None
-    magic, version, sequence, time_ns, *pose = _BODY.unpack(body)
-    if magic != MAGIC or version != VERSION:
-        return None
-    return Sample(sequence, time_ns, tuple(pose[:3]), tuple(pose[3:]))
+    displacement, quaternion = tuple(datagram["displacement"].tolist()), tuple(datagram["quaternion"].tolist())
+    return Sample(int(datagram["sequence"]), int(datagram["time_ns"]), displacement, quaternion)
 
 
 def open_socket(host: str = HOST, port: int = PORT) -> socket.socket:
     """A socket that receives a stream; port 0 takes a free one.
 
     Raises:
-        StreamError: the address is not to be had.
+        StreamError: the address cannot be used.
     """
     try:
-        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-        receiver = socket.socket(family, socket.SOCK_DGRAM)
-        try:
-            receiver.bind(address)
-        except OSError:
-            receiver.close()
-            raise
+        receiver = bound_socket(host, port)
     except (OSError, OverflowError) as error:
         raise StreamError(f"cannot receive a target at {host}:{port}: {error}: choose another address or port") from None
     receiver.setblocking(False)
@@ -115,16 +113,16 @@ def receive(
     lead: float = LEAD_S,
     ended: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Receive a stream and plan, until `DONE` is set or the process that started this one is gone; a process's body.
+    """Receive a stream and plan, until `DONE` is set or the parent process has ended; the body of a process.
 
-    A sample that cannot be followed fails the stream for good: no more is planned, and the last plan ends at rest.
+    A sample that cannot be followed fails the stream for good: planning ends, and the last plan ends at rest.
 
     Args:
         stream: dtype `controller.planning.stream.STREAM`, shared with the loop.
-        planner: at the lengths where the loop's reference rests.
+        planner: at the lengths at which the loop's reference rests.
         receiver: from `open_socket`.
         period: of a cycle [s].
-        lead: how long before it begins a plan is made [s].
+        lead: how long before its start a plan is made [s].
         ended: whether to end for another reason.
     """
     parent = os.getppid()
@@ -138,14 +136,14 @@ def receive(
             except BlockingIOError:
                 break
             except OSError:
-                # What the network says of an earlier datagram is none of the stream's.
+                # An error of an earlier datagram does not concern the stream.
                 continue
             reception.take(datagram, sender)
         reception.plan()
 
 
 def _load_kernels() -> None:
-    """Run the kernels once on scratch, so that none has to be loaded or compiled when a sample has come."""
+    """Run the kernels once on scratch, so that none has to be loaded or compiled when a sample arrives."""
     scratch = np.zeros((), STREAM)
     publish_plan(scratch, np.zeros(STREAM["plans"].shape[1:]), 0.0, 0)
     note_sample(scratch, 1)
@@ -153,7 +151,7 @@ def _load_kernels() -> None:
 
 
 class Reception:
-    """What the receiver knows: who sends, the last sample, the sender's clock, and the plan that the loop may yet take."""
+    """State of the receiver: the sender, the last sample, the sender's clock, and the plan that the loop may still take."""
 
     def __init__(self, stream: Record, planner: StreamPlanner, period: float, lead: float) -> None:
         self._stream, self._planner, self._period = stream, planner, period
@@ -168,7 +166,7 @@ class Reception:
 
     @property
     def waits(self) -> bool:
-        """Whether it is for the loop to say what becomes of a plan."""
+        """Whether the loop has not decided on a plan yet."""
         return self._pending is not None
 
     def take(self, datagram: bytes, sender: object) -> None:
@@ -198,14 +196,14 @@ class Reception:
         self._sender, self._last, self._at, self._fresh = sender, sample, at, True
         cycle = int(self._shared[CYCLE])
         if cycle == 0:
-            # The motion's time stands still until it begins.
+            # The motion's time does not run before its start.
             self._offsets.clear()
         self._offsets.append(cycle * self._period - at)
         stream["accepted"] += 1
         note_sample(stream, time.monotonic_ns())
 
     def plan(self) -> None:
-        """See what has become of the last plan, and make one for the newest sample."""
+        """Note the loop's decision on the last plan, and make a plan for the newest sample."""
         stream, shared = self._stream, self._shared
         if self._pending is not None:
             number, plan = self._pending
@@ -228,7 +226,7 @@ class Reception:
 
 @dataclass(frozen=True)
 class Faults:
-    """What a sender may do wrong on purpose, at a time of its motion [s]: fall silent, jump by 5 cm, send what is no number."""
+    """Faults of a sender on purpose, each from a time of its motion on [s]: silence, a jump by 5 cm, NaN."""
 
     stop_at: float = math.inf
     jump_at: float = math.inf
@@ -247,19 +245,18 @@ def send_target(
     duration: float | None = None,
     faults: Faults | None = None,
 ) -> int:
-    """Stream a target in real time, each pose at its time; returns how many were sent.
+    """Stream a target in real time, each pose at its time; returns the number of poses sent.
 
     Args:
-        mechanism: whose home the displacements are from.
+        mechanism: its home is the origin of the displacements.
         target: the motion.
         rate: poses per second [Hz].
-        host: where to.
-        port: where to.
+        host, port: of the receiver.
         duration: of the motion [s]; None for all of it.
-        faults: what to do wrong.
+        faults: of the sender.
 
     Raises:
-        InputError: the rate or the duration is not positive and finite, or the rate above 10 kHz.
+        InputError: the rate or the duration is not positive and finite, or the rate is above 10 kHz.
         StreamError: there is no such address.
     """
     duration = float(target.times[-1]) if duration is None else duration
@@ -278,7 +275,7 @@ def send_target(
 
 
 def _streamed(mechanism: Mechanism, target: Target, times: Array, faults: Faults) -> tuple[Array, Array]:
-    """Displacements (n, 3) and quaternions (n, 4) from home at times (n,), with what is to be wrong."""
+    """Displacements (n, 3) and quaternions (n, 4) from home at times (n,), with the faults."""
     home = mechanism.require_home()
     times = times[times < faults.stop_at]
     positions, rotations = target.at(times)
@@ -294,7 +291,7 @@ def _send(sender: socket.socket, address: tuple[Any, ...], rate: float, displace
         due = began + round(1e9 * k / rate)
         late = time.monotonic_ns() - due
         if late > 1e9 / rate:
-            # As with any sender that is held up: what is past is not sent any more.
+            # A sender that is held up leaves out the poses whose time is over.
             continue
         if late < 0:
             time.sleep(-1e-9 * late)
@@ -302,7 +299,7 @@ def _send(sender: socket.socket, address: tuple[Any, ...], rate: float, displace
         try:
             sender.sendto(datagram, address)
         except ConnectionRefusedError:
-            # Nobody listens yet, or any more.
+            # Nobody listens yet, or nobody listens any more.
             continue
         sent += 1
     return sent

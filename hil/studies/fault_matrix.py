@@ -53,7 +53,7 @@ from hil.loop.records import EMULATED_RIG, RECORD, Link, StopRequest
 from hil.realtime.clock import SCRIPTED, new_clock
 from hil.rigs.emulation.drives import new_emulated, sample
 from hil.rigs.emulation.faults import fault
-from hil.rigs.udp.emulator import look_after, new_udp_emulator
+from hil.rigs.udp.emulator import check_watchdog, new_udp_emulator
 from hil.rigs.udp.rig import TIMEOUT_SHARE
 from hil.runs.simulation import PreparedLoop, SimulationConfig, prepared_loop
 from hil.runs.target_stream import LEAD_S, Reception, Sample, encode
@@ -122,7 +122,7 @@ def _miss(periods: int) -> Callable[[PreparedLoop], None]:
 def _kill_rig(loop: PreparedLoop) -> None:
     """A rig that has been killed and started again knows no session, and its drives hold."""
     assert loop.emulator is not None
-    loop.emulator.port["session"] = 0
+    loop.emulator.session["id"] = 0
     loop.emulator.rig["request"], loop.emulator.rig["velocity"] = 0, 0.0
 
 
@@ -293,7 +293,7 @@ def _stand(loop: PreparedLoop) -> None:
     assert loop.emulator is not None
     begin = int(loop.emulator.rig["time_ns"])
     for passed in range(0, 500_000_000, 10_000_000):
-        look_after(loop.emulator, begin + passed)
+        check_watchdog(loop.emulator, begin + passed)
     sample(loop.fmu, loop.imu, loop.emulator.rig, int(loop.emulator.rig["time_ns"]))
 
 

@@ -1,32 +1,15 @@
-"""The emulated rig: the plant with drives and IMUs as hardware has them, on a clock of its own, and without any bus. Compiled.
+"""The emulated rig without a bus: the plant with drives and IMUs as hardware has them, on a clock of its own. Compiled.
 
-What speaks a bus is around it (`hil.rigs.udp.emulator`, `hil.rigs.canopen.nodes`): it sets each drive's `request` and
-`target`, and takes a `sample`, for which the plant moves on to the present. Faults of IMUs, drives and load are done here,
-those of the bus there.
+The code for a bus (`hil.rigs.udp.emulator`, `hil.rigs.canopen.emulator`) sets each drive's `request` and `target`, and takes a
+`sample`, which moves the plant on to the present. Faults of IMUs, drives and payload happen here, faults of the bus there.
 """
 
 from collections.abc import Iterable
 
 import numpy as np
 
-from controller.safety.watch import BRAKED, ENABLED, FAULTY, FOLLOWING, OFF, QUICK_STOP, QUICK_STOPPING, READY
-from hil.rigs.emulation.faults import (
-    DRIVE_FAULTS,
-    DRIVE_IGNORES,
-    DRIVE_RUNS_AWAY,
-    DRIVE_STUCK,
-    DRIVE_UNPOWERED,
-    FAULT,
-    IMU_BIASED,
-    IMU_DEAD,
-    IMU_FROZEN,
-    IMU_NOISY,
-    IMU_SWAPPED,
-    MOST_FAULTS,
-    PAYLOAD_JUMPS,
-    draw_normal,
-    is_active,
-)
+from hil.rigs import BRAKED, ENABLED, FAULTY, FOLLOWING, OFF, QUICK_STOP, QUICK_STOPPING, READY
+from hil.rigs.emulation.faults import FAULT, MOST_FAULTS, FaultKind, draw_normal, is_active
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
 from plant.errors import InputError
@@ -35,6 +18,7 @@ from plant.imu import measure
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import rotate_by_vector
 from plant.truth import TRUTH_SIZE
+from plant.vectors import rotate, vector
 
 EMULATED = np.dtype(
     [
@@ -60,25 +44,23 @@ EMULATED = np.dtype(
         ("random", np.uint64, 1),
         ("ideal", np.float64, (3, IMU_COUNT, 3)),
         ("turn", np.float64, (3, 3)),
-        ("turned", np.float64, (3, 3)),
         ("axis", np.float64, 3),
     ],
     align=True,
 )
-"""State of an emulated rig: its clock, the plant's largest step, when the drives were first enabled (negative before).
+"""State of an emulated rig: its clock, the plant's largest step, when the drives were first enabled (negative before), the
+drives' `deceleration` in a quick stop or after a fault [m/s^2], their speed limit [m/s], payload and added payload [kg].
 
-What a bus sets: of each drive its `request` (`BRAKED`, `ENABLED`, `QUICK_STOP`) and `target` velocity [m/s], and a `reset` of
-its fault. What it reads: each drive's state (`OFF`, `READY`, `FOLLOWING`, `QUICK_STOPPING`, `FAULTY`) with its fault code and
-what it does just now (`velocity`, [m/s]), and of each IMU the last sample, its time and its number. A quick stop, and a
-fault's, is at the drives' own `deceleration` [m/s^2].
+A bus sets each drive's `request` (`BRAKED`, `ENABLED`, `QUICK_STOP`), its `target` velocity [m/s], and `reset` to clear its
+fault. It reads each drive's state (`OFF`, `READY`, `FOLLOWING`, `QUICK_STOPPING`, `FAULTY`), fault code and present `velocity`
+[m/s], and each IMU's last sample with its time and number. The rest are the faults, their random state, and scratch.
 """
 
-
 POWER_LOST = 0x3220
-"""CiA 402's code for a voltage that was too low, which a drive reports when its power is back."""
+"""CiA 402's code for a voltage that was too low; a drive reports it when its power is back."""
 
 _SPEED_RESERVE = 1.5
-"""What a drive can do beyond the limit of velocity, for control."""
+"""A drive's largest velocity, over the limit of the mechanism."""
 
 
 def new_emulated(mechanism: Mechanism, step_ns: int, seed: int, faults: Iterable[Record] = ()) -> Record:
@@ -87,7 +69,7 @@ def new_emulated(mechanism: Mechanism, step_ns: int, seed: int, faults: Iterable
     Args:
         mechanism: with limits.
         step_ns: largest step of the plant [ns].
-        seed: of what the faults draw.
+        seed: of the faults' random numbers.
         faults: each of dtype `FAULT`.
     """
     rig: Record = np.zeros((), EMULATED)
@@ -108,14 +90,14 @@ def add_fault(rig: Record, fault: Record) -> None:
     """
     count = int(rig["faults"])
     if count == MOST_FAULTS:
-        raise InputError(f"there are {count} faults already, and no more can be")
+        raise InputError(f"there are already {count} faults, the most that are possible: leave some out, or clear them")
     rig["fault"][count] = fault
     rig["faults"] = count + 1
 
 
 @kernel
 def sample(fmu: Record, imu: Record, rig: Record, now_ns: int) -> int:
-    """Let the plant move on to `now_ns` on the rig's clock, and read the IMUs; returns FMI's status."""
+    """Move the plant on to `now_ns` on the rig's clock, and read the IMUs; returns FMI's status."""
     r, c = rig[()], fmu[()]
     status = move(fmu, rig, now_ns)
     status |= read_imus(fmu) | read_truth(fmu)
@@ -125,12 +107,12 @@ def sample(fmu: Record, imu: Record, rig: Record, now_ns: int) -> int:
         f = r.fault[i]
         if not is_active(f, r.enabled_ns, r.time_ns):
             continue
-        if f.kind == IMU_SWAPPED:
+        if f.kind == FaultKind.IMU_SWAPPED:
             k, m = f.index, min(max(int(f.size), 0), IMU_COUNT - 1)
             for kind in range(3):
                 for j in range(3):
                     r.ideal[kind, k, j], r.ideal[kind, m, j] = r.ideal[kind, m, j], r.ideal[kind, k, j]
-        elif f.kind == IMU_BIASED:
+        elif f.kind == FaultKind.IMU_BIASED:
             _turn(r, f.index, f.size)
     measure(imu, r.ideal, c.imu)
     for k in range(IMU_COUNT):
@@ -139,9 +121,9 @@ def sample(fmu: Record, imu: Record, rig: Record, now_ns: int) -> int:
         for i in range(r.faults):
             f = r.fault[i]
             if f.index == k and is_active(f, r.enabled_ns, r.time_ns):
-                silent = silent or f.kind == IMU_DEAD
-                frozen = frozen or f.kind == IMU_FROZEN
-                noise = f.size if f.kind == IMU_NOISY else noise
+                silent = silent or f.kind == FaultKind.IMU_DEAD
+                frozen = frozen or f.kind == FaultKind.IMU_FROZEN
+                noise = f.size if f.kind == FaultKind.IMU_NOISY else noise
         if silent:
             continue
         r.sequence[k] += 1
@@ -158,7 +140,7 @@ def sample(fmu: Record, imu: Record, rig: Record, now_ns: int) -> int:
 
 @kernel
 def _turn(r: Record, k: int, angle: float) -> None:
-    """Turn an IMU by an angle about its x axis; what it reads turns the other way."""
+    """Turn an IMU by an angle about its x axis; its readings turn the other way."""
     for i in range(3):
         for j in range(3):
             r.turn[i, j] = 1.0 if i == j else 0.0
@@ -166,24 +148,20 @@ def _turn(r: Record, k: int, angle: float) -> None:
     r.axis[0] = -angle
     rotate_by_vector(r.turn, r.axis)
     for kind in range(3):
-        for i in range(3):
-            r.turned[kind, i] = 0.0
-            for j in range(3):
-                r.turned[kind, i] += r.turn[i, j] * r.ideal[kind, k, j]
-    for kind in range(3):
-        r.ideal[kind, k] = r.turned[kind]
+        ideal = r.ideal[kind, k]
+        ideal[0], ideal[1], ideal[2] = rotate(r.turn, vector(ideal))
 
 
 @kernel
 def move(fmu: Record, rig: Record, now_ns: int) -> int:
-    """Let the plant and the drives move on to `now_ns`; returns FMI's status."""
+    """Move the plant and the drives on to `now_ns`; returns FMI's status."""
     r, c = rig[()], fmu[()]
     status = 0
     while r.time_ns < now_ns:
         step = min(r.step_ns, now_ns - r.time_ns)
         added = 0.0
         for i in range(r.faults):
-            if r.fault[i].kind == PAYLOAD_JUMPS and is_active(r.fault[i], r.enabled_ns, r.time_ns):
+            if r.fault[i].kind == FaultKind.PAYLOAD_JUMPS and is_active(r.fault[i], r.enabled_ns, r.time_ns):
                 added += r.fault[i].size
         if added != r.added:
             status |= write_payload_mass(fmu, r.payload + added)
@@ -200,19 +178,19 @@ def move(fmu: Record, rig: Record, now_ns: int) -> int:
 
 @kernel
 def _step_drive(r: Record, k: int, period: float) -> None:
-    """A drive's state and what it does, for a step of so long [s]."""
+    """Update a drive's state and velocity for a step of `period` [s]."""
     broken = unpowered = ignoring = stuck = running = False
     runaway = 0.0
     code = 0
     for i in range(r.faults):
         f = r.fault[i]
         if f.index == k and is_active(f, r.enabled_ns, r.time_ns):
-            unpowered = unpowered or f.kind == DRIVE_UNPOWERED
-            ignoring = ignoring or f.kind == DRIVE_IGNORES
-            stuck = stuck or f.kind == DRIVE_STUCK
-            if f.kind == DRIVE_FAULTS:
+            unpowered = unpowered or f.kind == FaultKind.DRIVE_UNPOWERED
+            ignoring = ignoring or f.kind == FaultKind.DRIVE_IGNORES
+            stuck = stuck or f.kind == FaultKind.DRIVE_STUCK
+            if f.kind == FaultKind.DRIVE_FAULTS:
                 broken, code = True, int(f.size)
-            if f.kind == DRIVE_RUNS_AWAY:
+            if f.kind == FaultKind.DRIVE_RUNS_AWAY:
                 running, runaway = True, f.size
     if unpowered:
         r.drive[k], r.velocity[k] = OFF, 0.0

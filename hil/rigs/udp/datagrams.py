@@ -1,10 +1,13 @@
-"""The datagrams of the UDP rig, version 1: one in each direction per cycle, and a hand-shake before. docs/rigs.md and
-`hil/rigs/udp/gough_rig.h` describe them for firmware.
+"""Datagrams over UDP: how any of them is packed and checked, and those of the UDP rig, version 1.
 
-Little-endian, every field aligned to its size, SI units. A datagram ends with the CRC-32 (IEEE 802.3, as in zlib) of all that
-comes before it. What is of another length, magic number, version, kind or session, or has a wrong CRC, is refused.
+The UDP rig's are one datagram in each direction per cycle, and a handshake before. docs/rigs.md and `hil/rigs/udp/gough_rig.h`
+describe them for firmware: little-endian, every field aligned to its size, SI units. A datagram ends with the CRC-32 (IEEE
+802.3, as in zlib) of all bytes before it. One with another length, magic number, version, kind or session, or with a wrong CRC,
+is refused.
 """
 
+import zlib
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -19,7 +22,16 @@ MAGIC = 0x48475547
 """The bytes "GUGH"."""
 
 VERSION = 1
-HELLO, WELCOME, COMMAND, MEASUREMENT = range(1, 5)
+
+
+class DatagramKind(IntEnum):
+    """The kinds of the UDP rig's datagrams."""
+
+    HELLO = 1
+    WELCOME = 2
+    COMMAND = 3
+    MEASUREMENT = 4
+
 
 _HEAD = [
     ("magic", np.uint32),
@@ -31,7 +43,7 @@ _HEAD = [
 ]
 
 HELLO_DATAGRAM = np.dtype([*_HEAD, ("period_us", np.uint32), ("reserved", np.uint32), ("crc", np.uint32)])
-"""From the controller: begin a session, with its period [us]."""
+"""From the controller: begin a session with commands at this period [us]."""
 
 WELCOME_DATAGRAM = np.dtype(
     [
@@ -43,8 +55,8 @@ WELCOME_DATAGRAM = np.dtype(
         ("crc", np.uint32),
     ]
 )
-"""From the rig: who it is, after how long without a command its drives stop [us], and whether it tells the truth, as emulated
-ones do.
+"""From the rig: its name and firmware, the time without a command after which its drives stop [us], and whether a truth follows
+its measurements, as an emulated rig's does.
 """
 
 COMMAND_DATAGRAM = np.dtype(
@@ -57,8 +69,8 @@ COMMAND_DATAGRAM = np.dtype(
         ("crc", np.uint32),
     ]
 )
-"""From the controller, once per cycle: what is asked of the drives (0 brake, 1 follow, 2 quick stop), whether faults are to be
-reset, and the velocities [m/s]. The rig applies it, samples its IMUs, and answers with the same sequence number."""
+"""From the controller, once per cycle: the request to the drives (0 brake, 1 follow, 2 quick stop), whether to reset faults,
+and the velocities [m/s]. The rig applies it, samples its IMUs, and answers with the same sequence number."""
 
 MEASUREMENT_DATAGRAM = np.dtype(
     [
@@ -74,16 +86,39 @@ MEASUREMENT_DATAGRAM = np.dtype(
         ("crc", np.uint32),
     ]
 )
-"""From the rig, once per command: the time on its own clock [ns], of each IMU when the sample was taken and its number; how
-many datagrams it has refused; of each drive its state (0 following, 1 ready, 2 off, 3 quick stop, 4 fault), its fault code and
-the velocity that it was really given [m/s]; and the raw IMU data [rad/s, m/s^2, uT], NaN where there is none."""
+"""From the rig, once per command: the time on its own clock [ns]; the time and number of each IMU's sample; how many datagrams
+it has refused; each drive's state (0 following, 1 ready, 2 not ready, 3 quick stop, 4 fault), fault code and velocity after
+limits [m/s]; and the raw IMU data [rad/s, m/s^2, uT], NaN without an IMU."""
 
 TRUTH_DATAGRAM = np.dtype([("truth", np.float64, TRUTH_SIZE), ("reserved", np.uint32), ("crc", np.uint32)])
-"""What an emulated rig appends to a measurement."""
+"""An emulated rig appends it to a measurement."""
 
 LONGEST = MEASUREMENT_DATAGRAM.itemsize + TRUTH_DATAGRAM.itemsize
 
 Bytes = NDArray[np.uint8]
+
+
+def encode(dtype: np.dtype[Any], **fields: object) -> bytes:
+    """A datagram that ends with a field `crc`, by default with the UDP rig's magic number and version. For datagrams that are
+    not sent in every cycle.
+    """
+    datagram: Record = np.zeros(1, dtype)
+    for name, value in ({"magic": MAGIC, "version": VERSION} | fields).items():
+        datagram[name] = value
+    content: bytes = datagram.tobytes()[:-4]
+    return content + zlib.crc32(content).to_bytes(4, "little")
+
+
+def decode(dtype: np.dtype[Any], content: bytes, **fields: object) -> Record | None:
+    """The datagram; None if its length or its CRC is wrong, or if magic number, version or one of the `fields` has another
+    value.
+    """
+    if len(content) != dtype.itemsize:
+        return None
+    datagram: Record = np.frombuffer(content, dtype)[0]
+    expected = {"magic": MAGIC, "version": VERSION} | fields
+    valid = all(datagram[name] == value for name, value in expected.items())
+    return datagram if valid and datagram["crc"] == zlib.crc32(content[:-4]) else None
 
 
 def _crc_table() -> NDArray[np.uint32]:
@@ -106,8 +141,8 @@ def crc32(data: Bytes, length: int) -> int:
 
 
 @kernel
-def is_sound(data: Bytes, datagram: Record, length: int, expected: int, kind: int) -> bool:
-    """Whether so many received bytes are a datagram of this kind; `datagram` is a view of `data`."""
+def is_valid(data: Bytes, datagram: Record, length: int, expected: int, kind: int) -> bool:
+    """Whether `length` received bytes are a datagram of this kind with this `expected` length; `datagram` views `data`."""
     return bool(
         length == expected
         and datagram.magic == MAGIC
@@ -115,24 +150,3 @@ def is_sound(data: Bytes, datagram: Record, length: int, expected: int, kind: in
         and datagram.kind == kind
         and datagram.crc == crc32(data, expected - 4)
     )
-
-
-def encode(dtype: np.dtype[Any], **fields: object) -> bytes:
-    """A whole datagram with head and CRC, for what is not sent in every cycle."""
-    datagram: Record = np.zeros(1, dtype)
-    datagram["magic"], datagram["version"] = MAGIC, VERSION
-    for name, value in fields.items():
-        datagram[name] = value
-    content: Bytes = datagram.view(np.uint8)
-    datagram["crc"] = crc32(content, dtype.itemsize - 4)
-    return content.tobytes()
-
-
-def decode(dtype: np.dtype[Any], kind: int, content: bytes) -> Record | None:
-    """The datagram, or None if it is none of this kind."""
-    if len(content) != dtype.itemsize:
-        return None
-    data = np.frombuffer(content, np.uint8)
-    datagram: Record = data.view(dtype)[0]
-    sound = datagram["magic"] == MAGIC and datagram["version"] == VERSION and datagram["kind"] == kind
-    return datagram if sound and datagram["crc"] == crc32(data, len(content) - 4) else None

@@ -1,9 +1,7 @@
-"""The emulated rig on UDP: it answers commands, looks after its drives when none come, and loses, delays or repeats packets on
-demand.
+"""The emulated rig on UDP: it answers commands, stops its drives without them, and loses, delays or repeats packets on demand.
 
-The same code answers a controller in another process, through a socket on the machine's clock, and one in the same thread,
-through memory on the clock of its cycles, so that what takes minutes elsewhere takes milliseconds and comes out the same every
-time.
+The same code answers a controller in another process, through a socket on the machine's clock, and a controller in the same
+thread, through memory on the clock of its cycles. The latter is much faster, and its results are repeatable.
 """
 
 from typing import NamedTuple
@@ -11,26 +9,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.safety.watch import BRAKED, FAULTY, FOLLOWING, QUICK_STOP, QUICK_STOPPING
 from hil.realtime.clock import now
-from hil.rigs import ANSWERED, SILENT
+from hil.rigs import ANSWERED, BRAKED, FAULTY, FOLLOWING, QUICK_STOP, QUICK_STOPPING, SILENT
 from hil.rigs.emulation.drives import move, sample
 from hil.rigs.emulation.faults import disturb, draw
-from hil.rigs.udp.datagrams import (
-    COMMAND,
-    COMMAND_DATAGRAM,
-    HELLO_DATAGRAM,
-    LONGEST,
-    MAGIC,
-    MEASUREMENT,
-    MEASUREMENT_DATAGRAM,
-    TRUTH_DATAGRAM,
-    VERSION,
-    Bytes,
-    crc32,
-    is_sound,
+from hil.rigs.udp.datagrams import HELLO_DATAGRAM, LONGEST, MAGIC, VERSION, Bytes, DatagramKind, crc32, is_valid
+from hil.rigs.udp.link import (
+    UdpLink,
+    await_datagram,
+    decode_answer,
+    encode_command,
+    new_link,
+    receive_datagram,
+    send_datagram,
 )
-from hil.rigs.udp.rig import SOCKET, UdpLink, await_datagram, decode_answer, encode_command, receive_datagram, send_datagram
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS
@@ -38,28 +30,28 @@ from plant.pose import Array
 
 WATCHDOG_S = 0.03
 WATCHDOG_CODE = 0x8130
-"""CiA 402's code for a controller whose life guarding has failed."""
+"""CiA 402's code for a failed life guarding: the controller has been silent for too long."""
 
 _PACKETS = 64
 _HELLO_BYTES = HELLO_DATAGRAM.itemsize
-_IN, _OUT = 0, 1
+_TO_RIG, _TO_CONTROLLER = 0, 1
 _NEVER = np.iinfo(np.int64).max
 _LATENCY_NS = 20_000
-"""What a packet takes each way through memory."""
+"""Travel time of a packet through memory, each way."""
 
 _IDLE_NS = 1_000_000
-"""How often an emulated rig looks after itself while nothing comes."""
+"""How often an emulated rig checks its watchdog while no datagram arrives."""
 
 PACKET = np.dtype(
     [("due_ns", np.int64), ("way", np.int64), ("length", np.int64), ("content", np.uint8, LONGEST)],
     align=True,
 )
 
-UDP_PORT = np.dtype(
+UDP_SESSION = np.dtype(
     [
-        ("session", np.uint32),
+        ("id", np.uint32),
         ("last", np.uint32),
-        ("heard_ns", np.int64),
+        ("commanded_ns", np.int64),
         ("watchdog_ns", np.int64),
         ("refused", np.int64),
         ("held_back", np.int64, 2),
@@ -67,85 +59,73 @@ UDP_PORT = np.dtype(
     ],
     align=True,
 )
-"""The bus side of an emulated rig: its session and the last command's number, when that came, after how long without one the
-drives stop, how many datagrams were refused, whether one is held back to come after the next, and the packets that are under
-way."""
+"""A session of an emulated rig: its id; sequence number and time of the last command; the time without a command after which
+the drives stop; the number of refused datagrams; whether a packet is held back to arrive after the next, each way; and the
+packets in transit."""
 
 
 class UdpEmulator(NamedTuple):
-    """An emulated rig on UDP, as compiled code takes it.
+    """An emulated rig on UDP, in compiled code.
 
     Attributes:
         fmu, imu: the plant and its IMUs' imperfections.
         rig: dtype `hil.rigs.emulation.drives.EMULATED`.
-        port: dtype `UDP_PORT`.
-        socket: dtype `hil.rigs.udp.rig.SOCKET`; without a descriptor the rig is in memory.
-        command, command_bytes: what is received.
-        answer, truth, answer_bytes: what is sent.
+        session: dtype `UDP_SESSION`.
+        link: the rig's side of the link; the rig is in memory if its socket has no descriptor.
     """
 
     fmu: Record
     imu: Record
     rig: Record
-    port: Record
-    socket: Record
-    command: Record
-    command_bytes: Bytes
-    answer: Record
-    truth: Record
-    answer_bytes: Bytes
+    session: Record
+    link: UdpLink
 
 
 def new_udp_emulator(fmu: Record, imu: Record, rig: Record, session: int = 0, watchdog_s: float = WATCHDOG_S) -> UdpEmulator:
-    """An emulated rig on UDP that has not been spoken to."""
-    port: Record = np.zeros((), UDP_PORT)
-    port["session"], port["watchdog_ns"] = session, round(1e9 * watchdog_s)
-    received, sent = np.zeros(LONGEST, np.uint8), np.zeros(LONGEST, np.uint8)
-    size = MEASUREMENT_DATAGRAM.itemsize
-    return UdpEmulator(
-        fmu, imu, rig, port, np.zeros((), SOCKET), received[: COMMAND_DATAGRAM.itemsize].view(COMMAND_DATAGRAM), received,
-        sent[:size].view(MEASUREMENT_DATAGRAM), sent[size:].view(TRUTH_DATAGRAM), sent,
-    )  # fmt: skip
+    """An emulated rig on UDP that has received nothing yet."""
+    made: Record = np.zeros((), UDP_SESSION)
+    made["id"], made["watchdog_ns"] = session, round(1e9 * watchdog_s)
+    return UdpEmulator(fmu, imu, rig, made, new_link())
 
 
 @kernel
 def is_later(sequence: int, last: int) -> bool:
-    """Whether a number that wraps at 2^32 comes after another."""
+    """Whether a sequence number, which wraps at 2^32, comes after another."""
     ahead = (np.int64(sequence) - np.int64(last)) & 0xFFFFFFFF
     return bool(0 < ahead < 0x80000000)
 
 
 @kernel
-def answer(emulator: UdpEmulator, length: int, now_ns: int) -> int:
-    """Do what the received datagram of `length` bytes says, and write the answer; returns its length, 0 if there is none."""
-    rig, port, c, a = emulator.rig[()], emulator.port[()], emulator.command[0], emulator.answer[0]
-    data, size = emulator.command_bytes, emulator.command.itemsize
+def answer_command(emulator: UdpEmulator, length: int, now_ns: int) -> int:
+    """Apply the received command of `length` bytes, and write the answer; returns its length, 0 without one."""
+    rig, session, link = emulator.rig[()], emulator.session[()], emulator.link
+    c, a, t = link.command[0], link.answer[0], link.truth[0]
     if (
-        not is_sound(data, c, length, size, COMMAND)
-        or c.session != port.session
+        not is_valid(link.command_bytes, c, length, link.command.itemsize, DatagramKind.COMMAND)
+        or c.session != session.id
         or c.session == 0
-        or not is_later(c.sequence, port.last)
+        or not is_later(c.sequence, session.last)
     ):
-        port.refused += 1
+        session.refused += 1
         return 0
     finite = True
     for k in range(LEGS):
         finite = finite and np.isfinite(c.velocity[k])
     if c.request > QUICK_STOP or not finite:
-        port.refused += 1
+        session.refused += 1
         return 0
     move(emulator.fmu, emulator.rig, now_ns)
-    port.last, port.heard_ns = c.sequence, now_ns
+    session.last, session.commanded_ns = c.sequence, now_ns
     for k in range(LEGS):
         rig.request[k], rig.target[k] = c.request, c.velocity[k]
         rig.reset[k] = 1 if c.reset != 0 and c.request == BRAKED else 0
-    # What is asked for takes effect in this instant.
+    # The request takes effect in this instant.
     move(emulator.fmu, emulator.rig, now_ns + 1)
     if sample(emulator.fmu, emulator.imu, emulator.rig, now_ns + 1) != 0:
         return 0
-    a.magic, a.version, a.kind = MAGIC, VERSION, MEASUREMENT
+    a.magic, a.version, a.kind = MAGIC, VERSION, DatagramKind.MEASUREMENT
     a.session, a.sequence, a.time_ns = c.session, c.sequence, now_ns
-    a.refused = port.refused
+    a.refused = session.refused
     for k in range(IMU_COUNT):
         a.sample_ns[k], a.sample_number[k] = rig.sample_ns[k], rig.sequence[k]
         for kind in range(3):
@@ -153,20 +133,19 @@ def answer(emulator: UdpEmulator, length: int, now_ns: int) -> int:
                 a.measurement[kind, k, i] = rig.measurement[kind, k, i]
     for k in range(LEGS):
         a.drive[k], a.code[k], a.velocity[k] = rig.drive[k], rig.code[k], rig.velocity[k]
-    a.crc = crc32(emulator.answer_bytes, emulator.answer.itemsize - 4)
-    t = emulator.truth[0]
+    a.crc = crc32(link.answer_bytes, link.answer.itemsize - 4)
     for i in range(rig.truth.size):
         t.truth[i] = rig.truth[i]
-    t.crc = crc32(emulator.answer_bytes[emulator.answer.itemsize :], emulator.truth.itemsize - 4)
-    return int(emulator.answer_bytes.size)
+    t.crc = crc32(link.answer_bytes[link.answer.itemsize :], link.truth.itemsize - 4)
+    return int(link.answer_bytes.size)
 
 
 @kernel
-def look_after(emulator: UdpEmulator, now_ns: int) -> None:
-    """Let the plant move on, and stop the drives with a fault if no command has come for too long."""
-    rig, port = emulator.rig[()], emulator.port[()]
+def check_watchdog(emulator: UdpEmulator, now_ns: int) -> None:
+    """Move the plant on to `now_ns`, and stop the drives with a fault if no command has arrived for too long."""
+    rig, session = emulator.rig[()], emulator.session[()]
     move(emulator.fmu, emulator.rig, now_ns)
-    if now_ns - port.heard_ns <= port.watchdog_ns:
+    if now_ns - session.commanded_ns <= session.watchdog_ns:
         return
     for k in range(LEGS):
         if rig.drive[k] == FOLLOWING or rig.drive[k] == QUICK_STOPPING:
@@ -174,15 +153,15 @@ def look_after(emulator: UdpEmulator, now_ns: int) -> None:
 
 
 @kernel
-def post(emulator: UdpEmulator, content: Bytes, length: int, way: int, now_ns: int) -> None:
-    """Put a packet on its way, with what the faults of the bus do to it."""
-    port = emulator.port[()]
+def post_packet(emulator: UdpEmulator, content: Bytes, length: int, way: int, now_ns: int) -> None:
+    """Put a packet in transit, subject to the faults of the bus."""
+    session = emulator.session[()]
     copies, delay, corrupt, held = disturb(emulator.rig[()], now_ns)
-    if emulator.socket[()].descriptor == 0:
+    if emulator.link.socket[()].descriptor == 0:
         delay += _LATENCY_NS
-    released = port.held_back[way] > 0 and not held
+    released = session.held_back[way] > 0 and not held
     for i in range(_PACKETS):
-        p = port.packet[i]
+        p = session.packet[i]
         if released and p.length > 0 and p.way == way and p.due_ns == _NEVER:
             p.due_ns = now_ns + delay + 1
         if copies > 0 and p.length == 0:
@@ -194,96 +173,96 @@ def post(emulator: UdpEmulator, content: Bytes, length: int, way: int, now_ns: i
                 bit = int(draw(emulator.rig[()].random) * 8 * length)
                 p.content[bit // 8] ^= np.uint8(1 << (bit % 8))
             copies -= 1
-    port.held_back[way] = 1 if held else 0
+    session.held_back[way] = 1 if held else 0
 
 
 @kernel
-def next_due(port: Record) -> int:
-    """The packet that is due next, -1 if none is under way."""
+def next_packet(session: Record) -> int:
+    """Index of the packet that arrives next, -1 if none is in transit."""
     best, due = -1, _NEVER
     for i in range(_PACKETS):
-        p = port[()].packet[i]
+        p = session[()].packet[i]
         if p.length > 0 and p.due_ns < due:
             best, due = i, p.due_ns
     return best
 
 
 @kernel
+def take_packet(packet: Record, data: Bytes) -> int:
+    """Take a packet out of transit into `data`; returns its length."""
+    length = packet.length
+    packet.length = 0
+    for j in range(length):
+        data[j] = packet.content[j]
+    return int(length)
+
+
+@kernel
 def exchange_in_memory(
     emulator: UdpEmulator, link: UdpLink, command: Array, request: int, feedback: Record, now_ns: int
 ) -> int:
-    """An exchange through memory, `now_ns` on the clock of both sides; returns `ANSWERED` or `SILENT`."""
-    port = emulator.port[()]
+    """An exchange through memory at `now_ns` on the clock of both sides; returns `ANSWERED` or `SILENT`."""
+    session, rig_link = emulator.session[()], emulator.link
     deadline = now_ns + link.socket[()].timeout_ns
-    look_after(emulator, now_ns)
+    check_watchdog(emulator, now_ns)
     encode_command(link, command, request, now_ns)
-    post(emulator, link.command_bytes, link.command_bytes.size, _IN, now_ns)
+    post_packet(emulator, link.command_bytes, link.command.itemsize, _TO_RIG, now_ns)
     while True:
-        i = next_due(emulator.port)
-        if i < 0 or port.packet[i].due_ns > deadline:
+        i = next_packet(emulator.session)
+        if i < 0 or session.packet[i].due_ns > deadline:
             feedback.round_trip_ns = link.socket[()].timeout_ns
             return SILENT
-        p = port.packet[i]
+        p = session.packet[i]
         at = max(p.due_ns, now_ns)
-        length, way = p.length, p.way
-        p.length = 0
-        target = emulator.command_bytes if way == _IN else link.answer_bytes
-        for j in range(length):
-            target[j] = p.content[j]
-        if way == _IN:
-            written = answer(emulator, length, at)
+        if p.way == _TO_RIG:
+            written = answer_command(emulator, take_packet(p, rig_link.command_bytes), at)
             if written > 0:
-                post(emulator, emulator.answer_bytes, written, _OUT, at)
-        elif decode_answer(link, length, feedback):
+                post_packet(emulator, rig_link.answer_bytes, written, _TO_CONTROLLER, at)
+        elif decode_answer(link, take_packet(p, link.answer_bytes), feedback):
             feedback.round_trip_ns = at - now_ns
             return ANSWERED
 
 
 @kernel
 def serve(emulator: UdpEmulator, started_ns: int, duration_ns: int, timespec: NDArray[np.int64]) -> int:
-    """Serve the socket for so long on the machine's clock, which read `started_ns` when the rig's clock began; returns 1 at
-    once when what may be a hello has been received, else 0.
+    """Serve the socket for a duration on the machine's clock. Returns 1 as soon as a possible hello arrives, else 0.
 
     Args:
-        emulator: with a socket that is bound, and its peer known.
-        started_ns, duration_ns: [ns].
+        emulator: with a bound socket and its peer.
+        started_ns: the machine's clock when the rig's clock began [ns].
+        duration_ns: [ns].
         timespec: (2,), scratch.
     """
-    port = emulator.port[()]
+    session, link = emulator.session[()], emulator.link
     begin = now(timespec)
     while True:
         at = now(timespec)
         if at - begin >= duration_ns:
             return 0
         time_ns = at - started_ns
-        # Also while datagrams come all the time: a flood of them must not hold the watchdog up.
+        # Also while datagrams keep arriving: a flood of them must not block the watchdog.
         if time_ns - emulator.rig[()].time_ns >= _IDLE_NS:
-            look_after(emulator, time_ns)
-        length = receive_datagram(emulator.socket, emulator.command_bytes)
+            check_watchdog(emulator, time_ns)
+        length = receive_datagram(link.socket, link.command_bytes)
         if length == _HELLO_BYTES:
             return 1
-        if length == 0 or (length > 0 and emulator.socket[()].stranger != 0):
-            port.refused += 1
+        if length == 0 or (length > 0 and link.socket[()].stranger != 0):
+            session.refused += 1
         elif length > 0:
-            post(emulator, emulator.command_bytes, min(length, LONGEST), _IN, time_ns)
-        i = next_due(emulator.port)
-        if i >= 0 and port.packet[i].due_ns <= time_ns:
-            p = port.packet[i]
-            length, way = p.length, p.way
-            p.length = 0
-            target = emulator.command_bytes if way == _IN else emulator.answer_bytes
-            for j in range(length):
-                target[j] = p.content[j]
-            if way == _OUT:
-                send_datagram(emulator.socket, emulator.answer_bytes, length)
+            post_packet(emulator, link.command_bytes, min(length, LONGEST), _TO_RIG, time_ns)
+        i = next_packet(emulator.session)
+        if i >= 0 and session.packet[i].due_ns <= time_ns:
+            p = session.packet[i]
+            if p.way == _TO_CONTROLLER:
+                send_datagram(link.socket, link.answer_bytes, take_packet(p, link.answer_bytes))
                 continue
-            written = answer(emulator, length, time_ns)
+            written = answer_command(emulator, take_packet(p, link.command_bytes), time_ns)
             if written > 0:
-                post(emulator, emulator.answer_bytes, written, _OUT, now(timespec) - started_ns)
+                post_packet(emulator, link.answer_bytes, written, _TO_CONTROLLER, now(timespec) - started_ns)
             continue
         if length >= 0:
             continue
         wait = _IDLE_NS
-        if i >= 0 and port.packet[i].due_ns != _NEVER:
-            wait = min(wait, max(port.packet[i].due_ns - time_ns, 1000))
-        await_datagram(emulator.socket, wait)
+        if i >= 0 and session.packet[i].due_ns != _NEVER:
+            wait = min(wait, max(session.packet[i].due_ns - time_ns, 1000))
+        await_datagram(link.socket, wait)

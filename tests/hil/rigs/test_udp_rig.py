@@ -31,22 +31,20 @@ from hil.rigs import (
 from hil.rigs.canopen.settings import LARGEST_LOAD, canopen_settings
 from hil.rigs.udp import datagrams
 from hil.rigs.udp.datagrams import (
-    COMMAND,
     COMMAND_DATAGRAM,
-    HELLO,
     HELLO_DATAGRAM,
-    MEASUREMENT,
     MEASUREMENT_DATAGRAM,
     TRUTH_DATAGRAM,
     VERSION,
-    WELCOME,
     WELCOME_DATAGRAM,
+    DatagramKind,
     crc32,
     decode,
     encode,
 )
-from hil.rigs.udp.emulator import WATCHDOG_CODE, answer, new_udp_emulator
-from hil.rigs.udp.rig import UdpRig, decode_answer, new_link, parse_address
+from hil.rigs.udp.emulator import WATCHDOG_CODE, answer_command, new_udp_emulator
+from hil.rigs.udp.link import decode_answer, new_link, parse_address
+from hil.rigs.udp.rig import UdpRig
 from hil.runs.emulator import EmulatorConfig, _rig_of
 from hil.runs.simulation import SimulationConfig
 from plant.compiled import kernel
@@ -103,7 +101,7 @@ def test_the_header_has_the_constants_of_the_datagrams():
     enums = {
         name: re.sub(r"GOUGH_| = 1", "", body).split(", ") for name, body in re.findall(r"enum gough_(\w+) \{ (.*) \}", text)
     }
-    assert [getattr(datagrams, name) for name in enums["kind"]] == [1, 2, 3, 4]
+    assert [DatagramKind[name] for name in enums["kind"]] == [1, 2, 3, 4]
     assert [getattr(hil.rigs, name) for name in enums["request"]] == [0, 1, 2]
     assert [getattr(hil.rigs, name) for name in enums["drive"]] == [0, 1, 2, 3, 4]
 
@@ -296,20 +294,22 @@ class Sender:
             return None
 
     def hello(self, patience=2.0, **changes):
-        content = encode(HELLO_DATAGRAM, **{"kind": HELLO, "session": self.session, "period_us": 10_000, **changes})
+        content = encode(
+            HELLO_DATAGRAM, **{"kind": DatagramKind.HELLO, "session": self.session, "period_us": 10_000, **changes}
+        )
         answer = self.ask(content, patience)
-        return answer and decode(WELCOME_DATAGRAM, WELCOME, answer)
+        return answer and decode(WELCOME_DATAGRAM, answer, kind=DatagramKind.WELCOME)
 
     def encoded(self, **changes):
         self.sequence += 1
-        own = {"kind": COMMAND, "session": self.session, "sequence": self.sequence}
+        own = {"kind": DatagramKind.COMMAND, "session": self.session, "sequence": self.sequence}
         return encode(COMMAND_DATAGRAM, **{**own, **changes})
 
     def command(self, **changes):
         """Send a command that must be answered; returns the answer."""
         answer = self.ask(self.encoded(**changes), 2.0)
         assert answer is not None
-        measurement = decode(MEASUREMENT_DATAGRAM, MEASUREMENT, answer[: MEASUREMENT_DATAGRAM.itemsize])
+        measurement = decode(MEASUREMENT_DATAGRAM, answer[: MEASUREMENT_DATAGRAM.itemsize], kind=DatagramKind.MEASUREMENT)
         assert measurement["session"] == self.session and measurement["sequence"] == self.sequence
         return measurement
 
@@ -339,7 +339,7 @@ def test_what_is_wrong_is_refused_counted_and_without_effect(address):
             "no session": controller.encoded(session=0),
             "magic": controller.encoded(magic=0x12345678),
             "version": controller.encoded(version=VERSION + 1),
-            "kind": controller.encoded(kind=MEASUREMENT),
+            "kind": controller.encoded(kind=DatagramKind.MEASUREMENT),
             "request": controller.encoded(request=3),
             "not finite": controller.encoded(velocity=infinite),
             "crc": controller.encoded()[:-1] + b"!",
@@ -390,7 +390,7 @@ def test_the_watchdog_is_not_held_up_by_a_flood(address):
                 controller.socket.sendto(controller.encoded(request=ENABLED, velocity=SPEEDS), controller.rig)
                 with suppress(BlockingIOError):
                     content = controller.socket.recv(2048)
-        answer = decode(MEASUREMENT_DATAGRAM, MEASUREMENT, content[: MEASUREMENT_DATAGRAM.itemsize])
+        answer = decode(MEASUREMENT_DATAGRAM, content[: MEASUREMENT_DATAGRAM.itemsize], kind=DatagramKind.MEASUREMENT)
         assert (answer["code"] == WATCHDOG_CODE).all() and answer["refused"] > 100
 
 
@@ -537,10 +537,10 @@ def fuzz_answer(emulator, good, length, rounds, state):
     """How many wrong commands are answered."""
     answered = 0
     for n in range(rounds):
-        got = spoil(emulator.command_bytes, good, length, state, n % 4)
+        got = spoil(emulator.link.command_bytes, good, length, state, n % 4)
         if n % 4 == HEADED:
-            emulator.command[0].crc = crc32(emulator.command_bytes, length - 4)
-        answered += answer(emulator, got, 1_000_000_000 + n) != 0
+            emulator.link.command[0].crc = crc32(emulator.link.command_bytes, length - 4)
+        answered += answer_command(emulator, got, 1_000_000_000 + n) != 0
     return answered
 
 
@@ -564,9 +564,9 @@ def bytes_changed_in_answer(emulator, good, length):
     for at in range(length):
         for change in range(1, 256):
             for i in range(length):
-                emulator.command_bytes[i] = good[i]
-            emulator.command_bytes[at] ^= np.uint8(change)
-            answered += answer(emulator, length, 1_000_000_000) != 0
+                emulator.link.command_bytes[i] = good[i]
+            emulator.link.command_bytes[at] ^= np.uint8(change)
+            answered += answer_command(emulator, length, 1_000_000_000) != 0
     return answered
 
 
@@ -579,7 +579,7 @@ def test_the_controller_takes_nothing_that_is_wrong(truthful):
     link, feedback = new_link(), new_feedback()[()]
     link.socket["session"], link.socket["sequence"] = 7, 9
     values = np.random.default_rng(1).normal(size=(3, 7, 3))
-    sound = encode(MEASUREMENT_DATAGRAM, kind=MEASUREMENT, session=7, sequence=9, measurement=values)
+    sound = encode(MEASUREMENT_DATAGRAM, kind=DatagramKind.MEASUREMENT, session=7, sequence=9, measurement=values)
     if truthful:
         truth = np.zeros(1, TRUTH_DATAGRAM)
         truth["truth"] = np.arange(19.0)
@@ -607,18 +607,18 @@ def test_the_rig_does_nothing_that_is_wrong():
     plant, imu, rig = _rig_of(EmulatorConfig(SimulationConfig(imu="ideal")), PERIOD, [])
     with plant:
         emulator = new_udp_emulator(plant.handle, imu, rig, session=7)
-        content = encode(COMMAND_DATAGRAM, kind=COMMAND, session=7, sequence=1, request=ENABLED, velocity=SPEEDS)
-        emulator.command_bytes[: len(content)] = np.frombuffer(content, np.uint8)
-        assert answer(emulator, len(content), 1_000_000) > 0
+        content = encode(COMMAND_DATAGRAM, kind=DatagramKind.COMMAND, session=7, sequence=1, request=ENABLED, velocity=SPEEDS)
+        emulator.link.command_bytes[: len(content)] = np.frombuffer(content, np.uint8)
+        assert answer_command(emulator, len(content), 1_000_000) > 0
         # The next one, which would turn all drives around.
-        content = encode(COMMAND_DATAGRAM, kind=COMMAND, session=7, sequence=2, request=ENABLED, velocity=-SPEEDS)
+        content = encode(COMMAND_DATAGRAM, kind=DatagramKind.COMMAND, session=7, sequence=2, request=ENABLED, velocity=-SPEEDS)
         good = np.frombuffer(content, np.uint8).copy()
-        before = without_refused(emulator.port), rig.tobytes(), emulator.answer_bytes.tobytes()
+        before = without_refused(emulator.session), rig.tobytes(), emulator.link.answer_bytes.tobytes()
         state = np.array([88172645463325252], np.uint64)
         assert fuzz_answer(emulator, good, len(good), ROUNDS, state) == 0
         assert bytes_changed_in_answer(emulator, good, len(good)) == 0
-        assert (without_refused(emulator.port), rig.tobytes(), emulator.answer_bytes.tobytes()) == before
-        assert emulator.port["refused"] == ROUNDS + 255 * len(good)
-        emulator.command_bytes[: len(good)] = good
-        assert answer(emulator, len(good), 2_000_000) > 0
+        assert (without_refused(emulator.session), rig.tobytes(), emulator.link.answer_bytes.tobytes()) == before
+        assert emulator.session["refused"] == ROUNDS + 255 * len(good)
+        emulator.link.command_bytes[: len(good)] = good
+        assert answer_command(emulator, len(good), 2_000_000) > 0
         np.testing.assert_allclose(rig["velocity"], -SPEEDS, rtol=1e-6)

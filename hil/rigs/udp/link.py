@@ -1,0 +1,241 @@
+"""The link to a UDP rig: addresses, and the exchange of datagrams from compiled code, without the GIL.
+
+The controller refuses and counts every datagram that does not come from the rig's address, is malformed, or does not answer the
+last command, such as one that is late, repeated or replayed.
+"""
+
+import ipaddress
+import socket
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import types
+from numpy.typing import NDArray
+
+from hil.realtime.clock import now
+from hil.rigs import ANSWERED, FAULTY, OFF, SILENT
+from hil.rigs.udp.datagrams import (
+    COMMAND_DATAGRAM,
+    LONGEST,
+    MAGIC,
+    MEASUREMENT_DATAGRAM,
+    TRUTH_DATAGRAM,
+    VERSION,
+    Bytes,
+    DatagramKind,
+    crc32,
+    is_valid,
+)
+from plant.compiled import Record, kernel
+from plant.dynamics.variables import IMU_COUNT
+from plant.errors import InputError
+from plant.mechanism import LEGS
+from plant.pose import Array
+
+DEFAULT_ADDRESS = "127.0.0.1:47100"
+
+
+def parse_address(text: str, anywhere: bool = False) -> tuple[str, int]:
+    """Host and port of an address such as 127.0.0.1:47100.
+
+    Raises:
+        InputError: the text is not an address, or is neither loopback nor of a private network and not allowed `anywhere`.
+    """
+    host, _, port = text.rpartition(":")
+    try:
+        address = ipaddress.IPv4Address(host)
+        # int would accept blanks, signs and underscores, too.
+        number = int(port) if port.isdecimal() else 0
+    except ValueError:
+        raise InputError(f"{text!r} is not an address; give an IPv4 address and a port, such as {DEFAULT_ADDRESS}") from None
+    if not 0 < number < 65536:
+        raise InputError(f"the port of {text!r} must be a number from 1 to 65535")
+    # 0.0.0.0, which means every interface, counts as private.
+    if not (anywhere or address.is_loopback or (address.is_private and not address.is_unspecified)):
+        raise InputError(f"{host} is neither loopback nor of a private network: nothing is encrypted; use a dedicated link")
+    return host, number
+
+
+def bound_socket(host: str, port: int) -> socket.socket:
+    """A socket that receives at an address; port 0 takes a free one.
+
+    Raises:
+        OSError: the address is taken or does not exist.
+    """
+    family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+    opened = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        opened.bind(address)
+    except OSError:
+        opened.close()
+        raise
+    return opened
+
+
+def socket_address(address: tuple[str, int]) -> NDArray[np.uint8]:
+    """A `sockaddr_in` as bytes (16,)."""
+    host, port = address
+    content = socket.AF_INET.to_bytes(2, "little") + port.to_bytes(2, "big") + socket.inet_aton(host) + bytes(8)
+    return np.frombuffer(content, np.uint8)
+
+
+SOCKET = np.dtype(
+    [
+        ("descriptor", np.int64),
+        ("session", np.uint32),
+        ("sequence", np.uint32),
+        ("timeout_ns", np.int64),
+        ("reset", np.uint32),
+        ("peer", np.uint8, 16),
+        ("sender", np.uint8, 16),
+        ("sender_size", np.int32, 2),
+        ("stranger", np.int64),
+        ("poll", np.int32, 2),
+        ("timespec", np.int64, 2),
+    ],
+    align=True,
+)
+"""A socket in compiled code: its descriptor; session and sequence number of the last command, and how long to wait for the
+answer; whether commands reset the drives' faults; the other side's address, and the last sender's, as `sockaddr_in`; whether
+that was a stranger; and scratch for system calls.
+"""
+
+
+class UdpLink(NamedTuple):
+    """One side of the link, in compiled code.
+
+    Attributes:
+        socket: dtype `SOCKET`.
+        command, command_bytes: the datagram from the controller, and its buffer.
+        answer, truth, answer_bytes: the measurement from the rig, the truth that may follow it, and the buffer of both.
+    """
+
+    socket: Record
+    command: Record
+    command_bytes: Bytes
+    answer: Record
+    truth: Record
+    answer_bytes: Bytes
+
+
+def new_link() -> UdpLink:
+    """A link without a socket."""
+    command, answer, size = np.zeros(LONGEST, np.uint8), np.zeros(LONGEST, np.uint8), MEASUREMENT_DATAGRAM.itemsize
+    return UdpLink(
+        np.zeros((), SOCKET), command[: COMMAND_DATAGRAM.itemsize].view(COMMAND_DATAGRAM), command,
+        answer[:size].view(MEASUREMENT_DATAGRAM), answer[size:].view(TRUTH_DATAGRAM), answer,
+    )  # fmt: skip
+
+
+_POLLIN = 1
+_MSG_DONTWAIT, _MSG_TRUNC = 0x40, 0x20
+_sendto: Any = types.ExternalFunction(
+    "sendto", types.intp(types.int32, types.intp, types.intp, types.int32, types.intp, types.int32)
+)
+_recvfrom: Any = types.ExternalFunction(
+    "recvfrom", types.intp(types.int32, types.intp, types.intp, types.int32, types.intp, types.intp)
+)
+_ppoll: Any = types.ExternalFunction("ppoll", types.int32(types.intp, types.intp, types.intp, types.intp))
+
+
+@kernel
+def send_datagram(socket: Record, data: Bytes, length: int) -> int:
+    """Send the first `length` bytes to the peer; returns the number of bytes sent, or a negative number for an error."""
+    s = socket[()]
+    return int(_sendto(s.descriptor, data.ctypes.data, length, _MSG_DONTWAIT, s.peer.ctypes.data, 16))
+
+
+@kernel
+def receive_datagram(socket: Record, data: Bytes) -> int:
+    """Receive a datagram if there is one; returns its length, which may exceed the buffer's, or a negative number without one.
+    Notes whether the sender is a `stranger`: another address than the peer's.
+    """
+    s = socket[()]
+    s.sender_size[0] = 16
+    length = _recvfrom(
+        s.descriptor, data.ctypes.data, data.size, _MSG_DONTWAIT | _MSG_TRUNC, s.sender.ctypes.data, s.sender_size.ctypes.data
+    )
+    s.stranger = 0
+    # Family, port and address; the rest is padding.
+    for i in range(8):
+        if s.sender[i] != s.peer[i]:
+            s.stranger = 1
+    return int(length)
+
+
+@kernel
+def await_datagram(socket: Record, duration_ns: int) -> None:
+    """Wait for a datagram, at most for this duration."""
+    s = socket[()]
+    s.poll[0], s.poll[1] = s.descriptor, _POLLIN
+    s.timespec[0], s.timespec[1] = duration_ns // 1_000_000_000, duration_ns % 1_000_000_000
+    _ppoll(s.poll.ctypes.data, 1, s.timespec.ctypes.data, 0)
+
+
+@kernel
+def encode_command(link: UdpLink, command: Array, request: int, time_ns: int) -> None:
+    """Write the next command datagram."""
+    s, c = link.socket[()], link.command[0]
+    s.sequence += np.uint32(1)
+    c.magic, c.version, c.kind = MAGIC, VERSION, DatagramKind.COMMAND
+    c.session, c.sequence, c.time_ns = s.session, s.sequence, time_ns
+    c.request, c.reset = request, s.reset
+    for k in range(LEGS):
+        c.velocity[k] = command[k]
+    c.crc = crc32(link.command_bytes, link.command.itemsize - 4)
+
+
+@kernel
+def send_command(link: UdpLink, command: Array, request: int, time_ns: int) -> None:
+    """Send the next command."""
+    encode_command(link, command, request, time_ns)
+    send_datagram(link.socket, link.command_bytes, link.command.itemsize)
+
+
+@kernel
+def decode_answer(link: UdpLink, length: int, feedback: Record) -> bool:
+    """Accept the received datagram of `length` bytes if it is the answer to the last command; otherwise only count it as
+    refused.
+    """
+    s, a, t = link.socket[()], link.answer[0], link.truth[0]
+    size = link.answer.itemsize
+    with_truth = length == size + link.truth.itemsize
+    if s.stranger != 0 or not is_valid(link.answer_bytes, a, size if with_truth else length, size, DatagramKind.MEASUREMENT):
+        feedback.refused += 1
+        return False
+    if a.session != s.session or a.sequence != s.sequence:
+        feedback.refused += 1
+        return False
+    if with_truth and t.crc != crc32(link.answer_bytes[size:], link.truth.itemsize - 4):
+        feedback.refused += 1
+        return False
+    for k in range(IMU_COUNT):
+        feedback.sample_ns[k], feedback.sequence[k] = a.sample_ns[k], a.sample_number[k]
+        for kind in range(3):
+            for i in range(3):
+                feedback.measurement[kind, k, i] = a.measurement[kind, k, i]
+    for k in range(LEGS):
+        feedback.drive[k] = a.drive[k] if a.drive[k] <= FAULTY else OFF
+        feedback.drive_code[k], feedback.sent[k] = a.code[k], a.velocity[k]
+    for i in range(feedback.truth.size):
+        feedback.truth[i] = t.truth[i] if with_truth else np.nan
+    return True
+
+
+@kernel
+def exchange_udp(link: UdpLink, command: Array, request: int, feedback: Record, timespec: NDArray[np.int64]) -> int:
+    """Send the command, and wait for its answer; returns `ANSWERED` or `SILENT`."""
+    s = link.socket[()]
+    began = now(timespec)
+    send_command(link, command, request, began)
+    while True:
+        length = receive_datagram(link.socket, link.answer_bytes)
+        if length >= 0 and decode_answer(link, length, feedback):
+            feedback.round_trip_ns = now(timespec) - began
+            return ANSWERED
+        left = s.timeout_ns - (now(timespec) - began)
+        if left <= 0:
+            feedback.round_trip_ns = s.timeout_ns
+            return SILENT
+        if length < 0:
+            await_datagram(link.socket, left)
