@@ -50,12 +50,14 @@ from controller.safety.watch import (
     watch,
 )
 from controller.settings import ControlSettings, FusionSettings, SafetySettings
+from plant.checks import check_rate
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
 from plant.errors import InputError
 from plant.imu import STANDARD_GRAVITY
 from plant.mechanism import LEGS, Mechanism, six_rows
 from plant.pose import Array
+from plant.wiring import ALL_IMUS
 
 OK = NO_CAUSE
 """What a cycle reports if all is well; else it is the cause of a fault, by `controller.safety.watch`."""
@@ -63,9 +65,6 @@ OK = NO_CAUSE
 _IMPLAUSIBLE_SHARE = 0.25
 """How far outside its stroke, as a share of it, the estimate of a leg may lie."""
 
-ALL_IMUS = tuple(range(IMU_COUNT))
-
-RATE_RANGE_HZ = (50.0, 4000.0)
 
 STOP_SETTLING_S = 0.1
 """How long a mechanism that has stopped is held by its drives before the brakes take over [s]."""
@@ -365,16 +364,6 @@ def cycle_parameters(
 def imus_of(mechanism: Mechanism, imus: Collection[int] = ALL_IMUS) -> tuple[int, ...]:
     """Those of `imus` that the legs of a mechanism and its platform can have."""
     return tuple(imu for imu in ALL_IMUS if imu in imus and (imu < mechanism.legs or imu == PLATFORM_IMU))
-
-
-def check_rate(rate: float) -> None:
-    """Check that the cycle can run at this rate [Hz].
-
-    Raises:
-        InputError: it is outside 50 to 4000 Hz.
-    """
-    if not RATE_RANGE_HZ[0] <= rate <= RATE_RANGE_HZ[1]:
-        raise InputError(f"the rate is {rate:g} Hz; it must be {RATE_RANGE_HZ[0]:g} to {RATE_RANGE_HZ[1]:g} Hz")
 
 
 def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool = False, section_5: bool = False) -> float:

@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from plant.checks import checked_seed
 from plant.compiled import Record, kernel
-from plant.dynamics.variables import IMU_COUNT
 from plant.errors import InputError, UnknownNameError
-from plant.pose import Array, checked_seed, rotation_from_vector
+from plant.pose import Array, rotation_from_vector
+from plant.wiring import IMU_COUNT, RIGHT_WIRING, Wiring
 
 STANDARD_GRAVITY = 9.80665
 MILLI_G = 1e-3 * STANDARD_GRAVITY
@@ -156,44 +157,13 @@ PRESETS = {
 }  # fmt: skip
 
 _LONGEST_DELAY = 32
-_RIGHT_AXES = ("+x+y+z",) * IMU_COUNT
-
-
-@dataclass(frozen=True)
-class Wiring:
-    """How seven IMUs are mounted and wired; by default as they should be.
-
-    Attributes:
-        places: where each sits, 0-5 on the legs and 6 on the platform.
-        gyroscopes, accelerometers: what each reads for its x, y and z, such as "+y-x+z"; 0 for nothing.
-    """
-
-    places: tuple[int, ...] = tuple(range(IMU_COUNT))
-    gyroscopes: tuple[str, ...] = _RIGHT_AXES
-    accelerometers: tuple[str, ...] = _RIGHT_AXES
-
-    def __post_init__(self) -> None:
-        if sorted(self.places) != list(range(IMU_COUNT)):
-            raise InputError(f"the IMUs' places are {self.places}; they must be 0 to {IMU_COUNT - 1} in some order")
-        if {len(self.gyroscopes), len(self.accelerometers)} != {IMU_COUNT}:
-            raise InputError(f"a wiring has axes of {IMU_COUNT} gyroscopes and {IMU_COUNT} accelerometers")
-        for axes in (*self.gyroscopes, *self.accelerometers):
-            axes_matrix(axes)
 
 
 def axes_matrix(axes: str) -> Array:
-    """The matrix (3, 3) that gives the readings of axes such as "+y-x+z", 0 for one that reads nothing.
-
-    Raises:
-        InputError: no such axes.
-    """
-    if not re.fullmatch("([+-][xyz]|0){3}", axes):
-        raise InputError(f"there are no axes {axes!r}; give three such as +y-x+z, 0 for one that reads nothing")
+    """The matrix (3, 3) that gives the readings of axes such as "+y-x+z", 0 for one that reads nothing."""
     units = dict(zip(("+x", "+y", "+z", "-x", "-y", "-z", "0"), (*np.eye(3), *-np.eye(3), np.zeros(3)), strict=True))
     return np.array([units[axis] for axis in re.findall("[+-].|0", axes)])
 
-
-RIGHT_WIRING = Wiring()
 
 IMU_STATE = np.dtype(
     [

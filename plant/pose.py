@@ -43,17 +43,6 @@ def numbers(value: ArrayLike, name: str, shape: tuple[int, ...] | str) -> Array:
     return np.array(given, dtype=np.float64)
 
 
-def checked_seed(seed: int) -> int:
-    """Return a seed of random numbers.
-
-    Raises:
-        InputError: it is negative or has more than 63 bits.
-    """
-    if not 0 <= seed < 2**63:
-        raise InputError(f"the seed is {seed}; it must lie between 0 and 2^63 - 1")
-    return seed
-
-
 def checked_array(value: ArrayLike, shape: tuple[int, ...], name: str, *, allow_nan: bool = False) -> Array:
     """Return a read-only float copy of `value` after checking its shape and that it is finite.
 

@@ -15,10 +15,11 @@ import casadi as ca
 import control
 import numpy as np
 
-from controller.cycle import STATE, check_rate, cycle_parameters
+from controller.cycle import STATE, cycle_parameters
 from controller.estimation.fusion import calibrate, fuse_legs, fuse_platform, locate
 from controller.inverse_kinematics import leg_lengths
 from controller.settings import ControlSettings, control_settings, fusion_settings
+from plant.checks import check_rate
 from plant.compiled import Record
 from plant.dynamics.spatial import build_dynamics
 from plant.dynamics.variables import INPUTS, PARAMETERS, STATES, VELOCITY

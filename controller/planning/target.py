@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from controller.inverse_kinematics import leg_lengths, sample_workspace
+from plant.checks import check_duration
 from plant.errors import InputError, UnknownNameError
 from plant.mechanism import Mechanism
 from plant.pose import (
@@ -99,16 +100,6 @@ def _interpolate(knots: Array, values: Array, times: Array) -> Array:
     start = values[i] * (1.0 + 2.0 * t) * (1.0 - t) ** 2 + step * slopes[i] * t * (1.0 - t) ** 2
     interpolated: Array = start + values[i + 1] * t * t * (3.0 - 2.0 * t) + step * slopes[i + 1] * t * t * (t - 1.0)
     return interpolated
-
-
-def check_duration(duration: float) -> None:
-    """Check that a motion can last so long [s].
-
-    Raises:
-        InputError: it is not positive and finite.
-    """
-    if not 0.0 < duration < np.inf:
-        raise InputError(f"the duration is {duration:g} s; it must be positive and finite")
 
 
 def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float) -> Target:

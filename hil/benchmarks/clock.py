@@ -28,7 +28,8 @@ from hil.loop.records import RECORD, Link, shared_array
 from hil.loop.timing import QUANTILES, Histogram, Timing, over_budget
 from hil.realtime.clock import REAL, finish, new_clock, now, start, wait
 from hil.realtime.scheduling import MEASURES, RealTimeSettings, real_time, usage
-from hil.runs.simulation import PreparedLoop, SimulationConfig, prepared_loop
+from hil.runs.config import SimulationConfig
+from hil.runs.prepare import PreparedLoop, prepared_loop
 from plant.compiled import Record, kernel
 from plant.errors import GoughError
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from hil.loop.records import COMPUTED, STAGES
 from hil.reports.page import LAYOUT, figure_html, page
-from hil.runs.simulation import SimulationConfig, simulate
+from hil.runs.config import SimulationConfig
+from hil.runs.simulation import simulate
 from plant.errors import InputError
 from plant.files import write_whole
 

@@ -50,7 +50,9 @@ from controller.safety.watch import watch_nothing
 from controller.settings import sensor_settings
 from hil.loop.records import Link
 from hil.recording.mcap import Recording, RecordingError, read
-from hil.runs.simulation import SimulationConfig, SimulationStoppedError, prepared_loop, simulate
+from hil.runs.config import SimulationConfig
+from hil.runs.prepare import prepared_loop
+from hil.runs.simulation import SimulationStoppedError, simulate
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
 from plant.imu import ACCELEROMETER, GYROSCOPE, MILLI_G, STANDARD_GRAVITY, load_imu

@@ -41,7 +41,8 @@ def add_compare(commands: Any) -> None:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    from hil.studies.fusion_comparison import ComparisonConfig, compare
+    from hil.studies.config import ComparisonConfig
+    from hil.studies.fusion_comparison import compare
 
     check_outputs(options.json)
     config = ComparisonConfig(**chosen(options, "mechanism", "motion", "duration", "rate", "imu", "calibration", "seeds"))
@@ -90,7 +91,8 @@ def add_evaluate(commands: Any) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    from hil.studies.fusion_evaluation import SECTIONS, EvaluationConfig, evaluate
+    from hil.studies.config import SECTIONS, EvaluationConfig
+    from hil.studies.fusion_evaluation import evaluate
 
     check_outputs(options.json)
     config = EvaluationConfig(
@@ -205,7 +207,8 @@ def add_tune_fusion(commands: Any) -> None:
 
 
 def _tune_fusion(options: argparse.Namespace) -> int:
-    from hil.studies.fusion_tuning import TuningConfig, tune_fusion, tuned_text
+    from hil.studies.config import TuningConfig
+    from hil.studies.fusion_tuning import tune_fusion, tuned_text
 
     check_outputs(options.output, options.json)
     config = TuningConfig(**chosen(options, "mechanism", "imu", "seeds", "rate"))

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hil.runs.simulation import SimulationConfig
+    from hil.runs.config import SimulationConfig
 
 
 def add_mechanism(command: argparse.ArgumentParser) -> None:
@@ -74,8 +74,8 @@ def simulation_config(options: argparse.Namespace, *names: str) -> "SimulationCo
     Raises:
         InputError: an option is out of its range, or no setting.
     """
-    from hil.runs.simulation import SimulationConfig
-    from plant.fmu.binding import Setting
+    from hil.runs.config import SimulationConfig
+    from plant.fmu.settings import Setting
 
     values = chosen(options, *names)
     if "settings" in values:

@@ -39,8 +39,8 @@ def _check_rig(options: argparse.Namespace) -> int:
 
     keep_to_one_thread()
     from hil.rigs.contract import CLAUSES, examine_rig
+    from hil.runs.config import SimulationConfig
     from hil.runs.executive import rig_of
-    from hil.runs.simulation import SimulationConfig
 
     check_outputs(options.json)
     if options.beyond is not None and not options.move:
@@ -113,7 +113,8 @@ def _emulate(options: argparse.Namespace) -> int:
     from hil.realtime.scheduling import RealTimeSettings, keep_to_one_thread
 
     keep_to_one_thread()
-    from hil.runs.emulator import EmulatorConfig, emulate
+    from hil.runs.config import EmulatorConfig
+    from hil.runs.emulator import emulate
 
     simulated = simulation_config(options, "mechanism", "target", "imu", "seed", "plant", "binding", "rate")
     config = EmulatorConfig(

@@ -21,7 +21,7 @@ from hil.command_line.printing import deg, mm, new_table, print_table, progress_
 from plant.errors import InputError
 
 if TYPE_CHECKING:
-    from hil.runs.simulation import SimulationConfig
+    from hil.runs.config import SimulationConfig
     from hil.runs.snapshot import Snapshot
 
 
@@ -141,7 +141,7 @@ def _simulate(options: argparse.Namespace) -> int:
 
 def _resumed_config(options: argparse.Namespace, config: "SimulationConfig", resumed: "Snapshot") -> "SimulationConfig":
     """The configuration of a snapshot, with another duration if one is given."""
-    from hil.runs.simulation import SimulationConfig
+    from hil.runs.config import SimulationConfig
 
     kept = SimulationConfig.from_plain(resumed.config)
     for name in (*_MOTION, "joint_error"):

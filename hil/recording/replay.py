@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from controller.cycle import OK, PARAMETERS, STATE, cycle, prepare, skip
+from controller.planning import STREAM_TARGET
 from controller.safety.watch import RIG_FAILED, begin_stop, coast, hear
 from hil.loop.records import RECORD
 from hil.recording.mcap import RecordingError, read, total
-from hil.runs.simulation import STREAM_TARGET
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import IMU_COUNT
 from plant.pose import Array

@@ -10,7 +10,6 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
-from controller.cycle import ALL_IMUS
 from hil.reports.page import (
     AXIS_NAMES,
     COLORS,
@@ -32,6 +31,7 @@ from hil.runs.simulation import SimulationResult
 from plant.files import write_whole
 from plant.pose import Array, rotation_angle
 from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS
+from plant.wiring import ALL_IMUS
 
 _POINTS = 3000
 _FRAMES = 150

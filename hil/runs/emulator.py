@@ -11,7 +11,6 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -23,9 +22,10 @@ from hil.rigs import FOLLOWING, QUICK_STOPPING
 from hil.rigs.emulation.drives import add_fault, new_emulated
 from hil.rigs.emulation.faults import fault
 from hil.rigs.udp.datagrams import HELLO_DATAGRAM, WELCOME_DATAGRAM, DatagramKind, decode, encode
-from hil.rigs.udp.emulator import WATCHDOG_S, UdpEmulator, new_udp_emulator, serve
+from hil.rigs.udp.emulator import UdpEmulator, new_udp_emulator, serve
 from hil.rigs.udp.link import DEFAULT_ADDRESS, bound_socket, parse_address, socket_address
-from hil.runs.simulation import SimulationConfig, simulated_plant
+from hil.runs.config import EmulatorConfig
+from hil.runs.prepare import simulated_plant
 from plant.compiled import Record
 from plant.errors import GoughError, InputError
 from plant.fmu.plant import FmuPlant
@@ -43,35 +43,6 @@ _Address = tuple[str, int]
 
 class BusyError(GoughError, OSError):
     """An address is taken, or nobody answers there."""
-
-
-@dataclass(frozen=True)
-class EmulatorConfig:
-    """What is emulated.
-
-    Attributes:
-        simulated: mechanism, IMUs, seed, and the target whose first pose is the platform's start.
-        bus: "udp" or "canopen".
-        at: the address, or the settings' file; None for the default.
-        control: address of the control channel.
-        faults: from the start, as `hil.rigs.emulation.faults.fault` reads them.
-        watchdog: time without a command after which the drives stop, on UDP [s].
-    """
-
-    simulated: SimulationConfig = field(default_factory=SimulationConfig)
-    bus: str = "udp"
-    at: str | None = None
-    control: str = "127.0.0.1:47101"
-    faults: tuple[str, ...] = ()
-    watchdog: float = WATCHDOG_S
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.watchdog < 60.0:
-            raise InputError(f"the watchdog is {1e3 * self.watchdog:g} ms; it must be more than 0 and less than a minute")
-
-    def watchdog_for(self, hello: Record) -> float:
-        """The watchdog of a session [s]: three periods at least."""
-        return max(self.watchdog, 3e-6 * int(hello["period_us"]))
 
 
 class _Stopped:
@@ -253,7 +224,7 @@ def _serve_sessions(
         period = 1e-6 * int(hello["period_us"])
         plant, imu, rig = _rig_of(config, period, faults)
         with plant:
-            emulator = new_udp_emulator(plant.handle, imu, rig, int(hello["session"]), config.watchdog_for(hello))
+            emulator = new_udp_emulator(plant.handle, imu, rig, int(hello["session"]), config.watchdog_for(int(hello["period_us"])))
             link = emulator.link.socket
             link["descriptor"], link["peer"] = opened.fileno(), socket_address(sender)
             _welcome(opened, config, hello, sender)
@@ -270,7 +241,7 @@ def _hello(content: bytes) -> Record | None:
 
 def _welcome(opened: socket.socket, config: EmulatorConfig, hello: Record, sender: _Address) -> None:
     name, firmware = (np.frombuffer(text.encode().ljust(n, b"\0"), np.uint8) for text, n in ((_NAME, 32), (_FIRMWARE, 16)))
-    watchdog_us = round(1e6 * config.watchdog_for(hello))
+    watchdog_us = round(1e6 * config.watchdog_for(int(hello["period_us"])))
     welcome = encode(
         WELCOME_DATAGRAM, kind=DatagramKind.WELCOME, session=hello["session"], watchdog_us=watchdog_us, truthful=1, name=name,
         firmware=firmware,

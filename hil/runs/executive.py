@@ -45,7 +45,8 @@ from hil.rigs import Rig
 from hil.rigs.by_name import check_legs, python_rig
 from hil.rigs.udp.link import DEFAULT_ADDRESS, parse_address
 from hil.rigs.udp.rig import UdpRig
-from hil.runs.simulation import PYTHON_RIG, SimulationConfig, prepared_loop
+from hil.runs.config import PYTHON_RIG, SimulationConfig
+from hil.runs.prepare import prepared_loop
 from hil.runs.target_stream import HOST, PORT, open_socket, receive
 from plant.compiled import Record
 from plant.errors import GoughError, InputError

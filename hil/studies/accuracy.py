@@ -16,6 +16,7 @@ from controller.direct_kinematics import Solutions, required_measurements, solve
 from controller.direct_kinematics.consistency import chi_square_quantile
 from controller.direct_kinematics.spatial import LEG_SIGMA, NEEDS, TILT_SIGMA, YAW_SIGMA
 from hil.reports.markdown import markdown_table
+from plant.checks import checked_seed
 from plant.errors import InputError, SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
 from plant.mechanism.classification import (
@@ -26,7 +27,7 @@ from plant.mechanism.classification import (
     planar_classes,
     spatial_classes,
 )
-from plant.pose import Array, checked_seed, rotation_angle, rotation_from_vector
+from plant.pose import Array, rotation_angle, rotation_from_vector
 
 ALL_LEGS = tuple(range(LEGS))
 

@@ -55,7 +55,8 @@ from hil.rigs.emulation.drives import new_emulated, sample
 from hil.rigs.emulation.faults import fault
 from hil.rigs.udp.emulator import check_watchdog, new_udp_emulator
 from hil.rigs.udp.rig import TIMEOUT_SHARE
-from hil.runs.simulation import PreparedLoop, SimulationConfig, prepared_loop
+from hil.runs.config import SimulationConfig
+from hil.runs.prepare import PreparedLoop, prepared_loop
 from hil.runs.target_stream import LEAD_S, Reception, Sample, encode
 from plant.compiled import Record
 from plant.mechanism import LEGS

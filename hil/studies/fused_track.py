@@ -23,9 +23,6 @@ from plant.imu import ImuModel, imu_state, measure
 from plant.mechanism import LEGS
 from plant.pose import Array, pose_errors, rms_figures
 
-LEARNING_S = 20.0
-"""The filters learn for this time [s]; errors count after it."""
-
 CLOSED, REFINED, WHOLE, LEGS_ALONE = range(4)
 """Steps of a `FusedTrack`: closed form, refined pose, whole-mechanism filter; times have the leg filters alone as well."""
 

@@ -15,13 +15,15 @@ import numpy as np
 from vqf import VQF
 
 from controller.calibration.file import Calibration, load_calibration
-from controller.cycle import ALL_IMUS, STATE, check_rate, cycle_parameters
+from controller.cycle import STATE, cycle_parameters
 from controller.direct_kinematics import solve_batch
 from controller.estimation.fusion import calibrate, find_pose, improve_pose
 from controller.estimation.leg_filter import leg_direction, start_leg
 from controller.settings import control_settings, sensor_settings
-from hil.runs.simulation import FUSIONS, filterpy_filters
-from hil.studies.fused_track import CLOSED, LEARNING_S, REFINED, WHOLE, FusedTrack, PoseErrors, PoseTrack, fuse, poses_of, read
+from hil.runs.config import FUSIONS
+from hil.runs.simulation import filterpy_filters
+from hil.studies.config import LEARNING_S, ComparisonConfig
+from hil.studies.fused_track import CLOSED, REFINED, WHOLE, FusedTrack, PoseErrors, PoseTrack, fuse, poses_of, read
 from plant.compiled import Record, kernel
 from plant.dynamics.imposed import ImposedMotion, impose
 from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
@@ -29,36 +31,7 @@ from plant.errors import InputError
 from plant.imu import ACCELEROMETER, GYROSCOPE, ImuModel, load_imu
 from plant.mechanism import LEGS, Mechanism, load_spatial
 from plant.pose import Array
-
-
-@dataclass(frozen=True)
-class ComparisonConfig:
-    """Configuration of a comparison.
-
-    Attributes:
-        mechanism: preset or TOML file.
-        motion: "static", "mixed", or a frequency in Hz.
-        duration: [s]; the first twenty seconds do not count.
-        rate: samples per second [Hz].
-        imu: preset of the imperfections.
-        calibration: file with the IMUs' constants.
-        seeds: of imperfections, motions and noise; errors are pooled over them.
-    """
-
-    mechanism: str = "hexapod"
-    motion: str = "1"
-    duration: float = 40.0
-    rate: float = 1000.0
-    imu: str = "mpu9150-calibrated"
-    calibration: str | None = None
-    seeds: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
-
-    def __post_init__(self) -> None:
-        check_rate(self.rate)
-        if not LEARNING_S < self.duration < 3600.0:
-            raise InputError(f"the duration is {self.duration:g} s; it must be more than {LEARNING_S:g} s, which do not count")
-        if not self.seeds:
-            raise InputError("there must be a seed at least")
+from plant.wiring import ALL_IMUS
 
 
 def compare(config: ComparisonConfig, progress: Callable[[float], None] = lambda share: None) -> dict[str, Any]:

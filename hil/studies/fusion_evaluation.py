@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from controller.calibration.at_rest import Prior
 from controller.calibration.file import Calibration
-from controller.cycle import ALL_IMUS, STATE, check_rate, cycle_parameters
+from controller.cycle import STATE, cycle_parameters
 from controller.settings import control_settings, sensor_settings
 from hil.calibration.rig_calibration import Knowledge, calibrate_rig
-from hil.runs.simulation import FUSIONS, SimulationConfig, simulate
+from hil.runs.config import FUSIONS, SimulationConfig
+from hil.runs.simulation import simulate
+from hil.studies.config import LEARNING_S, EvaluationConfig
 from hil.studies.fused_track import (
-    LEARNING_S,
     LEGS_ALONE,
     REFINED,
     WHOLE,
@@ -34,13 +35,12 @@ from hil.studies.fused_track import (
 from plant.compiled import Record
 from plant.dynamics.imposed import ImposedMotion, impose
 from plant.dynamics.variables import PLATFORM_IMU
-from plant.errors import InputError, UnknownNameError
 from plant.imu import imu_state, load_imu
 from plant.mechanism import LEGS, Mechanism, load_spatial
 from plant.pose import Array
+from plant.wiring import ALL_IMUS
 
 MOTIONS = ("static", "0.5", "1", "2", "mixed")
-SECTIONS = ("motions", "faults", "start", "drift", "follow", "cost")
 
 _MOTION_S = LEARNING_S + 10.0
 _FAULT_S = 15.0
@@ -53,49 +53,6 @@ _CHUNK_S = 60.0
 _FOLLOW_S, _FOLLOWING = 60.0, "whole"
 _COST_S, _COST_REPEATS = 10.0, 7
 _CALIBRATED_IMU = "mpu9150-calibrated"
-
-
-@dataclass(frozen=True)
-class EvaluationConfig:
-    """Configuration of an evaluation.
-
-    Attributes:
-        mechanism: preset or TOML file.
-        imu: preset of the raw IMUs' imperfections.
-        fusion: a key of `FUSIONS` with a whole-mechanism filter.
-        rate: samples per second [Hz].
-        joint_error: standard deviation of each coordinate of the joints [m] in half of the motions; 0 in the others.
-        seeds: one for each rig.
-        starts: number of starts in motion.
-        still: time for which the platform stands still [s].
-        target: motion or CSV file that the closed loop follows with calibrated IMUs.
-        only: sections to run, of `SECTIONS`.
-    """
-
-    mechanism: str = "hexapod"
-    imu: str = "mpu9150"
-    fusion: str = "whole-alignments"
-    rate: float = 1000.0
-    joint_error: float = 1e-4
-    seeds: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
-    starts: int = 100
-    still: float = 600.0
-    target: str = "sines"
-    only: tuple[str, ...] = SECTIONS
-
-    def __post_init__(self) -> None:
-        check_rate(self.rate)
-        if FUSIONS.get(self.fusion) is None:
-            names = ", ".join(name for name, errors in FUSIONS.items() if errors is not None)
-            raise UnknownNameError(f"no fusion of the whole mechanism {self.fusion!r}; there are {names}")
-        if not self.seeds:
-            raise InputError("there must be a seed at least")
-        if not 0.0 <= self.joint_error < np.inf:
-            raise InputError(f"the joint error is {1e3 * self.joint_error:g} mm; it must be at least 0 and finite")
-        if not 1 <= self.starts <= 10000:
-            raise InputError(f"{self.starts} starts are asked for; there can be 1 to 10000")
-        if not LEARNING_S < self.still <= 3600.0:
-            raise InputError(f"the platform is to stand still for {self.still:g} s; it can for {LEARNING_S:g} to 3600 s")
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,9 +20,10 @@ from filterpy.stats import NEES
 from scipy.optimize import brentq, minimize_scalar
 from scipy.stats import chi2
 
-from controller.cycle import check_rate, cycle_parameters
+from controller.cycle import cycle_parameters
 from controller.settings import FusionSettings, control_settings, sensor_settings
-from hil.runs.simulation import FUSIONS
+from hil.runs.config import FUSIONS
+from hil.studies.config import TuningConfig
 from hil.studies.fused_track import REFINED, WHOLE, FusedTrack, PoseTrack, fuse, poses_of, read
 from plant.dynamics.imposed import impose
 from plant.errors import InputError
@@ -50,28 +51,6 @@ _DIGITS = 4
 
 _MOST_LEG_ERROR = np.radians(5.0)
 """RMS up to which noise can explain the errors."""
-
-
-@dataclass(frozen=True)
-class TuningConfig:
-    """Configuration of a tuning.
-
-    Attributes:
-        mechanism: preset or TOML file.
-        imu: preset of the imperfections.
-        seeds: of imperfections, motions and noise.
-        rate: samples per second [Hz].
-    """
-
-    mechanism: str = "hexapod"
-    imu: str = "mpu9150-calibrated"
-    seeds: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
-    rate: float = 1000.0
-
-    def __post_init__(self) -> None:
-        check_rate(self.rate)
-        if not self.seeds:
-            raise InputError("there must be a seed at least")
 
 
 @dataclass(frozen=True, eq=False)

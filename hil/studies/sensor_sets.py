@@ -13,7 +13,8 @@ import numpy as np
 
 from controller.cycle import check_imus
 from hil.reports.markdown import markdown_table
-from hil.runs.simulation import SimulationConfig, SimulationStoppedError, simulate
+from hil.runs.config import SimulationConfig
+from hil.runs.simulation import SimulationStoppedError, simulate
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import InputError
 from plant.mechanism import LEGS, Mechanism, load_spatial
@@ -34,7 +35,7 @@ class SensorSet:
         legs: how many legs have an IMU.
         platform: whether the platform has one, which gives its roll and pitch.
         magnetometer: whether that gives its heading as well.
-        fusions: ways to fuse, keys of `hil.runs.simulation.FUSIONS`.
+        fusions: ways to fuse, keys of `hil.runs.config.FUSIONS`.
     """
 
     label: str

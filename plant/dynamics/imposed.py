@@ -6,11 +6,12 @@ from functools import cache
 import casadi as ca
 import numpy as np
 
+from plant.checks import checked_seed
 from plant.dynamics.spatial import imu_signals, variable_symbols
 from plant.dynamics.variables import PARAMETERS
 from plant.errors import InputError
 from plant.mechanism import Mechanism
-from plant.pose import Array, checked_seed
+from plant.pose import Array
 
 SIZE = (0.03, np.radians(10.0))
 """Of the motion along and about each axis [m, rad]."""

@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike
 
 from plant.errors import InputError, UnknownNameError
 from plant.pose import Array, checked_array, numbers
+from plant.wiring import IMU_COUNT as IMU_COUNT
+from plant.wiring import PLATFORM_IMU as PLATFORM_IMU
 
 Causality = Literal["state", "input", "parameter", "output"]
 
@@ -23,9 +25,6 @@ OPEN, BRAKE, VELOCITY = 0, 1, 2
 """Values of `drive_mode`: motor unpowered and free; held by its brake; driven at `velocity_command`."""
 
 DRIVE_MODES = {OPEN: "open", BRAKE: "brake", VELOCITY: "velocity"}
-PLATFORM_IMU = 6
-"""Row of the platform's IMU in arrays over the seven IMUs; rows 0 to 5 are the legs'."""
-IMU_COUNT = 7
 
 
 @dataclass(frozen=True)

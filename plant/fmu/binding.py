@@ -9,7 +9,6 @@ import sys
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from math import isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -107,48 +106,6 @@ class Binding:
 _OWN_SIGNALS = {name: SignalBinding((name,)) for name in SIGNAL_UNITS}
 OWN_BINDING = Binding("", _OWN_SIGNALS, native=True)
 """Of gough's own plants, spatial and planar."""
-
-
-@dataclass(frozen=True)
-class Setting:
-    """A value for a parameter or input of the FMU, from the start or from a time on.
-
-    Attributes:
-        name: in the FMU.
-        value: one number for all elements, or one for each.
-        at: [s]; None for the start.
-    """
-
-    name: str
-    value: tuple[float, ...]
-    at: float | None = None
-
-    @classmethod
-    def parse(cls, text: str) -> "Setting":
-        """From text such as `payload.mass=12`, `gravity=0,0,-9.8` or `payload.mass=12@3.5`.
-
-        Raises:
-            InputError: the text is no setting.
-        """
-        name, equals, rest = text.partition("=")
-        value, at, time = rest.partition("@")
-        try:
-            numbers = tuple(float(_SWITCHES.get(part.strip(), part)) for part in value.split(","))
-            seconds = float(time) if at else None
-        except ValueError:
-            numbers, seconds = (), None
-        sound = all(map(isfinite, numbers)) and (seconds is None or (isfinite(seconds) and seconds >= 0.0))
-        if not (name.strip() and equals and numbers and sound):
-            raise InputError(f"{text!r} is no setting such as payload.mass=12, gravity=0,0,-9.8 or payload.mass=12@3.5")
-        return cls(name.strip(), numbers, seconds)
-
-    @property
-    def text(self) -> str:
-        """As `parse` takes it."""
-        return f"{self.name}={','.join(f'{each:g}' for each in self.value)}" + ("" if self.at is None else f"@{self.at:g}")
-
-
-_SWITCHES = {"true": 1.0, "false": 0.0}
 
 
 def load_binding(path: Path | str) -> Binding:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from plant.compiled import Record
 from plant.errors import FmuError, InputError
-from plant.fmu.binding import OWN_BINDING, Binding, Modes, Scalars, Setting, bind, check_free, check_start, load_binding
+from plant.fmu.binding import OWN_BINDING, Binding, Modes, Scalars, bind, check_free, check_start, load_binding
 from plant.fmu.calls import (
     CALLED,
     FMU_HANDLE,
@@ -27,6 +27,7 @@ from plant.fmu.calls import (
     write_payload_mass,
 )  # fmt: skip
 from plant.fmu.importer import OK, FmuDescription, FmuInstance, FmuVariable
+from plant.fmu.settings import Setting
 from plant.mechanism import LEGS
 from plant.pose import Array
 

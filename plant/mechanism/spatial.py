@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from plant.checks import checked_seed
 from plant.dynamics.planar_variables import PLANAR
 from plant.dynamics.variables import SPATIAL, TINY, checked_parameters
 from plant.errors import InputError, UnknownNameError, UnreachableError
@@ -35,7 +36,6 @@ from plant.pose import (
     Pose,
     checked_array,
     checked_rotation,
-    checked_seed,
     checked_unit,
     quaternion_from_rotation,
     rotation_from_quaternion,

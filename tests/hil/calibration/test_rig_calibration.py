@@ -19,7 +19,9 @@ from hil.calibration.rig_calibration import (
 )
 from hil.command_line import main
 from hil.recording.mcap import Recorder
-from hil.runs.simulation import SimulationConfig, prepared_loop, simulate
+from hil.runs.config import SimulationConfig
+from hil.runs.prepare import prepared_loop
+from hil.runs.simulation import simulate
 from plant.imu import Wiring, imu_state, load_imu
 from plant.mechanism import load_spatial
 

@@ -8,7 +8,8 @@ from controller.safety.watch import ASKED_TO_STOP, END_OF_MOTION, MISSED_PERIODS
 from hil.loop.driver import FmuRig, Loop
 from hil.loop.records import RECORD, STAGES, Link
 from hil.realtime.clock import REAL, SCRIPTED, new_clock
-from hil.runs.simulation import SimulationConfig, prepared_loop
+from hil.runs.config import SimulationConfig
+from hil.runs.prepare import prepared_loop
 from plant.dynamics.variables import BRAKE
 from plant.imu import imu_state, load_imu
 from plant.truth import TRUTH_LENGTHS

@@ -19,7 +19,9 @@ from controller.safety.watch import (
 from hil.command_line import main
 from hil.loop.driver import FmuRig
 from hil.reports.run import write_report
-from hil.runs.simulation import SimulationConfig, prepared_loop, simulate
+from hil.runs.config import SimulationConfig
+from hil.runs.prepare import prepared_loop
+from hil.runs.simulation import simulate
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import InputError
 from plant.fmu.build import PLANAR_MODEL, default_fmu

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from hil.reports.run import write_report
-from hil.runs.simulation import SimulationConfig, simulate
+from hil.runs.config import SimulationConfig
+from hil.runs.simulation import simulate
 from plant.errors import InputError
 from plant.pose import rotation_angle, rotation_from_vector
 from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS

@@ -32,8 +32,9 @@ from hil.rigs.emulation.faults import fault
 from hil.rigs.template import TemplateRig
 from hil.rigs.udp.emulator import new_udp_emulator
 from hil.rigs.udp.rig import UdpRig
+from hil.runs.config import SimulationConfig
 from hil.runs.executive import RunStoppedError, rig_of, run
-from hil.runs.simulation import SimulationConfig, prepared_loop
+from hil.runs.prepare import prepared_loop
 from plant.errors import InputError, UnknownNameError
 from plant.mechanism import load_spatial
 

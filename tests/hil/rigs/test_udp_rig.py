@@ -45,8 +45,8 @@ from hil.rigs.udp.datagrams import (
 from hil.rigs.udp.emulator import WATCHDOG_CODE, answer_command, new_udp_emulator
 from hil.rigs.udp.link import decode_answer, new_link, parse_address
 from hil.rigs.udp.rig import UdpRig
-from hil.runs.emulator import EmulatorConfig, _rig_of
-from hil.runs.simulation import SimulationConfig
+from hil.runs.config import EmulatorConfig, SimulationConfig
+from hil.runs.emulator import _rig_of
 from plant.compiled import kernel
 from plant.errors import InputError
 

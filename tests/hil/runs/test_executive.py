@@ -23,8 +23,9 @@ from hil.realtime.scheduling import MEASURES, RealTimeSettings, RefusedError, re
 from hil.recording import mcap as recording
 from hil.recording.mcap import RecordingError, read, repair
 from hil.recording.replay import COMPARED, replay
+from hil.runs.config import SimulationConfig
 from hil.runs.executive import RunStoppedError, run
-from hil.runs.simulation import SimulationConfig, prepared_loop
+from hil.runs.prepare import prepared_loop
 from plant.errors import GoughError, InputError
 from plant.mechanism import load_mechanism
 

@@ -8,9 +8,10 @@ import sys
 import numpy as np
 import pytest
 
-from hil.runs.simulation import SimulationConfig, SimulationStoppedError, simulate
+from hil.runs.config import SimulationConfig
+from hil.runs.simulation import SimulationStoppedError, simulate
 from plant.errors import InputError
-from plant.fmu.binding import Setting
+from plant.fmu.settings import Setting
 from plant.truth import TRUTH_CURRENTS
 from tests.plant.fmu.foreign import BINDING, BINDING_3, TRUTH
 

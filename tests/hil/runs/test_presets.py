@@ -5,7 +5,8 @@ import pytest
 
 from controller.planning.planner import plan
 from controller.planning.target import MOTIONS, load_target
-from hil.runs.simulation import SimulationConfig, simulate
+from hil.runs.config import SimulationConfig
+from hil.runs.simulation import simulate
 from plant.errors import InputError
 from plant.mechanism import load_mechanism
 

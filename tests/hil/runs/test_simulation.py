@@ -11,9 +11,11 @@ import pytest
 
 from controller.estimation.filterpy_filters import FilterpyLeg, FilterpyPlatform
 from controller.settings import control_settings
-from hil.runs.simulation import SimulationConfig, SimulationStoppedError, prepared_loop, simulate
+from hil.runs.config import SimulationConfig
+from hil.runs.prepare import prepared_loop
+from hil.runs.simulation import SimulationStoppedError, simulate
 from plant.errors import InputError, UnknownNameError, UnreachableError
-from plant.fmu.binding import Setting
+from plant.fmu.settings import Setting
 from plant.mechanism import load_mechanism
 
 MM, DEG = 1e-3, np.radians(1.0)
@@ -176,7 +178,8 @@ def test_an_unreachable_pose_names_the_leg_and_by_how_much(tmp_path):
 def test_the_process_of_a_loop_loads_no_design_or_plotting_library():
     # numba loads a part of scipy by itself; nothing may be added to it.
     code = (
-        "import sys; from hil.runs.simulation import SimulationConfig, simulate; import numba.np.arraymath;"
+        "import sys; from hil.runs.config import SimulationConfig; from hil.runs.simulation import simulate;"
+        "import numba.np.arraymath;"
         "before = set(sys.modules);"
         "simulate(SimulationConfig(duration=0.05));"
         "roots = {name.split('.')[0] for name in sys.modules};"
@@ -189,7 +192,7 @@ def test_the_process_of_a_loop_loads_no_design_or_plotting_library():
 
 def test_the_loop_allocates_nothing_per_cycle():
     code = (
-        "from hil.runs.simulation import SimulationConfig, prepared_loop\n"
+        "from hil.runs.config import SimulationConfig\nfrom hil.runs.prepare import prepared_loop\n"
         "from numba.core.runtime import rtsys\n"
         "with prepared_loop(SimulationConfig(target='sines', duration=1.0)) as loop:\n"
         "    counts = [rtsys.get_allocation_stats().alloc]\n"

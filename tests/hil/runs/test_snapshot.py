@@ -12,10 +12,11 @@ import pytest
 
 from controller.cycle import STATE
 from hil.command_line import main
-from hil.runs.simulation import SimulationConfig, SimulationStoppedError, simulate
+from hil.runs.config import SimulationConfig
+from hil.runs.simulation import SimulationStoppedError, simulate
 from hil.runs.snapshot import read_snapshot, write_snapshot
 from plant.errors import GoughError, InputError
-from plant.fmu.binding import Setting
+from plant.fmu.settings import Setting
 from tests.plant.fmu.foreign import BINDING, TRUTH
 
 TIMED = ("time_ns", "late_ns", "stage_ns", "cpu_ns")

@@ -15,7 +15,6 @@ import pytest
 
 from plant.dynamics.variables import BRAKE, VELOCITY
 from plant.errors import FmuError, InputError, UnknownNameError
-from plant.fmu.binding import Setting
 from plant.fmu.plant import (
     MOST_CHANGES,
     FmuPlant,
@@ -26,6 +25,7 @@ from plant.fmu.plant import (
     write_drive_mode,
     write_drive_modes,
 )
+from plant.fmu.settings import Setting
 from plant.pose import Array
 from plant.truth import TRUTH_LENGTHS
 from tests.plant.fmu.foreign import BINDING, TRUTH, edited

@@ -17,9 +17,9 @@ import pytest
 
 from plant.dynamics.variables import BRAKE, OPEN, OUTPUTS, VELOCITY
 from plant.errors import FmuError, InputError, UnknownNameError
-from plant.fmu.binding import Setting
 from plant.fmu.build import PLANAR_MODEL, default_fmu
 from plant.fmu.plant import FmuPlant, advance, read_imus, read_truth, write_command, write_drive_mode, write_drive_modes
+from plant.fmu.settings import Setting
 from plant.mechanism import Mechanism
 from plant.pose import Array
 

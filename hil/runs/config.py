@@ -1,0 +1,183 @@
+"""Configurations of a simulation, of a run and of an emulator, checked when they are made; quick to load."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from controller.planning import STREAM_TARGET
+from hil.option import integers, option
+from plant.checks import check_duration, check_rate, checked_seed
+from plant.errors import InputError, UnknownNameError
+from plant.fmu.settings import Setting
+from plant.wiring import ALL_IMUS, RIGHT_WIRING, Wiring
+
+FUSIONS = {
+    "compiled": None,
+    "filterpy": None,
+    "section-5": None,
+    "whole-gyroscopes": "gyroscopes",
+    "whole": "accelerometers",
+    "whole-alignments": "alignments",
+}
+"""Ways to fuse the IMUs, with the errors of the IMUs that the whole-mechanism filter estimates; None without that filter."""
+
+RIGS = ("fmu", "udp", "canopen", "replay")
+PYTHON_RIG = "python:"
+"""The prefix of a rig in the user's own Python class, such as python:my_rig:MyRig (module and class)."""
+
+MECHANISM = "preset, or a TOML file"
+IMU = "ideal, mpu9150, mpu9150-calibrated or icm42688"
+CALIBRATION = "the IMUs' constants, as 'gough calibrate' writes them; without it the readings are used as they are"
+"""Help of options that several configurations have."""
+
+_NAMED_IMUS = {"all": ALL_IMUS, "legs": ALL_IMUS[:-1]}
+
+
+def imus_from_text(text: str) -> tuple[int, ...]:
+    """The numbers of the IMUs that a text such as all, legs or 0,2,4,6 names.
+
+    Raises:
+        InputError: it names none.
+    """
+    if text in _NAMED_IMUS:
+        return _NAMED_IMUS[text]
+    try:
+        return tuple(sorted(set(integers(text))))
+    except InputError:
+        raise InputError(f"{text!r} is neither all, legs, nor a list of numbers such as 0,2,4,6") from None
+
+
+@dataclass(frozen=True)
+class SimulationConfig:
+    """What to simulate, or to run on the clock. Fields that are options say below what they mean; the others:
+
+    Attributes:
+        hold: how long the brakes hold first [s]; None for the time in the mechanism's settings.
+        wiring: how the IMUs are mounted and wired.
+        raw_imus: whether the IMUs are known to be uncalibrated, so that disagreement between them says nothing.
+    """
+
+    mechanism: str = option("hexapod", MECHANISM)
+    target: str = option(
+        "circle",
+        "hold, circle, sines, steps, near-rests, rests, shaking, probing, or a CSV file of displacements from home "
+        "(time_s,x_m,y_m,z_m,qw,qx,qy,qz); for 'gough run' also stream or stream:HOST:PORT, as 'gough stream-target' sends",
+    )
+    duration: float = option(10.0, "duration of the motion, after the hold on the brakes", unit="s")
+    rate: float = option(1000.0, "cycles per second, 50 to 4000", unit="Hz")
+    imu: str = option("mpu9150-calibrated", IMU)
+    seed: int = option(0, "seed of the IMUs' imperfections")
+    fusion: str = option(
+        "compiled",
+        "compiled: leg and platform filters; whole, whole-gyroscopes, whole-alignments: all IMUs together, with biases "
+        "of both sensors, of the gyroscopes, or with scales and alignments; section-5: the paper's, the orientation from the "
+        "platform's IMU with --magnetometer, the position from the legs; filterpy: as compiled, but on filterpy (slow)",
+    )
+    calibration: str | None = option(None, CALIBRATION, metavar="FILE.toml")
+    hold: float | None = None
+    plant: str | None = option(None, "Co-Simulation FMU (FMI 2.0 or 3.0) instead of the built one", metavar="FILE.fmu")
+    binding: str | None = option(
+        None, "which of the FMU's variables are which, if they have other names (docs/fmu.md)", metavar="FILE.toml"
+    )
+    settings: tuple[Setting, ...] = option(
+        (),
+        "a parameter or input of the FMU, from the start or from a time of the motion on, such as payload.mass=12@3.5 or "
+        "gravity=0,0,-9.8; can be given several times",
+        flag="--set",
+        metavar="NAME=VALUE[@SECONDS]",
+        parse=Setting.parse,
+        several=True,
+    )
+    imus: tuple[int, ...] = option(
+        ALL_IMUS, "which IMUs there are: all, legs, or a list such as 0,2,4,6", parse=imus_from_text, shown="all"
+    )
+    wiring: Wiring = RIGHT_WIRING
+    joint_error: float = option(
+        0.0, "simulated: standard deviation of each coordinate of the joints from their places", unit="mm"
+    )
+    magnetometer: bool = option(False, "the platform's magnetometer gives its heading")
+    rig: str = option(
+        "fmu",
+        "what is driven: fmu, the plant; udp or canopen, a rig on a bus; replay, a recording; or python:MODULE:CLASS, a rig "
+        "of your own, as hil/rigs/template.py is one",
+        metavar="RIG",
+    )
+    rig_at: str | None = option(
+        None,
+        "where the rig is: HOST:PORT for udp (default: 127.0.0.1:47100), settings of the bus for canopen, the recording "
+        "(files of one run with commas in between) for replay",
+        metavar="ADDRESS|FILE",
+    )
+    arm: bool = option(True, "read everything, and move nothing")
+    raw_imus: bool = False
+
+    def __post_init__(self) -> None:
+        check_rate(self.rate)
+        checked_seed(self.seed)
+        check_duration(self.duration)
+        cycles = self.duration * self.rate
+        if round(cycles) < 1:
+            raise InputError(f"the duration is {self.duration:g} s, less than one cycle of {1.0 / self.rate:g} s")
+        if self.fusion not in FUSIONS:
+            raise UnknownNameError(f"no fusion {self.fusion!r}; there are {', '.join(FUSIONS)}")
+        if self.rig not in RIGS and not self.rig.startswith(PYTHON_RIG):
+            raise UnknownNameError(f"no rig {self.rig!r}; there are {', '.join(RIGS)} and {PYTHON_RIG}MODULE:CLASS")
+        if self.binding is not None and self.plant is None:
+            raise InputError(f"{self.binding} binds an FMU, and none is given: name it with --plant FILE.fmu")
+        if self.settings and self.rig != "fmu":
+            raise InputError(f"--set is for the plant's FMU, not for the rig {self.rig}: leave it out")
+
+    @classmethod
+    def from_plain(cls, values: Mapping[str, Any]) -> "SimulationConfig":
+        """The configuration that `dataclasses.asdict` has made these values from; lists may stand for tuples.
+
+        Raises:
+            InputError: the values are not those of a configuration.
+        """
+
+        def tuples(value: Any) -> Any:
+            return tuple(map(tuples, value)) if isinstance(value, list | tuple) else value
+
+        try:
+            plain = {name: tuples(value) for name, value in values.items()}
+            plain["wiring"] = Wiring(**{name: tuples(value) for name, value in values["wiring"].items()})
+            plain["settings"] = tuple(Setting(**each | {"value": tuples(each["value"])}) for each in values["settings"])
+            return cls(**plain)
+        except (TypeError, KeyError, AttributeError) as error:
+            raise InputError(f"these values are no configuration of a simulation: {error}") from None
+
+    @property
+    def streamed(self) -> bool:
+        """Whether the target is streamed while the loop runs."""
+        return self.target == STREAM_TARGET or self.target.startswith(f"{STREAM_TARGET}:")
+
+
+@dataclass(frozen=True)
+class EmulatorConfig:
+    """What to emulate. Fields that are options say below what they mean.
+
+    Attributes:
+        simulated: the mechanism, the IMUs, the seed, and the target at whose first pose the platform starts.
+    """
+
+    simulated: SimulationConfig = field(default_factory=SimulationConfig)
+    bus: str = option("udp", "the bus that the rig speaks", choices=("udp", "canopen"))
+    at: str | None = option(None, "where the rig is, as for --rig-at of 'gough run'", metavar="ADDRESS|FILE.toml")
+    control: str = option("127.0.0.1:47101", "address of the control channel, which takes faults", metavar="HOST:PORT")
+    faults: tuple[str, ...] = option(
+        (),
+        "a fault from the start, or at a time after the drives were first enabled [s]; 'gough inject --list' lists them",
+        flag="--fault",
+        metavar="KIND[:N][,at=S][,for=S][,size=X]",
+        parse=str,
+        several=True,
+    )
+    watchdog: float = option(0.03, "on udp: the drives stop after this time without a command", unit="ms")
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.watchdog < 60.0:
+            raise InputError(f"the watchdog is {1e3 * self.watchdog:g} ms; it must be more than 0 and less than a minute")
+
+    def watchdog_for(self, period_us: int) -> float:
+        """The watchdog of a session with this period [us]: three periods at least [s]."""
+        return max(self.watchdog, 3e-6 * period_us)

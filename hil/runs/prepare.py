@@ -1,0 +1,177 @@
+"""Preparation of a run: check everything, load the plant, plan the motion, load the machine code."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from controller.calibration.file import Calibration, load_calibration
+from controller.cycle import OK, STATE, cycle_parameters, imus_of
+from controller.inverse_kinematics import leg_lengths
+from controller.planning.planner import Reference, plan
+from controller.planning.stream import rest
+from controller.planning.target import Target, load_target
+from controller.safety.watch import describe_end
+from controller.settings import control_settings, safety_settings, sensor_settings
+from hil.loop.driver import Loop
+from hil.loop.records import RECORD
+from hil.rigs.by_name import check_legs
+from hil.runs.config import FUSIONS, SimulationConfig
+from plant.compiled import Record
+from plant.dynamics.variables import PLATFORM_IMU
+from plant.errors import GoughError, InputError
+from plant.fmu.binding import OWN_BINDING, load_binding
+from plant.fmu.build import default_fmu, model_of
+from plant.fmu.plant import FMU_HANDLE, FmuPlant
+from plant.imu import imu_state, load_imu
+from plant.mechanism import Mechanism, load_in_space
+from plant.pose import Pose
+
+HOLD_RANGE_S = (0.2, 10.0)
+MOST_RECORD_BYTES = 4 * 2**30
+"""The most memory that the records of a run may take."""
+
+
+@dataclass(eq=False, kw_only=True)
+class PreparedLoop(Loop):
+    """A loop that is ready to run, with what it was prepared from.
+
+    Attributes:
+        plant: the FMU that the loop calls; None on a rig.
+        mechanism, target, reference: what the loop was prepared with.
+        end: the cycle after the last of the motion.
+        planning_time: how long the planning took [s].
+    """
+
+    plant: FmuPlant | None
+    mechanism: Mechanism
+    target: Target
+    reference: Reference
+    end: int
+    planning_time: float
+
+    @property
+    def simulated(self) -> FmuPlant:
+        """The FMU of a simulation."""
+        if self.plant is None:
+            raise InputError("this loop has no FMU")
+        return self.plant
+
+    def reason(self) -> str:
+        """Why the run has ended, in words; if the plant has failed, its failure."""
+        if self.plant is not None and self.plant.handle["status"] != OK:
+            return str(self.plant.failure())
+        return describe_end(self.state)
+
+
+@contextmanager
+def prepared_loop(config: SimulationConfig, records: Record | None = None) -> Iterator[PreparedLoop]:
+    """Check everything, load the plant, plan the motion, and load the machine code.
+
+    Args:
+        config: what to run.
+        records: where to record, as a ring buffer; by default there is room for every cycle.
+
+    Raises:
+        GoughError: something in the configuration cannot be used.
+    """
+    nominal = load_in_space(config.mechanism)
+    calibration = Calibration() if config.calibration is None else load_calibration(config.calibration)
+    if nominal.planar:
+        check_legs(config.rig, nominal)
+        _check_planar(config, calibration)
+    mechanism = nominal.moved_joints(calibration.joints[:, : nominal.legs])
+    target = load_target("hold" if config.streamed else config.target, mechanism, config.duration)
+    period = 1.0 / config.rate
+    model = load_imu(config.imu)
+    imu = imu_state(model, config.seed, period, config.wiring)
+    control = control_settings(mechanism, **({} if config.hold is None else {"hold": config.hold}))
+    if not HOLD_RANGE_S[0] <= control.hold <= HOLD_RANGE_S[1]:
+        raise InputError(f"hold is {control.hold:g} s; the estimate settles in {HOLD_RANGE_S[0]:g} to {HOLD_RANGE_S[1]:g} s")
+    fusion, safety = sensor_settings(mechanism, model), safety_settings(mechanism)
+    parameters = cycle_parameters(
+        mechanism, config.rate, control, fusion, config.imus, FUSIONS[config.fusion], calibration, config.magnetometer,
+        config.fusion == "section-5", safety.for_raw_imus() if config.raw_imus else safety,
+        0.0 if config.rig == "fmu" else period, config.arm,
+    )  # fmt: skip
+    count = int(parameters["hold_cycles"]) + round(config.duration * config.rate)
+    if records is None and count * RECORD.itemsize > MOST_RECORD_BYTES:
+        raise InputError(
+            f"{config.duration:g} s at {config.rate:g} Hz would record {count * RECORD.itemsize / 2**30:.3g} GiB, more than "
+            f"{MOST_RECORD_BYTES / 2**30:g} GiB: choose a shorter duration or a lower rate, or 'gough run', which keeps seconds"
+        )
+    # Loads the planner, so that the planning time is that of the plan alone.
+    plan(mechanism, load_target("hold", mechanism, 0.1), 0.1)
+    with simulated_plant(config, nominal, target.start) if config.rig == "fmu" else nullcontext() as plant:
+        began = time.perf_counter()
+        if config.streamed:
+            lengths = leg_lengths(mechanism, target.start.position, target.start.rotation)
+            reference = Reference(rest(lengths), 0)
+        else:
+            reference = plan(mechanism, target, config.duration)
+        loop = PreparedLoop(
+            fmu=np.zeros((), FMU_HANDLE) if plant is None else plant.handle,
+            imu=imu,
+            parameters=parameters,
+            state=np.zeros((), STATE),
+            segments=reference.segments,
+            records=np.zeros(count, RECORD) if records is None else records,
+            end=count,
+            plant=plant,
+            mechanism=mechanism,
+            target=target,
+            reference=reference,
+            planning_time=time.perf_counter() - began,
+        )
+        loop.load(python=config.fusion == "filterpy")
+        yield loop
+
+
+def _check_planar(config: SimulationConfig, calibration: Calibration) -> None:
+    """Check that the configuration asks for nothing that a planar mechanism cannot do."""
+    if config.fusion != "compiled":
+        raise InputError(f"fusion {config.fusion!r} is for six legs; for {config.mechanism}, which is planar, take 'compiled'")
+    if config.streamed:
+        raise InputError(f"a target can be streamed to six legs alone; {config.mechanism} is planar: give a motion or a file")
+    if calibration.joints.any():
+        raise InputError(f"{config.calibration} moves the joints of six legs, and {config.mechanism} has three: leave them out")
+
+
+def simulated_plant(config: SimulationConfig, nominal: Mechanism, start: Pose) -> FmuPlant:
+    """The plant of a configuration, at rest at `start`; a plant with a binding starts where its binding says.
+
+    Raises:
+        GoughError: the FMU, its binding, a setting or the joint error cannot be used.
+    """
+    fmu = default_fmu(model_of(nominal)) if config.plant is None else Path(config.plant)
+    binding = OWN_BINDING if config.binding is None else load_binding(config.binding)
+    if config.joint_error and not binding.native:
+        raise InputError(f"{binding.source} binds an FMU with joints of its own, which have no joint error: leave it out")
+    built = nominal.built(config.joint_error, config.seed)
+    hold = control_settings(nominal).hold if config.hold is None else config.hold
+    settings = [each if each.at is None else replace(each, at=each.at + hold) for each in config.settings]
+    late = [each for each in config.settings if each.at is not None and each.at >= config.duration]
+    if late:
+        raise InputError(f"{late[0].name} is set at {late[0].at:g} s, when the motion of {config.duration:g} s is over")
+    parameters = built.plant_parameters(start) if binding.native else {}
+    plant = FmuPlant(fmu, parameters, 1.0 / config.rate, binding, settings, nominal.legs)
+    try:
+        _check_plant(config, plant, nominal)
+    except GoughError:
+        plant.close()
+        raise
+    return plant
+
+
+def _check_plant(config: SimulationConfig, plant: FmuPlant, nominal: Mechanism) -> None:
+    """Check that a plant has the IMUs and the magnetometer that the loop reads."""
+    name, bound = plant.path.name, plant.bound
+    absent = set(imus_of(nominal, config.imus)) - set(bound.imus)
+    if absent:
+        there = ",".join(map(str, bound.imus))
+        raise InputError(f"{name} has no IMU {', '.join(map(str, sorted(absent)))}: leave it out with --imus {there}")
+    if config.magnetometer and PLATFORM_IMU not in bound.magnetometers:
+        raise InputError(f"{name} has no magnetometer on the platform: bind imu_magnetic_field, or leave out --magnetometer")
