@@ -6,7 +6,7 @@ samples. The filters learn for the first twenty seconds, whose errors do not cou
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
 from typing import Any
@@ -27,7 +27,6 @@ from hil.studies.fused_track import CLOSED, REFINED, WHOLE, FusedTrack, PoseErro
 from plant.compiled import Record, kernel
 from plant.dynamics.imposed import ImposedMotion, impose
 from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
-from plant.errors import InputError
 from plant.imu import ACCELEROMETER, GYROSCOPE, ImuModel, load_imu
 from plant.mechanism import LEGS, Mechanism, load_spatial
 from plant.pose import Array
