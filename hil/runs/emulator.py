@@ -224,7 +224,9 @@ def _serve_sessions(
         period = 1e-6 * int(hello["period_us"])
         plant, imu, rig = _rig_of(config, period, faults)
         with plant:
-            emulator = new_udp_emulator(plant.handle, imu, rig, int(hello["session"]), config.watchdog_for(int(hello["period_us"])))
+            emulator = new_udp_emulator(
+                plant.handle, imu, rig, int(hello["session"]), config.watchdog_for(int(hello["period_us"]))
+            )
             link = emulator.link.socket
             link["descriptor"], link["peer"] = opened.fileno(), socket_address(sender)
             _welcome(opened, config, hello, sender)
