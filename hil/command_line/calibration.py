@@ -61,7 +61,8 @@ _RIG_SIMULATED = {
 def _calibrate_rig(options: argparse.Namespace) -> int:
     from controller.calibration.at_rest import Prior
     from controller.calibration.file import save_calibration
-    from hil.calibration.rig_calibration import Knowledge, calibrate_recordings, calibrate_rig
+    from hil.calibration.data import Knowledge
+    from hil.calibration.drive import calibrate_recordings, calibrate_rig
 
     check_outputs(options.output, options.json, options.report, options.picture)
     if not 0.0 < options.tilt < 45.0:
@@ -99,7 +100,7 @@ def _calibrate_rig(options: argparse.Namespace) -> int:
 
 
 def _print_rig_calibration(summary: dict[str, Any]) -> None:
-    from hil.calibration.rig_calibration import STAGES, weak_words
+    from hil.calibration.assessment import STAGES, weak_words
 
     columns = ("residual [mg]", "left out", "predicted [mm, deg]", "halves", "true")
     table = new_table(f"{summary['rests']} poses at rest", *columns)

@@ -8,7 +8,8 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from hil.calibration.rig_calibration import STAGES, RigCalibration, weak_words
+from hil.calibration.assessment import STAGES, weak_words
+from hil.calibration.drive import RigCalibration
 from hil.reports.page import (
     AXIS_NAMES,
     COLORS,

@@ -4,7 +4,7 @@ from math import ceil, floor, log10
 from pathlib import Path
 from typing import Any
 
-from hil.calibration.rig_calibration import STAGES
+from hil.calibration.assessment import STAGES
 from plant.files import write_whole
 
 _KINDS = {

@@ -17,7 +17,8 @@ from controller.calibration.at_rest import Prior
 from controller.calibration.file import Calibration
 from controller.cycle import STATE, cycle_parameters
 from controller.settings import control_settings, sensor_settings
-from hil.calibration.rig_calibration import Knowledge, calibrate_rig
+from hil.calibration.data import Knowledge
+from hil.calibration.drive import calibrate_rig
 from hil.runs.config import FUSIONS, SimulationConfig
 from hil.runs.simulation import simulate
 from hil.studies.config import LEARNING_S, EvaluationConfig

@@ -8,22 +8,14 @@ import numpy as np
 import pytest
 
 from controller.calibration.at_rest import CalibrationError
-from hil.calibration import rig_calibration
-from hil.calibration.rig_calibration import (
-    Knowledge,
-    calibrate_recordings,
-    calibrate_rig,
-    find_rests,
-    is_long,
-    weakest_direction,
-)
+from hil.calibration.data import Knowledge
+from hil.calibration.drive import calibrate_recordings, calibrate_rig
 from hil.command_line import main
 from hil.recording.mcap import Recorder
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import prepared_loop
 from hil.runs.simulation import simulate
 from plant.imu import Wiring, imu_state, load_imu
-from plant.mechanism import load_spatial
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +121,7 @@ def test_recordings_that_do_not_suffice_are_refused(recorded, tmp_path, capsys):
     ],
 )
 def test_a_rig_that_is_wired_wrongly_is_not_driven_by_its_imus(wiring, words, monkeypatch):
-    monkeypatch.setattr("hil.calibration.rig_calibration.simulate", None)
+    monkeypatch.setattr("hil.calibration.drive.simulate", None)
     with pytest.raises(CalibrationError, match=words):
         calibrate_rig(SimulationConfig(imu="mpu9150", wiring=wiring))
 
@@ -143,31 +135,6 @@ def test_raw_imus_follow_with_it_what_they_cannot_follow_without(calibrated):
     error = np.linalg.norm(result.records["position"] - result.true_positions, axis=1)[late]
     assert np.sqrt(np.mean(error**2)) < 0.25e-3
     assert result.records["trusted"][late].all()
-
-
-def test_the_rest_at_home_is_the_one_on_the_brakes():
-    config = SimulationConfig(imu="mpu9150", seed=7, target="hold", duration=0.1, hold=1.0)
-    mechanism = load_spatial(config.mechanism)
-    data = rig_calibration._Data(mechanism, config.imu, config.rate, Knowledge(home=True), config.seed)
-    data.begin(rig_calibration._run_open(config, blind=True), 1000)
-    assert data.rests.home and len(data.rests.readings) == 1
-    np.testing.assert_allclose(data._truth[0, :3], mechanism.home.position, atol=2e-5)
-
-
-def test_rests_are_where_nothing_turns():
-    random = np.random.default_rng(0)
-    samples, zero = np.zeros((5000, 3, 7, 3)), random.normal(0.0, 0.3, (7, 3))
-    samples[:, 0] = zero + random.normal(0.0, 0.002, (5000, 7, 3))
-    samples[1000:2500, 0, 4, 1] += 0.2
-    rests = find_rests(samples, zero, 1000.0)
-    assert rests == [slice(0, 1000), slice(2500, 5000)]
-    assert [is_long(rest, 1000.0) for rest in (*rests, slice(0, 800))] == [True, True, False]
-
-
-def test_the_weakest_direction_is_named():
-    mechanism = load_spatial("hexapod")
-    assert weakest_direction(np.diag([1e-8, 1e-8, 4e-6, 0.0, 0.0, 0.0]), mechanism).startswith("mostly along z: 2 mm")
-    assert weakest_direction(np.diag([1e-8, 1e-8, 1e-8, 0.0, 4e-4, 0.0]), mechanism).startswith("mostly about y: 4 mm")
 
 
 @pytest.mark.parametrize("tilt", ["0", "-1", "nan", "90"])

@@ -1,0 +1,185 @@
+"""Data for a calibration on the rig: the rests and the motion that the records of its runs hold."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from controller.calibration.at_rest import LEAST_POSES, CalibrationError, Found, Prior, Rests, fit_pose
+from controller.calibration.checks import check_alive, check_all_along, check_motion, check_places, check_spread
+from controller.calibration.file import Calibration
+from controller.direct_kinematics import poses_from_lengths
+from controller.estimation.readings import readings_along, sensor_geometry
+from controller.settings import sensor_settings
+from plant.compiled import Record
+from plant.dynamics.variables import IMU_COUNT
+from plant.imu import ACCELEROMETER, GYROSCOPE, load_imu
+from plant.mechanism import LEGS, Mechanism
+from plant.pose import Array, Pose
+from plant.truth import TRUTH_LENGTHS
+
+_SETTLED_S = 0.5
+"""A rest counts after this time [s]."""
+
+_SHORTEST_REST_S, _SHORTEST_MOTION_S = 0.4, 10.0
+_MEAN_S = 0.1
+_CHECKED_S = 0.04
+_MOST_RATE = np.radians(0.5)
+"""Greatest rate of a rest, in means over `_MEAN_S` [rad/s]."""
+
+_LENGTH_NOISE = 5e-5
+"""Standard deviation of the lengths that a simulated rig measures [m]."""
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What is known besides the IMUs' samples.
+
+    Attributes:
+        prior: standard deviations of the IMUs' errors and of the base's tilt.
+        home: whether the rig's first pose is home exactly.
+        lengths: whether the rig measures the changes of its lengths.
+        known_poses: whether to take the poses at rest for the planned ones, as the paper's section 7 does, and to seek the
+            mounting alone.
+    """
+
+    prior: Prior = field(default_factory=Prior)
+    home: bool = False
+    lengths: bool = False
+    known_poses: bool = False
+
+
+def raw_samples(records: Record) -> Array:
+    """The raw samples (N, 3, 7, 3) of records."""
+    return np.stack([records["angular_velocity"], records["specific_force"], records["magnetic_field"]], axis=1)
+
+
+def find_rests(samples: Array, zero: Array, rate: float) -> list[slice]:
+    """The stretches of raw samples (N, 3, 7, 3) in which no gyroscope, less its `zero` (7, 3) [rad/s], turns."""
+    length = max(1, round(_MEAN_S * rate))
+    count = len(samples) // length
+    means = (samples[: count * length, 0] - zero).reshape(count, length, IMU_COUNT, 3).mean(axis=1)
+    still = np.abs(means).max(axis=(1, 2)) < _MOST_RATE
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
+    return [slice(first * length, last * length) for first, last in edges.reshape(-1, 2)]
+
+
+def is_long(rest: slice, rate: float) -> bool:
+    """Whether a rest is long enough without its beginning."""
+    return int(rest.stop) - int(rest.start) >= (_SETTLED_S + _SHORTEST_REST_S) * rate
+
+
+class CalibrationData:
+    """The rests of all runs so far.
+
+    Attributes:
+        mechanism: the rig's.
+        rate: samples per second [Hz].
+        knowledge: besides the samples.
+        fusion: settings of the sensors.
+        zero: (7, 3) [rad/s], the gyroscopes' offsets.
+        readings: (R, 7, 6), mean rates and forces of each rest.
+        truth: (R, 7), true position and quaternion of each rest; NaN where they are not known.
+    """
+
+    def __init__(self, mechanism: Mechanism, imu: str, rate: float, knowledge: Knowledge, seed: int) -> None:
+        """Start without a rest; `imu` is a preset, and `seed` that of the noise of measured lengths."""
+        self.mechanism, self.rate, self.knowledge = mechanism, rate, knowledge
+        self.fusion = sensor_settings(mechanism, load_imu(imu))
+        self.zero = np.zeros((IMU_COUNT, 3))
+        self.readings, self.truth, self._lengths = np.zeros((0, IMU_COUNT, 6)), np.zeros((0, 7)), np.zeros((0, LEGS))
+        self._random = np.random.default_rng([seed, LEGS])
+
+    def begin(self, records: Record, hold: int) -> None:
+        """Check that every IMU works and zero the gyroscopes in the first `hold` cycles, while the brakes hold.
+
+        Where the rig begins at home, this is its rest there: a loop that closes over raw IMUs leaves home.
+        """
+        samples = raw_samples(records[:hold])
+        check_alive(samples)
+        self.zero = samples[:, GYROSCOPE].mean(axis=0)
+        if self.knowledge.home:
+            self._add_rest(records[:hold])
+
+    def check_places(self, records: Record) -> None:
+        """Check that each IMU reads the planned motion of its place."""
+        length = max(1, round(_CHECKED_S * self.rate))
+        count = len(records) // length
+
+        def means(values: Array) -> Array:
+            found: Array = values[: count * length].reshape(count, length, *values.shape[1:]).mean(axis=1)
+            return found
+
+        positions, rotations = self.planned_poses(means(records["reference"][:, :, 0]))
+        expected = readings_along(sensor_geometry(self.mechanism), positions, rotations, self.rate / length)
+        readings = np.concatenate([means(records["angular_velocity"]) - self.zero, means(records["specific_force"])], axis=2)
+        check_places(readings, expected)
+
+    def planned_poses(self, lengths: Array) -> tuple[Array, Array]:
+        """Positions (N, 3) [m] and rotations (N, 3, 3) for planned lengths (N, 6) [m]."""
+        return poses_from_lengths(self.mechanism, lengths, self.mechanism.require_home())
+
+    def rests_in(self, records: Record) -> list[slice]:
+        """The rests in records, without their beginnings."""
+        rests = find_rests(raw_samples(records), self.zero, self.rate)
+        settled = round(_SETTLED_S * self.rate)
+        return [slice(rest.start + settled, rest.stop) for rest in rests if is_long(rest, self.rate)]
+
+    def add_rests(self, records: Record) -> None:
+        """Add the rests in records."""
+        check_all_along(raw_samples(records), self.rate)
+        for rest in self.rests_in(records):
+            self._add_rest(records[rest])
+
+    def _add_rest(self, records: Record) -> None:
+        readings = np.concatenate([records["angular_velocity"], records["specific_force"]], axis=2).mean(axis=0)
+        truth = records["truth"].mean(axis=0)
+        self.readings = np.append(self.readings, readings[None], axis=0)
+        self.truth = np.append(self.truth, truth[None, :7], axis=0)
+        measured = truth[TRUTH_LENGTHS] + self._random.normal(0.0, _LENGTH_NOISE, LEGS)
+        self._lengths = np.append(self._lengths, measured[None], axis=0)
+
+    @property
+    def rests(self) -> Rests:
+        """The rests, for the calibration.
+
+        Raises:
+            CalibrationError: they are too few or too alike, or there are no lengths.
+        """
+        if self.knowledge.lengths and not np.isfinite(self._lengths).all():
+            raise CalibrationError("there are no measured lengths in the recording: leave out --lengths")
+        if len(self.readings) >= LEAST_POSES:
+            check_spread(self.readings[:, :, 3:])
+        changes = self._lengths - self._lengths[:1] if self.knowledge.lengths else None
+        return Rests(self.readings, self.knowledge.home, changes)
+
+    def longest_motion(self, runs: Sequence[Record], at_rest: Found) -> tuple[Array, tuple[Pose, Array]]:
+        """The longest motion that begins at rest: its samples (N, 3, 7, 3), and the pose and twist (6,) at the first.
+
+        Raises:
+            CalibrationError: it is too short.
+        """
+        motions: list[tuple[int, int, slice]] = []
+        for number, records in enumerate(runs):
+            rests = find_rests(raw_samples(records), self.zero, self.rate)
+            ends = [*(rest.start for rest in rests[1:]), len(records)]
+            motions += [(end - rest.stop, number, slice(rest.start, end)) for rest, end in zip(rests, ends, strict=True)]
+        length, number, whole = max(motions, default=(0, 0, slice(0, 0)), key=lambda motion: motion[0])
+        if length < _SHORTEST_MOTION_S * self.rate:
+            raise CalibrationError(
+                f"the longest motion that begins at rest lasts {length / self.rate:.3g} s; at least {_SHORTEST_MOTION_S:g} s "
+                "are needed: record 'shaking' for 40 s"
+            )
+        samples = raw_samples(runs[number][whole])
+        check_all_along(samples, self.rate)
+        last = max(len(samples) - length - round(_MEAN_S * self.rate), 1)
+        check_motion(samples[last:, GYROSCOPE] - self.zero)
+        first = max(last - round(_SETTLED_S * self.rate), 0)
+        calibration = at_rest.calibration()
+        mean = calibration.apply(samples[first:last].mean(axis=0))
+        pose = fit_pose(self.geometry(calibration), mean[ACCELEROMETER], self.mechanism.require_home())
+        return samples[last:], (Pose(*pose), np.zeros(6))
+
+    def geometry(self, calibration: Calibration) -> Record:
+        """Places of the sensors for the joints and the tilt of a calibration."""
+        return sensor_geometry(self.mechanism.moved_joints(calibration.joints), calibration.tilt)

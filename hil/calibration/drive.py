@@ -1,0 +1,212 @@
+"""Calibration on the rig: the rig rests at wide poses and shakes, and the redundancy of its IMUs tells their errors.
+
+1. The brakes hold: the gyroscopes are zeroed.
+2. The drives follow a small planned motion with the loop open: each IMU must read the motion of its place.
+3. The rig rests at a few poses near home, driven by raw samples: a first calibration.
+4. With this it rests at twenty wide poses: a better one.
+5. With that it shakes: the rest.
+
+Every run is one of `hil.runs.simulation`, and between runs the rig stands on its brakes. Recordings can replace all runs.
+"""
+
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from controller.calibration.at_rest import CalibrationError, Found, calibrate_at_rest, calibrate_in_motion
+from controller.calibration.file import Calibration, save_calibration
+from controller.estimation.mechanism_filter import ALL_ERRORS
+from controller.planning.target import REST_S
+from controller.safety.watch import watch_nothing
+from hil.calibration.assessment import assess, constants, cross_validate
+from hil.calibration.data import CalibrationData, Knowledge
+from hil.calibration.known_poses import calibrate_by_known_poses
+from hil.loop.records import Link
+from hil.recording.mcap import Recording, RecordingError, read
+from hil.runs.config import SimulationConfig
+from hil.runs.prepare import prepared_loop
+from hil.runs.simulation import SimulationStoppedError, simulate
+from plant.compiled import Record
+from plant.dynamics.variables import IMU_COUNT
+from plant.imu import GYROSCOPE
+from plant.mechanism import Mechanism, load_spatial
+
+FIRST_POSES, WIDE_POSES, SHAKING_S = 8, 20, 40.0
+_NOTHING = Knowledge()
+_PROBING_S = 4.0
+_ZEROING_S = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class RigCalibration:
+    """Result of a calibration on the rig.
+
+    Attributes:
+        mechanism: the rig's.
+        calibration: of the IMUs.
+        at_rest: from the rests alone.
+        summary: the figures.
+    """
+
+    mechanism: Mechanism
+    calibration: Calibration
+    at_rest: Found
+    summary: dict[str, Any]
+
+
+def calibrate_rig(
+    config: SimulationConfig,
+    knowledge: Knowledge = _NOTHING,
+    progress: Callable[[float], None] = lambda share: None,
+    validate: bool = True,
+) -> RigCalibration:
+    """Drive the rig and calibrate its IMUs.
+
+    Args:
+        config: mechanism, IMUs, seed, rate and plant; the calibration sets target and durations itself.
+        knowledge: besides the samples.
+        progress: called with the share that is done.
+        validate: whether to compare calibrations by parts of the data as well.
+
+    Raises:
+        CalibrationError: an IMU is not as it should be, or no calibration explains the data, or they do not suffice.
+        GoughError: something in the configuration cannot be used.
+    """
+    config = replace(config, raw_imus=True)
+    data = CalibrationData(load_spatial(config.mechanism), config.imu, config.rate, knowledge, config.seed)
+    probing = run_open(replace(config, target="probing", duration=_PROBING_S, hold=_ZEROING_S), blind=True)
+    data.begin(probing, round(_ZEROING_S * config.rate))
+    data.check_places(probing)
+    offset = np.zeros((3, IMU_COUNT, 3))
+    offset[GYROSCOPE] = -data.zero
+    zeroed, known = Calibration(offset=offset), None
+    if knowledge.known_poses:
+        with _calibrated(replace(config, target="rests", duration=WIDE_POSES * REST_S), zeroed) as run:
+            known = calibrate_by_known_poses(data, [run_open(run)])
+    with _calibrated(replace(config, target="near-rests", duration=FIRST_POSES * REST_S), zeroed) as run:
+        data.add_rests(run_open(run))
+    done, whole = FIRST_POSES * REST_S, (FIRST_POSES + WIDE_POSES) * REST_S + SHAKING_S
+
+    def drive(target: str, duration: float, calibration: Calibration) -> Record:
+        nonlocal done
+        start, done = done, done + duration
+        with _calibrated(replace(config, target=target, duration=duration), calibration) as run:
+            return _run_closed(run, lambda share: progress((start + share * duration) / whole))
+
+    first = calibrate_at_rest(data.mechanism, data.rests, knowledge.prior)
+    data.add_rests(drive("rests", WIDE_POSES * REST_S, first.calibration()))
+    at_rest = calibrate_at_rest(data.mechanism, data.rests, knowledge.prior)
+    return _finish(data, at_rest, [drive("shaking", SHAKING_S, at_rest.calibration())], known, validate)
+
+
+def calibrate_recordings(paths: Sequence[Path], knowledge: Knowledge = _NOTHING) -> RigCalibration:
+    """Calibrate the IMUs from recordings of one rig that rested at wide poses and shook.
+
+    All rests of all recordings count, and the longest motion that begins at rest. The gyroscopes are zeroed at the beginning
+    of the first recording, while the brakes hold.
+
+    Args:
+        paths: MCAP files, each from the first cycle of its run on.
+        knowledge: besides the samples.
+
+    Raises:
+        RecordingError: no recordings, or not of one rig.
+        CalibrationError: as `calibrate_rig`.
+    """
+    recordings = [_complete(path, read(path)) for path in paths]
+    first = recordings[0].config
+    for path, each in zip(paths, recordings, strict=True):
+        for name in ("mechanism", "imu", "rate"):
+            if each.config[name] != first[name]:
+                raise RecordingError(
+                    f"the {name} of {path} is {each.config[name]} and of {paths[0]} {first[name]}: give recordings of one rig"
+                )
+    data = CalibrationData(load_spatial(first["mechanism"]), first["imu"], first["rate"], knowledge, first["seed"])
+    runs = [_every_cycle(each.records) for each in recordings]
+    data.begin(runs[0], int(recordings[0].arrays["parameters"]["hold_cycles"]))
+    for records in runs:
+        data.check_places(records)
+        data.add_rests(records)
+    known = calibrate_by_known_poses(data, runs) if knowledge.known_poses else None
+    return _finish(data, calibrate_at_rest(data.mechanism, data.rests, knowledge.prior), runs, known)
+
+
+def _complete(path: Path, recording: Recording) -> Recording:
+    if "parameters" not in recording.arrays or not len(recording.records):
+        raise RecordingError(f"{path} holds no cycle, or lacks the constants of its run: it is damaged")
+    if recording.records["cycle"][0] != 0:
+        raise RecordingError(f"{path} does not begin with the first cycle of its run, in which the brakes hold: record it anew")
+    return recording
+
+
+def _every_cycle(records: Record) -> Record:
+    """Records in which the last one before stands for each missed one."""
+    cycles = records["cycle"]
+    filled: Record = records[np.searchsorted(cycles, np.arange(cycles[0], cycles[-1] + 1), side="right") - 1]
+    return filled
+
+
+def run_open(config: SimulationConfig, blind: bool = False) -> Record:
+    """The records of a run with the loop open, whatever the IMUs read.
+
+    The drives follow the planned speeds, and make up for the load; if `blind`, they do not, and the platform sinks by some
+    millimetres.
+    """
+    with prepared_loop(config) as loop:
+        loop.parameters["gains"] = 0.0
+        watch_nothing(loop.parameters)
+        if blind:
+            loop.parameters["droop"] = 0.0
+        loop.run(len(loop.records))
+        return loop.records[: int(loop.link[Link.HEAD])].copy()
+
+
+def _run_closed(config: SimulationConfig, progress: Callable[[float], None]) -> Record:
+    """The records of a run with the loop closed."""
+    try:
+        return simulate(config, progress).records
+    except SimulationStoppedError as error:
+        raise CalibrationError(f"the rig stopped at {config.target}: {error}: check the IMUs' errors and the drives") from None
+
+
+@contextmanager
+def _calibrated(config: SimulationConfig, calibration: Calibration) -> Iterator[SimulationConfig]:
+    with tempfile.TemporaryDirectory(prefix="gough-calibration-") as folder:
+        file = Path(folder) / "calibration.toml"
+        save_calibration(file, calibration)
+        yield replace(config, calibration=str(file))
+
+
+def _finish(
+    data: CalibrationData, at_rest: Found, runs: Sequence[Record], known: Calibration | None, validate: bool = True
+) -> RigCalibration:
+    """Calibrate in the longest motion of the runs, and assess every stage; a calibration by known poses is the result."""
+    samples, start = data.longest_motion(runs, at_rest)
+    calibration, covariance = calibrate_in_motion(data.mechanism, at_rest, samples, data.rate, start, data.fusion)
+    before = np.diag(data.knowledge.prior.sigmas() ** 2)
+    cases = {"before": (Calibration(), before)}
+    if known is not None and known.covariance is not None:
+        by_known_poses = before.copy()
+        by_known_poses[:ALL_ERRORS, :ALL_ERRORS] = known.covariance
+        cases["known"] = known, by_known_poses
+    cases |= {"rests": (at_rest.calibration(), at_rest.covariance), "motion": (calibration, covariance)}
+    summary = assess(data, cases) | {
+        "positions": at_rest.positions.tolist(),
+        "validated": cross_validate(data, calibration, samples, start) if validate else {},
+        **constants(calibration, data.knowledge.prior.error_sigmas()),
+    }
+    about = {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "version": version("gough"),
+        "mechanism": data.mechanism.name,
+        **{f"residual_{name}_mg": round(value, 4) for name, value in summary["residual_mg"].items()},
+    }
+    result = calibration if known is None else known
+    return RigCalibration(data.mechanism, replace(result, about=about), at_rest, summary)
