@@ -3,7 +3,7 @@
 import json
 import os
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import version
@@ -11,15 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import plotly.graph_objects as go
 from numpy.typing import NDArray
 
 from hil.loop.records import COMPUTED, STAGES
-from hil.reports.page import LAYOUT, figure_html, page
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import simulate
 from plant.errors import InputError
-from plant.files import write_whole
 
 _REPEATS = 3
 _FILTERPY_S = 2.0
@@ -68,77 +65,11 @@ def machine() -> dict[str, str]:
     }
 
 
-def _report_part(progress: Callable[[float], None], start: float, share: float, done: float) -> None:
-    progress(start + share * done)
-
-
-def _percentiles(nanoseconds: NDArray[np.int64]) -> dict[str, float]:
-    us = nanoseconds / 1e3
-    p50, p99, p999 = np.percentile(us, (50.0, 99.0, 99.9))
-    return {"p50": float(p50), "p99": float(p99), "p999": float(p999), "max": float(us.max()), "n": len(us)}
-
-
-def write_report(figures: dict[str, Any], history: Sequence[dict[str, Any]], path: Path) -> None:
-    """Write histograms of the loop on the clock, and how its figures have changed, as one HTML file.
-
-    Args:
-        figures: what `gough bench --json` writes, with the section `real_time`.
-        history: earlier such figures.
-        path: of the HTML file.
-
-    Raises:
-        InputError: there is no such section.
-    """
-    if "real_time" not in figures:
-        raise InputError(
-            "a report shows the loop on the clock, which was not measured: run it with --only clock, or without --only"
-        )
-    runs = sorted([*history, figures], key=lambda run: str(run["date"]))
-    sections = []
-    for rate, conditions in figures["real_time"]["rates"].items():
-        for condition, measured in conditions.items():
-            name = f"{rate} Hz, {condition.replace('_', ' ')}"
-            figure = go.Figure()
-            for label, (lower, counts) in measured["histograms"].items():
-                if counts:
-                    figure.add_scatter(x=lower, y=counts, name=label, mode="lines", line={"shape": "hv"})
-            axes = {"xaxis": {"title": "us", "type": "log"}, "yaxis": {"title": "cycles", "type": "log"}}
-            figure.update_layout(LAYOUT, height=380, **axes)
-            sections.append(figure_html(f"clock-{rate}-{condition}", name, _sentence(measured), figure, "time"))
-    for rate in figures["real_time"]["rates"]:
-        figure = go.Figure()
-        for name in ("compute_us", "latency_us", "wake_us", "cyclictest_us"):
-            for key in ("p50", "p999"):
-                measured = [(run["date"], _idle(run, rate).get(name)) for run in runs]
-                points = [(date, figures_of[key]) for date, figures_of in measured if figures_of]
-                label = f"{name.removesuffix('_us')} {key.replace('p999', 'p99.9')}"
-                figure.add_scatter(x=[at for at, _ in points], y=[us for _, us in points], name=label, mode="lines+markers")
-        figure.update_layout(LAYOUT, height=380, yaxis={"title": "us", "type": "log"})
-        caption = f"{len(runs)} runs, idle."
-        sections.append(figure_html(f"history-{rate}", f"{rate} Hz, from run to run", caption, figure, "time"))
-    subtitle = f"{figures['machine']}, {figures['date']}, gough {figures['version']}"
-    write_whole(path, page("The loop on the clock", subtitle, "\n".join(sections)).encode())
-
-
-def _sentence(measured: dict[str, Any]) -> str:
-    compute, latency = measured["compute_us"], measured["latency_us"]
-    return (
-        f"Computing p50 {compute['p50']:.1f} us, p99.9 {compute['p999']:.1f}; wake-up to command p50 {latency['p50']:.1f}, "
-        f"p99.9 {latency['p999']:.1f}; missed by own work {measured['missed_own']}, by the host {measured['missed_host']}."
-    )
-
-
-def _idle(run: dict[str, Any], rate: str) -> dict[str, Any]:
-    """What a run has measured at a rate, idle; empty if it has not."""
-    found: dict[str, Any] = run.get("real_time", {}).get("rates", {}).get(rate, {}).get("idle", {})
-    return found
-
-
 def read_earlier(path: Path) -> dict[str, Any]:
-    """Figures that `gough bench --json` has written.
+    """Read figures that `gough bench --json` wrote.
 
     Raises:
-        InputError: it has not.
+        InputError: the file holds none.
     """
     try:
         figures: dict[str, Any] = json.loads(path.read_text())
@@ -147,3 +78,13 @@ def read_earlier(path: Path) -> dict[str, Any]:
     if not isinstance(figures, dict) or "date" not in figures:
         raise InputError(f"{path} holds no figures of 'gough bench': it has no date")
     return figures
+
+
+def _report_part(progress: Callable[[float], None], start: float, share: float, done: float) -> None:
+    progress(start + share * done)
+
+
+def _percentiles(nanoseconds: NDArray[np.int64]) -> dict[str, float]:
+    us = nanoseconds / 1e3
+    p50, p99, p999 = np.percentile(us, (50.0, 99.0, 99.9))
+    return {"p50": float(p50), "p99": float(p99), "p999": float(p999), "max": float(us.max()), "n": len(us)}

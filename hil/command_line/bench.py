@@ -43,7 +43,7 @@ def add_bench(commands: Any) -> None:
 def _bench(options: argparse.Namespace) -> int:
     from hil.benchmarks.clock import GrossExcessError, gross_excess, measure_measures, measure_real_time, measure_start_up
     from hil.benchmarks.kinematics import measure_kinematics
-    from hil.benchmarks.loop import machine, measure_speed, read_earlier, write_report
+    from hil.benchmarks.loop import machine, measure_speed, read_earlier
     from hil.benchmarks.plant import measure_plant
 
     check_outputs(options.json, options.report)
@@ -75,6 +75,8 @@ def _bench(options: argparse.Namespace) -> int:
         _print_kinematics(figures["kinematics"])
     write_json(options.json, figures)
     if options.report:
+        from hil.reports.benchmark import write_report
+
         write_report(figures, earlier, options.report)
     print(f"{figures['machine']}, {figures['date']}, gough {figures['version']}")
     if options.check and (excess := gross_excess(figures.get("real_time", {"rates": {}}))):

@@ -26,13 +26,15 @@ def add_classify(commands: Any) -> None:
 
 
 def _classify(options: argparse.Namespace) -> int:
-    from hil.studies.classification import PAPER, describe, write_report
+    from hil.studies.classification import PAPER, describe
     from plant.mechanism import load_mechanism
 
     check_outputs(options.json, options.report)
     description = describe(load_mechanism(options.mechanism))
     write_json(options.json, description.summary())
     if options.report:
+        from hil.reports.classification import write_report
+
         write_report(description, options.report)
     mechanism_class = description.mechanism_class
     print(f"{description.mechanism.name}: class {mechanism_class.label}, a {mechanism_class.name} with the graph")
@@ -188,7 +190,7 @@ def add_planar(commands: Any) -> None:
 
 
 def _planar(options: argparse.Namespace) -> int:
-    from hil.studies.planar_rig import evaluate, write_report
+    from hil.studies.planar_rig import evaluate
     from plant.mechanism import load_mechanism
     from plant.mechanism.planar import PlanarMechanism
 
@@ -200,6 +202,8 @@ def _planar(options: argparse.Namespace) -> int:
     summary = result.summary()
     write_json(options.json, summary)
     if options.report:
+        from hil.reports.planar_rig import write_report
+
         write_report(result, options.report)
     table = new_table(
         "RMS of the poses' mean errors", "x [mm]", "y [mm]", "angle [deg]", "leg angles [deg]", "true pose is a mode"

@@ -1,5 +1,6 @@
-"""A picture of a calibration's accuracy, stage by stage, as a small SVG file for documents."""
+"""The accuracy of a calibration, stage by stage, drawn as SVG: in its report, and as a small file for documents."""
 
+from collections.abc import Mapping
 from math import ceil, floor, log10
 from pathlib import Path
 from typing import Any
@@ -7,56 +8,65 @@ from typing import Any
 from hil.calibration.assessment import STAGES
 from plant.files import write_whole
 
-_KINDS = {
+KINDS = {
     "predicted": ("predicted", "#9aa5b1"),
     "validated": ("halves of the data differ by", "#e8871e"),
     "true": ("true", "#3b6fb6"),
 }
+"""Measures of accuracy in a summary, with their names and colors."""
+
 _INK, _LINE = "#26323d", "#dfe4e9"
 _LEFT, _TOP, _BAR, _GAP, _WIDTH = 150, 40, 14, 16, 500
 
 
-def write_picture(summary: dict[str, Any], path: Path) -> None:
-    """Draw the RMS error of the position with each stage's calibration, on a logarithmic scale.
+def write_picture(summary: Mapping[str, Any], path: Path) -> None:
+    """Draw the RMS error of the position with each stage's calibration into a file.
 
     Raises:
         InputError: the file cannot be written.
     """
+    write_whole(path, f"{accuracy_svg(summary, 'position_rms', 'mm', 1e3)}\n".encode())
+
+
+def accuracy_svg(summary: Mapping[str, Any], error: str, unit: str, scale: float) -> str:
+    """Bars of an RMS error with each stage's calibration, on a logarithmic scale.
+
+    Args:
+        summary: of a `RigCalibration`.
+        error: "position_rms" or "rotation_rms".
+        unit: name of the unit shown.
+        scale: how many of this unit make one in SI units.
+    """
     stages = list(summary["residual_mg"])
-    sizes = {
-        (stage, kind): 1e3 * summary[kind][stage]["position_rms"]
-        for stage in stages
-        for kind in _KINDS
-        if stage in summary[kind]
-    }
+    sizes = {(stage, kind): scale * summary[kind][stage][error] for stage in stages for kind in KINDS if stage in summary[kind]}
     first, last = floor(log10(min(sizes.values()))), ceil(log10(max(sizes.values())))
 
     def x(size: float) -> float:
         return _LEFT + _WIDTH * (log10(size) - first) / (last - first)
 
-    step = len(_KINDS) * _BAR + _GAP
+    step = len(KINDS) * _BAR + _GAP
     bottom = _TOP + len(stages) * step
     parts = []
     for decade in range(first, last + 1):
         at = x(10.0**decade)
         parts.append(f'<path d="M{at:.1f} {_TOP - 6}V{bottom}" stroke="{_LINE}"/>')
-        parts.append(_text(at, bottom + 18, f"{10.0**decade:g} mm", "middle"))
+        parts.append(_text(at, bottom + 18, f"{10.0**decade:g} {unit}", "middle"))
     for i, stage in enumerate(stages):
         parts.append(_text(_LEFT - 10, _TOP + i * step + 1.5 * _BAR + 4, STAGES[stage], "end"))
-        for j, (kind, (_, color)) in enumerate(_KINDS.items()):
+        for j, (kind, (_, color)) in enumerate(KINDS.items()):
             if (size := sizes.get((stage, kind))) is None:
                 continue
             y, end = _TOP + i * step + j * _BAR, x(size)
             parts.append(f'<path d="M{_LEFT} {y}H{end:.1f}V{y + _BAR - 2}H{_LEFT}Z" fill="{color}"/>')
             parts.append(_text(end + 5, y + _BAR - 3, f"{size:.3g}", "start"))
-    for j, (name, color) in enumerate(_KINDS.values()):
+    for j, (name, color) in enumerate(KINDS.values()):
         at = _LEFT + 130 * j + 70 * (j > 1)
         parts.append(f'<path d="M{at} 8h12v12h-12Z" fill="{color}"/>')
         parts.append(_text(at + 17, 18, name, "start"))
     size = f"{_LEFT + _WIDTH + 60} {bottom + 30}"
     style = f'font-family="system-ui, sans-serif" font-size="12" fill="{_INK}"'
     body = "\n".join(parts)
-    write_whole(path, f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {size}" {style}>\n{body}\n</svg>\n'.encode())
+    return f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {size}" {style}>\n{body}\n</svg>'
 
 
 def _text(x: float, y: float, text: str, anchor: str) -> str:

@@ -1,6 +1,8 @@
-"""What every report is made of: one HTML page that opens offline, its look, and the parts of a mechanism in 3-D."""
+"""The page of every report: one HTML file that opens offline, its look, and the parts of a mechanism in 3-D."""
 
 from collections.abc import Sequence
+from html import escape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +11,7 @@ from numpy.typing import NDArray
 from plotly.io import to_html
 from plotly.offline import get_plotlyjs
 
+from plant.files import write_whole
 from plant.mechanism import LEGS
 from plant.pose import Array
 
@@ -21,9 +24,21 @@ COLORS = {
 INK, FAINT = "#26323d", "#9aa5b1"
 
 
-def page(title: str, subtitle: str, body: str, script: str = "") -> str:
-    """A whole page with the drawing library inside; `title`, `subtitle` and `body` are HTML."""
-    return f"""<!DOCTYPE html>
+def write_page(path: Path, title: str, subtitle: str, body: str, script: str = "") -> None:
+    """Write a page with the drawing library inside; the file takes its place only when it is complete.
+
+    Args:
+        path: of the HTML file.
+        title: plain text.
+        subtitle: plain text.
+        body: HTML.
+        script: JavaScript, run after the figures are drawn.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    title, subtitle = escape(title), escape(subtitle)
+    text = f"""<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
@@ -39,11 +54,26 @@ def page(title: str, subtitle: str, body: str, script: str = "") -> str:
 </body>
 </html>
 """
+    write_whole(path, text.encode())
 
 
-def figure_html(name: str, title: str, caption: str, figure: go.Figure, kind: str) -> str:
-    """A figure with its title and caption; `kind` is its class, "time" for one of full width."""
-    plot = to_html(
+def figure_html(name: str, title: str, caption: str, figure: go.Figure | str, kind: str = "time") -> str:
+    """A figure with its title and caption, in HTML.
+
+    Args:
+        name: its id on the page.
+        title: plain text.
+        caption: plain text.
+        figure: drawn by plotly, or HTML.
+        kind: its class: "time" takes the full width, "view" what is there.
+    """
+    drawn = f'<div id="{name}">{figure}</div>' if isinstance(figure, str) else _plot_html(name, figure)
+    text = f"<h2>{escape(title, quote=False)}</h2>\n{drawn}\n<figcaption>{escape(caption, quote=False)}</figcaption>"
+    return f'<figure class="{kind}">{text}</figure>\n'
+
+
+def _plot_html(name: str, figure: go.Figure) -> str:
+    html: str = to_html(
         figure,
         config={"displaylogo": False, "responsive": True, "doubleClick": "reset"},
         auto_play=False,
@@ -51,17 +81,17 @@ def figure_html(name: str, title: str, caption: str, figure: go.Figure, kind: st
         full_html=False,
         div_id=name,
     )
-    return f'<figure class="{kind}"><h2>{title}</h2>\n{plot}\n<figcaption>{caption}</figcaption></figure>\n'
+    return html
 
 
 def scene(points: Array, up: Array, front: Array | None = None) -> dict[str, Any]:
-    """Fixed axes with equal scales that hold all `points` (N, 3), seen from aside and above, or from a `front` (3,)."""
+    """Fixed axes with equal scales around `points` (N, 3), seen from the side and above, or along `front` (3,)."""
     margin = 0.05 * np.ptp(points, axis=0).max()
     ranges = np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin], axis=1)
     aside = np.array([1.15, -1.4, 0.0])
     eye = aside + (0.6 - aside @ up) * up
     if front is not None:
-        # The camera's unit is the edge of a cube of the same volume.
+        # The camera's unit is the edge of the cube that has the volume of the scene.
         spans = np.ptp(ranges, axis=1)
         eye = 1.2 * spans.max() / np.cbrt(spans.prod()) * front
     looks = {"up": up, "eye": eye, "center": -0.1 * up}
@@ -72,14 +102,14 @@ def scene(points: Array, up: Array, front: Array | None = None) -> dict[str, Any
             for name, ends in zip(AXIS_NAMES, ranges, strict=True)
         },
         "aspectmode": "data",
-        # A turntable's axis is always z.
+        # A turntable always turns about z.
         "dragmode": "turntable" if up[2] > 0.999 else "orbit",
         "camera": {key: dict(zip(AXIS_NAMES, vector.tolist(), strict=True)) for key, vector in looks.items()},
     }
 
 
 def ring(joints: Array) -> NDArray[np.intp]:
-    """The indices that go round `joints` (6, 3) once, back to the first."""
+    """The indices of `joints` (6, 3) in their order round the centre, and the first again."""
     center = joints - joints.mean(axis=0)
     plane = np.linalg.svd(center)[2][:2]
     x, y = plane @ center.T
@@ -108,7 +138,7 @@ def line_trace(points: dict[str, Array], color: str | list[str], width: float) -
 
 
 def plate_trace(corners: dict[str, Array], color: str, opacity: float) -> go.Mesh3d:
-    """A plate between `coordinates` that go round it."""
+    """A plate whose rim is `coordinates`."""
     fan = np.arange(1, len(corners["x"]) - 1)
     return go.Mesh3d(corners, i=0 * fan, j=fan, k=fan + 1, color=color, opacity=opacity, flatshading=True, hoverinfo="skip")
 
@@ -118,6 +148,9 @@ LAYOUT = {
     "font": {"family": "system-ui, -apple-system, 'Segoe UI', 'Liberation Sans', sans-serif", "size": 12, "color": INK},
     "margin": {"l": 70, "r": 15, "t": 30, "b": 45},
 }
+LEGEND = {"orientation": "h", "x": 0.0, "y": 1.0, "yanchor": "bottom"}
+VIEW = {"margin": {"l": 0, "r": 0, "t": 0, "b": 10}, "showlegend": False}
+"""The look of all figures, of a legend above a plot, and of a view of a mechanism."""
 
 _STYLE = """
 :root { --ink: #26323d; --faint: #66727e; --line: #dfe4e9; --accent: #2f6fb5; }
@@ -144,6 +177,7 @@ dd.bad { color: #c02f3f; }
 dt { color: var(--faint); font-size: 13px; }
 figure { margin: 0; min-width: 0; }
 figure.time { margin-top: 32px; border-top: 1px solid var(--line); padding-top: 18px; }
+.pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(420px, 1fr)); gap: 28px; }
 table + figure { margin-top: 22px; }
 figcaption { color: var(--faint); font-size: 13px; }
 @media (max-width: 960px) { .overview { grid-template-columns: 1fr; } }

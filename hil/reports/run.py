@@ -1,7 +1,6 @@
-"""The report of a simulation: one HTML file that opens offline, with summary, time series and the moving mechanism."""
+"""The report of a simulation: summary, the moving mechanism and time series."""
 
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,33 +16,44 @@ from hil.reports.page import (
     INK,
     LAYOUT,
     LEG_NAMES,
+    LEGEND,
+    VIEW,
     coordinates,
     figure_html,
     line_trace,
-    page,
     plate_trace,
     ring,
     scene,
     segment_colors,
     segments,
+    write_page,
 )
 from hil.runs.simulation import SimulationResult
-from plant.files import write_whole
-from plant.pose import Array, rotation_angle
+from hil.table import Cell, Table
+from plant.pose import Array, pose_errors
 from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS
 from plant.wiring import ALL_IMUS
 
+_QUANTITIES = (("position", "mm", 1e3), ("rotation", "deg", np.degrees(1.0)))
 _POINTS = 3000
 _FRAMES = 150
 _FRAME_RATE_HZ = 25.0
 _SLOWEST_HZ = 15.0
 _PATH_POINTS = 600
 _TUBE = 0.62
-"""The drawn length of a leg's lower part, relative to the least length of the leg."""
+"""The drawn length of a leg's lower part, as a share of the leg's least length."""
 
 
 class _Panel(NamedTuple):
-    """One pair of axes over time: `values` (N, k) of the curves `names`, their plan (N, k), and dashed limits."""
+    """Axes over time with k curves.
+
+    Attributes:
+        label: of the vertical axis.
+        names: of the curves.
+        values: (N, k).
+        planned: (N, k), drawn behind.
+        limits: drawn dashed.
+    """
 
     label: str
     names: Sequence[str]
@@ -53,36 +63,25 @@ class _Panel(NamedTuple):
 
 
 def write_report(result: SimulationResult, path: Path) -> None:
-    """Write the report of a simulation as one HTML file, which takes its place only when it is complete.
+    """Write the report of a simulation as one HTML file.
 
     Raises:
         InputError: the file cannot be written.
     """
-    write_whole(path, _page(result).encode())
-
-
-def _page(result: SimulationResult) -> str:
     summary = result.summary()
-    title = f"gough: {escape(result.mechanism.name)} follows {escape(result.target.name)}"
     view, speed = _mechanism_view(result)
     pace = "in real time" if speed < 1.05 else f"at {speed:.2g} times real speed"
-    series = "".join(figure_html(*figure, "time") for figure in _time_figures(result))
-    moving = figure_html(
-        "mechanism",
-        "The mechanism",
-        f"{_real(result)} poses {pace}; the path of the origin in grey. Drag to turn, scroll to zoom.",
-        view,
-        "view",
-    )
+    caption = f"{_real(result)} poses {pace}; the path of the origin in grey. Drag to turn, scroll to zoom."
     body = f"""<section class="overview">
 <div>
-{_error_table(summary)}
+{_error_table(summary).html()}
 {_facts(summary)}
 </div>
-{moving}
+{figure_html("mechanism", "The mechanism", caption, view, "view")}
 </section>
-{series}"""
-    return page(title, _configuration(result, summary), body, _SHARED_TIME)
+{"".join(figure_html(*figure) for figure in _time_figures(result))}"""
+    title = f"gough: {result.mechanism.name} follows {result.target.name}"
+    write_page(path, title, _configuration(result, summary), body, _SHARED_TIME)
 
 
 def _configuration(result: SimulationResult, summary: dict[str, Any]) -> str:
@@ -100,39 +99,24 @@ def _configuration(result: SimulationResult, summary: dict[str, Any]) -> str:
     if config.plant:
         parts.append(f"plant {config.plant}" + (f" with {config.binding}" if config.binding else ""))
     parts += [each.text for each in config.settings]
-    return " · ".join(map(escape, parts))
+    return " · ".join(parts)
 
 
-def _error_table(summary: dict[str, Any]) -> str:
-    reference = ("Reference", "planned reference - target", summary["target"], "reference_")
-    lines = (
-        (
-            ("Estimation", "estimate - truth", summary["estimation"], ""),
-            ("Tracking", "truth - planned reference", summary["tracking"], ""),
-            ("Against the raw target", "truth - target", summary["target"], ""),
-            reference,
-        )
-        if summary["truth_known"]
-        else (
-            ("Tracking", "estimate - planned reference; the truth is not known", summary["estimated_tracking"], ""),
-            reference,
-        )
-    )
-    rows = "".join(
-        f"<tr><th>{name}<small>{meaning}</small></th>"
-        + "".join(f"<td>{1e3 * errors[prefix + key]:.3f}</td>" for key in ("position_rms", "position_max"))
-        + "".join(f"<td>{np.degrees(errors[prefix + key]):.3f}</td>" for key in ("rotation_rms", "rotation_max"))
-        + "</tr>\n"
-        for name, meaning, errors, prefix in lines
-    )
-    return f"""<table>
-<thead>
-<tr><th rowspan="2"></th><th colspan="2">position [mm]</th><th colspan="2">rotation [deg]</th></tr>
-<tr><th>RMS</th><th>max</th><th>RMS</th><th>max</th></tr>
-</thead>
-<tbody>
-{rows}</tbody>
-</table>"""
+def _error_table(summary: dict[str, Any]) -> Table:
+    table = Table("", *((f"{name} [{unit}]", kind) for name, unit, _ in _QUANTITIES for kind in ("RMS", "max")))
+
+    def add(name: str, meaning: str, errors: dict[str, float], prefix: str = "") -> None:
+        keys = ((f"{prefix}{quantity}_{kind}", scale) for quantity, _, scale in _QUANTITIES for kind in ("rms", "max"))
+        table.add(Cell(name, meaning), *(f"{scale * errors[key]:.3f}" for key, scale in keys))
+
+    if summary["truth_known"]:
+        add("Estimation", "estimate - truth", summary["estimation"])
+        add("Tracking", "truth - planned reference", summary["tracking"])
+        add("Against the raw target", "truth - target", summary["target"])
+    else:
+        add("Tracking", "estimate - planned reference; the truth is not known", summary["estimated_tracking"])
+    add("Reference", "planned reference - target", summary["target"], "reference_")
+    return table
 
 
 def _facts(summary: dict[str, Any]) -> str:
@@ -149,7 +133,7 @@ def _facts(summary: dict[str, Any]) -> str:
 
 
 def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figure]]:
-    """Name, title, caption and figure of everything that is drawn over time."""
+    """Name, title, caption and figure of each plot over time."""
     records, times = result.records, result.times
     limits, home_pose = result.mechanism.require_limits(), result.mechanism.require_home()
     names, legs_there = LEG_NAMES[: result.mechanism.legs], slice(result.mechanism.legs)
@@ -198,36 +182,36 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
         (
             "pose",
             "Pose",
-            f"{real} pose of the platform and its planned reference, from home; the rotation vector is seen in the base.",
+            f"{real} pose of the platform and its planned reference, from home; the rotation vector is in the base's axes.",
             _plot(times, pose),
         ),
         (
             "errors",
             "Estimation and tracking error" if result.truth_known else "Tracking error",
             ("Estimate minus truth, and truth" if result.truth_known else "The truth is not known: estimate")
-            + " minus planned reference. The scales are those of the motion: while the filters "
-            "settle in the hold (grey), the estimate may be further off.",
+            + " minus planned reference. The scales fit the motion: during the hold (grey), while the filters settle, the "
+            "estimate may be further off.",
             _plot(times, errors, columns=len(differences), shared_yaxes=True),
         ),
         (
             "lengths",
             "Leg lengths",
-            f"{real_length} and planned length of each leg between the ends of its stroke.",
+            f"{real_length} and planned length of each leg, with the ends of its stroke.",
             _plot(times, legs, columns=3),
         ),
-        ("motion", "Planned motion of the legs", "The reference against the limits of the actuators.", _plot(times, motion)),
+        ("motion", "Planned motion of the legs", "The reference, with the limits of the actuators.", _plot(times, motion)),
         (
             "drives",
             "Drives",
-            f"{real_length} minus planned length of each leg, the speed that its drive is told, and the current that this "
-            "takes, if the plant tells it.",
+            f"{real_length} minus planned length of each leg, the speed commanded to its drive, and its motor's current, if "
+            "the plant has it.",
             _plot(times, drives),
         ),
     ]
 
 
 def _real(result: SimulationResult) -> str:
-    """What the poses that are drawn are."""
+    """The kind of the poses that are drawn."""
     return "True" if result.truth_known else "Estimated"
 
 
@@ -239,7 +223,7 @@ def _actual_poses(result: SimulationResult) -> tuple[Array, Array]:
 
 
 def _plot(times: Array, panels: Sequence[_Panel], columns: int = 1, shared_yaxes: bool = False) -> go.Figure:
-    """A figure of panels over one time axis, filled row by row; each name is once in the legend."""
+    """A figure of panels over one time axis, filled row by row; the legend has each name once."""
     rows = len(panels) // columns
     figure = make_subplots(
         rows,
@@ -277,13 +261,13 @@ def _plot(times: Array, panels: Sequence[_Panel], columns: int = 1, shared_yaxes
     figure.update_layout(
         LAYOUT,
         height=60 + 210 * rows,
-        legend={"orientation": "h", "x": 0.0, "y": 1.0, "yanchor": "bottom"},
+        legend=LEGEND,
     )
     return figure
 
 
 def _span(panels: Sequence[_Panel], moving: NDArray[np.bool_]) -> tuple[float, float]:
-    """What an axis for all of `panels` shows: the motion and the limits, but not how the filters settle before it."""
+    """The range of an axis for all `panels`: the motion and the limits, not the filters' settling before."""
     drawn = [curves[moving].ravel() for panel in panels for curves in (panel.values, panel.planned) if curves is not None]
     values = np.concatenate([*drawn, *(panel.limits for panel in panels)])
     finite = values[np.isfinite(values)]
@@ -303,7 +287,7 @@ def _curve(times: Array, values: Array, name: str, unit: str) -> dict[str, Any]:
 
 
 def _extremes(values: Array, points: int = _POINTS) -> NDArray[np.intp]:
-    """Indices of about `points` samples of `values` (N,), among them the least and the greatest of each bucket."""
+    """Indices of about `points` samples of `values` (N,), with the least and the greatest of each bucket."""
     if len(values) <= points:
         return np.arange(len(values))
     size = -(-2 * len(values) // points)
@@ -314,16 +298,13 @@ def _extremes(values: Array, points: int = _POINTS) -> NDArray[np.intp]:
 
 
 def _differences(poses: tuple[Array, Array], origins: tuple[Array, Array]) -> tuple[Array, Array]:
-    """From the poses `origins` to `poses`: translation (N, 3) [mm] and rotation vector (N, 3) [deg], both seen in {1}."""
-    relative = poses[1] @ np.swapaxes(origins[1], -1, -2)
-    skewed = relative - np.swapaxes(relative, 1, 2)
-    sines = 0.5 * np.stack([skewed[:, 2, 1], skewed[:, 0, 2], skewed[:, 1, 0]], axis=1)
-    angles = rotation_angle(poses[1], origins[1])
-    return 1e3 * (poses[0] - origins[0]), np.degrees(sines / np.sinc(angles / np.pi)[:, None])
+    """Translations (N, 3) [mm] and rotation vectors (N, 3) [deg] from the poses `origins` to `poses`, in {1}."""
+    errors = pose_errors(*poses, *origins)
+    return 1e3 * errors[:, :3], np.degrees(errors[:, 3:])
 
 
 def _mechanism_view(result: SimulationResult) -> tuple[go.Figure, float]:
-    """The moving mechanism, and how many times faster than real it plays."""
+    """The moving mechanism, and its playing speed as a multiple of the real one."""
     mechanism = result.mechanism
     moving = np.flatnonzero(result.times >= 0.0)
     span = len(moving) / result.config.rate
@@ -374,9 +355,8 @@ def _mechanism_view(result: SimulationResult) -> tuple[go.Figure, float]:
     )
     figure.update_layout(
         LAYOUT,
+        **VIEW,
         height=540,
-        margin={"l": 0, "r": 0, "t": 0, "b": 10},
-        showlegend=False,
         uirevision="kept",
         scene=scene(points, mechanism.up_in_base, np.array([0.0, 0.0, 1.0]) if mechanism.planar else None),
         **_player(result.times[shown], frame_s),

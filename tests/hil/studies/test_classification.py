@@ -8,7 +8,8 @@ import pytest
 
 from controller.direct_kinematics import solve
 from hil.command_line import main
-from hil.studies.classification import describe, write_report
+from hil.reports.classification import write_report
+from hil.studies.classification import describe
 from plant.errors import InputError
 from plant.mechanism import load_mechanism
 from plant.mechanism.classification import draw_mechanism, planar_classes, spatial_classes

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from hil.studies.planar_rig import COLUMNS, SOURCES, evaluate, write_report
+from hil.reports.planar_rig import write_report
+from hil.studies.planar_rig import COLUMNS, SOURCES, evaluate
 from plant.errors import InputError, SingularConfigurationError
 from plant.mechanism.planar import planar_from_document
 from tests.conftest import SHARED_DATA

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from hil.benchmarks.clock import BUSY, CONDITIONS, IDLE, LOAD, _figures_of_counts, gross_excess, measure_real_time
-from hil.benchmarks.loop import read_earlier, write_report
+from hil.benchmarks.loop import read_earlier
 from hil.command_line import main
 from hil.loop.records import LINK_SIZE, RECORD, Link
 from hil.recording.mcap import take
+from hil.reports.benchmark import write_report
 from plant.errors import InputError
 
 

@@ -1,0 +1,66 @@
+"""The report of the loop on the clock: histograms of its times, and their course from run to run."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import plotly.graph_objects as go
+
+from hil.reports.page import LAYOUT, figure_html, write_page
+from plant.errors import InputError
+
+
+def write_report(figures: dict[str, Any], history: Sequence[dict[str, Any]], path: Path) -> None:
+    """Write histograms of the loop on the clock, and the course of its figures over earlier runs, as one HTML file.
+
+    Args:
+        figures: as `gough bench --json` writes them, with the section `real_time`.
+        history: earlier figures.
+        path: of the HTML file.
+
+    Raises:
+        InputError: there is no such section, or the file cannot be written.
+    """
+    if "real_time" not in figures:
+        raise InputError(
+            "a report shows the loop on the clock, which was not measured: run it with --only clock, or without --only"
+        )
+    runs = sorted([*history, figures], key=lambda run: str(run["date"]))
+    sections = []
+    for rate, conditions in figures["real_time"]["rates"].items():
+        for condition, measured in conditions.items():
+            name = f"{rate} Hz, {condition.replace('_', ' ')}"
+            figure = go.Figure()
+            for label, (lower, counts) in measured["histograms"].items():
+                if counts:
+                    figure.add_scatter(x=lower, y=counts, name=label, mode="lines", line={"shape": "hv"})
+            axes = {"xaxis": {"title": "us", "type": "log"}, "yaxis": {"title": "cycles", "type": "log"}}
+            figure.update_layout(LAYOUT, height=380, **axes)
+            sections.append(figure_html(f"clock-{rate}-{condition}", name, _sentence(measured), figure))
+    for rate in figures["real_time"]["rates"]:
+        figure = go.Figure()
+        for name in ("compute_us", "latency_us", "wake_us", "cyclictest_us"):
+            for key in ("p50", "p999"):
+                measured = [(run["date"], _idle(run, rate).get(name)) for run in runs]
+                points = [(date, figures_of[key]) for date, figures_of in measured if figures_of]
+                label = f"{name.removesuffix('_us')} {key.replace('p999', 'p99.9')}"
+                figure.add_scatter(x=[at for at, _ in points], y=[us for _, us in points], name=label, mode="lines+markers")
+        figure.update_layout(LAYOUT, height=380, yaxis={"title": "us", "type": "log"})
+        caption = f"{len(runs)} runs, idle."
+        sections.append(figure_html(f"history-{rate}", f"{rate} Hz, from run to run", caption, figure))
+    subtitle = f"{figures['machine']}, {figures['date']}, gough {figures['version']}"
+    write_page(path, "The loop on the clock", subtitle, "\n".join(sections))
+
+
+def _sentence(measured: dict[str, Any]) -> str:
+    compute, latency = measured["compute_us"], measured["latency_us"]
+    return (
+        f"Computing p50 {compute['p50']:.1f} us, p99.9 {compute['p999']:.1f}; wake-up to command p50 {latency['p50']:.1f}, "
+        f"p99.9 {latency['p999']:.1f}; missed by own work {measured['missed_own']}, by the host {measured['missed_host']}."
+    )
+
+
+def _idle(run: dict[str, Any], rate: str) -> dict[str, Any]:
+    """The figures of an idle run at a rate; empty if it has none."""
+    found: dict[str, Any] = run.get("real_time", {}).get("rates", {}).get(rate, {}).get("idle", {})
+    return found
