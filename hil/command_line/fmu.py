@@ -91,7 +91,7 @@ def _build_fmu(options: argparse.Namespace) -> int:
 
 
 def _print_tables(options: argparse.Namespace) -> int:
-    from hil.reports.markdown import markdown_table
+    from hil.table import Table
     from plant.fmu.build import PLANAR_MODEL, SPATIAL_MODEL
 
     del options
@@ -99,8 +99,10 @@ def _print_tables(options: argparse.Namespace) -> int:
     sections = []
     for model in (SPATIAL_MODEL, PLANAR_MODEL):
         table = model.table
-        rows = map(_cells, (*table.inputs, *table.parameters, *table.outputs, *table.states))
-        sections += [f"### {model.identifier}", f"{model.description}.", markdown_table(headings, rows)]
+        shown = Table(*headings)
+        for variable in (*table.inputs, *table.parameters, *table.outputs, *table.states):
+            shown.add(*_cells(variable))
+        sections += [f"### {model.identifier}", f"{model.description}.", shown.markdown()]
     print("\n\n".join(sections))
     return 0
 

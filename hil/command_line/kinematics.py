@@ -113,19 +113,17 @@ def add_classes(commands: Any) -> None:
 def _classes(options: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from hil.studies.accuracy import COLUMNS, cells, evaluate_classes, markdown
+    from hil.studies.accuracy import class_table, evaluate_classes
 
     check_outputs(options.json)
     with progress_bar("classes") as progress:
         rows = evaluate_classes(options.seed, progress)
     write_json(options.json, {"seed": options.seed, "version": version("gough"), "classes": [asdict(row) for row in rows]})
+    table = class_table(rows)
     if options.markdown:
-        print(markdown(rows))
-        return 0
-    table = new_table(*COLUMNS)
-    for row in rows:
-        table.add_row(*cells(row))
-    print_table(table)
+        print(table.markdown())
+    else:
+        table.print()
     return 0
 
 
@@ -149,9 +147,8 @@ def add_sensor_sets(commands: Any) -> None:
 
 def _sensor_sets(options: argparse.Namespace) -> int:
     from dataclasses import asdict
-    from itertools import groupby
 
-    from hil.studies.sensor_sets import COLUMNS, MECHANISMS, cells, evaluate_sensor_sets, markdown, reasons
+    from hil.studies.sensor_sets import MECHANISMS, evaluate_sensor_sets, reasons, table
 
     check_outputs(options.json)
     with progress_bar("sets of sensors") as progress:
@@ -161,13 +158,10 @@ def _sensor_sets(options: argparse.Namespace) -> int:
     figures = {"duration": options.duration, "seed": options.seed, "version": version("gough")}
     write_json(options.json, {**figures, "sets": [asdict(outcome) for outcome in outcomes]})
     if options.markdown:
-        print(markdown(outcomes))
+        print("\n".join([table(outcomes).markdown(), "", *(f"- {reason}" for reason in reasons(outcomes))]))
         return 0
-    for mechanism, group in groupby(outcomes, lambda outcome: outcome.mechanism):
-        table = new_table(mechanism, *COLUMNS[2:])
-        for outcome in group:
-            table.add_row(*cells(outcome)[1:])
-        print_table(table)
+    for mechanism in dict.fromkeys(outcome.mechanism for outcome in outcomes):
+        table(outcomes, mechanism).print()
     for reason in reasons(outcomes):
         print(reason)
     return 0

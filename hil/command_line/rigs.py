@@ -173,8 +173,7 @@ def add_faults(commands: Any) -> None:
 
 
 def _faults(options: argparse.Namespace) -> int:
-    from hil.reports.markdown import markdown_table
-    from hil.studies.fault_matrix import CASES, HEADINGS, run_matrix, summary, table
+    from hil.studies.fault_matrix import CASES, run_matrix, summary, table
 
     check_outputs(options.json)
     if options.seeds < 1:
@@ -184,14 +183,10 @@ def _faults(options: argparse.Namespace) -> int:
         raise InputError(f"no case has {options.only!r} in its name")
     with progress_bar("faults") as progress:
         outcomes = run_matrix(options.seeds, cases, progress)
-    rows = table(outcomes)
     if options.markdown:
-        print(markdown_table(HEADINGS, rows))
+        print(table(outcomes).markdown())
     else:
-        shown = new_table(*HEADINGS)
-        for row in rows:
-            shown.add_row(*row)
-        print_table(shown)
+        table(outcomes).print()
     write_json(options.json, summary(outcomes, options.seeds))
     findings = [finding for outcome in outcomes for finding in outcome.findings]
     for finding in findings:

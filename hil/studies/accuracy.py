@@ -1,7 +1,7 @@
-"""How accurate direct kinematics is: Monte Carlo runs against the Cramér-Rao bound, for a mechanism and for every class.
+"""Accuracy of direct kinematics: Monte Carlo runs against the Cramér-Rao bound, for a mechanism and for every class.
 
-Noise is that of the sigmas of `controller.direct_kinematics.spatial`: 0.05 deg on each component of a leg's direction and on
-roll and pitch, 1.5 deg on a magnetic yaw.
+The noise has the sigmas of `controller.direct_kinematics.spatial`: 0.05 deg on each component of a leg's direction and on roll
+and pitch, 1.5 deg on a magnetic yaw.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,11 +11,11 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from controller.direct_kinematics import Solutions, required_measurements, solve_batch, solve_planar
-from controller.direct_kinematics.consistency import chi_square_quantile
 from controller.direct_kinematics.spatial import LEG_SIGMA, NEEDS, TILT_SIGMA, YAW_SIGMA
-from hil.reports.markdown import markdown_table
+from hil.table import Cell, Table
 from plant.checks import checked_seed
 from plant.errors import InputError, SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
@@ -27,20 +27,20 @@ from plant.mechanism.classification import (
     planar_classes,
     spatial_classes,
 )
-from plant.pose import Array, rotation_angle, rotation_from_vector
+from plant.pose import Array, pose_errors, rms_figures, rotation_angle, rotation_from_vector
 
 ALL_LEGS = tuple(range(LEGS))
 
 _REACH, _TILT = 1.0 / 6.0, np.radians(15.0)
-"""Poses are drawn within this share of the base's radius and this angle about home: 50 mm and 15 deg on `hexapod`."""
+"""Poses are drawn within this share of the base's radius and this angle from home: 50 mm and 15 deg on `hexapod`."""
 _TWO_LEGS = (0, 3)
-_BOUND_SHARE = 0.99
+_NEES_BOUNDS = 0.005, 0.995
 _CLASS_MECHANISMS, _CLASS_POSES = 20, 50
 
 
 @dataclass(frozen=True)
 class Estimator:
-    """A way to the pose: a method of direct kinematics, the legs it is given, and whether it is refined."""
+    """A method of direct kinematics, the legs that it uses, and whether its pose is refined."""
 
     label: str
     method: str
@@ -54,8 +54,8 @@ class Errors:
 
     Attributes:
         position_rms, rotation_rms: root mean square error [m], [rad].
-        position_over_bound, rotation_over_bound: the same over the Cramér-Rao bound of what the estimator is given.
-        nees: mean normalised squared error by the covariance that is stated; 6 if that is right and the pose refined.
+        position_over_bound, rotation_over_bound: the same over the Cramér-Rao bound of the given measurements.
+        nees: mean normalised squared error by the stated covariance; 6 if this is right and the pose refined.
         solved: share of the poses that were found.
     """
 
@@ -69,7 +69,7 @@ class Errors:
 
 @dataclass(frozen=True, eq=False)
 class Accuracy:
-    """The errors of every estimator on a mechanism; `nees_bounds` hold 99 % of the means of sound covariances."""
+    """The errors of every estimator on a mechanism; `nees_bounds` hold 99 % of the mean NEES if covariances are right."""
 
     mechanism: str
     mechanism_class: MechanismClass
@@ -93,7 +93,7 @@ class Accuracy:
 
 
 def evaluate_accuracy(mechanism: Mechanism, poses: int = 2000, seed: int = 0) -> Accuracy:
-    """Errors of the paper's algorithms and of the closed forms from all legs, at random poses about home.
+    """Errors of the paper's algorithms and of the closed forms with all legs, at random poses about home.
 
     Raises:
         InputError: no poses, or the mechanism is in no class.
@@ -109,9 +109,8 @@ def evaluate_accuracy(mechanism: Mechanism, poses: int = 2000, seed: int = 0) ->
         found = _run(mechanism, estimator, noisy)
         bound = _run(mechanism, estimator, exact).covariances
         errors[estimator] = _errors(found, positions, rotations, bound)
-    share = 0.5 * (1.0 - _BOUND_SHARE)
-    bounds = (chi_square_quantile(6 * poses, 1.0 - share) / poses, chi_square_quantile(6 * poses, share) / poses)
-    return Accuracy(mechanism.name, classify(mechanism), errors, poses, seed, bounds)
+    low, high = chi2.ppf(_NEES_BOUNDS, 6 * poses) / poses
+    return Accuracy(mechanism.name, classify(mechanism), errors, poses, seed, (float(low), float(high)))
 
 
 def draw_poses(mechanism: Mechanism, count: int, random: np.random.Generator) -> tuple[Array, Array]:
@@ -128,7 +127,7 @@ def draw_poses(mechanism: Mechanism, count: int, random: np.random.Generator) ->
 def draw_measurements(
     mechanism: Mechanism, positions: Array, rotations: Array, random: np.random.Generator, noise: float
 ) -> dict[str, Array]:
-    """What the IMUs tell at these poses, by the names of `solve_batch`, with `noise` times its sigmas."""
+    """The measurements at these poses, by their names in `solve_batch`, with `noise` times the sigmas."""
     up, count = mechanism.up_in_base, len(positions)
     vectors = positions[:, None] + mechanism.platform_joints @ np.swapaxes(rotations, 1, 2) - mechanism.base_joints
     level = np.linalg.svd(up[None])[2][1:]
@@ -166,7 +165,7 @@ def _estimators(mechanism: Mechanism) -> list[Estimator]:
 
 
 def _best_legs(mechanism: Mechanism, method: str, count: int) -> tuple[int, ...]:
-    """The legs, so many, with which the method is conditioned best near home."""
+    """The `count` legs with which the method is conditioned best near home."""
     choices = list(combinations(ALL_LEGS, count))
     random = np.random.default_rng(0)
     measurements = draw_measurements(mechanism, *draw_poses(mechanism, 10, random), random, 0.0)
@@ -185,25 +184,20 @@ def _run(mechanism: Mechanism, estimator: Estimator, measurements: dict[str, Arr
 
 def _errors(found: Solutions, positions: Array, rotations: Array, bounds: Array) -> Errors:
     kept = found.solved & np.isfinite(bounds[:, 0, 0])
-    moved = found.positions[kept] - positions[kept]
-    relative = found.rotations[kept] @ np.swapaxes(rotations[kept], 1, 2)
-    angles = rotation_angle(found.rotations[kept], rotations[kept])
-    sines = np.stack([relative[:, i, j] - relative[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1)
-    turned = 0.5 * sines / np.sinc(angles / np.pi)[:, None]
-    error = np.concatenate([moved, turned], axis=1)
+    error = pose_errors(found.positions[kept], found.rotations[kept], positions[kept], rotations[kept])
     nees = np.einsum("ni,ni->n", error, np.linalg.solve(found.covariances[kept], error[..., None])[..., 0])
     variances = np.diagonal(bounds[kept], axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=2).mean(axis=0)
-    rms = np.sqrt([np.mean(np.sum(moved**2, axis=1)), np.mean(angles**2)])
+    rms = tuple(rms_figures(error).values())
     over = rms / np.sqrt(variances)
     return Errors(*(float(value) for value in (*rms, *over, nees.mean(), kept.mean())))
 
 
 @dataclass(frozen=True)
 class ClassAccuracy:
-    """What the paper and what gough needs on a class of mechanisms, and the errors of each.
+    """The needs of the paper and of gough on a class of mechanisms, and the errors of each.
 
-    Errors are medians over random mechanisms and poses, position [m] and angle [rad]; those of the paper are of its
-    algorithm on the legs that suit it best, those of gough are refined and use all legs.
+    Errors are medians over random mechanisms and poses, position [m] and angle [rad]. The paper's algorithm uses the legs that
+    suit it best; gough uses all legs and refines the pose.
     """
 
     label: str
@@ -282,28 +276,19 @@ def _evaluate_planar_class(mechanism_class: MechanismClass, random: np.random.Ge
     )  # fmt: skip
 
 
-COLUMNS = (
-    "class", "graph", "the paper needs", "its error", "gough needs", "six legs alone", "or + vertical", "six legs + vertical",
-)  # fmt: skip
-"""What `cells` holds."""
+def class_table(rows: Sequence[ClassAccuracy]) -> Table:
+    """The needs and errors of classes, in words."""
 
+    def text(errors: tuple[float, float]) -> str:
+        return f"{1e3 * errors[0]:.2f} mm, {np.degrees(errors[1]):.3f} deg"
 
-def cells(row: ClassAccuracy) -> tuple[str, ...]:
-    """The needs and errors of a class, in words."""
-
-    def errors(pair: tuple[float, float]) -> str:
-        return f"{1e3 * pair[0]:.2f} mm, {np.degrees(pair[1]):.3f} deg"
-
-    return (
-        row.label, row.drawing, row.paper_needs, errors(row.paper_errors), row.alone_needs, errors(row.alone_errors),
-        row.vertical_needs, errors(row.vertical_errors),
+    table = Table(
+        "class", "graph", "the paper needs", "its error", "gough needs", "six legs alone", "or + vertical",
+        "six legs + vertical",
     )  # fmt: skip
-
-
-def markdown(rows: Sequence[ClassAccuracy]) -> str:
-    """The needs and errors of the classes as a table in Markdown."""
-    lines = []
     for row in rows:
-        label, drawing, *others = cells(row)
-        lines.append((label, f"`{drawing.replace('|', chr(92) + '|')}`", *others))
-    return markdown_table(COLUMNS, lines)
+        table.add(
+            row.label, Cell(row.drawing, code=True), row.paper_needs, text(row.paper_errors), row.alone_needs,
+            text(row.alone_errors), row.vertical_needs, text(row.vertical_errors),
+        )  # fmt: skip
+    return table

@@ -58,6 +58,7 @@ from hil.rigs.udp.rig import TIMEOUT_SHARE
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import PreparedLoop, prepared_loop
 from hil.runs.target_stream import LEAD_S, Reception, Sample, encode
+from hil.table import Table
 from plant.compiled import Record
 from plant.mechanism import LEGS
 from plant.pose import quaternion_from_rotation
@@ -182,9 +183,6 @@ CASES = (
 )  # fmt: skip
 
 
-HEADINGS = ("case", "told", "reaction", "cycles until told", "peak deviation [mm]", "travel to rest [mm]")
-
-
 @dataclass
 class Outcome:
     """What came of a case.
@@ -242,18 +240,17 @@ def summary(outcomes: list[Outcome], seeds: int) -> dict[str, Any]:
     return {"cases": [each.summary() for each in outcomes], "seeds": seeds, "rate_hz": RATE_HZ, "version": version("gough")}
 
 
-def table(outcomes: list[Outcome]) -> list[tuple[str, ...]]:
-    """Rows under the `HEADINGS`; figures are median and most of the seeds."""
-    rows: list[tuple[str, ...]] = []
+def table(outcomes: list[Outcome]) -> Table:
+    """The outcomes in words; figures are the median and the greatest over the seeds."""
+    result = Table("case", "told", "reaction", "cycles until told", "peak deviation [mm]", "travel to rest [mm]")
     for each in outcomes:
         told = CAUSES[each.case.expected].text.format("k") if each.case.expected else "-"
         cycles = f"{np.median(each.cycles):.0f}, {max(each.cycles)}" if each.cycles else "-"
         peaks, travels = 1e3 * np.array(each.peak), 1e3 * np.array(each.travel)
+        peak = f"{np.median(peaks):.2f}, {peaks.max():.2f}"
         travel = f"{np.median(travels):.1f}, {travels.max():.1f}" if travels.any() else "-"
-        rows.append(
-            (each.case.name, told, ", ".join(each.reactions), cycles, f"{np.median(peaks):.2f}, {peaks.max():.2f}", travel)
-        )
-    return rows
+        result.add(each.case.name, told, ", ".join(each.reactions), cycles, peak, travel)
+    return result
 
 
 def _try(case: Case, seed: int, outcome: Outcome) -> None:

@@ -1,7 +1,7 @@
-"""The closed loop with fewer sensors: which sets close it, on a mechanism of each type of the paper, and how accurate they are.
+"""The closed loop with fewer sensors, on a mechanism of each type of the paper: which sets close it, and how accurately.
 
-Each set runs with leg and platform filters and with the whole-mechanism filter. Of the legs that may carry the IMUs of a set,
-those are taken with which the pose is determined best at the worst pose of the workspace.
+Each set runs with leg and platform filters and with the whole-mechanism filter. Its IMUs sit on those legs that give the best
+conditioning at the worst pose of the workspace.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from controller.cycle import check_imus
-from hil.reports.markdown import markdown_table
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import SimulationStoppedError, simulate
+from hil.table import Table
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import InputError
 from plant.mechanism import LEGS, Mechanism, load_spatial
@@ -32,10 +32,10 @@ class SensorSet:
 
     Attributes:
         label: in words.
-        legs: how many legs have an IMU.
-        platform: whether the platform has one, which gives its roll and pitch.
-        magnetometer: whether that gives its heading as well.
-        fusions: ways to fuse, keys of `hil.runs.config.FUSIONS`.
+        legs: number of legs with an IMU.
+        platform: whether the platform has an IMU, which gives roll and pitch.
+        magnetometer: whether this IMU gives the heading as well.
+        fusions: keys of `hil.runs.config.FUSIONS`.
     """
 
     label: str
@@ -45,7 +45,7 @@ class SensorSet:
     fusions: tuple[str, ...] = ("compiled", "whole")
 
     def choices(self) -> Iterator[tuple[int, ...]]:
-        """The IMUs that these may be."""
+        """The possible choices of IMUs."""
         for legs in combinations(range(LEGS), self.legs):
             yield (*legs, PLATFORM_IMU) if self.platform else legs
 
@@ -61,7 +61,7 @@ SETS = (
     SensorSet("6 legs + yaw, section 5", 6, magnetometer=True, fusions=_SECTION_5),
     SensorSet("6 legs + yaw", 6, magnetometer=True),
 )
-"""From the fewest to all; the tilt is the platform's roll and pitch, and with the yaw it is the whole orientation."""
+"""From the fewest to all. The tilt is the platform's roll and pitch; with yaw, its whole orientation is measured."""
 
 
 def paper_set(mechanism_class: MechanismClass) -> str:
@@ -73,16 +73,16 @@ def paper_set(mechanism_class: MechanismClass) -> str:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How the closed loop does with a set of sensors.
+    """The closed loop with a set of sensors.
 
     Attributes:
         mechanism, sensors: labels.
-        paper: whether the paper needs just these.
-        imus: which IMUs there were; empty if every choice was refused.
+        paper: whether the paper needs exactly these.
+        imus: numbers of the IMUs; empty if every choice was refused.
         conditioning: of direct kinematics at the worst pose of the workspace.
-        refused: why no choice can be used; empty if one can.
-        runs: by fusion, `estimation` and `tracking` as `hil.runs.simulation.SimulationResult.summary` has them, or `stopped`,
-            why.
+        refused: the reason why no choice can be used; empty if one can.
+        runs: by fusion, `estimation` and `tracking` as in `hil.runs.simulation.SimulationResult.summary`, or `stopped` with
+            the reason.
     """
 
     mechanism: str
@@ -124,13 +124,13 @@ def evaluate_sensor_sets(
 
 
 def choose_imus(mechanism: Mechanism, sensors: SensorSet, paper: bool) -> tuple[tuple[int, ...], float, str]:
-    """The IMUs of a set, the worst conditioning with them, and why there are none; for the paper's set, such as it takes."""
+    """The best IMUs of a set, the worst conditioning with them, and why there are none; `paper`: legs as in the paper."""
     best, refused = 0.0, ""
     imus: tuple[int, ...] = ()
     joints = joint_numbers(mechanism.platform_joints)
     for choice in sensors.choices():
         if paper and sensors.legs == 4 and len({int(joints[leg]) for leg in choice[:4]}) != 3:
-            # The paper's section 4 takes two legs that meet, and two that end elsewhere.
+            # The paper's section 4 uses two legs that meet, and two that end elsewhere.
             continue
         try:
             conditioning = check_imus(mechanism, choice, sensors.magnetometer, sensors.fusions == _SECTION_5)
@@ -158,22 +158,28 @@ def _evaluate(name: str, mechanism: Mechanism, sensors: SensorSet, paper: bool, 
     return Outcome(name, sensors.label, paper, imus, conditioning, refused, runs)
 
 
-COLUMNS = ("mechanism", "sensors", "IMUs", "conditioning", "filters [mm / deg]", "at most", "whole [mm / deg]", "at most")
-"""What `cells` holds."""
+def table(outcomes: Sequence[Outcome], mechanism: str = "") -> Table:
+    """RMS and greatest errors, estimate against truth, with every set; of one mechanism alone, if it is named.
 
-
-def cells(outcome: Outcome) -> tuple[str, ...]:
-    """A set, and its RMS and greatest errors, estimate against truth, in words; the paper's set has a star."""
-    label = f"{outcome.sensors} *" if outcome.paper else outcome.sensors
-    if outcome.refused:
-        return (outcome.mechanism, label, "refused", "", "", "", "", "")
-    errors = [cell for run in outcome.runs.values() for cell in _errors(run)]
-    errors += [""] * (4 - len(errors))
-    return (outcome.mechanism, label, "".join(map(str, outcome.imus)), f"{outcome.conditioning:.2f}", *errors)
+    The paper's set has a star.
+    """
+    first = (mechanism,) if mechanism else ("mechanism", "sensors")
+    errors = ("filters [mm / deg]", "at most", "whole [mm / deg]", "at most")
+    result = Table(*first, "IMUs", "conditioning", *errors)
+    for outcome in outcomes:
+        if mechanism not in ("", outcome.mechanism):
+            continue
+        label = f"{outcome.sensors} *" if outcome.paper else outcome.sensors
+        names = [label] if mechanism else [outcome.mechanism, label]
+        imus, conditioning = "".join(map(str, outcome.imus)), f"{outcome.conditioning:.2f}"
+        found = [imus, conditioning, *(cell for run in outcome.runs.values() for cell in _errors(run))]
+        cells = [*names, *(["refused"] if outcome.refused else found)]
+        result.add(*cells, *[""] * (len(result.headings) - len(cells)))
+    return result
 
 
 def _errors(run: dict[str, Any]) -> tuple[str, str]:
-    """RMS and greatest error of a run, or that it stopped."""
+    """RMS and greatest error of a run in words, or "stopped"."""
     if "stopped" in run:
         return "stopped", ""
     found = run["estimation"]
@@ -184,7 +190,7 @@ def _errors(run: dict[str, Any]) -> tuple[str, str]:
 
 
 def reasons(outcomes: Sequence[Outcome]) -> list[str]:
-    """Why sets were refused, or stopped, in a line each."""
+    """Why sets were refused or runs stopped, a line each."""
     lines = [f"{each.mechanism}, {each.sensors}: {each.refused}" for each in outcomes if each.refused]
     lines += [
         f"{each.mechanism}, {each.sensors}, {fusion}: {run['stopped']}"
@@ -193,9 +199,3 @@ def reasons(outcomes: Sequence[Outcome]) -> list[str]:
         if "stopped" in run
     ]
     return lines
-
-
-def markdown(outcomes: Sequence[Outcome]) -> str:
-    """The outcomes as a table in Markdown, and why some were refused or stopped."""
-    table = markdown_table(COLUMNS, map(cells, outcomes))
-    return "\n".join([table, "", *(f"- {reason}" for reason in reasons(outcomes))])

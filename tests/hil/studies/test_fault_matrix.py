@@ -6,7 +6,7 @@ import pytest
 
 from controller.safety.watch import CAUSES, GO_ON, IMU_FROZEN, REACTIONS, STOP
 from hil.command_line import main
-from hil.studies.fault_matrix import CASES, HEADINGS, Case, run_matrix, table
+from hil.studies.fault_matrix import CASES, Case, run_matrix, table
 
 DOCS = Path(__file__).parents[3] / "docs" / "faults.md"
 
@@ -41,7 +41,7 @@ def test_a_case_comes_out_the_same_every_time():
 def test_the_table_in_the_docs_is_of_these_cases():
     lines = DOCS.read_text().splitlines()
     rows = lines[lines.index(next(line for line in lines if line.startswith("| case"))) :]
-    assert rows[0] == "| " + " | ".join(HEADINGS) + " |"
+    assert rows[:2] == table([]).markdown().splitlines()
     told = {case.name: CAUSES[case.expected].text.format("k") if case.expected else "-" for case in CASES}
     assert {row.split(" | ")[0][2:]: row.split(" | ")[1] for row in rows[2:]} == told
     for case, row in zip(CASES, rows[2:], strict=True):
@@ -55,4 +55,4 @@ def test_the_command_prints_the_table_and_its_status_says_whether_all_is_well(ca
     assert (tmp_path / "x.json").exists()
     assert main(["faults", "--only", "nothing like this"]) == 2
     assert main(["faults", "--seeds", "0"]) == 2
-    assert table([]) == []
+    assert table([]).rows == []

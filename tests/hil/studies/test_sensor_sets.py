@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hil.command_line import main
-from hil.studies.sensor_sets import COLUMNS, MECHANISMS, SETS, cells, choose_imus, evaluate_sensor_sets, paper_set
+from hil.studies.sensor_sets import MECHANISMS, SETS, choose_imus, evaluate_sensor_sets, paper_set, table
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.mechanism import load_spatial
 from plant.mechanism.classification import classify
@@ -60,7 +60,7 @@ def test_two_legs_that_meet_need_the_heading_in_the_whole_mechanism_filter():
 def documented():
     lines = DOCUMENT.read_text(encoding="utf-8").splitlines()
     rows = [tuple(cell.strip() for cell in line.strip("|").split("|")) for line in lines if line.startswith("| ")]
-    return [row for row in rows if len(row) == len(COLUMNS) and row[0] in MECHANISMS], lines
+    return [row for row in rows if len(row) == len(table([]).headings) and row[0] in MECHANISMS], lines
 
 
 def test_the_documented_table_has_every_set_with_its_imus_and_conditioning():
@@ -96,7 +96,7 @@ def test_the_documented_errors_are_what_the_command_prints(tmp_path, capsys):
 
 def test_a_refused_set_says_why():
     (outcome,) = evaluate_sensor_sets(["6-3-II"], SETS[:1])
-    assert cells(outcome)[2] == "refused" and "do not determine the pose" in outcome.refused
+    assert table([outcome]).rows[0][2].text == "refused" and "do not determine the pose" in outcome.refused
 
 
 @pytest.mark.parametrize(
