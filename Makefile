@@ -1,11 +1,11 @@
-# make demo | test | bench | lint: each sets up what it needs in .venv first.
+# make demo | test | test-all | bench | lint: each sets up what it needs in .venv first.
 SHELL := /bin/bash
 PYTHON ?= python3
 BIN := .venv/bin
 OUT := out
 WORKERS ?= 2
 
-.PHONY: demo test bench lint clean
+.PHONY: demo test test-all bench lint clean
 .DELETE_ON_ERROR:
 
 demo: .venv/installed
@@ -14,7 +14,10 @@ demo: .venv/installed
 	@echo "Open $(OUT)/demo.html in a browser to see it move."
 
 test: .venv/installed-test
-	$(BIN)/pytest -n $(WORKERS)
+	$(BIN)/pytest -n $(WORKERS) --dist loadfile -m "not slow"
+
+test-all: test
+	$(BIN)/pytest -n $(WORKERS) --dist loadfile -m slow
 
 bench: .venv/installed
 	@mkdir -p $(OUT)
