@@ -1,4 +1,4 @@
-"""The command `gough`, run as its users run it."""
+"""The command `gough`: what it prints, writes and refuses."""
 
 import json
 import re
@@ -9,11 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.hil.commands import gough
+
 HEADER = "time_s,x_m,y_m,z_m,qw,qx,qy,qz"
 REST = "0,0,0,0,1,0,0,0"
 
 
-def gough(*arguments, cwd=None):
+def gough_as_users_run_it(*arguments, cwd=None):
     return subprocess.run(
         [sys.executable, "-m", "hil.command_line", *map(str, arguments)], capture_output=True, text=True, cwd=cwd, check=False
     )
@@ -29,7 +31,8 @@ def refused(run):
 
 
 def test_simulate_prints_a_summary_and_writes_its_figures(tmp_path):
-    run = gough("simulate", "--duration", 1, "--json", "figures.json", "--report", "report.html", cwd=tmp_path)
+    arguments = ("simulate", "--duration", 1, "--json", "figures.json", "--report", "report.html")
+    run = gough_as_users_run_it(*arguments, cwd=tmp_path)
     assert run.returncode == 0, run.stderr
     assert "RMS [mm]" in run.stdout and "times real time" in run.stdout
     figures = json.loads((tmp_path / "figures.json").read_text())

@@ -583,7 +583,7 @@ def test_a_disk_without_room_is_refused(tmp_path, monkeypatch):
 
 
 def test_a_terminal_that_has_gone_and_a_full_output_are_told_in_a_line():
-    command = [sys.executable, "-m", "hil.command_line", "tune"]
+    command = [sys.executable, "-m", "hil.command_line", "fmu", "table"]
     with Path("/dev/full").open("w") as full:
         process = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=120.0)
     assert process.returncode == 1

@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -13,6 +11,7 @@ from hil.runs.simulation import SimulationStoppedError, simulate
 from plant.errors import InputError
 from plant.fmu.settings import Setting
 from plant.truth import TRUTH_CURRENTS
+from tests.hil.commands import gough
 from tests.plant.fmu.foreign import BINDING, BINDING_3, TRUTH
 
 MM, DEG = 1e-3, np.radians(1.0)
@@ -38,11 +37,6 @@ def bare(tmp_path):
     path = tmp_path / "bare.toml"
     path.write_text(BINDING)
     return path
-
-
-def gough(*arguments):
-    command = [sys.executable, "-m", "hil.command_line", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def test_a_foreign_fmu_follows_the_target(foreign_fmu, binding, tmp_path):
