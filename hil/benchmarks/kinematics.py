@@ -1,15 +1,15 @@
-"""Benchmarks of direct kinematics: time per pose by class and method, and whether the right pose is found from cold."""
+"""Benchmarks of direct kinematics: time per pose by class and method, and success from a cold start."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from controller.direct_kinematics import METHODS, pose_difference, pose_from_lengths, poses_from_lengths, solve, solve_batch
-from controller.direct_kinematics.spatial import NEEDS
+from controller.direct_kinematics.synthetic import draw_measurements, draw_poses, measurements_of
 from controller.inverse_kinematics import leg_lengths, sample_workspace
-from hil.studies.accuracy import draw_measurements, draw_poses
 from plant.errors import SingularConfigurationError
 from plant.mechanism import Mechanism, load_spatial
 from plant.mechanism.classification import draw_mechanism, spatial_classes
@@ -30,12 +30,12 @@ def measure_kinematics(progress: Callable[[float], None] = lambda share: None) -
     """Time direct kinematics and try it from cold.
 
     Returns:
-        `solve_us`: by class and method, `closed_form` and `refined`, which includes the covariance: microseconds per pose on
-        one core, compiled. `call_us`: one call of `solve` from Python. `batch_per_s`: poses per second on all cores.
-        `newton`: microseconds per pose of Newton's method from lengths along a motion at 1 kHz, and how many times longer
-        each method takes on the same mechanism. `cold_starts`: by preset, over the `workspace` and over `wide` poses (60 deg
-        of tilt, any yaw), the shares of poses found (`success`) and mistaken (`wrong`) by Newton's method from home and by
-        direct kinematics from the leg directions.
+        `solve_us`: by class and method, microseconds per pose on one core, compiled: `closed_form`, and `refined` with its
+        covariance. `call_us`: one call of `solve` from Python. `batch_per_s`: poses per second on all cores. `newton`:
+        microseconds per pose of Newton's method from lengths along a motion at 1 kHz, and the time of each method over it on
+        the same mechanism. `cold_starts`: by preset, over the `workspace` and over `wide` poses (60 deg of tilt, any yaw),
+        the shares of poses found (`success`) and mistaken (`wrong`), by Newton's method from home and by direct kinematics
+        from the leg directions.
     """
     classes = spatial_classes()
     steps = len(classes) + len(PRESETS) + 2
@@ -67,6 +67,16 @@ def measure_kinematics(progress: Callable[[float], None] = lambda share: None) -
     }
 
 
+def _median_s(work: Callable[[], object]) -> float:
+    """Median duration of some work [s]."""
+    runs = []
+    for _ in range(_REPEATS):
+        began = perf_counter()
+        work()
+        runs.append(perf_counter() - began)
+    return float(np.median(runs))
+
+
 def _time_methods(mechanism: Mechanism) -> dict[str, dict[str, float]]:
     """Microseconds per pose of every method that works on the mechanism with all its legs."""
     measurements = _measure(mechanism, _ROWS)
@@ -74,14 +84,11 @@ def _time_methods(mechanism: Mechanism) -> dict[str, dict[str, float]]:
     for method in METHODS:
         kinds: dict[str, float] = {}
         for kind, refine in (("closed_form", False), ("refined", True)):
-            given = _given(measurements, method)
-            runs = []
-            for _ in range(_REPEATS):
-                start = perf_counter()
-                found = solve_batch(mechanism, **given, method=method, refine=refine, workers=1)
-                runs.append(perf_counter() - start)
-            if found.solved.mean() > 0.5:
-                kinds[kind] = 1e6 * float(np.median(runs)) / _ROWS
+            given = measurements_of(method, measurements)
+            run = partial(solve_batch, mechanism, **given, method=method, refine=refine, workers=1)
+            us = 1e6 * _median_s(run) / _ROWS
+            if run().solved.mean() > 0.5:
+                kinds[kind] = us
         if kinds:
             times[method] = kinds
     return times
@@ -92,21 +99,13 @@ def _measure(mechanism: Mechanism, count: int) -> dict[str, Array]:
     return draw_measurements(mechanism, *draw_poses(mechanism, count, random), random, 1.0)
 
 
-def _given(measurements: dict[str, Array], method: str) -> dict[str, Any]:
-    return {name: measurements[name] for name in ("leg_directions", NEEDS.get(method)) if name}
-
-
 def _time_batch(mechanism: Mechanism) -> tuple[dict[str, float], float]:
     """Poses per second of a refined batch on all cores by method, and microseconds of one call of `solve`."""
     measurements = _measure(mechanism, _BATCH_ROWS)
-    rates = {}
-    for method in ("section-5", "up", "normal", "legs"):
-        runs = []
-        for _ in range(_REPEATS):
-            start = perf_counter()
-            solve_batch(mechanism, **_given(measurements, method), method=method)
-            runs.append(perf_counter() - start)
-        rates[method] = _BATCH_ROWS / float(np.median(runs))
+    rates = {
+        method: _BATCH_ROWS / _median_s(partial(solve_batch, mechanism, **measurements_of(method, measurements), method=method))
+        for method in ("section-5", "up", "normal", "legs")
+    }
     calls = []
     for directions, up in zip(measurements["leg_directions"][:_ROWS], measurements["up_in_platform"], strict=False):
         start = perf_counter()
@@ -123,13 +122,8 @@ def _time_newton(mechanism: Mechanism) -> float:
     positions = home.position + 0.02 * swings[:, :3]
     rotations = np.array([rotation_from_vector(0.05 * swing) for swing in swings[:, 3:]]) @ home.rotation
     lengths = leg_lengths(mechanism, positions, rotations)
-    start_pose = Pose(positions[0], rotations[0])
-    runs = []
-    for _ in range(_REPEATS):
-        start = perf_counter()
-        poses_from_lengths(mechanism, lengths, start_pose)
-        runs.append(perf_counter() - start)
-    return 1e6 * float(np.median(runs)) / len(times)
+    run = partial(poses_from_lengths, mechanism, lengths, Pose(positions[0], rotations[0]))
+    return 1e6 * _median_s(run) / len(times)
 
 
 def _start_cold(mechanism: Mechanism, random: np.random.Generator) -> dict[str, Any]:

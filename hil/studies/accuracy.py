@@ -14,7 +14,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from controller.direct_kinematics import Solutions, required_measurements, solve_batch, solve_planar
-from controller.direct_kinematics.spatial import LEG_SIGMA, NEEDS, TILT_SIGMA, YAW_SIGMA
+from controller.direct_kinematics.spatial import LEG_SIGMA, TILT_SIGMA, YAW_SIGMA
+from controller.direct_kinematics.synthetic import TILT, draw_measurements, draw_poses, measurements_of
 from hil.table import Cell, Table
 from plant.checks import checked_seed
 from plant.errors import InputError, SingularConfigurationError
@@ -27,12 +28,10 @@ from plant.mechanism.classification import (
     planar_classes,
     spatial_classes,
 )
-from plant.pose import Array, pose_errors, rms_figures, rotation_angle, rotation_from_vector
+from plant.pose import Array, pose_errors, rms_figures, rotation_angle
 
 ALL_LEGS = tuple(range(LEGS))
 
-_REACH, _TILT = 1.0 / 6.0, np.radians(15.0)
-"""Poses are drawn within this share of the base's radius and this angle from home: 50 mm and 15 deg on `hexapod`."""
 _TWO_LEGS = (0, 3)
 _NEES_BOUNDS = 0.005, 0.995
 _CLASS_MECHANISMS, _CLASS_POSES = 20, 50
@@ -113,38 +112,6 @@ def evaluate_accuracy(mechanism: Mechanism, poses: int = 2000, seed: int = 0) ->
     return Accuracy(mechanism.name, classify(mechanism), errors, poses, seed, (float(low), float(high)))
 
 
-def draw_poses(mechanism: Mechanism, count: int, random: np.random.Generator) -> tuple[Array, Array]:
-    """Positions (count, 3) [m] and rotations (count, 3, 3), uniform about home by axes and by xyz angles."""
-    radius = float(np.linalg.norm(mechanism.base_joints - mechanism.base_joints.mean(axis=0), axis=1).max())
-    home = mechanism.nominal_home
-    positions = home.position + random.uniform(-_REACH * radius, _REACH * radius, (count, 3))
-    about_x, about_y, about_z = (
-        np.array([rotation_from_vector(angle * axis) for angle in random.uniform(-_TILT, _TILT, count)]) for axis in np.eye(3)
-    )
-    return positions, about_z @ about_y @ about_x @ home.rotation
-
-
-def draw_measurements(
-    mechanism: Mechanism, positions: Array, rotations: Array, random: np.random.Generator, noise: float
-) -> dict[str, Array]:
-    """The measurements at these poses, by their names in `solve_batch`, with `noise` times the sigmas."""
-    up, count = mechanism.up_in_base, len(positions)
-    vectors = positions[:, None] + mechanism.platform_joints @ np.swapaxes(rotations, 1, 2) - mechanism.base_joints
-    level = np.linalg.svd(up[None])[2][1:]
-    turns = random.normal(size=(count, 3)) * [TILT_SIGMA, TILT_SIGMA, YAW_SIGMA] @ np.array([*level, up])
-    return {
-        "leg_directions": _unit(_unit(vectors) + noise * random.normal(scale=LEG_SIGMA, size=vectors.shape)),
-        "up_in_platform": _unit(up @ rotations + noise * random.normal(scale=TILT_SIGMA, size=(count, 3))),
-        "normal": _unit(rotations[:, :, 2] + noise * random.normal(scale=TILT_SIGMA, size=(count, 3))),
-        "rotation": np.array([rotation_from_vector(noise * turn) for turn in turns]) @ rotations,
-    }
-
-
-def _unit(vectors: Array) -> Array:
-    unit: Array = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return unit
-
-
 def _estimators(mechanism: Mechanism) -> list[Estimator]:
     estimators = [
         Estimator("paper, section 5: two legs + magnetic yaw", "section-5", _TWO_LEGS, False),
@@ -176,10 +143,10 @@ def _best_legs(mechanism: Mechanism, method: str, count: int) -> tuple[int, ...]
 
 
 def _run(mechanism: Mechanism, estimator: Estimator, measurements: dict[str, Array]) -> Solutions:
-    directions = measurements["leg_directions"].copy()
-    directions[:, [leg for leg in ALL_LEGS if leg not in estimator.legs]] = np.nan
-    needed: dict[str, Any] = {name: measurements[name] for method, name in NEEDS.items() if method == estimator.method}
-    return solve_batch(mechanism, directions, method=estimator.method, refine=estimator.refine, **needed)
+    given = measurements_of(estimator.method, measurements)
+    given["leg_directions"] = given["leg_directions"].copy()
+    given["leg_directions"][:, [leg for leg in ALL_LEGS if leg not in estimator.legs]] = np.nan
+    return solve_batch(mechanism, **given, method=estimator.method, refine=estimator.refine)
 
 
 def _errors(found: Solutions, positions: Array, rotations: Array, bounds: Array) -> Errors:
@@ -254,7 +221,7 @@ def _evaluate_planar_class(mechanism_class: MechanismClass, random: np.random.Ge
     for _ in range(_CLASS_MECHANISMS):
         mechanism = draw_planar_mechanism(mechanism_class, random)
         for _ in range(_CLASS_POSES):
-            position, angle = random.uniform(-0.05, 0.05, 2), random.uniform(-_TILT, _TILT)
+            position, angle = random.uniform(-0.05, 0.05, 2), random.uniform(-TILT, TILT)
             x, y = (mechanism.joints_at(position, angle) - mechanism.base_joints).T
             angles = np.arctan2(y, x) + random.normal(scale=LEG_SIGMA, size=3)
             roll = angle + random.normal(scale=TILT_SIGMA)

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from controller.direct_kinematics import Requirement, required_measurements, solve_batch, solve_planar
-from controller.direct_kinematics.spatial import NEEDS
+from controller.direct_kinematics.synthetic import draw_measurements, draw_poses, measurements_of
 from controller.inverse_kinematics import sample_workspace
-from hil.studies.accuracy import draw_measurements, draw_poses
 from plant.errors import SingularConfigurationError
 from plant.mechanism import Mechanism
 from plant.mechanism.classification import MechanismClass, classify, joint_numbers
@@ -98,8 +97,8 @@ def describe(mechanism: Mechanism | PlanarMechanism) -> Description:
     exact = draw_measurements(mechanism, positions, rotations, random, 0.0)
     needs = []
     for requirement in required_measurements(mechanism):
-        given: dict[str, Any] = {name: exact[name] for method, name in NEEDS.items() if method == requirement.method}
-        found = solve_batch(mechanism, exact["leg_directions"], method=requirement.method, refine=False, **given)
+        given = measurements_of(requirement.method, exact)
+        found = solve_batch(mechanism, **given, method=requirement.method, refine=False)
         conditionings = np.where(found.solved, found.conditionings, 0.0)
         needs.append(Need(requirement, 1, float(conditionings[0]), float(conditionings[1:].min()), conditionings[1:]))
     return Description(mechanism, mechanism_class, tuple(needs), where)
