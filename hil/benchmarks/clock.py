@@ -26,6 +26,7 @@ from controller.safety.watch import CAUSES, STOP
 from hil.loop.driver import prevent_compilation
 from hil.loop.records import RECORD, Link, shared_array
 from hil.loop.timing import QUANTILES, Histogram, Timing, over_budget
+from hil.progress import Progress, no_progress
 from hil.realtime.clock import REAL, finish, new_clock, now, start, wait
 from hil.realtime.scheduling import MEASURES, RealTimeSettings, real_time, usage
 from hil.runs.config import SimulationConfig
@@ -45,7 +46,7 @@ _ENDLESS = np.iinfo(np.int64).max
 _FORK = multiprocessing.get_context("fork")
 
 
-def measure_real_time(seconds: dict[float, float], progress: Callable[[float], None] = lambda share: None) -> dict[str, Any]:
+def measure_real_time(seconds: dict[float, float], progress: Progress = no_progress) -> dict[str, Any]:
     """Time loops on the clock.
 
     Args:
@@ -84,7 +85,7 @@ def measure_real_time(seconds: dict[float, float], progress: Callable[[float], N
     return {"rates": rates, "refused": refused, "missing": missing, "slice_s": _SLICE_S}
 
 
-def measure_measures(seconds: float, progress: Callable[[float], None] = lambda share: None) -> dict[str, Any]:
+def measure_measures(seconds: float, progress: Progress = no_progress) -> dict[str, Any]:
     """What each measure of `hil.realtime.scheduling` is good for: the loop at 1 kHz with all, without each, and without any.
 
     Args:

@@ -10,6 +10,7 @@ import numpy as np
 from controller.direct_kinematics import METHODS, pose_difference, pose_from_lengths, poses_from_lengths, solve, solve_batch
 from controller.direct_kinematics.synthetic import draw_measurements, draw_poses, measurements_of
 from controller.inverse_kinematics import leg_lengths, sample_workspace
+from hil.progress import Progress, no_progress
 from plant.errors import SingularConfigurationError
 from plant.mechanism import Mechanism, load_spatial
 from plant.mechanism.classification import draw_mechanism, spatial_classes
@@ -26,7 +27,7 @@ _WIDE_TILT = np.radians(60.0)
 _SAME_POSE_M, _SAME_POSE = 1e-6, 1e-6
 
 
-def measure_kinematics(progress: Callable[[float], None] = lambda share: None) -> dict[str, Any]:
+def measure_kinematics(progress: Progress = no_progress) -> dict[str, Any]:
     """Time direct kinematics and try it from cold.
 
     Returns:

@@ -3,7 +3,6 @@
 import json
 import os
 import platform
-from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import version
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.loop.records import COMPUTED, STAGES
+from hil.progress import Progress, no_progress
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import simulate
 from plant.errors import InputError
@@ -22,7 +22,7 @@ _REPEATS = 3
 _FILTERPY_S = 2.0
 
 
-def measure_speed(target: str, duration: float, progress: Callable[[float], None] = lambda share: None) -> dict[str, Any]:
+def measure_speed(target: str, duration: float, progress: Progress = no_progress) -> dict[str, Any]:
     """Run the simulation several times, and once on filterpy.
 
     Returns:
@@ -80,7 +80,7 @@ def read_earlier(path: Path) -> dict[str, Any]:
     return figures
 
 
-def _report_part(progress: Callable[[float], None], start: float, share: float, done: float) -> None:
+def _report_part(progress: Progress, start: float, share: float, done: float) -> None:
     progress(start + share * done)
 
 

@@ -1,12 +1,12 @@
 """Benchmark of the plant: what a step costs through compiled calls and through FMPy's own methods, and how exact it is."""
 
-from collections.abc import Callable
 from time import perf_counter_ns
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.progress import Progress, no_progress
 from hil.realtime.clock import now
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import VELOCITY
@@ -25,7 +25,7 @@ _FMPY_CYCLES = 2000
 _BLOCK = 50
 
 
-def measure_plant(duration: float, progress: Callable[[float], None] = lambda share: None) -> dict[str, Any]:
+def measure_plant(duration: float, progress: Progress = no_progress) -> dict[str, Any]:
     """Drive the plant of the hexapod with sines of all legs.
 
     Args:

@@ -10,7 +10,7 @@ Every run is one of `hil.runs.simulation`, and between runs the rig stands on it
 """
 
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -29,6 +29,7 @@ from hil.calibration.assessment import assess, constants, cross_validate
 from hil.calibration.data import CalibrationData, Knowledge
 from hil.calibration.known_poses import calibrate_by_known_poses
 from hil.loop.records import Link
+from hil.progress import Progress, no_progress
 from hil.recording.mcap import Recording, RecordingError, read
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import prepared_loop
@@ -64,7 +65,7 @@ class RigCalibration:
 def calibrate_rig(
     config: SimulationConfig,
     knowledge: Knowledge = _NOTHING,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Progress = no_progress,
     validate: bool = True,
 ) -> RigCalibration:
     """Drive the rig and calibrate its IMUs.
@@ -168,7 +169,7 @@ def run_open(config: SimulationConfig, blind: bool = False) -> Record:
         return loop.records[: int(loop.link[Link.HEAD])].copy()
 
 
-def _run_closed(config: SimulationConfig, progress: Callable[[float], None]) -> Record:
+def _run_closed(config: SimulationConfig, progress: Progress) -> Record:
     """The records of a run with the loop closed."""
     try:
         return simulate(config, progress).records

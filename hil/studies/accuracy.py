@@ -4,7 +4,7 @@ The noise has the sigmas of `controller.direct_kinematics.spatial`: 0.05 deg on 
 and pitch, 1.5 deg on a magnetic yaw.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from itertools import combinations
@@ -16,6 +16,7 @@ from scipy.stats import chi2
 from controller.direct_kinematics import Solutions, required_measurements, solve_batch, solve_planar
 from controller.direct_kinematics.spatial import LEG_SIGMA, TILT_SIGMA, YAW_SIGMA
 from controller.direct_kinematics.synthetic import TILT, draw_measurements, draw_poses, measurements_of
+from hil.progress import Progress, no_progress
 from hil.table import Cell, Table
 from plant.checks import checked_seed
 from plant.errors import InputError, SingularConfigurationError
@@ -177,7 +178,7 @@ class ClassAccuracy:
     vertical_errors: tuple[float, float]
 
 
-def evaluate_classes(seed: int = 0, progress: Callable[[float], None] = lambda share: None) -> list[ClassAccuracy]:
+def evaluate_classes(seed: int = 0, progress: Progress = no_progress) -> list[ClassAccuracy]:
     """The needs and errors of every class, spatial and planar."""
     checked_seed(seed)
     rows = []

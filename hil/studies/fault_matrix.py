@@ -50,6 +50,7 @@ from controller.safety.watch import (
     TARGET_NOT_FINITE,
 )
 from hil.loop.records import EMULATED_RIG, RECORD, Link, StopRequest
+from hil.progress import Progress, no_progress
 from hil.realtime.clock import SCRIPTED, new_clock
 from hil.rigs.emulation.drives import new_emulated, sample
 from hil.rigs.emulation.faults import fault
@@ -215,9 +216,7 @@ class Outcome:
         }
 
 
-def run_matrix(
-    seeds: int, cases: tuple[Case, ...] = CASES, progress: Callable[[float], None] = lambda share: None
-) -> list[Outcome]:
+def run_matrix(seeds: int, cases: tuple[Case, ...] = CASES, progress: Progress = no_progress) -> list[Outcome]:
     """Run every case with so many seeds.
 
     Args:

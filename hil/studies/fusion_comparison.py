@@ -20,6 +20,7 @@ from controller.direct_kinematics import solve_batch
 from controller.estimation.fusion import calibrate, find_pose, improve_pose
 from controller.estimation.leg_filter import leg_direction, start_leg
 from controller.settings import control_settings, sensor_settings
+from hil.progress import Progress, no_progress
 from hil.runs.config import FUSIONS
 from hil.runs.simulation import filterpy_filters
 from hil.studies.config import LEARNING_S, ComparisonConfig
@@ -33,7 +34,7 @@ from plant.pose import Array
 from plant.wiring import ALL_IMUS
 
 
-def compare(config: ComparisonConfig, progress: Callable[[float], None] = lambda share: None) -> dict[str, Any]:
+def compare(config: ComparisonConfig, progress: Progress = no_progress) -> dict[str, Any]:
     """Run every method.
 
     Args:

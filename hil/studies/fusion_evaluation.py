@@ -19,6 +19,7 @@ from controller.cycle import STATE, cycle_parameters
 from controller.settings import control_settings, sensor_settings
 from hil.calibration.data import Knowledge
 from hil.calibration.drive import calibrate_rig
+from hil.progress import Progress
 from hil.runs.config import FUSIONS, SimulationConfig
 from hil.runs.simulation import simulate
 from hil.studies.config import LEARNING_S, EvaluationConfig
@@ -79,7 +80,7 @@ class _Rig:
         return motion, read(motion, load_imu(self.config.imu), self.config.rate, self.seed)
 
 
-def _calibrated_rig(config: EvaluationConfig, seed: int, joint_error: float, progress: Callable[[float], None]) -> _Rig:
+def _calibrated_rig(config: EvaluationConfig, seed: int, joint_error: float, progress: Progress) -> _Rig:
     rig = SimulationConfig(mechanism=config.mechanism, imu=config.imu, seed=seed, rate=config.rate, joint_error=joint_error)
     found = calibrate_rig(rig, Knowledge(Prior(joints=joint_error)), progress, validate=False)
     nominal = load_spatial(config.mechanism)
@@ -157,7 +158,7 @@ def _late(rate: float) -> slice:
     return slice(round(LEARNING_S * rate), None)
 
 
-def _of_motions(rigs: Sequence[_Rig], progress: Callable[[float], None]) -> dict[str, Any]:
+def _of_motions(rigs: Sequence[_Rig], progress: Progress) -> dict[str, Any]:
     """Errors of the refined pose and of the whole-mechanism filter, by motion."""
     figures: dict[str, Any] = {}
     for m, kind in enumerate(MOTIONS):
@@ -172,7 +173,7 @@ def _of_motions(rigs: Sequence[_Rig], progress: Callable[[float], None]) -> dict
     return figures
 
 
-def _of_faults(rigs: Sequence[_Rig], progress: Callable[[float], None]) -> dict[str, Any]:
+def _of_faults(rigs: Sequence[_Rig], progress: Progress) -> dict[str, Any]:
     """Errors of the whole-mechanism filter at 1 Hz with all IMUs, without one leg's (another one for each seed), and without
     the platform's; and their ratios to those with all.
     """
@@ -197,7 +198,7 @@ def _of_faults(rigs: Sequence[_Rig], progress: Callable[[float], None]) -> dict[
     return figures
 
 
-def _of_starts(rigs: Sequence[_Rig], progress: Callable[[float], None]) -> dict[str, Any]:
+def _of_starts(rigs: Sequence[_Rig], progress: Progress) -> dict[str, Any]:
     """How many starts in the middle of a motion, at a random frequency, give the whole-mechanism filter's pose in time."""
     config, random = rigs[0].config, np.random.default_rng(0)
     due, succeeded, largest = round(_START_S * config.rate), 0, np.zeros(2)
@@ -217,7 +218,7 @@ def _of_starts(rigs: Sequence[_Rig], progress: Callable[[float], None]) -> dict[
     return {"starts": config.starts, "succeeded": succeeded, "position_max": position, "rotation_max": rotation}
 
 
-def _of_drift(rigs: Sequence[_Rig], progress: Callable[[float], None]) -> dict[str, Any]:
+def _of_drift(rigs: Sequence[_Rig], progress: Progress) -> dict[str, Any]:
     """Errors by minute while the platform stands still for long."""
     config = rigs[0].config
     chunks = int(np.ceil(config.still / _CHUNK_S))
@@ -234,7 +235,7 @@ def _of_drift(rigs: Sequence[_Rig], progress: Callable[[float], None]) -> dict[s
     return {"minutes": [_figures(errors) for errors in pooled]}
 
 
-def _of_following(config: EvaluationConfig, progress: Callable[[float], None]) -> dict[str, Any]:
+def _of_following(config: EvaluationConfig, progress: Progress) -> dict[str, Any]:
     """Errors of the estimate with calibrated IMUs while the closed loop follows a target."""
     pooled = PoseErrors()
     for i, seed in enumerate(config.seeds):
@@ -251,7 +252,7 @@ def _of_following(config: EvaluationConfig, progress: Callable[[float], None]) -
     return {"target": config.target, "fusion": _FOLLOWING, "imu": _CALIBRATED_IMU} | _figures(pooled)
 
 
-def _of_cost(config: EvaluationConfig, progress: Callable[[float], None]) -> dict[str, Any]:
+def _of_cost(config: EvaluationConfig, progress: Progress) -> dict[str, Any]:
     """Microseconds that the leg filters and each whole-mechanism filter take in a cycle, mean and greatest.
 
     The least of several repetitions counts for each cycle: all beyond it comes from the machine.

@@ -22,6 +22,7 @@ from scipy.stats import chi2
 
 from controller.cycle import cycle_parameters
 from controller.settings import FusionSettings, control_settings, sensor_settings
+from hil.progress import Progress, no_progress
 from hil.runs.config import FUSIONS
 from hil.studies.config import TuningConfig
 from hil.studies.fused_track import REFINED, WHOLE, FusedTrack, PoseTrack, fuse, poses_of, read
@@ -200,7 +201,7 @@ class _Motion:
 class _Runs:
     """Every kind of motion with every seed."""
 
-    def __init__(self, config: TuningConfig, mechanism: Mechanism, progress: Callable[[float], None]) -> None:
+    def __init__(self, config: TuningConfig, mechanism: Mechanism, progress: Progress) -> None:
         self.mechanism, self.rate = mechanism, config.rate
         self.late = slice(round(SETTLING_S * config.rate), None, max(1, round(_SAMPLE_S * config.rate)))
         self.motions: list[_Motion] = []
@@ -263,7 +264,7 @@ STEPS = (
 """In the order of the estimators: each builds upon the one before."""
 
 
-def tune_fusion(config: TuningConfig, progress: Callable[[float], None] = lambda share: None) -> dict[str, Any]:
+def tune_fusion(config: TuningConfig, progress: Progress = no_progress) -> dict[str, Any]:
     """Find the noise that makes the estimators consistent.
 
     Args:

@@ -4,7 +4,7 @@ Each set runs with leg and platform filters and with the whole-mechanism filter.
 conditioning at the worst pose of the workspace.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from controller.cycle import check_imus
+from hil.progress import Progress, no_progress
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import SimulationStoppedError, simulate
 from hil.table import Table
@@ -99,7 +100,7 @@ def evaluate_sensor_sets(
     sets: Sequence[SensorSet] = SETS,
     duration: float = 10.0,
     seed: int = 0,
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Progress = no_progress,
 ) -> list[Outcome]:
     """Follow `sines` with every set of sensors.
 
