@@ -24,7 +24,29 @@ from plant.mechanism import LEGS
 from plant.pose import Array, pose_errors, rms_figures
 
 CLOSED, REFINED, WHOLE, LEGS_ALONE = range(4)
-"""Steps of a `FusedTrack`: closed form, refined pose, whole-mechanism filter; times have the leg filters alone as well."""
+"""Steps of a fused track: closed form, refined pose, whole-mechanism filter; times have the leg filters alone as well."""
+
+FUSED = np.dtype(
+    [
+        ("positions", np.float64, (3, 3)),
+        ("rotations", np.float64, (3, 3, 3)),
+        ("information", np.float64, (6, 6)),
+        ("covariance", np.float64, (6, 6)),
+        ("directions", np.float64, (LEGS, 3)),
+        ("leg_covariances", np.float64, (LEGS, 2, 2)),
+        ("vertical", np.float64, 3),
+        ("vertical_covariance", np.float64, (3, 3)),
+        ("ns", np.int64, 4),
+    ],
+    align=True,
+)
+"""Estimates for a sample.
+
+Positions [m] and rotations of the closed form, the refined pose and the whole-mechanism filter; the refined pose's inverse
+covariance and the filter's covariance; the directions of the legs and the covariances of their angles [rad^2], by the leg
+filters; the vertical in {2}, with its covariance, by the platform filter; durations from raw sample to each step's pose, and of
+the leg filters alone [ns].
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,35 +118,15 @@ class PoseErrors:
         return {f"worst_{key}": max(each[key] for each in self._rms) for key in self._rms[0]}
 
 
-class FusedTrack:
-    """The estimates of the fusing stages over N samples.
-
-    Attributes:
-        positions, rotations: (3, N, 3) [m] and (3, N, 3, 3), by step: closed form, refined pose, whole-mechanism filter.
-        information: (N, 6, 6), the inverse covariances of the refined poses.
-        covariances: (N, 6, 6), of the poses of the whole-mechanism filter.
-        directions, leg_covariances: (N, 6, 3) and (N, 6, 2, 2) [rad^2], of the legs and of their angles, by the leg filters.
-        verticals, vertical_covariances: (N, 3) and (N, 3, 3), the vertical in {2}, by the platform filter.
-        ns: (4, N), from raw sample to each step's pose, and of the leg filters alone [ns].
-    """
-
-    def __init__(self, count: int) -> None:
-        """Make room for so many samples."""
-        self.positions, self.rotations = np.zeros((3, count, 3)), np.zeros((3, count, 3, 3))
-        self.information, self.covariances = np.zeros((count, 6, 6)), np.zeros((count, 6, 6))
-        self.directions, self.verticals = np.zeros((count, LEGS, 3)), np.zeros((count, 3))
-        self.leg_covariances, self.vertical_covariances = np.zeros((count, LEGS, 2, 2)), np.zeros((count, 3, 3))
-        self.ns = np.zeros((4, count), np.int64)
-
-    def track(self, step: int) -> PoseTrack:
-        """The poses of one step."""
-        return PoseTrack(
-            self.positions[step],
-            self.rotations[step],
-            information=self.information if step == REFINED else None,
-            covariances=self.covariances if step == WHOLE else None,
-            us=float(np.median(self.ns[step])) / 1e3,
-        )
+def track(fused: Record, step: int) -> PoseTrack:
+    """The poses of one step of a fused track (N,)."""
+    return PoseTrack(
+        fused["positions"][:, step],
+        fused["rotations"][:, step],
+        information=fused["information"] if step == REFINED else None,
+        covariances=fused["covariance"] if step == WHOLE else None,
+        us=float(np.median(fused["ns"][:, step])) / 1e3,
+    )
 
 
 def read(motion: ImposedMotion, model: ImuModel, rate: float, seed: int) -> Array:
@@ -141,46 +143,44 @@ def measure_all(imu: Record, signals: Array, raw: Array) -> None:
         measure(imu, signals[i], raw[i])
 
 
-def fuse(parameters: Record, raw: Array, state: Record | None = None) -> FusedTrack:
-    """Run the fusing stages of the cycle over raw samples (N, 3, 7, 3), from a given state or from the start."""
-    fused, state = FusedTrack(len(raw)), np.zeros((), STATE) if state is None else state
-    _follow(
-        parameters, state, raw, fused.positions, fused.rotations, fused.information, fused.covariances, fused.directions,
-        fused.leg_covariances, fused.verticals, fused.vertical_covariances, fused.ns, np.zeros(2, np.int64),
-    )  # fmt: skip
+def fuse(parameters: Record, raw: Array, state: Record | None = None) -> Record:
+    """Run the fusing stages of the cycle over raw samples (N, 3, 7, 3), from a given state or from the start.
+
+    Returns:
+        (N,), dtype `FUSED`.
+    """
+    fused = np.zeros(len(raw), FUSED)
+    _follow(parameters, np.zeros((), STATE) if state is None else state, raw, fused, np.zeros(2, np.int64))
     return fused
 
 
 @kernel
-def _follow(
-    parameters: Record, state: Record, raw: Array, positions: Array, rotations: Array, information: Array, covariances: Array,
-    directions: Array, leg_covariances: Array, verticals: Array, vertical_covariances: Array, ns: NDArray[np.int64],
-    timespec: NDArray[np.int64],
-) -> None:  # fmt: skip
+def _follow(parameters: Record, state: Record, raw: Array, fused: Record, timespec: NDArray[np.int64]) -> None:
     s = state[()]
     for i in range(raw.shape[0]):
+        f = fused[i]
         began = now(timespec)
         calibrate(parameters, state, raw[i])
         before_legs = now(timespec)
         fuse_legs(parameters, state)
-        ns[LEGS_ALONE, i] = now(timespec) - before_legs
+        f.ns[LEGS_ALONE] = now(timespec) - before_legs
         fuse_platform(parameters, state)
         fuse_heading(parameters, state)
         find_pose(parameters, state)
-        ns[0, i] = now(timespec) - began
-        positions[0, i], rotations[0, i] = s.position, s.rotation
-        directions[i], verticals[i] = s.directions, s.vectors[0]
-        leg_covariances[i], vertical_covariances[i] = s.leg_covariance[:, :2, :2], s.platform_covariance[:3, :3]
+        f.ns[CLOSED] = now(timespec) - began
+        f.positions[CLOSED], f.rotations[CLOSED] = s.position, s.rotation
+        f.directions[:], f.vertical[:] = s.directions, s.vectors[0]
+        f.leg_covariances[:], f.vertical_covariance[:] = s.leg_covariance[:, :2, :2], s.platform_covariance[:3, :3]
         began = now(timespec)
         improve_pose(parameters, state)
-        ns[1, i] = ns[0, i] + now(timespec) - began
-        positions[1, i], rotations[1, i] = s.position, s.rotation
+        f.ns[REFINED] = f.ns[CLOSED] + now(timespec) - began
+        f.positions[REFINED], f.rotations[REFINED] = s.position, s.rotation
         for j in range(6):
             for k in range(6):
-                information[i, j, k] = s.information[max(j, k), min(j, k)]
+                f.information[j, k] = s.information[max(j, k), min(j, k)]
         began = now(timespec)
         fuse_mechanism(parameters, state, True)
-        ns[2, i] = ns[1, i] + now(timespec) - began
-        positions[2, i], rotations[2, i] = s.position, s.rotation
-        extrapolate_covariance(parameters[()].filter, s.filter, s.cycle * parameters[()].period, covariances[i])
+        f.ns[WHOLE] = f.ns[REFINED] + now(timespec) - began
+        f.positions[WHOLE], f.rotations[WHOLE] = s.position, s.rotation
+        extrapolate_covariance(parameters[()].filter, s.filter, s.cycle * parameters[()].period, f.covariance)
         s.cycle += 1

@@ -24,7 +24,7 @@ from hil.progress import Progress, no_progress
 from hil.runs.config import FUSIONS
 from hil.runs.simulation import filterpy_filters
 from hil.studies.config import LEARNING_S, ComparisonConfig
-from hil.studies.fused_track import CLOSED, REFINED, WHOLE, FusedTrack, PoseErrors, PoseTrack, fuse, poses_of, read
+from hil.studies.fused_track import CLOSED, FUSED, REFINED, WHOLE, PoseErrors, PoseTrack, fuse, poses_of, read, track
 from plant.compiled import Record, kernel
 from plant.dynamics.imposed import ImposedMotion, impose
 from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
@@ -59,10 +59,10 @@ def compare(config: ComparisonConfig, progress: Progress = no_progress) -> dict[
         readings = _Readings(mechanism.moved_joints(calibration.joints), model, calibration, config.rate, seed, motion)
         methods = {**METHODS, **(SLOW_METHODS if i == 0 else {})}
         for k, (name, method) in enumerate(methods.items()):
-            track = method(readings)
-            errors.setdefault(name, PoseErrors()).add(track.at(late), truth)
-            if track.us is not None:
-                times.setdefault(name, []).append(track.us)
+            found = method(readings)
+            errors.setdefault(name, PoseErrors()).add(found.at(late), truth)
+            if found.us is not None:
+                times.setdefault(name, []).append(found.us)
             progress((i + (k + 1) / len(methods)) / len(config.seeds))
     return {
         "methods": {
@@ -84,7 +84,7 @@ class _Readings:
         self._fusion, self._calibration = sensor_settings(mechanism, model), calibration
         self.raw = read(motion, model, rate, seed)
         self.calibrated = calibration.apply(self.raw)
-        self._fused: dict[str | None, FusedTrack] = {}
+        self._fused: dict[str | None, Record] = {}
 
     def parameters(self, errors: str | None, section_5: bool = False) -> Record:
         """The cycle's constants."""
@@ -97,12 +97,12 @@ class _Readings:
         """The poses of a step of the cycle; `errors` of the IMUs are those that the whole-mechanism filter estimates."""
         if errors not in self._fused:
             self._fused[errors] = fuse(self.parameters(errors), self.raw)
-        return self._fused[errors].track(step)
+        return track(self._fused[errors], step)
 
 
 def _section_5(readings: _Readings) -> PoseTrack:
     """The paper's algorithm: leg directions, and the platform's whole orientation, with the heading of its magnetometer."""
-    return fuse(readings.parameters(None, section_5=True), readings.raw).track(CLOSED)
+    return track(fuse(readings.parameters(None, section_5=True), readings.raw), CLOSED)
 
 
 def _vqf(readings: _Readings) -> PoseTrack:
@@ -139,7 +139,7 @@ def _point(parameters: Record, ups: Array, directions: Array) -> None:
 def _filterpy(readings: _Readings) -> PoseTrack:
     """The refined pose with the filters of legs and platform on filterpy."""
     parameters, state = readings.parameters(None), np.zeros((), STATE)
-    filters, fused, ns = filterpy_filters(parameters), FusedTrack(readings.count), np.zeros(readings.count, np.int64)
+    filters, fused = filterpy_filters(parameters), np.zeros(readings.count, FUSED)
     for i, raw in enumerate(readings.raw):
         began = time.perf_counter_ns()
         calibrate(parameters, state, raw)
@@ -147,13 +147,12 @@ def _filterpy(readings: _Readings) -> PoseTrack:
         filters.fuse_platform(state)
         find_pose(parameters, state)
         improve_pose(parameters, state)
-        ns[i] = time.perf_counter_ns() - began
-        fused.positions[REFINED, i], fused.rotations[REFINED, i] = state["position"], state["rotation"]
+        fused["ns"][i, REFINED] = time.perf_counter_ns() - began
+        fused["positions"][i, REFINED], fused["rotations"][i, REFINED] = state["position"], state["rotation"]
         lower = np.tril(state["information"])
-        fused.information[i] = lower + np.tril(lower, -1).T
+        fused["information"][i] = lower + np.tril(lower, -1).T
         state["cycle"] += 1
-    fused.ns[REFINED] = ns
-    return fused.track(REFINED)
+    return track(fused, REFINED)
 
 
 METHODS: dict[str, Callable[[_Readings], PoseTrack]] = {

@@ -33,6 +33,7 @@ from hil.studies.fused_track import (
     measure_all,
     poses_of,
     read,
+    track,
 )
 from plant.compiled import Record
 from plant.dynamics.imposed import ImposedMotion, impose
@@ -167,7 +168,7 @@ def _of_motions(rigs: Sequence[_Rig], progress: Progress) -> dict[str, Any]:
             motion, raw = rig.move(kind, _MOTION_S, rig.seed)
             fused, late = fuse(rig.parameters(), raw), _late(rig.config.rate)
             for name, step in (("refined", REFINED), ("whole", WHOLE)):
-                pooled[name].add(fused.track(step).at(late), poses_of(motion, late))
+                pooled[name].add(track(fused, step).at(late), poses_of(motion, late))
             progress((m + (i + 1) / len(rigs)) / len(MOTIONS))
         figures[kind] = {name: _figures(errors) for name, errors in pooled.items()}
     return figures
@@ -189,7 +190,7 @@ def _of_faults(rigs: Sequence[_Rig], progress: Progress) -> dict[str, Any]:
         for name, dead in cases.items():
             broken = raw.copy()
             broken[round(_FAULT_S * rig.config.rate) :, :, dead(rig)] = np.nan
-            pooled[name].add(fuse(rig.parameters(), broken).track(WHOLE).at(late), poses_of(motion, late))
+            pooled[name].add(track(fuse(rig.parameters(), broken), WHOLE).at(late), poses_of(motion, late))
         progress((i + 1) / len(rigs))
     figures: dict[str, Any] = {name: _figures(errors) for name, errors in pooled.items()}
     for name in ("leg", "platform"):
@@ -208,8 +209,8 @@ def _of_starts(rigs: Sequence[_Rig], progress: Progress) -> dict[str, Any]:
         state, parameters = np.zeros((), STATE), rig.parameters()
         fuse(parameters, raw[:due], state)
         in_time = bool(state["filter_trusted"])
-        track = fuse(parameters, raw[due:], state).track(WHOLE)
-        errors = track.errors(poses_of(motion, slice(due, None)))
+        after = track(fuse(parameters, raw[due:], state), WHOLE)
+        errors = after.errors(poses_of(motion, slice(due, None)))
         worst = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2).max(axis=0)
         largest = np.maximum(largest, worst)
         succeeded += in_time and bool(state["filter_trusted"]) and bool((worst < (_STARTED_M, _STARTED_RAD)).all())
@@ -230,7 +231,7 @@ def _of_drift(rigs: Sequence[_Rig], progress: Progress) -> dict[str, Any]:
         for chunk in range(chunks):
             measure_all(imu, motion.signals, raw)
             counted = slice(None) if chunk else _late(config.rate)
-            pooled[chunk].add(fuse(parameters, raw, state).track(WHOLE).at(counted), poses_of(motion, counted))
+            pooled[chunk].add(track(fuse(parameters, raw, state), WHOLE).at(counted), poses_of(motion, counted))
             progress((i + (chunk + 1) / chunks) / len(rigs))
     return {"minutes": [_figures(errors) for errors in pooled]}
 
@@ -246,8 +247,8 @@ def _of_following(config: EvaluationConfig, progress: Progress) -> dict[str, Any
         )
         late, records = run.times >= LEARNING_S, run.records
         covariances = records["covariance"].astype(float)
-        track = PoseTrack(records["position"], records["rotation"], covariances=covariances)
-        pooled.add(track.at(late), PoseTrack(run.true_positions, run.true_rotations).at(late))
+        estimated = PoseTrack(records["position"], records["rotation"], covariances=covariances)
+        pooled.add(estimated.at(late), PoseTrack(run.true_positions, run.true_rotations).at(late))
         progress((i + 1) / len(config.seeds))
     return {"target": config.target, "fusion": _FOLLOWING, "imu": _CALIBRATED_IMU} | _figures(pooled)
 
@@ -266,11 +267,11 @@ def _of_cost(config: EvaluationConfig, progress: Progress) -> dict[str, Any]:
         parameters = cycle_parameters(mechanism, config.rate, control_settings(mechanism), fusion, ALL_IMUS, FUSIONS[name])
         runs = []
         for repeat in range(_COST_REPEATS):
-            runs.append(fuse(parameters, raw).ns)
+            runs.append(fuse(parameters, raw)["ns"])
             progress((i + (repeat + 1) / _COST_REPEATS) / len(names))
-        ns = np.min(runs, axis=0)[:, round(config.rate) :]
-        figures[name] = _microseconds(ns[WHOLE] - ns[REFINED])
-        figures["leg filters"] = _microseconds(ns[LEGS_ALONE])
+        ns = np.min(runs, axis=0)[round(config.rate) :]
+        figures[name] = _microseconds(ns[:, WHOLE] - ns[:, REFINED])
+        figures["leg filters"] = _microseconds(ns[:, LEGS_ALONE])
     return figures
 
 

@@ -25,7 +25,8 @@ from controller.settings import FusionSettings, control_settings, sensor_setting
 from hil.progress import Progress, no_progress
 from hil.runs.config import FUSIONS
 from hil.studies.config import TuningConfig
-from hil.studies.fused_track import REFINED, WHOLE, FusedTrack, PoseTrack, fuse, poses_of, read
+from hil.studies.fused_track import REFINED, WHOLE, PoseTrack, fuse, poses_of, read, track
+from plant.compiled import Record
 from plant.dynamics.imposed import impose
 from plant.errors import InputError
 from plant.imu import load_imu
@@ -77,8 +78,8 @@ class Consistency:
         return {"nees": float(self.nees.mean()), "rms": self.rms.tolist()}
 
 
-Errors = Callable[[Mechanism, FusedTrack, slice, PoseTrack], tuple[Array, Array]]
-"""A function of mechanism, fused track, counted samples and true poses in these.
+Errors = Callable[[Mechanism, Record, PoseTrack], tuple[Array, Array]]
+"""A function of the mechanism, a fused track (N,) and the true poses.
 
 Returns errors (N, s, n) of s independent estimates with n components, and their covariances (N, s, n, n)."""
 
@@ -101,9 +102,9 @@ class Estimator:
     series: int = 1
     whole: str | None = None
 
-    def judge(self, mechanism: Mechanism, fused: FusedTrack, late: slice, truth: PoseTrack) -> tuple[float, Array]:
+    def judge(self, mechanism: Mechanism, fused: Record, truth: PoseTrack) -> tuple[float, Array]:
         """Mean NEES and mean squares of the parts in a run."""
-        errors, covariances = self.errors(mechanism, fused, late, truth)
+        errors, covariances = self.errors(mechanism, fused, truth)
         n = self.components
         nees = NEES(errors.reshape(-1, n), np.zeros(n), covariances.reshape(-1, n, n))
         squares = np.sum(errors.reshape(*errors.shape[:2], self.parts, -1) ** 2, axis=3)
@@ -119,10 +120,10 @@ class Estimator:
         return float(low), float(high)
 
 
-def _leg_errors(mechanism: Mechanism, fused: FusedTrack, late: slice, truth: PoseTrack) -> tuple[Array, Array]:
+def _leg_errors(mechanism: Mechanism, fused: Record, truth: PoseTrack) -> tuple[Array, Array]:
     """Of the two angles of each leg [rad]."""
     vectors = truth.positions[:, None] + mechanism.platform_joints @ np.swapaxes(truth.rotations, 1, 2) - mechanism.base_joints
-    return _joint_angles(mechanism, fused.directions[late]) - _joint_angles(mechanism, vectors), fused.leg_covariances[late]
+    return _joint_angles(mechanism, fused["directions"]) - _joint_angles(mechanism, vectors), fused["leg_covariances"]
 
 
 def _joint_angles(mechanism: Mechanism, vectors: Array) -> Array:
@@ -131,23 +132,23 @@ def _joint_angles(mechanism: Mechanism, vectors: Array) -> Array:
     return np.stack([np.arctan2(-y, z), np.arctan2(x, np.hypot(y, z))]).T
 
 
-def _tilt_errors(mechanism: Mechanism, fused: FusedTrack, late: slice, truth: PoseTrack) -> tuple[Array, Array]:
+def _tilt_errors(mechanism: Mechanism, fused: Record, truth: PoseTrack) -> tuple[Array, Array]:
     """Of the vertical, along two axes across it [rad]."""
-    verticals = fused.verticals[late] / np.linalg.norm(fused.verticals[late], axis=1, keepdims=True)
+    verticals = fused["vertical"] / np.linalg.norm(fused["vertical"], axis=1, keepdims=True)
     across = np.linalg.svd(verticals[:, None])[2][:, 1:]
     errors = across @ (mechanism.up_in_base @ truth.rotations - verticals)[:, :, None]
-    covariances = across @ fused.vertical_covariances[late] @ np.swapaxes(across, 1, 2)
+    covariances = across @ fused["vertical_covariance"] @ np.swapaxes(across, 1, 2)
     return errors[:, None, :, 0], covariances[:, None]
 
 
-def _refined_errors(mechanism: Mechanism, fused: FusedTrack, late: slice, truth: PoseTrack) -> tuple[Array, Array]:
+def _refined_errors(mechanism: Mechanism, fused: Record, truth: PoseTrack) -> tuple[Array, Array]:
     """Of the refined pose [m, rad]."""
-    return fused.track(REFINED).at(late).errors(truth)[:, None], np.linalg.inv(fused.information[late])[:, None]
+    return track(fused, REFINED).errors(truth)[:, None], np.linalg.inv(fused["information"])[:, None]
 
 
-def _whole_errors(mechanism: Mechanism, fused: FusedTrack, late: slice, truth: PoseTrack) -> tuple[Array, Array]:
+def _whole_errors(mechanism: Mechanism, fused: Record, truth: PoseTrack) -> tuple[Array, Array]:
     """Of the whole-mechanism filter's pose [m, rad]."""
-    return fused.track(WHOLE).at(late).errors(truth)[:, None], fused.covariances[late][:, None]
+    return track(fused, WHOLE).errors(truth)[:, None], fused["covariance"][:, None]
 
 
 ESTIMATORS = {
@@ -190,26 +191,18 @@ def _seek_least_errors(evaluate: Evaluate, components: int) -> float:
     return float(found.x)
 
 
-@dataclass(frozen=True, eq=False)
-class _Motion:
-    """A simulated motion: the raw samples of its IMUs (N, 3, 7, 3), and the true poses in the samples that count."""
-
-    raw: Array
-    truth: PoseTrack
-
-
 class _Runs:
-    """Every kind of motion with every seed."""
+    """Every kind of motion with every seed: raw samples (N, 3, 7, 3), and the true poses in the samples that count."""
 
     def __init__(self, config: TuningConfig, mechanism: Mechanism, progress: Progress) -> None:
         self.mechanism, self.rate = mechanism, config.rate
         self.late = slice(round(SETTLING_S * config.rate), None, max(1, round(_SAMPLE_S * config.rate)))
-        self.motions: list[_Motion] = []
+        self.motions: list[tuple[Array, PoseTrack]] = []
         model, count = load_imu(config.imu), len(MOTIONS) * len(config.seeds)
         for kind in MOTIONS:
             for seed in config.seeds:
                 motion = impose(mechanism, kind, DURATION_S, config.rate, seed)
-                self.motions.append(_Motion(read(motion, model, config.rate, seed), poses_of(motion, self.late)))
+                self.motions.append((read(motion, model, config.rate, seed), poses_of(motion, self.late)))
                 progress(len(self.motions) / count)
 
     def evaluate(self, fusion: FusionSettings, names: Sequence[str], whole: str | None) -> dict[str, Consistency]:
@@ -217,9 +210,10 @@ class _Runs:
         control = control_settings(self.mechanism)
         parameters = cycle_parameters(self.mechanism, self.rate, control, fusion, whole=whole)
 
-        def run(motion: _Motion) -> list[tuple[float, Array]]:
-            fused = fuse(parameters, motion.raw)
-            return [ESTIMATORS[name].judge(self.mechanism, fused, self.late, motion.truth) for name in names]
+        def run(motion: tuple[Array, PoseTrack]) -> list[tuple[float, Array]]:
+            raw, truth = motion
+            fused = fuse(parameters, raw)[self.late]
+            return [ESTIMATORS[name].judge(self.mechanism, fused, truth) for name in names]
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             judged = zip(*pool.map(run, self.motions), strict=True)
@@ -302,12 +296,9 @@ def tune_fusion(config: TuningConfig, progress: Progress = no_progress) -> dict[
     names = {
         name: tuple(dict.fromkeys(s for step in STEPS if step.estimator == name for s in step.settings)) for name in ESTIMATORS
     }
+    tuned = [setting for settings in names.values() for setting in settings]
     return {
-        "settings": {
-            setting: {"before": getattr(before, setting), "after": getattr(fusion, setting)}
-            for settings in names.values()
-            for setting in settings
-        },
+        "settings": {name: {"before": getattr(before, name), "after": getattr(fusion, name)} for name in tuned},
         "estimators": {
             name: {
                 "settings": names[name],

@@ -8,7 +8,7 @@ import pytest
 
 from controller.settings import fusion_settings
 from hil.command_line import main
-from hil.studies.fused_track import REFINED, WHOLE, FusedTrack, PoseTrack
+from hil.studies.fused_track import FUSED, REFINED, WHOLE, PoseTrack
 from hil.studies.fusion_tuning import ESTIMATORS, Consistency, _seek_consistency, _seek_least_errors, tuned_text
 from plant.mechanism import load_mechanism
 from plant.pose import rotation_from_vector
@@ -61,7 +61,7 @@ def test_errors_drawn_from_a_covariance_have_as_much_nees_as_components(hexapod,
     covariances = roots @ np.swapaxes(roots, 2, 3)
     positions = hexapod.home.position + random.normal(scale=0.02, size=(count, 3))
     rotations = np.array([about(random, 0.1) for _ in range(count)])
-    fused = FusedTrack(count)
+    fused = np.zeros(count, FUSED)
     for i in range(count):
         if name == "leg filters":
             vectors = positions[i] + hexapod.platform_joints @ rotations[i].T - hexapod.base_joints
@@ -69,21 +69,21 @@ def test_errors_drawn_from_a_covariance_have_as_much_nees_as_components(hexapod,
                 x, y, z = joint.T @ vector / np.linalg.norm(vector)
                 b = np.arcsin(x) + noise[i, k, 1]
                 a = np.arctan2(-y, z) + noise[i, k, 0]
-                fused.directions[i, k] = joint @ [np.sin(b), -np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)]
+                fused["directions"][i, k] = joint @ [np.sin(b), -np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)]
         elif name == "platform filter":
             vertical = rotations[i].T @ hexapod.up_in_base
             across = np.linalg.qr(np.column_stack([vertical, np.eye(3)[:, :2]]))[0][:, 1:]
-            fused.verticals[i] = vertical + across @ noise[i, 0]
-            fused.vertical_covariances[i] = across @ covariances[i, 0] @ across.T
+            fused["vertical"][i] = vertical + across @ noise[i, 0]
+            fused["vertical_covariance"][i] = across @ covariances[i, 0] @ across.T
         else:
             step = REFINED if name == "refined pose" else WHOLE
-            fused.positions[step, i] = positions[i] + noise[i, 0, :3]
-            fused.rotations[step, i] = rotation_from_vector(noise[i, 0, 3:]) @ rotations[i]
-    fused.leg_covariances[...] = covariances if name == "leg filters" else 0.0
+            fused["positions"][i, step] = positions[i] + noise[i, 0, :3]
+            fused["rotations"][i, step] = rotation_from_vector(noise[i, 0, 3:]) @ rotations[i]
+    fused["leg_covariances"] = covariances if name == "leg filters" else 0.0
     if n == 6:
-        fused.information[:], fused.covariances[:] = np.linalg.inv(covariances[:, 0]), covariances[:, 0]
+        fused["information"], fused["covariance"] = np.linalg.inv(covariances[:, 0]), covariances[:, 0]
     truth = PoseTrack(positions, rotations)
-    nees, squares = estimator.judge(hexapod, fused, slice(None), truth)
+    nees, squares = estimator.judge(hexapod, fused, truth)
     low, high = estimator.bounds(count)
     assert low < n < high
     assert nees == pytest.approx(np.mean(np.sum(np.linalg.solve(roots, noise[..., None]) ** 2, axis=(2, 3))), rel=2e-3)
