@@ -8,3 +8,8 @@ Progress = Callable[[float], None]
 
 def no_progress(share: float) -> None:
     """Report nothing."""
+
+
+def part_of(progress: Progress, start: float, share: float) -> Progress:
+    """The progress of a part that begins at `start` and makes up `share` of the whole work."""
+    return lambda done: progress(start + share * done)

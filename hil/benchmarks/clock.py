@@ -1,7 +1,7 @@
-"""Benchmarks of the loop on the clock: how late it wakes, beside cyclictest, and how long it computes, idle and under load.
+"""Benchmarks of the loop on the clock: wake-up lateness, beside cyclictest, and computing time, idle and under load.
 
-Short slices of three loops take turns, so that all meet the same machine: ours, cyclictest, and a bare compiled loop that does
-nothing but compute for as long as ours. What the machine does to every loop alike shows in all.
+Short slices of three loops take turns on the same machine: ours, cyclictest, and a bare compiled loop that only computes, for
+as long as ours. Disturbances by the machine show in all three.
 """
 
 import contextlib
@@ -36,7 +36,7 @@ from plant.errors import GoughError
 
 IDLE, LOAD, BUSY = "idle", "load", "busy_supervisor"
 CONDITIONS = (IDLE, LOAD, BUSY)
-"""Nothing else to do; stress-ng on every processor; and a Python thread of the supervising process that never rests."""
+"""Nothing else runs; stress-ng on every processor; a busy Python thread in the supervising process."""
 
 _SLICE_S = 2.0
 _BARE_SHARE = 0.25
@@ -50,17 +50,17 @@ def measure_real_time(seconds: dict[float, float], progress: Progress = no_progr
     """Time loops on the clock.
 
     Args:
-        seconds: how long for each rate [Hz], pooled over slices, idle and again under load.
+        seconds: duration by rate [Hz], pooled over slices, idle and again under load.
         progress: called with the share that is done.
 
     Returns:
-        By rate and condition: `compute_us`, `latency_us`, `wake_us`, `cyclictest_us` (None without cyclictest), `bare_us` (the
-        bare loop's computing) and `bare_wake_us`, each with p50, p99, p999, max and n; `stages_us`, and what of all these is
-        `over_budget`; `missed_own` and `missed_host` periods; `usage` of the loop's thread; `histograms`. And what is
-        `refused`, and `missing` on this machine.
+        `rates`: by rate and condition, `compute_us`, `latency_us`, `wake_us`, `cyclictest_us` (None without cyclictest),
+        `bare_us` (computing of the bare loop) and `bare_wake_us`, each with p50, p99, p999, max and n; `stages_us`; those
+        `over_budget`; `missed_own` and `missed_host` periods; `usage` of the loop's thread; `histograms`. `refused`: measures
+        for real time that the machine refuses; `missing`: programs that it lacks.
 
     Raises:
-        GoughError: the loop stopped for another cause than the end of its slice.
+        GoughError: the loop stopped before the end of its slice.
     """
     settings = RealTimeSettings()
     missing = [name for name in ("cyclictest", "stress-ng") if shutil.which(name) is None]
@@ -86,15 +86,15 @@ def measure_real_time(seconds: dict[float, float], progress: Progress = no_progr
 
 
 def measure_measures(seconds: float, progress: Progress = no_progress) -> dict[str, Any]:
-    """What each measure of `hil.realtime.scheduling` is good for: the loop at 1 kHz with all, without each, and without any.
+    """The effect of each measure of `hil.realtime.scheduling`: the loop at 1 kHz with all, without each, and without any.
 
     Args:
-        seconds: how long for each, idle and again under load.
+        seconds: duration of each, idle and again under load.
         progress: called with the share that is done.
 
     Returns:
-        By what is left out, "nothing" and "all" included, and condition: `wake_us` and `compute_us` with p50, p99, p999, max
-        and n, periods missed, and `minor_faults` of the loop's thread.
+        By the measure left out ("nothing" and "all" included) and condition: `wake_us` and `compute_us` with p50, p99, p999,
+        max and n, periods `missed`, and `minor_faults` of the loop's thread.
     """
     conditions = [IDLE] if shutil.which("stress-ng") is None else [IDLE, LOAD]
     cases = {"nothing": (), **{measure: (measure,) for measure in MEASURES}, "all": MEASURES}
@@ -104,7 +104,7 @@ def measure_measures(seconds: float, progress: Progress = no_progress) -> dict[s
     done, whole = 0, slices * len(cases) * len(conditions)
     for condition in conditions:
         with _circumstances(condition):
-            # In turn, so that all meet the same machine.
+            # In turn: the machine changes with time.
             for _ in range(slices):
                 for case, bench in benches.items():
                     bench.add_slice(pools[case][condition], busy=False, bare=False)
@@ -125,7 +125,7 @@ def measure_measures(seconds: float, progress: Progress = no_progress) -> dict[s
 
 
 class _Pool:
-    """What the slices of one rate and condition have measured."""
+    """The measurements of all slices of one rate and condition."""
 
     def __init__(self) -> None:
         self.timing, self.cyclictest = Timing(), np.zeros(_LONGEST_US + 1, np.int64)
@@ -138,9 +138,9 @@ class _Pool:
     def figures(self) -> dict[str, Any]:
         timing = self.timing.figures()
         over = over_budget(timing)
-        named = {"compute": "compute", "latency": "latency"}
         return {
-            **{f"{name}_us": timing.pop(stage) for name, stage in named.items()},
+            "compute_us": timing.pop("compute"),
+            "latency_us": timing.pop("latency"),
             "wake_us": _figures_of_counts(self.late, timing.pop("wake")["max"]),
             "cyclictest_us": _figures_of_counts(self.cyclictest, self.longest_us) if self.cyclictest.any() else None,
             "bare_us": self.bare.figures(),
@@ -161,7 +161,7 @@ class _Pool:
 
 
 class _Bench:
-    """The loops of one rate, prepared once and run in a process of their own for every slice."""
+    """The loops of one rate, prepared once; every slice runs in a process of its own."""
 
     def __init__(self, rate: float, settings: RealTimeSettings, cyclictest: bool) -> None:
         self._config = SimulationConfig(target="sines", duration=_SLICE_S, rate=rate)
@@ -171,7 +171,7 @@ class _Bench:
         _run_bare(new_clock(0, 1), 0, 0, np.zeros((1, 2), np.int64))
 
     def add_slice(self, pool: _Pool, busy: bool, bare: bool = True) -> None:
-        """Run ours, cyclictest if wanted, and the bare loop in turn."""
+        """Run our loop, cyclictest if wanted, and the bare loop, one after the other."""
         with _busy_thread() if busy else contextlib.nullcontext():
             count, missed, used = self._in_a_process(self._ours)
         records = self._records[:count]
@@ -224,7 +224,7 @@ class _Bench:
         return new_clock(REAL, round(1e9 / self._config.rate))
 
     def _run_cyclictest(self) -> NDArray[np.int64]:
-        """Counts of cyclictest's wake-ups by whole microseconds."""
+        """Counts of cyclictest's wake-ups by lateness in whole microseconds."""
         period_us, loops = round(1e6 / self._config.rate), round(_SLICE_S * self._config.rate)
         settings = self._settings
         command = ["cyclictest", "-q", "-m", "-t1", f"-a{settings.processor}", f"-p{settings.priority}", f"-i{period_us}"]
@@ -233,7 +233,7 @@ class _Bench:
         )
         counts = np.zeros(_LONGEST_US + 1, np.int64)
         if output.returncode:
-            # Without privileges it does not run; then there is nothing to compare with.
+            # It does not run without privileges.
             self._cyclictest = False
             return counts
         for line in output.stdout.splitlines():
@@ -265,7 +265,7 @@ def _outcome(loop: PreparedLoop, cause: int, used: dict[str, float]) -> tuple[in
 
 @kernel
 def _compute_bare(turns: int) -> float:
-    """Work that needs no memory: a logistic map."""
+    """Compute without memory: a logistic map."""
     x = 0.3
     for _ in range(turns):
         x = 3.7 * x * (1.0 - x)
@@ -280,13 +280,13 @@ def _time_bare(timespec: NDArray[np.int64]) -> int:
         began = now(timespec)
         x += _compute_bare(1000)
         least = min(least, now(timespec) - began)
-    # Work of which nothing came would not be done.
+    # The compiler would drop work whose result is not used.
     return least if x > 0.0 else 0
 
 
 @kernel
 def _run_bare(clock: Record, cycles: int, turns: int, durations: NDArray[np.int64]) -> float:
-    """The bare loop: for each cycle, how late it woke and how long it computed [ns]."""
+    """The bare loop: write lateness and computing time of each cycle [ns]."""
     c, x = clock[()], 0.0
     script = np.zeros((1, 3), np.int64)
     if cycles > 0:
@@ -320,7 +320,7 @@ def _circumstances(condition: str) -> Iterator[None]:
 
 @contextmanager
 def _busy_thread() -> Iterator[None]:
-    """A Python thread that never rests, started once the process that is measured has been forked."""
+    """A busy Python thread, started after the fork of the measured process."""
     over = threading.Event()
 
     def turn() -> None:
@@ -337,19 +337,19 @@ def _busy_thread() -> Iterator[None]:
 
 
 def _figures_of_counts(counts: NDArray[np.int64], longest: float) -> dict[str, float]:
-    """Figures [us] of counts by whole microseconds, as cyclictest rounds them: down."""
+    """Figures [us] of counts by whole microseconds, rounded down as by cyclictest."""
     n = int(counts.sum())
     sums = np.cumsum(counts)
     figures = {}
     for name, share in QUANTILES.items():
         us = int(np.searchsorted(sums, share * n))
-        # Within a microsecond all durations are taken for equally likely.
+        # Durations are taken as equally likely within a microsecond.
         figures[name] = us + 1.0 - float(sums[us] - share * n) / float(counts[us])
     return {**figures, "max": float(longest), "n": n}
 
 
 def _bars(counts: NDArray[np.int64]) -> list[list[float]]:
-    """Counts by microseconds gathered into bins sixteen to the octave."""
+    """Counts by microseconds in bins of a sixteenth of an octave: lower ends, and counts."""
     used = np.flatnonzero(counts)
     bins = np.floor(16.0 * np.log2(np.maximum(used, 0.5)))
     lower = np.unique(bins)
@@ -357,7 +357,7 @@ def _bars(counts: NDArray[np.int64]) -> list[list[float]]:
 
 
 def measure_start_up(cold: bool) -> dict[str, float | None]:
-    """Seconds from the start of `gough run` to its first cycle: with caches, and, if wanted, without."""
+    """Seconds from the start of `gough run` to its first cycle: with caches and, if `cold`, without."""
 
     def first_cycle(cache: str | None) -> float:
         environment = dict(os.environ) if cache is None else {**os.environ, "GOUGH_CACHE": cache}
@@ -376,13 +376,13 @@ def measure_start_up(cold: bool) -> dict[str, float | None]:
 
 
 class GrossExcessError(GoughError, RuntimeError):
-    """The loop on the clock is off by more than any noise."""
+    """The loop on the clock is slower than any noise explains."""
 
     exit_status = 1
 
 
 def gross_excess(figures: dict[str, Any]) -> list[str]:
-    """What is wrong beyond the noise of any machine, in words: for continuous integration."""
+    """Excesses beyond the noise of any machine, in words, for continuous integration."""
     found = []
     for rate, conditions in figures["rates"].items():
         for condition, measured in conditions.items():

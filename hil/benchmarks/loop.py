@@ -1,10 +1,9 @@
-"""Benchmarks: how many times faster than real time the loop runs, and what each stage of it costs."""
+"""Benchmarks of the simulated loop: its speed over real time, and the cost of each stage."""
 
 import json
 import os
 import platform
 from datetime import UTC, datetime
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.loop.records import COMPUTED, STAGES
-from hil.progress import Progress, no_progress
+from hil.progress import Progress, no_progress, part_of
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import simulate
 from plant.errors import InputError
@@ -23,7 +22,7 @@ _FILTERPY_S = 2.0
 
 
 def measure_speed(target: str, duration: float, progress: Progress = no_progress) -> dict[str, Any]:
-    """Run the simulation several times, and once on filterpy.
+    """Run the simulation several times, and once with the filters on filterpy.
 
     Returns:
         `real_time_factor` (median, least, greatest), `filterpy_real_time_factor`, `filterpy_slowdown`, `cycle_us` and
@@ -38,7 +37,7 @@ def measure_speed(target: str, duration: float, progress: Progress = no_progress
     factors = []
     runs = []
     for i in range(_REPEATS):
-        result = simulate(config, partial(_report_part, progress, i * share, share))
+        result = simulate(config, part_of(progress, i * share, share))
         factors.append(result.real_time_factor)
         runs.append(result.records["stage_ns"])
     stage_ns = np.concatenate(runs)
@@ -57,7 +56,7 @@ def measure_speed(target: str, duration: float, progress: Progress = no_progress
 
 
 def machine() -> dict[str, str]:
-    """What figures are measured on: machine, date and version."""
+    """The machine, date and version of figures."""
     return {
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -78,10 +77,6 @@ def read_earlier(path: Path) -> dict[str, Any]:
     if not isinstance(figures, dict) or "date" not in figures:
         raise InputError(f"{path} holds no figures of 'gough bench': it has no date")
     return figures
-
-
-def _report_part(progress: Progress, start: float, share: float, done: float) -> None:
-    progress(start + share * done)
 
 
 def _percentiles(nanoseconds: NDArray[np.int64]) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Benchmark of the plant: what a step costs through compiled calls and through FMPy's own methods, and how exact it is."""
+"""Benchmark of the plant: the cost of a step through compiled calls and through FMPy's methods, and its exactness."""
 
 from time import perf_counter_ns
 from typing import Any
@@ -18,7 +18,7 @@ from plant.pose import Array
 
 PERIOD_S = 1e-3
 FINER = 16
-"""How many times shorter the substeps are that the error is measured against."""
+"""Substeps of the reference for the error are this many times shorter."""
 
 _PARTS = ("set modes and commands", "step", "read IMUs", "read truth")
 _FMPY_CYCLES = 2000
@@ -30,13 +30,13 @@ def measure_plant(duration: float, progress: Progress = no_progress) -> dict[str
 
     Args:
         duration: of the motion [s].
-        progress: called now and then with the share that is done.
+        progress: called with the share that is done.
 
     Returns:
-        `step_us`: of a 1 ms step from compiled code, by FMI's version; `calls_us`: of each of the calls of a cycle (FMI 3.0),
-        of which the first and the last only copy numbers; `cycle_us`: of all of them, and `fmpy_us` of the same through FMPy's
-        methods, medians; `fmpy_slowdown`: how many times longer these take; `error_m`: greatest distance from where shorter
-        substeps lead; `substep` [s].
+        `step_us`: of a 1 ms step from compiled code, by FMI's version; `calls_us`: of each call of a cycle (FMI 3.0), where the
+        first and the last only copy numbers; `cycle_us` and `fmpy_us`: medians of all calls, from compiled code and through
+        FMPy's methods; `fmpy_slowdown`: their ratio; `error_m`: greatest distance from the positions with shorter substeps;
+        `substep` [s].
     """
     commands = _commands(duration)
     parameters = load_spatial("hexapod").plant_parameters()
@@ -65,7 +65,7 @@ def measure_plant(duration: float, progress: Progress = no_progress) -> dict[str
 
 
 def _commands(duration: float) -> Array:
-    """Velocity commands (n, 6) [m/s] of every cycle."""
+    """Velocity commands (n, 6) [m/s], a row a cycle."""
     times = PERIOD_S * np.arange(round(duration / PERIOD_S))[:, None]
     legs = np.arange(6)
     commands: Array = 0.06 * np.sin(2.0 * np.pi * (0.4 + 0.07 * legs) * times + legs)

@@ -29,7 +29,7 @@ from hil.calibration.assessment import assess, constants, cross_validate
 from hil.calibration.data import CalibrationData, Knowledge
 from hil.calibration.known_poses import calibrate_by_known_poses
 from hil.loop.records import Link
-from hil.progress import Progress, no_progress
+from hil.progress import Progress, no_progress, part_of
 from hil.recording.mcap import Recording, RecordingError, read
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import prepared_loop
@@ -99,7 +99,7 @@ def calibrate_rig(
         nonlocal done
         start, done = done, done + duration
         with _calibrated(replace(config, target=target, duration=duration), calibration) as run:
-            return _run_closed(run, lambda share: progress((start + share * duration) / whole))
+            return _run_closed(run, part_of(progress, start / whole, duration / whole))
 
     first = calibrate_at_rest(data.mechanism, data.rests, knowledge.prior)
     data.add_rests(drive("rests", WIDE_POSES * REST_S, first.calibration()))

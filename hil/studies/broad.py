@@ -1,9 +1,9 @@
-"""The platform's filter by itself on trials of the BROAD benchmark: a real IMU, moved by hand, with an optical reference.
+"""The platform filter by itself on trials of the BROAD benchmark: a real IMU, moved by hand, with an optical reference.
 
 D. Laidig, M. Caruso, A. Cereatti, T. Seel, *BROAD - A Benchmark for Robust Inertial Orientation Estimation*, Data 6(7), 2021,
 doi 10.3390/data6070072. A trial is a NumPy archive with the rates `imu_gyr` (N, 3) [rad/s], the forces `imu_acc` (N, 3)
-[m/s^2], the reference `opt_quat` (N, 4), which turns the sensor's frame to one with z up and is NaN where the optics lost the
-sensor, `movement` (N,), which samples count, and `sampling_rate` [Hz]. The score is the RMS of the inclination's error.
+[m/s^2], the reference `opt_quat` (N, 4), which maps the sensor's frame to one with z up and is NaN where the optics lost the
+sensor, `movement` (N,), true for samples that count, and `sampling_rate` [Hz]. The score is the RMS inclination error.
 """
 
 import time
@@ -41,8 +41,8 @@ class Trial:
         name: of its file.
         rate: samples per second [Hz].
         rates, forces: (N, 3) [rad/s, m/s^2], of the IMU.
-        verticals: (N, 3), the unit vertical in the sensor's frame, by the optics.
-        counts: (N,), which samples do: those of the movement that the optics saw.
+        verticals: (N, 3), the true unit vertical in the sensor's frame, by the optics.
+        counts: (N,), true for samples of the movement that the optics saw.
     """
 
     name: str
@@ -60,19 +60,19 @@ class Trial:
 
 
 def evaluate(folder: str | Path, fusion: FusionSettings) -> dict[str, Any]:
-    """Run the platform's filter and the `vqf` package on every trial `*.npz` of a folder.
+    """Run the platform filter and the `vqf` package on every trial `*.npz` of a folder.
 
     Args:
         folder: with the trials.
-        fusion: what the filter assumes; the platform's own acceleration, which nothing tells it here, is for it the
-            accelerometer's noise.
+        fusion: noise that the filter assumes; the IMU's own acceleration, which nothing measures here, counts as noise of the
+            accelerometer.
 
     Returns:
         `trials`: by name and method (`filter`, `vqf`) the `inclination_rms` [rad] and `us`, microseconds per sample; the noise
         that the filter assumed [m/s^2/sqrt(Hz), rad/s/sqrt(s)], and the `version`.
 
     Raises:
-        InputError: the folder is missing or has no trial, or a file is none.
+        InputError: the folder is missing or has no trial, or a file is not a trial.
     """
     paths = sorted(Path(folder).glob("*.npz"))
     if not paths:
@@ -98,7 +98,7 @@ def load_trial(path: Path) -> Trial:
     """Read a trial.
 
     Raises:
-        InputError: the file cannot be read, lacks an array, or has one of another shape or with what is not finite.
+        InputError: the file cannot be read, lacks an array, or has one of a wrong shape or with values that are not finite.
     """
     try:
         with np.load(path) as file:
@@ -133,7 +133,7 @@ def load_trial(path: Path) -> Trial:
 
 
 def _score(trial: Trial, method: Callable[[], Array]) -> dict[str, float]:
-    """The error of a method, and the median time that it takes."""
+    """The error of a method, and its median time."""
     verticals, took = method(), []
     for _ in range(_REPEATS):
         began = time.perf_counter()
@@ -157,7 +157,7 @@ def _follow(
     rates: Array, forces: Array, period: float, rate_density: float, bias_walk: float, vertical_variance: float,
     bias_sigma: float, verticals: Array,
 ) -> None:  # fmt: skip
-    """Write the verticals (N, 3) that the platform's filter finds, told of no acceleration."""
+    """Write the verticals (N, 3) by the platform filter without a measured acceleration."""
     x, covariance, acceleration = np.zeros(STATES), np.zeros((STATES, STATES)), np.zeros(3)
     transition, work, gain, change = np.zeros((STATES, STATES)), np.zeros((STATES, STATES)), np.zeros(STATES), np.zeros(STATES)
     start_platform(x, covariance, forces[0], bias_sigma)

@@ -1,7 +1,7 @@
-"""What happens when something goes wrong: every case of a table, with many seeds, against the reaction specified for it.
+"""The fault matrix: every case of a table of faults, run with many seeds and compared with its specified reaction.
 
-The loop, its messages and the emulated rig are the real ones, but joined through memory and on virtual time, so that a case
-comes out the same every time. What needs processes of their own is in the tests of emulator and rigs.
+The loop, its messages and the emulated rig are the real ones, but connected in memory and on virtual time: a case gives the
+same result every time. Faults that need separate processes are in the tests of emulator and rigs.
 """
 
 from collections.abc import Callable
@@ -70,29 +70,29 @@ MOTION_S = 4.5
 _FIRST_S, _SPREAD_S = 1.5, 1.0
 _SESSION = 1
 _SMOOTH = 20
-"""Cycles over which a true acceleration is averaged: what the noise of the IMUs does to the commands is no motion."""
+"""Cycles over which a true acceleration is averaged, because the IMUs' noise in the commands does not count as motion."""
 
 MOST_TRAVEL_M = 0.03
-"""How far a leg may go on to rest, whatever has happened."""
+"""The greatest allowed travel of a leg until it rests, after any fault."""
 
 _SLACK = 1.001
 
 
 @dataclass(frozen=True)
 class Case:
-    """A case: what goes wrong, and what is to be done about it.
+    """A fault and the reaction that it must cause.
 
     Attributes:
-        name: of the table.
-        expected: the cause that is to be told; `NO_CAUSE` if nothing is.
+        name: in the table.
+        expected: the cause that must be reported; `NO_CAUSE` if none.
         reaction: `GO_ON`, `STOP`, `STOP_QUICKLY` or `BRAKE_AT_ONCE`.
-        within: cycles from the fault to the first event with that cause.
-        peak: largest deviation of a leg from its reference until it is over [m].
+        within: most cycles from the fault to the first event with this cause.
+        peak: greatest allowed deviation of a leg from its reference [m].
         faults: as `hil.rigs.emulation.faults.fault` reads them, with {k} an IMU, {j} another one, {d} a drive, {at} a time [s].
-        act: called with the loop when the time has come, for what no fault of the rig is.
-        streamed: what goes wrong with a streamed target.
-        hardness: largest true deceleration of a controlled stop, over the limit of acceleration.
-        also: causes that may end it as well.
+        act: called with the loop at the time of a fault that is not the rig's.
+        streamed: the fault of a streamed target.
+        hardness: greatest allowed true deceleration of a controlled stop, over the limit of acceleration.
+        also: other causes that may end the run.
     """
 
     name: str
@@ -123,7 +123,7 @@ def _miss(periods: int) -> Callable[[PreparedLoop], None]:
 
 
 def _kill_rig(loop: PreparedLoop) -> None:
-    """A rig that has been killed and started again knows no session, and its drives hold."""
+    """A rig that was killed and started again has no session, and its drives hold."""
     assert loop.emulator is not None
     loop.emulator.session["id"] = 0
     loop.emulator.rig["request"], loop.emulator.rig["velocity"] = 0, 0.0
@@ -186,14 +186,14 @@ CASES = (
 
 @dataclass
 class Outcome:
-    """What came of a case.
+    """The outcome of a case over all seeds.
 
     Attributes:
-        reactions: how often each reaction was found.
-        cycles: from the fault to its event, of each seed; empty if none was expected.
-        peak: largest deviation of a leg from its reference since the fault, as long as it has one, of each seed [m].
-        travel: how far a leg went on from being told to rest, of each seed [m].
-        findings: what is not as it should be, in words.
+        reactions: number of times of each reaction.
+        cycles: from the fault to its event, for each seed; empty if none was expected.
+        peak: greatest deviation of a leg from its reference since the fault, while there is a reference, for each seed [m].
+        travel: greatest travel of a leg from the event to rest, for each seed [m].
+        findings: differences from the specification, in words.
     """
 
     case: Case
@@ -217,10 +217,10 @@ class Outcome:
 
 
 def run_matrix(seeds: int, cases: tuple[Case, ...] = CASES, progress: Progress = no_progress) -> list[Outcome]:
-    """Run every case with so many seeds.
+    """Run every case with every seed.
 
     Args:
-        seeds: of IMUs, faults, when and where they are.
+        seeds: number of seeds of IMUs and faults, their times and places.
         cases: of the table.
         progress: called with the share that is done.
     """
@@ -274,7 +274,7 @@ def _try(case: Case, seed: int, outcome: Outcome) -> None:
 
 
 def _join(loop: PreparedLoop, faults: list[Record], seed: int) -> None:
-    """Put the emulated rig between the loop and its plant, and both on a script's clock."""
+    """Put the emulated rig between the loop and its plant, and both on a scripted clock."""
     rig = new_emulated(loop.mechanism, round(1e9 / RATE_HZ), seed, faults)
     loop.emulator = new_udp_emulator(loop.fmu, loop.imu, rig, _SESSION)
     loop.kind = EMULATED_RIG
@@ -286,7 +286,7 @@ def _join(loop: PreparedLoop, faults: list[Record], seed: int) -> None:
 
 
 def _stand(loop: PreparedLoop) -> None:
-    """After the run: what the rig does by itself when it hears nothing any more."""
+    """Let the rig go on by itself after the run, when no more commands come."""
     assert loop.emulator is not None
     begin = int(loop.emulator.rig["time_ns"])
     for passed in range(0, 500_000_000, 10_000_000):
@@ -298,7 +298,7 @@ _SAMPLE_CYCLES = 10
 
 
 def _follow_stream(loop: PreparedLoop, what: str, onset: int) -> None:
-    """Stream the target until something goes wrong with it."""
+    """Stream the target until its fault."""
     target, mechanism, hold = loop.target, loop.mechanism, int(loop.parameters["hold_cycles"])
     home, start = mechanism.require_home(), leg_lengths(mechanism, target.start.position, target.start.rotation)
     loop.stream, loop.segments = np.zeros((), STREAM), rest(start)
@@ -319,13 +319,13 @@ def _follow_stream(loop: PreparedLoop, what: str, onset: int) -> None:
 
 
 def _judge(case: Case, seed: int, loop: PreparedLoop, cause: int, onset: int, outcome: Outcome) -> None:
-    """Compare what has happened with what should have."""
+    """Compare the run with its specification."""
     assert loop.emulator is not None
     count, limits, period = int(loop.link[Link.HEAD]), loop.mechanism.require_limits(), 1.0 / RATE_HZ
     records, rig = loop.records[:count], loop.emulator.rig
     find = partial(_find, outcome, case, seed)
     moved = records[records["request"] != BRAKED]
-    # What ended it counts, not what was told on the way.
+    # The cause that ended the run counts, not events before it.
     reaction = GO_ON if cause == END_OF_MOTION else CAUSES[cause].reaction
     outcome.reactions[REACTIONS[reaction]] = outcome.reactions.get(REACTIONS[reaction], 0) + 1
     accepted = (case.expected, *case.also)
@@ -354,7 +354,7 @@ def _judge(case: Case, seed: int, loop: PreparedLoop, cause: int, onset: int, ou
     find(travel > MOST_TRAVEL_M, f"a leg went on for {1e3 * travel:.1f} mm, and {1e3 * MOST_TRAVEL_M:g} are allowed")
     allowed = {case.reaction, *(CAUSES[each].reaction for each in case.also)}
     find(reaction not in allowed, f"the reaction was: {REACTIONS[reaction]}")
-    # Our own commands, and references, within the limits; a fault comes to rest as fast as the limit of acceleration allows.
+    # Commands and references stay within the limits; a quick stop is no harder than the limit of acceleration.
     find(np.abs(records["command"]).max() > _SLACK * float(loop.parameters["command_limit"]), "a command was above its limit")
     find(np.abs(moved["reference"][:, :, 1]).max(initial=0.0) > _SLACK * limits.velocity, "a reference was too fast")
     find(
