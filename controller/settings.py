@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 from plant.errors import InputError
 from plant.imu import STANDARD_GRAVITY, ImuModel
 from plant.mechanism import Mechanism
+from plant.toml import check_entries
 
 _ENDLESS = 1e300
 _RAW_M = 0.05
@@ -191,10 +192,8 @@ def sensor_settings(mechanism: Mechanism, imu: ImuModel) -> FusionSettings:
 
 
 def _read(kind: type[S], name: str, table: Mapping[str, Any]) -> S:
-    known = {field.name for field in fields(kind)}
+    check_entries(table, sorted(field.name for field in fields(kind)), f"[{name}]")
     for key, value in table.items():
-        if key not in known:
-            raise InputError(f"[{name}] has no entry {key!r}; it has {', '.join(sorted(known))}")
         if not isinstance(value, int | float) or isinstance(value, bool):
             raise InputError(f"[{name}] {key} must be a number, got {value!r}")
     return kind(**table)

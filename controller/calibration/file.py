@@ -7,7 +7,6 @@ gain @ raw + offset. A file gives for each IMU what one would write on its box, 
 """
 
 import json
-import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from plant.errors import InputError
 from plant.files import write_whole
 from plant.mechanism import LEGS
 from plant.pose import Array, checked_array, rotation_from_vector, vector_from_rotation
+from plant.toml import check_entries, read_toml
 
 SENSORS = ("gyroscope", "accelerometer", "magnetometer")
 UNITS = ("rad/s", "m/s2", "uT")
@@ -94,12 +94,7 @@ def load_calibration(path: Path | str) -> Calibration:
     Raises:
         InputError: there is no such file, or it is malformed; the message names the entry.
     """
-    try:
-        document = tomllib.loads(Path(path).read_text())
-    except OSError as error:
-        raise InputError(f"the calibration {path} cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is no TOML file: {error}") from None
+    document = read_toml(path)
     for name, table in document.items():
         if not isinstance(table, dict):
             raise InputError(f"{path}: {name} must be a table, got {table!r}")
@@ -118,8 +113,7 @@ def load_calibration(path: Path | str) -> Calibration:
             _read_sensor(calibration, SENSORS.index(sensor), int(imu), entries, f"{path}: {name}.{sensor}")
     changes: dict[str, Any] = {}
     for name, entries in (("base", ("tilt", "floor")), ("joints", _SIDES), ("covariance", ("sigmas", "factor"))):
-        if unknown := sorted(set(document.get(name, {})) - set(entries)):
-            raise InputError(f"{path}: {name} has no entry {unknown[0]!r}; it has {', '.join(entries)}")
+        check_entries(document.get(name, {}), entries, f"{path}: {name}")
     if "base" in document:
         changes["tilt"] = checked_array(document["base"].get("tilt", (0.0, 0.0)), (2,), f"{path}: base.tilt")
         changes["floor"] = checked_array(document["base"].get("floor", (0.0, 0.0)), (2,), f"{path}: base.floor")

@@ -22,11 +22,13 @@ from controller.settings import ControlSettings, control_settings, fusion_settin
 from plant.checks import check_rate
 from plant.compiled import Record
 from plant.dynamics.spatial import build_dynamics
-from plant.dynamics.variables import INPUTS, PARAMETERS, STATES, VELOCITY
+from plant.dynamics.variables import SPATIAL, VELOCITY
 from plant.errors import SingularConfigurationError
 from plant.imu import ACCELEROMETER, GYROSCOPE
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array
+
+STATES, INPUTS = SPATIAL.states, SPATIAL.inputs
 
 INTEGRAL_TIME_S = 0.3
 SENSITIVITY_LIMIT = 2.0
@@ -155,7 +157,7 @@ def linear_plant(mechanism: Mechanism, rate: float) -> tuple[Linear, Array]:
     """
     values = mechanism.plant_parameters()
     friction = {"friction.coulomb": np.zeros(LEGS)}
-    flat = np.concatenate([np.ravel((values | friction)[variable.name]) for variable in PARAMETERS])
+    flat = np.concatenate([np.ravel((values | friction)[variable.name]) for variable in SPATIAL.parameters])
     dynamics = build_dynamics()
     constants = dynamics.constants(flat)
     x = np.concatenate(

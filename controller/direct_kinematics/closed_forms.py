@@ -24,7 +24,7 @@ import numpy as np
 from controller.least_squares import RANK_TOLERANCE, solve_least_squares, solve_truncated
 from plant.compiled import Record, kernel
 from plant.mechanism import LEGS, Mechanism, six_rows
-from plant.mechanism.planar import SAME_JOINT_M
+from plant.mechanism.checks import SAME_JOINT_M
 from plant.pose import Array
 
 FLATNESS = 1e-3

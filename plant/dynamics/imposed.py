@@ -8,7 +8,7 @@ import numpy as np
 
 from plant.checks import checked_seed
 from plant.dynamics.spatial import imu_signals, variable_symbols
-from plant.dynamics.variables import PARAMETERS
+from plant.dynamics.variables import SPATIAL
 from plant.errors import InputError
 from plant.mechanism import Mechanism
 from plant.pose import Array
@@ -103,7 +103,7 @@ def _signals() -> ca.Function:
     """Rotation and readings, row by row, from coordinates with their derivatives, the rotation at home, and the parameters."""
     q, qd, qdd = (ca.SX.sym(name, 6) for name in ("q", "qd", "qdd"))
     home = ca.SX.sym("home", 3, 3)
-    parameters = variable_symbols(PARAMETERS)
+    parameters = variable_symbols(SPATIAL.parameters)
     turn = _turn(2, q[5]) @ _turn(1, q[4]) @ _turn(0, q[3])
     turning = ca.reshape(ca.jtimes(ca.vec(turn), q, qd), 3, 3) @ turn.T
     omega = ca.vertcat(turning[2, 1], turning[0, 2], turning[1, 0])

@@ -24,8 +24,8 @@ from plant.dynamics.legs import (
     solve,
     speeds_of,
 )
-from plant.dynamics.planar_variables import PLANAR
 from plant.dynamics.spatial import Dynamics, assembled, variable_symbols
+from plant.dynamics.variables import PLANAR
 
 _NORMAL = SX([0, 0, 1])
 _AXES = ca.repmat(_NORMAL.T, 3, 1)

@@ -1,13 +1,13 @@
-"""The plant's variables: the one table that drives the dynamics, the FMU's layout and its XML, and their use by name.
+"""The plants' variables: the tables that drive the dynamics, the FMUs' layout and XML, and all use of variables by name.
 
-The table here is that of six legs in space; the planar plant's (`plant.dynamics.planar_variables`) takes the same rows by the
-functions that make them for any number of legs.
-
-Arrays are row-major. Vectors are seen in the base frame {1} unless the description names another.
+Arrays are row-major. Vectors are seen in the base frame {1} unless the description names another. The planar plant has three
+legs in the xy-plane of {1}. Its vectors of two components lie in that plane, but its IMUs measure in space: a leg's sensor
+frame has its x axis along the plane's normal and its z axis along the leg.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from math import prod
 from typing import Literal
 
@@ -22,27 +22,37 @@ from plant.wiring import PLATFORM_IMU as PLATFORM_IMU
 Causality = Literal["state", "input", "parameter", "output"]
 
 OPEN, BRAKE, VELOCITY = 0, 1, 2
-"""Values of `drive_mode`: motor unpowered and free; held by its brake; driven at `velocity_command`."""
+"""Values of `drive_mode`: the motor is unpowered and free, held by its brake, or driven at `velocity_command`."""
 
 DRIVE_MODES = {OPEN: "open", BRAKE: "brake", VELOCITY: "velocity"}
+
+TINY = 1e-9
+"""The smallest value of a parameter that must be positive."""
 
 
 @dataclass(frozen=True)
 class Variable:
-    """One variable of a plant: its name, shape (() for a scalar), unit, role, the range that makes sense, and a usual size.
+    """One variable of a plant.
 
-    A parameter outside its range is refused; for the others the range is a promise. A `tunable` parameter may change
-    during a run; the others are fixed once initialisation ends. `discrete` marks the drive modes, an enumeration.
+    Attributes:
+        name, unit: as in the FMU.
+        shape: () for a scalar.
+        description: one line for people.
+        minimum, maximum: a parameter outside is refused; other variables stay inside.
+        nominal: the usual size.
+        causality: its role.
+        tunable: whether a parameter may change during a run; the others are fixed once initialisation ends.
+        discrete: whether it is an enumeration, as the drive modes are.
     """
 
     name: str
     shape: tuple[int, ...]
     unit: str
-    causality: Causality
     description: str
     minimum: float
     maximum: float
     nominal: float
+    causality: Causality
     tunable: bool = False
     discrete: bool = False
 
@@ -62,194 +72,151 @@ class VariableTable:
     outputs: tuple[Variable, ...]
 
 
-def fixed(
-    name: str, shape: tuple[int, ...], unit: str, description: str, minimum: float, maximum: float, nominal: float
-) -> Variable:
-    """A parameter that stays as it is once initialisation ends."""
-    return Variable(name, shape, unit, "parameter", description, minimum, maximum, nominal)
+Shape = tuple[int, ...]
+Maker = Callable[..., Variable]
 
 
-def tunable(
-    name: str, shape: tuple[int, ...], unit: str, description: str, minimum: float, maximum: float, nominal: float
-) -> Variable:
-    """A parameter that may change during a run."""
-    return Variable(name, shape, unit, "parameter", description, minimum, maximum, nominal, tunable=True)
+_state: Maker = partial(Variable, causality="state")
+_input: Maker = partial(Variable, causality="input")
+_fixed: Maker = partial(Variable, causality="parameter")
+_tunable: Maker = partial(Variable, causality="parameter", tunable=True)
+_output: Maker = partial(Variable, causality="output")
 
 
-def output(
-    name: str, shape: tuple[int, ...], unit: str, description: str, minimum: float, maximum: float, nominal: float
-) -> Variable:
-    """What the plant tells of itself."""
-    return Variable(name, shape, unit, "output", description, minimum, maximum, nominal)
+def _pose(make: Maker, prefix: str, dimensions: int, when: str = "") -> tuple[Variable, Variable]:
+    position = make(f"{prefix}position", (dimensions,), "m", f"origin of {{2}}{when}", -100, 100, 0.1)
+    if dimensions == 2:
+        return position, make(f"{prefix}angle", (), "rad", f"from {{1}} to {{2}}{when}, counter-clockwise", -1e3, 1e3, 1)
+    return position, make(f"{prefix}quaternion", (4,), "1", f"rotation of {{2}} to {{1}}{when}, w first", -1.001, 1.001, 1)
 
 
-TINY = 1e-9
-"""Smallest value of what must be positive."""
-
-
-def actuator_states(legs: int) -> tuple[Variable, ...]:
-    """Of motors and brakes, in any plant of so many legs."""
+def _twist(make: Maker, prefix: str, dimensions: int) -> tuple[Variable, Variable]:
     return (
-        Variable("state.current", (legs,), "A", "state", "motor currents", -1e4, 1e4, 1),
-        Variable("state.brake_deflection", (legs,), "m", "state", "elastic deflection of the brakes", -0.1, 0.1, 1e-4),
+        make(f"{prefix}velocity", (dimensions,), "m/s", "velocity of the origin of {2}", -100, 100, 0.1),
+        make(f"{prefix}angular_velocity", _turning(dimensions), "rad/s", "angular velocity of {2}", -1e3, 1e3, 0.1),
     )
 
 
-def drive_inputs(legs: int) -> tuple[Variable, ...]:
-    """Of the drives of so many legs."""
+def _turning(dimensions: int) -> Shape:
+    """The shape of an angular velocity or a torque."""
+    return (3,) if dimensions == 3 else ()
+
+
+def _states(legs: int, dimensions: int) -> tuple[Variable, ...]:
     return (
-        Variable(
-            "velocity_command", (legs,), "m/s", "input", "commanded speed of each leg, positive when it grows", -10, 10, 0.1
-        ),
-        Variable("drive_mode", (legs,), "1", "input", "0 open, 1 brake, 2 velocity", OPEN, VELOCITY, 1, discrete=True),
+        *_pose(_state, "state.", dimensions),
+        *_twist(_state, "state.", dimensions),
+        _state("state.current", (legs,), "A", "motor currents", -1e4, 1e4, 1),
+        _state("state.brake_deflection", (legs,), "m", "elastic deflection of the brakes", -0.1, 0.1, 1e-4),
     )
 
 
-def joint_parameters(legs: int, dimensions: int) -> tuple[Variable, ...]:
-    """Where so many legs are joined, in the plane or in space."""
-    shape = (legs, dimensions)
+def _inputs(legs: int, dimensions: int) -> tuple[Variable, ...]:
+    sense = "" if dimensions == 3 else ", counter-clockwise"
     return (
-        fixed("base_joints", shape, "m", "base joint of each leg", -100, 100, 0.1),
-        fixed("platform_joints", shape, "m", "platform joint of each leg, in {2}", -100, 100, 0.1),
+        _input("velocity_command", (legs,), "m/s", "commanded speed of each leg, positive when it grows", -10, 10, 0.1),
+        _input("drive_mode", (legs,), "1", "0 open, 1 brake, 2 velocity", OPEN, VELOCITY, 1, discrete=True),
+        _input("external_wrench.force", (dimensions,), "N", "force on the origin of {2}", -1e6, 1e6, 100),
+        _input("external_wrench.torque", _turning(dimensions), "N.m", f"torque on the platform{sense}", -1e6, 1e6, 10),
     )
 
 
-def body_parameters(dimensions: int) -> tuple[Variable, ...]:
-    """Of platform and payload, in the plane or in space, where an inertia is a matrix."""
+def _body(make: Maker, body: str, dimensions: int, least: float) -> tuple[Variable, ...]:
+    """Mass properties of platform or payload; in the plane the inertia is a number."""
     spatial = dimensions == 3
-    made: list[Variable] = []
-    for body, make, least in (("platform", fixed, TINY), ("payload", tunable, 0.0)):
-        about = f"inertia of the {body} about its centre of mass{', in {2}' if spatial else ''}"
-        made += [
-            make(f"{body}.mass", (), "kg", f"mass of the {body}", least, 1e6, 1),
-            make(f"{body}.center_of_mass", (dimensions,), "m", f"centre of mass of the {body}, in {{2}}", -100, 100, 0.1),
-            make(f"{body}.inertia", (3, 3) if spatial else (), "kg.m2", about, -1e8 if spatial else least, 1e8, 0.01),
-        ]
-    return tuple(made)
-
-
-LEG_PARAMETERS = (
-    fixed("leg.lower.mass", (), "kg", "motor, gearbox and IMU: what turns about the base joint", TINY, 1e5, 1),
-    fixed("leg.lower.center", (), "m", "centre of mass of the lower part, from the base joint along the leg", -100, 100, 0.1),
-    fixed("leg.lower.inertia", (), "kg.m2", "transverse inertia of the lower part about its centre of mass", 0, 1e6, 0.01),
-    fixed("leg.lower.axial_inertia", (), "kg.m2", "inertia of the lower part about the leg's axis", 0, 1e6, 1e-3),
-    fixed("leg.upper.mass", (), "kg", "mass of the rod", TINY, 1e5, 1),
-    fixed("leg.upper.center", (), "m", "centre of mass of the rod, from the platform joint back along the leg", -100, 100, 0.1),
-    fixed("leg.upper.inertia", (), "kg.m2", "transverse inertia of the rod about its centre of mass", 0, 1e6, 0.01),
-    fixed("leg.upper.axial_inertia", (), "kg.m2", "inertia of the rod about the leg's axis", 0, 1e6, 1e-3),
-)
-"""Of every leg's two parts; the inertias about the leg's axis, whose names end in `axial_inertia`, are for legs in space."""
-
-
-def actuator_parameters(legs: int) -> tuple[Variable, ...]:
-    """Of the motors, drives, frictions, brakes and end stops of so many legs."""
+    about = f"inertia of the {body} about its centre of mass{', in {2}' if spatial else ''}"
     return (
-        fixed("motor.resistance", (legs,), "Ohm", "winding resistance", TINY, 1e6, 1),
-        fixed("motor.inductance", (), "H", "winding inductance", TINY, 1e3, 1e-3),
-        fixed("motor.torque_constant", (), "N.m/A", "torque constant, equal to the back-EMF constant", TINY, 1e3, 0.1),
-        fixed("motor.rotor_inertia", (), "kg.m2", "inertia of rotor and screw", TINY, 1e3, 1e-5),
-        fixed("motor.screw_lead", (), "m", "advance of the leg per turn", 1e-6, 10, 0.01),
-        fixed("drive.nominal_resistance", (), "Ohm", "winding resistance that the drive assumes", 0, 1e6, 1),
-        fixed("drive.compensation", (), "1", "share kappa of the resistive drop that the drive makes up for", 0, 10, 1),
-        fixed("drive.voltage_limit", (), "V", "largest voltage of the drive", TINY, 1e5, 10),
-        fixed("drive.current_limit", (), "A", "largest current of the drive", TINY, 1e4, 10),
-        fixed("drive.current_time_constant", (), "s", "time constant of the current limiter", TINY, 100, 1e-3),
-        tunable("friction.coulomb", (legs,), "N", "Coulomb friction of each leg", 0, 1e6, 10),
-        tunable("friction.viscous", (legs,), "N.s/m", "viscous friction of each leg", 0, 1e6, 10),
-        tunable("friction.velocity", (), "m/s", "speed over which Coulomb friction changes sign", TINY, 10, 1e-3),
-        fixed("brake.force", (), "N", "force at which a closed brake slips", TINY, 1e7, 1e3),
-        fixed("brake.stiffness", (), "N/m", "stiffness of a closed brake", TINY, 1e10, 1e6),
-        fixed("brake.damping", (), "N.s/m", "damping of a closed brake", 0, 1e7, 1e3),
-        fixed("brake.release_time", (), "s", "time constant with which an opened brake relaxes", TINY, 100, 0.01),
-        fixed("stop.minimum_length", (legs,), "m", "leg length at which the lower end stop touches", 0, 100, 0.1),
-        fixed("stop.maximum_length", (legs,), "m", "leg length at which the upper end stop touches", TINY, 100, 0.1),
-        fixed("stop.stiffness", (), "N/m", "stiffness of the end stops", 0, 1e10, 1e6),
-        fixed("stop.damping", (), "s/m", "damping of the end stops relative to their force", 0, 1e4, 1),
+        make(f"{body}.mass", (), "kg", f"mass of the {body}", least, 1e6, 1),
+        make(f"{body}.center_of_mass", (dimensions,), "m", f"centre of mass of the {body}, in {{2}}", -100, 100, 0.1),
+        make(f"{body}.inertia", (3, 3) if spatial else (), "kg.m2", about, -1e8 if spatial else least, 1e8, 0.01),
     )
 
 
-def surroundings_parameters(legs: int) -> tuple[Variable, ...]:
-    """Of the fields around the mechanism and the places of its IMUs."""
+def _leg_part(name: str, part: str, mass: str, center: str, dimensions: int) -> tuple[Variable, ...]:
+    """Mass properties of one part of every leg; a planar leg does not turn about its axis."""
+    axial = _fixed(f"leg.{name}.axial_inertia", (), "kg.m2", f"inertia of the {part} about the leg's axis", 0, 1e6, 1e-3)
     return (
-        tunable("gravity", (3,), "m/s2", "acceleration of gravity", -1e3, 1e3, 10),
-        fixed("magnetic_field", (3,), "uT", "magnetic field of the earth", -1e4, 1e4, 10),
-        fixed(
-            "leg_imu_position", (legs, 3), "m", "place of each leg's IMU from the base joint, in the leg frame", -100, 100, 0.1
-        ),
-        fixed("platform_imu_position", (3,), "m", "place of the platform's IMU, in {2}", -100, 100, 0.1),
+        _fixed(f"leg.{name}.mass", (), "kg", mass, TINY, 1e5, 1),
+        _fixed(f"leg.{name}.center", (), "m", f"centre of mass of the {part}, from the {center} the leg", -100, 100, 0.1),
+        _fixed(f"leg.{name}.inertia", (), "kg.m2", f"transverse inertia of the {part} about its centre of mass", 0, 1e6, 0.01),
+        *((axial,) if dimensions == 3 else ()),
     )
 
 
-SUBSTEP = fixed("substep", (), "s", "largest internal integration step", 1e-6, 0.1, 1e-3)
-
-
-def imu_outputs(legs: int) -> tuple[Variable, ...]:
-    """The ideal signals of the IMUs on so many legs and the platform."""
-    shape, which = (legs + 1, 3), f"legs 0-{legs - 1}, platform; sensor frames"
+def _parameters(legs: int, dimensions: int) -> tuple[Variable, ...]:
+    each, joints = (legs,), (legs, dimensions)
+    axes = _fixed(
+        "base_joint_axes", joints, "1", "unit first axis of each universal joint, fixed in the base", -1.001, 1.001, 1
+    )
+    lower = "motor, gearbox and IMU: everything that turns about the base joint"
     return (
-        output("imu_angular_velocity", shape, "rad/s", f"ideal gyroscopes: {which}", -1e3, 1e3, 0.1),
-        output("imu_specific_force", shape, "m/s2", f"ideal accelerometers: {which}", -1e5, 1e5, 10),
-        output("imu_magnetic_field", shape, "uT", f"ideal magnetometers: {which}", -2e4, 2e4, 10),
+        _fixed("base_joints", joints, "m", "base joint of each leg", -100, 100, 0.1),
+        _fixed("platform_joints", joints, "m", "platform joint of each leg, in {2}", -100, 100, 0.1),
+        *((axes,) if dimensions == 3 else ()),
+        *_body(_fixed, "platform", dimensions, TINY),
+        *_body(_tunable, "payload", dimensions, 0.0),
+        *_leg_part("lower", "lower part", lower, "base joint along", dimensions),
+        *_leg_part("upper", "rod", "mass of the rod", "platform joint back along", dimensions),
+        _fixed("motor.resistance", each, "Ohm", "winding resistance", TINY, 1e6, 1),
+        _fixed("motor.inductance", (), "H", "winding inductance", TINY, 1e3, 1e-3),
+        _fixed("motor.torque_constant", (), "N.m/A", "torque constant, equal to the back-EMF constant", TINY, 1e3, 0.1),
+        _fixed("motor.rotor_inertia", (), "kg.m2", "inertia of rotor and screw", TINY, 1e3, 1e-5),
+        _fixed("motor.screw_lead", (), "m", "advance of the leg per turn", 1e-6, 10, 0.01),
+        _fixed("drive.nominal_resistance", (), "Ohm", "winding resistance that the drive assumes", 0, 1e6, 1),
+        _fixed("drive.compensation", (), "1", "share kappa of the resistive drop that the drive compensates", 0, 10, 1),
+        _fixed("drive.voltage_limit", (), "V", "largest voltage of the drive", TINY, 1e5, 10),
+        _fixed("drive.current_limit", (), "A", "largest current of the drive", TINY, 1e4, 10),
+        _fixed("drive.current_time_constant", (), "s", "time constant of the current limiter", TINY, 100, 1e-3),
+        _tunable("friction.coulomb", each, "N", "Coulomb friction of each leg", 0, 1e6, 10),
+        _tunable("friction.viscous", each, "N.s/m", "viscous friction of each leg", 0, 1e6, 10),
+        _tunable("friction.velocity", (), "m/s", "speed over which Coulomb friction changes sign", TINY, 10, 1e-3),
+        _fixed("brake.force", (), "N", "force at which a closed brake slips", TINY, 1e7, 1e3),
+        _fixed("brake.stiffness", (), "N/m", "stiffness of a closed brake", TINY, 1e10, 1e6),
+        _fixed("brake.damping", (), "N.s/m", "damping of a closed brake", 0, 1e7, 1e3),
+        _fixed("brake.release_time", (), "s", "time constant with which an opened brake relaxes", TINY, 100, 0.01),
+        _fixed("stop.minimum_length", each, "m", "leg length at which the lower end stop touches", 0, 100, 0.1),
+        _fixed("stop.maximum_length", each, "m", "leg length at which the upper end stop touches", TINY, 100, 0.1),
+        _fixed("stop.stiffness", (), "N/m", "stiffness of the end stops", 0, 1e10, 1e6),
+        _fixed("stop.damping", (), "s/m", "damping of the end stops relative to their force", 0, 1e4, 1),
+        _tunable("gravity", (3,), "m/s2", "acceleration of gravity", -1e3, 1e3, 10),
+        _fixed("magnetic_field", (3,), "uT", "magnetic field of the earth", -1e4, 1e4, 10),
+        _fixed("leg_imu_position", (legs, 3), "m", "each leg's IMU from the base joint, in the leg frame", -100, 100, 0.1),
+        _fixed("platform_imu_position", (3,), "m", "the platform's IMU, in {2}", -100, 100, 0.1),
+        *_pose(_fixed, "initial_", dimensions, " at the start"),
+        _fixed("substep", (), "s", "largest internal integration step", 1e-6, 0.1, 1e-3),
     )
 
 
-def actuator_outputs(legs: int) -> tuple[Variable, ...]:
-    """Of so many legs and their actuators, and the balance of energy."""
+def _outputs(legs: int, dimensions: int) -> tuple[Variable, ...]:
+    imus, which = (legs + 1, 3), f"legs 0-{legs - 1}, platform; sensor frames"
     return (
-        output("leg_length", (legs,), "m", "lengths of the legs", 0, 400, 0.1),
-        output("leg_velocity", (legs,), "m/s", "rates of the lengths", -1e3, 1e3, 0.1),
-        output("current", (legs,), "A", "motor currents", -1e4, 1e4, 1),
-        output("voltage", (legs,), "V", "drive voltages that are asked for, within the voltage limit", -1e5, 1e5, 10),
-        output("kinetic_energy", (), "J", "of all bodies and rotors", 0, 1e9, 1),
-        output("potential_energy", (), "J", "of all bodies in the field of gravity", -1e9, 1e9, 10),
-        output("power.drive", (), "W", "mechanical power of the motors", -1e9, 1e9, 10),
-        output("power.friction", (), "W", "power lost in friction, as a negative number", -1e9, 0, 1),
-        output("power.brake", (), "W", "power of the brakes on the legs", -1e9, 1e9, 1),
-        output("power.stop", (), "W", "power of the end stops on the legs", -1e9, 1e9, 1),
-        output("power.external", (), "W", "power of the external wrench", -1e9, 1e9, 1),
+        _output("imu_angular_velocity", imus, "rad/s", f"ideal gyroscopes: {which}", -1e3, 1e3, 0.1),
+        _output("imu_specific_force", imus, "m/s2", f"ideal accelerometers: {which}", -1e5, 1e5, 10),
+        _output("imu_magnetic_field", imus, "uT", f"ideal magnetometers: {which}", -2e4, 2e4, 10),
+        *_pose(_output, "", dimensions),
+        *_twist(_output, "", dimensions),
+        _output("leg_length", (legs,), "m", "lengths of the legs", 0, 400, 0.1),
+        _output("leg_velocity", (legs,), "m/s", "rates of the lengths", -1e3, 1e3, 0.1),
+        _output("current", (legs,), "A", "motor currents", -1e4, 1e4, 1),
+        _output("voltage", (legs,), "V", "voltages that the drives ask for, within the voltage limit", -1e5, 1e5, 10),
+        _output("kinetic_energy", (), "J", "of all bodies and rotors", 0, 1e9, 1),
+        _output("potential_energy", (), "J", "of all bodies in the field of gravity", -1e9, 1e9, 10),
+        _output("power.drive", (), "W", "mechanical power of the motors", -1e9, 1e9, 10),
+        _output("power.friction", (), "W", "power lost in friction, as a negative number", -1e9, 0, 1),
+        _output("power.brake", (), "W", "power of the brakes on the legs", -1e9, 1e9, 1),
+        _output("power.stop", (), "W", "power of the end stops on the legs", -1e9, 1e9, 1),
+        _output("power.external", (), "W", "power of the external wrench", -1e9, 1e9, 1),
     )
 
 
-STATES = (
-    Variable("state.position", (3,), "m", "state", "origin of the platform frame {2}", -100, 100, 0.1),
-    Variable("state.quaternion", (4,), "1", "state", "rotation of {2} to {1}, w first", -1.001, 1.001, 1),
-    Variable("state.velocity", (3,), "m/s", "state", "velocity of the origin of {2}", -100, 100, 0.1),
-    Variable("state.angular_velocity", (3,), "rad/s", "state", "angular velocity of {2}", -1e3, 1e3, 0.1),
-    *actuator_states(6),
+SPATIAL, PLANAR = (
+    VariableTable(_states(*size), _inputs(*size), _parameters(*size), _outputs(*size)) for size in ((6, 3), (3, 2))
 )
-
-INPUTS = (
-    *drive_inputs(6),
-    Variable("external_wrench.force", (3,), "N", "input", "force on the origin of {2}", -1e6, 1e6, 100),
-    Variable("external_wrench.torque", (3,), "N.m", "input", "torque on the platform", -1e6, 1e6, 10),
-)
-
-PARAMETERS = (
-    *joint_parameters(6, 3),
-    fixed("base_joint_axes", (6, 3), "1", "unit first axis of each universal joint, fixed in the base", -1.001, 1.001, 1),
-    *body_parameters(3),
-    *LEG_PARAMETERS,
-    *actuator_parameters(6),
-    *surroundings_parameters(6),
-    fixed("initial_position", (3,), "m", "origin of {2} at the start", -100, 100, 0.1),
-    fixed("initial_quaternion", (4,), "1", "rotation of {2} to {1} at the start, w first", -1.001, 1.001, 1),
-    SUBSTEP,
-)
-
-OUTPUTS = (
-    *imu_outputs(6),
-    output("position", (3,), "m", "origin of {2}", -100, 100, 0.1),
-    output("quaternion", (4,), "1", "rotation of {2} to {1}, w first", -1.001, 1.001, 1),
-    output("velocity", (3,), "m/s", "velocity of the origin of {2}", -100, 100, 0.1),
-    output("angular_velocity", (3,), "rad/s", "angular velocity of {2}", -1e3, 1e3, 0.1),
-    *actuator_outputs(6),
-)
-
-SPATIAL = VariableTable(STATES, INPUTS, PARAMETERS, OUTPUTS)
+"""The variables of the plants with six legs in space and with three legs in the plane."""
 
 
 def checked_parameters(values: Mapping[str, ArrayLike], table: VariableTable = SPATIAL) -> dict[str, Array]:
-    """Check parameter values against a table; scalars are spread over arrays.
+    """Check parameter values against a table; a number is repeated for an array of one dimension.
 
     Raises:
         UnknownNameError: a name that is no parameter.

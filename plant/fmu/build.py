@@ -25,8 +25,7 @@ from typing import Any
 import fmpy
 
 from plant.compiled import hash_of_files, keyed_folder
-from plant.dynamics.planar_variables import PLANAR
-from plant.dynamics.variables import SPATIAL, Variable, VariableTable
+from plant.dynamics.variables import PLANAR, SPATIAL, Variable, VariableTable
 from plant.errors import InputError, ToolchainError
 from plant.files import check_writable, write_whole
 from plant.fmu.description import Dependencies, Layout, build_description, model_description, start_of

@@ -1,16 +1,9 @@
 """Mechanisms: geometry, limits, class and presets of a rig."""
 
+from plant.mechanism.documents import load_in_space, load_mechanism, load_spatial, mechanism_text
 from plant.mechanism.limits import Limits
 from plant.mechanism.planar import PlanarMechanism
-from plant.mechanism.spatial import (
-    LEGS,
-    Mechanism,
-    load_in_space,
-    load_mechanism,
-    load_spatial,
-    mechanism_text,
-    six_rows,
-)
+from plant.mechanism.spatial import LEGS, Mechanism, six_rows
 
 __all__ = [
     "LEGS",

@@ -22,7 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from plant.errors import InputError
 from plant.mechanism import LEGS, Mechanism
-from plant.mechanism.planar import PLANAR_LEGS, SAME_JOINT_M, PlanarMechanism
+from plant.mechanism.checks import SAME_JOINT_M
+from plant.mechanism.planar import PLANAR_LEGS, PlanarMechanism
 from plant.pose import Array, numbers, rotation_from_vector
 
 MOST_LEGS = 3

@@ -1,4 +1,4 @@
-"""What the actuators of a mechanism can do."""
+"""The limits of a mechanism's actuators."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -9,13 +9,17 @@ from numpy.typing import ArrayLike
 
 from plant.errors import InputError
 from plant.pose import Array, checked_array, numbers
+from plant.toml import check_entries
 
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """What the actuators can do: `stroke` (n, 2), least and greatest length of each leg [m], and along each leg the
-    greatest `velocity` [m/s], `acceleration` [m/s^2] and `jerk` [m/s^3]. The end stops of the plant lie
-    `stop_clearance` [m] beyond the stroke.
+    """Limits of the actuators of n legs.
+
+    Attributes:
+        stroke: (n, 2), least and greatest length of each leg [m].
+        velocity, acceleration, jerk: greatest along each leg [m/s, m/s^2, m/s^3].
+        stop_clearance: distance of the plant's end stops beyond the stroke [m].
 
     Raises:
         InputError: an empty or non-positive stroke, or a limit that is not positive.
@@ -47,17 +51,18 @@ def _checked_stroke(value: ArrayLike) -> Array:
 
 
 def checked_limits(limits: Mapping[str, Any], legs: int, lengths: Array | None) -> Limits:
-    """The limits of a mechanism of so many legs from the fields of `Limits`.
+    """The limits of a mechanism from the fields of `Limits`.
 
     Args:
         limits: a stroke of (2,) [m] counts from the home lengths, (legs, 2) is absolute.
-        legs: how many there are.
-        lengths: (legs,) [m] at home, None without one.
+        legs: their number.
+        lengths: (legs,) [m] at home; None without a home.
 
     Raises:
-        InputError: an unknown entry, no stroke, one about a home that is not given, one that home is outside of, or a limit
-            that is not positive.
+        InputError: an unknown entry, no stroke, a stroke about a missing home, a home outside the stroke, or a limit that is
+            not positive.
     """
+    check_entries(limits, sorted(field.name for field in fields(Limits)), "[limits]")
     shape = f"({legs}, 2)"
     if "stroke" not in limits:
         raise InputError(f"the limits lack the stroke: two numbers in metres about the home lengths, or {shape} lengths")
@@ -66,9 +71,6 @@ def checked_limits(limits: Mapping[str, Any], legs: int, lengths: Array | None) 
         if lengths is None:
             raise InputError(f"a stroke of two numbers counts from the home lengths: give a home pose, or {shape} lengths")
         stroke = lengths[:, None] + checked_array(stroke, (2,), "stroke")
-    unknown = set(limits) - {field.name for field in fields(Limits)}
-    if unknown:
-        raise InputError(f"the limits have no entry {sorted(unknown)[0]!r}")
     checked = Limits(**{**limits, "stroke": checked_array(stroke, (legs, 2), "stroke")})
     if lengths is not None:
         leg = int(np.argmax(np.maximum(checked.stroke[:, 0] - lengths, lengths - checked.stroke[:, 1])))

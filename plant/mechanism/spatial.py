@@ -1,36 +1,22 @@
-"""Mechanisms: the geometry of the legs, their limits, and the data of plant and controller that belong to one rig.
+"""Mechanisms in space: the geometry of the legs, their limits, and the data of plant and controller for one rig.
 
 Leg k joins base joint k, row k of an array (6, 3) in {1}, and platform joint k, row k of an array (6, 3) in {2}; a
 shared joint is a repeated row. The two arrays alone are enough for kinematics.
 """
 
-import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from importlib import resources
-from pathlib import Path
-from types import MappingProxyType
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plant.checks import checked_seed
-from plant.dynamics.planar_variables import PLANAR
-from plant.dynamics.variables import SPATIAL, TINY, checked_parameters
-from plant.errors import InputError, UnknownNameError, UnreachableError
+from plant.dynamics.variables import PLANAR, SPATIAL, TINY, checked_parameters
+from plant.errors import InputError, UnreachableError
+from plant.mechanism.checks import SAME_JOINT_M, check_legs_differ, checked_joints, checked_plant, read_only
 from plant.mechanism.limits import Limits, checked_limits
-from plant.mechanism.planar import (
-    PLANAR_LEGS,
-    SAME_JOINT_M,
-    PlanarMechanism,
-    check_drives,
-    check_legs_differ,
-    check_not_derived,
-    check_tables,
-    flattened,
-    planar_from_document,
-)
+from plant.mechanism.planar import PLANAR_LEGS, PlanarMechanism
 from plant.pose import (
     Array,
     Pose,
@@ -38,7 +24,6 @@ from plant.pose import (
     checked_rotation,
     checked_unit,
     quaternion_from_rotation,
-    rotation_from_quaternion,
     rotation_from_vector,
 )
 
@@ -46,25 +31,25 @@ LEGS = 6
 
 
 def six_rows(values: Array, filling: ArrayLike = 0.0) -> Array:
-    """Values by leg (n, ...) for arrays of six, with a filling in the rows of the legs that there are not."""
+    """Values by leg (n, ...) as an array of six rows; `filling` fills the rows of missing legs."""
     rows: Array = np.empty((LEGS, *values.shape[1:]))
     rows[: len(values)], rows[len(values) :] = values, filling
     return rows
 
 
 _NOMINAL_HEIGHT = 7.0 / 6.0
-"""Height of a nominal home over the base's radius."""
+"""Height of a nominal home, as a multiple of the base's radius."""
 
 _BUILDING = 1
-"""Keeps the joint errors apart from whatever else a seed draws."""
+"""Separates the joint errors from everything else that a seed draws."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mechanism:
-    """A mechanism of n = 6 legs, or a planar one of n = 3 seen in space; checked when it is built and never changed.
+    """A mechanism of n = 6 legs, or a planar one of n = 3 seen in space; checked when it is built, then read-only.
 
     Attributes:
-        name: what it is called in messages and reports.
+        name: for messages and reports.
         base_joints: (n, 3) [m] in {1}.
         platform_joints: (n, 3) [m] in {2}.
         base_joint_axes: (n, 3), unit; the first axis of each universal joint, fixed in the base. At rest the axis of
@@ -73,8 +58,8 @@ class Mechanism:
         up_in_base: (3,), unit; the vertical seen in {1}.
         home: the pose that strokes and targets are measured from, or None.
         limits: the actuators' limits, or None.
-        plant: parameters of the dynamics by the names of `plant.dynamics.variables`, or `plant.dynamics.planar_variables`.
-        settings: the tables `control`, `fusion` and `safety` of the preset, for the controller to read.
+        plant: parameters of the dynamics by the names of `plant.dynamics.variables`.
+        settings: the tables `control`, `fusion` and `safety`, which the controller reads.
     """
 
     name: str
@@ -102,7 +87,7 @@ class Mechanism:
         plant: Mapping[str, ArrayLike] | None = None,
         settings: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> "Mechanism":
-        """Build a mechanism from its two arrays of joints; all else may be left out.
+        """Build a mechanism from its two arrays of joints; everything else is optional.
 
         Args:
             base_joints: (6, 3) [m], in {1}.
@@ -110,25 +95,25 @@ class Mechanism:
             name: for messages and reports.
             up_in_base: (3,), the unit vertical seen in {1}.
             base_joint_axes: (6, 3), unit; by default e_z x (home direction), horizontal in {1}.
-            home: pose of reference; without one, `nominal_home` settles the default axes but no length.
+            home: reference pose; without it, `nominal_home` defines the default axes but no length.
             limits: the fields of `Limits`; a stroke of (2,) [m] counts from the home lengths, (6, 2) is absolute.
             plant: parameters of the dynamics by name.
             settings: the tables `control`, `fusion` and `safety`.
 
         Raises:
-            InputError: arrays of the wrong shape or not finite, legs that coincide, joints all on one line, an axis
-                along its leg, an empty stroke, a limit that is not positive, or a stroke about a home that is not given.
+            InputError: arrays of the wrong shape or not finite, legs that coincide, joints all on one line, an axis along its
+                leg, an empty stroke, a limit that is not positive, a stroke about a missing home, or a plant parameter that
+                makes no sense.
             UnknownNameError: a plant parameter that does not exist.
         """
-        base = checked_array(base_joints, (LEGS, 3), "base_joints")
-        platform = checked_array(platform_joints, (LEGS, 3), "platform_joints")
-        _check_joints(base, platform)
+        base, platform = checked_joints(base_joints, platform_joints, (LEGS, 3))
+        _check_spread(base, platform)
         home = None if home is None else _checked_home(home)
         up = checked_unit(up_in_base, 3, "up_in_base")
         directions = _home_directions(base, platform, home, up)
         axes = _joint_axes(base_joint_axes, directions)
-        parameters = checked_parameters(plant or {})
-        _check_plant(parameters, up)
+        parameters = checked_plant(plant, SPATIAL)
+        _check_bodies(parameters, up)
         lengths = None if home is None else np.linalg.norm(home.position + platform @ home.rotation.T - base, axis=1)
         return cls(
             name=name,
@@ -139,16 +124,16 @@ class Mechanism:
             up_in_base=up,
             home=home,
             limits=None if limits is None else checked_limits(limits, LEGS, lengths),
-            plant=MappingProxyType(parameters),
-            settings=MappingProxyType({key: MappingProxyType(dict(table)) for key, table in (settings or {}).items()}),
+            plant=parameters,
+            settings=read_only(settings),
         )
 
     @classmethod
     def from_planar(cls, planar: PlanarMechanism) -> "Mechanism":
-        """A planar mechanism in space: its plane is the xy-plane of {1}, whose normal is the first axis of every joint.
+        """A planar mechanism in space: it moves in the xy-plane of {1}, whose normal is the first axis of every joint.
 
         Raises:
-            InputError: it has no home pose, or a leg without length there.
+            InputError: it has no home pose, or a leg has no length at home.
         """
         if planar.home is None:
             raise InputError(f"the mechanism {planar.name!r} has no home pose: give one")
@@ -170,23 +155,23 @@ class Mechanism:
 
     @property
     def legs(self) -> int:
-        """How many legs there are, 6 or 3."""
+        """The number of legs, 6 or 3."""
         return len(self.base_joints)
 
     @property
     def planar(self) -> bool:
-        """Whether the platform moves in the xy-plane of {1} alone."""
+        """Whether the platform moves only in the xy-plane of {1}."""
         return self.legs == PLANAR_LEGS
 
     @property
     def nominal_home(self) -> Pose:
-        """Home, or for want of one a pose without rotation whose platform joints stand above the base's."""
+        """Home; without one, a pose without rotation whose platform joints lie above the base joints."""
         return self.home or _nominal_home(self.base_joints, self.platform_joints, self.up_in_base)
 
     @property
     def joint_rotations(self) -> Array:
-        """(n, 3, 3): the rotation of each joint frame to {1}; x is the joint's first axis, z the home direction made
-        perpendicular to it. A leg's frame is `joint_rotation @ Rx(a) @ Ry(b)` with the leg along its z axis.
+        """(n, 3, 3): the rotation of each joint frame to {1}; x is the joint's first axis, z the component of the home
+        direction perpendicular to it. A leg's frame is `joint_rotation @ Rx(a) @ Ry(b)` with the leg along its z axis.
         """
         x = self.base_joint_axes
         z = self.home_directions - np.sum(self.home_directions * x, axis=1, keepdims=True) * x
@@ -197,21 +182,22 @@ class Mechanism:
         """The same mechanism with its base and platform joints moved by (2, n, 3) [m]."""
         base, platform = self.base_joints + moves[0], self.platform_joints + moves[1]
         if not self.planar:
-            _check_joints(base, platform)
+            check_legs_differ(base, platform)
+            _check_spread(base, platform)
         return replace(self, base_joints=base, platform_joints=platform)
 
     def distinct_joints(self) -> NDArray[np.int64]:
-        """(2, n): for base and platform, the first leg that has the same joint as each leg."""
+        """(2, n): for base and platform, the first leg that shares each leg's joint."""
         joints = np.stack([self.base_joints, self.platform_joints])
         apart = np.linalg.norm(joints[:, :, None] - joints[:, None], axis=3)
         first: NDArray[np.int64] = np.argmax(apart < SAME_JOINT_M, axis=2)
         return first
 
     def built(self, joint_error: float, seed: int) -> "Mechanism":
-        """The mechanism as a workshop would build it, each joint's coordinates off by a standard deviation [m].
+        """The mechanism as built, with a normal error of each joint coordinate of standard deviation `joint_error` [m].
 
         Raises:
-            InputError: the joint error is negative or not below a tenth of the base's radius.
+            InputError: the joint error is negative, or at least a tenth of the base's radius.
         """
         most = 0.1 * float(np.linalg.norm(self.base_joints - self.base_joints.mean(axis=0), axis=1).max())
         if not 0.0 <= joint_error < most:
@@ -225,7 +211,7 @@ class Mechanism:
         """Check leg lengths (..., n) [m] against the stroke.
 
         Raises:
-            UnreachableError: names the leg that is furthest outside, its length, and by how much.
+            UnreachableError: names the leg furthest outside, its length, and the excess.
             InputError: the mechanism has no stroke.
         """
         stroke = self.require_limits().stroke
@@ -294,161 +280,20 @@ class Mechanism:
         return checked_parameters({name: values[name] for name in names}, table)
 
 
-_PRESETS = resources.files("plant.mechanism") / "presets"
-
-
-def load_spatial(name_or_path: str | Path) -> Mechanism:
-    """`load_mechanism` where only six legs will do.
-
-    Raises:
-        InputError: the mechanism is planar.
-    """
-    mechanism = load_mechanism(name_or_path)
-    if isinstance(mechanism, PlanarMechanism):
-        raise InputError(f"{name_or_path} has three legs in the plane; this needs six in space: choose another mechanism")
-    return mechanism
-
-
-def load_in_space(name_or_path: str | Path) -> Mechanism:
-    """`load_mechanism` for the loop, with a planar mechanism seen in space.
-
-    Raises:
-        InputError: a planar mechanism has no home pose.
-    """
-    mechanism = load_mechanism(name_or_path)
-    return Mechanism.from_planar(mechanism) if isinstance(mechanism, PlanarMechanism) else mechanism
-
-
-def load_mechanism(name_or_path: str | Path) -> Mechanism | PlanarMechanism:
-    """Load a preset by its name, or a mechanism from a TOML file; rows of two numbers make it a planar one.
-
-    Raises:
-        UnknownNameError: no such preset, and no such file.
-        InputError: the file is not TOML, or its content is not a mechanism.
-    """
-    source = str(name_or_path)
-    try:
-        document = tomllib.loads(mechanism_text(name_or_path))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{source} is not valid TOML: {error}") from None
-    try:
-        return _from_document(_completed(document, source))
-    except (InputError, UnknownNameError) as error:
-        raise type(error)(f"{source}: {error}") from None
-
-
-def mechanism_text(name_or_path: str | Path) -> str:
-    """The TOML text of a preset, or of a file.
-
-    Raises:
-        UnknownNameError: no such preset, and no such file.
-        InputError: the file cannot be read.
-    """
-    if str(name_or_path) in _preset_names():
-        return _preset_text(str(name_or_path))
-    path = Path(name_or_path)
-    if not path.is_file():
-        raise UnknownNameError(f"no mechanism {str(path)!r}: neither a preset ({', '.join(_preset_names())}) nor a file")
-    try:
-        return path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read {path}: {error}") from None
-
-
-def _preset_names() -> list[str]:
-    return sorted(entry.name.removesuffix(".toml") for entry in _PRESETS.iterdir() if entry.name.endswith(".toml"))
-
-
-def _preset_text(name: str) -> str:
-    return (_PRESETS / f"{name}.toml").read_text()
-
-
-def _completed(document: dict[str, Any], source: str) -> dict[str, Any]:
-    """A document laid over the preset that it is based on, that one over its own, and so on; a name is not handed down."""
-    names = [source]
-    while "based_on" in document:
-        names.append(document.pop("based_on"))
-        if names[-1] not in _preset_names():
-            raise UnknownNameError(f"based_on names no preset: {names[-1]!r}; there are {', '.join(_preset_names())}")
-        if names[-1] in names[:-1]:
-            raise InputError(f"based_on goes round in a circle, {' -> '.join(names)}: leave one out")
-        preset = tomllib.loads(_preset_text(names[-1]))
-        preset.pop("name", None)
-        document = _merged(preset, document)
-    return document
-
-
-def _merged(under: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """Two nested tables as one; where both have an entry that is no table, `over` wins."""
-    shared = [key for key in under.keys() & over.keys() if isinstance(under[key], dict) and isinstance(over[key], dict)]
-    return under | over | {key: _merged(under[key], over[key]) for key in shared}
-
-
-_TABLES = {
-    "geometry": {"base_joints", "platform_joints", "base_joint_axes", "up_in_base"},
-    "home": {"position", "quaternion"},
-    "limits": {field.name for field in fields(Limits)},
-    "plant": None,
-    "control": None,
-    "fusion": None,
-    "safety": None,
-}
-
-
-def _is_planar(document: dict[str, Any]) -> bool:
-    try:
-        return bool(np.shape(document["geometry"]["base_joints"])[-1:] == (2,))
-    except (LookupError, TypeError, ValueError):
-        return False
-
-
-def _from_document(document: dict[str, Any]) -> Mechanism | PlanarMechanism:
-    if _is_planar(document):
-        return planar_from_document(document)
-    check_tables(document, _TABLES)
-    geometry = dict(document.get("geometry", {}))
-    for array in ("base_joints", "platform_joints"):
-        if array not in geometry:
-            raise InputError(f"[geometry] lacks {array}, an array of six rows of three numbers in metres")
-    home = None
-    if "home" in document:
-        quaternion = checked_unit(document["home"].get("quaternion", (1.0, 0.0, 0.0, 0.0)), 4, "home.quaternion")
-        position = checked_array(document["home"].get("position"), (3,), "home.position")
-        home = Pose(position, rotation_from_quaternion(quaternion))
-    return Mechanism.from_legs(
-        **geometry,
-        name=str(document.get("name", "custom")),
-        home=home,
-        limits=document.get("limits"),
-        plant=flattened(document.get("plant", {})),
-        settings={key: document.get(key, {}) for key in ("control", "fusion", "safety")},
-    )
-
-
-def _check_joints(base: Array, platform: Array) -> None:
-    check_legs_differ(base, platform)
+def _check_spread(base: Array, platform: Array) -> None:
     for name, joints in (("base", base), ("platform", platform)):
         spread = np.linalg.svd(joints - joints.mean(axis=0), compute_uv=False)
         if spread[1] < 1e-6 * max(spread[0], SAME_JOINT_M):
-            raise InputError(f"the {name} joints all lie on one line: no pose of six legs can be told or held")
+            raise InputError(f"the {name} joints all lie on one line: no pose of six legs can be measured or held")
 
 
-_DERIVED = (
-    "base_joints", "platform_joints", "base_joint_axes", "stop.minimum_length", "stop.maximum_length", "initial_position",
-    "initial_quaternion",
-)  # fmt: skip
-"""Plant parameters that follow from the rest of a mechanism."""
-
-
-def _check_plant(parameters: Mapping[str, Array], up: Array) -> None:
-    check_not_derived(parameters, _DERIVED)
+def _check_bodies(parameters: Mapping[str, Array], up: Array) -> None:
     for name in ("platform.inertia", "payload.inertia"):
         inertia = parameters.get(name, np.eye(3))
         if np.abs(inertia - inertia.T).max() > 1e-9 or np.linalg.eigvalsh(inertia).min() < 0.0:
             raise InputError(
                 f"{name} {inertia.tolist()} is no inertia: it must be symmetric without negative principal moments"
             )
-    check_drives(parameters)
     gravity = parameters.get("gravity", np.zeros(3))
     size = float(np.linalg.norm(gravity))
     if size > 0.0 and np.linalg.norm(gravity / size + up) > 1e-3:

@@ -1,7 +1,6 @@
 """Settings of the CANopen rig, from a TOML file: bus, node ids, units, signs and gear ratios; and the load on the bus."""
 
 import configparser
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from math import ceil, isfinite
@@ -14,6 +13,7 @@ from hil.rigs import RigError
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import InputError
 from plant.mechanism import LEGS
+from plant.toml import check_entries, read_toml
 
 DEFAULT_FILE = Path(__file__).with_name("canopen.toml")
 INTERFACES = ("socketcan", "udp_multicast", "virtual")
@@ -305,12 +305,7 @@ def canopen_settings(path: Path | str = DEFAULT_FILE, **changes: Mapping[str, An
         InputError: the file cannot be read, or an entry is missing, unknown or out of range.
     """
     path = Path(path)
-    try:
-        document = tomllib.loads(path.read_text())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is no TOML file: {error}") from None
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from None
+    document = read_toml(path)
     names = {kind.table for kind in (BusSettings, ControllerSettings, DriveSettings, ImuSettings)}
     for name in [*document, *changes]:
         if name not in names:
@@ -329,9 +324,7 @@ def _read(kind: type[S], table: Mapping[str, Any]) -> S:
     title = f"[{kind.table}]"  # type: ignore[attr-defined]
     known = [field.name for field in fields(kind)]  # type: ignore[arg-type]
     hints = get_type_hints(kind)
-    for name in table:
-        if name not in known:
-            raise InputError(f"{title} has no entry {name!r}; it has {', '.join(known)}")
+    check_entries(table, known, title)
     values = {}
     for name in known:
         if name not in table:

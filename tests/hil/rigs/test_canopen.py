@@ -525,7 +525,7 @@ def test_files_of_settings_are_checked(tmp_path):
     with pytest.raises(InputError, match=r"cannot read .*rig\.toml"):
         canopen_settings(path)
     path.write_text("[bus")
-    with pytest.raises(InputError, match="is no TOML file"):
+    with pytest.raises(InputError, match="is not valid TOML"):
         canopen_settings(path)
     path.write_text("[bus]\ninterface = 'virtual'\n")
     with pytest.raises(InputError, match=r"\[bus\] lacks the entry 'channel'"):

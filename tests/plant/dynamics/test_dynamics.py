@@ -8,7 +8,7 @@ from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from plant.dynamics.spatial import Dynamics, build_dynamics
-from plant.dynamics.variables import BRAKE, INPUTS, OPEN, OUTPUTS, PARAMETERS, STATES, VELOCITY, Variable
+from plant.dynamics.variables import BRAKE, OPEN, SPATIAL, VELOCITY, Variable
 from plant.fmu.plant import FmuPlant
 from plant.mechanism import Mechanism
 from plant.pose import Array, quaternion_from_rotation, rotation_from_quaternion
@@ -127,8 +127,10 @@ def test_the_equations_of_motion_agree_with_explicit_bodies(dynamics: Dynamics, 
     random = np.random.default_rng(seed)
     p = odd_mechanism(hexapod, random)
     states, inputs = random_state(p, random)
-    constants = dynamics.constants(flat(p, PARAMETERS))
-    rates = named(np.array(dynamics.rates(flat(states, STATES), flat(inputs, INPUTS), constants)).ravel(), STATES)
+    constants = dynamics.constants(flat(p, SPATIAL.parameters))
+    rates = named(
+        np.array(dynamics.rates(flat(states, SPATIAL.states), flat(inputs, SPATIAL.inputs), constants)).ravel(), SPATIAL.states
+    )
     position, rotation, twist = pose_and_twist(states)
     acceleration = np.hstack([rates["state.velocity"], rates["state.angular_velocity"]])
 
@@ -144,10 +146,13 @@ def test_energies_and_powers_agree_with_explicit_bodies(dynamics: Dynamics, hexa
     random = np.random.default_rng(100 + seed)
     p = odd_mechanism(hexapod, random)
     states, inputs = random_state(p, random)
-    constants = dynamics.constants(flat(p, PARAMETERS))
+    constants = dynamics.constants(flat(p, SPATIAL.parameters))
 
     def outputs_at(states: Values) -> Values:
-        return named(np.array(dynamics.outputs(flat(states, STATES), flat(inputs, INPUTS), constants)).ravel(), OUTPUTS)
+        return named(
+            np.array(dynamics.outputs(flat(states, SPATIAL.states), flat(inputs, SPATIAL.inputs), constants)).ravel(),
+            SPATIAL.outputs,
+        )
 
     outputs = outputs_at(states)
     position, rotation, twist = pose_and_twist(states)
@@ -218,22 +223,22 @@ def test_motors_in_equilibrium_push_as_virtual_work_demands_at_a_thousand_poses(
     }
     poses = poses_in_the_stroke(hexapod, 1000, random)
     wrenches = random.normal(0.0, 1.0, (1000, 6)) * [100.0, 100.0, 100.0, 10.0, 10.0, 10.0]
-    still = named(np.zeros(sum(variable.size for variable in STATES)), STATES)
+    still = named(np.zeros(sum(variable.size for variable in SPATIAL.states)), SPATIAL.states)
     states, inputs = [], []
     for (position, rotation), wrench in zip(poses, wrenches, strict=True):
         pose = still | {"state.position": position, "state.quaternion": quaternion_from_rotation(rotation)}
         # At rest the accelerations are affine in the currents.
-        states += [flat(pose | {"state.current": current}, STATES) for current in np.vstack([np.zeros(6), np.eye(6)])]
+        states += [flat(pose | {"state.current": current}, SPATIAL.states) for current in np.vstack([np.zeros(6), np.eye(6)])]
         held = {
             "velocity_command": np.zeros(6),
             "drive_mode": np.full(6, OPEN),
             "external_wrench.force": wrench[:3],
             "external_wrench.torque": wrench[3:],
         }
-        inputs += [flat(held, INPUTS)] * 7
-    constants = dynamics.constants(flat(p, PARAMETERS))
+        inputs += [flat(held, SPATIAL.inputs)] * 7
+    constants = dynamics.constants(flat(p, SPATIAL.parameters))
     columns = np.array(dynamics.rates(np.transpose(states), np.transpose(inputs), constants)).T
-    rates = [named(column, STATES) for column in columns]
+    rates = [named(column, SPATIAL.states) for column in columns]
     accelerations = np.array([np.hstack([rate["state.velocity"], rate["state.angular_velocity"]]) for rate in rates])
     newtons_per_ampere = float(2.0 * np.pi / p["motor.screw_lead"] * p["motor.torque_constant"])
     for (position, rotation), wrench, found in zip(poses, wrenches, accelerations.reshape(1000, 7, 6), strict=True):
@@ -262,18 +267,18 @@ def test_forces_along_the_legs_that_hold_the_weight_leave_the_fmu_at_rest(
 
 
 def rk4(dynamics: Dynamics, p: Values, states: Values, inputs: Values, step: float) -> Values:
-    constants = dynamics.constants(flat(p, PARAMETERS))
-    held = flat(inputs, INPUTS)
+    constants = dynamics.constants(flat(p, SPATIAL.parameters))
+    held = flat(inputs, SPATIAL.inputs)
 
     def rate(x: Array) -> Array:
         return np.array(dynamics.rates(x, held, constants)).ravel()
 
-    x = flat(states, STATES)
+    x = flat(states, SPATIAL.states)
     k1 = rate(x)
     k2 = rate(x + step / 2 * k1)
     k3 = rate(x + step / 2 * k2)
     k4 = rate(x + step * k3)
-    after = named(x + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4), STATES)
+    after = named(x + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4), SPATIAL.states)
     after["state.quaternion"] /= np.linalg.norm(after["state.quaternion"])
     return after
 
@@ -284,7 +289,7 @@ def test_the_fmu_integrates_the_derived_rates(dynamics: Dynamics, hexapod: Mecha
     p = odd_mechanism(hexapod, random)
     substep = float(p["substep"])
     plant = make_plant(p)
-    states = {variable.name: np.zeros(variable.shape) for variable in STATES}
+    states = {variable.name: np.zeros(variable.shape) for variable in SPATIAL.states}
     states |= {"state.position": p["initial_position"], "state.quaternion": p["initial_quaternion"]}
     for cycle in range(100):
         inputs = {

@@ -5,25 +5,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from plant.dynamics.planar_variables import PLANAR
-from plant.dynamics.variables import DRIVE_MODES, INPUTS, OUTPUTS, PARAMETERS, STATES, checked_parameters
+from plant.dynamics.variables import DRIVE_MODES, PLANAR, SPATIAL, checked_parameters
 from plant.errors import InputError, UnknownNameError
 
-BY_NAME = {variable.name: variable for variable in (*STATES, *INPUTS, *PARAMETERS, *OUTPUTS)}
+BY_NAME = {variable.name: variable for variable in (*SPATIAL.states, *SPATIAL.inputs, *SPATIAL.parameters, *SPATIAL.outputs)}
 
 
 def test_every_variable_has_one_entry_with_unit_and_description() -> None:
-    table = (*STATES, *INPUTS, *PARAMETERS, *OUTPUTS)
+    table = (*SPATIAL.states, *SPATIAL.inputs, *SPATIAL.parameters, *SPATIAL.outputs)
     assert len(BY_NAME) == len(table)
     assert all(variable.unit and variable.description for variable in table)
-    assert {v.causality for v in STATES} == {"state"} and {v.causality for v in OUTPUTS} == {"output"}
-    assert {v.causality for v in INPUTS} == {"input"} and {v.causality for v in PARAMETERS} == {"parameter"}
+    assert {v.causality for v in SPATIAL.states} == {"state"} and {v.causality for v in SPATIAL.outputs} == {"output"}
+    assert {v.causality for v in SPATIAL.inputs} == {"input"} and {v.causality for v in SPATIAL.parameters} == {"parameter"}
 
 
 def test_payload_friction_and_gravity_are_what_may_change_during_a_run() -> None:
-    tunable = {v.name.split(".")[0] for v in PARAMETERS if v.tunable}
+    tunable = {v.name.split(".")[0] for v in SPATIAL.parameters if v.tunable}
     assert tunable == {"payload", "friction", "gravity"}
-    assert all(v.tunable for v in PARAMETERS if v.name.startswith(("payload.", "friction.", "gravity")))
+    assert all(v.tunable for v in SPATIAL.parameters if v.name.startswith(("payload.", "friction.", "gravity")))
 
 
 def test_both_plants_mean_the_same_by_a_name() -> None:

@@ -229,7 +229,7 @@ def test_a_unit_that_the_fmu_declares_and_nobody_knows_has_to_be_said(load: Load
 
 
 @pytest.mark.parametrize(
-    ("content", "message"), [(None, "cannot read the binding"), (b"[fmu", "is not a TOML file"), (b"\xff", "is not")]
+    ("content", "message"), [(None, "cannot read .*foreign.toml"), (b"[fmu", "is not valid TOML"), (b"\xff", "is not UTF-8")]
 )
 def test_a_file_that_is_no_binding_is_refused(foreign_fmu: Path, tmp_path: Path, content: bytes | None, message: str) -> None:
     path = tmp_path / "foreign.toml"

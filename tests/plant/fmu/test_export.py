@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
 
-from plant.dynamics.variables import BRAKE, DRIVE_MODES, OUTPUTS, SPATIAL, VELOCITY
+from plant.dynamics.variables import BRAKE, DRIVE_MODES, SPATIAL, VELOCITY
 from plant.errors import FmuError, ToolchainError
 from plant.fmu import build as export
 from plant.fmu.build import build_in_subprocess, default_fmu
@@ -193,10 +193,10 @@ def test_outputs_depend_on_the_listed_inputs_and_on_no_others(description: Any, 
     plant.step(1e-3)
 
     def outputs() -> dict[str, Array]:
-        return {variable.name: plant.get(variable.name) for variable in OUTPUTS}
+        return {variable.name: plant.get(variable.name) for variable in SPATIAL.outputs}
 
     before = outputs()
-    seen: dict[str, set[str]] = {variable.name: set() for variable in OUTPUTS}
+    seen: dict[str, set[str]] = {variable.name: set() for variable in SPATIAL.outputs}
     others: dict[str, Any] = {
         "velocity_command": [[0.05 * i for i in range(6)]],
         "drive_mode": [[mode] * 6 for mode in DRIVE_MODES],

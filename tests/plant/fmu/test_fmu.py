@@ -15,7 +15,7 @@ import fmpy
 import numpy as np
 import pytest
 
-from plant.dynamics.variables import BRAKE, OPEN, OUTPUTS, VELOCITY
+from plant.dynamics.variables import BRAKE, OPEN, SPATIAL, VELOCITY
 from plant.errors import FmuError, InputError, UnknownNameError
 from plant.fmu.build import PLANAR_MODEL, default_fmu
 from plant.fmu.plant import FmuPlant, advance, read_imus, read_truth, write_command, write_drive_mode, write_drive_modes
@@ -397,7 +397,7 @@ def test_compiled_calls_do_what_fmpys_methods_do(hexapod: Mechanism, fmu_path: P
             assert plant.handle["time"] == (cycle + 1) * period
             assert plant.get("time") == slow.getFloat64([references["time"]])[0]
         assert np.ptp(plant.get("leg_length")) > 1e-4
-        for variable in OUTPUTS:
+        for variable in SPATIAL.outputs:
             one_by_one = slow.getFloat64([references[variable.name]], nValues=variable.size)
             np.testing.assert_array_equal(plant.get(variable.name).ravel(), one_by_one)
     slow.terminate()

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from plant.dynamics.variables import PARAMETERS
+from plant.dynamics.variables import SPATIAL
 from plant.errors import InputError, UnknownNameError, UnreachableError
 from plant.mechanism import Limits, Mechanism, load_mechanism, load_spatial
 from plant.pose import Array, Pose
@@ -91,8 +91,8 @@ def test_the_preset_reaches_what_the_reference_reaches(hexapod: Mechanism) -> No
 
 def test_the_preset_has_every_parameter_of_the_plant(hexapod: Mechanism) -> None:
     parameters = hexapod.plant_parameters()
-    assert list(parameters) == [variable.name for variable in PARAMETERS]
-    assert {name: value.shape for name, value in parameters.items()} == {v.name: v.shape for v in PARAMETERS}
+    assert list(parameters) == [variable.name for variable in SPATIAL.parameters]
+    assert {name: value.shape for name, value in parameters.items()} == {v.name: v.shape for v in SPATIAL.parameters}
     stroke = hexapod.require_limits().stroke
     np.testing.assert_allclose(parameters["stop.minimum_length"], stroke[:, 0] - 0.002)
     np.testing.assert_allclose(parameters["stop.maximum_length"], stroke[:, 1] + 0.002)
@@ -432,7 +432,7 @@ def presets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     stiffer = 'name = "stiffer"\nbased_on = "good"\n[control]\nintegral = 90.0\n[plant.payload]\nmass = 4.0\n'
     for name, text in {"good": GOOD, "stiffer": stiffer, "egg": 'based_on = "hen"', "hen": 'based_on = "egg"'}.items():
         (folder / f"{name}.toml").write_text(text)
-    monkeypatch.setattr("plant.mechanism._PRESETS", folder)
+    monkeypatch.setattr("plant.mechanism.documents._PRESETS", folder)
     return folder
 
 

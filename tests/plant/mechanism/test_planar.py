@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from plant.errors import InputError
-from plant.mechanism.planar import PlanarMechanism, check_tables, planar_from_document
+from plant.mechanism.documents import mechanism_from_document
+from plant.mechanism.planar import PlanarMechanism
 
 BASE = [[0.0, 0.0], [0.2, 0.0], [0.3, 0.1]]
 PLATFORM = [[0.0, 0.0], [0.1, 0.0], [0.05, 0.08]]
@@ -21,7 +22,7 @@ def document(**tables):
 
 def test_the_preset_is_the_rig():
     text = (resources.files("plant.mechanism") / "presets" / "planar-3rpr.toml").read_text()
-    rig = planar_from_document(tomllib.loads(text))
+    rig = mechanism_from_document(tomllib.loads(text))
     assert rig.name == "planar-3rpr"
     home, limits = rig.home, rig.limits
     assert home is not None and limits is not None
@@ -33,12 +34,12 @@ def test_the_preset_is_the_rig():
 
 
 def test_a_document_says_the_same_as_two_arrays():
-    mechanism = planar_from_document(document(limits={"stroke": STROKE}))
+    mechanism = mechanism_from_document(document(limits={"stroke": STROKE}))
     twin = PlanarMechanism.from_legs(np.array(BASE), np.array(PLATFORM), name="mine", limits={"stroke": STROKE})
     for name in ("base_joints", "platform_joints", "stroke"):
         np.testing.assert_array_equal(getattr(mechanism, name), getattr(twin, name))
     assert mechanism.name == twin.name
-    assert planar_from_document({"geometry": document()["geometry"], "limits": {}}).name == "custom"
+    assert mechanism_from_document({"geometry": document()["geometry"], "limits": {}}).name == "custom"
 
 
 def test_arrays_are_copied_and_cannot_be_changed():
@@ -120,7 +121,10 @@ def test_what_is_no_mechanism_is_refused(changes, said):
             document(limits={"velocity": 0.2}),
             "the limits lack the stroke: two numbers in metres about the home lengths, or (3, 2)",
         ),
-        ({"geometry": {"base": BASE}}, "[geometry] has no entry 'base'; it has base_joints, platform_joints"),
+        (
+            {"geometry": {"base_joints": BASE, "base": BASE}},
+            "[geometry] has no entry 'base'; it has base_joints, platform_joints",
+        ),
         ({"geometry": {"base_joints": BASE}}, "[geometry] lacks platform_joints, an array of three rows of two numbers"),
         ({}, "[geometry] lacks base_joints"),
         (
@@ -131,11 +135,10 @@ def test_what_is_no_mechanism_is_refused(changes, said):
 )
 def test_what_is_no_document_of_a_mechanism_is_refused(content, said):
     with pytest.raises(InputError, match=re.escape(said)):
-        planar_from_document(content)
+        mechanism_from_document(content)
 
 
 def test_a_table_may_have_entries_of_any_name():
-    tables = {"geometry": {"base_joints"}, "plant": None}
-    check_tables({"name": "mine", "plant": {"anything": 1.0}}, tables)
-    with pytest.raises(InputError, match=re.escape("[geometry] has no entry 'anything'; it has base_joints")):
-        check_tables({"geometry": {"anything": 1.0}}, tables)
+    assert mechanism_from_document(document(control={"anything": 1.0})).settings["control"] == {"anything": 1.0}
+    with pytest.raises(InputError, match=re.escape("[home] has no entry 'anything'; it has angle, position")):
+        mechanism_from_document(document(home={"position": [0.0, 0.2], "anything": 1.0}))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from plant.dynamics.variables import PARAMETERS
+from plant.dynamics.variables import SPATIAL
 from plant.mechanism import Mechanism, load_mechanism
 from plant.pose import Array
 
@@ -65,7 +65,7 @@ def reciprocal_condition(matrices: Array, rank: int) -> float:
 def test_every_preset_loads_whole(name: str) -> None:
     mechanism = load_mechanism(name)
     assert mechanism.name == name
-    assert list(mechanism.plant_parameters()) == [variable.name for variable in PARAMETERS]
+    assert list(mechanism.plant_parameters()) == [variable.name for variable in SPATIAL.parameters]
     assert mechanism.settings["control"]
 
 

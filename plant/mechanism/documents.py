@@ -1,0 +1,162 @@
+"""Mechanisms as TOML documents: presets and files, what they are based on, and their tables."""
+
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from plant.errors import InputError, UnknownNameError
+from plant.mechanism.planar import PlanarMechanism, PlanarPose
+from plant.mechanism.spatial import Mechanism
+from plant.pose import Pose, checked_array, checked_unit, rotation_from_quaternion
+from plant.toml import check_entries, parse_toml, read_text
+
+_PRESETS = resources.files("plant.mechanism") / "presets"
+
+_JOINTS = ("base_joints", "platform_joints")
+_ANY_ENTRY = ("limits", "plant", "control", "fusion", "safety")
+"""Tables whose entries are checked by those who read them."""
+
+
+def load_mechanism(name_or_path: str | Path) -> Mechanism | PlanarMechanism:
+    """Load a preset by its name, or a mechanism from a TOML file; joints of two numbers make it a planar one.
+
+    Raises:
+        UnknownNameError: no such preset, and no such file.
+        InputError: the file is not TOML, or its content is not a mechanism.
+    """
+    source = str(name_or_path)
+    document = parse_toml(mechanism_text(name_or_path), source)
+    try:
+        return mechanism_from_document(_completed(document, source))
+    except (InputError, UnknownNameError) as error:
+        raise type(error)(f"{source}: {error}") from None
+
+
+def load_spatial(name_or_path: str | Path) -> Mechanism:
+    """`load_mechanism` for callers that need six legs.
+
+    Raises:
+        InputError: the mechanism is planar.
+    """
+    mechanism = load_mechanism(name_or_path)
+    if isinstance(mechanism, PlanarMechanism):
+        raise InputError(f"{name_or_path} has three legs in the plane; this needs six in space: choose another mechanism")
+    return mechanism
+
+
+def load_in_space(name_or_path: str | Path) -> Mechanism:
+    """`load_mechanism` for the loop, which sees a planar mechanism in space.
+
+    Raises:
+        InputError: a planar mechanism has no home pose.
+    """
+    mechanism = load_mechanism(name_or_path)
+    return Mechanism.from_planar(mechanism) if isinstance(mechanism, PlanarMechanism) else mechanism
+
+
+def mechanism_text(name_or_path: str | Path) -> str:
+    """The TOML text of a preset, or of a file.
+
+    Raises:
+        UnknownNameError: no such preset, and no such file.
+        InputError: the file cannot be read.
+    """
+    if str(name_or_path) in _preset_names():
+        return _preset_text(str(name_or_path))
+    path = Path(name_or_path)
+    if not path.is_file():
+        raise UnknownNameError(f"no mechanism {str(path)!r}: neither a preset ({', '.join(_preset_names())}) nor a file")
+    return read_text(path)
+
+
+def mechanism_from_document(document: dict[str, Any]) -> Mechanism | PlanarMechanism:
+    """The mechanism of a document that is based on no other.
+
+    Raises:
+        InputError: an entry is missing, unknown or of the wrong kind, or the content is not a mechanism.
+        UnknownNameError: a plant parameter that does not exist.
+    """
+    planar = _is_planar(document)
+    tables: dict[str, tuple[str, ...] | None] = {
+        "geometry": _JOINTS if planar else ("base_joint_axes", *_JOINTS, "up_in_base"),
+        "home": ("angle", "position") if planar else ("position", "quaternion"),
+        **dict.fromkeys(_ANY_ENTRY),
+    }
+    for name, table in document.items():
+        if name == "name":
+            continue
+        if name not in tables:
+            raise InputError(f"unknown entry {name!r}; a mechanism has name, {', '.join(tables)}, based_on")
+        if not isinstance(table, dict):
+            raise InputError(f"{name!r} must be a table")
+        if (known := tables[name]) is not None:
+            check_entries(table, known, f"[{name}]")
+    geometry = document.get("geometry", {})
+    for joints in _JOINTS:
+        if joints not in geometry:
+            rows = "three rows of two" if planar else "six rows of three"
+            raise InputError(f"[geometry] lacks {joints}, an array of {rows} numbers in metres")
+    kind: Any = PlanarMechanism if planar else Mechanism
+    mechanism: Mechanism | PlanarMechanism = kind.from_legs(
+        **geometry,
+        name=str(document.get("name", "custom")),
+        home=_home(document["home"], planar) if "home" in document else None,
+        limits=document.get("limits") or None,
+        plant=_flattened(document.get("plant", {})),
+        settings={name: document.get(name, {}) for name in ("control", "fusion", "safety")},
+    )
+    return mechanism
+
+
+def _preset_names() -> list[str]:
+    return sorted(entry.name.removesuffix(".toml") for entry in _PRESETS.iterdir() if entry.name.endswith(".toml"))
+
+
+def _preset_text(name: str) -> str:
+    return (_PRESETS / f"{name}.toml").read_text()
+
+
+def _completed(document: dict[str, Any], source: str) -> dict[str, Any]:
+    """A document laid over the preset that it is based on, and so on; the preset's name is not inherited."""
+    names = [source]
+    while "based_on" in document:
+        names.append(document.pop("based_on"))
+        if names[-1] not in _preset_names():
+            raise UnknownNameError(f"based_on names no preset: {names[-1]!r}; there are {', '.join(_preset_names())}")
+        if names[-1] in names[:-1]:
+            raise InputError(f"based_on goes round in a circle, {' -> '.join(names)}: leave one out")
+        preset = parse_toml(_preset_text(names[-1]), names[-1])
+        preset.pop("name", None)
+        document = _merged(preset, document)
+    return document
+
+
+def _merged(under: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Two nested tables as one; `over` wins where both have an entry, unless both entries are tables."""
+    shared = [key for key in under.keys() & over.keys() if isinstance(under[key], dict) and isinstance(over[key], dict)]
+    return under | over | {key: _merged(under[key], over[key]) for key in shared}
+
+
+def _is_planar(document: dict[str, Any]) -> bool:
+    try:
+        return bool(np.shape(document["geometry"]["base_joints"])[-1:] == (2,))
+    except (LookupError, TypeError, ValueError):
+        return False
+
+
+def _home(table: Any, planar: bool) -> Pose | PlanarPose:
+    if planar:
+        return PlanarPose(table.get("position"), table.get("angle", 0.0))
+    quaternion = checked_unit(table.get("quaternion", (1.0, 0.0, 0.0, 0.0)), 4, "home.quaternion")
+    return Pose(checked_array(table.get("position"), (3,), "home.position"), rotation_from_quaternion(quaternion))
+
+
+def _flattened(tables: dict[str, Any], prefix: str = "") -> dict[str, ArrayLike]:
+    """Nested tables as one, whose names have dots between the names of the tables."""
+    flat: dict[str, ArrayLike] = {}
+    for name, value in tables.items():
+        flat |= _flattened(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return flat
