@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from controller.safety.watch import CAUSES, STOP
 from hil.loop.driver import prevent_compilation
 from hil.loop.records import RECORD, Link, shared_array
-from hil.loop.timing import QUANTILES, Histogram, Timing, over_budget
+from hil.loop.timing import Histogram, Timing, over_budget
 from hil.progress import Progress, no_progress
 from hil.realtime.clock import REAL, finish, new_clock, now, start, wait
 from hil.realtime.scheduling import MEASURES, RealTimeSettings, real_time, usage
@@ -128,10 +128,8 @@ class _Pool:
     """The measurements of all slices of one rate and condition."""
 
     def __init__(self) -> None:
-        self.timing, self.cyclictest = Timing(), np.zeros(_LONGEST_US + 1, np.int64)
+        self.timing, self.cyclictest = Timing(), Histogram()
         self.bare, self.bare_wake = Histogram(), Histogram()
-        self.late = np.zeros(_LONGEST_US + 1, np.int64)
-        self.longest_us = 0
         self.missed: dict[str, int] = {}
         self.usage: dict[str, float] = {}
 
@@ -141,8 +139,8 @@ class _Pool:
         return {
             "compute_us": timing.pop("compute"),
             "latency_us": timing.pop("latency"),
-            "wake_us": _figures_of_counts(self.late, timing.pop("wake")["max"]),
-            "cyclictest_us": _figures_of_counts(self.cyclictest, self.longest_us) if self.cyclictest.any() else None,
+            "wake_us": timing.pop("wake"),
+            "cyclictest_us": self.cyclictest.figures() if self.cyclictest.longest else None,
             "bare_us": self.bare.figures(),
             "bare_wake_us": self.bare_wake.figures(),
             "stages_us": timing,
@@ -151,10 +149,8 @@ class _Pool:
             "missed_host": self.missed["host"],
             "usage": self.usage,
             "histograms": {
-                "compute": self.timing.histograms["compute"].bars(),
-                "latency": self.timing.histograms["latency"].bars(),
-                "wake": _bars(self.late),
-                "cyclictest": _bars(self.cyclictest),
+                **{name: self.timing.histograms[name].bars() for name in ("compute", "latency", "wake")},
+                "cyclictest": self.cyclictest.bars(),
                 "bare": self.bare.bars(),
             },
         }
@@ -165,7 +161,7 @@ class _Bench:
 
     def __init__(self, rate: float, settings: RealTimeSettings, cyclictest: bool) -> None:
         self._config = SimulationConfig(target="sines", duration=_SLICE_S, rate=rate)
-        self._settings, self._cyclictest, self.longest_us = settings, cyclictest, 0
+        self._settings, self._cyclictest = settings, cyclictest
         with prepared_loop(self._config) as loop:
             self._records = shared_array(loop.end + round(rate), RECORD)
         _run_bare(new_clock(0, 1), 0, 0, np.zeros((1, 2), np.int64))
@@ -174,15 +170,12 @@ class _Bench:
         """Run our loop, cyclictest if wanted, and the bare loop, one after the other."""
         with _busy_thread() if busy else contextlib.nullcontext():
             count, missed, used = self._in_a_process(self._ours)
-        records = self._records[:count]
-        pool.timing.add(records)
-        pool.late += np.bincount(np.minimum(records["late_ns"] // 1000, _LONGEST_US), minlength=len(pool.late))
+        pool.timing.add(self._records[:count])
         for total, new in ((pool.missed, missed), (pool.usage, used)):
             for name, value in new.items():
                 total[name] = total.get(name, 0) + value
         if self._cyclictest:
-            pool.cyclictest += self._run_cyclictest()
-            pool.longest_us, self.longest_us = max(pool.longest_us, self.longest_us), 0
+            self._run_cyclictest(pool.cyclictest)
         if bare:
             work = round(1e3 * pool.timing.histograms["compute"].figures()["p50"])
             durations: Record = self._in_a_process(self._bare, work)
@@ -223,28 +216,34 @@ class _Bench:
     def _clock(self) -> Record:
         return new_clock(REAL, round(1e9 / self._config.rate))
 
-    def _run_cyclictest(self) -> NDArray[np.int64]:
-        """Counts of cyclictest's wake-ups by lateness in whole microseconds."""
+    def _run_cyclictest(self, histogram: Histogram) -> None:
+        """Run cyclictest and count its wake-ups; without privileges it does not run, nor is it tried again."""
         period_us, loops = round(1e6 / self._config.rate), round(_SLICE_S * self._config.rate)
         settings = self._settings
         command = ["cyclictest", "-q", "-m", "-t1", f"-a{settings.processor}", f"-p{settings.priority}", f"-i{period_us}"]
         output = subprocess.run(
             [*command, f"-l{loops}", f"-h{_LONGEST_US}"], capture_output=True, text=True, check=False, timeout=60.0
         )
-        counts = np.zeros(_LONGEST_US + 1, np.int64)
         if output.returncode:
-            # It does not run without privileges.
             self._cyclictest = False
-            return counts
+            return
+        counts, longest = np.zeros(_LONGEST_US + 1, np.int64), 0
         for line in output.stdout.splitlines():
             if line.startswith("# Histogram Overflows:"):
                 counts[-1] += int(line.split(":")[1])
             elif line.startswith("# Max Latencies:"):
-                self.longest_us = max(self.longest_us, int(line.split(":")[1]))
+                longest = int(line.split(":")[1])
             elif line and not line.startswith("#"):
                 us, count = line.split()
                 counts[int(us)] += int(count)
-        return counts
+        histogram.add(durations_of(counts))
+        histogram.longest = max(histogram.longest, 1000 * longest)
+
+
+def durations_of(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Durations [ns] for counts by whole microseconds, rounded down as by cyclictest: spread evenly over each microsecond."""
+    parts = [1000 * us + 1000 * np.arange(count) // count for us, count in enumerate(counts.tolist()) if count]
+    return np.concatenate(parts) if parts else np.zeros(0, np.int64)
 
 
 def _send(pipe: Any, target: Callable[..., Any], *arguments: Any) -> None:
@@ -334,26 +333,6 @@ def _busy_thread() -> Iterator[None]:
     finally:
         over.set()
         starter.join()
-
-
-def _figures_of_counts(counts: NDArray[np.int64], longest: float) -> dict[str, float]:
-    """Figures [us] of counts by whole microseconds, rounded down as by cyclictest."""
-    n = int(counts.sum())
-    sums = np.cumsum(counts)
-    figures = {}
-    for name, share in QUANTILES.items():
-        us = int(np.searchsorted(sums, share * n))
-        # Durations are taken as equally likely within a microsecond.
-        figures[name] = us + 1.0 - float(sums[us] - share * n) / float(counts[us])
-    return {**figures, "max": float(longest), "n": n}
-
-
-def _bars(counts: NDArray[np.int64]) -> list[list[float]]:
-    """Counts by microseconds in bins of a sixteenth of an octave: lower ends, and counts."""
-    used = np.flatnonzero(counts)
-    bins = np.floor(16.0 * np.log2(np.maximum(used, 0.5)))
-    lower = np.unique(bins)
-    return [(2.0 ** (lower / 16.0)).tolist(), [int(counts[used[bins == each]].sum()) for each in lower]]
 
 
 def measure_start_up(cold: bool) -> dict[str, float | None]:

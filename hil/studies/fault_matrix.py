@@ -6,7 +6,6 @@ same result every time. Faults that need separate processes are in the tests of 
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from importlib.metadata import version
 from typing import Any
 
@@ -323,7 +322,11 @@ def _judge(case: Case, seed: int, loop: PreparedLoop, cause: int, onset: int, ou
     assert loop.emulator is not None
     count, limits, period = int(loop.link[Link.HEAD]), loop.mechanism.require_limits(), 1.0 / RATE_HZ
     records, rig = loop.records[:count], loop.emulator.rig
-    find = partial(_find, outcome, case, seed)
+
+    def find(wrong: bool, what: str) -> None:
+        if wrong:
+            outcome.findings.append(f"{case.name}, seed {seed}: {what}")
+
     moved = records[records["request"] != BRAKED]
     # The cause that ended the run counts, not events before it.
     reaction = GO_ON if cause == END_OF_MOTION else CAUSES[cause].reaction
@@ -372,8 +375,3 @@ def _judge(case: Case, seed: int, loop: PreparedLoop, cause: int, onset: int, ou
     find(bool(np.abs(rig["velocity"]).max() > 0.0 or (rig["drive"] == FOLLOWING).any()), "a drive still moves")
     expected_cycles = np.arange(count) + np.cumsum(records["missed"])
     find(not np.array_equal(records["cycle"], expected_cycles), "a cycle is not recorded")
-
-
-def _find(outcome: Outcome, case: Case, seed: int, wrong: bool, what: str) -> None:
-    if wrong:
-        outcome.findings.append(f"{case.name}, seed {seed}: {what}")

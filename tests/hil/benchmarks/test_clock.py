@@ -6,10 +6,11 @@ import json
 import numpy as np
 import pytest
 
-from hil.benchmarks.clock import BUSY, CONDITIONS, IDLE, LOAD, _figures_of_counts, gross_excess, measure_real_time
+from hil.benchmarks.clock import BUSY, CONDITIONS, IDLE, LOAD, durations_of, gross_excess, measure_real_time
 from hil.benchmarks.loop import read_earlier
 from hil.command_line import main
 from hil.loop.records import LINK_SIZE, RECORD, Link
+from hil.loop.timing import Histogram
 from hil.recording.mcap import take
 from hil.reports.benchmark import write_report
 from plant.errors import InputError
@@ -60,10 +61,13 @@ def test_the_check_passes_what_is_measured_and_fails_gross_excess(figures):
 def test_quantiles_of_whole_microseconds_are_those_of_the_durations():
     durations = np.random.default_rng(2).lognormal(2.0, 1.0, 50_000)
     counts = np.bincount(durations.astype(np.int64), minlength=2000)
-    found = _figures_of_counts(counts, 123.0)
+    histogram = Histogram()
+    histogram.add(durations_of(counts))
+    histogram.longest = 123_000_000
+    found = histogram.figures()
     for name, percent in (("p50", 50.0), ("p99", 99.0), ("p999", 99.9)):
         assert found[name] == pytest.approx(np.percentile(durations, percent), rel=0.02)
-    assert found["max"] == 123.0
+    assert found["max"] == 123_000.0
 
 
 def test_a_report_shows_histograms_and_earlier_figures(figures, tmp_path):
