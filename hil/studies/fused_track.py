@@ -1,5 +1,6 @@
 """Poses that the cycle's fusing stages estimate from raw IMU samples of an imposed motion, and the errors of these poses."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,6 +94,11 @@ def poses_of(motion: ImposedMotion, samples: slice) -> PoseTrack:
     return PoseTrack(motion.positions[samples].copy(), motion.rotations[samples].copy())
 
 
+def pooled_rms(figures: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """`position_rms` and `rotation_rms` over several runs, each of which counts the same."""
+    return {key: float(np.sqrt(np.mean([each[key] ** 2 for each in figures]))) for key in ("position_rms", "rotation_rms")}
+
+
 class PoseErrors:
     """Errors of tracks, pooled: every track counts the same."""
 
@@ -110,8 +116,7 @@ class PoseErrors:
 
     def figures(self) -> dict[str, float | None]:
         """RMS errors over all tracks, `position_rms` [m] and `rotation_rms` [rad], and the mean `nees`, if there is one."""
-        rms = {key: float(np.sqrt(np.mean([each[key] ** 2 for each in self._rms]))) for key in self._rms[0]}
-        return rms | {"nees": float(np.mean(self._nees)) if self._nees else None}
+        return pooled_rms(self._rms) | {"nees": float(np.mean(self._nees)) if self._nees else None}
 
     def worst(self) -> dict[str, float]:
         """RMS errors of the worst tracks."""

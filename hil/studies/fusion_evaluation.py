@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.calibration.at_rest import Prior
-from controller.calibration.file import Calibration
 from controller.cycle import STATE, cycle_parameters
 from controller.settings import control_settings, sensor_settings
 from hil.calibration.data import Knowledge
 from hil.calibration.drive import calibrate_rig
-from hil.progress import Progress
+from hil.progress import Progress, part_of
 from hil.runs.config import FUSIONS, SimulationConfig
 from hil.runs.simulation import simulate
 from hil.studies.config import LEARNING_S, EvaluationConfig
@@ -31,6 +30,7 @@ from hil.studies.fused_track import (
     PoseTrack,
     fuse,
     measure_all,
+    pooled_rms,
     poses_of,
     read,
     track,
@@ -60,34 +60,18 @@ _CALIBRATED_IMU = "mpu9150-calibrated"
 
 @dataclass(frozen=True, eq=False)
 class _Rig:
-    """A calibrated rig: its mechanism as built, and as the controller knows it."""
+    """A calibrated rig: its mechanism as built, the cycle's constants by the calibration, and the calibration's figures."""
 
     config: EvaluationConfig
     seed: int
     built: Mechanism
-    known: Mechanism
-    calibration: Calibration
+    parameters: Record
     summary: dict[str, Any]
-
-    def parameters(self) -> Record:
-        """The cycle's constants."""
-        control, fusion = control_settings(self.known), sensor_settings(self.known, load_imu(self.config.imu))
-        errors = FUSIONS[self.config.fusion]
-        return cycle_parameters(self.known, self.config.rate, control, fusion, ALL_IMUS, errors, self.calibration)
 
     def move(self, kind: str, duration: float, seed: int) -> tuple[ImposedMotion, Array]:
         """A motion of this rig, and the samples of its raw IMUs."""
         motion = impose(self.built, kind, duration, self.config.rate, seed)
         return motion, read(motion, load_imu(self.config.imu), self.config.rate, self.seed)
-
-
-def _calibrated_rig(config: EvaluationConfig, seed: int, joint_error: float, progress: Progress) -> _Rig:
-    rig = SimulationConfig(mechanism=config.mechanism, imu=config.imu, seed=seed, rate=config.rate, joint_error=joint_error)
-    found = calibrate_rig(rig, Knowledge(Prior(joints=joint_error)), progress, validate=False)
-    nominal = load_spatial(config.mechanism)
-    calibration = found.calibration
-    built = nominal.built(joint_error, seed)
-    return _Rig(config, seed, built, nominal.moved_joints(calibration.joints), calibration, found.summary)
 
 
 def evaluate(config: EvaluationConfig, progress: Callable[[str, float], None] = lambda what, share: None) -> dict[str, Any]:
@@ -125,27 +109,23 @@ def evaluate(config: EvaluationConfig, progress: Callable[[str, float], None] = 
 
 
 def _calibrated_rigs(config: EvaluationConfig, joint_error: float, progress: Callable[[str, float], None]) -> list[_Rig]:
-    count, label = len(config.seeds), "calibration" if joint_error == 0.0 else "calibration, joint errors"
-
-    def calibrated(i: int, seed: int) -> _Rig:
-        return _calibrated_rig(config, seed, joint_error, lambda share: progress(label, (i + share) / count))
-
-    return [calibrated(i, seed) for i, seed in enumerate(config.seeds)]
+    report = partial(progress, "calibration" if joint_error == 0.0 else "calibration, joint errors")
+    nominal, model, share = load_spatial(config.mechanism), load_imu(config.imu), 1.0 / len(config.seeds)
+    rigs = []
+    for i, seed in enumerate(config.seeds):
+        rig = SimulationConfig(mechanism=config.mechanism, imu=config.imu, seed=seed, rate=config.rate, joint_error=joint_error)
+        found = calibrate_rig(rig, Knowledge(Prior(joints=joint_error)), part_of(report, i * share, share), validate=False)
+        known = nominal.moved_joints(found.calibration.joints)
+        control, fusion, errors = control_settings(known), sensor_settings(known, model), FUSIONS[config.fusion]
+        parameters = cycle_parameters(known, config.rate, control, fusion, ALL_IMUS, errors, found.calibration)
+        rigs.append(_Rig(config, seed, nominal.built(joint_error, seed), parameters, found.summary))
+    return rigs
 
 
 def _of_calibrations(rigs: Sequence[_Rig]) -> dict[str, Any]:
     """RMS of the pose at rest before and after, predicted and true."""
-
-    def rms(kind: str, stage: str, key: str) -> float:
-        return float(np.sqrt(np.mean([rig.summary[kind][stage][key] ** 2 for rig in rigs])))
-
-    keys = ("position_rms", "rotation_rms")
-    figures = {
-        name: {key: rms(kind, stage, key) for key in keys}
-        for name, kind, stage in (
-            ("before", "true", "before"), ("after", "true", "motion"), ("predicted", "predicted", "motion"),
-        )
-    }  # fmt: skip
+    cases = {"before": ("true", "before"), "after": ("true", "motion"), "predicted": ("predicted", "motion")}
+    figures = {name: pooled_rms([rig.summary[kind][stage] for rig in rigs]) for name, (kind, stage) in cases.items()}
     least = min(rig.summary["true"]["before"]["position_rms"] / rig.summary["true"]["motion"]["position_rms"] for rig in rigs)
     return figures | {"least_improvement": least}
 
@@ -166,7 +146,7 @@ def _of_motions(rigs: Sequence[_Rig], progress: Progress) -> dict[str, Any]:
         pooled = {"refined": PoseErrors(), "whole": PoseErrors()}
         for i, rig in enumerate(rigs):
             motion, raw = rig.move(kind, _MOTION_S, rig.seed)
-            fused, late = fuse(rig.parameters(), raw), _late(rig.config.rate)
+            fused, late = fuse(rig.parameters, raw), _late(rig.config.rate)
             for name, step in (("refined", REFINED), ("whole", WHOLE)):
                 pooled[name].add(track(fused, step).at(late), poses_of(motion, late))
             progress((m + (i + 1) / len(rigs)) / len(MOTIONS))
@@ -190,7 +170,7 @@ def _of_faults(rigs: Sequence[_Rig], progress: Progress) -> dict[str, Any]:
         for name, dead in cases.items():
             broken = raw.copy()
             broken[round(_FAULT_S * rig.config.rate) :, :, dead(rig)] = np.nan
-            pooled[name].add(track(fuse(rig.parameters(), broken), WHOLE).at(late), poses_of(motion, late))
+            pooled[name].add(track(fuse(rig.parameters, broken), WHOLE).at(late), poses_of(motion, late))
         progress((i + 1) / len(rigs))
     figures: dict[str, Any] = {name: _figures(errors) for name, errors in pooled.items()}
     for name in ("leg", "platform"):
@@ -206,10 +186,10 @@ def _of_starts(rigs: Sequence[_Rig], progress: Progress) -> dict[str, Any]:
     for n in range(config.starts):
         rig, frequency = rigs[n % len(rigs)], random.uniform(*_START_HZ)
         motion, raw = rig.move(f"{frequency:.3f}", _WATCHED_S, n)
-        state, parameters = np.zeros((), STATE), rig.parameters()
-        fuse(parameters, raw[:due], state)
+        state = np.zeros((), STATE)
+        fuse(rig.parameters, raw[:due], state)
         in_time = bool(state["filter_trusted"])
-        after = track(fuse(parameters, raw[due:], state), WHOLE)
+        after = track(fuse(rig.parameters, raw[due:], state), WHOLE)
         errors = after.errors(poses_of(motion, slice(due, None)))
         worst = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2).max(axis=0)
         largest = np.maximum(largest, worst)
@@ -227,11 +207,11 @@ def _of_drift(rigs: Sequence[_Rig], progress: Progress) -> dict[str, Any]:
     for i, rig in enumerate(rigs):
         motion = impose(rig.built, "static", min(_CHUNK_S, config.still), config.rate, rig.seed)
         imu, raw = imu_state(load_imu(config.imu), rig.seed, 1.0 / config.rate), np.empty_like(motion.signals)
-        parameters, state = rig.parameters(), np.zeros((), STATE)
+        state = np.zeros((), STATE)
         for chunk in range(chunks):
             measure_all(imu, motion.signals, raw)
             counted = slice(None) if chunk else _late(config.rate)
-            pooled[chunk].add(track(fuse(parameters, raw, state), WHOLE).at(counted), poses_of(motion, counted))
+            pooled[chunk].add(track(fuse(rig.parameters, raw, state), WHOLE).at(counted), poses_of(motion, counted))
             progress((i + (chunk + 1) / chunks) / len(rigs))
     return {"minutes": [_figures(errors) for errors in pooled]}
 
