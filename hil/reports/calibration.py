@@ -11,21 +11,9 @@ from plotly.subplots import make_subplots
 
 from hil.calibration.assessment import STAGES, weak_words
 from hil.calibration.drive import RigCalibration
+from hil.reports import view
 from hil.reports.calibration_picture import KINDS, accuracy_svg
-from hil.reports.page import (
-    AXIS_NAMES,
-    COLORS,
-    FAINT,
-    INK,
-    LAYOUT,
-    LEGEND,
-    VIEW,
-    coordinates,
-    figure_html,
-    line_trace,
-    scene,
-    write_page,
-)
+from hil.reports.page import AXIS_NAMES, COLORS, FAINT, INK, LAYOUT, LEGEND, figure_html, write_page
 from hil.table import Cell, Table
 from plant.dynamics.variables import IMU_COUNT
 from plant.imu import MILLI_G
@@ -154,9 +142,9 @@ def _rests(result: RigCalibration) -> go.Figure:
     positions = 1e3 * np.array(result.summary["positions"])
     figure = go.Figure(
         [
-            line_trace(coordinates(positions), FAINT, 2),
+            view.line_trace(view.coordinates(positions), FAINT, 2),
             go.Scatter3d(
-                coordinates(positions),
+                view.coordinates(positions),
                 mode="markers+text",
                 text=[str(n) for n in range(len(positions))],
                 marker={"size": 4, "color": COLORS["z"]},
@@ -167,7 +155,7 @@ def _rests(result: RigCalibration) -> go.Figure:
     )
     return figure.update_layout(
         LAYOUT,
-        **VIEW,
+        **view.VIEW,
         height=460,
-        scene=scene(positions, result.mechanism.up_in_base),
+        scene=view.scene(positions, result.mechanism.up_in_base),
     )

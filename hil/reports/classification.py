@@ -6,23 +6,8 @@ from pathlib import Path
 import numpy as np
 import plotly.graph_objects as go
 
-from hil.reports.page import (
-    COLORS,
-    FAINT,
-    INK,
-    LAYOUT,
-    LEG_NAMES,
-    VIEW,
-    coordinates,
-    figure_html,
-    line_trace,
-    plate_trace,
-    ring,
-    scene,
-    segment_colors,
-    segments,
-    write_page,
-)
+from hil.reports import view
+from hil.reports.page import COLORS, FAINT, INK, LAYOUT, LEG_NAMES, figure_html, write_page
 from hil.studies.classification import PAPER, Description, Need, joints_about, planar_home
 from hil.table import Cell, Table
 from plant.mechanism import Mechanism
@@ -37,7 +22,7 @@ def write_report(description: Description, path: Path) -> None:
         InputError: the file cannot be written.
     """
     mechanism, mechanism_class = description.mechanism, description.mechanism_class
-    view = _planar_view(mechanism) if isinstance(mechanism, PlanarMechanism) else _spatial_view(mechanism)
+    figure = _planar_view(mechanism) if isinstance(mechanism, PlanarMechanism) else _spatial_view(mechanism)
     graph = figure_html(
         "graph",
         "Graph of the legs",
@@ -45,7 +30,7 @@ def write_report(description: Description, path: Path) -> None:
         _graph(description),
         "view",
     )
-    drawn = figure_html("mechanism", "The mechanism", "At home, in mm.", view, "view")
+    drawn = figure_html("mechanism", "The mechanism", "At home, in mm.", figure, "view")
     spread = figure_html(
         "conditioning",
         "Conditioning",
@@ -94,23 +79,23 @@ def _spatial_view(mechanism: Mechanism) -> go.Figure:
     base = 1e3 * mechanism.base_joints
     home = mechanism.nominal_home
     joints = 1e3 * (home.position + mechanism.platform_joints @ home.rotation.T)
-    base_ring, platform_ring = ring(base), ring(joints)
+    base_ring, platform_ring = view.ring(base), view.ring(joints)
     numbers = joint_numbers(mechanism.base_joints)
     shared = [np.flatnonzero(numbers == number) for number in range(numbers.max() + 1)]
     labels = np.array([base[legs[0]] + 0.12 * (base[legs[0]] - base.mean(axis=0)) for legs in shared])
     texts = [", ".join(str(leg) for leg in legs) for legs in shared]
     figure = go.Figure(
         [
-            plate_trace(coordinates(joints[platform_ring[:-1]]), "#6d87a3", 0.55),
-            line_trace(coordinates(joints[platform_ring]), "#3d5670", 6),
-            line_trace(coordinates(segments(base, joints)), segment_colors(LEG_NAMES), 10),
-            plate_trace(coordinates(base[base_ring[:-1]]), FAINT, 0.35),
-            line_trace(coordinates(base[base_ring]), "#5c6873", 6),
-            go.Scatter3d(coordinates(labels), mode="text", text=texts, hoverinfo="skip"),
+            view.plate_trace(view.coordinates(joints[platform_ring[:-1]]), "#6d87a3", 0.55),
+            view.line_trace(view.coordinates(joints[platform_ring]), "#3d5670", 6),
+            view.line_trace(view.coordinates(view.segments(base, joints)), view.segment_colors(LEG_NAMES), 10),
+            view.plate_trace(view.coordinates(base[base_ring[:-1]]), FAINT, 0.35),
+            view.line_trace(view.coordinates(base[base_ring]), "#5c6873", 6),
+            go.Scatter3d(view.coordinates(labels), mode="text", text=texts, hoverinfo="skip"),
         ]
     )
     points = np.concatenate([labels, joints])
-    figure.update_layout(LAYOUT, **VIEW, height=540, scene=scene(points, mechanism.up_in_base))
+    figure.update_layout(LAYOUT, **view.VIEW, height=540, scene=view.scene(points, mechanism.up_in_base))
     return figure
 
 

@@ -9,25 +9,8 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
-from hil.reports.page import (
-    AXIS_NAMES,
-    COLORS,
-    FAINT,
-    INK,
-    LAYOUT,
-    LEG_NAMES,
-    LEGEND,
-    VIEW,
-    coordinates,
-    figure_html,
-    line_trace,
-    plate_trace,
-    ring,
-    scene,
-    segment_colors,
-    segments,
-    write_page,
-)
+from hil.reports import view
+from hil.reports.page import AXIS_NAMES, COLORS, FAINT, INK, LAYOUT, LEG_NAMES, LEGEND, figure_html, write_page
 from hil.runs.simulation import SimulationResult
 from hil.table import Cell, Table
 from plant.pose import Array, pose_errors
@@ -45,15 +28,7 @@ _TUBE = 0.62
 
 
 class _Panel(NamedTuple):
-    """Axes over time with k curves.
-
-    Attributes:
-        label: of the vertical axis.
-        names: of the curves.
-        values: (N, k).
-        planned: (N, k), drawn behind.
-        limits: drawn dashed.
-    """
+    """Axes over time with the curves `names`: their `values` (N, k), their plan (N, k) behind, and dashed limits."""
 
     label: str
     names: Sequence[str]
@@ -69,7 +44,7 @@ def write_report(result: SimulationResult, path: Path) -> None:
         InputError: the file cannot be written.
     """
     summary = result.summary()
-    view, speed = _mechanism_view(result)
+    moving, speed = _mechanism_view(result)
     pace = "in real time" if speed < 1.05 else f"at {speed:.2g} times real speed"
     caption = f"{_real(result)} poses {pace}; the path of the origin in grey. Drag to turn, scroll to zoom."
     body = f"""<section class="overview">
@@ -77,7 +52,7 @@ def write_report(result: SimulationResult, path: Path) -> None:
 {_error_table(summary).html()}
 {_facts(summary)}
 </div>
-{figure_html("mechanism", "The mechanism", caption, view, "view")}
+{figure_html("mechanism", "The mechanism", caption, moving, "view")}
 </section>
 {"".join(figure_html(*figure) for figure in _time_figures(result))}"""
     title = f"gough: {result.mechanism.name} follows {result.target.name}"
@@ -127,9 +102,8 @@ def _facts(summary: dict[str, Any]) -> str:
         ("real-time factor", f"{summary['real_time_factor']:.1f}", ""),
         ("cycle [µs], p50 / p99 / p99.9", " / ".join(f"{cycle[name]:.1f}" for name in ("p50", "p99", "p999")), ""),
     )
-    return (
-        "<dl>" + "".join(f'<div><dd class="{kind}">{value}</dd><dt>{name}</dt></div>' for name, value, kind in facts) + "</dl>"
-    )
+    items = "".join(f'<div><dd class="{kind}">{value}</dd><dt>{name}</dt></div>' for name, value, kind in facts)
+    return f"<dl>{items}</dl>"
 
 
 def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figure]]:
@@ -140,15 +114,11 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
     estimate = (records["position"], records["rotation"])
     actual, real = _actual_poses(result), _real(result)
     planned = (result.reference_positions, result.reference_rotations)
-    true_lengths, currents = (
-        records["truth"][:, TRUTH_LENGTHS][:, legs_there],
-        records["truth"][:, TRUTH_CURRENTS][:, legs_there],
-    )
-    lengths_known = bool(np.isfinite(true_lengths[:1]).all())
-    lengths, real_length = (
-        1e3 * (true_lengths if lengths_known else records["lengths"][:, legs_there]),
-        "True" if lengths_known else "Estimated",
-    )
+    lengths, currents = (records["truth"][:, part][:, legs_there] for part in (TRUTH_LENGTHS, TRUTH_CURRENTS))
+    real_length = "True"
+    if not np.isfinite(lengths[:1]).all():
+        lengths, real_length = records["lengths"][:, legs_there], "Estimated"
+    lengths = 1e3 * lengths
     planned_lengths, rates, accelerations = np.moveaxis(records["reference"][:, legs_there], 2, 0) * [[[1e3]], [[1e3]], [[1.0]]]
 
     home = (home_pose.position, home_pose.rotation)
@@ -258,12 +228,7 @@ def _plot(times: Array, panels: Sequence[_Panel], columns: int = 1, shared_yaxes
         figure.add_vrect(times[0], min(0.0, times[-1]), fillcolor=FAINT, opacity=0.2, line_width=0, layer="below")
     figure.update_xaxes(range=[times[0], times[-1]])
     figure.update_xaxes(title_text="time [s]", row=rows)
-    figure.update_layout(
-        LAYOUT,
-        height=60 + 210 * rows,
-        legend=LEGEND,
-    )
-    return figure
+    return figure.update_layout(LAYOUT, height=60 + 210 * rows, legend=LEGEND)
 
 
 def _span(panels: Sequence[_Panel], moving: NDArray[np.bool_]) -> tuple[float, float]:
@@ -316,7 +281,7 @@ def _mechanism_view(result: SimulationResult) -> tuple[go.Figure, float]:
     path = 1e3 * all_positions[moving[:: -(-len(moving) // _PATH_POINTS)]]
     base, platform = 1e3 * mechanism.base_joints, 1e3 * mechanism.platform_joints
     joints = positions[:, None] + platform @ np.swapaxes(rotations, 1, 2)
-    base_ring, platform_ring = ring(base), ring(platform)
+    base_ring, platform_ring = view.ring(base), view.ring(platform)
     numbers = base + 0.12 * (base - base.mean(axis=0))
     tube = _TUBE * 1e3 * mechanism.require_limits().stroke[:, :1]
     points = np.concatenate([numbers, joints.reshape(-1, 3), path])
@@ -326,11 +291,11 @@ def _mechanism_view(result: SimulationResult) -> tuple[go.Figure, float]:
         legs = joints[k] - base
         ends = base + tube * legs / np.linalg.norm(legs, axis=1, keepdims=True)
         return [
-            coordinates(joints[k][platform_ring[:-1]]),
-            coordinates(joints[k][platform_ring]),
-            coordinates(segments(base, ends)),
-            coordinates(segments(ends, joints[k])),
-            coordinates(segments(np.broadcast_to(positions[k], (3, 3)), positions[k] + triad * rotations[k].T)),
+            view.coordinates(joints[k][platform_ring[:-1]]),
+            view.coordinates(joints[k][platform_ring]),
+            view.coordinates(view.segments(base, ends)),
+            view.coordinates(view.segments(ends, joints[k])),
+            view.coordinates(view.segments(np.broadcast_to(positions[k], (3, 3)), positions[k] + triad * rotations[k].T)),
         ]
 
     def frame(k: int) -> go.Frame:
@@ -341,24 +306,26 @@ def _mechanism_view(result: SimulationResult) -> tuple[go.Figure, float]:
     plate, outline, tubes, rods, axes = moving_parts(0)
     figure = go.Figure(
         [
-            plate_trace(plate, "#6d87a3", 0.55),
-            line_trace(outline, "#3d5670", 6),
-            line_trace(tubes, segment_colors(LEG_NAMES[: mechanism.legs]), 14),
-            line_trace(rods, "#6b7683", 6),
-            line_trace(axes, segment_colors(AXIS_NAMES), 5),
-            plate_trace(coordinates(base[base_ring[:-1]]), FAINT, 0.35),
-            line_trace(coordinates(base[base_ring]), "#5c6873", 6),
-            line_trace(coordinates(path), FAINT, 2),
-            go.Scatter3d(coordinates(numbers), mode="text", text=[str(k) for k in range(mechanism.legs)], hoverinfo="skip"),
+            view.plate_trace(plate, "#6d87a3", 0.55),
+            view.line_trace(outline, "#3d5670", 6),
+            view.line_trace(tubes, view.segment_colors(LEG_NAMES[: mechanism.legs]), 14),
+            view.line_trace(rods, "#6b7683", 6),
+            view.line_trace(axes, view.segment_colors(AXIS_NAMES), 5),
+            view.plate_trace(view.coordinates(base[base_ring[:-1]]), FAINT, 0.35),
+            view.line_trace(view.coordinates(base[base_ring]), "#5c6873", 6),
+            view.line_trace(view.coordinates(path), FAINT, 2),
+            go.Scatter3d(
+                view.coordinates(numbers), mode="text", text=[str(k) for k in range(mechanism.legs)], hoverinfo="skip"
+            ),
         ],
         frames=[frame(k) for k in range(count)],
     )
     figure.update_layout(
         LAYOUT,
-        **VIEW,
+        **view.VIEW,
         height=540,
         uirevision="kept",
-        scene=scene(points, mechanism.up_in_base, np.array([0.0, 0.0, 1.0]) if mechanism.planar else None),
+        scene=view.scene(points, mechanism.up_in_base, np.array([0.0, 0.0, 1.0]) if mechanism.planar else None),
         **_player(result.times[shown], frame_s),
     )
     return figure, span / count / frame_s

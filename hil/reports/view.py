@@ -1,0 +1,73 @@
+"""Parts of a view of a mechanism in 3-D."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+from numpy.typing import NDArray
+
+from hil.reports.page import AXIS_NAMES, COLORS, FAINT
+from plant.pose import Array
+
+VIEW = {"margin": {"l": 0, "r": 0, "t": 0, "b": 10}, "showlegend": False}
+"""The look of a view."""
+
+
+def scene(points: Array, up: Array, front: Array | None = None) -> dict[str, Any]:
+    """Fixed axes with equal scales around `points` (N, 3), seen from the side and above, or along `front` (3,)."""
+    margin = 0.05 * np.ptp(points, axis=0).max()
+    ranges = np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin], axis=1)
+    aside = np.array([1.15, -1.4, 0.0])
+    eye = aside + (0.6 - aside @ up) * up
+    if front is not None:
+        # The camera's unit is the edge of the cube that has the volume of the scene.
+        spans = np.ptp(ranges, axis=1)
+        eye = 1.2 * spans.max() / np.cbrt(spans.prod()) * front
+    looks = {"up": up, "eye": eye, "center": -0.1 * up}
+    look = {"showbackground": False, "showspikes": False, "gridcolor": "#e3e7eb", "color": FAINT, "nticks": 5}
+    return {
+        **{
+            f"{name}axis": {"range": ends.tolist(), "title": {"text": f"{name} [mm]"}, **look}
+            for name, ends in zip(AXIS_NAMES, ranges, strict=True)
+        },
+        "aspectmode": "data",
+        # A turntable always turns about z.
+        "dragmode": "turntable" if up[2] > 0.999 else "orbit",
+        "camera": {key: dict(zip(AXIS_NAMES, vector.tolist(), strict=True)) for key, vector in looks.items()},
+    }
+
+
+def ring(joints: Array) -> NDArray[np.intp]:
+    """The indices of `joints` (6, 3) in their order round the centre, and the first again."""
+    center = joints - joints.mean(axis=0)
+    plane = np.linalg.svd(center)[2][:2]
+    x, y = plane @ center.T
+    order = np.argsort(np.arctan2(y, x))
+    return np.append(order, order[0])
+
+
+def segments(starts: Array, ends: Array) -> Array:
+    """Points (3 n, 3) of n separate lines: start, end, gap."""
+    return np.stack([starts, ends, np.full_like(ends, np.nan)], axis=1).reshape(-1, 3)
+
+
+def segment_colors(names: Sequence[str]) -> list[str]:
+    """A color for each point of `segments`."""
+    return [COLORS[name] for name in names for _ in range(3)]
+
+
+def coordinates(points: Array) -> dict[str, Array]:
+    """Points (n, 3) as the keywords of a trace."""
+    return dict(zip(AXIS_NAMES, points.T.astype(np.float32), strict=True))
+
+
+def line_trace(points: dict[str, Array], color: str | list[str], width: float) -> go.Scatter3d:
+    """A line through `coordinates`."""
+    return go.Scatter3d(points, mode="lines", line={"color": color, "width": width}, hoverinfo="skip")
+
+
+def plate_trace(corners: dict[str, Array], color: str, opacity: float) -> go.Mesh3d:
+    """A plate whose rim is `coordinates`."""
+    fan = np.arange(1, len(corners["x"]) - 1)
+    return go.Mesh3d(corners, i=0 * fan, j=fan, k=fan + 1, color=color, opacity=opacity, flatshading=True, hoverinfo="skip")
