@@ -14,7 +14,7 @@ from collections.abc import Collection
 import numpy as np
 
 from controller.calibration.file import Calibration
-from controller.direct_kinematics.closed_forms import GEOMETRY, SCRATCH, geometry_of
+from controller.direct_kinematics.geometry import GEOMETRY, SCRATCH, geometry_of
 from controller.estimation.fusion import (
     WORST_CONDITIONING,
     calibrate,

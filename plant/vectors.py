@@ -17,6 +17,24 @@ def vector(array: Array) -> Vector:
 
 
 @kernel
+def add(a: Vector, b: Vector) -> Vector:
+    """A + b."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@kernel
+def subtract(a: Vector, b: Vector) -> Vector:
+    """A - b."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@kernel
+def scale(factor: float, a: Vector) -> Vector:
+    """The vector times a number."""
+    return factor * a[0], factor * a[1], factor * a[2]
+
+
+@kernel
 def dot(a: Vector, b: Vector) -> float:
     """The inner product."""
     a0, a1, a2 = a

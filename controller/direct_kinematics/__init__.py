@@ -1,21 +1,19 @@
-"""Direct kinematics: from the directions of the legs to the pose, in closed form and without a first guess."""
+"""Direct kinematics: from the directions of the legs to the pose, in closed form and without a first guess.
+
+`solve` and `solve_batch` take six legs, `solve_planar` three in the plane. `required_measurements` says what to measure,
+`integrity` which measurement is wrong. `pose_from_lengths` is for rigs that measure lengths.
+"""
 
 from controller.direct_kinematics.consistency import Integrity, LengthCheck, cross_check, integrity
 from controller.direct_kinematics.lengths import pose_from_lengths, poses_from_lengths
 from controller.direct_kinematics.planar import AssemblyMode, solve_planar
-from controller.direct_kinematics.spatial import (
-    METHODS,
-    Requirement,
-    Solution,
-    Solutions,
-    pose_difference,
-    required_measurements,
-    solve,
-    solve_batch,
-)
+from controller.direct_kinematics.requirements import Requirement, required_measurements
+from controller.direct_kinematics.solver import METHODS
+from controller.direct_kinematics.spatial import NEEDS, Solution, Solutions, pose_difference, solve, solve_batch
 
 __all__ = [
     "METHODS",
+    "NEEDS",
     "AssemblyMode",
     "Integrity",
     "LengthCheck",

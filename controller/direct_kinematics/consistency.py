@@ -1,4 +1,4 @@
-"""Watching over direct kinematics: which IMU contradicts the others, and whether measured lengths agree."""
+"""Consistency of what was measured: which IMU contradicts the others, and whether measured lengths agree with the pose."""
 
 import math
 from contextlib import suppress
@@ -17,7 +17,7 @@ from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, Pose, checked_array
 
 FALSE_ALARM_RATE = 1e-4
-"""Share of sound measurements that `integrity` and `cross_check` take for faulty."""
+"""Share of correct measurements that `integrity` and `cross_check` call faulty."""
 
 LENGTH_SIGMA = 1e-4
 """Standard deviation that `cross_check` assumes of a measured length [m]."""
@@ -28,13 +28,13 @@ class Integrity:
     """Whether the measurements of a pose agree, and the pose without the one that does not.
 
     Attributes:
-        solution: the pose, found without the faulty IMU if one is named; None if one is detected, cannot be named, and
-            leaves no pose.
+        solution: the pose, without the faulty IMU if one is named. None if a fault was detected, no IMU can be named, and no
+            pose fits.
         detected: whether the measurements contradict each other.
         faulty: the IMU without which the others agree, 0-5 on the legs and 6 on the platform; None if nothing is wrong, or
-            if no single IMU explains what is.
-        chi_square: sum of squared residuals over variances with everything; infinite if no pose fits everything.
-        threshold: what it exceeds for sound measurements at the false-alarm rate.
+            if no single IMU explains the contradiction.
+        chi_square: sum of squared residuals over variances, of all measurements; infinite if no pose fits them.
+        threshold: limit that the sum of correct measurements exceeds at the false-alarm rate.
         degrees_of_freedom: of `chi_square`.
         chi_squares: (7,), the same sum without each IMU; NaN where the pose needs it or it was not measured.
     """
@@ -58,15 +58,15 @@ def integrity(
     false_alarm_rate: float = FALSE_ALARM_RATE,
     **options: Any,
 ) -> Integrity:
-    """Solve a pose, tell from the residuals whether a measurement is wrong, and solve without it.
+    """Solve a pose, find out from the residuals whether a measurement is wrong, and solve without it.
 
-    The residuals of sound measurements have a chi-square sum. The faulty IMU is the one without which the others agree
-    best; two at once are detected, not named.
+    The squared residuals of correct measurements, over their variances, have a chi-square sum. The faulty IMU is the one
+    without which the others agree best. Two faults at once are detected but not named.
 
     Args:
         mechanism, leg_directions, rotation, normal, up_in_platform: as for `solve`.
-        false_alarm_rate: share of sound measurements that are taken for faulty, between 0 and 1.
-        options: the `method` and the sigmas of `solve`; the threshold is relative to those.
+        false_alarm_rate: share of correct measurements that are called faulty, between 0 and 1.
+        options: the `method` and the sigmas of `solve`; the threshold is relative to the sigmas.
 
     Raises:
         InputError: as `solve`; a rate out of range; or no more is measured than the pose needs.
@@ -85,7 +85,7 @@ def integrity(
     freedom = 2 * len(measured) + sum({"rotation": 3}.get(name, 2) for name in given) - 6
     if freedom <= 0:
         raise InputError(
-            f"{len(measured)} legs{''.join(f' and {name}' for name in given)} are no more than a pose needs, and do not tell "
+            f"{len(measured)} legs{''.join(f' and {name}' for name in given)} are no more than a pose needs, so nothing shows "
             "whether they are right: measure more"
         )
     threshold = chi_square_quantile(freedom, false_alarm_rate)
@@ -123,14 +123,14 @@ class LengthCheck:
     """How measured lengths compare with those of a pose found from orientations.
 
     Attributes:
-        errors: (6,) [m], measured less predicted length; NaN where none was measured.
+        errors: (6,) [m], measured minus predicted length; NaN where none was measured.
         deviations: (6,), the errors over their standard deviations.
         chi_square: sum of the squared errors over their covariance.
-        threshold: what it exceeds at the false-alarm rate if lengths and orientations are sound.
-        consistent: whether it does not.
+        threshold: limit that the sum exceeds at the false-alarm rate if lengths and orientations are correct.
+        consistent: whether the sum is within the limit.
         pose: the pose at which the legs have these lengths, by Newton's method from the given one; None if a length was not
             measured or there is no such pose.
-        distance, angle: between the two poses [m], [rad]; NaN without one.
+        distance, angle: between the two poses [m], [rad]; NaN without the second one.
     """
 
     errors: Array
@@ -155,10 +155,10 @@ def cross_check(
 
     Args:
         mechanism: the mechanism.
-        solution: of `solve`, whose covariance counts.
+        solution: from `solve`, with its covariance.
         lengths: (6,) [m]; NaN where none was measured.
         length_sigma: standard deviation of a measured length [m].
-        false_alarm_rate: share of sound measurements that are called inconsistent, between 0 and 1.
+        false_alarm_rate: share of correct measurements that are called inconsistent, between 0 and 1.
 
     Raises:
         InputError: wrong shape, no length at all, a sigma not positive, or a rate out of range.
@@ -185,27 +185,14 @@ def cross_check(
 
 
 def chi_square_quantile(degrees_of_freedom: int, rate: float) -> float:
-    """What a chi-square sum exceeds at this rate.
+    """The value that a chi-square sum exceeds at this rate.
 
     Raises:
         InputError: the rate is not between 0 and 1.
     """
+    # Imported here: a process that runs a loop imports this module, and SciPy takes long.
+    from scipy.special import chdtri
+
     if not 0.0 < checked_array(rate, (), "the false-alarm rate", allow_nan=True) < 1.0:
         raise InputError(f"the false-alarm rate is {rate}; it must lie between 0 and 1")
-    low, high = 0.0, 1.0
-    while _exceeded(degrees_of_freedom, high) > rate:
-        low, high = high, 2.0 * high
-    while high - low > 1e-12 * high:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if _exceeded(degrees_of_freedom, middle) > rate else (low, middle)
-    return high
-
-
-def _exceeded(degrees_of_freedom: int, value: float) -> float:
-    """How often a chi-square sum of whole degrees of freedom exceeds a value; elementary, so that no loop loads SciPy."""
-    half = 0.5 * value
-    if half == 0.0:
-        return 1.0
-    total, start = (0.0, 0.0) if degrees_of_freedom % 2 == 0 else (math.erfc(math.sqrt(half)), 0.5)
-    powers = (start + i for i in range((degrees_of_freedom - int(2.0 * start)) // 2))
-    return total + math.fsum(math.exp(power * math.log(half) - half - math.lgamma(power + 1.0)) for power in powers)
+    return float(chdtri(degrees_of_freedom, rate))

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from controller.direct_kinematics.closed_forms import geometry_of
+from controller.direct_kinematics.geometry import geometry_of
 from controller.direct_kinematics.refinement import move_pose
 from controller.inverse_kinematics import jacobian_at, legs_at
 from controller.least_squares import RANK_TOLERANCE, solve_square
@@ -40,7 +40,7 @@ def _copied(guess: Pose) -> tuple[Array, Array]:
 
 
 def _scratch() -> tuple[Array, ...]:
-    """Memory for `newton_from_lengths`, in the order in which it takes it."""
+    """Memory for `newton_from_lengths`, in the order of its arguments."""
     return tuple(np.zeros(shape) for shape in ((LEGS, 3), (LEGS, 3), LEGS, (6, 6)))
 
 
@@ -49,12 +49,13 @@ def newton_from_lengths(
     base_joints: Array, platform_joints: Array, target: Array, position: Array, rotation: Array, arms: Array, directions: Array,
     lengths: Array, jacobian: Array,
 ) -> float:  # fmt: skip
-    """Move a pose, in place, to where the legs have the lengths `target` (n,) [m]; returns the largest error left [m]."""
+    """Move a pose, in place, to where the legs have the lengths `target` (n,) [m]; returns the largest remaining error [m]."""
     error, legs = np.inf, target.shape[0]
     for _ in range(_NEWTON_LIMIT):
         legs_at(base_joints, platform_joints, position, rotation, arms, directions, lengths)
         before, error = error, 0.0
-        lengths[legs:] = 0.0
+        for k in range(legs, LEGS):
+            lengths[k] = 0.0
         for k in range(legs):
             lengths[k] = target[k] - lengths[k]
             if not np.isfinite(lengths[k]):
@@ -86,8 +87,8 @@ def _poses_from_lengths(
 
 
 def poses_from_lengths(mechanism: Mechanism, lengths: ArrayLike, guess: Pose) -> tuple[Array, Array]:
-    """Positions (N, 3) [m] and rotations (N, 3, 3) of a motion given by lengths (N, n) [m] of n legs, each found from the one
-    before.
+    """Positions (N, 3) [m] and rotations (N, 3, 3) of a motion given by lengths (N, n) [m] of n legs. Each pose is the first
+    guess for the next.
 
     Raises:
         InputError: wrong shape or not finite, or the guess is no pose.

@@ -1,14 +1,16 @@
 """Direct kinematics of planar mechanisms: from the angles of three legs to the assembly modes, in closed form.
 
 A leg at the angle t_k gives one equation, `n_k . (p + R a_k - b_k) = 0` with `n_k = (-sin t_k, cos t_k)`, linear in p and
-in the cosine and sine of the platform's angle. The paper's section 6 measures that angle too, its roll (30), and then two
-legs give p (31); here all measured ones do, by least squares. From the legs alone (34)-(36), the weights
-`w_k = sin(t_i - t_j)`, with k, j, i in cyclic order, add the equations up to one without p, because `sum w_k n_k = 0`:
+in the cosine and sine of the platform's angle. The paper's section 6 also measures that angle, the roll (30), and then two
+legs give p (31); here all measured legs do, by least squares. From the legs alone (34)-(36), the weights
+`w_k = sin(t_i - t_j)`, with k, j, i in cyclic order, sum the equations up to one without p, because `sum w_k n_k = 0`:
 
     c cos(angle) + s sin(angle) = d.
 
 Its two roots are the assembly modes. They merge where the perpendiculars to the legs in the platform joints meet in one
-point, about which the platform can then turn a little without turning a leg.
+point: the platform can then turn a little about that point without turning a leg.
+
+The loop measures the roll: `pose_from_roll` is its compiled form of (30) and (31).
 """
 
 from dataclasses import dataclass
@@ -16,8 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from controller.direct_kinematics.spatial import LEAST_CONDITIONING, LEG_SIGMA, TILT_SIGMA
+from controller.direct_kinematics.solver import LEAST_CONDITIONING
+from controller.direct_kinematics.spatial import LEG_SIGMA, TILT_SIGMA
+from controller.least_squares import RANK_TOLERANCE
+from plant.compiled import Record, kernel
 from plant.errors import InputError, SingularConfigurationError
+from plant.mechanism import LEGS
 from plant.mechanism.planar import PLANAR_LEGS, PlanarMechanism
 from plant.pose import Array, checked_array
 
@@ -29,13 +35,13 @@ class AssemblyMode:
     Attributes:
         position: (2,) [m], origin of {2} in {1}.
         angle: of {2} against {1}, counter-clockwise, in (-pi, pi] [rad].
-        lengths: (3,) [m], along the measured direction and so possibly negative; the distance of the joints for a leg that
-            was not measured.
+        lengths: (3,) [m], along the measured direction and so possibly negative; for a leg that was not measured, the
+            distance between its joints.
         within_stroke: whether every length is positive and, if the mechanism has a stroke, inside it.
-        double_root: whether the two modes have merged, or noise has made the angles contradict each other, so that no
-            pose has them all and this one comes closest.
-        conditioning: reciprocal condition of the pose's equations, with lengths in units of the joints' spread; near 0,
-            small changes of the leg angles are large changes of the pose.
+        double_root: whether the two modes have merged. If noise has made the angles contradict each other, no pose has all of
+            them, and this one comes closest.
+        conditioning: reciprocal condition of the pose's equations, with lengths in units of the joints' spread. Near 0, small
+            changes of the leg angles are large changes of the pose.
         covariance: (3, 3) of x, y [m] and angle [rad] to first order; infinite for a double root.
     """
 
@@ -56,16 +62,16 @@ def solve_planar(
     angle_sigma: float = LEG_SIGMA,
     roll_sigma: float = TILT_SIGMA,
 ) -> tuple[AssemblyMode, ...]:
-    """The poses that the angles of the legs allow: two, one if they merge, and one if the platform's roll is measured.
+    """The poses that the angles of the legs allow: two, or one if they merge or the platform's roll is measured.
 
-    Those within the stroke come first, then those whose angle is nearer to 0.
+    Poses within the stroke come first; among them, the pose whose angle is nearest to 0 comes first.
 
     Args:
-        mechanism: two arrays of joints are enough.
+        mechanism: its joints suffice; no home, limits or plant are needed.
         leg_angles: (3,) [rad], from the x axis of {1} to the leg from base to platform joint; NaN is a leg not measured.
         roll: measured angle of the platform [rad] (the paper's section 6); without it all three legs are needed.
         angle_sigma: standard deviation of each leg angle [rad], for the covariance.
-        roll_sigma: of the roll [rad].
+        roll_sigma: standard deviation of the roll [rad].
 
     Raises:
         InputError: wrong shape, infinite, or a sigma that is not positive.
@@ -96,8 +102,8 @@ def solve_planar(
 
 
 def closing_angles(mechanism: PlanarMechanism, leg_angles: Array) -> Array:
-    """Both angles (..., 2) [rad] of the platform, in (-pi, pi], at which three legs at angles (..., 3) [rad] meet its joints;
-    they are the same for a double root.
+    """Both angles (..., 2) [rad] of the platform, in (-pi, pi], at which three legs at angles (..., 3) [rad] meet its joints.
+    The two are equal for a double root.
 
     Raises:
         SingularConfigurationError: the legs leave the angle open.
@@ -122,8 +128,8 @@ def closing_angles(mechanism: PlanarMechanism, leg_angles: Array) -> Array:
 
 
 def closing_positions(mechanism: PlanarMechanism, leg_angles: Array, angles: Array | float) -> Array:
-    """Positions (..., 2) [m] of least squared distance from the platform joints to the legs at angles (..., 3) [rad], for a
-    platform at `angles` (...) [rad]; a leg at NaN is left out (the paper's (25)-(28) and (31), planar).
+    """Positions (..., 2) [m] with the least sum of squared distances from the platform joints to the legs at angles (..., 3)
+    [rad], for a platform at `angles` (...) [rad]. A leg at NaN is left out (the paper's (25)-(28) and (31), planar).
     """
     normals = _normals(leg_angles)
     arms = mechanism.base_joints - mechanism.joints_at(np.zeros(2), angles)
@@ -155,7 +161,7 @@ def _spread(mechanism: PlanarMechanism) -> float:
 def _mode(
     mechanism: PlanarMechanism, leg_angles: Array, angle: float, angle_sigma: float, roll_sigma: float | None, double_root: bool
 ) -> AssemblyMode:
-    """The mode at `angle` [rad], which was measured with `roll_sigma`, or follows from the legs if that is None."""
+    """The mode at `angle` [rad], which was measured with `roll_sigma`, or follows from the legs if `roll_sigma` is None."""
     position = closing_positions(mechanism, leg_angles, angle)
     joints = mechanism.joints_at(position, angle)
     legs = joints - mechanism.base_joints
@@ -183,3 +189,40 @@ def _mode(
         conditioning=float(1.0 / np.linalg.cond(equations)),
         covariance=np.full((3, 3), np.inf) if double_root else gain @ gain.T,
     )
+
+
+@kernel
+def pose_from_roll(
+    geometry: Record, directions: Array, measured: Array, in_base: Array, in_platform: Array, position: Array, rotation: Array
+) -> float:
+    """Pose of a planar mechanism in the xy-plane of {1} from its roll and two or more legs (the paper's section 6).
+
+    The roll is the angle between the parts in the plane of one vector that is known in {1} and in {2}; it replaces (30). The
+    position is that of least squares over all legs (31). Returns the conditioning of the position, which is what can fail.
+    """
+    b0, b1, v0, v1 = in_base[0], in_base[1], in_platform[0], in_platform[1]
+    cosine, sine = b0 * v0 + b1 * v1, b1 * v0 - b0 * v1
+    size = np.sqrt(cosine * cosine + sine * sine)
+    if not size > RANK_TOLERANCE:
+        return 0.0
+    cosine, sine = cosine / size, sine / size
+    n00 = n01 = n11 = r0 = r1 = 0.0
+    for k in range(LEGS):
+        if measured[k] == 0.0:
+            continue
+        n0, n1 = -directions[k, 1], directions[k, 0]
+        a0, a1 = geometry.platform_joints[k, 0], geometry.platform_joints[k, 1]
+        off = n0 * (geometry.base_joints[k, 0] - cosine * a0 + sine * a1)
+        off += n1 * (geometry.base_joints[k, 1] - sine * a0 - cosine * a1)
+        n00, n01, n11 = n00 + n0 * n0, n01 + n0 * n1, n11 + n1 * n1
+        r0, r1 = r0 + n0 * off, r1 + n1 * off
+    middle, swing = 0.5 * (n00 + n11), np.sqrt(0.25 * (n00 - n11) ** 2 + n01 * n01)
+    if not middle - swing > RANK_TOLERANCE**2 * middle:
+        return 0.0
+    determinant = n00 * n11 - n01 * n01
+    position[0], position[1], position[2] = (n11 * r0 - n01 * r1) / determinant, (n00 * r1 - n01 * r0) / determinant, 0.0
+    for i in range(3):
+        for j in range(3):
+            rotation[i, j] = 1.0 if i == j else 0.0
+    rotation[0, 0], rotation[0, 1], rotation[1, 0], rotation[1, 1] = cosine, -sine, sine, cosine
+    return float(np.sqrt((middle - swing) / (middle + swing)))

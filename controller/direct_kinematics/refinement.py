@@ -1,6 +1,6 @@
 """Refinement: Gauss-Newton steps on SE(3) that weigh leg directions and vectors by their variances.
 
-The normal matrix is the inverse of the pose's covariance; the twist follows from the same matrix.
+The normal matrix is the inverse of the pose's covariance. The twist follows from the same matrix.
 """
 
 from controller.inverse_kinematics import legs_at
@@ -8,34 +8,30 @@ from controller.least_squares import factor_cholesky, solve_cholesky
 from plant.compiled import kernel
 from plant.mechanism import LEGS
 from plant.pose import Array, rotate_by_vector
+from plant.vectors import Vector, cross, dot, rotate, scale, subtract, vector
 
 _BEYOND_DOUBT = 1e30
-"""Inverse variance of what is known."""
+"""Inverse variance of a known quantity."""
 
 
 @kernel
-def _across(direction: Array, x0: float, x1: float, x2: float) -> tuple[float, float, float]:
-    """The part of a vector x that is across a unit vector, projected twice: where legs are nearly parallel, what rounding
-    leaves along them would weigh more than what they measure.
+def _project(direction: Vector, x: Vector) -> Vector:
+    """The part of a vector x across a unit vector, projected twice. Where legs are nearly parallel, the rounding that one
+    projection leaves along them would weigh more than the measurement.
     """
-    d0, d1, d2 = direction[0], direction[1], direction[2]
     for _ in range(2):
-        along = d0 * x0 + d1 * x1 + d2 * x2
-        x0, x1, x2 = x0 - along * d0, x1 - along * d1, x2 - along * d2
-    return x0, x1, x2
+        x = subtract(x, scale(dot(direction, x), direction))
+    return x
 
 
 @kernel
-def _add_leg(right: Array, measured: Array, direction: Array, arm: Array, scale: float) -> None:
-    """Add `scale` J^T P `measured` to a right side (6,), P = I - d d^T and J = [I, -skew(arm)]."""
-    a0, a1, a2 = arm[0], arm[1], arm[2]
-    g0, g1, g2 = _across(direction, scale * measured[0], scale * measured[1], scale * measured[2])
-    right[0] += g0
-    right[1] += g1
-    right[2] += g2
-    right[3] += a1 * g2 - a2 * g1
-    right[4] += a2 * g0 - a0 * g2
-    right[5] += a0 * g1 - a1 * g0
+def _add_leg(right: Array, measured: Vector, direction: Vector, arm: Vector, weight: float) -> None:
+    """Add `weight` J^T P `measured` to a right side (6,), P = I - d d^T and J = [I, -skew(arm)]."""
+    force = _project(direction, scale(weight, measured))
+    torque = cross(arm, force)
+    for i in range(3):
+        right[i] += force[i]
+        right[3 + i] += torque[i]
 
 
 @kernel
@@ -49,10 +45,11 @@ def normal_equations(
     Args:
         directions: (6, 3), measured.
         weights: (6,), inverse variance of a component of a direction; 0 leaves a leg out.
-        in_base, in_platform: (m, 3), vectors known in both frames; `vector_weights` (m,) are their inverse variances, and 0
-            leaves one out.
+        in_base, in_platform: (m, 3), vectors known in both frames.
+        vector_weights: (m,), inverse variances of the vectors; 0 leaves a vector out.
         arms, predicted, lengths: the legs at the pose, written.
-        information: (6, 6), lower triangle written; `correction` (6,) is the right side.
+        information: (6, 6), lower triangle written.
+        correction: (6,), the right side, written.
     """
     legs_at(base_joints, platform_joints, position, rotation, arms, predicted, lengths)
     for i in range(6):
@@ -60,63 +57,44 @@ def normal_equations(
         for j in range(6):
             information[i, j] = 0.0
     for k in range(LEGS):
-        w = weights[k]
-        if w == 0.0:
+        if weights[k] == 0.0:
             continue
-        d0, d1, d2 = predicted[k, 0], predicted[k, 1], predicted[k, 2]
-        a0, a1, a2 = arms[k, 0], arms[k, 1], arms[k, 2]
-        scale = w / lengths[k]
+        direction, arm = vector(predicted[k]), vector(arms[k])
+        weight = weights[k] / lengths[k]
         # P = I - d d^T makes the derivative of a direction P / l; [I, -skew(a)] is that of the leg vector.
-        w2 = scale / lengths[k]
-        p00, p01, p02 = w2 * (1.0 - d0 * d0), -w2 * d0 * d1, -w2 * d0 * d2
-        p11, p12, p22 = w2 * (1.0 - d1 * d1), -w2 * d1 * d2, w2 * (1.0 - d2 * d2)
-        information[0, 0] += p00
-        information[1, 0] += p01
-        information[1, 1] += p11
-        information[2, 0] += p02
-        information[2, 1] += p12
-        information[2, 2] += p22
-        m00, m01, m02 = a1 * p02 - a2 * p01, a1 * p12 - a2 * p11, a1 * p22 - a2 * p12
-        m10, m11, m12 = a2 * p00 - a0 * p02, a2 * p01 - a0 * p12, a2 * p02 - a0 * p22
-        m20, m21, m22 = a0 * p01 - a1 * p00, a0 * p11 - a1 * p01, a0 * p12 - a1 * p02
-        information[3, 0] += m00
-        information[3, 1] += m01
-        information[3, 2] += m02
-        information[4, 0] += m10
-        information[4, 1] += m11
-        information[4, 2] += m12
-        information[5, 0] += m20
-        information[5, 1] += m21
-        information[5, 2] += m22
-        information[3, 3] += a1 * m02 - a2 * m01
-        information[4, 3] += a1 * m12 - a2 * m11
-        information[5, 3] += a1 * m22 - a2 * m21
-        information[4, 4] += a2 * m10 - a0 * m12
-        information[5, 4] += a2 * m20 - a0 * m22
-        information[5, 5] += a0 * m21 - a1 * m20
-        _add_leg(correction, directions[k], predicted[k], arms[k], scale)
+        w = weight / lengths[k]
+        d0, d1, d2 = direction
+        p = (
+            (w * (1.0 - d0 * d0), -w * d0 * d1, -w * d0 * d2),
+            (-w * d0 * d1, w * (1.0 - d1 * d1), -w * d1 * d2),
+            (-w * d0 * d2, -w * d1 * d2, w * (1.0 - d2 * d2)),
+        )
+        c0, c1, c2 = cross(arm, p[0]), cross(arm, p[1]), cross(arm, p[2])
+        for i in range(3):
+            row = c0[i], c1[i], c2[i]
+            turned = cross(arm, row)
+            for j in range(3):
+                information[3 + i, j] += row[j]
+            for j in range(i + 1):
+                information[i, j] += p[i][j]
+                information[3 + i, 3 + j] += turned[j]
+        _add_leg(correction, vector(directions[k]), direction, arm, weight)
     for k in range(vector_weights.shape[0]):
         w = vector_weights[k]
         if w == 0.0:
             continue
-        v0 = rotation[0, 0] * in_platform[k, 0] + rotation[0, 1] * in_platform[k, 1] + rotation[0, 2] * in_platform[k, 2]
-        v1 = rotation[1, 0] * in_platform[k, 0] + rotation[1, 1] * in_platform[k, 1] + rotation[1, 2] * in_platform[k, 2]
-        v2 = rotation[2, 0] * in_platform[k, 0] + rotation[2, 1] * in_platform[k, 1] + rotation[2, 2] * in_platform[k, 2]
-        b0, b1, b2 = in_base[k, 0], in_base[k, 1], in_base[k, 2]
-        information[3, 3] += w * (1.0 - v0 * v0)
-        information[4, 3] -= w * v0 * v1
-        information[5, 3] -= w * v0 * v2
-        information[4, 4] += w * (1.0 - v1 * v1)
-        information[5, 4] -= w * v1 * v2
-        information[5, 5] += w * (1.0 - v2 * v2)
-        correction[3] += w * (v1 * b2 - v2 * b1)
-        correction[4] += w * (v2 * b0 - v0 * b2)
-        correction[5] += w * (v0 * b1 - v1 * b0)
+        v = rotate(rotation, vector(in_platform[k]))
+        turn = cross(v, vector(in_base[k]))
+        for i in range(3):
+            correction[3 + i] += w * turn[i]
+            information[3 + i, 3 + i] += w * (1.0 - v[i] * v[i])
+            for j in range(i):
+                information[3 + i, 3 + j] -= w * v[j] * v[i]
 
 
 @kernel
 def stay_in_plane(information: Array, correction: Array) -> None:
-    """Let normal equations move the pose in the xy-plane of {1} alone: beyond all doubt it does not leave it."""
+    """Let normal equations move the pose in the xy-plane of {1} alone: no measurement outweighs that it stays there."""
     for i in range(2, 5):
         for j in range(6):
             information[i, j] = 0.0
@@ -127,8 +105,8 @@ def stay_in_plane(information: Array, correction: Array) -> None:
 
 @kernel
 def solve_normal_equations(information: Array, correction: Array, factor: Array) -> bool:
-    """Replace `correction` (6,) by the Gauss-Newton step; `factor` becomes the Cholesky factor of the information. False if
-    that is singular.
+    """Replace `correction` (6,) by the Gauss-Newton step; `factor` becomes the Cholesky factor of the information. False if the
+    information is singular.
     """
     for i in range(6):
         for j in range(i + 1):
@@ -156,23 +134,20 @@ def find_twist(
 
     Args:
         rates: (6, 3), derivatives of the directions [1/s].
-        angular_velocity: (3,) [rad/s] in {1}, which counts for the twist as the vectors do for the attitude.
+        angular_velocity: (3,) [rad/s] in {1}; it is to the twist what the vectors are to the attitude.
     """
     for i in range(6):
         twist[i] = 0.0
     for k in range(LEGS):
         if weights[k] != 0.0:
-            _add_leg(twist, rates[k], predicted[k], arms[k], weights[k] / lengths[k])
-    o0, o1, o2 = angular_velocity[0], angular_velocity[1], angular_velocity[2]
+            _add_leg(twist, vector(rates[k]), vector(predicted[k]), vector(arms[k]), weights[k] / lengths[k])
+    o = vector(angular_velocity)
     for k in range(vector_weights.shape[0]):
         w = vector_weights[k]
         if w == 0.0:
             continue
-        v0 = rotation[0, 0] * in_platform[k, 0] + rotation[0, 1] * in_platform[k, 1] + rotation[0, 2] * in_platform[k, 2]
-        v1 = rotation[1, 0] * in_platform[k, 0] + rotation[1, 1] * in_platform[k, 1] + rotation[1, 2] * in_platform[k, 2]
-        v2 = rotation[2, 0] * in_platform[k, 0] + rotation[2, 1] * in_platform[k, 1] + rotation[2, 2] * in_platform[k, 2]
-        along = v0 * o0 + v1 * o1 + v2 * o2
-        twist[3] += w * (o0 - along * v0)
-        twist[4] += w * (o1 - along * v1)
-        twist[5] += w * (o2 - along * v2)
+        v = rotate(rotation, vector(in_platform[k]))
+        across = subtract(o, scale(dot(v, o), v))
+        for i in range(3):
+            twist[3 + i] += w * across[i]
     solve_cholesky(factor, twist)

@@ -8,13 +8,9 @@ works on the cycle's parameters and state (`controller.cycle`).
 
 import numpy as np
 
-from controller.direct_kinematics.closed_forms import (
-    pose_from_legs,
-    pose_from_roll,
-    pose_from_rotation,
-    pose_from_vector,
-    rotation_from_vectors,
-)
+from controller.direct_kinematics.legs_alone import pose_from_legs
+from controller.direct_kinematics.legs_and_attitude import pose_from_rotation, pose_from_vector, rotation_from_vectors
+from controller.direct_kinematics.planar import pose_from_roll
 from controller.direct_kinematics.refinement import (
     find_twist,
     move_pose,

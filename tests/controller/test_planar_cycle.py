@@ -8,8 +8,8 @@ from scipy.optimize import least_squares
 
 from controller.cycle import ALL_IMUS, STATE, check_imus, cycle, cycle_parameters
 from controller.direct_kinematics import poses_from_lengths
-from controller.direct_kinematics.closed_forms import geometry_of, pose_from_roll
-from controller.direct_kinematics.planar import solve_planar
+from controller.direct_kinematics.geometry import geometry_of
+from controller.direct_kinematics.planar import pose_from_roll, solve_planar
 from controller.estimation.fusion import find_pose, improve_pose
 from controller.inverse_kinematics import leg_lengths, sample_workspace
 from controller.planning.target import load_target

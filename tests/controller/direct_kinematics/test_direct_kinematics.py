@@ -21,7 +21,8 @@ from controller.direct_kinematics import (
     solve,
     solve_batch,
 )
-from controller.direct_kinematics.closed_forms import SCRATCH, geometry_of, pose_from_rotation, rotation_between
+from controller.direct_kinematics.geometry import SCRATCH, geometry_of
+from controller.direct_kinematics.legs_and_attitude import pose_from_rotation, rotation_between
 from controller.inverse_kinematics import leg_lengths, sample_workspace
 from controller.least_squares import RANK_TOLERANCE
 from plant.errors import GoughError, InputError, SingularConfigurationError

@@ -1,0 +1,397 @@
+"""The compiled solver: reads what was measured of a pose, tries closed forms, refines, and decides between two roots.
+
+It never raises. Each row of a batch ends with a status, from which `spatial` makes the error.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controller.direct_kinematics.geometry import SCRATCH
+from controller.direct_kinematics.legs_alone import orthonormalise, pose_from_legs, second_pose_from_legs
+from controller.direct_kinematics.legs_and_attitude import pose_from_rotation, pose_from_vector
+from controller.direct_kinematics.paper import section_3_1_1, section_4
+from controller.direct_kinematics.refinement import move_pose, normal_equations, solve_normal_equations
+from controller.inverse_kinematics import legs_at
+from controller.least_squares import invert_cholesky
+from plant.compiled import Record, kernel
+from plant.mechanism import LEGS
+from plant.pose import UNIT_TOLERANCE, Array
+from plant.vectors import dot, rotate, vector
+
+METHODS = ("section-5", "up", "normal", "legs", "section-3.1.1", "section-4")
+"""The closed forms: those of the paper's sections, and those from all legs with the vertical, the normal, or nothing else."""
+
+_SECTION_5, _UP, _NORMAL, _LEGS, _SECTION_3_1_1, _SECTION_4 = range(len(METHODS))
+
+LEAST_CONDITIONING = 1e-6
+"""Conditioning below which the measurements count as singular."""
+
+_GOOD_CONDITIONING = 1e-2
+
+_MOST_MISFIT = 0.2
+"""Greatest distance from a rotation, in its nine elements, of what `legs` gives: beyond this the solution fits noise."""
+
+_DISTINCT, _DISTINCT_SHARE = 25.0, 400.0
+"""One of two roots is the pose if their chi-square sums differ by the first number, which noise does once in three million
+times, or by the second number times the better sum over its degrees of freedom, if the noise is far below the sigmas."""
+
+_SAME_ROTATION = 1e-6
+_MOST_REFINEMENTS = 20
+_REFINED = 1e-14
+"""Square of a step over its variance at which the pose has settled."""
+
+_TINY = 1e-9
+"""Step, over the joints' spread or in radians, that may be no more than rounding."""
+
+(
+    SOLVED, OPEN, SINGULAR, UNSETTLED, NEGATIVE, PARTLY_NAN, INFINITE, LEG_NOT_UNIT, ROTATION_INFINITE, NOT_ORTHOGONAL,
+    REFLECTION, UP_NOT_UNIT, NORMAL_NOT_UNIT, AMBIGUOUS,
+) = range(14)  # fmt: skip
+"""Statuses of a row."""
+
+
+class Measurements(NamedTuple):
+    """What was measured of N poses; an array without rows was not measured.
+
+    Attributes:
+        directions: (N, 6, 3).
+        rotations: (N, 3, 3) or (0, 3, 3).
+        ups, normals: (N, 3) or (0, 3).
+        axes: (3, 3), orthonormal rows in {1}, the first of which is the vertical.
+        leg_weight, tilt_weight, yaw_weight: inverse variances.
+    """
+
+    directions: Array
+    rotations: Array
+    ups: Array
+    normals: Array
+    axes: Array
+    leg_weight: float
+    tilt_weight: float
+    yaw_weight: float
+
+
+class Results(NamedTuple):
+    """What is written for N poses: the arrays of `Solutions`, the status of each row, and the leg that the status is about."""
+
+    positions: Array
+    rotations: Array
+    covariances: Array
+    residuals: Array
+    chi_squares: Array
+    degrees_of_freedom: NDArray[np.int64]
+    methods: NDArray[np.int64]
+    conditionings: Array
+    statuses: NDArray[np.int64]
+    legs: NDArray[np.int64]
+
+
+WORK = np.dtype(
+    [
+        ("scratch", SCRATCH),
+        ("directions", np.float64, (LEGS, 3)),
+        ("measured", np.float64, LEGS),
+        ("weights", np.float64, LEGS),
+        ("measured_rotation", np.float64, (3, 3)),
+        ("in_base", np.float64, (5, 3)),
+        ("in_platform", np.float64, (5, 3)),
+        ("vector_weights", np.float64, 5),
+        ("vectors", np.int64),
+        ("up", np.int64),
+        ("normal", np.int64),
+        ("equations", np.int64),
+        ("position", np.float64, 3),
+        ("rotation", np.float64, (3, 3)),
+        ("best_position", np.float64, 3),
+        ("best_rotation", np.float64, (3, 3)),
+        ("second_position", np.float64, 3),
+        ("second_rotation", np.float64, (3, 3)),
+        ("arms", np.float64, (LEGS, 3)),
+        ("predicted", np.float64, (LEGS, 3)),
+        ("lengths", np.float64, LEGS),
+        ("information", np.float64, (6, 6)),
+        ("factor", np.float64, (6, 6)),
+        ("correction", np.float64, 6),
+    ],
+    align=True,
+)
+"""Memory for one pose: what was measured, the pose, and its fit. `up` and `normal` are rows of the vectors known in both
+frames."""
+
+
+@kernel
+def solve_rows(
+    geometry: Record, work_array: Record, measurements: Measurements, candidates: NDArray[np.int64], refine: bool,
+    results: Results, start: int, stop: int,
+) -> None:  # fmt: skip
+    """Solve the rows from `start` to `stop`; a row without a pose is filled with NaN, and its status says why."""
+    work = work_array[()]
+    for row in range(start, stop):
+        status, results.legs[row] = _read(measurements, row, work)
+        results.conditionings[row] = 0.0
+        results.methods[row] = 0
+        if status == SOLVED:
+            results.methods[row], results.conditionings[row] = _find(geometry, candidates, work)
+            status = SOLVED if results.conditionings[row] > LEAST_CONDITIONING else OPEN
+        if status == SOLVED:
+            # If the joints are only nearly coplanar, the closed form that takes them for coplanar is a start, not the pose.
+            by_legs = results.methods[row] == _LEGS
+            settle = refine or (by_legs and work.scratch.approximate != 0)
+            two_roots = settle and by_legs and work.scratch.roots == 2
+            status, chi_square = _fit_better(geometry, work) if two_roots else _fit(geometry, settle, work)
+        results.statuses[row] = status
+        if status == SOLVED:
+            _write(work, chi_square, row, results)
+        else:
+            _write_nothing(row, results)
+
+
+@kernel
+def _read(measurements: Measurements, row: int, work: Record) -> tuple[int, int]:
+    """Read what was measured of a pose; returns a status and the leg that it is about."""
+    status, leg = _read_directions(measurements.directions[row], work.directions, work.measured)
+    if status != SOLVED:
+        return status, leg
+    work.vectors = 0
+    work.equations = 0
+    for k in range(LEGS):
+        work.weights[k] = work.measured[k] * measurements.leg_weight
+        work.equations += 2 * int(work.measured[k])
+    if measurements.rotations.shape[0] > 0:
+        status = _read_rotation(measurements.rotations[row], work.measured_rotation)
+        if status != SOLVED:
+            return status, leg
+        # These weights add up to the yaw's about the vertical, and to the tilt's about every level axis.
+        for axis in range(3):
+            work.vector_weights[axis] = 0.5 * measurements.yaw_weight
+            for i in range(3):
+                work.in_base[axis, i] = measurements.axes[axis, i]
+                work.in_platform[axis, i] = 0.0
+                for j in range(3):
+                    work.in_platform[axis, i] += work.measured_rotation[j, i] * measurements.axes[axis, j]
+        work.vector_weights[0] = measurements.tilt_weight - 0.5 * measurements.yaw_weight
+        work.vectors, work.equations = 3, work.equations + 3
+    work.up = work.vectors
+    if measurements.ups.shape[0] > 0:
+        if not _read_unit(measurements.ups[row], work.in_platform[work.up]):
+            return UP_NOT_UNIT, leg
+        for i in range(3):
+            work.in_base[work.up, i] = measurements.axes[0, i]
+        work.vector_weights[work.up] = measurements.tilt_weight
+        work.vectors, work.equations = work.vectors + 1, work.equations + 2
+    work.normal = work.vectors
+    if measurements.normals.shape[0] > 0:
+        if not _read_unit(measurements.normals[row], work.in_base[work.normal]):
+            return NORMAL_NOT_UNIT, leg
+        for i in range(3):
+            work.in_platform[work.normal, i] = 1.0 if i == 2 else 0.0
+        work.vector_weights[work.normal] = measurements.tilt_weight
+        work.vectors, work.equations = work.vectors + 1, work.equations + 2
+    return SOLVED, leg
+
+
+@kernel
+def _find(geometry: Record, candidates: NDArray[np.int64], work: Record) -> tuple[int, float]:
+    """Find the pose by the first method that is well conditioned, else by the best; returns the method and its conditioning."""
+    best, chosen = 0.0, candidates[0]
+    for method in candidates:
+        conditioning = _apply(geometry, method, work)
+        if conditioning > best:
+            best, chosen = conditioning, method
+            _copy_pose(work.position, work.rotation, work.best_position, work.best_rotation)
+        if best > _GOOD_CONDITIONING:
+            break
+    _copy_pose(work.best_position, work.best_rotation, work.position, work.rotation)
+    return chosen, best
+
+
+@kernel
+def _copy_pose(position: Array, rotation: Array, to_position: Array, to_rotation: Array) -> None:
+    for i in range(3):
+        to_position[i] = position[i]
+        for j in range(3):
+            to_rotation[i, j] = rotation[i, j]
+
+
+@kernel
+def _apply(geometry: Record, method: int, work: Record) -> float:
+    """Find the pose by a closed form; returns the conditioning."""
+    directions, measured, position, rotation = work.directions, work.measured, work.position, work.rotation
+    if method == _SECTION_5:
+        for i in range(3):
+            for j in range(3):
+                rotation[i, j] = work.measured_rotation[i, j]
+        return pose_from_rotation(geometry, directions, measured, rotation, position, work.scratch)
+    if method == _LEGS:
+        conditioning = pose_from_legs(geometry, directions, measured, position, rotation, work.scratch)
+        return conditioning if work.scratch.misfit < _MOST_MISFIT else 0.0
+    if method == _SECTION_3_1_1:
+        return section_3_1_1(geometry, directions, measured, position, rotation, work.scratch)
+    k = work.up if method == _UP else work.normal
+    in_base, in_platform = work.in_base[k], work.in_platform[k]
+    if method == _SECTION_4:
+        return section_4(geometry, directions, measured, in_base, in_platform, position, rotation, work.scratch)
+    return pose_from_vector(geometry, directions, measured, in_base, in_platform, position, rotation, work.scratch)
+
+
+@kernel
+def _fit(geometry: Record, refine: bool, work: Record) -> tuple[int, float]:
+    """Refine the pose, if wanted, and weigh its residuals; returns a status and their chi-square sum."""
+    base_joints, platform_joints, position, rotation = (
+        geometry.base_joints, geometry.platform_joints, work.position, work.rotation,
+    )  # fmt: skip
+    in_base, in_platform, vector_weights = work.in_base, work.in_platform, work.vector_weights[: work.vectors]
+    status, before, spread = UNSETTLED, np.inf, geometry.spreads[-1]
+    for _ in range(_MOST_REFINEMENTS if refine else 1):
+        normal_equations(
+            base_joints, platform_joints, work.directions, work.weights, in_base, in_platform, vector_weights, position,
+            rotation, work.arms, work.predicted, work.lengths, work.information, work.correction,
+        )  # fmt: skip
+        if not solve_normal_equations(work.information, work.correction, work.factor):
+            return SINGULAR, np.inf
+        if not refine:
+            status = SOLVED
+            break
+        move_pose(work.correction, position, rotation)
+        square = _square_over_variance(work.factor, work.correction)
+        if square < _REFINED or (square >= before and _is_tiny(work.correction, spread)):
+            status = SOLVED
+            break
+        before = square
+    legs_at(base_joints, platform_joints, position, rotation, work.arms, work.predicted, work.lengths)
+    chi_square = 0.0
+    for k in range(LEGS):
+        if work.measured[k] == 0.0:
+            continue
+        for i in range(3):
+            chi_square += work.weights[k] * (work.directions[k, i] - work.predicted[k, i]) ** 2
+        if status == SOLVED and not dot(vector(work.directions[k]), vector(work.predicted[k])) > 0.0:
+            status = NEGATIVE
+    for k in range(work.vectors):
+        seen = rotate(rotation, vector(in_platform[k]))
+        for i in range(3):
+            chi_square += vector_weights[k] * (seen[i] - in_base[k, i]) ** 2
+    return status, chi_square
+
+
+@kernel
+def _fit_better(geometry: Record, work: Record) -> tuple[int, float]:
+    """Refine the pose at both roots of the legs alone and keep the better one, if it is far better; returns its status and
+    chi-square sum.
+    """
+    position, rotation = work.position, work.rotation
+    _copy_pose(position, rotation, work.best_position, work.best_rotation)
+    second_pose_from_legs(geometry, work.directions, work.measured, position, rotation, work.scratch)
+    second_status, second_chi_square = _fit(geometry, True, work)
+    _copy_pose(position, rotation, work.second_position, work.second_rotation)
+    _copy_pose(work.best_position, work.best_rotation, position, rotation)
+    status, chi_square = _fit(geometry, True, work)
+    if second_status != SOLVED:
+        return status, chi_square
+    if status == SOLVED:
+        apart = 0.0
+        for i in range(3):
+            for j in range(3):
+                apart = max(apart, abs(rotation[i, j] - work.second_rotation[i, j]))
+        if apart <= _SAME_ROTATION:
+            return status, chi_square
+        least = min(chi_square, second_chi_square)
+        if abs(chi_square - second_chi_square) < min(_DISTINCT, _DISTINCT_SHARE * least / max(work.equations - 6, 1)):
+            return AMBIGUOUS, chi_square
+        if chi_square < second_chi_square:
+            return status, chi_square
+    _copy_pose(work.second_position, work.second_rotation, position, rotation)
+    return _fit(geometry, True, work)
+
+
+@kernel
+def _write(work: Record, chi_square: float, row: int, results: Results) -> None:
+    _copy_pose(work.position, work.rotation, results.positions[row], results.rotations[row])
+    results.chi_squares[row] = chi_square
+    results.degrees_of_freedom[row] = work.equations - 6
+    for k in range(LEGS):
+        for i in range(3):
+            residual = work.directions[k, i] - work.predicted[k, i]
+            results.residuals[row, k, i] = residual if work.measured[k] != 0.0 else np.nan
+    invert_cholesky(work.factor, results.covariances[row])
+
+
+@kernel
+def _write_nothing(row: int, results: Results) -> None:
+    results.chi_squares[row] = np.nan
+    results.degrees_of_freedom[row] = 0
+    for i in range(3):
+        results.positions[row, i] = np.nan
+        for j in range(3):
+            results.rotations[row, i, j] = np.nan
+    for i in range(6):
+        for j in range(6):
+            results.covariances[row, i, j] = np.nan
+            results.residuals[row, i, j % 3] = np.nan
+
+
+@kernel
+def _read_directions(given: Array, directions: Array, measured: Array) -> tuple[int, int]:
+    """Copy directions (6, 3) at unit length and note which are measured; returns a status and the leg that it is about."""
+    for k in range(LEGS):
+        missing = np.isnan(given[k, 0]) + np.isnan(given[k, 1]) + np.isnan(given[k, 2])
+        if missing == 3:
+            measured[k] = 0.0
+            directions[k, 0], directions[k, 1], directions[k, 2] = 0.0, 0.0, 1.0
+            continue
+        if missing > 0:
+            return PARTLY_NAN, k
+        measured[k] = 1.0
+        if not _read_unit(given[k], directions[k]):
+            return (LEG_NOT_UNIT if np.isfinite(given[k]).all() else INFINITE), k
+    return SOLVED, 0
+
+
+@kernel
+def _read_unit(given: Array, unit: Array) -> bool:
+    """Copy a vector (3,) at unit length; False if it was not nearly a unit vector."""
+    size = np.sqrt(dot(vector(given), vector(given)))
+    for i in range(3):
+        unit[i] = given[i] / size
+    return bool(abs(size - 1.0) <= UNIT_TOLERANCE)
+
+
+@kernel
+def _read_rotation(given: Array, rotation: Array) -> int:
+    """Copy the rotation (3, 3) nearest to a matrix; returns a status."""
+    columns = rotation.reshape(9)
+    for i in range(3):
+        for j in range(3):
+            if not np.isfinite(given[i, j]):
+                return ROTATION_INFINITE
+            dot = 0.0
+            for k in range(3):
+                dot += given[k, i] * given[k, j]
+            if abs(dot - (1.0 if i == j else 0.0)) > UNIT_TOLERANCE:
+                return NOT_ORTHOGONAL
+            columns[3 * i + j] = given[i, j]
+    # The nearest rotation to the transposed is the transposed nearest rotation.
+    return SOLVED if orthonormalise(columns, False) >= 0.0 else REFLECTION
+
+
+@kernel
+def _is_tiny(step: Array, spread: float) -> bool:
+    """Whether a step is so short that only rounding keeps it from getting shorter."""
+    longest = 0.0
+    for i in range(3):
+        longest = max(longest, abs(step[i]) / spread, abs(step[3 + i]))
+    return longest < _TINY
+
+
+@kernel
+def _square_over_variance(factor: Array, step: Array) -> float:
+    """step^T A step for a matrix A whose Cholesky factor is the lower triangle of `factor`."""
+    square = 0.0
+    for j in range(6):
+        value = 0.0
+        for i in range(j, 6):
+            value += factor[i, j] * step[i]
+        square += value * value
+    return square
