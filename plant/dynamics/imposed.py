@@ -1,4 +1,4 @@
-"""Imposed motion: what ideal IMUs read on a platform that is moved as prescribed, whatever the actuators could follow."""
+"""Imposed motion: ideal IMU signals for a prescribed motion of the platform, regardless of what actuators can follow."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -7,17 +7,18 @@ import casadi as ca
 import numpy as np
 
 from plant.checks import checked_seed
-from plant.dynamics.spatial import imu_signals, variable_symbols
+from plant.dynamics.assembly import variable_symbols
+from plant.dynamics.spatial import imu_signals
 from plant.dynamics.variables import SPATIAL
 from plant.errors import InputError
 from plant.mechanism import Mechanism
 from plant.pose import Array
 
 SIZE = (0.03, np.radians(10.0))
-"""Of the motion along and about each axis [m, rad]."""
+"""Size of the motion along and about each axis [m, rad]."""
 
 MOST_HZ = 5.0
-"""With 10 degrees about every axis the IMUs' gyroscopes are then at the end of their range."""
+"""With 10 degrees about every axis, the gyroscopes reach the end of their range here."""
 
 _MIXED_HZ = 0.5 * np.array([0.2, 0.45, 0.8, 1.3, 2.0])
 
@@ -29,7 +30,7 @@ class ImposedMotion:
     Attributes:
         times: (N,) [s].
         positions, rotations: (N, 3) [m] and (N, 3, 3), of {2}.
-        signals: (N, 3, 7, 3), as the plant's IMUs give them: [rad/s, m/s^2, uT].
+        signals: (N, 3, 7, 3) of the ideal IMUs [rad/s, m/s^2, uT].
     """
 
     times: Array
@@ -45,8 +46,8 @@ def impose(
 
     Args:
         mechanism: with home and plant data.
-        kind: "static", at a random pose; a frequency in Hz, such as "0.5", at which every axis moves, a few percent apart; or
-            "mixed", five sines from 0.1 to 1 Hz on every axis.
+        kind: "static" for a random pose; a frequency in Hz, such as "0.5", which all axes share within 10 %; or "mixed" for
+            five sines from 0.1 to 1 Hz on every axis.
         duration: [s].
         rate: samples per second [Hz].
         seed: of phases and the static pose.
@@ -74,7 +75,7 @@ def impose(
 
 
 def _frequencies(kind: str) -> Array:
-    """(6, n) [Hz], of each axis."""
+    """(6, n) [Hz], for each axis."""
     if kind == "mixed":
         return np.outer(1.0 + 0.03 * np.arange(6), _MIXED_HZ)
     try:

@@ -1,14 +1,15 @@
 """The legs of a mechanism and their actuators, as CasADi expressions that the spatial and the planar plant share.
 
-A leg is a universal joint (first axis e1 fixed in the base, second e2 = n x e1 / |n x e1|) that carries a lower part and
-a rod, both symmetric about the leg's axis n = s / l. Since the leg's angular velocity lies in the plane of e1 and e2,
+A leg is a universal joint (first axis e1 fixed in the base, second e2 = n x e1 / |n x e1|) with a lower part and a rod, both
+symmetric about the leg's axis n = s / l. Since the leg's angular velocity lies in the plane of e1 and e2,
 `omega = n x s' / l + omega_n n` with `omega_n = k e1 . (s x s') / (l (l^2 - k^2))`, k = e1 . s. In a planar mechanism e1 is
-the plane's normal, and k and omega_n are zero.
+the plane's normal, so k and omega_n are zero.
 
 Each leg is driven through a screw by a DC motor on an encoderless drive that turns a velocity command u into the voltage
 `n k u + kappa R_nominal i`, n = 2 pi / lead.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import pi
 
@@ -37,7 +38,7 @@ _UNCHANGED = (
 
 
 def leg_constants(p: dict[str, SX]) -> dict[str, SX]:
-    """What legs, actuators and IMUs need of the parameters, but for the joints and inertia about the legs' axes."""
+    """The constants of legs, actuators and IMUs, without the joints and the inertia about the legs' axes."""
     turns = 2 * pi / p["motor.screw_lead"]
     lower, upper = "leg.lower.", "leg.upper."
     return {name: p[name] for name in _UNCHANGED} | {
@@ -55,9 +56,22 @@ def leg_constants(p: dict[str, SX]) -> dict[str, SX]:
     }
 
 
+def platform_constants(p: dict[str, SX], about_offset: Callable[[SX], SX]) -> dict[str, SX]:
+    """Platform and payload as one rigid body; `about_offset(center)` is the inertia of a unit mass at an offset."""
+    masses = (p["platform.mass"], p["payload.mass"])
+    centers = (p["platform.center_of_mass"], p["payload.center_of_mass"])
+    inertias = (p["platform.inertia"], p["payload.inertia"])
+    first, second = (i + m * about_offset(c) for m, c, i in zip(masses, centers, inertias, strict=True))
+    return {
+        "mass": masses[0] + masses[1],
+        "first_moment": masses[0] * centers[0] + masses[1] * centers[1],
+        "inertia": first + second,
+    }
+
+
 @dataclass(frozen=True)
 class Condition:
-    """`value` must not exceed `limit`; `text` names the value, and what to change."""
+    """`value` must not exceed `limit`; `text` is the message, with both numbers and the remedy."""
 
     value: SX | float
     limit: SX | float
@@ -68,7 +82,7 @@ _LEAST_LENGTH_M = 1e-4
 
 
 def leg_conditions(p: dict[str, SX], lengths: SX) -> list[Condition]:
-    """For the parameters of legs and actuators to make sense; `lengths` (n, 1) are those at the start."""
+    """Conditions on the parameters of legs and actuators, for lengths (n, 1) at the start."""
     conditions = []
     for k in range(lengths.shape[0]):
         conditions += [
@@ -84,7 +98,7 @@ def leg_conditions(p: dict[str, SX], lengths: SX) -> list[Condition]:
 
 
 def length_limits(lengths: SX) -> list[Condition]:
-    """No leg may come to nothing during the motion; `lengths` (n, 1)."""
+    """Every leg keeps a length during the motion; `lengths` (n, 1)."""
     return [
         Condition(_LEAST_LENGTH_M, lengths[k], f"leg {k} needs a length of %g m and has come down to %g m: limit its stroke")
         for k in range(lengths.shape[0])
@@ -92,20 +106,20 @@ def length_limits(lengths: SX) -> list[Condition]:
 
 
 _RUNGE_KUTTA_REACH = 2.5
-"""The classical Runge-Kutta method is stable for |eigenvalue| x step up to this, wherever the eigenvalue does not grow."""
+"""The classical Runge-Kutta method is stable for |eigenvalue| x step up to this, for every eigenvalue that does not grow."""
 
 _CONTACT_REACH = 1.5
-"""The same for the end stops, which are not linear; found by 800 random sets of parameters."""
+"""The same for the end stops, which are nonlinear; found with 800 random sets of parameters."""
 
 
 def _substep_conditions(p: dict[str, SX], beyond_stop: SX) -> list[Condition]:
     """The substep is short enough for the fastest modes of the legs.
 
-    In coordinates whose squared length is the energy, what dissipates is on the diagonal of the linearised plant and what
-    stores is skew, so the larger of the one and the norm of the other bound every eigenvalue; what else moves with a leg
-    than its sliding mass only lowers them. A slipping brake forgets its deflection, and an end stop hits, the faster the leg
-    runs: without load at the drive's voltage over its force constant, or as an end stop throws it back that it begins
-    beyond, by `beyond_stop` [m].
+    In coordinates whose squared length is the energy, dissipation is the diagonal of the linearised plant and storage its
+    skew part. The largest dissipation and the norm of the storage therefore bound every eigenvalue. Mass beside a leg's
+    sliding mass only lowers them. A slipping brake loses its deflection, and an end stop hits, faster at a higher speed of
+    the leg. That speed is at most the drive's voltage over its force constant, or the speed at which an end stop throws a
+    leg back that starts `beyond_stop` [m] beyond it.
     """
     turns = 2 * pi / p["motor.screw_lead"]
     sliding_mass = p["leg.upper.mass"] + p["motor.rotor_inertia"] * turns**2
@@ -142,8 +156,13 @@ def _substep_conditions(p: dict[str, SX], beyond_stop: SX) -> list[Condition]:
 class Leg:
     """One leg at one instant; vectors (3, 1) seen in {1}.
 
-    `mass` (3, 3) and `force` (3, 1) are M_s and h in `M_s s'' + h = F`, F the force on the platform joint; `arm` leads from
-    the platform's origin to that joint, and `bias` is what s'' is without acceleration of the platform.
+    Attributes:
+        s, velocity: the leg vector and its derivative.
+        arm: from the platform's origin to the platform joint.
+        bias: s'' without acceleration of the platform.
+        length, speed, direction: of the leg.
+        mass, force: (3, 3) and (3, 1), M_s and h in `M_s s'' + h = F`, with F the force on the platform joint.
+        kinetic, potential: energies.
     """
 
     s: SX
@@ -160,12 +179,12 @@ class Leg:
 
 
 def _leg_at(s: SX, velocity: SX, arm: SX, bias: SX, e1: SX, c: dict[str, SX]) -> Leg:
-    """Lagrange's equations of one leg, its motor included, worked out for its three ways to move.
+    """Lagrange's equations of one leg with its motor.
 
-    Sliding with the mass m, swinging with the transverse inertia I(l), and turning about its axis with the rate
-    `w = kappa q`, kappa = k / (l^3 - l k^2), q = (e1 x s) . s', which the universal joint imposes.
+    The leg slides with the mass m, swings with the transverse inertia I(l), and turns about its axis with the rate that the
+    universal joint imposes, `w = kappa q`, kappa = k / (l^3 - l k^2), q = (e1 x s) . s'.
     """
-    # One square root and no division: CasADi would turn every product with 1 / l into a division of its own.
+    # One square root and no division: CasADi would make a separate division of every product with 1 / l.
     square = ca.dot(s, s)
     inverse = ca.sqrt(1 / square)
     length = square * inverse
@@ -217,7 +236,7 @@ def _leg_at(s: SX, velocity: SX, arm: SX, bias: SX, e1: SX, c: dict[str, SX]) ->
 def legs_at(
     position: SX, rotation: SX, velocity: SX, omega: SX, base_joints: SX, platform_joints: SX, axes: SX, c: dict[str, SX]
 ) -> list[Leg]:
-    """The legs of a platform that moves as given.
+    """The legs for a prescribed motion of the platform.
 
     Args:
         position, rotation: (3, 1), (3, 3), of {2}.
@@ -236,10 +255,12 @@ def legs_at(
 
 @dataclass(frozen=True)
 class Actuators:
-    """What the actuators of n legs do at one instant; (n, 1) each.
+    """The actuators of n legs at one instant; (n, 1) each.
 
-    Forces along the legs, positive when they push; the voltages that are asked for; and the rates of the motors' currents and
-    of the brakes' deflections.
+    Attributes:
+        motor, friction, brake, stop: forces along the legs; motor, brake and stop are positive when they push.
+        voltage: of the drives.
+        current_rate, brake_rate: rates of the motors' currents and of the brakes' deflections.
     """
 
     motor: SX
@@ -252,22 +273,13 @@ class Actuators:
 
     @property
     def force(self) -> SX:
-        """All of them together."""
+        """The total force, positive when it pushes."""
         return self.motor - self.friction + self.brake + self.stop
-
-    def powers(self, speeds: SX) -> dict[str, SX]:
-        """Their powers by their names in the table, at speeds (n, 1)."""
-        return {
-            "power.drive": ca.dot(self.motor, speeds),
-            "power.friction": -ca.dot(self.friction, speeds),
-            "power.brake": ca.dot(self.brake, speeds),
-            "power.stop": ca.dot(self.stop, speeds),
-        }
 
 
 def actuators_at(legs: list[Leg], x: dict[str, SX], u: dict[str, SX], c: dict[str, SX]) -> Actuators:
-    """What the actuators do, from states, inputs and constants."""
-    speeds, current = speeds_of(legs), x["state.current"]
+    """The actuators, from states, inputs and constants."""
+    speeds, current = _speeds(legs), x["state.current"]
     mode = u["drive_mode"]
     closed, driven = mode == BRAKE, mode == VELOCITY
     friction = c["friction.viscous"] * speeds + c["friction.coulomb"] * speeds / ca.sqrt(
@@ -276,13 +288,13 @@ def actuators_at(legs: list[Leg], x: dict[str, SX], u: dict[str, SX], c: dict[st
     back_emf = c["force_constant"] * speeds
     asked = driven * (c["force_constant"] * u["velocity_command"] + c["compensating_resistance"] * current)
     voltage = ca.fmax(ca.fmin(asked, c["drive.voltage_limit"]), -c["drive.voltage_limit"])
-    # An open motor has no back-EMF current to drive; a braked one is short-circuited.
+    # In an open motor the back-EMF drives no current; a braked motor is short-circuited.
     free = (voltage - c["motor.resistance"] * current - (mode != OPEN) * back_emf) * c["inverse_inductance"]
     deflections = x["state.brake_deflection"]
     return Actuators(
         motor=c["force_constant"] * current,
         friction=friction,
-        # An opened brake lets go within its release time, while the drive takes over the load.
+        # An opened brake releases within its release time, while the drive takes over the load.
         brake=-(c["brake.stiffness"] * deflections + closed * c["brake.damping"] * speeds),
         stop=stack([_stop_force(leg.length, leg.speed, c, k) for k, leg in enumerate(legs)]),
         voltage=voltage,
@@ -294,18 +306,27 @@ def actuators_at(legs: list[Leg], x: dict[str, SX], u: dict[str, SX], c: dict[st
     )
 
 
-def lengths_of(legs: list[Leg]) -> SX:
-    """(n, 1)."""
-    return stack([leg.length for leg in legs])
+def leg_outputs(legs: list[Leg], actuators: Actuators, x: dict[str, SX]) -> dict[str, SX]:
+    """What the table has of legs and actuators, by name."""
+    speeds = _speeds(legs)
+    return {
+        "leg_length": stack([leg.length for leg in legs]),
+        "leg_velocity": speeds,
+        "current": x["state.current"],
+        "voltage": actuators.voltage,
+        "power.drive": ca.dot(actuators.motor, speeds),
+        "power.friction": -ca.dot(actuators.friction, speeds),
+        "power.brake": ca.dot(actuators.brake, speeds),
+        "power.stop": ca.dot(actuators.stop, speeds),
+    }
 
 
-def speeds_of(legs: list[Leg]) -> SX:
-    """(n, 1), the rates of the lengths."""
+def _speeds(legs: list[Leg]) -> SX:
     return stack([leg.speed for leg in legs])
 
 
 def _stop_force(length: SX, speed: SX, c: dict[str, SX], k: int) -> SX:
-    """Hunt and Crossley's contact: the damping is in proportion to the elastic force, and nothing ever pulls."""
+    """Hunt and Crossley's contact: the damping is proportional to the elastic force, and a stop never pulls."""
     below = ca.fmax(c["stop.minimum_length"][k] - length, 0)
     above = ca.fmax(length - c["stop.maximum_length"][k], 0)
     stiffness, damping = c["stop.stiffness"], c["stop.damping"]
@@ -313,8 +334,8 @@ def _stop_force(length: SX, speed: SX, c: dict[str, SX], k: int) -> SX:
 
 
 def _brake_rate(deflection: SX, speed: SX, closed: SX, c: dict[str, SX]) -> SX:
-    """Elasto-plastic bristle (Dupont, Hayward, Armstrong, Altpeter 2002): purely elastic below 70 % of the slipping
-    force, so that a closed brake holds without creep.
+    """Elasto-plastic bristle (Dupont, Hayward, Armstrong, Altpeter 2002), purely elastic below 70 % of the slipping force,
+    so that a closed brake holds without creep.
     """
     load = ca.fabs(deflection) / c["brake_slip"]
     share = ca.fmin(ca.fmax((load - 0.7) / 0.3, 0), 1)
@@ -349,7 +370,7 @@ def _leg_turning(s: SX, velocity: SX, acceleration: SX, e1: SX) -> tuple[SX, SX,
     """
     square, k = ca.dot(s, s), ca.dot(e1, s)
     across = square - k**2
-    # As in `_leg_at`, square roots keep CasADi from dividing again and again.
+    # Square roots instead of divisions, as in `_leg_at`.
     inverse, inverse_across = ca.sqrt(1 / square), ca.sqrt(1 / across)
     n, e2 = s * inverse, ca.cross(s, e1) * inverse_across
     swing, swing_rate = ca.cross(s, velocity), ca.cross(s, acceleration)
@@ -363,9 +384,9 @@ def _leg_turning(s: SX, velocity: SX, acceleration: SX, e1: SX) -> tuple[SX, SX,
 
 
 def imu_signals_of(legs: list[Leg], axes: SX, rotation: SX, omega: SX, acceleration: SX, c: dict[str, SX]) -> dict[str, SX]:
-    """Ideal IMU signals by their names in the table, (n + 1, 3) each, of the legs and the platform.
+    """Ideal IMU signals (n + 1, 3) of legs and platform, by their names in the table.
 
-    A leg's are seen in the leg frame, whose z axis is the leg and whose y axis is e2; the platform's in {2}.
+    The signals of a leg are seen in the leg frame, whose z axis is the leg and whose y axis is e2, those of the platform in {2}.
 
     Args:
         axes: (n, 3), e1 of each leg.

@@ -1,15 +1,15 @@
 """Rigid-body and drive dynamics of a planar three-leg mechanism, as CasADi expressions in one set of symbols.
 
-Generalised coordinates are the platform's position in the plane and its angle; the legs follow. With the leg vector
-`s = p + R a - b` of each leg, `s'' = J nu' + J' nu`, J = [1, e_z x R a], carries the legs' equations `M_s s'' + h = F` to the
-platform:  `(M + sum J^T M_s J) nu' = wrench - sum J^T (h + M_s J' nu - F n)`.
+Generalised coordinates are the platform's position in the plane and its angle; the legs follow. The equations are those of
+`plant.dynamics.spatial`, with J = [1, e_z x R a].
 
-The legs and their actuators are those of `plant.dynamics.legs`, which are in space: the plane is the xy-plane of {1}, and the
-first axis of a leg's joint is its normal. What acts across the plane, the joints bear.
+The legs and their actuators are those of `plant.dynamics.legs`, which are in space: the plane is the xy-plane of {1}, and its
+normal is the first axis of every leg's joint. The joints bear the forces across the plane.
 """
 
 import casadi as ca
 
+from plant.dynamics.assembly import Dynamics, Values, assemble, variable_symbols
 from plant.dynamics.legs import (
     SX,
     Condition,
@@ -18,13 +18,12 @@ from plant.dynamics.legs import (
     imu_signals_of,
     leg_conditions,
     leg_constants,
+    leg_outputs,
     legs_at,
     length_limits,
-    lengths_of,
+    platform_constants,
     solve,
-    speeds_of,
 )
-from plant.dynamics.spatial import Dynamics, assembled, variable_symbols
 from plant.dynamics.variables import PLANAR
 
 _NORMAL = SX([0, 0, 1])
@@ -34,41 +33,24 @@ _AXES = ca.repmat(_NORMAL.T, 3, 1)
 def build_planar_dynamics() -> Dynamics:
     """Derive the plant's equations."""
     p = variable_symbols(PLANAR.parameters)
-    return assembled(PLANAR, p, _constants(p), _start(p), _conditions(p), _limits, _plant)
+    start = {"state.position": p["initial_position"], "state.angle": p["initial_angle"]}
+    return assemble(PLANAR, p, _constants(p), start, _conditions(p), _limits, _plant)
 
 
-def _constants(p: dict[str, SX]) -> dict[str, SX]:
-    """What follows from the parameters alone: one rigid body of platform and payload, one set of numbers per leg."""
-    masses = (p["platform.mass"], p["payload.mass"])
-    centers = (p["platform.center_of_mass"], p["payload.center_of_mass"])
-    inertias = (p["platform.inertia"], p["payload.inertia"])
-    about_origin = [i + m * ca.dot(c, c) for m, c, i in zip(masses, centers, inertias, strict=True)]
-    return (
-        {name: p[name] for name in ("base_joints", "platform_joints")}
-        | leg_constants(p)
-        | {
-            "mass": masses[0] + masses[1],
-            "first_moment": masses[0] * centers[0] + masses[1] * centers[1],
-            "inertia": about_origin[0] + about_origin[1],
-        }
-    )
+def _constants(p: Values) -> Values:
+    joints = {name: p[name] for name in ("base_joints", "platform_joints")}
+    return joints | leg_constants(p) | platform_constants(p, lambda center: ca.dot(center, center))
 
 
-def _start(p: dict[str, SX]) -> dict[str, SX]:
-    """At rest at the initial pose, without current, the brakes not deflected."""
-    resting = {variable.name: SX.zeros(variable.size) for variable in PLANAR.states}
-    return resting | {"state.position": p["initial_position"], "state.angle": p["initial_angle"]}
-
-
-def _conditions(p: dict[str, SX]) -> list[Condition]:
+def _conditions(p: Values) -> list[Condition]:
     return leg_conditions(p, _lengths(p["initial_position"], p["initial_angle"], p))
 
 
-def _limits(x: dict[str, SX], c: dict[str, SX]) -> list[Condition]:
+def _limits(x: Values, c: Values) -> list[Condition]:
     return length_limits(_lengths(x["state.position"], x["state.angle"], c))
 
 
-def _lengths(position: SX, angle: SX, c: dict[str, SX]) -> SX:
+def _lengths(position: SX, angle: SX, c: Values) -> SX:
     legs = (position + _rotation(angle)[:2, :2] @ c["platform_joints"].T).T - c["base_joints"]
     return ca.sqrt(ca.sum2(legs**2))
 
@@ -83,12 +65,12 @@ def _in_space(vectors: SX) -> SX:
     return ca.horzcat(vectors, SX(vectors.shape[0], 1))
 
 
-def _legs(position: SX, rotation: SX, velocity: SX, omega: SX, c: dict[str, SX]) -> list[Leg]:
+def _legs(position: SX, rotation: SX, velocity: SX, omega: SX, c: Values) -> list[Leg]:
     joints = (_in_space(c["base_joints"]), _in_space(c["platform_joints"]), _AXES)
     return legs_at(position, rotation, velocity, omega, *joints, c | {"axial_inertia": SX(0)})
 
 
-def _plant(x: dict[str, SX], u: dict[str, SX], c: dict[str, SX]) -> tuple[dict[str, SX], dict[str, SX]]:
+def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
     position, velocity, turning = x["state.position"], x["state.velocity"], x["state.angular_velocity"]
     rotation = _rotation(x["state.angle"])
     in_plane = c["gravity"][:2]
@@ -96,7 +78,6 @@ def _plant(x: dict[str, SX], u: dict[str, SX], c: dict[str, SX]) -> tuple[dict[s
     across = ca.vertcat(-moment[1], moment[0])
     omega = turning * _NORMAL
     legs = _legs(_in_space(position.T).T, rotation, _in_space(velocity.T).T, omega, c)
-    speeds = speeds_of(legs)
     actuators = actuators_at(legs, x, u, c)
     forces = actuators.force
 
@@ -120,26 +101,18 @@ def _plant(x: dict[str, SX], u: dict[str, SX], c: dict[str, SX]) -> tuple[dict[s
     }
     in_space = ca.vertcat(acceleration[:2], 0, 0, 0, acceleration[2])
     imu = imu_signals_of(legs, _AXES, rotation, omega, in_space, c)
-    outputs = (
-        imu
-        | actuators.powers(speeds)
-        | {
-            "position": position,
-            "angle": x["state.angle"],
-            "velocity": velocity,
-            "angular_velocity": turning,
-            "leg_length": lengths_of(legs),
-            "leg_velocity": speeds,
-            "current": x["state.current"],
-            "voltage": actuators.voltage,
-            "kinetic_energy": (
-                c["mass"] * ca.dot(velocity, velocity) / 2
-                + turning * ca.dot(velocity, across)
-                + c["inertia"] * turning**2 / 2
-                + sum(leg.kinetic for leg in legs)
-            ),
-            "potential_energy": -ca.dot(in_plane, c["mass"] * position + moment) + sum(leg.potential for leg in legs),
-            "power.external": ca.dot(external, ca.vertcat(velocity, turning)),
-        }
-    )
-    return rates, outputs
+    outputs = {
+        "position": position,
+        "angle": x["state.angle"],
+        "velocity": velocity,
+        "angular_velocity": turning,
+        "kinetic_energy": (
+            c["mass"] * ca.dot(velocity, velocity) / 2
+            + turning * ca.dot(velocity, across)
+            + c["inertia"] * turning**2 / 2
+            + sum(leg.kinetic for leg in legs)
+        ),
+        "potential_energy": -ca.dot(in_plane, c["mass"] * position + moment) + sum(leg.potential for leg in legs),
+        "power.external": ca.dot(external, ca.vertcat(velocity, turning)),
+    }
+    return rates, imu | leg_outputs(legs, actuators, x) | outputs

@@ -7,7 +7,8 @@ import pytest
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
-from plant.dynamics.spatial import Dynamics, build_dynamics
+from plant.dynamics.assembly import Dynamics
+from plant.dynamics.spatial import build_dynamics
 from plant.dynamics.variables import BRAKE, OPEN, SPATIAL, VELOCITY, Variable
 from plant.fmu.plant import FmuPlant
 from plant.mechanism import Mechanism

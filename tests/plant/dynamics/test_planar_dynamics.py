@@ -7,8 +7,8 @@ import pytest
 from numpy.random import Generator
 from numpy.typing import ArrayLike
 
+from plant.dynamics.assembly import Dynamics
 from plant.dynamics.planar import build_planar_dynamics
-from plant.dynamics.spatial import Dynamics
 from plant.dynamics.variables import BRAKE, OPEN, PLANAR, VELOCITY, Variable, checked_parameters
 from plant.errors import FmuError
 from plant.fmu.build import PLANAR_MODEL, SPATIAL_MODEL, Model, default_fmu

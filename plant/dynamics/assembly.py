@@ -1,0 +1,97 @@
+"""A plant's expressions as CasADi functions of flat vectors, in the order of its variable table."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import casadi as ca
+
+from plant.dynamics.legs import SX, Condition
+from plant.dynamics.variables import Variable, VariableTable
+
+Values = dict[str, SX]
+"""Expressions by name."""
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """A plant as functions of flat vectors; `conditions` and `limits` return two vectors, values and their greatest values.
+
+    Attributes:
+        constants: of the parameters, for all functions that take constants; computed once.
+        start: the states at the start, of the parameters.
+        conditions: on the parameters; `condition_texts` has a message for each.
+        limits: on the motion, of states and constants; `limit_texts` has a message for each.
+        rates: the time derivatives of the states, of states, inputs and constants.
+        outputs: of states, inputs and constants.
+    """
+
+    constants: ca.Function
+    start: ca.Function
+    conditions: ca.Function
+    condition_texts: tuple[str, ...]
+    limits: ca.Function
+    limit_texts: tuple[str, ...]
+    rates: ca.Function
+    outputs: ca.Function
+
+
+def assemble(
+    table: VariableTable,
+    parameters: Values,
+    constants: Values,
+    start: Values,
+    conditions: list[Condition],
+    limits: Callable[[Values, Values], list[Condition]],
+    plant: Callable[[Values, Values, Values], tuple[Values, Values]],
+) -> Dynamics:
+    """The functions of a plant from its expressions.
+
+    Args:
+        table: its variables.
+        parameters: symbols.
+        constants, start, conditions: expressions of these symbols; `start` has the states at rest that are not zero.
+        limits: gives the conditions on the motion for states and constants.
+        plant: gives rates and outputs for states, inputs and constants.
+    """
+    # In `rates` and `outputs`, symbols replace the computed constants.
+    symbols = {name: SX.sym(name, *value.shape) for name, value in constants.items()}
+    states, inputs = variable_symbols(table.states), variable_symbols(table.inputs)
+    rates, outputs = plant(states, inputs, symbols)
+    arguments = [_flat(states), _flat(inputs), _flat(symbols)]
+    given = [_flat(parameters)]
+    options = {"cse": True}
+    watched = limits(states, symbols)
+    resting = {variable.name: SX.zeros(variable.size) for variable in table.states}
+    return Dynamics(
+        constants=ca.Function("plant_constants", given, [_flat(constants)], options),
+        start=ca.Function("plant_start", given, [_in_order(resting | start, table.states)], options),
+        conditions=ca.Function("plant_conditions", given, _sides(conditions), options),
+        condition_texts=tuple(condition.text for condition in conditions),
+        limits=ca.Function("plant_limits", [_flat(states), _flat(symbols)], _sides(watched), options),
+        limit_texts=tuple(condition.text for condition in watched),
+        rates=ca.Function("plant_rates", arguments, [_in_order(rates, table.states)], options),
+        outputs=ca.Function("plant_outputs", arguments, [_in_order(outputs, table.outputs)], options),
+    )
+
+
+def variable_symbols(variables: tuple[Variable, ...]) -> Values:
+    """A symbol for each variable, in its shape."""
+    made = {}
+    for variable in variables:
+        rows, columns = (*variable.shape, 1, 1)[:2]
+        # CasADi stores matrices by columns and the table by rows, so the symbol is created transposed.
+        made[variable.name] = SX.sym(variable.name, columns, rows).T
+    return made
+
+
+def _sides(conditions: list[Condition]) -> list[SX]:
+    values = [ca.densify(ca.vertcat(*side)) for side in zip(*((c.value, c.limit) for c in conditions), strict=True)]
+    return values or [SX.zeros(0), SX.zeros(0)]
+
+
+def _in_order(values: Values, variables: tuple[Variable, ...]) -> SX:
+    return _flat({variable.name: values[variable.name] for variable in variables})
+
+
+def _flat(values: Values) -> SX:
+    return ca.vertcat(*[ca.vec(ca.densify(value).T) for value in values.values()])
