@@ -386,7 +386,7 @@ def _leg_turning(s: SX, velocity: SX, acceleration: SX, e1: SX) -> tuple[SX, SX,
 def imu_signals_of(legs: list[Leg], axes: SX, rotation: SX, omega: SX, acceleration: SX, c: dict[str, SX]) -> dict[str, SX]:
     """Ideal IMU signals (n + 1, 3) of legs and platform, by their names in the table.
 
-    The signals of a leg are seen in the leg frame, whose z axis is the leg and whose y axis is e2, those of the platform in {2}.
+    Signals of a leg are seen in the leg frame, whose z axis is the leg and whose y axis is e2; those of the platform in {2}.
 
     Args:
         axes: (n, 3), e1 of each leg.
