@@ -4,7 +4,7 @@
 2. The drives follow a small planned motion with the loop open: each IMU must read the motion of its place.
 3. The rig rests at a few poses near home, driven by raw samples: a first calibration.
 4. With this it rests at twenty wide poses: a better one.
-5. With that it shakes: the rest.
+5. With that it shakes: the constants that rests alone do not tell.
 
 Every run is one of `hil.runs.simulation`, and between runs the rig stands on its brakes. Recordings can replace all runs.
 """
@@ -39,10 +39,9 @@ from plant.dynamics.variables import IMU_COUNT
 from plant.imu import GYROSCOPE
 from plant.mechanism import Mechanism, load_spatial
 
-FIRST_POSES, WIDE_POSES, SHAKING_S = 8, 20, 40.0
 _NOTHING = Knowledge()
-_PROBING_S = 4.0
-_ZEROING_S = 1.0
+_ZEROING_S, _PROBING_S, _NEAR_S, _WIDE_S, _SHAKING_S = 1.0, 4.0, 8 * REST_S, 20 * REST_S, 40.0
+"""Durations of the runs: 8 rests near home, and 20 at wide poses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,13 +51,11 @@ class RigCalibration:
     Attributes:
         mechanism: the rig's.
         calibration: of the IMUs.
-        at_rest: from the rests alone.
         summary: the figures.
     """
 
     mechanism: Mechanism
     calibration: Calibration
-    at_rest: Found
     summary: dict[str, Any]
 
 
@@ -89,22 +86,21 @@ def calibrate_rig(
     offset[GYROSCOPE] = -data.zero
     zeroed, known = Calibration(offset=offset), None
     if knowledge.known_poses:
-        with _calibrated(replace(config, target="rests", duration=WIDE_POSES * REST_S), zeroed) as run:
+        with _calibrated(replace(config, target="rests", duration=_WIDE_S), zeroed) as run:
             known = calibrate_by_known_poses(data, [run_open(run)])
-    with _calibrated(replace(config, target="near-rests", duration=FIRST_POSES * REST_S), zeroed) as run:
+    with _calibrated(replace(config, target="near-rests", duration=_NEAR_S), zeroed) as run:
         data.add_rests(run_open(run))
-    done, whole = FIRST_POSES * REST_S, (FIRST_POSES + WIDE_POSES) * REST_S + SHAKING_S
+    whole = _NEAR_S + _WIDE_S + _SHAKING_S
 
-    def drive(target: str, duration: float, calibration: Calibration) -> Record:
-        nonlocal done
-        start, done = done, done + duration
+    def drive(target: str, start: float, duration: float, calibration: Calibration) -> Record:
         with _calibrated(replace(config, target=target, duration=duration), calibration) as run:
             return _run_closed(run, part_of(progress, start / whole, duration / whole))
 
     first = calibrate_at_rest(data.mechanism, data.rests, knowledge.prior)
-    data.add_rests(drive("rests", WIDE_POSES * REST_S, first.calibration()))
+    data.add_rests(drive("rests", _NEAR_S, _WIDE_S, first.calibration()))
     at_rest = calibrate_at_rest(data.mechanism, data.rests, knowledge.prior)
-    return _finish(data, at_rest, [drive("shaking", SHAKING_S, at_rest.calibration())], known, validate)
+    motion = drive("shaking", _NEAR_S + _WIDE_S, _SHAKING_S, at_rest.calibration())
+    return _finish(data, at_rest, [motion], known, validate)
 
 
 def calibrate_recordings(paths: Sequence[Path], knowledge: Knowledge = _NOTHING) -> RigCalibration:
@@ -210,4 +206,4 @@ def _finish(
         **{f"residual_{name}_mg": round(value, 4) for name, value in summary["residual_mg"].items()},
     }
     result = calibration if known is None else known
-    return RigCalibration(data.mechanism, replace(result, about=about), at_rest, summary)
+    return RigCalibration(data.mechanism, replace(result, about=about), summary)
