@@ -279,7 +279,7 @@ def _time_bare(timespec: NDArray[np.int64]) -> int:
         began = now(timespec)
         x += _compute_bare(1000)
         least = min(least, now(timespec) - began)
-    # The compiler would drop work whose result is not used.
+    # The compiler would drop work without a result.
     return least if x > 0.0 else 0
 
 

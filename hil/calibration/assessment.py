@@ -35,7 +35,7 @@ STAGES = {
 """Stages of a calibration, and their names in plain words."""
 
 UNTOLD = 0.5
-"""The data hardly told a constant that keeps more than this share of its prior standard deviation."""
+"""A constant that keeps more than this share of its prior standard deviation counts as hardly told by the data."""
 
 _FOLDS = 5
 
@@ -86,7 +86,7 @@ def _fit(data: CalibrationData, calibration: Calibration, kept: NDArray[np.int64
 def cross_validate(
     data: CalibrationData, calibration: Calibration, samples: Array, start: tuple[Pose, Array]
 ) -> dict[str, dict[str, float]]:
-    """The accuracy that can be told without the truth; nothing for too few rests.
+    """The accuracy as far as it shows without the truth; empty for too few rests.
 
     `left_out_mg` is the residual at rests that the calibration had not seen, in five parts. `position_rms` and `rotation_rms`
     are the differences of the poses by calibrations from disjoint halves of the data.

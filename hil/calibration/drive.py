@@ -1,10 +1,10 @@
-"""Calibration on the rig: the rig rests at wide poses and shakes, and the redundancy of its IMUs tells their errors.
+"""Calibration on the rig: the rig rests at wide poses and shakes, and the redundancy of its IMUs reveals their errors.
 
 1. The brakes hold: the gyroscopes are zeroed.
 2. The drives follow a small planned motion with the loop open: each IMU must read the motion of its place.
 3. The rig rests at a few poses near home, driven by raw samples: a first calibration.
 4. With this it rests at twenty wide poses: a better one.
-5. With that it shakes: the constants that rests alone do not tell.
+5. With that it shakes: the constants that rests alone leave open.
 
 Every run is one of `hil.runs.simulation`, and between runs the rig stands on its brakes. Recordings can replace all runs.
 """
@@ -151,10 +151,10 @@ def _every_cycle(records: Record) -> Record:
 
 
 def run_open(config: SimulationConfig, blind: bool = False) -> Record:
-    """The records of a run with the loop open, whatever the IMUs read.
+    """The records of a run with the loop open: the IMUs do not matter.
 
-    The drives follow the planned speeds, and make up for the load; if `blind`, they do not, and the platform sinks by some
-    millimetres.
+    The drives follow the planned speeds with the feed-forward for the load; if `blind`, without it, and the platform sinks by
+    some millimetres.
     """
     with prepared_loop(config) as loop:
         loop.parameters["gains"] = 0.0

@@ -30,7 +30,7 @@ _CONSTANTS = {
     "accelerometer axes": ("%", 100.0),
     "gyroscope axes": ("%", 100.0),
 }
-"""Unit of each constant, and how many of it make one in SI units."""
+"""Unit of each constant, and the factor from SI units to it."""
 
 
 def write_report(result: RigCalibration, path: Path) -> None:

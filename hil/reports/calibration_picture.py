@@ -34,8 +34,8 @@ def accuracy_svg(summary: Mapping[str, Any], error: str, unit: str, scale: float
     Args:
         summary: of a `RigCalibration`.
         error: "position_rms" or "rotation_rms".
-        unit: name of the unit shown.
-        scale: how many of this unit make one in SI units.
+        unit: to show.
+        scale: factor from SI units to it.
     """
     stages = list(summary["residual_mg"])
     sizes = {(stage, kind): scale * summary[kind][stage][error] for stage in stages for kind in KINDS if stage in summary[kind]}

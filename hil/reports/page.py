@@ -60,7 +60,7 @@ def figure_html(name: str, title: str, caption: str, figure: go.Figure | str, ki
         title: plain text.
         caption: plain text.
         figure: drawn by plotly, or HTML.
-        kind: its class: "time" takes the full width, "view" what is there.
+        kind: its class, "time" for the full width, "view" for a part of it.
     """
     drawn = f'<div id="{name}">{figure}</div>' if isinstance(figure, str) else _plot_html(name, figure)
     text = f"<h2>{escape(title, quote=False)}</h2>\n{drawn}\n<figcaption>{escape(caption, quote=False)}</figcaption>"

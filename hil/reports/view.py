@@ -68,6 +68,6 @@ def line_trace(points: dict[str, Array], color: str | list[str], width: float) -
 
 
 def plate_trace(corners: dict[str, Array], color: str, opacity: float) -> go.Mesh3d:
-    """A plate whose rim is `coordinates`."""
+    """A plate with `coordinates` as its rim."""
     fan = np.arange(1, len(corners["x"]) - 1)
     return go.Mesh3d(corners, i=0 * fan, j=fan, k=fan + 1, color=color, opacity=opacity, flatshading=True, hoverinfo="skip")

@@ -94,7 +94,7 @@ class _Readings:
         )
 
     def track(self, step: int, errors: str | None = None) -> PoseTrack:
-        """The poses of a step of the cycle; `errors` of the IMUs are those that the whole-mechanism filter estimates."""
+        """The poses of a step of the cycle; the whole-mechanism filter estimates these `errors` of the IMUs."""
         if errors not in self._fused:
             self._fused[errors] = fuse(self.parameters(errors), self.raw)
         return track(self._fused[errors], step)

@@ -79,7 +79,7 @@ def evaluate(config: EvaluationConfig, progress: Callable[[str, float], None] = 
 
     Args:
         config: of the evaluation.
-        progress: called with the name of what is under way and the share of it that is done.
+        progress: called with the name of a part and the share of it that is done.
 
     Returns:
         The figures in SI units by section (`SECTIONS` and `calibration`), and `config` and `version`.
@@ -155,8 +155,8 @@ def _of_motions(rigs: Sequence[_Rig], progress: Progress) -> dict[str, Any]:
 
 
 def _of_faults(rigs: Sequence[_Rig], progress: Progress) -> dict[str, Any]:
-    """Errors of the whole-mechanism filter at 1 Hz with all IMUs, without one leg's (another one for each seed), and without
-    the platform's; and their ratios to those with all.
+    """Errors of the whole-mechanism filter at 1 Hz: with all IMUs, without one leg's (another for each seed), and without the
+    platform's; with their ratios to the first.
     """
     cases: dict[str, Callable[[_Rig], list[int]]] = {
         "none": lambda rig: [],

@@ -271,11 +271,11 @@ def tune_fusion(config: TuningConfig, progress: Progress = no_progress) -> dict[
         position [m] and rotation [rad]; `config` and `version`.
 
     Raises:
-        GoughError: something in the configuration cannot be used, or the IMUs' errors are not those of noise.
+        GoughError: something in the configuration cannot be used, or noise cannot explain the IMUs' errors.
     """
     mechanism = load_spatial(config.mechanism)
     before = fusion = sensor_settings(mechanism, load_imu(config.imu))
-    stages = len(STEPS) + 3  # Before them the motions and the figures as they are, after them those that are found.
+    stages = len(STEPS) + 3  # Before the steps the motions and the first figures, after them the last figures.
 
     def report(stage: int, share: float = 0.0) -> None:
         progress((stage + share) / stages)

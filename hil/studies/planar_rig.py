@@ -28,7 +28,7 @@ TRUE_ANGLE = np.radians(8.0)
 
 _FIRST_LINE = re.compile(r"# true pose by image processing: x (\S+) mm, y (\S+) mm, gamma (\S+) deg")
 COMPONENTS = (("x", "mm", 1e3), ("y", "mm", 1e3), ("angle", "deg", np.degrees(1.0)))
-"""Components of a pose: name, the unit that files and reports show, and how many of it make one in SI units."""
+"""Components of a pose: name, unit in files and reports, and the factor from SI units to it."""
 
 
 @dataclass(frozen=True, eq=False)
