@@ -1,32 +1,63 @@
 """One PID controller per actuator, on the length deviation, with feed-forward; the command is a velocity [m/s].
 
-`u = v_ref + u_ff + Kp e + Ki integral(e) + Kd e'`, e = l_ref - l_is. The derivative is low-passed. Against wind-up the
+`u = v_ref + u_ff + Kp e + Ki integral(e) + Kd e'`, e = l_ref - l_is. The derivative is low-passed. Against wind-up, the
 integral rests while the command is at its limit and the error would drive it further.
 """
 
-from plant.compiled import kernel
+import numpy as np
+
+from controller.settings import ControlSettings
+from plant.compiled import Record, kernel
 from plant.mechanism import LEGS
 from plant.pose import Array
 
+PARAMETERS = np.dtype([("gains", np.float64, 4), ("limit", np.float64)], align=True)
+"""Proportional, integral and derivative gain, and corner of the derivative's low-pass [1/s, 1/s^2, -, rad/s]; largest command
+[m/s]."""
+
+STATE = np.dtype(
+    [
+        ("error", np.float64, LEGS),
+        ("integral", np.float64, LEGS),
+        ("previous_error", np.float64, LEGS),
+        ("derivative", np.float64, LEGS),
+        ("command", np.float64, LEGS),
+    ],
+    align=True,
+)
+"""Length deviations [m], their integral [m s], those of the last cycle, their low-passed derivative, the commands [m/s]."""
+
+
+def pid_parameters(control: ControlSettings, velocity: float) -> Record:
+    """The constants of the controllers (dtype `PARAMETERS`); `velocity` is the actuators' limit [m/s]."""
+    parameters: Record = np.zeros((), PARAMETERS)
+    parameters["gains"] = control.proportional, control.integral, control.derivative, control.derivative_bandwidth
+    parameters["limit"] = control.command_reserve * velocity
+    return parameters
+
 
 @kernel
-def step_pid(
-    error: Array, feed_forward: Array, gains: Array, limit: float, period: float, integral: Array, previous: Array,
-    derivative: Array, command: Array,
-) -> None:  # fmt: skip
-    """Write the commands (6,) from the errors (6,) [m] and the feed-forward (6,) [m/s].
+def step_pid(p: Record, s: Record, feed_forward: Array, period: float) -> None:
+    """Write the commands from the errors and the feed-forward (6,) [m/s], over one period [s].
 
     Args:
-        gains: proportional, integral, derivative, corner of the derivative's low-pass [rad/s].
-        limit: largest command [m/s].
-        integral, previous, derivative: (6,) each, the controllers' state.
+        p, s: dtypes `PARAMETERS` and `STATE`.
     """
+    gains = p.gains
     smoothing = period * gains[3] / (1.0 + period * gains[3])
     for k in range(LEGS):
-        e = error[k]
-        derivative[k] += smoothing * ((e - previous[k]) / period - derivative[k])
-        previous[k] = e
-        wanted = feed_forward[k] + gains[0] * e + gains[1] * integral[k] + gains[2] * derivative[k]
-        command[k] = min(max(wanted, -limit), limit)
-        if command[k] == wanted or (wanted - command[k]) * e < 0.0:
-            integral[k] += period * e
+        e = s.error[k]
+        s.derivative[k] += smoothing * ((e - s.previous_error[k]) / period - s.derivative[k])
+        s.previous_error[k] = e
+        wanted = feed_forward[k] + gains[0] * e + gains[1] * s.integral[k] + gains[2] * s.derivative[k]
+        s.command[k] = min(max(wanted, -p.limit), p.limit)
+        if s.command[k] == wanted or (wanted - s.command[k]) * e < 0.0:
+            s.integral[k] += period * e
+
+
+@kernel
+def hold_still(s: Record, legs: int) -> None:
+    """No commands, before the motion; the derivative will begin from the present error."""
+    for k in range(legs):
+        s.command[k] = 0.0
+        s.previous_error[k] = s.error[k]

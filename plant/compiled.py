@@ -103,12 +103,16 @@ def kernel(function: F) -> F:
 
 
 def _general(kind: Any) -> Any:
-    """The type of an argument without its value, and of a record's array without its shape."""
+    """The type of an argument without its value, of a member of an enumeration as its number, of a record's array without its
+    shape.
+    """
     general: Any = cast(Any, types.unliteral)(kind)
+    if isinstance(general, types.IntEnumMember):
+        return general.dtype
     return types.Array(general.dtype, general.ndim, "C") if isinstance(general, types.NestedArray) else general
 
 
-@lower_cast(types.NestedArray, types.Array)
+@lower_cast(types.NestedArray, types.Array)  # type: ignore[no-untyped-call, untyped-decorator]
 def _cast_nested(context: Any, builder: Any, from_type: Any, to_type: Any, value: Any) -> Any:
     """Pass a record's array on as it is: numba has no such cast, though both lie in memory alike."""
     return value

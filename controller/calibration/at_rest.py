@@ -14,25 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.calibration.file import Calibration
+from controller.estimation.imu_errors import ALIGNMENT, ERRORS, error_gradient, error_matrix
 from controller.estimation.mechanism_filter import (
-    ALIGNMENT,
     ALL_ERRORS,
-    ERRORS,
     FILTER_STATE,
-    JOINTS,
-    RIG,
-    TILT,
-    collect,
-    error_gradient,
-    error_matrix,
+    accumulate_sample,
     extrapolate,
     extrapolate_covariance,
     filter_parameters,
     start_filter,
     step_filter,
 )
-from controller.estimation.readings import MOTION_STATES, READINGS, READINGS_SCRATCH, predict_readings, sensor_geometry
+from controller.estimation.readings import MOTION_STATES, READINGS, READINGS_SCRATCH, predict_readings
+from controller.estimation.rig_jacobian import JOINTS, RIG_ERRORS, TILT
 from controller.inverse_kinematics import inverse_kinematics
+from controller.rig import sensor_geometry
 from controller.settings import FusionSettings
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import IMU_COUNT
@@ -235,7 +231,7 @@ class _Problem:
         self._places, joint_of = np.unique(LEGS * np.arange(2)[:, None] + mechanism.distinct_joints(), return_inverse=True)
         places = len(self._places)
         # Legs may share a joint: its coordinates are those of both.
-        self._rig_of = np.zeros((RIG, 3 * places + TILT))
+        self._rig_of = np.zeros((RIG_ERRORS, 3 * places + TILT))
         self._rig_of[:JOINTS, : 3 * places] = np.kron(np.eye(places)[joint_of.ravel()], np.eye(3))
         self._rig_of[JOINTS:, 3 * places :] = np.eye(TILT)
         self._rig = slice(self._errors.stop, self._errors.stop + 3 * places + TILT)
@@ -327,7 +323,7 @@ class _Problem:
     def found(self, x: _Unknowns, covariance: Array) -> Found:
         """The result."""
         residuals = np.array([self._readings_rows(x, n)[0] for n in range(self._count)])
-        spread = np.zeros((ALL_ERRORS + RIG, self._rig.stop - self._errors.start))
+        spread = np.zeros((ALL_ERRORS + RIG_ERRORS, self._rig.stop - self._errors.start))
         spread[:ALL_ERRORS, :ALL_ERRORS], spread[ALL_ERRORS:, ALL_ERRORS:] = np.eye(ALL_ERRORS), self._rig_of
         own = covariance[self._errors.start :, self._errors.start :]
         return Found(x.errors, x.tilt, x.joints, spread @ own @ spread.T, x.positions, x.rotations, residuals)
@@ -377,13 +373,13 @@ def pose_covariance(mechanism: Mechanism, tilt: Array, pose: tuple[Array, Array]
     """
     rest = _Rest()
     ideal, by_pose = rest(sensor_geometry(mechanism, tilt), *pose)
-    by_others, gradient = np.zeros((IMU_COUNT, 3, ALL_ERRORS + RIG)), np.zeros(ERRORS)
+    by_others, gradient = np.zeros((IMU_COUNT, 3, ALL_ERRORS + RIG_ERRORS)), np.zeros(ERRORS)
     for k in range(IMU_COUNT):
         for i in range(3):
             error_gradient(np.zeros(ERRORS), ideal[k], 3 + i, gradient)
             by_others[k, i, ERRORS * k : ERRORS * (k + 1)] = gradient
     by_others[:, :, ALL_ERRORS:] = rest.by_rig(mechanism, tilt, *pose)[:, 3:]
-    gain = np.linalg.pinv(by_pose[:, 3:].reshape(-1, 6)) @ by_others.reshape(-1, ALL_ERRORS + RIG)
+    gain = np.linalg.pinv(by_pose[:, 3:].reshape(-1, 6)) @ by_others.reshape(-1, ALL_ERRORS + RIG_ERRORS)
     found: Array = gain @ covariance @ gain.T
     return found
 
@@ -444,7 +440,7 @@ def _track(
         if guide.shape[0] > 0:
             state.low_passed[:] = guide[i]
         if i > 0:
-            collect(state, samples[i], used[i], i * period - delay)
+            accumulate_sample(state, samples[i], used[i], i * period - delay)
             step_filter(parameters, geometry, state)
         extrapolate(state, i * period, positions[i], rotations[i], twist, acceleration)
         extrapolate_covariance(parameters, state, i * period, covariances[i])
@@ -500,7 +496,7 @@ def calibrate_in_motion(
         joints=found.joints + moved[:JOINTS].reshape(2, LEGS, 3),
         tilt=found.tilt + moved[JOINTS:],
     )
-    kept = slice(MOTION_STATES, MOTION_STATES + ALL_ERRORS + RIG)
+    kept = slice(MOTION_STATES, MOTION_STATES + ALL_ERRORS + RIG_ERRORS)
     covariance: Array = runs[-1].state["covariance"][kept, kept].copy()
     of_errors, across, of_rig = (
         covariance[:ALL_ERRORS, :ALL_ERRORS],

@@ -15,8 +15,7 @@ import casadi as ca
 import control
 import numpy as np
 
-from controller.cycle import STATE, cycle_parameters
-from controller.estimation.fusion import calibrate, fuse_legs, fuse_platform, locate
+from controller.cycle import CONTROL, MARKS, SCREENING, STATE, cycle_parameters, run_stages
 from controller.inverse_kinematics import leg_lengths
 from controller.settings import ControlSettings, control_settings, fusion_settings
 from plant.checks import check_rate
@@ -230,25 +229,22 @@ def _reduction(quaternion: Array) -> Array:
     return reduce
 
 
-_ESTIMATOR_STATE = ("leg_x", "platform_x", "smooth_twist", "acceleration")
+_ESTIMATOR_STATE = (("legs", "x"), ("platform", "x"), ("pose", "smooth_twist"), ("pose", "acceleration"))
 
 
 def linear_estimator(mechanism: Mechanism, rate: float, signals: Array) -> Linear:
     """The estimator, from IMU signals (42,) to the six lengths [m], with settled covariances."""
     parameters = cycle_parameters(mechanism, rate, control_settings(mechanism), fusion_settings(mechanism))
-    measurement = np.zeros((3, 7, 3))
+    measurement, no_reference, marks = np.zeros((3, 7, 3)), np.zeros((LEGS, 1, 5)), np.zeros((), MARKS)[()]
     settled: Record = np.zeros((), STATE)
 
     def step(state: Record, sample: Array) -> None:
         measurement[GYROSCOPE], measurement[ACCELEROMETER] = sample.reshape(2, 7, 3)
-        calibrate(parameters, state, measurement)
-        fuse_legs(parameters, state)
-        fuse_platform(parameters, state)
-        locate(parameters, state)
-        state["cycle"] += 1
+        run_stages(parameters, state, measurement, no_reference, marks, SCREENING, CONTROL)
+        state["time"]["cycle"] += 1
 
     def flat(state: Record) -> Array:
-        return np.concatenate([np.ravel(state[name]) for name in _ESTIMATOR_STATE])
+        return np.concatenate([np.ravel(state[stage][name]) for stage, name in _ESTIMATOR_STATE])
 
     for _ in range(round(_SETTLE_S * rate)):
         step(settled, signals)
@@ -257,12 +253,12 @@ def linear_estimator(mechanism: Mechanism, rate: float, signals: Array) -> Linea
     def response(change: Array, sample: Array) -> tuple[Array, Array]:
         state = settled.copy()
         at = 0
-        for name in _ESTIMATOR_STATE:
-            count = state[name].size
-            state[name] += change[at : at + count].reshape(state[name].shape)
-            at += count
+        for stage, name in _ESTIMATOR_STATE:
+            part = state[stage][name]
+            part += change[at : at + part.size].reshape(part.shape)
+            at += part.size
         step(state, signals + sample)
-        lengths = leg_lengths(mechanism, state["position"], state["rotation"])
+        lengths = leg_lengths(mechanism, state["pose"]["position"], state["pose"]["rotation"])
         return flat(state), lengths
 
     def derivative(count: int, along_state: bool) -> tuple[Array, Array]:

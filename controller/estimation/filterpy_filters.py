@@ -8,7 +8,12 @@ share no line with the compiled filters.
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
-from controller.estimation.platform_filter import INNOVATION_LIMIT
+from controller.estimation.leg_filter import start_leg, update_leg_directions
+from controller.estimation.platform_filter import INNOVATION_LIMIT, begin_platform_step, end_platform_step
+from plant.compiled import Record
+from plant.dynamics.variables import PLATFORM_IMU
+from plant.imu import ACCELEROMETER, GYROSCOPE
+from plant.mechanism import LEGS
 from plant.pose import Array, skew
 
 STATES = 9
@@ -171,3 +176,65 @@ class FilterpyPlatform(_Filterpy):
         """The innovation, within `INNOVATION_LIMIT` standard deviations."""
         bound = INNOVATION_LIMIT * np.sqrt(self.filter.S)
         return np.clip(reading - expected, -bound, bound)
+
+
+class FilterpyFilters:
+    """The stages of leg and platform filters on filterpy, in place of the compiled ones.
+
+    Args:
+        parameters: of the cycle (dtype `controller.cycle.PARAMETERS`).
+    """
+
+    def __init__(self, parameters: Record) -> None:
+        self._parameters = parameters[()]
+        rig, legs, platform = (parameters[name] for name in ("rig", "legs", "platform"))
+        sensors, period = rig["sensors"], float(rig["period"])
+        self._legs = [
+            FilterpyLeg(
+                up_in_joint=sensors["up_in_joint"][k],
+                imu_position=sensors["leg_imu_position"][k],
+                gravity=float(sensors["gravity"]),
+                period=period,
+                jerk=float(legs["jerk"]),
+                bias_walk=float(legs["bias_walk"]),
+                rate_variance=float(legs["rate_variance"]),
+                force_variance=float(legs["force_variance"]),
+            )
+            for k in range(LEGS)
+        ]
+        self._platform = FilterpyPlatform(
+            gravity=float(sensors["gravity"]),
+            period=period,
+            rate_density=float(platform["rate_density"]),
+            bias_walk=float(platform["bias_walk"]),
+            vertical_variance=float(platform["vertical_variance"]),
+        )
+
+    def step_legs(self, state: Record) -> None:
+        """Step the leg filters, as `leg_filter.step_leg_filters` does; `state` has dtype `controller.cycle.STATE`."""
+        p, s = self._parameters, state[()]
+        imus, legs = s["imus"], s["legs"]
+        for k, leg in enumerate(self._legs):
+            if not imus["used"][k]:
+                continue
+            rate, force = imus["sample"][GYROSCOPE, k], imus["sample"][ACCELEROMETER, k]
+            if legs["age"][k] == 0:
+                x, covariance = legs["x"][k], legs["covariance"][k]
+                start_leg(x, covariance, rate, force, leg.up_in_joint, float(p["legs"]["bias_sigma"]))
+                leg.start(x, covariance)
+                leg.update(rate, force)
+            else:
+                leg.step(rate, force)
+            legs["x"][k], legs["covariance"][k] = leg.state, leg.covariance
+        update_leg_directions(p["legs"], legs, p["rig"], s["time"], imus)
+
+    def step_platform(self, state: Record) -> None:
+        """Step the platform's filter, as `platform_filter.step_platform_filter` does."""
+        p, s = self._parameters, state[()]
+        imus, platform = s["imus"], s["platform"]
+        if begin_platform_step(p["platform"], platform, p["rig"], s["time"], imus, s["pose"]):
+            self._platform.start(platform["x"], platform["covariance"])
+            rate, force = imus["sample"][GYROSCOPE, PLATFORM_IMU], imus["sample"][ACCELEROMETER, PLATFORM_IMU]
+            self._platform.step(rate, force, platform["imu_acceleration"])
+            platform["x"], platform["covariance"] = self._platform.state, self._platform.covariance
+            end_platform_step(p["platform"], platform, imus)

@@ -5,54 +5,139 @@ State (4): its unit vector n in {2}, across the vertical u, and what the platfor
 compensation. Errors (2) are the angle about u by which the true n is turned from the estimate, and that of the bias.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import ArrayLike
 
-from controller.estimation.platform_filter import INNOVATION_LIMIT
-from controller.estimation.readings import tilt_rotation
+from controller.estimation.leg_filter import SETTLING_S
+from controller.estimation.platform_filter import INNOVATION_LIMIT, extrapolate_direction
+from controller.rig import MagneticField, elapsed
 from controller.settings import FusionSettings
-from plant.compiled import kernel
-from plant.mechanism import Mechanism
+from plant.compiled import Record, kernel
+from plant.dynamics.variables import PLATFORM_IMU
+from plant.imu import MAGNETOMETER
 from plant.pose import Array
 
 STATES = 4
 ERRORS = 2
-_LEAST_HORIZONTAL = 1e-9
+
+_FIELD_SHARE = 0.3
+"""By how much of itself the magnetic field may differ from the earth's: beyond that something magnetic is near."""
+
+_FROZEN_FIELDS = 10
+"""How many samples in a row of a magnetometer may be the same while the rest of its IMU moves."""
+
+PARAMETERS = np.dtype(
+    [
+        ("active", np.int64),
+        ("strength", np.float64),
+        ("sample_cycles", np.int64),
+        ("variance", np.float64),
+        ("floor", np.float64),
+        ("rate_density", np.float64),
+        ("bias_walk", np.float64),
+        ("bias_sigma", np.float64),
+        ("delay", np.float64),
+        ("settling_cycles", np.int64),
+    ],
+    align=True,
+)
+"""Constants of the filter.
+
+Fields:
+    active: whether the magnetometer is used.
+    strength: of the earth's field [uT].
+    sample_cycles: for how many cycles a sample stands.
+    variance: of the heading of one sample; floor is the least of any average [rad^2].
+    rate_density, bias_walk, bias_sigma, delay, settling_cycles: as for the platform's filter.
+"""
+
+STATE = np.dtype(
+    [
+        ("x", np.float64, STATES),
+        ("covariance", np.float64, (ERRORS, ERRORS)),
+        ("age", np.int64),
+        ("used", np.int64),
+        ("weight", np.float64),
+        ("north", np.float64, 3),
+        ("field", np.float64, 3),
+        ("frozen_for", np.int64),
+        ("fresh", np.int64),
+    ],
+    align=True,
+)
+"""State of the filter.
+
+Fields:
+    x, covariance, age: of the filter, which has run for `age` cycles.
+    used, weight: whether the heading is used, and its weight in the refinement.
+    north: the horizontal direction of the field in {2}, without the sensors' delay.
+    field: the last sample [uT]; `frozen_for` how many cycles it has stood, `fresh` whether it is to be taken.
+"""
 
 
-@dataclass(frozen=True, eq=False)
-class MagneticField:
-    """The magnetic field of the earth at a mechanism.
+def heading_parameters(fusion: FusionSettings, rate: float, field: MagneticField, active: bool) -> Record:
+    """The constants of the filter (dtype `PARAMETERS`) in cycles of this rate [Hz]."""
+    values = {
+        "active": active,
+        "strength": field.strength,
+        "sample_cycles": max(1, round(rate / fusion.magnetometer_rate)),
+        "variance": field.heading_variance(fusion, rate),
+        "floor": fusion.heading_sigma**2,
+        "rate_density": fusion.gyroscope_noise**2,
+        "bias_walk": fusion.bias_walk**2,
+        "bias_sigma": fusion.bias_sigma,
+        "delay": fusion.sensor_delay,
+        "settling_cycles": round(SETTLING_S * rate),
+    }
+    parameters: Record = np.zeros((), PARAMETERS)
+    for name, value in values.items():
+        parameters[name] = value
+    return parameters
 
-    Attributes:
-        vectors: (2, 3), the vertical and the field's horizontal direction, as unit vectors in {1}.
-        horizontal, vertical: its components, the second positive upwards [uT].
+
+@kernel
+def step_heading_filter(p: Record, s: Record, rig: Record, time: Record, imus: Record, platform: Record) -> None:
+    """Step the filter, if the magnetometer is used and healthy.
+
+    The field must be about as strong as the earth's, and must not stand still while the rest of its IMU moves. A sample that
+    stands until the next one is taken once.
+
+    Args:
+        p, s: dtypes `PARAMETERS` and `STATE`.
+        rig, time: dtypes `RIG` and `TIME`.
+        imus, platform: states of these stages.
     """
-
-    vectors: Array
-    horizontal: float
-    vertical: float
-
-    @property
-    def strength(self) -> float:
-        """[uT]."""
-        return float(np.hypot(self.horizontal, self.vertical))
-
-    def heading_variance(self, fusion: FusionSettings, rate: float) -> float:
-        """Of the heading that a sample of the magnetometer tells, in cycles of this rate [Hz]; in rad^2."""
-        return fusion.magnetometer_noise**2 * min(fusion.magnetometer_rate, rate) / 2.0 / self.horizontal**2
-
-
-def field_of(mechanism: Mechanism, tilt: ArrayLike = (0.0, 0.0)) -> MagneticField:
-    """The field in the plant data of a mechanism, next to none without; `tilt` (2,) [rad] turns it with the vertical."""
-    up, field = mechanism.up_in_base, mechanism.plant.get("magnetic_field", np.zeros(3))
-    vertical = float(field @ up)
-    across = field - vertical * up
-    horizontal = max(float(np.linalg.norm(across)), _LEAST_HORIZONTAL)
-    vectors: Array = np.stack([up, across / horizontal]) @ tilt_rotation(tilt).T
-    return MagneticField(vectors, horizontal, vertical)
+    if p.active == 0:
+        return
+    field = imus.sample[MAGNETOMETER, PLATFORM_IMU]
+    if field[0] != s.field[0] or field[1] != s.field[1] or field[2] != s.field[2]:
+        s.frozen_for = 0
+    elif imus.unchanged[PLATFORM_IMU] == 0:
+        s.frozen_for += 1
+    s.field[:] = field
+    # NaN is not below the limit either.
+    strength = np.sqrt(field[0] * field[0] + field[1] * field[1] + field[2] * field[2])
+    healthy = (
+        imus.used[PLATFORM_IMU] != 0
+        and abs(strength - p.strength) < _FIELD_SHARE * p.strength
+        and s.frozen_for < _FROZEN_FIELDS * p.sample_cycles
+    )
+    age = s.age
+    s.age = age + 1 + time.missed if healthy else 0
+    s.used = 1 if platform.used != 0 and s.age > min(time.cycle, p.settling_cycles) else 0
+    s.fresh = 1 if healthy and s.frozen_for % p.sample_cycles == 0 else 0
+    s.weight = 0.0
+    if not healthy:
+        return
+    x, covariance, up = s.x, s.covariance, platform.x
+    if age == 0:
+        start_heading(x, covariance, field, up, p.variance, p.bias_sigma)
+    else:
+        predict_heading(x, covariance, up, platform.rate, elapsed(rig, time), p.rate_density, p.bias_walk)
+        if s.fresh != 0:
+            update_heading(x, covariance, field, up, p.variance)
+    extrapolate_direction(x, platform.rate, p.delay, s.north)
+    if s.used != 0:
+        s.weight = 1.0 / (covariance[0, 0] + p.floor)
 
 
 @kernel

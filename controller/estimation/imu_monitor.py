@@ -8,11 +8,26 @@ explains w f^T r of the sum of squares. `controller.direct_kinematics.integrity`
 import numpy as np
 
 from controller.least_squares import solve_cholesky
+from controller.settings import SafetySettings
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
 from plant.pose import Array
 
-MONITOR = np.dtype(
+_CONTRADICTION_S = 0.03
+"""Time constant of the low-pass on an IMU's contradiction, and how long a contradiction must last [s]."""
+
+_LARGEST_SHARE, _LEAST_LOOKS = 0.25, 3
+"""At low rates: the largest share of one look in the low-pass, and for how many looks a contradiction must last."""
+
+_SLOW_HZ = 300.0
+"""Below this rate the filters' directions are less exact."""
+
+PARAMETERS = np.dtype(
+    [("active", np.int64), ("disagreement", np.float64), ("smoothing", np.float64), ("lasting", np.float64)], align=True
+)
+"""Whether IMUs are compared; the limit of a contradiction [rad]; the share of a new look; how long it must last [s]."""
+
+STATE = np.dtype(
     [
         ("looked_at", np.int64),
         ("contradiction", np.float64, (IMU_COUNT, 3)),
@@ -25,44 +40,58 @@ MONITOR = np.dtype(
     ],
     align=True,
 )
-"""Which IMU was looked at last; by how much each IMU's direction is off what the others say, as a vector in {1} [rad], how much
-of the sum of squares that explains, and its own part of that sum, all low-passed; and scratch."""
+"""State of the monitor.
+
+Fields:
+    looked_at: the IMU that was looked at last.
+    contradiction: by how much each IMU's direction is off what the others say, a vector in {1} [rad], low-passed.
+    explained, squares: how much of the residuals' sum of squares that explains, and the IMU's own part of it, low-passed.
+    across, jacobian, solved, direction: scratch.
+"""
 
 _LEAST_SHARE = 0.08
 """How much of an error must show in the residuals for it to be told from those of others."""
 
 
+def monitor_parameters(settings: SafetySettings, rate: float) -> Record:
+    """The constants of the monitor (dtype `PARAMETERS`) in cycles of this rate [Hz]."""
+    parameters: Record = np.zeros((), PARAMETERS)
+    parameters["active"], parameters["disagreement"] = settings.watch_imus, settings.disagreement * max(1.0, _SLOW_HZ / rate)
+    # Each IMU's turn comes in every seventh cycle.
+    parameters["smoothing"] = min(IMU_COUNT / (rate * _CONTRADICTION_S), _LARGEST_SHARE)
+    parameters["lasting"] = max(_CONTRADICTION_S, _LEAST_LOOKS * IMU_COUNT / rate)
+    return parameters
+
+
 @kernel
 def look_at_next(
-    monitor: Record, factor: Array, arms: Array, predicted: Array, lengths: Array, directions: Array, leg_weights: Array,
-    rotation: Array, vertical_in_base: Array, vertical: Array, vertical_weight: float, smoothing: float,
-) -> None:  # fmt: skip
+    p: Record, monitor: Record, pose: Record, measured: Array, leg_weights: Array, vertical_in_base: Array
+) -> None:
     """Look at the next IMU's contradiction at a refined pose.
 
     Args:
-        monitor: dtype `MONITOR`.
-        factor: (6, 6), Cholesky factor of the information.
-        arms, predicted, lengths: the legs at the pose; `directions` (6, 3) are the measured ones, `leg_weights` (6,) theirs.
-        rotation: of the pose; `vertical_in_base` (3,) is known, `vertical` (3,) is measured in {2}, with its weight.
-        smoothing: share of a new contradiction in the low-pass.
+        p, monitor: dtypes `PARAMETERS` and `STATE`.
+        pose: state of the pose estimator: the pose, its legs, the Cholesky factor, and the measured vertical.
+        measured, leg_weights: (6, 3) and (6,), the legs' measured directions and their weights.
+        vertical_in_base: (3,), unit.
     """
     m = monitor
     k = m.looked_at = (m.looked_at + 1) % IMU_COUNT
     platform = k == PLATFORM_IMU
-    weight = vertical_weight if platform else leg_weights[k]
+    weight = pose.vector_weights[0] if platform else leg_weights[k]
     determinant = least = 0.0
     s00 = s01 = s11 = 0.0
     if weight > 0.0:
         for i in range(3):
-            m.direction[i] = 0.0 if platform else predicted[k, i]
+            m.direction[i] = 0.0 if platform else pose.directions[k, i]
             if platform:
                 for j in range(3):
-                    m.direction[i] += rotation[i, j] * vertical[j]
+                    m.direction[i] += pose.rotation[i, j] * pose.vectors[0, j]
         _find_across(m.direction, m.across)
         for n in range(2):
-            _find_jacobian(m, n, platform, arms[min(k, 5)], lengths[min(k, 5)])
+            _find_jacobian(m, n, platform, pose.arms[min(k, 5)], pose.lengths[min(k, 5)])
             m.solved[n] = m.jacobian[n]
-            solve_cholesky(factor, m.solved[n])
+            solve_cholesky(pose.factor, m.solved[n])
         s00 = s11 = 1.0
         for i in range(6):
             s00 -= weight * m.jacobian[0, i] * m.solved[0, i]
@@ -71,25 +100,25 @@ def look_at_next(
         determinant = s00 * s11 - s01 * s01
         least = 0.5 * (s00 + s11) - np.sqrt(0.25 * (s00 - s11) ** 2 + s01 * s01)
     if not least > _LEAST_SHARE:
-        forget(monitor, k)
+        reset(monitor, k)
         return
     r0 = r1 = 0.0
     for i in range(3):
-        off = vertical_in_base[i] - m.direction[i] if platform else directions[k, i] - m.direction[i]
+        off = vertical_in_base[i] - m.direction[i] if platform else measured[k, i] - m.direction[i]
         r0 += m.across[0, i] * off
         r1 += m.across[1, i] * off
     if not np.isfinite(r0 + r1):
-        forget(monitor, k)
+        reset(monitor, k)
         return
     f0, f1 = (s11 * r0 - s01 * r1) / determinant, (s00 * r1 - s01 * r0) / determinant
     for i in range(3):
-        m.contradiction[k, i] += smoothing * (f0 * m.across[0, i] + f1 * m.across[1, i] - m.contradiction[k, i])
-    m.explained[k] += smoothing * (weight * (f0 * r0 + f1 * r1) - m.explained[k])
-    m.squares[k] += smoothing * (weight * (r0 * r0 + r1 * r1) - m.squares[k])
+        m.contradiction[k, i] += p.smoothing * (f0 * m.across[0, i] + f1 * m.across[1, i] - m.contradiction[k, i])
+    m.explained[k] += p.smoothing * (weight * (f0 * r0 + f1 * r1) - m.explained[k])
+    m.squares[k] += p.smoothing * (weight * (r0 * r0 + r1 * r1) - m.squares[k])
 
 
 @kernel
-def forget(monitor: Record, k: int) -> None:
+def reset(monitor: Record, k: int) -> None:
     """Begin anew with IMU `k`."""
     monitor.contradiction[k] = 0.0
     monitor.explained[k] = 0.0

@@ -8,17 +8,144 @@ does, it measures exactly
     force = g up + alpha x d + omega x (omega x d),   up = Ry(b)^T Rx(a)^T up_in_joint
 
 The motion model is a random walk of the accelerations. The six measurements are taken one after the other, linearised
-once, which equals the joint update. `filterpy_fusion` is the slow clear twin.
+once, which equals the joint update. `filterpy_filters` is the slow clear twin.
 """
 
 import numpy as np
 
-from plant.compiled import kernel
+from controller.rig import elapsed
+from controller.settings import FusionSettings
+from plant.compiled import Record, kernel
+from plant.imu import ACCELEROMETER, GYROSCOPE
+from plant.mechanism import LEGS
 from plant.pose import Array
 
 STATES = 9
 ANGLE_SIGMA, RATE_SIGMA, ACCELERATION_SIGMA = 0.15, 0.05, 40.0
-"""What is known of the state after the first sample [rad, rad/s, rad/s^2]."""
+"""Uncertainty of the state after the first sample [rad, rad/s, rad/s^2]."""
+
+SETTLING_S = 0.1
+"""How long a filter that was started again is not relied upon [s]."""
+
+_GAP_S = 0.05
+"""Longest time for which a leg's angular acceleration is taken to last [s]."""
+
+PARAMETERS = np.dtype(
+    [
+        ("jerk", np.float64),
+        ("bias_walk", np.float64),
+        ("bias_sigma", np.float64),
+        ("rate_variance", np.float64),
+        ("force_variance", np.float64),
+        ("weight", np.float64),
+        ("delay", np.float64),
+        ("settling_cycles", np.int64),
+    ],
+    align=True,
+)
+"""Constants of the leg filters.
+
+Fields:
+    jerk, bias_walk: spectral densities of the legs' angular jerk and of the gyroscopes' biases.
+    bias_sigma: uncertainty of a gyroscope's bias at the start [rad/s].
+    rate_variance, force_variance: of one sample of gyroscope and accelerometer.
+    weight: of a direction in the refinement, 1 / variance [1/rad^2].
+    delay: of the sensors [s].
+    settling_cycles: how long a filter is not relied upon.
+"""
+
+STATE = np.dtype(
+    [
+        ("x", np.float64, (LEGS, STATES)),
+        ("covariance", np.float64, (LEGS, STATES, STATES)),
+        ("age", np.int64, LEGS),
+        ("used", np.float64, LEGS),
+        ("weights", np.float64, LEGS),
+        ("directions", np.float64, (LEGS, 3)),
+        ("rates", np.float64, (LEGS, 3)),
+        ("expected", np.float64, 6),
+        ("jacobian", np.float64, (6, STATES)),
+        ("gain", np.float64, STATES),
+        ("change", np.float64, STATES),
+    ],
+    align=True,
+)
+"""State of the leg filters.
+
+Fields:
+    x, covariance: of each leg's filter.
+    age: for how many cycles each filter has run.
+    used, weights: whether a direction is used, and its weight in the refinement.
+    directions, rates: the legs' unit directions in {1} and their derivatives [1/s].
+    expected, jacobian, gain, change: scratch, so that the cycle allocates nothing.
+"""
+
+
+def leg_parameters(fusion: FusionSettings, rate: float) -> Record:
+    """The constants of the leg filters (dtype `PARAMETERS`) in cycles of this rate [Hz]."""
+    values = {
+        "jerk": fusion.leg_jerk**2,
+        "bias_walk": fusion.bias_walk**2,
+        "bias_sigma": fusion.bias_sigma,
+        "rate_variance": fusion.gyroscope_noise**2 * rate / 2.0,
+        "force_variance": fusion.leg_accelerometer_noise**2 * rate / 2.0,
+        "weight": 1.0 / fusion.leg_sigma**2,
+        "delay": fusion.sensor_delay,
+        "settling_cycles": round(SETTLING_S * rate),
+    }
+    parameters: Record = np.zeros((), PARAMETERS)
+    for name, value in values.items():
+        parameters[name] = value
+    return parameters
+
+
+@kernel
+def step_leg_filters(p: Record, s: Record, rig: Record, time: Record, imus: Record) -> None:
+    """Step the filters of the legs whose IMUs are used.
+
+    Args:
+        p, s: dtypes `PARAMETERS` and `STATE`.
+        rig, time: dtypes `RIG` and `TIME`.
+        imus: state of the IMUs, which has the calibrated samples.
+    """
+    for k in range(LEGS):
+        if imus.used[k] != 0:
+            _step_leg_filter(p, s, rig, time, imus, k)
+    update_leg_directions(p, s, rig, time, imus)
+
+
+@kernel
+def _step_leg_filter(p: Record, s: Record, rig: Record, time: Record, imus: Record, k: int) -> None:
+    """Start or step the filter of leg `k`."""
+    x, covariance, up = s.x[k], s.covariance[k], rig.sensors.up_in_joint[k]
+    rate, force = imus.sample[GYROSCOPE, k], imus.sample[ACCELEROMETER, k]
+    period = elapsed(rig, time)
+    if s.age[k] == 0:
+        start_leg(x, covariance, rate, force, up, p.bias_sigma)
+    else:
+        if period > _GAP_S:
+            x[4:6] = 0.0
+        predict_leg(x, covariance, period, p.jerk, p.bias_walk)
+    if rig.planar != 0:
+        lock_second_axis(x, covariance)
+    update_leg(
+        x, covariance, rate, force, up, rig.sensors.leg_imu_position[k], rig.sensors.gravity, p.rate_variance, p.force_variance,
+        s.expected, s.jacobian, s.gain, s.change,
+    )  # fmt: skip
+
+
+@kernel
+def update_leg_directions(p: Record, s: Record, rig: Record, time: Record, imus: Record) -> None:
+    """Directions and rates of the legs from the filters' states, and which of them are used: those of settled filters.
+
+    Filters that start with the first cycle need not settle.
+    """
+    for k in range(LEGS):
+        s.age[k] = s.age[k] + 1 + time.missed if imus.used[k] != 0 else 0
+        settled = s.age[k] > min(time.cycle, p.settling_cycles)
+        s.used[k] = 1.0 if settled else 0.0
+        s.weights[k] = p.weight if settled else 0.0
+        leg_direction(s.x[k], rig.sensors.joint_rotations[k], p.delay, s.directions[k], s.rates[k])
 
 
 @kernel

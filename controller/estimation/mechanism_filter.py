@@ -1,7 +1,7 @@
 """The whole-mechanism filter: an error-state extended Kalman filter on the platform's motion, with all IMUs.
 
-Because the pose fixes every leg, the platform's motion predicts every reading (`controller.estimation.readings`), and motion
-tells the sensors' errors apart. Error state: of position, rotation (`R <- exp(skew(theta)) R`), velocity, angular velocity,
+The pose fixes every leg, so the platform's motion predicts every reading (`controller.estimation.readings`), and motion tells
+the sensors' errors apart. Error state: of position, rotation (`R <- exp(skew(theta)) R`), velocity, angular velocity,
 acceleration and angular acceleration (18), driven by white jerk, then for each IMU the first parameters of `ERROR_NAMES`, and
 for a calibration the places of the joints (36) and the tilt of the base (2). An IMU reads
 
@@ -18,7 +18,7 @@ excitation, and the biases would drift at rest.
 
 import numpy as np
 
-from controller.estimation.heading_filter import MagneticField
+from controller.estimation.imu_errors import ACCELEROMETER_SCALE, ERRORS, distort, distort_jacobian, error_gradient
 from controller.estimation.platform_filter import INNOVATION_LIMIT
 from controller.estimation.readings import (
     ACCELERATION,
@@ -28,9 +28,10 @@ from controller.estimation.readings import (
     READINGS,
     READINGS_SCRATCH,
     VELOCITY,
-    cross,
     predict_readings,
 )
+from controller.estimation.rig_jacobian import RIG_ERRORS, find_rig_jacobian, rig_state
+from controller.rig import MagneticField
 from controller.settings import FusionSettings
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import IMU_COUNT
@@ -38,27 +39,11 @@ from plant.errors import UnknownNameError
 from plant.mechanism import LEGS
 from plant.pose import Array, rotate_by_vector
 
-ERROR_NAMES = (
-    "gyroscope bias",
-    "accelerometer bias",
-    "accelerometer scale",
-    "gyroscope scale",
-    "alignment",
-    "accelerometer axes",
-    "gyroscope axes",
-)
-"""Errors of an IMU, three parameters each [rad/s, m/s^2, 1, 1, rad, rad, rad]; axes are the elements xy, xz, yz of U."""
-
-GYROSCOPE_BIAS, ACCELEROMETER_BIAS, ACCELEROMETER_SCALE, GYROSCOPE_SCALE, ALIGNMENT, ACCELEROMETER_AXES, GYROSCOPE_AXES = range(
-    0, 21, 3
-)
-ERRORS = 3 * len(ERROR_NAMES)
 BLOCKS = {"gyroscopes": 3, "accelerometers": 6, "alignments": 15, "axes": ERRORS}
 """How many of an IMU's errors are estimated."""
 
-ALL_ERRORS, JOINTS, TILT = IMU_COUNT * ERRORS, 2 * LEGS * 3, 2
-RIG = JOINTS + TILT
-MOST_STATES = MOTION_STATES + ALL_ERRORS + RIG + 1
+ALL_ERRORS = IMU_COUNT * ERRORS
+MOST_STATES = MOTION_STATES + ALL_ERRORS + RIG_ERRORS + 1
 _ROWS = IMU_COUNT * READINGS
 
 WINDOW_S = 0.005
@@ -82,7 +67,7 @@ FILTER_PARAMETERS = np.dtype(
         ("jerk", np.float64, 2),
         ("bias_walk", np.float64, 2),
         ("variance", np.float64, 2),
-        ("prior", np.float64, (ALL_ERRORS + RIG, ALL_ERRORS + RIG)),
+        ("prior", np.float64, (ALL_ERRORS + RIG_ERRORS, ALL_ERRORS + RIG_ERRORS)),
         ("floor", np.float64, 2),
         ("heading", np.int64),
         ("field_axes", np.float64, (3, 3)),
@@ -109,13 +94,13 @@ FILTER_STATE = np.dtype(
         ("low_passed", np.float64, (2, 4, 3)),
         ("smooth_motion", np.float64, (4, 3)),
         ("errors", np.float64, (IMU_COUNT, ERRORS)),
-        ("rig", np.float64, RIG),
+        ("rig", np.float64, RIG_ERRORS),
         ("covariance", np.float64, (MOST_STATES, MOST_STATES)),
-        ("known_time", np.float64),
-        ("known_position", np.float64, 3),
-        ("known_rotation", np.float64, (3, 3)),
-        ("known_motion", np.float64, (4, 3)),
-        ("known_covariance", np.float64, (MOTION_STATES, MOTION_STATES)),
+        ("published_time", np.float64),
+        ("published_position", np.float64, 3),
+        ("published_rotation", np.float64, (3, 3)),
+        ("published_motion", np.float64, (4, 3)),
+        ("published_covariance", np.float64, (MOTION_STATES, MOTION_STATES)),
         ("sum", np.float64, (IMU_COUNT, READINGS)),
         ("sum_time", np.float64),
         ("samples", np.int64, IMU_COUNT),
@@ -127,7 +112,7 @@ FILTER_STATE = np.dtype(
         ("sample", np.float64, (IMU_COUNT, READINGS)),
         ("sample_used", np.int64, IMU_COUNT),
         ("row", np.int64),
-        ("piece", np.int64),
+        ("update_step", np.int64),
         ("change", np.float64, MOST_STATES),
         ("gain", np.float64, MOST_STATES),
         ("turn", np.float64, 3),
@@ -142,7 +127,7 @@ FILTER_STATE = np.dtype(
     ],
     align=True,
 )
-"""State of the filter, whose update may be under way; `known` is what the last complete one has found.
+"""State of the filter, whose update may be under way; `published` is what the last complete one has found.
 
 Times are in seconds since the first cycle. `sum` collects the samples of a window, `sample` is the mean of the last one;
 `row` is the next scalar to take, -1 when none is left. `rig` is by how much joints (2, 6, 3) and tilt (2) are off; the readings
@@ -179,7 +164,7 @@ def filter_parameters(
         ],
         3,
     )  # fmt: skip
-    prior, known = np.zeros((ALL_ERRORS + RIG,) * 2), np.diag(np.tile(sigmas**2, IMU_COUNT))
+    prior, known = np.zeros((ALL_ERRORS + RIG_ERRORS,) * 2), np.diag(np.tile(sigmas**2, IMU_COUNT))
     if covariance is not None:
         known = covariance
     prior[: len(known), : len(known)] = known
@@ -220,17 +205,11 @@ def _rig_start(parameters: Record) -> int:
 
 
 @kernel
-def _rig_state(k: int, j: int) -> int:
-    """The place among the rig's errors of the one, 0 to 7, on which IMU `k` depends."""
-    return 3 * k + j if j < 3 else 3 * (LEGS + k - 1) + j if j < 6 else JOINTS + j - 6
-
-
-@kernel
 def start_filter(parameters: Record, state: Record, time: float, position: Array, rotation: Array, twist: Array) -> None:
     """Start from a pose (3,), (3, 3) and twist (6,) at `time`."""
     p, f = parameters, state
     f.running = 1
-    f.time = f.known_time = time
+    f.time = f.published_time = time
     f.position[:] = position
     f.rotation[:] = rotation
     f.motion[:] = 0.0
@@ -272,7 +251,7 @@ def start_filter(parameters: Record, state: Record, time: float, position: Array
 
 
 @kernel
-def collect(state: Record, sample: Array, used: Array, time: float) -> None:
+def accumulate_sample(state: Record, sample: Array, used: Array, time: float) -> None:
     """Add a calibrated sample (3, 7, 3) of the IMUs that are `used` (7,) to the window."""
     f = state
     if f.collected == 0:
@@ -291,7 +270,7 @@ def collect(state: Record, sample: Array, used: Array, time: float) -> None:
 
 
 @kernel
-def collect_field(state: Record, field: Array, time: float) -> None:
+def accumulate_field(state: Record, field: Array, time: float) -> None:
     """Keep a calibrated sample (3,) of the platform's magnetometer for the next update."""
     f = state
     f.field[:] = field
@@ -307,11 +286,11 @@ def step_filter(parameters: Record, geometry: Record, state: Record) -> None:
         _begin_update(parameters, geometry, state)
     if f.row < 0:
         return
-    f.piece += 1
+    f.update_step += 1
     whole = _PREPARING_ROWS + _ROWS
-    last = min(max(-(-whole * f.piece // p.window) - _PREPARING_ROWS, 0), _ROWS)
+    last = min(max(-(-whole * f.update_step // p.window) - _PREPARING_ROWS, 0), _ROWS)
     while f.row < last:
-        _take(parameters, state, f.row)
+        _update_scalar(parameters, state, f.row)
         f.row += 1
     if f.row == _ROWS:
         _end_update(parameters, state)
@@ -323,7 +302,7 @@ def _begin_update(parameters: Record, geometry: Record, state: Record) -> None:
     if f.row >= 0:
         # The windows have overtaken the update, which happens when cycles are missed.
         while f.row < _ROWS:
-            _take(parameters, state, f.row)
+            _update_scalar(parameters, state, f.row)
             f.row += 1
         _end_update(parameters, state)
     time = f.sum_time / f.collected
@@ -335,75 +314,18 @@ def _begin_update(parameters: Record, geometry: Record, state: Record) -> None:
     _predict(parameters, state, time - f.time)
     f.time = time
     f.change[:] = 0.0
-    f.row = f.piece = 0
+    f.row = f.update_step = 0
     if f.field_used != 0:
-        _take_heading(parameters, state)
+        _update_heading(parameters, state)
     predict_readings(
         geometry, f.position, f.rotation, f.smooth_motion, True, f.smooth_predicted, f.jacobian, f.readings_scratch
     )
     predict_readings(geometry, f.position, f.rotation, f.motion, False, f.predicted, f.jacobian, f.readings_scratch)
     if p.errors > ACCELEROMETER_SCALE:
         for k in range(IMU_COUNT):
-            _distort_jacobian(f.errors[k], f.jacobian[k], f.mixed)
+            distort_jacobian(f.errors[k], f.jacobian[k], f.mixed)
     if p.rig > 0:
-        _find_rig_jacobian(geometry, state)
-
-
-@kernel
-def _find_rig_jacobian(geometry: Record, state: Record) -> None:
-    """Derivatives (7, 6, 8) of the readings by base joint, platform joint and tilt, from those by the motion (7, 6, 18).
-
-    A leg vector p + R A - B answers to a move of B like to the opposite one of p; and to one of A like to one of p by R A, of
-    the velocity by omega x R A, and of the acceleration by alpha x R A + omega x (omega x R A). The tilt turns the vertical.
-    """
-    g, f = geometry, state
-    w, alpha = f.smooth_motion[RATE], f.smooth_motion[ANGULAR_ACCELERATION]
-    for k in range(LEGS):
-        for m in range(READINGS):
-            h, by_rig = f.jacobian[k, m], f.rig_jacobian[k, m]
-            for i in range(3):
-                by_rig[i] = -h[i]
-                r0, r1, r2 = f.rotation[0, i], f.rotation[1, i], f.rotation[2, i]
-                v0, v1, v2 = cross(w[0], w[1], w[2], r0, r1, r2)
-                a0, a1, a2 = cross(alpha[0], alpha[1], alpha[2], r0, r1, r2)
-                c0, c1, c2 = cross(w[0], w[1], w[2], v0, v1, v2)
-                by_rig[3 + i] = h[0] * r0 + h[1] * r1 + h[2] * r2 + h[6] * v0 + h[7] * v1 + h[8] * v2
-                by_rig[3 + i] += h[12] * (a0 + c0) + h[13] * (a1 + c1) + h[14] * (a2 + c2)
-    up = g.up_in_base[0]
-    for j in range(TILT):
-        # e x up for the axes e = x, y.
-        u0, u1, u2 = (0.0, -up[2], up[1]) if j == 0 else (up[2], 0.0, -up[0])
-        for k in range(IMU_COUNT):
-            if k < LEGS:
-                _find_leg_frame(g.joint_rotations[k], g.base_joints[k], g.platform_joints[k], f.position, f.rotation, f.frame)
-            else:
-                f.frame[:] = f.rotation
-            for i in range(3):
-                f.rig_jacobian[k, i, 6 + j] = 0.0
-                f.turn[i] = g.gravity * (f.frame[0, i] * u0 + f.frame[1, i] * u1 + f.frame[2, i] * u2)
-            turned = distort(f.errors[k], 1, f.turn[0], f.turn[1], f.turn[2])
-            for i in range(3):
-                f.rig_jacobian[k, 3 + i, 6 + j] = turned[i]
-
-
-@kernel
-def _find_leg_frame(
-    joint_rotation: Array, base_joint: Array, platform_joint: Array, position: Array, rotation: Array, frame: Array
-) -> None:
-    """Write the axes of a leg's frame in {1} as columns (3, 3): z along the leg, y across the joint's first axis, too."""
-    for i in range(3):
-        frame[i, 2] = position[i] - base_joint[i]
-        for j in range(3):
-            frame[i, 2] += rotation[i, j] * platform_joint[j]
-    z0, z1, z2 = frame[0, 2], frame[1, 2], frame[2, 2]
-    y0, y1, y2 = cross(z0, z1, z2, joint_rotation[0, 0], joint_rotation[1, 0], joint_rotation[2, 0])
-    x0, x1, x2 = cross(y0, y1, y2, z0, z1, z2)
-    frame[0, 0], frame[1, 0], frame[2, 0] = x0, x1, x2
-    frame[0, 1], frame[1, 1], frame[2, 1] = y0, y1, y2
-    for j in range(3):
-        size = np.sqrt(frame[0, j] ** 2 + frame[1, j] ** 2 + frame[2, j] ** 2)
-        for i in range(3):
-            frame[i, j] /= size
+        find_rig_jacobian(geometry, state)
 
 
 @kernel
@@ -470,75 +392,7 @@ def _predict(parameters: Record, state: Record, period: float) -> None:
 
 
 @kernel
-def _turned_back(errors: Array, x0: float, x1: float, x2: float) -> tuple[float, float, float]:
-    """A vector seen from the mounted IMU: turned back by the alignment, to second order."""
-    a0, a1, a2 = errors[ALIGNMENT], errors[ALIGNMENT + 1], errors[ALIGNMENT + 2]
-    c0, c1, c2 = a1 * x2 - a2 * x1, a2 * x0 - a0 * x2, a0 * x1 - a1 * x0
-    return (
-        x0 - c0 + 0.5 * (a1 * c2 - a2 * c1),
-        x1 - c1 + 0.5 * (a2 * c0 - a0 * c2),
-        x2 - c2 + 0.5 * (a0 * c1 - a1 * c0),
-    )
-
-
-@kernel
-def distort(errors: Array, sensor: int, x0: float, x1: float, x2: float) -> tuple[float, float, float]:
-    """What a sensor without bias, 0 the gyroscope and 1 the accelerometer, makes of an ideal reading."""
-    scale, axes = (ACCELEROMETER_SCALE, ACCELEROMETER_AXES) if sensor else (GYROSCOPE_SCALE, GYROSCOPE_AXES)
-    y0, y1, y2 = _turned_back(errors, x0, x1, x2)
-    return (
-        y0 + errors[scale] * y0 + errors[axes] * y1 + errors[axes + 1] * y2,
-        y1 + errors[scale + 1] * y1 + errors[axes + 2] * y2,
-        y2 + errors[scale + 2] * y2,
-    )
-
-
-def error_matrix(errors: Array, sensor: int) -> Array:
-    """The matrix (3, 3) of `distort`."""
-    return np.array([distort(errors, sensor, *axis) for axis in np.eye(3)]).T
-
-
-@kernel
-def _distort_jacobian(errors: Array, jacobian: Array, mixed: Array) -> None:
-    """Turn derivatives of ideal readings (6, 18) into those of an IMU with these errors."""
-    for sensor in range(2):
-        first = 3 * sensor
-        for j in range(MOTION_STATES):
-            mixed[0, j], mixed[1, j], mixed[2, j] = distort(
-                errors, sensor, jacobian[first, j], jacobian[first + 1, j], jacobian[first + 2, j]
-            )
-        for i in range(3):
-            for j in range(MOTION_STATES):
-                jacobian[first + i, j] = mixed[i, j]
-
-
-@kernel
-def error_gradient(errors: Array, ideal: Array, m: int, gradient: Array) -> None:
-    """Write the derivative (21,) of reading `m`, 0-5, of an IMU by its errors; `ideal` (6,) is what an ideal one reads."""
-    gradient[:] = 0.0
-    sensor, i = m // 3, m % 3
-    first = 3 * sensor
-    scale, axes = (ACCELEROMETER_SCALE, ACCELEROMETER_AXES) if sensor else (GYROSCOPE_SCALE, GYROSCOPE_AXES)
-    y0, y1, y2 = _turned_back(errors, ideal[first], ideal[first + 1], ideal[first + 2])
-    m0 = m1 = m2 = 0.0
-    gradient[first + i] = 1.0
-    if i == 0:
-        gradient[scale], gradient[axes], gradient[axes + 1] = y0, y1, y2
-        m0, m1, m2 = 1.0 + errors[scale], errors[axes], errors[axes + 1]
-    elif i == 1:
-        gradient[scale + 1], gradient[axes + 2] = y1, y2
-        m1, m2 = 1.0 + errors[scale + 1], errors[axes + 2]
-    else:
-        gradient[scale + 2] = y2
-        m2 = 1.0 + errors[scale + 2]
-    # A further turn of the alignment adds skew(y) of it, before scale and axes.
-    gradient[ALIGNMENT] = m1 * y2 - m2 * y1
-    gradient[ALIGNMENT + 1] = m2 * y0 - m0 * y2
-    gradient[ALIGNMENT + 2] = m0 * y1 - m1 * y0
-
-
-@kernel
-def _take(parameters: Record, state: Record, row: int) -> None:
+def _update_scalar(parameters: Record, state: Record, row: int) -> None:
     """Take one scalar of the sample into covariance and change."""
     p, f = parameters, state
     k, m = row // READINGS, row % READINGS
@@ -567,7 +421,7 @@ def _take(parameters: Record, state: Record, row: int) -> None:
                 gain[i] += weight * c[start + j, i]
     first = 8 if p.rig == 0 else 0 if k < LEGS else 6
     for j in range(first, 8):
-        weight, which = f.rig_jacobian[k, m, j], _rig_state(k, j)
+        weight, which = f.rig_jacobian[k, m, j], rig_state(k, j)
         at = _rig_start(p) + which
         innovation -= weight * (f.rig[which] + change[at])
         for i in range(states):
@@ -577,7 +431,7 @@ def _take(parameters: Record, state: Record, row: int) -> None:
     for j in range(p.errors):
         variance += f.gradient[j] * gain[start + j]
     for j in range(first, 8):
-        variance += f.rig_jacobian[k, m, j] * gain[_rig_start(p) + _rig_state(k, j)]
+        variance += f.rig_jacobian[k, m, j] * gain[_rig_start(p) + rig_state(k, j)]
     _correct(state, states, innovation, variance)
 
 
@@ -594,7 +448,7 @@ def _correct(state: Record, states: int, innovation: float, variance: float) -> 
 
 
 @kernel
-def _take_heading(parameters: Record, state: Record) -> None:
+def _update_heading(parameters: Record, state: Record) -> None:
     """Take the sample of the magnetometer, before all others: the angle about the vertical by which the field, turned into {1},
     is off its direction. An error of the rotation turns it by -axis^T theta, and the offset adds to it.
     """
@@ -642,17 +496,17 @@ def _end_update(parameters: Record, state: Record) -> None:
 def extrapolate(state: Record, time: float, position: Array, rotation: Array, twist: Array, acceleration: Array) -> None:
     """Carry what is known to `time`: write the pose (3,), (3, 3), twist (6,) and acceleration (6,)."""
     f = state
-    t = time - f.known_time
-    x = f.known_motion
+    t = time - f.published_time
+    x = f.published_motion
     for i in range(3):
-        position[i] = f.known_position[i] + t * (x[VELOCITY, i] + 0.5 * t * x[ACCELERATION, i])
+        position[i] = f.published_position[i] + t * (x[VELOCITY, i] + 0.5 * t * x[ACCELERATION, i])
         f.turn[i] = t * (x[RATE, i] + 0.5 * t * x[ANGULAR_ACCELERATION, i])
         twist[i] = x[VELOCITY, i] + t * x[ACCELERATION, i]
         twist[3 + i] = x[RATE, i] + t * x[ANGULAR_ACCELERATION, i]
         acceleration[i] = x[ACCELERATION, i]
         acceleration[3 + i] = x[ANGULAR_ACCELERATION, i]
         for j in range(3):
-            rotation[i, j] = f.known_rotation[i, j]
+            rotation[i, j] = f.published_rotation[i, j]
     rotate_by_vector(rotation, f.turn)
 
 
@@ -660,8 +514,8 @@ def extrapolate(state: Record, time: float, position: Array, rotation: Array, tw
 def extrapolate_covariance(parameters: Record, state: Record, time: float, covariance: Array) -> None:
     """Write the covariance (6, 6) of the pose carried to `time`, and add what the rig's errors leave that are not estimated."""
     p, f = parameters, state
-    t = time - f.known_time
-    half, c = 0.5 * t * t, f.known_covariance
+    t = time - f.published_time
+    half, c = 0.5 * t * t, f.published_covariance
     for i in range(6):
         for j in range(6):
             near = c[i, j] + t * c[i, 6 + j] + half * c[i, 12 + j]
@@ -674,10 +528,10 @@ def extrapolate_covariance(parameters: Record, state: Record, time: float, covar
 @kernel
 def _publish(state: Record) -> None:
     f = state
-    f.known_time = f.time
-    f.known_position[:] = f.position
-    f.known_rotation[:] = f.rotation
-    f.known_motion[:] = f.motion
+    f.published_time = f.time
+    f.published_position[:] = f.position
+    f.published_rotation[:] = f.rotation
+    f.published_motion[:] = f.motion
     for i in range(MOTION_STATES):
         for j in range(MOTION_STATES):
-            f.known_covariance[i, j] = f.covariance[i, j]
+            f.published_covariance[i, j] = f.covariance[i, j]

@@ -10,13 +10,12 @@ axes of {1}), velocity, angular velocity, acceleration and angular acceleration.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from controller.estimation.leg_filter import predict_measurement
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
-from plant.mechanism import LEGS, Mechanism, six_rows
-from plant.pose import Array, rotation_from_vector
+from plant.mechanism import LEGS
+from plant.pose import Array
 
 MOTION_STATES = 18
 READINGS = 6
@@ -24,21 +23,6 @@ READINGS = 6
 
 VELOCITY, RATE, ACCELERATION, ANGULAR_ACCELERATION = range(4)
 """Rows of a motion (4, 3), seen in {1}: velocity of the origin of {2}, angular velocity, and their derivatives."""
-
-SENSOR_GEOMETRY = np.dtype(
-    [
-        ("base_joints", np.float64, (LEGS, 3)),
-        ("platform_joints", np.float64, (LEGS, 3)),
-        ("joint_rotations", np.float64, (LEGS, 3, 3)),
-        ("up_in_joint", np.float64, (LEGS, 3)),
-        ("up_in_base", np.float64, (1, 3)),
-        ("leg_imu_position", np.float64, (LEGS, 3)),
-        ("platform_imu_position", np.float64, 3),
-        ("gravity", np.float64),
-    ],
-    align=True,
-)
-"""Where joints and IMUs are, and the vertical: what the readings depend on besides the motion."""
 
 READINGS_SCRATCH = np.dtype(
     [
@@ -52,36 +36,6 @@ READINGS_SCRATCH = np.dtype(
     ],
     align=True,
 )
-
-
-def sensor_geometry(mechanism: Mechanism, tilt: ArrayLike = (0.0, 0.0)) -> Record:
-    """What the readings depend on, dtype `SENSOR_GEOMETRY`.
-
-    Args:
-        mechanism: with plant data.
-        tilt: (2,) [rad], by which the vertical is turned about the axes x and y of {1}.
-    """
-    plant = mechanism.plant_parameters()
-    up = tilt_rotation(tilt) @ mechanism.up_in_base
-    values = {
-        "base_joints": six_rows(mechanism.base_joints),
-        "platform_joints": six_rows(mechanism.platform_joints),
-        "joint_rotations": six_rows(mechanism.joint_rotations),
-        "up_in_joint": six_rows(np.swapaxes(mechanism.joint_rotations, 1, 2) @ up),
-        "up_in_base": up,
-        "leg_imu_position": six_rows(plant["leg_imu_position"]),
-        "platform_imu_position": plant["platform_imu_position"],
-        "gravity": float(np.linalg.norm(plant["gravity"])),
-    }
-    geometry: Record = np.zeros((), SENSOR_GEOMETRY)
-    for name, value in values.items():
-        geometry[name] = value
-    return geometry
-
-
-def tilt_rotation(tilt: ArrayLike) -> Array:
-    """The rotation (3, 3) by which a tilt (2,) [rad] about the axes x and y of {1} turns what is fixed in the world."""
-    return rotation_from_vector([*np.asarray(tilt), 0.0])
 
 
 @kernel

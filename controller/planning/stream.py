@@ -9,7 +9,7 @@ rest.
 import numpy as np
 
 from controller.planning.segments import LENGTH, START
-from controller.safety.watch import NO_CAUSE, TARGET_LOST
+from controller.safety.causes import Cause
 from plant.compiled import Record, fence, kernel, load_acquire, store_release
 from plant.mechanism import LEGS
 from plant.pose import Array
@@ -158,7 +158,7 @@ def _used(rows: Array) -> int:
 def fail_stream(stream: Record, cause: int, index: int, value: float, limit: float) -> None:
     """Say why the stream has failed, a cause of `controller.safety.watch`; the first one counts."""
     s = stream[()]
-    if load_acquire(s.shared, CAUSE) == NO_CAUSE:
+    if load_acquire(s.shared, CAUSE) == Cause.NONE:
         s.index, s.value, s.limit = index, value, limit
         store_release(s.shared, CAUSE, cause)
 
@@ -177,9 +177,9 @@ def stream_cause(stream: Record, now_ns: int, patience_ns: int) -> tuple[int, in
     """
     s = stream[()]
     cause = load_acquire(s.shared, CAUSE)
-    if cause != NO_CAUSE:
+    if cause != Cause.NONE:
         return cause, s.index, s.value, s.limit
     last = load_acquire(s.shared, SAMPLE_NS)
     if last != 0 and now_ns - last > patience_ns:
-        return TARGET_LOST, 0, 1e-9 * (now_ns - last), 1e-9 * patience_ns
-    return NO_CAUSE, 0, np.nan, np.nan
+        return Cause.TARGET_LOST, 0, 1e-9 * (now_ns - last), 1e-9 * patience_ns
+    return Cause.NONE, 0, np.nan, np.nan

@@ -17,7 +17,7 @@ from controller.inverse_kinematics import leg_lengths
 from controller.planning.planner import PREVIEW_S, count_violations
 from controller.planning.segments import ACCELERATION, JERK, LENGTH, RATE, START, STOP_SEGMENTS, evaluate_reference, plan_stop
 from controller.planning.stream import PLAN_SEGMENTS, rest
-from controller.safety.watch import BEYOND_STROKE, TARGET_JUMPS, TARGET_NOT_FINITE, describe_event
+from controller.safety.causes import Cause
 from plant.compiled import kernel
 from plant.errors import GoughError, InputError
 from plant.mechanism import LEGS, Mechanism
@@ -54,7 +54,7 @@ class TargetRefusedError(GoughError, ValueError):
     """
 
     def __init__(self, cause: int, index: int = 0, value: float = np.nan, limit: float = np.nan) -> None:
-        super().__init__(f"{describe_event(cause, index, value, limit)}: correct what sends the target")
+        super().__init__(f"{Cause(cause).describe(index, value, limit)}: correct what sends the target")
         self.cause, self.index, self.value, self.limit = cause, index, value, limit
 
 
@@ -122,17 +122,17 @@ class StreamPlanner:
         """
         position, turn = np.asarray(displacement, float), np.asarray(quaternion, float)
         if not (np.isfinite(position).all() and np.isfinite(turn).all()):
-            raise TargetRefusedError(TARGET_NOT_FINITE)
+            raise TargetRefusedError(Cause.TARGET_NOT_FINITE)
         norm = float(np.linalg.norm(turn))
         if abs(norm - 1.0) > UNIT_TOLERANCE:
-            raise TargetRefusedError(TARGET_NOT_FINITE, 0, abs(norm - 1.0), UNIT_TOLERANCE)
+            raise TargetRefusedError(Cause.TARGET_NOT_FINITE, 0, abs(norm - 1.0), UNIT_TOLERANCE)
         rotation = rotation_from_quaternion(turn / norm) @ self._home.rotation
         lengths = leg_lengths(self._mechanism, self._home.position + position, rotation)
         stroke = self._limits.stroke
         excess = np.maximum(stroke[:, 0] - lengths, lengths - stroke[:, 1])
         leg = int(excess.argmax())
         if excess[leg] > _STROKE_SLACK_M:
-            raise TargetRefusedError(BEYOND_STROKE, leg, lengths[leg], stroke[leg, int(lengths[leg] > stroke[leg, 1])])
+            raise TargetRefusedError(Cause.BEYOND_STROKE, leg, lengths[leg], stroke[leg, int(lengths[leg] > stroke[leg, 1])])
         if self._samples:
             before, was = self._samples[-1]
             if not time_s > before:
@@ -140,7 +140,7 @@ class StreamPlanner:
             step = np.abs(lengths - was)
             most = _JUMP_FACTOR * self._limits.velocity * (time_s - before) + _JUMP_M
             if step.max() > most:
-                raise TargetRefusedError(TARGET_JUMPS, int(step.argmax()), float(step.max()), most)
+                raise TargetRefusedError(Cause.TARGET_JUMPS, int(step.argmax()), float(step.max()), most)
         self._samples.append((time_s, np.clip(lengths, stroke[:, 0], stroke[:, 1])))
 
     def plan(self, at_s: float, ahead_s: float) -> Plan | None:

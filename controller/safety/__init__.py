@@ -1,0 +1,58 @@
+"""Safety: the states of a run, what is checked in every cycle, and how each cause ends or degrades a run."""
+
+import numpy as np
+
+from controller.estimation import imu_monitor
+from controller.safety import arming, stop, watch
+from controller.safety.causes import EVENTS
+from controller.settings import SafetySettings
+from plant.compiled import Record
+from plant.dynamics.variables import IMU_COUNT
+from plant.mechanism.limits import Limits
+
+PARAMETERS = np.dtype(
+    [
+        ("arming", arming.PARAMETERS),
+        ("monitor", imu_monitor.PARAMETERS),
+        ("watch", watch.PARAMETERS),
+        ("stop", stop.PARAMETERS),
+    ],
+    align=True,
+)
+"""The constants of each part."""
+
+STATE = np.dtype(
+    [
+        ("mode", np.int64),
+        ("request", np.int64),
+        ("events", EVENTS),
+        ("arming", arming.STATE),
+        ("monitor", imu_monitor.STATE),
+        ("watch", watch.STATE),
+        ("stop", stop.STATE),
+    ],
+    align=True,
+)
+"""The `Mode` of the run, the `Request` to the drives, the events of the cycle, and the state of each part."""
+
+
+def safety_parameters(settings: SafetySettings, rate: float, limits: Limits, arm: bool) -> Record:
+    """The constants (dtype `PARAMETERS`) in cycles of this rate [Hz]; the drives are enabled only if `arm`."""
+    parameters: Record = np.zeros((), PARAMETERS)
+    parameters["arming"] = arming.arming_parameters(settings, rate, arm)
+    parameters["monitor"] = imu_monitor.monitor_parameters(settings, rate)
+    parameters["watch"] = watch.watch_parameters(settings, rate, limits)
+    parameters["stop"] = stop.stop_parameters(limits, rate)
+    return parameters
+
+
+def watch_nothing(parameters: Record) -> None:
+    """Let the cycle with these parameters arm and go on whatever it finds, for motions that do not rely on the estimate."""
+    parameters["imus"]["noise"] = np.inf
+    safety = parameters["safety"]
+    safety["monitor"]["active"], safety["arming"]["distance"] = 0, np.inf
+    limits = safety["watch"]
+    limits["most_lost_imus"], limits["conditioning"] = IMU_COUNT, 0.0
+    limits["lengths"] = limits["plausible_lengths"] = -np.inf, np.inf
+    for name in ("speed", "following", "saturation", "drive_deviation"):
+        limits[name] = np.inf

@@ -22,17 +22,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.safety.watch import CAUSES, STOP
+from controller.safety.causes import Cause, Reaction
 from hil.loop.driver import prevent_compilation
 from hil.loop.records import RECORD, Link, shared_array
 from hil.loop.timing import Histogram, Timing, over_budget
 from hil.progress import Progress, no_progress
-from hil.realtime.clock import REAL, finish, new_clock, now, start, wait
+from hil.realtime.clock import REAL, finish, new_clock, start, wait
 from hil.realtime.scheduling import MEASURES, RealTimeSettings, real_time, usage
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import PreparedLoop, prepared_loop
 from plant.compiled import Record, kernel
 from plant.errors import GoughError
+from plant.stopwatch import now
 
 IDLE, LOAD, BUSY = "idle", "load", "busy_supervisor"
 CONDITIONS = (IDLE, LOAD, BUSY)
@@ -255,7 +256,7 @@ def _send(pipe: Any, target: Callable[..., Any], *arguments: Any) -> None:
 
 
 def _outcome(loop: PreparedLoop, cause: int, used: dict[str, float]) -> tuple[int, dict[str, int], dict[str, float]]:
-    if CAUSES[cause].reaction != STOP:
+    if Cause(cause).reaction != Reaction.STOP:
         raise GoughError(f"the loop stopped in the benchmark: {loop.reason()}")
     clock = loop.clock
     missed = {"own": int(clock["missed_own"]), "host": int(clock["missed_late"] + clock["missed_host"])}

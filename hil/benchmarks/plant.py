@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.progress import Progress, no_progress
-from hil.realtime.clock import now
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import VELOCITY
 from plant.fmu.build import SPATIAL_MODEL, default_fmu
@@ -15,6 +14,7 @@ from plant.fmu.importer import FmuDescription, FmuInstance
 from plant.fmu.plant import FmuPlant, advance, read_imus, read_truth, write_command, write_drive_mode
 from plant.mechanism import load_spatial
 from plant.pose import Array
+from plant.stopwatch import now
 
 PERIOD_S = 1e-3
 FINER = 16

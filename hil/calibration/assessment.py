@@ -18,7 +18,8 @@ from controller.calibration.at_rest import (
     track,
 )
 from controller.calibration.file import Calibration, split_gain
-from controller.estimation.mechanism_filter import ERROR_NAMES, filter_parameters
+from controller.estimation.imu_errors import ERROR_NAMES
+from controller.estimation.mechanism_filter import filter_parameters
 from controller.estimation.readings import RATE, VELOCITY
 from hil.calibration.data import CalibrationData
 from plant.dynamics.variables import IMU_COUNT

@@ -24,7 +24,7 @@ from controller.calibration.at_rest import CalibrationError, Found, calibrate_at
 from controller.calibration.file import Calibration, save_calibration
 from controller.estimation.mechanism_filter import ALL_ERRORS
 from controller.planning.target import REST_S
-from controller.safety.watch import watch_nothing
+from controller.safety import watch_nothing
 from hil.calibration.assessment import assess, constants, cross_validate
 from hil.calibration.data import CalibrationData, Knowledge
 from hil.calibration.known_poses import calibrate_by_known_poses
@@ -127,7 +127,7 @@ def calibrate_recordings(paths: Sequence[Path], knowledge: Knowledge = _NOTHING)
                 )
     data = CalibrationData(load_spatial(first["mechanism"]), first["imu"], first["rate"], knowledge, first["seed"])
     runs = [_every_cycle(each.records) for each in recordings]
-    data.begin(runs[0], int(recordings[0].arrays["parameters"]["hold_cycles"]))
+    data.begin(runs[0], int(recordings[0].constant("rig", "hold_cycles")))
     for records in runs:
         data.check_places(records)
         data.add_rests(records)
@@ -157,10 +157,10 @@ def run_open(config: SimulationConfig, blind: bool = False) -> Record:
     some millimetres.
     """
     with prepared_loop(config) as loop:
-        loop.parameters["gains"] = 0.0
+        loop.parameters["pid"]["gains"] = 0.0
         watch_nothing(loop.parameters)
         if blind:
-            loop.parameters["droop"] = 0.0
+            loop.parameters["load"]["droop"] = 0.0
         loop.run(len(loop.records))
         return loop.records[: int(loop.link[Link.HEAD])].copy()
 

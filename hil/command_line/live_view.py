@@ -36,7 +36,7 @@ def live_view(mechanism: str, target: str, rate: float) -> Iterator[Callable[[An
 def _view(mechanism: str, target: str, rate: float, progress: Any) -> Any:
     from rich.markup import escape
 
-    from controller.safety.watch import CAUSES, MODES
+    from controller.safety.causes import Cause, Mode
 
     table = new_table(f"{mechanism} follows {target} at {rate:g} Hz", "")
     latest = progress.latest
@@ -47,7 +47,7 @@ def _view(mechanism: str, target: str, rate: float, progress: Any) -> Any:
     angles = (atan2(r[2, 1], r[2, 2]), asin(max(-1.0, min(1.0, -r[2, 0]))), atan2(r[1, 0], r[0, 0]))
     wake, compute = progress.timing.histograms["wake"].figures(), progress.timing.histograms["compute"].figures()
     errors = progress.errors()
-    state = MODES[int(latest["mode"])] + (f": {CAUSES[int(latest['stop'])].text}" if latest["stop"] else "")
+    state = Mode(int(latest["mode"])).name.lower() + (f": {Cause(int(latest['stop'])).text}" if latest["stop"] else "")
     rows = (
         ("state", f"{state}, {latest['time_ns'] / 1e9:.1f} s"),
         ("position [mm]", "  ".join(f"{value:9.3f}" for value in position)),

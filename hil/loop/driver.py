@@ -4,40 +4,33 @@ All state lies in the arrays of `Loop`, so a run can be taken up again at any cy
 filters, that are written in Python.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, Protocol
 
 import numpy as np
 from numba import typeof
 from numba.core import event
 from numpy.typing import NDArray
 
-from controller.cycle import OK
-from controller.estimation.fusion import (
-    calibrate,
-)
+from controller.cycle import END, HEADING, LEGS, PLATFORM, SCREENING, run_stages
 from controller.planning.stream import STREAM, TAKER
-from controller.safety.watch import (
-    FAULT,
-    coast,
-)
+from controller.safety.causes import Cause, Mode
 from hil.loop.kernels import (
     begin_cycle,
-    compute,
     drive_fmu,
     end_cycle,
     exchange_status,
-    locate_and_control,
     periods_passed,
     process_feedback,
     read_fmu,
     record_cycle,
     run_loop,
+    write_stage_times,
 )
 from hil.loop.records import FMU_RIG, LINK_SIZE, WORK, RigHandle, Stage, TargetStream
-from hil.realtime.clock import FREE, new_clock, now
+from hil.realtime.clock import FREE, new_clock
 from hil.rigs import SILENT, Identity, Rig, new_feedback
 from hil.rigs.emulation.drives import EMULATED
 from hil.rigs.udp.emulator import UdpEmulator, new_udp_emulator
@@ -46,17 +39,17 @@ from plant.compiled import Record
 from plant.dynamics.variables import BRAKE
 from plant.fmu.plant import write_drive_mode
 from plant.pose import Array
+from plant.stopwatch import now
 
 
-class PythonFilters(NamedTuple):
-    """Filters in Python, which take the calibrated sample in the cycle's state and leave there what the compiled ones would.
+class PythonFilters(Protocol):
+    """Stages in Python in place of the compiled filters of legs and platform; they change the cycle's state."""
 
-    Attributes:
-        fuse_legs, fuse_platform: in the place of those in `controller.estimation.fusion`.
-    """
+    def step_legs(self, state: Record) -> None:
+        """In place of `controller.estimation.leg_filter.step_leg_filters`."""
 
-    fuse_legs: Callable[[Record], None]
-    fuse_platform: Callable[[Record], None]
+    def step_platform(self, state: Record) -> None:
+        """In place of `controller.estimation.platform_filter.step_platform_filter`."""
 
 
 _RAISED = SILENT + 1
@@ -138,15 +131,13 @@ class Loop:
         _load(now, timespec)
         _load(begin_cycle, parameters, state, clock, self.script, link, work, self._streamed(), 0, 0)
         _load(process_feedback, parameters, state, work, 0)
-        _load(coast, parameters, state)
-        _load(compute, parameters, state, self.segments, work, timespec)
-        _load(calibrate, parameters, state, work["feedback"]["measurement"])
-        _load(locate_and_control, parameters, state, self.segments, work, timespec)
+        _load(run_stages, parameters, state, work["feedback"]["measurement"], self.segments, work["marks"][()], 0, 0)
+        _load(write_stage_times, work)
         _load(record_cycle, parameters, state, self.segments, self.records, clock, link, work, self._streamed(), 0)
         _load(end_cycle, self.records, clock, self.script, link, work)
         _load(periods_passed, state)
-        _load(drive_fmu, fmu, state["command"], 0, 0, 0.0)
-        _load(read_fmu, fmu, self.imu, state["command"], 0, work["feedback"][()])
+        _load(drive_fmu, fmu, state["pid"]["command"], 0, 0, 0.0)
+        _load(read_fmu, fmu, self.imu, state["pid"]["command"], 0, work["feedback"][()])
         _load(exchange_status, 0)
         _load(write_drive_mode, fmu, 0)
 
@@ -169,35 +160,37 @@ class Loop:
         """The loop of `_run`, in Python."""
         parameters, state, clock, work, streamed = self.parameters, self.state, self.clock, self._work, self._streamed()
         feedback, stage_ns, timespec, safety = work["feedback"][()], work["stage_ns"], clock["timespec"], state["safety"]
-        cause = OK
-        while cause == OK and state["cycle"] < last:
+        measurement, marks, cause = feedback["measurement"], work["marks"][()], Cause.NONE.value
+        while cause == Cause.NONE and state["time"]["cycle"] < last:
             cause = begin_cycle(parameters, state, clock, self.script, self.link, work, streamed, self.most_missed, end)
-            if cause != OK:
+            if cause != Cause.NONE:
                 break
             began = now(timespec)
             status = self._exchange(rig, int(safety["request"]), feedback)
             stage_ns[Stage.SENSE] = now(timespec) - began
             failed = process_feedback(parameters, state, work, status)
-            if not failed and filters is not None and safety["mode"] != FAULT:
-                t0 = now(timespec)
-                calibrate(parameters, state, feedback["measurement"])
-                filters.fuse_legs(state)
-                t1 = now(timespec)
-                filters.fuse_platform(state)
-                stage_ns[Stage.LEGS], stage_ns[Stage.PLATFORM] = t1 - t0, now(timespec) - t1
-                failed = locate_and_control(parameters, state, self.segments, work, timespec)
-            elif not failed:
-                failed = compute(parameters, state, self.segments, work, timespec)
+            if not failed:
+                first = SCREENING
+                if filters is not None and safety["mode"] != Mode.FAULT:
+                    run_stages(parameters, state, measurement, self.segments, marks, SCREENING, LEGS)
+                    t0 = now(timespec)
+                    filters.step_legs(state)
+                    t1 = now(timespec)
+                    filters.step_platform(state)
+                    marks["ns"][LEGS], marks["ns"][PLATFORM] = t1 - t0, now(timespec) - t1
+                    first = HEADING
+                failed = run_stages(parameters, state, measurement, self.segments, marks, first, END)
+                write_stage_times(work)
             record_cycle(parameters, state, self.segments, self.records, clock, self.link, work, streamed, failed)
             end_cycle(self.records, clock, self.script, self.link, work)
-        if cause != OK:
+        if cause != Cause.NONE:
             stop_quickly(rig)
         return cause
 
     def _exchange(self, rig: Rig, request: int, feedback: Record) -> int:
         """An exchange of a rig in Python; whatever it raises is a failure."""
         try:
-            return int(rig.exchange(self.state["command"], request, feedback))
+            return int(rig.exchange(self.state["pid"]["command"], request, feedback))
         except Exception as error:
             self.failure = f"{type(error).__name__}: {error}"
             return _RAISED
@@ -251,7 +244,7 @@ class FmuRig:
     def exchange(self, command: Array, request: int, feedback: Record) -> int:
         """Drive the plant for the periods that have passed since the last exchange, and read it."""
         loop = self._loop
-        status = drive_fmu(loop.fmu, command, request, periods_passed(loop.state), float(loop.parameters["period"]))
+        status = drive_fmu(loop.fmu, command, request, periods_passed(loop.state), float(loop.parameters["rig"]["period"]))
         return exchange_status(status or read_fmu(loop.fmu, loop.imu, command, request, feedback))
 
     def quick_stop(self) -> None:

@@ -6,39 +6,30 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from controller.cycle import OK, control, lose_pose, motion_cycle, prepare, skip
-from controller.estimation.fusion import (
-    calibrate,
-    find_pose,
-    fuse_heading,
-    fuse_legs,
-    fuse_mechanism,
-    fuse_platform,
-    improve_pose,
-    monitor_imus,
+from controller.cycle import (
+    CONTROL,
+    END,
+    HEADING,
+    LEGS,
+    MECHANISM,
+    PLATFORM,
+    POSE,
+    REFINEMENT,
+    SCREENING,
+    hear_rig,
+    prepare_next,
+    react,
+    run_stages,
+    skip_periods,
 )
 from controller.estimation.mechanism_filter import extrapolate_covariance
-from controller.least_squares import RANK_TOLERANCE, factor_cholesky, invert_cholesky
+from controller.least_squares import factor_cholesky, invert_cholesky
 from controller.planning.stream import stream_cause, take_plan
-from controller.safety.watch import (
-    ASKED_TO_STOP,
-    BRAKED,
-    CLOCK_FAILED,
-    EMERGENCY_STOP,
-    END_OF_MOTION,
-    EVENT_SLOTS,
-    FAULT,
-    MISSED_PERIODS,
-    REACTION,
-    RIG_FAILED,
-    SUPERVISOR_GONE,
-    coast,
-    has_stopped,
-    hear,
-    react,
-)
+from controller.reference import motion_cycle
+from controller.safety.causes import EVENT_SLOTS, REACTION, Cause, Request
+from controller.safety.stop import has_stopped, ramp_down
 from hil.loop.records import EMULATED_RIG, UDP_RIG, Link, RigHandle, Stage, StopRequest, TargetStream
-from hil.realtime.clock import FREE, REAL, finish, now, start, wait
+from hil.realtime.clock import FREE, REAL, finish, start, wait
 from hil.rigs import ANSWERED, SILENT
 from hil.rigs.udp.emulator import exchange_in_memory
 from hil.rigs.udp.link import exchange_udp, send_command
@@ -46,8 +37,9 @@ from plant.compiled import Record, kernel, store_release
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
 from plant.fmu.plant import advance, read_imus, read_truth, write_command, write_drive_mode
 from plant.imu import measure
-from plant.mechanism import LEGS
+from plant.mechanism import LEGS as LEG_COUNT
 from plant.pose import Array
+from plant.stopwatch import now
 
 _LOOK_NS = 100_000_000
 _SIGQUIT = 1 << 2
@@ -61,7 +53,7 @@ _sigpending: Any = types.ExternalFunction("sigpending", types.int32(types.intp))
 @kernel
 def drive_fmu(fmu: Record, command: Array, request: int, periods: int, period: float) -> int:
     """Let the plant move with the command for so many periods; returns FMI's status."""
-    status = write_drive_mode(fmu, BRAKE if request == BRAKED else VELOCITY)
+    status = write_drive_mode(fmu, BRAKE if request == Request.BRAKED else VELOCITY)
     if periods > 0:
         status |= write_command(fmu, command)
     for _ in range(periods):
@@ -75,8 +67,8 @@ def read_fmu(fmu: Record, imu: Record, command: Array, request: int, feedback: R
     status = read_imus(fmu) | read_truth(fmu)
     measure(imu, fmu[()].imu, feedback.measurement)
     feedback.truth[:] = fmu[()].truth
-    for k in range(LEGS):
-        feedback.sent[k] = 0.0 if request == BRAKED else command[k]
+    for k in range(LEG_COUNT):
+        feedback.sent[k] = 0.0 if request == Request.BRAKED else command[k]
     for k in range(IMU_COUNT):
         feedback.sequence[k] += 1
         feedback.sample_ns[k] = np.int64(np.rint(1e9 * fmu[()].time))
@@ -86,18 +78,18 @@ def read_fmu(fmu: Record, imu: Record, command: Array, request: int, feedback: R
 @kernel
 def exchange(rig: RigHandle, parameters: Record, state: Record, work: Record, timespec: NDArray[np.int64]) -> int:
     """Send the commands of the cycle before, and read the sensors; returns the rig's status."""
-    s, w, period = state[()], work[()], parameters[()].period
+    s, w, period = state[()], work[()], parameters[()].rig.period
     t0 = t1 = now(timespec)
     if rig.kind == UDP_RIG:
-        status = exchange_udp(rig.link, s.command, s.safety.request, w.feedback, timespec)
+        status = exchange_udp(rig.link, s.pid.command, s.safety.request, w.feedback, timespec)
     elif rig.kind == EMULATED_RIG:
-        at = int(np.rint(1e9 * period * s.cycle))
-        status = exchange_in_memory(rig.emulator, rig.link, s.command, s.safety.request, w.feedback, at)
+        at = int(np.rint(1e9 * period * s.time.cycle))
+        status = exchange_in_memory(rig.emulator, rig.link, s.pid.command, s.safety.request, w.feedback, at)
     else:
-        status = drive_fmu(rig.fmu, s.command, s.safety.request, periods_passed(state), period)
+        status = drive_fmu(rig.fmu, s.pid.command, s.safety.request, periods_passed(state), period)
         t1 = now(timespec)
         if status == 0:
-            status = read_fmu(rig.fmu, rig.imu, s.command, s.safety.request, w.feedback)
+            status = read_fmu(rig.fmu, rig.imu, s.pid.command, s.safety.request, w.feedback)
         status = exchange_status(status)
     w.stage_ns[Stage.PLANT], w.stage_ns[Stage.SENSE] = t1 - t0, now(timespec) - t1
     return status
@@ -107,10 +99,10 @@ def exchange(rig: RigHandle, parameters: Record, state: Record, work: Record, ti
 def hold_brakes(rig: RigHandle, parameters: Record, state: Record, work: Record, timespec: NDArray[np.int64]) -> None:
     """At the end: the drives hold on their brakes."""
     if rig.kind == UDP_RIG:
-        send_command(rig.link, state[()].command, BRAKED, now(timespec))
+        send_command(rig.link, state[()].pid.command, Request.BRAKED, now(timespec))
     elif rig.kind == EMULATED_RIG:
-        at = int(np.rint(1e9 * parameters[()].period * state[()].cycle))
-        exchange_in_memory(rig.emulator, rig.link, state[()].command, BRAKED, work[()].feedback, at)
+        at = int(np.rint(1e9 * parameters[()].rig.period * state[()].time.cycle))
+        exchange_in_memory(rig.emulator, rig.link, state[()].pid.command, Request.BRAKED, work[()].feedback, at)
     else:
         write_drive_mode(rig.fmu, BRAKE)
 
@@ -124,8 +116,8 @@ def exchange_status(status: int) -> int:
 @kernel
 def periods_passed(state: Record) -> int:
     """How many periods have passed since the last exchange; none before the first."""
-    s = state[()]
-    return 1 + s.missed if s.cycle > 0 else 0
+    time = state[()].time
+    return 1 + time.missed if time.cycle > 0 else 0
 
 
 @kernel
@@ -140,34 +132,35 @@ def begin_cycle(
     if c.cycles == 0:
         start(clock)
     missed = wait(clock, script)
-    w.asked = OK
+    w.asked = Cause.NONE
     if missed < 0:
-        _ask(work, CLOCK_FAILED)
+        _ask(work, Cause.CLOCK_FAILED)
         missed = 0
-    skip(state, missed)
-    w.cycle = s.cycle
+    skip_periods(state, missed)
+    w.cycle = s.time.cycle
     w.stage_ns[:] = 0
-    if s.cycle - s.safety.waited >= end:
-        _ask(work, END_OF_MOTION)
+    w.marks.ns[:] = 0
+    if s.time.cycle - s.safety.arming.delay >= end:
+        _ask(work, Cause.END_OF_MOTION)
     if c.mode == REAL and c.cycles % max(_LOOK_NS // c.period, 1) == 0:
         signals = w.signals
         if _sigpending(signals.ctypes.data) == 0 and signals[0] & _SIGNALS != 0:
-            _ask(work, ASKED_TO_STOP if signals[0] & _SIGQUIT == 0 else EMERGENCY_STOP)
+            _ask(work, Cause.STOP_REQUESTED if signals[0] & _SIGQUIT == 0 else Cause.EMERGENCY_STOP)
         if link[Link.SUPERVISOR] != 0 and _getppid() != link[Link.SUPERVISOR]:
-            _ask(work, SUPERVISOR_GONE)
+            _ask(work, Cause.SUPERVISOR_GONE)
     if c.in_a_row >= most_missed:
-        _ask(work, MISSED_PERIODS)
+        _ask(work, Cause.MISSED_PERIODS)
     if link[Link.STOP] != 0:
-        _ask(work, ASKED_TO_STOP if link[Link.STOP] == StopRequest.CONTROLLED else EMERGENCY_STOP)
+        _ask(work, Cause.STOP_REQUESTED if link[Link.STOP] == StopRequest.CONTROLLED else Cause.EMERGENCY_STOP)
     leg, value, limit = -1, np.nan, np.nan
-    if streamed.active != 0 and s.stopping == 0 and w.asked == OK:
+    if streamed.active != 0 and s.safety.stop.cause == Cause.NONE and w.asked == Cause.NONE:
         cause, leg, value, limit = stream_cause(streamed.stream, c.woke, streamed.patience_ns)
         _ask(work, cause)
-    if w.asked == MISSED_PERIODS:
+    if w.asked == Cause.MISSED_PERIODS:
         value, limit = float(c.in_a_row), float(most_missed)
-    if w.asked != OK:
+    if w.asked != Cause.NONE:
         react(parameters, state, w.asked, leg, value, limit)
-    return int(s.stopping) if has_stopped(state) else OK
+    return int(s.safety.stop.cause) if has_stopped(s.safety, s.time) else Cause.NONE.value
 
 
 @kernel
@@ -184,58 +177,29 @@ def process_feedback(parameters: Record, state: Record, work: Record, status: in
     """
     w = work[()]
     feedback = w.feedback
-    w.silent = w.silent + 1 + state[()].missed if status == SILENT else 0
+    p, s = parameters[()], state[()]
+    missed = s.time.missed
+    w.silent = w.silent + 1 + missed if status == SILENT else 0
     for k in range(IMU_COUNT):
         fresh = feedback.sequence[k] != w.sequence[k]
-        w.sample_age[k] = 0 if fresh else w.sample_age[k] + 1 + state[()].missed
+        w.sample_age[k] = 0 if fresh else w.sample_age[k] + 1 + missed
         w.sequence[k] = feedback.sequence[k]
     if status != ANSWERED and status != SILENT:
-        react(parameters, state, RIG_FAILED, -1, status, np.nan)
-        coast(parameters, state)
-        return RIG_FAILED
-    hear(parameters, state, w.sample_age, feedback.drive, w.silent)
-    return OK
+        react(parameters, state, Cause.RIG_FAILED, -1, float(status), np.nan)
+        ramp_down(p.safety.stop, p.rig, s.time, s.pid)
+        return Cause.RIG_FAILED.value
+    hear_rig(parameters, state, w.sample_age, feedback.drive, w.silent)
+    return Cause.NONE.value
 
 
 @kernel
-def compute(parameters: Record, state: Record, segments: Array, work: Record, timespec: NDArray[np.int64]) -> int:
-    """The steps of `controller.cycle.cycle`, with the clock read in between."""
-    measurement, stage_ns = work[()].feedback.measurement, work[()].stage_ns
-    if state[()].safety.mode == FAULT:
-        coast(parameters, state)
-        return OK
-    t0 = now(timespec)
-    calibrate(parameters, state, measurement)
-    fuse_legs(parameters, state)
-    t1 = now(timespec)
-    fuse_platform(parameters, state)
-    fuse_heading(parameters, state)
-    stage_ns[Stage.LEGS], stage_ns[Stage.PLATFORM] = t1 - t0, now(timespec) - t1
-    return locate_and_control(parameters, state, segments, work, timespec)
-
-
-@kernel
-def locate_and_control(parameters: Record, state: Record, segments: Array, work: Record, timespec: NDArray[np.int64]) -> int:
-    """The steps from the filtered samples to the commands, with the clock read in between."""
-    stage_ns = work[()].stage_ns
-    t0 = now(timespec)
-    conditioning = find_pose(parameters, state)
-    t1 = now(timespec)
-    found = conditioning >= RANK_TOLERANCE and improve_pose(parameters, state)
-    if found:
-        monitor_imus(parameters, state)
-    t2 = now(timespec)
-    known = fuse_mechanism(parameters, state, found)
-    t3 = now(timespec)
-    cause = control(parameters, state, segments) if known else lose_pose(parameters, state)
-    t4 = now(timespec)
-    stage_ns[Stage.POSE], stage_ns[Stage.REFINEMENT], stage_ns[Stage.MECHANISM], stage_ns[Stage.CONTROL] = (
-        t1 - t0,
-        t2 - t1,
-        t3 - t2,
-        t4 - t3,
-    )
-    return cause
+def write_stage_times(work: Record) -> None:
+    """The times of the cycle's stages, as they are recorded."""
+    w = work[()]
+    stage_ns, ns = w.stage_ns, w.marks.ns
+    stage_ns[Stage.LEGS], stage_ns[Stage.PLATFORM] = ns[SCREENING] + ns[LEGS], ns[PLATFORM] + ns[HEADING]
+    stage_ns[Stage.POSE], stage_ns[Stage.REFINEMENT] = ns[POSE], ns[REFINEMENT]
+    stage_ns[Stage.MECHANISM], stage_ns[Stage.CONTROL] = ns[MECHANISM], ns[CONTROL]
 
 
 @kernel
@@ -249,11 +213,11 @@ def record_cycle(
     head = link[Link.HEAD]
     record = records[head % records.shape[0]]
     record.cycle = w.cycle
-    record.time_ns = c.woke - c.start if c.mode != FREE else np.int64(np.rint(1e9 * p.period * w.cycle))
+    record.time_ns = c.woke - c.start if c.mode != FREE else np.int64(np.rint(1e9 * p.rig.period * w.cycle))
     record.late_ns = c.late
-    record.missed = s.missed
+    record.missed = s.time.missed
     record.status = failed
-    record.stop = s.stopping
+    record.stop = s.safety.stop.cause
     record.asked = w.asked
     record.mode, record.request = s.safety.mode, s.safety.request
     record.silent = w.silent
@@ -263,42 +227,44 @@ def record_cycle(
     record.sample_ns[:] = w.feedback.sample_ns
     record.round_trip_ns, record.refused = w.feedback.round_trip_ns, w.feedback.refused
     record.sent[:] = w.feedback.sent
-    record.event_count = s.safety.event_count
+    events = s.safety.events
+    record.event_count = events.count
     for i in range(EVENT_SLOTS):
-        told = i < s.safety.event_count
-        record.event_cause[i] = s.safety.event_cause[i] if told else 0
-        record.event_index[i] = s.safety.event_index[i] if told else 0
-        record.event_value[i] = s.safety.event_value[i] if told else 0.0
-        record.event_limit[i] = s.safety.event_limit[i] if told else 0.0
-    record.imus = s.heading_used << IMU_COUNT
+        reported = i < events.count
+        record.event_cause[i] = events.cause[i] if reported else 0
+        record.event_index[i] = events.index[i] if reported else 0
+        record.event_value[i] = events.value[i] if reported else 0.0
+        record.event_limit[i] = events.limit[i] if reported else 0.0
+    record.imus = s.heading.used << IMU_COUNT
     for k in range(IMU_COUNT):
-        record.imus |= s.imu_used[k] << k
-    record.trusted = s.filter_trusted
+        record.imus |= s.imus.used[k] << k
+    record.trusted = s.mechanism.trusted
     record.angular_velocity[:] = w.feedback.measurement[0]
     record.specific_force[:] = w.feedback.measurement[1]
     record.magnetic_field[:] = w.feedback.measurement[2]
-    record.position[:] = s.position
-    record.rotation[:] = s.rotation
-    record.conditioning = s.conditioning
-    record.lengths[:] = s.lengths
-    record.reference[:] = s.reference
-    record.command[:] = s.command
+    record.position[:] = s.pose.position
+    record.rotation[:] = s.pose.rotation
+    record.conditioning = s.pose.conditioning
+    record.lengths[:] = s.pose.lengths
+    record.reference[:] = s.reference.motion
+    record.command[:] = s.pid.command
     record.truth[:] = w.feedback.truth
-    for k in range(LEGS):
+    for k in range(LEG_COUNT):
         for i in range(3):
-            record.residuals[k, i] = s.directions[k, i] - s.predicted[k, i] if s.leg_used[k] != 0.0 else np.nan
-    w.factor[:] = s.information
-    if s.filter_trusted != 0:
-        extrapolate_covariance(p.filter, s.filter, s.cycle * p.period, w.covariance)
+            record.residuals[k, i] = s.legs.directions[k, i] - s.pose.directions[k, i] if s.legs.used[k] != 0.0 else np.nan
+    w.factor[:] = s.pose.information
+    if s.mechanism.trusted != 0:
+        extrapolate_covariance(p.mechanism.filter, s.mechanism.filter, s.time.cycle * p.rig.period, w.covariance)
         record.covariance[:] = w.covariance
     elif factor_cholesky(w.factor):
         invert_cholesky(w.factor, w.covariance)
         record.covariance[:] = w.covariance
     else:
         record.covariance[:] = np.nan
-    if streamed.active != 0 and s.stopping == 0:
-        take_plan(streamed.stream, streamed.taker, motion_cycle(parameters, state), p.period, segments, s.reference_index)
-    prepare(parameters, state, segments)
+    if streamed.active != 0 and s.safety.stop.cause == Cause.NONE:
+        cycle = motion_cycle(p.rig, s.time, s.safety)
+        take_plan(streamed.stream, streamed.taker, cycle, p.rig.period, segments, s.reference.index)
+    prepare_next(parameters, state, segments)
     w.stage_ns[Stage.RECORD] = now(c.timespec) - began
 
 
@@ -319,19 +285,21 @@ def run_loop(
     script: NDArray[np.int64], link: NDArray[np.int64], work: Record, streamed: TargetStream, most_missed: int, last: int,
     end: int,
 ) -> int:  # fmt: skip
-    """Run cycles up to `last`, or until a stop that begins at `end` or earlier is over; returns its cause, or `OK`."""
+    """Run cycles up to `last`, or until a stop that begins at `end` or earlier is over; returns its cause, or `Cause.NONE`."""
     s, timespec = state[()], clock[()].timespec
-    cause = OK
-    while cause == OK and s.cycle < last:
+    cause = Cause.NONE.value
+    while cause == Cause.NONE and s.time.cycle < last:
         cause = begin_cycle(parameters, state, clock, script, link, work, streamed, most_missed, end)
-        if cause != OK:
+        if cause != Cause.NONE:
             break
         status = exchange(rig, parameters, state, work, timespec)
         failed = process_feedback(parameters, state, work, status)
-        if failed == OK:
-            failed = compute(parameters, state, segments, work, timespec)
+        if failed == Cause.NONE:
+            w = work[()]
+            failed = run_stages(parameters, state, w.feedback.measurement, segments, w.marks, SCREENING, END)
+            write_stage_times(work)
         record_cycle(parameters, state, segments, records, clock, link, work, streamed, failed)
         end_cycle(records, clock, script, link, work)
-    if cause != OK:
+    if cause != Cause.NONE:
         hold_brakes(rig, parameters, state, work, timespec)
     return cause

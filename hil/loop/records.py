@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from controller.safety.watch import EVENTS
+from controller.cycle import MARKS
+from controller.safety.causes import EVENT_SLOTS
 from hil.rigs import FEEDBACK
 from hil.rigs.udp.emulator import UdpEmulator
 from hil.rigs.udp.link import UdpLink
@@ -71,7 +72,11 @@ RECORD = np.dtype(
         ("round_trip_ns", np.int64),
         ("refused", np.int64),
         ("sent", np.float64, LEGS),
-        *EVENTS,
+        ("event_count", np.int64),
+        ("event_cause", np.int32, EVENT_SLOTS),
+        ("event_index", np.int32, EVENT_SLOTS),
+        ("event_value", np.float64, EVENT_SLOTS),
+        ("event_limit", np.float64, EVENT_SLOTS),
         ("angular_velocity", np.float64, (IMU_COUNT, 3)),
         ("specific_force", np.float64, (IMU_COUNT, 3)),
         ("magnetic_field", np.float64, (IMU_COUNT, 3)),
@@ -173,6 +178,7 @@ WORK = np.dtype(
         ("factor", np.float64, (6, 6)),
         ("covariance", np.float64, (6, 6)),
         ("stage_ns", np.int64, len(STAGES)),
+        ("marks", MARKS),
         ("signals", np.int64, 16),
     ],
     align=True,

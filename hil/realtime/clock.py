@@ -13,6 +13,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from plant.compiled import Record, kernel
+from plant.stopwatch import CLOCK_MONOTONIC, clock_gettime, now
 
 FREE, REAL, SCRIPTED = range(3)
 """Whether the loop runs as fast as it goes, on the machine's clock, or on a script."""
@@ -44,11 +45,10 @@ missed since a cycle last followed right upon another, and `most_in_a_row` the m
 woken late, own work, and work that the host held up.
 """
 
-_CLOCK_MONOTONIC, _CLOCK_THREAD_CPUTIME = 1, 3
+_CLOCK_THREAD_CPUTIME = 3
 _TIMER_ABSTIME, _EINTR = 1, 4
 _LEAD_NS = 2_000_000
 
-_clock_gettime: Any = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.intp))
 _clock_nanosleep: Any = types.ExternalFunction("clock_nanosleep", types.int32(types.int32, types.int32, types.intp, types.intp))
 
 
@@ -60,15 +60,8 @@ def new_clock(mode: int, period_ns: int) -> Record:
 
 
 @kernel
-def now(timespec: NDArray[np.int64]) -> int:
-    """The monotonic clock [ns]; `timespec` (2,) is scratch."""
-    _clock_gettime(_CLOCK_MONOTONIC, timespec.ctypes.data)
-    return int(timespec[0] * 1_000_000_000 + timespec[1])
-
-
-@kernel
 def _cpu_time(timespec: NDArray[np.int64]) -> int:
-    _clock_gettime(_CLOCK_THREAD_CPUTIME, timespec.ctypes.data)
+    clock_gettime(_CLOCK_THREAD_CPUTIME, timespec.ctypes.data)
     return int(timespec[0] * 1_000_000_000 + timespec[1])
 
 
@@ -105,7 +98,7 @@ def wait(clock: Record, script: NDArray[np.int64]) -> int:
         c.woke = now(c.timespec)
         while c.woke < c.deadline:
             c.timespec[0], c.timespec[1] = c.deadline // 1_000_000_000, c.deadline % 1_000_000_000
-            status = _clock_nanosleep(_CLOCK_MONOTONIC, _TIMER_ABSTIME, c.timespec.ctypes.data, 0)
+            status = _clock_nanosleep(CLOCK_MONOTONIC, _TIMER_ABSTIME, c.timespec.ctypes.data, 0)
             if status != 0 and status != _EINTR:
                 return -1
             c.woke = now(c.timespec)

@@ -21,7 +21,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from numpy.typing import NDArray
 
-from controller.safety.watch import CAUSES, EVENT_SLOTS, GO_ON, REACTIONS, describe_event
+from controller.safety.causes import EVENT_SLOTS, Cause, Reaction
 from hil.loop.records import RECORD, STAGES, Link
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
@@ -176,9 +176,9 @@ def events_of(record: Record) -> Iterator[str]:
     count = int(record["event_count"])
     for i in range(min(count, EVENT_SLOTS)):
         cause, index, value, limit = (record[f"event_{name}"][i] for name in ("cause", "index", "value", "limit"))
-        reaction = CAUSES[int(cause)].reaction
-        how = f"{REACTIONS[reaction]}: " if reaction != GO_ON else ""
-        yield how + describe_event(int(cause), int(index), float(value), float(limit))
+        reaction = Cause(int(cause)).reaction
+        how = f"{Reaction(reaction).text}: " if reaction != Reaction.GO_ON else ""
+        yield how + Cause(int(cause)).describe(int(index), float(value), float(limit))
     if count > EVENT_SLOTS:
         yield f"and {count - EVENT_SLOTS} events more"
 
@@ -254,6 +254,11 @@ class Recording:
     events: list[tuple[int, str]]
     epoch_ns: int
     complete: bool
+
+    def constant(self, stage: str, name: str) -> Any:
+        """A constant of the cycle that was recorded; the layout of version 0.1 had no stages."""
+        parameters = self.arrays["parameters"]
+        return parameters[stage][name] if stage in (parameters.dtype.names or ()) else parameters[name]
 
 
 def read(path: Path | str) -> Recording:

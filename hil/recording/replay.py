@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from controller.cycle import OK, PARAMETERS, STATE, cycle, prepare, skip
+from controller.cycle import MARKS, PARAMETERS, STATE, cycle, hear_rig, prepare_next, react, skip_periods
 from controller.planning import STREAM_TARGET
-from controller.safety.watch import RIG_FAILED, begin_stop, coast, hear
+from controller.safety.causes import Cause
+from controller.safety.stop import ramp_down
 from hil.loop.records import RECORD
 from hil.recording.mcap import RecordingError, read, total
 from plant.compiled import Record, kernel
@@ -99,7 +100,9 @@ def replay(paths: Sequence[Path | str]) -> Replay:
     again = np.zeros(len(records), RECORD)
     streamed = str(first.config.get("target")).partition(":")[0] == STREAM_TARGET
     measurement = np.zeros((3, IMU_COUNT, 3))
-    count = int(_replay(constants, np.zeros((), STATE), segments, records, again, measurement, streamed))
+    count = int(
+        _replay(constants, np.zeros((), STATE), segments, records, again, measurement, np.zeros((), MARKS)[()], streamed)
+    )
     differs = [np.any(_bits(records[name][:count]) != _bits(again[name][:count]), axis=1) for name in COMPARED]
     rows = np.flatnonzero(np.any(differs, axis=0))
     different, fields = None, {}
@@ -129,40 +132,41 @@ def _bits(values: Array) -> Any:
 
 @kernel
 def _replay(
-    parameters: Record, state: Record, segments: Array, records: Record, again: Record, measurement: Array, streamed: bool
+    parameters: Record, state: Record, segments: Array, records: Record, again: Record, measurement: Array, marks: Record,
+    streamed: bool,
 ) -> int:  # fmt: skip
     """Run the cycle on the raw data of records (n,); returns how many it could, up to the first gap."""
-    s = state[()]
+    p, s = parameters[()], state[()]
     for k in range(records.shape[0]):
         recorded, found = records[k], again[k]
-        if recorded.cycle != s.cycle + recorded.missed:
+        if recorded.cycle != s.time.cycle + recorded.missed:
             return k
-        skip(state, recorded.missed)
-        if streamed and s.stopping == 0:
+        skip_periods(state, recorded.missed)
+        if streamed and s.safety.stop.cause == Cause.NONE:
             # What the stream's plans said is known from what was followed.
-            s.reference[:] = recorded.reference
-            s.prepared = s.cycle + 1
-        if recorded.asked != OK:
+            s.reference.motion[:] = recorded.reference
+            s.reference.due_cycle = s.time.cycle + 1
+        if recorded.asked != Cause.NONE:
             if streamed:
                 # What the stop made of missed periods is in the recorded reference.
-                s.missed = 0
-            begin_stop(parameters, state, recorded.asked)
-            s.missed = recorded.missed
+                s.time.missed = 0
+            react(parameters, state, recorded.asked, -1, np.nan, np.nan)
+            s.time.missed = recorded.missed
         measurement[0] = recorded.angular_velocity
         measurement[1] = recorded.specific_force
         measurement[2] = recorded.magnetic_field
-        if recorded.status == RIG_FAILED:
-            begin_stop(parameters, state, RIG_FAILED)
-            coast(parameters, state)
+        if recorded.status == Cause.RIG_FAILED:
+            react(parameters, state, Cause.RIG_FAILED, -1, np.nan, np.nan)
+            ramp_down(p.safety.stop, p.rig, s.time, s.pid)
         else:
-            hear(parameters, state, recorded.sample_age, recorded.drive, recorded.silent)
-            cycle(parameters, state, measurement, segments)
-        found.position[:] = s.position
-        found.rotation[:] = s.rotation
-        found.lengths[:] = s.lengths
-        found.reference[:] = s.reference
-        found.command[:] = s.command
-        found.conditioning = s.conditioning
-        found.mode, found.stop = s.safety.mode, s.stopping
-        prepare(parameters, state, segments)
+            hear_rig(parameters, state, recorded.sample_age, recorded.drive, recorded.silent)
+            cycle(parameters, state, measurement, segments, marks)
+        found.position[:] = s.pose.position
+        found.rotation[:] = s.pose.rotation
+        found.lengths[:] = s.pose.lengths
+        found.reference[:] = s.reference.motion
+        found.command[:] = s.pid.command
+        found.conditioning = s.pose.conditioning
+        found.mode, found.stop = s.safety.mode, s.safety.stop.cause
+        prepare_next(parameters, state, segments)
     return len(records)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from controller.safety.watch import RIG_FAILED
+from controller.safety.causes import Cause
 from hil.loop.records import RECORD
 from hil.recording.mcap import RecordingError, read, total
 from hil.rigs import ANSWERED, SILENT, Identity, RigError
@@ -82,7 +82,7 @@ class ReplayRig:
         self._numbers = np.cumsum(records["sample_age"] == 0, axis=0)
         self._cycle, self.failure = 0, ""
         if "parameters" in recordings[0].arrays:
-            self.command_delay = float(recordings[0].arrays["parameters"]["command_delay"])
+            self.command_delay = float(recordings[0].constant("load", "command_delay"))
         parts = {"rig": str(config.get("rig")), "run": str(config.get("run")), "recorded by": f"gough {config['version']}"}
         self._identity = Identity(f"recording {where}", parts)
 
@@ -115,7 +115,7 @@ class ReplayRig:
         feedback["sequence"] = self._numbers[row]
         for name in ("sample_ns", "drive", "drive_code", "sent", "truth", "round_trip_ns", "refused"):
             feedback[name] = record[name]
-        if record["status"] == RIG_FAILED:
+        if record["status"] == Cause.RIG_FAILED:
             return self._fail(FAILED)
         return SILENT if record["silent"] > 0 else ANSWERED
 

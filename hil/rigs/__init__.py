@@ -11,13 +11,16 @@ from typing import Protocol
 
 import numpy as np
 
-from controller.safety.watch import BRAKED, ENABLED, FAULTY, FOLLOWING, OFF, QUICK_STOP, QUICK_STOPPING, READY
+from controller.safety.causes import DriveState, Request
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import GoughError
 from plant.mechanism import LEGS
 from plant.pose import Array
 from plant.truth import TRUTH_SIZE
+
+BRAKED, ENABLED, QUICK_STOP = Request
+FOLLOWING, READY, OFF, QUICK_STOPPING, FAULTY = DriveState
 
 __all__ = [
     "ANSWERED", "BRAKED", "ENABLED", "FAULTY", "FEEDBACK", "FOLLOWING", "OFF", "QUICK_STOP", "QUICK_STOPPING", "READY",

@@ -33,7 +33,8 @@ from controller.inverse_kinematics import leg_lengths
 from controller.planning.stream import DONE as STREAM_DONE
 from controller.planning.stream import STREAM
 from controller.planning.stream_planner import StreamPlanner
-from controller.safety.watch import ASKED_TO_STOP, CAUSES, END_OF_MOTION, STOP_QUICKLY, describe_obstacle
+from controller.safety.arming import describe_obstacle
+from controller.safety.causes import Cause, Reaction
 from hil.loop.driver import Loop, prevent_compilation, stop_quickly
 from hil.loop.records import LINK_SIZE, RECORD, UDP_RIG, Link, StopRequest, shared_array
 from hil.loop.timing import Timing, over_budget
@@ -214,8 +215,8 @@ def run(
         progress.add(taken)
         progress.unseen += unseen
     summary = _summary(config, progress, outcome, recorders)
-    if outcome["stop"] not in (END_OF_MOTION, ASKED_TO_STOP):
-        quickly = CAUSES[outcome["stop"]].reaction >= STOP_QUICKLY
+    if outcome["stop"] not in (Cause.END_OF_MOTION, Cause.STOP_REQUESTED):
+        quickly = Cause(outcome["stop"]).reaction >= Reaction.QUICK_STOP
         how = "stopped on the brakes" if quickly else "stopped before its time"
         raise RunStoppedError(f"{how} at cycle {outcome['cycle']}: {outcome['reason']}", summary)
     return summary
@@ -388,7 +389,7 @@ def _prepare_and_follow(
             rigs.callback(stop_quickly, rig)
             if config.arm:
                 rig.arm()
-            loop.parameters["command_delay"] = rig.command_delay
+            loop.parameters["load"]["command_delay"] = rig.command_delay
         if isinstance(rig, UdpRig):
             loop.kind, loop.udp = UDP_RIG, rig.link
         if threading.active_count() > 1:
@@ -406,7 +407,7 @@ def _prepare_and_follow(
                 "identity": header["config"].get("identity"),
                 "obstacle": None if config.arm else describe_obstacle(loop.state),
                 "reason": ": ".join(filter(None, [loop.reason(), loop.failure or getattr(rig, "failure", "")])),
-                "cycle": int(loop.state["stop_cycle"]),
+                "cycle": int(loop.state["safety"]["stop"]["cycle"]),
                 "cycles": int(link[Link.HEAD]),
                 "missed_late": int(loop.clock["missed_late"]),
                 "missed_own": int(loop.clock["missed_own"]),

@@ -9,12 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from controller.calibration.file import Calibration, load_calibration
-from controller.cycle import OK, STATE, cycle_parameters, imus_of
+from controller.cycle import STATE, cycle_parameters
+from controller.imu_set import imus_of
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.planner import Reference, plan
 from controller.planning.stream import rest
 from controller.planning.target import Target, load_target
-from controller.safety.watch import describe_end
+from controller.safety.causes import Cause
+from controller.safety.stop import describe_end
 from controller.settings import control_settings, safety_settings, sensor_settings
 from hil.loop.driver import Loop
 from hil.loop.records import RECORD
@@ -62,7 +64,7 @@ class PreparedLoop(Loop):
 
     def reason(self) -> str:
         """Why the run has ended, in words; if the plant has failed, its failure."""
-        if self.plant is not None and self.plant.handle["status"] != OK:
+        if self.plant is not None and self.plant.handle["status"] != Cause.NONE:
             return str(self.plant.failure())
         return describe_end(self.state)
 
@@ -97,7 +99,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         config.fusion == "section-5", safety.for_raw_imus() if config.raw_imus else safety,
         0.0 if config.rig == "fmu" else period, config.arm,
     )  # fmt: skip
-    count = int(parameters["hold_cycles"]) + round(config.duration * config.rate)
+    count = int(parameters["rig"]["hold_cycles"]) + round(config.duration * config.rate)
     if records is None and count * RECORD.itemsize > MOST_RECORD_BYTES:
         raise InputError(
             f"{config.duration:g} s at {config.rate:g} Hz would record {count * RECORD.itemsize / 2**30:.3g} GiB, more than "

@@ -7,23 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from controller.cycle import OK
 from controller.direct_kinematics import poses_from_lengths
-from controller.estimation.fusion import find_vertical, fuse_heading, point_legs, prepare_platform
-from controller.estimation.leg_filter import start_leg
 from controller.planning.planner import Reference
 from controller.planning.target import Target
-from hil.loop.driver import PythonFilters
+from controller.safety.causes import Cause
 from hil.loop.records import COMPUTED
 from hil.progress import Progress, no_progress
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import PreparedLoop, prepared_loop
 from hil.runs.snapshot import Snapshot, resume_snapshot, take_snapshot
 from plant.compiled import Record
-from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import GoughError, InputError
-from plant.imu import ACCELEROMETER, GYROSCOPE
-from plant.mechanism import LEGS, Mechanism
+from plant.mechanism import Mechanism
 from plant.pose import Array, pose_errors, rms_figures, rotations_from_quaternions
 from plant.truth import TRUTH_POSITION, TRUTH_QUATERNION
 
@@ -140,32 +135,36 @@ def simulate(
         count = len(loop.records)
         if resumed is not None:
             resume_snapshot(resumed, loop, loop.simulated)
-        first = int(loop.state["cycle"])
+        first = int(loop.state["time"]["cycle"])
         saved = None if save_at is None else _cycle_at(save_at, loop, first)
         snapshot = None
-        filters = filterpy_filters(loop.parameters) if config.fusion == "filterpy" else None
-        cause, took = OK, loop.planning_time
+        filters = None
+        if config.fusion == "filterpy":
+            from controller.estimation.filterpy_filters import FilterpyFilters
+
+            filters = FilterpyFilters(loop.parameters)
+        cause, took = Cause.NONE.value, loop.planning_time
         chunk = max(1, round(_CHUNK_S * config.rate))
         for last in sorted({*range(first + chunk, count, chunk), count, *([] if saved is None else [saved])}):
             began = time.perf_counter()
             cause = loop.run(last, filters)
             took += time.perf_counter() - began
-            if cause != OK:
+            if cause != Cause.NONE:
                 break
-            if last == saved and loop.state["stopping"] == OK:
+            if last == saved and loop.state["safety"]["stop"]["cause"] == Cause.NONE:
                 snapshot = take_snapshot(asdict(config), loop, loop.simulated)
             progress((last - first) / (count - first))
         result = _result(config, loop, first, snapshot, took)
-        if loop.state["stopping"] != OK:
-            at = int(loop.state["stop_cycle"])
-            how = "stopped on the brakes" if cause != OK else "still stopping at the end, from"
+        if loop.state["safety"]["stop"]["cause"] != Cause.NONE:
+            at = int(loop.state["safety"]["stop"]["cycle"])
+            how = "stopped on the brakes" if cause != Cause.NONE else "still stopping at the end, from"
             raise SimulationStoppedError(f"{how} at cycle {at} of {count}: {loop.reason()}", result)
     return result
 
 
 def _cycle_at(at: float, loop: PreparedLoop, first: int) -> int:
     """The cycle at a time [s] of the motion."""
-    period, hold = float(loop.parameters["period"]), int(loop.parameters["hold_cycles"])
+    period, hold = float(loop.parameters["rig"]["period"]), int(loop.parameters["rig"]["hold_cycles"])
     cycle = hold + round(at / period) if np.isfinite(at) else -1
     if not first < cycle <= len(loop.records):
         least, most = ((cycle - hold) * period for cycle in (first, len(loop.records)))
@@ -177,9 +176,9 @@ def _result(
     config: SimulationConfig, loop: PreparedLoop, first: int, snapshot: Snapshot | None, took: float
 ) -> SimulationResult:
     """The result from cycle `first` on, after `took` seconds of planning and running."""
-    done = int(loop.state["cycle"])
+    done = int(loop.state["time"]["cycle"])
     records = loop.records[first:done]
-    times = (np.arange(first, done) - int(loop.parameters["hold_cycles"])) / config.rate
+    times = (np.arange(first, done) - int(loop.parameters["rig"]["hold_cycles"])) / config.rate
     positions, rotations = poses_from_lengths(
         loop.mechanism, records["reference"][:, : loop.mechanism.legs, 0], loop.target.start
     )
@@ -188,59 +187,6 @@ def _result(
         config, loop.mechanism, loop.target, loop.reference, times, records, positions, rotations, target_positions,
         target_rotations, (done - first) / config.rate / took, snapshot,
     )  # fmt: skip
-
-
-def filterpy_filters(parameters: Record) -> PythonFilters:
-    """The filters of legs and platform on filterpy, in place of the compiled ones."""
-    from controller.estimation.filterpy_filters import FilterpyLeg, FilterpyPlatform
-
-    legs = [
-        FilterpyLeg(
-            up_in_joint=parameters["sensors"]["up_in_joint"][k],
-            imu_position=parameters["sensors"]["leg_imu_position"][k],
-            gravity=float(parameters["sensors"]["gravity"]),
-            period=float(parameters["period"]),
-            jerk=float(parameters["leg_jerk"]),
-            bias_walk=float(parameters["bias_walk"]),
-            rate_variance=float(parameters["gyroscope_variance"]),
-            force_variance=float(parameters["leg_force_variance"]),
-        )
-        for k in range(LEGS)
-    ]
-    platform = FilterpyPlatform(
-        gravity=float(parameters["sensors"]["gravity"]),
-        period=float(parameters["period"]),
-        rate_density=float(parameters["gyroscope_density"]),
-        bias_walk=float(parameters["bias_walk"]),
-        vertical_variance=float(parameters["vertical_variance"]),
-    )
-
-    def fuse_legs(state: Record) -> None:
-        for k, leg in enumerate(legs):
-            if not state["imu_used"][k]:
-                continue
-            rate, force = state["sample"][GYROSCOPE, k], state["sample"][ACCELEROMETER, k]
-            if state["age"][k] == 0:
-                start_leg(
-                    state["leg_x"][k], state["leg_covariance"][k], rate, force, leg.up_in_joint, float(parameters["bias_sigma"])
-                )
-                leg.start(state["leg_x"][k], state["leg_covariance"][k])
-                leg.update(rate, force)
-            else:
-                leg.step(rate, force)
-            state["leg_x"][k], state["leg_covariance"][k] = leg.state, leg.covariance
-        point_legs(parameters, state)
-
-    def fuse_platform(state: Record) -> None:
-        if prepare_platform(parameters, state):
-            platform.start(state["platform_x"], state["platform_covariance"])
-            rate, force = state["sample"][GYROSCOPE, PLATFORM_IMU], state["sample"][ACCELEROMETER, PLATFORM_IMU]
-            platform.step(rate, force, state["imu_acceleration"])
-            state["platform_x"], state["platform_covariance"] = platform.state, platform.covariance
-            find_vertical(parameters, state)
-        fuse_heading(parameters, state)
-
-    return PythonFilters(fuse_legs, fuse_platform)
 
 
 def _figures(poses: tuple[Array, Array], true: tuple[Array, Array]) -> dict[str, float]:

@@ -51,7 +51,7 @@ def take_snapshot(config: Mapping[str, Any], loop: Loop, plant: FmuPlant) -> Sna
     Raises:
         FmuError: the FMU cannot save its state.
     """
-    cycle = int(loop.state["cycle"])
+    cycle = int(loop.state["time"]["cycle"])
     memory = {name: array.tobytes() for name, array in loop.memory().items()}
     return Snapshot(config, cycle, _settings(loop, plant), _motion(loop, cycle), memory, plant.state())
 
@@ -137,5 +137,5 @@ def _settings(loop: Loop, plant: FmuPlant) -> bytes:
 def _motion(loop: Loop, cycle: int) -> bytes:
     """The segments that have begun by a cycle."""
     segments: Array = loop.segments
-    begun = segments[:, :, START] <= cycle * float(loop.parameters["period"])
+    begun = segments[:, :, START] <= cycle * float(loop.parameters["rig"]["period"])
     return _hash(segments[begun].tobytes())

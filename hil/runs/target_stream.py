@@ -25,7 +25,7 @@ import numpy as np
 from controller.planning.stream import CAUSE, CYCLE, DONE, SEEN, STREAM, TAKEN, fail_stream, note_sample, publish_plan
 from controller.planning.stream_planner import Plan, StreamPlanner, TargetRefusedError
 from controller.planning.target import Target
-from controller.safety.watch import NO_CAUSE
+from controller.safety.causes import Cause
 from hil.rigs.udp import datagrams
 from hil.rigs.udp.link import bound_socket
 from plant.compiled import Record
@@ -147,7 +147,7 @@ def _load_kernels() -> None:
     scratch = np.zeros((), STREAM)
     publish_plan(scratch, np.zeros(STREAM["plans"].shape[1:]), 0.0, 0)
     note_sample(scratch, 1)
-    fail_stream(scratch, NO_CAUSE, 0, 0.0, 0.0)
+    fail_stream(scratch, Cause.NONE, 0, 0.0, 0.0)
 
 
 class Reception:
@@ -183,7 +183,7 @@ class Reception:
             if not (newer and sample.time_ns > self._last.time_ns):
                 stream["stale"] += 1
                 return
-        if self._shared[CAUSE] != NO_CAUSE:
+        if self._shared[CAUSE] != Cause.NONE:
             return
         if self._last is None:
             self._first = sample.time_ns
@@ -214,7 +214,7 @@ class Reception:
                 self._planner.follow(plan)
             else:
                 stream["late"] += 1
-        if not self._fresh or shared[CAUSE] != NO_CAUSE:
+        if not self._fresh or shared[CAUSE] != Cause.NONE:
             return
         self._fresh = False
         begin = max((int(shared[CYCLE]) + self._lead) * self._period, self._planner.current.begin)

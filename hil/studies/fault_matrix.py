@@ -14,40 +14,7 @@ import numpy as np
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.stream import STREAM, note_sample, rest
 from controller.planning.stream_planner import StreamPlanner
-from controller.safety.watch import (
-    ASKED_TO_STOP,
-    BRAKE_AT_ONCE,
-    BRAKED,
-    BUS_LOST,
-    CAUSES,
-    DRIVE_DEVIATES,
-    DRIVE_FAULT,
-    DRIVE_OFF,
-    EMERGENCY_STOP,
-    END_OF_MOTION,
-    FAULT,
-    FOLLOWING,
-    FOLLOWING_ERROR,
-    GO_ON,
-    IMU_DISAGREES,
-    IMU_FROZEN,
-    IMU_NOISY,
-    IMU_STALE,
-    IMUS_DISAGREE,
-    IMUS_LOST,
-    MISSED_PERIODS,
-    NO_CAUSE,
-    NO_SENSORS,
-    QUICK_STOP,
-    REACTIONS,
-    RUNNING,
-    STOP,
-    STOP_QUICKLY,
-    STOPPING,
-    TARGET_JUMPS,
-    TARGET_LOST,
-    TARGET_NOT_FINITE,
-)
+from controller.safety.causes import Cause, DriveState, Mode, Reaction, Request
 from hil.loop.records import EMULATED_RIG, RECORD, Link, StopRequest
 from hil.progress import Progress, no_progress
 from hil.realtime.clock import SCRIPTED, new_clock
@@ -129,57 +96,59 @@ def _kill_rig(loop: PreparedLoop) -> None:
 
 
 CASES = (
-    Case("a leg's IMU is frozen", IMU_FROZEN, GO_ON, 15, 2e-3, ("imu-frozen:{k},at={at}",)),
-    Case("a leg's IMU is dead", IMU_STALE, GO_ON, 15, 2e-3, ("imu-dead:{k},at={at}",)),
-    Case("a leg's IMU is noisy", IMU_NOISY, GO_ON, 25, 2e-3, ("imu-noisy:{k},at={at}",)),
-    Case("a leg's IMU is biased by 2 deg", IMU_DISAGREES, GO_ON, 2500, 10e-3, ("imu-biased:{k},at={at}",)),
-    Case("a leg's IMU is biased by 2 deg from the start", NO_SENSORS, STOP, 1300, 1e-3, ("imu-biased:{k}",)),
+    Case("a leg's IMU is frozen", Cause.IMU_FROZEN, Reaction.GO_ON, 15, 2e-3, ("imu-frozen:{k},at={at}",)),
+    Case("a leg's IMU is dead", Cause.IMU_STALE, Reaction.GO_ON, 15, 2e-3, ("imu-dead:{k},at={at}",)),
+    Case("a leg's IMU is noisy", Cause.IMU_NOISY, Reaction.GO_ON, 25, 2e-3, ("imu-noisy:{k},at={at}",)),
+    Case("a leg's IMU is biased by 2 deg", Cause.IMU_DISAGREES, Reaction.GO_ON, 2500, 10e-3, ("imu-biased:{k},at={at}",)),
+    Case("a leg's IMU is biased by 2 deg from the start", Cause.NO_SENSORS, Reaction.STOP, 1300, 1e-3, ("imu-biased:{k}",)),
     Case(
-        "two legs' IMUs are swapped from the start", IMUS_DISAGREE, STOP, 4000, 25e-3, ("imu-swapped:{k},size={j}",),
-        also=(DRIVE_DEVIATES,),
+        "two legs' IMUs are swapped from the start", Cause.IMUS_DISAGREE, Reaction.STOP, 4000, 25e-3,
+        ("imu-swapped:{k},size={j}",), also=(Cause.DRIVE_DEVIATES,),
     ),
-    Case("the platform's IMU is frozen", IMU_FROZEN, GO_ON, 15, 2e-3, ("imu-frozen:6,at={at}",)),
-    Case("the platform's IMU is dead", IMU_STALE, GO_ON, 15, 2e-3, ("imu-dead:6,at={at}",)),
-    Case("the platform's IMU is biased by 2 deg", IMU_DISAGREES, GO_ON, 2500, 10e-3, ("imu-biased:6,at={at}",)),
-    Case("two IMUs are dead", IMUS_LOST, STOP, 15, 4e-3, ("imu-dead:{k},at={at}", "imu-dead:{j},at={at}")),
+    Case("the platform's IMU is frozen", Cause.IMU_FROZEN, Reaction.GO_ON, 15, 2e-3, ("imu-frozen:6,at={at}",)),
+    Case("the platform's IMU is dead", Cause.IMU_STALE, Reaction.GO_ON, 15, 2e-3, ("imu-dead:6,at={at}",)),
+    Case("the platform's IMU is biased by 2 deg", Cause.IMU_DISAGREES, Reaction.GO_ON, 2500, 10e-3, ("imu-biased:6,at={at}",)),
+    Case("two IMUs are dead", Cause.IMUS_LOST, Reaction.STOP, 15, 4e-3, ("imu-dead:{k},at={at}", "imu-dead:{j},at={at}")),
     Case(
-        "two IMUs are biased by 2 deg", IMUS_DISAGREE, STOP, 2500, 30e-3,
+        "two IMUs are biased by 2 deg", Cause.IMUS_DISAGREE, Reaction.STOP, 2500, 30e-3,
         ("imu-biased:{k},at={at}", "imu-biased:{j},at={at}"),
     ),
-    Case("1 % of the packets are lost", NO_CAUSE, GO_ON, 0, 2e-3, ("bus-drops,at={at},size=0.01",)),
-    Case("10 % of the packets are lost", NO_CAUSE, GO_ON, 0, 2e-3, ("bus-drops,at={at},size=0.1",)),
-    Case("50 packets in a row are lost", BUS_LOST, STOP_QUICKLY, 21, 5e-3, ("bus-down,at={at},for=0.05",)),
-    Case("packets come 0.2 ms late", NO_CAUSE, GO_ON, 0, 2e-3, ("bus-delays,at={at},size=0.2",)),
-    Case("packets come 5 ms late", BUS_LOST, STOP_QUICKLY, 21, 5e-3, ("bus-delays,at={at},size=5",)),
-    Case("10 % of the packets are out of order", NO_CAUSE, GO_ON, 0, 2e-3, ("bus-reorders,at={at}",)),
-    Case("10 % of the packets come twice", NO_CAUSE, GO_ON, 0, 2e-3, ("bus-repeats,at={at}",)),
-    Case("10 % of the packets are damaged", NO_CAUSE, GO_ON, 0, 2e-3, ("bus-corrupts,at={at}",)),
-    Case("the bus is down", BUS_LOST, STOP_QUICKLY, 21, 5e-3, ("bus-down,at={at}",)),
-    Case("the rig is killed and started again", BUS_LOST, STOP_QUICKLY, 21, 20e-3, act=_kill_rig),
-    Case("a drive has a fault", DRIVE_FAULT, STOP_QUICKLY, 3, 5e-3, ("drive-faults:{d},at={at}",)),
-    Case("a drive loses its power", DRIVE_OFF, STOP_QUICKLY, 3, 5e-3, ("drive-unpowered:{d},at={at}",)),
+    Case("1 % of the packets are lost", Cause.NONE, Reaction.GO_ON, 0, 2e-3, ("bus-drops,at={at},size=0.01",)),
+    Case("10 % of the packets are lost", Cause.NONE, Reaction.GO_ON, 0, 2e-3, ("bus-drops,at={at},size=0.1",)),
+    Case("50 packets in a row are lost", Cause.BUS_LOST, Reaction.QUICK_STOP, 21, 5e-3, ("bus-down,at={at},for=0.05",)),
+    Case("packets come 0.2 ms late", Cause.NONE, Reaction.GO_ON, 0, 2e-3, ("bus-delays,at={at},size=0.2",)),
+    Case("packets come 5 ms late", Cause.BUS_LOST, Reaction.QUICK_STOP, 21, 5e-3, ("bus-delays,at={at},size=5",)),
+    Case("10 % of the packets are out of order", Cause.NONE, Reaction.GO_ON, 0, 2e-3, ("bus-reorders,at={at}",)),
+    Case("10 % of the packets come twice", Cause.NONE, Reaction.GO_ON, 0, 2e-3, ("bus-repeats,at={at}",)),
+    Case("10 % of the packets are damaged", Cause.NONE, Reaction.GO_ON, 0, 2e-3, ("bus-corrupts,at={at}",)),
+    Case("the bus is down", Cause.BUS_LOST, Reaction.QUICK_STOP, 21, 5e-3, ("bus-down,at={at}",)),
+    Case("the rig is killed and started again", Cause.BUS_LOST, Reaction.QUICK_STOP, 21, 20e-3, act=_kill_rig),
+    Case("a drive has a fault", Cause.DRIVE_FAULT, Reaction.QUICK_STOP, 3, 5e-3, ("drive-faults:{d},at={at}",)),
+    Case("a drive loses its power", Cause.DRIVE_OFF, Reaction.QUICK_STOP, 3, 5e-3, ("drive-unpowered:{d},at={at}",)),
     Case(
-        "a drive ignores its commands", FOLLOWING_ERROR, BRAKE_AT_ONCE, 1500, 25e-3, ("drive-ignores:{d},at={at}",),
-        also=(DRIVE_DEVIATES,),
+        "a drive ignores its commands", Cause.FOLLOWING_ERROR, Reaction.BRAKE, 1500, 25e-3, ("drive-ignores:{d},at={at}",),
+        also=(Cause.DRIVE_DEVIATES,),
     ),
     Case(
-        "a drive stands still", FOLLOWING_ERROR, BRAKE_AT_ONCE, 1500, 25e-3, ("drive-stuck:{d},at={at}",),
-        also=(DRIVE_DEVIATES,),
+        "a drive stands still", Cause.FOLLOWING_ERROR, Reaction.BRAKE, 1500, 25e-3, ("drive-stuck:{d},at={at}",),
+        also=(Cause.DRIVE_DEVIATES,),
     ),
     Case(
-        "a drive runs away", DRIVE_DEVIATES, BRAKE_AT_ONCE, 250, 30e-3, ("drive-runs-away:{d},at={at}",),
-        also=(FOLLOWING_ERROR,),
+        "a drive runs away", Cause.DRIVE_DEVIATES, Reaction.BRAKE, 250, 30e-3, ("drive-runs-away:{d},at={at}",),
+        also=(Cause.FOLLOWING_ERROR,),
     ),
-    Case("the payload gains 5 kg", NO_CAUSE, GO_ON, 0, 3e-3, ("payload-jumps,at={at}",)),
-    Case("the payload loses 8 kg", NO_CAUSE, GO_ON, 0, 3e-3, ("payload-jumps,at={at},size=-8",)),
-    Case("5 periods are missed", NO_CAUSE, GO_ON, 0, 3e-3, act=_miss(5)),
-    Case("20 periods are missed", MISSED_PERIODS, STOP, 22, 15e-3, act=_miss(20)),
-    Case("50 periods are missed", DRIVE_FAULT, STOP_QUICKLY, 52, 15e-3, act=_miss(50), also=(MISSED_PERIODS,)),
-    Case("a stop is asked for", ASKED_TO_STOP, STOP, 2, 2e-3, act=_ask(StopRequest.CONTROLLED)),
-    Case("an emergency stop is asked for", EMERGENCY_STOP, STOP_QUICKLY, 2, 5e-3, act=_ask(StopRequest.QUICK)),
-    Case("the target's stream stops", TARGET_LOST, STOP, 112, 2e-3, streamed="stops"),
-    Case("the target's stream jumps", TARGET_JUMPS, STOP, 12, 2e-3, streamed="jumps"),
-    Case("the target's stream turns NaN", TARGET_NOT_FINITE, STOP, 12, 2e-3, streamed="is not finite"),
+    Case("the payload gains 5 kg", Cause.NONE, Reaction.GO_ON, 0, 3e-3, ("payload-jumps,at={at}",)),
+    Case("the payload loses 8 kg", Cause.NONE, Reaction.GO_ON, 0, 3e-3, ("payload-jumps,at={at},size=-8",)),
+    Case("5 periods are missed", Cause.NONE, Reaction.GO_ON, 0, 3e-3, act=_miss(5)),
+    Case("20 periods are missed", Cause.MISSED_PERIODS, Reaction.STOP, 22, 15e-3, act=_miss(20)),
+    Case(
+        "50 periods are missed", Cause.DRIVE_FAULT, Reaction.QUICK_STOP, 52, 15e-3, act=_miss(50), also=(Cause.MISSED_PERIODS,)
+    ),
+    Case("a stop is asked for", Cause.STOP_REQUESTED, Reaction.STOP, 2, 2e-3, act=_ask(StopRequest.CONTROLLED)),
+    Case("an emergency stop is asked for", Cause.EMERGENCY_STOP, Reaction.QUICK_STOP, 2, 5e-3, act=_ask(StopRequest.QUICK)),
+    Case("the target's stream stops", Cause.TARGET_LOST, Reaction.STOP, 112, 2e-3, streamed="stops"),
+    Case("the target's stream jumps", Cause.TARGET_JUMPS, Reaction.STOP, 12, 2e-3, streamed="jumps"),
+    Case("the target's stream turns NaN", Cause.TARGET_NOT_FINITE, Reaction.STOP, 12, 2e-3, streamed="is not finite"),
 )  # fmt: skip
 
 
@@ -206,7 +175,7 @@ class Outcome:
         """The figures, for JSON."""
         return {
             "case": self.case.name,
-            "expected": CAUSES[self.case.expected].text,
+            "expected": Cause(self.case.expected).text,
             "reactions": self.reactions,
             "cycles": self.cycles,
             "peak_m": self.peak,
@@ -242,7 +211,7 @@ def table(outcomes: list[Outcome]) -> Table:
     """The outcomes in words; figures are the median and the greatest over the seeds."""
     result = Table("case", "told", "reaction", "cycles until told", "peak deviation [mm]", "travel to rest [mm]")
     for each in outcomes:
-        told = CAUSES[each.case.expected].text.format("k") if each.case.expected else "-"
+        told = Cause(each.case.expected).text.format("k") if each.case.expected else "-"
         cycles = f"{np.median(each.cycles):.0f}, {max(each.cycles)}" if each.cycles else "-"
         peaks, travels = 1e3 * np.array(each.peak), 1e3 * np.array(each.travel)
         peak = f"{np.median(peaks):.2f}, {peaks.max():.2f}"
@@ -259,7 +228,7 @@ def _try(case: Case, seed: int, outcome: Outcome) -> None:
     config = SimulationConfig(target="sines", duration=MOTION_S, rate=RATE_HZ, seed=seed)
     with prepared_loop(config) as loop:
         _join(loop, [fault(text.format(**names)) for text in case.faults], seed)
-        hold = int(loop.parameters["hold_cycles"])
+        hold = int(loop.parameters["rig"]["hold_cycles"])
         onset = hold + round(at * RATE_HZ) if "{at}" in "".join(case.faults) or not case.faults else hold
         if case.streamed:
             onset -= onset % _SAMPLE_CYCLES
@@ -278,7 +247,7 @@ def _join(loop: PreparedLoop, faults: list[Record], seed: int) -> None:
     loop.emulator = new_udp_emulator(loop.fmu, loop.imu, rig, _SESSION)
     loop.kind = EMULATED_RIG
     loop.udp.socket["session"], loop.udp.socket["timeout_ns"] = _SESSION, round(1e9 * TIMEOUT_SHARE / RATE_HZ)
-    loop.parameters["command_delay"] = 1.0 / RATE_HZ
+    loop.parameters["load"]["command_delay"] = 1.0 / RATE_HZ
     loop.clock = new_clock(SCRIPTED, round(1e9 / RATE_HZ))
     loop.script = np.zeros((1 << 14, 3), np.int64)
     loop.records = np.zeros(1 << 14, RECORD)
@@ -298,7 +267,7 @@ _SAMPLE_CYCLES = 10
 
 def _follow_stream(loop: PreparedLoop, what: str, onset: int) -> None:
     """Stream the target until its fault."""
-    target, mechanism, hold = loop.target, loop.mechanism, int(loop.parameters["hold_cycles"])
+    target, mechanism, hold = loop.target, loop.mechanism, int(loop.parameters["rig"]["hold_cycles"])
     home, start = mechanism.require_home(), leg_lengths(mechanism, target.start.position, target.start.rotation)
     loop.stream, loop.segments = np.zeros((), STREAM), rest(start)
     reception = Reception(loop.stream, StreamPlanner(mechanism, start), 1.0 / RATE_HZ, LEAD_S)
@@ -327,17 +296,17 @@ def _judge(case: Case, seed: int, loop: PreparedLoop, cause: int, onset: int, ou
         if wrong:
             outcome.findings.append(f"{case.name}, seed {seed}: {what}")
 
-    moved = records[records["request"] != BRAKED]
+    moved = records[records["request"] != Request.BRAKED]
     # The cause that ended the run counts, not events before it.
-    reaction = GO_ON if cause == END_OF_MOTION else CAUSES[cause].reaction
-    outcome.reactions[REACTIONS[reaction]] = outcome.reactions.get(REACTIONS[reaction], 0) + 1
+    reaction = Reaction.GO_ON if cause == Cause.END_OF_MOTION else Cause(cause).reaction
+    outcome.reactions[Reaction(reaction).text] = outcome.reactions.get(Reaction(reaction).text, 0) + 1
     accepted = (case.expected, *case.also)
-    if case.reaction == GO_ON:
-        find(cause != END_OF_MOTION, f"ended: {loop.reason()}")
+    if case.reaction == Reaction.GO_ON:
+        find(cause != Cause.END_OF_MOTION, f"ended: {loop.reason()}")
     else:
         find(cause not in accepted, f"ended for another cause: {loop.reason()}")
     begin = onset
-    if case.expected != NO_CAUSE:
+    if case.expected != Cause.NONE:
         told = np.isin(records["event_cause"], accepted).any(axis=1)
         cycles = records["cycle"][told] - onset
         find(not len(cycles), "was not told")
@@ -346,32 +315,32 @@ def _judge(case: Case, seed: int, loop: PreparedLoop, cause: int, onset: int, ou
             outcome.cycles.append(int(cycles[0]))
             find(cycles[0] > case.within, f"took {cycles[0]} cycles, and {case.within} are allowed")
     since = moved[moved["cycle"] >= onset]
-    followed = since[since["mode"] != FAULT]
+    followed = since[since["mode"] != Mode.FAULT]
     off = np.abs(followed["truth"][:, TRUTH_LENGTHS] - followed["reference"][:, :, 0]).max(initial=0.0)
     outcome.peak.append(float(off))
     find(off > case.peak, f"a leg was {1e3 * off:.2f} mm off, and {1e3 * case.peak:g} are allowed")
-    after = records[(records["mode"] >= RUNNING) & (records["cycle"] >= begin)]
+    after = records[(records["mode"] >= Mode.RUNNING) & (records["cycle"] >= begin)]
     rested = np.vstack([after["truth"][:, TRUTH_LENGTHS], rig["truth"][TRUTH_LENGTHS]]) if len(after) else np.zeros((1, LEGS))
-    travel = np.abs(rested - rested[0]).max() if case.reaction != GO_ON else 0.0
+    travel = np.abs(rested - rested[0]).max() if case.reaction != Reaction.GO_ON else 0.0
     outcome.travel.append(float(travel))
     find(travel > MOST_TRAVEL_M, f"a leg went on for {1e3 * travel:.1f} mm, and {1e3 * MOST_TRAVEL_M:g} are allowed")
-    allowed = {case.reaction, *(CAUSES[each].reaction for each in case.also)}
-    find(reaction not in allowed, f"the reaction was: {REACTIONS[reaction]}")
+    allowed = {case.reaction, *(Cause(each).reaction for each in case.also)}
+    find(reaction not in allowed, f"the reaction was: {Reaction(reaction).text}")
     # Commands and references stay within the limits; a quick stop is no harder than the limit of acceleration.
-    find(np.abs(records["command"]).max() > _SLACK * float(loop.parameters["command_limit"]), "a command was above its limit")
+    find(np.abs(records["command"]).max() > _SLACK * float(loop.parameters["pid"]["limit"]), "a command was above its limit")
     find(np.abs(moved["reference"][:, :, 1]).max(initial=0.0) > _SLACK * limits.velocity, "a reference was too fast")
     find(
         np.abs(moved["reference"][:, :, 2]).max(initial=0.0) > _SLACK * limits.acceleration,
         "a reference was beyond the limit of acceleration",
     )
-    coasting = records[records["request"] == QUICK_STOP]["command"]
+    coasting = records[records["request"] == Request.QUICK_STOP]["command"]
     steps = np.abs(np.diff(coasting, axis=0)).max(initial=0.0)
     find(steps > _SLACK * limits.acceleration * period * (1 + int(records["missed"].max())), "a quick stop was too hard")
-    if case.reaction == STOP and len(moved):
-        stopping = records[records["mode"] == STOPPING]["truth"][:, TRUTH_LENGTHS]
+    if case.reaction == Reaction.STOP and len(moved):
+        stopping = records[records["mode"] == Mode.STOPPING]["truth"][:, TRUTH_LENGTHS]
         smooth = np.diff(stopping[::_SMOOTH], n=2, axis=0) / (_SMOOTH * period) ** 2
         hard = np.abs(smooth).max(initial=0.0)
         find(hard > case.hardness * limits.acceleration, f"the legs stopped at {hard:.3g} m/s2")
-    find(bool(np.abs(rig["velocity"]).max() > 0.0 or (rig["drive"] == FOLLOWING).any()), "a drive still moves")
+    find(bool(np.abs(rig["velocity"]).max() > 0.0 or (rig["drive"] == DriveState.FOLLOWING).any()), "a drive still moves")
     expected_cycles = np.arange(count) + np.cumsum(records["missed"])
     find(not np.array_equal(records["cycle"], expected_cycles), "a cycle is not recorded")

@@ -6,18 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.cycle import STATE
-from controller.estimation.fusion import (
-    calibrate,
-    find_pose,
-    fuse_heading,
-    fuse_legs,
-    fuse_mechanism,
-    fuse_platform,
-    improve_pose,
-)
+from controller.cycle import CONTROL, MARKS, MECHANISM, REFINEMENT, SCREENING, STATE, run_stages
+from controller.cycle import LEGS as LEG_FILTERS
 from controller.estimation.mechanism_filter import extrapolate_covariance
-from hil.realtime.clock import now
 from plant.compiled import Record, kernel
 from plant.dynamics.imposed import ImposedMotion
 from plant.imu import ImuModel, imu_state, measure
@@ -155,37 +146,31 @@ def fuse(parameters: Record, raw: Array, state: Record | None = None) -> Record:
         (N,), dtype `FUSED`.
     """
     fused = np.zeros(len(raw), FUSED)
-    _follow(parameters, np.zeros((), STATE) if state is None else state, raw, fused, np.zeros(2, np.int64))
+    _follow(
+        parameters, np.zeros((), STATE) if state is None else state, raw, fused, np.zeros((LEGS, 1, 5)), np.zeros((), MARKS)[()]
+    )
     return fused
 
 
 @kernel
-def _follow(parameters: Record, state: Record, raw: Array, fused: Record, timespec: NDArray[np.int64]) -> None:
-    s = state[()]
+def _follow(parameters: Record, state: Record, raw: Array, fused: Record, segments: Array, marks: Record) -> None:
+    p, s, m = parameters[()], state[()], marks
     for i in range(raw.shape[0]):
         f = fused[i]
-        began = now(timespec)
-        calibrate(parameters, state, raw[i])
-        before_legs = now(timespec)
-        fuse_legs(parameters, state)
-        f.ns[LEGS_ALONE] = now(timespec) - before_legs
-        fuse_platform(parameters, state)
-        fuse_heading(parameters, state)
-        find_pose(parameters, state)
-        f.ns[CLOSED] = now(timespec) - began
-        f.positions[CLOSED], f.rotations[CLOSED] = s.position, s.rotation
-        f.directions[:], f.vertical[:] = s.directions, s.vectors[0]
-        f.leg_covariances[:], f.vertical_covariance[:] = s.leg_covariance[:, :2, :2], s.platform_covariance[:3, :3]
-        began = now(timespec)
-        improve_pose(parameters, state)
-        f.ns[REFINED] = f.ns[CLOSED] + now(timespec) - began
-        f.positions[REFINED], f.rotations[REFINED] = s.position, s.rotation
+        run_stages(parameters, state, raw[i], segments, marks, SCREENING, REFINEMENT)
+        f.positions[CLOSED], f.rotations[CLOSED] = s.pose.position, s.pose.rotation
+        f.directions[:], f.vertical[:] = s.legs.directions, s.platform.vertical
+        f.leg_covariances[:], f.vertical_covariance[:] = s.legs.covariance[:, :2, :2], s.platform.covariance[:3, :3]
+        run_stages(parameters, state, raw[i], segments, marks, REFINEMENT, MECHANISM)
+        f.positions[REFINED], f.rotations[REFINED] = s.pose.position, s.pose.rotation
         for j in range(6):
             for k in range(6):
-                f.information[j, k] = s.information[max(j, k), min(j, k)]
-        began = now(timespec)
-        fuse_mechanism(parameters, state, True)
-        f.ns[WHOLE] = f.ns[REFINED] + now(timespec) - began
-        f.positions[WHOLE], f.rotations[WHOLE] = s.position, s.rotation
-        extrapolate_covariance(parameters[()].filter, s.filter, s.cycle * parameters[()].period, f.covariance)
-        s.cycle += 1
+                f.information[j, k] = s.pose.information[max(j, k), min(j, k)]
+        run_stages(parameters, state, raw[i], segments, marks, MECHANISM, CONTROL)
+        f.positions[WHOLE], f.rotations[WHOLE] = s.pose.position, s.pose.rotation
+        extrapolate_covariance(p.mechanism.filter, s.mechanism.filter, s.time.cycle * p.rig.period, f.covariance)
+        f.ns[LEGS_ALONE] = m.ns[LEG_FILTERS]
+        f.ns[CLOSED] = m.ns[:REFINEMENT].sum()
+        f.ns[REFINED] = f.ns[CLOSED] + m.ns[REFINEMENT]
+        f.ns[WHOLE] = f.ns[REFINED] + m.ns[MECHANISM]
+        s.time.cycle += 1

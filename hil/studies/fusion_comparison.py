@@ -15,14 +15,14 @@ import numpy as np
 from vqf import VQF
 
 from controller.calibration.file import Calibration, load_calibration
-from controller.cycle import STATE, cycle_parameters
+from controller.cycle import HEADING, MARKS, MECHANISM, SCREENING, STATE, cycle_parameters, run_stages
+from controller.cycle import LEGS as LEG_FILTERS
 from controller.direct_kinematics import solve_batch
-from controller.estimation.fusion import calibrate, find_pose, improve_pose
+from controller.estimation.filterpy_filters import FilterpyFilters
 from controller.estimation.leg_filter import leg_direction, start_leg
 from controller.settings import control_settings, sensor_settings
 from hil.progress import Progress, no_progress
 from hil.runs.config import FUSIONS
-from hil.runs.simulation import filterpy_filters
 from hil.studies.config import LEARNING_S, ComparisonConfig
 from hil.studies.fused_track import CLOSED, FUSED, REFINED, WHOLE, PoseErrors, PoseTrack, fuse, poses_of, read, track
 from plant.compiled import Record, kernel
@@ -128,7 +128,7 @@ def vqf_verticals(period: float, rates: Array, forces: Array) -> Array:
 @kernel
 def _point(parameters: Record, ups: Array, directions: Array) -> None:
     """Write the directions (N, 6, 3) of legs whose IMUs see the vertical as `ups` (7, N, 3)."""
-    sensors = parameters[()].sensors
+    sensors = parameters[()].rig.sensors
     x, covariance, still, rate = np.zeros(9), np.zeros((9, 9)), np.zeros(3), np.zeros(3)
     for k in range(LEGS):
         for i in range(directions.shape[0]):
@@ -139,19 +139,19 @@ def _point(parameters: Record, ups: Array, directions: Array) -> None:
 def _filterpy(readings: _Readings) -> PoseTrack:
     """The refined pose with the filters of legs and platform on filterpy."""
     parameters, state = readings.parameters(None), np.zeros((), STATE)
-    filters, fused = filterpy_filters(parameters), np.zeros(readings.count, FUSED)
+    filters, fused = FilterpyFilters(parameters), np.zeros(readings.count, FUSED)
+    segments, marks, pose = np.zeros((LEGS, 1, 5)), np.zeros((), MARKS)[()], state["pose"]
     for i, raw in enumerate(readings.raw):
         began = time.perf_counter_ns()
-        calibrate(parameters, state, raw)
-        filters.fuse_legs(state)
-        filters.fuse_platform(state)
-        find_pose(parameters, state)
-        improve_pose(parameters, state)
+        run_stages(parameters, state, raw, segments, marks, SCREENING, LEG_FILTERS)
+        filters.step_legs(state)
+        filters.step_platform(state)
+        run_stages(parameters, state, raw, segments, marks, HEADING, MECHANISM)
         fused["ns"][i, REFINED] = time.perf_counter_ns() - began
-        fused["positions"][i, REFINED], fused["rotations"][i, REFINED] = state["position"], state["rotation"]
-        lower = np.tril(state["information"])
+        fused["positions"][i, REFINED], fused["rotations"][i, REFINED] = pose["position"], pose["rotation"]
+        lower = np.tril(pose["information"])
         fused["information"][i] = lower + np.tril(lower, -1).T
-        state["cycle"] += 1
+        state["time"]["cycle"] += 1
     return track(fused, REFINED)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.cycle import check_imus
+from controller.imu_set import check_imus
 from hil.progress import Progress, no_progress
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import SimulationStoppedError, simulate

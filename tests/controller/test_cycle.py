@@ -8,24 +8,19 @@ import pytest
 from numba.core.runtime import _nrt_python, rtsys
 from scipy.spatial.transform import Rotation
 
-from controller.cycle import (
-    ALL_IMUS,
-    OK,
-    STATE,
-    check_imus,
-    cycle,
-    cycle_parameters,
-)
+from controller.cycle import STATE, cycle_parameters
 from controller.direct_kinematics import solve
-from controller.estimation.fusion import improve_pose
+from controller.imu_set import check_imus
 from controller.inverse_kinematics import leg_lengths, sample_workspace
-from controller.safety.watch import IDLE, NOT_FINITE, POSE_LOST, RUNNING
+from controller.safety.causes import Cause, Mode
 from controller.settings import ControlSettings, FusionSettings, SafetySettings, control_settings, fusion_settings
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import InputError
 from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER, imu_state, load_imu, measure
 from plant.mechanism import Mechanism
 from plant.pose import Pose
+from plant.wiring import ALL_IMUS
+from tests.controller.cycles import cycle, refine
 from tests.controller.leg_geometry import (
     angle_between,
     leg_directions,
@@ -63,7 +58,7 @@ def run(parameters, signals, segments, count, state=None):
     state = np.zeros((), STATE) if state is None else state
     for k in range(count):
         measurement = signals(k) if callable(signals) else signals
-        assert cycle(parameters, state, measurement, segments) == OK
+        assert cycle(parameters, state, measurement, segments) == Cause.NONE
     return state
 
 
@@ -120,11 +115,11 @@ def test_ideal_signals_at_rest_give_the_exact_pose(hexapod, imus):
             signals[:, missing] = np.nan
         lengths = leg_lengths(hexapod, position, rotation)
         state = run(parameters, signals, resting(lengths), 20)
-        assert np.linalg.norm(state["position"] - position) < 1e-9
-        assert angle_between(state["rotation"], rotation) < 1e-9
-        np.testing.assert_allclose(state["lengths"], lengths, rtol=0.0, atol=1e-9)
-        np.testing.assert_allclose(state["error"], 0.0, atol=1e-9)
-        np.testing.assert_allclose(state["twist"], 0.0, atol=1e-9)
+        assert np.linalg.norm(state["pose"]["position"] - position) < 1e-9
+        assert angle_between(state["pose"]["rotation"], rotation) < 1e-9
+        np.testing.assert_allclose(state["pose"]["lengths"], lengths, rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(state["pid"]["error"], 0.0, atol=1e-9)
+        np.testing.assert_allclose(state["pose"]["twist"], 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("count", [3, 4, 5])
@@ -141,8 +136,8 @@ def test_every_subset_is_either_refused_or_gives_the_pose(hexapod, count, platfo
             continue
         accepted += 1
         state = run(parameters, signals, segments, 5)
-        assert np.linalg.norm(state["position"] - position) < 1e-9
-        assert angle_between(state["rotation"], rotation) < 1e-9
+        assert np.linalg.norm(state["pose"]["position"] - position) < 1e-9
+        assert angle_between(state["pose"]["rotation"], rotation) < 1e-9
     assert accepted >= {3: 10, 4: 15, 5: 6}[count] if platform else accepted == {3: 0, 4: 15, 5: 6}[count]
 
 
@@ -176,8 +171,8 @@ def test_an_inclined_base_makes_no_difference_to_the_estimate(hexapod, tilt_deg)
         parameters = parameters_of(mechanism, imus)
         for position, rotation in zip(*sample_workspace(mechanism, 10, seed=2), strict=True):
             state = run(parameters, static_signals(mechanism, position, rotation), resting(np.full(6, 0.4)), 5)
-            assert np.linalg.norm(state["position"] - position) < 1e-9
-            assert angle_between(state["rotation"], rotation) < 1e-9
+            assert np.linalg.norm(state["pose"]["position"] - position) < 1e-9
+            assert angle_between(state["pose"]["rotation"], rotation) < 1e-9
 
 
 # ------------------------------------------------------------------------------------------------------------- the estimate
@@ -195,7 +190,9 @@ def test_from_an_unknown_pose_the_estimate_is_right_within_fifty_milliseconds(he
             return measurement
 
         state = run(parameters, read, resting(np.full(6, 0.4)), 50)
-        errors.append([np.linalg.norm(state["position"] - position), angle_between(state["rotation"], rotation)])
+        errors.append(
+            [np.linalg.norm(state["pose"]["position"] - position), angle_between(state["pose"]["rotation"], rotation)]
+        )
     worst = np.max(errors, axis=0)
     assert worst[0] < 2e-3
     assert worst[1] < 0.5 * DEGREE
@@ -238,9 +235,9 @@ def test_a_moving_platform_is_followed_by_ideal_imus_wherever_they_sit(hexapod, 
     parameters, state, errors = parameters_of(mechanism, imus), np.zeros((), STATE), []
     for k in range(3000):
         run(parameters, signals[k], resting(np.full(6, 0.394)), 1, state)
-        tilt = np.linalg.norm(np.cross(state["vectors"][0], rotations[k].T @ mechanism.up_in_base))
-        off = state["twist"] - twists[k]
-        apart = np.linalg.norm(state["position"] - positions[k]), angle_between(state["rotation"], rotations[k])
+        tilt = np.linalg.norm(np.cross(state["pose"]["vectors"][0], rotations[k].T @ mechanism.up_in_base))
+        off = state["pose"]["twist"] - twists[k]
+        apart = np.linalg.norm(state["pose"]["position"] - positions[k]), angle_between(state["pose"]["rotation"], rotations[k])
         errors.append([*apart, tilt * (PLATFORM_IMU in imus), np.linalg.norm(off[:3]), np.linalg.norm(off[3:])])
     position, rotation, tilt, velocity, turning = np.sqrt(np.mean(np.square(errors[500:]), axis=0))
     if PLATFORM_IMU not in imus:
@@ -264,21 +261,21 @@ def test_the_estimate_is_the_public_solvers_for_the_same_directions(hexapod, imu
     at, segments, state = wavy(hexapod, 4), resting(np.full(6, 0.394)), np.zeros((), STATE)
     for _ in range(10):
         run(parameters, at, segments, 20, state)
-        directions = np.where(np.isin(np.arange(6), imus)[:, None], state["directions"], np.nan)
-        extra = {"up_in_platform": state["vectors"][0], "tilt_sigma": fusion.tilt_sigma} if PLATFORM_IMU in imus else {}
+        directions = np.where(np.isin(np.arange(6), imus)[:, None], state["legs"]["directions"], np.nan)
+        extra = {"up_in_platform": state["pose"]["vectors"][0], "tilt_sigma": fusion.tilt_sigma} if PLATFORM_IMU in imus else {}
         solution = solve(hexapod, directions, leg_sigma=fusion.leg_sigma, **extra)
         # A thousandth of what the noise leaves uncertain.
-        assert np.linalg.norm(state["position"] - solution.position) < 1e-6
-        assert angle_between(state["rotation"], solution.rotation) < 1e-6
-        information = np.tril(state["information"]) + np.tril(state["information"], -1).T
+        assert np.linalg.norm(state["pose"]["position"] - solution.position) < 1e-6
+        assert angle_between(state["pose"]["rotation"], solution.rotation) < 1e-6
+        information = np.tril(state["pose"]["information"]) + np.tril(state["pose"]["information"], -1).T
         root = np.linalg.cholesky(solution.covariance)
         np.testing.assert_allclose(root.T @ information @ root, np.eye(6), atol=1e-3)
 
 
 def weigh(state, imus):
     """Use these IMUs, all alike."""
-    state["leg_used"] = state["leg_weights"] = [float(leg in imus) for leg in range(6)]
-    state["platform_used"] = state["vector_weights"][0] = float(PLATFORM_IMU in imus)
+    state["legs"]["used"] = state["legs"]["weights"] = [float(leg in imus) for leg in range(6)]
+    state["platform"]["used"] = state["pose"]["vector_weights"][0] = float(PLATFORM_IMU in imus)
 
 
 @pytest.mark.parametrize("imus", [ALL_IMUS, LEG_IMUS, (0, 1, 2, 3, 4, PLATFORM_IMU)])
@@ -292,29 +289,31 @@ def test_the_twist_is_the_motion_behind_the_rates_of_the_directions(hexapod, imu
             leg_directions(hexapod, position + sign * h * velocity, rotation_of(sign * h * omega) @ rotation)
             for sign in (1, -1)
         )
-        state["directions"], state["rates"] = leg_directions(hexapod, position, rotation), (ahead - behind) / (2.0 * h)
-        state["vectors"][0], state["platform_rate"] = rotation.T @ hexapod.up_in_base, rotation.T @ omega
-        state["position"], state["rotation"] = position, rotation
+        legs, pose = state["legs"], state["pose"]
+        legs["directions"], legs["rates"] = leg_directions(hexapod, position, rotation), (ahead - behind) / (2.0 * h)
+        pose["vectors"][0], state["platform"]["rate"] = rotation.T @ hexapod.up_in_base, rotation.T @ omega
+        pose["position"], pose["rotation"] = position, rotation
         weigh(state, imus)
-        assert improve_pose(parameters, state)
-        np.testing.assert_allclose(state["twist"], [*velocity, *omega], rtol=0.0, atol=1e-7)
-        np.testing.assert_allclose(state["position"], position, rtol=0.0, atol=1e-12)
+        assert refine(parameters, state)
+        np.testing.assert_allclose(state["pose"]["twist"], [*velocity, *omega], rtol=0.0, atol=1e-7)
+        np.testing.assert_allclose(state["pose"]["position"], position, rtol=0.0, atol=1e-12)
 
 
 def test_the_acceleration_is_the_derivative_of_the_twist_with_its_time_constant(hexapod):
     parameters, tau = parameters_of(hexapod), FusionSettings().acceleration_time
     position, rotation, acceleration = hexapod.home.position, np.eye(3), np.array([0.5, -0.3, 0.2])
     state = np.zeros((), STATE)
-    state["directions"], state["vectors"][0] = leg_directions(hexapod, position, rotation), hexapod.up_in_base
+    state["legs"]["directions"], state["pose"]["vectors"][0] = leg_directions(hexapod, position, rotation), hexapod.up_in_base
     weigh(state, ALL_IMUS)
     found = []
     for k in range(200):
         velocity, h = acceleration * k * PERIOD_S, 1e-6
         ahead, behind = (leg_directions(hexapod, position + sign * h * velocity, rotation) for sign in (1.0, -1.0))
-        state["rates"], state["position"], state["rotation"] = (ahead - behind) / (2.0 * h), position, rotation
-        assert improve_pose(parameters, state)
-        state["cycle"] += 1
-        found.append(state["acceleration"].copy())
+        state["legs"]["rates"] = (ahead - behind) / (2.0 * h)
+        state["pose"]["position"], state["pose"]["rotation"] = position, rotation
+        assert refine(parameters, state)
+        state["time"]["cycle"] += 1
+        found.append(state["pose"]["acceleration"].copy())
     found = np.array(found)
     np.testing.assert_allclose(found[-1], [*acceleration, 0.0, 0.0, 0.0], atol=2e-3)
     share = found[round(tau / PERIOD_S)][:3] / acceleration
@@ -348,12 +347,12 @@ def test_cycles_allocate_nothing(hexapod):
 
     parameters, state = parameters_of(hexapod), np.zeros((), STATE)
     measurement, segments = wavy(hexapod, 7)(0), resting(np.full(6, 0.394))
-    assert repeat(parameters, state, measurement, segments, 1) == OK
+    assert repeat(parameters, state, measurement, segments, 1) == Cause.NONE
     _nrt_python.memsys_enable_stats()
     allocated = []
     for count in (1, 1000):
         before = rtsys.get_allocation_stats()
-        assert repeat(parameters, state, measurement, segments, count) == OK
+        assert repeat(parameters, state, measurement, segments, count) == Cause.NONE
         allocated.append(rtsys.get_allocation_stats().alloc - before.alloc)
     _nrt_python.memsys_disable_stats()
     # What remains belongs to the call from Python.
@@ -362,7 +361,7 @@ def test_cycles_allocate_nothing(hexapod):
 
 def used(state):
     """The IMUs that the pose rests on."""
-    return [k for k in range(6) if state["leg_used"][k]] + [PLATFORM_IMU] * bool(state["platform_used"])
+    return [k for k in range(6) if state["legs"]["used"][k]] + [PLATFORM_IMU] * bool(state["platform"]["used"])
 
 
 @pytest.mark.parametrize("kind", [GYROSCOPE, ACCELEROMETER])
@@ -374,13 +373,13 @@ def test_an_imu_whose_reading_is_no_number_is_left_out_at_once_and_taken_back(he
     for cycles in (0, 5, 250):
         for axis in range(3):
             state = run(parameters, at, segments, cycles)
-            before = state["position"].copy()
+            before = state["pose"]["position"].copy()
             measurement = at(cycles).copy()
             measurement[kind, imu, axis] = bad
-            assert cycle(parameters, state, measurement, segments) == OK
+            assert cycle(parameters, state, measurement, segments) == Cause.NONE
             assert used(state) == sorted(set(ALL_IMUS) - {imu})
             # These readings sway without regard to each other, so every set of IMUs has a pose of its own.
-            assert cycles < 250 or np.linalg.norm(state["position"] - before) < 1e-2
+            assert cycles < 250 or np.linalg.norm(state["pose"]["position"] - before) < 1e-2
             run(parameters, lambda k, first=cycles + 1: at(first + k), segments, 125, state)
             assert used(state) == list(ALL_IMUS)
 
@@ -411,7 +410,7 @@ def test_an_imu_at_the_end_of_its_range_is_left_out(hexapod, kind, reach):
         state = run(parameters, at, segments, 250)
         measurement = at(250).copy()
         measurement[kind, 3, 1] = sign * reach
-        assert cycle(parameters, state, measurement, segments) == OK
+        assert cycle(parameters, state, measurement, segments) == Cause.NONE
         assert used(state) == [0, 1, 2, 4, 5, 6]
 
 
@@ -428,7 +427,7 @@ def test_too_few_sound_imus_stop_the_cycle(hexapod, bad):
     state = run(parameters, at, segments, 250)
     measurement = at(250).copy()
     measurement[ACCELEROMETER, [0, 1, 2, 3]] = bad
-    assert cycle(parameters, state, measurement, segments) == POSE_LOST
+    assert cycle(parameters, state, measurement, segments) == Cause.POSE_LOST
 
 
 def test_a_reading_that_is_not_used_may_be_no_number(hexapod):
@@ -444,12 +443,12 @@ def test_a_reference_that_is_no_number_is_not_armed_and_stops_the_cycle_in_motio
     parameters, signals = parameters_of(hexapod), static_signals(hexapod, hexapod.home.position, np.eye(3))
     lengths = leg_lengths(hexapod, hexapod.home.position, hexapod.home.rotation)
     state = run(parameters, signals, resting(np.full(6, np.nan)), 250)
-    assert state["safety"]["mode"] == IDLE
-    assert (state["command"] == 0.0).all()
+    assert state["safety"]["mode"] == Mode.IDLE
+    assert (state["pid"]["command"] == 0.0).all()
     state = run(parameters, signals, resting(lengths), 250)
-    assert state["safety"]["mode"] == RUNNING
-    assert cycle(parameters, state, signals, resting(np.full(6, np.nan))) == NOT_FINITE
-    assert (np.isfinite(state["command"])).all()
+    assert state["safety"]["mode"] == Mode.RUNNING
+    assert cycle(parameters, state, signals, resting(np.full(6, np.nan))) == Cause.NOT_FINITE
+    assert (np.isfinite(state["pid"]["command"])).all()
 
 
 def test_directions_that_no_longer_determine_a_pose_are_reported(hexapod):
@@ -457,7 +456,7 @@ def test_directions_that_no_longer_determine_a_pose_are_reported(hexapod):
     parameters, state = parameters_of(hexapod), np.zeros((), STATE)
     signals = static_signals(hexapod, hexapod.home.position, np.eye(3))
     signals[ACCELEROMETER, :6] = [0.0, 0.0, 9.81]
-    assert cycle(parameters, state, signals, resting(np.full(6, 0.4))) == POSE_LOST
+    assert cycle(parameters, state, signals, resting(np.full(6, 0.4))) == Cause.POSE_LOST
 
 
 # -------------------------------------------------------------------------------------------------------------- the control
@@ -470,11 +469,11 @@ def test_during_the_hold_all_commands_are_zero_and_nothing_winds_up(hexapod):
     segments, state = resting(home + 0.001), np.zeros((), STATE)
     for _ in range(50):
         run(parameters, signals, segments, 1, state)
-        np.testing.assert_array_equal(state["command"], 0.0)
-        np.testing.assert_array_equal(state["integral"], 0.0)
-        np.testing.assert_allclose(state["error"], 0.001, atol=1e-9)
+        np.testing.assert_array_equal(state["pid"]["command"], 0.0)
+        np.testing.assert_array_equal(state["pid"]["integral"], 0.0)
+        np.testing.assert_allclose(state["pid"]["error"], 0.001, atol=1e-9)
     run(parameters, signals, segments, 1, state)
-    assert (state["command"] > 0.0).all()
+    assert (state["pid"]["command"] > 0.0).all()
 
 
 @pytest.mark.parametrize(
@@ -486,7 +485,7 @@ def test_the_hold_lasts_as_long_as_it_should_at_every_rate(hexapod, rate, hold, 
     state, moving = np.zeros((), STATE), []
     for _ in range(cycles + 5):
         run(parameters, signals, resting(np.full(6, 0.396)), 1, state)
-        moving.append(np.abs(state["command"]).max() > 0.0)
+        moving.append(np.abs(state["pid"]["command"]).max() > 0.0)
     assert moving == [False] * cycles + [True] * 5
 
 
@@ -498,8 +497,8 @@ def test_the_references_time_begins_where_the_hold_ends(hexapod):
     state = np.zeros((), STATE)
     for k in range(80):
         run(parameters, signals, segments, 1, state)
-        np.testing.assert_allclose(state["reference"][:, 0], 0.394 + 0.01 * PERIOD_S * max(k - 50, 0), rtol=1e-13)
-        np.testing.assert_allclose(state["reference"][:, 1:], [[0.01, 0.0]] * 6)
+        np.testing.assert_allclose(state["reference"]["motion"][:, 0], 0.394 + 0.01 * PERIOD_S * max(k - 50, 0), rtol=1e-13)
+        np.testing.assert_allclose(state["reference"]["motion"][:, 1:], [[0.01, 0.0]] * 6)
 
 
 def test_a_derivative_is_not_kicked_by_an_error_that_was_there_during_the_hold(hexapod):
@@ -519,9 +518,9 @@ def test_a_command_drives_each_leg_towards_its_reference_within_the_limit(hexapo
     off = np.array([1e-3, -1e-3, 2e-3, -2e-3, 0.05, -0.05])
     balanced = run(parameters_of(hexapod), signals, resting(home), 201)["command"].copy()
     state = run(parameters_of(hexapod), signals, resting(home + off), 201)
-    np.testing.assert_allclose((state["command"] - balanced)[:4], control.proportional * off[:4], rtol=1e-6)
+    np.testing.assert_allclose((state["pid"]["command"] - balanced)[:4], control.proportional * off[:4], rtol=1e-6)
     limit = control.command_reserve * hexapod.limits.velocity
-    np.testing.assert_allclose(state["command"][4:], [limit, -limit], rtol=1e-12)
+    np.testing.assert_allclose(state["pid"]["command"][4:], [limit, -limit], rtol=1e-12)
 
 
 def potential_energy(mechanism, position, rotation):
@@ -569,9 +568,9 @@ def test_the_load_feed_forward_is_that_of_virtual_work(hexapod, case):
         lengths = leg_lengths(mechanism, position, rotation)
         state = run(parameters, static_signals(mechanism, position, rotation), resting(lengths), 3)
         np.testing.assert_allclose(
-            state["feed_forward"], speed_per_force * forces, rtol=0.0, atol=1e-7 * speed_per_force * 200.0
+            state["load"]["feed_forward"], speed_per_force * forces, rtol=0.0, atol=1e-7 * speed_per_force * 200.0
         )
-        np.testing.assert_allclose(state["command"], state["feed_forward"], rtol=0.0, atol=1e-8)
+        np.testing.assert_allclose(state["pid"]["command"], state["load"]["feed_forward"], rtol=0.0, atol=1e-8)
         assert np.abs(forces).max() > 5.0
 
 
@@ -595,13 +594,13 @@ def test_the_feed_forward_adds_the_references_speed_and_the_inertia_of_its_accel
 def test_settings_reach_the_cycle(hexapod):
     control = ControlSettings(proportional=11.0, integral=22.0, derivative=0.3, derivative_bandwidth=44.0, command_reserve=1.2)
     parameters = cycle_parameters(hexapod, 500.0, control, FusionSettings(leg_sigma=2e-3), LEG_IMUS)
-    np.testing.assert_allclose(parameters["gains"], [11.0, 22.0, 0.3, 44.0])
-    np.testing.assert_allclose(parameters["command_limit"], 1.2 * hexapod.limits.velocity)
-    np.testing.assert_allclose(parameters["leg_weight"], 1.0 / 2e-3**2)
-    assert parameters["imu_present"].tolist() == [1, 1, 1, 1, 1, 1, 0]
-    assert parameters["period"] == 1.0 / 500.0
+    np.testing.assert_allclose(parameters["pid"]["gains"], [11.0, 22.0, 0.3, 44.0])
+    np.testing.assert_allclose(parameters["pid"]["limit"], 1.2 * hexapod.limits.velocity)
+    np.testing.assert_allclose(parameters["legs"]["weight"], 1.0 / 2e-3**2)
+    assert parameters["imus"]["present"].tolist() == [1, 1, 1, 1, 1, 1, 0]
+    assert parameters["rig"]["period"] == 1.0 / 500.0
     # A white density d over samples at a rate f has the variance d^2 f / 2.
-    np.testing.assert_allclose(parameters["gyroscope_variance"], FusionSettings().gyroscope_noise ** 2 * 250.0)
+    np.testing.assert_allclose(parameters["legs"]["rate_variance"], FusionSettings().gyroscope_noise ** 2 * 250.0)
 
 
 def test_a_turn_of_the_whole_world_about_the_vertical_turns_the_estimate_with_it(hexapod):

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from controller.pid import step_pid
+from controller.pid import PARAMETERS, STATE, step_pid
 
 PERIOD_S = 1e-3
 LIMIT = 0.35
@@ -17,13 +17,13 @@ class Controllers:
     """Six controllers with their state."""
 
     def __init__(self, gains=GAINS, limit=LIMIT):
-        self.gains, self.limit = np.asarray(gains, dtype=float), limit
-        self.integral, self.previous, self.derivative, self.command = (np.zeros(6) for _ in range(4))
+        self.parameters, self.state = np.zeros((), PARAMETERS)[()], np.zeros((), STATE)[()]
+        self.parameters["gains"], self.parameters["limit"] = gains, limit
+        self.integral, self.command = self.state["integral"], self.state["command"]
 
     def step(self, error, feed_forward=0.0):
-        errors, feeds = (np.array(np.broadcast_to(value, 6), dtype=float) for value in (error, feed_forward))
-        state = (self.integral, self.previous, self.derivative, self.command)
-        step_pid(errors, feeds, self.gains, self.limit, PERIOD_S, *state)
+        self.state["error"] = error
+        step_pid(self.parameters, self.state, np.array(np.broadcast_to(feed_forward, 6), dtype=float), PERIOD_S)
         return self.command.copy()
 
 

@@ -6,17 +6,19 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from controller.cycle import ALL_IMUS, STATE, check_imus, cycle, cycle_parameters
+from controller.cycle import STATE, cycle_parameters
 from controller.direct_kinematics import poses_from_lengths
 from controller.direct_kinematics.geometry import geometry_of
 from controller.direct_kinematics.planar import pose_from_roll, solve_planar
-from controller.estimation.fusion import find_pose, improve_pose
+from controller.imu_set import check_imus
 from controller.inverse_kinematics import leg_lengths, sample_workspace
 from controller.planning.target import load_target
 from controller.settings import control_settings, fusion_settings
 from plant.errors import InputError
 from plant.mechanism import Mechanism, load_in_space, load_mechanism
 from plant.pose import rotation_from_vector
+from plant.wiring import ALL_IMUS
+from tests.controller.cycles import cycle, find, refine
 from tests.plant.dynamics.planar_bodies import coordinates, frames_at, jacobian, weight_force
 
 RATE_HZ = 1000.0
@@ -104,31 +106,32 @@ def test_the_refined_pose_is_the_optimum_in_the_plane(planar, rig):
     """Against a solver of its own on the angles of legs and platform, weighted alike; and so is its covariance."""
     random = np.random.default_rng(3)
     parameters = parameters_of(rig)
-    sigmas = 1.0 / np.sqrt([parameters["leg_weight"]] * 3 + [parameters["vertical_weight"]])
+    sigmas = 1.0 / np.sqrt([parameters["legs"]["weight"]] * 3 + [parameters["platform"]["weight"]])
     for _ in range(10):
         angle = random.uniform(-0.8, 0.2)
         angles = leg_angles(planar, random.uniform((0.08, 0.19), (0.12, 0.22)), angle) + 1e-3 * random.normal(size=3)
         roll = angle + 1e-3 * random.normal()
         state = np.zeros((), STATE)
         # The vertical seems to lean out of the plane, as a biased accelerometer has it, and the pose must not follow.
-        state["directions"], state["vectors"][0] = directions_at(angles), np.array([0.0, 1.0, 0.005]) @ turned(roll)
-        state["leg_used"][:3], state["leg_weights"][:3] = 1.0, parameters["leg_weight"]
-        state["platform_used"], state["vector_weights"][0] = 1, parameters["vertical_weight"]
-        assert find_pose(parameters, state) > 0.1
-        assert improve_pose(parameters, state)
+        pose = state["pose"]
+        state["legs"]["directions"], pose["vectors"][0] = directions_at(angles), np.array([0.0, 1.0, 0.005]) @ turned(roll)
+        state["legs"]["used"][:3], state["legs"]["weights"][:3] = 1.0, parameters["legs"]["weight"]
+        state["platform"]["used"], state["pose"]["vector_weights"][0] = 1, parameters["platform"]["weight"]
+        assert find(parameters, state) > 0.1
+        assert refine(parameters, state)
 
         def residuals(q, angles=angles, roll=roll):
             return np.append(leg_angles(planar, q[:2], q[2]) - angles, q[2] - roll) / sigmas
 
-        best = least_squares(residuals, [*state["position"][:2], roll], x_scale=[1e-2, 1e-2, 0.1], xtol=1e-15, ftol=1e-15)
-        found = np.append(state["position"][:2], np.arctan2(state["rotation"][1, 0], state["rotation"][0, 0]))
+        best = least_squares(residuals, [*pose["position"][:2], roll], x_scale=[1e-2, 1e-2, 0.1], xtol=1e-15, ftol=1e-15)
+        found = np.append(pose["position"][:2], np.arctan2(pose["rotation"][1, 0], pose["rotation"][0, 0]))
         np.testing.assert_allclose(found, best.x, rtol=0.0, atol=1e-7)
-        lower = state["information"]
+        lower = state["pose"]["information"]
         information = np.tril(lower) + np.tril(lower, -1).T
         covariance = np.linalg.inv(information)[np.ix_([0, 1, 5], [0, 1, 5])]
         np.testing.assert_allclose(covariance, np.linalg.inv(best.jac.T @ best.jac), rtol=1e-2)
-        assert state["position"][2] == 0.0
-        np.testing.assert_array_equal(state["rotation"][2], [0.0, 0.0, 1.0])
+        assert state["pose"]["position"][2] == 0.0
+        np.testing.assert_array_equal(state["pose"]["rotation"][2], [0.0, 0.0, 1.0])
 
 
 def test_poses_in_the_plane_follow_from_three_lengths(rig):
@@ -161,8 +164,8 @@ def test_at_rest_the_commands_make_up_for_the_weight(rig):
     p = rig.plant_parameters()
     q = np.array([*rig.home.position[:2], np.arctan2(rig.home.rotation[1, 0], rig.home.rotation[0, 0])])
     forces = np.linalg.solve(jacobian(p, q)[-3:].T, -weight_force(p, q))
-    np.testing.assert_allclose(state["feed_forward"][:3], parameters["droop"] * forces, rtol=1e-6)
-    np.testing.assert_allclose(state["lengths"][:3], coordinates(p, q)[-3:], atol=1e-8)
+    np.testing.assert_allclose(state["load"]["feed_forward"][:3], parameters["load"]["droop"] * forces, rtol=1e-6)
+    np.testing.assert_allclose(state["pose"]["lengths"][:3], coordinates(p, q)[-3:], atol=1e-8)
     for name in ("lengths", "command", "feed_forward", "error"):
         assert not state[name][3:].any()
 
@@ -190,8 +193,8 @@ def test_a_level_leg_is_no_worse_than_others(planar):
         signals = signals_at(rig)
         signals[:2] += np.array([5e-4, 0.02])[:, None, None] * random.normal(size=(2, 7, 3))
         cycle(parameters, state, signals, segments)
-    assert state["directions"][0] == pytest.approx([1.0, 0.0, 0.0], abs=1e-3)
-    np.testing.assert_allclose(state["position"], [0.25, 0.0, 0.0], atol=1e-3)
+    assert state["legs"]["directions"][0] == pytest.approx([1.0, 0.0, 0.0], abs=1e-3)
+    np.testing.assert_allclose(state["pose"]["position"], [0.25, 0.0, 0.0], atol=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@
 Pure functions on integers.
 """
 
-from controller.safety.watch import BRAKED, ENABLED, FAULTY, FOLLOWING, OFF, QUICK_STOPPING, READY
+from controller.safety.causes import DriveState, Request
 
 (
     NOT_READY, SWITCH_ON_DISABLED, READY_TO_SWITCH_ON, SWITCHED_ON, OPERATION_ENABLED, QUICK_STOP_ACTIVE, FAULT_REACTION_ACTIVE,
@@ -122,14 +122,14 @@ def controlword_towards(request: int, state: int) -> int:
     `BRAKED` leads to Switched on, `ENABLED` to Operation enabled, `QUICK_STOP` to rest in Switch on disabled. A quick stop is
     let finish before the drive is enabled again; `BRAKED` cuts it short. A fault is never reset here.
     """
-    if request not in (BRAKED, ENABLED):
+    if request not in (Request.BRAKED, Request.ENABLED):
         return QUICK_STOP_COMMAND
     if state == SWITCH_ON_DISABLED:
         return SHUTDOWN
     if state == QUICK_STOP_ACTIVE:
-        return QUICK_STOP_COMMAND if request == ENABLED else DISABLE_VOLTAGE
+        return QUICK_STOP_COMMAND if request == Request.ENABLED else DISABLE_VOLTAGE
     if state in (SWITCHED_ON, OPERATION_ENABLED):
-        return ENABLE_OPERATION if request == ENABLED else SWITCH_ON
+        return ENABLE_OPERATION if request == Request.ENABLED else SWITCH_ON
     return SWITCH_ON if state == READY_TO_SWITCH_ON else DISABLE_VOLTAGE
 
 
@@ -141,9 +141,9 @@ def drive_state(word: int) -> int:
     """
     state = state_of(word)
     if state in (FAULT, FAULT_REACTION_ACTIVE):
-        return FAULTY
+        return DriveState.FAULTY
     if state == QUICK_STOP_ACTIVE:
-        return QUICK_STOPPING
+        return DriveState.QUICK_STOPPING
     if state == OPERATION_ENABLED and word & FOLLOWS_TARGET:
-        return FOLLOWING
-    return READY if state > NOT_READY and word & VOLTAGE_ENABLED else OFF
+        return DriveState.FOLLOWING
+    return DriveState.READY if state > NOT_READY and word & VOLTAGE_ENABLED else DriveState.NOT_READY

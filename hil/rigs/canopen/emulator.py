@@ -7,7 +7,7 @@ from typing import Any
 import can
 import numpy as np
 
-from controller.safety.watch import FOLLOWING, QUICK_STOPPING
+from controller.safety.causes import DriveState
 from hil.rigs.canopen.nodes import CanopenNodes
 from hil.rigs.canopen.settings import CanopenSettings
 from hil.rigs.emulation.drives import EMULATED, move, sample
@@ -55,7 +55,7 @@ class PlantMachine:
 
     def restart(self) -> None:
         """All nodes are started anew: the platform is put back to its start, unless it moves."""
-        if self.rig["enabled_ns"] < 0 or np.isin(self.drive, (FOLLOWING, QUICK_STOPPING)).any():
+        if self.rig["enabled_ns"] < 0 or np.isin(self.drive, (DriveState.FOLLOWING, DriveState.QUICK_STOPPING)).any():
             return
         self._plant.close()
         self._plant, self._imu, made = self._made()

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.realtime.clock import now
 from hil.rigs import ANSWERED, BRAKED, FAULTY, FOLLOWING, QUICK_STOP, QUICK_STOPPING, SILENT
 from hil.rigs.emulation.drives import move, sample
 from hil.rigs.emulation.faults import disturb, draw
@@ -27,6 +26,7 @@ from plant.compiled import Record, kernel
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS
 from plant.pose import Array
+from plant.stopwatch import now
 
 WATCHDOG_S = 0.03
 WATCHDOG_CODE = 0x8130

@@ -12,7 +12,6 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from hil.realtime.clock import now
 from hil.rigs import ANSWERED, FAULTY, OFF, SILENT
 from hil.rigs.udp.datagrams import (
     COMMAND_DATAGRAM,
@@ -31,6 +30,7 @@ from plant.dynamics.variables import IMU_COUNT
 from plant.errors import InputError
 from plant.mechanism import LEGS
 from plant.pose import Array
+from plant.stopwatch import now
 
 DEFAULT_ADDRESS = "127.0.0.1:47100"
 
@@ -215,7 +215,7 @@ def decode_answer(link: UdpLink, length: int, feedback: Record) -> bool:
             for i in range(3):
                 feedback.measurement[kind, k, i] = a.measurement[kind, k, i]
     for k in range(LEGS):
-        feedback.drive[k] = a.drive[k] if a.drive[k] <= FAULTY else OFF
+        feedback.drive[k] = a.drive[k] if a.drive[k] <= FAULTY else OFF.value
         feedback.drive_code[k], feedback.sent[k] = a.code[k], a.velocity[k]
     for i in range(feedback.truth.size):
         feedback.truth[i] = t.truth[i] if with_truth else np.nan

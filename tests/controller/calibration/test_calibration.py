@@ -10,11 +10,13 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from controller.calibration.file import Calibration, join_gain, load_calibration, save_calibration, split_gain
-from controller.cycle import OK, STATE, cycle, cycle_parameters
-from controller.estimation.mechanism_filter import ERRORS
+from controller.cycle import STATE, cycle_parameters
+from controller.estimation.imu_errors import ERRORS
+from controller.safety.causes import Cause
 from controller.settings import control_settings, fusion_settings
 from plant.errors import InputError
 from plant.imu import imu_state, load_imu, measure
+from tests.controller.cycles import cycle
 from tests.controller.leg_geometry import angle_between, rotation_of, static_signals
 
 
@@ -96,8 +98,10 @@ def test_the_cycle_applies_it(hexapod):
         state = np.zeros((), STATE)
         for _ in range(100):
             measure(imu, static_signals(hexapod, position, rotation), raw)
-            assert cycle(parameters, state, raw, segments) == OK
-        errors.append((np.linalg.norm(state["position"] - position), angle_between(state["rotation"], rotation)))
+            assert cycle(parameters, state, raw, segments) == Cause.NONE
+        errors.append(
+            (np.linalg.norm(state["pose"]["position"] - position), angle_between(state["pose"]["rotation"], rotation))
+        )
     assert errors[1][0] < 1e-9
     assert errors[1][1] < 1e-9
     assert errors[0][0] > 5e-3
@@ -108,10 +112,10 @@ def test_what_it_leaves_is_what_the_filter_knows_of_the_sensors(hexapod):
     parameters = cycle_parameters(
         hexapod, 1000.0, control_settings(hexapod), fusion_settings(hexapod), whole="alignments", calibration=calibration
     )
-    prior = parameters["filter"]["prior"]
+    prior = parameters["mechanism"]["filter"]["prior"]
     np.testing.assert_array_equal(prior[: 7 * ERRORS, : 7 * ERRORS], calibration.covariance)
     assert not prior[7 * ERRORS :].any()
-    assert parameters["filter"]["rig"] == 0
+    assert parameters["mechanism"]["filter"]["rig"] == 0
 
 
 @pytest.mark.parametrize(

@@ -17,9 +17,10 @@ from controller.calibration.at_rest import (
     undo,
 )
 from controller.calibration.file import Calibration
-from controller.estimation.mechanism_filter import ERRORS, JOINTS, error_matrix
-from controller.estimation.readings import sensor_geometry
+from controller.estimation.imu_errors import ERRORS, error_matrix
+from controller.estimation.rig_jacobian import JOINTS
 from controller.inverse_kinematics import leg_lengths, sample_workspace
+from controller.rig import sensor_geometry
 from controller.settings import sensor_settings
 from plant.dynamics.imposed import impose
 from plant.imu import imu_state, load_imu, measure

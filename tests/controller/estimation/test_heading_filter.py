@@ -6,16 +6,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from controller.cycle import ALL_IMUS, OK, STATE, check_imus, cycle, cycle_parameters
+from controller.cycle import STATE, cycle_parameters
 from controller.direct_kinematics import solve
 from controller.estimation.heading_filter import ERRORS, STATES, predict_heading, start_heading, update_heading
+from controller.imu_set import check_imus
 from controller.inverse_kinematics import leg_lengths, sample_workspace
-from controller.safety.watch import POSE_LOST
+from controller.safety.causes import Cause
 from controller.settings import FusionSettings, SafetySettings, control_settings, fusion_settings
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import InputError
 from plant.imu import MAGNETOMETER, imu_state, load_imu, measure
 from plant.mechanism import Mechanism
+from plant.wiring import ALL_IMUS
+from tests.controller.cycles import cycle
 from tests.controller.leg_geometry import UP, angle_between, leg_directions, rotation_of, static_signals
 
 PERIOD_S, EVERY = 1e-3, 10
@@ -108,7 +111,7 @@ def run(parameters, signals, count, state=None):
     state, segments = np.zeros((), STATE) if state is None else state, np.zeros((6, 1, 5))
     segments[:, 0, 1] = 0.394
     for _ in range(count):
-        assert cycle(parameters, state, signals, segments) == OK
+        assert cycle(parameters, state, signals, segments) == Cause.NONE
     return state
 
 
@@ -120,9 +123,9 @@ def test_any_two_legs_and_the_whole_orientation_give_the_exact_pose(hexapod, leg
         signals = static_signals(hexapod, position, rotation)
         signals[:, [leg for leg in range(6) if leg not in legs]] = np.nan
         state = run(parameters, signals, 20)
-        assert np.linalg.norm(state["position"] - position) < 1e-9
-        assert angle_between(state["rotation"], rotation) < 1e-9
-        np.testing.assert_allclose(state["lengths"], leg_lengths(hexapod, position, rotation), rtol=0.0, atol=1e-9)
+        assert np.linalg.norm(state["pose"]["position"] - position) < 1e-9
+        assert angle_between(state["pose"]["rotation"], rotation) < 1e-9
+        np.testing.assert_allclose(state["pose"]["lengths"], leg_lengths(hexapod, position, rotation), rtol=0.0, atol=1e-9)
 
 
 def noisy(mechanism, seed=0):
@@ -141,13 +144,13 @@ def test_section_5_is_the_public_solvers_for_the_same_measurements(hexapod):
     parameters, read, state = parameters_of(hexapod, magnetometer=True, section_5=True), noisy(hexapod), None
     for _ in range(300):
         state = run(parameters, read(), 1, state)
-    up, north = state["vectors"]
+    up, north = state["pose"]["vectors"]
     aligned, _ = Rotation.align_vectors([UP, [1.0, 0.0, 0.0]], [up, north], weights=[np.inf, 1.0])
     rotation = aligned.as_matrix()
-    solution = solve(hexapod, state["directions"], rotation=rotation, method="section-5", refine=False)
-    np.testing.assert_allclose(state["rotation"], rotation, atol=1e-9)
-    np.testing.assert_allclose(state["position"], solution.position, atol=1e-9)
-    np.testing.assert_array_equal(state["information"], 0.0)
+    solution = solve(hexapod, state["legs"]["directions"], rotation=rotation, method="section-5", refine=False)
+    np.testing.assert_allclose(state["pose"]["rotation"], rotation, atol=1e-9)
+    np.testing.assert_allclose(state["pose"]["position"], solution.position, atol=1e-9)
+    np.testing.assert_array_equal(state["pose"]["information"], 0.0)
 
 
 def test_without_it_the_magnetometer_makes_no_difference(hexapod):
@@ -172,9 +175,9 @@ def test_a_magnetometer_at_fault_is_left_out_and_taken_back(hexapod, fault):
             measurement[MAGNETOMETER] = {"lost": np.nan, "disturbed": [60.0, 0.0, -46.0], "frozen": stuck}[fault]
         state = run(parameters, measurement, 1, state)
         if k in (299, 799) or 300 + 150 * (fault == "frozen") <= k < 500:
-            assert state["heading_used"] == (not 300 <= k < 500), k
-            assert (state["vector_weights"][1] > 0.0) == (not 300 <= k < 500)
-    assert angle_between(state["rotation"], hexapod.home.rotation) < np.radians(0.3)
+            assert state["heading"]["used"] == (not 300 <= k < 500), k
+            assert (state["pose"]["vector_weights"][1] > 0.0) == (not 300 <= k < 500)
+    assert angle_between(state["pose"]["rotation"], hexapod.home.rotation) < np.radians(0.3)
 
 
 def test_a_set_that_needs_it_stops_without_it(hexapod):
@@ -182,7 +185,7 @@ def test_a_set_that_needs_it_stops_without_it(hexapod):
     signals = static_signals(hexapod, hexapod.home.position, np.eye(3))
     state = run(parameters, signals, 10)
     signals[MAGNETOMETER, PLATFORM_IMU] = np.nan
-    assert cycle(parameters, state, signals, np.zeros((6, 1, 5))) == POSE_LOST
+    assert cycle(parameters, state, signals, np.zeros((6, 1, 5))) == Cause.POSE_LOST
 
 
 def test_the_heading_counts_by_its_weight(hexapod):
@@ -197,8 +200,8 @@ def test_the_heading_counts_by_its_weight(hexapod):
         return np.concatenate([legs, turned.T @ UP, turned.T @ [1.0, 0.0, 0.0]])
 
     jacobian = np.array([(measured(h) - measured(-h)) / 2e-6 for h in 1e-6 * np.eye(6)]).T
-    weights = np.repeat([parameters["leg_weight"], *state["vector_weights"]], [6, 3, 3])
-    lower = np.tril(state["information"])
+    weights = np.repeat([parameters["legs"]["weight"], *state["pose"]["vector_weights"]], [6, 3, 3])
+    lower = np.tril(state["pose"]["information"])
     np.testing.assert_allclose(lower, np.tril(jacobian.T @ (weights[:, None] * jacobian)), rtol=1e-5, atol=1e-2)
 
 
@@ -209,9 +212,9 @@ def test_the_whole_mechanism_filter_finds_the_headings_offset_and_is_not_turned_
     signals = static_signals(hexapod, position, rotation)
     signals[MAGNETOMETER, PLATFORM_IMU] = rotation.T @ rotation_of([0.0, 0.0, np.radians(angle_deg)]) @ FIELD
     state = run(parameters, signals, 3000)
-    assert state["filter_trusted"] == 1
-    assert np.degrees(state["filter"]["heading_offset"]) == pytest.approx(angle_deg, rel=0.1)
-    assert angle_between(state["rotation"], rotation) < np.radians(0.1)
+    assert state["mechanism"]["trusted"] == 1
+    assert np.degrees(state["mechanism"]["filter"]["heading_offset"]) == pytest.approx(angle_deg, rel=0.1)
+    assert angle_between(state["pose"]["rotation"], rotation) < np.radians(0.1)
 
 
 def test_sets_that_do_not_do_are_refused_with_the_remedy(hexapod):

@@ -3,15 +3,17 @@
 import numpy as np
 import pytest
 
-from controller.cycle import ALL_IMUS, STATE, cycle_parameters
+from controller.cycle import STATE, cycle_parameters
 from controller.direct_kinematics import integrity, solve
 from controller.direct_kinematics.refinement import normal_equations, solve_normal_equations
-from controller.estimation.imu_monitor import MONITOR, contradiction, look_at_next
+from controller.estimation import imu_monitor, pose_estimator
+from controller.estimation.imu_monitor import contradiction, look_at_next
 from controller.inverse_kinematics import inverse_kinematics, sample_workspace
 from controller.settings import control_settings, fusion_settings
 from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
 from plant.mechanism import load_mechanism
 from plant.pose import Pose, rotation_from_vector
+from plant.wiring import ALL_IMUS
 
 UP = np.array([0.0, 0.0, 1.0])
 DEGREE = np.pi / 180.0
@@ -22,21 +24,20 @@ def monitored(mechanism, pose, directions, vertical, used=range(6), turns=1):
     fusion = fusion_settings(mechanism)
     weights = np.zeros(6)
     weights[list(used)] = 1.0 / fusion.leg_sigma**2
-    in_base, in_platform = np.array([UP, UP]), np.array([vertical, vertical])
-    vector_weights = np.array([1.0 / fusion.tilt_sigma**2, 0.0])
-    arms, predicted, lengths = np.zeros((6, 3)), np.zeros((6, 3)), np.zeros(6)
-    information, right, factor = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
+    pose_state = np.zeros((), pose_estimator.STATE)[()]
+    pose_state["position"], pose_state["rotation"] = pose.position, pose.rotation
+    pose_state["vectors"], pose_state["vector_weights"] = vertical, (1.0 / fusion.tilt_sigma**2, 0.0)
+    s = pose_state
     normal_equations(
-        mechanism.base_joints, mechanism.platform_joints, directions, weights, in_base, in_platform, vector_weights,
-        np.array(pose.position), np.array(pose.rotation), arms, predicted, lengths, information, right,
+        mechanism.base_joints, mechanism.platform_joints, directions, weights, np.array([UP, UP]), s["vectors"],
+        s["vector_weights"], s["position"], s["rotation"], s["arms"], s["directions"], s["lengths"], s["information"],
+        s["correction"],
     )  # fmt: skip
-    assert solve_normal_equations(information, right, factor)
-    monitor = np.zeros((), MONITOR)
+    assert solve_normal_equations(s["information"], s["correction"], s["factor"])
+    parameters, monitor = np.zeros((), imu_monitor.PARAMETERS), np.zeros((), imu_monitor.STATE)
+    parameters["smoothing"] = 1.0
     for _ in range(turns * IMU_COUNT):
-        look_at_next(
-            monitor[()], factor, arms, predicted, lengths, directions, weights, np.array(pose.rotation), UP, vertical,
-            vector_weights[0], 1.0,
-        )  # fmt: skip
+        look_at_next(parameters[()], monitor[()], pose_state, directions, weights, UP)
     return monitor
 
 
@@ -103,5 +104,5 @@ def test_what_the_pose_needs_contradicts_nothing(hexapod):
 
 def test_in_the_cycle_it_is_off_for_raw_imus(hexapod):
     settings = control_settings(hexapod), fusion_settings(hexapod)
-    assert cycle_parameters(hexapod, 1000.0, *settings, ALL_IMUS)["safety"]["watch_imus"] == 1
+    assert cycle_parameters(hexapod, 1000.0, *settings, ALL_IMUS)["safety"]["monitor"]["active"] == 1
     assert np.zeros((), STATE)["safety"]["monitor"]["looked_at"] == 0

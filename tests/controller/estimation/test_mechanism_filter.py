@@ -4,25 +4,22 @@ import numpy as np
 import pytest
 from numba import njit
 
+from controller.estimation.imu_errors import ERRORS, distort, error_gradient
 from controller.estimation.mechanism_filter import (
     ALL_ERRORS,
     BLOCKS,
-    ERRORS,
     FILTER_STATE,
-    JOINTS,
     MOTION_STATES,
-    RIG,
-    TILT,
     collect,
-    distort,
-    error_gradient,
     extrapolate,
     extrapolate_covariance,
     filter_parameters,
     start_filter,
     step_filter,
 )
-from controller.estimation.readings import READINGS_SCRATCH, predict_readings, sensor_geometry
+from controller.estimation.readings import READINGS_SCRATCH, predict_readings
+from controller.estimation.rig_jacobian import JOINTS, RIG_ERRORS, TILT
+from controller.rig import sensor_geometry
 from controller.settings import FusionSettings, fusion_settings
 from plant.dynamics.imposed import impose
 from plant.errors import UnknownNameError
@@ -223,7 +220,10 @@ def test_taken_bit_by_bit_it_equals_its_dense_twin(hexapod, errors, rig, toleran
     parameters = filter_parameters(settings, RATE_HZ, errors, None)
     if rig:
         # Correlated, as rests leave it; the twin's derivatives are differences.
-        prior, mixed = parameters["prior"][:ALL_ERRORS, :ALL_ERRORS], random.normal(size=(ALL_ERRORS + RIG, ALL_ERRORS + RIG))
+        prior, mixed = (
+            parameters["prior"][:ALL_ERRORS, :ALL_ERRORS],
+            random.normal(size=(ALL_ERRORS + RIG_ERRORS, ALL_ERRORS + RIG_ERRORS)),
+        )
         spread = np.diag(np.sqrt(np.concatenate([np.diag(prior), np.full(JOINTS, 1e-8), np.full(TILT, 1e-6)])))
         covariance = spread @ (np.eye(len(mixed)) + mixed @ mixed.T / len(mixed)) @ spread
         parameters = filter_parameters(settings, RATE_HZ, errors, covariance)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from controller.estimation.readings import READINGS_SCRATCH, predict_readings, sensor_geometry
+from controller.estimation.readings import READINGS_SCRATCH, predict_readings
+from controller.rig import sensor_geometry
 from plant.dynamics.imposed import impose
 from plant.mechanism import Mechanism, load_spatial
 from plant.pose import rotation_angle

@@ -28,7 +28,7 @@ from controller.planning.stream import (
 )
 from controller.planning.stream_planner import StreamPlanner, TargetRefusedError
 from controller.planning.target import load_target
-from controller.safety.watch import BEYOND_STROKE, NO_CAUSE, TARGET_JUMPS, TARGET_LOST, TARGET_NOT_FINITE
+from controller.safety.causes import Cause
 from hil.loop.records import shared_array
 from plant.errors import InputError, UnreachableError
 from plant.pose import quaternion_from_rotation
@@ -221,14 +221,14 @@ def test_a_standing_target_is_reached_exactly_and_planned_for_once(hexapod):
 @pytest.mark.parametrize(
     ("sample", "cause"),
     [
-        (([np.nan, 0.0, 0.0], LEVEL), TARGET_NOT_FINITE),
-        (([0.0, 0.0, np.inf], LEVEL), TARGET_NOT_FINITE),
-        (([0.0, 0.0, 0.0], [np.nan, 0.0, 0.0, 0.0]), TARGET_NOT_FINITE),
-        (([0.0, 0.0, 0.0], 1.002 * LEVEL), TARGET_NOT_FINITE),
-        (([0.0, 0.0, 0.0], 0.0 * LEVEL), TARGET_NOT_FINITE),
-        (([0.0, 0.0, 0.5], LEVEL), BEYOND_STROKE),
-        (([0.0, 0.0, -0.5], LEVEL), BEYOND_STROKE),
-        (([0.0, 0.0, 0.01], LEVEL), TARGET_JUMPS),
+        (([np.nan, 0.0, 0.0], LEVEL), Cause.TARGET_NOT_FINITE),
+        (([0.0, 0.0, np.inf], LEVEL), Cause.TARGET_NOT_FINITE),
+        (([0.0, 0.0, 0.0], [np.nan, 0.0, 0.0, 0.0]), Cause.TARGET_NOT_FINITE),
+        (([0.0, 0.0, 0.0], 1.002 * LEVEL), Cause.TARGET_NOT_FINITE),
+        (([0.0, 0.0, 0.0], 0.0 * LEVEL), Cause.TARGET_NOT_FINITE),
+        (([0.0, 0.0, 0.5], LEVEL), Cause.BEYOND_STROKE),
+        (([0.0, 0.0, -0.5], LEVEL), Cause.BEYOND_STROKE),
+        (([0.0, 0.0, 0.01], LEVEL), Cause.TARGET_JUMPS),
     ],
 )
 def test_what_cannot_be_followed_is_refused_with_its_cause(hexapod, sample, cause):
@@ -237,7 +237,7 @@ def test_what_cannot_be_followed_is_refused_with_its_cause(hexapod, sample, caus
     with pytest.raises(TargetRefusedError) as refusal:
         planner.add(0.01, *sample)
     assert refusal.value.cause == cause
-    assert not abs(refusal.value.value) <= refusal.value.limit or cause == BEYOND_STROKE
+    assert not abs(refusal.value.value) <= refusal.value.limit or cause == Cause.BEYOND_STROKE
     # What was refused is forgotten.
     planner.add(0.01, [1e-4, 0.0, 0.0], 1.0005 * LEVEL)
 
@@ -356,12 +356,12 @@ def test_a_plan_that_is_being_written_is_left():
 
 def test_a_stream_is_lost_when_no_sample_comes_for_longer_than_the_patience():
     stream = new_stream()
-    assert stream_cause(stream, 10**12, 10**8)[0] == NO_CAUSE
+    assert stream_cause(stream, 10**12, 10**8)[0] == Cause.NONE
     note_sample(stream, 10**9)
-    assert stream_cause(stream, 11 * 10**8, 10**8)[0] == NO_CAUSE
+    assert stream_cause(stream, 11 * 10**8, 10**8)[0] == Cause.NONE
     cause, index, value, limit = stream_cause(stream, 12 * 10**8, 10**8)
-    assert (cause, index) == (TARGET_LOST, 0)
+    assert (cause, index) == (Cause.TARGET_LOST, 0)
     assert value == pytest.approx(0.2) and limit == pytest.approx(0.1)
-    fail_stream(stream, TARGET_JUMPS, 3, 0.02, 0.005)
-    fail_stream(stream, TARGET_NOT_FINITE, 0, np.nan, np.nan)
-    assert stream_cause(stream, 10**9, 10**8) == (TARGET_JUMPS, 3, 0.02, 0.005)
+    fail_stream(stream, Cause.TARGET_JUMPS, 3, 0.02, 0.005)
+    fail_stream(stream, Cause.TARGET_NOT_FINITE, 0, np.nan, np.nan)
+    assert stream_cause(stream, 10**9, 10**8) == (Cause.TARGET_JUMPS, 3, 0.02, 0.005)

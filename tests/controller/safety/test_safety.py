@@ -5,41 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.cycle import OK, STATE, cycle, cycle_parameters, prepare
+from controller.cycle import STATE, cycle_parameters, hear_rig, prepare_next, react
 from controller.inverse_kinematics import leg_lengths
-from controller.safety.watch import (
-    ARMED,
-    ASKED_TO_STOP,
-    BRAKED,
-    BUS_LOST,
-    CAUSES,
-    DRIVE_FAULT,
-    DRIVE_OFF,
-    EMERGENCY_STOP,
-    ENABLED,
-    FAULT,
-    FAULTY,
-    FOLLOWING,
-    IDLE,
-    NO_AGREEMENT,
-    NO_DRIVES,
-    OFF,
-    QUICK_STOP,
-    QUICK_STOPPING,
-    READY,
-    RUNNING,
-    STOPPED,
-    STOPPING,
-    begin_stop,
-    describe_end,
-    describe_event,
-    describe_obstacle,
-    has_stopped,
-    hear,
-)
+from controller.safety.arming import describe_obstacle
+from controller.safety.causes import Cause, DriveState, Mode, Request
+from controller.safety.stop import describe_end, has_stopped
 from controller.settings import SafetySettings, control_settings, fusion_settings, safety_settings
 from plant.errors import InputError
 from plant.mechanism import Mechanism
+from tests.controller.cycles import cycle
 from tests.controller.leg_geometry import static_signals
 
 RATE_HZ = 500.0
@@ -53,7 +27,7 @@ class Bench:
         control = control_settings(mechanism)
         self.parameters = cycle_parameters(mechanism, RATE_HZ, control, fusion_settings(mechanism), **choices)
         self.state = np.zeros((), STATE)
-        self.hold = int(self.parameters["hold_cycles"])
+        self.hold = int(self.parameters["rig"]["hold_cycles"])
         self.signals = static_signals(mechanism, mechanism.home.position, mechanism.home.rotation)
         self.segments = np.zeros((6, 1, 5))
         self.segments[:, 0, 1] = leg_lengths(mechanism, mechanism.home.position, mechanism.home.rotation) + off
@@ -66,16 +40,16 @@ class Bench:
     def request(self):
         return int(self.state["safety"]["request"])
 
-    def step(self, drive=FOLLOWING, silent=0, age=ALL_FRESH, cause=None):
+    def step(self, drive=DriveState.FOLLOWING, silent=0, age=ALL_FRESH, cause=None):
         """A cycle; what it has told."""
         drives = np.full(6, drive, np.int64) if np.isscalar(drive) else np.array(drive, np.int64)
         if cause is not None:
-            begin_stop(self.parameters, self.state, cause)
-        hear(self.parameters, self.state, age, drives, silent)
+            react(self.parameters, self.state, cause, -1, np.nan, np.nan)
+        hear_rig(self.parameters, self.state, age, drives, silent)
         cycle(self.parameters, self.state, self.signals, self.segments)
         safety = self.state["safety"]
-        told = safety["event_cause"][: min(int(safety["event_count"]), 8)].tolist()
-        prepare(self.parameters, self.state, self.segments)
+        told = safety["events"]["cause"][: min(int(safety["events"]["count"]), 8)].tolist()
+        prepare_next(self.parameters, self.state, self.segments)
         return told
 
     def steps(self, count, **given):
@@ -88,30 +62,30 @@ def bench(hexapod):
 
 
 def test_from_idle_to_running_as_the_drives_are_ready(bench):
-    bench.steps(bench.hold, drive=READY)
-    assert (bench.mode, bench.request) == (IDLE, BRAKED)
-    bench.step(drive=READY)
-    assert (bench.mode, bench.request) == (ARMED, ENABLED)
-    bench.steps(5, drive=READY)
-    assert bench.mode == ARMED
-    assert (bench.state["command"] == 0.0).all()
-    bench.step(drive=[FOLLOWING] * 5 + [READY])
-    assert bench.mode == ARMED
+    bench.steps(bench.hold, drive=DriveState.READY)
+    assert (bench.mode, bench.request) == (Mode.IDLE, Request.BRAKED)
+    bench.step(drive=DriveState.READY)
+    assert (bench.mode, bench.request) == (Mode.ARMED, Request.ENABLED)
+    bench.steps(5, drive=DriveState.READY)
+    assert bench.mode == Mode.ARMED
+    assert (bench.state["pid"]["command"] == 0.0).all()
+    bench.step(drive=[DriveState.FOLLOWING] * 5 + [DriveState.READY])
+    assert bench.mode == Mode.ARMED
     bench.step()
-    assert bench.mode == RUNNING
-    assert bench.state["safety"]["waited"] == 7
+    assert bench.mode == Mode.RUNNING
+    assert bench.state["safety"]["arming"]["delay"] == 7
 
 
 def test_what_goes_wrong_between_armed_and_running_ends_it_at_once(hexapod):
     bench = Bench(hexapod)
-    bench.steps(bench.hold + 5, drive=READY)
-    assert bench.mode == ARMED
+    bench.steps(bench.hold + 5, drive=DriveState.READY)
+    assert bench.mode == Mode.ARMED
     bench.segments[:, 0, 1] += 0.02
-    bench.steps(2, drive=READY)
-    assert bench.state["stopping"] == NO_AGREEMENT
-    assert bench.request == BRAKED
-    assert (bench.state["command"] == 0.0).all()
-    assert has_stopped(bench.state)
+    bench.steps(2, drive=DriveState.READY)
+    assert bench.state["safety"]["stop"]["cause"] == Cause.NO_AGREEMENT
+    assert bench.request == Request.BRAKED
+    assert (bench.state["pid"]["command"] == 0.0).all()
+    assert has_stopped(bench.state["safety"][()], bench.state["time"][()])
 
 
 def test_a_bus_that_answers_now_and_then_is_lost(hexapod):
@@ -119,23 +93,23 @@ def test_a_bus_that_answers_now_and_then_is_lost(hexapod):
     for _ in range(20):
         bench.steps(3, silent=1)
         bench.step()
-    assert (bench.mode, bench.state["stopping"]) == (FAULT, BUS_LOST)
+    assert (bench.mode, bench.state["safety"]["stop"]["cause"]) == (Mode.FAULT, Cause.BUS_LOST)
 
 
-@pytest.mark.parametrize("drive", [OFF, FAULTY, QUICK_STOPPING])
+@pytest.mark.parametrize("drive", [DriveState.NOT_READY, DriveState.FAULTY, DriveState.QUICK_STOPPING])
 def test_drives_that_are_not_ready_are_not_armed(bench, drive):
-    told = bench.steps(bench.hold + round(1.1 * RATE_HZ), drive=[READY] * 3 + [drive] + [READY] * 2)
-    assert bench.state["stopping"] == NO_DRIVES
-    assert told.count(NO_DRIVES) == 1
-    assert bench.request == BRAKED
+    told = bench.steps(bench.hold + round(1.1 * RATE_HZ), drive=[DriveState.READY] * 3 + [drive] + [DriveState.READY] * 2)
+    assert bench.state["safety"]["stop"]["cause"] == Cause.NO_DRIVES
+    assert told.count(Cause.NO_DRIVES) == 1
+    assert bench.request == Request.BRAKED
     assert describe_end(bench.state) == "not armed: drive 3 is not ready"
-    assert has_stopped(bench.state)
+    assert has_stopped(bench.state["safety"][()], bench.state["time"][()])
 
 
 def test_a_target_that_begins_elsewhere_is_not_armed(hexapod):
     bench = Bench(hexapod, off=0.012)
     bench.steps(bench.hold + round(1.1 * RATE_HZ))
-    assert bench.state["stopping"] == NO_AGREEMENT
+    assert bench.state["safety"]["stop"]["cause"] == Cause.NO_AGREEMENT
     assert "leg 0 is not where the target begins (0.012 m, the limit is 0.01 m)" in describe_end(bench.state)
 
 
@@ -143,54 +117,58 @@ def test_a_dry_run_says_what_is_in_the_way_and_asks_nothing_of_the_drives(hexapo
     for off, words in ((0.0, ""), (0.012, "not armed: leg 0 is not where the target begins")):
         bench = Bench(hexapod, off=off, to_arm=False)
         bench.steps(bench.hold + 1000)
-        assert (bench.mode, bench.request) == (IDLE, BRAKED)
+        assert (bench.mode, bench.request) == (Mode.IDLE, Request.BRAKED)
         assert describe_obstacle(bench.state).startswith(words) and bool(describe_obstacle(bench.state)) == bool(words)
 
 
 def running(hexapod):
     bench = Bench(hexapod)
     bench.steps(bench.hold + 50)
-    assert bench.mode == RUNNING
+    assert bench.mode == Mode.RUNNING
     return bench
 
 
 @pytest.mark.parametrize(
     ("given", "cause", "asked"),
     [
-        ({"drive": [FOLLOWING, FAULTY] + [FOLLOWING] * 4}, DRIVE_FAULT, QUICK_STOP),
-        ({"drive": [FOLLOWING] * 5 + [OFF]}, DRIVE_OFF, QUICK_STOP),
-        ({"silent": 10}, BUS_LOST, QUICK_STOP),
-        ({"cause": EMERGENCY_STOP}, EMERGENCY_STOP, QUICK_STOP),
+        (
+            {"drive": [DriveState.FOLLOWING, DriveState.FAULTY] + [DriveState.FOLLOWING] * 4},
+            Cause.DRIVE_FAULT,
+            Request.QUICK_STOP,
+        ),
+        ({"drive": [DriveState.FOLLOWING] * 5 + [DriveState.NOT_READY]}, Cause.DRIVE_OFF, Request.QUICK_STOP),
+        ({"silent": 10}, Cause.BUS_LOST, Request.QUICK_STOP),
+        ({"cause": Cause.EMERGENCY_STOP}, Cause.EMERGENCY_STOP, Request.QUICK_STOP),
     ],
 )
 def test_a_fault_is_for_good(hexapod, given, cause, asked):
     bench = running(hexapod)
     assert cause in bench.step(**given)
-    assert (bench.mode, bench.request) == (FAULT, asked)
+    assert (bench.mode, bench.request) == (Mode.FAULT, asked)
     bench.steps(300)
-    assert bench.mode == FAULT
-    assert bench.state["stopping"] == cause
-    assert has_stopped(bench.state)
-    assert bench.request == BRAKED
+    assert bench.mode == Mode.FAULT
+    assert bench.state["safety"]["stop"]["cause"] == cause
+    assert has_stopped(bench.state["safety"][()], bench.state["time"][()])
+    assert bench.request == Request.BRAKED
 
 
 def test_a_fault_counts_more_than_a_stop_and_the_first_stop_more_than_others(hexapod):
     bench = running(hexapod)
-    bench.step(cause=ASKED_TO_STOP)
-    assert (bench.mode, bench.state["stopping"]) == (STOPPING, ASKED_TO_STOP)
+    bench.step(cause=Cause.STOP_REQUESTED)
+    assert (bench.mode, bench.state["safety"]["stop"]["cause"]) == (Mode.STOPPING, Cause.STOP_REQUESTED)
     assert bench.step(cause=1) == []
-    bench.step(drive=[FAULTY] * 6)
-    assert (bench.mode, bench.state["stopping"]) == (FAULT, DRIVE_FAULT)
+    bench.step(drive=[DriveState.FAULTY] * 6)
+    assert (bench.mode, bench.state["safety"]["stop"]["cause"]) == (Mode.FAULT, Cause.DRIVE_FAULT)
 
 
 def test_a_controlled_stop_ends_on_the_brakes(hexapod):
     bench = running(hexapod)
-    bench.step(cause=ASKED_TO_STOP)
+    bench.step(cause=Cause.STOP_REQUESTED)
     for _ in range(500):
-        if has_stopped(bench.state):
+        if has_stopped(bench.state["safety"][()], bench.state["time"][()]):
             break
         bench.step()
-    assert (bench.mode, bench.request) == (STOPPED, BRAKED)
+    assert (bench.mode, bench.request) == (Mode.STOPPED, Request.BRAKED)
 
 
 @settings(max_examples=40)
@@ -198,37 +176,46 @@ def test_a_controlled_stop_ends_on_the_brakes(hexapod):
 def test_whatever_drives_and_bus_say_nothing_moves_but_as_specified(hexapod, data):
     bench = Bench(hexapod)
     limits, period = hexapod.limits, 1.0 / RATE_HZ
-    drives = st.lists(st.sampled_from([FOLLOWING] * 8 + [READY, OFF, QUICK_STOPPING, FAULTY, 77]), min_size=6, max_size=6)
-    mode, command = IDLE, np.zeros(6)
+    drives = st.lists(
+        st.sampled_from(
+            [DriveState.FOLLOWING] * 8
+            + [DriveState.READY, DriveState.NOT_READY, DriveState.QUICK_STOPPING, DriveState.FAULTY, 77]
+        ),
+        min_size=6,
+        max_size=6,
+    )
+    mode, command = Mode.IDLE, np.zeros(6)
     for _ in range(data.draw(st.integers(1, 12))):
         given = {
             "drive": data.draw(drives),
             "silent": data.draw(st.integers(0, 30)),
             "age": np.array(data.draw(st.lists(st.integers(0, 20), min_size=7, max_size=7))),
-            "cause": data.draw(st.one_of(st.none(), st.sampled_from([ASKED_TO_STOP, EMERGENCY_STOP, BUS_LOST]))),
+            "cause": data.draw(
+                st.one_of(st.none(), st.sampled_from([Cause.STOP_REQUESTED, Cause.EMERGENCY_STOP, Cause.BUS_LOST]))
+            ),
         }
         for _ in range(data.draw(st.integers(1, 80))):
             bench.step(**given)
             given["cause"] = None
-            now = bench.state["command"].copy()
-            assert np.isfinite(now).all() and np.abs(now).max() <= bench.parameters["command_limit"]
-            if bench.mode in (IDLE, ARMED):
+            now = bench.state["pid"]["command"].copy()
+            assert np.isfinite(now).all() and np.abs(now).max() <= bench.parameters["pid"]["limit"]
+            if bench.mode in (Mode.IDLE, Mode.ARMED):
                 assert (now == 0.0).all()
-            if mode == FAULT:
+            if mode == Mode.FAULT:
                 # For good, and to rest at the limit of acceleration.
-                assert bench.mode == FAULT
+                assert bench.mode == Mode.FAULT
                 assert np.abs(now - command).max() <= limits.acceleration * period * (1.0 + 1e-9)
                 assert (np.abs(now) <= np.abs(command)).all()
-            if bench.mode == RUNNING:
-                assert bench.request == ENABLED
+            if bench.mode == Mode.RUNNING:
+                assert bench.request == Request.ENABLED
             mode, command = bench.mode, now
 
 
 def test_every_cause_reads_well():
-    for number, cause in enumerate(CAUSES):
-        assert describe_event(number, 3, np.nan, np.nan) == cause.text.format(3)
-    assert describe_event(BUS_LOST, -1, 21.0, 20.0).endswith("(21 cycles, the limit is 20 cycles)")
-    assert OK == 0
+    for cause in Cause:
+        assert cause.describe(3, np.nan, np.nan) == cause.text.format(3)
+    assert Cause.BUS_LOST.describe(-1, 21.0, 20.0).endswith("(21 cycles, the limit is 20 cycles)")
+    assert Cause.NONE == 0
 
 
 def test_settings_are_read_and_checked(hexapod):

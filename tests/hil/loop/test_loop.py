@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from controller.cycle import OK, STATE, cycle, prepare, skip
-from controller.safety.watch import ASKED_TO_STOP, END_OF_MOTION, MISSED_PERIODS
+from controller.cycle import STATE, prepare_next, skip_periods
+from controller.safety.causes import Cause
 from hil.loop.driver import FmuRig, Loop
 from hil.loop.records import RECORD, STAGES, Link
 from hil.realtime.clock import REAL, SCRIPTED, new_clock
@@ -13,6 +13,7 @@ from hil.runs.prepare import prepared_loop
 from plant.dynamics.variables import BRAKE
 from plant.imu import imu_state, load_imu
 from plant.truth import TRUTH_LENGTHS
+from tests.controller.cycles import cycle
 
 MS = 1_000_000
 CONFIG = SimulationConfig(target="sines", duration=2.0)
@@ -40,19 +41,19 @@ def replayed(loop, records):
     state, measurement = np.zeros((), STATE), np.zeros((3, 7, 3))
     found = np.zeros_like(records)
     for record, again in zip(records, found, strict=True):
-        skip(state, int(record["missed"]))
+        skip_periods(state, int(record["missed"]))
         for i, name in enumerate(SENSORS):
             measurement[i] = record[name]
-        assert cycle(loop.parameters, state, measurement, loop.segments) == OK
+        assert cycle(loop.parameters, state, measurement, loop.segments) == Cause.NONE
         for name in FOUND:
             again[name] = state[name]
-        prepare(loop.parameters, state, loop.segments)
+        prepare_next(loop.parameters, state, loop.segments)
     return found
 
 
 def test_the_stages_that_are_timed_are_the_cycle():
     with prepared_loop(CONFIG) as loop:
-        assert loop.run(1500) == OK
+        assert loop.run(1500) == Cause.NONE
         found = replayed(loop, written(loop))
         for name in FOUND:
             np.testing.assert_array_equal(found[name], written(loop)[name])
@@ -137,7 +138,7 @@ def test_a_late_start_sets_the_phase_and_misses_nothing():
 
 def follow(loop, seconds=2.0):
     loop.records = np.concatenate([loop.records, np.zeros(1000, RECORD)])
-    end = round(seconds * 1000) + int(loop.parameters["hold_cycles"])
+    end = round(seconds * 1000) + int(loop.parameters["rig"]["hold_cycles"])
     return loop.follow(end), written(loop)
 
 
@@ -159,8 +160,8 @@ def stops_within_limits(loop, records, off=1e-3):
 def test_the_end_of_a_motion_is_a_stop_within_the_limits_and_the_brakes():
     with prepared_loop(CONFIG) as loop:
         cause, records = follow(scripted(loop), 1.234)
-        assert cause == loop.state["stopping"] == END_OF_MOTION
-        assert records["stop"].nonzero()[0][0] == 1234 + loop.parameters["hold_cycles"]
+        assert cause == loop.state["safety"]["stop"]["cause"] == Cause.END_OF_MOTION
+        assert records["stop"].nonzero()[0][0] == 1234 + loop.parameters["rig"]["hold_cycles"]
         stops_within_limits(loop, records)
         assert (loop.fmu["mode"] == BRAKE).all()
 
@@ -169,7 +170,7 @@ def test_too_many_missed_in_a_row_end_in_a_controlled_stop_and_fewer_do_not():
     for periods, stops in ((9, False), (10, True), (400, True)):
         with prepared_loop(CONFIG) as loop:
             cause, records = follow(scripted(loop, late={900: periods * MS}))
-            assert cause == (MISSED_PERIODS if stops else END_OF_MOTION)
+            assert cause == (Cause.MISSED_PERIODS if stops else Cause.END_OF_MOTION)
             # In a long pause the drives go on as they were last told, and then have some way back.
             stops_within_limits(loop, records, off=1e-3 if periods < 100 else 2e-2)
             if stops:
@@ -183,7 +184,7 @@ def test_work_that_is_always_too_long_ends_in_a_controlled_stop():
         loop.most_missed = 25
         work = dict.fromkeys(range(800, 5000), 1_200_000)
         cause, records = follow(scripted(loop, work=work, cpu=work))
-        assert cause == MISSED_PERIODS
+        assert cause == Cause.MISSED_PERIODS
         assert records["stop"].nonzero()[0][0] == 825
         assert loop.clock["most_in_a_row"] >= 25
         stops_within_limits(loop, records)
@@ -194,14 +195,14 @@ def test_asked_to_stop_it_does_in_motion_at_once_and_in_the_hold_without_moving(
         scripted(loop).run(1000)
         loop.link[Link.STOP] = 1
         cause, records = follow(loop)
-        assert cause == ASKED_TO_STOP
+        assert cause == Cause.STOP_REQUESTED
         assert records["stop"].nonzero()[0][0] == 1000
         stops_within_limits(loop, records)
     with prepared_loop(CONFIG) as loop:
         scripted(loop).run(100)
         loop.link[Link.STOP] = 1
         cause, records = follow(loop)
-        assert cause == ASKED_TO_STOP
+        assert cause == Cause.STOP_REQUESTED
         assert len(records) == 100
         assert (records["command"] == 0.0).all()
 
@@ -223,8 +224,8 @@ def test_a_rig_in_python_runs_the_same_cycle_at_the_same_times():
         for loop in (compiled, python):
             scripted(loop, late=late, work=work)
         end = 1000
-        assert compiled.follow(end) == END_OF_MOTION
-        assert python.follow(end, FmuRig(python)) == END_OF_MOTION
+        assert compiled.follow(end) == Cause.END_OF_MOTION
+        assert python.follow(end, FmuRig(python)) == Cause.END_OF_MOTION
         assert compiled.link[Link.HEAD] == python.link[Link.HEAD]
         first, second = written(compiled), written(python)
         for name in set(first.dtype.names) - {"stage_ns"}:
@@ -236,7 +237,7 @@ def test_a_clock_on_the_machine_wakes_at_every_deadline():
     with prepared_loop(SimulationConfig(target="hold", duration=0.5, rate=250.0)) as loop:
         loop.clock = new_clock(REAL, 4 * MS)
         loop.records = np.zeros(1000, RECORD)
-        assert loop.follow(175) == END_OF_MOTION
+        assert loop.follow(175) == Cause.END_OF_MOTION
         records = written(loop)
         assert (np.diff(records["cycle"]) == 1 + records["missed"][1:]).all()
         assert (records["late_ns"] >= 0).all()
@@ -263,5 +264,5 @@ def test_recorded_covariance_is_that_of_the_errors_at_rest():
         loop.run(800)
         covariance = written(loop)["covariance"][-1].astype(float)
         np.testing.assert_array_equal(covariance, covariance.T)
-        expected = np.linalg.inv(np.tril(loop.state["information"]) + np.tril(loop.state["information"], -1).T)
+        expected = np.linalg.inv(np.tril(loop.state["pose"]["information"]) + np.tril(loop.state["pose"]["information"], -1).T)
         np.testing.assert_allclose(covariance, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())

@@ -5,17 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from controller.cycle import OK
-from controller.safety.watch import (
-    CAUSES,
-    END_OF_MOTION,
-    FAULT,
-    IMU_FROZEN,
-    IMUS_DISAGREE,
-    POSE_LOST,
-    STOPPED,
-    describe_end,
-)
+from controller.safety.causes import Cause, Mode
+from controller.safety.stop import describe_end
 from hil.command_line import main
 from hil.loop.driver import FmuRig
 from hil.reports.run import write_report
@@ -63,7 +54,7 @@ def test_the_plant_may_be_of_fmi_2_and_the_records_are_the_same():
 
 def test_a_cycle_that_is_replayed_finds_the_same():
     with prepared_loop(config()) as loop:
-        assert loop.run(1000) == OK
+        assert loop.run(1000) == Cause.NONE
         found = replayed(loop, loop.records[:1000])
         for name in ("position", "rotation", "lengths", "command", "conditioning"):
             np.testing.assert_array_equal(found[name], loop.records[name][:1000])
@@ -80,7 +71,7 @@ class Disturbed(FmuRig):
     def exchange(self, command, request, feedback):
         status = super().exchange(command, request, feedback)
         measurement = feedback["measurement"]
-        if self._loop_of.state["cycle"] < self._cycle:
+        if self._loop_of.state["time"]["cycle"] < self._cycle:
             self._last = measurement[:, self._frozen].copy()
             return status
         measurement[:, self._frozen] = self._last
@@ -97,7 +88,7 @@ def run_disturbed(**disturbance):
         cause = loop.follow(loop.end, Disturbed(loop, 900, **disturbance))
         loop.plant.step(0.5)
         speed = float(np.abs(loop.plant.get("leg_velocity")).max())
-        records = loop.records[: int(loop.state["cycle"])].copy()
+        records = loop.records[: int(loop.state["time"]["cycle"])].copy()
         return cause, loop.state.copy(), records, speed
 
 
@@ -107,8 +98,8 @@ def told(records):
 
 def test_a_leg_imu_that_freezes_is_left_out_and_the_motion_goes_on():
     cause, state, records, speed = run_disturbed(frozen=[1])
-    assert cause == END_OF_MOTION and state["safety"]["mode"] == STOPPED
-    assert IMU_FROZEN in told(records)
+    assert cause == Cause.END_OF_MOTION and state["safety"]["mode"] == Mode.STOPPED
+    assert Cause.IMU_FROZEN in told(records)
     off = np.linalg.norm(records["position"] - records["truth"][:, :3], axis=1)
     assert off[1000:].max() < 1.5e-3
     assert speed < 1e-6
@@ -117,10 +108,10 @@ def test_a_leg_imu_that_freezes_is_left_out_and_the_motion_goes_on():
 @pytest.mark.parametrize("frozen", [[PLATFORM_IMU], [0, 2]])
 def test_a_pose_that_is_lost_ends_on_the_brakes_with_its_cause(frozen):
     cause, state, records, speed = run_disturbed(frozen=frozen)
-    assert cause == POSE_LOST and state["safety"]["mode"] == FAULT
-    assert describe_end(state) == CAUSES[POSE_LOST].text
-    assert {IMU_FROZEN, POSE_LOST} <= told(records)
-    assert 900 <= state["stop_cycle"] < 930
+    assert cause == Cause.POSE_LOST and state["safety"]["mode"] == Mode.FAULT
+    assert describe_end(state) == Cause(Cause.POSE_LOST).text
+    assert {Cause.IMU_FROZEN, Cause.POSE_LOST} <= told(records)
+    assert 900 <= state["safety"]["stop"]["cycle"] < 930
     assert speed < 1e-6
 
 
@@ -128,9 +119,9 @@ def test_a_pose_that_is_lost_ends_on_the_brakes_with_its_cause(frozen):
 def test_a_leg_imu_that_lies_contradicts_the_others_and_the_motion_stops(leg):
     """Three legs and the roll tell that one of them is wrong, not which: none is named."""
     cause, state, records, speed = run_disturbed(turned={leg: np.radians(2.0)})
-    assert cause == IMUS_DISAGREE and state["safety"]["mode"] == STOPPED
+    assert cause == Cause.IMUS_DISAGREE and state["safety"]["mode"] == Mode.STOPPED
     assert describe_end(state).startswith("the IMUs contradict each other (0.0")
-    assert IMUS_DISAGREE in told(records)
+    assert Cause.IMUS_DISAGREE in told(records)
     assert speed < 1e-6
 
 

@@ -15,7 +15,7 @@ import can
 import numpy as np
 import pytest
 
-from controller.safety.watch import END_OF_MOTION, RIG_FAILED
+from controller.safety.causes import Cause
 from hil.command_line import main
 from hil.loop.driver import FmuRig
 from hil.loop.records import EMULATED_RIG, RECORD
@@ -104,7 +104,7 @@ class Plant:
 
     def exchange(self, command, request, feedback):
         status = self._rig.exchange(command, request, feedback)
-        self._loop.state["cycle"] += 1
+        self._loop.state["time"]["cycle"] += 1
         return status
 
     def quick_stop(self):
@@ -426,9 +426,9 @@ def recording(path, faults=None, **changes):
             rig = new_emulated(loop.mechanism, 1_000_000, 0, [fault(text) for text in faults])
             loop.kind, loop.emulator = EMULATED_RIG, new_udp_emulator(loop.fmu, loop.imu, rig, 1)
             loop.udp.socket["session"], loop.udp.socket["timeout_ns"] = 1, 1_000_000
-            loop.parameters["command_delay"] = 1.0 / CONFIG.rate
-        assert loop.follow(loop.end) == END_OF_MOTION
-        records = loop.records[: int(loop.state["cycle"])].copy()
+            loop.parameters["load"]["command_delay"] = 1.0 / CONFIG.rate
+        assert loop.follow(loop.end) == Cause.END_OF_MOTION
+        records = loop.records[: int(loop.state["time"]["cycle"])].copy()
         write(path, loop, records, rig="fmu" if faults is None else "udp")
     return path, records
 
@@ -451,9 +451,9 @@ def replayed(path, rig=None, **changes):
     rig = rig or ReplayRig(path, 1.0 / config.rate, HEXAPOD)
     with prepared_loop(config, np.zeros(4000, RECORD)) as loop:
         rig.open()
-        loop.parameters["command_delay"] = rig.command_delay
+        loop.parameters["load"]["command_delay"] = rig.command_delay
         cause = loop.follow(loop.end, rig)
-        return cause, loop.records[: int(loop.state["cycle"])].copy()
+        return cause, loop.records[: int(loop.state["time"]["cycle"])].copy()
 
 
 @pytest.mark.parametrize("faults", [None, (), FAULTS], ids=["fmu", "udp", "faults"])
@@ -464,7 +464,7 @@ def test_a_replayed_run_is_the_recorded_one_bit_for_bit(faults, tmp_path):
         assert records["sample_age"][:, 3].max() > 80
         assert len(np.unique(records["imus"])) > 1
     cause, again = replayed(path)
-    assert cause == END_OF_MOTION
+    assert cause == Cause.END_OF_MOTION
     assert len(again) == len(records) > 600
     for name in (*ESTIMATES, *FOLLOWED, "sample_ns", "drive", "sent", "truth", "silent", "refused", "event_cause"):
         assert again[name].tobytes() == records[name].tobytes(), name
@@ -488,13 +488,13 @@ def test_a_replay_on_the_clock(recorded, tmp_path):
 def test_the_end_of_the_recording_ends_the_run(recorded, tmp_path):
     path, records = recorded
     cause, again = replayed(path, duration=0.5, arm=False)
-    assert cause == END_OF_MOTION
+    assert cause == Cause.END_OF_MOTION
     assert len(again) < len(records)
     short = tmp_path / "short.mcap"
     with prepared_loop(CONFIG) as loop:
         write(short, loop, records[:300])
     cause, again = replayed(short)
-    assert cause == RIG_FAILED
+    assert cause == Cause.RIG_FAILED
     np.testing.assert_array_equal(again["position"][:300], records["position"][:300])
     with pytest.raises(RunStoppedError, match=r"the rig reports failure \(2\): the recording has come to its end"):
         run(replace(CONFIG, rig="replay", rig_at=str(short)), SETTINGS)
@@ -505,7 +505,7 @@ def test_missed_periods_and_consecutive_files(recorded, tmp_path):
     first, second = tmp_path / "a.mcap", tmp_path / "b.mcap"
     later = records[102:].copy()
     later["missed"][0] = 2
-    later["status"][5], later["silent"][7] = RIG_FAILED, 3
+    later["status"][5], later["silent"][7] = Cause.RIG_FAILED, 3
     with prepared_loop(CONFIG) as loop:
         write(first, loop, records[:100])
         write(second, loop, later)

@@ -627,7 +627,7 @@ class Raising(FmuRig):
     mark = Path()
 
     def exchange(self, command, request, feedback):
-        if self._loop.state["cycle"] > 60:
+        if self._loop.state["time"]["cycle"] > 60:
             raise ValueError("the bus is gone")
         return super().exchange(command, request, feedback)
 
@@ -647,7 +647,7 @@ class Refusing(FmuRig):
     """A rig whose exchanges fail in motion."""
 
     def exchange(self, command, request, feedback):
-        return 104 if self._loop.state["cycle"] > 60 else super().exchange(command, request, feedback)
+        return 104 if self._loop.state["time"]["cycle"] > 60 else super().exchange(command, request, feedback)
 
 
 def test_an_exchange_that_fails_is_told_and_replayed(tmp_path):

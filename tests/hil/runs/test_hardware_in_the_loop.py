@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.safety.watch import BUS_LOST, FAULTY, FOLLOWING, RUNNING
+from controller.safety.causes import Cause, DriveState, Mode
 from hil.recording.mcap import read
 from hil.recording.replay import replay
 from hil.rigs.canopen.settings import DEFAULT_FILE
@@ -77,7 +77,7 @@ def started(at, control, *options, rig="udp"):
 
 
 def moves(state):
-    return state["drive"] == [FOLLOWING] * 6 and np.abs(state["velocity"]).max() > 2e-3
+    return state["drive"] == [DriveState.FOLLOWING] * 6 and np.abs(state["velocity"]).max() > 2e-3
 
 
 def loop_of(run):
@@ -131,7 +131,9 @@ def test_over_udp_it_follows_as_with_the_plant_itself_and_says_how_the_bus_was(t
     # What is sent takes effect one exchange later, in single precision.
     answered = records["silent"][1:] == 0
     sent, told = records["command"][:-1][answered], records["sent"][1:][answered]
-    following = (records["drive"][1:][answered] == FOLLOWING).all(axis=1) & (records["mode"][1:][answered] == RUNNING)
+    following = (records["drive"][1:][answered] == DriveState.FOLLOWING).all(axis=1) & (
+        records["mode"][1:][answered] == Mode.RUNNING
+    )
     np.testing.assert_allclose(told[following], sent[following].astype(np.float32), rtol=1e-6)
     assert replay([tmp_path / "udp.mcap"]).same
 
@@ -175,7 +177,9 @@ def test_a_dry_run_reads_everything_and_moves_nothing(tmp_path):
         assert "nothing was moved; all is well for arming" in output
         lengths = state_of(control)["lengths"]
     records = read(tmp_path / "x.mcap").records
-    assert (records["command"] == 0.0).all() and (records["mode"] == 0).all() and (records["drive"] != FOLLOWING).all()
+    assert (
+        (records["command"] == 0.0).all() and (records["mode"] == 0).all() and (records["drive"] != DriveState.FOLLOWING).all()
+    )
     assert np.isfinite(records["position"]).all()
     assert np.abs(records["truth"][0, TRUTH_LENGTHS] - lengths).max() < 1e-4
 
@@ -187,7 +191,7 @@ def test_when_the_loop_is_killed_the_drives_stop_by_themselves(tmp_path):
     with emulated() as (_, at, control):
         run = started(at, control)
         os.kill(loop_of(run), signal.SIGKILL)
-        wait_for(lambda: state_of(control)["drive"] == [FAULTY] * 6, 10.0)
+        wait_for(lambda: state_of(control)["drive"] == [DriveState.FAULTY] * 6, 10.0)
         time.sleep(0.2)
         state = state_of(control)
         assert state["velocity"] == [0.0] * 6
@@ -201,7 +205,7 @@ def test_when_the_loop_is_killed_canopen_drives_stop_by_their_heartbeat(canopen_
     with emulated("--bus", "canopen", at=str(canopen_file)) as (_, at, control):
         run = started(at, control, "--rate", 250, rig="canopen")
         os.kill(loop_of(run), signal.SIGKILL)
-        wait_for(lambda: FOLLOWING not in state_of(control)["drive"], 10.0)
+        wait_for(lambda: DriveState.FOLLOWING not in state_of(control)["drive"], 10.0)
         time.sleep(0.5)
         state = state_of(control)
         assert state["velocity"] == [0.0] * 6
@@ -218,7 +222,7 @@ def test_when_the_rig_is_killed_the_run_ends_and_a_new_one_serves_the_next(tmp_p
         with pytest.raises(BusyError):
             ask(control, "state", patience=0.2)
     found = read(tmp_path / "x.mcap")
-    assert found.complete and found.records["stop"][-1] == BUS_LOST
+    assert found.complete and found.records["stop"][-1] == Cause.BUS_LOST
     with emulated(at=at, control=control):
         assert finished(gough("run", "--rig", "udp", "--rig-at", at, *MOTION, *PATIENT, "--duration", 0.5))[0] == 0
 
@@ -243,7 +247,7 @@ def test_the_emergency_key_stops_the_drives_quickly():
         status, _, errors = finished(run)
         assert status == 1
         assert "emergency stop" in errors
-        wait_for(lambda: FOLLOWING not in state_of(control)["drive"], 10.0)
+        wait_for(lambda: DriveState.FOLLOWING not in state_of(control)["drive"], 10.0)
 
 
 def test_a_rig_that_is_not_there_or_stands_elsewhere_is_not_driven():
@@ -298,12 +302,12 @@ def test_a_streamed_target_is_followed_until_it_goes_wrong(tmp_path, options, wo
     assert words in errors
     records = read(tmp_path / "x.mcap").records
     assert np.ptp(records["truth"][:, :3], axis=0).max() > 2e-3
-    moved = records[records["mode"] == RUNNING]
+    moved = records[records["mode"] == Mode.RUNNING]
     assert np.abs(moved["truth"][:, TRUTH_LENGTHS] - moved["reference"][:, :, 0]).max() < 3e-3
     assert replay([tmp_path / "x.mcap"]).same
 
 
 def moving(path):
     with suppress(GoughError):
-        return bool((read(path).records["mode"] == RUNNING).any())
+        return bool((read(path).records["mode"] == Mode.RUNNING).any())
     return False

@@ -15,7 +15,7 @@ from controller.planning.segments import evaluate_reference
 from controller.planning.stream import CAUSE, DONE, STREAM, TAKEN, TAKER, rest, stream_cause, take_plan
 from controller.planning.stream_planner import StreamPlanner
 from controller.planning.target import load_target
-from controller.safety.watch import BEYOND_STROKE, NO_CAUSE, TARGET_JUMPS, TARGET_LOST, TARGET_NOT_FINITE
+from controller.safety.causes import Cause
 from hil.loop.records import shared_array
 from hil.runs.target_stream import (
     DATAGRAM_BYTES,
@@ -125,22 +125,22 @@ def test_a_streamed_motion_is_followed_and_ends_at_rest_when_the_stream_does(hex
     assert stream["late"] < stream["planned"] / 4
     assert (references[-1, :, 1:] == 0.0).all()
     # After its end the stream is lost, and not before.
-    assert causes[-1][0] == TARGET_LOST and causes[-1][2] > causes[-1][3] == pytest.approx(0.1)
+    assert causes[-1][0] == Cause.TARGET_LOST and causes[-1][2] > causes[-1][3] == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(
     ("faults", "cause"),
     [
-        (Faults(stop_at=0.7), TARGET_LOST),
-        (Faults(jump_at=0.7), TARGET_JUMPS),
-        (Faults(nan_at=0.7), TARGET_NOT_FINITE),
+        (Faults(stop_at=0.7), Cause.TARGET_LOST),
+        (Faults(jump_at=0.7), Cause.TARGET_JUMPS),
+        (Faults(nan_at=0.7), Cause.TARGET_NOT_FINITE),
     ],
 )
 def test_a_stream_that_goes_wrong_fails_with_its_cause_and_ends_at_rest(hexapod, faults, cause):
     _, _, references, causes, stream = streamed(hexapod, faults)
     check(references, hexapod.limits)
     assert causes[-1][0] == cause
-    assert NO_CAUSE in {each[0] for each in causes}
+    assert Cause.NONE in {each[0] for each in causes}
     assert (references[-1, :, 1:] == 0.0).all()
     assert np.abs(references[:, :, 1]).max() > 1e-3
     assert 20 <= stream["accepted"] <= 71
@@ -167,9 +167,9 @@ def test_malformed_stale_repeated_and_strange_datagrams_are_counted_and_refused(
         assert stream["accepted"] == 3
         ours.send(good)
         wait_for(lambda: stream["accepted"] == 4)
-        assert stream["shared"][CAUSE] == NO_CAUSE
+        assert stream["shared"][CAUSE] == Cause.NONE
         ours.send(encode(Sample(2, 1_040_000_000, (0.0, 0.0, 0.4), LEVEL)))
-        wait_for(lambda: stream["shared"][CAUSE] == BEYOND_STROKE)
+        wait_for(lambda: stream["shared"][CAUSE] == Cause.BEYOND_STROKE)
         ours.send(encode(Sample(3, 1_050_000_000, HERE, LEVEL)))
         time.sleep(0.1)
         assert stream["accepted"] == 4

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from controller.safety.watch import CAUSES, GO_ON, IMU_FROZEN, REACTIONS, STOP
+from controller.safety.causes import Cause, Reaction
 from hil.command_line import main
 from hil.studies.fault_matrix import CASES, Case, run_matrix, table
 
@@ -22,10 +22,16 @@ def test_the_reaction_is_the_specified_one(case):
 @pytest.mark.parametrize(
     ("case", "finding"),
     [
-        (Case("frozen", IMU_FROZEN, STOP, 15, 2e-3, ("imu-frozen:2,at={at}",)), "ended for another cause: end of the motion"),
-        (Case("frozen", IMU_FROZEN, GO_ON, 3, 2e-3, ("imu-frozen:2,at={at}",)), "took 10 cycles, and 3 are allowed"),
-        (Case("frozen", IMU_FROZEN, GO_ON, 15, 1e-5, ("imu-frozen:2,at={at}",)), "mm off, and 0.01 are allowed"),
-        (Case("nothing", IMU_FROZEN, GO_ON, 15, 2e-3), "was not told"),
+        (
+            Case("frozen", Cause.IMU_FROZEN, Reaction.STOP, 15, 2e-3, ("imu-frozen:2,at={at}",)),
+            "ended for another cause: end of the motion",
+        ),
+        (
+            Case("frozen", Cause.IMU_FROZEN, Reaction.GO_ON, 3, 2e-3, ("imu-frozen:2,at={at}",)),
+            "took 10 cycles, and 3 are allowed",
+        ),
+        (Case("frozen", Cause.IMU_FROZEN, Reaction.GO_ON, 15, 1e-5, ("imu-frozen:2,at={at}",)), "mm off, and 0.01 are allowed"),
+        (Case("nothing", Cause.IMU_FROZEN, Reaction.GO_ON, 15, 2e-3), "was not told"),
     ],
 )
 def test_what_is_not_as_specified_is_found(case, finding):
@@ -42,10 +48,10 @@ def test_the_table_in_the_docs_is_of_these_cases():
     lines = DOCS.read_text().splitlines()
     rows = lines[lines.index(next(line for line in lines if line.startswith("| case"))) :]
     assert rows[:2] == table([]).markdown().splitlines()
-    told = {case.name: CAUSES[case.expected].text.format("k") if case.expected else "-" for case in CASES}
+    told = {case.name: Cause(case.expected).text.format("k") if case.expected else "-" for case in CASES}
     assert {row.split(" | ")[0][2:]: row.split(" | ")[1] for row in rows[2:]} == told
     for case, row in zip(CASES, rows[2:], strict=True):
-        allowed = {REACTIONS[case.reaction], *(REACTIONS[CAUSES[each].reaction] for each in case.also)}
+        allowed = {Reaction(case.reaction).text, *(Reaction(Cause(each).reaction).text for each in case.also)}
         assert set(row.split(" | ")[2].split(", ")) <= allowed
 
 

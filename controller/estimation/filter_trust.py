@@ -1,0 +1,182 @@
+"""Whether the whole-mechanism filter is trusted: when it starts, when its pose is used, and how the source of the pose changes.
+
+The filter starts from the pose in closed form. Its pose is used once it has settled, as long as the leg filters agree with it.
+When the source changes, the step between the two poses fades away.
+"""
+
+import numpy as np
+
+from controller.direct_kinematics.refinement import move_pose
+from controller.estimation.mechanism_filter import (
+    FILTER_PARAMETERS,
+    FILTER_STATE,
+    accumulate_field,
+    accumulate_sample,
+    extrapolate,
+    start_filter,
+    step_filter,
+)
+from controller.inverse_kinematics import legs_at
+from controller.rig import elapsed
+from controller.settings import FusionSettings
+from plant.compiled import Record, kernel
+from plant.mechanism import LEGS
+from plant.pose import Array
+
+_START_S, _SETTLING_S = 0.3, 0.3
+"""When the filter is started after it was stopped, and how long it is not relied upon [s]."""
+
+_PATIENCE_S = 0.05
+"""How long the leg filters may disagree with the filter [s]."""
+
+_FADING_S = 0.1
+"""Time constant with which the step between two sources of the pose fades away [s]."""
+
+PARAMETERS = np.dtype(
+    [
+        ("filter", FILTER_PARAMETERS),
+        ("delay", np.float64),
+        ("start_cycles", np.int64),
+        ("settling_cycles", np.int64),
+        ("disagreement", np.float64),
+        ("patience_cycles", np.int64),
+    ],
+    align=True,
+)
+"""Constants: of the filter itself; the sensors' delay [s]; the durations above; the limit of the disagreement [rad]."""
+
+STATE = np.dtype(
+    [
+        ("filter", FILTER_STATE),
+        ("due", np.int64),
+        ("trusted", np.int64),
+        ("disagreeing_for", np.int64),
+        ("blend_offset", np.float64, 6),
+        ("closed_position", np.float64, 3),
+        ("closed_rotation", np.float64, (3, 3)),
+        ("twist", np.float64, 6),
+        ("acceleration", np.float64, 6),
+    ],
+    align=True,
+)
+"""State of the filter and of the trust in it.
+
+Fields:
+    filter: the filter itself.
+    due: the cycle in which it is started, or from which on it may be trusted.
+    trusted: whether the pose is the filter's.
+    disagreeing_for: for how many cycles the leg filters have disagreed.
+    blend_offset: what is left of the step between two sources of the pose [m, rad].
+    closed_position, closed_rotation: the pose in closed form.
+    twist, acceleration: of the filter.
+"""
+
+
+def trust_parameters(fusion: FusionSettings, rate: float, filter_constants: Record) -> Record:
+    """The constants (dtype `PARAMETERS`) in cycles of this rate [Hz], around those of the filter itself."""
+    values = {
+        "filter": filter_constants,
+        "delay": fusion.sensor_delay,
+        "start_cycles": round(_START_S * rate),
+        "settling_cycles": round(_SETTLING_S * rate),
+        "disagreement": fusion.disagreement,
+        "patience_cycles": round(_PATIENCE_S * rate),
+    }
+    parameters: Record = np.zeros((), PARAMETERS)
+    for name, value in values.items():
+        parameters[name] = value
+    return parameters
+
+
+@kernel
+def step_mechanism_filter(
+    p: Record, s: Record, rig: Record, time: Record, imus: Record, legs: Record, heading: Record, pose: Record
+) -> bool:
+    """Step the filter, and let its pose replace the one in closed form while it is trusted.
+
+    Args:
+        p, s: dtypes `PARAMETERS` and `STATE`.
+        rig, time: dtypes `RIG` and `TIME`.
+        imus, legs, heading: states of these stages.
+        pose: the pose, if `pose.found` in closed form; replaced.
+
+    Returns:
+        Whether there is a pose.
+    """
+    f, found = s.filter, bool(pose.found != 0)
+    if p.filter.errors == 0:
+        return found
+    now = time.cycle * rig.period
+    if f.running == 0:
+        if not found or time.cycle < s.due:
+            return found
+        start_filter(p.filter, f, now, pose.position, pose.rotation, pose.twist)
+        s.due = time.cycle + p.settling_cycles
+        return found
+    accumulate_sample(f, imus.sample, imus.used, now - p.delay)
+    if heading.used != 0 and heading.fresh != 0:
+        accumulate_field(f, heading.field, now - p.delay)
+    step_filter(p.filter, rig.sensors, f)
+    s.closed_position[:] = pose.position
+    s.closed_rotation[:] = pose.rotation
+    extrapolate(f, now, pose.position, pose.rotation, s.twist, s.acceleration)
+    agree = _agree(p, rig, legs, pose)
+    s.disagreeing_for = 0 if agree else s.disagreeing_for + 1 + time.missed
+    if s.disagreeing_for > p.patience_cycles:
+        f.running = 0
+        s.due = time.cycle + p.start_cycles
+    elif time.cycle >= s.due and agree:
+        if s.trusted == 0:
+            s.trusted = 1
+            _add_step(s.closed_position, s.closed_rotation, pose.position, pose.rotation, s.blend_offset)
+        pose.twist[:] = s.twist
+        pose.acceleration[:] = s.acceleration
+    if s.trusted != 0 and f.running == 0:
+        s.trusted = 0
+        _add_step(pose.position, pose.rotation, s.closed_position, s.closed_rotation, s.blend_offset)
+    if s.trusted == 0:
+        if not found:
+            return False
+        pose.position[:] = s.closed_position
+        pose.rotation[:] = s.closed_rotation
+    share = max(1.0 - elapsed(rig, time) / _FADING_S, 0.0)
+    for i in range(6):
+        s.blend_offset[i] *= share
+    move_pose(s.blend_offset, pose.position, pose.rotation)
+    return True
+
+
+@kernel
+def _add_step(position: Array, rotation: Array, new_position: Array, new_rotation: Array, offset: Array) -> None:
+    """Add to `offset` (6,) the small step from the new pose to the earlier one."""
+    for i in range(3):
+        offset[i] += position[i] - new_position[i]
+        j, k = (i + 1) % 3, (i + 2) % 3
+        turn = 0.0
+        for m in range(3):
+            turn += 0.5 * (rotation[k, m] * new_rotation[j, m] - rotation[j, m] * new_rotation[k, m])
+        offset[3 + i] += turn
+    for i in range(6):
+        if not np.isfinite(offset[i]):
+            offset[:] = 0.0
+
+
+@kernel
+def _agree(p: Record, rig: Record, legs: Record, pose: Record) -> bool:
+    """Whether the leg filters' directions are near those of the filter's pose.
+
+    If the leg filters have no pose, it is enough that the filter's pose is finite.
+    """
+    if pose.found == 0:
+        return bool(np.isfinite(pose.position.sum() + pose.rotation.sum()))
+    legs_at(
+        rig.geometry.base_joints, rig.geometry.platform_joints, pose.position, pose.rotation, pose.arms, pose.directions,
+        pose.lengths,
+    )  # fmt: skip
+    total = count = 0.0
+    for k in range(LEGS):
+        if legs.used[k] != 0.0:
+            count += 1.0
+            for i in range(3):
+                total += (legs.directions[k, i] - pose.directions[k, i]) ** 2
+    return bool(total <= count * p.disagreement**2)

@@ -1,0 +1,192 @@
+"""Which IMUs can be used: calibration of the raw readings, by (37), and the health of each IMU."""
+
+from collections.abc import Collection
+
+import numpy as np
+
+from controller.calibration.file import Calibration
+from controller.safety.causes import Cause, report_event
+from controller.settings import FusionSettings, SafetySettings
+from plant.compiled import Record, kernel
+from plant.dynamics.variables import IMU_COUNT
+from plant.pose import Array
+
+_FROZEN_S = 0.01
+"""How long an IMU may repeat its reading while others do not [s]."""
+
+_HEALTHY_S = 0.02
+"""How long an IMU that was left out must be healthy before it is used again [s]."""
+
+_STALE_S = 0.01
+"""How old a sample may be while others are new [s]."""
+
+_NOISE_S = 0.02
+"""Time constant over which the noise of an IMU is averaged [s]."""
+
+_SHAKEN_HZ = 400.0
+"""Below this rate motion shows in second differences."""
+
+_NOISIER = 3.0
+"""How much noisier than the others an IMU must be: what shakes all of them is no fault of one."""
+
+PARAMETERS = np.dtype(
+    [
+        ("present", np.int64, IMU_COUNT),
+        ("gain", np.float64, (3, IMU_COUNT, 3, 3)),
+        ("offset", np.float64, (3, IMU_COUNT, 3)),
+        ("range", np.float64, 2),
+        ("noise", np.float64, 2),
+        ("noise_smoothing", np.float64),
+        ("frozen_cycles", np.int64),
+        ("healthy_cycles", np.int64),
+        ("stale_cycles", np.int64),
+    ],
+    align=True,
+)
+"""Constants of the IMUs.
+
+Fields:
+    present: which IMUs there are.
+    gain, offset: a calibrated reading is gain times the raw one plus offset.
+    range: of gyroscope and accelerometer; a reading this large is invalid [rad/s, m/s^2].
+    noise: limits of gyroscope and accelerometer, RMS; noise_smoothing is the share of a new sample in the average.
+    frozen_cycles, healthy_cycles, stale_cycles: the durations above.
+"""
+
+STATE = np.dtype(
+    [
+        ("raw", np.float64, (3, IMU_COUNT, 3)),
+        ("sample", np.float64, (3, IMU_COUNT, 3)),
+        ("sample_age", np.int64, IMU_COUNT),
+        ("unchanged", np.int64, IMU_COUNT),
+        ("frozen_for", np.int64, IMU_COUNT),
+        ("healthy_for", np.int64, IMU_COUNT),
+        ("used", np.int64, IMU_COUNT),
+        ("excluded", np.int64, IMU_COUNT),
+        ("earlier", np.float64, (2, 2, IMU_COUNT, 3)),
+        ("variance", np.float64, (2, IMU_COUNT)),
+        ("noise", np.float64, IMU_COUNT),
+    ],
+    align=True,
+)
+"""State of the IMUs.
+
+Fields:
+    raw, sample: the last raw reading, and the calibrated one.
+    sample_age: how many cycles old the sample is, as the rig reports it.
+    unchanged: whether the IMU repeats its reading; `frozen_for` how many cycles it has done so while others did not.
+    healthy_for: for how many cycles the IMU has been healthy.
+    used: whether the filters use it.
+    excluded: whether it contradicted the others, which excludes it for good.
+    earlier: the last two raw samples; `variance` of each sensor's noise, averaged; `noise` of each IMU over its limit.
+"""
+
+
+def imu_parameters(
+    present: Collection[int], calibration: Calibration, fusion: FusionSettings, safety: SafetySettings, rate: float
+) -> Record:
+    """The constants of the IMUs (dtype `PARAMETERS`) that are `present`, in cycles of this rate [Hz]."""
+    shaken = _SHAKEN_HZ / rate
+    values = {
+        "present": [imu in present for imu in range(IMU_COUNT)],
+        "gain": calibration.gain,
+        "offset": calibration.offset,
+        "range": (fusion.gyroscope_range, fusion.accelerometer_range),
+        "noise": np.array([safety.gyroscope_noise, safety.accelerometer_noise]) * max(1.0, shaken**2),
+        "noise_smoothing": min(0.05, 1.0 / (rate * _NOISE_S)),
+        "frozen_cycles": max(3, round(_FROZEN_S * rate)),
+        "healthy_cycles": round(_HEALTHY_S * rate),
+        "stale_cycles": max(3, round(_STALE_S * rate)),
+    }
+    parameters: Record = np.zeros((), PARAMETERS)
+    for name, value in values.items():
+        parameters[name] = value
+    return parameters
+
+
+@kernel
+def screen_imus(p: Record, s: Record, legs: int, time: Record, silent: int, measurement: Array, events: Record) -> None:
+    """Calibrate a raw measurement (3, 7, 3) by (37), and find out which IMUs are healthy.
+
+    An IMU is left out while its readings are not finite, out of range, noisy, or frozen or stale while others are not. It is
+    used again when it has been healthy for a while. An IMU that contradicted the others stays out.
+
+    Args:
+        p, s: dtypes `PARAMETERS` and `STATE`.
+        legs: how many legs there are.
+        time: dtype `TIME`.
+        silent: for how many cycles the rig has not answered.
+        measurement: raw [rad/s, m/s^2, uT].
+        events: dtype `EVENTS`.
+    """
+    changed, total_noise = 0, 0.0
+    for k in range(IMU_COUNT):
+        s.unchanged[k] = 1
+        for kind in range(2):
+            for i in range(3):
+                raw = measurement[kind, k, i]
+                if np.isfinite(raw) and raw != s.raw[kind, k, i]:
+                    s.unchanged[k] = 0
+        changed += p.present[k] != 0 and s.unchanged[k] == 0
+        _update_noise(p, s, time.cycle, measurement, k)
+        total_noise += s.noise[k]
+    for k in range(IMU_COUNT):
+        if s.unchanged[k] == 0:
+            s.frozen_for[k] = 0
+        elif changed > 0:
+            s.frozen_for[k] += 1
+        cause = Cause.NONE.value
+        value, limit = np.nan, np.nan
+        if s.sample_age[k] >= p.stale_cycles and silent == 0:
+            cause, value, limit = Cause.IMU_STALE.value, float(s.sample_age[k]), float(p.stale_cycles)
+        elif s.frozen_for[k] >= p.frozen_cycles:
+            cause, value, limit = Cause.IMU_FROZEN.value, float(s.frozen_for[k]), float(p.frozen_cycles)
+        noise = s.noise[k]
+        if cause == Cause.NONE and noise > max(1.0, _NOISIER * (total_noise - noise) / legs):
+            cause, value, limit = Cause.IMU_NOISY.value, noise, 1.0
+        for kind in range(3):
+            for i in range(3):
+                raw = measurement[kind, k, i]
+                s.raw[kind, k, i] = raw
+                # NaN is not below the limit either.
+                if kind < 2 and not abs(raw) < p.range[kind]:
+                    cause, value, limit = Cause.IMU_OUT_OF_RANGE.value, abs(raw) / p.range[kind], 1.0
+                    if not np.isfinite(raw):
+                        cause, value, limit = Cause.IMU_NOT_FINITE.value, np.nan, np.nan
+                total = p.offset[kind, k, i]
+                for j in range(3):
+                    total += p.gain[kind, k, i, j] * measurement[kind, k, j]
+                s.sample[kind, k, i] = total
+        if p.present[k] == 0 or s.excluded[k] != 0:
+            s.used[k] = 0
+            continue
+        used = s.used[k]
+        healthy = cause == Cause.NONE
+        s.healthy_for[k] = s.healthy_for[k] + 1 + time.missed if healthy else 0
+        s.used[k] = 1 if healthy and (used != 0 or s.healthy_for[k] > min(time.cycle, p.healthy_cycles)) else 0
+        if not healthy and (used != 0 or time.cycle == 0):
+            report_event(events, cause, k, value, limit)
+        elif s.used[k] > used and time.cycle > 0:
+            report_event(events, Cause.IMU_BACK, k, np.nan, np.nan)
+
+
+@kernel
+def _update_noise(p: Record, s: Record, cycle: int, measurement: Array, k: int) -> None:
+    """The noise of IMU `k` over its limit, RMS.
+
+    White noise of variance v has second differences of variance 6 v, and motion adds little to them.
+    """
+    worst = 0.0
+    for kind in range(2):
+        total = 0.0
+        for i in range(3):
+            raw = measurement[kind, k, i]
+            change = raw - 2.0 * s.earlier[0, kind, k, i] + s.earlier[1, kind, k, i]
+            total += change * change / 18.0
+            s.earlier[1, kind, k, i] = s.earlier[0, kind, k, i]
+            s.earlier[0, kind, k, i] = raw
+        if cycle < 2 or not np.isfinite(total):
+            total = 0.0
+        s.variance[kind, k] += p.noise_smoothing * (total - s.variance[kind, k])
+        worst = max(worst, s.variance[kind, k] / p.noise[kind] ** 2)
+    s.noise[k] = np.sqrt(worst)

@@ -1,0 +1,164 @@
+"""From leg directions and the platform's vertical to the pose: a closed form without a first guess, then its refinement.
+
+The twist follows from the refinement's normal equations, and the acceleration is the twist's derivative.
+"""
+
+import numpy as np
+
+from controller.direct_kinematics.geometry import SCRATCH
+from controller.direct_kinematics.legs_alone import pose_from_legs
+from controller.direct_kinematics.legs_and_attitude import pose_from_rotation, pose_from_vector, rotation_from_vectors
+from controller.direct_kinematics.planar import pose_from_roll
+from controller.direct_kinematics.refinement import (
+    find_twist,
+    move_pose,
+    normal_equations,
+    solve_normal_equations,
+    stay_in_plane,
+)
+from controller.rig import elapsed
+from controller.settings import FusionSettings
+from plant.compiled import Record, kernel
+from plant.mechanism import LEGS
+from plant.pose import Array
+
+WORST_CONDITIONING = 1e-2
+"""Least conditioning of a closed form that is relied upon where there is another one, or none."""
+
+PARAMETERS = np.dtype([("section_5", np.int64), ("acceleration_rate", np.float64)], align=True)
+"""Whether the pose is that of the paper's section 5, unrefined; and the corner of the acceleration's low-pass [1/s]."""
+
+STATE = np.dtype(
+    [
+        ("position", np.float64, 3),
+        ("rotation", np.float64, (3, 3)),
+        ("twist", np.float64, 6),
+        ("smooth_twist", np.float64, 6),
+        ("acceleration", np.float64, 6),
+        ("conditioning", np.float64),
+        ("found", np.int64),
+        ("information", np.float64, (6, 6)),
+        ("factor", np.float64, (6, 6)),
+        ("arms", np.float64, (LEGS, 3)),
+        ("directions", np.float64, (LEGS, 3)),
+        ("lengths", np.float64, LEGS),
+        ("vectors", np.float64, (2, 3)),
+        ("vector_weights", np.float64, 2),
+        ("angular_velocity", np.float64, 3),
+        ("correction", np.float64, 6),
+        ("scratch", SCRATCH),
+    ],
+    align=True,
+)
+"""The estimated pose.
+
+Fields:
+    position, rotation: of the platform.
+    twist, smooth_twist, acceleration: velocity and angular velocity in {1}, their low-pass, and their derivative.
+    conditioning: of the closed form.
+    found: whether the measurements determine the pose.
+    information, factor: inverse of the refined pose's covariance (lower triangle), and its Cholesky factor.
+    arms, directions, lengths: the turned platform joints, unit directions and lengths of the legs at the pose.
+    vectors, vector_weights: the measured vertical and horizontal field in {2}, and their weights.
+    angular_velocity, correction, scratch: so that the cycle allocates nothing.
+"""
+
+
+def pose_parameters(fusion: FusionSettings, section_5: bool) -> Record:
+    """The constants of the estimator (dtype `PARAMETERS`)."""
+    parameters: Record = np.zeros((), PARAMETERS)
+    parameters["section_5"], parameters["acceleration_rate"] = section_5, 1.0 / fusion.acceleration_time
+    return parameters
+
+
+@kernel
+def take_vectors(s: Record, platform: Record, heading: Record) -> None:
+    """Take the vertical and the heading from their filters."""
+    for i in range(3):
+        s.vectors[0, i] = platform.vertical[i]
+        s.vectors[1, i] = heading.north[i]
+    s.vector_weights[0], s.vector_weights[1] = platform.weight, heading.weight
+
+
+@kernel
+def find_pose(
+    p: Record, s: Record, rig: Record, directions: Array, leg_used: Array, platform_used: int, heading_used: int
+) -> float:
+    """The pose in closed form from the leg directions, and from the vertical if the platform has an IMU.
+
+    The platform's whole orientation, if there is a heading, serves where those do not suffice; it is all that the paper's
+    section 5 takes from the platform. A planar mechanism's pose takes the platform's vertical for its roll (section 6).
+
+    Args:
+        p, s: dtypes `PARAMETERS` and `STATE`.
+        rig: dtype `RIG`.
+        directions, leg_used: (6, 3) and (6,), the measured directions and which of them are used.
+        platform_used, heading_used: whether the vertical and the heading are used.
+
+    Returns:
+        The conditioning.
+    """
+    s.conditioning = 0.0
+    if rig.planar != 0:
+        if platform_used != 0:
+            s.conditioning = pose_from_roll(
+                rig.geometry, directions, leg_used, rig.vectors_in_base[0], s.vectors[0], s.position, s.rotation
+            )
+        return float(s.conditioning)
+    if platform_used == 0:
+        s.conditioning = pose_from_legs(rig.geometry, directions, leg_used, s.position, s.rotation, s.scratch)
+        return float(s.conditioning)
+    if p.section_5 == 0:
+        s.conditioning = pose_from_vector(
+            rig.geometry, directions, leg_used, rig.vectors_in_base[0], s.vectors[0], s.position, s.rotation, s.scratch
+        )
+    if heading_used != 0 and s.conditioning < WORST_CONDITIONING:
+        s.conditioning = 0.0
+        if rotation_from_vectors(rig.vectors_in_base, s.vectors, s.rotation):
+            s.conditioning = pose_from_rotation(rig.geometry, directions, leg_used, s.rotation, s.position, s.scratch)
+    return float(s.conditioning)
+
+
+@kernel
+def refine_pose(p: Record, s: Record, rig: Record, time: Record, legs: Record, platform_rate: Array) -> bool:
+    """Two Gauss-Newton steps for the pose; the twist comes with them, and the acceleration is its derivative.
+
+    The paper's section 5 does not move the pose and has no covariance.
+
+    Args:
+        p, s: dtypes `PARAMETERS` and `STATE`.
+        rig, time: dtypes `RIG` and `TIME`.
+        legs: state of the leg filters.
+        platform_rate: (3,), angular velocity in {2} [rad/s].
+
+    Returns:
+        Whether the normal equations have a solution.
+    """
+    for _ in range(2):
+        normal_equations(
+            rig.geometry.base_joints, rig.geometry.platform_joints, legs.directions, legs.weights, rig.vectors_in_base,
+            s.vectors, s.vector_weights, s.position, s.rotation, s.arms, s.directions, s.lengths, s.information, s.correction,
+        )  # fmt: skip
+        if rig.planar != 0:
+            stay_in_plane(s.information, s.correction)
+        if not solve_normal_equations(s.information, s.correction, s.factor):
+            return False
+        if p.section_5 != 0:
+            s.information[:] = 0.0
+            break
+        move_pose(s.correction, s.position, s.rotation)
+    for i in range(3):
+        s.angular_velocity[i] = 0.0
+        for j in range(3):
+            s.angular_velocity[i] += s.rotation[i, j] * platform_rate[j]
+    find_twist(
+        legs.rates, legs.weights, s.vectors, s.vector_weights, s.angular_velocity, s.rotation, s.arms, s.directions, s.lengths,
+        s.factor, s.twist,
+    )  # fmt: skip
+    if time.cycle == 0:
+        s.smooth_twist[:] = s.twist
+    share = min(1.0, elapsed(rig, time) * p.acceleration_rate)
+    for i in range(6):
+        s.acceleration[i] = (s.twist[i] - s.smooth_twist[i]) * p.acceleration_rate
+        s.smooth_twist[i] += share * (s.twist[i] - s.smooth_twist[i])
+    return True

@@ -1,0 +1,92 @@
+"""Which sets of IMUs can be used: whether they determine the pose everywhere in the workspace."""
+
+from collections.abc import Collection
+
+import numpy as np
+
+from controller.direct_kinematics.geometry import geometry_of
+from controller.estimation.pose_estimator import PARAMETERS, STATE, WORST_CONDITIONING, find_pose
+from controller.inverse_kinematics import sample_workspace
+from controller.rig import RIG, field_of
+from plant.errors import InputError
+from plant.mechanism import LEGS, Mechanism, six_rows
+from plant.wiring import ALL_IMUS, PLATFORM_IMU
+
+_LEAST_FIELD = 5.0
+"""Least horizontal magnetic field from which a heading can be taken [uT]."""
+
+_LEAST_OBSERVABILITY = 0.2
+"""Least component of the vertical across both axes of a universal joint at home; with less, gravity does not show the joint's
+angles."""
+
+
+def imus_of(mechanism: Mechanism, imus: Collection[int] = ALL_IMUS) -> tuple[int, ...]:
+    """Those of `imus` that the legs of a mechanism and its platform can have."""
+    return tuple(imu for imu in ALL_IMUS if imu in imus and (imu < mechanism.legs or imu == PLATFORM_IMU))
+
+
+def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool = False, section_5: bool = False) -> float:
+    """Check that these IMUs, and the platform's magnetometer, determine the pose, at home and over the workspace; returns the
+    worst conditioning there.
+
+    Raises:
+        InputError: an IMU outside 0 to 6, no field for the magnetometer, or the set does not determine the pose.
+    """
+    for imu in imus:
+        if imu not in ALL_IMUS:
+            raise InputError(f"there is no IMU {imu}; 0 to 5 sit on the legs, 6 on the platform")
+    field = field_of(mechanism)
+    if mechanism.planar and (magnetometer or section_5):
+        raise InputError(f"{mechanism.name!r} is planar and has no heading: do without magnetometer and section 5")
+    if magnetometer and PLATFORM_IMU not in imus:
+        raise InputError("the magnetometer is part of the platform's IMU, which is not there: add IMU 6")
+    if magnetometer and field.horizontal < _LEAST_FIELD:
+        raise InputError(
+            f"the horizontal magnetic field is {field.horizontal:.3g} uT; a heading needs at least {_LEAST_FIELD:g}: do "
+            "without the magnetometer, or set the plant's magnetic_field"
+        )
+    if section_5 and not magnetometer:
+        raise InputError("the paper's section 5 needs the platform's heading: add its magnetometer (--magnetometer)")
+    # Of the one axis of a planar joint, gravity tells the angle wherever the leg points.
+    in_plane = float(np.linalg.norm(mechanism.up_in_base[:2]))
+    if mechanism.planar and in_plane < _LEAST_OBSERVABILITY:
+        raise InputError(
+            f"gravity hardly tells the angles in the plane of {mechanism.name!r}: of the vertical only {in_plane:.2g} lies in "
+            f"it, and {_LEAST_OBSERVABILITY:g} is needed: set the plant's gravity"
+        )
+    across = np.abs(mechanism.joint_rotations[:, :, 2] @ mechanism.up_in_base)
+    for leg in range(mechanism.legs):
+        if not mechanism.planar and leg in imus and across[leg] < _LEAST_OBSERVABILITY:
+            raise InputError(
+                f"gravity hardly tells the angles of leg {leg}: of the vertical only {across[leg]:.2g} lies across the axes "
+                f"of its joint, and {_LEAST_OBSERVABILITY:g} is needed: turn base_joint_axes[{leg}], or leave its IMU out"
+            )
+    names = ", ".join(str(imu) for imu in imus_of(mechanism, imus)) or "none"
+    if mechanism.planar and PLATFORM_IMU not in imus:
+        raise InputError(
+            f"the IMUs {names} determine the pose of {mechanism.name!r} up to its two assembly modes at best, which the loop "
+            "cannot tell apart: add the platform's IMU (6), whose roll does"
+        )
+    positions, rotations = sample_workspace(mechanism, 50, seed=0)
+    rig, parameters, pose = np.zeros((), RIG), np.zeros((), PARAMETERS), np.zeros((), STATE)
+    rig["geometry"], rig["vectors_in_base"], rig["planar"] = geometry_of(mechanism), field.vectors, mechanism.planar
+    parameters["section_5"] = section_5
+    leg_used = np.array([float(leg in imus_of(mechanism, imus)) for leg in range(LEGS)])
+    worst = np.inf
+    for position, rotation in zip(positions, rotations, strict=True):
+        legs = position + mechanism.platform_joints @ rotation.T - mechanism.base_joints
+        directions = six_rows(legs / np.linalg.norm(legs, axis=1, keepdims=True))
+        pose["vectors"] = field.vectors @ rotation
+        used = (int(PLATFORM_IMU in imus), int(magnetometer))
+        worst = min(worst, find_pose(parameters[()], pose[()], rig[()], directions, leg_used, *used))
+    if worst < WORST_CONDITIONING:
+        remedies = ["legs"]
+        if PLATFORM_IMU not in imus:
+            remedies.append("the platform's IMU (6)")
+        if not (magnetometer or mechanism.planar):
+            remedies.append("its magnetometer (--magnetometer)")
+        raise InputError(
+            f"the IMUs {names} do not determine the pose of {mechanism.name!r} everywhere in its workspace (conditioning "
+            f"{worst:.1e}; at least {WORST_CONDITIONING:g} is needed): add {', or '.join(remedies)}"
+        )
+    return worst

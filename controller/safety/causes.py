@@ -1,0 +1,171 @@
+"""The states of a run, what is asked of the drives, and every cause that ends or degrades a run.
+
+    idle --checks pass, drives are enabled--> armed --all drives follow--> running
+    running --> stopping --> stopped            a controlled stop, within the limits of the actuators
+    any --> fault                               a quick stop without the estimate, or the brakes at once
+
+No command is sent before `Mode.RUNNING`. Every cause is reported as an event, with the leg or IMU, the value and its limit.
+"""
+
+from enum import IntEnum
+
+import numpy as np
+
+from plant.compiled import Record, kernel
+
+
+class Mode(IntEnum):
+    """The state of a run."""
+
+    IDLE, ARMED, RUNNING, STOPPING, STOPPED, FAULT = range(6)
+
+
+class Request(IntEnum):
+    """What the controller asks of the drives.
+
+    BRAKED: hold on the brakes. ENABLED: follow the commands. QUICK_STOP: stop by yourselves, then hold.
+    """
+
+    BRAKED, ENABLED, QUICK_STOP = range(3)
+
+
+class DriveState(IntEnum):
+    """What a drive reports of itself.
+
+    FOLLOWING: it follows the commands; a drive without states of its own always does. READY: it holds and can be enabled.
+    NOT_READY: it has no power or is not ready. QUICK_STOPPING: it stops by itself. FAULTY: it has a fault.
+    """
+
+    FOLLOWING, READY, NOT_READY, QUICK_STOPPING, FAULTY = range(5)
+
+
+class Reaction(IntEnum):
+    """What a cause leads to; the larger the number, the more severe."""
+
+    GO_ON, STOP, QUICK_STOP, BRAKE = range(4)
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        return ("goes on", "controlled stop", "quick stop", "brakes at once")[self]
+
+
+_WORST = ", the worst is IMU {}"
+
+
+class Cause(IntEnum):
+    """Why something happened. A cause whose reaction is `GO_ON` is reported and ends nothing.
+
+    Attributes:
+        text: the cause in words; {} is the number of the leg or IMU.
+        reaction: what the cause leads to.
+        unit: of its value and limit.
+    """
+
+    def __new__(cls, number: int, *_: object) -> "Cause":
+        """A member whose value is its number."""
+        member = int.__new__(cls, number)
+        member._value_ = number
+        return member
+
+    def __init__(self, number: int, text: str = "", reaction: Reaction = Reaction.GO_ON, unit: str = "") -> None:
+        self.text, self.reaction, self.unit = text, reaction, unit  # type: ignore[misc]
+
+    NONE = 0, "none", Reaction.GO_ON
+    END_OF_MOTION = 1, "end of the motion", Reaction.STOP
+    STOP_REQUESTED = 2, "asked for", Reaction.STOP
+    MISSED_PERIODS = 3, "too many periods missed in a row", Reaction.STOP, "periods"
+    SUPERVISOR_GONE = 4, "the supervising process has gone", Reaction.STOP
+    EMERGENCY_STOP = 5, "emergency stop", Reaction.QUICK_STOP
+    CLOCK_FAILED = 6, "this machine's clock refuses to wake the loop", Reaction.BRAKE
+    RIG_FAILED = 7, "the rig reports failure", Reaction.BRAKE
+    IMU_STALE = 8, "IMU {} is left out: its samples are stale", Reaction.GO_ON, "cycles"
+    IMU_FROZEN = 9, "IMU {} is left out: it is frozen", Reaction.GO_ON, "cycles"
+    IMU_NOT_FINITE = 10, "IMU {} is left out: it gives what is not finite", Reaction.GO_ON
+    IMU_OUT_OF_RANGE = 11, "IMU {} is left out: it is at the end of its range", Reaction.GO_ON, "of the range"
+    IMU_NOISY = 12, "IMU {} is left out: it is noisy", Reaction.GO_ON, "of the limit"
+    IMU_DISAGREES = 13, "IMU {} is left out: it disagrees with the others", Reaction.GO_ON, "rad"
+    IMU_BACK = 14, "IMU {} is used again", Reaction.GO_ON
+    IMUS_LOST = 15, "too many IMUs are lost", Reaction.STOP, "IMUs"
+    IMUS_DISAGREE = 16, f"the IMUs contradict each other{_WORST}", Reaction.STOP, "rad"
+    POSE_LOST = 17, "the IMUs that can be used no longer determine the pose", Reaction.QUICK_STOP
+    NOT_FINITE = 18, "an estimate or a command is no longer finite", Reaction.QUICK_STOP
+    IMPLAUSIBLE = (
+        19,
+        "the estimated pose needs leg {} far outside its stroke: the IMUs' errors are larger than the filters assume (raw ones "
+        "need a calibration)",
+        Reaction.QUICK_STOP,
+        "m",
+    )
+    ILL_CONDITIONED = 20, "the pose is badly determined", Reaction.STOP
+    BEYOND_STROKE = 21, "leg {} is beyond its stroke", Reaction.STOP, "m"
+    TOO_FAST = 22, "leg {} is too fast", Reaction.STOP, "m/s"
+    FOLLOWING_ERROR = 23, "leg {} does not follow its reference", Reaction.STOP, "m"
+    SATURATED = 24, "the command of leg {} stays at its limit", Reaction.STOP, "s"
+    ANSWER_LATE = 25, "an exchange with the rig was late or its answer was refused", Reaction.GO_ON
+    BUS_LOST = 26, "the bus is lost: the rig does not answer", Reaction.QUICK_STOP, "cycles"
+    DRIVE_FAULT = 27, "drive {} reports a fault", Reaction.QUICK_STOP
+    DRIVE_OFF = 28, "drive {} has left its operation", Reaction.QUICK_STOP
+    DRIVE_DEVIATES = 29, "drive {} does not do what it is told", Reaction.BRAKE, "m/s"
+    ARMED = 30, "armed", Reaction.GO_ON
+    NO_SENSORS = (
+        31,
+        "not armed: IMU {} is not plausible: a raw one needs a calibration, else check its place",
+        Reaction.STOP,
+        "rad",
+    )
+    NO_AGREEMENT = 32, "not armed: leg {} is not where the target begins", Reaction.STOP, "m"
+    NO_WORKSPACE = 33, "not armed: leg {} is outside its stroke", Reaction.STOP, "m"
+    NO_DRIVES = 34, "not armed: drive {} is not ready", Reaction.STOP
+    TARGET_LOST = 35, "the target's stream has stopped", Reaction.STOP, "s"
+    TARGET_JUMPS = 36, "the target jumps for leg {}", Reaction.STOP, "m"
+    TARGET_NOT_FINITE = 37, "the target is not finite, or its quaternion is none", Reaction.STOP
+
+    @property
+    def short(self) -> str:
+        """The text without the number of a leg or an IMU."""
+        return self.text.replace(_WORST, "").replace(" {}", "")
+
+    def describe(self, index: int, value: float, limit: float) -> str:
+        """An event with this cause, in words.
+
+        Args:
+            index: the number of the leg or IMU; -1 if none is named.
+            value, limit: in the unit of the cause; NaN if there is none.
+        """
+        text = (self.text if index >= 0 else self.text.replace(_WORST, "")).format(index)
+        if np.isnan(value):
+            return text
+        unit = f" {self.unit}" if self.unit else ""
+        return (
+            f"{text} ({value:.4g}{unit})" if np.isnan(limit) else f"{text} ({value:.4g}{unit}, the limit is {limit:.4g}{unit})"
+        )
+
+
+REACTION = np.array([cause.reaction.value for cause in Cause])
+"""The reaction to each cause, by number."""
+
+EVENT_SLOTS = 8
+
+EVENTS = np.dtype(
+    [
+        ("count", np.int64),
+        ("cause", np.int32, EVENT_SLOTS),
+        ("index", np.int32, EVENT_SLOTS),
+        ("value", np.float64, EVENT_SLOTS),
+        ("limit", np.float64, EVENT_SLOTS),
+    ],
+    align=True,
+)
+"""The events of one cycle. `count` also counts events for which there was no slot."""
+
+
+@kernel
+def report_event(events: Record, cause: int, index: int, value: float, limit: float) -> None:
+    """Add an event (dtype `EVENTS`)."""
+    if events.count < EVENT_SLOTS:
+        events.cause[events.count] = cause
+        events.index[events.count] = index
+        events.value[events.count] = value
+        events.limit[events.count] = limit
+    events.count += 1

@@ -1,0 +1,157 @@
+"""How a run ends: a controlled stop within the limits, a quick stop by the drives themselves, or the brakes at once."""
+
+import numpy as np
+
+from controller.planning.segments import STOP_SEGMENTS, plan_stop
+from controller.safety.causes import REACTION, Cause, Mode, Reaction, Request, report_event
+from plant.compiled import Record, kernel
+from plant.mechanism import LEGS
+from plant.mechanism.limits import Limits
+
+STOP_SETTLING_S = 0.1
+"""How long the drives hold a mechanism that has stopped before the brakes take over [s]."""
+
+PARAMETERS = np.dtype(
+    [
+        ("velocity_limit", np.float64),
+        ("acceleration_limit", np.float64),
+        ("jerk_limit", np.float64),
+        ("settling_cycles", np.int64),
+    ],
+    align=True,
+)
+"""The actuators' limits [m/s, m/s^2, m/s^3], and how long the drives hold before the brakes."""
+
+STATE = np.dtype(
+    [
+        ("cause", np.int64),
+        ("cycle", np.int64),
+        ("end_cycle", np.int64),
+        ("segments", np.float64, (LEGS, STOP_SEGMENTS, 5)),
+        ("index", np.int64),
+        ("value", np.float64),
+        ("limit", np.float64),
+        ("earlier_cause", np.int64),
+    ],
+    align=True,
+)
+"""The stop or fault that is under way.
+
+Fields:
+    cause: of the stop, `Cause.NONE` while the run goes on.
+    cycle, end_cycle: when it began, and when the brakes may hold.
+    segments: the reference of a controlled stop.
+    index, value, limit: of the cause.
+    earlier_cause: why the run was stopping already when a fault came.
+"""
+
+
+def stop_parameters(limits: Limits, rate: float) -> Record:
+    """The constants of a stop (dtype `PARAMETERS`) in cycles of this rate [Hz]."""
+    parameters: Record = np.zeros((), PARAMETERS)
+    parameters["velocity_limit"], parameters["acceleration_limit"] = limits.velocity, limits.acceleration
+    parameters["jerk_limit"], parameters["settling_cycles"] = limits.jerk, int(np.ceil(STOP_SETTLING_S * rate))
+    return parameters
+
+
+def describe_end(state: Record) -> str:
+    """Why a run has ended, in words, from the cycle's state."""
+    stop = state["safety"]["stop"]
+    earlier = Cause(int(stop["earlier_cause"]))
+    first = f"{earlier.short}, and then: " if earlier != Cause.NONE else ""
+    return first + Cause(int(stop["cause"])).describe(int(stop["index"]), float(stop["value"]), float(stop["limit"]))
+
+
+@kernel
+def handle_cause(
+    p: Record, s: Record, rig: Record, time: Record, reference: Record, pid: Record,
+    cause: int, index: int, value: float, limit: float,
+) -> None:  # fmt: skip
+    """Report a cause and react to it as `Cause` says.
+
+    The first cause of a stop counts, and the first of a fault. A fault overrides a stop.
+
+    Args:
+        p, s: parameters and state of the safety stage.
+        rig, time: dtypes `RIG` and `TIME`.
+        reference, pid: states of these stages, which a stop changes.
+        cause, index, value, limit: what has happened.
+    """
+    reaction = REACTION[cause]
+    if s.mode == Mode.FAULT or (reaction == Reaction.STOP and s.stop.cause != Cause.NONE):
+        return
+    report_event(s.events, cause, index, value, limit)
+    if reaction == Reaction.GO_ON:
+        return
+    s.stop.index, s.stop.value, s.stop.limit = index, value, limit
+    if reaction == Reaction.STOP:
+        _begin_stop(p.stop, s, rig, time, reference, pid, cause)
+    else:
+        _fail(p.stop, s, rig, time, pid, cause)
+
+
+@kernel
+def _begin_stop(p: Record, s: Record, rig: Record, time: Record, reference: Record, pid: Record, cause: int) -> None:
+    """Leave the motion for the fastest stop within the limits, leg by leg.
+
+    Before the motion there is nothing to stop. In missed periods the drives followed the last command, so the stop begins
+    where that has led.
+    """
+    s.stop.cause = cause
+    s.stop.cycle = s.stop.end_cycle = time.cycle
+    if s.mode == Mode.RUNNING:
+        if time.missed > 0:
+            for k in range(rig.legs):
+                speed = min(max(pid.command[k], -p.velocity_limit), p.velocity_limit)
+                reference.motion[k, 0] += time.missed * rig.period * speed
+                reference.motion[k, 1], reference.motion[k, 2] = speed, 0.0
+        duration = plan_stop(reference.motion, p.acceleration_limit, p.jerk_limit, s.stop.segments)
+        s.stop.end_cycle += int(np.ceil(duration / rig.period)) + p.settling_cycles
+        reference.index[:] = 0
+        reference.due_cycle = 0
+    else:
+        s.request = Request.BRAKED
+    s.mode = Mode.STOPPING
+
+
+@kernel
+def _fail(p: Record, s: Record, rig: Record, time: Record, pid: Record, cause: int) -> None:
+    """End without the estimate: the drives come to rest by themselves, or the brakes close at once."""
+    moving = s.request == Request.ENABLED
+    s.stop.earlier_cause = s.stop.cause
+    s.stop.cause = cause
+    s.stop.cycle = s.stop.end_cycle = time.cycle
+    s.mode = Mode.FAULT
+    s.request = Request.BRAKED
+    if REACTION[cause] == Reaction.QUICK_STOP and moving:
+        s.request = Request.QUICK_STOP
+        fastest = 0.0
+        for k in range(rig.legs):
+            if not np.isfinite(pid.command[k]):
+                pid.command[k] = 0.0
+            fastest = max(fastest, abs(pid.command[k]))
+        s.stop.end_cycle += int(np.ceil(fastest / (p.acceleration_limit * rig.period)))
+    else:
+        pid.command[:] = 0.0
+    if moving:
+        s.stop.end_cycle += p.settling_cycles
+
+
+@kernel
+def ramp_down(p: Record, rig: Record, time: Record, pid: Record) -> None:
+    """A cycle after a fault: every command comes to rest at the limit of acceleration, whatever is measured."""
+    step = p.acceleration_limit * rig.period * (1 + time.missed)
+    for k in range(rig.legs):
+        pid.command[k] -= min(max(pid.command[k], -step), step)
+    time.cycle += 1
+
+
+@kernel
+def has_stopped(s: Record, time: Record) -> bool:
+    """Whether a stop or a fault has come to its end, so that the brakes may hold; a stop becomes `Mode.STOPPED` then."""
+    ended = s.stop.cause != Cause.NONE and time.cycle >= s.stop.end_cycle
+    if ended:
+        s.request = Request.BRAKED
+        if s.mode == Mode.STOPPING:
+            s.mode = Mode.STOPPED
+    return bool(ended)

@@ -1,0 +1,26 @@
+"""The cycle as tests call it, without the times of its stages."""
+
+import numpy as np
+
+from controller import cycle as compiled
+from controller.estimation.pose_estimator import find_pose, refine_pose
+
+_MARKS = np.zeros((), compiled.MARKS)[()]
+
+
+def cycle(parameters, state, measurement, segments):
+    """One cycle; returns its cause."""
+    return compiled.cycle(parameters, state, measurement, segments, _MARKS)
+
+
+def find(parameters, state):
+    """The pose in closed form; returns its conditioning."""
+    p, s = parameters[()], state[()]
+    used = int(s["platform"]["used"]), int(s["heading"]["used"])
+    return find_pose(p["pose"], s["pose"], p["rig"], s["legs"]["directions"], s["legs"]["used"], *used)
+
+
+def refine(parameters, state):
+    """The refined pose with its twist; returns whether there is one."""
+    p, s = parameters[()], state[()]
+    return refine_pose(p["pose"], s["pose"], p["rig"], s["time"], s["legs"], s["platform"]["rate"])
