@@ -473,13 +473,17 @@ def test_a_replayed_run_is_the_recorded_one_bit_for_bit(faults, tmp_path):
 def test_a_replay_on_the_clock(recorded, tmp_path):
     path, records = recorded
     config = replace(CONFIG, rig="replay", rig_at=str(path))
-    summary = run(config, SETTINGS, tmp_path / "again.mcap")
-    assert summary["cause"] == "end of the motion"
-    assert summary["identity"]["parts"]["rig"] == "udp"
-    again = read(tmp_path / "again.mcap").records
-    # A period that is missed now leads to other estimates.
-    gaps = np.flatnonzero(again["missed"])
-    upto = int(gaps[0]) if len(gaps) else len(records)
+    # A period that is missed now leads to other estimates. On a busy machine one may be missed early: try again.
+    for number in range(10):
+        file = tmp_path / f"again-{number}.mcap"
+        summary = run(config, SETTINGS, file)
+        assert summary["cause"] == "end of the motion"
+        assert summary["identity"]["parts"]["rig"] == "udp"
+        again = read(file).records
+        gaps = np.flatnonzero(again["missed"])
+        upto = int(gaps[0]) if len(gaps) else len(records)
+        if upto > 50:
+            break
     assert upto > 50
     for name in (*ESTIMATES, *FOLLOWED):
         assert again[name][:upto].tobytes() == records[name][:upto].tobytes(), name
