@@ -63,7 +63,7 @@ def pose_errors(mechanism, calibration, tilt, readings, positions, rotations):
     return 1e3 * np.sqrt(np.mean(distances**2)), np.degrees(np.sqrt(np.mean(angles**2)))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_rests_at_unknown_poses_bring_the_error_down(hexapod, seed):
     readings, _, _ = rests_of(hexapod, 20, seed)
     others = rests_of(hexapod, 10, seed, poses=sample_workspace(hexapod, 10, seed=999))
@@ -76,6 +76,7 @@ def test_rests_at_unknown_poses_bring_the_error_down(hexapod, seed):
     assert after[1] < 0.3
 
 
+@pytest.mark.slow
 def test_a_known_home_and_measured_length_changes_help(hexapod):
     poses = sample_workspace(hexapod, 20, seed=7)
     poses[0][0], poses[1][0] = hexapod.home.position, hexapod.home.rotation
@@ -133,6 +134,7 @@ def test_motion_brings_it_to_a_tenth_of_a_millimetre(hexapod):
     assert error[6].max() < 2e-3
 
 
+@pytest.mark.slow
 def test_joints_that_are_off_are_sought_with_the_rest(hexapod):
     built, fusion = hexapod.built(2e-4, 3), sensor_settings(hexapod, RAW)
     readings, _, _ = rests_of(built, 20, 1)

@@ -14,7 +14,9 @@ from plant.fmu.plant import FmuPlant, write_drive_mode
 from plant.mechanism import Mechanism
 
 
-@pytest.mark.parametrize("model", [SPATIAL_MODEL, PLANAR_MODEL], ids=lambda model: model.identifier)
+@pytest.mark.parametrize(
+    "model", [pytest.param(SPATIAL_MODEL, marks=pytest.mark.slow), PLANAR_MODEL], ids=lambda model: model.identifier
+)
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_the_linear_plant_is_casadis(model: Model, fmi: int) -> None:
     """About a lively state, as python-control gets it; poles and matrices by their names."""

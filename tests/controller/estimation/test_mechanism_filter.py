@@ -72,9 +72,15 @@ class Run:
         return 1e3 * np.sqrt(np.mean(distance**2)), np.degrees(np.sqrt(np.mean(angle**2)))
 
 
-@pytest.mark.parametrize("errors", ["gyroscopes", "accelerometers", "alignments"])
+@pytest.mark.parametrize("errors", ["gyroscopes", pytest.param("accelerometers", marks=pytest.mark.slow), "alignments"])
 @pytest.mark.parametrize(
-    ("kind", "limits"), [("0.5", (0.2, 0.03)), ("1", (0.15, 0.03)), ("2", (0.1, 0.03)), ("mixed", (0.5, 0.1))]
+    ("kind", "limits"),
+    [
+        pytest.param("0.5", (0.2, 0.03), marks=pytest.mark.slow),
+        ("1", (0.15, 0.03)),
+        pytest.param("2", (0.1, 0.03), marks=pytest.mark.slow),
+        ("mixed", (0.5, 0.1)),
+    ],
 )
 def test_a_motion_is_followed_to_a_tenth_of_a_millimetre(hexapod, errors, kind, limits):
     position, rotation = Run(hexapod, kind, errors, seconds=20.0).rms()
@@ -209,7 +215,14 @@ class Twin:
         self.rig = self.rig + change[18 + 7 * self.n :]
 
 
-@pytest.mark.parametrize(("errors", "rig", "tolerance"), [*((name, False, 1.0) for name in BLOCKS), ("axes", True, 300.0)])
+@pytest.mark.parametrize(
+    ("errors", "rig", "tolerance"),
+    [
+        ("gyroscopes", False, 1.0),
+        *(pytest.param(name, False, 1.0, marks=pytest.mark.slow) for name in list(BLOCKS)[1:]),
+        ("axes", True, 300.0),
+    ],
+)
 def test_taken_bit_by_bit_it_equals_its_dense_twin(hexapod, errors, rig, tolerance):
     motion = impose(hexapod, "1", 0.5, RATE_HZ, 4)
     random = np.random.default_rng(4)

@@ -129,6 +129,7 @@ def test_a_corrupt_fmu_and_one_that_lacks_a_variable_are_one_clear_line(tmp_path
     assert "has no variable 'imu_specific_force'; did you mean imu_force?" in refused(gough("simulate", "--plant", poor))
 
 
+@pytest.mark.slow
 def test_fmu_build_writes_an_fmu_that_simulate_takes(tmp_path):
     run = gough("fmu", "build", "--output", "plant.fmu", cwd=tmp_path)
     assert run.returncode == 0, run.stderr

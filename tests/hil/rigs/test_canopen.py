@@ -131,7 +131,7 @@ def run(rig, cycles, command=None, request=ENABLED, until=None):
     return feedback, statuses
 
 
-@pytest.mark.parametrize("fd", [True, False])
+@pytest.mark.parametrize("fd", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_it_runs_from_open_to_close(fd):
     machine = Kinematic()
     config = settings(bus={"fd": fd}, drives={"signs": [1, -1, 1, -1, 1, -1]}, imus={"signs": [[1, -1, 1]] * 7})
@@ -325,7 +325,7 @@ def test_a_leg_that_leaves_operation_stops():
         np.testing.assert_array_equal(machine.velocity, 0.0)
 
 
-@pytest.mark.parametrize("fd", [True, False])
+@pytest.mark.parametrize("fd", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_late_and_double_frames_are_refused_and_counted(fd):
     faults = Counter()
 
@@ -402,7 +402,7 @@ def test_commands_that_are_not_numbers_are_zero():
 FRAMES = 500_000
 
 
-@pytest.mark.parametrize("fd", [True, False])
+@pytest.mark.parametrize("fd", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_decoder_takes_anything(fd):
     config = settings(bus={"fd": fd})
     decoder = Decoder(config)

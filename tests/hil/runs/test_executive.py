@@ -259,8 +259,8 @@ def test_what_cannot_be_run_is_refused_before_anything_runs(tmp_path):
 # ----------------------------------------------------------------------------------------------------------- being asked to end
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("whom", ["supervisor", "group"])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("whom", ["supervisor", pytest.param("group", marks=pytest.mark.slow)])
 def test_a_signal_ends_the_motion_by_a_controlled_stop(tmp_path, number, whom):
     path = tmp_path / "run.mcap"
     process, *others = started(path)
@@ -281,6 +281,7 @@ def test_a_signal_ends_the_motion_by_a_controlled_stop(tmp_path, number, whom):
     assert replay([path]).same
 
 
+@pytest.mark.slow
 def test_when_the_supervisor_is_killed_the_loop_stops_by_itself_and_the_file_is_complete(tmp_path):
     path = tmp_path / "run.mcap"
     process, *others = started(path)
@@ -480,6 +481,7 @@ def gone(*pids):
     return all(ended(pid) for pid in pids)
 
 
+@pytest.mark.slow
 def test_when_the_supervisor_is_killed_before_the_start_nothing_stays(tmp_path):
     process = gough("run", "--duration", 60, "--rate", 500, "--record", tmp_path / "run.mcap")
     wait_for(lambda: children(process.pid) or process.poll() is not None)
@@ -497,6 +499,7 @@ def test_a_signal_before_the_start_ends_it_at_once():
     assert process.returncode == 0 or "asked to stop before anything has moved" in errors
 
 
+@pytest.mark.slow
 def test_a_recorder_killed_at_once_costs_nothing(tmp_path):
     path, figures = tmp_path / "run.mcap", tmp_path / "run.json"
     process = gough("run", "--duration", 1.5, "--rate", 500, "--most-missed", 2000, "--record", path, "--json", figures)
@@ -510,6 +513,7 @@ def test_a_recorder_killed_at_once_costs_nothing(tmp_path):
     assert summary["recording"]["lost"] == 0
 
 
+@pytest.mark.slow
 def test_cycles_that_a_stopped_recorder_missed_are_counted(tmp_path):
     path, figures = tmp_path / "run.mcap", tmp_path / "run.json"
     process, _, recorder = started(path, "--json", figures)
@@ -525,6 +529,7 @@ def test_cycles_that_a_stopped_recorder_missed_are_counted(tmp_path):
     assert gone(recorder)
 
 
+@pytest.mark.slow
 def test_a_loop_that_does_not_answer_is_ended(tmp_path):
     process, loop, recorder = started(tmp_path / "run.mcap")
     os.kill(loop, signal.SIGSTOP)
@@ -537,6 +542,7 @@ def test_a_loop_that_does_not_answer_is_ended(tmp_path):
     assert gone(loop, recorder)
 
 
+@pytest.mark.slow
 def test_a_file_that_another_run_records_to_is_refused(tmp_path):
     path = tmp_path / "run.mcap"
     process, loop, recorder = started(path)
@@ -657,6 +663,7 @@ def test_an_exchange_that_fails_is_told_and_replayed(tmp_path):
     assert replay([path]).same
 
 
+@pytest.mark.slow
 def test_too_many_missed_periods_are_a_failure(tmp_path):
     path = tmp_path / "run.mcap"
     process, loop, _ = started(path, "--most-missed", 50)

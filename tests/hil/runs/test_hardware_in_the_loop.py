@@ -108,6 +108,7 @@ def canopen_file(tmp_path_factory):
 # --------------------------------------------------------------------------------------------------------------- it follows
 
 
+@pytest.mark.slow
 def test_over_udp_it_follows_as_with_the_plant_itself_and_says_how_the_bus_was(tmp_path):
     figures = {}
     direct = gough("run", *MOTION, *PATIENT, "--duration", 5, "--json", tmp_path / "fmu.json")
@@ -138,6 +139,7 @@ def test_over_udp_it_follows_as_with_the_plant_itself_and_says_how_the_bus_was(t
     assert replay([tmp_path / "udp.mcap"]).same
 
 
+@pytest.mark.slow
 def test_over_canopen_it_follows_and_replays(tmp_path, canopen_file):
     with emulated("--bus", "canopen", at=str(canopen_file)) as (_, at, _):
         run = gough(
@@ -156,6 +158,7 @@ def test_over_canopen_it_follows_and_replays(tmp_path, canopen_file):
     assert replay([tmp_path / "can.mcap"]).same
 
 
+@pytest.mark.slow
 def test_a_dry_run_reads_everything_and_moves_nothing(tmp_path):
     with emulated() as (_, at, control):
         run = gough(
@@ -201,6 +204,7 @@ def test_when_the_loop_is_killed_the_drives_stop_by_themselves(tmp_path):
         assert finished(gough("run", "--rig", "udp", "--rig-at", at, *MOTION, *PATIENT, "--duration", 0.5))[0] == 0
 
 
+@pytest.mark.slow
 def test_when_the_loop_is_killed_canopen_drives_stop_by_their_heartbeat(canopen_file):
     with emulated("--bus", "canopen", at=str(canopen_file)) as (_, at, control):
         run = started(at, control, "--rate", 250, rig="canopen")
@@ -212,6 +216,7 @@ def test_when_the_loop_is_killed_canopen_drives_stop_by_their_heartbeat(canopen_
         assert finished(run)[0] == 1
 
 
+@pytest.mark.slow
 def test_when_the_rig_is_killed_the_run_ends_and_a_new_one_serves_the_next(tmp_path):
     with emulated() as (process, at, control):
         run = started(at, control, "--record", tmp_path / "x.mcap", "--mechanism", "hexapod")
@@ -227,6 +232,7 @@ def test_when_the_rig_is_killed_the_run_ends_and_a_new_one_serves_the_next(tmp_p
         assert finished(gough("run", "--rig", "udp", "--rig-at", at, *MOTION, *PATIENT, "--duration", 0.5))[0] == 0
 
 
+@pytest.mark.slow
 def test_a_fault_that_is_injected_is_told_and_the_run_goes_on_without_the_imu(tmp_path):
     with emulated() as (_, at, control):
         run = started(at, control)
@@ -250,6 +256,7 @@ def test_the_emergency_key_stops_the_drives_quickly():
         wait_for(lambda: DriveState.FOLLOWING not in state_of(control)["drive"], 10.0)
 
 
+@pytest.mark.slow
 def test_a_rig_that_is_not_there_or_stands_elsewhere_is_not_driven():
     status, _, errors = finished(gough("run", "--rig", "udp", "--rig-at", f"127.0.0.1:{free_port()}", "--duration", 1))
     assert status == 2 and "no rig answers" in errors
@@ -275,8 +282,8 @@ def test_a_rig_that_is_not_there_or_stands_elsewhere_is_not_driven():
     ("options", "words"),
     [
         (("--duration", 3), "the target's stream has stopped"),
-        (("--jump-at", 2), "the target"),
-        (("--nan-at", 2), "the target is not finite"),
+        pytest.param(("--jump-at", 2), "the target", marks=pytest.mark.slow),
+        pytest.param(("--nan-at", 2), "the target is not finite", marks=pytest.mark.slow),
     ],
 )
 def test_a_streamed_target_is_followed_until_it_goes_wrong(tmp_path, options, words):

@@ -45,6 +45,7 @@ def test_the_default_fmu_is_built_once(fmu_path: Path, monkeypatch: pytest.Monke
     assert (fmu_path.stat().st_ino, fmu_path.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
 
 
+@pytest.mark.slow
 def test_a_build_is_the_same_to_the_byte_and_loads_no_casadi(fmu_path: Path, tmp_path: Path) -> None:
     """A fresh process with an empty cache builds the FMU again, in a process of its own."""
     code = "import sys, plant.fmu.build; path = plant.fmu.build.default_fmu(); print(path); print('casadi' in sys.modules)"

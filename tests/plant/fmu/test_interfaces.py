@@ -262,7 +262,13 @@ def drive_as_plant(path: Path) -> Array:
     return np.array(seen)
 
 
-@pytest.mark.parametrize(("model", "fmi"), [(SPATIAL_MODEL, 3), (PLANAR_MODEL, 2)], ids=["spatial, FMI 3", "planar, FMI 2"])
+@pytest.mark.parametrize(
+    ("model", "fmi"),
+    [
+        pytest.param(SPATIAL_MODEL, 3, marks=pytest.mark.slow, id="spatial, FMI 3"),
+        pytest.param(PLANAR_MODEL, 2, id="planar, FMI 2"),
+    ],
+)
 def test_the_recompiled_fmu_behaves_the_same(model: Model, fmi: int, tmp_path: Path) -> None:
     """`fmpy compile`: CMake and its own flags instead of ours, from the sources inside."""
     original, again = default_fmu(model, fmi), tmp_path / "again.fmu"
@@ -276,6 +282,7 @@ def test_the_recompiled_fmu_behaves_the_same(model: Model, fmi: int, tmp_path: P
     assert np.ptp(first[:, -1]) > 1e-4
 
 
+@pytest.mark.slow
 def test_other_platforms_are_compiled_by_zig(tmp_path: Path) -> None:
     pytest.importorskip("ziglang")
     path = tmp_path / "everywhere.fmu"
