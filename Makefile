@@ -17,7 +17,7 @@ test: .venv/installed-test
 	$(BIN)/pytest -n $(WORKERS) --dist loadfile -m "not slow"
 
 test-all: test
-	$(BIN)/pytest -n $(WORKERS) --dist loadfile -m slow
+	$(BIN)/pytest -n $(WORKERS) --dist loadfile -m "slow or hypothesis" --hypothesis-profile=all
 
 bench: .venv/installed
 	@mkdir -p $(OUT)
