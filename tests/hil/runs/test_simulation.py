@@ -61,8 +61,9 @@ def test_the_loop_follows_at_other_rates(rate):
 
 
 @pytest.mark.parametrize("rate", [50.0, 70.0, 100.0, 150.0, 200.0, 300.0, 500.0, 2000.0])
-def test_no_watch_stops_a_sound_run_at_any_rate(rate):
-    for seed in range(4):
+@pytest.mark.parametrize("seeds", [1, pytest.param(4, marks=pytest.mark.slow)])
+def test_no_watch_stops_a_sound_run_at_any_rate(rate, seeds):
+    for seed in range(seeds):
         for target in ("circle", "sines"):
             records = simulate(SimulationConfig(target=target, duration=3.0, rate=rate, seed=seed)).records
             # Armed, and nothing else: no IMU is left out.

@@ -63,10 +63,11 @@ def documented():
     return [row for row in rows if len(row) == len(table([]).headings) and row[0] in MECHANISMS], lines
 
 
-def test_the_documented_table_has_every_set_with_its_imus_and_conditioning():
+@pytest.mark.parametrize("step", [4, pytest.param(1, marks=pytest.mark.slow)])
+def test_the_documented_table_has_every_set_with_its_imus_and_conditioning(step):
     rows, _ = documented()
     assert [(row[0], row[1].removesuffix(" *")) for row in rows] == [(name, each.label) for name in MECHANISMS for each in SETS]
-    for k, name in enumerate(MECHANISMS):
+    for k, name in list(enumerate(MECHANISMS))[::step]:
         mechanism = load_spatial(name)
         least = paper_set(classify(mechanism))
         for row, sensors in zip(rows[k * len(SETS) :], SETS, strict=False):
@@ -77,6 +78,7 @@ def test_the_documented_table_has_every_set_with_its_imus_and_conditioning():
             assert "stopped" not in row
 
 
+@pytest.mark.slow
 def test_the_documented_errors_are_what_the_command_prints(tmp_path, capsys):
     path = tmp_path / "sets.json"
     sets = ["sensor-sets", "--mechanism", "6-3-II", "--duration", "10", "--markdown", "--json", str(path)]

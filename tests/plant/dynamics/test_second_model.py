@@ -47,7 +47,9 @@ def leaning(name: str) -> Values:
 
 
 @pytest.mark.parametrize("mode", [OPEN, VELOCITY])
-@pytest.mark.parametrize("name", ["hexapod", "6-3-I", "6-4-II"])
+@pytest.mark.parametrize(
+    "name", ["hexapod", pytest.param("6-3-I", marks=pytest.mark.slow), pytest.param("6-4-II", marks=pytest.mark.slow)]
+)
 def test_free_and_driven_motion_agree_with_maximal_coordinates(make_plant: MakePlant, name: str, mode: int) -> None:
     """A push, and then on without it: falling with open drives and no friction, or driven against friction."""
     p = leaning(name)

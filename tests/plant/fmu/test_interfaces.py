@@ -67,7 +67,9 @@ def command(t: float) -> Array:
     return command
 
 
-@pytest.mark.parametrize("model", [SPATIAL_MODEL, PLANAR_MODEL], ids=lambda model: model.identifier)
+@pytest.mark.parametrize(
+    "model", [pytest.param(SPATIAL_MODEL, marks=pytest.mark.slow, id="spatial"), pytest.param(PLANAR_MODEL, id="planar")]
+)
 def test_every_exported_fmu_is_clean_and_keeps_its_promises(model: Model) -> None:
     for path in (default_fmu(model), default_fmu(model, fmi=2)):
         assert validate_fmu(str(path)) == []
