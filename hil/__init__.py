@@ -1,0 +1,89 @@
+"""Pose control of parallel mechanisms from orientations, in simulation and with hardware in the loop.
+
+    from hil import SimulationConfig, simulate
+
+    result = simulate(SimulationConfig(target="sines", duration=5.0))
+    print(result.summary()["estimation"]["position_rms"])
+
+A run on the machine's clock, as `gough run`:
+
+    from pathlib import Path
+
+    from hil import RealTimeSettings, SimulationConfig, run
+
+    summary = run(SimulationConfig(rig="udp"), RealTimeSettings(), recording=Path("run.mcap"))
+
+Whatever refuses its input raises a `GoughError`. This package loads nothing until a name is used.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hil.calibration.data import Knowledge
+    from hil.calibration.drive import calibrate_recordings, calibrate_rig
+    from hil.realtime.scheduling import RealTimeSettings
+    from hil.recording.replay import replay
+    from hil.reports.run import write_report
+    from hil.runs.config import SimulationConfig
+    from hil.runs.executive import RunStoppedError, run
+    from hil.runs.run_state import RunState
+    from hil.runs.simulation import SimulationResult, SimulationStoppedError, simulate
+    from hil.runs.snapshot import Snapshot, read_snapshot, write_snapshot
+    from plant.errors import GoughError
+    from plant.fmu.settings import Setting
+    from plant.mechanism import Mechanism, PlanarMechanism, load_mechanism
+    from plant.wiring import Wiring
+
+__all__ = [
+    "GoughError",
+    "Knowledge",
+    "Mechanism",
+    "PlanarMechanism",
+    "RealTimeSettings",
+    "RunState",
+    "RunStoppedError",
+    "Setting",
+    "SimulationConfig",
+    "SimulationResult",
+    "SimulationStoppedError",
+    "Snapshot",
+    "Wiring",
+    "calibrate_recordings",
+    "calibrate_rig",
+    "load_mechanism",
+    "read_snapshot",
+    "replay",
+    "run",
+    "simulate",
+    "write_report",
+    "write_snapshot",
+]
+
+_HOMES = {
+    "hil.calibration.data": ("Knowledge",),
+    "hil.calibration.drive": ("calibrate_recordings", "calibrate_rig"),
+    "hil.realtime.scheduling": ("RealTimeSettings",),
+    "hil.recording.replay": ("replay",),
+    "hil.reports.run": ("write_report",),
+    "hil.runs.config": ("SimulationConfig",),
+    "hil.runs.executive": ("RunStoppedError", "run"),
+    "hil.runs.run_state": ("RunState",),
+    "hil.runs.simulation": ("SimulationResult", "SimulationStoppedError", "simulate"),
+    "hil.runs.snapshot": ("Snapshot", "read_snapshot", "write_snapshot"),
+    "plant.errors": ("GoughError",),
+    "plant.fmu.settings": ("Setting",),
+    "plant.mechanism": ("Mechanism", "PlanarMechanism", "load_mechanism"),
+    "plant.wiring": ("Wiring",),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOME_OF[name]), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,7 +1,7 @@
-"""Fields of configurations that the command line offers as options: their help, unit and form are said once, with the field."""
+"""Fields of configurations that are options of the command line, too: each says its help, unit and form once."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from plant.errors import InputError
@@ -9,36 +9,36 @@ from plant.errors import InputError
 T = TypeVar("T")
 
 
-def option(
-    default: T,
-    text: str,
-    *,
-    unit: str = "",
-    flag: str | None = None,
-    metavar: str | None = None,
-    choices: Sequence[Any] = (),
-    parse: Callable[[str], Any] | None = None,
-    several: bool = False,
-    shown: str | None = None,
-) -> T:
-    """A field of a dataclass, with what `hil.command_line.options.add_options` needs to know of it.
+@dataclass(frozen=True)
+class Option:
+    """The form of an option.
 
-    Args:
-        default: of the field, in SI units.
-        text: what the option means, without its unit and default.
-        unit: of the option's number; one in mm or ms is converted to the field's SI unit.
-        flag: such as "--set"; by default the field's name, for a field that is True by default with "--no-" before it.
-        metavar: stands for the value in the help.
-        choices: the values there are, if the parser shall check them.
-        parse: makes the value from text, and raises an InputError for text that it refuses; by default the default's type.
+    Attributes:
+        text: its help, without unit and default.
+        unit: of its number; mm and ms become the field's SI unit.
+        flag: such as "--set"; by default the field's name, with "--no-" before it if the field is True by default.
+        metavar: what stands for the value in the help.
+        choices: the possible values, if the parser checks them.
+        parse: makes the value from text, or raises an InputError; by default the type of the field's default.
         several: whether the option can be given several times, for a tuple.
         shown: the default in the help's words.
+        required: whether it must be given.
     """
-    details = {
-        "help": text, "unit": unit, "flag": flag, "metavar": metavar, "choices": choices or None, "parse": parse,
-        "several": several, "shown": shown,
-    }  # fmt: skip
-    made: T = field(default=default, metadata=details)
+
+    text: str
+    unit: str = ""
+    flag: str | None = None
+    metavar: str | None = None
+    choices: Sequence[Any] | None = None
+    parse: Callable[[str], Any] | None = None
+    several: bool = False
+    shown: str | None = None
+    required: bool = False
+
+
+def option(default: T, text: str, **form: Any) -> T:
+    """A dataclass field with this default in SI units, and its option with this help and the other attributes of `Option`."""
+    made: T = field(default=default, metadata={"option": Option(text, **form)})
     return made
 
 

@@ -6,6 +6,10 @@ from dataclasses import dataclass
 from html import escape
 from itertools import groupby
 from operator import itemgetter
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.table import Table as RichTable
 
 Heading = str | tuple[str, str]
 """A column's heading, or the heading of a group of columns and the column's own."""
@@ -48,8 +52,13 @@ class Table:
 
     def print(self) -> None:
         """Print the table, as wide as the terminal, or 100 characters wide where there is none."""
-        from rich.box import SIMPLE_HEAD
         from rich.console import Console
+
+        Console(width=None if sys.stdout.isatty() else 100).print(self.rich())
+
+    def rich(self) -> "RichTable":
+        """The table as rich draws it."""
+        from rich.box import SIMPLE_HEAD
         from rich.table import Table as RichTable
         from rich.text import Text
 
@@ -58,7 +67,7 @@ class Table:
             shown.add_column(Text(heading), justify="left" if i in self._left else "right")
         for row in self.rows:
             shown.add_row(*(Text(cell.text, "bold red" if cell.alarm else "") for cell in row))
-        Console(width=None if sys.stdout.isatty() else 100).print(shown)
+        return shown
 
     def markdown(self) -> str:
         """The table in Markdown."""

@@ -11,7 +11,7 @@ import fmpy
 import numpy as np
 import pytest
 
-from hil.command_line import _parser, main
+from hil.command_line import main, parse
 from plant.dynamics.variables import VELOCITY
 from plant.fmu.build import SPATIAL_MODEL, default_fmu
 from plant.mechanism import load_mechanism
@@ -100,7 +100,7 @@ def test_the_commands_exist(folder: Path, monkeypatch: pytest.MonkeyPatch, capsy
     assert len(COMMANDS) > 12
     for command in COMMANDS:
         arguments = shlex.split(command)[1:]
-        _parser().parse_args(arguments)
+        parse(arguments)
         if arguments[1] in ("info", "validate", "table"):
             assert main(arguments) == 0, capsys.readouterr().err
 

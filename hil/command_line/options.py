@@ -1,83 +1,87 @@
-"""Options that several commands have, and what is made of them."""
+"""Options of the command line, made from the fields of configurations (see `hil.option`)."""
 
 import argparse
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from hil.option import Option
+from plant.errors import InputError
 
 if TYPE_CHECKING:
-    from hil.runs.config import SimulationConfig
+    from _typeshed import DataclassInstance
+
+    C = TypeVar("C", bound=DataclassInstance)
+
+_SCALES = {"mm": 1e-3, "ms": 1e-3}
+"""Factors to SI units."""
 
 
-def add_mechanism(command: argparse.ArgumentParser) -> None:
-    """Add which mechanism it is."""
-    command.add_argument("--mechanism", default="hexapod", help="preset, or a TOML file")
+def add_options(command: argparse.ArgumentParser, config: "type[C]", *names: str, **changes: Mapping[str, Any]) -> None:
+    """Add options for fields of a configuration.
+
+    Args:
+        command: the parser to add to.
+        config: the configuration's dataclass.
+        names: the fields whose options are as declared.
+        changes: by name of a field, what is different in this command: `default`, or attributes of `Option`.
+    """
+    declared = {each.name: each for each in fields(config)}
+    for name in (*names, *changes):
+        form = dict(changes.get(name, {}))
+        default = form.pop("default", declared[name].default)
+        _add_option(command, name, default, replace(declared[name].metadata["option"], **form))
 
 
-def add_imu(command: argparse.ArgumentParser, default: str = "mpu9150-calibrated") -> None:
-    """Add which model of IMU is simulated."""
-    command.add_argument("--imu", default=default, help="ideal, mpu9150, mpu9150-calibrated or icm42688")
-
-
-def add_calibration(command: argparse.ArgumentParser) -> None:
-    """Add the calibration that is used."""
-    command.add_argument("--calibration", metavar="FILE.toml", help="the IMUs' constants, as 'gough calibrate' writes them")
-
-
-def add_plant(command: argparse.ArgumentParser) -> None:
-    """Add the FMU that is used, and its binding."""
-    command.add_argument("--plant", metavar="FILE.fmu", help="Co-Simulation FMU (FMI 2.0 or 3.0) instead of the built one")
-    add_binding(command)
-
-
-def add_binding(command: argparse.ArgumentParser) -> None:
-    """Add the binding of the FMU that is used."""
+def _add_option(command: argparse.ArgumentParser, name: str, default: Any, option: Option) -> None:
+    flag = option.flag or f"--{'no-' if default is True else ''}{name.replace('_', '-')}"
+    if isinstance(default, bool):
+        command.add_argument(flag, dest=name, action="store_false" if default else "store_true", help=option.text)
+        return
+    scale = _SCALES.get(option.unit, 1.0)
+    parse = option.parse or (type(default) if isinstance(default, int | float) else str)
+    shown = None if option.required else option.shown or _shown(default, scale)
     command.add_argument(
-        "--binding", metavar="FILE.toml", help="which of its variables are which, if they have other names (docs/fmu.md)"
-    )  # fmt: skip
-
-
-def add_joint_error(command: argparse.ArgumentParser) -> None:
-    """Add by how much the joints are off their places."""
-    command.add_argument(
-        "--joint-error",
-        type=float,
-        default=0.0,
-        help="simulated: standard deviation of each coordinate of the joints from their places [mm]",
+        flag,
+        dest=name,
+        default=list(default) if option.several else default,
+        type=_reader(parse, scale),
+        action="append" if option.several else "store",
+        required=option.required,
+        metavar=option.metavar,
+        choices=option.choices,
+        help=option.text + (f" [{option.unit}]" if option.unit else "") + (f" (default: {shown})" if shown else ""),
     )
 
 
-def add_rig(command: argparse.ArgumentParser, **rig: Any) -> None:
-    """Add which rig is driven, and where it is; `rig` is what else `add_argument` is told of the former."""
-    command.add_argument(
-        "--rig", metavar="RIG", **rig, help="what is driven: fmu, the plant; udp or canopen, a rig on a bus; replay, a "
-        "recording; or python:MODULE:CLASS, a rig of your own, as hil/rigs/template.py is one",
-    )  # fmt: skip
-    command.add_argument(
-        "--rig-at", metavar="ADDRESS|FILE", help="where the rig is: HOST:PORT for udp (default: 127.0.0.1:47100), settings of "
-        "the bus for canopen, the recording (files of one run with commas in between) for replay",
-    )  # fmt: skip
+def _shown(default: Any, scale: float) -> str:
+    """A default as the help shows it, "" for none."""
+    if isinstance(default, tuple):
+        return ",".join(map(str, default))
+    if isinstance(default, float):
+        return f"{default / scale:g}"
+    return "" if default is None else str(default)
 
 
-def add_json(command: argparse.ArgumentParser) -> None:
-    """Add the file for the figures."""
-    command.add_argument("--json", type=Path, metavar="FILE", help="write the figures in SI units")
+def _reader(parse: Callable[[str], Any], scale: float) -> Callable[[str], Any]:
+    """What argparse calls to parse an option, and names in its errors."""
+
+    def read(text: str) -> Any:
+        try:
+            value = parse(text)
+        except InputError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+        return value if scale == 1.0 else scale * value
+
+    read.__name__ = parse.__name__
+    return read
 
 
-def chosen(options: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """Return the options of these names, without those that are not given and have no default."""
-    return {name: getattr(options, name) for name in names if hasattr(options, name)}
-
-
-def simulation_config(options: argparse.Namespace, *names: str) -> "SimulationConfig":
-    """Return the simulation that the options of these names and `--joint-error` describe.
+def config_of(options: argparse.Namespace, config: "type[C]", **others: Any) -> "C":
+    """The configuration that the options describe; `others` are fields that are not options.
 
     Raises:
-        InputError: an option is out of its range, or no setting.
+        InputError: an option is out of its range.
     """
-    from hil.runs.config import SimulationConfig
-    from plant.fmu.settings import Setting
-
-    values = chosen(options, *names)
-    if "settings" in values:
-        values["settings"] = tuple(map(Setting.parse, values["settings"]))
-    return SimulationConfig(**values, joint_error=1e-3 * options.joint_error)
+    values = {each.name: getattr(options, each.name) for each in fields(config) if hasattr(options, each.name)}
+    return config(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()} | others)

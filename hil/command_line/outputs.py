@@ -1,21 +1,41 @@
 """Files that commands write."""
 
+import argparse
 import json
 from pathlib import Path
 from typing import Any
 
+from hil.table import Table
 from plant.errors import GoughError, InputError
 from plant.files import check_writable, write_whole
 
 
 class OutputError(GoughError, OSError):
-    """Something was done, but not all of what it gave could be written."""
+    """A command did its work, but not all of the results could be written."""
 
     exit_status = 1
 
 
+def add_json(command: argparse.ArgumentParser) -> None:
+    """Add the option for the file with the figures."""
+    command.add_argument("--json", type=Path, metavar="FILE", help="write the figures in SI units")
+
+
+def add_markdown(command: argparse.ArgumentParser, page: str) -> None:
+    """Add the option to print the table as a page of the documentation has it."""
+    command.add_argument("--markdown", action="store_true", help=f"print the table in Markdown, as {page} has it")
+
+
+def show_table(table: Table, markdown: bool) -> None:
+    """Print a table, or its Markdown."""
+    if markdown:
+        print(table.markdown())
+    else:
+        table.print()
+
+
 def check_outputs(*paths: Path | None) -> None:
-    """Check that the files that are wanted can be written, and that no two are the same.
+    """Check that the requested files can be written, and that no two are the same.
 
     Raises:
         InputError: one cannot be written, or two are the same.
@@ -27,10 +47,10 @@ def check_outputs(*paths: Path | None) -> None:
 
 
 def check_distinct(*paths: Path | None) -> None:
-    """Check that no two of the files that are wanted are the same.
+    """Check that no two of the requested files are the same.
 
     Raises:
-        InputError: two are.
+        InputError: two are the same.
     """
     named = [path.resolve() for path in paths if path is not None]
     for path in named:
@@ -39,6 +59,6 @@ def check_distinct(*paths: Path | None) -> None:
 
 
 def write_json(path: Path | None, content: dict[str, Any]) -> None:
-    """Write figures, if a file for them is wanted."""
+    """Write figures, if a file for them is requested."""
     if path is not None:
         write_whole(path, (json.dumps(content, indent=2) + "\n").encode())

@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from hil.option import option
 from plant.errors import GoughError, InputError, UnknownNameError
 
 MEASURES = ("memory", "processor", "doze", "priority")
@@ -35,20 +36,16 @@ def keep_to_one_thread() -> None:
 
 @dataclass(frozen=True)
 class RealTimeSettings:
-    """How a loop is to be run.
+    """How a loop is run. Fields that are options say below what they mean.
 
     Attributes:
-        priority: of SCHED_FIFO, 1 to 98.
-        cpu: the processor to stay on; by default the last of those that the process may use.
-        strict: whether anything that the machine refuses is an error.
-        most_missed: periods missed in a row that end in a controlled stop.
-        without: which of `MEASURES` are not wanted, to see what they are good for.
+        without: names of the `MEASURES` that are left out, to see what each gives.
     """
 
-    priority: int = 80
-    cpu: int | None = None
-    strict: bool = False
-    most_missed: int = 10
+    priority: int = option(80, "priority of SCHED_FIFO, 1 to 98")
+    cpu: int | None = option(None, "processor to stay on", parse=int, shown="the last one that the process may use")
+    strict: bool = option(False, "do not run if the machine refuses anything that real time needs")
+    most_missed: int = option(10, "number of periods missed in a row that end in a controlled stop")
     without: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

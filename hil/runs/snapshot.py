@@ -1,7 +1,7 @@
-"""Snapshots: all that the future of a simulation depends on, in a file, from which it goes on bit for bit.
+"""Snapshots: files from which a simulation goes on bit for bit.
 
-That is the plant's own state, and every array that the loop changes: the cycle's state, the IMUs' noise, the clock. What
-follows from the configuration, such as the motion and the gains, is made anew and must be the same as it was.
+A snapshot has the plant's own state, and every array that the loop changes: the cycle's state, the IMUs' noise, the clock. What
+follows from the configuration, such as the motion and the gains, is made again and must be the same as before.
 """
 
 import hashlib
@@ -29,10 +29,10 @@ class Snapshot:
     """A simulation between two cycles.
 
     Attributes:
-        config: of the simulation, as plain values.
+        config: the simulation's, as plain values.
         cycle: the next to run.
-        settings: a hash of what does not change: the cycle's parameters, the FMU and its binding.
-        motion: that was planned until then, a hash.
+        settings: hash of what does not change: the cycle's parameters, the FMU and its binding.
+        motion: hash of the motion planned until then.
         memory: the loop's arrays by name.
         plant: the state of the FMU and its clock.
     """
@@ -46,7 +46,7 @@ class Snapshot:
 
 
 def take_snapshot(config: Mapping[str, Any], loop: Loop, plant: FmuPlant) -> Snapshot:
-    """Keep a simulation as it is between two cycles.
+    """Take a snapshot between two cycles.
 
     Raises:
         FmuError: the FMU cannot save its state.
@@ -60,17 +60,17 @@ def resume_snapshot(snapshot: Snapshot, loop: Loop, plant: FmuPlant) -> None:
     """Go on from a snapshot, in a loop that has just been prepared from its configuration.
 
     Raises:
-        InputError: the loop is not the one that the snapshot is of, or has no cycle left.
+        InputError: the loop differs from the one in the snapshot, or has no cycle left.
         FmuError: the FMU is another one, or cannot restore its state.
     """
     if snapshot.settings != _settings(loop, plant):
         raise InputError(
-            "this simulation cannot go on from the snapshot, for its mechanism, calibration, FMU or binding have changed since"
+            "this simulation cannot go on from the snapshot, as its mechanism, calibration, FMU or binding have changed since"
         )
     if snapshot.motion != _motion(loop, snapshot.cycle):
         raise InputError(
-            "this simulation cannot go on from the snapshot, for until then another motion was planned: take the snapshot in a "
-            "run that is as long, with --save-at"
+            "this simulation cannot go on from the snapshot, as another motion was planned until then: take the snapshot in a "
+            "run of the same duration, with --save-at"
         )
     if snapshot.cycle >= len(loop.records):
         raise InputError(
@@ -78,14 +78,14 @@ def resume_snapshot(snapshot: Snapshot, loop: Loop, plant: FmuPlant) -> None:
         )
     memory = loop.memory()
     if {name: len(kept) for name, kept in snapshot.memory.items()} != {name: array.nbytes for name, array in memory.items()}:
-        raise InputError("this simulation cannot go on from the snapshot, for its memory is laid out in another way")
+        raise InputError("this simulation cannot go on from the snapshot, as its memory has another layout")
     plant.restore(snapshot.plant)
     for name, array in memory.items():
         array.reshape(-1).view("u1")[:] = memoryview(snapshot.memory[name])
 
 
 def write_snapshot(snapshot: Snapshot, path: Path) -> None:
-    """Write a snapshot's file, which takes its place only when it is complete.
+    """Write a snapshot's file; it appears only when it is complete.
 
     Raises:
         InputError: the file cannot be written.
@@ -98,7 +98,7 @@ def read_snapshot(path: Path) -> Snapshot:
     """Read a snapshot's file.
 
     Raises:
-        InputError: it cannot be read, or is no snapshot.
+        InputError: it cannot be read, or is no snapshot of this version.
     """
     try:
         content = msgpack.unpackb(path.read_bytes())
@@ -109,11 +109,11 @@ def read_snapshot(path: Path) -> Snapshot:
     if not isinstance(content, dict) or content.pop("kind", None) != _KIND:
         raise InputError(f"{path} is no snapshot of 'gough simulate --save-state'")
     if (of := content.pop("version", None)) != version("gough"):
-        raise InputError(f"{path} is of gough {of}, and this is gough {version('gough')}: go on with the version that it is of")
+        raise InputError(f"{path} is of gough {of}, and this is gough {version('gough')}: go on with that version")
     try:
         return Snapshot(**content)
     except TypeError:
-        raise InputError(f"{path} is a snapshot that lacks something, or has something unknown") from None
+        raise InputError(f"{path} is a snapshot with missing or unknown parts") from None
 
 
 def _hash(content: bytes) -> bytes:
@@ -121,7 +121,7 @@ def _hash(content: bytes) -> bytes:
 
 
 def _settings(loop: Loop, plant: FmuPlant) -> bytes:
-    """A hash of what does not change in a run; the arrays are those that the loop reads and writes the FMU by."""
+    """A hash of what does not change in a run; the arrays say how the loop reads and writes the FMU."""
     bound = plant.bound
     arrays: list[NDArray[Any]] = [
         *bound.sensed,
@@ -135,7 +135,7 @@ def _settings(loop: Loop, plant: FmuPlant) -> bytes:
 
 
 def _motion(loop: Loop, cycle: int) -> bytes:
-    """The segments that have begun by a cycle."""
+    """A hash of the segments that have begun by a cycle."""
     segments: Array = loop.segments
     begun = segments[:, :, START] <= cycle * float(loop.parameters["rig"]["period"])
     return _hash(segments[begun].tobytes())

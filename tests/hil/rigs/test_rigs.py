@@ -33,8 +33,9 @@ from hil.rigs.template import TemplateRig
 from hil.rigs.udp.emulator import new_udp_emulator
 from hil.rigs.udp.rig import UdpRig
 from hil.runs.config import SimulationConfig
-from hil.runs.executive import RunStoppedError, rig_of, run
+from hil.runs.executive import RunStoppedError, run
 from hil.runs.prepare import prepared_loop
+from hil.runs.rig_factory import rig_of
 from plant.errors import InputError, UnknownNameError
 from plant.mechanism import load_spatial
 

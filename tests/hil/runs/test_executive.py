@@ -582,7 +582,7 @@ def test_the_whole_mechanism_filter_runs_on_the_clock_and_replays_bit_for_bit(tm
 
 
 def test_a_disk_without_room_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("hil.runs.executive._LEAST_FREE", 2**60)
+    monkeypatch.setattr("hil.runs.recorders._LEAST_FREE", 2**60)
     with pytest.raises(InputError, match=r"MiB are free there, and .* MiB are needed to begin: make room"):
         run(SimulationConfig(duration=0.5), RealTimeSettings(), tmp_path / "run.mcap")
     assert not list(tmp_path.iterdir())

@@ -5,9 +5,11 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hil.command_line.options import add_binding, add_json, add_mechanism
-from hil.command_line.outputs import check_outputs, write_json
-from hil.command_line.printing import new_table, print_table, progress_bar
+from hil.command_line.options import add_options
+from hil.command_line.outputs import add_json, check_outputs, write_json
+from hil.command_line.terminal import progress_bar
+from hil.runs.config import SimulationConfig
+from hil.table import Table
 from plant.errors import GoughError
 
 if TYPE_CHECKING:
@@ -15,12 +17,12 @@ if TYPE_CHECKING:
 
 
 _PERIOD_S = 1e-3
-"""What a plant is asked to step by when it is only looked at."""
+"""The step of a plant that is only linearised."""
 
 
-def add_fmu(commands: Any) -> None:
-    """Add `gough fmu`."""
-    command = commands.add_parser("fmu", help="the plant as an FMU", description="The plant as an FMU.")
+def add_fmu(command: argparse.ArgumentParser) -> None:
+    """Add the actions of `gough fmu`."""
+    command.description = "The plant as an FMU."
     actions = command.add_subparsers(required=True, metavar="ACTION")
     build = actions.add_parser(
         "build",
@@ -28,12 +30,12 @@ def add_fmu(commands: Any) -> None:
         description="Write a plant as an FMU, with its sources: FMI 3.0 for Co-Simulation and Model Exchange, or FMI 2.0 for "
         "Co-Simulation. The parameters of any mechanism of the same kind can be set in it.",
     )
-    build.add_argument("--output", type=Path, metavar="FILE.fmu", help="default: in fmus/ in a checkout, else here")
-    build.add_argument("--fmi", type=int, choices=(2, 3), default=3, help="version of FMI (default: 3)")
-    add_mechanism(build)
+    build.add_argument("--output", type=Path, metavar="FILE.fmu", help="the FMU (default: in fmus/ in a checkout, else here)")
+    build.add_argument("--fmi", type=int, choices=(2, 3), default=3, help="version of FMI (default: %(default)s)")
+    add_options(build, SimulationConfig, "mechanism")
     build.add_argument(
         "--platforms",
-        type=lambda text: text.split(","),
+        type=_names,
         default=[],
         metavar="LIST",
         help="linux,windows,darwin: compiled by zig, 'pip install gough[cross]' (default: this machine's, by its C compiler)",
@@ -49,11 +51,11 @@ def add_fmu(commands: Any) -> None:
     info = actions.add_parser(
         "info",
         help="what an FMU is, and its variables",
-        description="Tell what any FMU for Co-Simulation is, its variables, and whether the loop can use it as it is.",
+        description="Show what any FMU for Co-Simulation is, its variables, and whether the loop can use it as it is.",
     )
     validate = actions.add_parser(
         "validate",
-        help="try whether an FMU keeps what it promises",
+        help="check that an FMU keeps what it promises",
         description="Validate the description of any FMU for Co-Simulation, load it, and try its steps, its saved states and "
         "its derivatives. The exit status is 1 if something is wrong.",
     )
@@ -67,12 +69,15 @@ def add_fmu(commands: Any) -> None:
         action.add_argument("file", type=Path, metavar="FILE.fmu", nargs="?" if action is linearize else None)
         action.set_defaults(run=run)
         add_json(action)
-    add_mechanism(linearize)
-    add_binding(linearize)
+    add_options(linearize, SimulationConfig, "mechanism", "binding")
     for side, default in (("inputs", "velocity_command"), ("outputs", "leg_length")):
         linearize.add_argument(
-            f"--{side}", type=lambda text: text.split(","), default=[default], metavar="NAMES", help=f"default: {default}"
+            f"--{side}", type=_names, default=[default], metavar="NAMES", help=f"names of the {side} (default: {default})"
         )
+
+
+def _names(text: str) -> list[str]:
+    return text.split(",")
 
 
 def _build_fmu(options: argparse.Namespace) -> int:
@@ -91,7 +96,6 @@ def _build_fmu(options: argparse.Namespace) -> int:
 
 
 def _print_tables(options: argparse.Namespace) -> int:
-    from hil.table import Table
     from plant.fmu.build import PLANAR_MODEL, SPATIAL_MODEL
 
     del options
@@ -144,13 +148,11 @@ def _show(options: argparse.Namespace) -> int:
         "use": fits,
     }
     _print_pairs(facts)
-    table = new_table("variable", "shape", "type", "unit", "what", "least", "greatest")
+    table = Table("variable", "shape", "type", "unit", "what", "least", "greatest")
     for each in description:
         kind = f"{each.variability} {each.causality}"
-        table.add_row(
-            each.name, _shape(each.shape), each.type, each.unit or "-", kind, f"{each.minimum:g}", f"{each.maximum:g}"
-        )
-    print_table(table)
+        table.add(each.name, _shape(each.shape), each.type, each.unit or "-", kind, f"{each.minimum:g}", f"{each.maximum:g}")
+    table.print()
     variables = [
         {
             **{name: getattr(each, name) for name in ("name", "shape", "type", "unit", "causality", "variability")},
@@ -200,13 +202,13 @@ def _linearize(options: argparse.Namespace) -> int:
     with FmuPlant(path, parameters, _PERIOD_S, options.binding) as plant:
         write_drive_mode(plant.handle, VELOCITY)
         system = state_space(plant, options.inputs, options.outputs)
-    table = new_table("pole [1/s]", "frequency [Hz]", "damping")
+    table = Table("pole [1/s]", "frequency [Hz]", "damping")
     poles = sorted(system.poles(), key=abs)
     for pole in poles:
         if pole.imag >= 0.0:
             size = abs(pole)
-            table.add_row(f"{pole:.4g}", f"{size / (2.0 * np.pi):.4g}", f"{-pole.real / size:.3f}" if size > 0.0 else "-")
-    print_table(table)
+            table.add(f"{pole:.4g}", f"{size / (2.0 * np.pi):.4g}", f"{-pole.real / size:.3f}" if size > 0.0 else "-")
+    table.print()
     print(f"{system.nstates} states, {system.ninputs} inputs, {system.noutputs} outputs")
     matrices = {name: getattr(system, name).tolist() for name in "ABCD"}
     names = {"states": system.state_labels, "inputs": system.input_labels, "outputs": system.output_labels}

@@ -4,31 +4,31 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from hil.command_line.options import add_json
-from hil.command_line.outputs import check_outputs, write_json
-from hil.command_line.printing import new_table, print_table, progress_bar
+from hil.command_line.outputs import add_json, check_outputs, write_json
+from hil.command_line.terminal import QUANTILES, progress_bar
+from hil.table import Table
 from plant.errors import InputError
 
 
-def add_bench(commands: Any) -> None:
-    """Add `gough bench`."""
-    command = commands.add_parser(
-        "bench",
-        help="measure speed",
-        description="Measure the loop on the clock: how late it wakes, beside cyclictest, and how long it computes, idle, "
-        "under load and with a busy supervisor; its speed against real time and the microseconds of each stage; the plant's "
-        "FMU, from compiled code and through FMPy, and how exact it is; and direct "
-        "kinematics: microseconds per pose, against Newton's method from lengths, and whether both find the pose from cold.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+def add_bench(command: argparse.ArgumentParser) -> None:
+    """Add the options of `gough bench`."""
+    command.description = (
+        "Measure the loop on the clock: how late it wakes, beside cyclictest, and how long it computes, idle, under load and "
+        "with a busy supervisor; its speed against real time and the microseconds of each stage; the plant's FMU, from "
+        "compiled code and through FMPy, and how exact it is; and direct kinematics: microseconds per pose, against Newton's "
+        "method from lengths, and whether both find the pose from cold."
     )
-    command.add_argument("--duration", type=float, default=60.0, help="of the simulated motion [s]")
-    command.add_argument("--target", default="sines", help="motion or CSV file")
+    command.add_argument(
+        "--duration", type=float, default=60.0, help="duration of the simulated motion [s] (default: %(default)g)"
+    )
+    command.add_argument("--target", default="sines", help="motion or CSV file (default: %(default)s)")
     command.add_argument("--only", choices=("loop", "plant", "kinematics", "clock"), help="one section instead of all")
     command.add_argument(
-        "--clock", type=float, default=10.0, help="seconds on the clock at 1 kHz, idle and again under load; 4 kHz gets a third"
-    )
+        "--clock", type=float, default=10.0, metavar="SECONDS",
+        help="time on the clock at 1 kHz, idle and again under load; 4 kHz gets a third [s] (default: %(default)g)",
+    )  # fmt: skip
     command.add_argument(
-        "--measures", type=float, metavar="SECONDS", help="also try the loop without each measure for real time, for so long"
+        "--measures", type=float, metavar="SECONDS", help="also try the loop without each measure for real time, for this time"
     )
     command.add_argument("--cold", action="store_true", help="measure the start without caches, too (a minute)")
     command.add_argument("--check", action="store_true", help="fail if the loop on the clock is off by more than any noise")
@@ -94,12 +94,12 @@ def _print_real_time(figures: dict[str, Any], start_up: dict[str, Any]) -> None:
     }
     for rate, conditions in figures["rates"].items():
         for condition, measured in conditions.items():
-            table = new_table(f"{rate} Hz, {condition.replace('_', ' ')} [us]", "p50", "p99", "p99.9", "max", "cycles")
+            table = Table(f"{rate} Hz, {condition.replace('_', ' ')} [us]", *QUANTILES, "cycles")
             for label, name in rows.items():
                 if measured[name]:
-                    cells = [f"{measured[name][key]:.1f}" for key in ("p50", "p99", "p999", "max")]
-                    table.add_row(label, *cells, f"{measured[name]['n']}")
-            print_table(table)
+                    cells = [f"{measured[name][key]:.1f}" for key in QUANTILES.values()]
+                    table.add(label, *cells, f"{measured[name]['n']}")
+            table.print()
             used, text = measured["usage"], ""
             if measured["cyclictest_us"]:
                 ratios = [measured["wake_us"][key] / measured["cyclictest_us"][key] for key in ("p50", "p999")]
@@ -128,19 +128,19 @@ def _print_real_time(figures: dict[str, Any], start_up: dict[str, Any]) -> None:
 
 
 def _print_measures(figures: dict[str, Any]) -> None:
-    table = new_table("1 kHz, left out", "condition", "woken late p50 [us]", "p99", "p99.9", "max", "missed", "minor faults")
+    table = Table("1 kHz, left out", "condition", "woken late p50 [us]", "p99", "p99.9", "max", "missed", "minor faults")
     for case, conditions in figures.items():
         for condition, measured in conditions.items():
-            late = [f"{measured['wake_us'][key]:.1f}" for key in ("p50", "p99", "p999", "max")]
-            table.add_row(case, condition, *late, f"{measured['missed']}", f"{measured['minor_faults']:g}")
-    print_table(table)
+            late = [f"{measured['wake_us'][key]:.1f}" for key in QUANTILES.values()]
+            table.add(case, condition, *late, f"{measured['missed']}", f"{measured['minor_faults']:g}")
+    table.print()
 
 
 def _print_speed(figures: dict[str, Any]) -> None:
-    table = new_table("stage", "p50 [us]", "p99 [us]", "p99.9 [us]")
+    table = Table("stage", "p50 [us]", "p99 [us]", "p99.9 [us]")
     for label, percentiles in (*figures["stages_us"].items(), ("whole cycle", figures["cycle_us"])):
-        table.add_row(label, *(f"{percentiles[key]:.2f}" for key in ("p50", "p99", "p999")))
-    print_table(table)
+        table.add(label, *(f"{percentiles[key]:.2f}" for key in ("p50", "p99", "p999")))
+    table.print()
     factor = figures["real_time_factor"]
     print(
         f"{factor['median']:.1f} times real time ({factor['least']:.1f} to {factor['greatest']:.1f}); "
@@ -149,11 +149,11 @@ def _print_speed(figures: dict[str, Any]) -> None:
 
 
 def _print_plant(figures: dict[str, Any]) -> None:
-    table = new_table("plant, 1 ms from compiled code", "p50 [us]", "p99 [us]")
+    table = Table("plant, 1 ms from compiled code", "p50 [us]", "p99 [us]")
     rows = {**figures["calls_us"], "step, FMI 2.0": figures["step_us"]["FMI 2"]}
     for label, percentiles in rows.items():
-        table.add_row(label, f"{percentiles['p50']:.3f}", f"{percentiles['p99']:.3f}")
-    print_table(table)
+        table.add(label, f"{percentiles['p50']:.3f}", f"{percentiles['p99']:.3f}")
+    table.print()
     print(
         f"all of them {figures['cycle_us']:.2f} us, through FMPy's methods {figures['fmpy_us']:.1f} us, "
         f"{figures['fmpy_slowdown']:.1f} times longer; off by {1e9 * figures['error_m']:.1f} nm at most from substeps 16 times "
@@ -169,26 +169,24 @@ def _print_kinematics(figures: dict[str, Any]) -> None:
         groups.setdefault(label.rpartition(".")[0], []).append(methods)
     groups["hexapod"] = [figures["hexapod_us"]]
     names = list(dict.fromkeys(name for methods in groups.values() for name in methods[0]))
-    table = new_table("us, closed / refined", *names)
+    table = Table("us, closed / refined", *names)
     for group, measured in groups.items():
         cells = []
         for name in names:
-            times = [methods[name] for methods in measured if name in methods]
-            kinds = [[time[kind] for time in times] for kind in ("closed_form", "refined")]
-            cells.append(" / ".join(f"{median(values):.2f}" for values in kinds) if times else "-")
-        table.add_row(group, *cells)
+            found = [methods[name] for methods in measured if name in methods]
+            medians = (f"{median(each[kind] for each in found):.2f}" for kind in ("closed_form", "refined"))
+            cells.append(" / ".join(medians) if found else "-")
+        table.add(group, *cells)
     newton = figures["newton"]
-    ratios = [newton["ratios"][name] for name in names if name in newton["ratios"]]
-    known = [name for name in names if name in newton["ratios"]]
-    over = dict(zip(known, (f"{ratio['closed_form']:.1f} / {ratio['refined']:.1f}" for ratio in ratios), strict=True))
-    table.add_row("hexapod, over Newton", *(over.get(name, "-") for name in names))
-    print_table(table)
+    times = {name: f"{ratio['closed_form']:.1f} / {ratio['refined']:.1f}" for name, ratio in newton["ratios"].items()}
+    table.add("hexapod, over Newton", *(times.get(name, "-") for name in names))
+    table.print()
     rates = ", ".join(f"{name} {rate / 1e3:.0f}" for name, rate in figures["batch_per_s"].items())
     print(f"refined poses per second on all cores [thousands]: {rates}; one call from Python {figures['call_us']:.0f} us")
     print(f"Newton's method from lengths, warm: {newton['warm_us']:.2f} us per pose")
-    table = new_table("cold starts [%]", "found by Newton", "mistaken", "found from directions", "mistaken")
+    table = Table("cold starts [%]", "found by Newton", "mistaken", "found from directions", "mistaken")
     for preset, ranges in figures["cold_starts"].items():
         for where, rates in ranges.items():
             shares = [rates[kind][key] for kind in ("newton", "directions") for key in ("success", "wrong")]
-            table.add_row(f"{preset}, {where}", *(f"{100.0 * share:.1f}" for share in shares))
-    print_table(table)
+            table.add(f"{preset}, {where}", *(f"{100.0 * share:.1f}" for share in shares))
+    table.print()

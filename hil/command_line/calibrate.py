@@ -1,61 +1,71 @@
 """The command calibrate."""
 
 import argparse
+from dataclasses import asdict, replace
 from math import degrees, radians
 from pathlib import Path
 from typing import Any
 
-from hil.command_line.options import add_imu, add_joint_error, add_json, add_mechanism, add_plant, simulation_config
-from hil.command_line.outputs import check_outputs, write_json
-from hil.command_line.printing import deg, mm, new_table, print_table, progress_bar
+from hil.command_line.options import add_options, config_of
+from hil.command_line.outputs import add_json, check_outputs, write_json
+from hil.command_line.terminal import deg, mm_deg, progress_bar
+from hil.runs.config import SimulationConfig
+from hil.table import Table
 from plant.errors import InputError
+from plant.wiring import ALL_IMUS, PLATFORM_IMU
+
+_DEFAULT_RIG = SimulationConfig(imu="mpu9150")
+"""The rig that is driven without any option."""
 
 
-def add_calibrate(commands: Any) -> None:
-    """Add `gough calibrate`."""
-    command = commands.add_parser("calibrate", help="find the IMUs' errors", description="Find the IMUs' errors.")
+def add_calibrate(command: argparse.ArgumentParser) -> None:
+    """Add the actions of `gough calibrate`."""
+    command.description = "Find the IMUs' errors."
     actions = command.add_subparsers(required=True, metavar="ACTION")
-    rig = actions.add_parser(
-        "rig",
-        help="on the mechanism, from its redundancy",
-        description="Calibrate the IMUs on the mechanism: it rests at wide poses, which need not be known, and shakes for "
-        "40 s. Before that it finds out, with the loop open, whether each IMU lives, and sits and is wired as it should be. "
-        "Writes bias, scale, axes and mounting of every sensor, with their covariance.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    _add_rig(actions.add_parser("rig", help="on the mechanism, from its redundancy"))
+    _add_imu(actions.add_parser("imu", help="a single one, turned by hand"))
+    _add_magnetometer(actions.add_parser("magnetometer", help="a single one, turned by hand: hard and soft iron"))
+
+
+def _add_rig(command: argparse.ArgumentParser) -> None:
+    command.description = (
+        "Calibrate the IMUs on the mechanism: it rests at wide poses, which need not be known, and shakes for 40 s. Before "
+        "that it finds out, with the loop open, whether each IMU works, and is mounted and wired correctly. Writes bias, "
+        "scale, axes and mounting of every sensor, with their covariance."
     )
-    rig.add_argument("output", type=Path, metavar="FILE.toml", help="the calibration to write")
-    add_mechanism(rig)
-    rig.add_argument("--rate", type=float, default=1000.0, help="cycles per second [Hz]")
-    add_imu(rig, default="mpu9150")
-    rig.add_argument("--seed", type=int, default=0, help="of the IMUs' imperfections")
-    rig.add_argument("--home", action="store_true", help="the rig stands exactly at home when it begins")
-    rig.add_argument("--tilt", type=float, default=0.05, help="by how much the base may be off level [deg]")
-    rig.add_argument(
-        "--joints", type=float, default=0.0, help="by how much each coordinate of a joint may be off, then sought, too [mm]"
+    command.add_argument("output", type=Path, metavar="FILE.toml", help="the calibration to write")
+    add_options(
+        command,
+        SimulationConfig,
+        "mechanism",
+        "rate",
+        "seed",
+        "joint_error",
+        "plant",
+        "binding",
+        imu={"default": _DEFAULT_RIG.imu},
     )
-    add_joint_error(rig)
-    rig.add_argument(
+    command.add_argument("--home", action="store_true", help="the rig stands exactly at home when it begins")
+    command.add_argument(
+        "--tilt", type=float, default=0.05, help="by how much the base may be off level [deg] (default: %(default)s)"
+    )
+    command.add_argument(
+        "--joints", type=float, default=0.0, help="by how much each coordinate of a joint may be off; if it is not 0, the "
+        "joints are estimated, too [mm] (default: %(default)g)",
+    )  # fmt: skip
+    command.add_argument(
         "--recording", type=Path, nargs="+", metavar="FILE.mcap",
         help="recordings of a rig that rested and shook, from which to take mechanism, IMUs, rate and data",
     )  # fmt: skip
-    rig.add_argument("--lengths", action="store_true", help="the rig measures by how much its lengths change (to 50 um)")
-    rig.add_argument(
+    command.add_argument("--lengths", action="store_true", help="the rig measures by how much its lengths change (to 50 um)")
+    command.add_argument(
         "--known-poses", action="store_true",
-        help="write the mounting alone, by comparing with the planned poses, as the paper's section 7 has it",
+        help="write the mounting alone, by comparing with the planned poses, as in the paper's section 7",
     )  # fmt: skip
-    add_plant(rig)
-    rig.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots")
-    rig.add_argument("--picture", type=Path, metavar="FILE.svg", help="draw the accuracy of each stage")
-    add_json(rig)
-    rig.set_defaults(run=_calibrate_rig)
-    _add_calibrate_imu(actions)
-    _add_calibrate_magnetometer(actions)
-
-
-_RIG_SIMULATED = {
-    "mechanism": "hexapod", "rate": 1000.0, "imu": "mpu9150", "seed": 0, "joint_error": 0.0, "plant": None, "binding": None,
-}  # fmt: skip
-"""Options of the rig that is driven, with their defaults."""
+    command.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots")
+    command.add_argument("--picture", type=Path, metavar="FILE.svg", help="draw the accuracy of each stage")
+    add_json(command)
+    command.set_defaults(run=_calibrate_rig)
 
 
 def _calibrate_rig(options: argparse.Namespace) -> int:
@@ -70,16 +80,16 @@ def _calibrate_rig(options: argparse.Namespace) -> int:
     if not 0.0 <= options.joints <= 10.0:
         raise InputError(f"--joints is {options.joints:g} mm; it must be between 0 and 10")
     if options.recording:
-        given = [name for name in _RIG_SIMULATED if getattr(options, name) != _RIG_SIMULATED[name]]
+        defaults = asdict(_DEFAULT_RIG)
+        given = [name for name, value in vars(options).items() if name in defaults and value != defaults[name]]
         if given:
             names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
             raise InputError(f"the recordings say what {names} would: leave it out with --recording")
     prior = Prior(tilt=radians(options.tilt), joints=1e-3 * options.joints)
     knowledge = Knowledge(prior, options.home, options.lengths, options.known_poses)
-    config = simulation_config(options, "mechanism", "rate", "imu", "seed", "plant", "binding")
-    with progress_bar(
-        "recorded IMUs are calibrated" if options.recording else f"{config.mechanism} calibrates its IMUs"
-    ) as progress:
+    config = config_of(options, SimulationConfig)
+    label = "recorded IMUs are calibrated" if options.recording else f"{config.mechanism} calibrates its IMUs"
+    with progress_bar(label) as progress:
         if options.recording:
             result = calibrate_recordings(options.recording, knowledge)
         else:
@@ -103,15 +113,15 @@ def _print_rig_calibration(summary: dict[str, Any]) -> None:
     from hil.calibration.assessment import STAGES, weak_words
 
     columns = ("residual [mg]", "left out", "predicted [mm, deg]", "halves", "true")
-    table = new_table(f"{summary['rests']} poses at rest", *columns)
+    table = Table(f"{summary['rests']} poses at rest", *columns)
     for name, residual in summary["residual_mg"].items():
         left_out = summary["validated"].get(name, {}).get("left_out_mg")
         cells = [f"{residual:.3f}", "" if left_out is None else f"{left_out:.3f}"]
         for kind in ("predicted", "validated", "true"):
             errors = summary[kind].get(name)
-            cells.append("" if errors is None else f"{mm(errors['position_rms'])}, {deg(errors['rotation_rms'])}")
-        table.add_row(STAGES[name], *cells)
-    print_table(table)
+            cells.append("" if errors is None else mm_deg(errors))
+        table.add(STAGES[name], *cells)
+    table.print()
     if summary["validated"]:
         print("left out: residual at rests that the calibration had not seen; halves: by how much the poses differ that "
               "calibrations by disjoint halves of the data give")  # fmt: skip
@@ -119,28 +129,28 @@ def _print_rig_calibration(summary: dict[str, Any]) -> None:
         print(line)
 
 
-def _add_calibrate_imu(actions: Any) -> None:
-    imu = actions.add_parser(
-        "imu",
-        help="a single one, turned by hand",
-        description="Calibrate a single IMU without equipment: it rests in ten or more orientations, every axis up and "
-        "down among them, half a second or longer each, and is turned by hand from one to the next. Refuses data that do not "
-        "tell the constants, and says which rest or turn is missing.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+def _add_imu(command: argparse.ArgumentParser) -> None:
+    command.description = (
+        "Calibrate a single IMU without equipment: it rests in ten or more orientations, every axis up and down among them, "
+        "half a second or longer each, and is turned by hand from one to the next. Refuses data that do not determine the "
+        "constants, and says which rest or turn is missing."
     )
-    imu.add_argument(
+    command.add_argument(
         "data", type=Path, metavar="FILE", help="CSV with time_s,wx,wy,wz,ax,ay,az (rad/s, m/s2), or an MCAP recording"
     )
-    imu.add_argument("output", type=Path, metavar="FILE.toml", help="the calibration to write, or to add this IMU to")
-    imu.add_argument("--number", type=int, default=0, choices=range(7), help="which IMU of the mechanism it is")
-    imu.add_argument("--gravity", type=float, default=9.80665, help="at the place [m/s2]")
-    add_json(imu)
-    imu.set_defaults(run=_calibrate_imu)
+    _add_single(command, 0, "which IMU of the mechanism it is")
+    command.set_defaults(run=_calibrate_imu)
+
+
+def _add_single(command: argparse.ArgumentParser, number: int, text: str) -> None:
+    """Add the options that single IMUs and magnetometers have in common."""
+    command.add_argument("output", type=Path, metavar="FILE.toml", help="the calibration to write, or to add this sensor to")
+    command.add_argument("--number", type=int, default=number, choices=ALL_IMUS, help=f"{text} (default: %(default)s)")
+    command.add_argument("--gravity", type=float, default=9.80665, help="gravity at the place [m/s2] (default: %(default)s)")
+    add_json(command)
 
 
 def _calibrate_imu(options: argparse.Namespace) -> int:
-    from dataclasses import replace
-
     from controller.calibration.file import Calibration, load_calibration, save_calibration
     from controller.calibration.single_imu import calibrate_imu
     from hil.recording.imu_data import read_imu
@@ -151,7 +161,7 @@ def _calibrate_imu(options: argparse.Namespace) -> int:
     calibration = load_calibration(options.output) if options.output.exists() else Calibration()
     found = calibrate_imu(*read_imu(options.data, options.number), options.gravity)
     calibration.gain[:2, options.number], calibration.offset[:2, options.number] = found.gain, found.offset
-    # What was known of the errors that are left was of other constants.
+    # The covariance of the remaining errors belongs to the constants that are replaced.
     save_calibration(options.output, replace(calibration, covariance=None))
     figures = {
         "rests": found.rests,
@@ -162,11 +172,11 @@ def _calibrate_imu(options: argparse.Namespace) -> int:
         "sigmas": found.sigmas.tolist(),
     }
     write_json(options.json, figures)
-    table = new_table(f"IMU {options.number}", "x", "y", "z")
+    table = Table(f"IMU {options.number}", "x", "y", "z")
     rows = (("gyroscope: ", "deg/s", degrees(1.0)), ("accelerometer: ", "mg", 1e3 / STANDARD_GRAVITY))
     for sensor, (name, unit, scale) in enumerate(rows):
         _add_constants(table, name, (unit, scale), found.gain[sensor], found.offset[sensor], found.sigmas[sensor])
-    print_table(table)
+    table.print()
     print(
         f"{found.rests} rests; residuals: gravity {1e3 * found.force_residual / STANDARD_GRAVITY:.3f} mg, "
         f"turns {deg(found.turn_residual)} deg; written to {options.output}"
@@ -174,23 +184,23 @@ def _calibrate_imu(options: argparse.Namespace) -> int:
     return 0
 
 
-def _add_constants(table: Any, name: str, unit: tuple[str, float], gain: Any, offset: Any, sigmas: Any) -> None:
+def _add_constants(table: Table, name: str, unit: tuple[str, float], gain: Any, offset: Any, sigmas: Any) -> None:
     """Add the constants of a sensor to a table of three axes, each with its standard deviation.
 
     Args:
         table: to add to.
-        name: put before each row's.
-        unit: of the offset, and how many of it are one in SI units.
-        gain: matrix, 3 x 3.
-        offset: of each axis, 3 [rad/s, m/s2 or uT].
-        sigmas: standard deviations of the offset and of the gain's rows, 12.
+        name: put before each row's label.
+        unit: of the offset, and the factor to it from the SI unit.
+        gain: matrix (3, 3).
+        offset: of each axis (3,) [rad/s, m/s2 or uT].
+        sigmas: standard deviations (12,) of the offset and of the gain's rows.
     """
     symbol, scale = unit
     cells = zip(offset, sigmas[:3], strict=True)
-    table.add_row(f"{name}offset [{symbol}]", *(f"{scale * value:.3f} +- {scale * sigma:.3f}" for value, sigma in cells))
+    table.add(f"{name}offset [{symbol}]", *(f"{scale * value:.3f} +- {scale * sigma:.3f}" for value, sigma in cells))
     for axis, (gains, deviations) in enumerate(zip(gain, sigmas[3:].reshape(3, 3), strict=True), start=1):
         cells = zip(gains, deviations, strict=True)
-        table.add_row(f"{name}gain, row {axis}", *(f"{value:.5f} +- {sigma:.5f}" for value, sigma in cells))
+        table.add(f"{name}gain, row {axis}", *(f"{value:.5f} +- {sigma:.5f}" for value, sigma in cells))
 
 
 def _check_gravity(gravity: float) -> None:
@@ -198,27 +208,23 @@ def _check_gravity(gravity: float) -> None:
         raise InputError(f"--gravity is {gravity:g} m/s2; on the earth it is between 9.7 and 9.9")
 
 
-def _add_calibrate_magnetometer(actions: Any) -> None:
-    magnetometer = actions.add_parser(
-        "magnetometer",
-        help="a single one, turned by hand: hard and soft iron",
-        description="Calibrate a magnetometer without equipment: it is turned slowly every way round for half a minute or "
-        "longer, away from iron. With a calibrated accelerometer beside it, its axes count for both. Refuses data that do "
-        "not tell the constants, and says what is missing.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+def _add_magnetometer(command: argparse.ArgumentParser) -> None:
+    command.description = (
+        "Calibrate a magnetometer without equipment: it is turned slowly every way round for half a minute or longer, away "
+        "from iron. With a calibrated accelerometer beside it, its axes hold for both. Refuses data that do not determine the "
+        "constants, and says what is missing."
     )
-    magnetometer.add_argument(
+    command.add_argument(
         "data",
         type=Path,
         metavar="FILE",
         help="CSV with time_s,wx,wy,wz,ax,ay,az,mx,my,mz or time_s,mx,my,mz (rad/s, m/s2, uT), or an MCAP recording",
     )
-    magnetometer.add_argument("output", type=Path, metavar="FILE.toml", help="the calibration to write, or to add this one to")
-    magnetometer.add_argument("--number", type=int, default=6, choices=range(7), help="which IMU of the mechanism it is in")
-    magnetometer.add_argument("--field", type=float, default=49.4, help="strength of the magnetic field at the place [uT]")
-    magnetometer.add_argument("--gravity", type=float, default=9.80665, help="at the place [m/s2]")
-    add_json(magnetometer)
-    magnetometer.set_defaults(run=_calibrate_magnetometer)
+    _add_single(command, PLATFORM_IMU, "which IMU of the mechanism it is in")
+    command.add_argument(
+        "--field", type=float, default=49.4, help="strength of the magnetic field at the place [uT] (default: %(default)s)"
+    )
+    command.set_defaults(run=_calibrate_magnetometer)
 
 
 def _calibrate_magnetometer(options: argparse.Namespace) -> int:
@@ -243,9 +249,9 @@ def _calibrate_magnetometer(options: argparse.Namespace) -> int:
     write_json(
         options.json, {name: getattr(value, "tolist", lambda value=value: value)() for name, value in vars(found).items()}
     )
-    table = new_table(f"magnetometer {options.number}", "x", "y", "z")
+    table = Table(f"magnetometer {options.number}", "x", "y", "z")
     _add_constants(table, "", ("uT", 1.0), found.gain, found.offset, found.sigmas)
-    print_table(table)
+    table.print()
     residuals = f"strength {found.field_residual:.3f} uT"
     if found.dip is not None and found.dip_residual is not None:
         residuals += f", dip {deg(found.dip_residual)} deg about {deg(found.dip)} deg"

@@ -1,0 +1,298 @@
+"""The commands that run the loop: simulate, run, replay, stream-target."""
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hil.command_line.options import add_options, config_of
+from hil.command_line.outputs import OutputError, add_json, check_distinct, check_outputs, write_json
+from hil.command_line.terminal import QUANTILES, deg, live_view, mm, progress_bar
+from hil.realtime.scheduling import RealTimeSettings, keep_to_one_thread
+from hil.runs.config import SimulationConfig
+from hil.table import Cell, Table
+from plant.errors import InputError
+
+if TYPE_CHECKING:
+    from hil.runs.snapshot import Snapshot
+
+
+def add_simulate(command: argparse.ArgumentParser) -> None:
+    """Add the options of `gough simulate`."""
+    command.description = "Simulate the closed loop: a mechanism follows a target motion on its FMU plant."
+    # Left out of the options if it is not given: a resumed run then keeps the duration of its snapshot.
+    duration = {"default": argparse.SUPPRESS, "parse": float, "shown": f"{SimulationConfig.duration:g}"}
+    _add_motion(command, duration=duration)
+    command.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots and a moving 3-D view")
+    add_json(command)
+    command.add_argument("--save-state", type=Path, metavar="FILE", help="write a snapshot, from which a run can go on")
+    command.add_argument(
+        "--save-at", type=float, metavar="SECONDS", help="time of the snapshot in the motion [s] (default: the motion's end)"
+    )
+    command.add_argument(
+        "--load-state", type=Path, metavar="FILE",
+        help="go on from a snapshot, bit for bit as if there had been none; nothing but --duration can be changed",
+    )  # fmt: skip
+    command.set_defaults(run=_simulate)
+
+
+def _add_motion(command: argparse.ArgumentParser, **changes: Mapping[str, Any]) -> None:
+    """Add what simulations and runs on the clock have in common."""
+    names = (
+        "mechanism", "target", "duration", "rate", "imu", "imus", "magnetometer", "seed", "calibration", "fusion", "plant",
+        "binding", "settings", "joint_error",
+    )  # fmt: skip
+    add_options(command, SimulationConfig, *(name for name in names if name not in changes), **changes)
+
+
+def _simulate(options: argparse.Namespace) -> int:
+    from hil.runs.simulation import SimulationStoppedError, simulate
+    from hil.runs.snapshot import read_snapshot, write_snapshot
+
+    check_outputs(options.json, options.report, options.save_state)
+    config, resumed = config_of(options, SimulationConfig), None
+    if options.load_state is not None:
+        resumed = read_snapshot(options.load_state)
+        config = _resumed_config(options, config, resumed)
+    if options.save_at is not None and options.save_state is None:
+        raise InputError("--save-at says when to write a snapshot, but not where to: add --save-state FILE")
+    save_at = config.duration if options.save_state is not None and options.save_at is None else options.save_at
+    stopped = None
+    with progress_bar(f"{config.mechanism} follows {config.target}") as progress:
+        try:
+            result = simulate(config, progress, resumed, save_at)
+        except SimulationStoppedError as error:
+            stopped, result = error, error.result
+    if result.snapshot is not None and options.save_state is not None:
+        write_snapshot(result.snapshot, options.save_state)
+    if stopped is None or result.moved:
+        write_json(options.json, result.summary())
+        if options.report:
+            from hil.reports.run import write_report
+
+            write_report(result, options.report)
+        _print_simulation(result.summary())
+    if stopped:
+        raise stopped
+    return 0
+
+
+def _resumed_config(options: argparse.Namespace, config: SimulationConfig, resumed: "Snapshot") -> SimulationConfig:
+    """The configuration of a snapshot, with another duration if one is given."""
+    kept = SimulationConfig.from_plain(resumed.config)
+    for field in fields(config):
+        given, was = getattr(config, field.name), getattr(kept, field.name)
+        if field.name != "duration" and given not in (was, field.default):
+            raise InputError(f"the snapshot was taken with {field.name} {was}, and cannot go on with {given}: leave it out")
+    return replace(kept, duration=getattr(options, "duration", kept.duration))
+
+
+def _print_simulation(summary: dict[str, Any]) -> None:
+    table = Table("", "position RMS [mm]", "max [mm]", "rotation RMS [deg]", "max [deg]")
+    rows = [("estimate - reference", "estimated_tracking", ""), ("reference - target", "target", "reference_")]
+    if summary["truth_known"]:
+        rows[:1] = [
+            ("estimate - truth", "estimation", ""),
+            ("truth - reference", "tracking", ""),
+            ("truth - target", "target", ""),
+        ]
+    for label, group, prefix in rows:
+        errors = summary[group]
+        table.add(
+            label,
+            *(mm(errors[f"{prefix}position_{kind}"], 4) for kind in ("rms", "max")),
+            *(deg(errors[f"{prefix}rotation_{kind}"], 4) for kind in ("rms", "max")),
+        )
+    table.print()
+    if not summary["truth_known"]:
+        print("the truth is not known: the plant does not give its pose")
+    cycle = summary["cycle_us"]
+    print(
+        f"limits violated by the reference: {summary['limits']['violations']}; "
+        f"{summary['real_time_factor']:.1f} times real time; "
+        f"cycle p50/p99/p99.9 {cycle['p50']:.1f}/{cycle['p99']:.1f}/{cycle['p999']:.1f} us"
+    )
+
+
+def add_run(command: argparse.ArgumentParser) -> None:
+    """Add the options of `gough run`."""
+    command.description = (
+        "Run the closed loop on the machine's clock: compiled, in a process of its own, with real-time priority where the "
+        "machine grants it. Ctrl-C or SIGTERM ends the motion by a controlled stop, Ctrl-\\ (SIGQUIT) by an emergency stop: "
+        "the drives come to rest by themselves, whatever is measured."
+    )
+    add_options(command, SimulationConfig, "rig", "rig_at", "arm")
+    _add_motion(command)
+    command.add_argument("--record", type=Path, metavar="FILE.mcap", help="record every cycle")
+    add_options(command, RealTimeSettings, "cpu", "priority", "strict", "most_missed")
+    add_json(command)
+    command.set_defaults(run=_run)
+
+
+def _run(options: argparse.Namespace) -> int:
+    keep_to_one_thread()
+    from hil.runs.executive import RunStoppedError, run
+
+    check_outputs(options.json, options.record)
+    config, settings = config_of(options, SimulationConfig), config_of(options, RealTimeSettings)
+    stopped = None
+    with live_view(config.mechanism, config.target, config.rate) as show:
+        try:
+            summary = run(config, settings, options.record, show)
+        except RunStoppedError as error:
+            if error.summary is None:
+                raise
+            stopped, summary = error, error.summary
+    unprinted = None
+    try:
+        _print_run(summary)
+    except OSError as error:
+        unprinted = error
+    write_json(options.json, summary)
+    if problem := stopped or unprinted:
+        raise problem
+    if summary["obstacle"]:
+        return 1
+    lost = summary["recording"]["lost"]
+    if lost:
+        raise OutputError(f"the run went to its end, but {lost} of {summary['cycles']} cycles are not recorded")
+    return 0
+
+
+def _print_run(summary: dict[str, Any]) -> None:
+    from hil.loop.timing import budget
+
+    _timing_table(summary["timing_us"], budget()).print()
+    for line in (*(f"over budget: {text}" for text in summary["over_budget"]), *summary["events"]):
+        print(line)
+    if not summary["over_budget"]:
+        print("within the timing budget (hil/loop/budget.toml)")
+    for text in summary["refused"]:
+        print(f"without {text}")
+    used, errors = summary["usage"], summary["errors_m"]
+    print(
+        f"{summary['cycles']} cycles; periods missed: {summary['missed_own']} by own work, "
+        f"{summary['missed_late']} woken late, {summary['missed_host']} held up by the host"
+    )
+    print(
+        f"the loop's thread: {used['major_faults']} major and {used['minor_faults']} minor page faults, "
+        f"{used['involuntary_switches']} involuntary switches, {used['resident']} bytes of growth; "
+        f"first cycle {summary['start_up_s']:.2f} s after the start"
+    )
+    truth = f"estimate - truth {mm(errors['estimation'])} mm RMS" if errors["known"] else "the truth is not known"
+    print(f"{truth}; reference - length {mm(errors['tracking'])} mm RMS")
+    if trip := summary["timing_us"].get("round trip"):
+        figures = ", ".join(f"{label} {trip[name]:.0f}" for label, name in QUANTILES.items())
+        print(f"round trip to the rig {figures} us")
+        print(f"{summary['late']} exchanges late, {summary['refused_packets']} packets refused")
+        print(_bars(summary["round_trip_bars"]))
+    if summary["unseen"]:
+        print(f"{summary['unseen']} cycles are in none of these figures: the supervisor came too late")
+    if summary["recording"]["files"]:
+        kept = summary["cycles"] - summary["recording"]["lost"]
+        files = ", ".join(summary["recording"]["files"])
+        print(f"{kept} cycles recorded in {files}; {summary['recording']['lost']} cycles lost")
+    if summary["identity"]:
+        print(f"rig: {summary['identity']['name']} {summary['identity']['parts']}")
+    if summary["obstacle"] is not None:
+        print(summary["obstacle"] or "nothing was moved; all is well for arming")
+    print(f"stopped on the brakes: {summary['cause']}")
+
+
+def _bars(bars: list[list[float]]) -> str:
+    """A histogram as text: for each octave of microseconds, how many."""
+    counts: dict[int, float] = {}
+    for low, count in zip(*bars, strict=True):
+        octave = int(low).bit_length() - 1 if low >= 1.0 else 0
+        counts[octave] = counts.get(octave, 0) + count
+    most = max(counts.values(), default=1)
+    return "\n".join(
+        f"  {2**octave:6d} to {2 ** (octave + 1):6d} us {'#' * max(1, round(40 * count / most)):40s} {count:.0f}"
+        for octave, count in sorted(counts.items())
+    )
+
+
+def _timing_table(timing: dict[str, dict[str, float]], budget: dict[str, dict[str, float]]) -> Table:
+    """The microseconds of each stage beside their budget, marked where they exceed it."""
+    table = Table("us", *(f"{label} / budget" for label in QUANTILES))
+    for stage, figures in timing.items():
+        limits = budget.get(stage, {})
+        table.add(stage, *(_timing_cell(figures[name], limits.get(name)) for name in QUANTILES.values()))
+    return table
+
+
+def _timing_cell(us: float, limit: float | None) -> Cell:
+    if limit is None:
+        return Cell(f"{us:.1f} /  -")
+    return Cell(f"{us:.1f} / {limit:g}", alarm=us > limit)
+
+
+def add_replay(command: argparse.ArgumentParser) -> None:
+    """Add the options of `gough replay`."""
+    command.description = (
+        "Feed the recorded raw IMU data through the same cycle and compare estimates and commands bit for bit."
+    )
+    command.add_argument("files", type=Path, nargs="+", metavar="FILE.mcap", help="files of one run, in their order")
+    add_json(command)
+    command.set_defaults(run=_replay)
+
+
+def _replay(options: argparse.Namespace) -> int:
+    from hil.recording.replay import replay
+
+    check_distinct(options.json, *options.files)
+    check_outputs(options.json)
+    result = replay(options.files)
+    write_json(options.json, result.summary())
+    for line in result.lines():
+        print(line)
+    return 0 if result.same else 1
+
+
+def add_stream_target(command: argparse.ArgumentParser) -> None:
+    """Add the options of `gough stream-target`."""
+    command.description = (
+        "Send a motion as a stream of poses in real time, one UDP datagram each, to a run that follows a stream. It can also "
+        "go wrong on purpose, to show that the run then stops as it should."
+    )
+    add_options(
+        command,
+        SimulationConfig,
+        "mechanism",
+        target={"text": "a motion's name, or a CSV file, as for 'gough run'"},
+        duration={"text": "duration of the motion"},
+        rate={"default": 100.0, "text": "poses per second, at most 10000"},
+    )
+    command.add_argument(
+        "--to",
+        type=_address,
+        default="127.0.0.1:47200",
+        metavar="HOST:PORT",
+        help="where the run listens (default: %(default)s)",
+    )
+    for name, text in (("stop", "fall silent"), ("jump", "jump up by 5 cm"), ("nan", "send what is no number")):
+        command.add_argument(
+            f"--{name}-at", type=float, default=argparse.SUPPRESS, metavar="SECONDS", help=f"{text} from this time on [s]"
+        )
+    command.set_defaults(run=_stream_target)
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise argparse.ArgumentTypeError(f"{text!r} is no address such as 127.0.0.1:47200")
+    return host.strip("[]"), int(port)
+
+
+def _stream_target(options: argparse.Namespace) -> int:
+    from controller.planning.target import load_target
+    from hil.runs.target_stream import Faults, send_target
+    from plant.mechanism import load_spatial
+
+    mechanism = load_spatial(options.mechanism)
+    target = load_target(options.target, mechanism, options.duration)
+    host, port = options.to
+    sent = send_target(mechanism, target, options.rate, host, port, options.duration, config_of(options, Faults))
+    print(f"{sent} poses of {target.name} sent to {host}:{port}")
+    return 0

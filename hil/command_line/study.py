@@ -1,0 +1,267 @@
+"""The studies: compare-fusion, evaluate-fusion, faults, planar, broad."""
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from hil.command_line.options import add_options, config_of
+from hil.command_line.outputs import add_json, add_markdown, check_outputs, show_table, write_json
+from hil.command_line.terminal import deg, mm, mm_deg, progress_bar
+from hil.runs.config import SimulationConfig
+from hil.studies.config import SECTIONS, ComparisonConfig, EvaluationConfig
+from hil.table import Table
+from plant.errors import InputError
+
+
+def add_compare_fusion(command: argparse.ArgumentParser) -> None:
+    """Add the options of `gough compare-fusion`."""
+    command.description = (
+        "Move the platform as prescribed, 30 mm and 10 deg along and about every axis, and compare every way to fuse the IMUs: "
+        "errors after the first 20 s, NEES (6 is consistent) and microseconds of a cycle."
+    )
+    add_options(command, ComparisonConfig, "mechanism", "motion", "duration", "rate", "imu", "calibration", "seeds")
+    add_json(command)
+    command.set_defaults(run=_compare)
+
+
+def _compare(options: argparse.Namespace) -> int:
+    from hil.studies.fusion_comparison import compare
+
+    check_outputs(options.json)
+    config = config_of(options, ComparisonConfig)
+    with progress_bar("every way to fuse") as progress:
+        figures = compare(config, progress)
+    write_json(options.json, figures)
+    table = Table(f"{config.imu}, {config.motion}", "position RMS [mm]", "rotation RMS [deg]", "NEES", "us", "seeds")
+    for name, method in figures["methods"].items():
+        nees = "" if method["nees"] is None else f"{method['nees']:.1f}"
+        us = "" if method["us"] is None else f"{method['us']:.1f}"
+        table.add(name, mm(method["position_rms"]), deg(method["rotation_rms"]), nees, us, f"{method['seeds']}")
+    table.print()
+    return 0
+
+
+def add_evaluate_fusion(command: argparse.ArgumentParser) -> None:
+    """Add the options of `gough evaluate-fusion`."""
+    command.description = (
+        "Calibrate the raw IMUs of several rigs on themselves, then move their platforms as prescribed, 30 mm and 10 deg along "
+        "and about every axis at 0.5, 1, 2 and 0.1 to 1 Hz, and still: errors after the first 20 s with exact and with wrong "
+        "joints, with a dead IMU, of starts in the middle of a motion, over minutes of standing still, in the closed loop, and "
+        "the cost of a cycle. The leg filters with the refined pose stand beside it. Ten minutes in all."
+    )
+    names = ("mechanism", "imu", "fusion", "rate", "joint_error", "seeds", "starts", "still", "target")
+    add_options(command, EvaluationConfig, *names)
+    command.add_argument(
+        "--only", choices=SECTIONS, nargs="+", default=argparse.SUPPRESS, help="these sections instead of all"
+    )  # fmt: skip
+    add_json(command)
+    command.set_defaults(run=_evaluate)
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    from hil.studies.fusion_evaluation import evaluate
+
+    check_outputs(options.json)
+    config = config_of(options, EvaluationConfig)
+    with progress_bar("calibration") as progress:
+        figures = evaluate(config, lambda label, share: progress(share, label))
+    write_json(options.json, figures)
+    for section, show in _EVALUATED.items():
+        if section in figures:
+            show(figures[section])
+    return 0
+
+
+def _joints(error: str) -> str:
+    return "exact joints" if error == "0" else f"joints {1e3 * float(error):g} mm off"
+
+
+def _print_calibrations(figures: dict[str, Any]) -> None:
+    table = Table("calibration, RMS [mm, deg]", "before", "after", "predicted", "least improvement")
+    for error, each in figures.items():
+        cells = (mm_deg(each[name]) for name in ("before", "after", "predicted"))
+        table.add(_joints(error), *cells, f"{each['least_improvement']:.0f} times")
+    table.print()
+
+
+def _print_motions(figures: dict[str, Any]) -> None:
+    for error, motions in figures.items():
+        table = Table(f"{_joints(error)}, RMS [mm, deg]", "legs, refined", "NEES", "whole mechanism", "worst seed", "NEES")
+        for kind, each in motions.items():
+            refined, whole = each["refined"], each["whole"]
+            table.add(
+                kind if kind.isalpha() else f"{kind} Hz",
+                mm_deg(refined),
+                f"{refined['nees']:.1f}",
+                mm_deg(whole),
+                mm_deg(whole, "worst_"),
+                f"{whole['nees']:.1f}",
+            )
+        table.print()
+
+
+def _print_faults(figures: dict[str, Any]) -> None:
+    table = Table("IMU dead at 1 Hz", "position RMS [mm]", "times", "rotation RMS [deg]", "times")
+    for name, each in figures.items():
+        times = (f"{each[f'{key}_ratio']:.2f}" if name != "none" else "" for key in ("position_rms", "rotation_rms"))
+        table.add(name, mm(each["position_rms"]), next(times), deg(each["rotation_rms"]), next(times))
+    table.print()
+
+
+def _print_starts(figures: dict[str, Any]) -> None:
+    print(
+        f"starts in motion up to 2 Hz: {figures['succeeded']} of {figures['starts']} within 1.5 s; largest error from then on "
+        f"{mm(figures['position_max'])} mm, {deg(figures['rotation_max'])} deg"
+    )
+
+
+def _print_drift(figures: dict[str, Any]) -> None:
+    table = Table("standing still", "position RMS [mm]", "rotation RMS [deg]", "NEES")
+    for minute, each in enumerate(figures["minutes"], start=1):
+        table.add(f"minute {minute}", mm(each["position_rms"]), deg(each["rotation_rms"]), f"{each['nees']:.1f}")
+    table.print()
+
+
+def _print_following(figures: dict[str, Any]) -> None:
+    print(
+        f"closed loop, {figures['imu']}, {figures['fusion']}, {figures['target']}: RMS {mm(figures['position_rms'])} mm, "
+        f"{deg(figures['rotation_rms'])} deg, worst seed {mm(figures['worst_position_rms'])} mm, "
+        f"{deg(figures['worst_rotation_rms'])} deg, NEES {figures['nees']:.1f}"
+    )
+
+
+def _print_cost(figures: dict[str, Any]) -> None:
+    table = Table("microseconds of a cycle", "mean", "most")
+    for name, each in figures.items():
+        table.add(name, f"{each['mean_us']:.1f}", f"{each['max_us']:.1f}")
+    table.print()
+
+
+_EVALUATED: dict[str, Callable[[dict[str, Any]], None]] = {
+    "calibration": _print_calibrations,
+    "motions": _print_motions,
+    "faults": _print_faults,
+    "start": _print_starts,
+    "drift": _print_drift,
+    "follow": _print_following,
+    "cost": _print_cost,
+}
+
+
+def add_faults(command: argparse.ArgumentParser) -> None:
+    """Add the options of `gough faults`."""
+    command.description = (
+        "Run every case of the fault matrix on the emulated rig, on virtual time: the reported cause, how the run ends, how "
+        "soon, and how far a leg gets off its reference. The exit status is 1 if any reaction differs from the specified one."
+    )
+    command.add_argument("--seeds", type=int, default=20, help="how often each case is tried (default: %(default)s)")
+    command.add_argument("--only", metavar="TEXT", help="only cases with this text in their names")
+    add_markdown(command, "docs/faults.md")
+    add_json(command)
+    command.set_defaults(run=_faults)
+
+
+def _faults(options: argparse.Namespace) -> int:
+    from hil.studies.fault_matrix import CASES, run_matrix, summary, table
+
+    check_outputs(options.json)
+    if options.seeds < 1:
+        raise InputError(f"there are {options.seeds} seeds; at least 1 is needed")
+    cases = tuple(case for case in CASES if options.only is None or options.only in case.name)
+    if not cases:
+        raise InputError(f"no case has {options.only!r} in its name")
+    with progress_bar("faults") as progress:
+        outcomes = run_matrix(options.seeds, cases, progress)
+    show_table(table(outcomes), options.markdown)
+    write_json(options.json, summary(outcomes, options.seeds))
+    findings = [finding for outcome in outcomes for finding in outcome.findings]
+    for finding in findings:
+        print(finding, file=sys.stderr)
+    return 1 if findings else 0
+
+
+def add_planar(command: argparse.ArgumentParser) -> None:
+    """Add the options of `gough planar`."""
+    command.description = (
+        "Solve the measured leg angles of a planar rig at known static poses, given in files pose_*.csv with the true pose in "
+        "the first line. Prints the errors of the assembly mode that is nearest to the true pose."
+    )
+    command.add_argument("folder", type=Path, metavar="FOLDER", help="folder with the files pose_*.csv")
+    add_options(command, SimulationConfig, mechanism={"default": "planar-3rpr"})
+    command.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots")
+    add_json(command)
+    command.set_defaults(run=_planar)
+
+
+def _planar(options: argparse.Namespace) -> int:
+    from hil.studies.planar_rig import evaluate
+    from plant.mechanism import load_mechanism
+    from plant.mechanism.planar import PlanarMechanism
+
+    check_outputs(options.json, options.report)
+    mechanism = load_mechanism(options.mechanism)
+    if not isinstance(mechanism, PlanarMechanism):
+        raise InputError(f"{options.mechanism} has six legs in space; this needs three in the plane: choose another mechanism")
+    result = evaluate(options.folder, mechanism)
+    summary = result.summary()
+    write_json(options.json, summary)
+    if options.report:
+        from hil.reports.planar_rig import write_report
+
+        write_report(result, options.report)
+    table = Table("RMS of the poses' mean errors", "x [mm]", "y [mm]", "angle [deg]", "leg angles [deg]", "true pose is a mode")
+    for source, figures in summary["sources"].items():
+        rms = figures["rms"]
+        table.add(
+            source,
+            mm(rms["x"], 2),
+            mm(rms["y"], 2),
+            deg(rms["angle"], 2),
+            deg(figures["leg_angles"]["constant_error"], 2),
+            f"{figures['true_mode']['poses']} of {len(result.poses)} poses",
+        )
+    table.print()
+    return 0
+
+
+def add_broad(command: argparse.ArgumentParser) -> None:
+    """Add the options of `gough broad`."""
+    command.description = (
+        "Run the platform's filter, and the vqf package, on trials of the BROAD benchmark: an IMU moved by hand, with an "
+        "optical reference. Prints the RMS of the inclination's error where the benchmark counts it."
+    )
+    command.add_argument("folder", type=Path, metavar="FOLDER", help="folder with the trials *.npz")
+    command.add_argument(
+        "--accelerometer-noise",
+        type=float,
+        default=0.25,
+        help="noise that the filter assumes [m/s2/sqrt(Hz)]; on a mechanism the legs give the platform's acceleration, which "
+        "here is unknown and counts as noise, far above the sensor's own (default: %(default)s)",
+    )
+    command.add_argument(
+        "--bias-walk",
+        type=float,
+        default=1e-4,
+        help="random walk of the gyroscope's bias that the filter assumes [rad/s/sqrt(s)] (default: %(default)s)",
+    )
+    add_json(command)
+    command.set_defaults(run=_broad)
+
+
+def _broad(options: argparse.Namespace) -> int:
+    from controller.settings import FusionSettings
+    from hil.studies.broad import evaluate
+
+    check_outputs(options.json)
+    fusion = FusionSettings(platform_accelerometer_noise=options.accelerometer_noise, bias_walk=options.bias_walk)
+    figures = evaluate(options.folder, fusion)
+    write_json(options.json, figures)
+    table = Table("inclination RMS", "filter [deg]", "vqf [deg]", "filter [us]", "vqf [us]", "samples")
+    for name, trial in figures["trials"].items():
+        methods = trial["filter"], trial["vqf"]
+        errors, times = (deg(method["inclination_rms"]) for method in methods), (f"{method['us']:.2f}" for method in methods)
+        table.add(name, *errors, *times, f"{trial['samples']}")
+    table.print()
+    return 0

@@ -1,0 +1,98 @@
+"""What the terminal shows: numbers, progress, and the state of a run."""
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from math import asin, atan2, degrees
+from typing import TYPE_CHECKING, Any
+
+from hil.table import Table
+
+if TYPE_CHECKING:
+    from hil.runs.run_state import RunState
+
+QUANTILES = {"p50": "p50", "p99": "p99", "p99.9": "p999", "max": "max"}
+"""How each quantile is printed, and its name in the figures."""
+
+
+def mm(metres: float, digits: int = 3) -> str:
+    """Return a length [m] in millimetres, with this number of digits after the point."""
+    return f"{1e3 * metres:.{digits}f}"
+
+
+def deg(angle: float, digits: int = 3) -> str:
+    """Return an angle [rad] in degrees, with this number of digits after the point."""
+    return f"{degrees(angle):.{digits}f}"
+
+
+def mm_deg(errors: dict[str, float], prefix: str = "") -> str:
+    """Return the RMS errors of a pose, in millimetres and degrees."""
+    return f"{mm(errors[f'{prefix}position_rms'])}, {deg(errors[f'{prefix}rotation_rms'])}"
+
+
+@contextmanager
+def progress_bar(label: str) -> Iterator[Callable[..., None]]:
+    """A progress bar on the terminal, removed at the end; it pulses until it is first called with the share that is done. A new
+    label can be given with the share.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    terminal = sys.stderr.isatty()
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not terminal) as bar:
+        task = bar.add_task(label, total=None)
+        yield lambda share, label=None: bar.update(task, total=1.0, completed=share, description=label)
+
+
+@contextmanager
+def live_view(mechanism: str, target: str, rate: float) -> Iterator[Callable[["RunState"], None]]:
+    """A view of a run, updated whenever it is called; nothing without a terminal."""
+    from rich.console import Console
+    from rich.live import Live
+
+    if not sys.stderr.isatty():
+        yield lambda state: None
+        return
+    live = Live(console=Console(stderr=True), auto_refresh=False, transient=True)
+
+    def show(state: "RunState") -> None:
+        # The motion goes on when the terminal has gone.
+        with suppress(OSError):
+            live.update(_view(f"{mechanism} follows {target} at {rate:g} Hz", state).rich(), refresh=True)
+
+    live.start()
+    try:
+        yield show
+    finally:
+        with suppress(OSError):
+            live.stop()
+
+
+def _view(title: str, state: "RunState") -> Table:
+    from controller.safety.causes import Cause, Mode
+
+    table = Table(title, "")
+    latest: Any = state.latest
+    if latest is None:
+        table.add("state", "preparing plan, plant and machine code, which the first time is compiled (under a minute)")
+        return table
+    position, r = 1e3 * latest["position"], latest["rotation"]
+    angles = (atan2(r[2, 1], r[2, 2]), asin(max(-1.0, min(1.0, -r[2, 0]))), atan2(r[1, 0], r[0, 0]))
+    wake, compute = state.timing.histograms["wake"].figures(), state.timing.histograms["compute"].figures()
+    errors = state.errors()
+    mode = Mode(int(latest["mode"])).name.lower() + (f": {Cause(int(latest['stop'])).text}" if latest["stop"] else "")
+    table.add("state", f"{mode}, {latest['time_ns'] / 1e9:.1f} s")
+    table.add("position [mm]", "  ".join(f"{value:9.3f}" for value in position))
+    table.add("roll, pitch, yaw [deg]", "  ".join(f"{degrees(angle):9.3f}" for angle in angles))
+    table.add("estimate - truth, RMS [mm]", mm(errors["estimation"]) if errors["known"] else "the truth is not known")
+    table.add("reference - length, RMS [mm]", mm(errors["tracking"]))
+    for label, figures in (("woken late", wake), ("computing", compute)):
+        table.add(f"{label} p50, p99.9, max [us]", "  ".join(f"{figures[name]:.0f}" for name in ("p50", "p999", "max")))
+    table.add("periods missed, exchanges late", f"{state.missed}, {state.late}")
+    table.add("stop", "Ctrl-C: controlled; Ctrl-\\: emergency")
+    for text in state.refused:
+        table.add("without", text)
+    for text in state.events:
+        table.add("", text)
+    return table

@@ -1,0 +1,26 @@
+"""Processes beside this one: they share its memory, leave its signals to it, and end with it."""
+
+import multiprocessing
+import signal
+from multiprocessing.process import BaseProcess
+
+FORK = multiprocessing.get_context("fork")
+PATIENCE_S = 10.0
+"""How long a process may take to end before it is killed."""
+
+_ENDING = (
+    signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU,
+)  # fmt: skip
+
+
+def block_signals() -> None:
+    """Block the signals that end or stop a process; the supervisor handles them."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
+
+
+def join_or_kill(process: BaseProcess) -> None:
+    """Wait for the end of a process, and kill it if it does not end."""
+    process.join(PATIENCE_S)
+    if process.is_alive():
+        process.kill()
+        process.join()

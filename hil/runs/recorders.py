@@ -1,0 +1,144 @@
+"""The process that records a run, its successors if it dies, and the file that they write."""
+
+import errno
+import fcntl
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.loop.records import Link
+from hil.realtime.processes import FORK, block_signals, join_or_kill
+from hil.recording.mcap import record, repair
+from plant.compiled import Record
+from plant.errors import GoughError, InputError
+
+_LEAST_FREE = 8 * 2**20
+_MOST_RECORDERS = 10
+
+
+@contextmanager
+def claimed(path: Path | None) -> Iterator[None]:
+    """Keep a recording's file for this run, after checking that it can be written.
+
+    Raises:
+        InputError: it cannot, another run records to it, or its disk is full.
+    """
+    if path is None:
+        yield
+        return
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path} is no file: name another for the recording")
+    fresh = not path.exists()
+    try:
+        file = path.open("ab")
+    except OSError as error:
+        raise InputError(f"cannot record to {path}: {error.strerror}: name another file") from None
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"{path} is being recorded to by another run: name another file") from None
+        free = shutil.disk_usage(path.resolve().parent).free
+        try:
+            if free < _LEAST_FREE:
+                raise InputError(
+                    f"cannot record to {path}: {free / 2**20:.3g} MiB are free there, and {_LEAST_FREE / 2**20:g} MiB are "
+                    "needed to begin: make room, or name another file"
+                )
+            yield
+        finally:
+            if fresh and not path.stat().st_size:
+                path.unlink()
+
+
+class Recorders:
+    """The process that records, and its successors if it dies."""
+
+    def __init__(
+        self, path: Path | None, records: Record, link: NDArray[np.int64], supervisors: Connection, events: list[str]
+    ) -> None:  # fmt: skip
+        """Start nothing yet.
+
+        Args:
+            path: the file to write; None for none.
+            records: the loop's, in shared memory.
+            link: shared with the loop (`hil.loop.records`).
+            supervisors: the supervisor's end of a pipe, which the recorder closes.
+            events: where deaths and successors are reported.
+        """
+        self.files: list[Path] = []
+        self._path, self._records, self._link, self._supervisors, self._events = path, records, link, supervisors, events
+        self._header: dict[str, Any] = {}
+        self._process: BaseProcess | None = None
+
+    @property
+    def lost(self) -> int:
+        """Number of cycles that are in no file."""
+        return int(self._link[Link.HEAD] - self._link[Link.KEPT]) if self.files else 0
+
+    def start(self, header: dict[str, Any]) -> None:
+        """Start the first recorder."""
+        self._header = header
+        if self._path is not None:
+            self._start(self._path)
+
+    def _start(self, path: Path) -> None:
+        self.files.append(path)
+        arguments = (path, self._header, self._records, self._link, self._supervisors)
+        self._process = FORK.Process(target=_recorder_process, args=arguments)
+        self._process.start()
+
+    def watch(self) -> None:
+        """If the recorder has been killed, start a successor with a file of its own; none if its file cannot be written."""
+        if self._path is None or self._process is None or self._process.is_alive():
+            return
+        if self._process.exitcode != 0:
+            self._report_death()
+        killed = (self._process.exitcode or 0) < 0
+        self._process = None
+        if killed and len(self.files) < _MOST_RECORDERS:
+            numbers = range(len(self.files) + 1, 10_000)
+            path = next(each for n in numbers if not (each := self._path.with_stem(f"{self._path.stem}-{n}")).exists())
+            self._events.append(f"another recorder goes on in {path}")
+            self._start(path)
+
+    def _report_death(self) -> None:
+        code = self._process.exitcode if self._process else 0
+        if code is not None and code > 0:
+            self._events.append(f"{self.files[-1]} cannot be written: {os.strerror(code)}: the rest is not recorded")
+        else:
+            self._events.append(f"the recorder died (exit code {code})")
+
+    def finish(self) -> None:
+        """Let the recorder write what is left, and complete the files of those that died."""
+        self._link[Link.DONE] = 1
+        if self._process is not None:
+            join_or_kill(self._process)
+            if self._process.exitcode != 0:
+                self._report_death()
+        for path in self.files:
+            try:
+                if path.exists():
+                    repair(path)
+            except (GoughError, OSError) as error:
+                self._events.append(f"{path} is incomplete: {error}")
+
+
+def _recorder_process(
+    path: Path, header: dict[str, Any], records: Record, link: NDArray[np.int64], supervisors: Connection
+) -> None:  # fmt: skip
+    block_signals()
+    supervisors.close()
+    try:
+        record(path, header, records, link)
+    except OSError as error:
+        # Skips the writer's collection, which would try to write again.
+        os._exit(error.errno or errno.EIO)

@@ -1,0 +1,81 @@
+"""What the supervisor sees of a run while it goes on."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.loop.timing import Timing
+from hil.recording.mcap import events_of, take
+from plant.compiled import Record
+from plant.truth import TRUTH_POSITION
+
+_MOST_EVENTS = 100
+
+
+@dataclass(eq=False)
+class RunState:
+    """State and figures of a run until now.
+
+    Attributes:
+        latest: the last record, of dtype `RECORD`; None before the first.
+        timing: of all cycles so far.
+        missed: number of periods missed.
+        late: number of exchanges without an answer in time.
+        refused: what the machine refuses of real time.
+        refused_packets: number of packets refused by a rig on a bus.
+        unseen: number of cycles that were overwritten before the supervisor saw them; no figure includes them.
+        events: the loop's, by cycle, and the supervisor's own, such as a recorder that died.
+    """
+
+    latest: Record | None = None
+    timing: Timing = field(default_factory=Timing)
+    missed: int = 0
+    late: int = 0
+    refused: list[str] = field(default_factory=list)
+    refused_packets: int = 0
+    unseen: int = 0
+    events: list[str] = field(default_factory=list)
+    _seen: int = 0
+    _squares: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    _counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(2, np.int64))
+
+    def update(self, records: Record, link: NDArray[np.int64]) -> bool:
+        """Add the cycles that the loop has recorded since the last call; returns whether there are any."""
+        taken, self._seen, unseen = take(records, link, self._seen)
+        self.unseen += unseen
+        if len(taken):
+            self._add(taken)
+        return bool(len(taken))
+
+    def _add(self, records: Record) -> None:
+        self.latest = records[-1]
+        self.timing.add(records)
+        self.missed += int(records["missed"].sum())
+        self.late += int((records["silent"] > 0).sum())
+        self.refused_packets = int(records["refused"][-1])
+        for eventful in records[records["event_count"] > 0]:
+            for text in events_of(eventful):
+                self._note(int(eventful["cycle"]), text)
+        # Before the rig is armed there may be cycles without a pose.
+        posed = records[records["status"] == 0]
+        known = posed[np.isfinite(posed["truth"][:, 0])]
+        errors = posed["lengths"] - posed["reference"][:, :, 0]
+        self._squares += (
+            np.sum((known["position"] - known["truth"][:, TRUTH_POSITION]) ** 2),
+            (np.sum(errors**2, axis=1) / np.count_nonzero(posed["lengths"], axis=1)).sum(),
+        )
+        self._counts += (len(known), len(posed))
+
+    def _note(self, cycle: int, text: str) -> None:
+        if len(self.events) < _MOST_EVENTS:
+            self.events.append(f"cycle {cycle}: {text}")
+        elif len(self.events) == _MOST_EVENTS:
+            self.events.append("later events are in the recording only")
+
+    def errors(self) -> dict[str, float]:
+        """RMS errors [m]: `estimation` of the position against the truth, over the `known` cycles that have a truth; `tracking`
+        of a leg's length against the reference.
+        """
+        estimation, tracking = np.sqrt(self._squares / np.maximum(self._counts, 1)).tolist()
+        return {"estimation": estimation, "tracking": tracking, "known": int(self._counts[0])}

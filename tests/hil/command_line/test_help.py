@@ -1,0 +1,106 @@
+"""The help of every command: quick, and true."""
+
+import argparse
+import re
+import subprocess
+import sys
+from dataclasses import fields, is_dataclass
+
+import pytest
+
+from hil.command_line import COMMANDS, parse
+from hil.command_line.options import add_options, config_of
+from hil.realtime.scheduling import RealTimeSettings
+from hil.runs.config import EmulatorConfig, SimulationConfig
+from hil.studies.config import ComparisonConfig, EvaluationConfig, TuningConfig
+
+ACTIONS = {"calibrate": ("rig", "imu", "magnetometer"), "fmu": ("build", "table", "info", "validate", "linearize")}
+NAMES = [name for helps in COMMANDS.values() for name in helps]
+LINES = [[name, *action] for name in NAMES for action in ([], *([each] for each in ACTIONS.get(name, ())))]
+HEAVY = ("numpy", "numba", "scipy", "casadi", "control", "fmpy", "rich", "importlib.metadata")
+
+
+def helped(capsys, *arguments):
+    with pytest.raises(SystemExit) as ended:
+        parse([*arguments, "--help"])
+    assert ended.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_the_help_fits_a_screen_and_has_every_command_under_a_heading(capsys):
+    lines = helped(capsys).splitlines()
+    assert len(lines) <= 45 and max(map(len, lines)) <= 100
+    headings = [line[:-1] for line in lines if re.fullmatch(r"[a-z]+:", line)]
+    assert headings == ["options", *COMMANDS]
+    for name in NAMES:
+        assert sum(line.startswith(f"  {name} ") for line in lines) == 1
+    assert len(NAMES) == 21
+
+
+def test_no_help_loads_a_heavy_library():
+    code = (
+        "import sys\nfrom hil.command_line import parse\n"
+        f"for line in {[[], *LINES]}:\n"
+        "    try:\n        parse([*line, '--help'])\n    except SystemExit:\n        pass\n"
+        f"print([name for name in {HEAVY} if name in sys.modules], file=sys.stderr)"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stderr.strip() == "[]"
+    assert run.stdout.count("usage: gough") == 1 + len(LINES)
+
+
+@pytest.mark.parametrize("line", LINES, ids=" ".join)
+def test_every_help_gives_one_default_and_every_option_a_help(line, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "1000")
+    text = re.sub(r"\n {20,}", "  ", helped(capsys, *line))
+    for option in re.findall(r"^  (-\S.*)$", text, re.MULTILINE):
+        assert re.search(r"\S  +\S", option), f"{option} has no help"
+        assert option.count("(default: ") <= 1
+        assert not re.search(r"default: (None|False|True|\[|\()", option)
+
+
+@pytest.mark.parametrize(
+    "config", [SimulationConfig, EmulatorConfig, RealTimeSettings, ComparisonConfig, EvaluationConfig, TuningConfig]
+)
+def test_options_without_arguments_are_the_configuration_s_defaults(config):
+    assert is_dataclass(config)
+    command = argparse.ArgumentParser()
+    add_options(command, config, *(each.name for each in fields(config) if "option" in each.metadata))
+    assert config_of(command.parse_args([]), config) == config()
+
+
+def test_options_are_read_in_their_units_and_forms():
+    line = "run --rig udp --no-arm --duration 2 --imus 6,0,2,0 --joint-error 0.1 --magnetometer --cpu 0 --strict --plant p.fmu"
+    options = parse(line.split())
+    config = config_of(options, SimulationConfig)
+    assert config == SimulationConfig(
+        rig="udp", arm=False, duration=2.0, imus=(0, 2, 6), joint_error=1e-4, magnetometer=True, plant="p.fmu"
+    )
+    assert config_of(options, RealTimeSettings) == RealTimeSettings(cpu=0, strict=True)
+    settings = parse(["simulate", "--set", "payload.mass=12@3.5", "--set", "gravity=0,0,-9.8"]).settings
+    assert [each.text for each in settings] == ["payload.mass=12@3.5", "gravity=0,0,-9.8"]
+    options = parse(["emulate", "--fault", "dead:1", "--fault", "noise,at=2", "--watchdog", "40"])
+    config = config_of(options, EmulatorConfig)
+    assert config.faults == ("dead:1", "noise,at=2") and config.watchdog == 0.04
+    assert config_of(options, RealTimeSettings) == RealTimeSettings(priority=79, cpu=0)
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("simulate --set mass", "argument --set: 'mass' is no setting such as payload.mass=12"),
+        ("simulate --imus some", "argument --imus: 'some' is neither all, legs, nor a list of numbers such as 0,2,4,6"),
+        ("simulate --joint-error much", "argument --joint-error: invalid float value: 'much'"),
+        ("compare-fusion --seeds 0,a", "argument --seeds: '0,a' is no list of numbers such as 0,1,2"),
+        ("run --cpu one", "argument --cpu: invalid int value: 'one'"),
+        ("emulate --bus can", "argument --bus: invalid choice: 'can'"),
+        ("simulat", "argument COMMAND: invalid choice: 'simulat'"),
+        ("", "the following arguments are required: COMMAND"),
+    ],
+)
+def test_what_cannot_be_read_is_one_line(line, said, capsys):
+    with pytest.raises(SystemExit) as ended:
+        parse(line.split())
+    assert ended.value.code == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1 and "--help)" in error

@@ -1,0 +1,33 @@
+"""Configurations of runs: what is given, checked and restored."""
+
+from dataclasses import asdict
+
+import pytest
+
+from hil.rigs.udp.emulator import WATCHDOG_S
+from hil.runs.config import EmulatorConfig, SimulationConfig, imus_from_text
+from plant.errors import InputError
+from plant.fmu.settings import Setting
+from plant.wiring import Wiring
+
+
+def test_a_configuration_comes_back_from_its_plain_values():
+    config = SimulationConfig(
+        settings=(Setting("payload.mass", (12.0,), 3.5),), wiring=Wiring(places=(1, 0, 2, 3, 4, 5, 6)), imus=(0, 2, 6)
+    )
+    plain = asdict(config)
+    assert SimulationConfig.from_plain(plain) == config
+    assert SimulationConfig.from_plain(plain | {"imus": [0, 2, 6]}) == config
+    with pytest.raises(InputError, match="these values are no configuration of a simulation"):
+        SimulationConfig.from_plain(plain | {"colour": "red"})
+
+
+@pytest.mark.parametrize(("text", "imus"), [("all", (0, 1, 2, 3, 4, 5, 6)), ("legs", (0, 1, 2, 3, 4, 5)), ("6,0,0", (0, 6))])
+def test_imus_have_names_and_numbers(text, imus):
+    assert imus_from_text(text) == imus
+
+
+def test_the_emulated_drives_have_one_watchdog():
+    assert EmulatorConfig().watchdog == WATCHDOG_S
+    with pytest.raises(InputError, match="the watchdog is 0 ms"):
+        EmulatorConfig(watchdog=0.0)
