@@ -202,7 +202,11 @@ def _checked(
         "leg_directions": (directions, (LEGS, 3)), "rotation": (rotation, (3, 3)), "normal": (normal, (3,)),
         "up_in_platform": (up_in_platform, (3,)),
     }  # fmt: skip
-    return {name: _shaped(value, (*rows, *shape), name) for name, (value, shape) in given.items() if value is not None}
+    return {
+        name: _shaped(value, (*rows, *shape), name)
+        for name, (value, shape) in given.items()
+        if value is not None or name == "leg_directions"
+    }
 
 
 def _shaped(value: ArrayLike, shape: tuple[int, ...], name: str) -> Array:

@@ -1,24 +1,28 @@
-"""The planner: from target poses to a reference that no actuator has to leave its limits for.
+"""The planner of a recorded target: from its poses to a reference that every actuator can follow within its limits.
 
-On every target sample ruckig plans anew, from the state of the reference to where the target will be 30 ms later, with
-its velocity and acceleration there. What is published are the cubic segments of those plans, so the limits on velocity,
-acceleration and jerk hold between samples too. ruckig does not know the stroke: a plan counts only if every leg could
-still stop inside its stroke after it, and if it arrives in time; else a gentler one is taken, and at last the stop itself.
+ruckig plans anew at every sample of the target: from the state of the reference to where the target will be 30 ms later, with
+the target's velocity and acceleration there. The reference consists of the cubic segments of these plans, so the limits on
+velocity, acceleration and jerk also hold between samples. ruckig does not know the stroke. A plan is accepted only if it
+arrives in time and every leg can still stop inside its stroke after it. Otherwise the planner tries a gentler plan, and at last
+the stop itself.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from ruckig import ControlInterface, InputParameter, Result, Ruckig, RuckigError, Synchronization, Trajectory
 
 from controller.inverse_kinematics import leg_lengths
-from controller.planning.segments import stop_phases
-from controller.planning.target import SAMPLE_PERIOD_S, Target
+from controller.planning.motions import SAMPLE_PERIOD_S
+from controller.planning.segments import state_after, stop_phases, write_segment
+from controller.planning.target import Target
 from plant.compiled import kernel
 from plant.errors import PlanningError
 from plant.mechanism import Mechanism, six_rows
 from plant.mechanism.limits import Limits
 from plant.pose import Array
+from plant.vectors import Vector
 
 PREVIEW_S = 0.03
 _LATEST_S = 2.0 * PREVIEW_S
@@ -26,13 +30,13 @@ _HALF_WINDOW = 3
 _STILL_M = 1e-9
 """A target that moves no leg by more than this within the window stands still."""
 _SLACK = 1e-9
-"""Rounding that a limit may be exceeded by before it counts, relative to the limit, or in m for the stroke."""
+"""Rounding by which a limit may be exceeded without a violation, relative to the limit, or in m for the stroke."""
 
 _STROKE_SLACK = 1e-10
-"""Rounding that the planner itself allows at the ends of the stroke [m]."""
+"""Rounding by which the planner's own plans may leave the stroke [m]."""
 
-_SEGMENTS = 9
-"""A plan of ruckig has two braking segments and seven more."""
+_PHASES = 9
+"""A plan of ruckig has two braking phases and seven more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +44,8 @@ class Reference:
     """A planned motion.
 
     Attributes:
-        segments: (6, n, 5), as `controller.planning.segments` evaluates them; legs that there are not rest at 0.
-        violations: how many segments leave a limit; the planner's promise is none.
+        segments: (6, n, 5), as `controller.planning.segments` evaluates them; rows of legs that a mechanism lacks rest at 0.
+        violations: how many segments leave a limit; the planner should make none.
     """
 
     segments: Array
@@ -69,14 +73,14 @@ def plan(mechanism: Mechanism, target: Target, duration: float) -> Reference:
 
 
 def count_violations(segments: Array, horizon: float, limits: Limits) -> int:
-    """How many segments before `horizon` [s] leave the stroke or the limits of velocity, acceleration or jerk."""
+    """How many segments before `horizon` [s] leave the stroke, or the limits of velocity, acceleration or jerk."""
     return int(
         _count_violations(segments, horizon, limits.stroke, np.array([limits.velocity, limits.acceleration, limits.jerk]))
     )
 
 
 class _Planner:
-    """Extends a reference by one sample period at a time, holding the state that the next plan starts from."""
+    """Extends a reference by one sample period at a time, and keeps the state from which the next plan starts."""
 
     def __init__(self, limits: Limits, lengths: Array, preview: float | None) -> None:
         self._limits = limits
@@ -84,21 +88,21 @@ class _Planner:
         self._state: tuple[list[float], ...] = (lengths.tolist(), [0.0] * self._legs, [0.0] * self._legs)
         self._otg = Ruckig(self._legs, SAMPLE_PERIOD_S)
         self._trajectory = Trajectory(self._legs)
-        self._follow = _input(limits, ControlInterface.Position, preview)
-        self._stop = _input(limits, ControlInterface.Velocity, None)
+        self._follow = ruckig_input(limits, ControlInterface.Position, preview)
+        self._stop = ruckig_input(limits, ControlInterface.Velocity, None)
         self._stop.synchronization = Synchronization.No
         self._goal: Array | None = None
         self._knot = 0
-        self._plans: list[tuple[float, ...]] = []
+        self._plans: list[Array] = []
         self._starts: list[int] = []
         self._states: list[tuple[list[float], ...]] = []
         self._stop_limits = np.array([limits.acceleration, limits.jerk])
-        # Within a sample period no leg goes further than this, so that inside it the plan need not be looked at.
+        # Within a sample period no leg goes further than this: inside this reach the plan need not be checked.
         near = limits.velocity * SAMPLE_PERIOD_S
         self._reach = [(least + near, greatest - near) for least, greatest in limits.stroke.tolist()]
 
     def advance(self, positions: Array, rates: Array, accelerations: Array) -> None:
-        """Go on for a sample period towards a state (legs,) each; a plan that leads to rest there is kept."""
+        """Go on for one sample period towards a state, (legs,) each. A plan that leads to rest there is kept."""
         resting = not rates.any() and not accelerations.any()
         if not (resting and self._goal is not None and np.abs(positions - self._goal).max() < _STILL_M):
             kept = self._begin(positions.tolist(), rates.tolist(), accelerations.tolist())
@@ -107,37 +111,27 @@ class _Planner:
         self._state = self._trajectory.at_time((self._knot - self._starts[-1]) * SAMPLE_PERIOD_S)[:3]
 
     def _begin(self, target: list[float], rates: list[float], accelerations: list[float]) -> bool:
-        """Begin a plan at the present state; return whether it leads to the target itself and is safe to its end."""
+        """Begin a plan at the present state; returns whether it leads to the target itself and is safe to its end."""
         rest = [0.0] * self._legs
         self._follow.target_position = target
         for rate, acceleration in ((rates, accelerations), (rates, rest), (rest, rest)):
             self._follow.target_velocity, self._follow.target_acceleration = rate, acceleration
-            if self._calculate(self._follow) and self._is_timely(rate) and self._is_safe():
+            if calculate(self._otg, self._follow, self._state, self._trajectory) and self._is_timely(rate) and self._is_safe():
                 kept = self._stays_inside()
                 break
         else:
             kept = False
-            if not self._calculate(self._stop):
+            if not calculate(self._otg, self._stop, self._state, self._trajectory):
                 raise PlanningError(f"ruckig finds no way to stop from lengths {self._state[0]}")
         self._starts.append(self._knot)
         self._states.append(self._state)
-        for profile in self._trajectory.profiles[0]:
-            brake = profile.brake
-            self._plans.append((*brake.t, *profile.t, *brake.j, *profile.j))
+        self._plans.append(phases_of(self._trajectory))
         return kept
-
-    def _calculate(self, parameters: InputParameter) -> bool:
-        parameters.current_position, parameters.current_velocity, parameters.current_acceleration = self._state
-        try:
-            return self._otg.calculate(parameters, self._trajectory) in (Result.Working, Result.Finished)
-        except (RuckigError, ValueError):
-            # ValueError: a result code of ruckig that its own binding does not know.
-            return False
 
     def _is_timely(self, rate: list[float]) -> bool:
         """Whether the plan arrives about when it should.
 
-        One that is to arrive with a speed, and cannot in time, would first swing away from the target to gain that speed.
+        A plan that must arrive with a speed, and cannot in time, first swings away from the target to gain that speed.
         """
         return self._trajectory.duration <= _LATEST_S or not any(rate)
 
@@ -157,15 +151,16 @@ class _Planner:
 
     def segments(self) -> Array:
         """All segments so far, (legs, n, 5)."""
-        plans = np.array(self._plans).reshape(-1, self._legs, 2, _SEGMENTS)
-        segments = np.zeros((self._legs, len(plans) * (_SEGMENTS + 1), 5))
+        plans = np.array(self._plans)
+        segments = np.zeros((self._legs, len(plans) * (_PHASES + 1), 5))
         segments[:, :, 0] = np.inf
         starts = np.array([*self._starts, self._knot]) * SAMPLE_PERIOD_S
         longest = _collect_segments(plans, np.array(self._states), starts, segments)
         return segments[:, :longest].copy()
 
 
-def _input(limits: Limits, interface: ControlInterface, minimum_duration: float | None) -> InputParameter:
+def ruckig_input(limits: Limits, interface: ControlInterface, minimum_duration: float | None) -> InputParameter:
+    """Parameters of ruckig with the limits of velocity, acceleration and jerk."""
     legs = len(limits.stroke)
     parameters = InputParameter(legs)
     parameters.control_interface = interface
@@ -176,13 +171,28 @@ def _input(limits: Limits, interface: ControlInterface, minimum_duration: float 
     return parameters
 
 
+def calculate(otg: Ruckig, parameters: InputParameter, state: Sequence[list[float]], trajectory: Trajectory) -> bool:
+    """Let ruckig plan from a state, lengths, rates and accelerations (legs,) each; returns whether there is a plan."""
+    parameters.current_position, parameters.current_velocity, parameters.current_acceleration = state
+    try:
+        return otg.calculate(parameters, trajectory) in (Result.Working, Result.Finished)
+    except (RuckigError, ValueError):
+        # ValueError: a result code of ruckig that its own binding does not know.
+        return False
+
+
+def phases_of(trajectory: Trajectory) -> Array:
+    """Durations and jerks (legs, 2, 9) of a plan of ruckig."""
+    return np.array([((*each.brake.t, *each.t), (*each.brake.j, *each.j)) for each in trajectory.profiles[0]])
+
+
 def _aims(mechanism: Mechanism, target: Target, knots: int) -> tuple[Array, Array, Array]:
     """Lengths, rates and accelerations (knots, legs) to aim at, within the limits."""
     limits = mechanism.require_limits()
     if target.held:
         positions = leg_lengths(mechanism, *target.at(np.arange(knots) * SAMPLE_PERIOD_S + 1e-9))
         return positions, np.zeros_like(positions), np.zeros_like(positions)
-    # A cubic fitted to seven samples about each aim: derivatives of the interpolation would make ruckig's plans chatter.
+    # A cubic is fitted to seven samples about each aim: derivatives of the interpolation would make ruckig's plans chatter.
     window = np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1)
     fit = np.linalg.pinv(np.vander(window * SAMPLE_PERIOD_S, 4, increasing=True))
     ahead = round(PREVIEW_S / SAMPLE_PERIOD_S)
@@ -204,12 +214,12 @@ def _aims(mechanism: Mechanism, target: Target, knots: int) -> tuple[Array, Arra
 
 @kernel
 def _collect_segments(plans: Array, states: Array, starts: Array, segments: Array) -> int:
-    """Write the segments of each plan up to the start of the next, and return how many the longest row has.
+    """Write the segments of each plan up to the start of the next; returns the number of segments in the longest row.
 
     Args:
         plans: (n, legs, 2, 9), durations and jerks.
-        states: (n, 3, legs), from which the plans start.
-        starts: (n + 1,) [s]; the last is the end of the last plan.
+        states: (n, 3, legs), the states from which the plans start.
+        starts: (n + 1,) [s], the starts of the plans and the end of the last one.
         segments: (legs, m, 5), written.
     """
     longest = 0
@@ -217,7 +227,7 @@ def _collect_segments(plans: Array, states: Array, starts: Array, segments: Arra
         row = 0
         for i in range(plans.shape[0]):
             durations, jerks = plans[i, leg, 0], plans[i, leg, 1]
-            p, v, a = states[i, 0, leg], states[i, 1, leg], states[i, 2, leg]
+            state = states[i, 0, leg], states[i, 1, leg], states[i, 2, leg]
             at, end = starts[i], starts[i + 1]
             for k in range(durations.shape[0] + 1):
                 # A plan that ends before the next one begins rests in its last state.
@@ -225,23 +235,21 @@ def _collect_segments(plans: Array, states: Array, starts: Array, segments: Arra
                 t = end - at if last else durations[k]
                 if t > 0.0 and at < end - 1e-12:
                     j = 0.0 if last else jerks[k]
-                    segments[leg, row, 0] = at
-                    segments[leg, row, 1], segments[leg, row, 2], segments[leg, row, 3], segments[leg, row, 4] = p, v, a, j
+                    write_segment(segments[leg, row], at, state, j)
                     row += 1
-                    p += t * (v + t * (a / 2.0 + t * j / 6.0))
-                    v += t * (a + t * j / 2.0)
-                    a += t * j
+                    state = state_after(state, j, t)
                     at += t
         longest = max(longest, row)
     return longest
 
 
 @kernel
-def _segment_extrema(p: float, v: float, a: float, j: float, t: float) -> tuple[float, float, float]:
-    """Least and greatest position, and greatest speed, over a cubic segment of duration t."""
-    end = p + t * (v + t * (a / 2.0 + t * j / 6.0))
+def _segment_extrema(state: Vector, j: float, t: float) -> Vector:
+    """Least and greatest position, and greatest speed, over a cubic segment of jerk j and duration t."""
+    p, v, a = state
+    end, rate, _ = state_after(state, j, t)
     least, greatest = min(p, end), max(p, end)
-    speed = max(abs(v), abs(v + t * (a + t * j / 2.0)))
+    speed = max(abs(v), abs(rate))
     # Positions peak where v + a s + j s^2 / 2 = 0, speeds where a + j s = 0.
     if j == 0.0:
         first = -v / a if a != 0.0 else -1.0
@@ -252,10 +260,10 @@ def _segment_extrema(p: float, v: float, a: float, j: float, t: float) -> tuple[
         first, second = (-a + root) / j, (-a - root) / j
         s = -a / j
         if 0.0 < s < t:
-            speed = max(speed, abs(v + s * (a + s * j / 2.0)))
+            speed = max(speed, abs(state_after(state, j, s)[1]))
     for s in (first, second):
         if 0.0 < s < t:
-            at = p + s * (v + s * (a / 2.0 + s * j / 6.0))
+            at = state_after(state, j, s)[0]
             least, greatest = min(least, at), max(greatest, at)
     return least, greatest, speed
 
@@ -267,15 +275,13 @@ def _stops_inside(state: Array, stroke: Array, limits: Array) -> bool:
     """
     acceleration_limit, jerk_limit = limits[0], limits[1]
     for k in range(state.shape[1]):
-        p, v, a = state[0, k], state[1, k], state[2, k]
-        stop_jerk, down, stay, up = stop_phases(v, a, acceleration_limit, jerk_limit)
-        least = greatest = at = 0.0
+        p, now = state[0, k], (0.0, state[1, k], state[2, k])
+        stop_jerk, down, stay, up = stop_phases(now[1], now[2], acceleration_limit, jerk_limit)
+        least = greatest = 0.0
         for jerk, duration in ((stop_jerk, down), (0.0, stay), (-stop_jerk, up)):
-            low, high, _ = _segment_extrema(at, v, a, jerk, duration)
+            low, high, _ = _segment_extrema(now, jerk, duration)
             least, greatest = min(least, low), max(greatest, high)
-            at += duration * (v + duration * (a / 2.0 + duration * jerk / 6.0))
-            v += duration * (a + duration * jerk / 2.0)
-            a += duration * jerk
+            now = state_after(now, jerk, duration)
         if p + least < stroke[k, 0] - _STROKE_SLACK or p + greatest > stroke[k, 1] + _STROKE_SLACK:
             return False
     return True
@@ -294,9 +300,9 @@ def _count_violations(segments: Array, horizon: float, stroke: Array, limits: Ar
                 end = min(end, segments[k, i + 1, 0])
             t = end - start
             p, v, a, j = segments[k, i, 1], segments[k, i, 2], segments[k, i, 3], segments[k, i, 4]
-            least, greatest, speed = _segment_extrema(p, v, a, j, t)
+            least, greatest, speed = _segment_extrema((p, v, a), j, t)
             acceleration = max(abs(a), abs(a + t * j))
-            # Written so that what is not a number is a violation.
+            # Written so that NaN is a violation.
             inside = (
                 least >= stroke[k, 0] - _SLACK
                 and greatest <= stroke[k, 1] + _SLACK

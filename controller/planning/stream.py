@@ -1,9 +1,9 @@
 """A streamed reference: plans that one process makes while the loop of another follows them, and why a stream has failed.
 
 The two share one record () of dtype `STREAM`, and neither ever waits for the other. A plan begins at a time in the future,
-exactly in the state that the plan before it has then. The loop takes it only if that time has not gone by and if it follows
-the plan before, and says what has become of it; so whatever is late or lost, the reference is continuous. Every plan ends at
-rest.
+exactly in the state that the previous plan has at that time. The loop takes it only if that time has not passed and the loop
+follows the previous plan; then it reports what it did. So the reference is continuous, whatever is late or lost. Every plan
+ends at rest.
 """
 
 import numpy as np
@@ -15,15 +15,15 @@ from plant.mechanism import LEGS
 from plant.pose import Array
 
 PLAN_SEGMENTS = 24
-"""Rows of a plan for each leg: ten of ruckig's, a moment at constant speed, a stop of four, and room."""
+"""Rows of a plan for each leg: ten of ruckig's, a moment at constant speed, a stop of four, and some spare."""
 
 FOLLOWED_SEGMENTS = 2 * PLAN_SEGMENTS
-"""Rows of the array that the cycle follows: what is left of the plan before, and the new one."""
+"""Rows of the array that the cycle follows: the rest of the previous plan, and the new one."""
 
-CYCLE, LATEST, SEEN, TAKEN, CAUSE, SAMPLE_NS, DONE = range(7)
-"""Places in `shared`: cycles since the motion began, the number
-of the latest plan, of the last one that the loop has looked at and of the one that it follows, why the stream has failed,
-when the last sample came [ns of CLOCK_MONOTONIC, 0 before the first], and whether the planner's process shall end."""
+CYCLE, LATEST, SEEN, TAKEN, CAUSE, SAMPLE_NS, END_PLANNER = range(7)
+"""Places in `shared`: cycles since the motion began; the numbers of the latest plan, of the last plan that the loop has seen,
+and of the plan that it follows; why the stream has failed; when the last sample came [ns of CLOCK_MONOTONIC, 0 before the
+first]; whether the planner's process must end."""
 
 STREAM = np.dtype(
     [
@@ -44,19 +44,21 @@ STREAM = np.dtype(
     ],
     align=True,
 )
-"""What planner and loop share. `shared` as above: the loop writes `CYCLE`, `SEEN` and `TAKEN`, the planner the others, and
-whoever ends it `DONE`. Plans lie in two slots by turns: which one is in it (0 while it is written), the plan that it follows,
-when it begins [s], and its segments. Then leg, value and limit of the failure; and the planner's counts: samples accepted;
-datagrams that were malformed, came late or twice, or from another sender; plans made, and those that the loop could not take
-in time.
+"""What planner and loop share. In `shared`, the loop writes `CYCLE`, `SEEN` and `TAKEN`, the planner the others, and the
+process that ends the planner `END_PLANNER`.
+
+Plans lie in two slots by turns. For each slot: in `guards` the number of its plan (0 while it is written), in `bases` the plan
+that it follows, in `begins` its begin [s], in `plans` its segments. `index`, `value` and `limit` belong to the failure: leg,
+value and limit. The planner counts samples accepted; datagrams that were malformed, came late or twice (`stale`), or came from
+another sender (`strange`); plans made, and plans that the loop could not take in time (`late`).
 """
 
-TAKER = np.dtype([("seen", np.int64), ("taken", np.int64), ("plan", np.float64, (LEGS, PLAN_SEGMENTS, 5))], align=True)
-"""The loop's own side of a stream: the last plan that it has looked at, the one that it follows, and scratch."""
+STREAM_READER = np.dtype([("seen", np.int64), ("taken", np.int64), ("plan", np.float64, (LEGS, PLAN_SEGMENTS, 5))], align=True)
+"""The loop's own side of a stream: the last plan that it has seen, the plan that it follows, and scratch."""
 
 
 def rest(lengths: Array, rows: int = FOLLOWED_SEGMENTS) -> Array:
-    """Segments (6, rows, 5) that stay at lengths (6,) [m] for ever: what a stream begins with."""
+    """Segments (6, rows, 5) that stay at lengths (6,) [m] without end: the start of a stream."""
     segments = np.zeros((LEGS, rows, 5))
     segments[:, 1:, START] = np.inf
     segments[:, 0, LENGTH] = lengths
@@ -65,13 +67,16 @@ def rest(lengths: Array, rows: int = FOLLOWED_SEGMENTS) -> Array:
 
 @kernel
 def publish_plan(stream: Record, plan: Array, begin: float, base: int) -> int:
-    """Let the loop see a plan (6, 24, 5) that begins at `begin` [s] and follows plan `base`; returns its number."""
+    """Publish a plan (6, 24, 5) to the loop. It begins at `begin` [s] and follows plan `base`. Returns its number."""
     s = stream[()]
     number = load_acquire(s.shared, LATEST) + 1
     slot = number % 2
     store_release(s.guards, slot, 0)
     fence()
-    s.plans[slot, :, :, :] = plan
+    for leg in range(LEGS):
+        for row in range(PLAN_SEGMENTS):
+            for column in range(5):
+                s.plans[slot, leg, row, column] = plan[leg, row, column]
     s.begins[slot] = begin
     s.bases[slot] = base
     store_release(s.guards, slot, number)
@@ -80,37 +85,40 @@ def publish_plan(stream: Record, plan: Array, begin: float, base: int) -> int:
 
 
 @kernel
-def take_plan(stream: Record, taker: Record, cycle: int, period: float, segments: Array, index: Array) -> bool:
-    """Take over the latest plan, if there is a new one that can still be taken, without ever waiting.
+def take_plan(stream: Record, reader: Record, cycle: int, period: float, segments: Array, index: Array) -> bool:
+    """Take over the latest plan if it is new and can still be taken; never waits.
 
     Args:
         stream: dtype `STREAM`.
-        taker: dtype `TAKER`.
-        cycle: of the motion, whose reference is evaluated next.
+        reader: dtype `STREAM_READER`.
+        cycle: of the motion; its reference is evaluated next.
         period: of a cycle [s].
-        segments: (6, n, 5), what the cycle follows; the new plan is put after what is left of the one before.
+        segments: (6, n, 5), which the cycle follows; the new plan is put after the rest of the previous one.
         index: (6,), the cycle's place in the segments.
 
     Returns:
         Whether a plan was taken.
     """
-    s, t = stream[()], taker[()]
+    s, r = stream[()], reader[()]
     store_release(s.shared, CYCLE, cycle)
     latest = load_acquire(s.shared, LATEST)
-    if latest == t.seen:
+    if latest == r.seen:
         return False
     slot = latest % 2
     if load_acquire(s.guards, slot) != latest:
         return False
     begin, base = s.begins[slot], s.bases[slot]
-    t.plan[:, :, :] = s.plans[slot]
+    for leg in range(LEGS):
+        for row in range(PLAN_SEGMENTS):
+            for column in range(5):
+                r.plan[leg, row, column] = s.plans[slot, leg, row, column]
     fence()
     if load_acquire(s.guards, slot) != latest:
         return False
-    t.seen = latest
-    taken = base == t.taken and begin >= cycle * period and _append(t.plan, begin, segments, index)
+    r.seen = latest
+    taken = base == r.taken and begin >= cycle * period and _append(r.plan, begin, segments, index)
     if taken:
-        t.taken = latest
+        r.taken = latest
         store_release(s.shared, TAKEN, latest)
     store_release(s.shared, SEEN, latest)
     return taken
@@ -118,7 +126,7 @@ def take_plan(stream: Record, taker: Record, cycle: int, period: float, segments
 
 @kernel
 def _append(plan: Array, begin: float, segments: Array, index: Array) -> bool:
-    """Put a plan in the place of what the segments have after its begin; false, and nothing done, if there is no room."""
+    """Replace the segments after the begin of a plan by the plan; False, and nothing changed, if there is no room."""
     rows = segments.shape[1]
     for leg in range(LEGS):
         if _kept(segments[leg], begin, index[leg]) + _used(plan[leg]) > rows:
@@ -139,7 +147,7 @@ def _append(plan: Array, begin: float, segments: Array, index: Array) -> bool:
 
 @kernel
 def _kept(rows: Array, begin: float, first: int) -> int:
-    """How many rows (n, 5) from the present one on start before a time."""
+    """The number of rows (n, 5), from the present one on, that start before a time."""
     last = first
     while last < rows.shape[0] and rows[last, START] < begin:
         last += 1
@@ -156,7 +164,7 @@ def _used(rows: Array) -> int:
 
 @kernel
 def fail_stream(stream: Record, cause: int, index: int, value: float, limit: float) -> None:
-    """Say why the stream has failed, a cause of `controller.safety.watch`; the first one counts."""
+    """Report why the stream has failed, a cause of `controller.safety.watch`; the first report counts."""
     s = stream[()]
     if load_acquire(s.shared, CAUSE) == Cause.NONE:
         s.index, s.value, s.limit = index, value, limit
@@ -165,15 +173,15 @@ def fail_stream(stream: Record, cause: int, index: int, value: float, limit: flo
 
 @kernel
 def note_sample(stream: Record, time_ns: int) -> None:
-    """Say when the last sample came [ns of CLOCK_MONOTONIC]."""
+    """Report when the last sample came [ns of CLOCK_MONOTONIC]."""
     store_release(stream[()].shared, SAMPLE_NS, time_ns)
 
 
 @kernel
 def stream_cause(stream: Record, now_ns: int, patience_ns: int) -> tuple[int, int, float, float]:
-    """Why the stream has failed: cause, leg, value and limit; `NO_CAUSE` as long as it has not.
+    """Why the stream has failed: cause, leg, value and limit; `NO_CAUSE` if it has not.
 
-    It is lost when no sample has come for longer than the patience; before the first it cannot be.
+    The stream is lost when no sample has come for longer than the patience. It cannot be lost before the first sample.
     """
     s = stream[()]
     cause = load_acquire(s.shared, CAUSE)

@@ -1,9 +1,9 @@
 """The planner of a streamed target: from each sample a plan of cubic segments, within all limits, that ends at rest.
 
-The target's motion is fitted to its last samples and followed with ruckig: from the state of the plan before to where the
-target will be a moment later, with its velocity there; then a moment at that velocity, and a stop. A plan counts only if all
-of it stays inside the limits and the stroke; else a gentler one is tried, and at last the plan before goes on, which ends at
-rest itself. So whatever the samples are, and whenever they end, no limit is left.
+The target's motion is fitted to its last samples. ruckig plans from the state of the previous plan to where the target will be
+a moment later, with the target's velocity there; a moment at that velocity follows, and a stop. A plan is accepted only if all
+of it stays inside the limits and the stroke. Otherwise the planner tries a gentler plan. If none is accepted, the previous plan
+goes on, which also ends at rest. So no limit is left, whatever the samples are and whenever they end.
 """
 
 from collections import deque
@@ -11,11 +11,20 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from ruckig import ControlInterface, InputParameter, Result, Ruckig, RuckigError, Trajectory
+from ruckig import ControlInterface, Ruckig, Trajectory
 
 from controller.inverse_kinematics import leg_lengths
-from controller.planning.planner import PREVIEW_S, count_violations
-from controller.planning.segments import ACCELERATION, JERK, LENGTH, RATE, START, STOP_SEGMENTS, evaluate_reference, plan_stop
+from controller.planning.planner import PREVIEW_S, calculate, count_violations, phases_of, ruckig_input
+from controller.planning.segments import (
+    JERK,
+    LENGTH,
+    START,
+    STOP_SEGMENTS,
+    evaluate_reference,
+    plan_stop,
+    state_after,
+    write_segment,
+)
 from controller.planning.stream import PLAN_SEGMENTS, rest
 from controller.safety.causes import Cause
 from plant.compiled import kernel
@@ -24,22 +33,22 @@ from plant.mechanism import LEGS, Mechanism
 from plant.pose import UNIT_TOLERANCE, Array, rotation_from_quaternion
 
 _WINDOW_S, _LEAST_SAMPLES, _MOST_SAMPLES = 0.08, 5, 64
-"""The target's motion is fitted to the samples of so long, but to so many at least and at most."""
+"""The target's motion is fitted to the samples of the first number [s], but to at least and at most so many samples."""
 
 _CURVED_S = 0.05
-"""For how long after its last sample the target's motion is thought to be accelerated as before; then it is uniform."""
+"""Time after the last sample for which the target is taken to accelerate as before; then its motion is taken as uniform."""
 
 _PREVIEWS_S = (PREVIEW_S, 0.045, 0.06, 0.08, 0.1, 0.15, 0.25)
-"""How long a plan may take to meet the target; the first that the limits allow is chosen."""
+"""Times in which a plan may meet the target; the first that the limits allow is chosen."""
 
 _TIMELY = 1.2
-"""A plan that takes this many times as long as it should would swing away from the target to gain speed."""
+"""A plan that takes this many times its intended time would swing away from the target to gain speed."""
 
 _COAST_S = 0.02
-"""How long a plan goes on with the target's velocity after it has met it, if the stroke allows."""
+"""Time for which a plan keeps the target's velocity after it has met the target, if the stroke allows."""
 
 _JUMP_FACTOR, _JUMP_M = 1.5, 1e-3
-"""A leg may go this many times as far as its velocity limit allows between samples, and this much further."""
+"""Between samples, a leg may go this many times as far as its velocity limit allows, and this much further."""
 
 _STILL_M = 1e-9
 """A target that moves no leg by more than this stands still."""
@@ -49,9 +58,7 @@ _STROKE_SLACK_M = 1e-9
 
 
 class TargetRefusedError(GoughError, ValueError):
-    """A sample is not one that can be followed; cause (of `controller.safety.watch`), leg, value and limit are its
-    attributes.
-    """
+    """A sample cannot be followed. Attributes: cause (of `controller.safety.watch`), leg, value and limit."""
 
     def __init__(self, cause: int, index: int = 0, value: float = np.nan, limit: float = np.nan) -> None:
         super().__init__(f"{Cause(cause).describe(index, value, limit)}: correct what sends the target")
@@ -60,12 +67,12 @@ class TargetRefusedError(GoughError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A plan that has been made.
+    """A plan.
 
     Attributes:
-        begin: motion time at which it follows on the plan before [s].
+        begin: motion time at which it takes over from the previous plan [s].
         segments: (6, 24, 5), as `controller.planning.segments` has them, in motion time.
-        goal: (6,) [m], the lengths at which it ends, if the target stands still there.
+        goal: (6,) [m], the lengths at which it ends if the target stands still there; else None.
     """
 
     begin: float
@@ -78,10 +85,10 @@ class StreamPlanner:
 
     Args:
         mechanism: with home and limits.
-        lengths: (6,) [m], where the legs rest when the motion begins.
+        lengths: (6,) [m], at which the legs rest when the motion begins.
 
     Raises:
-        UnreachableError: it begins outside the stroke.
+        UnreachableError: the motion begins outside the stroke.
         InputError: the mechanism has no home or no limits.
     """
 
@@ -92,12 +99,8 @@ class StreamPlanner:
         self._samples: deque[tuple[float, Array]] = deque(maxlen=_MOST_SAMPLES)
         self._otg = Ruckig(LEGS)
         self._trajectory = Trajectory(LEGS)
-        self._follow = InputParameter(LEGS)
-        self._follow.control_interface = ControlInterface.Position
-        self._follow.max_velocity = [self._limits.velocity] * LEGS
-        self._follow.max_acceleration = [self._limits.acceleration] * LEGS
-        self._follow.max_jerk = [self._limits.jerk] * LEGS
-        # Loads the machine code, which would take longer than there is between samples.
+        self._follow = ruckig_input(self._limits, ControlInterface.Position, None)
+        # Loads the machine code now: between samples there is not enough time.
         state = np.empty((LEGS, 3))
         evaluate_reference(self._now.segments, 0.0, np.zeros(LEGS, np.int64), state)
         self._plan_towards(0.0, state, lengths, None, PREVIEW_S)
@@ -109,16 +112,16 @@ class StreamPlanner:
         return self._now
 
     def add(self, time_s: float, displacement: ArrayLike, quaternion: ArrayLike) -> None:
-        """Take note of a sample.
+        """Add a sample.
 
         Args:
-            time_s: of the sample on the sender's clock [s].
+            time_s: of the sample, on the sender's clock [s].
             displacement: (3,) [m] from home.
             quaternion: (4,), unit, w first; the turn from home.
 
         Raises:
-            TargetRefusedError: it is not finite, off unit, out of reach or jumps.
-            InputError: its time does not come after the last one's.
+            TargetRefusedError: the sample is not finite, off unit length, out of reach, or a jump.
+            InputError: its time does not come after that of the last sample.
         """
         position, turn = np.asarray(displacement, float), np.asarray(quaternion, float)
         if not (np.isfinite(position).all() and np.isfinite(turn).all()):
@@ -136,7 +139,7 @@ class StreamPlanner:
         if self._samples:
             before, was = self._samples[-1]
             if not time_s > before:
-                raise InputError(f"a sample of {time_s:g} s does not come after {before:g} s: send them in their order")
+                raise InputError(f"a sample of {time_s:g} s does not come after {before:g} s: send samples in their order")
             step = np.abs(lengths - was)
             most = _JUMP_FACTOR * self._limits.velocity * (time_s - before) + _JUMP_M
             if step.max() > most:
@@ -144,21 +147,21 @@ class StreamPlanner:
         self._samples.append((time_s, np.clip(lengths, stroke[:, 0], stroke[:, 1])))
 
     def plan(self, at_s: float, ahead_s: float) -> Plan | None:
-        """Plan how to follow the target; the plan is of no consequence until `follow` says that it is followed.
+        """Plan how to follow the target. The plan takes effect only after `follow(plan)`.
 
         Args:
-            at_s: motion time at which the plan begins [s], no earlier than the current one.
-            ahead_s: by how much that is later than the newest sample [s].
+            at_s: motion time at which the plan begins [s], no earlier than the current plan.
+            ahead_s: time from the newest sample to that begin [s].
 
         Returns:
-            The plan; None if the current one shall go on.
+            The plan; None if the current plan goes on.
 
         Raises:
-            InputError: it is to begin before the current one, or there is no sample.
+            InputError: the plan would begin before the current one, or there is no sample.
         """
         if not at_s >= self._now.begin:
             raise InputError(
-                f"a plan from {at_s:g} s on would precede the current one of {self._now.begin:g} s: plan for later"
+                f"a plan from {at_s:g} s on would begin before the current plan, at {self._now.begin:g} s: plan for later"
             )
         if not self._samples:
             raise InputError("there is no sample to plan for: add one first")
@@ -179,7 +182,7 @@ class StreamPlanner:
         return self._plan_towards(at_s, state, aim, None, PREVIEW_S)
 
     def follow(self, plan: Plan) -> None:
-        """Say that a plan is followed from its begin on, so that the next one comes after it."""
+        """Follow a plan from its begin on; the next plan comes after it."""
         self._now = plan
 
     def _fit(self) -> Array:
@@ -201,30 +204,24 @@ class StreamPlanner:
         rates = np.clip(motion[1] + 2.0 * curved * motion[2], -limits.velocity, limits.velocity)
         aim = motion[0] + curved * (motion[1] + curved * motion[2]) + (ahead + preview - curved) * rates
         aim = np.clip(aim, limits.stroke[:, 0], limits.stroke[:, 1])
-        # What a leg must still be able to stop in.
+        # The way that a leg has left to stop in.
         room = np.where(rates > 0.0, limits.stroke[:, 1] - aim, aim - limits.stroke[:, 0])
         most = _stoppable(room, limits.acceleration, limits.jerk)
         return aim, np.clip(rates, -most, most)
 
     def _plan_towards(self, begin: float, state: Array, aim: Array, rates: Array | None, preview: float) -> Plan | None:
-        """A plan from a state (6, 3) to the aim, to be there after `preview` [s] with these rates, or to rest; None if the
-        limits, the stroke or ruckig do not allow it.
+        """A plan from a state (6, 3) to the aim, to arrive after `preview` [s] with these rates, or at rest; None if limits,
+        stroke or ruckig do not allow it.
         """
         follow, limits = self._follow, self._limits
         follow.minimum_duration = preview
-        follow.current_position, follow.current_velocity, follow.current_acceleration = state.T.tolist()
         follow.target_position = aim.tolist()
         follow.target_velocity = [0.0] * LEGS if rates is None else rates.tolist()
-        try:
-            if self._otg.calculate(follow, self._trajectory) not in (Result.Working, Result.Finished):
-                return None
-        except (RuckigError, ValueError):
-            # ValueError: a result code of ruckig that its own binding does not know.
+        if not calculate(self._otg, follow, state.T.tolist(), self._trajectory):
             return None
         if rates is not None and self._trajectory.duration > _TIMELY * preview:
             return None
-        phases = np.array([(*each.brake.t, *each.t, *each.brake.j, *each.j) for each in self._trajectory.profiles[0]])
-        segments = np.empty((LEGS, PLAN_SEGMENTS, 5))
+        phases, segments = phases_of(self._trajectory), np.empty((LEGS, PLAN_SEGMENTS, 5))
         most = np.array([limits.acceleration, limits.jerk])
         for coast in (0.0,) if rates is None else (_COAST_S, 0.0):
             end = _write_plan(phases, begin, self._trajectory.duration, coast, state, most, segments)
@@ -246,12 +243,12 @@ def _stoppable(room: Array, acceleration: float, jerk: float) -> Array:
 def _write_plan(
     phases: Array, begin: float, duration: float, coast: float, state: Array, limits: Array, segments: Array
 ) -> float:
-    """Write the segments (6, n, 5) of phases (6, 18), durations and jerks, from a state (6, 3), a coast, and a stop; returns
-    from when on all legs rest [s].
+    """Write the segments (6, n, 5) of phases (6, 2, 9), durations and jerks, from a state (6, 3), then a coast and a stop.
+    Returns the time at which all legs are at rest [s].
 
-    Durations are those between the starts as they are rounded, so that each row ends exactly where the next one begins.
+    Durations count between the rounded starts, so that each row ends exactly where the next one begins.
     """
-    count = phases.shape[1] // 2
+    count = phases.shape[2]
     rows = np.zeros(LEGS, np.int64)
     ends = state.copy()
     stops = np.empty((LEGS, STOP_SEGMENTS, 5))
@@ -259,38 +256,26 @@ def _write_plan(
     segments[:, :, START] = np.inf
     arrived = begin + duration
     for leg in range(LEGS):
-        p, v, a = state[leg, 0], state[leg, 1], state[leg, 2]
-        at = begin
+        now, at = (state[leg, 0], state[leg, 1], state[leg, 2]), begin
         for k in range(count + 2):
-            # What ruckig's phases leave of its duration, and the coast, have no jerk.
-            j = phases[leg, count + k] if k < count else 0.0
-            after = min(at + phases[leg, k], arrived) if k < count else arrived if k == count else arrived + coast
-            t = after - at
-            if t > 0.0:
-                segment = segments[leg, rows[leg]]
-                segment[START], segment[LENGTH], segment[RATE], segment[ACCELERATION], segment[JERK] = at, p, v, a, j
+            # The rest of ruckig's duration after its phases, and the coast, have no jerk.
+            j = phases[leg, 1, k] if k < count else 0.0
+            after = min(at + phases[leg, 0, k], arrived) if k < count else arrived if k == count else arrived + coast
+            if after > at:
+                write_segment(segments[leg, rows[leg]], at, now, j)
                 rows[leg] += 1
-                p += t * (v + t * (a / 2.0 + t * j / 6.0))
-                v += t * (a + t * j / 2.0)
-                a += t * j
-                at = after
-        ends[leg, 0], ends[leg, 1], ends[leg, 2] = p, v, a
+                now, at = state_after(now, j, after - at), after
+        ends[leg, 0], ends[leg, 1], ends[leg, 2] = now
     plan_stop(ends, limits[0], limits[1], stops)
     end = begin
     for leg in range(LEGS):
-        at = arrived + coast
-        p, v, a = ends[leg, 0], ends[leg, 1], ends[leg, 2]
+        now, at = (ends[leg, 0], ends[leg, 1], ends[leg, 2]), arrived + coast
         for k in range(STOP_SEGMENTS - 1):
             after = at + (stops[leg, k + 1, START] - stops[leg, k, START])
-            t = after - at
-            if t > 0.0:
-                segment, j = segments[leg, rows[leg]], stops[leg, k, JERK]
-                segment[START], segment[LENGTH], segment[RATE], segment[ACCELERATION], segment[JERK] = at, p, v, a, j
+            if after > at:
+                write_segment(segments[leg, rows[leg]], at, now, stops[leg, k, JERK])
                 rows[leg] += 1
-                p += t * (v + t * (a / 2.0 + t * j / 6.0))
-                v += t * (a + t * j / 2.0)
-                a += t * j
-                at = after
-        segments[leg, rows[leg], START], segments[leg, rows[leg], LENGTH] = at, p
+                now, at = state_after(now, stops[leg, k, JERK], after - at), after
+        segments[leg, rows[leg], START], segments[leg, rows[leg], LENGTH] = at, now[0]
         end = max(end, at)
     return end

@@ -15,7 +15,7 @@ from numba.core import event
 from numpy.typing import NDArray
 
 from controller.cycle import END, HEADING, LEGS, PLATFORM, SCREENING, run_stages
-from controller.planning.stream import STREAM, TAKER
+from controller.planning.stream import STREAM, STREAM_READER
 from controller.safety.causes import Cause, Mode
 from hil.loop.kernels import (
     begin_cycle,
@@ -94,7 +94,7 @@ class Loop:
     failure: str = ""
 
     def __post_init__(self) -> None:
-        self._taker: Record = np.zeros((), TAKER)
+        self._reader: Record = np.zeros((), STREAM_READER)
         self._work: Record = np.zeros((), WORK)
         self._work["feedback"], self._work["sequence"] = new_feedback(), -1
 
@@ -151,7 +151,7 @@ class Loop:
     def _streamed(self) -> TargetStream:
         active = self.stream is not None
         stream = self.stream if active else np.zeros((), STREAM)
-        return TargetStream(int(active), round(1e9 * STREAM_PATIENCE_S), stream, self._taker)
+        return TargetStream(int(active), round(1e9 * STREAM_PATIENCE_S), stream, self._reader)
 
     def _run(self, last: int, end: int) -> int:
         return run_loop(*self._arguments(last, end))

@@ -263,7 +263,7 @@ def record_cycle(
         record.covariance[:] = np.nan
     if streamed.active != 0 and s.safety.stop.cause == Cause.NONE:
         cycle = motion_cycle(p.rig, s.time, s.safety)
-        take_plan(streamed.stream, streamed.taker, cycle, p.rig.period, segments, s.reference.index)
+        take_plan(streamed.stream, streamed.reader, cycle, p.rig.period, segments, s.reference.index)
     prepare_next(parameters, state, segments)
     w.stage_ns[Stage.RECORD] = now(c.timespec) - began
 

@@ -158,13 +158,13 @@ class TargetStream(NamedTuple):
     Attributes:
         active: whether there is one.
         patience_ns: how long it may be silent.
-        stream, taker: dtypes `controller.planning.stream.STREAM` and `TAKER`.
+        stream, reader: dtypes `controller.planning.stream.STREAM` and `STREAM_READER`.
     """
 
     active: int
     patience_ns: int
     stream: Record
-    taker: Record
+    reader: Record
 
 
 WORK = np.dtype(

@@ -6,6 +6,7 @@ import numpy as np
 
 from hil.recording.mcap import read
 from plant.errors import InputError
+from plant.files import read_csv
 from plant.pose import Array
 
 COLUMNS = ("time_s", "wx", "wy", "wz", "ax", "ay", "az")
@@ -50,31 +51,14 @@ def read_field(path: Path, number: int) -> tuple[Array, Array | None]:
 
 def _read_table(path: Path, *headers: tuple[str, ...]) -> Array:
     """The numbers of a CSV file with one of these headers."""
-    try:
-        with path.open(encoding="utf-8-sig") as file:
-            columns = tuple(name.strip() for name in file.readline().split(","))
-            if columns not in headers:
-                wanted = " or ".join(",".join(header) for header in headers)
-                raise InputError(f"{path}, line 1: the header must be {wanted} (rad/s, m/s2, uT)")
-            table = np.loadtxt(file, delimiter=",", ndmin=2)
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from None
-    except (UnicodeDecodeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path} is no table of numbers: {error}") from None
-    if table.shape[1:] != (len(columns),) or len(table) < 2:
-        raise InputError(
-            f"{path} has {len(table)} rows of {table.shape[-1]} numbers; it needs {len(columns)} in each of two or more"
-        )
-    if not np.isfinite(table).all():
-        row, column = (int(i) for i in np.argwhere(~np.isfinite(table))[0])
-        raise InputError(f"{path}, line {row + 2}: {columns[column]} is {table[row, column]}; it must be finite")
+    _, table, lines = read_csv(path, *headers, note=" (rad/s, m/s2, uT)")
+    if len(table) < 2:
+        raise InputError(f"{path} has {len(table)} rows of numbers; it needs two or more")
     steps = np.diff(table[:, 0])
     usual = float(np.median(steps))
     uneven = np.flatnonzero(np.abs(steps - usual) > _MOST_JITTER * usual)
     if usual <= 0.0 or len(uneven):
-        line = int(uneven[0]) + 3 if len(uneven) else 2
+        line = lines[int(uneven[0]) + 1] if len(uneven) else lines[0]
         raise InputError(
             f"{path}, line {line}: the samples must be evenly spaced, {usual:g} s as most are: fill the gap or cut there"
         )

@@ -27,8 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.inverse_kinematics import leg_lengths
-from controller.planning.stream import DONE as STREAM_DONE
-from controller.planning.stream import STREAM
+from controller.planning.stream import END_PLANNER, STREAM
 from controller.planning.stream_planner import StreamPlanner
 from controller.safety.arming import describe_obstacle
 from controller.safety.causes import Cause, Reaction
@@ -178,7 +177,7 @@ def _receiver(config: SimulationConfig) -> Iterator[Record]:
         try:
             yield stream
         finally:
-            stream["shared"][STREAM_DONE] = 1
+            stream["shared"][END_PLANNER] = 1
             join_or_kill(process)
 
 

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from controller.planning.stream import CAUSE, CYCLE, DONE, SEEN, STREAM, TAKEN, fail_stream, note_sample, publish_plan
+from controller.planning.stream import CAUSE, CYCLE, END_PLANNER, SEEN, STREAM, TAKEN, fail_stream, note_sample, publish_plan
 from controller.planning.stream_planner import Plan, StreamPlanner, TargetRefusedError
 from controller.planning.target import Target
 from controller.safety.causes import Cause
@@ -113,7 +113,7 @@ def receive(
     lead: float = LEAD_S,
     ended: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Receive a stream and plan, until `DONE` is set or the parent process has ended; the body of a process.
+    """Receive a stream and plan, until `END_PLANNER` is set or the parent process has ended; the body of a process.
 
     A sample that cannot be followed fails the stream for good: planning ends, and the last plan ends at rest.
 
@@ -128,7 +128,7 @@ def receive(
     parent = os.getppid()
     _load_kernels()
     reception = Reception(stream, planner, period, lead)
-    while not (stream["shared"][DONE] or ended() or os.getppid() != parent):
+    while not (stream["shared"][END_PLANNER] or ended() or os.getppid() != parent):
         select.select([receiver], [], [], _SETTLE_S if reception.waits else _POLL_S)
         for _ in range(_BATCH):
             try:

@@ -5,7 +5,6 @@ names of the columns, and every other row a sample of all leg angles: raw, by a 
 """
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -16,8 +15,10 @@ from numpy.typing import NDArray
 
 from controller.direct_kinematics.planar import AssemblyMode, closing_angles, closing_positions, solve_planar, wrapped
 from plant.errors import InputError, SingularConfigurationError
+from plant.files import read_csv
 from plant.mechanism.planar import PLANAR_LEGS, PlanarMechanism
 from plant.pose import Array
+from plant.toml import read_text
 
 SOURCES = ("raw", "kalman", "complementary")
 COLUMNS = tuple(f"leg{leg}_{source}_deg" for source in SOURCES for leg in range(1, PLANAR_LEGS + 1))
@@ -144,41 +145,22 @@ def _distances(mechanism: PlanarMechanism, true_pose: Array, positions: Array, a
 
 def _read_csv(path: Path) -> tuple[Array, Array]:
     """The true pose (3,) [m, m, rad] and the leg angles (3, N, 3) [rad], by source, sample and leg."""
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read {path}: {error}") from None
-    first, header, *samples = (line.strip() for line in [*lines, "", ""])
+    first = read_text(path).removeprefix("\ufeff").partition("\n")[0].strip()
     match = _FIRST_LINE.fullmatch(first)
-    true_pose = _numbers(match.groups() if match else (), 3)
-    if true_pose is None:
+    try:
+        true_pose = [float(number) for number in match.groups()] if match else [np.nan]
+    except ValueError:
+        true_pose = [np.nan]
+    if not np.isfinite(true_pose).all():
         raise InputError(
             f"{path}, line 1: {first!r} gives no true pose in finite numbers: write "
             "'# true pose by image processing: x 107 mm, y 192 mm, gamma 0 deg'"
         )
-    if header != ",".join(COLUMNS):
-        raise InputError(f"{path}, line 2: the header must be {','.join(COLUMNS)}")
-    rows = []
-    for number, line in enumerate(samples, start=3):
-        if not line:
-            continue
-        row = _numbers(line.split(","), len(COLUMNS))
-        if row is None:
-            raise InputError(f"{path}, line {number}: {line!r} is not a row of {len(COLUMNS)} finite numbers")
-        rows.append(row)
-    if not rows:
+    rows = read_csv(path, COLUMNS, skipped=1).rows
+    if not len(rows):
         raise InputError(f"{path} ends without a sample: it needs at least 1")
     by_source = np.radians(rows).reshape(-1, len(SOURCES), PLANAR_LEGS).swapaxes(0, 1)
     return np.array(true_pose) / [scale for _, _, scale in COMPONENTS], by_source
-
-
-def _numbers(fields: Sequence[str], count: int) -> list[float] | None:
-    """The fields as `count` finite numbers, or None."""
-    try:
-        numbers = [float(field) for field in fields]
-    except ValueError:
-        return None
-    return numbers if len(numbers) == count and np.isfinite(numbers).all() else None
 
 
 def _rms(values: Array, axes: int | tuple[int, ...]) -> Array:

@@ -122,8 +122,11 @@ def test_the_command_writes_a_calibration_that_undoes_the_errors(tmp_path, capsy
     ("text", "complaint"),
     [
         ("t,x\n1,2\n", "the header must be time_s,wx,wy,wz,ax,ay,az"),
-        (",".join(COLUMNS) + "\n0,0,0,0,0,0,a\n", "is no table of numbers"),
-        (",".join(COLUMNS) + "\n0,0,0,0,0,0,nan\n0.1,0,0,0,0,0,1\n", "line 2: az is nan; it must be finite"),
+        (",".join(COLUMNS) + "\n0,0,0,0,0,0,a\n", "line 2: '0,0,0,0,0,0,a' is not a row of 7 finite numbers"),
+        (
+            ",".join(COLUMNS) + "\n0,0,0,0,0,0,nan\n0.1,0,0,0,0,0,1\n",
+            "line 2: '0,0,0,0,0,0,nan' is not a row of 7 finite numbers: az is nan",
+        ),
         (
             ",".join(COLUMNS) + "\n0,0,0,0,0,0,1\n0.1,0,0,0,0,0,1\n0.2,0,0,0,0,0,1\n0.9,0,0,0,0,0,1\n",
             "line 5: the samples must be evenly spaced",

@@ -12,13 +12,13 @@ from controller.inverse_kinematics import leg_lengths
 from controller.planning.planner import count_violations
 from controller.planning.segments import LENGTH, START, evaluate_reference
 from controller.planning.stream import (
-    DONE,
+    END_PLANNER,
     LATEST,
     PLAN_SEGMENTS,
     SEEN,
     STREAM,
+    STREAM_READER,
     TAKEN,
-    TAKER,
     fail_stream,
     note_sample,
     publish_plan,
@@ -52,7 +52,7 @@ class Follower:
     def __init__(self, mechanism, lengths=None):
         lengths = home_lengths(mechanism) if lengths is None else lengths
         self.planner = StreamPlanner(mechanism, lengths)
-        self.stream, self.taker = new_stream(), np.zeros((), TAKER)
+        self.stream, self.reader = new_stream(), np.zeros((), STREAM_READER)
         self.segments, self.index = rest(lengths), np.zeros(6, np.int64)
         self.cycle, self.taken, self.refused = 0, 0, 0
         self.pieces = []
@@ -68,10 +68,10 @@ class Follower:
         plan = self.planner.plan(at * PERIOD, ahead)
         if plan is None:
             return
-        number = publish_plan(self.stream, plan.segments, plan.begin, self.taker["taken"])
+        number = publish_plan(self.stream, plan.segments, plan.begin, self.reader["taken"])
         if late > 0:
             self.run(at + late)
-        take_plan(self.stream, self.taker, self.cycle, PERIOD, self.segments, self.index)
+        take_plan(self.stream, self.reader, self.cycle, PERIOD, self.segments, self.index)
         assert self.stream["shared"][SEEN] == number
         if self.stream["shared"][TAKEN] == number:
             self.taken += 1
@@ -273,44 +273,44 @@ def moved(value, begin=0.0, rows=PLAN_SEGMENTS):
     return plan
 
 
-def looked(stream, taker, segments, index, cycle=0):
-    return take_plan(stream, taker, cycle, PERIOD, segments, index)
+def looked(stream, reader, segments, index, cycle=0):
+    return take_plan(stream, reader, cycle, PERIOD, segments, index)
 
 
 def test_a_plan_is_taken_once_and_only_in_time_and_after_the_one_before():
-    stream, taker = new_stream(), np.zeros((), TAKER)
+    stream, reader = new_stream(), np.zeros((), STREAM_READER)
     segments, index = rest(np.full(6, 7.0)), np.zeros(6, np.int64)
-    assert not looked(stream, taker, segments, index)
+    assert not looked(stream, reader, segments, index)
     assert publish_plan(stream, moved(1.0, 0.005), 0.005, 0) == 1
-    assert looked(stream, taker, segments, index, 5)
-    assert not looked(stream, taker, segments, index, 5)
+    assert looked(stream, reader, segments, index, 5)
+    assert not looked(stream, reader, segments, index, 5)
     assert segments[0, 0, LENGTH] == 7.0 and segments[0, 1, LENGTH] == 1.0
     # Too late; then one that follows it; then one that follows the plan that was taken.
     publish_plan(stream, moved(2.0, 0.009), 0.009, 1)
-    assert not looked(stream, taker, segments, index, 10)
+    assert not looked(stream, reader, segments, index, 10)
     publish_plan(stream, moved(3.0, 0.02), 0.02, 2)
-    assert not looked(stream, taker, segments, index, 11)
+    assert not looked(stream, reader, segments, index, 11)
     index[:] = PLAN_SEGMENTS
     publish_plan(stream, moved(4.0, 0.02), 0.02, 1)
-    assert looked(stream, taker, segments, index, 12)
+    assert looked(stream, reader, segments, index, 12)
     assert list(stream["shared"][[LATEST, SEEN, TAKEN]]) == [4, 4, 4]
     assert segments[0, 0, LENGTH] == 1.0 and segments[0, 1, LENGTH] == 4.0
     assert (index == 0).all()
 
 
 def test_a_plan_that_has_no_room_is_left():
-    stream, taker = new_stream(), np.zeros((), TAKER)
+    stream, reader = new_stream(), np.zeros((), STREAM_READER)
     segments, index = rest(np.full(6, 7.0), PLAN_SEGMENTS), np.zeros(6, np.int64)
     publish_plan(stream, moved(1.0, 0.005), 0.005, 0)
     before = segments.copy()
-    assert not looked(stream, taker, segments, index)
+    assert not looked(stream, reader, segments, index)
     np.testing.assert_array_equal(segments, before)
     assert stream["shared"][SEEN] == 1 and stream["shared"][TAKEN] == 0
 
 
 def hammer(stream):
     value = 0
-    while not stream["shared"][DONE]:
+    while not stream["shared"][END_PLANNER]:
         value += 1
         # The base is always what the loop has taken, so that each may be.
         publish_plan(stream, moved(value), 1e9, int(stream["shared"][TAKEN]))
@@ -318,40 +318,40 @@ def hammer(stream):
 
 def test_no_plan_is_ever_torn():
     """However long it takes: the writer goes on until the reader has seen enough plans."""
-    stream, taker = new_stream(), np.zeros((), TAKER)
+    stream, reader = new_stream(), np.zeros((), STREAM_READER)
     segments, index = rest(np.full(6, 7.0)), np.zeros(6, np.int64)
     publish_plan(stream, moved(0.0), 1e9, 0)
-    looked(stream, taker, segments, index)
+    looked(stream, reader, segments, index)
     writer = multiprocessing.get_context("fork").Process(target=hammer, args=(stream,))
     writer.start()
     seen, last, until = 0, 0.0, time.monotonic() + 120.0
     try:
         while seen < 2000:
-            before = int(taker["seen"])
-            looked(stream, taker, segments, index)
-            if taker["seen"] == before:
+            before = int(reader["seen"])
+            looked(stream, reader, segments, index)
+            if reader["seen"] == before:
                 assert time.monotonic() < until
                 continue
             seen += 1
-            values = taker["plan"][:, :, 1:]
+            values = reader["plan"][:, :, 1:]
             assert (values == values[0, 0, 0]).all()
             assert values[0, 0, 0] > last
             last = values[0, 0, 0]
     finally:
-        stream["shared"][DONE] = 1
+        stream["shared"][END_PLANNER] = 1
         writer.join()
     assert writer.exitcode == 0
 
 
 def test_a_plan_that_is_being_written_is_left():
-    stream, taker = new_stream(), np.zeros((), TAKER)
+    stream, reader = new_stream(), np.zeros((), STREAM_READER)
     segments, index = rest(np.full(6, 7.0)), np.zeros(6, np.int64)
     number = publish_plan(stream, moved(1.0, 0.005), 0.005, 0)
     stream["guards"][number % 2] = 0
-    assert not looked(stream, taker, segments, index)
-    assert taker["seen"] == 0
+    assert not looked(stream, reader, segments, index)
+    assert reader["seen"] == 0
     stream["guards"][number % 2] = number
-    assert looked(stream, taker, segments, index)
+    assert looked(stream, reader, segments, index)
 
 
 def test_a_stream_is_lost_when_no_sample_comes_for_longer_than_the_patience():

@@ -12,7 +12,7 @@ import pytest
 
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.segments import evaluate_reference
-from controller.planning.stream import CAUSE, DONE, STREAM, TAKEN, TAKER, rest, stream_cause, take_plan
+from controller.planning.stream import CAUSE, END_PLANNER, STREAM, STREAM_READER, TAKEN, rest, stream_cause, take_plan
 from controller.planning.stream_planner import StreamPlanner
 from controller.planning.target import load_target
 from controller.safety.causes import Cause
@@ -60,7 +60,7 @@ def receiving(mechanism, period=PERIOD):
         try:
             yield stream, port
         finally:
-            stream["shared"][DONE] = 1
+            stream["shared"][END_PLANNER] = 1
             process.join(5.0)
             ended = process.exitcode
             process.kill()
@@ -69,14 +69,14 @@ def receiving(mechanism, period=PERIOD):
 
 def follow(stream, lengths, duration):
     """A loop at 1 kHz that follows a stream: times [ns], references (n, 6, 3), and the cause of each cycle."""
-    taker, segments, index = np.zeros((), TAKER), rest(lengths), np.zeros(6, np.int64)
+    reader, segments, index = np.zeros((), STREAM_READER), rest(lengths), np.zeros(6, np.int64)
     reference = np.zeros((6, 3))
     times, references, causes = [], [], []
     began = time.monotonic_ns()
     for cycle in range(round(duration / PERIOD)):
         due = began + round(1e9 * PERIOD * cycle)
         time.sleep(max(0.0, 1e-9 * (due - time.monotonic_ns())))
-        take_plan(stream, taker, cycle, PERIOD, segments, index)
+        take_plan(stream, reader, cycle, PERIOD, segments, index)
         evaluate_reference(segments, cycle * PERIOD, index, reference)
         times.append(due)
         references.append(reference.copy())

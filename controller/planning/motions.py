@@ -1,0 +1,168 @@
+"""The built-in motions: displacements from home over time by name, and motions fitted to the limits of a mechanism."""
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from controller.inverse_kinematics import leg_lengths, sample_workspace
+from plant.errors import InputError
+from plant.mechanism import Mechanism
+from plant.pose import Array, rotation_from_vector, vector_from_rotation
+
+SAMPLE_PERIOD_S = 0.01
+MARGIN_S = 0.1
+"""Time for which a motion goes on beyond its duration, so that the planner can look ahead."""
+
+REST_S = 2.5
+"""Time for each pose of `rests`, with the way to it."""
+
+_REST_CHOICE = 2000
+_SHAKING_HZ = 0.8
+_SHAKING_SHARE = 0.85
+_FADE_S = 1.0
+_STEP_S = 2.0
+
+Poses = tuple[Array, Array, Array]
+"""Times (N,) [s], positions (N, 3) [m] and rotations (N, 3, 3)."""
+
+
+def named_motion(name: str, mechanism: Mechanism, duration: float) -> Poses:
+    """The poses of a motion of `NAMES`.
+
+    Raises:
+        InputError: the mechanism has no home or no limits, or its workspace is too small.
+    """
+    if name in _FITTED:
+        return _FITTED[name](mechanism, duration)
+    home = mechanism.require_home()
+    period = _STEP_S if name in HELD else SAMPLE_PERIOD_S
+    times = np.arange(0.0, duration + MARGIN_S + period, period)
+    # The reach is in proportion to the stroke, so that every preset can make every motion.
+    stroke = mechanism.require_limits().stroke
+    motions = PLANAR_MOTIONS if mechanism.planar else MOTIONS
+    displacements = motions[name](times) * float((stroke[:, 1] - stroke[:, 0]).min() / 0.12)
+    rotations = np.array([rotation_from_vector(vector) @ home.rotation for vector in displacements[:, 3:]])
+    return times, home.position + displacements[:, :3], rotations
+
+
+def _fade(times: Array) -> Array:
+    """From 0 to 1 within the first second, with continuous acceleration."""
+    x = np.clip(times / _FADE_S, 0.0, 1.0)
+    faded: Array = x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
+    return faded[:, None]
+
+
+def _hold(times: Array) -> Array:
+    return np.zeros((len(times), 6))
+
+
+def _circle(times: Array, planar: bool = False) -> Array:
+    angle = 2.0 * np.pi * 0.25 * times
+    motion = np.zeros((len(times), 6))
+    motion[:, 0], motion[:, 1] = 0.03 * np.cos(angle), 0.03 * np.sin(angle)
+    if planar:
+        motion[:, 5] = np.radians(10.0) * np.sin(angle)
+    else:
+        motion[:, 3], motion[:, 4] = np.radians(4.0) * np.sin(angle), -np.radians(4.0) * np.cos(angle)
+    return motion * _fade(times)
+
+
+def _sines(times: Array, planar: bool = False) -> Array:
+    frequencies = np.array([0.30, 0.37, 0.43, 0.50, 0.57, 0.63])
+    amplitudes = np.array([0.012, 0.012, 0.012, np.radians(3.0), np.radians(3.0), np.radians(5.0)])
+    motion: Array = amplitudes * np.sin(2.0 * np.pi * frequencies * times[:, None]) * _fade(times)
+    if planar:
+        motion[:, 2:5] = 0.0
+    return motion
+
+
+def _steps(times: Array, axes: tuple[int, ...] = (0, 1, 2, 3, 4, 5)) -> Array:
+    sizes = np.diag([0.02, 0.02, 0.02, np.radians(4.0), np.radians(4.0), np.radians(8.0)])
+    poses = np.concatenate([np.zeros((1, 6)), sizes[list(axes)]])
+    return poses[np.arange(len(times)) % len(poses)]
+
+
+def rests(mechanism: Mechanism, duration: float, share: float = 0.8, size: float = 1.0) -> Poses:
+    """Poses to rest at for `REST_S` each, home first, as different as this share of the strokes allows.
+
+    They are chosen among random poses of the workspace, whose way from home is shortened to this `size`: without shortening,
+    hardly any pose is within a small share.
+    """
+    limits, home = mechanism.require_limits(), mechanism.require_home()
+    lengths = leg_lengths(mechanism, home.position, home.rotation)
+    positions, rotations = sample_workspace(mechanism, _REST_CHOICE, seed=0)
+    if size < 1.0:
+        turns = size * vector_from_rotation(rotations @ home.rotation.T)
+        positions = home.position + size * (positions - home.position)
+        rotations = np.array([rotation_from_vector(turn) @ home.rotation for turn in turns])
+    drawn = leg_lengths(mechanism, positions, rotations)
+    middle, half = limits.stroke.mean(axis=1), 0.5 * (limits.stroke[:, 1] - limits.stroke[:, 0])
+    inside = (np.abs(drawn - middle) <= share * half).all(axis=1)
+    positions, rotations, drawn = positions[inside], rotations[inside], drawn[inside]
+    if not len(drawn):
+        raise InputError(f"the workspace of {mechanism.name!r} has no poses within {share:g} of the strokes")
+    # Each is the pose farthest from all before.
+    chosen: list[int] = []
+    away = np.linalg.norm(drawn - lengths, axis=1)
+    for _ in range(int(np.ceil(duration / REST_S))):
+        chosen.append(int(away.argmax()))
+        away = np.minimum(away, np.linalg.norm(drawn - drawn[chosen[-1]], axis=1))
+    return (
+        REST_S * np.arange(len(chosen) + 1),
+        np.concatenate([home.position[None], positions[chosen]]),
+        np.concatenate([home.rotation[None], rotations[chosen]]),
+    )
+
+
+def shaking(mechanism: Mechanism, duration: float, share: float = 1.0) -> Poses:
+    """Sines about home on all axes at once, about 0.8 Hz and a few percent apart, at this share of what the limits allow."""
+    limits, home = mechanism.require_limits(), mechanism.require_home()
+    times = np.arange(0.0, duration + MARGIN_S + SAMPLE_PERIOD_S, SAMPLE_PERIOD_S)
+    spread = float(np.linalg.norm(mechanism.platform_joints, axis=1).mean())
+    frequencies = _SHAKING_HZ * (1.0 + 0.04 * (np.arange(6.0) - 2.5))
+    shape = np.sin(2.0 * np.pi * frequencies * times[:, None]) * _fade(times) * np.repeat([1.0, 1.0 / spread], 3)
+    if mechanism.planar:
+        shape[:, 2:5] = 0.0
+
+    def at(size: float) -> tuple[Array, Array]:
+        turned = np.array([rotation_from_vector(size * vector) @ home.rotation for vector in shape[:, 3:]])
+        return home.position + size * shape[:, :3], turned
+
+    middle, half = limits.stroke.mean(axis=1), 0.5 * (limits.stroke[:, 1] - limits.stroke[:, 0])
+    low, high = 0.0, spread
+    for _ in range(20):
+        size = 0.5 * (low + high)
+        lengths = leg_lengths(mechanism, *at(size))
+        rates = np.gradient(lengths, SAMPLE_PERIOD_S, axis=0)
+        use = max(
+            float((np.abs(lengths - middle) / half).max()),
+            float(np.abs(rates).max()) / limits.velocity,
+            float(np.abs(np.gradient(rates, SAMPLE_PERIOD_S, axis=0)).max()) / limits.acceleration,
+        )
+        low, high = (size, high) if use < _SHAKING_SHARE else (low, size)
+    return times, *at(share * low)
+
+
+_FITTED: dict[str, Callable[[Mechanism, float], Poses]] = {
+    "near-rests": partial(rests, share=0.4, size=0.5),
+    "rests": rests,
+    "shaking": shaking,
+    "probing": partial(shaking, share=0.3),
+}
+"""Motions for the calibration, fitted to the limits of the mechanism."""
+
+MOTIONS: dict[str, Callable[[Array], Array]] = {"hold": _hold, "circle": _circle, "sines": _sines, "steps": _steps}
+"""Displacements from home (N, 6), position [m] and rotation vector [rad], at times (N,) [s]."""
+
+PLANAR_MOTIONS: dict[str, Callable[[Array], Array]] = {
+    "hold": _hold,
+    "circle": partial(_circle, planar=True),
+    "sines": partial(_sines, planar=True),
+    "steps": partial(_steps, axes=(0, 1, 5)),
+}
+"""The same in the plane."""
+
+NAMES = (*MOTIONS, *_FITTED)
+HELD = ("steps", "rests", "near-rests")
+"""Motions whose poses are held until the next one."""
