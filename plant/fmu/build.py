@@ -13,8 +13,9 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
 from importlib.metadata import version
@@ -104,10 +105,21 @@ PLATFORMS = {
 
 
 def default_fmu(model: Model = SPATIAL_MODEL, fmi: int = 3) -> Path:
-    """A plant's FMU of FMI 2.0 or 3.0 for this machine, built on first use and kept under a hash of all that it is made from.
+    """A plant's FMU of FMI 2.0 or 3.0 for this machine, built on first use and kept under a hash of all its sources.
 
     Raises:
         ToolchainError: no C compiler, or it failed.
+    """
+    with building_default_fmu(model, fmi) as finish:
+        return finish()
+
+
+@contextmanager
+def building_default_fmu(model: Model = SPATIAL_MODEL, fmi: int = 3) -> Iterator[Callable[[], Path]]:
+    """As `default_fmu`, while other work goes on.
+
+    Yields:
+        A function that waits until the FMU is built and returns its path; it raises what `default_fmu` raises.
     """
     package = Path(__file__).resolve().parent.parent
     sources = [*sorted(package.rglob("*.py")), package / "mechanism" / "presets" / f"{model.preset}.toml"]
@@ -115,9 +127,19 @@ def default_fmu(model: Model = SPATIAL_MODEL, fmi: int = 3) -> Path:
         wrappers = sorted([*folder.glob("*.c"), *folder.glob("*.h")])
         key = hash_of_files([*sources, *wrappers], version("casadi"), platform.machine(), sys.platform, str(fmi))
     path = keyed_folder("fmus", key) / f"{model.identifier}.fmu"
-    if not path.exists():
-        build_in_subprocess(path, fmi, model.preset)
-    return path
+    process = None if path.exists() else _start_build(path, fmi, model.preset, ())
+
+    def finish() -> Path:
+        if process is not None:
+            _finish_build(process)
+        return path
+
+    try:
+        yield finish
+    finally:
+        if process is not None and process.poll() is None:
+            process.kill()
+            process.communicate()
 
 
 def build_in_subprocess(path: Path, fmi: int = 3, mechanism: str = "hexapod", platforms: Sequence[str] = ()) -> None:
@@ -126,10 +148,18 @@ def build_in_subprocess(path: Path, fmi: int = 3, mechanism: str = "hexapod", pl
     Raises:
         ToolchainError: no C compiler, or it failed, or `path` cannot be written.
     """
+    _finish_build(_start_build(path, fmi, mechanism, platforms))
+
+
+def _start_build(path: Path, fmi: int, mechanism: str, platforms: Sequence[str]) -> subprocess.Popen[str]:
     command = [sys.executable, "-P", "-m", "plant.fmu.build", str(path), str(fmi), mechanism, *platforms]
-    run = subprocess.run(command, capture_output=True, text=True, check=False)
-    if run.returncode:
-        last = (run.stderr.strip() or "no output").splitlines()[-1]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def _finish_build(process: subprocess.Popen[str]) -> None:
+    _, errors = process.communicate()
+    if process.returncode:
+        last = (errors.strip() or "no output").splitlines()[-1]
         raise ToolchainError(f"the plant's FMU could not be built: {last.split(': ', 1)[-1]}")
 
 

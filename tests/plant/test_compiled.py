@@ -6,16 +6,29 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
+import numba
 import numpy as np
 import pytest
 
-from plant.compiled import STALE_AFTER_S, hash_of_files, kernel, keyed_folder, user_cache
+from plant.compiled import hash_of_files, kernel, keyed_folder, user_cache
+from plant.compiled.cache import STALE_AFTER_S
 
 
 @kernel
 def _ratio(a: float, b: float) -> float:
     return a / b
+
+
+@kernel
+def _twice(a: float) -> float:
+    return _ratio(a, 0.5)
+
+
+@kernel
+def _faculty(n: int) -> int:
+    return n * _faculty(n - 1) if n > 1 else 1
 
 
 @kernel
@@ -30,6 +43,20 @@ def test_a_kernel_divides_by_zero_as_numpy_does() -> None:
 
 def test_a_kernel_can_tell_nan() -> None:
     assert _is_nan(np.nan) and not _is_nan(np.inf)
+
+
+def test_a_kernel_serves_python_and_other_kernels() -> None:
+    assert _twice(3.0) == 6.0
+    assert _ratio(3.0, 0.5) == 6.0
+    assert _faculty(5) == 120
+
+
+def test_a_function_of_numba_alone_calls_kernels_and_is_called_as_ever() -> None:
+    @numba.njit  # type: ignore[untyped-decorator]
+    def alone(values: Any) -> Any:
+        return _twice(values.sum()) + np.linalg.norm(values)
+
+    assert alone(np.array([3.0, 4.0])) == 19.0
 
 
 def test_the_cache_is_where_the_user_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -115,13 +142,34 @@ def test_machine_code_is_kept_in_the_cache_alone(tmp_path: Path) -> None:
     assert sorted(package.rglob("*.nb?")) == before
 
 
+def test_machine_code_that_calls_other_kernels_is_loaded_whole(tmp_path: Path) -> None:
+    """The callees have no machine code of their own in the cache; the next process finds them in their caller's."""
+    code = (
+        "import numpy as np; from plant.mechanism import load_mechanism; from controller.cycle import check_imus, find_pose;"
+        "print(check_imus(load_mechanism('hexapod'), range(7)), sum(find_pose.stats.cache_misses.values()))"
+    )
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", code],
+            env=os.environ | {"GOUGH_CACHE": str(tmp_path)},
+            cwd=Path(__file__).resolve().parents[2],
+            check=True,
+            capture_output=True,
+            text=True,
+        ).stdout.split()
+        for _ in range(2)
+    ]
+    assert said[0][0] == said[1][0] and float(said[0][0]) > 0.0
+    assert (said[0][1], said[1][1]) == ("1", "0")
+
+
 def test_an_edit_in_any_package_gives_a_new_folder(tmp_path: Path) -> None:
     """The sources are copied, one file is edited, and the kernels of another file move to another folder."""
     root = Path(__file__).resolve().parents[2]
     copy = tmp_path / "copy"
     for package in ("plant", "controller", "hil"):
         shutil.copytree(root / package, copy / package, ignore=shutil.ignore_patterns("__pycache__"))
-    code = "from plant.compiled import _kernel_folder; print(_kernel_folder().name)"
+    code = "from plant.compiled.kernels import _kernel_folder; print(_kernel_folder().name)"
 
     def key() -> str:
         run = subprocess.run(

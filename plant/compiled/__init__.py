@@ -1,0 +1,7 @@
+"""Compiled kernels: the decorator, the order of shared memory, and where machine code is kept."""
+
+from plant.compiled.atomics import fence, load_acquire, store_release
+from plant.compiled.cache import hash_of_files, keyed_folder, user_cache
+from plant.compiled.kernels import Record, kernel
+
+__all__ = ["Record", "fence", "hash_of_files", "kernel", "keyed_folder", "load_acquire", "store_release", "user_cache"]

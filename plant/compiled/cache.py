@@ -1,0 +1,58 @@
+"""Where gough keeps what it builds on demand: machine code and FMUs, each under a hash of its sources."""
+
+import atexit
+import hashlib
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Iterable
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+
+STALE_AFTER_S = 30 * 24 * 3600.0
+"""Folders that were not used for so long are removed [s]."""
+
+
+def user_cache() -> Path:
+    """The folder for what gough builds on demand: `$GOUGH_CACHE`, else `gough` in the user's cache folder."""
+    if configured := os.environ.get("GOUGH_CACHE"):
+        return Path(configured)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gough"
+
+
+def hash_of_files(files: Iterable[Path], *extra: str) -> str:
+    """Twenty hexadecimal digits that change with the content of any of the files, or with `extra`."""
+    digest = hashlib.sha256("\0".join(extra).encode())
+    for file in files:
+        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:20]
+
+
+def keyed_folder(kind: str, key: str) -> Path:
+    """The cache folder of this kind and key, made and marked as used; folders long unused are removed.
+
+    Where the user's cache cannot be written, the folder lasts only as long as the process.
+    """
+    try:
+        folder = user_cache() / kind / key
+        folder.mkdir(parents=True, exist_ok=True)
+        os.utime(folder)
+    except (OSError, RuntimeError):
+        # RuntimeError: there is no home folder.
+        folder = _temporary_cache() / kind / key
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+    for other in folder.parent.iterdir():
+        with suppress(OSError):
+            if other != folder and time.time() - other.stat().st_mtime > STALE_AFTER_S:
+                shutil.rmtree(other, ignore_errors=True)
+    return folder
+
+
+@cache
+def _temporary_cache() -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="gough-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder

@@ -1,0 +1,81 @@
+"""The one decorator that marks compiled kernels.
+
+numba notices an edit in the file of a kernel but not in the files of its callees, and an installed package may lie in a folder
+that cannot be written. The machine code therefore lies in the user's cache under a hash of every source file of the three
+packages: any edit gives a new folder.
+"""
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+from numba import types
+from numba.extending import lower_cast
+
+from plant.compiled.cache import hash_of_files, keyed_folder
+from plant.compiled.linking import linked_flat
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+Record = Any
+"""A structured array of shape () or (N,), or a record of one. Compiled code reads its fields as attributes, which the types of
+NumPy cannot say."""
+
+PACKAGES = ("plant", "controller", "hil")
+
+
+@cache
+def _kernel_folder() -> Path:
+    root = Path(__file__).resolve().parents[2]
+    sources = sorted(file for package in PACKAGES for file in (root / package).rglob("*.py"))
+    return keyed_folder("kernels", hash_of_files(sources, numba.__version__))
+
+
+def kernel(function: F) -> F:
+    """Mark a function as compiled code: off the GIL, never raising, its machine code cached.
+
+    Division by zero gives inf or NaN as in NumPy. fastmath stays off, so that NaN checks mean something. A kernel that Python
+    calls gets machine code, with all its callees in it, and a place in the cache; a kernel that only kernels call does not.
+    numba itself compiles a function again for each constant argument and for each shape of a record's array; here it is
+    compiled once for all of them.
+    """
+    settings: Any = numba.config
+    before = settings.CACHE_DIR
+    settings.CACHE_DIR = str(_kernel_folder())
+    try:
+        compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    finally:
+        settings.CACHE_DIR = before
+
+    @cache
+    def inner() -> Any:
+        """The same kernel for callers that are compiled themselves."""
+        njit: Any = numba.njit
+        made = njit(nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
+        made.compile = linked_flat(made.compile)
+        return made
+
+    compiled.compile = linked_flat(compiled.compile)
+    compiled.get_call_template = lambda args, kws: inner().get_call_template(
+        tuple(_general(each) for each in args), {name: _general(each) for name, each in kws.items()}
+    )
+    compiled.get_overload = lambda signature: inner().get_overload(signature)
+    return cast(F, compiled)
+
+
+def _general(kind: Any) -> Any:
+    """The type of an argument without its value, of a member of an enumeration as its number, of a record's array without its
+    shape.
+    """
+    general: Any = cast(Any, types.unliteral)(kind)
+    if isinstance(general, types.IntEnumMember):
+        return general.dtype
+    return types.Array(general.dtype, general.ndim, "C") if isinstance(general, types.NestedArray) else general
+
+
+@lower_cast(types.NestedArray, types.Array)  # type: ignore[no-untyped-call, untyped-decorator]
+def _cast_nested(context: Any, builder: Any, from_type: Any, to_type: Any, value: Any) -> Any:
+    """Pass a record's array on as it is: numba has no such cast, though both lie in memory alike."""
+    return value

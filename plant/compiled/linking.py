@@ -1,0 +1,161 @@
+"""Faster compilation: kernels are linked once, flat, instead of at every level of calls.
+
+This module replaces parts of numba while a kernel compiles, and only then. It halves the first start on a machine.
+"""
+
+import gc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, cast
+
+from llvmlite.binding import Linkage, parse_assembly
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.environment import lookup_environment
+from numba.core.registry import cpu_target
+from numba.core.targetconfig import ConfigStack
+from numba.core.types.functions import BaseFunction
+
+_Library: Any = JITCodeLibrary
+_environment_of: Any = lookup_environment
+
+
+class FlatLibrary(_Library):  # type: ignore[misc]
+    """The code of one function: machine code if Python calls it, else only bitcode, which is linked into its callers.
+
+    numba itself links, optimises and emits each function with all its callees, again at every level. Here all levels are linked
+    once, flat, and optimised once. The arithmetic does not depend on it, because fastmath is off.
+    """
+
+    inner = False
+    _shared_module: Any = None
+
+    @property
+    def codegen(self) -> Any:
+        """Where numba sets the environments of functions; a function without machine code has none."""
+        return _NO_ENVIRONMENTS if self.inner else self._codegen
+
+    def finalize(self) -> None:
+        """Link, optimise and load a function that Python calls; leave any other as it is."""
+        self._raise_if_finalized()
+        module = self._final_module
+        self.inner = not any(each.name.startswith(_WRAPPER) for each in module.functions)
+        # numba writes some helpers into several modules under one name.
+        _weaken(module, lambda name: not name.startswith(_MANGLED))
+        if self.inner:
+            self._finalized = True
+            return
+        self._link_callees(module)
+        self._optimize_final_module()
+        module.verify()
+        self._finalize_final_module()
+        for each in module.global_variables:
+            if each.name.startswith(_ENVIRONMENT) and (environment := _environment_of(each.name)) is not None:
+                self._codegen.set_env(each.name, environment)
+
+    def _link_callees(self, module: Any) -> None:
+        """Link all direct and indirect callees into a module that has this library's own code."""
+        inner: dict[Any, None] = {}
+        others: dict[Any, None] = {}
+        to_do = list(self._linking_libraries)
+        while to_do:
+            each = to_do.pop()
+            if not getattr(each, "inner", False):
+                others[each] = None
+            elif each not in inner:
+                inner[each] = None
+                to_do.extend(each._linking_libraries)
+        own = {each.name for each in module.functions if not each.is_declaration}
+        for each in inner:
+            module.link_in(each._final_module, preserve=True)
+        # A weak function is linked only where a function that is there already calls it, so these come last.
+        for each in others:
+            module.link_in(each._get_module_for_linking(), preserve=True)
+        # numba 0.68 has it, 0.62 does not.
+        for each in (*inner, *others):
+            if hasattr(self, "_reload_init"):
+                self._reload_init.update(each._reload_init)
+        _weaken(module, lambda name: name not in own)
+
+    def _get_module_for_linking(self) -> Any:
+        """The module with all callees, for a caller that is not a kernel."""
+        self._ensure_finalized()
+        if self.inner and self._shared_module is None:
+            module = self._final_module.clone()
+            self._link_callees(module)
+            _weaken(module, lambda name: True)
+            self._shared_module = module
+        return super()._get_module_for_linking()
+
+    def serialize_using_object_code(self) -> Any:
+        """As numba does, but without the bitcode: nothing links what Python calls, and loading needs only the names."""
+        self._ensure_finalized()
+        names = [each.name for each in self._final_module.functions if not each.is_declaration]
+        stub = parse_assembly("\n".join(f'define void @"{name}"() {{ ret void }}' for name in names))
+        return self.name, "object", (self._get_compiled_object(), stub.as_bitcode())
+
+
+def _weaken(module: Any, which: Callable[[str], bool]) -> None:
+    """Let functions be dropped when nothing calls them, and be defined in several modules."""
+    for each in module.functions:
+        if not each.is_declaration and each.linkage == Linkage.external and which(each.name):
+            each.linkage = "linkonce_odr"
+
+
+class _NoEnvironments:
+    def set_env(self, name: str, environment: Any) -> None:
+        """Do nothing: no machine code looks there."""
+
+
+_NO_ENVIRONMENTS = _NoEnvironments()
+_MANGLED, _WRAPPER, _ENVIRONMENT = "_ZN", "_ZN7cpython", "_ZN08NumbaEnv"
+_LAZY_COLLECTION = (50_000, 20, 20)
+_resolve: Any = BaseFunction.get_call_type
+
+
+def _resolve_once(self: Any, context: Any, args: Any, kws: Any) -> Any:
+    """The signature of an operator or function for these types; numba itself searches all candidates at each use."""
+    flags = cast(Any, ConfigStack).top_or_none()
+    known = self.__dict__.setdefault("_gough_resolved", {})
+    key = args, tuple(kws.items()), None if flags is None else repr(flags._values)
+    if key not in known:
+        signature = _resolve(self, context, args, kws)
+        known[key] = signature, self._impl_keys.get(signature.args)
+    signature, implementation = known[key]
+    self._impl_keys[signature.args] = implementation
+    return signature
+
+
+_depth = 0
+
+
+@contextmanager
+def flat_linking() -> Iterator[None]:
+    """Link flat what numba compiles meanwhile."""
+    global _depth
+    # numba's own runtime must not be linked flat: build it first.
+    cpu_target.target_context.refresh()
+    codegen: Any = cpu_target.target_context.codegen()
+    collection, functions = gc.get_threshold(), cast(Any, BaseFunction)
+    _depth += 1
+    if _depth == 1:
+        codegen._library_class, functions.get_call_type = FlatLibrary, _resolve_once
+        # A compilation makes many small objects; collecting garbage as often as usual would take a third of its time.
+        gc.set_threshold(*_LAZY_COLLECTION)
+    try:
+        yield
+    finally:
+        _depth -= 1
+        if _depth == 0:
+            codegen._library_class, functions.get_call_type = JITCodeLibrary, _resolve
+            gc.set_threshold(*collection)
+
+
+def linked_flat(compile_kernel: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """The `compile` of a dispatcher, with flat linking."""
+
+    def compile_flat(signature: Any) -> Any:
+        with global_compiler_lock, flat_linking():
+            return compile_kernel(signature)
+
+    return compile_flat
