@@ -42,7 +42,29 @@ def progress_bar(label: str) -> Iterator[Callable[..., None]]:
     terminal = sys.stderr.isatty()
     with Progress(*columns, console=Console(stderr=True), transient=True, disable=not terminal) as bar:
         task = bar.add_task(label, total=None)
-        yield lambda share, label=None: bar.update(task, total=1.0, completed=share, description=label)
+
+        def compiling(functions: int) -> None:
+            if functions == 1 and not terminal:
+                print("compiling the controller, once: the next start takes seconds", file=sys.stderr)
+            description = f"compiling function {functions} of about {_COMPILED_FUNCTIONS} (once; the next start takes seconds)"
+            bar.update(task, total=max(_COMPILED_FUNCTIONS, functions), completed=functions, description=description)
+
+        def show(share: float, now: str = label) -> None:
+            bar.update(task, total=1.0, completed=share, description=now)
+
+        with _compilation_shown(compiling):
+            yield show
+
+
+_COMPILED_FUNCTIONS = 280
+"""How many functions numba compiles for the first simulation on a machine."""
+
+
+def _compilation_shown(report: Callable[[int], None]) -> Any:
+    """Let `report` follow the compilation of kernels; the bar is on the screen before numba is loaded."""
+    from plant.compiled import compilation_reported
+
+    return compilation_reported(report)
 
 
 @contextmanager
@@ -75,7 +97,7 @@ def _view(title: str, state: "RunState") -> Table:
     table = Table(title, "")
     latest: Any = state.latest
     if latest is None:
-        table.add("state", "preparing plan, plant and machine code, which the first time is compiled (under a minute)")
+        table.add("state", "preparing plan, plant and machine code (compiled once: the next start takes seconds)")
         return table
     position, r = 1e3 * latest["position"], latest["rotation"]
     angles = (atan2(r[2, 1], r[2, 2]), asin(max(-1.0, min(1.0, -r[2, 0]))), atan2(r[1, 0], r[0, 0]))

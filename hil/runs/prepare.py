@@ -1,7 +1,7 @@
 """Preparation of a run: check everything, load the plant, plan the motion, load the machine code."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,7 +26,7 @@ from plant.compiled import Record
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import GoughError, InputError
 from plant.fmu.binding import OWN_BINDING, load_binding
-from plant.fmu.build import default_fmu, model_of
+from plant.fmu.build import building_default_fmu, default_fmu, model_of
 from plant.fmu.plant import FMU_HANDLE, FmuPlant
 from plant.imu import imu_state, load_imu
 from plant.mechanism import Mechanism, load_in_space
@@ -81,6 +81,17 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         GoughError: something in the configuration cannot be used.
     """
     nominal = load_in_space(config.mechanism)
+    own_plant = config.rig == "fmu" and config.plant is None
+    # The FMU is built while kernels compile.
+    building = building_default_fmu(model_of(nominal)) if own_plant else nullcontext()
+    with building as fmu, _prepared_loop(config, nominal, records, fmu) as loop:
+        yield loop
+
+
+@contextmanager
+def _prepared_loop(
+    config: SimulationConfig, nominal: Mechanism, records: Record | None, fmu: Callable[[], Path] | None
+) -> Iterator[PreparedLoop]:
     calibration = Calibration() if config.calibration is None else load_calibration(config.calibration)
     if nominal.planar:
         check_legs(config.rig, nominal)
@@ -107,7 +118,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         )
     # Loads the planner, so that the planning time is that of the plan alone.
     plan(mechanism, load_target("hold", mechanism, 0.1), 0.1)
-    with simulated_plant(config, nominal, target.start) if config.rig == "fmu" else nullcontext() as plant:
+    with simulated_plant(config, nominal, target.start, fmu) if config.rig == "fmu" else nullcontext() as plant:
         began = time.perf_counter()
         if config.streamed:
             lengths = leg_lengths(mechanism, target.start.position, target.start.rotation)
@@ -142,13 +153,24 @@ def _check_planar(config: SimulationConfig, calibration: Calibration) -> None:
         raise InputError(f"{config.calibration} moves the joints of six legs, and {config.mechanism} has three: leave them out")
 
 
-def simulated_plant(config: SimulationConfig, nominal: Mechanism, start: Pose) -> FmuPlant:
+def simulated_plant(
+    config: SimulationConfig, nominal: Mechanism, start: Pose, built_fmu: Callable[[], Path] | None = None
+) -> FmuPlant:
     """The plant of a configuration, at rest at `start`; a plant with a binding starts where its binding says.
+
+    Args:
+        config: of the run.
+        nominal: the mechanism as it was designed.
+        start: of the platform.
+        built_fmu: waits for gough's own FMU and returns its path; None to build it now.
 
     Raises:
         GoughError: the FMU, its binding, a setting or the joint error cannot be used.
     """
-    fmu = default_fmu(model_of(nominal)) if config.plant is None else Path(config.plant)
+    if config.plant is not None:
+        fmu = Path(config.plant)
+    else:
+        fmu = default_fmu(model_of(nominal)) if built_fmu is None else built_fmu()
     binding = OWN_BINDING if config.binding is None else load_binding(config.binding)
     if config.joint_error and not binding.native:
         raise InputError(f"{binding.source} binds an FMU with joints of its own, which have no joint error: leave it out")

@@ -2,6 +2,16 @@
 
 from plant.compiled.atomics import fence, load_acquire, store_release
 from plant.compiled.cache import hash_of_files, keyed_folder, user_cache
-from plant.compiled.kernels import Record, kernel
+from plant.compiled.kernels import Record, compilation_reported, kernel
 
-__all__ = ["Record", "fence", "hash_of_files", "kernel", "keyed_folder", "load_acquire", "store_release", "user_cache"]
+__all__ = [
+    "Record",
+    "compilation_reported",
+    "fence",
+    "hash_of_files",
+    "kernel",
+    "keyed_folder",
+    "load_acquire",
+    "store_release",
+    "user_cache",
+]

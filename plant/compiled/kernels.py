@@ -5,13 +5,16 @@ that cannot be written. The machine code therefore lies in the user's cache unde
 packages: any edit gives a new folder.
 """
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 from numba import types
+from numba.core import event
 from numba.extending import lower_cast
 
 from plant.compiled.cache import hash_of_files, keyed_folder
@@ -24,6 +27,23 @@ Record = Any
 NumPy cannot say."""
 
 PACKAGES = ("plant", "controller", "hil")
+
+
+@contextmanager
+def compilation_reported(report: Callable[[int], None]) -> Iterator[None]:
+    """Call `report` with the number of functions that numba has begun to compile meanwhile, each time it begins one."""
+    begun = itertools.count(1)
+    base: Any = event.Listener
+
+    class Listener(base):  # type: ignore[misc]
+        def on_start(self, event: Any) -> None:
+            report(next(begun))
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    with cast(Any, event).install_listener("numba:compile", Listener()):
+        yield
 
 
 @cache
