@@ -4,10 +4,7 @@ By default the drives are only asked to hold on their brakes. With `moving` they
 1 mm/s for 0.2 s each, and the drives are stopped; the rig must have room for that.
 """
 
-from collections.abc import Callable
-
-from hil.rigs import Rig
-from hil.rigs.examiner import FOLLOWED_WITHIN, Examination, Examiner
+from hil.rigs.examiner import FOLLOWED_WITHIN, Examination, Examiner, MakeRig
 
 CLAUSES = {
     "interface": "it has all methods, and its command_delay",
@@ -30,22 +27,14 @@ CLAUSES = {
 
 
 def check_rig(
-    make_rig: Callable[[], Rig],
-    period: float,
-    moving: bool = True,
-    beyond: float | None = None,
-    absent: Callable[[], Rig] | None = None,
+    make_rig: MakeRig, period: float, moving: bool = True, beyond: float | None = None, absent: MakeRig | None = None
 ) -> list[str]:
     """Check a rig against the contract; returns the findings, one sentence each (see `examine_rig`)."""
     return examine_rig(make_rig, period, moving, beyond, absent).all_findings()
 
 
 def examine_rig(
-    make_rig: Callable[[], Rig],
-    period: float,
-    moving: bool = True,
-    beyond: float | None = None,
-    absent: Callable[[], Rig] | None = None,
+    make_rig: MakeRig, period: float, moving: bool = True, beyond: float | None = None, absent: MakeRig | None = None
 ) -> Examination:
     """Check a rig against the contract.
 

@@ -33,6 +33,8 @@ from plant.mechanism import LEGS
 from plant.pose import Array
 from plant.truth import TRUTH_LENGTHS
 
+MakeRig = Callable[[], Rig]
+
 FOLLOWED_WITHIN = 20
 """Exchanges within which the drives must do what is requested."""
 
@@ -79,9 +81,7 @@ class _BrokenOffError(Exception):
 class Examiner:
     """One examination; the arguments are those of `hil.rigs.contract.examine_rig`."""
 
-    def __init__(
-        self, make_rig: Callable[[], Rig], period: float, moving: bool, beyond: float | None, absent: Callable[[], Rig] | None
-    ) -> None:  # fmt: skip
+    def __init__(self, make_rig: MakeRig, period: float, moving: bool, beyond: float | None, absent: MakeRig | None) -> None:
         self._make, self._period, self._moving, self._beyond, self._absent = make_rig, period, moving, beyond, absent
         self._result = Examination()
         self._noted: set[tuple[str, str]] = set()

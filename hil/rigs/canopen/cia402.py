@@ -1,4 +1,4 @@
-"""The power state machine of CiA 402, both sides: what a drive makes of a controlword, and which one leads where it is wanted.
+"""The power state machine of CiA 402: a drive's reaction to a controlword, and the controlword that leads to a wanted state.
 
     Not ready --> Switch on disabled <--> Ready to switch on <--> Switched on <--> Operation enabled
     Operation enabled --> Quick stop active --> Switch on disabled          (quick stop option code 2)
@@ -7,56 +7,58 @@
 Pure functions on integers.
 """
 
-from controller.safety.causes import DriveState, Request
+from enum import IntEnum
 
-(
-    NOT_READY, SWITCH_ON_DISABLED, READY_TO_SWITCH_ON, SWITCHED_ON, OPERATION_ENABLED, QUICK_STOP_ACTIVE, FAULT_REACTION_ACTIVE,
-    FAULT,
-) = range(8)  # fmt: skip
+from hil.rigs import BRAKED, ENABLED, FAULTY, FOLLOWING, OFF, QUICK_STOPPING, READY
 
-STATES = (
-    "Not ready to switch on", "Switch on disabled", "Ready to switch on", "Switched on", "Operation enabled",
-    "Quick stop active", "Fault reaction active", "Fault",
-)  # fmt: skip
 
-NO_STATE = -1
-"""A statusword that stands for no state."""
+class PowerState(IntEnum):
+    """A drive's power state."""
 
-DISABLE_VOLTAGE, QUICK_STOP_COMMAND, SHUTDOWN, SWITCH_ON, ENABLE_OPERATION, FAULT_RESET = 0x00, 0x02, 0x06, 0x07, 0x0F, 0x80
-"""Controlwords. `SWITCH_ON` in Operation enabled is "disable operation"."""
+    NOT_READY_TO_SWITCH_ON = 0
+    SWITCH_ON_DISABLED = 1
+    READY_TO_SWITCH_ON = 2
+    SWITCHED_ON = 3
+    OPERATION_ENABLED = 4
+    QUICK_STOP_ACTIVE = 5
+    FAULT_REACTION_ACTIVE = 6
+    FAULT = 7
+
+    @property
+    def label(self) -> str:
+        """The state's name in CiA 402, such as Switched on."""
+        return self.name.replace("_", " ").capitalize()
+
+
+class Controlword(IntEnum):
+    """Commands to the power state machine. `SWITCH_ON` in Operation enabled is CiA 402's "disable operation"."""
+
+    DISABLE_VOLTAGE = 0x00
+    QUICK_STOP = 0x02
+    SHUTDOWN = 0x06
+    SWITCH_ON = 0x07
+    ENABLE_OPERATION = 0x0F
+    FAULT_RESET = 0x80
+
 
 VOLTAGE_ENABLED, REMOTE, FOLLOWS_TARGET = 1 << 4, 1 << 9, 1 << 12
-"""Bits of the statusword: the power stage is supplied; the controlword is heeded; in cyclic synchronous velocity mode, the
-drive follows the target velocity."""
-
-(
-    ERROR_CODE, CONTROLWORD, STATUSWORD, QUICK_STOP_OPTION, DISABLE_OPERATION_OPTION, MODE, MODE_DISPLAY, VELOCITY_ACTUAL,
-    MAX_MOTOR_SPEED, QUICK_STOP_DECELERATION, TARGET_VELOCITY, ABORT_CONNECTION_OPTION, FAULT_REACTION_OPTION,
-    INTERPOLATION_PERIOD,
-) = (
-    0x603F, 0x6040, 0x6041, 0x605A, 0x605C, 0x6060, 0x6061, 0x606C, 0x6080, 0x6085, 0x60FF, 0x6007, 0x605E, 0x60C2,
-)  # fmt: skip
-"""Objects of a drive."""
+"""Bits of the statusword: the power stage is supplied; the drive obeys the controlword; in cyclic synchronous velocity mode,
+the drive follows the target velocity."""
 
 CYCLIC_SYNCHRONOUS_VELOCITY = 9
 """Mode of operation."""
-
-QUICK_STOP_RAMP, DISABLE_AT_ONCE, FAULT_RAMP, ABORT_QUICK_STOP = 2, 0, 2, 3
-"""Option codes: a quick stop slows down by the quick-stop deceleration and ends in Switch on disabled; "disable operation"
-takes the power off and so closes the brake at once; a fault slows down in the same way, and a lost connection is a quick
-stop."""
 
 HEARTBEAT_LOST, PDO_LOST = 0x8130, 0x8250
 """Error codes of a drive that misses its controller: no heartbeat, no RPDO in time."""
 
 _STATE_BITS = (0x00, 0x40, 0x21, 0x23, 0x27, 0x07, 0x0F, 0x08)
 _MASK, _MASK_WITHOUT_QUICK_STOP = 0x6F, 0x4F
-_QUICK_STOP_BIT_MATTERS = frozenset({READY_TO_SWITCH_ON, SWITCHED_ON, OPERATION_ENABLED, QUICK_STOP_ACTIVE})
+_QUICK_STOP_BIT_MATTERS = range(PowerState.READY_TO_SWITCH_ON, PowerState.QUICK_STOP_ACTIVE + 1)
 
 
-def _tabulated() -> tuple[int, ...]:
-    table = [NO_STATE] * (_MASK + 1)
-    for state, bits in enumerate(_STATE_BITS):
+def _tabulated() -> tuple[PowerState | None, ...]:
+    table: list[PowerState | None] = [None] * (_MASK + 1)
+    for state, bits in zip(PowerState, _STATE_BITS, strict=True):
         mask = _MASK if state in _QUICK_STOP_BIT_MATTERS else _MASK_WITHOUT_QUICK_STOP
         for word in range(_MASK + 1):
             if word & mask == bits:
@@ -67,83 +69,85 @@ def _tabulated() -> tuple[int, ...]:
 _STATE_OF = _tabulated()
 
 
-def state_of(statusword: int) -> int:
-    """The state that a statusword stands for, or `NO_STATE`."""
+def state_of(statusword: int) -> PowerState | None:
+    """The state in a statusword; None if there is no such state."""
     return _STATE_OF[statusword & _MASK]
 
 
-def statusword(state: int, powered: bool, follows: bool) -> int:
-    """The statusword of a drive in this state whose power stage is supplied or not, and which follows the target or not."""
+def statusword(state: PowerState, powered: bool, follows: bool) -> int:
+    """The statusword of a drive in this state whose power stage is `powered` or not, and which `follows` the target or not."""
     word = _STATE_BITS[state] | REMOTE
     if powered:
         word |= VOLTAGE_ENABLED
-    if follows and state == OPERATION_ENABLED:
+    if follows and state == PowerState.OPERATION_ENABLED:
         word |= FOLLOWS_TARGET
     return word
 
 
-def commanded(state: int, controlword: int, previous: int) -> int:
-    """The state into which a controlword takes a drive, one transition at most.
+def commanded(state: PowerState, controlword: int, previous: int) -> PowerState:
+    """The state after a controlword, at most one transition further.
 
     Args:
         state: of the drive.
-        controlword: now.
+        controlword: the new one.
         previous: the controlword before, for the rising edge that resets a fault.
     """
-    if state == FAULT:
-        return SWITCH_ON_DISABLED if controlword & ~previous & FAULT_RESET else FAULT
-    if state in (NOT_READY, FAULT_REACTION_ACTIVE):
+    if state == PowerState.FAULT:
+        return PowerState.SWITCH_ON_DISABLED if controlword & ~previous & Controlword.FAULT_RESET else state
+    if state in (PowerState.NOT_READY_TO_SWITCH_ON, PowerState.FAULT_REACTION_ACTIVE):
         return state
     if not controlword & 0x02:
-        return SWITCH_ON_DISABLED
-    if state == QUICK_STOP_ACTIVE:
+        return PowerState.SWITCH_ON_DISABLED
+    if state == PowerState.QUICK_STOP_ACTIVE:
         return state
     if not controlword & 0x04:
-        return QUICK_STOP_ACTIVE if state == OPERATION_ENABLED else SWITCH_ON_DISABLED
+        enabled = state == PowerState.OPERATION_ENABLED
+        return PowerState.QUICK_STOP_ACTIVE if enabled else PowerState.SWITCH_ON_DISABLED
     if not controlword & 0x01:
-        return READY_TO_SWITCH_ON
-    if state == SWITCH_ON_DISABLED:
+        return PowerState.READY_TO_SWITCH_ON
+    if state == PowerState.SWITCH_ON_DISABLED:
         return state
-    if state == READY_TO_SWITCH_ON or not controlword & 0x08:
-        return SWITCHED_ON
-    return OPERATION_ENABLED
+    if state == PowerState.READY_TO_SWITCH_ON or not controlword & 0x08:
+        return PowerState.SWITCHED_ON
+    return PowerState.OPERATION_ENABLED
 
 
-def settled(state: int) -> int:
-    """The state into which a drive goes by itself once it has come to rest."""
-    if state == QUICK_STOP_ACTIVE:
-        return SWITCH_ON_DISABLED
-    return FAULT if state == FAULT_REACTION_ACTIVE else state
+def settled(state: PowerState) -> PowerState:
+    """The state that a drive enters by itself once it is at rest."""
+    if state == PowerState.QUICK_STOP_ACTIVE:
+        return PowerState.SWITCH_ON_DISABLED
+    return PowerState.FAULT if state == PowerState.FAULT_REACTION_ACTIVE else state
 
 
-def controlword_towards(request: int, state: int) -> int:
-    """The controlword that leads a drive one step towards what is asked of it.
+def controlword_towards(request: int, state: PowerState | None) -> Controlword:
+    """The controlword that leads a drive one step towards the request.
 
-    `BRAKED` leads to Switched on, `ENABLED` to Operation enabled, `QUICK_STOP` to rest in Switch on disabled. A quick stop is
-    let finish before the drive is enabled again; `BRAKED` cuts it short. A fault is never reset here.
+    `BRAKED` leads to Switched on, `ENABLED` to Operation enabled, `QUICK_STOP` to rest in Switch on disabled. `ENABLED` lets a
+    quick stop finish; `BRAKED` cuts it short. This function never resets a fault.
     """
-    if request not in (Request.BRAKED, Request.ENABLED):
-        return QUICK_STOP_COMMAND
-    if state == SWITCH_ON_DISABLED:
-        return SHUTDOWN
-    if state == QUICK_STOP_ACTIVE:
-        return QUICK_STOP_COMMAND if request == Request.ENABLED else DISABLE_VOLTAGE
-    if state in (SWITCHED_ON, OPERATION_ENABLED):
-        return ENABLE_OPERATION if request == Request.ENABLED else SWITCH_ON
-    return SWITCH_ON if state == READY_TO_SWITCH_ON else DISABLE_VOLTAGE
+    if request not in (BRAKED, ENABLED):
+        return Controlword.QUICK_STOP
+    if state == PowerState.SWITCH_ON_DISABLED:
+        return Controlword.SHUTDOWN
+    if state == PowerState.QUICK_STOP_ACTIVE:
+        return Controlword.QUICK_STOP if request == ENABLED else Controlword.DISABLE_VOLTAGE
+    if state in (PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED):
+        return Controlword.ENABLE_OPERATION if request == ENABLED else Controlword.SWITCH_ON
+    return Controlword.SWITCH_ON if state == PowerState.READY_TO_SWITCH_ON else Controlword.DISABLE_VOLTAGE
 
 
 def drive_state(word: int) -> int:
-    """What a drive says of itself (`OFF`, `READY`, `FOLLOWING`, `QUICK_STOPPING`, `FAULTY`) by a statusword.
+    """A drive's state for the loop (`OFF`, `READY`, `FOLLOWING`, `QUICK_STOPPING`, `FAULTY`), by its statusword.
 
-    A drive with its power stage supplied is ready from Switch on disabled on, since `controlword_towards` leads it on; in
-    Operation enabled it is ready until it follows the target velocity.
+    A drive whose power stage is supplied is ready from Switch on disabled on, because `controlword_towards` leads it further;
+    in Operation enabled it is ready until it follows the target velocity.
     """
     state = state_of(word)
-    if state in (FAULT, FAULT_REACTION_ACTIVE):
-        return DriveState.FAULTY
-    if state == QUICK_STOP_ACTIVE:
-        return DriveState.QUICK_STOPPING
-    if state == OPERATION_ENABLED and word & FOLLOWS_TARGET:
-        return DriveState.FOLLOWING
-    return DriveState.READY if state > NOT_READY and word & VOLTAGE_ENABLED else DriveState.NOT_READY
+    if state in (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE):
+        return FAULTY
+    if state == PowerState.QUICK_STOP_ACTIVE:
+        return QUICK_STOPPING
+    if state == PowerState.OPERATION_ENABLED and word & FOLLOWS_TARGET:
+        return FOLLOWING
+    not_ready = state in (None, PowerState.NOT_READY_TO_SWITCH_ON) or not word & VOLTAGE_ENABLED
+    return OFF if not_ready else READY

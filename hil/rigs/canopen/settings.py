@@ -1,8 +1,8 @@
 """Settings of the CANopen rig, from a TOML file: bus, node ids, units, signs and gear ratios; and the load on the bus."""
 
 import configparser
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
 from math import ceil, isfinite
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_type_hints
@@ -18,54 +18,105 @@ from plant.toml import check_entries, read_toml
 DEFAULT_FILE = Path(__file__).with_name("canopen.toml")
 INTERFACES = ("socketcan", "udp_multicast", "virtual")
 LARGEST_LOAD = 0.9
-"""Share of the bus' time that the frames of a cycle may take in the worst case; the rest is for heartbeats and SDO."""
+"""The largest share of the bus' time for the frames of a cycle in the worst case; the rest is for heartbeats and SDO."""
 
 MAGNETOMETER_INTERVAL = 10
 """SYNCs per sample of the magnetometers on classic CAN; each IMU has its own turn."""
 
 COMMAND_BYTES, ANSWER_BYTES, FD_BYTES = 6, 8, 32
-"""Of a drive's RPDO; of a drive's TPDO and of an IMU's on classic CAN; of an IMU's one TPDO on CAN FD."""
+"""Length of a drive's RPDO; of a drive's TPDO and of an IMU's on classic CAN; of an IMU's one TPDO on CAN FD."""
 
 _LARGEST_NODE = 127
 _LONGEST_TIME = 65.535
 _INT32 = 2**31 - 1
 
-S = TypeVar("S")
+S = TypeVar("S", bound="_Table")
+Check = Callable[[str, Any], None]
+"""Takes an entry's name and value, and raises an `InputError` if the value cannot be used."""
+
+
+def _entry(text: str, check: Check | None = None) -> Any:
+    """An entry of a table: its meaning, and a check of its value."""
+    return field(metadata={"text": text, "check": check})
+
+
+def _within(lowest: float, highest: float) -> Check:
+    def check(name: str, value: float) -> None:
+        if not lowest <= value <= highest:
+            raise InputError(f"{name} is {value:g}; it must be from {lowest:g} to {highest:g}")
+
+    return check
+
+
+def _positive(name: str, value: float) -> None:
+    if not (isfinite(value) and value > 0.0):
+        raise InputError(f"{name} is {value:g}; it must be positive and finite")
+
+
+def _node_ids(count: int) -> Check:
+    def check(name: str, nodes: tuple[Any, ...]) -> None:
+        _check_count(name, nodes, count)
+        for node in nodes:
+            if type(node) is not int or not 1 <= node <= _LARGEST_NODE:
+                raise InputError(f"{name} has {node!r}; a node id is a number from 1 to {_LARGEST_NODE}")
+
+    return check
+
+
+def _signs(count: int) -> Check:
+    def check(name: str, signs: Any) -> None:
+        if not isinstance(signs, tuple) or len(signs) != count or any(type(s) is not int or s not in (-1, 1) for s in signs):
+            raise InputError(f"{name} is {signs!r}; it must be {count} numbers, each 1 or -1")
+
+    return check
+
+
+def _imu_signs(name: str, signs: tuple[Any, ...]) -> None:
+    _check_count(name, signs, IMU_COUNT)
+    for imu, each in enumerate(signs):
+        _signs(3)(f"{name} of IMU {imu}", each)
+
+
+def _check_count(name: str, values: tuple[Any, ...], count: int) -> None:
+    if len(values) != count:
+        raise InputError(f"{name} has {len(values)} entries; {count} are needed")
+
+
+def _interface(name: str, value: str) -> None:
+    if value not in INTERFACES:
+        raise InputError(f"{name} is {value!r}; it must be one of {', '.join(INTERFACES)}")
+
+
+class _Table:
+    """A table of the settings' file. Its fields say what they mean; their values are checked when it is made."""
+
+    table: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        for each in fields(self):  # type: ignore[arg-type]
+            if each.metadata["check"] is not None:
+                each.metadata["check"](f"[{self.table}] {each.name}", getattr(self, each.name))
 
 
 @dataclass(frozen=True)
-class BusSettings:
-    """The bus, as python-can names it.
-
-    Attributes:
-        interface: one of `INTERFACES`.
-        channel: such as `can0`, or the multicast group.
-        port: of the multicast group.
-        hop_limit: of the multicast group; 0 stays on this machine.
-        fd: CAN FD, its PDOs with bit rate switching; SDO, NMT, SYNC and heartbeats stay classic frames.
-        bitrate: [bit/s].
-        data_bitrate: of CAN FD's data phase [bit/s].
-    """
+class BusSettings(_Table):
+    """The bus, as python-can names it."""
 
     table: ClassVar[str] = "bus"
-    interface: str
-    channel: str
-    port: int
-    hop_limit: int
-    fd: bool
-    bitrate: int
-    data_bitrate: int
+    interface: str = _entry(f"one of {', '.join(INTERFACES)}", _interface)
+    channel: str = _entry("such as can0, or the multicast group")
+    port: int = _entry("port of the multicast group", _within(1, 65535))
+    hop_limit: int = _entry("hop limit of the multicast group; 0 stays on this machine", _within(0, 255))
+    fd: bool = _entry("CAN FD, PDOs with bit rate switching; SDO, NMT, SYNC and heartbeats stay classic frames")
+    bitrate: int = _entry("[bit/s]", _within(10_000, 1_000_000))
+    data_bitrate: int = _entry("bit rate of CAN FD's data phase [bit/s], at least the other one")
 
     def __post_init__(self) -> None:
-        if self.interface not in INTERFACES:
-            raise InputError(f"[bus] interface is {self.interface!r}; it must be one of {', '.join(INTERFACES)}")
-        _check(self, "port", 1, 65535)
-        _check(self, "hop_limit", 0, 255)
-        _check(self, "bitrate", 10_000, 1_000_000)
-        _check(self, "data_bitrate", self.bitrate, 8_000_000)
+        super().__post_init__()
+        _within(self.bitrate, 8_000_000)("[bus] data_bitrate", self.data_bitrate)
 
     def arguments(self) -> dict[str, Any]:
-        """What `can.Bus` takes."""
+        """The arguments of `can.Bus`."""
         common: dict[str, Any] = {"interface": self.interface, "channel": self.channel}
         if self.interface == "virtual":
             return common
@@ -75,72 +126,43 @@ class BusSettings:
 
 
 @dataclass(frozen=True)
-class ControllerSettings:
-    """The controller's node.
-
-    Attributes:
-        node: its id, for its heartbeat.
-        heartbeat: [s].
-        heartbeat_timeout: after which the drives stop by themselves [s].
-        answer_share: of the period, how long an exchange waits for answers.
-        boot_timeout: for all nodes to boot up [s].
-    """
+class ControllerSettings(_Table):
+    """The controller's node."""
 
     table: ClassVar[str] = "controller"
-    node: int
-    heartbeat: float
-    heartbeat_timeout: float
-    answer_share: float
-    boot_timeout: float
+    node: int = _entry("node id, for the heartbeat", _within(1, _LARGEST_NODE))
+    heartbeat: float = _entry("interval of the heartbeats [s]", _within(0.001, _LONGEST_TIME))
+    heartbeat_timeout: float = _entry("time without a heartbeat after which the drives stop by themselves [s]")
+    answer_share: float = _entry("share of the period that an exchange waits for answers", _within(0.05, 0.95))
+    boot_timeout: float = _entry("time for all nodes to boot up [s]", _within(0.01, 60.0))
 
     def __post_init__(self) -> None:
-        _check(self, "node", 1, _LARGEST_NODE)
-        _check(self, "heartbeat", 0.001, _LONGEST_TIME)
-        _check(self, "heartbeat_timeout", 2.0 * self.heartbeat, _LONGEST_TIME)
-        _check(self, "answer_share", 0.05, 0.95)
-        _check(self, "boot_timeout", 0.01, 60.0)
+        super().__post_init__()
+        _within(2.0 * self.heartbeat, _LONGEST_TIME)("[controller] heartbeat_timeout", self.heartbeat_timeout)
 
 
 @dataclass(frozen=True)
-class DriveSettings:
-    """The six drives, by leg.
-
-    Attributes:
-        nodes: their ids.
-        signs: of the motor's velocity when the leg extends.
-        eds: electronic data sheet; a relative path begins at the folder of the settings file.
-        screw_lead: of the actuators' screws [m per turn].
-        gear_ratio: turns of the motor per turn of the screw.
-        counts_per_turn: of the motor; velocities are in counts per second.
-        velocity_limit: commands beyond it are cut [m/s].
-        quick_stop_deceleration: [m/s^2].
-        heartbeat: of the drives [s].
-        silence: after which a drive that says nothing is taken to be off [s].
-        command_timeout: without SYNC and commands, after which a drive stops by itself [s].
-    """
+class DriveSettings(_Table):
+    """The six drives, by leg."""
 
     table: ClassVar[str] = "drives"
-    nodes: tuple[int, ...]
-    signs: tuple[int, ...]
-    eds: str
-    screw_lead: float
-    gear_ratio: float
-    counts_per_turn: int
-    velocity_limit: float
-    quick_stop_deceleration: float
-    heartbeat: float
-    silence: float
-    command_timeout: float
+    nodes: tuple[int, ...] = _entry("node ids", _node_ids(LEGS))
+    signs: tuple[int, ...] = _entry("signs of the motors' velocities when the legs extend", _signs(LEGS))
+    eds: str = _entry("electronic data sheet; a relative path begins at the folder of the settings file")
+    screw_lead: float = _entry("lead of the actuators' screws [m per turn]", _positive)
+    gear_ratio: float = _entry("turns of the motor per turn of the screw", _positive)
+    counts_per_turn: int = _entry("of the motor; velocities are in counts per second", _within(1, _INT32))
+    velocity_limit: float = _entry("larger commands are cut to it [m/s]", _positive)
+    quick_stop_deceleration: float = _entry("[m/s^2]", _positive)
+    heartbeat: float = _entry("interval of the heartbeats [s]", _within(0.001, _LONGEST_TIME))
+    silence: float = _entry("time after which a silent drive counts as not ready [s]")
+    command_timeout: float = _entry(
+        "time without SYNC and commands after which a drive stops by itself [s]", _within(0.001, _LONGEST_TIME)
+    )
 
     def __post_init__(self) -> None:
-        _check_nodes(self, self.nodes, LEGS)
-        _check_signs("[drives] signs", self.signs, LEGS)
-        _check(self, "counts_per_turn", 1, _INT32)
-        for name in ("screw_lead", "gear_ratio", "velocity_limit", "quick_stop_deceleration"):
-            _check_positive(self, name)
-        for name in ("heartbeat", "command_timeout"):
-            _check(self, name, 0.001, _LONGEST_TIME)
-        _check(self, "silence", 2.0 * self.heartbeat, _LONGEST_TIME)
+        super().__post_init__()
+        _within(2.0 * self.heartbeat, _LONGEST_TIME)("[drives] silence", self.silence)
         for name in ("velocity_limit", "quick_stop_deceleration"):
             if (counts := getattr(self, name) * self.counts_per_metre) > _INT32:
                 raise InputError(
@@ -154,39 +176,21 @@ class DriveSettings:
 
 
 @dataclass(frozen=True)
-class ImuSettings:
-    """The seven IMUs: those on the legs, and last the platform's.
-
-    Attributes:
-        nodes: their ids.
-        signs: of each IMU's three axes.
-        eds: electronic data sheet; a relative path begins at the folder of the settings file.
-        gyroscope_scale, accelerometer_scale, magnetometer_scale: of one LSB of 16 bits [rad/s, m/s^2, uT].
-        heartbeat: [s].
-    """
+class ImuSettings(_Table):
+    """The seven IMUs: those on the legs, and last the platform's."""
 
     table: ClassVar[str] = "imus"
-    nodes: tuple[int, ...]
-    signs: tuple[tuple[int, ...], ...]
-    eds: str
-    gyroscope_scale: float
-    accelerometer_scale: float
-    magnetometer_scale: float
-    heartbeat: float
-
-    def __post_init__(self) -> None:
-        _check_nodes(self, self.nodes, IMU_COUNT)
-        if len(self.signs) != IMU_COUNT:
-            raise InputError(f"[imus] signs has {len(self.signs)} entries; {IMU_COUNT} are needed, one per IMU")
-        for imu, signs in enumerate(self.signs):
-            _check_signs(f"[imus] signs of IMU {imu}", signs, 3)
-        for name in ("gyroscope_scale", "accelerometer_scale", "magnetometer_scale"):
-            _check_positive(self, name)
-        _check(self, "heartbeat", 0.001, _LONGEST_TIME)
+    nodes: tuple[int, ...] = _entry("node ids", _node_ids(IMU_COUNT))
+    signs: tuple[tuple[int, ...], ...] = _entry("signs of each IMU's three axes", _imu_signs)
+    eds: str = _entry("electronic data sheet; a relative path begins at the folder of the settings file")
+    gyroscope_scale: float = _entry("value of one LSB of 16 bits [rad/s]", _positive)
+    accelerometer_scale: float = _entry("value of one LSB of 16 bits [m/s^2]", _positive)
+    magnetometer_scale: float = _entry("value of one LSB of 16 bits [uT]", _positive)
+    heartbeat: float = _entry("interval of the heartbeats [s]", _within(0.001, _LONGEST_TIME))
 
     @property
     def scales(self) -> tuple[float, float, float]:
-        """Of gyroscope, accelerometer and magnetometer."""
+        """Scales of gyroscope, accelerometer and magnetometer."""
         return self.gyroscope_scale, self.accelerometer_scale, self.magnetometer_scale
 
 
@@ -195,11 +199,8 @@ class CanopenSettings:
     """Settings of the CANopen rig.
 
     Attributes:
-        bus: what it is connected to.
-        controller: this side.
-        drives: the six drives.
-        imus: the seven IMUs.
-        folder: at which the paths of the EDS files begin.
+        bus, controller, drives, imus: the tables.
+        folder: where relative paths of the EDS files begin.
     """
 
     bus: BusSettings
@@ -230,8 +231,8 @@ class CanopenSettings:
         return self.folder / self.imus.eds
 
     def bus_load(self, rate: float) -> float:
-        """Share of the bus' time that the frames of a cycle take at `rate` [Hz], with as many stuff bits as there can be: the
-        PDOs, SYNC and a heartbeat; on classic CAN two frames per IMU and one magnetometer's.
+        """Share of the bus' time that the frames of a cycle take at `rate` [Hz] with the most stuff bits: the PDOs, SYNC and a
+        heartbeat; on classic CAN two frames per IMU and one magnetometer's.
         """
         bus = self.bus
         if bus.fd:
@@ -243,10 +244,10 @@ class CanopenSettings:
         return (LEGS * drive + imus + 2 * classic_bits(1) / bus.bitrate) * rate
 
     def check_bus_load(self, rate: float) -> float:
-        """The bus load at `rate` [Hz]; on a bus that is only emulated it may be any.
+        """The bus load at `rate` [Hz]; an emulated bus has no limit.
 
         Raises:
-            RigError: it is more than a real bus can carry.
+            RigError: a real bus cannot carry the load.
         """
         load = self.bus_load(rate)
         if self.bus.interface == "socketcan" and load > LARGEST_LOAD:
@@ -263,20 +264,20 @@ def object_dictionary(eds: Path, node: int) -> Any:
     """The object dictionary (canopen's) of a node.
 
     Raises:
-        InputError: the file is no EDS.
+        InputError: the file is not an EDS.
     """
     try:
         dictionary = canopen.import_od(str(eds), node_id=node)
     except (configparser.Error, LookupError, ValueError, OSError, canopen.ObjectDictionaryError) as error:
-        raise InputError(f"{eds} is no EDS file that can be used: {error}") from None
+        raise InputError(f"{eds} is not a usable EDS file: {error}") from None
     if 0x1000 not in dictionary or 0x1018 not in dictionary:
         raise InputError(f"{eds} lacks object 1000h or 1018h: use the EDS of the node's manufacturer")
     return dictionary
 
 
 def classic_bits(count: int) -> int:
-    """Bits on the wire of a classic frame with an 11-bit identifier and `count` bytes, with the most stuff bits and the space
-    between frames.
+    """Bits on the wire of a classic frame with an 11-bit identifier and `count` bytes, with the most stuff bits and the
+    interframe space.
     """
     return 47 + 8 * count + (34 + 8 * count - 1) // 4
 
@@ -284,8 +285,8 @@ def classic_bits(count: int) -> int:
 def fd_duration(count: int, bitrate: int, data_bitrate: int) -> float:
     """Duration [s] of a CAN FD frame with an 11-bit identifier and `count` bytes, bit rate switched, with the most stuff bits.
 
-    At the nominal bit rate: start, identifier and flags until BRS (17 bits), and from the CRC delimiter to the space between
-    frames (13). At the data bit rate: ESI, DLC, data, stuff count and CRC with fixed stuff bits.
+    At the nominal bit rate: start, identifier and flags until BRS (17 bits), and from the CRC delimiter to the interframe space
+    (13). At the data bit rate: ESI, DLC, data, stuff count and CRC with fixed stuff bits.
     """
     crc = 4 + (17 if count <= 16 else 21)
     head, body = 17, 5 + 8 * count
@@ -298,7 +299,7 @@ def canopen_settings(path: Path | str = DEFAULT_FILE, **changes: Mapping[str, An
     """Read the settings of a CANopen rig.
 
     Args:
-        path: a TOML file with all the entries that the default one has.
+        path: a TOML file with all entries of the default one.
         changes: by table, such as `bus={"interface": "virtual"}`.
 
     Raises:
@@ -306,65 +307,35 @@ def canopen_settings(path: Path | str = DEFAULT_FILE, **changes: Mapping[str, An
     """
     path = Path(path)
     document = read_toml(path)
-    names = {kind.table for kind in (BusSettings, ControllerSettings, DriveSettings, ImuSettings)}
+    kinds = (BusSettings, ControllerSettings, DriveSettings, ImuSettings)
+    names = [kind.table for kind in kinds]
     for name in [*document, *changes]:
         if name not in names:
-            raise InputError(f"{path} has a table [{name}] that is not known; the tables are {', '.join(sorted(names))}")
-    tables = {name: {**document.get(name, {}), **changes.get(name, {})} for name in names}
-    return CanopenSettings(
-        _read(BusSettings, tables["bus"]),
-        _read(ControllerSettings, tables["controller"]),
-        _read(DriveSettings, tables["drives"]),
-        _read(ImuSettings, tables["imus"]),
-        path.resolve().parent,
-    )
+            raise InputError(f"{path} has a table [{name}] that is not known; the tables are {', '.join(names)}")
+    tables: dict[str, Any] = {
+        kind.table: _read(kind, {**document.get(kind.table, {}), **changes.get(kind.table, {})}) for kind in kinds
+    }
+    return CanopenSettings(**tables, folder=path.resolve().parent)
 
 
 def _read(kind: type[S], table: Mapping[str, Any]) -> S:
-    title = f"[{kind.table}]"  # type: ignore[attr-defined]
-    known = [field.name for field in fields(kind)]  # type: ignore[arg-type]
+    entries = {each.name: each.metadata["text"] for each in fields(kind)}  # type: ignore[arg-type]
     hints = get_type_hints(kind)
-    check_entries(table, known, title)
+    check_entries(table, entries, f"[{kind.table}]")
     values = {}
-    for name in known:
+    for name, text in entries.items():
         if name not in table:
-            raise InputError(f"{title} lacks the entry {name!r}")
-        value = _frozen(table[name])
-        wanted = hints[name]
+            raise InputError(f"[{kind.table}] lacks the entry {name!r} ({text})")
+        value, wanted = _frozen(table[name]), hints[name]
         if wanted is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if wanted in (bool, int, float, str) and type(value) is not wanted:
-            raise InputError(f"{title} {name} must be a {wanted.__name__}, got {value!r}")
+            raise InputError(f"[{kind.table}] {name} must be a {wanted.__name__}, got {value!r}")
         if wanted not in (bool, int, float, str) and not isinstance(value, tuple):
-            raise InputError(f"{title} {name} must be a list, got {value!r}")
+            raise InputError(f"[{kind.table}] {name} must be a list, got {value!r}")
         values[name] = value
     return kind(**values)
 
 
 def _frozen(value: Any) -> Any:
     return tuple(_frozen(each) for each in value) if isinstance(value, list | tuple) else value
-
-
-def _check(settings: Any, name: str, lowest: float, highest: float) -> None:
-    value = getattr(settings, name)
-    if not lowest <= value <= highest:
-        raise InputError(f"[{settings.table}] {name} is {value:g}; it must be from {lowest:g} to {highest:g}")
-
-
-def _check_positive(settings: Any, name: str) -> None:
-    value = getattr(settings, name)
-    if not (isfinite(value) and value > 0.0):
-        raise InputError(f"[{settings.table}] {name} is {value:g}; it must be positive and finite")
-
-
-def _check_nodes(settings: Any, nodes: tuple[Any, ...], count: int) -> None:
-    if len(nodes) != count:
-        raise InputError(f"[{settings.table}] nodes has {len(nodes)} entries; {count} are needed")
-    for node in nodes:
-        if type(node) is not int or not 1 <= node <= _LARGEST_NODE:
-            raise InputError(f"[{settings.table}] nodes has {node!r}; a node id is a number from 1 to {_LARGEST_NODE}")
-
-
-def _check_signs(name: str, signs: Any, count: int) -> None:
-    if not isinstance(signs, tuple) or len(signs) != count or any(type(s) is not int or s not in (-1, 1) for s in signs):
-        raise InputError(f"{name} is {signs!r}; it must be {count} numbers, each 1 or -1")

@@ -33,41 +33,20 @@ class DatagramKind(IntEnum):
     MEASUREMENT = 4
 
 
-_HEAD = [
-    ("magic", np.uint32),
-    ("version", np.uint16),
-    ("kind", np.uint16),
-    ("session", np.uint32),
-    ("sequence", np.uint32),
-    ("time_ns", np.int64),
-]
+_HEAD = [("magic", "u4"), ("version", "u2"), ("kind", "u2"), ("session", "u4"), ("sequence", "u4"), ("time_ns", "i8")]
 
-HELLO_DATAGRAM = np.dtype([*_HEAD, ("period_us", np.uint32), ("reserved", np.uint32), ("crc", np.uint32)])
+HELLO_DATAGRAM = np.dtype([*_HEAD, ("period_us", "u4"), ("reserved", "u4"), ("crc", "u4")])
 """From the controller: begin a session with commands at this period [us]."""
 
 WELCOME_DATAGRAM = np.dtype(
-    [
-        *_HEAD,
-        ("watchdog_us", np.uint32),
-        ("truthful", np.uint32),
-        ("name", np.uint8, 32),
-        ("firmware", np.uint8, 16),
-        ("crc", np.uint32),
-    ]
+    [*_HEAD, ("watchdog_us", "u4"), ("truthful", "u4"), ("name", "u1", 32), ("firmware", "u1", 16), ("crc", "u4")]
 )
 """From the rig: its name and firmware, the time without a command after which its drives stop [us], and whether a truth follows
 its measurements, as an emulated rig's does.
 """
 
 COMMAND_DATAGRAM = np.dtype(
-    [
-        *_HEAD,
-        ("request", np.uint32),
-        ("reset", np.uint32),
-        ("velocity", np.float32, LEGS),
-        ("reserved", np.uint32),
-        ("crc", np.uint32),
-    ]
+    [*_HEAD, ("request", "u4"), ("reset", "u4"), ("velocity", "f4", LEGS), ("reserved", "u4"), ("crc", "u4")]
 )
 """From the controller, once per cycle: the request to the drives (0 brake, 1 follow, 2 quick stop), whether to reset faults,
 and the velocities [m/s]. The rig applies it, samples its IMUs, and answers with the same sequence number."""
@@ -75,22 +54,22 @@ and the velocities [m/s]. The rig applies it, samples its IMUs, and answers with
 MEASUREMENT_DATAGRAM = np.dtype(
     [
         *_HEAD,
-        ("sample_ns", np.int64, IMU_COUNT),
-        ("sample_number", np.uint32, IMU_COUNT),
-        ("refused", np.uint32),
-        ("drive", np.uint8, LEGS),
-        ("reserved", np.uint8, 2),
-        ("code", np.uint16, LEGS),
-        ("velocity", np.float32, LEGS),
-        ("measurement", np.float32, (3, IMU_COUNT, 3)),
-        ("crc", np.uint32),
+        ("sample_ns", "i8", IMU_COUNT),
+        ("sample_number", "u4", IMU_COUNT),
+        ("refused", "u4"),
+        ("drive", "u1", LEGS),
+        ("reserved", "u1", 2),
+        ("code", "u2", LEGS),
+        ("velocity", "f4", LEGS),
+        ("measurement", "f4", (3, IMU_COUNT, 3)),
+        ("crc", "u4"),
     ]
 )
 """From the rig, once per command: the time on its own clock [ns]; the time and number of each IMU's sample; how many datagrams
 it has refused; each drive's state (0 following, 1 ready, 2 not ready, 3 quick stop, 4 fault), fault code and velocity after
 limits [m/s]; and the raw IMU data [rad/s, m/s^2, uT], NaN without an IMU."""
 
-TRUTH_DATAGRAM = np.dtype([("truth", np.float64, TRUTH_SIZE), ("reserved", np.uint32), ("crc", np.uint32)])
+TRUTH_DATAGRAM = np.dtype([("truth", "f8", TRUTH_SIZE), ("reserved", "u4"), ("crc", "u4")])
 """An emulated rig appends it to a measurement."""
 
 LONGEST = MEASUREMENT_DATAGRAM.itemsize + TRUTH_DATAGRAM.itemsize

@@ -100,18 +100,17 @@ def answer_command(emulator: UdpEmulator, length: int, now_ns: int) -> int:
     """Apply the received command of `length` bytes, and write the answer; returns its length, 0 without one."""
     rig, session, link = emulator.rig[()], emulator.session[()], emulator.link
     c, a, t = link.command[0], link.answer[0], link.truth[0]
+    finite = True
+    for k in range(LEGS):
+        finite = finite and np.isfinite(c.velocity[k])
     if (
         not is_valid(link.command_bytes, c, length, link.command.itemsize, DatagramKind.COMMAND)
         or c.session != session.id
         or c.session == 0
         or not is_later(c.sequence, session.last)
+        or c.request > QUICK_STOP
+        or not finite
     ):
-        session.refused += 1
-        return 0
-    finite = True
-    for k in range(LEGS):
-        finite = finite and np.isfinite(c.velocity[k])
-    if c.request > QUICK_STOP or not finite:
         session.refused += 1
         return 0
     move(emulator.fmu, emulator.rig, now_ns)

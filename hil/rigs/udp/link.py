@@ -200,13 +200,13 @@ def decode_answer(link: UdpLink, length: int, feedback: Record) -> bool:
     s, a, t = link.socket[()], link.answer[0], link.truth[0]
     size = link.answer.itemsize
     with_truth = length == size + link.truth.itemsize
-    if s.stranger != 0 or not is_valid(link.answer_bytes, a, size if with_truth else length, size, DatagramKind.MEASUREMENT):
-        feedback.refused += 1
-        return False
-    if a.session != s.session or a.sequence != s.sequence:
-        feedback.refused += 1
-        return False
-    if with_truth and t.crc != crc32(link.answer_bytes[size:], link.truth.itemsize - 4):
+    if (
+        s.stranger != 0
+        or not is_valid(link.answer_bytes, a, size if with_truth else length, size, DatagramKind.MEASUREMENT)
+        or a.session != s.session
+        or a.sequence != s.sequence
+        or (with_truth and t.crc != crc32(link.answer_bytes[size:], link.truth.itemsize - 4))
+    ):
         feedback.refused += 1
         return False
     for k in range(IMU_COUNT):

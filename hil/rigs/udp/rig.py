@@ -12,9 +12,10 @@ import numpy as np
 from hil.rigs import (
     ANSWERED,
     BRAKED,
+    FAULTY,
     FOLLOWING,
+    OFF,
     QUICK_STOP,
-    QUICK_STOPPING,
     READY,
     SILENT,
     Identity,
@@ -120,14 +121,8 @@ class UdpRig:
         """
         if self._socket is None:
             raise RigError("the rig is not open: open it first")
-        feedback = new_feedback()[()]
-        deadline = time.monotonic() + _ARMING_S
         self.link.socket["reset"] = 1
-        ready = False
-        while not ready and time.monotonic() < deadline:
-            status = self.exchange(np.zeros(LEGS), BRAKED, feedback)
-            ready = status == ANSWERED and bool(np.isin(feedback["drive"], (READY, FOLLOWING)).all())
-            time.sleep(self.command_delay)
+        ready, feedback = self._exchange_until(BRAKED, (READY, FOLLOWING), _ARMING_S)
         self.link.socket["reset"] = 0
         if not ready:
             states = ", ".join(f"{k}: {int(drive)}" for k, drive in enumerate(feedback["drive"]))
@@ -144,13 +139,20 @@ class UdpRig:
         """Request a quick stop until the drives report that they have stopped, at most for half a second."""
         if self._socket is None:
             return
-        feedback, deadline = new_feedback()[()], time.monotonic() + _STOPPING_S
         self.link.socket["reset"] = 0
+        self._exchange_until(QUICK_STOP, (READY, OFF, FAULTY), _STOPPING_S)
+
+    def _exchange_until(self, request: int, states: tuple[int, ...], patience: float) -> tuple[bool, Record]:
+        """Repeat a request until all drives are in one of these states, at most for the patience [s]; returns whether they are,
+        and the feedback.
+        """
+        feedback, deadline = new_feedback()[()], time.monotonic() + patience
         while time.monotonic() < deadline:
-            answered = self.exchange(np.zeros(LEGS), QUICK_STOP, feedback) == ANSWERED
-            if answered and not np.isin(feedback["drive"], (FOLLOWING, QUICK_STOPPING)).any():
-                return
+            status = self.exchange(np.zeros(LEGS), request, feedback)
+            if status == ANSWERED and np.isin(feedback["drive"], states).all():
+                return True, feedback
             time.sleep(self.command_delay)
+        return False, feedback
 
     def close(self) -> None:
         """Brake the drives and close the socket. If the commands do not arrive, the rig's watchdog brakes the drives."""

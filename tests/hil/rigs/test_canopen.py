@@ -26,8 +26,9 @@ from hil.rigs import (
     new_feedback,
 )
 from hil.rigs.canopen.cia402 import HEARTBEAT_LOST, PDO_LOST
-from hil.rigs.canopen.frames import ANSWER, TPDO, Decoder, advance_of, drive_scales, pack_imu, raw_readings, sensor_scales
-from hil.rigs.canopen.nodes import CanopenNodes
+from hil.rigs.canopen.decoder import Decoder, advance_of
+from hil.rigs.canopen.emulated_bus import EmulatedBus
+from hil.rigs.canopen.frames import ANSWER, CobId, drive_scales, new_message, pack_imu, raw_readings, sensor_scales
 from hil.rigs.canopen.rig import CanopenRig
 from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings, classic_bits, fd_duration
 from plant.errors import InputError
@@ -46,6 +47,8 @@ class Kinematic:
         self.sample_ns, self.sequence = np.zeros(7, np.int64), np.zeros(7, np.int64)
         self.frozen, self.truth = np.zeros(7, bool), np.arange(19.0)
         self.now = None
+        names = ("request", "drive", "code", "target", "velocity", "measurement", "sample_ns", "sequence", "truth")
+        self.rig = {name: getattr(self, name) for name in names}
 
     def advance(self, now_ns):
         dt = 0.0 if self.now is None else (now_ns - self.now) * 1e-9
@@ -93,7 +96,7 @@ def wait_for(condition, seconds=5.0):
 @contextmanager
 def serving(config, machine=None, channel=None):
     """Nodes that are served in a thread."""
-    nodes = CanopenNodes(config, machine or Kinematic(), channel)
+    nodes = EmulatedBus(config, machine or Kinematic(), channel)
     stop = threading.Event()
     thread = threading.Thread(target=nodes.serve, args=(stop.is_set,))
     thread.start()
@@ -318,7 +321,7 @@ def test_a_leg_that_leaves_operation_stops():
     machine = Kinematic()
     with armed(settings(), machine) as (rig, _):
         run(rig, 10, np.full(6, 0.3))
-        rig._command_all_nodes(0x80)
+        rig._command_nodes(0x80)
         wait_for(lambda: (machine.velocity == 0.0).all())
         _, statuses = run(rig, 12, np.full(6, 0.3))
         assert statuses[-1] == SILENT
@@ -330,7 +333,7 @@ def test_late_and_double_frames_are_refused_and_counted(fd):
     faults = Counter()
 
     def channel(frame, outgoing):
-        if outgoing and frame.arbitration_id == TPDO + 11:
+        if outgoing and frame.arbitration_id == CobId.TPDO + 11:
             faults["sent"] += 1
             if faults["sent"] % 10 == 0:
                 faults["late"] += 1
@@ -424,7 +427,10 @@ def test_the_decoder_takes_anything(fd):
             decoder.begin(begins[i])
         at = (i * 37) % 65_000
         before = decoder.refused
-        sound = decoder.take(identifier, noise[at : at + size], *flag)
+        remote, error, extended = flag
+        data = noise[at : at + size]
+        message = can.Message(0.0, identifier, extended, remote, error, data=data)
+        sound = decoder.take(message)
         assert decoder.refused == before + (not sound)
         taken += sound
     decoder.write_measurement(measurement)
@@ -436,7 +442,7 @@ def test_the_decoder_takes_anything(fd):
 def test_nodes_take_anything():
     config = settings()
     machine = Kinematic()
-    nodes = CanopenNodes(config, machine)
+    nodes = EmulatedBus(config, machine)
     rng = np.random.default_rng(11)
     identifiers = rng.choice(sorted(nodes._heard), 20_000).tolist()
     sizes = rng.choice([0, 1, 2, 6, 7, 8, 64], 20_000).tolist()
@@ -469,7 +475,7 @@ def test_what_is_refused_changes_nothing():
     decoder.begin(5)
     for imu in range(7):
         for cob_id, data in pack_imu(raw[:, imu], 2**32 + 3, 10**12, 5, True, True):
-            assert decoder.take(cob_id + 11 + imu, data)
+            assert decoder.take(new_message(cob_id + 11 + imu, data))
     decoded = np.zeros((3, 7, 3))
     decoder.write_measurement(decoded)
     np.testing.assert_allclose(decoded, measurement, atol=0.026)
@@ -477,8 +483,8 @@ def test_what_is_refused_changes_nothing():
     state = decoder.sequence.copy(), decoder.sample_ns.copy()
     for sync, extra in ((5, b""), (7, b""), (6, b"\0")):
         (_, data), *_ = pack_imu(raw[:, 0] + 1, 9, 10**13, sync, True, True)
-        assert not decoder.take(TPDO + 11, data + extra)
-    assert not decoder.take(TPDO + 1, b"\0" * (ANSWER.size - 1))
+        assert not decoder.take(new_message(CobId.TPDO + 11, data + extra))
+    assert not decoder.take(new_message(CobId.TPDO + 1, bytes(ANSWER.size - 1)))
     again = np.zeros((3, 7, 3))
     decoder.write_measurement(again)
     np.testing.assert_array_equal(again, decoded)
@@ -534,7 +540,7 @@ def test_files_of_settings_are_checked(tmp_path):
     path.write_text(DEFAULT_FILE.read_text().replace('"imu.eds"', f'"{DEFAULT_FILE.parent}/imu.eds"'))
     eds.write_text("[1000]\n")
     rig = CanopenRig(canopen_settings(path, bus={"interface": "virtual"}), PERIOD)
-    with pytest.raises(InputError, match=r"drive.eds is no EDS file"):
+    with pytest.raises(InputError, match=r"drive.eds is not a usable EDS file"):
         rig.open()
     with pytest.raises(RigError, match="not open"):
         rig.arm()
@@ -553,7 +559,7 @@ def test_a_real_bus_is_not_overloaded():
 
 
 def _serve_in_process(config, ready, stop):
-    nodes = CanopenNodes(config, Kinematic())
+    nodes = EmulatedBus(config, Kinematic())
     ready.set()
     nodes.serve(stop.is_set)
     nodes.close()

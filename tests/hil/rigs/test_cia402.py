@@ -7,22 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hil.rigs import BRAKED, ENABLED, FAULTY, FOLLOWING, OFF, QUICK_STOP, QUICK_STOPPING, READY
+from hil.rigs.canopen.cia402 import Controlword as Word
+from hil.rigs.canopen.cia402 import PowerState as State
 from hil.rigs.canopen.cia402 import (
-    DISABLE_VOLTAGE,
-    ENABLE_OPERATION,
-    FAULT,
-    FAULT_REACTION_ACTIVE,
-    FAULT_RESET,
-    NO_STATE,
-    NOT_READY,
-    OPERATION_ENABLED,
-    QUICK_STOP_ACTIVE,
-    READY_TO_SWITCH_ON,
-    SHUTDOWN,
-    STATES,
-    SWITCH_ON,
-    SWITCH_ON_DISABLED,
-    SWITCHED_ON,
     commanded,
     controlword_towards,
     drive_state,
@@ -31,7 +18,7 @@ from hil.rigs.canopen.cia402 import (
     statusword,
 )
 
-ALL = range(len(STATES))
+ALL = tuple(State)
 WORDS = st.integers(0, 0xFFFF)
 
 
@@ -44,20 +31,28 @@ def test_statuswords_stand_for_their_state(state, powered, follows):
 
 def test_no_statusword_stands_for_two_states_and_some_for_none():
     found = [state_of(word) for word in range(1 << 16)]
-    assert set(found) == {NO_STATE, *ALL}
+    assert set(found) == {None, *ALL}
 
 
-@given(st.lists(WORDS, max_size=60), st.sampled_from([SWITCH_ON_DISABLED, FAULT, NOT_READY]))
+@given(
+    st.lists(WORDS, max_size=60),
+    st.sampled_from([State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON]),
+)
 def test_operation_is_enabled_only_along_the_legal_way(controlwords, state):
     previous, path = 0, [state]
     for controlword in controlwords:
         state, previous = commanded(state, controlword, previous), controlword
         path.append(state)
     legal = {
-        READY_TO_SWITCH_ON: {SWITCH_ON_DISABLED, READY_TO_SWITCH_ON, SWITCHED_ON, OPERATION_ENABLED},
-        SWITCHED_ON: {READY_TO_SWITCH_ON, SWITCHED_ON, OPERATION_ENABLED},
-        OPERATION_ENABLED: {SWITCHED_ON, OPERATION_ENABLED},
-        QUICK_STOP_ACTIVE: {OPERATION_ENABLED, QUICK_STOP_ACTIVE},
+        State.READY_TO_SWITCH_ON: {
+            State.SWITCH_ON_DISABLED,
+            State.READY_TO_SWITCH_ON,
+            State.SWITCHED_ON,
+            State.OPERATION_ENABLED,
+        },
+        State.SWITCHED_ON: {State.READY_TO_SWITCH_ON, State.SWITCHED_ON, State.OPERATION_ENABLED},
+        State.OPERATION_ENABLED: {State.SWITCHED_ON, State.OPERATION_ENABLED},
+        State.QUICK_STOP_ACTIVE: {State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE},
     }
     for before, after in pairwise(path):
         assert before in legal.get(after, {before, *ALL})
@@ -65,19 +60,23 @@ def test_operation_is_enabled_only_along_the_legal_way(controlwords, state):
 
 @given(WORDS, WORDS)
 def test_only_a_rising_edge_resets_a_fault(controlword, previous):
-    rising = bool(controlword & FAULT_RESET) and not previous & FAULT_RESET
-    assert commanded(FAULT, controlword, previous) == (SWITCH_ON_DISABLED if rising else FAULT)
+    rising = bool(controlword & Word.FAULT_RESET) and not previous & Word.FAULT_RESET
+    assert commanded(State.FAULT, controlword, previous) == (State.SWITCH_ON_DISABLED if rising else State.FAULT)
 
 
-@given(WORDS, WORDS, st.sampled_from([NOT_READY, FAULT_REACTION_ACTIVE]))
+@given(WORDS, WORDS, st.sampled_from([State.NOT_READY_TO_SWITCH_ON, State.FAULT_REACTION_ACTIVE]))
 def test_nothing_is_heeded_before_a_drive_is_ready_or_while_it_reacts_to_a_fault(controlword, previous, state):
     assert commanded(state, controlword, previous) == state
 
 
 @pytest.mark.parametrize(
-    "request_, goal", [(BRAKED, SWITCHED_ON), (ENABLED, OPERATION_ENABLED), (QUICK_STOP, SWITCH_ON_DISABLED)]
+    "request_, goal",
+    [(BRAKED, State.SWITCHED_ON), (ENABLED, State.OPERATION_ENABLED), (QUICK_STOP, State.SWITCH_ON_DISABLED)],
 )
-@pytest.mark.parametrize("start", [s for s in ALL if s not in (NOT_READY, FAULT, FAULT_REACTION_ACTIVE)])
+@pytest.mark.parametrize(
+    "start",
+    [state for state in ALL if state not in (State.NOT_READY_TO_SWITCH_ON, State.FAULT, State.FAULT_REACTION_ACTIVE)],
+)
 def test_the_controller_gets_where_it_wants(request_, goal, start):
     state, previous = start, 0
     for _ in range(6):
@@ -90,26 +89,33 @@ def test_the_controller_gets_where_it_wants(request_, goal, start):
 
 @given(st.lists(st.sampled_from([BRAKED, ENABLED, QUICK_STOP]), max_size=20))
 def test_the_controller_resets_no_fault_on_its_own(requests):
-    state, previous = FAULT, 0
+    state, previous = State.FAULT, 0
     for each in requests:
         controlword = controlword_towards(each, state)
         state, previous = commanded(state, controlword, previous), controlword
-    assert state == FAULT
+    assert state == State.FAULT
 
 
 def test_nothing_but_being_enabled_keeps_a_drive_enabled():
-    assert commanded(OPERATION_ENABLED, ENABLE_OPERATION, ENABLE_OPERATION) == OPERATION_ENABLED
-    assert commanded(OPERATION_ENABLED, SWITCH_ON, ENABLE_OPERATION) == SWITCHED_ON
-    assert commanded(OPERATION_ENABLED, SHUTDOWN, ENABLE_OPERATION) == READY_TO_SWITCH_ON
-    assert commanded(OPERATION_ENABLED, DISABLE_VOLTAGE, ENABLE_OPERATION) == SWITCH_ON_DISABLED
-    assert commanded(OPERATION_ENABLED, controlword_towards(QUICK_STOP, OPERATION_ENABLED), 0) == QUICK_STOP_ACTIVE
+    assert commanded(State.OPERATION_ENABLED, Word.ENABLE_OPERATION, Word.ENABLE_OPERATION) == State.OPERATION_ENABLED
+    assert commanded(State.OPERATION_ENABLED, Word.SWITCH_ON, Word.ENABLE_OPERATION) == State.SWITCHED_ON
+    assert commanded(State.OPERATION_ENABLED, Word.SHUTDOWN, Word.ENABLE_OPERATION) == State.READY_TO_SWITCH_ON
+    assert commanded(State.OPERATION_ENABLED, Word.DISABLE_VOLTAGE, Word.ENABLE_OPERATION) == State.SWITCH_ON_DISABLED
+    assert (
+        commanded(State.OPERATION_ENABLED, controlword_towards(QUICK_STOP, State.OPERATION_ENABLED), 0)
+        == State.QUICK_STOP_ACTIVE
+    )
 
 
 def test_what_a_drive_says():
-    assert drive_state(statusword(SWITCHED_ON, True, False)) == READY
-    assert drive_state(statusword(SWITCH_ON_DISABLED, False, False)) == OFF
-    assert drive_state(statusword(NOT_READY, True, False)) == OFF
-    assert drive_state(statusword(OPERATION_ENABLED, True, False)) == READY
-    assert drive_state(statusword(OPERATION_ENABLED, True, True)) == FOLLOWING
-    assert drive_state(statusword(QUICK_STOP_ACTIVE, True, False)) == QUICK_STOPPING
-    assert drive_state(statusword(FAULT, True, False)) == drive_state(statusword(FAULT_REACTION_ACTIVE, True, False)) == FAULTY
+    assert drive_state(statusword(State.SWITCHED_ON, True, False)) == READY
+    assert drive_state(statusword(State.SWITCH_ON_DISABLED, False, False)) == OFF
+    assert drive_state(statusword(State.NOT_READY_TO_SWITCH_ON, True, False)) == OFF
+    assert drive_state(statusword(State.OPERATION_ENABLED, True, False)) == READY
+    assert drive_state(statusword(State.OPERATION_ENABLED, True, True)) == FOLLOWING
+    assert drive_state(statusword(State.QUICK_STOP_ACTIVE, True, False)) == QUICK_STOPPING
+    assert (
+        drive_state(statusword(State.FAULT, True, False))
+        == drive_state(statusword(State.FAULT_REACTION_ACTIVE, True, False))
+        == FAULTY
+    )

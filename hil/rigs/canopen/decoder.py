@@ -1,0 +1,223 @@
+"""The decoder of the nodes' frames: statuswords, heartbeats and samples, and the count of everything that is refused."""
+
+from enum import IntEnum
+
+import can
+import numpy as np
+
+from hil.rigs.canopen.frames import (
+    ANSWER,
+    CLASSIC_TAIL,
+    CODE,
+    FD_TAIL,
+    NO_VALUE,
+    STAMP,
+    SYNC_OVERFLOW,
+    TRUTH,
+    TRUTH_BYTES,
+    TRUTH_ID,
+    CobId,
+    NodeState,
+    sensor_scales,
+)
+from hil.rigs.canopen.settings import FD_BYTES, CanopenSettings
+from plant.dynamics.variables import IMU_COUNT
+from plant.mechanism import LEGS
+from plant.pose import Array
+
+_TAIL_AT = 18
+_NODE_STATES = frozenset(NodeState)
+
+
+class _Frame(IntEnum):
+    """What a frame is; up to the accelerometer's, an answer to SYNC that comes once."""
+
+    DRIVE = 0
+    IMU_FD = 1
+    GYROSCOPE = 2
+    ACCELEROMETER = 3
+    MAGNETOMETER = 4
+    HEARTBEAT = 5
+    EMERGENCY = 6
+    OTHER = 7
+
+
+class Decoder:
+    """What the nodes have sent. It accepts any frame and never raises; a frame that is unknown, malformed, late or a duplicate
+    changes nothing and is counted.
+
+    Attributes:
+        statuswords, velocities, error_codes: of the drives; velocities in counts/s.
+        nmt: state in the last heartbeat of each drive, then of each IMU; -1 before the first.
+        heard_ns: time of each node's last frame on the controller's clock [ns].
+        now_ns: that clock, set by the reader of the bus [ns].
+        awaited: a bit for each frame that is expected in answer to SYNC.
+        received: a bit for each of these frames that has arrived.
+        refused: number of refused frames.
+        answered: set when an IMU has answered this SYNC.
+        sample_ns, sequence: time [ns] and number of the IMUs' samples.
+        truth: position, quaternion and lengths of an emulated rig; else NaN.
+    """
+
+    def __init__(self, settings: CanopenSettings) -> None:
+        fd, drives, imus = settings.bus.fd, settings.drives.nodes, settings.imus.nodes
+        self._table: dict[int, tuple[int, int, int]] = {}
+        for drive, node in enumerate(drives):
+            self._table[CobId.TPDO + node] = _Frame.DRIVE, drive, 1 << drive
+            self._table[CobId.HEARTBEAT + node] = _Frame.HEARTBEAT, drive, 0
+            self._table[CobId.EMERGENCY + node] = _Frame.EMERGENCY, drive, 0
+        for imu, node in enumerate(imus):
+            first = 1 << LEGS + imu
+            self._table[CobId.HEARTBEAT + node] = _Frame.HEARTBEAT, LEGS + imu, 0
+            self._table[CobId.EMERGENCY + node] = _Frame.EMERGENCY, -1, 0
+            self._table[CobId.TPDO + node] = _Frame.IMU_FD if fd else _Frame.GYROSCOPE, imu, first
+            if not fd:
+                self._table[CobId.TPDO + 0x100 + node] = _Frame.ACCELEROMETER, imu, first << IMU_COUNT
+                self._table[CobId.TPDO + 0x200 + node] = _Frame.MAGNETOMETER, imu, 0
+        # Frames of this side, which some buses return, and late answers to SDO requests.
+        own = [CobId.NMT, CobId.SYNC, CobId.HEARTBEAT + settings.controller.node, *(CobId.RPDO + node for node in drives)]
+        for each in own + [sdo + node for sdo in (CobId.SDO_ANSWER, CobId.SDO_REQUEST) for node in (*drives, *imus)]:
+            self._table[each] = _Frame.OTHER, 0, 0
+        self.all_frames = (1 << LEGS + IMU_COUNT * (1 if fd else 2)) - 1
+        self.statuswords, self.velocities, self.error_codes = [0] * LEGS, [0] * LEGS, [0] * LEGS
+        self.nmt, self.heard_ns = [-1] * (LEGS + IMU_COUNT), [0] * (LEGS + IMU_COUNT)
+        self.awaited, self.received, self.refused, self.answered = self.all_frames, self.all_frames, 0, False
+        self.sample_ns, self.sequence = [0] * IMU_COUNT, [-1] * IMU_COUNT
+        self.truth: tuple[float, ...] = (float("nan"),) * 13
+        self.now_ns, self._sync, self._syncs = 0, 0, 0
+        self._sample_at, self._sample_sync = [0] * IMU_COUNT, [0] * IMU_COUNT
+        self._stamps, self._counters = [0] * IMU_COUNT, [0] * IMU_COUNT
+        self._pending: list[tuple[bytes, int]] = [(b"", 0)] * IMU_COUNT
+        self._magnetic_sync = [0] * IMU_COUNT
+        self._raw = [bytearray(NO_VALUE.to_bytes(2, "little", signed=True) * (3 * IMU_COUNT)) for _ in range(3)]
+        self._readings = [np.frombuffer(sensor, "<i2").reshape(IMU_COUNT, 3) for sensor in self._raw]
+        self._scales = sensor_scales(settings)
+
+    def begin(self, sync: int) -> None:
+        """Accept answers to the SYNC with this counter from now on."""
+        self._sync, self.received = sync, 0
+        self._syncs += 1
+
+    def end(self) -> int:
+        """Accept no more answers to this SYNC; returns a bit for each missing frame."""
+        missing = self.all_frames & ~self.received
+        self.received = self.all_frames
+        return missing
+
+    def refuse(self) -> None:
+        """Count an unreadable frame."""
+        self.refused += 1
+
+    def take(self, message: can.Message) -> bool:
+        """Decode a frame; returns whether it was valid."""
+        identifier, data, size = message.arbitration_id, message.data, len(message.data)
+        broken = message.is_remote_frame or message.is_error_frame
+        if message.is_extended_id and identifier == TRUTH_ID and size == TRUTH_BYTES and not broken:
+            *truth, sync = TRUTH.unpack_from(data)
+            if sync == self._sync:
+                self.truth = tuple(truth)
+                return True
+        entry = self._table.get(identifier)
+        if entry is None or broken or message.is_extended_id:
+            self.refused += 1
+            return False
+        kind, node, bit = entry
+        if kind <= _Frame.ACCELEROMETER:
+            if self.received & bit:
+                # A silent node that was given up is awaited again.
+                self.awaited |= bit
+                self.refused += 1
+                return False
+            if kind == _Frame.DRIVE:
+                valid = size == ANSWER.size
+                if valid:
+                    self.statuswords[node], self.velocities[node], self.error_codes[node] = ANSWER.unpack_from(data)
+                    self.heard_ns[node] = self.now_ns
+            elif kind == _Frame.IMU_FD:
+                valid = size == FD_BYTES and self._take_fd(node, data)
+            elif kind == _Frame.GYROSCOPE:
+                valid = size == 8 and self._take_gyroscope(node, data)
+            else:
+                valid = size == 8 and self._take_accelerometer(node, data)
+            if valid:
+                self.received |= bit
+                self.awaited |= bit
+        elif kind == _Frame.MAGNETOMETER:
+            valid = size == 8 and self._take_magnetometer(node, data)
+        elif kind == _Frame.HEARTBEAT:
+            valid = size == 1 and data[0] in _NODE_STATES
+            if valid:
+                self.nmt[node], self.heard_ns[node] = data[0], self.now_ns
+        elif kind == _Frame.EMERGENCY:
+            valid = size == 8
+            if valid and node >= 0:
+                self.error_codes[node] = CODE.unpack_from(data)[0]
+        else:
+            return True
+        if not valid:
+            self.refused += 1
+        return valid
+
+    def _take_fd(self, imu: int, data: bytearray) -> bool:
+        counter, stamp, sync = FD_TAIL.unpack_from(data, _TAIL_AT)
+        if sync != self._sync:
+            return False
+        at = 6 * imu
+        for sensor, raw in enumerate(self._raw):
+            raw[at : at + 6] = data[6 * sensor : 6 * sensor + 6]
+        self._count(imu, counter, 1 << 32, stamp, 1 << 32, 1000)
+        return True
+
+    def _take_gyroscope(self, imu: int, data: bytearray) -> bool:
+        counter, sync = CLASSIC_TAIL.unpack_from(data, 6)
+        if sync != self._sync:
+            return False
+        self._pending[imu] = bytes(data[:6]), counter
+        return True
+
+    def _take_accelerometer(self, imu: int, data: bytearray) -> bool:
+        if not self.received & 1 << LEGS + imu:
+            return False
+        at = 6 * imu
+        self._raw[0][at : at + 6], counter = self._pending[imu]
+        self._raw[1][at : at + 6] = data[:6]
+        self._count(imu, counter, 1 << 8, STAMP.unpack_from(data, 6)[0], 1 << 16, 10_000)
+        return True
+
+    def _take_magnetometer(self, imu: int, data: bytearray) -> bool:
+        # Accepted a SYNC late, too: it is sampled so seldom that nothing waits for it.
+        sync = data[6]
+        if sync == self._magnetic_sync[imu] or (self._sync - sync) % SYNC_OVERFLOW > 1:
+            return False
+        self._magnetic_sync[imu] = sync
+        self._raw[2][6 * imu : 6 * imu + 6] = data[:6]
+        return True
+
+    def _count(self, imu: int, counter: int, counters: int, stamp: int, stamps: int, unit_ns: int) -> None:
+        """Note that this sample is the IMU's answer to SYNC; time and number advance with a new sample only."""
+        self.answered = True
+        if self.sequence[imu] < 0:
+            self.sequence[imu], self.sample_ns[imu] = counter, stamp * unit_ns
+        elif counter != self._counters[imu]:
+            elapsed = (self.now_ns - self._sample_at[imu]) / unit_ns
+            self.sample_ns[imu] += advance_of(stamp, self._stamps[imu], stamps, elapsed) * unit_ns
+            self.sequence[imu] += advance_of(counter, self._counters[imu], counters, self._syncs - self._sample_sync[imu])
+        else:
+            return
+        self._stamps[imu], self._counters[imu], self._sample_at[imu] = stamp, counter, self.now_ns
+        self._sample_sync[imu] = self._syncs
+
+    def write_measurement(self, measurement: Array) -> None:
+        """Write the last readings (3, 7, 3) [rad/s, m/s^2, uT], NaN without a value."""
+        for sensor, readings in enumerate(self._readings):
+            np.multiply(readings, self._scales[sensor], out=measurement[sensor])
+            measurement[sensor][readings == NO_VALUE] = np.nan
+
+
+def advance_of(stamp: int, before: int, modulus: int, expected: float) -> int:
+    """The advance of a counter that wraps at `modulus`, if that is about the expected one; never negative."""
+    advance = (stamp - before) % modulus
+    if advance - expected > modulus / 2:
+        # The counter has gone back: the IMU has restarted.
+        return max(round(expected), 1)
+    return advance + max(round((expected - advance) / modulus), 0) * modulus

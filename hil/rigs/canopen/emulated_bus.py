@@ -1,0 +1,198 @@
+"""The emulated nodes on a python-can bus: six drives and seven IMUs around a machine, served by one thread.
+
+The object dictionaries are read and written over SDO; SYNC and PDOs bypass them.
+"""
+
+import heapq
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from copy import deepcopy
+from itertools import count
+
+import can
+
+from hil.rigs.canopen.emulated_nodes import EmulatedDrive, EmulatedImu, EmulatedNode, Machine, Network
+from hil.rigs.canopen.frames import (
+    ANSWER,
+    COMMAND,
+    TRUTH_BYTES,
+    TRUTH_ID,
+    CobId,
+    NmtCommand,
+    NodeState,
+    new_message,
+    pack_imu,
+    pack_truth,
+    raw_readings,
+    sensor_scales,
+)
+from hil.rigs.canopen.settings import MAGNETOMETER_INTERVAL, CanopenSettings
+from plant.dynamics.variables import IMU_COUNT
+from plant.mechanism import LEGS
+
+Channel = Callable[[can.Message, bool], Iterable[tuple[float, can.Message]]]
+"""The bus's effect on a frame, with whether the nodes send it: the frames that arrive instead, each with its delay [s]."""
+
+_POLL_S = 0.005
+
+
+def _unchanged(message: can.Message, outgoing: bool) -> Iterable[tuple[float, can.Message]]:
+    return ((0.0, message),)
+
+
+class EmulatedBus:
+    """Six drives and seven IMUs around a machine, on a bus of their own.
+
+    Attributes:
+        drives, imus: the nodes.
+        lost: number of frames that could not be sent or read.
+    """
+
+    def __init__(self, settings: CanopenSettings, machine: Machine, channel: Channel | None = None) -> None:
+        self._machine, self._channel, self._fd = machine, channel or _unchanged, settings.bus.fd
+        self._scales = sensor_scales(settings)
+        self._bus = can.Bus(**settings.bus.arguments())
+        self._network = Network(self._send)
+        self.drives = [EmulatedDrive(leg, settings, machine, self._network, self._send) for leg in range(LEGS)]
+        self.imus = [EmulatedImu(imu, settings, self._network) for imu in range(IMU_COUNT)]
+        self.lost = 0
+        self._nodes: list[EmulatedNode] = [*self.drives, *self.imus]
+        self._controller = CobId.HEARTBEAT + settings.controller.node
+        self._commands = {CobId.RPDO + drive.node: drive for drive in self.drives}
+        self._requests = {CobId.SDO_REQUEST + node.node for node in self._nodes}
+        self._truth = new_message(TRUTH_ID, is_extended_id=True, dlc=TRUTH_BYTES, is_fd=True, bitrate_switch=True)
+        self._heard = {CobId.NMT, CobId.SYNC, self._controller, *self._commands, *self._requests}
+        self._held: list[tuple[int, int, bool, can.Message]] = []
+        self._numbers = count()
+        self._polled_ns = 0
+        for node in self._nodes:
+            self._boot(node)
+
+    def serve(self, stop: Callable[[], bool]) -> None:
+        """Answer the bus until `stop` returns true."""
+        while not stop():
+            now = time.monotonic_ns()
+            due = self._polled_ns + round(_POLL_S * 1e9)
+            if self._held:
+                due = min(due, self._held[0][0])
+            try:
+                message = self._bus.recv(max(due - now, 0) * 1e-9)
+            except (can.CanError, OSError, ValueError):
+                self.lost += 1
+                message = None
+                time.sleep(0.001)
+            # Some buses return the frames that the nodes have sent.
+            if message is not None and message.arbitration_id in self._heard:
+                self._pass(message, False)
+            now = time.monotonic_ns()
+            while self._held and self._held[0][0] <= now:
+                _, _, outgoing, frame = heapq.heappop(self._held)
+                self._arrive(frame, outgoing)
+            if now - self._polled_ns >= _POLL_S * 1e9:
+                self._poll(now)
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._bus.shutdown()
+
+    def _poll(self, now: int) -> None:
+        """Advance the machine, and check watchdogs and heartbeats."""
+        self._polled_ns = now
+        self._machine.advance(now)
+        for drive in self.drives:
+            drive.settle()
+            drive.watch(now)
+        for node in self._nodes:
+            if node.heartbeat_ns and now >= node.heartbeat_due:
+                node.heartbeat_due = now + node.heartbeat_ns
+                self._send_heartbeat(node, node.state)
+
+    def _send_heartbeat(self, node: EmulatedNode, state: NodeState) -> None:
+        self._send(new_message(CobId.HEARTBEAT + node.node, bytes((state,))))
+
+    def _boot(self, node: EmulatedNode) -> None:
+        node.reset()
+        self._send_heartbeat(node, NodeState.BOOT_UP)
+
+    def _send(self, message: can.Message) -> None:
+        # A frame that is held back must not change when its object is used again.
+        self._pass(deepcopy(message), True)
+
+    def _pass(self, message: can.Message, outgoing: bool) -> None:
+        for delay, frame in self._channel(message, outgoing):
+            if delay > 0.0:
+                due = time.monotonic_ns() + round(delay * 1e9)
+                heapq.heappush(self._held, (due, next(self._numbers), outgoing, frame))
+            else:
+                self._arrive(frame, outgoing)
+
+    def _arrive(self, message: can.Message, outgoing: bool) -> None:
+        if outgoing:
+            try:
+                self._bus.send(message)
+            except (can.CanError, OSError, ValueError):
+                self.lost += 1
+        elif not (message.is_extended_id or message.is_remote_frame or message.is_error_frame):
+            self._dispatch(message.arbitration_id, message.data)
+
+    def _dispatch(self, identifier: int, data: bytearray) -> None:
+        if drive := self._commands.get(identifier):
+            if CobId.RPDO in drive.active and len(data) == COMMAND.size:
+                drive.command = COMMAND.unpack_from(data)
+        elif identifier == CobId.SYNC:
+            self._on_sync(data[0] if len(data) == 1 else 0)
+        elif identifier == self._controller:
+            now = time.monotonic_ns()
+            for drive in self.drives:
+                if drive.controller == identifier - CobId.HEARTBEAT:
+                    drive.controller_ns = now
+        elif identifier in self._requests:
+            self._machine.advance(time.monotonic_ns())
+            # A request that is not an SDO frame is ignored.
+            with suppress(Exception):
+                self._network.notify(identifier, data, 0.0)
+        elif identifier == CobId.NMT and len(data) == 2:
+            self._on_nmt(data[0], data[1])
+
+    def _on_sync(self, sync: int) -> None:
+        machine, rig, now = self._machine, self._machine.rig, time.monotonic_ns()
+        machine.advance(now)
+        for drive in self.drives:
+            drive.settle()
+            if drive.command is not None:
+                drive.obey(*drive.command)
+                drive.command = None
+        machine.sample(now)
+        if self._fd:
+            self._truth.data = bytearray(pack_truth(rig["truth"], sync))
+            self._send(self._truth)
+        for drive in self.drives:
+            if CobId.TPDO in drive.active:
+                drive.answer.data = bytearray(ANSWER.pack(drive.statusword(), drive.velocity(), drive.code))
+                self._send(drive.answer)
+        raw = raw_readings(rig["measurement"], self._scales)
+        for node in self.imus:
+            if node.active:
+                imu = node.imu
+                turn = (sync - node.magnetometer_start) % MAGNETOMETER_INTERVAL == 0
+                sequence, sample_ns = int(rig["sequence"][imu]), int(rig["sample_ns"][imu])
+                for cob_id, data in pack_imu(raw[:, imu], sequence, sample_ns, sync, self._fd, turn):
+                    if cob_id in node.active:
+                        answer = node.answers[cob_id]
+                        answer.data, answer.dlc = bytearray(data), len(data)
+                        self._send(answer)
+
+    def _on_nmt(self, command: int, addressed: int) -> None:
+        for node in self._nodes:
+            if addressed not in (0, node.node):
+                continue
+            if command == NmtCommand.START:
+                node.start()
+            elif command == NmtCommand.STOP:
+                node.stop(NodeState.STOPPED)
+            elif command == NmtCommand.ENTER_PRE_OPERATIONAL:
+                node.stop(NodeState.PRE_OPERATIONAL)
+            elif command in (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION):
+                self._machine.restart()
+                self._boot(node)
