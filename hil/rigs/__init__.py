@@ -19,13 +19,14 @@ from plant.mechanism import LEGS
 from plant.pose import Array
 from plant.truth import TRUTH_SIZE
 
-BRAKED, ENABLED, QUICK_STOP = Request
-FOLLOWING, READY, OFF, QUICK_STOPPING, FAULTY = DriveState
-
 __all__ = [
     "ANSWERED", "BRAKED", "ENABLED", "FAULTY", "FEEDBACK", "FOLLOWING", "OFF", "QUICK_STOP", "QUICK_STOPPING", "READY",
-    "SILENT", "Identity", "Rig", "RigError", "new_feedback",
+    "SILENT", "DriveState", "Identity", "Request", "Rig", "RigError", "new_feedback",
 ]  # fmt: skip
+
+BRAKED, ENABLED, QUICK_STOP = Request
+FOLLOWING, READY, OFF, QUICK_STOPPING, FAULTY = DriveState
+"""The requests to the drives and the states of a drive, as a rig of the user's own may name them."""
 
 ANSWERED, SILENT = 0, 1
 """Statuses of an exchange. `ANSWERED`: the feedback is new. `SILENT`: no valid sample has arrived in time, and the feedback
@@ -53,7 +54,7 @@ FEEDBACK = np.dtype(
   an IMU.
 - `sample_ns`, `sequence`: time of each IMU's sample on the rig's own clock [ns], and its number. The number does not change
   when a sample is repeated.
-- `drive`, `drive_code`: state of each drive (`OFF`, `READY`, `FOLLOWING`, `QUICK_STOPPING`, `FAULTY`), and its fault code.
+- `drive`, `drive_code`: `DriveState` of each drive, and its fault code.
 - `sent`: the velocities that were really sent, after rounding and limits [m/s].
 - `truth`: as the plant's `truth` buffer has it; NaN unless the rig is emulated.
 - `round_trip_ns`: from the request to the answer [ns].
@@ -119,9 +120,9 @@ class Rig(Protocol):
         """
 
     def exchange(self, command: Array, request: int, feedback: Record) -> int:
-        """Send the commands (6,) [m/s] and the request to the drives (`BRAKED`, `ENABLED`, `QUICK_STOP`), and fill in the
-        `feedback` (dtype `FEEDBACK`). Returns `ANSWERED`, `SILENT`, or a failure. It must return within the period, and
-        should allocate little memory.
+        """Send the commands (6,) [m/s] and the `Request` to the drives, and fill in the `feedback` (dtype `FEEDBACK`).
+
+        Returns `ANSWERED`, `SILENT`, or a failure. It must return within the period, and should allocate little memory.
         """
 
     def quick_stop(self) -> None:

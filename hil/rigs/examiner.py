@@ -9,23 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.rigs import (
-    ANSWERED,
-    BRAKED,
-    ENABLED,
-    FAULTY,
-    FEEDBACK,
-    FOLLOWING,
-    QUICK_STOP,
-    QUICK_STOPPING,
-    READY,
-    SILENT,
-    Identity,
-    Rig,
-    RigError,
-    missing_members,
-    new_feedback,
-)  # fmt: skip
+from hil.rigs import ANSWERED, FEEDBACK, SILENT, DriveState, Identity, Request, Rig, RigError, missing_members, new_feedback
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import GoughError
@@ -51,7 +35,7 @@ _STALE_S = 0.01
 _REST_FORCE, _REST_RATE = (5.0, 15.0), 0.5
 _CLOSED_WITHIN_S = 1.0
 _REQUESTS = ("to hold on their brakes", "to follow", "to stop quickly")
-_DRIVES = ("following", "ready", "not ready", "stopping quickly", "faulty")
+_DRIVES = tuple(state.name.lower().replace("_", " ") for state in DriveState)
 _GUARD, _GUARD_BYTES = 0xA5, 64
 
 
@@ -114,8 +98,8 @@ class Examiner:
                 self._check_moving()
                 for _ in range(2):
                     self._call("quick_stop", "stops at any time", "while the drives are enabled ")
-                self._request(QUICK_STOP, np.zeros(LEGS), (QUICK_STOPPING, READY))
-                self._request(BRAKED, np.zeros(LEGS), (READY,))
+                self._request(Request.QUICK_STOP, np.zeros(LEGS), (DriveState.QUICK_STOPPING, DriveState.READY))
+                self._request(Request.BRAKED, np.zeros(LEGS), (DriveState.READY,))
         except _BrokenOffError:
             pass
         finally:
@@ -193,11 +177,11 @@ class Examiner:
         self._restart()
         count = max(FOLLOWED_WITHIN, round(_STANDSTILL_S / self._period))
         for i in range(count):
-            self._exchange(zero, BRAKED)
+            self._exchange(zero, Request.BRAKED)
             if i == 0:
-                self._stateless = self._feedback["drive"] == FOLLOWING
-            if self._moving and i >= FOLLOWED_WITHIN and not self._are((READY,)):
-                self._find_wrong_drives(BRAKED, i + 1)
+                self._stateless = self._feedback["drive"] == DriveState.FOLLOWING
+            if self._moving and i >= FOLLOWED_WITHIN and not self._are((DriveState.READY,)):
+                self._find_wrong_drives(Request.BRAKED, i + 1)
         self._check_contents()
         silent = self._statuses.get(SILENT, 0)
         if silent > _MOST_SILENT * count:
@@ -206,20 +190,20 @@ class Examiner:
     def _check_moving(self) -> None:
         zero, up = np.zeros(LEGS), np.full(LEGS, SPEED)
         count = max(3, round(STROKE_S / self._period))
-        self._request(ENABLED, zero, (FOLLOWING,))
+        self._request(Request.ENABLED, zero, (DriveState.FOLLOWING,))
         lengths = [self._feedback["truth"][TRUTH_LENGTHS].copy()]
         for command in (up, -up):
             for _ in range(count):
-                self._exchange(command, ENABLED)
+                self._exchange(command, Request.ENABLED)
             lengths.append(self._feedback["truth"][TRUTH_LENGTHS].copy())
         self._check_motion(lengths, count)
         if self._beyond is not None:
             self._check_limit(self._beyond)
-            self._exchange(np.full(LEGS, np.nan), ENABLED)
-        self._request(QUICK_STOP, zero, (QUICK_STOPPING, READY))
-        self._request(BRAKED, zero, (READY,))
-        self._request(ENABLED, zero, (FOLLOWING,))
-        self._exchange(up, ENABLED)
+            self._exchange(np.full(LEGS, np.nan), Request.ENABLED)
+        self._request(Request.QUICK_STOP, zero, (DriveState.QUICK_STOPPING, DriveState.READY))
+        self._request(Request.BRAKED, zero, (DriveState.READY,))
+        self._request(Request.ENABLED, zero, (DriveState.FOLLOWING,))
+        self._exchange(up, Request.ENABLED)
 
     def _check_motion(self, lengths: list[Array], count: int) -> None:
         """Check the lengths at the motion's start, turn and end. The mean of both ways cancels a drive's sag under load."""
@@ -238,7 +222,7 @@ class Examiner:
     def _check_limit(self, beyond: float) -> None:
         most = 0.0
         for command in (beyond, *[0.0] * SENT_WITHIN):
-            self._exchange(np.full(LEGS, command), ENABLED)
+            self._exchange(np.full(LEGS, command), Request.ENABLED)
             most = max(most, float(abs(self._feedback["sent"]).max()))
         if most >= abs(beyond):
             self._find("sent", f"A command of {beyond:g} m/s was sent as it is: limit it.")
@@ -261,7 +245,7 @@ class Examiner:
         codes = ", ".join(f"{int(code):#x}" for code in self._feedback["drive_code"])
         text = f"Asked {_REQUESTS[request]}, the drives are {states} after {count} exchanges (fault codes {codes})."
         self._find("drives", text, str(request))
-        if (drives == FAULTY).any():
+        if (drives == DriveState.FAULTY).any():
             raise _BrokenOffError
 
     # ------------------------------------------------------------------------------------------------------ exchanges
@@ -299,7 +283,7 @@ class Examiner:
             raise _BrokenOffError
         if not np.array_equal(given, command, equal_nan=True):
             self._find("exchanges", "exchange changed the commands; they belong to the loop.")
-        self._commands = [*self._commands[-SENT_WITHIN:], command if request == ENABLED else np.zeros(LEGS)]
+        self._commands = [*self._commands[-SENT_WITHIN:], command if request == Request.ENABLED else np.zeros(LEGS)]
         self._check_layout()
         self._check_order()
         if status == ANSWERED:

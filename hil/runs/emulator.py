@@ -18,7 +18,7 @@ import numpy as np
 from controller.planning.target import load_target
 from hil.loop.driver import prevent_compilation
 from hil.realtime.scheduling import RealTimeSettings, real_time
-from hil.rigs import FOLLOWING, QUICK_STOPPING
+from hil.rigs import DriveState
 from hil.rigs.emulation.drives import add_fault, new_emulated
 from hil.rigs.emulation.faults import fault
 from hil.rigs.udp.datagrams import HELLO_DATAGRAM, WELCOME_DATAGRAM, DatagramKind, decode, encode
@@ -267,7 +267,7 @@ def _serve_session(
             address = bytes(link.socket["sender"])
             sender = (socket.inet_ntoa(address[4:8]), int.from_bytes(address[2:4], "big"))
             # A moving rig has one controller.
-            if hello is None or np.isin(rig["drive"], (FOLLOWING, QUICK_STOPPING)).any():
+            if hello is None or np.isin(rig["drive"], (DriveState.FOLLOWING, DriveState.QUICK_STOPPING)).any():
                 session["refused"] += 1
             elif hello["session"] == session["id"]:
                 _welcome(opened, config, hello, sender)

@@ -9,7 +9,7 @@ Pure functions on integers.
 
 from enum import IntEnum
 
-from hil.rigs import BRAKED, ENABLED, FAULTY, FOLLOWING, OFF, QUICK_STOPPING, READY
+from hil.rigs import DriveState, Request
 
 
 class PowerState(IntEnum):
@@ -125,29 +125,29 @@ def controlword_towards(request: int, state: PowerState | None) -> Controlword:
     `BRAKED` leads to Switched on, `ENABLED` to Operation enabled, `QUICK_STOP` to rest in Switch on disabled. `ENABLED` lets a
     quick stop finish; `BRAKED` cuts it short. This function never resets a fault.
     """
-    if request not in (BRAKED, ENABLED):
+    if request not in (Request.BRAKED, Request.ENABLED):
         return Controlword.QUICK_STOP
     if state == PowerState.SWITCH_ON_DISABLED:
         return Controlword.SHUTDOWN
     if state == PowerState.QUICK_STOP_ACTIVE:
-        return Controlword.QUICK_STOP if request == ENABLED else Controlword.DISABLE_VOLTAGE
+        return Controlword.QUICK_STOP if request == Request.ENABLED else Controlword.DISABLE_VOLTAGE
     if state in (PowerState.SWITCHED_ON, PowerState.OPERATION_ENABLED):
-        return Controlword.ENABLE_OPERATION if request == ENABLED else Controlword.SWITCH_ON
+        return Controlword.ENABLE_OPERATION if request == Request.ENABLED else Controlword.SWITCH_ON
     return Controlword.SWITCH_ON if state == PowerState.READY_TO_SWITCH_ON else Controlword.DISABLE_VOLTAGE
 
 
-def drive_state(word: int) -> int:
-    """A drive's state for the loop (`OFF`, `READY`, `FOLLOWING`, `QUICK_STOPPING`, `FAULTY`), by its statusword.
+def drive_state(word: int) -> DriveState:
+    """A drive's state for the loop, by its statusword.
 
     A drive whose power stage is supplied is ready from Switch on disabled on, because `controlword_towards` leads it further;
     in Operation enabled it is ready until it follows the target velocity.
     """
     state = state_of(word)
     if state in (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE):
-        return FAULTY
+        return DriveState.FAULTY
     if state == PowerState.QUICK_STOP_ACTIVE:
-        return QUICK_STOPPING
+        return DriveState.QUICK_STOPPING
     if state == PowerState.OPERATION_ENABLED and word & FOLLOWS_TARGET:
-        return FOLLOWING
+        return DriveState.FOLLOWING
     not_ready = state in (None, PowerState.NOT_READY_TO_SWITCH_ON) or not word & VOLTAGE_ENABLED
-    return OFF if not_ready else READY
+    return DriveState.NOT_READY if not_ready else DriveState.READY

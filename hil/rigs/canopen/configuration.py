@@ -2,7 +2,7 @@
 
 import time
 
-from hil.rigs import BRAKED, RigError
+from hil.rigs import Request, RigError
 from hil.rigs.canopen.cia402 import CYCLIC_SYNCHRONOUS_VELOCITY, Controlword, PowerState, controlword_towards, state_of
 from hil.rigs.canopen.frames import SYNC_OVERFLOW
 from hil.rigs.canopen.objects import (
@@ -95,7 +95,7 @@ def switch_on(node: RemoteNode, controller: ControllerSettings) -> int:
             resets += 1
             node.write(Object.CONTROLWORD, 0, Controlword.DISABLE_VOLTAGE)
             node.write(Object.CONTROLWORD, 0, Controlword.FAULT_RESET)
-        node.write(Object.CONTROLWORD, 0, controlword_towards(BRAKED, state))
+        node.write(Object.CONTROLWORD, 0, controlword_towards(Request.BRAKED, state))
 
 
 def interpolation_period(period: float) -> tuple[int, int]:

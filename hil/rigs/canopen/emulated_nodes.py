@@ -12,7 +12,7 @@ import can
 import canopen
 from canopen.sdo import SdoAbortedError
 
-from hil.rigs import BRAKED, ENABLED, FAULTY, FOLLOWING, OFF, QUICK_STOP, READY
+from hil.rigs import DriveState, Request
 from hil.rigs.canopen.cia402 import (
     CYCLIC_SYNCHRONOUS_VELOCITY,
     HEARTBEAT_LOST,
@@ -234,7 +234,7 @@ class EmulatedDrive(EmulatedNode):
     def statusword(self) -> int:
         """The present statusword."""
         drive = self.machine.rig["drive"][self.leg]
-        return statusword(self.power, bool(drive != OFF), bool(drive == FOLLOWING))
+        return statusword(self.power, bool(drive != DriveState.NOT_READY), bool(drive == DriveState.FOLLOWING))
 
     def velocity(self) -> int:
         """[counts/s]."""
@@ -254,14 +254,14 @@ class EmulatedDrive(EmulatedNode):
     def settle(self) -> None:
         """Follow what the machine's drive does by itself."""
         drive = int(self.machine.rig["drive"][self.leg])
-        if drive == OFF:
+        if drive == DriveState.NOT_READY:
             self.power = PowerState.NOT_READY_TO_SWITCH_ON
         elif self.power == PowerState.NOT_READY_TO_SWITCH_ON:
             self.power = PowerState.SWITCH_ON_DISABLED
-        if drive == FAULTY and self.power not in (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE):
+        if drive == DriveState.FAULTY and self.power not in (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE):
             self.power = PowerState.FAULT
             self._report(int(self.machine.rig["code"][self.leg]))
-        elif drive in (READY, FAULTY):
+        elif drive in (DriveState.READY, DriveState.FAULTY):
             self.power = settled(self.power)
         self.request()
 
@@ -292,11 +292,11 @@ class EmulatedDrive(EmulatedNode):
         """Pass the power state on to the machine's drive, as a request and a target."""
         rig, leg, power, target = self.machine.rig, self.leg, self.power, 0.0
         if power == PowerState.OPERATION_ENABLED:
-            rig["request"][leg] = ENABLED
+            rig["request"][leg] = Request.ENABLED
             target = self.target / self._scale if self.mode == CYCLIC_SYNCHRONOUS_VELOCITY else 0.0
         else:
             stopping = power in (PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
-            rig["request"][leg] = QUICK_STOP if stopping else BRAKED
+            rig["request"][leg] = Request.QUICK_STOP if stopping else Request.BRAKED
         rig["target"][leg] = target
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import can
 import numpy as np
 
-from hil.rigs import FOLLOWING, QUICK_STOPPING
+from hil.rigs import DriveState
 from hil.rigs.canopen.emulated_bus import EmulatedBus
 from hil.rigs.canopen.settings import CanopenSettings
 from hil.rigs.emulation.drives import EMULATED, move, sample
@@ -53,7 +53,7 @@ class PlantMachine:
 
     def restart(self) -> None:
         """Put the platform back to its start, unless a drive moves or none was ever enabled."""
-        if self.rig["enabled_ns"] < 0 or np.isin(self.rig["drive"], (FOLLOWING, QUICK_STOPPING)).any():
+        if self.rig["enabled_ns"] < 0 or np.isin(self.rig["drive"], (DriveState.FOLLOWING, DriveState.QUICK_STOPPING)).any():
             return
         self._plant.close()
         self._begin()

@@ -13,7 +13,7 @@ from typing import Any
 import can
 import canopen
 
-from hil.rigs import ANSWERED, ENABLED, OFF, SILENT, Identity, RigError
+from hil.rigs import ANSWERED, SILENT, DriveState, Identity, Request, RigError
 from hil.rigs.canopen.cia402 import Controlword, controlword_towards, drive_state, state_of
 from hil.rigs.canopen.configuration import configure_drive, configure_imu, switch_on
 from hil.rigs.canopen.decoder import Decoder
@@ -249,7 +249,7 @@ class CanopenRig:
     def _send_commands(self, command: Array, request: int, feedback: Record) -> None:
         statuswords, limit, sent = self.decoder.statuswords, self._settings.drives.velocity_limit, feedback["sent"]
         for drive, message in enumerate(self._commands):
-            velocity = float(command[drive]) if request == ENABLED else 0.0
+            velocity = float(command[drive]) if request == Request.ENABLED else 0.0
             # NaN is no command.
             velocity = min(max(velocity, -limit), limit) if velocity == velocity else 0.0
             counts = round(velocity * self._scales[drive])
@@ -299,7 +299,7 @@ class CanopenRig:
         feedback["drive"] = [
             drive_state(decoder.statuswords[drive])
             if decoder.nmt[drive] == NodeState.OPERATIONAL and now - decoder.heard_ns[drive] <= self._silence_ns
-            else OFF
+            else DriveState.NOT_READY
             for drive in range(LEGS)
         ]
         feedback["drive_code"] = decoder.error_codes

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from hil.rigs import BRAKED, ENABLED, FAULTY, FOLLOWING, OFF, QUICK_STOP, QUICK_STOPPING, READY
+from hil.rigs import DriveState, Request
 from hil.rigs.emulation.faults import FAULT, MOST_FAULTS, FaultKind, draw_normal, is_active
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
@@ -51,9 +51,9 @@ EMULATED = np.dtype(
 """State of an emulated rig: its clock, the plant's largest step, when the drives were first enabled (negative before), the
 drives' `deceleration` in a quick stop or after a fault [m/s^2], their speed limit [m/s], payload and added payload [kg].
 
-A bus sets each drive's `request` (`BRAKED`, `ENABLED`, `QUICK_STOP`), its `target` velocity [m/s], and `reset` to clear its
-fault. It reads each drive's state (`OFF`, `READY`, `FOLLOWING`, `QUICK_STOPPING`, `FAULTY`), fault code and present `velocity`
-[m/s], and each IMU's last sample with its time and number. The rest are the faults, their random state, and scratch.
+A bus sets each drive's `request` (`Request`), its `target` velocity [m/s], and `reset` to clear its fault. It reads each
+drive's state (`DriveState`), fault code and present `velocity` [m/s], and each IMU's last sample with its time and number. The
+rest are the faults, their random state, and scratch.
 """
 
 POWER_LOST = 0x3220
@@ -76,7 +76,7 @@ def new_emulated(mechanism: Mechanism, step_ns: int, seed: int, faults: Iterable
     limits = mechanism.require_limits()
     rig["step_ns"], rig["deceleration"], rig["speed_limit"] = step_ns, limits.acceleration, _SPEED_RESERVE * limits.velocity
     rig["payload"] = mechanism.plant_parameters()["payload.mass"]
-    rig["enabled_ns"], rig["drive"], rig["random"] = -1, READY, seed + 1
+    rig["enabled_ns"], rig["drive"], rig["random"] = -1, DriveState.READY, seed + 1
     for each in faults:
         add_fault(rig, each)
     return rig
@@ -168,7 +168,7 @@ def move(fmu: Record, rig: Record, now_ns: int) -> int:
             r.added = added
         for k in range(LEGS):
             _step_drive(r, k, 1e-9 * step)
-            moving = r.drive[k] == FOLLOWING or r.drive[k] == QUICK_STOPPING or r.velocity[k] != 0.0
+            moving = r.drive[k] == DriveState.FOLLOWING or r.drive[k] == DriveState.QUICK_STOPPING or r.velocity[k] != 0.0
             c.mode[k] = VELOCITY if moving else BRAKE
         status |= write_drive_modes(fmu) | write_command(fmu, r.velocity)
         status |= advance(fmu, 1e-9 * step)
@@ -193,36 +193,36 @@ def _step_drive(r: Record, k: int, period: float) -> None:
             if f.kind == FaultKind.DRIVE_RUNS_AWAY:
                 running, runaway = True, f.size
     if unpowered:
-        r.drive[k], r.velocity[k] = OFF, 0.0
+        r.drive[k], r.velocity[k] = DriveState.NOT_READY, 0.0
         return
-    if r.drive[k] == OFF:
-        r.drive[k], r.code[k] = FAULTY, POWER_LOST
-    if broken and r.drive[k] != FAULTY:
-        r.drive[k], r.code[k] = FAULTY, code
-    if r.drive[k] == FAULTY:
+    if r.drive[k] == DriveState.NOT_READY:
+        r.drive[k], r.code[k] = DriveState.FAULTY, POWER_LOST
+    if broken and r.drive[k] != DriveState.FAULTY:
+        r.drive[k], r.code[k] = DriveState.FAULTY, code
+    if r.drive[k] == DriveState.FAULTY:
         if r.reset[k] != 0 and not broken and r.velocity[k] == 0.0:
-            r.drive[k], r.code[k] = READY, 0
-    elif r.request[k] == BRAKED:
-        r.drive[k] = READY
-    elif r.request[k] == ENABLED and r.drive[k] != QUICK_STOPPING:
+            r.drive[k], r.code[k] = DriveState.READY, 0
+    elif r.request[k] == Request.BRAKED:
+        r.drive[k] = DriveState.READY
+    elif r.request[k] == Request.ENABLED and r.drive[k] != DriveState.QUICK_STOPPING:
         if r.enabled_ns < 0:
             r.enabled_ns = r.time_ns
-        r.drive[k] = FOLLOWING
-    elif r.request[k] == QUICK_STOP and r.drive[k] == FOLLOWING:
-        r.drive[k] = QUICK_STOPPING
+        r.drive[k] = DriveState.FOLLOWING
+    elif r.request[k] == Request.QUICK_STOP and r.drive[k] == DriveState.FOLLOWING:
+        r.drive[k] = DriveState.QUICK_STOPPING
     r.reset[k] = 0
     if stuck:
         r.velocity[k] = 0.0
-    elif running and r.request[k] != BRAKED:
+    elif running and r.request[k] != Request.BRAKED:
         r.velocity[k] = runaway
-    elif ignoring and r.request[k] != BRAKED:
+    elif ignoring and r.request[k] != Request.BRAKED:
         return
-    elif r.drive[k] == FOLLOWING:
+    elif r.drive[k] == DriveState.FOLLOWING:
         r.velocity[k] = min(max(r.target[k], -r.speed_limit), r.speed_limit)
-    elif r.drive[k] == READY and r.request[k] == BRAKED:
+    elif r.drive[k] == DriveState.READY and r.request[k] == Request.BRAKED:
         r.velocity[k] = 0.0
     else:
         slower = r.deceleration * period
         r.velocity[k] -= min(max(r.velocity[k], -slower), slower)
-        if r.velocity[k] == 0.0 and r.drive[k] == QUICK_STOPPING:
-            r.drive[k] = READY
+        if r.velocity[k] == 0.0 and r.drive[k] == DriveState.QUICK_STOPPING:
+            r.drive[k] = DriveState.READY

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.rigs import ANSWERED, BRAKED, FAULTY, FOLLOWING, QUICK_STOP, QUICK_STOPPING, SILENT
+from hil.rigs import ANSWERED, SILENT, DriveState, Request
 from hil.rigs.emulation.drives import move, sample
 from hil.rigs.emulation.faults import disturb, draw
 from hil.rigs.udp.datagrams import HELLO_DATAGRAM, LONGEST, MAGIC, VERSION, Bytes, DatagramKind, crc32, is_valid
@@ -108,7 +108,7 @@ def answer_command(emulator: UdpEmulator, length: int, now_ns: int) -> int:
         or c.session != session.id
         or c.session == 0
         or not is_later(c.sequence, session.last)
-        or c.request > QUICK_STOP
+        or c.request > Request.QUICK_STOP
         or not finite
     ):
         session.refused += 1
@@ -117,7 +117,7 @@ def answer_command(emulator: UdpEmulator, length: int, now_ns: int) -> int:
     session.last, session.commanded_ns = c.sequence, now_ns
     for k in range(LEGS):
         rig.request[k], rig.target[k] = c.request, c.velocity[k]
-        rig.reset[k] = 1 if c.reset != 0 and c.request == BRAKED else 0
+        rig.reset[k] = 1 if c.reset != 0 and c.request == Request.BRAKED else 0
     # The request takes effect in this instant.
     move(emulator.fmu, emulator.rig, now_ns + 1)
     if sample(emulator.fmu, emulator.imu, emulator.rig, now_ns + 1) != 0:
@@ -147,8 +147,8 @@ def check_watchdog(emulator: UdpEmulator, now_ns: int) -> None:
     if now_ns - session.commanded_ns <= session.watchdog_ns:
         return
     for k in range(LEGS):
-        if rig.drive[k] == FOLLOWING or rig.drive[k] == QUICK_STOPPING:
-            rig.drive[k], rig.code[k], rig.request[k] = FAULTY, WATCHDOG_CODE, BRAKED
+        if rig.drive[k] == DriveState.FOLLOWING or rig.drive[k] == DriveState.QUICK_STOPPING:
+            rig.drive[k], rig.code[k], rig.request[k] = DriveState.FAULTY, WATCHDOG_CODE, Request.BRAKED
 
 
 @kernel

@@ -12,7 +12,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from hil.rigs import ANSWERED, FAULTY, OFF, SILENT
+from hil.rigs import ANSWERED, SILENT, DriveState
 from hil.rigs.udp.datagrams import (
     COMMAND_DATAGRAM,
     LONGEST,
@@ -215,7 +215,7 @@ def decode_answer(link: UdpLink, length: int, feedback: Record) -> bool:
             for i in range(3):
                 feedback.measurement[kind, k, i] = a.measurement[kind, k, i]
     for k in range(LEGS):
-        feedback.drive[k] = a.drive[k] if a.drive[k] <= FAULTY else OFF.value
+        feedback.drive[k] = a.drive[k] if a.drive[k] <= DriveState.FAULTY else DriveState.NOT_READY.value
         feedback.drive_code[k], feedback.sent[k] = a.code[k], a.velocity[k]
     for i in range(feedback.truth.size):
         feedback.truth[i] = t.truth[i] if with_truth else np.nan

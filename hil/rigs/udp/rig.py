@@ -9,19 +9,7 @@ import time
 
 import numpy as np
 
-from hil.rigs import (
-    ANSWERED,
-    BRAKED,
-    FAULTY,
-    FOLLOWING,
-    OFF,
-    QUICK_STOP,
-    READY,
-    SILENT,
-    Identity,
-    RigError,
-    new_feedback,
-)
+from hil.rigs import ANSWERED, SILENT, DriveState, Identity, Request, RigError, new_feedback
 from hil.rigs.udp.datagrams import HELLO_DATAGRAM, WELCOME_DATAGRAM, DatagramKind, decode, encode
 from hil.rigs.udp.link import exchange_udp, new_link, parse_address, send_command, socket_address
 from plant.compiled import Record
@@ -122,7 +110,7 @@ class UdpRig:
         if self._socket is None:
             raise RigError("the rig is not open: open it first")
         self.link.socket["reset"] = 1
-        ready, feedback = self._exchange_until(BRAKED, (READY, FOLLOWING), _ARMING_S)
+        ready, feedback = self._exchange_until(Request.BRAKED, (DriveState.READY, DriveState.FOLLOWING), _ARMING_S)
         self.link.socket["reset"] = 0
         if not ready:
             states = ", ".join(f"{k}: {int(drive)}" for k, drive in enumerate(feedback["drive"]))
@@ -133,14 +121,14 @@ class UdpRig:
         """One exchange (see `hil.rigs.Rig.exchange`)."""
         if self._socket is None:
             return SILENT
-        return exchange_udp(self.link, command, request, feedback, self._timespec)
+        return exchange_udp(self.link, command, int(request), feedback, self._timespec)
 
     def quick_stop(self) -> None:
         """Request a quick stop until the drives report that they have stopped, at most for half a second."""
         if self._socket is None:
             return
         self.link.socket["reset"] = 0
-        self._exchange_until(QUICK_STOP, (READY, OFF, FAULTY), _STOPPING_S)
+        self._exchange_until(Request.QUICK_STOP, (DriveState.READY, DriveState.NOT_READY, DriveState.FAULTY), _STOPPING_S)
 
     def _exchange_until(self, request: int, states: tuple[int, ...], patience: float) -> tuple[bool, Record]:
         """Repeat a request until all drives are in one of these states, at most for the patience [s]; returns whether they are,
@@ -160,7 +148,7 @@ class UdpRig:
             return
         if self._identity is not None:
             for _ in range(_FAREWELLS):
-                send_command(self.link, np.zeros(LEGS), BRAKED, 0)
+                send_command(self.link, np.zeros(LEGS), int(Request.BRAKED), 0)
         self._socket.close()
         self._socket, self._identity = None, None
         self.link.socket["descriptor"] = -1
