@@ -87,9 +87,9 @@ def _time_methods(mechanism: Mechanism) -> dict[str, dict[str, float]]:
         for kind, refine in (("closed_form", False), ("refined", True)):
             given = measurements_of(method, measurements)
             run = partial(solve_batch, mechanism, **given, method=method, refine=refine, workers=1)
-            us = 1e6 * _median_s(run) / _ROWS
+            # The first run may compile.
             if run().solved.mean() > 0.5:
-                kinds[kind] = us
+                kinds[kind] = 1e6 * _median_s(run) / _ROWS
         if kinds:
             times[method] = kinds
     return times
