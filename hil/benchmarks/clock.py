@@ -48,11 +48,7 @@ _FORK = multiprocessing.get_context("fork")
 
 
 def measure_real_time(seconds: dict[float, float], progress: Progress = no_progress) -> dict[str, Any]:
-    """Time loops on the clock.
-
-    Args:
-        seconds: duration by rate [Hz], pooled over slices, idle and again under load.
-        progress: called with the share that is done.
+    """Time loops on the clock, for so many `seconds` by rate [Hz], idle and again under load.
 
     Returns:
         `rates`: by rate and condition, `compute_us`, `latency_us`, `wake_us`, `cyclictest_us` (None without cyclictest),
@@ -88,10 +84,6 @@ def measure_real_time(seconds: dict[float, float], progress: Progress = no_progr
 
 def measure_measures(seconds: float, progress: Progress = no_progress) -> dict[str, Any]:
     """The effect of each measure of `hil.realtime.scheduling`: the loop at 1 kHz with all, without each, and without any.
-
-    Args:
-        seconds: duration of each, idle and again under load.
-        progress: called with the share that is done.
 
     Returns:
         By the measure left out ("nothing" and "all" included) and condition: `wake_us` and `compute_us` with p50, p99, p999,

@@ -26,11 +26,7 @@ _BLOCK = 50
 
 
 def measure_plant(duration: float, progress: Progress = no_progress) -> dict[str, Any]:
-    """Drive the plant of the hexapod with sines of all legs.
-
-    Args:
-        duration: of the motion [s].
-        progress: called with the share that is done.
+    """Drive the plant of the hexapod with sines of all legs, for this duration [s].
 
     Returns:
         `step_us`: of a 1 ms step from compiled code, by FMI's version; `calls_us`: of each call of a cycle (FMI 3.0), where the

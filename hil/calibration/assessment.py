@@ -44,9 +44,7 @@ _FOLDS = 5
 def assess(data: CalibrationData, cases: Mapping[str, tuple[Calibration, Array]]) -> dict[str, Any]:
     """Residuals at rest and the accuracy of poses at rest, predicted and, where the truth is known, true.
 
-    Args:
-        data: with the rests.
-        cases: by stage, its calibration and the covariance (185, 185) of the errors that it leaves.
+    `cases` has by stage its calibration and the covariance (185, 185) of the remaining errors.
     """
     figures: dict[str, Any] = {"rests": len(data.readings), "residual_mg": {}, "residual_by_imu_mg": {}}
     figures |= {"predicted": {}, "true": {}}
@@ -95,7 +93,7 @@ def cross_validate(
     Args:
         data: with the rests.
         calibration: from all data.
-        samples: of the motion, (N, 3, 7, 3).
+        samples: (N, 3, 7, 3), of the motion.
         start: pose and twist (6,) at its first sample.
     """
     everything = np.arange(len(data.readings))
@@ -138,9 +136,7 @@ def _calibrate_part(data: CalibrationData, kept: NDArray[np.int64]) -> Found:
 def constants(calibration: Calibration, prior_sigmas: Array) -> dict[str, Any]:
     """The constants of each IMU by name with their standard deviations, and those that the data hardly told.
 
-    Args:
-        calibration: of the rig.
-        prior_sigmas: standard deviations before the calibration, of all errors of all IMUs.
+    `prior_sigmas` are the standard deviations of all errors of all IMUs before the calibration.
     """
     covariance, before = calibration.covariance, prior_sigmas.reshape(IMU_COUNT, -1, 3)
     sigmas = np.sqrt(np.diag(covariance)).reshape(IMU_COUNT, -1, 3) if covariance is not None else before

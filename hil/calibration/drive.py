@@ -70,7 +70,6 @@ def calibrate_rig(
     Args:
         config: mechanism, IMUs, seed, rate and plant; the calibration sets target and durations itself.
         knowledge: besides the samples.
-        progress: called with the share that is done.
         validate: whether to compare calibrations by parts of the data as well.
 
     Raises:

@@ -31,11 +31,7 @@ def write_picture(summary: Mapping[str, Any], path: Path) -> None:
 def accuracy_svg(summary: Mapping[str, Any], error: str, unit: str, scale: float) -> str:
     """Bars of an RMS error with each stage's calibration, on a logarithmic scale.
 
-    Args:
-        summary: of a `RigCalibration`.
-        error: "position_rms" or "rotation_rms".
-        unit: to show.
-        scale: factor from SI units to it.
+    The error is "position_rms" or "rotation_rms"; `scale` is the factor from SI units to the shown unit.
     """
     stages = list(summary["residual_mg"])
     sizes = {(stage, kind): scale * summary[kind][stage][error] for stage in stages for kind in KINDS if stage in summary[kind]}

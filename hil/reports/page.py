@@ -22,12 +22,7 @@ INK, FAINT = "#26323d", "#9aa5b1"
 def write_page(path: Path, title: str, subtitle: str, body: str, script: str = "") -> None:
     """Write a page with the drawing library inside; the file takes its place only when it is complete.
 
-    Args:
-        path: of the HTML file.
-        title: plain text.
-        subtitle: plain text.
-        body: HTML.
-        script: JavaScript, run after the figures are drawn.
+    Title and subtitle are plain text, the body is HTML, and the script is JavaScript that runs after the figures are drawn.
 
     Raises:
         InputError: the file cannot be written.
@@ -53,14 +48,9 @@ def write_page(path: Path, title: str, subtitle: str, body: str, script: str = "
 
 
 def figure_html(name: str, title: str, caption: str, figure: go.Figure | str, kind: str = "time") -> str:
-    """A figure with its title and caption, in HTML.
+    """A figure by plotly, or in HTML, with its title and caption in plain text.
 
-    Args:
-        name: its id on the page.
-        title: plain text.
-        caption: plain text.
-        figure: drawn by plotly, or HTML.
-        kind: its class, "time" for the full width, "view" for a part of it.
+    Its id is `name`, and its class `kind`: "time" for the full width, "view" for a part of it.
     """
     drawn = f'<div id="{name}">{figure}</div>' if isinstance(figure, str) else _plot_html(name, figure)
     text = f"<h2>{escape(title, quote=False)}</h2>\n{drawn}\n<figcaption>{escape(caption, quote=False)}</figcaption>"

@@ -185,13 +185,7 @@ class Outcome:
 
 
 def run_matrix(seeds: int, cases: tuple[Case, ...] = CASES, progress: Progress = no_progress) -> list[Outcome]:
-    """Run every case with every seed.
-
-    Args:
-        seeds: number of seeds of IMUs and faults, their times and places.
-        cases: of the table.
-        progress: called with the share that is done.
-    """
+    """Run the cases, each with so many seeds of IMUs and faults, their times and places."""
     outcomes = []
     for n, case in enumerate(cases):
         outcome = Outcome(case)

@@ -37,10 +37,6 @@ from plant.wiring import ALL_IMUS
 def compare(config: ComparisonConfig, progress: Progress = no_progress) -> dict[str, Any]:
     """Run every method.
 
-    Args:
-        config: of the comparison.
-        progress: called with the share that is done.
-
     Returns:
         `methods`: by name, `position_rms` [m], `rotation_rms` [rad], `nees` (6 is consistent; None without a covariance), `us`,
         the median time of a cycle from raw sample to pose, and the number of `seeds`; `config` and `version`.

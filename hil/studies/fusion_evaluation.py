@@ -75,11 +75,7 @@ class _Rig:
 
 
 def evaluate(config: EvaluationConfig, progress: Callable[[str, float], None] = lambda what, share: None) -> dict[str, Any]:
-    """Evaluate the fusion.
-
-    Args:
-        config: of the evaluation.
-        progress: called with the name of a part and the share of it that is done.
+    """Evaluate the fusion; `progress` is called with the name of a part and the share of it that is done.
 
     Returns:
         The figures in SI units by section (`SECTIONS` and `calibration`), and `config` and `version`.

@@ -261,10 +261,6 @@ STEPS = (
 def tune_fusion(config: TuningConfig, progress: Progress = no_progress) -> dict[str, Any]:
     """Find the noise that makes the estimators consistent.
 
-    Args:
-        config: of the tuning.
-        progress: called with the share that is done.
-
     Returns:
         `settings`: by name, their value `before` and `after`; `estimators`: by name, the `settings` found by it, the
         `consistent` NEES with its 95 % `bounds`, and `before` and `after` the mean `nees` and the `rms` of angles [rad], or of

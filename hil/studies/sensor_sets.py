@@ -109,7 +109,6 @@ def evaluate_sensor_sets(
         sets: of sensors.
         duration: of each motion [s].
         seed: of the imperfections of the IMUs, calibrated MPU-9150s.
-        progress: called with the share that is done.
 
     Raises:
         GoughError: a mechanism, the duration or the seed cannot be used.
