@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from hil.reports.planar_rig import write_report
 from hil.studies.planar_rig import COLUMNS, SOURCES, evaluate
 from plant.errors import InputError, SingularConfigurationError
-from plant.mechanism.planar import planar_from_document
+from plant.mechanism.documents import mechanism_from_document
 from tests.conftest import SHARED_DATA
 
 FIRST = "# true pose by image processing: x 107 mm, y 192 mm, gamma -5.5 deg"
@@ -27,7 +27,7 @@ TEN_POSES = {"raw": (1.41, 3.35, 2.04), "kalman": (1.26, 2.85, 2.07), "complemen
 @pytest.fixture(scope="session")
 def rig():
     text = (resources.files("plant.mechanism") / "presets" / "planar-3rpr.toml").read_text()
-    return planar_from_document(tomllib.loads(text))
+    return mechanism_from_document(tomllib.loads(text))
 
 
 @pytest.fixture(scope="session")
