@@ -10,8 +10,10 @@ from hil.progress import Progress, no_progress
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import VELOCITY
 from plant.fmu.build import SPATIAL_MODEL, default_fmu
-from plant.fmu.importer import FmuDescription, FmuInstance
-from plant.fmu.plant import FmuPlant, advance, read_imus, read_truth, write_command, write_drive_mode
+from plant.fmu.calls import advance, read_imus, read_truth, write_command, write_drive_mode
+from plant.fmu.importer import FmuDescription
+from plant.fmu.instance import FmuInstance
+from plant.fmu.plant import FmuPlant
 from plant.mechanism import load_spatial
 from plant.pose import Array
 from plant.stopwatch import now

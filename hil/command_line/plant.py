@@ -128,7 +128,8 @@ def _shape(shape: tuple[int, ...]) -> str:
 
 
 def _show(options: argparse.Namespace) -> int:
-    from plant.fmu.binding import OWN_BINDING, bind
+    from plant.fmu.binding import bind
+    from plant.fmu.binding_file import OWN_BINDING
     from plant.fmu.check import platforms_of
     from plant.fmu.importer import FmuDescription
 
@@ -193,7 +194,8 @@ def _linearize(options: argparse.Namespace) -> int:
     from controller.design.linearization import state_space
     from plant.dynamics.variables import VELOCITY
     from plant.fmu.build import default_fmu, model_of
-    from plant.fmu.plant import FmuPlant, write_drive_mode
+    from plant.fmu.calls import write_drive_mode
+    from plant.fmu.plant import FmuPlant
     from plant.mechanism import load_in_space
 
     mechanism = load_in_space(options.mechanism)

@@ -37,7 +37,7 @@ from hil.rigs.udp.emulator import UdpEmulator, new_udp_emulator
 from hil.rigs.udp.link import UdpLink, new_link
 from plant.compiled import Record
 from plant.dynamics.variables import BRAKE
-from plant.fmu.plant import write_drive_mode
+from plant.fmu.calls import write_drive_mode
 from plant.pose import Array
 from plant.stopwatch import now
 
@@ -63,7 +63,7 @@ class Loop:
     """Everything that a run changes or reads.
 
     Attributes:
-        fmu: the plant (dtype `plant.fmu.plant.FMU_HANDLE`).
+        fmu: the plant (dtype `plant.fmu.calls.FMU_HANDLE`).
         imu: the IMUs' imperfections (dtype `plant.imu.IMU_STATE`).
         parameters, state: of the cycle.
         kind, udp, emulator: as in `RigHandle`; by default the rig is the plant itself.

@@ -35,7 +35,7 @@ from hil.rigs.udp.emulator import exchange_in_memory
 from hil.rigs.udp.link import exchange_udp, send_command
 from plant.compiled import Record, kernel, store_release
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
-from plant.fmu.plant import advance, read_imus, read_truth, write_command, write_drive_mode
+from plant.fmu.calls import advance, read_imus, read_truth, write_command, write_drive_mode
 from plant.imu import measure
 from plant.mechanism import LEGS as LEG_COUNT
 from plant.pose import Array

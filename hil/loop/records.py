@@ -139,7 +139,7 @@ class RigHandle(NamedTuple):
 
     Attributes:
         kind: `FMU_RIG`, `UDP_RIG` or `EMULATED_RIG`.
-        fmu: the plant (dtype `plant.fmu.plant.FMU_HANDLE`).
+        fmu: the plant (dtype `plant.fmu.calls.FMU_HANDLE`).
         imu: the IMUs' imperfections (dtype `plant.imu.IMU_STATE`).
         link: the controller's side of UDP.
         emulator: the rig's side, in memory.

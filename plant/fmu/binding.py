@@ -1,223 +1,36 @@
-"""What an FMU's variables are to the loop: which of them take commands, which are the IMUs' signals and which tell the truth.
+"""Matching a binding to an FMU: the value references and conversions of the loop's signals."""
 
-A signal has the name of gough's own variable (`plant.dynamics.variables`), and its values lie in one variable of the FMU or in
-several. The binding of gough's own plants is that every signal is the variable of its name; one for other FMUs comes from a
-TOML file (docs/fmu.md).
-"""
-
-import sys
-import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plant.dynamics.variables import BRAKE, DRIVE_MODES, IMU_COUNT, OPEN, PLATFORM_IMU, VELOCITY
 from plant.errors import FmuError, GoughError, InputError
+from plant.fmu.binding_file import (
+    COMMANDS,
+    IMU_SIGNALS,
+    MODES,
+    PAYLOAD,
+    REQUIRED,
+    SIGNAL_UNITS,
+    TRUTH_PLACES,
+    UNITS,
+    WRITTEN,
+    Binding,
+    SignalBinding,
+    unit_names,
+)
 from plant.fmu.importer import FmuDescription, FmuVariable
-from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER
 from plant.mechanism import LEGS
 from plant.mechanism.planar import PLANAR_LEGS
 from plant.pose import Array
-from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS, TRUTH_POSITION, TRUTH_QUATERNION
-
-IMU_SIGNALS = {"imu_angular_velocity": GYROSCOPE, "imu_specific_force": ACCELEROMETER, "imu_magnetic_field": MAGNETOMETER}
-TRUTH_PLACES = {
-    "position": TRUTH_POSITION, "quaternion": TRUTH_QUATERNION, "angle": TRUTH_QUATERNION, "leg_length": TRUTH_LENGTHS,
-    "current": TRUTH_CURRENTS,
-}  # fmt: skip
-"""Where a signal lies in the truth (`plant.truth`). A planar plant tells its angle in the first place of the quaternion."""
-
-COMMANDS, MODES, PAYLOAD = "velocity_command", "drive_mode", "payload.mass"
-
-UNITS: dict[str, dict[str, float]] = {
-    "m": {"m": 1.0, "dm": 0.1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254},
-    "m/s": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "um/s": 1e-6, "m/min": 1 / 60, "mm/min": 1e-3 / 60, "in/s": 0.0254},
-    "m/s2": {"m/s2": 1.0, "m/s^2": 1.0, "mm/s2": 1e-3, "mm/s^2": 1e-3, "g": 9.80665, "mg": 9.80665e-3},
-    "rad": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180},
-    "rad/s": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": np.pi / 180, "rpm": np.pi / 30, "1/min": np.pi / 30},
-    "uT": {"uT": 1.0, "nT": 1e-3, "mT": 1e3, "T": 1e6, "G": 100.0, "mG": 0.1},
-    "A": {"A": 1.0, "mA": 1e-3},
-    "kg": {"kg": 1.0, "g": 1e-3, "t": 1e3},
-    "1": {"1": 1.0, "": 1.0},
-}
-"""Names of units by what the loop reckons in, with the factor from one to the other."""
-
-SIGNAL_UNITS = {
-    COMMANDS: "m/s", MODES: "1", "imu_angular_velocity": "rad/s", "imu_specific_force": "m/s2", "imu_magnetic_field": "uT",
-    "position": "m", "quaternion": "1", "angle": "rad", "leg_length": "m", "current": "A", PAYLOAD: "kg",
-}  # fmt: skip
-"""Every signal, and what the loop reckons it in."""
-
-REQUIRED = (COMMANDS, "imu_angular_velocity", "imu_specific_force")
-_WRITTEN = (COMMANDS, MODES, PAYLOAD)
-_MODE_NAMES = tuple(DRIVE_MODES.values())
-_ENTRIES = {"variables", "unit", "sign", "offset"}
-
-LEAST_STEP_S = 1e-6
-"""The shortest communication step [s]."""
-
-
-@dataclass(frozen=True)
-class SignalBinding:
-    """One signal: the FMU's variables that hold it, in their order, and how their values become the loop's.
-
-    Attributes:
-        variables: names in the FMU.
-        unit: of the FMU's values; None for what the FMU declares, or else the loop's own.
-        sign: factors of 1 or -1, one, or one for each axis, or for each element.
-        offset: added to the value after that, in the loop's unit: one, or one for each element.
-        imus: whose signals these are; None for all.
-        modes: the FMU's values for a drive that is open, braked, and driven at its velocity; None for the usual one.
-    """
-
-    variables: tuple[str, ...]
-    unit: str | None = None
-    sign: tuple[float, ...] = (1.0,)
-    offset: tuple[float, ...] = (0.0,)
-    imus: tuple[int, ...] | None = None
-    modes: tuple[float | None, ...] = (None,) * len(DRIVE_MODES)
-
-
-@dataclass(frozen=True)
-class Binding:
-    """A binding, which still has to be checked against its FMU.
-
-    Attributes:
-        source: its file, for messages; "" for gough's own.
-        signals: by name.
-        step: communication step [s]; None for the control period.
-        start: start values by the FMU's own names.
-        native: whether the signals are those of gough's own plants, which then have gough's parameters, too.
-        problems: what is wrong with the file.
-    """
-
-    source: str
-    signals: Mapping[str, SignalBinding]
-    step: float | None = None
-    start: Mapping[str, Any] = field(default_factory=dict)
-    native: bool = False
-    problems: tuple[str, ...] = ()
-
-
-_OWN_SIGNALS = {name: SignalBinding((name,)) for name in SIGNAL_UNITS}
-OWN_BINDING = Binding("", _OWN_SIGNALS, native=True)
-"""Of gough's own plants, spatial and planar."""
-
-
-def load_binding(path: Path | str) -> Binding:
-    """Read a binding; what is wrong with its entries is said together with what is wrong about the FMU.
-
-    Raises:
-        InputError: there is no such file, or it is not TOML.
-    """
-    try:
-        document = tomllib.loads(Path(path).read_text())
-    except OSError as error:
-        raise InputError(f"cannot read the binding {path}: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is not a TOML file: {error}") from None
-    reader = _Reader()
-    tables = {name: reader.table(name, content) for name, content in document.items()}
-    for name in tables.keys() - SIGNAL_UNITS.keys() - {"fmu", "start"}:
-        reader.problems.append(f"there is no table [{name}]; there are fmu, start, {', '.join(SIGNAL_UNITS)}")
-    step = reader.step(tables.get("fmu", {}))
-    signals = {name: reader.signal(name, tables[name]) for name in SIGNAL_UNITS if name in tables}
-    native = not signals
-    return Binding(
-        Path(path).name, signals or _OWN_SIGNALS, step, tables.get("start", {}), native, tuple(reader.problems)
-    )  # fmt: skip
-
-
-class _Reader:
-    """Reads entries of a binding and keeps what is wrong with them."""
-
-    def __init__(self) -> None:
-        self.problems: list[str] = []
-
-    def table(self, name: str, content: Any) -> dict[str, Any]:
-        if isinstance(content, dict):
-            return content
-        self.problems.append(f"{name} must be a table [{name}]")
-        return {}
-
-    def step(self, table: Mapping[str, Any]) -> float | None:
-        self._check_entries("fmu", table, {"step"})
-        step = table.get("step")
-        if step is not None and not (_is_number(step) and step >= LEAST_STEP_S):
-            self.problems.append(f"[fmu] step is {step!r}; it must be a number of seconds, at least {LEAST_STEP_S:g}")
-            return None
-        return None if step is None else float(step)
-
-    def signal(self, name: str, table: Mapping[str, Any]) -> SignalBinding:
-        entries = _ENTRIES if name != MODES else {"variables", *_MODE_NAMES}
-        self._check_entries(name, table, entries | {"imus"} if name in IMU_SIGNALS else entries)
-        variables = table.get("variables", [])
-        if isinstance(variables, str):
-            variables = [variables]
-        if not (isinstance(variables, list) and variables and all(isinstance(each, str) for each in variables)):
-            self.problems.append(f"[{name}] variables is {variables!r}; it must be the name of a variable, or a list of names")
-            variables = []
-        unit = table.get("unit")
-        if unit is not None and not (isinstance(unit, str) and unit in UNITS[SIGNAL_UNITS[name]]):
-            self.problems.append(f"[{name}] unit is {unit!r}; it must be one of {_unit_names(name)}")
-            unit = None
-        return SignalBinding(
-            tuple(variables), unit, self._signs(name, table), self._numbers(name, "offset", table.get("offset", 0.0)),
-            self._imus(name, table.get("imus")), tuple(self._mode(name, mode, table.get(mode)) for mode in _MODE_NAMES),
-        )  # fmt: skip
-
-    def _check_entries(self, name: str, table: Mapping[str, Any], known: set[str]) -> None:
-        for entry in table.keys() - known:
-            self.problems.append(f"[{name}] has no entry {entry!r}; it has {', '.join(sorted(known))}")
-
-    def _numbers(self, name: str, entry: str, value: Any) -> tuple[float, ...]:
-        values = value if isinstance(value, list) else [value]
-        if values and all(_is_number(each) or isinstance(each, bool) for each in values):
-            return tuple(map(float, values))
-        self.problems.append(f"[{name}] {entry} is {value!r}; it must be a number, or a list of numbers")
-        return (0.0,) * len(values or [0.0])
-
-    def _mode(self, name: str, mode: str, value: Any) -> float | None:
-        if value is None or _is_number(value) or isinstance(value, bool):
-            return None if value is None else float(value)
-        self.problems.append(f"[{name}] {mode} is {value!r}; it must be a number, true or false")
-        return None
-
-    def _signs(self, name: str, table: Mapping[str, Any]) -> tuple[float, ...]:
-        signs = self._numbers(name, "sign", table.get("sign", 1))
-        if set(signs) <= {1.0, -1.0}:
-            return signs
-        self.problems.append(f"[{name}] sign is {table['sign']!r}; it must be 1 or -1, or a list of these")
-        return (1.0,)
-
-    def _imus(self, name: str, value: Any) -> tuple[int, ...] | None:
-        if value is None:
-            return None
-        if (
-            isinstance(value, list)
-            and value
-            and all(type(each) is int and each in range(IMU_COUNT) for each in value)
-            and len(set(value)) == len(value)
-        ):
-            return tuple(value)
-        self.problems.append(f"[{name}] imus is {value!r}; it must be a list of different numbers from 0 to {PLATFORM_IMU}")
-        return None
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
-
-
-def _unit_names(signal: str) -> str:
-    return ", ".join(name for name in UNITS[SIGNAL_UNITS[signal]] if name)
 
 
 class Scalars(NamedTuple):
-    """Scalars that go between FMU and loop in one call: `loop = factor * fmu + offset`.
+    """Scalars that one call moves between FMU and loop: `loop = factor * fmu + offset`.
 
     Attributes:
         references: value references, in the order of the scalars.
@@ -232,13 +45,13 @@ class Scalars(NamedTuple):
 
 
 class Modes(NamedTuple):
-    """How the drives are switched.
+    """How to switch the drives.
 
     Attributes:
         references: value references.
-        values: of the FMU for each of `OPEN`, `BRAKE`, `VELOCITY`.
-        variable: one of them, for its type; None if the FMU cannot be told.
-        common: whether there is one for all drives.
+        values: the FMU's for `OPEN`, `BRAKE`, `VELOCITY`.
+        variable: one of the modes, for its type; None if the FMU has no modes.
+        common: whether all drives share one mode.
     """
 
     references: NDArray[np.uint32]
@@ -249,19 +62,19 @@ class Modes(NamedTuple):
 
 @dataclass(frozen=True)
 class Bound:
-    """A binding that fits its FMU.
+    """A binding matched to its FMU.
 
     Attributes:
         legs: 6, or 3 of a planar plant.
-        imus: that there are, and those of them that have a magnetometer.
-        magnetometers: as `imus`.
+        imus: numbers of the IMUs.
+        magnetometers: numbers of the IMUs with a magnetometer.
         sensed: the IMUs' signals, in (3, 7, 3).
         known: the truth, in (19,).
         commanded: the velocity commands, in (legs,).
         loaded: the payload's mass, in (1,), or nothing.
         modes: of the drives.
-        knows_pose: whether the truth tells the pose.
-        planar_angle: whether it tells an angle in the place of a quaternion.
+        knows_pose: whether the truth has the pose.
+        planar_angle: whether the truth has an angle instead of a quaternion.
         driven: names of the FMU's scalars that the loop sets in every cycle.
     """
 
@@ -279,7 +92,7 @@ class Bound:
 
 
 def check_start(variable: FmuVariable, owner: str, driven: frozenset[str]) -> None:
-    """Check that a variable may be given a start value.
+    """Check that a variable accepts a start value.
 
     Args:
         variable: of the FMU.
@@ -287,7 +100,7 @@ def check_start(variable: FmuVariable, owner: str, driven: frozenset[str]) -> No
         driven: as in `Bound`.
 
     Raises:
-        InputError: it may not.
+        InputError: it does not.
     """
     if not variable.startable:
         raise InputError(
@@ -298,10 +111,10 @@ def check_start(variable: FmuVariable, owner: str, driven: frozenset[str]) -> No
 
 
 def check_free(variable: FmuVariable, owner: str, driven: frozenset[str]) -> None:
-    """Check that the loop leaves a variable to others, with arguments as for `check_start`.
+    """Check that the loop does not set a variable; arguments as for `check_start`.
 
     Raises:
-        InputError: it does not.
+        InputError: it does.
     """
     if not driven.isdisjoint(variable.element_names):
         raise InputError(f"{variable.name} of {owner} is set by the loop, and cannot be set besides")
@@ -311,7 +124,7 @@ def bind(binding: Binding, description: FmuDescription) -> Bound:
     """Find a binding's variables in its FMU.
 
     Raises:
-        FmuError: all that is wrong, with the file or with the FMU's variables.
+        FmuError: lists all errors, in the file and in the FMU's variables.
     """
     return _Binder(binding, description).bound()
 
@@ -363,7 +176,7 @@ class _Binder:
         )
 
     def _present(self) -> dict[str, SignalBinding]:
-        """The signals to look for: of gough's own binding, those that are needed or there."""
+        """The signals to look for; in gough's own binding, those that are required or present."""
         signals = self._binding.signals
         if not self._binding.native:
             return dict(signals)
@@ -378,7 +191,7 @@ class _Binder:
                 self._problems.append(f"{name}: {str(error).removeprefix(f'{self._description.path.name} ')}")
                 continue
             found.append(variable)
-            written = name in _WRITTEN
+            written = name in WRITTEN
             fits = variable.tunable if written else variable.causality in ("output", "local")
             if not fits:
                 kind = (
@@ -447,7 +260,7 @@ class _Binder:
         if unit is None:
             unit = SIGNAL_UNITS[name] if variable.unit is None else variable.unit
         if unit not in known:
-            self._problems.append(f"{name}: {variable.name} is in {unit}: say with unit which of {_unit_names(name)} that is")
+            self._problems.append(f"{name}: {variable.name} is in {unit}: say with unit which of {unit_names(name)} that is")
         return known.get(unit, 1.0)
 
     def _spread(self, name: str, entry: str, values: tuple[float, ...], count: int) -> Array:
@@ -487,7 +300,7 @@ class _Binder:
         return Modes(references, np.array(values), first, size == 1)
 
     def _check_once(self) -> None:
-        """Check that no scalar of the FMU is bound twice."""
+        """Each scalar of the FMU may be bound once."""
         signals: dict[str, list[str]] = {}
         for name, found in self._found.items():
             for scalar in (scalar for each in found for scalar in each.element_names):

@@ -1,12 +1,11 @@
 """From the dynamics of a plant to its FMU: C code, description, shared libraries, and the archive around them.
 
-Run in a process of its own (`python -m plant.fmu.build FILE ...`), because CasADi must not be loaded by a process that runs a
-loop. The FMU is native and holds no Python.
+`python -m plant.fmu.build FILE ...` builds in a process of its own, because a process that runs a loop must not load CasADi.
+The FMU is native and contains no Python.
 """
 
 import io
 import platform
-import re
 import shutil
 import struct
 import subprocess
@@ -26,12 +25,11 @@ from typing import Any
 import fmpy
 
 from plant.compiled import hash_of_files, keyed_folder
-from plant.dynamics.variables import PLANAR, SPATIAL, Variable, VariableTable
+from plant.dynamics.variables import PLANAR, SPATIAL, VariableTable
 from plant.errors import InputError, ToolchainError
 from plant.files import check_writable, write_whole
-from plant.fmu.description import Dependencies, Layout, build_description, model_description, start_of
+from plant.fmu.description import Layout, build_description, model_description
 from plant.mechanism import Mechanism, load_in_space
-from plant.pose import Array
 
 C_FLAGS = (
     "-std=c11", "-fPIC", "-fvisibility=hidden", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math",
@@ -39,8 +37,8 @@ C_FLAGS = (
 SOURCES = ("model.c", "plant.c", "derivatives.c", "unsupported.c")
 """The C files of an FMU, beside `fmi2.c` or `fmi3.c`."""
 
+_HEADERS = Path(fmpy.__file__).parent / "c-code"
 _EPOCH = (1980, 1, 1, 0, 0, 0)
-_FUNCTIONS = ("constants", "start", "conditions", "limits", "rates", "outputs")
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,7 @@ class Model:
         description: one line about it.
         table: its variables.
         preset: the mechanism whose parameters are the default start values.
-        dynamics: derives its equations (`plant.dynamics.spatial.Dynamics`); loads CasADi.
+        dynamics: derives its equations (`plant.dynamics.assembly.Dynamics`); loads CasADi.
     """
 
     identifier: str
@@ -85,7 +83,7 @@ PLANAR_MODEL = Model(
 
 @dataclass(frozen=True)
 class Platform:
-    """A platform that FMUs are compiled for: its folders in FMI 3.0 and 2.0, zig's name for it, and its libraries' suffix."""
+    """A platform for FMUs: its folders in FMI 3.0 and 2.0, zig's name for it, and its libraries' suffix."""
 
     folder: str
     folder_2: str
@@ -101,7 +99,7 @@ PLATFORMS = {
         Platform("aarch64-darwin", "darwin64", "aarch64-macos.11.0", ".dylib"),
     ),
 }
-"""What `--platforms` can name. In FMI 2.0 both processors of darwin share one universal library."""
+"""The names for `--platforms`. In FMI 2.0 both processors of darwin share one universal library."""
 
 
 def default_fmu(model: Model = SPATIAL_MODEL, fmi: int = 3) -> Path:
@@ -199,6 +197,8 @@ def build(path: Path, fmi: int = 3, mechanism: str | Path = "hexapod", platforms
         ToolchainError: no C compiler, or it failed.
         InputError: a version or platform that does not exist, or `path` cannot be written.
     """
+    from plant.fmu import c_code
+
     check_build(fmi, platforms)
     check_writable(path)
     loaded = load_in_space(mechanism)
@@ -208,22 +208,23 @@ def build(path: Path, fmi: int = 3, mechanism: str | Path = "hexapod", platforms
     with tempfile.TemporaryDirectory(prefix="gough-build-") as folder:
         work = Path(folder)
         dynamics = model.dynamics()
-        _generate_c(dynamics, work)
-        dependencies = _dependencies(dynamics, layout)
+        c_code.write_functions(dynamics, work)
         wrapper = f"fmi{fmi}.c"
         for name in ("model.h", "model.c", wrapper):
             (work / name).write_text((resources.files("fmus") / name).read_text())
-        (work / "unsupported.c").write_text(_unsupported(fmi, (work / wrapper).read_text()))
+        declarations = (_HEADERS / f"fmi{fmi}Functions.h").read_text()
+        (work / "unsupported.c").write_text(c_code.unsupported_functions(fmi, declarations, (work / wrapper).read_text()))
         values = repr({name: value.tolist() for name, value in starts.items()})
         token = "{" + hash_of_files([work / name for name in (*SOURCES, wrapper, "model.h")], values) + "}"
-        (work / "layout.h").write_text(_layout_h(layout, starts, token, dynamics))
+        (work / "layout.h").write_text(c_code.layout_header(layout, starts, token, dynamics))
         sources = [*SOURCES, wrapper]
+        dependencies = c_code.find_dependencies(dynamics, layout)
         contents = {
             "modelDescription.xml": model_description(
                 fmi, model.identifier, model.description, layout, starts, token, dependencies, sources
-            ).encode(),
+            ),
             **{f"sources/{file.name}": file.read_bytes() for file in sorted(work.iterdir())},
-            "sources/buildDescription.xml": build_description(model.identifier, sources).encode(),
+            "sources/buildDescription.xml": build_description(model.identifier, sources),
         }
         for name, library in _libraries(model, fmi, work, sources, platforms).items():
             contents[f"binaries/{name}"] = library
@@ -231,7 +232,7 @@ def build(path: Path, fmi: int = 3, mechanism: str | Path = "hexapod", platforms
 
 
 def check_build(fmi: int, platforms: Sequence[str]) -> None:
-    """Check what an FMU is to be built for, and that there is a compiler for it.
+    """Check the version and the platforms of a build, and that a compiler is installed.
 
     Raises:
         InputError: a version or platform that does not exist.
@@ -248,12 +249,12 @@ def check_build(fmi: int, platforms: Sequence[str]) -> None:
 
 
 def model_of(mechanism: Mechanism) -> Model:
-    """The plant that a mechanism is one of."""
+    """The plant for a mechanism."""
     return PLANAR_MODEL if mechanism.planar else SPATIAL_MODEL
 
 
 def _archive(contents: Mapping[str, bytes]) -> bytes:
-    """A zip archive without the time of its making, so that the same sources give the same bytes."""
+    """A zip archive without a time stamp, so that the same sources give the same bytes."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in contents.items():
@@ -261,9 +262,6 @@ def _archive(contents: Mapping[str, bytes]) -> bytes:
             entry.external_attr = 0o644 << 16
             archive.writestr(entry, data, zipfile.ZIP_DEFLATED)
     return buffer.getvalue()
-
-
-# ---- shared libraries ----
 
 
 def _libraries(model: Model, fmi: int, work: Path, sources: list[str], platforms: Sequence[str]) -> dict[str, bytes]:
@@ -285,14 +283,13 @@ def _libraries(model: Model, fmi: int, work: Path, sources: list[str], platforms
 
 
 def _compile(compiler: list[str], work: Path, sources: list[str], suffix: str) -> bytes:
-    """A shared library; the derivatives are long and seldom used, and so compiled with less effort."""
-    headers = Path(fmpy.__file__).parent / "c-code"
+    """A shared library; the derivatives are long and seldom used, so they are compiled with less effort."""
 
     def compile_one(source: str) -> str:
-        # The equations are one long block of scalars, which GCC then keeps in registers; other compilers ignore this.
+        # The equations are one long block of scalars, and with these options GCC keeps them in registers.
         effort = ["-O1"] if source == "derivatives.c" else ["-O2", "-frename-registers", "-fno-tree-slp-vectorize"]
-        # The compilers run in the folder, so that no path of this machine gets into what they make.
-        _run([*compiler, *C_FLAGS, *effort, f"-I{headers}", "-c", source, "-o", f"{source}.o"], work)
+        # The compilers run in the folder, so that their output contains no path of this machine.
+        _run([*compiler, *C_FLAGS, *effort, f"-I{_HEADERS}", "-c", source, "-o", f"{source}.o"], work)
         return f"{source}.o"
 
     with ThreadPoolExecutor() as pool:
@@ -310,7 +307,7 @@ def _run(command: list[str], folder: Path) -> None:
 
 
 def _without_time(library: bytes) -> bytes:
-    """A library of Windows without the time of its making (TimeDateStamp in the header of its PE format)."""
+    """A library of Windows without its time stamp (TimeDateStamp in the header of the PE format)."""
     stamp = struct.unpack_from("<I", library, 0x3C)[0] + 8
     return library[:stamp] + bytes(4) + library[stamp + 4 :]
 
@@ -327,177 +324,6 @@ def _universal(libraries: list[bytes]) -> bytes:
         body += padded
         at += len(padded)
     return header.ljust(1 << alignment, b"\0") + body
-
-
-# ---- C code ----
-
-
-def _generate_c(dynamics: Any, work: Path) -> None:
-    """Write plant.c and derivatives.c with their headers."""
-    import casadi as ca
-
-    functions_of = {"plant": [getattr(dynamics, name) for name in _FUNCTIONS], "derivatives": _derivatives(dynamics)}
-    for file, functions in functions_of.items():
-        generator = ca.CodeGenerator(f"{file}.c", {"with_header": True})
-        for function in functions:
-            generator.add(function)
-        generator.generate(f"{work}/")
-
-
-def _derivatives(dynamics: Any) -> list[Any]:
-    """Functions for the products of vectors with the Jacobians of rates, outputs and constants, and their transposes."""
-    import casadi as ca
-
-    def product(name: str, function: Any, reverse: bool) -> Any:
-        arguments = [ca.SX.sym(f"i{i}", function.size1_in(i)) for i in range(function.n_in())]
-        results = function(*arguments)
-        results = results if isinstance(results, tuple) else (results,)
-        here, there = (results, arguments) if reverse else (arguments, results)
-        seeds = [ca.SX.sym(f"s{i}", value.shape[0]) for i, value in enumerate(here)]
-        derived = ca.jtimes(ca.vertcat(*results), ca.vertcat(*arguments), ca.vertcat(*seeds), reverse)
-        sides = ca.vertsplit(ca.densify(derived), [0, *_cumulated(value.shape[0] for value in there)])
-        return ca.Function(name, [*arguments, *seeds], sides, {"cse": True})
-
-    states, inputs, constants = (ca.SX.sym(n, dynamics.rates.size1_in(i)) for i, n in enumerate("xuc"))
-    both = ca.Function(
-        "both",
-        [states, inputs, constants],
-        [dynamics.rates(states, inputs, constants), dynamics.outputs(states, inputs, constants)],
-    )
-    return [
-        product(f"plant_{prefix}{name}", function, reverse)
-        for prefix, function in (("", both), ("constants_", dynamics.constants), ("start_", dynamics.start))
-        for name, reverse in (("forward", False), ("reverse", True))
-    ]
-
-
-def _cumulated(sizes: Any) -> list[int]:
-    total, sums = 0, []
-    for size in sizes:
-        total += size
-        sums.append(total)
-    return sums
-
-
-def _dependencies(dynamics: Any, layout: Layout) -> Dependencies:
-    """From the sparsity of the Jacobians."""
-    import casadi as ca
-
-    table = layout.table
-    p = ca.SX.sym("p", dynamics.constants.size1_in(0))
-    x, u, c = (ca.SX.sym(name, dynamics.rates.size1_in(i)) for i, name in enumerate("xuc"))
-    running = ca.Function("running", [ca.vertcat(x, u), c], [ca.vertcat(dynamics.rates(x, u, c), dynamics.outputs(x, u, c))])
-    started, constants = dynamics.start(p), dynamics.constants(p)
-    initial = ca.Function(
-        "initial",
-        [ca.vertcat(u, p)],
-        [ca.vertcat(dynamics.rates(started, u, constants), dynamics.outputs(started, u, constants), started)],
-    )
-
-    def places(variables: Sequence[Variable]) -> list[int]:
-        return [place for variable in variables for place in layout.places(variable)]
-
-    def found(function: Any, unknowns: list[int], knowns: list[int]) -> dict[int, frozenset[int]]:
-        touched: dict[int, set[int]] = {place: set() for place in unknowns}
-        for row, column in zip(*function.jac_sparsity(0, 0).get_triplet(), strict=True):
-            touched[unknowns[row]].add(knowns[column])
-        return {place: frozenset(known) for place, known in touched.items()}
-
-    unknowns = places([*layout.rates, *table.outputs])
-    return Dependencies(
-        running=found(running, unknowns, places([*table.states, *table.inputs])),
-        initial=found(initial, [*unknowns, *places(table.states)], places([*table.inputs, *table.parameters])),
-    )
-
-
-def _kind(layout: Layout, variable: Variable) -> str:
-    if variable in layout.rates:
-        return "RATE"
-    if variable.causality == "parameter":
-        return "TUNABLE" if variable.tunable else "FIXED"
-    return ("DISCRETE_" if variable.discrete else "") + variable.causality.upper()
-
-
-def _layout_h(layout: Layout, starts: Mapping[str, Array], token: str, dynamics: Any) -> str:
-    table = layout.table
-    blocks = {"INPUTS": table.inputs, "PARAMETERS": table.parameters, "OUTPUTS": table.outputs, "RATES": layout.rates}
-    exposed = layout.exposed
-    places = sorted((place, v) for v, variable in enumerate(exposed) for place in layout.places(variable))
-
-    def array(kind: str, name: str, values: list[str]) -> str:
-        return f"static const {kind} {name}[] = {{{', '.join(values)}}};"
-
-    macros = {
-        "VALUES": layout.size,
-        "CONSTANTS": dynamics.constants.size1_out(0),
-        "CONDITIONS": len(dynamics.condition_texts),
-        "LIMITS": len(dynamics.limit_texts),
-        "VARIABLES": len(exposed),
-        "STATES": sum(variable.size for variable in table.states),
-        "INPUTS": sum(variable.size for variable in table.inputs),
-        "PARAMETERS": sum(variable.size for variable in table.parameters),
-        "LONGEST": max(variable.size for variable in exposed),
-        "TOKEN": f'"{token}"',
-        "LAYOUT": f"0x{token[1:17]}ULL",
-        **{f"{block}_AT": layout.offsets[variables[0].name] for block, variables in blocks.items()},
-        "SUBSTEP_AT": layout.offsets["substep"],
-    }
-    if "state.quaternion" in layout.offsets:
-        macros["QUATERNION_AT"] = layout.offsets["state.quaternion"]
-    lines = [
-        "#pragma once",
-        # Every file includes all tables, and uses some.
-        "#if defined __GNUC__",
-        '#pragma GCC diagnostic ignored "-Wunused-variable"',
-        "#endif",
-        "enum { FIXED, TUNABLE, INPUT, DISCRETE_INPUT, OUTPUT, STATE, RATE };",
-        *(f"#define {name} {value}" for name, value in macros.items()),
-        array("char *const", "names", [f'"{v.name}"' for v in exposed]),
-        array("char *const", "condition_texts", [f'"{text}"' for text in dynamics.condition_texts]),
-        array("char *const", "limit_texts", [f'"{text}"' for text in (*dynamics.limit_texts, "")]),
-        array("int", "kind", [_kind(layout, v) for v in exposed]),
-        array("int", "offset", [str(layout.offsets[v.name]) for v in exposed]),
-        array("int", "length", [str(v.size) for v in exposed]),
-        array("unsigned", "variable_of", [str(v) for _, v in places]),
-        array("double", "minimum", [repr(float(v.minimum)) for v in exposed]),
-        array("double", "maximum", [repr(float(v.maximum)) for v in exposed]),
-        array("double", "nominal", [repr(float(v.nominal)) for v in exposed]),
-        array("double", "start", [value.hex() for v in layout.stored for value in start_of(v, starts)]),
-        "",
-    ]
-    return "\n".join(lines)
-
-
-def _unsupported(fmi: int, wrapper: str) -> str:
-    """C code of the FMI functions outside this FMU's capabilities: importers want every symbol, and each must fail."""
-    headers = (Path(fmpy.__file__).parent / "c-code" / f"fmi{fmi}Functions.h").read_text()
-    declared = re.findall(rf"FMI{fmi}_Export\s+fmi{fmi}\w+TYPE\s+(fmi{fmi}\w+);", headers)
-    missing = [name for name in declared if not re.search(rf"\b{name}\(", wrapper)]
-    lines = []
-    for name in missing:
-        if "Instantiate" in name:
-            lines.append(f"EXPORT void *{name}(void) {{ return 0; }}")
-        elif re.search(r"[GS]et(U?Int|Float|Real|Integer|Boolean|String|Binary|Clock)\w*$", name):
-            lines.append(
-                f"EXPORT int {name}(void *instance, const unsigned *references, size_t n) "
-                f'{{ (void)references; return model_absent(instance, "{name}", n); }}'
-            )
-        else:
-            lines.append(f'EXPORT int {name}(void *instance) {{ return model_absent(instance, "{name}", 1); }}')
-    return "\n".join(
-        [
-            "#if defined _WIN32 || defined __CYGWIN__",
-            "#define EXPORT __declspec(dllexport)",
-            "#elif defined __GNUC__",
-            '#define EXPORT __attribute__((visibility("default")))',
-            "#else",
-            "#define EXPORT",
-            "#endif",
-            '#include "model.h"',
-            *lines,
-            "",
-        ]
-    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Calling an FMU from compiled code, by the addresses of its C functions."""
+"""Calls of an FMU from compiled code, by the addresses of its C functions."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,25 +10,25 @@ from numba.extending import intrinsic
 
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import DRIVE_MODES, IMU_COUNT, VELOCITY
-from plant.fmu.importer import ASKS_TO_END, ERROR, NEEDS_EVENTS, OK
+from plant.fmu.instance import ASKS_TO_END, ERROR, NEEDS_EVENTS, OK
 from plant.mechanism import LEGS
 from plant.pose import Array
 from plant.truth import TRUTH_SIZE
 
 MOST_CHANGES = 32
-"""How many parameters may change during a run."""
+"""The most parameters that may change during a run."""
 
 _SENSED = 3 * IMU_COUNT * 3
-_READING, _TELLING, _COMMANDING, _SWITCHING, _LOADING, _CHANGING, _STEPPING = range(7)
+_READ_IMUS, _READ_TRUTH, _WRITE_COMMAND, _WRITE_MODES, _WRITE_PAYLOAD, _CHANGE_VALUE, _STEP = range(7)
 CALLED = (
     "reading the IMUs", "reading the truth", "setting the commands", "setting the drives' modes", "setting the payload",
     "changing a parameter", "a step",
 )  # fmt: skip
-"""What a call is, for messages, by the `call` of `FMU_HANDLE`."""
+"""The name of each call in messages, by the `call` of `FMU_HANDLE`."""
 
 
 def _scalars(most: int) -> np.dtype[Any]:
-    """As `plant.fmu.binding.Scalars`, with room for so many, and the FMU's values."""
+    """`plant.fmu.binding.Scalars` for at most so many, and a buffer `raw` for the FMU's values."""
     return np.dtype(
         [
             ("references", np.uint32, most),
@@ -96,20 +96,20 @@ FMU_HANDLE = np.dtype(
     ],
     align=True,
 )
-"""One FMU as compiled code sees it: addresses, value references with what makes the FMU's values the loop's, and buffers.
+"""One FMU in compiled code: addresses, value references with their conversions, and buffers.
 
-`imu` is angular velocity [rad/s], specific force [m/s^2] and magnetic field [uT] of the seven IMUs; `truth` is position (3)
-[m], quaternion (4), leg lengths (6) [m] and currents (6) [A]; both are NaN where the FMU says nothing. A planar plant's truth
-has its pose in space, with z = 0, and its first three legs. `step` is the communication step [s], 0 for that of each call.
-`time` is `steps` steps of one `length` [s] after `since` [s]: counted, for a sum would drift. `final` is whether no earlier
-state will be restored. `status` is how the first call that went wrong has ended, and `call` which that was.
+`imu` is angular velocity [rad/s], specific force [m/s^2] and magnetic field [uT] of the seven IMUs; `truth` is that of
+`plant.truth`; both are NaN where the FMU has no value. A planar plant's truth has its pose in space, with z = 0, and its first
+three legs. `step` is the communication step [s], or 0 to step by the duration of each call. `time` is `steps` steps of one
+`length` [s] after `since` [s]: a count, because a sum would drift. `final` is whether no earlier state will be restored.
+`status` is the status of the first call that failed, and `call` is that call.
 """
 
 
 def _calling(arguments: str) -> Any:
     """An intrinsic that calls the C function at an address with a tuple of arguments and returns its int.
 
-    `arguments` has one letter each: p for a pointer or size (intp), d for a double, b for a bool (uint8), i for an int.
+    `arguments` has a letter for each: p for a pointer or size (intp), d for a double, b for a bool (uint8), i for an int.
     """
     llvm = {"p": ir.IntType(64), "d": ir.DoubleType(), "b": ir.IntType(8), "i": ir.IntType(32)}
     numba_types = {"p": types.intp, "d": types.float64, "b": types.uint8, "i": types.int32}
@@ -123,7 +123,7 @@ def _calling(arguments: str) -> Any:
             function_type = ir.FunctionType(ir.IntType(32), [llvm[letter] for letter in arguments])
             function = builder.inttoptr(args[0], function_type.as_pointer())
             unpacked = [builder.extract_value(args[1], i) for i in range(len(arguments))]
-            # Callees may count on a bool that fills its register.
+            # Callees may expect a bool to fill its register.
             extended = {i: ("zeroext",) for i, letter in enumerate(arguments) if letter == "b"}
             return builder.call(function, unpacked, arg_attrs=extended)
 
@@ -139,8 +139,8 @@ _do_step_3: Callable[..., int] = _calling("pddbpppp")
 
 
 @kernel
-def _ended(c: Record, call: int, status: int) -> int:
-    """Take note of the first call that goes wrong; returns its status."""
+def _keep_failure(c: Record, call: int, status: int) -> int:
+    """Record the status if this call is the first that fails; return it."""
     if status != OK and c.status == OK:
         c.status, c.call = status, call
     return status
@@ -148,14 +148,14 @@ def _ended(c: Record, call: int, status: int) -> int:
 
 @kernel
 def _access(c: Record, call: int, function: int, references: int, reference_count: int, values: int, count: int) -> int:
-    """Get or set values, unless the FMU has failed before; returns FMI's status."""
+    """Get or set values, unless the FMU has failed; returns FMI's status."""
     if c.status >= ERROR:
         return int(c.status)
     if c.version == 2:
         status = _access_2(function, (c.instance, references, reference_count, values))
     else:
         status = _access_3(function, (c.instance, references, reference_count, values, count))
-    return _ended(c, call, status)
+    return _keep_failure(c, call, status)
 
 
 @kernel
@@ -185,17 +185,17 @@ def _write(c: Record, call: int, scalars: Record, values: Array) -> int:
 
 @kernel
 def read_imus(fmu: Record) -> int:
-    """Read the ideal IMU signals into `imu`; returns FMI's status, 0 when all is well."""
+    """Read the ideal IMU signals into `imu`; returns FMI's status, 0 for success."""
     c = fmu[()]
-    return _read(c, _READING, c.sensed, c.imu.reshape(-1))
+    return _read(c, _READ_IMUS, c.sensed, c.imu.reshape(-1))
 
 
 @kernel
 def read_truth(fmu: Record) -> int:
-    """Read pose, lengths and currents into `truth`, as far as the FMU tells them; returns FMI's status."""
+    """Read pose, lengths and currents into `truth`, as far as the FMU has them; returns FMI's status."""
     c = fmu[()]
     truth = c.truth
-    status = _read(c, _TELLING, c.known, truth)
+    status = _read(c, _READ_TRUTH, c.known, truth)
     if c.planar_angle != 0:
         half = 0.5 * truth[3]
         truth[3], truth[4], truth[5], truth[6] = np.cos(half), 0.0, 0.0, np.sin(half)
@@ -206,13 +206,13 @@ def read_truth(fmu: Record) -> int:
 def write_command(fmu: Record, command: Array) -> int:
     """Set the velocity commands (6,) or (3,) [m/s]; returns FMI's status.
 
-    Where the drives have no modes, those that are not to move are told to stand.
+    Drives without modes get the command 0 unless their mode is `VELOCITY`.
     """
     c = fmu[()]
     sent = c.command
     for k in range(c.legs):
         sent[k] = command[k] if c.mode_count > 0 or c.mode[k] == VELOCITY else 0.0
-    return _write(c, _COMMANDING, c.commanded, sent)
+    return _write(c, _WRITE_COMMAND, c.commanded, sent)
 
 
 @kernel
@@ -224,9 +224,9 @@ def write_drive_mode(fmu: Record, mode: int) -> int:
 
 @kernel
 def write_drive_modes(fmu: Record) -> int:
-    """Set the modes of the drives to those in `mode`; returns FMI's status.
+    """Set the drives to the modes in `mode`; returns FMI's status.
 
-    A switch that the drives have in common is on while any of them is to move.
+    A mode that all drives share is that of the drive with the highest mode.
     """
     c = fmu[()]
     if c.mode_count == 0:
@@ -242,7 +242,7 @@ def write_drive_modes(fmu: Record) -> int:
         raw[at >> 3] |= c.mode_values[mode] << np.uint64(8 * (at & 7))
     references = c.mode_references
     return _access(
-        c, _SWITCHING, c.set_mode, references.ctypes.data, c.mode_reference_count, raw.ctypes.data, c.mode_count
+        c, _WRITE_MODES, c.set_mode, references.ctypes.data, c.mode_reference_count, raw.ctypes.data, c.mode_count
     )  # fmt: skip
 
 
@@ -251,12 +251,12 @@ def write_payload_mass(fmu: Record, mass: float) -> int:
     """Set the mass of the payload [kg], if the plant has one; returns FMI's status."""
     c = fmu[()]
     c.payload[0] = mass
-    return _write(c, _LOADING, c.loaded, c.payload)
+    return _write(c, _WRITE_PAYLOAD, c.loaded, c.payload)
 
 
 @kernel
 def advance(fmu: Record, duration: float) -> int:
-    """Step the FMU by `duration` [s], in communication steps of its own if it has one; returns FMI's status."""
+    """Step the FMU by `duration` [s], in steps of `step` if that is set; returns FMI's status."""
     c = fmu[()]
     steps = 1 if c.step == 0.0 else max(int(np.rint(duration / c.step)), 1)
     status = OK
@@ -264,7 +264,7 @@ def advance(fmu: Record, duration: float) -> int:
         while c.changed < c.change_count and c.changes[c.changed].time <= c.time + _INSTANT_S:
             change = c.changes[c.changed]
             status |= _access(
-                c, _CHANGING, change.function, change.references, change.reference_count, change.values, change.count
+                c, _CHANGE_VALUE, change.function, change.references, change.reference_count, change.values, change.count
             )  # fmt: skip
             c.changed += 1
         status |= _step(c, duration / steps)
@@ -272,12 +272,12 @@ def advance(fmu: Record, duration: float) -> int:
 
 
 _INSTANT_S = 1e-9
-"""What is due within this time is due now [s]."""
+"""A change that is due within this time is made now [s]."""
 
 
 @kernel
 def _step(c: Record, step: float) -> int:
-    """Take a communication step, unless the FMU has failed before; returns FMI's status."""
+    """Take a communication step, unless the FMU has failed; returns FMI's status."""
     if c.status >= ERROR:
         return int(c.status)
     if c.version == 2:
@@ -294,4 +294,4 @@ def _step(c: Record, step: float) -> int:
         c.since, c.length, c.steps = c.time, step, 0
     c.steps += 1
     c.time = c.since + c.steps * step
-    return _ended(c, _STEPPING, status)
+    return _keep_failure(c, _STEP, status)

@@ -1,7 +1,4 @@
-"""Whether an FMU keeps what it promises: for any FMU of FMI 2.0 or 3.0 for Co-Simulation, ours or another's.
-
-FMPy validates the description; the rest is found by loading the FMU and trying it.
-"""
+"""Checks of any FMU for Co-Simulation, of FMI 2.0 or 3.0: FMPy validates its description, and trials use what it promises."""
 
 import contextlib
 import functools
@@ -18,21 +15,22 @@ from typing import Any
 import numpy as np
 from fmpy.validation import validate_fmu
 
-from plant.fmu.importer import FmuDescription, FmuInstance, FmuVariable
+from plant.fmu.importer import FmuDescription, FmuVariable
+from plant.fmu.instance import FmuInstance
 from plant.pose import Array
 
 _STEPS = 10
 _SMALL = 1e-4
 _ROUGHLY = 1e-4
-"""Of an input, a step for central differences; and how well they must agree with derivatives, relative to the largest."""
+"""The step of an input for central differences, and their tolerance against derivatives, relative to the largest."""
 
 Found = tuple[str, ...] | None
-"""Problems, none if all is well; None if there was nothing to look at."""
+"""Problems, if any; None if there was nothing to check."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was looked at, and what was found."""
+    """One check and its result."""
 
     name: str
     problems: Found
@@ -46,7 +44,7 @@ def platforms_of(path: Path) -> list[str]:
 
 
 def check_fmu(path: Path) -> list[Check]:
-    """Validate an FMU, and try it on this machine, in a process of its own, which may crash.
+    """Validate an FMU and try it on this machine, in a separate process, which may crash.
 
     Raises:
         FmuError: the file is no FMU for Co-Simulation.
@@ -58,7 +56,7 @@ def check_fmu(path: Path) -> list[Check]:
 
 
 def _try_apart(path: Path) -> list[Found]:
-    """What each trial finds; after a crash, the rest go on in another process."""
+    """The result of each trial; after a crash, another process continues with the next."""
     found: list[Found] = []
     context = multiprocessing.get_context("spawn")
     while len(found) < len(_TRIALS):
@@ -76,8 +74,8 @@ def _try_apart(path: Path) -> list[Found]:
 
 
 def _try(path: Path, first: int, sender: Connection) -> None:
-    """Make the trials from one on, in the process that is there for them."""
-    # Many an FMU prints.
+    """Run the trials from number `first` on, in their own process."""
+    # Some FMUs print.
     silence = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
         os.dup2(silence, stream)
@@ -87,12 +85,12 @@ def _try(path: Path, first: int, sender: Connection) -> None:
 
 
 def _ending(status: int) -> str:
-    """How a process ended that should not have."""
+    """How a process ended unexpectedly."""
     return f"crashed with signal {-status}" if status < 0 else f"ended its process with status {status}"
 
 
 def _found(trial: Callable[[], Iterable[str] | None]) -> Found:
-    """What a trial finds; what it raises is a finding, too."""
+    """The problems of a trial; an exception is a problem, too."""
     try:
         # FMPy prints.
         with contextlib.redirect_stdout(io.StringIO()), contextlib.chdir("."):

@@ -1,14 +1,14 @@
-"""modelDescription.xml of an exported plant, for FMI 2.0 and 3.0, from its variable table; and buildDescription.xml.
+"""The layout of an exported plant, and its XML: modelDescription.xml for FMI 2.0 and 3.0, and buildDescription.xml.
 
-FMI 3.0 has arrays: one variable per entry of the table, whose value reference is its index in `exposed`. FMI 2.0 has
-scalars: one per element, named `leg_length[1]` or `base_joints[1,3]`, counted from 1 and row by row, whose value reference
-is its place in the vector of all values (`Layout`).
+FMI 3.0 has arrays: each variable of the table is one variable, whose value reference is its index in `Layout.exposed`. FMI 2.0
+has scalars: one per element, named `leg_length[1]` or `base_joints[1,3]`, counted from 1 and row by row, whose value reference
+is its place in the vector of all values.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from xml.sax.saxutils import quoteattr
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from plant.dynamics.variables import BRAKE, DRIVE_MODES, Variable, VariableTable
 from plant.fmu.importer import element_names
@@ -41,7 +41,7 @@ QUANTITIES: dict[str, tuple[str, dict[str, int | str]]] = {
     "uT": ("MagneticFluxDensity", {"kg": 1, "s": -2, "A": -1, "factor": "1e-6"}),
     "1": ("Dimensionless", {}),
 }
-"""What each unit measures, and its exponents of the SI base units."""
+"""The quantity that each unit measures, and its exponents of the SI base units."""
 
 _PER_SECOND = {"m": "m/s", "m/s": "m/s2", "rad": "rad/s", "rad/s": "rad/s2", "1": "1/s", "A": "A/s"}
 """The units of the states' derivatives."""
@@ -49,7 +49,7 @@ _PER_SECOND = {"m": "m/s", "m/s": "m/s2", "rad": "rad/s", "rad/s": "rad/s2", "1"
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the values of a plant lie in one vector: states, inputs, parameters, outputs, derivatives of the states."""
+    """The values of a plant in one vector: states, inputs, parameters, outputs, derivatives of the states."""
 
     table: VariableTable
 
@@ -78,7 +78,7 @@ class Layout:
 
     @cached_property
     def offsets(self) -> Mapping[str, int]:
-        """Where the values of each variable begin, by its name."""
+        """The place of each variable's first value, by its name."""
         offsets, at = {}, 0
         for variable in self.stored:
             offsets[variable.name] = at
@@ -91,11 +91,11 @@ class Layout:
         return sum(variable.size for variable in self.stored)
 
     def state_of(self, variable: Variable) -> Variable | None:
-        """The state that a variable is the derivative of, or None."""
+        """The state whose derivative a variable is, or None."""
         return self.table.states[self.rates.index(variable)] if variable in self.rates else None
 
     def places(self, variable: Variable) -> range:
-        """Where the values of a variable are."""
+        """The places of a variable's values."""
         return range(self.offsets[variable.name], self.offsets[variable.name] + variable.size)
 
 
@@ -113,7 +113,7 @@ class Dependencies:
 
 
 def start_of(variable: Variable, starts: Mapping[str, Array]) -> list[float]:
-    """The start values of a variable, row by row: the drives on their brakes, the inputs zero."""
+    """The start values of a variable, row by row: the drives on their brakes, the other inputs zero."""
     if variable.discrete:
         return [float(BRAKE)] * variable.size
     if variable.causality == "parameter":
@@ -121,16 +121,15 @@ def start_of(variable: Variable, starts: Mapping[str, Array]) -> list[float]:
     return [0.0] * variable.size
 
 
-def build_description(identifier: str, sources: list[str]) -> str:
-    """How others can compile the FMU: sources/buildDescription.xml of FMI 3.0."""
-    files = "".join(f'<SourceFile name="{name}"/>' for name in sources)
-    return _document(
-        '<fmiBuildDescription fmiVersion="3.0">',
-        f'<BuildConfiguration modelIdentifier="{identifier}" description="any C99 compiler; without -ffast-math">',
-        f'<SourceFileSet language="C99">{files}</SourceFileSet>',
-        "</BuildConfiguration>",
-        "</fmiBuildDescription>",
-    )
+def build_description(identifier: str, sources: list[str]) -> bytes:
+    """The instructions to compile the FMU: sources/buildDescription.xml of FMI 3.0."""
+    root = Element("fmiBuildDescription", fmiVersion="3.0")
+    description = "any C99 compiler; without -ffast-math"
+    configuration = SubElement(root, "BuildConfiguration", modelIdentifier=identifier, description=description)
+    files = SubElement(configuration, "SourceFileSet", language="C99")
+    for name in sources:
+        SubElement(files, "SourceFile", name=name)
+    return _document(root)
 
 
 def model_description(
@@ -142,8 +141,8 @@ def model_description(
     token: str,
     dependencies: Dependencies,
     sources: list[str],
-) -> str:
-    """The text of modelDescription.xml.
+) -> bytes:
+    """The content of modelDescription.xml.
 
     Args:
         fmi: version of FMI, 2 or 3.
@@ -156,168 +155,177 @@ def model_description(
         sources: names of the C files.
     """
     writer = (_Fmi3 if fmi == 3 else _Fmi2)(layout, starts, dependencies)
-    head = (
-        f"modelName={quoteattr(identifier)} description={quoteattr(description)}"
-        ' generationTool="gough" variableNamingConvention="structured"'
-    )
-    return _document(*writer.document(head, identifier, token, sources))
+    root = Element(
+        "fmiModelDescription",
+        writer.head(token)
+        | {
+            "modelName": identifier, "description": description, "generationTool": "gough",
+            "variableNamingConvention": "structured",
+        },
+    )  # fmt: skip
+    writer.add_interfaces(root, identifier, sources)
+    units = SubElement(root, "UnitDefinitions")
+    for unit in sorted({variable.unit for variable in layout.exposed} | {"s"}):
+        bases = {base: str(exponent) for base, exponent in QUANTITIES[unit][1].items()}
+        SubElement(SubElement(units, "Unit", name=unit), "BaseUnit", bases)
+    writer.add_types(root)
+    categories = SubElement(root, "LogCategories")
+    SubElement(categories, "Category", name="logStatusError", description="why a call was refused or failed")
+    SubElement(root, "DefaultExperiment", startTime="0", stopTime="10", stepSize="0.001")
+    writer.add_variables(SubElement(root, "ModelVariables"))
+    writer.add_structure(SubElement(root, "ModelStructure"))
+    return _document(root)
 
 
-def _document(*lines: str) -> str:
-    return "\n".join(['<?xml version="1.0" encoding="UTF-8"?>', *lines, ""])
+def _document(root: Element) -> bytes:
+    indent(root)
+    document: bytes = tostring(root, encoding="UTF-8", xml_declaration=True)
+    return document + b"\n"
 
 
-_CATEGORY = '<Category name="logStatusError" description="why a call was refused or failed"/>'
-_EXPERIMENT = '<DefaultExperiment startTime="0" stopTime="10" stepSize="0.001"/>'
-_ITEMS = "".join(f'<Item name="{name}" value="{value}"/>' for value, name in DRIVE_MODES.items())
+def _words(numbers: Iterable[int]) -> str:
+    return " ".join(map(str, sorted(numbers)))
 
 
+_TIME = {
+    "causality": "independent", "variability": "continuous", "quantity": "Time", "unit": "s", "description": "simulation time",
+}  # fmt: skip
+_STEPS = {"canHandleVariableCommunicationStepSize": "true"}
+
+
+@dataclass
 class _Writer:
-    """What both versions have in common."""
+    """Common to both versions of FMI."""
 
-    def __init__(self, layout: Layout, starts: Mapping[str, Array], dependencies: Dependencies) -> None:
-        self.layout, self.starts, self.dependencies = layout, starts, dependencies
+    layout: Layout
+    starts: Mapping[str, Array]
+    dependencies: Dependencies
 
-    def units(self) -> str:
-        """The definitions of all units in use."""
-        used = sorted({variable.unit for variable in self.layout.exposed} | {"s"})
-        bases = [(unit, "".join(f' {base}="{exponent}"' for base, exponent in QUANTITIES[unit][1].items())) for unit in used]
-        return "".join(f'<Unit name="{unit}"><BaseUnit{base}/></Unit>' for unit, base in bases)
+    def add_types(self, root: Element) -> None:
+        """FMI 2.0 needs none."""
 
-    def variability(self, variable: Variable) -> str:
+    def role(self, variable: Variable) -> dict[str, str]:
+        """Causality and variability."""
+        causality = "local" if variable.causality == "state" else variable.causality
         if variable.causality == "parameter":
-            return "tunable" if variable.tunable else "fixed"
-        return "discrete" if variable.discrete else "continuous"
+            return {"causality": causality, "variability": "tunable" if variable.tunable else "fixed"}
+        return {"causality": causality, "variability": "discrete" if variable.discrete else "continuous"}
 
-    def causality(self, variable: Variable) -> str:
-        return "local" if variable.causality == "state" else variable.causality
+    def initial(self, variable: Variable) -> dict[str, str]:
+        return {"initial": "calculated"} if variable.causality in ("state", "output") else {}
 
-    def calculated(self, variable: Variable) -> bool:
-        return variable.causality in ("state", "output")
-
-    def attributes(self, variable: Variable) -> str:
-        """Quantity, unit and range."""
+    def bounds(self, variable: Variable) -> dict[str, str]:
+        """Quantity, unit and bounds."""
+        limits = {"min": repr(variable.minimum), "max": repr(variable.maximum)}
         if variable.discrete:
-            return f' min="{variable.minimum:d}" max="{variable.maximum:d}"'
-        quantity = QUANTITIES[variable.unit][0]
-        bounds = f' min="{variable.minimum!r}" max="{variable.maximum!r}" nominal="{variable.nominal!r}"'
-        return f' quantity="{quantity}" unit="{variable.unit}"{bounds}'
+            return limits
+        return {"quantity": QUANTITIES[variable.unit][0], "unit": variable.unit, **limits, "nominal": repr(variable.nominal)}
 
     def start(self, variable: Variable) -> list[str]:
-        """The start values as text; none for what is calculated."""
-        if self.calculated(variable):
+        """The start values as text; none for calculated variables."""
+        if self.initial(variable):
             return []
         values = start_of(variable, self.starts)
         return [str(int(value)) if variable.discrete else repr(value) for value in values]
 
     def unknowns(self) -> Iterator[tuple[str, Variable, Mapping[int, frozenset[int]]]]:
-        """Kind, variable and dependencies of everything that is listed as unknown, in the order of the standard."""
-        layout, dependencies = self.layout, self.dependencies
-        for output in layout.table.outputs:
-            yield "Output", output, dependencies.running
-        for rate in layout.rates:
-            yield "Derivative", rate, dependencies.running
-        for variable in (*layout.table.outputs, *layout.table.states, *layout.rates):
+        """Kind, variable and dependencies of each unknown, in the standard's order."""
+        table, rates, dependencies = self.layout.table, self.layout.rates, self.dependencies
+        for kind, variables in (("Output", table.outputs), ("Derivative", rates)):
+            for variable in variables:
+                yield kind, variable, dependencies.running
+        for variable in (*table.outputs, *table.states, *rates):
             yield "InitialUnknown", variable, dependencies.initial
 
 
 class _Fmi3(_Writer):
-    def document(self, head: str, identifier: str, token: str, _: list[str]) -> list[str]:
-        able = (
-            f'modelIdentifier="{identifier}" canGetAndSetFMUState="true" canSerializeFMUState="true"'
-            ' providesDirectionalDerivatives="true" providesAdjointDerivatives="true"'
-        )
-        return [
-            f'<fmiModelDescription fmiVersion="3.0" instantiationToken="{token}" {head}>',
-            f"<ModelExchange {able}/>",
-            f'<CoSimulation {able} canHandleVariableCommunicationStepSize="true"/>',
-            f"<UnitDefinitions>{self.units()}</UnitDefinitions>",
-            f'<TypeDefinitions><EnumerationType name="DriveMode">{_ITEMS}</EnumerationType></TypeDefinitions>',
-            f"<LogCategories>{_CATEGORY}</LogCategories>",
-            _EXPERIMENT,
-            "<ModelVariables>",
-            f'<Float64 name="time" valueReference="{len(self.layout.exposed)}" causality="independent"'
-            ' variability="continuous" quantity="Time" unit="s" description="simulation time"/>',
-            *(self._variable(reference, variable) for reference, variable in enumerate(self.layout.exposed)),
-            "</ModelVariables>",
-            f"<ModelStructure>{''.join(self._unknowns())}</ModelStructure>",
-            "</fmiModelDescription>",
-        ]
+    def head(self, token: str) -> dict[str, str]:
+        return {"fmiVersion": "3.0", "instantiationToken": token}
 
-    def _variable(self, reference: int, variable: Variable) -> str:
-        tag = "Enumeration" if variable.discrete else "Float64"
-        start = " ".join(self.start(variable))
-        extra = f' start="{start}"' if start else ""
-        if variable.discrete:
-            extra += ' declaredType="DriveMode"'
-        if self.calculated(variable):
-            extra += ' initial="calculated"'
-        if (state := self.layout.state_of(variable)) is not None:
-            extra += f' derivative="{self.layout.exposed.index(state)}"'
-        dimensions = "".join(f'<Dimension start="{n}"/>' for n in variable.shape)
-        return (
-            f'<{tag} name="{variable.name}" valueReference="{reference}" causality="{self.causality(variable)}"'
-            f' variability="{self.variability(variable)}"{self.attributes(variable)}{extra}'
-            f" description={quoteattr(variable.description)}>{dimensions}</{tag}>"
+    def add_interfaces(self, root: Element, identifier: str, _: list[str]) -> None:
+        abilities = (
+            "canGetAndSetFMUState",
+            "canSerializeFMUState",
+            "providesDirectionalDerivatives",
+            "providesAdjointDerivatives",
         )
+        able = {"modelIdentifier": identifier, **dict.fromkeys(abilities, "true")}
+        SubElement(root, "ModelExchange", able)
+        SubElement(root, "CoSimulation", able | _STEPS)
 
-    def _unknowns(self) -> Iterator[str]:
-        references = {place: i for i, v in enumerate(self.layout.exposed) for place in self.layout.places(v)}
+    def add_types(self, root: Element) -> None:
+        modes = SubElement(SubElement(root, "TypeDefinitions"), "EnumerationType", name="DriveMode")
+        for value, name in DRIVE_MODES.items():
+            SubElement(modes, "Item", name=name, value=str(value))
+
+    def add_variables(self, parent: Element) -> None:
+        exposed = self.layout.exposed
+        SubElement(parent, "Float64", {"name": "time", "valueReference": str(len(exposed)), **_TIME})
+        for reference, variable in enumerate(exposed):
+            attributes = {
+                "name": variable.name,
+                "valueReference": str(reference),
+                **self.role(variable),
+                **self.bounds(variable),
+            }
+            if start := self.start(variable):
+                attributes["start"] = " ".join(start)
+            if variable.discrete:
+                attributes["declaredType"] = "DriveMode"
+            attributes |= self.initial(variable)
+            if (state := self.layout.state_of(variable)) is not None:
+                attributes["derivative"] = str(exposed.index(state))
+            attributes["description"] = variable.description
+            element = SubElement(parent, "Enumeration" if variable.discrete else "Float64", attributes)
+            for length in variable.shape:
+                SubElement(element, "Dimension", start=str(length))
+
+    def add_structure(self, parent: Element) -> None:
+        exposed = self.layout.exposed
+        references = {place: i for i, variable in enumerate(exposed) for place in self.layout.places(variable)}
         for kind, variable, dependencies in self.unknowns():
+            known = {references[k] for place in self.layout.places(variable) for k in dependencies[place]}
             tag = "ContinuousStateDerivative" if kind == "Derivative" else kind
-            known = sorted({references[k] for place in self.layout.places(variable) for k in dependencies[place]})
-            reference = self.layout.exposed.index(variable)
-            yield f'<{tag} valueReference="{reference}" dependencies="{" ".join(map(str, known))}"/>'
+            SubElement(parent, tag, valueReference=str(exposed.index(variable)), dependencies=_words(known))
 
 
 class _Fmi2(_Writer):
-    def document(self, head: str, identifier: str, token: str, sources: list[str]) -> list[str]:
-        files = "".join(f'<File name="{name}"/>' for name in sources)
-        structure: dict[str, list[str]] = {"Outputs": [], "Derivatives": [], "InitialUnknowns": []}
-        for kind, text in self._unknowns():
-            structure[f"{kind}s"].append(text)
-        return [
-            f'<fmiModelDescription fmiVersion="2.0" guid="{token}" {head} numberOfEventIndicators="0">',
-            f'<CoSimulation modelIdentifier="{identifier}" canHandleVariableCommunicationStepSize="true"'
-            ' canNotUseMemoryManagementFunctions="true" canGetAndSetFMUstate="true" canSerializeFMUstate="true"'
-            f' providesDirectionalDerivative="true"><SourceFiles>{files}</SourceFiles></CoSimulation>',
-            f"<UnitDefinitions>{self.units()}</UnitDefinitions>",
-            f"<LogCategories>{_CATEGORY}</LogCategories>",
-            _EXPERIMENT,
-            "<ModelVariables>",
-            *(line for variable in self.layout.exposed for line in self._scalars(variable)),
-            "</ModelVariables>",
-            "<ModelStructure>",
-            *(f"<{tag}>{''.join(texts)}</{tag}>" for tag, texts in structure.items()),
-            "</ModelStructure>",
-            "</fmiModelDescription>",
-        ]
+    def head(self, token: str) -> dict[str, str]:
+        return {"fmiVersion": "2.0", "guid": token, "numberOfEventIndicators": "0"}
+
+    def add_interfaces(self, root: Element, identifier: str, sources: list[str]) -> None:
+        abilities = (
+            "canNotUseMemoryManagementFunctions", "canGetAndSetFMUstate", "canSerializeFMUstate",
+            "providesDirectionalDerivative",
+        )  # fmt: skip
+        able = {"modelIdentifier": identifier, **_STEPS, **dict.fromkeys(abilities, "true")}
+        files = SubElement(SubElement(root, "CoSimulation", able), "SourceFiles")
+        for name in sources:
+            SubElement(files, "File", name=name)
 
     @cached_property
     def _index(self) -> dict[int, int]:
-        """The index of each scalar, from its place."""
+        """The index of each scalar, counted from 1, by its place."""
         places = [place for variable in self.layout.exposed for place in self.layout.places(variable)]
         return {place: index for index, place in enumerate(places, start=1)}
 
-    def _scalars(self, variable: Variable) -> Iterator[str]:
-        # Not every importer can set an enumeration.
-        tag = "Integer" if variable.discrete else "Real"
-        starts = self.start(variable)
-        initial = ' initial="calculated"' if self.calculated(variable) else ""
-        for i, (name, place) in enumerate(
-            zip(element_names(variable.name, variable.shape), self.layout.places(variable), strict=True)
-        ):
-            extra = f' start="{starts[i]}"' if starts else ""
-            if (state := self.layout.state_of(variable)) is not None:
-                extra += f' derivative="{self._index[self.layout.offsets[state.name] + i]}"'
-            yield (
-                f'<ScalarVariable name="{name}" valueReference="{place}" causality="{self.causality(variable)}"'
-                f' variability="{self.variability(variable)}"{initial} description={quoteattr(variable.description)}>'
-                f"<{tag}{self.attributes(variable)}{extra}/></ScalarVariable>"
-            )
+    def add_variables(self, parent: Element) -> None:
+        for variable in self.layout.exposed:
+            starts, state, places = self.start(variable), self.layout.state_of(variable), self.layout.places(variable)
+            for i, name in enumerate(element_names(variable.name, variable.shape)):
+                scalar = {"name": name, "valueReference": str(places[i]), **self.role(variable), **self.initial(variable)}
+                element = SubElement(parent, "ScalarVariable", scalar, description=variable.description)
+                attributes = self.bounds(variable)
+                if starts:
+                    attributes["start"] = starts[i]
+                if state is not None:
+                    attributes["derivative"] = str(self._index[self.layout.places(state)[i]])
+                # Some importers cannot set an enumeration.
+                SubElement(element, "Integer" if variable.discrete else "Real", attributes)
 
-    def _unknowns(self) -> Iterator[tuple[str, str]]:
+    def add_structure(self, parent: Element) -> None:
+        lists = {kind: SubElement(parent, f"{kind}s") for kind in ("Output", "Derivative", "InitialUnknown")}
         for kind, variable, dependencies in self.unknowns():
             for place in self.layout.places(variable):
-                known = " ".join(map(str, sorted(self._index[k] for k in dependencies[place])))
-                yield kind, f'<Unknown index="{self._index[place]}" dependencies="{known}"/>'
+                known = _words(self._index[k] for k in dependencies[place])
+                SubElement(lists[kind], "Unknown", index=str(self._index[place]), dependencies=known)

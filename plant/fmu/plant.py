@@ -1,4 +1,4 @@
-"""Running a plant FMU: checked when it is loaded, then called from compiled code (`plant.fmu.calls`)."""
+"""A plant FMU for the loop: checked when it is loaded, then called from compiled code (`plant.fmu.calls`)."""
 
 import struct
 from collections.abc import Mapping, Sequence
@@ -13,33 +13,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from plant.compiled import Record
 from plant.errors import FmuError, InputError
-from plant.fmu.binding import OWN_BINDING, Binding, Modes, Scalars, bind, check_free, check_start, load_binding
-from plant.fmu.calls import (
-    CALLED,
-    FMU_HANDLE,
-    MOST_CHANGES,
-    advance,
-    read_imus,
-    read_truth,
-    write_command,
-    write_drive_mode,
-    write_drive_modes,
-    write_payload_mass,
-)  # fmt: skip
-from plant.fmu.importer import OK, FmuDescription, FmuInstance, FmuVariable
+from plant.fmu.binding import Modes, Scalars, bind, check_free, check_start
+from plant.fmu.binding_file import OWN_BINDING, Binding, load_binding
+from plant.fmu.calls import CALLED, FMU_HANDLE, MOST_CHANGES, advance
+from plant.fmu.importer import FmuDescription, FmuVariable
+from plant.fmu.instance import OK, FmuInstance
 from plant.fmu.settings import Setting
 from plant.mechanism import LEGS
 from plant.pose import Array
 
-__all__ = [
-    "FMU_HANDLE", "MOST_CHANGES", "FmuPlant", "LinearPlant", "advance", "read_imus", "read_truth", "write_command",
-    "write_drive_mode", "write_drive_modes", "write_payload_mass",
-]  # fmt: skip
-
 
 @dataclass(frozen=True, eq=False)
 class LinearPlant:
-    """A linear system `x' = A x + B u, y = C x + D u` of n states, m inputs and p outputs, all as differences.
+    """A linear system `x' = A x + B u, y = C x + D u` with n states, m inputs and p outputs, all differences from a point.
 
     Attributes:
         a, b, c, d: (n, n), (n, m), (p, n), (p, m).
@@ -60,21 +46,21 @@ class FmuPlant:
 
     Args:
         path: the FMU.
-        parameters: start values by name; a name that the FMU does not have is an error.
+        parameters: start values by name; a name that the FMU lacks is an error.
         period: of control [s].
-        binding: a TOML file that says which variables are which; None where they have gough's own names.
-        settings: values that come after the parameters and the binding's, at the start or during the run.
-        legs: that it must have; None for any number.
+        binding: a binding or its TOML file; None if the variables have gough's own names.
+        settings: values set after the parameters and the binding's start values, at the start or during the run.
+        legs: the required number; None for any.
 
     Attributes:
         handle: the structured array (dtype `FMU_HANDLE`) for `read_imus`, `read_truth`, `write_command` and `advance`.
-        bound: what its variables are to the loop.
-        folder: where it has been extracted to; removed by `close`, or after a crash when an FMU is next loaded.
+        bound: the loop's signals in the FMU.
+        folder: with the extracted files; removed by `close`, or after a crash when an FMU is next loaded.
 
     Raises:
-        FmuError: the file is no FMU, is of another kind, does not fit its binding, holds no binary for this machine, or refuses
+        FmuError: the file is no FMU, is of another kind, does not fit its binding, has no binary for this machine, or refuses
             its parameters.
-        UnknownNameError: a parameter or setting that the FMU does not have.
+        UnknownNameError: a parameter or setting that the FMU lacks.
         InputError: another number of legs, a period that the FMU cannot take, a binding that cannot be read, or a value that
             does not fit.
     """
@@ -105,7 +91,7 @@ class FmuPlant:
         self._check_changes(changes)
         self._instance = FmuInstance(self.description)
         try:
-            self._prepare_calls(binding.step)
+            self._prepare_handle(binding.step)
             for each in changes:
                 self._add_change(each)
             for variable, numbers in values:
@@ -123,16 +109,16 @@ class FmuPlant:
 
     @property
     def folder(self) -> Path:
-        """Where the FMU has been extracted to."""
+        """The folder with the extracted files."""
         return self._instance.folder
 
     @property
     def messages(self) -> Sequence[str]:
-        """What the FMU has logged of late, but for what says that all is well."""
+        """The latest warnings and errors that the FMU has logged."""
         return self._instance.messages
 
     def close(self) -> None:
-        """Free the instance and remove what was extracted; closing twice does no harm."""
+        """Free the instance and remove the extracted files; a second call does nothing."""
         self._instance.status = max(self._instance.status, int(self.handle["status"]))
         self._instance.close()
 
@@ -141,7 +127,7 @@ class FmuPlant:
 
         Raises:
             UnknownNameError: the FMU has no such variable.
-            InputError: it is no number.
+            InputError: the variable is no number.
             FmuError: the FMU refuses.
         """
         return self._instance.get(self.description[name])
@@ -151,7 +137,7 @@ class FmuPlant:
 
         Raises:
             UnknownNameError: the FMU has no such variable.
-            InputError: the value has the wrong number of elements, or is none for this variable.
+            InputError: the value has the wrong number of elements or the wrong type.
             FmuError: the FMU refuses.
         """
         self._instance.set(*self._values(name, value))
@@ -168,19 +154,19 @@ class FmuPlant:
             raise self.failure()
 
     def linearize(self, inputs: Sequence[str], outputs: Sequence[str]) -> "LinearPlant":
-        """The plant's equations to first order about where it is, from the FMU's directional derivatives.
+        """The plant's equations linearised at its present state, from the FMU's directional derivatives.
 
         Args:
-            inputs, outputs: names of the variables between which the plant is wanted.
+            inputs, outputs: names of variables.
 
         Raises:
             UnknownNameError: the FMU has no such variable.
-            InputError: it is no real variable.
-            FmuError: the FMU has no directional derivatives, or shows no states.
+            InputError: a variable is not real.
+            FmuError: the FMU has no directional derivatives, or exposes no states.
         """
         states, rates = [state for state, _ in self.description.states], [rate for _, rate in self.description.states]
         if not states:
-            raise FmuError(f"{self.path.name} shows no continuous states: export it with them")
+            raise FmuError(f"{self.path.name} exposes no continuous states: export it with them")
         u, y = [self.description[name] for name in inputs], [self.description[name] for name in outputs]
         n = sum(each.size for each in states)
         whole = self._instance.jacobian([*rates, *y], [*states, *u])
@@ -188,7 +174,7 @@ class FmuPlant:
         return LinearPlant(whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:], *names)
 
     def state(self) -> bytes:
-        """All that the plant's future depends on, its clock included.
+        """The plant's whole state, with its clock.
 
         Raises:
             FmuError: the FMU cannot save its state.
@@ -196,20 +182,20 @@ class FmuPlant:
         return struct.pack(_CLOCK, *(self.handle[name] for name in _CLOCKED)) + self._instance.state()
 
     def restore(self, state: bytes) -> None:
-        """Go back to a state of this plant, or of another with the same FMU and settings.
+        """Return to a state of this plant, or of another with the same FMU and settings.
 
         Raises:
-            FmuError: the FMU cannot, or this is no state of it.
+            FmuError: the FMU cannot restore a state, or this is no state of it.
         """
         size = struct.calcsize(_CLOCK)
         if len(state) < size:
-            raise FmuError(f"{self.path.name} cannot restore a state of {len(state)} bytes, for it is none of this plant")
+            raise FmuError(f"{self.path.name} cannot restore a state of {len(state)} bytes, which is no state of this plant")
         self._instance.restore(state[size:])
         for name, value in zip(_CLOCKED, struct.unpack(_CLOCK, state[:size]), strict=True):
             self.handle[name] = value
 
     def failure(self) -> FmuError:
-        """The error that says what went wrong in the compiled calls, in the FMU's own words."""
+        """The error for the first compiled call that failed, with the FMU's own reason."""
         return self._instance.failure(CALLED[int(self.handle["call"])], int(self.handle["status"]))
 
     def _values(self, name: str, value: ArrayLike, spread: bool = False) -> tuple[FmuVariable, NDArray[Any]]:
@@ -252,13 +238,13 @@ class FmuPlant:
             variable, values = self._values(each.name, each.value, spread=True)
             if not variable.tunable:
                 raise InputError(
-                    f"{each.name} of {self.path.name} cannot change during the run, for it is neither an input nor a tunable "
+                    f"{each.name} of {self.path.name} cannot change during the run, as it is neither an input nor a tunable "
                     "parameter: set it without @"
                 )
             check_free(variable, self.path.name, self.bound.driven)
             for name, value, (least, most) in zip(variable.element_names, values, variable.limits, strict=True):
                 if not least <= value <= most:
-                    raise InputError(f"{name} of {self.path.name} is to be {value:g}; it must be from {least:g} to {most:g}")
+                    raise InputError(f"{name} of {self.path.name} would be {value:g}; it must be from {least:g} to {most:g}")
 
     def _add_change(self, setting: Setting) -> None:
         variable, values = self._values(setting.name, setting.value, spread=True)
@@ -270,7 +256,7 @@ class FmuPlant:
         change["values"], change["count"] = values.ctypes.data, values.size
         self.handle["change_count"] += 1
 
-    def _prepare_calls(self, step: float | None) -> None:
+    def _prepare_handle(self, step: float | None) -> None:
         handle, bound, instance = self.handle, self.bound, self._instance
         real = "Real" if self.description.version == 2 else "Float64"
         handle["version"], handle["instance"] = self.description.version, instance.component()

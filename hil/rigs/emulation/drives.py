@@ -13,7 +13,7 @@ from hil.rigs.emulation.faults import FAULT, MOST_FAULTS, FaultKind, draw_normal
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
 from plant.errors import InputError
-from plant.fmu.plant import advance, read_imus, read_truth, write_command, write_drive_modes, write_payload_mass
+from plant.fmu.calls import advance, read_imus, read_truth, write_command, write_drive_modes, write_payload_mass
 from plant.imu import measure
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import rotate_by_vector

@@ -10,7 +10,8 @@ from controller.design.linearization import state_space
 from plant.dynamics.variables import VELOCITY
 from plant.errors import FmuError, InputError, UnknownNameError
 from plant.fmu.build import PLANAR_MODEL, SPATIAL_MODEL, Model, default_fmu
-from plant.fmu.plant import FmuPlant, write_drive_mode
+from plant.fmu.calls import write_drive_mode
+from plant.fmu.plant import FmuPlant
 from plant.mechanism import Mechanism
 
 

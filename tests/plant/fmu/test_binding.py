@@ -15,16 +15,8 @@ import pytest
 
 from plant.dynamics.variables import BRAKE, VELOCITY
 from plant.errors import FmuError, InputError, UnknownNameError
-from plant.fmu.plant import (
-    MOST_CHANGES,
-    FmuPlant,
-    advance,
-    read_imus,
-    read_truth,
-    write_command,
-    write_drive_mode,
-    write_drive_modes,
-)
+from plant.fmu.calls import MOST_CHANGES, advance, read_imus, read_truth, write_command, write_drive_mode, write_drive_modes
+from plant.fmu.plant import FmuPlant
 from plant.fmu.settings import Setting
 from plant.pose import Array
 from plant.truth import TRUTH_LENGTHS
@@ -287,7 +279,7 @@ def test_settings_come_after_the_binding_and_at_their_time(load: Load) -> None:
         (["servo1.retract=1@3"], InputError, "servo1.retract of foreign.fmu is set by the loop"),
         (["servo1.retract=1"], InputError, "servo1.retract of foreign.fmu is set by the loop"),
         (["pose.x=1"], InputError, "pose.x of foreign.fmu is a continuous output variable, which takes no start value"),
-        (["servo.lag=0@3"], InputError, "servo.lag of foreign.fmu is to be 0; it must be from 0.001 to inf"),
+        (["servo.lag=0@3"], InputError, "servo.lag of foreign.fmu would be 0; it must be from 0.001 to inf"),
         (["fault.status=0.5"], InputError, "fault.status of foreign.fmu must be whole numbers"),
         ([f"servo.lag=1@{n}" for n in range(MOST_CHANGES + 1)], InputError, f"at most {MOST_CHANGES} can"),
     ],
@@ -310,7 +302,7 @@ def test_each_scalar_of_an_array_keeps_its_own_limits(load: Load, foreign_fmu: P
     for _ in range(2):
         plant.step(1e-3)
     np.testing.assert_array_equal(plant.get("set"), [0.05, 8.0])
-    with pytest.raises(InputError, match=r"set\[2\] of array.fmu is to be 0.05; it must be from 5 to inf"):
+    with pytest.raises(InputError, match=r"set\[2\] of array.fmu would be 0.05; it must be from 5 to inf"):
         load(without("start"), "set=0.05@0.001", fmu=path)
 
 
@@ -338,7 +330,7 @@ def test_settings_are_read_from_text() -> None:
         (2, "was discarded"),
         (3, "failed"),
         (4, "failed for good"),
-        (5, "goes on in the background, for .*"),
+        (5, "continues in the background, .*"),
     ],
 )
 def test_every_status_but_ok_ends_with_the_message_of_the_fmu(load: Load, status: int, ending: str) -> None:

@@ -18,7 +18,8 @@ import pytest
 from plant.dynamics.variables import BRAKE, OPEN, SPATIAL, VELOCITY
 from plant.errors import FmuError, InputError, UnknownNameError
 from plant.fmu.build import PLANAR_MODEL, default_fmu
-from plant.fmu.plant import FmuPlant, advance, read_imus, read_truth, write_command, write_drive_mode, write_drive_modes
+from plant.fmu.calls import advance, read_imus, read_truth, write_command, write_drive_mode, write_drive_modes
+from plant.fmu.plant import FmuPlant
 from plant.fmu.settings import Setting
 from plant.mechanism import Mechanism
 from plant.pose import Array
@@ -126,8 +127,8 @@ def test_an_fmu_without_a_needed_variable_is_refused(hexapod: Mechanism, fmu_pat
 
 def test_all_that_is_wrong_with_the_variables_is_said_at_once(hexapod: Mechanism, fmu_path: Path, tmp_path: Path) -> None:
     changes = {
-        r'(name="position"[^>]*>)<Dimension start="3"/>': r'\1<Dimension start="4"/>',
-        r'(name="imu_magnetic_field"[^>]*>)<Dimension start="7"/><Dimension start="3"/>': r'\1<Dimension start="20"/>',
+        r'(name="position"[^>]*>)\s*<Dimension start="3" />': r'\1<Dimension start="4"/>',
+        r'(name="imu_magnetic_field"[^>]*>)\s*<Dimension start="7" />\s*<Dimension start="3" />': r'\1<Dimension start="20"/>',
         r'(name="velocity_command"[^>]*) causality="input" variability="continuous"': (
             r'\1 causality="parameter" variability="fixed"'
         ),

@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from plant.dynamics.variables import PLATFORM_IMU, SPATIAL, VariableTable, checked_parameters
 from plant.errors import FmuError
 from plant.fmu.build import PLANAR_MODEL, SPATIAL_MODEL, Model, default_fmu
-from plant.fmu.plant import FmuPlant, advance, read_imus
+from plant.fmu.calls import advance, read_imus
+from plant.fmu.plant import FmuPlant
 from plant.mechanism import load_in_space
 from plant.mechanism.classification import draw_mechanism, draw_planar_mechanism, planar_classes, spatial_classes
 from plant.pose import Array, quaternion_from_rotation
