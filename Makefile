@@ -13,6 +13,9 @@ demo: .venv/installed
 	$(BIN)/gough simulate --report $(OUT)/demo.html --json $(OUT)/demo.json
 	@echo "Open $(OUT)/demo.html in a browser to see it move."
 
+# The matrices are small: threads of BLAS would only wait for each other.
+test test-all: export OPENBLAS_NUM_THREADS = 1
+
 test: .venv/installed-test
 	$(BIN)/pytest -n $(WORKERS) --dist loadfile -m "not slow"
 

@@ -5,7 +5,10 @@ import json
 import numpy as np
 import pytest
 
+from controller.calibration.file import Calibration
+from hil.calibration.drive import RigCalibration
 from hil.command_line import main
+from plant.mechanism import load_spatial
 
 
 @pytest.fixture(scope="module")
@@ -16,6 +19,32 @@ def figures(tmp_path_factory):
     return json.loads(file.read_text())
 
 
+@pytest.fixture
+def without_calibration(monkeypatch):
+    """Calibrated IMUs on every rig, so that the evaluation need not drive it: `tests/hil/calibration` tests that."""
+    error = {"position_rms": 1e-3, "rotation_rms": 1e-3}
+    summary = {kind: dict.fromkeys(("before", "motion"), error) for kind in ("true", "predicted")}
+    found = RigCalibration(load_spatial("hexapod"), Calibration(), summary)
+    monkeypatch.setattr("hil.studies.fusion_evaluation.calibrate_rig", lambda *arguments, **options: found)
+
+
+def test_calibrated_imus_start_in_motion_bear_a_dead_one_and_do_not_drift(without_calibration, tmp_path):
+    file = tmp_path / "figures.json"
+    options = ("--imu", "mpu9150-calibrated", "--rate", "250", "--seeds", "1", "--starts", "2", "--still", "25")
+    sections = ("faults", "start", "drift")
+    assert main(["evaluate-fusion", *options, "--joint-error", "0", "--only", *sections, "--json", str(file)]) == 0
+    figures = json.loads(file.read_text())
+    assert {"calibration", *sections} < set(figures) and "motions" not in figures
+    assert figures["start"]["succeeded"] == figures["start"]["starts"] == 2
+    assert figures["start"]["position_max"] < 1e-3
+    for name, ratio in (("none", 1.0), ("leg", 1.5), ("platform", 3.0)):
+        assert figures["faults"][name]["position_rms"] < 0.3e-3
+        assert figures["faults"][name]["position_rms"] <= ratio * figures["faults"]["none"]["position_rms"]
+    (minute,) = figures["drift"]["minutes"]
+    assert minute["position_rms"] < 0.3e-3
+
+
+@pytest.mark.slow
 def test_raw_imus_come_to_tenths_of_a_millimetre(figures):
     for error, (position, rotation) in {"0": (0.2, 0.03), "0.0001": (0.4, 0.1)}.items():
         assert figures["calibration"][error]["least_improvement"] > 10.0
@@ -27,6 +56,7 @@ def test_raw_imus_come_to_tenths_of_a_millimetre(figures):
             assert each["refined"]["position_rms"] < 1e-3
 
 
+@pytest.mark.slow
 def test_a_dead_imu_costs_little(figures):
     faults = figures["faults"]
     assert faults["leg"]["position_rms_ratio"] < 1.5
@@ -34,6 +64,7 @@ def test_a_dead_imu_costs_little(figures):
     assert faults["leg"]["position_rms"] != faults["none"]["position_rms"] != faults["platform"]["position_rms"]
 
 
+@pytest.mark.slow
 def test_it_starts_in_motion_and_does_not_drift(figures):
     assert figures["start"]["succeeded"] == figures["start"]["starts"] == 4
     first, last = figures["drift"]["minutes"]
@@ -41,6 +72,7 @@ def test_it_starts_in_motion_and_does_not_drift(figures):
     assert figures["follow"]["position_rms"] < 0.2e-3
 
 
+@pytest.mark.slow
 def test_what_a_cycle_costs_is_told(figures):
     cost = figures["cost"]
     assert 0.0 < cost["whole-gyroscopes"]["mean_us"] < cost["whole-alignments"]["mean_us"]
