@@ -36,29 +36,10 @@ if TYPE_CHECKING:
     from plant.wiring import Wiring
 
 __all__ = [
-    "GoughError",
-    "Knowledge",
-    "Mechanism",
-    "PlanarMechanism",
-    "RealTimeSettings",
-    "RunState",
-    "RunStoppedError",
-    "Setting",
-    "SimulationConfig",
-    "SimulationResult",
-    "SimulationStoppedError",
-    "Snapshot",
-    "Wiring",
-    "calibrate_recordings",
-    "calibrate_rig",
-    "load_mechanism",
-    "read_snapshot",
-    "replay",
-    "run",
-    "simulate",
-    "write_report",
-    "write_snapshot",
-]
+    "GoughError", "Knowledge", "Mechanism", "PlanarMechanism", "RealTimeSettings", "RunState", "RunStoppedError", "Setting",
+    "SimulationConfig", "SimulationResult", "SimulationStoppedError", "Snapshot", "Wiring", "calibrate_recordings",
+    "calibrate_rig", "load_mechanism", "read_snapshot", "replay", "run", "simulate", "write_report", "write_snapshot",
+]  # fmt: skip
 
 _HOMES = {
     "hil.calibration.data": ("Knowledge",),

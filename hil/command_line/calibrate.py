@@ -4,9 +4,9 @@ import argparse
 from dataclasses import asdict, replace
 from math import degrees, radians
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from hil.command_line.options import add_options, config_of
+from hil.command_line.options import add_actions, add_options, config_of
 from hil.command_line.outputs import add_json, check_outputs, write_json
 from hil.command_line.terminal import deg, mm_deg, progress_bar
 from hil.runs.config import SimulationConfig
@@ -14,25 +14,25 @@ from hil.table import Table
 from plant.errors import InputError
 from plant.wiring import ALL_IMUS, PLATFORM_IMU
 
+if TYPE_CHECKING:
+    from controller.calibration.file import Calibration
+
 _DEFAULT_RIG = SimulationConfig(imu="mpu9150")
 """The rig that is driven without any option."""
 
 
 def add_calibrate(command: argparse.ArgumentParser) -> None:
-    """Add the actions of `gough calibrate`."""
-    command.description = "Find the IMUs' errors."
-    actions = command.add_subparsers(required=True, metavar="ACTION")
-    _add_rig(actions.add_parser("rig", help="on the mechanism, from its redundancy"))
-    _add_imu(actions.add_parser("imu", help="a single one, turned by hand"))
-    _add_magnetometer(actions.add_parser("magnetometer", help="a single one, turned by hand: hard and soft iron"))
+    """Find the IMUs' errors: on the mechanism, or of a single IMU or magnetometer."""
+    add_actions(command, rig=_add_rig, imu=_add_imu, magnetometer=_add_magnetometer)
 
 
 def _add_rig(command: argparse.ArgumentParser) -> None:
-    command.description = (
-        "Calibrate the IMUs on the mechanism: it rests at wide poses, which need not be known, and shakes for 40 s. Before "
-        "that it finds out, with the loop open, whether each IMU works, and is mounted and wired correctly. Writes bias, "
-        "scale, axes and mounting of every sensor, with their covariance."
-    )
+    """On the mechanism, from its redundancy.
+
+    The mechanism rests at wide poses, which need not be known, and shakes for 40 s. Before that it finds out, with the loop
+    open, whether each IMU works, and is mounted and wired correctly. Writes bias, scale, axes and mounting of every sensor,
+    with their covariance.
+    """
     command.add_argument("output", type=Path, metavar="FILE.toml", help="the calibration to write")
     add_options(
         command,
@@ -130,11 +130,12 @@ def _print_rig_calibration(summary: dict[str, Any]) -> None:
 
 
 def _add_imu(command: argparse.ArgumentParser) -> None:
-    command.description = (
-        "Calibrate a single IMU without equipment: it rests in ten or more orientations, every axis up and down among them, "
-        "half a second or longer each, and is turned by hand from one to the next. Refuses data that do not determine the "
-        "constants, and says which rest or turn is missing."
-    )
+    """A single IMU, turned by hand.
+
+    Without equipment: it rests in ten or more orientations, every axis up and down among them, half a second or longer each,
+    and is turned by hand from one to the next. Refuses data that do not determine the constants, and says which rest or turn is
+    missing.
+    """
     command.add_argument(
         "data", type=Path, metavar="FILE", help="CSV with time_s,wx,wy,wz,ax,ay,az (rad/s, m/s2), or an MCAP recording"
     )
@@ -151,27 +152,17 @@ def _add_single(command: argparse.ArgumentParser, number: int, text: str) -> Non
 
 
 def _calibrate_imu(options: argparse.Namespace) -> int:
-    from controller.calibration.file import Calibration, load_calibration, save_calibration
+    from controller.calibration.file import save_calibration
     from controller.calibration.single_imu import calibrate_imu
     from hil.recording.imu_data import read_imu
     from plant.imu import STANDARD_GRAVITY
 
-    check_outputs(options.output, options.json)
-    _check_gravity(options.gravity)
-    calibration = load_calibration(options.output) if options.output.exists() else Calibration()
+    calibration, sensors = _checked(options), (slice(2), options.number)
     found = calibrate_imu(*read_imu(options.data, options.number), options.gravity)
-    calibration.gain[:2, options.number], calibration.offset[:2, options.number] = found.gain, found.offset
+    calibration.gain[sensors], calibration.offset[sensors] = found.gain, found.offset
     # The covariance of the remaining errors belongs to the constants that are replaced.
     save_calibration(options.output, replace(calibration, covariance=None))
-    figures = {
-        "rests": found.rests,
-        "force_residual": found.force_residual,
-        "turn_residual": found.turn_residual,
-        "gain": found.gain.tolist(),
-        "offset": found.offset.tolist(),
-        "sigmas": found.sigmas.tolist(),
-    }
-    write_json(options.json, figures)
+    _write_constants(options, found)
     table = Table(f"IMU {options.number}", "x", "y", "z")
     rows = (("gyroscope: ", "deg/s", degrees(1.0)), ("accelerometer: ", "mg", 1e3 / STANDARD_GRAVITY))
     for sensor, (name, unit, scale) in enumerate(rows):
@@ -184,16 +175,25 @@ def _calibrate_imu(options: argparse.Namespace) -> int:
     return 0
 
 
-def _add_constants(table: Table, name: str, unit: tuple[str, float], gain: Any, offset: Any, sigmas: Any) -> None:
-    """Add the constants of a sensor to a table of three axes, each with its standard deviation.
+def _checked(options: argparse.Namespace) -> "Calibration":
+    """The calibration to add a sensor to, after checking what all sensors have in common."""
+    from controller.calibration.file import Calibration, load_calibration
 
-    Args:
-        table: to add to.
-        name: put before each row's label.
-        unit: of the offset, and the factor to it from the SI unit.
-        gain: matrix (3, 3).
-        offset: of each axis (3,) [rad/s, m/s2 or uT].
-        sigmas: standard deviations (12,) of the offset and of the gain's rows.
+    check_outputs(options.output, options.json)
+    if not 9.7 < options.gravity < 9.9:
+        raise InputError(f"--gravity is {options.gravity:g} m/s2; on the earth it is between 9.7 and 9.9")
+    return load_calibration(options.output) if options.output.exists() else Calibration()
+
+
+def _write_constants(options: argparse.Namespace, found: Any) -> None:
+    write_json(
+        options.json, {name: getattr(value, "tolist", lambda value=value: value)() for name, value in vars(found).items()}
+    )
+
+
+def _add_constants(table: Table, name: str, unit: tuple[str, float], gain: Any, offset: Any, sigmas: Any) -> None:
+    """Add the offset (3,), the gain (3, 3) and their `sigmas` (12,) to a table of three axes; `unit` is the offset's, with its
+    factor from the SI unit.
     """
     symbol, scale = unit
     cells = zip(offset, sigmas[:3], strict=True)
@@ -203,17 +203,12 @@ def _add_constants(table: Table, name: str, unit: tuple[str, float], gain: Any, 
         table.add(f"{name}gain, row {axis}", *(f"{value:.5f} +- {sigma:.5f}" for value, sigma in cells))
 
 
-def _check_gravity(gravity: float) -> None:
-    if not 9.7 < gravity < 9.9:
-        raise InputError(f"--gravity is {gravity:g} m/s2; on the earth it is between 9.7 and 9.9")
-
-
 def _add_magnetometer(command: argparse.ArgumentParser) -> None:
-    command.description = (
-        "Calibrate a magnetometer without equipment: it is turned slowly every way round for half a minute or longer, away "
-        "from iron. With a calibrated accelerometer beside it, its axes hold for both. Refuses data that do not determine the "
-        "constants, and says what is missing."
-    )
+    """A single magnetometer, turned by hand: hard and soft iron.
+
+    Without equipment: it is turned slowly every way round for half a minute or longer, away from iron. With a calibrated
+    accelerometer beside it, its axes hold for both. Refuses data that do not determine the constants, and says what is missing.
+    """
     command.add_argument(
         "data",
         type=Path,
@@ -228,16 +223,14 @@ def _add_magnetometer(command: argparse.ArgumentParser) -> None:
 
 
 def _calibrate_magnetometer(options: argparse.Namespace) -> int:
-    from controller.calibration.file import Calibration, load_calibration, save_calibration
+    from controller.calibration.file import save_calibration
     from controller.calibration.magnetometer import calibrate_magnetometer
     from hil.recording.imu_data import read_field
     from plant.imu import ACCELEROMETER, MAGNETOMETER
 
-    check_outputs(options.output, options.json)
-    _check_gravity(options.gravity)
+    calibration = _checked(options)
     if not 20.0 < options.field < 70.0:
         raise InputError(f"--field is {options.field:g} uT; on the earth it is between 20 and 70")
-    calibration = load_calibration(options.output) if options.output.exists() else Calibration()
     fields, forces = read_field(options.data, options.number)
     if forces is not None:
         at = ACCELEROMETER, options.number
@@ -246,9 +239,7 @@ def _calibrate_magnetometer(options: argparse.Namespace) -> int:
     at = MAGNETOMETER, options.number
     calibration.gain[at], calibration.offset[at] = found.gain, found.offset
     save_calibration(options.output, calibration)
-    write_json(
-        options.json, {name: getattr(value, "tolist", lambda value=value: value)() for name, value in vars(found).items()}
-    )
+    _write_constants(options, found)
     table = Table(f"magnetometer {options.number}", "x", "y", "z")
     _add_constants(table, "", ("uT", 1.0), found.gain, found.offset, found.sigmas)
     table.print()

@@ -14,11 +14,11 @@ from plant.files import write_whole
 
 
 def add_classify(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough classify`."""
-    command.description = (
-        "Show the combinatorial class of a mechanism, and for each method of direct kinematics the sensors that it needs, "
-        "whether its pose is unique, and its conditioning (1 is best, 0 singular) at home and at worst."
-    )
+    """Show the class of a mechanism, and the sensors that it needs.
+
+    For each method of direct kinematics: the sensors that it needs, whether its pose is unique, and its conditioning (1 is
+    best, 0 singular) at home and at worst.
+    """
     command.add_argument("mechanism", metavar="PRESET|FILE.toml", help="preset, or a TOML file")
     command.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with drawings")
     add_json(command)
@@ -54,11 +54,11 @@ def _classify(options: argparse.Namespace) -> int:
 
 
 def add_classes(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough classes`."""
-    command.description = (
-        "For each of the 60 spatial and 4 planar classes: what the paper needs, what gough needs, and the median errors of "
-        "each over random mechanisms and poses, for the noise of 'gough accuracy'."
-    )
+    """Show what every class of mechanism needs, and its errors.
+
+    For each of the 60 spatial and 4 planar classes: what the paper needs, what gough needs, and the median errors of each over
+    random mechanisms and poses, for the noise of 'gough accuracy'.
+    """
     add_options(command, SimulationConfig, seed={"text": "seed of mechanisms, poses and noise"})
     add_markdown(command, "docs/classes.md")
     add_json(command)
@@ -79,11 +79,11 @@ def _classes(options: argparse.Namespace) -> int:
 
 
 def add_accuracy(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough accuracy`."""
-    command.description = (
-        "Errors of the paper's algorithms and of all legs together, at random poses about home (50 mm, 15 deg on hexapod), for "
-        "noise of 0.05 deg on legs, roll and pitch, and 1.5 deg on a magnetic yaw."
-    )
+    """Find the errors of direct kinematics at a given noise.
+
+    Errors of the paper's algorithms and of all legs together, at random poses about home (50 mm, 15 deg on hexapod), for noise
+    of 0.05 deg on legs, roll and pitch, and 1.5 deg on a magnetic yaw.
+    """
     add_options(command, SimulationConfig, "mechanism")
     command.add_argument("--poses", type=int, default=2000, help="number of random poses (default: %(default)s)")
     add_options(command, SimulationConfig, seed={"text": "seed of poses and noise"})
@@ -118,12 +118,12 @@ def _accuracy(options: argparse.Namespace) -> int:
 
 
 def add_sensor_sets(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough sensor-sets`."""
-    command.description = (
-        "Follow the target sines with every set of sensors, from the paper's least to all: legs alone, with the platform's "
-        "roll and pitch, with its whole orientation (a magnetometer), by leg and platform filters and by the whole-mechanism "
-        "filter. Prints the errors of the estimate, and the worst conditioning of direct kinematics."
-    )
+    """Run the closed loop with fewer sensors, on every type of mechanism.
+
+    It follows the target sines with every set of sensors, from the paper's least to all: legs alone, with the platform's roll
+    and pitch, with its whole orientation (a magnetometer), by leg and platform filters and by the whole-mechanism filter.
+    Prints the errors of the estimate, and the worst conditioning of direct kinematics.
+    """
     command.add_argument("--mechanism", nargs="+", metavar="NAME", help="presets or TOML files (default: one of each type)")
     add_options(command, SimulationConfig, "seed", duration={"text": "duration of each motion"})
     add_markdown(command, "docs/sensor_sets.md")
@@ -154,8 +154,10 @@ def _sensor_sets(options: argparse.Namespace) -> int:
 
 
 def add_tune(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough tune`."""
-    command.description = "Design the gains from the linearised plant and filters, and print them with their margins."
+    """Design the PID gains and show their margins.
+
+    The gains follow from the linearised plant and filters.
+    """
     add_options(command, SimulationConfig, "mechanism", "rate")
     add_json(command)
     command.set_defaults(run=_tune)
@@ -176,14 +178,14 @@ def _tune(options: argparse.Namespace) -> int:
 
 
 def add_tune_fusion(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough tune-fusion`."""
-    command.description = (
-        "Tune the noise that filters and refinement assume, by consistency: on simulated motions (at rest, mixed, 1 Hz) their "
-        "errors shall be as large as their covariances say, which is a NEES of 2 for a leg's angles and the platform's tilt, "
-        "and of 6 for a pose. Writes the mechanism with the table [fusion] that was found."
-    )
+    """Find the noise that the fusion should assume.
+
+    Filters and refinement are tuned by consistency: on simulated motions (at rest, mixed, 1 Hz) their errors shall be as large
+    as their covariances say, which is a NEES of 2 for a leg's angles and the platform's tilt, and of 6 for a pose. Writes the
+    mechanism with the table [fusion] that was found.
+    """
     command.add_argument("output", type=Path, metavar="FILE.toml", help="the mechanism to write, for --mechanism")
-    add_options(command, TuningConfig, "mechanism", "imu", "seeds", "rate")
+    add_options(command, TuningConfig)
     add_json(command)
     command.set_defaults(run=_tune_fusion)
 

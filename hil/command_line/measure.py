@@ -11,13 +11,13 @@ from plant.errors import InputError
 
 
 def add_bench(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough bench`."""
-    command.description = (
-        "Measure the loop on the clock: how late it wakes, beside cyclictest, and how long it computes, idle, under load and "
-        "with a busy supervisor; its speed against real time and the microseconds of each stage; the plant's FMU, from "
-        "compiled code and through FMPy, and how exact it is; and direct kinematics: microseconds per pose, against Newton's "
-        "method from lengths, and whether both find the pose from cold."
-    )
+    """Measure the loop, the plant and the kinematics: their speed and lateness.
+
+    The loop on the clock: how late it wakes, beside cyclictest, and how long it computes, idle, under load and with a busy
+    supervisor; its speed against real time and the microseconds of each stage; the plant's FMU, from compiled code and through
+    FMPy, and how exact it is; and direct kinematics: microseconds per pose, against Newton's method from lengths, and whether
+    both find the pose from cold.
+    """
     command.add_argument(
         "--duration", type=float, default=60.0, help="duration of the simulated motion [s] (default: %(default)g)"
     )

@@ -1,6 +1,10 @@
-"""Options of the command line, made from the fields of configurations (see `hil.option`)."""
+"""Options of the command line, made from the fields of configurations (see `hil.option`).
+
+A function that adds the options of a command describes it to the user by its docstring.
+"""
 
 import argparse
+import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -17,17 +21,41 @@ _SCALES = {"mm": 1e-3, "ms": 1e-3}
 """Factors to SI units."""
 
 
+def build(command: argparse.ArgumentParser, add: Callable[[argparse.ArgumentParser], None]) -> None:
+    """Give a parser the docstring of `add` for its description, and the options that `add` adds."""
+    command.description = inspect.getdoc(add)
+    add(command)
+
+
+def summary(add: Callable[[argparse.ArgumentParser], None]) -> str:
+    """The first sentence of the docstring of `add`, as the help of its command."""
+    text = (inspect.getdoc(add) or "").partition("\n")[0]
+    return text[:1].lower() + text[1:].rstrip(".")
+
+
+def add_actions(command: argparse.ArgumentParser, **actions: Callable[[argparse.ArgumentParser], None]) -> None:
+    """Add actions to a command, by name with the function that adds their options."""
+    parsers = command.add_subparsers(required=True, metavar="ACTION")
+    for name, add in actions.items():
+        build(parsers.add_parser(name, help=summary(add)), add)
+
+
+def options_of(config: "type[C]", *without: str) -> list[str]:
+    """The names of a configuration's fields that are options, without some."""
+    return [each.name for each in fields(config) if "option" in each.metadata and each.name not in without]
+
+
 def add_options(command: argparse.ArgumentParser, config: "type[C]", *names: str, **changes: Mapping[str, Any]) -> None:
     """Add options for fields of a configuration.
 
     Args:
         command: the parser to add to.
         config: the configuration's dataclass.
-        names: the fields whose options are as declared.
+        names: the fields whose options are as declared; without names or changes, all that are options.
         changes: by name of a field, what is different in this command: `default`, or attributes of `Option`.
     """
     declared = {each.name: each for each in fields(config)}
-    for name in (*names, *changes):
+    for name in (*names, *changes) or options_of(config):
         form = dict(changes.get(name, {}))
         default = form.pop("default", declared[name].default)
         _add_option(command, name, default, replace(declared[name].metadata["option"], **form))

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,28 +35,19 @@ def show_table(table: Table, markdown: bool) -> None:
         table.print()
 
 
-def check_outputs(*paths: Path | None) -> None:
-    """Check that the requested files can be written, and that no two are the same.
+def check_outputs(*paths: Path | None, inputs: Sequence[Path] = ()) -> None:
+    """Check that the requested files can be written, and that no two of them and of the inputs are the same.
 
     Raises:
         InputError: one cannot be written, or two are the same.
     """
-    check_distinct(*paths)
-    for path in paths:
-        if path is not None:
-            check_writable(path)
-
-
-def check_distinct(*paths: Path | None) -> None:
-    """Check that no two of the requested files are the same.
-
-    Raises:
-        InputError: two are the same.
-    """
-    named = [path.resolve() for path in paths if path is not None]
+    requested = [path for path in paths if path is not None]
+    named = [path.resolve() for path in (*requested, *inputs)]
     for path in named:
         if named.count(path) > 1:
             raise InputError(f"{path} is named twice: give two files")
+    for path in requested:
+        check_writable(path)
 
 
 def write_json(path: Path | None, content: dict[str, Any]) -> None:

@@ -5,7 +5,7 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hil.command_line.options import add_options
+from hil.command_line.options import add_actions, add_options
 from hil.command_line.outputs import add_json, check_outputs, write_json
 from hil.command_line.terminal import progress_bar
 from hil.runs.config import SimulationConfig
@@ -21,59 +21,66 @@ _PERIOD_S = 1e-3
 
 
 def add_fmu(command: argparse.ArgumentParser) -> None:
-    """Add the actions of `gough fmu`."""
-    command.description = "The plant as an FMU."
-    actions = command.add_subparsers(required=True, metavar="ACTION")
-    build = actions.add_parser(
-        "build",
-        help="write the plant's FMU",
-        description="Write a plant as an FMU, with its sources: FMI 3.0 for Co-Simulation and Model Exchange, or FMI 2.0 for "
-        "Co-Simulation. The parameters of any mechanism of the same kind can be set in it.",
-    )
-    build.add_argument("--output", type=Path, metavar="FILE.fmu", help="the FMU (default: in fmus/ in a checkout, else here)")
-    build.add_argument("--fmi", type=int, choices=(2, 3), default=3, help="version of FMI (default: %(default)s)")
-    add_options(build, SimulationConfig, "mechanism")
-    build.add_argument(
+    """Build, show, validate or linearise the plant's FMU."""
+    add_actions(command, build=_add_build, table=_add_table, info=_add_info, validate=_add_validate, linearize=_add_linearize)
+
+
+def _add_build(command: argparse.ArgumentParser) -> None:
+    """Write a plant as an FMU, with its sources.
+
+    FMI 3.0 for Co-Simulation and Model Exchange, or FMI 2.0 for Co-Simulation. The parameters of any mechanism of the same kind
+    can be set in it.
+    """
+    command.add_argument("--output", type=Path, metavar="FILE.fmu", help="the FMU (default: in fmus/ in a checkout, else here)")
+    command.add_argument("--fmi", type=int, choices=(2, 3), default=3, help="version of FMI (default: %(default)s)")
+    add_options(command, SimulationConfig, "mechanism")
+    command.add_argument(
         "--platforms",
         type=_names,
         default=[],
         metavar="LIST",
         help="linux,windows,darwin: compiled by zig, 'pip install gough[cross]' (default: this machine's, by its C compiler)",
     )
-    build.set_defaults(run=_build_fmu)
-    table = actions.add_parser(
-        "table",
-        help="the variables of gough's own plants",
-        description="Print the variables of both plants, for six legs and for three in the plane, as docs/fmu.md has them: "
-        "tables in Markdown.",
-    )
-    table.set_defaults(run=_print_tables)
-    info = actions.add_parser(
-        "info",
-        help="what an FMU is, and its variables",
-        description="Show what any FMU for Co-Simulation is, its variables, and whether the loop can use it as it is.",
-    )
-    validate = actions.add_parser(
-        "validate",
-        help="check that an FMU keeps what it promises",
-        description="Validate the description of any FMU for Co-Simulation, load it, and try its steps, its saved states and "
-        "its derivatives. The exit status is 1 if something is wrong.",
-    )
-    linearize = actions.add_parser(
-        "linearize",
-        help="an FMU as a linear system",
-        description="Linearise a plant about its start, the drives following their commands, by its directional derivatives: "
-        "matrices of x' = A x + B u, y = C x + D u, and the poles.",
-    )
-    for action, run in ((info, _show), (validate, _validate), (linearize, _linearize)):
-        action.add_argument("file", type=Path, metavar="FILE.fmu", nargs="?" if action is linearize else None)
-        action.set_defaults(run=run)
-        add_json(action)
-    add_options(linearize, SimulationConfig, "mechanism", "binding")
+    command.set_defaults(run=_build_fmu)
+
+
+def _add_table(command: argparse.ArgumentParser) -> None:
+    """Print the variables of gough's own plants, as docs/fmu.md has them: tables in Markdown."""
+    command.set_defaults(run=_print_tables)
+
+
+def _add_info(command: argparse.ArgumentParser) -> None:
+    """Show what any FMU for Co-Simulation is, its variables, and whether the loop can use it as it is."""
+    command.add_argument("file", type=Path, metavar="FILE.fmu")
+    add_json(command)
+    command.set_defaults(run=_show)
+
+
+def _add_validate(command: argparse.ArgumentParser) -> None:
+    """Check that any FMU for Co-Simulation keeps what it promises.
+
+    Its description is validated, and its steps, saved states and derivatives are tried. The exit status is 1 if something is
+    wrong.
+    """
+    command.add_argument("file", type=Path, metavar="FILE.fmu")
+    add_json(command)
+    command.set_defaults(run=_validate)
+
+
+def _add_linearize(command: argparse.ArgumentParser) -> None:
+    """Print an FMU as a linear system.
+
+    The plant is linearised about its start, with the drives following their commands, by its directional derivatives: matrices
+    of x' = A x + B u, y = C x + D u, and the poles.
+    """
+    command.add_argument("file", type=Path, metavar="FILE.fmu", nargs="?", help="the FMU (default: the mechanism's plant)")
+    add_json(command)
+    add_options(command, SimulationConfig, "mechanism", "binding")
     for side, default in (("inputs", "velocity_command"), ("outputs", "leg_length")):
-        linearize.add_argument(
+        command.add_argument(
             f"--{side}", type=_names, default=[default], metavar="NAMES", help=f"names of the {side} (default: {default})"
         )
+    command.set_defaults(run=_linearize)
 
 
 def _names(text: str) -> list[str]:

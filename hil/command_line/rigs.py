@@ -13,11 +13,11 @@ from plant.errors import InputError
 
 
 def add_check_rig(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough check-rig`."""
-    command.description = (
-        "Put a rig through the contract that the loop relies on, clause by clause. Nothing moves without --move. The exit "
-        "status is 1 if anything is found."
-    )
+    """Check that a rig does what the loop relies on.
+
+    The rig is put through its contract, clause by clause. Nothing moves without --move. The exit status is 1 if anything is
+    found.
+    """
     add_options(command, SimulationConfig, rig={"required": True})
     rate = {"default": 200.0, "text": "exchanges per second, 50 to 4000"}
     add_options(command, SimulationConfig, "rig_at", "mechanism", rate=rate)
@@ -67,9 +67,11 @@ def _check_rig(options: argparse.Namespace) -> int:
 
 
 def add_emulate(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough emulate`."""
-    command.description = "Emulate a rig: the FMU plant, drives and IMUs on a clock of their own, behind a bus, until Ctrl-C."
-    add_options(command, EmulatorConfig, "bus", "at", "control", "faults", "watchdog")
+    """Emulate a rig on a bus, for 'gough run' in another process.
+
+    The FMU plant, drives and IMUs run on a clock of their own, behind a bus, until Ctrl-C.
+    """
+    add_options(command, EmulatorConfig)
     add_options(
         command,
         SimulationConfig,
@@ -96,8 +98,7 @@ def _emulate(options: argparse.Namespace) -> int:
 
 
 def add_inject(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough inject`."""
-    command.description = "Inject a fault into an emulated rig that is running, or ask for the rig's state."
+    """Inject a fault into an emulated rig that is running, or ask for its state."""
     command.add_argument("fault", nargs="?", metavar="KIND[:N][,for=S][,size=X]", help="the fault, from now on")
     command.add_argument("--list", action="store_true", help="list the kinds of faults")
     command.add_argument("--clear", action="store_true", help="take all faults away")

@@ -1,13 +1,12 @@
 """The commands that run the loop: simulate, run, replay, stream-target."""
 
 import argparse
-from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hil.command_line.options import add_options, config_of
-from hil.command_line.outputs import OutputError, add_json, check_distinct, check_outputs, write_json
+from hil.command_line.options import add_options, config_of, options_of
+from hil.command_line.outputs import OutputError, add_json, check_outputs, write_json
 from hil.command_line.terminal import QUANTILES, deg, live_view, mm, progress_bar
 from hil.realtime.scheduling import RealTimeSettings, keep_to_one_thread
 from hil.runs.config import SimulationConfig
@@ -19,11 +18,11 @@ if TYPE_CHECKING:
 
 
 def add_simulate(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough simulate`."""
-    command.description = "Simulate the closed loop: a mechanism follows a target motion on its FMU plant."
-    # Left out of the options if it is not given: a resumed run then keeps the duration of its snapshot.
+    """Follow a target on the FMU plant, as fast as the machine can."""
+    # A resumed run keeps the duration of its snapshot, unless this option is given.
     duration = {"default": argparse.SUPPRESS, "parse": float, "shown": f"{SimulationConfig.duration:g}"}
-    _add_motion(command, duration=duration)
+    names = options_of(SimulationConfig, "duration", "rig", "rig_at", "arm")
+    add_options(command, SimulationConfig, *names, duration=duration)
     command.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots and a moving 3-D view")
     add_json(command)
     command.add_argument("--save-state", type=Path, metavar="FILE", help="write a snapshot, from which a run can go on")
@@ -35,15 +34,6 @@ def add_simulate(command: argparse.ArgumentParser) -> None:
         help="go on from a snapshot, bit for bit as if there had been none; nothing but --duration can be changed",
     )  # fmt: skip
     command.set_defaults(run=_simulate)
-
-
-def _add_motion(command: argparse.ArgumentParser, **changes: Mapping[str, Any]) -> None:
-    """Add what simulations and runs on the clock have in common."""
-    names = (
-        "mechanism", "target", "duration", "rate", "imu", "imus", "magnetometer", "seed", "calibration", "fusion", "plant",
-        "binding", "settings", "joint_error",
-    )  # fmt: skip
-    add_options(command, SimulationConfig, *(name for name in names if name not in changes), **changes)
 
 
 def _simulate(options: argparse.Namespace) -> int:
@@ -116,16 +106,15 @@ def _print_simulation(summary: dict[str, Any]) -> None:
 
 
 def add_run(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough run`."""
-    command.description = (
-        "Run the closed loop on the machine's clock: compiled, in a process of its own, with real-time priority where the "
-        "machine grants it. Ctrl-C or SIGTERM ends the motion by a controlled stop, Ctrl-\\ (SIGQUIT) by an emergency stop: "
-        "the drives come to rest by themselves, whatever is measured."
-    )
-    add_options(command, SimulationConfig, "rig", "rig_at", "arm")
-    _add_motion(command)
+    r"""Follow a target on the machine's clock.
+
+    The closed loop runs compiled, in a process of its own, with real-time priority where the machine grants it. Ctrl-C or
+    SIGTERM ends the motion by a controlled stop, Ctrl-\ (SIGQUIT) by an emergency stop: the drives come to rest by themselves,
+    whatever is measured.
+    """
+    add_options(command, SimulationConfig)
     command.add_argument("--record", type=Path, metavar="FILE.mcap", help="record every cycle")
-    add_options(command, RealTimeSettings, "cpu", "priority", "strict", "most_missed")
+    add_options(command, RealTimeSettings)
     add_json(command)
     command.set_defaults(run=_run)
 
@@ -229,10 +218,10 @@ def _timing_cell(us: float, limit: float | None) -> Cell:
 
 
 def add_replay(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough replay`."""
-    command.description = (
-        "Feed the recorded raw IMU data through the same cycle and compare estimates and commands bit for bit."
-    )
+    """Feed a recording's raw IMU data through the cycle again.
+
+    Estimates and commands must be those of the recording, bit for bit.
+    """
     command.add_argument("files", type=Path, nargs="+", metavar="FILE.mcap", help="files of one run, in their order")
     add_json(command)
     command.set_defaults(run=_replay)
@@ -241,8 +230,7 @@ def add_replay(command: argparse.ArgumentParser) -> None:
 def _replay(options: argparse.Namespace) -> int:
     from hil.recording.replay import replay
 
-    check_distinct(options.json, *options.files)
-    check_outputs(options.json)
+    check_outputs(options.json, inputs=options.files)
     result = replay(options.files)
     write_json(options.json, result.summary())
     for line in result.lines():
@@ -251,11 +239,11 @@ def _replay(options: argparse.Namespace) -> int:
 
 
 def add_stream_target(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough stream-target`."""
-    command.description = (
-        "Send a motion as a stream of poses in real time, one UDP datagram each, to a run that follows a stream. It can also "
-        "go wrong on purpose, to show that the run then stops as it should."
-    )
+    """Send a target pose by pose to a run that follows a stream.
+
+    Each pose is one UDP datagram, in real time. The stream can also go wrong on purpose, to show that the run then stops as it
+    should.
+    """
     add_options(
         command,
         SimulationConfig,

@@ -16,12 +16,12 @@ from plant.errors import InputError
 
 
 def add_compare_fusion(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough compare-fusion`."""
-    command.description = (
-        "Move the platform as prescribed, 30 mm and 10 deg along and about every axis, and compare every way to fuse the IMUs: "
-        "errors after the first 20 s, NEES (6 is consistent) and microseconds of a cycle."
-    )
-    add_options(command, ComparisonConfig, "mechanism", "motion", "duration", "rate", "imu", "calibration", "seeds")
+    """Compare every way to fuse the IMUs, on one motion.
+
+    The platform moves as prescribed, 30 mm and 10 deg along and about every axis. Prints errors after the first 20 s, NEES (6
+    is consistent) and microseconds of a cycle.
+    """
+    add_options(command, ComparisonConfig)
     add_json(command)
     command.set_defaults(run=_compare)
 
@@ -44,15 +44,14 @@ def _compare(options: argparse.Namespace) -> int:
 
 
 def add_evaluate_fusion(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough evaluate-fusion`."""
-    command.description = (
-        "Calibrate the raw IMUs of several rigs on themselves, then move their platforms as prescribed, 30 mm and 10 deg along "
-        "and about every axis at 0.5, 1, 2 and 0.1 to 1 Hz, and still: errors after the first 20 s with exact and with wrong "
-        "joints, with a dead IMU, of starts in the middle of a motion, over minutes of standing still, in the closed loop, and "
-        "the cost of a cycle. The leg filters with the refined pose stand beside it. Ten minutes in all."
-    )
-    names = ("mechanism", "imu", "fusion", "rate", "joint_error", "seeds", "starts", "still", "target")
-    add_options(command, EvaluationConfig, *names)
+    """Evaluate the whole-mechanism filter after a self-calibration.
+
+    The raw IMUs of several rigs are calibrated on themselves; then their platforms move as prescribed, 30 mm and 10 deg along
+    and about every axis at 0.5, 1, 2 and 0.1 to 1 Hz, and stand still. Prints errors after the first 20 s with exact and with
+    wrong joints, with a dead IMU, of starts in the middle of a motion, over minutes of standing still, in the closed loop, and
+    the cost of a cycle, beside the leg filters with the refined pose. Ten minutes in all.
+    """
+    add_options(command, EvaluationConfig)
     command.add_argument(
         "--only", choices=SECTIONS, nargs="+", default=argparse.SUPPRESS, help="these sections instead of all"
     )  # fmt: skip
@@ -151,11 +150,11 @@ _EVALUATED: dict[str, Callable[[dict[str, Any]], None]] = {
 
 
 def add_faults(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough faults`."""
-    command.description = (
-        "Run every case of the fault matrix on the emulated rig, on virtual time: the reported cause, how the run ends, how "
-        "soon, and how far a leg gets off its reference. The exit status is 1 if any reaction differs from the specified one."
-    )
+    """Try every fault many times, and compare with the specified reaction.
+
+    Every case of the fault matrix runs on the emulated rig, on virtual time. Prints the reported cause, how the run ends, how
+    soon, and how far a leg gets off its reference. The exit status is 1 if any reaction differs from the specified one.
+    """
     command.add_argument("--seeds", type=int, default=20, help="how often each case is tried (default: %(default)s)")
     command.add_argument("--only", metavar="TEXT", help="only cases with this text in their names")
     add_markdown(command, "docs/faults.md")
@@ -183,11 +182,11 @@ def _faults(options: argparse.Namespace) -> int:
 
 
 def add_planar(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough planar`."""
-    command.description = (
-        "Solve the measured leg angles of a planar rig at known static poses, given in files pose_*.csv with the true pose in "
-        "the first line. Prints the errors of the assembly mode that is nearest to the true pose."
-    )
+    """Find the poses of a real planar rig from its measured leg angles.
+
+    The rig stands at known poses, given in files pose_*.csv with the true pose in the first line. Prints the errors of the
+    assembly mode that is nearest to the true pose.
+    """
     command.add_argument("folder", type=Path, metavar="FOLDER", help="folder with the files pose_*.csv")
     add_options(command, SimulationConfig, mechanism={"default": "planar-3rpr"})
     command.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots")
@@ -227,11 +226,11 @@ def _planar(options: argparse.Namespace) -> int:
 
 
 def add_broad(command: argparse.ArgumentParser) -> None:
-    """Add the options of `gough broad`."""
-    command.description = (
-        "Run the platform's filter, and the vqf package, on trials of the BROAD benchmark: an IMU moved by hand, with an "
-        "optical reference. Prints the RMS of the inclination's error where the benchmark counts it."
-    )
+    """Run the platform's filter alone, on real IMU data.
+
+    The filter, and the vqf package, run on trials of the BROAD benchmark: an IMU moved by hand, with an optical reference.
+    Prints the RMS of the inclination's error where the benchmark counts it.
+    """
     command.add_argument("folder", type=Path, metavar="FOLDER", help="folder with the trials *.npz")
     command.add_argument(
         "--accelerometer-noise",

@@ -125,13 +125,13 @@ def run(
                 loop.kill()
             recorders.watch()
             show(state)
-        outcome = _received(ours, loop)
+        cause, cycle, first_cycle_ns, figures = _received(ours, loop)
         state.update(records, link)
-    summary = _summary(config, state, outcome, recorders)
-    if outcome["stop"] not in (Cause.END_OF_MOTION, Cause.STOP_REQUESTED):
-        quickly = Cause(outcome["stop"]).reaction >= Reaction.QUICK_STOP
+    summary = _summary(config, state, first_cycle_ns, figures, recorders)
+    if cause not in (Cause.END_OF_MOTION, Cause.STOP_REQUESTED):
+        quickly = Cause(cause).reaction >= Reaction.QUICK_STOP
         how = "stopped on the brakes" if quickly else "stopped before its time"
-        raise RunStoppedError(f"{how} at cycle {outcome['cycle']}: {outcome['reason']}", summary)
+        raise RunStoppedError(f"{how} at cycle {cycle}: {summary['cause']}", summary)
     return summary
 
 
@@ -277,44 +277,31 @@ def _prepare_and_follow(
             before = usage()
             cause = loop.follow(loop.end, None if compiled else rig)
             used = usage().since(before)
-        pipe.send(
-            {
-                "stop": cause,
-                "identity": header["config"].get("identity"),
-                "obstacle": None if config.arm else describe_obstacle(loop.state),
-                "reason": ": ".join(filter(None, [loop.reason(), loop.failure or getattr(rig, "failure", "")])),
-                "cycle": int(loop.state["safety"]["stop"]["cycle"]),
-                "cycles": int(link[Link.HEAD]),
-                "missed_late": int(loop.clock["missed_late"]),
-                "missed_own": int(loop.clock["missed_own"]),
-                "missed_host": int(loop.clock["missed_host"]),
-                "usage": used,
-                "first_cycle_ns": int(loop.clock["start"]),
-            }
-        )
+        figures = {
+            "cause": ": ".join(filter(None, [loop.reason(), loop.failure or getattr(rig, "failure", "")])),
+            "cycles": int(link[Link.HEAD]),
+            **{name: int(loop.clock[name]) for name in ("missed_late", "missed_own", "missed_host")},
+            "usage": used,
+            "identity": header["config"].get("identity"),
+            "obstacle": None if config.arm else describe_obstacle(loop.state),
+        }
+        pipe.send((cause, int(loop.state["safety"]["stop"]["cycle"]), int(loop.clock["start"]), figures))
 
 
 def _summary(
-    config: SimulationConfig, state: RunState, outcome: dict[str, Any], recorders: Recorders
-) -> dict[str, Any]:  # fmt: skip
+    config: SimulationConfig, state: RunState, first_cycle_ns: int, figures: dict[str, Any], recorders: Recorders
+) -> dict[str, Any]:
     timing = state.timing.figures()
-    first = outcome["first_cycle_ns"] / 1e9 if outcome["first_cycle_ns"] else time.monotonic()
+    first = first_cycle_ns / 1e9 if first_cycle_ns else time.monotonic()
     return {
-        "cause": outcome["reason"],
-        **{name: outcome[name] for name in ("cycles", "missed_late", "missed_own", "missed_host", "usage")},
+        **figures,
         "timing_us": timing,
         "over_budget": over_budget(timing),
         "errors_m": state.errors(),
         "start_up_s": since_process_start() - (time.monotonic() - first),
-        "unseen": state.unseen,
+        **{name: getattr(state, name) for name in ("unseen", "refused", "late", "refused_packets", "events")},
         "recording": {"files": [str(path) for path in recorders.files], "lost": recorders.lost},
-        "refused": state.refused,
-        "late": state.late,
-        "refused_packets": state.refused_packets,
         "round_trip_bars": state.timing.histograms["round trip"].bars(),
-        "identity": outcome["identity"],
-        "obstacle": outcome["obstacle"],
-        "events": state.events,
         "config": asdict(config),
         "version": version("gough"),
     }

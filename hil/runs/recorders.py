@@ -65,15 +65,7 @@ class Recorders:
     def __init__(
         self, path: Path | None, records: Record, link: NDArray[np.int64], supervisors: Connection, events: list[str]
     ) -> None:  # fmt: skip
-        """Start nothing yet.
-
-        Args:
-            path: the file to write; None for none.
-            records: the loop's, in shared memory.
-            link: shared with the loop (`hil.loop.records`).
-            supervisors: the supervisor's end of a pipe, which the recorder closes.
-            events: where deaths and successors are reported.
-        """
+        """Record to `path`, if there is one, and report deaths to `events`; each recorder closes the supervisor's pipe."""
         self.files: list[Path] = []
         self._path, self._records, self._link, self._supervisors, self._events = path, records, link, supervisors, events
         self._header: dict[str, Any] = {}
