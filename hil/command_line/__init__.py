@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from hil.command_line.options import build, summary
 from plant.errors import GoughError
@@ -31,16 +31,6 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         self.exit(REFUSED, f"{self.prog}: {message} (see {self.prog} --help)\n")
-
-
-class _Version(argparse.Action):
-    """Prints the version, which is looked up only then."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        from importlib.metadata import version
-
-        print(f"gough {version('gough')}")
-        parser.exit()
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -76,7 +66,11 @@ def parse(arguments: list[str]) -> argparse.Namespace:
         epilog=None if chosen in homes else "\n\n".join(map(_section, COMMANDS)),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--version", action=_Version, nargs=0, help="show the program's version number and exit")
+    # Looking up the version takes longer than the rest.
+    if arguments[:1] != [chosen]:
+        from importlib.metadata import version
+
+        parser.add_argument("--version", action="version", version=f"gough {version('gough')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", help=argparse.SUPPRESS, prog="gough")
     for name, heading in homes.items():
         command = commands.add_parser(name)

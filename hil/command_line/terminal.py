@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 QUANTILES = {"p50": "p50", "p99": "p99", "p99.9": "p999", "max": "max"}
 """How each quantile is printed, and its name in the figures."""
 
+_COMPILED_FUNCTIONS = 280
+"""How many functions numba compiles for the first simulation on a machine."""
+
 
 def mm(metres: float, digits: int = 3) -> str:
     """Return a length [m] in millimetres, with this number of digits after the point."""
@@ -52,19 +55,11 @@ def progress_bar(label: str) -> Iterator[Callable[..., None]]:
         def show(share: float, now: str = label) -> None:
             bar.update(task, total=1.0, completed=share, description=now)
 
-        with _compilation_shown(compiling):
+        # Loads numba, so the bar is drawn first.
+        from plant.compiled import compilation_reported
+
+        with compilation_reported(compiling):
             yield show
-
-
-_COMPILED_FUNCTIONS = 280
-"""How many functions numba compiles for the first simulation on a machine."""
-
-
-def _compilation_shown(report: Callable[[int], None]) -> Any:
-    """Let `report` follow the compilation of kernels; the bar is on the screen before numba is loaded."""
-    from plant.compiled import compilation_reported
-
-    return compilation_reported(report)
 
 
 @contextmanager

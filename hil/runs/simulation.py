@@ -110,10 +110,7 @@ class SimulationResult:
 
 
 def simulate(
-    config: SimulationConfig,
-    progress: Progress = no_progress,
-    resumed: Snapshot | None = None,
-    save_at: float | None = None,
+    config: SimulationConfig, progress: Progress = no_progress, resumed: Snapshot | None = None, save_at: float | None = None
 ) -> SimulationResult:
     """Run a simulation.
 

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from dataclasses import fields, is_dataclass
+from importlib.metadata import version
 
 import pytest
 
@@ -17,7 +18,7 @@ from hil.studies.config import ComparisonConfig, EvaluationConfig, TuningConfig
 ACTIONS = {"calibrate": ("rig", "imu", "magnetometer"), "fmu": ("build", "table", "info", "validate", "linearize")}
 NAMES = [name for helps in COMMANDS.values() for name in helps]
 LINES = [[name, *action] for name in NAMES for action in ([], *([each] for each in ACTIONS.get(name, ())))]
-HEAVY = ("numpy", "numba", "scipy", "casadi", "control", "fmpy", "rich", "importlib.metadata")
+HEAVY = ("numpy", "numba", "scipy", "casadi", "control", "fmpy", "rich")
 
 
 def helped(capsys, *arguments):
@@ -47,6 +48,14 @@ def test_no_help_loads_a_heavy_library():
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stderr.strip() == "[]"
     assert run.stdout.count("usage: gough") == 1 + len(LINES)
+
+
+@pytest.mark.parametrize("line", ["--version", "--version simulate"])
+def test_the_version_is_that_of_the_package(line, capsys):
+    with pytest.raises(SystemExit) as ended:
+        parse(line.split())
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"gough {version('gough')}\n"
 
 
 @pytest.mark.parametrize("line", LINES, ids=" ".join)
