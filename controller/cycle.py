@@ -17,21 +17,21 @@ import numpy as np
 from controller import load_feed_forward, pid, reference, safety
 from controller.calibration.file import Calibration
 from controller.estimation import (
-    filter_trust,
     heading_filter,
     imu_health,
     leg_filter,
     platform_filter,
     pose_estimator,
 )
-from controller.estimation.filter_trust import step_mechanism_filter
 from controller.estimation.heading_filter import step_heading_filter
 from controller.estimation.imu_health import screen_imus
 from controller.estimation.imu_monitor import look_at_next
 from controller.estimation.leg_filter import step_leg_filters
-from controller.estimation.mechanism_filter import filter_parameters
 from controller.estimation.platform_filter import step_platform_filter
 from controller.estimation.pose_estimator import find_pose, refine_pose, take_vectors
+from controller.estimation.whole_mechanism import trust
+from controller.estimation.whole_mechanism.parameters import filter_parameters
+from controller.estimation.whole_mechanism.trust import step_mechanism_filter
 from controller.imu_set import check_imus, imus_of
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import RANK_TOLERANCE
@@ -62,7 +62,7 @@ PARAMETERS = np.dtype(
         ("platform", platform_filter.PARAMETERS),
         ("heading", heading_filter.PARAMETERS),
         ("pose", pose_estimator.PARAMETERS),
-        ("mechanism", filter_trust.PARAMETERS),
+        ("mechanism", trust.PARAMETERS),
         ("load", load_feed_forward.PARAMETERS),
         ("pid", pid.PARAMETERS),
         ("safety", safety.PARAMETERS),
@@ -79,7 +79,7 @@ STATE = np.dtype(
         ("platform", platform_filter.STATE),
         ("heading", heading_filter.STATE),
         ("pose", pose_estimator.STATE),
-        ("mechanism", filter_trust.STATE),
+        ("mechanism", trust.STATE),
         ("reference", reference.STATE),
         ("load", load_feed_forward.STATE),
         ("pid", pid.STATE),
@@ -117,8 +117,8 @@ def cycle_parameters(
         rate: cycles per second [Hz].
         control, fusion: settings.
         imus: which IMUs there are, 0-5 on the legs and 6 on the platform; those of absent legs do not count.
-        whole: which errors of the IMUs the whole-mechanism filter estimates, a key of `mechanism_filter.BLOCKS`; None for no
-            such filter.
+        whole: which errors of the IMUs the whole-mechanism filter estimates, a key of its `BLOCKS`; None for no such
+            filter.
         calibration: of the IMUs; without one their readings are taken as they are.
         magnetometer: whether the platform's magnetometer gives its heading.
         section_5: whether the pose is that of the paper's section 5, unrefined; that needs the magnetometer.
@@ -147,9 +147,7 @@ def cycle_parameters(
     parameters["platform"] = platform_filter.platform_parameters(fusion, rate)
     parameters["heading"] = heading_filter.heading_parameters(fusion, rate, field, magnetometer)
     parameters["pose"] = pose_estimator.pose_parameters(fusion, section_5)
-    parameters["mechanism"] = filter_trust.trust_parameters(
-        fusion, rate, filter_parameters(fusion, rate, whole, *errors, of_heading)
-    )
+    parameters["mechanism"] = trust.trust_parameters(fusion, rate, filter_parameters(fusion, rate, whole, *errors, of_heading))
     parameters["load"] = load_feed_forward.load_parameters(mechanism, command_delay)
     parameters["pid"] = pid.pid_parameters(control, limits.velocity)
     parameters["safety"] = safety.safety_parameters(watched, rate, limits, to_arm)

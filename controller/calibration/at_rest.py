@@ -14,19 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.calibration.file import Calibration
-from controller.estimation.imu_errors import ALIGNMENT, ERRORS, error_gradient, error_matrix
-from controller.estimation.mechanism_filter import (
-    ALL_ERRORS,
-    FILTER_STATE,
+from controller.estimation.whole_mechanism.filter import (
     accumulate_sample,
     extrapolate,
     extrapolate_covariance,
-    filter_parameters,
     start_filter,
     step_filter,
 )
-from controller.estimation.readings import MOTION_STATES, READINGS, READINGS_SCRATCH, predict_readings
-from controller.estimation.rig_jacobian import JOINTS, RIG_ERRORS, TILT
+from controller.estimation.whole_mechanism.imu_errors import ALIGNMENT, ERRORS, error_gradient, error_matrix
+from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, FILTER_STATE, filter_parameters
+from controller.estimation.whole_mechanism.readings import MOTION_STATES, READINGS, READINGS_SCRATCH, predict_readings
+from controller.estimation.whole_mechanism.rig_jacobian import JOINTS, RIG_ERRORS, TILT
 from controller.inverse_kinematics import inverse_kinematics
 from controller.rig import sensor_geometry
 from controller.settings import FusionSettings

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from controller.estimation.imu_errors import ERRORS
+from controller.estimation.whole_mechanism.imu_errors import ERRORS
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import InputError
 from plant.files import write_whole
@@ -40,7 +40,7 @@ class Calibration:
         tilt: (2,) [rad], by which the vertical is turned about the axes x and y of {1}.
         joints: (2, 6, 3) [m], what must be added to the mechanism's base and platform joints.
         floor: (2,) [m, rad], standard deviations of position and rotation that tilt and joints leave.
-        covariance: (147, 147), of what errors are left, in the order of `controller.estimation.mechanism_filter.ERROR_NAMES`
+        covariance: (147, 147), of what errors are left, in the order of `imu_errors.ERROR_NAMES`
             for each IMU; None if it is not known.
         about: what is worth knowing: date, residuals, where the data came from.
     """

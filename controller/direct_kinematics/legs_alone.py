@@ -256,8 +256,8 @@ def _product(a: Array, b: Array, i: int, j: int, step: int) -> float:
     """Inner product of two columns (`step` 1) or rows (`step` 3) from i and j on, the mean of that of a with b and b with a."""
     first = a[i] * b[j] + a[i + step] * b[j + step] + a[i + 2 * step] * b[j + 2 * step]
     if i == j:
-        return first
-    return 0.5 * (first + a[j] * b[i] + a[j + step] * b[i + step] + a[j + 2 * step] * b[i + 2 * step])
+        return float(first)
+    return float(0.5 * (first + a[j] * b[i] + a[j + step] * b[i + step] + a[j + 2 * step] * b[i + 2 * step]))
 
 
 @kernel

@@ -18,9 +18,9 @@ from controller.calibration.at_rest import (
     track,
 )
 from controller.calibration.file import Calibration, split_gain
-from controller.estimation.imu_errors import ERROR_NAMES
-from controller.estimation.mechanism_filter import filter_parameters
-from controller.estimation.readings import RATE, VELOCITY
+from controller.estimation.whole_mechanism.imu_errors import ERROR_NAMES
+from controller.estimation.whole_mechanism.parameters import filter_parameters
+from controller.estimation.whole_mechanism.readings import RATE, VELOCITY
 from hil.calibration.data import CalibrationData
 from plant.dynamics.variables import IMU_COUNT
 from plant.imu import ACCELEROMETER, MILLI_G

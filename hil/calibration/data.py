@@ -9,7 +9,7 @@ from controller.calibration.at_rest import LEAST_POSES, CalibrationError, Found,
 from controller.calibration.checks import check_alive, check_all_along, check_motion, check_places, check_spread
 from controller.calibration.file import Calibration
 from controller.direct_kinematics import poses_from_lengths
-from controller.estimation.readings import readings_along
+from controller.estimation.whole_mechanism.readings import readings_along
 from controller.rig import sensor_geometry
 from controller.settings import sensor_settings
 from plant.compiled import Record

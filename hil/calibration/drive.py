@@ -22,7 +22,7 @@ import numpy as np
 
 from controller.calibration.at_rest import CalibrationError, Found, calibrate_at_rest, calibrate_in_motion
 from controller.calibration.file import Calibration, save_calibration
-from controller.estimation.mechanism_filter import ALL_ERRORS
+from controller.estimation.whole_mechanism.parameters import ALL_ERRORS
 from controller.planning.motions import REST_S
 from controller.safety import watch_nothing
 from hil.calibration.assessment import assess, constants, cross_validate

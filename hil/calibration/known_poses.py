@@ -6,7 +6,7 @@ import numpy as np
 
 from controller.calibration.at_rest import CalibrationError, expected_forces, undo
 from controller.calibration.file import Calibration
-from controller.estimation.imu_errors import ACCELEROMETER_BIAS, ALIGNMENT, ERRORS, GYROSCOPE_BIAS
+from controller.estimation.whole_mechanism.imu_errors import ACCELEROMETER_BIAS, ALIGNMENT, ERRORS, GYROSCOPE_BIAS
 from controller.rig import sensor_geometry
 from hil.calibration.data import CalibrationData
 from plant.compiled import Record

@@ -22,7 +22,7 @@ from controller.cycle import (
     run_stages,
     skip_periods,
 )
-from controller.estimation.mechanism_filter import extrapolate_covariance
+from controller.estimation.whole_mechanism.filter import extrapolate_covariance
 from controller.least_squares import factor_cholesky, invert_cholesky
 from controller.planning.stream import stream_cause, take_plan
 from controller.reference import motion_cycle

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from controller.cycle import CONTROL, MARKS, MECHANISM, REFINEMENT, SCREENING, STATE, run_stages
 from controller.cycle import LEGS as LEG_FILTERS
-from controller.estimation.mechanism_filter import extrapolate_covariance
+from controller.estimation.whole_mechanism.filter import extrapolate_covariance
 from plant.compiled import Record, kernel
 from plant.dynamics.imposed import ImposedMotion
 from plant.imu import ImuModel, imu_state, measure

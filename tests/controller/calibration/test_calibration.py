@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from controller.calibration.file import Calibration, join_gain, load_calibration, save_calibration, split_gain
 from controller.cycle import STATE, cycle_parameters
-from controller.estimation.imu_errors import ERRORS
+from controller.estimation.whole_mechanism.imu_errors import ERRORS
 from controller.safety.causes import Cause
 from controller.settings import control_settings, fusion_settings
 from plant.errors import InputError

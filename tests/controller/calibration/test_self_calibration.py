@@ -17,8 +17,8 @@ from controller.calibration.at_rest import (
     undo,
 )
 from controller.calibration.file import Calibration
-from controller.estimation.imu_errors import ERRORS, error_matrix
-from controller.estimation.rig_jacobian import JOINTS
+from controller.estimation.whole_mechanism.imu_errors import ERRORS, error_matrix
+from controller.estimation.whole_mechanism.rig_jacobian import JOINTS
 from controller.inverse_kinematics import leg_lengths, sample_workspace
 from controller.rig import sensor_geometry
 from controller.settings import sensor_settings

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from controller.estimation.imu_errors import distort
-from controller.estimation.readings import ANGULAR_ACCELERATION, RATE, READINGS, cross
+from controller.estimation.whole_mechanism.imu_errors import distort
+from controller.estimation.whole_mechanism.readings import ANGULAR_ACCELERATION, RATE, READINGS, cross
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS

@@ -7,15 +7,14 @@ When the source changes, the step between the two poses fades away.
 import numpy as np
 
 from controller.direct_kinematics.refinement import move_pose
-from controller.estimation.mechanism_filter import (
-    FILTER_PARAMETERS,
-    FILTER_STATE,
+from controller.estimation.whole_mechanism.filter import (
     accumulate_field,
     accumulate_sample,
     extrapolate,
     start_filter,
     step_filter,
 )
+from controller.estimation.whole_mechanism.parameters import FILTER_PARAMETERS, FILTER_STATE
 from controller.inverse_kinematics import legs_at
 from controller.rig import elapsed
 from controller.settings import FusionSettings

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from controller.estimation.readings import READINGS_SCRATCH, predict_readings
+from controller.estimation.whole_mechanism.readings import READINGS_SCRATCH, predict_readings
 from controller.rig import sensor_geometry
 from plant.dynamics.imposed import impose
 from plant.mechanism import Mechanism, load_spatial

@@ -4,21 +4,18 @@ import numpy as np
 import pytest
 from numba import njit
 
-from controller.estimation.imu_errors import ERRORS, distort, error_gradient
-from controller.estimation.mechanism_filter import (
+from controller.estimation.whole_mechanism.filter import extrapolate, extrapolate_covariance, start_filter, step_filter
+from controller.estimation.whole_mechanism.imu_errors import ERRORS, distort, error_gradient
+from controller.estimation.whole_mechanism.parameters import (
     ALL_ERRORS,
     BLOCKS,
     FILTER_STATE,
     MOTION_STATES,
     collect,
-    extrapolate,
-    extrapolate_covariance,
     filter_parameters,
-    start_filter,
-    step_filter,
 )
-from controller.estimation.readings import READINGS_SCRATCH, predict_readings
-from controller.estimation.rig_jacobian import JOINTS, RIG_ERRORS, TILT
+from controller.estimation.whole_mechanism.readings import READINGS_SCRATCH, predict_readings
+from controller.estimation.whole_mechanism.rig_jacobian import JOINTS, RIG_ERRORS, TILT
 from controller.rig import sensor_geometry
 from controller.settings import FusionSettings, fusion_settings
 from plant.dynamics.imposed import impose

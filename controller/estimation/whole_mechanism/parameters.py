@@ -1,0 +1,176 @@
+"""What the whole-mechanism filter estimates: its constants and its state."""
+
+import numpy as np
+
+from controller.estimation.whole_mechanism.imu_errors import (
+    ERRORS,
+)
+from controller.estimation.whole_mechanism.readings import (
+    MOTION_STATES,
+    READINGS,
+    READINGS_SCRATCH,
+)
+from controller.estimation.whole_mechanism.rig_jacobian import RIG_ERRORS
+from controller.rig import MagneticField
+from controller.settings import FusionSettings
+from plant.compiled import Record, kernel
+from plant.dynamics.variables import IMU_COUNT
+from plant.errors import UnknownNameError
+from plant.pose import Array
+
+BLOCKS = {"gyroscopes": 3, "accelerometers": 6, "alignments": 15, "axes": ERRORS}
+"""How many of an IMU's errors are estimated."""
+
+ALL_ERRORS = IMU_COUNT * ERRORS
+MOST_STATES = MOTION_STATES + ALL_ERRORS + RIG_ERRORS + 1
+ROWS = IMU_COUNT * READINGS
+"""Scalars of one update."""
+
+WINDOW_S = 0.005
+_SMOOTHING_S = 0.03
+FILTER_PARAMETERS = np.dtype(
+    [
+        ("window", np.int64),
+        ("errors", np.int64),
+        ("rig", np.int64),
+        ("states", np.int64),
+        ("smoothing", np.float64),
+        ("jerk", np.float64, 2),
+        ("bias_walk", np.float64, 2),
+        ("variance", np.float64, 2),
+        ("prior", np.float64, (ALL_ERRORS + RIG_ERRORS, ALL_ERRORS + RIG_ERRORS)),
+        ("floor", np.float64, 2),
+        ("heading", np.int64),
+        ("field_axes", np.float64, (3, 3)),
+        ("heading_variance", np.float64),
+        ("offset_variance", np.float64),
+    ],
+    align=True,
+)
+"""Samples of a window; estimated errors of an IMU, 0 for no filter, and of the rig; all states; time constant of the motion at
+which the Jacobian is taken, infinite if that is set from outside; spectral densities of the platform's jerk (linear,
+angular) and of the biases' walks (gyroscope, accelerometer); variances of one sample (rate, force); the covariance of the
+errors; and the variances of position and rotation that are left because the rig's are not estimated. Then whether there is a
+heading; in {1} the horizontal direction of the magnetic field, that across it and the vertical, and the axis about which a
+small turn changes what the heading seems to be; and the variances of a sample's heading and of its offset.
+"""
+
+FILTER_STATE = np.dtype(
+    [
+        ("running", np.int64),
+        ("time", np.float64),
+        ("position", np.float64, 3),
+        ("rotation", np.float64, (3, 3)),
+        ("motion", np.float64, (4, 3)),
+        ("low_passed", np.float64, (2, 4, 3)),
+        ("smooth_motion", np.float64, (4, 3)),
+        ("errors", np.float64, (IMU_COUNT, ERRORS)),
+        ("rig", np.float64, RIG_ERRORS),
+        ("covariance", np.float64, (MOST_STATES, MOST_STATES)),
+        ("published_time", np.float64),
+        ("published_position", np.float64, 3),
+        ("published_rotation", np.float64, (3, 3)),
+        ("published_motion", np.float64, (4, 3)),
+        ("published_covariance", np.float64, (MOTION_STATES, MOTION_STATES)),
+        ("sum", np.float64, (IMU_COUNT, READINGS)),
+        ("sum_time", np.float64),
+        ("samples", np.int64, IMU_COUNT),
+        ("collected", np.int64),
+        ("field", np.float64, 3),
+        ("field_time", np.float64),
+        ("field_used", np.int64),
+        ("heading_offset", np.float64),
+        ("sample", np.float64, (IMU_COUNT, READINGS)),
+        ("sample_used", np.int64, IMU_COUNT),
+        ("row", np.int64),
+        ("update_step", np.int64),
+        ("change", np.float64, MOST_STATES),
+        ("gain", np.float64, MOST_STATES),
+        ("turn", np.float64, 3),
+        ("frame", np.float64, (3, 3)),
+        ("predicted", np.float64, (IMU_COUNT, READINGS)),
+        ("smooth_predicted", np.float64, (IMU_COUNT, READINGS)),
+        ("jacobian", np.float64, (IMU_COUNT, READINGS, MOTION_STATES)),
+        ("rig_jacobian", np.float64, (IMU_COUNT, READINGS, 8)),
+        ("gradient", np.float64, ERRORS),
+        ("mixed", np.float64, (3, MOTION_STATES)),
+        ("readings_scratch", READINGS_SCRATCH),
+    ],
+    align=True,
+)
+"""State of the filter, whose update may be under way; `published` is what the last complete one has found.
+
+Times are in seconds since the first cycle. `sum` collects the samples of a window, `sample` is the mean of the last one;
+`row` is the next scalar to take, -1 when none is left. `rig` is by how much joints (2, 6, 3) and tilt (2) are off; the readings
+of a leg's IMU depend on eight of these, its two joints and the tilt. `field` is the magnetometer's last sample, until it
+has been taken.
+"""
+
+
+def filter_parameters(
+    fusion: FusionSettings, rate: float, errors: str | None, covariance: Array | None, floor: Array | None = None,
+    field: MagneticField | None = None, inflation: float | None = None,
+) -> Record:  # fmt: skip
+    """Constants of the filter.
+
+    Args:
+        fusion: settings.
+        rate: samples per second [Hz].
+        errors: a key of `BLOCKS`; None for no filter.
+        covariance: (147, 147), of the errors that a calibration has left, or (185, 185), of joints and tilt, too, which are
+            estimated then; None for what the settings say.
+        floor: (2,) [m, rad], standard deviations of position and rotation that joints and tilt leave; None if they are exact.
+        field: of the earth, for the platform's magnetometer; None without one.
+        inflation: times the noise and the jerk; None for 1 with a covariance, and what the settings say without.
+
+    Raises:
+        UnknownNameError: no such block of errors.
+    """
+    if errors is not None and errors not in BLOCKS:
+        raise UnknownNameError(f"no block of errors {errors!r}; there are {', '.join(BLOCKS)}")
+    sigmas = np.repeat(
+        [
+            fusion.bias_sigma, fusion.accelerometer_bias_sigma, fusion.scale_sigma, fusion.scale_sigma, fusion.alignment_sigma,
+            fusion.axes_sigma, fusion.axes_sigma,
+        ],
+        3,
+    )  # fmt: skip
+    prior, known = np.zeros((ALL_ERRORS + RIG_ERRORS,) * 2), np.diag(np.tile(sigmas**2, IMU_COUNT))
+    if covariance is not None:
+        known = covariance
+    prior[: len(known), : len(known)] = known
+    estimated = 0 if errors is None else BLOCKS[errors]
+    if inflation is None:
+        inflation = 1.0 if covariance is not None else fusion.noise_inflation
+    jerk = inflation * np.array([fusion.platform_jerk, fusion.platform_angular_jerk])
+    noise = inflation * np.array([fusion.mechanism_gyroscope_noise, fusion.mechanism_accelerometer_noise])
+    parameters: Record = np.zeros((), FILTER_PARAMETERS)
+    values = {
+        "window": max(1, round(WINDOW_S * rate)),
+        "errors": estimated,
+        "rig": len(known) - ALL_ERRORS,
+        "states": MOTION_STATES + IMU_COUNT * estimated + len(known) - ALL_ERRORS + (field is not None),
+        "smoothing": _SMOOTHING_S,
+        "jerk": jerk**2,
+        "bias_walk": (fusion.bias_walk**2, fusion.accelerometer_bias_walk**2),
+        "variance": noise**2 * rate / 2.0,
+        "prior": prior,
+        "floor": np.zeros(2) if floor is None else floor**2 / 3.0,
+    }
+    if field is not None:
+        up, north = field.vectors
+        values |= {
+            "heading": 1,
+            "field_axes": (north, np.cross(up, north), up - field.vertical / field.horizontal * north),
+            "heading_variance": field.heading_variance(fusion, rate),
+            "offset_variance": fusion.heading_sigma**2,
+        }
+    for name, value in values.items():
+        parameters[name] = value
+    return parameters
+
+
+@kernel
+def rig_start(parameters: Record) -> int:
+    """The place of the first error of the rig among the states."""
+    return int(MOTION_STATES + IMU_COUNT * parameters.errors)
