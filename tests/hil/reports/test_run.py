@@ -1,10 +1,6 @@
 """The report of a simulation: what a browser would draw is read back from the file."""
 
-import base64
-import json
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +12,7 @@ from hil.runs.simulation import simulate
 from plant.errors import InputError
 from plant.pose import rotation_angle, rotation_from_vector
 from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS
+from tests.hil.pages import draw_in_browser, figures_in, json_after, numbers, traces_of
 
 CURVES = {"pose": 12, "errors": 12, "lengths": 12, "motion": 12, "drives": 18}
 FIGURES = ["mechanism", *CURVES]
@@ -40,16 +37,7 @@ def page(report):
 
 @pytest.fixture(scope="module")
 def traces(page):
-    return {name: json_after(page, f'"{name}",') for name in FIGURES}
-
-
-def json_after(page, start):
-    text = page[page.rindex(start) + len(start) :].lstrip()
-    return json.JSONDecoder().raw_decode(text)[0]
-
-
-def numbers(packed):
-    return np.frombuffer(base64.b64decode(packed["bdata"]), packed["dtype"]).astype(float)
+    return {name: traces_of(page, name) for name in FIGURES}
 
 
 def points(trace):
@@ -61,15 +49,13 @@ def curves(traces, name):
 
 
 def test_the_file_is_complete_in_itself_and_small(report, page):
-    assert page.count("* plotly.js v") == 1
-    markup = re.sub(r"(<script\b[^>]*>).*?</script>", r"\1", page, flags=re.DOTALL)
-    assert not re.search(r"<link\b|\b(src|href)\s*=|url\(|@import", markup)
+    figures_in(page)
     assert report.stat().st_size < 8e6
     assert list(report.parent.iterdir()) == [report]
 
 
 def test_every_figure_is_there_once(page, traces):
-    assert re.findall(r'<div id="(\w+)" class="plotly-graph-div"', page) == FIGURES
+    assert figures_in(page) == FIGURES
     assert page.count("<figcaption>") == len(FIGURES)
     assert {name: len(traces[name]) for name in CURVES} == CURVES
 
@@ -138,17 +124,7 @@ def test_the_mechanism_moves_on_legs_of_the_true_length(page, traces, result):
 
 
 def test_a_browser_draws_every_figure_without_an_error(report):
-    browser = shutil.which("chromium") or shutil.which("google-chrome")
-    if not browser:
-        pytest.skip("no browser here")
-    flags = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-component-update"
-    run = subprocess.run(
-        [browser, *flags.split(), "--virtual-time-budget=10000", f"--user-data-dir={report.parent.parent / 'profile'}",
-         "--dump-dom", f"file://{report}"], capture_output=True, text=True, check=False, timeout=120,
-    )  # fmt: skip
-    drawn = re.findall(r'class="[^"]*js-plotly-plot', run.stdout)
-    assert len(drawn) >= len(FIGURES), run.stderr[-2000:]
-    assert "Uncaught" not in run.stderr
+    draw_in_browser(report, len(FIGURES))
 
 
 def test_names_are_escaped_and_a_stop_is_told(result, tmp_path):

@@ -1,33 +1,25 @@
-"""The planar rig: its real measurements against an independent solver, made-up ones against what went in, and the report."""
+"""The planar rig: its real measurements against an independent solver, and made-up ones against what went in."""
 
-import base64
 import json
 import re
-import shutil
-import subprocess
-import tomllib
-from importlib import resources
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from hil.reports.planar_rig import write_report
 from hil.studies.planar_rig import COLUMNS, SOURCES, evaluate
 from plant.errors import InputError, SingularConfigurationError
-from plant.mechanism.documents import mechanism_from_document
 from tests.conftest import SHARED_DATA
+from tests.hil.planar_rig import BASE, joints_at, leg_degrees, load_rig, write_pose, write_two_poses
 
 FIRST = "# true pose by image processing: x 107 mm, y 192 mm, gamma -5.5 deg"
-BASE, PLATFORM = np.array([[0.0, 0.0], [170.0, 0.0], [280.0, 0.0]]), np.array([[0.0, 0.0], [70.0, 0.0], [100.0, 0.0]])
 TEN_POSES = {"raw": (1.41, 3.35, 2.04), "kalman": (1.26, 2.85, 2.07), "complementary": (1.23, 2.95, 2.33)}
 """RMS of the mean errors [mm, mm, deg] that come with the data, over these poses and three more."""
 
 
 @pytest.fixture(scope="session")
 def rig():
-    text = (resources.files("plant.mechanism") / "presets" / "planar-3rpr.toml").read_text()
-    return mechanism_from_document(tomllib.loads(text))
+    return load_rig()
 
 
 @pytest.fixture(scope="session")
@@ -39,35 +31,9 @@ def measured(rig):
     return evaluate(folder, rig)
 
 
-def joints_at(pose):
-    """The platform joints [mm] at x, y [mm] and angle [deg]."""
-    x, y, angle = pose
-    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
-    return np.array([[x + c * a - s * b, y + s * a + c * b] for a, b in PLATFORM])
-
-
-def leg_degrees(pose):
-    x, y = (joints_at(pose) - BASE).T
-    return np.degrees(np.arctan2(y, x))
-
-
-def write_pose(folder, number, pose, angles):
-    """A file with samples (N, 9) of leg angles [deg]."""
-    x, y, gamma = pose
-    rows = [",".join(map(repr, row)) for row in np.asarray(angles).tolist()]
-    text = [f"# true pose by image processing: x {x} mm, y {y} mm, gamma {gamma} deg", ",".join(COLUMNS), *rows]
-    (folder / f"pose_{number:02}.csv").write_text("\n".join(text) + "\n")
-
-
 @pytest.fixture
 def made_up(tmp_path):
-    """Two poses: legs without error as the raw ones, those of a pose near by as Kalman's, noise as the complementary ones."""
-    poses, offset = ((107.0, 192.0, -5.0), (84.0, 217.0, -20.0)), np.array([2.0, -3.0, 4.0])
-    noise = np.random.default_rng(1).normal(0.0, 0.01, (40, 3))
-    for number, pose in enumerate(poses, start=1):
-        true, near = leg_degrees(pose), leg_degrees(pose + offset)
-        write_pose(tmp_path, number, pose, [[*true, *near, *(true + sample)] for sample in noise])
-    return tmp_path, noise
+    return tmp_path, write_two_poses(tmp_path)
 
 
 def test_made_up_measurements_give_back_what_went_in(rig, made_up):
@@ -156,87 +122,6 @@ def test_the_figures_agree_with_those_that_come_with_the_data(measured):
         assert share < figures["true_mode"]["samples"] < 1.0
 
 
-# --------------------------------------------------------------------------------------------------------- the report
-
-
-@pytest.fixture
-def report(rig, made_up, tmp_path):
-    path = tmp_path / "report" / "report.html"
-    path.parent.mkdir()
-    write_report(evaluate(made_up[0], rig), path)
-    return path
-
-
-def traces_of(page, name):
-    start = f'"{name}",'
-    return json.JSONDecoder().raw_decode(page[page.rindex(start) + len(start) :].lstrip())[0]
-
-
-def numbers(packed):
-    return np.frombuffer(base64.b64decode(packed["bdata"]), packed["dtype"]).astype(float)
-
-
-def test_the_report_is_complete_in_itself_and_has_the_figures(report, rig, made_up):
-    page = report.read_text(encoding="utf-8")
-    assert page.count("* plotly.js v") == 1
-    markup = re.sub(r"(<script\b[^>]*>).*?</script>", r"\1", page, flags=re.DOTALL)
-    assert not re.search(r"<link\b|\b(src|href)\s*=|url\(|@import", markup)
-    assert list(report.parent.iterdir()) == [report]
-    assert re.findall(r'<div id="(\w+)" class="plotly-graph-div"', page) == ["errors", "modes"]
-    assert "gough: planar-3rpr at 2 known poses" in page and "80 samples of each source" in page
-
-    summary = evaluate(made_up[0], rig).summary()
-    cells = re.findall(r"<td>(.*?)</td>", page[page.index("<tbody>") : page.index("</tbody>")])
-    for row, figures in zip(np.reshape(cells, (3, 7)), summary["sources"].values(), strict=True):
-        x, y, angle = figures["rms"].values()
-        shown = [1e3 * x, 1e3 * y, *np.degrees([angle, *figures["leg_angles"].values()])]
-        np.testing.assert_allclose(row[:5].astype(float), shown, atol=0.00501)
-        assert row[5:].tolist() == ["2 of 2", "100.0 %"]
-
-
-def test_the_report_draws_the_errors_and_both_modes(report, rig, made_up):
-    page = report.read_text(encoding="utf-8")
-    errors = traces_of(page, "errors")
-    assert [trace["name"] for trace in errors] == 3 * list(SOURCES)
-    kalman, complementary = ([numbers(trace["y"]) for trace in errors if trace["name"] == name] for name in SOURCES[1:])
-    np.testing.assert_allclose(kalman, [[2.0, 2.0], [-3.0, -3.0], [4.0, 4.0]], atol=1e-9)
-    bars = [numbers(trace["error_y"]["array"]) for trace in errors if trace["name"] == "complementary"]
-    deviations = [
-        [figures["standard_deviation"][name] for name in ("x", "y", "angle")]
-        for figures in evaluate(made_up[0], rig).summary()["sources"]["complementary"]["poses"].values()
-    ]
-    np.testing.assert_allclose(np.transpose(bars), deviations * np.array([1e3, 1e3, np.degrees(1.0)]), rtol=1e-6)
-    assert np.shape(complementary) == (3, 2)
-
-    modes = traces_of(page, "modes")
-    assert [trace["name"] for trace in modes] == 2 * ["true pose", "mode nearest to it", "other mode"]
-    for k, pose in enumerate(np.array([(107.0, 192.0, -5.0), (84.0, 217.0, -20.0)])):
-        true, nearest, other = (
-            np.column_stack([numbers(trace["x"]), numbers(trace["y"])]) for trace in modes[3 * k : 3 * k + 3]
-        )
-        for drawn, at in ((true, pose), (nearest, pose + [2.0, -3.0, 4.0])):
-            np.testing.assert_allclose(drawn[[0, 3, 6]], BASE, atol=1e-9)
-            np.testing.assert_allclose(drawn[[1, 4, 7]], joints_at(at), atol=1e-6)
-            np.testing.assert_allclose(drawn[9:], joints_at(at)[[0, 1, 2, 0]], atol=1e-6)
-        legs = other[[1, 4, 7]] - BASE
-        np.testing.assert_allclose(np.degrees(np.arctan2(*legs.T[::-1])), leg_degrees(pose + [2.0, -3.0, 4.0]), atol=1e-6)
-        np.testing.assert_allclose(np.linalg.norm(np.diff(other[9:], axis=0), axis=1), [70.0, 30.0, 100.0], atol=1e-6)
-        assert np.linalg.norm(other[1] - nearest[1]) > 10.0
-
-
-def test_a_browser_draws_the_report_without_an_error(report):
-    browser = shutil.which("chromium") or shutil.which("google-chrome")
-    if not browser:
-        pytest.skip("no browser here")
-    flags = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-component-update"
-    run = subprocess.run(
-        [browser, *flags.split(), "--virtual-time-budget=10000", f"--user-data-dir={report.parent.parent / 'profile'}",
-         "--dump-dom", f"file://{report}"], capture_output=True, text=True, check=False, timeout=120,
-    )  # fmt: skip
-    assert len(re.findall(r'class="[^"]*js-plotly-plot', run.stdout)) >= 2, run.stderr[-2000:]
-    assert "Uncaught" not in run.stderr
-
-
 # ---------------------------------------------------------------------------------------------------- what is refused
 
 
@@ -279,9 +164,3 @@ def test_samples_with_parallel_legs_are_refused_with_their_file(rig, tmp_path):
     write_pose(tmp_path, 1, (107.0, 192.0, -5.5), [[*leg_degrees((107.0, 192.0, -5.5)), 60.0, 60.0, 60.0, 60.0, 80.0, 100.0]])
     with pytest.raises(SingularConfigurationError, match=r"pose_01.csv: legs at 60, 60, 60 deg leave the angle"):
         evaluate(tmp_path, rig)
-
-
-def test_a_report_that_cannot_be_written_is_refused(rig, made_up, tmp_path):
-    path = tmp_path / "missing" / "report.html"
-    with pytest.raises(InputError, match=re.escape(str(path))):
-        write_report(evaluate(made_up[0], rig), path)
