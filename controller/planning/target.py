@@ -7,8 +7,8 @@ import numpy as np
 
 from controller.planning.motions import HELD, MARGIN_S, NAMES, named_motion
 from plant.checks import check_duration
+from plant.csv import read_csv
 from plant.errors import InputError, UnknownNameError
-from plant.files import read_csv
 from plant.mechanism import Mechanism
 from plant.pose import UNIT_TOLERANCE, Array, Pose, checked_unit, quaternion_from_rotation, rotations_from_quaternions
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from hil.recording.mcap import read
+from plant.csv import read_csv
 from plant.errors import InputError
-from plant.files import read_csv
 from plant.pose import Array
 
 COLUMNS = ("time_s", "wx", "wy", "wz", "ax", "ay", "az")

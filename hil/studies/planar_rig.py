@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.direct_kinematics.planar import AssemblyMode, closing_angles, closing_positions, solve_planar, wrapped
+from plant.csv import read_csv
 from plant.errors import InputError, SingularConfigurationError
-from plant.files import read_csv
 from plant.mechanism.planar import PLANAR_LEGS, PlanarMechanism
 from plant.pose import Array
 from plant.toml import read_text

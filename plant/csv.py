@@ -1,0 +1,57 @@
+"""CSV files of numbers."""
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from plant.errors import InputError
+from plant.pose import Array
+from plant.toml import read_text
+
+
+class CsvTable(NamedTuple):
+    """The numbers of a CSV file: names of the columns (m), rows (N, m), and the line (N) of each row in the file."""
+
+    columns: tuple[str, ...]
+    rows: Array
+    lines: list[int]
+
+
+def read_csv(path: Path, *headers: tuple[str, ...], note: str = "", skipped: int = 0) -> CsvTable:
+    """Read a CSV file of finite numbers; blank lines do not count.
+
+    Args:
+        path: of the file.
+        headers: the headers that it may have.
+        note: for the message about the header, such as the units.
+        skipped: lines before the header.
+
+    Raises:
+        InputError: the file cannot be read, has another header, or has a row of other content; the message names the line.
+    """
+    lines = [line.strip() for line in read_text(path).removeprefix("\ufeff").splitlines()][skipped:]
+    columns = tuple(name.strip() for name in lines[0].split(",")) if lines else ()
+    if columns not in headers:
+        wanted = " or ".join(",".join(header) for header in headers)
+        raise InputError(f"{path}, line {skipped + 1}: the header must be {wanted}{note}")
+    rows: list[list[float]] = []
+    numbers: list[int] = []
+    for number, line in enumerate(lines[1:], start=skipped + 2):
+        if not line:
+            continue
+        found, row = "", list[float]()
+        try:
+            row = [float(field) for field in line.split(",")]
+            found = "" if len(row) == len(columns) else f": it has {len(row)} numbers"
+        except ValueError as error:
+            found = f": {error}"
+        for name, value in zip(columns, row, strict=False):
+            if not math.isfinite(value):
+                found = f": {name} is {value}"
+        if found:
+            raise InputError(f"{path}, line {number}: {line!r} is not a row of {len(columns)} finite numbers{found}")
+        rows.append(row)
+        numbers.append(number)
+    return CsvTable(columns, np.array(rows).reshape(-1, len(columns)), numbers)
