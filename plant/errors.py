@@ -25,6 +25,10 @@ class UnreachableError(GoughError, ValueError):
     """A pose needs a leg outside its stroke."""
 
 
+class CalibrationError(GoughError, ValueError):
+    """The data cannot be explained, or do not determine the constants."""
+
+
 class FmuError(GoughError, RuntimeError):
     """An FMU cannot be read, lacks something, or reported a failure of its own."""
 

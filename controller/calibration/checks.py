@@ -1,7 +1,7 @@
-"""Whether each IMU lives, sits where it should, and is turned and wired as it should be: to be known before a loop is closed.
+"""Checks before a loop is closed: whether each IMU works, sits in its place, and has the right orientation and wiring.
 
-While the drives follow a plan, whatever the IMUs say, each must read what its place does. One that does not is tried at the
-places of the others, and with the 48 signed permutations of its axes, 24 turns and 24 mirrored ones.
+The drives follow a plan with the loop open, and each IMU must read the motion of its place. For an IMU that does not, the check
+tries the places of the others, and the 48 signed permutations of its axes: 24 rotations and 24 mirrored ones.
 """
 
 from dataclasses import dataclass
@@ -11,25 +11,25 @@ from itertools import permutations, product
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from controller.calibration.at_rest import CalibrationError
 from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
+from plant.errors import CalibrationError
 from plant.imu import ACCELEROMETER, STANDARD_GRAVITY
 from plant.pose import Array, vector_from_rotation
 
 MOST_TILT = np.radians(15.0)
-"""By how much the mean force may be off what is expected, as an angle of gravity [rad]: raw IMUs are off by 8 degrees."""
+"""Largest angle between the mean force and the expected one [rad]; raw IMUs are off by 8 degrees."""
 
 FAR_BETTER = 0.5
-"""What another place or other axes may leave unexplained, as a share of what the right ones do, to be believed."""
+"""Another place or other axes are believed if they leave less than this share of what the right ones leave unexplained."""
 
 LEAST_MOTION = 0.2
-"""How much of the expected motion an IMU must read."""
+"""Least share of the expected motion that an IMU must read."""
 
 LEAST_RATE = np.radians(1.0)
-"""Of the turning of any IMU in a motion, RMS [rad/s]."""
+"""Least RMS of the rate of some IMU in a motion [rad/s]."""
 
 LEAST_SPREAD = np.radians(3.0)
-"""Of the verticals of an IMU over rests [rad]."""
+"""Least angle between verticals of some IMU over the rests [rad]."""
 
 _FROZEN_S = 0.1
 _RIGHT = np.eye(3)
@@ -38,7 +38,7 @@ _GRAVITY_RANGE = (0.7 * STANDARD_GRAVITY, 1.3 * STANDARD_GRAVITY)
 
 
 def check_alive(samples: Array) -> None:
-    """Check that no IMU stands still while others do not, and that each reads gravity.
+    """Check that no IMU is frozen while others are not, and that each reads gravity.
 
     Args:
         samples: (N, 3, 7, 3), raw, at rest.
@@ -46,12 +46,12 @@ def check_alive(samples: Array) -> None:
     Raises:
         CalibrationError: one does not; the message names it.
     """
-    stands = (samples[:, :2] == samples[0, :2]).all(axis=(0, 1, 3))
+    frozen = (samples[:, :2] == samples[0, :2]).all(axis=(0, 1, 3))
     for imu in range(IMU_COUNT):
         own = samples[:, :2, imu]
         if not np.isfinite(own).all():
-            raise CalibrationError(f"IMU {imu} reads what is no number: check its cable and its supply")
-        if stands[imu] and not stands.all():
+            raise CalibrationError(f"IMU {imu} gives readings that are not finite: check its cable and its supply")
+        if frozen[imu] and not frozen.all():
             raise CalibrationError(
                 f"IMU {imu} is frozen: {len(own)} readings are the same, and others' are not: check its cable and its supply"
             )
@@ -64,11 +64,11 @@ def check_alive(samples: Array) -> None:
 
 
 def check_all_along(samples: Array, rate: float) -> None:
-    """Check that every IMU reads numbers all along samples (N, 3, 7, 3) at this rate [Hz], and does not stand still for a tenth
-    of a second while others do not.
+    """Check all samples (N, 3, 7, 3) at this rate [Hz]: every IMU gives finite readings, and none is frozen for a tenth of a
+    second while others are not.
 
     Raises:
-        CalibrationError: one does not; the message names it, and when.
+        CalibrationError: one is; the message names it, and when.
     """
     readings = samples[:, :2]
     lost = ~np.isfinite(readings).all(axis=(1, 3))
@@ -76,7 +76,7 @@ def check_all_along(samples: Array, rate: float) -> None:
     same &= ~same.all(axis=1, keepdims=True)
     reach = max(round(_FROZEN_S * rate), 3)
     frozen = sliding_window_view(same, min(reach, len(same)), axis=0).all(axis=2)
-    faults = {"reads what is no number": np.atleast_2d(lost), "stands still while others do not": np.atleast_2d(frozen)}
+    faults = {"gives readings that are not finite": lost, "is frozen while others are not": np.atleast_2d(frozen)}
     for imu in range(IMU_COUNT):
         for what, found in faults.items():
             if found[:, imu].any():
@@ -87,7 +87,7 @@ def check_all_along(samples: Array, rate: float) -> None:
 
 
 def check_spread(forces: Array) -> None:
-    """Check that rests are unlike enough, and that every leg takes part.
+    """Check that the rests differ enough, and that every leg takes part.
 
     Args:
         forces: (N, 7, 3), raw means at rest.
@@ -100,7 +100,7 @@ def check_spread(forces: Array) -> None:
     spreads = np.arccos(np.clip(cosines, -1.0, 1.0))
     if spreads.max() < LEAST_SPREAD:
         raise CalibrationError(
-            f"the poses are too alike: between any two of {len(forces)} rests no IMU turns by more than "
+            f"the poses are too alike: between any two of {len(forces)} rests, no IMU turns by more than "
             f"{np.degrees(spreads.max()):.2g} deg; at least {np.degrees(LEAST_SPREAD):g} deg are needed: rest at wider poses"
         )
     least = LEAST_MOTION * float(np.median(spreads))
@@ -112,10 +112,10 @@ def check_spread(forces: Array) -> None:
 
 
 def check_motion(rates: Array) -> None:
-    """Check that there is a motion in rates (N, 7, 3) [rad/s] without their zeros.
+    """Check that rates (N, 7, 3) [rad/s], minus those at rest, show a motion.
 
     Raises:
-        CalibrationError: there is none.
+        CalibrationError: they do not.
     """
     most = float(np.sqrt(np.square(rates).sum(axis=2).mean(axis=0)).max())
     if most < LEAST_RATE:
@@ -126,15 +126,15 @@ def check_motion(rates: Array) -> None:
 
 
 def check_places(readings: Array, expected: Array) -> None:
-    """Check that each IMU reads what its place does along a planned motion, roughly.
+    """Check that each IMU roughly reads the motion of its place, along a planned motion.
 
     Args:
-        readings: (N, 7, 6), raw, the rates without their zeros.
+        readings: (N, 7, 6), raw, the rates minus those at rest.
         expected: (N, 7, 6), of ideal IMUs.
 
     Raises:
-        CalibrationError: one or more do not; the message names each, and where it sits or how it is turned or wired, if that
-            explains its readings.
+        CalibrationError: one or more do not. The message names each, and its place, orientation or wiring if that explains its
+            readings.
     """
     check_motion(expected[:, :, :3])
     fit, everywhere = _Fit(readings, expected), range(IMU_COUNT)
@@ -158,12 +158,11 @@ def _idle(imu: int) -> str:
 
 
 def _explained(fit: "_Fit", imu: int) -> list[str]:
-    """What is wrong with an IMU on its own place."""
+    """What is wrong with an IMU in its own place."""
     shares = [fit.share(imu, sensor) for sensor in range(2)]
     if max(shares) < LEAST_MOTION:
         return [
-            f"IMU {imu} reads {max(shares):.2g} of the motion that is expected, and at least {LEAST_MOTION:g} is needed: "
-            f"{_idle(imu)}"
+            f"IMU {imu} reads {max(shares):.2g} of the expected motion, and at least {LEAST_MOTION:g} is needed: {_idle(imu)}"
         ]
     misfits = [[fit.misfit(imu, imu, sensor, each.matrix) for each in _axes()] for sensor in range(2)]
     best = [_axes()[int(np.argmin(each))] for each in misfits]
@@ -171,7 +170,7 @@ def _explained(fit: "_Fit", imu: int) -> list[str]:
     both = min(_axes(), key=lambda each: fit.left(imu, imu, each.matrix))
     left = fit.left(imu, imu, both.matrix)
     alike = FAR_BETTER * left < np.linalg.norm([min(each) for each in misfits])
-    # No mounting mirrors: a sensor that can do without is not blamed.
+    # No mounting mirrors: mirrored axes of both sensors are believed only if each sensor alone needs other axes.
     if fit.is_better(imu, left) and alike and (all(wrong) or both.turned):
         return [f"IMU {imu} reads {both.text}: mount it as it should be, or change the axes of both its sensors"]
     told = []
@@ -180,21 +179,21 @@ def _explained(fit: "_Fit", imu: int) -> list[str]:
             told.append(f"the {name} of IMU {imu} reads {best[sensor].text}: change its axes")
         elif shares[sensor] < LEAST_MOTION:
             told.append(
-                f"the {name} of IMU {imu} reads {shares[sensor]:.2g} of the changes that are expected, and at least "
+                f"the {name} of IMU {imu} reads {shares[sensor]:.2g} of the expected changes, and at least "
                 f"{LEAST_MOTION:g} is needed: it is dead, or its range or unit is another"
             )
     if not told and (tilt := fit.tilt(imu)) > MOST_TILT:
         told.append(
-            f"gravity at IMU {imu} is {np.degrees(tilt):.3g} deg off what is expected; at most {np.degrees(MOST_TILT):g} "
-            "deg are allowed, and no axes explain it: check how it is mounted, and whether the rig begins at home"
+            f"gravity at IMU {imu} is {np.degrees(tilt):.3g} deg off the expected direction; at most {np.degrees(MOST_TILT):g} "
+            "deg are allowed, and no axes explain it: check its mounting, and whether the rig begins at home"
         )
     return told
 
 
 class _Fit:
-    """How well readings (N, 7, 6) are explained by what is expected (N, 7, 6) of a place with axes of its own.
+    """How well the readings (N, 7, 6) expected of a place explain an IMU's readings (N, 7, 6), with right or other axes.
 
-    Trends are left out: with the loop open the platform sinks.
+    Trends are left out: with the loop open, the platform sinks.
     """
 
     def __init__(self, readings: Array, expected: Array) -> None:
@@ -209,22 +208,22 @@ class _Fit:
         self._changes = [changes(each) for each in (readings, expected)]
 
     def share(self, imu: int, sensor: int) -> float:
-        """How much changes in what a sensor reads, relative to what is expected."""
+        """Size of the changes that a sensor reads, relative to the expected ones."""
         read, expected = (np.sqrt(np.square(each[:, imu, sensor]).mean()) for each in self._changes)
         return float(read / expected)
 
     def moves(self, imu: int) -> bool:
-        """Whether both sensors of an IMU read some motion."""
+        """Whether both sensors of an IMU read enough motion."""
         return min(self.share(imu, sensor) for sensor in range(2)) >= LEAST_MOTION
 
     def tilt(self, imu: int) -> float:
-        """By how much gravity is off what is expected [rad]."""
+        """Angle between gravity and its expected direction [rad]."""
         read, expected = (each[imu, ACCELEROMETER] / np.linalg.norm(each[imu, ACCELEROMETER]) for each in self._means)
         return float(np.arccos(np.clip(read @ expected, -1.0, 1.0)))
 
     def misfit(self, imu: int, place: int, sensor: int, axes: Array) -> float:
-        """RMS of what is left of a sensor's changes, relative to what is expected of them, and of the mean of a force, relative
-        to what is allowed.
+        """What a place with these axes leaves unexplained: RMS of a sensor's changes relative to the expected ones, and for a
+        force its mean relative to the allowed deviation.
         """
         read, expected = self._changes[0][:, imu, sensor], self._changes[1][:, place, sensor]
         changed = np.sqrt(np.square(read - expected @ axes.T).mean() / np.square(expected).mean())
@@ -233,30 +232,30 @@ class _Fit:
         return float(np.hypot(changed, off))
 
     def left(self, imu: int, place: int, axes: Array = _RIGHT) -> float:
-        """What is left of both sensors."""
+        """What a place with these axes leaves unexplained of both sensors."""
         return float(np.linalg.norm([self.misfit(imu, place, sensor, axes) for sensor in range(2)]))
 
     def is_better(self, imu: int, left: float) -> bool:
-        """Whether that is far better than the right place with the right axes."""
+        """Whether leaving that much is far better than the right place with the right axes."""
         return left < FAR_BETTER * self.left(imu, imu)
 
 
 @dataclass(frozen=True, eq=False)
 class _Axes:
-    """What an IMU reads for its x, y and z: in words, and as a matrix (3, 3)."""
+    """The axes that an IMU reads as its x, y and z: in words, and as a matrix (3, 3)."""
 
     text: str
     matrix: Array
 
     @property
     def turned(self) -> bool:
-        """Whether a mounting can do that, which no mirroring does."""
+        """Whether a mounting can cause this; it cannot mirror."""
         return bool(np.linalg.det(self.matrix) > 0.0)
 
 
 @cache
 def _axes() -> list[_Axes]:
-    """All 48, those as they should be first."""
+    """All 48, the right ones first."""
     found = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         matrix: Array = np.array(signs)[:, None] * np.eye(3)[list(order)]
@@ -267,7 +266,7 @@ def _axes() -> list[_Axes]:
 
 def _words(matrix: Array) -> str:
     if np.linalg.det(matrix) > 0.0:
-        # What is turned reads the world turned the other way.
+        # A turned IMU reads the world turned the other way.
         turn = vector_from_rotation(matrix.T)
         angle, about = np.degrees(np.linalg.norm(turn)), turn / np.abs(turn).max(initial=1e-9)
         names = "".join(f"{'-' if x < 0.0 else '+'}{name}" for name, x in zip("xyz", about, strict=True) if abs(x) > 0.5)

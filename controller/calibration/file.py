@@ -1,7 +1,7 @@
 """Calibration of the IMUs: the paper's (37), `a_cal = T S (a_u + b)`, for every sensor, and the file that keeps it.
 
-Here `T S` is kept as one matrix, the gain, with the mounting in it, and `T S b` as the offset, so that a calibrated reading is
-gain @ raw + offset. A file gives for each IMU what one would write on its box, bias, scale, axes and mounting of each sensor:
+One matrix, the gain, holds `T S` and the mounting, and the offset holds `T S b`: a calibrated reading is gain @ raw + offset.
+A file gives bias, scale, axes and mounting of each sensor of each IMU:
 
     gain = R(mounting) T(axes) diag(scale),  T = I + upper triangle (xy, xz, yz),  R that of a rotation vector
 """
@@ -37,12 +37,12 @@ class Calibration:
     Attributes:
         gain: (3, 7, 3, 3), by sensor (gyroscope, accelerometer, magnetometer) and IMU.
         offset: (3, 7, 3) [rad/s, m/s^2, uT].
-        tilt: (2,) [rad], by which the vertical is turned about the axes x and y of {1}.
-        joints: (2, 6, 3) [m], what must be added to the mechanism's base and platform joints.
+        tilt: (2,) [rad], turns of the vertical about the axes x and y of {1}.
+        joints: (2, 6, 3) [m], corrections of the mechanism's base and platform joints.
         floor: (2,) [m, rad], standard deviations of position and rotation that tilt and joints leave.
-        covariance: (147, 147), of what errors are left, in the order of `imu_errors.ERROR_NAMES`
-            for each IMU; None if it is not known.
-        about: what is worth knowing: date, residuals, where the data came from.
+        covariance: (147, 147), of the remaining errors, in the order of `controller.estimation.whole_mechanism.imu_errors.ERROR_NAMES` for each
+            IMU; None if it is not known.
+        about: further facts: date, residuals, source of the data.
     """
 
     gain: Array = field(default_factory=lambda: np.tile(np.eye(3), (3, IMU_COUNT, 1, 1)))

@@ -1,9 +1,9 @@
-"""Calibration of a magnetometer by hand: it is turned slowly every way round, in the field of the earth alone.
+"""Calibration of a magnetometer by hand: it is turned slowly in all directions, in the earth's field alone.
 
-Whatever the orientation, the calibrated field is as strong as the earth's: the raw one lies on an ellipsoid, whose centre is
-the hard iron and whose axes are the soft iron, nine constants in the form of the paper's (37). They leave open how the
-magnetometer's axes are turned against the accelerometer's. The angle between field and vertical, which gives the dip, is always
-the same, too, and tells those three.
+The calibrated field is as strong as the earth's in every orientation. So the raw field lies on an ellipsoid: its centre is the
+hard iron, its axes are the soft iron, nine constants in the form of the paper's (37). They leave open how the magnetometer's
+axes are turned against the accelerometer's. The angle between field and vertical, which gives the dip, is constant too and
+determines these three.
 """
 
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from controller.calibration.at_rest import CalibrationError
-from controller.calibration.single_imu import missing_half_axes
+from controller.calibration.single_imu import deviations_of, missing_half_axes
+from plant.errors import CalibrationError
 from plant.pose import Array
 
 LEAST_SAMPLES = 100
 _MOST_ACCELERATION = 0.02
-"""By how much of gravity the length of a force may be off for its direction to count."""
+"""Largest deviation of the length of a force from gravity, as a share of it, for the force to count as a vertical."""
 
 _MOST_RESIDUAL = 0.05
 _LARGEST_CONDITION = 1e3
@@ -31,7 +31,7 @@ class MagnetometerCalibration:
         gain: (3, 3), upper triangular without an accelerometer; calibrated = gain @ raw + offset.
         offset: (3,) [uT].
         sigmas: (12,), standard deviations of offset and gain, row by row.
-        samples: how many there were; what stands is counted once.
+        samples: number of samples; repeated ones count once.
         field_residual: RMS of the strength of the field [uT].
         dip: of the field below the horizontal plane [rad]; None without an accelerometer.
         dip_residual: RMS [rad]; None without an accelerometer.
@@ -54,8 +54,8 @@ def calibrate_magnetometer(
     Args:
         fields: (N, 3), raw [uT].
         forces: (N, 3), of the calibrated accelerometer [m/s^2]; None without one.
-        strength: of the field at the place [uT].
-        gravity: at the place [m/s^2].
+        strength: of the local field [uT].
+        gravity: local gravity [m/s^2].
 
     Raises:
         CalibrationError: the data do not determine the constants; the message says what is missing.
@@ -106,8 +106,7 @@ def _fit(fields: Array, still: Array, verticals: Array, strength: float) -> Magn
     _check(fields @ constants[0].T + constants[1], strength)
     if not fit.success or np.linalg.cond(fit.jac * sizes) > _LARGEST_CONDITION:
         raise CalibrationError("the orientations are too much alike: turn it about other axes, too")
-    variance = float(fit.fun @ fit.fun) / (len(fit.fun) - len(fit.x))
-    deviations = np.sqrt(np.diag(np.linalg.inv(fit.jac.T @ fit.jac)) * variance)
+    deviations = deviations_of(fit.jac, fit.fun, len(fit.fun) - len(fit.x))
     field_errors, dip_errors = np.split(fit.fun, [len(fields)])
     return MagnetometerCalibration(
         gain=constants[0],
@@ -121,7 +120,7 @@ def _fit(fields: Array, still: Array, verticals: Array, strength: float) -> Magn
 
 
 def _check(calibrated: Array, strength: float) -> None:
-    """Check that the field (N, 3) has been along every half-axis, and that it was the same all the time."""
+    """Check that the field (N, 3) was along every half-axis at some time, and equally strong all the time."""
     if missing := missing_half_axes(calibrated / strength):
         raise CalibrationError(f"the field was never along {', '.join(missing)}: turn it until it has been")
     residual = float(np.sqrt(np.mean((np.linalg.norm(calibrated, axis=1) - strength) ** 2)))

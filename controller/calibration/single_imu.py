@@ -1,8 +1,9 @@
 """Calibration of a single IMU by hand: it rests in many orientations and is turned from one to the next, without equipment.
 
-At rest the calibrated force has the length of gravity, whatever the orientation: nine constants of the accelerometer (bias,
-scale, axes; the multi-position method of the paper's reference 31). Between two rests the gyroscope must turn the one vertical
-into the other: nine more, in the accelerometer's frame, besides the bias that it reads at rest.
+At rest the calibrated force has the length of gravity in every orientation. That determines nine constants of the
+accelerometer: bias, scale and axes (the multi-position method of the paper's reference 31). Between two rests, the gyroscope
+must turn one vertical into the other. That determines nine more, in the accelerometer's frame. The gyroscope's bias is its
+reading at rest.
 """
 
 from dataclasses import dataclass
@@ -11,8 +12,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.optimize import least_squares
 
-from controller.calibration.at_rest import CalibrationError
 from plant.compiled import kernel
+from plant.errors import CalibrationError
 from plant.pose import Array, rotate_by_vector
 
 LEAST_RESTS = 9
@@ -22,10 +23,10 @@ _MARGIN_S = 0.1
 _MOST_RATE = np.radians(1.0)
 _MOST_SPREAD = 5.0
 _LEAST_SHARE = 0.75
-"""How much of a unit vector must lie along each half-axis at some time."""
+"""Least component of a unit vector along each half-axis, at some time."""
 
 _LEAST_TURN = np.pi
-"""By how much it must be turned about each axis in all [rad]."""
+"""Least sum of the turns about each axis [rad]."""
 
 _LARGEST_CONDITION = 1e3
 _AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
@@ -39,7 +40,7 @@ class ImuCalibration:
         gain: (2, 3, 3), the accelerometer's upper triangular; calibrated = gain @ raw + offset.
         offset: (2, 3) [rad/s, m/s^2].
         sigmas: (2, 12), standard deviations of offset and gain, row by row.
-        rests: how many rests there were.
+        rests: number of rests.
         force_residual: RMS of the length of gravity at rest [m/s^2].
         turn_residual: RMS of the angle between the verticals after a turn [rad].
     """
@@ -58,7 +59,7 @@ def calibrate_imu(times: Array, rates: Array, forces: Array, gravity: float) -> 
     Args:
         times: (N,) [s], evenly spaced.
         rates, forces: (N, 3), raw [rad/s, m/s^2]; they begin with a rest.
-        gravity: at the place [m/s^2].
+        gravity: local gravity [m/s^2].
 
     Raises:
         CalibrationError: the data do not determine the constants; the message says which rest or turn is missing.
@@ -90,7 +91,7 @@ def calibrate_imu(times: Array, rates: Array, forces: Array, gravity: float) -> 
 
 
 def _find_rests(rates: Array, forces: Array, period: float) -> list[slice]:
-    """Stretches in which neither the rates nor the forces change by more than their noise in the first half second does."""
+    """Stretches in which rates and forces change no more than by the noise of the first half second."""
     length = max(2, round(_WINDOW_S / period))
     count = len(rates) // length
     first = max(1, round(_SHORTEST_REST_S / _WINDOW_S))
@@ -129,28 +130,33 @@ def _fit_forces(at_rest: Array, gravity: float) -> tuple[Array, Array, Array, fl
     if not fit.success or np.linalg.cond(scaled) > _LARGEST_CONDITION:
         _check_orientations(at_rest, gravity)
         raise CalibrationError("the orientations at rest are too much alike: rest in more of them, also askew")
-    free = max(len(at_rest) - 9, 1)
-    variance = float(fit.fun @ fit.fun) / free
-    deviations = np.sqrt(np.diag(np.linalg.inv(fit.jac.T @ fit.jac)) * variance)
+    deviations = deviations_of(fit.jac, fit.fun, max(len(at_rest) - 9, 1))
     sigmas = np.concatenate([deviations[:3], gain_of(deviations).ravel()])
     return gain_of(fit.x), fit.x[:3], sigmas, float(np.sqrt(np.mean(fit.fun**2)))
 
 
+def deviations_of(jacobian: Array, residuals: Array, freedom: int) -> Array:
+    """Standard deviations (n,) of the unknowns of a least-squares fit, from the size of its residuals."""
+    variance = float(residuals @ residuals) / freedom
+    deviations: Array = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)) * variance)
+    return deviations
+
+
 def _check_orientations(forces: Array, gravity: float) -> None:
-    """Check that gravity has been along every half-axis in some rest."""
+    """Check that gravity is along every half-axis in some rest."""
     missing = missing_half_axes(forces / gravity)
     if missing:
         raise CalibrationError(f"no rest has {', '.join(missing)} up: rest in these orientations too")
 
 
 def missing_half_axes(vectors: Array) -> list[str]:
-    """The half-axes, such as "+x", that none of the unit vectors (n, 3) lies near."""
+    """The half-axes, such as "+x", that no unit vector of (n, 3) is near."""
     along = np.concatenate([vectors.max(axis=0), -vectors.min(axis=0)]).reshape(2, 3).T.ravel()
     return [name for name, share in zip(_AXES, along, strict=True) if share < _LEAST_SHARE]
 
 
 def _check_turns(rates: Array, bias: Array, rests: list[slice], period: float) -> None:
-    """Check that it has been turned about every axis."""
+    """Check that the IMU was turned about every axis."""
     moving = np.concatenate([rates[a.stop : b.start] for a, b in pairwise(rests)])
     turned = np.abs(moving - bias.mean(axis=0)).sum(axis=0) * period
     missing = [name for name, angle in zip("xyz", turned, strict=True) if angle < _LEAST_TURN]
@@ -168,7 +174,7 @@ def _fit_turns(
     """Gain (3, 3), standard deviations (12,) of offset and gain, and the residual [rad]."""
     middles = [(rest.start + rest.stop) // 2 for rest in rests]
     parts = list(pairwise(middles))
-    # The bias wanders: between two rests it is the mean of theirs.
+    # The bias drifts: between two rests it is the mean of theirs.
     unbiased = [rates[a:b] - 0.5 * (bias[i] + bias[i + 1]) for i, (a, b) in enumerate(parts)]
     carried = np.zeros((3, 3))
 
@@ -182,9 +188,7 @@ def _fit_turns(
     fit = least_squares(residuals, np.eye(3).ravel(), method="lm")
     if not fit.success or np.linalg.cond(fit.jac) > _LARGEST_CONDITION:
         raise CalibrationError("the turns are too much alike: turn it about each of its axes between rests")
-    free = max(2 * len(parts) - 9, 1)
-    variance = float(fit.fun @ fit.fun) / free
-    deviations = np.sqrt(np.diag(np.linalg.inv(fit.jac.T @ fit.jac)) * variance)
+    deviations = deviations_of(fit.jac, fit.fun, max(2 * len(parts) - 9, 1))
     offset = bias.std(axis=0) / np.sqrt(len(bias))
     return fit.x.reshape(3, 3), np.concatenate([offset, deviations]), float(np.sqrt(np.mean(fit.fun**2) * 1.5))
 
@@ -193,7 +197,9 @@ def _fit_turns(
 def _carry(rates: Array, period: float, carried: Array) -> None:
     """Write the rotation (3, 3) that carries a vector at rest, seen from a sensor, through its rates (N, 3) [rad/s]."""
     vector = np.zeros(3)
-    carried[:] = np.eye(3)
+    for i in range(3):
+        for j in range(3):
+            carried[i, j] = 1.0 if i == j else 0.0
     for i in range(rates.shape[0] - 1):
         for j in range(3):
             # Seen from the sensor, the world turns the other way.

@@ -8,16 +8,15 @@ from numpy.typing import NDArray
 
 from controller.calibration.at_rest import (
     LEAST_POSES,
-    Found,
+    RestCalibration,
     Rests,
     calibrate_at_rest,
-    calibrate_in_motion,
     expected_forces,
     fit_pose,
     pose_covariance,
-    track,
 )
 from controller.calibration.file import Calibration, split_gain
+from controller.calibration.in_motion import calibrate_in_motion, track
 from controller.estimation.whole_mechanism.imu_errors import ERROR_NAMES
 from controller.estimation.whole_mechanism.parameters import filter_parameters
 from controller.estimation.whole_mechanism.readings import RATE, VELOCITY
@@ -125,7 +124,7 @@ def cross_validate(
     return figures
 
 
-def _calibrate_part(data: CalibrationData, kept: NDArray[np.int64]) -> Found:
+def _calibrate_part(data: CalibrationData, kept: NDArray[np.int64]) -> RestCalibration:
     """Calibrate by some of the rests alone."""
     rests = data.rests
     changes = None if rests.length_changes is None else rests.length_changes[kept] - rests.length_changes[kept[0]]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from controller.calibration.at_rest import LEAST_POSES, CalibrationError, Found, Prior, Rests, fit_pose
+from controller.calibration.at_rest import LEAST_POSES, Prior, RestCalibration, Rests, fit_pose
 from controller.calibration.checks import check_alive, check_all_along, check_motion, check_places, check_spread
 from controller.calibration.file import Calibration
 from controller.direct_kinematics import poses_from_lengths
@@ -14,6 +14,7 @@ from controller.rig import sensor_geometry
 from controller.settings import sensor_settings
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
+from plant.errors import CalibrationError
 from plant.imu import ACCELEROMETER, GYROSCOPE, load_imu
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, Pose
@@ -154,7 +155,7 @@ class CalibrationData:
         changes = self._lengths - self._lengths[:1] if self.knowledge.lengths else None
         return Rests(self.readings, self.knowledge.home, changes)
 
-    def longest_motion(self, runs: Sequence[Record], at_rest: Found) -> tuple[Array, tuple[Pose, Array]]:
+    def longest_motion(self, runs: Sequence[Record], at_rest: RestCalibration) -> tuple[Array, tuple[Pose, Array]]:
         """The longest motion that begins at rest: its samples (N, 3, 7, 3), and the pose and twist (6,) at the first.
 
         Raises:

@@ -20,8 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from controller.calibration.at_rest import CalibrationError, Found, calibrate_at_rest, calibrate_in_motion
+from controller.calibration.at_rest import RestCalibration, calibrate_at_rest
 from controller.calibration.file import Calibration, save_calibration
+from controller.calibration.in_motion import calibrate_in_motion
 from controller.estimation.whole_mechanism.parameters import ALL_ERRORS
 from controller.planning.motions import REST_S
 from controller.safety import watch_nothing
@@ -36,6 +37,7 @@ from hil.runs.prepare import prepared_loop
 from hil.runs.simulation import SimulationStoppedError, simulate
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
+from plant.errors import CalibrationError
 from plant.imu import GYROSCOPE
 from plant.mechanism import Mechanism, load_spatial
 
@@ -181,7 +183,7 @@ def _calibrated(config: SimulationConfig, calibration: Calibration) -> Iterator[
 
 
 def _finish(
-    data: CalibrationData, at_rest: Found, runs: Sequence[Record], known: Calibration | None, validate: bool = True
+    data: CalibrationData, at_rest: RestCalibration, runs: Sequence[Record], known: Calibration | None, validate: bool = True
 ) -> RigCalibration:
     """Calibrate in the longest motion of the runs, and assess every stage; a calibration by known poses is the result."""
     samples, start = data.longest_motion(runs, at_rest)

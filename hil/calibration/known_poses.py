@@ -4,13 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from controller.calibration.at_rest import CalibrationError, expected_forces, undo
+from controller.calibration.at_rest import expected_forces, undo
 from controller.calibration.file import Calibration
 from controller.estimation.whole_mechanism.imu_errors import ACCELEROMETER_BIAS, ALIGNMENT, ERRORS, GYROSCOPE_BIAS
 from controller.rig import sensor_geometry
 from hil.calibration.data import CalibrationData
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
+from plant.errors import CalibrationError
 from plant.imu import STANDARD_GRAVITY
 
 _POSE_SIGMA = np.radians(0.3)

@@ -7,7 +7,6 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from controller.calibration.at_rest import CalibrationError
 from hil.calibration.data import Knowledge
 from hil.calibration.drive import calibrate_recordings, calibrate_rig
 from hil.command_line import main
@@ -15,6 +14,7 @@ from hil.recording.mcap import Recorder
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import prepared_loop
 from hil.runs.simulation import simulate
+from plant.errors import CalibrationError
 from plant.imu import Wiring, imu_state, load_imu
 
 

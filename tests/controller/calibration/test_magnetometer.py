@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from controller.calibration.at_rest import CalibrationError
 from controller.calibration.file import load_calibration
 from controller.calibration.magnetometer import calibrate_magnetometer
 from hil.command_line import main
 from hil.recording.imu_data import COLUMNS, FIELD_COLUMNS
+from plant.errors import CalibrationError
 from plant.imu import SensorErrors, imu_state, load_imu, measure
 
 RATE_HZ, GRAVITY = 200.0, 9.80665

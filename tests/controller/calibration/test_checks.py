@@ -5,11 +5,11 @@ import re
 import numpy as np
 import pytest
 
-from controller.calibration.at_rest import CalibrationError
 from controller.calibration.checks import check_alive, check_all_along, check_motion, check_places, check_spread
 from controller.estimation.whole_mechanism.readings import readings_along
 from controller.rig import sensor_geometry
 from plant.dynamics.imposed import impose
+from plant.errors import CalibrationError
 from plant.imu import Wiring, imu_state, load_imu, measure
 
 RATE = 250.0
@@ -120,8 +120,8 @@ def test_an_imu_that_is_lost_in_a_run_is_named_with_the_time():
     check_all_along(samples, RATE)
     frozen = samples.copy()
     frozen[600:850, :, 4] = frozen[599, :, 4]
-    with pytest.raises(CalibrationError, match=r"IMU 4 stands still while others do not 2\.4 s into a run"):
+    with pytest.raises(CalibrationError, match=r"IMU 4 is frozen while others are not 2\.4 s into a run"):
         check_all_along(frozen, RATE)
     samples[500:, 1, 2, 0] = np.nan
-    with pytest.raises(CalibrationError, match="IMU 2 reads what is no number 2 s into a run, for 2 s in all"):
+    with pytest.raises(CalibrationError, match="IMU 2 gives readings that are not finite 2 s into a run, for 2 s in all"):
         check_all_along(samples, RATE)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from controller.calibration.at_rest import CalibrationError
 from controller.calibration.single_imu import calibrate_imu
 from hil.command_line import main
 from hil.recording.imu_data import COLUMNS
+from plant.errors import CalibrationError
 from plant.imu import MILLI_G, imu_state, load_imu, measure
 
 RATE_HZ, GRAVITY = 500.0, 9.80665

@@ -1,0 +1,157 @@
+"""Calibration in motion: improves what was found at rest by a motion, above all the errors of the gyroscopes.
+
+The whole-mechanism filter, with every error of the IMUs as a state and the covariance at rest as prior, runs over the motion.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from controller.calibration.at_rest import RestCalibration, pose_covariance, undo
+from controller.calibration.file import Calibration
+from controller.estimation.whole_mechanism.filter import (
+    accumulate_sample,
+    extrapolate,
+    extrapolate_covariance,
+    start_filter,
+    step_filter,
+)
+from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, FILTER_STATE, filter_parameters
+from controller.estimation.whole_mechanism.readings import MOTION_STATES
+from controller.estimation.whole_mechanism.rig_jacobian import JOINTS, RIG_ERRORS
+from controller.rig import sensor_geometry
+from controller.settings import FusionSettings
+from plant.compiled import Record, kernel
+from plant.dynamics.variables import IMU_COUNT
+from plant.errors import CalibrationError
+from plant.mechanism import LEGS, Mechanism
+from plant.pose import Array, Pose
+
+_INFLATION = 1.5
+"""Factor on the noise for the covariance: what the model leaves out is the same in every swing, and does not average out."""
+
+_GUIDE_SIGMA_S = 0.02
+"""Standard deviation of the Gaussian low-pass of a motion at which the filter is linearised."""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Estimates of the whole-mechanism filter.
+
+    Attributes:
+        positions, rotations, motions: (N, 3) [m], (N, 3, 3), (N, 4, 3).
+        covariances: (N, 6, 6), of the pose.
+        state: of the filter at the end.
+    """
+
+    positions: Array
+    rotations: Array
+    motions: Array
+    covariances: Array
+    state: Record
+
+
+def track(
+    parameters: Record, geometry: Record, samples: Array, used: NDArray[np.int64], rate: float, delay: float,
+    start: tuple[Pose, Array], guide: Array | None = None,
+) -> Track:  # fmt: skip
+    """Run the whole-mechanism filter alone.
+
+    Args:
+        parameters, geometry: dtypes `FILTER_PARAMETERS` and `SENSOR_GEOMETRY`.
+        samples: (N, 3, 7, 3), calibrated.
+        used: (N, 7), which IMUs to use.
+        rate: samples per second [Hz].
+        delay: of the sensors [s].
+        start: pose and twist (6,) at the first sample.
+        guide: (N, 4, 3), motions at which the Jacobian is taken instead of the filter's own, low-passed one.
+    """
+    shapes, state = ((3,), (3, 3), (4, 3), (6, 6)), np.zeros((), FILTER_STATE)
+    arrays = [np.zeros((len(samples), *shape)) for shape in shapes]
+    guided = np.zeros((0, 4, 3)) if guide is None else guide
+    if guide is not None:
+        parameters = parameters.copy()
+        parameters["smoothing"] = np.inf
+    pose, twist = start
+    start_filter(parameters[()], state[()], 0.0, pose.position, pose.rotation, twist)
+    _track(
+        parameters[()], geometry[()], state[()], samples, used, 1.0 / rate, delay, guided, *arrays
+    )  # fmt: skip
+    return Track(*arrays, state)
+
+
+@kernel
+def _track(
+    parameters: Record, geometry: Record, state: Record, samples: Array, used: NDArray[np.int64], period: float, delay: float,
+    guide: Array, positions: Array, rotations: Array, motions: Array, covariances: Array,
+) -> None:  # fmt: skip
+    twist, acceleration = np.zeros(6), np.zeros(6)
+    for i in range(samples.shape[0]):
+        if guide.shape[0] > 0:
+            state.low_passed[:] = guide[i]
+        if i > 0:
+            accumulate_sample(state, samples[i], used[i], i * period - delay)
+            step_filter(parameters, geometry, state)
+        extrapolate(state, i * period, positions[i], rotations[i], twist, acceleration)
+        extrapolate_covariance(parameters, state, i * period, covariances[i])
+        for j in range(3):
+            motions[i, 0, j], motions[i, 1, j] = twist[j], twist[3 + j]
+            motions[i, 2, j], motions[i, 3, j] = acceleration[j], acceleration[3 + j]
+
+
+def calibrate_in_motion(
+    mechanism: Mechanism, found: RestCalibration, samples: Array, rate: float, start: tuple[Pose, Array], fusion: FusionSettings
+) -> tuple[Calibration, Array]:
+    """Improve what was found at rest by a motion.
+
+    The filter runs twice. The second run is linearised at the smoothed motion of the first: at its own motion, the filter would
+    take noise for excitation. A third run, with more noise, gives the covariance.
+
+    Args:
+        mechanism: as before.
+        found: by `calibrate_at_rest`.
+        samples: (N, 3, 7, 3), raw.
+        rate: samples per second [Hz].
+        start: pose and twist (6,) at the first sample.
+        fusion: settings.
+
+    Returns:
+        The calibration, and the covariance (185, 185) of the remaining errors of IMUs, joints and tilt.
+
+    Raises:
+        CalibrationError: the filter does not follow the motion.
+    """
+    plain, inflated = (filter_parameters(fusion, rate, "axes", found.covariance, inflation=by) for by in (1.0, _INFLATION))
+    used = np.ones((len(samples), IMU_COUNT), np.int64)
+    geometry = sensor_geometry(mechanism.moved_joints(found.joints), found.tilt)
+    calibrated, guide = found.calibration().apply(samples), None
+    runs: list[Track] = []
+    for parameters in (plain, plain, inflated):
+        run = track(parameters, geometry, calibrated, used, rate, fusion.sensor_delay, start, guide)
+        if not (np.isfinite(run.state["errors"]).all() and np.isfinite(run.positions).all()):
+            raise CalibrationError("the whole-mechanism filter does not follow the motion: check the calibration at rest")
+        guide = gaussian_filter1d(run.motions, _GUIDE_SIGMA_S * rate, axis=0, mode="nearest")
+        runs.append(run)
+    last = runs[-2].state
+    moved = last["rig"]
+    calibration = found.calibration().then(
+        *undo(last["errors"]),
+        joints=found.joints + moved[:JOINTS].reshape(2, LEGS, 3),
+        tilt=found.tilt + moved[JOINTS:],
+    )
+    kept = slice(MOTION_STATES, MOTION_STATES + ALL_ERRORS + RIG_ERRORS)
+    covariance: Array = runs[-1].state["covariance"][kept, kept].copy()
+    of_errors, across, of_rig = (
+        covariance[:ALL_ERRORS, :ALL_ERRORS],
+        covariance[ALL_ERRORS:, :ALL_ERRORS],
+        covariance[ALL_ERRORS:],
+    )
+    # The covariance of the IMUs' errors if joints and tilt were known, and what these two add.
+    known = of_errors - across.T @ np.linalg.pinv(of_rig[:, ALL_ERRORS:], rcond=1e-12, hermitian=True) @ across
+    added = covariance.copy()
+    added[:ALL_ERRORS, :ALL_ERRORS] -= known
+    built, poses = mechanism.moved_joints(calibration.joints), zip(found.positions, found.rotations, strict=True)
+    variances = np.diag(np.mean([pose_covariance(built, calibration.tilt, pose, added) for pose in poses], axis=0))
+    return replace(calibration, covariance=known, floor=np.sqrt(variances.reshape(2, 3).sum(axis=1))), covariance

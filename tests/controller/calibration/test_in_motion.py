@@ -1,0 +1,77 @@
+"""Calibration in motion: it improves what was found at rest, and predicts its own accuracy."""
+
+import numpy as np
+
+from controller.calibration.at_rest import Prior, Rests, calibrate_at_rest, pose_covariance
+from controller.calibration.in_motion import calibrate_in_motion
+from controller.estimation.whole_mechanism.imu_errors import ERRORS
+from controller.estimation.whole_mechanism.rig_jacobian import JOINTS
+from controller.inverse_kinematics import sample_workspace
+from controller.settings import sensor_settings
+from plant.dynamics.imposed import impose
+from plant.imu import imu_state, measure
+from plant.pose import Pose, vector_from_rotation
+from tests.controller.calibration.rest_readings import RAW, pose_errors, rests_of
+
+
+def test_motion_brings_it_to_a_tenth_of_a_millimetre(hexapod):
+    fusion = sensor_settings(hexapod, RAW)
+    readings, _, _ = rests_of(hexapod, 20, 1)
+    found = calibrate_at_rest(hexapod, Rests(readings))
+    motion = impose(hexapod, "0.8", 20.0, 1000.0, 3, size=(0.02, np.radians(6.0)))
+    imu, samples = imu_state(RAW, 1, 1e-3), np.zeros_like(motion.signals)
+    for signals, sample in zip(motion.signals, samples, strict=True):
+        measure(imu, signals, sample)
+    turn = (motion.rotations[1] @ motion.rotations[0].T - np.eye(3)) * 1000.0
+    velocity = (motion.positions[1] - motion.positions[0]) * 1000.0
+    start = Pose(motion.positions[0], motion.rotations[0]), np.array([*velocity, turn[2, 1], turn[0, 2], turn[1, 0]])
+    calibration, covariance = calibrate_in_motion(hexapod, found, samples, 1000.0, start, fusion)
+    others = rests_of(hexapod, 10, 1, poses=sample_workspace(hexapod, 10, seed=999))
+    true = pose_errors(hexapod, calibration, calibration.tilt, *others)
+    assert true[0] < 0.5
+    assert true[0] < pose_errors(hexapod, found.calibration(), found.tilt, *others)[0]
+    predicted = [pose_covariance(hexapod, calibration.tilt, pose, covariance) for pose in zip(*others[1:], strict=True)]
+    assert 0.4 < true[0] / (1e3 * np.sqrt(np.trace(np.mean(predicted, axis=0)[:3, :3]))) < 2.5
+    # The gyroscopes' scales, which no rest tells; a leg hardly turns about itself.
+    error = np.abs(calibration.gain[0] - np.linalg.inv(imu["gain"][0]))
+    assert error[:6, :, :2].max() < 2e-3
+    assert error[6].max() < 2e-3
+
+
+def test_joints_that_are_off_are_sought_with_the_rest(hexapod):
+    built, fusion = hexapod.built(2e-4, 3), sensor_settings(hexapod, RAW)
+    readings, _, _ = rests_of(built, 20, 1)
+    motion = impose(built, "0.8", 20.0, 1000.0, 3, size=(0.02, np.radians(6.0)))
+    imu, samples = imu_state(RAW, 1, 1e-3), np.zeros_like(motion.signals)
+    for signals, sample in zip(motion.signals, samples, strict=True):
+        measure(imu, signals, sample)
+    velocity = [
+        *(motion.positions[1] - motion.positions[0]),
+        *vector_from_rotation(motion.rotations[1] @ motion.rotations[0].T),
+    ]
+    start = Pose(motion.positions[0], motion.rotations[0]), 1000.0 * np.array(velocity)
+    others, surprise = rests_of(built, 10, 1, poses=sample_workspace(built, 10, seed=999)), []
+    true = np.stack([built.base_joints - hexapod.base_joints, built.platform_joints - hexapod.platform_joints])
+
+    def predicted(mechanism, tilt, covariance):
+        poses = zip(*others[1:], strict=True)
+        return np.mean([pose_covariance(mechanism, tilt, pose, covariance) for pose in poses], axis=0).diagonal()
+
+    for joints in (0.0, 2e-4):
+        found = calibrate_at_rest(hexapod, Rests(readings), Prior(joints=joints))
+        calibration, covariance = calibrate_in_motion(hexapod, found, samples, 1000.0, start, fusion)
+        known = hexapod.moved_joints(calibration.joints)
+        error = 1e-3 * pose_errors(known, calibration, calibration.tilt, *others)[0]
+        surprise.append(error / np.sqrt(predicted(known, calibration.tilt, covariance)[:3].sum()))
+    assert np.linalg.norm(calibration.joints - true) < 0.9 * np.linalg.norm(true)
+    assert surprise[1] < min(2.0, 0.9 * surprise[0])
+    off, of_joints = (
+        (calibration.joints - true).ravel(),
+        covariance[7 * ERRORS : 7 * ERRORS + JOINTS, 7 * ERRORS : 7 * ERRORS + JOINTS],
+    )
+    assert 0.3 < off @ np.linalg.solve(of_joints, off) / JOINTS < 1.6
+    # What the rig leaves is told apart from what the IMUs leave: together they are what there was.
+    of_imus = np.zeros_like(covariance)
+    of_imus[: 7 * ERRORS, : 7 * ERRORS] = calibration.covariance
+    apart = predicted(known, calibration.tilt, of_imus).reshape(2, 3).sum(axis=1) + calibration.floor**2
+    np.testing.assert_allclose(apart, predicted(known, calibration.tilt, covariance).reshape(2, 3).sum(axis=1), rtol=0.1)
