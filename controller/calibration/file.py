@@ -40,8 +40,8 @@ class Calibration:
         tilt: (2,) [rad], turns of the vertical about the axes x and y of {1}.
         joints: (2, 6, 3) [m], corrections of the mechanism's base and platform joints.
         floor: (2,) [m, rad], standard deviations of position and rotation that tilt and joints leave.
-        covariance: (147, 147), of the remaining errors, in the order of `controller.estimation.whole_mechanism.imu_errors.ERROR_NAMES` for each
-            IMU; None if it is not known.
+        covariance: (147, 147), of the remaining errors, in the order of `imu_errors.ERROR_NAMES` for each IMU; None if it is
+            not known.
         about: further facts: date, residuals, source of the data.
     """
 
