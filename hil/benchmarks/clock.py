@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from controller.safety.causes import Cause, Reaction
 from hil.loop.driver import prevent_compilation
 from hil.loop.records import RECORD, Link, shared_array
-from hil.loop.timing import Histogram, Timing, over_budget
+from hil.loop.timing import Timing, over_budget
 from hil.progress import Progress, no_progress
 from hil.realtime.clock import REAL, finish, new_clock, start, wait
+from hil.realtime.durations import Histogram
 from hil.realtime.scheduling import MEASURES, RealTimeSettings, real_time, usage
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import PreparedLoop, prepared_loop

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hil.loop.records import COMPUTED, STAGES
 from hil.progress import Progress, no_progress, part_of
+from hil.realtime.durations import percentiles
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import simulate
 from plant.errors import InputError
@@ -48,8 +48,8 @@ def measure_speed(target: str, duration: float, progress: Progress = no_progress
         "real_time_factor": {"median": median, "least": min(factors), "greatest": max(factors)},
         "filterpy_real_time_factor": slow.real_time_factor,
         "filterpy_slowdown": median / slow.real_time_factor,
-        "cycle_us": _percentiles(stage_ns[:, COMPUTED].sum(axis=1)),
-        "stages_us": {name: _percentiles(column) for name, column in zip(STAGES, stage_ns.T, strict=True)},
+        "cycle_us": percentiles(stage_ns[:, COMPUTED].sum(axis=1)),
+        "stages_us": {name: percentiles(column) for name, column in zip(STAGES, stage_ns.T, strict=True)},
         "duration": duration,
         "target": target,
     }
@@ -77,9 +77,3 @@ def read_earlier(path: Path) -> dict[str, Any]:
     if not isinstance(figures, dict) or "date" not in figures:
         raise InputError(f"{path} holds no figures of 'gough bench': it has no date")
     return figures
-
-
-def _percentiles(nanoseconds: NDArray[np.int64]) -> dict[str, float]:
-    us = nanoseconds / 1e3
-    p50, p99, p999 = np.percentile(us, (50.0, 99.0, 99.9))
-    return {"p50": float(p50), "p99": float(p99), "p999": float(p999), "max": float(us.max()), "n": len(us)}

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.progress import Progress, no_progress
+from hil.realtime.durations import percentiles
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import VELOCITY
 from plant.fmu.build import SPATIAL_MODEL, default_fmu
@@ -22,6 +23,7 @@ PERIOD_S = 1e-3
 FINER = 16
 """Substeps of the reference for the error are this many times shorter."""
 
+_SHOWN = ("p50", "p99")
 _PARTS = ("set modes and commands", "step", "read IMUs", "read truth")
 _FMPY_CYCLES = 2000
 _BLOCK = 50
@@ -51,8 +53,8 @@ def measure_plant(duration: float, progress: Progress = no_progress) -> dict[str
     times, positions = driven[3]
     cycle_us = float(np.median(times.sum(axis=1))) / 1e3
     return {
-        "step_us": {f"FMI {fmi}": _percentiles(parts[:, _PARTS.index("step")]) for fmi, (parts, _) in driven.items()},
-        "calls_us": {name: _percentiles(times[:, i]) for i, name in enumerate(_PARTS)},
+        "step_us": {f"FMI {fmi}": percentiles(parts[:, _PARTS.index("step")], _SHOWN) for fmi, (parts, _) in driven.items()},
+        "calls_us": {name: percentiles(times[:, i], _SHOWN) for i, name in enumerate(_PARTS)},
         "cycle_us": cycle_us,
         "fmpy_us": fmpy_us,
         "fmpy_slowdown": fmpy_us / cycle_us,
@@ -96,11 +98,6 @@ def _run(fmu: Record, commands: Array, durations: NDArray[np.int64], positions: 
         if status != 0:
             return status
     return 0
-
-
-def _percentiles(nanoseconds: Array) -> dict[str, float]:
-    p50, p99 = np.percentile(nanoseconds / 1e3, (50.0, 99.0))
-    return {"p50": float(p50), "p99": float(p99)}
 
 
 def _drive_with_fmpy(commands: Array) -> float:

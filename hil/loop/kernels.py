@@ -28,11 +28,11 @@ from controller.planning.stream import stream_cause, take_plan
 from controller.reference import motion_cycle
 from controller.safety.causes import EVENT_SLOTS, REACTION, Cause, Request
 from controller.safety.stop import has_stopped, ramp_down
-from hil.loop.records import EMULATED_RIG, UDP_RIG, Link, RigHandle, Stage, StopRequest, TargetStream
+from hil.loop.records import EmulatedUdp, Link, RigHandle, Stage, StopRequest, TargetStream
 from hil.realtime.clock import FREE, REAL, finish, start, wait
 from hil.rigs import ANSWERED, SILENT
 from hil.rigs.udp.emulator import exchange_in_memory
-from hil.rigs.udp.link import exchange_udp, send_command
+from hil.rigs.udp.link import UdpLink, exchange_udp, send_command
 from plant.compiled import Record, kernel, store_release
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
 from plant.fmu.calls import advance, read_imus, read_truth, write_command, write_drive_mode
@@ -42,6 +42,9 @@ from plant.pose import Array
 from plant.stopwatch import now
 
 _LOOK_NS = 100_000_000
+_STREAM_PATIENCE_NS = 100_000_000
+"""How long a streamed target may be silent before the motion stops."""
+
 _SIGQUIT = 1 << 2
 _SIGNALS = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14
 """SIGHUP, SIGINT, SIGQUIT and SIGTERM in a set of signals."""
@@ -51,66 +54,67 @@ _sigpending: Any = types.ExternalFunction("sigpending", types.int32(types.intp))
 
 
 @kernel
-def drive_fmu(fmu: Record, command: Array, request: int, periods: int, period: float) -> int:
-    """Let the plant move with the command for so many periods; returns FMI's status."""
+def exchange_fmu(
+    fmu: Record, imu: Record, command: Array, request: int, periods: int, period: float, feedback: Record,
+    stage_ns: NDArray[np.int64], timespec: NDArray[np.int64],
+) -> int:  # fmt: skip
+    """Let the plant move with the command for some periods, and read it; returns the status of the exchange."""
+    began = now(timespec)
     status = write_drive_mode(fmu, BRAKE if request == Request.BRAKED else VELOCITY)
     if periods > 0:
         status |= write_command(fmu, command)
     for _ in range(periods):
         status |= advance(fmu, period)
-    return status
+    stage_ns[Stage.PLANT] = now(timespec) - began
+    if status == 0:
+        status = read_imus(fmu) | read_truth(fmu)
+        measure(imu, fmu[()].imu, feedback.measurement)
+        feedback.truth[:] = fmu[()].truth
+        for k in range(LEG_COUNT):
+            feedback.sent[k] = 0.0 if request == Request.BRAKED else command[k]
+        for k in range(IMU_COUNT):
+            feedback.sequence[k] += 1
+            feedback.sample_ns[k] = np.int64(np.rint(1e9 * fmu[()].time))
+    return ANSWERED if status == 0 else SILENT + status
 
 
 @kernel
-def read_fmu(fmu: Record, imu: Record, command: Array, request: int, feedback: Record) -> int:
-    """Read the plant through the IMUs' imperfections; returns FMI's status."""
-    status = read_imus(fmu) | read_truth(fmu)
-    measure(imu, fmu[()].imu, feedback.measurement)
-    feedback.truth[:] = fmu[()].truth
-    for k in range(LEG_COUNT):
-        feedback.sent[k] = 0.0 if request == Request.BRAKED else command[k]
-    for k in range(IMU_COUNT):
-        feedback.sequence[k] += 1
-        feedback.sample_ns[k] = np.int64(np.rint(1e9 * fmu[()].time))
-    return status
+def exchange(
+    fmu: Record | None, imu: Record | None, udp: UdpLink | None, emulated: EmulatedUdp | None, parameters: Record,
+    state: Record, work: Record, timespec: NDArray[np.int64],
+) -> int:  # fmt: skip
+    """Send the commands of the cycle before, and read the sensors; returns the rig's status.
 
-
-@kernel
-def exchange(rig: RigHandle, parameters: Record, state: Record, work: Record, timespec: NDArray[np.int64]) -> int:
-    """Send the commands of the cycle before, and read the sensors; returns the rig's status."""
+    The first four are those of a `RigHandle`. numba leaves out the branches of what is None.
+    """
     s, w, period = state[()], work[()], parameters[()].rig.period
-    t0 = t1 = now(timespec)
-    if rig.kind == UDP_RIG:
-        status = exchange_udp(rig.link, s.pid.command, s.safety.request, w.feedback, timespec)
-    elif rig.kind == EMULATED_RIG:
+    began = now(timespec)
+    status = SILENT
+    if fmu is not None:
+        periods = periods_passed(state)
+        status = exchange_fmu(fmu, imu, s.pid.command, s.safety.request, periods, period, w.feedback, w.stage_ns, timespec)
+    if udp is not None:
+        status = exchange_udp(udp, s.pid.command, s.safety.request, w.feedback, timespec)
+    if emulated is not None:
         at = int(np.rint(1e9 * period * s.time.cycle))
-        status = exchange_in_memory(rig.emulator, rig.link, s.pid.command, s.safety.request, w.feedback, at)
-    else:
-        status = drive_fmu(rig.fmu, s.pid.command, s.safety.request, periods_passed(state), period)
-        t1 = now(timespec)
-        if status == 0:
-            status = read_fmu(rig.fmu, rig.imu, s.pid.command, s.safety.request, w.feedback)
-        status = exchange_status(status)
-    w.stage_ns[Stage.PLANT], w.stage_ns[Stage.SENSE] = t1 - t0, now(timespec) - t1
+        status = exchange_in_memory(emulated.emulator, emulated.link, s.pid.command, s.safety.request, w.feedback, at)
+    w.stage_ns[Stage.SENSE] = now(timespec) - began - w.stage_ns[Stage.PLANT]
     return status
 
 
 @kernel
-def hold_brakes(rig: RigHandle, parameters: Record, state: Record, work: Record, timespec: NDArray[np.int64]) -> None:
+def hold_brakes(
+    fmu: Record | None, udp: UdpLink | None, emulated: EmulatedUdp | None, parameters: Record, state: Record, work: Record,
+    timespec: NDArray[np.int64],
+) -> None:  # fmt: skip
     """At the end: the drives hold on their brakes."""
-    if rig.kind == UDP_RIG:
-        send_command(rig.link, state[()].pid.command, Request.BRAKED, now(timespec))
-    elif rig.kind == EMULATED_RIG:
+    if fmu is not None:
+        write_drive_mode(fmu, BRAKE)
+    if udp is not None:
+        send_command(udp, state[()].pid.command, Request.BRAKED, now(timespec))
+    if emulated is not None:
         at = int(np.rint(1e9 * parameters[()].rig.period * state[()].time.cycle))
-        exchange_in_memory(rig.emulator, rig.link, state[()].pid.command, Request.BRAKED, work[()].feedback, at)
-    else:
-        write_drive_mode(rig.fmu, BRAKE)
-
-
-@kernel
-def exchange_status(status: int) -> int:
-    """FMI's status as that of an exchange."""
-    return SILENT + status if status != 0 else ANSWERED
+        exchange_in_memory(emulated.emulator, emulated.link, state[()].pid.command, Request.BRAKED, work[()].feedback, at)
 
 
 @kernel
@@ -123,11 +127,9 @@ def periods_passed(state: Record) -> int:
 @kernel
 def begin_cycle(
     parameters: Record, state: Record, clock: Record, script: NDArray[np.int64], link: NDArray[np.int64], work: Record,
-    streamed: TargetStream, most_missed: int, end: int,
+    streamed: TargetStream | None, most_missed: int, end: int,
 ) -> int:  # fmt: skip
-    """Wait for the next period, take note of missed ones, and stop where that is due; returns the cause if the run has
-    ended.
-    """
+    """Wait for the next period, count missed ones, and begin a stop that is due; returns the cause if the run has ended."""
     c, s, w = clock[()], state[()], work[()]
     if c.cycles == 0:
         start(clock)
@@ -153,8 +155,8 @@ def begin_cycle(
     if link[Link.STOP] != 0:
         _ask(work, Cause.STOP_REQUESTED if link[Link.STOP] == StopRequest.CONTROLLED else Cause.EMERGENCY_STOP)
     leg, value, limit = -1, np.nan, np.nan
-    if streamed.active != 0 and s.safety.stop.cause == Cause.NONE and w.asked == Cause.NONE:
-        cause, leg, value, limit = stream_cause(streamed.stream, c.woke, streamed.patience_ns)
+    if streamed is not None and s.safety.stop.cause == Cause.NONE and w.asked == Cause.NONE:
+        cause, leg, value, limit = stream_cause(streamed.stream, c.woke, _STREAM_PATIENCE_NS)
         _ask(work, cause)
     if w.asked == Cause.MISSED_PERIODS:
         value, limit = float(c.in_a_row), float(most_missed)
@@ -165,16 +167,14 @@ def begin_cycle(
 
 @kernel
 def _ask(work: Record, cause: int) -> None:
-    """Ask for a reaction; of several causes the gravest counts, and of the same gravity the last."""
+    """Ask for a reaction. The most severe cause wins; ties go to the latest."""
     if REACTION[cause] >= REACTION[work[()].asked]:
         work[()].asked = cause
 
 
 @kernel
 def process_feedback(parameters: Record, state: Record, work: Record, status: int) -> int:
-    """After an exchange: note what is new, and react to what the rig has said; returns a cause if the cycle cannot be
-    computed.
-    """
+    """After an exchange: note which samples are new, and react to the rig's status; returns a cause if the cycle cannot run."""
     w = work[()]
     feedback = w.feedback
     p, s = parameters[()], state[()]
@@ -193,25 +193,9 @@ def process_feedback(parameters: Record, state: Record, work: Record, status: in
 
 
 @kernel
-def write_stage_times(work: Record) -> None:
-    """The times of the cycle's stages, as they are recorded."""
-    w = work[()]
-    stage_ns, ns = w.stage_ns, w.marks.ns
-    stage_ns[Stage.LEGS], stage_ns[Stage.PLATFORM] = ns[SCREENING] + ns[LEGS], ns[PLATFORM] + ns[HEADING]
-    stage_ns[Stage.POSE], stage_ns[Stage.REFINEMENT] = ns[POSE], ns[REFINEMENT]
-    stage_ns[Stage.MECHANISM], stage_ns[Stage.CONTROL] = ns[MECHANISM], ns[CONTROL]
-
-
-@kernel
-def record_cycle(
-    parameters: Record, state: Record, segments: Array, records: Record, clock: Record, link: NDArray[np.int64], work: Record,
-    streamed: TargetStream, failed: int,
-) -> None:  # fmt: skip
-    """After the command: record the cycle, and prepare the next reference."""
+def record_cycle(parameters: Record, state: Record, clock: Record, work: Record, failed: int, record: Record) -> None:
+    """Fill in the record of a cycle except its durations, which are known at its end."""
     p, s, c, w = parameters[()], state[()], clock[()], work[()]
-    began = now(c.timespec)
-    head = link[Link.HEAD]
-    record = records[head % records.shape[0]]
     record.cycle = w.cycle
     record.time_ns = c.woke - c.start if c.mode != FREE else np.int64(np.rint(1e9 * p.rig.period * w.cycle))
     record.late_ns = c.late
@@ -252,29 +236,53 @@ def record_cycle(
     for k in range(LEG_COUNT):
         for i in range(3):
             record.residuals[k, i] = s.legs.directions[k, i] - s.pose.directions[k, i] if s.legs.used[k] != 0.0 else np.nan
-    w.factor[:] = s.pose.information
-    if s.mechanism.trusted != 0:
-        extrapolate_covariance(p.mechanism.filter, s.mechanism.filter, s.time.cycle * p.rig.period, w.covariance)
-        record.covariance[:] = w.covariance
-    elif factor_cholesky(w.factor):
-        invert_cholesky(w.factor, w.covariance)
-        record.covariance[:] = w.covariance
-    else:
-        record.covariance[:] = np.nan
-    if streamed.active != 0 and s.safety.stop.cause == Cause.NONE:
-        cycle = motion_cycle(p.rig, s.time, s.safety)
-        take_plan(streamed.stream, streamed.reader, cycle, p.rig.period, segments, s.reference.index)
-    prepare_next(parameters, state, segments)
-    w.stage_ns[Stage.RECORD] = now(c.timespec) - began
+    update_covariance(p.mechanism, p.rig, s.time, s.mechanism, s.pose, w)
+    record.covariance[:] = w.covariance
 
 
 @kernel
-def end_cycle(records: Record, clock: Record, script: NDArray[np.int64], link: NDArray[np.int64], work: Record) -> None:
-    """End the cycle: set the next deadline, complete the record, and let others see it."""
+def update_covariance(p: Record, rig: Record, time: Record, mechanism: Record, pose: Record, work: Record) -> None:
+    """Covariance of the estimated pose: the whole-mechanism filter's if it is trusted, else the refinement's; NaN if there is
+    none.
+    """
+    work.factor[:] = pose.information
+    if mechanism.trusted != 0:
+        extrapolate_covariance(p.filter, mechanism.filter, time.cycle * rig.period, work.covariance)
+    elif factor_cholesky(work.factor):
+        invert_cholesky(work.factor, work.covariance)
+    else:
+        work.covariance[:] = np.nan
+
+
+@kernel
+def update_next_reference(parameters: Record, state: Record, segments: Array, streamed: TargetStream | None) -> None:
+    """The reference of the next cycle; of a streamed target, from its latest plan."""
+    rig, s = parameters[()].rig, state[()]
+    if streamed is not None and s.safety.stop.cause == Cause.NONE:
+        cycle = motion_cycle(rig, s.time, s.safety)
+        take_plan(streamed.stream, streamed.reader, cycle, rig.period, segments, s.reference.index)
+    prepare_next(parameters, state, segments)
+
+
+@kernel
+def end_cycle(
+    parameters: Record, state: Record, segments: Array, records: Record, clock: Record, script: NDArray[np.int64],
+    link: NDArray[np.int64], work: Record, streamed: TargetStream | None, failed: int,
+) -> None:  # fmt: skip
+    """After the command: record the cycle, update the next reference, set the next deadline, and publish the record."""
+    w, timespec = work[()], clock[()].timespec
+    began = now(timespec)
     head = link[Link.HEAD]
-    link[Link.START] = clock[()].start
     record = records[head % records.shape[0]]
-    record.stage_ns[:] = work[()].stage_ns
+    record_cycle(parameters, state, clock, work, failed, record)
+    update_next_reference(parameters, state, segments, streamed)
+    stage_ns, ns = w.stage_ns, w.marks.ns
+    stage_ns[Stage.LEGS], stage_ns[Stage.PLATFORM] = ns[SCREENING] + ns[LEGS], ns[PLATFORM] + ns[HEADING]
+    stage_ns[Stage.POSE], stage_ns[Stage.REFINEMENT] = ns[POSE], ns[REFINEMENT]
+    stage_ns[Stage.MECHANISM], stage_ns[Stage.CONTROL] = ns[MECHANISM], ns[CONTROL]
+    stage_ns[Stage.RECORD] = now(timespec) - began
+    link[Link.START] = clock[()].start
+    record.stage_ns[:] = stage_ns
     record.cpu_ns = finish(clock, script, record.stage_ns.sum())
     store_release(link, Link.HEAD, head + 1)
 
@@ -282,24 +290,21 @@ def end_cycle(records: Record, clock: Record, script: NDArray[np.int64], link: N
 @kernel
 def run_loop(
     rig: RigHandle, parameters: Record, state: Record, segments: Array, records: Record, clock: Record,
-    script: NDArray[np.int64], link: NDArray[np.int64], work: Record, streamed: TargetStream, most_missed: int, last: int,
-    end: int,
+    script: NDArray[np.int64], link: NDArray[np.int64], work: Record, streamed: TargetStream | None, most_missed: int,
+    last: int, end: int,
 ) -> int:  # fmt: skip
     """Run cycles up to `last`, or until a stop that begins at `end` or earlier is over; returns its cause, or `Cause.NONE`."""
-    s, timespec = state[()], clock[()].timespec
+    s, w, timespec = state[()], work[()], clock[()].timespec
     cause = Cause.NONE.value
     while cause == Cause.NONE and s.time.cycle < last:
         cause = begin_cycle(parameters, state, clock, script, link, work, streamed, most_missed, end)
         if cause != Cause.NONE:
             break
-        status = exchange(rig, parameters, state, work, timespec)
+        status = exchange(rig.fmu, rig.imu, rig.udp, rig.emulated, parameters, state, work, timespec)
         failed = process_feedback(parameters, state, work, status)
         if failed == Cause.NONE:
-            w = work[()]
             failed = run_stages(parameters, state, w.feedback.measurement, segments, w.marks, SCREENING, END)
-            write_stage_times(work)
-        record_cycle(parameters, state, segments, records, clock, link, work, streamed, failed)
-        end_cycle(records, clock, script, link, work)
+        end_cycle(parameters, state, segments, records, clock, script, link, work, streamed, failed)
     if cause != Cause.NONE:
-        hold_brakes(rig, parameters, state, work, timespec)
+        hold_brakes(rig.fmu, rig.udp, rig.emulated, parameters, state, work, timespec)
     return cause

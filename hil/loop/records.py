@@ -27,97 +27,75 @@ STAGES = (
     "record",
     "plant",
 )
-"""What a cycle is made of: `sense` is the exchange with the rig, the last commands sent; `leg filters` begin with the
-calibration; `control` is inverse kinematics, PID, feed-forward and the watch; `record` is telemetry and the next reference;
-`plant` is the simulated one's own time."""
+"""The stages of a cycle that are timed. `sense` is the exchange with the rig, which sends the last commands. `leg filters`
+begin with the calibration. `control` is inverse kinematics, PID, feed-forward and the watch. `record` is telemetry and the
+next reference. `plant` is the time that a simulated plant takes."""
 
 
 class Stage(IntEnum):
-    """Places in the durations of the stages."""
+    """Places of the stages in the durations of a cycle."""
 
-    SENSE = 0
-    LEGS = 1
-    PLATFORM = 2
-    POSE = 3
-    REFINEMENT = 4
-    MECHANISM = 5
-    CONTROL = 6
-    RECORD = 7
-    PLANT = 8
+    SENSE, LEGS, PLATFORM, POSE, REFINEMENT, MECHANISM, CONTROL, RECORD, PLANT = range(len(STAGES))
 
 
 COMPUTED, TO_COMMAND = slice(Stage.LEGS, Stage.RECORD), slice(Stage.SENSE, Stage.RECORD)
 """The stages of the paper's Figure 4, and all between the wake-up and the command."""
 
-RECORD = np.dtype(
-    [
-        ("cycle", np.int64),
-        ("time_ns", np.int64),
-        ("late_ns", np.int64),
-        ("stage_ns", np.int64, len(STAGES)),
-        ("cpu_ns", np.int64),
-        ("missed", np.int64),
-        ("status", np.int32),
-        ("stop", np.int32),
-        ("asked", np.int32),
-        ("mode", np.int32),
-        ("request", np.int32),
-        ("silent", np.int32),
-        ("drive", np.int32, LEGS),
-        ("drive_code", np.int32, LEGS),
-        ("sample_age", np.int32, IMU_COUNT),
-        ("imus", np.int32),
-        ("trusted", np.int32),
-        ("sample_ns", np.int64, IMU_COUNT),
-        ("round_trip_ns", np.int64),
-        ("refused", np.int64),
-        ("sent", np.float64, LEGS),
-        ("event_count", np.int64),
-        ("event_cause", np.int32, EVENT_SLOTS),
-        ("event_index", np.int32, EVENT_SLOTS),
-        ("event_value", np.float64, EVENT_SLOTS),
-        ("event_limit", np.float64, EVENT_SLOTS),
-        ("angular_velocity", np.float64, (IMU_COUNT, 3)),
-        ("specific_force", np.float64, (IMU_COUNT, 3)),
-        ("magnetic_field", np.float64, (IMU_COUNT, 3)),
-        ("position", np.float64, 3),
-        ("rotation", np.float64, (3, 3)),
-        ("covariance", np.float32, (6, 6)),
-        ("residuals", np.float32, (LEGS, 3)),
-        ("conditioning", np.float64),
-        ("lengths", np.float64, LEGS),
-        ("reference", np.float64, (LEGS, 3)),
-        ("command", np.float64, LEGS),
-        ("truth", np.float64, TRUTH_SIZE),
-    ],
-    align=True,
+RECORD_FIELDS = (
+    ("cycle", "i8", (), "periods since the first"),
+    ("time_ns", "i8", (), "when it woke, since the first deadline"),
+    ("late_ns", "i8", (), "how late it woke"),
+    ("stage_ns", "i8", len(STAGES), ", ".join(STAGES)),
+    ("cpu_ns", "i8", (), "processor time of the thread"),
+    ("missed", "i8", (), "periods missed before this one"),
+    ("status", "i4", (), "cause of a fault that began in this cycle; 0: none"),
+    ("stop", "i4", (), "cause of the stop or fault that is under way; 0: none"),
+    ("asked", "i4", (), "cause that was asked for before the cycle; 0: none"),
+    ("mode", "i4", (), "0 idle, 1 armed, 2 running, 3 stopping, 4 stopped, 5 fault"),
+    ("request", "i4", (), "to the drives: 0 braked, 1 enabled, 2 quick stop"),
+    ("silent", "i4", (), "cycles since the rig has answered"),
+    ("drive", "i4", LEGS, "0 following, 1 ready, 2 not ready, 3 stopping quickly, 4 faulty"),
+    ("drive_code", "i4", LEGS, "the drives' own fault codes"),
+    ("sample_age", "i4", IMU_COUNT, "cycles since each IMU's sample was new"),
+    ("imus", "i4", (), "which IMUs were used, a bit each, and the eighth for the platform's magnetometer"),
+    ("trusted", "i4", (), "1: the pose is the whole-mechanism filter's"),
+    ("sample_ns", "i8", IMU_COUNT, "time of each IMU's sample on the rig's clock"),
+    ("round_trip_ns", "i8", (), "of the exchange"),
+    ("refused", "i8", (), "frames or packets that were refused since the start"),
+    ("sent", "f8", LEGS, "m/s, what was really sent"),
+    ("event_count", "i8", (), "number of events in this cycle; the first eight follow"),
+    ("event_cause", "i4", EVENT_SLOTS, "by number, as in controller/safety"),
+    ("event_index", "i4", EVENT_SLOTS, "which leg or IMU; -1: none"),
+    ("event_value", "f8", EVENT_SLOTS, "in the unit of its cause; NaN: none"),
+    ("event_limit", "f8", EVENT_SLOTS, "that the value broke; NaN: none"),
+    ("angular_velocity", "f8", (IMU_COUNT, 3), "rad/s, seven IMUs by three axes: 0-5 on the legs, 6 on the platform; raw"),
+    ("specific_force", "f8", (IMU_COUNT, 3), "m/s^2, raw"),
+    ("magnetic_field", "f8", (IMU_COUNT, 3), "uT, raw"),
+    ("position", "f8", 3, "m, of {2} in {1}"),
+    ("rotation", "f8", (3, 3), "row by row, maps {2} to {1}"),
+    ("covariance", "f4", (6, 6), "row by row, of translation [m] and rotation [rad] in {1}"),
+    ("residuals", "f4", (LEGS, 3), "measured less predicted direction, six legs by three"),
+    ("conditioning", "f8", (), "1 is best, 0 singular"),
+    ("lengths", "f8", LEGS, "m; 0 for legs that a planar mechanism lacks"),
+    ("reference", "f8", (LEGS, 3), "six legs by length [m], rate [m/s], acceleration [m/s^2]"),
+    ("command", "f8", LEGS, "m/s"),
+    ("truth", "f8", TRUTH_SIZE, "position [m], quaternion (w first), lengths [m], currents [A]"),
 )
-"""What is kept of a cycle: the period that it ran in; when it woke [ns since the first] and how late; the stages' durations
-and the thread's CPU time; periods missed before it; the cause of a fault that began in it, and of the stop or fault that is
-on, and what was asked of it before it; mode and request to the drives (`controller.safety.watch`); what the rig said
-(`hil.rigs.FEEDBACK`): for how many cycles it has been silent, the drives, how many cycles old the samples are, their time,
-round trip, refused packets, and what was really sent; what happened; which IMUs were used (a bit each, and the eighth for
-the platform's magnetometer), and whether the pose is the whole-mechanism filter's; raw IMU data; the pose with covariance
-(translation, rotation; in {1}), residuals of the directions and conditioning; lengths, reference (length, rate,
-acceleration) and commands, 0 for legs that a planar mechanism has not; and the truth as the plant's `truth` buffer has it.
-"""
+"""What is kept of a cycle: name, type, shape and meaning. A recording's schema is made from it."""
+
+RECORD = np.dtype([(name, kind, shape) for name, kind, shape, _ in RECORD_FIELDS], align=True)
+"""A cycle as the loop records it, see `RECORD_FIELDS`."""
 
 
 class Link(IntEnum):
     """Places in the array that the loop shares with other processes, int64 (`LINK_SIZE`,).
 
     `HEAD`: number of records written. `STOP`: the `StopRequest`, 0 for none. `DONE`: whether the loop has ended. `TAIL`: where
-    the next recorder continues. `KEPT`: number of records that are safely in files. `SUPERVISOR`: the process whose end ends
+    the next recorder continues. `KEPT`: number of records that are complete in files. `SUPERVISOR`: the process whose end ends
     the motion, 0 for none. `START`: the first deadline [ns].
     """
 
-    HEAD = 0
-    STOP = 1
-    DONE = 2
-    TAIL = 3
-    KEPT = 4
-    SUPERVISOR = 5
-    START = 6
+    HEAD, STOP, DONE, TAIL, KEPT, SUPERVISOR, START = range(7)
 
 
 LINK_SIZE = 16
@@ -126,43 +104,40 @@ LINK_SIZE = 16
 class StopRequest(IntEnum):
     """How another process asks the loop to stop."""
 
-    CONTROLLED = 1
-    QUICK = 2
+    CONTROLLED, QUICK = 1, 2
 
 
-FMU_RIG, UDP_RIG, EMULATED_RIG = range(3)
-"""What the compiled loop exchanges with: the plant; a rig over UDP; an emulated one over UDP's datagrams, in memory."""
+class EmulatedUdp(NamedTuple):
+    """Both sides of a UDP rig that is emulated in memory."""
 
-
-class RigHandle(NamedTuple):
-    """The rig as compiled code sees it: which of the three it is, and what each needs.
-
-    Attributes:
-        kind: `FMU_RIG`, `UDP_RIG` or `EMULATED_RIG`.
-        fmu: the plant (dtype `plant.fmu.calls.FMU_HANDLE`).
-        imu: the IMUs' imperfections (dtype `plant.imu.IMU_STATE`).
-        link: the controller's side of UDP.
-        emulator: the rig's side, in memory.
-    """
-
-    kind: int
-    fmu: Record
-    imu: Record
     link: UdpLink
     emulator: UdpEmulator
 
 
-class TargetStream(NamedTuple):
-    """A streamed target as compiled code sees it.
+class RigHandle(NamedTuple):
+    """The rig as the compiled loop sees it. What a rig lacks is None, and no code is compiled for it.
 
     Attributes:
-        active: whether there is one.
-        patience_ns: how long it may be silent.
-        stream, reader: dtypes `controller.planning.stream.STREAM` and `STREAM_READER`.
+        fmu: the plant (dtype `plant.fmu.calls.FMU_HANDLE`).
+        imu: the IMUs' imperfections (dtype `plant.imu.IMU_STATE`).
+        udp: the controller's side of a UDP rig.
+        emulated: a UDP rig in memory.
     """
 
-    active: int
-    patience_ns: int
+    fmu: Record | None
+    imu: Record | None
+    udp: UdpLink | None
+    emulated: EmulatedUdp | None
+
+
+class TargetStream(NamedTuple):
+    """A streamed target as the compiled loop sees it.
+
+    Attributes:
+        stream: dtype `controller.planning.stream.STREAM`.
+        reader: dtype `controller.planning.stream.STREAM_READER`.
+    """
+
     stream: Record
     reader: Record
 
@@ -183,6 +158,9 @@ WORK = np.dtype(
     ],
     align=True,
 )
+"""The loop's own state and scratch: the cycle that runs and what was asked of it, since when the rig is silent, the last sample
+numbers and ages of the IMUs, the rig's feedback, matrices for the covariance, the
+stages' durations and those of the cycle's own stages, and a set of signals."""
 
 
 def shared_array(count: int, dtype: np.dtype[Any]) -> Any:

@@ -1,9 +1,9 @@
-"""The clock of the loop: absolute deadlines, late wake-ups and long work told apart, missed periods skipped in phase.
+"""The clock of the loop: absolute deadlines, and missed periods that are skipped in phase and counted by cause.
 
-A wake-up that is late by whole periods, or work that lasts into the next ones, leaves those periods out and counts them; the
-deadlines stay where they are. A period is missed by own work if the thread worked for longer than a period, by the clock as
-well as by its CPU time; else by the host, which took the processor away, or had it handle interrupts in the thread's name. Time
-is CLOCK_MONOTONIC, which no one sets. In tests a script takes its place.
+A wake-up that is late by whole periods, or work that lasts into the next ones, skips those periods; the deadlines stay where
+they are. Own work has missed a period if the thread worked longer than a period, both by the clock and by its CPU time. Else
+the host has: it took the processor away, or handled interrupts in the thread's time. Time is CLOCK_MONOTONIC, which nobody
+sets. In tests a script replaces it.
 """
 
 from typing import Any
@@ -16,7 +16,7 @@ from plant.compiled import Record, kernel
 from plant.stopwatch import CLOCK_MONOTONIC, clock_gettime, now
 
 FREE, REAL, SCRIPTED = range(3)
-"""Whether the loop runs as fast as it goes, on the machine's clock, or on a script."""
+"""Whether the loop runs as fast as it can, on the machine's clock, or on a script."""
 
 CLOCK = np.dtype(
     [
@@ -39,10 +39,12 @@ CLOCK = np.dtype(
     ],
     align=True,
 )
-"""State of the clock, in ns: period, first and present deadline, when the cycle woke and how late, CPU time at the end of the
-last one, and the time of a script. `overrun` is how many periods the last cycle's work ran over, `in_a_row` how many were
-missed since a cycle last followed right upon another, and `most_in_a_row` the most ever. Missed ones are counted by cause:
-woken late, own work, and work that the host held up.
+"""State of the clock, in ns.
+
+`start`, `deadline`: the first and the next deadline. `woke`, `late`: when the cycle woke, and how late. `cpu`: the thread's CPU
+time at the end of the last cycle. `time`: the present of a script. `overrun`: periods that the last cycle's work ran over.
+`in_a_row`: periods missed since two cycles last followed each other directly; `most_in_a_row`: its maximum. `missed_late`,
+`missed_own`, `missed_host`: periods missed because the thread woke late, because of its own work, and because of the host.
 """
 
 _CLOCK_THREAD_CPUTIME = 3
@@ -67,7 +69,7 @@ def _cpu_time(timespec: NDArray[np.int64]) -> int:
 
 @kernel
 def start(clock: Record) -> None:
-    """Set the first deadline, a moment from now."""
+    """Set the first deadline, two milliseconds from now."""
     c = clock[()]
     if c.mode == REAL:
         c.deadline = now(c.timespec) + _LEAD_NS
@@ -86,7 +88,7 @@ def wait(clock: Record, script: NDArray[np.int64]) -> int:
         script: (n, 3) [ns], for each cycle of a scripted clock: lateness, duration of the work, CPU time of it.
 
     Returns:
-        How many periods have been missed since the last cycle, -1 if the machine's clock refuses to wake anyone.
+        How many periods have been missed since the last cycle; -1 if the machine's clock fails.
     """
     c = clock[()]
     if c.mode == FREE:
@@ -105,7 +107,7 @@ def wait(clock: Record, script: NDArray[np.int64]) -> int:
     c.late = c.woke - c.deadline
     late = c.late // c.period
     if c.cycles == 0:
-        # The phase begins with the first cycle; before it there is nothing to miss.
+        # The phase begins with the first cycle, so nothing is missed before it.
         c.deadline += late * c.period
         c.start = c.deadline
         return 0
@@ -119,7 +121,7 @@ def wait(clock: Record, script: NDArray[np.int64]) -> int:
 
 @kernel
 def finish(clock: Record, script: NDArray[np.int64], worked: int) -> int:
-    """End a cycle that worked for so long [ns], and set the next deadline; returns the CPU time since the last [ns]."""
+    """End a cycle that `worked` for some time [ns], and set the next deadline; returns its CPU time [ns]."""
     c = clock[()]
     if c.mode == FREE:
         c.cycles += 1

@@ -1,6 +1,6 @@
-"""What a thread needs to keep its rate: priority, a processor, locked memory, a processor that does not doze; and what it used.
+"""What a thread needs to keep its rate: priority, a processor, no deep idle states, locked memory; and its usage of them.
 
-Whatever the machine refuses is told by name with a remedy, and can be an error. Everything is put back at the end.
+A measure that the machine refuses is reported with a remedy, and can be an error. Everything is restored at the end.
 """
 
 import contextlib
@@ -20,17 +20,17 @@ from hil.option import option
 from plant.errors import GoughError, InputError, UnknownNameError
 
 MEASURES = ("memory", "processor", "doze", "priority")
-"""What is done for real time, in this order: lock memory, stay on a processor, keep it from dozing, take a priority."""
+"""The measures for real time, in their order: lock memory, stay on a processor, forbid deep idle states, take a priority."""
 
 PRIORITY_RANGE = (1, 98)
-"""Priorities of SCHED_FIFO; 99 is left to the kernel's own threads."""
+"""Priorities of SCHED_FIFO; 99 is for the kernel's own threads."""
 
 _DMA_LATENCY = Path("/dev/cpu_dma_latency")
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 
 
 def keep_to_one_thread() -> None:
-    """Keep OpenBLAS from starting threads, which would live in the loop's process too; to be called before NumPy is loaded."""
+    """Keep OpenBLAS from starting threads, which the loop's process would have too. Call it before NumPy is loaded."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
@@ -67,19 +67,19 @@ class RealTimeSettings:
 
 
 class RefusedError(GoughError, PermissionError):
-    """The machine refuses what real time needs, and the settings are strict."""
+    """The machine refuses a measure, and the settings are strict."""
 
 
 @contextmanager
 def real_time(settings: RealTimeSettings) -> Iterator[list[str]]:
-    """Make the calling thread a real-time one for as long as the context lasts; gives what the machine refused, in words.
+    """Make the calling thread a real-time thread while the context lasts; yields the measures that the machine refused.
 
     Raises:
-        RefusedError: something was refused, and the settings are strict.
+        RefusedError: a measure was refused, and the settings are strict.
     """
     refused = []
     with contextlib.ExitStack() as restore:
-        # Before the priority is taken: another loop on this processor would have to wait for it.
+        # Before the priority is taken, as another loop on this processor would wait for the collection.
         gc.collect()
         gc.disable()
         restore.callback(gc.enable)
@@ -93,7 +93,7 @@ def real_time(settings: RealTimeSettings) -> Iterator[list[str]]:
             ),
             (
                 "doze",
-                f"a processor that does not doze ({_DMA_LATENCY})",
+                f"no deep idle states ({_DMA_LATENCY})",
                 _stay_awake,
                 "run as root, or let your group write to it",
             ),
@@ -144,11 +144,11 @@ def _take_priority(priority: int) -> Callable[[], Any]:
 
 @dataclass(frozen=True)
 class Usage:
-    """What the calling thread, and the memory of its process, have used.
+    """The usage of the calling thread, and of its process's memory.
 
     Attributes:
-        major_faults, minor_faults: pages that had to be read in, or mapped.
-        voluntary_switches, involuntary_switches: waits, and times that the scheduler took the processor away.
+        major_faults, minor_faults: pages that were read in, and pages that were only mapped.
+        voluntary_switches, involuntary_switches: how often the thread waited, and how often it lost the processor.
         resident: memory of the process [bytes].
         cpu: processor time [s].
     """
@@ -167,7 +167,7 @@ class Usage:
 
 
 def usage() -> Usage:
-    """The calling thread's usage until now."""
+    """The calling thread's usage so far."""
     used = resource.getrusage(resource.RUSAGE_THREAD)
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return Usage(
@@ -177,6 +177,6 @@ def usage() -> Usage:
 
 
 def since_process_start() -> float:
-    """Time since this process was started [s], to a hundredth."""
+    """Time since the start of this process [s], to a hundredth."""
     started = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
     return float(Path("/proc/uptime").read_text().split()[0]) - started

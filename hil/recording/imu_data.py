@@ -12,15 +12,15 @@ from plant.pose import Array
 COLUMNS = ("time_s", "wx", "wy", "wz", "ax", "ay", "az")
 FIELD_COLUMNS = ("mx", "my", "mz")
 _MOST_JITTER = 0.5
-"""Of the time between samples, relative to its median."""
+"""Allowed deviation of the time between samples from its median, relative to the median."""
 
 
 def read_imu(path: Path, number: int) -> tuple[Array, Array, Array]:
     """Times (N,) [s], rates and forces (N, 3) [rad/s, m/s^2] of an IMU.
 
     Args:
-        path: a CSV file with the header time_s,wx,wy,wz,ax,ay,az, where mx,my,mz may follow, or an MCAP recording.
-        number: which IMU of a recording.
+        path: a CSV file with the header time_s,wx,wy,wz,ax,ay,az and perhaps mx,my,mz, or an MCAP recording.
+        number: the IMU in a recording.
 
     Raises:
         InputError: the file cannot be read, is malformed, or its samples are not evenly spaced.
@@ -37,7 +37,7 @@ def read_field(path: Path, number: int) -> tuple[Array, Array | None]:
 
     Args:
         path: a CSV file with the header time_s,wx,wy,wz,ax,ay,az,mx,my,mz or time_s,mx,my,mz, or an MCAP recording.
-        number: which IMU of a recording.
+        number: the IMU in a recording.
 
     Raises:
         InputError: the file cannot be read, is malformed, or its samples are not evenly spaced.

@@ -1,8 +1,9 @@
-"""Recordings: every cycle of a run in an MCAP file, and the process that takes it there from memory shared with the loop.
+"""Recordings: every cycle of a run in an MCAP file, and the process that writes it.
 
-The loop writes its records round and round and never waits; the recorder takes them out and counts those that it came too late
-for. A record's layout is that of a ROS 2 message in CDR, so a message is the record's bytes, and the schema inside the file is
-made from its dtype: Foxglove and PlotJuggler open it. What a replay needs lies in the file's attachments.
+The loop writes its records into a ring buffer in shared memory and never waits. The recorder copies them to the file, and
+counts those that were overwritten before. A record's layout is that of a ROS 2 message in CDR, so a message is the record's
+bytes, and the schema in the file is made from `RECORD_FIELDS`: Foxglove and PlotJuggler open it. The file's attachments hold
+what a replay needs.
 """
 
 import hashlib
@@ -10,8 +11,9 @@ import io
 import json
 import os
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ from mcap.writer import Writer
 from numpy.typing import NDArray
 
 from controller.safety.causes import EVENT_SLOTS, Cause, Reaction
-from hil.loop.records import RECORD, STAGES, Link
+from hil.loop.records import RECORD, RECORD_FIELDS, Link
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import GoughError
@@ -34,69 +36,33 @@ _CHUNK_S = 0.25
 _POLL_S = 0.05
 _MOST_BYTES = 1 << 20
 _CDR_TYPES = {"i4": "int32", "i8": "int64", "f4": "float32", "f8": "float64"}
-_EVENT_SCHEMA = "int64 cycle  # the period that it happened in\nstring text\n"
-_NOTES = {
-    "cycle": "periods since the first",
-    "time_ns": "when it woke, since the first deadline",
-    "late_ns": "how late it woke",
-    "stage_ns": ", ".join(STAGES),
-    "cpu_ns": "processor time of the thread",
-    "missed": "periods missed before this one",
-    "status": "cause of a fault that began in this cycle; 0: none",
-    "stop": "cause of the stop or fault that is under way; 0: none",
-    "asked": "cause that was asked for before the cycle; 0: none",
-    "mode": "0 idle, 1 armed, 2 running, 3 stopping, 4 stopped, 5 fault",
-    "request": "to the drives: 0 braked, 1 enabled, 2 quick stop",
-    "silent": "cycles since the rig has answered",
-    "drive": "0 following, 1 ready, 2 off, 3 stopping quickly, 4 faulty",
-    "drive_code": "the drives' own fault codes",
-    "sample_age": "cycles since each IMU's sample was new",
-    "sample_ns": "time of each IMU's sample on the rig's clock",
-    "round_trip_ns": "of the exchange",
-    "refused": "frames or packets that were refused since the start",
-    "sent": "m/s, what was really sent",
-    "event_count": "what happened in this cycle: how much, and of the first eight",
-    "event_cause": "by number, controller/safety/watch.py",
-    "event_index": "which leg or IMU; -1: none",
-    "event_value": "in the unit of its cause; NaN: none",
-    "event_limit": "which it broke; NaN: none",
-    "imus": "which IMUs were used, a bit each, and the eighth for the platform's magnetometer",
-    "trusted": "1: the pose is the whole-mechanism filter's",
-    "angular_velocity": "rad/s, seven IMUs by three axes: 0-5 on the legs, 6 on the platform",
-    "specific_force": "m/s^2",
-    "magnetic_field": "uT",
-    "position": "m, of {2} in {1}",
-    "rotation": "row by row, maps {2} to {1}",
-    "covariance": "row by row, of translation [m] and rotation [rad] in {1}",
-    "residuals": "measured less predicted direction, six legs by three",
-    "conditioning": "1 is best, 0 singular",
-    "lengths": "m; 0 for legs that there are not",
-    "reference": "six legs by length [m], rate [m/s], acceleration [m/s^2]",
-    "command": "m/s",
-    "truth": "position [m], quaternion (w first), lengths [m], currents [A]",
-}
+_EVENT_SCHEMA = "int64 cycle  # the period in which it happened\nstring text\n"
 
 
 class RecordingError(GoughError, ValueError):
-    """A file is no recording of gough, or one that this version cannot read."""
+    """A file is not a recording of gough, or this version cannot read it."""
 
 
 def schema() -> str:
     """The ROS 2 message definition of a cycle."""
     lines = []
-    for name in RECORD.names or ():
-        base, shape = RECORD.fields[name][0].base, RECORD.fields[name][0].shape  # type: ignore[index]
+    for name, kind, shape, note in RECORD_FIELDS:
         count = f"[{int(np.prod(shape))}]" if shape else ""
-        lines.append(f"{_CDR_TYPES[base.str[1:]]}{count} {name}  # {_NOTES[name]}\n")
+        lines.append(f"{_CDR_TYPES[kind]}{count} {name}  # {note}\n")
     return "".join(lines)
+
+
+def _layout(definition: str) -> list[str]:
+    """The lines of a message definition without its comments."""
+    return [line.partition("#")[0].strip() for line in definition.splitlines()]
 
 
 class Recorder:
     """Writes cycles and events to an MCAP file.
 
     Args:
-        path: the file, replaced if it exists.
-        header: what a replay needs: `config` (JSON) and arrays by name.
+        path: the file; an existing one is replaced.
+        header: what a replay needs: `config` (for JSON) and arrays by name.
         epoch_ns: Unix time of the first deadline [ns].
     """
 
@@ -112,7 +78,7 @@ class Recorder:
         self._writer.add_metadata("gough", {"config": json.dumps(header["config"]), **digests})
         for name, content in contents.items():
             self._writer.add_attachment(0, 0, f"{name}.npy", "application/x-npy", content)
-        self._known = {"imus": -1, "trusted": 0}
+        self._last = {"imus": -1, "trusted": 0}
         self.flush()
 
     def _channel(self, topic: str, name: str, text: str) -> int:
@@ -120,21 +86,21 @@ class Recorder:
         return int(self._writer.register_channel(topic, "cdr", number))
 
     def flush(self) -> None:
-        """Complete the chunk: what has been written until now is in the file, whatever happens."""
+        """Complete the chunk, so that everything written until now is in the file, whatever happens."""
         flush: Any = self._writer.flush
         flush()
         self._file.flush()
 
     def write(self, records: Record) -> None:
-        """Append records (n,), dtype `RECORD`, and what is to be told of them."""
+        """Append records (n,), dtype `RECORD`, and their events."""
         self.write_cycles(records)
         times = self._epoch + records["time_ns"]
-        told = (records["missed"] > 0) | (records["event_count"] > 0)
-        for name, before in self._known.items():
-            told |= np.diff(records[name], prepend=before) != 0
-        for i in np.flatnonzero(told).tolist():
-            for text in self._tell(records[i]):
-                self.tell(int(records["cycle"][i]), text, int(times[i]))
+        eventful = (records["missed"] > 0) | (records["event_count"] > 0)
+        for name, before in self._last.items():
+            eventful |= np.diff(records[name], prepend=before) != 0
+        for i in np.flatnonzero(eventful).tolist():
+            for text in self._events_of(records[i]):
+                self.write_event(int(records["cycle"][i]), text, int(times[i]))
 
     def write_cycles(self, records: Record) -> None:
         """Append records (n,) alone."""
@@ -142,22 +108,22 @@ class Recorder:
         for i, at in enumerate(times):
             self._writer.add_message(self._cycles, at, _LITTLE_ENDIAN_CDR + records[i].tobytes(), at, int(records["cycle"][i]))
 
-    def _tell(self, record: Record) -> Iterator[str]:
+    def _events_of(self, record: Record) -> Iterator[str]:
         if record["missed"] > 0:
             yield f"{record['missed']} periods missed"
         yield from events_of(record)
         magnetometer, trusted = int(record["imus"]) >> IMU_COUNT & 1, int(record["trusted"])
-        if self._known["imus"] >= 0 and magnetometer != self._known["imus"] >> IMU_COUNT & 1:
+        if self._last["imus"] >= 0 and magnetometer != self._last["imus"] >> IMU_COUNT & 1:
             yield f"the magnetometer is {'used again' if magnetometer else 'left out: it is lost, frozen or disturbed'}"
-        if trusted != self._known["trusted"]:
+        if trusted != self._last["trusted"]:
             yield (
                 "the whole-mechanism filter is relied upon"
                 if trusted
                 else "the whole-mechanism filter is not relied upon: the leg filters disagree with it"
             )
-        self._known = {"imus": int(record["imus"]), "trusted": trusted}
+        self._last = {"imus": int(record["imus"]), "trusted": trusted}
 
-    def tell(self, cycle: int, text: str, time_ns: int | None = None) -> None:
+    def write_event(self, cycle: int, text: str, time_ns: int | None = None) -> None:
         """Append an event."""
         at = time.time_ns() if time_ns is None else time_ns
         encoded = text.encode() + b"\0"
@@ -172,7 +138,7 @@ class Recorder:
 
 
 def events_of(record: Record) -> Iterator[str]:
-    """What happened in a cycle, in words."""
+    """The events of a cycle, in words."""
     count = int(record["event_count"])
     for i in range(min(count, EVENT_SLOTS)):
         cause, index, value, limit = (record[f"event_{name}"][i] for name in ("cause", "index", "value", "limit"))
@@ -190,18 +156,22 @@ def _saved(array: Record) -> bytes:
 
 
 def take(records: Record, link: NDArray[np.int64], tail: int) -> tuple[Record, int, int]:
-    """Copy what the loop has written since record `tail`; returns it, the new tail, and how many were overwritten before."""
+    """Copy what the loop has written since record `tail`.
+
+    Returns:
+        The records, the new tail, and how many records were overwritten before they could be copied.
+    """
     capacity = len(records)
     head = int(link[Link.HEAD])
     first = max(tail, head - capacity)
     taken = records[np.arange(first, head) % capacity]
-    # What the loop has begun to write over meanwhile is not to be trusted.
-    sound = max(first, int(link[Link.HEAD]) - capacity + 1)
-    return taken[max(sound - first, 0) :], head, min(sound, head) - tail
+    # The loop may have begun to overwrite some of them meanwhile.
+    intact = max(first, int(link[Link.HEAD]) - capacity + 1)
+    return taken[max(intact - first, 0) :], head, min(intact, head) - tail
 
 
 def record(path: Path, header: Mapping[str, Any], records: Record, link: NDArray[np.int64]) -> None:
-    """Take the loop's records to a file until it is done; the body of the recorder's process."""
+    """Copy the loop's records to a file until it has ended; this is what the recorder's process runs."""
     supervisor = int(link[Link.SUPERVISOR])
     while not link[Link.HEAD] and not link[Link.DONE]:
         time.sleep(_POLL_S)
@@ -214,7 +184,7 @@ def record(path: Path, header: Mapping[str, Any], records: Record, link: NDArray
         done = bool(link[Link.DONE]) or (os.getppid() != supervisor and _has_ended(link))
         taken, tail, lost = take(records, link, tail)
         if lost:
-            recorder.tell(tail, f"{lost} cycles lost: the recorder came too late")
+            recorder.write_event(tail, f"{lost} cycles lost: the recorder came too late")
         recorder.write(taken)
         count += len(taken)
         ended = done and tail == link[Link.HEAD]
@@ -229,7 +199,7 @@ def record(path: Path, header: Mapping[str, Any], records: Record, link: NDArray
 
 
 def _has_ended(link: NDArray[np.int64]) -> bool:
-    """Whether the loop has stopped writing, when there is no supervisor any more to say so."""
+    """Whether the loop has stopped writing, once the supervisor is gone and cannot say so."""
     head = int(link[Link.HEAD])
     time.sleep(1.0)
     return head == int(link[Link.HEAD])
@@ -237,7 +207,7 @@ def _has_ended(link: NDArray[np.int64]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What a file holds.
+    """The content of a file.
 
     Attributes:
         config: what was run.
@@ -245,7 +215,8 @@ class Recording:
         records: (N,), dtype `RECORD`.
         events: cycle and text of each.
         epoch_ns: Unix time of the first deadline [ns].
-        complete: whether the file was closed; if not, its end is what was last written out.
+        complete: whether the file was closed; if not, it ends with the last chunk that was written.
+        path: of the file.
     """
 
     config: dict[str, Any]
@@ -254,18 +225,24 @@ class Recording:
     events: list[tuple[int, str]]
     epoch_ns: int
     complete: bool
+    path: Path
+
+    @property
+    def version(self) -> str:
+        """The version of gough that recorded it."""
+        return str(self.config.get("version"))
 
     def constant(self, stage: str, name: str) -> Any:
-        """A constant of the cycle that was recorded; the layout of version 0.1 had no stages."""
+        """A recorded constant of the cycle. The layout of version 0.1 had no stages."""
         parameters = self.arrays["parameters"]
         return parameters[stage][name] if stage in (parameters.dtype.names or ()) else parameters[name]
 
 
 def read(path: Path | str) -> Recording:
-    """Read a recording, also one that was cut short.
+    """Read a recording, even one that was cut short.
 
     Raises:
-        RecordingError: no such file, no recording of gough, or one of another layout.
+        RecordingError: there is no such file, it is not a recording of gough, or its records have another layout.
     """
     config: dict[str, Any] | None = None
     arrays: dict[str, Record] = {}
@@ -300,21 +277,22 @@ def read(path: Path | str) -> Recording:
     except FileNotFoundError:
         raise RecordingError(f"there is no recording at {path}") from None
     except IsADirectoryError:
-        raise RecordingError(f"{path} is a folder, no recording") from None
+        raise RecordingError(f"{path} is a folder, not a recording") from None
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror}") from None
     except MemoryError:
         raise
     except Exception:
-        # Whatever the decoder says of what follows the last chunk that is whole.
+        # Whatever the decoder raises for the part after the last whole chunk.
         complete = False
     if config is None:
         raise RecordingError(f"{path} is no recording of gough")
-    if layout != schema() and (layout or cycles):
+    if (layout or cycles) and _layout(layout) != _layout(schema()):
         raise RecordingError(
-            f"{path} was recorded by gough {config.get('version')}, whose records are of another layout: use that"
+            f"{path} was recorded by gough {config.get('version')}, whose records have another layout than those of this gough "
+            f"{version('gough')}: read it with the version that recorded it"
         )
-    return Recording(config, arrays, np.frombuffer(cycles, RECORD), events, epoch, complete)
+    return Recording(config, arrays, np.frombuffer(cycles, RECORD), events, epoch, complete, Path(path))
 
 
 def _items(path: Path | str) -> Iterator[Any]:
@@ -323,7 +301,7 @@ def _items(path: Path | str) -> Iterator[Any]:
 
 
 def repair(path: Path) -> bool:
-    """Complete a file that was cut short, in its place; returns whether it needed that.
+    """Complete a file that was cut short, in place; returns whether it was.
 
     Raises:
         RecordingError: as `read`.
@@ -336,7 +314,7 @@ def repair(path: Path) -> bool:
         recorder = Recorder(mended, {"config": recording.config, **recording.arrays}, recording.epoch_ns)
         recorder.write_cycles(recording.records)
         for cycle, text in recording.events:
-            recorder.tell(cycle, text)
+            recorder.write_event(cycle, text)
         recorder.close()
         mended.replace(path)
     finally:
@@ -344,8 +322,26 @@ def repair(path: Path) -> bool:
     return True
 
 
-def total(recordings: Iterable[Recording]) -> Record:
-    """The records of consecutive files; those that a recorder wrote just before it died may be in the next file again."""
+def read_run(paths: Sequence[Path | str]) -> list[Recording]:
+    """Read the consecutive files of one run, and sort them.
+
+    Raises:
+        RecordingError: as `read`; or the files are of different runs, hold no cycle, or lack the first one.
+    """
+    recordings = sorted((read(path) for path in paths), key=lambda each: each.records["cycle"][:1].tolist())
+    where = ", ".join(map(str, paths))
+    if any(each.config != recordings[0].config for each in recordings):
+        raise RecordingError(f"{where} are of different runs: give the files of one")
+    records = joined(recordings)
+    if not len(records):
+        raise RecordingError(f"{where} holds no cycle: the run ended before its first one, or it is damaged")
+    if records["cycle"][0] != 0:
+        raise RecordingError(f"{where} does not begin with the first cycle of its run: give all of its files")
+    return recordings
+
+
+def joined(recordings: Iterable[Recording]) -> Record:
+    """The records of consecutive files, each once: a recorder's last ones before it dies may be in the next file again."""
     parts: list[Record] = []
     last = -1
     for each in recordings:

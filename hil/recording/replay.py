@@ -1,4 +1,4 @@
-"""Replay: recorded raw IMU data go through the cycle again, and estimates and commands must come out bit for bit."""
+"""Replay: the cycle runs again on recorded raw IMU data. Estimates and commands must come out bit for bit."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from controller.planning import STREAM_TARGET
 from controller.safety.causes import Cause
 from controller.safety.stop import ramp_down
 from hil.loop.records import RECORD
-from hil.recording.mcap import RecordingError, read, total
+from hil.recording.mcap import RecordingError, joined, read_run
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import IMU_COUNT
 from plant.pose import Array
@@ -23,14 +23,14 @@ COMPARED = ("position", "rotation", "lengths", "reference", "command", "conditio
 
 @dataclass(frozen=True)
 class Replay:
-    """How a replay compares.
+    """How a replay compares with its recording.
 
     Attributes:
-        cycles: how many were replayed.
-        recorded: how many there are in the files.
-        missing_after: the cycle after which some are missing, so that the replay ends; None if none are.
+        cycles: number of cycles that were replayed.
+        recorded: number of cycles in the files.
+        missing_after: the cycle before the first gap, at which the replay ends; None without a gap.
         different: the first cycle that differs, None if none does.
-        fields: what differs in it, by name: recorded and replayed.
+        fields: what differs in that cycle, by name: recorded and replayed.
         recorded_by, replayed_by: versions of gough.
         cut_short: files that were not closed.
     """
@@ -46,11 +46,11 @@ class Replay:
 
     @property
     def same(self) -> bool:
-        """Whether all that was recorded came out the same."""
+        """Whether the whole recording came out the same."""
         return self.different is None and self.missing_after is None
 
     def summary(self) -> dict[str, Any]:
-        """Everything, for JSON."""
+        """All figures, for JSON."""
         return {**self.__dict__, "same": self.same}
 
     def lines(self) -> list[str]:
@@ -68,33 +68,24 @@ class Replay:
 
 
 def replay(paths: Sequence[Path | str]) -> Replay:
-    """Replay the files of one run, in their order.
+    """Replay the files of one run.
 
     Raises:
-        RecordingError: not a recording, one of another version whose cycle has other parameters, or files of different runs.
+        RecordingError: as `read_run`; a file's beginning is damaged; or another version recorded it, whose cycle has other
+            parameters.
     """
-    recordings = [read(path) for path in paths]
-    if len(recordings) > 1 and all(len(each.records) for each in recordings):
-        order = sorted(range(len(recordings)), key=lambda i: int(recordings[i].records["cycle"][0]))
-        paths, recordings = [paths[i] for i in order], [recordings[i] for i in order]
-    first = recordings[0]
-    for path, each in zip(paths, recordings, strict=True):
+    recordings = read_run(paths)
+    for each in recordings:
         if {"parameters", "reference"} - set(each.arrays):
-            raise RecordingError(f"{path} lacks what a replay needs: its beginning is damaged")
+            raise RecordingError(f"{each.path} lacks what a replay needs: its beginning is damaged")
+    first, records = recordings[0], joined(recordings)
     parameters, segments = first.arrays["parameters"], first.arrays["reference"]
     if parameters.dtype != PARAMETERS:
         raise RecordingError(
-            f"{paths[0]} was recorded by gough {first.config['version']}, whose cycle has other parameters: replay it with that"
+            f"{first.path} was recorded by gough {first.version}, whose cycle has other parameters than that of this gough "
+            f"{version('gough')}: replay it with the version that recorded it; everything else reads it as it is"
         )
-    for path, other in zip(paths[1:], recordings[1:], strict=True):
-        if other.arrays["parameters"].tobytes() != parameters.tobytes() or other.config != first.config:
-            raise RecordingError(f"{path} is of another run than {paths[0]}")
-    records = total(recordings)
-    if not len(records):
-        raise RecordingError(f"{paths[0]} holds no cycle: the run ended before its first one, or it is damaged")
-    if records["cycle"][0] != 0:
-        raise RecordingError(f"{paths[0]} does not begin with the first cycle of its run: name the files in their order")
-    # As the loop had them: aligned, which a file does not say.
+    # Aligned, as the loop had them; a file does not keep that.
     constants: Record = np.zeros((), PARAMETERS)
     constants[()] = parameters
     again = np.zeros(len(records), RECORD)
@@ -118,14 +109,14 @@ def replay(paths: Sequence[Path | str]) -> Replay:
         missing_after=int(records["cycle"][count - 1]) if count < len(records) else None,
         different=different,
         fields=fields,
-        recorded_by=first.config["version"],
+        recorded_by=first.version,
         replayed_by=version("gough"),
-        cut_short=tuple(str(path) for path, each in zip(paths, recordings, strict=True) if not each.complete),
+        cut_short=tuple(str(each.path) for each in recordings if not each.complete),
     )
 
 
 def _bits(values: Array) -> Any:
-    """Values (n, ...) as integers (n, m), so that NaN equals NaN and 0 does not equal -0."""
+    """Values (n, ...) as integers (n, m): NaN equals NaN, and 0 differs from -0."""
     flat = np.ascontiguousarray(values).reshape(len(values), -1)
     return flat.view(np.int64) if flat.dtype == np.float64 else flat
 
@@ -135,7 +126,7 @@ def _replay(
     parameters: Record, state: Record, segments: Array, records: Record, again: Record, measurement: Array, marks: Record,
     streamed: bool,
 ) -> int:  # fmt: skip
-    """Run the cycle on the raw data of records (n,); returns how many it could, up to the first gap."""
+    """Run the cycle on the raw data of records (n,); returns the number of cycles before the first gap."""
     p, s = parameters[()], state[()]
     for k in range(records.shape[0]):
         recorded, found = records[k], again[k]
@@ -143,12 +134,12 @@ def _replay(
             return k
         skip_periods(state, recorded.missed)
         if streamed and s.safety.stop.cause == Cause.NONE:
-            # What the stream's plans said is known from what was followed.
+            # The recorded reference replaces the stream's plans.
             s.reference.motion[:] = recorded.reference
             s.reference.due_cycle = s.time.cycle + 1
         if recorded.asked != Cause.NONE:
             if streamed:
-                # What the stop made of missed periods is in the recorded reference.
+                # The recorded reference contains how the stop dealt with missed periods.
                 s.time.missed = 0
             react(parameters, state, recorded.asked, -1, np.nan, np.nan)
             s.time.missed = recorded.missed

@@ -1,4 +1,4 @@
-"""A recording as a rig: the loop runs on the clock on what was recorded, and nothing moves."""
+"""A recording as a rig: the loop runs on the clock with recorded samples, and nothing moves."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,7 +7,7 @@ import numpy as np
 
 from controller.safety.causes import Cause
 from hil.loop.records import RECORD
-from hil.recording.mcap import RecordingError, read, total
+from hil.recording.mcap import RecordingError, joined, read_run
 from hil.rigs import ANSWERED, SILENT, Identity, RigError
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
@@ -15,24 +15,24 @@ from plant.mechanism import Mechanism
 from plant.pose import Array
 
 ENDED, FAILED = 2, 3
-"""Statuses of an exchange: the recording has come to its end; the rig failed when it was recorded."""
+"""Statuses of an exchange: the recording has ended; the rig failed when it was recorded."""
 
 _FAILURES = {ENDED: "the recording has come to its end", FAILED: "it did so when it was recorded"}
 
 
 class ReplayRig:
-    """A recording as a rig; each exchange is that of the next period. What is commanded goes nowhere.
+    """A recording as a rig. Each exchange returns the next recorded period; commands are ignored.
 
-    A period that was missed when it was recorded is one in which nothing answers. A run of another target or duration than the
-    recorded one sees drives that do not follow, and stops; without arming it goes on.
+    In a period that was missed when it was recorded, the rig does not answer. If the target or the duration differs from the
+    recorded one, the drives do not follow and the run stops; a run that does not arm continues.
 
     Args:
         path: the recording, or the consecutive files of one run.
         period: of the exchanges [s]; it must be the recording's.
-        mechanism: which must be the recording's, too; None for any.
+        mechanism: it must be the recording's, too; None for any.
 
     Attributes:
-        command_delay: of the rig that was recorded [s], as soon as this is open.
+        command_delay: of the recorded rig [s], once this one is open.
         failure: why an exchange has failed.
     """
 
@@ -42,32 +42,22 @@ class ReplayRig:
         self._paths = [path] if isinstance(path, str | Path) else list(path)
         self._period, self._mechanism = period, mechanism
         self._identity: Identity | None = None
-        self._records, self._rows, self._numbers = (
-            np.zeros(0, RECORD),
-            np.zeros(0, np.int64),
-            np.zeros((0, IMU_COUNT), np.int64),
-        )
+        self._records, self._rows = np.zeros(0, RECORD), np.zeros(0, np.int64)
+        self._numbers = np.zeros((0, IMU_COUNT), np.int64)
         self._cycle = 0
 
     def open(self) -> None:
         """Read the recording.
 
         Raises:
-            RigError: there is none, or it is of another rate, mechanism or run.
+            RigError: there is none, or its rate, mechanism or run is another.
         """
         try:
-            recordings = sorted((read(path) for path in self._paths), key=lambda each: each.records["cycle"][:1].tolist())
+            recordings = read_run(self._paths)
         except RecordingError as error:
             raise RigError(str(error)) from None
         where = ", ".join(map(str, self._paths))
-        config = recordings[0].config
-        if any(each.config != config for each in recordings):
-            raise RigError(f"{where} are of different runs: give the files of one")
-        records = total(recordings)
-        if not len(records):
-            raise RigError(f"{where} holds no cycle: the run ended before its first one, or it is damaged")
-        if records["cycle"][0] != 0:
-            raise RigError(f"{where} does not begin with the first cycle of its run: give all of its files")
+        config, records = recordings[0].config, joined(recordings)
         rate = float(config["rate"])
         if abs(rate * self._period - 1.0) > 1e-9:
             raise RigError(
@@ -83,11 +73,11 @@ class ReplayRig:
         self._cycle, self.failure = 0, ""
         if "parameters" in recordings[0].arrays:
             self.command_delay = float(recordings[0].constant("load", "command_delay"))
-        parts = {"rig": str(config.get("rig")), "run": str(config.get("run")), "recorded by": f"gough {config['version']}"}
+        parts = {"rig": str(config.get("rig")), "run": str(config.get("run")), "recorded by": f"gough {recordings[0].version}"}
         self._identity = Identity(f"recording {where}", parts)
 
     def identify(self) -> Identity:
-        """Which run it is of.
+        """The recorded run.
 
         Raises:
             RigError: it is not open.
@@ -97,10 +87,10 @@ class ReplayRig:
         return self._identity
 
     def arm(self) -> None:
-        """Nothing: the recorded drives are as they were."""
+        """Nothing: the drives are recorded."""
 
     def exchange(self, command: Array, request: int, feedback: Record) -> int:
-        """What was recorded of the next period, as `Rig` says."""
+        """Return the recording of the next period, as `Rig` describes."""
         del command, request
         cycle = self._cycle
         self._cycle += 1
@@ -127,5 +117,5 @@ class ReplayRig:
         """Nothing: nothing moves."""
 
     def close(self) -> None:
-        """Let go of the recording."""
+        """Release the recording."""
         self._identity, self._records, self._rows = None, self._records[:0], self._rows[:0]

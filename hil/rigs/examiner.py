@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hil.realtime.durations import percentiles
 from hil.rigs import ANSWERED, FEEDBACK, SILENT, DriveState, Identity, Request, Rig, RigError, missing_members, new_feedback
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
@@ -376,12 +377,11 @@ class Examiner:
     def _sum_up(self) -> None:
         if not self._durations:
             return
-        durations = np.array(self._durations) / 1e3
-        p50, p99 = (float(np.percentile(durations, share)) for share in (50, 99))
-        self._result.exchange_us = {"p50": p50, "p99": p99, "max": float(durations.max()), "n": len(durations)}
+        durations = percentiles(np.array(self._durations), ("p50", "p99", "max", "n"))
+        self._result.exchange_us, p99 = durations, durations["p99"]
         self._begin("period")
         if p99 > 1e6 * self._period:
-            took = f"{p99 / 1e3:.3g} ms (p99 of {len(durations)})"
+            took = f"{p99 / 1e3:.3g} ms (p99 of {durations['n']})"
             self._find("period", f"An exchange takes {took}, longer than the period of {1e3 * self._period:g} ms.")
 
     def _open_again(self) -> None:

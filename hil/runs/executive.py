@@ -32,7 +32,7 @@ from controller.planning.stream_planner import StreamPlanner
 from controller.safety.arming import describe_obstacle
 from controller.safety.causes import Cause, Reaction
 from hil.loop.driver import Loop, prevent_compilation, stop_quickly
-from hil.loop.records import LINK_SIZE, RECORD, UDP_RIG, Link, StopRequest, shared_array
+from hil.loop.records import LINK_SIZE, RECORD, Link, StopRequest, shared_array
 from hil.loop.timing import over_budget
 from hil.realtime.clock import REAL, new_clock
 from hil.realtime.processes import FORK, PATIENCE_S, block_signals, join_or_kill
@@ -257,6 +257,8 @@ def _prepare_and_follow(
         }
         rig = make_rig(loop) if make_rig is not None else rig_of(config)
         compiled = rig is None or isinstance(rig, UdpRig)
+        if isinstance(rig, UdpRig):
+            loop.udp = rig.link
         loop.load(python=not compiled)
         if rig is not None:
             rigs.callback(rig.close)
@@ -266,8 +268,6 @@ def _prepare_and_follow(
             if config.arm:
                 rig.arm()
             loop.parameters["load"]["command_delay"] = rig.command_delay
-        if isinstance(rig, UdpRig):
-            loop.kind, loop.udp = UDP_RIG, rig.link
         if threading.active_count() > 1:
             names = ", ".join(thread.name for thread in threading.enumerate()[1:])
             raise GoughError(f"the rig has left threads running ({names}), which delay the loop: end them when it is open")

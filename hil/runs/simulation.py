@@ -13,6 +13,7 @@ from controller.planning.target import Target
 from controller.safety.causes import Cause
 from hil.loop.records import COMPUTED
 from hil.progress import Progress, no_progress
+from hil.realtime.durations import QUANTILES, percentiles
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import PreparedLoop, prepared_loop
 from hil.runs.snapshot import Snapshot, resume_snapshot, take_snapshot
@@ -91,7 +92,6 @@ class SimulationResult:
         reference = (self.reference_positions[moving], self.reference_rotations[moving])
         target = (self.target_positions[moving], self.target_rotations[moving])
         truth = (self.true_positions[moving], self.true_rotations[moving]) if self.truth_known else None
-        cycle_us = self.records["stage_ns"][:, COMPUTED].sum(axis=1) / 1e3
         return {
             "truth_known": self.truth_known,
             "estimation": None if truth is None else _figures(estimate, truth),
@@ -101,9 +101,7 @@ class SimulationResult:
             | {f"reference_{key}": value for key, value in _figures(reference, target).items()},
             "limits": {"violations": self.reference.violations},
             "real_time_factor": self.real_time_factor,
-            "cycle_us": {
-                name: float(np.percentile(cycle_us, percent)) for name, percent in (("p50", 50), ("p99", 99), ("p999", 99.9))
-            },
+            "cycle_us": percentiles(self.records["stage_ns"][:, COMPUTED].sum(axis=1), tuple(QUANTILES)),
             "config": asdict(self.config),
             "version": version("gough"),
         }

@@ -15,12 +15,13 @@ from controller.inverse_kinematics import leg_lengths
 from controller.planning.stream import STREAM, note_sample, rest
 from controller.planning.stream_planner import StreamPlanner
 from controller.safety.causes import Cause, DriveState, Mode, Reaction, Request
-from hil.loop.records import EMULATED_RIG, RECORD, Link, StopRequest
+from hil.loop.records import RECORD, Link, StopRequest
 from hil.progress import Progress, no_progress
 from hil.realtime.clock import SCRIPTED, new_clock
 from hil.rigs.emulation.drives import new_emulated, sample
 from hil.rigs.emulation.faults import fault
 from hil.rigs.udp.emulator import check_watchdog, new_udp_emulator
+from hil.rigs.udp.link import new_link
 from hil.rigs.udp.rig import TIMEOUT_SHARE
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import PreparedLoop, prepared_loop
@@ -239,7 +240,7 @@ def _join(loop: PreparedLoop, faults: list[Record], seed: int) -> None:
     """Put the emulated rig between the loop and its plant, and both on a scripted clock."""
     rig = new_emulated(loop.mechanism, round(1e9 / RATE_HZ), seed, faults)
     loop.emulator = new_udp_emulator(loop.fmu, loop.imu, rig, _SESSION)
-    loop.kind = EMULATED_RIG
+    loop.udp = new_link()
     loop.udp.socket["session"], loop.udp.socket["timeout_ns"] = _SESSION, round(1e9 * TIMEOUT_SHARE / RATE_HZ)
     loop.parameters["load"]["command_delay"] = 1.0 / RATE_HZ
     loop.clock = new_clock(SCRIPTED, round(1e9 / RATE_HZ))

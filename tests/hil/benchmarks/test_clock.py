@@ -10,7 +10,7 @@ from hil.benchmarks.clock import BUSY, CONDITIONS, IDLE, LOAD, durations_of, gro
 from hil.benchmarks.loop import read_earlier
 from hil.command_line import main
 from hil.loop.records import LINK_SIZE, RECORD, Link
-from hil.loop.timing import Histogram
+from hil.realtime.durations import Histogram
 from hil.recording.mcap import take
 from hil.reports.benchmark import write_report
 from plant.errors import InputError

@@ -16,7 +16,7 @@ from hil.runs.simulation import simulate
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import InputError
 from plant.fmu.build import PLANAR_MODEL, default_fmu
-from tests.hil.loop.test_loop import replayed
+from tests.hil.loop.test_driver import replayed
 from tests.hil.runs.test_simulation import errors
 
 RIG = "planar-3rpr"

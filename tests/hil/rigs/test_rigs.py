@@ -18,7 +18,7 @@ import pytest
 from controller.safety.causes import Cause
 from hil.command_line import main
 from hil.loop.driver import FmuRig
-from hil.loop.records import EMULATED_RIG, RECORD
+from hil.loop.records import RECORD
 from hil.realtime.scheduling import RealTimeSettings
 from hil.recording.mcap import Recorder, read
 from hil.recording.replay_rig import ENDED, FAILED, ReplayRig
@@ -31,6 +31,7 @@ from hil.rigs.emulation.drives import new_emulated
 from hil.rigs.emulation.faults import fault
 from hil.rigs.template import TemplateRig
 from hil.rigs.udp.emulator import new_udp_emulator
+from hil.rigs.udp.link import new_link
 from hil.rigs.udp.rig import UdpRig
 from hil.runs.config import SimulationConfig
 from hil.runs.executive import RunStoppedError, run
@@ -425,7 +426,7 @@ def recording(path, faults=None, **changes):
     with prepared_loop(replace(CONFIG, **changes), np.zeros(4000, RECORD)) as loop:
         if faults is not None:
             rig = new_emulated(loop.mechanism, 1_000_000, 0, [fault(text) for text in faults])
-            loop.kind, loop.emulator = EMULATED_RIG, new_udp_emulator(loop.fmu, loop.imu, rig, 1)
+            loop.udp, loop.emulator = new_link(), new_udp_emulator(loop.fmu, loop.imu, rig, 1)
             loop.udp.socket["session"], loop.udp.socket["timeout_ns"] = 1, 1_000_000
             loop.parameters["load"]["command_delay"] = 1.0 / CONFIG.rate
         assert loop.follow(loop.end) == Cause.END_OF_MOTION
