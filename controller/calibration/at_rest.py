@@ -305,8 +305,9 @@ class _Problem:
 def _turn_by_vector(vector: Array) -> Array:
     """The derivative (3, 3) of a rotation, as a turn seen in {1}, by its rotation vector (3,)."""
     angle, cross = max(float(np.linalg.norm(vector)), 1e-4), skew(vector)
-    derivative: Array = np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * cross
-    return derivative + (angle - np.sin(angle)) / angle**3 * cross @ cross
+    a, b = (1.0 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    derivative: Array = np.eye(3) + a * cross + b * cross @ cross
+    return derivative
 
 
 def fit_pose(geometry: Record, forces: Array, home: Pose) -> tuple[Array, Array]:

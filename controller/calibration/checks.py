@@ -76,7 +76,10 @@ def check_all_along(samples: Array, rate: float) -> None:
     same &= ~same.all(axis=1, keepdims=True)
     reach = max(round(_FROZEN_S * rate), 3)
     frozen = sliding_window_view(same, min(reach, len(same)), axis=0).all(axis=2)
-    faults = {"gives readings that are not finite": lost, "is frozen while others are not": np.atleast_2d(frozen)}
+    faults = {
+        "gives readings that are not finite": np.atleast_2d(lost),
+        "is frozen while others are not": np.atleast_2d(frozen),
+    }
     for imu in range(IMU_COUNT):
         for what, found in faults.items():
             if found[:, imu].any():

@@ -69,7 +69,7 @@ def track(
         guide: (N, 4, 3), motions at which the Jacobian is taken instead of the filter's own, low-passed one.
     """
     shapes, state = ((3,), (3, 3), (4, 3), (6, 6)), np.zeros((), FILTER_STATE)
-    arrays = [np.zeros((len(samples), *shape)) for shape in shapes]
+    positions, rotations, motions, covariances = (np.zeros((len(samples), *shape)) for shape in shapes)
     guided = np.zeros((0, 4, 3)) if guide is None else guide
     if guide is not None:
         parameters = parameters.copy()
@@ -77,9 +77,10 @@ def track(
     pose, twist = start
     start_filter(parameters[()], state[()], 0.0, pose.position, pose.rotation, twist)
     _track(
-        parameters[()], geometry[()], state[()], samples, used, 1.0 / rate, delay, guided, *arrays
+        parameters[()], geometry[()], state[()], samples, used, 1.0 / rate, delay, guided, positions, rotations, motions,
+        covariances,
     )  # fmt: skip
-    return Track(*arrays, state)
+    return Track(positions, rotations, motions, covariances, state)
 
 
 @kernel

@@ -5,7 +5,8 @@ from itertools import combinations
 
 import numpy as np
 
-from controller.direct_kinematics.spatial import METHODS, NEEDS, check_spatial, solve_batch
+from controller.direct_kinematics.solver import METHODS
+from controller.direct_kinematics.spatial import NEEDS, check_spatial, solve_batch
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Pose, rotation_from_vector
 

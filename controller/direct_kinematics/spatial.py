@@ -198,15 +198,12 @@ def _checked(
     directions: ArrayLike, rotation: ArrayLike | None, normal: ArrayLike | None, up_in_platform: ArrayLike | None, *rows: int
 ) -> dict[str, Array]:  # fmt: skip
     """The measurements that are given, by name, with so many rows."""
-    given = {
-        "leg_directions": (directions, (LEGS, 3)), "rotation": (rotation, (3, 3)), "normal": (normal, (3,)),
-        "up_in_platform": (up_in_platform, (3,)),
-    }  # fmt: skip
-    return {
-        name: _shaped(value, (*rows, *shape), name)
-        for name, (value, shape) in given.items()
-        if value is not None or name == "leg_directions"
-    }
+    arrays = {"leg_directions": _shaped(directions, (*rows, LEGS, 3), "leg_directions")}
+    given = {"rotation": (rotation, (3, 3)), "normal": (normal, (3,)), "up_in_platform": (up_in_platform, (3,))}
+    for name, (value, shape) in given.items():
+        if value is not None:
+            arrays[name] = _shaped(value, (*rows, *shape), name)
+    return arrays
 
 
 def _shaped(value: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
