@@ -78,7 +78,7 @@ class Examiner:
         self._before: Record = new_feedback()
         self._durations: list[int] = []
         self._due = 0.0
-        self._statuses: dict[int, int] = {}
+        self._silent = 0
         self._commands: list[Array] = []
         self._age, self._stateless = np.zeros(IMU_COUNT, np.int64), np.zeros(LEGS, bool)
 
@@ -184,9 +184,8 @@ class Examiner:
             if self._moving and i >= FOLLOWED_WITHIN and not self._are((DriveState.READY,)):
                 self._find_wrong_drives(Request.BRAKED, i + 1)
         self._check_contents()
-        silent = self._statuses.get(SILENT, 0)
-        if silent > _MOST_SILENT * count:
-            self._find("exchanges", f"{silent} of {count} exchanges on the brakes brought no answer.")
+        if self._silent > _MOST_SILENT * count:
+            self._find("exchanges", f"{self._silent} of {count} exchanges on the brakes brought no answer.")
 
     def _check_moving(self) -> None:
         zero, up = np.zeros(LEGS), np.full(LEGS, SPEED)
@@ -276,7 +275,7 @@ class Examiner:
         if not isinstance(status, int | np.integer) or isinstance(status, bool) or status < 0:
             self._find("exchanges", f"exchange returned {status!r}; it must return ANSWERED, SILENT, or a failure above.")
             raise _BrokenOffError
-        self._statuses[int(status)] = self._statuses.get(int(status), 0) + 1
+        self._silent += status == SILENT
         if status > SILENT:
             text = getattr(self._rig, "failure", "")
             at = len(self._durations)

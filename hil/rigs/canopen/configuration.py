@@ -13,7 +13,6 @@ from hil.rigs.canopen.objects import (
     SYNC_START_VALUE,
     Object,
     imu_pdos,
-    magnetometer_turn,
 )
 from hil.rigs.canopen.sdo import RemoteNode
 from hil.rigs.canopen.settings import CanopenSettings, ControllerSettings, DriveSettings
@@ -64,7 +63,8 @@ def configure_imu(node: RemoteNode, imu: int, settings: CanopenSettings) -> None
     for pdo in imu_pdos(settings.bus.fd):
         node.map_pdo(pdo)
         if pdo == MAGNETOMETER_PDO:
-            node.configure(pdo.communication, SYNC_START_VALUE, magnetometer_turn(imu))
+            # The magnetometers take turns.
+            node.configure(pdo.communication, SYNC_START_VALUE, imu + 1)
     node.configure(Object.SYNC_OVERFLOW, 0, SYNC_OVERFLOW)
     node.configure(Object.PRODUCER_HEARTBEAT, 0, round(settings.imus.heartbeat * 1e3))
 

@@ -1,6 +1,6 @@
 """The decoder of the nodes' frames: statuswords, heartbeats and samples, and the count of everything that is refused."""
 
-from enum import IntEnum
+from collections.abc import Callable
 
 import can
 import numpy as np
@@ -18,7 +18,6 @@ from hil.rigs.canopen.frames import (
     TRUTH_ID,
     CobId,
     NodeState,
-    sensor_scales,
 )
 from hil.rigs.canopen.settings import FD_BYTES, CanopenSettings
 from plant.dynamics.variables import IMU_COUNT
@@ -27,19 +26,6 @@ from plant.pose import Array
 
 _TAIL_AT = 18
 _NODE_STATES = frozenset(NodeState)
-
-
-class _Frame(IntEnum):
-    """What a frame is; up to the accelerometer's, an answer to SYNC that comes once."""
-
-    DRIVE = 0
-    IMU_FD = 1
-    GYROSCOPE = 2
-    ACCELEROMETER = 3
-    MAGNETOMETER = 4
-    HEARTBEAT = 5
-    EMERGENCY = 6
-    OTHER = 7
 
 
 class Decoder:
@@ -61,23 +47,23 @@ class Decoder:
 
     def __init__(self, settings: CanopenSettings) -> None:
         fd, drives, imus = settings.bus.fd, settings.drives.nodes, settings.imus.nodes
-        self._table: dict[int, tuple[int, int, int]] = {}
+        self._table: dict[int, tuple[Callable[[int, bytearray], bool], int, int]] = {}
         for drive, node in enumerate(drives):
-            self._table[CobId.TPDO + node] = _Frame.DRIVE, drive, 1 << drive
-            self._table[CobId.HEARTBEAT + node] = _Frame.HEARTBEAT, drive, 0
-            self._table[CobId.EMERGENCY + node] = _Frame.EMERGENCY, drive, 0
+            self._table[CobId.TPDO + node] = self._take_drive, drive, 1 << drive
+            self._table[CobId.HEARTBEAT + node] = self._take_heartbeat, drive, 0
+            self._table[CobId.EMERGENCY + node] = self._take_emergency, drive, 0
         for imu, node in enumerate(imus):
             first = 1 << LEGS + imu
-            self._table[CobId.HEARTBEAT + node] = _Frame.HEARTBEAT, LEGS + imu, 0
-            self._table[CobId.EMERGENCY + node] = _Frame.EMERGENCY, -1, 0
-            self._table[CobId.TPDO + node] = _Frame.IMU_FD if fd else _Frame.GYROSCOPE, imu, first
+            self._table[CobId.HEARTBEAT + node] = self._take_heartbeat, LEGS + imu, 0
+            self._table[CobId.EMERGENCY + node] = self._take_emergency, -1, 0
+            self._table[CobId.TPDO + node] = self._take_fd if fd else self._take_gyroscope, imu, first
             if not fd:
-                self._table[CobId.TPDO + 0x100 + node] = _Frame.ACCELEROMETER, imu, first << IMU_COUNT
-                self._table[CobId.TPDO + 0x200 + node] = _Frame.MAGNETOMETER, imu, 0
+                self._table[CobId.TPDO + 0x100 + node] = self._take_accelerometer, imu, first << IMU_COUNT
+                self._table[CobId.TPDO + 0x200 + node] = self._take_magnetometer, imu, 0
         # Frames of this side, which some buses return, and late answers to SDO requests.
         own = [CobId.NMT, CobId.SYNC, CobId.HEARTBEAT + settings.controller.node, *(CobId.RPDO + node for node in drives)]
         for each in own + [sdo + node for sdo in (CobId.SDO_ANSWER, CobId.SDO_REQUEST) for node in (*drives, *imus)]:
-            self._table[each] = _Frame.OTHER, 0, 0
+            self._table[each] = self._ignore, 0, 0
         self.all_frames = (1 << LEGS + IMU_COUNT * (1 if fd else 2)) - 1
         self.statuswords, self.velocities, self.error_codes = [0] * LEGS, [0] * LEGS, [0] * LEGS
         self.nmt, self.heard_ns = [-1] * (LEGS + IMU_COUNT), [0] * (LEGS + IMU_COUNT)
@@ -91,7 +77,7 @@ class Decoder:
         self._magnetic_sync = [0] * IMU_COUNT
         self._raw = [bytearray(NO_VALUE.to_bytes(2, "little", signed=True) * (3 * IMU_COUNT)) for _ in range(3)]
         self._readings = [np.frombuffer(sensor, "<i2").reshape(IMU_COUNT, 3) for sensor in self._raw]
-        self._scales = sensor_scales(settings)
+        self._scales = settings.imus.scales
 
     def begin(self, sync: int) -> None:
         """Accept answers to the SYNC with this counter from now on."""
@@ -110,10 +96,9 @@ class Decoder:
 
     def take(self, message: can.Message) -> bool:
         """Decode a frame; returns whether it was valid."""
-        identifier, data, size = message.arbitration_id, message.data, len(message.data)
-        broken = message.is_remote_frame or message.is_error_frame
-        if message.is_extended_id and identifier == TRUTH_ID and size == TRUTH_BYTES and not broken:
-            *truth, sync = TRUTH.unpack_from(data)
+        identifier, broken = message.arbitration_id, message.is_remote_frame or message.is_error_frame
+        if message.is_extended_id and identifier == TRUTH_ID and len(message.data) == TRUTH_BYTES and not broken:
+            *truth, sync = TRUTH.unpack_from(message.data)
             if sync == self._sync:
                 self.truth = tuple(truth)
                 return True
@@ -121,44 +106,44 @@ class Decoder:
         if entry is None or broken or message.is_extended_id:
             self.refused += 1
             return False
-        kind, node, bit = entry
-        if kind <= _Frame.ACCELEROMETER:
-            if self.received & bit:
-                # A silent node that was given up is awaited again.
-                self.awaited |= bit
-                self.refused += 1
-                return False
-            if kind == _Frame.DRIVE:
-                valid = size == ANSWER.size
-                if valid:
-                    self.statuswords[node], self.velocities[node], self.error_codes[node] = ANSWER.unpack_from(data)
-                    self.heard_ns[node] = self.now_ns
-            elif kind == _Frame.IMU_FD:
-                valid = size == FD_BYTES and self._take_fd(node, data)
-            elif kind == _Frame.GYROSCOPE:
-                valid = size == 8 and self._take_gyroscope(node, data)
-            else:
-                valid = size == 8 and self._take_accelerometer(node, data)
-            if valid:
-                self.received |= bit
-                self.awaited |= bit
-        elif kind == _Frame.MAGNETOMETER:
-            valid = size == 8 and self._take_magnetometer(node, data)
-        elif kind == _Frame.HEARTBEAT:
-            valid = size == 1 and data[0] in _NODE_STATES
-            if valid:
-                self.nmt[node], self.heard_ns[node] = data[0], self.now_ns
-        elif kind == _Frame.EMERGENCY:
-            valid = size == 8
-            if valid and node >= 0:
-                self.error_codes[node] = CODE.unpack_from(data)[0]
+        decode, node, bit = entry
+        if self.received & bit:
+            # A silent node that was given up is awaited again.
+            self.awaited |= bit
+            self.refused += 1
+            return False
+        valid = decode(node, message.data)
+        if valid:
+            self.received |= bit
+            self.awaited |= bit
         else:
-            return True
-        if not valid:
             self.refused += 1
         return valid
 
+    def _take_drive(self, drive: int, data: bytearray) -> bool:
+        if len(data) != ANSWER.size:
+            return False
+        self.statuswords[drive], self.velocities[drive], self.error_codes[drive] = ANSWER.unpack_from(data)
+        self.heard_ns[drive] = self.now_ns
+        return True
+
+    def _take_heartbeat(self, node: int, data: bytearray) -> bool:
+        if len(data) != 1 or data[0] not in _NODE_STATES:
+            return False
+        self.nmt[node], self.heard_ns[node] = data[0], self.now_ns
+        return True
+
+    def _take_emergency(self, drive: int, data: bytearray) -> bool:
+        if len(data) == 8 and drive >= 0:
+            self.error_codes[drive] = CODE.unpack_from(data)[0]
+        return len(data) == 8
+
+    def _ignore(self, node: int, data: bytearray) -> bool:
+        return True
+
     def _take_fd(self, imu: int, data: bytearray) -> bool:
+        if len(data) != FD_BYTES:
+            return False
         counter, stamp, sync = FD_TAIL.unpack_from(data, _TAIL_AT)
         if sync != self._sync:
             return False
@@ -169,6 +154,8 @@ class Decoder:
         return True
 
     def _take_gyroscope(self, imu: int, data: bytearray) -> bool:
+        if len(data) != 8:
+            return False
         counter, sync = CLASSIC_TAIL.unpack_from(data, 6)
         if sync != self._sync:
             return False
@@ -176,7 +163,7 @@ class Decoder:
         return True
 
     def _take_accelerometer(self, imu: int, data: bytearray) -> bool:
-        if not self.received & 1 << LEGS + imu:
+        if len(data) != 8 or not self.received & 1 << LEGS + imu:
             return False
         at = 6 * imu
         self._raw[0][at : at + 6], counter = self._pending[imu]
@@ -186,6 +173,8 @@ class Decoder:
 
     def _take_magnetometer(self, imu: int, data: bytearray) -> bool:
         # Accepted a SYNC late, too: it is sampled so seldom that nothing waits for it.
+        if len(data) != 8:
+            return False
         sync = data[6]
         if sync == self._magnetic_sync[imu] or (self._sync - sync) % SYNC_OVERFLOW > 1:
             return False

@@ -25,7 +25,6 @@ from hil.rigs.canopen.frames import (
     pack_imu,
     pack_truth,
     raw_readings,
-    sensor_scales,
 )
 from hil.rigs.canopen.settings import MAGNETOMETER_INTERVAL, CanopenSettings
 from plant.dynamics.variables import IMU_COUNT
@@ -51,7 +50,7 @@ class EmulatedBus:
 
     def __init__(self, settings: CanopenSettings, machine: Machine, channel: Channel | None = None) -> None:
         self._machine, self._channel, self._fd = machine, channel or _unchanged, settings.bus.fd
-        self._scales = sensor_scales(settings)
+        self._scales = settings.imus.scales
         self._bus = can.Bus(**settings.bus.arguments())
         self._network = Network(self._send)
         self.drives = [EmulatedDrive(leg, settings, machine, self._network, self._send) for leg in range(LEGS)]

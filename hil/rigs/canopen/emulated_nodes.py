@@ -22,7 +22,7 @@ from hil.rigs.canopen.cia402 import (
     settled,
     statusword,
 )
-from hil.rigs.canopen.frames import ANSWER, CobId, NodeState, drive_scales, new_message
+from hil.rigs.canopen.frames import ANSWER, CobId, NodeState, new_message
 from hil.rigs.canopen.objects import (
     COB_ID,
     COMMAND_PDO,
@@ -93,9 +93,7 @@ class EmulatedNode:
         self.local.add_write_callback(self._on_write)
         self.local.add_read_callback(self._on_read)
         self.local.associate_network(network)
-        self.state = NodeState.PRE_OPERATIONAL
-        self.active: frozenset[int] = frozenset()
-        self.heartbeat_ns, self.heartbeat_due = 0, 0
+        self.heartbeat_due = 0
         self._most_bits = _FD_PDO_BITS if fd else _CLASSIC_PDO_BITS
 
     def value(self, index: int, subindex: int = 0) -> int:
@@ -106,7 +104,8 @@ class EmulatedNode:
     def reset(self) -> None:
         """Return to the values of the EDS."""
         self.local.data_store.clear()
-        self.heartbeat_ns, self.active, self.state = 0, frozenset(), NodeState.PRE_OPERATIONAL
+        self.heartbeat_ns, self.state = 0, NodeState.PRE_OPERATIONAL
+        self.active: frozenset[int] = frozenset()
 
     def start(self) -> None:
         """Become operational, with the PDOs that are configured."""
@@ -173,12 +172,8 @@ class EmulatedDrive(EmulatedNode):
     def __init__(self, leg: int, settings: CanopenSettings, machine: Machine, network: Network, send: Send) -> None:
         node, fd = settings.drives.nodes[leg], settings.bus.fd
         self.leg, self.machine = leg, machine
-        self.power, self.code, self.controlword, self.target = PowerState.NOT_READY_TO_SWITCH_ON, 0, 0, 0
-        self.command: tuple[int, int] | None = None
-        self.commanded_ns, self.timeout_ns = 0, 0
-        self.controller, self.consumer_ns, self.controller_ns = 0, 0, 0
-        self.mode = 0
-        self._scale = drive_scales(settings)[leg]
+        self.commanded_ns = 0
+        self._scale = settings.drives.scales[leg]
         self._send = send
         self.answer = new_message(CobId.TPDO + node, dlc=ANSWER.size, is_fd=fd, bitrate_switch=fd)
         super().__init__(f"drive {leg}", node, settings.drive_eds, DRIVE_PDOS, fd, network)
@@ -187,7 +182,7 @@ class EmulatedDrive(EmulatedNode):
         """Return to the values of the EDS, without power."""
         super().reset()
         self.power, self.code, self.controlword, self.target = PowerState.NOT_READY_TO_SWITCH_ON, 0, 0, 0
-        self.command = None
+        self.command: tuple[int, int] | None = None
         self.timeout_ns = self.controller = self.consumer_ns = self.controller_ns = self.mode = 0
         self.request()
 

@@ -8,7 +8,7 @@ import can
 import numpy as np
 
 from hil.rigs import DriveState
-from hil.rigs.canopen.emulated_bus import EmulatedBus
+from hil.rigs.canopen.emulated_bus import Channel, EmulatedBus
 from hil.rigs.canopen.settings import CanopenSettings
 from hil.rigs.emulation.drives import EMULATED, move, sample
 from hil.rigs.emulation.faults import disturb
@@ -67,19 +67,16 @@ class PlantMachine:
             raise self._plant.failure()
 
 
-class FaultyChannel:
-    """The faults of the bus as a `hil.rigs.canopen.emulated_bus.Channel`."""
+def faulty_channel(rig: Record) -> Channel:
+    """The faults of the bus of a rig (dtype `EMULATED`)."""
 
-    def __init__(self, rig: Record) -> None:
-        self._rig = rig
-
-    def __call__(self, frame: can.Message, outgoing: bool) -> Iterator[tuple[float, can.Message]]:
-        """The frames that arrive instead of this one, each with its delay [s]."""
-        del outgoing
-        copies, delay, damaged, held = disturb(self._rig[()], int(self._rig["time_ns"]))
+    def disturbed(frame: can.Message, outgoing: bool) -> Iterator[tuple[float, can.Message]]:
+        copies, delay, damaged, held = disturb(rig[()], int(rig["time_ns"]))
         # CAN frames have a CRC of their own: controllers never pass on a damaged frame.
         for _ in range(0 if damaged else copies):
             yield 1e-9 * delay + (_HELD_BACK_S if held else 0.0), frame
+
+    return disturbed
 
 
 def serve_canopen(
@@ -89,7 +86,7 @@ def serve_canopen(
     report: Callable[[Record, dict[str, Any]], None],
 ) -> None:
     """Serve the bus until `stopped`; `report` is called now and then with the rig and the figures of the bus."""
-    bus = EmulatedBus(settings, machine, FaultyChannel(machine.rig))
+    bus = EmulatedBus(settings, machine, faulty_channel(machine.rig))
     reported = 0.0
 
     def ended() -> bool:

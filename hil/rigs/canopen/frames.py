@@ -5,7 +5,6 @@ cannot be mistaken for the answer to this one. The sample counter beside it stay
 """
 
 import struct
-from collections.abc import Sequence
 from enum import IntEnum
 from typing import Any
 
@@ -13,7 +12,7 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.rigs.canopen.settings import FD_BYTES, CanopenSettings
+from hil.rigs.canopen.settings import FD_BYTES
 from plant.compiled import Record
 from plant.pose import Array
 
@@ -116,13 +115,3 @@ def raw_readings(measurement: Record, scales: NDArray[np.float64]) -> NDArray[np
     """
     lsb = np.clip(np.rint(measurement / scales), NO_VALUE + 1, -NO_VALUE - 1)
     return np.where(np.isfinite(lsb), lsb, NO_VALUE).astype("<i2")
-
-
-def sensor_scales(settings: CanopenSettings) -> NDArray[np.float64]:
-    """Value of an LSB of each axis (3, 7, 3) [rad/s, m/s^2, uT], with its sign."""
-    return np.multiply.outer(settings.imus.scales, np.array(settings.imus.signs, np.float64))
-
-
-def drive_scales(settings: CanopenSettings) -> Sequence[float]:
-    """Counts/s per m/s of each drive, with its sign."""
-    return [sign * settings.drives.counts_per_metre for sign in settings.drives.signs]

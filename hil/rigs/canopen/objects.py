@@ -86,8 +86,3 @@ IMU_PDOS_FD = (Pdo(0x1800, 0x1A00, CobId.TPDO, 1, (*_ALL_AXES, _SAMPLE_COUNTER, 
 def imu_pdos(fd: bool) -> tuple[Pdo, ...]:
     """The PDOs of an IMU."""
     return IMU_PDOS_FD if fd else IMU_PDOS_CLASSIC
-
-
-def magnetometer_turn(imu: int) -> int:
-    """SYNC start value of an IMU's magnetometer on classic CAN; the magnetometers take turns."""
-    return imu + 1

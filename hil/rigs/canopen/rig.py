@@ -6,7 +6,6 @@ thread runs beside it. Commands take effect at the SYNC after them.
 
 import struct
 import time
-from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
@@ -17,7 +16,7 @@ from hil.rigs import ANSWERED, SILENT, DriveState, Identity, Request, RigError
 from hil.rigs.canopen.cia402 import Controlword, controlword_towards, drive_state, state_of
 from hil.rigs.canopen.configuration import configure_drive, configure_imu, switch_on
 from hil.rigs.canopen.decoder import Decoder
-from hil.rigs.canopen.frames import COMMAND, SYNC_OVERFLOW, CobId, NmtCommand, NodeState, drive_scales, new_message
+from hil.rigs.canopen.frames import COMMAND, SYNC_OVERFLOW, CobId, NmtCommand, NodeState, new_message
 from hil.rigs.canopen.objects import Object
 from hil.rigs.canopen.sdo import BUS_ERRORS, MOST_DRAINED, RemoteNode
 from hil.rigs.canopen.settings import CanopenSettings
@@ -65,7 +64,7 @@ class CanopenRig:
         self._answer_ns = round(period * settings.controller.answer_share * 1e9)
         self._silence_ns = round(settings.drives.silence * 1e9)
         self._heartbeat_ns, self._heartbeat_due = round(settings.controller.heartbeat * 1e9), 0
-        self._scales = drive_scales(settings)
+        self._scales = settings.drives.scales
         self._misses = [0] * self.decoder.all_frames.bit_length()
         self._missed = False
         fd = settings.bus.fd
@@ -82,12 +81,17 @@ class CanopenRig:
             RigError: there is no such bus, or a node does not boot up.
             InputError: an EDS file cannot be used.
         """
-        bus = self._settings.bus
+        settings = self._settings
+        bus, drives, imus = settings.bus, settings.drives, settings.imus
         try:
             self._bus = can.Bus(**bus.arguments())
             self.decoder, self._misses = Decoder(self._settings), [0] * len(self._misses)
             network = canopen.Network(self._bus)
-            self._nodes = [RemoteNode(name, node, eds, network, self._receive) for name, node, eds in self._parts()]
+            self._nodes = [
+                RemoteNode(f"{name} {number}", node, eds, network, self._receive)
+                for name, nodes, eds in (("drive", drives.nodes, settings.drive_eds), ("IMU", imus.nodes, settings.imu_eds))
+                for number, node in enumerate(nodes)
+            ]
             within = f"{self._settings.controller.boot_timeout:g} s"
             complaint = f"no boot-up within {within} from {{}}: check power, wiring, node ids and bit rate"
             self._lead_nodes(NmtCommand.RESET_NODE, NodeState.BOOT_UP, complaint, broadcast=False)
@@ -190,24 +194,27 @@ class CanopenRig:
         if self._bus is None:
             raise RigError("the CANopen rig is not open: open it first")
 
-    def _parts(self) -> Iterator[tuple[str, int, Any]]:
-        settings = self._settings
-        for drive, node in enumerate(settings.drives.nodes):
-            yield f"drive {drive}", node, settings.drive_eds
-        for imu, node in enumerate(settings.imus.nodes):
-            yield f"IMU {imu}", node, settings.imu_eds
+    def _read(self, timeout: float) -> can.Message | None:
+        """The next frame, decoded; None if none arrives in time [s].
 
-    def _receive(self, timeout: float) -> can.Message | None:
-        """The next frame, decoded; None if none arrives in time [s], or if it cannot be read."""
+        Raises:
+            CanError: the frame cannot be read; it is counted as refused.
+        """
         try:
             message: can.Message | None = self._bus.recv(timeout)
         except can.CanError:
             self.decoder.refuse()
-            return None
+            raise
         if message is not None:
             self.decoder.now_ns = time.monotonic_ns()
             self.decoder.take(message)
         return message
+
+    def _receive(self, timeout: float) -> can.Message | None:
+        """The next frame, decoded; None if none arrives in time [s], or if it cannot be read."""
+        with suppress(can.CanError):
+            return self._read(timeout)
+        return None
 
     def _command_nodes(self, command: NmtCommand, node: int = 0) -> None:
         """Send an NMT command to a node, by default to all."""
@@ -237,14 +244,9 @@ class CanopenRig:
     def _drain(self) -> None:
         """Read the frames since the last exchange; as PDOs they are too late for it."""
         for _ in range(MOST_DRAINED):
-            try:
-                message = self._bus.recv(0)
-            except can.CanError:
-                self.decoder.refuse()
-                continue
-            if message is None:
-                return
-            self.decoder.take(message)
+            with suppress(can.CanError):
+                if self._read(0.0) is None:
+                    return
 
     def _send_commands(self, command: Array, request: int, feedback: Record) -> None:
         statuswords, limit, sent = self.decoder.statuswords, self._settings.drives.velocity_limit, feedback["sent"]
@@ -259,24 +261,14 @@ class CanopenRig:
 
     def _collect(self, deadline: int) -> None:
         """Read the answers to SYNC, until all awaited frames are there or until the deadline."""
-        decoder, receive = self.decoder, self._bus.recv
-        awaited, errors = decoder.awaited, 0
-        while awaited & ~decoder.received:
-            now = time.monotonic_ns()
-            if now >= deadline:
-                return
-            decoder.now_ns = now
+        decoder, awaited, errors = self.decoder, self.decoder.awaited, 0
+        while awaited & ~decoder.received and errors < _MOST_ERRORS:
+            left = deadline - time.monotonic_ns()
             try:
-                message = receive((deadline - now) * 1e-9)
-            except can.CanError:
-                decoder.refuse()
-                errors += 1
-                if errors == _MOST_ERRORS:
+                if left <= 0 or self._read(left * 1e-9) is None:
                     return
-                continue
-            if message is None:
-                return
-            decoder.take(message)
+            except can.CanError:
+                errors += 1
 
     def _note_missing(self, missing: int) -> None:
         """Stop waiting for frames that have been missing for a while."""

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_type_hints
 
 import canopen
+import numpy as np
+from numpy.typing import NDArray
 
 from hil.rigs import RigError
 from plant.dynamics.variables import IMU_COUNT
@@ -53,38 +55,30 @@ def _positive(name: str, value: float) -> None:
         raise InputError(f"{name} is {value:g}; it must be positive and finite")
 
 
-def _node_ids(count: int) -> Check:
-    def check(name: str, nodes: tuple[Any, ...]) -> None:
-        _check_count(name, nodes, count)
-        for node in nodes:
-            if type(node) is not int or not 1 <= node <= _LARGEST_NODE:
-                raise InputError(f"{name} has {node!r}; a node id is a number from 1 to {_LARGEST_NODE}")
+def _node_id(name: str, value: object) -> None:
+    if type(value) is not int or not 1 <= value <= _LARGEST_NODE:
+        raise InputError(f"{name} is {value!r}; a node id is a number from 1 to {_LARGEST_NODE}")
+
+
+def _one_of(*values: object) -> Check:
+    def check(name: str, value: object) -> None:
+        if type(value) is not type(values[0]) or value not in values:
+            raise InputError(f"{name} is {value!r}; it must be one of {', '.join(map(str, values))}")
 
     return check
 
 
-def _signs(count: int) -> Check:
-    def check(name: str, signs: Any) -> None:
-        if not isinstance(signs, tuple) or len(signs) != count or any(type(s) is not int or s not in (-1, 1) for s in signs):
-            raise InputError(f"{name} is {signs!r}; it must be {count} numbers, each 1 or -1")
+def _list_of(count: int, check_element: Check) -> Check:
+    def check(name: str, values: Any) -> None:
+        if not isinstance(values, tuple) or len(values) != count:
+            raise InputError(f"{name} is {values!r}; it must be a list of {count}")
+        for i, value in enumerate(values):
+            check_element(f"{name}[{i}]", value)
 
     return check
 
 
-def _imu_signs(name: str, signs: tuple[Any, ...]) -> None:
-    _check_count(name, signs, IMU_COUNT)
-    for imu, each in enumerate(signs):
-        _signs(3)(f"{name} of IMU {imu}", each)
-
-
-def _check_count(name: str, values: tuple[Any, ...], count: int) -> None:
-    if len(values) != count:
-        raise InputError(f"{name} has {len(values)} entries; {count} are needed")
-
-
-def _interface(name: str, value: str) -> None:
-    if value not in INTERFACES:
-        raise InputError(f"{name} is {value!r}; it must be one of {', '.join(INTERFACES)}")
+_TIME = _within(0.001, _LONGEST_TIME)
 
 
 class _Table:
@@ -103,7 +97,7 @@ class BusSettings(_Table):
     """The bus, as python-can names it."""
 
     table: ClassVar[str] = "bus"
-    interface: str = _entry(f"one of {', '.join(INTERFACES)}", _interface)
+    interface: str = _entry(f"one of {', '.join(INTERFACES)}", _one_of(*INTERFACES))
     channel: str = _entry("such as can0, or the multicast group")
     port: int = _entry("port of the multicast group", _within(1, 65535))
     hop_limit: int = _entry("hop limit of the multicast group; 0 stays on this machine", _within(0, 255))
@@ -130,8 +124,8 @@ class ControllerSettings(_Table):
     """The controller's node."""
 
     table: ClassVar[str] = "controller"
-    node: int = _entry("node id, for the heartbeat", _within(1, _LARGEST_NODE))
-    heartbeat: float = _entry("interval of the heartbeats [s]", _within(0.001, _LONGEST_TIME))
+    node: int = _entry("node id, for the heartbeat", _node_id)
+    heartbeat: float = _entry("interval of the heartbeats [s]", _TIME)
     heartbeat_timeout: float = _entry("time without a heartbeat after which the drives stop by themselves [s]")
     answer_share: float = _entry("share of the period that an exchange waits for answers", _within(0.05, 0.95))
     boot_timeout: float = _entry("time for all nodes to boot up [s]", _within(0.01, 60.0))
@@ -146,19 +140,17 @@ class DriveSettings(_Table):
     """The six drives, by leg."""
 
     table: ClassVar[str] = "drives"
-    nodes: tuple[int, ...] = _entry("node ids", _node_ids(LEGS))
-    signs: tuple[int, ...] = _entry("signs of the motors' velocities when the legs extend", _signs(LEGS))
+    nodes: tuple[int, ...] = _entry("node ids", _list_of(LEGS, _node_id))
+    signs: tuple[int, ...] = _entry("signs of the motors' velocities when the legs extend", _list_of(LEGS, _one_of(1, -1)))
     eds: str = _entry("electronic data sheet; a relative path begins at the folder of the settings file")
     screw_lead: float = _entry("lead of the actuators' screws [m per turn]", _positive)
     gear_ratio: float = _entry("turns of the motor per turn of the screw", _positive)
     counts_per_turn: int = _entry("of the motor; velocities are in counts per second", _within(1, _INT32))
     velocity_limit: float = _entry("larger commands are cut to it [m/s]", _positive)
     quick_stop_deceleration: float = _entry("[m/s^2]", _positive)
-    heartbeat: float = _entry("interval of the heartbeats [s]", _within(0.001, _LONGEST_TIME))
+    heartbeat: float = _entry("interval of the heartbeats [s]", _TIME)
     silence: float = _entry("time after which a silent drive counts as not ready [s]")
-    command_timeout: float = _entry(
-        "time without SYNC and commands after which a drive stops by itself [s]", _within(0.001, _LONGEST_TIME)
-    )
+    command_timeout: float = _entry("time without SYNC and commands after which a drive stops by itself [s]", _TIME)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -174,24 +166,30 @@ class DriveSettings(_Table):
         """Counts of the motor per metre of the leg, and so counts per second per m/s."""
         return self.counts_per_turn * self.gear_ratio / self.screw_lead
 
+    @property
+    def scales(self) -> list[float]:
+        """Counts/s per m/s of each drive, with its sign."""
+        return [sign * self.counts_per_metre for sign in self.signs]
+
 
 @dataclass(frozen=True)
 class ImuSettings(_Table):
     """The seven IMUs: those on the legs, and last the platform's."""
 
     table: ClassVar[str] = "imus"
-    nodes: tuple[int, ...] = _entry("node ids", _node_ids(IMU_COUNT))
-    signs: tuple[tuple[int, ...], ...] = _entry("signs of each IMU's three axes", _imu_signs)
+    nodes: tuple[int, ...] = _entry("node ids", _list_of(IMU_COUNT, _node_id))
+    signs: tuple[tuple[int, ...], ...] = _entry("signs of the axes", _list_of(IMU_COUNT, _list_of(3, _one_of(1, -1))))
     eds: str = _entry("electronic data sheet; a relative path begins at the folder of the settings file")
     gyroscope_scale: float = _entry("value of one LSB of 16 bits [rad/s]", _positive)
     accelerometer_scale: float = _entry("value of one LSB of 16 bits [m/s^2]", _positive)
     magnetometer_scale: float = _entry("value of one LSB of 16 bits [uT]", _positive)
-    heartbeat: float = _entry("interval of the heartbeats [s]", _within(0.001, _LONGEST_TIME))
+    heartbeat: float = _entry("interval of the heartbeats [s]", _TIME)
 
     @property
-    def scales(self) -> tuple[float, float, float]:
-        """Scales of gyroscope, accelerometer and magnetometer."""
-        return self.gyroscope_scale, self.accelerometer_scale, self.magnetometer_scale
+    def scales(self) -> NDArray[np.float64]:
+        """Value of an LSB of each axis (3, 7, 3) [rad/s, m/s^2, uT], with its sign."""
+        scales = self.gyroscope_scale, self.accelerometer_scale, self.magnetometer_scale
+        return np.multiply.outer(scales, np.array(self.signs, np.float64))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from hil.rigs import DriveState, Request
-from hil.rigs.emulation.faults import FAULT, MOST_FAULTS, FaultKind, draw_normal, is_active
+from hil.rigs.emulation.faults import FAULT, MOST_FAULTS, FaultKind, draw_normal, find_fault, is_active
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
 from plant.errors import InputError
@@ -116,20 +116,14 @@ def sample(fmu: Record, imu: Record, rig: Record, now_ns: int) -> int:
             _turn(r, f.index, f.size)
     measure(imu, r.ideal, c.imu)
     for k in range(IMU_COUNT):
-        silent = frozen = False
-        noise = 0.0
-        for i in range(r.faults):
-            f = r.fault[i]
-            if f.index == k and is_active(f, r.enabled_ns, r.time_ns):
-                silent = silent or f.kind == FaultKind.IMU_DEAD
-                frozen = frozen or f.kind == FaultKind.IMU_FROZEN
-                noise = f.size if f.kind == FaultKind.IMU_NOISY else noise
-        if silent:
+        if find_fault(r, FaultKind.IMU_DEAD, k) >= 0:
             continue
         r.sequence[k] += 1
         r.sample_ns[k] = r.time_ns
-        if frozen:
+        if find_fault(r, FaultKind.IMU_FROZEN, k) >= 0:
             continue
+        noisy = find_fault(r, FaultKind.IMU_NOISY, k)
+        noise = r.fault[noisy].size if noisy >= 0 else 0.0
         for kind in range(3):
             for j in range(3):
                 r.measurement[kind, k, j] = c.imu[kind, k, j]
@@ -179,28 +173,17 @@ def move(fmu: Record, rig: Record, now_ns: int) -> int:
 @kernel
 def _step_drive(r: Record, k: int, period: float) -> None:
     """Update a drive's state and velocity for a step of `period` [s]."""
-    broken = unpowered = ignoring = stuck = running = False
-    runaway = 0.0
-    code = 0
-    for i in range(r.faults):
-        f = r.fault[i]
-        if f.index == k and is_active(f, r.enabled_ns, r.time_ns):
-            unpowered = unpowered or f.kind == FaultKind.DRIVE_UNPOWERED
-            ignoring = ignoring or f.kind == FaultKind.DRIVE_IGNORES
-            stuck = stuck or f.kind == FaultKind.DRIVE_STUCK
-            if f.kind == FaultKind.DRIVE_FAULTS:
-                broken, code = True, int(f.size)
-            if f.kind == FaultKind.DRIVE_RUNS_AWAY:
-                running, runaway = True, f.size
-    if unpowered:
+    broken, stuck = find_fault(r, FaultKind.DRIVE_FAULTS, k), find_fault(r, FaultKind.DRIVE_STUCK, k)
+    running, ignoring = find_fault(r, FaultKind.DRIVE_RUNS_AWAY, k), find_fault(r, FaultKind.DRIVE_IGNORES, k)
+    if find_fault(r, FaultKind.DRIVE_UNPOWERED, k) >= 0:
         r.drive[k], r.velocity[k] = DriveState.NOT_READY, 0.0
         return
     if r.drive[k] == DriveState.NOT_READY:
         r.drive[k], r.code[k] = DriveState.FAULTY, POWER_LOST
-    if broken and r.drive[k] != DriveState.FAULTY:
-        r.drive[k], r.code[k] = DriveState.FAULTY, code
+    if broken >= 0 and r.drive[k] != DriveState.FAULTY:
+        r.drive[k], r.code[k] = DriveState.FAULTY, int(r.fault[broken].size)
     if r.drive[k] == DriveState.FAULTY:
-        if r.reset[k] != 0 and not broken and r.velocity[k] == 0.0:
+        if r.reset[k] != 0 and broken < 0 and r.velocity[k] == 0.0:
             r.drive[k], r.code[k] = DriveState.READY, 0
     elif r.request[k] == Request.BRAKED:
         r.drive[k] = DriveState.READY
@@ -211,11 +194,11 @@ def _step_drive(r: Record, k: int, period: float) -> None:
     elif r.request[k] == Request.QUICK_STOP and r.drive[k] == DriveState.FOLLOWING:
         r.drive[k] = DriveState.QUICK_STOPPING
     r.reset[k] = 0
-    if stuck:
+    if stuck >= 0:
         r.velocity[k] = 0.0
-    elif running and r.request[k] != Request.BRAKED:
-        r.velocity[k] = runaway
-    elif ignoring and r.request[k] != Request.BRAKED:
+    elif running >= 0 and r.request[k] != Request.BRAKED:
+        r.velocity[k] = r.fault[running].size
+    elif ignoring >= 0 and r.request[k] != Request.BRAKED:
         return
     elif r.drive[k] == DriveState.FOLLOWING:
         r.velocity[k] = min(max(r.target[k], -r.speed_limit), r.speed_limit)

@@ -114,6 +114,17 @@ def is_active(f: Record, enabled_ns: int, now_ns: int) -> bool:
 
 
 @kernel
+def find_fault(rig: Record, kind: int, index: int) -> int:
+    """Place of the latest active fault of this kind and index in a rig (dtype `hil.rigs.emulation.drives.EMULATED`), or -1."""
+    place = -1
+    for i in range(rig.faults):
+        f = rig.fault[i]
+        if f.kind == kind and f.index == index and is_active(f, rig.enabled_ns, rig.time_ns):
+            place = i
+    return place
+
+
+@kernel
 def disturb(rig: Record, now_ns: int) -> tuple[int, int, bool, bool]:
     """The effect of the bus's faults on a message of a rig (dtype `hil.rigs.emulation.drives.EMULATED`): the number of copies
     that arrive, their delay [ns], whether they are damaged, and whether they arrive after the next message.

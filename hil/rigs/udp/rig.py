@@ -112,6 +112,8 @@ class UdpRig:
         self.link.socket["reset"] = 1
         ready, feedback = self._exchange_until(Request.BRAKED, (DriveState.READY, DriveState.FOLLOWING), _ARMING_S)
         self.link.socket["reset"] = 0
+        # The next exchange comes a period later.
+        time.sleep(self.command_delay)
         if not ready:
             states = ", ".join(f"{k}: {int(drive)}" for k, drive in enumerate(feedback["drive"]))
             codes = ", ".join(f"{int(code):#06x}" for code in feedback["drive_code"])

@@ -28,7 +28,7 @@ from hil.rigs import (
 from hil.rigs.canopen.cia402 import HEARTBEAT_LOST, PDO_LOST
 from hil.rigs.canopen.decoder import Decoder, advance_of
 from hil.rigs.canopen.emulated_bus import EmulatedBus
-from hil.rigs.canopen.frames import ANSWER, CobId, drive_scales, new_message, pack_imu, raw_readings, sensor_scales
+from hil.rigs.canopen.frames import ANSWER, CobId, new_message, pack_imu, raw_readings
 from hil.rigs.canopen.rig import CanopenRig
 from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings, classic_bits, fd_duration
 from plant.errors import InputError
@@ -468,7 +468,7 @@ def test_it_can_be_opened_again():
 def test_what_is_refused_changes_nothing():
     config = settings()
     decoder = Decoder(config)
-    scales = sensor_scales(config)
+    scales = config.imus.scales
     measurement = np.fromfunction(lambda s, i, a: 0.5 * s + 0.01 * i + 0.1 * a, (3, 7, 3))
     measurement[2, 4] = np.nan
     raw = raw_readings(measurement, scales)
@@ -507,15 +507,15 @@ def test_counters_that_wrap():
         ({"bus": {"speed": 1}}, "no entry 'speed'"),
         ({"bus": {"fd": 1}}, "fd must be a bool"),
         ({"bus": {"bitrate": 2_000_000}}, "bitrate is 2e.06; it must be from 10000 to 1e.06"),
-        ({"drives": {"nodes": [1, 2, 3, 4, 5]}}, "nodes has 5 entries; 6 are needed"),
-        ({"drives": {"nodes": [1, 2, 3, 4, 5, 128]}}, "128; a node id is a number from 1 to 127"),
+        ({"drives": {"nodes": [1, 2, 3, 4, 5]}}, r"nodes is .*; it must be a list of 6"),
+        ({"drives": {"nodes": [1, 2, 3, 4, 5, 128]}}, r"nodes\[5\] is 128; a node id is a number from 1 to 127"),
         ({"drives": {"nodes": [1, 2, 3, 4, 5, 11]}}, "IMU 0 and drive 5 have the same node id 11"),
-        ({"drives": {"signs": [1, 1, 1, 1, 1, 2]}}, "signs is .*; it must be 6 numbers, each 1 or -1"),
+        ({"drives": {"signs": [1, 1, 1, 1, 1, 2]}}, r"signs\[5\] is 2; it must be one of 1, -1"),
         ({"drives": {"screw_lead": 0.0}}, "screw_lead is 0; it must be positive"),
         ({"drives": {"counts_per_turn": 2**31 - 1}}, "velocity_limit is .* counts, more than 32 bits hold"),
         ({"drives": {"eds": "none.eds"}}, "there is no EDS file"),
         ({"imus": {"gyroscope_scale": float("nan")}}, "gyroscope_scale is nan"),
-        ({"imus": {"signs": [[1, 1, 1]] * 6}}, "signs has 6 entries"),
+        ({"imus": {"signs": [[1, 1, 1]] * 6}}, "signs is .*; it must be a list of 7"),
         ({"imus": {"nodes": 3}}, "nodes must be a list"),
         ({"controller": {"heartbeat_timeout": 0.03}}, "heartbeat_timeout is 0.03; it must be from 0.04"),
         ({"gears": {}}, r"a table \[gears\] that is not known"),
@@ -599,4 +599,4 @@ def test_two_processes_by_multicast():
 
 def test_scales_have_signs():
     config = settings(drives={"signs": [1, -1, 1, -1, 1, -1]})
-    assert drive_scales(config)[:2] == [65536 / 0.005, -65536 / 0.005]
+    assert config.drives.scales[:2] == [65536 / 0.005, -65536 / 0.005]
