@@ -1,7 +1,7 @@
-"""The errors of gough: one hierarchy, each also the builtin kind that fits it.
+"""The errors of gough: one hierarchy, in which each error is also a fitting builtin error.
 
-Every message names the offending value, the limit it breaks and the remedy. The compiled kernels never raise; they
-report by return code, and the public functions around them raise from here.
+Every message names the offending value, the limit that it breaks and the remedy. Compiled kernels never raise: they return
+codes, and the public functions around them raise these errors.
 """
 
 

@@ -27,8 +27,8 @@ def check_writable(path: Path) -> None:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write `content` to `path`; the file takes its place only when it is complete. Links are followed, and what is no
-    regular file, such as a device, is written to and not replaced.
+    """Write `content` to `path`, which appears only when it is complete. Links are followed; a device or another irregular
+    file is written to and not replaced.
 
     Raises:
         InputError: the file cannot be written.
@@ -54,22 +54,22 @@ def write_whole(path: Path, content: bytes) -> None:
 
 @contextmanager
 def temporary_folder(prefix: str) -> Iterator[Path]:
-    """A temporary folder, removed at the end; when its process has died, the next to ask for one with this prefix removes it.
+    """A temporary folder, removed at the end. If its process dies, the next call with this prefix removes it.
 
-    A lock in it tells: it goes with the process, however that ends.
+    A lock in the folder shows that the process lives; the system releases it when the process ends.
     """
     _sweep(prefix)
     with tempfile.TemporaryDirectory(prefix=prefix, ignore_cleanup_errors=True) as name:
         made = Path(name, f"{_LOCK}.new")
         with made.open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            # Whoever sees a lock of this name sees one that is held.
+            # A lock of this name is always held.
             made.rename(made.with_name(_LOCK))
             yield made.parent
 
 
 def _sweep(prefix: str) -> None:
-    """Remove the temporary folders whose process is gone."""
+    """Remove the temporary folders of dead processes."""
     for lock in Path(tempfile.gettempdir()).glob(f"{prefix}*/{_LOCK}"):
         with suppress(OSError), lock.open("r+") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

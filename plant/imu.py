@@ -1,9 +1,9 @@
-"""IMU imperfections: what lies between the ideal signals of a plant and the raw data that a controller reads.
+"""IMU imperfections: from the ideal signals of a plant to the raw data of its IMUs.
 
-The raw reading is the inverse of the paper's (37), `a_cal = T S (a_u + b)`: with the mounting misalignment M,
-`a_u = S^-1 T^-1 M a - b + noise`, then low-pass (exact for a signal that is linear between samples, so that it delays by its
-time constant at any rate), delay, range, resolution and dropouts. All noise comes from a
-counter-based generator keyed by (seed, IMU, cycle), so any cycle can be made again on its own.
+The raw reading inverts the paper's (37), `a_cal = T S (a_u + b)`: with the mounting misalignment M,
+`a_u = S^-1 T^-1 M a - b + noise`. A low-pass, a delay, range, resolution and dropouts follow. The low-pass is exact for signals
+that are linear between samples, so it delays by its time constant at any rate. All noise comes from a counter-based generator
+keyed by (seed, IMU, cycle), so every cycle can be reproduced on its own.
 """
 
 import re
@@ -71,10 +71,10 @@ class ImuModel:
     Attributes:
         name: of the preset.
         gyroscope, accelerometer, magnetometer: errors in rad/s, m/s^2, uT.
-        magnetometer_rate: samples per second; between them the last one stands [Hz].
+        magnetometer_rate: samples per second; each is repeated until the next [Hz].
         misalignment: greatest angle of the mounting about each axis, uniform [rad].
         delay: pure delay [s], rounded to whole cycles.
-        dropout: probability that a cycle repeats the sample before.
+        dropout: probability that a cycle repeats the previous sample.
     """
 
     name: str
@@ -98,69 +98,55 @@ class ImuModel:
 
     @property
     def latency(self) -> float:
-        """By how much gyroscope and accelerometer, on average, are behind [s]: the delay, and the low-pass's time constant."""
+        """Mean delay of gyroscope and accelerometer [s]: the pure delay and the low-pass's time constant."""
         return self.delay + sum(0.5 / (2.0 * pi * sensor.bandwidth) for sensor in (self.gyroscope, self.accelerometer))
 
 
 _MPU9150_MAGNETOMETER = SensorErrors(noise=0.05, bias=(20.0, 20.0), scale=0.05, cross_axis=0.05, reach=1200.0, resolution=0.3)
-"""With the hard and soft iron of a board beside a motor; the data sheet says noise, range and resolution."""
+"""With the hard and soft iron of a board beside a motor; noise, range and resolution are those of the data sheet."""
 
 _CALIBRATED_MAGNETOMETER = replace(_MPU9150_MAGNETOMETER, bias=(0.3, 0.3), scale=5e-3, cross_axis=5e-3)
 
-PRESETS = {
-    model.name: model
-    for model in (
-        ImuModel("ideal"),
-        # InvenSense MPU-9150, +-4 g, +-250 deg/s, widest filter; noise, bias and scale as its product specification has them.
-        ImuModel(
-            "mpu9150",
-            gyroscope=SensorErrors(
-                noise=radians(0.005), bias=(radians(20.0), radians(20.0)), scale=0.03, cross_axis=0.02,
-                bandwidth=256.0, reach=radians(250.0), resolution=radians(1.0 / 131.0),
-            ),
-            accelerometer=SensorErrors(
-                noise=0.4 * MILLI_G, bias=(50.0 * MILLI_G, 80.0 * MILLI_G), scale=0.03, cross_axis=0.02,
-                bandwidth=260.0, reach=4.0 * STANDARD_GRAVITY, resolution=STANDARD_GRAVITY / 8192.0,
-            ),
-            magnetometer=_MPU9150_MAGNETOMETER,
-            magnetometer_rate=100.0,
-            misalignment=radians(1.0),
-        ),
-        ImuModel(
-            "mpu9150-calibrated",
-            gyroscope=SensorErrors(
-                noise=radians(0.005), bias=(radians(0.2), radians(0.2)),
-                bandwidth=256.0, reach=radians(250.0), resolution=radians(1.0 / 131.0),
-            ),
-            accelerometer=SensorErrors(
-                noise=0.4 * MILLI_G, bias=(MILLI_G, MILLI_G), scale=1e-3,
-                bandwidth=260.0, reach=4.0 * STANDARD_GRAVITY, resolution=STANDARD_GRAVITY / 8192.0,
-            ),
-            magnetometer=_CALIBRATED_MAGNETOMETER,
-            magnetometer_rate=100.0,
-        ),
-        # TDK ICM-42688-P after the same calibration, without a magnetometer worth its name.
-        ImuModel(
-            "icm42688",
-            gyroscope=SensorErrors(
-                noise=radians(0.0028), bias=(radians(0.2), radians(0.2)),
-                bandwidth=400.0, reach=radians(250.0), resolution=radians(1.0 / 131.0),
-            ),
-            accelerometer=SensorErrors(
-                noise=0.07 * MILLI_G, bias=(MILLI_G, MILLI_G), scale=1e-3,
-                bandwidth=400.0, reach=4.0 * STANDARD_GRAVITY, resolution=STANDARD_GRAVITY / 8192.0,
-            ),
-            magnetometer=_CALIBRATED_MAGNETOMETER,
-            magnetometer_rate=100.0,
-        ),
-    )
-}  # fmt: skip
+# InvenSense MPU-9150, +-4 g, +-250 deg/s, widest filter; noise, bias and scale as in its product specification.
+_MPU9150 = ImuModel(
+    "mpu9150",
+    gyroscope=SensorErrors(
+        noise=radians(0.005), bias=(radians(20.0), radians(20.0)), scale=0.03, cross_axis=0.02,
+        bandwidth=256.0, reach=radians(250.0), resolution=radians(1.0 / 131.0),
+    ),
+    accelerometer=SensorErrors(
+        noise=0.4 * MILLI_G, bias=(50.0 * MILLI_G, 80.0 * MILLI_G), scale=0.03, cross_axis=0.02,
+        bandwidth=260.0, reach=4.0 * STANDARD_GRAVITY, resolution=STANDARD_GRAVITY / 8192.0,
+    ),
+    magnetometer=_MPU9150_MAGNETOMETER,
+    magnetometer_rate=100.0,
+    misalignment=radians(1.0),
+)  # fmt: skip
+
+_CALIBRATED = replace(
+    _MPU9150,
+    name="mpu9150-calibrated",
+    gyroscope=replace(_MPU9150.gyroscope, bias=(radians(0.2), radians(0.2)), scale=0.0, cross_axis=0.0),
+    accelerometer=replace(_MPU9150.accelerometer, bias=(MILLI_G, MILLI_G), scale=1e-3, cross_axis=0.0),
+    magnetometer=_CALIBRATED_MAGNETOMETER,
+    misalignment=0.0,
+)
+
+# TDK ICM-42688-P after the same calibration; it has no magnetometer, so the MPU-9150's is used.
+_ICM42688 = replace(
+    _CALIBRATED,
+    name="icm42688",
+    gyroscope=replace(_CALIBRATED.gyroscope, noise=radians(0.0028), bandwidth=400.0),
+    accelerometer=replace(_CALIBRATED.accelerometer, noise=0.07 * MILLI_G, bandwidth=400.0),
+)
+
+PRESETS = {model.name: model for model in (ImuModel("ideal"), _MPU9150, _CALIBRATED, _ICM42688)}
 
 _LONGEST_DELAY = 32
 
 
 def axes_matrix(axes: str) -> Array:
-    """The matrix (3, 3) that gives the readings of axes such as "+y-x+z", 0 for one that reads nothing."""
+    """The matrix (3, 3) of axes such as "+y-x+z", with 0 for an axis that reads nothing."""
     units = dict(zip(("+x", "+y", "+z", "-x", "-y", "-z", "0"), (*np.eye(3), *-np.eye(3), np.zeros(3)), strict=True))
     return np.array([units[axis] for axis in re.findall("[+-].|0", axes)])
 
@@ -189,7 +175,7 @@ IMU_STATE = np.dtype(
     ],
     align=True,
 )
-"""Constants and state of the imperfections of seven IMUs; a copy of it is a snapshot."""
+"""Constants and state of the imperfections of seven IMUs; a copy is a snapshot."""
 
 
 Word = np.uint64 | int
@@ -257,7 +243,7 @@ def _constant_errors(sensor: SensorErrors, random: np.random.Generator) -> tuple
 
 
 def _smoothing(bandwidth: float, period: float) -> tuple[float, float]:
-    """What a first-order low-pass takes over a period of the value before, and of the new one, from what it had."""
+    """The shares of the previous and of the new value in a step of a first-order low-pass."""
     if bandwidth == inf:
         return 0.0, 1.0
     ratio = 2.0 * pi * bandwidth * period
@@ -310,7 +296,7 @@ _MEASURE, _MAGNETIC, _WALK = 0, 1, 2
 
 @kernel
 def measure(state: Record, ideal: Array, measurement: Array) -> None:
-    """Turn ideal signals (3, 7, 3) into what the IMUs read this cycle (3, 7, 3); advances `state` by one cycle."""
+    """Write the IMUs' raw readings (3, 7, 3) of ideal signals (3, 7, 3), and advance `state` by one cycle."""
     s = state[()]
     first = s.cycle == 0
     normals = s.normals

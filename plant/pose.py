@@ -1,8 +1,8 @@
-"""Poses and rotations: what every other room says positions and attitudes with.
+"""Poses and rotations, for all rooms.
 
 A pose is `position` (3,) [m], the origin of the platform frame {2} seen in the base frame {1}, and `rotation` (3, 3),
-which maps vectors of {2} to {1}. Quaternions are unit and w first. The paper's (14), (15) and (32) print the transposes
-of the rotations that its (1) needs; here every rotation is the active one.
+which maps vectors of {2} to {1}. Quaternions are unit and w first. Every rotation is the active one; the paper's (14), (15)
+and (32) print the transposes of the rotations that its (1) needs.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from plant.errors import InputError
 Array = NDArray[np.floating[Any]]
 
 UNIT_TOLERANCE = 1e-3
-"""How far a unit quaternion or direction given by a user may be off unit length before it is refused."""
+"""A user's unit quaternion or direction is refused if its length differs from 1 by more than this."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,10 +29,10 @@ class Pose:
 
 
 def numbers(value: ArrayLike, name: str, shape: tuple[int, ...] | str) -> Array:
-    """A float copy of `value`; `shape` is only what an error says was expected.
+    """A float copy of `value`; `shape` is the expected shape, for the error message only.
 
     Raises:
-        InputError: it is not an array of numbers.
+        InputError: `value` is not an array of numbers.
     """
     try:
         given = np.asarray(value)
@@ -44,7 +44,7 @@ def numbers(value: ArrayLike, name: str, shape: tuple[int, ...] | str) -> Array:
 
 
 def checked_array(value: ArrayLike, shape: tuple[int, ...], name: str, *, allow_nan: bool = False) -> Array:
-    """Return a read-only float copy of `value` after checking its shape and that it is finite.
+    """A read-only float copy of `value`, which must have this shape and be finite.
 
     Raises:
         InputError: wrong shape, not numeric, or not finite (NaN passes with `allow_nan`; infinity never).
@@ -61,10 +61,10 @@ def checked_array(value: ArrayLike, shape: tuple[int, ...], name: str, *, allow_
 
 
 def checked_unit(value: ArrayLike, size: int, name: str) -> Array:
-    """Return a unit vector after checking that it was within 1e-3 of unit length; the rest is normalised away.
+    """The normalised vector of one whose length is 1 within 1e-3.
 
     Raises:
-        InputError: wrong shape, not finite, or off unit length by more than 1e-3.
+        InputError: wrong shape, not finite, or another length.
     """
     array = checked_array(value, (size,), name)
     norm = float(np.linalg.norm(array))
@@ -76,7 +76,7 @@ def checked_unit(value: ArrayLike, size: int, name: str) -> Array:
 
 
 def checked_rotation(value: ArrayLike, name: str) -> Array:
-    """Return a proper rotation matrix (3, 3) after checking that the given one is orthogonal within 1e-3.
+    """The rotation (3, 3) closest to a matrix that is orthogonal within 1e-3.
 
     Raises:
         InputError: wrong shape, not finite, not orthogonal, or a reflection (determinant -1).
@@ -134,7 +134,7 @@ def rotations_from_quaternions(quaternions: Array) -> Array:
 
 def quaternion_from_rotation(rotation: Array) -> Array:
     """The unit quaternions (..., 4), w first and w >= 0, of rotations (..., 3, 3)."""
-    # The eigenvector of Bar-Itzhack's symmetric matrix is the quaternion, without a case per quadrant.
+    # The quaternion is an eigenvector of Bar-Itzhack's symmetric matrix, without a case for each quadrant.
     m = np.moveaxis(rotation, (-2, -1), (0, 1))
     rows = [
         [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],

@@ -1,13 +1,14 @@
 r"""Classes of mechanisms: which legs share a joint (the paper's sections 2 and 6).
 
-A combinatorial class is the bipartite graph whose edges (base joint, platform joint) are the legs, up to the numbering of
-the joints on either side; base and platform are not exchanged. No joint carries more than three legs and no two legs share
-both joints, which leaves 60 classes of six legs in space and four of three legs in the plane.
+A combinatorial class is a bipartite graph: its edges (base joint, platform joint) are the legs, and the numbering of the
+joints on either side does not matter. Base and platform are not exchanged. No joint carries more than three legs and no two
+legs share both joints. This leaves 60 classes of six legs in space and four of three legs in the plane.
 
-A class is drawn as a line of text by connected components, base joints below and platform joints above: `|` is a leg, `∧`
-and `∨` are two legs that meet above and below, `N`, `M` and `W` three and four in a row, `⩚` and `⩛` three that meet above
-and below; a superscript repeats. Any other component is spelled as a zigzag of `/` up and `\` down, in round brackets, or
-in square ones if it ends where it began; in it `|` is a leg that branches off, and inner round brackets are two in a row.
+The drawing of a class is a line of text, one connected component after the other, base joints below and platform joints above.
+`|` is a leg, `∧` and `∨` are two legs that meet above and below, `N`, `M` and `W` three and four in a row, `⩚` and `⩛` three
+that meet above and below; a superscript repeats. Any other component is a zigzag of `/` up and `\` down, in square brackets if
+it ends where it began, else in round ones. In a zigzag, `|` is a leg that branches off, and inner round brackets are two legs
+in a row that branch off.
 """
 
 from collections import Counter
@@ -27,9 +28,9 @@ from plant.mechanism.planar import PLANAR_LEGS, PlanarMechanism
 from plant.pose import Array, numbers, rotation_from_vector
 
 MOST_LEGS = 3
-"""No joint carries more legs than these."""
+"""The most legs at one joint."""
 LEAST_JOINTS = {LEGS: 3, PLANAR_LEGS: 2}
-"""The fewest joints of base or platform, by the number of legs."""
+"""The fewest joints on a side, by the number of legs."""
 
 Legs = tuple[tuple[int, int], ...]
 """The base joint and the platform joint of each leg."""
@@ -55,11 +56,11 @@ class Jointed(Protocol):
 
 @dataclass(frozen=True)
 class MechanismClass:
-    """A combinatorial class. However the joints and legs are numbered, the same graph is the same class.
+    """A combinatorial class; equal graphs are equal classes, however their joints and legs are numbered.
 
     Attributes:
-        legs: (base joint, platform joint) of six legs in space or three in the plane, any numbers; kept are the canonical
-            ones, which count from 0 on either side, joints of many legs first.
+        legs: (base joint, platform joint) of six legs in space or three in the plane, given with any numbers and stored with
+            the canonical ones, which count from 0 on either side, joints of many legs first.
 
     Raises:
         InputError: another number of legs, two legs that share both joints, a joint of more than three legs, or too few
@@ -74,7 +75,7 @@ class MechanismClass:
 
     @property
     def planar(self) -> bool:
-        """Whether the class is one of three legs in the plane."""
+        """Whether the class has three legs in the plane."""
         return len(self.legs) == PLANAR_LEGS
 
     @property
@@ -99,14 +100,14 @@ class MechanismClass:
 
     @property
     def type(self) -> str:
-        """The paper's type "I" or "II" of three and four platform joints in space, without or with one of three legs."""
+        """The paper's type: with three or four platform joints in space, "II" if one has three legs, else "I"."""
         if self.planar or self.platform_count > 4:
             return ""
         return "II" if self.platform_degrees[0] == MOST_LEGS else "I"
 
     @property
     def group(self) -> str:
-        """The paper's group, such as "n-4-II"; the base joints do not matter to it."""
+        """The paper's group, such as "n-4-II", which does not depend on the base joints."""
         return self._named("n")
 
     @property
@@ -122,12 +123,12 @@ class MechanismClass:
 
     @property
     def label(self) -> str:
-        """Group and number, such as "n-4-II.3" or "planar n-3.1"; no two classes share it."""
+        """Group and number, such as "n-4-II.3" or "planar n-3.1", different for every class."""
         return f"{'planar ' if self.planar else ''}{self.group}.{self.number}"
 
     @property
     def drawing(self) -> str:
-        """The graph in a line of text, as the module says; no two classes share it."""
+        """The graph as a line of text (see the module), different for every class."""
         glyphs = Counter(_GLYPHS.get(zigzag, zigzag if zigzag[0] == "[" else f"({zigzag})") for zigzag, _ in _components(self))
         return "".join(glyph + _SUPERSCRIPTS[count] for glyph, count in glyphs.items())
 
@@ -136,11 +137,11 @@ class MechanismClass:
 
 
 def joint_numbers(joints: ArrayLike, name: str = "joints") -> NDArray[np.intp]:
-    """The number of the joint that each leg ends in, counted by first appearance.
+    """The number of each leg's joint, in the order of first appearance.
 
     Args:
         joints: (6, 3) in space or (3, 2) in the plane [m]; joints within `SAME_JOINT_M` are one.
-        name: what messages call them.
+        name: for messages.
 
     Returns:
         (6,) or (3,), from 0.
@@ -205,16 +206,16 @@ def draw_mechanism(
     coplanar: bool = True,
     up_in_base: ArrayLike = (0.0, 0.0, 1.0),
 ) -> Mechanism:
-    """A random mechanism of a spatial class, about the size of a desk; legs and joints come in random order.
+    """A random mechanism of a spatial class, of desk size, with legs and joints in random order.
 
-    The base joints lie about a ring of 0.3 m and up to 0.05 m off its plane, the platform joints about a ring of 0.2 m in a
-    tilted plane of {2} that passes its origin by 0.02 to 0.06 m.
+    The base joints lie near a ring of 0.3 m, up to 0.05 m off its plane. The platform joints lie near a ring of 0.2 m in a
+    tilted plane of {2}, 0.02 to 0.06 m from its origin.
 
     Args:
         mechanism_class: the class.
-        random: the source of everything random.
-        coplanar: whether the platform joints keep to that plane; else they leave it by 0.03 to 0.06 m, up and down in
-            turn around the ring. Three are coplanar in any case.
+        random: the random generator.
+        coplanar: whether the platform joints lie in that plane; otherwise they are 0.03 to 0.06 m off it, alternately above
+            and below. Three joints are always coplanar.
         up_in_base: (3,), the unit vertical seen in {1}.
 
     Raises:
@@ -236,7 +237,7 @@ def draw_mechanism(
 
 
 def draw_planar_mechanism(mechanism_class: MechanismClass, random: np.random.Generator) -> PlanarMechanism:
-    """A random mechanism of a planar class: base joints about a circle of 0.3 m, platform joints about one of 0.1 m.
+    """A random mechanism of a planar class: base joints near a circle of 0.3 m, platform joints near one of 0.1 m.
 
     Raises:
         InputError: the class is spatial.
@@ -252,11 +253,11 @@ def draw_planar_mechanism(mechanism_class: MechanismClass, random: np.random.Gen
 
 
 def layout(mechanism_class: MechanismClass) -> tuple[Array, Array]:
-    """Where the joints of `mechanism_class.legs` stand in a picture of two rows with the fewest crossings of legs.
+    """Places of the joints of `mechanism_class.legs` in a picture of two rows with the fewest crossings of legs.
 
     Returns:
         x of the base joints (n,) and of the platform joints (m,), in units of the distance between neighbours in a row.
-        Components stand side by side in the order of the drawing.
+        Components lie side by side in the order of the drawing.
     """
     x: dict[Joint, float] = {}
     left = 0.0
@@ -317,11 +318,11 @@ def _neighbours(legs: Legs) -> Neighbours:
 
 
 def _canonical(legs: Legs) -> Legs:
-    """The least of all numberings that have base joints of many legs first, and platform joints by their base joints."""
+    """The smallest numbering with base joints of many legs first and platform joints ordered by their base joints."""
     neighbours = _neighbours(legs)
 
     def rank(joint: Joint) -> list[int]:
-        """What no numbering changes: minus the number of legs of the joint, then of each of its neighbours."""
+        """Independent of the numbering: minus the number of legs of the joint, then of each of its neighbours."""
         return [-len(neighbours[joint]), *sorted(-len(neighbours[other]) for other in neighbours[joint])]
 
     def numbered(order: Sequence[Joint]) -> Legs:
@@ -345,7 +346,7 @@ def _classes(leg_count: int) -> tuple[MechanismClass, ...]:
 
 
 def _additional_legs(legs: Legs) -> Iterator[tuple[int, int]]:
-    """The legs that can be added to a canonical graph, between joints it has or one more on either side."""
+    """The legs that can be added to a canonical graph, between its joints or one new joint on either side."""
     base_degrees, platform_degrees = (Counter(side) for side in zip(*legs, strict=True))
     for base, platform in product(range(len(base_degrees) + 1), range(len(platform_degrees) + 1)):
         if (base, platform) not in legs and max(base_degrees[base], platform_degrees[platform]) < MOST_LEGS:
@@ -353,7 +354,7 @@ def _additional_legs(legs: Legs) -> Iterator[tuple[int, int]]:
 
 
 def _paths(neighbours: Neighbours, start: Joint, avoided: Sequence[Joint] = ()) -> list[tuple[Joint, ...]]:
-    """Every path from a joint that visits none twice and no avoided one, shorter ones first."""
+    """Every path from a joint that visits no joint twice and no avoided joint, short paths first."""
     paths: list[tuple[Joint, ...]] = [(start,)]
     for path in paths:
         paths += [(*path, joint) for joint in neighbours[path[-1]] if joint not in path and joint not in avoided]
@@ -373,7 +374,7 @@ def _components(mechanism_class: MechanismClass) -> list[tuple[str, list[Joint]]
 
 
 def _zigzag(neighbours: Neighbours, joints: set[Joint]) -> tuple[str, list[Joint]]:
-    """The strokes along the cycle of a component, or else along its longest path: branches as early as can be, then up."""
+    """The strokes along the cycle of a component, or along its longest path, with branches as early as possible, then up."""
     paths = [path for joint in joints for path in _paths(neighbours, joint)]
     cycles = [(*path, path[0]) for path in paths if len(path) > 2 and path[0] in neighbours[path[-1]]]
     trunks = cycles or paths
@@ -384,7 +385,7 @@ def _zigzag(neighbours: Neighbours, joints: set[Joint]) -> tuple[str, list[Joint
 
 
 def _strokes(neighbours: Neighbours, trunk: Sequence[Joint]) -> tuple[str, list[Joint]]:
-    """The strokes along a trunk and its branches, which are of one or two legs, and the joints as they are met."""
+    """The strokes along a trunk and its branches of one or two legs, and the joints in that order."""
     strokes, order = "", [trunk[0]]
     for tail, head in pairwise(trunk):
         branch = _paths(neighbours, head, trunk)[-1]
@@ -395,13 +396,13 @@ def _strokes(neighbours: Neighbours, trunk: Sequence[Joint]) -> tuple[str, list[
 
 
 def _entanglement(legs: Sequence[tuple[float, float]]) -> tuple[int, float]:
-    """The number of crossings of legs (x below, x above), and how far the legs lean in total."""
+    """The number of crossings of legs (x below, x above), and the sum of their leans."""
     crossings = sum((base - other) * (platform - another) < 0.0 for (base, platform), (other, another) in combinations(legs, 2))
     return crossings, sum(abs(base - platform) for base, platform in legs)
 
 
 def _ring(places: NDArray[np.intp], radius: float, heights: ArrayLike, random: np.random.Generator) -> Array:
-    """Joints (count, 3) [m] at places 0, 1, ... around a ring, each somewhat off its place."""
+    """Joints (count, 3) [m] near places 0, 1, ... around a ring."""
     angles = 2.0 * np.pi * (places + random.uniform(-0.25, 0.25, places.size)) / places.size
     radii = radius * random.uniform(0.85, 1.15, places.size)
     return np.column_stack([radii * np.cos(angles), radii * np.sin(angles), np.broadcast_to(heights, places.size)])

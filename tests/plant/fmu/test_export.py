@@ -36,10 +36,10 @@ def description(fmu_path: Path) -> Any:
 
 
 def test_the_default_fmu_is_built_once(fmu_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def build_again(path: Path, fmi: int, mechanism: str) -> None:
-        raise AssertionError(f"{path} is there already")
+    def build_again(path: Path, *_: Any) -> None:
+        raise AssertionError(f"{path} exists already")
 
-    monkeypatch.setattr(export, "build_in_subprocess", build_again)
+    monkeypatch.setattr(export, "_start_build", build_again)
     before = fmu_path.stat()
     assert default_fmu() == fmu_path
     assert (fmu_path.stat().st_ino, fmu_path.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
@@ -65,7 +65,11 @@ def test_a_build_is_the_same_to_the_byte_and_loads_no_casadi(fmu_path: Path, tmp
 def test_the_cache_key_follows_the_sources(monkeypatch: pytest.MonkeyPatch, fmu_path: Path, tmp_path: Path) -> None:
     monkeypatch.setenv("GOUGH_CACHE", str(tmp_path))
     monkeypatch.setattr(export, "version", lambda package: "0.0.0")
-    monkeypatch.setattr(export, "build_in_subprocess", lambda path, fmi, mechanism: path.write_text("built"))
+
+    def write(path: Path, *_: Any) -> None:
+        path.write_text("built")
+
+    monkeypatch.setattr(export, "_start_build", write)
     path = default_fmu()
     assert path.read_text() == "built"
     assert path.parent.name != fmu_path.parent.name
