@@ -156,13 +156,8 @@ def _substep_conditions(p: dict[str, SX], beyond_stop: SX) -> list[Condition]:
 class Leg:
     """One leg at one instant; vectors (3, 1) seen in {1}.
 
-    Attributes:
-        s, velocity: the leg vector and its derivative.
-        arm: from the platform's origin to the platform joint.
-        bias: s'' without acceleration of the platform.
-        length, speed, direction: of the leg.
-        mass, force: (3, 3) and (3, 1), M_s and h in `M_s s'' + h = F`, with F the force on the platform joint.
-        kinetic, potential: energies.
+    `mass` (3, 3) and `force` (3, 1) are M_s and h in `M_s s'' + h = F`, with F the force on the platform joint. `arm` points
+    from the platform's origin to that joint, and `bias` is s'' without acceleration of the platform.
     """
 
     s: SX
@@ -255,12 +250,8 @@ def legs_at(
 
 @dataclass(frozen=True)
 class Actuators:
-    """The actuators of n legs at one instant; (n, 1) each.
-
-    Attributes:
-        motor, friction, brake, stop: forces along the legs; motor, brake and stop are positive when they push.
-        voltage: of the drives.
-        current_rate, brake_rate: rates of the motors' currents and of the brakes' deflections.
+    """The actuators of n legs at one instant, (n, 1) each: forces along the legs, which push if positive, except that friction
+    brakes; the drives' voltages; and the rates of the motors' currents and of the brakes' deflections.
     """
 
     motor: SX

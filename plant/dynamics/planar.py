@@ -30,7 +30,7 @@ _NORMAL = SX([0, 0, 1])
 _AXES = ca.repmat(_NORMAL.T, 3, 1)
 
 
-def build_planar_dynamics() -> Dynamics:
+def build_dynamics() -> Dynamics:
     """Derive the plant's equations."""
     p = variable_symbols(PLANAR.parameters)
     start = {"state.position": p["initial_position"], "state.angle": p["initial_angle"]}

@@ -32,17 +32,10 @@ TINY = 1e-9
 
 @dataclass(frozen=True)
 class Variable:
-    """One variable of a plant.
+    """One variable of a plant, with the names of FMI; the shape of a scalar is ().
 
-    Attributes:
-        name, unit: as in the FMU.
-        shape: () for a scalar.
-        description: one line for people.
-        minimum, maximum: a parameter outside is refused; other variables stay inside.
-        nominal: the usual size.
-        causality: its role.
-        tunable: whether a parameter may change during a run; the others are fixed once initialisation ends.
-        discrete: whether it is an enumeration, as the drive modes are.
+    A parameter outside its range is refused; other variables stay inside. `nominal` is the usual size. A `tunable` parameter
+    may change during a run; the others are fixed once initialisation ends. `discrete` marks the drive modes, an enumeration.
     """
 
     name: str

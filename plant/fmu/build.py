@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import resources
+from importlib import import_module, resources
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -50,34 +50,30 @@ class Model:
         description: one line about it.
         table: its variables.
         preset: the mechanism whose parameters are the default start values.
-        dynamics: derives its equations (`plant.dynamics.assembly.Dynamics`); loads CasADi.
+        module: with its equations, which loads CasADi.
     """
 
     identifier: str
     description: str
     table: VariableTable
     preset: str
-    dynamics: Callable[[], Any]
+    module: str
 
-
-def _planar_dynamics() -> Any:
-    from plant.dynamics.planar import build_planar_dynamics
-
-    return build_planar_dynamics()
-
-
-def _spatial_dynamics() -> Any:
-    from plant.dynamics.spatial import build_dynamics
-
-    return build_dynamics()
+    def dynamics(self) -> Any:
+        """Derive its equations (`plant.dynamics.assembly.Dynamics`)."""
+        return import_module(self.module).build_dynamics()
 
 
 SPATIAL_MODEL = Model(
-    "gough_plant", "Six-leg parallel mechanism with encoderless drives and ideal IMUs", SPATIAL, "hexapod", _spatial_dynamics
+    "gough_plant",
+    "Six-leg parallel mechanism with encoderless drives and ideal IMUs",
+    SPATIAL,
+    "hexapod",
+    "plant.dynamics.spatial",
 )
 PLANAR_MODEL = Model(
     "gough_planar_plant", "Planar three-leg mechanism with encoderless drives and ideal IMUs", PLANAR, "planar-3rpr",
-    _planar_dynamics,
+    "plant.dynamics.planar",
 )  # fmt: skip
 
 

@@ -16,7 +16,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import combinations, groupby, pairwise, permutations, product
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,18 +39,6 @@ Neighbours = dict[Joint, list[Joint]]
 
 _GLYPHS = {"/": "|", "/\\": "∧", "\\/": "∨", "/\\/": "N", "/\\/\\": "M", "\\/\\/": "W", "/|\\": "⩚", "\\|/": "⩛"}
 _SUPERSCRIPTS = ("", "", *"²³⁴⁵⁶")
-
-
-class Jointed(Protocol):
-    """A mechanism in space or in the plane: row k of either array is the joint of leg k."""
-
-    @property
-    def base_joints(self) -> Array:
-        """(6, 3) or (3, 2) [m]."""
-
-    @property
-    def platform_joints(self) -> Array:
-        """(6, 3) or (3, 2) [m]."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +145,7 @@ def joint_numbers(joints: ArrayLike, name: str = "joints") -> NDArray[np.intp]:
     return np.unique(same.argmax(axis=1), return_inverse=True)[1]
 
 
-def classify(mechanism: Jointed) -> MechanismClass:
+def classify(mechanism: Mechanism | PlanarMechanism) -> MechanismClass:
     """The combinatorial class of a mechanism; joints within `SAME_JOINT_M` are one.
 
     Raises:
@@ -168,7 +155,7 @@ def classify(mechanism: Jointed) -> MechanismClass:
     return MechanismClass(_legs(mechanism))
 
 
-def canonical_legs(mechanism: Jointed) -> Legs:
+def canonical_legs(mechanism: Mechanism | PlanarMechanism) -> Legs:
     """The joints of each leg of a mechanism, in the order of its legs and the numbers of its class.
 
     Raises:
@@ -275,7 +262,7 @@ def layout(mechanism_class: MechanismClass) -> tuple[Array, Array]:
     return np.array(base), np.array(platform)
 
 
-def _legs(mechanism: Jointed) -> Legs:
+def _legs(mechanism: Mechanism | PlanarMechanism) -> Legs:
     base = joint_numbers(mechanism.base_joints, "base_joints")
     platform = joint_numbers(mechanism.platform_joints, "platform_joints")
     if len(base) != len(platform):

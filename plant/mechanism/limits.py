@@ -14,12 +14,9 @@ from plant.toml import check_entries
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Limits of the actuators of n legs.
-
-    Attributes:
-        stroke: (n, 2), least and greatest length of each leg [m].
-        velocity, acceleration, jerk: greatest along each leg [m/s, m/s^2, m/s^3].
-        stop_clearance: distance of the plant's end stops beyond the stroke [m].
+    """Limits of the actuators of n legs: `stroke` (n, 2), least and greatest length of each leg [m]; greatest `velocity` [m/s],
+    `acceleration` [m/s^2] and `jerk` [m/s^3] along each leg; and the distance `stop_clearance` [m] of the plant's end stops
+    beyond the stroke.
 
     Raises:
         InputError: an empty or non-positive stroke, or a limit that is not positive.

@@ -8,7 +8,7 @@ from numpy.random import Generator
 from numpy.typing import ArrayLike
 
 from plant.dynamics.assembly import Dynamics
-from plant.dynamics.planar import build_planar_dynamics
+from plant.dynamics.planar import build_dynamics
 from plant.dynamics.variables import BRAKE, OPEN, PLANAR, VELOCITY, Variable, checked_parameters
 from plant.errors import FmuError
 from plant.fmu.build import PLANAR_MODEL, SPATIAL_MODEL, Model, default_fmu
@@ -30,7 +30,7 @@ from tests.plant.dynamics.planar_bodies import (
 
 @pytest.fixture(scope="module")
 def dynamics() -> Dynamics:
-    return build_planar_dynamics()
+    return build_dynamics()
 
 
 @pytest.fixture(scope="module")
