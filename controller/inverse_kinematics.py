@@ -12,7 +12,7 @@ from plant.pose import Array, Pose, checked_array, checked_rotation, rotation_fr
 
 @dataclass(frozen=True, eq=False)
 class Legs:
-    """The legs at a pose; leg k joins base joint k and platform joint k.
+    """The legs at a pose; leg k connects base joint k and platform joint k.
 
     Attributes:
         vectors: (6, 3) [m] from base to platform joint, in {1}.
@@ -32,7 +32,7 @@ def inverse_kinematics(mechanism: Mechanism, pose: Pose) -> Legs:
     """The legs of `mechanism` at `pose`.
 
     Raises:
-        InputError: the pose is not finite, or its rotation is not one.
+        InputError: the pose is not finite, or its rotation is no rotation matrix.
         SingularConfigurationError: a leg has no length.
     """
     position = checked_array(pose.position, (3,), "position")
@@ -57,7 +57,7 @@ def leg_lengths(mechanism: Mechanism, positions: Array, rotations: Array) -> Arr
 def legs_at(
     base_joints: Array, platform_joints: Array, position: Array, rotation: Array, arms: Array, directions: Array, lengths: Array
 ) -> None:
-    """Compiled twin of `inverse_kinematics`: writes arms (6, 3), the turned platform joints, directions and lengths."""
+    """Compiled twin of `inverse_kinematics`: writes arms (6, 3), the platform joints turned to {1}, directions and lengths."""
     for k in range(LEGS):
         square = 0.0
         for i in range(3):
@@ -79,7 +79,7 @@ def legs_at(
 def jacobian_at(arms: Array, directions: Array, legs: int, jacobian: Array) -> None:
     """Write the Jacobian (6, 6) of the lengths from arms (6, 3) and directions (6, 3).
 
-    In the place of legs that a planar mechanism has not, its plane allows no translation along z, and no turns about x and y.
+    In rows of legs that a planar mechanism lacks, its plane stands: no translation along z, no turns about x and y.
     """
     for k in range(legs, LEGS):
         for i in range(6):
@@ -97,12 +97,11 @@ _MOST_DRAWS = 500
 def sample_workspace(mechanism: Mechanism, count: int, seed: int) -> tuple[Array, Array]:
     """Random poses at which every leg is inside its stroke: positions (count, 3) [m] and rotations (count, 3, 3).
 
-    Drawn uniformly from a box about home, four fifths of the stroke's range to either side and 0.35 rad about each axis, of a
-    planar mechanism within its plane;
-    the poses outside the strokes are thrown away.
+    They are drawn uniformly from a box about home: four fifths of the stroke's range to either side, and 0.35 rad about each
+    axis; for a planar mechanism, within its plane. Poses outside the strokes are discarded.
 
     Raises:
-        InputError: no home, no stroke, or hardly a pose inside the strokes.
+        InputError: no home, no stroke, or too few poses inside the strokes.
     """
     home, limits = mechanism.require_home(), mechanism.require_limits()
     reach = 0.8 * float((limits.stroke[:, 1] - limits.stroke[:, 0]).max())

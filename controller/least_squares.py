@@ -1,6 +1,6 @@
 """Small dense systems for the cycle: pivoted Householder QR, elimination, and Cholesky for weighted normal equations.
 
-Normal equations of the closed forms lose half the digits, so those use QR; the refinement's are well scaled.
+The closed forms use QR, because their normal equations would lose half the digits. The refinement's are well scaled.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ from plant.compiled import kernel
 from plant.pose import Array
 
 RANK_TOLERANCE = 1e-9
-"""Ratio of the least to the greatest diagonal element of R below which columns count as dependent."""
+"""Ratio of the least to the greatest diagonal element of R, below which columns count as dependent."""
 
 
 @kernel
@@ -17,7 +17,7 @@ def solve_least_squares(matrix: Array, right: Array, rows: int, solution: Array,
     """Minimise |matrix @ solution - right| by QR with column pivoting; overwrites `matrix` and `right`.
 
     Args:
-        matrix: (>= rows, >= n), whose corner counts; contiguous, so that rows are worked on at once.
+        matrix: (>= rows, >= n), of which the corner counts; contiguous.
         right: (>= rows,).
         rows: at least n.
         solution: (n,), written.
@@ -40,13 +40,13 @@ def solve_least_squares(matrix: Array, right: Array, rows: int, solution: Array,
 def solve_truncated(
     matrix: Array, right: Array, rows: int, rank: int, solution: Array, null_space: Array, norms: Array, order: Array
 ) -> float:
-    """Solve a system of known rank: after `rank` pivots what is left of the rows counts as noise.
+    """Solve a system of known rank: after `rank` pivots, the rest of the rows counts as noise.
 
     Args:
         matrix, right, rows, norms, order: as for `solve_least_squares`.
         rank: of the system without noise, at most n.
         solution: (n,), one solution, written.
-        null_space: (>= n - rank, n), whose rows may be added to it in any amount, written.
+        null_space: (>= n - rank, n), written; any multiples of its rows may be added to the solution.
 
     Returns:
         The ratio of the last to the first pivot; below `RANK_TOLERANCE` nothing is solved.
@@ -73,8 +73,8 @@ def solve_truncated(
 def _triangularise(
     matrix: Array, right: Array, m: int, rank: int, dots: Array, norms: Array, order: Array
 ) -> float:  # fmt: skip
-    """Turn the corner (m, n) of `matrix` into R by `rank` pivots, and `right` along with it; n is the size of `dots`, which is
-    scratch. Returns the ratio of the last to the first pivot.
+    """Turn the corner (m, n) of `matrix` into R by `rank` pivots, and transform `right` with it; n is the size of `dots`, which
+    is scratch. Returns the ratio of the last to the first pivot.
     """
     n = dots.shape[0]
     for j in range(n):
@@ -101,7 +101,7 @@ def _triangularise(
             return 0.0
         if matrix[k, k] > 0.0:
             alpha = -alpha
-        # Householder's vector is stored below the diagonal, its leading element apart.
+        # The Householder vector is stored below the diagonal, its leading element in `lead`.
         lead = matrix[k, k] - alpha
         scale = 1.0 / (alpha * lead)
         dot = lead * right[k]

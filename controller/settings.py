@@ -1,6 +1,4 @@
-"""Settings of the controller: the tables `control`, `fusion` and `safety` of a mechanism's preset, checked when they are
-read.
-"""
+"""Settings of the controller: the tables `control`, `fusion` and `safety` of a mechanism's file, checked when they are read."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -20,14 +18,14 @@ S = TypeVar("S", "ControlSettings", "FusionSettings", "SafetySettings")
 
 @dataclass(frozen=True)
 class ControlSettings:
-    """Gains of the six PID controllers, designed by `controller.design.tuning`, and when feedback closes.
+    """Gains of the six PID controllers, designed by `controller.design.tuning`, and the time at which feedback closes.
 
     Attributes:
-        proportional: [1/s].
-        integral: [1/s^2].
-        derivative: [-].
+        proportional: gain [1/s].
+        integral: gain [1/s^2].
+        derivative: gain [-].
         derivative_bandwidth: corner of the derivative's low-pass [rad/s].
-        hold: how long the brakes hold while the estimate settles [s].
+        hold: time for which the brakes hold while the estimate settles [s].
         command_reserve: largest command as a multiple of the actuators' velocity limit.
     """
 
@@ -49,28 +47,29 @@ class FusionSettings:
     Attributes:
         leg_jerk: density of the legs' angular jerk [rad/s^3/sqrt(Hz)].
         bias_walk: random walk of the gyroscopes' biases [rad/s/sqrt(s)].
-        bias_sigma: what is known of a gyroscope's bias at the start [rad/s].
-        gyroscope_noise: [rad/s/sqrt(Hz)].
-        leg_accelerometer_noise, platform_accelerometer_noise: [m/s^2/sqrt(Hz)]; well above the data sheet's, because
-            bias and scale, which the filters do not estimate, would otherwise be taken for motion.
-        leg_sigma: of each component of a leg's direction, for the refinement [rad].
-        tilt_sigma: of the platform's roll and pitch, for the refinement [rad].
-        magnetometer_noise: [uT/sqrt(Hz)]; its resolution counts as noise.
-        magnetometer_rate: samples per second; between them the last one stands [Hz].
-        heading_sigma: of the heading, for the refinement, what its calibration leaves [rad].
+        bias_sigma: standard deviation of a gyroscope's bias at the start [rad/s].
+        gyroscope_noise: density [rad/s/sqrt(Hz)].
+        leg_accelerometer_noise, platform_accelerometer_noise: density [m/s^2/sqrt(Hz)]; well above the data sheet's: the
+            filters do not estimate bias and scale, and would take them for motion.
+        leg_sigma: standard deviation of each component of a leg's direction, for the refinement [rad].
+        tilt_sigma: standard deviation of the platform's roll and pitch, for the refinement [rad].
+        magnetometer_noise: density, including that of its resolution [uT/sqrt(Hz)].
+        magnetometer_rate: samples per second; between samples the last one is repeated [Hz].
+        heading_sigma: standard deviation of the heading that its calibration leaves, for the refinement [rad].
         acceleration_time: time constant of the platform's acceleration, which is the derivative of its twist [s].
-        sensor_delay: by how much what the IMUs read is behind [s].
-        gyroscope_range, accelerometer_range: a reading this large is none [rad/s, m/s^2].
+        sensor_delay: age of the IMUs' readings [s].
+        gyroscope_range, accelerometer_range: from this size on, a reading is not used [rad/s, m/s^2].
         platform_jerk, platform_angular_jerk: density of the platform's jerk, for the whole-mechanism filter
             [m/s^3/sqrt(Hz), rad/s^3/sqrt(Hz)].
-        mechanism_gyroscope_noise, mechanism_accelerometer_noise: for that filter [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)], for
-            calibrated IMUs; with the jerk such that its covariance is as large as its errors.
+        mechanism_gyroscope_noise, mechanism_accelerometer_noise: density for that filter with calibrated IMUs
+            [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]; chosen with the jerk so that its covariance is as large as its errors.
         accelerometer_bias_walk: random walk of the accelerometers' biases [m/s^2/sqrt(s)].
-        accelerometer_bias_sigma, scale_sigma, alignment_sigma, axes_sigma: what is known of IMUs without a calibration file
-            [m/s^2, 1, rad, rad].
-        noise_inflation: times these noises and the platform's jerk for IMUs without a calibration file, whose errors are more
-            than the filter estimates.
-        disagreement: of the leg filters' directions with the whole-mechanism filter's pose, RMS, that ends its use [rad].
+        accelerometer_bias_sigma, scale_sigma, alignment_sigma, axes_sigma: standard deviations for IMUs without a calibration
+            file [m/s^2, 1, rad, rad].
+        noise_inflation: factor on these noises and the platform's jerk for IMUs without a calibration file, which have errors
+            that the filter does not estimate.
+        disagreement: RMS angle between the leg filters' directions and the whole-mechanism filter's pose that ends the use of
+            that pose [rad].
     """
 
     leg_jerk: float = 100.0
@@ -106,23 +105,23 @@ class FusionSettings:
 
 @dataclass(frozen=True)
 class SafetySettings:
-    """Limits that are watched while the loop runs.
+    """Limits that are checked while the loop runs.
 
     Attributes:
-        most_lost_imus: how many IMUs may be left out at once.
-        disagreement: of an IMU's direction with all others, beyond which it is left out [rad].
-        gyroscope_noise, accelerometer_noise: of an IMU that is left out, RMS [rad/s, m/s^2].
+        most_lost_imus: number of IMUs that may be left out at once.
+        disagreement: angle between an IMU's direction and that of all others, beyond which the IMU is left out [rad].
+        gyroscope_noise, accelerometer_noise: RMS noise beyond which an IMU is left out [rad/s, m/s^2].
         conditioning: least conditioning of the closed form.
-        stroke_margin: how far beyond its stroke a leg may be estimated [m].
-        velocity_margin: estimated speed of a leg that is too fast, in multiples of its limit.
+        stroke_margin: largest distance of an estimated length beyond its stroke [m].
+        velocity_margin: largest estimated speed of a leg, as a multiple of its limit.
         following: largest deviation of a leg from its reference [m].
         saturation: longest time for which a command may be at its limit [s].
         drive_deviation: largest difference between a drive's command and its leg's estimated speed [m/s].
-        patience: for how long references and drives may be deviated from [s].
-        bus_patience: for how long the rig may give no answer [s].
-        arming_distance: largest distance of a leg from where the target begins [m].
-        arming_time: how long the checks before arming, and the drives, may take [s].
-        watch_imus: 0 if nothing is to be made of an IMU's disagreement.
+        patience: longest time of a deviation from a reference or of a drive [s].
+        bus_patience: longest time without an answer of the rig [s].
+        arming_distance: largest distance of a leg from the start of the target [m].
+        arming_time: longest time for the checks before arming, and for the drives [s].
+        watch_imus: 0 to ignore the disagreement of an IMU.
     """
 
     most_lost_imus: float = 1.0
@@ -145,7 +144,7 @@ class SafetySettings:
         _check_positive(self, zero_allowed={"most_lost_imus", "watch_imus"})
 
     def for_raw_imus(self) -> "SafetySettings":
-        """The same for IMUs whose errors put the pose off by centimetres."""
+        """These settings for raw IMUs, whose errors move the pose by centimetres."""
         wide = {name: max(getattr(self, name), _RAW_M) for name in ("stroke_margin", "following", "arming_distance")}
         return replace(self, watch_imus=0.0, **wide)
 
@@ -178,9 +177,7 @@ def safety_settings(mechanism: Mechanism, **changes: float) -> SafetySettings:
 
 
 def sensor_settings(mechanism: Mechanism, imu: ImuModel) -> FusionSettings:
-    """The fusion settings of a mechanism, with delay, rate of the magnetometer and ranges of its IMUs, where it does not say
-    them itself.
-    """
+    """The fusion settings of a mechanism; delay, magnetometer rate and ranges are those of its IMUs unless its file has them."""
     known = {
         "sensor_delay": imu.latency,
         "magnetometer_rate": min(imu.magnetometer_rate, _ENDLESS),

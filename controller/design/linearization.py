@@ -1,4 +1,4 @@
-"""A plant FMU as a linear system of python-control, for design; not for a process that runs a loop."""
+"""A plant FMU as a linear system of python-control, for design; never imported by a process that runs a loop."""
 
 from collections.abc import Sequence
 
@@ -10,13 +10,13 @@ from plant.fmu.plant import FmuPlant
 def state_space(
     plant: FmuPlant, inputs: Sequence[str] = ("velocity_command",), outputs: Sequence[str] = ("leg_length",)
 ) -> control.StateSpace:
-    """The plant about where it is, from the FMU's directional derivatives.
+    """The plant linearised at its present state, from the FMU's directional derivatives.
 
     Signals have their names of FMI 2.0, with underscores for points, which python-control does not allow. gough's spatial
-    plant has a quaternion among its states, so one state more than it has coordinates: its length, which nothing sees.
+    plant has a quaternion among its states, so one state too many: its length, which nothing observes.
 
     Args:
-        plant: any that has directional derivatives and shows its states.
+        plant: any plant that has directional derivatives and shows its states.
         inputs, outputs: names of its variables.
 
     Raises:

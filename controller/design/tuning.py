@@ -1,8 +1,8 @@
 """Design of the PID gains from the linearised loop: plant, filters, kinematics and one controller per actuator.
 
-The plant is linearised at home, at rest under its load, by CasADi, with Coulomb friction that does not change sign: a
-moving leg, the less damped case. The estimator is linearised from the compiled cycle itself, its covariances settled.
-python-control makes the plant discrete and finds the margins of one actuator's loop with the other five closed.
+CasADi linearises the plant at home, at rest under its load. Coulomb friction does not change sign there: this is a moving leg,
+the less damped case. The estimator is linearised from the compiled cycle itself, with settled covariances. python-control makes
+the plant discrete and finds the margins of one actuator's loop with the other five closed.
 
 The rule: an integral time of 0.3 s, and the largest proportional gain at which the multivariable sensitivity peak stays
 at 2 with 65 deg of phase margin and 12 dB of gain margin.
@@ -39,12 +39,12 @@ _SIGNALS = 2 * 7 * 3
 
 @dataclass(frozen=True)
 class Margins:
-    """Stability of the loop of one actuator with the others closed, of the worst one, and of all six together.
+    """Stability of the loop of one actuator with the others closed, for the worst actuator, and of all six together.
 
     Attributes:
         gain_db: gain margin [dB].
         phase_deg: phase margin [deg].
-        crossover_hz: where the loop gain falls below one, at the latest [Hz].
+        crossover_hz: highest frequency at which the loop gain falls below one [Hz].
         sensitivity_peak: greatest singular value of the sensitivity over frequency, all loops closed.
         stable: whether all poles lie inside the unit circle.
     """
@@ -68,7 +68,7 @@ class Margins:
 
 @dataclass(frozen=True)
 class Design:
-    """Gains and the margins that they have, beside those of the preset's gains."""
+    """Designed gains and their margins, beside the preset's gains and margins."""
 
     rate: float
     gains: ControlSettings
@@ -113,7 +113,7 @@ def tune(mechanism: Mechanism, rate: float) -> Design:
     """Design the gains for cycles of 1 / `rate`.
 
     Raises:
-        SingularConfigurationError: no gains have the margins asked for.
+        SingularConfigurationError: no gains have the required margins.
         InputError: the mechanism lacks data.
     """
     check_rate(rate)
@@ -124,7 +124,7 @@ def tune(mechanism: Mechanism, rate: float) -> Design:
     def with_proportional(proportional: float) -> ControlSettings:
         return replace(preset, proportional=proportional, integral=proportional / INTEGRAL_TIME_S, derivative=0.0)
 
-    # Small gains are not sound either, because the integral time is fixed: look from above.
+    # Small gains do not meet the rule either, because the integral time is fixed: search from above.
     steps = np.geomspace(0.5 * rate, 1.0, 40)
     sound = [margins(loop, response, with_proportional(float(step)), rate).sound for step in steps]
     if True not in sound:
@@ -150,9 +150,10 @@ def open_loop(mechanism: Mechanism, rate: float) -> Linear:
 
 
 def linear_plant(mechanism: Mechanism, rate: float) -> tuple[Linear, Array]:
-    """The plant at home under its load, from velocity commands to ideal IMU signals (42,), and those signals there.
+    """The plant at home under its load, from velocity commands to ideal IMU signals (42,), and the signals at home.
 
-    The signals are angular velocities of the seven IMUs, then specific forces. The attitude's state is a rotation vector.
+    The signals are the angular velocities of the seven IMUs, then their specific forces. The attitude's state is a rotation
+    vector.
     """
     values = mechanism.plant_parameters()
     friction = {"friction.coulomb": np.zeros(LEGS)}
@@ -195,7 +196,7 @@ def _slice(variables: Any, name: str) -> slice:
 
 
 def _equilibrium(rates: Any, x: Array, u: Array, constants: Any) -> tuple[Array, Array]:
-    """Currents and commands at which nothing accelerates; both enter linearly, as long as the drives do not saturate."""
+    """Currents and commands at which nothing accelerates; both enter linearly while the drives do not saturate."""
     current, command = _slice(STATES, "state.current"), _slice(INPUTS, "velocity_command")
     acceleration = slice(_slice(STATES, "state.velocity").start, _slice(STATES, "state.angular_velocity").stop)
 
@@ -216,7 +217,7 @@ def _equilibrium(rates: Any, x: Array, u: Array, constants: Any) -> tuple[Array,
 
 
 def _reduction(quaternion: Array) -> Array:
-    """The map (18, n) from the plant's states, less the brakes' deflections, to those with a rotation vector in {1}."""
+    """The map (18, n) from the plant's states, without the brakes' deflections, to states with a rotation vector in {1}."""
     w, x, y, z = quaternion
     from_rotation = 0.5 * np.array([[-x, -y, -z], [w, z, -y], [-z, w, x], [y, -x, w]])
     size = sum(variable.size for variable in STATES)
@@ -287,7 +288,7 @@ def frequency_response(loop: Linear, rate: float) -> tuple[Array, Any]:
 
 
 def margins(loop: Linear, response: tuple[Array, Any], gains: ControlSettings, rate: float) -> Margins:
-    """Margins of the loop closed by six PID controllers; the low-pass of their derivative is left out.
+    """Margins of the loop closed by six PID controllers, without the low-pass of their derivative.
 
     Args:
         loop: from commands to estimated lengths.
@@ -296,7 +297,7 @@ def margins(loop: Linear, response: tuple[Array, Any], gains: ControlSettings, r
         rate: cycles per second [Hz].
     """
     n, period = len(loop.a), 1.0 / rate
-    # Two further states per actuator close the loop: the integral of the error, and the error before.
+    # Two further states per actuator close the loop: the integral of the error, and the previous error.
     a = np.block(
         [
             [loop.a, np.zeros((n, 2 * LEGS))],
@@ -307,7 +308,7 @@ def margins(loop: Linear, response: tuple[Array, Any], gains: ControlSettings, r
     b = np.vstack([loop.b, np.zeros((2 * LEGS, LEGS))])
     slope = gains.derivative * rate
     c = np.hstack([(gains.proportional + slope) * loop.c, gains.integral * np.eye(LEGS), -slope * np.eye(LEGS)])
-    # The bias of a gyroscope that nothing sees neither decays nor matters: its pole stays at one.
+    # The unobserved bias of a gyroscope neither decays nor matters: its pole stays at one.
     stable = bool(np.abs(np.linalg.eigvals(a - b @ c)).max() < 1.0 + 1e-6)
 
     frequencies, plant = response
