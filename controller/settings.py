@@ -177,7 +177,7 @@ def safety_settings(mechanism: Mechanism, **changes: float) -> SafetySettings:
 
 
 def sensor_settings(mechanism: Mechanism, imu: ImuModel) -> FusionSettings:
-    """The fusion settings of a mechanism; delay, magnetometer rate and ranges are those of its IMUs unless its file has them."""
+    """The fusion settings of a mechanism, with delay, magnetometer rate and ranges of its IMUs where its file has none."""
     known = {
         "sensor_delay": imu.latency,
         "magnetometer_rate": min(imu.magnetometer_rate, _ENDLESS),
