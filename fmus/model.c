@@ -69,6 +69,9 @@ static void place_at_start(State *s) {
     forget(s);
 }
 
+/* A state that decays would pass through the denormal numbers, where many processors are slow, and never reach zero. */
+#define NEGLIGIBLE 1e-100
+
 /* The classical Runge-Kutta method with equal substeps. */
 static void integrate(State *s, double duration, long steps) {
     double h = duration / steps, *x = s->values, k[4][STATES], at[STATES];
@@ -81,7 +84,10 @@ static void integrate(State *s, double duration, long steps) {
         rates(s, at, k[2]);
         for (int i = 0; i < STATES; i++) at[i] = x[i] + h * k[2][i];
         rates(s, at, k[3]);
-        for (int i = 0; i < STATES; i++) x[i] += h / 6 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i]);
+        for (int i = 0; i < STATES; i++) {
+            x[i] += h / 6 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i]);
+            if (fabs(x[i]) < NEGLIGIBLE) x[i] = 0;
+        }
 #ifdef QUATERNION_AT
         double *q = x + QUATERNION_AT, scale = 1 / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
         for (int i = 0; i < 4; i++) q[i] *= scale;

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from hil.progress import Progress, no_progress
 from hil.realtime.durations import percentiles
 from plant.compiled import Record, kernel
-from plant.dynamics.variables import VELOCITY
+from plant.dynamics.variables import BRAKE, VELOCITY
 from plant.fmu.build import SPATIAL_MODEL, default_fmu
 from plant.fmu.calls import advance, read_imus, read_truth, write_command, write_drive_mode
 from plant.fmu.importer import FmuDescription
@@ -26,6 +26,7 @@ FINER = 16
 _SHOWN = ("p50", "p99")
 _PARTS = ("set modes and commands", "step", "read IMUs", "read truth")
 _FMPY_CYCLES = 2000
+_BRAKED_CYCLES = 300
 _BLOCK = 50
 
 
@@ -75,6 +76,8 @@ def _commands(duration: float) -> Array:
 def _drive(plant: FmuPlant, commands: Array) -> tuple[Array, Array]:
     """Durations of the parts [ns], means over blocks of cycles (m, 4), and positions (n, 3) [m]."""
     durations, positions = np.zeros((len(commands), len(_PARTS)), np.int64), np.zeros((len(commands), 3))
+    if write_drive_mode(plant.handle, BRAKE) != 0 or any(advance(plant.handle, PERIOD_S) for _ in range(_BRAKED_CYCLES)):
+        raise plant.failure()
     if _run(plant.handle, commands, durations, positions, np.zeros(2, np.int64)):
         raise plant.failure()
     whole = len(commands) // _BLOCK * _BLOCK

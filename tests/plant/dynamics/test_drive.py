@@ -223,6 +223,19 @@ def test_an_opened_brake_lets_go(make_plant: MakePlant) -> None:
     np.testing.assert_allclose(current, 0.0, atol=1e-12)
 
 
+def test_an_opened_brake_and_an_open_motor_leave_no_denormal_number(make_plant: MakePlant) -> None:
+    plant = make_plant()
+    set_all(plant, BRAKE)
+    run(plant, 0.2)
+    assert np.abs(plant.get("state.brake_deflection")).min() > 1e-6
+    set_all(plant, VELOCITY, 0.02)
+    run(plant, 1.5)
+    np.testing.assert_array_equal(plant.get("state.brake_deflection"), 0.0)
+    set_all(plant, OPEN)
+    run(plant, 1.0)
+    np.testing.assert_array_equal(plant.get("state.current"), 0.0)
+
+
 # ---- the drive ----
 
 
