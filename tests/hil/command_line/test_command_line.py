@@ -58,9 +58,9 @@ def test_help_gives_units_and_defaults():
 @pytest.mark.parametrize(
     ("rows", "said"),
     [
-        ([REST, "1,0,0,0,1,0,0"], "line 3: 7 numbers instead of 8"),
+        ([REST, "1,0,0,0,1,0,0"], "line 3: .*not a row of 8 finite numbers: it has 7 numbers"),
         ([REST, "1,0,0,zero,1,0,0,0"], "line 3: .*not a row"),
-        ([REST, "1,0,0,nan,1,0,0,0"], "line 3: .*not finite"),
+        ([REST, "1,0,0,nan,1,0,0,0"], "line 3: .*not a row of 8 finite numbers: z_m is nan"),
         ([REST, "0,0,0,0,1,0,0,0"], "line 3: time 0 s does not come after 0 s"),
         ([REST, "1,0,0,0,1.01,0,0,0"], "line 3: the quaternion has length 1.01"),
         ([REST], "1 samples"),
