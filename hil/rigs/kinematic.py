@@ -11,21 +11,21 @@ from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, quaternion_from_rotation
 
 _DRIVE_S = 0.02
-"""Time constant with which a drive's velocity follows its command [s]."""
+"""Time constant of a drive's velocity [s]."""
 
 _WATCHDOG_S = 0.1
-"""How long the legs go on without a command, as drives have it."""
+"""Time without a command after which the legs stop, as with real drives [s]."""
 
 
 class KinematicHexapod:
     """A mechanism at rest at home, on a clock of its own.
 
     Attributes:
-        time_ns: since the start [ns].
+        time_ns: time since the start [ns].
         lengths, velocities: of the legs, (6,) [m] and [m/s].
         commands: to the drives, (6,) [m/s].
         pose: of the platform.
-        signals: (3, 7, 3), of the IMUs, as everywhere.
+        signals: of the IMUs, (3, 7, 3) [rad/s, m/s^2, uT].
     """
 
     def __init__(self, mechanism: Mechanism) -> None:
@@ -46,7 +46,7 @@ class KinematicHexapod:
         self.advance(1)
 
     def advance(self, time_ns: int) -> None:
-        """Go on to this time with the commands."""
+        """Move on to this time with the present commands."""
         duration = 1e-9 * (time_ns - self.time_ns)
         self.time_ns = time_ns
         if duration > _WATCHDOG_S:

@@ -4,8 +4,8 @@
     gough check-rig --rig python:my_rig:MyRig --rig-at /dev/ttyUSB0 --rate 200 --move
     gough run       --rig python:my_rig:MyRig --rig-at /dev/ttyUSB0 --rate 200
 
-What to change is marked by 1 to 5. The drives' own watchdog is yours to set: drives that are told nothing for some periods must
-stop by themselves, for the loop may die.
+The places to change are marked by 1 to 5. Set the drives' own watchdog, too: drives without a command for some periods must
+stop by themselves, because the loop may die.
 """
 
 import time
@@ -19,34 +19,34 @@ from plant.mechanism import Mechanism
 from plant.pose import Array
 
 SPEED_LIMIT = 0.35
-"""Of each drive [m/s]."""
+"""The largest velocity of a drive [m/s]."""
 
 
 class TemplateRig:
     """Six velocity drives and seven IMUs.
 
     Args:
-        mechanism: what is driven.
+        mechanism: what the rig drives.
         period: of the exchanges [s].
-        rig_at: where it is, from the command line's --rig-at; None without one.
+        rig_at: the rig's address, from the command line's --rig-at; None without one.
     """
 
     def __init__(self, mechanism: Mechanism, period: float, rig_at: str | None) -> None:
-        # A command takes effect by the exchange after the one in which its sample was taken.
+        # A command takes effect at the exchange after that of its sample.
         self.command_delay = period
         self._mechanism, self._rig_at = mechanism, rig_at
         self._hardware: KinematicHexapod | None = None
         self._opened_ns = 0
 
     def open(self) -> None:
-        """Take hold of the hardware. No thread may run when this returns, and what numba compiles must be compiled."""
-        # 1: open the port or bus that rig_at names; let every error be a RigError that says what to do.
+        """Open the hardware. When this returns, no thread may run, and everything for numba must be compiled."""
+        # 1: open the port or bus at rig_at; turn every error into a RigError that says what to do.
         if self._rig_at == "nowhere":
             raise RigError("there is no hardware at nowhere: check --rig-at, cable and power")
         self._hardware, self._opened_ns = KinematicHexapod(self._mechanism), time.monotonic_ns()
 
     def identify(self) -> Identity:
-        """Ask every part who it is, and refuse what is not as expected."""
+        """Ask every part for its identity, and refuse an unexpected one."""
         self._check_open()
         # 2: ask for serial numbers and firmware, and compare them.
         return Identity("template", {"drives": "six of the first order", "IMUs": "seven ideal ones"})
@@ -54,15 +54,15 @@ class TemplateRig:
     def arm(self) -> None:
         """Reset faults and make the drives ready; they stay on their brakes."""
         self._check_open()
-        # 3: reset and prepare each drive; a RigError if one has a fault that stays.
+        # 3: reset and prepare each drive; raise a RigError if its fault stays.
 
     def exchange(self, command: Array, request: int, feedback: Record) -> int:
-        """Commands out, samples in, as `hil.rigs.Rig` says."""
+        """Commands out, samples in (see `hil.rigs.Rig.exchange`)."""
         hardware = self._hardware
         if hardware is None:
             return SILENT
         began = time.monotonic_ns()
-        # What is not a number is no command.
+        # NaN is no command.
         wanted = np.where(np.isnan(command), 0.0, command) if request == ENABLED else np.zeros(6)
         velocities = np.clip(wanted, -SPEED_LIMIT, SPEED_LIMIT)
         try:
@@ -75,12 +75,12 @@ class TemplateRig:
         return ANSWERED
 
     def quick_stop(self) -> None:
-        """Stop the drives, whatever has happened: nothing may be raised here, also when they are gone."""
+        """Stop the drives, whatever has happened; this must not raise, even if they are gone."""
         if self._hardware is not None:
             self._hardware.commands = np.zeros(6)
 
     def close(self) -> None:
-        """Leave the drives on their brakes, and let go of the hardware."""
+        """Leave the drives on their brakes, and close the hardware."""
         self.quick_stop()
         self._hardware = None
 
@@ -90,14 +90,14 @@ class TemplateRig:
 
 
 def drive(hardware: KinematicHexapod, velocities: Array, feedback: Record) -> None:
-    """4: Send the velocities (6,) [m/s], from now on, and note what was really sent after rounding."""
+    """4: Send the velocities (6,) [m/s], which hold from now on, and note what was really sent after rounding."""
     hardware.commands = velocities
     feedback["sent"] = velocities
 
 
 def read_imus(hardware: KinematicHexapod, time_ns: int, feedback: Record) -> None:
     """5: Read the IMUs: rad/s, m/s^2 and uT in their own axes, the time of each sample on one clock, and its number, which
-    stands if there is none that is new. Hardware leaves the truth as it is: it is not known.
+    changes only with a new sample. Hardware does not know the truth and leaves it unchanged.
     """
     hardware.advance(time_ns)
     feedback["measurement"] = hardware.signals

@@ -1,8 +1,8 @@
 /* Datagrams of gough's UDP rig, version 1, for firmware: C11, freestanding, for little-endian machines. docs/rigs.md describes
  * the protocol, and hil/rigs/udp/reference_rig.c is a rig to start from.
  *
- * Every field is aligned to its size, so the structures need no packing. Some are longer in memory than on the wire, by padding
- * at their end: a datagram ends with `crc`, and its length is GOUGH_..._LENGTH, not sizeof. SI units.
+ * Every field is aligned to its size, so the structures need no packing. Padding at their end makes some longer in memory than
+ * on the wire: a datagram ends with `crc`, and its length is GOUGH_..._LENGTH, not sizeof. SI units.
  */
 #ifndef GOUGH_RIG_H
 #define GOUGH_RIG_H
@@ -24,20 +24,20 @@
 
 enum gough_kind { GOUGH_HELLO = 1, GOUGH_WELCOME, GOUGH_COMMAND, GOUGH_MEASUREMENT };
 
-/* What is asked of the drives: to hold on their brakes, to follow the velocities, to stop by themselves and then to hold. */
+/* Request to the drives: hold on the brakes; follow the velocities; stop by themselves and then hold. */
 enum gough_request { GOUGH_BRAKED, GOUGH_ENABLED, GOUGH_QUICK_STOP };
 
-/* What a drive says of itself. */
+/* State of a drive. GOUGH_OFF: it is not ready, for example without power. */
 enum gough_drive { GOUGH_FOLLOWING, GOUGH_READY, GOUGH_OFF, GOUGH_QUICK_STOPPING, GOUGH_FAULTY };
 
-#define GOUGH_WATCHDOG_CODE 0x8130u /* fault code: no command has come for too long (CiA 402: life guarding) */
+#define GOUGH_WATCHDOG_CODE 0x8130u /* fault code: no command for too long (CiA 402: life guarding) */
 
 struct gough_head {
     uint32_t magic;
     uint16_t version;
     uint16_t kind;
     uint32_t session;  /* chosen by the controller, never 0 */
-    uint32_t sequence; /* of commands, from 1; an answer has its command's */
+    uint32_t sequence; /* of commands, from 1; an answer repeats its command's */
     int64_t time_ns;   /* on the sender's own clock */
 };
 
@@ -49,12 +49,12 @@ struct gough_hello {
     uint32_t crc;
 };
 
-/* From the rig: who it is. */
+/* From the rig: its identity. */
 struct gough_welcome {
     struct gough_head head;
-    uint32_t watchdog_us; /* after how long without a command the drives stop; three periods at least */
-    uint32_t truthful;    /* 0; 1 of an emulated rig, which appends a struct gough_truth to its measurements */
-    uint8_t name[32];     /* ASCII, zeros behind */
+    uint32_t watchdog_us; /* time without a command after which the drives stop; at least three periods */
+    uint32_t truthful;    /* 0; 1 for an emulated rig, which appends a struct gough_truth to its measurements */
+    uint8_t name[32];     /* ASCII, padded with zeros */
     uint8_t firmware[16];
     uint32_t crc;
 };
@@ -72,20 +72,20 @@ struct gough_command {
 /* From the rig, once per command. */
 struct gough_measurement {
     struct gough_head head;
-    int64_t sample_ns[GOUGH_IMUS];      /* when each IMU's sample was taken, on the rig's clock */
-    uint32_t sample_number[GOUGH_IMUS]; /* stands when a sample is repeated */
+    int64_t sample_ns[GOUGH_IMUS];      /* time of each IMU's sample, on the rig's clock */
+    uint32_t sample_number[GOUGH_IMUS]; /* the same when a sample is repeated */
     uint32_t refused;                   /* datagrams, since the session began */
     uint8_t drive[GOUGH_LEGS];          /* enum gough_drive */
     uint8_t reserved[2];
     uint16_t code[GOUGH_LEGS];  /* fault codes, 0 without a fault */
-    float velocity[GOUGH_LEGS]; /* that the drives were really given [m/s] */
-    /* Angular velocity [rad/s], specific force [m/s^2], magnetic field [uT]; NaN where there is none. The last IMU is the
+    float velocity[GOUGH_LEGS]; /* velocities of the drives after limits [m/s] */
+    /* Angular velocity [rad/s], specific force [m/s^2], magnetic field [uT]; NaN without a sensor. The last IMU is the
      * platform's. */
     float measurement[3][GOUGH_IMUS][3];
     uint32_t crc;
 };
 
-/* What an emulated rig appends to a measurement. */
+/* An emulated rig appends it to a measurement. */
 struct gough_truth {
     double truth[19];
     uint32_t reserved;

@@ -1,10 +1,10 @@
-/* The reference rig of gough's UDP protocol, on POSIX sockets: what firmware starts from. It passes the tests that the emulated
- * rig passes (tests/hil/rigs/test_udp_rig.py). Replace `read_imu` and `drive`; the rest is what every rig has to do.
+/* The reference rig of gough's UDP protocol, on POSIX sockets: a start for firmware. It passes the tests that the emulated rig
+ * passes (tests/hil/rigs/test_udp_rig.py). Replace `read_imu` and `drive`; every rig needs the rest.
  *
  *     cc -std=c11 -O2 -o reference_rig reference_rig.c && ./reference_rig [PORT [WATCHDOG_MS [ADDRESS]]]
  *
- * Port 0 is any that is free. It listens at 127.0.0.1 unless told the address of another interface. At SIGINT and SIGTERM it
- * ends, and says how many datagrams it has refused in its last session and by how much the legs have moved.
+ * Port 0 takes any free one. The rig listens at 127.0.0.1, or at the ADDRESS of another interface. At SIGINT and SIGTERM it
+ * ends, and prints how many datagrams it has refused in its last session and how far the legs have moved.
  */
 #define _POSIX_C_SOURCE 200809L
 
@@ -23,7 +23,7 @@
 
 #define VELOCITY_LIMIT 0.375f        /* m/s */
 #define QUICK_STOP_DECELERATION 3.0f /* m/s^2 */
-#define LOOK_MS 1                    /* how often the drives are looked after while nothing comes */
+#define UPDATE_MS 1                  /* how often the drives are updated while no datagram arrives */
 
 struct leg {
     uint8_t state; /* enum gough_drive */
@@ -40,7 +40,7 @@ static struct {
     uint32_t refused;
     uint32_t request;
     uint32_t samples;
-    int64_t heard_ns, stepped_ns, watchdog_ns;
+    int64_t commanded_ns, stepped_ns, watchdog_ns;
     struct leg leg[GOUGH_LEGS];
 } rig;
 
@@ -57,7 +57,7 @@ static int64_t now_ns(void) {
     return (int64_t)now.tv_sec * 1000000000 + now.tv_nsec;
 }
 
-/* Replace this: read an IMU's latest sample, and say when it was taken. Here it is at rest, on the preset "hexapod" at home. */
+/* Replace this: read an IMU's latest sample, and return its time. Here it is at rest, on the preset "hexapod" at home. */
 static int64_t read_imu(int imu, float gyroscope[3], float accelerometer[3], float magnetometer[3]) {
     const float leg[3] = {0.0f, 4.5149f, 8.7094f}, platform[3] = {0.0f, 0.0f, 9.81f};
     for (int i = 0; i < 3; i++) {
@@ -68,7 +68,7 @@ static int64_t read_imu(int imu, float gyroscope[3], float accelerometer[3], flo
     return now_ns();
 }
 
-/* Replace this: have a drive do a velocity [m/s], for `period` [s] here; one that is not `powered` holds on its brake. */
+/* Replace this: move a drive at a velocity [m/s], here for `period` [s]; a drive that is not `powered` holds on its brake. */
 static void drive(struct leg *leg, float velocity, int powered, double period) {
     leg->velocity = powered ? velocity : 0.0f;
     leg->moved += leg->velocity * period;
@@ -78,7 +78,7 @@ static float limited(float value, float limit) {
     return value > limit ? limit : value < -limit ? -limit : value;
 }
 
-/* What a drive does until the next look: follow, slow down, or hold. */
+/* Let a drive follow, slow down, or hold for a period [s]. */
 static void step(struct leg *leg, double period) {
     if (leg->state == GOUGH_FOLLOWING) {
         drive(leg, limited(leg->target, VELOCITY_LIMIT), 1, period);
@@ -94,10 +94,10 @@ static void step(struct leg *leg, double period) {
     drive(leg, 0.0f, 0, period);
 }
 
-/* The drives until now; without a command for too long they stop by themselves, with a fault. */
-static void look_after(int64_t now) {
+/* Update the drives until now; without a command for too long they stop by themselves, with a fault. */
+static void update_drives(int64_t now) {
     double period = 1e-9 * (double)(now - rig.stepped_ns);
-    int silent = now - rig.heard_ns > rig.watchdog_ns;
+    int silent = now - rig.commanded_ns > rig.watchdog_ns;
     rig.stepped_ns = now;
     for (int k = 0; k < GOUGH_LEGS; k++) {
         struct leg *leg = &rig.leg[k];
@@ -109,7 +109,7 @@ static void look_after(int64_t now) {
     }
 }
 
-/* What a command asks of a drive. A fault stays until it is reset, at rest and with nothing else asked for. */
+/* Apply a command to a drive. A fault stays until it is reset, at rest and with a request to brake. */
 static void request(struct leg *leg, const struct gough_command *command, float velocity) {
     leg->target = velocity;
     if (leg->state == GOUGH_FAULTY) {
@@ -138,11 +138,11 @@ static int is_same(const struct sockaddr_in *one, const struct sockaddr_in *othe
 }
 
 static void answer_to(const struct sockaddr_in *to, const void *datagram, size_t length) {
-    /* What is lost on the way is asked for again. */
+    /* The controller asks again for a lost answer. */
     (void)sendto(rig.socket, datagram, length, MSG_DONTWAIT, (const struct sockaddr *)to, sizeof *to);
 }
 
-/* Begin a session, or welcome its controller again. A rig that moves has one controller. */
+/* Begin a session, or welcome its controller again. A moving rig has one controller. */
 static int take_hello(const struct gough_hello *hello, const struct sockaddr_in *sender, int64_t now) {
     int again = hello->head.session == rig.session && is_same(sender, &rig.peer);
     if (hello->head.session == 0 || hello->period_us == 0 || (!again && (is_moving() || hello->head.session == rig.session)))
@@ -151,8 +151,8 @@ static int take_hello(const struct gough_hello *hello, const struct sockaddr_in 
         rig.peer = *sender;
         rig.session = hello->head.session;
         rig.last = rig.refused = 0;
-        rig.heard_ns = now;
-        /* Three periods at least, or slow controllers would not be served. */
+        rig.commanded_ns = now;
+        /* At least three periods, for slow controllers. */
         if (rig.watchdog_ns < 3000 * (int64_t)hello->period_us)
             rig.watchdog_ns = 3000 * (int64_t)hello->period_us;
     }
@@ -173,7 +173,7 @@ static int take_command(const struct gough_command *command, const struct sockad
         if (!isfinite(command->velocity[k]))
             return 0;
     rig.last = command->head.sequence;
-    rig.heard_ns = now;
+    rig.commanded_ns = now;
     for (int k = 0; k < GOUGH_LEGS; k++) {
         request(&rig.leg[k], command, command->velocity[k]);
         step(&rig.leg[k], 0.0);
@@ -195,7 +195,7 @@ static int take_command(const struct gough_command *command, const struct sockad
     return 1;
 }
 
-/* Take a datagram if there is one; whatever is wrong with it, nothing happens but that it is counted. */
+/* Read a datagram if there is one; an invalid one is counted and has no other effect. */
 static void receive(void) {
     union {
         struct gough_hello hello;
@@ -206,8 +206,8 @@ static void receive(void) {
     socklen_t size = sizeof sender;
     ssize_t length = recvfrom(rig.socket, &datagram, sizeof datagram, MSG_DONTWAIT, (struct sockaddr *)&sender, &size);
     int64_t now = now_ns();
-    /* At each turn, so that no flood of datagrams holds the watchdog up. */
-    look_after(now);
+    /* At each turn, so that no flood of datagrams blocks the watchdog. */
+    update_drives(now);
     if (length < 0)
         return;
     int taken = 0;
@@ -244,7 +244,7 @@ int main(int count, char **arguments) {
     fflush(stdout);
     while (!ending) {
         struct pollfd readable = {rig.socket, POLLIN, 0};
-        poll(&readable, 1, LOOK_MS);
+        poll(&readable, 1, UPDATE_MS);
         receive();
     }
     printf("%u datagrams refused; the legs have moved by", (unsigned)rig.refused);
