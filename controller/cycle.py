@@ -14,7 +14,8 @@ from collections.abc import Collection
 
 import numpy as np
 
-from controller import load_feed_forward, pid, reference, safety
+from controller import load_feed_forward, pid, reference
+from controller import safety as safety_stage
 from controller.calibration.file import Calibration
 from controller.estimation import (
     heading_filter,
@@ -65,7 +66,7 @@ PARAMETERS = np.dtype(
         ("mechanism", trust.PARAMETERS),
         ("load", load_feed_forward.PARAMETERS),
         ("pid", pid.PARAMETERS),
-        ("safety", safety.PARAMETERS),
+        ("safety", safety_stage.PARAMETERS),
     ],
     align=True,
 )
@@ -83,7 +84,7 @@ STATE = np.dtype(
         ("reference", reference.STATE),
         ("load", load_feed_forward.STATE),
         ("pid", pid.STATE),
-        ("safety", safety.STATE),
+        ("safety", safety_stage.STATE),
     ],
     align=True,
 )
@@ -106,7 +107,7 @@ def cycle_parameters(
     calibration: Calibration | None = None,
     magnetometer: bool = False,
     section_5: bool = False,
-    safety_settings: SafetySettings | None = None,
+    safety: SafetySettings | None = None,
     command_delay: float = 0.0,
     to_arm: bool = True,
 ) -> Record:
@@ -122,7 +123,7 @@ def cycle_parameters(
         calibration: of the IMUs; without one their readings are taken as they are.
         magnetometer: whether the platform's magnetometer gives its heading.
         section_5: whether the pose is that of the paper's section 5, unrefined; that needs the magnetometer.
-        safety_settings: limits that are watched; by default those of `SafetySettings`.
+        safety: limits that are watched; by default those of `SafetySettings`.
         command_delay: of the rig, from a sample to the command computed from it [s].
         to_arm: whether the drives are enabled; else everything is read and nothing moves.
 
@@ -131,7 +132,7 @@ def cycle_parameters(
     """
     check_rate(rate)
     check_imus(mechanism, imus, magnetometer, section_5)
-    calibration, watched = calibration or Calibration(), safety_settings or SafetySettings()
+    calibration, watched = calibration or Calibration(), safety or SafetySettings()
     limits, field = mechanism.require_limits(), field_of(mechanism, calibration.tilt)
     gravity = float(np.linalg.norm(mechanism.plant_parameters()["gravity"]))
     if gravity < _LEAST_GRAVITY:
@@ -150,7 +151,7 @@ def cycle_parameters(
     parameters["mechanism"] = trust.trust_parameters(fusion, rate, filter_parameters(fusion, rate, whole, *errors, of_heading))
     parameters["load"] = load_feed_forward.load_parameters(mechanism, command_delay)
     parameters["pid"] = pid.pid_parameters(control, limits.velocity)
-    parameters["safety"] = safety.safety_parameters(watched, rate, limits, to_arm)
+    parameters["safety"] = safety_stage.safety_parameters(watched, rate, limits, to_arm)
     return parameters
 
 

@@ -4,16 +4,15 @@ import numpy as np
 import pytest
 from numba import njit
 
-from controller.estimation.whole_mechanism.filter import extrapolate, extrapolate_covariance, start_filter, step_filter
-from controller.estimation.whole_mechanism.imu_errors import ERRORS, distort, error_gradient
-from controller.estimation.whole_mechanism.parameters import (
-    ALL_ERRORS,
-    BLOCKS,
-    FILTER_STATE,
-    MOTION_STATES,
-    collect,
-    filter_parameters,
+from controller.estimation.whole_mechanism.filter import (
+    accumulate_sample,
+    extrapolate,
+    extrapolate_covariance,
+    start_filter,
+    step_filter,
 )
+from controller.estimation.whole_mechanism.imu_errors import ERRORS, distort, error_gradient
+from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, BLOCKS, FILTER_STATE, MOTION_STATES, filter_parameters
 from controller.estimation.whole_mechanism.readings import READINGS_SCRATCH, predict_readings
 from controller.estimation.whole_mechanism.rig_jacobian import JOINTS, RIG_ERRORS, TILT
 from controller.rig import sensor_geometry
@@ -37,7 +36,7 @@ def follow(parameters, geometry, state, imu, signals, used, delay, start, positi
         if i == start:
             start_filter(parameters, state, time, position, rotation, twist)
         if i > start:
-            collect(state, measurement, used[i], time - delay)
+            accumulate_sample(state, measurement, used[i], time - delay)
             step_filter(parameters, geometry, state)
         extrapolate(state, time, positions[i], rotations[i], rate, acceleration)
 
@@ -246,7 +245,7 @@ def test_taken_bit_by_bit_it_equals_its_dense_twin(hexapod, errors, rig, toleran
     start_filter(parameters[()], state[()], 0.0, *start)
     window = 5
     for i in range(1, len(samples)):
-        collect(state[()], samples[i], used[i], i / RATE_HZ)
+        accumulate_sample(state[()], samples[i], used[i], i / RATE_HZ)
         step_filter(parameters[()], geometry, state[()])
         if i % window == 0:
             block = samples[i - window + 1 : i + 1].mean(axis=0)
@@ -273,7 +272,7 @@ def test_what_is_known_grows_less_sure_on_the_way_to_the_present(hexapod):
         np.zeros((), FILTER_STATE),
     )
     mixed, found = random.normal(0.0, 1e-3, (18, 18)), np.zeros((6, 6))
-    state["known_covariance"] = mixed @ mixed.T
+    state["published_covariance"] = mixed @ mixed.T
     extrapolate_covariance(parameters[()], state[()], time, found)
     carried = np.hstack([np.eye(6), time * np.eye(6), time**2 / 2.0 * np.eye(6)])
     jerk = np.repeat(parameters["jerk"], 3) * time**5 / 20.0
@@ -317,7 +316,7 @@ def test_every_cycle_of_a_window_takes_its_share(hexapod):
     signals = impose(hexapod, "static", 0.1, RATE_HZ, 0).signals[0]
     rows = []
     for i in range(1, 21):
-        collect(state[()], signals, np.ones(7, np.int64), i / RATE_HZ)
+        accumulate_sample(state[()], signals, np.ones(7, np.int64), i / RATE_HZ)
         step_filter(parameters[()], geometry, state[()])
         rows.append(int(state["row"]))
     assert rows[4:9] == [0, 9, 20, 31, -1]
