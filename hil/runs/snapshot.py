@@ -14,11 +14,15 @@ from typing import Any
 import msgpack
 from numpy.typing import NDArray
 
+from controller.cycle import PARAMETERS, STATE
 from controller.planning.segments import START
 from hil.loop.driver import Loop
+from hil.loop.records import WORK
+from hil.realtime.clock import CLOCK
 from plant.errors import InputError
 from plant.files import write_whole
 from plant.fmu.plant import FmuPlant
+from plant.imu import IMU_STATE
 from plant.pose import Array
 
 _KIND = "gough snapshot"
@@ -90,7 +94,7 @@ def write_snapshot(snapshot: Snapshot, path: Path) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    content = {"kind": _KIND, "version": version("gough"), **vars(snapshot)}
+    content = {"kind": _KIND, "version": version("gough"), "layout": _layout(), **vars(snapshot)}
     write_whole(path, msgpack.packb(content))
 
 
@@ -108,8 +112,12 @@ def read_snapshot(path: Path) -> Snapshot:
         content = None
     if not isinstance(content, dict) or content.pop("kind", None) != _KIND:
         raise InputError(f"{path} is no snapshot of 'gough simulate --save-state'")
-    if (of := content.pop("version", None)) != version("gough"):
-        raise InputError(f"{path} is of gough {of}, and this is gough {version('gough')}: go on with that version")
+    of, layout = content.pop("version", None), content.pop("layout", None)
+    if of != version("gough") or layout != _layout():
+        raise InputError(
+            f"{path} is of gough {of}, and this is gough {version('gough')} with another layout of the state: go on with the "
+            "version that saved it, or simulate from the start"
+        )
     try:
         return Snapshot(**content)
     except TypeError:
@@ -118,6 +126,11 @@ def read_snapshot(path: Path) -> Snapshot:
 
 def _hash(content: bytes) -> bytes:
     return hashlib.sha256(content).digest()
+
+
+def _layout() -> bytes:
+    """A hash of the layout of all that a snapshot keeps of a loop."""
+    return _hash(repr((PARAMETERS, STATE, WORK, CLOCK, IMU_STATE)).encode())
 
 
 def _settings(loop: Loop, plant: FmuPlant) -> bytes:

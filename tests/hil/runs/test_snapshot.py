@@ -110,6 +110,8 @@ def test_other_files_are_refused(saved: tuple[SimulationConfig, Path], tmp_path:
     whole = msgpack.unpackb(content)
     for changes, said in (
         ({"version": "0.0.1"}, "is of gough 0.0.1, and this is gough"),
+        ({"layout": b""}, "with another layout of the state: go on with the version that saved it, or simulate from the start"),
+        ({"layout": None}, "with another layout of the state"),
         ({"more": 1}, "missing or unknown parts"),
         ({"memory": whole["memory"] | {"imu": b""}}, "memory has another layout"),
         ({"config": whole["config"] | {"speed": 1}}, "no configuration of a simulation"),
