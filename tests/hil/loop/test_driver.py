@@ -1,4 +1,4 @@
-"""The loop around the cycle: what it records, and how it keeps time, on a scripted clock: late, long, many in a row, a stop."""
+"""The loop around the cycle on a scripted clock: its records, late wake-ups, long work, missed periods and stops."""
 
 import numpy as np
 import pytest
@@ -18,11 +18,12 @@ from tests.controller.cycles import cycle
 MS = 1_000_000
 CONFIG = SimulationConfig(target="sines", duration=2.0)
 SENSORS = ("angular_velocity", "specific_force", "magnetic_field")
-FOUND = ("position", "rotation", "lengths", "command", "conditioning")
+FOUND = {"position": "pose", "rotation": "pose", "lengths": "pose", "command": "pid", "conditioning": "pose"}
+"""What a cycle finds, and the stage whose state keeps it."""
 
 
 def scripted(loop, late=(), work=(), cpu=(), cycles=5000):
-    """Put a loop on a clock on which cycles are late, or their work takes long, by dicts from cycle number to ns."""
+    """Put a loop on a scripted clock; dicts from cycle number to ns say which cycles are late or work long."""
     loop.script = np.zeros((cycles, 3), np.int64)
     loop.script[:, 1:] = 100_000
     for column, values in enumerate((late, work, cpu)):
@@ -37,7 +38,7 @@ def written(loop):
 
 
 def replayed(loop, records):
-    """What `controller.cycle.cycle` finds from the raw data of records, in its own words."""
+    """Run the cycle again on the raw data of records; returns records with what it finds."""
     state, measurement = np.zeros((), STATE), np.zeros((3, 7, 3))
     found = np.zeros_like(records)
     for record, again in zip(records, found, strict=True):
@@ -45,8 +46,8 @@ def replayed(loop, records):
         for i, name in enumerate(SENSORS):
             measurement[i] = record[name]
         assert cycle(loop.parameters, state, measurement, loop.segments) == Cause.NONE
-        for name in FOUND:
-            again[name] = state[name]
+        for name, stage in FOUND.items():
+            again[name] = state[stage][name]
         prepare_next(loop.parameters, state, loop.segments)
     return found
 
@@ -78,7 +79,7 @@ def test_a_wake_up_late_by_less_than_a_period_misses_nothing():
         scripted(loop, late={10: 999_999, 500: 300_000}).run(1000)
         records = written(loop)
         assert records["late_ns"][10] == 999_999
-        # What came late ends late, and the next one is on time again unless it had to wait.
+        # A late cycle ends late; the next one is on time unless it had to wait.
         assert records["late_ns"][11] == 0 or records["missed"][11] > 0
         assert records["late_ns"][500] == 300_000 and records["late_ns"][501] == 0
         assert loop.clock["missed_late"] == 0
@@ -97,7 +98,7 @@ def test_a_late_wake_up_skips_whole_periods_and_keeps_the_phase(periods):
         np.testing.assert_array_equal(records["time_ns"], expected)
         clock = loop.clock
         assert (clock["missed_late"], clock["missed_own"], clock["missed_host"]) == (periods, 0, 0)
-        # The reference goes by time, the plant has moved on, and the estimate follows.
+        # The reference and the plant follow the time that has passed, and the estimate follows the plant.
         on_time = np.isin(np.arange(1500), records["cycle"])
         with prepared_loop(CONFIG) as undisturbed:
             undisturbed.run(1500)
@@ -143,7 +144,7 @@ def follow(loop, seconds=2.0):
 
 
 def stops_within_limits(loop, records, off=1e-3):
-    """The reference goes on from where the mechanism is, comes to rest within its limits, and the drives follow it there."""
+    """The reference starts where the mechanism is and comes to rest within its limits; the drives follow it."""
     limits = loop.mechanism.require_limits()
     stopping = records[records["stop"] > 0]
     reference = stopping["reference"]
@@ -171,7 +172,7 @@ def test_too_many_missed_in_a_row_end_in_a_controlled_stop_and_fewer_do_not():
         with prepared_loop(CONFIG) as loop:
             cause, records = follow(scripted(loop, late={900: periods * MS}))
             assert cause == (Cause.MISSED_PERIODS if stops else Cause.END_OF_MOTION)
-            # In a long pause the drives go on as they were last told, and then have some way back.
+            # In a long pause the drives keep their last command, and then have some way back.
             stops_within_limits(loop, records, off=1e-3 if periods < 100 else 2e-2)
             if stops:
                 assert records["cycle"][-1] < 900 + periods + 500
