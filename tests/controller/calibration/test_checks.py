@@ -87,7 +87,7 @@ def test_an_imu_that_does_not_take_part_is_named(hexapod, motion):
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (lambda own: np.full_like(own, np.nan), "no number"),
+        (lambda own: np.full_like(own, np.nan), "not finite"),
         (lambda own: np.broadcast_to(own[0], own.shape), "is frozen"),
         (lambda own: 0.1 * own, "reads 0.981 m/s2 at rest"),
     ],

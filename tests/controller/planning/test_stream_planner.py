@@ -260,7 +260,7 @@ def test_misuse_is_refused(hexapod):
         planner.add(1.0, np.zeros(3), LEVEL)
     plan = planner.plan(1.0, 0.0)
     planner.follow(plan)
-    with pytest.raises(InputError, match="precede"):
+    with pytest.raises(InputError, match="would begin before the current plan"):
         planner.plan(0.9, 0.0)
     with pytest.raises(UnreachableError):
         StreamPlanner(hexapod, home_lengths(hexapod) + 1.0)
