@@ -1,4 +1,4 @@
-/* FMI 2.0 Co-Simulation: every element of a variable is one scalar; its value reference is its place among the values. */
+/* FMI 2.0 Co-Simulation: every element of a variable is one scalar, whose value reference is its place in `values`. */
 #include <stdlib.h>
 #include <string.h>
 
@@ -10,9 +10,9 @@ typedef struct {
     char name[];
 } Importer;
 
-static void tell(const Plant *plant, const char *message) {
+static void log_error(const Plant *plant, const char *message) {
     const Importer *importer = plant->importer;
-    /* Not every importer expands a format, and no message has a percent sign. */
+    /* Some importers do not expand formats, so no message has a percent sign. */
     if (importer->callbacks && importer->callbacks->logger)
         importer->callbacks->logger(
             importer->callbacks->componentEnvironment, importer->name, fmi2Error, "logStatusError", message);
@@ -24,7 +24,7 @@ FMI2_Export const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
 FMI2_Export const char *fmi2GetVersion(void) { return "2.0"; }
 
 FMI2_Export fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t n, const fmi2String categories[]) {
-    (void)c, (void)on, (void)n, (void)categories; /* errors are always told, and there is nothing else */
+    (void)c, (void)on, (void)n, (void)categories; /* errors are always logged, and nothing else is */
     return fmi2OK;
 }
 
@@ -37,7 +37,7 @@ FMI2_Export fmi2Component fmi2Instantiate(
     if (!importer) return 0;
     importer->callbacks = callbacks;
     strcpy(importer->name, name);
-    Plant *plant = model_new(type == fmi2CoSimulation ? STEPPING : 0, token, tell, importer);
+    Plant *plant = model_new(type == fmi2CoSimulation ? STEPPING : 0, token, log_error, importer);
     if (!plant) free(importer);
     return plant;
 }

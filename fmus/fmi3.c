@@ -1,4 +1,4 @@
-/* FMI 3.0, Co-Simulation and Model Exchange: every variable of the table is one array; a value reference is its index. */
+/* FMI 3.0, Co-Simulation and Model Exchange: every variable of the table is one array, whose value reference is its index. */
 #include <math.h>
 #include <stdlib.h>
 
@@ -10,7 +10,7 @@ typedef struct {
     fmi3LogMessageCallback log;
 } Importer;
 
-static void tell(const Plant *plant, const char *message) {
+static void log_error(const Plant *plant, const char *message) {
     const Importer *importer = plant->importer;
     if (importer->log) importer->log(importer->environment, fmi3Error, "logStatusError", message);
 }
@@ -20,7 +20,7 @@ static void tell(const Plant *plant, const char *message) {
 FMI3_Export const char *fmi3GetVersion(void) { return "3.0"; }
 
 FMI3_Export fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean on, size_t n, const fmi3String categories[]) {
-    (void)instance, (void)on, (void)n, (void)categories; /* errors are always told, and there is nothing else */
+    (void)instance, (void)on, (void)n, (void)categories; /* errors are always logged, and nothing else is */
     return fmi3OK;
 }
 
@@ -29,7 +29,7 @@ static fmi3Instance instantiate(Phase after, fmi3String token, fmi3InstanceEnvir
     if (!importer) return 0;
     importer->environment = environment;
     importer->log = log;
-    Plant *plant = model_new(after, token, tell, importer);
+    Plant *plant = model_new(after, token, log_error, importer);
     if (!plant) free(importer);
     return plant;
 }
@@ -243,7 +243,7 @@ FMI3_Export fmi3Status fmi3SetInt64(
 
 /* ---- derivatives ---- */
 
-/* Check one side of a derivative, and add its values, if there are any, to their places. */
+/* Check the unknowns or the knowns of a derivative; if `values` are given, add them at their places in `vector`. */
 static int scatter(
     fmi3Instance instance, const fmi3ValueReference references[], size_t n, int unknown, const fmi3Float64 values[],
     size_t n_values, double *vector) {

@@ -12,7 +12,7 @@ Status model_fail(const Plant *plant, const char *format, ...) {
     va_start(arguments, format);
     vsnprintf(message, sizeof message, format, arguments);
     va_end(arguments);
-    plant->tell(plant, message);
+    plant->log_error(plant, message);
     return FAILED;
 }
 
@@ -27,7 +27,7 @@ Status model_require(const Plant *plant, int phases, const char *function) {
 
 /* ---- dynamics ---- */
 
-/* Call a function of plant.h: its arguments, then its results, and what it needs to work. */
+/* Call a function of plant.h or derivatives.h with its arguments, its results and scratch memory. */
 #define CALL(function, inputs, outputs)                                         \
     do {                                                                        \
         const double *arguments[function##_SZ_ARG] = {UNPACK inputs};           \
@@ -62,11 +62,11 @@ static void require_outputs(State *s) {
     s->outputs_known = 1;
 }
 
-static void forget(State *s) { s->outputs_known = s->rates_known = 0; }
+static void invalidate(State *s) { s->outputs_known = s->rates_known = 0; }
 
 static void place_at_start(State *s) {
     CALL(plant_start, (s->values + PARAMETERS_AT), (s->values));
-    forget(s);
+    invalidate(s);
 }
 
 /* A state that decays would pass through the denormal numbers, where many processors are slow, and never reach zero. */
@@ -93,7 +93,7 @@ static void integrate(State *s, double duration, long steps) {
         for (int i = 0; i < 4; i++) q[i] *= scale;
 #endif
     }
-    forget(s);
+    invalidate(s);
 }
 
 static int all_finite(const double *values, size_t n) {
@@ -130,11 +130,11 @@ static Status check_limits(const Plant *plant) {
 /* ---- life ---- */
 
 Plant *model_new(
-    Phase after_initialization, const char *token, void (*tell)(const Plant *, const char *), const void *importer) {
+    Phase after_initialization, const char *token, void (*log_error)(const Plant *, const char *), const void *importer) {
     Plant *plant = calloc(1, sizeof *plant);
     if (!plant) return 0;
     plant->after_initialization = after_initialization;
-    plant->tell = tell;
+    plant->log_error = log_error;
     plant->importer = importer;
     Status status = OK;
     if (!after_initialization) status = model_fail(plant, "this FMU is for Co-Simulation alone");
@@ -200,7 +200,7 @@ Status model_step(Plant *plant, double time, double step) {
 
 void model_set_states(Plant *plant, const double *states) {
     memcpy(plant->state.values, states, STATES * sizeof(double));
-    forget(&plant->state);
+    invalidate(&plant->state);
 }
 
 Status model_rates(Plant *plant, double *found) {
@@ -240,14 +240,14 @@ Status model_set(Plant *plant, unsigned v, int first, int count, int integer, co
         for (int i = 0; i < count; i++)
             if (values[i] < minimum[v] || values[i] > maximum[v])
                 return model_fail(plant, "%s is %g; it must be 0 (open), 1 (brake) or 2 (velocity)", names[v], values[i]);
-    /* Before the end of initialisation parameters may be set one after the other; then all are checked together. */
+    /* The end of initialisation checks all parameters together; after it, `model_end_set` does. */
     if (kind[v] == TUNABLE && s->phase >= STEPPING) {
         if (check_range(plant, v, values, count) != OK) return FAILED;
         if (!plant->tuned) memcpy(plant->untuned, s->values + PARAMETERS_AT, sizeof plant->untuned);
         plant->tuned = 1;
     }
     memcpy(place, values, count * sizeof(double));
-    forget(s);
+    invalidate(s);
     if (!is_parameter(v)) return OK;
     s->constants_known = 0;
     if (s->phase < STEPPING) place_at_start(s);
