@@ -1,6 +1,7 @@
 """Calibration in motion: it improves what was found at rest, and predicts its own accuracy."""
 
 import numpy as np
+import pytest
 
 from controller.calibration.at_rest import Prior, Rests, calibrate_at_rest, pose_covariance
 from controller.calibration.in_motion import calibrate_in_motion
@@ -38,6 +39,7 @@ def test_motion_brings_it_to_a_tenth_of_a_millimetre(hexapod):
     assert error[6].max() < 2e-3
 
 
+@pytest.mark.slow
 def test_joints_that_are_off_are_sought_with_the_rest(hexapod):
     built, fusion = hexapod.built(2e-4, 3), sensor_settings(hexapod, RAW)
     readings, _, _ = rests_of(built, 20, 1)
