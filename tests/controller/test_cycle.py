@@ -8,6 +8,7 @@ import pytest
 from numba.core.runtime import _nrt_python, rtsys
 from scipy.spatial.transform import Rotation
 
+from controller import cycle as compiled
 from controller.cycle import STATE, cycle_parameters
 from controller.direct_kinematics import solve
 from controller.imu_set import check_imus
@@ -334,25 +335,26 @@ def test_a_copied_state_goes_on_bit_by_bit_as_the_original(hexapod):
     assert state.tobytes() == snapshot.tobytes()
     whole = run(parameters, measurements.__getitem__, segments, 600)
     assert state.tobytes() == whole.tobytes()
-    assert np.abs(whole["command"]).max() > 0.0
+    assert np.abs(whole["pid"]["command"]).max() > 0.0
 
 
 def test_cycles_allocate_nothing(hexapod):
     @numba.njit
-    def repeat(parameters, state, measurement, segments, count):
+    def repeat(parameters, state, measurement, segments, marks, count):
         status = 0
         for _ in range(count):
-            status |= cycle(parameters, state, measurement, segments)
+            status |= compiled.cycle(parameters, state, measurement, segments, marks)
         return status
 
+    marks = np.zeros((), compiled.MARKS)[()]
     parameters, state = parameters_of(hexapod), np.zeros((), STATE)
     measurement, segments = wavy(hexapod, 7)(0), resting(np.full(6, 0.394))
-    assert repeat(parameters, state, measurement, segments, 1) == Cause.NONE
+    assert repeat(parameters, state, measurement, segments, marks, 1) == Cause.NONE
     _nrt_python.memsys_enable_stats()
     allocated = []
     for count in (1, 1000):
         before = rtsys.get_allocation_stats()
-        assert repeat(parameters, state, measurement, segments, count) == Cause.NONE
+        assert repeat(parameters, state, measurement, segments, marks, count) == Cause.NONE
         allocated.append(rtsys.get_allocation_stats().alloc - before.alloc)
     _nrt_python.memsys_disable_stats()
     # What remains belongs to the call from Python.
@@ -507,7 +509,7 @@ def test_a_derivative_is_not_kicked_by_an_error_that_was_there_during_the_hold(h
     commands = []
     for derivative in (0.0, 1.0):
         parameters = parameters_of(hexapod, hold=0.05, derivative=derivative)
-        commands.append(run(parameters, signals, resting(home + 1e-4), 51)["command"].copy())
+        commands.append(run(parameters, signals, resting(home + 1e-4), 51)["pid"]["command"].copy())
     np.testing.assert_allclose(commands[1], commands[0], rtol=0.0, atol=1e-9)
 
 
@@ -516,7 +518,7 @@ def test_a_command_drives_each_leg_towards_its_reference_within_the_limit(hexapo
     home = leg_lengths(hexapod, hexapod.home.position, np.eye(3))
     control = control_settings(hexapod)
     off = np.array([1e-3, -1e-3, 2e-3, -2e-3, 0.05, -0.05])
-    balanced = run(parameters_of(hexapod), signals, resting(home), 201)["command"].copy()
+    balanced = run(parameters_of(hexapod), signals, resting(home), 201)["pid"]["command"].copy()
     state = run(parameters_of(hexapod), signals, resting(home + off), 201)
     np.testing.assert_allclose((state["pid"]["command"] - balanced)[:4], control.proportional * off[:4], rtol=1e-6)
     limit = control.command_reserve * hexapod.limits.velocity
@@ -578,7 +580,7 @@ def test_the_feed_forward_adds_the_references_speed_and_the_inertia_of_its_accel
     plant, parameters = hexapod.plant, parameters_of(hexapod, hold=1e-3)
     position = hexapod.home.position
     signals, lengths = static_signals(hexapod, position, np.eye(3)), leg_lengths(hexapod, position, np.eye(3))
-    still = run(parameters, signals, resting(lengths), 2)["feed_forward"].copy()
+    still = run(parameters, signals, resting(lengths), 2)["load"]["feed_forward"].copy()
     segments = resting(lengths)
     segments[:, 0, 2], segments[:, 0, 3] = np.linspace(-0.1, 0.1, 6), np.linspace(1.0, -2.0, 6)
     moving = run(parameters, signals, segments, 2)
@@ -588,7 +590,7 @@ def test_the_feed_forward_adds_the_references_speed_and_the_inertia_of_its_accel
     speed_per_force = (1.0 - plant["drive.compensation"]) * plant["drive.nominal_resistance"]
     speed_per_force /= (turns * plant["motor.torque_constant"]) ** 2
     extra = segments[:, 0, 2] + speed_per_force * inertia * segments[:, 0, 3]
-    np.testing.assert_allclose(moving["feed_forward"] - still, extra, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(moving["load"]["feed_forward"] - still, extra, rtol=1e-9, atol=1e-12)
 
 
 def test_settings_reach_the_cycle(hexapod):
@@ -616,6 +618,6 @@ def test_a_turn_of_the_whole_world_about_the_vertical_turns_the_estimate_with_it
     at = wavy(hexapod, 10)
     measurements = [at(k).copy() for k in range(100)]
     states = [run(parameters_of(m), measurements.__getitem__, resting(np.full(6, 0.394)), 100) for m in (hexapod, turned)]
-    np.testing.assert_allclose(states[1]["position"], turn @ states[0]["position"], rtol=0.0, atol=1e-10)
-    np.testing.assert_allclose(states[1]["rotation"], turn @ states[0]["rotation"], rtol=0.0, atol=1e-10)
-    assert Rotation.from_matrix(states[0]["rotation"]).magnitude() > 1e-4
+    np.testing.assert_allclose(states[1]["pose"]["position"], turn @ states[0]["pose"]["position"], rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(states[1]["pose"]["rotation"], turn @ states[0]["pose"]["rotation"], rtol=0.0, atol=1e-10)
+    assert Rotation.from_matrix(states[0]["pose"]["rotation"]).magnitude() > 1e-4

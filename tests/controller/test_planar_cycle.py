@@ -166,8 +166,8 @@ def test_at_rest_the_commands_make_up_for_the_weight(rig):
     forces = np.linalg.solve(jacobian(p, q)[-3:].T, -weight_force(p, q))
     np.testing.assert_allclose(state["load"]["feed_forward"][:3], parameters["load"]["droop"] * forces, rtol=1e-6)
     np.testing.assert_allclose(state["pose"]["lengths"][:3], coordinates(p, q)[-3:], atol=1e-8)
-    for name in ("lengths", "command", "feed_forward", "error"):
-        assert not state[name][3:].any()
+    for stage, name in (("pose", "lengths"), ("pid", "command"), ("load", "feed_forward"), ("pid", "error")):
+        assert not state[stage][name][3:].any()
 
 
 def variant(planar, **changes):
