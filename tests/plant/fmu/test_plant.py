@@ -509,3 +509,55 @@ def test_a_reset_fmu_starts_over(make_plant: MakePlant, hexapod: Mechanism) -> N
     np.testing.assert_array_equal(plant.get("position"), first)
     assert plant.get("payload.mass") == hexapod.plant["payload.mass"]
     plant.step(1e-3)
+
+
+# ---- saving and restoring ----
+
+
+def move(plant: FmuPlant, cycles: range) -> Array:
+    """Drive on; the truth and IMU signals after every cycle, as the bits they are."""
+    seen = []
+    for cycle in cycles:
+        plant.set("drive_mode", np.full(6, BRAKE if cycle % 50 > 40 else VELOCITY))
+        plant.set("velocity_command", 0.1 * np.sin(0.1 * cycle + np.arange(6)))
+        plant.step(1e-3)
+        seen.append(
+            np.hstack([plant.get(name).ravel() for name in ("position", "quaternion", "current", "imu_specific_force")])
+        )
+    return np.array(seen).view(np.uint64)
+
+
+def test_a_restored_state_goes_on_bit_for_bit(make_plant: MakePlant) -> None:
+    plant = make_plant({"payload.mass": 4.0})
+    move(plant, range(45))
+    saved, time = plant.state(), float(plant.handle["time"])
+    first = move(plant, range(45, 145))
+    plant.set("payload.mass", 8.0)
+    move(plant, range(145, 150))
+    plant.restore(saved)
+    assert plant.get("time") == plant.handle["time"] == time
+    assert plant.get("payload.mass") == 4.0
+    np.testing.assert_array_equal(move(plant, range(45, 145)), first)
+
+
+def test_a_state_goes_on_in_another_instance(make_plant: MakePlant) -> None:
+    plant = make_plant({"payload.mass": 4.0, "brake.force": 1200.0})
+    move(plant, range(45))
+    saved = plant.state()
+    first = move(plant, range(45, 145))
+    other = make_plant()
+    other.restore(saved)
+    assert other.get("brake.force") == 1200.0
+    np.testing.assert_array_equal(move(other, range(45, 145)), first)
+
+
+def test_a_state_of_another_build_is_refused(make_plant: MakePlant) -> None:
+    plant = make_plant()
+    saved = plant._instance.state()
+    clock = plant.state().removesuffix(saved)
+    for broken, message in (
+        (bytes([saved[0] ^ 1]) + saved[1:], "from another build of this FMU"),
+        (saved[:-1], "wrong size"),
+    ):
+        with pytest.raises(FmuError, match=f"gough_plant.fmu: restoring a state failed: .*{message}"):
+            plant.restore(clock + broken)

@@ -1,9 +1,6 @@
-"""The FMU as a file: built once, always the same, valid, described by the table, and able to save its state."""
+"""The description of the FMU: valid, and what the table of variables says."""
 
-import os
 import re
-import subprocess
-import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -15,9 +12,6 @@ import pytest
 from fmpy.validation import validate_fmu
 
 from plant.dynamics.variables import BRAKE, DRIVE_MODES, SPATIAL, VELOCITY
-from plant.errors import FmuError, ToolchainError
-from plant.fmu import build as export
-from plant.fmu.build import build_in_subprocess, default_fmu
 from plant.fmu.description import QUANTITIES, Layout
 from plant.fmu.plant import FmuPlant
 from plant.mechanism import Mechanism
@@ -30,86 +24,6 @@ EXPOSED = Layout(SPATIAL).exposed
 @pytest.fixture(scope="module")
 def description(fmu_path: Path) -> Any:
     return fmpy.read_model_description(str(fmu_path), validate=True)
-
-
-# ---- building ----
-
-
-def test_the_default_fmu_is_built_once(fmu_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def build_again(path: Path, *_: Any) -> None:
-        raise AssertionError(f"{path} exists already")
-
-    monkeypatch.setattr(export, "_start_build", build_again)
-    before = fmu_path.stat()
-    assert default_fmu() == fmu_path
-    assert (fmu_path.stat().st_ino, fmu_path.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
-
-
-@pytest.mark.slow
-def test_a_build_is_the_same_to_the_byte_and_loads_no_casadi(fmu_path: Path, tmp_path: Path) -> None:
-    """A fresh process with an empty cache builds the FMU again, in a process of its own."""
-    code = "import sys, plant.fmu.build; path = plant.fmu.build.default_fmu(); print(path); print('casadi' in sys.modules)"
-    run = subprocess.run(
-        [sys.executable, "-c", code],
-        env=os.environ | {"GOUGH_CACHE": str(tmp_path / "cache")},
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    path, casadi = run.stdout.splitlines()
-    assert casadi == "False"
-    assert Path(path).is_relative_to(tmp_path / "cache" / "fmus") and Path(path).parent.name == fmu_path.parent.name
-    assert Path(path).read_bytes() == fmu_path.read_bytes()
-
-
-def test_the_cache_key_follows_the_sources(monkeypatch: pytest.MonkeyPatch, fmu_path: Path, tmp_path: Path) -> None:
-    monkeypatch.setenv("GOUGH_CACHE", str(tmp_path))
-    monkeypatch.setattr(export, "version", lambda package: "0.0.0")
-
-    def write(path: Path, *_: Any) -> None:
-        path.write_text("built")
-
-    monkeypatch.setattr(export, "_start_build", write)
-    path = default_fmu()
-    assert path.read_text() == "built"
-    assert path.parent.name != fmu_path.parent.name
-
-
-def refused_build(path: Path) -> str:
-    with pytest.raises(ToolchainError) as caught:
-        build_in_subprocess(path)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
-def test_a_missing_compiler_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("PATH", str(tmp_path))
-    message = refused_build(tmp_path / "plant.fmu")
-    assert "no C compiler (cc, gcc or clang) was found: install one" in message
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_failing_compiler_is_quoted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    compiler = tmp_path / "cc"
-    compiler.write_text("#!/bin/sh\necho 'In file included' >&2\necho 'plant.c:1: error: disk full' >&2\nexit 1\n")
-    compiler.chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    assert f"{compiler} could not compile the plant: plant.c:1: error: disk full" in refused_build(tmp_path / "plant.fmu")
-    assert list(tmp_path.iterdir()) == [compiler]
-
-
-def test_a_path_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    target = tmp_path / "no" / "such" / "folder" / "plant.fmu"
-    assert f"cannot write {target}: {target.parent} is no folder" in refused_build(target)
-
-
-def test_a_failed_write_leaves_nothing_behind(tmp_path: Path) -> None:
-    (tmp_path / "plant.fmu").mkdir()
-    assert "cannot write" in refused_build(tmp_path / "plant.fmu")
-    assert [entry.name for entry in tmp_path.iterdir()] == ["plant.fmu"]
-
-
-# ---- the description ----
 
 
 def test_fmpy_finds_no_problem(fmu_path: Path) -> None:
@@ -238,55 +152,3 @@ def test_a_foreign_importer_simulates_the_fmu(fmu_path: Path, make_plant: MakePl
             assert row[name] == pytest.approx(float(plant.get(name)), rel=1e-9)
         plant.step(1e-3)
     assert len(result) == 51 and np.ptp(result["kinetic_energy"]) > 0.0
-
-
-# ---- saving and restoring ----
-
-
-def move(plant: FmuPlant, cycles: range) -> Array:
-    """Drive on; the truth and IMU signals after every cycle, as the bits they are."""
-    seen = []
-    for cycle in cycles:
-        plant.set("drive_mode", np.full(6, BRAKE if cycle % 50 > 40 else VELOCITY))
-        plant.set("velocity_command", 0.1 * np.sin(0.1 * cycle + np.arange(6)))
-        plant.step(1e-3)
-        seen.append(
-            np.hstack([plant.get(name).ravel() for name in ("position", "quaternion", "current", "imu_specific_force")])
-        )
-    return np.array(seen).view(np.uint64)
-
-
-def test_a_restored_state_goes_on_bit_for_bit(make_plant: MakePlant) -> None:
-    plant = make_plant({"payload.mass": 4.0})
-    move(plant, range(45))
-    saved, time = plant.state(), float(plant.handle["time"])
-    first = move(plant, range(45, 145))
-    plant.set("payload.mass", 8.0)
-    move(plant, range(145, 150))
-    plant.restore(saved)
-    assert plant.get("time") == plant.handle["time"] == time
-    assert plant.get("payload.mass") == 4.0
-    np.testing.assert_array_equal(move(plant, range(45, 145)), first)
-
-
-def test_a_state_goes_on_in_another_instance(make_plant: MakePlant) -> None:
-    plant = make_plant({"payload.mass": 4.0, "brake.force": 1200.0})
-    move(plant, range(45))
-    saved = plant.state()
-    first = move(plant, range(45, 145))
-    other = make_plant()
-    other.restore(saved)
-    assert other.get("brake.force") == 1200.0
-    np.testing.assert_array_equal(move(other, range(45, 145)), first)
-
-
-def test_a_state_of_another_build_is_refused(make_plant: MakePlant) -> None:
-    plant = make_plant()
-    saved = plant._instance.state()
-    clock = plant.state().removesuffix(saved)
-    for broken, message in (
-        (bytes([saved[0] ^ 1]) + saved[1:], "from another build of this FMU"),
-        (saved[:-1], "wrong size"),
-    ):
-        with pytest.raises(FmuError, match=f"gough_plant.fmu: restoring a state failed: .*{message}"):
-            plant.restore(clock + broken)

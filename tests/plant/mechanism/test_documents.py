@@ -1,0 +1,160 @@
+"""Documents of mechanisms: what a file may say, what it may be based on, and what is refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plant.errors import InputError, UnknownNameError
+from plant.mechanism import Mechanism, load_mechanism
+from plant.pose import Array, Pose
+
+BASE = [[0.3, -0.05, 0.0], [0.3, 0.05, 0.0], [-0.1, 0.28, 0.0], [-0.2, 0.23, 0.0], [-0.2, -0.23, 0.0], [-0.1, -0.28, 0.0]]
+PLATFORM = [
+    [0.13, -0.15, 0.0],
+    [0.13, 0.15, 0.0],
+    [0.06, 0.19, 0.0],
+    [-0.19, 0.04, 0.0],
+    [-0.19, -0.04, 0.0],
+    [0.06, -0.19, 0.0],
+]
+HOME = Pose(np.array([0.0, 0.0, 0.35]), np.eye(3))
+
+
+def lengths_at(mechanism: Mechanism, position: Array, rotation: Array) -> Array:
+    return np.linalg.norm(position + mechanism.platform_joints @ rotation.T - mechanism.base_joints, axis=1)
+
+
+GOOD = f"""
+name = "mine"
+[geometry]
+base_joints = {BASE}
+platform_joints = {PLATFORM}
+up_in_base = [0.0, 0.6, 0.8]
+[home]
+position = [0.0, 0.0, 0.35]
+[limits]
+stroke = [-0.05, 0.05]
+[plant.platform]
+mass = 2.5
+[control]
+proportional = 30.0
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "mine.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_mechanism_is_loaded_from_a_file(tmp_path: Path) -> None:
+    mechanism = load_mechanism(write(tmp_path, GOOD))
+    assert mechanism.name == "mine"
+    np.testing.assert_array_equal(mechanism.base_joints, BASE)
+    np.testing.assert_allclose(mechanism.up_in_base, [0.0, 0.6, 0.8])
+    assert mechanism.plant["platform.mass"] == 2.5
+    assert mechanism.settings["control"] == {"proportional": 30.0}
+    np.testing.assert_allclose(np.ptp(mechanism.require_limits().stroke, axis=1), 0.1)
+
+
+def replaced(old: str, new: str) -> str:
+    assert old in GOOD
+    return GOOD.replace(old, new)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (replaced("[home]", "[home"), "mine.toml is not valid TOML: .*line"),
+        (replaced("[control]", "[kontrol]"), "unknown entry 'kontrol'; a mechanism has name, geometry, home, limits, plant"),
+        (replaced("[home]\n", "[home]\nattitude = 1\n"), r"\[home\] has no entry 'attitude'; it has position, quaternion"),
+        (replaced("stroke = ", "strokes = "), r"\[limits\] has no entry 'strokes'"),
+        (replaced("base_joints = ", "joints = "), r"\[geometry\] has no entry 'joints'"),
+        ("name = 'empty'", r"\[geometry\] lacks base_joints, an array of six rows"),
+        (f"[geometry]\nbase_joints = {BASE}", r"\[geometry\] lacks platform_joints"),
+        (replaced("[control]", "[home2]"), "unknown entry 'home2'"),
+        ("geometry = 3", "'geometry' must be a table"),
+        (replaced("[0.0, 0.0, 0.35]", "'here'"), "home.position must be an array of numbers .* got 'here'"),
+        (replaced("position = [0.0, 0.0, 0.35]", ""), r"home.position must be an array .* got None"),
+        (replaced("0.35]", "0.35]\nquaternion = [1.0, 0.1, 0.0, 0.0]"), "home.quaternion has length 1.00499; .* normalise it"),
+        (replaced("[0.0, 0.6, 0.8]", "[0.0, 0.6, 0.9]"), "up_in_base has length 1.08"),
+        (replaced("mass = 2.5", "mass = -2.5"), "platform.mass is -2.5 kg; it must be 1e-09 to"),
+        (replaced("mass = 2.5", "weight = 2.5"), "no parameter 'platform.weight'"),
+        (replaced("mass = 2.5", "mass = 'heavy'"), "platform.mass must be an array of numbers .* got 'heavy'"),
+    ],
+)
+def test_a_file_that_is_no_mechanism_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises((InputError, UnknownNameError), match=message) as caught:
+        load_mechanism(write(tmp_path, text))
+    assert "mine.toml" in str(caught.value)
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "binary.toml"
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match=r"cannot read .*binary.toml"):
+        load_mechanism(path)
+
+
+def test_an_unknown_preset_names_the_presets(tmp_path: Path) -> None:
+    with pytest.raises(UnknownNameError, match=r"no mechanism 'hexapot': neither a preset .*hexapod.* nor a file"):
+        load_mechanism("hexapot")
+    with pytest.raises(UnknownNameError, match="nor a file"):
+        load_mechanism(tmp_path)
+
+
+# ---- based on a preset ----
+
+
+@pytest.fixture
+def presets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of presets with a good one, another based on it, and two based on each other."""
+    folder = tmp_path / "presets"
+    folder.mkdir()
+    stiffer = 'name = "stiffer"\nbased_on = "good"\n[control]\nintegral = 90.0\n[plant.payload]\nmass = 4.0\n'
+    for name, text in {"good": GOOD, "stiffer": stiffer, "egg": 'based_on = "hen"', "hen": 'based_on = "egg"'}.items():
+        (folder / f"{name}.toml").write_text(text)
+    monkeypatch.setattr("plant.mechanism.documents._PRESETS", folder)
+    return folder
+
+
+def test_tables_are_laid_over_those_of_the_preset(tmp_path: Path, hexapod: Mechanism) -> None:
+    text = f'based_on = "hexapod"\n[geometry]\nbase_joints = {BASE}\n[plant.payload]\nmass = 4\n[control]\nhold = 0.5\n'
+    mechanism = load_mechanism(write(tmp_path, text))
+    np.testing.assert_array_equal(mechanism.base_joints, BASE)
+    np.testing.assert_array_equal(mechanism.platform_joints, hexapod.platform_joints)
+    lengths = lengths_at(mechanism, HOME.position, HOME.rotation)
+    np.testing.assert_allclose(mechanism.require_limits().stroke - lengths[:, None], np.tile([-0.06, 0.06], (6, 1)), atol=1e-15)
+    assert {name for name, value in hexapod.plant.items() if (mechanism.plant[name] != value).any()} == {"payload.mass"}
+    assert mechanism.settings["control"] == {**hexapod.settings["control"], "hold": 0.5}
+    assert mechanism.name == "custom"
+
+
+def test_a_preset_may_be_based_on_another(tmp_path: Path, presets: Path) -> None:
+    mechanism = load_mechanism(write(tmp_path, 'based_on = "stiffer"\n[plant.platform]\nmass = 3.0'))
+    np.testing.assert_array_equal(mechanism.base_joints, BASE)
+    assert mechanism.settings["control"] == {"proportional": 30.0, "integral": 90.0}
+    assert [mechanism.plant[f"{body}.mass"] for body in ("payload", "platform")] == [4.0, 3.0]
+    assert load_mechanism("stiffer").name == "stiffer"
+    assert load_mechanism("stiffer").plant["platform.mass"] == 2.5
+
+
+def test_only_presets_can_be_based_on(tmp_path: Path, presets: Path) -> None:
+    (tmp_path / "other.toml").write_text(GOOD)
+    message = r"mine.toml: based_on names no preset: .*; there are egg, good, hen, stiffer"
+    for base in ("'hexapod'", f"'{tmp_path / 'other.toml'}'", "3", "['good']"):
+        with pytest.raises(UnknownNameError, match=message):
+            load_mechanism(write(tmp_path, f"based_on = {base}"))
+
+
+def test_presets_based_on_each_other_are_refused(tmp_path: Path, presets: Path) -> None:
+    with pytest.raises(InputError, match="egg: based_on goes round in a circle, egg -> hen -> egg: leave one out"):
+        load_mechanism("egg")
+    with pytest.raises(InputError, match=r"circle, .*mine.toml -> hen -> egg -> hen"):
+        load_mechanism(write(tmp_path, "based_on = 'hen'"))
+
+
+def test_what_a_preset_has_as_a_table_must_stay_one(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="'limits' must be a table"):
+        load_mechanism(write(tmp_path, "based_on = 'hexapod'\nlimits = 3"))
