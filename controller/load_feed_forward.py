@@ -9,7 +9,7 @@ import numpy as np
 
 from controller.inverse_kinematics import jacobian_at
 from controller.least_squares import RANK_TOLERANCE, solve_least_squares
-from plant.compiled import Record, kernel
+from plant.compiled import Record, filled, kernel
 from plant.mechanism import LEGS, Mechanism
 
 PARAMETERS = np.dtype(
@@ -69,10 +69,7 @@ def load_parameters(mechanism: Mechanism, command_delay: float) -> Record:
         "rod_mass": plant["leg.upper.mass"],
         "rod_center": plant["leg.upper.center"],
     }
-    parameters: Record = np.zeros((), PARAMETERS)
-    for name, value in values.items():
-        parameters[name] = value
-    return parameters
+    return filled(PARAMETERS, values)
 
 
 @kernel

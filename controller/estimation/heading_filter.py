@@ -11,7 +11,7 @@ from controller.estimation.leg_filter import SETTLING_S
 from controller.estimation.platform_filter import INNOVATION_LIMIT, extrapolate_direction
 from controller.rig import MagneticField, elapsed
 from controller.settings import FusionSettings
-from plant.compiled import Record, kernel
+from plant.compiled import Record, filled, kernel
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.imu import MAGNETOMETER
 from plant.pose import Array
@@ -88,10 +88,7 @@ def heading_parameters(fusion: FusionSettings, rate: float, field: MagneticField
         "delay": fusion.sensor_delay,
         "settling_cycles": round(SETTLING_S * rate),
     }
-    parameters: Record = np.zeros((), PARAMETERS)
-    for name, value in values.items():
-        parameters[name] = value
-    return parameters
+    return filled(PARAMETERS, values)
 
 
 @kernel

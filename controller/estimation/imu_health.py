@@ -7,7 +7,7 @@ import numpy as np
 from controller.calibration.file import Calibration
 from controller.safety.causes import Cause, report_event
 from controller.settings import FusionSettings, SafetySettings
-from plant.compiled import Record, kernel
+from plant.compiled import Record, filled, kernel
 from plant.dynamics.variables import IMU_COUNT
 from plant.pose import Array
 
@@ -98,10 +98,7 @@ def imu_parameters(
         "healthy_cycles": round(_HEALTHY_S * rate),
         "stale_cycles": max(3, round(_STALE_S * rate)),
     }
-    parameters: Record = np.zeros((), PARAMETERS)
-    for name, value in values.items():
-        parameters[name] = value
-    return parameters
+    return filled(PARAMETERS, values)
 
 
 @kernel

@@ -15,7 +15,7 @@ import numpy as np
 
 from controller.rig import elapsed
 from controller.settings import FusionSettings
-from plant.compiled import Record, kernel
+from plant.compiled import Record, filled, kernel
 from plant.imu import ACCELEROMETER, GYROSCOPE
 from plant.mechanism import LEGS
 from plant.pose import Array
@@ -93,10 +93,7 @@ def leg_parameters(fusion: FusionSettings, rate: float) -> Record:
         "delay": fusion.sensor_delay,
         "settling_cycles": round(SETTLING_S * rate),
     }
-    parameters: Record = np.zeros((), PARAMETERS)
-    for name, value in values.items():
-        parameters[name] = value
-    return parameters
+    return filled(PARAMETERS, values)
 
 
 @kernel

@@ -9,7 +9,7 @@ import numpy as np
 from controller.estimation.leg_filter import SETTLING_S
 from controller.rig import elapsed
 from controller.settings import FusionSettings
-from plant.compiled import Record, kernel
+from plant.compiled import Record, filled, kernel
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.imu import ACCELEROMETER, GYROSCOPE, STANDARD_GRAVITY
 from plant.pose import Array
@@ -86,10 +86,7 @@ def platform_parameters(fusion: FusionSettings, rate: float) -> Record:
         "delay": fusion.sensor_delay,
         "settling_cycles": round(SETTLING_S * rate),
     }
-    parameters: Record = np.zeros((), PARAMETERS)
-    for name, value in values.items():
-        parameters[name] = value
-    return parameters
+    return filled(PARAMETERS, values)
 
 
 @kernel

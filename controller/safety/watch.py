@@ -6,7 +6,7 @@ from controller.estimation.imu_monitor import contradiction, reset
 from controller.safety.causes import Cause, DriveState, Mode, Request, report_event
 from controller.safety.stop import handle_cause
 from controller.settings import SafetySettings
-from plant.compiled import Record, kernel
+from plant.compiled import Record, filled, kernel
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS, six_rows
 from plant.mechanism.limits import Limits
@@ -79,10 +79,7 @@ def watch_parameters(settings: SafetySettings, rate: float, limits: Limits) -> R
         "patience": max(settings.patience, _LEAST_CYCLES / rate),
         "bus_cycles": max(3, round(settings.bus_patience * rate)),
     }
-    parameters: Record = np.zeros((), PARAMETERS)
-    for name, value in values.items():
-        parameters[name] = value
-    return parameters
+    return filled(PARAMETERS, values)
 
 
 @kernel

@@ -2,12 +2,13 @@
 
 from plant.compiled.atomics import fence, load_acquire, store_release
 from plant.compiled.cache import hash_of_files, keyed_folder, user_cache
-from plant.compiled.kernels import Record, compilation_reported, kernel
+from plant.compiled.kernels import Record, compilation_reported, filled, kernel
 
 __all__ = [
     "Record",
     "compilation_reported",
     "fence",
+    "filled",
     "hash_of_files",
     "kernel",
     "keyed_folder",

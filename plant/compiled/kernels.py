@@ -6,13 +6,14 @@ packages: any edit gives a new folder.
 """
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 from numba import types
 from numba.core import event
 from numba.extending import lower_cast
@@ -25,6 +26,15 @@ F = TypeVar("F", bound=Callable[..., Any])
 Record = Any
 """A structured array of shape () or (N,), or a record of one. Compiled code reads its fields as attributes, which the types of
 NumPy cannot say."""
+
+
+def filled(dtype: np.dtype[Any], values: Mapping[str, Any]) -> Record:
+    """A structured array of shape () with these values by field; the other fields are zero."""
+    record: Record = np.zeros((), dtype)
+    for name, value in values.items():
+        record[name] = value
+    return record
+
 
 PACKAGES = ("plant", "controller", "hil")
 

@@ -18,7 +18,7 @@ from controller.estimation.whole_mechanism.parameters import FILTER_PARAMETERS, 
 from controller.inverse_kinematics import legs_at
 from controller.rig import elapsed
 from controller.settings import FusionSettings
-from plant.compiled import Record, kernel
+from plant.compiled import Record, filled, kernel
 from plant.mechanism import LEGS
 from plant.pose import Array
 
@@ -81,10 +81,7 @@ def trust_parameters(fusion: FusionSettings, rate: float, filter_constants: Reco
         "disagreement": fusion.disagreement,
         "patience_cycles": round(_PATIENCE_S * rate),
     }
-    parameters: Record = np.zeros((), PARAMETERS)
-    for name, value in values.items():
-        parameters[name] = value
-    return parameters
+    return filled(PARAMETERS, values)
 
 
 @kernel
