@@ -46,7 +46,7 @@ from controller.safety.stop import handle_cause, ramp_down
 from controller.safety.watch import check_limits, exclude_imu, update_rig_status
 from controller.settings import ControlSettings, FusionSettings, SafetySettings
 from plant.checks import check_rate
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.errors import InputError
 from plant.mechanism import Mechanism
 from plant.pose import Array
@@ -55,45 +55,39 @@ from plant.wiring import ALL_IMUS
 
 _LEAST_GRAVITY = 0.1
 
-PARAMETERS = np.dtype(
-    [
-        ("rig", RIG),
-        ("imus", imu_health.PARAMETERS),
-        ("legs", leg_filter.PARAMETERS),
-        ("platform", platform_filter.PARAMETERS),
-        ("heading", heading_filter.PARAMETERS),
-        ("pose", pose_estimator.PARAMETERS),
-        ("mechanism", trust.PARAMETERS),
-        ("load", load_feed_forward.PARAMETERS),
-        ("pid", pid.PARAMETERS),
-        ("safety", safety_stage.PARAMETERS),
-    ],
-    align=True,
+PARAMETERS = record_dtype(
+    rig=RIG,
+    imus=imu_health.PARAMETERS,
+    legs=leg_filter.PARAMETERS,
+    platform=platform_filter.PARAMETERS,
+    heading=heading_filter.PARAMETERS,
+    pose=pose_estimator.PARAMETERS,
+    mechanism=trust.PARAMETERS,
+    load=load_feed_forward.PARAMETERS,
+    pid=pid.PARAMETERS,
+    safety=safety_stage.PARAMETERS,
 )
 """The constants of the cycle by stage, in SI units."""
 
-STATE = np.dtype(
-    [
-        ("time", TIME),
-        ("imus", imu_health.STATE),
-        ("legs", leg_filter.STATE),
-        ("platform", platform_filter.STATE),
-        ("heading", heading_filter.STATE),
-        ("pose", pose_estimator.STATE),
-        ("mechanism", trust.STATE),
-        ("reference", reference.STATE),
-        ("load", load_feed_forward.STATE),
-        ("pid", pid.STATE),
-        ("safety", safety_stage.STATE),
-    ],
-    align=True,
+STATE = record_dtype(
+    time=TIME,
+    imus=imu_health.STATE,
+    legs=leg_filter.STATE,
+    platform=platform_filter.STATE,
+    heading=heading_filter.STATE,
+    pose=pose_estimator.STATE,
+    mechanism=trust.STATE,
+    reference=reference.STATE,
+    load=load_feed_forward.STATE,
+    pid=pid.STATE,
+    safety=safety_stage.STATE,
 )
 """The state of the cycle by stage; zeros before the first cycle."""
 
 SCREENING, LEGS, PLATFORM, HEADING, POSE, REFINEMENT, MECHANISM, CONTROL, END = range(9)
 """The stages, in their order."""
 
-MARKS = np.dtype([("ns", np.int64, END), ("timespec", np.int64, 2)], align=True)
+MARKS = record_dtype(ns=(np.int64, END), timespec=(np.int64, 2))
 """How long each stage took in the last cycle [ns], and scratch."""
 
 

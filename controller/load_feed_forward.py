@@ -9,21 +9,18 @@ import numpy as np
 
 from controller.inverse_kinematics import jacobian_at
 from controller.least_squares import RANK_TOLERANCE, solve_least_squares
-from plant.compiled import Record, filled, kernel
+from plant.compiled import Record, filled, kernel, record_dtype
 from plant.mechanism import LEGS, Mechanism
 
-PARAMETERS = np.dtype(
-    [
-        ("command_delay", np.float64),
-        ("droop", np.float64),
-        ("moving_mass", np.float64),
-        ("mass", np.float64),
-        ("first_moment", np.float64, 3),
-        ("lower_moment", np.float64),
-        ("rod_mass", np.float64),
-        ("rod_center", np.float64),
-    ],
-    align=True,
+PARAMETERS = record_dtype(
+    command_delay=np.float64,
+    droop=np.float64,
+    moving_mass=np.float64,
+    mass=np.float64,
+    first_moment=(np.float64, 3),
+    lower_moment=np.float64,
+    rod_mass=np.float64,
+    rod_center=np.float64,
 )
 """Constants of the feed-forward.
 
@@ -36,17 +33,14 @@ Fields:
     rod_mass, rod_center: of a leg's rod [kg, m from its platform joint].
 """
 
-STATE = np.dtype(
-    [
-        ("feed_forward", np.float64, LEGS),
-        ("wrench", np.float64, 6),
-        ("force", np.float64, 6),
-        ("jacobian", np.float64, (6, 6)),
-        ("transposed", np.float64, (6, 6)),
-        ("norms", np.float64, 6),
-        ("order", np.float64, 6),
-    ],
-    align=True,
+STATE = record_dtype(
+    feed_forward=(np.float64, LEGS),
+    wrench=(np.float64, 6),
+    force=(np.float64, 6),
+    jacobian=(np.float64, (6, 6)),
+    transposed=(np.float64, (6, 6)),
+    norms=(np.float64, 6),
+    order=(np.float64, 6),
 )
 """The feed-forward [m/s], and scratch."""
 

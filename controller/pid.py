@@ -7,23 +7,20 @@ integral rests while the command is at its limit and the error would drive it fu
 import numpy as np
 
 from controller.settings import ControlSettings
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.mechanism import LEGS
 from plant.pose import Array
 
-PARAMETERS = np.dtype([("gains", np.float64, 4), ("limit", np.float64)], align=True)
+PARAMETERS = record_dtype(gains=(np.float64, 4), limit=np.float64)
 """Proportional, integral and derivative gain, and corner of the derivative's low-pass [1/s, 1/s^2, -, rad/s]; largest command
 [m/s]."""
 
-STATE = np.dtype(
-    [
-        ("error", np.float64, LEGS),
-        ("integral", np.float64, LEGS),
-        ("previous_error", np.float64, LEGS),
-        ("derivative", np.float64, LEGS),
-        ("command", np.float64, LEGS),
-    ],
-    align=True,
+STATE = record_dtype(
+    error=(np.float64, LEGS),
+    integral=(np.float64, LEGS),
+    previous_error=(np.float64, LEGS),
+    derivative=(np.float64, LEGS),
+    command=(np.float64, LEGS),
 )
 """Length deviations [m], their integral [m s], those of the last cycle, their low-passed derivative, the commands [m/s]."""
 

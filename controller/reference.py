@@ -4,13 +4,14 @@ import numpy as np
 
 from controller.planning.segments import evaluate_reference
 from controller.safety.causes import Cause, Mode, Request
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.mechanism import LEGS
 from plant.pose import Array
 
-STATE = np.dtype(
-    [("motion", np.float64, (LEGS, 3)), ("index", np.int64, LEGS), ("due_cycle", np.int64)],
-    align=True,
+STATE = record_dtype(
+    motion=(np.float64, (LEGS, 3)),
+    index=(np.int64, LEGS),
+    due_cycle=np.int64,
 )
 """Length, rate and acceleration of each leg in the cycle before `due_cycle`, and each leg's place in the segments."""
 

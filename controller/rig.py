@@ -7,38 +7,32 @@ from numpy.typing import ArrayLike
 
 from controller.direct_kinematics.geometry import GEOMETRY, geometry_of
 from controller.settings import FusionSettings
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.mechanism import LEGS, Mechanism, six_rows
 from plant.pose import Array, rotation_from_vector
 
 _LEAST_HORIZONTAL = 1e-9
 
-SENSOR_GEOMETRY = np.dtype(
-    [
-        ("base_joints", np.float64, (LEGS, 3)),
-        ("platform_joints", np.float64, (LEGS, 3)),
-        ("joint_rotations", np.float64, (LEGS, 3, 3)),
-        ("up_in_joint", np.float64, (LEGS, 3)),
-        ("up_in_base", np.float64, (1, 3)),
-        ("leg_imu_position", np.float64, (LEGS, 3)),
-        ("platform_imu_position", np.float64, 3),
-        ("gravity", np.float64),
-    ],
-    align=True,
+SENSOR_GEOMETRY = record_dtype(
+    base_joints=(np.float64, (LEGS, 3)),
+    platform_joints=(np.float64, (LEGS, 3)),
+    joint_rotations=(np.float64, (LEGS, 3, 3)),
+    up_in_joint=(np.float64, (LEGS, 3)),
+    up_in_base=(np.float64, (1, 3)),
+    leg_imu_position=(np.float64, (LEGS, 3)),
+    platform_imu_position=(np.float64, 3),
+    gravity=np.float64,
 )
 """Where joints and IMUs are, and the vertical: what the readings depend on besides the motion."""
 
-RIG = np.dtype(
-    [
-        ("legs", np.int64),
-        ("planar", np.int64),
-        ("period", np.float64),
-        ("hold_cycles", np.int64),
-        ("geometry", GEOMETRY),
-        ("sensors", SENSOR_GEOMETRY),
-        ("vectors_in_base", np.float64, (2, 3)),
-    ],
-    align=True,
+RIG = record_dtype(
+    legs=np.int64,
+    planar=np.int64,
+    period=np.float64,
+    hold_cycles=np.int64,
+    geometry=GEOMETRY,
+    sensors=SENSOR_GEOMETRY,
+    vectors_in_base=(np.float64, (2, 3)),
 )
 """Constants that several stages read.
 
@@ -51,7 +45,7 @@ Fields:
     vectors_in_base: the vertical and the horizontal direction of the magnetic field, unit vectors in {1}.
 """
 
-TIME = np.dtype([("cycle", np.int64), ("missed", np.int64)], align=True)
+TIME = record_dtype(cycle=np.int64, missed=np.int64)
 """The number of the present cycle, in periods, and how many periods were missed since the last cycle."""
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from plant.checks import checked_seed
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.errors import InputError, UnknownNameError
 from plant.pose import Array, rotation_from_vector
 from plant.wiring import IMU_COUNT, RIGHT_WIRING, Wiring
@@ -151,29 +151,26 @@ def axes_matrix(axes: str) -> Array:
     return np.array([units[axis] for axis in re.findall("[+-].|0", axes)])
 
 
-IMU_STATE = np.dtype(
-    [
-        ("gain", np.float64, (3, IMU_COUNT, 3, 3)),
-        ("offset", np.float64, (3, IMU_COUNT, 3)),
-        ("place", np.int64, IMU_COUNT),
-        ("noise", np.float64, 3),
-        ("drift", np.float64, 2),
-        ("smoothing", np.float64, (3, 2)),
-        ("reach", np.float64, 3),
-        ("resolution", np.float64, 3),
-        ("dropout", np.float64),
-        ("delay", np.int64),
-        ("magnetometer_every", np.int64),
-        ("seed", np.uint64),
-        ("cycle", np.int64),
-        ("bias_walk", np.float64, (2, IMU_COUNT, 3)),
-        ("value", np.float64, (3, IMU_COUNT, 3)),
-        ("smoothed", np.float64, (3, IMU_COUNT, 3)),
-        ("queue", np.float64, (_LONGEST_DELAY + 1, 3, IMU_COUNT, 3)),
-        ("reading", np.float64, (3, IMU_COUNT, 3)),
-        ("normals", np.float64, 6),
-    ],
-    align=True,
+IMU_STATE = record_dtype(
+    gain=(np.float64, (3, IMU_COUNT, 3, 3)),
+    offset=(np.float64, (3, IMU_COUNT, 3)),
+    place=(np.int64, IMU_COUNT),
+    noise=(np.float64, 3),
+    drift=(np.float64, 2),
+    smoothing=(np.float64, (3, 2)),
+    reach=(np.float64, 3),
+    resolution=(np.float64, 3),
+    dropout=np.float64,
+    delay=np.int64,
+    magnetometer_every=np.int64,
+    seed=np.uint64,
+    cycle=np.int64,
+    bias_walk=(np.float64, (2, IMU_COUNT, 3)),
+    value=(np.float64, (3, IMU_COUNT, 3)),
+    smoothed=(np.float64, (3, IMU_COUNT, 3)),
+    queue=(np.float64, (_LONGEST_DELAY + 1, 3, IMU_COUNT, 3)),
+    reading=(np.float64, (3, IMU_COUNT, 3)),
+    normals=(np.float64, 6),
 )
 """Constants and state of the imperfections of seven IMUs; a copy is a snapshot."""
 

@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.mechanism import LEGS, Mechanism, six_rows
 from plant.mechanism.checks import SAME_JOINT_M
 from plant.pose import Array
@@ -25,18 +25,15 @@ _LINEAR_RANK = 9
 """Greatest rank that is used of the legs' equations. With three parameters open, the equations of a rotation settle those with
 a sixth of the error that the last three pivots of a 6-6 mechanism would bring."""
 
-GEOMETRY = np.dtype(
-    [
-        ("base_joints", np.float64, (LEGS, 3)),
-        ("platform_joints", np.float64, (LEGS, 3)),
-        ("platform_numbers", np.int64, LEGS),
-        ("centers", np.float64, (_SETS, 3)),
-        ("axes", np.float64, (_SETS, 3, 3)),
-        ("spreads", np.float64, _SETS),
-        ("bulges", np.float64, _SETS),
-        ("ranks", np.int64, _SETS),
-    ],
-    align=True,
+GEOMETRY = record_dtype(
+    base_joints=(np.float64, (LEGS, 3)),
+    platform_joints=(np.float64, (LEGS, 3)),
+    platform_numbers=(np.int64, LEGS),
+    centers=(np.float64, (_SETS, 3)),
+    axes=(np.float64, (_SETS, 3, 3)),
+    spreads=(np.float64, _SETS),
+    bulges=(np.float64, _SETS),
+    ranks=(np.int64, _SETS),
 )
 """The joints of a mechanism [m], the first leg of each leg's platform joint, and these properties of each set of legs:
 
@@ -49,22 +46,19 @@ GEOMETRY = np.dtype(
 Leg k has bit k in the number of a set.
 """
 
-SCRATCH = np.dtype(
-    [
-        ("matrix", np.float64, (ROTATION_EQUATIONS, ROTATION_EQUATIONS)),
-        ("right", np.float64, ROTATION_EQUATIONS),
-        ("unknowns", np.float64, ROTATION_EQUATIONS),
-        ("span", np.float64, (1 + MOST_FREE, 12)),
-        ("norms", np.float64, ROTATION_EQUATIONS),
-        ("order", np.float64, ROTATION_EQUATIONS),
-        ("points", np.float64, (LEGS, 3)),
-        ("selected", np.float64, LEGS),
-        ("second_root", np.float64, 12),
-        ("roots", np.int64),
-        ("approximate", np.int64),
-        ("misfit", np.float64),
-    ],
-    align=True,
+SCRATCH = record_dtype(
+    matrix=(np.float64, (ROTATION_EQUATIONS, ROTATION_EQUATIONS)),
+    right=(np.float64, ROTATION_EQUATIONS),
+    unknowns=(np.float64, ROTATION_EQUATIONS),
+    span=(np.float64, (1 + MOST_FREE, 12)),
+    norms=(np.float64, ROTATION_EQUATIONS),
+    order=(np.float64, ROTATION_EQUATIONS),
+    points=(np.float64, (LEGS, 3)),
+    selected=(np.float64, LEGS),
+    second_root=(np.float64, 12),
+    roots=np.int64,
+    approximate=np.int64,
+    misfit=np.float64,
 )
 """Memory for the closed forms, which allocate nothing. `pose_from_legs` reports in it: how many `roots` it found, whether it
 took joints for coplanar that are so only approximately, and the `misfit`, how far its matrix was from a rotation.

@@ -15,7 +15,7 @@ from controller.direct_kinematics.paper import section_3_1_1, section_4
 from controller.direct_kinematics.refinement import move_pose, normal_equations, solve_normal_equations
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import invert_cholesky
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.mechanism import LEGS
 from plant.pose import UNIT_TOLERANCE, Array
 from plant.vectors import dot, rotate, vector
@@ -88,34 +88,31 @@ class Results(NamedTuple):
     legs: NDArray[np.int64]
 
 
-WORK = np.dtype(
-    [
-        ("scratch", SCRATCH),
-        ("directions", np.float64, (LEGS, 3)),
-        ("measured", np.float64, LEGS),
-        ("weights", np.float64, LEGS),
-        ("measured_rotation", np.float64, (3, 3)),
-        ("in_base", np.float64, (5, 3)),
-        ("in_platform", np.float64, (5, 3)),
-        ("vector_weights", np.float64, 5),
-        ("vectors", np.int64),
-        ("up", np.int64),
-        ("normal", np.int64),
-        ("equations", np.int64),
-        ("position", np.float64, 3),
-        ("rotation", np.float64, (3, 3)),
-        ("best_position", np.float64, 3),
-        ("best_rotation", np.float64, (3, 3)),
-        ("second_position", np.float64, 3),
-        ("second_rotation", np.float64, (3, 3)),
-        ("arms", np.float64, (LEGS, 3)),
-        ("predicted", np.float64, (LEGS, 3)),
-        ("lengths", np.float64, LEGS),
-        ("information", np.float64, (6, 6)),
-        ("factor", np.float64, (6, 6)),
-        ("correction", np.float64, 6),
-    ],
-    align=True,
+WORK = record_dtype(
+    scratch=SCRATCH,
+    directions=(np.float64, (LEGS, 3)),
+    measured=(np.float64, LEGS),
+    weights=(np.float64, LEGS),
+    measured_rotation=(np.float64, (3, 3)),
+    in_base=(np.float64, (5, 3)),
+    in_platform=(np.float64, (5, 3)),
+    vector_weights=(np.float64, 5),
+    vectors=np.int64,
+    up=np.int64,
+    normal=np.int64,
+    equations=np.int64,
+    position=(np.float64, 3),
+    rotation=(np.float64, (3, 3)),
+    best_position=(np.float64, 3),
+    best_rotation=(np.float64, (3, 3)),
+    second_position=(np.float64, 3),
+    second_rotation=(np.float64, (3, 3)),
+    arms=(np.float64, (LEGS, 3)),
+    predicted=(np.float64, (LEGS, 3)),
+    lengths=(np.float64, LEGS),
+    information=(np.float64, (6, 6)),
+    factor=(np.float64, (6, 6)),
+    correction=(np.float64, 6),
 )
 """Memory for one pose: what was measured, the pose, and its fit. `up` and `normal` are rows of the vectors known in both
 frames."""

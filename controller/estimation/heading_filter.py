@@ -11,7 +11,7 @@ from controller.estimation.leg_filter import SETTLING_S
 from controller.estimation.platform_filter import INNOVATION_LIMIT, extrapolate_direction
 from controller.rig import MagneticField, elapsed
 from controller.settings import FusionSettings
-from plant.compiled import Record, filled, kernel
+from plant.compiled import Record, filled, kernel, record_dtype
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.imu import MAGNETOMETER
 from plant.pose import Array
@@ -25,20 +25,17 @@ _FIELD_SHARE = 0.3
 _FROZEN_FIELDS = 10
 """How many samples in a row of a magnetometer may be the same while the rest of its IMU moves."""
 
-PARAMETERS = np.dtype(
-    [
-        ("active", np.int64),
-        ("strength", np.float64),
-        ("sample_cycles", np.int64),
-        ("variance", np.float64),
-        ("floor", np.float64),
-        ("rate_density", np.float64),
-        ("bias_walk", np.float64),
-        ("bias_sigma", np.float64),
-        ("delay", np.float64),
-        ("settling_cycles", np.int64),
-    ],
-    align=True,
+PARAMETERS = record_dtype(
+    active=np.int64,
+    strength=np.float64,
+    sample_cycles=np.int64,
+    variance=np.float64,
+    floor=np.float64,
+    rate_density=np.float64,
+    bias_walk=np.float64,
+    bias_sigma=np.float64,
+    delay=np.float64,
+    settling_cycles=np.int64,
 )
 """Constants of the filter.
 
@@ -50,19 +47,16 @@ Fields:
     rate_density, bias_walk, bias_sigma, delay, settling_cycles: as for the platform's filter.
 """
 
-STATE = np.dtype(
-    [
-        ("x", np.float64, STATES),
-        ("covariance", np.float64, (ERRORS, ERRORS)),
-        ("age", np.int64),
-        ("used", np.int64),
-        ("weight", np.float64),
-        ("north", np.float64, 3),
-        ("field", np.float64, 3),
-        ("frozen_for", np.int64),
-        ("fresh", np.int64),
-    ],
-    align=True,
+STATE = record_dtype(
+    x=(np.float64, STATES),
+    covariance=(np.float64, (ERRORS, ERRORS)),
+    age=np.int64,
+    used=np.int64,
+    weight=np.float64,
+    north=(np.float64, 3),
+    field=(np.float64, 3),
+    frozen_for=np.int64,
+    fresh=np.int64,
 )
 """State of the filter.
 

@@ -7,7 +7,7 @@ import numpy as np
 from controller.calibration.file import Calibration
 from controller.safety.causes import Cause, report_event
 from controller.settings import FusionSettings, SafetySettings
-from plant.compiled import Record, filled, kernel
+from plant.compiled import Record, filled, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.pose import Array
 
@@ -29,19 +29,16 @@ _SHAKEN_HZ = 400.0
 _NOISIER = 3.0
 """How much noisier than the others an IMU must be: what shakes all of them is no fault of one."""
 
-PARAMETERS = np.dtype(
-    [
-        ("present", np.int64, IMU_COUNT),
-        ("gain", np.float64, (3, IMU_COUNT, 3, 3)),
-        ("offset", np.float64, (3, IMU_COUNT, 3)),
-        ("range", np.float64, 2),
-        ("noise", np.float64, 2),
-        ("noise_smoothing", np.float64),
-        ("frozen_cycles", np.int64),
-        ("healthy_cycles", np.int64),
-        ("stale_cycles", np.int64),
-    ],
-    align=True,
+PARAMETERS = record_dtype(
+    present=(np.int64, IMU_COUNT),
+    gain=(np.float64, (3, IMU_COUNT, 3, 3)),
+    offset=(np.float64, (3, IMU_COUNT, 3)),
+    range=(np.float64, 2),
+    noise=(np.float64, 2),
+    noise_smoothing=np.float64,
+    frozen_cycles=np.int64,
+    healthy_cycles=np.int64,
+    stale_cycles=np.int64,
 )
 """Constants of the IMUs.
 
@@ -53,21 +50,18 @@ Fields:
     frozen_cycles, healthy_cycles, stale_cycles: the durations above.
 """
 
-STATE = np.dtype(
-    [
-        ("raw", np.float64, (3, IMU_COUNT, 3)),
-        ("sample", np.float64, (3, IMU_COUNT, 3)),
-        ("sample_age", np.int64, IMU_COUNT),
-        ("unchanged", np.int64, IMU_COUNT),
-        ("frozen_for", np.int64, IMU_COUNT),
-        ("healthy_for", np.int64, IMU_COUNT),
-        ("used", np.int64, IMU_COUNT),
-        ("excluded", np.int64, IMU_COUNT),
-        ("earlier", np.float64, (2, 2, IMU_COUNT, 3)),
-        ("variance", np.float64, (2, IMU_COUNT)),
-        ("noise", np.float64, IMU_COUNT),
-    ],
-    align=True,
+STATE = record_dtype(
+    raw=(np.float64, (3, IMU_COUNT, 3)),
+    sample=(np.float64, (3, IMU_COUNT, 3)),
+    sample_age=(np.int64, IMU_COUNT),
+    unchanged=(np.int64, IMU_COUNT),
+    frozen_for=(np.int64, IMU_COUNT),
+    healthy_for=(np.int64, IMU_COUNT),
+    used=(np.int64, IMU_COUNT),
+    excluded=(np.int64, IMU_COUNT),
+    earlier=(np.float64, (2, 2, IMU_COUNT, 3)),
+    variance=(np.float64, (2, IMU_COUNT)),
+    noise=(np.float64, IMU_COUNT),
 )
 """State of the IMUs.
 

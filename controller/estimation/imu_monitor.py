@@ -9,7 +9,7 @@ import numpy as np
 
 from controller.least_squares import solve_cholesky
 from controller.settings import SafetySettings
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
 from plant.pose import Array
 
@@ -22,23 +22,23 @@ _LARGEST_SHARE, _LEAST_LOOKS = 0.25, 3
 _SLOW_HZ = 300.0
 """Below this rate the filters' directions are less exact."""
 
-PARAMETERS = np.dtype(
-    [("active", np.int64), ("disagreement", np.float64), ("smoothing", np.float64), ("lasting", np.float64)], align=True
+PARAMETERS = record_dtype(
+    active=np.int64,
+    disagreement=np.float64,
+    smoothing=np.float64,
+    lasting=np.float64,
 )
 """Whether IMUs are compared; the limit of a contradiction [rad]; the share of a new look; how long it must last [s]."""
 
-STATE = np.dtype(
-    [
-        ("looked_at", np.int64),
-        ("contradiction", np.float64, (IMU_COUNT, 3)),
-        ("explained", np.float64, IMU_COUNT),
-        ("squares", np.float64, IMU_COUNT),
-        ("across", np.float64, (2, 3)),
-        ("jacobian", np.float64, (2, 6)),
-        ("solved", np.float64, (2, 6)),
-        ("direction", np.float64, 3),
-    ],
-    align=True,
+STATE = record_dtype(
+    looked_at=np.int64,
+    contradiction=(np.float64, (IMU_COUNT, 3)),
+    explained=(np.float64, IMU_COUNT),
+    squares=(np.float64, IMU_COUNT),
+    across=(np.float64, (2, 3)),
+    jacobian=(np.float64, (2, 6)),
+    solved=(np.float64, (2, 6)),
+    direction=(np.float64, 3),
 )
 """State of the monitor.
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from controller.rig import elapsed
 from controller.settings import FusionSettings
-from plant.compiled import Record, filled, kernel
+from plant.compiled import Record, filled, kernel, record_dtype
 from plant.imu import ACCELEROMETER, GYROSCOPE
 from plant.mechanism import LEGS
 from plant.pose import Array
@@ -30,18 +30,15 @@ SETTLING_S = 0.1
 _GAP_S = 0.05
 """Longest time for which a leg's angular acceleration is taken to last [s]."""
 
-PARAMETERS = np.dtype(
-    [
-        ("jerk", np.float64),
-        ("bias_walk", np.float64),
-        ("bias_sigma", np.float64),
-        ("rate_variance", np.float64),
-        ("force_variance", np.float64),
-        ("weight", np.float64),
-        ("delay", np.float64),
-        ("settling_cycles", np.int64),
-    ],
-    align=True,
+PARAMETERS = record_dtype(
+    jerk=np.float64,
+    bias_walk=np.float64,
+    bias_sigma=np.float64,
+    rate_variance=np.float64,
+    force_variance=np.float64,
+    weight=np.float64,
+    delay=np.float64,
+    settling_cycles=np.int64,
 )
 """Constants of the leg filters.
 
@@ -54,21 +51,18 @@ Fields:
     settling_cycles: how long a filter is not relied upon.
 """
 
-STATE = np.dtype(
-    [
-        ("x", np.float64, (LEGS, STATES)),
-        ("covariance", np.float64, (LEGS, STATES, STATES)),
-        ("age", np.int64, LEGS),
-        ("used", np.float64, LEGS),
-        ("weights", np.float64, LEGS),
-        ("directions", np.float64, (LEGS, 3)),
-        ("rates", np.float64, (LEGS, 3)),
-        ("expected", np.float64, 6),
-        ("jacobian", np.float64, (6, STATES)),
-        ("gain", np.float64, STATES),
-        ("change", np.float64, STATES),
-    ],
-    align=True,
+STATE = record_dtype(
+    x=(np.float64, (LEGS, STATES)),
+    covariance=(np.float64, (LEGS, STATES, STATES)),
+    age=(np.int64, LEGS),
+    used=(np.float64, LEGS),
+    weights=(np.float64, LEGS),
+    directions=(np.float64, (LEGS, 3)),
+    rates=(np.float64, (LEGS, 3)),
+    expected=(np.float64, 6),
+    jacobian=(np.float64, (6, STATES)),
+    gain=(np.float64, STATES),
+    change=(np.float64, STATES),
 )
 """State of the leg filters.
 

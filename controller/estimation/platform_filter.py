@@ -9,7 +9,7 @@ import numpy as np
 from controller.estimation.leg_filter import SETTLING_S
 from controller.rig import elapsed
 from controller.settings import FusionSettings
-from plant.compiled import Record, filled, kernel
+from plant.compiled import Record, filled, kernel, record_dtype
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.imu import ACCELEROMETER, GYROSCOPE, STANDARD_GRAVITY
 from plant.pose import Array
@@ -23,17 +23,14 @@ INNOVATION_LIMIT = 3.0
 accelerometer's reading but not in the acceleration known from the legs."""
 
 
-PARAMETERS = np.dtype(
-    [
-        ("rate_density", np.float64),
-        ("bias_walk", np.float64),
-        ("bias_sigma", np.float64),
-        ("vertical_variance", np.float64),
-        ("weight", np.float64),
-        ("delay", np.float64),
-        ("settling_cycles", np.int64),
-    ],
-    align=True,
+PARAMETERS = record_dtype(
+    rate_density=np.float64,
+    bias_walk=np.float64,
+    bias_sigma=np.float64,
+    vertical_variance=np.float64,
+    weight=np.float64,
+    delay=np.float64,
+    settling_cycles=np.int64,
 )
 """Constants of the filter.
 
@@ -46,23 +43,20 @@ Fields:
     settling_cycles: how long the filter is not relied upon.
 """
 
-STATE = np.dtype(
-    [
-        ("x", np.float64, STATES),
-        ("covariance", np.float64, (STATES, STATES)),
-        ("age", np.int64),
-        ("used", np.int64),
-        ("weight", np.float64),
-        ("vertical", np.float64, 3),
-        ("rate", np.float64, 3),
-        ("angular_acceleration", np.float64, 3),
-        ("imu_acceleration", np.float64, 3),
-        ("transition", np.float64, (STATES, STATES)),
-        ("work", np.float64, (STATES, STATES)),
-        ("gain", np.float64, STATES),
-        ("change", np.float64, STATES),
-    ],
-    align=True,
+STATE = record_dtype(
+    x=(np.float64, STATES),
+    covariance=(np.float64, (STATES, STATES)),
+    age=np.int64,
+    used=np.int64,
+    weight=np.float64,
+    vertical=(np.float64, 3),
+    rate=(np.float64, 3),
+    angular_acceleration=(np.float64, 3),
+    imu_acceleration=(np.float64, 3),
+    transition=(np.float64, (STATES, STATES)),
+    work=(np.float64, (STATES, STATES)),
+    gain=(np.float64, STATES),
+    change=(np.float64, STATES),
 )
 """State of the filter.
 

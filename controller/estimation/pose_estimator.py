@@ -18,37 +18,34 @@ from controller.direct_kinematics.refinement import (
 )
 from controller.rig import elapsed
 from controller.settings import FusionSettings
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.mechanism import LEGS
 from plant.pose import Array
 
 WORST_CONDITIONING = 1e-2
 """Least conditioning of a closed form that is relied upon where there is another one, or none."""
 
-PARAMETERS = np.dtype([("section_5", np.int64), ("acceleration_rate", np.float64)], align=True)
+PARAMETERS = record_dtype(section_5=np.int64, acceleration_rate=np.float64)
 """Whether the pose is that of the paper's section 5, unrefined; and the corner of the acceleration's low-pass [1/s]."""
 
-STATE = np.dtype(
-    [
-        ("position", np.float64, 3),
-        ("rotation", np.float64, (3, 3)),
-        ("twist", np.float64, 6),
-        ("smooth_twist", np.float64, 6),
-        ("acceleration", np.float64, 6),
-        ("conditioning", np.float64),
-        ("found", np.int64),
-        ("information", np.float64, (6, 6)),
-        ("factor", np.float64, (6, 6)),
-        ("arms", np.float64, (LEGS, 3)),
-        ("directions", np.float64, (LEGS, 3)),
-        ("lengths", np.float64, LEGS),
-        ("vectors", np.float64, (2, 3)),
-        ("vector_weights", np.float64, 2),
-        ("angular_velocity", np.float64, 3),
-        ("correction", np.float64, 6),
-        ("scratch", SCRATCH),
-    ],
-    align=True,
+STATE = record_dtype(
+    position=(np.float64, 3),
+    rotation=(np.float64, (3, 3)),
+    twist=(np.float64, 6),
+    smooth_twist=(np.float64, 6),
+    acceleration=(np.float64, 6),
+    conditioning=np.float64,
+    found=np.int64,
+    information=(np.float64, (6, 6)),
+    factor=(np.float64, (6, 6)),
+    arms=(np.float64, (LEGS, 3)),
+    directions=(np.float64, (LEGS, 3)),
+    lengths=(np.float64, LEGS),
+    vectors=(np.float64, (2, 3)),
+    vector_weights=(np.float64, 2),
+    angular_velocity=(np.float64, 3),
+    correction=(np.float64, 6),
+    scratch=SCRATCH,
 )
 """The estimated pose.
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from controller.planning.segments import LENGTH, START
 from controller.safety.causes import Cause
-from plant.compiled import Record, fence, kernel, load_acquire, store_release
+from plant.compiled import Record, fence, kernel, load_acquire, record_dtype, store_release
 from plant.mechanism import LEGS
 from plant.pose import Array
 
@@ -25,24 +25,21 @@ CYCLE, LATEST, SEEN, TAKEN, CAUSE, SAMPLE_NS, END_PLANNER = range(7)
 and of the plan that it follows; why the stream has failed; when the last sample came [ns of CLOCK_MONOTONIC, 0 before the
 first]; whether the planner's process must end."""
 
-STREAM = np.dtype(
-    [
-        ("shared", np.int64, 8),
-        ("guards", np.int64, 2),
-        ("bases", np.int64, 2),
-        ("begins", np.float64, 2),
-        ("plans", np.float64, (2, LEGS, PLAN_SEGMENTS, 5)),
-        ("index", np.int64),
-        ("value", np.float64),
-        ("limit", np.float64),
-        ("accepted", np.int64),
-        ("malformed", np.int64),
-        ("stale", np.int64),
-        ("strange", np.int64),
-        ("planned", np.int64),
-        ("late", np.int64),
-    ],
-    align=True,
+STREAM = record_dtype(
+    shared=(np.int64, 8),
+    guards=(np.int64, 2),
+    bases=(np.int64, 2),
+    begins=(np.float64, 2),
+    plans=(np.float64, (2, LEGS, PLAN_SEGMENTS, 5)),
+    index=np.int64,
+    value=np.float64,
+    limit=np.float64,
+    accepted=np.int64,
+    malformed=np.int64,
+    stale=np.int64,
+    strange=np.int64,
+    planned=np.int64,
+    late=np.int64,
 )
 """What planner and loop share. In `shared`, the loop writes `CYCLE`, `SEEN` and `TAKEN`, the planner the others, and the
 process that ends the planner `END_PLANNER`.
@@ -53,7 +50,7 @@ value and limit. The planner counts samples accepted; datagrams that were malfor
 another sender (`strange`); plans made, and plans that the loop could not take in time (`late`).
 """
 
-STREAM_READER = np.dtype([("seen", np.int64), ("taken", np.int64), ("plan", np.float64, (LEGS, PLAN_SEGMENTS, 5))], align=True)
+STREAM_READER = record_dtype(seen=np.int64, taken=np.int64, plan=(np.float64, (LEGS, PLAN_SEGMENTS, 5)))
 """The loop's own side of a stream: the last plan that it has seen, the plan that it follows, and scratch."""
 
 

@@ -6,32 +6,26 @@ from controller.estimation import imu_monitor
 from controller.safety import arming, stop, watch
 from controller.safety.causes import EVENTS
 from controller.settings import SafetySettings
-from plant.compiled import Record
+from plant.compiled import Record, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism.limits import Limits
 
-PARAMETERS = np.dtype(
-    [
-        ("arming", arming.PARAMETERS),
-        ("monitor", imu_monitor.PARAMETERS),
-        ("watch", watch.PARAMETERS),
-        ("stop", stop.PARAMETERS),
-    ],
-    align=True,
+PARAMETERS = record_dtype(
+    arming=arming.PARAMETERS,
+    monitor=imu_monitor.PARAMETERS,
+    watch=watch.PARAMETERS,
+    stop=stop.PARAMETERS,
 )
 """The constants of each part."""
 
-STATE = np.dtype(
-    [
-        ("mode", np.int64),
-        ("request", np.int64),
-        ("events", EVENTS),
-        ("arming", arming.STATE),
-        ("monitor", imu_monitor.STATE),
-        ("watch", watch.STATE),
-        ("stop", stop.STATE),
-    ],
-    align=True,
+STATE = record_dtype(
+    mode=np.int64,
+    request=np.int64,
+    events=EVENTS,
+    arming=arming.STATE,
+    monitor=imu_monitor.STATE,
+    watch=watch.STATE,
+    stop=stop.STATE,
 )
 """The `Mode` of the run, the `Request` to the drives, the events of the cycle, and the state of each part."""
 

@@ -6,21 +6,18 @@ from controller.estimation.imu_monitor import contradiction
 from controller.safety.causes import Cause, DriveState, Mode, Request, report_event
 from controller.safety.stop import handle_cause
 from controller.settings import SafetySettings
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 
-PARAMETERS = np.dtype([("active", np.int64), ("distance", np.float64), ("cycles", np.int64)], align=True)
+PARAMETERS = record_dtype(active=np.int64, distance=np.float64, cycles=np.int64)
 """Whether the drives are to be enabled; how far a leg may be from the start of the target [m]; how long arming may take."""
 
-STATE = np.dtype(
-    [
-        ("delay", np.int64),
-        ("obstacle", np.int64),
-        ("index", np.int64),
-        ("value", np.float64),
-        ("limit", np.float64),
-    ],
-    align=True,
+STATE = record_dtype(
+    delay=np.int64,
+    obstacle=np.int64,
+    index=np.int64,
+    value=np.float64,
+    limit=np.float64,
 )
 """How many cycles arming took beyond the hold; and what prevents it, a `Cause` with its leg or IMU, value and limit."""
 

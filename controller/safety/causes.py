@@ -11,7 +11,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 
 
 class Mode(IntEnum):
@@ -147,15 +147,12 @@ REACTION = np.array([cause.reaction.value for cause in Cause])
 
 EVENT_SLOTS = 8
 
-EVENTS = np.dtype(
-    [
-        ("count", np.int64),
-        ("cause", np.int32, EVENT_SLOTS),
-        ("index", np.int32, EVENT_SLOTS),
-        ("value", np.float64, EVENT_SLOTS),
-        ("limit", np.float64, EVENT_SLOTS),
-    ],
-    align=True,
+EVENTS = record_dtype(
+    count=np.int64,
+    cause=(np.int32, EVENT_SLOTS),
+    index=(np.int32, EVENT_SLOTS),
+    value=(np.float64, EVENT_SLOTS),
+    limit=(np.float64, EVENT_SLOTS),
 )
 """The events of one cycle. `count` also counts events for which there was no slot."""
 

@@ -4,36 +4,30 @@ import numpy as np
 
 from controller.planning.segments import STOP_SEGMENTS, plan_stop
 from controller.safety.causes import REACTION, Cause, Mode, Reaction, Request, report_event
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.mechanism import LEGS
 from plant.mechanism.limits import Limits
 
 STOP_SETTLING_S = 0.1
 """How long the drives hold a mechanism that has stopped before the brakes take over [s]."""
 
-PARAMETERS = np.dtype(
-    [
-        ("velocity_limit", np.float64),
-        ("acceleration_limit", np.float64),
-        ("jerk_limit", np.float64),
-        ("settling_cycles", np.int64),
-    ],
-    align=True,
+PARAMETERS = record_dtype(
+    velocity_limit=np.float64,
+    acceleration_limit=np.float64,
+    jerk_limit=np.float64,
+    settling_cycles=np.int64,
 )
 """The actuators' limits [m/s, m/s^2, m/s^3], and how long the drives hold before the brakes."""
 
-STATE = np.dtype(
-    [
-        ("cause", np.int64),
-        ("cycle", np.int64),
-        ("end_cycle", np.int64),
-        ("segments", np.float64, (LEGS, STOP_SEGMENTS, 5)),
-        ("index", np.int64),
-        ("value", np.float64),
-        ("limit", np.float64),
-        ("earlier_cause", np.int64),
-    ],
-    align=True,
+STATE = record_dtype(
+    cause=np.int64,
+    cycle=np.int64,
+    end_cycle=np.int64,
+    segments=(np.float64, (LEGS, STOP_SEGMENTS, 5)),
+    index=np.int64,
+    value=np.float64,
+    limit=np.float64,
+    earlier_cause=np.int64,
 )
 """The stop or fault that is under way.
 

@@ -6,7 +6,7 @@ from controller.estimation.imu_monitor import contradiction, reset
 from controller.safety.causes import Cause, DriveState, Mode, Request, report_event
 from controller.safety.stop import handle_cause
 from controller.settings import SafetySettings
-from plant.compiled import Record, filled, kernel
+from plant.compiled import Record, filled, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS, six_rows
 from plant.mechanism.limits import Limits
@@ -20,35 +20,29 @@ _LEAST_CYCLES = 10
 _CLEARER = 1.3
 """How much more of the residuals the named IMU must explain than any other."""
 
-PARAMETERS = np.dtype(
-    [
-        ("most_lost_imus", np.int64),
-        ("conditioning", np.float64),
-        ("lengths", np.float64, (LEGS, 2)),
-        ("plausible_lengths", np.float64, (LEGS, 2)),
-        ("speed", np.float64),
-        ("following", np.float64),
-        ("saturation", np.float64),
-        ("drive_deviation", np.float64),
-        ("patience", np.float64),
-        ("bus_cycles", np.int64),
-    ],
-    align=True,
+PARAMETERS = record_dtype(
+    most_lost_imus=np.int64,
+    conditioning=np.float64,
+    lengths=(np.float64, (LEGS, 2)),
+    plausible_lengths=(np.float64, (LEGS, 2)),
+    speed=np.float64,
+    following=np.float64,
+    saturation=np.float64,
+    drive_deviation=np.float64,
+    patience=np.float64,
+    bus_cycles=np.int64,
 )
 """The limits. Durations that are compared with sums of periods are in s."""
 
-STATE = np.dtype(
-    [
-        ("drive", np.int64, LEGS),
-        ("silent", np.int64),
-        ("unanswered", np.int64),
-        ("contradicted_for", np.float64),
-        ("off_reference_for", np.float64, LEGS),
-        ("deviating_for", np.float64, LEGS),
-        ("saturated_for", np.float64, LEGS),
-        ("speed", np.float64, LEGS),
-    ],
-    align=True,
+STATE = record_dtype(
+    drive=(np.int64, LEGS),
+    silent=np.int64,
+    unanswered=np.int64,
+    contradicted_for=np.float64,
+    off_reference_for=(np.float64, LEGS),
+    deviating_for=(np.float64, LEGS),
+    saturated_for=(np.float64, LEGS),
+    speed=(np.float64, LEGS),
 )
 """What the rig has reported, and what lasts.
 

@@ -11,7 +11,7 @@ from controller.safety.causes import EVENT_SLOTS
 from hil.rigs import FEEDBACK
 from hil.rigs.udp.emulator import UdpEmulator
 from hil.rigs.udp.link import UdpLink
-from plant.compiled import Record
+from plant.compiled import Record, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS
 from plant.truth import TRUTH_SIZE
@@ -142,21 +142,18 @@ class TargetStream(NamedTuple):
     reader: Record
 
 
-WORK = np.dtype(
-    [
-        ("cycle", np.int64),
-        ("asked", np.int64),
-        ("silent", np.int64),
-        ("sequence", np.int64, IMU_COUNT),
-        ("sample_age", np.int64, IMU_COUNT),
-        ("feedback", FEEDBACK),
-        ("factor", np.float64, (6, 6)),
-        ("covariance", np.float64, (6, 6)),
-        ("stage_ns", np.int64, len(STAGES)),
-        ("marks", MARKS),
-        ("signals", np.int64, 16),
-    ],
-    align=True,
+WORK = record_dtype(
+    cycle=np.int64,
+    asked=np.int64,
+    silent=np.int64,
+    sequence=(np.int64, IMU_COUNT),
+    sample_age=(np.int64, IMU_COUNT),
+    feedback=FEEDBACK,
+    factor=(np.float64, (6, 6)),
+    covariance=(np.float64, (6, 6)),
+    stage_ns=(np.int64, len(STAGES)),
+    marks=MARKS,
+    signals=(np.int64, 16),
 )
 """The loop's own state and scratch: the cycle that runs and what was asked of it, since when the rig is silent, the last sample
 numbers and ages of the IMUs, the rig's feedback, matrices for the covariance, the

@@ -12,32 +12,29 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.stopwatch import CLOCK_MONOTONIC, clock_gettime, now
 
 FREE, REAL, SCRIPTED = range(3)
 """Whether the loop runs as fast as it can, on the machine's clock, or on a script."""
 
-CLOCK = np.dtype(
-    [
-        ("mode", np.int64),
-        ("period", np.int64),
-        ("start", np.int64),
-        ("deadline", np.int64),
-        ("woke", np.int64),
-        ("late", np.int64),
-        ("cpu", np.int64),
-        ("time", np.int64),
-        ("cycles", np.int64),
-        ("overrun", np.int64),
-        ("in_a_row", np.int64),
-        ("most_in_a_row", np.int64),
-        ("missed_late", np.int64),
-        ("missed_own", np.int64),
-        ("missed_host", np.int64),
-        ("timespec", np.int64, 2),
-    ],
-    align=True,
+CLOCK = record_dtype(
+    mode=np.int64,
+    period=np.int64,
+    start=np.int64,
+    deadline=np.int64,
+    woke=np.int64,
+    late=np.int64,
+    cpu=np.int64,
+    time=np.int64,
+    cycles=np.int64,
+    overrun=np.int64,
+    in_a_row=np.int64,
+    most_in_a_row=np.int64,
+    missed_late=np.int64,
+    missed_own=np.int64,
+    missed_host=np.int64,
+    timespec=(np.int64, 2),
 )
 """State of the clock, in ns.
 

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from controller.safety.causes import DriveState, Request
-from plant.compiled import Record
+from plant.compiled import Record, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import GoughError
 from plant.mechanism import LEGS
@@ -34,19 +34,16 @@ still holds the last one, although the drives' states may be new. Any other stat
 the brakes.
 """
 
-FEEDBACK = np.dtype(
-    [
-        ("measurement", np.float64, (3, IMU_COUNT, 3)),
-        ("sample_ns", np.int64, IMU_COUNT),
-        ("sequence", np.int64, IMU_COUNT),
-        ("drive", np.int64, LEGS),
-        ("drive_code", np.int64, LEGS),
-        ("sent", np.float64, LEGS),
-        ("truth", np.float64, TRUTH_SIZE),
-        ("round_trip_ns", np.int64),
-        ("refused", np.int64),
-    ],
-    align=True,
+FEEDBACK = record_dtype(
+    measurement=(np.float64, (3, IMU_COUNT, 3)),
+    sample_ns=(np.int64, IMU_COUNT),
+    sequence=(np.int64, IMU_COUNT),
+    drive=(np.int64, LEGS),
+    drive_code=(np.int64, LEGS),
+    sent=(np.float64, LEGS),
+    truth=(np.float64, TRUTH_SIZE),
+    round_trip_ns=np.int64,
+    refused=np.int64,
 )
 """The result of an exchange.
 

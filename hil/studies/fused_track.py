@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from controller.cycle import CONTROL, MARKS, MECHANISM, REFINEMENT, SCREENING, STATE, run_stages
 from controller.cycle import LEGS as LEG_FILTERS
 from controller.estimation.whole_mechanism.filter import extrapolate_covariance
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.imposed import ImposedMotion
 from plant.imu import ImuModel, imu_state, measure
 from plant.mechanism import LEGS
@@ -18,19 +18,16 @@ from plant.pose import Array, pose_errors, rms_figures
 CLOSED, REFINED, WHOLE, LEGS_ALONE = range(4)
 """Steps of a fused track: closed form, refined pose, whole-mechanism filter; times have the leg filters alone as well."""
 
-FUSED = np.dtype(
-    [
-        ("positions", np.float64, (3, 3)),
-        ("rotations", np.float64, (3, 3, 3)),
-        ("information", np.float64, (6, 6)),
-        ("covariance", np.float64, (6, 6)),
-        ("directions", np.float64, (LEGS, 3)),
-        ("leg_covariances", np.float64, (LEGS, 2, 2)),
-        ("vertical", np.float64, 3),
-        ("vertical_covariance", np.float64, (3, 3)),
-        ("ns", np.int64, 4),
-    ],
-    align=True,
+FUSED = record_dtype(
+    positions=(np.float64, (3, 3)),
+    rotations=(np.float64, (3, 3, 3)),
+    information=(np.float64, (6, 6)),
+    covariance=(np.float64, (6, 6)),
+    directions=(np.float64, (LEGS, 3)),
+    leg_covariances=(np.float64, (LEGS, 2, 2)),
+    vertical=(np.float64, 3),
+    vertical_covariance=(np.float64, (3, 3)),
+    ns=(np.int64, 4),
 )
 """Estimates for a sample.
 

@@ -2,7 +2,7 @@
 
 from plant.compiled.atomics import fence, load_acquire, store_release
 from plant.compiled.cache import hash_of_files, keyed_folder, user_cache
-from plant.compiled.kernels import Record, compilation_reported, filled, kernel
+from plant.compiled.kernels import Record, compilation_reported, filled, kernel, record_dtype
 
 __all__ = [
     "Record",
@@ -13,6 +13,7 @@ __all__ = [
     "kernel",
     "keyed_folder",
     "load_acquire",
+    "record_dtype",
     "store_release",
     "user_cache",
 ]

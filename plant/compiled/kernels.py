@@ -28,6 +28,11 @@ Record = Any
 NumPy cannot say."""
 
 
+def record_dtype(**fields: Any) -> np.dtype[Any]:
+    """The dtype of a record with these fields, in their order: each a type, or a type and a shape."""
+    return np.dtype(list(fields.items()), align=True)
+
+
 def filled(dtype: np.dtype[Any], values: Mapping[str, Any]) -> Record:
     """A structured array of shape () with these values by field; the other fields are zero."""
     record: Record = np.zeros((), dtype)

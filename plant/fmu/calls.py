@@ -8,7 +8,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.variables import DRIVE_MODES, IMU_COUNT, VELOCITY
 from plant.fmu.instance import ASKS_TO_END, ERROR, NEEDS_EVENTS, OK
 from plant.mechanism import LEGS
@@ -29,72 +29,63 @@ CALLED = (
 
 def _scalars(most: int) -> np.dtype[Any]:
     """`plant.fmu.binding.Scalars` for at most so many, and a buffer `raw` for the FMU's values."""
-    return np.dtype(
-        [
-            ("references", np.uint32, most),
-            ("reference_count", np.int64),
-            ("count", np.int64),
-            ("places", np.int64, most),
-            ("factors", np.float64, most),
-            ("offsets", np.float64, most),
-            ("raw", np.float64, most),
-        ],
-        align=True,
+    return record_dtype(
+        references=(np.uint32, most),
+        reference_count=np.int64,
+        count=np.int64,
+        places=(np.int64, most),
+        factors=(np.float64, most),
+        offsets=(np.float64, most),
+        raw=(np.float64, most),
     )
 
 
-_CHANGE = np.dtype(
-    [
-        ("time", np.float64),
-        ("function", np.int64),
-        ("references", np.int64),
-        ("reference_count", np.int64),
-        ("values", np.int64),
-        ("count", np.int64),
-    ],
-    align=True,
+_CHANGE = record_dtype(
+    time=np.float64,
+    function=np.int64,
+    references=np.int64,
+    reference_count=np.int64,
+    values=np.int64,
+    count=np.int64,
 )
 
-FMU_HANDLE = np.dtype(
-    [
-        ("version", np.int64),
-        ("instance", np.int64),
-        ("get", np.int64),
-        ("set", np.int64),
-        ("set_mode", np.int64),
-        ("do_step", np.int64),
-        ("time", np.float64),
-        ("since", np.float64),
-        ("length", np.float64),
-        ("steps", np.int64),
-        ("step", np.float64),
-        ("final", np.uint8),
-        ("status", np.int64),
-        ("call", np.int64),
-        ("sensed", _scalars(_SENSED)),
-        ("known", _scalars(TRUTH_SIZE)),
-        ("commanded", _scalars(LEGS)),
-        ("loaded", _scalars(1)),
-        ("mode_references", np.uint32, LEGS),
-        ("mode_reference_count", np.int64),
-        ("mode_count", np.int64),
-        ("mode_bytes", np.int64),
-        ("mode_values", np.uint64, len(DRIVE_MODES)),
-        ("mode_raw", np.uint64, LEGS),
-        ("imu", np.float64, (3, IMU_COUNT, 3)),
-        ("truth", np.float64, TRUTH_SIZE),
-        ("planar_angle", np.int64),
-        ("legs", np.int64),
-        ("command", np.float64, LEGS),
-        ("mode", np.int64, LEGS),
-        ("payload", np.float64, 1),
-        ("reached", np.float64, 1),
-        ("flags", np.uint8, 3),
-        ("changes", _CHANGE, MOST_CHANGES),
-        ("change_count", np.int64),
-        ("changed", np.int64),
-    ],
-    align=True,
+FMU_HANDLE = record_dtype(
+    version=np.int64,
+    instance=np.int64,
+    get=np.int64,
+    set=np.int64,
+    set_mode=np.int64,
+    do_step=np.int64,
+    time=np.float64,
+    since=np.float64,
+    length=np.float64,
+    steps=np.int64,
+    step=np.float64,
+    final=np.uint8,
+    status=np.int64,
+    call=np.int64,
+    sensed=_scalars(_SENSED),
+    known=_scalars(TRUTH_SIZE),
+    commanded=_scalars(LEGS),
+    loaded=_scalars(1),
+    mode_references=(np.uint32, LEGS),
+    mode_reference_count=np.int64,
+    mode_count=np.int64,
+    mode_bytes=np.int64,
+    mode_values=(np.uint64, len(DRIVE_MODES)),
+    mode_raw=(np.uint64, LEGS),
+    imu=(np.float64, (3, IMU_COUNT, 3)),
+    truth=(np.float64, TRUTH_SIZE),
+    planar_angle=np.int64,
+    legs=np.int64,
+    command=(np.float64, LEGS),
+    mode=(np.int64, LEGS),
+    payload=(np.float64, 1),
+    reached=(np.float64, 1),
+    flags=(np.uint8, 3),
+    changes=(_CHANGE, MOST_CHANGES),
+    change_count=np.int64,
+    changed=np.int64,
 )
 """One FMU in compiled code: addresses, value references with their conversions, and buffers.
 

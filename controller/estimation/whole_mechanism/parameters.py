@@ -13,7 +13,7 @@ from controller.estimation.whole_mechanism.readings import (
 from controller.estimation.whole_mechanism.rig_jacobian import RIG_ERRORS
 from controller.rig import MagneticField
 from controller.settings import FusionSettings
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import UnknownNameError
 from plant.pose import Array
@@ -28,24 +28,21 @@ ROWS = IMU_COUNT * READINGS
 
 WINDOW_S = 0.005
 _SMOOTHING_S = 0.03
-FILTER_PARAMETERS = np.dtype(
-    [
-        ("window", np.int64),
-        ("errors", np.int64),
-        ("rig", np.int64),
-        ("states", np.int64),
-        ("smoothing", np.float64),
-        ("jerk", np.float64, 2),
-        ("bias_walk", np.float64, 2),
-        ("variance", np.float64, 2),
-        ("prior", np.float64, (ALL_ERRORS + RIG_ERRORS, ALL_ERRORS + RIG_ERRORS)),
-        ("floor", np.float64, 2),
-        ("heading", np.int64),
-        ("field_axes", np.float64, (3, 3)),
-        ("heading_variance", np.float64),
-        ("offset_variance", np.float64),
-    ],
-    align=True,
+FILTER_PARAMETERS = record_dtype(
+    window=np.int64,
+    errors=np.int64,
+    rig=np.int64,
+    states=np.int64,
+    smoothing=np.float64,
+    jerk=(np.float64, 2),
+    bias_walk=(np.float64, 2),
+    variance=(np.float64, 2),
+    prior=(np.float64, (ALL_ERRORS + RIG_ERRORS, ALL_ERRORS + RIG_ERRORS)),
+    floor=(np.float64, 2),
+    heading=np.int64,
+    field_axes=(np.float64, (3, 3)),
+    heading_variance=np.float64,
+    offset_variance=np.float64,
 )
 """Samples of a window; estimated errors of an IMU, 0 for no filter, and of the rig; all states; time constant of the motion at
 which the Jacobian is taken, infinite if that is set from outside; spectral densities of the platform's jerk (linear,
@@ -55,48 +52,45 @@ heading; in {1} the horizontal direction of the magnetic field, that across it a
 small turn changes what the heading seems to be; and the variances of a sample's heading and of its offset.
 """
 
-FILTER_STATE = np.dtype(
-    [
-        ("running", np.int64),
-        ("time", np.float64),
-        ("position", np.float64, 3),
-        ("rotation", np.float64, (3, 3)),
-        ("motion", np.float64, (4, 3)),
-        ("low_passed", np.float64, (2, 4, 3)),
-        ("smooth_motion", np.float64, (4, 3)),
-        ("errors", np.float64, (IMU_COUNT, ERRORS)),
-        ("rig", np.float64, RIG_ERRORS),
-        ("covariance", np.float64, (MOST_STATES, MOST_STATES)),
-        ("published_time", np.float64),
-        ("published_position", np.float64, 3),
-        ("published_rotation", np.float64, (3, 3)),
-        ("published_motion", np.float64, (4, 3)),
-        ("published_covariance", np.float64, (MOTION_STATES, MOTION_STATES)),
-        ("sum", np.float64, (IMU_COUNT, READINGS)),
-        ("sum_time", np.float64),
-        ("samples", np.int64, IMU_COUNT),
-        ("collected", np.int64),
-        ("field", np.float64, 3),
-        ("field_time", np.float64),
-        ("field_used", np.int64),
-        ("heading_offset", np.float64),
-        ("sample", np.float64, (IMU_COUNT, READINGS)),
-        ("sample_used", np.int64, IMU_COUNT),
-        ("row", np.int64),
-        ("update_step", np.int64),
-        ("change", np.float64, MOST_STATES),
-        ("gain", np.float64, MOST_STATES),
-        ("turn", np.float64, 3),
-        ("frame", np.float64, (3, 3)),
-        ("predicted", np.float64, (IMU_COUNT, READINGS)),
-        ("smooth_predicted", np.float64, (IMU_COUNT, READINGS)),
-        ("jacobian", np.float64, (IMU_COUNT, READINGS, MOTION_STATES)),
-        ("rig_jacobian", np.float64, (IMU_COUNT, READINGS, 8)),
-        ("gradient", np.float64, ERRORS),
-        ("mixed", np.float64, (3, MOTION_STATES)),
-        ("readings_scratch", READINGS_SCRATCH),
-    ],
-    align=True,
+FILTER_STATE = record_dtype(
+    running=np.int64,
+    time=np.float64,
+    position=(np.float64, 3),
+    rotation=(np.float64, (3, 3)),
+    motion=(np.float64, (4, 3)),
+    low_passed=(np.float64, (2, 4, 3)),
+    smooth_motion=(np.float64, (4, 3)),
+    errors=(np.float64, (IMU_COUNT, ERRORS)),
+    rig=(np.float64, RIG_ERRORS),
+    covariance=(np.float64, (MOST_STATES, MOST_STATES)),
+    published_time=np.float64,
+    published_position=(np.float64, 3),
+    published_rotation=(np.float64, (3, 3)),
+    published_motion=(np.float64, (4, 3)),
+    published_covariance=(np.float64, (MOTION_STATES, MOTION_STATES)),
+    sum=(np.float64, (IMU_COUNT, READINGS)),
+    sum_time=np.float64,
+    samples=(np.int64, IMU_COUNT),
+    collected=np.int64,
+    field=(np.float64, 3),
+    field_time=np.float64,
+    field_used=np.int64,
+    heading_offset=np.float64,
+    sample=(np.float64, (IMU_COUNT, READINGS)),
+    sample_used=(np.int64, IMU_COUNT),
+    row=np.int64,
+    update_step=np.int64,
+    change=(np.float64, MOST_STATES),
+    gain=(np.float64, MOST_STATES),
+    turn=(np.float64, 3),
+    frame=(np.float64, (3, 3)),
+    predicted=(np.float64, (IMU_COUNT, READINGS)),
+    smooth_predicted=(np.float64, (IMU_COUNT, READINGS)),
+    jacobian=(np.float64, (IMU_COUNT, READINGS, MOTION_STATES)),
+    rig_jacobian=(np.float64, (IMU_COUNT, READINGS, 8)),
+    gradient=(np.float64, ERRORS),
+    mixed=(np.float64, (3, MOTION_STATES)),
+    readings_scratch=READINGS_SCRATCH,
 )
 """State of the filter, whose update may be under way; `published` is what the last complete one has found.
 

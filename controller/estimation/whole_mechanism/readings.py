@@ -12,7 +12,7 @@ axes of {1}), velocity, angular velocity, acceleration and angular acceleration.
 import numpy as np
 
 from controller.estimation.leg_filter import predict_measurement
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
 from plant.mechanism import LEGS
 from plant.pose import Array
@@ -24,17 +24,14 @@ READINGS = 6
 VELOCITY, RATE, ACCELERATION, ANGULAR_ACCELERATION = range(4)
 """Rows of a motion (4, 3), seen in {1}: velocity of the origin of {2}, angular velocity, and their derivatives."""
 
-READINGS_SCRATCH = np.dtype(
-    [
-        ("arm", np.float64, 3),
-        ("turning", np.float64, 3),
-        ("vector", np.float64, (3, 3)),
-        ("gradient", np.float64, (3, 2, 3)),
-        ("gradient_in_base", np.float64, (3, 2, 3)),
-        ("angles", np.float64, 9),
-        ("angle_jacobian", np.float64, (READINGS, 9)),
-    ],
-    align=True,
+READINGS_SCRATCH = record_dtype(
+    arm=(np.float64, 3),
+    turning=(np.float64, 3),
+    vector=(np.float64, (3, 3)),
+    gradient=(np.float64, (3, 2, 3)),
+    gradient_in_base=(np.float64, (3, 2, 3)),
+    angles=(np.float64, 9),
+    angle_jacobian=(np.float64, (READINGS, 9)),
 )
 
 

@@ -18,7 +18,7 @@ from controller.estimation.whole_mechanism.parameters import FILTER_PARAMETERS, 
 from controller.inverse_kinematics import legs_at
 from controller.rig import elapsed
 from controller.settings import FusionSettings
-from plant.compiled import Record, filled, kernel
+from plant.compiled import Record, filled, kernel, record_dtype
 from plant.mechanism import LEGS
 from plant.pose import Array
 
@@ -31,32 +31,26 @@ _PATIENCE_S = 0.05
 _FADING_S = 0.1
 """Time constant with which the step between two sources of the pose fades away [s]."""
 
-PARAMETERS = np.dtype(
-    [
-        ("filter", FILTER_PARAMETERS),
-        ("delay", np.float64),
-        ("start_cycles", np.int64),
-        ("settling_cycles", np.int64),
-        ("disagreement", np.float64),
-        ("patience_cycles", np.int64),
-    ],
-    align=True,
+PARAMETERS = record_dtype(
+    filter=FILTER_PARAMETERS,
+    delay=np.float64,
+    start_cycles=np.int64,
+    settling_cycles=np.int64,
+    disagreement=np.float64,
+    patience_cycles=np.int64,
 )
 """Constants: of the filter itself; the sensors' delay [s]; the durations above; the limit of the disagreement [rad]."""
 
-STATE = np.dtype(
-    [
-        ("filter", FILTER_STATE),
-        ("due", np.int64),
-        ("trusted", np.int64),
-        ("disagreeing_for", np.int64),
-        ("blend_offset", np.float64, 6),
-        ("closed_position", np.float64, 3),
-        ("closed_rotation", np.float64, (3, 3)),
-        ("twist", np.float64, 6),
-        ("acceleration", np.float64, 6),
-    ],
-    align=True,
+STATE = record_dtype(
+    filter=FILTER_STATE,
+    due=np.int64,
+    trusted=np.int64,
+    disagreeing_for=np.int64,
+    blend_offset=(np.float64, 6),
+    closed_position=(np.float64, 3),
+    closed_rotation=(np.float64, (3, 3)),
+    twist=(np.float64, 6),
+    acceleration=(np.float64, 6),
 )
 """State of the filter and of the trust in it.
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from hil.rigs import DriveState, Request
 from hil.rigs.emulation.faults import FAULT, MOST_FAULTS, FaultKind, draw_normal, find_fault, is_active
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
 from plant.errors import InputError
 from plant.fmu.calls import advance, read_imus, read_truth, write_command, write_drive_modes, write_payload_mass
@@ -20,33 +20,30 @@ from plant.pose import rotate_by_vector
 from plant.truth import TRUTH_SIZE
 from plant.vectors import rotate, vector
 
-EMULATED = np.dtype(
-    [
-        ("time_ns", np.int64),
-        ("step_ns", np.int64),
-        ("enabled_ns", np.int64),
-        ("deceleration", np.float64),
-        ("speed_limit", np.float64),
-        ("payload", np.float64),
-        ("added", np.float64),
-        ("request", np.int64, LEGS),
-        ("target", np.float64, LEGS),
-        ("reset", np.int64, LEGS),
-        ("drive", np.int64, LEGS),
-        ("code", np.int64, LEGS),
-        ("velocity", np.float64, LEGS),
-        ("measurement", np.float64, (3, IMU_COUNT, 3)),
-        ("sample_ns", np.int64, IMU_COUNT),
-        ("sequence", np.int64, IMU_COUNT),
-        ("truth", np.float64, TRUTH_SIZE),
-        ("fault", FAULT, MOST_FAULTS),
-        ("faults", np.int64),
-        ("random", np.uint64, 1),
-        ("ideal", np.float64, (3, IMU_COUNT, 3)),
-        ("turn", np.float64, (3, 3)),
-        ("axis", np.float64, 3),
-    ],
-    align=True,
+EMULATED = record_dtype(
+    time_ns=np.int64,
+    step_ns=np.int64,
+    enabled_ns=np.int64,
+    deceleration=np.float64,
+    speed_limit=np.float64,
+    payload=np.float64,
+    added=np.float64,
+    request=(np.int64, LEGS),
+    target=(np.float64, LEGS),
+    reset=(np.int64, LEGS),
+    drive=(np.int64, LEGS),
+    code=(np.int64, LEGS),
+    velocity=(np.float64, LEGS),
+    measurement=(np.float64, (3, IMU_COUNT, 3)),
+    sample_ns=(np.int64, IMU_COUNT),
+    sequence=(np.int64, IMU_COUNT),
+    truth=(np.float64, TRUTH_SIZE),
+    fault=(FAULT, MOST_FAULTS),
+    faults=np.int64,
+    random=(np.uint64, 1),
+    ideal=(np.float64, (3, IMU_COUNT, 3)),
+    turn=(np.float64, (3, 3)),
+    axis=(np.float64, 3),
 )
 """State of an emulated rig: its clock, the plant's largest step, when the drives were first enabled (negative before), the
 drives' `deceleration` in a quick stop or after a fault [m/s^2], their speed limit [m/s], payload and added payload [kg].

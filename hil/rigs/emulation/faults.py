@@ -5,7 +5,7 @@ from math import inf, radians
 
 import numpy as np
 
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import InputError, UnknownNameError
 from plant.mechanism import LEGS
@@ -57,8 +57,12 @@ class FaultKind(IntEnum):
     PAYLOAD_JUMPS = 0, 5.0, 1.0, "the payload gains this mass [kg]"
 
 
-FAULT = np.dtype(
-    [("kind", np.int64), ("index", np.int64), ("begin_ns", np.int64), ("end_ns", np.int64), ("size", np.float64)], align=True
+FAULT = record_dtype(
+    kind=np.int64,
+    index=np.int64,
+    begin_ns=np.int64,
+    end_ns=np.int64,
+    size=np.float64,
 )
 """A fault: its kind, the number of the IMU or drive, its start and end [ns since the drives were first enabled], and its size.
 A fault that begins below 0 is there from the start.

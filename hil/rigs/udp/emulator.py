@@ -22,7 +22,7 @@ from hil.rigs.udp.link import (
     receive_datagram,
     send_datagram,
 )
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS
 from plant.pose import Array
@@ -42,22 +42,21 @@ _LATENCY_NS = 20_000
 _IDLE_NS = 1_000_000
 """How often an emulated rig checks its watchdog while no datagram arrives."""
 
-PACKET = np.dtype(
-    [("due_ns", np.int64), ("way", np.int64), ("length", np.int64), ("content", np.uint8, LONGEST)],
-    align=True,
+PACKET = record_dtype(
+    due_ns=np.int64,
+    way=np.int64,
+    length=np.int64,
+    content=(np.uint8, LONGEST),
 )
 
-UDP_SESSION = np.dtype(
-    [
-        ("id", np.uint32),
-        ("last", np.uint32),
-        ("commanded_ns", np.int64),
-        ("watchdog_ns", np.int64),
-        ("refused", np.int64),
-        ("held_back", np.int64, 2),
-        ("packet", PACKET, _PACKETS),
-    ],
-    align=True,
+UDP_SESSION = record_dtype(
+    id=np.uint32,
+    last=np.uint32,
+    commanded_ns=np.int64,
+    watchdog_ns=np.int64,
+    refused=np.int64,
+    held_back=(np.int64, 2),
+    packet=(PACKET, _PACKETS),
 )
 """A session of an emulated rig: its id; sequence number and time of the last command; the time without a command after which
 the drives stop; the number of refused datagrams; whether a packet is held back to arrive after the next, each way; and the

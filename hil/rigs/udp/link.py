@@ -25,7 +25,7 @@ from hil.rigs.udp.datagrams import (
     crc32,
     is_valid,
 )
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import InputError
 from plant.mechanism import LEGS
@@ -79,21 +79,18 @@ def socket_address(address: tuple[str, int]) -> NDArray[np.uint8]:
     return np.frombuffer(content, np.uint8)
 
 
-SOCKET = np.dtype(
-    [
-        ("descriptor", np.int64),
-        ("session", np.uint32),
-        ("sequence", np.uint32),
-        ("timeout_ns", np.int64),
-        ("reset", np.uint32),
-        ("peer", np.uint8, 16),
-        ("sender", np.uint8, 16),
-        ("sender_size", np.int32, 2),
-        ("stranger", np.int64),
-        ("poll", np.int32, 2),
-        ("timespec", np.int64, 2),
-    ],
-    align=True,
+SOCKET = record_dtype(
+    descriptor=np.int64,
+    session=np.uint32,
+    sequence=np.uint32,
+    timeout_ns=np.int64,
+    reset=np.uint32,
+    peer=(np.uint8, 16),
+    sender=(np.uint8, 16),
+    sender_size=(np.int32, 2),
+    stranger=np.int64,
+    poll=(np.int32, 2),
+    timespec=(np.int64, 2),
 )
 """A socket in compiled code: its descriptor; session and sequence number of the last command, and how long to wait for the
 answer; whether commands reset the drives' faults; the other side's address, and the last sender's, as `sockaddr_in`; whether
