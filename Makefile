@@ -22,7 +22,7 @@ test: .venv/installed-test
 test-all: test
 	$(BIN)/pytest -n $(WORKERS) --dist loadfile -m "slow or hypothesis" --hypothesis-profile=all
 
-bench: .venv/installed
+bench: .venv/installed-all
 	@mkdir -p $(OUT)
 	$(BIN)/gough bench --json $(OUT)/bench.json $(BENCH)
 	$(BIN)/gough compare-fusion --json $(OUT)/fusion.json $(FUSION)
@@ -46,10 +46,14 @@ clean:
 	@command -v cc >/dev/null || command -v gcc >/dev/null || command -v clang >/dev/null || \
 		{ echo "a C compiler is missing (it builds the plant): install one, on Debian with 'apt install gcc libc6-dev'"; exit 1; }
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable .
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[reports]'
 	@touch $@
 
-.venv/installed-test: .venv/installed
+.venv/installed-all: .venv/installed
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[all]'
+	@touch $@
+
+.venv/installed-test: .venv/installed-all
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[test]'
 	@touch $@
 

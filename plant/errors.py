@@ -37,5 +37,9 @@ class ToolchainError(GoughError, OSError):
     """Something that building needs, such as the C compiler, is missing or failed."""
 
 
+class MissingPackageError(GoughError, ImportError):
+    """A package that only some users need is not installed."""
+
+
 class PlanningError(GoughError, RuntimeError):
     """The trajectory generator found no motion within the limits."""

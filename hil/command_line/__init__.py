@@ -10,6 +10,7 @@ from typing import NoReturn
 
 from hil.command_line.options import build, summary
 from plant.errors import GoughError
+from plant.extras import missing_extras_named
 
 REFUSED, INTERRUPTED = 2, 130
 """Exit statuses beside 0, and 1 for a run that ended early: bad input, with nothing done; Ctrl-C."""
@@ -37,7 +38,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     options = parse(sys.argv[1:] if arguments is None else arguments)
     try:
-        status: int = options.run(options)
+        with missing_extras_named():
+            status: int = options.run(options)
         sys.stdout.flush()
     except GoughError as error:
         with suppress(OSError):

@@ -74,7 +74,7 @@ def _calibrate_rig(options: argparse.Namespace) -> int:
     from hil.calibration.data import Knowledge
     from hil.calibration.drive import calibrate_recordings, calibrate_rig
 
-    check_outputs(options.output, options.json, options.report, options.picture)
+    check_outputs(options.output, options.json, options.picture, report=options.report)
     if not 0.0 < options.tilt < 45.0:
         raise InputError(f"--tilt is {options.tilt:g} deg; it must be between 0 and 45")
     if not 0.0 <= options.joints <= 10.0:

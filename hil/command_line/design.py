@@ -29,7 +29,7 @@ def _classify(options: argparse.Namespace) -> int:
     from hil.studies.classification import PAPER, describe
     from plant.mechanism import load_mechanism
 
-    check_outputs(options.json, options.report)
+    check_outputs(options.json, report=options.report)
     description = describe(load_mechanism(options.mechanism))
     write_json(options.json, description.summary())
     if options.report:

@@ -46,7 +46,7 @@ def _bench(options: argparse.Namespace) -> int:
     from hil.benchmarks.loop import machine, measure_speed, read_earlier
     from hil.benchmarks.plant import measure_plant
 
-    check_outputs(options.json, options.report)
+    check_outputs(options.json, report=options.report)
     for name, seconds in (("--clock", options.clock), ("--measures", options.measures)):
         if seconds is not None and not 0.0 < seconds < float("inf"):
             raise InputError(f"{name} is {seconds:g} s; it must be positive and finite")

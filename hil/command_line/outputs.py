@@ -8,6 +8,7 @@ from typing import Any
 
 from hil.table import Table
 from plant.errors import GoughError, InputError
+from plant.extras import check_installed
 from plant.files import check_writable, write_whole
 
 
@@ -35,13 +36,16 @@ def show_table(table: Table, markdown: bool) -> None:
         table.print()
 
 
-def check_outputs(*paths: Path | None, inputs: Sequence[Path] = ()) -> None:
+def check_outputs(*paths: Path | None, report: Path | None = None, inputs: Sequence[Path] = ()) -> None:
     """Check that the requested files can be written, and that no two of them and of the inputs are the same.
 
     Raises:
         InputError: one cannot be written, or two are the same.
+        MissingPackageError: what makes reports is not installed.
     """
-    requested = [path for path in paths if path is not None]
+    if report is not None:
+        check_installed("plotly")
+    requested = [path for path in (*paths, report) if path is not None]
     named = [path.resolve() for path in (*requested, *inputs)]
     for path in named:
         if named.count(path) > 1:

@@ -40,7 +40,7 @@ def _simulate(options: argparse.Namespace) -> int:
     from hil.runs.simulation import SimulationStoppedError, simulate
     from hil.runs.snapshot import read_snapshot, write_snapshot
 
-    check_outputs(options.json, options.report, options.save_state)
+    check_outputs(options.json, options.save_state, report=options.report)
     config, resumed = config_of(options, SimulationConfig), None
     if options.load_state is not None:
         resumed = read_snapshot(options.load_state)

@@ -199,7 +199,7 @@ def _planar(options: argparse.Namespace) -> int:
     from plant.mechanism import load_mechanism
     from plant.mechanism.planar import PlanarMechanism
 
-    check_outputs(options.json, options.report)
+    check_outputs(options.json, report=options.report)
     mechanism = load_mechanism(options.mechanism)
     if not isinstance(mechanism, PlanarMechanism):
         raise InputError(f"{options.mechanism} has six legs in space; this needs three in the plane: choose another mechanism")

@@ -7,6 +7,7 @@ from hil.rigs.udp.link import DEFAULT_ADDRESS
 from hil.rigs.udp.rig import UdpRig
 from hil.runs.config import PYTHON_RIG, SimulationConfig
 from plant.errors import InputError
+from plant.extras import missing_extras_named
 from plant.mechanism import load_in_space
 
 
@@ -21,9 +22,9 @@ def rig_of(config: SimulationConfig) -> Rig | None:
     if config.rig == "udp":
         return UdpRig(config.rig_at or DEFAULT_ADDRESS, period)
     if config.rig == "canopen":
-        # Without a CAN bus, its libraries are not needed.
-        from hil.rigs.canopen.rig import CanopenRig
-        from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings
+        with missing_extras_named():
+            from hil.rigs.canopen.rig import CanopenRig
+            from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings
 
         return CanopenRig(canopen_settings(config.rig_at or DEFAULT_FILE), period)
     if config.rig == "replay":

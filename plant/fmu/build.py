@@ -18,7 +18,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module, resources
 from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ import fmpy
 from plant.compiled import hash_of_files, keyed_folder
 from plant.dynamics.variables import PLANAR, SPATIAL, VariableTable
 from plant.errors import InputError, ToolchainError
+from plant.extras import check_installed
 from plant.files import check_writable, write_whole
 from plant.fmu.description import Layout, build_description, model_description
 from plant.mechanism import Mechanism, load_in_space
@@ -170,13 +170,8 @@ def c_compiler() -> list[str]:
 
 
 def _zig() -> list[str]:
-    """The command of the compiler for other platforms.
-
-    Raises:
-        ToolchainError: it is not installed.
-    """
-    if find_spec("ziglang") is None:
-        raise ToolchainError("other platforms are compiled by zig, which is not installed: pip install 'gough[cross]'")
+    """The command of the compiler for other platforms."""
+    check_installed("ziglang")
     return [sys.executable, "-m", "ziglang", "cc"]
 
 
