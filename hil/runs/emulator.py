@@ -10,7 +10,7 @@ import signal
 import socket
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from typing import Any
 
 import numpy as np
@@ -97,21 +97,21 @@ def _emulate_canopen(
     config: EmulatorConfig, faults: list[Record], settings: RealTimeSettings, say: Callable[[str], None], control: "_Control",
     stopped: _Stopped,
 ) -> None:  # fmt: skip
-    from hil.rigs.canopen.emulator import PlantMachine, serve_canopen
+    from hil.rigs.canopen.emulated_bus import EmulatedBus
+    from hil.rigs.canopen.emulator import PlantMachine, faulty_channel, serve_canopen
     from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings
 
     bus = canopen_settings(config.at or DEFAULT_FILE)
-    machine = PlantMachine(lambda: _rig_of(config, 1.0 / config.simulated.rate, faults))
-    try:
-        machine.sample(time.monotonic_ns())
-        with real_time(settings) as refused:
-            for text in refused:
-                say(f"without {text}")
-            where = f"{bus.bus.interface} {bus.bus.channel}"
-            say(f"the rig {config.simulated.mechanism} listens at {where}, its control at {config.control}")
-            serve_canopen(bus, machine, lambda: stopped.asked, control.answer)
-    finally:
-        machine.close()
+    with (
+        closing(PlantMachine(lambda: _rig_of(config, 1.0 / config.simulated.rate, faults))) as machine,
+        real_time(settings) as refused,
+        closing(EmulatedBus(bus, machine, faulty_channel(machine.rig))) as nodes,
+    ):
+        for text in refused:
+            say(f"without {text}")
+        where = f"{bus.bus.interface} {bus.bus.channel}"
+        say(f"the rig {config.simulated.mechanism} listens at {where}, its control at {config.control}")
+        serve_canopen(nodes, machine, lambda: stopped.asked, control.answer)
 
 
 def _listen(address: str) -> socket.socket:

@@ -9,7 +9,6 @@ import numpy as np
 
 from hil.rigs import DriveState
 from hil.rigs.canopen.emulated_bus import Channel, EmulatedBus
-from hil.rigs.canopen.settings import CanopenSettings
 from hil.rigs.emulation.drives import EMULATED, move, sample
 from hil.rigs.emulation.faults import disturb
 from plant.compiled import Record
@@ -32,7 +31,12 @@ class PlantMachine:
     def __init__(self, make: Callable[[], tuple[FmuPlant, Record, Record]]) -> None:
         self._make = make
         self.rig: Record = np.zeros((), EMULATED)
+        self._started = 0
         self._begin()
+        # The clock starts when the machine code is loaded: a node that waits for it would not answer over SDO in time.
+        self.sample(self._started)
+        self.advance(self._started)
+        self._started = time.monotonic_ns()
 
     def _begin(self) -> None:
         self._plant, self._imu, self.rig[()] = self._make()
@@ -80,13 +84,9 @@ def faulty_channel(rig: Record) -> Channel:
 
 
 def serve_canopen(
-    settings: CanopenSettings,
-    machine: PlantMachine,
-    stopped: Callable[[], bool],
-    report: Callable[[Record, dict[str, Any]], None],
+    bus: EmulatedBus, machine: PlantMachine, stopped: Callable[[], bool], report: Callable[[Record, dict[str, Any]], None]
 ) -> None:
     """Serve the bus until `stopped`; `report` is called now and then with the rig and the figures of the bus."""
-    bus = EmulatedBus(settings, machine, faulty_channel(machine.rig))
     reported = 0.0
 
     def ended() -> bool:
@@ -96,7 +96,4 @@ def serve_canopen(
             report(machine.rig, {"lost": bus.lost})
         return stopped()
 
-    try:
-        bus.serve(ended)
-    finally:
-        bus.close()
+    bus.serve(ended)

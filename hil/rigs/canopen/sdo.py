@@ -26,7 +26,7 @@ _SDO_ATTEMPTS = 3
 class _Sdo(SdoClient):  # type: ignore[misc]
     """canopen's SDO client, but it reads the bus itself instead of having a thread do it."""
 
-    RESPONSE_TIMEOUT = 0.3
+    RESPONSE_TIMEOUT = 1.0
 
     def __init__(self, node: int, eds: Any, network: canopen.Network, receive: Callable[[float], can.Message | None]) -> None:
         super().__init__(CobId.SDO_REQUEST + node, CobId.SDO_ANSWER + node, object_dictionary(eds, node))
