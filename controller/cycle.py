@@ -6,47 +6,35 @@
 The cycle allocates nothing, raises nothing and knows no clock: time is counted in periods, missed ones included. Each stage
 owns its constants and its state; `PARAMETERS` and `STATE` compose them, and a copy of the state is a snapshot.
 
+In the kernels of a stage, `p` and `s` are its own constants and state, `rig` and `time` are records of `RIG` and `TIME`, and
+the states of other stages have their names in `STATE`. A kernel that takes `parameters` and `state` gets those of the whole
+cycle.
+
 A planar mechanism goes through the same cycle in the first three rows of all that is kept by leg. Its leg filters, direct
 kinematics and refinement stay in the plane.
 """
 
 from collections.abc import Collection
+from enum import IntEnum
 
 import numpy as np
 
 from controller import load_feed_forward, pid, reference
 from controller import safety as safety_stage
 from controller.calibration.file import Calibration
-from controller.estimation import (
-    heading_filter,
-    imu_health,
-    leg_filter,
-    platform_filter,
-    pose_estimator,
-)
-from controller.estimation.heading_filter import step_heading_filter
-from controller.estimation.imu_health import screen_imus
-from controller.estimation.imu_monitor import look_at_next
-from controller.estimation.leg_filter import step_leg_filters
-from controller.estimation.platform_filter import step_platform_filter
-from controller.estimation.pose_estimator import find_pose, refine_pose, take_vectors
+from controller.estimation import heading_filter, imu_health, imu_monitor, leg_filter, platform_filter, pose_estimator
 from controller.estimation.whole_mechanism import trust
 from controller.estimation.whole_mechanism.parameters import filter_parameters
-from controller.estimation.whole_mechanism.trust import step_mechanism_filter
 from controller.imu_set import check_imus, imus_of
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import RANK_TOLERANCE
-from controller.load_feed_forward import find_feed_forward
-from controller.pid import hold_still, step_pid
-from controller.reference import update_reference
 from controller.rig import RIG, TIME, elapsed, field_of, rig_parameters
-from controller.safety.arming import postpones_arming, run_arming_checks
+from controller.safety import arming, watch
 from controller.safety.causes import Cause, Mode, Request
-from controller.safety.stop import handle_cause, ramp_down
-from controller.safety.watch import check_limits, exclude_imu, update_rig_status
+from controller.safety.stop import ramp_down, react
 from controller.settings import ControlSettings, FusionSettings, SafetySettings
 from plant.checks import check_rate
-from plant.compiled import Record, kernel, record_dtype
+from plant.compiled import Record, filled, kernel, record_dtype
 from plant.errors import InputError
 from plant.mechanism import Mechanism
 from plant.pose import Array
@@ -84,10 +72,14 @@ STATE = record_dtype(
 )
 """The state of the cycle by stage; zeros before the first cycle."""
 
-SCREENING, LEGS, PLATFORM, HEADING, POSE, REFINEMENT, MECHANISM, CONTROL, END = range(9)
-"""The stages, in their order."""
 
-MARKS = record_dtype(ns=(np.int64, END), timespec=(np.int64, 2))
+class CycleStage(IntEnum):
+    """The stages, in their order."""
+
+    SCREENING, LEGS, PLATFORM, HEADING, POSE, REFINEMENT, MECHANISM, CONTROL, END = range(9)
+
+
+MARKS = record_dtype(ns=(np.int64, CycleStage.END), timespec=(np.int64, 2))
 """How long each stage took in the last cycle [ns], and scratch."""
 
 
@@ -135,18 +127,19 @@ def cycle_parameters(
         )
     present = imus_of(mechanism, imus)
     errors, of_heading = (calibration.covariance, calibration.floor), field if magnetometer else None
-    parameters: Record = np.zeros((), PARAMETERS)
-    parameters["rig"] = rig_parameters(mechanism, rate, control.hold, calibration.tilt)
-    parameters["imus"] = imu_health.imu_parameters(present, calibration, fusion, watched, rate)
-    parameters["legs"] = leg_filter.leg_parameters(fusion, rate)
-    parameters["platform"] = platform_filter.platform_parameters(fusion, rate)
-    parameters["heading"] = heading_filter.heading_parameters(fusion, rate, field, magnetometer)
-    parameters["pose"] = pose_estimator.pose_parameters(fusion, section_5)
-    parameters["mechanism"] = trust.trust_parameters(fusion, rate, filter_parameters(fusion, rate, whole, *errors, of_heading))
-    parameters["load"] = load_feed_forward.load_parameters(mechanism, command_delay)
-    parameters["pid"] = pid.pid_parameters(control, limits.velocity)
-    parameters["safety"] = safety_stage.safety_parameters(watched, rate, limits, to_arm)
-    return parameters
+    return filled(
+        PARAMETERS,
+        rig=rig_parameters(mechanism, rate, control.hold, calibration.tilt),
+        imus=imu_health.imu_parameters(present, calibration, fusion, watched, rate),
+        legs=leg_filter.leg_parameters(fusion, rate),
+        platform=platform_filter.platform_parameters(fusion, rate),
+        heading=heading_filter.heading_parameters(fusion, rate, field, magnetometer),
+        pose=pose_estimator.pose_parameters(fusion, section_5),
+        mechanism=trust.trust_parameters(fusion, rate, filter_parameters(fusion, rate, whole, *errors, of_heading)),
+        load=load_feed_forward.load_parameters(mechanism, command_delay),
+        pid=pid.pid_parameters(control, limits.velocity),
+        safety=safety_stage.safety_parameters(watched, rate, limits, to_arm),
+    )
 
 
 @kernel
@@ -154,8 +147,7 @@ def cycle(parameters: Record, state: Record, measurement: Array, segments: Array
     """One cycle: from raw IMU data to the commands, which are left in `state`.
 
     Args:
-        parameters: dtype `PARAMETERS`.
-        state: dtype `STATE`; zeros before the first cycle.
+        parameters, state: dtypes `PARAMETERS` and `STATE`; the state is zeros before the first cycle.
         measurement: (3, 7, 3), angular velocity [rad/s], specific force [m/s^2], magnetic field [uT] of the seven IMUs.
         segments: (6, n, 5), the reference as `controller.planning.segments` has it.
         marks: a record of dtype `MARKS`.
@@ -164,7 +156,7 @@ def cycle(parameters: Record, state: Record, measurement: Array, segments: Array
         `Cause.NONE`, or why there is no pose or why the estimate cannot be used: the cause of a fault, unless nothing has been
         armed yet.
     """
-    return run_stages(parameters, state, measurement, segments, marks, SCREENING, END)
+    return run_stages(parameters, state, measurement, segments, marks, CycleStage.SCREENING, CycleStage.END)
 
 
 @kernel
@@ -178,39 +170,43 @@ def run_stages(
     p, s, m = parameters[()], state[()], marks
     rig, time = p.rig, s.time
     if s.safety.mode == Mode.FAULT:
-        ramp_down(p.safety.stop, rig, time, s.pid)
+        ramp_down(parameters, state)
         return Cause.NONE.value
     t = now(m.timespec)
-    if first <= SCREENING < last:
-        screen_imus(p.imus, s.imus, rig.legs, time, s.safety.watch.silent, measurement, s.safety.events)
-        t = _mark(m, SCREENING, t)
-    if first <= LEGS < last:
-        step_leg_filters(p.legs, s.legs, rig, time, s.imus)
-        t = _mark(m, LEGS, t)
-    if first <= PLATFORM < last:
-        step_platform_filter(p.platform, s.platform, rig, time, s.imus, s.pose)
-    if first <= HEADING < last:
-        step_heading_filter(p.heading, s.heading, rig, time, s.imus, s.platform)
-        t = _mark(m, HEADING, t)
-    if first <= POSE < last:
-        take_vectors(s.pose, s.platform, s.heading)
-        conditioning = find_pose(p.pose, s.pose, rig, s.legs.directions, s.legs.used, s.platform.used, s.heading.used)
+    if first <= CycleStage.SCREENING < last:
+        imu_health.screen_imus(p.imus, s.imus, rig.legs, time, s.safety.watch.silent, measurement, s.safety.events)
+        t = _mark(m, CycleStage.SCREENING, t)
+    if first <= CycleStage.LEGS < last:
+        leg_filter.step_leg_filters(p.legs, s.legs, rig, time, s.imus)
+        t = _mark(m, CycleStage.LEGS, t)
+    if first <= CycleStage.PLATFORM < last:
+        platform_filter.step_platform_filter(p.platform, s.platform, rig, time, s.imus, s.pose)
+    if first <= CycleStage.HEADING < last:
+        heading_filter.step_heading_filter(p.heading, s.heading, rig, time, s.imus, s.platform)
+        t = _mark(m, CycleStage.HEADING, t)
+    if first <= CycleStage.POSE < last:
+        pose_estimator.take_vectors(s.pose, s.platform, s.heading)
+        conditioning = pose_estimator.find_pose(
+            p.pose, s.pose, rig, s.legs.directions, s.legs.used, s.platform.used, s.heading.used
+        )
         s.pose.found = conditioning >= RANK_TOLERANCE
-        t = _mark(m, POSE, t)
-    if first <= REFINEMENT < last:
+        t = _mark(m, CycleStage.POSE, t)
+    if first <= CycleStage.REFINEMENT < last:
         if s.pose.found != 0:
-            s.pose.found = refine_pose(p.pose, s.pose, rig, time, s.legs, s.platform.rate)
+            s.pose.found = pose_estimator.refine_pose(p.pose, s.pose, rig, time, s.legs, s.platform.rate)
         if s.pose.found != 0 and p.safety.monitor.active != 0 and p.pose.section_5 == 0:
-            look_at_next(p.safety.monitor, s.safety.monitor, s.pose, s.legs.directions, s.legs.weights, rig.vectors_in_base[0])
-            exclude_imu(p.safety, s.safety, rig, time, s.imus, p.legs.weight, s.reference, s.pid)
-        t = _mark(m, REFINEMENT, t)
-    if first <= MECHANISM < last:
-        s.pose.found = step_mechanism_filter(p.mechanism, s.mechanism, rig, time, s.imus, s.legs, s.heading, s.pose)
-        t = _mark(m, MECHANISM, t)
+            imu_monitor.look_at_next(
+                p.safety.monitor, s.safety.monitor, s.pose, s.legs.directions, s.legs.weights, rig.vectors_in_base[0]
+            )
+            watch.exclude_imu(parameters, state)
+        t = _mark(m, CycleStage.REFINEMENT, t)
+    if first <= CycleStage.MECHANISM < last:
+        s.pose.found = trust.step_mechanism_filter(p.mechanism, s.mechanism, rig, time, s.imus, s.legs, s.heading, s.pose)
+        t = _mark(m, CycleStage.MECHANISM, t)
     cause = Cause.NONE.value
-    if first <= CONTROL < last:
+    if first <= CycleStage.CONTROL < last:
         cause = _control(parameters, state, segments) if s.pose.found != 0 else _lose_pose(parameters, state)
-        _mark(m, CONTROL, t)
+        _mark(m, CycleStage.CONTROL, t)
     return cause
 
 
@@ -233,28 +229,25 @@ def _control(parameters: Record, state: Record, segments: Array) -> int:
     )  # fmt: skip
     pose.lengths[rig.legs :] = 0.0
     if s.reference.due_cycle != time.cycle + 1:
-        update_reference(s.reference, rig, time, s.safety, segments)
+        reference.update_reference(s.reference, rig, time, s.safety, segments)
     for k in range(rig.legs):
         s.pid.error[k] = s.reference.motion[k, 0] - pose.lengths[k]
-    run_arming_checks(p.safety, s.safety, rig, time, p.imus, s.imus, pose, s.reference, s.pid)
+    arming.run_arming_checks(parameters, state)
     if s.safety.request != Request.ENABLED or s.safety.mode < Mode.RUNNING:
-        hold_still(s.pid, rig.legs)
+        pid.hold_still(s.pid, rig.legs)
     else:
-        find_feed_forward(p.load, s.load, rig, pose, s.reference)
-        step_pid(p.pid, s.pid, s.load.feed_forward, elapsed(rig, time))
+        load_feed_forward.find_feed_forward(p.load, s.load, rig, pose, s.reference)
+        pid.step_pid(p.pid, s.pid, s.load.feed_forward, elapsed(rig, time))
     time.cycle += 1
-    return check_limits(
-        p.safety, s.safety, rig, time, p.imus, s.imus, pose, s.mechanism.trusted, s.reference, p.pid.limit, s.pid
-    )
+    return watch.check_limits(parameters, state)
 
 
 @kernel
 def _lose_pose(parameters: Record, state: Record) -> int:
     """The rest of a cycle without a pose, which is a fault unless nothing has been armed; returns its cause."""
-    p, s = parameters[()], state[()]
-    if not postpones_arming(p.safety, s.safety, p.rig, s.time, Cause.POSE_LOST):
+    if not arming.postpones_arming(parameters, state, Cause.POSE_LOST):
         react(parameters, state, Cause.POSE_LOST, -1, np.nan, np.nan)
-    s.time.cycle += 1
+    state[()].time.cycle += 1
     return Cause.POSE_LOST.value
 
 
@@ -267,23 +260,9 @@ def skip_periods(state: Record, missed: int) -> None:
 
 
 @kernel
-def hear_rig(parameters: Record, state: Record, sample_age: Array, drive: Array, silent: int) -> None:
-    """Before a cycle: take the rig's report, as `controller.safety.watch.update_rig_status` has it."""
-    p, s = parameters[()], state[()]
-    update_rig_status(p.safety, s.safety, p.rig, s.time, s.imus, s.reference, s.pid, sample_age, drive, silent)
-
-
-@kernel
-def react(parameters: Record, state: Record, cause: int, index: int, value: float, limit: float) -> None:
-    """Between cycles: report a cause and react to it, as `controller.safety.stop.handle_cause` has it."""
-    p, s = parameters[()], state[()]
-    handle_cause(p.safety, s.safety, p.rig, s.time, s.reference, s.pid, cause, index, value, limit)
-
-
-@kernel
 def prepare_next(parameters: Record, state: Record, segments: Array) -> None:
     """After a cycle, when its events have been read: the next reference, which need not lie between measurement and command."""
-    p, s = parameters[()], state[()]
+    rig, s = parameters[()].rig, state[()]
     s.safety.events.count = 0
     if s.safety.mode != Mode.FAULT:
-        update_reference(s.reference, p.rig, s.time, s.safety, segments)
+        reference.update_reference(s.reference, rig, s.time, s.safety, segments)

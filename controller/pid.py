@@ -7,39 +7,35 @@ integral rests while the command is at its limit and the error would drive it fu
 import numpy as np
 
 from controller.settings import ControlSettings
-from plant.compiled import Record, kernel, record_dtype
+from plant.compiled import Record, filled, kernel, record_dtype
 from plant.mechanism import LEGS
 from plant.pose import Array
 
-PARAMETERS = record_dtype(gains=(np.float64, 4), limit=np.float64)
-"""Proportional, integral and derivative gain, and corner of the derivative's low-pass [1/s, 1/s^2, -, rad/s]; largest command
-[m/s]."""
+PARAMETERS = record_dtype(
+    gains=(np.float64, 4),  # Kp [1/s], Ki [1/s^2], Kd [-], and the corner of the derivative's low-pass [rad/s]
+    limit=np.float64,  # largest command [m/s]
+)
+"""The constants of the controllers."""
 
 STATE = record_dtype(
-    error=(np.float64, LEGS),
-    integral=(np.float64, LEGS),
+    error=(np.float64, LEGS),  # deviation of the length [m]
+    integral=(np.float64, LEGS),  # of the error [m s]
     previous_error=(np.float64, LEGS),
-    derivative=(np.float64, LEGS),
-    command=(np.float64, LEGS),
+    derivative=(np.float64, LEGS),  # of the error, low-passed [m/s]
+    command=(np.float64, LEGS),  # [m/s]
 )
-"""Length deviations [m], their integral [m s], those of the last cycle, their low-passed derivative, the commands [m/s]."""
+"""The state of each controller."""
 
 
 def pid_parameters(control: ControlSettings, velocity: float) -> Record:
     """The constants of the controllers (dtype `PARAMETERS`); `velocity` is the actuators' limit [m/s]."""
-    parameters: Record = np.zeros((), PARAMETERS)
-    parameters["gains"] = control.proportional, control.integral, control.derivative, control.derivative_bandwidth
-    parameters["limit"] = control.command_reserve * velocity
-    return parameters
+    gains = control.proportional, control.integral, control.derivative, control.derivative_bandwidth
+    return filled(PARAMETERS, gains=gains, limit=control.command_reserve * velocity)
 
 
 @kernel
 def step_pid(p: Record, s: Record, feed_forward: Array, period: float) -> None:
-    """Write the commands from the errors and the feed-forward (6,) [m/s], over one period [s].
-
-    Args:
-        p, s: dtypes `PARAMETERS` and `STATE`.
-    """
+    """Write the commands from the errors and the feed-forward (6,) [m/s], over one period [s]."""
     gains = p.gains
     smoothing = period * gains[3] / (1.0 + period * gains[3])
     for k in range(LEGS):

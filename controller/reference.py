@@ -9,11 +9,11 @@ from plant.mechanism import LEGS
 from plant.pose import Array
 
 STATE = record_dtype(
-    motion=(np.float64, (LEGS, 3)),
-    index=(np.int64, LEGS),
+    motion=(np.float64, (LEGS, 3)),  # length, rate and acceleration in the cycle before `due_cycle` [m, m/s, m/s^2]
+    index=(np.int64, LEGS),  # place in the segments
     due_cycle=np.int64,
 )
-"""Length, rate and acceleration of each leg in the cycle before `due_cycle`, and each leg's place in the segments."""
+"""The reference of each leg."""
 
 
 @kernel
@@ -24,14 +24,7 @@ def motion_cycle(rig: Record, time: Record, safety: Record) -> int:
 
 @kernel
 def update_reference(s: Record, rig: Record, time: Record, safety: Record, segments: Array) -> None:
-    """Evaluate the reference of this cycle.
-
-    Args:
-        s: dtype `STATE`.
-        rig, time: dtypes `RIG` and `TIME`.
-        safety: state of that stage, which has the segments of a stop.
-        segments: (6, n, 5), the motion as `controller.planning.segments` has it.
-    """
+    """Evaluate the reference of this cycle, from the `segments` (6, n, 5) of the motion or those of a stop."""
     stop = safety.stop
     if stop.cause != Cause.NONE and safety.request == Request.ENABLED:
         evaluate_reference(stop.segments, (time.cycle - stop.cycle) * rig.period, s.index, s.motion)

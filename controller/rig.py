@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from controller.direct_kinematics.geometry import GEOMETRY, geometry_of
 from controller.settings import FusionSettings
-from plant.compiled import Record, kernel, record_dtype
+from plant.compiled import Record, filled, kernel, record_dtype
 from plant.mechanism import LEGS, Mechanism, six_rows
 from plant.pose import Array, rotation_from_vector
 
@@ -26,52 +26,38 @@ SENSOR_GEOMETRY = record_dtype(
 """Where joints and IMUs are, and the vertical: what the readings depend on besides the motion."""
 
 RIG = record_dtype(
-    legs=np.int64,
-    planar=np.int64,
-    period=np.float64,
-    hold_cycles=np.int64,
-    geometry=GEOMETRY,
+    legs=np.int64,  # how many there are; of what is kept by leg, the first `legs` rows count
+    planar=np.int64,  # whether the platform moves in a plane
+    period=np.float64,  # of a cycle [s]
+    hold_cycles=np.int64,  # how long the brakes hold before the motion
+    geometry=GEOMETRY,  # for the closed forms
     sensors=SENSOR_GEOMETRY,
-    vectors_in_base=(np.float64, (2, 3)),
+    vectors_in_base=(np.float64, (2, 3)),  # the vertical and the magnetic field's horizontal direction, unit, in {1}
 )
-"""Constants that several stages read.
+"""Constants that several stages read."""
 
-Fields:
-    legs: how many legs there are. Of what is kept by leg, the first `legs` rows count.
-    planar: whether the platform moves in a plane.
-    period: of a cycle [s].
-    hold_cycles: how long the brakes hold before the motion.
-    geometry, sensors: of the closed forms and of the IMUs.
-    vectors_in_base: the vertical and the horizontal direction of the magnetic field, unit vectors in {1}.
-"""
-
-TIME = record_dtype(cycle=np.int64, missed=np.int64)
-"""The number of the present cycle, in periods, and how many periods were missed since the last cycle."""
+TIME = record_dtype(
+    cycle=np.int64,  # number of the present cycle, in periods
+    missed=np.int64,  # periods that were missed since the last cycle
+)
+"""The time, in periods."""
 
 
 def sensor_geometry(mechanism: Mechanism, tilt: ArrayLike = (0.0, 0.0)) -> Record:
-    """What the readings depend on, dtype `SENSOR_GEOMETRY`.
-
-    Args:
-        mechanism: with plant data.
-        tilt: (2,) [rad], by which the vertical is turned about the axes x and y of {1}.
-    """
+    """What the readings depend on (dtype `SENSOR_GEOMETRY`); `tilt` (2,) [rad] turns the vertical about x, y of {1}."""
     plant = mechanism.plant_parameters()
     up = tilt_rotation(tilt) @ mechanism.up_in_base
-    values = {
-        "base_joints": six_rows(mechanism.base_joints),
-        "platform_joints": six_rows(mechanism.platform_joints),
-        "joint_rotations": six_rows(mechanism.joint_rotations),
-        "up_in_joint": six_rows(np.swapaxes(mechanism.joint_rotations, 1, 2) @ up),
-        "up_in_base": up,
-        "leg_imu_position": six_rows(plant["leg_imu_position"]),
-        "platform_imu_position": plant["platform_imu_position"],
-        "gravity": float(np.linalg.norm(plant["gravity"])),
-    }
-    geometry: Record = np.zeros((), SENSOR_GEOMETRY)
-    for name, value in values.items():
-        geometry[name] = value
-    return geometry
+    return filled(
+        SENSOR_GEOMETRY,
+        base_joints=six_rows(mechanism.base_joints),
+        platform_joints=six_rows(mechanism.platform_joints),
+        joint_rotations=six_rows(mechanism.joint_rotations),
+        up_in_joint=six_rows(np.swapaxes(mechanism.joint_rotations, 1, 2) @ up),
+        up_in_base=up,
+        leg_imu_position=six_rows(plant["leg_imu_position"]),
+        platform_imu_position=plant["platform_imu_position"],
+        gravity=float(np.linalg.norm(plant["gravity"])),
+    )
 
 
 def tilt_rotation(tilt: ArrayLike) -> Array:
@@ -113,20 +99,22 @@ def field_of(mechanism: Mechanism, tilt: ArrayLike = (0.0, 0.0)) -> MagneticFiel
 
 
 def rig_parameters(mechanism: Mechanism, rate: float, hold: float, tilt: Array) -> Record:
-    """The constants of a rig (dtype `RIG`).
+    """The constants of a rig (dtype `RIG`) in cycles of this rate [Hz].
 
     Args:
-        mechanism: spatial or planar.
-        rate: cycles per second [Hz].
         hold: how long the brakes hold before the motion [s].
         tilt: (2,) [rad], of the base about the axes x and y of {1}, as a calibration has found it.
     """
-    rig: Record = np.zeros((), RIG)
-    rig["legs"], rig["planar"], rig["period"] = mechanism.legs, mechanism.planar, 1.0 / rate
-    rig["hold_cycles"] = int(np.ceil(hold * rate - 1e-9))
-    rig["geometry"], rig["sensors"] = geometry_of(mechanism), sensor_geometry(mechanism, tilt)
-    rig["vectors_in_base"] = field_of(mechanism, tilt).vectors
-    return rig
+    return filled(
+        RIG,
+        legs=mechanism.legs,
+        planar=mechanism.planar,
+        period=1.0 / rate,
+        hold_cycles=int(np.ceil(hold * rate - 1e-9)),
+        geometry=geometry_of(mechanism),
+        sensors=sensor_geometry(mechanism, tilt),
+        vectors_in_base=field_of(mechanism, tilt).vectors,
+    )
 
 
 @kernel

@@ -15,8 +15,15 @@ from scipy.optimize import least_squares
 from controller.calibration.file import Calibration
 from controller.estimation.whole_mechanism.imu_errors import ALIGNMENT, ERRORS, error_gradient, error_matrix
 from controller.estimation.whole_mechanism.parameters import ALL_ERRORS
-from controller.estimation.whole_mechanism.readings import MOTION_STATES, READINGS, READINGS_SCRATCH, predict_readings
-from controller.estimation.whole_mechanism.rig_jacobian import JOINTS, RIG_ERRORS, TILT
+from controller.estimation.whole_mechanism.readings import (
+    JOINTS,
+    MOTION_STATES,
+    READINGS,
+    READINGS_SCRATCH,
+    RIG_ERRORS,
+    TILT,
+    predict_readings,
+)
 from controller.inverse_kinematics import Legs, inverse_kinematics
 from controller.rig import sensor_geometry
 from plant.compiled import Record

@@ -19,8 +19,7 @@ from controller.estimation.whole_mechanism.filter import (
     step_filter,
 )
 from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, FILTER_STATE, filter_parameters
-from controller.estimation.whole_mechanism.readings import MOTION_STATES
-from controller.estimation.whole_mechanism.rig_jacobian import JOINTS, RIG_ERRORS
+from controller.estimation.whole_mechanism.readings import JOINTS, MOTION_STATES, RIG_ERRORS
 from controller.rig import sensor_geometry
 from controller.settings import FusionSettings
 from plant.compiled import Record, kernel

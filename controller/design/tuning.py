@@ -15,7 +15,7 @@ import casadi as ca
 import control
 import numpy as np
 
-from controller.cycle import CONTROL, MARKS, SCREENING, STATE, cycle_parameters, run_stages
+from controller.cycle import MARKS, STATE, CycleStage, cycle_parameters, run_stages
 from controller.inverse_kinematics import leg_lengths
 from controller.settings import ControlSettings, control_settings, fusion_settings
 from plant.checks import check_rate
@@ -241,7 +241,7 @@ def linear_estimator(mechanism: Mechanism, rate: float, signals: Array) -> Linea
 
     def step(state: Record, sample: Array) -> None:
         measurement[GYROSCOPE], measurement[ACCELEROMETER] = sample.reshape(2, 7, 3)
-        run_stages(parameters, state, measurement, no_reference, marks, SCREENING, CONTROL)
+        run_stages(parameters, state, measurement, no_reference, marks, CycleStage.SCREENING, CycleStage.CONTROL)
         state["time"]["cycle"] += 1
 
     def flat(state: Record) -> Array:

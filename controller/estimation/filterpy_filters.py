@@ -13,39 +13,24 @@ from controller.estimation.platform_filter import INNOVATION_LIMIT, begin_platfo
 from plant.compiled import Record
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.imu import ACCELEROMETER, GYROSCOPE
-from plant.mechanism import LEGS
 from plant.pose import Array, skew
 
 STATES = 9
 PLATFORM_STATES = 6
 
 
-class _Filterpy:
-    """State and covariance of a filter of filterpy.
-
-    Args:
-        states, readings: how many there are of each.
-    """
-
-    def __init__(self, states: int, readings: int) -> None:
-        self.filter = ExtendedKalmanFilter(dim_x=states, dim_z=readings)
-
-    def start(self, x: Array, covariance: Array) -> None:
-        """Take over state (n,) and covariance (n, n)."""
-        self.filter.x = x.reshape(-1, 1).copy()
-        self.filter.P = covariance.copy()
+class _Filterpy(ExtendedKalmanFilter):  # type: ignore[misc]
+    """A filter of filterpy with its state as a vector."""
 
     @property
     def state(self) -> Array:
         """The state (n,)."""
-        state: Array = self.filter.x[:, 0]
+        state: Array = self.x[:, 0]
         return state
 
-    @property
-    def covariance(self) -> Array:
-        """The covariance (n, n)."""
-        covariance: Array = self.filter.P
-        return covariance
+    def start(self, x: Array, covariance: Array) -> None:
+        """Take over state (n,) and covariance (n, n)."""
+        self.x, self.P = x.reshape(-1, 1).copy(), covariance.copy()
 
 
 class FilterpyLeg(_Filterpy):
@@ -56,46 +41,31 @@ class FilterpyLeg(_Filterpy):
         imu_position: (3,) [m], in the leg frame.
         gravity: [m/s^2].
         period: [s].
-        jerk, bias_walk: spectral densities of the angles' jerk and of the gyroscope's bias.
-        rate_variance, force_variance: of the gyroscope [(rad/s)^2] and the accelerometer [(m/s^2)^2].
+        jerk, bias_walk, rate_variance, force_variance: as in `leg_filter.PARAMETERS`.
     """
 
     def __init__(
-        self,
-        up_in_joint: Array,
-        imu_position: Array,
-        gravity: float,
-        period: float,
-        jerk: float,
-        bias_walk: float,
-        rate_variance: float,
-        force_variance: float,
-    ) -> None:
-        super().__init__(STATES, readings=6)
+        self, up_in_joint: Array, imu_position: Array, gravity: float, period: float, jerk: float, bias_walk: float,
+        rate_variance: float, force_variance: float,
+    ) -> None:  # fmt: skip
+        super().__init__(dim_x=STATES, dim_z=6)
         self.up_in_joint, self.imu_position, self.gravity = up_in_joint, imu_position, gravity
-        pair = np.array([[1.0, period, period**2 / 2], [0.0, 1.0, period], [0.0, 0.0, 1.0]])
-        self.filter.F = np.eye(STATES)
-        self.filter.F[:6, :6] = np.kron(pair, np.eye(2))
-        noise = jerk * np.array(
-            [
-                [period**5 / 20, period**4 / 8, period**3 / 6],
-                [period**4 / 8, period**3 / 3, period**2 / 2],
-                [period**3 / 6, period**2 / 2, period],
-            ]
-        )
-        self.filter.Q = np.diag([0.0] * 6 + [bias_walk * period] * 3)
-        self.filter.Q[:6, :6] += np.kron(noise, np.eye(2))
-        self.filter.R = np.diag([rate_variance] * 3 + [force_variance] * 3)
+        t = period
+        noise = np.array([[t**5 / 20, t**4 / 8, t**3 / 6], [t**4 / 8, t**3 / 3, t**2 / 2], [t**3 / 6, t**2 / 2, t]])
+        self.F, self.Q = np.eye(STATES), np.diag([0.0] * 6 + [bias_walk * t] * 3)
+        self.F[:6, :6] = np.kron([[1.0, t, t**2 / 2], [0.0, 1.0, t], [0.0, 0.0, 1.0]], np.eye(2))
+        self.Q[:6, :6] += np.kron(jerk * noise, np.eye(2))
+        self.R = np.diag([rate_variance] * 3 + [force_variance] * 3)
 
     def step(self, gyroscope: Array, accelerometer: Array) -> None:
         """Predict over one period and take a sample [rad/s, m/s^2]."""
-        self.filter.predict()
-        self.update(gyroscope, accelerometer)
+        self.predict()
+        self.take(gyroscope, accelerometer)
 
-    def update(self, gyroscope: Array, accelerometer: Array) -> None:
+    def take(self, gyroscope: Array, accelerometer: Array) -> None:
         """Take a sample [rad/s, m/s^2] without predicting."""
         sample = np.concatenate([gyroscope, accelerometer]).reshape(6, 1)
-        self.filter.update(sample, self.measurement_jacobian, self.measurement)
+        self.update(sample, self.measurement_jacobian, self.measurement)
 
     def measurement(self, x: Array) -> Array:
         """Expected rate and force (6, 1) at a state (9, 1)."""
@@ -144,37 +114,36 @@ class FilterpyPlatform(_Filterpy):
     Args:
         gravity: [m/s^2].
         period: [s].
-        rate_density, bias_walk: spectral densities of the gyroscope's noise and of its bias.
-        vertical_variance: of each component of the accelerometer's reading over g.
+        rate_density, bias_walk, vertical_variance: as in `platform_filter.PARAMETERS`.
     """
 
     def __init__(self, gravity: float, period: float, rate_density: float, bias_walk: float, vertical_variance: float) -> None:
-        super().__init__(PLATFORM_STATES, readings=1)
+        super().__init__(dim_x=PLATFORM_STATES, dim_z=1)
         self.gravity, self.period = gravity, period
-        self.filter.Q = period * np.diag([rate_density] * 3 + [bias_walk] * 3)
-        self.filter.R = np.array([[vertical_variance]])
+        self.Q = period * np.diag([rate_density] * 3 + [bias_walk] * 3)
+        self.R = np.array([[vertical_variance]])
 
     def step(self, gyroscope: Array, accelerometer: Array, acceleration: Array) -> None:
         """Predict over one period and take a sample [rad/s, m/s^2], without the IMU's own acceleration (3,) in {2}."""
-        self._predict(gyroscope)
+        self._turn(gyroscope)
         for axis, reading in zip(np.eye(3, PLATFORM_STATES), (accelerometer - acceleration) / self.gravity, strict=True):
             jacobian = axis[None]
-            self.filter.update(reading, lambda x, h: h, lambda x, h: h @ x, args=jacobian, hx_args=jacobian, residual=self._cut)
-        self.filter.x[:3] /= np.linalg.norm(self.filter.x[:3])
+            self.update(reading, lambda x, h: h, lambda x, h: h @ x, args=jacobian, hx_args=jacobian, residual=self._cut)
+        self.x[:3] /= np.linalg.norm(self.x[:3])
 
-    def _predict(self, gyroscope: Array) -> None:
+    def _turn(self, gyroscope: Array) -> None:
         """`u' = u x (rate - bias)`: the state to second order, its covariance to first."""
         t, u, bias = self.period, self.state[:3], self.state[3:]
         turn = -t * skew(gyroscope - bias)
         turned = (np.eye(3) + turn + turn @ turn / 2.0) @ u
-        self.filter.F = np.eye(PLATFORM_STATES)
-        self.filter.F[:3] += np.hstack([turn, -t * skew(u)])
-        self.filter.predict()
-        self.filter.x = np.concatenate([turned, bias]).reshape(-1, 1)
+        self.F = np.eye(PLATFORM_STATES)
+        self.F[:3] += np.hstack([turn, -t * skew(u)])
+        self.predict()
+        self.x = np.concatenate([turned, bias]).reshape(-1, 1)
 
     def _cut(self, reading: Array, expected: Array) -> Array:
         """The innovation, within `INNOVATION_LIMIT` standard deviations."""
-        bound = INNOVATION_LIMIT * np.sqrt(self.filter.S)
+        bound = INNOVATION_LIMIT * np.sqrt(self.S)
         return np.clip(reading - expected, -bound, bound)
 
 
@@ -186,29 +155,13 @@ class FilterpyFilters:
     """
 
     def __init__(self, parameters: Record) -> None:
-        self._parameters = parameters[()]
-        rig, legs, platform = (parameters[name] for name in ("rig", "legs", "platform"))
-        sensors, period = rig["sensors"], float(rig["period"])
-        self._legs = [
-            FilterpyLeg(
-                up_in_joint=sensors["up_in_joint"][k],
-                imu_position=sensors["leg_imu_position"][k],
-                gravity=float(sensors["gravity"]),
-                period=period,
-                jerk=float(legs["jerk"]),
-                bias_walk=float(legs["bias_walk"]),
-                rate_variance=float(legs["rate_variance"]),
-                force_variance=float(legs["force_variance"]),
-            )
-            for k in range(LEGS)
-        ]
-        self._platform = FilterpyPlatform(
-            gravity=float(sensors["gravity"]),
-            period=period,
-            rate_density=float(platform["rate_density"]),
-            bias_walk=float(platform["bias_walk"]),
-            vertical_variance=float(platform["vertical_variance"]),
-        )
+        self._parameters = p = parameters[()]
+        sensors, constants = p["rig"]["sensors"], (float(p["rig"]["sensors"]["gravity"]), float(p["rig"]["period"]))
+        noise = [float(p["legs"][name]) for name in ("jerk", "bias_walk", "rate_variance", "force_variance")]
+        places = zip(sensors["up_in_joint"], sensors["leg_imu_position"], strict=True)
+        self._legs = [FilterpyLeg(up, position, *constants, *noise) for up, position in places]
+        noise = [float(p["platform"][name]) for name in ("rate_density", "bias_walk", "vertical_variance")]
+        self._platform = FilterpyPlatform(*constants, *noise)
 
     def step_legs(self, state: Record) -> None:
         """Step the leg filters, as `leg_filter.step_leg_filters` does; `state` has dtype `controller.cycle.STATE`."""
@@ -222,10 +175,10 @@ class FilterpyFilters:
                 x, covariance = legs["x"][k], legs["covariance"][k]
                 start_leg(x, covariance, rate, force, leg.up_in_joint, float(p["legs"]["bias_sigma"]))
                 leg.start(x, covariance)
-                leg.update(rate, force)
+                leg.take(rate, force)
             else:
                 leg.step(rate, force)
-            legs["x"][k], legs["covariance"][k] = leg.state, leg.covariance
+            legs["x"][k], legs["covariance"][k] = leg.state, leg.P
         update_leg_directions(p["legs"], legs, p["rig"], s["time"], imus)
 
     def step_platform(self, state: Record) -> None:
@@ -236,5 +189,5 @@ class FilterpyFilters:
             self._platform.start(platform["x"], platform["covariance"])
             rate, force = imus["sample"][GYROSCOPE, PLATFORM_IMU], imus["sample"][ACCELEROMETER, PLATFORM_IMU]
             self._platform.step(rate, force, platform["imu_acceleration"])
-            platform["x"], platform["covariance"] = self._platform.state, self._platform.covariance
+            platform["x"], platform["covariance"] = self._platform.state, self._platform.P
             end_platform_step(p["platform"], platform, imus)

@@ -8,13 +8,14 @@ compensation. Errors (2) are the angle about u by which the true n is turned fro
 import numpy as np
 
 from controller.estimation.leg_filter import SETTLING_S
-from controller.estimation.platform_filter import INNOVATION_LIMIT, extrapolate_direction
+from controller.estimation.platform_filter import cut_innovation, extrapolate_direction, turn_direction
 from controller.rig import MagneticField, elapsed
 from controller.settings import FusionSettings
 from plant.compiled import Record, filled, kernel, record_dtype
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.imu import MAGNETOMETER
 from plant.pose import Array
+from plant.vectors import cross, dot, scale, subtract, vector
 
 STATES = 4
 ERRORS = 2
@@ -26,63 +27,48 @@ _FROZEN_FIELDS = 10
 """How many samples in a row of a magnetometer may be the same while the rest of its IMU moves."""
 
 PARAMETERS = record_dtype(
-    active=np.int64,
-    strength=np.float64,
-    sample_cycles=np.int64,
-    variance=np.float64,
-    floor=np.float64,
-    rate_density=np.float64,
+    active=np.int64,  # whether the magnetometer is used
+    strength=np.float64,  # of the earth's field [uT]
+    sample_cycles=np.int64,  # for how many cycles a sample stands
+    variance=np.float64,  # of the heading of one sample [rad^2]
+    floor=np.float64,  # least variance of any average [rad^2]
+    rate_density=np.float64,  # this and the rest as for the platform's filter
     bias_walk=np.float64,
     bias_sigma=np.float64,
     delay=np.float64,
     settling_cycles=np.int64,
 )
-"""Constants of the filter.
-
-Fields:
-    active: whether the magnetometer is used.
-    strength: of the earth's field [uT].
-    sample_cycles: for how many cycles a sample stands.
-    variance: of the heading of one sample; floor is the least of any average [rad^2].
-    rate_density, bias_walk, bias_sigma, delay, settling_cycles: as for the platform's filter.
-"""
+"""Constants of the filter."""
 
 STATE = record_dtype(
     x=(np.float64, STATES),
     covariance=(np.float64, (ERRORS, ERRORS)),
-    age=np.int64,
-    used=np.int64,
-    weight=np.float64,
-    north=(np.float64, 3),
-    field=(np.float64, 3),
-    frozen_for=np.int64,
-    fresh=np.int64,
+    age=np.int64,  # for how many cycles the filter has run
+    used=np.int64,  # whether the heading is used
+    weight=np.float64,  # of the heading in the refinement
+    north=(np.float64, 3),  # horizontal direction of the field in {2}, without the sensors' delay
+    field=(np.float64, 3),  # last sample [uT]
+    frozen_for=np.int64,  # how many cycles the sample has stood
+    fresh=np.int64,  # whether the sample is to be taken
 )
-"""State of the filter.
-
-Fields:
-    x, covariance, age: of the filter, which has run for `age` cycles.
-    used, weight: whether the heading is used, and its weight in the refinement.
-    north: the horizontal direction of the field in {2}, without the sensors' delay.
-    field: the last sample [uT]; `frozen_for` how many cycles it has stood, `fresh` whether it is to be taken.
-"""
+"""State of the filter."""
 
 
 def heading_parameters(fusion: FusionSettings, rate: float, field: MagneticField, active: bool) -> Record:
     """The constants of the filter (dtype `PARAMETERS`) in cycles of this rate [Hz]."""
-    values = {
-        "active": active,
-        "strength": field.strength,
-        "sample_cycles": max(1, round(rate / fusion.magnetometer_rate)),
-        "variance": field.heading_variance(fusion, rate),
-        "floor": fusion.heading_sigma**2,
-        "rate_density": fusion.gyroscope_noise**2,
-        "bias_walk": fusion.bias_walk**2,
-        "bias_sigma": fusion.bias_sigma,
-        "delay": fusion.sensor_delay,
-        "settling_cycles": round(SETTLING_S * rate),
-    }
-    return filled(PARAMETERS, values)
+    return filled(
+        PARAMETERS,
+        active=active,
+        strength=field.strength,
+        sample_cycles=max(1, round(rate / fusion.magnetometer_rate)),
+        variance=field.heading_variance(fusion, rate),
+        floor=fusion.heading_sigma**2,
+        rate_density=fusion.gyroscope_noise**2,
+        bias_walk=fusion.bias_walk**2,
+        bias_sigma=fusion.bias_sigma,
+        delay=fusion.sensor_delay,
+        settling_cycles=round(SETTLING_S * rate),
+    )
 
 
 @kernel
@@ -91,11 +77,6 @@ def step_heading_filter(p: Record, s: Record, rig: Record, time: Record, imus: R
 
     The field must be about as strong as the earth's, and must not stand still while the rest of its IMU moves. A sample that
     stands until the next one is taken once.
-
-    Args:
-        p, s: dtypes `PARAMETERS` and `STATE`.
-        rig, time: dtypes `RIG` and `TIME`.
-        imus, platform: states of these stages.
     """
     if p.active == 0:
         return
@@ -106,7 +87,7 @@ def step_heading_filter(p: Record, s: Record, rig: Record, time: Record, imus: R
         s.frozen_for += 1
     s.field[:] = field
     # NaN is not below the limit either.
-    strength = np.sqrt(field[0] * field[0] + field[1] * field[1] + field[2] * field[2])
+    strength = np.sqrt(dot(vector(field), vector(field)))
     healthy = (
         imus.used[PLATFORM_IMU] != 0
         and abs(strength - p.strength) < _FIELD_SHARE * p.strength
@@ -152,14 +133,8 @@ def predict_heading(
         rate: (3,) [rad/s], less the bias that the platform filter knows.
         rate_density, bias_walk: spectral densities of the gyroscope's noise and of its bias.
     """
-    t, b = period, x[3]
-    w0, w1, w2 = rate[0] - b * vertical[0], rate[1] - b * vertical[1], rate[2] - b * vertical[2]
-    n0, n1, n2 = x[0], x[1], x[2]
-    c0, c1, c2 = n1 * w2 - n2 * w1, n2 * w0 - n0 * w2, n0 * w1 - n1 * w0
-    half = 0.5 * t * t
-    x[0] += t * c0 + half * (c1 * w2 - c2 * w1)
-    x[1] += t * c1 + half * (c2 * w0 - c0 * w2)
-    x[2] += t * c2 + half * (c0 * w1 - c1 * w0)
+    t = period
+    turn_direction(x, subtract(vector(rate), scale(x[3], vector(vertical))), t)
     _level(x, vertical)
     # Too large a bias turns n too far against the rate: the angle's error grows by that of the bias.
     mixed = covariance[0, 1] + t * covariance[1, 1]
@@ -171,16 +146,14 @@ def predict_heading(
 @kernel
 def update_heading(x: Array, covariance: Array, field: Array, vertical: Array, variance: float) -> None:
     """Take a sample of the field (3,) [uT], whose horizontal part has an angle of this variance [rad^2]."""
-    n0, n1, n2, u0, u1, u2 = x[0], x[1], x[2], vertical[0], vertical[1], vertical[2]
-    e0, e1, e2 = u1 * n2 - u2 * n1, u2 * n0 - u0 * n2, u0 * n1 - u1 * n0
-    along = n0 * field[0] + n1 * field[1] + n2 * field[2]
-    aside = e0 * field[0] + e1 * field[1] + e2 * field[2]
+    north = vector(x)
+    east = cross(vector(vertical), north)
     total = covariance[0, 0] + variance
-    bound = INNOVATION_LIMIT * np.sqrt(total)
-    innovation = min(max(np.arctan2(aside, along), -bound), bound)
+    innovation = cut_innovation(np.arctan2(dot(east, vector(field)), dot(north, vector(field))), total)
     k0, k1 = covariance[0, 0] / total, covariance[0, 1] / total
     sine, cosine = np.sin(k0 * innovation), np.cos(k0 * innovation)
-    x[0], x[1], x[2] = cosine * n0 + sine * e0, cosine * n1 + sine * e1, cosine * n2 + sine * e2
+    for i in range(3):
+        x[i] = cosine * north[i] + sine * east[i]
     x[3] += k1 * innovation
     covariance[1, 1] -= k1 * covariance[0, 1]
     covariance[0, 0] *= 1.0 - k0
@@ -191,11 +164,8 @@ def update_heading(x: Array, covariance: Array, field: Array, vertical: Array, v
 @kernel
 def _level(x: Array, vertical: Array) -> None:
     """Make n a unit vector across the vertical."""
-    along = x[0] * vertical[0] + x[1] * vertical[1] + x[2] * vertical[2]
-    size = 0.0
+    north, up = vector(x), vector(vertical)
+    level = subtract(north, scale(dot(north, up), up))
+    size = np.sqrt(dot(level, level))
     for i in range(3):
-        x[i] -= along * vertical[i]
-        size += x[i] * x[i]
-    size = np.sqrt(size)
-    for i in range(3):
-        x[i] /= size
+        x[i] = level[i] / size

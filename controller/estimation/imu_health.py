@@ -30,50 +30,32 @@ _NOISIER = 3.0
 """How much noisier than the others an IMU must be: what shakes all of them is no fault of one."""
 
 PARAMETERS = record_dtype(
-    present=(np.int64, IMU_COUNT),
-    gain=(np.float64, (3, IMU_COUNT, 3, 3)),
+    present=(np.int64, IMU_COUNT),  # which IMUs there are
+    gain=(np.float64, (3, IMU_COUNT, 3, 3)),  # a calibrated reading is gain times the raw one plus offset
     offset=(np.float64, (3, IMU_COUNT, 3)),
-    range=(np.float64, 2),
-    noise=(np.float64, 2),
-    noise_smoothing=np.float64,
-    frozen_cycles=np.int64,
+    range=(np.float64, 2),  # of gyroscope and accelerometer; a reading this large is invalid [rad/s, m/s^2]
+    noise=(np.float64, 2),  # limits of gyroscope and accelerometer, RMS [rad/s, m/s^2]
+    noise_smoothing=np.float64,  # share of a new sample in the average
+    frozen_cycles=np.int64,  # these three: the durations above
     healthy_cycles=np.int64,
     stale_cycles=np.int64,
 )
-"""Constants of the IMUs.
-
-Fields:
-    present: which IMUs there are.
-    gain, offset: a calibrated reading is gain times the raw one plus offset.
-    range: of gyroscope and accelerometer; a reading this large is invalid [rad/s, m/s^2].
-    noise: limits of gyroscope and accelerometer, RMS; noise_smoothing is the share of a new sample in the average.
-    frozen_cycles, healthy_cycles, stale_cycles: the durations above.
-"""
+"""Constants of the IMUs."""
 
 STATE = record_dtype(
-    raw=(np.float64, (3, IMU_COUNT, 3)),
-    sample=(np.float64, (3, IMU_COUNT, 3)),
-    sample_age=(np.int64, IMU_COUNT),
-    unchanged=(np.int64, IMU_COUNT),
-    frozen_for=(np.int64, IMU_COUNT),
-    healthy_for=(np.int64, IMU_COUNT),
-    used=(np.int64, IMU_COUNT),
-    excluded=(np.int64, IMU_COUNT),
-    earlier=(np.float64, (2, 2, IMU_COUNT, 3)),
-    variance=(np.float64, (2, IMU_COUNT)),
-    noise=(np.float64, IMU_COUNT),
+    raw=(np.float64, (3, IMU_COUNT, 3)),  # last reading [rad/s, m/s^2, uT]
+    sample=(np.float64, (3, IMU_COUNT, 3)),  # last reading, calibrated
+    sample_age=(np.int64, IMU_COUNT),  # how many cycles old the sample is, as the rig reports it
+    unchanged=(np.int64, IMU_COUNT),  # whether the IMU repeats its reading
+    frozen_for=(np.int64, IMU_COUNT),  # for how many cycles it has done so while others did not
+    healthy_for=(np.int64, IMU_COUNT),  # for how many cycles the IMU has been healthy
+    used=(np.int64, IMU_COUNT),  # whether the filters use it
+    excluded=(np.int64, IMU_COUNT),  # whether it contradicted the others, which excludes it for good
+    earlier=(np.float64, (2, 2, IMU_COUNT, 3)),  # the last two raw samples
+    variance=(np.float64, (2, IMU_COUNT)),  # of each sensor's noise, averaged
+    noise=(np.float64, IMU_COUNT),  # of each IMU over its limit
 )
-"""State of the IMUs.
-
-Fields:
-    raw, sample: the last raw reading, and the calibrated one.
-    sample_age: how many cycles old the sample is, as the rig reports it.
-    unchanged: whether the IMU repeats its reading; `frozen_for` how many cycles it has done so while others did not.
-    healthy_for: for how many cycles the IMU has been healthy.
-    used: whether the filters use it.
-    excluded: whether it contradicted the others, which excludes it for good.
-    earlier: the last two raw samples; `variance` of each sensor's noise, averaged; `noise` of each IMU over its limit.
-"""
+"""State of the IMUs."""
 
 
 def imu_parameters(
@@ -81,18 +63,18 @@ def imu_parameters(
 ) -> Record:
     """The constants of the IMUs (dtype `PARAMETERS`) that are `present`, in cycles of this rate [Hz]."""
     shaken = _SHAKEN_HZ / rate
-    values = {
-        "present": [imu in present for imu in range(IMU_COUNT)],
-        "gain": calibration.gain,
-        "offset": calibration.offset,
-        "range": (fusion.gyroscope_range, fusion.accelerometer_range),
-        "noise": np.array([safety.gyroscope_noise, safety.accelerometer_noise]) * max(1.0, shaken**2),
-        "noise_smoothing": min(0.05, 1.0 / (rate * _NOISE_S)),
-        "frozen_cycles": max(3, round(_FROZEN_S * rate)),
-        "healthy_cycles": round(_HEALTHY_S * rate),
-        "stale_cycles": max(3, round(_STALE_S * rate)),
-    }
-    return filled(PARAMETERS, values)
+    return filled(
+        PARAMETERS,
+        present=[imu in present for imu in range(IMU_COUNT)],
+        gain=calibration.gain,
+        offset=calibration.offset,
+        range=(fusion.gyroscope_range, fusion.accelerometer_range),
+        noise=np.array([safety.gyroscope_noise, safety.accelerometer_noise]) * max(1.0, shaken**2),
+        noise_smoothing=min(0.05, 1.0 / (rate * _NOISE_S)),
+        frozen_cycles=max(3, round(_FROZEN_S * rate)),
+        healthy_cycles=round(_HEALTHY_S * rate),
+        stale_cycles=max(3, round(_STALE_S * rate)),
+    )
 
 
 @kernel
@@ -103,9 +85,7 @@ def screen_imus(p: Record, s: Record, legs: int, time: Record, silent: int, meas
     used again when it has been healthy for a while. An IMU that contradicted the others stays out.
 
     Args:
-        p, s: dtypes `PARAMETERS` and `STATE`.
         legs: how many legs there are.
-        time: dtype `TIME`.
         silent: for how many cycles the rig has not answered.
         measurement: raw [rad/s, m/s^2, uT].
         events: dtype `EVENTS`.

@@ -19,6 +19,7 @@ from plant.compiled import Record, filled, kernel, record_dtype
 from plant.imu import ACCELEROMETER, GYROSCOPE
 from plant.mechanism import LEGS
 from plant.pose import Array
+from plant.vectors import dot, rotate, vector
 
 STATES = 9
 ANGLE_SIGMA, RATE_SIGMA, ACCELERATION_SIGMA = 0.15, 0.05, 40.0
@@ -31,98 +32,70 @@ _GAP_S = 0.05
 """Longest time for which a leg's angular acceleration is taken to last [s]."""
 
 PARAMETERS = record_dtype(
-    jerk=np.float64,
-    bias_walk=np.float64,
-    bias_sigma=np.float64,
-    rate_variance=np.float64,
-    force_variance=np.float64,
-    weight=np.float64,
-    delay=np.float64,
-    settling_cycles=np.int64,
+    jerk=np.float64,  # spectral density of the legs' angular jerk
+    bias_walk=np.float64,  # spectral density of the gyroscopes' biases
+    bias_sigma=np.float64,  # uncertainty of a gyroscope's bias at the start [rad/s]
+    rate_variance=np.float64,  # of one sample [(rad/s)^2]
+    force_variance=np.float64,  # of one sample [(m/s^2)^2]
+    weight=np.float64,  # of a direction in the refinement, 1 / variance [1/rad^2]
+    delay=np.float64,  # of the sensors [s]
+    settling_cycles=np.int64,  # how long a filter is not relied upon
 )
-"""Constants of the leg filters.
-
-Fields:
-    jerk, bias_walk: spectral densities of the legs' angular jerk and of the gyroscopes' biases.
-    bias_sigma: uncertainty of a gyroscope's bias at the start [rad/s].
-    rate_variance, force_variance: of one sample of gyroscope and accelerometer.
-    weight: of a direction in the refinement, 1 / variance [1/rad^2].
-    delay: of the sensors [s].
-    settling_cycles: how long a filter is not relied upon.
-"""
+"""Constants of the leg filters."""
 
 STATE = record_dtype(
     x=(np.float64, (LEGS, STATES)),
     covariance=(np.float64, (LEGS, STATES, STATES)),
-    age=(np.int64, LEGS),
-    used=(np.float64, LEGS),
-    weights=(np.float64, LEGS),
-    directions=(np.float64, (LEGS, 3)),
-    rates=(np.float64, (LEGS, 3)),
-    expected=(np.float64, 6),
+    age=(np.int64, LEGS),  # for how many cycles each filter has run
+    used=(np.float64, LEGS),  # whether a direction is used
+    weights=(np.float64, LEGS),  # in the refinement
+    directions=(np.float64, (LEGS, 3)),  # of the legs in {1}, unit
+    rates=(np.float64, (LEGS, 3)),  # derivatives of the directions [1/s]
+    expected=(np.float64, 6),  # from here on scratch, so that the cycle allocates nothing
     jacobian=(np.float64, (6, STATES)),
     gain=(np.float64, STATES),
     change=(np.float64, STATES),
 )
-"""State of the leg filters.
-
-Fields:
-    x, covariance: of each leg's filter.
-    age: for how many cycles each filter has run.
-    used, weights: whether a direction is used, and its weight in the refinement.
-    directions, rates: the legs' unit directions in {1} and their derivatives [1/s].
-    expected, jacobian, gain, change: scratch, so that the cycle allocates nothing.
-"""
+"""State of the leg filters."""
 
 
 def leg_parameters(fusion: FusionSettings, rate: float) -> Record:
     """The constants of the leg filters (dtype `PARAMETERS`) in cycles of this rate [Hz]."""
-    values = {
-        "jerk": fusion.leg_jerk**2,
-        "bias_walk": fusion.bias_walk**2,
-        "bias_sigma": fusion.bias_sigma,
-        "rate_variance": fusion.gyroscope_noise**2 * rate / 2.0,
-        "force_variance": fusion.leg_accelerometer_noise**2 * rate / 2.0,
-        "weight": 1.0 / fusion.leg_sigma**2,
-        "delay": fusion.sensor_delay,
-        "settling_cycles": round(SETTLING_S * rate),
-    }
-    return filled(PARAMETERS, values)
+    return filled(
+        PARAMETERS,
+        jerk=fusion.leg_jerk**2,
+        bias_walk=fusion.bias_walk**2,
+        bias_sigma=fusion.bias_sigma,
+        rate_variance=fusion.gyroscope_noise**2 * rate / 2.0,
+        force_variance=fusion.leg_accelerometer_noise**2 * rate / 2.0,
+        weight=1.0 / fusion.leg_sigma**2,
+        delay=fusion.sensor_delay,
+        settling_cycles=round(SETTLING_S * rate),
+    )
 
 
 @kernel
 def step_leg_filters(p: Record, s: Record, rig: Record, time: Record, imus: Record) -> None:
-    """Step the filters of the legs whose IMUs are used.
-
-    Args:
-        p, s: dtypes `PARAMETERS` and `STATE`.
-        rig, time: dtypes `RIG` and `TIME`.
-        imus: state of the IMUs, which has the calibrated samples.
-    """
-    for k in range(LEGS):
-        if imus.used[k] != 0:
-            _step_leg_filter(p, s, rig, time, imus, k)
-    update_leg_directions(p, s, rig, time, imus)
-
-
-@kernel
-def _step_leg_filter(p: Record, s: Record, rig: Record, time: Record, imus: Record, k: int) -> None:
-    """Start or step the filter of leg `k`."""
-    x, covariance, up = s.x[k], s.covariance[k], rig.sensors.up_in_joint[k]
-    rate, force = imus.sample[GYROSCOPE, k], imus.sample[ACCELEROMETER, k]
+    """Step the filters of the legs whose IMUs are used."""
     period = elapsed(rig, time)
-    if s.age[k] == 0:
-        start_leg(x, covariance, rate, force, up, p.bias_sigma)
-    else:
-        if period > _GAP_S:
-            x[4:6] = 0.0
-        predict_leg(x, covariance, period, p.jerk, p.bias_walk)
-    if rig.planar != 0:
-        lock_second_axis(x, covariance)
-    update_leg(
-        x, covariance, rate, force, up, rig.sensors.leg_imu_position[k], rig.sensors.gravity, p.rate_variance, p.force_variance,
-        s.expected, s.jacobian, s.gain, s.change,
-    )  # fmt: skip
+    for k in range(LEGS):
+        if imus.used[k] == 0:
+            continue
+        x, covariance, up = s.x[k], s.covariance[k], rig.sensors.up_in_joint[k]
+        rate, force = imus.sample[GYROSCOPE, k], imus.sample[ACCELEROMETER, k]
+        if s.age[k] == 0:
+            start_leg(x, covariance, rate, force, up, p.bias_sigma)
+        else:
+            if period > _GAP_S:
+                x[4:6] = 0.0
+            predict_leg(x, covariance, period, p.jerk, p.bias_walk)
+        if rig.planar != 0:
+            lock_second_axis(x, covariance)
+        update_leg(
+            x, covariance, rate, force, up, rig.sensors.leg_imu_position[k], rig.sensors.gravity, p.rate_variance,
+            p.force_variance, s.expected, s.jacobian, s.gain, s.change,
+        )  # fmt: skip
+    update_leg_directions(p, s, rig, time, imus)
 
 
 @kernel
@@ -147,9 +120,10 @@ def start_leg(
 
     Of the two pairs of angles that agree with a vertical, the one nearer to the joint's rest is taken.
     """
-    p, q, r = up_in_joint[0], up_in_joint[1], up_in_joint[2]
-    norm = np.sqrt(accelerometer[0] ** 2 + accelerometer[1] ** 2 + accelerometer[2] ** 2)
-    u0, u1, u2 = accelerometer[0] / norm, accelerometer[1] / norm, accelerometer[2] / norm
+    p, q, r = vector(up_in_joint)
+    force = vector(accelerometer)
+    norm = np.sqrt(dot(force, force))
+    u0, u1, u2 = force[0] / norm, force[1] / norm, force[2] / norm
     middle = np.arctan2(r, q)
     spread = np.arccos(min(1.0, max(-1.0, u1 / np.sqrt(q * q + r * r))))
     best = np.inf
@@ -163,11 +137,8 @@ def start_leg(
             x[0], x[1] = a, b
     x[2] = gyroscope[0] * np.cos(x[1]) + gyroscope[2] * np.sin(x[1])
     x[3] = gyroscope[1]
-    for i in range(4, STATES):
-        x[i] = 0.0
-    for i in range(STATES):
-        for j in range(STATES):
-            covariance[i, j] = 0.0
+    x[4:] = 0.0
+    covariance[:] = 0.0
     for i in range(2):
         covariance[i, i] = ANGLE_SIGMA**2
         covariance[2 + i, 2 + i] = RATE_SIGMA**2
@@ -191,21 +162,22 @@ def predict_leg(x: Array, covariance: Array, period: float, jerk: float, bias_wa
         for j in range(2):
             covariance[i, j] += t * covariance[i, 2 + j] + half * covariance[i, 4 + j]
             covariance[i, 2 + j] += t * covariance[i, 4 + j]
-    t3 = t * t * t
-    q00, q01, q02 = jerk * t3 * t * t / 20.0, jerk * t3 * t / 8.0, jerk * t3 / 6.0
-    q11, q12, q22 = jerk * t3 / 3.0, jerk * t * t / 2.0, jerk * t
     for i in range(2):
-        covariance[i, i] += q00
-        covariance[2 + i, 2 + i] += q11
-        covariance[4 + i, 4 + i] += q22
-        covariance[i, 2 + i] += q01
-        covariance[2 + i, i] += q01
-        covariance[i, 4 + i] += q02
-        covariance[4 + i, i] += q02
-        covariance[2 + i, 4 + i] += q12
-        covariance[4 + i, 2 + i] += q12
+        add_jerk(covariance, i, 2 + i, 4 + i, jerk, t)
     for i in range(6, STATES):
         covariance[i, i] += bias_walk * t
+
+
+@kernel
+def add_jerk(covariance: Array, x: int, v: int, a: int, jerk: float, t: float) -> None:
+    """Add to the covariance of the states x, v = x', a = x'' what white jerk of this spectral density does in a time t."""
+    t3 = t * t * t
+    covariance[x, x] += jerk * t3 * t * t / 20.0
+    covariance[v, v] += jerk * t3 / 3.0
+    covariance[a, a] += jerk * t
+    for i, j, value in ((x, v, jerk * t3 * t / 8.0), (x, a, jerk * t3 / 6.0), (v, a, jerk * t * t / 2.0)):
+        covariance[i, j] += value
+        covariance[j, i] += value
 
 
 @kernel
@@ -225,7 +197,7 @@ def predict_measurement(x: Array, up_in_joint: Array, d: Array, gravity: float, 
     """Write the expected measurement `h` (6,), rate then force, and its Jacobian (6, 9), whose other elements stay 0."""
     ca, sa, cb, sb = np.cos(x[0]), np.sin(x[0]), np.cos(x[1]), np.sin(x[1])
     da, db, dda, ddb = x[2], x[3], x[4], x[5]
-    d0, d1, d2 = d[0], d[1], d[2]
+    d0, d1, d2 = vector(d)
     w0, w1, w2 = da * cb, db, da * sb
     a0, a1, a2 = dda * cb - da * db * sb, ddb, dda * sb + da * db * cb
     # The vertical after the first turn; its derivative with respect to a is (0, r, -q).
@@ -270,20 +242,17 @@ def update_leg(
 ) -> None:  # fmt: skip
     """Take one sample into state and covariance; the last four arguments are scratch (6,), (6, 9), (9,), (9,)."""
     predict_measurement(x, up_in_joint, d, gravity, h, jacobian)
-    for i in range(STATES):
-        change[i] = 0.0
+    change[:] = 0.0
     for m in range(6):
         rate = m < 3
         innovation = (gyroscope[m] if rate else accelerometer[m - 3]) - h[m]
         variance = rate_variance if rate else force_variance
         for i in range(STATES):
             if rate:
-                gain[i] = (
-                    jacobian[m, 1] * covariance[1, i]
-                    + jacobian[m, 2] * covariance[2, i]
-                    + jacobian[m, 3] * covariance[3, i]
-                    + covariance[6 + m, i]
-                )
+                total = jacobian[m, 1] * covariance[1, i]
+                for j in range(2, 4):
+                    total += jacobian[m, j] * covariance[j, i]
+                gain[i] = total + covariance[6 + m, i]
             else:
                 total = jacobian[m, 0] * covariance[0, i]
                 for j in range(1, 6):
@@ -310,8 +279,7 @@ def leg_direction(x: Array, joint_rotation: Array, delay: float, direction: Arra
     da, db = x[2] + delay * x[4], x[3] + delay * x[5]
     a, b = x[0] + 0.5 * delay * (x[2] + da), x[1] + 0.5 * delay * (x[3] + db)
     ca, sa, cb, sb = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
-    v0, v1, v2 = sb, -sa * cb, ca * cb
-    r0, r1, r2 = cb * db, -ca * cb * da + sa * sb * db, -sa * cb * da - ca * sb * db
+    turned = rotate(joint_rotation, (sb, -sa * cb, ca * cb))
+    turning = rotate(joint_rotation, (cb * db, -ca * cb * da + sa * sb * db, -sa * cb * da - ca * sb * db))
     for i in range(3):
-        direction[i] = joint_rotation[i, 0] * v0 + joint_rotation[i, 1] * v1 + joint_rotation[i, 2] * v2
-        rate[i] = joint_rotation[i, 0] * r0 + joint_rotation[i, 1] * r1 + joint_rotation[i, 2] * r2
+        direction[i], rate[i] = turned[i], turning[i]

@@ -13,6 +13,7 @@ from plant.compiled import Record, filled, kernel, record_dtype
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.imu import ACCELEROMETER, GYROSCOPE, STANDARD_GRAVITY
 from plant.pose import Array
+from plant.vectors import Vector, cross, dot, rotate_back, subtract, vector
 
 STATES = 6
 TILT_SIGMA = 0.15
@@ -22,76 +23,52 @@ INNOVATION_LIMIT = 3.0
 """Innovations are cut to this many standard deviations: a jolt between two samples, as when the brakes open, is in the
 accelerometer's reading but not in the acceleration known from the legs."""
 
-
 PARAMETERS = record_dtype(
-    rate_density=np.float64,
-    bias_walk=np.float64,
-    bias_sigma=np.float64,
-    vertical_variance=np.float64,
-    weight=np.float64,
-    delay=np.float64,
-    settling_cycles=np.int64,
+    rate_density=np.float64,  # spectral density of the gyroscope's noise
+    bias_walk=np.float64,  # spectral density of the gyroscope's bias
+    bias_sigma=np.float64,  # uncertainty of the gyroscope's bias at the start [rad/s]
+    vertical_variance=np.float64,  # of each component of the accelerometer's reading over g
+    weight=np.float64,  # of the vertical in the refinement, 1 / variance [1/rad^2]
+    delay=np.float64,  # of the sensors [s]
+    settling_cycles=np.int64,  # how long the filter is not relied upon
 )
-"""Constants of the filter.
-
-Fields:
-    rate_density, bias_walk: spectral densities of the gyroscope's noise and of its bias.
-    bias_sigma: uncertainty of the gyroscope's bias at the start [rad/s].
-    vertical_variance: of each component of the accelerometer's reading over g.
-    weight: of the vertical in the refinement, 1 / variance [1/rad^2].
-    delay: of the sensors [s].
-    settling_cycles: how long the filter is not relied upon.
-"""
+"""Constants of the filter."""
 
 STATE = record_dtype(
     x=(np.float64, STATES),
     covariance=(np.float64, (STATES, STATES)),
-    age=np.int64,
-    used=np.int64,
-    weight=np.float64,
-    vertical=(np.float64, 3),
-    rate=(np.float64, 3),
-    angular_acceleration=(np.float64, 3),
-    imu_acceleration=(np.float64, 3),
-    transition=(np.float64, (STATES, STATES)),
+    age=np.int64,  # for how many cycles the filter has run
+    used=np.int64,  # whether the vertical is used
+    weight=np.float64,  # of the vertical in the refinement
+    vertical=(np.float64, 3),  # in {2}, without the sensors' delay
+    rate=(np.float64, 3),  # angular velocity in {2} [rad/s]
+    imu_acceleration=(np.float64, 3),  # of the IMU in {2} [m/s^2]
+    transition=(np.float64, (STATES, STATES)),  # from here on scratch
     work=(np.float64, (STATES, STATES)),
     gain=(np.float64, STATES),
     change=(np.float64, STATES),
 )
-"""State of the filter.
-
-Fields:
-    x, covariance, age: of the filter, which has run for `age` cycles.
-    used, weight: whether the vertical is used, and its weight in the refinement.
-    vertical, rate: the vertical and the angular velocity [rad/s], both in {2}, without the sensors' delay.
-    angular_acceleration, imu_acceleration: of the platform and of its IMU, in {2}.
-    transition, work, gain, change: scratch.
-"""
+"""State of the filter."""
 
 
 def platform_parameters(fusion: FusionSettings, rate: float) -> Record:
     """The constants of the filter (dtype `PARAMETERS`) in cycles of this rate [Hz]."""
-    values = {
-        "rate_density": fusion.gyroscope_noise**2,
-        "bias_walk": fusion.bias_walk**2,
-        "bias_sigma": fusion.bias_sigma,
-        "vertical_variance": (fusion.platform_accelerometer_noise / STANDARD_GRAVITY) ** 2 * rate / 2.0,
-        "weight": 1.0 / fusion.tilt_sigma**2,
-        "delay": fusion.sensor_delay,
-        "settling_cycles": round(SETTLING_S * rate),
-    }
-    return filled(PARAMETERS, values)
+    return filled(
+        PARAMETERS,
+        rate_density=fusion.gyroscope_noise**2,
+        bias_walk=fusion.bias_walk**2,
+        bias_sigma=fusion.bias_sigma,
+        vertical_variance=(fusion.platform_accelerometer_noise / STANDARD_GRAVITY) ** 2 * rate / 2.0,
+        weight=1.0 / fusion.tilt_sigma**2,
+        delay=fusion.sensor_delay,
+        settling_cycles=round(SETTLING_S * rate),
+    )
 
 
 @kernel
 def step_platform_filter(p: Record, s: Record, rig: Record, time: Record, imus: Record, pose: Record) -> None:
-    """Step the filter, with the platform's own acceleration taken out of the reading.
-
-    Args:
-        p, s: dtypes `PARAMETERS` and `STATE`.
-        rig, time: dtypes `RIG` and `TIME`.
-        imus: state of the IMUs.
-        pose: the last cycle's pose, whose acceleration is known from the legs.
+    """Step the filter, with the platform's own acceleration taken out of the reading: that of the last cycle's `pose`, known
+    from the legs.
     """
     if not begin_platform_step(p, s, rig, time, imus, pose):
         return
@@ -105,11 +82,7 @@ def step_platform_filter(p: Record, s: Record, rig: Record, time: Record, imus: 
 
 @kernel
 def begin_platform_step(p: Record, s: Record, rig: Record, time: Record, imus: Record, pose: Record) -> bool:
-    """Start the filter where that is due, and find the acceleration of the IMU, in {2}.
-
-    Returns:
-        Whether there is a sample to take.
-    """
+    """Start the filter where that is due, and find the acceleration of the IMU, in {2}; returns whether there is a sample."""
     age = s.age
     s.age = age + 1 + time.missed if imus.used[PLATFORM_IMU] != 0 else 0
     s.used = s.age > min(time.cycle, p.settling_cycles)
@@ -120,20 +93,13 @@ def begin_platform_step(p: Record, s: Record, rig: Record, time: Record, imus: R
     if age == 0:
         start_platform(s.x, s.covariance, force, p.bias_sigma)
     # The acceleration of the origin, and what turning adds at the IMU's place d.
-    d = rig.sensors.platform_imu_position
-    w0, w1, w2 = rate[0] - s.x[3], rate[1] - s.x[4], rate[2] - s.x[5]
-    wd = w0 * d[0] + w1 * d[1] + w2 * d[2]
-    ww = w0 * w0 + w1 * w1 + w2 * w2
-    a = s.angular_acceleration
+    d = vector(rig.sensors.platform_imu_position)
+    w = subtract(vector(rate), vector(s.x[3:]))
+    wd, ww = dot(w, d), dot(w, w)
+    of_origin = rotate_back(pose.rotation, vector(pose.acceleration))
+    tangential = cross(rotate_back(pose.rotation, vector(pose.acceleration[3:])), d)
     for i in range(3):
-        s.imu_acceleration[i] = 0.0
-        a[i] = 0.0
-        for j in range(3):
-            s.imu_acceleration[i] += pose.rotation[j, i] * pose.acceleration[j]
-            a[i] += pose.rotation[j, i] * pose.acceleration[3 + j]
-    s.imu_acceleration[0] += a[1] * d[2] - a[2] * d[1] + w0 * wd - d[0] * ww
-    s.imu_acceleration[1] += a[2] * d[0] - a[0] * d[2] + w1 * wd - d[1] * ww
-    s.imu_acceleration[2] += a[0] * d[1] - a[1] * d[0] + w2 * wd - d[2] * ww
+        s.imu_acceleration[i] = of_origin[i] + (tangential[i] + w[i] * wd - d[i] * ww)
     return True
 
 
@@ -149,15 +115,48 @@ def end_platform_step(p: Record, s: Record, imus: Record) -> None:
 @kernel
 def extrapolate_direction(x: Array, rate: Array, delay: float, carried: Array) -> None:
     """Write a direction that is fixed in {1}, seen in {2}, carried on by a delay [s]: x' = x x rate."""
-    carried[0] = x[0] + delay * (x[1] * rate[2] - x[2] * rate[1])
-    carried[1] = x[1] + delay * (x[2] * rate[0] - x[0] * rate[2])
-    carried[2] = x[2] + delay * (x[0] * rate[1] - x[1] * rate[0])
+    turning = cross(vector(x), vector(rate))
+    for i in range(3):
+        carried[i] = x[i] + delay * turning[i]
+
+
+@kernel
+def turn_direction(x: Array, rate: Vector, t: float) -> None:
+    """Carry on a direction that is fixed in {1}, seen in {2}, by a time t [s]: x' = x x rate, to second order."""
+    turning, half = cross(vector(x), rate), 0.5 * t * t
+    twice = cross(turning, rate)
+    for i in range(3):
+        x[i] += t * turning[i] + half * twice[i]
+
+
+@kernel
+def cut_innovation(innovation: float, variance: float) -> float:
+    """An innovation of this variance, within `INNOVATION_LIMIT` standard deviations."""
+    bound = INNOVATION_LIMIT * np.sqrt(variance)
+    return float(min(max(innovation, -bound), bound))
+
+
+@kernel
+def take_scalar(covariance: Array, gain: Array, change: Array, states: int, innovation: float, variance: float) -> None:
+    """Take a scalar measurement into covariance and change of the first `states` states.
+
+    Args:
+        gain: the covariance of the states with the measurement.
+        variance: of the innovation.
+    """
+    inverse = 1.0 / variance
+    for i in range(states):
+        weight = gain[i] * inverse
+        change[i] += weight * innovation
+        for j in range(states):
+            covariance[i, j] -= weight * gain[j]
 
 
 @kernel
 def start_platform(x: Array, covariance: Array, accelerometer: Array, bias_sigma: float) -> None:
     """Start the filter from its first sample, taking the force for gravity."""
-    norm = np.sqrt(accelerometer[0] ** 2 + accelerometer[1] ** 2 + accelerometer[2] ** 2)
+    force = vector(accelerometer)
+    norm = np.sqrt(dot(force, force))
     for i in range(STATES):
         x[i] = accelerometer[i] / norm if i < 3 else 0.0
         for j in range(STATES):
@@ -178,14 +177,10 @@ def step_platform(
         vertical_variance: of each component of the accelerometer's reading over g.
         transition, work, gain, change: scratch (6, 6), (6, 6), (6,), (6,).
     """
-    w0, w1, w2 = gyroscope[0] - x[3], gyroscope[1] - x[4], gyroscope[2] - x[5]
-    u0, u1, u2 = x[0], x[1], x[2]
-    t = period
-    c0, c1, c2 = u1 * w2 - u2 * w1, u2 * w0 - u0 * w2, u0 * w1 - u1 * w0
-    half = 0.5 * t * t
-    x[0] += t * c0 + half * (c1 * w2 - c2 * w1)
-    x[1] += t * c1 + half * (c2 * w0 - c0 * w2)
-    x[2] += t * c2 + half * (c0 * w1 - c1 * w0)
+    rate, t = subtract(vector(gyroscope), vector(x[3:])), period
+    w0, w1, w2 = rate
+    u0, u1, u2 = vector(x)
+    turn_direction(x, rate, t)
     for i in range(STATES):
         change[i] = 0.0
         for j in range(STATES):
@@ -197,15 +192,14 @@ def step_platform(
     transition[1, 3], transition[1, 5] = -t * u2, t * u0
     transition[2, 3], transition[2, 4] = t * u1, -t * u0
     # The lower half of the transition is the identity.
-    for i in range(3):
+    for i in range(STATES):
         for j in range(STATES):
-            total = 0.0
-            for k in range(STATES):
-                total += transition[i, k] * covariance[k, j]
+            total = covariance[i, j]
+            if i < 3:
+                total = 0.0
+                for k in range(STATES):
+                    total += transition[i, k] * covariance[k, j]
             work[i, j] = total
-    for i in range(3, STATES):
-        for j in range(STATES):
-            work[i, j] = covariance[i, j]
     for i in range(STATES):
         for j in range(i + 1):
             total = work[i, j]
@@ -221,18 +215,11 @@ def step_platform(
     for m in range(3):
         innovation = (accelerometer[m] - acceleration[m]) / gravity - x[m] - change[m]
         variance = covariance[m, m] + vertical_variance
-        bound = INNOVATION_LIMIT * np.sqrt(variance)
-        innovation = min(max(innovation, -bound), bound)
-        inverse = 1.0 / variance
         for i in range(STATES):
             gain[i] = covariance[i, m]
-        for i in range(STATES):
-            k = gain[i] * inverse
-            change[i] += k * innovation
-            for j in range(STATES):
-                covariance[i, j] -= k * gain[j]
+        take_scalar(covariance, gain, change, STATES, cut_innovation(innovation, variance), variance)
     for i in range(STATES):
         x[i] += change[i]
-    norm = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+    norm = np.sqrt(dot(vector(x), vector(x)))
     for i in range(3):
         x[i] /= norm

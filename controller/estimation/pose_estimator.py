@@ -18,54 +18,45 @@ from controller.direct_kinematics.refinement import (
 )
 from controller.rig import elapsed
 from controller.settings import FusionSettings
-from plant.compiled import Record, kernel, record_dtype
+from plant.compiled import Record, filled, kernel, record_dtype
 from plant.mechanism import LEGS
 from plant.pose import Array
+from plant.vectors import rotate, vector
 
 WORST_CONDITIONING = 1e-2
 """Least conditioning of a closed form that is relied upon where there is another one, or none."""
 
-PARAMETERS = record_dtype(section_5=np.int64, acceleration_rate=np.float64)
-"""Whether the pose is that of the paper's section 5, unrefined; and the corner of the acceleration's low-pass [1/s]."""
+PARAMETERS = record_dtype(
+    section_5=np.int64,  # whether the pose is that of the paper's section 5, unrefined
+    acceleration_rate=np.float64,  # corner of the acceleration's low-pass [1/s]
+)
+"""Constants of the estimator."""
 
 STATE = record_dtype(
-    position=(np.float64, 3),
+    position=(np.float64, 3),  # [m]
     rotation=(np.float64, (3, 3)),
-    twist=(np.float64, 6),
-    smooth_twist=(np.float64, 6),
-    acceleration=(np.float64, 6),
-    conditioning=np.float64,
-    found=np.int64,
-    information=(np.float64, (6, 6)),
-    factor=(np.float64, (6, 6)),
-    arms=(np.float64, (LEGS, 3)),
-    directions=(np.float64, (LEGS, 3)),
-    lengths=(np.float64, LEGS),
-    vectors=(np.float64, (2, 3)),
+    twist=(np.float64, 6),  # velocity and angular velocity in {1} [m/s, rad/s]
+    smooth_twist=(np.float64, 6),  # the twist, low-passed
+    acceleration=(np.float64, 6),  # derivative of the twist
+    conditioning=np.float64,  # of the closed form
+    found=np.int64,  # whether the measurements determine the pose
+    information=(np.float64, (6, 6)),  # inverse of the refined pose's covariance, lower triangle
+    factor=(np.float64, (6, 6)),  # Cholesky factor of the information
+    arms=(np.float64, (LEGS, 3)),  # the turned platform joints at the pose [m]
+    directions=(np.float64, (LEGS, 3)),  # of the legs at the pose, unit
+    lengths=(np.float64, LEGS),  # of the legs at the pose [m]
+    vectors=(np.float64, (2, 3)),  # the measured vertical and horizontal field in {2}
     vector_weights=(np.float64, 2),
-    angular_velocity=(np.float64, 3),
+    angular_velocity=(np.float64, 3),  # from here on scratch
     correction=(np.float64, 6),
     scratch=SCRATCH,
 )
-"""The estimated pose.
-
-Fields:
-    position, rotation: of the platform.
-    twist, smooth_twist, acceleration: velocity and angular velocity in {1}, their low-pass, and their derivative.
-    conditioning: of the closed form.
-    found: whether the measurements determine the pose.
-    information, factor: inverse of the refined pose's covariance (lower triangle), and its Cholesky factor.
-    arms, directions, lengths: the turned platform joints, unit directions and lengths of the legs at the pose.
-    vectors, vector_weights: the measured vertical and horizontal field in {2}, and their weights.
-    angular_velocity, correction, scratch: so that the cycle allocates nothing.
-"""
+"""The estimated pose."""
 
 
 def pose_parameters(fusion: FusionSettings, section_5: bool) -> Record:
     """The constants of the estimator (dtype `PARAMETERS`)."""
-    parameters: Record = np.zeros((), PARAMETERS)
-    parameters["section_5"], parameters["acceleration_rate"] = section_5, 1.0 / fusion.acceleration_time
-    return parameters
+    return filled(PARAMETERS, section_5=section_5, acceleration_rate=1.0 / fusion.acceleration_time)
 
 
 @kernel
@@ -87,8 +78,6 @@ def find_pose(
     section 5 takes from the platform. A planar mechanism's pose takes the platform's vertical for its roll (section 6).
 
     Args:
-        p, s: dtypes `PARAMETERS` and `STATE`.
-        rig: dtype `RIG`.
         directions, leg_used: (6, 3) and (6,), the measured directions and which of them are used.
         platform_used, heading_used: whether the vertical and the heading are used.
 
@@ -120,16 +109,8 @@ def find_pose(
 def refine_pose(p: Record, s: Record, rig: Record, time: Record, legs: Record, platform_rate: Array) -> bool:
     """Two Gauss-Newton steps for the pose; the twist comes with them, and the acceleration is its derivative.
 
-    The paper's section 5 does not move the pose and has no covariance.
-
-    Args:
-        p, s: dtypes `PARAMETERS` and `STATE`.
-        rig, time: dtypes `RIG` and `TIME`.
-        legs: state of the leg filters.
-        platform_rate: (3,), angular velocity in {2} [rad/s].
-
-    Returns:
-        Whether the normal equations have a solution.
+    The paper's section 5 does not move the pose and has no covariance. `platform_rate` (3,) is the angular velocity in {2}
+    [rad/s]. False if the normal equations have no solution.
     """
     for _ in range(2):
         normal_equations(
@@ -144,10 +125,7 @@ def refine_pose(p: Record, s: Record, rig: Record, time: Record, legs: Record, p
             s.information[:] = 0.0
             break
         move_pose(s.correction, s.position, s.rotation)
-    for i in range(3):
-        s.angular_velocity[i] = 0.0
-        for j in range(3):
-            s.angular_velocity[i] += s.rotation[i, j] * platform_rate[j]
+    s.angular_velocity[0], s.angular_velocity[1], s.angular_velocity[2] = rotate(s.rotation, vector(platform_rate))
     find_twist(
         legs.rates, legs.weights, s.vectors, s.vector_weights, s.angular_velocity, s.rotation, s.arms, s.directions, s.lengths,
         s.factor, s.twist,

@@ -40,8 +40,7 @@ def named_motion(name: str, mechanism: Mechanism, duration: float) -> Poses:
     times = np.arange(0.0, duration + MARGIN_S + period, period)
     # The reach is in proportion to the stroke, so that every preset can make every motion.
     stroke = mechanism.require_limits().stroke
-    motions = PLANAR_MOTIONS if mechanism.planar else MOTIONS
-    displacements = motions[name](times) * float((stroke[:, 1] - stroke[:, 0]).min() / 0.12)
+    displacements = MOTIONS[name](times, mechanism.planar) * float((stroke[:, 1] - stroke[:, 0]).min() / 0.12)
     rotations = np.array([rotation_from_vector(vector) @ home.rotation for vector in displacements[:, 3:]])
     return times, home.position + displacements[:, :3], rotations
 
@@ -53,11 +52,11 @@ def _fade(times: Array) -> Array:
     return faded[:, None]
 
 
-def _hold(times: Array) -> Array:
+def _hold(times: Array, planar: bool) -> Array:
     return np.zeros((len(times), 6))
 
 
-def _circle(times: Array, planar: bool = False) -> Array:
+def _circle(times: Array, planar: bool) -> Array:
     angle = 2.0 * np.pi * 0.25 * times
     motion = np.zeros((len(times), 6))
     motion[:, 0], motion[:, 1] = 0.03 * np.cos(angle), 0.03 * np.sin(angle)
@@ -68,7 +67,7 @@ def _circle(times: Array, planar: bool = False) -> Array:
     return motion * _fade(times)
 
 
-def _sines(times: Array, planar: bool = False) -> Array:
+def _sines(times: Array, planar: bool) -> Array:
     frequencies = np.array([0.30, 0.37, 0.43, 0.50, 0.57, 0.63])
     amplitudes = np.array([0.012, 0.012, 0.012, np.radians(3.0), np.radians(3.0), np.radians(5.0)])
     motion: Array = amplitudes * np.sin(2.0 * np.pi * frequencies * times[:, None]) * _fade(times)
@@ -77,9 +76,9 @@ def _sines(times: Array, planar: bool = False) -> Array:
     return motion
 
 
-def _steps(times: Array, axes: tuple[int, ...] = (0, 1, 2, 3, 4, 5)) -> Array:
+def _steps(times: Array, planar: bool) -> Array:
     sizes = np.diag([0.02, 0.02, 0.02, np.radians(4.0), np.radians(4.0), np.radians(8.0)])
-    poses = np.concatenate([np.zeros((1, 6)), sizes[list(axes)]])
+    poses = np.concatenate([np.zeros((1, 6)), sizes[[0, 1, 5] if planar else slice(None)]])
     return poses[np.arange(len(times)) % len(poses)]
 
 
@@ -152,16 +151,8 @@ _FITTED: dict[str, Callable[[Mechanism, float], Poses]] = {
 }
 """Motions for the calibration, fitted to the limits of the mechanism."""
 
-MOTIONS: dict[str, Callable[[Array], Array]] = {"hold": _hold, "circle": _circle, "sines": _sines, "steps": _steps}
-"""Displacements from home (N, 6), position [m] and rotation vector [rad], at times (N,) [s]."""
-
-PLANAR_MOTIONS: dict[str, Callable[[Array], Array]] = {
-    "hold": _hold,
-    "circle": partial(_circle, planar=True),
-    "sines": partial(_sines, planar=True),
-    "steps": partial(_steps, axes=(0, 1, 5)),
-}
-"""The same in the plane."""
+MOTIONS: dict[str, Callable[[Array, bool], Array]] = {"hold": _hold, "circle": _circle, "sines": _sines, "steps": _steps}
+"""Displacements from home (N, 6), position [m] and rotation vector [rad], at times (N,) [s], and in the plane if wanted."""
 
 NAMES = (*MOTIONS, *_FITTED)
 HELD = ("steps", "rests", "near-rests")

@@ -116,7 +116,10 @@ class _Planner:
         self._follow.target_position = target
         for rate, acceleration in ((rates, accelerations), (rates, rest), (rest, rest)):
             self._follow.target_velocity, self._follow.target_acceleration = rate, acceleration
-            if calculate(self._otg, self._follow, self._state, self._trajectory) and self._is_timely(rate) and self._is_safe():
+            if not calculate(self._otg, self._follow, self._state, self._trajectory):
+                continue
+            # A plan that must arrive with a speed, and cannot in time, first swings away from the target to gain that speed.
+            if (self._trajectory.duration <= _LATEST_S or not any(rate)) and self._is_safe():
                 kept = self._stays_inside()
                 break
         else:
@@ -127,13 +130,6 @@ class _Planner:
         self._states.append(self._state)
         self._plans.append(phases_of(self._trajectory))
         return kept
-
-    def _is_timely(self, rate: list[float]) -> bool:
-        """Whether the plan arrives about when it should.
-
-        A plan that must arrive with a speed, and cannot in time, first swings away from the target to gain that speed.
-        """
-        return self._trajectory.duration <= _LATEST_S or not any(rate)
 
     def _is_safe(self) -> bool:
         """Whether the first sample period of the plan, and a stop after it, stay inside the stroke."""

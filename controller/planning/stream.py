@@ -27,31 +27,30 @@ first]; whether the planner's process must end."""
 
 STREAM = record_dtype(
     shared=(np.int64, 8),
-    guards=(np.int64, 2),
-    bases=(np.int64, 2),
-    begins=(np.float64, 2),
+    guards=(np.int64, 2),  # number of each slot's plan, 0 while it is written
+    bases=(np.int64, 2),  # the plan that it follows
+    begins=(np.float64, 2),  # [s]
     plans=(np.float64, (2, LEGS, PLAN_SEGMENTS, 5)),
-    index=np.int64,
+    index=np.int64,  # leg, value and limit of the failure
     value=np.float64,
     limit=np.float64,
-    accepted=np.int64,
-    malformed=np.int64,
-    stale=np.int64,
-    strange=np.int64,
-    planned=np.int64,
-    late=np.int64,
+    accepted=np.int64,  # samples
+    malformed=np.int64,  # datagrams
+    stale=np.int64,  # datagrams that came late or twice
+    strange=np.int64,  # datagrams from another sender
+    planned=np.int64,  # plans
+    late=np.int64,  # plans that the loop could not take in time
 )
-"""What planner and loop share. In `shared`, the loop writes `CYCLE`, `SEEN` and `TAKEN`, the planner the others, and the
-process that ends the planner `END_PLANNER`.
-
-Plans lie in two slots by turns. For each slot: in `guards` the number of its plan (0 while it is written), in `bases` the plan
-that it follows, in `begins` its begin [s], in `plans` its segments. `index`, `value` and `limit` belong to the failure: leg,
-value and limit. The planner counts samples accepted; datagrams that were malformed, came late or twice (`stale`), or came from
-another sender (`strange`); plans made, and plans that the loop could not take in time (`late`).
+"""What planner and loop share; plans lie in two slots by turns. In `shared`, the loop writes `CYCLE`, `SEEN` and `TAKEN`, the
+planner the others, and the process that ends the planner `END_PLANNER`.
 """
 
-STREAM_READER = record_dtype(seen=np.int64, taken=np.int64, plan=(np.float64, (LEGS, PLAN_SEGMENTS, 5)))
-"""The loop's own side of a stream: the last plan that it has seen, the plan that it follows, and scratch."""
+STREAM_READER = record_dtype(
+    seen=np.int64,  # the last plan that the loop has seen
+    taken=np.int64,  # the plan that it follows
+    plan=(np.float64, (LEGS, PLAN_SEGMENTS, 5)),  # scratch
+)
+"""The loop's own side of a stream."""
 
 
 def rest(lengths: Array, rows: int = FOLLOWED_SEGMENTS) -> Array:
@@ -70,10 +69,7 @@ def publish_plan(stream: Record, plan: Array, begin: float, base: int) -> int:
     slot = number % 2
     store_release(s.guards, slot, 0)
     fence()
-    for leg in range(LEGS):
-        for row in range(PLAN_SEGMENTS):
-            for column in range(5):
-                s.plans[slot, leg, row, column] = plan[leg, row, column]
+    s.plans[slot] = plan
     s.begins[slot] = begin
     s.bases[slot] = base
     store_release(s.guards, slot, number)
@@ -105,10 +101,7 @@ def take_plan(stream: Record, reader: Record, cycle: int, period: float, segment
     if load_acquire(s.guards, slot) != latest:
         return False
     begin, base = s.begins[slot], s.bases[slot]
-    for leg in range(LEGS):
-        for row in range(PLAN_SEGMENTS):
-            for column in range(5):
-                r.plan[leg, row, column] = s.plans[slot, leg, row, column]
+    r.plan[:] = s.plans[slot]
     fence()
     if load_acquire(s.guards, slot) != latest:
         return False

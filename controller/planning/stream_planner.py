@@ -15,16 +15,7 @@ from ruckig import ControlInterface, Ruckig, Trajectory
 
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.planner import PREVIEW_S, calculate, count_violations, phases_of, ruckig_input
-from controller.planning.segments import (
-    JERK,
-    LENGTH,
-    START,
-    STOP_SEGMENTS,
-    evaluate_reference,
-    plan_stop,
-    state_after,
-    write_segment,
-)
+from controller.planning.segments import LENGTH, START, evaluate_reference, state_after, stop_phases, write_segment
 from controller.planning.stream import PLAN_SEGMENTS, rest
 from controller.safety.causes import Cause
 from plant.compiled import kernel
@@ -249,33 +240,25 @@ def _write_plan(
     Durations count between the rounded starts, so that each row ends exactly where the next one begins.
     """
     count = phases.shape[2]
-    rows = np.zeros(LEGS, np.int64)
-    ends = state.copy()
-    stops = np.empty((LEGS, STOP_SEGMENTS, 5))
     segments[:, :, :] = 0.0
     segments[:, :, START] = np.inf
-    arrived = begin + duration
+    end, arrived = begin, begin + duration
     for leg in range(LEGS):
-        now, at = (state[leg, 0], state[leg, 1], state[leg, 2]), begin
+        row, now, at = 0, (state[leg, 0], state[leg, 1], state[leg, 2]), begin
         for k in range(count + 2):
             # The rest of ruckig's duration after its phases, and the coast, have no jerk.
             j = phases[leg, 1, k] if k < count else 0.0
             after = min(at + phases[leg, 0, k], arrived) if k < count else arrived if k == count else arrived + coast
             if after > at:
-                write_segment(segments[leg, rows[leg]], at, now, j)
-                rows[leg] += 1
-                now, at = state_after(now, j, after - at), after
-        ends[leg, 0], ends[leg, 1], ends[leg, 2] = now
-    plan_stop(ends, limits[0], limits[1], stops)
-    end = begin
-    for leg in range(LEGS):
-        now, at = (ends[leg, 0], ends[leg, 1], ends[leg, 2]), arrived + coast
-        for k in range(STOP_SEGMENTS - 1):
-            after = at + (stops[leg, k + 1, START] - stops[leg, k, START])
+                write_segment(segments[leg, row], at, now, j)
+                row, now, at = row + 1, state_after(now, j, after - at), after
+        jerk, down, stay, up = stop_phases(now[1], now[2], limits[0], limits[1])
+        starts = 0.0, down, down + stay, down + stay + up
+        for k, j in enumerate((jerk, 0.0, -jerk)):
+            after = at + (starts[k + 1] - starts[k])
             if after > at:
-                write_segment(segments[leg, rows[leg]], at, now, stops[leg, k, JERK])
-                rows[leg] += 1
-                now, at = state_after(now, stops[leg, k, JERK], after - at), after
-        segments[leg, rows[leg], START], segments[leg, rows[leg], LENGTH] = at, now[0]
+                write_segment(segments[leg, row], at, now, j)
+                row, now, at = row + 1, state_after(now, j, after - at), after
+        segments[leg, row, START], segments[leg, row, LENGTH] = at, now[0]
         end = max(end, at)
     return end

@@ -6,7 +6,7 @@ from controller.estimation import imu_monitor
 from controller.safety import arming, stop, watch
 from controller.safety.causes import EVENTS
 from controller.settings import SafetySettings
-from plant.compiled import Record, record_dtype
+from plant.compiled import Record, filled, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism.limits import Limits
 
@@ -32,12 +32,13 @@ STATE = record_dtype(
 
 def safety_parameters(settings: SafetySettings, rate: float, limits: Limits, arm: bool) -> Record:
     """The constants (dtype `PARAMETERS`) in cycles of this rate [Hz]; the drives are enabled only if `arm`."""
-    parameters: Record = np.zeros((), PARAMETERS)
-    parameters["arming"] = arming.arming_parameters(settings, rate, arm)
-    parameters["monitor"] = imu_monitor.monitor_parameters(settings, rate)
-    parameters["watch"] = watch.watch_parameters(settings, rate, limits)
-    parameters["stop"] = stop.stop_parameters(limits, rate)
-    return parameters
+    return filled(
+        PARAMETERS,
+        arming=arming.arming_parameters(settings, rate, arm),
+        monitor=imu_monitor.monitor_parameters(settings, rate),
+        watch=watch.watch_parameters(settings, rate, limits),
+        stop=stop.stop_parameters(limits, rate),
+    )
 
 
 def watch_nothing(parameters: Record) -> None:

@@ -137,9 +137,8 @@ class Cause(IntEnum):
         if np.isnan(value):
             return text
         unit = f" {self.unit}" if self.unit else ""
-        return (
-            f"{text} ({value:.4g}{unit})" if np.isnan(limit) else f"{text} ({value:.4g}{unit}, the limit is {limit:.4g}{unit})"
-        )
+        limited = "" if np.isnan(limit) else f", the limit is {limit:.4g}{unit}"
+        return f"{text} ({value:.4g}{unit}{limited})"
 
 
 REACTION = np.array([cause.reaction.value for cause in Cause])

@@ -4,7 +4,7 @@ import numpy as np
 
 from controller.planning.segments import STOP_SEGMENTS, plan_stop
 from controller.safety.causes import REACTION, Cause, Mode, Reaction, Request, report_event
-from plant.compiled import Record, kernel, record_dtype
+from plant.compiled import Record, filled, kernel, record_dtype
 from plant.mechanism import LEGS
 from plant.mechanism.limits import Limits
 
@@ -12,40 +12,35 @@ STOP_SETTLING_S = 0.1
 """How long the drives hold a mechanism that has stopped before the brakes take over [s]."""
 
 PARAMETERS = record_dtype(
-    velocity_limit=np.float64,
-    acceleration_limit=np.float64,
-    jerk_limit=np.float64,
-    settling_cycles=np.int64,
+    velocity_limit=np.float64,  # [m/s]
+    acceleration_limit=np.float64,  # [m/s^2]
+    jerk_limit=np.float64,  # [m/s^3]
+    settling_cycles=np.int64,  # how long the drives hold before the brakes
 )
-"""The actuators' limits [m/s, m/s^2, m/s^3], and how long the drives hold before the brakes."""
+"""The actuators' limits."""
 
 STATE = record_dtype(
-    cause=np.int64,
-    cycle=np.int64,
-    end_cycle=np.int64,
-    segments=(np.float64, (LEGS, STOP_SEGMENTS, 5)),
-    index=np.int64,
+    cause=np.int64,  # of the stop, `Cause.NONE` while the run goes on
+    cycle=np.int64,  # when it began
+    end_cycle=np.int64,  # when the brakes may hold
+    segments=(np.float64, (LEGS, STOP_SEGMENTS, 5)),  # the reference of a controlled stop
+    index=np.int64,  # with value and limit: of the cause
     value=np.float64,
     limit=np.float64,
-    earlier_cause=np.int64,
+    earlier_cause=np.int64,  # why the run was stopping already when a fault came
 )
-"""The stop or fault that is under way.
-
-Fields:
-    cause: of the stop, `Cause.NONE` while the run goes on.
-    cycle, end_cycle: when it began, and when the brakes may hold.
-    segments: the reference of a controlled stop.
-    index, value, limit: of the cause.
-    earlier_cause: why the run was stopping already when a fault came.
-"""
+"""The stop or fault that is under way."""
 
 
 def stop_parameters(limits: Limits, rate: float) -> Record:
     """The constants of a stop (dtype `PARAMETERS`) in cycles of this rate [Hz]."""
-    parameters: Record = np.zeros((), PARAMETERS)
-    parameters["velocity_limit"], parameters["acceleration_limit"] = limits.velocity, limits.acceleration
-    parameters["jerk_limit"], parameters["settling_cycles"] = limits.jerk, int(np.ceil(STOP_SETTLING_S * rate))
-    return parameters
+    return filled(
+        PARAMETERS,
+        velocity_limit=limits.velocity,
+        acceleration_limit=limits.acceleration,
+        jerk_limit=limits.jerk,
+        settling_cycles=int(np.ceil(STOP_SETTLING_S * rate)),
+    )
 
 
 def describe_end(state: Record) -> str:
@@ -57,21 +52,17 @@ def describe_end(state: Record) -> str:
 
 
 @kernel
-def handle_cause(
-    p: Record, s: Record, rig: Record, time: Record, reference: Record, pid: Record,
-    cause: int, index: int, value: float, limit: float,
-) -> None:  # fmt: skip
+def react(parameters: Record, state: Record, cause: int, index: int, value: float, limit: float) -> None:
     """Report a cause and react to it as `Cause` says.
 
     The first cause of a stop counts, and the first of a fault. A fault overrides a stop.
 
     Args:
-        p, s: parameters and state of the safety stage.
-        rig, time: dtypes `RIG` and `TIME`.
-        reference, pid: states of these stages, which a stop changes.
-        cause, index, value, limit: what has happened.
+        parameters, state: of the cycle.
+        index: the number of the leg or IMU; -1 if none is named.
+        value, limit: in the unit of the cause; NaN if there is none.
     """
-    reaction = REACTION[cause]
+    s, reaction = state[()].safety, REACTION[cause]
     if s.mode == Mode.FAULT or (reaction == Reaction.STOP and s.stop.cause != Cause.NONE):
         return
     report_event(s.events, cause, index, value, limit)
@@ -79,24 +70,26 @@ def handle_cause(
         return
     s.stop.index, s.stop.value, s.stop.limit = index, value, limit
     if reaction == Reaction.STOP:
-        _begin_stop(p.stop, s, rig, time, reference, pid, cause)
+        _begin_stop(parameters, state, cause)
     else:
-        _fail(p.stop, s, rig, time, pid, cause)
+        _fail(parameters, state, cause)
 
 
 @kernel
-def _begin_stop(p: Record, s: Record, rig: Record, time: Record, reference: Record, pid: Record, cause: int) -> None:
+def _begin_stop(parameters: Record, state: Record, cause: int) -> None:
     """Leave the motion for the fastest stop within the limits, leg by leg.
 
     Before the motion there is nothing to stop. In missed periods the drives followed the last command, so the stop begins
     where that has led.
     """
+    p, rig, time = parameters[()].safety.stop, parameters[()].rig, state[()].time
+    s, reference, command = state[()].safety, state[()].reference, state[()].pid.command
     s.stop.cause = cause
     s.stop.cycle = s.stop.end_cycle = time.cycle
     if s.mode == Mode.RUNNING:
         if time.missed > 0:
             for k in range(rig.legs):
-                speed = min(max(pid.command[k], -p.velocity_limit), p.velocity_limit)
+                speed = min(max(command[k], -p.velocity_limit), p.velocity_limit)
                 reference.motion[k, 0] += time.missed * rig.period * speed
                 reference.motion[k, 1], reference.motion[k, 2] = speed, 0.0
         duration = plan_stop(reference.motion, p.acceleration_limit, p.jerk_limit, s.stop.segments)
@@ -109,34 +102,37 @@ def _begin_stop(p: Record, s: Record, rig: Record, time: Record, reference: Reco
 
 
 @kernel
-def _fail(p: Record, s: Record, rig: Record, time: Record, pid: Record, cause: int) -> None:
+def _fail(parameters: Record, state: Record, cause: int) -> None:
     """End without the estimate: the drives come to rest by themselves, or the brakes close at once."""
+    p, rig = parameters[()].safety.stop, parameters[()].rig
+    s, command = state[()].safety, state[()].pid.command
     moving = s.request == Request.ENABLED
     s.stop.earlier_cause = s.stop.cause
     s.stop.cause = cause
-    s.stop.cycle = s.stop.end_cycle = time.cycle
+    s.stop.cycle = s.stop.end_cycle = state[()].time.cycle
     s.mode = Mode.FAULT
     s.request = Request.BRAKED
     if REACTION[cause] == Reaction.QUICK_STOP and moving:
         s.request = Request.QUICK_STOP
         fastest = 0.0
         for k in range(rig.legs):
-            if not np.isfinite(pid.command[k]):
-                pid.command[k] = 0.0
-            fastest = max(fastest, abs(pid.command[k]))
+            if not np.isfinite(command[k]):
+                command[k] = 0.0
+            fastest = max(fastest, abs(command[k]))
         s.stop.end_cycle += int(np.ceil(fastest / (p.acceleration_limit * rig.period)))
     else:
-        pid.command[:] = 0.0
+        command[:] = 0.0
     if moving:
         s.stop.end_cycle += p.settling_cycles
 
 
 @kernel
-def ramp_down(p: Record, rig: Record, time: Record, pid: Record) -> None:
+def ramp_down(parameters: Record, state: Record) -> None:
     """A cycle after a fault: every command comes to rest at the limit of acceleration, whatever is measured."""
-    step = p.acceleration_limit * rig.period * (1 + time.missed)
+    rig, time, command = parameters[()].rig, state[()].time, state[()].pid.command
+    step = parameters[()].safety.stop.acceleration_limit * rig.period * (1 + time.missed)
     for k in range(rig.legs):
-        pid.command[k] -= min(max(pid.command[k], -step), step)
+        command[k] -= min(max(command[k], -step), step)
     time.cycle += 1
 
 

@@ -4,12 +4,13 @@ import numpy as np
 
 from controller.estimation.imu_monitor import contradiction, reset
 from controller.safety.causes import Cause, DriveState, Mode, Request, report_event
-from controller.safety.stop import handle_cause
+from controller.safety.stop import react
 from controller.settings import SafetySettings
 from plant.compiled import Record, filled, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS, six_rows
 from plant.mechanism.limits import Limits
+from plant.pose import Array
 
 _IMPLAUSIBLE_SHARE = 0.25
 """How far outside its stroke, as a share of it, the estimate of a leg may lie."""
@@ -23,78 +24,64 @@ _CLEARER = 1.3
 PARAMETERS = record_dtype(
     most_lost_imus=np.int64,
     conditioning=np.float64,
-    lengths=(np.float64, (LEGS, 2)),
-    plausible_lengths=(np.float64, (LEGS, 2)),
-    speed=np.float64,
-    following=np.float64,
-    saturation=np.float64,
-    drive_deviation=np.float64,
-    patience=np.float64,
+    lengths=(np.float64, (LEGS, 2)),  # [m]
+    plausible_lengths=(np.float64, (LEGS, 2)),  # [m]
+    speed=np.float64,  # [m/s]
+    following=np.float64,  # [m]
+    saturation=np.float64,  # [s]
+    drive_deviation=np.float64,  # [m/s]
+    patience=np.float64,  # [s]
     bus_cycles=np.int64,
 )
 """The limits. Durations that are compared with sums of periods are in s."""
 
 STATE = record_dtype(
-    drive=(np.int64, LEGS),
-    silent=np.int64,
-    unanswered=np.int64,
-    contradicted_for=np.float64,
-    off_reference_for=(np.float64, LEGS),
-    deviating_for=(np.float64, LEGS),
-    saturated_for=(np.float64, LEGS),
-    speed=(np.float64, LEGS),
+    drive=(np.int64, LEGS),  # the `DriveState` of each drive
+    silent=np.int64,  # for how many cycles the rig has not answered
+    unanswered=np.int64,  # how many more exchanges failed than succeeded
+    contradicted_for=np.float64,  # how long the IMUs have contradicted each other [s]
+    off_reference_for=(np.float64, LEGS),  # how long each leg has been off its reference [s]
+    deviating_for=(np.float64, LEGS),  # how long each drive has been off its command [s]
+    saturated_for=(np.float64, LEGS),  # how long each command has been at its limit [s]
+    speed=(np.float64, LEGS),  # estimated, of each leg [m/s]
 )
-"""What the rig has reported, and what lasts.
-
-Fields:
-    drive: the `DriveState` of each drive.
-    silent: for how many cycles the rig has not answered.
-    unanswered: how many more exchanges failed than succeeded.
-    contradicted_for: how long the IMUs have contradicted each other [s].
-    off_reference_for, deviating_for, saturated_for: how long each leg has been off its reference, each drive off its command,
-        each command at its limit [s].
-    speed: estimated, of each leg [m/s].
-"""
+"""What the rig has reported, and what lasts."""
 
 
 def watch_parameters(settings: SafetySettings, rate: float, limits: Limits) -> Record:
     """The limits (dtype `PARAMETERS`) in cycles of this rate [Hz]."""
     stroke = limits.stroke
     margin = _IMPLAUSIBLE_SHARE * (stroke[:, 1] - stroke[:, 0])
-    values = {
-        "most_lost_imus": settings.most_lost_imus,
-        "conditioning": settings.conditioning,
-        "lengths": six_rows(stroke + settings.stroke_margin * np.array([-1.0, 1.0])),
-        "plausible_lengths": six_rows(np.stack([stroke[:, 0] - margin, stroke[:, 1] + margin], axis=1)),
-        "speed": settings.velocity_margin * limits.velocity,
-        "following": settings.following,
-        "saturation": settings.saturation,
-        "drive_deviation": settings.drive_deviation,
-        "patience": max(settings.patience, _LEAST_CYCLES / rate),
-        "bus_cycles": max(3, round(settings.bus_patience * rate)),
-    }
-    return filled(PARAMETERS, values)
+    return filled(
+        PARAMETERS,
+        most_lost_imus=settings.most_lost_imus,
+        conditioning=settings.conditioning,
+        lengths=six_rows(stroke + settings.stroke_margin * np.array([-1.0, 1.0])),
+        plausible_lengths=six_rows(np.stack([stroke[:, 0] - margin, stroke[:, 1] + margin], axis=1)),
+        speed=settings.velocity_margin * limits.velocity,
+        following=settings.following,
+        saturation=settings.saturation,
+        drive_deviation=settings.drive_deviation,
+        patience=max(settings.patience, _LEAST_CYCLES / rate),
+        bus_cycles=max(3, round(settings.bus_patience * rate)),
+    )
 
 
 @kernel
-def update_rig_status(
-    p: Record, s: Record, rig: Record, time: Record, imus: Record, reference: Record, pid: Record, sample_age: Record,
-    drive: Record, silent: int,
-) -> None:  # fmt: skip
+def hear_rig(parameters: Record, state: Record, sample_age: Array, drive: Array, silent: int) -> None:
     """Before a cycle: take the rig's report, and react to a lost bus and to drives that left their operation.
 
     Args:
-        p, s: parameters and state of the safety stage.
-        rig, time: dtypes `RIG` and `TIME`.
-        imus, reference, pid: states of these stages.
+        parameters, state: of the cycle.
         sample_age: (7,), of each IMU's sample, in cycles.
         drive: (6,), of each drive its `DriveState`.
         silent: for how many cycles the rig has not answered.
     """
+    legs, s = parameters[()].rig.legs, state[()].safety
     w = s.watch
     for k in range(IMU_COUNT):
-        imus.sample_age[k] = sample_age[k]
-    for k in range(rig.legs):
+        state[()].imus.sample_age[k] = sample_age[k]
+    for k in range(legs):
         w.drive[k] = drive[k]
     if silent > 0 and w.silent == 0:
         report_event(s.events, Cause.ANSWER_LATE, -1, np.nan, np.nan)
@@ -102,35 +89,32 @@ def update_rig_status(
     w.unanswered = max(w.unanswered + (1 if silent > 0 else -1), 0)
     if s.request != Request.ENABLED:
         return
-    most = p.watch.bus_cycles
+    most = parameters[()].safety.watch.bus_cycles
     if silent >= most or w.unanswered >= 2 * most:
-        handle_cause(
-            p, s, rig, time, reference, pid, Cause.BUS_LOST, -1, float(max(silent, w.unanswered)), float(most)
-        )  # fmt: skip
-    for k in range(rig.legs):
+        react(parameters, state, Cause.BUS_LOST, -1, float(max(silent, w.unanswered)), float(most))
+    for k in range(legs):
         if drive[k] == DriveState.FAULTY:
-            handle_cause(p, s, rig, time, reference, pid, Cause.DRIVE_FAULT, k, np.nan, np.nan)
+            react(parameters, state, Cause.DRIVE_FAULT, k, np.nan, np.nan)
         elif s.mode != Mode.ARMED and drive[k] != DriveState.FOLLOWING:
-            handle_cause(p, s, rig, time, reference, pid, Cause.DRIVE_OFF, k, np.nan, np.nan)
+            react(parameters, state, Cause.DRIVE_OFF, k, np.nan, np.nan)
 
 
 @kernel
-def exclude_imu(
-    p: Record, s: Record, rig: Record, time: Record, imus: Record, leg_weight: float, reference: Record, pid: Record
-) -> None:
+def exclude_imu(parameters: Record, state: Record) -> None:
     """After the refinement: leave out the IMU that contradicts the others, once, if it can be named; else stop.
 
     Three legs and the roll of a planar mechanism are one measurement more than its pose needs: they show that an IMU is
     wrong, not which one.
     """
-    m = s.monitor
+    p, rig, s, imus = parameters[()].safety, parameters[()].rig, state[()].safety, state[()].imus
+    m, w = s.monitor, s.watch
     worst = 0
     for k in range(1, IMU_COUNT):
         if m.explained[k] > m.explained[worst]:
             worst = k
     off, limit = contradiction(m, worst), p.monitor.disagreement
-    s.watch.contradicted_for = s.watch.contradicted_for + rig.period if off > limit else 0.0
-    if s.watch.contradicted_for < p.monitor.lasting or s.mode != Mode.RUNNING:
+    w.contradicted_for = w.contradicted_for + rig.period if off > limit else 0.0
+    if w.contradicted_for < p.monitor.lasting or s.mode != Mode.RUNNING:
         return
     second = left = 0.0
     excluded = 0
@@ -140,53 +124,47 @@ def exclude_imu(
         if k != worst:
             second = max(second, m.explained[k])
     # Without the named IMU, the others must agree.
-    disagree = left - m.explained[worst] > leg_weight * limit**2
+    disagree = left - m.explained[worst] > parameters[()].legs.weight * limit**2
     if disagree or excluded > 0 or m.explained[worst] < _CLEARER * second or p.watch.most_lost_imus == 0:
         named = worst if rig.planar == 0 else -1
-        handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_DISAGREE, named, off, limit)
+        react(parameters, state, Cause.IMUS_DISAGREE, named, off, limit)
         return
     imus.excluded[worst] = 1
-    s.watch.contradicted_for = 0.0
+    w.contradicted_for = 0.0
     for k in range(IMU_COUNT):
         reset(m, k)
     report_event(s.events, Cause.IMU_DISAGREES, worst, off, limit)
 
 
 @kernel
-def check_limits(
-    p: Record, s: Record, rig: Record, time: Record, imu_parameters: Record, imus: Record, pose: Record, filter_trusted: int,
-    reference: Record, command_limit: float, pid: Record,
-) -> int:  # fmt: skip
-    """After the commands, while there is motion: hold everything against its limit.
-
-    Returns:
-        The cause of a fault, or `Cause.NONE`.
+def check_limits(parameters: Record, state: Record) -> int:
+    """After the commands, while there is motion: hold everything against its limit; returns the cause of a fault, or
+    `Cause.NONE`.
     """
-    w, limits = s.watch, p.watch
-    for k in range(rig.legs):
-        if not (np.isfinite(pid.command[k]) and np.isfinite(pose.lengths[k])):
-            handle_cause(p, s, rig, time, reference, pid, Cause.NOT_FINITE, k, np.nan, np.nan)
+    p, s = parameters[()], state[()]
+    w, limits, pose, period = s.safety.watch, p.safety.watch, s.pose, p.rig.period
+    for k in range(p.rig.legs):
+        if not (np.isfinite(s.pid.command[k]) and np.isfinite(pose.lengths[k])):
+            react(parameters, state, Cause.NOT_FINITE, k, np.nan, np.nan)
             return Cause.NOT_FINITE.value
-    if s.mode < Mode.RUNNING or s.request != Request.ENABLED:
+    if s.safety.mode < Mode.RUNNING or s.safety.request != Request.ENABLED:
         return Cause.NONE.value
     lost = 0
     for k in range(IMU_COUNT):
-        lost += imu_parameters.present[k] != 0 and imus.used[k] == 0
+        lost += p.imus.present[k] != 0 and s.imus.used[k] == 0
     if lost > limits.most_lost_imus:
-        handle_cause(
-            p, s, rig, time, reference, pid, Cause.IMUS_LOST, -1, float(lost), float(limits.most_lost_imus)
-        )  # fmt: skip
-    if pose.conditioning < limits.conditioning and filter_trusted == 0:
-        handle_cause(p, s, rig, time, reference, pid, Cause.ILL_CONDITIONED, -1, pose.conditioning, limits.conditioning)
-    for k in range(rig.legs):
-        length, command, d, a = pose.lengths[k], pid.command[k], pose.directions[k], pose.arms[k]
+        react(parameters, state, Cause.IMUS_LOST, -1, float(lost), float(limits.most_lost_imus))
+    if pose.conditioning < limits.conditioning and s.mechanism.trusted == 0:
+        react(parameters, state, Cause.ILL_CONDITIONED, -1, pose.conditioning, limits.conditioning)
+    for k in range(p.rig.legs):
+        length, command, d, a = pose.lengths[k], s.pid.command[k], pose.directions[k], pose.arms[k]
         low, high = limits.plausible_lengths[k, 0], limits.plausible_lengths[k, 1]
         if not low <= length <= high:
-            handle_cause(p, s, rig, time, reference, pid, Cause.IMPLAUSIBLE, k, length, low if length < low else high)
+            react(parameters, state, Cause.IMPLAUSIBLE, k, length, low if length < low else high)
             return Cause.IMPLAUSIBLE.value
         low, high = limits.lengths[k, 0], limits.lengths[k, 1]
         if not low <= length <= high:
-            handle_cause(p, s, rig, time, reference, pid, Cause.BEYOND_STROKE, k, length, low if length < low else high)
+            react(parameters, state, Cause.BEYOND_STROKE, k, length, low if length < low else high)
         t = pose.smooth_twist
         w.speed[k] = (
             d[0] * (t[0] + t[4] * a[2] - t[5] * a[1])
@@ -194,18 +172,18 @@ def check_limits(
             + d[2] * (t[2] + t[3] * a[1] - t[4] * a[0])
         )
         if not abs(w.speed[k]) <= limits.speed:
-            handle_cause(p, s, rig, time, reference, pid, Cause.TOO_FAST, k, abs(w.speed[k]), limits.speed)
-        off = abs(pid.error[k])
-        w.off_reference_for[k] = w.off_reference_for[k] + rig.period if off > limits.following else 0.0
+            react(parameters, state, Cause.TOO_FAST, k, abs(w.speed[k]), limits.speed)
+        off = abs(s.pid.error[k])
+        w.off_reference_for[k] = w.off_reference_for[k] + period if off > limits.following else 0.0
         if w.off_reference_for[k] > limits.patience:
-            handle_cause(p, s, rig, time, reference, pid, Cause.FOLLOWING_ERROR, k, off, limits.following)
+            react(parameters, state, Cause.FOLLOWING_ERROR, k, off, limits.following)
         # A drive is behind its command, by less than what it may deviate by.
         off = abs(w.speed[k] - command)
-        w.deviating_for[k] = w.deviating_for[k] + rig.period if off > limits.drive_deviation else 0.0
+        w.deviating_for[k] = w.deviating_for[k] + period if off > limits.drive_deviation else 0.0
         if w.deviating_for[k] > limits.patience:
-            handle_cause(p, s, rig, time, reference, pid, Cause.DRIVE_DEVIATES, k, off, limits.drive_deviation)
+            react(parameters, state, Cause.DRIVE_DEVIATES, k, off, limits.drive_deviation)
             return Cause.DRIVE_DEVIATES.value
-        w.saturated_for[k] = w.saturated_for[k] + rig.period if abs(command) >= command_limit else 0.0
+        w.saturated_for[k] = w.saturated_for[k] + period if abs(command) >= p.pid.limit else 0.0
         if w.saturated_for[k] > limits.saturation:
-            handle_cause(p, s, rig, time, reference, pid, Cause.SATURATED, k, w.saturated_for[k], limits.saturation)
+            react(parameters, state, Cause.SATURATED, k, w.saturated_for[k], limits.saturation)
     return Cause.NONE.value

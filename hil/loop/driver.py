@@ -14,7 +14,7 @@ from numba import typeof
 from numba.core import event
 from numpy.typing import NDArray
 
-from controller.cycle import END, HEADING, LEGS, PLATFORM, SCREENING, run_stages
+from controller.cycle import CycleStage, run_stages
 from controller.planning.stream import STREAM_READER
 from controller.safety.causes import Cause, Mode
 from hil.loop.kernels import begin_cycle, end_cycle, exchange_fmu, periods_passed, process_feedback, run_loop
@@ -153,16 +153,16 @@ class Loop:
             work["stage_ns"][Stage.SENSE] = now(timespec) - began
             failed = process_feedback(parameters, state, work, status)
             if not failed:
-                first = SCREENING
+                first = CycleStage.SCREENING
                 if filters is not None and safety["mode"] != Mode.FAULT:
-                    run_stages(parameters, state, measurement, segments, marks, SCREENING, LEGS)
+                    run_stages(parameters, state, measurement, segments, marks, CycleStage.SCREENING, CycleStage.LEGS)
                     t0 = now(timespec)
                     filters.step_legs(state)
                     t1 = now(timespec)
                     filters.step_platform(state)
-                    marks["ns"][LEGS], marks["ns"][PLATFORM] = t1 - t0, now(timespec) - t1
-                    first = HEADING
-                failed = run_stages(parameters, state, measurement, segments, marks, first, END)
+                    marks["ns"][CycleStage.LEGS], marks["ns"][CycleStage.PLATFORM] = t1 - t0, now(timespec) - t1
+                    first = CycleStage.HEADING
+                failed = run_stages(parameters, state, measurement, segments, marks, first, CycleStage.END)
             end_cycle(parameters, state, segments, self.records, clock, self.script, self.link, work, streamed, failed)
         if cause != Cause.NONE:
             stop_quickly(rig)

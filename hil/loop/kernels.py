@@ -6,28 +6,14 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from controller.cycle import (
-    CONTROL,
-    END,
-    HEADING,
-    LEGS,
-    MECHANISM,
-    PLATFORM,
-    POSE,
-    REFINEMENT,
-    SCREENING,
-    hear_rig,
-    prepare_next,
-    react,
-    run_stages,
-    skip_periods,
-)
+from controller.cycle import CycleStage, prepare_next, run_stages, skip_periods
 from controller.estimation.whole_mechanism.filter import extrapolate_covariance
 from controller.least_squares import factor_cholesky, invert_cholesky
 from controller.planning.stream import stream_cause, take_plan
 from controller.reference import motion_cycle
 from controller.safety.causes import EVENT_SLOTS, REACTION, Cause, Request
-from controller.safety.stop import has_stopped, ramp_down
+from controller.safety.stop import has_stopped, ramp_down, react
+from controller.safety.watch import hear_rig
 from hil.loop.records import EmulatedUdp, Link, RigHandle, Stage, StopRequest, TargetStream
 from hil.realtime.clock import FREE, REAL, finish, start, wait
 from hil.rigs import ANSWERED, SILENT
@@ -37,7 +23,7 @@ from plant.compiled import Record, kernel, store_release
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
 from plant.fmu.calls import advance, read_imus, read_truth, write_command, write_drive_mode
 from plant.imu import measure
-from plant.mechanism import LEGS as LEG_COUNT
+from plant.mechanism import LEGS
 from plant.pose import Array
 from plant.stopwatch import now
 
@@ -70,7 +56,7 @@ def exchange_fmu(
         status = read_imus(fmu) | read_truth(fmu)
         measure(imu, fmu[()].imu, feedback.measurement)
         feedback.truth[:] = fmu[()].truth
-        for k in range(LEG_COUNT):
+        for k in range(LEGS):
             feedback.sent[k] = 0.0 if request == Request.BRAKED else command[k]
         for k in range(IMU_COUNT):
             feedback.sequence[k] += 1
@@ -176,9 +162,7 @@ def _ask(work: Record, cause: int) -> None:
 def process_feedback(parameters: Record, state: Record, work: Record, status: int) -> int:
     """After an exchange: note which samples are new, and react to the rig's status; returns a cause if the cycle cannot run."""
     w = work[()]
-    feedback = w.feedback
-    p, s = parameters[()], state[()]
-    missed = s.time.missed
+    feedback, missed = w.feedback, state[()].time.missed
     w.silent = w.silent + 1 + missed if status == SILENT else 0
     for k in range(IMU_COUNT):
         fresh = feedback.sequence[k] != w.sequence[k]
@@ -186,7 +170,7 @@ def process_feedback(parameters: Record, state: Record, work: Record, status: in
         w.sequence[k] = feedback.sequence[k]
     if status != ANSWERED and status != SILENT:
         react(parameters, state, Cause.RIG_FAILED, -1, float(status), np.nan)
-        ramp_down(p.safety.stop, p.rig, s.time, s.pid)
+        ramp_down(parameters, state)
         return Cause.RIG_FAILED.value
     hear_rig(parameters, state, w.sample_age, feedback.drive, w.silent)
     return Cause.NONE.value
@@ -233,7 +217,7 @@ def record_cycle(parameters: Record, state: Record, clock: Record, work: Record,
     record.reference[:] = s.reference.motion
     record.command[:] = s.pid.command
     record.truth[:] = w.feedback.truth
-    for k in range(LEG_COUNT):
+    for k in range(LEGS):
         for i in range(3):
             record.residuals[k, i] = s.legs.directions[k, i] - s.pose.directions[k, i] if s.legs.used[k] != 0.0 else np.nan
     update_covariance(p.mechanism, p.rig, s.time, s.mechanism, s.pose, w)
@@ -277,9 +261,10 @@ def end_cycle(
     record_cycle(parameters, state, clock, work, failed, record)
     update_next_reference(parameters, state, segments, streamed)
     stage_ns, ns = w.stage_ns, w.marks.ns
-    stage_ns[Stage.LEGS], stage_ns[Stage.PLATFORM] = ns[SCREENING] + ns[LEGS], ns[PLATFORM] + ns[HEADING]
-    stage_ns[Stage.POSE], stage_ns[Stage.REFINEMENT] = ns[POSE], ns[REFINEMENT]
-    stage_ns[Stage.MECHANISM], stage_ns[Stage.CONTROL] = ns[MECHANISM], ns[CONTROL]
+    stage_ns[Stage.LEGS] = ns[CycleStage.SCREENING] + ns[CycleStage.LEGS]
+    stage_ns[Stage.PLATFORM] = ns[CycleStage.PLATFORM] + ns[CycleStage.HEADING]
+    stage_ns[Stage.POSE], stage_ns[Stage.REFINEMENT] = ns[CycleStage.POSE], ns[CycleStage.REFINEMENT]
+    stage_ns[Stage.MECHANISM], stage_ns[Stage.CONTROL] = ns[CycleStage.MECHANISM], ns[CycleStage.CONTROL]
     stage_ns[Stage.RECORD] = now(timespec) - began
     link[Link.START] = clock[()].start
     record.stage_ns[:] = stage_ns
@@ -303,7 +288,9 @@ def run_loop(
         status = exchange(rig.fmu, rig.imu, rig.udp, rig.emulated, parameters, state, work, timespec)
         failed = process_feedback(parameters, state, work, status)
         if failed == Cause.NONE:
-            failed = run_stages(parameters, state, w.feedback.measurement, segments, w.marks, SCREENING, END)
+            failed = run_stages(
+                parameters, state, w.feedback.measurement, segments, w.marks, CycleStage.SCREENING, CycleStage.END
+            )
         end_cycle(parameters, state, segments, records, clock, script, link, work, streamed, failed)
     if cause != Cause.NONE:
         hold_brakes(rig.fmu, rig.udp, rig.emulated, parameters, state, work, timespec)

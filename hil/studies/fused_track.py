@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.cycle import CONTROL, MARKS, MECHANISM, REFINEMENT, SCREENING, STATE, run_stages
-from controller.cycle import LEGS as LEG_FILTERS
+from controller.cycle import MARKS, STATE, CycleStage, run_stages
 from controller.estimation.whole_mechanism.filter import extrapolate_covariance
 from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.imposed import ImposedMotion
@@ -154,20 +153,20 @@ def _follow(parameters: Record, state: Record, raw: Array, fused: Record, segmen
     p, s, m = parameters[()], state[()], marks
     for i in range(raw.shape[0]):
         f = fused[i]
-        run_stages(parameters, state, raw[i], segments, marks, SCREENING, REFINEMENT)
+        run_stages(parameters, state, raw[i], segments, marks, CycleStage.SCREENING, CycleStage.REFINEMENT)
         f.positions[CLOSED], f.rotations[CLOSED] = s.pose.position, s.pose.rotation
         f.directions[:], f.vertical[:] = s.legs.directions, s.platform.vertical
         f.leg_covariances[:], f.vertical_covariance[:] = s.legs.covariance[:, :2, :2], s.platform.covariance[:3, :3]
-        run_stages(parameters, state, raw[i], segments, marks, REFINEMENT, MECHANISM)
+        run_stages(parameters, state, raw[i], segments, marks, CycleStage.REFINEMENT, CycleStage.MECHANISM)
         f.positions[REFINED], f.rotations[REFINED] = s.pose.position, s.pose.rotation
         for j in range(6):
             for k in range(6):
                 f.information[j, k] = s.pose.information[max(j, k), min(j, k)]
-        run_stages(parameters, state, raw[i], segments, marks, MECHANISM, CONTROL)
+        run_stages(parameters, state, raw[i], segments, marks, CycleStage.MECHANISM, CycleStage.CONTROL)
         f.positions[WHOLE], f.rotations[WHOLE] = s.pose.position, s.pose.rotation
         extrapolate_covariance(p.mechanism.filter, s.mechanism.filter, s.time.cycle * p.rig.period, f.covariance)
-        f.ns[LEGS_ALONE] = m.ns[LEG_FILTERS]
-        f.ns[CLOSED] = m.ns[:REFINEMENT].sum()
-        f.ns[REFINED] = f.ns[CLOSED] + m.ns[REFINEMENT]
-        f.ns[WHOLE] = f.ns[REFINED] + m.ns[MECHANISM]
+        f.ns[LEGS_ALONE] = m.ns[CycleStage.LEGS]
+        f.ns[CLOSED] = m.ns[: CycleStage.REFINEMENT].sum()
+        f.ns[REFINED] = f.ns[CLOSED] + m.ns[CycleStage.REFINEMENT]
+        f.ns[WHOLE] = f.ns[REFINED] + m.ns[CycleStage.MECHANISM]
         s.time.cycle += 1

@@ -15,8 +15,7 @@ import numpy as np
 from vqf import VQF
 
 from controller.calibration.file import Calibration, load_calibration
-from controller.cycle import HEADING, MARKS, MECHANISM, SCREENING, STATE, cycle_parameters, run_stages
-from controller.cycle import LEGS as LEG_FILTERS
+from controller.cycle import MARKS, STATE, CycleStage, cycle_parameters, run_stages
 from controller.direct_kinematics import solve_batch
 from controller.estimation.filterpy_filters import FilterpyFilters
 from controller.estimation.leg_filter import leg_direction, start_leg
@@ -139,10 +138,10 @@ def _filterpy(readings: _Readings) -> PoseTrack:
     segments, marks, pose = np.zeros((LEGS, 1, 5)), np.zeros((), MARKS)[()], state["pose"]
     for i, raw in enumerate(readings.raw):
         began = time.perf_counter_ns()
-        run_stages(parameters, state, raw, segments, marks, SCREENING, LEG_FILTERS)
+        run_stages(parameters, state, raw, segments, marks, CycleStage.SCREENING, CycleStage.LEGS)
         filters.step_legs(state)
         filters.step_platform(state)
-        run_stages(parameters, state, raw, segments, marks, HEADING, MECHANISM)
+        run_stages(parameters, state, raw, segments, marks, CycleStage.HEADING, CycleStage.MECHANISM)
         fused["ns"][i, REFINED] = time.perf_counter_ns() - began
         fused["positions"][i, REFINED], fused["rotations"][i, REFINED] = pose["position"], pose["rotation"]
         lower = np.tril(pose["information"])

@@ -6,7 +6,7 @@ packages: any edit gives a new folder.
 """
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -33,7 +33,7 @@ def record_dtype(**fields: Any) -> np.dtype[Any]:
     return np.dtype(list(fields.items()), align=True)
 
 
-def filled(dtype: np.dtype[Any], values: Mapping[str, Any]) -> Record:
+def filled(dtype: np.dtype[Any], /, **values: Any) -> Record:
     """A structured array of shape () with these values by field; the other fields are zero."""
     record: Record = np.zeros((), dtype)
     for name, value in values.items():

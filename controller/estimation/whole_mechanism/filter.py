@@ -16,19 +16,34 @@ motion model. The Jacobian is taken at a motion low-passed over 30 ms: at the no
 excitation, and the biases would drift at rest.
 """
 
-from controller.estimation.whole_mechanism.imu_errors import ERRORS
+import numpy as np
+
+from controller.estimation.leg_filter import add_jerk
+from controller.estimation.platform_filter import cut_innovation, take_scalar
+from controller.estimation.whole_mechanism.imu_errors import (
+    ACCELEROMETER_SCALE,
+    ERRORS,
+    distort,
+    distort_jacobian,
+    error_gradient,
+)
 from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, ROWS, rig_start
 from controller.estimation.whole_mechanism.readings import (
     ACCELERATION,
     ANGULAR_ACCELERATION,
     MOTION_STATES,
     RATE,
+    READINGS,
     VELOCITY,
+    find_rig_jacobian,
+    predict_readings,
+    rig_state,
 )
-from controller.estimation.whole_mechanism.update import begin_update, end_update, publish, update_scalar
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import IMU_COUNT
+from plant.mechanism import LEGS
 from plant.pose import Array, rotate_by_vector
+from plant.vectors import dot, rotate, vector
 
 _FIRST_SIGMAS = (0.01, 0.05, 0.1, 0.5, 5.0, 50.0)
 """Uncertainty of the motion at the start: position [m], rotation [rad], and their derivatives."""
@@ -36,11 +51,13 @@ _FIRST_SIGMAS = (0.01, 0.05, 0.1, 0.5, 5.0, 50.0)
 _PREPARING_ROWS = 14
 """What prediction costs, in scalar updates."""
 
+_OFFSET_LASTS_S = 100.0
+"""Time in which the offset of the heading may change by as much as its uncertainty at the start [s]."""
+
 
 @kernel
-def start_filter(parameters: Record, state: Record, time: float, position: Array, rotation: Array, twist: Array) -> None:
+def start_filter(p: Record, f: Record, time: float, position: Array, rotation: Array, twist: Array) -> None:
     """Start from a pose (3,), (3, 3) and twist (6,) at `time`."""
-    p, f = parameters, state
     f.running = 1
     f.time = f.published_time = time
     f.position[:] = position
@@ -59,20 +76,16 @@ def start_filter(parameters: Record, state: Record, time: float, position: Array
     for i in range(states):
         for j in range(states):
             f.covariance[i, j] = 0.0
-    for block in range(6):
-        for i in range(3):
-            f.covariance[3 * block + i, 3 * block + i] = _FIRST_SIGMAS[block] ** 2
+    for i in range(MOTION_STATES):
+        f.covariance[i, i] = _FIRST_SIGMAS[i // 3] ** 2
     for k in range(IMU_COUNT):
         for i in range(p.errors):
+            at, known = MOTION_STATES + k * p.errors + i, p.prior[k * ERRORS + i]
             for other in range(IMU_COUNT):
                 for j in range(p.errors):
-                    f.covariance[MOTION_STATES + k * p.errors + i, MOTION_STATES + other * p.errors + j] = p.prior[
-                        k * ERRORS + i, other * ERRORS + j
-                    ]
+                    f.covariance[at, MOTION_STATES + other * p.errors + j] = known[other * ERRORS + j]
             for j in range(p.rig):
-                covariance = p.prior[k * ERRORS + i, ALL_ERRORS + j]
-                f.covariance[MOTION_STATES + k * p.errors + i, rig + j] = covariance
-                f.covariance[rig + j, MOTION_STATES + k * p.errors + i] = covariance
+                f.covariance[at, rig + j] = f.covariance[rig + j, at] = known[ALL_ERRORS + j]
     for i in range(p.rig):
         for j in range(p.rig):
             f.covariance[rig + i, rig + j] = p.prior[ALL_ERRORS + i, ALL_ERRORS + j]
@@ -80,13 +93,12 @@ def start_filter(parameters: Record, state: Record, time: float, position: Array
         f.covariance[states - 1, states - 1] = p.offset_variance
     f.row = -1
     f.collected = 0
-    publish(state)
+    _publish(f)
 
 
 @kernel
-def accumulate_sample(state: Record, sample: Array, used: Array, time: float) -> None:
+def accumulate_sample(f: Record, sample: Array, used: Array, time: float) -> None:
     """Add a calibrated sample (3, 7, 3) of the IMUs that are `used` (7,) to the window."""
-    f = state
     if f.collected == 0:
         f.sum[:] = 0.0
         f.samples[:] = 0
@@ -103,36 +115,210 @@ def accumulate_sample(state: Record, sample: Array, used: Array, time: float) ->
 
 
 @kernel
-def accumulate_field(state: Record, field: Array, time: float) -> None:
+def accumulate_field(f: Record, field: Array, time: float) -> None:
     """Keep a calibrated sample (3,) of the platform's magnetometer for the next update."""
-    f = state
     f.field[:] = field
     f.field_time = time
     f.field_used = 1
 
 
 @kernel
-def step_filter(parameters: Record, geometry: Record, state: Record) -> None:
+def step_filter(p: Record, geometry: Record, f: Record) -> None:
     """The share of this cycle in the update; a new one begins when the window is full."""
-    p, f = parameters, state
     if f.collected >= p.window:
-        begin_update(parameters, geometry, state)
+        _begin_update(p, geometry, f)
     if f.row < 0:
         return
     f.update_step += 1
     whole = _PREPARING_ROWS + ROWS
     last = min(max(-(-whole * f.update_step // p.window) - _PREPARING_ROWS, 0), ROWS)
     while f.row < last:
-        update_scalar(parameters, state, f.row)
+        _update_scalar(p, f, f.row)
         f.row += 1
     if f.row == ROWS:
-        end_update(parameters, state)
+        _end_update(p, f)
 
 
 @kernel
-def extrapolate(state: Record, time: float, position: Array, rotation: Array, twist: Array, acceleration: Array) -> None:
+def _begin_update(p: Record, geometry: Record, f: Record) -> None:
+    """Begin an update with the samples of a full window: predict, take the heading, and predict the readings."""
+    if f.row >= 0:
+        # The windows have overtaken the update, which happens when cycles are missed.
+        while f.row < ROWS:
+            _update_scalar(p, f, f.row)
+            f.row += 1
+        _end_update(p, f)
+    time = f.sum_time / f.collected
+    for k in range(IMU_COUNT):
+        f.sample_used[k] = f.samples[k]
+        for i in range(READINGS):
+            f.sample[k, i] = f.sum[k, i] / max(f.samples[k], 1)
+    f.collected = 0
+    _predict(p, f, time - f.time)
+    f.time = time
+    f.change[:] = 0.0
+    f.row = f.update_step = 0
+    if f.field_used != 0:
+        _update_heading(p, f)
+    x, smooth = f.motion, f.smooth_motion
+    predict_readings(geometry, f.position, f.rotation, smooth, True, f.smooth_predicted, f.jacobian, f.readings_scratch)
+    predict_readings(geometry, f.position, f.rotation, x, False, f.predicted, f.jacobian, f.readings_scratch)
+    if p.errors > ACCELEROMETER_SCALE:
+        for k in range(IMU_COUNT):
+            distort_jacobian(f.errors[k], f.jacobian[k])
+    if p.rig > 0:
+        find_rig_jacobian(geometry, f.position, f.rotation, smooth, f.errors, f.jacobian, f.rig_jacobian)
+
+
+@kernel
+def _predict(p: Record, f: Record, period: float) -> None:
+    """Carry motion and covariance on by `period` [s]."""
+    t, half = period, 0.5 * period * period
+    x, c = f.motion, f.covariance
+    for i in range(3):
+        f.position[i] += t * x[VELOCITY, i] + half * x[ACCELERATION, i]
+        f.turn[i] = t * x[RATE, i] + half * x[ANGULAR_ACCELERATION, i]
+        x[VELOCITY, i] += t * x[ACCELERATION, i]
+        x[RATE, i] += t * x[ANGULAR_ACCELERATION, i]
+    rotate_by_vector(f.rotation, f.turn)
+    share = t / (t + p.smoothing)
+    for block in range(4):
+        for i in range(3):
+            f.low_passed[0, block, i] += share * (x[block, i] - f.low_passed[0, block, i])
+            f.low_passed[1, block, i] += share * (f.low_passed[0, block, i] - f.low_passed[1, block, i])
+            # Low-passed once and twice, these have one and two lags.
+            f.smooth_motion[block, i] = 2.0 * f.low_passed[0, block, i] - f.low_passed[1, block, i]
+    # theta+ = (I + skew(turn)) theta + t d_omega + t^2/2 d_alpha, first by rows and then by columns.
+    states = p.states
+    r0, r1, r2 = f.turn[0], f.turn[1], f.turn[2]
+    for j in range(states):
+        x0, x1, x2 = c[3, j], c[4, j], c[5, j]
+        c[3, j] += r1 * x2 - r2 * x1
+        c[4, j] += r2 * x0 - r0 * x2
+        c[5, j] += r0 * x1 - r1 * x0
+    for i in range(6):
+        for j in range(states):
+            c[i, j] += t * c[6 + i, j] + half * c[12 + i, j]
+            c[6 + i, j] += t * c[12 + i, j]
+    for i in range(states):
+        x0, x1, x2 = c[i, 3], c[i, 4], c[i, 5]
+        c[i, 3] += r1 * x2 - r2 * x1
+        c[i, 4] += r2 * x0 - r0 * x2
+        c[i, 5] += r0 * x1 - r1 * x0
+        for j in range(6):
+            c[i, j] += t * c[i, 6 + j] + half * c[i, 12 + j]
+            c[i, 6 + j] += t * c[i, 12 + j]
+    for i in range(6):
+        add_jerk(c, i, 6 + i, 12 + i, p.jerk[i // 3], t)
+    for k in range(IMU_COUNT):
+        for i in range(min(p.errors, ACCELEROMETER_SCALE)):
+            at = MOTION_STATES + k * p.errors + i
+            c[at, at] += p.bias_walk[i // 3] * t
+    if p.heading != 0:
+        c[states - 1, states - 1] += p.offset_variance * t / _OFFSET_LASTS_S
+    # The updates take the matrix for symmetric.
+    for i in range(states):
+        for j in range(i):
+            mean = 0.5 * (c[i, j] + c[j, i])
+            c[i, j] = mean
+            c[j, i] = mean
+
+
+@kernel
+def _update_scalar(p: Record, f: Record, row: int) -> None:
+    """Take one scalar of the sample into covariance and change."""
+    k, m = row // READINGS, row % READINGS
+    if f.sample_used[k] == 0:
+        return
+    sensor = m // 3
+    states, start = p.states, MOTION_STATES + k * p.errors
+    h, gain, change, c = f.jacobian[k, m], f.gain, f.change, f.covariance
+    expected = distort(f.errors[k], sensor, vector(f.predicted[k, 3 * sensor :]))
+    innovation = f.sample[k, m] - expected[m % 3] - f.errors[k, m]
+    variance = p.variance[sensor] / f.sample_used[k]
+    for i in range(states):
+        gain[i] = 0.0
+    for j in range(MOTION_STATES):
+        weight = h[j]
+        innovation -= weight * change[j]
+        for i in range(states):
+            gain[i] += weight * c[j, i]
+    error_gradient(f.errors[k], f.smooth_predicted[k], m, f.gradient)
+    for j in range(p.errors):
+        weight = f.gradient[j]
+        if weight != 0.0:
+            innovation -= weight * change[start + j]
+            for i in range(states):
+                gain[i] += weight * c[start + j, i]
+    first = 8 if p.rig == 0 else 0 if k < LEGS else 6
+    for j in range(first, 8):
+        weight, which = f.rig_jacobian[k, m, j], rig_state(k, j)
+        at = rig_start(p) + which
+        innovation -= weight * (f.rig[which] + change[at])
+        for i in range(states):
+            gain[i] += weight * c[at, i]
+    for j in range(MOTION_STATES):
+        variance += h[j] * gain[j]
+    for j in range(p.errors):
+        variance += f.gradient[j] * gain[start + j]
+    for j in range(first, 8):
+        variance += f.rig_jacobian[k, m, j] * gain[rig_start(p) + rig_state(k, j)]
+    take_scalar(c, gain, change, states, innovation, variance)
+
+
+@kernel
+def _update_heading(p: Record, f: Record) -> None:
+    """Take the sample of the magnetometer, before all others: the angle about the vertical by which the field, turned into {1},
+    is off its direction. An error of the rotation turns it by -axis^T theta, and the offset adds to it.
+    """
+    f.field_used = 0
+    c, gain, states = f.covariance, f.gain, p.states
+    north, east, axis = vector(p.field_axes[0]), vector(p.field_axes[1]), vector(p.field_axes[2])
+    field = rotate(f.rotation, vector(f.field))
+    for i in range(states):
+        gain[i] = c[states - 1, i] - axis[0] * c[3, i] - axis[1] * c[4, i] - axis[2] * c[5, i]
+    variance = gain[states - 1] - axis[0] * gain[3] - axis[1] * gain[4] - axis[2] * gain[5] + p.heading_variance
+    # The rotation is that at the time of the update.
+    turned = (f.field_time - f.time) * dot(axis, vector(f.motion[RATE]))
+    innovation = np.arctan2(dot(east, field), dot(north, field)) + turned - f.heading_offset
+    take_scalar(c, gain, f.change, states, cut_innovation(innovation, variance), variance)
+
+
+@kernel
+def _end_update(p: Record, f: Record) -> None:
+    """Put the change into the motion and the errors."""
+    f.row = -1
+    for i in range(3):
+        f.position[i] += f.change[i]
+        f.turn[i] = f.change[3 + i]
+        for block in range(4):
+            f.motion[block, i] += f.change[6 + 3 * block + i]
+    rotate_by_vector(f.rotation, f.turn)
+    for k in range(IMU_COUNT):
+        for i in range(p.errors):
+            f.errors[k, i] += f.change[MOTION_STATES + k * p.errors + i]
+    for i in range(p.rig):
+        f.rig[i] += f.change[rig_start(p) + i]
+    if p.heading != 0:
+        f.heading_offset += f.change[p.states - 1]
+    _publish(f)
+
+
+@kernel
+def _publish(f: Record) -> None:
+    """Let others see the result of a complete update."""
+    f.published_time = f.time
+    f.published_position[:] = f.position
+    f.published_rotation[:] = f.rotation
+    f.published_motion[:] = f.motion
+    for i in range(MOTION_STATES):
+        for j in range(MOTION_STATES):
+            f.published_covariance[i, j] = f.covariance[i, j]
+
+
+@kernel
+def extrapolate(f: Record, time: float, position: Array, rotation: Array, twist: Array, acceleration: Array) -> None:
     """Carry what is known to `time`: write the pose (3,), (3, 3), twist (6,) and acceleration (6,)."""
-    f = state
     t = time - f.published_time
     x = f.published_motion
     for i in range(3):
@@ -148,9 +334,8 @@ def extrapolate(state: Record, time: float, position: Array, rotation: Array, tw
 
 
 @kernel
-def extrapolate_covariance(parameters: Record, state: Record, time: float, covariance: Array) -> None:
+def extrapolate_covariance(p: Record, f: Record, time: float, covariance: Array) -> None:
     """Write the covariance (6, 6) of the pose carried to `time`, and add what the rig's errors leave that are not estimated."""
-    p, f = parameters, state
     t = time - f.published_time
     half, c = 0.5 * t * t, f.published_covariance
     for i in range(6):

@@ -2,18 +2,11 @@
 
 import numpy as np
 
-from controller.estimation.whole_mechanism.imu_errors import (
-    ERRORS,
-)
-from controller.estimation.whole_mechanism.readings import (
-    MOTION_STATES,
-    READINGS,
-    READINGS_SCRATCH,
-)
-from controller.estimation.whole_mechanism.rig_jacobian import RIG_ERRORS
+from controller.estimation.whole_mechanism.imu_errors import ERRORS
+from controller.estimation.whole_mechanism.readings import MOTION_STATES, READINGS, READINGS_SCRATCH, RIG_ERRORS
 from controller.rig import MagneticField
 from controller.settings import FusionSettings
-from plant.compiled import Record, kernel, record_dtype
+from plant.compiled import Record, filled, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import UnknownNameError
 from plant.pose import Array
@@ -28,77 +21,64 @@ ROWS = IMU_COUNT * READINGS
 
 WINDOW_S = 0.005
 _SMOOTHING_S = 0.03
+
 FILTER_PARAMETERS = record_dtype(
-    window=np.int64,
-    errors=np.int64,
-    rig=np.int64,
-    states=np.int64,
-    smoothing=np.float64,
-    jerk=(np.float64, 2),
-    bias_walk=(np.float64, 2),
-    variance=(np.float64, 2),
-    prior=(np.float64, (ALL_ERRORS + RIG_ERRORS, ALL_ERRORS + RIG_ERRORS)),
-    floor=(np.float64, 2),
-    heading=np.int64,
-    field_axes=(np.float64, (3, 3)),
-    heading_variance=np.float64,
-    offset_variance=np.float64,
+    window=np.int64,  # samples that are averaged
+    errors=np.int64,  # estimated errors of each IMU, 0 for no filter
+    rig=np.int64,  # estimated errors of the rig
+    states=np.int64,  # all states
+    smoothing=np.float64,  # time constant of the motion at which the Jacobian is taken; infinite if set from outside [s]
+    jerk=(np.float64, 2),  # spectral densities of the platform's jerk, linear and angular
+    bias_walk=(np.float64, 2),  # spectral densities of the biases' walks, gyroscope and accelerometer
+    variance=(np.float64, 2),  # of one sample, rate [(rad/s)^2] and force [(m/s^2)^2]
+    prior=(np.float64, (ALL_ERRORS + RIG_ERRORS, ALL_ERRORS + RIG_ERRORS)),  # covariance of the errors at the start
+    floor=(np.float64, 2),  # variances of position and rotation that are left as the rig's errors are not estimated
+    heading=np.int64,  # whether there is one
+    field_axes=(np.float64, (3, 3)),  # north, east, and the axis about which a small turn changes the heading, in {1}
+    heading_variance=np.float64,  # of a sample's heading [rad^2]
+    offset_variance=np.float64,  # of the heading's offset [rad^2]
 )
-"""Samples of a window; estimated errors of an IMU, 0 for no filter, and of the rig; all states; time constant of the motion at
-which the Jacobian is taken, infinite if that is set from outside; spectral densities of the platform's jerk (linear,
-angular) and of the biases' walks (gyroscope, accelerometer); variances of one sample (rate, force); the covariance of the
-errors; and the variances of position and rotation that are left because the rig's are not estimated. Then whether there is a
-heading; in {1} the horizontal direction of the magnetic field, that across it and the vertical, and the axis about which a
-small turn changes what the heading seems to be; and the variances of a sample's heading and of its offset.
-"""
+"""Constants of the filter."""
 
 FILTER_STATE = record_dtype(
     running=np.int64,
-    time=np.float64,
+    time=np.float64,  # of the motion, since the first cycle [s]
     position=(np.float64, 3),
     rotation=(np.float64, (3, 3)),
     motion=(np.float64, (4, 3)),
-    low_passed=(np.float64, (2, 4, 3)),
-    smooth_motion=(np.float64, (4, 3)),
+    low_passed=(np.float64, (2, 4, 3)),  # the motion, once and twice
+    smooth_motion=(np.float64, (4, 3)),  # at which the Jacobian is taken
     errors=(np.float64, (IMU_COUNT, ERRORS)),
-    rig=(np.float64, RIG_ERRORS),
+    rig=(np.float64, RIG_ERRORS),  # by how much joints (2, 6, 3) and tilt (2) are off
     covariance=(np.float64, (MOST_STATES, MOST_STATES)),
-    published_time=np.float64,
+    published_time=np.float64,  # what is published is what the last complete update has found
     published_position=(np.float64, 3),
     published_rotation=(np.float64, (3, 3)),
     published_motion=(np.float64, (4, 3)),
     published_covariance=(np.float64, (MOTION_STATES, MOTION_STATES)),
-    sum=(np.float64, (IMU_COUNT, READINGS)),
+    sum=(np.float64, (IMU_COUNT, READINGS)),  # of the samples in the present window
     sum_time=np.float64,
     samples=(np.int64, IMU_COUNT),
     collected=np.int64,
-    field=(np.float64, 3),
+    field=(np.float64, 3),  # the magnetometer's last sample [uT]
     field_time=np.float64,
-    field_used=np.int64,
-    heading_offset=np.float64,
-    sample=(np.float64, (IMU_COUNT, READINGS)),
+    field_used=np.int64,  # whether the field is still to be taken
+    heading_offset=np.float64,  # [rad]
+    sample=(np.float64, (IMU_COUNT, READINGS)),  # mean of the last full window
     sample_used=(np.int64, IMU_COUNT),
-    row=np.int64,
+    row=np.int64,  # next scalar of the sample to take, -1 when none is left
     update_step=np.int64,
-    change=(np.float64, MOST_STATES),
+    change=(np.float64, MOST_STATES),  # of the states, found so far by the update under way
     gain=(np.float64, MOST_STATES),
     turn=(np.float64, 3),
-    frame=(np.float64, (3, 3)),
     predicted=(np.float64, (IMU_COUNT, READINGS)),
     smooth_predicted=(np.float64, (IMU_COUNT, READINGS)),
     jacobian=(np.float64, (IMU_COUNT, READINGS, MOTION_STATES)),
-    rig_jacobian=(np.float64, (IMU_COUNT, READINGS, 8)),
+    rig_jacobian=(np.float64, (IMU_COUNT, READINGS, 8)),  # by a leg's two joints and the tilt
     gradient=(np.float64, ERRORS),
-    mixed=(np.float64, (3, MOTION_STATES)),
     readings_scratch=READINGS_SCRATCH,
 )
-"""State of the filter, whose update may be under way; `published` is what the last complete one has found.
-
-Times are in seconds since the first cycle. `sum` collects the samples of a window, `sample` is the mean of the last one;
-`row` is the next scalar to take, -1 when none is left. `rig` is by how much joints (2, 6, 3) and tilt (2) are off; the readings
-of a leg's IMU depend on eight of these, its two joints and the tilt. `field` is the magnetometer's last sample, until it
-has been taken.
-"""
+"""State of the filter, whose update may be under way."""
 
 
 def filter_parameters(
@@ -129,38 +109,33 @@ def filter_parameters(
         ],
         3,
     )  # fmt: skip
-    prior, known = np.zeros((ALL_ERRORS + RIG_ERRORS,) * 2), np.diag(np.tile(sigmas**2, IMU_COUNT))
-    if covariance is not None:
-        known = covariance
+    known = np.diag(np.tile(sigmas**2, IMU_COUNT)) if covariance is None else covariance
+    prior = np.zeros((ALL_ERRORS + RIG_ERRORS,) * 2)
     prior[: len(known), : len(known)] = known
     estimated = 0 if errors is None else BLOCKS[errors]
     if inflation is None:
         inflation = 1.0 if covariance is not None else fusion.noise_inflation
     jerk = inflation * np.array([fusion.platform_jerk, fusion.platform_angular_jerk])
     noise = inflation * np.array([fusion.mechanism_gyroscope_noise, fusion.mechanism_accelerometer_noise])
-    parameters: Record = np.zeros((), FILTER_PARAMETERS)
-    values = {
-        "window": max(1, round(WINDOW_S * rate)),
-        "errors": estimated,
-        "rig": len(known) - ALL_ERRORS,
-        "states": MOTION_STATES + IMU_COUNT * estimated + len(known) - ALL_ERRORS + (field is not None),
-        "smoothing": _SMOOTHING_S,
-        "jerk": jerk**2,
-        "bias_walk": (fusion.bias_walk**2, fusion.accelerometer_bias_walk**2),
-        "variance": noise**2 * rate / 2.0,
-        "prior": prior,
-        "floor": np.zeros(2) if floor is None else floor**2 / 3.0,
-    }
+    parameters = filled(
+        FILTER_PARAMETERS,
+        window=max(1, round(WINDOW_S * rate)),
+        errors=estimated,
+        rig=len(known) - ALL_ERRORS,
+        states=MOTION_STATES + IMU_COUNT * estimated + len(known) - ALL_ERRORS + (field is not None),
+        smoothing=_SMOOTHING_S,
+        jerk=jerk**2,
+        bias_walk=(fusion.bias_walk**2, fusion.accelerometer_bias_walk**2),
+        variance=noise**2 * rate / 2.0,
+        prior=prior,
+        floor=np.zeros(2) if floor is None else floor**2 / 3.0,
+    )
     if field is not None:
         up, north = field.vectors
-        values |= {
-            "heading": 1,
-            "field_axes": (north, np.cross(up, north), up - field.vertical / field.horizontal * north),
-            "heading_variance": field.heading_variance(fusion, rate),
-            "offset_variance": fusion.heading_sigma**2,
-        }
-    for name, value in values.items():
-        parameters[name] = value
+        parameters["heading"] = 1
+        parameters["field_axes"] = north, np.cross(up, north), up - field.vertical / field.horizontal * north
+        parameters["heading_variance"] = field.heading_variance(fusion, rate)
+        parameters["offset_variance"] = fusion.heading_sigma**2
     return parameters
 
 

@@ -6,16 +6,19 @@ joint's angles are `a = atan2(-s_y, s_z)` and `b = atan2(s_x, hypot(s_y, s_z))`;
     q' = J s',  q'' = J' s' + J s'',     dq = J ds,  dq' = J' ds + J ds',  dq'' = J'' ds + 2 J' ds' + J ds''
 
 and the leg's IMU reads what `leg_filter.predict_measurement` says. Errors of the motion are (18): of position, rotation (about
-axes of {1}), velocity, angular velocity, acceleration and angular acceleration.
+axes of {1}), velocity, angular velocity, acceleration and angular acceleration. Errors of the rig are (38): of the places of
+the joints and of the tilt of the base.
 """
 
 import numpy as np
 
 from controller.estimation.leg_filter import predict_measurement
+from controller.estimation.whole_mechanism.imu_errors import distort
 from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
 from plant.mechanism import LEGS
 from plant.pose import Array
+from plant.vectors import Vector, add, cross, dot, rotate, rotate_back, scale, subtract, vector
 
 MOTION_STATES = 18
 READINGS = 6
@@ -24,10 +27,11 @@ READINGS = 6
 VELOCITY, RATE, ACCELERATION, ANGULAR_ACCELERATION = range(4)
 """Rows of a motion (4, 3), seen in {1}: velocity of the origin of {2}, angular velocity, and their derivatives."""
 
+JOINTS, TILT = 2 * LEGS * 3, 2
+RIG_ERRORS = JOINTS + TILT
+"""How many errors of the rig can be estimated: the places of the joints (2, 6, 3) [m] and the tilt (2) [rad]."""
+
 READINGS_SCRATCH = record_dtype(
-    arm=(np.float64, 3),
-    turning=(np.float64, 3),
-    vector=(np.float64, (3, 3)),
     gradient=(np.float64, (3, 2, 3)),
     gradient_in_base=(np.float64, (3, 2, 3)),
     angles=(np.float64, 9),
@@ -36,172 +40,117 @@ READINGS_SCRATCH = record_dtype(
 
 
 @kernel
-def cross(x0: float, x1: float, x2: float, y0: float, y1: float, y2: float) -> tuple[float, float, float]:
-    """The product x x y of two vectors."""
-    return x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
-
-
-@kernel
-def _joint_angles(vector: Array, x: Array, gradient: Array) -> None:
-    """Angles, rates and accelerations (6,) of a universal joint from the leg vector and its two derivatives (3, 3) in the joint
-    frame, and the angles' gradient with its two derivatives (3, 2, 3).
+def _joint_angles(x: Vector, y: Vector, z: Vector, angles: Array, gradient: Array) -> None:
+    """Angles, rates and accelerations (6,) of a universal joint from the leg vector's components in the joint frame, each with
+    its two derivatives, and the angles' gradient with its two derivatives (3, 2, 3).
     """
-    x0, y0, z0 = vector[0, 0], vector[0, 1], vector[0, 2]
-    x1, y1, z1 = vector[1, 0], vector[1, 1], vector[1, 2]
-    x2, y2, z2 = vector[2, 0], vector[2, 1], vector[2, 2]
-    # Each quantity with its first and second derivative: h = hypot(y, z), l = |s|^2.
-    h_h, h_h1, h_h2 = y0 * y0 + z0 * z0, 2.0 * (y0 * y1 + z0 * z1), 2.0 * (y1 * y1 + y0 * y2 + z1 * z1 + z0 * z2)
-    h = np.sqrt(h_h)
-    h1 = h_h1 / (2.0 * h)
-    h2 = (h_h2 - 2.0 * h1 * h1) / (2.0 * h)
-    l0, l1, l2 = h_h + x0 * x0, h_h1 + 2.0 * x0 * x1, h_h2 + 2.0 * (x1 * x1 + x0 * x2)
-    u, u1, u2 = _inverse(h_h, h_h1, h_h2)
-    v, v1, v2 = _inverse(l0, l1, l2)
-    w, w1, w2 = _product(h, h1, h2, l0, l1, l2)
-    w, w1, w2 = _inverse(w, w1, w2)
-    c, c1, c2 = _product(-x0, -x1, -x2, w, w1, w2)
-    # Gradient of a is (0, -z, y) / h^2, of b (h^2, -x y, -x z) / (h l).
-    ay, ay1, ay2 = _product(-z0, -z1, -z2, u, u1, u2)
-    az, az1, az2 = _product(y0, y1, y2, u, u1, u2)
-    bx, bx1, bx2 = _product(h, h1, h2, v, v1, v2)
-    by, by1, by2 = _product(c, c1, c2, y0, y1, y2)
-    bz, bz1, bz2 = _product(c, c1, c2, z0, z1, z2)
-    gradient[0, 0, 1], gradient[0, 0, 2] = ay, az
-    gradient[1, 0, 1], gradient[1, 0, 2] = ay1, az1
-    gradient[2, 0, 1], gradient[2, 0, 2] = ay2, az2
-    gradient[0, 1, 0], gradient[0, 1, 1], gradient[0, 1, 2] = bx, by, bz
-    gradient[1, 1, 0], gradient[1, 1, 1], gradient[1, 1, 2] = bx1, by1, bz1
-    gradient[2, 1, 0], gradient[2, 1, 1], gradient[2, 1, 2] = bx2, by2, bz2
-    x[0], x[1] = np.arctan2(-y0, z0), np.arctan2(x0, h)
-    x[2], x[3] = ay * y1 + az * z1, bx * x1 + by * y1 + bz * z1
-    x[4] = ay1 * y1 + az1 * z1 + ay * y2 + az * z2
-    x[5] = bx1 * x1 + by1 * y1 + bz1 * z1 + bx * x2 + by * y2 + bz * z2
+    # Each quantity with its first and second derivative: h = hypot(y, z), ss = |s|^2.
+    hh = (
+        y[0] * y[0] + z[0] * z[0],
+        2.0 * (y[0] * y[1] + z[0] * z[1]),
+        2.0 * (y[1] * y[1] + y[0] * y[2] + z[1] * z[1] + z[0] * z[2]),
+    )
+    root = np.sqrt(hh[0])
+    root1 = hh[1] / (2.0 * root)
+    h = root, root1, (hh[2] - 2.0 * root1 * root1) / (2.0 * root)
+    ss = hh[0] + x[0] * x[0], hh[1] + 2.0 * x[0] * x[1], hh[2] + 2.0 * (x[1] * x[1] + x[0] * x[2])
+    u, c = _inverse(hh), _product(_negative(x), _inverse(_product(h, ss)))
+    # Gradient of a is (0, -z, y) / h^2, of b (h^2, -x y, -x z) / (h ss).
+    ay, az = _product(_negative(z), u), _product(y, u)
+    bx, by, bz = _product(h, _inverse(ss)), _product(c, y), _product(c, z)
+    for n in range(3):
+        gradient[n, 0, 1], gradient[n, 0, 2] = ay[n], az[n]
+        gradient[n, 1, 0], gradient[n, 1, 1], gradient[n, 1, 2] = bx[n], by[n], bz[n]
+    angles[0], angles[1] = np.arctan2(-y[0], z[0]), np.arctan2(x[0], h[0])
+    angles[2], angles[3] = ay[0] * y[1] + az[0] * z[1], bx[0] * x[1] + by[0] * y[1] + bz[0] * z[1]
+    angles[4] = ay[1] * y[1] + az[1] * z[1] + ay[0] * y[2] + az[0] * z[2]
+    angles[5] = bx[1] * x[1] + by[1] * y[1] + bz[1] * z[1] + bx[0] * x[2] + by[0] * y[2] + bz[0] * z[2]
 
 
 @kernel
-def _product(x: float, x1: float, x2: float, y: float, y1: float, y2: float) -> tuple[float, float, float]:
+def _negative(x: Vector) -> Vector:
+    return -x[0], -x[1], -x[2]
+
+
+@kernel
+def _product(x: Vector, y: Vector) -> Vector:
     """A product with its two derivatives."""
-    return x * y, x1 * y + x * y1, x2 * y + 2.0 * x1 * y1 + x * y2
+    return x[0] * y[0], x[1] * y[0] + x[0] * y[1], x[2] * y[0] + 2.0 * x[1] * y[1] + x[0] * y[2]
 
 
 @kernel
-def _inverse(x: float, x1: float, x2: float) -> tuple[float, float, float]:
+def _inverse(x: Vector) -> Vector:
     """1 / x with its two derivatives."""
-    y = 1.0 / x
-    y1 = -x1 * y * y
-    return y, y1, -x2 * y * y - 2.0 * x1 * y * y1
+    y = 1.0 / x[0]
+    y1 = -x[1] * y * y
+    return y, y1, -x[2] * y * y - 2.0 * x[1] * y * y1
 
 
 @kernel
-def predict_leg_readings(
-    joint_rotation: Array, base_joint: Array, platform_joint: Array, up_in_joint: Array, imu_position: Array, gravity: float,
-    position: Array, rotation: Array, motion: Array, derive: bool, readings: Array, jacobian: Array, scratch: Record,
+def _predict_leg(
+    geometry: Record, k: int, position: Array, rotation: Array, motion: Array, derive: bool, readings: Array, jacobian: Array,
+    scratch: Record,
 ) -> None:  # fmt: skip
-    """Write what a leg's IMU reads (6,), and if wanted the derivative by the errors of the motion (6, 18)."""
-    t = scratch
-    arm, turning, vector = t.arm, t.turning, t.vector
-    w0, w1, w2 = motion[RATE, 0], motion[RATE, 1], motion[RATE, 2]
-    e0, e1, e2 = motion[ANGULAR_ACCELERATION, 0], motion[ANGULAR_ACCELERATION, 1], motion[ANGULAR_ACCELERATION, 2]
-    for i in range(3):
-        arm[i] = 0.0
-        for j in range(3):
-            arm[i] += rotation[i, j] * platform_joint[j]
-    r0, r1, r2 = arm[0], arm[1], arm[2]
-    t0, t1, t2 = cross(w0, w1, w2, r0, r1, r2)
-    turning[0], turning[1], turning[2] = t0, t1, t2
-    c0, c1, c2 = cross(w0, w1, w2, t0, t1, t2)
-    f0, f1, f2 = cross(e0, e1, e2, r0, r1, r2)
-    s0, s1, s2 = position[0] + r0 - base_joint[0], position[1] + r1 - base_joint[1], position[2] + r2 - base_joint[2]
-    v0, v1, v2 = motion[VELOCITY, 0] + t0, motion[VELOCITY, 1] + t1, motion[VELOCITY, 2] + t2
-    a0 = motion[ACCELERATION, 0] + f0 + c0
-    a1 = motion[ACCELERATION, 1] + f1 + c1
-    a2 = motion[ACCELERATION, 2] + f2 + c2
-    q = joint_rotation
-    for k in range(3):
-        vector[0, k] = q[0, k] * s0 + q[1, k] * s1 + q[2, k] * s2
-        vector[1, k] = q[0, k] * v0 + q[1, k] * v1 + q[2, k] * v2
-        vector[2, k] = q[0, k] * a0 + q[1, k] * a1 + q[2, k] * a2
-    _joint_angles(vector, t.angles, t.gradient)
-    predict_measurement(t.angles, up_in_joint, imu_position, gravity, readings, t.angle_jacobian)
+    """Write what the IMU of leg `k` reads (6,), and if wanted the derivative by the errors of the motion (6, 18)."""
+    t, frame = scratch, geometry.joint_rotations[k]
+    w, alpha = vector(motion[RATE]), vector(motion[ANGULAR_ACCELERATION])
+    arm = rotate(rotation, vector(geometry.platform_joints[k]))
+    turning = cross(w, arm)
+    s = rotate_back(frame, subtract(add(vector(position), arm), vector(geometry.base_joints[k])))
+    v = rotate_back(frame, add(vector(motion[VELOCITY]), turning))
+    a = rotate_back(frame, add(add(vector(motion[ACCELERATION]), cross(alpha, arm)), cross(w, turning)))
+    _joint_angles((s[0], v[0], a[0]), (s[1], v[1], a[1]), (s[2], v[2], a[2]), t.angles, t.gradient)
+    up, place = geometry.up_in_joint[k], geometry.leg_imu_position[k]
+    predict_measurement(t.angles, up, place, geometry.gravity, readings, t.angle_jacobian)
     if not derive:
         return
     for n in range(3):
         for m in range(2):
+            in_base = rotate(frame, vector(t.gradient[n, m]))
             for i in range(3):
-                g = t.gradient[n, m]
-                t.gradient_in_base[n, m, i] = q[i, 0] * g[0] + q[i, 1] * g[1] + q[i, 2] * g[2]
+                t.gradient_in_base[n, m, i] = in_base[i]
     g, g1, g2 = t.gradient_in_base[0], t.gradient_in_base[1], t.gradient_in_base[2]
     for m in range(READINGS):
-        h = t.angle_jacobian[m]
+        h, row = t.angle_jacobian[m], jacobian[m]
         # Derivatives by s, s' and s'', and from there by the motion.
-        by_s0 = h[0] * g[0, 0] + h[1] * g[1, 0] + h[2] * g1[0, 0] + h[3] * g1[1, 0] + h[4] * g2[0, 0] + h[5] * g2[1, 0]
-        by_s1 = h[0] * g[0, 1] + h[1] * g[1, 1] + h[2] * g1[0, 1] + h[3] * g1[1, 1] + h[4] * g2[0, 1] + h[5] * g2[1, 1]
-        by_s2 = h[0] * g[0, 2] + h[1] * g[1, 2] + h[2] * g1[0, 2] + h[3] * g1[1, 2] + h[4] * g2[0, 2] + h[5] * g2[1, 2]
-        by_v0 = h[2] * g[0, 0] + h[3] * g[1, 0] + 2.0 * (h[4] * g1[0, 0] + h[5] * g1[1, 0])
-        by_v1 = h[2] * g[0, 1] + h[3] * g[1, 1] + 2.0 * (h[4] * g1[0, 1] + h[5] * g1[1, 1])
-        by_v2 = h[2] * g[0, 2] + h[3] * g[1, 2] + 2.0 * (h[4] * g1[0, 2] + h[5] * g1[1, 2])
-        by_a0, by_a1, by_a2 = (
-            h[4] * g[0, 0] + h[5] * g[1, 0],
-            h[4] * g[0, 1] + h[5] * g[1, 1],
-            h[4] * g[0, 2] + h[5] * g[1, 2],
-        )
-        row = jacobian[m]
-        row[0], row[1], row[2] = by_s0, by_s1, by_s2
-        row[6], row[7], row[8] = by_v0, by_v1, by_v2
-        row[12], row[13], row[14] = by_a0, by_a1, by_a2
-        # s' = v + w x r and s'' = a + e x r + w x (w x r), with r turned by the rotation's error.
-        x0, x1, x2 = cross(by_a0, by_a1, by_a2, w0, w1, w2)
-        y0, y1, y2 = cross(x0, x1, x2, w0, w1, w2)
-        z0, z1, z2 = cross(by_a0, by_a1, by_a2, e0, e1, e2)
-        u0, u1, u2 = cross(by_v0, by_v1, by_v2, w0, w1, w2)
-        row[3], row[4], row[5] = cross(r0, r1, r2, by_s0 + u0 + y0 + z0, by_s1 + u1 + y1 + z1, by_s2 + u2 + y2 + z2)
-        n0, n1, n2 = cross(r0, r1, r2, by_v0 + x0, by_v1 + x1, by_v2 + x2)
-        o0, o1, o2 = cross(t0, t1, t2, by_a0, by_a1, by_a2)
-        row[9], row[10], row[11] = n0 + o0, n1 + o1, n2 + o2
-        row[15], row[16], row[17] = cross(r0, r1, r2, by_a0, by_a1, by_a2)
+        for i in range(3):
+            row[i] = h[0] * g[0, i] + h[1] * g[1, i] + h[2] * g1[0, i] + h[3] * g1[1, i] + h[4] * g2[0, i] + h[5] * g2[1, i]
+            row[6 + i] = h[2] * g[0, i] + h[3] * g[1, i] + 2.0 * (h[4] * g1[0, i] + h[5] * g1[1, i])
+            row[12 + i] = h[4] * g[0, i] + h[5] * g[1, i]
+        by_s, by_v, by_a = vector(row), vector(row[6:]), vector(row[12:])
+        # s' = v + w x r and s'' = a + alpha x r + w x (w x r), with r turned by the rotation's error.
+        x = cross(by_a, w)
+        by_turned = add(add(add(by_s, cross(by_v, w)), cross(x, w)), cross(by_a, alpha))
+        by_rate = add(cross(arm, add(by_v, x)), cross(turning, by_a))
+        row[3], row[4], row[5] = cross(arm, by_turned)
+        row[9], row[10], row[11] = by_rate
+        row[15], row[16], row[17] = cross(arm, by_a)
 
 
 @kernel
-def predict_platform_readings(
-    imu_position: Array, up_in_base: Array, gravity: float, rotation: Array, motion: Array, derive: bool, readings: Array,
-    jacobian: Array,
-) -> None:  # fmt: skip
+def _predict_platform(geometry: Record, rotation: Array, motion: Array, derive: bool, readings: Array, jacobian: Array) -> None:
     """Write what the platform's IMU reads (6,), and if wanted the derivative by the errors of the motion (6, 18)."""
-    d0, d1, d2 = imu_position[0], imu_position[1], imu_position[2]
-    r0 = rotation[0, 0] * d0 + rotation[0, 1] * d1 + rotation[0, 2] * d2
-    r1 = rotation[1, 0] * d0 + rotation[1, 1] * d1 + rotation[1, 2] * d2
-    r2 = rotation[2, 0] * d0 + rotation[2, 1] * d1 + rotation[2, 2] * d2
-    w0, w1, w2 = motion[RATE, 0], motion[RATE, 1], motion[RATE, 2]
-    e0, e1, e2 = motion[ANGULAR_ACCELERATION, 0], motion[ANGULAR_ACCELERATION, 1], motion[ANGULAR_ACCELERATION, 2]
-    t0, t1, t2 = cross(w0, w1, w2, r0, r1, r2)
-    c0, c1, c2 = cross(w0, w1, w2, t0, t1, t2)
-    a0, a1, a2 = cross(e0, e1, e2, r0, r1, r2)
-    f0 = motion[ACCELERATION, 0] + a0 + c0 + gravity * up_in_base[0]
-    f1 = motion[ACCELERATION, 1] + a1 + c1 + gravity * up_in_base[1]
-    f2 = motion[ACCELERATION, 2] + a2 + c2 + gravity * up_in_base[2]
+    w, alpha = vector(motion[RATE]), vector(motion[ANGULAR_ACCELERATION])
+    arm = rotate(rotation, vector(geometry.platform_imu_position))
+    turning = cross(w, arm)
+    f = add(add(vector(motion[ACCELERATION]), cross(alpha, arm)), cross(w, turning))
+    f = add(f, scale(geometry.gravity, vector(geometry.up_in_base[0])))
     for m in range(3):
-        g0, g1, g2 = rotation[0, m], rotation[1, m], rotation[2, m]
-        readings[m] = g0 * w0 + g1 * w1 + g2 * w2
-        readings[3 + m] = g0 * f0 + g1 * f1 + g2 * f2
+        g = rotation[0, m], rotation[1, m], rotation[2, m]
+        readings[m], readings[3 + m] = dot(g, w), dot(g, f)
         if not derive:
             continue
         rate, force = jacobian[m], jacobian[3 + m]
         rate[:] = 0.0
         force[:] = 0.0
-        # An error of the rotation turns the axis g and the arm r.
-        rate[3], rate[4], rate[5] = cross(g0, g1, g2, w0, w1, w2)
-        rate[9], rate[10], rate[11] = g0, g1, g2
-        x0, x1, x2 = cross(g0, g1, g2, w0, w1, w2)
-        y0, y1, y2 = cross(x0, x1, x2, w0, w1, w2)
-        z0, z1, z2 = cross(g0, g1, g2, e0, e1, e2)
-        p0, p1, p2 = cross(g0, g1, g2, f0, f1, f2)
-        n0, n1, n2 = cross(r0, r1, r2, y0 + z0, y1 + z1, y2 + z2)
-        force[3], force[4], force[5] = p0 + n0, p1 + n1, p2 + n2
-        n0, n1, n2 = cross(r0, r1, r2, x0, x1, x2)
-        o0, o1, o2 = cross(t0, t1, t2, g0, g1, g2)
-        force[9], force[10], force[11] = n0 + o0, n1 + o1, n2 + o2
-        force[12], force[13], force[14] = g0, g1, g2
-        force[15], force[16], force[17] = cross(r0, r1, r2, g0, g1, g2)
+        # An error of the rotation turns the axis g and the arm.
+        x = cross(g, w)
+        rate[3], rate[4], rate[5] = x
+        rate[9], rate[10], rate[11] = g
+        force[3], force[4], force[5] = add(cross(g, f), cross(arm, add(cross(x, w), cross(g, alpha))))
+        force[9], force[10], force[11] = add(cross(arm, x), cross(turning, g))
+        force[12], force[13], force[14] = g
+        force[15], force[16], force[17] = cross(arm, g)
 
 
 @kernel
@@ -216,16 +165,68 @@ def predict_readings(
         position, rotation, motion: (3,), (3, 3), (4, 3), of {2}.
         scratch: dtype `READINGS_SCRATCH`.
     """
-    g = geometry
     for k in range(LEGS):
-        predict_leg_readings(
-            g.joint_rotations[k], g.base_joints[k], g.platform_joints[k], g.up_in_joint[k], g.leg_imu_position[k], g.gravity,
-            position, rotation, motion, derive, readings[k], jacobian[k], scratch,
-        )  # fmt: skip
-    predict_platform_readings(
-        g.platform_imu_position, g.up_in_base[0], g.gravity, rotation, motion, derive, readings[PLATFORM_IMU],
-        jacobian[PLATFORM_IMU],
-    )  # fmt: skip
+        _predict_leg(geometry, k, position, rotation, motion, derive, readings[k], jacobian[k], scratch)
+    _predict_platform(geometry, rotation, motion, derive, readings[PLATFORM_IMU], jacobian[PLATFORM_IMU])
+
+
+@kernel
+def rig_state(k: int, j: int) -> int:
+    """The place among the rig's errors of the one, 0 to 7, on which IMU `k` depends."""
+    return 3 * k + j if j < 3 else 3 * (LEGS + k - 1) + j if j < 6 else JOINTS + j - 6
+
+
+@kernel
+def find_rig_jacobian(
+    geometry: Record, position: Array, rotation: Array, motion: Array, errors: Array, jacobian: Array, rig_jacobian: Array
+) -> None:
+    """Write the derivatives (7, 6, 8) of the readings by base joint, platform joint and tilt.
+
+    They follow from the derivatives by the motion (7, 6, 18) and the IMUs' errors (7, 21).
+
+    A leg vector p + R A - B answers to a move of B like to the opposite one of p; and to one of A like to one of p by R A, of
+    the velocity by omega x R A, and of the acceleration by alpha x R A + omega x (omega x R A). The tilt turns the vertical.
+    """
+    w, alpha = vector(motion[RATE]), vector(motion[ANGULAR_ACCELERATION])
+    for k in range(LEGS):
+        for m in range(READINGS):
+            h, by_rig = jacobian[k, m], rig_jacobian[k, m]
+            for i in range(3):
+                r = rotation[0, i], rotation[1, i], rotation[2, i]
+                v = cross(w, r)
+                a = add(cross(alpha, r), cross(w, v))
+                by_rig[i] = -h[i]
+                by_rig[3 + i] = h[0] * r[0] + h[1] * r[1] + h[2] * r[2] + h[6] * v[0] + h[7] * v[1] + h[8] * v[2]
+                by_rig[3 + i] += dot(vector(h[12:]), a)
+    up = geometry.up_in_base[0]
+    # e x up for the axes e = x, y.
+    for j, turned in enumerate(((0.0, -up[2], up[1]), (up[2], 0.0, -up[0]))):
+        for k in range(IMU_COUNT):
+            in_frame = rotate_back(rotation, turned)
+            if k < LEGS:
+                x, y, z = _leg_axes(geometry, k, position, rotation)
+                in_frame = dot(x, turned), dot(y, turned), dot(z, turned)
+            read = distort(errors[k], 1, scale(geometry.gravity, in_frame))
+            for i in range(3):
+                rig_jacobian[k, i, 6 + j] = 0.0
+                rig_jacobian[k, 3 + i, 6 + j] = read[i]
+
+
+@kernel
+def _leg_axes(geometry: Record, k: int, position: Array, rotation: Array) -> tuple[Vector, Vector, Vector]:
+    """The axes of the frame of leg `k` in {1}: z along the leg, y across the joint's first axis, too."""
+    joint, frame = geometry.platform_joints[k], geometry.joint_rotations[k]
+    z = subtract(vector(position), vector(geometry.base_joints[k]))
+    for j in range(3):
+        z = add(z, scale(joint[j], (rotation[0, j], rotation[1, j], rotation[2, j])))
+    y = cross(z, (frame[0, 0], frame[1, 0], frame[2, 0]))
+    return _unit(cross(y, z)), _unit(y), _unit(z)
+
+
+@kernel
+def _unit(x: Vector) -> Vector:
+    size = np.sqrt(dot(x, x))
+    return x[0] / size, x[1] / size, x[2] / size
 
 
 def readings_along(geometry: Record, positions: Array, rotations: Array, rate: float) -> Array:

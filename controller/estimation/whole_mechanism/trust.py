@@ -33,66 +33,46 @@ _FADING_S = 0.1
 
 PARAMETERS = record_dtype(
     filter=FILTER_PARAMETERS,
-    delay=np.float64,
-    start_cycles=np.int64,
+    delay=np.float64,  # of the sensors [s]
+    start_cycles=np.int64,  # this and the next: the durations above
     settling_cycles=np.int64,
-    disagreement=np.float64,
-    patience_cycles=np.int64,
+    disagreement=np.float64,  # limit [rad]
+    patience_cycles=np.int64,  # how long the leg filters may disagree
 )
-"""Constants: of the filter itself; the sensors' delay [s]; the durations above; the limit of the disagreement [rad]."""
+"""Constants."""
 
 STATE = record_dtype(
     filter=FILTER_STATE,
-    due=np.int64,
-    trusted=np.int64,
-    disagreeing_for=np.int64,
-    blend_offset=(np.float64, 6),
-    closed_position=(np.float64, 3),
+    due=np.int64,  # the cycle in which the filter is started, or from which on it may be trusted
+    trusted=np.int64,  # whether the pose is the filter's
+    disagreeing_for=np.int64,  # for how many cycles the leg filters have disagreed
+    blend_offset=(np.float64, 6),  # what is left of the step between two sources of the pose [m, rad]
+    closed_position=(np.float64, 3),  # of the pose in closed form [m]
     closed_rotation=(np.float64, (3, 3)),
-    twist=(np.float64, 6),
-    acceleration=(np.float64, 6),
+    twist=(np.float64, 6),  # of the filter
+    acceleration=(np.float64, 6),  # of the filter
 )
-"""State of the filter and of the trust in it.
-
-Fields:
-    filter: the filter itself.
-    due: the cycle in which it is started, or from which on it may be trusted.
-    trusted: whether the pose is the filter's.
-    disagreeing_for: for how many cycles the leg filters have disagreed.
-    blend_offset: what is left of the step between two sources of the pose [m, rad].
-    closed_position, closed_rotation: the pose in closed form.
-    twist, acceleration: of the filter.
-"""
+"""State of the filter and of the trust in it."""
 
 
 def trust_parameters(fusion: FusionSettings, rate: float, filter_constants: Record) -> Record:
     """The constants (dtype `PARAMETERS`) in cycles of this rate [Hz], around those of the filter itself."""
-    values = {
-        "filter": filter_constants,
-        "delay": fusion.sensor_delay,
-        "start_cycles": round(_START_S * rate),
-        "settling_cycles": round(_SETTLING_S * rate),
-        "disagreement": fusion.disagreement,
-        "patience_cycles": round(_PATIENCE_S * rate),
-    }
-    return filled(PARAMETERS, values)
+    return filled(
+        PARAMETERS,
+        filter=filter_constants,
+        delay=fusion.sensor_delay,
+        start_cycles=round(_START_S * rate),
+        settling_cycles=round(_SETTLING_S * rate),
+        disagreement=fusion.disagreement,
+        patience_cycles=round(_PATIENCE_S * rate),
+    )
 
 
 @kernel
 def step_mechanism_filter(
     p: Record, s: Record, rig: Record, time: Record, imus: Record, legs: Record, heading: Record, pose: Record
 ) -> bool:
-    """Step the filter, and let its pose replace the one in closed form while it is trusted.
-
-    Args:
-        p, s: dtypes `PARAMETERS` and `STATE`.
-        rig, time: dtypes `RIG` and `TIME`.
-        imus, legs, heading: states of these stages.
-        pose: the pose, if `pose.found` in closed form; replaced.
-
-    Returns:
-        Whether there is a pose.
-    """
+    """Step the filter, and let its pose replace the one in closed form while it is trusted; returns whether there is a pose."""
     f, found = s.filter, bool(pose.found != 0)
     if p.filter.errors == 0:
         return found

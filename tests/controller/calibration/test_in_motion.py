@@ -6,7 +6,7 @@ import pytest
 from controller.calibration.at_rest import Prior, Rests, calibrate_at_rest, pose_covariance
 from controller.calibration.in_motion import calibrate_in_motion
 from controller.estimation.whole_mechanism.imu_errors import ERRORS
-from controller.estimation.whole_mechanism.rig_jacobian import JOINTS
+from controller.estimation.whole_mechanism.readings import JOINTS
 from controller.inverse_kinematics import sample_workspace
 from controller.settings import sensor_settings
 from plant.dynamics.imposed import impose

@@ -13,8 +13,7 @@ from controller.estimation.whole_mechanism.filter import (
 )
 from controller.estimation.whole_mechanism.imu_errors import ERRORS, distort, error_gradient
 from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, BLOCKS, FILTER_STATE, MOTION_STATES, filter_parameters
-from controller.estimation.whole_mechanism.readings import READINGS_SCRATCH, predict_readings
-from controller.estimation.whole_mechanism.rig_jacobian import JOINTS, RIG_ERRORS, TILT
+from controller.estimation.whole_mechanism.readings import JOINTS, READINGS_SCRATCH, RIG_ERRORS, TILT, predict_readings
 from controller.rig import sensor_geometry
 from controller.settings import FusionSettings, fusion_settings
 from plant.dynamics.imposed import impose
@@ -286,7 +285,9 @@ def test_the_gradient_of_the_errors_is_that_of_the_reading():
 
     def read(errors):
         sensors = ((sensor, slice(3 * sensor, 3 * sensor + 3)) for sensor in range(2))
-        return np.concatenate([np.array(distort(errors, sensor, *ideal[part])) + errors[part] for sensor, part in sensors])
+        return np.concatenate(
+            [np.array(distort(errors, sensor, tuple(ideal[part]))) + errors[part] for sensor, part in sensors]
+        )
 
     for m in range(6):
         gradient = np.zeros(ERRORS)
