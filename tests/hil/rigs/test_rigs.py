@@ -189,8 +189,8 @@ def multicast(tmp_path):
 def test_the_canopen_rig_keeps_the_contract(multicast):
     settings = canopen_settings(multicast)
     # On a loaded machine two processes need a while to take turns.
-    period = 0.04
-    with emulator("--bus", "canopen", "--at", str(multicast), "--rate", "25"):
+    period = 0.02
+    with emulator("--bus", "canopen", "--at", str(multicast), "--rate", "50"):
         found = examine_rig(lambda: CanopenRig(settings, period), period, beyond=10.0)
         assert findings_of_real_time(found) == []
 
