@@ -8,8 +8,10 @@ of the gyroscopes (`in_motion`).
 
 from dataclasses import dataclass
 from math import radians
+from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from controller.calibration.file import Calibration
@@ -45,28 +47,18 @@ _LENGTH_SIGMA = 5e-5
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known before the calibration: standard deviations.
+    """What is known before the calibration: standard deviations."""
 
-    Attributes:
-        gyroscope_bias, accelerometer_bias: [rad/s, m/s^2].
-        accelerometer_scale, gyroscope_scale: [1].
-        alignment: of the mounting about each axis [rad].
-        axes: deviation from a right angle [rad].
-        tilt: of the base about each horizontal axis [rad]; the data determine it hardly better than a spirit level does.
-        joints: of each joint's coordinates [m]; 0 takes the joints as exact.
-        reading_rate, reading_force: of a mean over a rest, beyond the sensors' noise [rad/s, m/s^2].
-    """
-
-    gyroscope_bias: float = radians(20.0)
-    accelerometer_bias: float = 0.05 * STANDARD_GRAVITY
-    accelerometer_scale: float = 0.03
-    gyroscope_scale: float = 0.03
-    alignment: float = radians(1.0)
-    axes: float = 0.02
-    tilt: float = radians(0.05)
-    joints: float = 0.0
-    reading_rate: float = radians(0.02)
-    reading_force: float = 2e-4 * STANDARD_GRAVITY
+    gyroscope_bias: float = radians(20.0)  # [rad/s]
+    accelerometer_bias: float = 0.05 * STANDARD_GRAVITY  # [m/s^2]
+    accelerometer_scale: float = 0.03  # [1]
+    gyroscope_scale: float = 0.03  # [1]
+    alignment: float = radians(1.0)  # of the mounting about each axis [rad]
+    axes: float = 0.02  # deviation from a right angle [rad]
+    tilt: float = radians(0.05)  # of the base about x and y [rad]; the data determine it hardly better than a spirit level does
+    joints: float = 0.0  # of each joint's coordinates [m]; 0 takes the joints as exact
+    reading_rate: float = radians(0.02)  # of a mean over a rest, beyond the sensors' noise [rad/s]
+    reading_force: float = 2e-4 * STANDARD_GRAVITY  # likewise [m/s^2]
 
     def error_sigmas(self) -> Array:
         """(147,), in the order of the errors."""
@@ -83,39 +75,24 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Rests:
-    """Readings of the IMUs at rest, by pose.
+    """Readings of the IMUs at rest, by pose."""
 
-    Attributes:
-        readings: (N, 7, 6), raw means of rate [rad/s] and force [m/s^2].
-        home: whether the first pose is exactly home.
-        length_changes: (N, 6) [m], length of each leg minus its length at the first rest, if a rig measures it; else None.
-    """
-
-    readings: Array
-    home: bool = False
-    length_changes: Array | None = None
+    readings: Array  # (N, 7, 6), raw means of rate [rad/s] and force [m/s^2]
+    home: bool = False  # whether the first pose is exactly home
+    length_changes: Array | None = None  # (N, 6) [m], of each leg since the first rest, if a rig measures them
 
 
 @dataclass(frozen=True, eq=False)
 class RestCalibration:
-    """The result of a calibration at rest.
+    """The result of a calibration at rest."""
 
-    Attributes:
-        errors: (7, 21), of the raw IMUs.
-        tilt: (2,) [rad], of the base about the axes x and y of {1}.
-        joints: (2, 6, 3) [m], corrections of base and platform joints.
-        covariance: (185, 185), of the errors, the joints and the tilt.
-        positions, rotations: (N, 3), (N, 3, 3), of the rests.
-        residuals: (N, 7, 6), of the readings.
-    """
-
-    errors: Array
-    tilt: Array
-    joints: Array
-    covariance: Array
-    positions: Array
-    rotations: Array
-    residuals: Array
+    errors: Array  # (7, 21), of the raw IMUs
+    tilt: Array  # (2,) [rad], of the base about the axes x and y of {1}
+    joints: Array  # (2, 6, 3) [m], corrections of base and platform joints
+    covariance: Array  # (185, 185), of the errors, the joints and the tilt
+    positions: Array  # (N, 3) [m], of the rests
+    rotations: Array  # (N, 3, 3), of the rests
+    residuals: Array  # (N, 7, 6), of the readings
 
     def calibration(self) -> Calibration:
         """The calibration that undoes the errors."""
@@ -134,35 +111,29 @@ def undo(errors: Array) -> tuple[Array, Array]:
     return gain, offset
 
 
-class _IdealReadings:
-    """Ideal readings at rest, and their derivatives."""
+def _ideal_readings(geometry: Record, position: Array, rotation: Array) -> tuple[Array, Array]:
+    """Ideal readings (7, 6) at rest, and their derivatives (7, 6, 6) by position and rotation."""
+    readings, jacobian = np.zeros((IMU_COUNT, READINGS)), np.zeros((IMU_COUNT, READINGS, MOTION_STATES))
+    scratch: Record = np.zeros((), READINGS_SCRATCH)
+    predict_readings(geometry[()], position, rotation, np.zeros((4, 3)), True, readings, jacobian, scratch[()])
+    return readings, jacobian[:, :, :6].copy()
 
-    def __init__(self) -> None:
-        self._motion, self._readings = np.zeros((4, 3)), np.zeros((IMU_COUNT, READINGS))
-        self._jacobian = np.zeros((IMU_COUNT, READINGS, MOTION_STATES))
-        self._scratch: Record = np.zeros((), READINGS_SCRATCH)
 
-    def __call__(self, geometry: Record, position: Array, rotation: Array) -> tuple[Array, Array]:
-        """(7, 6), and by position and rotation (7, 6, 6)."""
-        predict_readings(
-            geometry[()], position, rotation, self._motion, True, self._readings, self._jacobian, self._scratch[()]
-        )
-        return self._readings.copy(), self._jacobian[:, :, :6].copy()
-
-    def by_rig(self, mechanism: Mechanism, tilt: Array, position: Array, rotation: Array) -> Array:
-        """The derivative (7, 6, 38) of the readings by joints and tilt."""
-        ideal, _ = self(sensor_geometry(mechanism, tilt), position, rotation)
-        by_tilt = np.zeros((IMU_COUNT, READINGS, TILT))
-        for i, step in enumerate(_TILT_STEP * np.eye(TILT)):
-            by_tilt[:, :, i] = (self(sensor_geometry(mechanism, tilt + step), position, rotation)[0] - ideal) / _TILT_STEP
-        # A leg's readings depend on its own joints only.
-        legs, by_joints = np.arange(LEGS), np.zeros((IMU_COUNT, READINGS, 2, LEGS, 3))
-        for side, axis in np.ndindex(2, 3):
-            moves = np.zeros((2, LEGS, 3))
-            moves[side, :, axis] = _LENGTH_STEP
-            moved, _ = self(sensor_geometry(mechanism.moved_joints(moves), tilt), position, rotation)
-            by_joints[legs, :, side, legs, axis] = (moved - ideal)[:LEGS] / _LENGTH_STEP
-        return np.concatenate([by_joints.reshape(IMU_COUNT, READINGS, JOINTS), by_tilt], axis=2)
+def _readings_by_rig(mechanism: Mechanism, tilt: Array, position: Array, rotation: Array) -> Array:
+    """The derivative (7, 6, 38) of the ideal readings at rest by joints and tilt."""
+    ideal, _ = _ideal_readings(sensor_geometry(mechanism, tilt), position, rotation)
+    by_tilt = np.zeros((IMU_COUNT, READINGS, TILT))
+    for i, step in enumerate(_TILT_STEP * np.eye(TILT)):
+        tilted, _ = _ideal_readings(sensor_geometry(mechanism, tilt + step), position, rotation)
+        by_tilt[:, :, i] = (tilted - ideal) / _TILT_STEP
+    # A leg's readings depend on its own joints only.
+    legs, by_joints = np.arange(LEGS), np.zeros((IMU_COUNT, READINGS, 2, LEGS, 3))
+    for side, axis in np.ndindex(2, 3):
+        moves = np.zeros((2, LEGS, 3))
+        moves[side, :, axis] = _LENGTH_STEP
+        moved, _ = _ideal_readings(sensor_geometry(mechanism.moved_joints(moves), tilt), position, rotation)
+        by_joints[legs, :, side, legs, axis] = (moved - ideal)[:LEGS] / _LENGTH_STEP
+    return np.concatenate([by_joints.reshape(IMU_COUNT, READINGS, JOINTS), by_tilt], axis=2)
 
 
 def calibrate_at_rest(mechanism: Mechanism, rests: Rests, prior: Prior = Prior()) -> RestCalibration:
@@ -171,7 +142,6 @@ def calibrate_at_rest(mechanism: Mechanism, rests: Rests, prior: Prior = Prior()
     Args:
         mechanism: with home and plant data.
         rests: at least five, as different as possible.
-        prior: what is known before.
 
     Raises:
         CalibrationError: too few rests, or readings that no pose explains.
@@ -188,15 +158,15 @@ def calibrate_at_rest(mechanism: Mechanism, rests: Rests, prior: Prior = Prior()
     return problem.result(fit.x, np.linalg.inv(fit.jac.T @ fit.jac))
 
 
-@dataclass(frozen=True, eq=False)
-class _State:
-    """Poses of the rests, errors (7, 21) of the IMUs, joints (2, 6, 3) [m] and tilt (2,) [rad] at some unknowns."""
+class _State(NamedTuple):
+    """What some unknowns stand for, with the fields of `RestCalibration`, and the mechanism with its joints moved."""
 
     positions: Array
     rotations: Array
     errors: Array
     joints: Array
     tilt: Array
+    mechanism: Mechanism
 
 
 class _Problem:
@@ -204,45 +174,39 @@ class _Problem:
     errors (147), each distinct joint (3) and the tilt (2).
 
     The weighted residuals are those of the readings, of home, of the length changes, and of the prior.
-
-    Attributes:
-        start: the unknowns at the first poses, which explain the forces best if the accelerometers have no errors.
     """
 
     def __init__(self, mechanism: Mechanism, rests: Rests, prior: Prior) -> None:
         self._mechanism, self._rests, self._home = mechanism, rests, mechanism.require_home()
         self._count = len(rests.readings)
-        self._ideal = _IdealReadings()
         self._weights = 1.0 / np.repeat([prior.reading_rate, prior.reading_force], 3)
         geometry = sensor_geometry(mechanism)
         poses = [fit_pose(geometry, reading[:, 3:], self._home) for reading in rests.readings]
         self._positions, self._rotations = (np.array(each) for each in zip(*poses, strict=True))
         # Legs may share a joint: its coordinates are those of both.
         places, joint_of = np.unique(LEGS * np.arange(2)[:, None] + mechanism.distinct_joints(), return_inverse=True)
-        self._rig_of = np.zeros((RIG_ERRORS, 3 * len(places) + TILT))
-        self._rig_of[:JOINTS, :-TILT] = np.kron(np.eye(len(places))[joint_of.ravel()], np.eye(3))
-        self._rig_of[JOINTS:, -TILT:] = np.eye(TILT)
+        self._rig_of = block_diag(np.kron(np.eye(len(places))[joint_of.ravel()], np.eye(3)), np.eye(TILT))
         rig_sigmas = prior.sigmas()[ALL_ERRORS:] @ self._rig_of / self._rig_of.sum(axis=0)
         self._sigmas = np.concatenate([prior.error_sigmas(), rig_sigmas])
         own = 6 * self._count
         self._errors, self._rig = slice(own, own + ALL_ERRORS), slice(own + ALL_ERRORS, own + len(self._sigmas))
-        errors = np.zeros((IMU_COUNT, ERRORS))
-        errors[:, :3] = rests.readings[:, :, :3].mean(axis=0)
+        # The first poses explain the forces best if the accelerometers have no errors.
         self.start = np.zeros(self._rig.stop)
-        self.start[self._errors] = errors.ravel()
+        self.start[self._errors].reshape(IMU_COUNT, ERRORS)[:, :3] = rests.readings[:, :, :3].mean(axis=0)
 
     def _state(self, x: Array) -> _State:
         poses, rig = x[: 6 * self._count].reshape(-1, 6), self._rig_of @ x[self._rig]
         turned = [rotation_from_vector(turn) @ start for turn, start in zip(poses[:, 3:], self._rotations, strict=True)]
-        errors = x[self._errors].reshape(IMU_COUNT, ERRORS)
-        return _State(self._positions + poses[:, :3], np.array(turned), errors, rig[:JOINTS].reshape(2, LEGS, 3), rig[JOINTS:])
+        errors, joints = x[self._errors].reshape(IMU_COUNT, ERRORS), rig[:JOINTS].reshape(2, LEGS, 3)
+        moved = self._mechanism.moved_joints(joints)
+        return _State(self._positions + poses[:, :3], np.array(turned), errors, joints, rig[JOINTS:], moved)
 
     def _expected(self, state: _State) -> Array:
         """The readings (N, 7, 6) that are expected."""
-        geometry = sensor_geometry(self._mechanism.moved_joints(state.joints), state.tilt)
+        geometry = sensor_geometry(state.mechanism, state.tilt)
         expected = np.empty((self._count, IMU_COUNT, READINGS))
         for n in range(self._count):
-            ideal, _ = self._ideal(geometry, state.positions[n], state.rotations[n])
+            ideal, _ = _ideal_readings(geometry, state.positions[n], state.rotations[n])
             for k, sensor in np.ndindex(IMU_COUNT, 2):
                 part = slice(3 * sensor, 3 * sensor + 3)
                 expected[n, k, part] = error_matrix(state.errors[k], sensor) @ ideal[k, part] + state.errors[k, part]
@@ -267,13 +231,12 @@ class _Problem:
     def jacobian(self, x: Array) -> Array:
         """The derivatives (M, size) of the residuals."""
         state = self._state(x)
-        mechanism = self._mechanism.moved_joints(state.joints)
-        geometry, gradient = sensor_geometry(mechanism, state.tilt), np.zeros(ERRORS)
+        geometry, gradient = sensor_geometry(state.mechanism, state.tilt), np.zeros(ERRORS)
         rows = np.zeros((self._count, IMU_COUNT, READINGS, len(x)))
         for n in range(self._count):
             pose = state.positions[n], state.rotations[n]
-            ideal, by_pose = self._ideal(geometry, *pose)
-            by_rig = self._ideal.by_rig(mechanism, state.tilt, *pose) @ self._rig_of
+            ideal, by_pose = _ideal_readings(geometry, *pose)
+            by_rig = _readings_by_rig(state.mechanism, state.tilt, *pose) @ self._rig_of
             for k in range(IMU_COUNT):
                 for sensor in range(2):
                     part, distortion = slice(3 * sensor, 3 * sensor + 3), error_matrix(state.errors[k], sensor)
@@ -299,9 +262,7 @@ class _Problem:
 
     def result(self, x: Array, covariance: Array) -> RestCalibration:
         """The result at the unknowns, with their covariance."""
-        state, rig_of = self._state(x), self._rig_of
-        spread = np.zeros((ALL_ERRORS + RIG_ERRORS, ALL_ERRORS + rig_of.shape[1]))
-        spread[:ALL_ERRORS, :ALL_ERRORS], spread[ALL_ERRORS:, ALL_ERRORS:] = np.eye(ALL_ERRORS), rig_of
+        state, spread = self._state(x), block_diag(np.eye(ALL_ERRORS), self._rig_of)
         own = covariance[self._errors.start :, self._errors.start :]
         residuals = self._rests.readings - self._expected(state)
         return RestCalibration(
@@ -323,16 +284,15 @@ def fit_pose(geometry: Record, forces: Array, home: Pose) -> tuple[Array, Array]
     Raises:
         CalibrationError: none does.
     """
-    readings = _IdealReadings()
 
     def pose(x: Array) -> tuple[Array, Array]:
         return home.position + x[:3], rotation_from_vector(x[3:]) @ home.rotation
 
     def residuals(x: Array) -> Array:
-        return (readings(geometry, *pose(x))[0][:, 3:] - forces).ravel()
+        return (expected_forces(geometry, *pose(x)) - forces).ravel()
 
     def jacobian(x: Array) -> Array:
-        by_pose = readings(geometry, *pose(x))[1][:, 3:].reshape(-1, 6)
+        by_pose = _ideal_readings(geometry, *pose(x))[1][:, 3:].reshape(-1, 6)
         return np.hstack([by_pose[:, :3], by_pose[:, 3:] @ _turn_by_vector(x[3:])])
 
     fit = least_squares(residuals, np.zeros(6), jacobian, method="lm", ftol=1e-12, xtol=1e-12, gtol=1e-12)
@@ -343,21 +303,20 @@ def fit_pose(geometry: Record, forces: Array, home: Pose) -> tuple[Array, Array]
 
 def expected_forces(geometry: Record, position: Array, rotation: Array) -> Array:
     """Forces (7, 3) that ideal accelerometers read at rest."""
-    return _IdealReadings()(geometry, position, rotation)[0][:, 3:]
+    return _ideal_readings(geometry, position, rotation)[0][:, 3:]
 
 
 def pose_covariance(mechanism: Mechanism, tilt: Array, pose: tuple[Array, Array], covariance: Array) -> Array:
     """The covariance (6, 6) of a pose at rest from seven accelerometers, for a `covariance` (185, 185) of the IMUs' errors, the
     joints and the tilt.
     """
-    readings = _IdealReadings()
-    ideal, by_pose = readings(sensor_geometry(mechanism, tilt), *pose)
+    ideal, by_pose = _ideal_readings(sensor_geometry(mechanism, tilt), *pose)
     by_others, gradient = np.zeros((IMU_COUNT, 3, ALL_ERRORS + RIG_ERRORS)), np.zeros(ERRORS)
     for k in range(IMU_COUNT):
         for i in range(3):
             error_gradient(np.zeros(ERRORS), ideal[k], 3 + i, gradient)
             by_others[k, i, ERRORS * k : ERRORS * (k + 1)] = gradient
-    by_others[:, :, ALL_ERRORS:] = readings.by_rig(mechanism, tilt, *pose)[:, 3:]
+    by_others[:, :, ALL_ERRORS:] = _readings_by_rig(mechanism, tilt, *pose)[:, 3:]
     gain = np.linalg.pinv(by_pose[:, 3:].reshape(-1, 6)) @ by_others.reshape(-1, ALL_ERRORS + RIG_ERRORS)
     found: Array = gain @ covariance @ gain.T
     return found

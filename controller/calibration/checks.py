@@ -4,9 +4,9 @@ The drives follow a plan with the loop open, and each IMU must read the motion o
 tries the places of the others, and the 48 signed permutations of its axes: 24 rotations and 24 mirrored ones.
 """
 
-from dataclasses import dataclass
 from functools import cache
 from itertools import permutations, product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -16,32 +16,19 @@ from plant.errors import CalibrationError
 from plant.imu import ACCELEROMETER, STANDARD_GRAVITY
 from plant.pose import Array, vector_from_rotation
 
-MOST_TILT = np.radians(15.0)
-"""Largest angle between the mean force and the expected one [rad]; raw IMUs are off by 8 degrees."""
-
+# Another place or other axes are believed if they leave less than this share of what the right ones leave unexplained.
 FAR_BETTER = 0.5
-"""Another place or other axes are believed if they leave less than this share of what the right ones leave unexplained."""
-
-LEAST_MOTION = 0.2
-"""Least share of the expected motion that an IMU must read."""
-
-LEAST_RATE = np.radians(1.0)
-"""Least RMS of the rate of some IMU in a motion [rad/s]."""
-
-LEAST_SPREAD = np.radians(3.0)
-"""Least angle between verticals of some IMU over the rests [rad]."""
-
+MOST_TILT = np.radians(15.0)  # of the mean force from the expected one [rad]; raw IMUs are off by 8 degrees
+LEAST_MOTION = 0.2  # share of the expected motion that an IMU must read
+LEAST_RATE = np.radians(1.0)  # RMS of the rate of some IMU in a motion [rad/s]
+LEAST_SPREAD = np.radians(3.0)  # angle between verticals of some IMU over the rests [rad]
 _FROZEN_S = 0.1
-_RIGHT = np.eye(3)
 _SENSORS = ("gyroscope", "accelerometer")
 _GRAVITY_RANGE = (0.7 * STANDARD_GRAVITY, 1.3 * STANDARD_GRAVITY)
 
 
 def check_alive(samples: Array) -> None:
-    """Check that no IMU is frozen while others are not, and that each reads gravity.
-
-    Args:
-        samples: (N, 3, 7, 3), raw, at rest.
+    """Check raw samples (N, 3, 7, 3) at rest: no IMU is frozen while others are not, and each reads gravity.
 
     Raises:
         CalibrationError: one does not; the message names it.
@@ -71,32 +58,25 @@ def check_all_along(samples: Array, rate: float) -> None:
         CalibrationError: one is; the message names it, and when.
     """
     readings = samples[:, :2]
-    lost = ~np.isfinite(readings).all(axis=(1, 3))
+    lost = np.atleast_2d(~np.isfinite(readings).all(axis=(1, 3)))
     same = (readings[1:] == readings[:-1]).all(axis=(1, 3))
     same &= ~same.all(axis=1, keepdims=True)
     reach = max(round(_FROZEN_S * rate), 3)
-    frozen = sliding_window_view(same, min(reach, len(same)), axis=0).all(axis=2)
-    faults = {
-        "gives readings that are not finite": np.atleast_2d(lost),
-        "is frozen while others are not": np.atleast_2d(frozen),
-    }
-    for imu in range(IMU_COUNT):
-        for what, found in faults.items():
-            if found[:, imu].any():
-                first, whole = found[:, imu].argmax() / rate, found[:, imu].sum() / rate
-                raise CalibrationError(
-                    f"IMU {imu} {what} {first:.3g} s into a run, for {whole:.3g} s in all: check its cable and its supply"
-                )
+    frozen = np.atleast_2d(sliding_window_view(same, min(reach, len(same)), axis=0).all(axis=2))
+    faults = {"gives readings that are not finite": lost, "is frozen while others are not": frozen}
+    for imu, (what, found) in product(range(IMU_COUNT), faults.items()):
+        if found[:, imu].any():
+            first, whole = found[:, imu].argmax() / rate, found[:, imu].sum() / rate
+            raise CalibrationError(
+                f"IMU {imu} {what} {first:.3g} s into a run, for {whole:.3g} s in all: check its cable and its supply"
+            )
 
 
 def check_spread(forces: Array) -> None:
-    """Check that the rests differ enough, and that every leg takes part.
-
-    Args:
-        forces: (N, 7, 3), raw means at rest.
+    """Check by raw mean forces (N, 7, 3) that the rests differ enough, and that every leg takes part.
 
     Raises:
-        CalibrationError: they are not, or one does not.
+        CalibrationError: they do not, or one does not.
     """
     verticals = forces / np.linalg.norm(forces, axis=2, keepdims=True)
     cosines = np.einsum("nki,mki->knm", verticals, verticals).min(axis=(1, 2))
@@ -129,11 +109,8 @@ def check_motion(rates: Array) -> None:
 
 
 def check_places(readings: Array, expected: Array) -> None:
-    """Check that each IMU roughly reads the motion of its place, along a planned motion.
-
-    Args:
-        readings: (N, 7, 6), raw, the rates minus those at rest.
-        expected: (N, 7, 6), of ideal IMUs.
+    """Check that each IMU roughly reads the motion of its place, along a planned motion: by raw readings (N, 7, 6), the rates
+    minus those at rest, and those `expected` (N, 7, 6) of ideal IMUs.
 
     Raises:
         CalibrationError: one or more do not. The message names each, and its place, orientation or wiring if that explains its
@@ -141,11 +118,11 @@ def check_places(readings: Array, expected: Array) -> None:
     """
     check_motion(expected[:, :, :3])
     fit, everywhere = _Fit(readings, expected), range(IMU_COUNT)
-    best = [min(everywhere, key=lambda place, imu=imu: fit.left(imu, place)) for imu in everywhere]  # type: ignore[misc]
-    found, moved = [], [imu for imu in everywhere if best[imu] != imu and fit.is_better(imu, fit.left(imu, best[imu]))]
-    for imu in everywhere:
-        place = best[imu]
-        if imu not in moved or not fit.moves(imu):
+    left = np.array([[fit.left(imu, place) for place in everywhere] for imu in everywhere])
+    best, found = left.argmin(axis=1).tolist(), []
+    moved = np.flatnonzero(left.min(axis=1) < FAR_BETTER * np.diag(left))
+    for imu, place in enumerate(best):
+        if imu not in moved or min(fit.share(imu, sensor) for sensor in range(2)) < LEAST_MOTION:
             found += _explained(fit, imu)
         elif place in moved and best[place] == imu:
             found += [f"IMUs {imu} and {place} are swapped: exchange their cables or numbers"] if imu < place else []
@@ -156,8 +133,7 @@ def check_places(readings: Array, expected: Array) -> None:
 
 
 def _idle(imu: int) -> str:
-    place = "the platform" if imu == PLATFORM_IMU else f"leg {imu}"
-    return f"{place} does not move, or the IMU is not fixed to it"
+    return f"{'the platform' if imu == PLATFORM_IMU else f'leg {imu}'} does not move, or the IMU is not fixed to it"
 
 
 def _explained(fit: "_Fit", imu: int) -> list[str]:
@@ -167,14 +143,13 @@ def _explained(fit: "_Fit", imu: int) -> list[str]:
         return [
             f"IMU {imu} reads {max(shares):.2g} of the expected motion, and at least {LEAST_MOTION:g} is needed: {_idle(imu)}"
         ]
-    misfits = [[fit.misfit(imu, imu, sensor, each.matrix) for each in _axes()] for sensor in range(2)]
-    best = [_axes()[int(np.argmin(each))] for each in misfits]
-    wrong = [min(each) < FAR_BETTER * each[0] for each in misfits]
-    both = min(_axes(), key=lambda each: fit.left(imu, imu, each.matrix))
-    left = fit.left(imu, imu, both.matrix)
-    alike = FAR_BETTER * left < np.linalg.norm([min(each) for each in misfits])
+    misfits = np.array([[fit.misfit(imu, imu, sensor, each.matrix) for each in _axes()] for sensor in range(2)])
+    least, left = misfits.min(axis=1), np.linalg.norm(misfits, axis=0)
+    best, both = [_axes()[i] for i in misfits.argmin(axis=1)], _axes()[left.argmin()]
+    wrong = least < FAR_BETTER * misfits[:, 0]
+    alike = FAR_BETTER * left.min() < np.linalg.norm(least)
     # No mounting mirrors: mirrored axes of both sensors are believed only if each sensor alone needs other axes.
-    if fit.is_better(imu, left) and alike and (all(wrong) or both.turned):
+    if left.min() < FAR_BETTER * left[0] and alike and (wrong.all() or both.turned):
         return [f"IMU {imu} reads {both.text}: mount it as it should be, or change the axes of both its sensors"]
     told = []
     for sensor, name in enumerate(_SENSORS):
@@ -204,8 +179,7 @@ class _Fit:
 
         def changes(values: Array) -> Array:
             flat = values.reshape(len(values), -1)
-            left: Array = (flat - trends @ (trends.T @ flat)).reshape(-1, IMU_COUNT, 2, 3)
-            return left
+            return (flat - trends @ (trends.T @ flat)).reshape(-1, IMU_COUNT, 2, 3)
 
         self._means = [each.mean(axis=0).reshape(IMU_COUNT, 2, 3) for each in (readings, expected)]
         self._changes = [changes(each) for each in (readings, expected)]
@@ -214,10 +188,6 @@ class _Fit:
         """Size of the changes that a sensor reads, relative to the expected ones."""
         read, expected = (np.sqrt(np.square(each[:, imu, sensor]).mean()) for each in self._changes)
         return float(read / expected)
-
-    def moves(self, imu: int) -> bool:
-        """Whether both sensors of an IMU read enough motion."""
-        return min(self.share(imu, sensor) for sensor in range(2)) >= LEAST_MOTION
 
     def tilt(self, imu: int) -> float:
         """Angle between gravity and its expected direction [rad]."""
@@ -234,26 +204,17 @@ class _Fit:
         off = np.linalg.norm(mean - axes @ expected_mean) / (MOST_TILT * STANDARD_GRAVITY) if sensor == ACCELEROMETER else 0.0
         return float(np.hypot(changed, off))
 
-    def left(self, imu: int, place: int, axes: Array = _RIGHT) -> float:
-        """What a place with these axes leaves unexplained of both sensors."""
-        return float(np.linalg.norm([self.misfit(imu, place, sensor, axes) for sensor in range(2)]))
-
-    def is_better(self, imu: int, left: float) -> bool:
-        """Whether leaving that much is far better than the right place with the right axes."""
-        return left < FAR_BETTER * self.left(imu, imu)
+    def left(self, imu: int, place: int) -> float:
+        """What a place with the right axes leaves unexplained of both sensors."""
+        return float(np.linalg.norm([self.misfit(imu, place, sensor, np.eye(3)) for sensor in range(2)]))
 
 
-@dataclass(frozen=True, eq=False)
-class _Axes:
-    """The axes that an IMU reads as its x, y and z: in words, and as a matrix (3, 3)."""
+class _Axes(NamedTuple):
+    """The axes that an IMU reads as its x, y and z."""
 
     text: str
-    matrix: Array
-
-    @property
-    def turned(self) -> bool:
-        """Whether a mounting can cause this; it cannot mirror."""
-        return bool(np.linalg.det(self.matrix) > 0.0)
+    matrix: Array  # (3, 3)
+    turned: bool  # whether a mounting can cause this; it cannot mirror
 
 
 @cache
@@ -263,12 +224,13 @@ def _axes() -> list[_Axes]:
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         matrix: Array = np.array(signs)[:, None] * np.eye(3)[list(order)]
         name = "".join(f"{'-' if sign < 0.0 else '+'}{'xyz'[axis]}" for sign, axis in zip(signs, order, strict=True))
-        found.append(_Axes(f"{name} for its x, y and z, {_words(matrix)}", matrix))
+        turned = bool(np.linalg.det(matrix) > 0.0)
+        found.append(_Axes(f"{name} for its x, y and z, {_words(matrix, turned)}", matrix, turned))
     return found
 
 
-def _words(matrix: Array) -> str:
-    if np.linalg.det(matrix) > 0.0:
+def _words(matrix: Array, turned: bool) -> str:
+    if turned:
         # A turned IMU reads the world turned the other way.
         turn = vector_from_rotation(matrix.T)
         angle, about = np.degrees(np.linalg.norm(turn)), turn / np.abs(turn).max(initial=1e-9)

@@ -7,7 +7,9 @@ A file gives bias, scale, axes and mounting of each sensor of each IMU:
 """
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,7 @@ from plant.toml import check_entries, read_toml
 
 SENSORS = ("gyroscope", "accelerometer", "magnetometer")
 UNITS = ("rad/s", "m/s2", "uT")
-_FIELDS = ("bias", "scale", "axes", "mounting")
+_FIELDS = {"bias": np.zeros(3), "scale": np.ones(3), "axes": np.zeros(3), "mounting": np.zeros(3)}
 _SIDES = ("base", "platform")
 _LEAST_MOVE_M = 1e-9
 _MOST_TILT = 0.8
@@ -32,25 +34,21 @@ _MOST_TILT = 0.8
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Constants of the seven IMUs.
+    """Constants of the seven IMUs, and what is known of the rig: offset [rad/s, m/s^2, uT], tilt [rad], joints [m].
 
-    Attributes:
-        gain: (3, 7, 3, 3), by sensor (gyroscope, accelerometer, magnetometer) and IMU.
-        offset: (3, 7, 3) [rad/s, m/s^2, uT].
-        tilt: (2,) [rad], turns of the vertical about the axes x and y of {1}.
-        joints: (2, 6, 3) [m], corrections of the mechanism's base and platform joints.
-        floor: (2,) [m, rad], standard deviations of position and rotation that tilt and joints leave.
-        covariance: (147, 147), of the remaining errors, in the order of `imu_errors.ERROR_NAMES` for each IMU; None if it is
-            not known.
-        about: further facts: date, residuals, source of the data.
+    Gain and offset stand by sensor (gyroscope, accelerometer, magnetometer) and IMU.
     """
 
     gain: Array = field(default_factory=lambda: np.tile(np.eye(3), (3, IMU_COUNT, 1, 1)))
     offset: Array = field(default_factory=lambda: np.zeros((3, IMU_COUNT, 3)))
+    # By which the vertical is turned about the axes x and y of {1}, and corrections of the base and platform joints.
     tilt: Array = field(default_factory=lambda: np.zeros(2))
     joints: Array = field(default_factory=lambda: np.zeros((2, LEGS, 3)))
+    # Standard deviations of position [m] and rotation [rad] that tilt and joints leave.
     floor: Array = field(default_factory=lambda: np.zeros(2))
+    # (147, 147), of the remaining errors, in the order of `imu_errors.ERROR_NAMES` for each IMU; None if it is not known.
     covariance: Array | None = None
+    # Further facts: date, residuals, source of the data.
     about: dict[str, Any] = field(default_factory=dict)
 
     def apply(self, measurements: Array) -> Array:
@@ -98,10 +96,10 @@ def load_calibration(path: Path | str) -> Calibration:
     for name, table in document.items():
         if not isinstance(table, dict):
             raise InputError(f"{path}: {name} must be a table, got {table!r}")
-    calibration = Calibration(about=document.get("about", {}))
+    about, base, joints = (document.pop(name, {}) for name in ("about", "base", "joints"))
+    remaining = document.pop("covariance", None)
+    calibration = Calibration(about=about)
     for name, table in document.items():
-        if name in ("about", "base", "joints", "covariance"):
-            continue
         imu = name.removeprefix("imu_")
         if not (name.startswith("imu_") and imu in map(str, range(IMU_COUNT))):
             raise InputError(
@@ -111,29 +109,20 @@ def load_calibration(path: Path | str) -> Calibration:
             if sensor not in SENSORS:
                 raise InputError(f"{path}: {name} has no sensor {sensor!r}; it has {', '.join(SENSORS)}")
             _read_sensor(calibration, SENSORS.index(sensor), int(imu), entries, f"{path}: {name}.{sensor}")
-    changes: dict[str, Any] = {}
-    for name, entries in (("base", ("tilt", "floor")), ("joints", _SIDES), ("covariance", ("sigmas", "factor"))):
-        check_entries(document.get(name, {}), entries, f"{path}: {name}")
-    if "base" in document:
-        changes["tilt"] = checked_array(document["base"].get("tilt", (0.0, 0.0)), (2,), f"{path}: base.tilt")
-        changes["floor"] = checked_array(document["base"].get("floor", (0.0, 0.0)), (2,), f"{path}: base.floor")
-        if np.abs(changes["tilt"]).max() > _MOST_TILT or (changes["floor"] < 0.0).any():
-            raise InputError(f"{path}: base.tilt must be within {_MOST_TILT:g} rad of level, and base.floor not negative")
-    if "joints" in document:
-        sides = [document["joints"].get(side, np.zeros((LEGS, 3))) for side in _SIDES]
-        moves = [checked_array(moved, (LEGS, 3), f"{path}: joints.{side}") for side, moved in zip(_SIDES, sides, strict=True)]
-        changes["joints"] = np.stack(moves)
-    if "covariance" in document:
-        changes["covariance"] = _read_covariance(document["covariance"], path)
-    return replace(calibration, **changes)
+    check_entries(base, ("tilt", "floor"), f"{path}: base")
+    check_entries(joints, _SIDES, f"{path}: joints")
+    tilt, floor = (checked_array(base.get(name, (0.0, 0.0)), (2,), f"{path}: base.{name}") for name in ("tilt", "floor"))
+    if np.abs(tilt).max() > _MOST_TILT or (floor < 0.0).any():
+        raise InputError(f"{path}: base.tilt must be within {_MOST_TILT:g} rad of level, and base.floor not negative")
+    moves = [checked_array(joints.get(side, np.zeros((LEGS, 3))), (LEGS, 3), f"{path}: joints.{side}") for side in _SIDES]
+    covariance = None if remaining is None else _read_covariance(remaining, path)
+    return replace(calibration, tilt=tilt, floor=floor, joints=np.stack(moves), covariance=covariance)
 
 
 def _read_sensor(calibration: Calibration, sensor: int, imu: int, entries: Any, where: str) -> None:
     if not isinstance(entries, dict) or set(entries) - set(_FIELDS):
         raise InputError(f"{where} must be a table of {', '.join(_FIELDS)}")
-    values: dict[str, Array] = {"bias": np.zeros(3), "scale": np.ones(3), "axes": np.zeros(3), "mounting": np.zeros(3)}
-    for entry, value in entries.items():
-        values[entry] = checked_array(value, (3,), f"{where}.{entry}")
+    values = {entry: checked_array(entries.get(entry, usual), (3,), f"{where}.{entry}") for entry, usual in _FIELDS.items()}
     if (values["scale"] <= 0.0).any():
         raise InputError(f"{where}.scale is {values['scale'].tolist()}; it must be positive")
     if np.abs(values["axes"]).max() > 1.0:
@@ -143,6 +132,7 @@ def _read_sensor(calibration: Calibration, sensor: int, imu: int, entries: Any, 
 
 
 def _read_covariance(table: dict[str, ArrayLike], path: Path | str) -> Array:
+    check_entries(table, ("sigmas", "factor"), f"{path}: covariance")
     size = IMU_COUNT * ERRORS
     sigmas = checked_array(table.get("sigmas", ()), (size,), f"{path}: covariance.sigmas")
     rows = table.get("factor", ())
@@ -166,25 +156,22 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
     lines = [
         "# Calibration of the IMUs: 0 to 5 on the legs, 6 on the platform.",
         "# calibrated = R(mounting) T(axes) S(scale) (raw + bias)",
-    ]
-    lines += ["", "[about]", *(f"{name} = {_toml(value)}" for name, value in calibration.about.items())]
-    lines += [
+        "",
+        "[about]",
+        *_entries(calibration.about),
         "",
         "# By which the vertical is turned about x and y, in rad; what tilt and joints leave of the pose, in m and rad.",
         "[base]",
-        f"tilt = {_toml(calibration.tilt.tolist())}",
-        f"floor = {_toml(calibration.floor.tolist())}",
+        *_entries({"tilt": calibration.tilt, "floor": calibration.floor}),
     ]
     if np.abs(calibration.joints).max() >= _LEAST_MOVE_M:
-        lines += ["", "[joints]  # what must be added to their places, in m"]
-        lines += [f"{side} = {_toml(moves.tolist())}" for side, moves in zip(_SIDES, calibration.joints, strict=True)]
-    for imu in range(IMU_COUNT):
-        for sensor, name in enumerate(SENSORS):
-            gain, offset = calibration.gain[sensor, imu], calibration.offset[sensor, imu]
-            scale, axes, mounting = split_gain(gain)
-            values = {"bias": np.linalg.solve(gain, offset), "scale": scale, "axes": axes, "mounting": mounting}
-            lines += ["", f"[imu_{imu}.{name}]  # bias in {UNITS[sensor]}, mounting in rad"]
-            lines += [f"{entry} = {_toml(value.tolist())}" for entry, value in values.items()]
+        moves = dict(zip(_SIDES, calibration.joints, strict=True))
+        lines += ["", "[joints]  # what must be added to their places, in m", *_entries(moves)]
+    for imu, (sensor, name) in product(range(IMU_COUNT), enumerate(SENSORS)):
+        gain, offset = calibration.gain[sensor, imu], calibration.offset[sensor, imu]
+        scale, axes, mounting = split_gain(gain)
+        values = {"bias": np.linalg.solve(gain, offset), "scale": scale, "axes": axes, "mounting": mounting}
+        lines += ["", f"[imu_{imu}.{name}]  # bias in {UNITS[sensor]}, mounting in rad", *_entries(values)]
     if calibration.covariance is not None:
         sigmas = np.sqrt(np.diag(calibration.covariance))
         # Positive definite whatever rounding has done to the correlation.
@@ -193,16 +180,21 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
             "",
             "# Of the errors that are left: standard deviations, and the Cholesky factor of their correlation.",
             "[covariance]",
+            *_entries({"sigmas": sigmas}),
+            "factor = [",
+            *(f"    [{', '.join(f'{value:.6g}' for value in row[: i + 1])}]," for i, row in enumerate(factor)),
+            "]",
         ]
-        lines += [f"sigmas = {_toml(sigmas.tolist())}", "factor = ["]
-        lines += [f"    [{', '.join(f'{value:.6g}' for value in row[: i + 1])}]," for i, row in enumerate(factor)]
-        lines += ["]"]
     write_whole(path, ("\n".join(lines) + "\n").encode())
+
+
+def _entries(values: Mapping[str, Any]) -> list[str]:
+    return [f"{name} = {_toml(value.tolist() if isinstance(value, np.ndarray) else value)}" for name, value in values.items()]
 
 
 def _toml(value: Any) -> str:
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False)
     if isinstance(value, list):
-        return f"[{', '.join(_toml(each) for each in value)}]"
+        return f"[{', '.join(map(_toml, value))}]"
     return f"{value!r}".lower()

@@ -28,38 +28,29 @@ from plant.errors import CalibrationError
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, Pose
 
+# Factor on the noise for the covariance: what the model leaves out is the same in every swing, and does not average out.
 _INFLATION = 1.5
-"""Factor on the noise for the covariance: what the model leaves out is the same in every swing, and does not average out."""
-
-_GUIDE_SIGMA_S = 0.02
-"""Standard deviation of the Gaussian low-pass of a motion at which the filter is linearised."""
+_GUIDE_SIGMA_S = 0.02  # of the Gaussian low-pass of a motion at which the filter is linearised
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Estimates of the whole-mechanism filter.
+    """Estimates of the whole-mechanism filter."""
 
-    Attributes:
-        positions, rotations, motions: (N, 3) [m], (N, 3, 3), (N, 4, 3).
-        covariances: (N, 6, 6), of the pose.
-        state: of the filter at the end.
-    """
-
-    positions: Array
-    rotations: Array
-    motions: Array
-    covariances: Array
-    state: Record
+    positions: Array  # (N, 3) [m]
+    rotations: Array  # (N, 3, 3)
+    motions: Array  # (N, 4, 3): velocity and angular velocity in {1}, and their derivatives
+    covariances: Array  # (N, 6, 6), of the pose
+    state: Record  # of the filter at the end
 
 
 def track(
     parameters: Record, geometry: Record, samples: Array, used: NDArray[np.int64], rate: float, delay: float,
     start: tuple[Pose, Array], guide: Array | None = None,
 ) -> Track:  # fmt: skip
-    """Run the whole-mechanism filter alone.
+    """Run the whole-mechanism filter (dtypes `FILTER_PARAMETERS` and `SENSOR_GEOMETRY`) alone.
 
     Args:
-        parameters, geometry: dtypes `FILTER_PARAMETERS` and `SENSOR_GEOMETRY`.
         samples: (N, 3, 7, 3), calibrated.
         used: (N, 7), which IMUs to use.
         rate: samples per second [Hz].
@@ -69,17 +60,16 @@ def track(
     """
     shapes, state = ((3,), (3, 3), (4, 3), (6, 6)), np.zeros((), FILTER_STATE)
     positions, rotations, motions, covariances = (np.zeros((len(samples), *shape)) for shape in shapes)
-    guided = np.zeros((0, 4, 3)) if guide is None else guide
-    if guide is not None:
+    if guide is None:
+        guide = np.zeros((0, 4, 3))
+    else:
         parameters = parameters.copy()
         parameters["smoothing"] = np.inf
     pose, twist = start
     start_filter(parameters[()], state[()], 0.0, pose.position, pose.rotation, twist)
-    _track(
-        parameters[()], geometry[()], state[()], samples, used, 1.0 / rate, delay, guided, positions, rotations, motions,
-        covariances,
-    )  # fmt: skip
-    return Track(positions, rotations, motions, covariances, state)
+    found = positions, rotations, motions, covariances
+    _track(parameters[()], geometry[()], state[()], samples, used, 1.0 / rate, delay, guide, *found)
+    return Track(*found, state)
 
 
 @kernel
@@ -87,18 +77,15 @@ def _track(
     parameters: Record, geometry: Record, state: Record, samples: Array, used: NDArray[np.int64], period: float, delay: float,
     guide: Array, positions: Array, rotations: Array, motions: Array, covariances: Array,
 ) -> None:  # fmt: skip
-    twist, acceleration = np.zeros(6), np.zeros(6)
     for i in range(samples.shape[0]):
         if guide.shape[0] > 0:
             state.low_passed[:] = guide[i]
         if i > 0:
             accumulate_sample(state, samples[i], used[i], i * period - delay)
             step_filter(parameters, geometry, state)
-        extrapolate(state, i * period, positions[i], rotations[i], twist, acceleration)
+        motion = motions[i].reshape(12)
+        extrapolate(state, i * period, positions[i], rotations[i], motion[:6], motion[6:])
         extrapolate_covariance(parameters, state, i * period, covariances[i])
-        for j in range(3):
-            motions[i, 0, j], motions[i, 1, j] = twist[j], twist[3 + j]
-            motions[i, 2, j], motions[i, 3, j] = acceleration[j], acceleration[3 + j]
 
 
 def calibrate_in_motion(
@@ -110,12 +97,10 @@ def calibrate_in_motion(
     take noise for excitation. A third run, with more noise, gives the covariance.
 
     Args:
-        mechanism: as before.
-        found: by `calibrate_at_rest`.
+        found: by `calibrate_at_rest`, for the same mechanism.
         samples: (N, 3, 7, 3), raw.
         rate: samples per second [Hz].
         start: pose and twist (6,) at the first sample.
-        fusion: settings.
 
     Returns:
         The calibration, and the covariance (185, 185) of the remaining errors of IMUs, joints and tilt.
@@ -135,21 +120,13 @@ def calibrate_in_motion(
         guide = gaussian_filter1d(run.motions, _GUIDE_SIGMA_S * rate, axis=0, mode="nearest")
         runs.append(run)
     last = runs[-2].state
-    moved = last["rig"]
-    calibration = found.calibration().then(
-        *undo(last["errors"]),
-        joints=found.joints + moved[:JOINTS].reshape(2, LEGS, 3),
-        tilt=found.tilt + moved[JOINTS:],
-    )
+    joints, tilt = found.joints + last["rig"][:JOINTS].reshape(2, LEGS, 3), found.tilt + last["rig"][JOINTS:]
+    calibration = found.calibration().then(*undo(last["errors"]), joints=joints, tilt=tilt)
     kept = slice(MOTION_STATES, MOTION_STATES + ALL_ERRORS + RIG_ERRORS)
     covariance: Array = runs[-1].state["covariance"][kept, kept].copy()
-    of_errors, across, of_rig = (
-        covariance[:ALL_ERRORS, :ALL_ERRORS],
-        covariance[ALL_ERRORS:, :ALL_ERRORS],
-        covariance[ALL_ERRORS:],
-    )
+    across, of_rig = covariance[ALL_ERRORS:, :ALL_ERRORS], covariance[ALL_ERRORS:, ALL_ERRORS:]
     # The covariance of the IMUs' errors if joints and tilt were known, and what these two add.
-    known = of_errors - across.T @ np.linalg.pinv(of_rig[:, ALL_ERRORS:], rcond=1e-12, hermitian=True) @ across
+    known = covariance[:ALL_ERRORS, :ALL_ERRORS] - across.T @ np.linalg.pinv(of_rig, rcond=1e-12, hermitian=True) @ across
     added = covariance.copy()
     added[:ALL_ERRORS, :ALL_ERRORS] -= known
     built, poses = mechanism.moved_joints(calibration.joints), zip(found.positions, found.rotations, strict=True)

@@ -16,34 +16,22 @@ from plant.errors import CalibrationError
 from plant.pose import Array
 
 LEAST_SAMPLES = 100
-_MOST_ACCELERATION = 0.02
-"""Largest deviation of the length of a force from gravity, as a share of it, for the force to count as a vertical."""
-
+_MOST_ACCELERATION = 0.02  # share of gravity by which the length of a force may be off for it to count as a vertical
 _MOST_RESIDUAL = 0.05
 _LARGEST_CONDITION = 1e3
 
 
 @dataclass(frozen=True, eq=False)
 class MagnetometerCalibration:
-    """The constants of one magnetometer.
+    """The constants of one magnetometer: calibrated = gain @ raw + offset."""
 
-    Attributes:
-        gain: (3, 3), upper triangular without an accelerometer; calibrated = gain @ raw + offset.
-        offset: (3,) [uT].
-        sigmas: (12,), standard deviations of offset and gain, row by row.
-        samples: number of samples; repeated ones count once.
-        field_residual: RMS of the strength of the field [uT].
-        dip: of the field below the horizontal plane [rad]; None without an accelerometer.
-        dip_residual: RMS [rad]; None without an accelerometer.
-    """
-
-    gain: Array
-    offset: Array
-    sigmas: Array
-    samples: int
-    field_residual: float
-    dip: float | None
-    dip_residual: float | None
+    gain: Array  # (3, 3), upper triangular without an accelerometer
+    offset: Array  # (3,) [uT]
+    sigmas: Array  # (12,), standard deviations of offset and gain, row by row
+    samples: int  # repeated ones count once
+    field_residual: float  # RMS of the strength of the field [uT]
+    dip: float | None  # of the field below the horizontal plane [rad]; None without an accelerometer
+    dip_residual: float | None  # RMS [rad]; None without an accelerometer
 
 
 def calibrate_magnetometer(
@@ -102,15 +90,15 @@ def _fit(fields: Array, still: Array, verticals: Array, strength: float) -> Magn
         start = np.append(start, scale * np.mean(np.sum((fields[still] - center) * verticals, axis=1)))
     sizes = np.repeat([1.0, 1.0 / strength, 1.0], [3, len(rows), len(start) - 3 - len(rows)])
     fit = least_squares(residuals, start, method="lm", x_scale=sizes)
-    constants = gain_of(fit.x), fit.x[:3]
-    _check(fields @ constants[0].T + constants[1], strength)
+    gain, offset = gain_of(fit.x), fit.x[:3]
+    _check(fields @ gain.T + offset, strength)
     if not fit.success or np.linalg.cond(fit.jac * sizes) > _LARGEST_CONDITION:
         raise CalibrationError("the orientations are too much alike: turn it about other axes, too")
     deviations = deviations_of(fit.jac, fit.fun, len(fit.fun) - len(fit.x))
     field_errors, dip_errors = np.split(fit.fun, [len(fields)])
     return MagnetometerCalibration(
-        gain=constants[0],
-        offset=constants[1],
+        gain=gain,
+        offset=offset,
         sigmas=np.concatenate([deviations[:3], gain_of(deviations).ravel()]),
         samples=len(fields),
         field_residual=float(np.sqrt(np.mean(field_errors**2))),

@@ -22,35 +22,22 @@ _SHORTEST_REST_S = 0.5
 _MARGIN_S = 0.1
 _MOST_RATE = np.radians(1.0)
 _MOST_SPREAD = 5.0
-_LEAST_SHARE = 0.75
-"""Least component of a unit vector along each half-axis, at some time."""
-
-_LEAST_TURN = np.pi
-"""Least sum of the turns about each axis [rad]."""
-
+_LEAST_SHARE = 0.75  # component of a unit vector along each half-axis, at some time
+_LEAST_TURN = np.pi  # sum of the turns about each axis [rad]
 _LARGEST_CONDITION = 1e3
 _AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 
 
 @dataclass(frozen=True, eq=False)
 class ImuCalibration:
-    """The constants of one IMU, by sensor (gyroscope, accelerometer).
+    """The constants of one IMU, by sensor (gyroscope, accelerometer): calibrated = gain @ raw + offset."""
 
-    Attributes:
-        gain: (2, 3, 3), the accelerometer's upper triangular; calibrated = gain @ raw + offset.
-        offset: (2, 3) [rad/s, m/s^2].
-        sigmas: (2, 12), standard deviations of offset and gain, row by row.
-        rests: number of rests.
-        force_residual: RMS of the length of gravity at rest [m/s^2].
-        turn_residual: RMS of the angle between the verticals after a turn [rad].
-    """
-
-    gain: Array
-    offset: Array
-    sigmas: Array
+    gain: Array  # (2, 3, 3), the accelerometer's upper triangular
+    offset: Array  # (2, 3) [rad/s, m/s^2]
+    sigmas: Array  # (2, 12), standard deviations of offset and gain, row by row
     rests: int
-    force_residual: float
-    turn_residual: float
+    force_residual: float  # RMS of the length of gravity at rest [m/s^2]
+    turn_residual: float  # RMS of the angle between the verticals after a turn [rad]
 
 
 def calibrate_imu(times: Array, rates: Array, forces: Array, gravity: float) -> ImuCalibration:
@@ -73,8 +60,8 @@ def calibrate_imu(times: Array, rates: Array, forces: Array, gravity: float) -> 
         )
     at_rest = np.array([forces[rest].mean(axis=0) for rest in rests])
     force_gain, force_offset, force_sigmas, force_residual = _fit_forces(at_rest, gravity)
-    _check_orientations(at_rest @ force_gain.T + force_offset, gravity)
     verticals = at_rest @ force_gain.T + force_offset
+    _check_orientations(verticals, gravity)
     verticals /= np.linalg.norm(verticals, axis=1, keepdims=True)
     bias = np.array([rates[rest].mean(axis=0) for rest in rests])
     _check_turns(rates, bias, rests, period)
