@@ -9,7 +9,7 @@ at 2 with 65 deg of phase margin and 12 dB of gain margin.
 """
 
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import control
@@ -39,21 +39,13 @@ _SIGNALS = 2 * 7 * 3
 
 @dataclass(frozen=True)
 class Margins:
-    """Stability of the loop of one actuator with the others closed, for the worst actuator, and of all six together.
-
-    Attributes:
-        gain_db: gain margin [dB].
-        phase_deg: phase margin [deg].
-        crossover_hz: highest frequency at which the loop gain falls below one [Hz].
-        sensitivity_peak: greatest singular value of the sensitivity over frequency, all loops closed.
-        stable: whether all poles lie inside the unit circle.
-    """
+    """Stability of the loop of one actuator with the others closed, for the worst actuator, and of all six together."""
 
     gain_db: float
     phase_deg: float
-    crossover_hz: float
-    sensitivity_peak: float
-    stable: bool
+    crossover_hz: float  # highest frequency at which the loop gain falls below one
+    sensitivity_peak: float  # greatest singular value of the sensitivity over frequency, all loops closed
+    stable: bool  # whether all poles lie inside the unit circle
 
     @property
     def sound(self) -> bool:
@@ -99,8 +91,7 @@ class Design:
         return rows
 
 
-@dataclass(frozen=True, eq=False)
-class Linear:
+class Linear(NamedTuple):
     """A discrete linear system x+ = A x + B u, y = C x + D u."""
 
     a: Array
@@ -160,20 +151,16 @@ def linear_plant(mechanism: Mechanism, rate: float) -> tuple[Linear, Array]:
     flat = np.concatenate([np.ravel((values | friction)[variable.name]) for variable in SPATIAL.parameters])
     dynamics = build_dynamics()
     constants = dynamics.constants(flat)
-    x = np.concatenate(
-        [np.concatenate([values["initial_position"], values["initial_quaternion"]]), np.zeros(sum(v.size for v in STATES) - 7)]
-    )
-    u = np.zeros(sum(variable.size for variable in INPUTS))
+    x, u = (np.zeros(sum(variable.size for variable in variables)) for variables in (STATES, INPUTS))
+    x[:7] = *values["initial_position"], *values["initial_quaternion"]
     u[_slice(INPUTS, "drive_mode")] = VELOCITY
     x[_slice(STATES, "state.current")], u[_slice(INPUTS, "velocity_command")] = _equilibrium(dynamics.rates, x, u, constants)
 
     states, inputs = ca.SX.sym("x", len(x)), ca.SX.sym("u", len(u))
-    symbols = [states, inputs]
-    point = (x, u)
     rates = dynamics.rates(states, inputs, constants)
     signals = dynamics.outputs(states, inputs, constants)[:_SIGNALS]
     a, b, c = (
-        np.array(ca.Function("jacobian", symbols, [ca.jacobian(of, by)])(*point))
+        np.array(ca.Function("jacobian", [states, inputs], [ca.jacobian(of, by)])(x, u))
         for of, by in ((rates, states), (rates, inputs), (signals, states))
     )
     reduce = _reduction(values["initial_quaternion"])
@@ -220,14 +207,9 @@ def _reduction(quaternion: Array) -> Array:
     """The map (18, n) from the plant's states, without the brakes' deflections, to states with a rotation vector in {1}."""
     w, x, y, z = quaternion
     from_rotation = 0.5 * np.array([[-x, -y, -z], [w, z, -y], [-z, w, x], [y, -x, w]])
-    size = sum(variable.size for variable in STATES)
-    attitude = _slice(STATES, "state.quaternion")
-    kept = [i for i in range(_slice(STATES, "state.brake_deflection").start) if not attitude.start <= i < attitude.stop]
-    reduce = np.zeros((len(kept) + 3, size))
-    for row, i in enumerate(kept):
-        reduce[row, i] = 1.0
-    reduce[len(kept) :, attitude] = np.linalg.pinv(from_rotation)
-    return reduce
+    identity, attitude = np.eye(sum(variable.size for variable in STATES)), _slice(STATES, "state.quaternion")
+    before, after = identity[: attitude.start], identity[attitude.stop : _slice(STATES, "state.brake_deflection").start]
+    return np.concatenate([before, after, np.linalg.pinv(from_rotation) @ identity[attitude]])
 
 
 _ESTIMATOR_STATE = (("legs", "x"), ("platform", "x"), ("pose", "smooth_twist"), ("pose", "acceleration"))
@@ -251,32 +233,19 @@ def linear_estimator(mechanism: Mechanism, rate: float, signals: Array) -> Linea
         step(settled, signals)
     size = len(flat(settled))
 
-    def response(change: Array, sample: Array) -> tuple[Array, Array]:
-        state = settled.copy()
-        at = 0
+    def response(change: Array) -> Array:
+        """State and lengths after a step, by changes of the state and of the signals."""
+        state, at = settled.copy(), 0
         for stage, name in _ESTIMATOR_STATE:
             part = state[stage][name]
             part += change[at : at + part.size].reshape(part.shape)
             at += part.size
-        step(state, signals + sample)
-        lengths = leg_lengths(mechanism, state["pose"]["position"], state["pose"]["rotation"])
-        return flat(state), lengths
+        step(state, signals + change[size:])
+        return np.concatenate([flat(state), leg_lengths(mechanism, state["pose"]["position"], state["pose"]["rotation"])])
 
-    def derivative(count: int, along_state: bool) -> tuple[Array, Array]:
-        columns_x, columns_y = [], []
-        for i in range(count):
-            ends = []
-            for sign in (1.0, -1.0):
-                change, sample = np.zeros(size), np.zeros(_SIGNALS)
-                (change if along_state else sample)[i] = sign * 1e-6
-                ends.append(response(change, sample))
-            columns_x.append((ends[0][0] - ends[1][0]) / 2e-6)
-            columns_y.append((ends[0][1] - ends[1][1]) / 2e-6)
-        return np.stack(columns_x, axis=1), np.stack(columns_y, axis=1)
-
-    a, c = derivative(size, True)
-    b, d = derivative(_SIGNALS, False)
-    return Linear(a, b, c, d)
+    steps = 1e-6 * np.eye(size + _SIGNALS)
+    slopes = np.stack([(response(change) - response(-change)) / 2e-6 for change in steps], axis=1)
+    return Linear(slopes[:size, :size], slopes[:size, size:], slopes[size:, :size], slopes[size:, size:])
 
 
 def frequency_response(loop: Linear, rate: float) -> tuple[Array, Any]:
@@ -290,11 +259,7 @@ def frequency_response(loop: Linear, rate: float) -> tuple[Array, Any]:
 def margins(loop: Linear, response: tuple[Array, Any], gains: ControlSettings, rate: float) -> Margins:
     """Margins of the loop closed by six PID controllers, without the low-pass of their derivative.
 
-    Args:
-        loop: from commands to estimated lengths.
-        response: of `loop`, from `frequency_response`.
-        gains: of the controllers.
-        rate: cycles per second [Hz].
+    `loop` leads from commands to estimated lengths, `response` is its `frequency_response`, `rate` is in cycles per second.
     """
     n, period = len(loop.a), 1.0 / rate
     # Two further states per actuator close the loop: the integral of the error, and the previous error.
