@@ -8,6 +8,7 @@ from plant.compiled import kernel
 from plant.errors import InputError, SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, Pose, checked_array, checked_rotation, rotation_from_vector
+from plant.vectors import add, cross, dot, rotate, subtract, vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,20 +60,12 @@ def legs_at(
 ) -> None:
     """Compiled twin of `inverse_kinematics`: writes arms (6, 3), the platform joints turned to {1}, directions and lengths."""
     for k in range(LEGS):
-        square = 0.0
+        arm = rotate(rotation, vector(platform_joints[k]))
+        leg = subtract(add(vector(position), arm), vector(base_joints[k]))
+        lengths[k] = np.sqrt(dot(leg, leg))
         for i in range(3):
-            arm = (
-                rotation[i, 0] * platform_joints[k, 0]
-                + rotation[i, 1] * platform_joints[k, 1]
-                + rotation[i, 2] * platform_joints[k, 2]
-            )
-            arms[k, i] = arm
-            component = position[i] + arm - base_joints[k, i]
-            directions[k, i] = component
-            square += component * component
-        lengths[k] = np.sqrt(square)
-        for i in range(3):
-            directions[k, i] /= lengths[k]
+            arms[k, i] = arm[i]
+            directions[k, i] = leg[i] / lengths[k]
 
 
 @kernel
@@ -85,10 +78,9 @@ def jacobian_at(arms: Array, directions: Array, legs: int, jacobian: Array) -> N
         for i in range(6):
             jacobian[k, i] = 1.0 if i == k - 1 else 0.0
     for k in range(legs):
-        a0, a1, a2 = arms[k, 0], arms[k, 1], arms[k, 2]
-        d0, d1, d2 = directions[k, 0], directions[k, 1], directions[k, 2]
-        jacobian[k, 0], jacobian[k, 1], jacobian[k, 2] = d0, d1, d2
-        jacobian[k, 3], jacobian[k, 4], jacobian[k, 5] = a1 * d2 - a2 * d1, a2 * d0 - a0 * d2, a0 * d1 - a1 * d0
+        direction = vector(directions[k])
+        jacobian[k, 0], jacobian[k, 1], jacobian[k, 2] = direction
+        jacobian[k, 3], jacobian[k, 4], jacobian[k, 5] = cross(vector(arms[k]), direction)
 
 
 _MOST_DRAWS = 500

@@ -14,26 +14,13 @@ RANK_TOLERANCE = 1e-9
 
 @kernel
 def solve_least_squares(matrix: Array, right: Array, rows: int, solution: Array, norms: Array, order: Array) -> float:
-    """Minimise |matrix @ solution - right| by QR with column pivoting; overwrites `matrix` and `right`.
-
-    Args:
-        matrix: (>= rows, >= n), of which the corner counts; contiguous.
-        right: (>= rows,).
-        rows: at least n.
-        solution: (n,), written.
-        norms, order: (>= n,) scratch.
+    """Minimise |matrix @ solution - right| by QR with column pivoting: `solve_truncated` with as many pivots as unknowns.
 
     Returns:
         The ratio of the least to the greatest diagonal element of R, an estimate of the reciprocal condition number;
         below `RANK_TOLERANCE` nothing is solved.
     """
-    n = solution.shape[0]
-    conditioning = _triangularise(matrix, right, rows, n, solution, norms, order)
-    if conditioning >= RANK_TOLERANCE:
-        _substitute_back(matrix, right, n)
-        for k in range(n):
-            solution[int(order[k])] = right[k]
-    return conditioning
+    return solve_truncated(matrix, right, rows, solution.shape[0], solution, matrix[:0], norms, order)
 
 
 @kernel
@@ -43,10 +30,13 @@ def solve_truncated(
     """Solve a system of known rank: after `rank` pivots, the rest of the rows counts as noise.
 
     Args:
-        matrix, right, rows, norms, order: as for `solve_least_squares`.
+        matrix: (>= rows, >= n), of which the corner counts; contiguous, overwritten.
+        right: (>= rows,), overwritten.
+        rows: at least `rank`.
         rank: of the system without noise, at most n.
         solution: (n,), one solution, written.
         null_space: (>= n - rank, n), written; any multiples of its rows may be added to the solution.
+        norms, order: (>= n,) scratch.
 
     Returns:
         The ratio of the last to the first pivot; below `RANK_TOLERANCE` nothing is solved.

@@ -16,11 +16,8 @@ from plant.errors import InputError, SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, Pose, checked_array
 
-FALSE_ALARM_RATE = 1e-4
-"""Share of correct measurements that `integrity` and `cross_check` call faulty."""
-
-LENGTH_SIGMA = 1e-4
-"""Standard deviation that `cross_check` assumes of a measured length [m]."""
+FALSE_ALARM_RATE = 1e-4  # share of correct measurements that are called faulty
+LENGTH_SIGMA = 1e-4  # standard deviation that `cross_check` assumes of a measured length [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +71,7 @@ def integrity(
     """
     attitude = {"rotation": rotation, "normal": normal, "up_in_platform": up_in_platform}
     given: dict[str, Any] = {name: value for name, value in attitude.items() if value is not None}
-    fitted: Solution | None = None
-    no_pose: SingularConfigurationError | None = None
+    fitted, no_pose = None, None
     try:
         fitted = solve(mechanism, leg_directions, **given, **options)
     except SingularConfigurationError as error:
@@ -91,9 +87,7 @@ def integrity(
     threshold = chi_square_quantile(freedom, false_alarm_rate)
     leave_one_out = np.repeat(directions[None], len(measured), axis=0)
     leave_one_out[range(len(measured)), measured] = np.nan
-    repeated: dict[str, Any] = {
-        name: np.repeat(np.array(value, np.float64)[None], len(measured), axis=0) for name, value in given.items()
-    }
+    repeated: dict[str, Any] = {name: np.repeat([value], len(measured), axis=0) for name, value in given.items()}
     without = solve_batch(mechanism, leave_one_out, **repeated, **options, workers=1)
     alone = {leg: without[i] for i, leg in enumerate(measured) if without.solved[i]}
     if no_pose and not alone:
@@ -105,15 +99,12 @@ def integrity(
     for imu, solution in alone.items():
         chi_squares[imu] = solution.chi_square
     chi_square = fitted.chi_square if fitted else math.inf
-    faulty = None
-    if chi_square > threshold:
-        agreeing = [
-            imu
-            for imu, solution in alone.items()
-            if solution.degrees_of_freedom > 0
-            and solution.chi_square <= chi_square_quantile(solution.degrees_of_freedom, false_alarm_rate)
-        ]
-        faulty = min(agreeing, key=lambda imu: alone[imu].chi_square - alone[imu].degrees_of_freedom, default=None)
+    excess = {}
+    for imu, solution in alone.items():
+        degrees = solution.degrees_of_freedom
+        if degrees > 0 and solution.chi_square <= chi_square_quantile(degrees, false_alarm_rate):
+            excess[imu] = solution.chi_square - degrees
+    faulty = min(excess, key=lambda imu: excess[imu]) if excess and chi_square > threshold else None
     best = fitted if faulty is None else alone[faulty]
     return Integrity(best, chi_square > threshold, faulty, chi_square, threshold, freedom, chi_squares)
 
@@ -154,8 +145,7 @@ def cross_check(
     """Compare a pose found from orientations with measured lengths, for rigs that have encoders.
 
     Args:
-        mechanism: the mechanism.
-        solution: from `solve`, with its covariance.
+        solution: from `solve`, with its covariance, for this mechanism.
         lengths: (6,) [m]; NaN where none was measured.
         length_sigma: standard deviation of a measured length [m].
         false_alarm_rate: share of correct measurements that are called inconsistent, between 0 and 1.
@@ -185,11 +175,7 @@ def cross_check(
 
 
 def chi_square_quantile(degrees_of_freedom: int, rate: float) -> float:
-    """The value that a chi-square sum exceeds at this rate.
-
-    Raises:
-        InputError: the rate is not between 0 and 1.
-    """
+    """The value that a chi-square sum exceeds at this rate; an `InputError` unless it is between 0 and 1."""
     # Imported here: a process that runs a loop imports this module, and SciPy takes long.
     from scipy.special import chdtri
 

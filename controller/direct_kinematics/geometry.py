@@ -14,11 +14,8 @@ from plant.mechanism.checks import SAME_JOINT_M
 from plant.pose import Array
 from plant.vectors import Vector
 
-MOST_FREE = 5
-"""Parameters that the legs' equations may leave open for the equations of a rotation to settle."""
-
-ROTATION_EQUATIONS = 20
-"""Quadratic equations that the elements of a rotation obey."""
+MOST_FREE = 5  # parameters that the legs' equations may leave open for the equations of a rotation to settle
+ROTATION_EQUATIONS = 20  # that the elements of a rotation obey, quadratic ones
 
 _SETS = 1 << LEGS
 _LINEAR_RANK = 9
@@ -26,25 +23,16 @@ _LINEAR_RANK = 9
 a sixth of the error that the last three pivots of a 6-6 mechanism would bring."""
 
 GEOMETRY = record_dtype(
-    base_joints=(np.float64, (LEGS, 3)),
-    platform_joints=(np.float64, (LEGS, 3)),
-    platform_numbers=(np.int64, LEGS),
-    centers=(np.float64, (_SETS, 3)),
-    axes=(np.float64, (_SETS, 3, 3)),
-    spreads=(np.float64, _SETS),
-    bulges=(np.float64, _SETS),
-    ranks=(np.int64, _SETS),
+    base_joints=(np.float64, (LEGS, 3)),  # [m]
+    platform_joints=(np.float64, (LEGS, 3)),  # [m]
+    platform_numbers=(np.int64, LEGS),  # the first leg of each leg's platform joint
+    centers=(np.float64, (_SETS, 3)),  # of the platform joints of a set of legs [m]
+    axes=(np.float64, (_SETS, 3, 3)),  # in columns, of which the first two span the plane of these joints
+    spreads=(np.float64, _SETS),  # the joints' root mean square distance from the centre [m]
+    bulges=(np.float64, _SETS),  # the share of the spread by which the joints leave their plane
+    ranks=(np.int64, _SETS),  # of the legs' equations for p and R
 )
-"""The joints of a mechanism [m], the first leg of each leg's platform joint, and these properties of each set of legs:
-
-- the centre of its platform joints [m];
-- axes in columns, of which the first two span the plane of these joints;
-- the joints' root mean square distance from the centre, the spread [m];
-- the share of the spread by which the joints leave their plane, the bulge;
-- the rank of the legs' equations for p and R.
-
-Leg k has bit k in the number of a set.
-"""
+"""The joints of a mechanism, and what follows from them for each set of legs. Leg k has bit k in the number of a set."""
 
 SCRATCH = record_dtype(
     matrix=(np.float64, (ROTATION_EQUATIONS, ROTATION_EQUATIONS)),
@@ -56,13 +44,11 @@ SCRATCH = record_dtype(
     points=(np.float64, (LEGS, 3)),
     selected=(np.float64, LEGS),
     second_root=(np.float64, 12),
-    roots=np.int64,
-    approximate=np.int64,
-    misfit=np.float64,
+    roots=np.int64,  # how many `pose_from_legs` found
+    approximate=np.int64,  # whether it took joints for coplanar that are so only approximately
+    misfit=np.float64,  # how far its matrix was from a rotation
 )
-"""Memory for the closed forms, which allocate nothing. `pose_from_legs` reports in it: how many `roots` it found, whether it
-took joints for coplanar that are so only approximately, and the `misfit`, how far its matrix was from a rotation.
-"""
+"""Memory for the closed forms, which allocate nothing."""
 
 _OUT_OF_THE_WAY = (0.0, 0.0, -1.0)
 """Base joint [m] in the rows of legs that a planar mechanism lacks: no row has the length zero."""

@@ -21,17 +21,14 @@ _FLATNESS = 1e-3
 """Platform joints count as coplanar if they leave their plane by less than this share of their spread. The refinement makes
 up for the difference if it starts near enough."""
 
-_FLAT = 1e-13
-"""Such a share that is no more than rounding."""
-
+_FLAT = 1e-13  # such a share that is no more than rounding
+# Least conditioning over that share: more than a tenth of a radian away, the refinement may find another pose.
 _LEAST_FLAT_CONDITIONING = 10.0
-"""Least conditioning over that share: more than a tenth of a radian away, the refinement may find another pose."""
 
 _COLUMN_EQUATIONS = 3
 _COLUMN_STEPS = 5
 _MOST_POLAR_STEPS = 30
-_POLAR_TOLERANCE = 1e-18
-"""Square of the last step; the error left after it is the square of that step."""
+_POLAR_TOLERANCE = 1e-18  # square of the last step; the error left after it is the square of that step
 
 
 @kernel

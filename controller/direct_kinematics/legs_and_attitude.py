@@ -139,14 +139,12 @@ def pose_from_vector(
 
 @kernel
 def _from_one_base_joint(base_joints: Array, measured: Array) -> bool:
-    first = -1
-    for k in range(LEGS):
-        if measured[k] == 0.0:
-            continue
-        if first < 0:
-            first = k
+    first = 0
+    while measured[first] == 0.0:
+        first += 1
+    for k in range(first + 1, LEGS):
         for i in range(3):
-            if abs(base_joints[k, i] - base_joints[first, i]) > SAME_JOINT_M:
+            if measured[k] != 0.0 and abs(base_joints[k, i] - base_joints[first, i]) > SAME_JOINT_M:
                 return False
     return True
 

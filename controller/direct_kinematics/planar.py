@@ -102,11 +102,8 @@ def solve_planar(
 
 
 def closing_angles(mechanism: PlanarMechanism, leg_angles: Array) -> Array:
-    """Both angles (..., 2) [rad] of the platform, in (-pi, pi], at which three legs at angles (..., 3) [rad] meet its joints.
-    The two are equal for a double root.
-
-    Raises:
-        SingularConfigurationError: the legs leave the angle open.
+    """Both angles (..., 2) [rad] of the platform, in (-pi, pi], at which three legs at angles (..., 3) [rad] meet its joints;
+    equal for a double root. A `SingularConfigurationError` if the legs leave the angle open.
     """
     # As complex numbers, leg k gives im(conj(u) (p + turn a - b)) = 0, and the weights close a triangle: sum w u = 0.
     base, platform = mechanism.base_joints @ (1.0, 1.0j), mechanism.platform_joints @ (1.0, 1.0j)

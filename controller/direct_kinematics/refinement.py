@@ -10,24 +10,16 @@ from plant.mechanism import LEGS
 from plant.pose import Array, rotate_by_vector
 from plant.vectors import Vector, cross, dot, rotate, scale, subtract, vector
 
-_BEYOND_DOUBT = 1e30
-"""Inverse variance of a known quantity."""
-
-
-@kernel
-def _project(direction: Vector, x: Vector) -> Vector:
-    """The part of a vector x across a unit vector, projected twice. Where legs are nearly parallel, the rounding that one
-    projection leaves along them would weigh more than the measurement.
-    """
-    for _ in range(2):
-        x = subtract(x, scale(dot(direction, x), direction))
-    return x
+_BEYOND_DOUBT = 1e30  # inverse variance of a known quantity
 
 
 @kernel
 def _add_leg(right: Array, measured: Vector, direction: Vector, arm: Vector, weight: float) -> None:
     """Add `weight` J^T P `measured` to a right side (6,), P = I - d d^T and J = [I, -skew(arm)]."""
-    force = _project(direction, scale(weight, measured))
+    force = scale(weight, measured)
+    # Where legs are nearly parallel, the rounding that one projection leaves along them would outweigh the measurement.
+    for _ in range(2):
+        force = subtract(force, scale(dot(direction, force), direction))
     torque = cross(arm, force)
     for i in range(3):
         right[i] += force[i]
@@ -52,10 +44,8 @@ def normal_equations(
         correction: (6,), the right side, written.
     """
     legs_at(base_joints, platform_joints, position, rotation, arms, predicted, lengths)
-    for i in range(6):
-        correction[i] = 0.0
-        for j in range(6):
-            information[i, j] = 0.0
+    correction[:] = 0.0
+    information[:] = 0.0
     for k in range(LEGS):
         if weights[k] == 0.0:
             continue
@@ -136,8 +126,7 @@ def find_twist(
         rates: (6, 3), derivatives of the directions [1/s].
         angular_velocity: (3,) [rad/s] in {1}; it is to the twist what the vectors are to the attitude.
     """
-    for i in range(6):
-        twist[i] = 0.0
+    twist[:] = 0.0
     for k in range(LEGS):
         if weights[k] != 0.0:
             _add_leg(twist, vector(rates[k]), vector(predicted[k]), vector(arms[k]), weights[k] / lengths[k])

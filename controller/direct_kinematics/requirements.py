@@ -2,13 +2,15 @@
 
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
 from controller.direct_kinematics.solver import METHODS
 from controller.direct_kinematics.spatial import NEEDS, check_spatial, solve_batch
+from controller.direct_kinematics.synthetic import leg_directions
 from plant.mechanism import LEGS, Mechanism
-from plant.pose import Pose, rotation_from_vector
+from plant.pose import Array, rotation_from_vector
 
 _TRIAL_POSES = 8
 _TRIAL_TILT = 0.3
@@ -61,16 +63,14 @@ def required_measurements(mechanism: Mechanism) -> tuple[Requirement, ...]:
         InputError: the mechanism does not have six legs.
     """
     check_spatial(mechanism)
-    poses = _trial_poses(mechanism)
+    positions, rotations = _trial_poses(mechanism)
+    seen = leg_directions(mechanism, positions, rotations)
     sets = [legs for count in range(2, LEGS + 1) for legs in combinations(range(LEGS), count)]
-    directions = np.empty((len(sets), len(poses), LEGS, 3))
-    for i, pose in enumerate(poses):
-        vectors = pose.position + mechanism.platform_joints @ pose.rotation.T - mechanism.base_joints
-        directions[:, i] = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    for j, legs in enumerate(sets):
-        directions[j][:, [leg for leg in range(LEGS) if leg not in legs]] = np.nan
-    rotations = np.tile([pose.rotation for pose in poses], (len(sets), 1, 1))
-    given = {
+    directions = np.full((len(sets), *seen.shape), np.nan)
+    for legs, of_set in zip(sets, directions, strict=True):
+        of_set[:, legs] = seen[:, legs]
+    rotations = np.tile(rotations, (len(sets), 1, 1))
+    given: dict[str, dict[str, Any]] = {
         "nothing": {},
         "rotation": {"rotation": rotations},
         "normal": {"normal": rotations[:, :, 2]},
@@ -80,7 +80,7 @@ def required_measurements(mechanism: Mechanism) -> tuple[Requirement, ...]:
     for method in METHODS:
         platform = NEEDS.get(method, "nothing")
         found = solve_batch(mechanism, directions.reshape(-1, LEGS, 3), method=method, **given[platform])
-        enough = found.solved.reshape(len(sets), len(poses)).mean(axis=1) > 0.5
+        enough = found.solved.reshape(len(sets), _TRIAL_POSES).mean(axis=1) > 0.5
         if not enough.any():
             continue
         sufficient = [legs for legs, suffices in zip(sets, enough, strict=True) if suffices]
@@ -91,14 +91,8 @@ def required_measurements(mechanism: Mechanism) -> tuple[Requirement, ...]:
     return tuple(requirements)
 
 
-def _trial_poses(mechanism: Mechanism) -> list[Pose]:
-    random = np.random.default_rng(0)
+def _trial_poses(mechanism: Mechanism) -> tuple[Array, Array]:
     size = float(np.linalg.norm(mechanism.base_joints - mechanism.base_joints.mean(axis=0), axis=1).max())
-    home = mechanism.nominal_home
-    return [
-        Pose(
-            home.position + 0.2 * size * random.uniform(-1.0, 1.0, 3),
-            rotation_from_vector(_TRIAL_TILT * random.uniform(-1.0, 1.0, 3)) @ home.rotation,
-        )
-        for _ in range(_TRIAL_POSES)
-    ]
+    moves = np.random.default_rng(0).uniform(-1.0, 1.0, (_TRIAL_POSES, 6))
+    turns = np.array([rotation_from_vector(_TRIAL_TILT * turn) for turn in moves[:, 3:]])
+    return mechanism.nominal_home.position + 0.2 * size * moves[:, :3], turns @ mechanism.nominal_home.rotation

@@ -1,6 +1,6 @@
 """The compiled solver: reads what was measured of a pose, tries closed forms, refines, and decides between two roots.
 
-It never raises. Each row of a batch ends with a status, from which `spatial` makes the error.
+It never raises: `spatial` has checked what was measured, and makes an error from the status with which a row ends.
 """
 
 from typing import NamedTuple
@@ -17,21 +17,17 @@ from controller.inverse_kinematics import legs_at
 from controller.least_squares import invert_cholesky
 from plant.compiled import Record, kernel, record_dtype
 from plant.mechanism import LEGS
-from plant.pose import UNIT_TOLERANCE, Array
-from plant.vectors import dot, rotate, vector
+from plant.pose import Array
+from plant.vectors import Vector, dot, rotate, rotate_back, vector
 
 METHODS = ("section-5", "up", "normal", "legs", "section-3.1.1", "section-4")
 """The closed forms: those of the paper's sections, and those from all legs with the vertical, the normal, or nothing else."""
 
 _SECTION_5, _UP, _NORMAL, _LEGS, _SECTION_3_1_1, _SECTION_4 = range(len(METHODS))
 
-LEAST_CONDITIONING = 1e-6
-"""Conditioning below which the measurements count as singular."""
-
+LEAST_CONDITIONING = 1e-6  # below which the measurements count as singular
 _GOOD_CONDITIONING = 1e-2
-
-_MOST_MISFIT = 0.2
-"""Greatest distance from a rotation, in its nine elements, of what `legs` gives: beyond this the solution fits noise."""
+_MOST_MISFIT = 0.2  # distance from a rotation, in its nine elements, beyond which what `legs` gives fits noise
 
 _DISTINCT, _DISTINCT_SHARE = 25.0, 400.0
 """One of two roots is the pose if their chi-square sums differ by the first number, which noise does once in three million
@@ -39,42 +35,28 @@ times, or by the second number times the better sum over its degrees of freedom,
 
 _SAME_ROTATION = 1e-6
 _MOST_REFINEMENTS = 20
-_REFINED = 1e-14
-"""Square of a step over its variance at which the pose has settled."""
+_REFINED = 1e-14  # square of a step over its variance at which the pose has settled
+_TINY = 1e-9  # step, over the joints' spread or in radians, that may be no more than rounding
 
-_TINY = 1e-9
-"""Step, over the joints' spread or in radians, that may be no more than rounding."""
-
-(
-    SOLVED, OPEN, SINGULAR, UNSETTLED, NEGATIVE, PARTLY_NAN, INFINITE, LEG_NOT_UNIT, ROTATION_INFINITE, NOT_ORTHOGONAL,
-    REFLECTION, UP_NOT_UNIT, NORMAL_NOT_UNIT, AMBIGUOUS,
-) = range(14)  # fmt: skip
+SOLVED, OPEN, SINGULAR, UNSETTLED, NEGATIVE, AMBIGUOUS = range(6)
 """Statuses of a row."""
 
 
 class Measurements(NamedTuple):
-    """What was measured of N poses; an array without rows was not measured.
+    """What was measured of N poses; an array without rows was not measured. The weights are inverse variances."""
 
-    Attributes:
-        directions: (N, 6, 3).
-        rotations: (N, 3, 3) or (0, 3, 3).
-        ups, normals: (N, 3) or (0, 3).
-        axes: (3, 3), orthonormal rows in {1}, the first of which is the vertical.
-        leg_weight, tilt_weight, yaw_weight: inverse variances.
-    """
-
-    directions: Array
-    rotations: Array
-    ups: Array
-    normals: Array
-    axes: Array
+    directions: Array  # (N, 6, 3)
+    rotations: Array  # (N, 3, 3) or (0, 3, 3)
+    ups: Array  # (N, 3) or (0, 3)
+    normals: Array  # (N, 3) or (0, 3)
+    axes: Array  # (3, 3), orthonormal rows in {1}, the first of which is the vertical
     leg_weight: float
     tilt_weight: float
     yaw_weight: float
 
 
 class Results(NamedTuple):
-    """What is written for N poses: the arrays of `Solutions`, the status of each row, and the leg that the status is about."""
+    """The arrays of `Solutions`, NaN where nothing is written, and the status of each row."""
 
     positions: Array
     rotations: Array
@@ -85,7 +67,6 @@ class Results(NamedTuple):
     methods: NDArray[np.int64]
     conditionings: Array
     statuses: NDArray[np.int64]
-    legs: NDArray[np.int64]
 
 
 WORK = record_dtype(
@@ -97,9 +78,9 @@ WORK = record_dtype(
     in_base=(np.float64, (5, 3)),
     in_platform=(np.float64, (5, 3)),
     vector_weights=(np.float64, 5),
-    vectors=np.int64,
-    up=np.int64,
-    normal=np.int64,
+    vectors=np.int64,  # how many are known in both frames
+    up=np.int64,  # row of the vectors
+    normal=np.int64,  # row of the vectors
     equations=np.int64,
     position=(np.float64, 3),
     rotation=(np.float64, (3, 3)),
@@ -114,8 +95,7 @@ WORK = record_dtype(
     factor=(np.float64, (6, 6)),
     correction=(np.float64, 6),
 )
-"""Memory for one pose: what was measured, the pose, and its fit. `up` and `normal` are rows of the vectors known in both
-frames."""
+"""Memory for one pose: what was measured, the pose, and its fit."""
 
 
 @kernel
@@ -123,70 +103,71 @@ def solve_rows(
     geometry: Record, work_array: Record, measurements: Measurements, candidates: NDArray[np.int64], refine: bool,
     results: Results, start: int, stop: int,
 ) -> None:  # fmt: skip
-    """Solve the rows from `start` to `stop`; a row without a pose is filled with NaN, and its status says why."""
+    """Solve the rows from `start` to `stop`; of a row without a pose, the status says why."""
     work = work_array[()]
     for row in range(start, stop):
-        status, results.legs[row] = _read(measurements, row, work)
-        results.conditionings[row] = 0.0
-        results.methods[row] = 0
-        if status == SOLVED:
-            results.methods[row], results.conditionings[row] = _find(geometry, candidates, work)
-            status = SOLVED if results.conditionings[row] > LEAST_CONDITIONING else OPEN
-        if status == SOLVED:
-            # If the joints are only nearly coplanar, the closed form that takes them for coplanar is a start, not the pose.
-            by_legs = results.methods[row] == _LEGS
-            settle = refine or (by_legs and work.scratch.approximate != 0)
-            two_roots = settle and by_legs and work.scratch.roots == 2
-            status, chi_square = _fit_better(geometry, work) if two_roots else _fit(geometry, settle, work)
+        _read(measurements, row, work)
+        method, conditioning = _find(geometry, candidates, work)
+        results.methods[row], results.conditionings[row] = method, conditioning
+        if not conditioning > LEAST_CONDITIONING:
+            results.statuses[row] = OPEN
+            continue
+        # If the joints are only nearly coplanar, the closed form that takes them for coplanar is a start, not the pose.
+        settle = refine or (method == _LEGS and work.scratch.approximate != 0)
+        two_roots = settle and method == _LEGS and work.scratch.roots == 2
+        status, chi_square = _fit_better(geometry, work) if two_roots else _fit(geometry, settle, work)
         results.statuses[row] = status
         if status == SOLVED:
             _write(work, chi_square, row, results)
-        else:
-            _write_nothing(row, results)
 
 
 @kernel
-def _read(measurements: Measurements, row: int, work: Record) -> tuple[int, int]:
-    """Read what was measured of a pose; returns a status and the leg that it is about."""
-    status, leg = _read_directions(measurements.directions[row], work.directions, work.measured)
-    if status != SOLVED:
-        return status, leg
+def _read(measurements: Measurements, row: int, work: Record) -> None:
+    """Read what was measured of a pose: directions at unit length, and the vectors that are known in both frames."""
     work.vectors = 0
     work.equations = 0
     for k in range(LEGS):
+        given = vector(measurements.directions[row, k])
+        measured = not np.isnan(given[0])
+        direction = _unit(given) if measured else (0.0, 0.0, 1.0)
+        work.directions[k, 0], work.directions[k, 1], work.directions[k, 2] = direction
+        work.measured[k] = 1.0 if measured else 0.0
         work.weights[k] = work.measured[k] * measurements.leg_weight
-        work.equations += 2 * int(work.measured[k])
+        work.equations += 2 * int(measured)
     if measurements.rotations.shape[0] > 0:
-        status = _read_rotation(measurements.rotations[row], work.measured_rotation)
-        if status != SOLVED:
-            return status, leg
+        # The nearest rotation to the transposed, which the columns are, is the transposed nearest rotation.
+        work.measured_rotation[:] = measurements.rotations[row]
+        orthonormalise(work.measured_rotation.reshape(9), False)
         # These weights add up to the yaw's about the vertical, and to the tilt's about every level axis.
-        for axis in range(3):
-            work.vector_weights[axis] = 0.5 * measurements.yaw_weight
-            for i in range(3):
-                work.in_base[axis, i] = measurements.axes[axis, i]
-                work.in_platform[axis, i] = 0.0
-                for j in range(3):
-                    work.in_platform[axis, i] += work.measured_rotation[j, i] * measurements.axes[axis, j]
-        work.vector_weights[0] = measurements.tilt_weight - 0.5 * measurements.yaw_weight
-        work.vectors, work.equations = 3, work.equations + 3
+        yaw = 0.5 * measurements.yaw_weight
+        for i in range(3):
+            axis = vector(measurements.axes[i])
+            weight = measurements.tilt_weight - yaw if i == 0 else yaw
+            _add_vector(work, axis, rotate_back(work.measured_rotation, axis), weight)
+        work.equations += 3
     work.up = work.vectors
     if measurements.ups.shape[0] > 0:
-        if not _read_unit(measurements.ups[row], work.in_platform[work.up]):
-            return UP_NOT_UNIT, leg
-        for i in range(3):
-            work.in_base[work.up, i] = measurements.axes[0, i]
-        work.vector_weights[work.up] = measurements.tilt_weight
-        work.vectors, work.equations = work.vectors + 1, work.equations + 2
+        _add_vector(work, vector(measurements.axes[0]), _unit(vector(measurements.ups[row])), measurements.tilt_weight)
+        work.equations += 2
     work.normal = work.vectors
     if measurements.normals.shape[0] > 0:
-        if not _read_unit(measurements.normals[row], work.in_base[work.normal]):
-            return NORMAL_NOT_UNIT, leg
-        for i in range(3):
-            work.in_platform[work.normal, i] = 1.0 if i == 2 else 0.0
-        work.vector_weights[work.normal] = measurements.tilt_weight
-        work.vectors, work.equations = work.vectors + 1, work.equations + 2
-    return SOLVED, leg
+        _add_vector(work, _unit(vector(measurements.normals[row])), (0.0, 0.0, 1.0), measurements.tilt_weight)
+        work.equations += 2
+
+
+@kernel
+def _unit(given: Vector) -> Vector:
+    size = np.sqrt(dot(given, given))
+    return given[0] / size, given[1] / size, given[2] / size
+
+
+@kernel
+def _add_vector(work: Record, in_base: Vector, in_platform: Vector, weight: float) -> None:
+    for i in range(3):
+        work.in_base[work.vectors, i] = in_base[i]
+        work.in_platform[work.vectors, i] = in_platform[i]
+    work.vector_weights[work.vectors] = weight
+    work.vectors += 1
 
 
 @kernel
@@ -206,10 +187,8 @@ def _find(geometry: Record, candidates: NDArray[np.int64], work: Record) -> tupl
 
 @kernel
 def _copy_pose(position: Array, rotation: Array, to_position: Array, to_rotation: Array) -> None:
-    for i in range(3):
-        to_position[i] = position[i]
-        for j in range(3):
-            to_rotation[i, j] = rotation[i, j]
+    to_position[:] = position
+    to_rotation[:] = rotation
 
 
 @kernel
@@ -217,9 +196,7 @@ def _apply(geometry: Record, method: int, work: Record) -> float:
     """Find the pose by a closed form; returns the conditioning."""
     directions, measured, position, rotation = work.directions, work.measured, work.position, work.rotation
     if method == _SECTION_5:
-        for i in range(3):
-            for j in range(3):
-                rotation[i, j] = work.measured_rotation[i, j]
+        rotation[:] = work.measured_rotation
         return pose_from_rotation(geometry, directions, measured, rotation, position, work.scratch)
     if method == _LEGS:
         conditioning = pose_from_legs(geometry, directions, measured, position, rotation, work.scratch)
@@ -236,20 +213,17 @@ def _apply(geometry: Record, method: int, work: Record) -> float:
 @kernel
 def _fit(geometry: Record, refine: bool, work: Record) -> tuple[int, float]:
     """Refine the pose, if wanted, and weigh its residuals; returns a status and their chi-square sum."""
-    base_joints, platform_joints, position, rotation = (
-        geometry.base_joints, geometry.platform_joints, work.position, work.rotation,
-    )  # fmt: skip
-    in_base, in_platform, vector_weights = work.in_base, work.in_platform, work.vector_weights[: work.vectors]
-    status, before, spread = UNSETTLED, np.inf, geometry.spreads[-1]
+    base_joints, platform_joints = geometry.base_joints, geometry.platform_joints
+    position, rotation, vector_weights = work.position, work.rotation, work.vector_weights[: work.vectors]
+    status, before, spread = UNSETTLED if refine else SOLVED, np.inf, geometry.spreads[-1]
     for _ in range(_MOST_REFINEMENTS if refine else 1):
         normal_equations(
-            base_joints, platform_joints, work.directions, work.weights, in_base, in_platform, vector_weights, position,
-            rotation, work.arms, work.predicted, work.lengths, work.information, work.correction,
+            base_joints, platform_joints, work.directions, work.weights, work.in_base, work.in_platform, vector_weights,
+            position, rotation, work.arms, work.predicted, work.lengths, work.information, work.correction,
         )  # fmt: skip
         if not solve_normal_equations(work.information, work.correction, work.factor):
             return SINGULAR, np.inf
         if not refine:
-            status = SOLVED
             break
         move_pose(work.correction, position, rotation)
         square = _square_over_variance(work.factor, work.correction)
@@ -267,9 +241,9 @@ def _fit(geometry: Record, refine: bool, work: Record) -> tuple[int, float]:
         if status == SOLVED and not dot(vector(work.directions[k]), vector(work.predicted[k])) > 0.0:
             status = NEGATIVE
     for k in range(work.vectors):
-        seen = rotate(rotation, vector(in_platform[k]))
+        seen = rotate(rotation, vector(work.in_platform[k]))
         for i in range(3):
-            chi_square += vector_weights[k] * (seen[i] - in_base[k, i]) ** 2
+            chi_square += vector_weights[k] * (seen[i] - work.in_base[k, i]) ** 2
     return status, chi_square
 
 
@@ -313,64 +287,6 @@ def _write(work: Record, chi_square: float, row: int, results: Results) -> None:
             residual = work.directions[k, i] - work.predicted[k, i]
             results.residuals[row, k, i] = residual if work.measured[k] != 0.0 else np.nan
     invert_cholesky(work.factor, results.covariances[row])
-
-
-@kernel
-def _write_nothing(row: int, results: Results) -> None:
-    results.chi_squares[row] = np.nan
-    results.degrees_of_freedom[row] = 0
-    for i in range(3):
-        results.positions[row, i] = np.nan
-        for j in range(3):
-            results.rotations[row, i, j] = np.nan
-    for i in range(6):
-        for j in range(6):
-            results.covariances[row, i, j] = np.nan
-            results.residuals[row, i, j % 3] = np.nan
-
-
-@kernel
-def _read_directions(given: Array, directions: Array, measured: Array) -> tuple[int, int]:
-    """Copy directions (6, 3) at unit length and note which are measured; returns a status and the leg that it is about."""
-    for k in range(LEGS):
-        missing = np.isnan(given[k, 0]) + np.isnan(given[k, 1]) + np.isnan(given[k, 2])
-        if missing == 3:
-            measured[k] = 0.0
-            directions[k, 0], directions[k, 1], directions[k, 2] = 0.0, 0.0, 1.0
-            continue
-        if missing > 0:
-            return PARTLY_NAN, k
-        measured[k] = 1.0
-        if not _read_unit(given[k], directions[k]):
-            return (LEG_NOT_UNIT if np.isfinite(given[k]).all() else INFINITE), k
-    return SOLVED, 0
-
-
-@kernel
-def _read_unit(given: Array, unit: Array) -> bool:
-    """Copy a vector (3,) at unit length; False if it was not nearly a unit vector."""
-    size = np.sqrt(dot(vector(given), vector(given)))
-    for i in range(3):
-        unit[i] = given[i] / size
-    return bool(abs(size - 1.0) <= UNIT_TOLERANCE)
-
-
-@kernel
-def _read_rotation(given: Array, rotation: Array) -> int:
-    """Copy the rotation (3, 3) nearest to a matrix; returns a status."""
-    columns = rotation.reshape(9)
-    for i in range(3):
-        for j in range(3):
-            if not np.isfinite(given[i, j]):
-                return ROTATION_INFINITE
-            dot = 0.0
-            for k in range(3):
-                dot += given[k, i] * given[k, j]
-            if abs(dot - (1.0 if i == j else 0.0)) > UNIT_TOLERANCE:
-                return NOT_ORTHOGONAL
-            columns[3 * i + j] = given[i, j]
-    # The nearest rotation to the transposed is the transposed nearest rotation.
-    return SOLVED if orthonormalise(columns, False) >= 0.0 else REFLECTION
 
 
 @kernel

@@ -16,21 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 from controller.direct_kinematics import solver
 from controller.direct_kinematics.geometry import geometry_of
 from controller.direct_kinematics.solver import METHODS, SOLVED, WORK, Measurements, Results, solve_rows
-from plant.errors import GoughError, InputError, SingularConfigurationError
+from plant.errors import InputError, SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import UNIT_TOLERANCE, Array, Pose, numbers, rotation_angle
 
-LEG_SIGMA = np.radians(0.05)
-"""Standard deviation that `solve` assumes of each component of a leg's direction [rad]."""
-
-TILT_SIGMA = np.radians(0.05)
-"""Standard deviation that `solve` assumes of roll and pitch [rad]."""
-
-YAW_SIGMA = np.radians(1.5)
-"""Standard deviation that `solve` assumes of a magnetically measured yaw [rad]."""
-
-LEAST_SIGMA = 1e-9
-"""Least standard deviation of a direction that double precision can resolve [rad]."""
+# Standard deviations that `solve` assumes [rad].
+LEG_SIGMA = np.radians(0.05)  # of each component of a leg's direction
+TILT_SIGMA = np.radians(0.05)  # of roll and pitch
+YAW_SIGMA = np.radians(1.5)  # of a yaw that is measured magnetically
+LEAST_SIGMA = 1e-9  # of a direction, that double precision can resolve
 
 NEEDS = {"section-5": "rotation", "up": "up_in_platform", "normal": "normal", "section-4": "normal"}
 """The measurement of the platform that a method needs; the others need none."""
@@ -70,15 +64,10 @@ class Solution:
 class Solutions:
     """Many poses; `solutions[i]` is a `Solution`, or raises the reason why there is none.
 
+    The arrays have N rows with the shapes and units of a `Solution`, NaN where there is no pose.
+
     Attributes:
-        positions: (N, 3) [m]; NaN where there is no pose, as in the arrays below.
-        rotations: (N, 3, 3).
-        covariances: (N, 6, 6).
-        residuals: (N, 6, 3).
-        chi_squares: (N,).
-        degrees_of_freedom: (N,).
         methods: (N,), indices into `METHODS`.
-        conditionings: (N,).
         solved: (N,), whether there is a pose.
         errors: by row, the reason why there is none.
     """
@@ -92,7 +81,7 @@ class Solutions:
     methods: NDArray[np.int64]
     conditionings: Array
     solved: NDArray[np.bool_]
-    errors: dict[int, GoughError]
+    errors: dict[int, SingularConfigurationError]
 
     def __len__(self) -> int:
         return len(self.solved)
@@ -151,7 +140,7 @@ def solve(
             method, or a method whose measurement is not given.
         SingularConfigurationError: the measurements do not determine the pose.
     """
-    given = _checked(leg_directions, rotation, normal, up_in_platform)
+    given = _shapes_checked(leg_directions, rotation, normal, up_in_platform)
     arrays = {name: array[None] for name, array in given.items()}
     return _solve(mechanism, arrays, method, refine, (leg_sigma, tilt_sigma, yaw_sigma), 1, "")[0]
 
@@ -179,13 +168,10 @@ def solve_batch(
         InputError: as `solve`, naming the row. A row whose pose is not determined raises only when it is asked for.
     """
     directions = numbers(leg_directions, "leg_directions", "(N, 6, 3)")
-    arrays = _checked(directions, rotation, normal, up_in_platform, len(directions) if directions.ndim else 0)
-    sigmas = (leg_sigma, tilt_sigma, yaw_sigma)
-    return _solve(mechanism, arrays, method, refine, sigmas, _cores() if workers is None else workers, " of row {row}")
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    arrays = _shapes_checked(directions, rotation, normal, up_in_platform, len(directions) if directions.ndim else 0)
+    if workers is None:
+        workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return _solve(mechanism, arrays, method, refine, (leg_sigma, tilt_sigma, yaw_sigma), workers, " of row {row}")
 
 
 def pose_difference(first: Solution | Pose, second: Solution | Pose) -> tuple[float, float]:
@@ -194,7 +180,7 @@ def pose_difference(first: Solution | Pose, second: Solution | Pose) -> tuple[fl
     return distance, float(rotation_angle(first.rotation, second.rotation))
 
 
-def _checked(
+def _shapes_checked(
     directions: ArrayLike, rotation: ArrayLike | None, normal: ArrayLike | None, up_in_platform: ArrayLike | None, *rows: int
 ) -> dict[str, Array]:  # fmt: skip
     """The measurements that are given, by name, with so many rows."""
@@ -234,16 +220,20 @@ def _solve(
         if not LEAST_SIGMA <= value < np.inf:
             raise InputError(f"{name} is {sigma}; it must be at least {LEAST_SIGMA:g} and finite [rad]")
         weights.append(float(value) ** -2)
+    for name, values in arrays.items():
+        if name == "rotation":
+            _check_rotations(values, where)
+        else:
+            _check_vectors(name, values, where)
     count = len(arrays["leg_directions"])
     measurements = Measurements(
         arrays["leg_directions"], arrays.get("rotation", np.empty((0, 3, 3))), arrays.get("up_in_platform", np.empty((0, 3))),
         arrays.get("normal", np.empty((0, 3))), _axes_about(mechanism.up_in_base), *weights,
     )  # fmt: skip
     results = Results(
-        np.empty((count, 3)), np.empty((count, 3, 3)), np.empty((count, 6, 6)), np.empty((count, LEGS, 3)), np.empty(count),
-        np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count), np.empty(count, np.int64),
-        np.empty(count, np.int64),
-    )  # fmt: skip
+        *(np.full((count, *shape), np.nan) for shape in ((3,), (3, 3), (6, 6), (LEGS, 3), ())),
+        *(np.zeros(count, kind) for kind in (np.int64, np.int64, np.float64, np.int64)),
+    )
 
     def solve_chunk(start: int) -> None:
         stop = min(start + _CHUNK, count)
@@ -256,36 +246,26 @@ def _solve(
     else:
         with ThreadPoolExecutor(workers) as pool:
             list(pool.map(solve_chunk, starts))
-    errors = {
-        int(row): _error(mechanism, arrays, method, int(results.statuses[row]), int(row), int(results.legs[row]), where)
-        for row in np.flatnonzero(results.statuses != SOLVED)
-    }
-    for error in errors.values():
-        if isinstance(error, InputError):
-            raise error
-    return Solutions(*results[:-2], solved=results.statuses == SOLVED, errors=errors)
+    solved = results.statuses == SOLVED
+    unsolved = np.flatnonzero(~solved).tolist()
+    errors = {row: _error(mechanism, arrays, method, results.statuses[row], row, where) for row in unsolved}
+    return Solutions(*results[:-1], solved, errors)
 
 
 def check_spatial(mechanism: Mechanism) -> None:
-    """Check that a mechanism has six legs.
-
-    Raises:
-        InputError: it has not.
-    """
+    """Raise an `InputError` unless the mechanism has six legs."""
     if not isinstance(mechanism, Mechanism):
         raise InputError(f"the mechanism must be a Mechanism of six legs, not a {type(mechanism).__name__}")
 
 
 def _candidates(method: str, arrays: dict[str, Array]) -> NDArray[np.int64]:
-    if isinstance(method, str) and method == "auto":
-        names = [name for name in _AUTOMATIC if name not in NEEDS or NEEDS[name] in arrays]
-    elif not isinstance(method, str) or method not in METHODS:
+    if not isinstance(method, str) or method not in ("auto", *METHODS):
         raise InputError(f"there is no method {method!r}; there are auto, {', '.join(METHODS)}")
-    elif NEEDS.get(method, "leg_directions") not in arrays:
+    names = _AUTOMATIC if method == "auto" else (method,)
+    given = [name for name in names if NEEDS.get(name, "leg_directions") in arrays]
+    if not given:
         raise InputError(f"the method {method!r} needs {NEEDS[method]}: give it, or choose another method")
-    else:
-        names = [method]
-    return np.array([METHODS.index(name) for name in names])
+    return np.array([METHODS.index(name) for name in given])
 
 
 def _axes_about(up: Array) -> Array:
@@ -295,37 +275,43 @@ def _axes_about(up: Array) -> Array:
     return np.array([up, level, np.cross(up, level)])
 
 
+def _check_vectors(name: str, vectors: Array, where: str) -> None:
+    """Check that vectors (N, 3), or those of the legs (N, 6, 3) that were measured, are unit vectors."""
+    legs = vectors.ndim == 3
+    with np.errstate(over="ignore"):
+        sizes = np.linalg.norm(vectors, axis=-1)
+    wrong = ~(np.abs(sizes - 1.0) <= UNIT_TOLERANCE) & ~(legs & np.isnan(vectors).all(axis=-1))
+    for row, *leg in np.argwhere(wrong).tolist():
+        vector = vectors[row, *leg]
+        said = f"has length {sizes[row, *leg]:.6g}; it must be 1 within {UNIT_TOLERANCE:g}: normalise it"
+        if legs and np.isnan(vector).any():
+            said = "is partly NaN; a leg that is not measured has a row of NaN"
+        elif not np.isfinite(vector).all():
+            said = f"is {vector.tolist()}; it must be finite{', or NaN if not measured' if legs else ''}"
+        raise InputError(f"{name}{leg or ''}{where.format(row=row)} {said}")
+
+
+def _check_rotations(rotations: Array, where: str) -> None:
+    """Check that matrices (N, 3, 3) are rotations."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
+        wrong = ~(off <= UNIT_TOLERANCE) | (np.linalg.det(rotations) < 0.0)
+    for row in np.flatnonzero(wrong).tolist():
+        said = "is a reflection (determinant -1); the frames of a pose are both right-handed"
+        if not np.isfinite(rotations[row]).all():
+            said = f"is {rotations[row].tolist()}; it must be finite"
+        elif not off[row] <= UNIT_TOLERANCE:
+            said = f"is off orthogonal by {off[row]:.3g}, more than {UNIT_TOLERANCE:g}: give a rotation matrix"
+        raise InputError(f"rotation{where.format(row=row)} {said}")
+
+
 def _error(
-    mechanism: Mechanism, arrays: dict[str, Array], method: str, status: int, row: int, leg: int, where: str
-) -> GoughError:  # fmt: skip
-    where = where.format(row=row)
+    mechanism: Mechanism, arrays: dict[str, Array], method: str, status: int, row: int, where: str
+) -> SingularConfigurationError:
+    """Why a row has no pose."""
     legs = arrays["leg_directions"][row]
-    if status == solver.PARTLY_NAN:
-        return InputError(f"leg_directions[{leg}]{where} is partly NaN; a leg that is not measured has a row of NaN")
-    if status == solver.INFINITE:
-        return InputError(f"leg_directions[{leg}]{where} is {legs[leg].tolist()}; it must be finite, or NaN if not measured")
-    if status == solver.ROTATION_INFINITE:
-        return InputError(f"rotation{where} is {arrays['rotation'][row].tolist()}; it must be finite")
-    if status == solver.REFLECTION:
-        return InputError(f"rotation{where} is a reflection (determinant -1); the frames of a pose are both right-handed")
-    if status == solver.NOT_ORTHOGONAL:
-        given = arrays["rotation"][row]
-        off = float(np.abs(given.T @ given - np.eye(3)).max())
-        return InputError(
-            f"rotation{where} is off orthogonal by {off:.3g}, more than {UNIT_TOLERANCE:g}: give a rotation matrix"
-        )
-    if status in (solver.LEG_NOT_UNIT, solver.UP_NOT_UNIT, solver.NORMAL_NOT_UNIT):
-        name, vector = {
-            solver.LEG_NOT_UNIT: (f"leg_directions[{leg}]", legs[leg]),
-            solver.UP_NOT_UNIT: ("up_in_platform", arrays.get("up_in_platform", legs)[row]),
-            solver.NORMAL_NOT_UNIT: ("normal", arrays.get("normal", legs)[row]),
-        }[status]
-        if not np.isfinite(vector).all():
-            return InputError(f"{name}{where} is {vector.tolist()}; it must be finite")
-        size = float(np.linalg.norm(vector))
-        return InputError(f"{name}{where} has length {size:.6g}; it must be 1 within {UNIT_TOLERANCE:g}: normalise it")
     measured = [f"leg {k}" for k in range(LEGS) if np.isfinite(legs[k, 0])] + [n for n in arrays if n != "leg_directions"]
-    known = f"{', '.join(measured) or 'nothing'}{where}"
+    known = f"{', '.join(measured) or 'nothing'}{where.format(row=row)}"
     return SingularConfigurationError(
         {
             solver.OPEN: f"{known} do not give the pose of {mechanism.name!r} here"

@@ -1,4 +1,4 @@
-"""Synthetic measurements for direct kinematics at random poses, with the noise of real sensors or without."""
+"""Measurements for direct kinematics at given and at random poses, with the noise of real sensors or without."""
 
 from typing import Any
 
@@ -23,16 +23,21 @@ def draw_poses(mechanism: Mechanism, count: int, random: np.random.Generator) ->
     return positions, about_z @ about_y @ about_x @ home.rotation
 
 
+def leg_directions(mechanism: Mechanism, positions: Array, rotations: Array) -> Array:
+    """The unit vectors (N, 6, 3) along the legs at positions (N, 3) [m] and rotations (N, 3, 3)."""
+    return _unit(positions[:, None] + mechanism.platform_joints @ np.swapaxes(rotations, 1, 2) - mechanism.base_joints)
+
+
 def draw_measurements(
     mechanism: Mechanism, positions: Array, rotations: Array, random: np.random.Generator, noise: float
 ) -> dict[str, Array]:
     """The measurements at these poses, by their names in `solve_batch`, with `noise` times the sigmas."""
     up, count = mechanism.up_in_base, len(positions)
-    vectors = positions[:, None] + mechanism.platform_joints @ np.swapaxes(rotations, 1, 2) - mechanism.base_joints
+    directions = leg_directions(mechanism, positions, rotations)
     level = np.linalg.svd(up[None])[2][1:]
     turns = random.normal(size=(count, 3)) * [TILT_SIGMA, TILT_SIGMA, YAW_SIGMA] @ np.array([*level, up])
     return {
-        "leg_directions": _unit(_unit(vectors) + noise * random.normal(scale=LEG_SIGMA, size=vectors.shape)),
+        "leg_directions": _unit(directions + noise * random.normal(scale=LEG_SIGMA, size=directions.shape)),
         "up_in_platform": _unit(up @ rotations + noise * random.normal(scale=TILT_SIGMA, size=(count, 3))),
         "normal": _unit(rotations[:, :, 2] + noise * random.normal(scale=TILT_SIGMA, size=(count, 3))),
         "rotation": np.array([rotation_from_vector(noise * turn) for turn in turns]) @ rotations,
