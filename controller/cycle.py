@@ -130,7 +130,7 @@ def cycle_parameters(
     return filled(
         PARAMETERS,
         rig=rig_parameters(mechanism, rate, control.hold, calibration.tilt),
-        imus=imu_health.imu_parameters(present, calibration, fusion, watched, rate),
+        imus=imu_health.imu_parameters(present, calibration.gain, calibration.offset, fusion, watched, rate),
         legs=leg_filter.leg_parameters(fusion, rate),
         platform=platform_filter.platform_parameters(fusion, rate),
         heading=heading_filter.heading_parameters(fusion, rate, field, magnetometer),

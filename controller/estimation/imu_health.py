@@ -4,7 +4,6 @@ from collections.abc import Collection
 
 import numpy as np
 
-from controller.calibration.file import Calibration
 from controller.safety.causes import Cause, report_event
 from controller.settings import FusionSettings, SafetySettings
 from plant.compiled import Record, filled, kernel, record_dtype
@@ -59,15 +58,17 @@ STATE = record_dtype(
 
 
 def imu_parameters(
-    present: Collection[int], calibration: Calibration, fusion: FusionSettings, safety: SafetySettings, rate: float
+    present: Collection[int], gain: Array, offset: Array, fusion: FusionSettings, safety: SafetySettings, rate: float
 ) -> Record:
-    """The constants of the IMUs (dtype `PARAMETERS`) that are `present`, in cycles of this rate [Hz]."""
+    """The constants of the IMUs (dtype `PARAMETERS`) that are `present`, in cycles of this rate [Hz]; gain and offset are those
+    of a calibration.
+    """
     shaken = _SHAKEN_HZ / rate
     return filled(
         PARAMETERS,
         present=[imu in present for imu in range(IMU_COUNT)],
-        gain=calibration.gain,
-        offset=calibration.offset,
+        gain=gain,
+        offset=offset,
         range=(fusion.gyroscope_range, fusion.accelerometer_range),
         noise=np.array([safety.gyroscope_noise, safety.accelerometer_noise]) * max(1.0, shaken**2),
         noise_smoothing=min(0.05, 1.0 / (rate * _NOISE_S)),
