@@ -17,31 +17,21 @@ Heading = str | tuple[str, str]
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell that is more than plain text.
-
-    Attributes:
-        text: the content.
-        note: a smaller line below it; HTML only.
-        code: set in the typeface of code; not on the terminal.
-        alarm: bold and red; terminal only.
-    """
+    """A cell that is more than plain text."""
 
     text: str
-    note: str = ""
-    code: bool = False
-    alarm: bool = False
+    note: str = ""  # a smaller line below it; HTML only
+    code: bool = False  # set in the typeface of code; not on the terminal
+    alarm: bool = False  # bold and red; terminal only
 
 
 class Table:
-    """Columns with headings, and rows of text; the first column names the row."""
+    """Columns with headings, and rows of text; the first column names the row.
+
+    `left` has the numbers of the columns that the terminal aligns left; it aligns all others right.
+    """
 
     def __init__(self, *headings: Heading, left: Sequence[int] = (0,)) -> None:
-        """Start without rows.
-
-        Args:
-            headings: one for each column.
-            left: numbers of the columns that the terminal aligns left; it aligns all others right.
-        """
         self.headings = [("", heading) if isinstance(heading, str) else heading for heading in headings]
         self.rows: list[list[Cell]] = []
         self._left = left
@@ -50,8 +40,11 @@ class Table:
         """Add a row."""
         self.rows.append([Cell(cell) if isinstance(cell, str) else cell for cell in cells])
 
-    def print(self) -> None:
-        """Print the table, as wide as the terminal, or 100 characters wide where there is none."""
+    def print(self, markdown: bool = False) -> None:
+        """Print the table, as wide as the terminal or 100 characters wide, or its Markdown."""
+        if markdown:
+            print(self.markdown())
+            return
         from rich.console import Console
 
         Console(width=None if sys.stdout.isatty() else 100).print(self.rich())

@@ -1,14 +1,15 @@
-"""The command `gough`: its commands by heading, each built only when it is called, so that nothing waits for the others."""
+"""The command `gough`. A command is built only when it is called, so that nothing waits for the others."""
 
 import argparse
 import os
+import re
 import sys
-from collections.abc import Callable
+from collections.abc import Iterable
 from contextlib import suppress
 from importlib import import_module
 from typing import NoReturn
 
-from hil.command_line.options import build, summary
+from hil.command_line.cli import Command, check_outputs
 from plant.errors import GoughError
 from plant.extras import missing_extras_named
 
@@ -24,7 +25,7 @@ COMMANDS = {
     "study": ("compare-fusion", "evaluate-fusion", "faults", "planar", "broad"),
     "measure": ("bench",),
 }
-"""The commands by heading. A heading names the module of its commands, where a function such as `add_tune` adds each."""
+"""The commands by heading. A heading is the module of its commands, where `gough tune` is `gough_tune`."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -38,8 +39,9 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     options = parse(sys.argv[1:] if arguments is None else arguments)
     try:
+        check_outputs(options)
         with missing_extras_named():
-            status: int = options.run(options)
+            status: int = options.run(options) or 0
         sys.stdout.flush()
     except GoughError as error:
         with suppress(OSError):
@@ -68,26 +70,38 @@ def parse(arguments: list[str]) -> argparse.Namespace:
         epilog=None if chosen in homes else "\n\n".join(map(_section, COMMANDS)),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    # Looking up the version takes longer than the rest.
-    if arguments[:1] != [chosen]:
+    if chosen is None or arguments[0] != chosen:
+        # Looking up the version takes longer than the rest.
         from importlib.metadata import version
 
         parser.add_argument("--version", action="version", version=f"gough {version('gough')}")
+    elif chosen not in homes:
+        parser.error(f"argument COMMAND: invalid choice: {chosen!r}{_nearest(chosen, homes)}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", help=argparse.SUPPRESS, prog="gough")
     for name, heading in homes.items():
         command = commands.add_parser(name)
         if name == chosen:
-            build(command, _adder(heading, name))
-    return parser.parse_args(arguments)
+            _command(heading, name).build(command)
+    options, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        flags = re.findall(r"--[\w-]+", options.parser.format_usage())
+        options.parser.error(f"unrecognized arguments: {' '.join(unknown)}{_nearest(unknown[0], flags)}")
+    return options
 
 
-def _adder(heading: str, name: str) -> Callable[[argparse.ArgumentParser], None]:
-    """The function that adds the options of a command, imported only here."""
-    module = import_module(f"hil.command_line.{heading}")
-    adder: Callable[[argparse.ArgumentParser], None] = getattr(module, f"add_{name.replace('-', '_')}")
-    return adder
+def _nearest(text: str, names: Iterable[str]) -> str:
+    """A question for the name that a mistyped text may mean; "" if none is near."""
+    from difflib import get_close_matches
+
+    return "".join(f"; did you mean {name!r}?" for name in get_close_matches(text, names, 1))
+
+
+def _command(heading: str, name: str) -> Command:
+    """A command, imported only here."""
+    found: Command = getattr(import_module(f"hil.command_line.{heading}"), f"gough_{name.replace('-', '_')}")
+    return found
 
 
 def _section(heading: str) -> str:
     """The part of the help with the commands under a heading."""
-    return "\n".join([f"{heading}:", *(f"  {name:15}  {summary(_adder(heading, name))}" for name in COMMANDS[heading])])
+    return "\n".join([f"{heading}:", *(f"  {name:15}  {_command(heading, name).help}" for name in COMMANDS[heading])])

@@ -1,13 +1,11 @@
 """The command calibrate."""
 
-import argparse
+from argparse import Namespace
 from dataclasses import asdict, replace
 from math import degrees, radians
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hil.command_line.options import add_actions, add_options, config_of
-from hil.command_line.outputs import add_json, check_outputs, write_json
+from hil.command_line import cli
 from hil.command_line.terminal import deg, mm_deg, progress_bar
 from hil.runs.config import SimulationConfig
 from hil.table import Table
@@ -21,60 +19,40 @@ _DEFAULT_RIG = SimulationConfig(imu="mpu9150")
 """The rig that is driven without any option."""
 
 
-def add_calibrate(command: argparse.ArgumentParser) -> None:
-    """Find the IMUs' errors: on the mechanism, or of a single IMU or magnetometer."""
-    add_actions(command, rig=_add_rig, imu=_add_imu, magnetometer=_add_magnetometer)
-
-
-def _add_rig(command: argparse.ArgumentParser) -> None:
+@cli.command(
+    cli.output("output", "FILE.toml", "the calibration to write"),
+    cli.options_of(
+        SimulationConfig, "mechanism", "rate", "seed", "joint_error", "plant", "binding", imu={"default": _DEFAULT_RIG.imu}
+    ),
+    cli.flag("--home", "the rig stands exactly at home when it begins"),
+    cli.setting("--tilt", 0.05, "by how much the base may be off level [deg]"),
+    cli.setting(
+        "--joints", 0.0, "by how much each coordinate of a joint may be off; if it is not 0, the joints are estimated, too [mm]"
+    ),
+    cli.source(
+        "--recording",
+        "FILE.mcap",
+        "recordings of a rig that rested and shook, from which to take mechanism, IMUs, rate and data",
+        nargs="+",
+    ),
+    cli.flag("--lengths", "the rig measures by how much its lengths change (to 50 um)"),
+    cli.flag("--known-poses", "write the mounting alone, by comparing with the planned poses, as in the paper's section 7"),
+    cli.report("write a report with plots"),
+    cli.output("--picture", "FILE.svg", "draw the accuracy of each stage"),
+    cli.JSON,
+)
+def gough_calibrate_rig(options: Namespace) -> None:
     """On the mechanism, from its redundancy.
 
     The mechanism rests at wide poses, which need not be known, and shakes for 40 s. Before that it finds out, with the loop
     open, whether each IMU works, and is mounted and wired correctly. Writes bias, scale, axes and mounting of every sensor,
     with their covariance.
     """
-    command.add_argument("output", type=Path, metavar="FILE.toml", help="the calibration to write")
-    add_options(
-        command,
-        SimulationConfig,
-        "mechanism",
-        "rate",
-        "seed",
-        "joint_error",
-        "plant",
-        "binding",
-        imu={"default": _DEFAULT_RIG.imu},
-    )
-    command.add_argument("--home", action="store_true", help="the rig stands exactly at home when it begins")
-    command.add_argument(
-        "--tilt", type=float, default=0.05, help="by how much the base may be off level [deg] (default: %(default)s)"
-    )
-    command.add_argument(
-        "--joints", type=float, default=0.0, help="by how much each coordinate of a joint may be off; if it is not 0, the "
-        "joints are estimated, too [mm] (default: %(default)g)",
-    )  # fmt: skip
-    command.add_argument(
-        "--recording", type=Path, nargs="+", metavar="FILE.mcap",
-        help="recordings of a rig that rested and shook, from which to take mechanism, IMUs, rate and data",
-    )  # fmt: skip
-    command.add_argument("--lengths", action="store_true", help="the rig measures by how much its lengths change (to 50 um)")
-    command.add_argument(
-        "--known-poses", action="store_true",
-        help="write the mounting alone, by comparing with the planned poses, as in the paper's section 7",
-    )  # fmt: skip
-    command.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots")
-    command.add_argument("--picture", type=Path, metavar="FILE.svg", help="draw the accuracy of each stage")
-    add_json(command)
-    command.set_defaults(run=_calibrate_rig)
-
-
-def _calibrate_rig(options: argparse.Namespace) -> int:
     from controller.calibration.at_rest import Prior
     from controller.calibration.file import save_calibration
     from hil.calibration.data import Knowledge
     from hil.calibration.drive import calibrate_recordings, calibrate_rig
 
-    check_outputs(options.output, options.json, options.picture, report=options.report)
     if not 0.0 < options.tilt < 45.0:
         raise InputError(f"--tilt is {options.tilt:g} deg; it must be between 0 and 45")
     if not 0.0 <= options.joints <= 10.0:
@@ -87,7 +65,7 @@ def _calibrate_rig(options: argparse.Namespace) -> int:
             raise InputError(f"the recordings say what {names} would: leave it out with --recording")
     prior = Prior(tilt=radians(options.tilt), joints=1e-3 * options.joints)
     knowledge = Knowledge(prior, options.home, options.lengths, options.known_poses)
-    config = config_of(options, SimulationConfig)
+    config = cli.config_of(options, SimulationConfig)
     label = "recorded IMUs are calibrated" if options.recording else f"{config.mechanism} calibrates its IMUs"
     with progress_bar(label) as progress:
         if options.recording:
@@ -95,7 +73,7 @@ def _calibrate_rig(options: argparse.Namespace) -> int:
         else:
             result = calibrate_rig(config, knowledge, progress)
     save_calibration(options.output, result.calibration)
-    write_json(options.json, result.summary)
+    cli.write_json(options.json, result.summary)
     if options.report:
         from hil.reports.calibration import write_report
 
@@ -106,21 +84,18 @@ def _calibrate_rig(options: argparse.Namespace) -> int:
         write_picture(result.summary, options.picture)
     _print_rig_calibration(result.summary)
     print(f"written to {options.output}")
-    return 0
 
 
 def _print_rig_calibration(summary: dict[str, Any]) -> None:
     from hil.calibration.assessment import STAGES, weak_words
 
-    columns = ("residual [mg]", "left out", "predicted [mm, deg]", "halves", "true")
-    table = Table(f"{summary['rests']} poses at rest", *columns)
+    headings = ("residual [mg]", "left out", "predicted [mm, deg]", "halves", "true")
+    table = Table(f"{summary['rests']} poses at rest", *headings)
     for name, residual in summary["residual_mg"].items():
         left_out = summary["validated"].get(name, {}).get("left_out_mg")
-        cells = [f"{residual:.3f}", "" if left_out is None else f"{left_out:.3f}"]
-        for kind in ("predicted", "validated", "true"):
-            errors = summary[kind].get(name)
-            cells.append("" if errors is None else mm_deg(errors))
-        table.add(STAGES[name], *cells)
+        errors = (summary[kind].get(name) for kind in ("predicted", "validated", "true"))
+        accuracy = ("" if each is None else mm_deg(each) for each in errors)
+        table.add(STAGES[name], f"{residual:.3f}", "" if left_out is None else f"{left_out:.3f}", *accuracy)
     table.print()
     if summary["validated"]:
         print("left out: residual at rests that the calibration had not seen; halves: by how much the poses differ that "
@@ -129,29 +104,27 @@ def _print_rig_calibration(summary: dict[str, Any]) -> None:
         print(line)
 
 
-def _add_imu(command: argparse.ArgumentParser) -> None:
+def _single(number: int, text: str) -> list[cli.Argument]:
+    """The arguments that single IMUs and magnetometers have in common."""
+    return [
+        cli.output("output", "FILE.toml", "the calibration to write, or to add this sensor to"),
+        cli.setting("--number", number, text, choices=ALL_IMUS),
+        cli.setting("--gravity", 9.80665, "gravity at the place [m/s2]"),
+        cli.JSON,
+    ]
+
+
+@cli.command(
+    cli.source("data", "FILE", "CSV with time_s,wx,wy,wz,ax,ay,az (rad/s, m/s2), or an MCAP recording"),
+    *_single(0, "which IMU of the mechanism it is"),
+)
+def gough_calibrate_imu(options: Namespace) -> None:
     """A single IMU, turned by hand.
 
     Without equipment: it rests in ten or more orientations, every axis up and down among them, half a second or longer each,
     and is turned by hand from one to the next. Refuses data that do not determine the constants, and says which rest or turn is
     missing.
     """
-    command.add_argument(
-        "data", type=Path, metavar="FILE", help="CSV with time_s,wx,wy,wz,ax,ay,az (rad/s, m/s2), or an MCAP recording"
-    )
-    _add_single(command, 0, "which IMU of the mechanism it is")
-    command.set_defaults(run=_calibrate_imu)
-
-
-def _add_single(command: argparse.ArgumentParser, number: int, text: str) -> None:
-    """Add the options that single IMUs and magnetometers have in common."""
-    command.add_argument("output", type=Path, metavar="FILE.toml", help="the calibration to write, or to add this sensor to")
-    command.add_argument("--number", type=int, default=number, choices=ALL_IMUS, help=f"{text} (default: %(default)s)")
-    command.add_argument("--gravity", type=float, default=9.80665, help="gravity at the place [m/s2] (default: %(default)s)")
-    add_json(command)
-
-
-def _calibrate_imu(options: argparse.Namespace) -> int:
     from controller.calibration.file import save_calibration
     from controller.calibration.single_imu import calibrate_imu
     from hil.recording.imu_data import read_imu
@@ -162,7 +135,7 @@ def _calibrate_imu(options: argparse.Namespace) -> int:
     calibration.gain[sensors], calibration.offset[sensors] = found.gain, found.offset
     # The covariance of the remaining errors belongs to the constants that are replaced.
     save_calibration(options.output, replace(calibration, covariance=None))
-    _write_constants(options, found)
+    cli.write_json(options.json, vars(found))
     table = Table(f"IMU {options.number}", "x", "y", "z")
     rows = (("gyroscope: ", "deg/s", degrees(1.0)), ("accelerometer: ", "mg", 1e3 / STANDARD_GRAVITY))
     for sensor, (name, unit, scale) in enumerate(rows):
@@ -172,29 +145,19 @@ def _calibrate_imu(options: argparse.Namespace) -> int:
         f"{found.rests} rests; residuals: gravity {1e3 * found.force_residual / STANDARD_GRAVITY:.3f} mg, "
         f"turns {deg(found.turn_residual)} deg; written to {options.output}"
     )
-    return 0
 
 
-def _checked(options: argparse.Namespace) -> "Calibration":
+def _checked(options: Namespace) -> "Calibration":
     """The calibration to add a sensor to, after checking what all sensors have in common."""
     from controller.calibration.file import Calibration, load_calibration
 
-    check_outputs(options.output, options.json)
     if not 9.7 < options.gravity < 9.9:
         raise InputError(f"--gravity is {options.gravity:g} m/s2; on the earth it is between 9.7 and 9.9")
     return load_calibration(options.output) if options.output.exists() else Calibration()
 
 
-def _write_constants(options: argparse.Namespace, found: Any) -> None:
-    write_json(
-        options.json, {name: getattr(value, "tolist", lambda value=value: value)() for name, value in vars(found).items()}
-    )
-
-
 def _add_constants(table: Table, name: str, unit: tuple[str, float], gain: Any, offset: Any, sigmas: Any) -> None:
-    """Add the offset (3,), the gain (3, 3) and their `sigmas` (12,) to a table of three axes; `unit` is the offset's, with its
-    factor from the SI unit.
-    """
+    """Add the offset (3,) in `unit`, with its factor from SI, the gain (3, 3), and their `sigmas` (12,) to a table."""
     symbol, scale = unit
     cells = zip(offset, sigmas[:3], strict=True)
     table.add(f"{name}offset [{symbol}]", *(f"{scale * value:.3f} +- {scale * sigma:.3f}" for value, sigma in cells))
@@ -203,26 +166,19 @@ def _add_constants(table: Table, name: str, unit: tuple[str, float], gain: Any, 
         table.add(f"{name}gain, row {axis}", *(f"{value:.5f} +- {sigma:.5f}" for value, sigma in cells))
 
 
-def _add_magnetometer(command: argparse.ArgumentParser) -> None:
+@cli.command(
+    cli.source(
+        "data", "FILE", "CSV with time_s,wx,wy,wz,ax,ay,az,mx,my,mz or time_s,mx,my,mz (rad/s, m/s2, uT), or an MCAP recording"
+    ),
+    *_single(PLATFORM_IMU, "which IMU of the mechanism it is in"),
+    cli.setting("--field", 49.4, "strength of the magnetic field at the place [uT]"),
+)
+def gough_calibrate_magnetometer(options: Namespace) -> None:
     """A single magnetometer, turned by hand: hard and soft iron.
 
     Without equipment: it is turned slowly every way round for half a minute or longer, away from iron. With a calibrated
     accelerometer beside it, its axes hold for both. Refuses data that do not determine the constants, and says what is missing.
     """
-    command.add_argument(
-        "data",
-        type=Path,
-        metavar="FILE",
-        help="CSV with time_s,wx,wy,wz,ax,ay,az,mx,my,mz or time_s,mx,my,mz (rad/s, m/s2, uT), or an MCAP recording",
-    )
-    _add_single(command, PLATFORM_IMU, "which IMU of the mechanism it is in")
-    command.add_argument(
-        "--field", type=float, default=49.4, help="strength of the magnetic field at the place [uT] (default: %(default)s)"
-    )
-    command.set_defaults(run=_calibrate_magnetometer)
-
-
-def _calibrate_magnetometer(options: argparse.Namespace) -> int:
     from controller.calibration.file import save_calibration
     from controller.calibration.magnetometer import calibrate_magnetometer
     from hil.recording.imu_data import read_field
@@ -239,7 +195,7 @@ def _calibrate_magnetometer(options: argparse.Namespace) -> int:
     at = MAGNETOMETER, options.number
     calibration.gain[at], calibration.offset[at] = found.gain, found.offset
     save_calibration(options.output, calibration)
-    _write_constants(options, found)
+    cli.write_json(options.json, vars(found))
     table = Table(f"magnetometer {options.number}", "x", "y", "z")
     _add_constants(table, "", ("uT", 1.0), found.gain, found.offset, found.sigmas)
     table.print()
@@ -247,4 +203,11 @@ def _calibrate_magnetometer(options: argparse.Namespace) -> int:
     if found.dip is not None and found.dip_residual is not None:
         residuals += f", dip {deg(found.dip_residual)} deg about {deg(found.dip)} deg"
     print(f"{found.samples} samples; residuals: {residuals}; written to {options.output}")
-    return 0
+
+
+gough_calibrate = cli.group(
+    "Find the IMUs' errors: on the mechanism, or of a single IMU or magnetometer.",
+    rig=gough_calibrate_rig,
+    imu=gough_calibrate_imu,
+    magnetometer=gough_calibrate_magnetometer,
+)

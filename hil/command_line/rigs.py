@@ -1,46 +1,48 @@
 """The commands for rigs: check-rig, emulate, inject."""
 
-import argparse
+from argparse import Namespace
 from dataclasses import asdict
 from typing import Any
 
-from hil.command_line.options import add_options, config_of
-from hil.command_line.outputs import add_json, check_outputs, write_json
+from hil.command_line import cli
 from hil.realtime.scheduling import RealTimeSettings, keep_to_one_thread
 from hil.runs.config import EmulatorConfig, SimulationConfig
 from hil.table import Cell, Table
 from plant.errors import InputError
 
 
-def add_check_rig(command: argparse.ArgumentParser) -> None:
+@cli.command(
+    cli.options_of(
+        SimulationConfig,
+        rig={"required": True},
+        rig_at={},
+        mechanism={},
+        rate={"default": 200.0, "text": "exchanges per second, 50 to 4000"},
+    ),
+    cli.flag("--move", "enable the drives, and move all legs by 0.2 mm at 1 mm/s"),
+    cli.argument(
+        "--beyond",
+        type=float,
+        metavar="SPEED",
+        help="with --move, a command beyond the limits to try [m/s]: for emulated rigs only, never for hardware",
+    ),
+    cli.JSON,
+)
+def gough_check_rig(options: Namespace) -> int:
     """Check that a rig does what the loop relies on.
 
     The rig is put through its contract, clause by clause. Nothing moves without --move. The exit status is 1 if anything is
     found.
     """
-    add_options(command, SimulationConfig, rig={"required": True})
-    rate = {"default": 200.0, "text": "exchanges per second, 50 to 4000"}
-    add_options(command, SimulationConfig, "rig_at", "mechanism", rate=rate)
-    command.add_argument("--move", action="store_true", help="enable the drives, and move all legs by 0.2 mm at 1 mm/s")
-    command.add_argument(
-        "--beyond", type=float, metavar="SPEED", help="with --move, a command beyond the limits to try [m/s]: for emulated "
-        "rigs only, never for hardware",
-    )  # fmt: skip
-    add_json(command)
-    command.set_defaults(run=_check_rig)
-
-
-def _check_rig(options: argparse.Namespace) -> int:
     from importlib.metadata import version
 
     keep_to_one_thread()
     from hil.rigs.contract import CLAUSES, examine_rig
     from hil.runs.rig_factory import rig_of
 
-    check_outputs(options.json)
     if options.beyond is not None and not options.move:
         raise InputError("--beyond is a command to the drives: it needs --move")
-    config = config_of(options, SimulationConfig)
+    config = cli.config_of(options, SimulationConfig)
 
     def made() -> Any:
         rig = rig_of(config)
@@ -62,18 +64,13 @@ def _check_rig(options: argparse.Namespace) -> int:
     moved = "and the drives moved" if options.move else "and nothing was moved"
     print(f"{len(examination.findings)} clauses checked, {len(found)} findings, {moved}")
     asked = {"rig": options.rig, "rig_at": options.rig_at, "rate": options.rate, "moved": options.move}
-    write_json(options.json, {**asked, **asdict(examination), "version": version("gough")})
-    return 1 if found else 0
+    cli.write_json(options.json, {**asked, **asdict(examination), "version": version("gough")})
+    return int(bool(found))
 
 
-def add_emulate(command: argparse.ArgumentParser) -> None:
-    """Emulate a rig on a bus, for 'gough run' in another process.
-
-    The FMU plant, drives and IMUs run on a clock of their own, behind a bus, until Ctrl-C.
-    """
-    add_options(command, EmulatorConfig)
-    add_options(
-        command,
+@cli.command(
+    cli.options_of(EmulatorConfig),
+    cli.options_of(
         SimulationConfig,
         "mechanism",
         "imu",
@@ -83,35 +80,29 @@ def add_emulate(command: argparse.ArgumentParser) -> None:
         target={"text": "the platform starts at the first pose of this target"},
         rate={"text": "rate of the IMUs' samples on canopen; on udp the run sets it"},
         seed={"text": "seed of the IMUs' imperfections and of the faults"},
-    )
-    add_options(command, RealTimeSettings, cpu={"default": 0, "shown": None}, priority={"default": 79})
-    command.set_defaults(run=_emulate)
+    ),
+    cli.options_of(RealTimeSettings, cpu={"default": 0, "shown": None}, priority={"default": 79}),
+)
+def gough_emulate(options: Namespace) -> None:
+    """Emulate a rig on a bus, for 'gough run' in another process.
 
-
-def _emulate(options: argparse.Namespace) -> int:
+    The FMU plant, drives and IMUs run on a clock of their own, behind a bus, until Ctrl-C.
+    """
     keep_to_one_thread()
     from hil.runs.emulator import emulate
 
-    config = config_of(options, EmulatorConfig, simulated=config_of(options, SimulationConfig))
-    emulate(config, config_of(options, RealTimeSettings), lambda text: print(text, flush=True))
-    return 0
+    config = cli.config_of(options, EmulatorConfig, simulated=cli.config_of(options, SimulationConfig))
+    emulate(config, cli.config_of(options, RealTimeSettings), lambda text: print(text, flush=True))
 
 
-def add_inject(command: argparse.ArgumentParser) -> None:
+@cli.command(
+    cli.argument("fault", nargs="?", metavar="KIND[:N][,for=S][,size=X]", help="the fault, from now on"),
+    cli.flag("--list", "list the kinds of faults"),
+    cli.flag("--clear", "take all faults away"),
+    cli.setting("--to", EmulatorConfig.control, "the emulator's control channel", metavar="HOST:PORT"),
+)
+def gough_inject(options: Namespace) -> None:
     """Inject a fault into an emulated rig that is running, or ask for its state."""
-    command.add_argument("fault", nargs="?", metavar="KIND[:N][,for=S][,size=X]", help="the fault, from now on")
-    command.add_argument("--list", action="store_true", help="list the kinds of faults")
-    command.add_argument("--clear", action="store_true", help="take all faults away")
-    command.add_argument(
-        "--to",
-        default=EmulatorConfig.control,
-        metavar="HOST:PORT",
-        help="the emulator's control channel (default: %(default)s)",
-    )
-    command.set_defaults(run=_inject)
-
-
-def _inject(options: argparse.Namespace) -> int:
     from hil.rigs.emulation.faults import FaultKind
     from hil.runs.emulator import ask
 
@@ -120,8 +111,7 @@ def _inject(options: argparse.Namespace) -> int:
         for kind in FaultKind:
             table.add(kind.label, f"0 to {kind.count - 1}" if kind.count else "", f"{kind.default:g}", kind.text)
         table.print()
-        return 0
+        return
     question = "clear" if options.clear else f"fault {options.fault}" if options.fault else "state"
     for name, value in ask(options.to, question).items():
         print(f"{name}: {value}")
-    return 0

@@ -1,12 +1,11 @@
 """The commands that run the loop: simulate, run, replay, stream-target."""
 
-import argparse
+from argparse import SUPPRESS, ArgumentTypeError, Namespace
 from dataclasses import fields, replace
-from pathlib import Path
+from math import inf
 from typing import TYPE_CHECKING, Any
 
-from hil.command_line.options import add_options, config_of, options_of
-from hil.command_line.outputs import OutputError, add_json, check_outputs, write_json
+from hil.command_line import cli
 from hil.command_line.terminal import QUANTILES, deg, live_view, mm, progress_bar
 from hil.realtime.scheduling import RealTimeSettings, keep_to_one_thread
 from hil.runs.config import SimulationConfig
@@ -17,31 +16,31 @@ if TYPE_CHECKING:
     from hil.runs.snapshot import Snapshot
 
 
-def add_simulate(command: argparse.ArgumentParser) -> None:
-    """Follow a target on the FMU plant, as fast as the machine can."""
-    # A resumed run keeps the duration of its snapshot, unless this option is given.
-    duration = {"default": argparse.SUPPRESS, "parse": float, "shown": f"{SimulationConfig.duration:g}"}
-    names = options_of(SimulationConfig, "duration", "rig", "rig_at", "arm")
-    add_options(command, SimulationConfig, *names, duration=duration)
-    command.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots and a moving 3-D view")
-    add_json(command)
-    command.add_argument("--save-state", type=Path, metavar="FILE", help="write a snapshot, from which a run can go on")
-    command.add_argument(
+@cli.command(
+    cli.options_of(
+        SimulationConfig,
+        *cli.names_of(SimulationConfig, "duration", "rig", "rig_at", "arm"),
+        # A resumed run keeps the duration of its snapshot, unless this option is given.
+        duration={"default": SUPPRESS, "parse": float, "shown": f"{SimulationConfig.duration:g}"},
+    ),
+    cli.report("write a report with plots and a moving 3-D view"),
+    cli.JSON,
+    cli.output("--save-state", "FILE", "write a snapshot, from which a run can go on"),
+    cli.argument(
         "--save-at", type=float, metavar="SECONDS", help="time of the snapshot in the motion [s] (default: the motion's end)"
-    )
-    command.add_argument(
-        "--load-state", type=Path, metavar="FILE",
-        help="go on from a snapshot, bit for bit as if there had been none; nothing but --duration can be changed",
-    )  # fmt: skip
-    command.set_defaults(run=_simulate)
-
-
-def _simulate(options: argparse.Namespace) -> int:
+    ),
+    cli.source(
+        "--load-state",
+        "FILE",
+        "go on from a snapshot, bit for bit as if there had been none; nothing but --duration can be changed",
+    ),
+)
+def gough_simulate(options: Namespace) -> None:
+    """Follow a target on the FMU plant, as fast as the machine can."""
     from hil.runs.simulation import SimulationStoppedError, simulate
     from hil.runs.snapshot import read_snapshot, write_snapshot
 
-    check_outputs(options.json, options.save_state, report=options.report)
-    config, resumed = config_of(options, SimulationConfig), None
+    config, resumed = cli.config_of(options, SimulationConfig), None
     if options.load_state is not None:
         resumed = read_snapshot(options.load_state)
         config = _resumed_config(options, config, resumed)
@@ -57,7 +56,7 @@ def _simulate(options: argparse.Namespace) -> int:
     if result.snapshot is not None and options.save_state is not None:
         write_snapshot(result.snapshot, options.save_state)
     if stopped is None or result.moved:
-        write_json(options.json, result.summary())
+        cli.write_json(options.json, result.summary())
         if options.report:
             from hil.reports.run import write_report
 
@@ -65,10 +64,9 @@ def _simulate(options: argparse.Namespace) -> int:
         _print_simulation(result.summary())
     if stopped:
         raise stopped
-    return 0
 
 
-def _resumed_config(options: argparse.Namespace, config: SimulationConfig, resumed: "Snapshot") -> SimulationConfig:
+def _resumed_config(options: Namespace, config: SimulationConfig, resumed: "Snapshot") -> SimulationConfig:
     """The configuration of a snapshot, with another duration if one is given."""
     kept = SimulationConfig.from_plain(resumed.config)
     for field in fields(config):
@@ -105,26 +103,23 @@ def _print_simulation(summary: dict[str, Any]) -> None:
     )
 
 
-def add_run(command: argparse.ArgumentParser) -> None:
+@cli.command(
+    cli.options_of(SimulationConfig),
+    cli.output("--record", "FILE.mcap", "record every cycle"),
+    cli.options_of(RealTimeSettings),
+    cli.JSON,
+)
+def gough_run(options: Namespace) -> int:
     r"""Follow a target on the machine's clock.
 
     The closed loop runs compiled, in a process of its own, with real-time priority where the machine grants it. Ctrl-C or
     SIGTERM ends the motion by a controlled stop, Ctrl-\ (SIGQUIT) by an emergency stop: the drives come to rest by themselves,
     whatever is measured.
     """
-    add_options(command, SimulationConfig)
-    command.add_argument("--record", type=Path, metavar="FILE.mcap", help="record every cycle")
-    add_options(command, RealTimeSettings)
-    add_json(command)
-    command.set_defaults(run=_run)
-
-
-def _run(options: argparse.Namespace) -> int:
     keep_to_one_thread()
     from hil.runs.executive import RunStoppedError, run
 
-    check_outputs(options.json, options.record)
-    config, settings = config_of(options, SimulationConfig), config_of(options, RealTimeSettings)
+    config, settings = cli.config_of(options, SimulationConfig), cli.config_of(options, RealTimeSettings)
     stopped = None
     with live_view(config.mechanism, config.target, config.rate) as show:
         try:
@@ -138,21 +133,25 @@ def _run(options: argparse.Namespace) -> int:
         _print_run(summary)
     except OSError as error:
         unprinted = error
-    write_json(options.json, summary)
+    cli.write_json(options.json, summary)
     if problem := stopped or unprinted:
         raise problem
     if summary["obstacle"]:
         return 1
     lost = summary["recording"]["lost"]
     if lost:
-        raise OutputError(f"the run went to its end, but {lost} of {summary['cycles']} cycles are not recorded")
+        raise cli.OutputError(f"the run went to its end, but {lost} of {summary['cycles']} cycles are not recorded")
     return 0
 
 
 def _print_run(summary: dict[str, Any]) -> None:
     from hil.loop.timing import budget
 
-    _timing_table(summary["timing_us"], budget()).print()
+    table = Table("us", *(f"{label} / budget" for label in QUANTILES))
+    for stage, figures in summary["timing_us"].items():
+        limits = budget().get(stage, {})
+        table.add(stage, *(_timing_cell(figures[name], limits.get(name, inf)) for name in QUANTILES.values()))
+    table.print()
     for line in (*(f"over budget: {text}" for text in summary["over_budget"]), *summary["events"]):
         print(line)
     if not summary["over_budget"]:
@@ -202,78 +201,53 @@ def _bars(bars: list[list[float]]) -> str:
     )
 
 
-def _timing_table(timing: dict[str, dict[str, float]], budget: dict[str, dict[str, float]]) -> Table:
-    """The microseconds of each stage beside their budget, marked where they exceed it."""
-    table = Table("us", *(f"{label} / budget" for label in QUANTILES))
-    for stage, figures in timing.items():
-        limits = budget.get(stage, {})
-        table.add(stage, *(_timing_cell(figures[name], limits.get(name)) for name in QUANTILES.values()))
-    return table
+def _timing_cell(us: float, limit: float) -> Cell:
+    return Cell(f"{us:.1f} / {f'{limit:g}' if limit < inf else ' -'}", alarm=us > limit)
 
 
-def _timing_cell(us: float, limit: float | None) -> Cell:
-    if limit is None:
-        return Cell(f"{us:.1f} /  -")
-    return Cell(f"{us:.1f} / {limit:g}", alarm=us > limit)
-
-
-def add_replay(command: argparse.ArgumentParser) -> None:
+@cli.command(cli.source("files", "FILE.mcap", "files of one run, in their order", nargs="+"), cli.JSON)
+def gough_replay(options: Namespace) -> int:
     """Feed a recording's raw IMU data through the cycle again.
 
     Estimates and commands must be those of the recording, bit for bit.
     """
-    command.add_argument("files", type=Path, nargs="+", metavar="FILE.mcap", help="files of one run, in their order")
-    add_json(command)
-    command.set_defaults(run=_replay)
-
-
-def _replay(options: argparse.Namespace) -> int:
     from hil.recording.replay import replay
 
-    check_outputs(options.json, inputs=options.files)
+    cli.check_outputs(options, inputs=options.files)
     result = replay(options.files)
-    write_json(options.json, result.summary())
+    cli.write_json(options.json, result.summary())
     for line in result.lines():
         print(line)
-    return 0 if result.same else 1
-
-
-def add_stream_target(command: argparse.ArgumentParser) -> None:
-    """Send a target pose by pose to a run that follows a stream.
-
-    Each pose is one UDP datagram, in real time. The stream can also go wrong on purpose, to show that the run then stops as it
-    should.
-    """
-    add_options(
-        command,
-        SimulationConfig,
-        "mechanism",
-        target={"text": "a motion's name, or a CSV file, as for 'gough run'"},
-        duration={"text": "duration of the motion"},
-        rate={"default": 100.0, "text": "poses per second, at most 10000"},
-    )
-    command.add_argument(
-        "--to",
-        type=_address,
-        default="127.0.0.1:47200",
-        metavar="HOST:PORT",
-        help="where the run listens (default: %(default)s)",
-    )
-    for name, text in (("stop", "fall silent"), ("jump", "jump up by 5 cm"), ("nan", "send what is no number")):
-        command.add_argument(
-            f"--{name}-at", type=float, default=argparse.SUPPRESS, metavar="SECONDS", help=f"{text} from this time on [s]"
-        )
-    command.set_defaults(run=_stream_target)
+    return int(not result.same)
 
 
 def _address(text: str) -> tuple[str, int]:
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise argparse.ArgumentTypeError(f"{text!r} is no address such as 127.0.0.1:47200")
+        raise ArgumentTypeError(f"{text!r} is no address such as 127.0.0.1:47200")
     return host.strip("[]"), int(port)
 
 
-def _stream_target(options: argparse.Namespace) -> int:
+@cli.command(
+    cli.options_of(
+        SimulationConfig,
+        "mechanism",
+        target={"text": "a motion's name, or a CSV file, as for 'gough run'"},
+        duration={"text": "duration of the motion"},
+        rate={"default": 100.0, "text": "poses per second, at most 10000"},
+    ),
+    cli.setting("--to", "127.0.0.1:47200", "where the run listens", type=_address, metavar="HOST:PORT"),
+    *(
+        cli.argument(f"--{name}-at", type=float, default=SUPPRESS, metavar="SECONDS", help=f"{text} from this time on [s]")
+        for name, text in (("stop", "fall silent"), ("jump", "jump up by 5 cm"), ("nan", "send what is no number"))
+    ),
+)
+def gough_stream_target(options: Namespace) -> None:
+    """Send a target pose by pose to a run that follows a stream.
+
+    Each pose is one UDP datagram, in real time. The stream can also go wrong on purpose, to show that the run then stops as it
+    should.
+    """
     from controller.planning.target import load_target
     from hil.runs.target_stream import Faults, send_target
     from plant.mechanism import load_spatial
@@ -281,6 +255,5 @@ def _stream_target(options: argparse.Namespace) -> int:
     mechanism = load_spatial(options.mechanism)
     target = load_target(options.target, mechanism, options.duration)
     host, port = options.to
-    sent = send_target(mechanism, target, options.rate, host, port, options.duration, config_of(options, Faults))
+    sent = send_target(mechanism, target, options.rate, host, port, options.duration, cli.config_of(options, Faults))
     print(f"{sent} poses of {target.name} sent to {host}:{port}")
-    return 0

@@ -1,13 +1,11 @@
 """The studies: compare-fusion, evaluate-fusion, faults, planar, broad."""
 
-import argparse
 import sys
+from argparse import SUPPRESS, Namespace
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-from hil.command_line.options import add_options, config_of
-from hil.command_line.outputs import add_json, add_markdown, check_outputs, show_table, write_json
+from hil.command_line import cli
 from hil.command_line.terminal import deg, mm, mm_deg, progress_bar
 from hil.runs.config import SimulationConfig
 from hil.studies.config import SECTIONS, ComparisonConfig, EvaluationConfig
@@ -15,35 +13,32 @@ from hil.table import Table
 from plant.errors import InputError
 
 
-def add_compare_fusion(command: argparse.ArgumentParser) -> None:
+@cli.command(cli.options_of(ComparisonConfig), cli.JSON)
+def gough_compare_fusion(options: Namespace) -> None:
     """Compare every way to fuse the IMUs, on one motion.
 
     The platform moves as prescribed, 30 mm and 10 deg along and about every axis. Prints errors after the first 20 s, NEES (6
     is consistent) and microseconds of a cycle.
     """
-    add_options(command, ComparisonConfig)
-    add_json(command)
-    command.set_defaults(run=_compare)
-
-
-def _compare(options: argparse.Namespace) -> int:
     from hil.studies.fusion_comparison import compare
 
-    check_outputs(options.json)
-    config = config_of(options, ComparisonConfig)
+    config = cli.config_of(options, ComparisonConfig)
     with progress_bar("every way to fuse") as progress:
         figures = compare(config, progress)
-    write_json(options.json, figures)
+    cli.write_json(options.json, figures)
     table = Table(f"{config.imu}, {config.motion}", "position RMS [mm]", "rotation RMS [deg]", "NEES", "us", "seeds")
     for name, method in figures["methods"].items():
-        nees = "" if method["nees"] is None else f"{method['nees']:.1f}"
-        us = "" if method["us"] is None else f"{method['us']:.1f}"
-        table.add(name, mm(method["position_rms"]), deg(method["rotation_rms"]), nees, us, f"{method['seeds']}")
+        known = ("" if method[figure] is None else f"{method[figure]:.1f}" for figure in ("nees", "us"))
+        table.add(name, mm(method["position_rms"]), deg(method["rotation_rms"]), *known, f"{method['seeds']}")
     table.print()
-    return 0
 
 
-def add_evaluate_fusion(command: argparse.ArgumentParser) -> None:
+@cli.command(
+    cli.options_of(EvaluationConfig),
+    cli.argument("--only", choices=SECTIONS, nargs="+", default=SUPPRESS, help="these sections instead of all"),
+    cli.JSON,
+)
+def gough_evaluate_fusion(options: Namespace) -> None:
     """Evaluate the whole-mechanism filter after a self-calibration.
 
     The raw IMUs of several rigs are calibrated on themselves; then their platforms move as prescribed, 30 mm and 10 deg along
@@ -51,26 +46,15 @@ def add_evaluate_fusion(command: argparse.ArgumentParser) -> None:
     wrong joints, with a dead IMU, of starts in the middle of a motion, over minutes of standing still, in the closed loop, and
     the cost of a cycle, beside the leg filters with the refined pose. Ten minutes in all.
     """
-    add_options(command, EvaluationConfig)
-    command.add_argument(
-        "--only", choices=SECTIONS, nargs="+", default=argparse.SUPPRESS, help="these sections instead of all"
-    )  # fmt: skip
-    add_json(command)
-    command.set_defaults(run=_evaluate)
-
-
-def _evaluate(options: argparse.Namespace) -> int:
     from hil.studies.fusion_evaluation import evaluate
 
-    check_outputs(options.json)
-    config = config_of(options, EvaluationConfig)
+    config = cli.config_of(options, EvaluationConfig)
     with progress_bar("calibration") as progress:
         figures = evaluate(config, lambda label, share: progress(share, label))
-    write_json(options.json, figures)
+    cli.write_json(options.json, figures)
     for section, show in _EVALUATED.items():
         if section in figures:
             show(figures[section])
-    return 0
 
 
 def _joints(error: str) -> str:
@@ -149,23 +133,20 @@ _EVALUATED: dict[str, Callable[[dict[str, Any]], None]] = {
 }
 
 
-def add_faults(command: argparse.ArgumentParser) -> None:
+@cli.command(
+    cli.setting("--seeds", 20, "how often each case is tried"),
+    cli.argument("--only", metavar="TEXT", help="only cases with this text in their names"),
+    cli.markdown("docs/faults.md"),
+    cli.JSON,
+)
+def gough_faults(options: Namespace) -> int:
     """Try every fault many times, and compare with the specified reaction.
 
     Every case of the fault matrix runs on the emulated rig, on virtual time. Prints the reported cause, how the run ends, how
     soon, and how far a leg gets off its reference. The exit status is 1 if any reaction differs from the specified one.
     """
-    command.add_argument("--seeds", type=int, default=20, help="how often each case is tried (default: %(default)s)")
-    command.add_argument("--only", metavar="TEXT", help="only cases with this text in their names")
-    add_markdown(command, "docs/faults.md")
-    add_json(command)
-    command.set_defaults(run=_faults)
-
-
-def _faults(options: argparse.Namespace) -> int:
     from hil.studies.fault_matrix import CASES, run_matrix, summary, table
 
-    check_outputs(options.json)
     if options.seeds < 1:
         raise InputError(f"there are {options.seeds} seeds; at least 1 is needed")
     cases = tuple(case for case in CASES if options.only is None or options.only in case.name)
@@ -173,94 +154,74 @@ def _faults(options: argparse.Namespace) -> int:
         raise InputError(f"no case has {options.only!r} in its name")
     with progress_bar("faults") as progress:
         outcomes = run_matrix(options.seeds, cases, progress)
-    show_table(table(outcomes), options.markdown)
-    write_json(options.json, summary(outcomes, options.seeds))
+    table(outcomes).print(options.markdown)
+    cli.write_json(options.json, summary(outcomes, options.seeds))
     findings = [finding for outcome in outcomes for finding in outcome.findings]
     for finding in findings:
         print(finding, file=sys.stderr)
-    return 1 if findings else 0
+    return int(bool(findings))
 
 
-def add_planar(command: argparse.ArgumentParser) -> None:
+@cli.command(
+    cli.source("folder", "FOLDER", "folder with the files pose_*.csv"),
+    cli.options_of(SimulationConfig, mechanism={"default": "planar-3rpr"}),
+    cli.report("write a report with plots"),
+    cli.JSON,
+)
+def gough_planar(options: Namespace) -> None:
     """Find the poses of a real planar rig from its measured leg angles.
 
     The rig stands at known poses, given in files pose_*.csv with the true pose in the first line. Prints the errors of the
     assembly mode that is nearest to the true pose.
     """
-    command.add_argument("folder", type=Path, metavar="FOLDER", help="folder with the files pose_*.csv")
-    add_options(command, SimulationConfig, mechanism={"default": "planar-3rpr"})
-    command.add_argument("--report", type=Path, metavar="FILE.html", help="write a report with plots")
-    add_json(command)
-    command.set_defaults(run=_planar)
-
-
-def _planar(options: argparse.Namespace) -> int:
     from hil.studies.planar_rig import evaluate
     from plant.mechanism import load_mechanism
     from plant.mechanism.planar import PlanarMechanism
 
-    check_outputs(options.json, report=options.report)
     mechanism = load_mechanism(options.mechanism)
     if not isinstance(mechanism, PlanarMechanism):
         raise InputError(f"{options.mechanism} has six legs in space; this needs three in the plane: choose another mechanism")
     result = evaluate(options.folder, mechanism)
     summary = result.summary()
-    write_json(options.json, summary)
+    cli.write_json(options.json, summary)
     if options.report:
         from hil.reports.planar_rig import write_report
 
         write_report(result, options.report)
     table = Table("RMS of the poses' mean errors", "x [mm]", "y [mm]", "angle [deg]", "leg angles [deg]", "true pose is a mode")
     for source, figures in summary["sources"].items():
-        rms = figures["rms"]
-        table.add(
-            source,
-            mm(rms["x"], 2),
-            mm(rms["y"], 2),
-            deg(rms["angle"], 2),
-            deg(figures["leg_angles"]["constant_error"], 2),
-            f"{figures['true_mode']['poses']} of {len(result.poses)} poses",
-        )
+        rms, poses = figures["rms"], f"{figures['true_mode']['poses']} of {len(result.poses)} poses"
+        angles = (deg(angle, 2) for angle in (rms["angle"], figures["leg_angles"]["constant_error"]))
+        table.add(source, mm(rms["x"], 2), mm(rms["y"], 2), *angles, poses)
     table.print()
-    return 0
 
 
-def add_broad(command: argparse.ArgumentParser) -> None:
+@cli.command(
+    cli.source("folder", "FOLDER", "folder with the trials *.npz"),
+    cli.setting(
+        "--accelerometer-noise",
+        0.25,
+        "noise that the filter assumes [m/s2/sqrt(Hz)]; on a mechanism the legs give the platform's acceleration, which "
+        "here is unknown and counts as noise, far above the sensor's own",
+    ),
+    cli.setting("--bias-walk", 1e-4, "random walk of the gyroscope's bias that the filter assumes [rad/s/sqrt(s)]"),
+    cli.JSON,
+)
+def gough_broad(options: Namespace) -> None:
     """Run the platform's filter alone, on real IMU data.
 
     The filter, and the vqf package, run on trials of the BROAD benchmark: an IMU moved by hand, with an optical reference.
     Prints the RMS of the inclination's error where the benchmark counts it.
     """
-    command.add_argument("folder", type=Path, metavar="FOLDER", help="folder with the trials *.npz")
-    command.add_argument(
-        "--accelerometer-noise",
-        type=float,
-        default=0.25,
-        help="noise that the filter assumes [m/s2/sqrt(Hz)]; on a mechanism the legs give the platform's acceleration, which "
-        "here is unknown and counts as noise, far above the sensor's own (default: %(default)s)",
-    )
-    command.add_argument(
-        "--bias-walk",
-        type=float,
-        default=1e-4,
-        help="random walk of the gyroscope's bias that the filter assumes [rad/s/sqrt(s)] (default: %(default)s)",
-    )
-    add_json(command)
-    command.set_defaults(run=_broad)
-
-
-def _broad(options: argparse.Namespace) -> int:
     from controller.settings import FusionSettings
     from hil.studies.broad import evaluate
 
-    check_outputs(options.json)
     fusion = FusionSettings(platform_accelerometer_noise=options.accelerometer_noise, bias_walk=options.bias_walk)
     figures = evaluate(options.folder, fusion)
-    write_json(options.json, figures)
+    cli.write_json(options.json, figures)
     table = Table("inclination RMS", "filter [deg]", "vqf [deg]", "filter [us]", "vqf [us]", "samples")
     for name, trial in figures["trials"].items():
         methods = trial["filter"], trial["vqf"]
         errors, times = (deg(method["inclination_rms"]) for method in methods), (f"{method['us']:.2f}" for method in methods)
         table.add(name, *errors, *times, f"{trial['samples']}")
     table.print()
-    return 0

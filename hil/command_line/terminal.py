@@ -19,25 +19,23 @@ _COMPILED_FUNCTIONS = 280
 
 
 def mm(metres: float, digits: int = 3) -> str:
-    """Return a length [m] in millimetres, with this number of digits after the point."""
+    """A length [m] in millimetres."""
     return f"{1e3 * metres:.{digits}f}"
 
 
 def deg(angle: float, digits: int = 3) -> str:
-    """Return an angle [rad] in degrees, with this number of digits after the point."""
+    """An angle [rad] in degrees."""
     return f"{degrees(angle):.{digits}f}"
 
 
 def mm_deg(errors: dict[str, float], prefix: str = "") -> str:
-    """Return the RMS errors of a pose, in millimetres and degrees."""
+    """The RMS errors of a pose, in millimetres and degrees."""
     return f"{mm(errors[f'{prefix}position_rms'])}, {deg(errors[f'{prefix}rotation_rms'])}"
 
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[..., None]]:
-    """A progress bar on the terminal, removed at the end; it pulses until it is first called with the share that is done. A new
-    label can be given with the share.
-    """
+    """A progress bar on the terminal. It pulses until it is called with the share that is done, and may be a new label."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -49,8 +47,8 @@ def progress_bar(label: str) -> Iterator[Callable[..., None]]:
         def compiling(functions: int) -> None:
             if functions == 1 and not terminal:
                 print("compiling the controller, once: the next start takes seconds", file=sys.stderr)
-            description = f"compiling function {functions} of about {_COMPILED_FUNCTIONS} (once; the next start takes seconds)"
-            bar.update(task, total=max(_COMPILED_FUNCTIONS, functions), completed=functions, description=description)
+            text = f"compiling function {functions} of about {_COMPILED_FUNCTIONS} (once; the next start takes seconds)"
+            bar.update(task, total=max(_COMPILED_FUNCTIONS, functions), completed=functions, description=text)
 
         def show(share: float, now: str = label) -> None:
             bar.update(task, total=1.0, completed=share, description=now)
@@ -96,16 +94,18 @@ def _view(title: str, state: "RunState") -> Table:
         return table
     position, r = 1e3 * latest["position"], latest["rotation"]
     angles = (atan2(r[2, 1], r[2, 2]), asin(max(-1.0, min(1.0, -r[2, 0]))), atan2(r[1, 0], r[0, 0]))
-    wake, compute = state.timing.histograms["wake"].figures(), state.timing.histograms["compute"].figures()
-    errors = state.errors()
-    mode = Mode(int(latest["mode"])).name.lower() + (f": {Cause(int(latest['stop'])).text}" if latest["stop"] else "")
+    errors, histograms = state.errors(), state.timing.histograms
+    mode = Mode(int(latest["mode"])).name.lower()
+    if latest["stop"]:
+        mode += f": {Cause(int(latest['stop'])).text}"
     table.add("state", f"{mode}, {latest['time_ns'] / 1e9:.1f} s")
     table.add("position [mm]", "  ".join(f"{value:9.3f}" for value in position))
     table.add("roll, pitch, yaw [deg]", "  ".join(f"{degrees(angle):9.3f}" for angle in angles))
     table.add("estimate - truth, RMS [mm]", mm(errors["estimation"]) if errors["known"] else "the truth is not known")
     table.add("reference - length, RMS [mm]", mm(errors["tracking"]))
-    for label, figures in (("woken late", wake), ("computing", compute)):
-        table.add(f"{label} p50, p99.9, max [us]", "  ".join(f"{figures[name]:.0f}" for name in ("p50", "p999", "max")))
+    for label, name in (("woken late", "wake"), ("computing", "compute")):
+        figures = histograms[name].figures()
+        table.add(f"{label} p50, p99.9, max [us]", "  ".join(f"{figures[key]:.0f}" for key in ("p50", "p999", "max")))
     table.add("periods missed, exchanges late", f"{state.missed}, {state.late}")
     table.add("stop", "Ctrl-C: controlled; Ctrl-\\: emergency")
     for text in state.refused:

@@ -4,13 +4,13 @@ import argparse
 import re
 import subprocess
 import sys
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from importlib.metadata import version
 
 import pytest
 
 from hil.command_line import COMMANDS, parse
-from hil.command_line.options import add_options, config_of
+from hil.command_line.cli import config_of, options_of
 from hil.realtime.scheduling import RealTimeSettings
 from hil.runs.config import EmulatorConfig, SimulationConfig
 from hil.studies.config import ComparisonConfig, EvaluationConfig, TuningConfig
@@ -74,7 +74,7 @@ def test_every_help_gives_one_default_and_every_option_a_help(line, capsys, monk
 def test_options_without_arguments_are_the_configuration_s_defaults(config):
     assert is_dataclass(config)
     command = argparse.ArgumentParser()
-    add_options(command, config, *(each.name for each in fields(config) if "option" in each.metadata))
+    options_of(config)(command)
     assert config_of(command.parse_args([]), config) == config()
 
 
@@ -103,7 +103,15 @@ def test_options_are_read_in_their_units_and_forms():
         ("compare-fusion --seeds 0,a", "argument --seeds: '0,a' is no list of numbers such as 0,1,2"),
         ("run --cpu one", "argument --cpu: invalid int value: 'one'"),
         ("emulate --bus can", "argument --bus: invalid choice: 'can'"),
-        ("simulat", "argument COMMAND: invalid choice: 'simulat'"),
+        ("simulat", "gough: argument COMMAND: invalid choice: 'simulat'; did you mean 'simulate'? (see gough --help)"),
+        ("check_rig", "'check_rig'; did you mean 'check-rig'?"),
+        ("octopus", "gough: argument COMMAND: invalid choice: 'octopus' (see gough --help)"),
+        (
+            "simulate --sed 1",
+            "gough simulate: unrecognized arguments: --sed 1; did you mean '--seed'? (see gough simulate --help)",
+        ),
+        ("fmu info a.fmu --jsn b", "gough fmu info: unrecognized arguments: --jsn b; did you mean '--json'?"),
+        ("simulate --colour red", "gough simulate: unrecognized arguments: --colour red (see"),
         ("", "the following arguments are required: COMMAND"),
     ],
 )

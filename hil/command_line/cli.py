@@ -1,0 +1,219 @@
+"""The parts of a command: arguments, options from configurations (see `hil.option`), and output files."""
+
+import inspect
+import json
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from hil.option import Option
+from plant.errors import GoughError, InputError
+from plant.extras import check_installed
+from plant.files import check_writable, write_whole
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+    C = TypeVar("C", bound=DataclassInstance)
+
+Argument = Callable[[ArgumentParser], object]
+"""Adds one or several arguments to a parser."""
+
+Handler = Callable[[Namespace], int | None]
+"""Carries out a command, and returns its exit status; None is 0."""
+
+_SCALES = {"mm": 1e-3, "ms": 1e-3}
+"""Factors to SI units."""
+
+
+class OutputError(GoughError, OSError):
+    """A command did its work, but not all of the results could be written."""
+
+    exit_status = 1
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command, or an action of one; the first line of its `text` is its help."""
+
+    text: str
+    arguments: Sequence[Argument]
+    run: Handler | None = None
+
+    @property
+    def help(self) -> str:
+        """One line on what it does."""
+        line = self.text.partition("\n")[0]
+        return line[:1].lower() + line[1:].rstrip(".")
+
+    def build(self, parser: ArgumentParser) -> None:
+        """Give a parser the description and the arguments, and what it parses `run` and `parser`."""
+        parser.description = self.text
+        for add in self.arguments:
+            add(parser)
+        parser.set_defaults(run=self.run, parser=parser)
+
+
+def command(*arguments: Argument) -> Callable[[Handler], Command]:
+    """Make the function below a command, which its docstring describes to the user."""
+    return lambda run: Command(inspect.getdoc(run) or "", arguments, run)
+
+
+def group(text: str, **actions: Command) -> Command:
+    """A command of which the user names an action."""
+
+    def add(parser: ArgumentParser) -> None:
+        parsers = parser.add_subparsers(required=True, metavar="ACTION")
+        for name, action in actions.items():
+            action.build(parsers.add_parser(name, help=action.help))
+
+    return Command(text, [add])
+
+
+def argument(*names: str, **form: Any) -> Argument:
+    """An argument, in the form of `ArgumentParser.add_argument`."""
+    return lambda parser: parser.add_argument(*names, **form)
+
+
+def flag(name: str, text: str) -> Argument:
+    """An option without a value."""
+    return argument(name, action="store_true", help=text)
+
+
+def setting(name: str, default: float | str, text: str, **form: Any) -> Argument:
+    """An option with a default, which the help shows, and whose type it has."""
+    form = {"type": type(default), **form}
+    return argument(name, default=default, help=f"{text} (default: {_shown(default)})", **form)
+
+
+def source(name: str, metavar: str, text: str, **form: Any) -> Argument:
+    """A file or folder that a command reads."""
+    return argument(name, type=Path, metavar=metavar, help=text, **form)
+
+
+def output(name: str, metavar: str, text: str) -> Argument:
+    """A file that a command writes; `check_outputs` finds it."""
+
+    def add(parser: ArgumentParser) -> None:
+        added = parser.add_argument(name, type=Path, metavar=metavar, help=text)
+        parser.set_defaults(to_write=[*(parser.get_default("to_write") or ()), added.dest])
+
+    return add
+
+
+def report(text: str) -> Argument:
+    """The option for a report, which needs a package of its own."""
+    return output("--report", "FILE.html", text)
+
+
+JSON = output("--json", "FILE", "write the figures in SI units")
+
+
+def markdown(page: str) -> Argument:
+    """The option to print the table as a page of the documentation has it."""
+    return flag("--markdown", f"print the table in Markdown, as {page} has it")
+
+
+def names_of(config: "type[C]", *without: str) -> list[str]:
+    """The names of a configuration's fields that are options, without some."""
+    return [each.name for each in fields(config) if "option" in each.metadata and each.name not in without]
+
+
+def options_of(config: "type[C]", *names: str, **changes: Mapping[str, Any]) -> Argument:
+    """The options of a configuration's fields; without names or changes, of all that have one.
+
+    `changes` has by name of a field what is different in this command: `default`, or attributes of `Option`.
+    """
+
+    def add(parser: ArgumentParser) -> None:
+        declared = {each.name: each for each in fields(config)}
+        for name in (*names, *changes) or names_of(config):
+            form = dict(changes.get(name, {}))
+            default = form.pop("default", declared[name].default)
+            _add_option(parser, name, default, replace(declared[name].metadata["option"], **form))
+
+    return add
+
+
+def _add_option(parser: ArgumentParser, name: str, default: Any, option: Option) -> None:
+    flag = option.flag or f"--{'no-' if default is True else ''}{name.replace('_', '-')}"
+    if isinstance(default, bool):
+        parser.add_argument(flag, dest=name, action="store_false" if default else "store_true", help=option.text)
+        return
+    scale = _SCALES.get(option.unit, 1.0)
+    shown = None if option.required else option.shown or _shown(default, scale)
+    parser.add_argument(
+        flag,
+        dest=name,
+        default=list(default) if option.several else default,
+        type=_reader(option.parse or (type(default) if isinstance(default, int | float) else str), scale),
+        action="append" if option.several else "store",
+        required=option.required,
+        metavar=option.metavar,
+        choices=option.choices,
+        help=option.text + (f" [{option.unit}]" if option.unit else "") + (f" (default: {shown})" if shown else ""),
+    )
+
+
+def _shown(default: Any, scale: float = 1.0) -> str:
+    """A default as the help shows it, "" for none."""
+    if isinstance(default, tuple):
+        return ",".join(map(str, default))
+    if isinstance(default, float):
+        return f"{default / scale:g}"
+    return "" if default is None else str(default)
+
+
+def _reader(parse: Callable[[str], Any], scale: float) -> Callable[[str], Any]:
+    """What argparse calls to parse an option, and names in its errors."""
+
+    def read(text: str) -> Any:
+        try:
+            value = parse(text)
+        except InputError as error:
+            raise ArgumentTypeError(str(error)) from None
+        return value if scale == 1.0 else scale * value
+
+    read.__name__ = parse.__name__
+    return read
+
+
+def config_of(options: Namespace, config: "type[C]", **others: Any) -> "C":
+    """The configuration that the options describe; `others` are fields that are not options.
+
+    Raises:
+        InputError: an option is out of its range.
+    """
+    for each in fields(config):
+        if hasattr(options, each.name):
+            value = getattr(options, each.name)
+            others.setdefault(each.name, tuple(value) if isinstance(value, list) else value)
+    return config(**others)
+
+
+def check_outputs(options: Namespace, inputs: Sequence[Path] = ()) -> None:
+    """Check that the output files can be written, and that no two of them and of the inputs are one.
+
+    Raises:
+        InputError: one cannot be written, or two are the same.
+        MissingPackageError: what makes reports is not installed.
+    """
+    paths = {name: getattr(options, name) for name in getattr(options, "to_write", ())}
+    if paths.get("report") is not None:
+        check_installed("plotly")
+    requested = [path for path in paths.values() if path is not None]
+    named = [path.resolve() for path in (*requested, *inputs)]
+    for path in named:
+        if named.count(path) > 1:
+            raise InputError(f"{path} is named twice: give two files")
+    for path in requested:
+        check_writable(path)
+
+
+def write_json(path: Path | None, content: Mapping[str, Any]) -> None:
+    """Write figures, which may be NumPy arrays, if a file is given."""
+    if path is not None:
+        text = json.dumps(content, indent=2, default=lambda array: array.tolist())
+        write_whole(path, f"{text}\n".encode())
