@@ -11,15 +11,12 @@ from plant.errors import InputError
 
 
 def write_report(figures: dict[str, Any], history: Sequence[dict[str, Any]], path: Path) -> None:
-    """Write histograms of the loop on the clock, and the course of its figures over earlier runs, as one HTML file.
+    """Write histograms of the loop on the clock, and its figures from run to run, as one HTML file.
 
-    Args:
-        figures: as `gough bench --json` writes them, with the section `real_time`.
-        history: earlier figures.
-        path: of the HTML file.
+    Figures and those of the `history` are as `gough bench --json` writes them.
 
     Raises:
-        InputError: there is no such section, or the file cannot be written.
+        InputError: the figures lack the section `real_time`, or the file cannot be written.
     """
     if "real_time" not in figures:
         raise InputError(
@@ -41,10 +38,9 @@ def write_report(figures: dict[str, Any], history: Sequence[dict[str, Any]], pat
         figure = go.Figure()
         for name in ("compute_us", "latency_us", "wake_us", "cyclictest_us"):
             for key in ("p50", "p999"):
-                measured = [(run["date"], _idle(run, rate).get(name)) for run in runs]
-                points = [(date, figures_of[key]) for date, figures_of in measured if figures_of]
+                times = {run["date"]: found[key] for run in runs if (found := _idle(run, rate).get(name))}
                 label = f"{name.removesuffix('_us')} {key.replace('p999', 'p99.9')}"
-                figure.add_scatter(x=[at for at, _ in points], y=[us for _, us in points], name=label, mode="lines+markers")
+                figure.add_scatter(x=list(times), y=list(times.values()), name=label, mode="lines+markers")
         figure.update_layout(LAYOUT, height=380, yaxis={"title": "us", "type": "log"})
         caption = f"{len(runs)} runs, idle."
         sections.append(figure_html(f"history-{rate}", f"{rate} Hz, from run to run", caption, figure))

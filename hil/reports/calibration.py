@@ -13,7 +13,7 @@ from hil.calibration.assessment import STAGES, weak_words
 from hil.calibration.drive import RigCalibration
 from hil.reports import view
 from hil.reports.calibration_picture import KINDS, accuracy_svg
-from hil.reports.page import AXIS_NAMES, COLORS, FAINT, INK, LAYOUT, LEGEND, figure_html, write_page
+from hil.reports.page import AXIS_NAMES, COLORS, FAINT, INK, LAYOUT, LEGEND, figure_html, overview, place, write_page
 from hil.table import Cell, Table
 from plant.dynamics.variables import IMU_COUNT
 from plant.imu import MILLI_G
@@ -66,13 +66,7 @@ def write_report(result: RigCalibration, path: Path) -> None:
             _constants(summary),
         ),
     )
-    body = f"""<section class="overview">
-<div>
-{_table(summary).html()}
-{words}
-</div>
-{rests}</section>
-{"".join(figure_html(*figure) for figure in figures)}"""
+    body = overview(f"{_table(summary).html()}\n{words}", rests) + "".join(figure_html(*figure) for figure in figures)
     title = f"gough: the IMUs of {result.mechanism.name}, calibrated on the rig"
     write_page(path, title, f"{summary['rests']} rests · {about['date']} · gough {about['version']}", body)
 
@@ -114,48 +108,39 @@ def _constants(summary: Mapping[str, Any]) -> go.Figure:
     rows = -(-len(_CONSTANTS) // columns)
     figure = make_subplots(rows, columns, horizontal_spacing=0.08, vertical_spacing=0.06)
     for number, (name, (unit, scale)) in enumerate(_CONSTANTS.items()):
-        row, column = divmod(number, columns)
         found = summary["constants"][name]
         values, sigmas = scale * np.array(found["values"]), scale * np.array(found["sigmas"])
         for axis, label in enumerate(AXIS_NAMES):
-            shown = ("xy", "xz", "yz")[axis] if name.endswith("axes") else label
+            axes = ("xy", "xz", "yz")[axis]
+            shown = axes if name.endswith("axes") else label
             figure.add_scatter(
                 x=np.arange(IMU_COUNT) + 0.18 * (axis - 1),
                 y=values[:, axis],
                 error_y={"array": 3.0 * sigmas[:, axis], "thickness": 1.5, "width": 3},
                 mode="markers",
                 marker={"color": COLORS[label], "size": 7},
-                name=f"{label} (axes: {('xy', 'xz', 'yz')[axis]})",
+                name=f"{label} (axes: {axes})",
                 legendgroup=label,
                 showlegend=number == 0,
                 customdata=sigmas[:, axis],
                 hovertemplate=f"{shown}: %{{y:.4~g}} ± %{{customdata:.2~g}} {unit}<extra></extra>",
-                row=row + 1,
-                col=column + 1,
+                **place(number, columns),
             )
-        figure.update_yaxes(title_text=f"{name} [{unit}]", zerolinecolor=INK, row=row + 1, col=column + 1)
+        figure.update_yaxes(title_text=f"{name} [{unit}]", zerolinecolor=INK, **place(number, columns))
     figure.update_xaxes(tickvals=list(range(IMU_COUNT)), title_text="IMU", title_standoff=2)
     return figure.update_layout(LAYOUT, height=60 + 230 * rows, legend=LEGEND)
 
 
 def _rests(result: RigCalibration) -> go.Figure:
     positions = 1e3 * np.array(result.summary["positions"])
-    figure = go.Figure(
-        [
-            view.line_trace(view.coordinates(positions), FAINT, 2),
-            go.Scatter3d(
-                view.coordinates(positions),
-                mode="markers+text",
-                text=[str(n) for n in range(len(positions))],
-                marker={"size": 4, "color": COLORS["z"]},
-                textfont={"size": 10, "color": INK},
-                hovertemplate="rest %{text}: %{x:.1f}, %{y:.1f}, %{z:.1f} mm<extra></extra>",
-            ),
-        ]
+    rests = go.Scatter3d(
+        view.coordinates(positions),
+        mode="markers+text",
+        text=[str(n) for n in range(len(positions))],
+        marker={"size": 4, "color": COLORS["z"]},
+        textfont={"size": 10, "color": INK},
+        hovertemplate="rest %{text}: %{x:.1f}, %{y:.1f}, %{z:.1f} mm<extra></extra>",
     )
-    return figure.update_layout(
-        LAYOUT,
-        **view.VIEW,
-        height=460,
-        scene=view.scene(positions, result.mechanism.up_in_base),
-    )
+    figure = go.Figure([view.line(positions, FAINT, 2), rests])
+    scene = view.scene(positions, result.mechanism.up_in_base)
+    return figure.update_layout(LAYOUT, **view.VIEW, height=460, scene=scene)

@@ -1,4 +1,4 @@
-"""The report of a mechanism's class: needs of each method, the graph of the legs, the mechanism, and conditioning."""
+"""The report of a mechanism's class: needs of each method, graph of the legs, and conditioning."""
 
 from importlib.metadata import version
 from pathlib import Path
@@ -7,7 +7,7 @@ import numpy as np
 import plotly.graph_objects as go
 
 from hil.reports import view
-from hil.reports.page import COLORS, FAINT, INK, LAYOUT, LEG_NAMES, figure_html, write_page
+from hil.reports.page import COLORS, INK, LAYOUT, LEG_NAMES, figure_html, overview, write_page
 from hil.studies.classification import PAPER, Description, Need, joints_about, planar_home
 from hil.table import Cell, Table
 from plant.mechanism import Mechanism
@@ -23,15 +23,14 @@ def write_report(description: Description, path: Path) -> None:
     """
     mechanism, mechanism_class = description.mechanism, description.mechanism_class
     figure = _planar_view(mechanism) if isinstance(mechanism, PlanarMechanism) else _spatial_view(mechanism)
-    graph = figure_html(
+    graph = (
         "graph",
         "Graph of the legs",
         "Platform joints above, base joints below; legs in the colours of the mechanism.",
         _graph(description),
         "view",
     )
-    drawn = figure_html("mechanism", "The mechanism", "At home, in mm.", figure, "view")
-    spread = figure_html(
+    spread = (
         "conditioning",
         "Conditioning",
         f"The share of {description.where} at which the conditioning of each method, with all legs, is lower. 1 is best; "
@@ -47,7 +46,8 @@ def write_report(description: Description, path: Path) -> None:
         f"{mechanism_class.name} · {mechanism_class.base_count} base and {mechanism_class.platform_count} platform joints · "
         f"graph {mechanism_class.drawing} · gough {version('gough')}"
     )
-    body = f'<section class="overview"><div>\n{table.html()}\n{graph}</div>\n{drawn}\n</section>\n{spread}'
+    drawn = figure_html("mechanism", "The mechanism", "At home, in mm.", figure, "view")
+    body = overview(f"{table.html()}\n{figure_html(*graph)}", drawn) + figure_html(*spread)
     write_page(path, f"gough: {mechanism.name} is of class {mechanism_class.label}", subtitle, body)
 
 
@@ -71,32 +71,27 @@ def _graph(description: Description) -> go.Figure:
             hovertemplate=f"{name} %{{pointNumber}}<extra></extra>",
         )  # fmt: skip
     hidden = {"visible": False, "fixedrange": True}
-    figure.update_layout(LAYOUT, height=220, xaxis=hidden, yaxis={**hidden, "range": [-0.3, 1.3]})
-    return figure
+    return figure.update_layout(LAYOUT, height=220, xaxis=hidden, yaxis={**hidden, "range": [-0.3, 1.3]})
 
 
 def _spatial_view(mechanism: Mechanism) -> go.Figure:
     base = 1e3 * mechanism.base_joints
     home = mechanism.nominal_home
     joints = 1e3 * (home.position + mechanism.platform_joints @ home.rotation.T)
-    base_ring, platform_ring = view.ring(base), view.ring(joints)
     numbers = joint_numbers(mechanism.base_joints)
     shared = [np.flatnonzero(numbers == number) for number in range(numbers.max() + 1)]
     labels = np.array([base[legs[0]] + 0.12 * (base[legs[0]] - base.mean(axis=0)) for legs in shared])
-    texts = [", ".join(str(leg) for leg in legs) for legs in shared]
+    texts = [", ".join(map(str, legs)) for legs in shared]
     figure = go.Figure(
         [
-            view.plate_trace(view.coordinates(joints[platform_ring[:-1]]), "#6d87a3", 0.55),
-            view.line_trace(view.coordinates(joints[platform_ring]), "#3d5670", 6),
-            view.line_trace(view.coordinates(view.segments(base, joints)), view.segment_colors(LEG_NAMES), 10),
-            view.plate_trace(view.coordinates(base[base_ring[:-1]]), FAINT, 0.35),
-            view.line_trace(view.coordinates(base[base_ring]), "#5c6873", 6),
-            go.Scatter3d(view.coordinates(labels), mode="text", text=texts, hoverinfo="skip"),
+            *view.plate(joints[view.ring(joints)], *view.PLATFORM),
+            view.line(view.segments(base, joints), view.segment_colors(LEG_NAMES), 10),
+            *view.plate(base[view.ring(base)], *view.BASE),
+            view.labels(labels, texts),
         ]
     )
     points = np.concatenate([labels, joints])
-    figure.update_layout(LAYOUT, **view.VIEW, height=540, scene=view.scene(points, mechanism.up_in_base))
-    return figure
+    return figure.update_layout(LAYOUT, **view.VIEW, height=540, scene=view.scene(points, mechanism.up_in_base))
 
 
 def _planar_view(mechanism: PlanarMechanism) -> go.Figure:
@@ -112,8 +107,7 @@ def _planar_view(mechanism: PlanarMechanism) -> go.Figure:
             x=[base[k, 0], joints[k, 0]], y=[base[k, 1], joints[k, 1]], name=LEG_NAMES[k], mode="lines",
             line={"color": COLORS[LEG_NAMES[k]], "width": 3},
         )  # fmt: skip
-    figure.update_layout(LAYOUT, height=540, xaxis={"title": "x [mm]"}, yaxis={"title": "y [mm]", "scaleanchor": "x"})
-    return figure
+    return figure.update_layout(LAYOUT, height=540, xaxis={"title": "x [mm]"}, yaxis={"title": "y [mm]", "scaleanchor": "x"})
 
 
 def _conditioning(description: Description) -> go.Figure:
@@ -124,7 +118,5 @@ def _conditioning(description: Description) -> go.Figure:
             x=np.percentile(need.conditionings, shares), y=shares, name=need.requirement.method, mode="lines",
             hovertemplate=f"{need.requirement.method}: %{{y:.1f}} % of the poses below %{{x:.2g}}<extra></extra>",
         )  # fmt: skip
-    figure.update_layout(
-        LAYOUT, height=380, xaxis={"title": "conditioning", "type": "log"}, yaxis={"title": "poses below [%]"}
-    )  # fmt: skip
-    return figure
+    axes = {"xaxis": {"title": "conditioning", "type": "log"}, "yaxis": {"title": "poses below [%]"}}
+    return figure.update_layout(LAYOUT, height=380, **axes)

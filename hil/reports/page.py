@@ -47,26 +47,29 @@ def write_page(path: Path, title: str, subtitle: str, body: str, script: str = "
     write_whole(path, text.encode())
 
 
+def overview(text: str, figure: str) -> str:
+    """The top of a page in HTML: text, and a figure beside it."""
+    return f'<section class="overview">\n<div>\n{text}\n</div>\n{figure}</section>\n'
+
+
+def place(number: int, columns: int) -> dict[str, int]:
+    """The place of a subplot, counted row by row, as plotly's methods take it."""
+    row, column = divmod(number, columns)
+    return {"row": row + 1, "col": column + 1}
+
+
 def figure_html(name: str, title: str, caption: str, figure: go.Figure | str, kind: str = "time") -> str:
     """A figure by plotly, or in HTML, with its title and caption in plain text.
 
     Its id is `name`, and its class `kind`: "time" for the full width, "view" for a part of it.
     """
-    drawn = f'<div id="{name}">{figure}</div>' if isinstance(figure, str) else _plot_html(name, figure)
+    if isinstance(figure, str):
+        drawn = f'<div id="{name}">{figure}</div>'
+    else:
+        config = {"displaylogo": False, "responsive": True, "doubleClick": "reset"}
+        drawn = to_html(figure, config, auto_play=False, include_plotlyjs=False, full_html=False, div_id=name)
     text = f"<h2>{escape(title, quote=False)}</h2>\n{drawn}\n<figcaption>{escape(caption, quote=False)}</figcaption>"
     return f'<figure class="{kind}">{text}</figure>\n'
-
-
-def _plot_html(name: str, figure: go.Figure) -> str:
-    html: str = to_html(
-        figure,
-        config={"displaylogo": False, "responsive": True, "doubleClick": "reset"},
-        auto_play=False,
-        include_plotlyjs=False,
-        full_html=False,
-        div_id=name,
-    )
-    return html
 
 
 LAYOUT = {

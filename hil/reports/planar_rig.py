@@ -8,7 +8,8 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from hil.reports.page import LAYOUT, LEGEND, figure_html, write_page
+from hil.reports.page import LAYOUT, LEGEND, figure_html, place, write_page
+from hil.reports.view import segments
 from hil.studies.planar_rig import COMPONENTS, SOURCES, TRUE_ANGLE, TRUE_DISTANCE_M, RigEvaluation, modes_near
 from hil.table import Table
 from plant.mechanism.planar import PlanarMechanism
@@ -86,8 +87,7 @@ def _error_plot(result: RigEvaluation) -> go.Figure:
             )
         figure.update_yaxes(title_text=f"{name} [{unit}]", row=row + 1)
     figure.update_xaxes(tickvals=places, ticktext=[escape(pose.name) for pose in result.poses])
-    figure.update_layout(LAYOUT, height=620, legend=LEGEND)
-    return figure
+    return figure.update_layout(LAYOUT, height=620, legend=LEGEND)
 
 
 def _mode_plot(result: RigEvaluation) -> go.Figure:
@@ -102,7 +102,6 @@ def _mode_plot(result: RigEvaluation) -> go.Figure:
         vertical_spacing=0.25 / rows,
     )
     for number, (pose, near, far) in enumerate(drawn):
-        row, column = divmod(number, columns)
         for name, position, angle, line in (
             ("true pose", pose.true_pose[:2], pose.true_pose[2], {"color": "#c5ccd4", "width": 7}),
             ("mode nearest to it", near.position, near.angle, {"color": "#3b6fb6", "width": 2}),
@@ -111,17 +110,15 @@ def _mode_plot(result: RigEvaluation) -> go.Figure:
             x, y = 1e3 * _outline(result.mechanism, position, angle).T
             figure.add_scatter(
                 x=x, y=y, mode="lines", line=line, name=name, legendgroup=name, showlegend=number == 0, hoverinfo="skip",
-                row=row + 1, col=column + 1,
+                **place(number, columns),
             )  # fmt: skip
-        figure.update_yaxes(scaleanchor=f"x{number + 1}" if number else "x", row=row + 1, col=column + 1)
+        figure.update_yaxes(scaleanchor=f"x{number + 1}" if number else "x", **place(number, columns))
     figure.update_xaxes(title_text="x [mm]", row=rows)
     figure.update_yaxes(title_text="y [mm]", col=1)
-    figure.update_layout(LAYOUT, height=120 + 330 * rows, legend={**LEGEND, "y": 1.06})
-    return figure
+    return figure.update_layout(LAYOUT, height=120 + 330 * rows, legend={**LEGEND, "y": 1.06})
 
 
 def _outline(mechanism: PlanarMechanism, position: Array, angle: float) -> Array:
     """Points (13, 2) [m] of the legs, with gaps between, and round the platform."""
     joints = mechanism.joints_at(position, angle)
-    legs = np.stack([mechanism.base_joints, joints, np.full_like(joints, np.nan)], axis=1)
-    return np.concatenate([legs.reshape(-1, 2), joints, joints[:1]])
+    return np.concatenate([segments(mechanism.base_joints, joints), joints, joints[:1]])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
 from hil.reports import view
-from hil.reports.page import AXIS_NAMES, COLORS, FAINT, INK, LAYOUT, LEG_NAMES, LEGEND, figure_html, write_page
+from hil.reports.page import AXIS_NAMES, COLORS, FAINT, INK, LAYOUT, LEG_NAMES, LEGEND, figure_html, overview, place, write_page
 from hil.runs.simulation import SimulationResult
 from hil.table import Cell, Table
 from plant.pose import Array, pose_errors
@@ -18,23 +18,20 @@ from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS
 from plant.wiring import ALL_IMUS
 
 _QUANTITIES = (("position", "mm", 1e3), ("rotation", "deg", np.degrees(1.0)))
-_POINTS = 3000
-_FRAMES = 150
-_FRAME_RATE_HZ = 25.0
-_SLOWEST_HZ = 15.0
-_PATH_POINTS = 600
+_POINTS, _PATH_POINTS = 3000, 600
+_FRAMES, _FRAME_RATE_HZ, _SLOWEST_HZ = 150, 25.0, 15.0
 _TUBE = 0.62
 """The drawn length of a leg's lower part, as a share of the leg's least length."""
 
 
 class _Panel(NamedTuple):
-    """Axes over time with the curves `names`: their `values` (N, k), their plan (N, k) behind, and dashed limits."""
+    """Axes over time."""
 
     label: str
-    names: Sequence[str]
-    values: Array
-    planned: Array | None = None
-    limits: Sequence[float] = ()
+    names: Sequence[str]  # of its k curves
+    values: Array  # (N, k)
+    planned: Array | None = None  # (N, k), drawn behind
+    limits: Sequence[float] = ()  # dashed
 
 
 def write_report(result: SimulationResult, path: Path) -> None:
@@ -44,17 +41,9 @@ def write_report(result: SimulationResult, path: Path) -> None:
         InputError: the file cannot be written.
     """
     summary = result.summary()
-    moving, speed = _mechanism_view(result)
-    pace = "in real time" if speed < 1.05 else f"at {speed:.2g} times real speed"
-    caption = f"{_real(result)} poses {pace}; the path of the origin in grey. Drag to turn, scroll to zoom."
-    body = f"""<section class="overview">
-<div>
-{_error_table(summary).html()}
-{_facts(summary)}
-</div>
-{figure_html("mechanism", "The mechanism", caption, moving, "view")}
-</section>
-{"".join(figure_html(*figure) for figure in _time_figures(result))}"""
+    mechanism = figure_html("mechanism", "The mechanism", *_mechanism_view(result), "view")
+    body = overview(f"{_error_table(summary).html()}\n{_facts(summary)}", mechanism)
+    body += "".join(figure_html(*figure) for figure in _time_figures(result))
     title = f"gough: {result.mechanism.name} follows {result.target.name}"
     write_page(path, title, _configuration(result, summary), body, _SHARED_TIME)
 
@@ -80,17 +69,17 @@ def _configuration(result: SimulationResult, summary: dict[str, Any]) -> str:
 def _error_table(summary: dict[str, Any]) -> Table:
     table = Table("", *((f"{name} [{unit}]", kind) for name, unit, _ in _QUANTITIES for kind in ("RMS", "max")))
 
-    def add(name: str, meaning: str, errors: dict[str, float], prefix: str = "") -> None:
+    rows = [("Tracking", "estimate - planned reference; the truth is not known", summary["estimated_tracking"], "")]
+    if summary["truth_known"]:
+        rows = [
+            ("Estimation", "estimate - truth", summary["estimation"], ""),
+            ("Tracking", "truth - planned reference", summary["tracking"], ""),
+            ("Against the raw target", "truth - target", summary["target"], ""),
+        ]
+    rows.append(("Reference", "planned reference - target", summary["target"], "reference_"))
+    for name, meaning, errors, prefix in rows:
         keys = ((f"{prefix}{quantity}_{kind}", scale) for quantity, _, scale in _QUANTITIES for kind in ("rms", "max"))
         table.add(Cell(name, meaning), *(f"{scale * errors[key]:.3f}" for key, scale in keys))
-
-    if summary["truth_known"]:
-        add("Estimation", "estimate - truth", summary["estimation"])
-        add("Tracking", "truth - planned reference", summary["tracking"])
-        add("Against the raw target", "truth - target", summary["target"])
-    else:
-        add("Tracking", "estimate - planned reference; the truth is not known", summary["estimated_tracking"])
-    add("Reference", "planned reference - target", summary["target"], "reference_")
     return table
 
 
@@ -110,29 +99,31 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
     """Name, title, caption and figure of each plot over time."""
     records, times = result.records, result.times
     limits, home_pose = result.mechanism.require_limits(), result.mechanism.require_home()
-    names, legs_there = LEG_NAMES[: result.mechanism.legs], slice(result.mechanism.legs)
+    there = slice(result.mechanism.legs)
+    names = LEG_NAMES[there]
     estimate = (records["position"], records["rotation"])
-    actual, real = _actual_poses(result), _real(result)
+    real, *actual = _drawn_poses(result)
     planned = (result.reference_positions, result.reference_rotations)
-    lengths, currents = (records["truth"][:, part][:, legs_there] for part in (TRUTH_LENGTHS, TRUTH_CURRENTS))
+    lengths, currents = (records["truth"][:, part][:, there] for part in (TRUTH_LENGTHS, TRUTH_CURRENTS))
     real_length = "True"
     if not np.isfinite(lengths[:1]).all():
-        lengths, real_length = records["lengths"][:, legs_there], "Estimated"
+        lengths, real_length = records["lengths"][:, there], "Estimated"
     lengths = 1e3 * lengths
-    planned_lengths, rates, accelerations = np.moveaxis(records["reference"][:, legs_there], 2, 0) * [[[1e3]], [[1e3]], [[1.0]]]
+    planned_lengths, rates, accelerations = np.moveaxis(records["reference"][:, there] * [1e3, 1e3, 1.0], 2, 0)
 
     home = (home_pose.position, home_pose.rotation)
+    drawn, plan = _differences(actual, home), _differences(planned, home)
     pose = [
-        _Panel(label, AXIS_NAMES, true, plan)
-        for label, true, plan in zip(
-            ("position [mm]", "rotation vector [deg]"), _differences(actual, home), _differences(planned, home), strict=True
-        )
+        _Panel(label, AXIS_NAMES, drawn[:, part], plan[:, part])
+        for label, part in (("position [mm]", slice(3)), ("rotation vector [deg]", slice(3, 6)))
     ]
     differences = [("tracking", _differences(actual, planned))]
     if result.truth_known:
         differences.insert(0, ("estimation", _differences(estimate, actual)))
     errors = [
-        _Panel(f"{name} [{unit}]", AXIS_NAMES, error[i]) for i, unit in enumerate(("mm", "deg")) for name, error in differences
+        _Panel(f"{name} [{unit}]", AXIS_NAMES, error[:, part])
+        for unit, part in (("mm", slice(3)), ("deg", slice(3, 6)))
+        for name, error in differences
     ]
     legs = [
         _Panel(f"{name} [mm]", (name,), lengths[:, [k]], planned_lengths[:, [k]], 1e3 * limits.stroke[k])
@@ -144,7 +135,7 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
     ]
     drives = [
         _Panel("length error [mm]", names, lengths - planned_lengths),
-        _Panel("command [mm/s]", names, 1e3 * records["command"][:, legs_there]),
+        _Panel("command [mm/s]", names, 1e3 * records["command"][:, there]),
     ]
     if np.isfinite(currents[:1]).all():
         drives.append(_Panel("motor current [A]", names, currents))
@@ -180,16 +171,11 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
     ]
 
 
-def _real(result: SimulationResult) -> str:
-    """The kind of the poses that are drawn."""
-    return "True" if result.truth_known else "Estimated"
-
-
-def _actual_poses(result: SimulationResult) -> tuple[Array, Array]:
-    """The true poses, or the estimated ones where the truth is not known."""
+def _drawn_poses(result: SimulationResult) -> tuple[str, Array, Array]:
+    """The true poses, or the estimated ones where the truth is not known, after the word for them."""
     if result.truth_known:
-        return result.true_positions, result.true_rotations
-    return result.records["position"], result.records["rotation"]
+        return "True", result.true_positions, result.true_rotations
+    return "Estimated", result.records["position"], result.records["rotation"]
 
 
 def _plot(times: Array, panels: Sequence[_Panel], columns: int = 1, shared_yaxes: bool = False) -> go.Figure:
@@ -211,19 +197,19 @@ def _plot(times: Array, panels: Sequence[_Panel], columns: int = 1, shared_yaxes
         return {"name": name, "legendgroup": name, "showlegend": first, "legendrank": 1 if name in COLORS else 2}
 
     for number, panel in enumerate(panels):
-        row, column = divmod(number, columns)
-        place: dict[str, Any] = {"row": row + 1, "col": column + 1}
-        peers = panels[row * columns : (row + 1) * columns] if shared_yaxes else [panel]
+        at: dict[str, Any] = place(number, columns)
+        first = number - number % columns
+        peers = panels[first : first + columns] if shared_yaxes else [panel]
         unit = panel.label.partition("[")[2].rstrip("]")
         for name, values in zip(panel.names, panel.planned.T if panel.planned is not None else (), strict=False):
             line = {"color": "#c5ccd4", "width": 5}
-            figure.add_scatter(**_curve(times, values, f"{name} planned", unit), line=line, **legend("planned"), **place)
+            figure.add_scatter(**_curve(times, values, f"{name} planned", unit), line=line, **legend("planned"), **at)
         for name, values in zip(panel.names, panel.values.T, strict=True):
             line = {"color": COLORS[name], "width": 1.5}
-            figure.add_scatter(**_curve(times, values, name, unit), line=line, **legend(name), **place)
+            figure.add_scatter(**_curve(times, values, name, unit), line=line, **legend(name), **at)
         for limit in panel.limits:
-            figure.add_hline(limit, line={"color": INK, "width": 1, "dash": "dash"}, **legend("limit"), **place)
-        figure.update_yaxes(title_text=panel.label, range=_span(peers, times >= 0.0), **place)
+            figure.add_hline(limit, line={"color": INK, "width": 1, "dash": "dash"}, **legend("limit"), **at)
+        figure.update_yaxes(title_text=panel.label, range=_span(peers, times >= 0.0), **at)
     if times[0] < 0.0:
         figure.add_vrect(times[0], min(0.0, times[-1]), fillcolor=FAINT, opacity=0.2, line_width=0, layer="below")
     figure.update_xaxes(range=[times[0], times[-1]])
@@ -262,64 +248,56 @@ def _extremes(values: Array, points: int = _POINTS) -> NDArray[np.intp]:
     return np.unique(np.concatenate([starts + buckets.argmin(axis=1), starts + buckets.argmax(axis=1), rest]))
 
 
-def _differences(poses: tuple[Array, Array], origins: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Translations (N, 3) [mm] and rotation vectors (N, 3) [deg] from the poses `origins` to `poses`, in {1}."""
-    errors = pose_errors(*poses, *origins)
-    return 1e3 * errors[:, :3], np.degrees(errors[:, 3:])
+def _differences(poses: Sequence[Array], origins: Sequence[Array]) -> Array:
+    """Translations [mm] and rotation vectors [deg] (N, 6) from the poses `origins` to `poses`, in {1}."""
+    return pose_errors(*poses, *origins) * np.repeat([1e3, np.degrees(1.0)], 3)
 
 
-def _mechanism_view(result: SimulationResult) -> tuple[go.Figure, float]:
-    """The moving mechanism, and its playing speed as a multiple of the real one."""
+def _mechanism_view(result: SimulationResult) -> tuple[str, go.Figure]:
+    """The caption and the figure of the moving mechanism."""
     mechanism = result.mechanism
     moving = np.flatnonzero(result.times >= 0.0)
     span = len(moving) / result.config.rate
     count = int(np.clip(span * _FRAME_RATE_HZ, 1, _FRAMES))
     frame_s = min(span / count, 1.0 / _SLOWEST_HZ)
     shown = moving[np.linspace(0, len(moving) - 1, count).astype(int)]
-    all_positions, all_rotations = _actual_poses(result)
+    real, all_positions, all_rotations = _drawn_poses(result)
     positions, rotations = 1e3 * all_positions[shown], all_rotations[shown]
     path = 1e3 * all_positions[moving[:: -(-len(moving) // _PATH_POINTS)]]
     base, platform = 1e3 * mechanism.base_joints, 1e3 * mechanism.platform_joints
     joints = positions[:, None] + platform @ np.swapaxes(rotations, 1, 2)
-    base_ring, platform_ring = view.ring(base), view.ring(platform)
+    platform_ring = view.ring(platform)
     numbers = base + 0.12 * (base - base.mean(axis=0))
     tube = _TUBE * 1e3 * mechanism.require_limits().stroke[:, :1]
-    points = np.concatenate([numbers, joints.reshape(-1, 3), path])
     triad = 0.4 * np.linalg.norm(platform, axis=1).max()
 
-    def moving_parts(k: int) -> list[dict[str, Array]]:
+    def moving_parts(k: int) -> list[Array]:
+        """The platform's rim, tubes, rods and axes."""
         legs = joints[k] - base
         ends = base + tube * legs / np.linalg.norm(legs, axis=1, keepdims=True)
-        return [
-            view.coordinates(joints[k][platform_ring[:-1]]),
-            view.coordinates(joints[k][platform_ring]),
-            view.coordinates(view.segments(base, ends)),
-            view.coordinates(view.segments(ends, joints[k])),
-            view.coordinates(view.segments(np.broadcast_to(positions[k], (3, 3)), positions[k] + triad * rotations[k].T)),
-        ]
+        axes = view.segments(np.broadcast_to(positions[k], (3, 3)), positions[k] + triad * rotations[k].T)
+        return [joints[k][platform_ring], view.segments(base, ends), view.segments(ends, joints[k]), axes]
 
     def frame(k: int) -> go.Frame:
-        plate, *lines = moving_parts(k)
-        data = [{"type": "mesh3d", **plate}, *({"type": "scatter3d", **line} for line in lines)]
+        lines = moving_parts(k)
+        plate = {"type": "mesh3d", **view.coordinates(lines[0][:-1])}
+        data = [plate, *({"type": "scatter3d", **view.coordinates(line)} for line in lines)]
         return go.Frame(name=str(k), traces=list(range(len(data))), data=data)
 
-    plate, outline, tubes, rods, axes = moving_parts(0)
+    rim, tubes, rods, axes = moving_parts(0)
     figure = go.Figure(
         [
-            view.plate_trace(plate, "#6d87a3", 0.55),
-            view.line_trace(outline, "#3d5670", 6),
-            view.line_trace(tubes, view.segment_colors(LEG_NAMES[: mechanism.legs]), 14),
-            view.line_trace(rods, "#6b7683", 6),
-            view.line_trace(axes, view.segment_colors(AXIS_NAMES), 5),
-            view.plate_trace(view.coordinates(base[base_ring[:-1]]), FAINT, 0.35),
-            view.line_trace(view.coordinates(base[base_ring]), "#5c6873", 6),
-            view.line_trace(view.coordinates(path), FAINT, 2),
-            go.Scatter3d(
-                view.coordinates(numbers), mode="text", text=[str(k) for k in range(mechanism.legs)], hoverinfo="skip"
-            ),
+            *view.plate(rim, *view.PLATFORM),
+            view.line(tubes, view.segment_colors(LEG_NAMES[: mechanism.legs]), 14),
+            view.line(rods, "#6b7683", 6),
+            view.line(axes, view.segment_colors(AXIS_NAMES), 5),
+            *view.plate(base[view.ring(base)], *view.BASE),
+            view.line(path, FAINT, 2),
+            view.labels(numbers, [str(k) for k in range(mechanism.legs)]),
         ],
         frames=[frame(k) for k in range(count)],
     )
+    points = np.concatenate([numbers, joints.reshape(-1, 3), path])
     figure.update_layout(
         LAYOUT,
         **view.VIEW,
@@ -328,7 +306,9 @@ def _mechanism_view(result: SimulationResult) -> tuple[go.Figure, float]:
         scene=view.scene(points, mechanism.up_in_base, np.array([0.0, 0.0, 1.0]) if mechanism.planar else None),
         **_player(result.times[shown], frame_s),
     )
-    return figure, span / count / frame_s
+    speed = span / count / frame_s
+    pace = "in real time" if speed < 1.05 else f"at {speed:.2g} times real speed"
+    return f"{real} poses {pace}; the path of the origin in grey. Drag to turn, scroll to zoom.", figure
 
 
 def _player(times: Array, frame_s: float) -> dict[str, Any]:

@@ -11,7 +11,8 @@ from hil.reports.page import AXIS_NAMES, COLORS, FAINT
 from plant.pose import Array
 
 VIEW = {"margin": {"l": 0, "r": 0, "t": 0, "b": 10}, "showlegend": False}
-"""The look of a view."""
+PLATFORM, BASE = ("#6d87a3", 0.55, "#3d5670"), (FAINT, 0.35, "#5c6873")
+"""The look of a view, and of its plates."""
 
 
 def scene(points: Array, up: Array, front: Array | None = None) -> dict[str, Any]:
@@ -48,8 +49,8 @@ def ring(joints: Array) -> NDArray[np.intp]:
 
 
 def segments(starts: Array, ends: Array) -> Array:
-    """Points (3 n, 3) of n separate lines: start, end, gap."""
-    return np.stack([starts, ends, np.full_like(ends, np.nan)], axis=1).reshape(-1, 3)
+    """Points (3 n, d) of n separate lines: start, end, gap."""
+    return np.stack([starts, ends, np.full_like(ends, np.nan)], axis=1).reshape(-1, ends.shape[1])
 
 
 def segment_colors(names: Sequence[str]) -> list[str]:
@@ -62,12 +63,18 @@ def coordinates(points: Array) -> dict[str, Array]:
     return dict(zip(AXIS_NAMES, points.T.astype(np.float32), strict=True))
 
 
-def line_trace(points: dict[str, Array], color: str | list[str], width: float) -> go.Scatter3d:
-    """A line through `coordinates`."""
-    return go.Scatter3d(points, mode="lines", line={"color": color, "width": width}, hoverinfo="skip")
+def line(points: Array, color: str | list[str], width: float) -> go.Scatter3d:
+    """A line through points (n, 3)."""
+    return go.Scatter3d(coordinates(points), mode="lines", line={"color": color, "width": width}, hoverinfo="skip")
 
 
-def plate_trace(corners: dict[str, Array], color: str, opacity: float) -> go.Mesh3d:
-    """A plate with `coordinates` as its rim."""
-    fan = np.arange(1, len(corners["x"]) - 1)
-    return go.Mesh3d(corners, i=0 * fan, j=fan, k=fan + 1, color=color, opacity=opacity, flatshading=True, hoverinfo="skip")
+def plate(rim: Array, color: str, opacity: float, edge: str) -> tuple[go.Mesh3d, go.Scatter3d]:
+    """A plate within a closed rim (n, 3), and the line round it."""
+    fan = np.arange(1, len(rim) - 2)
+    look = {"color": color, "opacity": opacity, "flatshading": True, "hoverinfo": "skip"}
+    return go.Mesh3d(coordinates(rim[:-1]), i=0 * fan, j=fan, k=fan + 1, **look), line(rim, edge, 6)
+
+
+def labels(points: Array, texts: Sequence[str]) -> go.Scatter3d:
+    """Texts at points (n, 3)."""
+    return go.Scatter3d(coordinates(points), mode="text", text=texts, hoverinfo="skip")
