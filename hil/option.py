@@ -1,4 +1,4 @@
-"""Fields of configurations that are options of the command line, too: each says its help, unit and form once."""
+"""Fields of configurations that are options of the command line, too."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -11,33 +11,21 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Option:
-    """The form of an option.
+    """The form of an option."""
 
-    Attributes:
-        text: its help, without unit and default.
-        unit: of its number; mm and ms become the field's SI unit.
-        flag: such as "--set"; by default the field's name, with "--no-" before it if the field is True by default.
-        metavar: what stands for the value in the help.
-        choices: the possible values, if the parser checks them.
-        parse: makes the value from text, or raises an InputError; by default the type of the field's default.
-        several: whether the option can be given several times, for a tuple.
-        shown: the default in the help's words.
-        required: whether it must be given.
-    """
-
-    text: str
-    unit: str = ""
-    flag: str | None = None
-    metavar: str | None = None
-    choices: Sequence[Any] | None = None
-    parse: Callable[[str], Any] | None = None
-    several: bool = False
-    shown: str | None = None
-    required: bool = False
+    text: str  # its help, without unit and default
+    unit: str = ""  # of its number; mm and ms become the field's SI unit
+    flag: str | None = None  # by default the field's name, after "--no-" if the field is True by default
+    metavar: str | None = None  # what stands for the value in the help
+    choices: Sequence[Any] | None = None  # the possible values, if the parser checks them
+    parse: Callable[[str], Any] | None = None  # by default the type of the field's default
+    several: bool = False  # whether it can be given several times, for a tuple
+    shown: str | None = None  # the default in the help's words
+    required: bool = False  # whether it must be given
 
 
 def option(default: T, text: str, **form: Any) -> T:
-    """A dataclass field with this default in SI units, and its option with this help and the other attributes of `Option`."""
+    """A dataclass field with this default in SI units, and its option."""
     made: T = field(default=default, metadata={"option": Option(text, **form)})
     return made
 

@@ -1,12 +1,10 @@
-"""Benchmarks of the loop on the clock: wake-up lateness, beside cyclictest, and computing time, idle and under load.
+"""Benchmarks of the loop on the clock: how late it wakes and how long it computes, idle and under load.
 
-Short slices of three loops take turns on the same machine: ours, cyclictest, and a bare compiled loop that only computes, for
-as long as ours. Disturbances by the machine show in all three.
+Short slices of three loops take turns: ours, cyclictest, and a bare compiled loop that only computes, for as long as ours.
+Disturbances by the machine show in all three.
 """
 
-import contextlib
 import json
-import multiprocessing
 import os
 import shutil
 import signal
@@ -14,8 +12,9 @@ import subprocess
 import sys
 import tempfile
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -29,23 +28,22 @@ from hil.loop.timing import Timing, over_budget
 from hil.progress import Progress, no_progress
 from hil.realtime.clock import REAL, finish, new_clock, start, wait
 from hil.realtime.durations import Histogram
+from hil.realtime.processes import FORK
 from hil.realtime.scheduling import MEASURES, RealTimeSettings, real_time, usage
 from hil.runs.config import SimulationConfig
-from hil.runs.prepare import PreparedLoop, prepared_loop
+from hil.runs.prepare import prepared_loop
 from plant.compiled import Record, kernel
 from plant.errors import GoughError
 from plant.stopwatch import now
 
 IDLE, LOAD, BUSY = "idle", "load", "busy_supervisor"
-CONDITIONS = (IDLE, LOAD, BUSY)
-"""Nothing else runs; stress-ng on every processor; a busy Python thread in the supervising process."""
+CONDITIONS = {IDLE: 1.0, LOAD: 1.0, BUSY: 0.25}
+"""Shares of time: nothing else runs; stress-ng on every processor; a busy Python thread in the supervising process."""
 
 _SLICE_S = 2.0
 _BARE_SHARE = 0.25
-_BUSY_SHARE = 0.25
 _LONGEST_US = 20_000
 _ENDLESS = np.iinfo(np.int64).max
-_FORK = multiprocessing.get_context("fork")
 
 
 def measure_real_time(seconds: dict[float, float], progress: Progress = no_progress) -> dict[str, Any]:
@@ -64,27 +62,25 @@ def measure_real_time(seconds: dict[float, float], progress: Progress = no_progr
     missing = [name for name in ("cyclictest", "stress-ng") if shutil.which(name) is None]
     with real_time(settings) as refused:
         pass
-    conditions = [each for each in CONDITIONS if each != LOAD or "stress-ng" not in missing]
-    shares = {condition: _BUSY_SHARE if condition == BUSY else 1.0 for condition in conditions}
+    shares = {each: share for each, share in CONDITIONS.items() if each != LOAD or "stress-ng" not in missing}
     whole, done = sum(shares.values()) * sum(seconds.values()), 0.0
     rates: dict[str, Any] = {}
     for rate, duration in seconds.items():
         bench = _Bench(rate, settings, cyclictest="cyclictest" not in missing)
         rates[f"{rate:g}"] = {}
-        for condition in conditions:
-            pooled = _Pool()
-            slices = max(1, round(duration * shares[condition] / _SLICE_S))
+        for condition, share in shares.items():
+            pool = _Pool()
             with _circumstances(condition):
-                for _ in range(slices):
-                    bench.add_slice(pooled, busy=condition == BUSY)
+                for _ in range(max(1, round(duration * share / _SLICE_S))):
+                    bench.add_slice(pool, busy=condition == BUSY)
                     done += _SLICE_S
                     progress(min(done / whole, 1.0))
-            rates[f"{rate:g}"][condition] = pooled.figures()
+            rates[f"{rate:g}"][condition] = pool.figures()
     return {"rates": rates, "refused": refused, "missing": missing, "slice_s": _SLICE_S}
 
 
 def measure_measures(seconds: float, progress: Progress = no_progress) -> dict[str, Any]:
-    """The effect of each measure of `hil.realtime.scheduling`: the loop at 1 kHz with all, without each, and without any.
+    """The effect of each measure for real time: the loop at 1 kHz with all, without each, and without any.
 
     Returns:
         By the measure left out ("nothing" and "all" included) and condition: `wake_us` and `compute_us` with p50, p99, p999,
@@ -107,10 +103,9 @@ def measure_measures(seconds: float, progress: Progress = no_progress) -> dict[s
     return {
         case: {
             condition: {
-                "wake_us": pool.timing.histograms["wake"].figures(),
-                "compute_us": pool.timing.histograms["compute"].figures(),
-                "missed": sum(pool.missed.values()),
-                "minor_faults": pool.usage["minor_faults"],
+                **{f"{name}_us": pool.timing.histograms[name].figures() for name in ("wake", "compute")},
+                "missed": pool.counts["missed_own"] + pool.counts["missed_host"],
+                "minor_faults": pool.counts["minor_faults"],
             }
             for condition, pool in by_condition.items()
         }
@@ -119,34 +114,26 @@ def measure_measures(seconds: float, progress: Progress = no_progress) -> dict[s
 
 
 class _Pool:
-    """The measurements of all slices of one rate and condition."""
+    """The measurements of all slices of one rate and condition; `counts` has missed periods and the thread's usage."""
 
     def __init__(self) -> None:
-        self.timing, self.cyclictest = Timing(), Histogram()
-        self.bare, self.bare_wake = Histogram(), Histogram()
-        self.missed: dict[str, int] = {}
-        self.usage: dict[str, float] = {}
+        self.timing, self.counts = Timing(), Counter[str]()
+        self.cyclictest, self.bare, self.bare_wake = Histogram(), Histogram(), Histogram()
 
     def figures(self) -> dict[str, Any]:
-        timing = self.timing.figures()
-        over = over_budget(timing)
+        timing, counts = self.timing.figures(), dict(self.counts)
+        shown = {name: self.timing.histograms[name] for name in ("compute", "latency", "wake")}
+        shown |= {"cyclictest": self.cyclictest, "bare": self.bare}
         return {
-            "compute_us": timing.pop("compute"),
-            "latency_us": timing.pop("latency"),
-            "wake_us": timing.pop("wake"),
+            "over_budget": over_budget(timing),
+            **{f"{name}_us": timing.pop(name) for name in ("compute", "latency", "wake")},
             "cyclictest_us": self.cyclictest.figures() if self.cyclictest.longest else None,
             "bare_us": self.bare.figures(),
             "bare_wake_us": self.bare_wake.figures(),
             "stages_us": timing,
-            "over_budget": over,
-            "missed_own": self.missed["own"],
-            "missed_host": self.missed["host"],
-            "usage": self.usage,
-            "histograms": {
-                **{name: self.timing.histograms[name].bars() for name in ("compute", "latency", "wake")},
-                "cyclictest": self.cyclictest.bars(),
-                "bare": self.bare.bars(),
-            },
+            **{name: counts.pop(name) for name in ("missed_own", "missed_host")},
+            "usage": counts,
+            "histograms": {name: histogram.bars() for name, histogram in shown.items()},
         }
 
 
@@ -162,42 +149,29 @@ class _Bench:
 
     def add_slice(self, pool: _Pool, busy: bool, bare: bool = True) -> None:
         """Run our loop, cyclictest if wanted, and the bare loop, one after the other."""
-        with _busy_thread() if busy else contextlib.nullcontext():
-            count, missed, used = self._in_a_process(self._ours)
+        with _busy_thread() if busy else nullcontext():
+            count, counts = _in_a_process(self._ours)
         pool.timing.add(self._records[:count])
-        for total, new in ((pool.missed, missed), (pool.usage, used)):
-            for name, value in new.items():
-                total[name] = total.get(name, 0) + value
+        pool.counts.update(counts)
         if self._cyclictest:
             self._run_cyclictest(pool.cyclictest)
         if bare:
             work = round(1e3 * pool.timing.histograms["compute"].figures()["p50"])
-            durations: Record = self._in_a_process(self._bare, work)
+            durations: Record = _in_a_process(self._bare, work)
             pool.bare_wake.add(durations[:, 0])
             pool.bare.add(durations[:, 1])
 
-    def _in_a_process(self, target: Callable[..., Any], *arguments: Any) -> Any:
-        ours, theirs = _FORK.Pipe()
-        process = _FORK.Process(target=_send, args=(theirs, target, *arguments))
-        process.start()
-        theirs.close()
-        try:
-            result = ours.recv()
-        except EOFError:
-            raise GoughError("a loop's process has died in the benchmark") from None
-        process.join()
-        if isinstance(result, GoughError):
-            raise result
-        return result
-
-    def _ours(self) -> tuple[int, dict[str, int], dict[str, float]]:
+    def _ours(self) -> tuple[int, dict[str, Any]]:
         with prepared_loop(self._config, self._records) as loop:
             loop.clock, loop.most_missed = self._clock(), _ENDLESS
             with prevent_compilation(), real_time(self._settings):
                 before = usage()
-                status = loop.follow(loop.end)
+                cause = loop.follow(loop.end)
                 used = usage().since(before)
-            return _outcome(loop, status, used)
+            if Cause(cause).reaction != Reaction.STOP:
+                raise GoughError(f"the loop stopped in the benchmark: {loop.reason()}")
+            own, late, host = (int(loop.clock[f"missed_{by}"]) for by in ("own", "late", "host"))
+            return int(loop.link[Link.HEAD]), {"missed_own": own, "missed_host": late + host, **used}
 
     def _bare(self, work_ns: int) -> NDArray[np.int64]:
         durations = np.zeros((round(_BARE_SHARE * _SLICE_S * self._config.rate), 2), np.int64)
@@ -235,25 +209,33 @@ class _Bench:
 
 
 def durations_of(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Durations [ns] for counts by whole microseconds, rounded down as by cyclictest: spread evenly over each microsecond."""
+    """Durations [ns] for counts by whole microseconds, as by cyclictest, spread evenly over each."""
     parts = [1000 * us + 1000 * np.arange(count) // count for us, count in enumerate(counts.tolist()) if count]
     return np.concatenate(parts) if parts else np.zeros(0, np.int64)
 
 
-def _send(pipe: Any, target: Callable[..., Any], *arguments: Any) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _in_a_process(target: Callable[..., Any], *arguments: Any) -> Any:
+    """What a function returns in a process of its own, which shares the memory of this one."""
+
+    def send() -> None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        try:
+            theirs.send(target(*arguments))
+        except GoughError as error:
+            theirs.send(error)
+
+    ours, theirs = FORK.Pipe()
+    process = FORK.Process(target=send)
+    process.start()
+    theirs.close()
     try:
-        pipe.send(target(*arguments))
-    except GoughError as error:
-        pipe.send(error)
-
-
-def _outcome(loop: PreparedLoop, cause: int, used: dict[str, float]) -> tuple[int, dict[str, int], dict[str, float]]:
-    if Cause(cause).reaction != Reaction.STOP:
-        raise GoughError(f"the loop stopped in the benchmark: {loop.reason()}")
-    clock = loop.clock
-    missed = {"own": int(clock["missed_own"]), "host": int(clock["missed_late"] + clock["missed_host"])}
-    return int(loop.link[Link.HEAD]), missed, used
+        result = ours.recv()
+    except EOFError:
+        raise GoughError("a loop's process has died in the benchmark") from None
+    process.join()
+    if isinstance(result, GoughError):
+        raise result
+    return result
 
 
 @kernel
@@ -359,14 +341,13 @@ def gross_excess(figures: dict[str, Any]) -> list[str]:
     found = []
     for rate, conditions in figures["rates"].items():
         for condition, measured in conditions.items():
-            where = f"{rate} Hz, {condition}"
-            if measured["missed_own"]:
-                found.append(f"{where}: {measured['missed_own']} periods missed by our own work")
-            if not figures["refused"] and measured["usage"]["major_faults"]:
-                found.append(f"{where}: {measured['usage']['major_faults']:g} major page faults in the loop")
-            if condition == IDLE and measured["compute_us"]["p50"] > 100.0:
-                found.append(f"{where}: computing takes {measured['compute_us']['p50']:.0f} us")
-            slow = measured["compute_us"]["p50"] / max(measured["bare_us"]["p50"], 1.0)
-            if slow > 10.0:
-                found.append(f"{where}: computing takes {slow:.0f} times as long as a bare loop of the same work")
+            compute, faults = measured["compute_us"]["p50"], measured["usage"]["major_faults"]
+            slow = compute / max(measured["bare_us"]["p50"], 1.0)
+            checks = (
+                (measured["missed_own"], f"{measured['missed_own']} periods missed by our own work"),
+                (not figures["refused"] and faults, f"{faults:g} major page faults in the loop"),
+                (condition == IDLE and compute > 100.0, f"computing takes {compute:.0f} us"),
+                (slow > 10.0, f"computing takes {slow:.0f} times as long as a bare loop of the same work"),
+            )
+            found += [f"{rate} Hz, {condition}: {text}" for exceeded, text in checks if exceeded]
     return found

@@ -24,19 +24,19 @@ _BATCH_ROWS = 100_000
 _MOTION_S = 10.0
 _COLD_STARTS = 1000
 _WIDE_TILT = np.radians(60.0)
-_SAME_POSE_M, _SAME_POSE = 1e-6, 1e-6
+_SAME_POSE = 1e-6, 1e-6
+"""Within this distance [m] and angle [rad], two poses are the same."""
 
 
 def measure_kinematics(progress: Progress = no_progress) -> dict[str, Any]:
     """Time direct kinematics and try it from cold.
 
     Returns:
-        `solve_us`: by class and method, microseconds per pose on one core, compiled: `closed_form`, and `refined` with its
-        covariance. `call_us`: one call of `solve` from Python. `batch_per_s`: poses per second on all cores. `newton`:
-        microseconds per pose of Newton's method from lengths along a motion at 1 kHz, and the time of each method over it on
-        the same mechanism. `cold_starts`: by preset, over the `workspace` and over `wide` poses (60 deg of tilt, any yaw),
-        the shares of poses found (`success`) and mistaken (`wrong`), by Newton's method from home and by direct kinematics
-        from the leg directions.
+        `solve_us`: by class and method, per pose on one core, compiled: `closed_form`, and `refined` with its covariance.
+        `call_us`: one call of `solve` from Python. `batch_per_s`: poses per second on all cores. `newton`: `warm_us` per
+        pose by Newton's method from lengths along a motion at 1 kHz, and the `ratios` of each method to it. `cold_starts`:
+        by preset, over the `workspace` and over `wide` poses (60 deg of tilt, any yaw), the shares of poses found
+        (`success`) and mistaken (`wrong`), by Newton's method from home and from the leg directions.
     """
     classes = spatial_classes()
     steps = len(classes) + len(PRESETS) + 2
@@ -153,11 +153,8 @@ def _start_cold(mechanism: Mechanism, random: np.random.Generator) -> dict[str, 
     return figures
 
 
-def _score(found: Sequence[Any], truth: Sequence[Pose]) -> dict[str, float]:
-    right = wrong = 0
-    for pose, true_pose in zip(found, truth, strict=True):
-        if pose is not None:
-            distance, angle = pose_difference(pose, true_pose)
-            right += distance < _SAME_POSE_M and angle < _SAME_POSE
-            wrong += not (distance < _SAME_POSE_M and angle < _SAME_POSE)
-    return {"success": right / len(truth), "wrong": wrong / len(truth)}
+def _score(found: Sequence[Pose | None], truth: Sequence[Pose]) -> dict[str, float]:
+    pairs = [(pose, true_pose) for pose, true_pose in zip(found, truth, strict=True) if pose is not None]
+    differences = np.array([pose_difference(*pair) for pair in pairs]).reshape(-1, 2)
+    right = int((differences < _SAME_POSE).all(axis=1).sum())
+    return {"success": right / len(truth), "wrong": (len(pairs) - right) / len(truth)}

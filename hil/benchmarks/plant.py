@@ -1,5 +1,6 @@
-"""Benchmark of the plant: the cost of a step through compiled calls and through FMPy's methods, and its exactness."""
+"""Benchmark of the plant: the cost of a step by compiled calls and by FMPy's methods, and its exactness."""
 
+from contextlib import closing
 from time import perf_counter_ns
 from typing import Any
 
@@ -34,10 +35,9 @@ def measure_plant(duration: float, progress: Progress = no_progress) -> dict[str
     """Drive the plant of the hexapod with sines of all legs, for this duration [s].
 
     Returns:
-        `step_us`: of a 1 ms step from compiled code, by FMI's version; `calls_us`: of each call of a cycle (FMI 3.0), where the
-        first and the last only copy numbers; `cycle_us` and `fmpy_us`: medians of all calls, from compiled code and through
-        FMPy's methods; `fmpy_slowdown`: their ratio; `error_m`: greatest distance from the positions with shorter substeps;
-        `substep` [s].
+        `step_us`: of a 1 ms step from compiled code, by FMI's version. `calls_us`: of each call of a cycle (FMI 3.0).
+        `cycle_us` and `fmpy_us`: medians of all calls, from compiled code and through FMPy's methods; `fmpy_slowdown`: their
+        ratio. `error_m`: greatest distance from the positions with shorter substeps. `substep` [s].
     """
     commands = _commands(duration)
     parameters = load_spatial("hexapod").plant_parameters()
@@ -66,7 +66,7 @@ def measure_plant(duration: float, progress: Progress = no_progress) -> dict[str
 
 
 def _commands(duration: float) -> Array:
-    """Velocity commands (n, 6) [m/s], a row a cycle."""
+    """Velocity commands (n, 6) [m/s]."""
     times = PERIOD_S * np.arange(round(duration / PERIOD_S))[:, None]
     legs = np.arange(6)
     commands: Array = 0.06 * np.sin(2.0 * np.pi * (0.4 + 0.07 * legs) * times + legs)
@@ -76,9 +76,9 @@ def _commands(duration: float) -> Array:
 def _drive(plant: FmuPlant, commands: Array) -> tuple[Array, Array]:
     """Durations of the parts [ns], means over blocks of cycles (m, 4), and positions (n, 3) [m]."""
     durations, positions = np.zeros((len(commands), len(_PARTS)), np.int64), np.zeros((len(commands), 3))
-    if write_drive_mode(plant.handle, BRAKE) != 0 or any(advance(plant.handle, PERIOD_S) for _ in range(_BRAKED_CYCLES)):
-        raise plant.failure()
-    if _run(plant.handle, commands, durations, positions, np.zeros(2, np.int64)):
+    fmu = plant.handle
+    failed = write_drive_mode(fmu, BRAKE) or any(advance(fmu, PERIOD_S) for _ in range(_BRAKED_CYCLES))
+    if failed or _run(fmu, commands, durations, positions, np.zeros(2, np.int64)):
         raise plant.failure()
     whole = len(commands) // _BLOCK * _BLOCK
     return durations[:whole].reshape(-1, _BLOCK, len(_PARTS)).mean(axis=1), positions
@@ -106,28 +106,24 @@ def _run(fmu: Record, commands: Array, durations: NDArray[np.int64], positions: 
 def _drive_with_fmpy(commands: Array) -> float:
     """Median duration of a cycle [us] through FMPy's own methods."""
     description = FmuDescription(default_fmu())
-    instance = FmuInstance(description)
-    try:
+    groups = []
+    for names in (
+        ("imu_angular_velocity", "imu_specific_force", "imu_magnetic_field"),
+        ("position", "quaternion", "leg_length", "current"),
+    ):
+        variables = [description[name] for name in names]
+        groups.append(([each.references[0] for each in variables], sum(each.size for each in variables)))
+    drive_mode, velocity_command = (description[name].references[:1] for name in ("drive_mode", "velocity_command"))
+    took = []
+    with closing(FmuInstance(description)) as instance:
         instance.initialize()
         fmu = instance.fmu
-        reference = {name: description[name].references[0] for name in ("velocity_command", "drive_mode")}
-        imus, truth = (
-            [description[name] for name in names]
-            for names in (
-                ("imu_angular_velocity", "imu_specific_force", "imu_magnetic_field"),
-                ("position", "quaternion", "leg_length", "current"),
-            )
-        )
-        groups = [([v.references[0] for v in group], sum(v.size for v in group)) for group in (imus, truth)]
-        took = []
         for i, command in enumerate(commands.tolist()):
             began = perf_counter_ns()
-            fmu.setInt64([reference["drive_mode"]], [VELOCITY] * 6)
-            fmu.setFloat64([reference["velocity_command"]], command)
+            fmu.setInt64(drive_mode, [VELOCITY] * 6)
+            fmu.setFloat64(velocity_command, command)
             fmu.doStep(currentCommunicationPoint=PERIOD_S * i, communicationStepSize=PERIOD_S)
             for references, size in groups:
                 fmu.getFloat64(references, nValues=size)
             took.append(perf_counter_ns() - began)
-    finally:
-        instance.close()
     return float(np.median(took)) / 1e3
