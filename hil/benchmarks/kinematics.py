@@ -153,7 +153,7 @@ def _start_cold(mechanism: Mechanism, random: np.random.Generator) -> dict[str, 
     return figures
 
 
-def _score(found: Sequence[Pose | None], truth: Sequence[Pose]) -> dict[str, float]:
+def _score(found: Sequence[Any], truth: Sequence[Pose]) -> dict[str, float]:
     pairs = [(pose, true_pose) for pose, true_pose in zip(found, truth, strict=True) if pose is not None]
     differences = np.array([pose_difference(*pair) for pair in pairs]).reshape(-1, 2)
     right = int((differences < _SAME_POSE).all(axis=1).sum())

@@ -250,7 +250,8 @@ def _extremes(values: Array, points: int = _POINTS) -> NDArray[np.intp]:
 
 def _differences(poses: Sequence[Array], origins: Sequence[Array]) -> Array:
     """Translations [mm] and rotation vectors [deg] (N, 6) from the poses `origins` to `poses`, in {1}."""
-    return pose_errors(*poses, *origins) * np.repeat([1e3, np.degrees(1.0)], 3)
+    errors: Array = pose_errors(*poses, *origins) * np.repeat([1e3, np.degrees(1.0)], 3)
+    return errors
 
 
 def _mechanism_view(result: SimulationResult) -> tuple[str, go.Figure]:
