@@ -8,6 +8,7 @@ from controller.direct_kinematics.geometry import geometry_of
 from controller.estimation.pose_estimator import PARAMETERS, STATE, WORST_CONDITIONING, find_pose
 from controller.inverse_kinematics import sample_workspace
 from controller.rig import RIG, field_of
+from plant.compiled import filled
 from plant.errors import InputError
 from plant.mechanism import LEGS, Mechanism, six_rows
 from plant.wiring import ALL_IMUS, PLATFORM_IMU
@@ -68,9 +69,8 @@ def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool =
             "cannot tell apart: add the platform's IMU (6), whose roll does"
         )
     positions, rotations = sample_workspace(mechanism, 50, seed=0)
-    rig, parameters, pose = np.zeros((), RIG), np.zeros((), PARAMETERS), np.zeros((), STATE)
-    rig["geometry"], rig["vectors_in_base"], rig["planar"] = geometry_of(mechanism), field.vectors, mechanism.planar
-    parameters["section_5"] = section_5
+    rig = filled(RIG, geometry=geometry_of(mechanism), vectors_in_base=field.vectors, planar=mechanism.planar)
+    parameters, pose = filled(PARAMETERS, section_5=section_5), np.zeros((), STATE)
     leg_used = np.array([float(leg in imus_of(mechanism, imus)) for leg in range(LEGS)])
     worst = np.inf
     for position, rotation in zip(positions, rotations, strict=True):

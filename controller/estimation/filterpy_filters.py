@@ -45,9 +45,16 @@ class FilterpyLeg(_Filterpy):
     """
 
     def __init__(
-        self, up_in_joint: Array, imu_position: Array, gravity: float, period: float, jerk: float, bias_walk: float,
-        rate_variance: float, force_variance: float,
-    ) -> None:  # fmt: skip
+        self,
+        up_in_joint: Array,
+        imu_position: Array,
+        gravity: float,
+        period: float,
+        jerk: float,
+        bias_walk: float,
+        rate_variance: float,
+        force_variance: float,
+    ) -> None:
         super().__init__(dim_x=STATES, dim_z=6)
         self.up_in_joint, self.imu_position, self.gravity = up_in_joint, imu_position, gravity
         t = period

@@ -71,6 +71,9 @@ def look_at_next(p: Record, m: Record, pose: Record, measured: Array, leg_weight
     k = m.looked_at = (m.looked_at + 1) % IMU_COUNT
     platform, leg = k == PLATFORM_IMU, min(k, LEGS - 1)
     weight = pose.vector_weights[0] if platform else leg_weights[leg]
+    if not weight > 0.0:
+        reset(m, k)
+        return
     direction = rotate(pose.rotation, vector(pose.vectors[0])) if platform else vector(pose.directions[leg])
     known = vector(vertical_in_base) if platform else vector(measured[leg])
     first, second = _across(direction)
@@ -94,7 +97,7 @@ def look_at_next(p: Record, m: Record, pose: Record, measured: Array, leg_weight
     least = 0.5 * (s00 + s11) - np.sqrt(0.25 * (s00 - s11) ** 2 + s01 * s01)
     off = subtract(known, direction)
     r0, r1 = dot(first, off), dot(second, off)
-    if not (weight > 0.0 and least > _LEAST_SHARE and np.isfinite(r0 + r1)):
+    if not (least > _LEAST_SHARE and np.isfinite(r0 + r1)):
         reset(m, k)
         return
     determinant = s00 * s11 - s01 * s01

@@ -249,10 +249,8 @@ def update_leg(
         variance = rate_variance if rate else force_variance
         for i in range(STATES):
             if rate:
-                total = jacobian[m, 1] * covariance[1, i]
-                for j in range(2, 4):
-                    total += jacobian[m, j] * covariance[j, i]
-                gain[i] = total + covariance[6 + m, i]
+                total = jacobian[m, 1] * covariance[1, i] + jacobian[m, 2] * covariance[2, i]
+                gain[i] = total + jacobian[m, 3] * covariance[3, i] + covariance[6 + m, i]
             else:
                 total = jacobian[m, 0] * covariance[0, i]
                 for j in range(1, 6):

@@ -74,9 +74,8 @@ def plan(mechanism: Mechanism, target: Target, duration: float) -> Reference:
 
 def count_violations(segments: Array, horizon: float, limits: Limits) -> int:
     """How many segments before `horizon` [s] leave the stroke, or the limits of velocity, acceleration or jerk."""
-    return int(
-        _count_violations(segments, horizon, limits.stroke, np.array([limits.velocity, limits.acceleration, limits.jerk]))
-    )
+    most = np.array([limits.velocity, limits.acceleration, limits.jerk])
+    return int(_count_violations(segments, horizon, limits.stroke, most))
 
 
 class _Planner:
@@ -269,12 +268,10 @@ def _stops_inside(state: Array, stroke: Array, limits: Array) -> bool:
     """Whether every leg, from its state (3, legs), can stop within the stroke (legs, 2) and the limits of acceleration and
     jerk.
     """
-    acceleration_limit, jerk_limit = limits[0], limits[1]
     for k in range(state.shape[1]):
         p, now = state[0, k], (0.0, state[1, k], state[2, k])
-        stop_jerk, down, stay, up = stop_phases(now[1], now[2], acceleration_limit, jerk_limit)
         least = greatest = 0.0
-        for jerk, duration in ((stop_jerk, down), (0.0, stay), (-stop_jerk, up)):
+        for jerk, duration in stop_phases(now[1], now[2], limits[0], limits[1]):
             low, high, _ = _segment_extrema(now, jerk, duration)
             least, greatest = min(least, low), max(greatest, high)
             now = state_after(now, jerk, duration)

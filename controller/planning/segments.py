@@ -47,13 +47,13 @@ def evaluate_reference(segments: Array, time: float, index: Array, reference: Ar
         reference[k, 0], reference[k, 1], reference[k, 2] = state_after(state, segment[JERK], time - segment[START])
 
 
+Phase = tuple[float, float]
+"""A jerk [m/s^3] and its duration [s]."""
+
+
 @kernel
-def stop_phases(
-    rate: float, acceleration: float, most_acceleration: float, most_jerk: float
-) -> tuple[float, float, float, float]:
-    """The fastest way to rest within the limits of acceleration and jerk: a jerk, its duration, the duration without jerk, and
-    the duration of the opposite jerk.
-    """
+def stop_phases(rate: float, acceleration: float, most_acceleration: float, most_jerk: float) -> tuple[Phase, Phase, Phase]:
+    """The fastest way to rest within the limits of acceleration and jerk: a jerk, none, and the opposite one."""
     sign = 1.0 if rate + acceleration * abs(acceleration) / (2.0 * most_jerk) >= 0.0 else -1.0
     # In the direction in which the actuator would go on: jerk down to -peak, stay there, jerk back up.
     v, a = sign * rate, sign * acceleration
@@ -62,7 +62,8 @@ def stop_phases(
     if peak > most_acceleration:
         peak = most_acceleration
         stay = max((v + a * a / (2.0 * most_jerk) - peak * peak / most_jerk) / peak, 0.0)
-    return -sign * most_jerk, max((a + peak) / most_jerk, 0.0), stay, peak / most_jerk
+    jerk = -sign * most_jerk
+    return (jerk, max((a + peak) / most_jerk, 0.0)), (0.0, stay), (-jerk, peak / most_jerk)
 
 
 @kernel
@@ -71,9 +72,8 @@ def plan_stop(reference: Array, most_acceleration: float, most_jerk: float, segm
     longest = 0.0
     for k in range(LEGS):
         state = reference[k, 0], reference[k, 1], reference[k, 2]
-        jerk, down, stay, up = stop_phases(state[1], state[2], most_acceleration, most_jerk)
         at = 0.0
-        for i, (j, t) in enumerate(((jerk, down), (0.0, stay), (-jerk, up))):
+        for i, (j, t) in enumerate(stop_phases(state[1], state[2], most_acceleration, most_jerk)):
             write_segment(segments[k, i], at, state, j)
             state = state_after(state, j, t)
             at += t

@@ -78,6 +78,9 @@ class StreamPlanner:
         mechanism: with home and limits.
         lengths: (6,) [m], at which the legs rest when the motion begins.
 
+    Attributes:
+        current: the plan that is followed.
+
     Raises:
         UnreachableError: the motion begins outside the stroke.
         InputError: the mechanism has no home or no limits.
@@ -86,21 +89,16 @@ class StreamPlanner:
     def __init__(self, mechanism: Mechanism, lengths: Array) -> None:
         self._mechanism, self._home, self._limits = mechanism, mechanism.require_home(), mechanism.require_limits()
         mechanism.check_lengths(lengths, "the start of the stream")
-        self._now = Plan(0.0, rest(lengths, PLAN_SEGMENTS), None)
+        self.current = Plan(0.0, rest(lengths, PLAN_SEGMENTS), None)
         self._samples: deque[tuple[float, Array]] = deque(maxlen=_MOST_SAMPLES)
         self._otg = Ruckig(LEGS)
         self._trajectory = Trajectory(LEGS)
         self._follow = ruckig_input(self._limits, ControlInterface.Position, None)
         # Loads the machine code now: between samples there is not enough time.
         state = np.empty((LEGS, 3))
-        evaluate_reference(self._now.segments, 0.0, np.zeros(LEGS, np.int64), state)
+        evaluate_reference(self.current.segments, 0.0, np.zeros(LEGS, np.int64), state)
         self._plan_towards(0.0, state, lengths, None, PREVIEW_S)
         rotation_from_quaternion(np.array([1.0, 0.0, 0.0, 0.0]))
-
-    @property
-    def current(self) -> Plan:
-        """The plan that is followed."""
-        return self._now
 
     def add(self, time_s: float, displacement: ArrayLike, quaternion: ArrayLike) -> None:
         """Add a sample.
@@ -150,18 +148,18 @@ class StreamPlanner:
         Raises:
             InputError: the plan would begin before the current one, or there is no sample.
         """
-        if not at_s >= self._now.begin:
+        if not at_s >= self.current.begin:
             raise InputError(
-                f"a plan from {at_s:g} s on would begin before the current plan, at {self._now.begin:g} s: plan for later"
+                f"a plan from {at_s:g} s on would begin before the current plan, at {self.current.begin:g} s: plan for later"
             )
         if not self._samples:
             raise InputError("there is no sample to plan for: add one first")
         state = np.empty((LEGS, 3))
-        evaluate_reference(self._now.segments, at_s, np.zeros(LEGS, np.int64), state)
+        evaluate_reference(self.current.segments, at_s, np.zeros(LEGS, np.int64), state)
         motion = self._fit()
         if not motion[1:].any():
             goal = motion[0]
-            if self._now.goal is not None and np.abs(goal - self._now.goal).max() < _STILL_M:
+            if self.current.goal is not None and np.abs(goal - self.current.goal).max() < _STILL_M:
                 return None
             return self._plan_towards(at_s, state, goal, None, PREVIEW_S)
         for preview in _PREVIEWS_S:
@@ -174,7 +172,7 @@ class StreamPlanner:
 
     def follow(self, plan: Plan) -> None:
         """Follow a plan from its begin on; the next plan comes after it."""
-        self._now = plan
+        self.current = plan
 
     def _fit(self) -> Array:
         """The target's motion (m, 6) by powers of the time since its newest sample; one row if it stands still."""
@@ -252,10 +250,10 @@ def _write_plan(
             if after > at:
                 write_segment(segments[leg, row], at, now, j)
                 row, now, at = row + 1, state_after(now, j, after - at), after
-        jerk, down, stay, up = stop_phases(now[1], now[2], limits[0], limits[1])
-        starts = 0.0, down, down + stay, down + stay + up
-        for k, j in enumerate((jerk, 0.0, -jerk)):
-            after = at + (starts[k + 1] - starts[k])
+        before = 0.0
+        for j, t in stop_phases(now[1], now[2], limits[0], limits[1]):
+            after = at + ((before + t) - before)
+            before += t
             if after > at:
                 write_segment(segments[leg, row], at, now, j)
                 row, now, at = row + 1, state_after(now, j, after - at), after

@@ -131,12 +131,7 @@ def step_filter(p: Record, geometry: Record, f: Record) -> None:
         return
     f.update_step += 1
     whole = _PREPARING_ROWS + ROWS
-    last = min(max(-(-whole * f.update_step // p.window) - _PREPARING_ROWS, 0), ROWS)
-    while f.row < last:
-        _update_scalar(p, f, f.row)
-        f.row += 1
-    if f.row == ROWS:
-        _end_update(p, f)
+    _update_rows(p, f, min(max(-(-whole * f.update_step // p.window) - _PREPARING_ROWS, 0), ROWS))
 
 
 @kernel
@@ -144,10 +139,7 @@ def _begin_update(p: Record, geometry: Record, f: Record) -> None:
     """Begin an update with the samples of a full window: predict, take the heading, and predict the readings."""
     if f.row >= 0:
         # The windows have overtaken the update, which happens when cycles are missed.
-        while f.row < ROWS:
-            _update_scalar(p, f, f.row)
-            f.row += 1
-        _end_update(p, f)
+        _update_rows(p, f, ROWS)
     time = f.sum_time / f.collected
     for k in range(IMU_COUNT):
         f.sample_used[k] = f.samples[k]
@@ -222,6 +214,16 @@ def _predict(p: Record, f: Record, period: float) -> None:
             mean = 0.5 * (c[i, j] + c[j, i])
             c[i, j] = mean
             c[j, i] = mean
+
+
+@kernel
+def _update_rows(p: Record, f: Record, last: int) -> None:
+    """Take the scalars of the sample up to row `last`; the update ends with the last of all."""
+    while f.row < last:
+        _update_scalar(p, f, f.row)
+        f.row += 1
+    if f.row == ROWS:
+        _end_update(p, f)
 
 
 @kernel

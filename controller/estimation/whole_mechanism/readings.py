@@ -54,9 +54,9 @@ def _joint_angles(x: Vector, y: Vector, z: Vector, angles: Array, gradient: Arra
     root1 = hh[1] / (2.0 * root)
     h = root, root1, (hh[2] - 2.0 * root1 * root1) / (2.0 * root)
     ss = hh[0] + x[0] * x[0], hh[1] + 2.0 * x[0] * x[1], hh[2] + 2.0 * (x[1] * x[1] + x[0] * x[2])
-    u, c = _inverse(hh), _product(_negative(x), _inverse(_product(h, ss)))
+    u, c = _inverse(hh), _product(scale(-1.0, x), _inverse(_product(h, ss)))
     # Gradient of a is (0, -z, y) / h^2, of b (h^2, -x y, -x z) / (h ss).
-    ay, az = _product(_negative(z), u), _product(y, u)
+    ay, az = _product(scale(-1.0, z), u), _product(y, u)
     bx, by, bz = _product(h, _inverse(ss)), _product(c, y), _product(c, z)
     for n in range(3):
         gradient[n, 0, 1], gradient[n, 0, 2] = ay[n], az[n]
@@ -65,11 +65,6 @@ def _joint_angles(x: Vector, y: Vector, z: Vector, angles: Array, gradient: Arra
     angles[2], angles[3] = ay[0] * y[1] + az[0] * z[1], bx[0] * x[1] + by[0] * y[1] + bz[0] * z[1]
     angles[4] = ay[1] * y[1] + az[1] * z[1] + ay[0] * y[2] + az[0] * z[2]
     angles[5] = bx[1] * x[1] + by[1] * y[1] + bz[1] * z[1] + bx[0] * x[2] + by[0] * y[2] + bz[0] * z[2]
-
-
-@kernel
-def _negative(x: Vector) -> Vector:
-    return -x[0], -x[1], -x[2]
 
 
 @kernel
