@@ -67,16 +67,11 @@ def tilt_rotation(tilt: ArrayLike) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class MagneticField:
-    """The magnetic field of the earth at a mechanism.
+    """The magnetic field of the earth at a mechanism."""
 
-    Attributes:
-        vectors: (2, 3), the vertical and the field's horizontal direction, as unit vectors in {1}.
-        horizontal, vertical: its components, the second positive upwards [uT].
-    """
-
-    vectors: Array
-    horizontal: float
-    vertical: float
+    vectors: Array  # (2, 3), the vertical and the field's horizontal direction, unit, in {1}
+    horizontal: float  # [uT]
+    vertical: float  # positive upwards [uT]
 
     @property
     def strength(self) -> float:

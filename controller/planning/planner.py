@@ -41,15 +41,10 @@ _PHASES = 9
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """A planned motion.
+    """A planned motion. Rows of legs that a mechanism lacks rest at 0."""
 
-    Attributes:
-        segments: (6, n, 5), as `controller.planning.segments` evaluates them; rows of legs that a mechanism lacks rest at 0.
-        violations: how many segments leave a limit; the planner should make none.
-    """
-
-    segments: Array
-    violations: int
+    segments: Array  # (6, n, 5), as `controller.planning.segments` evaluates them
+    violations: int  # how many segments leave a limit; the planner should make none
 
 
 def plan(mechanism: Mechanism, target: Target, duration: float) -> Reference:

@@ -58,17 +58,11 @@ class TargetRefusedError(GoughError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A plan.
+    """A plan, in motion time."""
 
-    Attributes:
-        begin: motion time at which it takes over from the previous plan [s].
-        segments: (6, 24, 5), as `controller.planning.segments` has them, in motion time.
-        goal: (6,) [m], the lengths at which it ends if the target stands still there; else None.
-    """
-
-    begin: float
-    segments: Array
-    goal: Array | None
+    begin: float  # when it takes over from the previous plan [s]
+    segments: Array  # (6, 24, 5), as `controller.planning.segments` has them
+    goal: Array | None  # (6,) [m], the lengths at which it ends if the target stands still there
 
 
 class StreamPlanner:

@@ -20,21 +20,13 @@ _IN_PLANE_M, _IN_PLANE_RAD = 1e-9, 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Poses to be reached at given times.
+    """Poses to be reached at given times."""
 
-    Attributes:
-        name: for messages and reports.
-        times: (N,) [s], increasing from 0.
-        positions: (N, 3) [m], origin of {2} in {1}.
-        rotations: (N, 3, 3), map {2} to {1}.
-        held: whether each pose is held until the time of the next one. Otherwise the platform passes through it.
-    """
-
-    name: str
-    times: Array
-    positions: Array
-    rotations: Array
-    held: bool = False
+    name: str  # for messages and reports
+    times: Array  # (N,) [s], increasing from 0
+    positions: Array  # (N, 3) [m], origin of {2} in {1}
+    rotations: Array  # (N, 3, 3), map {2} to {1}
+    held: bool = False  # whether each pose is held until the time of the next one; else the platform passes through it
 
     @property
     def start(self) -> Pose:
