@@ -7,7 +7,7 @@ The cycle allocates nothing, raises nothing and knows no clock: time is counted 
 owns its constants and its state; `PARAMETERS` and `STATE` compose them, and a copy of the state is a snapshot.
 
 In the kernels of a stage, `p` and `s` are its own constants and state, `rig` and `time` are records of `RIG` and `TIME`, and
-the states of other stages have their names in `STATE`. A kernel that takes `parameters` and `state` gets those of the whole
+the states of other stages have their names in `STATE`. Only the entry points here take `parameters` and `state` of the whole
 cycle.
 
 A planar mechanism goes through the same cycle in the first three rows of all that is kept by leg. Its leg filters, direct
@@ -31,7 +31,7 @@ from controller.least_squares import RANK_TOLERANCE
 from controller.rig import RIG, TIME, elapsed, field_of, rig_parameters
 from controller.safety import arming, watch
 from controller.safety.causes import Cause, Mode, Request
-from controller.safety.stop import ramp_down, react
+from controller.safety.stop import handle_cause, ramp_down
 from controller.settings import ControlSettings, FusionSettings, SafetySettings
 from plant.checks import check_rate
 from plant.compiled import Record, filled, kernel, record_dtype
@@ -170,7 +170,7 @@ def run_stages(
     p, s, m = parameters[()], state[()], marks
     rig, time = p.rig, s.time
     if s.safety.mode == Mode.FAULT:
-        ramp_down(parameters, state)
+        ramp_down(p.safety.stop, rig, time, s.pid)
         return Cause.NONE.value
     t = now(m.timespec)
     if first <= CycleStage.SCREENING < last:
@@ -198,7 +198,7 @@ def run_stages(
             imu_monitor.look_at_next(
                 p.safety.monitor, s.safety.monitor, s.pose, s.legs.directions, s.legs.weights, rig.vectors_in_base[0]
             )
-            watch.exclude_imu(parameters, state)
+            watch.exclude_imu(p.safety, s.safety, rig, time, s.imus, p.legs.weight, s.reference, s.pid)
         t = _mark(m, CycleStage.REFINEMENT, t)
     if first <= CycleStage.MECHANISM < last:
         s.pose.found = trust.step_mechanism_filter(p.mechanism, s.mechanism, rig, time, s.imus, s.legs, s.heading, s.pose)
@@ -232,22 +232,25 @@ def _control(parameters: Record, state: Record, segments: Array) -> int:
         reference.update_reference(s.reference, rig, time, s.safety, segments)
     for k in range(rig.legs):
         s.pid.error[k] = s.reference.motion[k, 0] - pose.lengths[k]
-    arming.run_arming_checks(parameters, state)
+    arming.run_arming_checks(p.safety, s.safety, rig, time, p.imus, s.imus, pose, s.reference, s.pid)
     if s.safety.request != Request.ENABLED or s.safety.mode < Mode.RUNNING:
         pid.hold_still(s.pid, rig.legs)
     else:
         load_feed_forward.find_feed_forward(p.load, s.load, rig, pose, s.reference)
         pid.step_pid(p.pid, s.pid, s.load.feed_forward, elapsed(rig, time))
     time.cycle += 1
-    return watch.check_limits(parameters, state)
+    return watch.check_limits(
+        p.safety, s.safety, rig, time, p.imus, s.imus, pose, s.mechanism.trusted, s.reference, p.pid.limit, s.pid
+    )
 
 
 @kernel
 def _lose_pose(parameters: Record, state: Record) -> int:
     """The rest of a cycle without a pose, which is a fault unless nothing has been armed; returns its cause."""
-    if not arming.postpones_arming(parameters, state, Cause.POSE_LOST):
+    p, s = parameters[()], state[()]
+    if not arming.postpones_arming(p.safety, s.safety, p.rig, s.time, Cause.POSE_LOST):
         react(parameters, state, Cause.POSE_LOST, -1, np.nan, np.nan)
-    state[()].time.cycle += 1
+    s.time.cycle += 1
     return Cause.POSE_LOST.value
 
 
@@ -257,6 +260,20 @@ def skip_periods(state: Record, missed: int) -> None:
     time = state[()].time
     time.missed = missed
     time.cycle += missed
+
+
+@kernel
+def hear_rig(parameters: Record, state: Record, sample_age: Array, drive: Array, silent: int) -> None:
+    """Before a cycle: take the rig's report, as `controller.safety.watch.update_rig_status` has it."""
+    p, s = parameters[()], state[()]
+    watch.update_rig_status(p.safety, s.safety, p.rig, s.time, s.imus, s.reference, s.pid, sample_age, drive, silent)
+
+
+@kernel
+def react(parameters: Record, state: Record, cause: int, index: int, value: float, limit: float) -> None:
+    """Between cycles: report a cause and react to it, as `controller.safety.stop.handle_cause` has it."""
+    p, s = parameters[()], state[()]
+    handle_cause(p.safety, s.safety, p.rig, s.time, s.reference, s.pid, cause, index, value, limit)
 
 
 @kernel

@@ -4,7 +4,7 @@ import numpy as np
 
 from controller.estimation.imu_monitor import contradiction
 from controller.safety.causes import Cause, DriveState, Mode, Request, report_event
-from controller.safety.stop import react
+from controller.safety.stop import handle_cause
 from controller.settings import SafetySettings
 from plant.compiled import Record, filled, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
@@ -42,26 +42,28 @@ def describe_obstacle(state: Record) -> str:
 
 
 @kernel
-def run_arming_checks(parameters: Record, state: Record) -> None:
+def run_arming_checks(
+    p: Record, s: Record, rig: Record, time: Record, imu_parameters: Record, imus: Record, pose: Record, reference: Record,
+    pid: Record,
+) -> None:  # fmt: skip
     """Before the commands: from idle to armed, and from armed to running.
 
     Idle becomes armed when the IMUs are plausible, the pose is in the workspace and where the target begins, and the drives
     are there. Armed becomes running when all drives follow.
     """
-    p, rig, time, s = parameters[()].safety.arming, parameters[()].rig, state[()].time, state[()].safety
     a = s.arming
     if time.cycle < rig.hold_cycles or s.mode > Mode.ARMED:
         return
     if s.mode == Mode.IDLE:
-        a.obstacle, a.index, a.value, a.limit = _find_obstacle(parameters, state)
-        if a.obstacle == Cause.NONE and p.active != 0:
+        a.obstacle, a.index, a.value, a.limit = _find_obstacle(p, s, rig, imu_parameters, imus, pose, pid)
+        if a.obstacle == Cause.NONE and p.arming.active != 0:
             s.mode, s.request = Mode.ARMED, Request.ENABLED
             report_event(s.events, Cause.ARMED, -1, np.nan, np.nan)
     if s.mode == Mode.ARMED:
-        a.obstacle, a.index, a.value, a.limit = _find_obstacle(parameters, state)
+        a.obstacle, a.index, a.value, a.limit = _find_obstacle(p, s, rig, imu_parameters, imus, pose, pid)
         if a.obstacle != Cause.NONE:
             # The drives are enabled already, so arming does not wait here.
-            react(parameters, state, a.obstacle, a.index, a.value, a.limit)
+            handle_cause(p, s, rig, time, reference, pid, a.obstacle, a.index, a.value, a.limit)
             return
         for k in range(rig.legs):
             if s.watch.drive[k] != DriveState.FOLLOWING and a.obstacle == Cause.NONE:
@@ -70,39 +72,39 @@ def run_arming_checks(parameters: Record, state: Record) -> None:
             s.mode = Mode.RUNNING
             a.delay = time.cycle - rig.hold_cycles
             return
-    if p.active == 0:
+    if p.arming.active == 0:
         return
     a.delay = time.cycle + 1 - rig.hold_cycles
-    if a.delay > p.cycles:
-        react(parameters, state, a.obstacle, a.index, a.value, a.limit)
+    if a.delay > p.arming.cycles:
+        handle_cause(p, s, rig, time, reference, pid, a.obstacle, a.index, a.value, a.limit)
 
 
 @kernel
-def postpones_arming(parameters: Record, state: Record, cause: int) -> bool:
+def postpones_arming(p: Record, s: Record, rig: Record, time: Record, cause: int) -> bool:
     """Whether a cause only prevents arming: nothing has been armed, and there is still time."""
-    p, rig, time, s = parameters[()].safety.arming, parameters[()].rig, state[()].time, state[()].safety
     a = s.arming
     if s.mode != Mode.IDLE:
         return False
     a.obstacle, a.index, a.value, a.limit = cause, -1, np.nan, np.nan
-    if time.cycle >= rig.hold_cycles and p.active != 0:
+    if time.cycle >= rig.hold_cycles and p.arming.active != 0:
         a.delay = time.cycle + 1 - rig.hold_cycles
-    return bool(a.delay <= p.cycles)
+    return bool(a.delay <= p.arming.cycles)
 
 
 @kernel
-def _find_obstacle(parameters: Record, state: Record) -> tuple[int, int, float, float]:
+def _find_obstacle(
+    p: Record, s: Record, rig: Record, imu_parameters: Record, imus: Record, pose: Record, pid: Record
+) -> tuple[int, int, float, float]:
     """The first obstacle: a `Cause` with its leg or IMU, value and limit."""
-    p, s, lengths, error = parameters[()].safety, state[()].safety, state[()].pose.lengths, state[()].pid.error
-    lost = 0
+    lost, lengths, error = 0, pose.lengths, pid.error
     for k in range(IMU_COUNT):
         off = contradiction(s.monitor, k)
         if not off <= p.monitor.disagreement:
             return Cause.NO_SENSORS.value, k, off, p.monitor.disagreement
-        lost += parameters[()].imus.present[k] != 0 and state[()].imus.used[k] == 0
+        lost += imu_parameters.present[k] != 0 and imus.used[k] == 0
         if lost > p.watch.most_lost_imus:
             return Cause.NO_SENSORS.value, k, np.nan, np.nan
-    for k in range(parameters[()].rig.legs):
+    for k in range(rig.legs):
         low, high = p.watch.lengths[k, 0], p.watch.lengths[k, 1]
         if not low <= lengths[k] <= high:
             return Cause.NO_WORKSPACE.value, k, lengths[k], low if lengths[k] < low else high

@@ -52,17 +52,20 @@ def describe_end(state: Record) -> str:
 
 
 @kernel
-def react(parameters: Record, state: Record, cause: int, index: int, value: float, limit: float) -> None:
+def handle_cause(
+    p: Record, s: Record, rig: Record, time: Record, reference: Record, pid: Record,
+    cause: int, index: int, value: float, limit: float,
+) -> None:  # fmt: skip
     """Report a cause and react to it as `Cause` says.
 
     The first cause of a stop counts, and the first of a fault. A fault overrides a stop.
 
     Args:
-        parameters, state: of the cycle.
+        reference, pid: states of these stages, which a stop changes.
         index: the number of the leg or IMU; -1 if none is named.
         value, limit: in the unit of the cause; NaN if there is none.
     """
-    s, reaction = state[()].safety, REACTION[cause]
+    reaction = REACTION[cause]
     if s.mode == Mode.FAULT or (reaction == Reaction.STOP and s.stop.cause != Cause.NONE):
         return
     report_event(s.events, cause, index, value, limit)
@@ -70,26 +73,24 @@ def react(parameters: Record, state: Record, cause: int, index: int, value: floa
         return
     s.stop.index, s.stop.value, s.stop.limit = index, value, limit
     if reaction == Reaction.STOP:
-        _begin_stop(parameters, state, cause)
+        _begin_stop(p.stop, s, rig, time, reference, pid, cause)
     else:
-        _fail(parameters, state, cause)
+        _fail(p.stop, s, rig, time, pid, cause)
 
 
 @kernel
-def _begin_stop(parameters: Record, state: Record, cause: int) -> None:
+def _begin_stop(p: Record, s: Record, rig: Record, time: Record, reference: Record, pid: Record, cause: int) -> None:
     """Leave the motion for the fastest stop within the limits, leg by leg.
 
     Before the motion there is nothing to stop. In missed periods the drives followed the last command, so the stop begins
     where that has led.
     """
-    p, rig, time = parameters[()].safety.stop, parameters[()].rig, state[()].time
-    s, reference, command = state[()].safety, state[()].reference, state[()].pid.command
     s.stop.cause = cause
     s.stop.cycle = s.stop.end_cycle = time.cycle
     if s.mode == Mode.RUNNING:
         if time.missed > 0:
             for k in range(rig.legs):
-                speed = min(max(command[k], -p.velocity_limit), p.velocity_limit)
+                speed = min(max(pid.command[k], -p.velocity_limit), p.velocity_limit)
                 reference.motion[k, 0] += time.missed * rig.period * speed
                 reference.motion[k, 1], reference.motion[k, 2] = speed, 0.0
         duration = plan_stop(reference.motion, p.acceleration_limit, p.jerk_limit, s.stop.segments)
@@ -102,37 +103,34 @@ def _begin_stop(parameters: Record, state: Record, cause: int) -> None:
 
 
 @kernel
-def _fail(parameters: Record, state: Record, cause: int) -> None:
+def _fail(p: Record, s: Record, rig: Record, time: Record, pid: Record, cause: int) -> None:
     """End without the estimate: the drives come to rest by themselves, or the brakes close at once."""
-    p, rig = parameters[()].safety.stop, parameters[()].rig
-    s, command = state[()].safety, state[()].pid.command
     moving = s.request == Request.ENABLED
     s.stop.earlier_cause = s.stop.cause
     s.stop.cause = cause
-    s.stop.cycle = s.stop.end_cycle = state[()].time.cycle
+    s.stop.cycle = s.stop.end_cycle = time.cycle
     s.mode = Mode.FAULT
     s.request = Request.BRAKED
     if REACTION[cause] == Reaction.QUICK_STOP and moving:
         s.request = Request.QUICK_STOP
         fastest = 0.0
         for k in range(rig.legs):
-            if not np.isfinite(command[k]):
-                command[k] = 0.0
-            fastest = max(fastest, abs(command[k]))
+            if not np.isfinite(pid.command[k]):
+                pid.command[k] = 0.0
+            fastest = max(fastest, abs(pid.command[k]))
         s.stop.end_cycle += int(np.ceil(fastest / (p.acceleration_limit * rig.period)))
     else:
-        command[:] = 0.0
+        pid.command[:] = 0.0
     if moving:
         s.stop.end_cycle += p.settling_cycles
 
 
 @kernel
-def ramp_down(parameters: Record, state: Record) -> None:
+def ramp_down(p: Record, rig: Record, time: Record, pid: Record) -> None:
     """A cycle after a fault: every command comes to rest at the limit of acceleration, whatever is measured."""
-    rig, time, command = parameters[()].rig, state[()].time, state[()].pid.command
-    step = parameters[()].safety.stop.acceleration_limit * rig.period * (1 + time.missed)
+    step = p.acceleration_limit * rig.period * (1 + time.missed)
     for k in range(rig.legs):
-        command[k] -= min(max(command[k], -step), step)
+        pid.command[k] -= min(max(pid.command[k], -step), step)
     time.cycle += 1
 
 

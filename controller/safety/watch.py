@@ -4,7 +4,7 @@ import numpy as np
 
 from controller.estimation.imu_monitor import contradiction, reset
 from controller.safety.causes import Cause, DriveState, Mode, Request, report_event
-from controller.safety.stop import react
+from controller.safety.stop import handle_cause
 from controller.settings import SafetySettings
 from plant.compiled import Record, filled, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
@@ -68,20 +68,21 @@ def watch_parameters(settings: SafetySettings, rate: float, limits: Limits) -> R
 
 
 @kernel
-def hear_rig(parameters: Record, state: Record, sample_age: Array, drive: Array, silent: int) -> None:
+def update_rig_status(
+    p: Record, s: Record, rig: Record, time: Record, imus: Record, reference: Record, pid: Record, sample_age: Array,
+    drive: Array, silent: int,
+) -> None:  # fmt: skip
     """Before a cycle: take the rig's report, and react to a lost bus and to drives that left their operation.
 
     Args:
-        parameters, state: of the cycle.
         sample_age: (7,), of each IMU's sample, in cycles.
         drive: (6,), of each drive its `DriveState`.
         silent: for how many cycles the rig has not answered.
     """
-    legs, s = parameters[()].rig.legs, state[()].safety
     w = s.watch
     for k in range(IMU_COUNT):
-        state[()].imus.sample_age[k] = sample_age[k]
-    for k in range(legs):
+        imus.sample_age[k] = sample_age[k]
+    for k in range(rig.legs):
         w.drive[k] = drive[k]
     if silent > 0 and w.silent == 0:
         report_event(s.events, Cause.ANSWER_LATE, -1, np.nan, np.nan)
@@ -89,32 +90,35 @@ def hear_rig(parameters: Record, state: Record, sample_age: Array, drive: Array,
     w.unanswered = max(w.unanswered + (1 if silent > 0 else -1), 0)
     if s.request != Request.ENABLED:
         return
-    most = parameters[()].safety.watch.bus_cycles
+    most = p.watch.bus_cycles
     if silent >= most or w.unanswered >= 2 * most:
-        react(parameters, state, Cause.BUS_LOST, -1, float(max(silent, w.unanswered)), float(most))
-    for k in range(legs):
+        handle_cause(
+            p, s, rig, time, reference, pid, Cause.BUS_LOST, -1, float(max(silent, w.unanswered)), float(most)
+        )  # fmt: skip
+    for k in range(rig.legs):
         if drive[k] == DriveState.FAULTY:
-            react(parameters, state, Cause.DRIVE_FAULT, k, np.nan, np.nan)
+            handle_cause(p, s, rig, time, reference, pid, Cause.DRIVE_FAULT, k, np.nan, np.nan)
         elif s.mode != Mode.ARMED and drive[k] != DriveState.FOLLOWING:
-            react(parameters, state, Cause.DRIVE_OFF, k, np.nan, np.nan)
+            handle_cause(p, s, rig, time, reference, pid, Cause.DRIVE_OFF, k, np.nan, np.nan)
 
 
 @kernel
-def exclude_imu(parameters: Record, state: Record) -> None:
+def exclude_imu(
+    p: Record, s: Record, rig: Record, time: Record, imus: Record, leg_weight: float, reference: Record, pid: Record
+) -> None:
     """After the refinement: leave out the IMU that contradicts the others, once, if it can be named; else stop.
 
     Three legs and the roll of a planar mechanism are one measurement more than its pose needs: they show that an IMU is
     wrong, not which one.
     """
-    p, rig, s, imus = parameters[()].safety, parameters[()].rig, state[()].safety, state[()].imus
-    m, w = s.monitor, s.watch
+    m = s.monitor
     worst = 0
     for k in range(1, IMU_COUNT):
         if m.explained[k] > m.explained[worst]:
             worst = k
     off, limit = contradiction(m, worst), p.monitor.disagreement
-    w.contradicted_for = w.contradicted_for + rig.period if off > limit else 0.0
-    if w.contradicted_for < p.monitor.lasting or s.mode != Mode.RUNNING:
+    s.watch.contradicted_for = s.watch.contradicted_for + rig.period if off > limit else 0.0
+    if s.watch.contradicted_for < p.monitor.lasting or s.mode != Mode.RUNNING:
         return
     second = left = 0.0
     excluded = 0
@@ -124,47 +128,51 @@ def exclude_imu(parameters: Record, state: Record) -> None:
         if k != worst:
             second = max(second, m.explained[k])
     # Without the named IMU, the others must agree.
-    disagree = left - m.explained[worst] > parameters[()].legs.weight * limit**2
+    disagree = left - m.explained[worst] > leg_weight * limit**2
     if disagree or excluded > 0 or m.explained[worst] < _CLEARER * second or p.watch.most_lost_imus == 0:
         named = worst if rig.planar == 0 else -1
-        react(parameters, state, Cause.IMUS_DISAGREE, named, off, limit)
+        handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_DISAGREE, named, off, limit)
         return
     imus.excluded[worst] = 1
-    w.contradicted_for = 0.0
+    s.watch.contradicted_for = 0.0
     for k in range(IMU_COUNT):
         reset(m, k)
     report_event(s.events, Cause.IMU_DISAGREES, worst, off, limit)
 
 
 @kernel
-def check_limits(parameters: Record, state: Record) -> int:
+def check_limits(
+    p: Record, s: Record, rig: Record, time: Record, imu_parameters: Record, imus: Record, pose: Record, filter_trusted: int,
+    reference: Record, command_limit: float, pid: Record,
+) -> int:  # fmt: skip
     """After the commands, while there is motion: hold everything against its limit; returns the cause of a fault, or
     `Cause.NONE`.
     """
-    p, s = parameters[()], state[()]
-    w, limits, pose, period = s.safety.watch, p.safety.watch, s.pose, p.rig.period
-    for k in range(p.rig.legs):
-        if not (np.isfinite(s.pid.command[k]) and np.isfinite(pose.lengths[k])):
-            react(parameters, state, Cause.NOT_FINITE, k, np.nan, np.nan)
+    w, limits = s.watch, p.watch
+    for k in range(rig.legs):
+        if not (np.isfinite(pid.command[k]) and np.isfinite(pose.lengths[k])):
+            handle_cause(p, s, rig, time, reference, pid, Cause.NOT_FINITE, k, np.nan, np.nan)
             return Cause.NOT_FINITE.value
-    if s.safety.mode < Mode.RUNNING or s.safety.request != Request.ENABLED:
+    if s.mode < Mode.RUNNING or s.request != Request.ENABLED:
         return Cause.NONE.value
     lost = 0
     for k in range(IMU_COUNT):
-        lost += p.imus.present[k] != 0 and s.imus.used[k] == 0
+        lost += imu_parameters.present[k] != 0 and imus.used[k] == 0
     if lost > limits.most_lost_imus:
-        react(parameters, state, Cause.IMUS_LOST, -1, float(lost), float(limits.most_lost_imus))
-    if pose.conditioning < limits.conditioning and s.mechanism.trusted == 0:
-        react(parameters, state, Cause.ILL_CONDITIONED, -1, pose.conditioning, limits.conditioning)
-    for k in range(p.rig.legs):
-        length, command, d, a = pose.lengths[k], s.pid.command[k], pose.directions[k], pose.arms[k]
+        handle_cause(
+            p, s, rig, time, reference, pid, Cause.IMUS_LOST, -1, float(lost), float(limits.most_lost_imus)
+        )  # fmt: skip
+    if pose.conditioning < limits.conditioning and filter_trusted == 0:
+        handle_cause(p, s, rig, time, reference, pid, Cause.ILL_CONDITIONED, -1, pose.conditioning, limits.conditioning)
+    for k in range(rig.legs):
+        length, command, d, a = pose.lengths[k], pid.command[k], pose.directions[k], pose.arms[k]
         low, high = limits.plausible_lengths[k, 0], limits.plausible_lengths[k, 1]
         if not low <= length <= high:
-            react(parameters, state, Cause.IMPLAUSIBLE, k, length, low if length < low else high)
+            handle_cause(p, s, rig, time, reference, pid, Cause.IMPLAUSIBLE, k, length, low if length < low else high)
             return Cause.IMPLAUSIBLE.value
         low, high = limits.lengths[k, 0], limits.lengths[k, 1]
         if not low <= length <= high:
-            react(parameters, state, Cause.BEYOND_STROKE, k, length, low if length < low else high)
+            handle_cause(p, s, rig, time, reference, pid, Cause.BEYOND_STROKE, k, length, low if length < low else high)
         t = pose.smooth_twist
         w.speed[k] = (
             d[0] * (t[0] + t[4] * a[2] - t[5] * a[1])
@@ -172,18 +180,18 @@ def check_limits(parameters: Record, state: Record) -> int:
             + d[2] * (t[2] + t[3] * a[1] - t[4] * a[0])
         )
         if not abs(w.speed[k]) <= limits.speed:
-            react(parameters, state, Cause.TOO_FAST, k, abs(w.speed[k]), limits.speed)
-        off = abs(s.pid.error[k])
-        w.off_reference_for[k] = w.off_reference_for[k] + period if off > limits.following else 0.0
+            handle_cause(p, s, rig, time, reference, pid, Cause.TOO_FAST, k, abs(w.speed[k]), limits.speed)
+        off = abs(pid.error[k])
+        w.off_reference_for[k] = w.off_reference_for[k] + rig.period if off > limits.following else 0.0
         if w.off_reference_for[k] > limits.patience:
-            react(parameters, state, Cause.FOLLOWING_ERROR, k, off, limits.following)
+            handle_cause(p, s, rig, time, reference, pid, Cause.FOLLOWING_ERROR, k, off, limits.following)
         # A drive is behind its command, by less than what it may deviate by.
         off = abs(w.speed[k] - command)
-        w.deviating_for[k] = w.deviating_for[k] + period if off > limits.drive_deviation else 0.0
+        w.deviating_for[k] = w.deviating_for[k] + rig.period if off > limits.drive_deviation else 0.0
         if w.deviating_for[k] > limits.patience:
-            react(parameters, state, Cause.DRIVE_DEVIATES, k, off, limits.drive_deviation)
+            handle_cause(p, s, rig, time, reference, pid, Cause.DRIVE_DEVIATES, k, off, limits.drive_deviation)
             return Cause.DRIVE_DEVIATES.value
-        w.saturated_for[k] = w.saturated_for[k] + period if abs(command) >= p.pid.limit else 0.0
+        w.saturated_for[k] = w.saturated_for[k] + rig.period if abs(command) >= command_limit else 0.0
         if w.saturated_for[k] > limits.saturation:
-            react(parameters, state, Cause.SATURATED, k, w.saturated_for[k], limits.saturation)
+            handle_cause(p, s, rig, time, reference, pid, Cause.SATURATED, k, w.saturated_for[k], limits.saturation)
     return Cause.NONE.value

@@ -6,14 +6,13 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from controller.cycle import CycleStage, prepare_next, run_stages, skip_periods
+from controller.cycle import CycleStage, hear_rig, prepare_next, react, run_stages, skip_periods
 from controller.estimation.whole_mechanism.filter import extrapolate_covariance
 from controller.least_squares import factor_cholesky, invert_cholesky
 from controller.planning.stream import stream_cause, take_plan
 from controller.reference import motion_cycle
 from controller.safety.causes import EVENT_SLOTS, REACTION, Cause, Request
-from controller.safety.stop import has_stopped, ramp_down, react
-from controller.safety.watch import hear_rig
+from controller.safety.stop import has_stopped, ramp_down
 from hil.loop.records import EmulatedUdp, Link, RigHandle, Stage, StopRequest, TargetStream
 from hil.realtime.clock import FREE, REAL, finish, start, wait
 from hil.rigs import ANSWERED, SILENT
@@ -161,8 +160,8 @@ def _ask(work: Record, cause: int) -> None:
 @kernel
 def process_feedback(parameters: Record, state: Record, work: Record, status: int) -> int:
     """After an exchange: note which samples are new, and react to the rig's status; returns a cause if the cycle cannot run."""
-    w = work[()]
-    feedback, missed = w.feedback, state[()].time.missed
+    p, s, w = parameters[()], state[()], work[()]
+    feedback, missed = w.feedback, s.time.missed
     w.silent = w.silent + 1 + missed if status == SILENT else 0
     for k in range(IMU_COUNT):
         fresh = feedback.sequence[k] != w.sequence[k]
@@ -170,7 +169,7 @@ def process_feedback(parameters: Record, state: Record, work: Record, status: in
         w.sequence[k] = feedback.sequence[k]
     if status != ANSWERED and status != SILENT:
         react(parameters, state, Cause.RIG_FAILED, -1, float(status), np.nan)
-        ramp_down(parameters, state)
+        ramp_down(p.safety.stop, p.rig, s.time, s.pid)
         return Cause.RIG_FAILED.value
     hear_rig(parameters, state, w.sample_age, feedback.drive, w.silent)
     return Cause.NONE.value

@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from controller.cycle import MARKS, PARAMETERS, STATE, cycle, prepare_next, skip_periods
+from controller.cycle import MARKS, PARAMETERS, STATE, cycle, hear_rig, prepare_next, react, skip_periods
 from controller.planning import STREAM_TARGET
 from controller.safety.causes import Cause
-from controller.safety.stop import ramp_down, react
-from controller.safety.watch import hear_rig
+from controller.safety.stop import ramp_down
 from hil.loop.records import RECORD
 from hil.recording.mcap import RecordingError, joined, read_run
 from plant.compiled import Record, kernel
@@ -128,7 +127,7 @@ def _replay(
     streamed: bool,
 ) -> int:  # fmt: skip
     """Run the cycle on the raw data of records (n,); returns the number of cycles before the first gap."""
-    s = state[()]
+    p, s = parameters[()], state[()]
     for k in range(records.shape[0]):
         recorded, found = records[k], again[k]
         if recorded.cycle != s.time.cycle + recorded.missed:
@@ -149,7 +148,7 @@ def _replay(
         measurement[2] = recorded.magnetic_field
         if recorded.status == Cause.RIG_FAILED:
             react(parameters, state, Cause.RIG_FAILED, -1, np.nan, np.nan)
-            ramp_down(parameters, state)
+            ramp_down(p.safety.stop, p.rig, s.time, s.pid)
         else:
             hear_rig(parameters, state, recorded.sample_age, recorded.drive, recorded.silent)
             cycle(parameters, state, measurement, segments, marks)

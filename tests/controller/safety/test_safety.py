@@ -5,12 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.cycle import STATE, cycle_parameters, prepare_next
+from controller.cycle import STATE, cycle_parameters, hear_rig, prepare_next, react
 from controller.inverse_kinematics import leg_lengths
 from controller.safety.arming import describe_obstacle
 from controller.safety.causes import Cause, DriveState, Mode, Request
-from controller.safety.stop import describe_end, has_stopped, react
-from controller.safety.watch import hear_rig
+from controller.safety.stop import describe_end, has_stopped
 from controller.settings import SafetySettings, control_settings, fusion_settings, safety_settings
 from plant.errors import InputError
 from plant.mechanism import Mechanism
