@@ -21,28 +21,22 @@ FREE, REAL, SCRIPTED = range(3)
 CLOCK = record_dtype(
     mode=np.int64,
     period=np.int64,
-    start=np.int64,
-    deadline=np.int64,
+    start=np.int64,  # the first deadline
+    deadline=np.int64,  # the next one
     woke=np.int64,
-    late=np.int64,
-    cpu=np.int64,
-    time=np.int64,
+    late=np.int64,  # how late the cycle woke
+    cpu=np.int64,  # the thread's CPU time at the end of the last cycle
+    time=np.int64,  # the present of a script
     cycles=np.int64,
-    overrun=np.int64,
-    in_a_row=np.int64,
+    overrun=np.int64,  # periods that the last cycle's work ran over
+    in_a_row=np.int64,  # periods missed since two cycles last followed each other directly
     most_in_a_row=np.int64,
-    missed_late=np.int64,
-    missed_own=np.int64,
-    missed_host=np.int64,
-    timespec=(np.int64, 2),
+    missed_late=np.int64,  # periods missed because the thread woke late
+    missed_own=np.int64,  # because of its own work
+    missed_host=np.int64,  # because of the host
+    timespec=(np.int64, 2),  # scratch
 )
-"""State of the clock, in ns.
-
-`start`, `deadline`: the first and the next deadline. `woke`, `late`: when the cycle woke, and how late. `cpu`: the thread's CPU
-time at the end of the last cycle. `time`: the present of a script. `overrun`: periods that the last cycle's work ran over.
-`in_a_row`: periods missed since two cycles last followed each other directly; `most_in_a_row`: its maximum. `missed_late`,
-`missed_own`, `missed_host`: periods missed because the thread woke late, because of its own work, and because of the host.
-"""
+"""State of the clock; times are in ns."""
 
 _CLOCK_THREAD_CPUTIME = 3
 _TIMER_ABSTIME, _EINTR = 1, 4

@@ -3,7 +3,6 @@
 A measure that the machine refuses is reported with a remedy, and can be an error. Everything is restored at the end.
 """
 
-import contextlib
 import ctypes
 import errno
 import gc
@@ -11,7 +10,7 @@ import os
 import resource
 import struct
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -36,17 +35,13 @@ def keep_to_one_thread() -> None:
 
 @dataclass(frozen=True)
 class RealTimeSettings:
-    """How a loop is run. Fields that are options say below what they mean.
-
-    Attributes:
-        without: names of the `MEASURES` that are left out, to see what each gives.
-    """
+    """How a loop is run."""
 
     priority: int = option(80, "priority of SCHED_FIFO, 1 to 98")
     cpu: int | None = option(None, "processor to stay on", parse=int, shown="the last one that the process may use")
     strict: bool = option(False, "do not run if the machine refuses anything that real time needs")
     most_missed: int = option(10, "number of periods missed in a row that end in a controlled stop")
-    without: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()  # the measures that are left out, to see what each gives
 
     def __post_init__(self) -> None:
         if not PRIORITY_RANGE[0] <= self.priority <= PRIORITY_RANGE[1]:
@@ -77,33 +72,20 @@ def real_time(settings: RealTimeSettings) -> Iterator[list[str]]:
     Raises:
         RefusedError: a measure was refused, and the settings are strict.
     """
-    refused = []
-    with contextlib.ExitStack() as restore:
+    cpu, priority, refused = settings.processor, settings.priority, []
+    raise_limit = "run as root, or raise the limit {!r} in /etc/security/limits.conf"
+    measures = (
+        ("memory", "locked memory", _lock_memory, raise_limit.format("memlock")),
+        ("processor", f"staying on processor {cpu}", lambda: _stay_on(cpu), "choose another with --cpu"),
+        ("doze", f"no deep idle states ({_DMA_LATENCY})", _stay_awake, "run as root, or let your group write to it"),
+        ("priority", f"SCHED_FIFO at priority {priority}", lambda: _take_priority(priority), raise_limit.format("rtprio")),
+    )
+    with ExitStack() as restore:
         # Before the priority is taken, as another loop on this processor would wait for the collection.
         gc.collect()
         gc.disable()
         restore.callback(gc.enable)
-        for measure, what, take, remedy in (
-            ("memory", "locked memory", _lock_memory, "run as root, or raise the limit 'memlock' in /etc/security/limits.conf"),
-            (
-                "processor",
-                f"staying on processor {settings.processor}",
-                lambda: _stay_on(settings.processor),
-                "choose another with --cpu",
-            ),
-            (
-                "doze",
-                f"no deep idle states ({_DMA_LATENCY})",
-                _stay_awake,
-                "run as root, or let your group write to it",
-            ),
-            (
-                "priority",
-                f"SCHED_FIFO at priority {settings.priority}",
-                lambda: _take_priority(settings.priority),
-                "run as root, or raise the limit 'rtprio' in /etc/security/limits.conf",
-            ),
-        ):
+        for measure, what, take, remedy in measures:
             if measure in settings.without:
                 continue
             try:
@@ -144,21 +126,14 @@ def _take_priority(priority: int) -> Callable[[], Any]:
 
 @dataclass(frozen=True)
 class Usage:
-    """The usage of the calling thread, and of its process's memory.
+    """The usage of the calling thread, and of its process's memory."""
 
-    Attributes:
-        major_faults, minor_faults: pages that were read in, and pages that were only mapped.
-        voluntary_switches, involuntary_switches: how often the thread waited, and how often it lost the processor.
-        resident: memory of the process [bytes].
-        cpu: processor time [s].
-    """
-
-    major_faults: int
-    minor_faults: int
-    voluntary_switches: int
-    involuntary_switches: int
-    resident: int
-    cpu: float
+    major_faults: int  # pages that were read in
+    minor_faults: int  # pages that were only mapped
+    voluntary_switches: int  # how often the thread waited
+    involuntary_switches: int  # how often it lost the processor
+    resident: int  # memory of the process [bytes]
+    cpu: float  # processor time [s]
 
     def since(self, before: "Usage") -> dict[str, float]:
         """The differences, by name."""

@@ -35,28 +35,17 @@ the brakes.
 """
 
 FEEDBACK = record_dtype(
-    measurement=(np.float64, (3, IMU_COUNT, 3)),
-    sample_ns=(np.int64, IMU_COUNT),
-    sequence=(np.int64, IMU_COUNT),
-    drive=(np.int64, LEGS),
-    drive_code=(np.int64, LEGS),
-    sent=(np.float64, LEGS),
-    truth=(np.float64, TRUTH_SIZE),
-    round_trip_ns=np.int64,
-    refused=np.int64,
+    measurement=(np.float64, (3, IMU_COUNT, 3)),  # raw [rad/s, m/s^2, uT]; NaN without an IMU
+    sample_ns=(np.int64, IMU_COUNT),  # on the rig's own clock
+    sequence=(np.int64, IMU_COUNT),  # number of the sample; stays the same when a sample is repeated
+    drive=(np.int64, LEGS),  # DriveState
+    drive_code=(np.int64, LEGS),  # fault code
+    sent=(np.float64, LEGS),  # velocities after rounding and limits [m/s]
+    truth=(np.float64, TRUTH_SIZE),  # as the plant's buffer; NaN unless the rig is emulated
+    round_trip_ns=np.int64,  # from the request to the answer
+    refused=np.int64,  # frames or packets since the rig was opened
 )
-"""The result of an exchange.
-
-- `measurement`: angular velocity [rad/s], specific force [m/s^2] and magnetic field [uT] of the seven IMUs, raw; NaN without
-  an IMU.
-- `sample_ns`, `sequence`: time of each IMU's sample on the rig's own clock [ns], and its number. The number does not change
-  when a sample is repeated.
-- `drive`, `drive_code`: `DriveState` of each drive, and its fault code.
-- `sent`: the velocities that were really sent, after rounding and limits [m/s].
-- `truth`: as the plant's `truth` buffer has it; NaN unless the rig is emulated.
-- `round_trip_ns`: from the request to the answer [ns].
-- `refused`: how many frames or packets the rig has refused since it was opened.
-"""
+"""The result of an exchange: angular velocity, specific force and magnetic field of the seven IMUs, and the drives' states."""
 
 
 def new_feedback() -> Record:

@@ -2,8 +2,6 @@
 
 import importlib
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -56,9 +54,10 @@ def python_rig(name: str, mechanism: Mechanism, period: float, rig_at: str | Non
 
 
 def _find_class(module_name: str, class_name: str) -> Any:
+    folder = str(Path.cwd())
+    sys.path.insert(0, folder)
     try:
-        with _current_folder():
-            module = importlib.import_module(module_name)
+        module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise InputError(f"module {module_name} cannot be imported: {error}") from None
@@ -67,6 +66,8 @@ def _find_class(module_name: str, class_name: str) -> Any:
         ) from None
     except Exception as error:
         raise InputError(f"module {module_name} cannot be imported: {type(error).__name__}: {error}") from None
+    finally:
+        sys.path.remove(folder)
     made: Any = getattr(module, class_name, None)
     if made is None:
         rigs = [key for key, value in vars(module).items() if isinstance(value, type) and not missing_members(value)]
@@ -78,14 +79,3 @@ def _find_class(module_name: str, class_name: str) -> Any:
 def _check_members(rig: object, where: str) -> None:
     if missing := missing_members(rig):
         raise InputError(f"{where} is not a rig: it lacks {', '.join(missing)} (see hil.rigs.Rig)")
-
-
-@contextmanager
-def _current_folder() -> Iterator[None]:
-    """Let modules in the current folder be found."""
-    folder = str(Path.cwd())
-    sys.path.insert(0, folder)
-    try:
-        yield
-    finally:
-        sys.path.remove(folder)

@@ -97,8 +97,8 @@ def _emulate_canopen(
     config: EmulatorConfig, faults: list[Record], settings: RealTimeSettings, say: Callable[[str], None], control: "_Control",
     stopped: _Stopped,
 ) -> None:  # fmt: skip
-    from hil.rigs.canopen.emulated_bus import EmulatedBus
-    from hil.rigs.canopen.emulator import PlantMachine, faulty_channel, serve_canopen
+    from hil.rigs.canopen.emulated_bus import EmulatedBus, faulty_channel
+    from hil.rigs.canopen.emulated_nodes import PlantMachine
     from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings
 
     bus = canopen_settings(config.at or DEFAULT_FILE)
@@ -111,7 +111,7 @@ def _emulate_canopen(
             say(f"without {text}")
         where = f"{bus.bus.interface} {bus.bus.channel}"
         say(f"the rig {config.simulated.mechanism} listens at {where}, its control at {config.control}")
-        serve_canopen(nodes, machine, lambda: stopped.asked, control.answer)
+        nodes.serve(lambda: stopped.asked, lambda: control.answer(machine.rig, {"lost": nodes.lost}))
 
 
 def _listen(address: str) -> socket.socket:

@@ -8,6 +8,7 @@ Pure functions on integers.
 """
 
 from enum import IntEnum
+from functools import cache
 
 from hil.rigs import DriveState, Request
 
@@ -52,26 +53,14 @@ HEARTBEAT_LOST, PDO_LOST = 0x8130, 0x8250
 """Error codes of a drive that misses its controller: no heartbeat, no RPDO in time."""
 
 _STATE_BITS = (0x00, 0x40, 0x21, 0x23, 0x27, 0x07, 0x0F, 0x08)
-_MASK, _MASK_WITHOUT_QUICK_STOP = 0x6F, 0x4F
-_QUICK_STOP_BIT_MATTERS = range(PowerState.READY_TO_SWITCH_ON, PowerState.QUICK_STOP_ACTIVE + 1)
+_STATE_MASKS = (0x4F, 0x4F, 0x6F, 0x6F, 0x6F, 0x6F, 0x4F, 0x4F)
+"""By state: the bits of the statusword, and which bits must be these."""
 
 
-def _tabulated() -> tuple[PowerState | None, ...]:
-    table: list[PowerState | None] = [None] * (_MASK + 1)
-    for state, bits in zip(PowerState, _STATE_BITS, strict=True):
-        mask = _MASK if state in _QUICK_STOP_BIT_MATTERS else _MASK_WITHOUT_QUICK_STOP
-        for word in range(_MASK + 1):
-            if word & mask == bits:
-                table[word] = state
-    return tuple(table)
-
-
-_STATE_OF = _tabulated()
-
-
+@cache
 def state_of(statusword: int) -> PowerState | None:
     """The state in a statusword; None if there is no such state."""
-    return _STATE_OF[statusword & _MASK]
+    return next((state for state in PowerState if statusword & _STATE_MASKS[state] == _STATE_BITS[state]), None)
 
 
 def statusword(state: PowerState, powered: bool, follows: bool) -> int:
@@ -85,13 +74,7 @@ def statusword(state: PowerState, powered: bool, follows: bool) -> int:
 
 
 def commanded(state: PowerState, controlword: int, previous: int) -> PowerState:
-    """The state after a controlword, at most one transition further.
-
-    Args:
-        state: of the drive.
-        controlword: the new one.
-        previous: the controlword before, for the rising edge that resets a fault.
-    """
+    """The state after a controlword, at most one transition further; the `previous` one shows the edge that resets a fault."""
     if state == PowerState.FAULT:
         return PowerState.SWITCH_ON_DISABLED if controlword & ~previous & Controlword.FAULT_RESET else state
     if state in (PowerState.NOT_READY_TO_SWITCH_ON, PowerState.FAULT_REACTION_ACTIVE):

@@ -1,42 +1,162 @@
-"""What the controller writes to the drives and IMUs before a run: PDOs, watchdogs, modes and option codes."""
+"""The nodes as the controller reads and configures them over SDO: PDOs, watchdogs, modes and option codes, all read back.
 
+A node that does not answer, refuses a value, has another one or does not reach a state raises a `RigError`.
+"""
+
+import struct
 import time
+from collections.abc import Callable
+from typing import Any
+
+import can
+import canopen
+from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
 
 from hil.rigs import Request, RigError
 from hil.rigs.canopen.cia402 import CYCLIC_SYNCHRONOUS_VELOCITY, Controlword, PowerState, controlword_towards, state_of
-from hil.rigs.canopen.frames import SYNC_OVERFLOW
-from hil.rigs.canopen.objects import (
+from hil.rigs.canopen.frames import (
     COMMAND_PDO,
     DRIVE_PDOS,
-    EVENT_TIMER,
+    INVALID_COB_ID,
     MAGNETOMETER_PDO,
-    SYNC_START_VALUE,
+    SYNC_OVERFLOW,
+    CobId,
     Object,
+    Parameter,
+    Pdo,
     imu_pdos,
 )
-from hil.rigs.canopen.sdo import RemoteNode
-from hil.rigs.canopen.settings import CanopenSettings, ControllerSettings, DriveSettings
+from hil.rigs.canopen.settings import CanopenSettings, ControllerSettings, DriveSettings, object_dictionary
+
+BUS_ERRORS = (can.CanError, OSError, ValueError)
+"""What python-can raises when a bus fails."""
+
+MOST_DRAINED = 256
+"""The largest number of old frames that are read at once."""
 
 _QUICK_STOP_RAMP, _DISABLE_AT_ONCE, _FAULT_RAMP, _ABORT_BY_QUICK_STOP = 2, 0, 2, 3
 """Option codes: a quick stop slows down by the quick-stop deceleration and ends in Switch on disabled; "disable operation"
 takes the power off at once, which closes the brake; a fault slows down like a quick stop; a lost connection is a quick stop."""
 
 _SWITCH_ON_TIMEOUT_S, _MODE_TIMEOUT_S = 2.0, 0.5
+_SDO_ATTEMPTS = 3
+
+
+class RemoteNode(SdoClient):  # type: ignore[misc]
+    """A node on the bus: canopen's SDO client, but it reads the bus itself instead of having a thread do it.
+
+    Args:
+        name: for messages, such as drive 0.
+        node: its id.
+        eds: electronic data sheet.
+        network: canopen's.
+        receive: returns the next frame within a time [s], or None.
+    """
+
+    RESPONSE_TIMEOUT = 1.0
+
+    def __init__(
+        self, name: str, node: int, eds: Any, network: canopen.Network, receive: Callable[[float], can.Message | None]
+    ) -> None:  # fmt: skip
+        super().__init__(CobId.SDO_REQUEST + node, CobId.SDO_ANSWER + node, object_dictionary(eds, node))
+        self.name, self.node, self.network, self._receive = f"{name} (node {node})", node, network, receive
+
+    def send_request(self, request: bytes) -> None:
+        """Send a request; frames that an earlier one has left are no answer to it."""
+        for _ in range(MOST_DRAINED):
+            if self._receive(0.0) is None:
+                break
+        super().send_request(request)
+
+    def read_response(self) -> bytes:
+        """Wait for the answer."""
+        deadline = time.monotonic() + self.RESPONSE_TIMEOUT
+        while self.responses.empty():
+            left = deadline - time.monotonic()
+            if left <= 0.0:
+                raise SdoCommunicationError("no answer")
+            message = self._receive(left)
+            if message is not None and message.arbitration_id == self.tx_cobid and len(message.data) == 8:
+                self.responses.put(bytes(message.data))
+        response: bytes = super().read_response()
+        return response
+
+    def has(self, index: int, subindex: int = 0) -> bool:
+        """Whether the EDS has this object."""
+        return self.od.get_variable(index, subindex) is not None
+
+    def expected(self, index: int, subindex: int = 0) -> Any:
+        """The value of an object in the EDS."""
+        return self._variable(index, subindex).default
+
+    def read(self, index: int, subindex: int = 0) -> Any:
+        """The value of an object."""
+        variable, purpose = self._variable(index, subindex), f"to give object {_named(index, subindex)}"
+        return self._transfer(lambda: variable.decode_raw(self.upload(index, subindex)), purpose)
+
+    def write(self, index: int, subindex: int, value: int) -> None:
+        """Write an object."""
+        data = self._variable(index, subindex).encode_raw(value)
+        purpose = f"{_shown(value)} for object {_named(index, subindex)}"
+        self._transfer(lambda: self.download(index, subindex, data), purpose)
+
+    def check(self, index: int, subindex: int, value: Any, within: float = 0.0) -> None:
+        """Check that an object has this value, or takes it within a time [s]."""
+        deadline = time.monotonic() + within
+        found = self.read(index, subindex)
+        while found != value and time.monotonic() < deadline:
+            found = self.read(index, subindex)
+        if found != value:
+            raise RigError(
+                f"{self.name} has {_shown(found)} in object {_named(index, subindex)}; it must be {_shown(value)}: "
+                "check that it is the right device with the right firmware"
+            )
+
+    def configure(self, index: int, subindex: int, value: int) -> None:
+        """Write an object and check that the node has accepted it."""
+        self.write(index, subindex, value)
+        self.check(index, subindex, value)
+
+    def map_pdo(self, pdo: Pdo) -> None:
+        """Configure a PDO and check all of it."""
+        cob_id = pdo.cob_id + self.node
+        self.write(pdo.communication, Parameter.COB_ID, cob_id | INVALID_COB_ID)
+        self.write(pdo.mapping, 0, 0)
+        for i, entry in enumerate(pdo.objects):
+            self.write(pdo.mapping, i + 1, entry)
+        self.configure(pdo.mapping, 0, len(pdo.objects))
+        for i, entry in enumerate(pdo.objects):
+            self.check(pdo.mapping, i + 1, entry)
+        self.configure(pdo.communication, Parameter.TRANSMISSION_TYPE, pdo.transmission_type)
+        self.configure(pdo.communication, Parameter.COB_ID, cob_id)
+
+    def _variable(self, index: int, subindex: int) -> Any:
+        variable = self.od.get_variable(index, subindex)
+        if variable is None:
+            raise RigError(f"{self.name} needs object {_named(index, subindex)}, which its EDS does not have: check the EDS")
+        return variable
+
+    def _transfer(self, transfer: Callable[[], Any], purpose: str) -> Any:
+        reason: Exception | None = None
+        for _ in range(_SDO_ATTEMPTS):
+            try:
+                return transfer()
+            except SdoAbortedError as error:
+                raise RigError(f"{self.name} refuses {purpose}: {error}; check its EDS") from None
+            except (SdoCommunicationError, struct.error, *BUS_ERRORS) as error:
+                reason = error
+        raise RigError(f"{self.name} does not answer over SDO: {reason}; check its power, wiring and bit rate")
 
 
 def configure_drive(node: RemoteNode, drives: DriveSettings, period: float) -> None:
-    """Configure a drive for commands every `period` [s].
-
-    Raises:
-        RigError: the drive does not answer, or refuses a value.
-    """
+    """Configure a drive for commands every `period` [s]."""
     units, exponent = interpolation_period(period)
     for pdo in DRIVE_PDOS:
         node.map_pdo(pdo)
     node.configure(Object.PRODUCER_HEARTBEAT, 0, round(drives.heartbeat * 1e3))
     node.configure(Object.QUICK_STOP_OPTION, 0, _QUICK_STOP_RAMP)
     for index, subindex, value in (
-        (COMMAND_PDO.communication, EVENT_TIMER, round(drives.command_timeout * 1e3)),
+        (COMMAND_PDO.communication, Parameter.EVENT_TIMER, round(drives.command_timeout * 1e3)),
         (Object.SYNC_OVERFLOW, 0, SYNC_OVERFLOW),
         (Object.DISABLE_OPERATION_OPTION, 0, _DISABLE_AT_ONCE),
         (Object.FAULT_REACTION_OPTION, 0, _FAULT_RAMP),
@@ -55,26 +175,18 @@ def configure_drive(node: RemoteNode, drives: DriveSettings, period: float) -> N
 
 
 def configure_imu(node: RemoteNode, imu: int, settings: CanopenSettings) -> None:
-    """Configure an IMU.
-
-    Raises:
-        RigError: the IMU does not answer, or refuses a value.
-    """
+    """Configure an IMU."""
     for pdo in imu_pdos(settings.bus.fd):
         node.map_pdo(pdo)
         if pdo == MAGNETOMETER_PDO:
             # The magnetometers take turns.
-            node.configure(pdo.communication, SYNC_START_VALUE, imu + 1)
+            node.configure(pdo.communication, Parameter.SYNC_START_VALUE, imu + 1)
     node.configure(Object.SYNC_OVERFLOW, 0, SYNC_OVERFLOW)
     node.configure(Object.PRODUCER_HEARTBEAT, 0, round(settings.imus.heartbeat * 1e3))
 
 
 def switch_on(node: RemoteNode, controller: ControllerSettings) -> int:
-    """Reset a drive's fault and lead the drive to Switched on; returns its statusword.
-
-    Raises:
-        RigError: the drive does not reach Switched on.
-    """
+    """Reset a drive's fault and lead the drive to Switched on; returns its statusword."""
     # Written each time: a drive begins to watch for the heartbeat at its next one, which comes with the first exchange.
     node.configure(Object.CONSUMER_HEARTBEAT, 1, controller.node << 16 | round(controller.heartbeat_timeout * 1e3))
     deadline = time.monotonic() + _SWITCH_ON_TIMEOUT_S
@@ -106,3 +218,11 @@ def interpolation_period(period: float) -> tuple[int, int]:
     if exponent is None:
         exponent = min((each for each in exponents if period * 10.0**-each <= 255.0), default=-3)
     return max(1, round(period * 10.0**-exponent)), exponent
+
+
+def _named(index: int, subindex: int) -> str:
+    return f"{index:04X}h:{subindex:02X}"
+
+
+def _shown(value: Any) -> str:
+    return f"0x{value & 0xFFFFFFFF:X}" if isinstance(value, int) else repr(value)

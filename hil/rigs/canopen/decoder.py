@@ -47,23 +47,26 @@ class Decoder:
 
     def __init__(self, settings: CanopenSettings) -> None:
         fd, drives, imus = settings.bus.fd, settings.drives.nodes, settings.imus.nodes
-        self._table: dict[int, tuple[Callable[[int, bytearray], bool], int, int]] = {}
+        # By identifier: how to decode the data, the node's number, the bit in `awaited`, and the length; None for any.
+        self._table: dict[int, tuple[Callable[[int, bytearray], bool], int, int, int | None]] = {}
         for drive, node in enumerate(drives):
-            self._table[CobId.TPDO + node] = self._take_drive, drive, 1 << drive
-            self._table[CobId.HEARTBEAT + node] = self._take_heartbeat, drive, 0
-            self._table[CobId.EMERGENCY + node] = self._take_emergency, drive, 0
+            self._table[CobId.TPDO + node] = self._take_drive, drive, 1 << drive, ANSWER.size
+            self._table[CobId.HEARTBEAT + node] = self._take_heartbeat, drive, 0, 1
+            self._table[CobId.EMERGENCY + node] = self._take_emergency, drive, 0, 8
         for imu, node in enumerate(imus):
             first = 1 << LEGS + imu
-            self._table[CobId.HEARTBEAT + node] = self._take_heartbeat, LEGS + imu, 0
-            self._table[CobId.EMERGENCY + node] = self._take_emergency, -1, 0
-            self._table[CobId.TPDO + node] = self._take_fd if fd else self._take_gyroscope, imu, first
-            if not fd:
-                self._table[CobId.TPDO + 0x100 + node] = self._take_accelerometer, imu, first << IMU_COUNT
-                self._table[CobId.TPDO + 0x200 + node] = self._take_magnetometer, imu, 0
+            self._table[CobId.HEARTBEAT + node] = self._take_heartbeat, LEGS + imu, 0, 1
+            self._table[CobId.EMERGENCY + node] = self._ignore, imu, 0, 8
+            if fd:
+                self._table[CobId.TPDO + node] = self._take_fd, imu, first, FD_BYTES
+            else:
+                self._table[CobId.TPDO + node] = self._take_gyroscope, imu, first, 8
+                self._table[CobId.TPDO + 0x100 + node] = self._take_accelerometer, imu, first << IMU_COUNT, 8
+                self._table[CobId.TPDO + 0x200 + node] = self._take_magnetometer, imu, 0, 8
         # Frames of this side, which some buses return, and late answers to SDO requests.
         own = [CobId.NMT, CobId.SYNC, CobId.HEARTBEAT + settings.controller.node, *(CobId.RPDO + node for node in drives)]
         for each in own + [sdo + node for sdo in (CobId.SDO_ANSWER, CobId.SDO_REQUEST) for node in (*drives, *imus)]:
-            self._table[each] = self._ignore, 0, 0
+            self._table[each] = self._ignore, 0, 0, None
         self.all_frames = (1 << LEGS + IMU_COUNT * (1 if fd else 2)) - 1
         self.statuswords, self.velocities, self.error_codes = [0] * LEGS, [0] * LEGS, [0] * LEGS
         self.nmt, self.heard_ns = [-1] * (LEGS + IMU_COUNT), [0] * (LEGS + IMU_COUNT)
@@ -106,13 +109,13 @@ class Decoder:
         if entry is None or broken or message.is_extended_id:
             self.refused += 1
             return False
-        decode, node, bit = entry
+        decode, node, bit, size = entry
         if self.received & bit:
             # A silent node that was given up is awaited again.
             self.awaited |= bit
             self.refused += 1
             return False
-        valid = decode(node, message.data)
+        valid = size in (None, len(message.data)) and decode(node, message.data)
         if valid:
             self.received |= bit
             self.awaited |= bit
@@ -121,29 +124,24 @@ class Decoder:
         return valid
 
     def _take_drive(self, drive: int, data: bytearray) -> bool:
-        if len(data) != ANSWER.size:
-            return False
         self.statuswords[drive], self.velocities[drive], self.error_codes[drive] = ANSWER.unpack_from(data)
         self.heard_ns[drive] = self.now_ns
         return True
 
     def _take_heartbeat(self, node: int, data: bytearray) -> bool:
-        if len(data) != 1 or data[0] not in _NODE_STATES:
+        if data[0] not in _NODE_STATES:
             return False
         self.nmt[node], self.heard_ns[node] = data[0], self.now_ns
         return True
 
     def _take_emergency(self, drive: int, data: bytearray) -> bool:
-        if len(data) == 8 and drive >= 0:
-            self.error_codes[drive] = CODE.unpack_from(data)[0]
-        return len(data) == 8
+        (self.error_codes[drive],) = CODE.unpack_from(data)
+        return True
 
     def _ignore(self, node: int, data: bytearray) -> bool:
         return True
 
     def _take_fd(self, imu: int, data: bytearray) -> bool:
-        if len(data) != FD_BYTES:
-            return False
         counter, stamp, sync = FD_TAIL.unpack_from(data, _TAIL_AT)
         if sync != self._sync:
             return False
@@ -154,8 +152,6 @@ class Decoder:
         return True
 
     def _take_gyroscope(self, imu: int, data: bytearray) -> bool:
-        if len(data) != 8:
-            return False
         counter, sync = CLASSIC_TAIL.unpack_from(data, 6)
         if sync != self._sync:
             return False
@@ -163,7 +159,7 @@ class Decoder:
         return True
 
     def _take_accelerometer(self, imu: int, data: bytearray) -> bool:
-        if len(data) != 8 or not self.received & 1 << LEGS + imu:
+        if not self.received & 1 << LEGS + imu:
             return False
         at = 6 * imu
         self._raw[0][at : at + 6], counter = self._pending[imu]
@@ -173,8 +169,6 @@ class Decoder:
 
     def _take_magnetometer(self, imu: int, data: bytearray) -> bool:
         # Accepted a SYNC late, too: it is sampled so seldom that nothing waits for it.
-        if len(data) != 8:
-            return False
         sync = data[6]
         if sync == self._magnetic_sync[imu] or (self._sync - sync) % SYNC_OVERFLOW > 1:
             return False

@@ -1,18 +1,18 @@
-"""The emulated nodes on a python-can bus: six drives and seven IMUs around a machine, served by one thread.
+"""The emulated nodes on a python-can bus: six drives and seven IMUs around a machine, served by one thread, with faults.
 
 The object dictionaries are read and written over SDO; SYNC and PDOs bypass them.
 """
 
 import heapq
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from copy import deepcopy
 from itertools import count
 
 import can
 
-from hil.rigs.canopen.emulated_nodes import EmulatedDrive, EmulatedImu, EmulatedNode, Machine, Network
+from hil.rigs.canopen.emulated_nodes import EmulatedDrive, EmulatedImu, EmulatedNode, Network, PlantMachine
 from hil.rigs.canopen.frames import (
     ANSWER,
     COMMAND,
@@ -27,17 +27,27 @@ from hil.rigs.canopen.frames import (
     raw_readings,
 )
 from hil.rigs.canopen.settings import MAGNETOMETER_INTERVAL, CanopenSettings
+from hil.rigs.emulation.faults import disturb
+from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS
 
 Channel = Callable[[can.Message, bool], Iterable[tuple[float, can.Message]]]
 """The bus's effect on a frame, with whether the nodes send it: the frames that arrive instead, each with its delay [s]."""
 
-_POLL_S = 0.005
+_POLL_S, _HELD_BACK_S = 0.005, 0.002
 
 
-def _unchanged(message: can.Message, outgoing: bool) -> Iterable[tuple[float, can.Message]]:
-    return ((0.0, message),)
+def faulty_channel(rig: Record) -> Channel:
+    """The faults of the bus of a rig (dtype `EMULATED`)."""
+
+    def disturbed(frame: can.Message, outgoing: bool) -> Iterator[tuple[float, can.Message]]:
+        copies, delay, damaged, held = disturb(rig[()], int(rig["time_ns"]))
+        # CAN frames have a CRC of their own: controllers never pass on a damaged frame.
+        for _ in range(0 if damaged else copies):
+            yield 1e-9 * delay + (_HELD_BACK_S if held else 0.0), frame
+
+    return disturbed
 
 
 class EmulatedBus:
@@ -48,12 +58,13 @@ class EmulatedBus:
         lost: number of frames that could not be sent or read.
     """
 
-    def __init__(self, settings: CanopenSettings, machine: Machine, channel: Channel | None = None) -> None:
-        self._machine, self._channel, self._fd = machine, channel or _unchanged, settings.bus.fd
+    def __init__(self, settings: CanopenSettings, machine: PlantMachine, channel: Channel | None = None) -> None:
+        self._machine, self._fd = machine, settings.bus.fd
+        self._channel = channel or (lambda message, outgoing: ((0.0, message),))
         self._scales = settings.imus.scales
         self._bus = can.Bus(**settings.bus.arguments())
         self._network = Network(self._send)
-        self.drives = [EmulatedDrive(leg, settings, machine, self._network, self._send) for leg in range(LEGS)]
+        self.drives = [EmulatedDrive(leg, settings, machine, self._network) for leg in range(LEGS)]
         self.imus = [EmulatedImu(imu, settings, self._network) for imu in range(IMU_COUNT)]
         self.lost = 0
         self._nodes: list[EmulatedNode] = [*self.drives, *self.imus]
@@ -68,8 +79,8 @@ class EmulatedBus:
         for node in self._nodes:
             self._boot(node)
 
-    def serve(self, stop: Callable[[], bool]) -> None:
-        """Answer the bus until `stop` returns true."""
+    def serve(self, stop: Callable[[], bool], report: Callable[[], None] = lambda: None) -> None:
+        """Answer the bus until `stop` returns true; `report` is called every few milliseconds."""
         while not stop():
             now = time.monotonic_ns()
             due = self._polled_ns + round(_POLL_S * 1e9)
@@ -90,6 +101,7 @@ class EmulatedBus:
                 self._arrive(frame, outgoing)
             if now - self._polled_ns >= _POLL_S * 1e9:
                 self._poll(now)
+                report()
 
     def close(self) -> None:
         """Leave the bus."""

@@ -1,15 +1,16 @@
-"""Emulated nodes of the CANopen rig: CiA 402 drives and IMUs, whose mechanics and readings are a machine's.
+"""Emulated nodes of the CANopen rig: CiA 402 drives and IMUs, and the machine whose mechanics and readings they have.
 
-Their object dictionaries are canopen's. The nodes accept the PDO mapping of `hil.rigs.canopen.objects` and refuse any other
+Their object dictionaries are canopen's. The nodes accept the PDO mapping of `hil.rigs.canopen.frames` and refuse any other
 over SDO.
 """
 
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import can
 import canopen
+import numpy as np
 from canopen.sdo import SdoAbortedError
 
 from hil.rigs import DriveState, Request
@@ -22,23 +23,24 @@ from hil.rigs.canopen.cia402 import (
     settled,
     statusword,
 )
-from hil.rigs.canopen.frames import ANSWER, CobId, NodeState, new_message
-from hil.rigs.canopen.objects import (
-    COB_ID,
+from hil.rigs.canopen.frames import (
+    ANSWER,
     COMMAND_PDO,
     DRIVE_PDOS,
-    EVENT_TIMER,
     INVALID_COB_ID,
     MAGNETOMETER_PDO,
-    SYNC_START_VALUE,
-    TRANSMISSION_TYPE,
+    CobId,
+    NodeState,
     Object,
+    Parameter,
     Pdo,
     imu_pdos,
+    new_message,
 )
 from hil.rigs.canopen.settings import CanopenSettings, object_dictionary
-
-Send = Callable[[can.Message], None]
+from hil.rigs.emulation.drives import EMULATED, move, sample
+from plant.compiled import Record
+from plant.fmu.plant import FmuPlant
 
 _LARGEST = 2**31 - 1
 _CLASSIC_PDO_BITS, _FD_PDO_BITS = 64, 512
@@ -47,46 +49,76 @@ _MODE_UNSUPPORTED = 0x06090030
 _DRIVE_ERROR = 0x81
 
 
-class Machine(Protocol):
-    """What the nodes drive and read.
+class PlantMachine:
+    """The plant that the nodes drive and read, on a clock of its own.
+
+    Args:
+        make: makes the plant at its start, its IMUs' imperfections, and the drives (dtype `EMULATED`).
 
     Attributes:
-        rig: arrays by name, as the fields of `hil.rigs.emulation.drives.EMULATED`: the nodes write `request` and `target`, and
-            read `drive`, `code`, `velocity`, `measurement`, `sample_ns`, `sequence` and, for CAN FD, `truth`.
+        rig: dtype `EMULATED`: the nodes write `request` and `target`, and read the rest.
     """
 
-    rig: Any
+    def __init__(self, make: Callable[[], tuple[FmuPlant, Record, Record]]) -> None:
+        self._make = make
+        self.rig: Record = np.zeros((), EMULATED)
+        self._started = 0
+        self._begin()
+        # The clock starts when the machine code is loaded: a node that waits for it would not answer over SDO in time.
+        self.sample(self._started)
+        self.advance(self._started)
+        self._started = time.monotonic_ns()
+
+    def _begin(self) -> None:
+        self._plant, self._imu, self.rig[()] = self._make()
+        self._started = time.monotonic_ns()
 
     def advance(self, now_ns: int) -> None:
-        """Move the machine on to a time [ns]."""
+        """Move the plant on to this time of the machine's clock."""
+        self._check(move(self._plant.handle, self.rig, now_ns - self._started))
 
     def sample(self, now_ns: int) -> None:
-        """Take a sample of the IMUs at a time [ns]."""
+        """Read the IMUs."""
+        self._check(sample(self._plant.handle, self._imu, self.rig, now_ns - self._started))
 
     def reset(self, drive: int) -> None:
-        """Clear a drive's fault, if its cause is gone; `drive` shows it at once."""
+        """Reset a drive's fault."""
+        self.rig["reset"][drive] = 1
+        self._check(move(self._plant.handle, self.rig, int(self.rig["time_ns"]) + 1))
 
     def restart(self) -> None:
-        """A node has been reset."""
+        """Put the platform back to its start, unless a drive moves or none was ever enabled."""
+        if self.rig["enabled_ns"] < 0 or np.isin(self.rig["drive"], (DriveState.FOLLOWING, DriveState.QUICK_STOPPING)).any():
+            return
+        self._plant.close()
+        self._begin()
+
+    def close(self) -> None:
+        """Close the plant."""
+        self._plant.close()
+
+    def _check(self, status: int) -> None:
+        if status:
+            raise self._plant.failure()
 
 
 class Network(canopen.Network):  # type: ignore[misc]
-    """A network whose object dictionaries send their answers with the nodes' own `send`."""
+    """A network whose nodes send with a function of their own."""
 
-    def __init__(self, send: Send) -> None:
+    def __init__(self, send: Callable[[can.Message], None]) -> None:
         super().__init__()
-        self._send = send
+        self.send = send
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
         """Send a frame."""
-        self._send(new_message(can_id, data, is_remote_frame=remote))
+        self.send(new_message(can_id, data, is_remote_frame=remote))
 
 
 class EmulatedNode:
     """What drives and IMUs have in common: object dictionary, NMT state, heartbeat and configuration of the PDOs."""
 
-    def __init__(self, name: str, node: int, eds: Any, pdos: tuple[Pdo, ...], fd: bool, network: Network) -> None:
-        self.name, self.node, self.pdos = name, node, pdos
+    def __init__(self, node: int, eds: Any, pdos: tuple[Pdo, ...], fd: bool, network: Network) -> None:
+        self.node, self.pdos, self.network = node, pdos, network
         self.local = canopen.LocalNode(node, object_dictionary(eds, node))
         # canopen's own callback would start a thread that sends the heartbeat.
         self.local._write_callbacks.clear()
@@ -113,8 +145,8 @@ class EmulatedNode:
         self.active = frozenset(
             pdo.cob_id
             for pdo in self.pdos
-            if self.value(pdo.communication, COB_ID) == pdo.cob_id + self.node
-            and self.value(pdo.communication, TRANSMISSION_TYPE) == pdo.transmission_type
+            if self.value(pdo.communication, Parameter.COB_ID) == pdo.cob_id + self.node
+            and self.value(pdo.communication, Parameter.TRANSMISSION_TYPE) == pdo.transmission_type
             and self._mapped(pdo, self.value(pdo.mapping)) == pdo.objects
         )
 
@@ -142,7 +174,7 @@ class EmulatedNode:
             self.heartbeat_due = time.monotonic_ns() + self.heartbeat_ns
 
     def _check_mapping(self, pdo: Pdo, subindex: int, number: int) -> None:
-        if not self.value(pdo.communication, COB_ID) & INVALID_COB_ID or self.state == NodeState.OPERATIONAL:
+        if not self.value(pdo.communication, Parameter.COB_ID) & INVALID_COB_ID or self.state == NodeState.OPERATIONAL:
             raise SdoAbortedError(_NOT_NOW)
         if subindex:
             if self.value(pdo.mapping):
@@ -157,26 +189,21 @@ class EmulatedNode:
                 raise SdoAbortedError(_NOT_MAPPABLE)
 
     def _check_mappable(self, entry: int) -> None:
-        index, subindex, bits = entry >> 16, entry >> 8 & 0xFF, entry & 0xFF
-        dictionary = self.local.object_dictionary
-        found = dictionary.get(index)
-        if isinstance(found, canopen.objectdictionary.ODRecord | canopen.objectdictionary.ODArray):
-            found = found.get(subindex)
-        if found is None or not found.pdo_mappable or len(found) != bits:
+        found = self.local.object_dictionary.get_variable(entry >> 16, entry >> 8 & 0xFF)
+        if found is None or not found.pdo_mappable or len(found) != entry & 0xFF:
             raise SdoAbortedError(_NOT_MAPPABLE)
 
 
 class EmulatedDrive(EmulatedNode):
     """A CiA 402 drive, whose mechanics are the machine's."""
 
-    def __init__(self, leg: int, settings: CanopenSettings, machine: Machine, network: Network, send: Send) -> None:
+    def __init__(self, leg: int, settings: CanopenSettings, machine: PlantMachine, network: Network) -> None:
         node, fd = settings.drives.nodes[leg], settings.bus.fd
         self.leg, self.machine = leg, machine
         self.commanded_ns = 0
         self._scale = settings.drives.scales[leg]
-        self._send = send
         self.answer = new_message(CobId.TPDO + node, dlc=ANSWER.size, is_fd=fd, bitrate_switch=fd)
-        super().__init__(f"drive {leg}", node, settings.drive_eds, DRIVE_PDOS, fd, network)
+        super().__init__(node, settings.drive_eds, DRIVE_PDOS, fd, network)
 
     def reset(self) -> None:
         """Return to the values of the EDS, without power."""
@@ -199,15 +226,15 @@ class EmulatedDrive(EmulatedNode):
             self.request()
 
     def _on_read(self, index: int, subindex: int, od: Any) -> int | None:
-        if index == Object.STATUSWORD:
-            return self.statusword()
-        if index == Object.ERROR_CODE:
-            return self.code
-        if index == Object.VELOCITY_ACTUAL:
-            return self.velocity()
-        if index == Object.ERROR_REGISTER:
-            return _DRIVE_ERROR if self.power in (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE) else 0
-        return self.mode if index == Object.MODE_DISPLAY else None
+        faulty = self.power in (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
+        values = {
+            Object.STATUSWORD: self.statusword(),
+            Object.ERROR_CODE: self.code,
+            Object.VELOCITY_ACTUAL: self.velocity(),
+            Object.ERROR_REGISTER: _DRIVE_ERROR if faulty else 0,
+            Object.MODE_DISPLAY: self.mode,
+        }
+        return values.get(index)
 
     def _on_write(self, index: int, subindex: int, od: Any, data: bytes) -> None:
         super()._on_write(index, subindex, od, data)
@@ -223,7 +250,7 @@ class EmulatedDrive(EmulatedNode):
             self.mode = number
         elif (index, subindex) == (Object.CONSUMER_HEARTBEAT, 1):
             self.controller, self.consumer_ns, self.controller_ns = number >> 16 & 0x7F, (number & 0xFFFF) * 1_000_000, 0
-        elif (index, subindex) == (COMMAND_PDO.communication, EVENT_TIMER):
+        elif (index, subindex) == (COMMAND_PDO.communication, Parameter.EVENT_TIMER):
             self.timeout_ns = number * 1_000_000
 
     def statusword(self) -> int:
@@ -281,7 +308,8 @@ class EmulatedDrive(EmulatedNode):
 
     def _report(self, code: int) -> None:
         self.code = code
-        self._send(new_message(CobId.EMERGENCY + self.node, code.to_bytes(2, "little") + bytes((_DRIVE_ERROR,)) + bytes(5)))
+        data = code.to_bytes(2, "little") + bytes((_DRIVE_ERROR,)) + bytes(5)
+        self.network.send_message(CobId.EMERGENCY + self.node, data)
 
     def request(self) -> None:
         """Pass the power state on to the machine's drive, as a request and a target."""
@@ -301,11 +329,11 @@ class EmulatedImu(EmulatedNode):
     def __init__(self, imu: int, settings: CanopenSettings, network: Network) -> None:
         node, fd = settings.imus.nodes[imu], settings.bus.fd
         self.imu = imu
-        super().__init__(f"IMU {imu}", node, settings.imu_eds, imu_pdos(fd), fd, network)
+        super().__init__(node, settings.imu_eds, imu_pdos(fd), fd, network)
         self.answers = {pdo.cob_id: new_message(pdo.cob_id + node, is_fd=fd, bitrate_switch=fd) for pdo in self.pdos}
         self.magnetometer_start = 0
 
     def start(self) -> None:
         """Become operational; the magnetometer's turn is as configured."""
         super().start()
-        self.magnetometer_start = self.value(MAGNETOMETER_PDO.communication, SYNC_START_VALUE)
+        self.magnetometer_start = self.value(MAGNETOMETER_PDO.communication, Parameter.SYNC_START_VALUE)

@@ -1,10 +1,11 @@
-"""Frames of the CANopen rig: identifiers, node commands and states, and how the PDOs' data are packed.
+"""What is on the bus: the frames' identifiers and data, and the nodes' objects and PDOs behind them.
 
 An IMU's synchronous PDOs carry the counter of the SYNC (object 1019h) that they answer. So a late answer to an earlier SYNC
 cannot be mistaken for the answer to this one. The sample counter beside it stays the same when the IMU repeats a sample.
 """
 
 import struct
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
@@ -12,7 +13,7 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.rigs.canopen.settings import FD_BYTES
+from hil.rigs.canopen.settings import FD_BYTES, MAGNETOMETER_INTERVAL
 from plant.compiled import Record
 from plant.pose import Array
 
@@ -71,6 +72,85 @@ TRUTH = struct.Struct("<13fB")
 TRUTH_BYTES = 64
 
 
+class Object(IntEnum):
+    """Index of an object: those of every node (CiA 301), and those of a drive (CiA 402)."""
+
+    DEVICE_TYPE = 0x1000
+    ERROR_REGISTER = 0x1001
+    DEVICE_NAME = 0x1008
+    CONSUMER_HEARTBEAT = 0x1016
+    PRODUCER_HEARTBEAT = 0x1017
+    IDENTITY = 0x1018
+    SYNC_OVERFLOW = 0x1019
+    ABORT_CONNECTION_OPTION = 0x6007
+    ERROR_CODE = 0x603F
+    CONTROLWORD = 0x6040
+    STATUSWORD = 0x6041
+    QUICK_STOP_OPTION = 0x605A
+    DISABLE_OPERATION_OPTION = 0x605C
+    FAULT_REACTION_OPTION = 0x605E
+    MODE = 0x6060
+    MODE_DISPLAY = 0x6061
+    VELOCITY_ACTUAL = 0x606C
+    MAX_MOTOR_SPEED = 0x6080
+    QUICK_STOP_DECELERATION = 0x6085
+    INTERPOLATION_PERIOD = 0x60C2
+    TARGET_VELOCITY = 0x60FF
+
+
+class Parameter(IntEnum):
+    """Sub-index of a PDO's communication parameter."""
+
+    COB_ID = 1
+    TRANSMISSION_TYPE = 2
+    EVENT_TIMER = 5
+    SYNC_START_VALUE = 6
+
+
+INVALID_COB_ID = 1 << 31
+"""Bit of a PDO's COB-ID that switches it off."""
+
+
+@dataclass(frozen=True)
+class Pdo:
+    """A PDO as it is configured over SDO."""
+
+    communication: int  # index of its communication parameters
+    mapping: int  # index of its mapping parameters
+    cob_id: int  # without the node id
+    transmission_type: int  # number of SYNCs per transmission
+    objects: tuple[int, ...]  # each: index (16 bits), sub-index (8), length in bits (8)
+
+
+_GYROSCOPE = (0x20000110, 0x20000210, 0x20000310)
+_ACCELEROMETER = (0x20010110, 0x20010210, 0x20010310)
+_MAGNETOMETER = (0x20020110, 0x20020210, 0x20020310)
+_SAMPLE_COUNTER, _LOW_SAMPLE_COUNTER, _SYNC_COUNTER = 0x20100020, 0x20110008, 0x20120008
+_MICROSECONDS, _TENS_OF_MICROSECONDS = 0x20130020, 0x20140010
+
+COMMAND_PDO = Pdo(0x1400, 0x1600, CobId.RPDO, 1, (0x60400010, 0x60FF0020))
+ANSWER_PDO = Pdo(0x1800, 0x1A00, CobId.TPDO, 1, (0x60410010, 0x606C0020, 0x603F0010))
+DRIVE_PDOS = (COMMAND_PDO, ANSWER_PDO)
+
+MAGNETOMETER_PDO = Pdo(0x1802, 0x1A02, CobId.TPDO + 0x200, MAGNETOMETER_INTERVAL, (*_MAGNETOMETER, _SYNC_COUNTER))
+_IMU_PDOS_CLASSIC = (
+    Pdo(0x1800, 0x1A00, CobId.TPDO, 1, (*_GYROSCOPE, _LOW_SAMPLE_COUNTER, _SYNC_COUNTER)),
+    Pdo(0x1801, 0x1A01, CobId.TPDO + 0x100, 1, (*_ACCELEROMETER, _TENS_OF_MICROSECONDS)),
+    MAGNETOMETER_PDO,
+)
+"""An IMU's on classic CAN. The sample counter wraps at 256, the time stamp, in units of 10 us, at 655.36 ms; the decoder finds
+the number of wraps by its own clock."""
+
+_ALL_AXES = (*_GYROSCOPE, *_ACCELEROMETER, *_MAGNETOMETER)
+_IMU_PDOS_FD = (Pdo(0x1800, 0x1A00, CobId.TPDO, 1, (*_ALL_AXES, _SAMPLE_COUNTER, _MICROSECONDS, _SYNC_COUNTER)),)
+"""An IMU's on CAN FD: 27 bytes in a frame of 32. The time stamp in us wraps after 71.6 minutes."""
+
+
+def imu_pdos(fd: bool) -> tuple[Pdo, ...]:
+    """The PDOs of an IMU."""
+    return _IMU_PDOS_FD if fd else _IMU_PDOS_CLASSIC
+
+
 def new_message(identifier: int, data: bytes = b"", **flags: Any) -> can.Message:
     """A frame with an 11-bit identifier, and further arguments of `can.Message`."""
     return can.Message(arbitration_id=identifier, data=data, **{"is_extended_id": False, **flags})
@@ -83,8 +163,7 @@ def pack_imu(
 
     Args:
         raw: (3, 3) readings of gyroscope, accelerometer and magnetometer in LSB.
-        sequence: number of the sample.
-        sample_ns: its time [ns].
+        sequence, sample_ns: number and time [ns] of the sample.
         sync: counter of the SYNC.
         fd: whether the bus is CAN FD.
         magnetometer: whether it is the magnetometer's turn, on classic CAN.
@@ -107,11 +186,9 @@ def pack_truth(truth: Array, sync: int) -> bytes:
 
 
 def raw_readings(measurement: Record, scales: NDArray[np.float64]) -> NDArray[np.int16]:
-    """Readings (3, 7, 3) in LSB of 16 bits, limited to the range; `NO_VALUE` for NaN.
+    """Readings (3, 7, 3) [rad/s, m/s^2, uT] in LSB of 16 bits, limited to the range; `NO_VALUE` for NaN.
 
-    Args:
-        measurement: (3, 7, 3) [rad/s, m/s^2, uT].
-        scales: (3, 7, 3) of an LSB, with the axes' signs.
+    The `scales` (3, 7, 3) are those of an LSB, with the axes' signs.
     """
     lsb = np.clip(np.rint(measurement / scales), NO_VALUE + 1, -NO_VALUE - 1)
     return np.where(np.isfinite(lsb), lsb, NO_VALUE).astype("<i2")

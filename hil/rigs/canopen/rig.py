@@ -14,11 +14,9 @@ import canopen
 
 from hil.rigs import ANSWERED, SILENT, DriveState, Identity, Request, RigError
 from hil.rigs.canopen.cia402 import Controlword, controlword_towards, drive_state, state_of
-from hil.rigs.canopen.configuration import configure_drive, configure_imu, switch_on
+from hil.rigs.canopen.configuration import BUS_ERRORS, MOST_DRAINED, RemoteNode, configure_drive, configure_imu, switch_on
 from hil.rigs.canopen.decoder import Decoder
-from hil.rigs.canopen.frames import COMMAND, SYNC_OVERFLOW, CobId, NmtCommand, NodeState, new_message
-from hil.rigs.canopen.objects import Object
-from hil.rigs.canopen.sdo import BUS_ERRORS, MOST_DRAINED, RemoteNode
+from hil.rigs.canopen.frames import COMMAND, SYNC_OVERFLOW, CobId, NmtCommand, NodeState, Object, new_message
 from hil.rigs.canopen.settings import CanopenSettings
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
@@ -130,12 +128,9 @@ class CanopenRig:
         """
         self._check_open()
         self._configure()
-        try:
-            for drive, node in enumerate(self._nodes[:LEGS]):
-                self.decoder.statuswords[drive] = switch_on(node, self._settings.controller)
-                self.decoder.error_codes[drive] = 0
-        except BUS_ERRORS as error:
-            raise _bus_failure(error) from error
+        for drive, node in enumerate(self._nodes[:LEGS]):
+            self.decoder.statuswords[drive] = switch_on(node, self._settings.controller)
+            self.decoder.error_codes[drive] = 0
 
     def exchange(self, command: Array, request: int, feedback: Record) -> int:
         """Send the commands (6,) [m/s] and SYNC, and receive the answers to it (see `hil.rigs.Rig.exchange`)."""
@@ -187,7 +182,7 @@ class CanopenRig:
             complaint = f"{{}} does not become operational; read its error register, object {Object.ERROR_REGISTER:04X}h"
             self._lead_nodes(NmtCommand.START, NodeState.OPERATIONAL, complaint, broadcast=True)
         except BUS_ERRORS as error:
-            raise _bus_failure(error) from error
+            raise RigError(f"the bus has failed: {error}; check its wiring and termination") from error
         self._configured = True
 
     def _check_open(self) -> None:
@@ -303,17 +298,11 @@ class CanopenRig:
         """Send all drives a controlword, by SDO and by PDO with SYNC, whatever happens."""
         if self._bus is None:
             return
+        frames, request = [], _SDO_CONTROLWORD.pack(0x2B, Object.CONTROLWORD, 0, controlword, 0)
         for message, node in zip(self._commands, self._settings.drives.nodes, strict=True):
             COMMAND.pack_into(message.data, 0, controlword, 0)
-            request = _SDO_CONTROLWORD.pack(0x2B, Object.CONTROLWORD, 0, controlword, 0)
+            frames += [message, new_message(CobId.SDO_REQUEST + node, request)]
+        self.decoder.begin(self._next_sync())
+        for frame in (*frames, self._sync):
             with suppress(Exception):
-                self._bus.send(message)
-            with suppress(Exception):
-                self._bus.send(new_message(CobId.SDO_REQUEST + node, request))
-        with suppress(Exception):
-            self.decoder.begin(self._next_sync())
-            self._bus.send(self._sync)
-
-
-def _bus_failure(error: Exception) -> RigError:
-    return RigError(f"the bus has failed: {error}; check its wiring and termination")
+                self._bus.send(frame)

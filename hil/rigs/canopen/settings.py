@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from math import ceil, isfinite
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, get_type_hints
+from typing import Any
 
 import canopen
 import numpy as np
@@ -32,12 +32,11 @@ _LARGEST_NODE = 127
 _LONGEST_TIME = 65.535
 _INT32 = 2**31 - 1
 
-S = TypeVar("S", bound="_Table")
 Check = Callable[[str, Any], None]
 """Takes an entry's name and value, and raises an `InputError` if the value cannot be used."""
 
 
-def _entry(text: str, check: Check | None = None) -> Any:
+def _entry(text: str, check: Check = lambda name, value: None) -> Any:
     """An entry of a table: its meaning, and a check of its value."""
     return field(metadata={"text": text, "check": check})
 
@@ -81,22 +80,10 @@ def _list_of(count: int, check_element: Check) -> Check:
 _TIME = _within(0.001, _LONGEST_TIME)
 
 
-class _Table:
-    """A table of the settings' file. Its fields say what they mean; their values are checked when it is made."""
-
-    table: ClassVar[str]
-
-    def __post_init__(self) -> None:
-        for each in fields(self):  # type: ignore[arg-type]
-            if each.metadata["check"] is not None:
-                each.metadata["check"](f"[{self.table}] {each.name}", getattr(self, each.name))
-
-
 @dataclass(frozen=True)
-class BusSettings(_Table):
+class BusSettings:
     """The bus, as python-can names it."""
 
-    table: ClassVar[str] = "bus"
     interface: str = _entry(f"one of {', '.join(INTERFACES)}", _one_of(*INTERFACES))
     channel: str = _entry("such as can0, or the multicast group")
     port: int = _entry("port of the multicast group", _within(1, 65535))
@@ -106,24 +93,18 @@ class BusSettings(_Table):
     data_bitrate: int = _entry("bit rate of CAN FD's data phase [bit/s], at least the other one")
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         _within(self.bitrate, 8_000_000)("[bus] data_bitrate", self.data_bitrate)
 
     def arguments(self) -> dict[str, Any]:
         """The arguments of `can.Bus`."""
-        common: dict[str, Any] = {"interface": self.interface, "channel": self.channel}
-        if self.interface == "virtual":
-            return common
-        if self.interface == "socketcan":
-            return common | {"fd": self.fd}
-        return common | {"port": self.port, "hop_limit": self.hop_limit, "fd": self.fd}
+        needed = {"virtual": (), "socketcan": ("fd",), "udp_multicast": ("port", "hop_limit", "fd")}[self.interface]
+        return {name: getattr(self, name) for name in ("interface", "channel", *needed)}
 
 
 @dataclass(frozen=True)
-class ControllerSettings(_Table):
+class ControllerSettings:
     """The controller's node."""
 
-    table: ClassVar[str] = "controller"
     node: int = _entry("node id, for the heartbeat", _node_id)
     heartbeat: float = _entry("interval of the heartbeats [s]", _TIME)
     heartbeat_timeout: float = _entry("time without a heartbeat after which the drives stop by themselves [s]")
@@ -131,15 +112,13 @@ class ControllerSettings(_Table):
     boot_timeout: float = _entry("time for all nodes to boot up [s]", _within(0.01, 60.0))
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         _within(2.0 * self.heartbeat, _LONGEST_TIME)("[controller] heartbeat_timeout", self.heartbeat_timeout)
 
 
 @dataclass(frozen=True)
-class DriveSettings(_Table):
+class DriveSettings:
     """The six drives, by leg."""
 
-    table: ClassVar[str] = "drives"
     nodes: tuple[int, ...] = _entry("node ids", _list_of(LEGS, _node_id))
     signs: tuple[int, ...] = _entry("signs of the motors' velocities when the legs extend", _list_of(LEGS, _one_of(1, -1)))
     eds: str = _entry("electronic data sheet; a relative path begins at the folder of the settings file")
@@ -153,7 +132,6 @@ class DriveSettings(_Table):
     command_timeout: float = _entry("time without SYNC and commands after which a drive stops by itself [s]", _TIME)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         _within(2.0 * self.heartbeat, _LONGEST_TIME)("[drives] silence", self.silence)
         for name in ("velocity_limit", "quick_stop_deceleration"):
             if (counts := getattr(self, name) * self.counts_per_metre) > _INT32:
@@ -173,10 +151,9 @@ class DriveSettings(_Table):
 
 
 @dataclass(frozen=True)
-class ImuSettings(_Table):
+class ImuSettings:
     """The seven IMUs: those on the legs, and last the platform's."""
 
-    table: ClassVar[str] = "imus"
     nodes: tuple[int, ...] = _entry("node ids", _list_of(IMU_COUNT, _node_id))
     signs: tuple[tuple[int, ...], ...] = _entry("signs of the axes", _list_of(IMU_COUNT, _list_of(3, _one_of(1, -1))))
     eds: str = _entry("electronic data sheet; a relative path begins at the folder of the settings file")
@@ -305,34 +282,34 @@ def canopen_settings(path: Path | str = DEFAULT_FILE, **changes: Mapping[str, An
     """
     path = Path(path)
     document = read_toml(path)
-    kinds = (BusSettings, ControllerSettings, DriveSettings, ImuSettings)
-    names = [kind.table for kind in kinds]
+    kinds = {"bus": BusSettings, "controller": ControllerSettings, "drives": DriveSettings, "imus": ImuSettings}
     for name in [*document, *changes]:
-        if name not in names:
-            raise InputError(f"{path} has a table [{name}] that is not known; the tables are {', '.join(names)}")
+        if name not in kinds:
+            raise InputError(f"{path} has a table [{name}] that is not known; the tables are {', '.join(kinds)}")
     tables: dict[str, Any] = {
-        kind.table: _read(kind, {**document.get(kind.table, {}), **changes.get(kind.table, {})}) for kind in kinds
+        name: kind(**_checked(name, kind, {**document.get(name, {}), **changes.get(name, {})})) for name, kind in kinds.items()
     }
     return CanopenSettings(**tables, folder=path.resolve().parent)
 
 
-def _read(kind: type[S], table: Mapping[str, Any]) -> S:
-    entries = {each.name: each.metadata["text"] for each in fields(kind)}  # type: ignore[arg-type]
-    hints = get_type_hints(kind)
-    check_entries(table, entries, f"[{kind.table}]")
+def _checked(title: str, kind: Any, table: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of a table, whose types and ranges are those of the fields of `kind`."""
+    check_entries(table, [each.name for each in fields(kind)], f"[{title}]")
     values = {}
-    for name, text in entries.items():
-        if name not in table:
-            raise InputError(f"[{kind.table}] lacks the entry {name!r} ({text})")
-        value, wanted = _frozen(table[name]), hints[name]
-        if wanted is float and isinstance(value, int) and not isinstance(value, bool):
+    for each in fields(kind):
+        name = f"[{title}] {each.name}"
+        if each.name not in table:
+            raise InputError(f"[{title}] lacks the entry {each.name!r} ({each.metadata['text']})")
+        value, wanted = _frozen(table[each.name]), each.type
+        if wanted is float and type(value) is int:
             value = float(value)
         if wanted in (bool, int, float, str) and type(value) is not wanted:
-            raise InputError(f"[{kind.table}] {name} must be a {wanted.__name__}, got {value!r}")
+            raise InputError(f"{name} must be a {wanted.__name__}, got {value!r}")
         if wanted not in (bool, int, float, str) and not isinstance(value, tuple):
-            raise InputError(f"[{kind.table}] {name} must be a list, got {value!r}")
-        values[name] = value
-    return kind(**values)
+            raise InputError(f"{name} must be a list, got {value!r}")
+        each.metadata["check"](name, value)
+        values[each.name] = value
+    return values
 
 
 def _frozen(value: Any) -> Any:

@@ -22,36 +22,30 @@ from plant.vectors import rotate, vector
 
 EMULATED = record_dtype(
     time_ns=np.int64,
-    step_ns=np.int64,
-    enabled_ns=np.int64,
-    deceleration=np.float64,
-    speed_limit=np.float64,
-    payload=np.float64,
-    added=np.float64,
-    request=(np.int64, LEGS),
-    target=(np.float64, LEGS),
-    reset=(np.int64, LEGS),
-    drive=(np.int64, LEGS),
-    code=(np.int64, LEGS),
-    velocity=(np.float64, LEGS),
-    measurement=(np.float64, (3, IMU_COUNT, 3)),
+    step_ns=np.int64,  # the plant's largest
+    enabled_ns=np.int64,  # when the drives were first enabled; negative before
+    deceleration=np.float64,  # in a quick stop or after a fault [m/s^2]
+    speed_limit=np.float64,  # [m/s]
+    payload=np.float64,  # [kg]
+    added=np.float64,  # payload [kg]
+    request=(np.int64, LEGS),  # Request
+    target=(np.float64, LEGS),  # velocity [m/s]
+    reset=(np.int64, LEGS),  # whether to clear the drive's fault
+    drive=(np.int64, LEGS),  # DriveState
+    code=(np.int64, LEGS),  # of the fault
+    velocity=(np.float64, LEGS),  # present [m/s]
+    measurement=(np.float64, (3, IMU_COUNT, 3)),  # the last sample [rad/s, m/s^2, uT]
     sample_ns=(np.int64, IMU_COUNT),
     sequence=(np.int64, IMU_COUNT),
     truth=(np.float64, TRUTH_SIZE),
     fault=(FAULT, MOST_FAULTS),
     faults=np.int64,
-    random=(np.uint64, 1),
-    ideal=(np.float64, (3, IMU_COUNT, 3)),
+    random=(np.uint64, 1),  # state of the faults' random numbers
+    ideal=(np.float64, (3, IMU_COUNT, 3)),  # scratch, as the rest
     turn=(np.float64, (3, 3)),
     axis=(np.float64, 3),
 )
-"""State of an emulated rig: its clock, the plant's largest step, when the drives were first enabled (negative before), the
-drives' `deceleration` in a quick stop or after a fault [m/s^2], their speed limit [m/s], payload and added payload [kg].
-
-A bus sets each drive's `request` (`Request`), its `target` velocity [m/s], and `reset` to clear its fault. It reads each
-drive's state (`DriveState`), fault code and present `velocity` [m/s], and each IMU's last sample with its time and number. The
-rest are the faults, their random state, and scratch.
-"""
+"""State of an emulated rig. A bus sets `request`, `target` and `reset`, and reads the drives and the IMUs' last samples."""
 
 POWER_LOST = 0x3220
 """CiA 402's code for a voltage that was too low; a drive reports it when its power is back."""

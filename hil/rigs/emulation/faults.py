@@ -59,14 +59,12 @@ class FaultKind(IntEnum):
 
 FAULT = record_dtype(
     kind=np.int64,
-    index=np.int64,
-    begin_ns=np.int64,
+    index=np.int64,  # of the IMU or drive
+    begin_ns=np.int64,  # since the drives were first enabled; below 0: from the start
     end_ns=np.int64,
     size=np.float64,
 )
-"""A fault: its kind, the number of the IMU or drive, its start and end [ns since the drives were first enabled], and its size.
-A fault that begins below 0 is there from the start.
-"""
+"""A fault."""
 
 MOST_FAULTS = 32
 _FOREVER = np.iinfo(np.int64).max

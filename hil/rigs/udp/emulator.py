@@ -51,33 +51,24 @@ PACKET = record_dtype(
 
 UDP_SESSION = record_dtype(
     id=np.uint32,
-    last=np.uint32,
-    commanded_ns=np.int64,
-    watchdog_ns=np.int64,
-    refused=np.int64,
-    held_back=(np.int64, 2),
-    packet=(PACKET, _PACKETS),
+    last=np.uint32,  # sequence number of the last command
+    commanded_ns=np.int64,  # its time
+    watchdog_ns=np.int64,  # time without a command after which the drives stop
+    refused=np.int64,  # datagrams
+    held_back=(np.int64, 2),  # whether a packet arrives after the next, each way
+    packet=(PACKET, _PACKETS),  # in transit
 )
-"""A session of an emulated rig: its id; sequence number and time of the last command; the time without a command after which
-the drives stop; the number of refused datagrams; whether a packet is held back to arrive after the next, each way; and the
-packets in transit."""
+"""A session of an emulated rig."""
 
 
 class UdpEmulator(NamedTuple):
-    """An emulated rig on UDP, in compiled code.
+    """An emulated rig on UDP, in compiled code."""
 
-    Attributes:
-        fmu, imu: the plant and its IMUs' imperfections.
-        rig: dtype `hil.rigs.emulation.drives.EMULATED`.
-        session: dtype `UDP_SESSION`.
-        link: the rig's side of the link; the rig is in memory if its socket has no descriptor.
-    """
-
-    fmu: Record
-    imu: Record
-    rig: Record
-    session: Record
-    link: UdpLink
+    fmu: Record  # the plant
+    imu: Record  # its IMUs' imperfections
+    rig: Record  # dtype `hil.rigs.emulation.drives.EMULATED`
+    session: Record  # dtype `UDP_SESSION`
+    link: UdpLink  # the rig's side; the rig is in memory if its socket has no descriptor
 
 
 def new_udp_emulator(fmu: Record, imu: Record, rig: Record, session: int = 0, watchdog_s: float = WATCHDOG_S) -> UdpEmulator:

@@ -82,37 +82,28 @@ def socket_address(address: tuple[str, int]) -> NDArray[np.uint8]:
 SOCKET = record_dtype(
     descriptor=np.int64,
     session=np.uint32,
-    sequence=np.uint32,
-    timeout_ns=np.int64,
-    reset=np.uint32,
-    peer=(np.uint8, 16),
-    sender=(np.uint8, 16),
+    sequence=np.uint32,  # of the last command
+    timeout_ns=np.int64,  # to wait for the answer
+    reset=np.uint32,  # whether commands reset the drives' faults
+    peer=(np.uint8, 16),  # sockaddr_in
+    sender=(np.uint8, 16),  # the last one, sockaddr_in
     sender_size=(np.int32, 2),
-    stranger=np.int64,
-    poll=(np.int32, 2),
-    timespec=(np.int64, 2),
+    stranger=np.int64,  # whether the sender is not the peer
+    poll=(np.int32, 2),  # scratch
+    timespec=(np.int64, 2),  # scratch
 )
-"""A socket in compiled code: its descriptor; session and sequence number of the last command, and how long to wait for the
-answer; whether commands reset the drives' faults; the other side's address, and the last sender's, as `sockaddr_in`; whether
-that was a stranger; and scratch for system calls.
-"""
+"""A socket in compiled code."""
 
 
 class UdpLink(NamedTuple):
-    """One side of the link, in compiled code.
+    """One side of the link, in compiled code."""
 
-    Attributes:
-        socket: dtype `SOCKET`.
-        command, command_bytes: the datagram from the controller, and its buffer.
-        answer, truth, answer_bytes: the measurement from the rig, the truth that may follow it, and the buffer of both.
-    """
-
-    socket: Record
-    command: Record
-    command_bytes: Bytes
-    answer: Record
-    truth: Record
-    answer_bytes: Bytes
+    socket: Record  # dtype `SOCKET`
+    command: Record  # from the controller
+    command_bytes: Bytes  # its buffer
+    answer: Record  # the measurement from the rig
+    truth: Record  # which may follow it
+    answer_bytes: Bytes  # the buffer of both
 
 
 def new_link() -> UdpLink:

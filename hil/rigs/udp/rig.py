@@ -19,9 +19,7 @@ from plant.pose import Array
 TIMEOUT_SHARE = 0.5
 """Share of the period that an exchange may take."""
 
-_OPENING_S, _HANDSHAKE_S = 2.0, 0.2
-_ARMING_S = 2.0
-_STOPPING_S = 0.5
+_OPENING_S, _HANDSHAKE_S, _ARMING_S, _STOPPING_S = 2.0, 0.2, 2.0, 0.5
 _FAREWELLS = 3
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from hil.rigs import examiner, template
+from hil.rigs import contract, template
 
 LOOK_NS = 1_000
 
@@ -31,6 +31,6 @@ class VirtualTime:
 def virtual_time(monkeypatch: pytest.MonkeyPatch) -> VirtualTime:
     """The clock of the examiner and of the template rig."""
     clock = VirtualTime()
-    for module in (examiner, template):
+    for module in (contract, template):
         monkeypatch.setattr(module, "time", clock)
     return clock

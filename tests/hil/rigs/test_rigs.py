@@ -22,7 +22,7 @@ from hil.loop.records import RECORD
 from hil.realtime.scheduling import RealTimeSettings
 from hil.recording.mcap import Recorder, read
 from hil.recording.replay_rig import ENDED, FAILED, ReplayRig
-from hil.rigs import ANSWERED, BRAKED, ENABLED, FOLLOWING, READY, SILENT, Identity, RigError, examiner, new_feedback
+from hil.rigs import ANSWERED, BRAKED, ENABLED, FOLLOWING, READY, SILENT, Identity, RigError, contract, new_feedback
 from hil.rigs.by_name import python_rig
 from hil.rigs.canopen.rig import CanopenRig
 from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings
@@ -231,7 +231,7 @@ class StandsStill(TemplateRig):
 
 class IsSlow(TemplateRig):
     def exchange(self, command, request, feedback):
-        examiner.time.sleep(1.5 * PERIOD)
+        contract.time.sleep(1.5 * PERIOD)
         return super().exchange(command, request, feedback)
 
 
