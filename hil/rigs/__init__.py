@@ -118,11 +118,8 @@ class Rig(Protocol):
         """Leave the drives on their brakes, and release the bus. It must not raise, and may be called twice."""
 
 
-METHODS = ("open", "identify", "arm", "exchange", "quick_stop", "close")
-"""The methods of a rig."""
-
-
 def missing_members(rig: object) -> list[str]:
     """The methods and attributes of `Rig` that an object lacks; of a class, the methods."""
-    missing = [name for name in METHODS if not callable(getattr(rig, name, None))]
+    methods = ("open", "identify", "arm", "exchange", "quick_stop", "close")
+    missing = [name for name in methods if not callable(getattr(rig, name, None))]
     return missing if isinstance(rig, type) or hasattr(rig, "command_delay") else [*missing, "command_delay"]

@@ -168,13 +168,14 @@ class _Examiner:
 
     def _expect(self, held: object, clause: str, text: str, kind: str = "") -> None:
         """Note a finding unless something held."""
+        self._begin(clause)
         if not held:
             self._find(clause, text, kind)
 
     def _require(self, held: object, clause: str, text: str) -> None:
         """Note a finding and break off unless something held."""
+        self._expect(held, clause, text)
         if not held:
-            self._find(clause, text)
             raise _BrokenOffError
 
     def _call(self, name: str, clause: str, when: str = "") -> Any:
@@ -196,7 +197,6 @@ class _Examiner:
     # -------------------------------------------------------------------------------------------- before the exchanges
 
     def _check_interface(self) -> None:
-        self._begin("interface")
         missing = missing_members(self._rig)
         self._require(not missing, "interface", f"It lacks {', '.join(missing)}.")
         delay = self._rig.command_delay
@@ -212,7 +212,6 @@ class _Examiner:
         self._expect(texts, "identifies", "The identity's parts must be texts by name, for they are recorded.")
 
     def _check_threads(self, before: set[threading.Thread], when: str, patience: float = 0.0) -> None:
-        self._begin("threads")
         deadline = time.monotonic() + patience
         while (more := [each for each in threading.enumerate() if each not in before]) and time.monotonic() < deadline:
             time.sleep(0.01)
@@ -411,7 +410,6 @@ class _Examiner:
             return
         durations = percentiles(np.array(self._durations), ("p50", "p99", "max", "n"))
         self._result.exchange_us, p99 = durations, durations["p99"]
-        self._begin("period")
         took = f"{p99 / 1e3:.3g} ms (p99 of {durations['n']})"
         text = f"An exchange takes {took}, longer than the period of {1e3 * self._period:g} ms."
         self._expect(p99 <= 1e6 * self._period, "period", text)

@@ -11,8 +11,9 @@ from copy import deepcopy
 from itertools import count
 
 import can
+import canopen
 
-from hil.rigs.canopen.emulated_nodes import EmulatedDrive, EmulatedImu, EmulatedNode, Network, PlantMachine
+from hil.rigs.canopen.emulated_nodes import EmulatedDrive, EmulatedImu, EmulatedNode, PlantMachine
 from hil.rigs.canopen.frames import (
     ANSWER,
     COMMAND,
@@ -63,7 +64,8 @@ class EmulatedBus:
         self._channel = channel or (lambda message, outgoing: ((0.0, message),))
         self._scales = settings.imus.scales
         self._bus = can.Bus(**settings.bus.arguments())
-        self._network = Network(self._send)
+        # The network sends by this object's `send`.
+        self._network = canopen.Network(self)
         self.drives = [EmulatedDrive(leg, settings, machine, self._network) for leg in range(LEGS)]
         self.imus = [EmulatedImu(imu, settings, self._network) for imu in range(IMU_COUNT)]
         self.lost = 0
@@ -117,17 +119,14 @@ class EmulatedBus:
         for node in self._nodes:
             if node.heartbeat_ns and now >= node.heartbeat_due:
                 node.heartbeat_due = now + node.heartbeat_ns
-                self._send_heartbeat(node, node.state)
-
-    def _send_heartbeat(self, node: EmulatedNode, state: NodeState) -> None:
-        self._send(new_message(CobId.HEARTBEAT + node.node, bytes((state,))))
+                self._network.send_message(CobId.HEARTBEAT + node.node, bytes((node.state,)))
 
     def _boot(self, node: EmulatedNode) -> None:
         node.reset()
-        self._send_heartbeat(node, NodeState.BOOT_UP)
+        self._network.send_message(CobId.HEARTBEAT + node.node, bytes((NodeState.BOOT_UP,)))
 
-    def _send(self, message: can.Message) -> None:
-        # A frame that is held back must not change when its object is used again.
+    def send(self, message: can.Message) -> None:
+        """Send a frame; one that is held back does not change when its object is used again."""
         self._pass(deepcopy(message), True)
 
     def _pass(self, message: can.Message, outgoing: bool) -> None:
@@ -177,11 +176,11 @@ class EmulatedBus:
         machine.sample(now)
         if self._fd:
             self._truth.data = bytearray(pack_truth(rig["truth"], sync))
-            self._send(self._truth)
+            self.send(self._truth)
         for drive in self.drives:
             if CobId.TPDO in drive.active:
                 drive.answer.data = bytearray(ANSWER.pack(drive.statusword(), drive.velocity(), drive.code))
-                self._send(drive.answer)
+                self.send(drive.answer)
         raw = raw_readings(rig["measurement"], self._scales)
         for node in self.imus:
             if node.active:
@@ -192,7 +191,7 @@ class EmulatedBus:
                     if cob_id in node.active:
                         answer = node.answers[cob_id]
                         answer.data, answer.dlc = bytearray(data), len(data)
-                        self._send(answer)
+                        self.send(answer)
 
     def _on_nmt(self, command: int, addressed: int) -> None:
         for node in self._nodes:

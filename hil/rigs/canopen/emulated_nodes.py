@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import can
 import canopen
 import numpy as np
 from canopen.sdo import SdoAbortedError
@@ -102,22 +101,10 @@ class PlantMachine:
             raise self._plant.failure()
 
 
-class Network(canopen.Network):  # type: ignore[misc]
-    """A network whose nodes send with a function of their own."""
-
-    def __init__(self, send: Callable[[can.Message], None]) -> None:
-        super().__init__()
-        self.send = send
-
-    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """Send a frame."""
-        self.send(new_message(can_id, data, is_remote_frame=remote))
-
-
 class EmulatedNode:
     """What drives and IMUs have in common: object dictionary, NMT state, heartbeat and configuration of the PDOs."""
 
-    def __init__(self, node: int, eds: Any, pdos: tuple[Pdo, ...], fd: bool, network: Network) -> None:
+    def __init__(self, node: int, eds: Any, pdos: tuple[Pdo, ...], fd: bool, network: canopen.Network) -> None:
         self.node, self.pdos, self.network = node, pdos, network
         self.local = canopen.LocalNode(node, object_dictionary(eds, node))
         # canopen's own callback would start a thread that sends the heartbeat.
@@ -197,7 +184,7 @@ class EmulatedNode:
 class EmulatedDrive(EmulatedNode):
     """A CiA 402 drive, whose mechanics are the machine's."""
 
-    def __init__(self, leg: int, settings: CanopenSettings, machine: PlantMachine, network: Network) -> None:
+    def __init__(self, leg: int, settings: CanopenSettings, machine: PlantMachine, network: canopen.Network) -> None:
         node, fd = settings.drives.nodes[leg], settings.bus.fd
         self.leg, self.machine = leg, machine
         self.commanded_ns = 0
@@ -326,7 +313,7 @@ class EmulatedDrive(EmulatedNode):
 class EmulatedImu(EmulatedNode):
     """An IMU, whose readings are the machine's."""
 
-    def __init__(self, imu: int, settings: CanopenSettings, network: Network) -> None:
+    def __init__(self, imu: int, settings: CanopenSettings, network: canopen.Network) -> None:
         node, fd = settings.imus.nodes[imu], settings.bus.fd
         self.imu = imu
         super().__init__(node, settings.imu_eds, imu_pdos(fd), fd, network)

@@ -64,7 +64,6 @@ class CanopenRig:
         self._heartbeat_ns, self._heartbeat_due = round(settings.controller.heartbeat * 1e9), 0
         self._scales = settings.drives.scales
         self._misses = [0] * self.decoder.all_frames.bit_length()
-        self._missed = False
         fd = settings.bus.fd
         self._commands = [
             new_message(CobId.RPDO + node, bytes(COMMAND.size), is_fd=fd, bitrate_switch=fd) for node in settings.drives.nodes
@@ -141,8 +140,7 @@ class CanopenRig:
         try:
             self._drain()
             self._send_commands(command, request, feedback)
-            decoder.begin(self._next_sync())
-            self._bus.send(self._sync)
+            self._bus.send(self._next_sync())
             if start >= self._heartbeat_due:
                 self._heartbeat_due = start + self._heartbeat_ns
                 self._bus.send(self._heartbeat)
@@ -231,10 +229,11 @@ class CanopenRig:
                     self._command_nodes(command, node)
             self._receive(min(deadline, reminder) - now)
 
-    def _next_sync(self) -> int:
-        sync = self._sync.data[0] % SYNC_OVERFLOW + 1
-        self._sync.data[0] = sync
-        return sync
+    def _next_sync(self) -> can.Message:
+        """The next SYNC, whose answers the decoder then accepts."""
+        self._sync.data[0] = self._sync.data[0] % SYNC_OVERFLOW + 1
+        self.decoder.begin(self._sync.data[0])
+        return self._sync
 
     def _drain(self) -> None:
         """Read the frames since the last exchange; as PDOs they are too late for it."""
@@ -267,15 +266,9 @@ class CanopenRig:
 
     def _note_missing(self, missing: int) -> None:
         """Stop waiting for frames that have been missing for a while."""
-        if not missing:
-            if self._missed:
-                self._misses = [0] * len(self._misses)
-                self._missed = False
-            return
-        self._missed = True
         for bit, misses in enumerate(self._misses):
             self._misses[bit] = misses + 1 if missing >> bit & 1 else 0
-            if misses + 1 >= _GIVEN_UP_AFTER and missing >> bit & 1:
+            if self._misses[bit] >= _GIVEN_UP_AFTER:
                 self.decoder.awaited &= ~(1 << bit)
 
     def _fill(self, feedback: Record, start: int) -> None:
@@ -302,7 +295,6 @@ class CanopenRig:
         for message, node in zip(self._commands, self._settings.drives.nodes, strict=True):
             COMMAND.pack_into(message.data, 0, controlword, 0)
             frames += [message, new_message(CobId.SDO_REQUEST + node, request)]
-        self.decoder.begin(self._next_sync())
-        for frame in (*frames, self._sync):
+        for frame in (*frames, self._next_sync()):
             with suppress(Exception):
                 self._bus.send(frame)

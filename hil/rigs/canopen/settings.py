@@ -28,7 +28,6 @@ MAGNETOMETER_INTERVAL = 10
 COMMAND_BYTES, ANSWER_BYTES, FD_BYTES = 6, 8, 32
 """Length of a drive's RPDO; of a drive's TPDO and of an IMU's on classic CAN; of an IMU's one TPDO on CAN FD."""
 
-_LARGEST_NODE = 127
 _LONGEST_TIME = 65.535
 _INT32 = 2**31 - 1
 
@@ -41,30 +40,21 @@ def _entry(text: str, check: Check = lambda name, value: None) -> Any:
     return field(metadata={"text": text, "check": check})
 
 
-def _within(lowest: float, highest: float) -> Check:
-    def check(name: str, value: float) -> None:
-        if not lowest <= value <= highest:
-            raise InputError(f"{name} is {value:g}; it must be from {lowest:g} to {highest:g}")
+def _must(hold: Callable[[Any], bool], text: str, shown: Callable[[Any], str] = repr) -> Check:
+    def check(name: str, value: object) -> None:
+        if not hold(value):
+            raise InputError(f"{name} is {shown(value)}; {text}")
 
     return check
 
 
-def _positive(name: str, value: float) -> None:
-    if not (isfinite(value) and value > 0.0):
-        raise InputError(f"{name} is {value:g}; it must be positive and finite")
-
-
-def _node_id(name: str, value: object) -> None:
-    if type(value) is not int or not 1 <= value <= _LARGEST_NODE:
-        raise InputError(f"{name} is {value!r}; a node id is a number from 1 to {_LARGEST_NODE}")
+def _within(lowest: float, highest: float) -> Check:
+    return _must(lambda value: lowest <= value <= highest, f"it must be from {lowest:g} to {highest:g}", "{:g}".format)
 
 
 def _one_of(*values: object) -> Check:
-    def check(name: str, value: object) -> None:
-        if type(value) is not type(values[0]) or value not in values:
-            raise InputError(f"{name} is {value!r}; it must be one of {', '.join(map(str, values))}")
-
-    return check
+    text = f"it must be one of {', '.join(map(str, values))}"
+    return _must(lambda value: type(value) is type(values[0]) and value in values, text)
 
 
 def _list_of(count: int, check_element: Check) -> Check:
@@ -78,6 +68,8 @@ def _list_of(count: int, check_element: Check) -> Check:
 
 
 _TIME = _within(0.001, _LONGEST_TIME)
+_positive = _must(lambda value: isfinite(value) and value > 0.0, "it must be positive and finite", "{:g}".format)
+_node_id = _must(lambda value: type(value) is int and 1 <= value <= 127, "a node id is a number from 1 to 127")
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ from hil.rigs.udp.link import (
     send_datagram,
 )
 from plant.compiled import Record, kernel, record_dtype
-from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS
 from plant.pose import Array
 from plant.stopwatch import now
@@ -115,16 +114,10 @@ def answer_command(emulator: UdpEmulator, length: int, now_ns: int) -> int:
     a.magic, a.version, a.kind = MAGIC, VERSION, DatagramKind.MEASUREMENT
     a.session, a.sequence, a.time_ns = c.session, c.sequence, now_ns
     a.refused = session.refused
-    for k in range(IMU_COUNT):
-        a.sample_ns[k], a.sample_number[k] = rig.sample_ns[k], rig.sequence[k]
-        for kind in range(3):
-            for i in range(3):
-                a.measurement[kind, k, i] = rig.measurement[kind, k, i]
-    for k in range(LEGS):
-        a.drive[k], a.code[k], a.velocity[k] = rig.drive[k], rig.code[k], rig.velocity[k]
+    a.sample_ns[:], a.sample_number[:], a.measurement[:] = rig.sample_ns, rig.sequence, rig.measurement
+    a.drive[:], a.code[:], a.velocity[:] = rig.drive, rig.code, rig.velocity
     a.crc = crc32(link.answer_bytes, link.answer.itemsize - 4)
-    for i in range(rig.truth.size):
-        t.truth[i] = rig.truth[i]
+    t.truth[:] = rig.truth
     t.crc = crc32(link.answer_bytes[link.answer.itemsize :], link.truth.itemsize - 4)
     return int(link.answer_bytes.size)
 
@@ -156,8 +149,7 @@ def post_packet(emulator: UdpEmulator, content: Bytes, length: int, way: int, no
         if copies > 0 and p.length == 0:
             p.way, p.length = way, length
             p.due_ns = _NEVER if held else now_ns + delay
-            for j in range(length):
-                p.content[j] = content[j]
+            p.content[:length] = content[:length]
             if corrupt:
                 bit = int(draw(emulator.rig[()].random) * 8 * length)
                 p.content[bit // 8] ^= np.uint8(1 << (bit % 8))
@@ -181,8 +173,7 @@ def take_packet(packet: Record, data: Bytes) -> int:
     """Take a packet out of transit into `data`; returns its length."""
     length = packet.length
     packet.length = 0
-    for j in range(length):
-        data[j] = packet.content[j]
+    data[:length] = packet.content[:length]
     return int(length)
 
 

@@ -26,7 +26,6 @@ from hil.rigs.udp.datagrams import (
     is_valid,
 )
 from plant.compiled import Record, kernel, record_dtype
-from plant.dynamics.variables import IMU_COUNT
 from plant.errors import InputError
 from plant.mechanism import LEGS
 from plant.pose import Array
@@ -168,8 +167,7 @@ def encode_command(link: UdpLink, command: Array, request: int, time_ns: int) ->
     c.magic, c.version, c.kind = MAGIC, VERSION, DatagramKind.COMMAND
     c.session, c.sequence, c.time_ns = s.session, s.sequence, time_ns
     c.request, c.reset = request, s.reset
-    for k in range(LEGS):
-        c.velocity[k] = command[k]
+    c.velocity[:] = command
     c.crc = crc32(link.command_bytes, link.command.itemsize - 4)
 
 
@@ -197,14 +195,10 @@ def decode_answer(link: UdpLink, length: int, feedback: Record) -> bool:
     ):
         feedback.refused += 1
         return False
-    for k in range(IMU_COUNT):
-        feedback.sample_ns[k], feedback.sequence[k] = a.sample_ns[k], a.sample_number[k]
-        for kind in range(3):
-            for i in range(3):
-                feedback.measurement[kind, k, i] = a.measurement[kind, k, i]
+    feedback.sample_ns[:], feedback.sequence[:], feedback.measurement[:] = a.sample_ns, a.sample_number, a.measurement
     for k in range(LEGS):
         feedback.drive[k] = a.drive[k] if a.drive[k] <= DriveState.FAULTY else DriveState.NOT_READY.value
-        feedback.drive_code[k], feedback.sent[k] = a.code[k], a.velocity[k]
+    feedback.drive_code[:], feedback.sent[:] = a.code, a.velocity
     for i in range(feedback.truth.size):
         feedback.truth[i] = t.truth[i] if with_truth else np.nan
     return True
