@@ -103,7 +103,7 @@ def gough_emulate(options: Namespace) -> None:
 )
 def gough_inject(options: Namespace) -> None:
     """Inject a fault into an emulated rig that is running, or ask for its state."""
-    from hil.rigs.emulation.faults import FaultKind
+    from hil.rigs.emulation import FaultKind
     from hil.runs.emulator import ask
 
     if options.list:

@@ -11,9 +11,9 @@ import resource
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from hil.option import option
 from plant.errors import GoughError, InputError, UnknownNameError
@@ -124,8 +124,7 @@ def _take_priority(priority: int) -> Callable[[], Any]:
     return lambda: os.sched_setscheduler(0, policy, before)
 
 
-@dataclass(frozen=True)
-class Usage:
+class Usage(NamedTuple):
     """The usage of the calling thread, and of its process's memory."""
 
     major_faults: int  # pages that were read in
@@ -137,8 +136,7 @@ class Usage:
 
     def since(self, before: "Usage") -> dict[str, float]:
         """The differences, by name."""
-        first = asdict(before)
-        return {name: value - first[name] for name, value in asdict(self).items()}
+        return {name: getattr(self, name) - getattr(before, name) for name in self._fields}
 
 
 def usage() -> Usage:

@@ -320,8 +320,8 @@ class _Examiner:
         text = f"exchange returned {status!r}; it must return ANSWERED, SILENT, or a failure above."
         self._require(sound, "exchanges", text)
         self._silent += status == SILENT
-        reason = f": {self._rig.failure}" if getattr(self._rig, "failure", "") else ""
-        text = f"Exchange {len(self._durations)} failed with status {status}{reason}."
+        failure = getattr(self._rig, "failure", "")
+        text = f"Exchange {len(self._durations)} failed with status {status}{f': {failure}' if failure else ''}."
         self._require(status <= SILENT, "exchanges", text)
         kept = np.array_equal(given, command, equal_nan=True)
         self._expect(kept, "exchanges", "exchange changed the commands; they belong to the loop.")

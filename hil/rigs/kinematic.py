@@ -18,23 +18,15 @@ _WATCHDOG_S = 0.1
 
 
 class KinematicHexapod:
-    """A mechanism at rest at home, on a clock of its own.
-
-    Attributes:
-        time_ns: time since the start [ns].
-        lengths, velocities: of the legs, (6,) [m] and [m/s].
-        commands: to the drives, (6,) [m/s].
-        pose: of the platform.
-        signals: of the IMUs, (3, 7, 3) [rad/s, m/s^2, uT].
-    """
+    """A mechanism at rest at home, on a clock of its own."""
 
     def __init__(self, mechanism: Mechanism) -> None:
-        self.time_ns = 0
-        self.velocities: Array = np.zeros(LEGS)
-        self.commands: Array = np.zeros(LEGS)
-        self.pose = mechanism.require_home()
-        self.lengths: Array = inverse_kinematics(mechanism, self.pose).lengths
-        self.signals: Array = np.zeros((3, IMU_COUNT, 3))
+        self.time_ns = 0  # since the start
+        self.velocities: Array = np.zeros(LEGS)  # of the legs [m/s]
+        self.commands: Array = np.zeros(LEGS)  # to the drives [m/s]
+        self.pose = mechanism.require_home()  # of the platform
+        self.lengths: Array = inverse_kinematics(mechanism, self.pose).lengths  # of the legs [m]
+        self.signals: Array = np.zeros((3, IMU_COUNT, 3))  # of the IMUs [rad/s, m/s^2, uT]
         self._mechanism = mechanism
         self._twist: Array = np.zeros(6)
         position, velocity, omega = (ca.SX.sym(name, 3) for name in ("position", "velocity", "omega"))

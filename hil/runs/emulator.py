@@ -19,8 +19,7 @@ from controller.planning.target import load_target
 from hil.loop.driver import prevent_compilation
 from hil.realtime.scheduling import RealTimeSettings, real_time
 from hil.rigs import DriveState
-from hil.rigs.emulation.drives import add_fault, new_emulated
-from hil.rigs.emulation.faults import fault
+from hil.rigs.emulation import add_fault, fault, new_emulated
 from hil.rigs.udp.datagrams import HELLO_DATAGRAM, WELCOME_DATAGRAM, DatagramKind, decode, encode
 from hil.rigs.udp.emulator import UdpEmulator, new_udp_emulator, serve
 from hil.rigs.udp.link import DEFAULT_ADDRESS, bound_socket, parse_address, socket_address

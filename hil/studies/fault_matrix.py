@@ -18,8 +18,7 @@ from controller.safety.causes import Cause, DriveState, Mode, Reaction, Request
 from hil.loop.records import RECORD, Link, StopRequest
 from hil.progress import Progress, no_progress
 from hil.realtime.clock import SCRIPTED, new_clock
-from hil.rigs.emulation.drives import new_emulated, sample
-from hil.rigs.emulation.faults import fault
+from hil.rigs.emulation import fault, new_emulated, sample
 from hil.rigs.udp.emulator import check_watchdog, new_udp_emulator
 from hil.rigs.udp.link import new_link
 from hil.rigs.udp.rig import TIMEOUT_SHARE
@@ -55,7 +54,7 @@ class Case:
         reaction: `GO_ON`, `STOP`, `STOP_QUICKLY` or `BRAKE_AT_ONCE`.
         within: most cycles from the fault to the first event with this cause.
         peak: greatest allowed deviation of a leg from its reference [m].
-        faults: as `hil.rigs.emulation.faults.fault` reads them, with {k} an IMU, {j} another one, {d} a drive, {at} a time [s].
+        faults: as `hil.rigs.emulation.fault` reads them, with {k} an IMU, {j} another one, {d} a drive, {at} a time [s].
         act: called with the loop at the time of a fault that is not the rig's.
         streamed: the fault of a streamed target.
         hardness: greatest allowed true deceleration of a controlled stop, over the limit of acceleration.

@@ -46,8 +46,8 @@ VOLTAGE_ENABLED, REMOTE, FOLLOWS_TARGET = 1 << 4, 1 << 9, 1 << 12
 """Bits of the statusword: the power stage is supplied; the drive obeys the controlword; in cyclic synchronous velocity mode,
 the drive follows the target velocity."""
 
-CYCLIC_SYNCHRONOUS_VELOCITY = 9
-"""Mode of operation."""
+VELOCITY_MODE = 9
+"""Mode of operation: cyclic synchronous velocity."""
 
 HEARTBEAT_LOST, PDO_LOST = 0x8130, 0x8250
 """Error codes of a drive that misses its controller: no heartbeat, no RPDO in time."""
@@ -65,9 +65,7 @@ def state_of(statusword: int) -> PowerState | None:
 
 def statusword(state: PowerState, powered: bool, follows: bool) -> int:
     """The statusword of a drive in this state whose power stage is `powered` or not, and which `follows` the target or not."""
-    word = _STATE_BITS[state] | REMOTE
-    if powered:
-        word |= VOLTAGE_ENABLED
+    word = _STATE_BITS[state] | REMOTE | (VOLTAGE_ENABLED if powered else 0)
     if follows and state == PowerState.OPERATION_ENABLED:
         word |= FOLLOWS_TARGET
     return word

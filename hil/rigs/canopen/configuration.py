@@ -13,7 +13,7 @@ import canopen
 from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
 
 from hil.rigs import Request, RigError
-from hil.rigs.canopen.cia402 import CYCLIC_SYNCHRONOUS_VELOCITY, Controlword, PowerState, controlword_towards, state_of
+from hil.rigs.canopen.cia402 import VELOCITY_MODE, Controlword, PowerState, controlword_towards, state_of
 from hil.rigs.canopen.frames import (
     COMMAND_PDO,
     DRIVE_PDOS,
@@ -169,8 +169,8 @@ def configure_drive(node: RemoteNode, drives: DriveSettings, period: float) -> N
         if node.has(index, subindex):
             node.configure(index, subindex, value)
     node.configure(Object.QUICK_STOP_DECELERATION, 0, round(drives.quick_stop_deceleration * drives.counts_per_metre))
-    node.write(Object.MODE, 0, CYCLIC_SYNCHRONOUS_VELOCITY)
-    node.check(Object.MODE_DISPLAY, 0, CYCLIC_SYNCHRONOUS_VELOCITY, _MODE_TIMEOUT_S)
+    node.write(Object.MODE, 0, VELOCITY_MODE)
+    node.check(Object.MODE_DISPLAY, 0, VELOCITY_MODE, _MODE_TIMEOUT_S)
     node.write(Object.TARGET_VELOCITY, 0, 0)
 
 

@@ -5,20 +5,7 @@ from collections.abc import Callable
 import can
 import numpy as np
 
-from hil.rigs.canopen.frames import (
-    ANSWER,
-    CLASSIC_TAIL,
-    CODE,
-    FD_TAIL,
-    NO_VALUE,
-    STAMP,
-    SYNC_OVERFLOW,
-    TRUTH,
-    TRUTH_BYTES,
-    TRUTH_ID,
-    CobId,
-    NodeState,
-)
+from hil.rigs.canopen.frames import ANSWER, CLASSIC_TAIL, FD_TAIL, NO_VALUE, SYNC_OVERFLOW, TRUTH, TRUTH_ID, CobId, NodeState
 from hil.rigs.canopen.settings import FD_BYTES, CanopenSettings
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS
@@ -93,14 +80,10 @@ class Decoder:
         self.received = self.all_frames
         return missing
 
-    def refuse(self) -> None:
-        """Count an unreadable frame."""
-        self.refused += 1
-
     def take(self, message: can.Message) -> bool:
         """Decode a frame; returns whether it was valid."""
         identifier, broken = message.arbitration_id, message.is_remote_frame or message.is_error_frame
-        if message.is_extended_id and identifier == TRUTH_ID and len(message.data) == TRUTH_BYTES and not broken:
+        if message.is_extended_id and identifier == TRUTH_ID and len(message.data) == TRUTH.size and not broken:
             *truth, sync = TRUTH.unpack_from(message.data)
             if sync == self._sync:
                 self.truth = tuple(truth)
@@ -135,7 +118,7 @@ class Decoder:
         return True
 
     def _take_emergency(self, drive: int, data: bytearray) -> bool:
-        (self.error_codes[drive],) = CODE.unpack_from(data)
+        self.error_codes[drive] = int.from_bytes(data[:2], "little")
         return True
 
     def _ignore(self, node: int, data: bytearray) -> bool:
@@ -164,7 +147,7 @@ class Decoder:
         at = 6 * imu
         self._raw[0][at : at + 6], counter = self._pending[imu]
         self._raw[1][at : at + 6] = data[:6]
-        self._count(imu, counter, 1 << 8, STAMP.unpack_from(data, 6)[0], 1 << 16, 10_000)
+        self._count(imu, counter, 1 << 8, int.from_bytes(data[6:], "little"), 1 << 16, 10_000)
         return True
 
     def _take_magnetometer(self, imu: int, data: bytearray) -> bool:

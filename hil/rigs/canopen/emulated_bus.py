@@ -14,21 +14,9 @@ import can
 import canopen
 
 from hil.rigs.canopen.emulated_nodes import EmulatedDrive, EmulatedImu, EmulatedNode, PlantMachine
-from hil.rigs.canopen.frames import (
-    ANSWER,
-    COMMAND,
-    TRUTH_BYTES,
-    TRUTH_ID,
-    CobId,
-    NmtCommand,
-    NodeState,
-    new_message,
-    pack_imu,
-    pack_truth,
-    raw_readings,
-)
+from hil.rigs.canopen.frames import ANSWER, COMMAND, CobId, NmtCommand, NodeState, pack_imu, raw_readings, truth_message
 from hil.rigs.canopen.settings import MAGNETOMETER_INTERVAL, CanopenSettings
-from hil.rigs.emulation.faults import disturb
+from hil.rigs.emulation import disturb
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS
@@ -52,12 +40,7 @@ def faulty_channel(rig: Record) -> Channel:
 
 
 class EmulatedBus:
-    """Six drives and seven IMUs around a machine, on a bus of their own.
-
-    Attributes:
-        drives, imus: the nodes.
-        lost: number of frames that could not be sent or read.
-    """
+    """Six drives and seven IMUs around a machine, on a bus of their own."""
 
     def __init__(self, settings: CanopenSettings, machine: PlantMachine, channel: Channel | None = None) -> None:
         self._machine, self._fd = machine, settings.bus.fd
@@ -68,12 +51,11 @@ class EmulatedBus:
         self._network = canopen.Network(self)
         self.drives = [EmulatedDrive(leg, settings, machine, self._network) for leg in range(LEGS)]
         self.imus = [EmulatedImu(imu, settings, self._network) for imu in range(IMU_COUNT)]
-        self.lost = 0
+        self.lost = 0  # frames that could not be sent or read
         self._nodes: list[EmulatedNode] = [*self.drives, *self.imus]
         self._controller = CobId.HEARTBEAT + settings.controller.node
         self._commands = {CobId.RPDO + drive.node: drive for drive in self.drives}
         self._requests = {CobId.SDO_REQUEST + node.node for node in self._nodes}
-        self._truth = new_message(TRUTH_ID, is_extended_id=True, dlc=TRUTH_BYTES, is_fd=True, bitrate_switch=True)
         self._heard = {CobId.NMT, CobId.SYNC, self._controller, *self._commands, *self._requests}
         self._held: list[tuple[int, int, bool, can.Message]] = []
         self._numbers = count()
@@ -175,8 +157,7 @@ class EmulatedBus:
                 drive.command = None
         machine.sample(now)
         if self._fd:
-            self._truth.data = bytearray(pack_truth(rig["truth"], sync))
-            self.send(self._truth)
+            self.send(truth_message(rig["truth"], sync))
         for drive in self.drives:
             if CobId.TPDO in drive.active:
                 drive.answer.data = bytearray(ANSWER.pack(drive.statusword(), drive.velocity(), drive.code))

@@ -13,15 +13,7 @@ import numpy as np
 from canopen.sdo import SdoAbortedError
 
 from hil.rigs import DriveState, Request
-from hil.rigs.canopen.cia402 import (
-    CYCLIC_SYNCHRONOUS_VELOCITY,
-    HEARTBEAT_LOST,
-    PDO_LOST,
-    PowerState,
-    commanded,
-    settled,
-    statusword,
-)
+from hil.rigs.canopen.cia402 import HEARTBEAT_LOST, PDO_LOST, VELOCITY_MODE, PowerState, commanded, settled, statusword
 from hil.rigs.canopen.frames import (
     ANSWER,
     COMMAND_PDO,
@@ -37,7 +29,7 @@ from hil.rigs.canopen.frames import (
     new_message,
 )
 from hil.rigs.canopen.settings import CanopenSettings, object_dictionary
-from hil.rigs.emulation.drives import EMULATED, move, sample
+from hil.rigs.emulation import EMULATED, move, sample
 from plant.compiled import Record
 from plant.fmu.plant import FmuPlant
 
@@ -53,14 +45,11 @@ class PlantMachine:
 
     Args:
         make: makes the plant at its start, its IMUs' imperfections, and the drives (dtype `EMULATED`).
-
-    Attributes:
-        rig: dtype `EMULATED`: the nodes write `request` and `target`, and read the rest.
     """
 
     def __init__(self, make: Callable[[], tuple[FmuPlant, Record, Record]]) -> None:
         self._make = make
-        self.rig: Record = np.zeros((), EMULATED)
+        self.rig: Record = np.zeros((), EMULATED)  # the nodes write `request` and `target`, and read the rest
         self._started = 0
         self._begin()
         # The clock starts when the machine code is loaded: a node that waits for it would not answer over SDO in time.
@@ -190,7 +179,7 @@ class EmulatedDrive(EmulatedNode):
         self.commanded_ns = 0
         self._scale = settings.drives.scales[leg]
         self.answer = new_message(CobId.TPDO + node, dlc=ANSWER.size, is_fd=fd, bitrate_switch=fd)
-        super().__init__(node, settings.drive_eds, DRIVE_PDOS, fd, network)
+        super().__init__(node, settings.drives.eds, DRIVE_PDOS, fd, network)
 
     def reset(self) -> None:
         """Return to the values of the EDS, without power."""
@@ -232,7 +221,7 @@ class EmulatedDrive(EmulatedNode):
         elif index == Object.TARGET_VELOCITY:
             self.target = number
         elif index == Object.MODE:
-            if number != CYCLIC_SYNCHRONOUS_VELOCITY:
+            if number != VELOCITY_MODE:
                 raise SdoAbortedError(_MODE_UNSUPPORTED)
             self.mode = number
         elif (index, subindex) == (Object.CONSUMER_HEARTBEAT, 1):
@@ -303,7 +292,7 @@ class EmulatedDrive(EmulatedNode):
         rig, leg, power, target = self.machine.rig, self.leg, self.power, 0.0
         if power == PowerState.OPERATION_ENABLED:
             rig["request"][leg] = Request.ENABLED
-            target = self.target / self._scale if self.mode == CYCLIC_SYNCHRONOUS_VELOCITY else 0.0
+            target = self.target / self._scale if self.mode == VELOCITY_MODE else 0.0
         else:
             stopping = power in (PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
             rig["request"][leg] = Request.QUICK_STOP if stopping else Request.BRAKED
@@ -316,7 +305,7 @@ class EmulatedImu(EmulatedNode):
     def __init__(self, imu: int, settings: CanopenSettings, network: canopen.Network) -> None:
         node, fd = settings.imus.nodes[imu], settings.bus.fd
         self.imu = imu
-        super().__init__(node, settings.imu_eds, imu_pdos(fd), fd, network)
+        super().__init__(node, settings.imus.eds, imu_pdos(fd), fd, network)
         self.answers = {pdo.cob_id: new_message(pdo.cob_id + node, is_fd=fd, bitrate_switch=fd) for pdo in self.pdos}
         self.magnetometer_start = 0
 

@@ -62,14 +62,12 @@ TRUTH_ID = 0x1F470001
 COMMAND, ANSWER = struct.Struct("<Hi"), struct.Struct("<HiH")
 """A drive's PDOs: controlword and target velocity [counts/s]; statusword, velocity [counts/s] and error code."""
 
-CLASSIC_TAIL, FD_TAIL, CODE, STAMP = (struct.Struct(f"<{each}") for each in ("BB", "IIB", "H", "H"))
+CLASSIC_TAIL, FD_TAIL = struct.Struct("<BB"), struct.Struct("<IIB")
 """Of an IMU's PDOs, behind the axes: sample counter and SYNC counter on classic CAN; sample counter, time [us] and SYNC counter
-on CAN FD; the error code of an emergency; the time stamp on classic CAN [10 us]."""
+on CAN FD."""
 
-TRUTH = struct.Struct("<13fB")
+TRUTH = struct.Struct("<13fB11x")
 """Position, quaternion and lengths, and the SYNC counter."""
-
-TRUTH_BYTES = 64
 
 
 class Object(IntEnum):
@@ -173,16 +171,16 @@ def pack_imu(
         return [(CobId.TPDO, (raw.tobytes() + tail).ljust(FD_BYTES, b"\0"))]
     frames = [
         (CobId.TPDO, raw[0].tobytes() + CLASSIC_TAIL.pack(sequence & 0xFF, sync)),
-        (CobId.TPDO + 0x100, raw[1].tobytes() + STAMP.pack(sample_ns // 10_000 & 0xFFFF)),
+        (CobId.TPDO + 0x100, raw[1].tobytes() + (sample_ns // 10_000 & 0xFFFF).to_bytes(2, "little")),
     ]
     if magnetometer:
         frames.append((CobId.TPDO + 0x200, raw[2].tobytes() + bytes((sync, 0))))
     return frames
 
 
-def pack_truth(truth: Array, sync: int) -> bytes:
-    """Position [m], quaternion and lengths [m] of the plant's truth at this SYNC."""
-    return TRUTH.pack(*truth[:13], sync).ljust(TRUTH_BYTES, b"\0")
+def truth_message(truth: Array, sync: int) -> can.Message:
+    """The frame with position [m], quaternion and lengths [m] of the plant's truth at this SYNC."""
+    return new_message(TRUTH_ID, TRUTH.pack(*truth[:13], sync), is_extended_id=True, is_fd=True, bitrate_switch=True)
 
 
 def raw_readings(measurement: Record, scales: NDArray[np.float64]) -> NDArray[np.int16]:

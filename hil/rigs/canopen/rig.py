@@ -38,13 +38,7 @@ _REMEDIES = {
 
 
 class CanopenRig:
-    """A rig on CANopen (see `hil.rigs.Rig`).
-
-    Attributes:
-        command_delay: one period [s].
-        decoder: what the nodes have sent.
-        bus_load: share of the bus' time that a cycle takes in the worst case.
-    """
+    """A rig on CANopen (see `hil.rigs.Rig`)."""
 
     def __init__(self, settings: CanopenSettings, period: float) -> None:
         """Prepare a rig for exchanges every `period` [s].
@@ -53,7 +47,7 @@ class CanopenRig:
             RigError: the bus cannot carry that many frames.
         """
         self.command_delay = period
-        self.bus_load = settings.check_bus_load(1.0 / period)
+        self.bus_load = settings.check_bus_load(1.0 / period)  # share of the bus' time that a cycle takes in the worst case
         self.decoder = Decoder(settings)
         self._settings = settings
         self._bus: Any = None
@@ -78,16 +72,15 @@ class CanopenRig:
             RigError: there is no such bus, or a node does not boot up.
             InputError: an EDS file cannot be used.
         """
-        settings = self._settings
-        bus, drives, imus = settings.bus, settings.drives, settings.imus
+        bus, drives, imus = self._settings.bus, self._settings.drives, self._settings.imus
         try:
             self._bus = can.Bus(**bus.arguments())
             self.decoder, self._misses = Decoder(self._settings), [0] * len(self._misses)
             network = canopen.Network(self._bus)
             self._nodes = [
-                RemoteNode(f"{name} {number}", node, eds, network, self._receive)
-                for name, nodes, eds in (("drive", drives.nodes, settings.drive_eds), ("IMU", imus.nodes, settings.imu_eds))
-                for number, node in enumerate(nodes)
+                RemoteNode(f"{name} {number}", node, table.eds, network, self._receive)
+                for name, table in (("drive", drives), ("IMU", imus))
+                for number, node in enumerate(table.nodes)
             ]
             within = f"{self._settings.controller.boot_timeout:g} s"
             complaint = f"no boot-up within {within} from {{}}: check power, wiring, node ids and bit rate"
@@ -102,10 +95,8 @@ class CanopenRig:
             ) from error
 
     def identify(self) -> Identity:
-        """Ask each node for its device type and identity, compare them with the EDS, and configure and start it.
-
-        Raises:
-            RigError: a node does not answer, differs from its EDS, or refuses its configuration.
+        """Ask each node for its device type and identity, compare them with the EDS, and configure and start it; see
+        `hil.rigs.Rig.identify`.
         """
         self._check_open()
         parts = {}
@@ -120,11 +111,7 @@ class CanopenRig:
         return Identity(f"CANopen on {self._settings.bus.interface} {self._settings.bus.channel}", parts)
 
     def arm(self) -> None:
-        """Reset the drives' faults and lead them to Switched on.
-
-        Raises:
-            RigError: a drive does not get there.
-        """
+        """Reset the drives' faults and lead them to Switched on (see `hil.rigs.Rig.arm`)."""
         self._check_open()
         self._configure()
         for drive, node in enumerate(self._nodes[:LEGS]):
@@ -147,7 +134,7 @@ class CanopenRig:
             self._collect(start + self._answer_ns)
         except BUS_ERRORS:
             # The bus is gone, or its queue is full: there is no answer.
-            decoder.refuse()
+            decoder.refused += 1
         self._note_missing(decoder.end())
         self._fill(feedback, start)
         return ANSWERED if decoder.answered else SILENT
@@ -196,7 +183,7 @@ class CanopenRig:
         try:
             message: can.Message | None = self._bus.recv(timeout)
         except can.CanError:
-            self.decoder.refuse()
+            self.decoder.refused += 1
             raise
         if message is not None:
             self.decoder.now_ns = time.monotonic_ns()

@@ -163,39 +163,23 @@ class ImuSettings:
 
 @dataclass(frozen=True)
 class CanopenSettings:
-    """Settings of the CANopen rig.
-
-    Attributes:
-        bus, controller, drives, imus: the tables.
-        folder: where relative paths of the EDS files begin.
-    """
+    """Settings of the CANopen rig: the tables of the file, with absolute paths of the EDS files."""
 
     bus: BusSettings
     controller: ControllerSettings
     drives: DriveSettings
     imus: ImuSettings
-    folder: Path = DEFAULT_FILE.parent
 
     def __post_init__(self) -> None:
         owners = {self.controller.node: "the controller"}
-        for kind, nodes in (("drive", self.drives.nodes), ("IMU", self.imus.nodes)):
-            for number, node in enumerate(nodes):
+        for kind, table in (("drive", self.drives), ("IMU", self.imus)):
+            for number, node in enumerate(table.nodes):
                 if node in owners:
                     raise InputError(f"{kind} {number} and {owners[node]} have the same node id {node}: each needs its own")
                 owners[node] = f"{kind} {number}"
-        for eds in (self.drive_eds, self.imu_eds):
-            if not eds.is_file():
+        for eds in (self.drives.eds, self.imus.eds):
+            if not Path(eds).is_file():
                 raise InputError(f"there is no EDS file {eds}: name the one of the node's manufacturer")
-
-    @property
-    def drive_eds(self) -> Path:
-        """Electronic data sheet of the drives."""
-        return self.folder / self.drives.eds
-
-    @property
-    def imu_eds(self) -> Path:
-        """Electronic data sheet of the IMUs."""
-        return self.folder / self.imus.eds
 
     def bus_load(self, rate: float) -> float:
         """Share of the bus' time that the frames of a cycle take at `rate` [Hz] with the most stuff bits: the PDOs, SYNC and a
@@ -227,14 +211,14 @@ class CanopenSettings:
         return load
 
 
-def object_dictionary(eds: Path, node: int) -> Any:
+def object_dictionary(eds: str, node: int) -> Any:
     """The object dictionary (canopen's) of a node.
 
     Raises:
         InputError: the file is not an EDS.
     """
     try:
-        dictionary = canopen.import_od(str(eds), node_id=node)
+        dictionary = canopen.import_od(eds, node_id=node)
     except (configparser.Error, LookupError, ValueError, OSError, canopen.ObjectDictionaryError) as error:
         raise InputError(f"{eds} is not a usable EDS file: {error}") from None
     if 0x1000 not in dictionary or 0x1018 not in dictionary:
@@ -274,14 +258,14 @@ def canopen_settings(path: Path | str = DEFAULT_FILE, **changes: Mapping[str, An
     """
     path = Path(path)
     document = read_toml(path)
-    kinds = {"bus": BusSettings, "controller": ControllerSettings, "drives": DriveSettings, "imus": ImuSettings}
+    kinds: dict[str, Any] = {"bus": BusSettings, "controller": ControllerSettings, "drives": DriveSettings, "imus": ImuSettings}
     for name in [*document, *changes]:
         if name not in kinds:
             raise InputError(f"{path} has a table [{name}] that is not known; the tables are {', '.join(kinds)}")
-    tables: dict[str, Any] = {
-        name: kind(**_checked(name, kind, {**document.get(name, {}), **changes.get(name, {})})) for name, kind in kinds.items()
-    }
-    return CanopenSettings(**tables, folder=path.resolve().parent)
+    tables = {name: _checked(name, kind, {**document.get(name, {}), **changes.get(name, {})}) for name, kind in kinds.items()}
+    for name in ("drives", "imus"):
+        tables[name]["eds"] = str(path.resolve().parent / tables[name]["eds"])
+    return CanopenSettings(*(kind(**tables[name]) for name, kind in kinds.items()))
 
 
 def _checked(title: str, kind: Any, table: Mapping[str, Any]) -> dict[str, Any]:

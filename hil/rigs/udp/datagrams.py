@@ -100,14 +100,8 @@ def decode(dtype: np.dtype[Any], content: bytes, **fields: object) -> Record | N
     return datagram if valid and datagram["crc"] == zlib.crc32(content[:-4]) else None
 
 
-def _crc_table() -> NDArray[np.uint32]:
-    table = np.arange(256, dtype=np.uint32)
-    for _ in range(8):
-        table = np.where(table & 1, (table >> 1) ^ np.uint32(0xEDB88320), table >> 1)
-    return table.astype(np.uint32)
-
-
-_CRC_TABLE = _crc_table()
+# The CRC-32 of a byte, without the inversions at its start and end.
+_CRC_TABLE = np.array([zlib.crc32(bytes((i ^ 0xFF,))) ^ 0xFF000000 for i in range(256)], np.uint32)
 
 
 @kernel

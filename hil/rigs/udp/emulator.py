@@ -10,18 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.rigs import ANSWERED, SILENT, DriveState, Request
-from hil.rigs.emulation.drives import move, sample
-from hil.rigs.emulation.faults import disturb, draw
+from hil.rigs.emulation import disturb, draw, move, sample
 from hil.rigs.udp.datagrams import HELLO_DATAGRAM, LONGEST, MAGIC, VERSION, Bytes, DatagramKind, crc32, is_valid
-from hil.rigs.udp.link import (
-    UdpLink,
-    await_datagram,
-    decode_answer,
-    encode_command,
-    new_link,
-    receive_datagram,
-    send_datagram,
-)
+from hil.rigs.udp.link import UdpLink, await_datagram, decode_answer, encode_command, new_link, receive_datagram, send_datagram
 from plant.compiled import Record, kernel, record_dtype
 from plant.mechanism import LEGS
 from plant.pose import Array
@@ -65,7 +56,7 @@ class UdpEmulator(NamedTuple):
 
     fmu: Record  # the plant
     imu: Record  # its IMUs' imperfections
-    rig: Record  # dtype `hil.rigs.emulation.drives.EMULATED`
+    rig: Record  # dtype `hil.rigs.emulation.EMULATED`
     session: Record  # dtype `UDP_SESSION`
     link: UdpLink  # the rig's side; the rig is in memory if its socket has no descriptor
 

@@ -45,11 +45,7 @@ class UdpRig:
         self._identity: Identity | None = None
 
     def open(self) -> None:
-        """Shake hands: the rig begins a new session with this controller alone.
-
-        Raises:
-            RigError: no rig answers.
-        """
+        """Shake hands: the rig begins a new session with this controller alone (see `hil.rigs.Rig.open`)."""
         self.close()
         host, port = self.address
         self._socket = opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -100,11 +96,7 @@ class UdpRig:
         return self._identity
 
     def arm(self) -> None:
-        """Reset faults, and wait until all drives are ready.
-
-        Raises:
-            RigError: a drive does not become ready.
-        """
+        """Reset faults, and wait until all drives are ready (see `hil.rigs.Rig.arm`)."""
         if self._socket is None:
             raise RigError("the rig is not open: open it first")
         self.link.socket["reset"] = 1

@@ -27,8 +27,7 @@ from hil.rigs.by_name import python_rig
 from hil.rigs.canopen.rig import CanopenRig
 from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings
 from hil.rigs.contract import CLAUSES, check_rig, examine_rig
-from hil.rigs.emulation.drives import new_emulated
-from hil.rigs.emulation.faults import fault
+from hil.rigs.emulation import fault, new_emulated
 from hil.rigs.template import TemplateRig
 from hil.rigs.udp.emulator import new_udp_emulator
 from hil.rigs.udp.link import new_link
