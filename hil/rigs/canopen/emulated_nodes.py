@@ -203,7 +203,7 @@ class EmulatedDrive(EmulatedNode):
 
     def _on_read(self, index: int, subindex: int, od: Any) -> int | None:
         faulty = self.power in (PowerState.FAULT, PowerState.FAULT_REACTION_ACTIVE)
-        values = {
+        values: dict[int, int] = {
             Object.STATUSWORD: self.statusword(),
             Object.ERROR_CODE: self.code,
             Object.VELOCITY_ACTUAL: self.velocity(),

@@ -47,7 +47,7 @@ class CanopenRig:
             RigError: the bus cannot carry that many frames.
         """
         self.command_delay = period
-        self.bus_load = settings.check_bus_load(1.0 / period)  # share of the bus' time that a cycle takes in the worst case
+        self.bus_load = settings.check_bus_load(1.0 / period)  # in the worst case
         self.decoder = Decoder(settings)
         self._settings = settings
         self._bus: Any = None

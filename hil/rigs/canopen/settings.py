@@ -262,10 +262,13 @@ def canopen_settings(path: Path | str = DEFAULT_FILE, **changes: Mapping[str, An
     for name in [*document, *changes]:
         if name not in kinds:
             raise InputError(f"{path} has a table [{name}] that is not known; the tables are {', '.join(kinds)}")
-    tables = {name: _checked(name, kind, {**document.get(name, {}), **changes.get(name, {})}) for name, kind in kinds.items()}
-    for name in ("drives", "imus"):
-        tables[name]["eds"] = str(path.resolve().parent / tables[name]["eds"])
-    return CanopenSettings(*(kind(**tables[name]) for name, kind in kinds.items()))
+    made = []
+    for name, kind in kinds.items():
+        values = _checked(name, kind, {**document.get(name, {}), **changes.get(name, {})})
+        if "eds" in values:
+            values["eds"] = str(path.resolve().parent / values["eds"])
+        made.append(kind(**values))
+    return CanopenSettings(*made)
 
 
 def _checked(title: str, kind: Any, table: Mapping[str, Any]) -> dict[str, Any]:

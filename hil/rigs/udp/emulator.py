@@ -105,7 +105,8 @@ def answer_command(emulator: UdpEmulator, length: int, now_ns: int) -> int:
     a.magic, a.version, a.kind = MAGIC, VERSION, DatagramKind.MEASUREMENT
     a.session, a.sequence, a.time_ns = c.session, c.sequence, now_ns
     a.refused = session.refused
-    a.sample_ns[:], a.sample_number[:], a.measurement[:] = rig.sample_ns, rig.sequence, rig.measurement
+    a.sample_ns[:], a.sample_number[:] = rig.sample_ns, rig.sequence
+    a.measurement[:] = rig.measurement
     a.drive[:], a.code[:], a.velocity[:] = rig.drive, rig.code, rig.velocity
     a.crc = crc32(link.answer_bytes, link.answer.itemsize - 4)
     t.truth[:] = rig.truth

@@ -195,7 +195,8 @@ def decode_answer(link: UdpLink, length: int, feedback: Record) -> bool:
     ):
         feedback.refused += 1
         return False
-    feedback.sample_ns[:], feedback.sequence[:], feedback.measurement[:] = a.sample_ns, a.sample_number, a.measurement
+    feedback.sample_ns[:], feedback.sequence[:] = a.sample_ns, a.sample_number
+    feedback.measurement[:] = a.measurement
     for k in range(LEGS):
         feedback.drive[k] = a.drive[k] if a.drive[k] <= DriveState.FAULTY else DriveState.NOT_READY.value
     feedback.drive_code[:], feedback.sent[:] = a.code, a.velocity
