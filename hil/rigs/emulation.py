@@ -1,8 +1,8 @@
 """The emulated rig without a bus: the plant with drives and IMUs as hardware has them, on a clock of its own. Compiled.
 
 The code for a bus (`hil.rigs.udp.emulator`, `hil.rigs.canopen.emulated_bus`) sets each drive's `request` and `target`, and
-takes a `sample`, which moves the plant on to the present. Faults of IMUs, drives and payload happen here; those of the bus have
-only their effect computed here.
+takes a `sample`, which moves the plant on to the present. Faults of IMUs, drives and payload happen here. A fault of the bus
+happens there: `disturb` only says what becomes of a message.
 """
 
 from collections.abc import Iterable
