@@ -1,6 +1,5 @@
 """Benchmark of the plant: the cost of a step by compiled calls and by FMPy's methods, and its exactness."""
 
-from contextlib import closing
 from time import perf_counter_ns
 from typing import Any
 
@@ -115,8 +114,8 @@ def _drive_with_fmpy(commands: Array) -> float:
         groups.append(([each.references[0] for each in variables], sum(each.size for each in variables)))
     drive_mode, velocity_command = (description[name].references[:1] for name in ("drive_mode", "velocity_command"))
     took = []
-    with closing(FmuInstance(description)) as instance:
-        instance.initialize()
+    with FmuInstance(description) as instance:
+        instance.start()
         fmu = instance.fmu
         for i, command in enumerate(commands.tolist()):
             began = perf_counter_ns()

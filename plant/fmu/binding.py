@@ -30,13 +30,7 @@ from plant.pose import Array
 
 
 class Scalars(NamedTuple):
-    """Scalars that one call moves between FMU and loop: `loop = factor * fmu + offset`.
-
-    Attributes:
-        references: value references, in the order of the scalars.
-        places: of each scalar in the loop's array.
-        factors, offsets: of each scalar.
-    """
+    """Scalars that one call moves between FMU and loop, `loop = factor * fmu + offset`, and their places in the loop's array."""
 
     references: NDArray[np.uint32]
     places: NDArray[np.int64]
@@ -45,77 +39,53 @@ class Scalars(NamedTuple):
 
 
 class Modes(NamedTuple):
-    """How to switch the drives.
-
-    Attributes:
-        references: value references.
-        values: the FMU's for `OPEN`, `BRAKE`, `VELOCITY`.
-        variable: one of the modes, for its type; None if the FMU has no modes.
-        common: whether all drives share one mode.
-    """
+    """How to switch the drives."""
 
     references: NDArray[np.uint32]
-    values: Array
-    variable: FmuVariable | None
-    common: bool
+    values: Array  # the FMU's for `OPEN`, `BRAKE`, `VELOCITY`
+    variable: FmuVariable | None  # one of the modes, for its type; None if the FMU has no modes
+    common: bool  # whether all drives share one mode
 
 
 @dataclass(frozen=True)
 class Bound:
-    """A binding matched to its FMU.
+    """A binding matched to its FMU."""
 
-    Attributes:
-        legs: 6, or 3 of a planar plant.
-        imus: numbers of the IMUs.
-        magnetometers: numbers of the IMUs with a magnetometer.
-        sensed: the IMUs' signals, in (3, 7, 3).
-        known: the truth, in (19,).
-        commanded: the velocity commands, in (legs,).
-        loaded: the payload's mass, in (1,), or nothing.
-        modes: of the drives.
-        knows_pose: whether the truth has the pose.
-        planar_angle: whether the truth has an angle instead of a quaternion.
-        driven: names of the FMU's scalars that the loop sets in every cycle.
-    """
-
-    legs: int
+    legs: int  # 6, or 3 of a planar plant
     imus: tuple[int, ...]
-    magnetometers: tuple[int, ...]
-    sensed: Scalars
-    known: Scalars
-    commanded: Scalars
-    loaded: Scalars
+    magnetometers: tuple[int, ...]  # the IMUs with one
+    sensed: Scalars  # the IMUs' signals, in (3, 7, 3)
+    known: Scalars  # the truth, in (19,)
+    commanded: Scalars  # the velocity commands, in (legs,)
+    loaded: Scalars  # the payload's mass, in (1,), or nothing
     modes: Modes
-    knows_pose: bool
-    planar_angle: bool
-    driven: frozenset[str]
+    knows_pose: bool  # whether the truth has the pose
+    planar_angle: bool  # whether the truth has an angle instead of a quaternion
+    driven: frozenset[str]  # the FMU's scalars that the loop sets in every cycle
 
 
-def check_start(variable: FmuVariable, owner: str, driven: frozenset[str]) -> None:
-    """Check that a variable accepts a start value.
+def check_settable(variable: FmuVariable, owner: str, driven: frozenset[str], running: bool = False) -> None:
+    """Check that a variable accepts a start value, or a change during the run.
 
     Args:
         variable: of the FMU.
         owner: the FMU's file, for messages.
         driven: as in `Bound`.
+        running: whether it is set during the run.
 
     Raises:
-        InputError: it does not.
+        InputError: it does not, or the loop sets it.
     """
-    if not variable.startable:
+    if running and not variable.tunable:
+        raise InputError(
+            f"{variable.name} of {owner} cannot change during the run, as it is neither an input nor a tunable parameter: "
+            "set it without @"
+        )
+    if not running and not variable.startable:
         raise InputError(
             f"{variable.name} of {owner} is a {variable.variability} {variable.causality} variable, which takes no start "
             "value: set parameters and inputs"
         )
-    check_free(variable, owner, driven)
-
-
-def check_free(variable: FmuVariable, owner: str, driven: frozenset[str]) -> None:
-    """Check that the loop does not set a variable; arguments as for `check_start`.
-
-    Raises:
-        InputError: it does.
-    """
     if not driven.isdisjoint(variable.element_names):
         raise InputError(f"{variable.name} of {owner} is set by the loop, and cannot be set besides")
 
@@ -133,15 +103,23 @@ class _Binder:
     def __init__(self, binding: Binding, description: FmuDescription) -> None:
         self._binding, self._description = binding, description
         self._problems = list(binding.problems)
-        self._found = {name: self._variables(name, each) for name, each in self._present().items()}
-        commands = self._size(COMMANDS)
-        self._legs = PLANAR_LEGS if commands == PLANAR_LEGS else LEGS
+        present = {
+            name: each
+            for name, each in binding.signals.items()
+            if not binding.native or name in REQUIRED or name in description
+        }
+        self._found = {name: self._variables(name, each) for name, each in present.items()}
+        self._legs = PLANAR_LEGS if self._size(COMMANDS) == PLANAR_LEGS else LEGS
+        self._all_imus = (*range(self._legs), PLATFORM_IMU)
+        self._driven = frozenset(
+            scalar for name in (COMMANDS, MODES) for each in self._found.get(name, ()) for scalar in each.element_names
+        )
 
     def bound(self) -> Bound:
         for name in REQUIRED:
             if name not in self._binding.signals:
                 self._problems.append(f"there is no table [{name}], which is needed")
-        imus = {name: self._imus(name) for name in IMU_SIGNALS if name in self._found}
+        imus = {name: self._binding.signals[name].imus or self._all_imus for name in IMU_SIGNALS if name in self._found}
         if len({frozenset(imus[name]) for name in REQUIRED[1:] if name in imus}) > 1:
             self._problems.append("imu_angular_velocity and imu_specific_force are of different imus, and must be of the same")
         groups = {
@@ -167,20 +145,8 @@ class _Binder:
             modes=modes,
             knows_pose=all(knows),
             planar_angle="angle" in self._found,
-            driven=self._driven(),
+            driven=self._driven,
         )
-
-    def _driven(self) -> frozenset[str]:
-        return frozenset(
-            scalar for name in (COMMANDS, MODES) for each in self._found.get(name, ()) for scalar in each.element_names
-        )
-
-    def _present(self) -> dict[str, SignalBinding]:
-        """The signals to look for; in gough's own binding, those that are required or present."""
-        signals = self._binding.signals
-        if not self._binding.native:
-            return dict(signals)
-        return {name: each for name, each in signals.items() if name in REQUIRED or name in self._description}
 
     def _variables(self, name: str, signal: SignalBinding) -> list[FmuVariable]:
         found = []
@@ -191,12 +157,9 @@ class _Binder:
                 self._problems.append(f"{name}: {str(error).removeprefix(f'{self._description.path.name} ')}")
                 continue
             found.append(variable)
-            written = name in WRITTEN
-            fits = variable.tunable if written else variable.causality in ("output", "local")
-            if not fits:
-                kind = (
-                    f"{variable.variability} {variable.causality}" if variable.causality == "parameter" else variable.causality
-                )
+            written, kind = name in WRITTEN, variable.causality
+            if not (variable.tunable if written else kind in ("output", "local")):
+                kind = f"{variable.variability} {kind}" if kind == "parameter" else kind
                 self._problems.append(f"{name}: {wanted} is of causality {kind} and must be {'input' if written else 'output'}")
             if name == MODES and variable.ending and variable.dtype.itemsize <= 8:
                 continue
@@ -212,16 +175,10 @@ class _Binder:
         """Whether all variables of a signal have been found."""
         return len(self._found[name]) == len(self._binding.signals[name].variables) > 0
 
-    def _all_imus(self) -> tuple[int, ...]:
-        return (*range(self._legs), PLATFORM_IMU)
-
-    def _imus(self, name: str) -> tuple[int, ...]:
-        return self._binding.signals[name].imus or self._all_imus()
-
     def _imu_places(self, name: str, imus: Sequence[int]) -> list[int]:
-        beyond = sorted(set(imus) - set(self._all_imus()))
+        beyond = sorted(set(imus) - set(self._all_imus))
         if beyond:
-            self._problems.append(f"{name}: there is no imu {beyond[0]} on {self._legs} legs; there are {self._all_imus()}")
+            self._problems.append(f"{name}: there is no imu {beyond[0]} on {self._legs} legs; there are {self._all_imus}")
         return [(IMU_SIGNALS[name] * IMU_COUNT + imu) * 3 + axis for imu in imus for axis in range(3)]
 
     def _truth_places(self, name: str) -> range:
@@ -317,6 +274,6 @@ class _Binder:
             try:
                 variable, owner = self._description[name], self._description.path.name
                 variable.values(value, owner)
-                check_start(variable, owner, self._driven())
+                check_settable(variable, owner, self._driven)
             except GoughError as error:
                 self._problems.append(f"[start] {error}")

@@ -108,26 +108,26 @@ def _advance(fmu: FmuInstance) -> None:
     experiment = fmu.description.experiment
     step = float(experiment.stepSize if experiment and experiment.stepSize else 1e-3)
     for i in range(_STEPS):
-        fmu.step(i * step, step)
+        fmu.do_step(i * step, step)
 
 
 def _outputs(fmu: FmuInstance) -> list[Array]:
-    return [fmu.get(each).ravel() for each in _reals(fmu.description, "output")]
+    return [fmu.get(each.name).ravel() for each in _reals(fmu.description, "output")]
 
 
 def _step(description: FmuDescription) -> list[str]:
-    with contextlib.closing(FmuInstance(description)) as fmu:
-        fmu.initialize()
+    with FmuInstance(description) as fmu:
+        fmu.start()
         _advance(fmu)
         outputs = _reals(description, "output")
-        return [f"{each.name} is not finite" for each in outputs if not np.isfinite(fmu.get(each)).all()]
+        return [f"{each.name} is not finite" for each in outputs if not np.isfinite(fmu.get(each.name)).all()]
 
 
 def _restore(description: FmuDescription) -> list[str] | None:
     if not description.saves_state:
         return None
-    with contextlib.closing(FmuInstance(description)) as fmu:
-        fmu.initialize()
+    with FmuInstance(description) as fmu:
+        fmu.start()
         saved = fmu.state()
         _advance(fmu)
         once = _outputs(fmu)
@@ -143,19 +143,19 @@ def _differentiate(description: FmuDescription) -> list[str] | None:
     if not (description.differentiable and inputs and outputs):
         return None
     problems = []
-    with contextlib.closing(FmuInstance(description)) as fmu:
-        fmu.initialize()
+    with FmuInstance(description) as fmu:
+        fmu.start()
         for known in inputs:
             derivatives = fmu.jacobian(outputs, [known])
-            middle = fmu.get(known).ravel()
+            middle = fmu.get(known.name).ravel()
             for i, column in enumerate(derivatives.T):
                 ends: list[Array] = []
                 for sign in (1.0, -1.0):
                     moved: Any = middle.copy()
                     moved[i] += sign * _SMALL
-                    fmu.set(known, moved)
+                    fmu.set(known.name, moved)
                     ends.append(np.concatenate(_outputs(fmu)))
-                fmu.set(known, middle)
+                fmu.set(known.name, middle)
                 differences = (ends[0] - ends[1]) / (2.0 * _SMALL)
                 size = max(float(np.abs(column).max()), float(np.abs(differences).max()))
                 if np.abs(column - differences).max() > _ROUGHLY * size:

@@ -9,15 +9,15 @@ import itertools
 import zipfile
 import zlib
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import fmpy
 import fmpy.fmi2
 import fmpy.fmi3
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from plant.errors import FmuError, InputError
 from plant.files import temporary_folder
@@ -40,47 +40,54 @@ _MOST_MESSAGES = 100
 
 
 class FmuInstance:
-    """A loaded and instantiated FMU, until it is closed.
-
-    Args:
-        description: of the FMU.
+    """An FMU that is loaded by `start` and freed by `close`.
 
     Attributes:
         messages: the latest warnings and errors that the FMU has logged.
-        folder: with its extracted files.
-        initialized: whether initialisation has ended.
+        folder: with the extracted files; removed by `close`, or after a crash when an FMU is next loaded.
         status: of its failure, after which FMI allows fewer calls.
-
-    Raises:
-        FmuError: it holds no binary for this machine, or cannot be loaded.
     """
 
     def __init__(self, description: FmuDescription) -> None:
-        self.description = description
+        self.description, self.path = description, description.path
         self.messages: deque[str] = deque(maxlen=_MOST_MESSAGES)
         self.folder = Path()
-        self.initialized = self.closed = False
         self.status = OK
+        self._initialized = self._closed = False
         self._cleanup = contextlib.ExitStack()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def start(self, values: Iterable[tuple[FmuVariable, NDArray[Any]]] = ()) -> None:
+        """Load the FMU, set start values, and initialise it at time 0.
+
+        Raises:
+            FmuError: it holds no binary for this machine, cannot be loaded, or refuses.
+        """
+        experiment = (False, 0.0, 0.0, False, 0.0)
         try:
             self.fmu = self._load()
+            for variable, numbers in values:
+                self._access("Set", variable, numbers)
+            if self.description.version == 2:
+                self._call("SetupExperiment", "the setup of the experiment", *experiment)
+                self._call("EnterInitializationMode", "initialisation")
+            else:
+                self._call("EnterInitializationMode", "initialisation", *experiment)
+            self._call("ExitInitializationMode", "initialisation")
         except BaseException:
-            self._cleanup.close()
+            self.close()
             raise
+        self._initialized = True
 
     def close(self) -> None:
         """Free the instance and remove the extracted files; a second call does nothing."""
-        self.closed = True
+        self._closed = True
         self._cleanup.close()
-
-    def check_open(self) -> None:
-        """Check that it has not been closed.
-
-        Raises:
-            FmuError: it has.
-        """
-        if self.closed:
-            raise FmuError(f"{self.description.path.name} has been closed: load it again")
 
     def address(self, function: str) -> int:
         """The address of a C function, named without its prefix, such as `DoStep`."""
@@ -91,39 +98,31 @@ class FmuInstance:
         component = self.fmu.component
         return int(component if isinstance(component, int) else component.value)
 
-    def initialize(self) -> None:
-        """Set up the experiment at time 0 and initialise the FMU.
+    def get(self, name: str) -> NDArray[Any]:
+        """The value of a number, in its own shape.
 
         Raises:
+            UnknownNameError: the FMU has no such variable.
+            InputError: the variable is no number.
             FmuError: the FMU refuses.
         """
-        if self.description.version == 2:
-            self._check(self._call("SetupExperiment", 0, 0.0, 0.0, 0, 0.0), "the setup of the experiment")
-            self._check(self._call("EnterInitializationMode"), "initialisation")
-        else:
-            self._check(self._call("EnterInitializationMode", False, 0.0, 0.0, False, 0.0), "initialisation")
-        self._check(self._call("ExitInitializationMode"), "initialisation")
-        self.initialized = True
-
-    def get(self, variable: FmuVariable) -> NDArray[Any]:
-        """The values of a variable, in its own shape.
-
-        Raises:
-            FmuError: the FMU refuses.
-        """
+        variable = self.description[name]
         if not variable.ending:
-            raise InputError(f"{variable.name} of {self.description.path.name} is a {variable.type} and no number")
+            raise InputError(f"{name} of {self.path.name} is a {variable.type} and no number")
         values = np.zeros(variable.size, variable.dtype)
         self._access("Get", variable, values)
         return values.reshape(variable.shape)
 
-    def set(self, variable: FmuVariable, values: NDArray[Any]) -> None:
-        """Set a variable to values (size,) of its own type.
+    def set(self, name: str, value: ArrayLike) -> None:
+        """Set a number.
 
         Raises:
+            UnknownNameError: the FMU has no such variable.
+            InputError: the value has the wrong number of elements or the wrong type.
             FmuError: the FMU refuses.
         """
-        self._access("Set", variable, values)
+        variable = self.description[name]
+        self._access("Set", variable, variable.values(value, self.path.name))
 
     def jacobian(self, unknowns: Sequence[FmuVariable], knowns: Sequence[FmuVariable]) -> Array:
         """The partial derivatives (m, n) of the unknowns' m scalars by the knowns' n, from the FMU's directional derivatives.
@@ -132,14 +131,13 @@ class FmuInstance:
             FmuError: the FMU lacks directional derivatives, or these ones.
             InputError: a variable is not real.
         """
-        self.check_open()
+        self._check_open()
         if not self.description.differentiable:
-            raise FmuError(f"{self.description.path.name} has no directional derivatives: export it with them")
+            raise FmuError(f"{self.path.name} has no directional derivatives: export it with them")
         for each in (*unknowns, *knowns):
             if not each.real:
                 raise InputError(
-                    f"{each.name} of {self.description.path.name} is of type {each.type} and has no derivatives: choose real "
-                    "variables"
+                    f"{each.name} of {self.path.name} is of type {each.type} and has no derivatives: choose real variables"
                 )
         rows, columns = sum(each.size for each in unknowns), sum(each.size for each in knowns)
         jacobian, seed, product = np.zeros((rows, columns)), np.zeros(columns), np.zeros(rows)
@@ -159,13 +157,13 @@ class FmuInstance:
             jacobian[:, column] = product
         return jacobian
 
-    def step(self, time: float, duration: float) -> None:
+    def do_step(self, time: float, duration: float) -> None:
         """Take a communication step from `time` [s].
 
         Raises:
             FmuError: the FMU fails.
         """
-        self.check_open()
+        self._check_open()
         with self._calling("a step"):
             self.fmu.doStep(time, duration, not self.description.saves_state)
 
@@ -197,52 +195,54 @@ class FmuInstance:
             finally:
                 self.fmu.freeFMUState(held)
 
-    def failure(self, what: str, status: int) -> FmuError:
+    def _failed(self, what: str, status: int) -> FmuError:
         """The error for an action that ended with a status, with the FMU's own reason."""
         self.status = status
         reason = self.messages[-1] if self.messages else "the FMU gives no reason"
-        return FmuError(f"{self.description.path.name}: {what} {_ENDINGS.get(status, f'ended with status {status}')}: {reason}")
+        return FmuError(f"{self.path.name}: {what} {_ENDINGS.get(status, f'ended with status {status}')}: {reason}")
 
     def _check(self, status: int, what: str) -> None:
         if status != OK:
-            raise self.failure(what, status)
+            raise self._failed(what, status)
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise FmuError(f"{self.path.name} has been closed: load it again")
 
     def _check_saves(self) -> None:
-        self.check_open()
+        self._check_open()
         if not self.description.saves_state:
-            raise FmuError(f"{self.description.path.name} cannot save its state: export it with canSerializeFMUState")
+            raise FmuError(f"{self.path.name} cannot save its state: export it with canSerializeFMUState")
 
     @contextlib.contextmanager
     def _calling(self, what: str) -> Any:
         try:
             yield
         except fmpy.fmi1.FMICallException as error:
-            raise self.failure(what, error.status) from None
+            raise self._failed(what, error.status) from None
 
     def _function(self, name: str) -> Any:
         return getattr(self.fmu.dll, f"fmi{self.description.version}{name}")
 
-    def _call(self, name: str, *arguments: Any) -> int:
-        return int(self._function(name)(self.fmu.component, *arguments))
+    def _call(self, name: str, what: str, *arguments: Any) -> None:
+        self._check(self._function(name)(self.fmu.component, *arguments), what)
 
     def _access(self, verb: str, variable: FmuVariable, values: NDArray[Any]) -> None:
-        self.check_open()
+        self._check_open()
         function = self._function(f"{verb}{variable.ending}")
         references = np.array(variable.references, np.uint32)
-        pointers = [
-            array.ctypes.data_as(kind) for array, kind in ((references, function.argtypes[1]), (values, function.argtypes[3]))
-        ]
+        at, into = references.ctypes.data_as(function.argtypes[1]), values.ctypes.data_as(function.argtypes[3])
         sizes = [] if self.description.version == 2 else [values.size]
-        status = function(self.fmu.component, pointers[0], references.size, pointers[1], *sizes)
+        status = function(self.fmu.component, at, references.size, into, *sizes)
         self._check(status, f"{verb.lower()}ting {variable.name}")
 
     def _load(self) -> Any:
-        description, name = self.description, self.description.path.name
+        description, name = self.description, self.path.name
         identifier = description.co_simulation.modelIdentifier
         platform = fmpy.platform if description.version == 2 else fmpy.platform_tuple
         self.folder = self._cleanup.enter_context(temporary_folder("gough-fmu-"))
         try:
-            with zipfile.ZipFile(description.path) as archive:
+            with zipfile.ZipFile(self.path) as archive:
                 for member in archive.namelist():
                     if not member.startswith(("sources/", "documentation/")):
                         archive.extract(member, self.folder)
@@ -263,18 +263,15 @@ class FmuInstance:
                 fmu.instantiate(loggingOn=True, logMessage=self._logged)
         except Exception as error:
             reason = self.messages[-1] if self.messages else error
-            needed = (
-                f" (it needs {description.tool or 'its tool'} on this machine)"
-                if description.co_simulation.needsExecutionTool
-                else ""
-            )
+            tool = f" (it needs {description.tool or 'its tool'} on this machine)"
+            needed = tool if description.co_simulation.needsExecutionTool else ""
             raise FmuError(f"{name} cannot be loaded: {reason}{needed}") from None
         self._cleanup.callback(self._free, fmu)
         return fmu
 
     def _free(self, fmu: Any) -> None:
-        if self.initialized and self.status < ERROR:
-            self._call("Terminate")
+        if self._initialized and self.status < ERROR:
+            self._function("Terminate")(fmu.component)
         if self.status != FATAL:
             fmu.freeInstance()
 

@@ -2,18 +2,16 @@
 
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plant.compiled import Record
 from plant.errors import FmuError, InputError
-from plant.fmu.binding import Modes, Scalars, bind, check_free, check_start
+from plant.fmu.binding import Modes, Scalars, bind, check_settable
 from plant.fmu.binding_file import OWN_BINDING, Binding, load_binding
 from plant.fmu.calls import CALLED, FMU_HANDLE, MOST_CHANGES, advance
 from plant.fmu.importer import FmuDescription, FmuVariable
@@ -23,13 +21,9 @@ from plant.mechanism import LEGS
 from plant.pose import Array
 
 
-@dataclass(frozen=True, eq=False)
-class LinearPlant:
-    """A linear system `x' = A x + B u, y = C x + D u` with n states, m inputs and p outputs, all differences from a point.
-
-    Attributes:
-        a, b, c, d: (n, n), (n, m), (p, n), (p, m).
-        states, inputs, outputs: the names of the scalars.
+class LinearPlant(NamedTuple):
+    """A linear system `x' = A x + B u, y = C x + D u` with n states, m inputs and p outputs, all differences from a point:
+    matrices (n, n), (n, m), (p, n), (p, m), and the names of the scalars.
     """
 
     a: Array
@@ -41,7 +35,7 @@ class LinearPlant:
     outputs: tuple[str, ...]
 
 
-class FmuPlant:
+class FmuPlant(FmuInstance):
     """A plant FMU for Co-Simulation, of FMI 2.0 or 3.0, initialised and ready to step.
 
     Args:
@@ -55,7 +49,6 @@ class FmuPlant:
     Attributes:
         handle: the structured array (dtype `FMU_HANDLE`) for `read_imus`, `read_truth`, `write_command` and `advance`.
         bound: the loop's signals in the FMU.
-        folder: with the extracted files; removed by `close`, or after a crash when an FMU is next loaded.
 
     Raises:
         FmuError: the file is no FMU, is of another kind, does not fit its binding, has no binary for this machine, or refuses
@@ -74,73 +67,29 @@ class FmuPlant:
         settings: Sequence[Setting] = (),
         legs: int | None = None,
     ) -> None:
-        self.path = Path(path)
-        self.handle: Record = np.zeros((), FMU_HANDLE)
         if not isinstance(binding, Binding):
             binding = OWN_BINDING if binding is None else load_binding(binding)
-        self.description = FmuDescription(self.path)
+        super().__init__(FmuDescription(Path(path)))
+        self.handle: Record = np.zeros((), FMU_HANDLE)
         self.bound = bind(binding, self.description)
         if legs not in (None, self.bound.legs):
             raise InputError(f"{self.path.name} has {self.bound.legs} legs, and the mechanism has {legs}: choose another one")
         self._check_period(period, binding.step)
-        self._kept: list[NDArray[Any]] = []
-        starts = {**parameters, **binding.start}
-        values = [self._values(name, value) for name, value in starts.items()]
-        values += [self._start_values(each) for each in settings if each.at is None]
-        changes = sorted((each for each in settings if each.at is not None), key=lambda each: each.at or 0.0)
-        self._check_changes(changes)
-        self._instance = FmuInstance(self.description)
-        try:
-            self._prepare_handle(binding.step)
-            for each in changes:
-                self._add_change(each)
-            for variable, numbers in values:
-                self._instance.set(variable, numbers)
-            self._instance.initialize()
-        except BaseException:
-            self._instance.close()
-            raise
-
-    def __enter__(self) -> "FmuPlant":
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
-
-    @property
-    def folder(self) -> Path:
-        """The folder with the extracted files."""
-        return self._instance.folder
-
-    @property
-    def messages(self) -> Sequence[str]:
-        """The latest warnings and errors that the FMU has logged."""
-        return self._instance.messages
+        values = [self._values(name, value) for name, value in {**parameters, **binding.start}.items()]
+        values += [self._setting(each) for each in settings if each.at is None]
+        later = sorted((each.at, i) for i, each in enumerate(settings) if each.at is not None)
+        if len(later) > MOST_CHANGES:
+            raise InputError(f"{len(later)} settings change during the run, and at most {MOST_CHANGES} can")
+        changes = [(at, *self._setting(settings[i])) for at, i in later]
+        self.start(values)
+        self._prepare_handle(binding.step)
+        self._kept = [self._prepare_change(record, *each) for record, each in zip(self.handle["changes"], changes, strict=False)]
+        self.handle["change_count"] = len(changes)
 
     def close(self) -> None:
         """Free the instance and remove the extracted files; a second call does nothing."""
-        self._instance.status = max(self._instance.status, int(self.handle["status"]))
-        self._instance.close()
-
-    def get(self, name: str) -> NDArray[Any]:
-        """The value of a number, in its own shape.
-
-        Raises:
-            UnknownNameError: the FMU has no such variable.
-            InputError: the variable is no number.
-            FmuError: the FMU refuses.
-        """
-        return self._instance.get(self.description[name])
-
-    def set(self, name: str, value: ArrayLike) -> None:
-        """Set a number.
-
-        Raises:
-            UnknownNameError: the FMU has no such variable.
-            InputError: the value has the wrong number of elements or the wrong type.
-            FmuError: the FMU refuses.
-        """
-        self._instance.set(*self._values(name, value))
+        self.status = max(self.status, int(self.handle["status"]))
+        super().close()
 
     def step(self, duration: float) -> None:
         """Advance by `duration` [s].
@@ -148,12 +97,12 @@ class FmuPlant:
         Raises:
             FmuError: the FMU reports a failure.
         """
-        self._instance.check_open()
+        self._check_open()
         self.handle["status"] = OK
         if advance(self.handle, duration):
             raise self.failure()
 
-    def linearize(self, inputs: Sequence[str], outputs: Sequence[str]) -> "LinearPlant":
+    def linearize(self, inputs: Sequence[str], outputs: Sequence[str]) -> LinearPlant:
         """The plant's equations linearised at its present state, from the FMU's directional derivatives.
 
         Args:
@@ -169,7 +118,7 @@ class FmuPlant:
             raise FmuError(f"{self.path.name} exposes no continuous states: export it with them")
         u, y = [self.description[name] for name in inputs], [self.description[name] for name in outputs]
         n = sum(each.size for each in states)
-        whole = self._instance.jacobian([*rates, *y], [*states, *u])
+        whole = self.jacobian([*rates, *y], [*states, *u])
         names = tuple(tuple(name for each in side for name in each.element_names) for side in (states, u, y))
         return LinearPlant(whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:], *names)
 
@@ -179,7 +128,7 @@ class FmuPlant:
         Raises:
             FmuError: the FMU cannot save its state.
         """
-        return struct.pack(_CLOCK, *(self.handle[name] for name in _CLOCKED)) + self._instance.state()
+        return struct.pack(_CLOCK, *(self.handle[name] for name in _CLOCKED)) + super().state()
 
     def restore(self, state: bytes) -> None:
         """Return to a state of this plant, or of another with the same FMU and settings.
@@ -190,21 +139,26 @@ class FmuPlant:
         size = struct.calcsize(_CLOCK)
         if len(state) < size:
             raise FmuError(f"{self.path.name} cannot restore a state of {len(state)} bytes, which is no state of this plant")
-        self._instance.restore(state[size:])
+        super().restore(state[size:])
         for name, value in zip(_CLOCKED, struct.unpack(_CLOCK, state[:size]), strict=True):
             self.handle[name] = value
 
     def failure(self) -> FmuError:
         """The error for the first compiled call that failed, with the FMU's own reason."""
-        return self._instance.failure(CALLED[int(self.handle["call"])], int(self.handle["status"]))
+        return self._failed(CALLED[int(self.handle["call"])], int(self.handle["status"]))
 
     def _values(self, name: str, value: ArrayLike, spread: bool = False) -> tuple[FmuVariable, NDArray[Any]]:
         variable = self.description[name]
         return variable, variable.values(value, self.path.name, spread)
 
-    def _start_values(self, setting: Setting) -> tuple[FmuVariable, NDArray[Any]]:
+    def _setting(self, setting: Setting) -> tuple[FmuVariable, NDArray[Any]]:
+        """The variable and the values of a setting that the FMU takes at its time."""
         variable, values = self._values(setting.name, setting.value, spread=True)
-        check_start(variable, self.path.name, self.bound.driven)
+        check_settable(variable, self.path.name, self.bound.driven, running=setting.at is not None)
+        if setting.at is not None:
+            for name, value, (least, most) in zip(variable.element_names, values, variable.limits, strict=True):
+                if not least <= value <= most:
+                    raise InputError(f"{name} of {self.path.name} would be {value:g}; it must be from {least:g} to {most:g}")
         return variable, values
 
     def _check_period(self, period: float, step: float | None) -> None:
@@ -231,38 +185,12 @@ class FmuPlant:
             f"rate must be {1 / fixed:g} Hz divided by a whole number"
         )
 
-    def _check_changes(self, changes: Sequence[Setting]) -> None:
-        if len(changes) > MOST_CHANGES:
-            raise InputError(f"{len(changes)} settings change during the run, and at most {MOST_CHANGES} can")
-        for each in changes:
-            variable, values = self._values(each.name, each.value, spread=True)
-            if not variable.tunable:
-                raise InputError(
-                    f"{each.name} of {self.path.name} cannot change during the run, as it is neither an input nor a tunable "
-                    "parameter: set it without @"
-                )
-            check_free(variable, self.path.name, self.bound.driven)
-            for name, value, (least, most) in zip(variable.element_names, values, variable.limits, strict=True):
-                if not least <= value <= most:
-                    raise InputError(f"{name} of {self.path.name} would be {value:g}; it must be from {least:g} to {most:g}")
-
-    def _add_change(self, setting: Setting) -> None:
-        variable, values = self._values(setting.name, setting.value, spread=True)
-        references = np.array(variable.references, np.uint32)
-        self._kept += [references, values]
-        change = self.handle["changes"][self.handle["change_count"]]
-        change["time"], change["function"] = setting.at, self._instance.address(f"Set{variable.ending}")
-        change["references"], change["reference_count"] = references.ctypes.data, references.size
-        change["values"], change["count"] = values.ctypes.data, values.size
-        self.handle["change_count"] += 1
-
     def _prepare_handle(self, step: float | None) -> None:
-        handle, bound, instance = self.handle, self.bound, self._instance
+        handle, bound = self.handle, self.bound
         real = "Real" if self.description.version == 2 else "Float64"
-        handle["version"], handle["instance"] = self.description.version, instance.component()
-        handle["get"], handle["set"], handle["do_step"] = (
-            instance.address(each) for each in (f"Get{real}", f"Set{real}", "DoStep")
-        )  # fmt: skip
+        handle["version"], handle["instance"] = self.description.version, self.component()
+        for field, function in (("get", f"Get{real}"), ("set", f"Set{real}"), ("do_step", "DoStep")):
+            handle[field] = self.address(function)
         handle["step"], handle["final"] = step or 0.0, not self.description.saves_state
         for group in ("sensed", "known", "commanded", "loaded"):
             _fill(handle[group], getattr(bound, group))
@@ -275,13 +203,21 @@ class FmuPlant:
 
     def _prepare_modes(self, modes: Modes, variable: FmuVariable) -> None:
         handle = self.handle
-        count = 1 if modes.common else self.bound.legs
-        handle["set_mode"] = self._instance.address(f"Set{variable.ending}")
+        handle["set_mode"] = self.address(f"Set{variable.ending}")
         handle["mode_references"][: modes.references.size] = modes.references
-        handle["mode_count"], handle["mode_bytes"] = count, variable.dtype.itemsize
         handle["mode_reference_count"] = modes.references.size
+        handle["mode_count"] = 1 if modes.common else self.bound.legs
+        handle["mode_bytes"] = variable.dtype.itemsize
         for mode, value in enumerate(modes.values.astype(variable.dtype)):
             handle["mode_values"][mode] = int.from_bytes(value.tobytes(), "little")
+
+    def _prepare_change(self, change: Record, at: float, variable: FmuVariable, values: NDArray[Any]) -> list[NDArray[Any]]:
+        """Fill the record of a change; returns the arrays that it points to, which must be kept."""
+        references = np.array(variable.references, np.uint32)
+        change["time"], change["function"] = at, self.address(f"Set{variable.ending}")
+        change["references"], change["reference_count"] = references.ctypes.data, references.size
+        change["values"], change["count"] = values.ctypes.data, values.size
+        return [references, values]
 
 
 _CLOCKED = ("time", "since", "length", "steps", "changed")
