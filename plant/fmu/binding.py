@@ -199,10 +199,9 @@ class _Binder:
             found, signal, count = self._found[name], self._binding.signals[name], len(elements)
             references += [reference for each in found for reference in each.references]
             if self._size(name) != count:
-                names = ", ".join(each.name for each in found)
                 have = "has" if len(found) == 1 else "together have"
                 remedy = "; if there are fewer imus, name them with imus" if name in IMU_SIGNALS and signal.imus is None else ""
-                self._problems.append(f"{name}: {names} {have} {self._size(name)} elements and must have {count}{remedy}")
+                self._problems.append(f"{name}: {_names(found)} {have} {self._size(name)} elements and must have {count}{remedy}")
                 continue
             units = np.array([self._factor(name, each) for each in found for _ in range(each.size)])
             factors += list(units * self._spread(name, "sign", signal.sign, count))
@@ -234,14 +233,10 @@ class _Binder:
             return Modes(references[:0], np.zeros(len(DRIVE_MODES)), None, False)
         size, first = self._size(MODES), found[0]
         if size not in (1, self._legs):
-            names = ", ".join(each.name for each in found)
-            self._problems.append(f"{MODES}: {names} together have {size} elements and must have 1, or {self._legs}")
+            self._problems.append(f"{MODES}: {_names(found)} together have {size} elements and must have 1, or {self._legs}")
         if len({(each.ending, each.dtype) for each in found}) > 1:
-            self._problems.append(
-                f"{MODES}: {', '.join(each.name for each in found)} are of different types and must be of one"
-            )
-        switch = first.type == "Boolean"
-        usual = (0.0, 0.0, 1.0) if switch else tuple(map(float, DRIVE_MODES))
+            self._problems.append(f"{MODES}: {_names(found)} are of different types and must be of one")
+        usual = (0.0, 0.0, 1.0) if first.type == "Boolean" else tuple(map(float, DRIVE_MODES))
         told = self._binding.signals[MODES].modes
         values = [each if mode is None else mode for each, mode in zip(usual, told, strict=True)]
         if told[OPEN] is None and told[BRAKE] is not None:
@@ -277,3 +272,7 @@ class _Binder:
                 check_settable(variable, owner, self._driven)
             except GoughError as error:
                 self._problems.append(f"[start] {error}")
+
+
+def _names(variables: Sequence[FmuVariable]) -> str:
+    return ", ".join(each.name for each in variables)

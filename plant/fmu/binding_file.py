@@ -56,44 +56,26 @@ LEAST_STEP_S = 1e-6
 
 @dataclass(frozen=True)
 class SignalBinding:
-    """One signal: the FMU's variables that hold it, in order, and the conversion of their values to the loop's.
-
-    Attributes:
-        variables: names in the FMU.
-        unit: of the FMU's values; None for the unit that the FMU declares, or else the loop's.
-        sign: factors of 1 or -1: one, one for each axis, or one for each element.
-        offset: added afterwards, in the loop's unit: one, or one for each element.
-        imus: numbers of the IMUs; None for all.
-        modes: the FMU's values for a drive that is open, braked, and driven at its velocity; None for the usual value.
-    """
+    """One signal: the FMU's variables that hold it, in order, and the conversion of their values to the loop's."""
 
     variables: tuple[str, ...]
-    unit: str | None = None
-    sign: tuple[float, ...] = (1.0,)
-    offset: tuple[float, ...] = (0.0,)
-    imus: tuple[int, ...] | None = None
-    modes: tuple[float | None, ...] = (None,) * len(DRIVE_MODES)
+    unit: str | None = None  # None for the unit that the FMU declares, or else the loop's
+    sign: tuple[float, ...] = (1.0,)  # 1 or -1: one, one for each axis, or one for each element
+    offset: tuple[float, ...] = (0.0,)  # added afterwards, in the loop's unit: one, or one for each element
+    imus: tuple[int, ...] | None = None  # None for all
+    modes: tuple[float | None, ...] = (None,) * len(DRIVE_MODES)  # the FMU's values; None for the usual value
 
 
 @dataclass(frozen=True)
 class Binding:
-    """A binding that has not been checked against its FMU.
+    """A binding that has not been checked against its FMU."""
 
-    Attributes:
-        source: its file, for messages; "" for gough's own.
-        signals: by name.
-        step: communication step [s]; None for the control period.
-        start: start values by the FMU's own names.
-        native: whether the signals are those of gough's own plants, which also have gough's parameters.
-        problems: errors in the file.
-    """
-
-    source: str
+    source: str  # its file, for messages; "" for gough's own
     signals: Mapping[str, SignalBinding]
-    step: float | None = None
-    start: Mapping[str, Any] = field(default_factory=dict)
-    native: bool = False
-    problems: tuple[str, ...] = ()
+    step: float | None = None  # of communication [s]; None for the control period
+    start: Mapping[str, Any] = field(default_factory=dict)  # values by the FMU's own names
+    native: bool = False  # whether the signals are those of gough's own plants, which also have gough's parameters
+    problems: tuple[str, ...] = ()  # errors in the file
 
 
 _OWN_SIGNALS = {name: SignalBinding((name,)) for name in SIGNAL_UNITS}
@@ -133,10 +115,9 @@ class _Reader:
     def step(self, table: Mapping[str, Any]) -> float | None:
         self.problems += unknown_entries(table, ("step",), "[fmu]")
         step = table.get("step")
-        if step is not None and not (_is_number(step) and step >= LEAST_STEP_S):
-            self.problems.append(f"[fmu] step is {step!r}; it must be a number of seconds, at least {LEAST_STEP_S:g}")
-            return None
-        return None if step is None else float(step)
+        good = step is None or (_is_number(step) and step >= LEAST_STEP_S)
+        self._check("fmu", "step", step, good, f"a number of seconds, at least {LEAST_STEP_S:g}")
+        return float(step) if good and step is not None else None
 
     def signal(self, name: str, table: Mapping[str, Any]) -> SignalBinding:
         entries = _ENTRIES if name != MODES else ("variables", *_MODE_NAMES)
@@ -144,50 +125,49 @@ class _Reader:
         variables = table.get("variables", [])
         if isinstance(variables, str):
             variables = [variables]
-        if not (isinstance(variables, list) and variables and all(isinstance(each, str) for each in variables)):
-            self.problems.append(f"[{name}] variables is {variables!r}; it must be the name of a variable, or a list of names")
-            variables = []
+        named = isinstance(variables, list) and variables and all(isinstance(each, str) for each in variables)
+        self._check(name, "variables", variables, named, "the name of a variable, or a list of names")
         unit = table.get("unit")
-        if unit is not None and not (isinstance(unit, str) and unit in UNITS[SIGNAL_UNITS[name]]):
-            self.problems.append(f"[{name}] unit is {unit!r}; it must be one of {unit_names(name)}")
-            unit = None
+        known = unit is None or (isinstance(unit, str) and unit in UNITS[SIGNAL_UNITS[name]])
+        self._check(name, "unit", unit, known, f"one of {unit_names(name)}")
+        sign = self._numbers(name, "sign", table.get("sign", 1))
+        signs = set(sign) <= {1.0, -1.0}
+        self._check(name, "sign", table.get("sign"), signs, "1 or -1, or a list of these")
         return SignalBinding(
-            tuple(variables), unit, self._signs(name, table), self._numbers(name, "offset", table.get("offset", 0.0)),
-            self._imus(name, table.get("imus")), tuple(self._mode(name, mode, table.get(mode)) for mode in _MODE_NAMES),
-        )  # fmt: skip
+            tuple(variables) if named else (),
+            unit if known else None,
+            sign if signs else (1.0,),
+            self._numbers(name, "offset", table.get("offset", 0.0)),
+            self._imus(name, table.get("imus")),
+            tuple(self._mode(name, mode, table.get(mode)) for mode in _MODE_NAMES),
+        )
+
+    def _check(self, name: str, entry: str, value: Any, good: Any, needed: str) -> None:
+        if not good:
+            self.problems.append(f"[{name}] {entry} is {value!r}; it must be {needed}")
 
     def _numbers(self, name: str, entry: str, value: Any) -> tuple[float, ...]:
         values = value if isinstance(value, list) else [value]
-        if values and all(_is_number(each) or isinstance(each, bool) for each in values):
-            return tuple(map(float, values))
-        self.problems.append(f"[{name}] {entry} is {value!r}; it must be a number, or a list of numbers")
-        return (0.0,) * len(values or [0.0])
+        good = values and all(_is_number(each) or isinstance(each, bool) for each in values)
+        self._check(name, entry, value, good, "a number, or a list of numbers")
+        return tuple(map(float, values)) if good else (0.0,) * len(values or [0.0])
 
     def _mode(self, name: str, mode: str, value: Any) -> float | None:
-        if value is None or _is_number(value) or isinstance(value, bool):
-            return None if value is None else float(value)
-        self.problems.append(f"[{name}] {mode} is {value!r}; it must be a number, true or false")
-        return None
-
-    def _signs(self, name: str, table: Mapping[str, Any]) -> tuple[float, ...]:
-        signs = self._numbers(name, "sign", table.get("sign", 1))
-        if set(signs) <= {1.0, -1.0}:
-            return signs
-        self.problems.append(f"[{name}] sign is {table['sign']!r}; it must be 1 or -1, or a list of these")
-        return (1.0,)
+        good = value is None or _is_number(value) or isinstance(value, bool)
+        self._check(name, mode, value, good, "a number, true or false")
+        return float(value) if good and value is not None else None
 
     def _imus(self, name: str, value: Any) -> tuple[int, ...] | None:
         if value is None:
             return None
-        if (
+        good = (
             isinstance(value, list)
             and value
             and all(type(each) is int and each in range(IMU_COUNT) for each in value)
             and len(set(value)) == len(value)
-        ):
-            return tuple(value)
-        self.problems.append(f"[{name}] imus is {value!r}; it must be a list of different numbers from 0 to {PLATFORM_IMU}")
-        return None
+        )
+        self._check(name, "imus", value, good, f"a list of different numbers from 0 to {PLATFORM_IMU}")
+        return tuple(value) if good else None
 
 
 def _is_number(value: Any) -> bool:

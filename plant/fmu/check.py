@@ -7,10 +7,9 @@ import multiprocessing
 import os
 import zipfile
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from fmpy.validation import validate_fmu
@@ -28,8 +27,7 @@ Found = tuple[str, ...] | None
 """Problems, if any; None if there was nothing to check."""
 
 
-@dataclass(frozen=True)
-class Check:
+class Check(NamedTuple):
     """One check and its result."""
 
     name: str
@@ -50,9 +48,8 @@ def check_fmu(path: Path) -> list[Check]:
         FmuError: the file is no FMU for Co-Simulation.
     """
     FmuDescription(path)
-    found = {"description and units (FMPy)": _found(lambda: validate_fmu(str(path)))}
-    found |= zip(_TRIALS, _try_apart(path), strict=True)
-    return [Check(name, problems) for name, problems in found.items()]
+    valid = Check("description and units (FMPy)", _found(lambda: validate_fmu(str(path))))
+    return [valid, *map(Check, _TRIALS, _try_apart(path))]
 
 
 def _try_apart(path: Path) -> list[Found]:
@@ -69,7 +66,9 @@ def _try_apart(path: Path) -> list[Found]:
                 found.append(receiver.recv())
         process.join()
         if len(found) < len(_TRIALS):
-            found.append((_ending(process.exitcode or 0),))
+            status = process.exitcode or 0
+            ending = f"crashed with signal {-status}" if status < 0 else f"ended its process with status {status}"
+            found.append((ending,))
     return found
 
 
@@ -82,11 +81,6 @@ def _try(path: Path, first: int, sender: Connection) -> None:
     description = FmuDescription(path)
     for trial in list(_TRIALS.values())[first:]:
         sender.send(_found(functools.partial(trial, description)))
-
-
-def _ending(status: int) -> str:
-    """How a process ended unexpectedly."""
-    return f"crashed with signal {-status}" if status < 0 else f"ended its process with status {status}"
 
 
 def _found(trial: Callable[[], Iterable[str] | None]) -> Found:

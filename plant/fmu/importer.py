@@ -43,19 +43,7 @@ _ELEMENT = re.compile(r"(.+)\[(\d+(?:, ?\d+)*)\]")
 
 @dataclass(frozen=True)
 class FmuVariable:
-    """A variable of an FMU. In FMI 2.0, the scalars `name[1,1]`, `name[1,2]`, ... also form one array variable `name`.
-
-    Attributes:
-        name: in the FMU.
-        shape: () for a scalar.
-        type, causality, variability: as FMI names them.
-        unit: None if the FMU declares none.
-        limits: least and greatest value of each scalar, as the FMU declares them.
-        startable: whether it may be set before initialisation.
-        references: value references; for an array of scalars, row by row.
-        ending: of its functions' names, such as Float64 in `fmi3GetFloat64`; "" if it is no number.
-        dtype: of these functions' values.
-    """
+    """A variable of an FMU. In FMI 2.0, the scalars `name[1,1]`, `name[1,2]`, ... also form one array variable `name`."""
 
     name: str
     shape: tuple[int, ...]
@@ -63,11 +51,11 @@ class FmuVariable:
     causality: str
     variability: str
     unit: str | None
-    limits: tuple[tuple[float, float], ...]
-    startable: bool
-    references: tuple[int, ...]
-    ending: str
-    dtype: np.dtype[Any]
+    limits: tuple[tuple[float, float], ...]  # least and greatest value of each scalar
+    startable: bool  # whether it may be set before initialisation
+    references: tuple[int, ...]  # for an array of scalars, row by row
+    ending: str  # of its functions' names, such as Float64 in `fmi3GetFloat64`; "" if it is no number
+    dtype: np.dtype[Any]  # of these functions' values
 
     @property
     def size(self) -> int:
@@ -122,11 +110,10 @@ class FmuVariable:
             raise InputError(f"{self.name} of {owner} has {self.size} elements, got {numbers.size}")
         if self.dtype.kind == "f":
             return numbers.astype(self.dtype)
-        whole, needed = numbers == np.rint(numbers), "whole numbers"
-        if self.type == "Boolean":
-            whole, needed = np.isin(numbers, (0.0, 1.0)), "true or false"
+        switch = self.type == "Boolean"
+        whole = np.isin(numbers, (0.0, 1.0)) if switch else numbers == np.rint(numbers)
         if not whole.all():
-            raise InputError(f"{self.name} of {owner} must be {needed}, got {given!r}")
+            raise InputError(f"{self.name} of {owner} must be {'true or false' if switch else 'whole numbers'}, got {given!r}")
         return numbers.astype(self.dtype)
 
 
@@ -177,16 +164,12 @@ class FmuDescription:
         with zipfile.ZipFile(path) as archive:
             # FMPy omits some abilities of FMI 3.0.
             element = ElementTree.fromstring(archive.read("modelDescription.xml")).find("CoSimulation")
-        self.abilities = frozenset(
-            name for name, value in ({} if element is None else element).items() if value in ("true", "1")
-        )
+        abilities = {} if element is None else element.attrib
+        self.abilities = frozenset(name for name, value in abilities.items() if value in ("true", "1"))
         self._variables = {each.name: self._variable(each) for each in read.modelVariables}
+        derivatives = {each.name: each.derivative.name for each in read.modelVariables if each.derivative}
+        self.states = tuple((self._variables[state], self._variables[rate]) for rate, state in derivatives.items())
         self._elements: dict[str, dict[tuple[int, ...], FmuVariable]] = {}
-        self.states = tuple(
-            (self._variables[each.derivative.name], self._variables[each.name])
-            for each in read.modelVariables
-            if each.derivative
-        )
         for name, variable in self._variables.items():
             if variable.shape == () and (match := _ELEMENT.fullmatch(name)):
                 indices = tuple(int(index) for index in match[2].split(","))
@@ -198,10 +181,8 @@ class FmuDescription:
         Raises:
             UnknownNameError: there is none.
         """
-        if name in self._variables:
-            return self._variables[name]
-        if name in self._elements and (whole := _assembled(name, self._elements[name])):
-            return whole
+        if found := self._find(name):
+            return found
         near = get_close_matches(name, [*self._variables, *self._elements], 1)
         raise UnknownNameError(f"{self.path.name} has no variable {name!r}{f'; did you mean {near[0]}?' if near else ''}")
 
@@ -221,37 +202,36 @@ class FmuDescription:
         return iter(self._variables.values())
 
     def __contains__(self, name: str) -> bool:
-        return name in self._variables or (name in self._elements and _assembled(name, self._elements[name]) is not None)
+        return self._find(name) is not None
+
+    def _find(self, name: str) -> FmuVariable | None:
+        if name in self._variables or name not in self._elements:
+            return self._variables.get(name)
+        return _assembled(name, self._elements[name])
 
     def _variable(self, each: Any) -> FmuVariable:
         ending, dtype = _TYPES[self.version].get(each.type, ("", _FLOAT))
         limits = float(-np.inf if each.min is None else each.min), float(np.inf if each.max is None else each.max)
         startable = each.causality in ("input", "parameter") or each.initial in ("exact", "approx")
+        unit = each.unit or (each.declaredType and each.declaredType.unit)
         return FmuVariable(
-            each.name, tuple(each.shape), each.type, each.causality, each.variability, each.unit or _declared_unit(each),
-            (limits,) * prod(each.shape), startable and each.variability != "constant", (each.valueReference,), ending, dtype,
+            each.name, tuple(each.shape), each.type, each.causality, each.variability, unit, (limits,) * prod(each.shape),
+            startable and each.variability != "constant", (each.valueReference,), ending, dtype,
         )  # fmt: skip
-
-
-def _declared_unit(variable: Any) -> str | None:
-    return variable.declaredType.unit if variable.declaredType is not None else None
 
 
 def _assembled(name: str, elements: dict[tuple[int, ...], FmuVariable]) -> FmuVariable | None:
     """The array of these scalars, keyed by indices from 1; None if one is missing or differs in kind."""
-    first = next(iter(elements.values()))
     if len({len(indices) for indices in elements}) > 1:
         return None
     shape = tuple(map(max, zip(*elements, strict=True)))
     order = list(itertools.product(*(range(1, length + 1) for length in shape)))
-    if set(order) != set(elements):
-        return None
     kinds = {(each.type, each.causality, each.variability, each.unit, each.startable) for each in elements.values()}
-    if len(kinds) > 1:
+    if set(order) != set(elements) or len(kinds) > 1:
         return None
     scalars = [elements[indices] for indices in order]
     return replace(
-        first,
+        scalars[0],
         name=name,
         shape=shape,
         limits=tuple(each.limits[0] for each in scalars),
