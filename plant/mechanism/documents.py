@@ -36,11 +36,7 @@ def load_mechanism(name_or_path: str | Path) -> Mechanism | PlanarMechanism:
 
 
 def load_spatial(name_or_path: str | Path) -> Mechanism:
-    """`load_mechanism` for callers that need six legs.
-
-    Raises:
-        InputError: the mechanism is planar.
-    """
+    """`load_mechanism` for callers that need six legs; a planar mechanism is an error."""
     mechanism = load_mechanism(name_or_path)
     if isinstance(mechanism, PlanarMechanism):
         raise InputError(f"{name_or_path} has three legs in the plane; this needs six in space: choose another mechanism")
@@ -48,11 +44,7 @@ def load_spatial(name_or_path: str | Path) -> Mechanism:
 
 
 def load_in_space(name_or_path: str | Path) -> Mechanism:
-    """`load_mechanism` for the loop, which sees a planar mechanism in space.
-
-    Raises:
-        InputError: a planar mechanism has no home pose.
-    """
+    """`load_mechanism` for the loop, which sees a planar mechanism, if it has a home pose, in space."""
     mechanism = load_mechanism(name_or_path)
     return Mechanism.from_planar(mechanism) if isinstance(mechanism, PlanarMechanism) else mechanism
 
@@ -65,7 +57,7 @@ def mechanism_text(name_or_path: str | Path) -> str:
         InputError: the file cannot be read.
     """
     if str(name_or_path) in _preset_names():
-        return _preset_text(str(name_or_path))
+        return (_PRESETS / f"{name_or_path}.toml").read_text()
     path = Path(name_or_path)
     if not path.is_file():
         raise UnknownNameError(f"no mechanism {str(path)!r}: neither a preset ({', '.join(_preset_names())}) nor a file")
@@ -94,14 +86,13 @@ def mechanism_from_document(document: dict[str, Any]) -> Mechanism | PlanarMecha
             raise InputError(f"{name!r} must be a table")
         if (known := tables[name]) is not None:
             check_entries(table, known, f"[{name}]")
-    geometry = document.get("geometry", {})
     for joints in _JOINTS:
-        if joints not in geometry:
+        if joints not in document.get("geometry", {}):
             rows = "three rows of two" if planar else "six rows of three"
             raise InputError(f"[geometry] lacks {joints}, an array of {rows} numbers in metres")
     kind: Any = PlanarMechanism if planar else Mechanism
     mechanism: Mechanism | PlanarMechanism = kind.from_legs(
-        **geometry,
+        **document["geometry"],
         name=str(document.get("name", "custom")),
         home=_home(document["home"], planar) if "home" in document else None,
         limits=document.get("limits") or None,
@@ -115,10 +106,6 @@ def _preset_names() -> list[str]:
     return sorted(entry.name.removesuffix(".toml") for entry in _PRESETS.iterdir() if entry.name.endswith(".toml"))
 
 
-def _preset_text(name: str) -> str:
-    return (_PRESETS / f"{name}.toml").read_text()
-
-
 def _completed(document: dict[str, Any], source: str) -> dict[str, Any]:
     """A document laid over the preset that it is based on, and so on; the preset's name is not inherited."""
     names = [source]
@@ -128,7 +115,7 @@ def _completed(document: dict[str, Any], source: str) -> dict[str, Any]:
             raise UnknownNameError(f"based_on names no preset: {names[-1]!r}; there are {', '.join(_preset_names())}")
         if names[-1] in names[:-1]:
             raise InputError(f"based_on goes round in a circle, {' -> '.join(names)}: leave one out")
-        preset = parse_toml(_preset_text(names[-1]), names[-1])
+        preset = parse_toml(mechanism_text(names[-1]), names[-1])
         preset.pop("name", None)
         document = _merged(preset, document)
     return document

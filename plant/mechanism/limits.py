@@ -5,7 +5,6 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from plant.errors import InputError
 from plant.pose import Array, checked_array, numbers
@@ -29,7 +28,13 @@ class Limits:
     stop_clearance: float = 0.002
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "stroke", _checked_stroke(self.stroke))
+        stroke = checked_array(self.stroke, (len(np.atleast_1d(self.stroke)), 2), "stroke")
+        object.__setattr__(self, "stroke", stroke)
+        for leg, (least, greatest) in enumerate(stroke):
+            if not 0.0 < least < greatest:
+                raise InputError(
+                    f"the stroke of leg {leg} runs from {least:g} m to {greatest:g} m; it needs 0 < least < greatest length"
+                )
         for name in ("velocity", "acceleration", "jerk", "stop_clearance"):
             value = float(checked_array(getattr(self, name), (), f"limit of {name}"))
             object.__setattr__(self, name, value)
@@ -37,27 +42,11 @@ class Limits:
                 raise InputError(f"the limit of {name} is {value:g}; it must be positive")
 
 
-def _checked_stroke(value: ArrayLike) -> Array:
-    stroke = checked_array(value, (len(np.atleast_1d(value)), 2), "stroke")
-    for leg, (least, greatest) in enumerate(stroke):
-        if not 0.0 < least < greatest:
-            raise InputError(
-                f"the stroke of leg {leg} runs from {least:g} m to {greatest:g} m; it needs 0 < least < greatest length"
-            )
-    return stroke
-
-
 def checked_limits(limits: Mapping[str, Any], legs: int, lengths: Array | None) -> Limits:
-    """The limits of a mechanism from the fields of `Limits`.
-
-    Args:
-        limits: a stroke of (2,) [m] counts from the home lengths, (legs, 2) is absolute.
-        legs: their number.
-        lengths: (legs,) [m] at home; None without a home.
+    """The limits of a mechanism from the fields of `Limits`, with the lengths (legs,) [m] at home, if there is one.
 
     Raises:
-        InputError: an unknown entry, no stroke, a stroke about a missing home, a home outside the stroke, or a limit that is
-            not positive.
+        InputError: an unknown entry, no stroke, a stroke about a missing home, or a home outside the stroke.
     """
     check_entries(limits, sorted(field.name for field in fields(Limits)), "[limits]")
     shape = f"({legs}, 2)"

@@ -23,11 +23,7 @@ PLANAR_LEGS = 3
 
 @dataclass(frozen=True, eq=False)
 class PlanarPose:
-    """Where the platform is.
-
-    Attributes:
-        position: (2,) [m], origin of {2} in {1}.
-        angle: of {2} against {1}, counter-clockwise [rad].
+    """Position (2,) [m] of the origin of {2} in {1}, and angle of {2} against {1}, counter-clockwise [rad].
 
     Raises:
         InputError: wrong shape, or not finite.
@@ -77,13 +73,10 @@ class PlanarMechanism:
     ) -> "PlanarMechanism":
         """Build a mechanism from its two arrays of joints; the joints of a side may lie on one line.
 
-        Arguments as for `Mechanism.from_legs`, with joints (3, 2) and a stroke (2,) or (3, 2).
+        Arguments and errors as for `Mechanism.from_legs`, with joints (3, 2) and a stroke (2,) or (3, 2).
 
         Raises:
-            InputError: arrays of the wrong shape or not finite, legs that coincide, joints of a side that are all one
-                point, an empty stroke, a limit that is not positive, a stroke about a missing home, or a plant parameter
-                that makes no sense.
-            UnknownNameError: a plant parameter that does not exist.
+            InputError: joints of a side that are all one point.
         """
         base, platform = checked_joints(base_joints, platform_joints, (PLANAR_LEGS, 2))
         for side, joints in (("base", base), ("platform", platform)):

@@ -90,28 +90,23 @@ class Mechanism:
         """Build a mechanism from its two arrays of joints; everything else is optional.
 
         Args:
-            base_joints: (6, 3) [m], in {1}.
-            platform_joints: (6, 3) [m], in {2}.
-            name: for messages and reports.
-            up_in_base: (3,), the unit vertical seen in {1}.
-            base_joint_axes: (6, 3), unit; by default e_z x (home direction), horizontal in {1}.
-            home: reference pose; without it, `nominal_home` defines the default axes but no length.
+            base_joints, platform_joints: (6, 3) [m].
+            name, up_in_base, plant, settings: as the attributes.
+            base_joint_axes: by default e_z x (home direction), horizontal in {1}.
+            home: without it, `nominal_home` defines the default axes but no length.
             limits: the fields of `Limits`; a stroke of (2,) [m] counts from the home lengths, (6, 2) is absolute.
-            plant: parameters of the dynamics by name.
-            settings: the tables `control`, `fusion` and `safety`.
 
         Raises:
-            InputError: arrays of the wrong shape or not finite, legs that coincide, joints all on one line, an axis along its
-                leg, an empty stroke, a limit that is not positive, a stroke about a missing home, or a plant parameter that
-                makes no sense.
+            InputError: an array of the wrong shape or not finite, legs that coincide, joints all on one line, an axis along its
+                leg, or a parameter or limit that makes no sense.
             UnknownNameError: a plant parameter that does not exist.
         """
         base, platform = checked_joints(base_joints, platform_joints, (LEGS, 3))
         _check_spread(base, platform)
-        home = None if home is None else _checked_home(home)
+        if home is not None:
+            home = Pose(checked_array(home.position, (3,), "home.position"), checked_rotation(home.rotation, "home.rotation"))
         up = checked_unit(up_in_base, 3, "up_in_base")
         directions = _home_directions(base, platform, home, up)
-        axes = _joint_axes(base_joint_axes, directions)
         parameters = checked_plant(plant, SPATIAL)
         _check_bodies(parameters, up)
         lengths = None if home is None else np.linalg.norm(home.position + platform @ home.rotation.T - base, axis=1)
@@ -119,7 +114,7 @@ class Mechanism:
             name=name,
             base_joints=base,
             platform_joints=platform,
-            base_joint_axes=axes,
+            base_joint_axes=_joint_axes(base_joint_axes, directions),
             home_directions=directions,
             up_in_base=up,
             home=home,
@@ -252,30 +247,21 @@ class Mechanism:
         """
         start = initial or self.require_home()
         limits = self.require_limits()
+        axes = slice(2 if self.planar else 3)
         values: dict[str, ArrayLike] = {
+            "base_joints": self.base_joints[:, axes],
+            "platform_joints": self.platform_joints[:, axes],
+            "base_joint_axes": self.base_joint_axes,
             "stop.minimum_length": limits.stroke[:, 0] - limits.stop_clearance,
             "stop.maximum_length": limits.stroke[:, 1] + limits.stop_clearance,
+            "initial_position": start.position[axes],
+            "initial_quaternion": quaternion_from_rotation(start.rotation),
+            "initial_angle": np.arctan2(start.rotation[1, 0], start.rotation[0, 0]),
             **self.plant,
         }
-        if self.planar:
-            values |= {
-                "base_joints": self.base_joints[:, :2],
-                "platform_joints": self.platform_joints[:, :2],
-                "initial_position": start.position[:2],
-                "initial_angle": np.arctan2(start.rotation[1, 0], start.rotation[0, 0]),
-            }
-        else:
-            values |= {
-                "base_joints": self.base_joints,
-                "platform_joints": self.platform_joints,
-                "base_joint_axes": self.base_joint_axes,
-                "initial_position": start.position,
-                "initial_quaternion": quaternion_from_rotation(start.rotation),
-            }
         table = PLANAR if self.planar else SPATIAL
         names = [variable.name for variable in table.parameters]
-        missing = [name for name in names if name not in values]
-        if missing:
+        if missing := [name for name in names if name not in values]:
             raise InputError(f"the mechanism {self.name!r} lacks plant parameters: {', '.join(missing)}")
         return checked_parameters({name: values[name] for name in names}, table)
 
@@ -298,13 +284,6 @@ def _check_bodies(parameters: Mapping[str, Array], up: Array) -> None:
     size = float(np.linalg.norm(gravity))
     if size > 0.0 and np.linalg.norm(gravity / size + up) > 1e-3:
         raise InputError(f"gravity {gravity.tolist()} does not point against up_in_base {up.tolist()}: make them agree")
-
-
-def _checked_home(home: Pose) -> Pose:
-    return Pose(
-        checked_array(home.position, (3,), "home.position"),
-        checked_rotation(home.rotation, "home.rotation"),
-    )
 
 
 def _nominal_home(base: Array, platform: Array, up: Array) -> Pose:
