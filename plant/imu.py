@@ -39,15 +39,10 @@ def _check_not_negative(what: str, value: Any) -> None:
 class SensorErrors:
     """Errors of one three-axis sensor, in its own unit.
 
-    Attributes:
-        noise: white noise density [unit/sqrt(Hz)].
-        bias: least and greatest magnitude of the constant bias, whose direction is random [unit].
-        scale: greatest error of the scale of an axis, uniform and relative.
-        cross_axis: greatest element of the upper triangle of T, uniform.
-        drift: random walk of the bias [unit/sqrt(s)].
-        bandwidth: -3 dB frequency of the first-order low-pass [Hz].
-        reach: largest reading [unit].
-        resolution: step of the reading [unit]; 0 for none.
+    The white noise has a density `noise` [unit/sqrt(Hz)]. The constant `bias` [unit] has a magnitude between two numbers and a
+    random direction, and walks by `drift` [unit/sqrt(s)]. The errors of the `scale` of each axis and the elements `cross_axis`
+    of the upper triangle of T are relative, uniform, and at most this large. `bandwidth` [Hz] is the -3 dB frequency of a
+    first-order low-pass, `reach` [unit] the largest reading, and `resolution` [unit] its step, 0 for none.
     """
 
     noise: float = 0.0
@@ -66,15 +61,11 @@ class SensorErrors:
 
 @dataclass(frozen=True)
 class ImuModel:
-    """The imperfections of one kind of IMU.
+    """The imperfections of one kind of IMU; `name` is that of the preset.
 
-    Attributes:
-        name: of the preset.
-        gyroscope, accelerometer, magnetometer: errors in rad/s, m/s^2, uT.
-        magnetometer_rate: samples per second; each is repeated until the next [Hz].
-        misalignment: greatest angle of the mounting about each axis, uniform [rad].
-        delay: pure delay [s], rounded to whole cycles.
-        dropout: probability that a cycle repeats the previous sample.
+    The magnetometer takes `magnetometer_rate` samples per second and repeats each until the next. `misalignment` [rad] is the
+    greatest angle of the mounting about each axis, `delay` [s] is rounded to whole cycles, and `dropout` is the probability
+    that a cycle repeats the previous sample.
     """
 
     name: str
@@ -102,12 +93,8 @@ class ImuModel:
         return self.delay + sum(0.5 / (2.0 * pi * sensor.bandwidth) for sensor in (self.gyroscope, self.accelerometer))
 
 
-_MPU9150_MAGNETOMETER = SensorErrors(noise=0.05, bias=(20.0, 20.0), scale=0.05, cross_axis=0.05, reach=1200.0, resolution=0.3)
-"""With the hard and soft iron of a board beside a motor; noise, range and resolution are those of the data sheet."""
-
-_CALIBRATED_MAGNETOMETER = replace(_MPU9150_MAGNETOMETER, bias=(0.3, 0.3), scale=5e-3, cross_axis=5e-3)
-
-# InvenSense MPU-9150, +-4 g, +-250 deg/s, widest filter; noise, bias and scale as in its product specification.
+# InvenSense MPU-9150, +-4 g, +-250 deg/s, widest filter; noise, bias and scale as in its product specification, but with the
+# hard and soft iron of a board beside a motor.
 _MPU9150 = ImuModel(
     "mpu9150",
     gyroscope=SensorErrors(
@@ -118,7 +105,7 @@ _MPU9150 = ImuModel(
         noise=0.4 * MILLI_G, bias=(50.0 * MILLI_G, 80.0 * MILLI_G), scale=0.03, cross_axis=0.02,
         bandwidth=260.0, reach=4.0 * STANDARD_GRAVITY, resolution=STANDARD_GRAVITY / 8192.0,
     ),
-    magnetometer=_MPU9150_MAGNETOMETER,
+    magnetometer=SensorErrors(noise=0.05, bias=(20.0, 20.0), scale=0.05, cross_axis=0.05, reach=1200.0, resolution=0.3),
     magnetometer_rate=100.0,
     misalignment=radians(1.0),
 )  # fmt: skip
@@ -128,7 +115,7 @@ _CALIBRATED = replace(
     name="mpu9150-calibrated",
     gyroscope=replace(_MPU9150.gyroscope, bias=(radians(0.2), radians(0.2)), scale=0.0, cross_axis=0.0),
     accelerometer=replace(_MPU9150.accelerometer, bias=(MILLI_G, MILLI_G), scale=1e-3, cross_axis=0.0),
-    magnetometer=_CALIBRATED_MAGNETOMETER,
+    magnetometer=replace(_MPU9150.magnetometer, bias=(0.3, 0.3), scale=5e-3, cross_axis=5e-3),
     misalignment=0.0,
 )
 
@@ -185,10 +172,9 @@ def load_imu(name: str) -> ImuModel:
     Raises:
         UnknownNameError: there is none.
     """
-    try:
-        return PRESETS[name]
-    except KeyError:
-        raise UnknownNameError(f"no IMU preset {name!r}; there are {', '.join(PRESETS)}") from None
+    if name not in PRESETS:
+        raise UnknownNameError(f"no IMU preset {name!r}; there are {', '.join(PRESETS)}")
+    return PRESETS[name]
 
 
 def imu_state(model: ImuModel, seed: int, period: float, wiring: Wiring = RIGHT_WIRING) -> Record:
@@ -204,10 +190,12 @@ def imu_state(model: ImuModel, seed: int, period: float, wiring: Wiring = RIGHT_
     every = max(1, round(1.0 / (model.magnetometer_rate * period)))
     for kind, sensor in enumerate((model.gyroscope, model.accelerometer, model.magnetometer)):
         sampling = every * period if kind == MAGNETOMETER else period
+        axes = (wiring.gyroscopes, wiring.accelerometers, RIGHT_WIRING.gyroscopes)[kind]
         for imu in range(IMU_COUNT):
             gain, offset = _constant_errors(sensor, random)
-            state["gain"][kind, imu] = gain @ alignments[imu]
-            state["offset"][kind, imu] = offset
+            read = axes_matrix(axes[imu])
+            state["gain"][kind, imu] = read @ (gain @ alignments[imu])
+            state["offset"][kind, imu] = read @ offset
         state["noise"][kind] = sensor.noise * sqrt(0.5 / sampling)
         state["smoothing"][kind] = _smoothing(sensor.bandwidth, sampling)
         state["reach"][kind] = sensor.reach
@@ -217,10 +205,6 @@ def imu_state(model: ImuModel, seed: int, period: float, wiring: Wiring = RIGHT_
     delay = round(model.delay / period)
     if delay > _LONGEST_DELAY:
         raise InputError(f"the delay of the IMUs is {delay} cycles; at most {_LONGEST_DELAY} are kept")
-    for kind, axes in ((GYROSCOPE, wiring.gyroscopes), (ACCELEROMETER, wiring.accelerometers)):
-        for imu, matrix in enumerate(map(axes_matrix, axes)):
-            state["gain"][kind, imu] = matrix @ state["gain"][kind, imu]
-            state["offset"][kind, imu] = matrix @ state["offset"][kind, imu]
     state["place"] = wiring.places
     state["delay"] = delay
     state["magnetometer_every"] = every
@@ -234,9 +218,7 @@ def _constant_errors(sensor: SensorErrors, random: np.random.Generator) -> tuple
     scale = np.diag(1.0 + random.uniform(-sensor.scale, sensor.scale, 3))
     axes = np.eye(3) + np.triu(random.uniform(-sensor.cross_axis, sensor.cross_axis, (3, 3)), 1)
     direction = random.normal(size=3)
-    bias = random.uniform(*sensor.bias) * direction / np.linalg.norm(direction)
-    gain: Array = np.linalg.inv(axes @ scale)
-    return gain, -bias
+    return np.linalg.inv(axes @ scale), -random.uniform(*sensor.bias) * direction / np.linalg.norm(direction)
 
 
 def _smoothing(bandwidth: float, period: float) -> tuple[float, float]:

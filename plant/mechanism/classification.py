@@ -45,9 +45,8 @@ _SUPERSCRIPTS = ("", "", *"²³⁴⁵⁶")
 class MechanismClass:
     """A combinatorial class; equal graphs are equal classes, however their joints and legs are numbered.
 
-    Attributes:
-        legs: (base joint, platform joint) of six legs in space or three in the plane, given with any numbers and stored with
-            the canonical ones, which count from 0 on either side, joints of many legs first.
+    The `legs`, six in space or three in the plane, are given with any numbers of joints and stored with the canonical ones,
+    which count from 0 on either side, joints of many legs first.
 
     Raises:
         InputError: another number of legs, two legs that share both joints, a joint of more than three legs, or too few
@@ -68,12 +67,12 @@ class MechanismClass:
     @property
     def base_degrees(self) -> tuple[int, ...]:
         """The number of legs of each base joint, the most first."""
-        return _degrees(base for base, _ in self.legs)
+        return tuple(sorted(Counter(base for base, _ in self.legs).values(), reverse=True))
 
     @property
     def platform_degrees(self) -> tuple[int, ...]:
         """The number of legs of each platform joint, the most first."""
-        return _degrees(platform for _, platform in self.legs)
+        return tuple(sorted(Counter(platform for _, platform in self.legs).values(), reverse=True))
 
     @property
     def base_count(self) -> int:
@@ -95,12 +94,12 @@ class MechanismClass:
     @property
     def group(self) -> str:
         """The paper's group, such as "n-4-II", which does not depend on the base joints."""
-        return self._named("n")
+        return f"n-{self.platform_count}" + (f"-{self.type}" if self.type else "")
 
     @property
     def name(self) -> str:
         """The numbers of joints, such as "6-4-II" or "planar 3-2"."""
-        return ("planar " if self.planar else "") + self._named(str(self.base_count))
+        return ("planar " if self.planar else "") + self.group.replace("n", str(self.base_count), 1)
 
     @property
     def number(self) -> int:
@@ -119,19 +118,11 @@ class MechanismClass:
         glyphs = Counter(_GLYPHS.get(zigzag, zigzag if zigzag[0] == "[" else f"({zigzag})") for zigzag, _ in _components(self))
         return "".join(glyph + _SUPERSCRIPTS[count] for glyph, count in glyphs.items())
 
-    def _named(self, base: str) -> str:
-        return f"{base}-{self.platform_count}" + (f"-{self.type}" if self.type else "")
-
 
 def joint_numbers(joints: ArrayLike, name: str = "joints") -> NDArray[np.intp]:
-    """The number of each leg's joint, in the order of first appearance.
+    """The number (6,) or (3,) of each leg's joint, from 0 in the order of first appearance.
 
-    Args:
-        joints: (6, 3) in space or (3, 2) in the plane [m]; joints within `SAME_JOINT_M` are one.
-        name: for messages.
-
-    Returns:
-        (6,) or (3,), from 0.
+    The joints are (6, 3) in space or (3, 2) in the plane [m]; those within `SAME_JOINT_M` are one.
 
     Raises:
         InputError: joints of another shape, or not finite.
@@ -149,8 +140,7 @@ def classify(mechanism: Mechanism | PlanarMechanism) -> MechanismClass:
     """The combinatorial class of a mechanism; joints within `SAME_JOINT_M` are one.
 
     Raises:
-        InputError: joints of the wrong shape or not finite, two legs that share both joints, a joint of more than three
-            legs, or too few joints.
+        InputError: as `joint_numbers` and `MechanismClass`.
     """
     return MechanismClass(_legs(mechanism))
 
@@ -165,11 +155,8 @@ def canonical_legs(mechanism: Mechanism | PlanarMechanism) -> Legs:
     bases, platforms = zip(*own, strict=True)
 
     def same(legs: Legs) -> bool:
-        pairs = (
-            set(zip(mine, theirs, strict=True))
-            for mine, theirs in zip((bases, platforms), zip(*legs, strict=True), strict=True)
-        )
-        return [len(pair) for pair in pairs] == [len(set(bases)), len(set(platforms))]
+        sides = zip((bases, platforms), zip(*legs, strict=True), strict=True)
+        return all(len(set(zip(mine, theirs, strict=True))) == len(set(mine)) for mine, theirs in sides)
 
     return next(legs for legs in permutations(MechanismClass(own).legs) if same(legs))
 
@@ -196,14 +183,8 @@ def draw_mechanism(
     """A random mechanism of a spatial class, of desk size, with legs and joints in random order.
 
     The base joints lie near a ring of 0.3 m, up to 0.05 m off its plane. The platform joints lie near a ring of 0.2 m in a
-    tilted plane of {2}, 0.02 to 0.06 m from its origin.
-
-    Args:
-        mechanism_class: the class.
-        random: the random generator.
-        coplanar: whether the platform joints lie in that plane; otherwise they are 0.03 to 0.06 m off it, alternately above
-            and below. Three joints are always coplanar.
-        up_in_base: (3,), the unit vertical seen in {1}.
+    tilted plane of {2}, 0.02 to 0.06 m from its origin. If they are not `coplanar`, they are 0.03 to 0.06 m off that plane,
+    alternately above and below.
 
     Raises:
         InputError: the class is planar, or the vertical is not a unit vector.
@@ -240,11 +221,8 @@ def draw_planar_mechanism(mechanism_class: MechanismClass, random: np.random.Gen
 
 
 def layout(mechanism_class: MechanismClass) -> tuple[Array, Array]:
-    """Places of the joints of `mechanism_class.legs` in a picture of two rows with the fewest crossings of legs.
-
-    Returns:
-        x of the base joints (n,) and of the platform joints (m,), in units of the distance between neighbours in a row.
-        Components lie side by side in the order of the drawing.
+    """Places x of the base joints (n,) and of the platform joints (m,) in a picture of two rows with the fewest crossings of
+    legs, in units of the distance between neighbours in a row.
     """
     x: dict[Joint, float] = {}
     left = 0.0
@@ -281,15 +259,9 @@ def _check(legs: Legs) -> None:
         if count > MOST_LEGS:
             shared = ", ".join(str(leg) for leg, other in enumerate(joints) if other == joint)
             raise InputError(f"legs {shared} share a {side} joint, which carries {MOST_LEGS} at most: move some of them")
-        least = LEAST_JOINTS[len(legs)]
-        if len(set(joints)) < least:
-            raise InputError(
-                f"the number of {side} joints is {len(set(joints))}; {len(legs)} legs need {least} at least: move some apart"
-            )
-
-
-def _degrees(joints: Iterator[int]) -> tuple[int, ...]:
-    return tuple(sorted(Counter(joints).values(), reverse=True))
+        least, there = LEAST_JOINTS[len(legs)], len(set(joints))
+        if there < least:
+            raise InputError(f"the number of {side} joints is {there}; {len(legs)} legs need {least} at least: move some apart")
 
 
 def _leg_joints(legs: Legs) -> list[tuple[Joint, Joint]]:
