@@ -30,7 +30,7 @@ from plant.pose import Array
 
 
 class Scalars(NamedTuple):
-    """Scalars that one call moves between FMU and loop, `loop = factor * fmu + offset`, and their places in the loop's array."""
+    """Scalars that one call moves between FMU and loop, `loop = factor * fmu + offset`, and where they lie in the loop."""
 
     references: NDArray[np.uint32]
     places: NDArray[np.int64]
@@ -201,7 +201,9 @@ class _Binder:
             if self._size(name) != count:
                 have = "has" if len(found) == 1 else "together have"
                 remedy = "; if there are fewer imus, name them with imus" if name in IMU_SIGNALS and signal.imus is None else ""
-                self._problems.append(f"{name}: {_names(found)} {have} {self._size(name)} elements and must have {count}{remedy}")
+                self._problems.append(
+                    f"{name}: {_names(found)} {have} {self._size(name)} elements and must have {count}{remedy}"
+                )
                 continue
             units = np.array([self._factor(name, each) for each in found for _ in range(each.size)])
             factors += list(units * self._spread(name, "sign", signal.sign, count))

@@ -83,7 +83,9 @@ class FmuPlant(FmuInstance):
         changes = [(at, *self._setting(settings[i])) for at, i in later]
         self.start(values)
         self._prepare_handle(binding.step)
-        self._kept = [self._prepare_change(record, *each) for record, each in zip(self.handle["changes"], changes, strict=False)]
+        self._kept = [
+            self._prepare_change(record, *each) for record, each in zip(self.handle["changes"], changes, strict=False)
+        ]
         self.handle["change_count"] = len(changes)
 
     def close(self) -> None:
@@ -211,8 +213,9 @@ class FmuPlant(FmuInstance):
         for mode, value in enumerate(modes.values.astype(variable.dtype)):
             handle["mode_values"][mode] = int.from_bytes(value.tobytes(), "little")
 
-    def _prepare_change(self, change: Record, at: float, variable: FmuVariable, values: NDArray[Any]) -> list[NDArray[Any]]:
-        """Fill the record of a change; returns the arrays that it points to, which must be kept."""
+    def _prepare_change(self, i: int, at: float, variable: FmuVariable, values: NDArray[Any]) -> list[NDArray[Any]]:
+        """Fill the record of change i; returns the arrays that it points to, which must be kept."""
+        change = self.handle["changes"][i]
         references = np.array(variable.references, np.uint32)
         change["time"], change["function"] = at, self.address(f"Set{variable.ending}")
         change["references"], change["reference_count"] = references.ctypes.data, references.size
