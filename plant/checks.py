@@ -1,4 +1,4 @@
-"""Checks of numbers that several configurations share. They load no other module, so that configurations load fast."""
+"""Checks of numbers that several configurations share."""
 
 from math import inf
 
@@ -8,31 +8,19 @@ RATE_RANGE_HZ = (50.0, 4000.0)
 
 
 def check_rate(rate: float) -> None:
-    """Check that the cycle can run at this rate [Hz].
-
-    Raises:
-        InputError: it is outside 50 to 4000 Hz.
-    """
+    """Check a rate [Hz] of the cycle: 50 to 4000 Hz, or an `InputError`."""
     if not RATE_RANGE_HZ[0] <= rate <= RATE_RANGE_HZ[1]:
         raise InputError(f"the rate is {rate:g} Hz; it must be {RATE_RANGE_HZ[0]:g} to {RATE_RANGE_HZ[1]:g} Hz")
 
 
 def check_duration(duration: float) -> None:
-    """Check that a motion can last this long [s].
-
-    Raises:
-        InputError: it is not positive and finite.
-    """
+    """Check a motion's duration [s]: positive and finite, or an `InputError`."""
     if not 0.0 < duration < inf:
         raise InputError(f"the duration is {duration:g} s; it must be positive and finite")
 
 
 def checked_seed(seed: int) -> int:
-    """Return a seed of random numbers.
-
-    Raises:
-        InputError: it is negative or has more than 63 bits.
-    """
+    """A seed of random numbers: not negative and of 63 bits at most, or an `InputError`."""
     if not 0 <= seed < 2**63:
         raise InputError(f"the seed is {seed}; it must lie between 0 and 2^63 - 1")
     return seed

@@ -20,16 +20,10 @@ class CsvTable(NamedTuple):
 
 
 def read_csv(path: Path, *headers: tuple[str, ...], note: str = "", skipped: int = 0) -> CsvTable:
-    """Read a CSV file of finite numbers; blank lines do not count.
-
-    Args:
-        path: of the file.
-        headers: the headers that it may have.
-        note: for the message about the header, such as the units.
-        skipped: lines before the header.
+    """Read a CSV file of finite numbers, which has one of these headers after some skipped lines; blank lines do not count.
 
     Raises:
-        InputError: the file cannot be read, has another header, or has a row of other content; the message names the line.
+        InputError: the file cannot be read, has another header (`note` says more of it), or another row.
     """
     lines = [line.strip() for line in read_text(path).removeprefix("\ufeff").splitlines()][skipped:]
     columns = tuple(name.strip() for name in lines[0].split(",")) if lines else ()

@@ -1,7 +1,6 @@
 """The errors of gough: one hierarchy, in which each error is also a fitting builtin error.
 
-Every message names the offending value, the limit that it breaks and the remedy. Compiled kernels never raise: they return
-codes, and the public functions around them raise these errors.
+Every message names the offending value, the limit that it breaks and the remedy.
 """
 
 

@@ -14,11 +14,7 @@ _LOCK = "gough.lock"
 
 
 def check_writable(path: Path) -> None:
-    """Check that a file could be written at `path`, before any work is done for it.
-
-    Raises:
-        InputError: the path is a folder, or its folder does not exist or cannot be written.
-    """
+    """Check, before any work is done for it, that a file could be written at `path`, or raise an `InputError`."""
     folder = path.resolve().parent
     if path.is_dir():
         raise InputError(f"cannot write {path}: it is a folder")
@@ -27,8 +23,7 @@ def check_writable(path: Path) -> None:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write `content` to `path`, which appears only when it is complete. Links are followed; a device or another irregular
-    file is written to and not replaced.
+    """Write a file, which appears only when it is complete. Links are followed, and a device is not replaced.
 
     Raises:
         InputError: the file cannot be written.
@@ -56,7 +51,7 @@ def write_whole(path: Path, content: bytes) -> None:
 def temporary_folder(prefix: str) -> Iterator[Path]:
     """A temporary folder, removed at the end. If its process dies, the next call with this prefix removes it.
 
-    A lock in the folder shows that the process lives; the system releases it when the process ends.
+    The system releases the lock in the folder when the process ends.
     """
     _sweep(prefix)
     with tempfile.TemporaryDirectory(prefix=prefix, ignore_cleanup_errors=True) as name:
@@ -69,7 +64,6 @@ def temporary_folder(prefix: str) -> Iterator[Path]:
 
 
 def _sweep(prefix: str) -> None:
-    """Remove the temporary folders of dead processes."""
     for lock in Path(tempfile.gettempdir()).glob(f"{prefix}*/{_LOCK}"):
         with suppress(OSError), lock.open("r+") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

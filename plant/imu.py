@@ -2,8 +2,7 @@
 
 The raw reading inverts the paper's (37), `a_cal = T S (a_u + b)`: with the mounting misalignment M,
 `a_u = S^-1 T^-1 M a - b + noise`. A low-pass, a delay, range, resolution and dropouts follow. The low-pass is exact for signals
-that are linear between samples, so it delays by its time constant at any rate. All noise comes from a counter-based generator
-keyed by (seed, IMU, cycle), so every cycle can be reproduced on its own.
+that are linear between samples. All noise is keyed by (seed, IMU, cycle), so every cycle can be reproduced on its own.
 """
 
 import re
@@ -37,22 +36,16 @@ def _check_not_negative(what: str, value: Any) -> None:
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """Errors of one three-axis sensor, in its own unit.
+    """Errors of one three-axis sensor, in its own unit."""
 
-    The white noise has a density `noise` [unit/sqrt(Hz)]. The constant `bias` [unit] has a magnitude between two numbers and a
-    random direction, and walks by `drift` [unit/sqrt(s)]. The errors of the `scale` of each axis and the elements `cross_axis`
-    of the upper triangle of T are relative, uniform, and at most this large. `bandwidth` [Hz] is the -3 dB frequency of a
-    first-order low-pass, `reach` [unit] the largest reading, and `resolution` [unit] its step, 0 for none.
-    """
-
-    noise: float = 0.0
-    bias: tuple[float, float] = (0.0, 0.0)
-    scale: float = 0.0
-    cross_axis: float = 0.0
-    drift: float = 0.0
-    bandwidth: float = inf
-    reach: float = inf
-    resolution: float = 0.0
+    noise: float = 0.0  # white [unit/sqrt(Hz)]
+    bias: tuple[float, float] = (0.0, 0.0)  # least and greatest magnitude, in a random direction
+    scale: float = 0.0  # greatest error of an axis, uniform and relative
+    cross_axis: float = 0.0  # greatest element of the upper triangle of T, uniform
+    drift: float = 0.0  # random walk of the bias [unit/sqrt(s)]
+    bandwidth: float = inf  # -3 dB frequency of the first-order low-pass [Hz]
+    reach: float = inf  # largest reading
+    resolution: float = 0.0  # step of the reading; 0 for none
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -61,21 +54,16 @@ class SensorErrors:
 
 @dataclass(frozen=True)
 class ImuModel:
-    """The imperfections of one kind of IMU; `name` is that of the preset.
-
-    The magnetometer takes `magnetometer_rate` samples per second and repeats each until the next. `misalignment` [rad] is the
-    greatest angle of the mounting about each axis, `delay` [s] is rounded to whole cycles, and `dropout` is the probability
-    that a cycle repeats the previous sample.
-    """
+    """The imperfections of one kind of IMU."""
 
     name: str
     gyroscope: SensorErrors = SensorErrors()
     accelerometer: SensorErrors = SensorErrors()
     magnetometer: SensorErrors = SensorErrors()
-    magnetometer_rate: float = inf
-    misalignment: float = 0.0
-    delay: float = 0.0
-    dropout: float = 0.0
+    magnetometer_rate: float = inf  # [Hz]; each sample is repeated until the next
+    misalignment: float = 0.0  # greatest angle about each axis, uniform [rad]
+    delay: float = 0.0  # [s], rounded to whole cycles
+    dropout: float = 0.0  # probability that a cycle repeats the previous sample
 
     def __post_init__(self) -> None:
         for name in ("magnetometer_rate", "misalignment", "delay", "dropout"):
@@ -89,12 +77,11 @@ class ImuModel:
 
     @property
     def latency(self) -> float:
-        """Mean delay of gyroscope and accelerometer [s]: the pure delay and the low-pass's time constant."""
+        """Mean delay of gyroscope and accelerometer, with their low-passes [s]."""
         return self.delay + sum(0.5 / (2.0 * pi * sensor.bandwidth) for sensor in (self.gyroscope, self.accelerometer))
 
 
-# InvenSense MPU-9150, +-4 g, +-250 deg/s, widest filter; noise, bias and scale as in its product specification, but with the
-# hard and soft iron of a board beside a motor.
+# InvenSense MPU-9150, +-4 g, +-250 deg/s, widest filter, as in its product specification; with iron of a motor beside it.
 _MPU9150 = ImuModel(
     "mpu9150",
     gyroscope=SensorErrors(

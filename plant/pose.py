@@ -61,11 +61,7 @@ def checked_array(value: ArrayLike, shape: tuple[int, ...], name: str, *, allow_
 
 
 def checked_unit(value: ArrayLike, size: int, name: str) -> Array:
-    """The normalised vector of one whose length is 1 within 1e-3.
-
-    Raises:
-        InputError: wrong shape, not finite, or another length.
-    """
+    """The normalised vector of one whose length is 1 within 1e-3, or an `InputError`."""
     array = checked_array(value, (size,), name)
     norm = float(np.linalg.norm(array))
     if abs(norm - 1.0) > UNIT_TOLERANCE:
@@ -134,7 +130,7 @@ def rotations_from_quaternions(quaternions: Array) -> Array:
 
 def quaternion_from_rotation(rotation: Array) -> Array:
     """The unit quaternions (..., 4), w first and w >= 0, of rotations (..., 3, 3)."""
-    # The quaternion is an eigenvector of Bar-Itzhack's symmetric matrix, without a case for each quadrant.
+    # The quaternion is an eigenvector of Bar-Itzhack's symmetric matrix.
     m = np.moveaxis(rotation, (-2, -1), (0, 1))
     rows = [
         [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],

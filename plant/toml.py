@@ -9,11 +9,7 @@ from plant.errors import InputError
 
 
 def read_text(path: Path | str) -> str:
-    """The text of a file.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """The text of a file, or an `InputError`."""
     try:
         return Path(path).read_text(encoding="utf-8")
     except OSError as error:
@@ -23,11 +19,7 @@ def read_text(path: Path | str) -> str:
 
 
 def parse_toml(text: str, name: str) -> dict[str, Any]:
-    """The content of a TOML text, which messages call `name`.
-
-    Raises:
-        InputError: it is not TOML.
-    """
+    """The content of a TOML text, which messages call `name`, or an `InputError`."""
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -35,11 +27,7 @@ def parse_toml(text: str, name: str) -> dict[str, Any]:
 
 
 def read_toml(path: Path | str) -> dict[str, Any]:
-    """The content of a TOML file.
-
-    Raises:
-        InputError: it cannot be read, or is not TOML.
-    """
+    """The content of a TOML file, or an `InputError`."""
     return parse_toml(read_text(path), str(path))
 
 
@@ -50,10 +38,6 @@ def unknown_entries(table: Mapping[str, Any], known: Iterable[str], title: str) 
 
 
 def check_entries(table: Mapping[str, Any], known: Iterable[str], title: str) -> None:
-    """Check that a table has only `known` entries.
-
-    Raises:
-        InputError: the message of `unknown_entries` for the first that it has beside these.
-    """
+    """Check that a table has only `known` entries, or raise an `InputError`."""
     for message in unknown_entries(table, known, title):
         raise InputError(message)

@@ -16,14 +16,14 @@ STALE_AFTER_S = 30 * 24 * 3600.0
 
 
 def user_cache() -> Path:
-    """The folder for what gough builds on demand: `$GOUGH_CACHE`, else `gough` in the user's cache folder."""
+    """`$GOUGH_CACHE`, else `gough` in the user's cache folder."""
     if configured := os.environ.get("GOUGH_CACHE"):
         return Path(configured)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gough"
 
 
 def hash_of_files(files: Iterable[Path], *extra: str) -> str:
-    """Twenty hexadecimal digits that change with the content of any of the files, or with `extra`."""
+    """Twenty hexadecimal digits for the content of files, and `extra`."""
     digest = hashlib.sha256("\0".join(extra).encode())
     for file in files:
         digest.update(file.name.encode() + b"\0" + file.read_bytes())
@@ -33,7 +33,7 @@ def hash_of_files(files: Iterable[Path], *extra: str) -> str:
 def keyed_folder(kind: str, key: str) -> Path:
     """The cache folder of this kind and key, made and marked as used; folders long unused are removed.
 
-    Where the user's cache cannot be written, the folder lasts only as long as the process.
+    Without a cache that can be written, it lasts as long as the process.
     """
     try:
         folder = user_cache() / kind / key

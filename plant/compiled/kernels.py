@@ -1,8 +1,7 @@
 """The one decorator that marks compiled kernels.
 
-numba notices an edit in the file of a kernel but not in the files of its callees, and an installed package may lie in a folder
-that cannot be written. The machine code therefore lies in the user's cache under a hash of every source file of the three
-packages: any edit gives a new folder.
+numba notices no edit in the files of a kernel's callees. The machine code therefore lies in the user's cache under a hash of
+every source file of the three packages: any edit gives a new folder.
 """
 
 import itertools
@@ -46,7 +45,7 @@ PACKAGES = ("plant", "controller", "hil")
 
 @contextmanager
 def compilation_reported(report: Callable[[int], None]) -> Iterator[None]:
-    """Call `report` with the number of functions that numba has begun to compile meanwhile, each time it begins one."""
+    """Call `report` each time numba begins to compile a function, with their number so far."""
     begun = itertools.count(1)
     base: Any = event.Listener
 
@@ -71,10 +70,8 @@ def _kernel_folder() -> Path:
 def kernel(function: F) -> F:
     """Mark a function as compiled code: off the GIL, never raising, its machine code cached.
 
-    Division by zero gives inf or NaN as in NumPy. fastmath stays off, so that NaN checks mean something. A kernel that Python
-    calls gets machine code, with all its callees in it, and a place in the cache; a kernel that only kernels call does not.
-    numba itself compiles a function again for each constant argument and for each shape of a record's array; here it is
-    compiled once for all of them.
+    Division by zero gives inf or NaN as in NumPy. fastmath stays off, so that NaN checks mean something. Only a kernel that
+    Python calls gets machine code, with all its callees in it, one for all constants and shapes of arrays.
     """
     settings: Any = numba.config
     before = settings.CACHE_DIR
@@ -101,9 +98,7 @@ def kernel(function: F) -> F:
 
 
 def _general(kind: Any) -> Any:
-    """The type of an argument without its value, of a member of an enumeration as its number, of a record's array without its
-    shape.
-    """
+    """The type of an argument without the value of a constant and without the shape of a record's array."""
     general: Any = cast(Any, types.unliteral)(kind)
     if isinstance(general, types.IntEnumMember):
         return general.dtype
@@ -112,5 +107,5 @@ def _general(kind: Any) -> Any:
 
 @lower_cast(types.NestedArray, types.Array)  # type: ignore[no-untyped-call, untyped-decorator]
 def _cast_nested(context: Any, builder: Any, from_type: Any, to_type: Any, value: Any) -> Any:
-    """Pass a record's array on as it is: numba has no such cast, though both lie in memory alike."""
+    """Both lie in memory alike."""
     return value

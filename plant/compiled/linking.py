@@ -1,6 +1,6 @@
 """Faster compilation: kernels are linked once, flat, instead of at every level of calls.
 
-This module replaces parts of numba while a kernel compiles, and only then. It halves the first start on a machine.
+This module replaces parts of numba while a kernel compiles. It halves the first start on a machine.
 """
 
 import gc
@@ -23,8 +23,8 @@ _environment_of: Any = lookup_environment
 class FlatLibrary(_Library):  # type: ignore[misc]
     """The code of one function: machine code if Python calls it, else only bitcode, which is linked into its callers.
 
-    numba itself links, optimises and emits each function with all its callees, again at every level. Here all levels are linked
-    once, flat, and optimised once. The arithmetic does not depend on it, because fastmath is off.
+    numba itself links and optimises each function with all its callees, again at every level; here it is done once. The
+    arithmetic does not depend on it, because fastmath is off.
     """
 
     inner = False
@@ -32,7 +32,7 @@ class FlatLibrary(_Library):  # type: ignore[misc]
 
     @property
     def codegen(self) -> Any:
-        """Where numba sets the environments of functions; a function without machine code has none."""
+        """Where numba sets the environments of functions."""
         return _NO_ENVIRONMENTS if self.inner else self._codegen
 
     def finalize(self) -> None:
@@ -54,7 +54,6 @@ class FlatLibrary(_Library):  # type: ignore[misc]
                 self._codegen.set_env(each.name, environment)
 
     def _link_callees(self, module: Any) -> None:
-        """Link all direct and indirect callees into a module that has this library's own code."""
         inner: dict[Any, None] = {}
         others: dict[Any, None] = {}
         to_do = list(self._linking_libraries)
@@ -88,7 +87,7 @@ class FlatLibrary(_Library):  # type: ignore[misc]
         return super()._get_module_for_linking()
 
     def serialize_using_object_code(self) -> Any:
-        """As numba does, but without the bitcode: nothing links what Python calls, and loading needs only the names."""
+        """As numba, with names instead of bitcode: nothing links what Python calls."""
         self._ensure_finalized()
         names = [each.name for each in self._final_module.functions if not each.is_declaration]
         stub = parse_assembly("\n".join(f'define void @"{name}"() {{ ret void }}' for name in names))
@@ -114,7 +113,7 @@ _resolve: Any = BaseFunction.get_call_type
 
 
 def _resolve_once(self: Any, context: Any, args: Any, kws: Any) -> Any:
-    """The signature of an operator or function for these types; numba itself searches all candidates at each use."""
+    """As `get_call_type`, which searches all candidates at each use."""
     flags = cast(Any, ConfigStack).top_or_none()
     known = self.__dict__.setdefault("_gough_resolved", {})
     key = args, tuple(kws.items()), None if flags is None else repr(flags._values)
@@ -140,7 +139,7 @@ def flat_linking() -> Iterator[None]:
     _depth += 1
     if _depth == 1:
         codegen._library_class, functions.get_call_type = FlatLibrary, _resolve_once
-        # A compilation makes many small objects; collecting garbage as often as usual would take a third of its time.
+        # Collecting the many small objects as often as usual would take a third of the time.
         gc.set_threshold(*_LAZY_COLLECTION)
     try:
         yield

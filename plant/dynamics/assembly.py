@@ -14,25 +14,16 @@ Values = dict[str, SX]
 
 @dataclass(frozen=True)
 class Dynamics:
-    """A plant as functions of flat vectors; `conditions` and `limits` return two vectors, values and their greatest values.
+    """A plant as functions of flat vectors; `conditions` and `limits` return two vectors, values and their greatest values."""
 
-    Attributes:
-        constants: of the parameters, for all functions that take constants; computed once.
-        start: the states at the start, of the parameters.
-        conditions: on the parameters; `condition_texts` has a message for each.
-        limits: on the motion, of states and constants; `limit_texts` has a message for each.
-        rates: the time derivatives of the states, of states, inputs and constants.
-        outputs: of states, inputs and constants.
-    """
-
-    constants: ca.Function
-    start: ca.Function
-    conditions: ca.Function
+    constants: ca.Function  # of the parameters
+    start: ca.Function  # the states, of the parameters
+    conditions: ca.Function  # on the parameters
     condition_texts: tuple[str, ...]
-    limits: ca.Function
+    limits: ca.Function  # on states and constants
     limit_texts: tuple[str, ...]
-    rates: ca.Function
-    outputs: ca.Function
+    rates: ca.Function  # of states, inputs and constants
+    outputs: ca.Function  # of the same
 
 
 def assemble(
@@ -44,15 +35,7 @@ def assemble(
     limits: Callable[[Values, Values], list[Condition]],
     plant: Callable[[Values, Values, Values], tuple[Values, Values]],
 ) -> Dynamics:
-    """The functions of a plant from its expressions.
-
-    Args:
-        table: its variables.
-        parameters: symbols.
-        constants, start, conditions: expressions of these symbols; `start` has the states at rest that are not zero.
-        limits: gives the conditions on the motion for states and constants.
-        plant: gives rates and outputs for states, inputs and constants.
-    """
+    """The functions of a plant from its expressions; `start` has the states that are not zero."""
     # In `rates` and `outputs`, symbols replace the computed constants.
     symbols = {name: SX.sym(name, *value.shape) for name, value in constants.items()}
     states, inputs = variable_symbols(table.states), variable_symbols(table.inputs)
@@ -79,7 +62,7 @@ def variable_symbols(variables: tuple[Variable, ...]) -> Values:
     made = {}
     for variable in variables:
         rows, columns = (*variable.shape, 1, 1)[:2]
-        # CasADi stores matrices by columns and the table by rows, so the symbol is created transposed.
+        # CasADi stores matrices by columns, and the table by rows.
         made[variable.name] = SX.sym(variable.name, columns, rows).T
     return made
 

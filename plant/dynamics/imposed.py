@@ -1,4 +1,4 @@
-"""Imposed motion: ideal IMU signals for a prescribed motion of the platform, regardless of what actuators can follow."""
+"""Imposed motion: ideal IMU signals for a motion of the platform, whatever the actuators could follow."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -25,39 +25,26 @@ _MIXED_HZ = 0.5 * np.array([0.2, 0.45, 0.8, 1.3, 2.0])
 
 @dataclass(frozen=True, eq=False)
 class ImposedMotion:
-    """A prescribed motion and its ideal readings.
+    """A prescribed motion of {2} and its ideal readings."""
 
-    Attributes:
-        times: (N,) [s].
-        positions, rotations: (N, 3) [m] and (N, 3, 3), of {2}.
-        signals: (N, 3, 7, 3) of the ideal IMUs [rad/s, m/s^2, uT].
-    """
-
-    times: Array
-    positions: Array
-    rotations: Array
-    signals: Array
+    times: Array  # (N,) [s]
+    positions: Array  # (N, 3) [m]
+    rotations: Array  # (N, 3, 3)
+    signals: Array  # (N, 3, 7, 3) [rad/s, m/s^2, uT]
 
 
 def impose(
     mechanism: Mechanism, kind: str, duration: float, rate: float, seed: int, size: tuple[float, float] = SIZE
 ) -> ImposedMotion:
-    """A motion about home on all axes at once.
+    """A motion about home on all axes at once, in samples at `rate` [Hz] for `duration` [s].
 
-    Args:
-        mechanism: with home and plant data.
-        kind: "static" for a random pose; a frequency in Hz, such as "0.5", which all axes share within 10 %; or "mixed" for
-            five sines from 0.1 to 1 Hz on every axis.
-        duration: [s].
-        rate: samples per second [Hz].
-        seed: of phases and the static pose.
-        size: of the motion along and about each axis [m, rad].
+    Its kind is "static" for a random pose; a frequency such as "0.5" [Hz], which all axes share within 10 %; or "mixed" for
+    five sines from 0.1 to 1 Hz on every axis.
 
     Raises:
         InputError: no such kind.
     """
-    checked_seed(seed)
-    random = np.random.default_rng([seed, *kind.encode()])
+    random = np.random.default_rng([checked_seed(seed), *kind.encode()])
     reach: Array = np.repeat(size, 3)[:, None]
     times = np.arange(round(duration * rate)) / rate
     home = mechanism.require_home()
@@ -101,7 +88,7 @@ def _sines(frequencies: Array, reach: Array, times: Array, random: np.random.Gen
 
 @cache
 def _signals() -> ca.Function:
-    """Rotation and readings, row by row, from coordinates with their derivatives, the rotation at home, and the parameters."""
+    """Rotation and readings, row by row."""
     q, qd, qdd = (ca.SX.sym(name, 6) for name in ("q", "qd", "qdd"))
     home = ca.SX.sym("home", 3, 3)
     parameters = variable_symbols(SPATIAL.parameters)
@@ -117,7 +104,6 @@ def _signals() -> ca.Function:
 
 
 def _turn(axis: int, angle: ca.SX) -> ca.SX:
-    """Rotation about a coordinate axis."""
     c, s = ca.cos(angle), ca.sin(angle)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     turn = ca.SX.eye(3)

@@ -1,4 +1,4 @@
-"""The legs of a mechanism and their actuators, as CasADi expressions that the spatial and the planar plant share.
+"""The legs and their actuators, as CasADi expressions that the spatial and the planar plant share.
 
 A leg is a universal joint (first axis e1 fixed in the base, second e2 = n x e1 / |n x e1|) with a lower part and a rod, both
 symmetric about the leg's axis n = s / l. Since the leg's angular velocity lies in the plane of e1 and e2,
@@ -38,7 +38,7 @@ _UNCHANGED = (
 
 
 def leg_constants(p: dict[str, SX]) -> dict[str, SX]:
-    """The constants of legs, actuators and IMUs, without the joints and the inertia about the legs' axes."""
+    """The constants of legs, actuators and IMUs."""
     turns = 2 * pi / p["motor.screw_lead"]
     lower, upper = "leg.lower.", "leg.upper."
     return {name: p[name] for name in _UNCHANGED} | {
@@ -106,7 +106,7 @@ def length_limits(lengths: SX) -> list[Condition]:
 
 
 _RUNGE_KUTTA_REACH = 2.5
-"""The classical Runge-Kutta method is stable for |eigenvalue| x step up to this, for every eigenvalue that does not grow."""
+"""The classical Runge-Kutta method is stable for |eigenvalue| x step up to this."""
 
 _CONTACT_REACH = 1.5
 """The same for the end stops, which are nonlinear; found with 800 random sets of parameters."""
@@ -115,11 +115,9 @@ _CONTACT_REACH = 1.5
 def _substep_conditions(p: dict[str, SX], beyond_stop: SX) -> list[Condition]:
     """The substep is short enough for the fastest modes of the legs.
 
-    In coordinates whose squared length is the energy, dissipation is the diagonal of the linearised plant and storage its
-    skew part. The largest dissipation and the norm of the storage therefore bound every eigenvalue. Mass beside a leg's
-    sliding mass only lowers them. A slipping brake loses its deflection, and an end stop hits, faster at a higher speed of
-    the leg. That speed is at most the drive's voltage over its force constant, or the speed at which an end stop throws a
-    leg back that starts `beyond_stop` [m] beyond it.
+    In coordinates whose squared length is the energy, the largest dissipation and the norm of the storage bound every
+    eigenvalue, and mass beside a leg's sliding mass only lowers them. Brakes and end stops act faster at a higher speed of the
+    leg: at most the drive's voltage over its force constant, or that of a leg that starts `beyond_stop` [m] beyond its stop.
     """
     turns = 2 * pi / p["motor.screw_lead"]
     sliding_mass = p["leg.upper.mass"] + p["motor.rotor_inertia"] * turns**2
@@ -231,14 +229,7 @@ def _leg_at(s: SX, velocity: SX, arm: SX, bias: SX, e1: SX, c: dict[str, SX]) ->
 def legs_at(
     position: SX, rotation: SX, velocity: SX, omega: SX, base_joints: SX, platform_joints: SX, axes: SX, c: dict[str, SX]
 ) -> list[Leg]:
-    """The legs for a prescribed motion of the platform.
-
-    Args:
-        position, rotation: (3, 1), (3, 3), of {2}.
-        velocity, omega: (3, 1), of the origin of {2}, and its angular velocity.
-        base_joints, platform_joints, axes: (n, 3).
-        c: the constants, of `leg_constants` and `axial_inertia`.
-    """
+    """The legs (joints and axes (n, 3)) for a prescribed motion of {2}; `c` has `leg_constants` and `axial_inertia`."""
     legs = []
     for k in range(base_joints.shape[0]):
         arm = rotation @ row(platform_joints, k)
@@ -250,9 +241,7 @@ def legs_at(
 
 @dataclass(frozen=True)
 class Actuators:
-    """The actuators of n legs at one instant, (n, 1) each: forces along the legs, which push if positive, except that friction
-    brakes; the drives' voltages; and the rates of the motors' currents and of the brakes' deflections.
-    """
+    """The actuators of n legs at one instant, (n, 1) each; a force pushes if it is positive, but friction brakes."""
 
     motor: SX
     friction: SX
@@ -317,7 +306,7 @@ def _speeds(legs: list[Leg]) -> SX:
 
 
 def _stop_force(length: SX, speed: SX, c: dict[str, SX], k: int) -> SX:
-    """Hunt and Crossley's contact: the damping is proportional to the elastic force, and a stop never pulls."""
+    """Hunt and Crossley's contact: damping in proportion to the elastic force, and no pull."""
     below = ca.fmax(c["stop.minimum_length"][k] - length, 0)
     above = ca.fmax(length - c["stop.maximum_length"][k], 0)
     stiffness, damping = c["stop.stiffness"], c["stop.damping"]
@@ -335,7 +324,7 @@ def _brake_rate(deflection: SX, speed: SX, closed: SX, c: dict[str, SX]) -> SX:
 
 
 def solve(matrix: SX, right: SX) -> SX:
-    """Solve a symmetric positive definite system by Cholesky's method, unrolled; only the lower triangle is read."""
+    """Solve a symmetric positive definite system by Cholesky's method; only the lower triangle is read."""
     n = right.shape[0]
     lower = SX.zeros(n, n)
     inverses: list[SX] = []
@@ -378,33 +367,19 @@ def imu_signals_of(legs: list[Leg], axes: SX, rotation: SX, omega: SX, accelerat
     """Ideal IMU signals (n + 1, 3) of legs and platform, by their names in the table.
 
     Signals of a leg are seen in the leg frame, whose z axis is the leg and whose y axis is e2; those of the platform in {2}.
-
-    Args:
-        axes: (n, 3), e1 of each leg.
-        rotation: (3, 3), of {2}.
-        omega: (3, 1), its angular velocity.
-        acceleration: (6, 1), of the origin of {2}, then angular.
+    The rows of `axes` (n, 3) are e1 of each leg; `acceleration` (6, 1) is that of the origin of {2}, then angular.
     """
-    rates: list[SX] = []
-    forces: list[SX] = []
-    fields: list[SX] = []
+    signals: list[tuple[SX, SX, SX]] = []
     for i, leg in enumerate(legs):
         e1, arm = row(axes, i), row(c["leg_imu_position"], i)
         frame, turning, angular = _leg_turning(
             leg.s, leg.velocity, acceleration[:3] + ca.cross(acceleration[3:], leg.arm) + leg.bias, e1
         )
         rate = frame.T @ turning
-        rates.append(rate.T)
         force = ca.cross(frame.T @ angular, arm) + ca.cross(rate, ca.cross(rate, arm)) - frame.T @ c["gravity"]
-        forces.append(force.T)
-        fields.append((frame.T @ c["magnetic_field"]).T)
+        signals.append((rate, force, frame.T @ c["magnetic_field"]))
     place = rotation @ c["platform_imu_position"]
     at_imu = acceleration[:3] + ca.cross(acceleration[3:], place) + ca.cross(omega, ca.cross(omega, place))
-    rates.append((rotation.T @ omega).T)
-    forces.append((rotation.T @ (at_imu - c["gravity"])).T)
-    fields.append((rotation.T @ c["magnetic_field"]).T)
-    return {
-        "imu_angular_velocity": ca.vertcat(*rates),
-        "imu_specific_force": ca.vertcat(*forces),
-        "imu_magnetic_field": ca.vertcat(*fields),
-    }
+    signals.append((rotation.T @ omega, rotation.T @ (at_imu - c["gravity"]), rotation.T @ c["magnetic_field"]))
+    names = ("imu_angular_velocity", "imu_specific_force", "imu_magnetic_field")
+    return {name: ca.horzcat(*values).T for name, values in zip(names, zip(*signals, strict=True), strict=True)}

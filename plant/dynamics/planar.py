@@ -1,10 +1,7 @@
 """Rigid-body and drive dynamics of a planar three-leg mechanism, as CasADi expressions in one set of symbols.
 
-Generalised coordinates are the platform's position in the plane and its angle; the legs follow. The equations are those of
-`plant.dynamics.spatial`, with J = [1, e_z x R a].
-
-The legs and their actuators are those of `plant.dynamics.legs`, which are in space: the plane is the xy-plane of {1}, and its
-normal is the first axis of every leg's joint. The joints bear the forces across the plane.
+The equations are those of `plant.dynamics.spatial`, with J = [1, e_z x R a]. The legs are in space: the plane is the xy-plane
+of {1}, and its normal is the first axis of every leg's joint. The joints bear the forces across the plane.
 """
 
 import casadi as ca
@@ -13,7 +10,6 @@ from plant.dynamics.assembly import Dynamics, Values, assemble, variable_symbols
 from plant.dynamics.legs import (
     SX,
     Condition,
-    Leg,
     actuators_at,
     imu_signals_of,
     leg_conditions,
@@ -65,11 +61,6 @@ def _in_space(vectors: SX) -> SX:
     return ca.horzcat(vectors, SX(vectors.shape[0], 1))
 
 
-def _legs(position: SX, rotation: SX, velocity: SX, omega: SX, c: Values) -> list[Leg]:
-    joints = (_in_space(c["base_joints"]), _in_space(c["platform_joints"]), _AXES)
-    return legs_at(position, rotation, velocity, omega, *joints, c | {"axial_inertia": SX(0)})
-
-
 def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
     position, velocity, turning = x["state.position"], x["state.velocity"], x["state.angular_velocity"]
     rotation = _rotation(x["state.angle"])
@@ -77,7 +68,9 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
     moment = rotation[:2, :2] @ c["first_moment"]
     across = ca.vertcat(-moment[1], moment[0])
     omega = turning * _NORMAL
-    legs = _legs(_in_space(position.T).T, rotation, _in_space(velocity.T).T, omega, c)
+    joints = (_in_space(c["base_joints"]), _in_space(c["platform_joints"]), _AXES)
+    inertias = {"axial_inertia": SX(0)}
+    legs = legs_at(_in_space(position.T).T, rotation, _in_space(velocity.T).T, omega, *joints, c | inertias)
     actuators = actuators_at(legs, x, u, c)
     forces = actuators.force
 

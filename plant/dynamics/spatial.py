@@ -3,8 +3,6 @@
 Generalised coordinates are the platform's pose and twist; the legs follow. For a leg with the vector `s = p + R a - b`, the
 kinetic energy `T(s, s')` and the potential `V(s)` give `M_s s'' + h = F`. With `s'' = J nu' + J' nu` the platform's equation is
 `(M + sum J^T M_s J) nu' = wrench - sum J^T (h + M_s J' nu - F n)`.
-
-The legs and their actuators are those of `plant.dynamics.legs`. The FMU's C code integrates the equations.
 """
 
 import casadi as ca
@@ -120,7 +118,6 @@ def _leg_vectors(position: SX, rotation: SX, joints: Values) -> list[SX]:
 
 
 def _limits(x: Values, c: Values) -> list[Condition]:
-    """During the motion, every leg keeps a length and stays away from the first axis of its joint."""
     vectors = _leg_vectors(x["state.position"], _rotation(x["state.quaternion"]), c)
     limits = length_limits(stack([ca.norm_2(s) for s in vectors]))
     for k, s in enumerate(vectors):
@@ -197,14 +194,7 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
 
 
 def imu_signals(position: SX, rotation: SX, velocity: SX, omega: SX, acceleration: SX, parameters: Values) -> Values:
-    """Ideal IMU signals (7, 3) by their names in the table, for a prescribed motion of the platform, seen in {1}.
-
-    Args:
-        position, rotation: (3, 1), (3, 3), of {2}.
-        velocity, omega: (3, 1), of the origin of {2}, and its angular velocity.
-        acceleration: (6, 1), their derivatives.
-        parameters: all of the table.
-    """
+    """Ideal IMU signals (7, 3) by name for a motion of {2}; `acceleration` (6, 1) is that of the origin, then angular."""
     c = _constants(parameters)
     legs = _legs(position, rotation, velocity, omega, c)
     return imu_signals_of(legs, c["base_joint_axes"], rotation, omega, acceleration, c)

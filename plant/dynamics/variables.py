@@ -1,8 +1,7 @@
 """The plants' variables: the tables that drive the dynamics, the FMUs' layout and XML, and all use of variables by name.
 
-Arrays are row-major. Vectors are seen in the base frame {1} unless the description names another. The planar plant has three
-legs in the xy-plane of {1}. Its vectors of two components lie in that plane, but its IMUs measure in space: a leg's sensor
-frame has its x axis along the plane's normal and its z axis along the leg.
+Arrays are row-major. Vectors are seen in the base frame {1} unless the description names another. The IMUs of the planar plant
+measure in space: a leg's sensor frame has its x axis along the plane's normal and its z axis along the leg.
 """
 
 from collections.abc import Callable, Mapping
@@ -34,8 +33,8 @@ TINY = 1e-9
 class Variable:
     """One variable of a plant, with the names of FMI; the shape of a scalar is ().
 
-    A parameter outside its range is refused; other variables stay inside. `nominal` is the usual size. A `tunable` parameter
-    may change during a run; the others are fixed once initialisation ends. `discrete` marks the drive modes, an enumeration.
+    A parameter outside its range is refused; other variables stay inside. A `tunable` parameter may change during a run.
+    `discrete` marks the drive modes, an enumeration.
     """
 
     name: str

@@ -30,10 +30,10 @@ from plant.pose import Array
 
 
 class Scalars(NamedTuple):
-    """Scalars that one call moves between FMU and loop, `loop = factor * fmu + offset`, and where they lie in the loop."""
+    """Scalars that one call moves between FMU and loop: `loop = factor * fmu + offset`."""
 
     references: NDArray[np.uint32]
-    places: NDArray[np.int64]
+    places: NDArray[np.int64]  # in the loop's array
     factors: Array
     offsets: Array
 
@@ -43,8 +43,8 @@ class Modes(NamedTuple):
 
     references: NDArray[np.uint32]
     values: Array  # the FMU's for `OPEN`, `BRAKE`, `VELOCITY`
-    variable: FmuVariable | None  # one of the modes, for its type; None if the FMU has no modes
-    common: bool  # whether all drives share one mode
+    variable: FmuVariable | None  # one of the modes, for its type
+    common: bool  # one mode for all drives
 
 
 @dataclass(frozen=True)
@@ -53,28 +53,22 @@ class Bound:
 
     legs: int  # 6, or 3 of a planar plant
     imus: tuple[int, ...]
-    magnetometers: tuple[int, ...]  # the IMUs with one
-    sensed: Scalars  # the IMUs' signals, in (3, 7, 3)
+    magnetometers: tuple[int, ...]
+    sensed: Scalars  # in (3, 7, 3)
     known: Scalars  # the truth, in (19,)
-    commanded: Scalars  # the velocity commands, in (legs,)
-    loaded: Scalars  # the payload's mass, in (1,), or nothing
+    commanded: Scalars  # in (legs,)
+    loaded: Scalars  # the payload's mass, in (1,)
     modes: Modes
-    knows_pose: bool  # whether the truth has the pose
-    planar_angle: bool  # whether the truth has an angle instead of a quaternion
-    driven: frozenset[str]  # the FMU's scalars that the loop sets in every cycle
+    knows_pose: bool
+    planar_angle: bool  # in place of the quaternion
+    driven: frozenset[str]  # scalars that the loop sets
 
 
 def check_settable(variable: FmuVariable, owner: str, driven: frozenset[str], running: bool = False) -> None:
-    """Check that a variable accepts a start value, or a change during the run.
-
-    Args:
-        variable: of the FMU.
-        owner: the FMU's file, for messages.
-        driven: as in `Bound`.
-        running: whether it is set during the run.
+    """Check that a variable of the FMU `owner` takes a start value or a change during the run, and that the loop leaves it.
 
     Raises:
-        InputError: it does not, or the loop sets it.
+        InputError: it does not.
     """
     if running and not variable.tunable:
         raise InputError(

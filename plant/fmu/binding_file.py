@@ -56,14 +56,14 @@ LEAST_STEP_S = 1e-6
 
 @dataclass(frozen=True)
 class SignalBinding:
-    """One signal: the FMU's variables that hold it, in order, and the conversion of their values to the loop's."""
+    """The FMU's variables that hold one signal, in order, and the conversion to the loop's values."""
 
     variables: tuple[str, ...]
-    unit: str | None = None  # None for the unit that the FMU declares, or else the loop's
-    sign: tuple[float, ...] = (1.0,)  # 1 or -1: one, one for each axis, or one for each element
-    offset: tuple[float, ...] = (0.0,)  # added afterwards, in the loop's unit: one, or one for each element
+    unit: str | None = None  # by default the FMU's, or else the loop's
+    sign: tuple[float, ...] = (1.0,)  # of all, each axis, or each element
+    offset: tuple[float, ...] = (0.0,)  # added afterwards, in the loop's unit
     imus: tuple[int, ...] | None = None  # None for all
-    modes: tuple[float | None, ...] = (None,) * len(DRIVE_MODES)  # the FMU's values; None for the usual value
+    modes: tuple[float | None, ...] = (None,) * len(DRIVE_MODES)  # None for the usual value
 
 
 @dataclass(frozen=True)
@@ -72,9 +72,9 @@ class Binding:
 
     source: str  # its file, for messages; "" for gough's own
     signals: Mapping[str, SignalBinding]
-    step: float | None = None  # of communication [s]; None for the control period
-    start: Mapping[str, Any] = field(default_factory=dict)  # values by the FMU's own names
-    native: bool = False  # whether the signals are those of gough's own plants, which also have gough's parameters
+    step: float | None = None  # [s]; None for the control period
+    start: Mapping[str, Any] = field(default_factory=dict)
+    native: bool = False  # as gough's own plants, with their parameters
     problems: tuple[str, ...] = ()  # errors in the file
 
 
@@ -84,7 +84,7 @@ OWN_BINDING = Binding("", _OWN_SIGNALS, native=True)
 
 
 def load_binding(path: Path | str) -> Binding:
-    """Read a binding; errors in its entries are reported later, together with those in the FMU's variables.
+    """Read a binding; errors in its entries are reported later, with those in the FMU's variables.
 
     Raises:
         InputError: the file cannot be read, or is not TOML.

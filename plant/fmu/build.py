@@ -1,7 +1,6 @@
 """From the dynamics of a plant to its FMU: C code, description, shared libraries, and the archive around them.
 
 `python -m plant.fmu.build FILE ...` builds in a process of its own, because a process that runs a loop must not load CasADi.
-The FMU is native and contains no Python.
 """
 
 import io
@@ -19,7 +18,7 @@ from dataclasses import dataclass
 from importlib import import_module, resources
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import fmpy
 
@@ -43,21 +42,13 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)
 
 @dataclass(frozen=True)
 class Model:
-    """A plant that can be exported.
+    """A plant that can be exported."""
 
-    Attributes:
-        identifier: of the FMU and its binaries.
-        description: one line about it.
-        table: its variables.
-        preset: the mechanism whose parameters are the default start values.
-        module: with its equations, which loads CasADi.
-    """
-
-    identifier: str
+    identifier: str  # of the FMU and its binaries
     description: str
     table: VariableTable
-    preset: str
-    module: str
+    preset: str  # with the default start values
+    module: str  # with its equations, which loads CasADi
 
     def dynamics(self) -> Any:
         """Derive its equations (`plant.dynamics.assembly.Dynamics`)."""
@@ -77,13 +68,12 @@ PLANAR_MODEL = Model(
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Platform:
-    """A platform for FMUs: its folders in FMI 3.0 and 2.0, zig's name for it, and its libraries' suffix."""
+class Platform(NamedTuple):
+    """A platform for FMUs."""
 
-    folder: str
-    folder_2: str
-    zig: str
+    folder: str  # in FMI 3.0
+    folder_2: str  # in FMI 2.0
+    zig: str  # zig's name for it
     suffix: str
 
 
@@ -99,7 +89,7 @@ PLATFORMS = {
 
 
 def default_fmu(model: Model = SPATIAL_MODEL, fmi: int = 3) -> Path:
-    """A plant's FMU of FMI 2.0 or 3.0 for this machine, built on first use and kept under a hash of all its sources.
+    """A plant's FMU for this machine, built on first use and kept under a hash of all its sources.
 
     Raises:
         ToolchainError: no C compiler, or it failed.
@@ -110,11 +100,7 @@ def default_fmu(model: Model = SPATIAL_MODEL, fmi: int = 3) -> Path:
 
 @contextmanager
 def building_default_fmu(model: Model = SPATIAL_MODEL, fmi: int = 3) -> Iterator[Callable[[], Path]]:
-    """As `default_fmu`, while other work goes on.
-
-    Yields:
-        A function that waits until the FMU is built and returns its path; it raises what `default_fmu` raises.
-    """
+    """Build the `default_fmu` while other work goes on; yields a function that waits for it and returns its path."""
     package = Path(__file__).resolve().parent.parent
     sources = [*sorted(package.rglob("*.py")), package / "mechanism" / "presets" / f"{model.preset}.toml"]
     with resources.as_file(resources.files("fmus")) as folder:
@@ -137,11 +123,7 @@ def building_default_fmu(model: Model = SPATIAL_MODEL, fmi: int = 3) -> Iterator
 
 
 def build_in_subprocess(path: Path, fmi: int = 3, mechanism: str = "hexapod", platforms: Sequence[str] = ()) -> None:
-    """Build an FMU at `path` without loading CasADi into this process; arguments as for `build`.
-
-    Raises:
-        ToolchainError: no C compiler, or it failed, or `path` cannot be written.
-    """
+    """As `build`, without loading CasADi into this process; every error is a `ToolchainError`."""
     _finish_build(_start_build(path, fmi, mechanism, platforms))
 
 
@@ -158,11 +140,7 @@ def _finish_build(process: subprocess.Popen[str]) -> None:
 
 
 def c_compiler() -> list[str]:
-    """The command of a C compiler for this machine.
-
-    Raises:
-        ToolchainError: none is installed.
-    """
+    """The command of a C compiler for this machine; `ToolchainError` if none is installed."""
     for name in ("cc", "gcc", "clang"):
         if found := shutil.which(name):
             return [found]
@@ -180,9 +158,9 @@ def build(path: Path, fmi: int = 3, mechanism: str | Path = "hexapod", platforms
 
     Args:
         path: the file.
-        fmi: 3 for FMI 3.0, Co-Simulation and Model Exchange; 2 for FMI 2.0 Co-Simulation.
-        mechanism: preset or file whose parameters are the start values; a planar one gives the planar plant.
-        platforms: keys of `PLATFORMS`, compiled by zig; by default this machine's, by its C compiler.
+        fmi: 3 for Co-Simulation and Model Exchange, 2 for Co-Simulation.
+        mechanism: preset or file whose parameters are the start values.
+        platforms: keys of `PLATFORMS`; by default this machine's.
 
     Raises:
         ToolchainError: no C compiler, or it failed.
@@ -223,12 +201,7 @@ def build(path: Path, fmi: int = 3, mechanism: str | Path = "hexapod", platforms
 
 
 def check_build(fmi: int, platforms: Sequence[str]) -> None:
-    """Check the version and the platforms of a build, and that a compiler is installed.
-
-    Raises:
-        InputError: a version or platform that does not exist.
-        ToolchainError: no compiler.
-    """
+    """Check the version and the platforms of a build, and that a compiler is installed."""
     if fmi not in (2, 3):
         raise InputError(f"there is no FMI {fmi} to export: choose 2 or 3")
     if unknown := [name for name in platforms if name not in PLATFORMS]:
@@ -245,7 +218,7 @@ def model_of(mechanism: Mechanism) -> Model:
 
 
 def _archive(contents: Mapping[str, bytes]) -> bytes:
-    """A zip archive without a time stamp, so that the same sources give the same bytes."""
+    """A zip archive without time stamps: the same sources give the same bytes."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in contents.items():
@@ -256,7 +229,6 @@ def _archive(contents: Mapping[str, bytes]) -> bytes:
 
 
 def _libraries(model: Model, fmi: int, work: Path, sources: list[str], platforms: Sequence[str]) -> dict[str, bytes]:
-    """The shared libraries by their paths in the folder `binaries`."""
     if not platforms:
         library = _compile(c_compiler(), work, sources, fmpy.sharedLibraryExtension)
         folder = fmpy.platform_tuple if fmi == 3 else fmpy.platform
@@ -274,7 +246,7 @@ def _libraries(model: Model, fmi: int, work: Path, sources: list[str], platforms
 
 
 def _compile(compiler: list[str], work: Path, sources: list[str], suffix: str) -> bytes:
-    """A shared library; the derivatives are long and seldom used, so they are compiled with less effort."""
+    """A shared library."""
 
     def compile_one(source: str) -> str:
         # The equations are one long block of scalars, and with these options GCC keeps them in registers.
@@ -298,13 +270,13 @@ def _run(command: list[str], folder: Path) -> None:
 
 
 def _without_time(library: bytes) -> bytes:
-    """A library of Windows without its time stamp (TimeDateStamp in the header of the PE format)."""
+    """A library of Windows without its time stamp in the PE header."""
     stamp = struct.unpack_from("<I", library, 0x3C)[0] + 8
     return library[:stamp] + bytes(4) + library[stamp + 4 :]
 
 
 def _universal(libraries: list[bytes]) -> bytes:
-    """Mach-O libraries of several processors in one file (the fat header of mach-o/fat.h)."""
+    """Mach-O libraries of several processors in one file (mach-o/fat.h)."""
     alignment = 14
     header, body = struct.pack(">2I", 0xCAFEBABE, len(libraries)), b""
     at = 1 << alignment

@@ -98,7 +98,7 @@ three legs. `step` is the communication step [s], or 0 to step by the duration o
 
 
 def _calling(arguments: str) -> Any:
-    """An intrinsic that calls the C function at an address with a tuple of arguments and returns its int.
+    """An intrinsic that calls the C function at an address with a tuple of arguments.
 
     `arguments` has a letter for each: p for a pointer or size (intp), d for a double, b for a bool (uint8), i for an int.
     """

@@ -1,4 +1,4 @@
-"""Checks of any FMU for Co-Simulation, of FMI 2.0 or 3.0: FMPy validates its description, and trials use what it promises."""
+"""Checks of any FMU for Co-Simulation: FMPy validates its description, and trials use what it promises."""
 
 import contextlib
 import functools
@@ -21,7 +21,7 @@ from plant.pose import Array
 _STEPS = 10
 _SMALL = 1e-4
 _ROUGHLY = 1e-4
-"""The step of an input for central differences, and their tolerance against derivatives, relative to the largest."""
+"""The step of an input for central differences, and their relative tolerance."""
 
 Found = tuple[str, ...] | None
 """Problems, if any; None if there was nothing to check."""

@@ -8,6 +8,7 @@ is its place in the vector of all values.
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from plant.dynamics.variables import BRAKE, DRIVE_MODES, Variable, VariableTable
@@ -99,17 +100,11 @@ class Layout:
         return range(self.offsets[variable.name], self.offsets[variable.name] + variable.size)
 
 
-@dataclass(frozen=True)
-class Dependencies:
-    """What depends on what, by the places of their values.
+class Dependencies(NamedTuple):
+    """What depends on what, by the places of their values."""
 
-    Attributes:
-        running: the states and inputs that each output and each derivative depends on.
-        initial: the parameters and inputs that each output, state and derivative depends on before the start.
-    """
-
-    running: Mapping[int, frozenset[int]]
-    initial: Mapping[int, frozenset[int]]
+    running: Mapping[int, frozenset[int]]  # outputs and derivatives on states and inputs
+    initial: Mapping[int, frozenset[int]]  # these and states on parameters and inputs
 
 
 def start_of(variable: Variable, starts: Mapping[str, Array]) -> list[float]:
@@ -142,18 +137,7 @@ def model_description(
     dependencies: Dependencies,
     sources: list[str],
 ) -> bytes:
-    """The content of modelDescription.xml.
-
-    Args:
-        fmi: version of FMI, 2 or 3.
-        identifier: name of model and binaries.
-        description: one line about the model.
-        layout: its variables.
-        starts: values of all parameters by name.
-        token: instantiation token, or GUID.
-        dependencies: what depends on what.
-        sources: names of the C files.
-    """
+    """The content of modelDescription.xml, for the start values of all parameters and the names of the C files."""
     writer = (_Fmi3 if fmi == 3 else _Fmi2)(layout, starts, dependencies)
     root = Element(
         "fmiModelDescription",
@@ -244,11 +228,8 @@ class _Fmi3(_Writer):
 
     def add_interfaces(self, root: Element, identifier: str, _: list[str]) -> None:
         abilities = (
-            "canGetAndSetFMUState",
-            "canSerializeFMUState",
-            "providesDirectionalDerivatives",
-            "providesAdjointDerivatives",
-        )
+            "canGetAndSetFMUState", "canSerializeFMUState", "providesDirectionalDerivatives", "providesAdjointDerivatives",
+        )  # fmt: skip
         able = {"modelIdentifier": identifier, **dict.fromkeys(abilities, "true")}
         SubElement(root, "ModelExchange", able)
         SubElement(root, "CoSimulation", able | _STEPS)
@@ -262,12 +243,8 @@ class _Fmi3(_Writer):
         exposed = self.layout.exposed
         SubElement(parent, "Float64", {"name": "time", "valueReference": str(len(exposed)), **_TIME})
         for reference, variable in enumerate(exposed):
-            attributes = {
-                "name": variable.name,
-                "valueReference": str(reference),
-                **self.role(variable),
-                **self.bounds(variable),
-            }
+            attributes = {"name": variable.name, "valueReference": str(reference)}
+            attributes |= self.role(variable) | self.bounds(variable)
             if start := self.start(variable):
                 attributes["start"] = " ".join(start)
             if variable.discrete:

@@ -36,7 +36,7 @@ _TYPES: dict[int, dict[str, tuple[str, np.dtype[Any]]]] = {
         **{name: (name, np.dtype(name.lower())) for name in _SIZED},
     },
 }
-"""The ending of the getter's and setter's names and their number type, by FMI version and type of the variable."""
+"""The ending of the functions' names and their number type, by FMI version and type of the variable."""
 
 _ELEMENT = re.compile(r"(.+)\[(\d+(?:, ?\d+)*)\]")
 
@@ -51,10 +51,10 @@ class FmuVariable:
     causality: str
     variability: str
     unit: str | None
-    limits: tuple[tuple[float, float], ...]  # least and greatest value of each scalar
-    startable: bool  # whether it may be set before initialisation
-    references: tuple[int, ...]  # for an array of scalars, row by row
-    ending: str  # of its functions' names, such as Float64 in `fmi3GetFloat64`; "" if it is no number
+    limits: tuple[tuple[float, float], ...]  # of each scalar
+    startable: bool  # before initialisation
+    references: tuple[int, ...]  # row by row
+    ending: str  # of its functions' names, such as Float64; "" if it is no number
     dtype: np.dtype[Any]  # of these functions' values
 
     @property
@@ -64,12 +64,12 @@ class FmuVariable:
 
     @property
     def minimum(self) -> float:
-        """The smallest value allowed for any of its scalars."""
+        """The least of all scalars."""
         return min((least for least, _ in self.limits), default=-np.inf)
 
     @property
     def maximum(self) -> float:
-        """The largest value allowed for any of its scalars."""
+        """The greatest of all scalars."""
         return max((most for _, most in self.limits), default=np.inf)
 
     @property
@@ -88,12 +88,7 @@ class FmuVariable:
         return self.causality == "input" or (self.causality == "parameter" and self.variability == "tunable")
 
     def values(self, given: ArrayLike, owner: str, spread: bool = False) -> NDArray[Any]:
-        """Values (size,) for this variable, of its own type.
-
-        Args:
-            given: the values, in any shape.
-            owner: the FMU's file, for messages.
-            spread: whether one number may stand for all elements.
+        """Values (size,) of this variable's type; with `spread`, one number may stand for all elements.
 
         Raises:
             InputError: no numbers, numbers of another type, or too few or too many.
@@ -128,9 +123,6 @@ def element_names(name: str, shape: tuple[int, ...]) -> list[str]:
 
 class FmuDescription:
     """The checked description of an FMU.
-
-    Args:
-        path: the FMU.
 
     Attributes:
         version: 2 or 3.
@@ -221,7 +213,7 @@ class FmuDescription:
 
 
 def _assembled(name: str, elements: dict[tuple[int, ...], FmuVariable]) -> FmuVariable | None:
-    """The array of these scalars, keyed by indices from 1; None if one is missing or differs in kind."""
+    """The array of these scalars, by indices from 1; None if one is missing or differs in kind."""
     if len({len(indices) for indices in elements}) > 1:
         return None
     shape = tuple(map(max, zip(*elements, strict=True)))

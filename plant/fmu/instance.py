@@ -68,20 +68,24 @@ class FmuInstance:
         Raises:
             FmuError: it holds no binary for this machine, cannot be loaded, or refuses.
         """
-        experiment = (False, 0.0, 0.0, False, 0.0)
         try:
             self.fmu = self._load()
             for variable, numbers in values:
                 self._access("Set", variable, numbers)
-            if self.description.version == 2:
-                self._call("SetupExperiment", "the setup of the experiment", *experiment)
-                self._call("EnterInitializationMode", "initialisation")
-            else:
-                self._call("EnterInitializationMode", "initialisation", *experiment)
-            self._call("ExitInitializationMode", "initialisation")
+            self.initialize()
         except BaseException:
             self.close()
             raise
+
+    def initialize(self) -> None:
+        """Initialise the FMU at time 0."""
+        experiment = (False, 0.0, 0.0, False, 0.0)
+        if self.description.version == 2:
+            self._call("SetupExperiment", "the setup of the experiment", *experiment)
+            self._call("EnterInitializationMode", "initialisation")
+        else:
+            self._call("EnterInitializationMode", "initialisation", *experiment)
+        self._call("ExitInitializationMode", "initialisation")
         self._initialized = True
 
     def close(self) -> None:
@@ -90,7 +94,7 @@ class FmuInstance:
         self._cleanup.close()
 
     def address(self, function: str) -> int:
-        """The address of a C function, named without its prefix, such as `DoStep`."""
+        """The address of a C function such as `DoStep`."""
         return int(ctypes.cast(self._function(function), ctypes.c_void_p).value or 0)
 
     def component(self) -> int:
@@ -128,7 +132,7 @@ class FmuInstance:
         """The partial derivatives (m, n) of the unknowns' m scalars by the knowns' n, from the FMU's directional derivatives.
 
         Raises:
-            FmuError: the FMU lacks directional derivatives, or these ones.
+            FmuError: the FMU lacks these derivatives.
             InputError: a variable is not real.
         """
         self._check_open()
@@ -158,21 +162,13 @@ class FmuInstance:
         return jacobian
 
     def do_step(self, time: float, duration: float) -> None:
-        """Take a communication step from `time` [s].
-
-        Raises:
-            FmuError: the FMU fails.
-        """
+        """Take a communication step from `time` [s]; `FmuError` if the FMU fails."""
         self._check_open()
         with self._calling("a step"):
             self.fmu.doStep(time, duration, not self.description.saves_state)
 
     def state(self) -> bytes:
-        """The FMU's whole state.
-
-        Raises:
-            FmuError: the FMU cannot save it.
-        """
+        """The FMU's whole state; `FmuError` if it cannot save it."""
         self._check_saves()
         with self._calling("saving the state"):
             held = self.fmu.getFMUState()
@@ -182,11 +178,7 @@ class FmuInstance:
                 self.fmu.freeFMUState(held)
 
     def restore(self, state: bytes) -> None:
-        """Return to a saved state.
-
-        Raises:
-            FmuError: the FMU cannot restore a state, or this is no state of it.
-        """
+        """Return to a saved state; `FmuError` if the FMU cannot, or this is no state of it."""
         self._check_saves()
         with self._calling("restoring a state"):
             held = self.fmu.deserializeFMUState(state)
@@ -299,7 +291,7 @@ class FmuInstance:
 
 
 _LOGS: dict[int, Callable[[int, bytes | None], None]] = {}
-"""The loggers of all FMI 2.0 instances by the number that identifies them, because FMPy's proxy has only one logger."""
+"""The loggers of all FMI 2.0 instances by their number, because FMPy's proxy has only one logger."""
 
 _NUMBERS = itertools.count(1)
 

@@ -22,15 +22,13 @@ from plant.pose import Array
 
 
 class LinearPlant(NamedTuple):
-    """A linear system `x' = A x + B u, y = C x + D u` with n states, m inputs and p outputs, all differences from a point:
-    matrices (n, n), (n, m), (p, n), (p, m), and the names of the scalars.
-    """
+    """A linear system `x' = A x + B u, y = C x + D u`, all differences from a point."""
 
     a: Array
     b: Array
     c: Array
     d: Array
-    states: tuple[str, ...]
+    states: tuple[str, ...]  # names of scalars
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
 
@@ -39,7 +37,6 @@ class FmuPlant(FmuInstance):
     """A plant FMU for Co-Simulation, of FMI 2.0 or 3.0, initialised and ready to step.
 
     Args:
-        path: the FMU.
         parameters: start values by name; a name that the FMU lacks is an error.
         period: of control [s].
         binding: a binding or its TOML file; None if the variables have gough's own names.
@@ -51,11 +48,9 @@ class FmuPlant(FmuInstance):
         bound: the loop's signals in the FMU.
 
     Raises:
-        FmuError: the file is no FMU, is of another kind, does not fit its binding, has no binary for this machine, or refuses
-            its parameters.
+        FmuError: the file is no such FMU, does not fit its binding, or refuses a parameter.
         UnknownNameError: a parameter or setting that the FMU lacks.
-        InputError: another number of legs, a period that the FMU cannot take, a binding that cannot be read, or a value that
-            does not fit.
+        InputError: a number of legs, a period, a binding or a value that does not fit.
     """
 
     def __init__(
@@ -83,10 +78,8 @@ class FmuPlant(FmuInstance):
         changes = [(at, *self._setting(settings[i])) for at, i in later]
         self.start(values)
         self._prepare_handle(binding.step)
-        self._kept = [
-            self._prepare_change(record, *each) for record, each in zip(self.handle["changes"], changes, strict=False)
-        ]
         self.handle["change_count"] = len(changes)
+        self._kept = [self._prepare_change(i, *change) for i, change in enumerate(changes)]
 
     def close(self) -> None:
         """Free the instance and remove the extracted files; a second call does nothing."""
@@ -107,9 +100,6 @@ class FmuPlant(FmuInstance):
     def linearize(self, inputs: Sequence[str], outputs: Sequence[str]) -> LinearPlant:
         """The plant's equations linearised at its present state, from the FMU's directional derivatives.
 
-        Args:
-            inputs, outputs: names of variables.
-
         Raises:
             UnknownNameError: the FMU has no such variable.
             InputError: a variable is not real.
@@ -125,19 +115,11 @@ class FmuPlant(FmuInstance):
         return LinearPlant(whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:], *names)
 
     def state(self) -> bytes:
-        """The plant's whole state, with its clock.
-
-        Raises:
-            FmuError: the FMU cannot save its state.
-        """
+        """The plant's whole state, with its clock."""
         return struct.pack(_CLOCK, *(self.handle[name] for name in _CLOCKED)) + super().state()
 
     def restore(self, state: bytes) -> None:
-        """Return to a state of this plant, or of another with the same FMU and settings.
-
-        Raises:
-            FmuError: the FMU cannot restore a state, or this is no state of it.
-        """
+        """Return to a state of this plant, or of another with the same FMU and settings."""
         size = struct.calcsize(_CLOCK)
         if len(state) < size:
             raise FmuError(f"{self.path.name} cannot restore a state of {len(state)} bytes, which is no state of this plant")
@@ -214,7 +196,7 @@ class FmuPlant(FmuInstance):
             handle["mode_values"][mode] = int.from_bytes(value.tobytes(), "little")
 
     def _prepare_change(self, i: int, at: float, variable: FmuVariable, values: NDArray[Any]) -> list[NDArray[Any]]:
-        """Fill the record of change i; returns the arrays that it points to, which must be kept."""
+        """Fill the record of change i; returns the arrays that it points to."""
         change = self.handle["changes"][i]
         references = np.array(variable.references, np.uint32)
         change["time"], change["function"] = at, self.address(f"Set{variable.ending}")

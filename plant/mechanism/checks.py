@@ -22,22 +22,14 @@ _DERIVED = (
 
 
 def checked_joints(base_joints: ArrayLike, platform_joints: ArrayLike, shape: tuple[int, int]) -> tuple[Array, Array]:
-    """The joints of base and platform, each of `shape`.
-
-    Raises:
-        InputError: another shape, a coordinate that is not finite, or two legs that share both their joints.
-    """
+    """The joints of base and platform, each of `shape`, of legs that differ; or an `InputError`."""
     base, platform = checked_array(base_joints, shape, "base_joints"), checked_array(platform_joints, shape, "platform_joints")
     check_legs_differ(base, platform)
     return base, platform
 
 
 def check_legs_differ(base: Array, platform: Array) -> None:
-    """Check that no two legs share both their joints.
-
-    Raises:
-        InputError: names the two legs.
-    """
+    """Check that no two legs share both their joints, or raise an `InputError`."""
     for leg in range(len(base)):
         for other in range(leg):
             apart = max(np.linalg.norm(base[leg] - base[other]), np.linalg.norm(platform[leg] - platform[other]))
@@ -46,12 +38,11 @@ def check_legs_differ(base: Array, platform: Array) -> None:
 
 
 def checked_plant(values: Mapping[str, ArrayLike] | None, table: VariableTable) -> Mapping[str, Array]:
-    """The parameters of the dynamics that a mechanism gives, by the names of the plant's variables.
+    """The parameters of the dynamics that a mechanism gives.
 
     Raises:
         UnknownNameError: a parameter that does not exist.
-        InputError: wrong shape, out of range, a parameter that follows from the rest of the mechanism, or a drive that
-            compensates more than a motor's resistance, which makes it unstable.
+        InputError: wrong shape, out of range, a parameter that follows from the geometry, or an unstable drive.
     """
     parameters = checked_parameters(values or {}, table)
     for name in parameters.keys() & _DERIVED:

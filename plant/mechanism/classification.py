@@ -49,8 +49,7 @@ class MechanismClass:
     which count from 0 on either side, joints of many legs first.
 
     Raises:
-        InputError: another number of legs, two legs that share both joints, a joint of more than three legs, or too few
-            joints.
+        InputError: another number of legs, legs that share both joints, a joint of too many legs, or too few joints.
     """
 
     legs: Legs
@@ -182,9 +181,8 @@ def draw_mechanism(
 ) -> Mechanism:
     """A random mechanism of a spatial class, of desk size, with legs and joints in random order.
 
-    The base joints lie near a ring of 0.3 m, up to 0.05 m off its plane. The platform joints lie near a ring of 0.2 m in a
-    tilted plane of {2}, 0.02 to 0.06 m from its origin. If they are not `coplanar`, they are 0.03 to 0.06 m off that plane,
-    alternately above and below.
+    The base joints lie near a ring of 0.3 m. The platform joints lie near a ring of 0.2 m in a tilted plane of {2}, or if they
+    are not `coplanar`, alternately above and below it.
 
     Raises:
         InputError: the class is planar, or the vertical is not a unit vector.
@@ -221,9 +219,7 @@ def draw_planar_mechanism(mechanism_class: MechanismClass, random: np.random.Gen
 
 
 def layout(mechanism_class: MechanismClass) -> tuple[Array, Array]:
-    """Places x of the base joints (n,) and of the platform joints (m,) in a picture of two rows with the fewest crossings of
-    legs, in units of the distance between neighbours in a row.
-    """
+    """Places of base joints (n,) and platform joints (m,) in a picture of two rows with the fewest crossings of legs."""
     x: dict[Joint, float] = {}
     left = 0.0
     for _, joints in _components(mechanism_class):
@@ -277,11 +273,11 @@ def _neighbours(legs: Legs) -> Neighbours:
 
 
 def _canonical(legs: Legs) -> Legs:
-    """The smallest numbering with base joints of many legs first and platform joints ordered by their base joints."""
+    """The smallest numbering with joints of many legs first."""
     neighbours = _neighbours(legs)
 
     def rank(joint: Joint) -> list[int]:
-        """Independent of the numbering: minus the number of legs of the joint, then of each of its neighbours."""
+        """Minus the number of legs of the joint, then of each neighbour."""
         return [-len(neighbours[joint]), *sorted(-len(neighbours[other]) for other in neighbours[joint])]
 
     def numbered(order: Sequence[Joint]) -> Legs:
@@ -305,7 +301,6 @@ def _classes(leg_count: int) -> tuple[MechanismClass, ...]:
 
 
 def _additional_legs(legs: Legs) -> Iterator[tuple[int, int]]:
-    """The legs that can be added to a canonical graph, between its joints or one new joint on either side."""
     base_degrees, platform_degrees = (Counter(side) for side in zip(*legs, strict=True))
     for base, platform in product(range(len(base_degrees) + 1), range(len(platform_degrees) + 1)):
         if (base, platform) not in legs and max(base_degrees[base], platform_degrees[platform]) < MOST_LEGS:
@@ -313,7 +308,7 @@ def _additional_legs(legs: Legs) -> Iterator[tuple[int, int]]:
 
 
 def _paths(neighbours: Neighbours, start: Joint, avoided: Sequence[Joint] = ()) -> list[tuple[Joint, ...]]:
-    """Every path from a joint that visits no joint twice and no avoided joint, short paths first."""
+    """Every path from a joint that visits no joint twice, short paths first."""
     paths: list[tuple[Joint, ...]] = [(start,)]
     for path in paths:
         paths += [(*path, joint) for joint in neighbours[path[-1]] if joint not in path and joint not in avoided]
@@ -321,7 +316,7 @@ def _paths(neighbours: Neighbours, start: Joint, avoided: Sequence[Joint] = ()) 
 
 
 def _components(mechanism_class: MechanismClass) -> list[tuple[str, list[Joint]]]:
-    """The zigzag of each connected component and its joints in the order of the strokes, large components first."""
+    """The zigzag of each connected component and its joints, large components first."""
     neighbours = _neighbours(mechanism_class.legs)
     components = []
     left = set(neighbours)
@@ -333,7 +328,7 @@ def _components(mechanism_class: MechanismClass) -> list[tuple[str, list[Joint]]
 
 
 def _zigzag(neighbours: Neighbours, joints: set[Joint]) -> tuple[str, list[Joint]]:
-    """The strokes along the cycle of a component, or along its longest path, with branches as early as possible, then up."""
+    """The strokes along the cycle of a component, or along its longest path, with branches early."""
     paths = [path for joint in joints for path in _paths(neighbours, joint)]
     cycles = [(*path, path[0]) for path in paths if len(path) > 2 and path[0] in neighbours[path[-1]]]
     trunks = cycles or paths
@@ -344,7 +339,7 @@ def _zigzag(neighbours: Neighbours, joints: set[Joint]) -> tuple[str, list[Joint
 
 
 def _strokes(neighbours: Neighbours, trunk: Sequence[Joint]) -> tuple[str, list[Joint]]:
-    """The strokes along a trunk and its branches of one or two legs, and the joints in that order."""
+    """The strokes along a trunk and its branches, and the joints in that order."""
     strokes, order = "", [trunk[0]]
     for tail, head in pairwise(trunk):
         branch = _paths(neighbours, head, trunk)[-1]

@@ -25,7 +25,7 @@ def load_mechanism(name_or_path: str | Path) -> Mechanism | PlanarMechanism:
 
     Raises:
         UnknownNameError: no such preset, and no such file.
-        InputError: the file is not TOML, or its content is not a mechanism.
+        InputError: the content is not a mechanism.
     """
     source = str(name_or_path)
     document = parse_toml(mechanism_text(name_or_path), source)
@@ -50,12 +50,7 @@ def load_in_space(name_or_path: str | Path) -> Mechanism:
 
 
 def mechanism_text(name_or_path: str | Path) -> str:
-    """The TOML text of a preset, or of a file.
-
-    Raises:
-        UnknownNameError: no such preset, and no such file.
-        InputError: the file cannot be read.
-    """
+    """The TOML text of a preset, or of a file; errors as for `load_mechanism`."""
     if str(name_or_path) in _preset_names():
         return (_PRESETS / f"{name_or_path}.toml").read_text()
     path = Path(name_or_path)
@@ -65,12 +60,7 @@ def mechanism_text(name_or_path: str | Path) -> str:
 
 
 def mechanism_from_document(document: dict[str, Any]) -> Mechanism | PlanarMechanism:
-    """The mechanism of a document that is based on no other.
-
-    Raises:
-        InputError: an entry is missing, unknown or of the wrong kind, or the content is not a mechanism.
-        UnknownNameError: a plant parameter that does not exist.
-    """
+    """The mechanism of a document that is based on no other; errors as for `load_mechanism`."""
     planar = _is_planar(document)
     tables: dict[str, tuple[str, ...] | None] = {
         "geometry": _JOINTS if planar else ("base_joint_axes", *_JOINTS, "up_in_base"),
@@ -122,7 +112,7 @@ def _completed(document: dict[str, Any], source: str) -> dict[str, Any]:
 
 
 def _merged(under: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """Two nested tables as one; `over` wins where both have an entry, unless both entries are tables."""
+    """Two nested tables as one; where both have an entry that is no table, `over` wins."""
     shared = [key for key in under.keys() & over.keys() if isinstance(under[key], dict) and isinstance(over[key], dict)]
     return under | over | {key: _merged(under[key], over[key]) for key in shared}
 
@@ -142,7 +132,7 @@ def _home(table: Any, planar: bool) -> Pose | PlanarPose:
 
 
 def _flattened(tables: dict[str, Any], prefix: str = "") -> dict[str, ArrayLike]:
-    """Nested tables as one, whose names have dots between the names of the tables."""
+    """Nested tables as one, with dots in the names."""
     flat: dict[str, ArrayLike] = {}
     for name, value in tables.items():
         flat |= _flattened(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}

@@ -1,4 +1,4 @@
-"""Mechanisms in space: the geometry of the legs, their limits, and the data of plant and controller for one rig.
+"""Mechanisms in space: geometry, limits, and the data of plant and controller for one rig.
 
 Leg k joins base joint k, row k of an array (6, 3) in {1}, and platform joint k, row k of an array (6, 3) in {2}; a
 shared joint is a repeated row. The two arrays alone are enough for kinematics.
@@ -97,8 +97,7 @@ class Mechanism:
             limits: the fields of `Limits`; a stroke of (2,) [m] counts from the home lengths, (6, 2) is absolute.
 
         Raises:
-            InputError: an array of the wrong shape or not finite, legs that coincide, joints all on one line, an axis along its
-                leg, or a parameter or limit that makes no sense.
+            InputError: geometry, a limit or a parameter that makes no sense.
             UnknownNameError: a plant parameter that does not exist.
         """
         base, platform = checked_joints(base_joints, platform_joints, (LEGS, 3))
@@ -160,7 +159,7 @@ class Mechanism:
 
     @property
     def nominal_home(self) -> Pose:
-        """Home; without one, a pose without rotation whose platform joints lie above the base joints."""
+        """Home; without one, a pose without rotation above the base joints."""
         return self.home or _nominal_home(self.base_joints, self.platform_joints, self.up_in_base)
 
     @property
@@ -220,31 +219,19 @@ class Mechanism:
             )
 
     def require_home(self) -> Pose:
-        """The home pose.
-
-        Raises:
-            InputError: the mechanism has none.
-        """
+        """The home pose, or an `InputError`."""
         if self.home is None:
             raise InputError(f"the mechanism {self.name!r} has no home pose: give one")
         return self.home
 
     def require_limits(self) -> Limits:
-        """The actuators' limits.
-
-        Raises:
-            InputError: the mechanism has none.
-        """
+        """The actuators' limits, or an `InputError`."""
         if self.limits is None:
             raise InputError(f"the mechanism {self.name!r} has no stroke: give one")
         return self.limits
 
     def plant_parameters(self, initial: Pose | None = None) -> dict[str, Array]:
-        """Every parameter of the plant by name, for a start at the pose `initial` (default: home).
-
-        Raises:
-            InputError: the mechanism lacks a parameter of the dynamics.
-        """
+        """Every parameter of the plant by name, for a start at the pose `initial` (default: home)."""
         start = initial or self.require_home()
         limits = self.require_limits()
         axes = slice(2 if self.planar else 3)

@@ -173,7 +173,7 @@ def test_energies_and_powers_agree_with_explicit_bodies(dynamics: Dynamics, hexa
 
 def start(plant: FmuPlant, position: Array, rotation: Array) -> None:
     """Take a plant of default parameters back to a start at this pose, before initialisation."""
-    plant._instance.fmu.reset()
+    plant.fmu.reset()
     plant.set("initial_position", position)
     plant.set("initial_quaternion", quaternion_from_rotation(rotation))
 

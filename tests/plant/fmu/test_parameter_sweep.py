@@ -159,12 +159,12 @@ SWEEPS = (
 
 def restart(plant: FmuPlant, parameters: Mapping[str, Array]) -> None:
     """Initialise a loaded plant anew."""
-    plant._instance.fmu.reset()
+    plant.fmu.reset()
     plant.handle["time"] = plant.handle["since"] = 0.0
     plant.handle["steps"] = 0
     for name, value in parameters.items():
         plant.set(name, value)
-    plant._instance.initialize()
+    plant.initialize()
 
 
 class Reader:
@@ -174,9 +174,9 @@ class Reader:
         sizes = {variable.name: variable.size for variable in table.outputs}
         self._references = np.array([plant.description[name].references[0] for name in names], np.uint32)
         self._values = np.zeros(sum(sizes[name] for name in names))
-        self._read = plant._instance.fmu.dll.fmi3GetFloat64
+        self._read = plant.fmu.dll.fmi3GetFloat64
         self._arguments = (
-            plant._instance.fmu.component,
+            plant.fmu.component,
             self._references.ctypes.data_as(ctypes.POINTER(ctypes.c_uint32)), self._references.size,
             self._values.ctypes.data_as(ctypes.POINTER(ctypes.c_double)), self._values.size,
         )  # fmt: skip

@@ -19,6 +19,7 @@ from plant.dynamics.variables import BRAKE, OPEN, SPATIAL, VELOCITY
 from plant.errors import FmuError, InputError, UnknownNameError
 from plant.fmu.build import PLANAR_MODEL, default_fmu
 from plant.fmu.calls import advance, read_imus, read_truth, write_command, write_drive_mode, write_drive_modes
+from plant.fmu.instance import FmuInstance
 from plant.fmu.plant import FmuPlant
 from plant.fmu.settings import Setting
 from plant.mechanism import Mechanism
@@ -502,9 +503,9 @@ def test_a_reset_fmu_starts_over(make_plant: MakePlant, hexapod: Mechanism) -> N
     plant.set("drive_mode", [OPEN] * 6)
     for _ in range(10):
         plant.step(1e-3)
-    plant._instance.fmu.reset()
-    plant._instance.fmu.enterInitializationMode()
-    plant._instance.fmu.exitInitializationMode()
+    plant.fmu.reset()
+    plant.fmu.enterInitializationMode()
+    plant.fmu.exitInitializationMode()
     plant.handle["time"] = 0.0
     np.testing.assert_array_equal(plant.get("position"), first)
     assert plant.get("payload.mass") == hexapod.plant["payload.mass"]
@@ -553,7 +554,7 @@ def test_a_state_goes_on_in_another_instance(make_plant: MakePlant) -> None:
 
 def test_a_state_of_another_build_is_refused(make_plant: MakePlant) -> None:
     plant = make_plant()
-    saved = plant._instance.state()
+    saved = FmuInstance.state(plant)
     clock = plant.state().removesuffix(saved)
     for broken, message in (
         (bytes([saved[0] ^ 1]) + saved[1:], "from another build of this FMU"),
