@@ -6,9 +6,9 @@ from math import radians
 from typing import TypeVar
 
 from plant.errors import InputError
+from plant.files import check_entries
 from plant.imu import STANDARD_GRAVITY, ImuModel
 from plant.mechanism import Mechanism
-from plant.toml import check_entries
 
 _ENDLESS = 1e300
 _RAW_M = 0.05

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from plant.errors import InputError
+from plant.files import read_text
 from plant.pose import Array
-from plant.toml import read_text
 
 
 class CsvTable(NamedTuple):

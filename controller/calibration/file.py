@@ -19,10 +19,9 @@ from numpy.typing import ArrayLike
 from controller.estimation.whole_mechanism.imu_errors import ERRORS
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import InputError
-from plant.files import write_whole
+from plant.files import check_entries, read_toml, write_whole
 from plant.mechanism import LEGS
 from plant.pose import Array, checked_array, rotation_from_vector, vector_from_rotation
-from plant.toml import check_entries, read_toml
 
 SENSORS = ("gyroscope", "accelerometer", "magnetometer")
 UNITS = ("rad/s", "m/s2", "uT")

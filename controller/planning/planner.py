@@ -19,8 +19,7 @@ from controller.planning.segments import state_after, stop_phases, write_segment
 from controller.planning.target import Target
 from plant.compiled import kernel
 from plant.errors import PlanningError
-from plant.mechanism import Mechanism, six_rows
-from plant.mechanism.limits import Limits
+from plant.mechanism import Limits, Mechanism, six_rows
 from plant.pose import Array
 from plant.vectors import Vector
 

@@ -8,7 +8,7 @@ from controller.safety.causes import EVENTS
 from controller.settings import SafetySettings
 from plant.compiled import Record, filled, record_dtype
 from plant.dynamics.variables import IMU_COUNT
-from plant.mechanism.limits import Limits
+from plant.mechanism import Limits
 
 PARAMETERS = record_dtype(
     arming=arming.PARAMETERS,

@@ -5,8 +5,7 @@ import numpy as np
 from controller.planning.segments import STOP_SEGMENTS, plan_stop
 from controller.safety.causes import REACTION, Cause, Mode, Reaction, Request, report_event
 from plant.compiled import Record, filled, kernel, record_dtype
-from plant.mechanism import LEGS
-from plant.mechanism.limits import Limits
+from plant.mechanism import LEGS, Limits
 
 STOP_SETTLING_S = 0.1
 """How long the drives hold a mechanism that has stopped before the brakes take over [s]."""

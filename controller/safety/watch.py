@@ -8,8 +8,7 @@ from controller.safety.stop import handle_cause
 from controller.settings import SafetySettings
 from plant.compiled import Record, filled, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
-from plant.mechanism import LEGS, six_rows
-from plant.mechanism.limits import Limits
+from plant.mechanism import LEGS, Limits, six_rows
 from plant.pose import Array
 
 _IMPLAUSIBLE_SHARE = 0.25

@@ -75,8 +75,7 @@ def gough_fmu_table(options: Namespace) -> None:
 @cli.command(_FILE, cli.JSON)
 def gough_fmu_info(options: Namespace) -> None:
     """Show what any FMU for Co-Simulation is, its variables, and whether the loop can use it as it is."""
-    from plant.fmu.binding import bind
-    from plant.fmu.binding_file import OWN_BINDING
+    from plant.fmu.binding import OWN_BINDING, bind
     from plant.fmu.check import platforms_of
     from plant.fmu.importer import FmuDescription
 

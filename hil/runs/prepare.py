@@ -25,7 +25,7 @@ from hil.runs.config import FUSIONS, SimulationConfig
 from plant.compiled import Record
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import GoughError, InputError
-from plant.fmu.binding_file import OWN_BINDING, load_binding
+from plant.fmu.binding import OWN_BINDING, load_binding
 from plant.fmu.build import building_default_fmu, default_fmu, model_of
 from plant.fmu.calls import FMU_HANDLE
 from plant.fmu.plant import FmuPlant

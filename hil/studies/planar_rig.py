@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from controller.direct_kinematics.planar import AssemblyMode, closing_angles, closing_positions, solve_planar, wrapped
 from plant.csv import read_csv
 from plant.errors import InputError, SingularConfigurationError
+from plant.files import read_text
 from plant.mechanism.planar import PLANAR_LEGS, PlanarMechanism
 from plant.pose import Array
-from plant.toml import read_text
 
 SOURCES = ("raw", "kalman", "complementary")
 COLUMNS = tuple(f"leg{leg}_{source}_deg" for source in SOURCES for leg in range(1, PLANAR_LEGS + 1))

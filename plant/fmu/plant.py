@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from plant.compiled import Record
 from plant.errors import FmuError, InputError
-from plant.fmu.binding import Modes, Scalars, bind, check_settable
-from plant.fmu.binding_file import OWN_BINDING, Binding, load_binding
+from plant.fmu.binding import OWN_BINDING, Binding, Modes, Scalars, bind, check_settable, load_binding
 from plant.fmu.calls import CALLED, FMU_HANDLE, MOST_CHANGES, advance
 from plant.fmu.importer import FmuDescription, FmuVariable
 from plant.fmu.instance import OK, FmuInstance

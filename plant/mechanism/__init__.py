@@ -1,7 +1,7 @@
 """Mechanisms: geometry, limits, class and presets of a rig."""
 
+from plant.mechanism.checks import Limits
 from plant.mechanism.documents import load_in_space, load_mechanism, load_spatial, mechanism_text
-from plant.mechanism.limits import Limits
 from plant.mechanism.planar import PlanarMechanism
 from plant.mechanism.spatial import LEGS, Mechanism, six_rows
 

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from plant.errors import InputError, UnknownNameError
+from plant.files import check_entries, parse_toml, read_text
 from plant.mechanism.planar import PlanarMechanism, PlanarPose
 from plant.mechanism.spatial import Mechanism
 from plant.pose import Pose, checked_array, checked_unit, rotation_from_quaternion
-from plant.toml import check_entries, parse_toml, read_text
 
 _PRESETS = resources.files("plant.mechanism") / "presets"
 

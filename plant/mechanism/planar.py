@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 
 from plant.dynamics.variables import PLANAR
 from plant.errors import InputError
-from plant.mechanism.checks import SAME_JOINT_M, checked_joints, checked_plant, read_only
-from plant.mechanism.limits import Limits, checked_limits
+from plant.mechanism.checks import SAME_JOINT_M, Limits, checked_joints, checked_limits, checked_plant, read_only
 from plant.pose import Array, checked_array
 
 PLANAR_LEGS = 3

@@ -14,8 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 from plant.checks import checked_seed
 from plant.dynamics.variables import PLANAR, SPATIAL, TINY, checked_parameters
 from plant.errors import InputError, UnreachableError
-from plant.mechanism.checks import SAME_JOINT_M, check_legs_differ, checked_joints, checked_plant, read_only
-from plant.mechanism.limits import Limits, checked_limits
+from plant.mechanism.checks import (
+    SAME_JOINT_M,
+    Limits,
+    check_legs_differ,
+    checked_joints,
+    checked_limits,
+    checked_plant,
+    read_only,
+)
 from plant.mechanism.planar import PLANAR_LEGS, PlanarMechanism
 from plant.pose import (
     Array,

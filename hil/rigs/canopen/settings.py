@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from hil.rigs import RigError
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import InputError
+from plant.files import check_entries, read_toml
 from plant.mechanism import LEGS
-from plant.toml import check_entries, read_toml
 
 DEFAULT_FILE = Path(__file__).with_name("canopen.toml")
 INTERFACES = ("socketcan", "udp_multicast", "virtual")

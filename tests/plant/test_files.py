@@ -3,7 +3,7 @@
 import pytest
 
 from plant.errors import InputError
-from plant.toml import check_entries, read_toml, unknown_entries
+from plant.files import check_entries, read_toml, unknown_entries
 
 
 def test_a_file_is_read(tmp_path):
