@@ -12,7 +12,7 @@ from plant.pose import Array
 
 
 class CsvTable(NamedTuple):
-    """The numbers of a CSV file: names of the columns (m), rows (N, m), and the line (N) of each row in the file."""
+    """The numbers of a CSV file: columns (m), rows (N, m), and the line (N) of each row."""
 
     columns: tuple[str, ...]
     rows: Array

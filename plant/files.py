@@ -39,7 +39,7 @@ def read_toml(path: Path | str) -> dict[str, Any]:
 
 
 def unknown_entries(table: Mapping[str, Any], known: Iterable[str], title: str) -> list[str]:
-    """A message for each entry of a table that is not `known`; `title` is what messages call the table."""
+    """A message for each entry that is not `known`; `title` is what messages call the table."""
     names = list(known)
     return [f"{title} has no entry {entry!r}; it has {', '.join(names)}" for entry in table if entry not in names]
 
@@ -51,7 +51,7 @@ def check_entries(table: Mapping[str, Any], known: Iterable[str], title: str) ->
 
 
 def check_writable(path: Path) -> None:
-    """Check, before any work is done for it, that a file could be written at `path`, or raise an `InputError`."""
+    """Check that a file could be written at `path`, or raise an `InputError`."""
     folder = path.resolve().parent
     if path.is_dir():
         raise InputError(f"cannot write {path}: it is a folder")

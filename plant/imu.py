@@ -22,7 +22,7 @@ STANDARD_GRAVITY = 9.80665
 MILLI_G = 1e-3 * STANDARD_GRAVITY
 
 GYROSCOPE, ACCELEROMETER, MAGNETOMETER = 0, 1, 2
-"""First index of a measurement (3, 7, 3): [rad/s], [m/s^2], [uT]; the second is the IMU, the third its axis."""
+"""First index of a measurement (3, 7, 3) [rad/s, m/s^2, uT]: sensor, IMU, axis."""
 
 
 def _check_not_negative(what: str, value: Any) -> None:
@@ -165,7 +165,7 @@ def load_imu(name: str) -> ImuModel:
 
 
 def imu_state(model: ImuModel, seed: int, period: float, wiring: Wiring = RIGHT_WIRING) -> Record:
-    """Draw the constant errors of seven IMUs and prepare their state for cycles of `period` [s].
+    """Draw the constant errors of seven IMUs, for cycles of `period` [s].
 
     Raises:
         InputError: a negative seed, or a delay longer than 32 cycles.
@@ -209,7 +209,7 @@ def _constant_errors(sensor: SensorErrors, random: np.random.Generator) -> tuple
 
 
 def _smoothing(bandwidth: float, period: float) -> tuple[float, float]:
-    """The shares of the previous and of the new value in a step of a first-order low-pass."""
+    """The shares of the previous and the new value in a first-order low-pass."""
     if bandwidth == inf:
         return 0.0, 1.0
     ratio = 2.0 * pi * bandwidth * period

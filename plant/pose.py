@@ -180,26 +180,21 @@ def vector_from_rotation(rotation: Array) -> Array:
 
 def rotation_angle(first: Array, second: Array) -> Array:
     """The angle [rad] between rotations (..., 3, 3) and (..., 3, 3); shape (...)."""
+    return _turn(first, second)[0]
+
+
+def _turn(first: Array, second: Array) -> tuple[Array, Array]:
+    """The angle (...) [rad] from `second` to `first`, and its axis (..., 3) of the length 2 sin(angle)."""
     relative = first @ np.swapaxes(second, -1, -2)
-    axis = np.stack(
-        [
-            relative[..., 2, 1] - relative[..., 1, 2],
-            relative[..., 0, 2] - relative[..., 2, 0],
-            relative[..., 1, 0] - relative[..., 0, 1],
-        ],
-        axis=-1,
-    )
-    angle: Array = np.arctan2(np.linalg.norm(axis, axis=-1), np.trace(relative, axis1=-2, axis2=-1) - 1.0)
-    return angle
+    skewed = relative - np.swapaxes(relative, -1, -2)
+    axis = np.stack([skewed[..., 2, 1], skewed[..., 0, 2], skewed[..., 1, 0]], axis=-1)
+    return np.arctan2(np.linalg.norm(axis, axis=-1), np.trace(relative, axis1=-2, axis2=-1) - 1.0), axis
 
 
 def pose_errors(positions: Array, rotations: Array, true_positions: Array, true_rotations: Array) -> Array:
     """Errors (..., 6) of poses, less than half a turn: translation [m] and rotation vector [rad], both seen in {1}."""
-    relative = rotations @ np.swapaxes(true_rotations, -1, -2)
-    skewed = relative - np.swapaxes(relative, -1, -2)
-    sines = 0.5 * np.stack([skewed[..., 2, 1], skewed[..., 0, 2], skewed[..., 1, 0]], axis=-1)
-    vectors = sines / np.sinc(rotation_angle(rotations, true_rotations) / np.pi)[..., None]
-    return np.concatenate([positions - true_positions, vectors], axis=-1)
+    angle, axis = _turn(rotations, true_rotations)
+    return np.concatenate([positions - true_positions, 0.5 * axis / np.sinc(angle / np.pi)[..., None]], axis=-1)
 
 
 def rms_figures(errors: Array) -> dict[str, float]:

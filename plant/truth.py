@@ -1,4 +1,4 @@
-"""The truth of a run, for evaluation: a float array (19,) with the pose of {2}, and the lengths and currents of six legs."""
+"""The truth of a run: an array (19,) with the pose of {2}, and the lengths and currents of six legs."""
 
 TRUTH_SIZE = 19
 TRUTH_POSITION = slice(0, 3)

@@ -1,7 +1,7 @@
 """Products of three-vectors in compiled code.
 
-A vector is a tuple of three floats, so that a call costs as little as the formula written out; `vector` makes one from an
-array. Every sum is taken from left to right and starts with its first term.
+A vector is a tuple of three floats, so that a call costs as little as the formula written out. Every sum is taken from left to
+right.
 """
 
 from plant.compiled import kernel

@@ -1,4 +1,4 @@
-"""Loads and stores of shared arrays in a fixed order, for processes that share memory without locks."""
+"""Loads and stores in a fixed order, for processes that share memory without locks."""
 
 from typing import Any
 
@@ -32,10 +32,10 @@ def _fence(typing_context: Any) -> Any:
 
 
 store_release: Any = intrinsic(_store)
-"""Kernel (array, index, value): store a number in a shared int64 array (n,) after everything that was stored before it."""
+"""Kernel (array, index, value): store in a shared int64 array after all that was stored before."""
 
 load_acquire: Any = intrinsic(_load)
-"""Kernel (array, index): load a number of a shared int64 array (n,) before everything that is loaded after it."""
+"""Kernel (array, index): load from a shared int64 array before all that is loaded after."""
 
 fence: Any = intrinsic(_fence)
-"""Kernel (): keep what is loaded and stored before apart from what is stored after, and what is loaded before from after."""
+"""Kernel (): keep what is loaded and stored before apart from what comes after."""

@@ -31,7 +31,7 @@ def hash_of_files(files: Iterable[Path], *extra: str) -> str:
 
 
 def keyed_folder(kind: str, key: str) -> Path:
-    """The cache folder of this kind and key, made and marked as used; folders long unused are removed.
+    """The cache folder of this kind and key; folders long unused are removed.
 
     Without a cache that can be written, it lasts as long as the process.
     """

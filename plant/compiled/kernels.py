@@ -28,7 +28,7 @@ NumPy cannot say."""
 
 
 def record_dtype(**fields: Any) -> np.dtype[Any]:
-    """The dtype of a record with these fields, in their order: each a type, or a type and a shape."""
+    """The dtype of a record with these fields: each a type, or a type and a shape."""
     return np.dtype(list(fields.items()), align=True)
 
 
@@ -98,7 +98,7 @@ def kernel(function: F) -> F:
 
 
 def _general(kind: Any) -> Any:
-    """The type of an argument without the value of a constant and without the shape of a record's array."""
+    """The type of an argument without a constant's value and an array's shape."""
     general: Any = cast(Any, types.unliteral)(kind)
     if isinstance(general, types.IntEnumMember):
         return general.dtype

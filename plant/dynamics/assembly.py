@@ -14,7 +14,7 @@ Values = dict[str, SX]
 
 @dataclass(frozen=True)
 class Dynamics:
-    """A plant as functions of flat vectors; `conditions` and `limits` return two vectors, values and their greatest values."""
+    """A plant as functions of flat vectors; `conditions` and `limits` return values and their greatest values."""
 
     constants: ca.Function  # of the parameters
     start: ca.Function  # the states, of the parameters

@@ -57,7 +57,7 @@ def leg_constants(p: dict[str, SX]) -> dict[str, SX]:
 
 
 def platform_constants(p: dict[str, SX], about_offset: Callable[[SX], SX]) -> dict[str, SX]:
-    """Platform and payload as one rigid body; `about_offset(center)` is the inertia of a unit mass at an offset."""
+    """Platform and payload as one body; `about_offset(center)` is the inertia of a unit mass."""
     masses = (p["platform.mass"], p["payload.mass"])
     centers = (p["platform.center_of_mass"], p["payload.center_of_mass"])
     inertias = (p["platform.inertia"], p["payload.inertia"])
@@ -109,7 +109,7 @@ _RUNGE_KUTTA_REACH = 2.5
 """The classical Runge-Kutta method is stable for |eigenvalue| x step up to this."""
 
 _CONTACT_REACH = 1.5
-"""The same for the end stops, which are nonlinear; found with 800 random sets of parameters."""
+"""The same for the end stops, found with 800 random sets of parameters."""
 
 
 def _substep_conditions(p: dict[str, SX], beyond_stop: SX) -> list[Condition]:
@@ -229,7 +229,7 @@ def _leg_at(s: SX, velocity: SX, arm: SX, bias: SX, e1: SX, c: dict[str, SX]) ->
 def legs_at(
     position: SX, rotation: SX, velocity: SX, omega: SX, base_joints: SX, platform_joints: SX, axes: SX, c: dict[str, SX]
 ) -> list[Leg]:
-    """The legs (joints and axes (n, 3)) for a prescribed motion of {2}; `c` has `leg_constants` and `axial_inertia`."""
+    """The legs, of joints and axes (n, 3), for a motion of {2}."""
     legs = []
     for k in range(base_joints.shape[0]):
         arm = rotation @ row(platform_joints, k)
@@ -324,7 +324,7 @@ def _brake_rate(deflection: SX, speed: SX, closed: SX, c: dict[str, SX]) -> SX:
 
 
 def solve(matrix: SX, right: SX) -> SX:
-    """Solve a symmetric positive definite system by Cholesky's method; only the lower triangle is read."""
+    """Solve a positive definite system by Cholesky's method; only the lower triangle is read."""
     n = right.shape[0]
     lower = SX.zeros(n, n)
     inverses: list[SX] = []

@@ -34,7 +34,7 @@ _NORM_RATE = 5.0
 """The rate at which the quaternion's length returns to one [1/s]."""
 
 _MOST_ALONG_AT_START, _MOST_ALONG = 0.99, 0.9998
-"""Cosine between a leg and the first axis of its joint; at 1, turning about its own axis would take infinite inertia."""
+"""Cosine between a leg and the first axis of its joint, along which the leg would be singular."""
 
 
 def build_dynamics() -> Dynamics:

@@ -21,7 +21,7 @@ from plant.wiring import PLATFORM_IMU as PLATFORM_IMU
 Causality = Literal["state", "input", "parameter", "output"]
 
 OPEN, BRAKE, VELOCITY = 0, 1, 2
-"""Values of `drive_mode`: the motor is unpowered and free, held by its brake, or driven at `velocity_command`."""
+"""Values of `drive_mode`: free, held by the brake, or driven at `velocity_command`."""
 
 DRIVE_MODES = {OPEN: "open", BRAKE: "brake", VELOCITY: "velocity"}
 

@@ -1,4 +1,4 @@
-"""Bindings: which of an FMU's variables hold the loop's signals, as a TOML file says (docs/fmu.md), and how to convert them.
+"""Bindings: which of an FMU's variables hold the loop's signals, as a TOML file says (docs/fmu.md).
 
 A signal has the name of gough's own variable (`plant.dynamics.variables`). One or several variables of the FMU hold its values.
 In the binding of gough's own plants, every signal is the variable of its name.
@@ -28,7 +28,7 @@ TRUTH_PLACES = {
     "position": TRUTH_POSITION, "quaternion": TRUTH_QUATERNION, "angle": TRUTH_QUATERNION, "leg_length": TRUTH_LENGTHS,
     "current": TRUTH_CURRENTS,
 }  # fmt: skip
-"""Where a signal lies in the truth (`plant.truth`). A planar plant tells its angle in the first place of the quaternion."""
+"""Where a signal lies in the truth. A planar plant's angle is in the first place of the quaternion."""
 
 COMMANDS, MODES, PAYLOAD = "velocity_command", "drive_mode", "payload.mass"
 
@@ -43,7 +43,7 @@ UNITS: dict[str, dict[str, float]] = {
     "kg": {"kg": 1.0, "g": 1e-3, "t": 1e3},
     "1": {"1": 1.0, "": 1.0},
 }
-"""By the loop's unit: the units that an FMU may use, with the factor from the FMU's to the loop's."""
+"""The units that an FMU may use, with the factors to the loop's unit."""
 
 SIGNAL_UNITS = {
     COMMANDS: "m/s", MODES: "1", "imu_angular_velocity": "rad/s", "imu_specific_force": "m/s2", "imu_magnetic_field": "uT",
@@ -90,7 +90,7 @@ OWN_BINDING = Binding("", _OWN_SIGNALS, native=True)
 
 
 def load_binding(path: Path | str) -> Binding:
-    """Read a binding; errors in its entries are reported later, with those in the FMU's variables.
+    """Read a binding; `bind` reports errors in its entries.
 
     Raises:
         InputError: the file cannot be read, or is not TOML.
@@ -221,10 +221,10 @@ class Bound:
 
 
 def check_settable(variable: FmuVariable, owner: str, driven: frozenset[str], running: bool = False) -> None:
-    """Check that a variable of the FMU `owner` takes a start value or a change during the run, and that the loop leaves it.
+    """Check that a variable of the FMU `owner` may be set at the start, or during the run.
 
     Raises:
-        InputError: it does not.
+        InputError: it may not, or the loop sets it.
     """
     if running and not variable.tunable:
         raise InputError(

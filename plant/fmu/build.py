@@ -1,6 +1,6 @@
-"""From the dynamics of a plant to its FMU: C code, description, shared libraries, and the archive around them.
+"""From the dynamics of a plant to its FMU.
 
-`python -m plant.fmu.build FILE ...` builds in a process of its own, because a process that runs a loop must not load CasADi.
+`python -m plant.fmu.build FILE ...` builds in its own process: one that runs a loop must not load CasADi.
 """
 
 import io
@@ -100,7 +100,7 @@ def default_fmu(model: Model = SPATIAL_MODEL, fmi: int = 3) -> Path:
 
 @contextmanager
 def building_default_fmu(model: Model = SPATIAL_MODEL, fmi: int = 3) -> Iterator[Callable[[], Path]]:
-    """Build the `default_fmu` while other work goes on; yields a function that waits for it and returns its path."""
+    """Build the `default_fmu` meanwhile; yields a function that waits for its path."""
     package = Path(__file__).resolve().parent.parent
     sources = [*sorted(package.rglob("*.py")), package / "mechanism" / "presets" / f"{model.preset}.toml"]
     with resources.as_file(resources.files("fmus")) as folder:

@@ -1,4 +1,4 @@
-"""The C code of an exported plant: its functions, the header of its layout, and the FMI functions that it lacks."""
+"""The C code of an exported plant."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ def write_functions(dynamics: Dynamics, folder: Path) -> None:
 
 
 def _derivatives(dynamics: Dynamics) -> list[ca.Function]:
-    """Products of vectors with the Jacobians of rates, outputs and constants, and their transposes."""
+    """Products with the Jacobians of rates, outputs and constants, and their transposes."""
 
     def product(name: str, function: ca.Function, reverse: bool) -> ca.Function:
         arguments = [ca.SX.sym(f"i{i}", function.size1_in(i)) for i in range(function.n_in())]
@@ -161,7 +161,7 @@ _UNSUPPORTED_HEAD = """\
 
 
 def unsupported_functions(fmi: int, declarations: str, wrapper: str) -> str:
-    """C code of the functions in the standard's header that fmi2.c or fmi3.c lacks: importers need every symbol."""
+    """Functions of the standard's header that the wrapper lacks: importers need every symbol."""
     declared = re.findall(rf"FMI{fmi}_Export\s+fmi{fmi}\w+TYPE\s+(fmi{fmi}\w+);", declarations)
     lines = []
     for name in (name for name in declared if not re.search(rf"\b{name}\(", wrapper)):

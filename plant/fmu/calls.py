@@ -183,7 +183,7 @@ def read_imus(fmu: Record) -> int:
 
 @kernel
 def read_truth(fmu: Record) -> int:
-    """Read pose, lengths and currents into `truth`, as far as the FMU has them; returns FMI's status."""
+    """Read what the FMU has of the truth into `truth`; returns FMI's status."""
     c = fmu[()]
     truth = c.truth
     status = _read(c, _READ_TRUTH, c.known, truth)

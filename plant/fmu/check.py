@@ -1,4 +1,4 @@
-"""Checks of any FMU for Co-Simulation: FMPy validates its description, and trials use what it promises."""
+"""Checks of any FMU for Co-Simulation: its description, and trials of what it promises."""
 
 import contextlib
 import functools

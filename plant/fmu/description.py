@@ -1,8 +1,7 @@
-"""The layout of an exported plant, and its XML: modelDescription.xml for FMI 2.0 and 3.0, and buildDescription.xml.
+"""The layout of an exported plant, and its XML: modelDescription.xml and buildDescription.xml.
 
-FMI 3.0 has arrays: each variable of the table is one variable, whose value reference is its index in `Layout.exposed`. FMI 2.0
-has scalars: one per element, named `leg_length[1]` or `base_joints[1,3]`, counted from 1 and row by row, whose value reference
-is its place in the vector of all values.
+In FMI 3.0 each variable of the table is one variable, whose value reference is its index in `Layout.exposed`. In FMI 2.0 each
+element is one, such as `base_joints[1,3]`, whose value reference is its place in the vector of all values.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -50,7 +49,7 @@ _PER_SECOND = {"m": "m/s", "m/s": "m/s2", "rad": "rad/s", "rad/s": "rad/s2", "1"
 
 @dataclass(frozen=True)
 class Layout:
-    """The values of a plant in one vector: states, inputs, parameters, outputs, derivatives of the states."""
+    """The values of a plant in one vector."""
 
     table: VariableTable
 
@@ -108,7 +107,7 @@ class Dependencies(NamedTuple):
 
 
 def start_of(variable: Variable, starts: Mapping[str, Array]) -> list[float]:
-    """The start values of a variable, row by row: the drives on their brakes, the other inputs zero."""
+    """The start values of a variable: drives on their brakes, other inputs zero."""
     if variable.discrete:
         return [float(BRAKE)] * variable.size
     if variable.causality == "parameter":
@@ -137,7 +136,7 @@ def model_description(
     dependencies: Dependencies,
     sources: list[str],
 ) -> bytes:
-    """The content of modelDescription.xml, for the start values of all parameters and the names of the C files."""
+    """The content of modelDescription.xml."""
     writer = (_Fmi3 if fmi == 3 else _Fmi2)(layout, starts, dependencies)
     root = Element(
         "fmiModelDescription",

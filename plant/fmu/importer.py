@@ -1,4 +1,4 @@
-"""The description of an FMU for Co-Simulation, of FMI 2.0 or 3.0: its variables and abilities, read by FMPy."""
+"""The description of an FMU for Co-Simulation, of FMI 2.0 or 3.0, read by FMPy."""
 
 import itertools
 import re
@@ -43,7 +43,7 @@ _ELEMENT = re.compile(r"(.+)\[(\d+(?:, ?\d+)*)\]")
 
 @dataclass(frozen=True)
 class FmuVariable:
-    """A variable of an FMU. In FMI 2.0, the scalars `name[1,1]`, `name[1,2]`, ... also form one array variable `name`."""
+    """A variable of an FMU. In FMI 2.0, the scalars `name[1]`, `name[2]`, ... also form an array `name`."""
 
     name: str
     shape: tuple[int, ...]
@@ -113,7 +113,7 @@ class FmuVariable:
 
 
 def element_names(name: str, shape: tuple[int, ...]) -> list[str]:
-    """The names of an array's elements in FMI 2.0, row by row and counted from 1; a scalar keeps its own name."""
+    """The names of an array's elements in FMI 2.0, row by row and counted from 1."""
     if not shape:
         return [name]
     name, closing = (name[:-1], ")") if name.startswith("der(") else (name, "")

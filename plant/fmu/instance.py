@@ -129,7 +129,7 @@ class FmuInstance:
         self._access("Set", variable, variable.values(value, self.path.name))
 
     def jacobian(self, unknowns: Sequence[FmuVariable], knowns: Sequence[FmuVariable]) -> Array:
-        """The partial derivatives (m, n) of the unknowns' m scalars by the knowns' n, from the FMU's directional derivatives.
+        """The partial derivatives (m, n) of the unknowns' m scalars by the knowns' n.
 
         Raises:
             FmuError: the FMU lacks these derivatives.

@@ -1,4 +1,4 @@
-"""A plant FMU for the loop: checked when it is loaded, then called from compiled code (`plant.fmu.calls`)."""
+"""A plant FMU for the loop, called from compiled code (`plant.fmu.calls`)."""
 
 import struct
 from collections.abc import Mapping, Sequence
@@ -39,11 +39,11 @@ class FmuPlant(FmuInstance):
         parameters: start values by name; a name that the FMU lacks is an error.
         period: of control [s].
         binding: a binding or its TOML file; None if the variables have gough's own names.
-        settings: values set after the parameters and the binding's start values, at the start or during the run.
+        settings: set after the parameters and the binding's start values, or during the run.
         legs: the required number; None for any.
 
     Attributes:
-        handle: the structured array (dtype `FMU_HANDLE`) for `read_imus`, `read_truth`, `write_command` and `advance`.
+        handle: the record (dtype `FMU_HANDLE`) for the kernels of `plant.fmu.calls`.
         bound: the loop's signals in the FMU.
 
     Raises:
@@ -97,7 +97,7 @@ class FmuPlant(FmuInstance):
             raise self.failure()
 
     def linearize(self, inputs: Sequence[str], outputs: Sequence[str]) -> LinearPlant:
-        """The plant's equations linearised at its present state, from the FMU's directional derivatives.
+        """The plant linearised at its present state.
 
         Raises:
             UnknownNameError: the FMU has no such variable.

@@ -1,4 +1,4 @@
-"""What every mechanism must satisfy, in space and in the plane, and the limits of its actuators."""
+"""What every mechanism must satisfy, and the limits of its actuators."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -24,7 +24,7 @@ _DERIVED = (
 
 
 def checked_joints(base_joints: ArrayLike, platform_joints: ArrayLike, shape: tuple[int, int]) -> tuple[Array, Array]:
-    """The joints of base and platform, each of `shape`, of legs that differ; or an `InputError`."""
+    """The joints of base and platform, each of `shape`, or an `InputError`."""
     base, platform = checked_array(base_joints, shape, "base_joints"), checked_array(platform_joints, shape, "platform_joints")
     check_legs_differ(base, platform)
     return base, platform
@@ -67,19 +67,17 @@ def read_only(settings: Mapping[str, Mapping[str, Any]] | None) -> Mapping[str, 
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Limits of the actuators of n legs: `stroke` (n, 2), least and greatest length of each leg [m]; greatest `velocity` [m/s],
-    `acceleration` [m/s^2] and `jerk` [m/s^3] along each leg; and the distance `stop_clearance` [m] of the plant's end stops
-    beyond the stroke.
+    """Limits of the actuators of n legs.
 
     Raises:
         InputError: an empty or non-positive stroke, or a limit that is not positive.
     """
 
-    stroke: Array
-    velocity: float = 0.25
-    acceleration: float = 3.0
-    jerk: float = 60.0
-    stop_clearance: float = 0.002
+    stroke: Array  # (n, 2), least and greatest length of each leg [m]
+    velocity: float = 0.25  # [m/s]
+    acceleration: float = 3.0  # [m/s^2]
+    jerk: float = 60.0  # [m/s^3]
+    stop_clearance: float = 0.002  # from the stroke to the plant's end stops [m]
 
     def __post_init__(self) -> None:
         stroke = checked_array(self.stroke, (len(np.atleast_1d(self.stroke)), 2), "stroke")

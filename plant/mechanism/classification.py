@@ -43,10 +43,9 @@ _SUPERSCRIPTS = ("", "", *"²³⁴⁵⁶")
 
 @dataclass(frozen=True)
 class MechanismClass:
-    """A combinatorial class; equal graphs are equal classes, however their joints and legs are numbered.
+    """A combinatorial class; equal graphs are equal classes, however they are numbered.
 
-    The `legs`, six in space or three in the plane, are given with any numbers of joints and stored with the canonical ones,
-    which count from 0 on either side, joints of many legs first.
+    The joints of `legs` may be given by any numbers; they are stored by canonical ones, from 0 on either side.
 
     Raises:
         InputError: another number of legs, legs that share both joints, a joint of too many legs, or too few joints.
@@ -102,7 +101,7 @@ class MechanismClass:
 
     @property
     def number(self) -> int:
-        """The place within the group, from 1, in the order of `spatial_classes` or `planar_classes`."""
+        """The place within the group, from 1."""
         classes = planar_classes() if self.planar else spatial_classes()
         return [peer for peer in classes if peer.group == self.group].index(self) + 1
 
@@ -162,7 +161,7 @@ def canonical_legs(mechanism: Mechanism | PlanarMechanism) -> Legs:
 
 @cache
 def spatial_classes() -> tuple[MechanismClass, ...]:
-    """The 60 classes of six legs by platform joints, type, and base joints, the most base joints first (section 2)."""
+    """The 60 classes of six legs, by platform joints, type, and base joints (section 2)."""
     return _classes(LEGS)
 
 
@@ -181,8 +180,7 @@ def draw_mechanism(
 ) -> Mechanism:
     """A random mechanism of a spatial class, of desk size, with legs and joints in random order.
 
-    The base joints lie near a ring of 0.3 m. The platform joints lie near a ring of 0.2 m in a tilted plane of {2}, or if they
-    are not `coplanar`, alternately above and below it.
+    The base joints lie near a ring of 0.3 m; the platform joints near one of 0.2 m, in a plane if they are `coplanar`.
 
     Raises:
         InputError: the class is planar, or the vertical is not a unit vector.
@@ -203,7 +201,7 @@ def draw_mechanism(
 
 
 def draw_planar_mechanism(mechanism_class: MechanismClass, random: np.random.Generator) -> PlanarMechanism:
-    """A random mechanism of a planar class: base joints near a circle of 0.3 m, platform joints near one of 0.1 m.
+    """A random mechanism of a planar class, near circles of 0.3 m and 0.1 m.
 
     Raises:
         InputError: the class is spatial.
@@ -219,7 +217,7 @@ def draw_planar_mechanism(mechanism_class: MechanismClass, random: np.random.Gen
 
 
 def layout(mechanism_class: MechanismClass) -> tuple[Array, Array]:
-    """Places of base joints (n,) and platform joints (m,) in a picture of two rows with the fewest crossings of legs."""
+    """Places of the joints (n,) and (m,) in a picture of two rows with the fewest crossings of legs."""
     x: dict[Joint, float] = {}
     left = 0.0
     for _, joints in _components(mechanism_class):

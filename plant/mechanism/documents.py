@@ -97,7 +97,7 @@ def _preset_names() -> list[str]:
 
 
 def _completed(document: dict[str, Any], source: str) -> dict[str, Any]:
-    """A document laid over the preset that it is based on, and so on; the preset's name is not inherited."""
+    """A document laid over the preset that it is based on, and so on."""
     names = [source]
     while "based_on" in document:
         names.append(document.pop("based_on"))

@@ -99,7 +99,7 @@ class Mechanism:
         Args:
             base_joints, platform_joints: (6, 3) [m].
             name, up_in_base, plant, settings: as the attributes.
-            base_joint_axes: by default e_z x (home direction), horizontal in {1}.
+            base_joint_axes: by default e_z x (home direction).
             home: without it, `nominal_home` defines the default axes but no length.
             limits: the fields of `Limits`; a stroke of (2,) [m] counts from the home lengths, (6, 2) is absolute.
 
@@ -195,7 +195,7 @@ class Mechanism:
         return first
 
     def built(self, joint_error: float, seed: int) -> "Mechanism":
-        """The mechanism as built, with a normal error of each joint coordinate of standard deviation `joint_error` [m].
+        """The mechanism as built, with a normal error of each joint coordinate [m].
 
         Raises:
             InputError: the joint error is negative, or at least a tenth of the base's radius.
