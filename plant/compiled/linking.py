@@ -6,6 +6,7 @@ This module replaces parts of numba while a kernel compiles. It halves the first
 import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any, cast
 
 from llvmlite.binding import Linkage, parse_assembly
@@ -101,12 +102,7 @@ def _weaken(module: Any, which: Callable[[str], bool]) -> None:
             each.linkage = "linkonce_odr"
 
 
-class _NoEnvironments:
-    def set_env(self, name: str, environment: Any) -> None:
-        """Do nothing: no machine code looks there."""
-
-
-_NO_ENVIRONMENTS = _NoEnvironments()
+_NO_ENVIRONMENTS = SimpleNamespace(set_env=lambda name, environment: None)
 _MANGLED, _WRAPPER, _ENVIRONMENT = "_ZN", "_ZN7cpython", "_ZN08NumbaEnv"
 _LAZY_COLLECTION = (50_000, 20, 20)
 _resolve: Any = BaseFunction.get_call_type

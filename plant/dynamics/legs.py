@@ -25,11 +25,6 @@ def row(matrix: SX, k: int) -> SX:
     return matrix[k, :].T
 
 
-def stack(values: list[SX]) -> SX:
-    """Scalars in a column."""
-    return ca.vertcat(*values)
-
-
 _UNCHANGED = (
     "motor.resistance", "drive.voltage_limit", "drive.current_limit", "friction.coulomb", "friction.viscous",
     "friction.velocity", "brake.stiffness", "brake.damping", "stop.minimum_length", "stop.maximum_length", "stop.stiffness",
@@ -37,8 +32,15 @@ _UNCHANGED = (
 )  # fmt: skip
 
 
-def leg_constants(p: dict[str, SX]) -> dict[str, SX]:
-    """The constants of legs, actuators and IMUs."""
+def body_constants(p: dict[str, SX], about_offset: Callable[[SX], SX]) -> dict[str, SX]:
+    """The constants of legs, actuators, IMUs, and of platform and payload as one body.
+
+    `about_offset(center)` is the inertia of a unit mass at an offset.
+    """
+    masses = (p["platform.mass"], p["payload.mass"])
+    centers = (p["platform.center_of_mass"], p["payload.center_of_mass"])
+    inertias = (p["platform.inertia"], p["payload.inertia"])
+    first, second = (i + m * about_offset(c) for m, c, i in zip(masses, centers, inertias, strict=True))
     turns = 2 * pi / p["motor.screw_lead"]
     lower, upper = "leg.lower.", "leg.upper."
     return {name: p[name] for name in _UNCHANGED} | {
@@ -53,16 +55,6 @@ def leg_constants(p: dict[str, SX]) -> dict[str, SX]:
         "limiter_rate": 1 / p["drive.current_time_constant"],
         "brake_slip": p["brake.force"] / p["brake.stiffness"],
         "release_rate": 1 / p["brake.release_time"],
-    }
-
-
-def platform_constants(p: dict[str, SX], about_offset: Callable[[SX], SX]) -> dict[str, SX]:
-    """Platform and payload as one body; `about_offset(center)` is the inertia of a unit mass."""
-    masses = (p["platform.mass"], p["payload.mass"])
-    centers = (p["platform.center_of_mass"], p["payload.center_of_mass"])
-    inertias = (p["platform.inertia"], p["payload.inertia"])
-    first, second = (i + m * about_offset(c) for m, c, i in zip(masses, centers, inertias, strict=True))
-    return {
         "mass": masses[0] + masses[1],
         "first_moment": masses[0] * centers[0] + masses[1] * centers[1],
         "inertia": first + second,
@@ -226,16 +218,14 @@ def _leg_at(s: SX, velocity: SX, arm: SX, bias: SX, e1: SX, c: dict[str, SX]) ->
     )
 
 
-def legs_at(
-    position: SX, rotation: SX, velocity: SX, omega: SX, base_joints: SX, platform_joints: SX, axes: SX, c: dict[str, SX]
-) -> list[Leg]:
-    """The legs, of joints and axes (n, 3), for a motion of {2}."""
+def legs_at(position: SX, rotation: SX, velocity: SX, omega: SX, c: dict[str, SX]) -> list[Leg]:
+    """The legs, whose constants include joints and axes (n, 3), for a motion of {2}."""
     legs = []
-    for k in range(base_joints.shape[0]):
-        arm = rotation @ row(platform_joints, k)
-        s = position + arm - row(base_joints, k)
+    for k in range(c["base_joints"].shape[0]):
+        arm = rotation @ row(c["platform_joints"], k)
+        s = position + arm - row(c["base_joints"], k)
         turning = ca.cross(omega, arm)
-        legs.append(_leg_at(s, velocity + turning, arm, ca.cross(omega, turning), row(axes, k), c))
+        legs.append(_leg_at(s, velocity + turning, arm, ca.cross(omega, turning), row(c["base_joint_axes"], k), c))
     return legs
 
 
@@ -276,13 +266,13 @@ def actuators_at(legs: list[Leg], x: dict[str, SX], u: dict[str, SX], c: dict[st
         friction=friction,
         # An opened brake releases within its release time, while the drive takes over the load.
         brake=-(c["brake.stiffness"] * deflections + closed * c["brake.damping"] * speeds),
-        stop=stack([_stop_force(leg.length, leg.speed, c, k) for k, leg in enumerate(legs)]),
+        stop=ca.vertcat(*[_stop_force(leg.length, leg.speed, c, k) for k, leg in enumerate(legs)]),
         voltage=voltage,
         current_rate=ca.fmax(
             ca.fmin(free, c["limiter_rate"] * (c["drive.current_limit"] - current)),
             c["limiter_rate"] * (-c["drive.current_limit"] - current),
         ),
-        brake_rate=stack([_brake_rate(deflections[k], leg.speed, closed[k], c) for k, leg in enumerate(legs)]),
+        brake_rate=ca.vertcat(*[_brake_rate(deflections[k], leg.speed, closed[k], c) for k, leg in enumerate(legs)]),
     )
 
 
@@ -290,7 +280,7 @@ def leg_outputs(legs: list[Leg], actuators: Actuators, x: dict[str, SX]) -> dict
     """What the table has of legs and actuators, by name."""
     speeds = _speeds(legs)
     return {
-        "leg_length": stack([leg.length for leg in legs]),
+        "leg_length": ca.vertcat(*[leg.length for leg in legs]),
         "leg_velocity": speeds,
         "current": x["state.current"],
         "voltage": actuators.voltage,
@@ -302,7 +292,7 @@ def leg_outputs(legs: list[Leg], actuators: Actuators, x: dict[str, SX]) -> dict
 
 
 def _speeds(legs: list[Leg]) -> SX:
-    return stack([leg.speed for leg in legs])
+    return ca.vertcat(*[leg.speed for leg in legs])
 
 
 def _stop_force(length: SX, speed: SX, c: dict[str, SX], k: int) -> SX:
@@ -363,15 +353,15 @@ def _leg_turning(s: SX, velocity: SX, acceleration: SX, e1: SX) -> tuple[SX, SX,
     return ca.horzcat(ca.cross(e2, n), e2, n), turning, angular
 
 
-def imu_signals_of(legs: list[Leg], axes: SX, rotation: SX, omega: SX, acceleration: SX, c: dict[str, SX]) -> dict[str, SX]:
+def imu_signals_of(legs: list[Leg], rotation: SX, omega: SX, acceleration: SX, c: dict[str, SX]) -> dict[str, SX]:
     """Ideal IMU signals (n + 1, 3) of legs and platform, by their names in the table.
 
     Signals of a leg are seen in the leg frame, whose z axis is the leg and whose y axis is e2; those of the platform in {2}.
-    The rows of `axes` (n, 3) are e1 of each leg; `acceleration` (6, 1) is that of the origin of {2}, then angular.
+    The `acceleration` (6, 1) is that of the origin of {2}, then angular.
     """
     signals: list[tuple[SX, SX, SX]] = []
     for i, leg in enumerate(legs):
-        e1, arm = row(axes, i), row(c["leg_imu_position"], i)
+        e1, arm = row(c["base_joint_axes"], i), row(c["leg_imu_position"], i)
         frame, turning, angular = _leg_turning(
             leg.s, leg.velocity, acceleration[:3] + ca.cross(acceleration[3:], leg.arm) + leg.bias, e1
         )

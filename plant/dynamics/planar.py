@@ -11,19 +11,17 @@ from plant.dynamics.legs import (
     SX,
     Condition,
     actuators_at,
+    body_constants,
     imu_signals_of,
     leg_conditions,
-    leg_constants,
     leg_outputs,
     legs_at,
     length_limits,
-    platform_constants,
     solve,
 )
 from plant.dynamics.variables import PLANAR
 
 _NORMAL = SX([0, 0, 1])
-_AXES = ca.repmat(_NORMAL.T, 3, 1)
 
 
 def build_dynamics() -> Dynamics:
@@ -35,7 +33,7 @@ def build_dynamics() -> Dynamics:
 
 def _constants(p: Values) -> Values:
     joints = {name: p[name] for name in ("base_joints", "platform_joints")}
-    return joints | leg_constants(p) | platform_constants(p, lambda center: ca.dot(center, center))
+    return joints | body_constants(p, lambda center: ca.dot(center, center))
 
 
 def _conditions(p: Values) -> list[Condition]:
@@ -68,9 +66,9 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
     moment = rotation[:2, :2] @ c["first_moment"]
     across = ca.vertcat(-moment[1], moment[0])
     omega = turning * _NORMAL
-    joints = (_in_space(c["base_joints"]), _in_space(c["platform_joints"]), _AXES)
-    inertias = {"axial_inertia": SX(0)}
-    legs = legs_at(_in_space(position.T).T, rotation, _in_space(velocity.T).T, omega, *joints, c | inertias)
+    joints = {name: _in_space(c[name]) for name in ("base_joints", "platform_joints")}
+    c = c | joints | {"base_joint_axes": ca.repmat(_NORMAL.T, 3, 1), "axial_inertia": SX(0)}
+    legs = legs_at(_in_space(position.T).T, rotation, _in_space(velocity.T).T, omega, c)
     actuators = actuators_at(legs, x, u, c)
     forces = actuators.force
 
@@ -93,7 +91,7 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
         "state.brake_deflection": actuators.brake_rate,
     }
     in_space = ca.vertcat(acceleration[:2], 0, 0, 0, acceleration[2])
-    imu = imu_signals_of(legs, _AXES, rotation, omega, in_space, c)
+    imu = imu_signals_of(legs, rotation, omega, in_space, c)
     outputs = {
         "position": position,
         "angle": x["state.angle"],

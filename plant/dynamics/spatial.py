@@ -11,18 +11,15 @@ from plant.dynamics.assembly import Dynamics, Values, assemble, variable_symbols
 from plant.dynamics.legs import (
     SX,
     Condition,
-    Leg,
     actuators_at,
+    body_constants,
     imu_signals_of,
     leg_conditions,
-    leg_constants,
     leg_outputs,
     legs_at,
     length_limits,
-    platform_constants,
     row,
     solve,
-    stack,
 )
 from plant.dynamics.variables import SPATIAL, TINY
 from plant.mechanism import LEGS
@@ -56,9 +53,8 @@ def _rotation(q: SX) -> SX:
 
 def _constants(p: Values) -> Values:
     joints = {name: p[name] for name in ("base_joints", "platform_joints", "base_joint_axes")}
-    platform = platform_constants(p, lambda center: ca.dot(center, center) * SX.eye(3) - center @ center.T)
-    axial_inertia = p["leg.lower.axial_inertia"] + p["leg.upper.axial_inertia"]
-    return joints | leg_constants(p) | platform | {"axial_inertia": axial_inertia}
+    bodies = body_constants(p, lambda center: ca.dot(center, center) * SX.eye(3) - center @ center.T)
+    return joints | bodies | {"axial_inertia": p["leg.lower.axial_inertia"] + p["leg.upper.axial_inertia"]}
 
 
 def inertia_conditions(inertia: SX, name: str) -> list[Condition]:
@@ -94,7 +90,7 @@ def _conditions(p: Values) -> list[Condition]:
         *inertia_conditions(p["payload.inertia"], "payload.inertia"),
     ]
     vectors = _leg_vectors(p["initial_position"], _rotation(q / ca.norm_2(q)), p)
-    conditions += leg_conditions(p, stack([ca.norm_2(s) for s in vectors]))
+    conditions += leg_conditions(p, ca.vertcat(*[ca.norm_2(s) for s in vectors]))
     for k, s in enumerate(vectors):
         axis = row(p["base_joint_axes"], k)
         conditions += [
@@ -119,17 +115,12 @@ def _leg_vectors(position: SX, rotation: SX, joints: Values) -> list[SX]:
 
 def _limits(x: Values, c: Values) -> list[Condition]:
     vectors = _leg_vectors(x["state.position"], _rotation(x["state.quaternion"]), c)
-    limits = length_limits(stack([ca.norm_2(s) for s in vectors]))
+    limits = length_limits(ca.vertcat(*[ca.norm_2(s) for s in vectors]))
     for k, s in enumerate(vectors):
         along = ca.fabs(ca.dot(row(c["base_joint_axes"], k), s)) / ca.norm_2(s)
         text = f"leg {k} has come to lie along the first axis of its base joint (cosine %g, at most %g): limit its stroke"
         limits.append(Condition(along, _MOST_ALONG, text))
     return limits
-
-
-def _legs(position: SX, rotation: SX, velocity: SX, omega: SX, c: Values) -> list[Leg]:
-    joints = (c["base_joints"], c["platform_joints"], c["base_joint_axes"])
-    return legs_at(position, rotation, velocity, omega, *joints, c)
 
 
 def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
@@ -138,7 +129,7 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
     gravity = c["gravity"]
     moment = rotation @ c["first_moment"]
     inertia = rotation @ c["inertia"] @ rotation.T
-    legs = _legs(position, rotation, velocity, omega, c)
+    legs = legs_at(position, rotation, velocity, omega, c)
     actuators = actuators_at(legs, x, u, c)
     forces = actuators.force
 
@@ -175,7 +166,7 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
         "state.current": actuators.current_rate,
         "state.brake_deflection": actuators.brake_rate,
     }
-    imu = imu_signals_of(legs, c["base_joint_axes"], rotation, omega, acceleration, c)
+    imu = imu_signals_of(legs, rotation, omega, acceleration, c)
     outputs = {
         "position": position,
         "quaternion": x["state.quaternion"],
@@ -196,5 +187,5 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
 def imu_signals(position: SX, rotation: SX, velocity: SX, omega: SX, acceleration: SX, parameters: Values) -> Values:
     """Ideal IMU signals (7, 3) by name for a motion of {2}; `acceleration` (6, 1) is that of the origin, then angular."""
     c = _constants(parameters)
-    legs = _legs(position, rotation, velocity, omega, c)
-    return imu_signals_of(legs, c["base_joint_axes"], rotation, omega, acceleration, c)
+    legs = legs_at(position, rotation, velocity, omega, c)
+    return imu_signals_of(legs, rotation, omega, acceleration, c)

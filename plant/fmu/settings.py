@@ -10,17 +10,11 @@ _SWITCHES = {"true": 1.0, "false": 0.0}
 
 @dataclass(frozen=True)
 class Setting:
-    """A value for a parameter or input of the FMU, from the start or from a later time.
-
-    Attributes:
-        name: in the FMU.
-        value: one number for all elements, or one for each.
-        at: [s]; None for the start.
-    """
+    """A value for a parameter or input of the FMU, from the start or from a later time."""
 
     name: str
-    value: tuple[float, ...]
-    at: float | None = None
+    value: tuple[float, ...]  # one number for all elements, or one for each
+    at: float | None = None  # [s]; None for the start
 
     @classmethod
     def parse(cls, text: str) -> "Setting":

@@ -38,21 +38,11 @@ class PlanarPose:
 
 @dataclass(frozen=True, eq=False)
 class PlanarMechanism:
-    """A planar mechanism of three legs, checked when it is built and never changed.
-
-    Attributes:
-        name: for messages and reports.
-        base_joints: (3, 2) [m] in {1}.
-        platform_joints: (3, 2) [m] in {2}.
-        home: the pose that strokes and targets are measured from, or None.
-        limits: the actuators' limits, or None.
-        plant: parameters of the dynamics by the names of `plant.dynamics.variables.PLANAR`.
-        settings: the tables `control`, `fusion` and `safety`, which the controller reads.
-    """
+    """A planar mechanism of three legs, checked when it is built and never changed; its attributes are as of `Mechanism`."""
 
     name: str
-    base_joints: Array
-    platform_joints: Array
+    base_joints: Array  # (3, 2) [m] in {1}
+    platform_joints: Array  # (3, 2) [m] in {2}
     home: PlanarPose | None
     limits: Limits | None
     plant: Mapping[str, Array]
