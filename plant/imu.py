@@ -57,9 +57,9 @@ class ImuModel:
     """The imperfections of one kind of IMU."""
 
     name: str
-    gyroscope: SensorErrors = SensorErrors()
-    accelerometer: SensorErrors = SensorErrors()
-    magnetometer: SensorErrors = SensorErrors()
+    gyroscope: SensorErrors = SensorErrors()  # in rad/s
+    accelerometer: SensorErrors = SensorErrors()  # in m/s^2
+    magnetometer: SensorErrors = SensorErrors()  # in uT
     magnetometer_rate: float = inf  # [Hz]; each sample is repeated until the next
     misalignment: float = 0.0  # greatest angle about each axis, uniform [rad]
     delay: float = 0.0  # [s], rounded to whole cycles

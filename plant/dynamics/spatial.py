@@ -185,7 +185,10 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
 
 
 def imu_signals(position: SX, rotation: SX, velocity: SX, omega: SX, acceleration: SX, parameters: Values) -> Values:
-    """Ideal IMU signals (7, 3) by name for a motion of {2}; `acceleration` (6, 1) is that of the origin, then angular."""
+    """Ideal IMU signals (7, 3) by name, for a motion of {2} seen in {1}.
+
+    Its rotation is (3, 3), its acceleration (6, 1), of the origin and then angular; the other arguments are (3, 1).
+    """
     c = _constants(parameters)
     legs = legs_at(position, rotation, velocity, omega, c)
     return imu_signals_of(legs, rotation, omega, acceleration, c)

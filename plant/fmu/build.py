@@ -201,7 +201,7 @@ def build(path: Path, fmi: int = 3, mechanism: str | Path = "hexapod", platforms
 
 
 def check_build(fmi: int, platforms: Sequence[str]) -> None:
-    """Check the version and the platforms of a build, and that a compiler is installed."""
+    """Check the version and the platforms of a build (`InputError`) and the compiler (`ToolchainError`)."""
     if fmi not in (2, 3):
         raise InputError(f"there is no FMI {fmi} to export: choose 2 or 3")
     if unknown := [name for name in platforms if name not in PLATFORMS]:

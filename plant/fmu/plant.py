@@ -23,10 +23,10 @@ from plant.pose import Array
 class LinearPlant(NamedTuple):
     """A linear system `x' = A x + B u, y = C x + D u`, all differences from a point."""
 
-    a: Array
-    b: Array
-    c: Array
-    d: Array
+    a: Array  # (n, n)
+    b: Array  # (n, m)
+    c: Array  # (p, n)
+    d: Array  # (p, m)
     states: tuple[str, ...]  # names of scalars
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]

@@ -95,7 +95,11 @@ class Limits:
 
 
 def checked_limits(limits: Mapping[str, Any], legs: int, lengths: Array | None) -> Limits:
-    """The limits of a mechanism from the fields of `Limits` and the lengths (legs,) [m] at home, if there is one."""
+    """The limits of a mechanism from the fields of `Limits` and the lengths (legs,) [m] at home, if there is one.
+
+    Raises:
+        InputError: an unknown entry, no stroke, a stroke about a missing home, or a home outside the stroke.
+    """
     check_entries(limits, sorted(field.name for field in fields(Limits)), "[limits]")
     shape = f"({legs}, 2)"
     if "stroke" not in limits:

@@ -44,7 +44,7 @@ def load_spatial(name_or_path: str | Path) -> Mechanism:
 
 
 def load_in_space(name_or_path: str | Path) -> Mechanism:
-    """`load_mechanism` for the loop, which sees a planar mechanism, if it has a home pose, in space."""
+    """`load_mechanism` for the loop, which sees a planar mechanism in space; one without a home is an error."""
     mechanism = load_mechanism(name_or_path)
     return Mechanism.from_planar(mechanism) if isinstance(mechanism, PlanarMechanism) else mechanism
 

@@ -238,7 +238,11 @@ class Mechanism:
         return self.limits
 
     def plant_parameters(self, initial: Pose | None = None) -> dict[str, Array]:
-        """Every parameter of the plant by name, for a start at the pose `initial` (default: home)."""
+        """Every parameter of the plant by name, for a start at the pose `initial` (default: home).
+
+        Raises:
+            InputError: the mechanism lacks a parameter of the dynamics.
+        """
         start = initial or self.require_home()
         limits = self.require_limits()
         axes = slice(2 if self.planar else 3)
