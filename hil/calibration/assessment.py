@@ -1,4 +1,4 @@
-"""Assessment of a calibration on the rig: how well it explains the rests, and how accurate poses are with it."""
+"""Assessment of a calibration on the rig: how well it explains the rests, and how accurate poses are."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -6,15 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.calibration.at_rest import (
-    LEAST_POSES,
-    RestCalibration,
-    Rests,
-    calibrate_at_rest,
-    expected_forces,
-    fit_pose,
-    pose_covariance,
-)
+from controller.calibration.at_rest import LEAST_POSES, expected_forces, fit_pose, pose_covariance
 from controller.calibration.file import Calibration, split_gain
 from controller.calibration.in_motion import calibrate_in_motion, track
 from controller.estimation.whole_mechanism.imu_errors import ERROR_NAMES
@@ -35,18 +27,18 @@ STAGES = {
 """Stages of a calibration, and their names in plain words."""
 
 UNTOLD = 0.5
-"""A constant that keeps more than this share of its prior standard deviation counts as hardly told by the data."""
+"""Data hardly tell a constant that keeps more than this share of its prior standard deviation."""
 
 _FOLDS = 5
 
 
 def assess(data: CalibrationData, cases: Mapping[str, tuple[Calibration, Array]]) -> dict[str, Any]:
-    """Residuals at rest and the accuracy of poses at rest, predicted and, where the truth is known, true.
+    """Residuals and the accuracy of poses at rest, predicted and, where the truth is known, true.
 
     `cases` has by stage its calibration and the covariance (185, 185) of the remaining errors.
     """
-    figures: dict[str, Any] = {"rests": len(data.readings), "residual_mg": {}, "residual_by_imu_mg": {}}
-    figures |= {"predicted": {}, "true": {}}
+    figures: dict[str, Any] = {"rests": len(data.readings)}
+    figures |= {kind: {} for kind in ("residual_mg", "residual_by_imu_mg", "predicted", "true")}
     for name, (calibration, covariance) in cases.items():
         positions, rotations, residuals = _fit(data, calibration, np.arange(len(data.readings)))
         figures["residual_mg"][name] = float(np.sqrt(np.mean(residuals**2))) / MILLI_G
@@ -100,55 +92,40 @@ def cross_validate(
         return {}
     left_out = []
     for fold in range(_FOLDS):
-        part = _calibrate_part(data, everything[everything % _FOLDS != fold])
+        part = data.at_rest(everything[everything % _FOLDS != fold])
         left_out.append(_fit(data, part.calibration(), everything[everything % _FOLDS == fold])[2])
-    halves = [_calibrate_part(data, everything[first::2]) for first in range(2)]
     # The second half of the motion begins where the filter with the whole calibration was.
     middle = len(samples) // 2
     parameters = filter_parameters(data.fusion, data.rate, "axes", calibration.covariance)
     first, used = calibration.apply(samples[: middle + 1]), np.ones((middle + 1, IMU_COUNT), np.int64)
     way = track(parameters, data.geometry(calibration), first, used, data.rate, data.fusion.sensor_delay, start)
     there = Pose(way.positions[-1], way.rotations[-1]), way.motions[-1, [VELOCITY, RATE]].ravel()
-    parts = ((halves[0], samples[:middle], start), (halves[1], samples[middle:], there))
-    calibrations = {
-        "rests": [half.calibration() for half in halves],
-        "motion": [
-            calibrate_in_motion(data.mechanism, half, part, data.rate, begin, data.fusion)[0] for half, part, begin in parts
-        ],
-    }
-    figures = {}
-    for name, pair in calibrations.items():
-        poses = [each for half in pair for each in _fit(data, half, everything)[:2]]
-        figures[name] = rms_figures(pose_errors(*poses))
+    poses: dict[str, list[Array]] = {"rests": [], "motion": []}
+    parts = ((0, samples[:middle], start), (1, samples[middle:], there))
+    for first_rest, motion, begin in parts:
+        half = data.at_rest(everything[first_rest::2])
+        moved, _ = calibrate_in_motion(data.mechanism, half, motion, data.rate, begin, data.fusion)
+        poses["rests"] += _fit(data, half.calibration(), everything)[:2]
+        poses["motion"] += _fit(data, moved, everything)[:2]
+    figures = {name: rms_figures(pose_errors(*each)) for name, each in poses.items()}
     figures["rests"]["left_out_mg"] = float(np.sqrt(np.mean(np.concatenate(left_out) ** 2))) / MILLI_G
     return figures
 
 
-def _calibrate_part(data: CalibrationData, kept: NDArray[np.int64]) -> RestCalibration:
-    """Calibrate by some of the rests alone."""
-    rests = data.rests
-    changes = None if rests.length_changes is None else rests.length_changes[kept] - rests.length_changes[kept[0]]
-    part = Rests(rests.readings[kept], rests.home and kept[0] == 0, changes)
-    return calibrate_at_rest(data.mechanism, part, data.knowledge.prior)
-
-
 def constants(calibration: Calibration, prior_sigmas: Array) -> dict[str, Any]:
-    """The constants of each IMU by name with their standard deviations, and those that the data hardly told.
-
-    `prior_sigmas` are the standard deviations of all errors of all IMUs before the calibration.
-    """
+    """Each IMU's constants with their standard deviations, `prior_sigmas` before, and those that the data hardly told."""
     covariance, before = calibration.covariance, prior_sigmas.reshape(IMU_COUNT, -1, 3)
     sigmas = np.sqrt(np.diag(covariance)).reshape(IMU_COUNT, -1, 3) if covariance is not None else before
     values = np.empty((IMU_COUNT, len(ERROR_NAMES), 3))
     for imu in range(IMU_COUNT):
-        parts = [split_gain(calibration.gain[sensor, imu]) for sensor in range(2)]
-        biases = [np.linalg.solve(calibration.gain[sensor, imu], calibration.offset[sensor, imu]) for sensor in range(2)]
-        (gyroscope_scale, gyroscope_axes, _), (scale, axes, mounting) = parts
+        gains, offsets = calibration.gain[:2, imu], calibration.offset[:2, imu]
+        biases = [np.linalg.solve(gain, offset) for gain, offset in zip(gains, offsets, strict=True)]
+        (gyroscope_scale, gyroscope_axes, _), (scale, axes, mounting) = (split_gain(gain) for gain in gains)
         values[imu] = [*biases, scale - 1.0, gyroscope_scale - 1.0, mounting, axes, gyroscope_axes]
     shares, untold = sigmas / before, dict[str, list[int]]()
     for imu, kind, axis in np.argwhere(shares > UNTOLD).tolist():
         untold.setdefault(_constant(kind, axis), []).append(imu)
-    imu, kind, axis = (int(i) for i in np.unravel_index(shares.argmax(), shares.shape))
+    imu, kind, axis = map(int, np.unravel_index(shares.argmax(), shares.shape))
     return {
         "constants": {
             name: {"values": values[:, i].tolist(), "sigmas": sigmas[:, i].tolist()} for i, name in enumerate(ERROR_NAMES)

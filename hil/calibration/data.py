@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from operator import itemgetter
 
 import numpy as np
+from numpy.typing import NDArray
 
-from controller.calibration.at_rest import LEAST_POSES, Prior, RestCalibration, Rests, fit_pose
+from controller.calibration.at_rest import LEAST_POSES, Prior, RestCalibration, Rests, calibrate_at_rest, fit_pose
 from controller.calibration.checks import check_alive, check_all_along, check_motion, check_places, check_spread
 from controller.calibration.file import Calibration
 from controller.direct_kinematics import poses_from_lengths
@@ -41,8 +43,7 @@ class Knowledge:
         prior: standard deviations of the IMUs' errors and of the base's tilt.
         home: whether the rig's first pose is home exactly.
         lengths: whether the rig measures the changes of its lengths.
-        known_poses: whether to take the poses at rest for the planned ones, as the paper's section 7 does, and to seek the
-            mounting alone.
+        known_poses: whether to seek the mounting alone, from planned poses at rest, as the paper's section 7 does.
     """
 
     prior: Prior = field(default_factory=Prior)
@@ -56,12 +57,16 @@ def raw_samples(records: Record) -> Array:
     return np.stack([records["angular_velocity"], records["specific_force"], records["magnetic_field"]], axis=1)
 
 
+def _means(values: Array, length: int) -> Array:
+    """The means (N // length, ...) of values (N, ...) over so many samples each."""
+    whole = values[: len(values) // length * length]
+    return np.asarray(whole.reshape(-1, length, *values.shape[1:]).mean(axis=1))
+
+
 def find_rests(samples: Array, zero: Array, rate: float) -> list[slice]:
     """The stretches of raw samples (N, 3, 7, 3) in which no gyroscope, less its `zero` (7, 3) [rad/s], turns."""
     length = max(1, round(_MEAN_S * rate))
-    count = len(samples) // length
-    means = (samples[: count * length, 0] - zero).reshape(count, length, IMU_COUNT, 3).mean(axis=1)
-    still = np.abs(means).max(axis=(1, 2)) < _MOST_RATE
+    still = np.abs(_means(samples[:, GYROSCOPE] - zero, length)).max(axis=(1, 2)) < _MOST_RATE
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
     return [slice(first * length, last * length) for first, last in edges.reshape(-1, 2)]
 
@@ -75,9 +80,6 @@ class CalibrationData:
     """The rests of all runs so far.
 
     Attributes:
-        mechanism: the rig's.
-        rate: samples per second [Hz].
-        knowledge: besides the samples.
         fusion: settings of the sensors.
         zero: (7, 3) [rad/s], the gyroscopes' offsets.
         readings: (R, 7, 6), mean rates and forces of each rest.
@@ -85,17 +87,18 @@ class CalibrationData:
     """
 
     def __init__(self, mechanism: Mechanism, imu: str, rate: float, knowledge: Knowledge, seed: int) -> None:
-        """Start without a rest; `imu` is a preset, and `seed` that of the noise of measured lengths."""
+        """Start without a rest; `imu` is a preset, `rate` in Hz, and `seed` that of the noise of measured lengths."""
         self.mechanism, self.rate, self.knowledge = mechanism, rate, knowledge
         self.fusion = sensor_settings(mechanism, load_imu(imu))
         self.zero = np.zeros((IMU_COUNT, 3))
-        self.readings, self.truth, self._lengths = np.zeros((0, IMU_COUNT, 6)), np.zeros((0, 7)), np.zeros((0, LEGS))
+        self.readings = np.zeros((0, IMU_COUNT, 6))
+        self.truth, self._lengths = np.zeros((0, 7)), np.zeros((0, LEGS))
         self._random = np.random.default_rng([seed, LEGS])
 
     def begin(self, records: Record, hold: int) -> None:
         """Check that every IMU works and zero the gyroscopes in the first `hold` cycles, while the brakes hold.
 
-        Where the rig begins at home, this is its rest there: a loop that closes over raw IMUs leaves home.
+        A rig that begins at home rests there only then: a loop that closes over raw IMUs leaves home.
         """
         samples = raw_samples(records[:hold])
         check_alive(samples)
@@ -106,16 +109,10 @@ class CalibrationData:
     def check_places(self, records: Record) -> None:
         """Check that each IMU reads the planned motion of its place."""
         length = max(1, round(_CHECKED_S * self.rate))
-        count = len(records) // length
-
-        def means(values: Array) -> Array:
-            found: Array = values[: count * length].reshape(count, length, *values.shape[1:]).mean(axis=1)
-            return found
-
-        positions, rotations = self.planned_poses(means(records["reference"][:, :, 0]))
+        positions, rotations = self.planned_poses(_means(records["reference"][:, :, 0], length))
         expected = readings_along(sensor_geometry(self.mechanism), positions, rotations, self.rate / length)
-        readings = np.concatenate([means(records["angular_velocity"]) - self.zero, means(records["specific_force"])], axis=2)
-        check_places(readings, expected)
+        rates, forces = (_means(records[name], length) for name in ("angular_velocity", "specific_force"))
+        check_places(np.concatenate([rates - self.zero, forces], axis=2), expected)
 
     def planned_poses(self, lengths: Array) -> tuple[Array, Array]:
         """Positions (N, 3) [m] and rotations (N, 3, 3) for planned lengths (N, 6) [m]."""
@@ -155,18 +152,26 @@ class CalibrationData:
         changes = self._lengths - self._lengths[:1] if self.knowledge.lengths else None
         return Rests(self.readings, self.knowledge.home, changes)
 
+    def at_rest(self, kept: NDArray[np.int64] | None = None) -> RestCalibration:
+        """Calibrate by all rests, or by some of them alone."""
+        rests = self.rests
+        if kept is not None:
+            changes = None if rests.length_changes is None else rests.length_changes[kept] - rests.length_changes[kept[0]]
+            rests = Rests(rests.readings[kept], rests.home and kept[0] == 0, changes)
+        return calibrate_at_rest(self.mechanism, rests, self.knowledge.prior)
+
     def longest_motion(self, runs: Sequence[Record], at_rest: RestCalibration) -> tuple[Array, tuple[Pose, Array]]:
         """The longest motion that begins at rest: its samples (N, 3, 7, 3), and the pose and twist (6,) at the first.
 
         Raises:
             CalibrationError: it is too short.
         """
-        motions: list[tuple[int, int, slice]] = []
+        motions = [(0, slice(0), 0)]
         for number, records in enumerate(runs):
             rests = find_rests(raw_samples(records), self.zero, self.rate)
             ends = [*(rest.start for rest in rests[1:]), len(records)]
-            motions += [(end - rest.stop, number, slice(rest.start, end)) for rest, end in zip(rests, ends, strict=True)]
-        length, number, whole = max(motions, default=(0, 0, slice(0, 0)), key=lambda motion: motion[0])
+            motions += [(end - rest.stop, slice(rest.start, end), number) for rest, end in zip(rests, ends, strict=True)]
+        length, whole, number = max(motions, key=itemgetter(0))
         if length < _SHORTEST_MOTION_S * self.rate:
             raise CalibrationError(
                 f"the longest motion that begins at rest lasts {length / self.rate:.3g} s; at least {_SHORTEST_MOTION_S:g} s "

@@ -6,21 +6,20 @@
 4. With this it rests at twenty wide poses: a better one.
 5. With that it shakes: the constants that rests alone leave open.
 
-Every run is one of `hil.runs.simulation`, and between runs the rig stands on its brakes. Recordings can replace all runs.
+Between these runs the rig stands on its brakes. Recordings can replace all runs.
 """
 
-import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
-from controller.calibration.at_rest import RestCalibration, calibrate_at_rest
+from controller.calibration.at_rest import RestCalibration
 from controller.calibration.file import Calibration, save_calibration
 from controller.calibration.in_motion import calibrate_in_motion
 from controller.estimation.whole_mechanism.parameters import ALL_ERRORS
@@ -36,7 +35,6 @@ from hil.runs.config import SimulationConfig
 from hil.runs.prepare import prepared_loop
 from hil.runs.simulation import SimulationStoppedError, simulate
 from plant.compiled import Record
-from plant.dynamics.variables import IMU_COUNT
 from plant.errors import CalibrationError
 from plant.imu import GYROSCOPE
 from plant.mechanism import Mechanism, load_spatial
@@ -48,13 +46,7 @@ _ZEROING_S, _PROBING_S, _NEAR_S, _WIDE_S, _SHAKING_S = 1.0, 4.0, 8 * REST_S, 20 
 
 @dataclass(frozen=True, eq=False)
 class RigCalibration:
-    """Result of a calibration on the rig.
-
-    Attributes:
-        mechanism: the rig's.
-        calibration: of the IMUs.
-        summary: the figures.
-    """
+    """Result of a calibration on the rig: its mechanism, the calibration of its IMUs, and the figures."""
 
     mechanism: Mechanism
     calibration: Calibration
@@ -62,15 +54,12 @@ class RigCalibration:
 
 
 def calibrate_rig(
-    config: SimulationConfig,
-    knowledge: Knowledge = _NOTHING,
-    progress: Progress = no_progress,
-    validate: bool = True,
+    config: SimulationConfig, knowledge: Knowledge = _NOTHING, progress: Progress = no_progress, validate: bool = True
 ) -> RigCalibration:
     """Drive the rig and calibrate its IMUs.
 
     Args:
-        config: mechanism, IMUs, seed, rate and plant; the calibration sets target and durations itself.
+        config: mechanism, IMUs, seed, rate and plant; target and durations do not matter.
         knowledge: besides the samples.
         validate: whether to compare calibrations by parts of the data as well.
 
@@ -83,36 +72,32 @@ def calibrate_rig(
     probing = run_open(replace(config, target="probing", duration=_PROBING_S, hold=_ZEROING_S), blind=True)
     data.begin(probing, round(_ZEROING_S * config.rate))
     data.check_places(probing)
-    offset = np.zeros((3, IMU_COUNT, 3))
-    offset[GYROSCOPE] = -data.zero
-    zeroed, known = Calibration(offset=offset), None
-    if knowledge.known_poses:
-        with _calibrated(replace(config, target="rests", duration=_WIDE_S), zeroed) as run:
-            known = calibrate_by_known_poses(data, [run_open(run)])
-    with _calibrated(replace(config, target="near-rests", duration=_NEAR_S), zeroed) as run:
-        data.add_rests(run_open(run))
+    calibration, known = Calibration(), None
+    calibration.offset[GYROSCOPE] = -data.zero
     whole = _NEAR_S + _WIDE_S + _SHAKING_S
-
-    def drive(target: str, start: float, duration: float, calibration: Calibration) -> Record:
-        with _calibrated(replace(config, target=target, duration=duration), calibration) as run:
-            return _run_closed(run, part_of(progress, start / whole, duration / whole))
-
-    first = calibrate_at_rest(data.mechanism, data.rests, knowledge.prior)
-    data.add_rests(drive("rests", _NEAR_S, _WIDE_S, first.calibration()))
-    at_rest = calibrate_at_rest(data.mechanism, data.rests, knowledge.prior)
-    motion = drive("shaking", _NEAR_S + _WIDE_S, _SHAKING_S, at_rest.calibration())
+    with TemporaryDirectory(prefix="gough-calibration-") as folder:
+        file = Path(folder) / "calibration.toml"
+        config = replace(config, calibration=str(file))
+        near = replace(config, target="near-rests", duration=_NEAR_S)
+        wide = replace(config, target="rests", duration=_WIDE_S)
+        shaking = replace(config, target="shaking", duration=_SHAKING_S)
+        save_calibration(file, calibration)
+        if knowledge.known_poses:
+            known = calibrate_by_known_poses(data, [run_open(wide)])
+        data.add_rests(run_open(near))
+        save_calibration(file, data.at_rest().calibration())
+        data.add_rests(_run_closed(wide, part_of(progress, _NEAR_S / whole, _WIDE_S / whole)))
+        at_rest = data.at_rest()
+        save_calibration(file, at_rest.calibration())
+        motion = _run_closed(shaking, part_of(progress, (_NEAR_S + _WIDE_S) / whole, _SHAKING_S / whole))
     return _finish(data, at_rest, [motion], known, validate)
 
 
 def calibrate_recordings(paths: Sequence[Path], knowledge: Knowledge = _NOTHING) -> RigCalibration:
-    """Calibrate the IMUs from recordings of one rig that rested at wide poses and shook.
+    """Calibrate the IMUs from recordings (MCAP) of one rig that rested at wide poses and shook.
 
     All rests of all recordings count, and the longest motion that begins at rest. The gyroscopes are zeroed at the beginning
     of the first recording, while the brakes hold.
-
-    Args:
-        paths: MCAP files, each from the first cycle of its run on.
-        knowledge: besides the samples.
 
     Raises:
         RecordingError: no recordings, or not of one rig.
@@ -133,7 +118,7 @@ def calibrate_recordings(paths: Sequence[Path], knowledge: Knowledge = _NOTHING)
         data.check_places(records)
         data.add_rests(records)
     known = calibrate_by_known_poses(data, runs) if knowledge.known_poses else None
-    return _finish(data, calibrate_at_rest(data.mechanism, data.rests, knowledge.prior), runs, known)
+    return _finish(data, data.at_rest(), runs, known)
 
 
 def _complete(path: Path, recording: Recording) -> Recording:
@@ -152,10 +137,9 @@ def _every_cycle(records: Record) -> Record:
 
 
 def run_open(config: SimulationConfig, blind: bool = False) -> Record:
-    """The records of a run with the loop open: the IMUs do not matter.
+    """The records of a run with the loop open: the IMUs do not matter, and the drives follow the planned speeds.
 
-    The drives follow the planned speeds with the feed-forward for the load; if `blind`, without it, and the platform sinks by
-    some millimetres.
+    If `blind`, there is no feed-forward for the load, and the platform sinks by millimetres.
     """
     with prepared_loop(config) as loop:
         loop.parameters["pid"]["gains"] = 0.0
@@ -174,26 +158,17 @@ def _run_closed(config: SimulationConfig, progress: Progress) -> Record:
         raise CalibrationError(f"the rig stopped at {config.target}: {error}: check the IMUs' errors and the drives") from None
 
 
-@contextmanager
-def _calibrated(config: SimulationConfig, calibration: Calibration) -> Iterator[SimulationConfig]:
-    with tempfile.TemporaryDirectory(prefix="gough-calibration-") as folder:
-        file = Path(folder) / "calibration.toml"
-        save_calibration(file, calibration)
-        yield replace(config, calibration=str(file))
-
-
 def _finish(
     data: CalibrationData, at_rest: RestCalibration, runs: Sequence[Record], known: Calibration | None, validate: bool = True
 ) -> RigCalibration:
-    """Calibrate in the longest motion of the runs, and assess every stage; a calibration by known poses is the result."""
+    """Calibrate in the longest motion, and assess every stage; a calibration by known poses is the result."""
     samples, start = data.longest_motion(runs, at_rest)
     calibration, covariance = calibrate_in_motion(data.mechanism, at_rest, samples, data.rate, start, data.fusion)
     before = np.diag(data.knowledge.prior.sigmas() ** 2)
     cases = {"before": (Calibration(), before)}
-    if known is not None and known.covariance is not None:
-        by_known_poses = before.copy()
-        by_known_poses[:ALL_ERRORS, :ALL_ERRORS] = known.covariance
-        cases["known"] = known, by_known_poses
+    if known is not None:
+        cases["known"] = known, before.copy()
+        cases["known"][1][:ALL_ERRORS, :ALL_ERRORS] = known.covariance
     cases |= {"rests": (at_rest.calibration(), at_rest.covariance), "motion": (calibration, covariance)}
     summary = assess(data, cases) | {
         "positions": at_rest.positions.tolist(),

@@ -1,4 +1,4 @@
-"""Calibration of the mounting by known poses, as in the paper's section 7: measured and planned orientations are compared."""
+"""Calibration of the mounting by known poses: it compares measured and planned orientations (the paper's section 7)."""
 
 from collections.abc import Sequence
 

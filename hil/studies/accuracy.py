@@ -1,22 +1,23 @@
-"""Accuracy of direct kinematics: Monte Carlo runs against the Cramér-Rao bound, for a mechanism and for every class.
+"""Accuracy of direct kinematics, by Monte Carlo runs against the Cramér-Rao bound.
 
-The noise has the sigmas of `controller.direct_kinematics.spatial`: 0.05 deg on each component of a leg's direction and on roll
-and pitch, 1.5 deg on a magnetic yaw.
+The noise is 0.05 deg on legs, roll and pitch, and 1.5 deg on a magnetic yaw.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from itertools import combinations
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 from controller.direct_kinematics import Solutions, required_measurements, solve_batch, solve_planar
 from controller.direct_kinematics.spatial import LEG_SIGMA, TILT_SIGMA, YAW_SIGMA
 from controller.direct_kinematics.synthetic import TILT, draw_measurements, draw_poses, measurements_of
-from hil.progress import Progress, no_progress
+from hil.progress import Progress, in_parts, no_progress
 from hil.table import Cell, Table
 from plant.checks import checked_seed
 from plant.errors import InputError, SingularConfigurationError
@@ -32,7 +33,6 @@ from plant.mechanism.classification import (
 from plant.pose import Array, pose_errors, rms_figures, rotation_angle
 
 ALL_LEGS = tuple(range(LEGS))
-
 _TWO_LEGS = (0, 3)
 _NEES_BOUNDS = 0.005, 0.995
 _CLASS_MECHANISMS, _CLASS_POSES = 20, 50
@@ -44,19 +44,15 @@ class Estimator:
 
     label: str
     method: str
-    legs: tuple[int, ...]
-    refine: bool
+    legs: tuple[int, ...] = ALL_LEGS
+    refine: bool = False
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of an estimator over many noisy poses.
+    """RMS errors of an estimator [m, rad], also over the bound, and the share of poses that it solved.
 
-    Attributes:
-        position_rms, rotation_rms: root mean square error [m], [rad].
-        position_over_bound, rotation_over_bound: the same over the Cramér-Rao bound of the given measurements.
-        nees: mean normalised squared error by the stated covariance; 6 if this is right and the pose refined.
-        solved: share of the poses that were found.
+    The mean NEES is 6 if the stated covariance is right and the pose refined.
     """
 
     position_rms: float
@@ -69,7 +65,7 @@ class Errors:
 
 @dataclass(frozen=True, eq=False)
 class Accuracy:
-    """The errors of every estimator on a mechanism; `nees_bounds` hold 99 % of the mean NEES if covariances are right."""
+    """The errors on a mechanism; `nees_bounds` hold 99 % of the mean NEES if covariances are right."""
 
     mechanism: str
     mechanism_class: MechanismClass
@@ -93,7 +89,7 @@ class Accuracy:
 
 
 def evaluate_accuracy(mechanism: Mechanism, poses: int = 2000, seed: int = 0) -> Accuracy:
-    """Errors of the paper's algorithms and of the closed forms with all legs, at random poses about home.
+    """Errors of the paper's algorithms, and with all legs, at random poses about home.
 
     Raises:
         InputError: no poses, or the mechanism is in no class.
@@ -106,41 +102,36 @@ def evaluate_accuracy(mechanism: Mechanism, poses: int = 2000, seed: int = 0) ->
     exact = draw_measurements(mechanism, positions, rotations, random, 0.0)
     errors = {}
     for estimator in _estimators(mechanism):
-        found = _run(mechanism, estimator, noisy)
-        bound = _run(mechanism, estimator, exact).covariances
-        errors[estimator] = _errors(found, positions, rotations, bound)
+        bounds = _run(mechanism, estimator, exact).covariances
+        errors[estimator] = _errors(_run(mechanism, estimator, noisy), positions, rotations, bounds)
     low, high = chi2.ppf(_NEES_BOUNDS, 6 * poses) / poses
     return Accuracy(mechanism.name, classify(mechanism), errors, poses, seed, (float(low), float(high)))
 
 
 def _estimators(mechanism: Mechanism) -> list[Estimator]:
-    estimators = [
-        Estimator("paper, section 5: two legs + magnetic yaw", "section-5", _TWO_LEGS, False),
-        Estimator("section 5, six legs + magnetic yaw", "section-5", ALL_LEGS, False),
-    ]
+    of_class = []
     if classify(mechanism).platform_count < LEGS:
         four = _best_legs(mechanism, "section-4", 4)
-        estimators.append(Estimator("paper, section 4: four legs + normal", "section-4", four, False))
+        of_class.append(Estimator("paper, section 4: four legs + normal", "section-4", four))
     if classify(mechanism).group == "n-3-I":
-        estimators.append(Estimator("paper, section 3.1.1: six legs alone", "section-3.1.1", ALL_LEGS, False))
+        of_class.append(Estimator("paper, section 3.1.1: six legs alone", "section-3.1.1"))
     return [
-        *estimators,
-        Estimator("six legs alone", "legs", ALL_LEGS, False),
-        Estimator("six legs alone, refined", "legs", ALL_LEGS, True),
-        Estimator("six legs + vertical", "up", ALL_LEGS, False),
-        Estimator("six legs + vertical, refined", "up", ALL_LEGS, True),
+        Estimator("paper, section 5: two legs + magnetic yaw", "section-5", _TWO_LEGS),
+        Estimator("section 5, six legs + magnetic yaw", "section-5"),
+        *of_class,
+        Estimator("six legs alone", "legs"),
+        Estimator("six legs alone, refined", "legs", refine=True),
+        Estimator("six legs + vertical", "up"),
+        Estimator("six legs + vertical, refined", "up", refine=True),
     ]
 
 
 def _best_legs(mechanism: Mechanism, method: str, count: int) -> tuple[int, ...]:
     """The `count` legs with which the method is conditioned best near home."""
-    choices = list(combinations(ALL_LEGS, count))
-    random = np.random.default_rng(0)
+    choices, random = list(combinations(ALL_LEGS, count)), np.random.default_rng(0)
     measurements = draw_measurements(mechanism, *draw_poses(mechanism, 10, random), random, 0.0)
-    best = [
-        float(np.median(_run(mechanism, Estimator("", method, legs, False), measurements).conditionings)) for legs in choices
-    ]
-    return choices[int(np.argmax(best))]
+    found = (_run(mechanism, Estimator("", method, legs), measurements) for legs in choices)
+    return choices[int(np.argmax([np.median(solutions.conditionings) for solutions in found]))]
 
 
 def _run(mechanism: Mechanism, estimator: Estimator, measurements: dict[str, Array]) -> Solutions:
@@ -162,10 +153,9 @@ def _errors(found: Solutions, positions: Array, rotations: Array, bounds: Array)
 
 @dataclass(frozen=True)
 class ClassAccuracy:
-    """The needs of the paper and of gough on a class of mechanisms, and the errors of each.
+    """What the paper and gough need on a class of mechanisms, and their median errors [m, rad].
 
-    Errors are medians over random mechanisms and poses, position [m] and angle [rad]. The paper's algorithm uses the legs that
-    suit it best; gough uses all legs and refines the pose.
+    The paper's algorithm uses the legs that suit it best; gough uses all legs and refines the pose.
     """
 
     label: str
@@ -181,14 +171,10 @@ class ClassAccuracy:
 def evaluate_classes(seed: int = 0, progress: Progress = no_progress) -> list[ClassAccuracy]:
     """The needs and errors of every class, spatial and planar."""
     checked_seed(seed)
-    rows = []
-    for number, mechanism_class in enumerate(spatial_classes()):
-        rows.append(_evaluate_class(mechanism_class, np.random.default_rng((seed, number))))
-        progress((number + 1) / (len(spatial_classes()) + len(planar_classes())))
-    for number, mechanism_class in enumerate(planar_classes()):
-        rows.append(_evaluate_planar_class(mechanism_class, np.random.default_rng((seed, LEGS * LEGS * LEGS + number))))
-    progress(1.0)
-    return rows
+    spatial = [(_evaluate_class, each, number) for number, each in enumerate(spatial_classes())]
+    planar = [(_evaluate_planar_class, each, LEGS**3 + number) for number, each in enumerate(planar_classes())]
+    classes = in_parts(spatial + planar, progress)
+    return [evaluate(each, np.random.default_rng((seed, number))) for (evaluate, each, number), _ in classes]
 
 
 def _evaluate_class(mechanism_class: MechanismClass, random: np.random.Generator) -> ClassAccuracy:
@@ -203,18 +189,14 @@ def _evaluate_class(mechanism_class: MechanismClass, random: np.random.Generator
         mechanism = draw_mechanism(mechanism_class, random)
         positions, rotations = draw_poses(mechanism, _CLASS_POSES, random)
         measurements = draw_measurements(mechanism, positions, rotations, random, 1.0)
-        paper = Estimator("paper", paper_method, _best_legs(mechanism, paper_method, paper_legs), False)
-        for estimator in (paper, Estimator("legs", "legs", ALL_LEGS, True), Estimator("up", "up", ALL_LEGS, True)):
+        paper = Estimator("paper", paper_method, _best_legs(mechanism, paper_method, paper_legs))
+        for estimator in (paper, Estimator("legs", "legs", refine=True), Estimator("up", "up", refine=True)):
             found = _run(mechanism, estimator, measurements)
             away = np.linalg.norm(found.positions - positions, axis=1)
             angles = rotation_angle(np.where(found.solved[:, None, None], found.rotations, np.eye(3)), rotations)
             errors[estimator.label].append(np.stack([away, angles], axis=1)[found.solved])
     needs = {need.method: need.text.partition(" + ")[0] for need in required_measurements(mechanism)}
-    medians = {label: tuple(np.median(np.concatenate(parts), axis=0).tolist()) for label, parts in errors.items()}
-    return ClassAccuracy(
-        mechanism_class.label, mechanism_class.drawing, paper_needs, medians["paper"], needs["legs"], medians["legs"],
-        needs["up"], medians["up"],
-    )  # fmt: skip
+    return _class_accuracy(mechanism_class, (paper_needs, needs["legs"], needs["up"]), *errors.values())
 
 
 def _evaluate_planar_class(mechanism_class: MechanismClass, random: np.random.Generator) -> ClassAccuracy:
@@ -230,18 +212,17 @@ def _evaluate_planar_class(mechanism_class: MechanismClass, random: np.random.Ge
             two = angles.copy()
             two[(int(np.argmax(apart)) + 1) % 3] = np.nan
             for label, given, known in (("paper", two, roll), ("alone", angles, None), ("roll", angles, roll)):
-                try:
+                with suppress(SingularConfigurationError):
                     modes = solve_planar(mechanism, given, roll=known)
-                except SingularConfigurationError:
-                    continue
-                errors[label].append(
-                    min((float(np.linalg.norm(mode.position - position)), abs(mode.angle - angle)) for mode in modes)
-                )
-    medians = {label: tuple(np.median(parts, axis=0).tolist()) for label, parts in errors.items()}
-    return ClassAccuracy(
-        mechanism_class.label, mechanism_class.drawing, "2 legs + roll", medians["paper"], "3 legs, two modes",
-        medians["alone"], "any 2 legs", medians["roll"],
-    )  # fmt: skip
+                    away = ((float(np.linalg.norm(mode.position - position)), abs(mode.angle - angle)) for mode in modes)
+                    errors[label].append(min(away))
+    return _class_accuracy(mechanism_class, ("2 legs + roll", "3 legs, two modes", "any 2 legs"), *errors.values())
+
+
+def _class_accuracy(mechanism_class: MechanismClass, needs: Sequence[str], *errors: Sequence[ArrayLike]) -> ClassAccuracy:
+    """From needs and errors by the paper, by legs alone, and by legs with the vertical or the roll."""
+    paper, alone, vertical = (tuple(np.median(np.vstack(each), axis=0).tolist()) for each in errors)
+    return ClassAccuracy(mechanism_class.label, mechanism_class.drawing, needs[0], paper, needs[1], alone, needs[2], vertical)
 
 
 def class_table(rows: Sequence[ClassAccuracy]) -> Table:

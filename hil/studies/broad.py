@@ -1,12 +1,15 @@
 """The platform filter by itself on trials of the BROAD benchmark: a real IMU, moved by hand, with an optical reference.
 
 D. Laidig, M. Caruso, A. Cereatti, T. Seel, *BROAD - A Benchmark for Robust Inertial Orientation Estimation*, Data 6(7), 2021,
-doi 10.3390/data6070072. A trial is a NumPy archive with the rates `imu_gyr` (N, 3) [rad/s], the forces `imu_acc` (N, 3)
-[m/s^2], the reference `opt_quat` (N, 4), which maps the sensor's frame to one with z up and is NaN where the optics lost the
-sensor, `movement` (N,), true for samples that count, and `sampling_rate` [Hz]. The score is the RMS inclination error.
+doi 10.3390/data6070072. A trial is a NumPy archive with
+
+- `imu_gyr`, `imu_acc`: (N, 3), rates [rad/s] and forces [m/s^2],
+- `opt_quat`: (N, 4), maps the sensor's frame to one with z up; NaN where the optics lost the sensor,
+- `movement`: (N,), true for samples that count,
+- `sampling_rate`: [Hz].
 """
 
-import time
+import timeit
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,21 +31,15 @@ from plant.pose import Array, rotations_from_quaternions
 
 SHAPES = {"imu_gyr": (3,), "imu_acc": (3,), "opt_quat": (4,), "movement": ()}
 """Arrays of a trial, and the shape of a sample of each."""
-
 _REPEATS = 5
 _UNIT_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """A trial.
+    """A trial: its rate [Hz], and the IMU's rates and forces (N, 3) [rad/s, m/s^2].
 
-    Attributes:
-        name: of its file.
-        rate: samples per second [Hz].
-        rates, forces: (N, 3) [rad/s, m/s^2], of the IMU.
-        verticals: (N, 3), the true unit vertical in the sensor's frame, by the optics.
-        counts: (N,), true for samples of the movement that the optics saw.
+    `verticals` (N, 3) are the true ones in the sensor's frame, by the optics. Samples of the movement that they saw count.
     """
 
     name: str
@@ -62,14 +59,11 @@ class Trial:
 def evaluate(folder: str | Path, fusion: FusionSettings) -> dict[str, Any]:
     """Run the platform filter and the `vqf` package on every trial `*.npz` of a folder.
 
-    Args:
-        folder: with the trials.
-        fusion: noise that the filter assumes; the IMU's own acceleration, which nothing measures here, counts as noise of the
-            accelerometer.
+    The noise in `fusion` includes the IMU's own acceleration, which nothing measures here.
 
     Returns:
-        `trials`: by name and method (`filter`, `vqf`) the `inclination_rms` [rad] and `us`, microseconds per sample; the noise
-        that the filter assumed [m/s^2/sqrt(Hz), rad/s/sqrt(s)], and the `version`.
+        `trials`: by name and method (`filter`, `vqf`) the `inclination_rms` [rad] and the `us` of a sample; the noise that the
+        filter assumed [m/s^2/sqrt(Hz), rad/s/sqrt(s)], and the `version`.
 
     Raises:
         InputError: the folder is missing or has no trial, or a file is not a trial.
@@ -98,7 +92,7 @@ def load_trial(path: Path) -> Trial:
     """Read a trial.
 
     Raises:
-        InputError: the file cannot be read, lacks an array, or has one of a wrong shape or with values that are not finite.
+        InputError: the file cannot be read, or an array is missing, of a wrong shape, or not finite.
     """
     try:
         with np.load(path) as file:
@@ -120,11 +114,11 @@ def load_trial(path: Path) -> Trial:
     rate = arrays["sampling_rate"]
     if rate.shape != () or not 0.0 < rate < np.inf:
         raise InputError(f"{path}: sampling_rate is {rate}; it must be one positive number")
-    seen = np.isfinite(arrays["opt_quat"]).all(axis=1)
+    lengths = np.linalg.norm(arrays["opt_quat"], axis=1)
+    seen = np.isfinite(lengths)
     counts = seen & (arrays["movement"] != 0.0)
     if not counts.any():
         raise InputError(f"{path}: no sample counts: movement must mark some that opt_quat is known of")
-    lengths = np.linalg.norm(arrays["opt_quat"], axis=1)
     crooked = np.flatnonzero(seen & (abs(lengths - 1.0) > _UNIT_TOLERANCE))
     if len(crooked):
         raise InputError(f"{path}: opt_quat has length {lengths[crooked[0]]:g} in sample {crooked[0]}; it must be 1")
@@ -134,36 +128,29 @@ def load_trial(path: Path) -> Trial:
 
 def _score(trial: Trial, method: Callable[[], Array]) -> dict[str, float]:
     """The error of a method, and its median time."""
-    verticals, took = method(), []
-    for _ in range(_REPEATS):
-        began = time.perf_counter()
-        method()
-        took.append(time.perf_counter() - began)
+    verticals, took = method(), timeit.repeat(method, repeat=_REPEATS, number=1)
     return {"inclination_rms": trial.inclination_rms(verticals), "us": 1e6 * float(np.median(took)) / len(verticals)}
 
 
 def _filter(trial: Trial, fusion: FusionSettings) -> Array:
-    verticals = np.empty_like(trial.forces)
-    vertical_variance = (fusion.platform_accelerometer_noise / STANDARD_GRAVITY) ** 2 * trial.rate / 2.0
-    _follow(
-        trial.rates, trial.forces, 1.0 / trial.rate, fusion.gyroscope_noise**2, fusion.bias_walk**2, vertical_variance,
-        fusion.bias_sigma, verticals,
-    )  # fmt: skip
-    return verticals
+    variance = (fusion.platform_accelerometer_noise / STANDARD_GRAVITY) ** 2 * trial.rate / 2.0
+    densities = fusion.gyroscope_noise**2, fusion.bias_walk**2
+    return _follow(trial.rates, trial.forces, 1.0 / trial.rate, *densities, variance, fusion.bias_sigma)
 
 
 @kernel
 def _follow(
-    rates: Array, forces: Array, period: float, rate_density: float, bias_walk: float, vertical_variance: float,
-    bias_sigma: float, verticals: Array,
-) -> None:  # fmt: skip
-    """Write the verticals (N, 3) by the platform filter without a measured acceleration."""
-    x, covariance, acceleration = np.zeros(STATES), np.zeros((STATES, STATES)), np.zeros(3)
-    transition, work, gain, change = np.zeros((STATES, STATES)), np.zeros((STATES, STATES)), np.zeros(STATES), np.zeros(STATES)
+    rates: Array, forces: Array, period: float, rate_density: float, bias_walk: float, variance: float, bias_sigma: float
+) -> Array:
+    """The verticals (N, 3) by the platform filter without a measured acceleration."""
+    x, gain, change = np.zeros(STATES), np.zeros(STATES), np.zeros(STATES)
+    covariance, transition, work = np.zeros((STATES, STATES)), np.zeros((STATES, STATES)), np.zeros((STATES, STATES))
+    acceleration, verticals = np.zeros(3), np.empty_like(forces)
     start_platform(x, covariance, forces[0], bias_sigma)
     for i in range(rates.shape[0]):
         step_platform(
-            x, covariance, rates[i], forces[i], acceleration, period, STANDARD_GRAVITY, rate_density, bias_walk,
-            vertical_variance, transition, work, gain, change,
+            x, covariance, rates[i], forces[i], acceleration, period, STANDARD_GRAVITY, rate_density, bias_walk, variance,
+            transition, work, gain, change,
         )  # fmt: skip
         verticals[i] = x[:3]
+    return verticals

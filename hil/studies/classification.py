@@ -1,7 +1,9 @@
-"""The class of a mechanism, and what each method of direct kinematics needs on it: sensors, uniqueness, conditioning."""
+"""The class of a mechanism, and what each method of direct kinematics needs on it."""
 
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -24,26 +26,25 @@ PAPER = {"section-3.1.1": "3.1.1", "section-4": "4", "section-5": "5", "planar, 
 
 @dataclass(frozen=True, eq=False)
 class Need:
-    """Needs and conditioning of a method on a mechanism.
+    """Sensors that a method needs on a mechanism, how many poses it leaves, and its conditioning with all legs.
 
-    Attributes:
-        requirement: sensors that it needs.
-        modes: number of poses that it leaves possible.
-        home: conditioning at home with all legs; 1 is best, 0 singular.
-        worst: least conditioning over many poses.
-        conditionings: (N,), at these poses.
+    The conditioning is given at home and at N poses; 1 is best, 0 singular.
     """
 
     requirement: Requirement
     modes: int
     home: float
-    worst: float
     conditionings: Array
+
+    @property
+    def worst(self) -> float:
+        """The least conditioning over these poses."""
+        return float(self.conditionings.min())
 
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """A mechanism, its class and the needs of each method; `where` names the poses that the conditioning is the worst of."""
+    """A mechanism, its class and the needs of each method; the conditioning is the worst of the poses `where`."""
 
     mechanism: Mechanism | PlanarMechanism
     mechanism_class: MechanismClass
@@ -83,51 +84,41 @@ def describe(mechanism: Mechanism | PlanarMechanism) -> Description:
     """
     if isinstance(mechanism, PlanarMechanism):
         return _describe_planar(mechanism)
-    mechanism_class = classify(mechanism)
-    random = np.random.default_rng(0)
+    mechanism_class, random = classify(mechanism), np.random.default_rng(0)
     if mechanism.limits is not None and mechanism.home is not None:
-        where = "the workspace"
-        poses = sample_workspace(mechanism, _POSES, seed=0)
+        where, poses = "the workspace", sample_workspace(mechanism, _POSES, seed=0)
     else:
         where = "poses within a sixth of the base's radius and 15 deg about home"
         poses = draw_poses(mechanism, _POSES, random)
     home = mechanism.nominal_home
-    positions = np.concatenate([home.position[None], poses[0]])
-    rotations = np.concatenate([home.rotation[None], poses[1]])
+    positions = np.vstack([home.position[None], poses[0]])
+    rotations = np.vstack([home.rotation[None], poses[1]])
     exact = draw_measurements(mechanism, positions, rotations, random, 0.0)
     needs = []
     for requirement in required_measurements(mechanism):
         given = measurements_of(requirement.method, exact)
         found = solve_batch(mechanism, **given, method=requirement.method, refine=False)
         conditionings = np.where(found.solved, found.conditionings, 0.0)
-        needs.append(Need(requirement, 1, float(conditionings[0]), float(conditionings[1:].min()), conditionings[1:]))
+        needs.append(Need(requirement, 1, float(conditionings[0]), conditionings[1:]))
     return Description(mechanism, mechanism_class, tuple(needs), where)
 
 
 def _describe_planar(mechanism: PlanarMechanism) -> Description:
-    random = np.random.default_rng(0)
+    random, every = np.random.default_rng(0), tuple(range(PLANAR_LEGS))
+    by_legs = Requirement("planar, legs", "nothing", PLANAR_LEGS, (every,), PLANAR_LEGS)
+    by_roll = Requirement("planar, roll", "roll", 2, tuple(combinations(every, 2)), 2)
     center, across, spread = planar_home(mechanism)
-    values: dict[str, list[float]] = {"planar, legs": [], "planar, roll": []}
+    conditionings = np.zeros((_POSES + 1, 2))
     for number in range(_POSES + 1):
         reach = 0.0 if number == 0 else 1.0
         angle = reach * random.uniform(-_PLANAR_TILT, _PLANAR_TILT)
         middle = center + spread * (across + reach * random.uniform(-_PLANAR_REACH, _PLANAR_REACH, 2))
         x, y = (joints_about(mechanism, middle, angle) - mechanism.base_joints).T
-        for method, roll in (("planar, legs", None), ("planar, roll", angle)):
-            try:
-                values[method].append(solve_planar(mechanism, np.arctan2(y, x), roll=roll)[0].conditioning)
-            except SingularConfigurationError:
-                values[method].append(0.0)
-    every = tuple(range(PLANAR_LEGS))
-    pairs = tuple((i, j) for i in every for j in every[i + 1 :])
-    requirements = {
-        "planar, legs": Requirement("planar, legs", "nothing", PLANAR_LEGS, (every,), PLANAR_LEGS),
-        "planar, roll": Requirement("planar, roll", "roll", 2, pairs, 2),
-    }
-    needs = tuple(
-        Need(requirements[method], 2 if method == "planar, legs" else 1, found[0], min(found[1:]), np.array(found[1:]))
-        for method, found in values.items()
-    )
+        for method, roll in enumerate((None, angle)):
+            with suppress(SingularConfigurationError):
+                conditionings[number, method] = solve_planar(mechanism, np.arctan2(y, x), roll=roll)[0].conditioning
+    (home_legs, home_roll), (of_legs, of_roll) = conditionings[0].tolist(), conditionings[1:].T
+    needs = Need(by_legs, 2, home_legs, of_legs), Need(by_roll, 1, home_roll, of_roll)
     where = "poses within 15 % of the base's spread and 15 deg about a platform that stands off the base by its spread"
     return Description(mechanism, classify(mechanism), needs, where)
 

@@ -10,10 +10,10 @@ from plant.errors import InputError, UnknownNameError
 
 LEARNING_S = 20.0
 """The filters learn for this time [s]; errors count after it."""
-
+WHOLE_FUSIONS = {name: errors for name, errors in FUSIONS.items() if errors is not None}
+"""Whole-mechanism filters, with the errors of the IMUs that each estimates."""
 SECTIONS = ("motions", "faults", "start", "drift", "follow", "cost")
 """Sections of an evaluation."""
-
 _SEEDS = (0, 1, 2, 3, 4, 5)
 _RATE = "samples per second, 50 to 4000"
 
@@ -61,8 +61,8 @@ class EvaluationConfig:
 
     def __post_init__(self) -> None:
         _check(self.rate, self.seeds)
-        if FUSIONS.get(self.fusion) is None:
-            names = ", ".join(name for name, errors in FUSIONS.items() if errors is not None)
+        if self.fusion not in WHOLE_FUSIONS:
+            names = ", ".join(WHOLE_FUSIONS)
             raise UnknownNameError(f"no fusion of the whole mechanism {self.fusion!r}; there are {names}")
         if not 0.0 <= self.joint_error < inf:
             raise InputError(f"the joint error is {1e3 * self.joint_error:g} mm; it must be at least 0 and finite")

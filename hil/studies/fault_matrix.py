@@ -1,11 +1,13 @@
 """The fault matrix: every case of a table of faults, run with many seeds and compared with its specified reaction.
 
-The loop, its messages and the emulated rig are the real ones, but connected in memory and on virtual time: a case gives the
-same result every time. Faults that need separate processes are in the tests of emulator and rigs.
+Loop, messages and emulated rig are the real ones, connected in memory and on virtual time: results are reproducible. Faults
+that need separate processes are in the tests of emulator and rigs.
 """
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
@@ -16,7 +18,7 @@ from controller.planning.stream import STREAM, note_sample, rest
 from controller.planning.stream_planner import StreamPlanner
 from controller.safety.causes import Cause, DriveState, Mode, Reaction, Request
 from hil.loop.records import RECORD, Link, StopRequest
-from hil.progress import Progress, no_progress
+from hil.progress import Progress, in_parts, no_progress
 from hil.realtime.clock import SCRIPTED, new_clock
 from hil.rigs.emulation import fault, new_emulated, sample
 from hil.rigs.udp.emulator import check_watchdog, new_udp_emulator
@@ -28,20 +30,21 @@ from hil.runs.target_stream import LEAD_S, Reception, Sample, encode
 from hil.table import Table
 from plant.compiled import Record
 from plant.mechanism import LEGS
-from plant.pose import quaternion_from_rotation
+from plant.pose import Array, quaternion_from_rotation
 from plant.truth import TRUTH_LENGTHS
 
 RATE_HZ = 1000.0
 MOTION_S = 4.5
 _FIRST_S, _SPREAD_S = 1.5, 1.0
-_SESSION = 1
+_SESSION, _SAMPLE_CYCLES = 1, 10
 _SMOOTH = 20
-"""Cycles over which a true acceleration is averaged, because the IMUs' noise in the commands does not count as motion."""
-
+"""Cycles over which a true acceleration is averaged: the IMUs' noise in the commands is no motion."""
 MOST_TRAVEL_M = 0.03
 """The greatest allowed travel of a leg until it rests, after any fault."""
+_SLACK, _HARDEST = 1.001, 1.5
+"""Allowed factors over the limits, and of a controlled stop over the limit of acceleration."""
 
-_SLACK = 1.001
+GO_ON, STOP, QUICK_STOP, BRAKE = Reaction
 
 
 @dataclass(frozen=True)
@@ -50,42 +53,35 @@ class Case:
 
     Attributes:
         name: in the table.
-        expected: the cause that must be reported; `NO_CAUSE` if none.
-        reaction: `GO_ON`, `STOP`, `STOP_QUICKLY` or `BRAKE_AT_ONCE`.
-        within: most cycles from the fault to the first event with this cause.
+        expected: the cause that must be reported, or `Cause.NONE`.
+        within: most cycles from the fault to this cause.
         peak: greatest allowed deviation of a leg from its reference [m].
-        faults: as `hil.rigs.emulation.fault` reads them, with {k} an IMU, {j} another one, {d} a drive, {at} a time [s].
-        act: called with the loop at the time of a fault that is not the rig's.
+        faults: of the rig, as `hil.rigs.emulation.fault` reads them; {k} is an IMU or drive, {j} another IMU.
+        from_start: whether they are there before the motion.
+        act: makes a fault that is not the rig's.
         streamed: the fault of a streamed target.
-        hardness: greatest allowed true deceleration of a controlled stop, over the limit of acceleration.
         also: other causes that may end the run.
     """
 
     name: str
-    expected: int
-    reaction: int
+    expected: Cause
+    reaction: Reaction
     within: int
     peak: float
-    faults: tuple[str, ...] = ()
+    faults: str = ""
+    from_start: bool = False
     act: Callable[[PreparedLoop], None] | None = None
     streamed: str = ""
-    also: tuple[int, ...] = ()
-    hardness: float = 1.5
+    also: tuple[Cause, ...] = ()
 
 
-def _ask(how: int) -> Callable[[PreparedLoop], None]:
-    def act(loop: PreparedLoop) -> None:
-        loop.link[Link.STOP] = how
-
-    return act
+def _ask(how: int, loop: PreparedLoop) -> None:
+    loop.link[Link.STOP] = how
 
 
-def _miss(periods: int) -> Callable[[PreparedLoop], None]:
-    def act(loop: PreparedLoop) -> None:
-        cycle, period = int(loop.clock["cycles"]), int(loop.clock["period"])
-        loop.script[cycle % len(loop.script), 0] = periods * period
-
-    return act
+def _miss(periods: int, loop: PreparedLoop) -> None:
+    cycle, period = int(loop.clock["cycles"]), int(loop.clock["period"])
+    loop.script[cycle % len(loop.script), 0] = periods * period
 
 
 def _kill_rig(loop: PreparedLoop) -> None:
@@ -96,59 +92,66 @@ def _kill_rig(loop: PreparedLoop) -> None:
 
 
 CASES = (
-    Case("a leg's IMU is frozen", Cause.IMU_FROZEN, Reaction.GO_ON, 15, 2e-3, ("imu-frozen:{k},at={at}",)),
-    Case("a leg's IMU is dead", Cause.IMU_STALE, Reaction.GO_ON, 15, 2e-3, ("imu-dead:{k},at={at}",)),
-    Case("a leg's IMU is noisy", Cause.IMU_NOISY, Reaction.GO_ON, 25, 2e-3, ("imu-noisy:{k},at={at}",)),
-    Case("a leg's IMU is biased by 2 deg", Cause.IMU_DISAGREES, Reaction.GO_ON, 2500, 10e-3, ("imu-biased:{k},at={at}",)),
-    Case("a leg's IMU is biased by 2 deg from the start", Cause.NO_SENSORS, Reaction.STOP, 1300, 1e-3, ("imu-biased:{k}",)),
+    Case("a leg's IMU is frozen", Cause.IMU_FROZEN, GO_ON, 15, 2e-3, "imu-frozen:{k}"),
+    Case("a leg's IMU is dead", Cause.IMU_STALE, GO_ON, 15, 2e-3, "imu-dead:{k}"),
+    Case("a leg's IMU is noisy", Cause.IMU_NOISY, GO_ON, 25, 2e-3, "imu-noisy:{k}"),
+    Case("a leg's IMU is biased by 2 deg", Cause.IMU_DISAGREES, GO_ON, 2500, 10e-3, "imu-biased:{k}"),
     Case(
-        "two legs' IMUs are swapped from the start", Cause.IMUS_DISAGREE, Reaction.STOP, 4000, 25e-3,
-        ("imu-swapped:{k},size={j}",), also=(Cause.DRIVE_DEVIATES,),
+        "a leg's IMU is biased by 2 deg from the start", Cause.NO_SENSORS, STOP, 1300, 1e-3,
+        "imu-biased:{k}", from_start=True,
     ),
-    Case("the platform's IMU is frozen", Cause.IMU_FROZEN, Reaction.GO_ON, 15, 2e-3, ("imu-frozen:6,at={at}",)),
-    Case("the platform's IMU is dead", Cause.IMU_STALE, Reaction.GO_ON, 15, 2e-3, ("imu-dead:6,at={at}",)),
-    Case("the platform's IMU is biased by 2 deg", Cause.IMU_DISAGREES, Reaction.GO_ON, 2500, 10e-3, ("imu-biased:6,at={at}",)),
-    Case("two IMUs are dead", Cause.IMUS_LOST, Reaction.STOP, 15, 4e-3, ("imu-dead:{k},at={at}", "imu-dead:{j},at={at}")),
     Case(
-        "two IMUs are biased by 2 deg", Cause.IMUS_DISAGREE, Reaction.STOP, 2500, 30e-3,
-        ("imu-biased:{k},at={at}", "imu-biased:{j},at={at}"),
+        "two legs' IMUs are swapped from the start", Cause.IMUS_DISAGREE, STOP, 4000, 25e-3,
+        "imu-swapped:{k},size={j}", from_start=True, also=(Cause.DRIVE_DEVIATES,),
     ),
-    Case("1 % of the packets are lost", Cause.NONE, Reaction.GO_ON, 0, 2e-3, ("bus-drops,at={at},size=0.01",)),
-    Case("10 % of the packets are lost", Cause.NONE, Reaction.GO_ON, 0, 2e-3, ("bus-drops,at={at},size=0.1",)),
-    Case("50 packets in a row are lost", Cause.BUS_LOST, Reaction.QUICK_STOP, 21, 5e-3, ("bus-down,at={at},for=0.05",)),
-    Case("packets come 0.2 ms late", Cause.NONE, Reaction.GO_ON, 0, 2e-3, ("bus-delays,at={at},size=0.2",)),
-    Case("packets come 5 ms late", Cause.BUS_LOST, Reaction.QUICK_STOP, 21, 5e-3, ("bus-delays,at={at},size=5",)),
-    Case("10 % of the packets are out of order", Cause.NONE, Reaction.GO_ON, 0, 2e-3, ("bus-reorders,at={at}",)),
-    Case("10 % of the packets come twice", Cause.NONE, Reaction.GO_ON, 0, 2e-3, ("bus-repeats,at={at}",)),
-    Case("10 % of the packets are damaged", Cause.NONE, Reaction.GO_ON, 0, 2e-3, ("bus-corrupts,at={at}",)),
-    Case("the bus is down", Cause.BUS_LOST, Reaction.QUICK_STOP, 21, 5e-3, ("bus-down,at={at}",)),
-    Case("the rig is killed and started again", Cause.BUS_LOST, Reaction.QUICK_STOP, 21, 20e-3, act=_kill_rig),
-    Case("a drive has a fault", Cause.DRIVE_FAULT, Reaction.QUICK_STOP, 3, 5e-3, ("drive-faults:{d},at={at}",)),
-    Case("a drive loses its power", Cause.DRIVE_OFF, Reaction.QUICK_STOP, 3, 5e-3, ("drive-unpowered:{d},at={at}",)),
+    Case("the platform's IMU is frozen", Cause.IMU_FROZEN, GO_ON, 15, 2e-3, "imu-frozen:6"),
+    Case("the platform's IMU is dead", Cause.IMU_STALE, GO_ON, 15, 2e-3, "imu-dead:6"),
+    Case("the platform's IMU is biased by 2 deg", Cause.IMU_DISAGREES, GO_ON, 2500, 10e-3, "imu-biased:6"),
+    Case("two IMUs are dead", Cause.IMUS_LOST, STOP, 15, 4e-3, "imu-dead:{k} imu-dead:{j}"),
     Case(
-        "a drive ignores its commands", Cause.FOLLOWING_ERROR, Reaction.BRAKE, 1500, 25e-3, ("drive-ignores:{d},at={at}",),
+        "two IMUs are biased by 2 deg", Cause.IMUS_DISAGREE, STOP, 2500, 30e-3,
+        "imu-biased:{k} imu-biased:{j}",
+    ),
+    Case("1 % of the packets are lost", Cause.NONE, GO_ON, 0, 2e-3, "bus-drops,size=0.01"),
+    Case("10 % of the packets are lost", Cause.NONE, GO_ON, 0, 2e-3, "bus-drops,size=0.1"),
+    Case("50 packets in a row are lost", Cause.BUS_LOST, QUICK_STOP, 21, 5e-3, "bus-down,for=0.05"),
+    Case("packets come 0.2 ms late", Cause.NONE, GO_ON, 0, 2e-3, "bus-delays,size=0.2"),
+    Case("packets come 5 ms late", Cause.BUS_LOST, QUICK_STOP, 21, 5e-3, "bus-delays,size=5"),
+    Case("10 % of the packets are out of order", Cause.NONE, GO_ON, 0, 2e-3, "bus-reorders"),
+    Case("10 % of the packets come twice", Cause.NONE, GO_ON, 0, 2e-3, "bus-repeats"),
+    Case("10 % of the packets are damaged", Cause.NONE, GO_ON, 0, 2e-3, "bus-corrupts"),
+    Case("the bus is down", Cause.BUS_LOST, QUICK_STOP, 21, 5e-3, "bus-down"),
+    Case("the rig is killed and started again", Cause.BUS_LOST, QUICK_STOP, 21, 20e-3, act=_kill_rig),
+    Case("a drive has a fault", Cause.DRIVE_FAULT, QUICK_STOP, 3, 5e-3, "drive-faults:{k}"),
+    Case("a drive loses its power", Cause.DRIVE_OFF, QUICK_STOP, 3, 5e-3, "drive-unpowered:{k}"),
+    Case(
+        "a drive ignores its commands", Cause.FOLLOWING_ERROR, BRAKE, 1500, 25e-3, "drive-ignores:{k}",
         also=(Cause.DRIVE_DEVIATES,),
     ),
     Case(
-        "a drive stands still", Cause.FOLLOWING_ERROR, Reaction.BRAKE, 1500, 25e-3, ("drive-stuck:{d},at={at}",),
+        "a drive stands still", Cause.FOLLOWING_ERROR, BRAKE, 1500, 25e-3, "drive-stuck:{k}",
         also=(Cause.DRIVE_DEVIATES,),
     ),
     Case(
-        "a drive runs away", Cause.DRIVE_DEVIATES, Reaction.BRAKE, 250, 30e-3, ("drive-runs-away:{d},at={at}",),
+        "a drive runs away", Cause.DRIVE_DEVIATES, BRAKE, 250, 30e-3, "drive-runs-away:{k}",
         also=(Cause.FOLLOWING_ERROR,),
     ),
-    Case("the payload gains 5 kg", Cause.NONE, Reaction.GO_ON, 0, 3e-3, ("payload-jumps,at={at}",)),
-    Case("the payload loses 8 kg", Cause.NONE, Reaction.GO_ON, 0, 3e-3, ("payload-jumps,at={at},size=-8",)),
-    Case("5 periods are missed", Cause.NONE, Reaction.GO_ON, 0, 3e-3, act=_miss(5)),
-    Case("20 periods are missed", Cause.MISSED_PERIODS, Reaction.STOP, 22, 15e-3, act=_miss(20)),
+    Case("the payload gains 5 kg", Cause.NONE, GO_ON, 0, 3e-3, "payload-jumps"),
+    Case("the payload loses 8 kg", Cause.NONE, GO_ON, 0, 3e-3, "payload-jumps,size=-8"),
+    Case("5 periods are missed", Cause.NONE, GO_ON, 0, 3e-3, act=partial(_miss, 5)),
+    Case("20 periods are missed", Cause.MISSED_PERIODS, STOP, 22, 15e-3, act=partial(_miss, 20)),
     Case(
-        "50 periods are missed", Cause.DRIVE_FAULT, Reaction.QUICK_STOP, 52, 15e-3, act=_miss(50), also=(Cause.MISSED_PERIODS,)
+        "50 periods are missed", Cause.DRIVE_FAULT, QUICK_STOP, 52, 15e-3, act=partial(_miss, 50),
+        also=(Cause.MISSED_PERIODS,),
     ),
-    Case("a stop is asked for", Cause.STOP_REQUESTED, Reaction.STOP, 2, 2e-3, act=_ask(StopRequest.CONTROLLED)),
-    Case("an emergency stop is asked for", Cause.EMERGENCY_STOP, Reaction.QUICK_STOP, 2, 5e-3, act=_ask(StopRequest.QUICK)),
-    Case("the target's stream stops", Cause.TARGET_LOST, Reaction.STOP, 112, 2e-3, streamed="stops"),
-    Case("the target's stream jumps", Cause.TARGET_JUMPS, Reaction.STOP, 12, 2e-3, streamed="jumps"),
-    Case("the target's stream turns NaN", Cause.TARGET_NOT_FINITE, Reaction.STOP, 12, 2e-3, streamed="is not finite"),
+    Case("a stop is asked for", Cause.STOP_REQUESTED, STOP, 2, 2e-3, act=partial(_ask, StopRequest.CONTROLLED)),
+    Case(
+        "an emergency stop is asked for", Cause.EMERGENCY_STOP, QUICK_STOP, 2, 5e-3,
+        act=partial(_ask, StopRequest.QUICK),
+    ),
+    Case("the target's stream stops", Cause.TARGET_LOST, STOP, 112, 2e-3, streamed="stops"),
+    Case("the target's stream jumps", Cause.TARGET_JUMPS, STOP, 12, 2e-3, streamed="jumps"),
+    Case("the target's stream turns NaN", Cause.TARGET_NOT_FINITE, STOP, 12, 2e-3, streamed="is not finite"),
 )  # fmt: skip
 
 
@@ -157,42 +160,32 @@ class Outcome:
     """The outcome of a case over all seeds.
 
     Attributes:
-        reactions: number of times of each reaction.
-        cycles: from the fault to its event, for each seed; empty if none was expected.
-        peak: greatest deviation of a leg from its reference since the fault, while there is a reference, for each seed [m].
-        travel: greatest travel of a leg from the event to rest, for each seed [m].
+        reactions: number of times of each.
+        cycles: from the fault to its event; empty if none was expected.
+        peak_m: greatest deviation of a leg from its reference since the fault, by seed.
+        travel_m: greatest travel of a leg from the event to rest, by seed.
         findings: differences from the specification, in words.
     """
 
     case: Case
-    reactions: dict[str, int] = field(default_factory=dict)
+    reactions: Counter[str] = field(default_factory=Counter)
     cycles: list[int] = field(default_factory=list)
-    peak: list[float] = field(default_factory=list)
-    travel: list[float] = field(default_factory=list)
+    peak_m: list[float] = field(default_factory=list)
+    travel_m: list[float] = field(default_factory=list)
     findings: list[str] = field(default_factory=list)
 
     def summary(self) -> dict[str, Any]:
         """The figures, for JSON."""
-        return {
-            "case": self.case.name,
-            "expected": Cause(self.case.expected).text,
-            "reactions": self.reactions,
-            "cycles": self.cycles,
-            "peak_m": self.peak,
-            "travel_m": self.travel,
-            "findings": self.findings,
-        }
+        figures = {name: value for name, value in vars(self).items() if name != "case"}
+        return {"case": self.case.name, "expected": self.case.expected.text, **figures}
 
 
 def run_matrix(seeds: int, cases: tuple[Case, ...] = CASES, progress: Progress = no_progress) -> list[Outcome]:
     """Run the cases, each with so many seeds of IMUs and faults, their times and places."""
-    outcomes = []
-    for n, case in enumerate(cases):
-        outcome = Outcome(case)
-        for seed in range(seeds):
-            _try(case, seed, outcome)
-            progress((n + (seed + 1) / seeds) / len(cases))
-        outcomes.append(outcome)
+    outcomes = [Outcome(case) for case in cases]
+    for outcome, of_case in in_parts(outcomes, progress):
+        for seed, _ in in_parts(range(seeds), of_case):
+            _try(outcome, seed)
     return outcomes
 
 
@@ -205,25 +198,26 @@ def table(outcomes: list[Outcome]) -> Table:
     """The outcomes in words; figures are the median and the greatest over the seeds."""
     result = Table("case", "told", "reaction", "cycles until told", "peak deviation [mm]", "travel to rest [mm]")
     for each in outcomes:
-        told = Cause(each.case.expected).text.format("k") if each.case.expected else "-"
+        told = each.case.expected.text.format("k") if each.case.expected else "-"
         cycles = f"{np.median(each.cycles):.0f}, {max(each.cycles)}" if each.cycles else "-"
-        peaks, travels = 1e3 * np.array(each.peak), 1e3 * np.array(each.travel)
+        peaks, travels = 1e3 * np.array(each.peak_m), 1e3 * np.array(each.travel_m)
         peak = f"{np.median(peaks):.2f}, {peaks.max():.2f}"
         travel = f"{np.median(travels):.1f}, {travels.max():.1f}" if travels.any() else "-"
         result.add(each.case.name, told, ", ".join(each.reactions), cycles, peak, travel)
     return result
 
 
-def _try(case: Case, seed: int, outcome: Outcome) -> None:
-    random = np.random.default_rng([seed, len(case.name), 6])
+def _try(outcome: Outcome, seed: int) -> None:
+    case, random = outcome.case, np.random.default_rng([seed, len(outcome.case.name), 6])
     at = _FIRST_S + _SPREAD_S * random.random()
-    k, j = (int(each) for each in random.permutation(6)[:2])
-    names = {"k": k, "j": j, "d": k, "at": round(at, 4)}
+    k, j = random.permutation(LEGS)[:2].tolist()
+    begin = "" if case.from_start else f",at={round(at, 4)}"
+    faults = [fault(text.format(k=k, j=j) + begin) for text in case.faults.split()]
     config = SimulationConfig(target="sines", duration=MOTION_S, rate=RATE_HZ, seed=seed)
     with prepared_loop(config) as loop:
-        _join(loop, [fault(text.format(**names)) for text in case.faults], seed)
+        _join(loop, faults, seed)
         hold = int(loop.parameters["rig"]["hold_cycles"])
-        onset = hold + round(at * RATE_HZ) if "{at}" in "".join(case.faults) or not case.faults else hold
+        onset = hold if case.from_start else hold + round(at * RATE_HZ)
         if case.streamed:
             onset -= onset % _SAMPLE_CYCLES
             _follow_stream(loop, case.streamed, onset)
@@ -236,11 +230,12 @@ def _try(case: Case, seed: int, outcome: Outcome) -> None:
 
 
 def _join(loop: PreparedLoop, faults: list[Record], seed: int) -> None:
-    """Put the emulated rig between the loop and its plant, and both on a scripted clock."""
+    """Put the emulated rig between the loop and its plant, on a scripted clock."""
     rig = new_emulated(loop.mechanism, round(1e9 / RATE_HZ), seed, faults)
     loop.emulator = new_udp_emulator(loop.fmu, loop.imu, rig, _SESSION)
     loop.udp = new_link()
-    loop.udp.socket["session"], loop.udp.socket["timeout_ns"] = _SESSION, round(1e9 * TIMEOUT_SHARE / RATE_HZ)
+    loop.udp.socket["session"] = _SESSION
+    loop.udp.socket["timeout_ns"] = round(1e9 * TIMEOUT_SHARE / RATE_HZ)
     loop.parameters["load"]["command_delay"] = 1.0 / RATE_HZ
     loop.clock = new_clock(SCRIPTED, round(1e9 / RATE_HZ))
     loop.script = np.zeros((1 << 14, 3), np.int64)
@@ -254,9 +249,6 @@ def _stand(loop: PreparedLoop) -> None:
     for passed in range(0, 500_000_000, 10_000_000):
         check_watchdog(loop.emulator, begin + passed)
     sample(loop.fmu, loop.imu, loop.emulator.rig, int(loop.emulator.rig["time_ns"]))
-
-
-_SAMPLE_CYCLES = 10
 
 
 def _follow_stream(loop: PreparedLoop, what: str, onset: int) -> None:
@@ -283,19 +275,21 @@ def _follow_stream(loop: PreparedLoop, what: str, onset: int) -> None:
 def _judge(case: Case, seed: int, loop: PreparedLoop, cause: int, onset: int, outcome: Outcome) -> None:
     """Compare the run with its specification."""
     assert loop.emulator is not None
-    count, limits, period = int(loop.link[Link.HEAD]), loop.mechanism.require_limits(), 1.0 / RATE_HZ
-    records, rig = loop.records[:count], loop.emulator.rig
+    limits, period = loop.mechanism.require_limits(), 1.0 / RATE_HZ
+    records, rig = loop.records[: int(loop.link[Link.HEAD])], loop.emulator.rig
 
     def find(wrong: bool, what: str) -> None:
         if wrong:
             outcome.findings.append(f"{case.name}, seed {seed}: {what}")
 
-    moved = records[records["request"] != Request.BRAKED]
+    def most(values: Array) -> float:
+        return float(np.abs(values).max(initial=0.0))
+
     # The cause that ended the run counts, not events before it.
-    reaction = Reaction.GO_ON if cause == Cause.END_OF_MOTION else Cause(cause).reaction
-    outcome.reactions[Reaction(reaction).text] = outcome.reactions.get(Reaction(reaction).text, 0) + 1
+    reaction = GO_ON if cause == Cause.END_OF_MOTION else Cause(cause).reaction
+    outcome.reactions[reaction.text] += 1
     accepted = (case.expected, *case.also)
-    if case.reaction == Reaction.GO_ON:
+    if case.reaction == GO_ON:
         find(cause != Cause.END_OF_MOTION, f"ended: {loop.reason()}")
     else:
         find(cause not in accepted, f"ended for another cause: {loop.reason()}")
@@ -308,33 +302,30 @@ def _judge(case: Case, seed: int, loop: PreparedLoop, cause: int, onset: int, ou
             begin += int(cycles[0])
             outcome.cycles.append(int(cycles[0]))
             find(cycles[0] > case.within, f"took {cycles[0]} cycles, and {case.within} are allowed")
-    since = moved[moved["cycle"] >= onset]
-    followed = since[since["mode"] != Mode.FAULT]
-    off = np.abs(followed["truth"][:, TRUTH_LENGTHS] - followed["reference"][:, :, 0]).max(initial=0.0)
-    outcome.peak.append(float(off))
+    moved = records[records["request"] != Request.BRAKED]
+    followed = moved[(moved["cycle"] >= onset) & (moved["mode"] != Mode.FAULT)]
+    off = most(followed["truth"][:, TRUTH_LENGTHS] - followed["reference"][:, :, 0])
+    outcome.peak_m.append(off)
     find(off > case.peak, f"a leg was {1e3 * off:.2f} mm off, and {1e3 * case.peak:g} are allowed")
-    after = records[(records["mode"] >= Mode.RUNNING) & (records["cycle"] >= begin)]
-    rested = np.vstack([after["truth"][:, TRUTH_LENGTHS], rig["truth"][TRUTH_LENGTHS]]) if len(after) else np.zeros((1, LEGS))
-    travel = np.abs(rested - rested[0]).max() if case.reaction != Reaction.GO_ON else 0.0
-    outcome.travel.append(float(travel))
+    travel = 0.0
+    after = records[(records["mode"] >= Mode.RUNNING) & (records["cycle"] >= begin)]["truth"][:, TRUTH_LENGTHS]
+    if len(after) and case.reaction != GO_ON:
+        travel = most(np.vstack([after, rig["truth"][TRUTH_LENGTHS]]) - after[0])
+    outcome.travel_m.append(travel)
     find(travel > MOST_TRAVEL_M, f"a leg went on for {1e3 * travel:.1f} mm, and {1e3 * MOST_TRAVEL_M:g} are allowed")
-    allowed = {case.reaction, *(Cause(each).reaction for each in case.also)}
-    find(reaction not in allowed, f"the reaction was: {Reaction(reaction).text}")
+    allowed = {case.reaction, *(each.reaction for each in case.also)}
+    find(reaction not in allowed, f"the reaction was: {reaction.text}")
     # Commands and references stay within the limits; a quick stop is no harder than the limit of acceleration.
-    find(np.abs(records["command"]).max() > _SLACK * float(loop.parameters["pid"]["limit"]), "a command was above its limit")
-    find(np.abs(moved["reference"][:, :, 1]).max(initial=0.0) > _SLACK * limits.velocity, "a reference was too fast")
-    find(
-        np.abs(moved["reference"][:, :, 2]).max(initial=0.0) > _SLACK * limits.acceleration,
-        "a reference was beyond the limit of acceleration",
-    )
-    coasting = records[records["request"] == Request.QUICK_STOP]["command"]
-    steps = np.abs(np.diff(coasting, axis=0)).max(initial=0.0)
+    find(most(records["command"]) > _SLACK * float(loop.parameters["pid"]["limit"]), "a command was above its limit")
+    find(most(moved["reference"][:, :, 1]) > _SLACK * limits.velocity, "a reference was too fast")
+    hardest = most(moved["reference"][:, :, 2])
+    find(hardest > _SLACK * limits.acceleration, "a reference was beyond the limit of acceleration")
+    steps = most(np.diff(records[records["request"] == Request.QUICK_STOP]["command"], axis=0))
     find(steps > _SLACK * limits.acceleration * period * (1 + int(records["missed"].max())), "a quick stop was too hard")
-    if case.reaction == Reaction.STOP and len(moved):
+    if case.reaction == STOP:
         stopping = records[records["mode"] == Mode.STOPPING]["truth"][:, TRUTH_LENGTHS]
-        smooth = np.diff(stopping[::_SMOOTH], n=2, axis=0) / (_SMOOTH * period) ** 2
-        hard = np.abs(smooth).max(initial=0.0)
-        find(hard > case.hardness * limits.acceleration, f"the legs stopped at {hard:.3g} m/s2")
-    find(bool(np.abs(rig["velocity"]).max() > 0.0 or (rig["drive"] == DriveState.FOLLOWING).any()), "a drive still moves")
-    expected_cycles = np.arange(count) + np.cumsum(records["missed"])
+        hard = most(np.diff(stopping[::_SMOOTH], n=2, axis=0) / (_SMOOTH * period) ** 2)
+        find(hard > _HARDEST * limits.acceleration, f"the legs stopped at {hard:.3g} m/s2")
+    find(most(rig["velocity"]) > 0.0 or (rig["drive"] == DriveState.FOLLOWING).any(), "a drive still moves")
+    expected_cycles = np.arange(len(records)) + np.cumsum(records["missed"])
     find(not np.array_equal(records["cycle"], expected_cycles), "a cycle is not recorded")

@@ -1,17 +1,17 @@
 """Tuning of the noise that the fusion assumes, by the consistency of its estimators on simulated motions.
 
-An estimator is consistent if its errors are as large as its covariance says: the mean of their normalised square (NEES) then
-equals the number of their components. The noise of each estimator is scaled until it is consistent, unless its errors grow
-before. Settings that consistency leaves open minimise the errors. The simulated joints lie exactly where the mechanism's file
-says, so the result does not allow for wrong joints.
+An estimator is consistent if the mean NEES, the square of its errors over its covariance, equals the number of components.
+The noise of each estimator is scaled until it is consistent, unless its errors grow before. Settings that consistency leaves
+open minimise the errors. The simulated joints are exact, so the result does not allow for wrong joints.
 """
 
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import version
+from itertools import chain, product
 from typing import Any
 
 import numpy as np
@@ -22,66 +22,42 @@ from scipy.stats import chi2
 
 from controller.cycle import cycle_parameters
 from controller.settings import FusionSettings, control_settings, sensor_settings
-from hil.progress import Progress, no_progress
+from hil.progress import Progress, in_parts, no_progress, part_of
 from hil.runs.config import FUSIONS
 from hil.studies.config import TuningConfig
 from hil.studies.fused_track import REFINED, WHOLE, PoseTrack, fuse, poses_of, read, track
 from plant.compiled import Record
 from plant.dynamics.imposed import impose
 from plant.errors import InputError
-from plant.imu import load_imu
+from plant.imu import imu_state, load_imu
 from plant.mechanism import LEGS, Mechanism, load_spatial, mechanism_text
 from plant.pose import Array
 
 MOTIONS = ("static", "mixed", "1")
 """As `plant.dynamics.imposed.impose` has them."""
-
 DURATION_S, SETTLING_S = 16.0, 8.0
 """Durations of a run, and of its first part, which does not count."""
-
 _SAMPLE_S = 0.05
 """Time between the samples that count; errors hardly change from one cycle to the next."""
-
 _MOST_WORSE = 1.02
 """Factor up to which errors may grow for the sake of consistency."""
-
-_REACH = np.log(4.0)
-_COARSE, _FINE = 0.3, 0.02
-"""Range and tolerances of a search for a noise, as logarithms of factors; coarse at the least errors, where they are flat."""
-
+_REACH, _COARSE, _FINE = np.log(4.0), 0.3, 0.02
+"""Range and tolerances of a search, as logarithms of factors; coarse at least errors, which are flat."""
 _DIGITS = 4
-
 _MOST_LEG_ERROR = np.radians(5.0)
 """RMS up to which noise can explain the errors."""
 
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """Errors and consistency of an estimator in M runs.
-
-    Attributes:
-        nees: (M,), the mean of each run.
-        rms: of the error's parts over all runs, angles [rad] or position [m] and rotation [rad].
-    """
+    """The mean NEES (M,) of each run, and the RMS of the error's parts over all runs, [rad] or [m, rad]."""
 
     nees: Array
     rms: Array
 
-    @classmethod
-    def pooled(cls, runs: Sequence[tuple[float, Array]]) -> "Consistency":
-        """Pool runs, each given by its mean NEES and its mean squares."""
-        nees, squares = zip(*runs, strict=True)
-        return cls(np.array(nees), np.sqrt(np.mean(squares, axis=0)))
-
     def summary(self) -> dict[str, Any]:
-        """The figures in SI units."""
+        """The mean NEES and the RMS."""
         return {"nees": float(self.nees.mean()), "rms": self.rms.tolist()}
-
-
-Errors = Callable[[Mechanism, Record, PoseTrack], tuple[Array, Array]]
-"""A function of the mechanism, a fused track (N,) and the true poses.
-
-Returns errors (N, s, n) of s independent estimates with n components, and their covariances (N, s, n, n)."""
 
 
 @dataclass(frozen=True)
@@ -89,14 +65,14 @@ class Estimator:
     """An estimator that is tuned.
 
     Attributes:
-        errors: its errors and covariances.
-        components: of an error; a consistent NEES equals this number.
+        errors: finds the errors (N, s, n) in a fused track (N,), and their covariances (N, s, n, n).
+        components: n; a consistent NEES equals this number.
         parts: number of groups of components that have an RMS each.
-        series: number of independent estimates in a run.
+        series: s, the number of independent estimates.
         whole: errors of the IMUs that the whole-mechanism filter estimates; None for other estimators.
     """
 
-    errors: Errors
+    errors: Callable[[Mechanism, Record, PoseTrack], tuple[Array, Array]]
     components: int
     parts: int
     series: int = 1
@@ -111,7 +87,7 @@ class Estimator:
         return float(np.mean(nees)), squares.mean(axis=(0, 1))
 
     def bounds(self, runs: int) -> tuple[float, float]:
-        """Bounds that hold the mean NEES of so many runs with 95 % if the estimator is consistent.
+        """Bounds that hold 95 % of the mean NEES of so many runs if the estimator is consistent.
 
         A run counts once, however long it is: the IMUs' errors are constant in it.
         """
@@ -141,21 +117,17 @@ def _tilt_errors(mechanism: Mechanism, fused: Record, truth: PoseTrack) -> tuple
     return errors[:, None, :, 0], covariances[:, None]
 
 
-def _refined_errors(mechanism: Mechanism, fused: Record, truth: PoseTrack) -> tuple[Array, Array]:
-    """Of the refined pose [m, rad]."""
-    return track(fused, REFINED).errors(truth)[:, None], np.linalg.inv(fused["information"])[:, None]
-
-
-def _whole_errors(mechanism: Mechanism, fused: Record, truth: PoseTrack) -> tuple[Array, Array]:
-    """Of the whole-mechanism filter's pose [m, rad]."""
-    return track(fused, WHOLE).errors(truth)[:, None], fused["covariance"][:, None]
+def _pose_errors(mechanism: Mechanism, fused: Record, truth: PoseTrack, step: int) -> tuple[Array, Array]:
+    """Of the pose of a step [m, rad]."""
+    covariances = np.linalg.inv(fused["information"]) if step == REFINED else fused["covariance"]
+    return track(fused, step).errors(truth)[:, None], covariances[:, None]
 
 
 ESTIMATORS = {
     "leg filters": Estimator(_leg_errors, components=2, parts=1, series=LEGS),
     "platform filter": Estimator(_tilt_errors, components=2, parts=1),
-    "refined pose": Estimator(_refined_errors, components=6, parts=2),
-    "whole mechanism": Estimator(_whole_errors, components=6, parts=2, whole=FUSIONS["whole"]),
+    "refined pose": Estimator(partial(_pose_errors, step=REFINED), components=6, parts=2),
+    "whole mechanism": Estimator(partial(_pose_errors, step=WHOLE), components=6, parts=2, whole=FUSIONS["whole"]),
 }
 
 Evaluate = Callable[[float], Consistency]
@@ -163,7 +135,7 @@ Evaluate = Callable[[float], Consistency]
 
 
 def _seek_consistency(evaluate: Evaluate, components: int) -> float:
-    """The change that makes the mean NEES right, or a smaller one where errors grow too large or the reach ends before."""
+    """The change that makes the mean NEES right, or a smaller one where errors grow or the reach ends."""
     start = evaluate(0.0)
     side = 1.0 if start.nees.mean() > components else -1.0
 
@@ -192,39 +164,33 @@ def _seek_least_errors(evaluate: Evaluate, components: int) -> float:
 
 
 class _Runs:
-    """Every kind of motion with every seed: raw samples (N, 3, 7, 3), and the true poses in the samples that count."""
+    """Every motion with every seed: raw samples (N, 3, 7, 3), and the true poses that count."""
 
     def __init__(self, config: TuningConfig, mechanism: Mechanism, progress: Progress) -> None:
         self.mechanism, self.rate = mechanism, config.rate
         self.late = slice(round(SETTLING_S * config.rate), None, max(1, round(_SAMPLE_S * config.rate)))
         self.motions: list[tuple[Array, PoseTrack]] = []
-        model, count = load_imu(config.imu), len(MOTIONS) * len(config.seeds)
-        for kind in MOTIONS:
-            for seed in config.seeds:
-                motion = impose(mechanism, kind, DURATION_S, config.rate, seed)
-                self.motions.append((read(motion, model, config.rate, seed), poses_of(motion, self.late)))
-                progress(len(self.motions) / count)
+        for (kind, seed), _ in in_parts(list(product(MOTIONS, config.seeds)), progress):
+            motion = impose(mechanism, kind, DURATION_S, config.rate, seed)
+            raw = read(motion, imu_state(load_imu(config.imu), seed, 1.0 / config.rate))
+            self.motions.append((raw, poses_of(motion, self.late)))
 
-    def evaluate(self, fusion: FusionSettings, names: Sequence[str], whole: str | None) -> dict[str, Consistency]:
-        """Consistency of estimators by name with these settings; `whole` as in `Estimator`."""
-        control = control_settings(self.mechanism)
-        parameters = cycle_parameters(self.mechanism, self.rate, control, fusion, whole=whole)
+    def evaluate(self, fusion: FusionSettings, names: Sequence[str] = tuple(ESTIMATORS)) -> dict[str, Consistency]:
+        """Consistency of estimators by name with these settings."""
+        control, filters = control_settings(self.mechanism), {ESTIMATORS[name].whole for name in names}
+        parameters = {whole: cycle_parameters(self.mechanism, self.rate, control, fusion, whole=whole) for whole in filters}
 
-        def run(motion: tuple[Array, PoseTrack]) -> list[tuple[float, Array]]:
+        def judge(motion: tuple[Array, PoseTrack]) -> list[tuple[float, Array]]:
             raw, truth = motion
-            fused = fuse(parameters, raw)[self.late]
-            return [ESTIMATORS[name].judge(self.mechanism, fused, truth) for name in names]
+            fused = {whole: fuse(each, raw)[self.late] for whole, each in parameters.items()}
+            return [ESTIMATORS[name].judge(self.mechanism, fused[ESTIMATORS[name].whole], truth) for name in names]
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            judged = zip(*pool.map(run, self.motions), strict=True)
-        return {name: Consistency.pooled(each) for name, each in zip(names, judged, strict=True)}
-
-    def evaluate_all(self, fusion: FusionSettings) -> dict[str, Consistency]:
-        """Consistency of every estimator with these settings."""
-        figures: dict[str, Consistency] = {}
-        for whole in dict.fromkeys(estimator.whole for estimator in ESTIMATORS.values()):
-            names = [name for name, estimator in ESTIMATORS.items() if estimator.whole == whole]
-            figures |= self.evaluate(fusion, names, whole)
+            judged = zip(*pool.map(judge, self.motions), strict=True)
+        figures = {}
+        for name, runs in zip(names, judged, strict=True):
+            nees, squares = zip(*runs, strict=True)
+            figures[name] = Consistency(np.array(nees), np.sqrt(np.mean(squares, axis=0)))
         return figures
 
 
@@ -238,14 +204,16 @@ class _Step:
 
     def tuned(self, fusion: FusionSettings, runs: _Runs) -> FusionSettings:
         """The settings with the result of the search."""
-        estimator = ESTIMATORS[self.estimator]
+
+        def scaled(change: float) -> FusionSettings:
+            changed = {name: getattr(fusion, name) * np.exp(change) for name in self.settings}
+            return replace(fusion, **{name: float(f"{value:.{_DIGITS}g}") for name, value in changed.items()})
 
         @cache
         def evaluate(change: float) -> Consistency:
-            changed = _scaled(fusion, self.settings, change)
-            return runs.evaluate(changed, (self.estimator,), estimator.whole)[self.estimator]
+            return runs.evaluate(scaled(change), (self.estimator,))[self.estimator]
 
-        return _scaled(fusion, self.settings, self.seek(evaluate, estimator.components))
+        return scaled(self.seek(evaluate, ESTIMATORS[self.estimator].components))
 
 
 STEPS = (
@@ -262,39 +230,34 @@ def tune_fusion(config: TuningConfig, progress: Progress = no_progress) -> dict[
     """Find the noise that makes the estimators consistent.
 
     Returns:
-        `settings`: by name, their value `before` and `after`; `estimators`: by name, the `settings` found by it, the
-        `consistent` NEES with its 95 % `bounds`, and `before` and `after` the mean `nees` and the `rms` of angles [rad], or of
-        position [m] and rotation [rad]; `config` and `version`.
+        `settings`: by name, the value `before` and `after`; `estimators`: by name, the `settings` that it has, its `consistent`
+        NEES with 95 % `bounds`, and `before` and `after` the mean `nees` and the `rms` [rad], or [m, rad]; `config`, `version`.
 
     Raises:
         GoughError: something in the configuration cannot be used, or noise cannot explain the IMUs' errors.
     """
     mechanism = load_spatial(config.mechanism)
     before = fusion = sensor_settings(mechanism, load_imu(config.imu))
-    stages = len(STEPS) + 3  # Before the steps the motions and the first figures, after them the last figures.
-
-    def report(stage: int, share: float = 0.0) -> None:
-        progress((stage + share) / stages)
-
-    runs = _Runs(config, mechanism, lambda share: report(0, share))
-    figures_before = runs.evaluate_all(before)
+    stages = len(STEPS) + 3  # Motions and first figures before, last figures after.
+    runs = _Runs(config, mechanism, part_of(progress, 0.0, 1.0 / stages))
+    figures_before = runs.evaluate(before)
     worst = float(figures_before["leg filters"].rms[0])
     if not worst < _MOST_LEG_ERROR:
         raise InputError(
             f"the IMUs {config.imu} put the leg filters off by {np.degrees(worst):.3g} deg RMS, and beyond "
             f"{np.degrees(_MOST_LEG_ERROR):g} deg no noise accounts for it: tune for calibrated ones"
         )
-    for i, step in enumerate(STEPS):
-        report(2 + i)
+    names: dict[str, list[str]] = {name: [] for name in ESTIMATORS}
+    for i, step in enumerate(STEPS, start=2):
+        progress(i / stages)
         fusion = step.tuned(fusion, runs)
-    report(stages - 1)
-    figures_after = runs.evaluate_all(fusion)
-    names = {
-        name: tuple(dict.fromkeys(s for step in STEPS if step.estimator == name for s in step.settings)) for name in ESTIMATORS
-    }
-    tuned = [setting for settings in names.values() for setting in settings]
+        names[step.estimator] += [name for name in step.settings if name not in names[step.estimator]]
+    progress((stages - 1) / stages)
+    figures_after = runs.evaluate(fusion)
     return {
-        "settings": {name: {"before": getattr(before, name), "after": getattr(fusion, name)} for name in tuned},
+        "settings": {
+            name: {"before": getattr(before, name), "after": getattr(fusion, name)} for name in chain(*names.values())
+        },
         "estimators": {
             name: {
                 "settings": names[name],
@@ -310,17 +273,12 @@ def tune_fusion(config: TuningConfig, progress: Progress = no_progress) -> dict[
     }
 
 
-def _scaled(fusion: FusionSettings, settings: Sequence[str], change: float) -> FusionSettings:
-    return replace(fusion, **{name: float(f"{getattr(fusion, name) * np.exp(change):.{_DIGITS}g}") for name in settings})
-
-
 def tuned_text(mechanism: str, settings: Mapping[str, float]) -> str:
-    """The TOML text of a mechanism, preset or file, with these entries in its table `fusion` and no other change.
+    """The TOML text of a mechanism with these entries in its table `fusion`, and no other change.
 
     Raises:
         GoughError: no such mechanism, or its file cannot be read.
     """
     document = tomlkit.parse(mechanism_text(mechanism))
-    table = document.setdefault("fusion", tomlkit.table())
-    table.update(settings)
+    document.setdefault("fusion", tomlkit.table()).update(settings)
     return tomlkit.dumps(document)

@@ -1,10 +1,11 @@
 """Direct kinematics of a real planar rig, from the leg angles that its IMUs measured at known static poses.
 
-A folder holds one file `pose_*.csv` for each pose. Its first line has the true pose by image processing, its second line the
-names of the columns, and every other row a sample of all leg angles: raw, by a Kalman filter, and by a complementary filter.
+Each pose has a file `pose_*.csv`: a line with the true pose by image processing, the names of the columns, and samples of all
+leg angles, raw and by two filters.
 """
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -22,11 +23,8 @@ from plant.pose import Array
 
 SOURCES = ("raw", "kalman", "complementary")
 COLUMNS = tuple(f"leg{leg}_{source}_deg" for source in SOURCES for leg in range(1, PLANAR_LEGS + 1))
-
-TRUE_DISTANCE_M = 0.010
-TRUE_ANGLE = np.radians(8.0)
-"""A mode counts as the true pose if it differs from it by no more than `TRUE_DISTANCE_M` [m] and this angle [rad]."""
-
+TRUE_DISTANCE_M, TRUE_ANGLE = 0.010, np.radians(8.0)
+"""A mode that is no farther off [m, rad] counts as the true pose."""
 _FIRST_LINE = re.compile(r"# true pose by image processing: x (\S+) mm, y (\S+) mm, gamma (\S+) deg")
 COMPONENTS = (("x", "mm", 1e3), ("y", "mm", 1e3), ("angle", "deg", np.degrees(1.0)))
 """Components of a pose: name, unit in files and reports, and the factor from SI units to it."""
@@ -38,10 +36,10 @@ class RigPose:
 
     Attributes:
         name: of its file.
-        true_pose: (3,), x, y [m] and angle [rad].
-        true_leg_angles: (3,) [rad] at the true pose.
+        true_pose: (3,) [m, m, rad].
+        true_leg_angles: (3,) [rad].
         leg_errors: (3, N, 3), measured minus true angles [rad], by source, sample and leg.
-        errors: (3, N, 3), the assembly mode nearest to the true pose minus the true pose: x, y [m] and angle [rad].
+        errors: (3, N, 3), of the assembly mode nearest to the true pose [m, m, rad].
     """
 
     name: str
@@ -62,16 +60,15 @@ class RigEvaluation:
         """The figures by source, in SI units.
 
         - `rms`: over the poses, of the mean error of a pose.
-        - `true_mode`: the share of `samples` and the number of `poses`, by their mean, at which a mode is the true pose.
-        - `leg_angles`: RMS over legs and poses of their mean errors (`constant_error`) and of their standard deviations
-          (`noise`).
+        - `true_mode`: the share of `samples` and the number of `poses` at which a mode is the true pose.
+        - `leg_angles`: RMS of their mean errors (`constant_error`) and standard deviations (`noise`).
         - `poses`: mean and standard deviation of the error of each.
         """
         means = np.array([pose.errors.mean(axis=1) for pose in self.poses])
         samples = np.concatenate([pose.errors for pose in self.poses], axis=1)
         constant_error = _rms(np.array([pose.leg_errors.mean(axis=1) for pose in self.poses]), (0, 2))
         noise = _rms(np.array([pose.leg_errors.std(axis=1) for pose in self.poses]), (0, 2))
-        sources: dict[str, Any] = {
+        sources = {
             source: {
                 "rms": _named(_rms(means[:, i], 0)),
                 "true_mode": {"samples": float(_is_true(samples[i]).mean()), "poses": int(_is_true(means[:, i]).sum())},
@@ -97,10 +94,8 @@ class RigEvaluation:
 def evaluate(folder: str | Path, mechanism: PlanarMechanism) -> RigEvaluation:
     """Solve every sample of every pose in the files `pose_*.csv` of a folder.
 
-    The errors are those of the assembly mode whose platform joints are nearest to the true ones.
-
     Raises:
-        InputError: the folder is missing or has no such file, or a file is malformed or not finite; names file and line.
+        InputError: the folder has no such file, or a file is malformed; the message names file and line.
         SingularConfigurationError: a sample leaves the pose open.
     """
     paths = sorted(Path(folder).glob("pose_*.csv"))
@@ -120,24 +115,19 @@ def _evaluate_pose(path: Path, mechanism: PlanarMechanism) -> RigPose:
     positions = closing_positions(mechanism, leg_angles[..., None, :], angles)
     nearest = _distances(mechanism, true_pose, positions, angles).argmin(axis=-1)[..., None, None]
     errors = np.concatenate([positions - true_pose[:2], wrapped(angles - true_pose[2])[..., None]], axis=-1)
-    return RigPose(
-        name=path.stem,
-        true_pose=true_pose,
-        true_leg_angles=true_leg_angles,
-        leg_errors=wrapped(leg_angles - true_leg_angles),
-        errors=np.take_along_axis(errors, nearest, axis=-2)[..., 0, :],
-    )
+    errors = np.take_along_axis(errors, nearest, axis=-2)[..., 0, :]
+    return RigPose(path.stem, true_pose, true_leg_angles, wrapped(leg_angles - true_leg_angles), errors)
 
 
 def modes_near(mechanism: PlanarMechanism, pose: RigPose, source: int) -> tuple[AssemblyMode, AssemblyMode]:
-    """The assembly modes at a source's mean leg angles, the nearest to the true pose first; twice the same where they merge."""
+    """The assembly modes at a source's mean leg angles, the nearest to the truth first; equal if they merge."""
     modes = solve_planar(mechanism, pose.true_leg_angles + pose.leg_errors[source].mean(axis=0))
     near, *others = sorted(modes, key=lambda mode: float(_distances(mechanism, pose.true_pose, mode.position, mode.angle)))
     return near, others[0] if others else near
 
 
 def _distances(mechanism: PlanarMechanism, true_pose: Array, positions: Array, angles: Array | float) -> Array:
-    """Distances (...) [m] of the platform joints, in root sum square, from their places at the true pose."""
+    """Distances (...) [m] of the platform joints from their true places, in root sum square."""
     offsets = mechanism.joints_at(positions, angles) - mechanism.joints_at(true_pose[:2], true_pose[2])
     distances: Array = np.linalg.norm(offsets, axis=(-2, -1))
     return distances
@@ -147,10 +137,9 @@ def _read_csv(path: Path) -> tuple[Array, Array]:
     """The true pose (3,) [m, m, rad] and the leg angles (3, N, 3) [rad], by source, sample and leg."""
     first = read_text(path).removeprefix("\ufeff").partition("\n")[0].strip()
     match = _FIRST_LINE.fullmatch(first)
-    try:
-        true_pose = [float(number) for number in match.groups()] if match else [np.nan]
-    except ValueError:
-        true_pose = [np.nan]
+    true_pose = np.full(3, np.nan)
+    with suppress(ValueError):
+        true_pose[:] = match.groups() if match else np.nan
     if not np.isfinite(true_pose).all():
         raise InputError(
             f"{path}, line 1: {first!r} gives no true pose in finite numbers: write "
@@ -160,17 +149,15 @@ def _read_csv(path: Path) -> tuple[Array, Array]:
     if not len(rows):
         raise InputError(f"{path} ends without a sample: it needs at least 1")
     by_source = np.radians(rows).reshape(-1, len(SOURCES), PLANAR_LEGS).swapaxes(0, 1)
-    return np.array(true_pose) / [scale for _, _, scale in COMPONENTS], by_source
+    return true_pose / [scale for _, _, scale in COMPONENTS], by_source
 
 
 def _rms(values: Array, axes: int | tuple[int, ...]) -> Array:
-    root: Array = np.sqrt(np.mean(values**2, axis=axes))
-    return root
+    return np.asarray(np.sqrt(np.mean(values**2, axis=axes)))
 
 
 def _is_true(errors: Array) -> NDArray[np.bool_]:
-    true: NDArray[np.bool_] = (np.hypot(errors[:, 0], errors[:, 1]) <= TRUE_DISTANCE_M) & (np.abs(errors[:, 2]) <= TRUE_ANGLE)
-    return true
+    return np.asarray((np.hypot(*errors.T[:2]) <= TRUE_DISTANCE_M) & (np.abs(errors[:, 2]) <= TRUE_ANGLE))
 
 
 def _named(pose: Array) -> dict[str, float]:

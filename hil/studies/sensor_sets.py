@@ -1,18 +1,17 @@
-"""The closed loop with fewer sensors, on a mechanism of each type of the paper: which sets close it, and how accurately.
+"""The closed loop with fewer sensors, on each of the paper's types: which sets close it, and how accurately.
 
-Each set runs with leg and platform filters and with the whole-mechanism filter. Its IMUs sit on those legs that give the best
-conditioning at the worst pose of the workspace.
+The IMUs of a set sit on those legs that give the best conditioning at the worst pose of the workspace.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from controller.imu_set import check_imus
-from hil.progress import Progress, no_progress
+from hil.progress import Progress, in_parts, no_progress
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import SimulationStoppedError, simulate
 from hil.table import Table
@@ -29,26 +28,13 @@ _SECTION_5 = ("section-5",)
 
 @dataclass(frozen=True)
 class SensorSet:
-    """Sensors of a mechanism.
-
-    Attributes:
-        label: in words.
-        legs: number of legs with an IMU.
-        platform: whether the platform has an IMU, which gives roll and pitch.
-        magnetometer: whether this IMU gives the heading as well.
-        fusions: keys of `hil.runs.config.FUSIONS`.
-    """
+    """IMUs on so many legs and on the platform, its magnetometer, and the `hil.runs.config.FUSIONS` that use them."""
 
     label: str
     legs: int
     platform: bool = True
     magnetometer: bool = False
     fusions: tuple[str, ...] = ("compiled", "whole")
-
-    def choices(self) -> Iterator[tuple[int, ...]]:
-        """The possible choices of IMUs."""
-        for legs in combinations(range(LEGS), self.legs):
-            yield (*legs, PLATFORM_IMU) if self.platform else legs
 
 
 SETS = (
@@ -79,11 +65,10 @@ class Outcome:
     Attributes:
         mechanism, sensors: labels.
         paper: whether the paper needs exactly these.
-        imus: numbers of the IMUs; empty if every choice was refused.
+        imus: their numbers; none if every choice was refused.
         conditioning: of direct kinematics at the worst pose of the workspace.
         refused: the reason why no choice can be used; empty if one can.
-        runs: by fusion, `estimation` and `tracking` as in `hil.runs.simulation.SimulationResult.summary`, or `stopped` with
-            the reason.
+        runs: by fusion, `estimation` and `tracking` of `SimulationResult.summary`, or the reason why it `stopped`.
     """
 
     mechanism: str
@@ -102,36 +87,34 @@ def evaluate_sensor_sets(
     seed: int = 0,
     progress: Progress = no_progress,
 ) -> list[Outcome]:
-    """Follow `sines` with every set of sensors.
-
-    Args:
-        mechanisms: presets or TOML files.
-        sets: of sensors.
-        duration: of each motion [s].
-        seed: of the imperfections of the IMUs, calibrated MPU-9150s.
+    """Follow `sines` for `duration` [s] with every set of sensors, on presets or TOML files; `seed` is that of the IMUs.
 
     Raises:
         GoughError: a mechanism, the duration or the seed cannot be used.
     """
     outcomes = []
-    for name in mechanisms:
+    for name, of_mechanism in in_parts(mechanisms, progress):
         mechanism = load_spatial(name)
         minimum = paper_set(classify(mechanism))
-        for sensors in sets:
-            outcomes.append(_evaluate(name, mechanism, sensors, sensors.label == minimum, duration, seed))
-            progress(len(outcomes) / (len(mechanisms) * len(sets)))
+        for sensors, _ in in_parts(sets, of_mechanism):
+            paper = sensors.label == minimum
+            imus, conditioning, refused = choose_imus(mechanism, sensors, paper)
+            config = SimulationConfig(name, "sines", duration, seed=seed, imus=imus, magnetometer=sensors.magnetometer)
+            runs = {fusion: _follow(replace(config, fusion=fusion)) for fusion in sensors.fusions if imus}
+            outcomes.append(Outcome(name, sensors.label, paper, imus, conditioning, refused, runs))
     return outcomes
 
 
 def choose_imus(mechanism: Mechanism, sensors: SensorSet, paper: bool) -> tuple[tuple[int, ...], float, str]:
-    """The best IMUs of a set, the worst conditioning with them, and why there are none; `paper`: legs as in the paper."""
+    """The best IMUs of a set, the worst conditioning with them, and why there are none."""
     best, refused = 0.0, ""
     imus: tuple[int, ...] = ()
     joints = joint_numbers(mechanism.platform_joints)
-    for choice in sensors.choices():
-        if paper and sensors.legs == 4 and len({int(joints[leg]) for leg in choice[:4]}) != 3:
+    for legs in combinations(range(LEGS), sensors.legs):
+        if paper and sensors.legs == 4 and len(set(joints[list(legs)].tolist())) != 3:
             # The paper's section 4 uses two legs that meet, and two that end elsewhere.
             continue
+        choice = (*legs, PLATFORM_IMU) if sensors.platform else legs
         try:
             conditioning = check_imus(mechanism, choice, sensors.magnetometer, sensors.fusions == _SECTION_5)
         except InputError as error:
@@ -142,27 +125,16 @@ def choose_imus(mechanism: Mechanism, sensors: SensorSet, paper: bool) -> tuple[
     return imus, best, "" if imus else refused
 
 
-def _evaluate(name: str, mechanism: Mechanism, sensors: SensorSet, paper: bool, duration: float, seed: int) -> Outcome:
-    imus, conditioning, refused = choose_imus(mechanism, sensors, paper)
-    runs: dict[str, dict[str, Any]] = {}
-    for fusion in sensors.fusions if imus else ():
-        config = SimulationConfig(
-            mechanism=name, target="sines", duration=duration, seed=seed, fusion=fusion, imus=imus,
-            magnetometer=sensors.magnetometer,
-        )  # fmt: skip
-        try:
-            summary = simulate(config).summary()
-            runs[fusion] = {group: summary[group] for group in ("estimation", "tracking")}
-        except SimulationStoppedError as error:
-            runs[fusion] = {"stopped": str(error)}
-    return Outcome(name, sensors.label, paper, imus, conditioning, refused, runs)
+def _follow(config: SimulationConfig) -> dict[str, Any]:
+    try:
+        summary = simulate(config).summary()
+    except SimulationStoppedError as error:
+        return {"stopped": str(error)}
+    return {group: summary[group] for group in ("estimation", "tracking")}
 
 
 def table(outcomes: Sequence[Outcome], mechanism: str = "") -> Table:
-    """RMS and greatest errors, estimate against truth, with every set; of one mechanism alone, if it is named.
-
-    The paper's set has a star.
-    """
+    """Errors of the estimate with every set, of one mechanism alone if it is named; the paper's set has a star."""
     first = (mechanism,) if mechanism else ("mechanism", "sensors")
     errors = ("filters [mm / deg]", "at most", "whole [mm / deg]", "at most")
     result = Table(*first, "IMUs", "conditioning", *errors)

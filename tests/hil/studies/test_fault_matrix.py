@@ -24,14 +24,14 @@ def test_the_reaction_is_the_specified_one(case, seeds):
     ("case", "finding"),
     [
         (
-            Case("frozen", Cause.IMU_FROZEN, Reaction.STOP, 15, 2e-3, ("imu-frozen:2,at={at}",)),
+            Case("frozen", Cause.IMU_FROZEN, Reaction.STOP, 15, 2e-3, "imu-frozen:2"),
             "ended for another cause: end of the motion",
         ),
         (
-            Case("frozen", Cause.IMU_FROZEN, Reaction.GO_ON, 3, 2e-3, ("imu-frozen:2,at={at}",)),
+            Case("frozen", Cause.IMU_FROZEN, Reaction.GO_ON, 3, 2e-3, "imu-frozen:2"),
             "took 10 cycles, and 3 are allowed",
         ),
-        (Case("frozen", Cause.IMU_FROZEN, Reaction.GO_ON, 15, 1e-5, ("imu-frozen:2,at={at}",)), "mm off, and 0.01 are allowed"),
+        (Case("frozen", Cause.IMU_FROZEN, Reaction.GO_ON, 15, 1e-5, "imu-frozen:2"), "mm off, and 0.01 are allowed"),
         (Case("nothing", Cause.IMU_FROZEN, Reaction.GO_ON, 15, 2e-3), "was not told"),
     ],
 )
