@@ -28,7 +28,6 @@ STAGES = {
 
 UNTOLD = 0.5
 """Data hardly tell a constant that keeps more than this share of its prior standard deviation."""
-
 _FOLDS = 5
 
 
@@ -43,15 +42,15 @@ def assess(data: CalibrationData, cases: Mapping[str, tuple[Calibration, Array]]
         positions, rotations, residuals = _fit(data, calibration, np.arange(len(data.readings)))
         figures["residual_mg"][name] = float(np.sqrt(np.mean(residuals**2))) / MILLI_G
         figures["residual_by_imu_mg"][name] = (np.sqrt(np.mean(residuals**2, axis=(0, 2))) / MILLI_G).tolist()
-        mechanism = data.mechanism.moved_joints(calibration.joints)
+        mechanism, tilt = data.mechanism.moved_joints(calibration.joints), calibration.tilt
         poses = zip(positions, rotations, strict=True)
-        of_poses = np.mean([pose_covariance(mechanism, calibration.tilt, pose, covariance) for pose in poses], axis=0)
+        of_poses = np.mean([pose_covariance(mechanism, tilt, pose, covariance) for pose in poses], axis=0)
         figures["predicted"][name] = {
             "position_rms": float(np.sqrt(np.trace(of_poses[:3, :3]))),
             "rotation_rms": float(np.sqrt(np.trace(of_poses[3:, 3:]))),
         }
         figures["weakest"] = weakest_direction(of_poses, data.mechanism)
-        figures["tilt"] = calibration.tilt.tolist()
+        figures["tilt"] = tilt.tolist()
         if np.isfinite(data.truth).all():
             true_rotations = rotations_from_quaternions(np.ascontiguousarray(data.truth[:, 3:]))
             figures["true"][name] = rms_figures(pose_errors(positions, rotations, data.truth[:, :3], true_rotations))
@@ -61,7 +60,7 @@ def assess(data: CalibrationData, cases: Mapping[str, tuple[Calibration, Array]]
 def _fit(data: CalibrationData, calibration: Calibration, kept: NDArray[np.int64]) -> tuple[Array, Array, Array]:
     """Positions and rotations of some rests, and the residuals of their forces (n, 7, 3).
 
-    The residuals are scaled for the six of their twenty-one components that the pose takes up.
+    The residuals are scaled for the six of twenty-one components that the pose takes up.
     """
     raw = np.zeros((len(kept), 3, IMU_COUNT, 3))
     raw[:, ACCELEROMETER] = data.readings[kept, :, 3:]
@@ -85,7 +84,7 @@ def cross_validate(
         data: with the rests.
         calibration: from all data.
         samples: (N, 3, 7, 3), of the motion.
-        start: pose and twist (6,) at its first sample.
+        start: pose and twist (6,) at the first.
     """
     everything = np.arange(len(data.readings))
     if len(everything) < 2 * LEAST_POSES:
@@ -97,7 +96,8 @@ def cross_validate(
     # The second half of the motion begins where the filter with the whole calibration was.
     middle = len(samples) // 2
     parameters = filter_parameters(data.fusion, data.rate, "axes", calibration.covariance)
-    first, used = calibration.apply(samples[: middle + 1]), np.ones((middle + 1, IMU_COUNT), np.int64)
+    first = calibration.apply(samples[: middle + 1])
+    used = np.ones((middle + 1, IMU_COUNT), np.int64)
     way = track(parameters, data.geometry(calibration), first, used, data.rate, data.fusion.sensor_delay, start)
     there = Pose(way.positions[-1], way.rotations[-1]), way.motions[-1, [VELOCITY, RATE]].ravel()
     poses: dict[str, list[Array]] = {"rests": [], "motion": []}
@@ -113,7 +113,7 @@ def cross_validate(
 
 
 def constants(calibration: Calibration, prior_sigmas: Array) -> dict[str, Any]:
-    """Each IMU's constants with their standard deviations, `prior_sigmas` before, and those that the data hardly told."""
+    """Each IMU's constants with their standard deviations, and those that the data hardly told."""
     covariance, before = calibration.covariance, prior_sigmas.reshape(IMU_COUNT, -1, 3)
     sigmas = np.sqrt(np.diag(covariance)).reshape(IMU_COUNT, -1, 3) if covariance is not None else before
     values = np.empty((IMU_COUNT, len(ERROR_NAMES), 3))
@@ -122,7 +122,8 @@ def constants(calibration: Calibration, prior_sigmas: Array) -> dict[str, Any]:
         biases = [np.linalg.solve(gain, offset) for gain, offset in zip(gains, offsets, strict=True)]
         (gyroscope_scale, gyroscope_axes, _), (scale, axes, mounting) = (split_gain(gain) for gain in gains)
         values[imu] = [*biases, scale - 1.0, gyroscope_scale - 1.0, mounting, axes, gyroscope_axes]
-    shares, untold = sigmas / before, dict[str, list[int]]()
+    shares = sigmas / before
+    untold = dict[str, list[int]]()
     for imu, kind, axis in np.argwhere(shares > UNTOLD).tolist():
         untold.setdefault(_constant(kind, axis), []).append(imu)
     imu, kind, axis = map(int, np.unravel_index(shares.argmax(), shares.shape))
@@ -154,7 +155,7 @@ def weak_words(summary: Mapping[str, Any]) -> Sequence[str]:
 
 
 def weakest_direction(covariance: Array, mechanism: Mechanism) -> str:
-    """The direction in which the pose is known least, in plain words; rotations count at the platform's joints."""
+    """The direction in which the pose is known least, in words; rotations count at the platform's joints."""
     arm = float(np.linalg.norm(mechanism.platform_joints, axis=1).mean())
     scale = np.repeat([1.0, arm], 3)
     values, vectors = np.linalg.eigh(covariance * np.outer(scale, scale))

@@ -1,4 +1,4 @@
-"""Data for a calibration on the rig: the rests and the motion that the records of its runs hold."""
+"""Data for a calibration on the rig: the rests and the motion in the records of its runs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -24,13 +24,10 @@ from plant.truth import TRUTH_LENGTHS
 
 _SETTLED_S = 0.5
 """A rest counts after this time [s]."""
-
 _SHORTEST_REST_S, _SHORTEST_MOTION_S = 0.4, 10.0
-_MEAN_S = 0.1
-_CHECKED_S = 0.04
+_MEAN_S, _CHECKED_S = 0.1, 0.04
 _MOST_RATE = np.radians(0.5)
 """Greatest rate of a rest, in means over `_MEAN_S` [rad/s]."""
-
 _LENGTH_NOISE = 5e-5
 """Standard deviation of the lengths that a simulated rig measures [m]."""
 
@@ -64,7 +61,7 @@ def _means(values: Array, length: int) -> Array:
 
 
 def find_rests(samples: Array, zero: Array, rate: float) -> list[slice]:
-    """The stretches of raw samples (N, 3, 7, 3) in which no gyroscope, less its `zero` (7, 3) [rad/s], turns."""
+    """Where no gyroscope turns in raw samples (N, 3, 7, 3), less its `zero` (7, 3) [rad/s]."""
     length = max(1, round(_MEAN_S * rate))
     still = np.abs(_means(samples[:, GYROSCOPE] - zero, length)).max(axis=(1, 2)) < _MOST_RATE
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
@@ -87,7 +84,7 @@ class CalibrationData:
     """
 
     def __init__(self, mechanism: Mechanism, imu: str, rate: float, knowledge: Knowledge, seed: int) -> None:
-        """Start without a rest; `imu` is a preset, `rate` in Hz, and `seed` that of the noise of measured lengths."""
+        """Start without a rest; `rate` is in Hz, and `seed` that of the noise of measured lengths."""
         self.mechanism, self.rate, self.knowledge = mechanism, rate, knowledge
         self.fusion = sensor_settings(mechanism, load_imu(imu))
         self.zero = np.zeros((IMU_COUNT, 3))
@@ -98,7 +95,7 @@ class CalibrationData:
     def begin(self, records: Record, hold: int) -> None:
         """Check that every IMU works and zero the gyroscopes in the first `hold` cycles, while the brakes hold.
 
-        A rig that begins at home rests there only then: a loop that closes over raw IMUs leaves home.
+        At home the rig rests only now: a loop that closes over raw IMUs leaves it.
         """
         samples = raw_samples(records[:hold])
         check_alive(samples)
@@ -156,7 +153,9 @@ class CalibrationData:
         """Calibrate by all rests, or by some of them alone."""
         rests = self.rests
         if kept is not None:
-            changes = None if rests.length_changes is None else rests.length_changes[kept] - rests.length_changes[kept[0]]
+            changes = rests.length_changes
+            if changes is not None:
+                changes = changes[kept] - changes[kept[0]]
             rests = Rests(rests.readings[kept], rests.home and kept[0] == 0, changes)
         return calibrate_at_rest(self.mechanism, rests, self.knowledge.prior)
 

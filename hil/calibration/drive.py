@@ -1,8 +1,8 @@
-"""Calibration on the rig: the rig rests at wide poses and shakes, and the redundancy of its IMUs reveals their errors.
+"""Calibration on the rig: it rests at wide poses and shakes, and the redundancy of its IMUs reveals their errors.
 
 1. The brakes hold: the gyroscopes are zeroed.
 2. The drives follow a small planned motion with the loop open: each IMU must read the motion of its place.
-3. The rig rests at a few poses near home, driven by raw samples: a first calibration.
+3. The rig rests at a few poses near home with the loop open: a first calibration.
 4. With this it rests at twenty wide poses: a better one.
 5. With that it shakes: the constants that rests alone leave open.
 
@@ -40,8 +40,9 @@ from plant.imu import GYROSCOPE
 from plant.mechanism import Mechanism, load_spatial
 
 _NOTHING = Knowledge()
-_ZEROING_S, _PROBING_S, _NEAR_S, _WIDE_S, _SHAKING_S = 1.0, 4.0, 8 * REST_S, 20 * REST_S, 40.0
-"""Durations of the runs: 8 rests near home, and 20 at wide poses."""
+_ZEROING_S, _PROBING_S, _SHAKING_S = 1.0, 4.0, 40.0
+_NEAR_S, _WIDE_S = 8 * REST_S, 20 * REST_S
+_WHOLE_S = _NEAR_S + _WIDE_S + _SHAKING_S
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +65,7 @@ def calibrate_rig(
         validate: whether to compare calibrations by parts of the data as well.
 
     Raises:
-        CalibrationError: an IMU is not as it should be, or no calibration explains the data, or they do not suffice.
+        CalibrationError: an IMU is not as it should be, or the data do not give a calibration.
         GoughError: something in the configuration cannot be used.
     """
     config = replace(config, raw_imus=True)
@@ -74,7 +75,6 @@ def calibrate_rig(
     data.check_places(probing)
     calibration, known = Calibration(), None
     calibration.offset[GYROSCOPE] = -data.zero
-    whole = _NEAR_S + _WIDE_S + _SHAKING_S
     with TemporaryDirectory(prefix="gough-calibration-") as folder:
         file = Path(folder) / "calibration.toml"
         config = replace(config, calibration=str(file))
@@ -86,18 +86,17 @@ def calibrate_rig(
             known = calibrate_by_known_poses(data, [run_open(wide)])
         data.add_rests(run_open(near))
         save_calibration(file, data.at_rest().calibration())
-        data.add_rests(_run_closed(wide, part_of(progress, _NEAR_S / whole, _WIDE_S / whole)))
+        data.add_rests(_run_closed(wide, part_of(progress, _NEAR_S / _WHOLE_S, _WIDE_S / _WHOLE_S)))
         at_rest = data.at_rest()
         save_calibration(file, at_rest.calibration())
-        motion = _run_closed(shaking, part_of(progress, (_NEAR_S + _WIDE_S) / whole, _SHAKING_S / whole))
+        motion = _run_closed(shaking, part_of(progress, 1.0 - _SHAKING_S / _WHOLE_S, _SHAKING_S / _WHOLE_S))
     return _finish(data, at_rest, [motion], known, validate)
 
 
 def calibrate_recordings(paths: Sequence[Path], knowledge: Knowledge = _NOTHING) -> RigCalibration:
     """Calibrate the IMUs from recordings (MCAP) of one rig that rested at wide poses and shook.
 
-    All rests of all recordings count, and the longest motion that begins at rest. The gyroscopes are zeroed at the beginning
-    of the first recording, while the brakes hold.
+    All rests count, and the longest motion that begins at rest. The first recording zeroes the gyroscopes.
 
     Raises:
         RecordingError: no recordings, or not of one rig.
@@ -139,7 +138,7 @@ def _every_cycle(records: Record) -> Record:
 def run_open(config: SimulationConfig, blind: bool = False) -> Record:
     """The records of a run with the loop open: the IMUs do not matter, and the drives follow the planned speeds.
 
-    If `blind`, there is no feed-forward for the load, and the platform sinks by millimetres.
+    If `blind`, there is no feed-forward for the load: the platform sinks by millimetres.
     """
     with prepared_loop(config) as loop:
         loop.parameters["pid"]["gains"] = 0.0
@@ -161,7 +160,7 @@ def _run_closed(config: SimulationConfig, progress: Progress) -> Record:
 def _finish(
     data: CalibrationData, at_rest: RestCalibration, runs: Sequence[Record], known: Calibration | None, validate: bool = True
 ) -> RigCalibration:
-    """Calibrate in the longest motion, and assess every stage; a calibration by known poses is the result."""
+    """Calibrate in the longest motion, and assess every stage; the result is `known` if it is given."""
     samples, start = data.longest_motion(runs, at_rest)
     calibration, covariance = calibrate_in_motion(data.mechanism, at_rest, samples, data.rate, start, data.fusion)
     before = np.diag(data.knowledge.prior.sigmas() ** 2)

@@ -40,7 +40,7 @@ def calibrate_by_known_poses(data: CalibrationData, runs: Sequence[Record]) -> C
     weight = 1.0 / (_POSE_SIGMA * STANDARD_GRAVITY) ** 2
     for imu in range(IMU_COUNT):
         # R(-alignment) f is about f + f x alignment.
-        rows = np.concatenate([np.concatenate([np.eye(3), np.cross(force, np.eye(3)).T], axis=1) for force in expected[:, imu]])
+        rows = np.vstack([np.hstack([np.eye(3), np.cross(force, np.eye(3)).T]) for force in expected[:, imu]])
         residuals = (np.array(forces) - expected)[:, imu].ravel()
         inverse = np.linalg.inv(weight * rows.T @ rows + np.diag(1.0 / sigmas[imu, sought] ** 2))
         errors[imu, sought] = weight * inverse @ rows.T @ residuals
