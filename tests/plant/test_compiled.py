@@ -145,7 +145,8 @@ def test_machine_code_is_kept_in_the_cache_alone(tmp_path: Path) -> None:
 def test_machine_code_that_calls_other_kernels_is_loaded_whole(tmp_path: Path) -> None:
     """The callees have no machine code of their own in the cache; the next process finds them in their caller's."""
     code = (
-        "import numpy as np; from plant.mechanism import load_mechanism; from controller.cycle import check_imus, find_pose;"
+        "from plant.mechanism import load_mechanism; from controller.cycle import check_imus;"
+        "from controller.estimation.pose_estimator import find_pose;"
         "print(check_imus(load_mechanism('hexapod'), range(7)), sum(find_pose.stats.cache_misses.values()))"
     )
     said = [
