@@ -10,6 +10,8 @@ from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, Pose, checked_array, checked_rotation, rotation_from_vector
 from plant.vectors import add, cross, dot, rotate, subtract, vector
 
+_MOST_DRAWS = 500
+
 
 @dataclass(frozen=True, eq=False)
 class Legs:
@@ -81,9 +83,6 @@ def jacobian_at(arms: Array, directions: Array, legs: int, jacobian: Array) -> N
         direction = vector(directions[k])
         jacobian[k, 0], jacobian[k, 1], jacobian[k, 2] = direction
         jacobian[k, 3], jacobian[k, 4], jacobian[k, 5] = cross(vector(arms[k]), direction)
-
-
-_MOST_DRAWS = 500
 
 
 def sample_workspace(mechanism: Mechanism, count: int, seed: int) -> tuple[Array, Array]:

@@ -8,17 +8,14 @@ import numpy as np
 from plant.compiled import kernel
 from plant.pose import Array
 
-RANK_TOLERANCE = 1e-9
-"""Ratio of the least to the greatest diagonal element of R, below which columns count as dependent."""
+RANK_TOLERANCE = 1e-9  # ratio of the least to the greatest diagonal element of R, below which columns count as dependent
 
 
 @kernel
 def solve_least_squares(matrix: Array, right: Array, rows: int, solution: Array, norms: Array, order: Array) -> float:
     """Minimise |matrix @ solution - right| by QR with column pivoting: `solve_truncated` with as many pivots as unknowns.
 
-    Returns:
-        The ratio of the least to the greatest diagonal element of R, an estimate of the reciprocal condition number;
-        below `RANK_TOLERANCE` nothing is solved.
+    The ratio that it returns estimates the reciprocal condition number.
     """
     return solve_truncated(matrix, right, rows, solution.shape[0], solution, matrix[:0], norms, order)
 
@@ -30,8 +27,7 @@ def solve_truncated(
     """Solve a system of known rank: after `rank` pivots, the rest of the rows counts as noise.
 
     Args:
-        matrix: (>= rows, >= n), of which the corner counts; contiguous, overwritten.
-        right: (>= rows,), overwritten.
+        matrix, right: (>= rows, >= n), of which the corner counts, contiguous, and (>= rows,); overwritten.
         rows: at least `rank`.
         rank: of the system without noise, at most n.
         solution: (n,), one solution, written.

@@ -22,7 +22,6 @@ from controller.estimation.whole_mechanism.readings import (
     MOTION_STATES,
     READINGS,
     READINGS_SCRATCH,
-    RIG_ERRORS,
     TILT,
     predict_readings,
 )
@@ -311,12 +310,12 @@ def pose_covariance(mechanism: Mechanism, tilt: Array, pose: tuple[Array, Array]
     joints and the tilt.
     """
     ideal, by_pose = _ideal_readings(sensor_geometry(mechanism, tilt), *pose)
-    by_others, gradient = np.zeros((IMU_COUNT, 3, ALL_ERRORS + RIG_ERRORS)), np.zeros(ERRORS)
+    by_others, gradient = np.zeros((IMU_COUNT, 3, len(covariance))), np.zeros(ERRORS)
     for k in range(IMU_COUNT):
         for i in range(3):
             error_gradient(np.zeros(ERRORS), ideal[k], 3 + i, gradient)
             by_others[k, i, ERRORS * k : ERRORS * (k + 1)] = gradient
     by_others[:, :, ALL_ERRORS:] = _readings_by_rig(mechanism, tilt, *pose)[:, 3:]
-    gain = np.linalg.pinv(by_pose[:, 3:].reshape(-1, 6)) @ by_others.reshape(-1, ALL_ERRORS + RIG_ERRORS)
+    gain = np.linalg.pinv(by_pose[:, 3:].reshape(-1, 6)) @ by_others.reshape(-1, len(covariance))
     found: Array = gain @ covariance @ gain.T
     return found

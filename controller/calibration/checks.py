@@ -176,13 +176,9 @@ class _Fit:
 
     def __init__(self, readings: Array, expected: Array) -> None:
         trends = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, len(readings)), 3))[0]
-
-        def changes(values: Array) -> Array:
-            flat = values.reshape(len(values), -1)
-            return (flat - trends @ (trends.T @ flat)).reshape(-1, IMU_COUNT, 2, 3)
-
-        self._means = [each.mean(axis=0).reshape(IMU_COUNT, 2, 3) for each in (readings, expected)]
-        self._changes = [changes(each) for each in (readings, expected)]
+        both = np.stack([readings, expected]).reshape(2, len(readings), -1)
+        self._means = both.mean(axis=1).reshape(2, IMU_COUNT, 2, 3)
+        self._changes = (both - trends @ (trends.T @ both)).reshape(2, -1, IMU_COUNT, 2, 3)
 
     def share(self, imu: int, sensor: int) -> float:
         """Size of the changes that a sensor reads, relative to the expected ones."""

@@ -112,18 +112,18 @@ def calibrate_in_motion(
     used = np.ones((len(samples), IMU_COUNT), np.int64)
     geometry = sensor_geometry(mechanism.moved_joints(found.joints), found.tilt)
     calibrated, guide = found.calibration().apply(samples), None
-    runs: list[Track] = []
+    states = []
     for parameters in (plain, plain, inflated):
         run = track(parameters, geometry, calibrated, used, rate, fusion.sensor_delay, start, guide)
         if not (np.isfinite(run.state["errors"]).all() and np.isfinite(run.positions).all()):
             raise CalibrationError("the whole-mechanism filter does not follow the motion: check the calibration at rest")
         guide = gaussian_filter1d(run.motions, _GUIDE_SIGMA_S * rate, axis=0, mode="nearest")
-        runs.append(run)
-    last = runs[-2].state
+        states.append(run.state)
+    _, last, with_noise = states
     joints, tilt = found.joints + last["rig"][:JOINTS].reshape(2, LEGS, 3), found.tilt + last["rig"][JOINTS:]
     calibration = found.calibration().then(*undo(last["errors"]), joints=joints, tilt=tilt)
     kept = slice(MOTION_STATES, MOTION_STATES + ALL_ERRORS + RIG_ERRORS)
-    covariance: Array = runs[-1].state["covariance"][kept, kept].copy()
+    covariance: Array = with_noise["covariance"][kept, kept].copy()
     across, of_rig = covariance[ALL_ERRORS:, :ALL_ERRORS], covariance[ALL_ERRORS:, ALL_ERRORS:]
     # The covariance of the IMUs' errors if joints and tilt were known, and what these two add.
     known = covariance[:ALL_ERRORS, :ALL_ERRORS] - across.T @ np.linalg.pinv(of_rig, rcond=1e-12, hermitian=True) @ across

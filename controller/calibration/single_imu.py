@@ -66,10 +66,9 @@ def calibrate_imu(times: Array, rates: Array, forces: Array, gravity: float) -> 
     bias = np.array([rates[rest].mean(axis=0) for rest in rests])
     _check_turns(rates, bias, rests, period)
     rate_gain, rate_sigmas, turn_residual = _fit_turns(rates, bias, rests, verticals, period)
-    mean = bias.mean(axis=0)
     return ImuCalibration(
         gain=np.stack([rate_gain, force_gain]),
-        offset=np.stack([-rate_gain @ mean, force_offset]),
+        offset=np.stack([-rate_gain @ bias.mean(axis=0), force_offset]),
         sigmas=np.stack([rate_sigmas, force_sigmas]),
         rests=len(rests),
         force_residual=force_residual,
@@ -84,8 +83,7 @@ def _find_rests(rates: Array, forces: Array, period: float) -> list[slice]:
     first = max(1, round(_SHORTEST_REST_S / _WINDOW_S))
     if count < first:
         return []
-    shape = (count, length, 3)
-    rate_windows, force_windows = rates[: count * length].reshape(shape), forces[: count * length].reshape(shape)
+    rate_windows, force_windows = (each[: count * length].reshape(count, length, 3) for each in (rates, forces))
     spread = force_windows.std(axis=1).max(axis=1)
     zero = rate_windows[:first].mean(axis=(0, 1))
     turning = np.abs(rate_windows.mean(axis=1) - zero).max(axis=1)
@@ -131,8 +129,7 @@ def deviations_of(jacobian: Array, residuals: Array, freedom: int) -> Array:
 
 def _check_orientations(forces: Array, gravity: float) -> None:
     """Check that gravity is along every half-axis in some rest."""
-    missing = missing_half_axes(forces / gravity)
-    if missing:
+    if missing := missing_half_axes(forces / gravity):
         raise CalibrationError(f"no rest has {', '.join(missing)} up: rest in these orientations too")
 
 
@@ -146,11 +143,10 @@ def _check_turns(rates: Array, bias: Array, rests: list[slice], period: float) -
     """Check that the IMU was turned about every axis."""
     moving = np.concatenate([rates[a.stop : b.start] for a, b in pairwise(rests)])
     turned = np.abs(moving - bias.mean(axis=0)).sum(axis=0) * period
-    missing = [name for name, angle in zip("xyz", turned, strict=True) if angle < _LEAST_TURN]
+    missing = {name: f"{np.degrees(angle):.0f} deg" for name, angle in zip("xyz", turned, strict=True) if angle < _LEAST_TURN}
     if missing:
         raise CalibrationError(
-            f"it was turned by too little about {', '.join(missing)} "
-            f"({', '.join(f'{np.degrees(angle):.0f} deg' for angle in turned if angle < _LEAST_TURN)} in all; "
+            f"it was turned by too little about {', '.join(missing)} ({', '.join(missing.values())} in all; "
             f"{np.degrees(_LEAST_TURN):.0f} deg are needed): turn it about that axis between two rests, while it is not upright"
         )
 
@@ -163,13 +159,11 @@ def _fit_turns(
     parts = list(pairwise(middles))
     # The bias drifts: between two rests it is the mean of theirs.
     unbiased = [rates[a:b] - 0.5 * (bias[i] + bias[i + 1]) for i, (a, b) in enumerate(parts)]
-    carried = np.zeros((3, 3))
 
     def residuals(x: Array) -> Array:
         gain, found = x.reshape(3, 3), []
         for i, part in enumerate(unbiased):
-            _carry(np.ascontiguousarray(part @ gain.T), period, carried)
-            found.append(carried @ verticals[i] - verticals[i + 1])
+            found.append(_turn(np.ascontiguousarray(part @ gain.T), period) @ verticals[i] - verticals[i + 1])
         return np.concatenate(found)
 
     fit = least_squares(residuals, np.eye(3).ravel(), method="lm")
@@ -181,14 +175,12 @@ def _fit_turns(
 
 
 @kernel
-def _carry(rates: Array, period: float, carried: Array) -> None:
-    """Write the rotation (3, 3) that carries a vector at rest, seen from a sensor, through its rates (N, 3) [rad/s]."""
-    vector = np.zeros(3)
-    for i in range(3):
-        for j in range(3):
-            carried[i, j] = 1.0 if i == j else 0.0
+def _turn(rates: Array, period: float) -> Array:
+    """The rotation (3, 3) that carries a vector at rest, seen from a sensor, through its rates (N, 3) [rad/s]."""
+    rotation, step = np.eye(3), np.zeros(3)
     for i in range(rates.shape[0] - 1):
         for j in range(3):
             # Seen from the sensor, the world turns the other way.
-            vector[j] = -0.5 * period * (rates[i, j] + rates[i + 1, j])
-        rotate_by_vector(carried, vector)
+            step[j] = -0.5 * period * (rates[i, j] + rates[i + 1, j])
+        rotate_by_vector(rotation, step)
+    return rotation

@@ -35,6 +35,7 @@ PHASE_MARGIN_DEG, GAIN_MARGIN_DB = 65.0, 12.0
 _SETTLE_S = 10.0
 _SMALL_STEP = 1e-3
 _SIGNALS = 2 * 7 * 3
+_ESTIMATOR_STATE = (("legs", "x"), ("platform", "x"), ("pose", "smooth_twist"), ("pose", "acceleration"))
 
 
 @dataclass(frozen=True)
@@ -154,7 +155,7 @@ def linear_plant(mechanism: Mechanism, rate: float) -> tuple[Linear, Array]:
     x, u = (np.zeros(sum(variable.size for variable in variables)) for variables in (STATES, INPUTS))
     x[:7] = *values["initial_position"], *values["initial_quaternion"]
     u[_slice(INPUTS, "drive_mode")] = VELOCITY
-    x[_slice(STATES, "state.current")], u[_slice(INPUTS, "velocity_command")] = _equilibrium(dynamics.rates, x, u, constants)
+    _balance(dynamics.rates, x, u, constants)
 
     states, inputs = ca.SX.sym("x", len(x)), ca.SX.sym("u", len(u))
     rates = dynamics.rates(states, inputs, constants)
@@ -182,25 +183,19 @@ def _slice(variables: Any, name: str) -> slice:
     raise KeyError(name)
 
 
-def _equilibrium(rates: Any, x: Array, u: Array, constants: Any) -> tuple[Array, Array]:
-    """Currents and commands at which nothing accelerates; both enter linearly while the drives do not saturate."""
+def _balance(rates: Any, x: Array, u: Array, constants: Any) -> None:
+    """Set the currents in x, and then the commands in u, so that nothing accelerates. Both enter linearly while the drives do
+    not saturate.
+    """
     current, command = _slice(STATES, "state.current"), _slice(INPUTS, "velocity_command")
     acceleration = slice(_slice(STATES, "state.velocity").start, _slice(STATES, "state.angular_velocity").stop)
-
-    def column(vector: Array, where: slice, rows: slice) -> tuple[Array, Array]:
-        base = np.array(rates(x, u, constants)).ravel()[rows]
-        columns = []
-        for k in range(LEGS):
-            vector[where.start + k] += _SMALL_STEP
+    for vector, sought, rows in ((x, current, acceleration), (u, command, current)):
+        base, columns = np.array(rates(x, u, constants)).ravel()[rows], []
+        for k in range(sought.start, sought.stop):
+            vector[k] += _SMALL_STEP
             columns.append((np.array(rates(x, u, constants)).ravel()[rows] - base) / _SMALL_STEP)
-            vector[where.start + k] -= _SMALL_STEP
-        return base, np.stack(columns, axis=1)
-
-    base, slope = column(x, current, acceleration)
-    x[current] = -np.linalg.solve(slope, base)
-    base, slope = column(u, command, current)
-    u[command] = -np.linalg.solve(slope, base)
-    return x[current], u[command]
+            vector[k] -= _SMALL_STEP
+        vector[sought] = -np.linalg.solve(np.stack(columns, axis=1), base)
 
 
 def _reduction(quaternion: Array) -> Array:
@@ -210,9 +205,6 @@ def _reduction(quaternion: Array) -> Array:
     identity, attitude = np.eye(sum(variable.size for variable in STATES)), _slice(STATES, "state.quaternion")
     before, after = identity[: attitude.start], identity[attitude.stop : _slice(STATES, "state.brake_deflection").start]
     return np.concatenate([before, after, np.linalg.pinv(from_rotation) @ identity[attitude]])
-
-
-_ESTIMATOR_STATE = (("legs", "x"), ("platform", "x"), ("pose", "smooth_twist"), ("pose", "acceleration"))
 
 
 def linear_estimator(mechanism: Mechanism, rate: float, signals: Array) -> Linear:

@@ -18,9 +18,9 @@ MOST_FREE = 5  # parameters that the legs' equations may leave open for the equa
 ROTATION_EQUATIONS = 20  # that the elements of a rotation obey, quadratic ones
 
 _SETS = 1 << LEGS
+# Greatest rank that is used of the legs' equations. With three parameters open, the equations of a rotation settle those with
+# a sixth of the error that the last three pivots of a 6-6 mechanism would bring.
 _LINEAR_RANK = 9
-"""Greatest rank that is used of the legs' equations. With three parameters open, the equations of a rotation settle those with
-a sixth of the error that the last three pivots of a 6-6 mechanism would bring."""
 
 GEOMETRY = record_dtype(
     base_joints=(np.float64, (LEGS, 3)),  # [m]
@@ -50,8 +50,7 @@ SCRATCH = record_dtype(
 )
 """Memory for the closed forms, which allocate nothing."""
 
-_OUT_OF_THE_WAY = (0.0, 0.0, -1.0)
-"""Base joint [m] in the rows of legs that a planar mechanism lacks: no row has the length zero."""
+_OUT_OF_THE_WAY = (0.0, 0.0, -1.0)  # base joint [m] of legs that a planar mechanism lacks: no row has the length zero
 
 
 @lru_cache(maxsize=256)

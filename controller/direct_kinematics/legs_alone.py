@@ -84,9 +84,7 @@ def _pose_from_legs(
                     matrix[rows, 3 * i + j] = x * w[j]
             right[rows] = dot(w, base)
             rows += 1
-    for i in range(1 + MOST_FREE):
-        for e in range(12):
-            span[i, e] = 0.0
+    span[:] = 0.0
     solution, null_space = span[0, :unknowns], span[1:, :unknowns]
     conditioning = solve_truncated(matrix, right, rows, rank, solution, null_space, scratch.norms, scratch.order)
     if conditioning < RANK_TOLERANCE:

@@ -29,7 +29,6 @@ def section_3_1_1(
     points, base, platform = scratch.points, scratch.span[:3, :3], scratch.span[3:, :3]
     joints = np.int64(0)
     conditioning = 1.0
-    first = -1
     for joint in range(LEGS):
         if _select(geometry, measured, joint, scratch.selected) < 2:
             continue
@@ -39,8 +38,6 @@ def section_3_1_1(
         conditioning = min(conditioning, met)
         for i in range(3):
             points[3 + joints, i] = geometry.platform_joints[joint, i]
-        if joints == 0:
-            first = joint
         joints += 1
     if joints < 3 or conditioning < RANK_TOLERANCE:
         return 0.0
@@ -50,7 +47,7 @@ def section_3_1_1(
     for i in range(3):
         for j in range(3):
             rotation[i, j] = base[0, i] * platform[0, j] + base[1, i] * platform[1, j] + base[2, i] * platform[2, j]
-    _place(geometry, first, points[0], rotation, position)
+    _place(points[3], points[0], rotation, position)
     return conditioning
 
 
@@ -103,7 +100,7 @@ def section_4(
         r0, r1 = rotation[i, 0], rotation[i, 1]
         rotation[i, 0] = r0 * cosine + r1 * sine
         rotation[i, 1] = r1 * cosine - r0 * sine
-    _place(geometry, pivot, best, rotation, position)
+    _place(geometry.platform_joints[pivot], best, rotation, position)
     return float(min(conditioning, np.sqrt(weights / LEGS) / spread))
 
 
@@ -137,8 +134,8 @@ def _triad(points: Array, axes: Array) -> float:
 
 
 @kernel
-def _place(geometry: Record, leg: int, joint: Array, rotation: Array, position: Array) -> None:
-    """Position of the platform from that of a leg's platform joint in {1} (13)."""
-    arm = rotate(rotation, vector(geometry.platform_joints[leg]))
+def _place(in_platform: Array, in_base: Array, rotation: Array, position: Array) -> None:
+    """Position of the platform from that of a platform joint (3,) in {2} and in {1} (13)."""
+    arm = rotate(rotation, vector(in_platform))
     for i in range(3):
-        position[i] = joint[i] - arm[i]
+        position[i] = in_base[i] - arm[i]

@@ -218,8 +218,7 @@ def pose_from_roll(
         return 0.0
     determinant = n00 * n11 - n01 * n01
     position[0], position[1], position[2] = (n11 * r0 - n01 * r1) / determinant, (n00 * r1 - n01 * r0) / determinant, 0.0
-    for i in range(3):
-        for j in range(3):
-            rotation[i, j] = 1.0 if i == j else 0.0
+    rotation[:] = 0.0
     rotation[0, 0], rotation[0, 1], rotation[1, 0], rotation[1, 1] = cosine, -sine, sine, cosine
+    rotation[2, 2] = 1.0
     return float(np.sqrt((middle - swing) / (middle + swing)))

@@ -8,12 +8,10 @@ import numpy as np
 
 from controller.direct_kinematics.solver import METHODS
 from controller.direct_kinematics.spatial import NEEDS, check_spatial, solve_batch
-from controller.direct_kinematics.synthetic import leg_directions
+from controller.direct_kinematics.synthetic import draw_poses, leg_directions
 from plant.mechanism import LEGS, Mechanism
-from plant.pose import Array, rotation_from_vector
 
 _TRIAL_POSES = 8
-_TRIAL_TILT = 0.3
 
 
 @dataclass(frozen=True)
@@ -63,7 +61,7 @@ def required_measurements(mechanism: Mechanism) -> tuple[Requirement, ...]:
         InputError: the mechanism does not have six legs.
     """
     check_spatial(mechanism)
-    positions, rotations = _trial_poses(mechanism)
+    positions, rotations = draw_poses(mechanism, _TRIAL_POSES, np.random.default_rng(0))
     seen = leg_directions(mechanism, positions, rotations)
     sets = [legs for count in range(2, LEGS + 1) for legs in combinations(range(LEGS), count)]
     directions = np.full((len(sets), *seen.shape), np.nan)
@@ -89,10 +87,3 @@ def required_measurements(mechanism: Mechanism) -> tuple[Requirement, ...]:
         choices = tuple(legs for legs in sufficient if len(legs) == fewest)
         requirements.append(Requirement(method, platform, fewest, choices, max(lacking, default=1) + 1))
     return tuple(requirements)
-
-
-def _trial_poses(mechanism: Mechanism) -> tuple[Array, Array]:
-    size = float(np.linalg.norm(mechanism.base_joints - mechanism.base_joints.mean(axis=0), axis=1).max())
-    moves = np.random.default_rng(0).uniform(-1.0, 1.0, (_TRIAL_POSES, 6))
-    turns = np.array([rotation_from_vector(_TRIAL_TILT * turn) for turn in moves[:, 3:]])
-    return mechanism.nominal_home.position + 0.2 * size * moves[:, :3], turns @ mechanism.nominal_home.rotation

@@ -38,8 +38,7 @@ _MOST_REFINEMENTS = 20
 _REFINED = 1e-14  # square of a step over its variance at which the pose has settled
 _TINY = 1e-9  # step, over the joints' spread or in radians, that may be no more than rounding
 
-SOLVED, OPEN, SINGULAR, UNSETTLED, NEGATIVE, AMBIGUOUS = range(6)
-"""Statuses of a row."""
+SOLVED, OPEN, SINGULAR, UNSETTLED, NEGATIVE, AMBIGUOUS = range(6)  # statuses of a row
 
 
 class Measurements(NamedTuple):

@@ -312,11 +312,14 @@ def _error(
     legs = arrays["leg_directions"][row]
     measured = [f"leg {k}" for k in range(LEGS) if np.isfinite(legs[k, 0])] + [n for n in arrays if n != "leg_directions"]
     known = f"{', '.join(measured) or 'nothing'}{where.format(row=row)}"
+    by, remedy = f" by {method}", "choose the method auto, or measure more"
+    if method == "auto":
+        missing = [name for name in ("up_in_platform", "rotation") if name not in arrays]
+        by, remedy = "", f"measure more legs{''.join(f', or {name}' for name in missing)}"
     return SingularConfigurationError(
         {
-            solver.OPEN: f"{known} do not give the pose of {mechanism.name!r} here"
-            f"{'' if method == 'auto' else f' by {method}'} (legs parallel or too few, joints in line or alike): "
-            f"{_remedy(arrays, method)}",
+            solver.OPEN: f"{known} do not give the pose of {mechanism.name!r} here{by} (legs parallel or too few, joints in "
+            f"line or alike): {remedy}",
             solver.SINGULAR: f"{known} leave the pose of {mechanism.name!r} open to a small motion: measure more",
             solver.AMBIGUOUS: f"two poses fit {known}, and noise cannot tell them apart: measure up_in_platform too",
             solver.UNSETTLED: f"no pose fits {known}: the measurements contradict each other",
@@ -324,10 +327,3 @@ def _error(
             f"point down the legs ({known})",
         }[status]
     )  # fmt: skip
-
-
-def _remedy(arrays: dict[str, Array], method: str) -> str:
-    if method != "auto":
-        return "choose the method auto, or measure more"
-    missing = [name for name in ("up_in_platform", "rotation") if name not in arrays]
-    return f"measure more legs{''.join(f', or {name}' for name in missing)}"
