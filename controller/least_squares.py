@@ -56,9 +56,7 @@ def solve_truncated(
 
 
 @kernel
-def _triangularise(
-    matrix: Array, right: Array, m: int, rank: int, dots: Array, norms: Array, order: Array
-) -> float:  # fmt: skip
+def _triangularise(matrix: Array, right: Array, m: int, rank: int, dots: Array, norms: Array, order: Array) -> float:
     """Turn the corner (m, n) of `matrix` into R by `rank` pivots, and transform `right` with it; n is the size of `dots`, which
     is scratch. Returns the ratio of the last to the first pivot.
     """

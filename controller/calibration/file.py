@@ -33,21 +33,24 @@ _MOST_TILT = 0.8
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Constants of the seven IMUs, and what is known of the rig: offset [rad/s, m/s^2, uT], tilt [rad], joints [m].
+    """Constants of the seven IMUs.
 
-    Gain and offset stand by sensor (gyroscope, accelerometer, magnetometer) and IMU.
+    Attributes:
+        gain: (3, 7, 3, 3), by sensor (gyroscope, accelerometer, magnetometer) and IMU.
+        offset: (3, 7, 3) [rad/s, m/s^2, uT].
+        tilt: (2,) [rad], turns of the vertical about the axes x and y of {1}.
+        joints: (2, 6, 3) [m], corrections of the mechanism's base and platform joints.
+        floor: (2,) [m, rad], standard deviations of position and rotation that tilt and joints leave.
+        covariance: (147, 147), of the remaining errors, in the order of `imu_errors.ERROR_NAMES` for each IMU, if it is known.
+        about: further facts: date, residuals, source of the data.
     """
 
     gain: Array = field(default_factory=lambda: np.tile(np.eye(3), (3, IMU_COUNT, 1, 1)))
     offset: Array = field(default_factory=lambda: np.zeros((3, IMU_COUNT, 3)))
-    # By which the vertical is turned about the axes x and y of {1}, and corrections of the base and platform joints.
     tilt: Array = field(default_factory=lambda: np.zeros(2))
     joints: Array = field(default_factory=lambda: np.zeros((2, LEGS, 3)))
-    # Standard deviations of position [m] and rotation [rad] that tilt and joints leave.
     floor: Array = field(default_factory=lambda: np.zeros(2))
-    # (147, 147), of the remaining errors, in the order of `imu_errors.ERROR_NAMES` for each IMU; None if it is not known.
     covariance: Array | None = None
-    # Further facts: date, residuals, source of the data.
     about: dict[str, Any] = field(default_factory=dict)
 
     def apply(self, measurements: Array) -> Array:

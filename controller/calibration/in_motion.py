@@ -3,7 +3,8 @@
 The whole-mechanism filter, with every error of the IMUs as a state and the covariance at rest as prior, runs over the motion.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +34,7 @@ _INFLATION = 1.5
 _GUIDE_SIGMA_S = 0.02  # of the Gaussian low-pass of a motion at which the filter is linearised
 
 
-@dataclass(frozen=True, eq=False)
-class Track:
+class Track(NamedTuple):
     """Estimates of the whole-mechanism filter."""
 
     positions: Array  # (N, 3) [m]
@@ -67,9 +67,9 @@ def track(
         parameters["smoothing"] = np.inf
     pose, twist = start
     start_filter(parameters[()], state[()], 0.0, pose.position, pose.rotation, twist)
-    found = positions, rotations, motions, covariances
-    _track(parameters[()], geometry[()], state[()], samples, used, 1.0 / rate, delay, guide, *found)
-    return Track(*found, state)
+    run = Track(positions, rotations, motions, covariances, state)
+    _track(parameters[()], geometry[()], state[()], samples, used, 1.0 / rate, delay, guide, *run[:-1])
+    return run
 
 
 @kernel

@@ -34,9 +34,7 @@ class MagnetometerCalibration:
     dip_residual: float | None  # RMS [rad]; None without an accelerometer
 
 
-def calibrate_magnetometer(
-    fields: Array, forces: Array | None, strength: float, gravity: float
-) -> MagnetometerCalibration:  # fmt: skip
+def calibrate_magnetometer(fields: Array, forces: Array | None, strength: float, gravity: float) -> MagnetometerCalibration:
     """Find the constants of a magnetometer.
 
     Args:

@@ -151,9 +151,7 @@ def _check_turns(rates: Array, bias: Array, rests: list[slice], period: float) -
         )
 
 
-def _fit_turns(
-    rates: Array, bias: Array, rests: list[slice], verticals: Array, period: float
-) -> tuple[Array, Array, float]:  # fmt: skip
+def _fit_turns(rates: Array, bias: Array, rests: list[slice], verticals: Array, period: float) -> tuple[Array, Array, float]:
     """Gain (3, 3), standard deviations (12,) of offset and gain, and the residual [rad]."""
     middles = [(rest.start + rest.stop) // 2 for rest in rests]
     parts = list(pairwise(middles))

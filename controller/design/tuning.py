@@ -184,9 +184,7 @@ def _slice(variables: Any, name: str) -> slice:
 
 
 def _balance(rates: Any, x: Array, u: Array, constants: Any) -> None:
-    """Set the currents in x, and then the commands in u, so that nothing accelerates. Both enter linearly while the drives do
-    not saturate.
-    """
+    """Set the currents in x, then the commands in u, so that nothing accelerates; both enter linearly below saturation."""
     current, command = _slice(STATES, "state.current"), _slice(INPUTS, "velocity_command")
     acceleration = slice(_slice(STATES, "state.velocity").start, _slice(STATES, "state.angular_velocity").stop)
     for vector, sought, rows in ((x, current, acceleration), (u, command, current)):

@@ -170,8 +170,9 @@ def cross_check(
         with suppress(SingularConfigurationError):
             pose = pose_from_lengths(mechanism, given, Pose(solution.position, solution.rotation))
             distance, angle = pose_difference(pose, solution)
-    deviations = errors / np.sqrt(np.diag(covariance))
-    return LengthCheck(errors, deviations, chi_square, threshold, chi_square <= threshold, pose, distance, angle)
+    return LengthCheck(
+        errors, errors / np.sqrt(np.diag(covariance)), chi_square, threshold, chi_square <= threshold, pose, distance, angle
+    )
 
 
 def chi_square_quantile(degrees_of_freedom: int, rate: float) -> float:

@@ -214,9 +214,7 @@ def _settle_rotation(free: int, scratch: Record) -> float:
 
 
 @kernel
-def _write_equations(
-    a: Array, b: Array, quadratic: float, linear: float, constant: float, equations: int, out: Array
-) -> None:  # fmt: skip
+def _write_equations(a: Array, b: Array, quadratic: float, linear: float, constant: float, equations: int, out: Array) -> None:
     """Write `quadratic` Q(a, b) + `linear` L(b) + `constant` c, where a rotation r of columns r1, r2, r3 (9,) obeys
     Q(r, r) = L(r) + c: its columns are orthonormal, each is the cross product of the others, and R R^T = I.
 

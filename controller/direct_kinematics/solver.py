@@ -1,6 +1,6 @@
 """The compiled solver: reads what was measured of a pose, tries closed forms, refines, and decides between two roots.
 
-It never raises: `spatial` has checked what was measured, and makes an error from the status with which a row ends.
+It never raises: `spatial` makes an error from the status with which a row ends.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from controller.inverse_kinematics import legs_at
 from controller.least_squares import invert_cholesky
 from plant.compiled import Record, kernel, record_dtype
 from plant.mechanism import LEGS
-from plant.pose import Array
+from plant.pose import UNIT_TOLERANCE, Array
 from plant.vectors import Vector, dot, rotate, rotate_back, vector
 
 METHODS = ("section-5", "up", "normal", "legs", "section-3.1.1", "section-4")
@@ -38,7 +38,7 @@ _MOST_REFINEMENTS = 20
 _REFINED = 1e-14  # square of a step over its variance at which the pose has settled
 _TINY = 1e-9  # step, over the joints' spread or in radians, that may be no more than rounding
 
-SOLVED, OPEN, SINGULAR, UNSETTLED, NEGATIVE, AMBIGUOUS = range(6)  # statuses of a row
+SOLVED, REFUSED, OPEN, SINGULAR, UNSETTLED, NEGATIVE, AMBIGUOUS = range(7)  # statuses of a row
 
 
 class Measurements(NamedTuple):
@@ -77,6 +77,7 @@ WORK = record_dtype(
     in_base=(np.float64, (5, 3)),
     in_platform=(np.float64, (5, 3)),
     vector_weights=(np.float64, 5),
+    refused=np.int64,  # whether a measurement is no unit vector or no rotation
     vectors=np.int64,  # how many are known in both frames
     up=np.int64,  # row of the vectors
     normal=np.int64,  # row of the vectors
@@ -106,6 +107,9 @@ def solve_rows(
     work = work_array[()]
     for row in range(start, stop):
         _read(measurements, row, work)
+        if work.refused != 0:
+            results.statuses[row] = REFUSED
+            continue
         method, conditioning = _find(geometry, candidates, work)
         results.methods[row], results.conditionings[row] = method, conditioning
         if not conditioning > LEAST_CONDITIONING:
@@ -123,12 +127,13 @@ def solve_rows(
 @kernel
 def _read(measurements: Measurements, row: int, work: Record) -> None:
     """Read what was measured of a pose: directions at unit length, and the vectors that are known in both frames."""
+    work.refused = 0
     work.vectors = 0
     work.equations = 0
     for k in range(LEGS):
         given = vector(measurements.directions[row, k])
-        measured = not np.isnan(given[0])
-        direction = _unit(given) if measured else (0.0, 0.0, 1.0)
+        measured = not (np.isnan(given[0]) and np.isnan(given[1]) and np.isnan(given[2]))
+        direction = _unit(given, work) if measured else (0.0, 0.0, 1.0)
         work.directions[k, 0], work.directions[k, 1], work.directions[k, 2] = direction
         work.measured[k] = 1.0 if measured else 0.0
         work.weights[k] = work.measured[k] * measurements.leg_weight
@@ -136,7 +141,8 @@ def _read(measurements: Measurements, row: int, work: Record) -> None:
     if measurements.rotations.shape[0] > 0:
         # The nearest rotation to the transposed, which the columns are, is the transposed nearest rotation.
         work.measured_rotation[:] = measurements.rotations[row]
-        orthonormalise(work.measured_rotation.reshape(9), False)
+        if not _is_orthogonal(work.measured_rotation) or orthonormalise(work.measured_rotation.reshape(9), False) < 0.0:
+            work.refused = 1
         # These weights add up to the yaw's about the vertical, and to the tilt's about every level axis.
         yaw = 0.5 * measurements.yaw_weight
         for i in range(3):
@@ -146,18 +152,30 @@ def _read(measurements: Measurements, row: int, work: Record) -> None:
         work.equations += 3
     work.up = work.vectors
     if measurements.ups.shape[0] > 0:
-        _add_vector(work, vector(measurements.axes[0]), _unit(vector(measurements.ups[row])), measurements.tilt_weight)
+        _add_vector(work, vector(measurements.axes[0]), _unit(vector(measurements.ups[row]), work), measurements.tilt_weight)
         work.equations += 2
     work.normal = work.vectors
     if measurements.normals.shape[0] > 0:
-        _add_vector(work, _unit(vector(measurements.normals[row])), (0.0, 0.0, 1.0), measurements.tilt_weight)
+        _add_vector(work, _unit(vector(measurements.normals[row]), work), (0.0, 0.0, 1.0), measurements.tilt_weight)
         work.equations += 2
 
 
 @kernel
-def _unit(given: Vector) -> Vector:
+def _unit(given: Vector, work: Record) -> Vector:
     size = np.sqrt(dot(given, given))
+    if not abs(size - 1.0) <= UNIT_TOLERANCE:
+        work.refused = 1
     return given[0] / size, given[1] / size, given[2] / size
+
+
+@kernel
+def _is_orthogonal(matrix: Array) -> bool:
+    for i in range(3):
+        for j in range(3):
+            product = matrix[0, i] * matrix[0, j] + matrix[1, i] * matrix[1, j] + matrix[2, i] * matrix[2, j]
+            if not abs(product - (1.0 if i == j else 0.0)) <= UNIT_TOLERANCE:
+                return False
+    return True
 
 
 @kernel

@@ -220,11 +220,6 @@ def _solve(
         if not LEAST_SIGMA <= value < np.inf:
             raise InputError(f"{name} is {sigma}; it must be at least {LEAST_SIGMA:g} and finite [rad]")
         weights.append(float(value) ** -2)
-    for name, values in arrays.items():
-        if name == "rotation":
-            _check_rotations(values, where)
-        else:
-            _check_vectors(name, values, where)
     count = len(arrays["leg_directions"])
     measurements = Measurements(
         arrays["leg_directions"], arrays.get("rotation", np.empty((0, 3, 3))), arrays.get("up_in_platform", np.empty((0, 3))),
@@ -246,6 +241,8 @@ def _solve(
     else:
         with ThreadPoolExecutor(workers) as pool:
             list(pool.map(solve_chunk, starts))
+    for row in np.flatnonzero(results.statuses == solver.REFUSED).tolist():
+        raise _refusal(arrays, row, where.format(row=row))
     solved = results.statuses == SOLVED
     unsolved = np.flatnonzero(~solved).tolist()
     errors = {row: _error(mechanism, arrays, method, results.statuses[row], row, where) for row in unsolved}
@@ -275,34 +272,32 @@ def _axes_about(up: Array) -> Array:
     return np.array([up, level, np.cross(up, level)])
 
 
-def _check_vectors(name: str, vectors: Array, where: str) -> None:
-    """Check that vectors (N, 3), or those of the legs (N, 6, 3) that were measured, are unit vectors."""
-    legs = vectors.ndim == 3
-    with np.errstate(over="ignore"):
-        sizes = np.linalg.norm(vectors, axis=-1)
-    wrong = ~(np.abs(sizes - 1.0) <= UNIT_TOLERANCE) & ~(legs & np.isnan(vectors).all(axis=-1))
-    for row, *leg in np.argwhere(wrong).tolist():
-        vector = vectors[row, *leg]
-        said = f"has length {sizes[row, *leg]:.6g}; it must be 1 within {UNIT_TOLERANCE:g}: normalise it"
-        if legs and np.isnan(vector).any():
-            said = "is partly NaN; a leg that is not measured has a row of NaN"
-        elif not np.isfinite(vector).all():
-            said = f"is {vector.tolist()}; it must be finite{', or NaN if not measured' if legs else ''}"
-        raise InputError(f"{name}{leg or ''}{where.format(row=row)} {said}")
-
-
-def _check_rotations(rotations: Array, where: str) -> None:
-    """Check that matrices (N, 3, 3) are rotations."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2))
-        wrong = ~(off <= UNIT_TOLERANCE) | (np.linalg.det(rotations) < 0.0)
-    for row in np.flatnonzero(wrong).tolist():
-        said = "is a reflection (determinant -1); the frames of a pose are both right-handed"
-        if not np.isfinite(rotations[row]).all():
-            said = f"is {rotations[row].tolist()}; it must be finite"
-        elif not off[row] <= UNIT_TOLERANCE:
-            said = f"is off orthogonal by {off[row]:.3g}, more than {UNIT_TOLERANCE:g}: give a rotation matrix"
-        raise InputError(f"rotation{where.format(row=row)} {said}")
+def _refusal(arrays: dict[str, Array], row: int, where: str) -> InputError:
+    """Why the measurements of a row are refused: a vector that is no unit vector, or else a matrix that is no rotation."""
+    vectors = {f"leg_directions[{leg}]": vector for leg, vector in enumerate(arrays["leg_directions"][row])}
+    vectors |= {name: arrays[name][row] for name in ("up_in_platform", "normal") if name in arrays}
+    for name, vector in vectors.items():
+        leg, missing = name not in arrays, np.isnan(vector)
+        if leg and missing.all():
+            continue
+        if leg and missing.any():
+            return InputError(f"{name}{where} is partly NaN; a leg that is not measured has a row of NaN")
+        if not np.isfinite(vector).all():
+            return InputError(
+                f"{name}{where} is {vector.tolist()}; it must be finite{', or NaN if not measured' if leg else ''}"
+            )
+        size = float(np.sqrt(np.sum(vector * vector)))
+        if abs(size - 1.0) > UNIT_TOLERANCE:
+            return InputError(f"{name}{where} has length {size:.6g}; it must be 1 within {UNIT_TOLERANCE:g}: normalise it")
+    given = arrays["rotation"][row]
+    if not np.isfinite(given).all():
+        return InputError(f"rotation{where} is {given.tolist()}; it must be finite")
+    off = float(np.abs(given.T @ given - np.eye(3)).max())
+    if not off <= UNIT_TOLERANCE:
+        return InputError(
+            f"rotation{where} is off orthogonal by {off:.3g}, more than {UNIT_TOLERANCE:g}: give a rotation matrix"
+        )
+    return InputError(f"rotation{where} is a reflection (determinant -1); the frames of a pose are both right-handed")
 
 
 def _error(
