@@ -157,9 +157,7 @@ def solve_square(matrix: Array, right: Array) -> float:
 
 @kernel
 def factor_cholesky(matrix: Array) -> bool:
-    """Replace the lower triangle of a symmetric `matrix` (n, n) by its Cholesky factor; False if it is not positive
-    definite beyond rounding.
-    """
+    """Replace a symmetric matrix's lower triangle by its Cholesky factor; False if not positive definite beyond rounding."""
     n = matrix.shape[0]
     for j in range(n):
         before = matrix[j, j]

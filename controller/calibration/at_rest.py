@@ -306,9 +306,7 @@ def expected_forces(geometry: Record, position: Array, rotation: Array) -> Array
 
 
 def pose_covariance(mechanism: Mechanism, tilt: Array, pose: tuple[Array, Array], covariance: Array) -> Array:
-    """The covariance (6, 6) of a pose at rest from seven accelerometers, for a `covariance` (185, 185) of the IMUs' errors, the
-    joints and the tilt.
-    """
+    """The covariance (6, 6) of a pose at rest by accelerometers, for one (185, 185) of the IMUs' errors, joints and tilt."""
     ideal, by_pose = _ideal_readings(sensor_geometry(mechanism, tilt), *pose)
     by_others, gradient = np.zeros((IMU_COUNT, 3, len(covariance))), np.zeros(ERRORS)
     for k in range(IMU_COUNT):

@@ -126,9 +126,7 @@ def _pose_from_columns(
 
 @kernel
 def _orthonormalise_span(free: int, span: Array) -> bool:
-    """Make the matrices `span[1:free + 1, 3:]` orthonormal and `span[0, 3:]` orthogonal to them; False if they are linearly
-    dependent.
-    """
+    """Make the matrices `span[1:free + 1, 3:]` orthonormal, `span[0, 3:]` orthogonal to them; False if they are dependent."""
     for i in range(1, free + 1):
         before = after = 0.0
         for e in range(3, 12):

@@ -95,9 +95,7 @@ def stay_in_plane(information: Array, correction: Array) -> None:
 
 @kernel
 def solve_normal_equations(information: Array, correction: Array, factor: Array) -> bool:
-    """Replace `correction` (6,) by the Gauss-Newton step; `factor` becomes the Cholesky factor of the information. False if the
-    information is singular.
-    """
+    """Replace `correction` (6,) by the Gauss-Newton step and write the information's Cholesky factor; False if singular."""
     for i in range(6):
         for j in range(i + 1):
             factor[i, j] = information[i, j]

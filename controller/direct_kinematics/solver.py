@@ -204,8 +204,10 @@ def _find(geometry: Record, candidates: NDArray[np.int64], work: Record) -> tupl
 
 @kernel
 def _copy_pose(position: Array, rotation: Array, to_position: Array, to_rotation: Array) -> None:
-    to_position[:] = position
-    to_rotation[:] = rotation
+    for i in range(3):
+        to_position[i] = position[i]
+        for j in range(3):
+            to_rotation[i, j] = rotation[i, j]
 
 
 @kernel
