@@ -1,12 +1,11 @@
 """The loop around the cycle: wait for the clock, exchange with the rig, run the cycle, record.
 
-The compiled loop is `hil.loop.kernels.run_loop`. The same steps in Python serve rigs and filters that are written in Python.
-All state lies in the arrays of `Loop`, so a run can be resumed at any cycle.
+The compiled loop is `run_loop`. The same steps in Python serve rigs and filters that are written in Python.
 """
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,7 +17,7 @@ from controller.cycle import CycleStage, run_stages
 from controller.planning.stream import STREAM_READER
 from controller.safety.causes import Cause, Mode
 from hil.loop.kernels import begin_cycle, end_cycle, exchange_fmu, periods_passed, process_feedback, run_loop
-from hil.loop.records import LINK_SIZE, STAGES, WORK, EmulatedUdp, RigHandle, Stage, TargetStream
+from hil.loop.records import LINK_SIZE, STAGES, WORK, Stage, TargetStream
 from hil.realtime.clock import FREE, new_clock
 from hil.rigs import SILENT, Identity, Rig, new_feedback
 from hil.rigs.udp.emulator import UdpEmulator
@@ -46,38 +45,22 @@ _ENDLESS = np.iinfo(np.int64).max
 
 @dataclass(eq=False)
 class Loop:
-    """Everything that a run changes or reads.
+    """Everything that a run changes or reads; by default on a clock that never waits."""
 
-    Attributes:
-        fmu: the plant (dtype `plant.fmu.calls.FMU_HANDLE`).
-        imu: the IMUs' imperfections (dtype `plant.imu.IMU_STATE`).
-        parameters, state: of the cycle.
-        segments: the reference.
-        records: (N,), dtype `RECORD`, a ring buffer.
-        clock: dtype `hil.realtime.clock.CLOCK`; by default the loop runs as fast as it can.
-        script: (n, 3), of a scripted clock.
-        link: (`LINK_SIZE`,), shared with other processes, see `Link`.
-        most_missed: periods missed in a row that end in a controlled stop.
-        udp: the rig on UDP that replaces the plant, None without one.
-        emulator: the other side of `udp` in memory; None if that is another process.
-        stream: of a streamed target (dtype `controller.planning.stream.STREAM`), None without one.
-        failure: the exception that a rig in Python has raised, as text.
-    """
-
-    fmu: Record
-    imu: Record
+    fmu: Record  # dtype `FMU_HANDLE`
+    imu: Record  # dtype `IMU_STATE`
     parameters: Record
     state: Record
     segments: Array
-    records: Record
+    records: Record  # (N,), a ring buffer
     clock: Record = field(default_factory=lambda: new_clock(FREE, 0))
     script: NDArray[np.int64] = field(default_factory=lambda: np.zeros((1, 3), np.int64))
     link: NDArray[np.int64] = field(default_factory=lambda: np.zeros(LINK_SIZE, np.int64))
-    most_missed: int = 10
-    udp: UdpLink | None = None
-    emulator: UdpEmulator | None = None
-    stream: Record | None = None
-    failure: str = ""
+    most_missed: int = 10  # periods in a row, before a controlled stop
+    udp: UdpLink | None = None  # replaces the plant
+    emulator: UdpEmulator | None = None  # the other side of `udp`, if it is in memory
+    stream: Record | None = None  # of a streamed target
+    failure: str = ""  # what a rig in Python has raised
 
     def __post_init__(self) -> None:
         self._stream_reader: Record = np.zeros((), STREAM_READER)
@@ -85,16 +68,13 @@ class Loop:
         self._work["feedback"], self._work["sequence"] = new_feedback(), -1
 
     def run(self, last: int, filters: PythonFilters | None = None) -> int:
-        """Run up to but not including cycle `last`; returns 0, or the cause if the run has ended on the brakes."""
+        """Run up to, not including, cycle `last`; returns 0, or the cause if the run has ended on the brakes."""
         if filters is None:
             return run_loop(*self._arguments(last, _ENDLESS))
         return self._run_python(FmuRig(self), last, _ENDLESS, filters)
 
     def follow(self, end: int, rig: Rig | None = None) -> int:
-        """Follow the motion to cycle `end` and stop there, or earlier for a cause; returns the cause.
-
-        A rig in Python is driven by the loop in Python.
-        """
+        """Follow the motion to cycle `end` and stop there, or earlier for a cause; returns the cause."""
         if rig is None:
             return run_loop(*self._arguments(_ENDLESS, end))
         try:
@@ -104,43 +84,34 @@ class Loop:
             raise
 
     def memory(self) -> dict[str, Record]:
-        """All arrays that the loop changes and on which the rest of a run depends, except the plant's."""
+        """The arrays on which the rest of a run depends, except the plant's."""
         return {"imu": self.imu, "state": self.state, "clock": self.clock, "link": self.link, "work": self._work}
 
     def load(self, python: bool = False) -> None:
-        """Load the machine code of the loop, or of the one in Python, so that nothing is compiled while it runs."""
+        """Load the machine code of the loop, or of the one in Python."""
         if not python:
             load_kernel(run_loop, *self._arguments(0, 0))
             return
-        # One cycle on copies, with a rig that does nothing.
-        trial = replace(
-            self,
-            state=self.state.copy(),
-            segments=self.segments.copy(),
-            records=self.records[:1].copy(),
-            stream=None if self.stream is None else self.stream.copy(),
-            clock=new_clock(FREE, 0),
-            link=np.zeros_like(self.link),
-        )
-        trial._run_python(_IdleRig(trial), int(self.state["time"]["cycle"]) + 1, _ENDLESS)
+        cycle, work, segments, clock = (self.parameters, self.state), self._work, self.segments, self.clock
+        shared = self.script, self.link, work, self._streamed()
+        load_kernel(now, clock["timespec"])
+        load_kernel(begin_cycle, *cycle, clock, *shared, self.most_missed, 0)
+        load_kernel(process_feedback, *cycle, work, 0)
+        stages = CycleStage.SCREENING, CycleStage.END
+        load_kernel(run_stages, *cycle, work["feedback"]["measurement"], segments, work["marks"][()], *stages)
+        load_kernel(end_cycle, *cycle, segments, self.records, clock, *shared, 0)
 
     def _arguments(self, last: int, end: int) -> tuple[Any, ...]:
-        if self.udp is None:
-            rig = RigHandle(self.fmu, self.imu, None, None)
-        elif self.emulator is None:
-            rig = RigHandle(None, None, self.udp, None)
-        else:
-            rig = RigHandle(None, None, None, EmulatedUdp(self.udp, self.emulator))
+        plant = (self.fmu, self.imu) if self.udp is None else (None, None)
         return (
-            rig, self.parameters, self.state, self.segments, self.records, self.clock, self.script, self.link, self._work,
-            self._streamed(), self.most_missed, last, end,
+            *plant, self.udp, self.emulator, self.parameters, self.state, self.segments, self.records, self.clock, self.script,
+            self.link, self._work, self._streamed(), self.most_missed, last, end,
         )  # fmt: skip
 
     def _streamed(self) -> TargetStream | None:
         return None if self.stream is None else TargetStream(self.stream, self._stream_reader)
 
     def _run_python(self, rig: Rig, last: int, end: int, filters: PythonFilters | None = None) -> int:
-        """`run_loop` in Python."""
         parameters, state, clock, work, streamed = self.parameters, self.state, self.clock, self._work, self._streamed()
         feedback, timespec, safety, segments = work["feedback"][()], clock["timespec"], state["safety"], self.segments
         measurement, marks, cause = feedback["measurement"], work["marks"][()], Cause.NONE.value
@@ -169,7 +140,6 @@ class Loop:
         return cause
 
     def _exchange(self, rig: Rig, request: int, feedback: Record) -> int:
-        """Exchange with a rig in Python; whatever it raises is a failure."""
         try:
             return int(rig.exchange(self.state["pid"]["command"], request, feedback))
         except Exception as error:
@@ -184,7 +154,7 @@ def load_kernel(kernel: Any, *arguments: Any) -> None:
 
 
 def stop_quickly(rig: Rig) -> None:
-    """Stop a rig's drives. An exception here must not hide the reason for the stop."""
+    """Stop a rig's drives; no exception hides the reason for the stop."""
     with suppress(Exception):
         rig.quick_stop()
 
@@ -214,7 +184,7 @@ class FmuRig:
         self._stage_ns, self._timespec = np.zeros(len(STAGES), np.int64), np.zeros(2, np.int64)
 
     def open(self) -> None:
-        """Load the machine code that drives the plant; the plant itself is loaded."""
+        """Load the machine code that drives the plant."""
         loop, feedback = self._loop, new_feedback()[()]
         load_kernel(periods_passed, loop.state)
         load_kernel(
@@ -227,10 +197,10 @@ class FmuRig:
         return Identity("FMU")
 
     def arm(self) -> None:
-        """Nothing: the plant's drives are always ready."""
+        """Nothing: the drives are always ready."""
 
     def exchange(self, command: Array, request: int, feedback: Record) -> int:
-        """Drive the plant for the periods that have passed since the last exchange, and read it."""
+        """Drive the plant for the periods that have passed, and read it."""
         loop = self._loop
         periods, period = periods_passed(loop.state), float(loop.parameters["rig"]["period"])
         return exchange_fmu(loop.fmu, loop.imu, command, request, periods, period, feedback, self._stage_ns, self._timespec)
@@ -241,13 +211,3 @@ class FmuRig:
 
     def close(self) -> None:
         """Nothing."""
-
-
-class _IdleRig(FmuRig):
-    """A rig that does nothing."""
-
-    def exchange(self, command: Array, request: int, feedback: Record) -> int:
-        return SILENT
-
-    def quick_stop(self) -> None:
-        pass

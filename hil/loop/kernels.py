@@ -13,10 +13,10 @@ from controller.planning.stream import stream_cause, take_plan
 from controller.reference import motion_cycle
 from controller.safety.causes import EVENT_SLOTS, REACTION, Cause, Request
 from controller.safety.stop import has_stopped, ramp_down
-from hil.loop.records import EmulatedUdp, Link, RigHandle, Stage, StopRequest, TargetStream
+from hil.loop.records import Link, Stage, StopRequest, TargetStream
 from hil.realtime.clock import FREE, REAL, finish, start, wait
 from hil.rigs import ANSWERED, SILENT
-from hil.rigs.udp.emulator import exchange_in_memory
+from hil.rigs.udp.emulator import UdpEmulator, exchange_in_memory
 from hil.rigs.udp.link import UdpLink, exchange_udp, send_command
 from plant.compiled import Record, kernel, store_release
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
@@ -32,7 +32,7 @@ _STREAM_PATIENCE_NS = 100_000_000
 
 _SIGQUIT = 1 << 2
 _SIGNALS = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14
-"""SIGHUP, SIGINT, SIGQUIT and SIGTERM in a set of signals."""
+"""SIGHUP, SIGINT, SIGQUIT and SIGTERM."""
 
 _getppid: Any = types.ExternalFunction("getppid", types.int32())
 _sigpending: Any = types.ExternalFunction("sigpending", types.int32(types.intp))
@@ -65,46 +65,43 @@ def exchange_fmu(
 
 @kernel
 def exchange(
-    fmu: Record | None, imu: Record | None, udp: UdpLink | None, emulated: EmulatedUdp | None, parameters: Record,
+    fmu: Record | None, imu: Record | None, udp: UdpLink | None, emulator: UdpEmulator | None, parameters: Record,
     state: Record, work: Record, timespec: NDArray[np.int64],
 ) -> int:  # fmt: skip
-    """Send the commands of the cycle before, and read the sensors; returns the rig's status.
-
-    The first four are those of a `RigHandle`. numba leaves out the branches of what is None.
-    """
+    """Send the last commands, and read the sensors; returns the rig's status. numba leaves out the branches of what is None."""
     s, w, period = state[()], work[()], parameters[()].rig.period
     began = now(timespec)
     status = SILENT
     if fmu is not None:
         periods = periods_passed(state)
         status = exchange_fmu(fmu, imu, s.pid.command, s.safety.request, periods, period, w.feedback, w.stage_ns, timespec)
-    if udp is not None:
-        status = exchange_udp(udp, s.pid.command, s.safety.request, w.feedback, timespec)
-    if emulated is not None:
+    if udp is not None and emulator is not None:
         at = int(np.rint(1e9 * period * s.time.cycle))
-        status = exchange_in_memory(emulated.emulator, emulated.link, s.pid.command, s.safety.request, w.feedback, at)
+        status = exchange_in_memory(emulator, udp, s.pid.command, s.safety.request, w.feedback, at)
+    elif udp is not None:
+        status = exchange_udp(udp, s.pid.command, s.safety.request, w.feedback, timespec)
     w.stage_ns[Stage.SENSE] = now(timespec) - began - w.stage_ns[Stage.PLANT]
     return status
 
 
 @kernel
 def hold_brakes(
-    fmu: Record | None, udp: UdpLink | None, emulated: EmulatedUdp | None, parameters: Record, state: Record, work: Record,
+    fmu: Record | None, udp: UdpLink | None, emulator: UdpEmulator | None, parameters: Record, state: Record, work: Record,
     timespec: NDArray[np.int64],
 ) -> None:  # fmt: skip
-    """At the end: the drives hold on their brakes."""
+    """Let the drives hold on their brakes."""
     if fmu is not None:
         write_drive_mode(fmu, BRAKE)
-    if udp is not None:
-        send_command(udp, state[()].pid.command, Request.BRAKED, now(timespec))
-    if emulated is not None:
+    if udp is not None and emulator is not None:
         at = int(np.rint(1e9 * parameters[()].rig.period * state[()].time.cycle))
-        exchange_in_memory(emulated.emulator, emulated.link, state[()].pid.command, Request.BRAKED, work[()].feedback, at)
+        exchange_in_memory(emulator, udp, state[()].pid.command, Request.BRAKED, work[()].feedback, at)
+    elif udp is not None:
+        send_command(udp, state[()].pid.command, Request.BRAKED, now(timespec))
 
 
 @kernel
 def periods_passed(state: Record) -> int:
-    """How many periods have passed since the last exchange; none before the first."""
+    """Periods since the last exchange; none before the first."""
     time = state[()].time
     return 1 + time.missed if time.cycle > 0 else 0
 
@@ -152,14 +149,14 @@ def begin_cycle(
 
 @kernel
 def _ask(work: Record, cause: int) -> None:
-    """Ask for a reaction. The most severe cause wins; ties go to the latest."""
+    """Ask for a reaction; the most severe cause wins, and ties go to the latest."""
     if REACTION[cause] >= REACTION[work[()].asked]:
         work[()].asked = cause
 
 
 @kernel
 def process_feedback(parameters: Record, state: Record, work: Record, status: int) -> int:
-    """After an exchange: note which samples are new, and react to the rig's status; returns a cause if the cycle cannot run."""
+    """Note which samples are new, and react to the rig's status; returns a cause if the cycle cannot run."""
     p, s, w = parameters[()], state[()], work[()]
     feedback, missed = w.feedback, s.time.missed
     w.silent = w.silent + 1 + missed if status == SILENT else 0
@@ -177,16 +174,15 @@ def process_feedback(parameters: Record, state: Record, work: Record, status: in
 
 @kernel
 def record_cycle(parameters: Record, state: Record, clock: Record, work: Record, failed: int, record: Record) -> None:
-    """Fill in the record of a cycle except its durations, which are known at its end."""
+    """Fill in the record of a cycle except its durations."""
     p, s, c, w = parameters[()], state[()], clock[()], work[()]
     record.cycle = w.cycle
     record.time_ns = c.woke - c.start if c.mode != FREE else np.int64(np.rint(1e9 * p.rig.period * w.cycle))
     record.late_ns = c.late
     record.missed = s.time.missed
     record.status = failed
-    record.stop = s.safety.stop.cause
     record.asked = w.asked
-    record.mode, record.request = s.safety.mode, s.safety.request
+    record.request = s.safety.request
     record.silent = w.silent
     record.drive[:] = w.feedback.drive
     record.drive_code[:] = w.feedback.drive_code
@@ -209,25 +205,31 @@ def record_cycle(parameters: Record, state: Record, clock: Record, work: Record,
     record.angular_velocity[:] = w.feedback.measurement[0]
     record.specific_force[:] = w.feedback.measurement[1]
     record.magnetic_field[:] = w.feedback.measurement[2]
-    record.position[:] = s.pose.position
-    record.rotation[:] = s.pose.rotation
-    record.conditioning = s.pose.conditioning
-    record.lengths[:] = s.pose.lengths
-    record.reference[:] = s.reference.motion
-    record.command[:] = s.pid.command
     record.truth[:] = w.feedback.truth
     for k in range(LEGS):
         for i in range(3):
             record.residuals[k, i] = s.legs.directions[k, i] - s.pose.directions[k, i] if s.legs.used[k] != 0.0 else np.nan
     update_covariance(p.mechanism, p.rig, s.time, s.mechanism, s.pose, w)
     record.covariance[:] = w.covariance
+    record_state(state, record)
+
+
+@kernel
+def record_state(state: Record, record: Record) -> None:
+    """Fill in what a replay compares."""
+    s = state[()]
+    record.position[:] = s.pose.position
+    record.rotation[:] = s.pose.rotation
+    record.conditioning = s.pose.conditioning
+    record.lengths[:] = s.pose.lengths
+    record.reference[:] = s.reference.motion
+    record.command[:] = s.pid.command
+    record.mode, record.stop = s.safety.mode, s.safety.stop.cause
 
 
 @kernel
 def update_covariance(p: Record, rig: Record, time: Record, mechanism: Record, pose: Record, work: Record) -> None:
-    """Covariance of the estimated pose: the whole-mechanism filter's if it is trusted, else the refinement's; NaN if there is
-    none.
-    """
+    """The whole-mechanism filter's covariance if it is trusted, else the refinement's; NaN if there is none."""
     work.factor[:] = pose.information
     if mechanism.trusted != 0:
         extrapolate_covariance(p.filter, mechanism.filter, time.cycle * rig.period, work.covariance)
@@ -239,7 +241,7 @@ def update_covariance(p: Record, rig: Record, time: Record, mechanism: Record, p
 
 @kernel
 def update_next_reference(parameters: Record, state: Record, segments: Array, streamed: TargetStream | None) -> None:
-    """The reference of the next cycle; of a streamed target, from its latest plan."""
+    """Take over the latest plan of a streamed target, and prepare the next cycle."""
     rig, s = parameters[()].rig, state[()]
     if streamed is not None and s.safety.stop.cause == Cause.NONE:
         cycle = motion_cycle(rig, s.time, s.safety)
@@ -252,7 +254,7 @@ def end_cycle(
     parameters: Record, state: Record, segments: Array, records: Record, clock: Record, script: NDArray[np.int64],
     link: NDArray[np.int64], work: Record, streamed: TargetStream | None, failed: int,
 ) -> None:  # fmt: skip
-    """After the command: record the cycle, update the next reference, set the next deadline, and publish the record."""
+    """Record the cycle, update the next reference, set the next deadline, and publish the record."""
     w, timespec = work[()], clock[()].timespec
     began = now(timespec)
     head = link[Link.HEAD]
@@ -262,8 +264,8 @@ def end_cycle(
     stage_ns, ns = w.stage_ns, w.marks.ns
     stage_ns[Stage.LEGS] = ns[CycleStage.SCREENING] + ns[CycleStage.LEGS]
     stage_ns[Stage.PLATFORM] = ns[CycleStage.PLATFORM] + ns[CycleStage.HEADING]
-    stage_ns[Stage.POSE], stage_ns[Stage.REFINEMENT] = ns[CycleStage.POSE], ns[CycleStage.REFINEMENT]
-    stage_ns[Stage.MECHANISM], stage_ns[Stage.CONTROL] = ns[CycleStage.MECHANISM], ns[CycleStage.CONTROL]
+    # From here to `control`, both have the same stages.
+    stage_ns[Stage.POSE.value : Stage.RECORD.value] = ns[CycleStage.POSE.value : CycleStage.END.value]
     stage_ns[Stage.RECORD] = now(timespec) - began
     link[Link.START] = clock[()].start
     record.stage_ns[:] = stage_ns
@@ -273,18 +275,21 @@ def end_cycle(
 
 @kernel
 def run_loop(
-    rig: RigHandle, parameters: Record, state: Record, segments: Array, records: Record, clock: Record,
-    script: NDArray[np.int64], link: NDArray[np.int64], work: Record, streamed: TargetStream | None, most_missed: int,
-    last: int, end: int,
+    fmu: Record | None, imu: Record | None, udp: UdpLink | None, emulator: UdpEmulator | None, parameters: Record,
+    state: Record, segments: Array, records: Record, clock: Record, script: NDArray[np.int64], link: NDArray[np.int64],
+    work: Record, streamed: TargetStream | None, most_missed: int, last: int, end: int,
 ) -> int:  # fmt: skip
-    """Run cycles up to `last`, or until a stop that begins at `end` or earlier is over; returns its cause, or `Cause.NONE`."""
+    """Run cycles up to `last`, or until a stop that begins at `end` or earlier is over; returns its cause, or `Cause.NONE`.
+
+    The rig is the plant `fmu` with its `imu`, or the one on `udp`, in memory if that has an `emulator`; the rest is None.
+    """
     s, w, timespec = state[()], work[()], clock[()].timespec
     cause = Cause.NONE.value
     while cause == Cause.NONE and s.time.cycle < last:
         cause = begin_cycle(parameters, state, clock, script, link, work, streamed, most_missed, end)
         if cause != Cause.NONE:
             break
-        status = exchange(rig.fmu, rig.imu, rig.udp, rig.emulated, parameters, state, work, timespec)
+        status = exchange(fmu, imu, udp, emulator, parameters, state, work, timespec)
         failed = process_feedback(parameters, state, work, status)
         if failed == Cause.NONE:
             failed = run_stages(
@@ -292,5 +297,5 @@ def run_loop(
             )
         end_cycle(parameters, state, segments, records, clock, script, link, work, streamed, failed)
     if cause != Cause.NONE:
-        hold_brakes(rig.fmu, rig.udp, rig.emulated, parameters, state, work, timespec)
+        hold_brakes(fmu, udp, emulator, parameters, state, work, timespec)
     return cause

@@ -9,8 +9,6 @@ import numpy as np
 from controller.cycle import MARKS
 from controller.safety.causes import EVENT_SLOTS
 from hil.rigs import FEEDBACK
-from hil.rigs.udp.emulator import UdpEmulator
-from hil.rigs.udp.link import UdpLink
 from plant.compiled import Record, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS
@@ -84,18 +82,18 @@ RECORD_FIELDS = (
 """What is kept of a cycle: name, type, shape and meaning. A recording's schema is made from it."""
 
 RECORD = np.dtype([(name, kind, shape) for name, kind, shape, _ in RECORD_FIELDS], align=True)
-"""A cycle as the loop records it, see `RECORD_FIELDS`."""
 
 
 class Link(IntEnum):
-    """Places in the array that the loop shares with other processes, int64 (`LINK_SIZE`,).
+    """Places in the array that processes share, int64 (`LINK_SIZE`,)."""
 
-    `HEAD`: number of records written. `STOP`: the `StopRequest`, 0 for none. `DONE`: whether the loop has ended. `TAIL`: where
-    the next recorder continues. `KEPT`: number of records that are complete in files. `SUPERVISOR`: the process whose end ends
-    the motion, 0 for none. `START`: the first deadline [ns].
-    """
-
-    HEAD, STOP, DONE, TAIL, KEPT, SUPERVISOR, START = range(7)
+    HEAD = 0  # number of records written
+    STOP = 1  # the `StopRequest`, 0: none
+    DONE = 2  # whether the loop has ended
+    TAIL = 3  # where the next recorder continues
+    KEPT = 4  # number of records in complete files
+    SUPERVISOR = 5  # the process whose end ends the motion, 0: none
+    START = 6  # the first deadline [ns]
 
 
 LINK_SIZE = 16
@@ -107,59 +105,29 @@ class StopRequest(IntEnum):
     CONTROLLED, QUICK = 1, 2
 
 
-class EmulatedUdp(NamedTuple):
-    """Both sides of a UDP rig that is emulated in memory."""
-
-    link: UdpLink
-    emulator: UdpEmulator
-
-
-class RigHandle(NamedTuple):
-    """The rig as the compiled loop sees it. What a rig lacks is None, and no code is compiled for it.
-
-    Attributes:
-        fmu: the plant (dtype `plant.fmu.calls.FMU_HANDLE`).
-        imu: the IMUs' imperfections (dtype `plant.imu.IMU_STATE`).
-        udp: the controller's side of a UDP rig.
-        emulated: a UDP rig in memory.
-    """
-
-    fmu: Record | None
-    imu: Record | None
-    udp: UdpLink | None
-    emulated: EmulatedUdp | None
-
-
 class TargetStream(NamedTuple):
-    """A streamed target as the compiled loop sees it.
+    """A streamed target as the compiled loop sees it."""
 
-    Attributes:
-        stream: dtype `controller.planning.stream.STREAM`.
-        reader: dtype `controller.planning.stream.STREAM_READER`.
-    """
-
-    stream: Record
-    reader: Record
+    stream: Record  # dtype `STREAM`
+    reader: Record  # dtype `STREAM_READER`
 
 
 WORK = record_dtype(
-    cycle=np.int64,
-    asked=np.int64,
-    silent=np.int64,
-    sequence=(np.int64, IMU_COUNT),
-    sample_age=(np.int64, IMU_COUNT),
+    cycle=np.int64,  # the one that runs
+    asked=np.int64,  # the cause that was asked for before it
+    silent=np.int64,  # cycles since the rig has answered
+    sequence=(np.int64, IMU_COUNT),  # numbers of the last samples
+    sample_age=(np.int64, IMU_COUNT),  # cycles since they were new
     feedback=FEEDBACK,
     factor=(np.float64, (6, 6)),
     covariance=(np.float64, (6, 6)),
     stage_ns=(np.int64, len(STAGES)),
     marks=MARKS,
-    signals=(np.int64, 16),
+    signals=(np.int64, 16),  # a set of signals
 )
-"""The loop's own state and scratch: the cycle that runs and what was asked of it, since when the rig is silent, the last sample
-numbers and ages of the IMUs, the rig's feedback, matrices for the covariance, the
-stages' durations and those of the cycle's own stages, and a set of signals."""
+"""The loop's own state and scratch."""
 
 
 def shared_array(count: int, dtype: np.dtype[Any]) -> Any:
-    """Zeros (count,) in memory that is shared with the processes forked later."""
+    """Zeros (count,), shared with the processes forked later."""
     return np.frombuffer(mmap.mmap(-1, count * dtype.itemsize), dtype)
