@@ -1,4 +1,8 @@
-"""Readings of a single IMU from a file: a CSV file that was logged by hand, or a recording of a rig."""
+"""Readings of a single IMU from a file: a CSV file that was logged by hand, or a recording of a rig.
+
+A CSV file has evenly spaced samples and the header time_s,wx,wy,wz,ax,ay,az, with or without mx,my,mz, or for magnetometers
+time_s,mx,my,mz. A recording has all IMUs of a mechanism, so `number` says which.
+"""
 
 from pathlib import Path
 
@@ -18,10 +22,6 @@ _MOST_JITTER = 0.5
 def read_imu(path: Path, number: int) -> tuple[Array, Array, Array]:
     """Times (N,) [s], rates and forces (N, 3) [rad/s, m/s^2] of an IMU.
 
-    Args:
-        path: a CSV file with the header time_s,wx,wy,wz,ax,ay,az and perhaps mx,my,mz, or an MCAP recording.
-        number: the IMU in a recording.
-
     Raises:
         InputError: the file cannot be read, is malformed, or its samples are not evenly spaced.
     """
@@ -33,15 +33,7 @@ def read_imu(path: Path, number: int) -> tuple[Array, Array, Array]:
 
 
 def read_field(path: Path, number: int) -> tuple[Array, Array | None]:
-    """Fields (N, 3) [uT] and forces (N, 3) [m/s^2] of an IMU; None without an accelerometer.
-
-    Args:
-        path: a CSV file with the header time_s,wx,wy,wz,ax,ay,az,mx,my,mz or time_s,mx,my,mz, or an MCAP recording.
-        number: the IMU in a recording.
-
-    Raises:
-        InputError: the file cannot be read, is malformed, or its samples are not evenly spaced.
-    """
+    """Fields (N, 3) [uT] and forces (N, 3) [m/s^2] of an IMU, None without an accelerometer; raises as `read_imu`."""
     if path.suffix == ".mcap":
         records = read(path).records
         return records["magnetic_field"][:, number], records["specific_force"][:, number]
@@ -50,7 +42,6 @@ def read_field(path: Path, number: int) -> tuple[Array, Array | None]:
 
 
 def _read_table(path: Path, *headers: tuple[str, ...]) -> Array:
-    """The numbers of a CSV file with one of these headers."""
     _, table, lines = read_csv(path, *headers, note=" (rad/s, m/s2, uT)")
     if len(table) < 2:
         raise InputError(f"{path} has {len(table)} rows of numbers; it needs two or more")

@@ -2,8 +2,7 @@
 
 The loop writes its records into a ring buffer in shared memory and never waits. The recorder copies them to the file, and
 counts those that were overwritten before. A record's layout is that of a ROS 2 message in CDR, so a message is the record's
-bytes, and the schema in the file is made from `RECORD_FIELDS`: Foxglove and PlotJuggler open it. The file's attachments hold
-what a replay needs.
+bytes, and Foxglove and PlotJuggler open the file. Its attachments hold what a replay needs.
 """
 
 import hashlib
@@ -11,7 +10,7 @@ import io
 import json
 import os
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -45,15 +44,14 @@ class RecordingError(GoughError, ValueError):
 
 def schema() -> str:
     """The ROS 2 message definition of a cycle."""
-    lines = []
+    text = ""
     for name, kind, shape, note in RECORD_FIELDS:
         count = f"[{int(np.prod(shape))}]" if shape else ""
-        lines.append(f"{_CDR_TYPES[kind]}{count} {name}  # {note}\n")
-    return "".join(lines)
+        text += f"{_CDR_TYPES[kind]}{count} {name}  # {note}\n"
+    return text
 
 
 def _layout(definition: str) -> list[str]:
-    """The lines of a message definition without its comments."""
     return [line.partition("#")[0].strip() for line in definition.splitlines()]
 
 
@@ -69,7 +67,7 @@ class Recorder:
     def __init__(self, path: Path, header: Mapping[str, Any], epoch_ns: int) -> None:
         self._file = path.open("wb")
         self._epoch = epoch_ns
-        self._writer = Writer(self._file, chunk_size=_MOST_BYTES)
+        self._writer: Any = Writer(self._file, chunk_size=_MOST_BYTES)
         self._writer.start(library=f"gough {header['config']['version']}")
         self._cycles = self._channel(_CYCLE_TOPIC, _CYCLE_SCHEMA, schema())
         self._events = self._channel(_EVENT_TOPIC, "gough/Event", _EVENT_SCHEMA)
@@ -86,29 +84,28 @@ class Recorder:
         return int(self._writer.register_channel(topic, "cdr", number))
 
     def flush(self) -> None:
-        """Complete the chunk, so that everything written until now is in the file, whatever happens."""
-        flush: Any = self._writer.flush
-        flush()
+        """Complete the chunk, so that all of it is in the file, whatever happens."""
+        self._writer.flush()
         self._file.flush()
 
     def write(self, records: Record) -> None:
         """Append records (n,), dtype `RECORD`, and their events."""
         self.write_cycles(records)
-        times = self._epoch + records["time_ns"]
         eventful = (records["missed"] > 0) | (records["event_count"] > 0)
         for name, before in self._last.items():
             eventful |= np.diff(records[name], prepend=before) != 0
-        for i in np.flatnonzero(eventful).tolist():
-            for text in self._events_of(records[i]):
-                self.write_event(int(records["cycle"][i]), text, int(times[i]))
+        for record in records[eventful]:
+            for text in self._news(record):
+                self.write_event(int(record["cycle"]), text, self._epoch + int(record["time_ns"]))
 
     def write_cycles(self, records: Record) -> None:
         """Append records (n,) alone."""
-        times = (self._epoch + records["time_ns"]).tolist()
-        for i, at in enumerate(times):
-            self._writer.add_message(self._cycles, at, _LITTLE_ENDIAN_CDR + records[i].tobytes(), at, int(records["cycle"][i]))
+        for record in records:
+            at = self._epoch + int(record["time_ns"])
+            self._writer.add_message(self._cycles, at, _LITTLE_ENDIAN_CDR + record.tobytes(), at, int(record["cycle"]))
 
-    def _events_of(self, record: Record) -> Iterator[str]:
+    def _news(self, record: Record) -> Iterator[str]:
+        """The events of a cycle, and what has changed since the last eventful one."""
         if record["missed"] > 0:
             yield f"{record['missed']} periods missed"
         yield from events_of(record)
@@ -116,11 +113,8 @@ class Recorder:
         if self._last["imus"] >= 0 and magnetometer != self._last["imus"] >> IMU_COUNT & 1:
             yield f"the magnetometer is {'used again' if magnetometer else 'left out: it is lost, frozen or disturbed'}"
         if trusted != self._last["trusted"]:
-            yield (
-                "the whole-mechanism filter is relied upon"
-                if trusted
-                else "the whole-mechanism filter is not relied upon: the leg filters disagree with it"
-            )
+            how = "relied upon" if trusted else "not relied upon: the leg filters disagree with it"
+            yield f"the whole-mechanism filter is {how}"
         self._last = {"imus": int(record["imus"]), "trusted": trusted}
 
     def write_event(self, cycle: int, text: str, time_ns: int | None = None) -> None:
@@ -132,8 +126,7 @@ class Recorder:
 
     def close(self) -> None:
         """Complete the file with its index."""
-        finish: Any = self._writer.finish
-        finish()
+        self._writer.finish()
         self._file.close()
 
 
@@ -178,28 +171,25 @@ def record(path: Path, header: Mapping[str, Any], records: Record, link: NDArray
         if os.getppid() != supervisor:
             return
     recorder = Recorder(path, header, time.time_ns() - time.monotonic_ns() + int(link[Link.START]))
-    tail, before = int(link[Link.TAIL]), int(link[Link.KEPT])
-    count, flushed = 0, time.monotonic()
-    while True:
+    tail, kept, flushed = int(link[Link.TAIL]), int(link[Link.KEPT]), time.monotonic()
+    ended = False
+    while not ended:
+        time.sleep(_POLL_S)
         done = bool(link[Link.DONE]) or (os.getppid() != supervisor and _has_ended(link))
         taken, tail, lost = take(records, link, tail)
         if lost:
             recorder.write_event(tail, f"{lost} cycles lost: the recorder came too late")
         recorder.write(taken)
-        count += len(taken)
+        kept += len(taken)
         ended = done and tail == link[Link.HEAD]
         if ended or time.monotonic() - flushed > _CHUNK_S:
             recorder.flush()
-            link[Link.KEPT], link[Link.TAIL] = before + count, tail
+            link[Link.KEPT], link[Link.TAIL] = kept, tail
             flushed = time.monotonic()
-        if ended:
-            break
-        time.sleep(_POLL_S)
     recorder.close()
 
 
 def _has_ended(link: NDArray[np.int64]) -> bool:
-    """Whether the loop has stopped writing, once the supervisor is gone and cannot say so."""
     head = int(link[Link.HEAD])
     time.sleep(1.0)
     return head == int(link[Link.HEAD])
@@ -207,24 +197,14 @@ def _has_ended(link: NDArray[np.int64]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """The content of a file.
+    """The content of a file."""
 
-    Attributes:
-        config: what was run.
-        arrays: what a replay needs, by name.
-        records: (N,), dtype `RECORD`.
-        events: cycle and text of each.
-        epoch_ns: Unix time of the first deadline [ns].
-        complete: whether the file was closed; if not, it ends with the last chunk that was written.
-        path: of the file.
-    """
-
-    config: dict[str, Any]
-    arrays: dict[str, Record]
-    records: Record
-    events: list[tuple[int, str]]
-    epoch_ns: int
-    complete: bool
+    config: dict[str, Any]  # what was run
+    arrays: dict[str, Record]  # what a replay needs, by name
+    records: Record  # (N,), dtype `RECORD`
+    events: list[tuple[int, str]]  # cycle and text of each
+    epoch_ns: int  # Unix time of the first deadline [ns]
+    complete: bool  # else it was not closed, and ends with its last whole chunk
     path: Path
 
     @property
@@ -250,10 +230,11 @@ def read(path: Path | str) -> Recording:
     events: list[tuple[int, str]] = []
     topics: dict[int, str] = {}
     digests: dict[str, str] = {}
-    layout, epoch, complete = "", 0, True
+    layout, began, complete = "", 0, False
     try:
         for item in _items(path):
             if isinstance(item, Footer):
+                complete = True
                 break
             if isinstance(item, Schema) and item.name == _CYCLE_SCHEMA:
                 layout = item.data.decode()
@@ -267,13 +248,11 @@ def read(path: Path | str) -> Recording:
                     arrays[name] = np.load(io.BytesIO(item.data))
             elif isinstance(item, Message) and topics[item.channel_id] == _CYCLE_TOPIC:
                 if not cycles:
-                    epoch = item.log_time - int(np.frombuffer(item.data[len(_LITTLE_ENDIAN_CDR) :], RECORD)[0]["time_ns"])
+                    began = item.log_time
                 cycles += item.data[len(_LITTLE_ENDIAN_CDR) :]
             elif isinstance(item, Message):
                 text = item.data[len(_LITTLE_ENDIAN_CDR) :]
                 events.append((int.from_bytes(text[:8], "little", signed=True), text[12:-1].decode()))
-        else:
-            complete = False
     except FileNotFoundError:
         raise RecordingError(f"there is no recording at {path}") from None
     except IsADirectoryError:
@@ -284,7 +263,7 @@ def read(path: Path | str) -> Recording:
         raise
     except Exception:
         # Whatever the decoder raises for the part after the last whole chunk.
-        complete = False
+        pass
     if config is None:
         raise RecordingError(f"{path} is no recording of gough")
     if (layout or cycles) and _layout(layout) != _layout(schema()):
@@ -292,7 +271,9 @@ def read(path: Path | str) -> Recording:
             f"{path} was recorded by gough {config.get('version')}, whose records have another layout than those of this gough "
             f"{version('gough')}: read it with the version that recorded it"
         )
-    return Recording(config, arrays, np.frombuffer(cycles, RECORD), events, epoch, complete, Path(path))
+    records: Record = np.frombuffer(cycles, RECORD)
+    epoch = began - int(records["time_ns"][0]) if len(records) else 0
+    return Recording(config, arrays, records, events, epoch, complete, Path(path))
 
 
 def _items(path: Path | str) -> Iterator[Any]:
@@ -301,11 +282,7 @@ def _items(path: Path | str) -> Iterator[Any]:
 
 
 def repair(path: Path) -> bool:
-    """Complete a file that was cut short, in place; returns whether it was.
-
-    Raises:
-        RecordingError: as `read`.
-    """
+    """Complete a file that was cut short, in place; returns whether it was. Raises as `read`."""
     recording = read(path)
     if recording.complete:
         return False
@@ -322,8 +299,10 @@ def repair(path: Path) -> bool:
     return True
 
 
-def read_run(paths: Sequence[Path | str]) -> list[Recording]:
-    """Read the consecutive files of one run, and sort them.
+def read_run(paths: Sequence[Path | str]) -> tuple[list[Recording], Record]:
+    """Read the consecutive files of one run: the recordings in their order, and all records.
+
+    Each record comes once, although the last ones before a recorder dies may be in the next file again.
 
     Raises:
         RecordingError: as `read`; or the files are of different runs, hold no cycle, or lack the first one.
@@ -332,19 +311,10 @@ def read_run(paths: Sequence[Path | str]) -> list[Recording]:
     where = ", ".join(map(str, paths))
     if any(each.config != recordings[0].config for each in recordings):
         raise RecordingError(f"{where} are of different runs: give the files of one")
-    records = joined(recordings)
+    records = np.concatenate([each.records for each in recordings])
+    records = records[np.diff(np.maximum.accumulate(records["cycle"]), prepend=-1) > 0]
     if not len(records):
         raise RecordingError(f"{where} holds no cycle: the run ended before its first one, or it is damaged")
     if records["cycle"][0] != 0:
         raise RecordingError(f"{where} does not begin with the first cycle of its run: give all of its files")
-    return recordings
-
-
-def joined(recordings: Iterable[Recording]) -> Record:
-    """The records of consecutive files, each once: a recorder's last ones before it dies may be in the next file again."""
-    parts: list[Record] = []
-    last = -1
-    for each in recordings:
-        parts.append(each.records[each.records["cycle"] > last])
-        last = max([last, *each.records["cycle"][-1:].tolist()])
-    return np.concatenate(parts)
+    return recordings, records

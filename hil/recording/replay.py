@@ -12,37 +12,29 @@ from controller.cycle import MARKS, PARAMETERS, STATE, cycle, hear_rig, prepare_
 from controller.planning import STREAM_TARGET
 from controller.safety.causes import Cause
 from controller.safety.stop import ramp_down
+from hil.loop.kernels import record_state
 from hil.loop.records import RECORD
-from hil.recording.mcap import RecordingError, joined, read_run
+from hil.recording.mcap import RecordingError, read_run
 from plant.compiled import Record, kernel
 from plant.dynamics.variables import IMU_COUNT
 from plant.pose import Array
 
 COMPARED = ("position", "rotation", "lengths", "reference", "command", "conditioning", "mode", "stop")
+"""What must come out the same, by its name in `RECORD`."""
 
 
 @dataclass(frozen=True)
 class Replay:
-    """How a replay compares with its recording.
+    """How a replay compares with its recording."""
 
-    Attributes:
-        cycles: number of cycles that were replayed.
-        recorded: number of cycles in the files.
-        missing_after: the cycle before the first gap, at which the replay ends; None without a gap.
-        different: the first cycle that differs, None if none does.
-        fields: what differs in that cycle, by name: recorded and replayed.
-        recorded_by, replayed_by: versions of gough.
-        cut_short: files that were not closed.
-    """
-
-    cycles: int
-    recorded: int
-    missing_after: int | None
-    different: int | None
-    fields: dict[str, tuple[list[float], list[float]]]
-    recorded_by: str
+    cycles: int  # that were replayed
+    recorded: int  # cycles in the files
+    missing_after: int | None  # the cycle before the first gap, where the replay ends
+    different: int | None  # the first cycle that differs
+    fields: dict[str, tuple[list[float], list[float]]]  # what differs in it, by name: recorded and replayed
+    recorded_by: str  # version of gough
     replayed_by: str
-    cut_short: tuple[str, ...]
+    cut_short: tuple[str, ...]  # files that were not closed
 
     @property
     def same(self) -> bool:
@@ -74,11 +66,11 @@ def replay(paths: Sequence[Path | str]) -> Replay:
         RecordingError: as `read_run`; a file's beginning is damaged; or another version recorded it, whose cycle has other
             parameters.
     """
-    recordings = read_run(paths)
+    recordings, records = read_run(paths)
     for each in recordings:
         if {"parameters", "reference"} - set(each.arrays):
             raise RecordingError(f"{each.path} lacks what a replay needs: its beginning is damaged")
-    first, records = recordings[0], joined(recordings)
+    first = recordings[0]
     parameters, segments = first.arrays["parameters"], first.arrays["reference"]
     if parameters.dtype != PARAMETERS:
         raise RecordingError(
@@ -90,18 +82,15 @@ def replay(paths: Sequence[Path | str]) -> Replay:
     constants[()] = parameters
     again = np.zeros(len(records), RECORD)
     streamed = str(first.config.get("target")).partition(":")[0] == STREAM_TARGET
-    measurement = np.zeros((3, IMU_COUNT, 3))
-    count = int(
-        _replay(constants, np.zeros((), STATE), segments, records, again, measurement, np.zeros((), MARKS)[()], streamed)
-    )
-    differs = [np.any(_bits(records[name][:count]) != _bits(again[name][:count]), axis=1) for name in COMPARED]
-    rows = np.flatnonzero(np.any(differs, axis=0))
+    count = int(_replay(constants, np.zeros((), STATE), segments, records, again, np.zeros((), MARKS)[()], streamed))
+    differs = {name: np.any(_bits(records[name][:count]) != _bits(again[name][:count]), axis=1) for name in COMPARED}
+    rows = np.flatnonzero(np.any([*differs.values()], axis=0))
     different, fields = None, {}
     if len(rows):
         row = int(rows[0])
         different = int(records["cycle"][row])
-        for name, unequal in zip(COMPARED, differs, strict=True):
-            if unequal[row]:
+        for name in COMPARED:
+            if differs[name][row]:
                 fields[name] = (np.ravel(records[name][row]).tolist(), np.ravel(again[name][row]).tolist())
     return Replay(
         cycles=count,
@@ -123,13 +112,12 @@ def _bits(values: Array) -> Any:
 
 @kernel
 def _replay(
-    parameters: Record, state: Record, segments: Array, records: Record, again: Record, measurement: Array, marks: Record,
-    streamed: bool,
-) -> int:  # fmt: skip
+    parameters: Record, state: Record, segments: Array, records: Record, again: Record, marks: Record, streamed: bool
+) -> int:
     """Run the cycle on the raw data of records (n,); returns the number of cycles before the first gap."""
-    p, s = parameters[()], state[()]
+    p, s, measurement = parameters[()], state[()], np.zeros((3, IMU_COUNT, 3))
     for k in range(records.shape[0]):
-        recorded, found = records[k], again[k]
+        recorded = records[k]
         if recorded.cycle != s.time.cycle + recorded.missed:
             return k
         skip_periods(state, recorded.missed)
@@ -152,12 +140,6 @@ def _replay(
         else:
             hear_rig(parameters, state, recorded.sample_age, recorded.drive, recorded.silent)
             cycle(parameters, state, measurement, segments, marks)
-        found.position[:] = s.pose.position
-        found.rotation[:] = s.pose.rotation
-        found.lengths[:] = s.pose.lengths
-        found.reference[:] = s.reference.motion
-        found.command[:] = s.pid.command
-        found.conditioning = s.pose.conditioning
-        found.mode, found.stop = s.safety.mode, s.safety.stop.cause
+        record_state(state, again[k])
         prepare_next(parameters, state, segments)
     return len(records)

@@ -7,7 +7,7 @@ import numpy as np
 
 from controller.safety.causes import Cause
 from hil.loop.records import RECORD
-from hil.recording.mcap import RecordingError, joined, read_run
+from hil.recording.mcap import RecordingError, read_run
 from hil.rigs import ANSWERED, SILENT, Identity, RigError
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
@@ -15,9 +15,8 @@ from plant.mechanism import Mechanism
 from plant.pose import Array
 
 ENDED, FAILED = 2, 3
-"""Statuses of an exchange: the recording has ended; the rig failed when it was recorded."""
-
 _FAILURES = {ENDED: "the recording has come to its end", FAILED: "it did so when it was recorded"}
+"""Statuses of an exchange that fails, and why."""
 
 
 class ReplayRig:
@@ -33,7 +32,6 @@ class ReplayRig:
 
     Attributes:
         command_delay: of the recorded rig [s], once this one is open.
-        failure: why an exchange has failed.
     """
 
     def __init__(self, path: Path | str | Sequence[Path | str], period: float, mechanism: Mechanism | None = None) -> None:
@@ -47,17 +45,12 @@ class ReplayRig:
         self._cycle = 0
 
     def open(self) -> None:
-        """Read the recording.
-
-        Raises:
-            RigError: there is none, or its rate, mechanism or run is another.
-        """
+        """Read the recording; a `RigError` if there is none, or its rate, mechanism or run is another."""
         try:
-            recordings = read_run(self._paths)
+            (first, *_), records = read_run(self._paths)
         except RecordingError as error:
             raise RigError(str(error)) from None
-        where = ", ".join(map(str, self._paths))
-        config, records = recordings[0].config, joined(recordings)
+        where, config = ", ".join(map(str, self._paths)), first.config
         rate = float(config["rate"])
         if abs(rate * self._period - 1.0) > 1e-9:
             raise RigError(
@@ -71,17 +64,13 @@ class ReplayRig:
         self._rows[records["cycle"]] = np.arange(len(records))
         self._numbers = np.cumsum(records["sample_age"] == 0, axis=0)
         self._cycle, self.failure = 0, ""
-        if "parameters" in recordings[0].arrays:
-            self.command_delay = float(recordings[0].constant("load", "command_delay"))
-        parts = {"rig": str(config.get("rig")), "run": str(config.get("run")), "recorded by": f"gough {recordings[0].version}"}
+        if "parameters" in first.arrays:
+            self.command_delay = float(first.constant("load", "command_delay"))
+        parts = {"rig": str(config.get("rig")), "run": str(config.get("run")), "recorded by": f"gough {first.version}"}
         self._identity = Identity(f"recording {where}", parts)
 
     def identify(self) -> Identity:
-        """The recorded run.
-
-        Raises:
-            RigError: it is not open.
-        """
+        """The recorded run; a `RigError` if it is not open."""
         if self._identity is None:
             raise RigError("the recording is not open: open it first")
         return self._identity
@@ -92,11 +81,10 @@ class ReplayRig:
     def exchange(self, command: Array, request: int, feedback: Record) -> int:
         """Return the recording of the next period, as `Rig` describes."""
         del command, request
-        cycle = self._cycle
-        self._cycle += 1
-        if cycle >= len(self._rows):
+        if self._cycle >= len(self._rows):
             return self._fail(ENDED)
-        row = self._rows[cycle]
+        row = self._rows[self._cycle]
+        self._cycle += 1
         if row < 0:
             return SILENT
         record, measurement = self._records[row], feedback["measurement"]

@@ -78,9 +78,9 @@ def test_files_of_one_run_come_in_order_and_others_are_refused(tmp_path):
     later["cycle"] += 40
     recorder.write_cycles(later)
     recorder.close()
-    run = read_run([second, first])
+    run, joined = read_run([second, first])
     assert [each.path for each in run] == [first, second]
-    assert mcap.joined(run)["cycle"].tolist() == list(range(90))
+    assert joined["cycle"].tolist() == list(range(90))
     with pytest.raises(RecordingError, match="are of different runs"):
         read_run([first, other])
     with pytest.raises(RecordingError, match="does not begin with the first cycle"):
