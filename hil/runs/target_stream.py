@@ -15,12 +15,13 @@ import select
 import socket
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from statistics import median
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from controller.planning.stream import CAUSE, CYCLE, END_PLANNER, SEEN, STREAM, TAKEN, fail_stream, note_sample, publish_plan
 from controller.planning.stream_planner import Plan, StreamPlanner, TargetRefusedError
@@ -34,21 +35,11 @@ from plant.mechanism import Mechanism
 from plant.pose import Array, quaternion_from_rotation
 
 HOST, PORT = "127.0.0.1", 47200
-MAGIC, VERSION = int.from_bytes(b"GGHT", "little"), 1
 
-TARGET_DATAGRAM = np.dtype(
-    [
-        ("magic", np.uint32),
-        ("version", np.uint16),
-        ("sequence", np.uint32),
-        ("time_ns", np.uint64),
-        ("displacement", np.float64, 3),
-        ("quaternion", np.float64, 4),
-        ("crc", np.uint32),
-    ]
-)
-DATAGRAM_BYTES = TARGET_DATAGRAM.itemsize
-_SEQUENCES = 1 << 32
+_HEAD = [("magic", "u4"), ("version", "u2"), ("sequence", "u4"), ("time_ns", "u8")]
+TARGET_DATAGRAM = np.dtype([*_HEAD, ("displacement", "f8", 3), ("quaternion", "f8", 4), ("crc", "u4")])
+_NUMBERS = 1 << 32
+_KIND = {"magic": int.from_bytes(b"GGHT", "little"), "version": 1}
 
 LEAD_S = 0.01
 """How long before its start a plan is made: the delay that planner and loop together may have [s]."""
@@ -61,34 +52,22 @@ _CLOCK_SAMPLES = 15
 """Number of samples over which the sender's clock is compared with the motion's time, against the network's jitter."""
 
 _BATCH = 64
+_JUMP_M = 0.05
 
 
 class StreamError(GoughError, OSError):
     """The network refuses what a stream needs."""
 
 
-class Sample(NamedTuple):
-    """A pose of the target: number, time on the sender's clock [ns], displacement (3,) [m], quaternion (4,), w first."""
-
-    sequence: int
-    time_ns: int
-    displacement: tuple[float, ...]
-    quaternion: tuple[float, ...]
+def encode(number: int, time_ns: int, displacement: ArrayLike, quaternion: ArrayLike) -> bytes:
+    """The datagram of a pose; its number wraps."""
+    pose = {"displacement": displacement, "quaternion": quaternion}
+    return datagrams.encode(TARGET_DATAGRAM, **_KIND, sequence=number % _NUMBERS, time_ns=time_ns, **pose)
 
 
-def encode(sample: Sample) -> bytes:
-    """The datagram of a sample."""
-    fields = sample._asdict() | {"sequence": sample.sequence % _SEQUENCES}
-    return datagrams.encode(TARGET_DATAGRAM, magic=MAGIC, version=VERSION, **fields)
-
-
-def decode(content: bytes) -> Sample | None:
-    """The sample of a datagram; None if it is malformed, damaged, or of another version."""
-    datagram = datagrams.decode(TARGET_DATAGRAM, content, magic=MAGIC, version=VERSION)
-    if datagram is None:
-        return None
-    displacement, quaternion = tuple(datagram["displacement"].tolist()), tuple(datagram["quaternion"].tolist())
-    return Sample(int(datagram["sequence"]), int(datagram["time_ns"]), displacement, quaternion)
+def decode(content: bytes) -> Record | None:
+    """The pose (dtype `TARGET_DATAGRAM`) of a datagram; None if it is malformed, damaged, or of another version."""
+    return datagrams.decode(TARGET_DATAGRAM, content, **_KIND)
 
 
 def open_socket(host: str = HOST, port: int = PORT) -> socket.socket:
@@ -105,34 +84,29 @@ def open_socket(host: str = HOST, port: int = PORT) -> socket.socket:
     return receiver
 
 
-def receive(
-    stream: Record,
-    planner: StreamPlanner,
-    receiver: socket.socket,
-    period: float,
-    lead: float = LEAD_S,
-    ended: Callable[[], bool] = lambda: False,
-) -> None:
+def receive(stream: Record, planner: StreamPlanner, receiver: socket.socket, period: float) -> None:
     """Receive a stream and plan, until `END_PLANNER` is set or the parent process has ended; the body of a process.
 
     A sample that cannot be followed fails the stream for good: planning ends, and the last plan ends at rest.
 
     Args:
-        stream: dtype `controller.planning.stream.STREAM`, shared with the loop.
+        stream: dtype `STREAM`, shared with the loop.
         planner: at the lengths at which the loop's reference rests.
         receiver: from `open_socket`.
         period: of a cycle [s].
-        lead: how long before its start a plan is made [s].
-        ended: whether to end for another reason.
     """
     parent = os.getppid()
-    _load_kernels()
-    reception = Reception(stream, planner, period, lead)
-    while not (stream["shared"][END_PLANNER] or ended() or os.getppid() != parent):
+    # Loads the kernels before the first sample arrives.
+    scratch = np.zeros((), STREAM)
+    publish_plan(scratch, np.zeros(STREAM["plans"].shape[1:]), 0.0, 0)
+    note_sample(scratch, 1)
+    fail_stream(scratch, Cause.NONE, 0, 0.0, 0.0)
+    reception = Reception(stream, planner, period)
+    while not (stream["shared"][END_PLANNER] or os.getppid() != parent):
         select.select([receiver], [], [], _SETTLE_S if reception.waits else _POLL_S)
         for _ in range(_BATCH):
             try:
-                datagram, sender = receiver.recvfrom(DATAGRAM_BYTES + 1)
+                datagram, sender = receiver.recvfrom(TARGET_DATAGRAM.itemsize + 1)
             except BlockingIOError:
                 break
             except OSError:
@@ -142,24 +116,15 @@ def receive(
         reception.plan()
 
 
-def _load_kernels() -> None:
-    """Run the kernels once on scratch, so that none has to be loaded or compiled when a sample arrives."""
-    scratch = np.zeros((), STREAM)
-    publish_plan(scratch, np.zeros(STREAM["plans"].shape[1:]), 0.0, 0)
-    note_sample(scratch, 1)
-    fail_stream(scratch, Cause.NONE, 0, 0.0, 0.0)
-
-
 class Reception:
-    """State of the receiver: the sender, the last sample, the sender's clock, and the plan that the loop may still take."""
+    """The sender, its last sample and its clock, and the plan that the loop may still take."""
 
-    def __init__(self, stream: Record, planner: StreamPlanner, period: float, lead: float) -> None:
+    def __init__(self, stream: Record, planner: StreamPlanner, period: float) -> None:
         self._stream, self._planner, self._period = stream, planner, period
         self._shared = stream["shared"]
-        self._lead = math.ceil(lead / period - 1e-9)
+        self._lead = math.ceil(LEAD_S / period - 1e-9)
         self._sender: object = None
-        self._last: Sample | None = None
-        self._first, self._at = 0, 0.0
+        self._number, self._time_ns, self._first_ns, self._at = 0, 0, 0, 0.0
         self._offsets: deque[float] = deque(maxlen=_CLOCK_SAMPLES)
         self._pending: tuple[int, Plan] | None = None
         self._fresh = False
@@ -171,29 +136,29 @@ class Reception:
 
     def take(self, datagram: bytes, sender: object) -> None:
         """Check a datagram, and keep its sample."""
-        stream, sample = self._stream, decode(datagram)
-        if sample is None:
+        stream, pose = self._stream, decode(datagram)
+        if pose is None:
             stream["malformed"] += 1
             return
-        if self._last is not None:
-            if sender != self._sender:
-                stream["strange"] += 1
-                return
-            newer = 0 < (sample.sequence - self._last.sequence) % _SEQUENCES < _SEQUENCES // 2
-            if not (newer and sample.time_ns > self._last.time_ns):
-                stream["stale"] += 1
-                return
+        number, time_ns, first = int(pose["sequence"]), int(pose["time_ns"]), self._sender is None
+        if not first and sender != self._sender:
+            stream["strange"] += 1
+            return
+        newer = 0 < (number - self._number) % _NUMBERS < _NUMBERS // 2 and time_ns > self._time_ns
+        if not first and not newer:
+            stream["stale"] += 1
+            return
         if self._shared[CAUSE] != Cause.NONE:
             return
-        if self._last is None:
-            self._first = sample.time_ns
-        at = 1e-9 * (sample.time_ns - self._first)
+        if first:
+            self._first_ns = time_ns
+        at = 1e-9 * (time_ns - self._first_ns)
         try:
-            self._planner.add(at, sample.displacement, sample.quaternion)
+            self._planner.add(at, pose["displacement"], pose["quaternion"])
         except TargetRefusedError as refusal:
             fail_stream(stream, refusal.cause, refusal.index, refusal.value, refusal.limit)
             return
-        self._sender, self._last, self._at, self._fresh = sender, sample, at, True
+        self._sender, self._number, self._time_ns, self._at, self._fresh = sender, number, time_ns, at, True
         cycle = int(self._shared[CYCLE])
         if cycle == 0:
             # The motion's time does not run before its start.
@@ -226,14 +191,11 @@ class Reception:
 
 @dataclass(frozen=True)
 class Faults:
-    """Faults of a sender on purpose, each from a time of its motion on [s]: silence, a jump by 5 cm, NaN."""
+    """Faults of a sender on purpose, each from a time of its motion on [s]."""
 
-    stop_at: float = math.inf
-    jump_at: float = math.inf
-    nan_at: float = math.inf
-
-
-_JUMP_M = 0.05
+    stop_at: float = math.inf  # silence
+    jump_at: float = math.inf  # a jump up by 5 cm
+    nan_at: float = math.inf  # NaN
 
 
 def send_target(
@@ -264,30 +226,24 @@ def send_target(
         raise InputError(f"the rate is {rate:g} Hz; it must be positive and at most 10000: choose another")
     if not 0.0 < duration < math.inf:
         raise InputError(f"the duration is {duration:g} s; it must be positive and finite")
+    home, faults = mechanism.require_home(), faults or Faults()
     times = np.arange(math.floor(duration * rate) + 1) / rate
-    displacements, quaternions = _streamed(mechanism, target, times, faults or Faults())
+    times = times[times < faults.stop_at]
+    positions, rotations = target.at(times)
+    displacements, quaternions = positions - home.position, quaternion_from_rotation(rotations @ home.rotation.T)
+    displacements[times >= faults.jump_at] += [0.0, 0.0, _JUMP_M]
+    displacements[times >= faults.nan_at] = np.nan
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         with socket.socket(family, socket.SOCK_DGRAM) as sender:
-            return _send(sender, address, rate, displacements, quaternions)
+            return _send(sender, address, rate, zip(displacements, quaternions, strict=True))
     except (OSError, OverflowError) as error:
         raise StreamError(f"cannot send a target to {host}:{port}: {error}: choose another address or port") from None
 
 
-def _streamed(mechanism: Mechanism, target: Target, times: Array, faults: Faults) -> tuple[Array, Array]:
-    """Displacements (n, 3) and quaternions (n, 4) from home at times (n,), with the faults."""
-    home = mechanism.require_home()
-    times = times[times < faults.stop_at]
-    positions, rotations = target.at(times)
-    displacements = positions - home.position
-    displacements[times >= faults.jump_at] += [0.0, 0.0, _JUMP_M]
-    displacements[times >= faults.nan_at] = np.nan
-    return displacements, quaternion_from_rotation(rotations @ home.rotation.T)
-
-
-def _send(sender: socket.socket, address: tuple[Any, ...], rate: float, displacements: Array, quaternions: Array) -> int:
+def _send(sender: socket.socket, address: Any, rate: float, poses: Iterable[tuple[Array, Array]]) -> int:
     began, sent = time.monotonic_ns(), 0
-    for k, (displacement, quaternion) in enumerate(zip(displacements.tolist(), quaternions.tolist(), strict=True)):
+    for k, pose in enumerate(poses):
         due = began + round(1e9 * k / rate)
         late = time.monotonic_ns() - due
         if late > 1e9 / rate:
@@ -295,9 +251,8 @@ def _send(sender: socket.socket, address: tuple[Any, ...], rate: float, displace
             continue
         if late < 0:
             time.sleep(-1e-9 * late)
-        datagram = encode(Sample(k, due, tuple(displacement), tuple(quaternion)))
         try:
-            sender.sendto(datagram, address)
+            sender.sendto(encode(k, due, *pose), address)
         except ConnectionRefusedError:
             # Nobody listens yet, or nobody listens any more.
             continue

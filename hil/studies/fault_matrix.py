@@ -26,7 +26,7 @@ from hil.rigs.udp.link import new_link
 from hil.rigs.udp.rig import TIMEOUT_SHARE
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import PreparedLoop, prepared_loop
-from hil.runs.target_stream import LEAD_S, Reception, Sample, encode
+from hil.runs.target_stream import Reception, encode
 from hil.table import Table
 from plant.compiled import Record
 from plant.mechanism import LEGS
@@ -256,7 +256,7 @@ def _follow_stream(loop: PreparedLoop, what: str, onset: int) -> None:
     target, mechanism, hold = loop.target, loop.mechanism, int(loop.parameters["rig"]["hold_cycles"])
     home, start = mechanism.require_home(), leg_lengths(mechanism, target.start.position, target.start.rotation)
     loop.stream, loop.segments = np.zeros((), STREAM), rest(start)
-    reception = Reception(loop.stream, StreamPlanner(mechanism, start), 1.0 / RATE_HZ, LEAD_S)
+    reception = Reception(loop.stream, StreamPlanner(mechanism, start), 1.0 / RATE_HZ)
     for n, cycle in enumerate(range(hold + _SAMPLE_CYCLES - hold % _SAMPLE_CYCLES, onset + 1, _SAMPLE_CYCLES)):
         loop.run(cycle)
         time = (cycle - hold) / RATE_HZ
@@ -266,8 +266,8 @@ def _follow_stream(loop: PreparedLoop, what: str, onset: int) -> None:
             if what == "stops":
                 return
             displacement = displacement + (0.012 if what == "jumps" else np.nan) * np.array([0.0, 0.0, 1.0])
-        sample = Sample(n, round(1e9 * time), tuple(displacement), tuple(quaternion_from_rotation(rotation @ home.rotation.T)))
-        reception.take(encode(sample), "here")
+        quaternion = quaternion_from_rotation(rotation @ home.rotation.T)
+        reception.take(encode(n, round(1e9 * time), displacement, quaternion), "here")
         note_sample(loop.stream, int(loop.clock["woke"]))
         reception.plan()
 

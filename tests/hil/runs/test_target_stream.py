@@ -18,9 +18,8 @@ from controller.planning.target import load_target
 from controller.safety.causes import Cause
 from hil.loop.records import shared_array
 from hil.runs.target_stream import (
-    DATAGRAM_BYTES,
+    TARGET_DATAGRAM,
     Faults,
-    Sample,
     StreamError,
     decode,
     encode,
@@ -150,15 +149,15 @@ def test_malformed_stale_repeated_and_strange_datagrams_are_counted_and_refused(
     with receiving(hexapod) as (stream, port), socket.socket(type=socket.SOCK_DGRAM) as ours:
         ours.connect(("127.0.0.1", port))
         # The sequence wraps round.
-        ours.send(encode(Sample(2**32 - 2, 1_000_000_000, HERE, LEVEL)))
-        ours.send(encode(Sample(2**32 - 1, 1_010_000_000, HERE, LEVEL)))
-        ours.send(encode(Sample(2**32, 1_020_000_000, HERE, LEVEL)))
+        ours.send(encode(2**32 - 2, 1_000_000_000, HERE, LEVEL))
+        ours.send(encode(2**32 - 1, 1_010_000_000, HERE, LEVEL))
+        ours.send(encode(2**32, 1_020_000_000, HERE, LEVEL))
         wait_for(lambda: stream["accepted"] == 3)
         for sequence, at in ((0, 1_030_000_000), (2**32 - 1, 1_030_000_000), (1, 1_020_000_000)):
-            ours.send(encode(Sample(sequence, at, HERE, LEVEL)))
+            ours.send(encode(sequence, at, HERE, LEVEL))
         wait_for(lambda: stream["stale"] == 3)
-        good = encode(Sample(1, 1_030_000_000, HERE, LEVEL))
-        for bad in (b"", good[:-1], good + b"\0", bytes(DATAGRAM_BYTES), good[:20] + b"\x55" + good[21:], 50_000 * b"x"):
+        good = encode(1, 1_030_000_000, HERE, LEVEL)
+        for bad in (b"", good[:-1], good + b"\0", bytes(len(good)), good[:20] + b"\x55" + good[21:], 50_000 * b"x"):
             ours.send(bad)
         wait_for(lambda: stream["malformed"] == 6)
         with socket.socket(type=socket.SOCK_DGRAM) as other:
@@ -168,9 +167,9 @@ def test_malformed_stale_repeated_and_strange_datagrams_are_counted_and_refused(
         ours.send(good)
         wait_for(lambda: stream["accepted"] == 4)
         assert stream["shared"][CAUSE] == Cause.NONE
-        ours.send(encode(Sample(2, 1_040_000_000, (0.0, 0.0, 0.4), LEVEL)))
+        ours.send(encode(2, 1_040_000_000, (0.0, 0.0, 0.4), LEVEL))
         wait_for(lambda: stream["shared"][CAUSE] == Cause.BEYOND_STROKE)
-        ours.send(encode(Sample(3, 1_050_000_000, HERE, LEVEL)))
+        ours.send(encode(3, 1_050_000_000, HERE, LEVEL))
         time.sleep(0.1)
         assert stream["accepted"] == 4
 
@@ -178,7 +177,7 @@ def test_malformed_stale_repeated_and_strange_datagrams_are_counted_and_refused(
 def test_a_loop_that_does_not_look_gets_no_second_plan(hexapod):
     with receiving(hexapod) as (stream, port), socket.socket(type=socket.SOCK_DGRAM) as ours:
         for k in range(20):
-            ours.sendto(encode(Sample(k, 10_000_000 * k, (0.0, 0.0, 1e-3 * k), LEVEL)), ("127.0.0.1", port))
+            ours.sendto(encode(k, 10_000_000 * k, (0.0, 0.0, 1e-3 * k), LEVEL), ("127.0.0.1", port))
         wait_for(lambda: stream["accepted"] == 20)
         time.sleep(0.1)
         assert stream["planned"] == 1 and stream["shared"][TAKEN] == 0
@@ -188,11 +187,13 @@ def test_a_loop_that_does_not_look_gets_no_second_plan(hexapod):
 
 
 def test_a_datagram_is_what_was_packed():
-    sample = Sample(7, 123_456_789_012, (0.1, -0.2, 0.3), (0.5, -0.5, 0.5, -0.5))
-    datagram = encode(sample)
-    assert len(datagram) == DATAGRAM_BYTES == 78
+    packed = (7, 123_456_789_012, (0.1, -0.2, 0.3), (0.5, -0.5, 0.5, -0.5))
+    datagram = encode(*packed)
+    assert len(datagram) == TARGET_DATAGRAM.itemsize == 78
     assert datagram[:6] == b"GGHT\x01\x00"
-    assert decode(datagram) == sample
+    found = decode(datagram)
+    for name, value in zip(("sequence", "time_ns", "displacement", "quaternion"), packed, strict=True):
+        np.testing.assert_array_equal(found[name], value)
     for bit in range(8 * len(datagram)):
         damaged = bytearray(datagram)
         damaged[bit // 8] ^= 1 << bit % 8
@@ -227,10 +228,10 @@ def test_the_command_streams_a_file_in_real_time(tmp_path, hexapod):
         assert run.returncode == 0, run.stderr
         assert f"26 poses of motion.csv sent to 127.0.0.1:{port}" in run.stdout
         samples = [decode(listener.recv(100)) for _ in range(26)]
-    assert [sample.sequence for sample in samples] == list(range(26))
-    assert np.diff([sample.time_ns for sample in samples]) == pytest.approx(20_000_000)
-    assert samples[-1].displacement == pytest.approx((0.0, 0.0, 5e-3), abs=1e-9)
-    assert samples[-1].quaternion == pytest.approx(LEVEL)
+    assert [sample["sequence"] for sample in samples] == list(range(26))
+    assert np.diff([int(sample["time_ns"]) for sample in samples]) == pytest.approx(20_000_000)
+    assert samples[-1]["displacement"] == pytest.approx((0.0, 0.0, 5e-3), abs=1e-9)
+    assert samples[-1]["quaternion"] == pytest.approx(LEVEL)
 
 
 def test_the_command_refuses_what_it_cannot_send():
