@@ -38,7 +38,7 @@ def gough_check_rig(options: Namespace) -> int:
 
     keep_to_one_thread()
     from hil.rigs.contract import CLAUSES, examine_rig
-    from hil.runs.rig_factory import rig_of
+    from hil.runs.prepare import rig_of
 
     if options.beyond is not None and not options.move:
         raise InputError("--beyond is a command to the drives: it needs --move")

@@ -2,7 +2,9 @@
 
 import multiprocessing
 import signal
+from collections.abc import Callable
 from multiprocessing.process import BaseProcess
+from typing import Any
 
 FORK = multiprocessing.get_context("fork")
 PATIENCE_S = 10.0
@@ -13,9 +15,16 @@ _ENDING = (
 )  # fmt: skip
 
 
-def block_signals() -> None:
-    """Block the signals that end or stop a process; the supervisor handles them."""
+def started(target: Callable[..., None], *arguments: Any) -> BaseProcess:
+    """Start a process that runs a function. The signals that end or stop a process are blocked; the supervisor handles them."""
+    process = FORK.Process(target=_run, args=(target, *arguments))
+    process.start()
+    return process
+
+
+def _run(target: Callable[..., None], *arguments: Any) -> None:
     signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
+    target(*arguments)
 
 
 def join_or_kill(process: BaseProcess) -> None:

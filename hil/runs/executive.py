@@ -3,9 +3,8 @@
     supervisor --fork--> loop       plant or rig, compiled cycle, SCHED_FIFO; writes into shared memory and never waits
                --fork--> recorder   takes the records to an MCAP file
 
-The three share two arrays, `records` and `link` (see `hil.loop.records`). Whichever other process dies, the recorder completes
-its file. If the recorder dies, another takes over with a file of its own. If the supervisor dies, the loop comes to a
-controlled stop.
+The three share two arrays, `records` and `link`. Whichever other process dies, the recorder completes its file. If it dies
+itself, another takes over with a file of its own. If the supervisor dies, the loop comes to a controlled stop.
 """
 
 import contextlib
@@ -35,15 +34,14 @@ from hil.loop.driver import Loop, prevent_compilation, stop_quickly
 from hil.loop.records import LINK_SIZE, RECORD, Link, StopRequest, shared_array
 from hil.loop.timing import over_budget
 from hil.realtime.clock import REAL, new_clock
-from hil.realtime.processes import FORK, PATIENCE_S, block_signals, join_or_kill
+from hil.realtime.processes import FORK, PATIENCE_S, join_or_kill, started
 from hil.realtime.scheduling import RealTimeSettings, real_time, since_process_start, usage
 from hil.rigs import Rig
 from hil.rigs.udp.link import parse_address
 from hil.rigs.udp.rig import UdpRig
 from hil.runs.config import SimulationConfig
-from hil.runs.prepare import prepared_loop
+from hil.runs.prepare import prepared_loop, rig_of
 from hil.runs.recorders import Recorders, claimed
-from hil.runs.rig_factory import rig_of
 from hil.runs.run_state import RunState
 from hil.runs.target_stream import HOST, PORT, open_socket, receive
 from plant.compiled import Record
@@ -78,12 +76,10 @@ def run(
     other thread runs.
 
     Args:
-        config: what to run.
-        settings: priority, processor, and what the machine may refuse.
-        recording: the MCAP file to write; None for none.
+        config, settings: what to run, and how.
+        recording: the MCAP file to write.
         show: called ten times a second.
-        rig: makes a rig in Python, in the loop's process, for a loop in Python; without it, the configuration's rig is driven.
-            Threads that it starts must have ended when it returns.
+        rig: makes a rig in Python, in the loop's process, instead of the configuration's. Its threads must have ended then.
 
     Returns:
         The summary: `cause` of the stop, `cycles`, missed periods by cause, `timing_us` and which of it is `over_budget`,
@@ -106,8 +102,7 @@ def run(
     with _asked_to_stop(link), claimed(recording), _reported(state, recorders), contextlib.ExitStack() as at_end:
         at_end.callback(recorders.finish)
         stream = at_end.enter_context(_receiver(config)) if config.streamed else None
-        loop = FORK.Process(target=_loop_process, args=(theirs, ours, link, config, settings, rig, records, stream))
-        loop.start()
+        loop = started(_loop_process, theirs, ours, link, config, settings, rig, records, stream)
         theirs.close()
         leftovers: list[Path | None] = []
         at_end.callback(_end, loop, link, leftovers)
@@ -137,7 +132,7 @@ def run(
 
 @contextmanager
 def _reported(state: RunState, recorders: Recorders) -> Iterator[None]:
-    """Add to an early end without a summary the events and the files of the run."""
+    """Add the events and the files of the run to an early end without a summary."""
     try:
         yield
     except RunStoppedError as error:
@@ -147,8 +142,6 @@ def _reported(state: RunState, recorders: Recorders) -> Iterator[None]:
 
 @contextmanager
 def _asked_to_stop(link: NDArray[np.int64]) -> Iterator[None]:
-    """Let the signals that would end this process ask for a controlled stop, and SIGQUIT for an emergency stop."""
-
     def ask(number: int, frame: object) -> None:
         del frame
         link[Link.STOP] = max(int(link[Link.STOP]), StopRequest.QUICK if number == signal.SIGQUIT else StopRequest.CONTROLLED)
@@ -165,25 +158,19 @@ def _asked_to_stop(link: NDArray[np.int64]) -> Iterator[None]:
 
 @contextmanager
 def _receiver(config: SimulationConfig) -> Iterator[Record]:
-    """A process that receives a streamed target and plans it; yields the memory that it shares with the loop."""
+    """The memory that the process of a streamed target shares with the loop."""
     stream: Record = shared_array(1, STREAM).reshape(())
     host, port = parse_address(config.target.partition(":")[2] or f"{HOST}:{PORT}")
     mechanism = load_spatial(config.mechanism)
     start = mechanism.require_home()
     planner = StreamPlanner(mechanism, leg_lengths(mechanism, start.position, start.rotation))
     with open_socket(host, port) as listener:
-        process = FORK.Process(target=_receiver_process, args=(stream, planner, listener, 1.0 / config.rate))
-        process.start()
+        process = started(receive, stream, planner, listener, 1.0 / config.rate)
         try:
             yield stream
         finally:
             stream["shared"][END_PLANNER] = 1
             join_or_kill(process)
-
-
-def _receiver_process(*what: Any) -> None:
-    block_signals()
-    receive(*what)
 
 
 def _prepared(
@@ -199,7 +186,6 @@ def _prepared(
 
 
 def _received(ours: Connection, loop: BaseProcess) -> Any:
-    """What the loop's process has sent; an error that it has sent is raised."""
     try:
         message = ours.recv()
     except (EOFError, ConnectionResetError):
@@ -211,17 +197,14 @@ def _received(ours: Connection, loop: BaseProcess) -> Any:
 
 
 def _end(loop: BaseProcess, link: NDArray[np.int64], leftovers: list[Path | None]) -> None:
-    """End the loop's process, whatever has happened, and remove the folders that a crash has left."""
+    """End the loop's process, and remove the folders that a crash has left."""
     link[Link.STOP] = max(int(link[Link.STOP]), StopRequest.CONTROLLED)
     join_or_kill(loop)
-    for folder in leftovers:
-        if folder is not None:
-            shutil.rmtree(folder, ignore_errors=True)
+    for folder in filter(None, leftovers):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _loop_process(pipe: Connection, supervisors: Connection, link: NDArray[np.int64], *what: Any) -> None:
-    """The loop's process."""
-    block_signals()
     # With this end open here, the loop would not see the supervisor's death.
     supervisors.close()
     # Without a supervisor, nobody reads the pipe.

@@ -1,8 +1,8 @@
-"""Preparation of a run: check everything, load the plant, plan the motion, load the machine code."""
+"""Preparation of a run: check everything, load the plant or make the rig, plan the motion, load the machine code."""
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,11 +20,16 @@ from controller.safety.stop import describe_end
 from controller.settings import control_settings, safety_settings, sensor_settings
 from hil.loop.driver import Loop
 from hil.loop.records import RECORD
-from hil.rigs.by_name import check_legs
-from hil.runs.config import FUSIONS, SimulationConfig
+from hil.recording.replay_rig import ReplayRig
+from hil.rigs import Rig
+from hil.rigs.by_name import check_legs, python_rig
+from hil.rigs.udp.link import DEFAULT_ADDRESS
+from hil.rigs.udp.rig import UdpRig
+from hil.runs.config import FUSIONS, PYTHON_RIG, SimulationConfig
 from plant.compiled import Record
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import GoughError, InputError
+from plant.extras import missing_extras_named
 from plant.fmu.binding import OWN_BINDING, load_binding
 from plant.fmu.build import building_default_fmu, default_fmu, model_of
 from plant.fmu.calls import FMU_HANDLE
@@ -40,21 +45,14 @@ MOST_RECORD_BYTES = 4 * 2**30
 
 @dataclass(eq=False, kw_only=True)
 class PreparedLoop(Loop):
-    """A loop that is ready to run, with what it was prepared from.
+    """A loop that is ready to run, with what it was prepared from."""
 
-    Attributes:
-        plant: the FMU that the loop calls; None on a rig.
-        mechanism, target, reference: what the loop was prepared with.
-        end: the cycle after the last of the motion.
-        planning_time: how long the planning took [s].
-    """
-
-    plant: FmuPlant | None
+    plant: FmuPlant | None  # the FMU that the loop calls; None on a rig
     mechanism: Mechanism
     target: Target
     reference: Reference
-    end: int
-    planning_time: float
+    end: int  # the cycle after the last of the motion
+    planning_time: float  # [s]
 
     @property
     def simulated(self) -> FmuPlant:
@@ -74,52 +72,41 @@ class PreparedLoop(Loop):
 def prepared_loop(config: SimulationConfig, records: Record | None = None) -> Iterator[PreparedLoop]:
     """Check everything, load the plant, plan the motion, and load the machine code.
 
-    Args:
-        config: what to run.
-        records: where to record, as a ring buffer; by default there is room for every cycle.
+    The loop records into `records`, a ring buffer; by default there is room for every cycle.
 
     Raises:
         GoughError: something in the configuration cannot be used.
     """
-    nominal = load_in_space(config.mechanism)
-    own_plant = config.rig == "fmu" and config.plant is None
-    # The FMU is built while kernels compile.
-    building = building_default_fmu(model_of(nominal)) if own_plant else nullcontext()
-    with building as fmu, _prepared_loop(config, nominal, records, fmu) as loop:
-        yield loop
-
-
-@contextmanager
-def _prepared_loop(
-    config: SimulationConfig, nominal: Mechanism, records: Record | None, fmu: Callable[[], Path] | None
-) -> Iterator[PreparedLoop]:
-    calibration = Calibration() if config.calibration is None else load_calibration(config.calibration)
-    if nominal.planar:
-        check_legs(config.rig, nominal)
-        _check_planar(config, calibration)
-    mechanism = nominal.moved_joints(calibration.joints[:, : nominal.legs])
-    target = load_target("hold" if config.streamed else config.target, mechanism, config.duration)
-    period = 1.0 / config.rate
-    model = load_imu(config.imu)
-    imu = imu_state(model, config.seed, period, config.wiring)
-    control = control_settings(mechanism, **({} if config.hold is None else {"hold": config.hold}))
-    if not HOLD_RANGE_S[0] <= control.hold <= HOLD_RANGE_S[1]:
-        raise InputError(f"hold is {control.hold:g} s; the estimate settles in {HOLD_RANGE_S[0]:g} to {HOLD_RANGE_S[1]:g} s")
-    fusion, safety = sensor_settings(mechanism, model), safety_settings(mechanism)
-    parameters = cycle_parameters(
-        mechanism, config.rate, control, fusion, config.imus, FUSIONS[config.fusion], calibration, config.magnetometer,
-        config.fusion == "section-5", safety.for_raw_imus() if config.raw_imus else safety,
-        0.0 if config.rig == "fmu" else period, config.arm,
-    )  # fmt: skip
-    count = int(parameters["rig"]["hold_cycles"]) + round(config.duration * config.rate)
-    if records is None and count * RECORD.itemsize > MOST_RECORD_BYTES:
-        raise InputError(
-            f"{config.duration:g} s at {config.rate:g} Hz would record {count * RECORD.itemsize / 2**30:.3g} GiB, more than "
-            f"{MOST_RECORD_BYTES / 2**30:g} GiB: choose a shorter duration or a lower rate, or 'gough run', which keeps seconds"
-        )
-    # Loads the planner, so that the planning time is that of the plan alone.
-    plan(mechanism, load_target("hold", mechanism, 0.1), 0.1)
-    with simulated_plant(config, nominal, target.start, fmu) if config.rig == "fmu" else nullcontext() as plant:
+    nominal, period = load_in_space(config.mechanism), 1.0 / config.rate
+    with ExitStack() as stack:
+        fmu = None
+        if config.rig == "fmu" and config.plant is None:
+            # The FMU is built while kernels compile.
+            fmu = stack.enter_context(building_default_fmu(model_of(nominal)))
+        calibration = Calibration() if config.calibration is None else load_calibration(config.calibration)
+        if nominal.planar:
+            check_legs(config.rig, nominal)
+            _check_planar(config, calibration)
+        mechanism = nominal.moved_joints(calibration.joints[:, : nominal.legs])
+        target = load_target("hold" if config.streamed else config.target, mechanism, config.duration)
+        model = load_imu(config.imu)
+        imu = imu_state(model, config.seed, period, config.wiring)
+        control = control_settings(mechanism, **({} if config.hold is None else {"hold": config.hold}))
+        least, most = HOLD_RANGE_S
+        if not least <= control.hold <= most:
+            raise InputError(f"hold is {control.hold:g} s; the estimate settles in {least:g} to {most:g} s")
+        fusion, safety = sensor_settings(mechanism, model), safety_settings(mechanism)
+        parameters = cycle_parameters(
+            mechanism, config.rate, control, fusion, config.imus, FUSIONS[config.fusion], calibration, config.magnetometer,
+            config.fusion == "section-5", safety.for_raw_imus() if config.raw_imus else safety,
+            0.0 if config.rig == "fmu" else period, config.arm,
+        )  # fmt: skip
+        count = int(parameters["rig"]["hold_cycles"]) + round(config.duration * config.rate)
+        if records is None:
+            _check_memory(config, count)
+        # Loads the planner, so that the planning time is that of the plan alone.
+        plan(mechanism, load_target("hold", mechanism, 0.1), 0.1)
+        plant = stack.enter_context(simulated_plant(config, nominal, target.start, fmu)) if config.rig == "fmu" else None
         began = time.perf_counter()
         if config.streamed:
             lengths = leg_lengths(mechanism, target.start.position, target.start.rotation)
@@ -144,8 +131,15 @@ def _prepared_loop(
         yield loop
 
 
+def _check_memory(config: SimulationConfig, count: int) -> None:
+    if count * RECORD.itemsize > MOST_RECORD_BYTES:
+        raise InputError(
+            f"{config.duration:g} s at {config.rate:g} Hz would record {count * RECORD.itemsize / 2**30:.3g} GiB, more than "
+            f"{MOST_RECORD_BYTES / 2**30:g} GiB: choose a shorter duration or a lower rate, or 'gough run', which keeps seconds"
+        )
+
+
 def _check_planar(config: SimulationConfig, calibration: Calibration) -> None:
-    """Check that the configuration asks for nothing that a planar mechanism cannot do."""
     if config.fusion != "compiled":
         raise InputError(f"fusion {config.fusion!r} is for six legs; for {config.mechanism}, which is planar, take 'compiled'")
     if config.streamed:
@@ -159,11 +153,8 @@ def simulated_plant(
 ) -> FmuPlant:
     """The plant of a configuration, at rest at `start`; a plant with a binding starts where its binding says.
 
-    Args:
-        config: of the run.
-        nominal: the mechanism as it was designed.
-        start: of the platform.
-        built_fmu: waits for gough's own FMU and returns its path; None to build it now.
+    `nominal` is the mechanism as it was designed. `built_fmu` waits for gough's own FMU and returns its path; without it, that
+    is built now.
 
     Raises:
         GoughError: the FMU, its binding, a setting or the joint error cannot be used.
@@ -192,7 +183,6 @@ def simulated_plant(
 
 
 def _check_plant(config: SimulationConfig, plant: FmuPlant, nominal: Mechanism) -> None:
-    """Check that a plant has the IMUs and the magnetometer that the loop reads."""
     name, bound = plant.path.name, plant.bound
     absent = set(imus_of(nominal, config.imus)) - set(bound.imus)
     if absent:
@@ -200,3 +190,28 @@ def _check_plant(config: SimulationConfig, plant: FmuPlant, nominal: Mechanism) 
         raise InputError(f"{name} has no IMU {', '.join(map(str, sorted(absent)))}: leave it out with --imus {there}")
     if config.magnetometer and PLATFORM_IMU not in bound.magnetometers:
         raise InputError(f"{name} has no magnetometer on the platform: bind imu_magnetic_field, or leave out --magnetometer")
+
+
+def rig_of(config: SimulationConfig) -> Rig | None:
+    """The rig that a configuration names; None for the plant's FMU.
+
+    Raises:
+        GoughError: the rig cannot be made, or its number of legs is not the mechanism's.
+    """
+    mechanism, period = load_in_space(config.mechanism), 1.0 / config.rate
+    check_legs(config.rig, mechanism)
+    if config.rig == "udp":
+        return UdpRig(config.rig_at or DEFAULT_ADDRESS, period)
+    if config.rig == "canopen":
+        with missing_extras_named():
+            from hil.rigs.canopen.rig import CanopenRig
+            from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings
+
+        return CanopenRig(canopen_settings(config.rig_at or DEFAULT_FILE), period)
+    if config.rig == "replay":
+        if not config.rig_at:
+            raise InputError("a replay needs its recording: name it with --rig-at FILE.mcap")
+        return ReplayRig(config.rig_at.split(","), period, mechanism)
+    if config.rig.startswith(PYTHON_RIG):
+        return python_rig(config.rig.removeprefix(PYTHON_RIG), mechanism, period, config.rig_at)
+    return None

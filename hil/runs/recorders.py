@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.loop.records import Link
-from hil.realtime.processes import FORK, block_signals, join_or_kill
+from hil.realtime.processes import join_or_kill, started
 from hil.recording.mcap import record, repair
 from plant.compiled import Record
 from plant.errors import GoughError, InputError
@@ -65,7 +65,7 @@ class Recorders:
     def __init__(
         self, path: Path | None, records: Record, link: NDArray[np.int64], supervisors: Connection, events: list[str]
     ) -> None:  # fmt: skip
-        """Record to `path`, if there is one, and report deaths to `events`; each recorder closes the supervisor's pipe."""
+        """Record to `path`, if there is one, and report deaths to `events`."""
         self.files: list[Path] = []
         self._path, self._records, self._link, self._supervisors, self._events = path, records, link, supervisors, events
         self._header: dict[str, Any] = {}
@@ -84,38 +84,35 @@ class Recorders:
 
     def _start(self, path: Path) -> None:
         self.files.append(path)
-        arguments = (path, self._header, self._records, self._link, self._supervisors)
-        self._process = FORK.Process(target=_recorder_process, args=arguments)
-        self._process.start()
+        self._process = started(_recorder_process, path, self._header, self._records, self._link, self._supervisors)
 
     def watch(self) -> None:
-        """If the recorder has been killed, start a successor with a file of its own; none if its file cannot be written."""
-        if self._path is None or self._process is None or self._process.is_alive():
+        """If the recorder has been killed, start a successor with a file of its own."""
+        if self._process is None or self._process.is_alive():
             return
-        if self._process.exitcode != 0:
-            self._report_death()
-        killed = (self._process.exitcode or 0) < 0
+        killed = self._report_death(self._process) < 0
         self._process = None
         if killed and len(self.files) < _MOST_RECORDERS:
-            numbers = range(len(self.files) + 1, 10_000)
-            path = next(each for n in numbers if not (each := self._path.with_stem(f"{self._path.stem}-{n}")).exists())
+            first, numbers = self.files[0], range(len(self.files) + 1, 10_000)
+            path = next(each for n in numbers if not (each := first.with_stem(f"{first.stem}-{n}")).exists())
             self._events.append(f"another recorder goes on in {path}")
             self._start(path)
 
-    def _report_death(self) -> None:
-        code = self._process.exitcode if self._process else 0
-        if code is not None and code > 0:
+    def _report_death(self, recorder: BaseProcess) -> int:
+        """Note why a recorder has ended, if it was not asked to; returns its exit code."""
+        code = recorder.exitcode or 0
+        if code > 0:
             self._events.append(f"{self.files[-1]} cannot be written: {os.strerror(code)}: the rest is not recorded")
-        else:
+        elif code < 0:
             self._events.append(f"the recorder died (exit code {code})")
+        return code
 
     def finish(self) -> None:
         """Let the recorder write what is left, and complete the files of those that died."""
         self._link[Link.DONE] = 1
         if self._process is not None:
             join_or_kill(self._process)
-            if self._process.exitcode != 0:
-                self._report_death()
+            self._report_death(self._process)
         for path in self.files:
             try:
                 if path.exists():
@@ -127,7 +124,6 @@ class Recorders:
 def _recorder_process(
     path: Path, header: dict[str, Any], records: Record, link: NDArray[np.int64], supervisors: Connection
 ) -> None:  # fmt: skip
-    block_signals()
     supervisors.close()
     try:
         record(path, header, records, link)

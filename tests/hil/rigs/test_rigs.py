@@ -34,8 +34,7 @@ from hil.rigs.udp.link import new_link
 from hil.rigs.udp.rig import UdpRig
 from hil.runs.config import SimulationConfig
 from hil.runs.executive import RunStoppedError, run
-from hil.runs.prepare import prepared_loop
-from hil.runs.rig_factory import rig_of
+from hil.runs.prepare import prepared_loop, rig_of
 from plant.errors import InputError, UnknownNameError
 from plant.mechanism import load_spatial
 
