@@ -41,14 +41,11 @@ class SimulationResult:
     """What a simulation found.
 
     Attributes:
-        config: what was simulated.
-        mechanism, target, reference: as prepared from the configuration.
         times: (N,) [s]; 0 is the end of the hold.
         records: (N,), dtype `hil.loop.records.RECORD`.
         reference_positions, reference_rotations: (N, 3) [m] and (N, 3, 3), the planned poses.
         target_positions, target_rotations: (N, 3) [m] and (N, 3, 3), the raw target.
         real_time_factor: simulated time over the time that planning and loop took.
-        snapshot: None if none was asked for.
     """
 
     config: SimulationConfig
@@ -66,7 +63,7 @@ class SimulationResult:
 
     @property
     def moved(self) -> bool:
-        """Whether the run went beyond the hold on the brakes, so that there are figures to sum up."""
+        """Whether the run went beyond the hold on the brakes."""
         return bool(len(self.times)) and bool(self.times[-1] >= 0.0)
 
     @property
@@ -92,13 +89,13 @@ class SimulationResult:
         reference = (self.reference_positions[moving], self.reference_rotations[moving])
         target = (self.target_positions[moving], self.target_rotations[moving])
         truth = (self.true_positions[moving], self.true_rotations[moving]) if self.truth_known else None
+        planned = {f"reference_{name}": value for name, value in _figures(reference, target).items()}
         return {
             "truth_known": self.truth_known,
             "estimation": None if truth is None else _figures(estimate, truth),
             "tracking": None if truth is None else _figures(truth, reference),
             "estimated_tracking": _figures(estimate, reference),
-            "target": ({} if truth is None else _figures(truth, target))
-            | {f"reference_{key}": value for key, value in _figures(reference, target).items()},
+            "target": planned if truth is None else _figures(truth, target) | planned,
             "limits": {"violations": self.reference.violations},
             "real_time_factor": self.real_time_factor,
             "cycle_us": percentiles(self.records["stage_ns"][:, COMPUTED].sum(axis=1), tuple(QUANTILES)),
@@ -115,7 +112,7 @@ def simulate(
     Args:
         config: what to simulate.
         progress: called with the share of the run that is done.
-        resumed: the snapshot to resume from; the result then covers the rest of the run.
+        resumed: where to go on; the result then covers the rest of the run.
         save_at: the time in the motion at which to take a snapshot [s], its duration for the end; None for never.
 
     Raises:
@@ -129,36 +126,33 @@ def simulate(
     with prepared_loop(config) as loop:
         count = len(loop.records)
         if resumed is not None:
-            resume_snapshot(resumed, loop, loop.simulated)
-        first = int(loop.state["time"]["cycle"])
+            resume_snapshot(resumed, loop)
+        first, stop = int(loop.state["time"]["cycle"]), loop.state["safety"]["stop"]
         saved = None if save_at is None else _cycle_at(save_at, loop, first)
-        snapshot = None
-        filters = None
+        snapshot = filters = None
         if config.fusion == "filterpy":
             from controller.estimation.filterpy_filters import FilterpyFilters
 
             filters = FilterpyFilters(loop.parameters)
         cause, took = Cause.NONE.value, loop.planning_time
         chunk = max(1, round(_CHUNK_S * config.rate))
-        for last in sorted({*range(first + chunk, count, chunk), count, *([] if saved is None else [saved])}):
+        for last in sorted({*range(first + chunk, count, chunk), count, saved or count}):
             began = time.perf_counter()
             cause = loop.run(last, filters)
             took += time.perf_counter() - began
             if cause != Cause.NONE:
                 break
-            if last == saved and loop.state["safety"]["stop"]["cause"] == Cause.NONE:
-                snapshot = take_snapshot(asdict(config), loop, loop.simulated)
+            if last == saved and stop["cause"] == Cause.NONE:
+                snapshot = take_snapshot(asdict(config), loop)
             progress((last - first) / (count - first))
         result = _result(config, loop, first, snapshot, took)
-        if loop.state["safety"]["stop"]["cause"] != Cause.NONE:
-            at = int(loop.state["safety"]["stop"]["cycle"])
+        if stop["cause"] != Cause.NONE:
             how = "stopped on the brakes" if cause != Cause.NONE else "still stopping at the end, from"
-            raise SimulationStoppedError(f"{how} at cycle {at} of {count}: {loop.reason()}", result)
+            raise SimulationStoppedError(f"{how} at cycle {stop['cycle']} of {count}: {loop.reason()}", result)
     return result
 
 
 def _cycle_at(at: float, loop: PreparedLoop, first: int) -> int:
-    """The cycle at a time [s] of the motion."""
     period, hold = float(loop.parameters["rig"]["period"]), int(loop.parameters["rig"]["hold_cycles"])
     cycle = hold + round(at / period) if np.isfinite(at) else -1
     if not first < cycle <= len(loop.records):
@@ -170,22 +164,19 @@ def _cycle_at(at: float, loop: PreparedLoop, first: int) -> int:
 def _result(
     config: SimulationConfig, loop: PreparedLoop, first: int, snapshot: Snapshot | None, took: float
 ) -> SimulationResult:
-    """The result from cycle `first` on, after `took` seconds of planning and running."""
     done = int(loop.state["time"]["cycle"])
     records = loop.records[first:done]
     times = (np.arange(first, done) - int(loop.parameters["rig"]["hold_cycles"])) / config.rate
-    positions, rotations = poses_from_lengths(
-        loop.mechanism, records["reference"][:, : loop.mechanism.legs, 0], loop.target.start
-    )
-    target_positions, target_rotations = loop.target.at(times)
+    lengths = records["reference"][:, : loop.mechanism.legs, 0]
     return SimulationResult(
-        config, loop.mechanism, loop.target, loop.reference, times, records, positions, rotations, target_positions,
-        target_rotations, (done - first) / config.rate / took, snapshot,
+        config, loop.mechanism, loop.target, loop.reference, times, records,
+        *poses_from_lengths(loop.mechanism, lengths, loop.target.start), *loop.target.at(times),
+        (done - first) / config.rate / took, snapshot,
     )  # fmt: skip
 
 
 def _figures(poses: tuple[Array, Array], true: tuple[Array, Array]) -> dict[str, float]:
-    """RMS and largest differences of poses, positions (N, 3) and rotations (N, 3, 3), from true ones."""
+    """RMS and largest errors of poses, positions (N, 3) and rotations (N, 3, 3)."""
     errors = pose_errors(*poses, *true)
     largest = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2).max(axis=0)
     return rms_figures(errors) | {"position_max": float(largest[0]), "rotation_max": float(largest[1])}

@@ -1,7 +1,7 @@
 """Snapshots: files from which a simulation goes on bit for bit.
 
-A snapshot has the plant's own state, and every array that the loop changes: the cycle's state, the IMUs' noise, the clock. What
-follows from the configuration, such as the motion and the gains, is made again and must be the same as before.
+A snapshot has the plant's own state, and every array that the loop changes. What follows from the configuration, such as the
+motion and the gains, is made again and must be the same as before.
 """
 
 import hashlib
@@ -12,44 +12,32 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
-from numpy.typing import NDArray
 
 from controller.cycle import PARAMETERS, STATE
 from controller.planning.segments import START
-from hil.loop.driver import Loop
 from hil.loop.records import WORK
 from hil.realtime.clock import CLOCK
+from hil.runs.prepare import PreparedLoop
 from plant.errors import InputError
 from plant.files import write_whole
-from plant.fmu.plant import FmuPlant
 from plant.imu import IMU_STATE
-from plant.pose import Array
 
 _KIND = "gough snapshot"
 
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A simulation between two cycles.
+    """A simulation between two cycles."""
 
-    Attributes:
-        config: the simulation's, as plain values.
-        cycle: the next to run.
-        settings: hash of what does not change: the cycle's parameters, the FMU and its binding.
-        motion: hash of the motion planned until then.
-        memory: the loop's arrays by name.
-        plant: the state of the FMU and its clock.
-    """
-
-    config: Mapping[str, Any]
-    cycle: int
-    settings: bytes
-    motion: bytes
-    memory: Mapping[str, bytes]
-    plant: bytes
+    config: Mapping[str, Any]  # plain values
+    cycle: int  # the next to run
+    settings: bytes  # hash of what does not change: the cycle's parameters, the FMU and its binding
+    motion: bytes  # hash of what was planned until then
+    memory: Mapping[str, bytes]  # the loop's arrays
+    plant: bytes  # state of the FMU and its clock
 
 
-def take_snapshot(config: Mapping[str, Any], loop: Loop, plant: FmuPlant) -> Snapshot:
+def take_snapshot(config: Mapping[str, Any], loop: PreparedLoop) -> Snapshot:
     """Take a snapshot between two cycles.
 
     Raises:
@@ -57,33 +45,29 @@ def take_snapshot(config: Mapping[str, Any], loop: Loop, plant: FmuPlant) -> Sna
     """
     cycle = int(loop.state["time"]["cycle"])
     memory = {name: array.tobytes() for name, array in loop.memory().items()}
-    return Snapshot(config, cycle, _settings(loop, plant), _motion(loop, cycle), memory, plant.state())
+    return Snapshot(config, cycle, _settings(loop), _motion(loop, cycle), memory, loop.simulated.state())
 
 
-def resume_snapshot(snapshot: Snapshot, loop: Loop, plant: FmuPlant) -> None:
+def resume_snapshot(snapshot: Snapshot, loop: PreparedLoop) -> None:
     """Go on from a snapshot, in a loop that has just been prepared from its configuration.
 
     Raises:
         InputError: the loop differs from the one in the snapshot, or has no cycle left.
         FmuError: the FMU is another one, or cannot restore its state.
     """
-    if snapshot.settings != _settings(loop, plant):
-        raise InputError(
-            "this simulation cannot go on from the snapshot, as its mechanism, calibration, FMU or binding have changed since"
-        )
+    refused, memory = "this simulation cannot go on from the snapshot, as", loop.memory()
+    if snapshot.settings != _settings(loop):
+        raise InputError(f"{refused} its mechanism, calibration, FMU or binding have changed since")
     if snapshot.motion != _motion(loop, snapshot.cycle):
-        raise InputError(
-            "this simulation cannot go on from the snapshot, as another motion was planned until then: take the snapshot in a "
-            "run of the same duration, with --save-at"
-        )
+        remedy = "take the snapshot in a run of the same duration, with --save-at"
+        raise InputError(f"{refused} another motion was planned until then: {remedy}")
     if snapshot.cycle >= len(loop.records):
         raise InputError(
             f"the snapshot is of the end of its motion of {snapshot.config['duration']:g} s: go on with a longer --duration"
         )
-    memory = loop.memory()
     if {name: len(kept) for name, kept in snapshot.memory.items()} != {name: array.nbytes for name, array in memory.items()}:
-        raise InputError("this simulation cannot go on from the snapshot, as its memory has another layout")
-    plant.restore(snapshot.plant)
+        raise InputError(f"{refused} its memory has another layout")
+    loop.simulated.restore(snapshot.plant)
     for name, array in memory.items():
         array.reshape(-1).view("u1")[:] = memoryview(snapshot.memory[name])
 
@@ -129,26 +113,16 @@ def _hash(content: bytes) -> bytes:
 
 
 def _layout() -> bytes:
-    """A hash of the layout of all that a snapshot keeps of a loop."""
     return _hash(repr((PARAMETERS, STATE, WORK, CLOCK, IMU_STATE)).encode())
 
 
-def _settings(loop: Loop, plant: FmuPlant) -> bytes:
-    """A hash of what does not change in a run; the arrays say how the loop reads and writes the FMU."""
-    bound = plant.bound
-    arrays: list[NDArray[Any]] = [
-        *bound.sensed,
-        *bound.known,
-        *bound.commanded,
-        *bound.loaded,
-        bound.modes.references,
-        bound.modes.values,
-    ]
-    return _hash(b"".join([loop.parameters.tobytes(), plant.path.read_bytes(), *(array.tobytes() for array in arrays)]))
+def _settings(loop: PreparedLoop) -> bytes:
+    bound, content = loop.simulated.bound, loop.parameters.tobytes() + loop.simulated.path.read_bytes()
+    for array in (*bound.sensed, *bound.known, *bound.commanded, *bound.loaded, bound.modes.references, bound.modes.values):
+        content += array.tobytes()
+    return _hash(content)
 
 
-def _motion(loop: Loop, cycle: int) -> bytes:
-    """A hash of the segments that have begun by a cycle."""
-    segments: Array = loop.segments
-    begun = segments[:, :, START] <= cycle * float(loop.parameters["rig"]["period"])
-    return _hash(segments[begun].tobytes())
+def _motion(loop: PreparedLoop, cycle: int) -> bytes:
+    begun = loop.segments[:, :, START] <= cycle * float(loop.parameters["rig"]["period"])
+    return _hash(loop.segments[begun].tobytes())
