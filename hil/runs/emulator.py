@@ -11,6 +11,7 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,8 @@ from plant.truth import TRUTH_LENGTHS
 _STEP_NS = 1_000_000
 _TURN_NS = 20_000_000
 _IDLE_S = 0.1
-_NAME, _FIRMWARE = "gough emulated hexapod", "1"
+_NAME = np.frombuffer(b"gough emulated hexapod".ljust(32, b"\0"), np.uint8)
+_FIRMWARE = np.frombuffer(b"1".ljust(16, b"\0"), np.uint8)
 
 _Address = tuple[str, int]
 
@@ -44,58 +46,35 @@ class BusyError(GoughError, OSError):
     """An address is taken, or nobody answers there."""
 
 
-class _Stopped:
-    """Whether a signal has asked to end."""
-
-    def __init__(self) -> None:
-        self.asked = False
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, self._ask)
-
-    def _ask(self, number: int, frame: object) -> None:
-        del number, frame
-        self.asked = True
-
-
 def emulate(config: EmulatorConfig, settings: RealTimeSettings, say: Callable[[str], None]) -> None:
-    """Emulate a rig until SIGINT, SIGTERM or SIGHUP, or `stop` on the control channel.
-
-    Args:
-        config: what to emulate.
-        settings: priority and processor of the process.
-        say: is called with each message.
+    """Emulate a rig until SIGINT, SIGTERM or SIGHUP, or `stop` on the control channel; `say` gets each message.
 
     Raises:
         GoughError: something in the configuration cannot be used, or an address is taken.
     """
     faults = [fault(text) for text in config.faults]
-    stopped = _Stopped()
     with ExitStack() as stack:
-        control = _Control(stack.enter_context(_listen(config.control)), stopped)
+        control = _Control(stack.enter_context(_listen(config.control)))
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, control.stop)
         if config.bus == "canopen":
-            _emulate_canopen(config, faults, settings, say, control, stopped)
+            _emulate_canopen(config, faults, settings, say, control)
             return
         where = config.at or DEFAULT_ADDRESS
-        opened = stack.enter_context(_listen(where))
+        udp = _UdpSessions(stack.enter_context(_listen(where)), config, faults, control, say)
         _load(config)
-        for text in stack.enter_context(real_time(settings)):
-            say(f"without {text}")
-        say(f"the rig {config.simulated.mechanism} listens at {where}, its control at {config.control}")
-        while not stopped.asked:
-            readable, _, _ = select.select([opened, control.socket], [], [], _IDLE_S)
+        _announce(config, where, stack.enter_context(real_time(settings)), say)
+        while not control.stopped:
+            readable, _, _ = select.select([udp.opened, control.socket], [], [], _IDLE_S)
             if control.socket in readable:
                 control.answer(None)
-            if opened in readable:
-                content, sender = opened.recvfrom(2048)
-                hello = _hello(content)
-                if hello is not None:
-                    _serve_sessions(opened, hello, sender, config, faults, control, say, stopped)
+            if udp.opened in readable:
+                udp.serve(*udp.opened.recvfrom(2048))
 
 
 def _emulate_canopen(
-    config: EmulatorConfig, faults: list[Record], settings: RealTimeSettings, say: Callable[[str], None], control: "_Control",
-    stopped: _Stopped,
-) -> None:  # fmt: skip
+    config: EmulatorConfig, faults: list[Record], settings: RealTimeSettings, say: Callable[[str], None], control: "_Control"
+) -> None:
     from hil.rigs.canopen.emulated_bus import EmulatedBus, faulty_channel
     from hil.rigs.canopen.emulated_nodes import PlantMachine
     from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings
@@ -106,11 +85,14 @@ def _emulate_canopen(
         real_time(settings) as refused,
         closing(EmulatedBus(bus, machine, faulty_channel(machine.rig))) as nodes,
     ):
-        for text in refused:
-            say(f"without {text}")
-        where = f"{bus.bus.interface} {bus.bus.channel}"
-        say(f"the rig {config.simulated.mechanism} listens at {where}, its control at {config.control}")
-        nodes.serve(lambda: stopped.asked, lambda: control.answer(machine.rig, {"lost": nodes.lost}))
+        _announce(config, f"{bus.bus.interface} {bus.bus.channel}", refused, say)
+        nodes.serve(lambda: control.stopped, lambda: control.answer(machine.rig, {"lost": nodes.lost}))
+
+
+def _announce(config: EmulatorConfig, where: str, refused: list[str], say: Callable[[str], None]) -> None:
+    for text in refused:
+        say(f"without {text}")
+    say(f"the rig {config.simulated.mechanism} listens at {where}, its control at {config.control}")
 
 
 def _listen(address: str) -> socket.socket:
@@ -123,18 +105,17 @@ def _listen(address: str) -> socket.socket:
 class _Control:
     """The control channel."""
 
-    def __init__(self, opened: socket.socket, stopped: _Stopped) -> None:
-        self.socket = opened
-        self._stopped = stopped
+    def __init__(self, opened: socket.socket) -> None:
+        self.socket, self.stopped = opened, False
         opened.setblocking(False)
 
-    def answer(self, rig: Record | None, bus: dict[str, Any] | None = None) -> None:
-        """Answer all questions that have arrived.
+    def stop(self, *signalled: object) -> None:
+        """Ask the emulator to end."""
+        del signalled
+        self.stopped = True
 
-        Args:
-            rig: dtype `EMULATED`; None without a session.
-            bus: figures of the bus, which become part of the state.
-        """
+    def answer(self, rig: Record | None, bus: dict[str, Any] | None = None) -> None:
+        """Answer all questions that have arrived. There is no `rig` without a session; `bus` becomes part of the state."""
         while True:
             try:
                 content, sender = self.socket.recvfrom(4096)
@@ -149,7 +130,7 @@ class _Control:
 
     def _do(self, command: str, argument: str, rig: Record | None, bus: dict[str, Any]) -> dict[str, Any]:
         if command == "stop":
-            self._stopped.asked = True
+            self.stop()
             return {"stopping": True}
         if rig is None:
             raise InputError("no controller has begun a session: the rig has no state and cannot be disturbed")
@@ -194,7 +175,6 @@ def ask(address: str, question: str, patience: float = 2.0) -> dict[str, Any]:
 
 
 def _rig_of(config: EmulatorConfig, period: float, faults: list[Record]) -> tuple[FmuPlant, Record, Record]:
-    """The plant at its start, the IMUs and the drives."""
     simulated = config.simulated
     mechanism = load_spatial(simulated.mechanism)
     start = load_target(simulated.target, mechanism, 1.0).start
@@ -204,7 +184,6 @@ def _rig_of(config: EmulatorConfig, period: float, faults: list[Record]) -> tupl
 
 
 def _load(config: EmulatorConfig) -> None:
-    """Load or compile the machine code before the first session."""
     plant, imu, rig = _rig_of(config, 1e-3, [])
     with plant, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as scratch:
         emulator = new_udp_emulator(plant.handle, imu, rig)
@@ -212,64 +191,60 @@ def _load(config: EmulatorConfig) -> None:
         serve(emulator, time.monotonic_ns(), 0, np.zeros(2, np.int64))
 
 
-def _serve_sessions(
-    opened: socket.socket, hello: Record, sender: _Address, config: EmulatorConfig, faults: list[Record], control: _Control,
-    say: Callable[[str], None], stopped: _Stopped,
-) -> None:  # fmt: skip
-    """Serve one session after the other."""
-    following: tuple[Record, _Address] | None = (hello, sender)
-    while following is not None and not stopped.asked:
-        hello, sender = following
-        period = 1e-6 * int(hello["period_us"])
-        plant, imu, rig = _rig_of(config, period, faults)
-        with plant:
-            emulator = new_udp_emulator(
-                plant.handle, imu, rig, int(hello["session"]), config.watchdog_for(int(hello["period_us"]))
-            )
-            link = emulator.link.socket
-            link["descriptor"], link["peer"] = opened.fileno(), socket_address(sender)
-            _welcome(opened, config, hello, sender)
-            say(f"session with {sender[0]}:{sender[1]} at {1.0 / period:g} Hz")
-            following = _serve_session(opened, config, emulator, control, stopped)
-            say(f"end of the session; {int(emulator.session['refused'])} datagrams refused")
+@dataclass(eq=False)
+class _UdpSessions:
+    """The rig's side of the UDP link: one session after the other."""
+
+    opened: socket.socket
+    config: EmulatorConfig
+    faults: list[Record]
+    control: _Control
+    say: Callable[[str], None]
+
+    def serve(self, content: bytes, sender: _Address) -> None:
+        """Serve the session that a datagram from `sender` begins, and those that follow it."""
+        hello = _hello(content)
+        while hello is not None and not self.control.stopped:
+            period = 1e-6 * int(hello["period_us"])
+            plant, imu, rig = _rig_of(self.config, period, self.faults)
+            with plant:
+                watchdog = self.config.watchdog_for(int(hello["period_us"]))
+                emulator = new_udp_emulator(plant.handle, imu, rig, int(hello["session"]), watchdog)
+                link = emulator.link.socket
+                link["descriptor"], link["peer"] = self.opened.fileno(), socket_address(sender)
+                self._welcome(hello, sender)
+                self.say(f"session with {sender[0]}:{sender[1]} at {1.0 / period:g} Hz")
+                hello, sender = self._serve_session(emulator, sender)
+                self.say(f"end of the session; {int(emulator.session['refused'])} datagrams refused")
+
+    def _welcome(self, hello: Record, sender: _Address) -> None:
+        watchdog_us = round(1e6 * self.config.watchdog_for(int(hello["period_us"])))
+        fields = {"session": hello["session"], "watchdog_us": watchdog_us, "truthful": 1, "name": _NAME, "firmware": _FIRMWARE}
+        self.opened.sendto(encode(WELCOME_DATAGRAM, kind=DatagramKind.WELCOME, **fields), sender)
+
+    def _serve_session(self, emulator: UdpEmulator, sender: _Address) -> tuple[Record | None, _Address]:
+        """Serve a session to its end; returns the hello that begins the next one, and its sender."""
+        started, timespec = time.monotonic_ns(), np.zeros(2, np.int64)
+        rig, session, link = emulator.rig, emulator.session, emulator.link
+        with prevent_compilation():
+            while not self.control.stopped:
+                met = serve(emulator, started, _TURN_NS, timespec)
+                self.control.answer(rig, {"refused": int(session["refused"])})
+                if not met:
+                    continue
+                hello = _hello(link.command_bytes[: HELLO_DATAGRAM.itemsize].tobytes())
+                address = bytes(link.socket["sender"])
+                sender = (socket.inet_ntoa(address[4:8]), int.from_bytes(address[2:4], "big"))
+                # A moving rig has one controller.
+                if hello is None or np.isin(rig["drive"], (DriveState.FOLLOWING, DriveState.QUICK_STOPPING)).any():
+                    session["refused"] += 1
+                elif hello["session"] == session["id"]:
+                    self._welcome(hello, sender)
+                else:
+                    return hello, sender
+        return None, sender
 
 
 def _hello(content: bytes) -> Record | None:
-    """The hello that begins a session, if these bytes are one."""
     hello = decode(HELLO_DATAGRAM, content, kind=DatagramKind.HELLO)
     return hello if hello is not None and hello["session"] != 0 and hello["period_us"] != 0 else None
-
-
-def _welcome(opened: socket.socket, config: EmulatorConfig, hello: Record, sender: _Address) -> None:
-    name, firmware = (np.frombuffer(text.encode().ljust(n, b"\0"), np.uint8) for text, n in ((_NAME, 32), (_FIRMWARE, 16)))
-    watchdog_us = round(1e6 * config.watchdog_for(int(hello["period_us"])))
-    welcome = encode(
-        WELCOME_DATAGRAM, kind=DatagramKind.WELCOME, session=hello["session"], watchdog_us=watchdog_us, truthful=1, name=name,
-        firmware=firmware,
-    )  # fmt: skip
-    opened.sendto(welcome, sender)
-
-
-def _serve_session(
-    opened: socket.socket, config: EmulatorConfig, emulator: UdpEmulator, control: _Control, stopped: _Stopped
-) -> tuple[Record, _Address] | None:
-    """Serve a session to its end; returns the hello that begins the next one, and its sender."""
-    started, timespec = time.monotonic_ns(), np.zeros(2, np.int64)
-    rig, session, link = emulator.rig, emulator.session, emulator.link
-    with prevent_compilation():
-        while not stopped.asked:
-            met = serve(emulator, started, _TURN_NS, timespec)
-            control.answer(rig, {"refused": int(session["refused"])})
-            if not met:
-                continue
-            hello = _hello(link.command_bytes[: HELLO_DATAGRAM.itemsize].tobytes())
-            address = bytes(link.socket["sender"])
-            sender = (socket.inet_ntoa(address[4:8]), int.from_bytes(address[2:4], "big"))
-            # A moving rig has one controller.
-            if hello is None or np.isin(rig["drive"], (DriveState.FOLLOWING, DriveState.QUICK_STOPPING)).any():
-                session["refused"] += 1
-            elif hello["session"] == session["id"]:
-                _welcome(opened, config, hello, sender)
-            else:
-                return hello, sender
-    return None
