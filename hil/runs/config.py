@@ -49,13 +49,7 @@ def imus_from_text(text: str) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class SimulationConfig:
-    """What to simulate, or to run on the clock. Fields that are options say below what they mean; the others:
-
-    Attributes:
-        hold: how long the brakes hold first [s]; None for the time in the mechanism's settings.
-        wiring: how the IMUs are mounted and wired.
-        raw_imus: whether the IMUs are known to be uncalibrated, so that disagreement between them says nothing.
-    """
+    """What to simulate, or to run on the clock."""
 
     mechanism: str = option("hexapod", MECHANISM)
     target: str = option(
@@ -74,7 +68,7 @@ class SimulationConfig:
         "platform's IMU with --magnetometer, the position from the legs; filterpy: as compiled, but on filterpy (slow)",
     )
     calibration: str | None = option(None, CALIBRATION, metavar="FILE.toml")
-    hold: float | None = None
+    hold: float | None = None  # on the brakes first [s]; by default as the mechanism's settings say
     plant: str | None = option(None, "Co-Simulation FMU (FMI 2.0 or 3.0) instead of the built one", metavar="FILE.fmu")
     binding: str | None = option(
         None, "which of the FMU's variables are which, if they have other names (docs/fmu.md)", metavar="FILE.toml"
@@ -109,7 +103,7 @@ class SimulationConfig:
         metavar="ADDRESS|FILE",
     )
     arm: bool = option(True, "read everything, and move nothing")
-    raw_imus: bool = False
+    raw_imus: bool = False  # known to be uncalibrated, so that disagreement between them says nothing
 
     def __post_init__(self) -> None:
         check_rate(self.rate)
@@ -154,11 +148,7 @@ class SimulationConfig:
 
 @dataclass(frozen=True)
 class EmulatorConfig:
-    """What to emulate. Fields that are options say below what they mean.
-
-    Attributes:
-        simulated: the mechanism, the IMUs, the seed, and the target at whose first pose the platform starts.
-    """
+    """What to emulate; the platform starts at the first pose of the simulated target."""
 
     simulated: SimulationConfig = field(default_factory=SimulationConfig)
     bus: str = option("udp", "the bus that the rig speaks", choices=("udp", "canopen"))

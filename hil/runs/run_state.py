@@ -15,40 +15,26 @@ _MOST_EVENTS = 100
 
 @dataclass(eq=False)
 class RunState:
-    """State and figures of a run until now.
+    """State and figures of a run until now."""
 
-    Attributes:
-        latest: the last record, of dtype `RECORD`; None before the first.
-        timing: of all cycles so far.
-        missed: number of periods missed.
-        late: number of exchanges without an answer in time.
-        refused: what the machine refuses of real time.
-        refused_packets: number of packets refused by a rig on a bus.
-        unseen: number of cycles that were overwritten before the supervisor saw them; no figure includes them.
-        events: the loop's, by cycle, and the supervisor's own, such as a recorder that died.
-    """
-
-    latest: Record | None = None
+    latest: Record | None = None  # dtype `RECORD`
     timing: Timing = field(default_factory=Timing)
-    missed: int = 0
-    late: int = 0
-    refused: list[str] = field(default_factory=list)
-    refused_packets: int = 0
-    unseen: int = 0
-    events: list[str] = field(default_factory=list)
+    missed: int = 0  # periods
+    late: int = 0  # exchanges without an answer in time
+    refused: list[str] = field(default_factory=list)  # by the machine, of real time
+    refused_packets: int = 0  # by a rig on a bus
+    unseen: int = 0  # cycles that were overwritten before the supervisor saw them; no figure includes them
+    events: list[str] = field(default_factory=list)  # the loop's, by cycle, and the supervisor's own
     _seen: int = 0
     _squares: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
     _counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(2, np.int64))
 
     def update(self, records: Record, link: NDArray[np.int64]) -> bool:
-        """Add the cycles that the loop has recorded since the last call; returns whether there are any."""
-        taken, self._seen, unseen = take(records, link, self._seen)
+        """Add the cycles that the loop has recorded meanwhile; returns whether there are any."""
+        records, self._seen, unseen = take(records, link, self._seen)
         self.unseen += unseen
-        if len(taken):
-            self._add(taken)
-        return bool(len(taken))
-
-    def _add(self, records: Record) -> None:
+        if not len(records):
+            return False
         self.latest = records[-1]
         self.timing.add(records)
         self.missed += int(records["missed"].sum())
@@ -66,6 +52,7 @@ class RunState:
             (np.sum(errors**2, axis=1) / np.count_nonzero(posed["lengths"], axis=1)).sum(),
         )
         self._counts += (len(known), len(posed))
+        return True
 
     def _note(self, cycle: int, text: str) -> None:
         if len(self.events) < _MOST_EVENTS:
