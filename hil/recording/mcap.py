@@ -56,12 +56,9 @@ def _layout(definition: str) -> list[str]:
 
 
 class Recorder:
-    """Writes cycles and events to an MCAP file.
+    """Writes cycles and events to an MCAP file; an existing one is replaced.
 
-    Args:
-        path: the file; an existing one is replaced.
-        header: what a replay needs: `config` (for JSON) and arrays by name.
-        epoch_ns: Unix time of the first deadline [ns].
+    The header is what a replay needs: `config`, for JSON, and arrays by name. The epoch is the Unix time of the start [ns].
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any], epoch_ns: int) -> None:
@@ -149,11 +146,7 @@ def _saved(array: Record) -> bytes:
 
 
 def take(records: Record, link: NDArray[np.int64], tail: int) -> tuple[Record, int, int]:
-    """Copy what the loop has written since record `tail`.
-
-    Returns:
-        The records, the new tail, and how many records were overwritten before they could be copied.
-    """
+    """Copy what the loop has written since record `tail`: the records, the new tail, and how many were overwritten before."""
     capacity = len(records)
     head = int(link[Link.HEAD])
     first = max(tail, head - capacity)

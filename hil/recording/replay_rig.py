@@ -29,13 +29,10 @@ class ReplayRig:
         path: the recording, or the consecutive files of one run.
         period: of the exchanges [s]; it must be the recording's.
         mechanism: it must be the recording's, too; None for any.
-
-    Attributes:
-        command_delay: of the recorded rig [s], once this one is open.
     """
 
     def __init__(self, path: Path | str | Sequence[Path | str], period: float, mechanism: Mechanism | None = None) -> None:
-        self.command_delay = period
+        self.command_delay = period  # [s]; when it is open, that of the recorded rig
         self.failure = ""
         self._paths = [path] if isinstance(path, str | Path) else list(path)
         self._period, self._mechanism = period, mechanism

@@ -73,11 +73,7 @@ def resume_snapshot(snapshot: Snapshot, loop: PreparedLoop) -> None:
 
 
 def write_snapshot(snapshot: Snapshot, path: Path) -> None:
-    """Write a snapshot's file; it appears only when it is complete.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write a snapshot's file, which appears only when it is complete; an `InputError` if it cannot be written."""
     content = {"kind": _KIND, "version": version("gough"), "layout": _layout(), **vars(snapshot)}
     write_whole(path, msgpack.packb(content))
 
