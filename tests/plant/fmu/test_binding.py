@@ -88,6 +88,18 @@ def test_commands_reach_the_drives_and_the_pose_follows(load: Load) -> None:
     assert np.linalg.norm(plant.handle["imu"][1, 6]) == pytest.approx(9.81, abs=0.5)
 
 
+def test_what_is_written_is_converted_back_as_what_is_read(load: Load) -> None:
+    """`loop = sign * unit * fmu + offset`, also where the loop writes, and for each element by itself."""
+    signs, offsets = np.array([1, -1, 1, -1, -1, 1]), 0.01 * np.arange(-2, 4)
+    own = f"unit = 'mm/s'\nsign = {signs.tolist()}\noffset = {offsets.tolist()}"
+    for text, sign, offset in ((own, signs, offsets), ("unit = 'mm/s'\nsign = -1\noffset = 0.004", -1, 0.004)):
+        plant = load(BINDING.replace('unit = "mm/s"\nsign = -1', text))
+        assert write_drive_mode(plant.handle, VELOCITY) == 0
+        assert write_command(plant.handle, SPEEDS) == 0
+        told = np.array([float(plant.get(f"servo{k}.retract")) for k in range(1, 7)])
+        np.testing.assert_allclose(1e-3 * sign * told + offset, SPEEDS, rtol=0.0, atol=1e-16)
+
+
 def test_a_common_switch_is_on_while_any_drive_moves(load: Load) -> None:
     plant = load()
     for modes, expected in (([BRAKE] * 6, 0), ([VELOCITY] * 6, 1), ([BRAKE] * 5 + [VELOCITY], 1)):
