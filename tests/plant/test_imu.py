@@ -214,6 +214,15 @@ def test_drift_is_a_random_walk_of_the_bias() -> None:
             assert variance == pytest.approx(drift**2 * share * seconds, rel=0.3)  # of 336 walks
 
 
+def test_every_random_error_has_random_numbers_of_its_own() -> None:
+    """Neither a sensor, an axis or an IMU shares them with another, nor the noise with the walk of the bias."""
+    cycles = 3000
+    walks = readings(imu_state(one_sensor(SensorErrors(drift=1.0)), 4, PERIOD), constant(0.0, cycles))[:, :2]
+    noise = readings(imu_state(NOISY, 4, PERIOD), constant(0.0, cycles))
+    columns = np.hstack([np.diff(walks.reshape(cycles, 42), axis=0), noise[1:].reshape(-1, 63)])
+    assert np.abs(np.corrcoef(columns.T) - np.eye(105)).max() < 5.0 / sqrt(cycles)
+
+
 # ---- constant errors ----
 
 
