@@ -6,9 +6,18 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from controller.estimation.leg_filter import STATES, leg_direction, predict_leg, predict_measurement, start_leg, update_leg
+from controller.cycle import STATE, cycle_parameters
+from controller.estimation.leg_filter import (
+    STATES,
+    leg_direction,
+    predict_leg,
+    predict_measurement,
+    start_leg,
+    step_leg_filters,
+    update_leg,
+)
 from controller.inverse_kinematics import sample_workspace
-from controller.settings import FusionSettings
+from controller.settings import FusionSettings, control_settings, fusion_settings
 from plant.imu import load_imu
 from plant.mechanism import Mechanism
 from tests.controller.leg_geometry import leg_directions, leg_frames, rotation_of, unit
@@ -248,3 +257,26 @@ def test_the_covariance_is_that_of_the_errors_when_the_noise_is_as_assumed():
         count += STATES
     least, greatest = chi2.ppf([0.0005, 0.9995], count)
     assert 0.8 * least < total < 1.2 * greatest
+
+
+@pytest.mark.parametrize("missed", [0, 1, 40, 60, 300])
+def test_missed_periods_are_predicted_and_in_a_long_gap_the_speed_lasts_without_acceleration(hexapod, missed):
+    """The readings are so uncertain that the states after the cycle are those that were predicted."""
+    parameters = cycle_parameters(hexapod, RATE_HZ, control_settings(hexapod), fusion_settings(hexapod))
+    parameters["legs"]["rate_variance"] = parameters["legs"]["force_variance"] = 1e30
+    state = np.zeros((), STATE)
+    legs, before = state["legs"], np.random.default_rng(missed).uniform(-1.0, 1.0, (6, STATES))
+    legs["x"], legs["age"], legs["covariance"] = before, 500, np.eye(STATES)
+    state["imus"]["used"], state["imus"]["sample"] = 1, 1.0
+    state["time"]["missed"], state["time"]["cycle"] = missed, 1000
+    p, s = parameters[()], state[()]
+    step_leg_filters(p["legs"], s["legs"], p["rig"], s["time"], s["imus"])
+
+    time = (1 + missed) * PERIOD_S
+    acceleration = before[:, 4:6] if time <= 0.05 else np.zeros((6, 2))
+    expected = before.copy()
+    expected[:, :2] += time * before[:, 2:4] + time**2 / 2.0 * acceleration
+    expected[:, 2:4] += time * acceleration
+    expected[:, 4:6] = acceleration
+    np.testing.assert_allclose(legs["x"], expected, rtol=0.0, atol=1e-12)
+    np.testing.assert_array_equal(legs["age"], 501 + missed)
