@@ -130,6 +130,19 @@ def test_a_motion_is_cut_to_the_duration_and_a_margin_to_look_ahead(hexapod, mot
     assert len(load_target(motion_capture, hexapod, 1e-6).times) >= 2
 
 
+@pytest.mark.parametrize("period", [0.01, 0.07, 0.5, 3.0])
+@pytest.mark.parametrize("duration", [0.5, 1.0, 1.234])
+def test_the_samples_that_are_kept_lead_beyond_the_duration_and_its_margin(hexapod, tmp_path, period, duration):
+    """At a steady speed the poses up to there are those of the whole file, however far apart the samples are."""
+    times = period * np.arange(round(9.0 / period) + 1)
+    rows = [f"{time!r},{0.003 * time!r},0,0,1,0,0,0" for time in times.tolist()]
+    target = load_target(write(tmp_path, HEADER, *rows), hexapod, duration)
+    needed = np.linspace(0.0, duration + MARGIN_S, 50)
+    np.testing.assert_allclose(target.at(needed)[0][:, 0], hexapod.home.position[0] + 0.003 * needed, rtol=0.0, atol=1e-12)
+    # And no more of them than that takes.
+    assert len(target.times) == 2 or target.times[-2] < duration + MARGIN_S
+
+
 def test_displacements_turn_about_a_home_that_is_turned_itself(hexapod, tmp_path):
     home = Pose(np.array([0.01, -0.02, 0.36]), rotation_of([0.0, 0.05, 0.1]))
     mechanism = Mechanism.from_legs(hexapod.base_joints, hexapod.platform_joints, home=home, limits={"stroke": (-0.06, 0.06)})
