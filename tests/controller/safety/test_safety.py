@@ -113,6 +113,63 @@ def test_a_target_that_begins_elsewhere_is_not_armed(hexapod):
     assert "leg 0 is not where the target begins (0.012 m, the limit is 0.01 m)" in describe_end(bench.state)
 
 
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("leg", range(6))
+def test_a_leg_too_short_is_in_the_way_of_arming_as_one_too_long(hexapod, leg, sign):
+    def obstacle(bench):
+        bench.steps(bench.hold + 1, drive=DriveState.READY)
+        arming = bench.state["safety"]["arming"]
+        return bench.mode, arming["obstacle"], arming["index"], arming["value"], arming["limit"]
+
+    off = np.zeros(6)
+    off[leg] = 0.0099 * sign
+    assert obstacle(Bench(hexapod, off=off))[0] == Mode.ARMED
+    off[leg] = 0.0101 * sign
+    found = obstacle(Bench(hexapod, off=off))
+    assert found == (Mode.IDLE, Cause.NO_AGREEMENT, leg, pytest.approx(0.0101, abs=1e-6), 0.01)
+
+    bench = Bench(hexapod)
+    length = bench.segments[leg, 0, 1]
+    for margin, mode in ((1e-4, Mode.ARMED), (-1e-4, Mode.IDLE)):
+        bench = Bench(hexapod)
+        limits = bench.parameters["safety"]["watch"]["lengths"][leg]
+        limits[int(sign > 0.0)] = length + sign * margin
+        found = obstacle(bench)
+        assert found[0] == mode
+    assert found[1:] == (Cause.NO_WORKSPACE, leg, pytest.approx(length, abs=1e-6), length - 1e-4 * sign)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("leg", [0, 3, 5])
+def test_in_motion_a_leg_is_watched_in_both_directions(hexapod, leg, sign):
+    def stopped(change):
+        bench = running(hexapod)
+        bench.parameters["safety"]["watch"]["drive_deviation"] = 1e3
+        change(bench)
+        bench.steps(round(0.6 * RATE_HZ))
+        return bench.state["safety"]["stop"]["cause"], bench.state["safety"]["stop"]["index"]
+
+    def shift_reference(bench):
+        bench.segments[leg, 0, 1] += sign * 2.0 * bench.parameters["safety"]["watch"]["following"]
+
+    def narrow_stroke(bench):
+        limits = bench.parameters["safety"]["watch"]["lengths"][leg]
+        limits[int(sign > 0.0)] = bench.segments[leg, 0, 1] - 1e-4 * sign
+
+    def command(bench):
+        shift_reference(bench)
+        bench.parameters["safety"]["watch"]["drive_deviation"] = 0.1
+
+    def saturate(bench):
+        bench.parameters["safety"]["watch"]["following"] = 1e3
+        bench.segments[leg, 0, 1] += sign
+
+    assert stopped(shift_reference) == (Cause.FOLLOWING_ERROR, leg)
+    assert stopped(narrow_stroke) == (Cause.BEYOND_STROKE, leg)
+    assert stopped(command) == (Cause.DRIVE_DEVIATES, leg)
+    assert stopped(saturate) == (Cause.SATURATED, leg)
+
+
 def test_a_dry_run_says_what_is_in_the_way_and_asks_nothing_of_the_drives(hexapod):
     for off, words in ((0.0, ""), (0.012, "not armed: leg 0 is not where the target begins")):
         bench = Bench(hexapod, off=off, to_arm=False)
