@@ -49,6 +49,19 @@ def test_a_gain_splits_into_what_it_is_made_of(scale, axes, mounting):
         np.testing.assert_allclose(found, given_, atol=1e-9)
 
 
+@pytest.mark.parametrize("value", [-2e-3, 2e-3])
+@pytest.mark.parametrize(
+    ("name", "index"), [("tilt", 0), ("tilt", 1), ("joints", (0, 5, 2)), ("joints", (1, 0, 0)), ("offset", (2, 6, 1))]
+)
+def test_a_single_correction_of_either_sign_survives_the_file(tmp_path, name, index, value):
+    calibration = Calibration()
+    getattr(calibration, name)[index] = value
+    save_calibration(tmp_path / "c.toml", calibration)
+    again = load_calibration(tmp_path / "c.toml")
+    for each in ("gain", "offset", "tilt", "joints", "floor"):
+        np.testing.assert_allclose(getattr(again, each), getattr(calibration, each), rtol=0.0, atol=1e-15)
+
+
 @pytest.mark.parametrize("gain", [np.zeros((3, 3)), np.diag([1.0, 1.0, -1.0]), np.full((3, 3), -np.inf)])
 def test_a_gain_that_no_sensor_has_is_refused(gain):
     with pytest.raises(InputError, match="singular or mirrors"):
