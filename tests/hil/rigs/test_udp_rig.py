@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 import time
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +43,15 @@ from hil.rigs.udp.datagrams import (
     encode,
 )
 from hil.rigs.udp.emulator import WATCHDOG_CODE, answer_command, new_udp_emulator
-from hil.rigs.udp.link import decode_answer, new_link, parse_address
+from hil.rigs.udp.link import (
+    await_datagram,
+    bound_socket,
+    decode_answer,
+    new_link,
+    parse_address,
+    receive_datagram,
+    socket_address,
+)
 from hil.rigs.udp.rig import UdpRig
 from hil.runs.config import EmulatorConfig, SimulationConfig
 from hil.runs.emulator import _rig_of
@@ -622,3 +630,21 @@ def test_the_rig_does_nothing_that_is_wrong():
         emulator.link.command_bytes[: len(good)] = good
         assert answer_command(emulator, len(good), 2_000_000) > 0
         np.testing.assert_allclose(rig["velocity"], -SPEEDS, rtol=1e-6)
+
+
+def test_only_datagrams_from_the_peers_host_and_port_are_its_own():
+    with ExitStack() as stack:
+
+        def opened(host, port=0):
+            return stack.enter_context(closing(bound_socket(host, port)))
+
+        own, peer = opened("127.0.0.1"), opened("127.0.0.1")
+        link = new_link()
+        link.socket["descriptor"], link.socket["peer"] = own.fileno(), socket_address(peer.getsockname())
+        port = peer.getsockname()[1]
+        others = [opened("127.0.0.1"), *(opened(host, port) for host in ("127.0.0.2", "127.0.1.1", "127.1.0.1"))]
+        for sender, strange in [(peer, 0), *((other, 1) for other in others), (peer, 0)]:
+            sender.sendto(b"four", own.getsockname())
+            await_datagram(link.socket, 1_000_000_000)
+            assert receive_datagram(link.socket, link.answer_bytes) == 4
+            assert link.socket["stranger"] == strange
