@@ -26,9 +26,10 @@ from hil.rigs import (
     new_feedback,
 )
 from hil.rigs.canopen.cia402 import HEARTBEAT_LOST, PDO_LOST
+from hil.rigs.canopen.configuration import configure_drive
 from hil.rigs.canopen.decoder import Decoder, advance_of
 from hil.rigs.canopen.emulated_bus import EmulatedBus
-from hil.rigs.canopen.frames import ANSWER, CobId, new_message, pack_imu, raw_readings
+from hil.rigs.canopen.frames import ANSWER, COMMAND_PDO, CobId, Object, Parameter, new_message, pack_imu, raw_readings
 from hil.rigs.canopen.rig import CanopenRig
 from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings, classic_bits, fd_duration
 from plant.errors import InputError
@@ -600,3 +601,45 @@ def test_two_processes_by_multicast():
 def test_scales_have_signs():
     config = settings(drives={"signs": [1, -1, 1, -1, 1, -1]})
     assert config.drives.scales[:2] == [65536 / 0.005, -65536 / 0.005]
+
+
+class Dictionary:
+    """A node that notes what is written to it."""
+
+    def __init__(self):
+        self.written = {}
+
+    def write(self, index, subindex, value):
+        self.written[index, subindex] = value
+
+    configure = write
+
+    def check(self, index, subindex, value, within=0.0):
+        pass
+
+    def has(self, index, subindex):
+        return True
+
+    def map_pdo(self, pdo):
+        pass
+
+
+@pytest.mark.parametrize("gear", [1.0, 4.0, 0.5])
+def test_a_drive_is_configured_in_its_own_units_for_any_screw_and_gear(gear):
+    """Of lengths that differ from their defaults and from each other, so that none can stand for another."""
+    lead, counts, speed, deceleration = 0.004, 1024, 0.3, 2.5
+    changes = {"heartbeat": 0.03, "silence": 0.7, "command_timeout": 0.11}
+    changes |= {"screw_lead": lead, "gear_ratio": gear, "counts_per_turn": counts}
+    drives = settings(drives={**changes, "velocity_limit": speed, "quick_stop_deceleration": deceleration}).drives
+    node = Dictionary()
+    configure_drive(node, drives, 0.004)
+    # A metre of the leg is so many turns of the motor.
+    turns = gear / lead
+    assert drives.counts_per_metre == pytest.approx(turns * counts)
+    found = node.written
+    assert found[Object.MAX_MOTOR_SPEED, 0] == pytest.approx(60.0 * turns * speed, abs=0.5)
+    assert found[Object.QUICK_STOP_DECELERATION, 0] == pytest.approx(turns * counts * deceleration, abs=0.5)
+    assert found[Object.PRODUCER_HEARTBEAT, 0] == 30
+    assert found[COMMAND_PDO.communication, Parameter.EVENT_TIMER] == 110
+    assert found[Object.INTERPOLATION_PERIOD, 1] * 10.0 ** found[Object.INTERPOLATION_PERIOD, 2] == pytest.approx(0.004)
+    assert (found[Object.MODE, 0], found[Object.TARGET_VELOCITY, 0]) == (9, 0)
