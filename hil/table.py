@@ -1,4 +1,4 @@
-"""A table of text with three outputs: the terminal (by rich), Markdown for docs/, and HTML for reports."""
+"""A table of text for the terminal, for docs/ in Markdown, and for reports in HTML."""
 
 import sys
 from collections.abc import Sequence
@@ -80,7 +80,9 @@ class Table:
             else:
                 upper += "".join(f"<th{span}>{name}</th>" for name in names)
         heads = "".join(f"<tr>{row}</tr>\n" for row in (upper, lower) if row)
-        rows = "".join(f"<tr>{_html(row[0], 'th')}{''.join(_html(cell, 'td') for cell in row[1:])}</tr>\n" for row in self.rows)
+        rows = ""
+        for head, *cells in self.rows:
+            rows += f"<tr>{_html(head, 'th')}{''.join(_html(cell, 'td') for cell in cells)}</tr>\n"
         return f"<table>\n<thead>\n{heads}</thead>\n<tbody>\n{rows}</tbody>\n</table>"
 
     def _flat_headings(self) -> list[str]:

@@ -1,4 +1,4 @@
-"""The command `gough`. A command is built only when it is called, so that nothing waits for the others."""
+"""The command `gough`. Each of its commands is built only when it is called."""
 
 import argparse
 import os
@@ -14,7 +14,7 @@ from plant.errors import GoughError
 from plant.extras import missing_extras_named
 
 REFUSED, INTERRUPTED = 2, 130
-"""Exit statuses beside 0, and 1 for a run that ended early: bad input, with nothing done; Ctrl-C."""
+"""Exit statuses for bad input and for Ctrl-C; 1 is for a run that ended early."""
 
 COMMANDS = {
     "run": ("simulate", "run", "replay", "stream-target"),
@@ -25,7 +25,7 @@ COMMANDS = {
     "study": ("compare-fusion", "evaluate-fusion", "faults", "planar", "broad"),
     "measure": ("bench",),
 }
-"""The commands by heading. A heading is the module of its commands, where `gough tune` is `gough_tune`."""
+"""The commands by heading, which is also their module; there `gough tune` is `gough_tune`."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -98,10 +98,12 @@ def _nearest(text: str, names: Iterable[str]) -> str:
 
 def _command(heading: str, name: str) -> Command:
     """A command, imported only here."""
-    found: Command = getattr(import_module(f"hil.command_line.{heading}"), f"gough_{name.replace('-', '_')}")
+    module = import_module(f"hil.command_line.{heading}")
+    found: Command = getattr(module, f"gough_{name.replace('-', '_')}")
     return found
 
 
 def _section(heading: str) -> str:
     """The part of the help with the commands under a heading."""
-    return "\n".join([f"{heading}:", *(f"  {name:15}  {_command(heading, name).help}" for name in COMMANDS[heading])])
+    lines = (f"  {name:15}  {_command(heading, name).help}" for name in COMMANDS[heading])
+    return "\n".join([f"{heading}:", *lines])

@@ -74,10 +74,7 @@ def gough_calibrate_rig(options: Namespace) -> None:
             result = calibrate_rig(config, knowledge, progress)
     save_calibration(options.output, result.calibration)
     cli.write_json(options.json, result.summary)
-    if options.report:
-        from hil.reports.calibration import write_report
-
-        write_report(result, options.report)
+    cli.write_report(options, "calibration", result)
     if options.picture:
         from hil.reports.calibration_picture import write_picture
 

@@ -1,10 +1,11 @@
-"""The parts of a command: arguments, options from configurations (see `hil.option`), and output files."""
+"""The parts of a command: arguments, options of configurations, and output files."""
 
 import inspect
 import json
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -49,7 +50,7 @@ class Command:
         return line[:1].lower() + line[1:].rstrip(".")
 
     def build(self, parser: ArgumentParser) -> None:
-        """Give a parser the description and the arguments, and what it parses `run` and `parser`."""
+        """Give a parser the description, the arguments, and the defaults `run` and `parser`."""
         parser.description = self.text
         for add in self.arguments:
             add(parser)
@@ -122,9 +123,9 @@ def names_of(config: "type[C]", *without: str) -> list[str]:
 
 
 def options_of(config: "type[C]", *names: str, **changes: Mapping[str, Any]) -> Argument:
-    """The options of a configuration's fields; without names or changes, of all that have one.
+    """The options of a configuration's fields; all of them without names or changes.
 
-    `changes` has by name of a field what is different in this command: `default`, or attributes of `Option`.
+    `changes` has by field what is different in this command: `default`, or attributes of `Option`.
     """
 
     def add(parser: ArgumentParser) -> None:
@@ -140,20 +141,24 @@ def options_of(config: "type[C]", *names: str, **changes: Mapping[str, Any]) -> 
 def _add_option(parser: ArgumentParser, name: str, default: Any, option: Option) -> None:
     flag = option.flag or f"--{'no-' if default is True else ''}{name.replace('_', '-')}"
     if isinstance(default, bool):
-        parser.add_argument(flag, dest=name, action="store_false" if default else "store_true", help=option.text)
+        action = "store_false" if default else "store_true"
+        parser.add_argument(flag, dest=name, action=action, help=option.text)
         return
     scale = _SCALES.get(option.unit, 1.0)
-    shown = None if option.required else option.shown or _shown(default, scale)
+    parse = option.parse or (type(default) if isinstance(default, int | float) else str)
+    text = option.text + (f" [{option.unit}]" if option.unit else "")
+    if not option.required and (shown := option.shown or _shown(default, scale)):
+        text += f" (default: {shown})"
     parser.add_argument(
         flag,
         dest=name,
         default=list(default) if option.several else default,
-        type=_reader(option.parse or (type(default) if isinstance(default, int | float) else str), scale),
+        type=_reader(parse, scale),
         action="append" if option.several else "store",
         required=option.required,
         metavar=option.metavar,
         choices=option.choices,
-        help=option.text + (f" [{option.unit}]" if option.unit else "") + (f" (default: {shown})" if shown else ""),
+        help=text,
     )
 
 
@@ -181,7 +186,7 @@ def _reader(parse: Callable[[str], Any], scale: float) -> Callable[[str], Any]:
 
 
 def config_of(options: Namespace, config: "type[C]", **others: Any) -> "C":
-    """The configuration that the options describe; `others` are fields that are not options.
+    """The configuration that the options describe; `others` are its other fields.
 
     Raises:
         InputError: an option is out of its range.
@@ -194,7 +199,7 @@ def config_of(options: Namespace, config: "type[C]", **others: Any) -> "C":
 
 
 def check_outputs(options: Namespace, inputs: Sequence[Path] = ()) -> None:
-    """Check that the output files can be written, and that no two of them and of the inputs are one.
+    """Check that the outputs can be written, and that no two of them and the inputs are one.
 
     Raises:
         InputError: one cannot be written, or two are the same.
@@ -217,3 +222,9 @@ def write_json(path: Path | None, content: Mapping[str, Any]) -> None:
     if path is not None:
         text = json.dumps(content, indent=2, default=lambda array: array.tolist())
         write_whole(path, f"{text}\n".encode())
+
+
+def write_report(options: Namespace, kind: str, *results: Any) -> None:
+    """Write the report of the module `kind` of `hil.reports`, if a file is given."""
+    if options.report is not None:
+        import_module(f"hil.reports.{kind}").write_report(*results, options.report)

@@ -27,10 +27,7 @@ def gough_classify(options: Namespace) -> None:
 
     description = describe(load_mechanism(options.mechanism))
     cli.write_json(options.json, description.summary())
-    if options.report:
-        from hil.reports.classification import write_report
-
-        write_report(description, options.report)
+    cli.write_report(options, "classification", description)
     found = description.mechanism_class
     print(f"{description.mechanism.name}: class {found.label}, a {found.name} with the graph\n  {found.drawing}")
     table = Table("method", "needs", "section", "poses", "conditioning: home", "worst")
@@ -62,7 +59,8 @@ def gough_classes(options: Namespace) -> None:
 
     with progress_bar("classes") as progress:
         rows = evaluate_classes(options.seed, progress)
-    cli.write_json(options.json, {"seed": options.seed, "version": version("gough"), "classes": [asdict(row) for row in rows]})
+    about = {"seed": options.seed, "version": version("gough")}
+    cli.write_json(options.json, about | {"classes": [asdict(row) for row in rows]})
     class_table(rows).print(options.markdown)
 
 
@@ -167,11 +165,12 @@ def gough_tune_fusion(options: Namespace) -> None:
     config = cli.config_of(options, TuningConfig)
     with progress_bar(f"noise of {config.mechanism} with {config.imu}") as progress:
         figures = tune_fusion(config, progress)
-    found = {name: values["after"] for name, values in figures["settings"].items()}
+    settings = figures["settings"]
+    found = {name: values["after"] for name, values in settings.items()}
     write_whole(options.output, tuned_text(config.mechanism, found).encode())
     cli.write_json(options.json, figures)
     table = Table("setting", "before", "after")
-    for name, values in figures["settings"].items():
+    for name, values in settings.items():
         table.add(name, f"{values['before']:.4g}", f"{values['after']:.4g}")
     table.print()
     table = Table(f"{len(config.seeds)} seeds", "NEES before", "after", "95 % bounds", "RMS before", "after")

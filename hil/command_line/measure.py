@@ -44,10 +44,7 @@ def gough_bench(options: Namespace) -> None:
         if options.only in (None, section):
             measure(options, figures)
     cli.write_json(options.json, figures)
-    if options.report:
-        from hil.reports.benchmark import write_report
-
-        write_report(figures, earlier, options.report)
+    cli.write_report(options, "benchmark", figures, earlier)
     print(f"{figures['machine']}, {figures['date']}, gough {figures['version']}")
     if options.check:
         from hil.benchmarks.clock import GrossExcessError, gross_excess

@@ -17,9 +17,6 @@ if TYPE_CHECKING:
 
 _FILE = cli.argument("file", type=Path, metavar="FILE.fmu")
 
-_PERIOD_S = 1e-3
-"""The step of a plant that is only linearised."""
-
 
 def _names(text: str) -> list[str]:
     return text.split(",")
@@ -57,11 +54,10 @@ def gough_fmu_build(options: Namespace) -> None:
 
 
 @cli.command()
-def gough_fmu_table(options: Namespace) -> None:
+def gough_fmu_table(_: Namespace) -> None:
     """Print the variables of gough's own plants, as docs/fmu.md has them: tables in Markdown."""
     from plant.fmu.build import PLANAR_MODEL, SPATIAL_MODEL
 
-    del options
     sections = []
     for model in (SPATIAL_MODEL, PLANAR_MODEL):
         variables = model.table
@@ -97,8 +93,8 @@ def gough_fmu_info(options: Namespace) -> None:
     _print_pairs(facts)
     table = Table("variable", "shape", "type", "unit", "what", "least", "greatest")
     for each in description:
-        kind = f"{each.variability} {each.causality}"
-        table.add(each.name, _shape(each.shape), each.type, each.unit or "-", kind, f"{each.minimum:g}", f"{each.maximum:g}")
+        kind, limits = f"{each.variability} {each.causality}", (f"{each.minimum:g}", f"{each.maximum:g}")
+        table.add(each.name, _shape(each.shape), each.type, each.unit or "-", kind, *limits)
     table.print()
     names = ("name", "shape", "type", "unit", "causality", "variability", "minimum", "maximum")
     variables = [{name: _finite(getattr(each, name)) for name in names} for each in description]
@@ -116,11 +112,10 @@ def gough_fmu_validate(options: Namespace) -> int:
 
     with progress_bar(f"trying {options.file}"):
         checks = check_fmu(options.file)
-    _print_pairs(
-        {check.name: "not promised" if check.problems is None else "; ".join(check.problems) or "ok" for check in checks}
-    )
-    cli.write_json(options.json, {"file": str(options.file), "checks": {check.name: check.problems for check in checks}})
-    return int(any(check.problems for check in checks))
+    problems = {check.name: check.problems for check in checks}
+    _print_pairs({name: "not promised" if found is None else "; ".join(found) or "ok" for name, found in problems.items()})
+    cli.write_json(options.json, {"file": str(options.file), "checks": problems})
+    return int(any(problems.values()))
 
 
 @cli.command(
@@ -148,18 +143,19 @@ def gough_fmu_linearize(options: Namespace) -> None:
     mechanism = load_in_space(options.mechanism)
     path = options.file or default_fmu(model_of(mechanism))
     parameters = mechanism.plant_parameters() if options.binding is None else {}
-    with FmuPlant(path, parameters, _PERIOD_S, options.binding) as plant:
+    with FmuPlant(path, parameters, 1e-3, options.binding) as plant:
         write_drive_mode(plant.handle, VELOCITY)
         system = state_space(plant, options.inputs, options.outputs)
-    table = Table("pole [1/s]", "frequency [Hz]", "damping")
     poles = sorted(system.poles(), key=abs)
+    table = Table("pole [1/s]", "frequency [Hz]", "damping")
     for pole in poles:
         if pole.imag >= 0.0:
             size = abs(pole)
-            table.add(f"{pole:.4g}", f"{size / (2.0 * np.pi):.4g}", f"{-pole.real / size:.3f}" if size > 0.0 else "-")
+            damping = f"{-pole.real / size:.3f}" if size > 0.0 else "-"
+            table.add(f"{pole:.4g}", f"{size / (2.0 * np.pi):.4g}", damping)
     table.print()
     print(f"{system.nstates} states, {system.ninputs} inputs, {system.noutputs} outputs")
-    matrices = {name: getattr(system, name).tolist() for name in "ABCD"}
+    matrices = {name: getattr(system, name) for name in "ABCD"}
     names = {"states": system.state_labels, "inputs": system.input_labels, "outputs": system.output_labels}
     cli.write_json(options.json, matrices | names | {"poles": [[pole.real, pole.imag] for pole in poles]})
 

@@ -57,10 +57,7 @@ def gough_simulate(options: Namespace) -> None:
         write_snapshot(result.snapshot, options.save_state)
     if stopped is None or result.moved:
         cli.write_json(options.json, result.summary())
-        if options.report:
-            from hil.reports.run import write_report
-
-            write_report(result, options.report)
+        cli.write_report(options, "run", result)
         _print_simulation(result.summary())
     if stopped:
         raise stopped
@@ -86,12 +83,9 @@ def _print_simulation(summary: dict[str, Any]) -> None:
             ("truth - target", "target", ""),
         ]
     for label, group, prefix in rows:
-        errors = summary[group]
-        table.add(
-            label,
-            *(mm(errors[f"{prefix}position_{kind}"], 4) for kind in ("rms", "max")),
-            *(deg(errors[f"{prefix}rotation_{kind}"], 4) for kind in ("rms", "max")),
-        )
+        positions = (mm(summary[group][f"{prefix}position_{kind}"], 4) for kind in ("rms", "max"))
+        rotations = (deg(summary[group][f"{prefix}rotation_{kind}"], 4) for kind in ("rms", "max"))
+        table.add(label, *positions, *rotations)
     table.print()
     if not summary["truth_known"]:
         print("the truth is not known: the plant does not give its pose")
@@ -120,7 +114,7 @@ def gough_run(options: Namespace) -> int:
     from hil.runs.executive import RunStoppedError, run
 
     config, settings = cli.config_of(options, SimulationConfig), cli.config_of(options, RealTimeSettings)
-    stopped = None
+    stopped: Exception | None = None
     with live_view(config.mechanism, config.target, config.rate) as show:
         try:
             summary = run(config, settings, options.record, show)
@@ -128,18 +122,16 @@ def gough_run(options: Namespace) -> int:
             if error.summary is None:
                 raise
             stopped, summary = error, error.summary
-    unprinted = None
     try:
         _print_run(summary)
     except OSError as error:
-        unprinted = error
+        stopped = stopped or error
     cli.write_json(options.json, summary)
-    if problem := stopped or unprinted:
-        raise problem
+    if stopped:
+        raise stopped
     if summary["obstacle"]:
         return 1
-    lost = summary["recording"]["lost"]
-    if lost:
+    if lost := summary["recording"]["lost"]:
         raise cli.OutputError(f"the run went to its end, but {lost} of {summary['cycles']} cycles are not recorded")
     return 0
 
@@ -177,10 +169,9 @@ def _print_run(summary: dict[str, Any]) -> None:
         print(_bars(summary["round_trip_bars"]))
     if summary["unseen"]:
         print(f"{summary['unseen']} cycles are in none of these figures: the supervisor came too late")
-    if summary["recording"]["files"]:
-        kept = summary["cycles"] - summary["recording"]["lost"]
-        files = ", ".join(summary["recording"]["files"])
-        print(f"{kept} cycles recorded in {files}; {summary['recording']['lost']} cycles lost")
+    files, lost = summary["recording"]["files"], summary["recording"]["lost"]
+    if files:
+        print(f"{summary['cycles'] - lost} cycles recorded in {', '.join(files)}; {lost} cycles lost")
     if summary["identity"]:
         print(f"rig: {summary['identity']['name']} {summary['identity']['parts']}")
     if summary["obstacle"] is not None:

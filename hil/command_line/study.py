@@ -184,10 +184,7 @@ def gough_planar(options: Namespace) -> None:
     result = evaluate(options.folder, mechanism)
     summary = result.summary()
     cli.write_json(options.json, summary)
-    if options.report:
-        from hil.reports.planar_rig import write_report
-
-        write_report(result, options.report)
+    cli.write_report(options, "planar_rig", result)
     table = Table("RMS of the poses' mean errors", "x [mm]", "y [mm]", "angle [deg]", "leg angles [deg]", "true pose is a mode")
     for source, figures in summary["sources"].items():
         rms, poses = figures["rms"], f"{figures['true_mode']['poses']} of {len(result.poses)} poses"
@@ -222,6 +219,7 @@ def gough_broad(options: Namespace) -> None:
     table = Table("inclination RMS", "filter [deg]", "vqf [deg]", "filter [us]", "vqf [us]", "samples")
     for name, trial in figures["trials"].items():
         methods = trial["filter"], trial["vqf"]
-        errors, times = (deg(method["inclination_rms"]) for method in methods), (f"{method['us']:.2f}" for method in methods)
+        errors = (deg(method["inclination_rms"]) for method in methods)
+        times = (f"{method['us']:.2f}" for method in methods)
         table.add(name, *errors, *times, f"{trial['samples']}")
     table.print()

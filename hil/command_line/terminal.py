@@ -35,7 +35,7 @@ def mm_deg(errors: dict[str, float], prefix: str = "") -> str:
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[..., None]]:
-    """A progress bar on the terminal. It pulses until it is called with the share that is done, and may be a new label."""
+    """A progress bar. It pulses until it is called with the share that is done, and may be a new label."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 

@@ -64,6 +64,7 @@ def test_a_broken_promise_is_told_by_the_exit_status(
         (["build", "--output", "no/such/folder.fmu"], "cannot write"),
         (["info", "missing.fmu"], "there is no FMU at missing.fmu"),
         (["validate", "missing.fmu"], "there is no FMU at missing.fmu"),
+        (["validate", "missing.fmu", "--json", "no/such/checks.json"], "cannot write no/such/checks.json"),
         (["linearize", "--outputs", "leg_lengths"], "has no variable 'leg_lengths'; did you mean leg_length?"),
     ],
 )
