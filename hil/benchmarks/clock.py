@@ -1,7 +1,7 @@
 """Benchmarks of the loop on the clock: how late it wakes and how long it computes, idle and under load.
 
-Short slices of three loops take turns: ours, cyclictest, and a bare compiled loop that only computes, for as long as ours.
-Disturbances by the machine show in all three.
+Short slices of three loops take turns, so that disturbances by the machine show in all: ours, cyclictest, and a bare compiled
+loop that only computes, for as long as ours.
 """
 
 import json
@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -25,7 +25,7 @@ from controller.safety.causes import Cause, Reaction
 from hil.loop.driver import prevent_compilation
 from hil.loop.records import RECORD, Link, shared_array
 from hil.loop.timing import Timing, over_budget
-from hil.progress import Progress, no_progress
+from hil.progress import Progress, no_progress, part_of
 from hil.realtime.clock import REAL, finish, new_clock, start, wait
 from hil.realtime.durations import Histogram
 from hil.realtime.processes import FORK
@@ -50,10 +50,10 @@ def measure_real_time(seconds: dict[float, float], progress: Progress = no_progr
     """Time loops on the clock, for so many `seconds` by rate [Hz], idle and again under load.
 
     Returns:
-        `rates`: by rate and condition, `compute_us`, `latency_us`, `wake_us`, `cyclictest_us` (None without cyclictest),
-        `bare_us` (computing of the bare loop) and `bare_wake_us`, each with p50, p99, p999, max and n; `stages_us`; those
-        `over_budget`; `missed_own` and `missed_host` periods; `usage` of the loop's thread; `histograms`. `refused`: measures
-        for real time that the machine refuses; `missing`: programs that it lacks.
+        `rates`: by rate and condition, `compute_us`, `latency_us`, `wake_us`, `cyclictest_us` (None without it), and
+        `bare_us` and `bare_wake_us` of the bare loop, each with p50, p99, p999, max and n; `stages_us`; `over_budget`;
+        `missed_own` and `missed_host` periods; `usage`; `histograms`. `refused`: measures for real time that the machine
+        refuses. `missing`: programs that it lacks.
 
     Raises:
         GoughError: the loop stopped before the end of its slice.
@@ -63,19 +63,12 @@ def measure_real_time(seconds: dict[float, float], progress: Progress = no_progr
     with real_time(settings) as refused:
         pass
     shares = {each: share for each, share in CONDITIONS.items() if each != LOAD or "stress-ng" not in missing}
-    whole, done = sum(shares.values()) * sum(seconds.values()), 0.0
-    rates: dict[str, Any] = {}
+    rates, whole, done = {}, sum(seconds.values()), 0.0
     for rate, duration in seconds.items():
-        bench = _Bench(rate, settings, cyclictest="cyclictest" not in missing)
-        rates[f"{rate:g}"] = {}
-        for condition, share in shares.items():
-            pool = _Pool()
-            with _circumstances(condition):
-                for _ in range(max(1, round(duration * share / _SLICE_S))):
-                    bench.add_slice(pool, busy=condition == BUSY)
-                    done += _SLICE_S
-                    progress(min(done / whole, 1.0))
-            rates[f"{rate:g}"][condition] = pool.figures()
+        bench = _Bench(rate, settings, compare=True)
+        _take_turns([bench], shares, duration, part_of(progress, done / whole, duration / whole))
+        rates[f"{rate:g}"] = {condition: pool.figures() for condition, pool in bench.pools.items()}
+        done += duration
     return {"rates": rates, "refused": refused, "missing": missing, "slice_s": _SLICE_S}
 
 
@@ -83,23 +76,13 @@ def measure_measures(seconds: float, progress: Progress = no_progress) -> dict[s
     """The effect of each measure for real time: the loop at 1 kHz with all, without each, and without any.
 
     Returns:
-        By the measure left out ("nothing" and "all" included) and condition: `wake_us` and `compute_us` with p50, p99, p999,
-        max and n, periods `missed`, and `minor_faults` of the loop's thread.
+        By the measure left out ("nothing" and "all" included) and condition: `wake_us`, `compute_us`, the periods
+        `missed`, and `minor_faults` of the loop's thread.
     """
-    conditions = [IDLE] if shutil.which("stress-ng") is None else [IDLE, LOAD]
     cases = {"nothing": (), **{measure: (measure,) for measure in MEASURES}, "all": MEASURES}
-    slices = max(1, round(seconds / _SLICE_S))
-    pools = {case: {condition: _Pool() for condition in conditions} for case in cases}
-    benches = {case: _Bench(1000.0, RealTimeSettings(without=left_out), False) for case, left_out in cases.items()}
-    done, whole = 0, slices * len(cases) * len(conditions)
-    for condition in conditions:
-        with _circumstances(condition):
-            # In turn: the machine changes with time.
-            for _ in range(slices):
-                for case, bench in benches.items():
-                    bench.add_slice(pools[case][condition], busy=False, bare=False)
-                    done += 1
-                    progress(done / whole)
+    benches = {case: _Bench(1000.0, RealTimeSettings(without=left_out), compare=False) for case, left_out in cases.items()}
+    conditions = [IDLE] if shutil.which("stress-ng") is None else [IDLE, LOAD]
+    _take_turns(list(benches.values()), dict.fromkeys(conditions, 1.0), seconds, progress)
     return {
         case: {
             condition: {
@@ -107,14 +90,26 @@ def measure_measures(seconds: float, progress: Progress = no_progress) -> dict[s
                 "missed": pool.counts["missed_own"] + pool.counts["missed_host"],
                 "minor_faults": pool.counts["minor_faults"],
             }
-            for condition, pool in by_condition.items()
+            for condition, pool in bench.pools.items()
         }
-        for case, by_condition in pools.items()
+        for case, bench in benches.items()
     }
 
 
+def _take_turns(benches: list["_Bench"], shares: dict[str, float], seconds: float, progress: Progress) -> None:
+    """Run slices of all benches in turn, as the machine changes with time, for shares of `seconds` by condition."""
+    counts = {condition: max(1, round(seconds * share / _SLICE_S)) for condition, share in shares.items()}
+    whole, done = len(benches) * sum(counts.values()), 0
+    for condition, count in counts.items():
+        with _circumstances(condition):
+            for bench in benches * count:
+                bench.add_slice(condition)
+                done += 1
+                progress(done / whole)
+
+
 class _Pool:
-    """The measurements of all slices of one rate and condition; `counts` has missed periods and the thread's usage."""
+    """The measurements of all slices of a condition; `counts` has missed periods and the thread's usage."""
 
     def __init__(self) -> None:
         self.timing, self.counts = Timing(), Counter[str]()
@@ -138,24 +133,27 @@ class _Pool:
 
 
 class _Bench:
-    """The loops of one rate, prepared once; every slice runs in a process of its own."""
+    """The loops of one rate, prepared once: ours, and the others if it is to `compare`. A slice has its own process."""
 
-    def __init__(self, rate: float, settings: RealTimeSettings, cyclictest: bool) -> None:
+    def __init__(self, rate: float, settings: RealTimeSettings, compare: bool) -> None:
+        self.pools = defaultdict[str, _Pool](_Pool)
         self._config = SimulationConfig(target="sines", duration=_SLICE_S, rate=rate)
-        self._settings, self._cyclictest = settings, cyclictest
+        self._settings, self._compare = settings, compare
+        self._cyclictest = compare and shutil.which("cyclictest") is not None
         with prepared_loop(self._config) as loop:
             self._records = shared_array(loop.end + round(rate), RECORD)
         _run_bare(new_clock(0, 1), 0, 0, np.zeros((1, 2), np.int64))
 
-    def add_slice(self, pool: _Pool, busy: bool, bare: bool = True) -> None:
-        """Run our loop, cyclictest if wanted, and the bare loop, one after the other."""
-        with _busy_thread() if busy else nullcontext():
+    def add_slice(self, condition: str) -> None:
+        """Run our loop, and to compare with it cyclictest and the bare loop, one after the other."""
+        pool = self.pools[condition]
+        with _busy_thread() if condition == BUSY else nullcontext():
             count, counts = _in_a_process(self._ours)
         pool.timing.add(self._records[:count])
         pool.counts.update(counts)
         if self._cyclictest:
             self._run_cyclictest(pool.cyclictest)
-        if bare:
+        if self._compare:
             work = round(1e3 * pool.timing.histograms["compute"].figures()["p50"])
             durations: Record = _in_a_process(self._bare, work)
             pool.bare_wake.add(durations[:, 0])
@@ -209,13 +207,13 @@ class _Bench:
 
 
 def durations_of(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Durations [ns] for counts by whole microseconds, as by cyclictest, spread evenly over each."""
+    """Durations [ns] for counts by whole microseconds, spread evenly over each."""
     parts = [1000 * us + 1000 * np.arange(count) // count for us, count in enumerate(counts.tolist()) if count]
     return np.concatenate(parts) if parts else np.zeros(0, np.int64)
 
 
 def _in_a_process(target: Callable[..., Any], *arguments: Any) -> Any:
-    """What a function returns in a process of its own, which shares the memory of this one."""
+    """What a function returns in a process that shares the memory of this one."""
 
     def send() -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -314,20 +312,19 @@ def _busy_thread() -> Iterator[None]:
 def measure_start_up(cold: bool) -> dict[str, float | None]:
     """Seconds from the start of `gough run` to its first cycle: with caches and, if `cold`, without."""
 
-    def first_cycle(cache: str | None) -> float:
-        environment = dict(os.environ) if cache is None else {**os.environ, "GOUGH_CACHE": cache}
+    def first_cycle(**cache: str) -> float:
         with tempfile.TemporaryDirectory(prefix="gough-start-") as folder:
             path = Path(folder) / "run.json"
             command = [sys.executable, "-m", "hil.command_line", "run", "--target", "hold", "--duration", "0.1", "--json"]
-            subprocess.run([*command, str(path)], env=environment, check=True, capture_output=True)
+            subprocess.run([*command, str(path)], env={**os.environ, **cache}, check=True, capture_output=True)
             return float(json.loads(path.read_text())["start_up_s"])
 
     figures: dict[str, float | None] = {"cold_s": None}
     if cold:
         with tempfile.TemporaryDirectory(prefix="gough-cold-") as cache:
-            figures["cold_s"] = first_cycle(cache)
-    first_cycle(None)
-    return {**figures, "cached_s": min(first_cycle(None) for _ in range(3))}
+            figures["cold_s"] = first_cycle(GOUGH_CACHE=cache)
+    first_cycle()
+    return {**figures, "cached_s": min(first_cycle() for _ in range(3))}
 
 
 class GrossExcessError(GoughError, RuntimeError):

@@ -1,4 +1,4 @@
-"""Benchmarks of direct kinematics: time per pose by class and method, and success from a cold start."""
+"""Benchmarks of direct kinematics: time per pose, and success from a cold start."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -79,7 +79,7 @@ def _median_s(work: Callable[[], object]) -> float:
 
 
 def _time_methods(mechanism: Mechanism) -> dict[str, dict[str, float]]:
-    """Microseconds per pose of every method that works on the mechanism with all its legs."""
+    """Microseconds per pose of every method that works on the mechanism."""
     measurements = _measure(mechanism, _ROWS)
     times = {}
     for method in METHODS:
@@ -101,12 +101,12 @@ def _measure(mechanism: Mechanism, count: int) -> dict[str, Array]:
 
 
 def _time_batch(mechanism: Mechanism) -> tuple[dict[str, float], float]:
-    """Poses per second of a refined batch on all cores by method, and microseconds of one call of `solve`."""
+    """Poses per second of a refined batch by method, and microseconds of a call of `solve`."""
     measurements = _measure(mechanism, _BATCH_ROWS)
-    rates = {
-        method: _BATCH_ROWS / _median_s(partial(solve_batch, mechanism, **measurements_of(method, measurements), method=method))
-        for method in ("section-5", "up", "normal", "legs")
-    }
+    rates = {}
+    for method in ("section-5", "up", "normal", "legs"):
+        given = measurements_of(method, measurements)
+        rates[method] = _BATCH_ROWS / _median_s(partial(solve_batch, mechanism, **given, method=method))
     calls = []
     for directions, up in zip(measurements["leg_directions"][:_ROWS], measurements["up_in_platform"], strict=False):
         start = perf_counter()
@@ -116,7 +116,7 @@ def _time_batch(mechanism: Mechanism) -> tuple[dict[str, float], float]:
 
 
 def _time_newton(mechanism: Mechanism) -> float:
-    """Microseconds per pose of Newton's method along a motion at 1 kHz, each started from the pose before."""
+    """Microseconds per pose of Newton's method, each started from the pose before."""
     times = np.arange(0.0, _MOTION_S, 1e-3)
     home = mechanism.require_home()
     swings = np.sin(2.0 * np.pi * times[:, None] * [0.9, 0.7, 0.5, 0.8, 0.6, 1.0])
@@ -135,10 +135,12 @@ def _start_cold(mechanism: Mechanism, random: np.random.Generator) -> dict[str, 
             for tilt, way, yaw in random.uniform([0.0, -np.pi, -np.pi], [_WIDE_TILT, np.pi, np.pi], (_COLD_STARTS, 3))
         ]
     )
-    reach = 0.3 * float(np.median(np.linalg.norm(home.position + mechanism.platform_joints - mechanism.base_joints, axis=1)))
+    legs = home.position + mechanism.platform_joints - mechanism.base_joints
+    reach = 0.3 * float(np.median(np.linalg.norm(legs, axis=1)))
     wide = home.position + random.uniform(-reach, reach, (_COLD_STARTS, 3)), turns @ home.rotation
     figures = {}
-    for name, (positions, rotations) in (("workspace", sample_workspace(mechanism, _COLD_STARTS, seed=0)), ("wide", wide)):
+    ranges = {"workspace": sample_workspace(mechanism, _COLD_STARTS, seed=0), "wide": wide}
+    for name, (positions, rotations) in ranges.items():
         exact = draw_measurements(mechanism, positions, rotations, random, 0.0)
         found = solve_batch(mechanism, exact["leg_directions"])
         ours = [found[i] if found.solved[i] else None for i in range(_COLD_STARTS)]

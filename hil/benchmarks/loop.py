@@ -25,8 +25,7 @@ def measure_speed(target: str, duration: float, progress: Progress = no_progress
     """Run the simulation several times, and once with the filters on filterpy.
 
     Returns:
-        `real_time_factor` (median, least, greatest), `filterpy_real_time_factor`, `filterpy_slowdown`, `cycle_us` and
-        `stages_us` (p50, p99, p999, max, n).
+        `real_time_factor`, `filterpy_real_time_factor`, `filterpy_slowdown`, `cycle_us` and `stages_us`.
 
     Raises:
         GoughError: as `simulate`.
@@ -34,13 +33,9 @@ def measure_speed(target: str, duration: float, progress: Progress = no_progress
     config = SimulationConfig(target=target, duration=duration)
     simulate(SimulationConfig(target=target, duration=0.1))
     share = 1.0 / (_REPEATS + 1)
-    factors = []
-    runs = []
-    for i in range(_REPEATS):
-        result = simulate(config, part_of(progress, i * share, share))
-        factors.append(result.real_time_factor)
-        runs.append(result.records["stage_ns"])
-    stage_ns = np.concatenate(runs)
+    results = [simulate(config, part_of(progress, i * share, share)) for i in range(_REPEATS)]
+    factors = [result.real_time_factor for result in results]
+    stage_ns = np.concatenate([result.records["stage_ns"] for result in results])
     slow = simulate(SimulationConfig(target=target, duration=min(duration, _FILTERPY_S), fusion="filterpy"))
     progress(1.0)
     median = float(np.median(factors))
