@@ -1,4 +1,4 @@
-"""The report of the loop on the clock: histograms of its times, and their course from run to run."""
+"""The report of the loop on the clock."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,9 +11,9 @@ from plant.errors import InputError
 
 
 def write_report(figures: dict[str, Any], history: Sequence[dict[str, Any]], path: Path) -> None:
-    """Write histograms of the loop on the clock, and its figures from run to run, as one HTML file.
+    """Write histograms, and the times from run to run, as one HTML file.
 
-    Figures and those of the `history` are as `gough bench --json` writes them.
+    The figures, and those in `history`, are as `gough bench --json` writes them.
 
     Raises:
         InputError: the figures lack the section `real_time`, or the file cannot be written.

@@ -75,17 +75,19 @@ def _table(summary: Mapping[str, Any]) -> Table:
     table = Table("", "residual [mg]", "at rests left out [mg]", *(f"{name} [mm]" for name, _ in KINDS.values()))
     for stage, residual in summary["residual_mg"].items():
         left_out = summary["validated"].get(stage, {}).get("left_out_mg")
-        accuracy = (summary[kind].get(stage) for kind in KINDS)
         table.add(
             STAGES[stage],
             f"{residual:.3f}",
             "" if left_out is None else f"{left_out:.3f}",
-            *(
-                Cell(f"{1e3 * each['position_rms']:.3f}", f"{np.degrees(each['rotation_rms']):.3f} deg") if each else ""
-                for each in accuracy
-            ),
+            *(_accuracy(summary[kind].get(stage)) for kind in KINDS),
         )
     return table
+
+
+def _accuracy(errors: dict[str, float] | None) -> Cell:
+    if errors is None:
+        return Cell("")
+    return Cell(f"{1e3 * errors['position_rms']:.3f}", f"{np.degrees(errors['rotation_rms']):.3f} deg")
 
 
 def _residuals(summary: Mapping[str, Any]) -> go.Figure:

@@ -1,4 +1,4 @@
-"""The accuracy of a calibration, stage by stage, drawn as SVG: in its report, and as a small file for documents."""
+"""The accuracy of a calibration, stage by stage, as SVG for its report and for documents."""
 
 from collections.abc import Mapping
 from math import ceil, floor, log10
@@ -29,12 +29,12 @@ def write_picture(summary: Mapping[str, Any], path: Path) -> None:
 
 
 def accuracy_svg(summary: Mapping[str, Any], error: str, unit: str, scale: float) -> str:
-    """Bars of an RMS error with each stage's calibration, on a logarithmic scale.
-
-    The error is "position_rms" or "rotation_rms"; `scale` is the factor from SI units to the shown unit.
-    """
+    """Logarithmic bars of "position_rms" or "rotation_rms" by stage; `scale` is the factor from SI to the unit."""
     stages = list(summary["residual_mg"])
-    sizes = {(stage, kind): scale * summary[kind][stage][error] for stage in stages for kind in KINDS if stage in summary[kind]}
+    sizes = {}
+    for kind in KINDS:
+        for stage, errors in summary[kind].items():
+            sizes[stage, kind] = scale * errors[error]
     first, last = floor(log10(min(sizes.values()))), ceil(log10(max(sizes.values())))
 
     def x(size: float) -> float:

@@ -20,9 +20,9 @@ INK, FAINT = "#26323d", "#9aa5b1"
 
 
 def write_page(path: Path, title: str, subtitle: str, body: str, script: str = "") -> None:
-    """Write a page with the drawing library inside; the file takes its place only when it is complete.
+    """Write a page with the drawing library inside.
 
-    Title and subtitle are plain text, the body is HTML, and the script is JavaScript that runs after the figures are drawn.
+    Title and subtitle are plain text, the body is HTML, and the JavaScript `script` runs after the figures.
 
     Raises:
         InputError: the file cannot be written.
@@ -59,9 +59,9 @@ def place(number: int, columns: int) -> dict[str, int]:
 
 
 def figure_html(name: str, title: str, caption: str, figure: go.Figure | str, kind: str = "time") -> str:
-    """A figure by plotly, or in HTML, with its title and caption in plain text.
+    """A figure by plotly, or in HTML, with title and caption in plain text.
 
-    Its id is `name`, and its class `kind`: "time" for the full width, "view" for a part of it.
+    Its id is `name`, and its class `kind`: "time" has the full width, "view" a part.
     """
     if isinstance(figure, str):
         drawn = f'<div id="{name}">{figure}</div>'

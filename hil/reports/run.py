@@ -219,8 +219,9 @@ def _plot(times: Array, panels: Sequence[_Panel], columns: int = 1, shared_yaxes
 
 def _span(panels: Sequence[_Panel], moving: NDArray[np.bool_]) -> tuple[float, float]:
     """The range of an axis for all `panels`: the motion and the limits, not the filters' settling before."""
-    drawn = [curves[moving].ravel() for panel in panels for curves in (panel.values, panel.planned) if curves is not None]
-    values = np.concatenate([*drawn, *(panel.limits for panel in panels)])
+    curves = [curve for panel in panels for curve in (panel.values, panel.planned) if curve is not None]
+    limits = (panel.limits for panel in panels)
+    values = np.concatenate([*(curve[moving].ravel() for curve in curves), *limits])
     finite = values[np.isfinite(values)]
     least, greatest = (finite.min(), finite.max()) if finite.size else (0.0, 0.0)
     margin = 0.06 * (greatest - least) or 1.0
@@ -316,20 +317,11 @@ def _player(times: Array, frame_s: float) -> dict[str, Any]:
     """Buttons to play and pause, and a slider with a step for each frame."""
     play = {"frame": {"duration": 1e3 * frame_s, "redraw": True}, "transition": {"duration": 0}, "fromcurrent": True}
     show = {"frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}, "mode": "immediate"}
-    buttons = {
-        "type": "buttons",
-        "direction": "left",
-        "showactive": False,
-        "x": 0.0,
-        "xanchor": "left",
-        "y": 0.0,
-        "yanchor": "top",
-        "pad": {"t": 22, "l": 10},
-        "buttons": [
-            {"label": "▶", "method": "animate", "args": [None, play]},
-            {"label": "❚❚", "method": "animate", "args": [[None], show]},
-        ],
-    }
+    buttons = [
+        {"label": "▶", "method": "animate", "args": [None, play]},
+        {"label": "❚❚", "method": "animate", "args": [[None], show]},
+    ]
+    steps = [{"label": f"{time:.2f}", "method": "animate", "args": [[str(k)], show]} for k, time in enumerate(times)]
     slider = {
         "x": 0.16,
         "len": 0.8,
@@ -339,9 +331,20 @@ def _player(times: Array, frame_s: float) -> dict[str, Any]:
         "minorticklen": 0,
         "font": {"color": "rgba(0,0,0,0)", "size": 1},
         "currentvalue": {"prefix": "time ", "suffix": " s", "xanchor": "right", "font": {"color": INK, "size": 13}},
-        "steps": [{"label": f"{time:.2f}", "method": "animate", "args": [[str(k)], show]} for k, time in enumerate(times)],
+        "steps": steps,
     }
-    return {"updatemenus": [buttons], "sliders": [slider]}
+    menu = {
+        "type": "buttons",
+        "direction": "left",
+        "showactive": False,
+        "x": 0.0,
+        "xanchor": "left",
+        "y": 0.0,
+        "yanchor": "top",
+        "pad": {"t": 22, "l": 10},
+        "buttons": buttons,
+    }
+    return {"updatemenus": [menu], "sliders": [slider]}
 
 
 _SHARED_TIME = """

@@ -16,7 +16,7 @@ PLATFORM, BASE = ("#6d87a3", 0.55, "#3d5670"), (FAINT, 0.35, "#5c6873")
 
 
 def scene(points: Array, up: Array, front: Array | None = None) -> dict[str, Any]:
-    """Fixed axes with equal scales around `points` (N, 3), seen from the side and above, or along `front` (3,)."""
+    """Fixed axes with equal scales around `points` (N, 3), seen from above, or along `front` (3,)."""
     margin = 0.05 * np.ptp(points, axis=0).max()
     ranges = np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin], axis=1)
     aside = np.array([1.15, -1.4, 0.0])
