@@ -40,7 +40,7 @@ class Knowledge:
         prior: standard deviations of the IMUs' errors and of the base's tilt.
         home: whether the rig's first pose is home exactly.
         lengths: whether the rig measures the changes of its lengths.
-        known_poses: whether to seek the mounting alone, from planned poses at rest, as the paper's section 7 does.
+        known_poses: whether to seek the mounting alone, from planned poses (the paper's section 7).
     """
 
     prior: Prior = field(default_factory=Prior)

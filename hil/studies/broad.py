@@ -39,7 +39,7 @@ _UNIT_TOLERANCE = 1e-3
 class Trial:
     """A trial: its rate [Hz], and the IMU's rates and forces (N, 3) [rad/s, m/s^2].
 
-    `verticals` (N, 3) are the true ones in the sensor's frame, by the optics. Samples of the movement that they saw count.
+    `verticals` (N, 3) are the true ones in the sensor's frame. Only samples with `counts` (N,) count.
     """
 
     name: str

@@ -10,8 +10,8 @@ from plant.errors import InputError, UnknownNameError
 
 LEARNING_S = 20.0
 """The filters learn for this time [s]; errors count after it."""
-WHOLE_FUSIONS = {name: errors for name, errors in FUSIONS.items() if errors is not None}
-"""Whole-mechanism filters, with the errors of the IMUs that each estimates."""
+WHOLE_FUSIONS = tuple(name for name, errors in FUSIONS.items() if errors is not None)
+"""Names of the whole-mechanism filters."""
 SECTIONS = ("motions", "faults", "start", "drift", "follow", "cost")
 """Sections of an evaluation."""
 _SEEDS = (0, 1, 2, 3, 4, 5)

@@ -1,7 +1,6 @@
 """The fault matrix: every case of a table of faults, run with many seeds and compared with its specified reaction.
 
-Loop, messages and emulated rig are the real ones, connected in memory and on virtual time: results are reproducible. Faults
-that need separate processes are in the tests of emulator and rigs.
+Loop, messages and emulated rig are the real ones, connected in memory and on virtual time: results are reproducible.
 """
 
 from collections import Counter
@@ -253,8 +252,9 @@ def _stand(loop: PreparedLoop) -> None:
 
 def _follow_stream(loop: PreparedLoop, what: str, onset: int) -> None:
     """Stream the target until its fault."""
-    target, mechanism, hold = loop.target, loop.mechanism, int(loop.parameters["rig"]["hold_cycles"])
-    home, start = mechanism.require_home(), leg_lengths(mechanism, target.start.position, target.start.rotation)
+    target, mechanism, home = loop.target, loop.mechanism, loop.mechanism.require_home()
+    hold = int(loop.parameters["rig"]["hold_cycles"])
+    start = leg_lengths(mechanism, target.start.position, target.start.rotation)
     loop.stream, loop.segments = np.zeros((), STREAM), rest(start)
     reception = Reception(loop.stream, StreamPlanner(mechanism, start), 1.0 / RATE_HZ)
     for n, cycle in enumerate(range(hold + _SAMPLE_CYCLES - hold % _SAMPLE_CYCLES, onset + 1, _SAMPLE_CYCLES)):

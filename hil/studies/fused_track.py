@@ -9,6 +9,7 @@ from controller.calibration.file import Calibration
 from controller.cycle import MARKS, STATE, CycleStage, cycle_parameters, run_stages
 from controller.estimation.whole_mechanism.filter import extrapolate_covariance
 from controller.settings import control_settings, sensor_settings
+from hil.runs.config import FUSIONS
 from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.imposed import ImposedMotion
 from plant.imu import load_imu, measure
@@ -106,17 +107,11 @@ def track(fused: Record, step: int) -> PoseTrack:
     )
 
 
-def constants(
-    mechanism: Mechanism,
-    imu: str,
-    rate: float,
-    errors: str | None,
-    calibration: Calibration | None = None,
-    section_5: bool = False,
-) -> Record:
-    """The cycle's constants; the whole-mechanism filter estimates these `errors` of the IMUs."""
-    control, fusion = control_settings(mechanism), sensor_settings(mechanism, load_imu(imu))
-    return cycle_parameters(mechanism, rate, control, fusion, ALL_IMUS, errors, calibration, section_5, section_5)
+def constants(mechanism: Mechanism, imu: str, rate: float, fusion: str, calibration: Calibration | None = None) -> Record:
+    """The cycle's constants with all IMUs; `fusion` is a key of `hil.runs.config.FUSIONS`."""
+    control, sensors = control_settings(mechanism), sensor_settings(mechanism, load_imu(imu))
+    section_5 = fusion == "section-5"
+    return cycle_parameters(mechanism, rate, control, sensors, ALL_IMUS, FUSIONS[fusion], calibration, section_5, section_5)
 
 
 def read(motion: ImposedMotion, imu: Record) -> Array:

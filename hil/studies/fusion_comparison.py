@@ -72,36 +72,31 @@ class _Readings:
         self.calibration = calibration
         self.mechanism = nominal.moved_joints(calibration.joints)
         self.imu = config.imu
-        self._fused: dict[str | None, Record] = {}
+        self._fused: dict[str, Record] = {}
 
-    def parameters(self, errors: str | None, section_5: bool = False) -> Record:
-        """As `hil.studies.fused_track.constants`."""
-        return constants(self.mechanism, self.imu, self.rate, errors, self.calibration, section_5)
+    def parameters(self, fusion: str = "compiled") -> Record:
+        """The cycle's constants with this fusion, a key of `hil.runs.config.FUSIONS`."""
+        return constants(self.mechanism, self.imu, self.rate, fusion, self.calibration)
 
-    def track(self, step: int, errors: str | None = None) -> PoseTrack:
+    def track(self, step: int, fusion: str = "compiled") -> PoseTrack:
         """The poses of a step of the cycle that count."""
-        if errors not in self._fused:
-            self._fused[errors] = fuse(self.parameters(errors), self.raw)
-        return track(self._fused[errors][self.late], step)
-
-
-def _section_5(readings: _Readings) -> PoseTrack:
-    """The paper's algorithm, with the heading of the platform's magnetometer."""
-    fused = fuse(readings.parameters(None, section_5=True), readings.raw)
-    return track(fused[readings.late], CLOSED)
+        if fusion not in self._fused:
+            self._fused[fusion] = fuse(self.parameters(fusion), self.raw)
+        return track(self._fused[fusion][self.late], step)
 
 
 def _vqf(readings: _Readings) -> PoseTrack:
-    """The refined pose with the `vqf` package on each IMU, which knows neither joints nor motion."""
+    """The refined pose with the `vqf` package, which knows neither joints nor motion."""
     count = len(readings.raw)
     calibrated = readings.calibration.apply(readings.raw)
     ups, directions = np.empty((IMU_COUNT, count, 3)), np.empty((count, LEGS, 3))
     began = time.perf_counter()
     for imu in range(IMU_COUNT):
-        rates, forces = (np.ascontiguousarray(calibrated[:, sensor, imu]) for sensor in (GYROSCOPE, ACCELEROMETER))
+        rates = np.ascontiguousarray(calibrated[:, GYROSCOPE, imu])
+        forces = np.ascontiguousarray(calibrated[:, ACCELEROMETER, imu])
         ups[imu] = vqf_verticals(1.0 / readings.rate, rates, forces)
     us = 1e6 * (time.perf_counter() - began) / count
-    _point(readings.parameters(None), ups, directions)
+    _point(readings.parameters(), ups, directions)
     solutions = solve_batch(readings.mechanism, directions, up_in_platform=ups[PLATFORM_IMU])
     return PoseTrack(solutions.positions[readings.late], solutions.rotations[readings.late], us=us)
 
@@ -125,7 +120,7 @@ def _point(parameters: Record, ups: Array, directions: Array) -> None:
 
 def _filterpy(readings: _Readings) -> PoseTrack:
     """The refined pose with the filters of legs and platform on filterpy."""
-    parameters, state = readings.parameters(None), np.zeros((), STATE)
+    parameters, state = readings.parameters(), np.zeros((), STATE)
     filters, fused = FilterpyFilters(parameters), np.zeros(len(readings.raw), FUSED)
     segments, marks, pose = np.zeros((LEGS, 1, 5)), np.zeros((), MARKS)[()], state["pose"]
     for i, raw in enumerate(readings.raw):
@@ -143,11 +138,11 @@ def _filterpy(readings: _Readings) -> PoseTrack:
 
 
 METHODS: dict[str, Callable[[_Readings], PoseTrack]] = {
-    "section 5, magnetometer": _section_5,
+    "section 5, magnetometer": partial(_Readings.track, step=CLOSED, fusion="section-5"),
     "vqf per IMU, refined": _vqf,
     "legs + vertical": partial(_Readings.track, step=CLOSED),
     "refined (compiled)": partial(_Readings.track, step=REFINED),
-    **{name: partial(_Readings.track, step=WHOLE, errors=errors) for name, errors in WHOLE_FUSIONS.items()},
+    **{name: partial(_Readings.track, step=WHOLE, fusion=name) for name in WHOLE_FUSIONS},
 }
 SLOW_METHODS: dict[str, Callable[[_Readings], PoseTrack]] = {"refined (filterpy)": _filterpy}
 """Ways to fuse; the slow ones run on the first seed only."""

@@ -116,7 +116,7 @@ def _calibrated_rigs(config: EvaluationConfig, joint_error: float, progress: Pro
         )
         found = calibrate_rig(rig, Knowledge(Prior(joints=joint_error)), of_seed, validate=False)
         known = nominal.moved_joints(found.calibration.joints)
-        parameters = constants(known, config.imu, config.rate, WHOLE_FUSIONS[config.fusion], found.calibration)
+        parameters = constants(known, config.imu, config.rate, config.fusion, found.calibration)
         rigs.append(_Rig(config, seed, nominal.built(joint_error, seed), parameters, found.summary))
     return rigs
 
@@ -223,7 +223,7 @@ def _of_cost(config: EvaluationConfig, progress: Progress) -> dict[str, Any]:
     raw = read(motion, imu_state(load_imu(_CALIBRATED_IMU), 0, 1.0 / config.rate))
     figures: dict[str, Any] = {}
     for name, of_name in in_parts(WHOLE_FUSIONS, progress):
-        parameters = constants(mechanism, _CALIBRATED_IMU, config.rate, WHOLE_FUSIONS[name])
+        parameters = constants(mechanism, _CALIBRATED_IMU, config.rate, name)
         runs = [fuse(parameters, raw)["ns"] for _ in in_parts(range(_COST_REPEATS), of_name)]
         ns = np.min(runs, axis=0)[round(config.rate) :]
         figures[name] = _microseconds(ns[:, WHOLE] - ns[:, REFINED])

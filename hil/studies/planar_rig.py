@@ -60,7 +60,7 @@ class RigEvaluation:
         """The figures by source, in SI units.
 
         - `rms`: over the poses, of the mean error of a pose.
-        - `true_mode`: the share of `samples` and the number of `poses` at which a mode is the true pose.
+        - `true_mode`: the share of `samples` and number of `poses` at which a mode is the true pose.
         - `leg_angles`: RMS of their mean errors (`constant_error`) and standard deviations (`noise`).
         - `poses`: mean and standard deviation of the error of each.
         """
@@ -122,12 +122,16 @@ def _evaluate_pose(path: Path, mechanism: PlanarMechanism) -> RigPose:
 def modes_near(mechanism: PlanarMechanism, pose: RigPose, source: int) -> tuple[AssemblyMode, AssemblyMode]:
     """The assembly modes at a source's mean leg angles, the nearest to the truth first; equal if they merge."""
     modes = solve_planar(mechanism, pose.true_leg_angles + pose.leg_errors[source].mean(axis=0))
-    near, *others = sorted(modes, key=lambda mode: float(_distances(mechanism, pose.true_pose, mode.position, mode.angle)))
+
+    def distance(mode: AssemblyMode) -> float:
+        return float(_distances(mechanism, pose.true_pose, mode.position, mode.angle))
+
+    near, *others = sorted(modes, key=distance)
     return near, others[0] if others else near
 
 
 def _distances(mechanism: PlanarMechanism, true_pose: Array, positions: Array, angles: Array | float) -> Array:
-    """Distances (...) [m] of the platform joints from their true places, in root sum square."""
+    """Root sum square distances (...) [m] of the platform joints from their true places."""
     offsets = mechanism.joints_at(positions, angles) - mechanism.joints_at(true_pose[:2], true_pose[2])
     distances: Array = np.linalg.norm(offsets, axis=(-2, -1))
     return distances

@@ -28,7 +28,7 @@ _SECTION_5 = ("section-5",)
 
 @dataclass(frozen=True)
 class SensorSet:
-    """IMUs on so many legs and on the platform, its magnetometer, and the `hil.runs.config.FUSIONS` that use them."""
+    """IMUs on so many legs and on the platform, its magnetometer, and the fusions that use them."""
 
     label: str
     legs: int
@@ -48,7 +48,7 @@ SETS = (
     SensorSet("6 legs + yaw, section 5", 6, magnetometer=True, fusions=_SECTION_5),
     SensorSet("6 legs + yaw", 6, magnetometer=True),
 )
-"""From the fewest to all. The tilt is the platform's roll and pitch; with yaw, its whole orientation is measured."""
+"""From the fewest to all. The tilt is the platform's roll and pitch."""
 
 
 def paper_set(mechanism_class: MechanismClass) -> str:
