@@ -1,9 +1,10 @@
-"""Which IMUs can be used: calibration of the raw readings, by (37), and the health of each IMU."""
+"""The health of each IMU: which of them can be used."""
 
 from collections.abc import Collection
 
 import numpy as np
 
+from controller.estimation.imu_calibration import calibrate_samples
 from controller.safety.causes import Cause, report_event
 from controller.settings import FusionSettings, SafetySettings
 from plant.compiled import Record, filled, kernel, record_dtype
@@ -80,7 +81,7 @@ def imu_parameters(
 
 @kernel
 def screen_imus(p: Record, s: Record, legs: int, time: Record, silent: int, measurement: Array, events: Record) -> None:
-    """Calibrate a raw measurement (3, 7, 3) by (37), and find out which IMUs are healthy.
+    """Calibrate a raw measurement (3, 7, 3), and find out which IMUs are healthy.
 
     An IMU is left out while its readings are not finite, out of range, noisy, or frozen or stale while others are not. It is
     used again when it has been healthy for a while. An IMU that contradicted the others stays out.
@@ -91,6 +92,7 @@ def screen_imus(p: Record, s: Record, legs: int, time: Record, silent: int, meas
         measurement: raw [rad/s, m/s^2, uT].
         events: dtype `EVENTS`.
     """
+    calibrate_samples(p.gain, p.offset, measurement, s.sample)
     changed, total_noise = 0, 0.0
     for k in range(IMU_COUNT):
         s.unchanged[k] = 1
@@ -125,10 +127,6 @@ def screen_imus(p: Record, s: Record, legs: int, time: Record, silent: int, meas
                     cause, value, limit = Cause.IMU_OUT_OF_RANGE.value, abs(raw) / p.range[kind], 1.0
                     if not np.isfinite(raw):
                         cause, value, limit = Cause.IMU_NOT_FINITE.value, np.nan, np.nan
-                total = p.offset[kind, k, i]
-                for j in range(3):
-                    total += p.gain[kind, k, i, j] * measurement[kind, k, j]
-                s.sample[kind, k, i] = total
         if p.present[k] == 0 or s.excluded[k] != 0:
             s.used[k] = 0
             continue

@@ -1,0 +1,25 @@
+"""The IMUs' calibration in the cycle: the paper's (37), `a_cal = T S (a_u + b)`, for every raw sample.
+
+`controller.calibration` finds the constants and keeps them in a file.
+"""
+
+from plant.compiled import kernel
+from plant.dynamics.variables import IMU_COUNT
+from plant.pose import Array
+
+
+@kernel
+def calibrate_samples(gain: Array, offset: Array, measurement: Array, sample: Array) -> None:
+    """Write the calibrated samples (3, 7, 3) of a raw measurement (3, 7, 3) [rad/s, m/s^2, uT].
+
+    Args:
+        gain: (3, 7, 3, 3), T S and the mounting of each sensor.
+        offset: (3, 7, 3), T S b [rad/s, m/s^2, uT].
+    """
+    for kind in range(3):
+        for k in range(IMU_COUNT):
+            for i in range(3):
+                total = offset[kind, k, i]
+                for j in range(3):
+                    total += gain[kind, k, i, j] * measurement[kind, k, j]
+                sample[kind, k, i] = total
