@@ -49,7 +49,13 @@ def imus_from_text(text: str) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class SimulationConfig:
-    """What to simulate, or to run on the clock."""
+    """What to simulate, or to run on the clock. Fields that are options say below what they mean; the others:
+
+    Attributes:
+        hold: how long the brakes hold first [s]; None for the time in the mechanism's settings.
+        wiring: how the IMUs are mounted and wired.
+        raw_imus: whether the IMUs are known to be uncalibrated, so that disagreement between them says nothing.
+    """
 
     mechanism: str = option("hexapod", MECHANISM)
     target: str = option(
@@ -68,7 +74,7 @@ class SimulationConfig:
         "platform's IMU with --magnetometer, the position from the legs; filterpy: as compiled, but on filterpy (slow)",
     )
     calibration: str | None = option(None, CALIBRATION, metavar="FILE.toml")
-    hold: float | None = None  # on the brakes first [s]; by default as the mechanism's settings say
+    hold: float | None = None
     plant: str | None = option(None, "Co-Simulation FMU (FMI 2.0 or 3.0) instead of the built one", metavar="FILE.fmu")
     binding: str | None = option(
         None, "which of the FMU's variables are which, if they have other names (docs/fmu.md)", metavar="FILE.toml"
@@ -103,7 +109,7 @@ class SimulationConfig:
         metavar="ADDRESS|FILE",
     )
     arm: bool = option(True, "read everything, and move nothing")
-    raw_imus: bool = False  # known to be uncalibrated, so that disagreement between them says nothing
+    raw_imus: bool = False
 
     def __post_init__(self) -> None:
         check_rate(self.rate)

@@ -15,16 +15,27 @@ _MOST_EVENTS = 100
 
 @dataclass(eq=False)
 class RunState:
-    """State and figures of a run until now."""
+    """State and figures of a run until now.
 
-    latest: Record | None = None  # dtype `RECORD`
+    Attributes:
+        latest: the last record of the loop, dtype `RECORD`.
+        timing: the durations of its stages.
+        missed: number of periods missed.
+        late: number of exchanges without an answer in time.
+        refused: what the machine refused of the measures for real time.
+        refused_packets: number of packets that a rig on a bus refused.
+        unseen: number of cycles that were overwritten before the supervisor saw them; no figure includes them.
+        events: the loop's, by cycle, and the supervisor's own.
+    """
+
+    latest: Record | None = None
     timing: Timing = field(default_factory=Timing)
-    missed: int = 0  # periods
-    late: int = 0  # exchanges without an answer in time
-    refused: list[str] = field(default_factory=list)  # by the machine, of real time
-    refused_packets: int = 0  # by a rig on a bus
-    unseen: int = 0  # cycles that were overwritten before the supervisor saw them; no figure includes them
-    events: list[str] = field(default_factory=list)  # the loop's, by cycle, and the supervisor's own
+    missed: int = 0
+    late: int = 0
+    refused: list[str] = field(default_factory=list)
+    refused_packets: int = 0
+    unseen: int = 0
+    events: list[str] = field(default_factory=list)
     _seen: int = 0
     _squares: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
     _counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(2, np.int64))

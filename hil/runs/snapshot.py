@@ -27,14 +27,23 @@ _KIND = "gough snapshot"
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A simulation between two cycles."""
+    """A simulation between two cycles.
 
-    config: Mapping[str, Any]  # plain values
-    cycle: int  # the next to run
-    settings: bytes  # hash of what does not change: the cycle's parameters, the FMU and its binding
-    motion: bytes  # hash of what was planned until then
-    memory: Mapping[str, bytes]  # the loop's arrays
-    plant: bytes  # state of the FMU and its clock
+    Attributes:
+        config: the configuration as plain values.
+        cycle: the next one to run.
+        settings: hash of what does not change: the cycle's parameters, the FMU and its binding.
+        motion: hash of what was planned until then.
+        memory: the loop's arrays.
+        plant: state of the FMU and its clock.
+    """
+
+    config: Mapping[str, Any]
+    cycle: int
+    settings: bytes
+    motion: bytes
+    memory: Mapping[str, bytes]
+    plant: bytes
 
 
 def take_snapshot(config: Mapping[str, Any], loop: PreparedLoop) -> Snapshot:
