@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from controller.safety.causes import Cause, Reaction
 from hil.loop.driver import prevent_compilation
 from hil.loop.records import RECORD, Link, shared_array
-from hil.loop.timing import Timing, over_budget
+from hil.loop.stage_times import Timing, over_budget
 from hil.progress import Progress, no_progress, part_of
 from hil.realtime.clock import REAL, finish, new_clock, start, wait
 from hil.realtime.durations import Histogram

@@ -12,7 +12,7 @@ from plant.compiled import Record, kernel
 from plant.dynamics.variables import BRAKE, VELOCITY
 from plant.fmu.build import SPATIAL_MODEL, default_fmu
 from plant.fmu.calls import advance, read_imus, read_truth, write_command, write_drive_mode
-from plant.fmu.importer import FmuDescription
+from plant.fmu.description_reader import FmuDescription
 from plant.fmu.instance import FmuInstance
 from plant.fmu.plant import FmuPlant
 from plant.mechanism import load_spatial

@@ -73,7 +73,7 @@ def gough_fmu_info(options: Namespace) -> None:
     """Show what any FMU for Co-Simulation is, its variables, and whether the loop can use it as it is."""
     from plant.fmu.binding import OWN_BINDING, bind
     from plant.fmu.check import platforms_of
-    from plant.fmu.importer import FmuDescription
+    from plant.fmu.description_reader import FmuDescription
 
     description = FmuDescription(options.file)
     try:

@@ -137,7 +137,7 @@ def gough_run(options: Namespace) -> int:
 
 
 def _print_run(summary: dict[str, Any]) -> None:
-    from hil.loop.timing import budget
+    from hil.loop.stage_times import budget
 
     table = Table("us", *(f"{label} / budget" for label in QUANTILES))
     for stage, figures in summary["timing_us"].items():

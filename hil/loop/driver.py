@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from controller.cycle import CycleStage, run_stages
 from controller.planning.stream import STREAM_READER
 from controller.safety.causes import Cause, Mode
-from hil.loop.kernels import begin_cycle, end_cycle, exchange_fmu, periods_passed, process_feedback, run_loop
+from hil.loop.compiled_loop import begin_cycle, end_cycle, exchange_fmu, periods_passed, process_feedback, run_loop
 from hil.loop.records import LINK_SIZE, STAGES, WORK, Stage, TargetStream
 from hil.realtime.clock import FREE, new_clock
 from hil.rigs import SILENT, Identity, Rig, new_feedback

@@ -12,7 +12,7 @@ from controller.cycle import MARKS, PARAMETERS, STATE, cycle, hear_rig, prepare_
 from controller.planning import STREAM_TARGET
 from controller.safety.causes import Cause
 from controller.safety.stop import ramp_down
-from hil.loop.kernels import record_state
+from hil.loop.compiled_loop import record_state
 from hil.loop.records import RECORD
 from hil.recording.mcap import RecordingError, read_run
 from plant.compiled import Record, kernel

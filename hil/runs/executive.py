@@ -32,7 +32,7 @@ from controller.safety.arming import describe_obstacle
 from controller.safety.causes import Cause, Reaction
 from hil.loop.driver import Loop, prevent_compilation, stop_quickly
 from hil.loop.records import LINK_SIZE, RECORD, Link, StopRequest, shared_array
-from hil.loop.timing import over_budget
+from hil.loop.stage_times import over_budget
 from hil.realtime.clock import REAL, new_clock
 from hil.realtime.processes import FORK, PATIENCE_S, join_or_kill, started
 from hil.realtime.scheduling import RealTimeSettings, real_time, since_process_start, usage

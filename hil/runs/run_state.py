@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.loop.timing import Timing
+from hil.loop.stage_times import Timing
 from hil.recording.mcap import events_of, take
 from plant.compiled import Record
 from plant.truth import TRUTH_POSITION

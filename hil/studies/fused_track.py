@@ -11,7 +11,7 @@ from controller.estimation.whole_mechanism.filter import extrapolate_covariance
 from controller.settings import control_settings, sensor_settings
 from hil.runs.config import FUSIONS
 from plant.compiled import Record, kernel, record_dtype
-from plant.dynamics.imposed import ImposedMotion
+from plant.dynamics.imposed_motion import ImposedMotion
 from plant.imu import load_imu, measure
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, pose_errors, rms_figures

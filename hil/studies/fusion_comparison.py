@@ -22,7 +22,7 @@ from hil.progress import Progress, in_parts, no_progress
 from hil.studies.config import LEARNING_S, WHOLE_FUSIONS, ComparisonConfig
 from hil.studies.fused_track import CLOSED, FUSED, REFINED, WHOLE, PoseErrors, PoseTrack, constants, fuse, poses_of, read, track
 from plant.compiled import Record, kernel
-from plant.dynamics.imposed import impose
+from plant.dynamics.imposed_motion import impose
 from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
 from plant.imu import ACCELEROMETER, GYROSCOPE, imu_state, load_imu
 from plant.mechanism import LEGS, load_spatial

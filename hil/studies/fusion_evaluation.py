@@ -1,6 +1,6 @@
 """Evaluation of the whole-mechanism filter after a self-calibration from raw IMUs, beside the refined pose.
 
-Every seed is a rig of its own, which is calibrated (`hil.calibration.drive`) and then moved as `plant.dynamics.imposed` says.
+Every seed is a rig of its own, which is calibrated (`hil.calibration.drive`) and then moved by `plant.dynamics.imposed_motion`.
 """
 
 from collections import defaultdict
@@ -35,7 +35,7 @@ from hil.studies.fused_track import (
     track,
 )
 from plant.compiled import Record
-from plant.dynamics.imposed import impose
+from plant.dynamics.imposed_motion import impose
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.imu import imu_state, load_imu
 from plant.mechanism import LEGS, Mechanism, load_spatial

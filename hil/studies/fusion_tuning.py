@@ -27,14 +27,14 @@ from hil.runs.config import FUSIONS
 from hil.studies.config import TuningConfig
 from hil.studies.fused_track import REFINED, WHOLE, PoseTrack, fuse, poses_of, read, track
 from plant.compiled import Record
-from plant.dynamics.imposed import impose
+from plant.dynamics.imposed_motion import impose
 from plant.errors import InputError
 from plant.imu import imu_state, load_imu
 from plant.mechanism import LEGS, Mechanism, load_spatial, mechanism_text
 from plant.pose import Array
 
 MOTIONS = ("static", "mixed", "1")
-"""As `plant.dynamics.imposed.impose` has them."""
+"""As `plant.dynamics.imposed_motion.impose` has them."""
 DURATION_S, SETTLING_S = 16.0, 8.0
 """Durations of a run, and of its first part, which does not count."""
 _SAMPLE_S = 0.05

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from plant.dynamics.variables import BRAKE, DRIVE_MODES, IMU_COUNT, OPEN, PLATFORM_IMU, VELOCITY
 from plant.errors import FmuError, GoughError, InputError
 from plant.files import read_toml, unknown_entries
-from plant.fmu.importer import FmuDescription, FmuVariable
+from plant.fmu.description_reader import FmuDescription, FmuVariable
 from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER
 from plant.mechanism import LEGS
 from plant.mechanism.planar import PLANAR_LEGS

@@ -27,7 +27,7 @@ from plant.dynamics.variables import PLANAR, SPATIAL, VariableTable
 from plant.errors import InputError, ToolchainError
 from plant.extras import check_installed
 from plant.files import check_writable, write_whole
-from plant.fmu.description import Layout, build_description, model_description
+from plant.fmu.description_writer import Layout, build_description, model_description
 from plant.mechanism import Mechanism, load_in_space
 
 C_FLAGS = (

@@ -9,7 +9,7 @@ import casadi as ca
 
 from plant.dynamics.assembly import Dynamics
 from plant.dynamics.variables import Variable
-from plant.fmu.description import Dependencies, Layout, start_of
+from plant.fmu.description_writer import Dependencies, Layout, start_of
 from plant.pose import Array
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from fmpy.validation import validate_fmu
 
-from plant.fmu.importer import FmuDescription, FmuVariable
+from plant.fmu.description_reader import FmuDescription, FmuVariable
 from plant.fmu.instance import FmuInstance
 from plant.pose import Array
 

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from plant.errors import FmuError, InputError
 from plant.files import temporary_folder
-from plant.fmu.importer import FmuDescription, FmuVariable
+from plant.fmu.description_reader import FmuDescription, FmuVariable
 from plant.pose import Array
 
 OK, WARNING, DISCARD, ERROR, FATAL, PENDING, ASKS_TO_END, NEEDS_EVENTS = range(8)

@@ -13,7 +13,7 @@ from plant.compiled import Record
 from plant.errors import FmuError, InputError
 from plant.fmu.binding import OWN_BINDING, Binding, Modes, Scalars, bind, check_settable, load_binding
 from plant.fmu.calls import CALLED, FMU_HANDLE, MOST_CHANGES, advance
-from plant.fmu.importer import FmuDescription, FmuVariable
+from plant.fmu.description_reader import FmuDescription, FmuVariable
 from plant.fmu.instance import OK, FmuInstance
 from plant.fmu.settings import Setting
 from plant.mechanism import LEGS

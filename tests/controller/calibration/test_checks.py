@@ -8,7 +8,7 @@ import pytest
 from controller.calibration.checks import check_alive, check_all_along, check_motion, check_places, check_spread
 from controller.estimation.whole_mechanism.readings import readings_along
 from controller.rig import sensor_geometry
-from plant.dynamics.imposed import impose
+from plant.dynamics.imposed_motion import impose
 from plant.errors import CalibrationError
 from plant.imu import Wiring, imu_state, load_imu, measure
 

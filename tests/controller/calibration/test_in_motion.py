@@ -9,7 +9,7 @@ from controller.estimation.whole_mechanism.imu_errors import ERRORS
 from controller.estimation.whole_mechanism.readings import JOINTS
 from controller.inverse_kinematics import sample_workspace
 from controller.settings import sensor_settings
-from plant.dynamics.imposed import impose
+from plant.dynamics.imposed_motion import impose
 from plant.imu import imu_state, measure
 from plant.pose import Pose, vector_from_rotation
 from tests.controller.calibration.rest_readings import RAW, pose_errors, rests_of

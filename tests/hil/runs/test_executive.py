@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from hil.loop.driver import FmuRig, prevent_compilation
-from hil.loop.timing import over_budget
+from hil.loop.stage_times import over_budget
 from hil.realtime.durations import Histogram
 from hil.realtime.scheduling import MEASURES, RealTimeSettings, RefusedError, real_time, usage
 from hil.recording import mcap as recording

@@ -23,7 +23,7 @@ from plant.dynamics.variables import SPATIAL, VELOCITY, Variable
 from plant.errors import InputError
 from plant.fmu.build import PLANAR_MODEL, SPATIAL_MODEL, Model, build, check_build, default_fmu
 from plant.fmu.check import check_fmu
-from plant.fmu.description import Layout, element_names
+from plant.fmu.description_writer import Layout, element_names
 from plant.fmu.plant import FmuPlant
 from plant.mechanism import Mechanism
 from plant.pose import Array

@@ -16,7 +16,7 @@ from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, BLOCKS,
 from controller.estimation.whole_mechanism.readings import JOINTS, READINGS_SCRATCH, RIG_ERRORS, TILT, predict_readings
 from controller.rig import sensor_geometry
 from controller.settings import FusionSettings, fusion_settings
-from plant.dynamics.imposed import impose
+from plant.dynamics.imposed_motion import impose
 from plant.errors import UnknownNameError
 from plant.imu import imu_state, load_imu, measure
 from plant.pose import rotation_angle, skew

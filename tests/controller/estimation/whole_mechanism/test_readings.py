@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from controller.estimation.whole_mechanism.readings import READINGS_SCRATCH, predict_readings
 from controller.rig import sensor_geometry
-from plant.dynamics.imposed import impose
+from plant.dynamics.imposed_motion import impose
 from plant.mechanism import Mechanism, load_spatial
 from plant.pose import rotation_angle
 from tests.controller.leg_geometry import rotation_of

@@ -12,7 +12,7 @@ import pytest
 from fmpy.validation import validate_fmu
 
 from plant.dynamics.variables import BRAKE, DRIVE_MODES, SPATIAL, VELOCITY
-from plant.fmu.description import QUANTITIES, Layout
+from plant.fmu.description_writer import QUANTITIES, Layout
 from plant.fmu.plant import FmuPlant
 from plant.mechanism import Mechanism
 from plant.pose import Array

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from plant.dynamics.variables import BRAKE, DRIVE_MODES, Variable, VariableTable
-from plant.fmu.importer import element_names
+from plant.fmu.description_reader import element_names
 from plant.pose import Array
 
 QUANTITIES: dict[str, tuple[str, dict[str, int | str]]] = {

@@ -6,7 +6,7 @@ import pytest
 from controller.cycle import STATE, cycle_parameters, skip_periods
 from controller.safety.causes import Cause
 from controller.settings import control_settings, fusion_settings
-from hil.loop.kernels import process_feedback
+from hil.loop.compiled_loop import process_feedback
 from hil.loop.records import WORK
 from hil.rigs import ANSWERED, SILENT, new_feedback
 
