@@ -9,9 +9,7 @@ import pytest
 from hil.benchmarks.clock import BUSY, CONDITIONS, IDLE, LOAD, durations_of, gross_excess, measure_real_time
 from hil.benchmarks.loop import read_earlier
 from hil.command_line import main
-from hil.loop.records import LINK_SIZE, RECORD, Link
 from hil.realtime.durations import Histogram
-from hil.recording.mcap import take
 from hil.reports.benchmark import write_report
 from plant.errors import InputError
 
@@ -89,25 +87,3 @@ def test_a_bench_of_no_time_is_refused(capsys):
     for option, value in (("--clock", "0"), ("--measures", "-1"), ("--measures", "nan")):
         assert main(["bench", "--only", "clock", option, value]) == 2
         assert f"{option} is {value} s; it must be positive and finite" in capsys.readouterr().err
-
-
-def test_what_was_overwritten_before_it_was_taken_is_counted():
-    records, link = np.zeros(8, RECORD), np.zeros(LINK_SIZE, np.int64)
-
-    def write(count):
-        for _ in range(count):
-            records["cycle"][link[Link.HEAD] % 8] = link[Link.HEAD]
-            link[Link.HEAD] += 1
-
-    write(5)
-    taken, tail, lost = take(records, link, 0)
-    assert (taken["cycle"].tolist(), tail, lost) == ([0, 1, 2, 3, 4], 5, 0)
-    write(3)
-    taken, tail, lost = take(records, link, tail)
-    assert (taken["cycle"].tolist(), tail, lost) == ([5, 6, 7], 8, 0)
-    # The loop may be writing the next record, over the oldest of the eight.
-    write(20)
-    taken, tail, lost = take(records, link, tail)
-    assert (taken["cycle"].tolist(), tail, lost) == (list(range(21, 28)), 28, 13)
-    taken, tail, lost = take(records, link, tail)
-    assert (len(taken), tail, lost) == (0, 28, 0)
