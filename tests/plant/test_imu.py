@@ -497,3 +497,74 @@ def test_imus_are_wired_as_told():
     for wrong in ({"places": (0, 0, 2, 3, 4, 5, 6)}, {"gyroscopes": axes[:3]}, {"accelerometers": (*axes[:6], "+x+y")}):
         with pytest.raises(InputError, match=r"places are|has axes of|no axes"):
             Wiring(**wrong)
+
+
+SENSOR_ERRORS = {
+    "noise": SensorErrors(noise=0.1),
+    "bias": SensorErrors(bias=(0.5, 0.5)),
+    "scale": SensorErrors(scale=0.1),
+    "cross_axis": SensorErrors(cross_axis=0.1),
+    "drift": SensorErrors(drift=1.0),
+    "bandwidth": SensorErrors(bandwidth=5.0),
+    "reach": SensorErrors(reach=0.5),
+    "resolution": SensorErrors(resolution=0.3),
+}
+
+
+@pytest.mark.parametrize("name", SENSOR_ERRORS)
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_an_error_of_one_sensor_alone_disturbs_this_sensor_alone(sensor: str, name: str) -> None:
+    model = ImuModel("one", **{sensor: SENSOR_ERRORS[name]})
+    signals = np.random.default_rng(1).normal(size=(200, 3, 7, 3))
+    measured = readings(imu_state(model, 3, PERIOD), signals)
+    kind = SENSORS.index(sensor)
+    others = [other for other in range(3) if other != kind]
+    np.testing.assert_array_equal(measured[:, others], signals[:, others])
+    # The bias of a magnetometer does not drift.
+    disturbed = (measured[:, kind] != signals[:, kind]).any(axis=(0, 2)).all()
+    assert disturbed == ((name, sensor) != ("drift", "magnetometer"))
+
+
+def test_what_arrives_late_or_never_begins_with_the_first_sample() -> None:
+    """Neither a delay nor a dropout makes an IMU read zero before its first sample."""
+    first = np.random.default_rng(2).normal(size=(1, 3, 7, 3))
+    signals = np.concatenate([first, first + 1.0, first + 2.0, first + 3.0])
+    late = readings(imu_state(ImuModel("late", delay=2.0 * PERIOD), 0, PERIOD), signals)
+    np.testing.assert_array_equal(late, np.concatenate([first, first, first, first + 1.0]))
+    lost = readings(imu_state(ImuModel("lossy", dropout=1.0), 0, PERIOD), signals)
+    np.testing.assert_array_equal(lost, np.repeat(first, 4, axis=0))
+
+
+def test_an_imu_on_another_place_keeps_its_own_errors_and_its_axes_are_turned_after_them() -> None:
+    """Wiring turns what the sensor reads, bias included, but not which IMU has which bias."""
+    places, turned = (3, 1, 2, 0, 4, 6, 5), "-y+x0"
+    wiring = Wiring(places, (turned,) * 7, ("+z+x+y",) * 7)
+    model = replace(load_imu("mpu9150"), **{name: replace(getattr(load_imu("mpu9150"), name), noise=0.0, resolution=0.0,
+        bandwidth=inf, reach=inf) for name in SENSORS}, magnetometer_rate=inf)  # fmt: skip
+    signals = np.random.default_rng(3).normal(size=(5, 3, 7, 3))
+    raw = readings(imu_state(model, 9, PERIOD), signals[:, :, list(places)])
+    wired = readings(imu_state(model, 9, PERIOD, wiring), signals)
+    x, y = raw[:, GYROSCOPE, :, 0], raw[:, GYROSCOPE, :, 1]
+    np.testing.assert_allclose(wired[:, GYROSCOPE], np.stack([-y, x, np.zeros_like(x)], axis=-1), atol=1e-13)
+    np.testing.assert_allclose(wired[:, ACCELEROMETER], raw[:, ACCELEROMETER][..., [2, 0, 1]], atol=1e-13)
+    np.testing.assert_allclose(wired[:, MAGNETOMETER], raw[:, MAGNETOMETER], atol=1e-13)
+    assert np.abs(raw - signals[:, :, list(places)]).min(axis=(0, 3))[GYROSCOPE].max() > 0.05, "there are errors to turn"
+
+
+def test_presets_have_the_figures_of_their_data_sheets() -> None:
+    """MPU-9150: 131 LSB/(deg/s), 8192 LSB/g, 0.3 uT; the low-pass of the gyroscope and the accelerometer of each [Hz]."""
+    for name, bandwidths, misalignment in (
+        ("mpu9150", (256.0, 260.0), 1.0), ("mpu9150-calibrated", (256.0, 260.0), 0.0), ("icm42688", (400.0, 400.0), 0.0)
+    ):  # fmt: skip
+        model = load_imu(name)
+        assert (model.name, model.delay, model.dropout) == (name, 0.0, 0.0)
+        assert np.degrees(model.misalignment) == pytest.approx(misalignment)
+        assert (model.gyroscope.bandwidth, model.accelerometer.bandwidth, model.magnetometer.bandwidth) == (*bandwidths, inf)
+        assert 1.0 / np.degrees(model.gyroscope.resolution) == pytest.approx(131.0)
+        assert 9.80665 / model.accelerometer.resolution == pytest.approx(8192.0)
+        assert (model.magnetometer.noise, model.magnetometer.drift, model.gyroscope.drift) == (0.05, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(("delay", "cycles"), [(0.0324, 32), (0.0004, 0), (0.0006, 1)])
+def test_the_longest_delay_is_kept_and_the_shortest_is_none(delay: float, cycles: int) -> None:
+    assert imu_state(ImuModel("late", delay=delay), 0, PERIOD)["delay"] == cycles

@@ -25,6 +25,7 @@ from plant.pose import (
     rotation_from_vector,
     rotations_from_quaternions,
     skew,
+    vector_from_rotation,
 )
 
 seeds = st.integers(0, 2**32 - 1)
@@ -86,6 +87,31 @@ def test_a_small_turn_keeps_its_relative_accuracy(seed: int, exponent: float) ->
     rotate_by_vector(turned, vector)
     off = [turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]]
     np.testing.assert_allclose(off, 2.0 * np.sin(angle) / angle * vector, rtol=1e-12, atol=1e-22)
+
+
+@given(seeds, angles)
+def test_a_rotation_vector_is_found_again(seed: int, angle: float) -> None:
+    vector = min(angle, np.pi - 1e-9) * unit(seed)
+    rotation = Rotation.from_rotvec(vector).as_matrix()
+    np.testing.assert_allclose(vector_from_rotation(rotation), vector, rtol=0.0, atol=1e-14)
+    stack = np.array([rotation, rotation.T, np.eye(3), rotation]).reshape(2, 2, 3, 3)
+    found = vector_from_rotation(stack)
+    np.testing.assert_allclose(found, [[vector, -vector], [np.zeros(3), vector]], rtol=0.0, atol=1e-14)
+
+
+def test_half_a_turn_is_found_from_its_rotation() -> None:
+    axis = np.array([0.6, 0.0, -0.8])
+    vector = vector_from_rotation(2.0 * np.outer(axis, axis) - np.eye(3))
+    assert np.linalg.norm(vector) == pytest.approx(np.pi, abs=1e-14)
+    assert abs(vector @ axis) == pytest.approx(np.pi, abs=1e-14)
+
+
+def test_quaternions_are_found_for_stacks_of_rotations() -> None:
+    stack = Rotation.random(6, random_state=1)
+    expected = stack.as_quat(canonical=True, scalar_first=True).reshape(2, 3, 4)
+    np.testing.assert_allclose(quaternion_from_rotation(stack.as_matrix().reshape(2, 3, 3, 3)), expected, atol=1e-14)
+    quaternions = stack.as_quat(scalar_first=True)
+    np.testing.assert_allclose(rotations_from_quaternions(quaternions), stack.as_matrix(), atol=1e-15)
 
 
 def test_thousands_of_small_turns_stay_a_rotation() -> None:
@@ -191,6 +217,12 @@ def test_a_rotation_with_rounding_errors_is_made_proper(seed: int) -> None:
     checked = checked_rotation(rounded, "thing")
     np.testing.assert_allclose(checked @ checked.T, np.eye(3), atol=1e-14)
     np.testing.assert_allclose(checked, rotation, atol=2e-4)
+
+
+def test_a_matrix_just_within_the_tolerance_is_a_rotation() -> None:
+    np.testing.assert_allclose(checked_rotation(np.diag([1.0, 1.0, 1.0 + 4.9e-4]), "thing"), np.eye(3), atol=1e-15)
+    with pytest.raises(InputError, match=r"thing is off orthogonal by 0\.00102"):
+        checked_rotation(np.diag([1.0, 1.0, 1.0 + 5.1e-4]), "thing")
 
 
 @pytest.mark.parametrize(

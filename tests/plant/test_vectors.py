@@ -3,7 +3,7 @@
 import numpy as np
 
 from plant.pose import rotation_from_vector
-from plant.vectors import cross, dot, rotate, rotate_back, vector
+from plant.vectors import add, cross, dot, rotate, rotate_back, scale, subtract, vector
 
 
 def drawn(random):
@@ -15,6 +15,8 @@ def test_products_are_those_of_numpy():
     for _ in range(50):
         a, b = drawn(random), drawn(random)
         matrix = random.normal(size=(3, 3))
+        assert add(a, b) == tuple(np.add(a, b)) and subtract(a, b) == tuple(np.subtract(a, b))
+        assert scale(matrix[0, 0], a) == tuple(matrix[0, 0] * np.array(a))
         assert np.allclose(cross(a, b), np.cross(a, b), rtol=0, atol=1e-14)
         assert np.isclose(dot(a, b), np.dot(a, b), rtol=0, atol=1e-14)
         assert np.allclose(rotate(matrix, a), matrix @ a, rtol=0, atol=1e-14)

@@ -375,3 +375,179 @@ def test_the_quaternion_stays_of_unit_length(make_plant: MakePlant) -> None:
 def test_a_start_quaternion_that_is_nearly_unit_is_normalised(make_plant: MakePlant) -> None:
     plant = make_plant({"initial_quaternion": 1.0005 * np.array([np.cos(0.1), 0.0, 0.0, np.sin(0.1)])})
     np.testing.assert_allclose(plant.get("quaternion"), [np.cos(0.1), 0.0, 0.0, np.sin(0.1)], atol=1e-15)
+
+
+def odd_drives(p: Values, random: Generator) -> Values:
+    """Drives and brakes without a figure that is one, alike between legs, or never reached."""
+    changes = {
+        "motor.resistance": random.uniform(0.5, 0.9, 6),
+        "motor.inductance": 0.7e-3,
+        "motor.torque_constant": 0.06,
+        "motor.screw_lead": 0.004,
+        "drive.nominal_resistance": 0.8,
+        "drive.compensation": 0.3,
+        "drive.voltage_limit": 15.0,
+        "drive.current_limit": 6.0,
+        "drive.current_time_constant": 0.002,
+        "brake.force": 30.0,
+        "brake.stiffness": 1e5,
+        "brake.release_time": 0.004,
+    }
+    return p | {name: np.asarray(value, float) for name, value in changes.items()}
+
+
+def current_rates(p: Values, mode: Array, current: Array, command: Array, speed: Array) -> tuple[Array, Array]:
+    """Rates of the currents [A/s], and the voltages of the drives [V]; leg by leg."""
+    constant = 2.0 * np.pi / p["motor.screw_lead"] * p["motor.torque_constant"]
+    limit, lag = p["drive.current_limit"], p["drive.current_time_constant"]
+    rates, voltages = [], []
+    for i, which, u, v, r in zip(current, mode, command, speed, p["motor.resistance"], strict=True):
+        asked = constant * u + p["drive.compensation"] * p["drive.nominal_resistance"] * i if which == VELOCITY else 0.0
+        voltage = float(np.clip(asked, -p["drive.voltage_limit"], p["drive.voltage_limit"]))
+        back = 0.0 if which == OPEN else constant * v
+        rates.append(np.clip((voltage - r * i - back) / p["motor.inductance"], (-limit - i) / lag, (limit - i) / lag))
+        voltages.append(voltage)
+    return np.array(rates), np.array(voltages)
+
+
+def brake_rates(p: Values, mode: Array, deflection: Array, speed: Array) -> Array:
+    """Rates of the brakes' deflections [m/s], leg by leg: stuck below 70 % of the slipping deflection, slipping at it."""
+    slip = p["brake.force"] / p["brake.stiffness"]
+    rates = []
+    for which, z, v in zip(mode, deflection, speed, strict=True):
+        load = abs(z) / slip
+        if which != BRAKE:
+            rates.append(-z / p["brake.release_time"])
+        else:
+            assert load < 0.7 or load > 1.0 - 1e-9, "the blend in between may have any smooth shape"
+            rates.append(v if z * v <= 0.0 or load < 0.7 else v * (1.0 - load))
+    return np.array(rates)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_currents_brakes_and_attitude_change_at_their_rates(dynamics: Dynamics, hexapod: Mechanism, seed: int) -> None:
+    random = np.random.default_rng(400 + seed)
+    p = odd_drives(odd_mechanism(hexapod, random), random)
+    states, inputs = random_state(p, random)
+    slip = p["brake.force"] / p["brake.stiffness"]
+    states["state.brake_deflection"] = slip * random.permutation([0.69, -0.69, 1.0, -1.0, 1.2, -1.2])
+    # Strong and weak commands, so that voltages and currents are at their limits or within, of either sign.
+    inputs["velocity_command"] = random.permutation([0.3, -0.3, 0.02, -0.02, 0.1, -0.1])
+    inputs["drive_mode"] = np.full(6, (OPEN, BRAKE, VELOCITY)[seed % 3])
+    states["state.velocity"] *= 0.1
+    states["state.angular_velocity"] *= 0.1
+    held = flat(states, SPATIAL.states), flat(inputs, SPATIAL.inputs), dynamics.constants(flat(p, SPATIAL.parameters))
+    rates = named(np.array(dynamics.rates(*held)).ravel(), SPATIAL.states)
+    outputs = named(np.array(dynamics.outputs(*held)).ravel(), SPATIAL.outputs)
+    position, rotation, twist = pose_and_twist(states)
+    speed = jacobian(p, position, rotation) @ twist
+    mode, current = inputs["drive_mode"], states["state.current"]
+    expected, voltage = current_rates(p, mode, current, inputs["velocity_command"], speed)
+    np.testing.assert_allclose(rates["state.current"], expected, rtol=1e-10, atol=1e-9)
+    np.testing.assert_allclose(outputs["voltage"], voltage, rtol=1e-12)
+    np.testing.assert_array_equal(outputs["current"], current)
+    bristles = brake_rates(p, mode, states["state.brake_deflection"], speed)
+    np.testing.assert_allclose(rates["state.brake_deflection"], bristles, rtol=1e-9, atol=1e-12)
+
+    step = 1e-6
+    after = Rotation.from_rotvec(step * states["state.angular_velocity"]).as_matrix() @ rotation
+    before = Rotation.from_rotvec(-step * states["state.angular_velocity"]).as_matrix() @ rotation
+    difference = (quaternion_from_rotation(after) - quaternion_from_rotation(before)) / (2.0 * step)
+    np.testing.assert_allclose(rates["state.quaternion"], difference, rtol=0.0, atol=1e-8)
+
+
+def test_a_start_is_the_initial_pose_at_rest(dynamics: Dynamics, hexapod: Mechanism) -> None:
+    start = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_quat(scalar_first=True)
+    p = hexapod.plant_parameters() | {"initial_position": np.array([0.01, -0.02, 0.34]), "initial_quaternion": 1.0005 * start}
+    states = named(np.array(dynamics.start(flat(p, SPATIAL.parameters))).ravel(), SPATIAL.states)
+    np.testing.assert_array_equal(states["state.position"], [0.01, -0.02, 0.34])
+    np.testing.assert_allclose(states["state.quaternion"], start, atol=1e-15)
+    for name in ("velocity", "angular_velocity", "current", "brake_deflection"):
+        assert not states[f"state.{name}"].any()
+
+
+def broken(dynamics: Dynamics, p: Values) -> list[str]:
+    """What the conditions on the parameters say."""
+    values, limits = (np.array(side).ravel() for side in dynamics.conditions(flat(p, SPATIAL.parameters)))
+    told = zip(dynamics.condition_texts, values, limits, strict=True)
+    return [text % (value, limit) for text, value, limit in told if not value <= limit]
+
+
+FLAT = np.diag([0.02, 0.03, 0.05])
+"""Of a flat body: the third principal moment is the sum of the others."""
+
+
+@pytest.mark.parametrize("body", ["platform", "payload"])
+def test_an_inertia_is_that_of_a_real_body(dynamics: Dynamics, hexapod: Mechanism, body: str) -> None:
+    p = dict(hexapod.plant_parameters())
+    turn = Rotation.from_rotvec([0.4, -0.7, 0.2]).as_matrix()
+    for axes in ([0, 1, 2], [1, 2, 0], [2, 0, 1]):
+        whole = FLAT[np.ix_(axes, axes)]
+        thinner = whole + np.diag(np.where(np.diag(whole) == 0.05, 1e-4, 0.0))
+        for rotation in (np.eye(3), turn):
+            assert broken(dynamics, p | {f"{body}.inertia": rotation @ whole @ rotation.T}) == []
+            (said,) = broken(dynamics, p | {f"{body}.inertia": rotation @ thinner @ rotation.T})
+            assert said.startswith(f"{body}.inertia is of no real body")
+    for row, column in ((0, 1), (2, 0), (1, 2)):
+        skewed = FLAT + 0.01 * np.eye(3)
+        skewed[row, column] += 1e-4
+        assert any(f"{body}.inertia is not symmetric" in said for said in broken(dynamics, p | {f"{body}.inertia": skewed}))
+    if body == "payload":
+        assert broken(dynamics, p | {"payload.inertia": np.zeros((3, 3)), "payload.mass": np.array(0.0)}) == []
+
+
+@pytest.mark.parametrize("leg", [0, 5])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_leg_along_the_axis_of_its_joint_is_told_at_the_start_and_later(
+    dynamics: Dynamics, hexapod: Mechanism, leg: int, sign: float
+) -> None:
+    p = dict(hexapod.plant_parameters())
+    assert broken(dynamics, p) == []
+    along, across = hexapod.home_directions[leg], hexapod.base_joint_axes[leg]
+
+    def turned(cosine: float) -> Values:
+        axes = np.array(hexapod.base_joint_axes)
+        axes[leg] = sign * (cosine * along + np.sqrt(1.0 - cosine**2) * across)
+        return p | {"base_joint_axes": axes}
+
+    def limits(p: Values) -> list[str]:
+        constants = dynamics.constants(flat(p, SPATIAL.parameters))
+        start = dynamics.start(flat(p, SPATIAL.parameters))
+        values, most = (np.array(side).ravel() for side in dynamics.limits(start, constants))
+        return [text for text, value, limit in zip(dynamics.limit_texts, values, most, strict=True) if not value <= limit]
+
+    assert broken(dynamics, turned(0.9899)) == []
+    (said,) = broken(dynamics, turned(0.9901))
+    assert said == f"leg {leg} starts along its base_joint_axes (cosine 0.9901, at most 0.99): turn the axis"
+    assert limits(turned(0.9997)) == []
+    (said,) = limits(turned(0.9999))
+    assert said.startswith(f"leg {leg} has come to lie along the first axis of its base joint")
+    longer = p | {"base_joint_axes": np.array(p["base_joint_axes"])}
+    longer["base_joint_axes"][leg] *= 1.0011
+    (said,) = broken(dynamics, longer)
+    assert said.startswith(f"base_joint_axes of leg {leg} is not of unit length")
+
+
+def test_a_quaternion_off_unit_length_is_told_from_either_side(dynamics: Dynamics, hexapod: Mechanism) -> None:
+    p = dict(hexapod.plant_parameters())
+    for length, good in ((1.0009, True), (0.9991, True), (1.0011, False), (0.9989, False)):
+        said = broken(dynamics, p | {"initial_quaternion": length * p["initial_quaternion"]})
+        assert (said == []) == good
+        assert all("initial_quaternion is not of unit length" in text for text in said)
+
+
+def test_the_greatest_substep_is_told_in_seconds(dynamics: Dynamics, hexapod: Mechanism) -> None:
+    """Of drive, released brake and slipping brake: Runge and Kutta's method holds to 2.5 time constants."""
+    p = dict(hexapod.plant_parameters()) | {
+        "substep": np.array(0.1),
+        "drive.current_time_constant": np.array(0.003),
+        "brake.release_time": np.array(0.007),
+    }
+    constant = 2.0 * np.pi / 0.005 * 0.05
+    for cause, most in (
+        ("drive.current_time_constant", 2.5 * 0.003),
+        ("brake.release_time", 2.5 * 0.007),
+        ("a slipping brake", 2.5 * 1500.0 / 5e6 / (24.0 / constant)),
+    ):
+        (said,) = (text for text in broken(dynamics, p) if f"because of {cause}" in text)
+        assert said.startswith(f"substep is 0.1 s, and may be at most {most:g} s because of")

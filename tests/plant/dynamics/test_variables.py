@@ -1,5 +1,6 @@
 """The table of the plant's variables and the check of parameters against it."""
 
+import re
 from typing import Any
 
 import numpy as np
@@ -66,3 +67,40 @@ def test_a_scalar_is_spread_over_the_legs() -> None:
 def test_parameters_that_cannot_be_used_are_refused(values: dict[str, Any], kind: type[Exception], message: str) -> None:
     with pytest.raises(kind, match=message):
         checked_parameters(values)
+
+
+@pytest.mark.parametrize(
+    ("name", "allowed", "refused"),
+    [
+        ("substep", [1e-6, 0.1], [0.9e-6, 0.1001]),
+        ("drive.compensation", [0.0, 10.0], [-1e-6, 10.1]),
+        ("payload.mass", [0.0, 1e6], [-1e-9, 1.1e6]),
+        ("motor.screw_lead", [1e-6, 10.0], [0.0, -0.005, 10.1]),
+    ],
+)
+def test_a_parameter_may_be_either_end_of_its_range(name: str, allowed: list[float], refused: list[float]) -> None:
+    for value in allowed:
+        assert checked_parameters({name: value})[name] == value
+    for value in refused:
+        with pytest.raises(InputError, match=re.escape(f"{name} is {value:g} ")):
+            checked_parameters({name: value})
+
+
+def test_the_value_that_is_out_of_range_is_told_wherever_it_stands() -> None:
+    with pytest.raises(InputError, match=r"motor\.resistance is -3 Ohm"):
+        checked_parameters({"motor.resistance": [1, 1, 1, 1, 1, -3]})
+    with pytest.raises(InputError, match=r"friction\.coulomb is 2e"):
+        checked_parameters({"friction.coulomb": [1, 1, 1, 2e6, 1, 1]})
+
+
+def test_a_number_is_spread_over_three_legs_and_shapes_are_the_planes() -> None:
+    checked = checked_parameters(
+        {"friction.coulomb": 2.5, "platform.inertia": 0.1, "leg_imu_position": np.ones((3, 3))}, PLANAR
+    )
+    assert {name: value.shape for name, value in checked.items()} == {
+        "friction.coulomb": (3,), "platform.inertia": (), "leg_imu_position": (3, 3)
+    }  # fmt: skip
+    with pytest.raises(UnknownNameError, match="no parameter 'base_joint_axes'"):
+        checked_parameters({"base_joint_axes": np.ones((3, 3))}, PLANAR)
+    with pytest.raises(InputError, match=r"base_joints must have shape \(3, 2\), got \(6, 3\)"):
+        checked_parameters({"base_joints": np.ones((6, 3))}, PLANAR)

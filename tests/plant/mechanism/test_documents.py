@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from plant.errors import InputError, UnknownNameError
-from plant.mechanism import Mechanism, load_mechanism
+from plant.mechanism import Mechanism, PlanarMechanism, load_in_space, load_mechanism, load_spatial
 from plant.pose import Array, Pose
 
 BASE = [[0.3, -0.05, 0.0], [0.3, 0.05, 0.0], [-0.1, 0.28, 0.0], [-0.2, 0.23, 0.0], [-0.2, -0.23, 0.0], [-0.1, -0.28, 0.0]]
@@ -158,3 +158,56 @@ def test_presets_based_on_each_other_are_refused(tmp_path: Path, presets: Path) 
 def test_what_a_preset_has_as_a_table_must_stay_one(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="'limits' must be a table"):
         load_mechanism(write(tmp_path, "based_on = 'hexapod'\nlimits = 3"))
+
+
+def test_every_table_reaches_the_mechanism(tmp_path: Path) -> None:
+    """Numbers that no default has, in every table."""
+    half = np.radians(20.0) / 2.0
+    axes = np.tile([0.6, 0.8, 0.0], (6, 1))
+    text = replaced("0.35]", f"0.35]\nquaternion = [{np.cos(half)}, 0.0, 0.0, {np.sin(half)}]")
+    text = text.replace("up_in_base = ", f"base_joint_axes = {axes.tolist()}\nup_in_base = ")
+    text = text.replace(
+        "[-0.05, 0.05]", "[-0.04, 0.05]\nvelocity = 0.2\nacceleration = 2.0\njerk = 50.0\nstop_clearance = 0.003"
+    )
+    text += "[plant.leg.lower]\nmass = 1.5\n[plant.motor]\nresistance = [1, 2, 3, 4, 5, 6]\n"
+    text += "[fusion]\na = 1.0\n[safety]\nb = 2.0\n"
+    mechanism = load_mechanism(write(tmp_path, text))
+    assert isinstance(mechanism, Mechanism)
+    home, kept = mechanism.require_home(), mechanism.require_limits()
+    turned = [[np.cos(2 * half), -np.sin(2 * half), 0.0], [np.sin(2 * half), np.cos(2 * half), 0.0], [0.0, 0.0, 1.0]]
+    np.testing.assert_allclose(home.rotation, turned, atol=1e-15)
+    np.testing.assert_allclose(kept.stroke, lengths_at(mechanism, home.position, home.rotation)[:, None] + [-0.04, 0.05])
+    assert (kept.velocity, kept.acceleration, kept.jerk, kept.stop_clearance) == (0.2, 2.0, 50.0, 0.003)
+    np.testing.assert_allclose(mechanism.base_joint_axes, axes, atol=1e-15)
+    np.testing.assert_array_equal(mechanism.platform_joints, PLATFORM)
+    assert set(mechanism.plant) == {"platform.mass", "leg.lower.mass", "motor.resistance"}
+    assert mechanism.plant["leg.lower.mass"] == 1.5
+    np.testing.assert_array_equal(mechanism.plant["motor.resistance"], [1, 2, 3, 4, 5, 6])
+    assert mechanism.settings == {"control": {"proportional": 30.0}, "fusion": {"a": 1.0}, "safety": {"b": 2.0}}
+
+
+def test_without_a_name_and_an_attitude_it_is_custom_and_level(tmp_path: Path) -> None:
+    mechanism = load_mechanism(write(tmp_path, replaced('name = "mine"', "")))
+    assert isinstance(mechanism, Mechanism) and mechanism.name == "custom"
+    np.testing.assert_array_equal(mechanism.require_home().rotation, np.eye(3))
+    assert mechanism.settings["safety"] == {} == mechanism.settings["fusion"]
+
+
+def test_three_legs_in_the_plane_are_loaded_for_the_loop_only() -> None:
+    assert isinstance(load_mechanism("planar-3rpr"), PlanarMechanism)
+    with pytest.raises(InputError, match="planar-3rpr has three legs in the plane; this needs six in space"):
+        load_spatial("planar-3rpr")
+    seen = load_in_space("planar-3rpr")
+    assert (seen.legs, seen.planar) == (3, True)
+    for load in (load_mechanism, load_spatial, load_in_space):
+        assert (load("hexapod").legs, load("hexapod").planar) == (6, False)
+
+
+def test_a_planar_mechanism_without_a_home_is_none_for_the_loop(tmp_path: Path) -> None:
+    joints = (
+        "[geometry]\nbase_joints = [[0.0, 0.0], [0.2, 0.0], [0.3, 0.1]]\nplatform_joints = [[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]]"
+    )
+    path = write(tmp_path, joints)
+    assert isinstance(load_mechanism(path), PlanarMechanism)
+    with pytest.raises(InputError, match="the mechanism 'custom' has no home pose: give one"):
+        load_in_space(path)

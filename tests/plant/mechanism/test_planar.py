@@ -9,7 +9,7 @@ import pytest
 
 from plant.errors import InputError
 from plant.mechanism.documents import mechanism_from_document
-from plant.mechanism.planar import PlanarMechanism
+from plant.mechanism.planar import PlanarMechanism, PlanarPose
 
 BASE = [[0.0, 0.0], [0.2, 0.0], [0.3, 0.1]]
 PLATFORM = [[0.0, 0.0], [0.1, 0.0], [0.05, 0.08]]
@@ -142,3 +142,25 @@ def test_a_table_may_have_entries_of_any_name():
     assert mechanism_from_document(document(control={"anything": 1.0})).settings["control"] == {"anything": 1.0}
     with pytest.raises(InputError, match=re.escape("[home] has no entry 'anything'; it has angle, position")):
         mechanism_from_document(document(home={"position": [0.0, 0.2], "anything": 1.0}))
+
+
+def test_lengths_are_those_of_a_ruler():
+    mechanism = PlanarMechanism.from_legs([[0.0, 0.0], [4.0, 0.0], [0.0, 5.0]], [[0.0, 0.0], [1.0, 0.0], [0.0, 2.0]])
+    # {2} at (3, 4) and turned by a quarter: joints at (3, 4), (3, 5) and (1, 4).
+    np.testing.assert_allclose(mechanism.lengths_at(np.array([3.0, 4.0]), np.pi / 2), [5.0, np.sqrt(26.0), np.sqrt(2.0)])
+
+
+def test_a_stroke_about_home_counts_from_the_lengths_of_the_turned_platform():
+    home = PlanarPose(np.array([0.05, 0.2]), 0.4)
+    mechanism = PlanarMechanism.from_legs(BASE, PLATFORM, home=home, limits={"stroke": [-0.02, 0.03], "velocity": 0.07})
+    lengths = mechanism.lengths_at(home.position, 0.4)
+    assert np.abs(lengths - mechanism.lengths_at(home.position, 0.0)).max() > 0.01
+    np.testing.assert_allclose(mechanism.stroke, lengths[:, None] + [-0.02, 0.03], atol=1e-15)
+    assert mechanism.limits.velocity == 0.07
+    assert PlanarMechanism.from_legs(BASE, PLATFORM).stroke is None
+
+
+def test_a_home_of_a_document_is_not_turned_unless_it_says_so():
+    assert mechanism_from_document(document(home={"position": [0.0, 0.2]})).home.angle == 0.0
+    home = mechanism_from_document(document(home={"position": [0.1, -0.2], "angle": -0.3})).home
+    assert home.angle == -0.3 and home.position.tolist() == [0.1, -0.2]

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from plant.dynamics.variables import SPATIAL
 from plant.errors import InputError, UnknownNameError, UnreachableError
-from plant.mechanism import Limits, Mechanism, load_mechanism, load_spatial
+from plant.mechanism import LEGS, Limits, Mechanism, PlanarMechanism, load_in_space, load_mechanism, load_spatial, six_rows
+from plant.mechanism.planar import PlanarPose
 from plant.pose import Array, Pose
 
 BASE = [[0.3, -0.05, 0.0], [0.3, 0.05, 0.0], [-0.1, 0.28, 0.0], [-0.2, 0.23, 0.0], [-0.2, -0.23, 0.0], [-0.1, -0.28, 0.0]]
@@ -361,3 +362,174 @@ def test_the_first_leg_with_the_same_joint_is_told() -> None:
     platform = np.array([[0.5, 0.1 * k, 0.0] if k else [0.2, 0.0, 0.0] for k in range(6)])
     mechanism = Mechanism.from_legs(base, platform)
     assert mechanism.distinct_joints().tolist() == [[0, 0, 2, 3, 3, 5], [0, 1, 2, 3, 4, 5]]
+
+
+def test_the_first_leg_with_the_same_joint_is_told_for_the_platform_by_itself() -> None:
+    platform = [PLATFORM[0], PLATFORM[1], PLATFORM[1], PLATFORM[3], PLATFORM[0], PLATFORM[5]]
+    mechanism = Mechanism.from_legs(BASE, platform)
+    assert mechanism.distinct_joints().tolist() == [[0, 1, 2, 3, 4, 5], [0, 1, 1, 3, 0, 5]]
+
+
+def test_a_joint_error_is_measured_against_the_bases_radius_about_its_middle() -> None:
+    """The middle of a base that is far from the origin of {1}; the error is refused from a tenth of the radius on."""
+    far = Mechanism.from_legs(np.add(BASE, [5.0, 0.0, 0.0]), PLATFORM)
+    middle = np.mean(BASE, axis=0)
+    most = 0.1 * max(np.hypot(x - middle[0], y - middle[1]) for x, y, _ in BASE)
+    far.built(0.999 * most, 0)
+    for error in (most * (1.0 + 1e-9), -1e-6, np.nan):
+        with pytest.raises(InputError, match=f"it must be at least 0 and below {1e3 * most:g} mm"):
+            far.built(error, 0)
+
+
+def test_base_and_platform_are_built_with_errors_of_their_own() -> None:
+    nominal = load_spatial("hexapod")
+    built, other = nominal.built(1e-4, 3), nominal.built(1e-4, 4)
+    base, platform = built.base_joints - nominal.base_joints, built.platform_joints - nominal.platform_joints
+    assert min(np.abs(base).min(), np.abs(platform).min(), np.abs(base - platform).min()) > 1e-9
+    assert np.abs(other.base_joints - built.base_joints).min() > 1e-9
+    np.testing.assert_allclose(nominal.built(3e-4, 3).base_joints - nominal.base_joints, 3.0 * base, atol=1e-15)
+    np.testing.assert_array_equal(built.home_directions, nominal.home_directions)
+
+
+def test_a_planar_mechanism_is_built_in_its_plane() -> None:
+    nominal = load_in_space("planar-3rpr")
+    built = nominal.built(1e-4, 2)
+    for joints, before in ((built.base_joints, nominal.base_joints), (built.platform_joints, nominal.platform_joints)):
+        np.testing.assert_array_equal(joints[:, 2], 0.0)
+        assert np.abs(joints - before)[:, :2].min() > 1e-9
+
+
+def test_joints_are_moved_on_their_own_side_and_must_stay_a_mechanism() -> None:
+    nominal = Mechanism.from_legs(BASE, PLATFORM)
+    moves = 1e-3 * np.arange(36.0).reshape(2, 6, 3)
+    moved = nominal.moved_joints(moves)
+    np.testing.assert_array_equal(moved.base_joints, np.array(BASE) + moves[0])
+    np.testing.assert_array_equal(moved.platform_joints, np.array(PLATFORM) + moves[1])
+    together = np.zeros((2, 6, 3))
+    together[0, 1], together[1, 1] = np.subtract(BASE[0], BASE[1]), np.subtract(PLATFORM[0], PLATFORM[1])
+    with pytest.raises(InputError, match="legs 0 and 1 coincide"):
+        nominal.moved_joints(together)
+    flat = np.zeros((2, 6, 3))
+    flat[1, :, 0] = -np.array(PLATFORM)[:, 0]
+    with pytest.raises(InputError, match="the platform joints all lie on one line"):
+        nominal.moved_joints(flat)
+
+
+def test_without_a_home_the_platform_is_over_the_base_along_the_vertical() -> None:
+    """Its middle stands over the base's middle by 7/6 of the base's radius, on a base that is neither level nor centred."""
+    up, shift, offset = np.array([0.48, -0.36, 0.8]), np.array([2.0, -1.0, 0.5]), np.array([0.3, 0.2, -0.1])
+    base, platform = np.add(BASE, shift), np.add(PLATFORM, offset)
+    mechanism = Mechanism.from_legs(base, platform, up_in_base=up)
+    radius = np.linalg.norm(base - base.mean(axis=0), axis=1).max()
+    home = mechanism.nominal_home
+    np.testing.assert_array_equal(home.rotation, np.eye(3))
+    middles = home.position + platform.mean(axis=0) - base.mean(axis=0)
+    np.testing.assert_allclose(middles, 7.0 / 6.0 * radius * up, atol=1e-14)
+    legs = home.position + platform - base
+    np.testing.assert_allclose(mechanism.home_directions, legs / np.linalg.norm(legs, axis=1)[:, None], atol=1e-14)
+    given = Mechanism.from_legs(base, platform, up_in_base=up, home=HOME)
+    np.testing.assert_array_equal(given.nominal_home.position, HOME.position)
+
+
+def test_home_directions_are_those_of_the_turned_platform() -> None:
+    home = Pose(np.array([0.02, -0.03, 0.35]), Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix())
+    mechanism = Mechanism.from_legs(BASE, PLATFORM, home=home)
+    for k in range(LEGS):
+        leg = home.position + home.rotation @ PLATFORM[k] - BASE[k]
+        np.testing.assert_allclose(mechanism.home_directions[k], leg / np.linalg.norm(leg), atol=1e-15)
+        across = np.cross([0.0, 0.0, 1.0], leg)
+        np.testing.assert_allclose(mechanism.base_joint_axes[k], across / np.linalg.norm(across), atol=1e-15)
+
+
+SKEWED = np.array([[0.10, 0.01, -0.02], [0.01, 0.07, 0.015], [-0.02, 0.015, 0.12]])
+
+
+@pytest.mark.parametrize("body", ["platform", "payload"])
+@pytest.mark.parametrize(
+    "inertia",
+    [SKEWED + [[0.0, 2e-9, 0.0], [0.0] * 3, [0.0] * 3], SKEWED - 0.07 * np.eye(3)],
+    ids=["asymmetric", "a negative moment"],
+)
+def test_what_is_no_inertia_is_refused(body: str, inertia: Array) -> None:
+    assert Mechanism.from_legs(BASE, PLATFORM, plant={f"{body}.inertia": SKEWED}).plant[f"{body}.inertia"][0, 2] == -0.02
+    with pytest.raises(InputError, match=f"{body}.inertia .* is no inertia: it must be symmetric without negative principal"):
+        Mechanism.from_legs(BASE, PLATFORM, plant={f"{body}.inertia": inertia})
+
+
+def test_gravity_points_against_a_vertical_that_is_not_level_or_is_none() -> None:
+    up = np.array([0.0, 0.6, 0.8])
+    for gravity in (-9.81 * up, -1.62 * up, np.zeros(3)):
+        made = Mechanism.from_legs(BASE, PLATFORM, up_in_base=up, plant={"gravity": gravity})
+        np.testing.assert_array_equal(made.plant["gravity"], gravity)
+    for gravity in (9.81 * up, [0.0, 0.0, -9.81], [0.02, -5.886, -7.848]):
+        with pytest.raises(InputError, match="does not point against up_in_base"):
+            Mechanism.from_legs(BASE, PLATFORM, up_in_base=up, plant={"gravity": gravity})
+
+
+# ---- planar mechanisms in space ----
+
+PLANAR_BASE, PLANAR_PLATFORM = [[0.0, 0.0], [0.2, 0.0], [0.3, 0.1]], [[0.0, 0.0], [0.1, 0.0], [0.05, 0.08]]
+
+
+def planar_in_space(**options: Any) -> Mechanism:
+    home = PlanarPose(np.array([0.05, 0.2]), 0.4)
+    return Mechanism.from_planar(PlanarMechanism.from_legs(PLANAR_BASE, PLANAR_PLATFORM, home=home, **options))
+
+
+def test_a_planar_mechanism_lies_in_the_xy_plane_of_space() -> None:
+    seen = planar_in_space(name="flat", limits={"stroke": [-0.02, 0.03]}, settings={"safety": {"a": 1.0}})
+    assert (seen.name, seen.legs, seen.planar, seen.settings["safety"]) == ("flat", 3, True, {"a": 1.0})
+    np.testing.assert_array_equal(seen.base_joints, [[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.3, 0.1, 0.0]])
+    np.testing.assert_array_equal(seen.platform_joints, [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.05, 0.08, 0.0]])
+    home = seen.require_home()
+    np.testing.assert_array_equal(home.position, [0.05, 0.2, 0.0])
+    np.testing.assert_allclose(home.rotation, Rotation.from_rotvec([0.0, 0.0, 0.4]).as_matrix(), atol=1e-15)
+    lengths = lengths_at(seen, home.position, home.rotation)
+    np.testing.assert_allclose(seen.require_limits().stroke, lengths[:, None] + [-0.02, 0.03], atol=1e-15)
+    legs = home.position + seen.platform_joints @ home.rotation.T - seen.base_joints
+    np.testing.assert_allclose(seen.home_directions, legs / lengths[:, None], atol=1e-15)
+    # A joint's frame has the plane's normal as x, the leg at home as z, and y across both.
+    normal = np.tile([0.0, 0.0, 1.0], (3, 1))
+    frames = np.stack([normal, np.cross(seen.home_directions, normal), seen.home_directions], axis=2)
+    np.testing.assert_allclose(seen.joint_rotations, frames, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("gravity", "up"),
+    [
+        (None, [0.0, 1.0, 0.0]),
+        ([3.0, -4.0, 0.0], [-0.6, 0.8, 0.0]),
+        ([0.0, -6.0, -8.0], [0.0, 0.6, 0.8]),
+        ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]),
+    ],
+)
+def test_the_vertical_of_a_planar_mechanism_is_against_its_gravity(gravity: list[float] | None, up: list[float]) -> None:
+    seen = planar_in_space(plant={} if gravity is None else {"gravity": gravity})
+    np.testing.assert_allclose(seen.up_in_base, up, atol=1e-15)
+
+
+@pytest.mark.parametrize("angle", [2.5, -3.0, 0.3])
+def test_the_planar_plant_starts_at_the_pose_asked_for(angle: float) -> None:
+    rig = load_in_space("planar-3rpr")
+    start = Pose(np.array([0.11, 0.21, 0.0]), Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix())
+    p = rig.plant_parameters(start)
+    assert p["initial_angle"] == pytest.approx(angle, abs=1e-15)
+    np.testing.assert_array_equal(p["initial_position"], [0.11, 0.21])
+    np.testing.assert_array_equal(p["base_joints"], rig.base_joints[:, :2])
+    stroke = rig.require_limits().stroke
+    np.testing.assert_allclose(p["stop.minimum_length"], stroke[:, 0] - 0.002, atol=1e-15)
+    np.testing.assert_allclose(p["stop.maximum_length"], stroke[:, 1] + 0.002, atol=1e-15)
+
+
+def test_lengths_of_three_legs_are_checked_as_those_of_six() -> None:
+    rig = load_in_space("planar-3rpr")
+    stroke = rig.require_limits().stroke
+    rig.check_lengths(stroke.T, "the ends")
+    with pytest.raises(UnreachableError, match=r"the path needs leg 2 at .*, 4\.00 mm outside its stroke"):
+        rig.check_lengths(np.stack([stroke[:, 0], stroke[:, 0] - [0.001, 0.003, 0.004]]), "the path")
+
+
+def test_rows_of_missing_legs_are_filled() -> None:
+    np.testing.assert_array_equal(six_rows(np.array([1.0, 2.0, 3.0]), 7.0), [1.0, 2.0, 3.0, 7.0, 7.0, 7.0])
+    np.testing.assert_array_equal(six_rows(np.ones((3, 2))), [[1.0, 1.0]] * 3 + [[0.0, 0.0]] * 3)
+    np.testing.assert_array_equal(six_rows(np.arange(12.0).reshape(6, 2), [8.0, 9.0]), np.arange(12.0).reshape(6, 2))

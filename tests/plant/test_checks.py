@@ -1,0 +1,33 @@
+"""Checks of numbers that several configurations share: each limit, from both sides."""
+
+from math import inf, nan
+
+import pytest
+
+from plant.checks import check_duration, check_rate, checked_seed
+from plant.errors import InputError
+
+
+@pytest.mark.parametrize("rate", [50.0, 4000.0])
+def test_the_least_and_the_greatest_rate_are_allowed(rate):
+    check_rate(rate)
+
+
+@pytest.mark.parametrize("rate", [49.9, 4000.1, -1000.0, 0.0, nan, inf])
+def test_a_rate_beyond_them_is_refused(rate):
+    with pytest.raises(InputError, match=f"the rate is {rate:g} Hz; it must be 50 to 4000 Hz"):
+        check_rate(rate)
+
+
+@pytest.mark.parametrize("duration", [0.0, -1.0, nan, inf])
+def test_a_duration_that_never_ends_or_begins_is_refused(duration):
+    check_duration(1e-3)
+    with pytest.raises(InputError, match=f"the duration is {duration:g} s; it must be positive and finite"):
+        check_duration(duration)
+
+
+def test_a_seed_is_returned_and_has_63_bits():
+    assert [checked_seed(seed) for seed in (0, 7, 2**63 - 1)] == [0, 7, 2**63 - 1]
+    for seed in (-1, 2**63):
+        with pytest.raises(InputError, match=f"the seed is {seed}; it must lie between 0 and"):
+            checked_seed(seed)
