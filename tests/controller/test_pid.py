@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from controller.pid import PARAMETERS, STATE, step_pid
+from controller.pid import PARAMETERS, STATE, hold_still, pid_parameters, step_pid
+from controller.settings import ControlSettings
 
 PERIOD_S = 1e-3
 LIMIT = 0.35
@@ -21,9 +22,9 @@ class Controllers:
         self.parameters["gains"], self.parameters["limit"] = gains, limit
         self.integral, self.command = self.state["integral"], self.state["command"]
 
-    def step(self, error, feed_forward=0.0):
+    def step(self, error, feed_forward=0.0, period=PERIOD_S):
         self.state["error"] = error
-        step_pid(self.parameters, self.state, np.array(np.broadcast_to(feed_forward, 6), dtype=float), PERIOD_S)
+        step_pid(self.parameters, self.state, np.array(np.broadcast_to(feed_forward, 6), dtype=float), period)
         return self.command.copy()
 
 
@@ -174,3 +175,55 @@ def test_an_error_that_is_not_a_number_is_not_turned_into_a_command():
     command = controllers.step(error)
     assert np.isnan(command[2])
     np.testing.assert_array_equal(np.isfinite(command), np.arange(6) != 2)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_after_missed_periods_integral_and_derivative_count_the_whole_time(seed):
+    """Errors that are straight in time, however unevenly the cycles come: the integral is the sum of error times the time after
+    it, and the derivative settles at the slope as backward Euler with these steps does.
+    """
+    random = np.random.default_rng(seed)
+    periods, slopes, corner = PERIOD_S * random.integers(1, 6, 60), random.uniform(-0.01, 0.01, 6), 40.0
+    controllers = Controllers([0.0, 0.0, 0.0, corner], limit=1e9)
+    integral, derivative, time = np.zeros(6), np.zeros(6), 0.0
+    for period in periods:
+        time += period
+        controllers.step(slopes * time, period=period)
+        integral += slopes * time * period
+        derivative = slopes + (derivative - slopes) / (1.0 + corner * period)
+        np.testing.assert_allclose(controllers.state["derivative"], derivative, rtol=1e-10, atol=1e-15)
+    np.testing.assert_allclose(controllers.integral, integral, rtol=1e-12)
+
+
+@pytest.mark.parametrize("end", [1.0, -1.0])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_at_either_end_of_the_limit_the_integral_takes_what_leads_away_from_it(end, sign):
+    controllers = Controllers([1.0, 200.0, 0.0, 100.0])
+    assert controllers.step(0.01 * sign, feed_forward=end)[0] == end * LIMIT
+    np.testing.assert_allclose(controllers.integral, 0.01 * sign * PERIOD_S if sign != end else 0.0)
+    # Within the limit it takes both, also by the last step before.
+    controllers = Controllers([0.0, 200.0, 0.0, 100.0])
+    controllers.step(0.01 * sign, feed_forward=end * LIMIT)
+    np.testing.assert_allclose(controllers.integral, 0.01 * sign * PERIOD_S)
+
+
+def test_the_gains_and_the_limit_are_those_of_the_settings():
+    control = ControlSettings(11.0, 22.0, 0.3, derivative_bandwidth=44.0, command_reserve=1.5)
+    parameters = pid_parameters(control, 0.08)
+    assert parameters["gains"].tolist() == [11.0, 22.0, 0.3, 44.0]
+    assert parameters["limit"] == pytest.approx(0.12, rel=1e-15)
+
+
+@pytest.mark.parametrize("legs", [3, 6])
+def test_while_it_holds_still_nothing_is_commanded_and_the_integral_stays(legs):
+    controllers = Controllers([60.0, 200.0, 0.5, 100.0])
+    controllers.step([1e-4, -2e-4, 3e-4, -4e-4, 5e-4, -6e-4])
+    integral, before = controllers.integral.copy(), controllers.state["previous_error"].copy()
+    assert np.all(controllers.command != 0.0) and np.all(integral != 0.0)
+    command = controllers.command.copy()
+    controllers.state["error"] = error = np.arange(1.0, 7.0)
+    hold_still(controllers.state, legs)
+    np.testing.assert_array_equal(controllers.command, np.where(np.arange(6) < legs, 0.0, command))
+    np.testing.assert_array_equal(controllers.state["previous_error"], np.where(np.arange(6) < legs, error, before))
+    np.testing.assert_array_equal(controllers.integral, integral)

@@ -5,11 +5,24 @@ from dataclasses import FrozenInstanceError, asdict, fields
 import numpy as np
 import pytest
 
-from controller.settings import ControlSettings, FusionSettings, control_settings, fusion_settings
+from controller.settings import (
+    ControlSettings,
+    FusionSettings,
+    SafetySettings,
+    control_settings,
+    fusion_settings,
+    safety_settings,
+    sensor_settings,
+)
 from plant.errors import GoughError, InputError
+from plant.imu import ImuModel, SensorErrors, load_imu
 from plant.mechanism import Mechanism
 
-KINDS = [(ControlSettings, control_settings, "control"), (FusionSettings, fusion_settings, "fusion")]
+KINDS = [
+    (ControlSettings, control_settings, "control"),
+    (FusionSettings, fusion_settings, "fusion"),
+    (SafetySettings, safety_settings, "safety"),
+]
 
 
 def mechanism_with(hexapod, **tables):
@@ -75,9 +88,12 @@ def test_a_bad_value_of_any_setting_is_refused_by_name(hexapod, kind, read, tabl
 def test_zero_is_allowed_only_where_it_switches_something_off(hexapod):
     off = control_settings(hexapod, integral=0.0, derivative=0.0)
     assert (off.integral, off.derivative) == (0.0, 0.0)
+    assert fusion_settings(hexapod, sensor_delay=0.0).sensor_delay == 0.0
+    unwatched = safety_settings(hexapod, most_lost_imus=0.0, watch_imus=0.0)
+    assert (unwatched.most_lost_imus, unwatched.watch_imus) == (0.0, 0.0)
     for kind, read, _ in KINDS:
         for field in fields(kind):
-            if field.name not in ("integral", "derivative", "sensor_delay"):
+            if field.name not in ("integral", "derivative", "sensor_delay", "most_lost_imus", "watch_imus"):
                 with pytest.raises(InputError, match=field.name):
                     read(hexapod, **{field.name: 0.0})
 
@@ -87,3 +103,42 @@ def test_settings_do_not_change_once_built():
         ControlSettings().proportional = 1.0
     with pytest.raises(FrozenInstanceError):
         FusionSettings().leg_sigma = 1.0
+
+
+IMU = ImuModel(
+    "own", gyroscope=SensorErrors(bandwidth=100.0, reach=5.0), accelerometer=SensorErrors(bandwidth=50.0, reach=30.0),
+    magnetometer_rate=25.0, delay=0.003,
+)  # fmt: skip
+
+
+def test_the_imus_tell_their_delay_their_ranges_and_the_magnetometers_rate(hexapod):
+    found = sensor_settings(mechanism_with(hexapod, fusion={"leg_sigma": 2e-3}), IMU)
+    expected = FusionSettings(
+        leg_sigma=2e-3, magnetometer_rate=25.0, gyroscope_range=5.0, accelerometer_range=30.0,
+        sensor_delay=0.003 + 0.5 * (1.0 / (2.0 * np.pi * 100.0) + 1.0 / (2.0 * np.pi * 50.0)),
+    )  # fmt: skip
+    assert found == expected
+
+
+@pytest.mark.parametrize("name", ["sensor_delay", "magnetometer_rate", "gyroscope_range", "accelerometer_range"])
+def test_what_the_mechanisms_file_says_of_its_imus_goes_before_what_they_tell(hexapod, name):
+    own, told = sensor_settings(mechanism_with(hexapod, fusion={name: 7.0}), IMU), sensor_settings(hexapod, IMU)
+    assert getattr(own, name) == 7.0
+    for field in fields(FusionSettings):
+        assert field.name == name or getattr(own, field.name) == getattr(told, field.name)
+
+
+def test_ranges_and_rates_without_an_end_are_finite_settings(hexapod):
+    found = sensor_settings(hexapod, load_imu("ideal"))
+    assert found.sensor_delay == 0.0
+    for value in (found.magnetometer_rate, found.gyroscope_range, found.accelerometer_range):
+        assert 1e12 < value < np.inf
+
+
+def test_for_raw_imus_the_distances_are_5_cm_at_least_and_no_imu_is_watched():
+    usual = SafetySettings(following=0.02, velocity_margin=3.0, saturation=0.4)
+    raw = usual.for_raw_imus()
+    changed = {"stroke_margin": 0.05, "following": 0.05, "arming_distance": 0.05, "watch_imus": 0.0}
+    assert asdict(raw) == asdict(usual) | changed
+    wide = SafetySettings(stroke_margin=0.06, following=0.07, arming_distance=0.08).for_raw_imus()
+    assert (wide.stroke_margin, wide.following, wide.arming_distance) == (0.06, 0.07, 0.08)

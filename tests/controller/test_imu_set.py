@@ -1,0 +1,103 @@
+"""Which sets of IMUs do: those that there are, the conditioning over the workspace, and the limits of what gravity and the
+magnetic field tell.
+"""
+
+import numpy as np
+import pytest
+
+from controller.direct_kinematics import solve_batch
+from controller.imu_set import check_imus, imus_of
+from controller.inverse_kinematics import sample_workspace
+from plant.errors import InputError
+from plant.mechanism import Mechanism, load_in_space, load_mechanism
+from plant.wiring import ALL_IMUS
+from tests.controller.leg_geometry import leg_directions, unit
+
+
+def test_a_planar_mechanism_has_the_imus_of_three_legs_and_the_platform(hexapod):
+    planar = load_in_space("planar-3rpr")
+    assert imus_of(planar) == (0, 1, 2, 6)
+    assert imus_of(planar, (6, 5, 3, 2, 0)) == (0, 2, 6)
+    assert imus_of(hexapod) == (0, 1, 2, 3, 4, 5, 6)
+    assert imus_of(hexapod, [6, 4, 1]) == (1, 4, 6)
+    assert imus_of(hexapod, {3}) == (3,)
+
+
+@pytest.mark.parametrize(
+    ("imus", "method"), [(range(6), "legs"), ((0, 1, 3, 4), "legs"), (range(7), "up"), ((0, 2, 3, 6), "up")]
+)
+def test_the_worst_conditioning_over_the_workspace_is_told(hexapod, imus, method):
+    """The least of the public solver's over the same poses."""
+    poses = sample_workspace(hexapod, 50, seed=0)
+    directions = np.array([leg_directions(hexapod, *pose) for pose in zip(*poses, strict=True)])
+    directions[:, [leg for leg in range(6) if leg not in imus]] = np.nan
+    known = {"up_in_platform": hexapod.up_in_base @ poses[1]} if method == "up" else {}
+    found = solve_batch(hexapod, directions, method=method, workers=1, **known)
+    assert check_imus(hexapod, imus) == pytest.approx(found.conditionings.min(), rel=1e-9)
+    assert found.conditionings.min() < 0.99 * np.median(found.conditionings)
+
+
+def with_field(hexapod, horizontal):
+    return Mechanism.from_legs(
+        hexapod.base_joints, hexapod.platform_joints, home=hexapod.home, limits={"stroke": hexapod.limits.stroke},
+        plant={**hexapod.plant, "magnetic_field": [0.6 * horizontal, -0.8 * horizontal, -60.0]},
+    )  # fmt: skip
+
+
+def test_a_heading_needs_5_microtesla_across_the_vertical(hexapod):
+    assert check_imus(with_field(hexapod, 5.01), ALL_IMUS, magnetometer=True) > 0.0
+    with pytest.raises(InputError, match=r"the horizontal magnetic field is 4\.99 uT; a heading needs at least 5"):
+        check_imus(with_field(hexapod, 4.99), ALL_IMUS, magnetometer=True)
+    # Nobody asks for it without a magnetometer.
+    assert check_imus(with_field(hexapod, 0.1), ALL_IMUS) > 0.0
+
+
+@pytest.mark.parametrize("leg", [0, 3, 5])
+@pytest.mark.parametrize(("share", "said"), [(0.21, None), (0.19, "0.19"), (-0.21, None), (-0.19, "0.19")])
+def test_gravity_must_lie_across_the_axes_of_a_legs_joint(hexapod, leg, share, said):
+    """The joint's third axis, across the first, near the leg's direction at home, leans so that this share is vertical."""
+    direction = hexapod.home_directions[leg]
+    # In the frame of the joint the third axis is what of the leg is across the first axis, and the second is across both.
+    up_in_joint = unit([np.sqrt(1.0 - share**2), 0.0, share])
+    up = hexapod.joint_rotations[leg] @ up_in_joint
+    leaning = Mechanism.from_legs(
+        hexapod.base_joints, hexapod.platform_joints, up_in_base=up, home=hexapod.home,
+        base_joint_axes=hexapod.base_joint_axes, limits={"stroke": hexapod.limits.stroke},
+        plant={**hexapod.plant, "gravity": -9.81 * up},
+    )  # fmt: skip
+    assert abs(direction @ hexapod.base_joint_axes[leg]) < 0.9
+    shares = np.abs(leaning.joint_rotations[:, :, 2] @ up)
+    others = [k for k in range(6) if k != leg and shares[k] > 0.2]
+    imus = (*others, leg, 6)
+    if said is None:
+        check_imus(leaning, imus)
+    else:
+        with pytest.raises(InputError, match=rf"the angles of leg {leg}: of the vertical only {said} lies across"):
+            check_imus(leaning, imus)
+        check_imus(leaning, (*others, 6))
+
+
+@pytest.mark.parametrize(("share", "fits"), [(0.21, True), (0.19, False)])
+def test_gravity_must_lie_in_the_plane_of_a_planar_mechanism(share, fits):
+    planar = load_mechanism("planar-3rpr")
+    gravity = -9.81 * np.array([0.0, share, np.sqrt(1.0 - share**2)])
+    made = type(planar).from_legs(
+        planar.base_joints, planar.platform_joints, home=planar.home, limits={"stroke": [-0.02, 0.02]},
+        plant={**planar.plant, "gravity": gravity},
+    )  # fmt: skip
+    rig = Mechanism.from_planar(made)
+    if fits:
+        assert check_imus(rig, ALL_IMUS) > 0.0
+    else:
+        with pytest.raises(InputError, match=r"of the vertical only 0\.19 lies in it, and 0\.2 is needed"):
+            check_imus(rig, ALL_IMUS)
+
+
+def test_the_heading_and_two_legs_are_conditioned_as_section_5_is(hexapod):
+    mechanism, poses = with_field(hexapod, 20.0), sample_workspace(hexapod, 50, seed=0)
+    directions = np.array([leg_directions(hexapod, *pose) for pose in zip(*poses, strict=True)])
+    directions[:, [1, 2, 4, 5]] = np.nan
+    found = solve_batch(hexapod, directions, rotation=poses[1], method="section-5", workers=1)
+    told = check_imus(mechanism, (0, 3, 6), magnetometer=True)
+    assert told == pytest.approx(found.conditionings.min(), rel=1e-9)
+    assert check_imus(mechanism, ALL_IMUS, magnetometer=True, section_5=True) > told
