@@ -1,0 +1,124 @@
+"""Arming: what is in its way, how long that may last, and what is made of it."""
+
+import numpy as np
+import pytest
+
+from controller.cycle import skip_periods
+from controller.safety.arming import arming_parameters, describe_obstacle
+from controller.safety.causes import Cause, DriveState, Mode, Request
+from controller.settings import SafetySettings
+from tests.controller.safety.test_safety import RATE_HZ, Bench
+
+ARMING_CYCLES = 500
+"""1 s at 500 Hz."""
+
+
+def obstacle(bench):
+    arming = bench.state["safety"]["arming"]
+    return Cause(int(arming["obstacle"])), int(arming["index"]), float(arming["value"]), float(arming["limit"])
+
+
+def test_arming_takes_whole_cycles():
+    p = arming_parameters(SafetySettings(arming_distance=0.02, arming_time=0.5), 333.0, True)
+    assert (p["active"], p["distance"], p["cycles"]) == (1, 0.02, 167)
+    assert arming_parameters(SafetySettings(), RATE_HZ, False)["active"] == 0
+
+
+@pytest.mark.parametrize("late", [0, 30])
+def test_arming_may_last_its_time_and_missed_periods_count(hexapod, late):
+    bench = Bench(hexapod)
+    bench.steps(bench.hold + 10, drive=DriveState.NOT_READY)
+    skip_periods(bench.state, late)
+    bench.step(drive=DriveState.NOT_READY)
+    skip_periods(bench.state, 0)
+    arming = bench.state["safety"]["arming"]
+    assert arming["delay"] == 11 + late
+    bench.steps(ARMING_CYCLES - late - 11, drive=DriveState.NOT_READY)
+    assert (bench.mode, arming["delay"]) == (Mode.IDLE, ARMING_CYCLES)
+    assert obstacle(bench)[:2] == (Cause.NO_DRIVES, 0)
+    bench.step(drive=DriveState.NOT_READY)
+    assert (bench.mode, bench.state["safety"]["stop"]["cause"]) == (Mode.STOPPING, Cause.NO_DRIVES)
+
+
+def test_in_its_last_cycle_it_is_still_armed(hexapod):
+    bench = Bench(hexapod)
+    bench.steps(bench.hold + ARMING_CYCLES, drive=DriveState.NOT_READY)
+    bench.step()
+    assert (bench.mode, bench.request) == (Mode.RUNNING, Request.ENABLED)
+    # The motion begins later by that.
+    assert bench.state["safety"]["arming"]["delay"] == ARMING_CYCLES
+
+
+@pytest.mark.parametrize(("lost", "armed"), [((2,), True), ((6,), True), ((2, 5), False), ((0, 6), False)])
+def test_as_many_imus_may_be_lost_as_in_motion(hexapod, lost, armed):
+    bench = Bench(hexapod)
+    bench.signals[:, list(lost)] = np.nan
+    bench.steps(bench.hold + 5)
+    assert bench.mode == (Mode.RUNNING if armed else Mode.IDLE)
+    if not armed:
+        assert obstacle(bench)[:2] == (Cause.NO_SENSORS, lost[-1])
+        assert np.isnan(obstacle(bench)[2:]).all()
+
+
+def test_a_rig_that_does_not_answer_is_waited_for(hexapod):
+    bench = Bench(hexapod)
+    bench.steps(bench.hold)
+    bench.step(silent=2)
+    assert (bench.mode, obstacle(bench)) == (Mode.IDLE, (Cause.BUS_LOST, -1, 2.0, 0.0))
+    assert describe_obstacle(bench.state) == "the bus is lost: the rig does not answer (2 cycles, the limit is 0 cycles)"
+    bench.step()
+    assert bench.mode == Mode.RUNNING
+    assert describe_obstacle(bench.state) == ""
+
+
+def test_an_imu_that_contradicts_the_others_is_in_the_way(hexapod):
+    bench = Bench(hexapod)
+    bench.steps(bench.hold - 1)
+    limit = float(bench.parameters["safety"]["monitor"]["disagreement"])
+    # What is found of one at rest fades slowly.
+    bench.parameters["safety"]["monitor"]["smoothing"] = 1e-9
+    for off, mode in ((1.01 * limit, Mode.IDLE), (0.99 * limit, Mode.RUNNING)):
+        bench.state["safety"]["monitor"]["contradiction"][4] = (0.0, -off, 0.0)
+        bench.steps(2)
+        assert bench.mode == mode
+        if mode == Mode.IDLE:
+            assert obstacle(bench) == (Cause.NO_SENSORS, 4, pytest.approx(off, rel=1e-6), limit)
+
+
+def without_pose(bench):
+    """Only two legs' IMUs and the platform's are left, which determine no pose."""
+    kept = bench.signals.copy()
+    bench.signals[:, [0, 1, 2, 3]] = np.nan
+    return kept
+
+
+def test_a_pose_that_is_lost_before_arming_is_waited_for(hexapod):
+    bench = Bench(hexapod)
+    kept = without_pose(bench)
+    bench.steps(bench.hold + 100)
+    assert (bench.mode, obstacle(bench)[:2]) == (Mode.IDLE, (Cause.POSE_LOST, -1))
+    bench.signals[:] = kept
+    bench.steps(100)
+    assert bench.mode == Mode.RUNNING
+
+
+def test_a_pose_that_stays_lost_is_a_fault_when_the_time_is_over(hexapod):
+    bench = Bench(hexapod)
+    without_pose(bench)
+    bench.steps(bench.hold + ARMING_CYCLES)
+    assert bench.mode == Mode.IDLE
+    assert Cause.POSE_LOST in bench.step()
+    assert (bench.mode, bench.request) == (Mode.FAULT, Request.BRAKED)
+    dry = Bench(hexapod, to_arm=False)
+    without_pose(dry)
+    dry.steps(dry.hold + 2 * ARMING_CYCLES)
+    assert (dry.mode, obstacle(dry)[0]) == (Mode.IDLE, Cause.POSE_LOST)
+
+
+def test_a_pose_that_is_lost_between_armed_and_running_is_a_fault_at_once(hexapod):
+    bench = Bench(hexapod)
+    bench.steps(bench.hold + 5, drive=DriveState.READY)
+    assert bench.mode == Mode.ARMED
+    without_pose(bench)
+    bench.step(drive=DriveState.READY)
+    assert (bench.mode, bench.state["safety"]["stop"]["cause"]) == (Mode.FAULT, Cause.POSE_LOST)

@@ -1,0 +1,417 @@
+"""What is watched in motion: every limit, in both directions, as long as it lasts, and what the rig reports."""
+
+import numpy as np
+import pytest
+
+from controller.cycle import hear_rig
+from controller.inverse_kinematics import leg_lengths
+from controller.safety import watch_nothing
+from controller.safety.causes import Cause, DriveState, Mode, Request
+from controller.safety.watch import check_limits, exclude_imu, watch_parameters
+from controller.settings import SafetySettings
+from plant.mechanism import Limits
+from plant.pose import rotation_from_vector
+from tests.controller.safety.moving import PERIOD_S, moving, place, stop_of, told
+
+FOLLOWING = np.full(6, DriveState.FOLLOWING, np.int64)
+BUS_CYCLES = 8
+"""0.02 s at 400 Hz."""
+
+
+def check(parameters, state, trusted=0):
+    """Hold the state against the limits; returns the cause of a fault."""
+    p, s = parameters, state
+    return check_limits(
+        p["safety"][()], s["safety"][()], p["rig"][()], s["time"][()], p["imus"][()], s["imus"][()], s["pose"][()], trusted,
+        s["reference"][()], float(p["pid"]["limit"]), s["pid"][()],
+    )  # fmt: skip
+
+
+def cycles_until_a_stop(parameters, state, most=200):
+    for n in range(1, most):
+        check(parameters, state)
+        if state["safety"]["stop"]["cause"] != Cause.NONE:
+            return n
+    return None
+
+
+def slide(state, speed):
+    """Let all legs grow at a speed."""
+    state["pose"]["arms"], state["pose"]["directions"] = 0.0, (0.0, 1.0, 0.0)
+    state["pose"]["smooth_twist"][1] = speed
+    state["pid"]["command"] = speed
+
+
+# ------------------------------------------------------------------------------------------------------------- the constants
+
+
+def test_limits_are_those_of_the_settings_with_their_margins():
+    stroke = np.array([[0.30 + 0.01 * k, 0.40 + 0.02 * k] for k in range(6)])
+    limits = Limits(stroke, velocity=0.3, acceleration=2.0, jerk=50.0)
+    settings = SafetySettings(
+        most_lost_imus=2.0, conditioning=0.01, stroke_margin=0.004, velocity_margin=1.5, following=0.02, saturation=0.3,
+        drive_deviation=0.11, patience=0.06, bus_patience=0.05,
+    )  # fmt: skip
+    p = watch_parameters(settings, 200.0, limits)
+    assert (p["most_lost_imus"], p["conditioning"], p["following"]) == (2, 0.01, 0.02)
+    assert (p["saturation"], p["drive_deviation"], p["patience"], p["bus_cycles"]) == (0.3, 0.11, 0.06, 10)
+    assert p["speed"] == pytest.approx(0.45)
+    np.testing.assert_allclose(p["lengths"], stroke + [-0.004, 0.004])
+    # A quarter of the stroke's 100 to 150 mm.
+    away = (0.1 + 0.01 * np.arange(6)) / 4.0
+    np.testing.assert_allclose(p["plausible_lengths"], np.stack([stroke[:, 0] - away, stroke[:, 1] + away], axis=1))
+    # At low rates, a deviation lasts for ten cycles and a bus is lost after three.
+    slow = watch_parameters(SafetySettings(), 100.0, limits)
+    assert (slow["patience"], slow["bus_cycles"]) == (0.1, 3)
+
+
+@pytest.mark.parametrize("preset", ["hexapod", "planar-3rpr"])
+def test_with_nothing_watched_nothing_stops(preset):
+    mechanism, parameters, state = moving(preset)
+    watch_nothing(parameters)
+    random = np.random.default_rng(0)
+    for _ in range(300):
+        state["pose"]["lengths"][: mechanism.legs] = random.normal(0.0, 5.0, mechanism.legs)
+        state["pose"]["conditioning"], state["imus"]["used"] = 0.0, 0
+        state["pose"]["smooth_twist"], state["pid"]["error"] = random.normal(0.0, 9.0, 6), 10.0
+        state["pid"]["command"] = parameters["pid"]["limit"]
+        assert check(parameters, state) == Cause.NONE
+    assert told(state) == []
+    assert np.isinf(parameters["imus"]["noise"]).all() and np.isinf(parameters["safety"]["arming"]["distance"])
+    assert parameters["safety"]["monitor"]["active"] == 0
+
+
+# ---------------------------------------------------------------------------------------------------------------- the limits
+
+
+@pytest.mark.parametrize("preset", ["hexapod", "planar-3rpr"])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_speed_of_a_leg_is_the_derivative_of_its_length(preset, seed):
+    mechanism, parameters, state = moving(preset)
+    watch_nothing(parameters)
+    random = np.random.default_rng(seed)
+    move, twist = random.normal(0.0, [0.01, 0.01, 0.01, 0.1, 0.1, 0.1]), random.normal(0.0, 0.3, 6)
+    if mechanism.planar:
+        move[2:5] = twist[2:5] = 0.0
+    position, rotation = mechanism.home.position + move[:3], rotation_from_vector(move[3:]) @ mechanism.home.rotation
+    place(mechanism, state, position, rotation)
+    state["pose"]["smooth_twist"] = twist
+    check(parameters, state)
+    h = 1e-6
+    after, before = (
+        leg_lengths(mechanism, position + t * twist[:3], rotation_from_vector(t * twist[3:]) @ rotation) for t in (h, -h)
+    )
+    speeds = state["safety"]["watch"]["speed"]
+    np.testing.assert_allclose(speeds[: mechanism.legs], (after - before) / (2.0 * h), rtol=0.0, atol=1e-8)
+    assert not speeds[mechanism.legs :].any()
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_leg_may_be_as_fast_as_its_margin_allows(sign):
+    for speed, expected in ((0.49, Cause.NONE), (0.51, Cause.TOO_FAST)):
+        _, parameters, state = moving()
+        slide(state, sign * speed)
+        assert check(parameters, state) == Cause.NONE
+        assert stop_of(state)[0] == expected
+    assert stop_of(state) == (Cause.TOO_FAST, 0, pytest.approx(0.51), 0.5)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("leg", [0, 5])
+def test_a_drive_must_do_what_it_is_told_in_the_direction_in_which_it_is_told(leg, sign):
+    _, parameters, state = moving()
+    slide(state, 0.1 * sign)
+    state["pid"]["command"][leg] = -0.04 * sign
+    assert cycles_until_a_stop(parameters, state) is None
+    # Only what lasts counts, without a break.
+    state["pid"]["command"][leg] = -0.06 * sign
+    for _ in range(3):
+        assert cycles_until_a_stop(parameters, state, 18) is None
+        state["pid"]["command"][leg] = 0.1 * sign
+        check(parameters, state)
+        state["pid"]["command"][leg] = -0.06 * sign
+    # 0.05 s are 20 cycles.
+    assert cycles_until_a_stop(parameters, state) in (20, 21)
+    assert stop_of(state) == (Cause.DRIVE_DEVIATES, leg, pytest.approx(0.16), 0.15)
+    assert (state["safety"]["mode"], state["safety"]["request"]) == (Mode.FAULT, Request.BRAKED)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("leg", [0, 5])
+def test_a_leg_must_be_off_its_reference_for_a_while_without_a_break(leg, sign):
+    _, parameters, state = moving()
+    error = state["pid"]["error"]
+    error[leg] = 0.0099 * sign
+    assert cycles_until_a_stop(parameters, state) is None
+    for _ in range(3):
+        error[leg] = 0.0101 * sign
+        assert cycles_until_a_stop(parameters, state, 18) is None
+        error[leg] = 0.0
+        check(parameters, state)
+    error[leg] = 0.0101 * sign
+    assert cycles_until_a_stop(parameters, state) in (20, 21)
+    assert stop_of(state) == (Cause.FOLLOWING_ERROR, leg, pytest.approx(0.0101), 0.01)
+    assert (state["safety"]["mode"], state["safety"]["request"]) == (Mode.STOPPING, Request.ENABLED)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_command_may_be_at_its_limit_for_a_while(sign):
+    _, parameters, state = moving()
+    parameters["safety"]["watch"]["drive_deviation"] = 1e3
+    most = float(parameters["pid"]["limit"])
+    assert most == pytest.approx(0.35)
+    command = state["pid"]["command"]
+    command[4] = np.nextafter(most, 0.0) * sign
+    assert cycles_until_a_stop(parameters, state) is None
+    command[4] = most * sign
+    assert cycles_until_a_stop(parameters, state, 95) is None
+    command[4] = 0.0
+    check(parameters, state)
+    command[4] = most * sign
+    # 0.25 s are 100 cycles.
+    assert cycles_until_a_stop(parameters, state) in (100, 101)
+    assert stop_of(state) == (Cause.SATURATED, 4, pytest.approx(0.25, abs=0.0026), 0.25)
+
+
+@pytest.mark.parametrize("end", [0, 1])
+@pytest.mark.parametrize("leg", [0, 5])
+def test_a_little_beyond_the_stroke_is_a_stop_and_far_beyond_it_a_fault(leg, end):
+    out = 2.0 * end - 1.0
+    for beyond, cause, limit, mode in (
+        (0.0029, Cause.NONE, 0.0, Mode.RUNNING),
+        (0.0031, Cause.BEYOND_STROKE, 0.003, Mode.STOPPING),
+        (0.0299, Cause.BEYOND_STROKE, 0.003, Mode.STOPPING),
+        (0.0301, Cause.IMPLAUSIBLE, 0.03, Mode.FAULT),
+    ):
+        mechanism, parameters, state = moving()
+        edge = mechanism.limits.stroke[leg, end]
+        state["pose"]["lengths"][leg] = edge + out * beyond
+        assert check(parameters, state) == (cause if mode == Mode.FAULT else Cause.NONE)
+        assert state["safety"]["mode"] == mode
+        if cause != Cause.NONE:
+            assert stop_of(state) == (cause, leg, pytest.approx(edge + out * beyond), pytest.approx(edge + out * limit))
+
+
+@pytest.mark.parametrize("leg", [0, 5])
+@pytest.mark.parametrize("stage", ["command", "lengths"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_is_a_fault(leg, stage, value):
+    _, parameters, state = moving()
+    state["pid" if stage == "command" else "pose"][stage][leg] = value
+    assert check(parameters, state) == Cause.NOT_FINITE
+    assert stop_of(state)[:2] == (Cause.NOT_FINITE, leg)
+    assert (state["safety"]["mode"], state["safety"]["request"]) == (Mode.FAULT, Request.QUICK_STOP)
+    assert np.isfinite(state["pid"]["command"]).all()
+
+
+def test_a_badly_determined_pose_is_a_stop_unless_the_filter_is_trusted():
+    for conditioning, trusted, cause in (
+        (0.0051, 0, Cause.NONE), (0.0049, 0, Cause.ILL_CONDITIONED), (0.0049, 1, Cause.NONE), (0.0, 1, Cause.NONE),
+    ):  # fmt: skip
+        _, parameters, state = moving()
+        state["pose"]["conditioning"] = conditioning
+        assert check(parameters, state, trusted) == Cause.NONE
+        assert stop_of(state)[0] == cause
+
+
+@pytest.mark.parametrize("lost", [(0, 6), (4, 5), (6,), (0,)])
+def test_more_lost_imus_than_may_be_are_a_stop_and_absent_ones_are_not_lost(lost):
+    _, parameters, state = moving()
+    state["imus"]["used"][list(lost)] = 0
+    check(parameters, state)
+    assert stop_of(state) == ((Cause.IMUS_LOST, -1, 2.0, 1.0) if len(lost) == 2 else (Cause.NONE, 0, 0.0, 0.0))
+    _, parameters, state = moving()
+    parameters["imus"]["present"][list(lost)] = state["imus"]["used"][list(lost)] = 0
+    check(parameters, state)
+    assert stop_of(state)[0] == Cause.NONE
+
+
+@pytest.mark.parametrize(
+    ("mode", "request_", "watched"),
+    [
+        (Mode.IDLE, Request.BRAKED, False),
+        (Mode.ARMED, Request.ENABLED, False),
+        (Mode.STOPPING, Request.BRAKED, False),
+        (Mode.STOPPING, Request.ENABLED, True),
+    ],
+)
+def test_it_is_watched_while_anything_may_move(mode, request_, watched):
+    mechanism, parameters, state = moving(mode=mode, request=request_)
+    state["pose"]["lengths"][2] = mechanism.limits.stroke[2, 1] + 0.05
+    assert check(parameters, state) == (Cause.IMPLAUSIBLE if watched else Cause.NONE)
+    assert state["safety"]["mode"] == (Mode.FAULT if watched else mode)
+
+
+# ------------------------------------------------------------------------------------------------------------ the rig's report
+
+
+def hear(parameters, state, drive=FOLLOWING, silent=0, age=None):
+    hear_rig(parameters, state, np.zeros(7, np.int64) if age is None else age, drive, silent)
+
+
+def test_what_the_rig_reports_is_noted():
+    _, parameters, state = moving()
+    age, drive = np.arange(7) + 3, np.array([0, 0, 0, 0, 0, 0])
+    hear(parameters, state, drive, 2, age)
+    np.testing.assert_array_equal(state["imus"]["sample_age"], age)
+    np.testing.assert_array_equal(state["safety"]["watch"]["drive"], drive)
+    assert state["safety"]["watch"]["silent"] == 2
+
+
+def test_each_lapse_of_the_rig_is_told_once():
+    _, parameters, state = moving()
+    lapses = []
+    for silent in (0, 1, 2, 3, 0, 0, 1, 0):
+        hear(parameters, state, silent=silent)
+        lapses.append(told(state) == [Cause.ANSWER_LATE])
+    assert lapses == [False, True, False, False, False, False, True, False]
+
+
+def test_a_bus_is_lost_after_its_patience_and_not_before():
+    for silent, cause in ((BUS_CYCLES - 1, Cause.NONE), (BUS_CYCLES, Cause.BUS_LOST)):
+        _, parameters, state = moving()
+        hear(parameters, state, silent=silent)
+        assert stop_of(state)[0] == cause
+    assert stop_of(state) == (Cause.BUS_LOST, -1, 8.0, 8.0)
+
+
+def test_a_bus_is_lost_when_more_exchanges_fail_than_succeed():
+    _, parameters, state = moving()
+    # As many failures as successes are borne; early successes are no reserve.
+    for _ in range(50):
+        hear(parameters, state)
+    for _ in range(50):
+        hear(parameters, state, silent=1)
+        hear(parameters, state)
+    assert stop_of(state)[0] == Cause.NONE
+    for _ in range(2 * BUS_CYCLES - 1):
+        hear(parameters, state, silent=1)
+    assert state["safety"]["mode"] == Mode.RUNNING
+    hear(parameters, state, silent=1)
+    assert stop_of(state) == (Cause.BUS_LOST, -1, 16.0, 8.0)
+
+
+def test_before_the_drives_are_enabled_the_rig_may_report_what_it_will():
+    _, parameters, state = moving(mode=Mode.IDLE, request=Request.BRAKED)
+    hear(parameters, state, np.full(6, DriveState.FAULTY, np.int64), 100)
+    assert stop_of(state)[0] == Cause.NONE and state["safety"]["mode"] == Mode.IDLE
+
+
+@pytest.mark.parametrize("leg", [0, 5])
+@pytest.mark.parametrize(
+    ("mode", "drive", "cause"),
+    [
+        (Mode.ARMED, DriveState.READY, Cause.NONE),
+        (Mode.ARMED, DriveState.NOT_READY, Cause.NONE),
+        (Mode.ARMED, DriveState.FAULTY, Cause.DRIVE_FAULT),
+        (Mode.RUNNING, DriveState.READY, Cause.DRIVE_OFF),
+        (Mode.RUNNING, DriveState.FAULTY, Cause.DRIVE_FAULT),
+        (Mode.STOPPING, DriveState.QUICK_STOPPING, Cause.DRIVE_OFF),
+    ],
+)
+def test_a_drive_that_leaves_its_operation_is_named(mode, drive, cause, leg):
+    _, parameters, state = moving(mode=mode)
+    drives = FOLLOWING.copy()
+    drives[leg] = drive
+    hear(parameters, state, drives)
+    assert stop_of(state)[:2] == ((cause, leg) if cause != Cause.NONE else (cause, 0))
+
+
+def test_drives_that_a_planar_mechanism_lacks_do_not_count():
+    for leg, mode in ((2, Mode.FAULT), (3, Mode.RUNNING), (5, Mode.RUNNING)):
+        _, parameters, state = moving("planar-3rpr")
+        drives = FOLLOWING.copy()
+        drives[leg] = DriveState.FAULTY
+        hear(parameters, state, drives)
+        assert state["safety"]["mode"] == mode
+
+
+# ------------------------------------------------------------------------------------------- an IMU that contradicts the others
+
+OFF = 0.03
+LIMIT = np.radians(1.0)
+LASTING = 21
+"""Three looks at each of seven IMUs."""
+
+
+def contradicted(worst, explained=10.0, others=1.0, **given):
+    """A cycle in motion in which an IMU contradicts the others."""
+    mechanism, parameters, state = moving(**given)
+    monitor = state["safety"]["monitor"]
+    monitor["explained"] = others
+    monitor["explained"][worst] = explained
+    monitor["squares"] = monitor["explained"]
+    monitor["contradiction"][worst] = (0.0, 0.6 * OFF, -0.8 * OFF)
+    return mechanism, parameters, state
+
+
+def exclude(parameters, state, cycles=LASTING + 1, rest=6.5):
+    """Run the check for some cycles; `rest` is the sum of squares that the other IMUs may leave."""
+    p, s = parameters, state
+    for _ in range(cycles):
+        exclude_imu(
+            p["safety"][()], s["safety"][()], p["rig"][()], s["time"][()], s["imus"][()], float(rest / LIMIT**2),
+            s["reference"][()], s["pid"][()],
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("worst", [0, 3, 6])
+def test_an_imu_that_contradicts_the_others_for_long_is_left_out_and_all_begin_anew(worst):
+    _, parameters, state = contradicted(worst)
+    exclude(parameters, state, LASTING - 1)
+    assert told(state) == [] and not state["imus"]["excluded"].any()
+    exclude(parameters, state, 2)
+    assert state["imus"]["excluded"].tolist() == [k == worst for k in range(7)]
+    assert told(state) == [Cause.IMU_DISAGREES]
+    events, safety = state["safety"]["events"], state["safety"]
+    assert (events["index"][0], events["value"][0]) == (worst, pytest.approx(OFF))
+    assert events["limit"][0] == pytest.approx(LIMIT)
+    assert safety["mode"] == Mode.RUNNING and safety["watch"]["contradicted_for"] <= PERIOD_S
+    for name in ("contradiction", "explained", "squares"):
+        assert not safety["monitor"][name].any()
+
+
+def test_a_contradiction_must_last_without_a_break():
+    _, parameters, state = contradicted(2)
+    contradiction = state["safety"]["monitor"]["contradiction"]
+    for _ in range(4):
+        exclude(parameters, state, LASTING - 2)
+        contradiction[2] *= 0.5
+        exclude(parameters, state, 1)
+        assert state["safety"]["watch"]["contradicted_for"] == 0.0
+        contradiction[2] *= 2.0
+    assert told(state) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "excluded"),
+    [
+        ({"rest": 6.01}, True),
+        ({"rest": 5.99}, False),
+        ({"explained": 1.31, "rest": 100.0}, True),
+        ({"explained": 1.29, "rest": 100.0}, False),
+        ({"most_lost": 0}, False),
+        ({"already": 0}, False),
+        ({"already": 6}, False),
+    ],
+)
+@pytest.mark.parametrize("preset", ["hexapod", "planar-3rpr"])
+def test_an_imu_that_cannot_be_named_for_sure_is_a_stop(change, excluded, preset):
+    worst = 1
+    _, parameters, state = contradicted(worst, change.get("explained", 10.0), preset=preset)
+    parameters["safety"]["watch"]["most_lost_imus"] = change.get("most_lost", 1)
+    if "already" in change:
+        state["imus"]["excluded"][change["already"]] = 1
+    exclude(parameters, state, rest=change.get("rest", 6.5))
+    assert bool(state["imus"]["excluded"][worst]) == excluded
+    if not excluded:
+        named = worst if preset == "hexapod" else -1
+        assert stop_of(state) == (Cause.IMUS_DISAGREE, named, pytest.approx(OFF), pytest.approx(LIMIT))
+        assert state["safety"]["mode"] == Mode.STOPPING
+
+
+@pytest.mark.parametrize("mode", [Mode.IDLE, Mode.ARMED, Mode.STOPPING])
+def test_only_in_motion_an_imu_is_left_out(mode):
+    _, parameters, state = contradicted(4, mode=mode)
+    exclude(parameters, state)
+    assert told(state) == [] and not state["imus"]["excluded"].any()
