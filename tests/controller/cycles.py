@@ -13,6 +13,12 @@ def cycle(parameters, state, measurement, segments):
     return compiled.cycle(parameters, state, measurement, segments, _MARKS)
 
 
+def run_stages(parameters, state, measurement, first, last=None):
+    """The stages from `first` up to `last`, by default the first alone; the time stands still."""
+    last = compiled.CycleStage(first + 1) if last is None else last
+    return compiled.run_stages(parameters, state, measurement, np.zeros((6, 1, 5)), _MARKS, first, last)
+
+
 def find(parameters, state):
     """The pose in closed form; returns its conditioning."""
     p, s = parameters[()], state[()]
