@@ -1,8 +1,10 @@
 """The FMU as a file: built once, the same to the byte, and an error in one line."""
 
 import os
+import struct
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,8 @@ import pytest
 
 from plant.errors import ToolchainError
 from plant.fmu import build as export
-from plant.fmu.build import build_in_subprocess, default_fmu
+from plant.fmu.build import PLANAR_MODEL, PLATFORMS, SPATIAL_MODEL, build_in_subprocess, default_fmu, model_of
+from plant.mechanism import load_in_space
 
 
 def test_the_default_fmu_is_built_once(fmu_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,3 +88,58 @@ def test_a_failed_write_leaves_nothing_behind(tmp_path: Path) -> None:
     (tmp_path / "plant.fmu").mkdir()
     assert "cannot write" in refused_build(tmp_path / "plant.fmu")
     assert [entry.name for entry in tmp_path.iterdir()] == ["plant.fmu"]
+
+
+def test_the_plant_of_a_mechanism_follows_from_its_legs() -> None:
+    assert (model_of(load_in_space("hexapod")), model_of(load_in_space("planar-3rpr"))) == (SPATIAL_MODEL, PLANAR_MODEL)
+    for model, legs in ((SPATIAL_MODEL, 6), (PLANAR_MODEL, 3)):
+        (command,) = (each for each in model.table.inputs if each.name == "velocity_command")
+        assert command.shape == (legs,) and load_in_space(model.preset).legs == legs
+
+
+def test_the_names_of_platforms_are_those_of_fmi() -> None:
+    names = {each.folder: (each.folder_2, each.suffix) for platforms in PLATFORMS.values() for each in platforms}
+    assert names == {
+        "x86_64-linux": ("linux64", ".so"),
+        "x86_64-windows": ("win64", ".dll"),
+        "x86_64-darwin": ("darwin64", ".dylib"),
+        "aarch64-darwin": ("darwin64", ".dylib"),
+    }
+    for platforms in PLATFORMS.values():
+        for each in platforms:
+            assert each.zig.partition("-")[0] == each.folder.partition("-")[0]
+
+
+def test_libraries_of_two_processors_are_one_file_as_mach_o_has_it() -> None:
+    """Little-endian libraries behind a big-endian table of processor, variant, place, size and alignment."""
+    first = struct.pack("<3I", 0xFEEDFACF, 0x01000007, 3) + b"intel" * 4000
+    second = struct.pack("<3I", 0xFEEDFACF, 0x0100000C, 0) + b"arm" * 11
+    whole = export._universal([first, second])
+    assert struct.unpack_from(">2I", whole) == (0xCAFEBABE, 2)
+    for i, (library, processor, variant) in enumerate(((first, 0x01000007, 3), (second, 0x0100000C, 0))):
+        found, kind, at, size, alignment = struct.unpack_from(">5I", whole, 8 + 20 * i)
+        assert (found, kind, size) == (processor, variant, len(library))
+        assert at % (1 << alignment) == 0 and 1 << alignment == 16384
+        assert whole[at : at + size] == library
+
+
+def test_a_library_of_windows_loses_its_time_and_nothing_else() -> None:
+    library = bytearray(range(1, 251))
+    struct.pack_into("<I", library, 0x3C, 0x80)
+    kept = export._without_time(bytes(library))
+    assert len(kept) == len(library)
+    # Signature and two words of the header come before the stamp.
+    changed = [i for i in range(len(library)) if kept[i] != library[i]]
+    assert changed == [0x88, 0x89, 0x8A, 0x8B] and kept[0x88:0x8C] == bytes(4)
+
+
+def test_an_archive_has_no_time_and_its_members_in_order(tmp_path: Path) -> None:
+    contents = {"modelDescription.xml": b"first", "binaries/a": b"second" * 1000}
+    path = tmp_path / "archive.fmu"
+    path.write_bytes(export._archive(contents))
+    with zipfile.ZipFile(path) as archive:
+        assert {name: archive.read(name) for name in archive.namelist()} == contents
+        assert archive.namelist()[0] == "modelDescription.xml"
+        for entry in archive.infolist():
+            assert entry.date_time == (1980, 1, 1, 0, 0, 0) and entry.external_attr >> 16 == 0o644
+            assert entry.compress_type == zipfile.ZIP_DEFLATED

@@ -1,11 +1,12 @@
 """Trying FMUs: those that keep what they promise, and those that fail or crash."""
 
 import re
+import zipfile
 from pathlib import Path
 
 import pytest
 
-from plant.fmu.check import check_fmu
+from plant.fmu.check import check_fmu, platforms_of
 from tests.plant.fmu.foreign import edited
 
 
@@ -24,3 +25,14 @@ def test_a_failure_and_a_crash_are_findings(foreign_fmu: Path, tmp_path: Path, f
     for check in checks[1:3]:
         assert check.problems is not None and len(check.problems) == 1
         assert re.search(finding, check.problems[0])
+
+
+def test_platforms_are_the_folders_that_hold_binaries(tmp_path: Path) -> None:
+    path = tmp_path / "many.fmu"
+    with zipfile.ZipFile(path, "w") as archive:
+        for name in (
+            "modelDescription.xml", "binaries/win64/a.dll", "binaries/linux64/a.so", "binaries/linux64/b.so", "binaries/empty/",
+            "binaries/note.txt", "resources/darwin64/a.dylib",
+        ):  # fmt: skip
+            archive.writestr(name, b"")
+    assert platforms_of(path) == ["linux64", "win64"]

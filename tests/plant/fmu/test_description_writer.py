@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
 
-from plant.dynamics.variables import BRAKE, DRIVE_MODES, SPATIAL, VELOCITY
+from plant.dynamics.variables import BRAKE, DRIVE_MODES, PLANAR, SPATIAL, VELOCITY, VariableTable
 from plant.fmu.description_writer import QUANTITIES, Layout
 from plant.fmu.plant import FmuPlant
 from plant.mechanism import Mechanism
@@ -152,3 +152,39 @@ def test_a_foreign_importer_simulates_the_fmu(fmu_path: Path, make_plant: MakePl
             assert row[name] == pytest.approx(float(plant.get(name)), rel=1e-9)
         plant.step(1e-3)
     assert len(result) == 51 and np.ptp(result["kinetic_energy"]) > 0.0
+
+
+@pytest.mark.parametrize("table", [SPATIAL, PLANAR], ids=["spatial", "planar"])
+def test_a_derivative_is_its_state_per_second(table: VariableTable) -> None:
+    layout = Layout(table)
+    for state, rate in zip(table.states, layout.rates, strict=True):
+        assert rate.name == f"der({state.name})" and rate.shape == state.shape
+        assert layout.state_of(rate) is state and layout.state_of(state) is None
+        per_second = {"s": 0} | exponents(state.unit)
+        per_second["s"] -= 1
+        assert exponents(rate.unit) == {base: exponent for base, exponent in per_second.items() if exponent}
+
+
+def test_the_derivatives_of_the_description_are_those_of_its_states(description: Any) -> None:
+    rates = {each.name: each.derivative.name for each in description.modelVariables if each.derivative}
+    assert rates == {f"der({state.name})": state.name for state in SPATIAL.states}
+
+
+@pytest.mark.parametrize("table", [SPATIAL, PLANAR], ids=["spatial", "planar"])
+def test_every_value_has_a_place_of_its_own(table: VariableTable) -> None:
+    layout = Layout(table)
+    places = [place for variable in layout.stored for place in layout.places(variable)]
+    assert places == list(range(layout.size)) and set(layout.stored) == set(layout.exposed)
+    assert layout.places(table.states[0]).start == 0
+
+
+def test_what_may_change_and_when_is_described(description: Any) -> None:
+    described = {variable.name: variable for variable in description.modelVariables}
+    for variable in (*SPATIAL.inputs, *SPATIAL.outputs, *SPATIAL.states, *Layout(SPATIAL).rates):
+        actual = described[variable.name]
+        assert actual.variability == ("discrete" if variable.name == "drive_mode" else "continuous"), variable.name
+        # What is calculated has no start value, and an input is zero but for the drives' mode.
+        calculated = variable.causality in ("output", "state")
+        assert (actual.initial == "calculated") == calculated and (actual.start is None) == calculated, variable.name
+        if variable.causality == "input" and variable.name != "drive_mode":
+            assert {float(text) for text in actual.start.split()} == {0.0}
