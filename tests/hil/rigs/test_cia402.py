@@ -119,3 +119,80 @@ def test_what_a_drive_says():
         == drive_state(statusword(State.FAULT_REACTION_ACTIVE, True, False))
         == FAULTY
     )
+
+
+@pytest.mark.parametrize(
+    "word, state",
+    [
+        (0x0000, State.NOT_READY_TO_SWITCH_ON),
+        (0x0230, State.NOT_READY_TO_SWITCH_ON),
+        (0x0040, State.SWITCH_ON_DISABLED),
+        (0x0270, State.SWITCH_ON_DISABLED),
+        (0x0231, State.READY_TO_SWITCH_ON),
+        (0x0233, State.SWITCHED_ON),
+        (0x1637, State.OPERATION_ENABLED),
+        (0x0217, State.QUICK_STOP_ACTIVE),
+        (0x020F, State.FAULT_REACTION_ACTIVE),
+        (0x023F, State.FAULT_REACTION_ACTIVE),
+        (0x0208, State.FAULT),
+        (0x0238, State.FAULT),
+        (0x0211, None),
+        (0x0277, None),
+        (0x0248, None),
+    ],
+)
+def test_statuswords_have_the_bits_of_cia_402(word, state):
+    assert state_of(word) == state
+
+
+def test_an_emulated_drives_statuswords_have_the_bits_of_cia_402():
+    assert statusword(State.OPERATION_ENABLED, True, True) == 0x1237
+    assert statusword(State.OPERATION_ENABLED, False, False) == 0x0227
+    assert statusword(State.SWITCHED_ON, True, True) == 0x0233
+    assert statusword(State.SWITCH_ON_DISABLED, True, False) == 0x0250
+    assert statusword(State.QUICK_STOP_ACTIVE, True, True) == 0x0217
+    assert statusword(State.FAULT, False, True) == 0x0208
+
+
+@pytest.mark.parametrize("more", [0x00, 0x70, 0xFF70])
+@pytest.mark.parametrize(
+    "state, after",
+    [
+        (State.SWITCH_ON_DISABLED, "DDRDD"),
+        (State.READY_TO_SWITCH_ON, "DDRSS"),
+        (State.SWITCHED_ON, "DDRSE"),
+        (State.OPERATION_ENABLED, "DQRSE"),
+        (State.QUICK_STOP_ACTIVE, "DQQQQ"),
+    ],
+)
+def test_a_controlword_takes_a_drive_one_transition_further(state, after, more):
+    reached = {
+        "D": State.SWITCH_ON_DISABLED, "R": State.READY_TO_SWITCH_ON, "S": State.SWITCHED_ON, "E": State.OPERATION_ENABLED,
+        "Q": State.QUICK_STOP_ACTIVE,
+    }  # fmt: skip
+    assert [commanded(state, word | more, 0) for word in (0x00, 0x02, 0x06, 0x07, 0x0F)] == [reached[each] for each in after]
+
+
+@pytest.mark.parametrize(
+    "request_, words",
+    [
+        (BRAKED, (0, 0x06, 0x07, 0x07, 0x07, 0, 0, 0)),
+        (ENABLED, (0, 0x06, 0x07, 0x0F, 0x0F, 0x02, 0, 0)),
+        (QUICK_STOP, 8 * (0x02,)),
+    ],
+)
+def test_the_controlword_towards_a_request_by_state(request_, words):
+    assert tuple(controlword_towards(request_, state) for state in ALL) == words
+    assert controlword_towards(request_, None) == (0x02 if request_ == QUICK_STOP else 0)
+
+
+def test_a_request_that_is_unknown_stops_quickly():
+    assert {controlword_towards(3, state) for state in (*ALL, None)} == {0x02}
+
+
+def test_a_drive_without_a_supplied_power_stage_is_off_unless_its_state_says_more():
+    found = [drive_state(statusword(state, False, True)) for state in ALL]
+    assert found == [OFF, OFF, OFF, OFF, FOLLOWING, QUICK_STOPPING, FAULTY, FAULTY]
+    assert drive_state(statusword(State.OPERATION_ENABLED, False, False)) == drive_state(0x0211) == OFF
+    found = [drive_state(statusword(state, True, False)) for state in ALL]
+    assert found == [OFF, READY, READY, READY, READY, QUICK_STOPPING, FAULTY, FAULTY]
