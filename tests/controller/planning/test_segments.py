@@ -1,11 +1,14 @@
-"""The reference: cubic segments are evaluated as polynomials, segment after segment."""
+"""The reference: cubic segments are evaluated as polynomials, segment after segment; and the fastest way to rest."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ruckig import ControlInterface, Ruckig, Trajectory
 
-from controller.planning.segments import evaluate_reference
+from controller.planning.planner import calculate, ruckig_input
+from controller.planning.segments import STOP_SEGMENTS, evaluate_reference, plan_stop, stop_phases
+from plant.mechanism import Limits
 from tests.controller.planning.sampled_reference import sample_reference
 
 
@@ -95,3 +98,74 @@ def test_samples_are_the_reference_at_whole_cycles():
     assert samples.shape == (700, 6, 3)
     expected, _ = evaluated(segments, 1e-3 * np.arange(700))
     np.testing.assert_array_equal(samples, expected)
+
+
+# ------------------------------------------------------------------------------------------------------------ the way to rest
+
+ACCELERATION, JERK = 3.0, 60.0
+
+
+def run_down(rate, acceleration):
+    """Time to rest, the way there, the final rate and acceleration, and the largest acceleration on the way."""
+    state, total, largest = (0.0, rate, acceleration), 0.0, abs(acceleration)
+    for jerk, duration in stop_phases(rate, acceleration, ACCELERATION, JERK):
+        assert duration >= 0.0 and abs(jerk) in (0.0, JERK)
+        polynomial = np.polynomial.Polynomial([state[0], state[1], state[2] / 2.0, jerk / 6.0])
+        state = tuple(float(polynomial.deriv(order)(duration) if order else polynomial(duration)) for order in range(3))
+        total, largest = total + duration, max(largest, abs(state[2]))
+    return total, state, largest
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_stop_is_the_fastest_that_ruckig_knows(seed):
+    random = np.random.default_rng(seed)
+    parameters = ruckig_input(Limits(np.array([[0.1, 0.2]]), 10.0, ACCELERATION, JERK), ControlInterface.Velocity, None)
+    parameters.target_velocity, parameters.target_acceleration = [0.0], [0.0]
+    otg, trajectory = Ruckig(1), Trajectory(1)
+    for _ in range(100):
+        rate, acceleration = (
+            random.choice([0.0, 0.02, 0.3]) * random.normal(),
+            random.choice([0.0, 1.0]) * random.uniform(-3, 3),
+        )
+        total, (way, *rest), largest = run_down(rate, acceleration)
+        np.testing.assert_allclose(rest, 0.0, atol=1e-12)
+        assert largest <= ACCELERATION * (1.0 + 1e-12)
+        assert calculate(otg, parameters, ([0.0], [rate], [acceleration]), trajectory)
+        assert total == pytest.approx(trajectory.duration, abs=1e-9)
+        assert way == pytest.approx(trajectory.at_time(total)[0][0], abs=1e-12)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize(
+    ("rate", "acceleration", "time", "way"),
+    [
+        # Up to 3 m/s^2 in 50 ms, which takes 0.15 m/s with its way back; 50 ms more take another 0.15 m/s.
+        (0.15, 0.0, 0.1, 0.0075),
+        (0.30, 0.0, 0.15, 0.0225),
+        (0.0375, 0.0, 0.05, 0.0009375),
+        # Braking already as a stop would in its middle.
+        (0.075, -3.0, 0.05, 0.00125),
+        (0.0, 0.0, 0.0, 0.0),
+    ],
+)
+def test_a_stop_takes_the_time_and_the_way_that_are_worked_out_by_hand(rate, acceleration, time, way, sign):
+    total, (gone, *_), _ = run_down(sign * rate, sign * acceleration)
+    assert total == pytest.approx(time, abs=1e-9)
+    assert gone == pytest.approx(sign * way, abs=1e-12)
+
+
+def test_every_leg_stops_by_itself_and_the_slowest_tells_how_long_it_takes():
+    random = np.random.default_rng(5)
+    reference = random.normal([0.4, 0.0, 0.0], [0.05, 0.2, 1.0], (6, 3))
+    segments = np.full((6, STOP_SEGMENTS, 5), np.nan)
+    longest = plan_stop(reference, ACCELERATION, JERK, segments)
+    each = [run_down(rate, acceleration) for _, rate, acceleration in reference]
+    assert longest == pytest.approx(max(total for total, _, _ in each))
+    np.testing.assert_allclose(segments[:, 0], np.column_stack([np.zeros(6), reference, segments[:, 0, 4]]))
+    np.testing.assert_allclose(segments[:, 3, 0], [total for total, _, _ in each])
+    np.testing.assert_array_equal(segments[:, 3, 2:], 0.0)
+    times = np.sort(np.concatenate([segments[:, :, 0].ravel(), np.nextafter(segments[:, :, 0].ravel(), 0.0)]).clip(0.0))
+    found, _ = evaluated(segments, [*times, longest + 1.0])
+    np.testing.assert_allclose(np.diff(found[:-1], axis=0)[np.diff(times) < 1e-12], 0.0, atol=1e-9)
+    np.testing.assert_allclose(found[-1, :, 0], reference[:, 0] + [state[0] for _, state, _ in each], atol=1e-12)
+    np.testing.assert_array_equal(found[-1, :, 1:], 0.0)

@@ -26,12 +26,12 @@ from controller.planning.stream import (
     stream_cause,
     take_plan,
 )
-from controller.planning.stream_planner import StreamPlanner, TargetRefusedError
+from controller.planning.stream_planner import Plan, StreamPlanner, TargetRefusedError
 from controller.planning.target import load_target
 from controller.safety.causes import Cause
 from hil.loop.records import shared_array
 from plant.errors import InputError, UnreachableError
-from plant.pose import quaternion_from_rotation
+from plant.pose import quaternion_from_rotation, rotation_from_vector
 
 ROUNDING = 1e-9
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -365,3 +365,76 @@ def test_a_stream_is_lost_when_no_sample_comes_for_longer_than_the_patience():
     fail_stream(stream, Cause.TARGET_JUMPS, 3, 0.02, 0.005)
     fail_stream(stream, Cause.TARGET_NOT_FINITE, 0, np.nan, np.nan)
     assert stream_cause(stream, 10**9, 10**8) == (Cause.TARGET_JUMPS, 3, 0.02, 0.005)
+
+
+@pytest.mark.parametrize(("height", "end"), [(0.5, 1), (-0.2, 0)])
+def test_a_sample_out_of_reach_names_the_leg_that_is_farthest_out_its_length_and_the_end_of_its_stroke(hexapod, height, end):
+    planner = StreamPlanner(hexapod, home_lengths(hexapod))
+    # Leaning, so that the legs differ.
+    position, turn = np.array([0.02, -0.01, height]), np.array([np.cos(0.05), np.sin(0.05), 0.0, 0.0])
+    with pytest.raises(TargetRefusedError) as refusal:
+        planner.add(0.0, position, turn)
+    lean = rotation_from_vector([0.1, 0.0, 0.0]) @ hexapod.home.rotation
+    lengths = leg_lengths(hexapod, hexapod.home.position + position, lean)
+    stroke = hexapod.limits.stroke
+    leg = int(np.argmax((lengths - stroke[:, 1]) if end else (stroke[:, 0] - lengths)))
+    found = refusal.value
+    assert (found.cause, found.index, found.limit) == (Cause.BEYOND_STROKE, leg, stroke[leg, end])
+    assert found.value == pytest.approx(lengths[leg], abs=1e-12)
+    assert str(found).startswith(f"leg {leg} is beyond its stroke (") and str(found).endswith(": correct what sends the target")
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_jump_names_the_leg_that_jumps_farthest_and_by_how_much(hexapod, sign):
+    planner = StreamPlanner(hexapod, home_lengths(hexapod))
+    planner.add(2.0, np.zeros(3), LEVEL)
+    move = sign * np.array([0.03, 0.01, 0.0])
+    steps = leg_lengths(hexapod, hexapod.home.position + move, hexapod.home.rotation) - home_lengths(hexapod)
+    leg = int(np.argmax(np.abs(steps)))
+    # 1.5 times 0.25 m/s for 20 ms, and a millimetre.
+    with pytest.raises(TargetRefusedError) as refusal:
+        planner.add(2.02, move, LEVEL)
+    found = refusal.value
+    assert (found.cause, found.index) == (Cause.TARGET_JUMPS, leg)
+    assert found.value == pytest.approx(np.abs(steps[leg])) and found.limit == pytest.approx(0.0085)
+    size = 0.0085 / np.abs(steps[leg])
+    with pytest.raises(TargetRefusedError):
+        planner.add(2.02, 1.03 * size * move, LEVEL)
+    planner.add(2.02, 0.97 * size * move, LEVEL)
+
+
+@pytest.mark.parametrize("ahead", [0.0, 0.015, 0.04])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_plan_meets_an_accelerating_target_where_it_will_be(hexapod, ahead, sign):
+    """Samples of an even acceleration: the plan is where the target is, and as fast, when it meets it after 30 ms."""
+    planner, times = StreamPlanner(hexapod, home_lengths(hexapod)), 0.01 * np.arange(-12, 1)
+
+    def height(t):
+        return sign * (0.004 * t + 0.15 * t * t)
+
+    def expected(t):
+        # It is taken to accelerate for 50 ms after the last sample.
+        bent = min(t, 0.05)
+        at = height(bent) + (t - bent) * sign * (0.004 + 0.3 * bent)
+        return leg_lengths(hexapod, hexapod.home.position + [0.0, 0.0, at], hexapod.home.rotation)
+
+    for t in times:
+        planner.add(5.0 + t, [0.0, 0.0, height(t)], LEVEL)
+    # From the state in which the target will be, the plan can follow at once.
+    at, state = 2.0, np.zeros((6, 3))
+    h = 1e-4
+    segments = rest(expected(ahead), PLAN_SEGMENTS)
+    segments[:, 0, 0] = at
+    segments[:, 0, 2] = (expected(ahead + h) - expected(ahead - h)) / (2.0 * h)
+    planner.follow(Plan(at, segments, None))
+    plan = planner.plan(at, ahead)
+    evaluate_reference(plan.segments, at + 0.03, np.zeros(6, np.int64), state)
+    np.testing.assert_allclose(state[:, 0], expected(ahead + 0.03), rtol=0.0, atol=3e-6)
+    rates = (expected(ahead + 0.03 + h) - expected(ahead + 0.03 - h)) / (2.0 * h)
+    np.testing.assert_allclose(state[:, 1], rates, rtol=0.0, atol=3e-4)
+    assert plan.begin == at and plan.goal is None
+    # It coasts for 20 ms, and then stops.
+    evaluate_reference(plan.segments, at + 0.05, np.zeros(6, np.int64), state)
+    np.testing.assert_allclose(state[:, 1], rates, rtol=0.0, atol=3e-4)
+    evaluate_reference(plan.segments, at + 0.07, np.zeros(6, np.int64), state)
+    assert (np.abs(state[:, 1]) < np.abs(rates)).all()

@@ -13,7 +13,7 @@ from controller.planning.motions import MARGIN_S, MOTIONS, REST_S, SAMPLE_PERIOD
 from controller.planning.planner import plan
 from controller.planning.target import COLUMNS, Target, load_target
 from plant.errors import GoughError, InputError, UnknownNameError
-from plant.mechanism import Mechanism, load_spatial
+from plant.mechanism import Mechanism, load_in_space, load_spatial
 from plant.pose import Pose
 from tests.controller.leg_geometry import angle_between, rotation_of, unit
 from tests.controller.planning.sampled_reference import sample_reference
@@ -29,6 +29,13 @@ def write(folder, *lines, ending="\n"):
 
 
 # ----------------------------------------------------------------------------------------------------------- named motions
+
+
+def displacements_at(mechanism, name, times, duration=4.0):
+    """Displacements (N, 6) of a motion from home, position and rotation vector."""
+    positions, rotations = load_target(name, mechanism, duration).at(np.asarray(times, float))
+    turns = Rotation.from_matrix(rotations @ mechanism.home.rotation.T).as_rotvec()
+    return np.hstack([positions - mechanism.home.position, turns])
 
 
 @pytest.mark.parametrize("name", list(MOTIONS))
@@ -57,6 +64,88 @@ def test_the_circle_turns_once_in_four_seconds(hexapod):
     np.testing.assert_allclose(target.at(np.array([2.0]))[0], target.at(np.array([6.0]))[0], atol=1e-9)
     tilts = Rotation.from_matrix(target.rotations[later]).magnitude()
     np.testing.assert_allclose(tilts, np.radians(4.0), rtol=1e-9)
+
+
+@pytest.mark.parametrize("preset", ["hexapod", "planar-3rpr"])
+def test_the_circle_and_the_sines_are_those_that_are_described(preset):
+    mechanism = load_in_space(preset)
+    # The hexapod's strokes are 120 mm, the planar mechanism's 60 mm.
+    scale, planar = (1.0, False) if preset == "hexapod" else (0.5, True)
+    circle = displacements_at(mechanism, "circle", [0.5, 1.0, 2.0, 3.0])
+    # Half of it after half a second, at 45 deg.
+    r, tilt = 0.03 * scale, np.radians(4.0) * scale
+    half = 0.5 * np.sqrt(0.5)
+    np.testing.assert_allclose(circle[:, :2], [[half * r, half * r], [0.0, r], [-r, 0.0], [0.0, -r]], atol=1e-9)
+    turns = [[half * tilt, -half * tilt, 0.0], [tilt, 0.0, 0.0], [0.0, tilt, 0.0], [-tilt, 0.0, 0.0]]
+    if planar:
+        turns = np.outer([half, 1.0, 0.0, -1.0], [0.0, 0.0, np.radians(10.0) * scale])
+    np.testing.assert_allclose(circle[:, 3:], turns, atol=1e-9)
+    sines = displacements_at(mechanism, "sines", [0.25, 1.5, 3.0])
+    sizes = np.array([0.012, 0.012, 0.012, *np.radians([3.0, 3.0, 5.0])]) * scale
+    times = np.array([[0.25], [1.5], [3.0]])
+    expected = sizes * np.sin(2.0 * np.pi * times * [0.30, 0.37, 0.43, 0.50, 0.57, 0.63])
+    # 10 x^3 - 15 x^4 + 6 x^5 at a quarter is 0.103515625.
+    expected[0] *= 0.103515625
+    expected[:, 2:5] *= not planar
+    np.testing.assert_allclose(sines, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("preset", ["hexapod", "planar-3rpr"])
+def test_steps_go_to_each_axis_in_turn_and_home_again(preset):
+    mechanism = load_in_space(preset)
+    scale = 1.0 if preset == "hexapod" else 0.5
+    sizes = scale * np.diag([0.02, 0.02, 0.02, *np.radians([4.0, 4.0, 8.0])])
+    poses = [np.zeros(6), *(sizes if preset == "hexapod" else sizes[[0, 1, 5]])]
+    found = displacements_at(mechanism, "steps", 2.0 * np.arange(9) + 1.0, 20.0)
+    np.testing.assert_allclose(found, [poses[k % len(poses)] for k in range(9)], atol=1e-12)
+
+
+@pytest.mark.parametrize("preset", ["hexapod", "planar-3rpr"])
+def test_shaking_uses_what_the_limits_allow_and_probing_three_tenths_of_it(preset):
+    mechanism = load_in_space(preset)
+    limits, target = mechanism.limits, load_target("shaking", mechanism, 6.0)
+    assert target.times[-1] >= 6.0 + MARGIN_S - 1e-9 and not target.held
+    lengths = leg_lengths(mechanism, target.positions, target.rotations)
+    middle, half = limits.stroke.mean(axis=1), np.ptp(limits.stroke, axis=1) / 2.0
+    rates = np.gradient(lengths, SAMPLE_PERIOD_S, axis=0)
+    use = (
+        (np.abs(lengths - middle) / half).max(),
+        np.abs(rates).max() / limits.velocity,
+        np.abs(np.gradient(rates, SAMPLE_PERIOD_S, axis=0)).max() / limits.acceleration,
+    )
+    assert 0.849 < max(use) <= 0.85
+    times = np.arange(0.2, 6.0, 0.37)
+    whole, small = (displacements_at(mechanism, name, times, 6.0) for name in ("shaking", "probing"))
+    np.testing.assert_allclose(small, 0.3 * whole, rtol=0.0, atol=1e-4 * np.abs(whole).max())
+    # 0.72 to 0.88 Hz: in order of the axes, each a little faster.
+    moved = [k for k in range(6) if not mechanism.planar or k in (0, 1, 5)]
+    times = np.arange(1.0, 6.0, 0.01)
+    whole = displacements_at(mechanism, "shaking", times, 6.0)
+    for k in moved:
+        wave = np.sin(2.0 * np.pi * (0.72 + 0.032 * k) * times)
+        np.testing.assert_allclose(whole[:, k], wave * (whole[:, k] @ wave) / (wave @ wave), atol=2e-4)
+    size = [np.abs(whole[:, k]).max() for k in moved]
+    spread = np.linalg.norm(mechanism.platform_joints, axis=1).mean()
+    assert size[0] / size[-1] == pytest.approx(spread, rel=0.05)
+
+
+@pytest.mark.parametrize(("name", "share"), [("rests", 0.8), ("near-rests", 0.4)])
+@pytest.mark.parametrize("preset", ["hexapod", "planar-3rpr"])
+def test_rests_begin_at_home_and_are_as_far_apart_as_the_strokes_share_allows(preset, name, share):
+    mechanism = load_in_space(preset)
+    target = load_target(name, mechanism, 2.0 * REST_S + 0.1)
+    # Home, and three more for two and a bit.
+    np.testing.assert_array_equal(target.times, REST_S * np.arange(4))
+    assert target.held
+    np.testing.assert_array_equal(target.positions[0], mechanism.home.position)
+    lengths = leg_lengths(mechanism, target.positions, target.rotations)
+    middle, half = mechanism.limits.stroke.mean(axis=1), np.ptp(mechanism.limits.stroke, axis=1) / 2.0
+    used = np.abs(lengths - middle) / half
+    assert used.max() <= share and used[1:].max() > 0.7 * share
+    # Each is farther from those before than those that follow it will be.
+    apart = [min(np.linalg.norm(lengths[k] - lengths[i]) for i in range(k)) for k in range(1, 4)]
+    assert (np.diff(apart) <= 1e-12).all() and apart[-1] > half.mean() * share
+    assert len(load_target(name, mechanism, 2.0 * REST_S).times) == 3
 
 
 def test_steps_are_held_and_visit_every_axis(hexapod):
