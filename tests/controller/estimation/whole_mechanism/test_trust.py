@@ -1,14 +1,15 @@
 """The trust in the whole-mechanism filter: no change of the pose's source is a step of the pose."""
 
 import numpy as np
+import pytest
 
-from controller.cycle import STATE, cycle_parameters
+from controller.cycle import STATE, CycleStage, cycle_parameters
 from controller.inverse_kinematics import leg_lengths
 from controller.safety.causes import Cause
 from controller.settings import SafetySettings, control_settings, fusion_settings
 from plant.pose import pose_errors
-from tests.controller.cycles import cycle
-from tests.controller.leg_geometry import rotation_of, static_signals
+from tests.controller.cycles import cycle, run_stages
+from tests.controller.leg_geometry import leg_directions, rotation_of, static_signals
 
 RATE_HZ = 500.0
 FADING_S = 0.1
@@ -89,3 +90,192 @@ def test_when_the_filter_is_trusted_the_pose_fades_to_the_filters(hexapod):
     errors = np.array([rest.step() for _ in range(100)])
     assert rest.trust["trusted"] == 1
     fades(errors[np.abs(errors).max(axis=1) > 1e-6], 0.0, AWAY)
+
+
+# ------------------------------------------------------------------------------------------------------ its stage alone
+
+
+SETTLING, PATIENCE = 150, 25
+"""Cycles of settling, of waiting for a new start, and for which the leg filters may disagree."""
+
+
+class Stage:
+    """The stage of the filter alone, at rest at home, with a pose in closed form and leg filters as a test has them."""
+
+    def __init__(self, mechanism, magnetometer=False, **fusion):
+        settings = control_settings(mechanism), fusion_settings(mechanism, **fusion)
+        self.parameters = cycle_parameters(mechanism, RATE_HZ, *settings, whole="gyroscopes", magnetometer=magnetometer)
+        self.state = np.zeros((), STATE)
+        self.home = mechanism.home
+        self.directions = leg_directions(mechanism, self.home.position, self.home.rotation)
+        self.state["imus"]["used"] = 1
+        self.state["imus"]["sample"] = static_signals(mechanism, self.home.position, self.home.rotation)
+        self.state["legs"]["used"], self.state["legs"]["directions"] = 1.0, self.directions
+        self.trust, self.pose, self.time = self.state["mechanism"], self.state["pose"], self.state["time"]
+
+    def step(self, found=True, missed=0, closed=None):
+        """A cycle; whether there is a pose."""
+        self.time["missed"] = missed
+        self.time["cycle"] += missed
+        self.pose["found"] = found
+        self.pose["position"] = self.home.position if closed is None else closed
+        self.pose["rotation"] = self.home.rotation
+        self.pose["twist"], self.pose["acceleration"] = 7.0, 8.0
+        run_stages(self.parameters, self.state, self.state["imus"]["sample"].copy(), CycleStage.MECHANISM)
+        self.time["cycle"] += 1
+        return bool(self.pose["found"])
+
+    @property
+    def stands(self):
+        """Whether the filter runs, and whether it is trusted."""
+        return bool(self.trust["filter"]["running"]), bool(self.trust["trusted"])
+
+    def trusted(self):
+        """Once it is."""
+        self.pose["twist"] = 0.0
+        while not self.trust["trusted"]:
+            self.step()
+            # The start took the twist of the pose.
+            self.trust["filter"]["motion"] = self.trust["filter"]["published_motion"] = 0.0
+            self.trust["filter"]["low_passed"] = self.trust["filter"]["smooth_motion"] = 0.0
+        return self
+
+
+def test_the_filter_starts_with_the_first_pose_and_is_trusted_when_it_has_settled(hexapod):
+    stage = Stage(hexapod)
+    assert not stage.step(found=False)
+    assert stage.stands == (False, False)
+    stage.step()
+    # Started in cycle 1, at the pose and twist of that cycle, which go on unchanged.
+    assert stage.stands == (True, False)
+    assert (stage.trust["due"], stage.trust["filter"]["time"]) == (1 + SETTLING, 1.0 / RATE_HZ)
+    np.testing.assert_array_equal(stage.trust["filter"]["position"], stage.home.position)
+    np.testing.assert_array_equal(stage.trust["filter"]["motion"][:2], 7.0)
+    stage.trust["filter"]["motion"] = stage.trust["filter"]["published_motion"] = 0.0
+    stage.trust["filter"]["low_passed"] = stage.trust["filter"]["smooth_motion"] = 0.0
+    while stage.time["cycle"] < 1 + SETTLING:
+        assert stage.step()
+        assert stage.stands == (True, False)
+        np.testing.assert_array_equal(stage.pose["twist"], 7.0)
+        np.testing.assert_allclose(stage.pose["position"], stage.home.position, rtol=0.0, atol=1e-15)
+    assert stage.step()
+    assert stage.stands == (True, True)
+    np.testing.assert_array_equal(stage.pose["twist"], stage.trust["twist"])
+    np.testing.assert_array_equal(stage.pose["acceleration"], stage.trust["acceleration"])
+    np.testing.assert_allclose(stage.pose["twist"], 0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("missed", [0, 3, 25])
+def test_leg_filters_that_disagree_for_long_stop_the_filter_missed_periods_counted(hexapod, missed):
+    stage = Stage(hexapod).trusted()
+    stage.state["legs"]["directions"] = stage.directions @ rotation_of([0.0, 0.05, 0.0]).T
+    disagreeing = 0
+    while stage.stands == (True, True):
+        # A lapse that is over in time counts no more.
+        if disagreeing == 0:
+            for _ in range(PATIENCE):
+                assert stage.step() and stage.stands == (True, True)
+            stage.state["legs"]["directions"], kept = stage.directions, stage.state["legs"]["directions"].copy()
+            stage.step()
+            assert stage.trust["disagreeing_for"] == 0
+            stage.state["legs"]["directions"] = kept
+        stage.step(missed=missed)
+        disagreeing += 1 + missed
+        assert stage.trust["disagreeing_for"] == disagreeing
+        assert stage.stands == ((True, True) if disagreeing <= PATIENCE else (False, False))
+    due = int(stage.time["cycle"]) - 1 + SETTLING
+    assert stage.trust["due"] == due
+    stage.state["legs"]["directions"] = stage.directions
+    while stage.time["cycle"] <= due:
+        assert stage.stands == (False, False)
+        assert stage.step()
+    assert stage.stands == (True, False)
+    assert stage.trust["due"] == due + SETTLING
+
+
+def test_the_limit_is_the_root_of_the_mean_square_over_the_legs_that_are_used(hexapod):
+    stage = Stage(hexapod, disagreement=0.02).trusted()
+
+    def agrees(chords):
+        """With leg directions moved by so much across themselves, without a change of their state."""
+        across = np.cross(stage.directions, [0.0, 0.0, 1.0])
+        across *= (np.asarray(chords) / np.linalg.norm(across, axis=1))[:, None]
+        stage.state["legs"]["directions"] = stage.directions + across
+        stage.step()
+        stage.state["legs"]["directions"], found = stage.directions, stage.trust["disagreeing_for"] == 0
+        stage.step()
+        return bool(found)
+
+    assert agrees(np.full(6, 0.0199)) and agrees(np.full(6, -0.0199))
+    assert not agrees(np.full(6, 0.0201)) and not agrees(np.full(6, -0.0201))
+    for leg in (0, 5):
+        alone = np.zeros(6)
+        alone[leg] = 0.0199 * np.sqrt(6.0)
+        assert agrees(alone)
+        alone[leg] = 0.0201 * np.sqrt(6.0)
+        assert not agrees(alone)
+        # Of five legs, the same counts more; and a leg that is not used, not at all.
+        alone[leg] = 0.0199 * np.sqrt(6.0)
+        stage.state["legs"]["used"][3] = 0.0
+        assert not agrees(alone)
+        stage.state["legs"]["used"][[leg, 3]] = 0.0, 1.0
+        assert agrees(100.0 * alone)
+        stage.state["legs"]["used"] = 1.0
+
+
+def test_without_a_pose_in_closed_form_the_trusted_filters_pose_goes_on_and_another_does_not(hexapod):
+    stage = Stage(hexapod)
+    stage.step()
+    assert not stage.step(found=False, closed=np.nan)
+    stage = Stage(hexapod).trusted()
+    stage.trust["blend_offset"] = 0.0
+    for _ in range(2 * PATIENCE):
+        assert stage.step(found=False, closed=np.nan)
+        assert stage.stands == (True, True)
+        np.testing.assert_allclose(stage.pose["position"], stage.home.position, rtol=0.0, atol=1e-6)
+    # A filter that is no longer finite is not trusted either, and what is not finite does not stay in the step.
+    stage.trust["filter"]["published_position"] = np.nan
+    stage.trust["filter"]["position"] = np.nan
+    for _ in range(PATIENCE + 1):
+        stage.step()
+    assert stage.stands == (False, False)
+    np.testing.assert_array_equal(stage.trust["blend_offset"], 0.0)
+    assert stage.step()
+    np.testing.assert_array_equal(stage.pose["position"], stage.home.position)
+
+
+@pytest.mark.parametrize(("missed", "left"), [(0, 0.98), (4, 0.9), (48, 0.02), (49, 0.0), (300, 0.0)])
+def test_what_is_left_of_a_step_fades_over_missed_periods_too(hexapod, missed, left):
+    stage, offset = Stage(hexapod), np.array([1e-3, -2e-3, 3e-3, 0.01, -0.02, 0.03])
+    stage.step()
+    stage.step()
+    stage.trust["blend_offset"] = offset
+    stage.step(missed=missed)
+    np.testing.assert_allclose(stage.trust["blend_offset"], left * offset, rtol=1e-12, atol=1e-18)
+    np.testing.assert_allclose(stage.pose["position"], stage.home.position + left * offset[:3], rtol=0.0, atol=1e-15)
+    turned = rotation_of(left * offset[3:]) @ stage.home.rotation
+    np.testing.assert_allclose(stage.pose["rotation"], turned, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.007])
+def test_samples_and_field_are_older_than_the_cycle_by_the_sensors_delay(hexapod, delay):
+    stage = Stage(hexapod, magnetometer=True, sensor_delay=delay)
+    heading, f = stage.state["heading"], stage.trust["filter"]
+    window = int(stage.parameters["mechanism"]["filter"]["window"])
+    stage.step()
+    for used, fresh in ((0, 1), (1, 0), (1, 1)):
+        heading["used"], heading["fresh"], heading["field"] = used, fresh, [3.0, 4.0, 5.0]
+        f["field"], f["field_time"], f["collected"] = 0.0, -1.0, 0
+        stage.step()
+        now = (stage.time["cycle"] - 1) / RATE_HZ
+        taken = bool(used and fresh)
+        np.testing.assert_array_equal(f["field"], [3.0, 4.0, 5.0] if taken else 0.0)
+        assert f["field_time"] == pytest.approx(now - delay if taken else -1.0, abs=1e-12)
+        assert f["sum_time"] == pytest.approx(now - delay, abs=1e-12)
+    heading["used"] = 0
+    f["collected"] = f["field_used"] = 0
+    first = int(stage.time["cycle"])
+    for _ in range(window):
+        stage.step()
+    # The mean of the window.
+    assert f["time"] == pytest.approx((first + (window - 1) / 2.0) / RATE_HZ - delay, abs=1e-12)
