@@ -1,10 +1,18 @@
 """The data of a calibration: the rests in records."""
 
-import numpy as np
+from types import SimpleNamespace
 
+import numpy as np
+import pytest
+
+from controller.calibration.file import Calibration
+from controller.inverse_kinematics import leg_lengths
+from hil.calibration import data as calibration_data
 from hil.calibration.data import CalibrationData, Knowledge, find_rests, is_long
-from hil.calibration.drive import run_open
+from hil.calibration.drive import _every_cycle, run_open
+from hil.loop.records import RECORD
 from hil.runs.config import SimulationConfig
+from plant.errors import CalibrationError
 from plant.mechanism import load_spatial
 
 
@@ -25,3 +33,142 @@ def test_rests_are_where_nothing_turns():
     rests = find_rests(samples, zero, 1000.0)
     assert rests == [slice(0, 1000), slice(2500, 5000)]
     assert [is_long(rest, 1000.0) for rest in (*rests, slice(0, 800))] == [True, True, False]
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("degrees", "still"), [(0.49, True), (0.51, False)])
+def test_half_a_degree_per_second_of_any_axis_is_a_motion(sign, degrees, still):
+    samples, zero = np.zeros((1050, 3, 7, 3)), np.full((7, 3), 0.2)
+    samples[:, 0] = zero
+    samples[300:600, 0, 6, 2] += sign * np.radians(degrees)
+    # Forces and fields do not count, and what is left of a tenth of a second at the end is no mean.
+    samples[:, 1:] = np.random.default_rng(0).normal(size=(1050, 2, 7, 3))
+    assert find_rests(samples, zero, 1000.0) == ([slice(0, 1000)] if still else [slice(0, 300), slice(600, 1000)])
+
+
+@pytest.mark.parametrize(("samples", "long"), [(450, True), (449, False)])
+def test_a_rest_is_long_from_nine_tenths_of_a_second_on(samples, long):
+    assert is_long(slice(1000, 1000 + samples), 500.0) == long
+
+
+RATE = 500.0
+
+
+def phases(*seconds, turning=0.3):
+    """Records at 500 Hz that rest and turn by turns, beginning at rest; the forces tell the number of the sample."""
+    counts = [round(each * RATE) for each in seconds]
+    records = np.zeros(sum(counts), RECORD)
+    moving = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
+    records["cycle"] = np.arange(len(records))
+    records["angular_velocity"] = 0.05
+    records["angular_velocity"][moving] += turning
+    records["specific_force"] = records["cycle"][:, None, None]
+    records["truth"] = np.arange(len(records))[:, None] + 0.01 * np.arange(19)
+    return records
+
+
+def new_data(**knowledge):
+    data = CalibrationData(load_spatial("hexapod"), "mpu9150", RATE, Knowledge(**knowledge), 3)
+    data.zero[:] = 0.05
+    return data
+
+
+def test_the_first_half_second_of_a_rest_does_not_count():
+    records = phases(2.0, 1.0, 0.8, 1.0, 0.9)
+    assert new_data().rests_in(records) == [slice(250, 1000), slice(2650, 2850)]
+
+
+def test_a_rest_is_the_means_of_its_readings_and_what_was_true_then(monkeypatch):
+    monkeypatch.setattr(calibration_data, "check_all_along", lambda samples, rate: None)
+    monkeypatch.setattr(calibration_data, "check_spread", lambda forces: None)
+    records, random = phases(2.0, 1.0, 1.5), np.random.default_rng(4)
+    for name in ("angular_velocity", "specific_force"):
+        records[name] += 1e-4 * random.normal(size=(1, 7, 3))
+    data = new_data(lengths=True)
+    data.add_rests(records)
+    assert data.readings.shape == (2, 7, 6)
+    for rest, found, true in zip((slice(250, 1000), slice(1750, 2250)), data.readings, data.truth, strict=True):
+        np.testing.assert_allclose(found[:, :3], records["angular_velocity"][rest].mean(axis=0), rtol=1e-12)
+        np.testing.assert_allclose(found[:, 3:], records["specific_force"][rest].mean(axis=0), rtol=1e-12)
+        np.testing.assert_allclose(true, records["truth"][rest].mean(axis=0)[:7], rtol=1e-12)
+    # The lengths that a rig measures have a noise of 50 um, and count from the first rest on.
+    changes = data.rests.length_changes
+    noise = changes[1] - (1999.5 - 624.5)
+    assert (changes[0] == 0.0).all() and 1e-6 < np.abs(noise).max() < 5.0 * np.sqrt(2.0) * 5e-5
+    assert new_data().rests.length_changes is None
+    records["truth"] = np.nan
+    data.add_rests(records)
+    with pytest.raises(CalibrationError, match="leave out --lengths"):
+        _ = data.rests
+
+
+@pytest.mark.parametrize(("kept", "home"), [([0, 2, 3], True), ([1, 3], False), (None, True)])
+def test_parts_of_the_rests_count_from_their_own_first(monkeypatch, kept, home):
+    monkeypatch.setattr(calibration_data, "check_spread", lambda forces: None)
+    monkeypatch.setattr(calibration_data, "calibrate_at_rest", lambda mechanism, rests, prior: rests)
+    data = new_data(lengths=True, home=True)
+    data.readings = np.random.default_rng(0).normal(size=(4, 7, 6))
+    data._lengths = np.random.default_rng(1).normal(size=(4, 6))
+    rests = data.at_rest(None if kept is None else np.array(kept))
+    chosen = kept or [0, 1, 2, 3]
+    assert rests.home == home
+    np.testing.assert_array_equal(rests.readings, data.readings[chosen])
+    np.testing.assert_allclose(rests.length_changes, data._lengths[chosen] - data._lengths[chosen[0]], atol=1e-15)
+
+
+def longest(monkeypatch, data, runs, calibration):
+    """What `longest_motion` returns, and the forces at which it fits the pose."""
+    fitted = []
+    monkeypatch.setattr(calibration_data, "check_all_along", lambda samples, rate: None)
+    monkeypatch.setattr(
+        calibration_data, "fit_pose", lambda geometry, forces, home: fitted.append(forces) or (np.ones(3), np.eye(3))
+    )
+    samples, (pose, twist) = data.longest_motion(runs, SimpleNamespace(calibration=lambda: calibration))
+    assert (pose.position == 1.0).all() and (twist == 0.0).all() and twist.shape == (6,)
+    return samples, fitted[0]
+
+
+def test_the_longest_motion_begins_with_the_last_tenth_of_its_rest(monkeypatch):
+    runs = [phases(1.0, 12.0, 5.0), phases(2.0, 3.0, 1.6, 14.0, 1.0, 2.0), phases(1.0, 13.0)]
+    calibration = Calibration()
+    calibration.offset[1] = 0.25
+    samples, forces = longest(monkeypatch, new_data(), runs, calibration)
+    # It begins at 6.6 s, and the pose is that of the half second before its last tenth at rest.
+    first = round(6.5 * RATE)
+    assert samples[0, 1, 0, 0] == first and samples[-1, 1, 0, 0] == round(20.6 * RATE) - 1
+    assert (np.diff(samples[:, 1, 3, 1]) == 1.0).all()
+    np.testing.assert_allclose(forces, np.arange(first - 250, first).mean() + 0.25)
+
+
+@pytest.mark.parametrize(("seconds", "said"), [(9.8, "at rest lasts 9.8 s; at least 10 s are needed"), (10.0, "")])
+def test_a_motion_of_ten_seconds_is_long_enough(monkeypatch, seconds, said):
+    runs = [phases(1.0, seconds, 1.0, 4.0)]
+    if said:
+        with pytest.raises(CalibrationError, match=said):
+            longest(monkeypatch, new_data(), runs, Calibration())
+    else:
+        assert len(longest(monkeypatch, new_data(), runs, Calibration())[0]) == 5050
+
+
+def test_the_planned_poses_are_those_of_the_planned_lengths(hexapod):
+    random = np.random.default_rng(2)
+    positions = hexapod.home.position + random.uniform(-0.02, 0.02, (5, 3))
+    found = new_data().planned_poses(leg_lengths(hexapod, positions, np.tile(hexapod.home.rotation, (5, 1, 1))))
+    np.testing.assert_allclose(found[0], positions, atol=1e-9)
+    np.testing.assert_allclose(found[1], np.tile(hexapod.home.rotation, (5, 1, 1)), atol=1e-8)
+
+
+def test_the_gyroscopes_are_zeroed_while_the_brakes_hold():
+    records = phases(1.0, 2.0)
+    records["angular_velocity"] += np.random.default_rng(0).normal(size=(7, 3))
+    records["specific_force"] = 9.81 * np.array([0.0, 0.0, 1.0])
+    data = new_data()
+    data.begin(records, 400)
+    np.testing.assert_allclose(data.zero, records["angular_velocity"][0], rtol=1e-12)
+    assert len(data.readings) == 0
+
+
+def test_the_record_before_stands_for_a_missed_one():
+    records = np.zeros(4, RECORD)
+    records["cycle"], records["missed"] = [0, 1, 4, 5], [0, 0, 2, 0]
+    assert _every_cycle(records)["cycle"].tolist() == [0, 1, 1, 1, 4, 5]
