@@ -19,6 +19,19 @@ def test_the_terminal_shows_the_text_as_it_is(capsys):
     assert lines[3] == " estimate [a]                 0.1                22.5   a|b "
 
 
+def test_columns_are_aligned_as_they_say_and_an_alarm_is_bold_and_red():
+    rich = table().rich()
+    assert [column.justify for column in rich.columns] == ["left", "right", "right", "left"]
+    assert [column.justify for column in Table("a", "b").rich().columns] == ["left", "right"]
+    styles = [[str(cell.style) for cell in column.cells] for column in rich.columns]
+    assert styles == [[""], [""], ["bold red"], [""]]
+
+
+def test_a_table_can_be_printed_in_markdown(capsys):
+    table().print(markdown=True)
+    assert capsys.readouterr().out == table().markdown() + "\n"
+
+
 def test_markdown_escapes_bars():
     assert table().markdown().splitlines() == [
         "|  | position [mm] RMS | position [mm] max | why |",

@@ -484,7 +484,13 @@ def test_a_replay_on_the_clock(recorded, tmp_path):
     # A period that is missed now leads to other estimates. On a busy machine one may be missed early: try again.
     for number in range(10):
         file = tmp_path / f"again-{number}.mcap"
-        summary = run(config, SETTINGS, file)
+        try:
+            summary = run(config, SETTINGS, file)
+        except RunStoppedError:
+            # After a missed period the recorded drives may not do what is asked of them now; nothing else excuses a stop.
+            assert read(file).records["missed"].any()
+            upto = 0
+            continue
         assert summary["cause"] == "end of the motion"
         assert summary["identity"]["parts"]["rig"] == "udp"
         again = read(file).records

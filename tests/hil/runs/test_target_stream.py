@@ -12,14 +12,27 @@ import pytest
 
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.segments import evaluate_reference
-from controller.planning.stream import CAUSE, END_PLANNER, STREAM, STREAM_READER, TAKEN, rest, stream_cause, take_plan
-from controller.planning.stream_planner import StreamPlanner
+from controller.planning.stream import (
+    CAUSE,
+    CYCLE,
+    END_PLANNER,
+    SAMPLE_NS,
+    SEEN,
+    STREAM,
+    STREAM_READER,
+    TAKEN,
+    rest,
+    stream_cause,
+    take_plan,
+)
+from controller.planning.stream_planner import Plan, StreamPlanner
 from controller.planning.target import load_target
 from controller.safety.causes import Cause
 from hil.loop.records import shared_array
 from hil.runs.target_stream import (
     TARGET_DATAGRAM,
     Faults,
+    Reception,
     StreamError,
     decode,
     encode,
@@ -201,6 +214,101 @@ def test_a_datagram_is_what_was_packed():
     for version in (0, 2):
         body = datagram[:4] + struct.pack("<H", version) + datagram[6:-4]
         assert decode(body + struct.pack("<I", zlib.crc32(body))) is None
+
+
+# ---------------------------------------------------------------------------------------------------- a receiver, in memory
+
+
+class Planner:
+    """A planner that keeps what it is asked, and whose plans stay where they are."""
+
+    def __init__(self):
+        self.samples, self.asked, self.followed = [], [], []
+        self.current = Plan(0.0, np.zeros((6, 24, 5)), None)
+
+    def add(self, at, displacement, quaternion):
+        self.samples.append(at)
+
+    def plan(self, begin, at):
+        self.asked.append((begin, at))
+        return Plan(begin, np.zeros((6, 24, 5)), None)
+
+    def follow(self, plan):
+        self.followed.append(plan.begin)
+        self.current = plan
+
+
+def sent(reception, number, time_s):
+    reception.take(encode(number, round(1e9 * time_s), HERE, LEVEL), "here")
+
+
+@pytest.mark.parametrize(("period", "lead"), [(1e-3, 10), (2.5e-4, 40), (3e-3, 4)])
+def test_a_plan_begins_ten_milliseconds_ahead_for_the_time_of_the_newest_sample(period, lead):
+    stream, planner = np.zeros((), STREAM), Planner()
+    reception = Reception(stream, planner, period)
+    reception.plan()
+    assert planner.asked == []
+    sent(reception, 3, 50.0)
+    stream["shared"][CYCLE] = 100
+    sent(reception, 4, 50.04)
+    reception.plan()
+    # The sender's clock counts from its first sample. The loop's was at 0, then at 100 cycles, 40 ms after that: on average.
+    assert planner.samples == pytest.approx([0.0, 0.04])
+    begin = (100 + lead) * period
+    assert planner.asked[0] == pytest.approx((begin, begin - (0.04 + (100 * period - 0.04) / 2)))
+    assert reception.waits and stream["planned"] == 1 and stream["shared"][SAMPLE_NS] > 0
+    np.testing.assert_allclose(stream["begins"].max(), begin)
+
+
+@pytest.mark.parametrize(("delayed", "off"), [(7, 0.0), (8, 0.04)])
+def test_the_clocks_are_compared_by_the_median_of_the_last_fifteen_samples(delayed, off):
+    stream, planner = np.zeros((), STREAM), Planner()
+    reception = Reception(stream, planner, 1e-3)
+    for number in range(25):
+        sent(reception, number, 7.0 + 0.01 * number)
+        # The next one comes in time, or 40 ms late as so many of the last fifteen do; the first ten were half a second late.
+        late = 500 if number < 9 else 40 if number < 9 + delayed else 0
+        stream["shared"][CYCLE] = 10 * (number + 1) + late
+    reception.plan()
+    begin, at = planner.asked[0]
+    assert begin == pytest.approx(0.260)
+    assert at == pytest.approx(begin - (0.24 + off))
+
+
+@pytest.mark.parametrize("taken", [True, False])
+def test_the_loops_decision_on_a_plan_comes_before_the_next_one(taken):
+    stream, planner = np.zeros((), STREAM), Planner()
+    reception = Reception(stream, planner, 1e-3)
+    sent(reception, 0, 1.0)
+    reception.plan()
+    sent(reception, 1, 1.01)
+    reception.plan()
+    assert len(planner.asked) == 1 and planner.followed == []
+    stream["shared"][SEEN], stream["shared"][CYCLE] = 1, 5
+    stream["shared"][TAKEN] = 1 if taken else 0
+    reception.plan()
+    assert planner.followed == ([0.01] if taken else []) and stream["late"] == (0 if taken else 1)
+    assert len(planner.asked) == 2 and stream["bases"].max() == (1 if taken else 0)
+    # No plan begins before the one that is followed.
+    assert planner.asked[1][0] == pytest.approx(0.015)
+    stream["shared"][[SEEN, TAKEN]] = 2
+    planner.current = Plan(0.5, np.zeros((6, 24, 5)), None)
+    reception.plan()
+    assert len(planner.asked) == 2 and not reception.waits
+    planner.current = Plan(0.5, np.zeros((6, 24, 5)), None)
+    sent(reception, 2, 1.02)
+    reception.plan()
+    assert planner.asked[2][0] == 0.5
+
+
+def test_a_stream_that_has_failed_takes_and_plans_no_more():
+    stream, planner = np.zeros((), STREAM), Planner()
+    reception = Reception(stream, planner, 1e-3)
+    sent(reception, 0, 1.0)
+    stream["shared"][CAUSE] = Cause.TARGET_JUMPS
+    reception.plan()
+    sent(reception, 1, 1.01)
+    assert planner.asked == [] and stream["accepted"] == 1 and len(planner.samples) == 1
 
 
 def test_an_address_that_is_not_to_be_had_is_refused(hexapod):
