@@ -9,13 +9,16 @@ import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from plant.dynamics.variables import BRAKE, VELOCITY
+from plant.dynamics.variables import BRAKE, PLANAR, SPATIAL, VELOCITY
 from plant.errors import FmuError, InputError, UnknownNameError
+from plant.fmu.binding import SIGNAL_UNITS, UNITS, Binding, SignalBinding, bind, load_binding
 from plant.fmu.calls import MOST_CHANGES, advance, read_imus, read_truth, write_command, write_drive_mode, write_drive_modes
+from plant.fmu.description_reader import FmuVariable
 from plant.fmu.plant import FmuPlant
 from plant.fmu.settings import Setting
 from plant.pose import Array
@@ -424,3 +427,204 @@ def test_the_next_to_load_removes_what_a_killed_process_has_left(foreign_fmu: Pa
         assert list(temporary.iterdir()) == [kept]
         alive.communicate("")
     assert list(temporary.iterdir()) == []
+
+
+# ---- matched without an FMU ----
+
+
+class Described(dict[str, FmuVariable]):
+    """What `bind` needs of a description."""
+
+    path = Path("any.fmu")
+
+    def __missing__(self, name: str) -> FmuVariable:
+        raise UnknownNameError(f"any.fmu has no variable {name!r}")
+
+
+def described(*variables: FmuVariable) -> Any:
+    return Described({each.name: each for each in variables})
+
+
+def variable(
+    name: str, size: int, first: int, causality: str = "output", unit: str | None = None, type_: str = "Float64"
+) -> FmuVariable:
+    """A variable with consecutive references from `first` on."""
+    limits = ((-np.inf, np.inf),) * size
+    dtype = {"Float64": "float64", "Int32": "int32", "Boolean": "bool"}[type_]
+    references = tuple(range(first, first + size))
+    return FmuVariable(name, (size,), type_, causality, "continuous", unit, limits, True, references, type_, np.dtype(dtype))
+
+
+def plant_of(legs: int) -> list[FmuVariable]:
+    """The least that a plant needs, in odd units."""
+    return [
+        variable("u", legs, 100, "input", "mm/s"),
+        variable("gyro", 3 * (legs + 1), 200, unit="deg/s"),
+        variable("acc", 3 * (legs + 1), 300),
+    ]
+
+
+LEAST = {
+    "velocity_command": SignalBinding(("u",)),
+    "imu_angular_velocity": SignalBinding(("gyro",)),
+    "imu_specific_force": SignalBinding(("acc",), unit="g"),
+}
+
+HAND_COMPUTED = {
+    "m": {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "um": 0.000001, "in": 0.0254},
+    "m/s": {
+        "m/s": 1.0, "cm/s": 0.01, "mm/s": 0.001, "um/s": 0.000001, "m/min": 1.0 / 60.0, "mm/min": 1.0 / 60000.0, "in/s": 0.0254
+    },
+    "m/s2": {"m/s2": 1.0, "m/s^2": 1.0, "mm/s2": 0.001, "mm/s^2": 0.001, "g": 9.80665, "mg": 0.00980665},
+    "rad": {"rad": 1.0, "mrad": 0.001, "deg": 0.017453292519943295},
+    "rad/s": {
+        "rad/s": 1.0, "mrad/s": 0.001, "deg/s": 0.017453292519943295, "rpm": 0.10471975511965977, "1/min": 0.10471975511965977
+    },
+    "uT": {"uT": 1.0, "nT": 0.001, "mT": 1000.0, "T": 1000000.0, "G": 100.0, "mG": 0.1},
+    "A": {"A": 1.0, "mA": 0.001},
+    "kg": {"kg": 1.0, "g": 0.001, "t": 1000.0},
+    "1": {"1": 1.0, "": 1.0},
+}  # fmt: skip
+
+
+def test_every_unit_is_worth_what_it_is() -> None:
+    assert {kind: set(units) for kind, units in UNITS.items()} == {kind: set(units) for kind, units in HAND_COMPUTED.items()}
+    for kind, units in HAND_COMPUTED.items():
+        for unit, worth in units.items():
+            assert UNITS[kind][unit] == pytest.approx(worth, rel=1e-15), (kind, unit)
+    own = [each for table in (SPATIAL, PLANAR) for each in (*table.inputs, *table.parameters, *table.outputs)]
+    for name, kind in SIGNAL_UNITS.items():
+        assert {each.unit for each in own if each.name == name} == {kind}
+
+
+@pytest.mark.parametrize("legs", [6, 3])
+def test_readings_go_to_their_place_with_unit_sign_and_offset_of_each_axis(legs: int) -> None:
+    """One variable for all gyroscopes, and one for each accelerometer, of which two declare units of their own."""
+    imus = [*range(legs), 6]
+    each = [variable(f"acc{k}", 3, 300 + 10 * k, unit={0: "m/s2", 1: "mm/s2"}.get(k)) for k in range(legs + 1)]
+    order = tuple(reversed(imus))
+    signals = {
+        "velocity_command": SignalBinding(("u",), sign=(-1.0,), offset=(0.25,)),
+        "imu_angular_velocity": SignalBinding(("gyro",), sign=(1.0, -1.0, 1.0), offset=(0.1, 0.2, 0.3)),
+        "imu_specific_force": SignalBinding(tuple(v.name for v in each), imus=order),
+        "imu_magnetic_field": SignalBinding(("field",), unit="G", imus=(6, 1)),
+    }
+    bound = bind(Binding("", signals), described(*plant_of(legs)[:2], *each, variable("field", 6, 400)))
+    assert (bound.legs, bound.imus, bound.magnetometers) == (legs, tuple(imus), (1, 6))
+    assert bound.driven == {f"u[{k}]" for k in range(1, legs + 1)} and not bound.knows_pose
+    np.testing.assert_array_equal(bound.commanded.places, range(legs))
+    np.testing.assert_allclose(bound.commanded.factors, [-1e-3] * legs, rtol=1e-15)
+    np.testing.assert_array_equal(bound.commanded.offsets, [0.25] * legs)
+
+    raw = dict(zip(range(200, 500), np.random.default_rng(0).normal(size=300), strict=True))
+    read = np.full((3, 7, 3), np.nan)
+    scalars = bound.sensed
+    for place, reference, factor, offset in zip(
+        scalars.places, scalars.references, scalars.factors, scalars.offsets, strict=True
+    ):
+        read.reshape(-1)[place] = factor * raw[int(reference)] + offset
+    expected = np.full((3, 7, 3), np.nan)
+    for row, imu in enumerate(imus):
+        for axis in range(3):
+            sign, offset = ((1.0, 0.1), (-1.0, 0.2), (1.0, 0.3))[axis]
+            expected[0, imu, axis] = sign * np.pi / 180.0 * raw[200 + 3 * row + axis] + offset
+    for k, imu in enumerate(order):
+        expected[1, imu] = [{1: 1e-3}.get(k, 1.0) * raw[300 + 10 * k + axis] for axis in range(3)]
+    for row, imu in enumerate((6, 1)):
+        expected[2, imu] = [100.0 * raw[400 + 3 * row + axis] for axis in range(3)]
+    np.testing.assert_allclose(read, expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("legs", [6, 3])
+def test_the_truth_of_either_plant_goes_to_its_place(legs: int) -> None:
+    spatial = legs == 6
+    attitude = "quaternion" if spatial else "angle"
+    signals = LEAST | {
+        "position": SignalBinding(("p",), unit="mm"),
+        attitude: SignalBinding(("turn",)),
+        "leg_length": SignalBinding(("l",), sign=(-1.0,), offset=tuple(0.1 * k for k in range(legs))),
+        "current": SignalBinding(("i",)),
+        "payload.mass": SignalBinding(("load",), unit="g"),
+    }
+    truth = [
+        variable("p", 3 if spatial else 2, 10), variable("turn", 4 if spatial else 1, 20, unit=None if spatial else "deg"),
+        variable("l", legs, 30, unit="cm"), variable("i", legs, 40, unit="mA"), variable("load", 1, 50, "input"),
+    ]  # fmt: skip
+    bound = bind(Binding("", signals), described(*plant_of(legs), *truth))
+    assert (bound.knows_pose, bound.planar_angle) == (True, not spatial)
+    found = {
+        int(reference): (int(place), factor, offset)
+        for place, reference, factor, offset in zip(
+            bound.known.places, bound.known.references, bound.known.factors, bound.known.offsets, strict=True
+        )
+    }
+    expected: dict[int, tuple[int, float, float]] = {10 + k: (k, 1e-3, 0.0) for k in range(3 if spatial else 2)}
+    expected |= {20 + k: (3 + k, 1.0 if spatial else np.pi / 180.0, 0.0) for k in range(4 if spatial else 1)}
+    expected |= {30 + k: (7 + k, -1e-2, 0.1 * k) for k in range(legs)}
+    expected |= {40 + k: (13 + k, 1e-3, 0.0) for k in range(legs)}
+    assert found == {key: pytest.approx(value) for key, value in expected.items()}
+    assert bound.loaded.places.tolist() == [0] and bound.loaded.factors.tolist() == [1e-3]
+    assert bound.loaded.references.tolist() == [50]
+
+
+@pytest.mark.parametrize(
+    ("type_", "told", "values"),
+    [
+        ("Int32", (None, None, None), [0.0, 1.0, 2.0]),
+        ("Boolean", (None, None, None), [0.0, 0.0, 1.0]),
+        ("Int32", (None, 5.0, 7.0), [5.0, 5.0, 7.0]),
+        ("Int32", (3.0, 5.0, None), [3.0, 5.0, 2.0]),
+        ("Int32", (None, None, 9.0), [0.0, 1.0, 9.0]),
+        ("Boolean", (None, 1.0, 0.0), [1.0, 1.0, 0.0]),
+    ],
+)
+@pytest.mark.parametrize("common", [True, False])
+def test_a_drive_that_has_no_open_mode_is_braked_instead(
+    type_: str, told: tuple[float | None, ...], values: list[float], common: bool
+) -> None:
+    modes = variable("m", 1 if common else 6, 60, "input", type_=type_)
+    bound = bind(Binding("", LEAST | {"drive_mode": SignalBinding(("m",), modes=told)}), described(*plant_of(6), modes))
+    np.testing.assert_array_equal(bound.modes.values, values)
+    assert bound.modes.common == common and bound.modes.variable is modes
+    np.testing.assert_array_equal(bound.modes.references, modes.references)
+    assert {each for each in bound.driven if each[0] == "m"} == set(modes.element_names)
+
+
+@pytest.mark.parametrize(
+    ("legs", "changes", "message"),
+    [
+        (3, {"imu_specific_force": SignalBinding(("acc",), imus=(0, 1, 2, 3))}, "there is no imu 3 on 3 legs; there are"),
+        (6, {"imu_specific_force": SignalBinding(("acc3",), imus=(0,))}, "imu_specific_force are of different imus"),
+        (6, {"angle": SignalBinding(("acc3",))}, "angle: only a planar plant, with three commands, has one"),
+        (6, {"imu_angular_velocity": SignalBinding(("gyro",), sign=(1.0, -1.0))}, "sign has 2 numbers and must have 1, 3"),
+        (6, {"velocity_command": SignalBinding(("u",), offset=(1.0, 2.0, 3.0))}, "offset has 3 numbers and must have 1 or 6"),
+        (6, {"drive_mode": SignalBinding(("acc3",))}, "drive_mode: acc3 is of causality output and must be input"),
+        (6, {"drive_mode": SignalBinding(("m2",))}, "drive_mode: m2 together have 2 elements and must have 1, or 6"),
+        (6, {"drive_mode": SignalBinding(("m2", "n4"))}, "drive_mode: m2, n4 are of different types and must be of one"),
+        (6, {"payload.mass": SignalBinding(("u",))}, "velocity_command and payload.mass: u.* must be bound once"),
+    ],
+)  # fmt: skip
+def test_what_no_plant_has_is_refused(legs: int, changes: dict[str, SignalBinding], message: str) -> None:
+    others = [variable("acc3", 3, 500), variable("m2", 2, 510, "input", type_="Int32"),
+        variable("n4", 4, 520, "input", type_="Boolean")]  # fmt: skip
+    with pytest.raises(FmuError, match=message):
+        bind(Binding("", LEAST | changes), described(*plant_of(legs), *others))
+
+
+def test_a_binding_that_names_no_signal_is_our_own_with_its_step_and_start(tmp_path: Path) -> None:
+    path = tmp_path / "step.toml"
+    path.write_text("[fmu]\nstep = 0.00025\n[start]\n'payload.mass' = 4.0\n")
+    found = load_binding(path)
+    assert (found.step, found.native, found.start, found.source) == (0.00025, True, {"payload.mass": 4.0}, "step.toml")
+    assert set(found.signals) == set(SIGNAL_UNITS) and found.problems == ()
+    path.write_text("[current]\nvariables = 'i'\nunit = 'mA'\nsign = -1\noffset = [0.5, 1]\n")
+    found = load_binding(path)
+    assert (found.step, found.native, dict(found.start)) == (None, False, {})
+    assert dict(found.signals) == {"current": SignalBinding(("i",), "mA", (-1.0,), (0.5, 1.0))}
+
+
+@pytest.mark.parametrize(("step", "good"), [("0.000001", True), ("0.0000009", False), ("-0.001", False), ("true", False)])
+def test_a_step_is_at_least_a_microsecond(tmp_path: Path, step: str, good: bool) -> None:
+    path = tmp_path / "step.toml"
+    path.write_text(f"[fmu]\nstep = {step}\n")
+    assert (load_binding(path).problems == ()) == good

@@ -8,6 +8,7 @@ import sys
 import tempfile
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ import pytest
 
 from plant.dynamics.variables import BRAKE, OPEN, SPATIAL, VELOCITY
 from plant.errors import FmuError, InputError, UnknownNameError
-from plant.fmu.build import PLANAR_MODEL, default_fmu
+from plant.fmu.binding import OWN_BINDING
+from plant.fmu.build import PLANAR_MODEL, SPATIAL_MODEL, Model, default_fmu
 from plant.fmu.calls import advance, read_imus, read_truth, write_command, write_drive_mode, write_drive_modes
 from plant.fmu.instance import FmuInstance
 from plant.fmu.plant import FmuPlant
@@ -562,3 +564,111 @@ def test_a_state_of_another_build_is_refused(make_plant: MakePlant) -> None:
     ):
         with pytest.raises(FmuError, match=f"gough_plant.fmu: restoring a state failed: .*{message}"):
             plant.restore(clock + broken)
+
+
+# ---- what the loop asks besides ----
+
+
+def test_a_plant_of_another_number_of_legs_is_refused(hexapod: Mechanism, fmu_path: Path) -> None:
+    with pytest.raises(InputError, match=r"gough_plant\.fmu has 6 legs, and the mechanism has 3: choose another one"):
+        FmuPlant(fmu_path, {}, 1e-3, legs=3)
+    FmuPlant(fmu_path, {}, 1e-3, legs=6).close()
+
+
+def test_settings_at_one_time_come_in_the_order_of_the_user_and_at_zero_before_the_first_step(fmu_path: Path) -> None:
+    texts = ("payload.mass=9@0.002", "payload.mass=7@0.002", "payload.mass=5@0", "payload.mass=4", "friction.coulomb=2@0.001")
+    with FmuPlant(fmu_path, {}, 1e-3, settings=[Setting.parse(text) for text in texts]) as plant:
+        assert plant.get("payload.mass") == 4.0
+        seen = []
+        for _ in range(4):
+            plant.step(1e-3)
+            seen.append((float(plant.get("payload.mass")), *set(plant.get("friction.coulomb").tolist())))
+        assert seen == [(5.0, 15.0), (5.0, 2.0), (7.0, 2.0), (7.0, 2.0)]
+
+
+def test_a_setting_during_the_run_may_be_an_end_of_its_range(fmu_path: Path) -> None:
+    FmuPlant(fmu_path, {}, 1e-3, settings=[Setting.parse("payload.mass=0@1"), Setting.parse("payload.mass=1e6@2")]).close()
+    for text, message in (
+        ("payload.mass=-0.1@1", "payload.mass of gough_plant.fmu would be -0.1; it must be from 0 to 1e+06"),
+        ("gravity=0,0,2000@1", "gravity[3] of gough_plant.fmu would be 2000; it must be from -1000 to 1000"),
+    ):
+        with pytest.raises(InputError, match=re.escape(message)):
+            FmuPlant(fmu_path, {}, 1e-3, settings=[Setting.parse(text)])
+
+
+@pytest.mark.parametrize(
+    ("step", "said"),
+    [
+        (0.003, "fixed.fmu cannot take a step of 0.003 s: its own is fixed at 0.002 s; set [fmu] step to that"),
+        (0.001, "fixed.fmu cannot take a step of 0.001 s"),
+        (0.005, "fixed.fmu cannot take a rate of 83.3333 Hz: its binding sets a step of 0.005 s, so the rate must be 200 Hz"),
+        (0.024, "fixed.fmu cannot take a rate of 83.3333 Hz: its binding sets a step of 0.024 s"),
+        (0.004, ""),
+        (0.012, ""),
+    ],
+)
+def test_a_step_of_the_binding_divides_the_period_and_is_a_multiple_of_the_fmus(
+    hexapod: Mechanism, fixed_step: Path, step: float, said: str
+) -> None:
+    binding = replace(OWN_BINDING, step=step)
+    if said:
+        with pytest.raises(InputError, match=re.escape(said)):
+            FmuPlant(fixed_step, hexapod.plant_parameters(), 0.012, binding)
+    else:
+        with FmuPlant(fixed_step, hexapod.plant_parameters(), 0.012, binding) as plant:
+            plant.step(0.012)
+            assert plant.handle["length"] == pytest.approx(step) and plant.get("time") == pytest.approx(0.012)
+
+
+@pytest.mark.parametrize("model", [SPATIAL_MODEL, PLANAR_MODEL], ids=lambda model: model.identifier)
+def test_a_linear_plant_goes_as_the_plant_does_nearby(model: Model) -> None:
+    """Its four matrices against differences of the plant's own outputs and rates, at a lively moment."""
+    with FmuPlant(default_fmu(model), {}, 1e-3) as plant:
+        legs = plant.bound.legs
+        plant.set("drive_mode", np.full(legs, VELOCITY))
+        plant.set("velocity_command", 0.02 * np.arange(1, legs + 1) / legs)
+        plant.step(0.02)
+        inputs, outputs = ["external_wrench.force", "velocity_command"], ["leg_velocity", "position", "voltage"]
+        linear = plant.linearize(inputs, outputs)
+        sizes = {"n": len(linear.states), "m": len(linear.inputs), "p": len(linear.outputs)}
+        assert (linear.a.shape, linear.b.shape) == ((sizes["n"], sizes["n"]), (sizes["n"], sizes["m"]))
+        assert (linear.c.shape, linear.d.shape) == ((sizes["p"], sizes["n"]), (sizes["p"], sizes["m"]))
+        assert linear.inputs[0] == "external_wrench.force[1]" and linear.inputs[-1] == f"velocity_command[{legs}]"
+        assert linear.outputs[:2] == ("leg_velocity[1]", "leg_velocity[2]") and linear.states[0] == "state.position[1]"
+
+        rates = [rate.name for _, rate in plant.description.states]
+
+        def values(names: list[str]) -> Array:
+            return np.concatenate([plant.get(name).ravel() for name in names])
+
+        column = 0
+        for name in inputs:
+            middle = plant.get(name)
+            for i in range(middle.size):
+                ends = []
+                for sign in (1.0, -1.0):
+                    plant.set(name, middle + sign * 1e-4 * np.eye(middle.size)[i])
+                    ends.append((values(rates), values(outputs)))
+                plant.set(name, middle)
+                for matrix, one, other in zip((linear.b, linear.d), *ends, strict=True):
+                    difference = (one - other) / 2e-4
+                    np.testing.assert_allclose(matrix[:, column], difference, rtol=1e-5, atol=1e-6 * np.abs(matrix).max())
+                column += 1
+        assert column == sizes["m"]
+        # A position is a state itself, and its rate is a velocity.
+        place = linear.states.index("state.velocity[1]")
+        np.testing.assert_array_equal(linear.a[0], np.eye(sizes["n"])[place])
+        np.testing.assert_array_equal(linear.c[linear.outputs.index("position[1]")], np.eye(sizes["n"])[0])
+
+
+def test_a_plant_without_derivatives_or_states_is_not_linearised(fmu_path: Path, tmp_path: Path, make_plant: MakePlant) -> None:
+    changes = {'providesDirectionalDerivatives="true"': ""}
+    with (
+        FmuPlant(copy_of(fmu_path, tmp_path / "stiff.fmu", changes), {}, 1e-3) as plant,
+        pytest.raises(FmuError, match=r"stiff\.fmu has no directional derivatives: export it with them"),
+    ):
+        plant.linearize(["velocity_command"], ["leg_length"])
+    with pytest.raises(InputError, match=r"drive_mode of gough_plant\.fmu is of type Enumeration and has no derivatives"):
+        make_plant().linearize(["drive_mode"], ["leg_length"])
+    with pytest.raises(UnknownNameError, match="no variable 'lengths'"):
+        make_plant().linearize(["velocity_command"], ["lengths"])
