@@ -5,16 +5,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller.calibration.at_rest import Prior, Rests, calibrate_at_rest, expected_forces, fit_pose, undo
+from controller.calibration.at_rest import (
+    Prior,
+    Rests,
+    calibrate_at_rest,
+    expected_forces,
+    fit_pose,
+    pose_covariance,
+    undo,
+)
 from controller.calibration.file import Calibration
-from controller.estimation.whole_mechanism.imu_errors import ERRORS, error_matrix
+from controller.estimation.whole_mechanism.imu_errors import ALIGNMENT, ERROR_NAMES, ERRORS, error_matrix
 from controller.inverse_kinematics import leg_lengths, sample_workspace
 from controller.rig import sensor_geometry
 from plant.errors import CalibrationError
 from plant.imu import load_imu
 from plant.mechanism import Mechanism, load_spatial
 from tests.controller.calibration.rest_readings import pose_errors, rests_of
-from tests.controller.leg_geometry import rotation_of
+from tests.controller.leg_geometry import rotation_of, static_signals
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
@@ -95,3 +103,111 @@ def test_too_few_rests_are_refused(hexapod):
     readings, _, _ = rests_of(hexapod, 4, 0)
     with pytest.raises(CalibrationError, match="4 poses at rest do not determine the IMUs' errors; at least 5 do, 20 are good"):
         calibrate_at_rest(hexapod, Rests(readings))
+
+
+def test_the_mounting_of_the_magnetometers_is_undone_as_that_of_the_accelerometers():
+    errors = np.zeros((7, ERRORS))
+    errors[:, ALIGNMENT : ALIGNMENT + 3] = np.random.default_rng(1).normal(0.0, 0.01, (7, 3))
+    gain, offset = undo(errors)
+    for k in range(7):
+        np.testing.assert_allclose(gain[2, k], rotation_of(errors[k, ALIGNMENT : ALIGNMENT + 3]), rtol=0.0, atol=1e-15)
+        np.testing.assert_allclose(gain[2, k], gain[1, k], rtol=0.0, atol=1e-5)
+    assert not offset[2].any()
+
+
+def test_the_prior_is_in_the_order_of_the_errors():
+    prior = Prior(
+        gyroscope_bias=1.0, accelerometer_bias=2.0, accelerometer_scale=3.0, gyroscope_scale=4.0, alignment=5.0, axes=6.0,
+        tilt=7.0, joints=8.0,
+    )  # fmt: skip
+    of_names = {
+        "gyroscope bias": 1.0, "accelerometer bias": 2.0, "accelerometer scale": 3.0, "gyroscope scale": 4.0, "alignment": 5.0,
+        "accelerometer axes": 6.0, "gyroscope axes": 6.0,
+    }  # fmt: skip
+    expected = [of_names[name] for _ in range(7) for name in ERROR_NAMES for _ in range(3)]
+    assert prior.error_sigmas().tolist() == expected
+    assert prior.sigmas().tolist() == expected + [8.0] * 36 + [7.0] * 2
+    # Joints that count as exact still have a variance.
+    assert (Prior().sigmas()[147:183] == 1e-8).all()
+
+
+def exact_rests(mechanism, errors, poses):
+    """Readings (N, 7, 6) at rest, without noise, of IMUs with these errors (7, 21)."""
+    readings = np.zeros((len(poses[0]), 7, 6))
+    for n, (position, rotation) in enumerate(zip(*poses, strict=True)):
+        ideal = static_signals(mechanism, position, rotation)
+        for k, sensor in np.ndindex(7, 2):
+            part = slice(3 * sensor, 3 * sensor + 3)
+            readings[n, k, part] = error_matrix(errors[k], sensor) @ ideal[sensor, k] + errors[k, part]
+    return readings
+
+
+@pytest.fixture(scope="module")
+def skewed(hexapod):
+    """Rests of IMUs with errors that let the poses seem centimetres off; the first at home."""
+    poses = sample_workspace(hexapod, 8, seed=11)
+    poses[0][0], poses[1][0] = hexapod.home.position, hexapod.home.rotation
+    errors = np.random.default_rng(5).normal(size=(7, ERRORS)) * np.repeat([0.1, 0.2, 0.01, 0.01, 0.01, 0.005, 0.005], 3)
+    return exact_rests(hexapod, errors, poses), poses, errors
+
+
+def test_a_known_home_and_known_length_changes_bind_the_poses_and_the_joints_stay_in_their_prior(hexapod, skewed):
+    readings, (positions, rotations), _ = skewed
+    changes = leg_lengths(hexapod, positions, rotations)
+    changes -= changes[0]
+    free = calibrate_at_rest(hexapod, Rests(readings))
+    bound = calibrate_at_rest(hexapod, Rests(readings, home=True, length_changes=changes), Prior(joints=1e-4))
+    assert np.linalg.norm(free.positions - positions, axis=1).max() > 1e-3
+    np.testing.assert_allclose(bound.positions[0], hexapod.home.position, rtol=0.0, atol=2e-5)
+    np.testing.assert_allclose(bound.rotations[0], hexapod.home.rotation, rtol=0.0, atol=1e-4)
+    lengths = leg_lengths(hexapod, bound.positions, bound.rotations)
+    np.testing.assert_allclose(lengths - lengths[0], changes, rtol=0.0, atol=3e-5)
+    np.testing.assert_allclose(bound.positions, positions, rtol=0.0, atol=1e-4)
+    assert 0.0 < np.abs(bound.joints).max() < 3e-4 and not np.allclose(bound.joints, 0.0, atol=1e-9)
+    assert np.abs(free.joints).max() < 1e-9
+
+
+def test_the_result_explains_the_readings_and_its_residuals_are_read_minus_expected(hexapod, skewed):
+    readings, _, errors = skewed
+    found = calibrate_at_rest(hexapod, Rests(readings))
+    moved = hexapod.moved_joints(found.joints)
+    up = rotation_of([*found.tilt, 0.0]) @ hexapod.up_in_base
+    tilted = Mechanism.from_legs(
+        moved.base_joints, moved.platform_joints, base_joint_axes=hexapod.base_joint_axes, up_in_base=up, home=hexapod.home,
+        plant={**hexapod.plant, "gravity": -np.linalg.norm(hexapod.plant["gravity"]) * up},
+    )  # fmt: skip
+    expected = exact_rests(tilted, found.errors, (found.positions, found.rotations))
+    np.testing.assert_allclose(found.residuals, readings - expected, rtol=0.0, atol=1e-6)
+    # The rate of the prior's reading errors, of which most are explained.
+    assert np.sqrt(np.mean(found.residuals[:, :, :3] ** 2)) < np.radians(0.02)
+    assert np.sqrt(np.mean(found.residuals[:, :, 3:] ** 2)) < 2e-3
+    np.testing.assert_allclose(found.errors[:, :3], errors[:, :3], rtol=0.0, atol=1e-3)
+    of_errors = found.calibration()
+    assert of_errors.covariance.shape == (147, 147)
+    np.testing.assert_array_equal(of_errors.tilt, found.tilt)
+    np.testing.assert_array_equal(of_errors.joints, found.joints)
+    # A gyroscope's bias is as uncertain as a mean reading over eight rests; a scale that no rest tells is as before.
+    sigmas = np.sqrt(np.diag(found.covariance))[:147].reshape(7, 7, 3)
+    np.testing.assert_allclose(sigmas[:, 0], np.radians(0.02) / np.sqrt(8.0), rtol=0.01)
+    np.testing.assert_allclose(sigmas[:, 3], 0.03, rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_covariance_of_a_pose_is_that_of_what_errors_do_to_it(hexapod, seed):
+    """One direction of errors of IMUs, joints and tilt at once, small enough to act linearly, through the fitted pose."""
+    random, tilt = np.random.default_rng(seed), np.array([0.01, -0.02])
+    position, rotation = (each[seed] for each in sample_workspace(hexapod, 3, seed=21))
+    off = random.normal(size=185) * np.concatenate([np.full(147, 1e-5), np.full(36, 1e-6), np.full(2, 1e-5)])
+    imus, joints, lean = off[:147].reshape(7, ERRORS), off[147:183].reshape(2, 6, 3), off[183:]
+    poses = []
+    for sign in (1.0, -1.0):
+        true = sensor_geometry(hexapod.moved_joints(sign * joints), tilt + sign * lean)
+        forces = expected_forces(true, position, rotation)
+        read = [error_matrix(sign * e, 1) @ force + sign * e[3:6] for e, force in zip(imus, forces, strict=True)]
+        poses.append(fit_pose(sensor_geometry(hexapod, tilt), np.array(read), hexapod.home))
+    (ahead, turned_ahead), (behind, turned_behind) = poses
+    turn = 0.5 * (turned_ahead @ turned_behind.T - turned_behind @ turned_ahead.T)
+    moved = 0.5 * np.array([*(ahead - behind), turn[2, 1], turn[0, 2], turn[1, 0]])
+    found = pose_covariance(hexapod, tilt, (position, rotation), np.outer(off, off))
+    scale = np.repeat([np.linalg.norm(moved[:3]), np.linalg.norm(moved[3:])], 3)
+    np.testing.assert_allclose(found / np.outer(scale, scale), np.outer(moved, moved) / np.outer(scale, scale), atol=2e-3)

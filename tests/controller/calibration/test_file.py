@@ -145,6 +145,11 @@ def test_what_it_leaves_is_what_the_filter_knows_of_the_sensors(hexapod):
         ("imu_0 = 3", "imu_0 must be a table, got 3"),
         ("joints = [1]", r"joints must be a table, got \[1\]"),
         ("[base]\ntitl = [0, 0]", "base has no entry 'titl'; it has tilt, floor"),
+        ("[base]\ntilt = [0.1, -0.81]", "base.tilt must be within 0.8 rad of level"),
+        ("[base]\nfloor = [1e-4, -1e-4]", "base.floor not negative"),
+        ("[imu_6.magnetometer]\naxes = [0, 0, -1.1]", r"imu_6.magnetometer.axes is \[.*\]; an axis is at most 1 off"),
+        ("[joints]\nbases = [0]", "joints has no entry 'bases'; it has base, platform"),
+        ("[joints]\nplatform = [[0, 0, 0]]", r"joints.platform must have shape \(6, 3\)"),
         ('["imu_²"]', "no table 'imu_²'"),
         (f"[covariance]\nsigmas = {[1.0] * 147}\nfactor = [[1.0]]", "covariance.factor must have 147 rows"),
     ],
@@ -170,3 +175,45 @@ def test_what_a_file_does_not_say_stays_as_it_is(tmp_path):
     np.testing.assert_array_equal(calibration.offset, expected)
     np.testing.assert_array_equal(calibration.gain, np.tile(np.eye(3), (3, 7, 1, 1)))
     assert calibration.covariance is None
+
+
+def test_a_file_is_read_as_the_papers_equation_37(tmp_path):
+    """T S (raw + bias), and then the mounting: a quarter turn about z carries x to y."""
+    path = tmp_path / "c.toml"
+    path.write_text(
+        f"[imu_3.gyroscope]\nbias = [0.1, -0.2, 0.3]\nscale = [2.0, 1.0, 0.5]\naxes = [0.1, 0.2, 0.3]\n"
+        f"mounting = [0.0, 0.0, {np.pi / 2.0!r}]\n[imu_6.magnetometer]\nscale = [1.0, 4.0, 1.0]\nbias = [0.0, 5.0, 0.0]\n"
+        "[base]\ntilt = [0.01, -0.02]\nfloor = [3e-4, 4e-3]\n"
+        "[joints]\nplatform = [[0, 0, 0], [0, 1e-3, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]]\n"
+    )
+    found, raw = load_calibration(path), np.zeros((3, 7, 3))
+    raw[0, 3], raw[2, 6] = [0.4, 0.7, 1.7], [1.0, 2.0, 3.0]
+    # (raw + bias) is (0.5, 0.5, 2), scaled (1, 0.5, 1), and with the axes (1 + 0.05 + 0.2, 0.5 + 0.3, 1).
+    calibrated = found.apply(raw)
+    np.testing.assert_allclose(calibrated[0, 3], [-0.8, 1.25, 1.0], rtol=1e-14)
+    np.testing.assert_allclose(calibrated[2, 6], [1.0, 28.0, 3.0], rtol=1e-14)
+    calibrated[0, 3] = calibrated[2, 6] = 0.0
+    assert not calibrated.any()
+    assert (found.tilt.tolist(), found.floor.tolist()) == ([0.01, -0.02], [3e-4, 4e-3])
+    assert not found.joints[0].any() and found.joints[1, 1].tolist() == [0.0, 1e-3, 0.0]
+    assert np.abs(found.joints).sum() == 1e-3
+
+
+def test_the_file_tells_its_units(tmp_path):
+    save_calibration(tmp_path / "c.toml", Calibration(joints=np.full((2, 6, 3), 1e-4)))
+    text = (tmp_path / "c.toml").read_text()
+    for imu in range(7):
+        for sensor, unit in (("gyroscope", "rad/s"), ("accelerometer", "m/s2"), ("magnetometer", "uT")):
+            assert f"[imu_{imu}.{sensor}]  # bias in {unit}, mounting in rad\n" in text
+
+
+def test_one_calibration_after_another_is_both():
+    random = np.random.default_rng(3)
+    gains, offsets = np.eye(3) + 0.1 * random.normal(size=(2, 3, 7, 3, 3)), random.normal(size=(2, 3, 7, 3))
+    first = Calibration(gains[0], offsets[0], tilt=np.array([0.01, 0.02]), floor=np.array([1e-4, 2e-4]))
+    both, raw = first.then(gains[1], offsets[1], tilt=np.array([0.03, 0.0])), random.normal(size=(5, 3, 7, 3))
+    once = np.einsum("skij,nskj->nski", gains[0], raw) + offsets[0]
+    np.testing.assert_allclose(first.apply(raw), once, rtol=0.0, atol=1e-13)
+    twice = np.einsum("skij,nskj->nski", gains[1], once) + offsets[1]
+    np.testing.assert_allclose(both.apply(raw), twice, rtol=0.0, atol=1e-13)
+    assert (both.tilt.tolist(), both.floor.tolist()) == ([0.03, 0.0], [1e-4, 2e-4])

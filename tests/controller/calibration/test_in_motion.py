@@ -33,6 +33,16 @@ def test_motion_brings_it_to_a_tenth_of_a_millimetre(hexapod):
     assert true[0] < pose_errors(hexapod, found.calibration(), found.tilt, *others)[0]
     predicted = [pose_covariance(hexapod, calibration.tilt, pose, covariance) for pose in zip(*others[1:], strict=True)]
     assert 0.4 < true[0] / (1e3 * np.sqrt(np.trace(np.mean(predicted, axis=0)[:3, :3]))) < 2.5
+    # What the rig leaves is told apart from what the IMUs leave: together they are what there was, over the rests.
+    of_imus = np.zeros_like(covariance)
+    of_imus[: 7 * ERRORS, : 7 * ERRORS] = calibration.covariance
+    of_both, of_one = (
+        np.mean([pose_covariance(hexapod, calibration.tilt, pose, each) for pose in zip(found.positions, found.rotations, strict=True)], axis=0)
+        for each in (covariance, of_imus)
+    )  # fmt: skip
+    apart, together = (np.diag(each).reshape(2, 3).sum(axis=1) for each in (of_one, of_both))
+    np.testing.assert_allclose(apart + calibration.floor**2, together, rtol=1e-3)
+    assert (calibration.floor > 0.0).all()
     # The gyroscopes' scales, which no rest tells; a leg hardly turns about itself.
     error = np.abs(calibration.gain[0] - np.linalg.inv(imu["gain"][0]))
     assert error[:6, :, :2].max() < 2e-3
