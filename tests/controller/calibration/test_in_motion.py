@@ -36,10 +36,11 @@ def test_motion_brings_it_to_a_tenth_of_a_millimetre(hexapod):
     # What the rig leaves is told apart from what the IMUs leave: together they are what there was, over the rests.
     of_imus = np.zeros_like(covariance)
     of_imus[: 7 * ERRORS, : 7 * ERRORS] = calibration.covariance
+    rests = list(zip(found.positions, found.rotations, strict=True))
     of_both, of_one = (
-        np.mean([pose_covariance(hexapod, calibration.tilt, pose, each) for pose in zip(found.positions, found.rotations, strict=True)], axis=0)
+        np.mean([pose_covariance(hexapod, calibration.tilt, pose, each) for pose in rests], axis=0)
         for each in (covariance, of_imus)
-    )  # fmt: skip
+    )
     apart, together = (np.diag(each).reshape(2, 3).sum(axis=1) for each in (of_one, of_both))
     np.testing.assert_allclose(apart + calibration.floor**2, together, rtol=1e-3)
     assert (calibration.floor > 0.0).all()

