@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from controller.inverse_kinematics import inverse_kinematics, jacobian_at, leg_lengths, legs_at, sample_workspace
-from plant.errors import GoughError, InputError
-from plant.mechanism import Mechanism
+from plant.errors import GoughError, InputError, SingularConfigurationError
+from plant.mechanism import Mechanism, load_in_space
 from plant.pose import Pose
 from tests.controller.leg_geometry import leg_vectors, random_mechanism, random_rotation, rotation_of
 
@@ -160,3 +161,44 @@ def test_a_home_far_outside_the_stroke_is_an_error_and_not_an_endless_search(hex
     )
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30, check=False)
     assert run.stdout.strip() == "refused", run.stderr
+
+
+def test_a_planar_mechanisms_jacobian_keeps_it_in_its_plane():
+    """Its first rows are the slopes of three lengths, by finite differences; the others ask for what leaves the plane."""
+    rig = load_in_space("planar-3rpr")
+    arms, directions, lengths, jacobian = np.zeros((6, 3)), np.zeros((6, 3)), np.zeros(6), np.full((6, 6), np.nan)
+    base, platform = (np.vstack([each, np.full((3, 3), 0.7)]) for each in (rig.base_joints, rig.platform_joints))
+    base[3:] = 0.0
+    position, rotation = rig.home.position + [0.01, -0.02, 0.0], rotation_of([0.0, 0.0, 0.3]) @ rig.home.rotation
+    legs_at(base, platform, position, rotation, arms, directions, lengths)
+    jacobian_at(arms, directions, 3, jacobian)
+    h = 1e-6
+    for i, step in enumerate(h * np.eye(6)):
+        ahead, behind = (
+            leg_lengths(rig, position + sign * step[:3], rotation_of(sign * step[3:]) @ rotation) for sign in (1.0, -1.0)
+        )
+        np.testing.assert_allclose(jacobian[:3, i], (ahead - behind) / (2.0 * h), rtol=0.0, atol=1e-8)
+    # No translation along z, no turns about x and y.
+    np.testing.assert_array_equal(jacobian[3:], np.eye(6)[2:5])
+
+
+@pytest.mark.parametrize("leg", [0, 4])
+def test_a_leg_without_a_length_is_named(hexapod, leg):
+    position = hexapod.base_joints[leg] - hexapod.platform_joints[leg]
+    with pytest.raises(SingularConfigurationError, match=f"leg {leg} has no length at this pose"):
+        inverse_kinematics(hexapod, Pose(position, np.eye(3)))
+
+
+def test_sampled_poses_keep_to_their_box_about_a_turned_home(hexapod):
+    """Four fifths of the widest stroke's range to either side, and 0.35 rad about each axis of {1}."""
+    home = Pose(hexapod.home.position, rotation_of([0.0, 0.0, 0.5]))
+    lengths = inverse_kinematics(hexapod, home).lengths
+    stroke = lengths[:, None] + np.array([[-0.06, 0.06]] * 5 + [[-0.05, 0.07]])
+    mechanism = Mechanism.from_legs(hexapod.base_joints, hexapod.platform_joints, home=home, limits={"stroke": stroke})
+    positions, rotations = sample_workspace(mechanism, 1000, seed=5)
+    away = np.abs(positions - home.position).max(axis=0)
+    turns = np.array([Rotation.from_matrix(rotation @ home.rotation.T).as_rotvec() for rotation in rotations])
+    assert 0.08 < away.max() <= 0.096
+    assert 0.34 < np.abs(turns).max() <= 0.35
+    # Either way alike.
+    assert np.abs((positions - home.position).mean(axis=0)[:2]).max() < 0.01

@@ -242,3 +242,41 @@ def test_malformed_lengths_are_refused(hexapod):
     for sigma in (0.0, -1.0):
         with pytest.raises(InputError, match=r"length_sigma is .*must be positive"):
             cross_check(hexapod, solution, np.ones(6), length_sigma=sigma)
+
+
+@pytest.mark.parametrize(
+    ("names", "freedom"),
+    [((), 6), (("up",), 8), (("normal",), 8), (("rotation",), 9), (("normal", "up"), 10), (("rotation", "normal", "up"), 13)],
+)
+@pytest.mark.parametrize("missing", [0, 1])
+def test_the_degrees_of_freedom_are_two_for_each_leg_and_vector_three_for_a_rotation_less_six(hexapod, names, freedom, missing):
+    position, rotation = hexapod.home.position, rotation_of([0.1, -0.05, 0.2])
+    known = {"up": rotation.T @ UP, "normal": rotation[:, 2], "rotation": rotation}
+    given = {"up_in_platform" if name == "up" else name: known[name] for name in names}
+    directions = leg_directions(hexapod, position, rotation)
+    directions[:missing] = np.nan
+    found = integrity(hexapod, directions, **given)
+    assert found.degrees_of_freedom == freedom - 2 * missing == found.solution.degrees_of_freedom
+    assert found.threshold == pytest.approx(chi2.isf(1e-4, freedom - 2 * missing))
+    assert found.faulty is None and not found.detected
+    # The sum without the platform's IMU is there if it has one that is tried.
+    assert np.isfinite(found.chi_squares[6]) == bool(names)
+
+
+def test_with_a_method_of_its_own_the_platforms_imu_is_not_tried(hexapod):
+    rotation = rotation_of([0.1, -0.05, 0.2])
+    directions = leg_directions(hexapod, hexapod.home.position, rotation)
+    found = integrity(hexapod, directions, up_in_platform=turned(np.random.default_rng(0), rotation.T @ UP, 0.1), method="up")
+    assert found.detected and np.isnan(found.chi_squares[6]) and found.faulty != 6
+
+
+@pytest.mark.parametrize("length_sigma", [1e-5, 3e-3])
+def test_the_deviations_of_lengths_are_errors_over_what_pose_and_encoder_leave(hexapod, poses, length_sigma):
+    random, deviations = np.random.default_rng(11), []
+    for pose in poses[:300]:
+        directions, up = measured(random, hexapod, pose)
+        lengths = lengths_at(hexapod, pose) + length_sigma * random.normal(size=6)
+        found = cross_check(hexapod, solve(hexapod, directions, up_in_platform=up), lengths, length_sigma=length_sigma)
+        assert (np.sign(found.deviations) == np.sign(found.errors)).all()
+        deviations.append(found.deviations)
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(deviations))), 1.0, atol=0.06)
