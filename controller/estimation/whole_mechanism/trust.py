@@ -78,10 +78,10 @@ def step_mechanism_filter(
         return found
     now = time.cycle * rig.period
     if f.running == 0:
-        if not found or time.cycle < s.due:
-            return found
-        start_filter(p.filter, f, now, pose.position, pose.rotation, pose.twist)
-        s.due = time.cycle + p.settling_cycles
+        if found and time.cycle >= s.due:
+            start_filter(p.filter, f, now, pose.position, pose.rotation, pose.twist)
+            s.due = time.cycle + p.settling_cycles
+        _fade_step(s, rig, time, pose)
         return found
     accumulate_sample(f, imus.sample, imus.used, now - p.delay)
     if heading.used != 0 and heading.fresh != 0:
@@ -109,11 +109,17 @@ def step_mechanism_filter(
             return False
         pose.position[:] = s.closed_position
         pose.rotation[:] = s.closed_rotation
+    _fade_step(s, rig, time, pose)
+    return True
+
+
+@kernel
+def _fade_step(s: Record, rig: Record, time: Record, pose: Record) -> None:
+    """Move the pose by what is left of the step between two sources, and let that fade."""
     share = max(1.0 - elapsed(rig, time) / _FADING_S, 0.0)
     for i in range(6):
         s.blend_offset[i] *= share
     move_pose(s.blend_offset, pose.position, pose.rotation)
-    return True
 
 
 @kernel

@@ -63,7 +63,7 @@ def fades(errors, first, last):
     np.testing.assert_allclose(errors, last + left[:, None] * (first - last), rtol=0.0, atol=0.02 * np.abs(AWAY).max())
 
 
-def test_when_the_filter_is_no_longer_trusted_the_pose_goes_on_from_where_it_was(hexapod):
+def test_when_the_filter_is_no_longer_trusted_the_pose_fades_to_the_closed_form(hexapod):
     rest = Rest(hexapod)
     rest.step_until(trusted=1)
     for _ in range(300):
@@ -75,7 +75,9 @@ def test_when_the_filter_is_no_longer_trusted_the_pose_goes_on_from_where_it_was
     rest.move_filter()
     errors = rest.step_until(trusted=0)
     np.testing.assert_allclose(errors[:-1], np.broadcast_to(AWAY, errors[:-1].shape), rtol=0.0, atol=1e-4)
-    fades(errors[-1:], AWAY, 0.0)
+    # Beyond the restart of the filter, too.
+    fades(np.array([errors[-1], *(rest.step() for _ in range(200))]), AWAY, 0.0)
+    assert rest.trust["filter"]["running"] == 1
 
 
 def test_when_the_filter_is_trusted_the_pose_fades_to_the_filters(hexapod):
