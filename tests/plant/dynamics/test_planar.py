@@ -280,3 +280,65 @@ def test_the_fmu_refuses_parameters_that_make_no_sense_together(rig: Mechanism) 
     p = rig.plant_parameters() | {"stop.minimum_length": np.full(3, 0.3)}
     with pytest.raises(FmuError, match=r"stop\.minimum_length of leg 0 is 0.3 m, beyond its stop\.maximum_length of 0\.26"):
         FmuPlant(default_fmu(PLANAR_MODEL), p, 1e-3)
+
+
+def limits_of(dynamics: Dynamics, p: Values) -> tuple[Array, Array]:
+    """Values and greatest values of the limits at the start."""
+    parameters = flat(p, PLANAR.parameters)
+    values, limits = dynamics.limits(dynamics.start(parameters), dynamics.constants(parameters))
+    return np.array(values).ravel(), np.array(limits).ravel()
+
+
+@pytest.mark.parametrize("leg", range(LEGS))
+def test_each_leg_keeps_a_tenth_of_a_millimetre_at_any_angle(dynamics: Dynamics, rig: Mechanism, leg: int) -> None:
+    """The base joint is put beside the turned platform joint, on either side of the limit."""
+    p = dict(rig.plant_parameters())
+    angle = float(p["initial_angle"])
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    joints = p["initial_position"] + p["platform_joints"] @ turn.T
+    np.testing.assert_allclose(limits_of(dynamics, p)[1], np.linalg.norm(joints - p["base_joints"], axis=1), rtol=1e-12)
+    for length, good in ((1.01e-4, True), (0.99e-4, False)):
+        base = p["base_joints"].copy()
+        base[leg] = joints[leg] + length * np.array([0.6, -0.8])
+        values, limits = limits_of(dynamics, p | {"base_joints": base})
+        np.testing.assert_array_equal(values, 1e-4)
+        assert [value <= limit for value, limit in zip(values, limits, strict=True)] == [good or k != leg for k in range(LEGS)]
+
+
+@pytest.mark.parametrize("leg", range(LEGS))
+def test_stops_in_the_wrong_order_name_their_leg(dynamics: Dynamics, rig: Mechanism, leg: int) -> None:
+    p = dict(rig.plant_parameters())
+    stops = p["stop.minimum_length"].copy()
+    stops[leg] = p["stop.maximum_length"][leg] + 1e-6
+    said = broken(dynamics, p | {"stop.minimum_length": stops})
+    assert [text[: len("stop.minimum_length of leg 0")] for text in said if "beyond" in text] == [
+        f"stop.minimum_length of leg {leg}"
+    ]
+
+
+def test_the_planar_drives_and_brakes_change_at_their_rates(dynamics: Dynamics, rig: Mechanism) -> None:
+    """Each leg in its own mode: an open motor has no back-EMF, a braked one is short-circuited, a driven one follows."""
+    changes = {"motor.resistance": np.array([4.5, 5.0, 5.5]), "drive.compensation": np.array(0.4),
+        "drive.nominal_resistance": np.array(5.0), "drive.current_limit": np.array(50.0)}  # fmt: skip
+    p = rig.plant_parameters() | changes
+    random = np.random.default_rng(8)
+    states, inputs = random_state(p, random)
+    constant = 2.0 * np.pi / p["motor.screw_lead"] * p["motor.torque_constant"]
+    for shift in range(3):
+        mode = np.roll([OPEN, BRAKE, VELOCITY], shift)
+        inputs |= {"drive_mode": mode, "velocity_command": np.array([0.02, -0.03, 0.04])}
+        held = flat(states, PLANAR.states), flat(inputs, PLANAR.inputs), dynamics.constants(flat(p, PLANAR.parameters))
+        rates, outputs = named(dynamics.rates(*held), PLANAR.states), named(dynamics.outputs(*held), PLANAR.outputs)
+        speed, current, deflection = outputs["leg_velocity"], states["state.current"], states["state.brake_deflection"]
+        voltage = np.where(mode == VELOCITY, constant * inputs["velocity_command"] + 0.4 * 5.0 * current, 0.0)
+        assert np.abs(voltage).max() < p["drive.voltage_limit"]
+        back = np.where(mode == OPEN, 0.0, constant * speed)
+        expected = (voltage - p["motor.resistance"] * current - back) / p["motor.inductance"]
+        np.testing.assert_allclose(rates["state.current"], expected, rtol=1e-10)
+        np.testing.assert_allclose(outputs["voltage"], voltage, rtol=1e-12)
+        # The deflections are below 70 % of the slipping one.
+        assert np.abs(deflection).max() < 0.7 * p["brake.force"] / p["brake.stiffness"]
+        expected = np.where(mode == BRAKE, speed, -deflection / p["brake.release_time"])
+        np.testing.assert_allclose(rates["state.brake_deflection"], expected, rtol=1e-10, atol=1e-15)
+        np.testing.assert_array_equal(rates["state.position"], states["state.velocity"])
+        assert rates["state.angle"] == states["state.angular_velocity"]

@@ -492,6 +492,13 @@ def test_an_inertia_is_that_of_a_real_body(dynamics: Dynamics, hexapod: Mechanis
         skewed = FLAT + 0.01 * np.eye(3)
         skewed[row, column] += 1e-4
         assert any(f"{body}.inertia is not symmetric" in said for said in broken(dynamics, p | {f"{body}.inertia": skewed}))
+    # Second moments with one negative beside a zero, which neither the diagonal nor the determinant shows.
+    for axis in range(3):
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        moments = np.diag([0.01, 0.01, 0.01])
+        moments[axis, axis], moments[first, second], moments[second, first] = 0.0, 0.02, 0.02
+        (said,) = broken(dynamics, p | {f"{body}.inertia": np.trace(moments) * np.eye(3) - moments})
+        assert said.startswith(f"{body}.inertia is of no real body")
     if body == "payload":
         assert broken(dynamics, p | {"payload.inertia": np.zeros((3, 3)), "payload.mass": np.array(0.0)}) == []
 

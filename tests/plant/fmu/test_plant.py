@@ -20,7 +20,15 @@ from plant.dynamics.variables import BRAKE, OPEN, SPATIAL, VELOCITY
 from plant.errors import FmuError, InputError, UnknownNameError
 from plant.fmu.binding import OWN_BINDING
 from plant.fmu.build import PLANAR_MODEL, SPATIAL_MODEL, Model, default_fmu
-from plant.fmu.calls import advance, read_imus, read_truth, write_command, write_drive_mode, write_drive_modes
+from plant.fmu.calls import (
+    advance,
+    read_imus,
+    read_truth,
+    write_command,
+    write_drive_mode,
+    write_drive_modes,
+    write_payload_mass,
+)
 from plant.fmu.instance import FmuInstance
 from plant.fmu.plant import FmuPlant
 from plant.fmu.settings import Setting
@@ -672,3 +680,11 @@ def test_a_plant_without_derivatives_or_states_is_not_linearised(fmu_path: Path,
         make_plant().linearize(["drive_mode"], ["leg_length"])
     with pytest.raises(UnknownNameError, match="no variable 'lengths'"):
         make_plant().linearize(["velocity_command"], ["lengths"])
+
+
+def test_the_payload_is_set_and_a_refusal_is_told(make_plant: MakePlant) -> None:
+    plant = make_plant()
+    assert write_payload_mass(plant.handle, 7.5) == 0
+    assert plant.get("payload.mass") == 7.5
+    assert write_payload_mass(plant.handle, -1.0) == 3
+    assert "setting the payload failed" in str(plant.failure())

@@ -65,7 +65,7 @@ def test_a_drive_compensates_for_less_than_the_least_resistance_of_its_motors():
     assert checked_plant({**DRIVE, "drive.compensation": 0.749}, SPATIAL)["drive.compensation"] == 0.749
     message = r"drive.compensation x nominal_resistance is 0.6 Ohm; .* resistance of 0.6 Ohm: choose a smaller"
     with pytest.raises(InputError, match=message):
-        checked_plant({**DRIVE, "drive.compensation": 0.75, "drive.nominal_resistance": 0.8}, SPATIAL)
+        checked_plant({**DRIVE, "drive.compensation": 0.5, "drive.nominal_resistance": 1.2}, SPATIAL)
     # Without one of the three there is nothing to compare.
     assert len(checked_plant({"drive.compensation": 5.0, "motor.resistance": 0.1}, SPATIAL)) == 2
 
