@@ -1,0 +1,81 @@
+"""The control channel of an emulated rig: what it answers, and when a fault that is injected begins and ends."""
+
+import socket
+
+import numpy as np
+import pytest
+
+from hil.rigs.emulation import new_emulated
+from hil.runs.config import EmulatorConfig
+from hil.runs.emulator import _Control, _hello
+from plant.errors import GoughError, InputError
+
+
+@pytest.fixture
+def control():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+        yield _Control(opened)
+
+
+@pytest.fixture
+def rig(hexapod):
+    rig = new_emulated(hexapod, 1_000_000, 0)
+    rig["time_ns"] = 7_500_000_000
+    return rig
+
+
+def injected(control, rig, text):
+    assert control._do("fault", text, rig, {}) == {"fault": text}
+    made = rig["fault"][int(rig["faults"]) - 1]
+    return int(made["begin_ns"]), int(made["end_ns"])
+
+
+def test_a_fault_begins_now_and_ends_after_its_time(control, rig):
+    rig["enabled_ns"] = 5_000_000_000
+    begin, end = injected(control, rig, "imu-dead:3,for=2")
+    # 2.5 s after the drives were first enabled, to the nanosecond before which it counts as from the start.
+    assert begin == 2_500_000_000 and abs(end - 4_500_000_000) <= 1
+    begin, end = injected(control, rig, "drive-faults:1")
+    assert begin == 2_500_000_000 and end > 2**61
+    assert injected(control, rig, "imu-dead:2,at=4,for=1") == (4_000_000_000, 5_000_000_000)
+    assert int(rig["faults"]) == 3
+    assert control._do("clear", "", rig, {}) == {"faults": 0} and rig["faults"] == 0
+
+
+def test_a_fault_before_the_drives_are_enabled_is_there_from_the_start(control, rig):
+    assert injected(control, rig, "imu-dead:3")[0] == -1
+    rig["enabled_ns"] = 7_500_000_000
+    assert injected(control, rig, "imu-dead:4")[0] == 0
+
+
+def test_the_state_is_that_of_the_rig_and_its_bus(control, rig):
+    rig["drive"], rig["code"], rig["velocity"] = np.arange(6) % 5, 10 * np.arange(6), 0.1 * np.arange(6)
+    rig["truth"] = np.arange(19.0)
+    assert control._do("state", "", rig, {"lost": 4}) == {
+        "time_s": pytest.approx(7.5),
+        "drive": [0, 1, 2, 3, 4, 0],
+        "code": [0, 10, 20, 30, 40, 50],
+        "velocity": pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 0.5]),
+        "lengths": [7.0, 8.0, 9.0, 10.0, 11.0, 12.0],
+        "lost": 4,
+    }
+
+
+def test_without_a_session_it_can_only_stop(control, rig):
+    for command in ("state", "fault", "clear"):
+        with pytest.raises(InputError, match="no controller has begun a session"):
+            control._do(command, "imu-dead:3", None, {})
+    with pytest.raises(InputError, match="the control channel has the commands fault, clear, state and stop, not 'dance'"):
+        control._do("dance", "", rig, {})
+    with pytest.raises(GoughError, match="there is no fault"):
+        control._do("fault", "imu-happy:3", rig, {})
+    assert not control.stopped and control._do("stop", "", None, {}) == {"stopping": True} and control.stopped
+
+
+@pytest.mark.parametrize(("watchdog", "period_us", "seconds"), [(0.03, 1000, 0.03), (0.03, 20_000, 0.06), (0.03, 10_000, 0.03)])
+def test_the_watchdog_waits_for_three_periods_at_least(watchdog, period_us, seconds):
+    assert EmulatorConfig(watchdog=watchdog).watchdog_for(period_us) == pytest.approx(seconds)
+
+
+def test_what_is_no_greeting_begins_no_session():
+    assert _hello(b"") is None and _hello(bytes(64)) is None
