@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from controller.direct_kinematics import METHODS, required_measurements, solve, solve_batch
+from controller.direct_kinematics import METHODS, Requirement, required_measurements, solve, solve_batch
 from plant.errors import InputError, SingularConfigurationError
 from plant.mechanism import Mechanism
 from plant.mechanism.classification import draw_mechanism, joint_numbers, spatial_classes
@@ -358,6 +358,35 @@ def test_without_refinement_section_4_is_the_papers_construction(coplanar):
                 np.testing.assert_allclose(solution.rotation, rotation, rtol=0.0, atol=1e-10)
 
 
+@pytest.mark.parametrize("coplanar", [True, False])
+def test_section_4_weighs_further_legs_by_how_steeply_they_cut_the_plane(coplanar):
+    """The yaw is that of weighted least squares on the points at which the legs cut the planes of their joints."""
+    random = np.random.default_rng(31)
+    for each in [each for each in EVERY if each.group == "n-5"]:
+        mechanism, *frame = drawn(each, random, coplanar)
+        numbers = joint_numbers(mechanism.platform_joints)
+        pair = np.flatnonzero(numbers == np.bincount(numbers).argmax())
+        others = [leg for leg in range(6) if leg not in pair]
+        positions, rotations = any_poses(random, mechanism, *frame, count=4)
+        directions = noisy(random, seen(mechanism, positions, rotations), 1e-2)
+        for row in range(4):
+            normal = rotations[row, :, 2]
+            found = solve(mechanism, directions[row], normal=normal, method="section-4", refine=False)
+            point = meeting_twin(mechanism.base_joints[pair], directions[row, pair])
+            level = Rotation.align_vectors(normal[None], UP[None])[0].as_matrix()
+            total = 0.0
+            for leg in others:
+                arm = mechanism.platform_joints[leg] - mechanism.platform_joints[pair[0]]
+                start, along = mechanism.base_joints[leg] - point, directions[row, leg]
+                slope = normal @ along
+                x, y, _ = level.T @ (start + (arm[2] - normal @ start) / slope * along)
+                total += slope**2 * (x + 1j * y) * (arm[0] - 1j * arm[1])
+            rotation = rotation_of(np.angle(total) * normal) @ level
+            np.testing.assert_allclose(found.rotation, rotation, rtol=0.0, atol=1e-10)
+            position = point - rotation @ mechanism.platform_joints[pair[0]]
+            np.testing.assert_allclose(found.position, position, rtol=0.0, atol=1e-10)
+
+
 @every_method
 def test_a_refined_pose_fits_better_than_the_closed_form_that_it_starts_from(method):
     random = np.random.default_rng(16)
@@ -629,3 +658,17 @@ def test_required_legs_suffice_at_other_poses_and_none_can_be_spared(each):
         assert missed[found.solved].max() < 1e-8
         fewer = [tuple(set(legs) - {leg}) for legs in requirement.choices for leg in legs]
         assert not solve_sets(requirement.method, mechanism, *poses, sets=fewer)[0].solved.any()
+
+
+@pytest.mark.parametrize(
+    ("choices", "fewest", "any_choice", "platform", "text", "choice_text"),
+    [
+        (((0, 1, 2, 3, 4, 5),), 6, 6, "nothing", "6 legs", ""),
+        (((0, 1), (0, 2), (1, 2)), 2, 2, "rotation", "any 2 legs + rotation", ""),
+        (((0, 1, 2), (0, 2, 4)), 3, 4, "normal", "3 legs, 2 choices + normal", "012, 024"),
+        (((1, 3, 5),), 3, 4, "up_in_platform", "3 legs + up_in_platform", ""),
+    ],
+)
+def test_requirements_read_well(choices, fewest, any_choice, platform, text, choice_text):
+    requirement = Requirement("up", platform, fewest, choices, any_choice)
+    assert (requirement.text, requirement.choice_text) == (text, choice_text)

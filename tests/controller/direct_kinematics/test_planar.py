@@ -404,3 +404,17 @@ def test_three_legs_that_meet_in_one_point_determine_the_pose():
     # The other mode is the mirror image in the meeting point.
     assert separation(second.angle, angle + np.pi) < 1e-12
     np.testing.assert_allclose(second.position, 2.0 * meeting - position, atol=1e-12)
+
+
+@pytest.mark.parametrize("between", [0.1, 0.7, 1.5, -0.4])
+def test_the_conditioning_of_two_legs_with_the_roll_is_the_tangent_of_half_their_angle(between):
+    (mode,) = solve_planar(RIG, [0.4, 0.4 + between, np.nan], roll=0.2)
+    assert mode.conditioning == pytest.approx(abs(np.tan(0.5 * between)), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("given_", "expected"), [(np.pi, np.pi), (-np.pi, np.pi), (3.0 * np.pi, np.pi), (-4.0, 2.0 * np.pi - 4.0)]
+)
+def test_an_angle_is_told_above_minus_and_up_to_plus_half_a_turn(given_, expected):
+    (mode,) = solve_planar(RIG, [1.2, 1.4, np.nan], roll=given_)
+    assert mode.angle == pytest.approx(expected, abs=1e-14) and mode.angle > 0.0
