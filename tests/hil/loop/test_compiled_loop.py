@@ -1,14 +1,17 @@
-"""What the loop notes of an exchange with the rig."""
+"""What the loop begins a cycle with, notes of an exchange with the rig, and records."""
 
 import numpy as np
 import pytest
 
 from controller.cycle import STATE, cycle_parameters, skip_periods
-from controller.safety.causes import Cause
+from controller.safety.causes import Cause, Mode, Request
 from controller.settings import control_settings, fusion_settings
-from hil.loop.compiled_loop import process_feedback
-from hil.loop.records import WORK
+from hil.loop.compiled_loop import begin_cycle, end_cycle, periods_passed, process_feedback
+from hil.loop.records import STAGES, WORK, Link, Stage, StopRequest
+from hil.realtime.clock import SCRIPTED, new_clock
 from hil.rigs import ANSWERED, SILENT, new_feedback
+from hil.runs.config import SimulationConfig
+from hil.runs.prepare import prepared_loop
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -32,3 +35,190 @@ def test_samples_and_silence_age_by_the_periods_that_pass_missed_ones_too(hexapo
         np.testing.assert_array_equal(state["imus"]["sample_age"], now - renewed)
         assert work["silent"] == state["safety"]["watch"]["silent"] == now - answered
         state["time"]["cycle"] += 1
+
+
+# ----------------------------------------------------------------------------------------------------- what a cycle begins with
+
+
+@pytest.fixture
+def loop():
+    """A loop in motion, in cycle 700, on a scripted clock that is on time."""
+    with prepared_loop(SimulationConfig(target="hold", duration=2.0)) as loop:
+        loop.clock = new_clock(SCRIPTED, 1_000_000)
+        loop.state["time"]["cycle"] = 700
+        safety = loop.state["safety"]
+        safety["mode"], safety["request"] = Mode.RUNNING, Request.ENABLED
+        safety["arming"]["delay"] = 30
+        loop.work = loop.memory()["work"]
+        yield loop
+
+
+def begin(loop, most_missed=10, end=10_000, streamed=None):
+    return begin_cycle(loop.parameters, loop.state, loop.clock, loop.script, loop.link, loop.work, streamed, most_missed, end)
+
+
+def stop_of(loop):
+    stop = loop.state["safety"]["stop"]
+    return Cause(int(stop["cause"])), int(stop["index"]), float(stop["value"]), float(stop["limit"])
+
+
+def test_the_motion_ends_when_its_cycles_without_those_of_arming_are_over(loop):
+    for end, cause in ((671, Cause.NONE), (670, Cause.END_OF_MOTION)):
+        assert begin(loop, end=end) == Cause.NONE
+        assert (loop.work["asked"], loop.work["cycle"]) == (cause, 700)
+    assert stop_of(loop)[0] == Cause.END_OF_MOTION and loop.state["safety"]["mode"] == Mode.STOPPING
+
+
+def test_as_many_periods_as_are_too_many_in_a_row_stop_it(loop):
+    begin(loop)
+    loop.clock["cycles"], loop.clock["overrun"], loop.clock["in_a_row"] = 1, 3, 6
+    assert begin(loop, most_missed=10) == Cause.NONE
+    assert (loop.clock["in_a_row"], loop.state["time"]["cycle"], loop.state["time"]["missed"]) == (9, 703, 3)
+    assert stop_of(loop)[0] == Cause.NONE
+    loop.clock["overrun"] = 1
+    begin(loop, most_missed=10)
+    assert stop_of(loop) == (Cause.MISSED_PERIODS, -1, 10.0, 10.0)
+    assert loop.work["asked"] == Cause.MISSED_PERIODS and loop.work["cycle"] == 704
+
+
+@pytest.mark.parametrize(
+    ("asked", "cause", "mode"),
+    [
+        (StopRequest.CONTROLLED, Cause.STOP_REQUESTED, Mode.STOPPING),
+        (StopRequest.QUICK, Cause.EMERGENCY_STOP, Mode.FAULT),
+        # The most severe counts; of those that are as severe, the latest.
+        ((StopRequest.CONTROLLED, "missed"), Cause.STOP_REQUESTED, Mode.STOPPING),
+        ((StopRequest.QUICK, "missed"), Cause.EMERGENCY_STOP, Mode.FAULT),
+        ((0, "missed"), Cause.MISSED_PERIODS, Mode.STOPPING),
+    ],
+)
+def test_another_process_may_ask_for_a_stop_of_either_kind(loop, asked, cause, mode):
+    asked, *missed = asked if isinstance(asked, tuple) else (asked,)
+    begin(loop)
+    if missed:
+        loop.clock["cycles"], loop.clock["overrun"] = 1, 50
+    loop.link[Link.STOP] = asked
+    begin(loop)
+    assert stop_of(loop)[0] == cause == loop.work["asked"]
+    assert loop.state["safety"]["mode"] == mode
+    if cause != Cause.MISSED_PERIODS:
+        assert np.isnan(stop_of(loop)[2:]).all()
+
+
+def test_what_was_asked_for_before_is_not_asked_for_again(loop):
+    loop.link[Link.STOP] = StopRequest.CONTROLLED
+    begin(loop)
+    loop.link[Link.STOP] = 0
+    loop.work["stage_ns"], loop.work["marks"]["ns"] = 77, 77
+    begin(loop)
+    assert loop.work["asked"] == Cause.NONE and stop_of(loop)[0] == Cause.STOP_REQUESTED
+    assert not loop.work["stage_ns"].any() and not loop.work["marks"]["ns"].any()
+
+
+def test_when_a_stop_is_over_its_cause_is_returned(loop):
+    loop.link[Link.STOP] = StopRequest.CONTROLLED
+    begin(loop)
+    loop.link[Link.STOP] = 0
+    loop.state["time"]["cycle"] = int(loop.state["safety"]["stop"]["end_cycle"]) - 1
+    assert begin(loop) == Cause.NONE
+    loop.state["time"]["cycle"] += 1
+    assert begin(loop) == Cause.STOP_REQUESTED
+    assert loop.state["safety"]["request"] == Request.BRAKED
+
+
+def test_the_plant_moves_by_the_periods_that_have_passed_but_not_before_the_first(loop):
+    for cycle, missed, periods in ((0, 0, 0), (1, 0, 1), (9, 4, 5)):
+        loop.state["time"]["cycle"], loop.state["time"]["missed"] = cycle, missed
+        assert periods_passed(loop.state) == periods
+
+
+def test_a_rig_that_fails_is_told_with_its_status_and_ends_at_once(loop):
+    loop.state["pid"]["command"] = [0.1, -0.1, 0.0, 0.2, -0.2, 0.05]
+    assert process_feedback(loop.parameters, loop.state, loop.work, SILENT + 5) == Cause.RIG_FAILED
+    cause, index, value, limit = stop_of(loop)
+    assert (cause, index, value) == (Cause.RIG_FAILED, -1, SILENT + 5.0) and np.isnan(limit)
+    assert loop.state["safety"]["request"] == Request.BRAKED and not loop.state["pid"]["command"].any()
+    # No stage runs, so the cycle is counted here.
+    assert loop.state["time"]["cycle"] == 701
+
+
+# ------------------------------------------------------------------------------------------------------------- what is recorded
+
+
+def test_a_record_holds_what_each_part_has_found_in_its_place(loop):
+    begin(loop)
+    random, state, work = np.random.default_rng(0), loop.state, loop.work
+    feedback, safety = work["feedback"], state["safety"]
+    for name in ("measurement", "truth", "sent"):
+        feedback[name] = random.normal(size=feedback[name].shape)
+    for name in ("sequence", "sample_ns", "drive_code"):
+        feedback[name] = random.integers(1, 1000, feedback[name].shape)
+    feedback["drive"] = [0, 1, 2, 3, 4, 0]
+    feedback["round_trip_ns"], feedback["refused"] = 123_456, 7
+    work["sample_age"], work["silent"], work["asked"] = np.arange(7) + 11, 5, Cause.SUPERVISOR_GONE
+    for stage, names in {
+        "pose": ("position", "rotation", "conditioning", "lengths", "directions"),
+        "reference": ("motion",),
+        "pid": ("command",),
+    }.items():
+        for name in names:
+            state[stage][name] = random.normal(size=state[stage][name].shape)
+    state["legs"]["directions"] = random.normal(size=(6, 3))
+    state["legs"]["used"], state["imus"]["used"] = [1, 1, 0, 1, 1, 0], [1, 0, 0, 1, 1, 0, 1]
+    state["heading"]["used"], state["mechanism"]["trusted"] = 1, 0
+    state["time"]["missed"] = 4
+    root = random.normal(size=(6, 6))
+    information = root @ root.T + np.eye(6)
+    state["pose"]["information"] = information
+    loop.clock["late"], loop.clock["start"], loop.clock["woke"] = 4321, 1_000_000, 9_500_000
+    events = safety["events"]
+    events["count"], events["cause"], events["index"] = 2, np.arange(20, 28), np.arange(8)
+    events["value"], events["limit"] = 0.5 * np.arange(8) + 1.0, 2.0 * np.arange(8) + 1.0
+    safety["mode"], safety["stop"]["cause"] = Mode.STOPPING, Cause.TOO_FAST
+    work["marks"]["ns"] = [1, 20, 300, 4000, 50_000, 600_000, 7_000_000, 80_000_000]
+    work["stage_ns"][Stage.SENSE], work["stage_ns"][Stage.PLANT] = 9, 13
+    expected = {
+        "cycle": 700, "time_ns": 8_500_000, "late_ns": 4321, "missed": 4, "status": Cause.RIG_FAILED,
+        "asked": Cause.SUPERVISOR_GONE, "mode": Mode.STOPPING, "stop": Cause.TOO_FAST, "request": Request.ENABLED, "silent": 5,
+        "drive": [0, 1, 2, 3, 4, 0], "drive_code": feedback["drive_code"], "sample_age": np.arange(7) + 11, "imus": 0b11011001,
+        "trusted": 0, "sample_ns": feedback["sample_ns"], "round_trip_ns": 123_456, "refused": 7, "sent": feedback["sent"],
+        "event_count": 2, "event_cause": [20, 21] + 6 * [0], "event_index": [0, 1] + 6 * [0],
+        "event_value": [1.0, 1.5] + 6 * [0.0], "event_limit": [1.0, 3.0] + 6 * [0.0],
+        "angular_velocity": feedback["measurement"][0], "specific_force": feedback["measurement"][1],
+        "magnetic_field": feedback["measurement"][2], "truth": feedback["truth"], "position": state["pose"]["position"],
+        "rotation": state["pose"]["rotation"], "lengths": state["pose"]["lengths"],
+        "conditioning": state["pose"]["conditioning"], "reference": state["reference"]["motion"],
+        "command": state["pid"]["command"],
+    }  # fmt: skip
+    expected = {name: np.array(value) for name, value in expected.items()}
+    off = np.where(state["legs"]["used"][:, None] != 0, state["legs"]["directions"] - state["pose"]["directions"], np.nan)
+    loop.link[Link.HEAD] = 5
+    end_cycle(
+        loop.parameters,
+        state,
+        loop.segments,
+        loop.records,
+        loop.clock,
+        loop.script,
+        loop.link,
+        work,
+        None,
+        int(Cause.RIG_FAILED),
+    )
+    record = loop.records[5]
+    assert loop.link[Link.HEAD] == 6 and loop.link[Link.START] == loop.clock["start"]
+    for name, value in expected.items():
+        np.testing.assert_array_equal(record[name], value, err_msg=name)
+    np.testing.assert_allclose(record["residuals"], off, rtol=1e-6)
+    np.testing.assert_allclose(record["covariance"], np.linalg.inv(information), rtol=1e-4, atol=1e-7)
+    stages = dict(zip(STAGES, record["stage_ns"].tolist(), strict=True))
+    assert stages.pop("record") > 0
+    assert stages == {
+        "sense": 9, "leg filters": 21, "platform filter": 4300, "direct kinematics": 50_000, "refinement": 600_000,
+        "whole mechanism": 7_000_000, "control": 80_000_000, "plant": 13,
+    }  # fmt: skip
+    # Information that is none has no covariance; a second record goes behind the first.
+    state["pose"]["information"] = -np.eye(6)
+    end_cycle(loop.parameters, state, loop.segments, loop.records, loop.clock, loop.script, loop.link, work, None, 0)
+    assert np.isnan(loop.records[6]["covariance"]).all() and loop.records[6]["status"] == 0
+    assert loop.records[6]["event_count"] == 0
