@@ -12,7 +12,7 @@ from controller.planning.motions import SAMPLE_PERIOD_S
 from controller.planning.planner import Reference, count_violations, plan
 from controller.planning.target import Target, load_target
 from plant.errors import GoughError, InputError, UnreachableError
-from plant.mechanism import Mechanism
+from plant.mechanism import Mechanism, load_in_space
 from tests.controller.leg_geometry import leg_vectors
 from tests.controller.planning.sampled_reference import sample_reference
 
@@ -352,6 +352,19 @@ def test_a_target_that_stands_still_is_not_left_by_rounding(hexapod):
         samples = sample_reference(reference.segments, 1e-3, 2000)
         home = leg_lengths(hexapod, hexapod.home.position, np.eye(3))
         np.testing.assert_allclose(samples[:, :, 0], np.broadcast_to(home, (2000, 6)), rtol=0.0, atol=1e-9)
+
+
+def test_a_planar_mechanism_is_planned_for_in_its_three_legs_alone():
+    mechanism = load_in_space("planar-3rpr")
+    target = load_target("circle", mechanism, 3.0)
+    reference = plan(mechanism, target, 3.0)
+    assert reference.violations == 0
+    samples = sample_reference(reference.segments, 5e-3, 600)
+    assert not samples[:, 3:].any()
+    wanted = leg_lengths(mechanism, *target.at(5e-3 * np.arange(600)))
+    np.testing.assert_allclose(samples[:, :3, 0], wanted, rtol=0.0, atol=0.1e-3)
+    # And its own limits are kept, which are a third of the hexapod's.
+    assert np.abs(samples[:, :, 1]).max() <= mechanism.limits.velocity == 0.08
 
 
 def test_planning_twice_gives_the_same_segments_bit_by_bit(hexapod):

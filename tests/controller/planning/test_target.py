@@ -283,6 +283,21 @@ def test_a_bad_file_is_refused_with_the_number_of_the_line(hexapod, tmp_path, li
     assert "motion.csv" in str(caught.value)
 
 
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_target_leaves_the_plane_to_either_side_and_the_first_sample_that_does_is_named(tmp_path, sign):
+    rig = load_in_space("planar-3rpr")
+
+    def rows(*heights):
+        return [f"{0.5 * k},0,0,{sign * height!r},1,0,0,0" for k, height in enumerate(heights)]
+
+    load_target(write(tmp_path, HEADER, *rows(0.0, 0.9e-9, 0.0)), rig, 5.0)
+    with pytest.raises(InputError, match=r"leaves the plane of 'planar-3rpr' at 1 s by 2 mm and 0 deg"):
+        load_target(write(tmp_path, HEADER, *rows(0.0, 0.9e-9, 0.002, 0.005)), rig, 5.0)
+    turn = float(np.cos(0.01)), sign * float(np.sin(0.01))
+    with pytest.raises(InputError, match=r"at 0.5 s by 0 mm and 1.15 deg"):
+        load_target(write(tmp_path, HEADER, *rows(0.0), f"0.5,0,0,0,{turn[0]!r},0,{turn[1]!r},0"), rig, 5.0)
+
+
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_file_of_too_few_samples_is_refused(hexapod, tmp_path, count):
     with pytest.raises(InputError, match=f"{count} samples"):

@@ -1,5 +1,8 @@
 """What the loop begins a cycle with, notes of an exchange with the rig, and records."""
 
+import os
+import signal
+
 import numpy as np
 import pytest
 
@@ -7,11 +10,14 @@ from controller.cycle import STATE, cycle_parameters, skip_periods
 from controller.safety.causes import Cause, Mode, Request
 from controller.settings import control_settings, fusion_settings
 from hil.loop.compiled_loop import begin_cycle, end_cycle, periods_passed, process_feedback
+from hil.loop.driver import FmuRig
 from hil.loop.records import STAGES, WORK, Link, Stage, StopRequest
-from hil.realtime.clock import SCRIPTED, new_clock
+from hil.realtime.clock import REAL, SCRIPTED, new_clock
 from hil.rigs import ANSWERED, SILENT, new_feedback
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import prepared_loop
+from plant.dynamics.variables import BRAKE, VELOCITY
+from plant.truth import TRUTH_LENGTHS
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -222,3 +228,97 @@ def test_a_record_holds_what_each_part_has_found_in_its_place(loop):
     end_cycle(loop.parameters, state, loop.segments, loop.records, loop.clock, loop.script, loop.link, work, None, 0)
     assert np.isnan(loop.records[6]["covariance"]).all() and loop.records[6]["status"] == 0
     assert loop.records[6]["event_count"] == 0
+
+
+# ------------------------------------------------------------------------------------------------------ what else may end a run
+
+
+@pytest.fixture
+def real_loop(loop):
+    """The loop on this machine's clock, which looks about every 100 ms."""
+    loop.clock = new_clock(REAL, 1_000_000)
+    return loop
+
+
+@pytest.mark.parametrize(
+    ("number", "cause"),
+    [
+        (signal.SIGHUP, Cause.STOP_REQUESTED),
+        (signal.SIGINT, Cause.STOP_REQUESTED),
+        (signal.SIGTERM, Cause.STOP_REQUESTED),
+        (signal.SIGQUIT, Cause.EMERGENCY_STOP),
+        (signal.SIGUSR1, Cause.NONE),
+    ],
+)
+def test_a_signal_that_waits_asks_for_a_stop(real_loop, number, cause):
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [number])
+    try:
+        os.kill(os.getpid(), number)
+        begin(real_loop, most_missed=10**9)
+    finally:
+        signal.sigwait([number])
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    assert real_loop.work["asked"] == stop_of(real_loop)[0] == cause
+
+
+def test_when_the_supervisor_has_gone_the_loop_stops_when_it_looks(real_loop):
+    for supervisor, cycles, cause in (
+        (0, 0, Cause.NONE), (os.getppid(), 0, Cause.NONE), (2**22 + 5, 99, Cause.NONE), (2**22 + 5, 200, Cause.SUPERVISOR_GONE),
+    ):  # fmt: skip
+        real_loop.link[Link.SUPERVISOR], real_loop.clock["cycles"] = supervisor, cycles
+        begin(real_loop, most_missed=10**9)
+        assert real_loop.work["asked"] == stop_of(real_loop)[0] == cause
+
+
+def test_the_plant_is_given_the_commands_for_the_periods_that_passed_and_says_what_was_sent(loop):
+    rig, feedback, command = FmuRig(loop), new_feedback()[()], np.array([0.02, -0.01, 0.015, 0.0, -0.02, 0.01])
+    time, lengths = loop.state["time"], []
+    for n, (cycle, missed, request, passed_ns) in enumerate(
+        [
+            (0, 0, Request.BRAKED, 0),
+            (1, 2, Request.BRAKED, 3_000_000),
+            (2, 0, Request.ENABLED, 4_000_000),
+            (3, 299, Request.ENABLED, 304_000_000),
+            (4, 0, Request.QUICK_STOP, 305_000_000),
+            (5, 0, Request.BRAKED, 306_000_000),
+        ]
+    ):
+        time["cycle"], time["missed"] = cycle, missed
+        assert rig.exchange(command, int(request), feedback) == ANSWERED
+        np.testing.assert_array_equal(feedback["sent"], 0.0 * command if request == Request.BRAKED else command)
+        # The first sample is number 0.
+        np.testing.assert_array_equal(feedback["sequence"], n)
+        np.testing.assert_array_equal(feedback["sample_ns"], passed_ns)
+        assert (loop.fmu["mode"] == (BRAKE if request == Request.BRAKED else VELOCITY)).all()
+        lengths.append(feedback["truth"][TRUTH_LENGTHS].copy())
+    np.testing.assert_allclose(lengths[1], lengths[0], atol=1e-5)
+    # 0.3 s at these speeds, less what it takes to get up to them.
+    np.testing.assert_allclose(lengths[3] - lengths[2], 0.3 * command, atol=1.5e-3)
+
+
+class Failing:
+    """A rig that raises in its first exchange, and then again when it is stopped."""
+
+    def __init__(self, error):
+        self.error, self.stops = error, 0
+
+    def exchange(self, command, request, feedback):
+        raise self.error
+
+    def quick_stop(self):
+        self.stops += 1
+        raise OSError("no drives")
+
+
+def test_a_rig_that_raises_is_stopped_and_what_it_raised_is_kept(loop):
+    rig = Failing(ValueError("a wire is loose"))
+    assert loop.follow(10_000, rig) == Cause.RIG_FAILED
+    assert (loop.failure, rig.stops) == ("ValueError: a wire is loose", 1)
+    assert loop.records[0]["status"] == Cause.RIG_FAILED
+
+
+def test_a_rig_is_stopped_before_an_interrupt_goes_on(loop):
+    rig = Failing(KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        loop.follow(10_000, rig)
+    assert rig.stops == 1 and loop.failure == ""
