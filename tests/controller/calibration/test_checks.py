@@ -11,6 +11,7 @@ from controller.rig import sensor_geometry
 from plant.dynamics.imposed_motion import impose
 from plant.errors import CalibrationError
 from plant.imu import Wiring, imu_state, load_imu, measure
+from tests.controller.leg_geometry import rotation_of
 
 RATE = 250.0
 PLACES = tuple(range(7))
@@ -125,3 +126,65 @@ def test_an_imu_that_is_lost_in_a_run_is_named_with_the_time():
     samples[500:, 1, 2, 0] = np.nan
     with pytest.raises(CalibrationError, match="IMU 2 gives readings that are not finite 2 s into a run, for 2 s in all"):
         check_all_along(samples, RATE)
+
+
+@pytest.mark.parametrize(("share", "fits"), [(0.69, False), (0.71, True), (1.29, True), (1.31, False)])
+def test_gravity_at_rest_may_be_off_by_three_tenths(share, fits):
+    samples = np.random.default_rng(0).normal(0.0, 0.001, (500, 3, 7, 3))
+    samples[:, 1, :, 2] += 9.80665
+    samples[:, 1, 3] *= share
+    if fits:
+        check_alive(samples)
+    else:
+        with pytest.raises(CalibrationError, match=rf"the accelerometer of IMU 3 reads {9.80665 * share:.3g} m/s2 at rest"):
+            check_alive(samples)
+
+
+@pytest.mark.parametrize("sensor", [0, 1])
+@pytest.mark.parametrize(("repeats", "fits"), [(24, True), (25, False)])
+def test_an_imu_may_stand_for_less_than_a_tenth_of_a_second(sensor, repeats, fits):
+    """One sensor alone that stands is at rest; the IMU is frozen if both stand."""
+    samples = np.random.default_rng(0).normal(size=(1000, 3, 7, 3))
+    alone, both = samples.copy(), samples
+    alone[401 : 401 + 200, sensor, 6] = alone[400, sensor, 6]
+    check_all_along(alone, RATE)
+    both[401 : 401 + repeats, :, 6] = both[400, :, 6]
+    if fits:
+        check_all_along(both, RATE)
+    else:
+        with pytest.raises(CalibrationError, match=r"IMU 6 is frozen while others are not 1\.6 s into a run, for 0\.004 s"):
+            check_all_along(both, RATE)
+
+
+@pytest.mark.parametrize(("rate", "fits"), [(0.95, False), (1.05, True), (-1.05, True)])
+def test_a_motion_turns_some_imu_at_a_degree_per_second(rate, fits):
+    rates = np.zeros((100, 7, 3))
+    rates[:, 5] = np.radians(rate) * np.array([0.6, 0.0, 0.8])
+    if fits:
+        check_motion(rates)
+    else:
+        with pytest.raises(CalibrationError, match=r"no IMU turns at more than 0\.95 deg/s RMS; at least 1 are needed"):
+            check_motion(rates)
+
+
+def test_an_accelerometer_that_reads_no_changes_is_named(hexapod, motion):
+    readings = read(motion, Wiring())[KEPT]
+    readings[:, 2, 3:] = readings[:, 2, 3:].mean(axis=0) + 0.1 * (readings[:, 2, 3:] - readings[:, 2, 3:].mean(axis=0))
+    with pytest.raises(
+        CalibrationError, match=r"the accelerometer of IMU 2 reads 0\.\d+ of the expected changes, and at least 0\.2"
+    ):
+        check_places(readings, expected(hexapod, motion)[KEPT])
+
+
+@pytest.mark.parametrize(("angle", "fits"), [(10.0, True), (-10.0, True), (25.0, False), (-25.0, False)])
+def test_an_imu_that_leans_is_named_with_its_angle(hexapod, motion, angle, fits):
+    ideal = np.concatenate([motion.signals[:, 0], motion.signals[:, 1]], axis=2)[KEPT]
+    lean = rotation_of([np.radians(angle), 0.0, 0.0])
+    ideal[:, 6, :3], ideal[:, 6, 3:] = ideal[:, 6, :3] @ lean, ideal[:, 6, 3:] @ lean
+    if fits:
+        check_places(ideal, expected(hexapod, motion)[KEPT])
+    else:
+        with pytest.raises(
+            CalibrationError, match=r"^gravity at IMU 6 is 2[45]\.?\d* deg off the expected direction; at most 15 deg"
+        ):
+            check_places(ideal, expected(hexapod, motion)[KEPT])

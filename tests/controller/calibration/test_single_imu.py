@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from controller.calibration.single_imu import calibrate_imu
+from controller.calibration.single_imu import calibrate_imu, deviations_of, missing_half_axes
 from hil.command_line import main
 from hil.recording.imu_data import COLUMNS
 from plant.errors import CalibrationError
@@ -139,3 +139,26 @@ def test_a_malformed_file_is_refused_by_its_line(tmp_path, text, complaint, caps
     assert main(["calibrate", "imu", str(path), str(tmp_path / "c.toml")]) == 2
     assert complaint in capsys.readouterr().err
     assert not (tmp_path / "c.toml").exists()
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize(("sign", "name"), [(1.0, "+"), (-1.0, "-")])
+def test_the_half_axis_without_a_vector_is_named(axis, sign, name):
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    assert missing_half_axes(axes) == []
+    tilted = sign * np.eye(3)[axis] * 0.74 + np.eye(3)[(axis + 1) % 3] * np.sqrt(1.0 - 0.74**2)
+    others = axes[axes[:, axis] * sign < 0.5]
+    assert missing_half_axes(np.vstack([others, tilted])) == [f"{name}{'xyz'[axis]}"]
+    assert missing_half_axes(np.vstack([others, tilted + 0.02 * sign * np.eye(3)[axis]])) == []
+
+
+def test_the_deviations_of_a_fit_are_those_of_linear_regression():
+    """By the noise: over many straight lines with slope and offset, which are off by as much as is told."""
+    random, x = np.random.default_rng(4), np.linspace(-1.0, 2.0, 12)
+    jacobian, off, told = np.column_stack([np.ones(12), x]), [], []
+    for _ in range(4000):
+        noise = random.normal(0.0, 0.3, 12)
+        fit = np.linalg.lstsq(jacobian, noise, rcond=None)[0]
+        off.append(fit)
+        told.append(deviations_of(jacobian, jacobian @ fit - noise, 10))
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(told), axis=0)), np.std(off, axis=0), rtol=0.05)
