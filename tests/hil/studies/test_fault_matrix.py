@@ -6,7 +6,7 @@ import pytest
 
 from controller.safety.causes import Cause, Reaction
 from hil.command_line import main
-from hil.studies.fault_matrix import CASES, Case, run_matrix, table
+from hil.studies.fault_matrix import CASES, Case, Outcome, run_matrix, table
 
 DOCS = Path(__file__).parents[3] / "docs" / "faults.md"
 
@@ -54,6 +54,15 @@ def test_the_table_in_the_docs_is_of_these_cases():
     for case, row in zip(CASES, rows[2:], strict=True):
         allowed = {Reaction(case.reaction).text, *(Reaction(Cause(each).reaction).text for each in case.also)}
         assert set(row.split(" | ")[2].split(", ")) <= allowed
+
+
+def test_the_table_has_the_median_and_the_greatest_of_each_figure():
+    case = Case("frozen", Cause.IMU_FROZEN, Reaction.GO_ON, 15, 2e-3)
+    told = Outcome(case, {"goes on": 3}, [10, 12, 30], [1e-3, 2e-3, 6e-3], [0.0, 4e-3, 10e-3])
+    rows = [[cell.text for cell in row] for row in table([told]).rows]
+    assert rows == [["frozen", "IMU k is left out: it is frozen", "goes on", "12, 30", "2.00, 6.00", "4.0, 10.0"]]
+    quiet = Outcome(Case("q", Cause.NONE, Reaction.GO_ON, 0, 2e-3), {"goes on": 1}, [], [5e-4], [0.0])
+    assert [cell.text for cell in table([quiet]).rows[0]] == ["q", "-", "goes on", "-", "0.50, 0.50", "-"]
 
 
 def test_the_command_prints_the_table_and_its_status_says_whether_all_is_well(capsys, tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hil.command_line import main
-from hil.studies.sensor_sets import MECHANISMS, SETS, choose_imus, evaluate_sensor_sets, paper_set, table
+from hil.studies.sensor_sets import MECHANISMS, SETS, Outcome, choose_imus, evaluate_sensor_sets, paper_set, reasons, table
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.mechanism import load_spatial
 from plant.mechanism.classification import classify
@@ -116,3 +116,30 @@ def test_bad_input_is_refused_in_a_line(arguments, complaint, capsys):
     assert main(arguments) == 2
     error = capsys.readouterr().err
     assert complaint in error and error.count("\n") == 1
+
+
+def errors(number):
+    names = ("position_rms", "position_max", "rotation_rms", "rotation_max")
+    values = number * np.array([1e-3, 2e-3, np.radians(3.0), np.radians(4.0)])
+    return dict(zip(names, values.tolist(), strict=True))
+
+
+def test_the_table_shows_the_errors_of_the_estimate_and_the_star_of_the_paper():
+    runs = {
+        "compiled": {"estimation": errors(1.0), "tracking": errors(9.0)},
+        "whole": {"estimation": errors(0.5), "tracking": errors(9.0)},
+    }
+    outcomes = [
+        Outcome("a", "4 legs", True, (0, 2, 3, 5), 0.126, "", runs),
+        Outcome("b", "6 legs", False, (0, 1), 0.5, "", {"compiled": {"stopped": "why"}, "whole": runs["whole"]}),
+        Outcome("b", "2 legs", False, (), 0.0, "too few", {}),
+    ]
+    rows = [[cell.text for cell in row] for row in table(outcomes).rows]
+    whole = ["0.50 / 1.50", "1.00 / 2.00"]
+    assert rows == [
+        ["a", "4 legs *", "0235", "0.13", "1.00 / 3.00", "2.00 / 4.00", *whole],
+        ["b", "6 legs", "01", "0.50", "stopped", "", *whole],
+        ["b", "2 legs", "refused", "", "", "", "", ""],
+    ]
+    assert [row[0].text for row in table(outcomes, "b").rows] == ["6 legs", "2 legs"]
+    assert reasons(outcomes) == ["b, 2 legs: too few", "b, 6 legs, compiled: why"]
