@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numba import njit
+from scipy.spatial.transform import Rotation
 
 from controller.estimation.whole_mechanism.filter import (
     accumulate_sample,
@@ -14,11 +15,12 @@ from controller.estimation.whole_mechanism.filter import (
 from controller.estimation.whole_mechanism.imu_errors import ERRORS, distort, error_gradient
 from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, BLOCKS, FILTER_STATE, MOTION_STATES, filter_parameters
 from controller.estimation.whole_mechanism.readings import JOINTS, READINGS_SCRATCH, RIG_ERRORS, TILT, predict_readings
-from controller.rig import sensor_geometry
+from controller.rig import field_of, sensor_geometry
 from controller.settings import FusionSettings, fusion_settings
 from plant.dynamics.imposed_motion import impose
 from plant.errors import UnknownNameError
 from plant.imu import imu_state, load_imu, measure
+from plant.mechanism import Mechanism
 from plant.pose import rotation_angle, skew
 from tests.controller.leg_geometry import rotation_of
 
@@ -172,7 +174,7 @@ class Twin:
         steps = 1e-6 * np.eye(len(self.rig))
         return np.stack([(ideal(step) - ideal(-step)) / 2e-6 for step in steps], axis=2) if len(steps) else np.zeros((7, 6, 0))
 
-    def update(self, samples, used, count, time):
+    def update(self, samples, count, time):
         self.predict(time - self.time)
         self.time = time
         scratch, ideal, at_smooth = np.zeros((), READINGS_SCRATCH), np.zeros((7, 6)), np.zeros((7, 6, MOTION_STATES))
@@ -181,7 +183,7 @@ class Twin:
         predict_readings(self.geometry, self.position, self.rotation, self.motion, False, ideal, at_smooth.copy(), scratch[()])
         by_rig = self.by_rig()
         rows, innovations, variances = [], [], []
-        for k in np.flatnonzero(used):
+        for k in np.flatnonzero(count):
             matrices, back = self.matrices(self.errors[k])
             for sensor, matrix in enumerate(matrices):
                 part = slice(3 * sensor, 3 * sensor + 3)
@@ -197,7 +199,7 @@ class Twin:
                 row[:, 18 + 7 * self.n :] = matrix @ back @ by_rig[k, part]
                 rows.append(row)
                 innovations.append(samples[k, part] - matrix @ x - self.errors[k, part] - row[:, 18 + 7 * self.n :] @ self.rig)
-                variances += [self.p["variance"][sensor] / count] * 3
+                variances += [self.p["variance"][sensor] / count[k]] * 3
         h, innovation = np.vstack(rows), np.concatenate(innovations)
         gain = np.linalg.solve(h @ self.covariance @ h.T + np.diag(variances), h @ self.covariance).T
         change = gain @ innovation
@@ -223,7 +225,7 @@ def test_taken_bit_by_bit_it_equals_its_dense_twin(hexapod, errors, rig, toleran
     random = np.random.default_rng(4)
     samples = motion.signals + random.normal(0.0, 1.0, motion.signals.shape) * np.array([0.002, 0.02, 0.0])[:, None, None]
     used = np.ones((len(samples), 7), np.int64)
-    used[101:201, 2] = used[151:251, 6] = 0
+    used[103:202, 2] = used[151:251, 6] = 0
     settings = FusionSettings(accelerometer_bias_sigma=0.1, scale_sigma=0.02, alignment_sigma=0.02, axes_sigma=0.02)
     parameters = filter_parameters(settings, RATE_HZ, errors, None)
     if rig:
@@ -247,9 +249,10 @@ def test_taken_bit_by_bit_it_equals_its_dense_twin(hexapod, errors, rig, toleran
         accumulate_sample(state[()], samples[i], used[i], i / RATE_HZ)
         step_filter(parameters[()], geometry, state[()])
         if i % window == 0:
-            block = samples[i - window + 1 : i + 1].mean(axis=0)
-            mean = np.concatenate([block[0], block[1]], axis=1)
-            twin.update(mean, used[i], window, (i - (window - 1) / 2.0) / RATE_HZ)
+            taken, block = used[i - window + 1 : i + 1], samples[i - window + 1 : i + 1]
+            count = taken.sum(axis=0)
+            mean = np.einsum("nk,nski->ksi", taken, block[:, :2]).reshape(7, 6) / np.maximum(count, 1)[:, None]
+            twin.update(mean, count, (i - (window - 1) / 2.0) / RATE_HZ)
         if i % window == window - 1 and i > window:
             # The update that began four cycles ago is complete.
             assert state["row"] == -1
@@ -322,6 +325,98 @@ def test_every_cycle_of_a_window_takes_its_share(hexapod):
         rows.append(int(state["row"]))
     assert rows[4:9] == [0, 9, 20, 31, -1]
     assert rows[9:14] == rows[4:9]
+
+
+@pytest.mark.parametrize("off", [0.02, -0.02, 2.0, -2.0])
+def test_the_heading_is_taken_as_a_kalman_filter_takes_it(hexapod, off):
+    """On an inclined base, while the platform turns; against a dense update with a Jacobian of differences."""
+    random, up, magnetic = np.random.default_rng(8), np.array([0.2, -0.1, 0.9]) / np.sqrt(0.86), np.array([12.0, 15.0, -40.0])
+    mechanism = Mechanism.from_legs(
+        hexapod.base_joints, hexapod.platform_joints, up_in_base=up, home=hexapod.home, limits={"stroke": (-0.06, 0.06)},
+        plant={**hexapod.plant, "gravity": -9.81 * up, "magnetic_field": magnetic},
+    )  # fmt: skip
+    parameters = filter_parameters(fusion_settings(mechanism), RATE_HZ, "gyroscopes", None, field=field_of(mechanism))
+    parameters["heading_variance"], n = 1e-4, int(parameters["states"])
+    state, rotation = np.zeros((), FILTER_STATE), rotation_of([0.2, -0.1, 0.3])
+    start_filter(parameters[()], state[()], 0.0, mechanism.home.position, rotation, np.array([0.1, -0.2, 0.3, 1.0, -2.0, 1.5]))
+    geometry, mixed = sensor_geometry(mechanism)[()], random.normal(size=(n, n))
+    state["covariance"][:n, :n] = 1e-4 * mixed @ mixed.T / n
+    state["heading_offset"], offset_variance = 0.015, state["covariance"][n - 1, n - 1]
+    state["field"], state["field_time"], state["field_used"] = rotation.T @ rotation_of(off * up) @ magnetic, 0.005, 1
+    without = state.copy()
+    without["field_used"] = 0
+    for each in (state, without):
+        for i in range(1, 10):
+            # No IMU is used, so that nothing but the field is taken.
+            accumulate_sample(each[()], np.zeros((3, 7, 3)), np.zeros(7, np.int64), i / RATE_HZ)
+            step_filter(parameters[()], geometry, each[()])
+    assert state["row"] == without["row"] == -1 and state["field_used"] == 0
+    predicted, spread = without["rotation"], without["covariance"][:n, :n]
+    # What the offset is grows less sure, by as much as at the start in 100 s.
+    growth = float(parameters["offset_variance"]) * without["time"] / 100.0
+    assert spread[n - 1, n - 1] == pytest.approx(offset_variance + growth, rel=1e-12)
+
+    north, east = field_of(mechanism).vectors[1], np.cross(up, field_of(mechanism).vectors[1])
+    ahead = rotation_of(-(state["field_time"] - without["time"]) * without["motion"][1])
+
+    def heading(error):
+        seen = rotation_of(-error[:3]) @ ahead @ rotation_of(error[3] * up) @ magnetic
+        return np.arctan2(east @ seen, north @ seen)
+
+    at = np.array([0.0, 0.0, 0.0, 0.015])
+    row = np.zeros(n)
+    row[[3, 4, 5, n - 1]] = [(heading(at + h) - heading(at - h)) / 2e-6 for h in 1e-6 * np.eye(4)]
+    seen = predicted @ state["field"]
+    innovation, variance = np.arctan2(east @ seen, north @ seen) - heading(at), row @ spread @ row + 1e-4
+    innovation = np.clip(innovation, -3.0 * np.sqrt(variance), 3.0 * np.sqrt(variance))
+    assert (abs(innovation) == 3.0 * np.sqrt(variance)) == (abs(off) > 1.0)
+    gain = spread @ row / variance
+    change = gain * innovation
+    found = [
+        state["position"] - without["position"], Rotation.from_matrix(state["rotation"] @ predicted.T).as_rotvec(),
+        (state["motion"] - without["motion"]).ravel(), (state["errors"] - without["errors"])[:, :3].ravel(),
+        [state["heading_offset"] - 0.015],
+    ]  # fmt: skip
+    np.testing.assert_allclose(np.concatenate(found), change, rtol=0.0, atol=0.02 * np.abs(change).max())
+    left = spread - np.outer(gain, row @ spread)
+    np.testing.assert_allclose(state["covariance"][:n, :n], left, rtol=0.0, atol=0.02 * np.abs(spread).max())
+
+
+def test_what_is_published_is_carried_to_the_present_by_its_motion():
+    random, state = np.random.default_rng(9), np.zeros((), FILTER_STATE)
+    state["published_time"], state["published_rotation"] = 2.0, rotation_of([0.3, -0.2, 0.5])
+    state["published_position"], motion = random.normal(size=3), random.normal(size=(4, 3))
+    state["published_motion"] = motion
+
+    def at(time):
+        pose = np.zeros(3), np.zeros((3, 3)), np.zeros(6), np.zeros(6)
+        extrapolate(state[()], time, *pose)
+        return pose
+
+    position, rotation, twist, acceleration = at(2.3)
+    np.testing.assert_allclose(position, state["published_position"] + 0.3 * motion[0] + 0.045 * motion[2], atol=1e-14)
+    turned = rotation_of(0.3 * motion[1] + 0.045 * motion[3]) @ state["published_rotation"]
+    np.testing.assert_allclose(rotation, turned, atol=1e-12)
+    np.testing.assert_allclose(twist, np.concatenate([motion[0] + 0.3 * motion[2], motion[1] + 0.3 * motion[3]]), atol=1e-14)
+    np.testing.assert_allclose(acceleration, motion[2:].ravel(), atol=1e-14)
+
+
+def test_a_window_is_the_mean_of_the_samples_of_each_imu_that_were_used(hexapod):
+    random, parameters = np.random.default_rng(10), filter_parameters(FusionSettings(), RATE_HZ, "accelerometers", None)
+    state, geometry = np.zeros((), FILTER_STATE), sensor_geometry(hexapod)[()]
+    start_filter(parameters[()], state[()], 0.0, hexapod.home.position, np.eye(3), np.zeros(6))
+    for window in range(2):
+        samples, used = random.normal(size=(5, 3, 7, 3)), random.integers(0, 2, (5, 7))
+        used[:, 0], used[:, 6] = 0, 1
+        for i in range(5):
+            accumulate_sample(state[()], samples[i], used[i], (5 * window + i) / RATE_HZ)
+            step_filter(parameters[()], geometry, state[()])
+        np.testing.assert_array_equal(state["sample_used"], used.sum(axis=0))
+        for imu in range(1, 7):
+            if used[:, imu].any():
+                mean = samples[used[:, imu] > 0][:, :2, imu].mean(axis=0).ravel()
+                np.testing.assert_allclose(state["sample"][imu], mean, rtol=0.0, atol=1e-14)
+        assert state["time"] == pytest.approx((5 * window + 2) / RATE_HZ)
 
 
 def test_an_unknown_block_of_errors_is_refused():
