@@ -1,5 +1,6 @@
 """The cycle: from raw IMU data to commands, with every set of IMUs that it accepts, bit by bit the same again."""
 
+import re
 from itertools import combinations
 
 import numba
@@ -9,6 +10,7 @@ from numba.core.runtime import _nrt_python, rtsys
 from scipy.spatial.transform import Rotation
 
 from controller import cycle as compiled
+from controller.calibration.file import Calibration
 from controller.cycle import STATE, cycle_parameters
 from controller.direct_kinematics import solve
 from controller.imu_set import check_imus
@@ -18,7 +20,7 @@ from controller.settings import ControlSettings, FusionSettings, SafetySettings,
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import InputError
 from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER, imu_state, load_imu, measure
-from plant.mechanism import Mechanism
+from plant.mechanism import Mechanism, load_in_space
 from plant.pose import Pose
 from plant.wiring import ALL_IMUS
 from tests.controller.cycles import cycle, refine
@@ -603,6 +605,98 @@ def test_settings_reach_the_cycle(hexapod):
     assert parameters["rig"]["period"] == 1.0 / 500.0
     # A white density d over samples at a rate f has the variance d^2 f / 2.
     np.testing.assert_allclose(parameters["legs"]["rate_variance"], FusionSettings().gyroscope_noise ** 2 * 250.0)
+
+
+def test_calibration_and_choices_reach_the_stages(hexapod):
+    settings = control_settings(hexapod), fusion_settings(hexapod)
+    known = np.diag(np.arange(1.0, 148.0))
+    calibration = Calibration(tilt=np.array([0.02, -0.03]), covariance=known, floor=np.array([3e-3, 6e-3]))
+    choices = {"magnetometer": True, "section_5": True, "command_delay": 0.003, "whole": "alignments"}
+    found = cycle_parameters(hexapod, RATE_HZ, *settings, calibration=calibration, **choices)
+    up = rotation_of([0.02, -0.03, 0.0]) @ [0.0, 0.0, 1.0]
+    np.testing.assert_allclose(found["rig"]["vectors_in_base"][0], up, atol=1e-12)
+    np.testing.assert_allclose(found["rig"]["sensors"]["up_in_base"][0], up, atol=1e-12)
+    filtered = found["mechanism"]["filter"]
+    np.testing.assert_array_equal(filtered["prior"][:147, :147], known)
+    np.testing.assert_allclose(filtered["floor"], [3e-6, 12e-6], rtol=1e-12)
+    assert (int(filtered["errors"]), int(filtered["heading"]), float(found["load"]["command_delay"])) == (15, 1, 0.003)
+    assert (int(found["heading"]["active"]), int(found["pose"]["section_5"])) == (1, 1)
+    plain = cycle_parameters(hexapod, RATE_HZ, *settings)
+    assert (int(plain["mechanism"]["filter"]["errors"]), int(plain["mechanism"]["filter"]["heading"])) == (0, 0)
+    assert (int(plain["heading"]["active"]), int(plain["pose"]["section_5"]), float(plain["load"]["command_delay"])) == (
+        0,
+        0,
+        0.0,
+    )
+    planar = load_in_space("planar-3rpr")
+    found = cycle_parameters(planar, RATE_HZ, control_settings(planar), fusion_settings(planar))
+    assert found["imus"]["present"].tolist() == [1, 1, 1, 0, 0, 0, 1]
+
+
+@pytest.mark.parametrize(("gravity", "told"), [(0.101, False), (0.099, True)])
+def test_too_little_gravity_is_refused(hexapod, gravity, told):
+    mechanism = variant(hexapod, gravity=np.array([0.0, 0.0, -gravity]))
+    if not told:
+        assert parameters_of(mechanism)["rig"]["sensors"]["gravity"] == pytest.approx(gravity)
+        return
+    with pytest.raises(
+        InputError, match=re.escape("gravity is 0.099 m/s2; the accelerometers need at least 0.1 to tell a direction")
+    ):
+        parameters_of(mechanism)
+
+
+# ------------------------------------------------------------------------------------------------------- around the cycle
+
+
+def test_missed_periods_are_counted_and_forgotten_with_the_next_cycle():
+    state = np.zeros((), STATE)
+    state["time"]["cycle"] = 7
+    for missed, cycle_number in ((3, 10), (0, 10), (2, 12)):
+        compiled.skip_periods(state, missed)
+        assert (int(state["time"]["cycle"]), int(state["time"]["missed"])) == (cycle_number, missed)
+
+
+def test_every_stage_that_runs_is_timed_and_no_other(hexapod):
+    parameters, signals = parameters_of(hexapod), static_signals(hexapod, hexapod.home.position, np.eye(3))
+    state, marks, stages = np.zeros((), STATE), np.zeros((), compiled.MARKS)[()], compiled.CycleStage
+    for first, last, timed in (
+        (stages.SCREENING, stages.LEGS, [0]),
+        (stages.LEGS, stages.POSE, [1, 3]),
+        (stages.POSE, stages.REFINEMENT, [4]),
+        (stages.REFINEMENT, stages.CONTROL, [5, 6]),
+        (stages.CONTROL, stages.END, [7]),
+    ):
+        marks["ns"] = -1
+        assert state["time"]["cycle"] == 0
+        compiled.run_stages(parameters, state, signals, resting(np.full(6, 0.394)), marks, first, last)
+        assert np.flatnonzero(marks["ns"] >= 0).tolist() == timed
+    # After the control, the cycle is over.
+    assert state["time"]["cycle"] == 1
+
+
+def test_the_next_reference_is_prepared_after_a_cycle_unless_it_has_failed(hexapod):
+    parameters, signals = parameters_of(hexapod, hold=0.02), static_signals(hexapod, hexapod.home.position, np.eye(3))
+    segments = resting(leg_lengths(hexapod, hexapod.home.position, np.eye(3)))
+    segments[:, 0, 2] = 0.01
+    state, alone = np.zeros((), STATE), np.zeros((), STATE)
+    for _ in range(100):
+        run(parameters, signals, segments, 1, alone)
+        run(parameters, signals, segments, 1, state)
+        # Prepared or not, a cycle has the same reference.
+        np.testing.assert_array_equal(state["reference"]["motion"], alone["reference"]["motion"])
+        np.testing.assert_array_equal(state["pid"]["command"], alone["pid"]["command"])
+        before = state["reference"]["motion"].copy()
+        compiled.prepare_next(parameters, state, segments)
+        assert state["safety"]["events"]["count"] == 0
+        assert state["reference"]["due_cycle"] == state["time"]["cycle"] + 1
+    assert state["safety"]["mode"] == Mode.RUNNING
+    np.testing.assert_allclose(state["reference"]["motion"][:, 0] - before[:, 0], 0.01 * PERIOD_S, rtol=1e-9)
+    state["safety"]["mode"], before = Mode.FAULT, state["reference"].copy()
+    state["safety"]["events"]["count"] = 3
+    state["time"]["cycle"] += 10
+    compiled.prepare_next(parameters, state, segments)
+    assert state["reference"].tobytes() == before.tobytes()
+    assert state["safety"]["events"]["count"] == 0
 
 
 def test_a_turn_of_the_whole_world_about_the_vertical_turns_the_estimate_with_it(hexapod):
