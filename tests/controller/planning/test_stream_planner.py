@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.planner import count_violations
-from controller.planning.segments import LENGTH, START, evaluate_reference
+from controller.planning.segments import LENGTH, START, evaluate_reference, stop_phases
 from controller.planning.stream import (
     END_PLANNER,
     LATEST,
@@ -26,7 +26,7 @@ from controller.planning.stream import (
     stream_cause,
     take_plan,
 )
-from controller.planning.stream_planner import Plan, StreamPlanner, TargetRefusedError
+from controller.planning.stream_planner import Plan, StreamPlanner, TargetRefusedError, _stoppable
 from controller.planning.target import load_target
 from controller.safety.causes import Cause
 from hil.loop.records import shared_array
@@ -438,3 +438,20 @@ def test_a_plan_meets_an_accelerating_target_where_it_will_be(hexapod, ahead, si
     np.testing.assert_allclose(state[:, 1], rates, rtol=0.0, atol=3e-4)
     evaluate_reference(plan.segments, at + 0.07, np.zeros(6, np.int64), state)
     assert (np.abs(state[:, 1]) < np.abs(rates)).all()
+
+
+def test_from_the_speeds_that_a_leg_may_arrive_with_it_stops_within_the_way_that_is_left():
+    room = np.array([1e-7, 1e-5, 1e-4, 1e-3, 0.0075, 0.0225, 0.06, 0.12])
+    speeds = _stoppable(room, 3.0, 60.0)
+    for way, speed in zip(room, speeds, strict=True):
+        for sign in (-1.0, 1.0):
+            length, rate = 0.0, sign * speed
+            acceleration = 0.0
+            for jerk, duration in stop_phases(rate, acceleration, 3.0, 60.0):
+                length += duration * (rate + duration * (acceleration / 2.0 + duration * jerk / 6.0))
+                rate += duration * (acceleration + duration * jerk / 2.0)
+                acceleration += duration * jerk
+            assert length == pytest.approx(sign * way, rel=1e-9) and rate == pytest.approx(0.0, abs=1e-12)
+    # 7.5 mm from 0.15 m/s, 22.5 mm from 0.3 m/s.
+    np.testing.assert_allclose(speeds[4:6], [0.15, 0.3], rtol=1e-12)
+    assert _stoppable(np.array([-1e-3, 0.0]), 3.0, 60.0).tolist() == [0.0, 0.0]
