@@ -674,6 +674,32 @@ def test_every_stage_that_runs_is_timed_and_no_other(hexapod):
     assert state["time"]["cycle"] == 1
 
 
+def test_without_a_pose_the_cycle_is_counted_and_only_a_run_that_moves_fails(hexapod):
+    signals = static_signals(hexapod, hexapod.home.position, np.eye(3))
+    lengths = leg_lengths(hexapod, hexapod.home.position, np.eye(3))
+    blind = np.full((3, 7, 3), np.nan)
+    parameters, state = parameters_of(hexapod, hold=0.02), np.zeros((), STATE)
+    for k in range(3):
+        assert cycle(parameters, state, blind, resting(lengths)) == Cause.POSE_LOST
+        assert (int(state["time"]["cycle"]), state["safety"]["mode"]) == (k + 1, Mode.IDLE)
+    # The filters settle first.
+    for _ in range(160):
+        cycle(parameters, state, signals, resting(lengths))
+    run(parameters, signals, resting(lengths), 100, state)
+    assert state["safety"]["mode"] == Mode.RUNNING
+    assert cycle(parameters, state, blind, resting(lengths)) == Cause.POSE_LOST
+    assert (int(state["time"]["cycle"]), state["safety"]["mode"]) == (264, Mode.FAULT)
+    assert state["safety"]["stop"]["cause"] == Cause.POSE_LOST
+    # From here on nothing is measured: the commands come to rest, and no cause is told again.
+    state["pid"]["command"], pose = [0.01, -0.01, 0.001, -0.001, 0.0, 0.02], state["pose"].copy()
+    assert cycle(parameters, state, signals, resting(lengths)) == Cause.NONE
+    step = hexapod.limits.acceleration * PERIOD_S
+    expected = [0.01 - step, step - 0.01, 0.0, 0.0, 0.0, 0.02 - step]
+    np.testing.assert_allclose(state["pid"]["command"], expected, rtol=0.0, atol=1e-15)
+    assert state["pose"].tobytes() == pose.tobytes()
+    assert state["time"]["cycle"] == 265
+
+
 def test_the_next_reference_is_prepared_after_a_cycle_unless_it_has_failed(hexapod):
     parameters, signals = parameters_of(hexapod, hold=0.02), static_signals(hexapod, hexapod.home.position, np.eye(3))
     segments = resting(leg_lengths(hexapod, hexapod.home.position, np.eye(3)))
