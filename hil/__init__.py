@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hil.calibration.data import Knowledge
-    from hil.calibration.drive import calibrate_recordings, calibrate_rig
+    from hil.calibration.procedure import calibrate_recordings, calibrate_rig
     from hil.realtime.scheduling import RealTimeSettings
     from hil.recording.replay import replay
     from hil.reports.run import write_report
@@ -43,7 +43,7 @@ __all__ = [
 
 _HOMES = {
     "hil.calibration.data": ("Knowledge",),
-    "hil.calibration.drive": ("calibrate_recordings", "calibrate_rig"),
+    "hil.calibration.procedure": ("calibrate_recordings", "calibrate_rig"),
     "hil.realtime.scheduling": ("RealTimeSettings",),
     "hil.recording.replay": ("replay",),
     "hil.reports.run": ("write_report",),

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from controller.direct_kinematics.geometry import SCRATCH
 from controller.direct_kinematics.legs_alone import orthonormalise, pose_from_legs, second_pose_from_legs
 from controller.direct_kinematics.legs_and_attitude import pose_from_rotation, pose_from_vector
-from controller.direct_kinematics.paper import section_3_1_1, section_4
 from controller.direct_kinematics.refinement import move_pose, normal_equations, solve_normal_equations
+from controller.direct_kinematics.shared_joints import section_3_1_1, section_4
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import invert_cholesky
 from plant.compiled import Record, kernel, record_dtype

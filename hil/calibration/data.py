@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.calibration.at_rest import LEAST_POSES, Prior, RestCalibration, Rests, calibrate_at_rest, fit_pose
-from controller.calibration.checks import check_alive, check_all_along, check_motion, check_places, check_spread
 from controller.calibration.file import Calibration
+from controller.calibration.mounting_checks import check_alive, check_all_along, check_motion, check_places, check_spread
 from controller.direct_kinematics import poses_from_lengths
 from controller.estimation.whole_mechanism.readings import readings_along
 from controller.rig import sensor_geometry

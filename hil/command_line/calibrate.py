@@ -51,7 +51,7 @@ def gough_calibrate_rig(options: Namespace) -> None:
     from controller.calibration.at_rest import Prior
     from controller.calibration.file import save_calibration
     from hil.calibration.data import Knowledge
-    from hil.calibration.drive import calibrate_recordings, calibrate_rig
+    from hil.calibration.procedure import calibrate_recordings, calibrate_rig
 
     if not 0.0 < options.tilt < 45.0:
         raise InputError(f"--tilt is {options.tilt:g} deg; it must be between 0 and 45")

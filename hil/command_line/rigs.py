@@ -89,7 +89,7 @@ def gough_emulate(options: Namespace) -> None:
     The FMU plant, drives and IMUs run on a clock of their own, behind a bus, until Ctrl-C.
     """
     keep_to_one_thread()
-    from hil.runs.emulator import emulate
+    from hil.runs.emulator_process import emulate
 
     config = cli.config_of(options, EmulatorConfig, simulated=cli.config_of(options, SimulationConfig))
     emulate(config, cli.config_of(options, RealTimeSettings), lambda text: print(text, flush=True))
@@ -104,7 +104,7 @@ def gough_emulate(options: Namespace) -> None:
 def gough_inject(options: Namespace) -> None:
     """Inject a fault into an emulated rig that is running, or ask for its state."""
     from hil.rigs.emulation import FaultKind
-    from hil.runs.emulator import ask
+    from hil.runs.emulator_process import ask
 
     if options.list:
         table = Table("fault", "number", "size by default", "")

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from controller.cycle import CycleStage, hear_rig, prepare_next, react, run_stages, skip_periods
 from controller.estimation.whole_mechanism.filter import extrapolate_covariance
 from controller.least_squares import factor_cholesky, invert_cholesky
-from controller.planning.stream import stream_cause, take_plan
+from controller.planning.plan_handover import stream_cause, take_plan
 from controller.reference import motion_cycle
 from controller.safety.causes import EVENT_SLOTS, REACTION, Cause, Request
 from controller.safety.stop import has_stopped, ramp_down

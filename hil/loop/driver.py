@@ -14,7 +14,7 @@ from numba.core import event
 from numpy.typing import NDArray
 
 from controller.cycle import CycleStage, run_stages
-from controller.planning.stream import STREAM_READER
+from controller.planning.plan_handover import STREAM_READER
 from controller.safety.causes import Cause, Mode
 from hil.loop.compiled_loop import begin_cycle, end_cycle, exchange_fmu, periods_passed, process_feedback, run_loop
 from hil.loop.records import LINK_SIZE, STAGES, WORK, Stage, TargetStream

@@ -196,6 +196,7 @@ class Recording:
     arrays: dict[str, Record]  # what a replay needs, by name
     records: Record  # (N,), dtype `RECORD`
     events: list[tuple[int, str]]  # cycle and text of each
+    event_times_ns: list[int]  # Unix time of each [ns]
     epoch_ns: int  # Unix time of the first deadline [ns]
     complete: bool  # else it was not closed, and ends with its last whole chunk
     path: Path
@@ -221,6 +222,7 @@ def read(path: Path | str) -> Recording:
     arrays: dict[str, Record] = {}
     cycles = bytearray()
     events: list[tuple[int, str]] = []
+    event_times_ns: list[int] = []
     topics: dict[int, str] = {}
     digests: dict[str, str] = {}
     layout, began, complete = "", 0, False
@@ -246,6 +248,7 @@ def read(path: Path | str) -> Recording:
             elif isinstance(item, Message):
                 text = item.data[len(_LITTLE_ENDIAN_CDR) :]
                 events.append((int.from_bytes(text[:8], "little", signed=True), text[12:-1].decode()))
+                event_times_ns.append(item.log_time)
     except FileNotFoundError:
         raise RecordingError(f"there is no recording at {path}") from None
     except IsADirectoryError:
@@ -266,7 +269,7 @@ def read(path: Path | str) -> Recording:
         )
     records: Record = np.frombuffer(cycles, RECORD)
     epoch = began - int(records["time_ns"][0]) if len(records) else 0
-    return Recording(config, arrays, records, events, epoch, complete, Path(path))
+    return Recording(config, arrays, records, events, event_times_ns, epoch, complete, Path(path))
 
 
 def _items(path: Path | str) -> Iterator[Any]:
@@ -283,8 +286,8 @@ def repair(path: Path) -> bool:
     try:
         recorder = Recorder(mended, {"config": recording.config, **recording.arrays}, recording.epoch_ns)
         recorder.write_cycles(recording.records)
-        for cycle, text in recording.events:
-            recorder.write_event(cycle, text)
+        for (cycle, text), time_ns in zip(recording.events, recording.event_times_ns, strict=True):
+            recorder.write_event(cycle, text, time_ns)
         recorder.close()
         mended.replace(path)
     finally:

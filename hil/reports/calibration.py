@@ -10,7 +10,7 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from hil.calibration.assessment import STAGES, weak_words
-from hil.calibration.drive import RigCalibration
+from hil.calibration.procedure import RigCalibration
 from hil.reports import view
 from hil.reports.calibration_picture import KINDS, accuracy_svg
 from hil.reports.page import AXIS_NAMES, COLORS, FAINT, INK, LAYOUT, LEGEND, figure_html, overview, place, write_page

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.inverse_kinematics import leg_lengths
-from controller.planning.stream import END_PLANNER, STREAM
+from controller.planning.plan_handover import END_PLANNER, STREAM
 from controller.planning.stream_planner import StreamPlanner
 from controller.safety.arming import describe_obstacle
 from controller.safety.causes import Cause, Reaction

@@ -1,7 +1,7 @@
 """Streamed targets: poses arrive as UDP datagrams, about 100 a second, and a process of its own plans how to follow them.
 
     sender --UDP--> receiver   checks each pose, plans, writes into shared memory and never waits for the loop
-                      loop     takes the plans as they come (see `controller.planning.stream`)
+                      loop     takes the plans as they come (see `controller.planning.plan_handover`)
 
 A datagram of version 1 is little-endian and packed, 78 bytes: `GGHT`, version (2 bytes), sequence number (4), time of the pose
 on the sender's clock [ns] (8), displacement from home x, y, z [m] and rotation from home as a unit quaternion, w first (7
@@ -23,7 +23,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from controller.planning.stream import CAUSE, CYCLE, END_PLANNER, SEEN, STREAM, TAKEN, fail_stream, note_sample, publish_plan
+from controller.planning.plan_handover import (
+    CAUSE,
+    CYCLE,
+    END_PLANNER,
+    SEEN,
+    STREAM,
+    TAKEN,
+    fail_stream,
+    note_sample,
+    publish_plan,
+)
 from controller.planning.stream_planner import Plan, StreamPlanner, TargetRefusedError
 from controller.planning.target import Target
 from controller.safety.causes import Cause

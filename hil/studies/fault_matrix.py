@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from controller.inverse_kinematics import leg_lengths
-from controller.planning.stream import STREAM, note_sample, rest
+from controller.planning.plan_handover import STREAM, note_sample, rest
 from controller.planning.stream_planner import StreamPlanner
 from controller.safety.causes import Cause, DriveState, Mode, Reaction, Request
 from hil.loop.records import RECORD, Link, StopRequest

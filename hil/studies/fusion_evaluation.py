@@ -1,6 +1,6 @@
 """Evaluation of the whole-mechanism filter after a self-calibration from raw IMUs, beside the refined pose.
 
-Every seed is a rig of its own, which is calibrated (`hil.calibration.drive`) and then moved by `plant.dynamics.imposed_motion`.
+Every seed is a rig of its own, calibrated by `hil.calibration.procedure` and then moved by `plant.dynamics.imposed_motion`.
 """
 
 from collections import defaultdict
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from controller.calibration.at_rest import Prior
 from controller.cycle import STATE
 from hil.calibration.data import Knowledge
-from hil.calibration.drive import calibrate_rig
+from hil.calibration.procedure import calibrate_rig
 from hil.progress import Progress, in_parts
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import simulate

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from plant.dynamics.legs import SX, Condition
+from plant.dynamics.legs_and_actuators import SX, Condition
 from plant.dynamics.variables import Variable, VariableTable
 
 Values = dict[str, SX]

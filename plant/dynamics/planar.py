@@ -7,7 +7,7 @@ of {1}, and its normal is the first axis of every leg's joint. The joints bear t
 import casadi as ca
 
 from plant.dynamics.assembly import Dynamics, Values, assemble, variable_symbols
-from plant.dynamics.legs import (
+from plant.dynamics.legs_and_actuators import (
     SX,
     Condition,
     actuators_at,

@@ -8,7 +8,7 @@ kinetic energy `T(s, s')` and the potential `V(s)` give `M_s s'' + h = F`. With 
 import casadi as ca
 
 from plant.dynamics.assembly import Dynamics, Values, assemble, variable_symbols
-from plant.dynamics.legs import (
+from plant.dynamics.legs_and_actuators import (
     SX,
     Condition,
     actuators_at,

@@ -9,9 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controller.inverse_kinematics import leg_lengths
-from controller.planning.planner import count_violations
-from controller.planning.segments import LENGTH, START, evaluate_reference, stop_phases
-from controller.planning.stream import (
+from controller.planning.plan_handover import (
     END_PLANNER,
     LATEST,
     PLAN_SEGMENTS,
@@ -26,6 +24,8 @@ from controller.planning.stream import (
     stream_cause,
     take_plan,
 )
+from controller.planning.planner import count_violations
+from controller.planning.segments import LENGTH, START, evaluate_reference, stop_phases
 from controller.planning.stream_planner import Plan, StreamPlanner, TargetRefusedError, _stoppable
 from controller.planning.target import load_target
 from controller.safety.causes import Cause

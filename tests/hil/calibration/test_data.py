@@ -9,7 +9,7 @@ from controller.calibration.file import Calibration
 from controller.inverse_kinematics import leg_lengths
 from hil.calibration import data as calibration_data
 from hil.calibration.data import CalibrationData, Knowledge, find_rests, is_long
-from hil.calibration.drive import _every_cycle, run_open
+from hil.calibration.procedure import _every_cycle, run_open
 from hil.loop.records import RECORD
 from hil.runs.config import SimulationConfig
 from plant.errors import CalibrationError

@@ -190,7 +190,7 @@ def test_a_filter_that_is_relied_upon_from_the_first_cycle_is_told(tmp_path):
 def test_a_mended_file_has_everything_up_to_the_cut_at_its_time(tmp_path):
     records, events = eventful_records()
     path = written(tmp_path / "run.mcap", records[:5], records[5:])
-    whole, content = read(path), path.read_bytes()
+    whole, content, event_times = read(path), path.read_bytes(), [at for at, _, _ in messages(path, "/event")]
     assert not repair(path) and path.read_bytes() == content
     # Within the index at the end of the file.
     path.write_bytes(content[: content.rindex(b"gough/Event")])
@@ -203,6 +203,7 @@ def test_a_mended_file_has_everything_up_to_the_cut_at_its_time(tmp_path):
     assert mended.epoch_ns == whole.epoch_ns == EPOCH_NS and mended.config == whole.config
     assert mended.arrays["parameters"].tobytes() == whole.arrays["parameters"].tobytes()
     assert [at for at, _, _ in messages(path, "/cycle")] == (EPOCH_NS + records["time_ns"]).tolist()
+    assert [at for at, _, _ in messages(path, "/event")] == event_times == mended.event_times_ns
 
 
 # ---------------------------------------------------------------------------------------------------------------- the recorder

@@ -21,7 +21,7 @@ from hil.rigs.emulation import (
     sample,
 )
 from hil.runs.config import EmulatorConfig, SimulationConfig
-from hil.runs.emulator import _rig_of
+from hil.runs.emulator_process import _rig_of
 from plant.errors import InputError, UnknownNameError
 from plant.mechanism import load_spatial
 from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS

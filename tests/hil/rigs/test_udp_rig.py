@@ -54,7 +54,7 @@ from hil.rigs.udp.link import (
 )
 from hil.rigs.udp.rig import UdpRig
 from hil.runs.config import EmulatorConfig, SimulationConfig
-from hil.runs.emulator import _rig_of
+from hil.runs.emulator_process import _rig_of
 from plant.compiled import kernel
 from plant.errors import InputError
 

@@ -19,7 +19,7 @@ from hil.recording.mcap import read
 from hil.recording.replay import replay
 from hil.rigs.canopen.settings import DEFAULT_FILE
 from hil.rigs.udp.emulator import WATCHDOG_CODE
-from hil.runs.emulator import BusyError, ask
+from hil.runs.emulator_process import BusyError, ask
 from plant.errors import GoughError
 from plant.truth import TRUTH_LENGTHS
 

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from controller.inverse_kinematics import leg_lengths
-from controller.planning.segments import evaluate_reference
-from controller.planning.stream import (
+from controller.planning.plan_handover import (
     CAUSE,
     CYCLE,
     END_PLANNER,
@@ -25,6 +24,7 @@ from controller.planning.stream import (
     stream_cause,
     take_plan,
 )
+from controller.planning.segments import evaluate_reference
 from controller.planning.stream_planner import Plan, StreamPlanner
 from controller.planning.target import load_target
 from controller.safety.causes import Cause

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from controller.calibration.file import Calibration
-from hil.calibration.drive import RigCalibration
+from hil.calibration.procedure import RigCalibration
 from hil.command_line import main
 from plant.mechanism import load_spatial
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from controller.planning.segments import evaluate_reference
-from controller.planning.stream import (
+from controller.planning.plan_handover import (
     CYCLE,
     FOLLOWED_SEGMENTS,
     LATEST,
@@ -19,6 +18,7 @@ from controller.planning.stream import (
     stream_cause,
     take_plan,
 )
+from controller.planning.segments import evaluate_reference
 from controller.safety.causes import Cause
 from hil.loop.records import shared_array
 from tests.controller.planning.test_segments import twin

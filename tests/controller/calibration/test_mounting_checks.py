@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from controller.calibration.checks import check_alive, check_all_along, check_motion, check_places, check_spread
+from controller.calibration.mounting_checks import check_alive, check_all_along, check_motion, check_places, check_spread
 from controller.estimation.whole_mechanism.readings import readings_along
 from controller.rig import sensor_geometry
 from plant.dynamics.imposed_motion import impose

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hil.calibration.data import Knowledge
-from hil.calibration.drive import calibrate_recordings, calibrate_rig
+from hil.calibration.procedure import calibrate_recordings, calibrate_rig
 from hil.command_line import main
 from hil.recording.mcap import Recorder
 from hil.runs.config import SimulationConfig
@@ -127,7 +127,7 @@ def test_recordings_without_the_truth_suffice(recorded, tmp_path, capsys):
     ],
 )
 def test_a_rig_that_is_wired_wrongly_is_not_driven_by_its_imus(wiring, words, monkeypatch):
-    monkeypatch.setattr("hil.calibration.drive.simulate", None)
+    monkeypatch.setattr("hil.calibration.procedure.simulate", None)
     with pytest.raises(CalibrationError, match=words):
         calibrate_rig(SimulationConfig(imu="mpu9150", wiring=wiring))
 

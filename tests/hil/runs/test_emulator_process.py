@@ -7,7 +7,7 @@ import pytest
 
 from hil.rigs.emulation import new_emulated
 from hil.runs.config import EmulatorConfig
-from hil.runs.emulator import _Control, _hello
+from hil.runs.emulator_process import _Control, _hello
 from plant.errors import GoughError, InputError
 
 
