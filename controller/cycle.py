@@ -36,10 +36,10 @@ from controller.settings import ControlSettings, FusionSettings, SafetySettings
 from plant.checks import check_rate
 from plant.compiled import Record, filled, kernel, record_dtype
 from plant.errors import InputError
+from plant.imu_wiring import ALL_IMUS
 from plant.mechanism import Mechanism
 from plant.pose import Array
 from plant.stopwatch import now
-from plant.wiring import ALL_IMUS
 
 _LEAST_GRAVITY = 0.1
 

@@ -10,8 +10,8 @@ from controller.inverse_kinematics import sample_workspace
 from controller.rig import RIG, field_of
 from plant.compiled import filled
 from plant.errors import InputError
+from plant.imu_wiring import ALL_IMUS, PLATFORM_IMU
 from plant.mechanism import LEGS, Mechanism, six_rows
-from plant.wiring import ALL_IMUS, PLATFORM_IMU
 
 _LEAST_FIELD = 5.0
 """Least horizontal magnetic field from which a heading can be taken [uT]."""

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from hil.runs.snapshot import Snapshot, read_snapshot, write_snapshot
     from plant.errors import GoughError
     from plant.fmu.settings import Setting
+    from plant.imu_wiring import Wiring
     from plant.mechanism import Mechanism, PlanarMechanism, load_mechanism
-    from plant.wiring import Wiring
 
 __all__ = [
     "GoughError", "Knowledge", "Mechanism", "PlanarMechanism", "RealTimeSettings", "RunState", "RunStoppedError", "Setting",
@@ -55,7 +55,7 @@ _HOMES = {
     "plant.errors": ("GoughError",),
     "plant.fmu.settings": ("Setting",),
     "plant.mechanism": ("Mechanism", "PlanarMechanism", "load_mechanism"),
-    "plant.wiring": ("Wiring",),
+    "plant.imu_wiring": ("Wiring",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

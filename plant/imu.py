@@ -15,8 +15,8 @@ import numpy as np
 from plant.checks import checked_seed
 from plant.compiled import Record, kernel, record_dtype
 from plant.errors import InputError, UnknownNameError
+from plant.imu_wiring import IMU_COUNT, RIGHT_WIRING, Wiring
 from plant.pose import Array, rotation_from_vector
-from plant.wiring import IMU_COUNT, RIGHT_WIRING, Wiring
 
 STANDARD_GRAVITY = 9.80665
 MILLI_G = 1e-3 * STANDARD_GRAVITY

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 from ruckig import ControlInterface, Ruckig, Trajectory
 
 from controller.inverse_kinematics import leg_lengths
+from controller.planning.offline_planner import PREVIEW_S, calculate, count_violations, phases_of, ruckig_input
 from controller.planning.plan_handover import PLAN_SEGMENTS, rest
-from controller.planning.planner import PREVIEW_S, calculate, count_violations, phases_of, ruckig_input
 from controller.planning.segments import LENGTH, START, evaluate_reference, state_after, stop_phases, write_segment
 from controller.safety.causes import Cause
 from plant.compiled import kernel

@@ -10,7 +10,7 @@ from hil.command_line.terminal import deg, mm_deg, progress_bar
 from hil.runs.config import SimulationConfig
 from hil.table import Table
 from plant.errors import InputError
-from plant.wiring import ALL_IMUS, PLATFORM_IMU
+from plant.imu_wiring import ALL_IMUS, PLATFORM_IMU
 
 if TYPE_CHECKING:
     from controller.calibration.file import Calibration

@@ -13,9 +13,9 @@ from hil.reports import view
 from hil.reports.page import AXIS_NAMES, COLORS, FAINT, INK, LAYOUT, LEG_NAMES, LEGEND, figure_html, overview, place, write_page
 from hil.runs.simulation import SimulationResult
 from hil.table import Cell, Table
+from plant.imu_wiring import ALL_IMUS
 from plant.pose import Array, pose_errors
 from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS
-from plant.wiring import ALL_IMUS
 
 _QUANTITIES = (("position", "mm", 1e3), ("rotation", "deg", np.degrees(1.0)))
 _POINTS, _PATH_POINTS = 3000, 600

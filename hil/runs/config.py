@@ -9,7 +9,7 @@ from hil.option import integers, option
 from plant.checks import check_duration, check_rate, checked_seed
 from plant.errors import InputError, UnknownNameError
 from plant.fmu.settings import Setting
-from plant.wiring import ALL_IMUS, RIGHT_WIRING, Wiring
+from plant.imu_wiring import ALL_IMUS, RIGHT_WIRING, Wiring
 
 FUSIONS = {
     "compiled": None,

@@ -12,8 +12,8 @@ from controller.calibration.file import Calibration, load_calibration
 from controller.cycle import STATE, cycle_parameters
 from controller.imu_set import imus_of
 from controller.inverse_kinematics import leg_lengths
+from controller.planning.offline_planner import Reference, plan
 from controller.planning.plan_handover import rest
-from controller.planning.planner import Reference, plan
 from controller.planning.target import Target, load_target
 from controller.safety.causes import Cause
 from controller.safety.stop import describe_end

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from controller.direct_kinematics import poses_from_lengths
-from controller.planning.planner import Reference
+from controller.planning.offline_planner import Reference
 from controller.planning.target import Target
 from controller.safety.causes import Cause
 from hil.loop.records import COMPUTED

@@ -13,9 +13,9 @@ from hil.runs.config import FUSIONS
 from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.imposed_motion import ImposedMotion
 from plant.imu import load_imu, measure
+from plant.imu_wiring import ALL_IMUS
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, pose_errors, rms_figures
-from plant.wiring import ALL_IMUS
 
 CLOSED, REFINED, WHOLE, LEGS_ALONE = range(4)
 """Steps of a fused track: closed form, refined pose, whole-mechanism filter; of times, the leg filters too."""

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from plant.errors import InputError, UnknownNameError
+from plant.imu_wiring import IMU_COUNT as IMU_COUNT
+from plant.imu_wiring import PLATFORM_IMU as PLATFORM_IMU
 from plant.pose import Array, checked_array, numbers
-from plant.wiring import IMU_COUNT as IMU_COUNT
-from plant.wiring import PLATFORM_IMU as PLATFORM_IMU
 
 Causality = Literal["state", "input", "parameter", "output"]
 

@@ -20,9 +20,9 @@ from controller.settings import ControlSettings, FusionSettings, SafetySettings,
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import InputError
 from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER, imu_state, load_imu, measure
+from plant.imu_wiring import ALL_IMUS
 from plant.mechanism import Mechanism, load_in_space
 from plant.pose import Pose
-from plant.wiring import ALL_IMUS
 from tests.controller.cycles import cycle, refine
 from tests.controller.leg_geometry import (
     angle_between,

@@ -9,8 +9,8 @@ from controller.direct_kinematics import solve_batch
 from controller.imu_set import check_imus, imus_of
 from controller.inverse_kinematics import sample_workspace
 from plant.errors import InputError
+from plant.imu_wiring import ALL_IMUS
 from plant.mechanism import Mechanism, load_in_space, load_mechanism
-from plant.wiring import ALL_IMUS
 from tests.controller.leg_geometry import leg_directions, unit
 
 

@@ -15,9 +15,9 @@ from controller.inverse_kinematics import leg_lengths, sample_workspace
 from controller.planning.target import load_target
 from controller.settings import control_settings, fusion_settings
 from plant.errors import InputError
+from plant.imu_wiring import ALL_IMUS
 from plant.mechanism import Mechanism, load_in_space, load_mechanism
 from plant.pose import rotation_from_vector
-from plant.wiring import ALL_IMUS
 from tests.controller.cycles import cycle, find, refine
 from tests.plant.dynamics.planar_bodies import coordinates, frames_at, jacobian, weight_force
 

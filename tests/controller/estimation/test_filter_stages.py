@@ -14,8 +14,8 @@ from controller.rig import MagneticField, field_of
 from controller.settings import FusionSettings, control_settings, fusion_settings
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER
+from plant.imu_wiring import ALL_IMUS
 from plant.mechanism import Mechanism, load_in_space
-from plant.wiring import ALL_IMUS
 from tests.controller.cycles import run_stages
 from tests.controller.leg_geometry import rotation_of, static_signals, unit
 from tests.controller.leg_motion import joint_to_leg

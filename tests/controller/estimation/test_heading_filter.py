@@ -16,8 +16,8 @@ from controller.settings import FusionSettings, SafetySettings, control_settings
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import InputError
 from plant.imu import MAGNETOMETER, imu_state, load_imu, measure
+from plant.imu_wiring import ALL_IMUS
 from plant.mechanism import Mechanism
-from plant.wiring import ALL_IMUS
 from tests.controller.cycles import cycle
 from tests.controller.leg_geometry import UP, angle_between, leg_directions, rotation_of, static_signals
 

@@ -9,8 +9,8 @@ from controller.estimation.imu_health import imu_parameters
 from controller.safety.causes import Cause
 from controller.settings import FusionSettings, SafetySettings, control_settings, fusion_settings
 from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER
+from plant.imu_wiring import ALL_IMUS
 from plant.mechanism import load_in_space
-from plant.wiring import ALL_IMUS
 from tests.controller.cycles import run_stages
 
 RATE_HZ = 500.0

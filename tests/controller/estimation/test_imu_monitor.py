@@ -11,9 +11,9 @@ from controller.estimation.imu_monitor import contradiction, look_at_next
 from controller.inverse_kinematics import inverse_kinematics, sample_workspace
 from controller.settings import SafetySettings, control_settings, fusion_settings
 from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
+from plant.imu_wiring import ALL_IMUS
 from plant.mechanism import load_mechanism
 from plant.pose import Pose, rotation_from_vector
-from plant.wiring import ALL_IMUS
 
 UP = np.array([0.0, 0.0, 1.0])
 DEGREE = np.pi / 180.0

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruckig import ControlInterface, Ruckig, Trajectory
 
-from controller.planning.planner import calculate, ruckig_input
+from controller.planning.offline_planner import calculate, ruckig_input
 from controller.planning.segments import STOP_SEGMENTS, evaluate_reference, plan_stop, stop_phases
 from plant.mechanism import Limits
 from tests.controller.planning.sampled_reference import sample_reference

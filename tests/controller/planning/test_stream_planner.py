@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controller.inverse_kinematics import leg_lengths
+from controller.planning.offline_planner import count_violations
 from controller.planning.plan_handover import (
     END_PLANNER,
     LATEST,
@@ -24,7 +25,6 @@ from controller.planning.plan_handover import (
     stream_cause,
     take_plan,
 )
-from controller.planning.planner import count_violations
 from controller.planning.segments import LENGTH, START, evaluate_reference, stop_phases
 from controller.planning.stream_planner import Plan, StreamPlanner, TargetRefusedError, _stoppable
 from controller.planning.target import load_target

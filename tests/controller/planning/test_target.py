@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from controller.direct_kinematics import poses_from_lengths
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.motions import MARGIN_S, MOTIONS, REST_S, SAMPLE_PERIOD_S
-from controller.planning.planner import plan
+from controller.planning.offline_planner import plan
 from controller.planning.target import COLUMNS, Target, load_target
 from plant.errors import GoughError, InputError, UnknownNameError
 from plant.mechanism import Mechanism, load_in_space, load_spatial

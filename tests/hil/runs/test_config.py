@@ -8,7 +8,7 @@ from hil.rigs.udp.emulator import WATCHDOG_S
 from hil.runs.config import EmulatorConfig, SimulationConfig, imus_from_text
 from plant.errors import InputError
 from plant.fmu.settings import Setting
-from plant.wiring import Wiring
+from plant.imu_wiring import Wiring
 
 
 def test_a_configuration_comes_back_from_its_plain_values():

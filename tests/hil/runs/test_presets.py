@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from controller.planning.motions import MOTIONS
-from controller.planning.planner import plan
+from controller.planning.offline_planner import plan
 from controller.planning.target import load_target
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import simulate

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from controller.direct_kinematics import poses_from_lengths
 from controller.inverse_kinematics import leg_lengths, sample_workspace
 from controller.planning.motions import SAMPLE_PERIOD_S
-from controller.planning.planner import Reference, count_violations, plan
+from controller.planning.offline_planner import Reference, count_violations, plan
 from controller.planning.target import Target, load_target
 from plant.errors import GoughError, InputError, UnreachableError
 from plant.mechanism import Mechanism, load_in_space
