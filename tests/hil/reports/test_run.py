@@ -10,7 +10,7 @@ from hil.reports.run import write_report
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import simulate
 from plant.errors import InputError
-from plant.pose import rotation_angle, rotation_from_vector
+from plant.pose import pose_errors, rotation_angle, rotation_from_vector
 from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS
 from tests.hil.pages import draw_in_browser, figures_in, json_after, numbers, traces_of
 
@@ -107,6 +107,25 @@ def test_the_pose_is_drawn_from_home_in_mm_and_deg(traces, result):
     assert np.linalg.norm(vector) > 1.0
     drawn = rotation_from_vector(np.radians(vector)) @ home.rotation
     assert rotation_angle(drawn, result.true_rotations[moment]) < 1e-5
+
+
+def test_the_errors_are_estimate_less_truth_and_truth_less_reference(traces, result):
+    truth = (result.true_positions, result.true_rotations)
+    estimate = (result.records["position"], result.records["rotation"])
+    planned = (result.reference_positions, result.reference_rotations)
+    for i, axis in enumerate("xyz"):
+        panels = curves(traces["errors"], axis)
+        for (times, drawn), part, unit, (poses, origins) in zip(
+            panels,
+            (0, 0, 3, 3),
+            (1e3, 1e3, np.degrees(1.0), np.degrees(1.0)),
+            [(estimate, truth), (truth, planned)] * 2,
+            strict=True,
+        ):
+            moments = np.searchsorted(result.times, times - 1e-5)[::200]
+            for moment, value in zip(moments, drawn[::200], strict=True):
+                error = pose_errors(poses[0][moment], poses[1][moment], origins[0][moment], origins[1][moment])
+                assert value == pytest.approx(unit * error[part + i], rel=1e-5, abs=1e-6)
 
 
 def test_the_mechanism_moves_on_legs_of_the_true_length(page, traces, result):
