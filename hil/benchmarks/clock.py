@@ -333,20 +333,15 @@ class GrossExcessError(GoughError, RuntimeError):
     exit_status = 1
 
 
-_MOST_MISSED = 0.01
-"""Share of the periods that the noise of a virtual machine may make our own work miss."""
-
-
 def gross_excess(figures: dict[str, Any]) -> list[str]:
     """Excesses beyond the noise of any machine, in words, for continuous integration."""
     found = []
     for rate, conditions in figures["rates"].items():
         for condition, measured in conditions.items():
             compute, faults = measured["compute_us"]["p50"], measured["usage"]["major_faults"]
-            own = measured["missed_own"]
             slow = compute / max(measured["bare_us"]["p50"], 1.0)
             checks = (
-                (own > _MOST_MISSED * measured["compute_us"]["n"], f"{own} periods missed by our own work"),
+                (measured["missed_own"], f"{measured['missed_own']} periods missed by our own work"),
                 (not figures["refused"] and faults, f"{faults:g} major page faults in the loop"),
                 (condition == IDLE and compute > 100.0, f"computing takes {compute:.0f} us"),
                 (slow > 10.0, f"computing takes {slow:.0f} times as long as a bare loop of the same work"),

@@ -48,9 +48,7 @@ def test_the_check_passes_what_is_measured_and_fails_gross_excess(figures):
         altered["rates"]["500"][IDLE] |= values
         return gross_excess(altered)
 
-    count = measured["rates"]["500"][IDLE]["compute_us"]["n"]
-    assert changed(missed_own=count // 100) == []
-    assert changed(missed_own=count // 50) == [f"500 Hz, idle: {count // 50} periods missed by our own work"]
+    assert changed(missed_own=3) == ["500 Hz, idle: 3 periods missed by our own work"]
     slow = dict.fromkeys(("p50", "p99", "p999", "max"), 900.0) | {"n": 1000}
     assert any("computing takes 900 us" in text for text in changed(compute_us=slow))
     if not measured["refused"]:

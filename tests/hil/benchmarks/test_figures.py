@@ -12,12 +12,7 @@ from plant.pose import Pose, rotation_from_vector
 
 
 def measured(compute=10.0, bare=9.0, own=0, faults=0):
-    return {
-        "compute_us": {"p50": compute, "n": 1000},
-        "bare_us": {"p50": bare},
-        "missed_own": own,
-        "usage": {"major_faults": faults},
-    }
+    return {"compute_us": {"p50": compute}, "bare_us": {"p50": bare}, "missed_own": own, "usage": {"major_faults": faults}}
 
 
 @pytest.mark.parametrize(
@@ -30,8 +25,7 @@ def measured(compute=10.0, bare=9.0, own=0, faults=0):
         (BUSY, {"compute": 10.0, "bare": 0.5}, [], []),
         (BUSY, {"compute": 11.0, "bare": 0.5}, [], ["computing takes 11 times as long as a bare loop of the same work"]),
         (BUSY, {"compute": 91.0}, [], ["computing takes 10 times as long as a bare loop of the same work"]),
-        (IDLE, {"own": 10}, [], []),
-        (IDLE, {"own": 11}, ["x"], ["11 periods missed by our own work"]),
+        (IDLE, {"own": 1}, ["x"], ["1 periods missed by our own work"]),
         (IDLE, {"faults": 1}, [], ["1 major page faults in the loop"]),
         (IDLE, {"faults": 1}, ["locked memory"], []),
     ],
