@@ -17,10 +17,10 @@ demo: .venv/installed
 test test-all: export OPENBLAS_NUM_THREADS = 1
 
 test: .venv/installed-test
-	$(BIN)/pytest -n $(WORKERS) --dist loadfile -m "not slow"
+	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "not slow"
 
 test-all: test
-	$(BIN)/pytest -n $(WORKERS) --dist loadfile -m "slow or hypothesis" --hypothesis-profile=all
+	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "slow or hypothesis" --hypothesis-profile=all
 
 bench: .venv/installed-all
 	@mkdir -p $(OUT)

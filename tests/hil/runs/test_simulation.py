@@ -26,6 +26,7 @@ def errors(result, group):
     return figures["position_rms"] / MM, figures["rotation_rms"] / DEG
 
 
+@pytest.mark.slow
 def test_low_cost_imus_follow_a_real_motion_within_the_promise(motion_capture):
     estimation, tracking = [], []
     for seed in range(20):
