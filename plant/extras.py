@@ -7,14 +7,21 @@ from importlib.util import find_spec
 from plant.errors import MissingPackageError
 
 EXTRAS = {
+    "SALib": "sweep",
     "can": "canopen",
     "canopen": "canopen",
     "control": "design",
+    "dask": "sweep",
+    "distributed": "sweep",
     "filterpy": "studies",
+    "optuna": "sweep",
+    "pandas": "sweep",
     "plotly": "reports",
+    "pyarrow": "sweep",
     "scipy": "calibrate",
     "tomlkit": "studies",
     "vqf": "studies",
+    "xarray": "sweep",
     "ziglang": "cross",
 }
 """The extra that installs each package."""

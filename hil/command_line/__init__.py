@@ -22,7 +22,7 @@ COMMANDS = {
     "design": ("classify", "classes", "accuracy", "sensor-sets", "tune", "tune-fusion"),
     "rigs": ("check-rig", "emulate", "inject"),
     "plant": ("fmu",),
-    "study": ("compare-fusion", "evaluate-fusion", "faults", "planar", "broad"),
+    "study": ("sweep", "compare-fusion", "evaluate-fusion", "faults", "planar", "broad"),
     "measure": ("bench",),
 }
 """The commands by heading, which is also their module; there `gough tune` is `gough_tune`."""

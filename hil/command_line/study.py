@@ -1,16 +1,56 @@
-"""The studies: compare-fusion, evaluate-fusion, faults, planar, broad."""
+"""The studies: sweep, compare-fusion, evaluate-fusion, faults, planar, broad."""
 
 import sys
 from argparse import SUPPRESS, Namespace
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from hil.command_line import cli
 from hil.command_line.terminal import deg, mm, mm_deg, progress_bar
+from hil.engine.settings import EngineSettings
 from hil.runs.config import SimulationConfig
 from hil.studies.config import SECTIONS, ComparisonConfig, EvaluationConfig
 from hil.table import Table
 from plant.errors import InputError
+
+
+@cli.command(
+    cli.source("study", "STUDY.toml", "what is run, what varies and what is measured (docs/sweeps.md)"),
+    cli.argument("--results", type=Path, metavar="FOLDER", help="where the table is kept (default: STUDY.results)"),
+    cli.flag("--dry-run", "say how many runs there are, and how long they take by a first one that is measured"),
+    cli.options_of(EngineSettings),
+    cli.JSON,
+)
+def gough_sweep(options: Namespace) -> int:
+    """Run a study with many runs, on all processors or on a cluster.
+
+    The study's file says what varies: fields of a run, entries of the mechanism's file, parameters of the plant. Every run is a
+    row of a table in Parquet. A sweep that was interrupted goes on where it stopped. Prints the distribution of every figure.
+    The exit status is 1 if a run has failed; its row has the reason.
+    """
+    check_installed("pyarrow")
+    from hil.engine.engine import open_engine
+    from hil.sweep.study import read_study
+    from hil.sweep.sweep import estimate, sweep
+
+    study, settings = read_study(options.study), cli.config_of(options, EngineSettings)
+    folder = options.results or options.study.with_suffix(".results")
+    if options.dry_run:
+        with progress_bar("the first run") as progress:
+            found = estimate(study, folder)
+        total = found.total(settings.processes)
+        print(
+            f"{found.points} runs, of which {found.known} are in {folder} already; a run takes {found.seconds:.3g} s: "
+            f"{duration(total)} on {settings.processes} processors"
+        )
+        cli.write_json(options.json, {**asdict(found), "total_seconds": total, "version": version("gough")})
+        return 0
+    with progress_bar(study.name) as progress, open_engine(settings) as engine:
+        if engine.dashboard:
+            print(f"the workers at their work: {engine.dashboard}", file=sys.stderr)
+        result = sweep(study, folder, engine, progress)
+    return 0
 
 
 @cli.command(cli.options_of(ComparisonConfig), cli.JSON)

@@ -1,0 +1,122 @@
+"""A batch of a study's work, as a worker does it."""
+
+import fcntl
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from plant.compiled import hash_of_files, keyed_folder
+from plant.errors import GoughError
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+_PACKAGES = ("plant", "controller", "hil", "fmus")
+_WITHOUT_RESULTS = ("command_line", "reports")
+"""Rooms that show results and make none."""
+_LIBRARIES = ("casadi", "numba", "numpy", "ruckig")
+
+
+class SourcesDifferError(GoughError, RuntimeError):
+    """A worker has another version of gough, or of what computes for it."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """An item whose function raised an error, or that no worker survived."""
+
+    reason: str
+    trace: str = ""  # where it was raised, if that is an error of the program
+    died: bool = False  # whether the workers died
+    error: Exception | None = field(default=None, compare=False)  # in the process that raised it
+
+
+@dataclass(frozen=True)
+class Batch(Generic[Result]):
+    """The results of a batch, and the time [s] that an item took; without items that had to wait for machine code, NaN."""
+
+    results: list[Result | Failure]
+    seconds: float
+
+
+@cache
+def fingerprint() -> str:
+    """A hash of all that determines results: gough's sources and the versions of the libraries that compute."""
+    root = Path(__file__).resolve().parents[2]
+    files = (file for package in _PACKAGES for file in (root / package).rglob("*.*"))
+    kept = sorted(
+        file for file in files if file.suffix in (".py", ".c", ".h", ".toml") and not {*_WITHOUT_RESULTS} & {*file.parts}
+    )
+    return hash_of_files(kept, *(f"{name} {version(name)}" for name in _LIBRARIES))
+
+
+def attempt(function: Callable[[Item], Result], item: Item) -> Result | Failure:
+    """What a function gives for an item, or why it failed."""
+    try:
+        return function(item)
+    except GoughError as error:
+        return Failure(str(error), error=error)
+    except Exception as error:
+        return Failure(f"{type(error).__name__}: {error}", traceback.format_exc(), error)
+
+
+def run_batch(function: Callable[[Item], Result], items: Sequence[Item], kinds: Sequence[str], sources: str) -> Batch[Result]:
+    """Do a batch of work on a worker.
+
+    Args:
+        function: what to do with an item.
+        items: the batch.
+        kinds: of each item; all items of a kind need the same machine code and FMU.
+        sources: the `fingerprint` of who asks.
+
+    Raises:
+        SourcesDifferError: this worker would give other results.
+    """
+    if sources != fingerprint():
+        raise SourcesDifferError(f"its gough {version('gough')} has the sources {fingerprint()}, and this one {sources}")
+    results: list[Result | Failure] = []
+    times = []
+    for item, kind in zip(items, kinds, strict=True):
+        with alone_if_first(kind) as first:
+            began = time.perf_counter()
+            outcome = attempt(function, item)
+            if not first:
+                times.append(time.perf_counter() - began)
+        if isinstance(outcome, Failure):
+            outcome = Failure(outcome.reason, outcome.trace)
+        results.append(outcome)
+    return Batch(results, sum(times) / len(times) if times else float("nan"))
+
+
+_prepared: set[str] = set()
+"""Kinds of work that this process has done."""
+
+
+@contextmanager
+def alone_if_first(kind: str) -> Iterator[bool]:
+    """Let no other process of this machine do work of a kind that was never done on it, as that builds what all need.
+
+    Yields whether this process has not done such work yet.
+    """
+    if kind in _prepared:
+        yield False
+        return
+    folder = keyed_folder("prepared", hash_of_files([], fingerprint(), kind))
+    done = folder / "done"
+    with (folder / "lock").open("w") as lock:
+        if not done.exists():
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield True
+        done.touch()
+    _prepared.add(kind)
+
+
+def no_kind(item: Any) -> str:
+    """The kind of items that are all alike."""
+    return ""

@@ -1,0 +1,86 @@
+"""The engine of all studies: a function and its items in, results out, from one process or from many."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.util import find_spec
+from typing import TypeVar, cast
+
+from hil.engine.batches import Failure, attempt, no_kind
+from hil.engine.settings import EngineSettings
+from hil.progress import Progress, no_progress
+from plant.errors import GoughError
+from plant.extras import check_installed
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+class Engine(ABC):
+    """Does work item by item. Functions, items and results go to other processes, so they can be pickled."""
+
+    workers: int = 1
+    """How many items are worked on at the same time."""
+    dashboard: str | None = None
+    """Address of a page that shows the work."""
+
+    @abstractmethod
+    def run(
+        self, function: Callable[[Item], Result], items: Sequence[Item], kind: Callable[[Item], str] = no_kind
+    ) -> Iterator[tuple[int, Result | Failure]]:
+        """The results with the numbers of their items, as they come; an item that fails gives a `Failure`.
+
+        Args:
+            function: what to do with an item.
+            items: the work.
+            kind: items of the same kind need the same machine code and FMU, which are built once on each machine.
+
+        Raises:
+            GoughError: the workers have gone, or have another version of gough.
+        """
+
+    def map(self, function: Callable[[Item], Result], items: Sequence[Item], progress: Progress = no_progress) -> list[Result]:
+        """The results in the order of the items.
+
+        Raises:
+            GoughError: an item has failed, or as for `run`.
+        """
+        results: dict[int, Result] = {}
+        for number, outcome in self.run(function, items):
+            if isinstance(outcome, Failure):
+                if outcome.error is not None:
+                    raise outcome.error
+                raise GoughError(outcome.reason) if not outcome.trace else RuntimeError(outcome.trace)
+            results[number] = outcome
+            progress(len(results) / len(items))
+        return [results[number] for number in range(len(items))]
+
+
+class InOneProcess(Engine):
+    """Does one item after the other, here."""
+
+    def run(
+        self, function: Callable[[Item], Result], items: Sequence[Item], kind: Callable[[Item], str] = no_kind
+    ) -> Iterator[tuple[int, Result | Failure]]:
+        """As `Engine.run`, in the order of the items."""
+        return ((number, attempt(function, item)) for number, item in enumerate(items))
+
+
+@contextmanager
+def open_engine(settings: EngineSettings | None = None) -> Iterator[Engine]:
+    """The engine that settings ask for; without Dask, and without settings that need it, all is done in this process.
+
+    Raises:
+        GoughError: the scheduler cannot be reached, or an address or a file for TLS cannot be used.
+        MissingPackageError: the settings need Dask, and it is not installed.
+    """
+    settings = settings or EngineSettings()
+    if settings != EngineSettings() and settings.workers != 1:
+        check_installed("distributed")
+    if settings.scheduler is None and settings.processes == 1 or find_spec("distributed") is None:
+        yield InOneProcess()
+        return
+    from hil.engine.cluster import connected
+
+    with connected(settings) as engine:
+        yield cast(Engine, engine)

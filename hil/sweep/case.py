@@ -1,0 +1,198 @@
+"""One point of a study as a worker gets it: it needs no file of the machine that asks."""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from hil.engine.batches import fingerprint
+from hil.runs.config import SimulationConfig
+from hil.sweep.function import UserFunction
+from hil.sweep.study import Study
+from plant.compiled import keyed_folder
+from plant.errors import GoughError, InputError, UnknownNameError
+from plant.files import write_whole
+from plant.mechanism import load_in_space
+from plant.mechanism.documents import mechanism_text
+
+_FILES = ("mechanism", "target", "calibration", "plant", "binding")
+"""Fields of a run's configuration that may name files."""
+_OF_THIS_RUN = ("config", "version", "real_time_factor", "cycle_us")
+"""Parts of a summary that are no figures, or not the same each time."""
+
+
+@dataclass(frozen=True)
+class SentFile:
+    """A file that goes with a case; its name is kept."""
+
+    field: str  # of the configuration that names it
+    name: str
+    content: bytes
+
+    @property
+    def digest(self) -> str:
+        """A hash of the content."""
+        return _digest(self.content)
+
+    def local(self) -> Path:
+        """The file in this machine's cache."""
+        path = keyed_folder("files", self.digest) / self.name
+        if not path.is_file():
+            write_whole(path, self.content)
+        return path
+
+
+@dataclass(frozen=True)
+class Case:
+    """A point of a study, and all that its figures depend on.
+
+    Attributes:
+        key: a hash of all that determines the figures: configuration, files, functions and gough's sources.
+        kind: cases of a kind need the same machine code and FMU.
+        point: the factors' values.
+        config: of the run; the names of `files` are not in it.
+        files: the files that the configuration names.
+        function, model: as in `Study`.
+    """
+
+    key: str
+    kind: str
+    point: Mapping[str, Any]
+    config: SimulationConfig
+    files: tuple[SentFile, ...]
+    function: UserFunction | None
+    model: UserFunction | None
+
+    def local_config(self) -> SimulationConfig:
+        """The configuration with this machine's files."""
+        return replace(self.config, **{file.field: str(file.local()) for file in self.files})
+
+
+def kind_of(case: Case) -> str:
+    """`Case.kind`."""
+    return case.kind
+
+
+def measure(case: Case) -> dict[str, float]:
+    """The figures of a case.
+
+    Raises:
+        GoughError: it cannot be run, or the run has stopped early.
+    """
+    if case.model is not None:
+        return case.model.figures(**case.point)
+    from hil.runs.simulation import simulate
+
+    result = simulate(case.local_config())
+    summary = {name: value for name, value in result.summary().items() if name not in _OF_THIS_RUN}
+    own = case.function.figures(result) if case.function else {}
+    return dict(_flat(summary)) | own
+
+
+def cases_of(study: Study) -> Iterator[Case]:
+    """The cases of a study in the order of its points.
+
+    Raises:
+        GoughError: a point cannot be run.
+    """
+    for point in study.points():
+        try:
+            yield _case(study, point)
+        except TypeError as error:
+            raise InputError(f"at {_text(point)}: {error}") from None
+        except GoughError as error:
+            raise type(error)(f"at {_text(point)}: {error}") from None
+
+
+def _case(study: Study, point: Mapping[str, Any]) -> Case:
+    if study.model is not None:
+        key = _key({"model": study.model.source, "name": study.model.name, "point": dict(point)})
+        return Case(key, "", point, study.run, (), None, study.model)
+    config, changes = study.config_at(point), study.mechanism_at(point)
+    files = []
+    for field in _FILES:
+        name = getattr(config, field)
+        if field == "mechanism" and (changes or Path(name).is_file()):
+            content = _changed_mechanism(name, tuple(changes.items())) if changes else _content(name)
+            files.append(SentFile(field, f"{Path(name).stem}.toml", content))
+        elif field != "mechanism" and name is not None and Path(name).is_file():
+            files.append(SentFile(field, Path(name).name, _content(name)))
+    config_of_key = asdict(config) | {file.field: file.digest for file in files}
+    function = study.function and (study.function.name, study.function.source)
+    planar = _is_planar(config.mechanism)
+    kind = f"{config.fusion} {planar} {config.plant and _digest(_content(config.plant))}"
+    key = _key({"config": config_of_key, "function": function})
+    without = {file.field: SimulationConfig.__dataclass_fields__[file.field].default for file in files}
+    return Case(key, kind, point, replace(config, **without | _kept(config)), tuple(files), study.function, None)
+
+
+def _kept(config: SimulationConfig) -> dict[str, Any]:
+    """The plant keeps its name, as a binding without a plant is refused."""
+    return {} if config.plant is None else {"plant": Path(config.plant).name}
+
+
+@cache
+def _is_planar(mechanism: str) -> bool:
+    return load_in_space(mechanism).planar
+
+
+@cache
+def _content(path: str) -> bytes:
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from None
+
+
+@cache
+def _changed_mechanism(name: str, changes: tuple[tuple[str, Any], ...]) -> bytes:
+    """The TOML text of a mechanism with other entries."""
+    import tomlkit
+
+    document: Any = tomlkit.parse(mechanism_text(name))
+    document["name"] = document.get("name", Path(name).stem)
+    for entry, value in changes:
+        *tables, last = entry.split(".")
+        inner = document
+        for part in tables:
+            if isinstance(inner, list):
+                inner = inner[_index(part, inner, entry)]
+            else:
+                inner = inner.setdefault(part, tomlkit.table())
+        if isinstance(inner, list):
+            inner[_index(last, inner, entry)] = value
+        elif isinstance(inner, dict):
+            inner[last] = value
+        else:
+            raise UnknownNameError(f"the mechanism has no entry {entry}: {'.'.join(tables)} is no table")
+    return tomlkit.dumps(document).encode()
+
+
+def _index(part: str, inner: Any, entry: str) -> int:
+    if not part.isdecimal() or int(part) >= len(inner):
+        raise UnknownNameError(f"the mechanism has no entry {entry}: {part!r} is no number from 0 to {len(inner) - 1}")
+    return int(part)
+
+
+def _flat(figures: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
+    for name, value in figures.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{name}.")
+        elif isinstance(value, bool | int | float):
+            yield prefix + name, float(value)
+
+
+def _key(content: Mapping[str, Any]) -> str:
+    text = json.dumps({**content, "sources": fingerprint()}, sort_keys=True, default=str)
+    return _digest(text.encode())
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:24]
+
+
+def _text(point: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} = {value}" for name, value in point.items())

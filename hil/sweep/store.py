@@ -1,0 +1,121 @@
+"""The table of a study's results: Parquet files in a folder, to which rows are added as they come.
+
+`runs.parquet` is the table. While a study runs, new rows stand in small files beside it; what a process that died has left
+there is taken in by the next.
+"""
+
+import fcntl
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from plant.errors import InputError
+from plant.files import write_whole
+
+TABLE = "runs.parquet"
+KEY, STATUS, REASON = "key", "status", "reason"
+DONE, FAILED, DIED = "done", "failed", "died"
+"""A row's status: figures are there, the run gave the reason, the worker died."""
+_MOST_FILES = 100
+
+
+class Store:
+    """The rows of a study, each key once: the last one that was added."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._new = folder / "new"
+        self._number = 0
+
+    @classmethod
+    @contextmanager
+    def opened(cls, folder: Path) -> Iterator["Store"]:
+        """The store in a folder, which is made if it is not there, for this process alone.
+
+        Raises:
+            InputError: the folder cannot be written, or another process has it.
+        """
+        store = cls(folder)
+        try:
+            store._new.mkdir(parents=True, exist_ok=True)
+            lock = (folder / "lock").open("w")
+        except OSError as error:
+            raise InputError(f"cannot write results to {folder}: {error.strerror}") from None
+        with lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                raise InputError(f"another process writes results to {folder}: wait for it, or give another folder") from None
+            store.compact()
+            yield store
+            store.compact()
+
+    def table(self) -> pa.Table:
+        """All rows."""
+        files = [self.folder / TABLE, *sorted(self._new.glob("*.parquet"))]
+        tables = [_read(file) for file in files if file.is_file()]
+        if not tables:
+            return pa.table({KEY: pa.array([], pa.string()), STATUS: pa.array([], pa.string())})
+        table = pa.concat_tables(tables, promote_options="permissive")
+        last = {key: row for row, key in enumerate(table[KEY].to_pylist())}
+        return table if len(last) == len(table) else table.take(sorted(last.values()))
+
+    def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Add rows, which are on the disk when this returns."""
+        if rows:
+            self._write(self._new / f"{self._number:08d}.parquet", pa.Table.from_pylist(list(map(_row, rows)), _schema(rows)))
+            self._number += 1
+        if self._number >= _MOST_FILES:
+            self.compact()
+
+    def compact(self) -> None:
+        """Take the new rows into the table."""
+        files = sorted(self._new.glob("*.parquet"))
+        if files:
+            self._write(self.folder / TABLE, self.table())
+            # A process that dies here leaves rows that are in the table already; a key counts once.
+            for file in files:
+                file.unlink()
+        self._number = 0
+
+    def _write(self, path: Path, table: pa.Table) -> None:
+        sink = pa.BufferOutputStream()
+        pq.write_table(table, sink)
+        write_whole(path, sink.getvalue().to_pybytes())
+
+
+def rows_of(table: pa.Table, keys: Iterable[str]) -> pa.Table:
+    """The rows with these keys, in their order."""
+    place = {key: row for row, key in enumerate(table[KEY].to_pylist())}
+    return table.take([place[key] for key in keys if key in place])
+
+
+def _read(file: Path) -> pa.Table:
+    try:
+        return pq.read_table(file, partitioning=None)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise InputError(f"cannot read {file}: {error}; move it away to run what it had again") from None
+
+
+def _row(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        name: value if isinstance(value, str | bool | int | float | None) else json.dumps(value) for name, value in row.items()
+    }
+
+
+def _schema(rows: Sequence[Mapping[str, Any]]) -> pa.Schema:
+    """All columns of some rows, as rows of failed runs lack figures."""
+    kinds: dict[str, Any] = {}
+    for row in rows:
+        for name, value in row.items():
+            if kinds.get(name) is None and value is not None:
+                kinds[name] = type(value)
+            elif isinstance(value, float) and kinds[name] is int:
+                kinds[name] = float
+    arrow = {bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
+    return pa.schema([(name, arrow.get(kind, pa.string())) for name, kind in kinds.items()])

@@ -1,0 +1,305 @@
+"""A study as its TOML file or a Python program describes it: what is run, what varies, what is measured."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.runs.config import SimulationConfig
+from hil.sweep.function import UserFunction
+from plant.checks import checked_seed
+from plant.errors import GoughError, InputError
+from plant.files import check_entries, read_toml
+from plant.fmu.settings import Setting
+
+METHODS = ("sobol", "latin-hypercube", "saltelli")
+"""How ranges without steps are sampled; `saltelli` is Sobol's sequence in the form that sensitivity indices need."""
+FIGURES = (
+    "estimation.position_rms", "estimation.rotation_rms", "tracking.position_rms", "tracking.rotation_rms",
+)  # fmt: skip
+"""Figures of a run that are shown if a study names none."""
+_PARTS = ("run", "mechanism", "plant")
+_MOST_RUNS = 10_000_000
+
+
+@dataclass(frozen=True)
+class Factor:
+    """Something that varies: with `values` they are crossed with all others, else it is sampled from `low` to `high`.
+
+    The name is `run.FIELD`, a field of the run's configuration; `mechanism.TABLE.ENTRY`, an entry of the mechanism's file; or
+    `plant.PARAMETER`, a parameter or input of the FMU. For a `model`, it is an argument of that function.
+    """
+
+    name: str
+    values: tuple[Any, ...] = ()
+    low: float = 0.0
+    high: float = 0.0
+    logarithmic: bool = False
+
+    def __post_init__(self) -> None:
+        if self.values:
+            return
+        if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):
+            raise InputError(f"{self.name} goes from {self.low:g} to {self.high:g}: give a finite range that goes up")
+        if self.logarithmic and self.low <= 0.0:
+            raise InputError(f"{self.name} begins at {self.low:g}, and a logarithmic range must be positive")
+
+    @property
+    def sampled(self) -> bool:
+        """Whether its values come from the design of the samples."""
+        return not self.values
+
+    def at(self, share: float) -> float:
+        """The value at a share 0 to 1 of its range."""
+        if self.logarithmic:
+            return float(self.low * (self.high / self.low) ** share)
+        return float(self.low + share * (self.high - self.low))
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How ranges are sampled: the method, the number of samples (saltelli: its base), and the seed."""
+
+    method: str = "sobol"
+    count: int = 64
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        checked_seed(self.seed)
+        if self.method not in METHODS:
+            raise InputError(f"there is no method {self.method!r} of sampling; there are {', '.join(METHODS)}")
+        if not 2 <= self.count <= _MOST_RUNS:
+            raise InputError(f"{self.count} samples are asked for; there can be 2 to {_MOST_RUNS}")
+
+    def shares(self, factors: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """Samples (N, factors) of the unit cube."""
+        if self.method == "saltelli":
+            from SALib.sample import sobol
+
+            problem = {"num_vars": factors, "names": [str(n) for n in range(factors)], "bounds": [[0.0, 1.0]] * factors}
+            drawn = sobol.sample(problem, self.count, calc_second_order=False, seed=self.seed)
+        else:
+            from scipy.stats import qmc
+
+            kind: Any = qmc.Sobol if self.method == "sobol" else qmc.LatinHypercube
+            drawn = kind(factors, rng=self.seed).random(self.count)
+        return np.asarray(drawn, np.float64)
+
+
+@dataclass(frozen=True)
+class Study:
+    """What is run, what varies and what is measured.
+
+    Attributes:
+        factors: what varies.
+        run: the configuration of every run, where nothing varies.
+        mechanism: entries that replace those of the mechanism's file, by name with dots.
+        sampling: how ranges are sampled.
+        figures: which figures reports and tables show; all are kept.
+        function: figures of the user's own, from the result of a run.
+        model: figures of the user's own, from the factors, in place of a run.
+        name: what reports call it.
+    """
+
+    factors: tuple[Factor, ...]
+    run: SimulationConfig = field(default_factory=SimulationConfig)
+    mechanism: Mapping[str, Any] = field(default_factory=dict)
+    sampling: Sampling = field(default_factory=Sampling)
+    figures: tuple[str, ...] = ()
+    function: UserFunction | None = None
+    model: UserFunction | None = None
+    name: str = "study"
+
+    def __post_init__(self) -> None:
+        if not self.factors:
+            raise InputError("nothing varies: give a factor, such as run.seed, in [vary]")
+        names = [factor.name for factor in self.factors]
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"{name} varies twice: leave one out")
+        if self.model is not None and self.function is not None:
+            raise InputError("a model is in place of a run, of which a function takes the result: leave one of them out")
+        if self.model is None:
+            for name in names:
+                _check_factor(name)
+        if self.function is None and self.model is None and not self.figures:
+            object.__setattr__(self, "figures", FIGURES)
+        if self.sampling.method == "saltelli" and not any(factor.sampled for factor in self.factors):
+            raise InputError("saltelli samples ranges, and none varies: give one, such as { from = 1.0, to = 2.0 }")
+
+    @property
+    def size(self) -> int:
+        """The number of points, without drawing them."""
+        crossed, sampled = 1, sum(factor.sampled for factor in self.factors)
+        for factor in self.factors:
+            crossed *= len(factor.values) or 1
+        count = self.sampling.count * ((sampled + 2) if self.sampling.method == "saltelli" else 1)
+        return crossed * (count if sampled else 1)
+
+    def points(self) -> list[dict[str, Any]]:
+        """The values of all factors at each point: samples in the outer loop, crossed values in the inner ones.
+
+        Raises:
+            InputError: there are too many.
+        """
+        if self.size > _MOST_RUNS:
+            raise InputError(f"the study has {self.size} points; there can be {_MOST_RUNS}: vary less")
+        sampled = [factor for factor in self.factors if factor.sampled]
+        crossed = [factor for factor in self.factors if not factor.sampled]
+        shares = self.sampling.shares(len(sampled)) if sampled else [[]]
+        drawn = [{factor.name: factor.at(share) for factor, share in zip(sampled, row, strict=True)} for row in shares]
+        grid = [dict(zip((f.name for f in crossed), values, strict=True)) for values in product(*(f.values for f in crossed))]
+        order = [factor.name for factor in self.factors]
+        return [{name: (sample | cell)[name] for name in order} for sample in drawn for cell in grid]
+
+    def config_at(self, point: Mapping[str, Any]) -> SimulationConfig:
+        """The configuration of the run at a point, but for entries of the mechanism's file.
+
+        Raises:
+            GoughError: a value cannot be used.
+        """
+        changes = {name.removeprefix("run."): value for name, value in point.items() if name.startswith("run.")}
+        settings = tuple(
+            Setting(name.removeprefix("plant."), tuple(np.atleast_1d(value).astype(float).tolist()))
+            for name, value in point.items()
+            if name.startswith("plant.")
+        )
+        return replace(self.run, **_parsed(changes), settings=(*self.run.settings, *settings))
+
+    def mechanism_at(self, point: Mapping[str, Any]) -> dict[str, Any]:
+        """The entries that replace those of the mechanism's file at a point, by name with dots."""
+        changes = {name.removeprefix("mechanism."): value for name, value in point.items() if name.startswith("mechanism.")}
+        return {**self.mechanism, **changes}
+
+
+def read_study(path: Path | str) -> Study:
+    """Read a study from its TOML file; names of files in it are relative to its folder.
+
+    Raises:
+        GoughError: the file is no study.
+    """
+    path, document = Path(path), read_toml(path)
+    try:
+        return _study(document, path)
+    except GoughError as error:
+        raise type(error)(f"{path}: {error}") from None
+
+
+def _study(document: dict[str, Any], path: Path) -> Study:
+    check_entries(document, ("name", "run", "mechanism", "plant", "vary", "sampling", "measure", "model"), "the study")
+    for entry, value in document.items():
+        if entry not in ("name", "model") and not isinstance(value, dict):
+            raise InputError(f"{entry!r} must be a table")
+    measure, sampling = document.get("measure", {}), document.get("sampling", {})
+    check_entries(measure, ("figures", "function"), "[measure]")
+    check_entries(sampling, [each.name for each in fields(Sampling)], "[sampling]")
+    model = document.get("model")
+    factors = tuple(_factors(document.get("vary", {}), "", model is None))
+    run = {name: _beside(path, value) for name, value in _parsed(document.get("run", {})).items()}
+    factors = tuple(
+        replace(each, values=tuple(_beside(path, value) for value in each.values)) if each.name.startswith("run.") else each
+        for each in factors
+    )
+    settings = tuple(
+        Setting(name, tuple(np.atleast_1d(value).astype(float).tolist()))
+        for name, value in _flat(document.get("plant", {})).items()
+    )
+    function = measure.get("function")
+    try:
+        return Study(
+            factors,
+            SimulationConfig(**run, settings=settings),
+            _flat(document.get("mechanism", {})),
+            Sampling(**sampling),
+            tuple(measure.get("figures", ())),
+            None if function is None else UserFunction.from_file(function, path.parent),
+            None if model is None else UserFunction.from_file(model, path.parent),
+            str(document.get("name", path.stem)),
+        )
+    except TypeError as error:
+        raise InputError(f"a value has the wrong kind: {error}") from None
+
+
+def _beside(path: Path, value: Any) -> Any:
+    """A name of a file beside the study's, if there is such a file; any other value as it is."""
+    if isinstance(value, str) and value and (path.parent / value).is_file():
+        return str(path.parent / value)
+    return value
+
+
+_SPECIFICATION = {"from", "to", "steps", "logarithmic", "seeds"}
+
+
+def _factors(table: Mapping[str, Any], prefix: str, of_run: bool) -> "list[Factor]":
+    found = []
+    for name, value in table.items():
+        full = prefix + name
+        if isinstance(value, dict) and value and value.keys() <= _SPECIFICATION:
+            found.append(_factor(full, value))
+        elif isinstance(value, dict):
+            found += _factors(value, f"{full}.", of_run)
+        elif isinstance(value, list) and value:
+            found.append(Factor(full, tuple(value)))
+        else:
+            raise InputError(f"{full} = {value!r} does not vary: give a list, {{ from = 1.0, to = 2.0 }}, or {{ seeds = 10 }}")
+    return found
+
+
+def _factor(name: str, table: Mapping[str, Any]) -> Factor:
+    if "seeds" in table:
+        if set(table) != {"seeds"} or not isinstance(table["seeds"], int) or table["seeds"] < 1:
+            raise InputError(f"{name}: seeds = N stands alone, and is a positive whole number")
+        return Factor(name, tuple(range(table["seeds"])))
+    if not {"from", "to"} <= set(table):
+        raise InputError(f"{name}: a range has from and to, such as {{ from = 1.0, to = 2.0 }}")
+    try:
+        factor = Factor(name, (), float(table["from"]), float(table["to"]), bool(table.get("logarithmic", False)))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: {error}") from None
+    if "steps" not in table:
+        return factor
+    if not isinstance(table["steps"], int) or table["steps"] < 2:
+        raise InputError(f"{name}: steps is a whole number, 2 at least")
+    return Factor(name, tuple(factor.at(share) for share in np.linspace(0.0, 1.0, table["steps"]).tolist()))
+
+
+def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in table.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return flat
+
+
+def _run_fields() -> dict[str, Any]:
+    """The fields of a run's configuration that a study can set, with how their text is read."""
+    return {
+        each.name: each.metadata["option"].parse
+        for each in fields(SimulationConfig)
+        if "option" in each.metadata and each.name not in ("settings", "rig", "rig_at", "arm")
+    } | {"hold": None}
+
+
+def _check_factor(name: str) -> None:
+    part, _, rest = name.partition(".")
+    if part not in _PARTS or not rest:
+        raise InputError(f"{name} cannot vary: a factor is run.FIELD, mechanism.TABLE.ENTRY or plant.PARAMETER")
+    if part == "run":
+        check_entries({rest: None}, _run_fields(), "a run")
+
+
+def _parsed(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of a run's fields, read as the command line reads them if they are text."""
+    readers: dict[str, Callable[[str], Any] | None] = _run_fields()
+    check_entries(values, readers, "[run]")
+    parsed = {}
+    for name, value in values.items():
+        read = readers[name]
+        parsed[name] = read(value) if read is not None and isinstance(value, str) else value
+        if isinstance(value, list):
+            parsed[name] = tuple(value)
+        elif isinstance(value, int) and not isinstance(value, bool) and name in ("duration", "rate", "joint_error", "hold"):
+            parsed[name] = float(value)
+    return parsed
