@@ -3,16 +3,19 @@
 import sys
 from argparse import SUPPRESS, Namespace
 from collections.abc import Callable
+from dataclasses import asdict
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from hil.command_line import cli
-from hil.command_line.terminal import deg, mm, mm_deg, progress_bar
+from hil.command_line.terminal import deg, duration, mm, mm_deg, progress_bar
 from hil.engine.settings import EngineSettings
 from hil.runs.config import SimulationConfig
 from hil.studies.config import SECTIONS, ComparisonConfig, EvaluationConfig
 from hil.table import Table
 from plant.errors import InputError
+from plant.extras import check_installed
 
 
 @cli.command(
@@ -31,6 +34,7 @@ def gough_sweep(options: Namespace) -> int:
     """
     check_installed("pyarrow")
     from hil.engine.engine import open_engine
+    from hil.sweep.store import TABLE
     from hil.sweep.study import read_study
     from hil.sweep.sweep import estimate, sweep
 
@@ -50,7 +54,16 @@ def gough_sweep(options: Namespace) -> int:
         if engine.dashboard:
             print(f"the workers at their work: {engine.dashboard}", file=sys.stderr)
         result = sweep(study, folder, engine, progress)
-    return 0
+    cli.write_json(options.json, result.summary())
+    table = Table("over all runs", "median", "90 %", "95 % confidence", "99 %", "95 % confidence")
+    for name, (half, *others) in result.quantiles().items():
+        intervals = (text for each in others for text in (f"{each.value:.4g}", f"{each.low:.4g} to {each.high:.4g}"))
+        table.add(name, f"{half.value:.4g}", *intervals)
+    table.print()
+    print(f"{len(result.table)} runs, {result.ran} of them new, in {folder / TABLE}")
+    if result.failed:
+        print(f"{result.failed} runs have failed, the first one: {result.first_reason}", file=sys.stderr)
+    return int(result.failed > 0)
 
 
 @cli.command(cli.options_of(ComparisonConfig), cli.JSON)

@@ -28,6 +28,14 @@ def deg(angle: float, digits: int = 3) -> str:
     return f"{degrees(angle):.{digits}f}"
 
 
+def duration(seconds: float) -> str:
+    """A time [s] in the unit that suits it."""
+    for unit, length in (("days", 86400.0), ("hours", 3600.0), ("minutes", 60.0)):
+        if seconds >= 2.0 * length:
+            return f"{seconds / length:.3g} {unit}"
+    return f"{seconds:.3g} s"
+
+
 def mm_deg(errors: dict[str, float], prefix: str = "") -> str:
     """The RMS errors of a pose, in millimetres and degrees."""
     return f"{mm(errors[f'{prefix}position_rms'])}, {deg(errors[f'{prefix}rotation_rms'])}"

@@ -18,6 +18,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _PACKAGES = ("plant", "controller", "hil", "fmus")
+_SOURCES = (".py", ".c", ".h", ".toml")
 _WITHOUT_RESULTS = ("command_line", "reports")
 """Rooms that show results and make none."""
 _LIBRARIES = ("casadi", "numba", "numpy", "ruckig")
@@ -49,11 +50,9 @@ class Batch(Generic[Result]):
 def fingerprint() -> str:
     """A hash of all that determines results: gough's sources and the versions of the libraries that compute."""
     root = Path(__file__).resolve().parents[2]
-    files = (file for package in _PACKAGES for file in (root / package).rglob("*.*"))
-    kept = sorted(
-        file for file in files if file.suffix in (".py", ".c", ".h", ".toml") and not {*_WITHOUT_RESULTS} & {*file.parts}
-    )
-    return hash_of_files(kept, *(f"{name} {version(name)}" for name in _LIBRARIES))
+    files = (file.relative_to(root) for package in _PACKAGES for file in (root / package).rglob("*.*"))
+    kept = (file for file in files if file.suffix in _SOURCES and not {*_WITHOUT_RESULTS} & {*file.parts})
+    return hash_of_files([root / file for file in sorted(kept)], *(f"{name} {version(name)}" for name in _LIBRARIES))
 
 
 def attempt(function: Callable[[Item], Result], item: Item) -> Result | Failure:

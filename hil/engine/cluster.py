@@ -3,7 +3,7 @@
 import logging
 import math
 import warnings
-from asyncio import CancelledError, TimeoutError  # noqa: A004 (Dask raises this one)
+from asyncio import CancelledError
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -99,8 +99,8 @@ class DaskEngine(Engine):
         except (CancelledError, CommClosedError, TimeoutError) as error:
             address = self._client.scheduler.address if self._client.scheduler else "Dask"
             raise SchedulerLostError(
-                f"the scheduler at {address} has gone ({type(error).__name__}); what was finished is kept, and the same command "
-                "goes on from there"
+                f"the scheduler at {address} has gone ({type(error).__name__}); what was finished is kept, and the same "
+                "command goes on from there"
             ) from None
 
 

@@ -77,7 +77,7 @@ def open_engine(settings: EngineSettings | None = None) -> Iterator[Engine]:
     settings = settings or EngineSettings()
     if settings != EngineSettings() and settings.workers != 1:
         check_installed("distributed")
-    if settings.scheduler is None and settings.processes == 1 or find_spec("distributed") is None:
+    if find_spec("distributed") is None or (settings.scheduler is None and settings.processes == 1):
         yield InOneProcess()
         return
     from hil.engine.cluster import connected

@@ -158,10 +158,8 @@ def _changed_mechanism(name: str, changes: tuple[tuple[str, Any], ...]) -> bytes
         *tables, last = entry.split(".")
         inner = document
         for part in tables:
-            if isinstance(inner, list):
-                inner = inner[_index(part, inner, entry)]
-            else:
-                inner = inner.setdefault(part, tomlkit.table())
+            in_list = isinstance(inner, list)
+            inner = inner[_index(part, inner, entry)] if in_list else inner.setdefault(part, tomlkit.table())
         if isinstance(inner, list):
             inner[_index(last, inner, entry)] = value
         elif isinstance(inner, dict):

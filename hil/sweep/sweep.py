@@ -2,14 +2,17 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pyarrow as pa
 
-from hil.engine.batches import Failure
+from hil.engine.batches import Failure, fingerprint
 from hil.engine.engine import Engine
+from hil.sweep.analysis import QUANTILES, Quantile, quantile
 from hil.sweep.case import Case, cases_of, kind_of, measure
 from hil.sweep.store import DIED, DONE, FAILED, KEY, REASON, STATUS, Store, rows_of
 from hil.sweep.study import Study
@@ -38,6 +41,37 @@ class SweepResult:
     def failed(self) -> int:
         """The number of points without figures."""
         return len(self.table) - self.table[STATUS].to_pylist().count(DONE)
+
+    @property
+    def first_reason(self) -> str:
+        """Why the first run that failed has failed; "" if none has."""
+        return next((reason for reason in self.table[REASON].to_pylist() if reason), "") if self.failed else ""
+
+    def summary(self) -> dict[str, Any]:
+        """The quantiles of the shown figures, and how many runs there are."""
+        return {
+            "study": self.study.name,
+            "factors": [factor.name for factor in self.study.factors],
+            "runs": len(self.table),
+            "new": self.ran,
+            "failed": self.failed,
+            "quantiles": {name: [asdict(each) for each in quantiles] for name, quantiles in self.quantiles().items()},
+            "sources": fingerprint(),
+            "version": version("gough"),
+        }
+
+    def figures(self) -> list[str]:
+        """The figures that the study shows; all of them for functions of the user's own."""
+        others = (KEY, STATUS, REASON, *(factor.name for factor in self.study.factors))
+        return list(self.study.figures) or [name for name in self.table.column_names if name not in others]
+
+    def quantiles(self) -> dict[str, list[Quantile]]:
+        """The quantiles of each shown figure over all runs that have it."""
+        found = {}
+        for name in self.figures():
+            values = np.array([each for each in self.table[name].to_pylist() if each is not None])
+            found[name] = [quantile(values, share) for share in QUANTILES] if len(values) else []
+        return found
 
     def frame(self) -> "pd.DataFrame":
         """The table for pandas."""

@@ -41,6 +41,8 @@ def filled(dtype: np.dtype[Any], /, **values: Any) -> Record:
 
 
 PACKAGES = ("plant", "controller", "hil")
+WITHOUT_KERNELS = ("command_line", "engine", "reports", "sweep")
+"""Rooms of `hil` on which no kernel depends; an edit there leaves all machine code as it is."""
 
 
 @contextmanager
@@ -63,7 +65,8 @@ def compilation_reported(report: Callable[[int], None]) -> Iterator[None]:
 @cache
 def _kernel_folder() -> Path:
     root = Path(__file__).resolve().parents[2]
-    sources = sorted(file for package in PACKAGES for file in (root / package).rglob("*.py"))
+    files = (file.relative_to(root) for package in PACKAGES for file in (root / package).rglob("*.py"))
+    sources = sorted(root / file for file in files if not {*WITHOUT_KERNELS} & {*file.parts})
     return keyed_folder("kernels", hash_of_files(sources, numba.__version__))
 
 
