@@ -1,6 +1,7 @@
 """A batch of a study's work, as a worker does it."""
 
 import fcntl
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -24,10 +25,6 @@ _WITHOUT_RESULTS = ("command_line", "reports")
 _LIBRARIES = ("casadi", "numba", "numpy", "ruckig")
 
 
-class SourcesDifferError(GoughError, RuntimeError):
-    """A worker has another version of gough, or of what computes for it."""
-
-
 @dataclass(frozen=True)
 class Failure:
     """An item whose function raised an error, or that no worker survived."""
@@ -46,6 +43,14 @@ class Batch(Generic[Result]):
     seconds: float
 
 
+@dataclass(frozen=True)
+class Refusal:
+    """Why a worker, at this address, cannot take part."""
+
+    worker: str
+    reason: str
+
+
 @cache
 def fingerprint() -> str:
     """A hash of all that determines results: gough's sources and the versions of the libraries that compute."""
@@ -62,23 +67,34 @@ def attempt(function: Callable[[Item], Result], item: Item) -> Result | Failure:
     except GoughError as error:
         return Failure(str(error), error=error)
     except Exception as error:
-        return Failure(f"{type(error).__name__}: {error}", traceback.format_exc(), error)
+        return Failure(f"{type(error).__name__}: {error}", traceback.format_exc(), error=error)
 
 
-def run_batch(function: Callable[[Item], Result], items: Sequence[Item], kinds: Sequence[str], sources: str) -> Batch[Result]:
-    """Do a batch of work on a worker.
+_ONE_AT_A_TIME = threading.Lock()
+"""A run takes a whole process, and `dask worker` has a thread for each processor unless it is told otherwise."""
+
+
+def run_batch(
+    function: Callable[[Item], Result], items: Sequence[Item], kinds: Sequence[str], sources: str
+) -> Batch[Result] | Refusal:
+    """Do a batch of work on a worker, unless it would give other results than who asks.
 
     Args:
         function: what to do with an item.
         items: the batch.
         kinds: of each item; all items of a kind need the same machine code and FMU.
         sources: the `fingerprint` of who asks.
-
-    Raises:
-        SourcesDifferError: this worker would give other results.
     """
     if sources != fingerprint():
-        raise SourcesDifferError(f"its gough {version('gough')} has the sources {fingerprint()}, and this one {sources}")
+        from distributed import get_worker
+
+        reason = f"its gough {version('gough')} has other sources ({fingerprint()}) than this one ({sources})"
+        return Refusal(get_worker().address, reason)
+    with _ONE_AT_A_TIME:
+        return _run_batch(function, items, kinds)
+
+
+def _run_batch(function: Callable[[Item], Result], items: Sequence[Item], kinds: Sequence[str]) -> Batch[Result]:
     results: list[Result | Failure] = []
     times = []
     for item, kind in zip(items, kinds, strict=True):

@@ -2,12 +2,16 @@
 
 import logging
 import math
+import signal
+import ssl
+import time
 import warnings
 from asyncio import CancelledError
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import count
+from multiprocessing import spawn
 from pathlib import Path
 from typing import Any, TypeVar
 from uuid import uuid4
@@ -15,10 +19,12 @@ from uuid import uuid4
 import dask
 from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
 from distributed.comm.core import CommClosedError
+from distributed.utils import LoopRunner
 
-from hil.engine.batches import Batch, Failure, SourcesDifferError, fingerprint, no_kind, run_batch
+from hil.engine.batches import Batch, Failure, Refusal, fingerprint, no_kind, run_batch
 from hil.engine.engine import Engine
 from hil.engine.settings import EngineSettings, host_and_port
+from plant.compiled import keyed_folder
 from plant.errors import GoughError, InputError
 
 Item = TypeVar("Item")
@@ -29,7 +35,12 @@ _BATCH_S = 2.0
 _AHEAD = 2
 """Batches for each worker, so that none waits for the next."""
 _MOST_GROWTH = 16
-_CONNECT_S, _FIRST_WORKER_S = 10.0, 60.0
+_TRIES = 3
+"""How often a worker may die over an item: in a batch, by itself, and at last while nothing else is at work."""
+_CONNECT_S, _FIRST_WORKER_S, _LOOK_S, _SILENT_S = 10.0, 60.0, 0.02, 10.0
+
+_LOG = logging.getLogger("gough")
+"""Without a handler, Python prints its warnings on standard error, a line each."""
 
 
 class SchedulerLostError(GoughError, ConnectionError):
@@ -38,70 +49,143 @@ class SchedulerLostError(GoughError, ConnectionError):
     exit_status = 1
 
 
+class WorkerRefusedError(GoughError, RuntimeError):
+    """No worker is left, as the last one has another version of gough, or of what computes for it."""
+
+    exit_status = 1
+
+
 class DaskEngine(Engine):
     """Sends batches of items to the workers of a Dask cluster, and the items of a worker that dies to another."""
 
-    def __init__(self, client: Client, workers: int) -> None:
-        self._client, self._fixed = client, workers
+    def __init__(self, client: Client, joined_at: str | None = None) -> None:
+        self._client, self._address, self.joined_at = client, client.scheduler.address, joined_at
         self.dashboard = client.dashboard_link
 
     @property
     def workers(self) -> int:  # type: ignore[override]
         """How many items are worked on at the same time: workers come and go."""
-        return max(self._fixed, len(self._client.scheduler_info(n_workers=-1)["workers"]))
+        return max(1, self._present())
+
+    def _present(self) -> int:
+        try:
+            return len(self._client.nthreads())
+        except (OSError, RuntimeError, AttributeError, TimeoutError) as error:
+            raise self._lost(error) from None
+
+    def _lost(self, error: BaseException) -> SchedulerLostError:
+        return SchedulerLostError(
+            f"the scheduler at {self._address} has gone ({type(error).__name__}); what was finished is kept: start a scheduler "
+            "and workers again, and the same command goes on from there"
+        )
 
     def run(
         self, function: Callable[[Item], Result], items: Sequence[Item], kind: Callable[[Item], str] = no_kind
     ) -> Iterator[tuple[int, Result | Failure]]:
         """As `Engine.run`."""
-        left, alone = deque(range(len(items))), deque[int]()
-        running: dict[Any, list[int]] = {}
-        completed, size, names = as_completed(loop=self._client.loop), 1, (f"gough-{uuid4().hex}-{n}" for n in count())
-
-        def submit() -> None:
-            while (alone or left) and len(running) < _AHEAD * self.workers:
-                # The last batches are small, so that all workers end together.
-                most = max(1, min(size, len(left) // (_AHEAD * self.workers)))
-                numbers = [alone.popleft()] if alone else [left.popleft() for _ in range(most)]
-                batch, kinds = [items[n] for n in numbers], [kind(items[n]) for n in numbers]
-                future = self._client.submit(run_batch, function, batch, kinds, fingerprint(), key=next(names), pure=False)
-                running[future] = numbers
-                completed.add(future)
-
+        queue, running = _Queue(len(items)), dict[Any, list[int]]()
+        completed, names = as_completed(loop=self._client.loop), (f"gough-{uuid4().hex}-{n}" for n in count())
         try:
-            submit()
-            for future in completed:
-                numbers = running.pop(future)
-                batch = self._result(future)
-                if batch is None and len(numbers) == 1:
-                    yield numbers[0], Failure("the process that worked on it died, each time it was tried", died=True)
-                elif batch is None:
-                    alone.extend(numbers)
+            while True:
+                workers = self.workers
+                while len(running) < _AHEAD * workers and (numbers := queue.next(list(running.values()), workers)):
+                    batch, kinds = [items[n] for n in numbers], [kind(items[n]) for n in numbers]
+                    future = self._client.submit(run_batch, function, batch, kinds, fingerprint(), key=next(names), pure=False)
+                    running[future] = numbers
+                    completed.add(future)
+                if not running:
+                    return
+                future = self._next(completed)
+                numbers, outcome = running.pop(future), self._outcome(future)
+                if outcome is None:
+                    for number in queue.died(numbers):
+                        reason = f"the process that worked on it died, each of the {_TRIES} times it was tried"
+                        yield number, Failure(reason, died=True)
+                elif isinstance(outcome, Refusal):
+                    queue.put_back(numbers)
+                    self._leave_out(outcome)
                 else:
-                    yield from zip(numbers, batch.results, strict=True)
-                    if math.isfinite(batch.seconds):
-                        size = max(1, min(round(_BATCH_S / max(batch.seconds, 1e-9)), _MOST_GROWTH * size))
+                    queue.took(outcome.seconds)
+                    yield from zip(numbers, outcome.results, strict=True)
                 future.release()
-                submit()
         finally:
             with suppress(Exception):
                 self._client.cancel(list(running), force=True)
 
-    def _result(self, future: Any) -> Batch[Any] | None:
-        """A finished batch; None if every worker that tried it died."""
+    def _next(self, completed: Any) -> Any:
+        """The next batch that is finished; waits for workers if there are none."""
+        silent_from = time.monotonic() + _SILENT_S
+        while not completed.has_ready():
+            time.sleep(_LOOK_S)
+            if time.monotonic() > silent_from:
+                silent_from = math.inf
+                if not self._present():
+                    _LOG.warning("no worker is there; the work goes on as soon as one joins")
+        return next(completed)
+
+    def _outcome(self, future: Any) -> Batch[Any] | Refusal | None:
+        """A finished batch, or why the worker did not do it; None if the worker died."""
         try:
-            batch: Batch[Any] = future.result()
-            return batch
+            outcome: Batch[Any] | Refusal = future.result()
+            return outcome
         except KilledWorker:
             return None
-        except SourcesDifferError as error:
-            raise SourcesDifferError(f"a worker cannot take part: {error}; install the same on all machines") from None
         except (CancelledError, CommClosedError, TimeoutError) as error:
-            address = self._client.scheduler.address if self._client.scheduler else "Dask"
-            raise SchedulerLostError(
-                f"the scheduler at {address} has gone ({type(error).__name__}); what was finished is kept, and the same "
-                "command goes on from there"
-            ) from None
+            raise self._lost(error) from None
+        except (ImportError, AttributeError) as error:
+            raise WorkerRefusedError(f"a worker cannot take part: {error}; install the same gough on all machines") from None
+
+    def _leave_out(self, refusal: Refusal) -> None:
+        with suppress(OSError, TimeoutError):
+            self._client.retire_workers([refusal.worker], close_workers=True)
+        text = f"the worker at {refusal.worker} is left out: {refusal.reason}; install the same on all machines"
+        if not self._present():
+            raise WorkerRefusedError(text)
+        _LOG.warning(text)
+
+
+class _Queue:
+    """The numbers of items that are still to do, and how many of them make a batch."""
+
+    def __init__(self, items: int) -> None:
+        self._left, self._suspects = deque(range(items)), deque[int]()
+        self._deaths = Counter[int]()
+        self._size = 1
+
+    def next(self, running: list[list[int]], workers: int) -> list[int]:
+        """The next batch beside those that are running; none if they must end first, or if there is no more.
+
+        Items of a batch over which a worker died go one at a time, beside batches that have killed none. What dies again is
+        alone on the cluster in the end, so that no other item pays for it, and none is taken for guilty that is not.
+        """
+        suspect = next((numbers[0] for numbers in running if self._deaths[numbers[0]]), None)
+        if suspect is not None and self._last_try(suspect):
+            return []
+        if self._suspects and suspect is None:
+            return [] if self._last_try(self._suspects[0]) and running else [self._suspects.popleft()]
+        # The last batches are small, so that all workers end together.
+        most = max(1, min(self._size, len(self._left) // (_AHEAD * workers)))
+        return [self._left.popleft() for _ in range(min(most, len(self._left)))]
+
+    def _last_try(self, number: int) -> bool:
+        return self._deaths[number] == _TRIES - 1
+
+    def died(self, numbers: list[int]) -> list[int]:
+        """Take back a batch over which a worker died; returns the items that are not tried again."""
+        self._deaths.update(numbers)
+        again = [number for number in numbers if self._deaths[number] < _TRIES]
+        self._suspects.extend(again)
+        return [number for number in numbers if number not in again]
+
+    def put_back(self, numbers: list[int]) -> None:
+        """Take back a batch that has not begun."""
+        for number in reversed(numbers):
+            (self._suspects if self._deaths[number] else self._left).appendleft(number)
+
+    def took(self, seconds: float) -> None:
+        """Choose the size of batches by the time that an item took [s], if that is known."""
+        if math.isfinite(seconds):
+            self._size = max(1, min(round(_BATCH_S / max(seconds, 1e-9)), _MOST_GROWTH * self._size))
 
 
 @contextmanager
@@ -117,36 +201,80 @@ def connected(settings: EngineSettings) -> Iterator[DaskEngine]:
         if settings.scheduler is not None:
             client = stack.enter_context(_client(settings.scheduler, security))
             _wait_for_workers(client, settings.scheduler)
-            yield DaskEngine(client, 1)
+            yield DaskEngine(client)
             return
-        host, port = host_and_port(settings.listen)
-        if settings.tls:
-            stack.enter_context(
-                dask.config.set(
-                    {
-                        "distributed.scheduler.dashboard.tls.ca-file": settings.tls_ca,
-                        "distributed.scheduler.dashboard.tls.cert": settings.tls_cert,
-                        "distributed.scheduler.dashboard.tls.key": settings.tls_key,
-                    }
-                )
-            )
+        cluster = stack.enter_context(_local_cluster(settings, security))
+        joined_at = cluster.scheduler_address if settings.others_join else None
+        yield DaskEngine(stack.enter_context(_client(cluster, security)), joined_at)
+
+
+@contextmanager
+def _local_cluster(settings: EngineSettings, security: Security | None) -> Iterator[LocalCluster]:
+    """A scheduler in this process, and processes that work. All but the scheduler listens on loopback only."""
+    host, port = host_and_port(settings.listen)
+    with ExitStack() as stack:
+        files = {"ca-file": settings.tls_ca, "cert": settings.tls_cert, "key": settings.tls_key}
+        stack.enter_context(
+            dask.config.set({f"distributed.scheduler.dashboard.tls.{name}": file for name, file in files.items()})
+        )
+        stack.enter_context(_main_module_not_run_again())
+        loop = stack.enter_context(_loop_for_workers())
         try:
             cluster = stack.enter_context(
                 LocalCluster(
                     n_workers=settings.processes,
                     threads_per_worker=1,
-                    host=host,
+                    host="127.0.0.1",
+                    # `_Queue` tries again what a worker died over.
+                    scheduler_kwargs={"host": host, "allowed_failures": 0},
                     scheduler_port=port,
                     protocol="tls" if settings.tls else "tcp",
                     security=security,
                     dashboard_address=settings.dashboard,
-                    env={"OPENBLAS_NUM_THREADS": "1"},
+                    # If the user's cache cannot be written, all share the one of this process.
+                    env={"GOUGH_CACHE": str(keyed_folder("prepared", fingerprint()).resolve().parents[1])},
+                    loop=loop,
                     silence_logs=logging.CRITICAL,
                 )
             )
         except (OSError, RuntimeError, ValueError) as error:
-            raise InputError(f"no scheduler can listen on {settings.listen}: {error}") from None
-        yield DaskEngine(stack.enter_context(_client(cluster, security)), settings.processes)
+            raise InputError(f"cannot start a scheduler at {settings.listen} with its workers: {error}") from None
+        if settings.tls:
+            cluster.scheduler.http_server.ssl_options.verify_mode = ssl.CERT_REQUIRED
+        yield cluster
+
+
+@contextmanager
+def _loop_for_workers() -> Iterator[Any]:
+    """An event loop that starts processes which never see Ctrl-C: it is for this process, which then ends them."""
+    runner = LoopRunner()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        runner.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    try:
+        yield runner.loop
+    finally:
+        runner.stop()
+
+
+@contextmanager
+def _main_module_not_run_again() -> Iterator[None]:
+    """Let workers start without running the program's main module, so that it needs no `if __name__ == "__main__"`."""
+    original = spawn.get_preparation_data
+
+    def without_main(name: str) -> dict[str, Any]:
+        data = original(name)
+        if name.startswith("Dask Worker"):
+            data = {each: value for each, value in data.items() if not each.startswith("init_main")}
+        return data
+
+    spawn.get_preparation_data = without_main
+    try:
+        yield
+    finally:
+        spawn.get_preparation_data = original
 
 
 @contextmanager

@@ -23,6 +23,8 @@ class Engine(ABC):
     """How many items are worked on at the same time."""
     dashboard: str | None = None
     """Address of a page that shows the work."""
+    joined_at: str | None = None
+    """Address at which workers of other machines can join."""
 
     @abstractmethod
     def run(
@@ -75,9 +77,9 @@ def open_engine(settings: EngineSettings | None = None) -> Iterator[Engine]:
         MissingPackageError: the settings need Dask, and it is not installed.
     """
     settings = settings or EngineSettings()
-    if settings != EngineSettings() and settings.workers != 1:
+    if not settings.alone and settings != EngineSettings():
         check_installed("distributed")
-    if find_spec("distributed") is None or (settings.scheduler is None and settings.processes == 1):
+    if settings.alone or find_spec("distributed") is None:
         yield InOneProcess()
         return
     from hil.engine.cluster import connected

@@ -9,6 +9,8 @@ from plant.errors import InputError
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 """Hosts that only this machine can reach."""
 
+_LISTEN, _DASHBOARD = "127.0.0.1:0", "127.0.0.1:8787"
+
 
 @dataclass(frozen=True)
 class EngineSettings:
@@ -16,50 +18,77 @@ class EngineSettings:
 
     workers: int | None = option(
         None,
-        "processes of this machine that work; 1 does everything in one, without Dask",
+        "processes of this machine that do the work; 1 needs no Dask; 0 leaves the work to workers that join at --listen",
         parse=int,
         shown="one for each processor",
     )
     scheduler: str | None = option(
         None,
-        "a Dask scheduler whose workers do the work instead, tcp://HOST:PORT or tls://HOST:PORT",
+        "a Dask scheduler that is there already, whose workers do the work: tcp://HOST:PORT, or tls://HOST:PORT",
         metavar="ADDRESS",
     )
     listen: str = option(
-        "127.0.0.1:0",
-        "where the scheduler of this machine's processes listens, so that workers of other machines can join; beyond this "
-        "machine it needs the three files for TLS",
+        _LISTEN,
+        "where workers of other machines can join ('dask worker', docs/sweeps.md); an address that other machines reach needs "
+        "TLS; port 0 is any that is free",
         metavar="HOST:PORT",
     )
-    dashboard: str = option("127.0.0.1:8787", "where Dask's dashboard listens; as above", metavar="HOST:PORT")
-    tls_ca: str | None = option(None, "certificate of the authority that signed everyone's certificate", metavar="FILE.pem")
-    tls_cert: str | None = option(None, "certificate of this machine", metavar="FILE.pem")
-    tls_key: str | None = option(None, "private key of this machine", metavar="FILE.pem")
+    dashboard: str = option(
+        _DASHBOARD,
+        "where Dask's page on the work is, or a free port if another sweep has this one; an address that other machines reach "
+        "needs TLS",
+        metavar="HOST:PORT",
+    )
+    tls_ca: str | None = option(None, "TLS: certificate of the authority that has signed everyone's", metavar="FILE.pem")
+    tls_cert: str | None = option(None, "TLS: certificate of this machine", metavar="FILE.pem")
+    tls_key: str | None = option(None, "TLS: private key of this machine", metavar="FILE.pem")
 
     def __post_init__(self) -> None:
-        if self.workers is not None and not 1 <= self.workers <= 1024:
-            raise InputError(f"{self.workers} workers are asked for; there can be 1 to 1024")
-        if self.scheduler is not None and not self.scheduler.startswith(("tcp://", "tls://")):
-            raise InputError(f"{self.scheduler!r} is no address of a scheduler such as tcp://127.0.0.1:8786")
-        if self.scheduler is not None and self.workers is not None:
-            raise InputError("--workers is for this machine, and the scheduler has workers of its own: leave one of them out")
+        if self.workers is not None and not 0 <= self.workers <= 1024:
+            raise InputError(f"{self.workers} workers are asked for; there can be 0 to 1024")
+        if self.workers == 0 and self.listen == _LISTEN:
+            raise InputError("without processes of this machine others must join: say where, with --listen HOST:PORT")
         files = (self.tls_ca, self.tls_cert, self.tls_key)
         if any(files) and not all(files):
             raise InputError("TLS needs three files: --tls-ca, --tls-cert and --tls-key")
-        if self.scheduler is not None and self.scheduler.startswith("tls://") and not all(files):
-            raise InputError(f"{self.scheduler} speaks TLS: add --tls-ca, --tls-cert and --tls-key")
+        if self.scheduler is not None:
+            self._check_scheduler(self.scheduler)
         for flag, address in (("--listen", self.listen), ("--dashboard", self.dashboard)):
             host, _ = host_and_port(address)
-            if host not in LOOPBACK and not all(files):
+            if host not in LOOPBACK and not self.tls:
                 raise InputError(
                     f"{flag} {address} can be reached from other machines, so it needs TLS: add --tls-ca, --tls-cert and "
                     "--tls-key, or take 127.0.0.1"
                 )
 
+    def _check_scheduler(self, address: str) -> None:
+        protocol, _, rest = address.partition("://")
+        if protocol not in ("tcp", "tls"):
+            raise InputError(f"{address!r} is no address of a scheduler such as tcp://127.0.0.1:8786")
+        host_and_port(rest)
+        if self.tls != (protocol == "tls"):
+            raise InputError(f"--tls-ca, --tls-cert and --tls-key go with tls://HOST:PORT, and only with it; here is {address}")
+        if self.workers is not None:
+            raise InputError("--workers is for this machine, and the scheduler has workers of its own: leave one of them out")
+        if (self.listen, self.dashboard) != (_LISTEN, _DASHBOARD):
+            raise InputError(
+                "--listen and --dashboard are for a scheduler of this command's own: leave them or --scheduler out"
+            )
+
     @property
     def processes(self) -> int:
         """How many processes of this machine work."""
         return len(os.sched_getaffinity(0)) if self.workers is None else self.workers
+
+    @property
+    def alone(self) -> bool:
+        """Whether one process does everything."""
+        return self.scheduler is None and self.listen == _LISTEN and self.processes == 1
+
+    @property
+    def others_join(self) -> bool:
+        """Whether workers that are started by hand are expected to join."""
+        return self.listen != _LISTEN
 
     @property
     def tls(self) -> bool:

@@ -18,10 +18,15 @@ from plant.errors import InputError
 from plant.files import write_whole
 
 TABLE = "runs.parquet"
+_PARTS = ".*.parquet.*"
+"""What a process that died in the middle of `write_whole` has left."""
 KEY, STATUS, REASON = "key", "status", "reason"
 DONE, FAILED, DIED = "done", "failed", "died"
 """A row's status: figures are there, the run gave the reason, the worker died."""
-_MOST_FILES = 100
+_ALWAYS = {KEY: str, STATUS: str, REASON: str}
+"""Columns that every table has."""
+_MOST_FILES = 1000
+"""So many files of new rows are taken into the table, which costs as much as to write it whole."""
 
 
 class Store:
@@ -51,24 +56,35 @@ class Store:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 raise InputError(f"another process writes results to {folder}: wait for it, or give another folder") from None
+            for part in (*folder.glob(_PARTS), *store._new.glob(_PARTS)):
+                part.unlink()
             store.compact()
             yield store
             store.compact()
 
     def table(self) -> pa.Table:
         """All rows."""
-        files = [self.folder / TABLE, *sorted(self._new.glob("*.parquet"))]
-        tables = [_read(file) for file in files if file.is_file()]
-        if not tables:
-            return pa.table({KEY: pa.array([], pa.string()), STATUS: pa.array([], pa.string())})
-        table = pa.concat_tables(tables, promote_options="permissive")
+        # The table is read last, as another process may just be taking new rows into it.
+        new = [_read(file) for file in sorted(self._new.glob("*.parquet"))]
+        parts = [part for part in (_read(self.folder / TABLE), *new) if part is not None]
+        try:
+            table = pa.concat_tables([_schema([]).empty_table(), *parts], promote_options="permissive")
+        except pa.ArrowInvalid as error:
+            text = str(error).splitlines()[0]
+            raise InputError(
+                f"the rows in {self.folder} are of several kinds ({text}): give another folder for these"
+            ) from None
         last = {key: row for row, key in enumerate(table[KEY].to_pylist())}
         return table if len(last) == len(table) else table.take(sorted(last.values()))
 
     def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Add rows, which are on the disk when this returns."""
         if rows:
-            self._write(self._new / f"{self._number:08d}.parquet", pa.Table.from_pylist(list(map(_row, rows)), _schema(rows)))
+            try:
+                table = pa.Table.from_pylist(list(map(_row, rows)), _schema(rows))
+            except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError) as error:
+                raise InputError(f"the values of a factor or figure are of several kinds: {error}") from None
+            self._write(self._new / f"{self._number:08d}.parquet", table)
             self._number += 1
         if self._number >= _MOST_FILES:
             self.compact()
@@ -95,9 +111,12 @@ def rows_of(table: pa.Table, keys: Iterable[str]) -> pa.Table:
     return table.take([place[key] for key in keys if key in place])
 
 
-def _read(file: Path) -> pa.Table:
+def _read(file: Path) -> pa.Table | None:
+    """The rows of a file; None if there is no such file."""
     try:
         return pq.read_table(file, partitioning=None)
+    except FileNotFoundError:
+        return None
     except (OSError, pa.ArrowInvalid) as error:
         raise InputError(f"cannot read {file}: {error}; move it away to run what it had again") from None
 
@@ -110,7 +129,7 @@ def _row(row: Mapping[str, Any]) -> dict[str, Any]:
 
 def _schema(rows: Sequence[Mapping[str, Any]]) -> pa.Schema:
     """All columns of some rows, as rows of failed runs lack figures."""
-    kinds: dict[str, Any] = {}
+    kinds: dict[str, Any] = dict(_ALWAYS)
     for row in rows:
         for name, value in row.items():
             if kinds.get(name) is None and value is not None:

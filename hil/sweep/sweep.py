@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-_FLUSH_S = 1.0
-"""Rows are on the disk at most this time after they came [s]."""
+_FLUSH_S = 0.1
+"""The least time between files of new rows [s]; a batch of two seconds is written as it comes."""
 
 
 @dataclass(frozen=True, eq=False)
