@@ -1,0 +1,184 @@
+"""Studies: what varies, at which points, and what a file may say."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import qmc
+
+from hil.runs.config import SimulationConfig
+from hil.sweep.study import METHODS, Factor, Sampling, Study, read_study
+from plant.errors import GoughError, InputError
+
+SEEDS = Factor("run.seed", (0, 1, 2))
+GAIN = Factor("mechanism.control.proportional", (), 40.0, 80.0)
+MASS = Factor("plant.payload.mass", (), 5.0, 15.0)
+
+
+@pytest.fixture
+def written(tmp_path: Path):
+    """Writes a study's file."""
+
+    def write(text: str) -> Path:
+        path = tmp_path / "imu_grade.toml"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_values_are_crossed_and_ranges_are_sampled() -> None:
+    study = Study((SEEDS, GAIN, Factor("run.imu", ("ideal", "mpu9150"))), sampling=Sampling(count=4))
+    points = study.points()
+    assert len(points) == study.size == 4 * 3 * 2
+    assert len({point["mechanism.control.proportional"] for point in points}) == 4
+    assert list(points[0]) == ["run.seed", "mechanism.control.proportional", "run.imu"]
+    # Samples are the outer loop: what is crossed changes first.
+    assert [point["run.imu"] for point in points[:4]] == ["ideal", "mpu9150", "ideal", "mpu9150"]
+    assert len({point["mechanism.control.proportional"] for point in points[:6]}) == 1
+
+
+def test_without_a_range_nothing_is_sampled() -> None:
+    assert [point["run.seed"] for point in Study((SEEDS,)).points()] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_samples_fill_the_range_evenly_and_follow_the_seed(method: str) -> None:
+    study = Study((GAIN, MASS), sampling=Sampling(method, 64, seed=5))
+    points = study.points()
+    values = np.array([list(point.values()) for point in points])
+    assert len(points) == study.size == (64 * 4 if method == "saltelli" else 64)
+    assert (values >= (40.0, 5.0)).all()
+    assert (values <= (80.0, 15.0)).all()
+    assert points == study.points()
+    assert points != Study((GAIN, MASS), sampling=Sampling(method, 64, seed=6)).points()
+    # Random points have a discrepancy of about 0.01.
+    unit = (values - (40.0, 5.0)) / (40.0, 10.0)
+    assert qmc.discrepancy(unit[np.unique(unit, axis=0, return_index=True)[1]]) < 5e-3
+
+
+@given(st.floats(0.0, 1.0), st.floats(1e-6, 1e3), st.floats(1.001, 1e3))
+def test_a_range_has_its_ends_and_a_logarithmic_one_its_geometric_mean(share: float, low: float, times: float) -> None:
+    even, logarithmic = (Factor("run.rate", (), low, low * times, each) for each in (False, True))
+    for factor in (even, logarithmic):
+        assert factor.at(0.0) == low
+        assert factor.at(1.0) == pytest.approx(low * times, rel=1e-12)
+        assert low * (1.0 - 1e-12) <= factor.at(share) <= low * times * (1.0 + 1e-12)
+    assert logarithmic.at(0.5) == pytest.approx(np.sqrt(low * low * times), rel=1e-9)
+    assert even.at(0.5) == pytest.approx((low + low * times) / 2.0, rel=1e-9)
+
+
+def test_a_file_says_all_of_it(written) -> None:
+    study = read_study(
+        written(
+            """
+            name = "Grade"
+            [run]
+            duration = 2
+            imus = "legs"
+            [mechanism.control]
+            integral = 150.0
+            [plant]
+            payload.mass = 12
+            [vary]
+            run.imu = ["ideal", "mpu9150"]
+            run.seed = { seeds = 3 }
+            run.joint_error = { from = 0.0, to = 2e-4, steps = 3 }
+            mechanism.control.proportional = { from = 40.0, to = 80.0 }
+            plant.friction.coulomb = { from = 1.0, to = 100.0, logarithmic = true }
+            [sampling]
+            method = "latin-hypercube"
+            count = 5
+            seed = 7
+            [measure]
+            figures = ["tracking.position_rms"]
+            """
+        )
+    )
+    assert (study.name, study.size) == ("Grade", 2 * 3 * 3 * 5)
+    assert study.sampling == Sampling("latin-hypercube", 5, 7)
+    assert study.figures == ("tracking.position_rms",)
+    names = [factor.name for factor in study.factors]
+    assert names == [
+        "run.imu", "run.seed", "run.joint_error", "mechanism.control.proportional", "plant.friction.coulomb",
+    ]  # fmt: skip
+    assert study.factors[2].values == (0.0, 1e-4, 2e-4)
+    point = study.points()[-1]
+    config = study.config_at(point)
+    assert (config.imu, config.seed, config.joint_error, config.duration) == ("mpu9150", 2, 2e-4, 2.0)
+    assert config.imus == (0, 1, 2, 3, 4, 5)
+    assert [(each.name, each.value) for each in config.settings] == [
+        ("payload.mass", (12.0,)),
+        ("friction.coulomb", (point["plant.friction.coulomb"],)),
+    ]
+    assert study.mechanism_at(point) == {
+        "control.integral": 150.0,
+        "control.proportional": point["mechanism.control.proportional"],
+    }
+
+
+def test_files_are_looked_for_beside_the_study(written, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "mine.toml").write_text('based_on = "hexapod"\n')
+    (tmp_path / "wave.csv").write_text("")
+    (tmp_path / "own.py").write_text("def figure(result):\n    return 1.0\n")
+    path = written(
+        '[run]\ntarget = "wave.csv"\n[vary]\nrun.mechanism = ["hexapod", "mine.toml"]\n[measure]\nfunction = "own.py:figure"\n'
+    )
+    monkeypatch.chdir("/")
+    study = read_study(path)
+    assert study.run.target == str(tmp_path / "wave.csv")
+    assert study.factors[0].values == ("hexapod", str(tmp_path / "mine.toml"))
+    assert study.function is not None
+    assert study.function.figures(None) == {"figure": 1.0}
+
+
+def test_what_does_not_vary_is_that_of_a_simulation() -> None:
+    assert Study((SEEDS,)).config_at({"run.seed": 2}) == SimulationConfig(seed=2)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "nothing varies"),
+        ("speed = 1\n", "no entry 'speed'"),
+        ("vary = 1\n", "'vary' must be a table"),
+        ("[vary]\nrun.seed = 3\n", "does not vary"),
+        ("[vary]\nrun.seed = []\n", "does not vary"),
+        ("[vary]\nrun.seed = { seeds = 0 }\n", "positive whole number"),
+        ("[vary]\nrun.seed = { seeds = 2, from = 1 }\n", "stands alone"),
+        ("[vary]\nrun.speed = [1, 2]\n", "no entry 'speed'"),
+        ("[vary]\nrun.arm = [true, false]\n", "no entry 'arm'"),
+        ("[vary]\nspeed = [1, 2]\n", "run.FIELD"),
+        ("[vary]\nrun.rate = { from = 1.0 }\n", "from and to"),
+        ("[vary]\nrun.rate = { from = 200.0, to = 100.0 }\n", "goes up"),
+        ("[vary]\nrun.rate = { from = 1.0, to = nan }\n", "finite"),
+        ("[vary]\nrun.rate = { from = 0.0, to = 1.0, logarithmic = true }\n", "must be positive"),
+        ("[vary]\nrun.rate = { from = 1.0, to = 2.0, steps = 1 }\n", "2 at least"),
+        ('[vary]\nrun.rate = { from = "a", to = 2.0 }\n', "run.rate"),
+        ("[sampling]\ncount = 1\n[vary]\nrun.seed = [1]\n", "2 to"),
+        ('[sampling]\nmethod = "dice"\n[vary]\nrun.seed = [1]\n', "sobol"),
+        ('[sampling]\nmethod = "saltelli"\n[vary]\nrun.seed = [1]\n', "samples ranges"),
+        ("[sampling]\nseed = -1\n[vary]\nrun.seed = [1]\n", "seed is -1"),
+        ('[run]\nrate = "fast"\n[vary]\nrun.seed = [1]\n', "wrong kind"),
+        ("[run]\nrate = 1e9\n[vary]\nrun.seed = [1]\n", "4000"),
+        ('[run]\nfusion = "cold"\n[vary]\nrun.seed = [1]\n', "no fusion"),
+        ('[measure]\nfunction = "nothing.py:f"\n[vary]\nrun.seed = [1]\n', "nothing.py"),
+        ('model = "f"\n[vary]\nx = [1]\n', "FILE.py:FUNCTION"),
+    ],
+)
+def test_a_wrong_file_gets_one_line_that_names_it(written, text: str, said: str) -> None:
+    with pytest.raises(GoughError) as error:
+        read_study(written(text))
+    message = str(error.value)
+    assert "imu_grade.toml" in message
+    assert said in message
+    assert "\n" not in message
+
+
+def test_a_factor_varies_once_and_points_are_limited() -> None:
+    with pytest.raises(InputError, match="twice"):
+        Study((SEEDS, SEEDS))
+    with pytest.raises(InputError, match="vary less"):
+        Study((Factor("run.seed", tuple(range(4000))), Factor("run.rate", tuple(range(4000))))).points()
