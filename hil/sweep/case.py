@@ -53,7 +53,7 @@ class Case:
         key: a hash of all that determines the figures: configuration, files, functions and gough's sources.
         kind: cases of a kind need the same machine code and FMU.
         point: the factors' values.
-        config: of the run; the names of `files` are not in it.
+        config: of the run; `files` are in it by name alone.
         files: the files that the configuration names.
         function, model: as in `Study`.
     """
@@ -68,7 +68,8 @@ class Case:
 
     def local_config(self) -> SimulationConfig:
         """The configuration with this machine's files."""
-        return replace(self.config, **{file.field: str(file.local()) for file in self.files})
+        local: dict[str, Any] = {file.field: str(file.local()) for file in self.files}
+        return replace(self.config, **local)
 
 
 def kind_of(case: Case) -> str:
@@ -125,13 +126,8 @@ def _case(study: Study, point: Mapping[str, Any]) -> Case:
     planar = _is_planar(config.mechanism)
     kind = f"{config.fusion} {planar} {config.plant and _digest(_content(config.plant))}"
     key = _key({"config": config_of_key, "function": function})
-    without = {file.field: SimulationConfig.__dataclass_fields__[file.field].default for file in files}
-    return Case(key, kind, point, replace(config, **without | _kept(config)), tuple(files), study.function, None)
-
-
-def _kept(config: SimulationConfig) -> dict[str, Any]:
-    """The plant keeps its name, as a binding without a plant is refused."""
-    return {} if config.plant is None else {"plant": Path(config.plant).name}
+    without: dict[str, Any] = {file.field: file.name for file in files}
+    return Case(key, kind, point, replace(config, **without), tuple(files), study.function, None)
 
 
 @cache

@@ -40,7 +40,7 @@ class SweepResult:
     @property
     def failed(self) -> int:
         """The number of points without figures."""
-        return len(self.table) - self.table[STATUS].to_pylist().count(DONE)
+        return sum(status != DONE for status in self.table[STATUS].to_pylist())
 
     @property
     def first_reason(self) -> str:
@@ -82,9 +82,9 @@ class SweepResult:
         """The figures for xarray, over the factors if all are crossed, else over the point's number."""
         frame = self.frame().drop(columns=[KEY])
         names = [factor.name for factor in self.study.factors]
-        if all(not factor.sampled for factor in self.study.factors):
-            return frame.set_index(names).to_xarray()
-        return frame.rename_axis("point").to_xarray()
+        crossed = all(not factor.sampled for factor in self.study.factors)
+        cube: xr.Dataset = (frame.set_index(names) if crossed else frame.rename_axis("point")).to_xarray()
+        return cube
 
 
 @dataclass(frozen=True)

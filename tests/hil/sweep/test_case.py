@@ -6,11 +6,11 @@ from pathlib import Path
 import cloudpickle
 import pytest
 
+from hil.runs.config import SimulationConfig
 from hil.runs.simulation import simulate
 from hil.sweep.case import Case, cases_of, measure
 from hil.sweep.function import UserFunction
 from hil.sweep.study import Factor, Study
-from hil.runs.config import SimulationConfig
 from plant.errors import GoughError
 from plant.mechanism import load_spatial
 
@@ -88,7 +88,10 @@ def test_the_key_is_that_of_all_that_determines_the_figures(tmp_path: Path) -> N
     assert key == only(seeds(1)).key
     assert key == only(Study((Factor("run.seed", (1,)), Factor("run.rate", (1000,))))).key
     others = [seeds(2), seeds(1, run=SHORT), seeds(1, mechanism={"control.integral": 150.0}), seeds(1, run=there)]
-    others += [seeds(1, function=UserFunction.of(cycles)), Study((Factor("plant.payload.mass", (9.0,)), Factor("run.seed", (1,))))]
+    others += [
+        seeds(1, function=UserFunction.of(cycles)),
+        Study((Factor("plant.payload.mass", (9.0,)), Factor("run.seed", (1,)))),
+    ]
     keys = {only(study).key for study in others}
     assert len(keys | {key}) == len(others) + 1
     before = only(seeds(1, run=there)).key

@@ -44,7 +44,7 @@ def test_it_may_give_several_figures(tmp_path: Path) -> None:
 @pytest.mark.parametrize("value", ["'much'", "None", "[1, 2]", "{'a': 'b'}"])
 def test_what_is_no_number_is_refused(tmp_path: Path, value: str) -> None:
     (tmp_path / "f.py").write_text(f"def f():\n    return {value}\n")
-    with pytest.raises(InputError, match="f returned .*must return a number"):
+    with pytest.raises(InputError, match="must return a number"):
         UserFunction.from_file("f.py:f", tmp_path).figures()
 
 
