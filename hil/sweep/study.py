@@ -149,7 +149,7 @@ class Study:
             raise InputError(f"the study has {self.size} points; there can be {_MOST_RUNS}: vary less")
         sampled = [factor for factor in self.factors if factor.sampled]
         crossed = [factor for factor in self.factors if not factor.sampled]
-        shares = self.sampling.shares(len(sampled)) if sampled else [[]]
+        shares = self.sampling.shares(len(sampled)).tolist() if sampled else [[]]
         drawn = [{factor.name: factor.at(share) for factor, share in zip(sampled, row, strict=True)} for row in shares]
         grid = [dict(zip((f.name for f in crossed), values, strict=True)) for values in product(*(f.values for f in crossed))]
         order = [factor.name for factor in self.factors]
