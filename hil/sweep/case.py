@@ -11,15 +11,13 @@ from typing import Any
 from hil.engine.batches import fingerprint
 from hil.runs.config import SimulationConfig
 from hil.sweep.function import UserFunction
-from hil.sweep.study import Study
+from hil.sweep.study import FILES, Study
 from plant.compiled import keyed_folder
 from plant.errors import GoughError, InputError, UnknownNameError
 from plant.files import write_whole
 from plant.mechanism import load_in_space
 from plant.mechanism.documents import mechanism_text
 
-_FILES = ("mechanism", "target", "calibration", "plant", "binding")
-"""Fields of a run's configuration that may name files."""
 _OF_THIS_RUN = ("config", "version", "real_time_factor", "cycle_us")
 """Parts of a summary that are no figures, or not the same each time."""
 
@@ -114,7 +112,7 @@ def _case(study: Study, point: Mapping[str, Any]) -> Case:
         return Case(key, "", point, study.run, (), None, study.model)
     config, changes = study.config_at(point), study.mechanism_at(point)
     files = []
-    for field in _FILES:
+    for field in FILES:
         name = getattr(config, field)
         if field == "mechanism" and (changes or Path(name).is_file()):
             content = _changed_mechanism(name, tuple(changes.items())) if changes else _content(name)

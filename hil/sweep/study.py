@@ -21,6 +21,8 @@ FIGURES = (
     "estimation.position_rms", "estimation.rotation_rms", "tracking.position_rms", "tracking.rotation_rms",
 )  # fmt: skip
 """Figures of a run that are shown if a study names none."""
+FILES = ("mechanism", "target", "calibration", "plant", "binding")
+"""Fields of a run's configuration that may name files."""
 _PARTS = ("run", "mechanism", "plant")
 _MOST_RUNS = 10_000_000
 
@@ -73,6 +75,9 @@ class Sampling:
             raise InputError(f"there is no method {self.method!r} of sampling; there are {', '.join(METHODS)}")
         if not 2 <= self.count <= _MOST_RUNS:
             raise InputError(f"{self.count} samples are asked for; there can be 2 to {_MOST_RUNS}")
+        below = 1 << (self.count.bit_length() - 1)
+        if self.method != "latin-hypercube" and self.count != below:
+            raise InputError(f"{self.count} samples are asked for; {self.method} needs a power of two: {below} or {2 * below}")
 
     def shares(self, factors: int) -> np.ndarray[Any, np.dtype[np.float64]]:
         """Samples (N, factors) of the unit cube."""
@@ -198,9 +203,9 @@ def _study(document: dict[str, Any], path: Path) -> Study:
     check_entries(sampling, [each.name for each in fields(Sampling)], "[sampling]")
     model = document.get("model")
     factors = tuple(_factors(document.get("vary", {}), "", model is None))
-    run = {name: _beside(path, value) for name, value in _parsed(document.get("run", {})).items()}
+    run = {name: _beside(path, name, value) for name, value in _parsed(document.get("run", {})).items()}
     factors = tuple(
-        replace(each, values=tuple(_beside(path, value) for value in each.values)) if each.name.startswith("run.") else each
+        replace(each, values=tuple(_beside(path, each.name.removeprefix("run."), value) for value in each.values))
         for each in factors
     )
     settings = tuple(
@@ -223,9 +228,9 @@ def _study(document: dict[str, Any], path: Path) -> Study:
         raise InputError(f"a value has the wrong kind: {error}") from None
 
 
-def _beside(path: Path, value: Any) -> Any:
+def _beside(path: Path, field: str, value: Any) -> Any:
     """A name of a file beside the study's, if there is such a file; any other value as it is."""
-    if isinstance(value, str) and value and (path.parent / value).is_file():
+    if field in FILES and isinstance(value, str) and (path.parent / value).is_file():
         return str(path.parent / value)
     return value
 

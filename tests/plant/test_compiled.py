@@ -1,6 +1,7 @@
 """Compiled kernels and the cache that keeps them."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import pytest
 
 from plant.compiled import hash_of_files, kernel, keyed_folder, user_cache
 from plant.compiled.cache import STALE_AFTER_S
+from plant.compiled.kernels import PACKAGES, WITHOUT_KERNELS
 
 
 @kernel
@@ -164,7 +166,7 @@ def test_machine_code_that_calls_other_kernels_is_loaded_whole(tmp_path: Path) -
     assert (said[0][1], said[1][1]) == ("1", "0")
 
 
-def test_an_edit_in_any_package_gives_a_new_folder(tmp_path: Path) -> None:
+def test_an_edit_where_kernels_are_gives_a_new_folder(tmp_path: Path) -> None:
     """The sources are copied, one file is edited, and the kernels of another file move to another folder."""
     root = Path(__file__).resolve().parents[2]
     copy = tmp_path / "copy"
@@ -185,6 +187,22 @@ def test_an_edit_in_any_package_gives_a_new_folder(tmp_path: Path) -> None:
 
     first = key()
     assert key() == first
+    shown = copy / "hil" / "reports" / "page.py"
+    shown.write_text(shown.read_text() + "# edited\n")
+    assert key() == first
     edited = copy / "controller" / "pid.py"
     edited.write_text(edited.read_text() + "# edited\n")
     assert key() != first
+
+
+def test_rooms_that_leave_machine_code_as_it_is_serve_no_kernel() -> None:
+    root = Path(__file__).resolve().parents[2]
+    sources = {file: file.read_text() for package in PACKAGES for file in (root / package).rglob("*.py")}
+    rooms = "|".join(WITHOUT_KERNELS)
+    with_kernels = {
+        file: text for file, text in sources.items() if re.search(r"^\s*@kernel|record_dtype\(", text, re.MULTILINE)
+    }
+    assert len(with_kernels) > 50
+    for file, text in with_kernels.items():
+        assert file.parent.name not in WITHOUT_KERNELS or file.name == "kernels.py", file
+        assert not re.search(rf"^(from|import) hil\.({rooms})\b", text, re.MULTILINE), file

@@ -158,6 +158,7 @@ def test_what_does_not_vary_is_that_of_a_simulation() -> None:
         ("[vary]\nrun.rate = { from = 1.0, to = 2.0, steps = 1 }\n", "2 at least"),
         ('[vary]\nrun.rate = { from = "a", to = 2.0 }\n', "run.rate"),
         ("[sampling]\ncount = 1\n[vary]\nrun.seed = [1]\n", "2 to"),
+        ("[sampling]\ncount = 100\n[vary]\nrun.seed = [1]\n", "64 or 128"),
         ('[sampling]\nmethod = "dice"\n[vary]\nrun.seed = [1]\n', "sobol"),
         ('[sampling]\nmethod = "saltelli"\n[vary]\nrun.seed = [1]\n', "samples ranges"),
         ("[sampling]\nseed = -1\n[vary]\nrun.seed = [1]\n", "seed is -1"),
