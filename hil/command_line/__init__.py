@@ -4,12 +4,12 @@ import argparse
 import os
 import re
 import sys
-from collections.abc import Iterable
 from contextlib import suppress
 from importlib import import_module
 from typing import NoReturn
 
 from hil.command_line.cli import Command, check_outputs
+from hil.option import nearest
 from plant.errors import GoughError
 from plant.extras import missing_extras_named
 
@@ -76,7 +76,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
 
         parser.add_argument("--version", action="version", version=f"gough {version('gough')}")
     elif chosen not in homes:
-        parser.error(f"argument COMMAND: invalid choice: {chosen!r}{_nearest(chosen, homes)}")
+        parser.error(f"argument COMMAND: invalid choice: {chosen!r}{nearest(chosen, homes)}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND", help=argparse.SUPPRESS, prog="gough")
     for name, heading in homes.items():
         command = commands.add_parser(name)
@@ -85,15 +85,8 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
         flags = re.findall(r"--[\w-]+", options.parser.format_usage())
-        options.parser.error(f"unrecognized arguments: {' '.join(unknown)}{_nearest(unknown[0], flags)}")
+        options.parser.error(f"unrecognized arguments: {' '.join(unknown)}{nearest(unknown[0], flags)}")
     return options
-
-
-def _nearest(text: str, names: Iterable[str]) -> str:
-    """A question for the name that a mistyped text may mean; "" if none is near."""
-    from difflib import get_close_matches
-
-    return "".join(f"; did you mean {name!r}?" for name in get_close_matches(text, names, 1))
 
 
 def _command(heading: str, name: str) -> Command:

@@ -5,8 +5,9 @@ from argparse import SUPPRESS, Namespace
 from collections.abc import Callable
 from dataclasses import asdict
 from importlib.metadata import version
+from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hil.command_line import cli
 from hil.command_line.terminal import deg, duration, mm, mm_deg, progress_bar
@@ -17,20 +18,27 @@ from hil.table import Table
 from plant.errors import InputError
 from plant.extras import check_installed
 
+if TYPE_CHECKING:
+    from hil.sweep.analysis import Quantile
+    from hil.sweep.sweep import SweepResult
+
 
 @cli.command(
     cli.source("study", "STUDY.toml", "what is run, what varies and what is measured (docs/sweeps.md)"),
     cli.argument("--results", type=Path, metavar="FOLDER", help="where the table is kept (default: STUDY.results)"),
     cli.flag("--dry-run", "say how many runs there are, and how long they take by a first one that is measured"),
     cli.options_of(EngineSettings),
+    cli.report("write a report with distributions, main effects and sensitivities"),
     cli.JSON,
 )
 def gough_sweep(options: Namespace) -> int:
     """Run a study with many runs, on all processors or on a cluster.
 
-    The study's file says what varies: fields of a run, entries of the mechanism's file, parameters of the plant. Every run is a
-    row of a table in Parquet. A sweep that was interrupted goes on where it stopped. Prints the distribution of every figure.
-    The exit status is 1 if a run has failed; its row has the reason.
+    The study's file says what varies, in SI units: fields of a run, entries of the mechanism's file, parameters of the plant.
+    Every run is a row of a table in Parquet. A sweep that was interrupted goes on where it stopped. Prints the distribution of
+    every figure, over all runs and at each value of the crossed factors, how much each factor explains, and Sobol indices if
+    saltelli samples the ranges; position in mm, rotation in deg. The exit status is 1 if a run has failed; its row has the
+    reason.
     """
     check_installed("pyarrow")
     from hil.engine.engine import open_engine
@@ -55,15 +63,88 @@ def gough_sweep(options: Namespace) -> int:
             print(f"the workers at their work: {engine.dashboard}", file=sys.stderr)
         result = sweep(study, folder, engine, progress)
     cli.write_json(options.json, result.summary())
-    table = Table("over all runs", "median", "90 %", "95 % confidence", "99 %", "95 % confidence")
-    for name, (half, *others) in result.quantiles().items():
-        intervals = (text for each in others for text in (f"{each.value:.4g}", f"{each.low:.4g} to {each.high:.4g}"))
-        table.add(name, f"{half.value:.4g}", *intervals)
-    table.print()
+    cli.write_report(options, "sweep", result)
+    _print_sweep(result)
     print(f"{len(result.table)} runs, {result.ran} of them new, in {folder / TABLE}")
     if result.failed:
         print(f"{result.failed} runs have failed, the first one: {result.first_reason}", file=sys.stderr)
     return int(result.failed > 0)
+
+
+_MOST_PRINTED = 8
+"""Figures that are printed by factor; JSON and the report have the others."""
+
+
+def _print_sweep(result: "SweepResult") -> None:
+    from hil.sweep.units import headed, unit_of_figure
+
+    table = Table("over all runs", "median", "90 %", "95 % confidence", "99 %", "95 % confidence")
+    known = [name for name in result.figures() if result.analysis.over_all(name)]
+    for name in known:
+        unit, scale = unit_of_figure(name)
+        level = result.analysis.over_all(name)
+        half, *cells = (text for each in level.quantiles for text in _with_interval(each, scale)) if level else [""] * 6
+        table.add(headed(name, unit), half, *cells[1:])
+    if known:
+        table.print()
+    for name in known[:_MOST_PRINTED]:
+        _print_by_factor(result, name)
+    for name in known[:_MOST_PRINTED]:
+        _print_sensitivities(result, name)
+    if len(known) > _MOST_PRINTED:
+        print(f"by factor, the first {_MOST_PRINTED} of {len(known)} figures: name others in [measure], or add --report")
+
+
+def _print_by_factor(result: "SweepResult", name: str) -> None:
+    from hil.sweep.analysis import INTERACTIONS
+    from hil.sweep.units import headed, label_of, unit_of_factor, unit_of_figure
+
+    unit, scale = unit_of_figure(name)
+    table = Table(headed(name, unit), "runs", "median", "95 %", "90 %", "mean - all", "95 %", "share")
+    shares = {factor: f"{100.0 * share:.1f} %" for factor, share in result.analysis.shares(name).items()}
+    for factor in result.study.factors:
+        factor_unit, factor_scale = unit_of_factor(result.study, factor.name)
+        levels = [] if factor.is_seed or factor.sampled else result.analysis.levels(name, factor)
+        if levels or factor.name in shares:
+            table.add(headed(factor.name, factor_unit), *[""] * 6, shares.pop(factor.name, ""))
+        for level in levels:
+            half, most = _with_interval(level.quantiles[0], scale), f"{scale * level.quantiles[1].value:.3g}"
+            change = level.difference
+            effect = f"{scale * change.value:+.3g}", f"± {scale * (change.high - change.value):.2g}".replace("± inf", "?")
+            table.add(f"  {label_of(level.value, factor_scale)}", f"{level.runs}", *half, most, *effect, "")
+    for factor_name in [each for each in shares if each != INTERACTIONS] + [INTERACTIONS] * bool(shares):
+        table.add(factor_name, *[""] * 6, shares[factor_name])
+    if table.rows:
+        table.print()
+
+
+def _print_sensitivities(result: "SweepResult", name: str) -> None:
+    from hil.sweep.units import headed, label_of, unit_of_factor
+
+    if result.study.sampling.method != "saltelli":
+        return
+    if missing := result.analysis.no_sensitivities(name):
+        print(missing)
+        return
+    table = Table(f"Sobol indices of {name}", "first order", "95 %", "total", "95 %")
+    at = None
+    for each in result.analysis.sensitivities(name):
+        if each.at != at:
+            at = each.at
+            units = {factor: unit_of_factor(result.study, factor) for factor in at}
+            if at:
+                values = (f"{headed(factor, units[factor][0])} = {label_of(at[factor], units[factor][1])}" for factor in at)
+                table.add(", ".join(values), *[""] * 4)
+        cells = (
+            text for index in (each.first, each.total) for text in (f"{index.value:.3f}", f"± {index.high - index.value:.2g}")
+        )
+        table.add(f"  {each.factor}" if at else each.factor, *cells)
+    table.print()
+
+
+def _with_interval(quantile: "Quantile", scale: float) -> tuple[str, str]:
+    low, high = (f"{scale * end:.3g}" if isfinite(end) else "?" for end in (quantile.low, quantile.high))
+    return f"{scale * quantile.value:.3g}", f"{low} to {high}"
 
 
 @cli.command(cli.options_of(ComparisonConfig), cli.JSON)

@@ -2,6 +2,7 @@
 
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import plotly.graph_objects as go
 from plotly.io import to_html
@@ -72,7 +73,7 @@ def figure_html(name: str, title: str, caption: str, figure: go.Figure | str, ki
     return f'<figure class="{kind}">{text}</figure>\n'
 
 
-LAYOUT = {
+LAYOUT: dict[str, Any] = {
     "template": "plotly_white",
     "font": {"family": "system-ui, -apple-system, 'Segoe UI', 'Liberation Sans', sans-serif", "size": 12, "color": INK},
     "margin": {"l": 70, "r": 15, "t": 30, "b": 45},
@@ -93,7 +94,7 @@ h2 { font-size: 18px; font-weight: 600; margin: 0 0 4px; }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
 th { font-weight: 500; text-align: right; padding: 3px 0 3px 10px; }
 thead th { color: var(--faint); font-size: 13px; }
-tbody th { text-align: left; padding-left: 0; }
+thead tr:first-child th:first-child, tbody th { text-align: left; padding-left: 0; }
 tbody tr { border-top: 1px solid var(--line); }
 th small, td small { display: block; color: var(--faint); font-weight: 400; }
 td { text-align: right; padding: 8px 0 8px 10px; }

@@ -2,24 +2,29 @@
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from controller.planning.motions import NAMES
 from hil.engine.batches import fingerprint
+from hil.option import nearest
 from hil.runs.config import SimulationConfig
 from hil.sweep.function import UserFunction
 from hil.sweep.study import FILES, Study
 from plant.compiled import keyed_folder
 from plant.errors import GoughError, InputError, UnknownNameError
 from plant.files import write_whole
+from plant.imu import load_imu
 from plant.mechanism import load_in_space
 from plant.mechanism.documents import mechanism_text
 
 _OF_THIS_RUN = ("config", "version", "real_time_factor", "cycle_us")
 """Parts of a summary that are no figures, or not the same each time."""
+_OF_SUMMARY = ("truth_known", "estimation", "tracking", "estimated_tracking", "target", "limits")
+"""The other parts."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +96,12 @@ def measure(case: Case) -> dict[str, float]:
     return dict(_flat(summary)) | own
 
 
+def own_figures(names: Iterable[str]) -> list[str]:
+    """Those figures that are not of a run's summary, but of the user's own function; all of them without a function."""
+    found = list(names)
+    return [name for name in found if name.partition(".")[0] not in _OF_SUMMARY] or found
+
+
 def cases_of(study: Study) -> Iterator[Case]:
     """The cases of a study in the order of its points.
 
@@ -111,6 +122,7 @@ def _case(study: Study, point: Mapping[str, Any]) -> Case:
         key = _key({"model": study.model.source, "name": study.model.name, "point": dict(point)})
         return Case(key, "", point, study.run, (), None, study.model)
     config, changes = study.config_at(point), study.mechanism_at(point)
+    _check_names(config)
     files = []
     for field in FILES:
         name = getattr(config, field)
@@ -126,6 +138,18 @@ def _case(study: Study, point: Mapping[str, Any]) -> Case:
     key = _key({"config": config_of_key, "function": function})
     without: dict[str, Any] = {file.field: file.name for file in files}
     return Case(key, kind, point, replace(config, **without), tuple(files), study.function, None)
+
+
+def _check_names(config: SimulationConfig) -> None:
+    """Check that what a configuration names is there, before any run."""
+    load_imu(config.imu)
+    if config.target not in NAMES and not Path(config.target).is_file():
+        question = nearest(config.target, NAMES)
+        raise UnknownNameError(f"no target {config.target!r}: neither a motion ({', '.join(NAMES)}) nor a CSV file{question}")
+    for field in ("calibration", "plant", "binding"):
+        name = getattr(config, field)
+        if name is not None and not Path(name).is_file():
+            raise InputError(f"{field} = {name!r}: there is no such file")
 
 
 @cache

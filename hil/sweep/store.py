@@ -80,8 +80,9 @@ class Store:
     def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Add rows, which are on the disk when this returns."""
         if rows:
+            stored = [{name: as_stored(value) for name, value in row.items()} for row in rows]
             try:
-                table = pa.Table.from_pylist(list(map(_row, rows)), _schema(rows))
+                table = pa.Table.from_pylist(stored, _schema(rows))
             except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError) as error:
                 raise InputError(f"the values of a factor or figure are of several kinds: {error}") from None
             self._write(self._new / f"{self._number:08d}.parquet", table)
@@ -121,10 +122,9 @@ def _read(file: Path) -> pa.Table | None:
         raise InputError(f"cannot read {file}: {error}; move it away to run what it had again") from None
 
 
-def _row(row: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        name: value if isinstance(value, str | bool | int | float | None) else json.dumps(value) for name, value in row.items()
-    }
+def as_stored(value: Any) -> Any:
+    """A value as the table has it: a number, a switch or text; anything else as JSON."""
+    return value if isinstance(value, str | bool | int | float | None) else json.dumps(value)
 
 
 def _schema(rows: Sequence[Mapping[str, Any]]) -> pa.Schema:

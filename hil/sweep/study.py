@@ -1,18 +1,20 @@
 """A study as its TOML file or a Python program describes it: what is run, what varies, what is measured."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from itertools import product
+from math import prod, sqrt
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hil.option import nearest
 from hil.runs.config import SimulationConfig
 from hil.sweep.function import UserFunction
 from plant.checks import checked_seed
 from plant.errors import GoughError, InputError
-from plant.files import check_entries, read_toml
+from plant.files import read_toml, unknown_entries
 from plant.fmu.settings import Setting
 
 METHODS = ("sobol", "latin-hypercube", "saltelli")
@@ -23,6 +25,8 @@ FIGURES = (
 """Figures of a run that are shown if a study names none."""
 FILES = ("mechanism", "target", "calibration", "plant", "binding")
 """Fields of a run's configuration that may name files."""
+SEED = "seed"
+"""The last part of the name of factors that replicate."""
 _PARTS = ("run", "mechanism", "plant")
 _MOST_RUNS = 10_000_000
 
@@ -43,11 +47,31 @@ class Factor:
 
     def __post_init__(self) -> None:
         if self.values:
+            self._check_values()
             return
         if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):
             raise InputError(f"{self.name} goes from {self.low:g} to {self.high:g}: give a finite range that goes up")
         if self.logarithmic and self.low <= 0.0:
             raise InputError(f"{self.name} begins at {self.low:g}, and a logarithmic range must be positive")
+
+    def _check_values(self) -> None:
+        kinds = {float if type(value) is int else list if type(value) is tuple else type(value) for value in self.values}
+        if len(kinds) > 1:
+            raise InputError(
+                f"{self.name} has values of several kinds, {list(self.values)}: give numbers, switches or texts alone"
+            )
+        known: list[Any] = []
+        for value in self.values:
+            if isinstance(value, float) and not np.isfinite(value):
+                raise InputError(f"{self.name} has the value {value}: give finite numbers")
+            if value in known:
+                raise InputError(f"{self.name} has the value {value!r} twice: leave one out")
+            known.append(value)
+
+    @property
+    def is_seed(self) -> bool:
+        """Whether it replicates: a factor called seed is no cause to look for, but chance."""
+        return self.name.rpartition(".")[2] == SEED
 
     @property
     def sampled(self) -> bool:
@@ -59,6 +83,10 @@ class Factor:
         if self.logarithmic:
             return float(self.low * (self.high / self.low) ** share)
         return float(self.low + share * (self.high - self.low))
+
+    def middle(self, low: float, high: float) -> float:
+        """The middle of a part of its range."""
+        return sqrt(low * high) if self.logarithmic else (low + high) / 2.0
 
 
 @dataclass(frozen=True)
@@ -72,7 +100,8 @@ class Sampling:
     def __post_init__(self) -> None:
         checked_seed(self.seed)
         if self.method not in METHODS:
-            raise InputError(f"there is no method {self.method!r} of sampling; there are {', '.join(METHODS)}")
+            question = nearest(str(self.method), METHODS)
+            raise InputError(f"there is no method {self.method!r} of sampling; there are {', '.join(METHODS)}{question}")
         if not 2 <= self.count <= _MOST_RUNS:
             raise InputError(f"{self.count} samples are asked for; there can be 2 to {_MOST_RUNS}")
         below = 1 << (self.count.bit_length() - 1)
@@ -136,13 +165,26 @@ class Study:
             raise InputError("saltelli samples ranges, and none varies: give one, such as { from = 1.0, to = 2.0 }")
 
     @property
+    def sampled(self) -> list[Factor]:
+        """The factors that are sampled."""
+        return [factor for factor in self.factors if factor.sampled]
+
+    @property
+    def crossed(self) -> list[Factor]:
+        """The factors of which every value meets every other one, and every sample."""
+        return [factor for factor in self.factors if not factor.sampled]
+
+    @property
+    def samples(self) -> int:
+        """The number of samples; 1 if nothing is sampled."""
+        if not self.sampled:
+            return 1
+        return self.sampling.count * (len(self.sampled) + 2 if self.sampling.method == "saltelli" else 1)
+
+    @property
     def size(self) -> int:
         """The number of points, without drawing them."""
-        crossed, sampled = 1, sum(factor.sampled for factor in self.factors)
-        for factor in self.factors:
-            crossed *= len(factor.values) or 1
-        count = self.sampling.count * ((sampled + 2) if self.sampling.method == "saltelli" else 1)
-        return crossed * (count if sampled else 1)
+        return self.samples * prod(len(factor.values) for factor in self.crossed)
 
     def points(self) -> list[dict[str, Any]]:
         """The values of all factors at each point: samples in the outer loop, crossed values in the inner ones.
@@ -152,8 +194,7 @@ class Study:
         """
         if self.size > _MOST_RUNS:
             raise InputError(f"the study has {self.size} points; there can be {_MOST_RUNS}: vary less")
-        sampled = [factor for factor in self.factors if factor.sampled]
-        crossed = [factor for factor in self.factors if not factor.sampled]
+        sampled, crossed = self.sampled, self.crossed
         shares = self.sampling.shares(len(sampled)).tolist() if sampled else [[]]
         drawn = [{factor.name: factor.at(share) for factor, share in zip(sampled, row, strict=True)} for row in shares]
         grid = [dict(zip((f.name for f in crossed), values, strict=True)) for values in product(*(f.values for f in crossed))]
@@ -167,11 +208,7 @@ class Study:
             GoughError: a value cannot be used.
         """
         changes = {name.removeprefix("run."): value for name, value in point.items() if name.startswith("run.")}
-        settings = tuple(
-            Setting(name.removeprefix("plant."), tuple(np.atleast_1d(value).astype(float).tolist()))
-            for name, value in point.items()
-            if name.startswith("plant.")
-        )
+        settings = [_setting(name.removeprefix("plant."), value) for name, value in point.items() if name.startswith("plant.")]
         return replace(self.run, **_parsed(changes), settings=(*self.run.settings, *settings))
 
     def mechanism_at(self, point: Mapping[str, Any]) -> dict[str, Any]:
@@ -194,13 +231,16 @@ def read_study(path: Path | str) -> Study:
 
 
 def _study(document: dict[str, Any], path: Path) -> Study:
-    check_entries(document, ("name", "run", "mechanism", "plant", "vary", "sampling", "measure", "model"), "the study")
+    _check_entries(document, ("name", "run", "mechanism", "plant", "vary", "sampling", "measure", "model"), "the study")
     for entry, value in document.items():
-        if entry not in ("name", "model") and not isinstance(value, dict):
-            raise InputError(f"{entry!r} must be a table")
+        kind: type = str if entry in ("name", "model") else dict
+        if not isinstance(value, kind):
+            raise InputError(f"{entry} = {value!r} must be {'text' if kind is str else f'a table [{entry}]'}")
+    if "model" in document and (table := next((part for part in _PARTS if part in document), None)):
+        raise InputError(f"a model takes the place of a run: leave out [{table}], or model")
     measure, sampling = document.get("measure", {}), document.get("sampling", {})
-    check_entries(measure, ("figures", "function"), "[measure]")
-    check_entries(sampling, [each.name for each in fields(Sampling)], "[sampling]")
+    _check_entries(measure, ("figures", "function"), "[measure]")
+    _check_entries(sampling, [each.name for each in fields(Sampling)], "[sampling]")
     model = document.get("model")
     factors = tuple(_factors(document.get("vary", {}), "", model is None))
     run = {name: _beside(path, name, value) for name, value in _parsed(document.get("run", {})).items()}
@@ -208,18 +248,20 @@ def _study(document: dict[str, Any], path: Path) -> Study:
         replace(each, values=tuple(_beside(path, each.name.removeprefix("run."), value) for value in each.values))
         for each in factors
     )
-    settings = tuple(
-        Setting(name, tuple(np.atleast_1d(value).astype(float).tolist()))
-        for name, value in _flat(document.get("plant", {})).items()
-    )
-    function = measure.get("function")
+    settings = tuple(_setting(name, value) for name, value in _flat(document.get("plant", {})).items())
+    figures, function = measure.get("figures", []), measure.get("function")
+    if not (isinstance(figures, list) and all(isinstance(each, str) for each in figures)):
+        raise InputError(f"[measure] figures = {figures!r} must be a list of texts, such as [{FIGURES[0]!r}]")
+    for entry, value in sampling.items():
+        if not (isinstance(value, str) if entry == "method" else _is_whole(value)):
+            raise InputError(f"[sampling] {entry} = {value!r} must be {'text' if entry == 'method' else 'a whole number'}")
     try:
         return Study(
             factors,
             SimulationConfig(**run, settings=settings),
             _flat(document.get("mechanism", {})),
             Sampling(**sampling),
-            tuple(measure.get("figures", ())),
+            tuple(figures),
             None if function is None else UserFunction.from_file(function, path.parent),
             None if model is None else UserFunction.from_file(model, path.parent),
             str(document.get("name", path.stem)),
@@ -235,14 +277,23 @@ def _beside(path: Path, field: str, value: Any) -> Any:
     return value
 
 
-_SPECIFICATION = {"from", "to", "steps", "logarithmic", "seeds"}
+_SPECIFICATION = ("from", "to", "steps", "logarithmic", "seeds")
+
+
+def _check_entries(table: Mapping[str, Any], known: Iterable[str], title: str) -> None:
+    """As `plant.files.check_entries`, with the name that may be meant."""
+    names = list(known)
+    for entry in table:
+        for message in unknown_entries({entry: None}, names, title):
+            raise InputError(f"{message}{nearest(entry, names)}")
 
 
 def _factors(table: Mapping[str, Any], prefix: str, of_run: bool) -> "list[Factor]":
     found = []
     for name, value in table.items():
         full = prefix + name
-        if isinstance(value, dict) and value and value.keys() <= _SPECIFICATION:
+        if isinstance(value, dict) and value.keys() & {*_SPECIFICATION}:
+            _check_entries(value, _SPECIFICATION, full)
             found.append(_factor(full, value))
         elif isinstance(value, dict):
             found += _factors(value, f"{full}.", of_run)
@@ -255,20 +306,36 @@ def _factors(table: Mapping[str, Any], prefix: str, of_run: bool) -> "list[Facto
 
 def _factor(name: str, table: Mapping[str, Any]) -> Factor:
     if "seeds" in table:
-        if set(table) != {"seeds"} or not isinstance(table["seeds"], int) or table["seeds"] < 1:
-            raise InputError(f"{name}: seeds = N stands alone, and is a positive whole number")
-        return Factor(name, tuple(range(table["seeds"])))
+        if len(table) > 1 or not _is_whole(table["seeds"]) or table["seeds"] < 1:
+            raise InputError(f"{name}: seeds = {table['seeds']!r} must be a whole number, 1 at least, and stand alone")
+        factor = Factor(name, tuple(range(table["seeds"])))
+        if not factor.is_seed:
+            raise InputError(f"{name} is no seed: {{ seeds = N }} is for run.seed, or for a model's argument called seed")
+        return factor
     if not {"from", "to"} <= set(table):
         raise InputError(f"{name}: a range has from and to, such as {{ from = 1.0, to = 2.0 }}")
-    try:
-        factor = Factor(name, (), float(table["from"]), float(table["to"]), bool(table.get("logarithmic", False)))
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: {error}") from None
+    for entry in ("from", "to"):
+        if not isinstance(table[entry], int | float) or isinstance(table[entry], bool):
+            raise InputError(f"{name}: {entry} = {table[entry]!r} must be a number")
+    if not isinstance(table.get("logarithmic", False), bool):
+        raise InputError(f"{name}: logarithmic = {table['logarithmic']!r} must be true or false")
+    factor = Factor(name, (), float(table["from"]), float(table["to"]), table.get("logarithmic", False))
     if "steps" not in table:
         return factor
-    if not isinstance(table["steps"], int) or table["steps"] < 2:
-        raise InputError(f"{name}: steps is a whole number, 2 at least")
+    if not _is_whole(table["steps"]) or table["steps"] < 2:
+        raise InputError(f"{name}: steps = {table['steps']!r} must be a whole number, 2 at least")
     return Factor(name, tuple(factor.at(share) for share in np.linspace(0.0, 1.0, table["steps"]).tolist()))
+
+
+def _setting(name: str, value: Any) -> Setting:
+    numbers = value if isinstance(value, list | tuple) else [value]
+    if not numbers or not all(isinstance(each, int | float) and np.isfinite(each) for each in numbers):
+        raise InputError(f"plant.{name} = {value!r} must be a finite number, or a list of them")
+    return Setting(name, tuple(map(float, numbers)))
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
 
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -290,21 +357,41 @@ def _run_fields() -> dict[str, Any]:
 def _check_factor(name: str) -> None:
     part, _, rest = name.partition(".")
     if part not in _PARTS or not rest:
-        raise InputError(f"{name} cannot vary: a factor is run.FIELD, mechanism.TABLE.ENTRY or plant.PARAMETER")
+        raise InputError(
+            f"{name} cannot vary: a factor is run.FIELD, mechanism.TABLE.ENTRY or plant.PARAMETER{nearest(part, _PARTS)}"
+        )
     if part == "run":
-        check_entries({rest: None}, _run_fields(), "a run")
+        _check_entries({rest: None}, _run_fields(), "a run")
 
 
 def _parsed(values: Mapping[str, Any]) -> dict[str, Any]:
     """Values of a run's fields, read as the command line reads them if they are text."""
     readers: dict[str, Callable[[str], Any] | None] = _run_fields()
-    check_entries(values, readers, "[run]")
-    parsed = {}
-    for name, value in values.items():
-        read = readers[name]
-        parsed[name] = read(value) if read is not None and isinstance(value, str) else value
-        if isinstance(value, list):
-            parsed[name] = tuple(value)
-        elif isinstance(value, int) and not isinstance(value, bool) and name in ("duration", "rate", "joint_error", "hold"):
-            parsed[name] = float(value)
-    return parsed
+    _check_entries(values, readers, "[run]")
+    return {name: _read(name, value, readers[name]) for name, value in values.items()}
+
+
+def _read(name: str, value: Any, read: Callable[[str], Any] | None) -> Any:
+    default = SimulationConfig.__dataclass_fields__[name].default
+    if default is None:
+        default = 0.0 if name == "hold" else ""
+    if read is not None and isinstance(value, str):
+        return read(value)
+    if isinstance(default, tuple) and isinstance(value, list | tuple) and all(map(_is_whole, value)):
+        return tuple(value)
+    if isinstance(default, float) and _is_whole(value):
+        return float(value)
+    kind, words = next(each for each in _KINDS if isinstance(default, each[0]))
+    if isinstance(value, bool) != (kind is bool) or not isinstance(value, kind):
+        raise InputError(f"run.{name} = {value!r} must be {words}")
+    return value
+
+
+_KINDS: tuple[tuple[type, str], ...] = (
+    (bool, "true or false"),
+    (int, "a whole number"),
+    (float, "a number"),
+    (tuple, "a list of whole numbers, or text"),
+    (str, "text"),
+)
+"""What a run's field takes, by the kind of its default; checked in this order, as a switch is a whole number, too."""

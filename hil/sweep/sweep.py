@@ -1,8 +1,9 @@
 """A sweep: all points of a study, run on an engine, into a table."""
 
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,10 +13,12 @@ import pyarrow as pa
 
 from hil.engine.batches import Failure, fingerprint
 from hil.engine.engine import Engine
-from hil.sweep.analysis import QUANTILES, Quantile, quantile
-from hil.sweep.case import Case, cases_of, kind_of, measure
+from hil.option import nearest
+from hil.sweep.analysis import Analysis
+from hil.sweep.case import Case, cases_of, kind_of, measure, own_figures
 from hil.sweep.store import DIED, DONE, FAILED, KEY, REASON, STATUS, Store, rows_of
 from hil.sweep.study import Study
+from plant.errors import InputError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,10 +40,15 @@ class SweepResult:
     table: pa.Table
     ran: int  # rows that were not there before
 
+    @cached_property
+    def analysis(self) -> Analysis:
+        """What the table says."""
+        return Analysis(self.study, self.table)
+
     @property
     def failed(self) -> int:
         """The number of points without figures."""
-        return sum(status != DONE for status in self.table[STATUS].to_pylist())
+        return self.analysis.failed
 
     @property
     def first_reason(self) -> str:
@@ -48,43 +56,48 @@ class SweepResult:
         return next((reason for reason in self.table[REASON].to_pylist() if reason), "") if self.failed else ""
 
     def summary(self) -> dict[str, Any]:
-        """The quantiles of the shown figures, and how many runs there are."""
+        """What the table says of the shown figures, in SI units, and how many runs there are."""
         return {
             "study": self.study.name,
             "factors": [factor.name for factor in self.study.factors],
             "runs": len(self.table),
             "new": self.ran,
             "failed": self.failed,
-            "quantiles": {name: [asdict(each) for each in quantiles] for name, quantiles in self.quantiles().items()},
+            "figures": self.analysis.plain(self.figures()),
             "sources": fingerprint(),
             "version": version("gough"),
         }
 
     def figures(self) -> list[str]:
-        """The figures that the study shows; all of them for functions of the user's own."""
-        others = (KEY, STATUS, REASON, *(factor.name for factor in self.study.factors))
-        return list(self.study.figures) or [name for name in self.table.column_names if name not in others]
-
-    def quantiles(self) -> dict[str, list[Quantile]]:
-        """The quantiles of each shown figure over all runs that have it."""
-        found = {}
-        for name in self.figures():
-            values = np.array([each for each in self.table[name].to_pylist() if each is not None])
-            found[name] = [quantile(values, share) for share in QUANTILES] if len(values) else []
-        return found
+        """The figures that are shown: those that the study names, else those of the user's own function."""
+        return list(self.study.figures) or own_figures(self.analysis.names())
 
     def frame(self) -> "pd.DataFrame":
-        """The table for pandas."""
+        """The table for pandas, with a row for each point; a figure that a run lacks is NaN."""
         frame: pd.DataFrame = self.table.to_pandas()
         return frame
 
     def dataset(self) -> "xr.Dataset":
-        """The figures for xarray, over the factors if all are crossed, else over the point's number."""
-        frame = self.frame().drop(columns=[KEY])
-        names = [factor.name for factor in self.study.factors]
-        crossed = all(not factor.sampled for factor in self.study.factors)
-        cube: xr.Dataset = (frame.set_index(names) if crossed else frame.rename_axis("point")).to_xarray()
-        return cube
+        """The figures for xarray, over the crossed factors, and over the samples if there are any.
+
+        The values of the sampled factors are coordinates of the dimension `sample`.
+
+        Raises:
+            InputError: points are missing, as some were the same run.
+        """
+        if len(self.table) != self.study.size:
+            raise InputError(
+                f"the study has {self.study.size} points, and {len(self.table)} different runs: use the frame, or leave out "
+                "values that mean the same"
+            )
+        sampled, frame = [each.name for each in self.study.sampled], self.frame().drop(columns=[KEY])
+        dimensions = [each.name for each in self.study.crossed]
+        if sampled:
+            frame["sample"] = np.arange(len(frame)) // (len(frame) // self.study.samples)
+            dimensions.insert(0, "sample")
+        dataset: xr.Dataset = frame.drop(columns=sampled).set_index(dimensions).to_xarray()
+        first = frame.groupby("sample")[sampled].first() if sampled else {}
+        return dataset.assign_coords({name: ("sample", first[name].to_numpy()) for name in sampled})
 
 
 @dataclass(frozen=True)
@@ -125,9 +138,13 @@ def sweep(study: Study, folder: Path, engine: Engine, progress: Callable[[float,
         left = [case for case in cases if case.key not in settled]
         rows: list[dict[str, Any]] = []
         began = flushed = time.monotonic()
+        checked = False
         try:
             for done, (number, outcome) in enumerate(engine.run(measure, left, kind_of), start=1):
                 rows.append(_row(left[number], outcome))
+                if not (checked or isinstance(outcome, Failure)):
+                    check_figures(study, outcome)
+                    checked = True
                 now = time.monotonic()
                 if now - flushed > _FLUSH_S:
                     store.add(rows)
@@ -137,7 +154,10 @@ def sweep(study: Study, folder: Path, engine: Engine, progress: Callable[[float,
         finally:
             store.add(rows)
         table = rows_of(store.table(), [case.key for case in cases])
-    return SweepResult(study, folder, table, len(left))
+    result = SweepResult(study, folder, table, len(left))
+    if result.failed < len(table):
+        check_figures(study, result.analysis.names())
+    return result
 
 
 def estimate(study: Study, folder: Path) -> Estimate:
@@ -148,10 +168,21 @@ def estimate(study: Study, folder: Path) -> Estimate:
     """
     cases = _unique(study)
     known = {*Store(folder).table()[KEY].to_pylist()} & {case.key for case in cases}
-    measure(cases[0])
+    check_figures(study, measure(cases[0]))
     began = time.perf_counter()
     measure(cases[0])
     return Estimate(len(cases), len(known), time.perf_counter() - began)
+
+
+def check_figures(study: Study, names: Collection[str]) -> None:
+    """Check that a run, which has figures of these names, has those that a study shows.
+
+    Raises:
+        InputError: it lacks one.
+    """
+    for name in study.figures:
+        if name not in names:
+            raise InputError(f"no run has the figure {name!r}{nearest(name, names)}; there are {', '.join(names)}")
 
 
 def _unique(study: Study) -> list[Case]:
@@ -162,4 +193,9 @@ def _unique(study: Study) -> list[Case]:
 def _row(case: Case, outcome: dict[str, float] | Failure) -> dict[str, Any]:
     if isinstance(outcome, Failure):
         return {KEY: case.key, STATUS: DIED if outcome.died else FAILED, REASON: outcome.reason, **case.point}
-    return {KEY: case.key, STATUS: DONE, REASON: None, **case.point, **outcome}
+    row = {KEY: case.key, STATUS: DONE, REASON: None, **case.point}
+    for name in outcome:
+        if name in row:
+            reason = f"the figure {name!r} has the name of a factor, or of a column of the table: give it another one"
+            return {**row, STATUS: FAILED, REASON: reason}
+    return {**row, **outcome}

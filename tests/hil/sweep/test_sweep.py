@@ -72,9 +72,10 @@ def test_a_study_that_grows_runs_what_is_new(study: Study, tmp_path: Path) -> No
     assert (result.ran, result.table["product"].to_pylist()) == (0, [8.0])
 
 
-def test_the_same_run_at_two_points_is_one_row(study: Study, tmp_path: Path) -> None:
-    twice = Study((Factor("x", (1.0, 1.0)), Factor("y", (1.0,))), model=study.model)
-    assert len(run(twice, tmp_path).table) == len(CALLS) == 1
+def test_the_same_run_at_two_points_is_done_once(tmp_path: Path) -> None:
+    study = Study((Factor("run.imus", ("all", "0,1,2,3,4,5,6")),))
+    assert study.size == 2
+    assert estimate(study, tmp_path).points == 1
 
 
 def test_an_estimate_counts_what_is_there(study: Study, tmp_path: Path) -> None:
