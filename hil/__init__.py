@@ -13,6 +13,15 @@ A run on the machine's clock, as `gough run`:
 
     summary = run(SimulationConfig(rig="udp"), RealTimeSettings(), recording=Path("run.mcap"))
 
+Many runs, as `gough sweep` (docs/sweeps.md):
+
+    from hil import Factor, Study, open_engine, run_study
+
+    study = Study((Factor("run.imu", ("mpu9150-calibrated", "icm42688")), Factor("run.seed", tuple(range(20)))))
+    if __name__ == "__main__":
+        with open_engine() as engine:
+            print(run_study(study, Path("imus.results"), engine).frame())
+
 Whatever refuses its input raises a `GoughError`. This package loads nothing until a name is used.
 """
 
@@ -22,6 +31,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hil.calibration.data import Knowledge
     from hil.calibration.procedure import calibrate_recordings, calibrate_rig
+    from hil.engine.engine import open_engine
+    from hil.engine.settings import EngineSettings
     from hil.realtime.scheduling import RealTimeSettings
     from hil.recording.replay import replay
     from hil.reports.run import write_report
@@ -30,20 +41,26 @@ if TYPE_CHECKING:
     from hil.runs.run_state import RunState
     from hil.runs.simulation import SimulationResult, SimulationStoppedError, simulate
     from hil.runs.snapshot import Snapshot, read_snapshot, write_snapshot
+    from hil.sweep.function import UserFunction
+    from hil.sweep.study import Factor, Sampling, Study, read_study
+    from hil.sweep.sweep import SweepResult, run_study
     from plant.errors import GoughError
     from plant.fmu.settings import Setting
     from plant.imu_wiring import Wiring
     from plant.mechanism import Mechanism, PlanarMechanism, load_mechanism
 
 __all__ = [
-    "GoughError", "Knowledge", "Mechanism", "PlanarMechanism", "RealTimeSettings", "RunState", "RunStoppedError", "Setting",
-    "SimulationConfig", "SimulationResult", "SimulationStoppedError", "Snapshot", "Wiring", "calibrate_recordings",
-    "calibrate_rig", "load_mechanism", "read_snapshot", "replay", "run", "simulate", "write_report", "write_snapshot",
+    "EngineSettings", "Factor", "GoughError", "Knowledge", "Mechanism", "PlanarMechanism", "RealTimeSettings", "RunState",
+    "RunStoppedError", "Sampling", "Setting", "SimulationConfig", "SimulationResult", "SimulationStoppedError", "Snapshot",
+    "Study", "SweepResult", "UserFunction", "Wiring", "calibrate_recordings", "calibrate_rig", "load_mechanism", "open_engine",
+    "read_snapshot", "read_study", "replay", "run", "run_study", "simulate", "write_report", "write_snapshot",
 ]  # fmt: skip
 
 _HOMES = {
     "hil.calibration.data": ("Knowledge",),
     "hil.calibration.procedure": ("calibrate_recordings", "calibrate_rig"),
+    "hil.engine.engine": ("open_engine",),
+    "hil.engine.settings": ("EngineSettings",),
     "hil.realtime.scheduling": ("RealTimeSettings",),
     "hil.recording.replay": ("replay",),
     "hil.reports.run": ("write_report",),
@@ -52,6 +69,9 @@ _HOMES = {
     "hil.runs.run_state": ("RunState",),
     "hil.runs.simulation": ("SimulationResult", "SimulationStoppedError", "simulate"),
     "hil.runs.snapshot": ("Snapshot", "read_snapshot", "write_snapshot"),
+    "hil.sweep.function": ("UserFunction",),
+    "hil.sweep.study": ("Factor", "Sampling", "Study", "read_study"),
+    "hil.sweep.sweep": ("SweepResult", "run_study"),
     "plant.errors": ("GoughError",),
     "plant.fmu.settings": ("Setting",),
     "plant.mechanism": ("Mechanism", "PlanarMechanism", "load_mechanism"),

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     cli.flag("--dry-run", "say how many runs there are, and how long they take by a first one that is measured"),
     cli.options_of(EngineSettings),
     cli.report("write a report with distributions, main effects and sensitivities"),
+    cli.output("--picture", "FILE.svg", "draw the figures over up to three factors"),
     cli.JSON,
 )
 def gough_sweep(options: Namespace) -> int:
@@ -44,7 +45,7 @@ def gough_sweep(options: Namespace) -> int:
     from hil.engine.engine import open_engine
     from hil.sweep.store import TABLE
     from hil.sweep.study import read_study
-    from hil.sweep.sweep import estimate, sweep
+    from hil.sweep.sweep import estimate, run_study
 
     study, settings = read_study(options.study), cli.config_of(options, EngineSettings)
     folder = options.results or options.study.with_suffix(".results")
@@ -61,9 +62,13 @@ def gough_sweep(options: Namespace) -> int:
     with progress_bar(study.name) as progress, open_engine(settings) as engine:
         if engine.dashboard:
             print(f"the workers at their work: {engine.dashboard}", file=sys.stderr)
-        result = sweep(study, folder, engine, progress)
+        result = run_study(study, folder, engine, progress)
     cli.write_json(options.json, result.summary())
     cli.write_report(options, "sweep", result)
+    if options.picture is not None:
+        from hil.reports.sweep_picture import write_picture
+
+        write_picture(result, options.picture)
     _print_sweep(result)
     print(f"{len(result.table)} runs, {result.ran} of them new, in {folder / TABLE}")
     if result.failed:

@@ -90,8 +90,9 @@ def _figures(result: SweepResult, shown: Sequence[_Shown]) -> Iterator[tuple[str
         yield (
             f"effects{number}",
             f"Effects on {figure.name}",
-            "Runs (faint), means with their 95 % confidence (filled), and medians (open), at each value of a factor, or in "
-            "parts of its range. The dashed line is the mean of all runs.",
+            "Runs (faint), means (filled) and medians (open) at each value of a factor, or in parts of its range. The dashed "
+            "line is the mean of all runs, and a bar the 95 % confidence of a mean's difference from it: a bar that does not "
+            "reach the line is an effect.",
             _effects(result, figure, factors),
         )
     if shares := {each.heading: found for each in shown if (found := analysis.shares(each.name))}:
@@ -124,7 +125,7 @@ def _quantiles(result: SweepResult, shown: Sequence[_Shown]) -> Table:
 
 def _interval_cell(interval: Interval, scale: float) -> Cell:
     low, high = (f"{scale * end:.3g}" if isfinite(end) else "?" for end in (interval.low, interval.high))
-    return Cell(f"{scale * interval.value:.4g}", f"{low} to {high}")
+    return Cell(f"{scale * interval.value:.4g}", f"{low} to {high}".replace(" ", "\u00a0"))
 
 
 def _facts(result: SweepResult) -> str:
@@ -260,7 +261,7 @@ def _places(levels: Sequence[Level], factor: Factor, scale: float) -> list[float
 
 
 def _means(levels: Sequence[Level], shown: _Shown, factor: Factor, scale: float) -> dict[str, Any]:
-    halves = [each.mean.high - each.mean.value for each in levels]
+    halves = [each.difference.high - each.difference.value for each in levels]
     return {
         "x": _places(levels, factor, scale), "y": [shown.scale * each.mean.value for each in levels],
         "error_y": {"array": [shown.scale * half if isfinite(half) else 0.0 for half in halves], "thickness": 1.6, "width": 5},

@@ -134,8 +134,8 @@ def _independent(below: NDArray[np.bool_], groups: Sequence[Groups]) -> int:
     grouped, freedom = _variance(influence, groups)
     if freedom in (0, n - 1):
         return n
-    if alone == 0.0:
-        return freedom + 1
+    if alone == 0.0 or grouped == 0.0:
+        return n if alone else freedom + 1
     few = (t.ppf(1.0 - _TAIL, n - 1) / t.ppf(1.0 - _TAIL, freedom)) ** 2
     return max(1, min(n, int(n * alone / grouped * few)))
 
@@ -199,11 +199,11 @@ class Analysis:
 
     def over_all(self, figure: str) -> Level | None:
         """A figure over all runs; None if none has it."""
-        return self._level(figure, None, np.ones(self.runs, np.bool_))
+        return self.level(figure, None, np.ones(self.runs, np.bool_))
 
     def levels(self, figure: str, factor: Factor) -> list[Level]:
         """A figure at each value of a crossed factor, or in parts of a sampled one's range; only where runs have it."""
-        found = (self._level(figure, value, chosen) for value, chosen in self.parts(factor))
+        found = (self.level(figure, value, chosen) for value, chosen in self.parts(factor))
         return [each for each in found if each is not None]
 
     def parts(self, factor: Factor) -> Iterable[tuple[Any, NDArray[np.bool_]]]:
@@ -219,7 +219,8 @@ class Analysis:
         for i, (low, high) in enumerate(pairwise(ends)):
             yield (low, high), number == i
 
-    def _level(self, figure: str, value: Any, chosen: NDArray[np.bool_]) -> Level | None:
+    def level(self, figure: str, value: Any, chosen: NDArray[np.bool_]) -> Level | None:
+        """A figure in the chosen rows, at what is called their value; None if none of them has it."""
         values = self.values(figure)
         known = np.isfinite(values)
         chosen, groups, values = chosen[known], [each[known] for each in self._groups], values[known]

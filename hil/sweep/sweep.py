@@ -117,7 +117,7 @@ def no_report(share: float, label: str) -> None:
     """Report nothing."""
 
 
-def sweep(study: Study, folder: Path, engine: Engine, progress: Callable[[float, str], None] = no_report) -> SweepResult:
+def run_study(study: Study, folder: Path, engine: Engine, progress: Callable[[float, str], None] = no_report) -> SweepResult:
     """Run all points of a study that are not in the table of a folder yet.
 
     Args:

@@ -9,7 +9,7 @@ from hil.engine.engine import InOneProcess
 from hil.sweep.function import UserFunction
 from hil.sweep.store import Store
 from hil.sweep.study import Factor, Study
-from hil.sweep.sweep import SweepResult, estimate, sweep
+from hil.sweep.sweep import SweepResult, estimate, run_study
 
 CALLS: list[float] = []
 
@@ -29,7 +29,7 @@ def study() -> Iterator[Study]:
 
 
 def run(study: Study, folder: Path) -> SweepResult:
-    return sweep(study, folder, InOneProcess())
+    return run_study(study, folder, InOneProcess())
 
 
 def test_every_point_is_a_row_in_the_study_s_order(study: Study, tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_it_goes_on_where_it_was_interrupted(study: Study, tmp_path: Path) -> No
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        sweep(study, tmp_path, InOneProcess(), interrupt)
+        run_study(study, tmp_path, InOneProcess(), interrupt)
     assert len(Store(tmp_path).table()) == 4
     result = run(study, tmp_path)
     assert len(CALLS) == 6
