@@ -6,9 +6,9 @@ import signal
 import ssl
 import time
 import warnings
-from asyncio import CancelledError
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import count
 from multiprocessing import spawn
@@ -37,6 +37,7 @@ _AHEAD = 2
 _MOST_GROWTH = 16
 _TRIES = 3
 """How often a worker may die over an item: in a batch, by itself, and at last while nothing else is at work."""
+_DIED = "the processes that worked on it died: it ends them, crashes, or takes more memory than there is"
 _CONNECT_S, _FIRST_WORKER_S, _LOOK_S, _SILENT_S = 10.0, 60.0, 0.02, 10.0
 
 _LOG = logging.getLogger("gough")
@@ -99,8 +100,7 @@ class DaskEngine(Engine):
                 numbers, outcome = running.pop(future), self._outcome(future)
                 if outcome is None:
                     for number in queue.died(numbers):
-                        reason = f"the process that worked on it died, each of the {_TRIES} times it was tried"
-                        yield number, Failure(reason, died=True)
+                        yield number, Failure(_DIED, died=True)
                 elif isinstance(outcome, Refusal):
                     queue.put_back(numbers)
                     self._leave_out(outcome)
@@ -280,17 +280,19 @@ def _main_module_not_run_again() -> Iterator[None]:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Dask tells of workers that come, go and stand still for a second; only what ends the work is for the user."""
-    names = ("distributed", "tornado", "bokeh")
-    levels = {name: logging.getLogger(name).level for name in names}
-    with warnings.catch_warnings(), dask.config.set({"logging.distributed": "critical"}):
+    loggers = [
+        logging.getLogger(name) for name in logging.root.manager.loggerDict if name.startswith(("distributed", "tornado"))
+    ]
+    handlers = {handler: handler.level for logger in loggers for handler in logger.handlers}
+    with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module="distributed")
         try:
-            for name in names:
-                logging.getLogger(name).setLevel(logging.CRITICAL)
+            for handler in handlers:
+                handler.setLevel(logging.CRITICAL + 1)
             yield
         finally:
-            for name, level in levels.items():
-                logging.getLogger(name).setLevel(level)
+            for handler, level in handlers.items():
+                handler.setLevel(level)
 
 
 def _security(settings: EngineSettings) -> Security | None:
