@@ -4,6 +4,7 @@ import logging
 import math
 import signal
 import ssl
+import threading
 import time
 import warnings
 from collections import Counter, deque
@@ -11,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import count
-from multiprocessing import spawn
+from multiprocessing import resource_tracker, spawn
 from pathlib import Path
 from typing import Any, TypeVar
 from uuid import uuid4
@@ -38,7 +39,7 @@ _MOST_GROWTH = 16
 _TRIES = 3
 """How often a worker may die over an item: in a batch, by itself, and at last while nothing else is at work."""
 _DIED = "the processes that worked on it died: it ends them, crashes, or takes more memory than there is"
-_CONNECT_S, _FIRST_WORKER_S, _LOOK_S, _SILENT_S = 10.0, 60.0, 0.02, 10.0
+_CONNECT_S, _FIRST_WORKER_S, _CLOSE_S, _LOOK_S, _SILENT_S = 10.0, 60.0, 30.0, 0.02, 10.0
 
 _LOG = logging.getLogger("gough")
 """Without a handler, Python prints its warnings on standard error, a line each."""
@@ -62,6 +63,7 @@ class DaskEngine(Engine):
     def __init__(self, client: Client, joined_at: str | None = None) -> None:
         self._client, self._address, self.joined_at = client, client.scheduler.address, joined_at
         self.dashboard = client.dashboard_link
+        self._refused: set[str] = set()
 
     @property
     def workers(self) -> int:  # type: ignore[override]
@@ -136,6 +138,9 @@ class DaskEngine(Engine):
             raise WorkerRefusedError(f"a worker cannot take part: {error}; install the same gough on all machines") from None
 
     def _leave_out(self, refusal: Refusal) -> None:
+        if refusal.worker in self._refused:
+            return
+        self._refused.add(refusal.worker)
         with suppress(OSError, TimeoutError):
             self._client.retire_workers([refusal.worker], close_workers=True)
         text = f"the worker at {refusal.worker} is left out: {refusal.reason}; install the same on all machines"
@@ -211,43 +216,73 @@ def connected(settings: EngineSettings) -> Iterator[DaskEngine]:
 @contextmanager
 def _local_cluster(settings: EngineSettings, security: Security | None) -> Iterator[LocalCluster]:
     """A scheduler in this process, and processes that work. All but the scheduler listens on loopback only."""
-    host, port = host_and_port(settings.listen)
     with ExitStack() as stack:
         files = {"ca-file": settings.tls_ca, "cert": settings.tls_cert, "key": settings.tls_key}
-        stack.enter_context(
-            dask.config.set({f"distributed.scheduler.dashboard.tls.{name}": file for name, file in files.items()})
-        )
+        tls = {f"distributed.scheduler.dashboard.tls.{name}": file for name, file in files.items()}
+        stack.enter_context(dask.config.set(tls))
         stack.enter_context(_main_module_not_run_again())
         loop = stack.enter_context(_loop_for_workers())
-        try:
-            cluster = stack.enter_context(
-                LocalCluster(
-                    n_workers=settings.processes,
-                    threads_per_worker=1,
-                    host="127.0.0.1",
-                    # `_Queue` tries again what a worker died over.
-                    scheduler_kwargs={"host": host, "allowed_failures": 0},
-                    scheduler_port=port,
-                    protocol="tls" if settings.tls else "tcp",
-                    security=security,
-                    dashboard_address=settings.dashboard,
-                    # If the user's cache cannot be written, all share the one of this process.
-                    env={"GOUGH_CACHE": str(keyed_folder("prepared", fingerprint()).resolve().parents[1])},
-                    loop=loop,
-                    silence_logs=logging.CRITICAL,
-                )
-            )
-        except (OSError, RuntimeError, ValueError) as error:
-            raise InputError(f"cannot start a scheduler at {settings.listen} with its workers: {error}") from None
+        with _ctrl_c_deferred():
+            cluster = _started(settings, security, loop)
+            stack.callback(_close, cluster)
         if settings.tls:
             cluster.scheduler.http_server.ssl_options.verify_mode = ssl.CERT_REQUIRED
         yield cluster
+
+
+def _started(settings: EngineSettings, security: Security | None, loop: Any) -> LocalCluster:
+    host, port = host_and_port(settings.listen)
+    for tries_left in reversed(range(_TRIES)):
+        try:
+            return LocalCluster(
+                n_workers=settings.processes,
+                threads_per_worker=1,
+                host="127.0.0.1",
+                # `_Queue` tries again what a worker died over.
+                scheduler_kwargs={"host": host, "allowed_failures": 0},
+                scheduler_port=port,
+                protocol="tls" if settings.tls else "tcp",
+                security=security,
+                dashboard_address=settings.dashboard,
+                # If the user's cache cannot be written, all share the one of this process.
+                env={"GOUGH_CACHE": str(keyed_folder("prepared", fingerprint()).resolve().parents[1])},
+                loop=loop,
+                silence_logs=logging.CRITICAL,
+            )
+        except (OSError, RuntimeError, ValueError) as error:
+            # A worker that dies before it works fails the start.
+            if not tries_left:
+                raise InputError(f"cannot start a scheduler at {settings.listen} with its workers: {error}") from None
+    raise AssertionError
+
+
+def _close(cluster: LocalCluster) -> None:
+    with _ctrl_c_deferred(), suppress(TimeoutError):
+        cluster.close(timeout=_CLOSE_S)
+
+
+@contextmanager
+def _ctrl_c_deferred() -> Iterator[None]:
+    """Let Dask start or end its processes, which takes seconds, before Ctrl-C is heeded."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    pressed: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: pressed.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if pressed:
+        raise KeyboardInterrupt
 
 
 @contextmanager
 def _loop_for_workers() -> Iterator[Any]:
     """An event loop that starts processes which never see Ctrl-C: it is for this process, which then ends them."""
     runner = LoopRunner()
+    # Else it would be started with the first process, and let signals through again.
+    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         runner.start()

@@ -71,9 +71,7 @@ class EngineSettings:
         if self.workers is not None:
             raise InputError("--workers is for this machine, and the scheduler has workers of its own: leave one of them out")
         if (self.listen, self.dashboard) != (_LISTEN, _DASHBOARD):
-            raise InputError(
-                "--listen and --dashboard are for a scheduler of this command's own: leave them or --scheduler out"
-            )
+            raise InputError("--listen and --dashboard are for a scheduler of its own: leave out these, or --scheduler")
 
     @property
     def processes(self) -> int:

@@ -1,0 +1,143 @@
+"""The engine on Dask: who can connect, what programs it works in, and what it does about workers that die."""
+
+import os
+import shutil
+import socket
+import ssl
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hil.engine.cluster import _AHEAD, _TRIES, _Queue
+from hil.engine.engine import Engine, open_engine
+from hil.engine.settings import EngineSettings, host_and_port
+from tests.hil.engine.certificates import Certificates, make_certificates
+from tests.hil.processes import dask_worker, started, wait_until
+
+LOOPBACK = ("127.0.0.1", "::1", "::ffff:127.0.0.1")
+
+
+@given(st.integers(0, 80), st.integers(1, 5), st.sets(st.integers(0, 79), max_size=30), st.integers(0, 2**32 - 1))
+def test_only_what_kills_workers_is_given_up(items: int, workers: int, deadly: set[int], seed: int) -> None:
+    """A cluster in which batches end in any order, and a worker that dies takes any other batches with it."""
+    rng, queue, running = np.random.default_rng(seed), _Queue(items), list[list[int]]()
+    done, given_up, deaths = Counter[int](), Counter[int](), Counter[int]()
+    while True:
+        while len(running) < _AHEAD * workers and (numbers := queue.next(running, workers)):
+            running.append(numbers)
+        if not running:
+            break
+        batch = running.pop(rng.integers(len(running)))
+        if not deadly & {*batch}:
+            done.update(batch)
+            queue.took(rng.choice([np.nan, 1e-3, 0.1, 10.0]))
+        elif rng.random() < 0.2:
+            queue.put_back(batch)
+        else:
+            beside = [each for each in running if rng.random() < 0.5]
+            running = [each for each in running if each not in beside]
+            for killed in (batch, *beside):
+                deaths.update(killed)
+                given_up.update(queue.died(killed))
+    there = {number for number in deadly if number < items}
+    assert given_up == Counter(there)
+    assert done == Counter({*range(items)} - there)
+    assert all(deaths[number] <= _TRIES for number in range(items))
+
+
+def listening(pids: set[int]) -> list[tuple[str, int]]:
+    """The addresses at which these processes listen."""
+    found = psutil.net_connections(kind="tcp")
+    return [(each.laddr.ip, each.laddr.port) for each in found if each.pid in pids and each.status == psutil.CONN_LISTEN]
+
+
+def family() -> set[int]:
+    return {os.getpid(), *(each.pid for each in psutil.Process().children(recursive=True))}
+
+
+PROCESS = "__import__('os').getpid()"
+"""What Python evaluates on a worker to its number."""
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Certificates:
+    return make_certificates(tmp_path_factory.mktemp("tls") / "ours")
+
+
+@pytest.fixture(scope="module")
+def engine(certificates: Certificates) -> Iterator[Engine]:
+    """Two processes, which others can join with a certificate."""
+    files = {"tls_ca": str(certificates.ca), "tls_cert": str(certificates.cert), "tls_key": str(certificates.key)}
+    with open_engine(EngineSettings(workers=2, listen="localhost:0", **files)) as engine:
+        yield engine
+
+
+def test_all_workers_work_and_nothing_listens_beyond_this_machine(engine: Engine) -> None:
+    pids = {*engine.map(eval, [PROCESS] * 50)}
+    assert engine.workers == 2
+    assert os.getpid() not in pids
+    addresses = listening(family())
+    # Scheduler, dashboard, and nanny, worker and its page twice.
+    assert len(addresses) >= 6
+    assert {host for host, _ in addresses} <= {*LOOPBACK}
+
+
+# Dask speaks first.
+@pytest.mark.parametrize(("name", "spoken"), [("joined_at", b""), ("dashboard", b"GET /status HTTP/1.0\r\n\r\n")])
+def test_nobody_connects_without_a_certificate(
+    engine: Engine, certificates: Certificates, name: str, spoken: bytes, tmp_path: Path
+) -> None:
+    address = (getattr(engine, name) or "").partition("://")[2].removesuffix("/status")
+    others = make_certificates(tmp_path / "others")
+
+    def answers(shown: Certificates | None) -> bool:
+        context = ssl.create_default_context(cafile=certificates.ca)
+        context.check_hostname = False
+        if shown:
+            context.load_cert_chain(shown.cert, shown.key)
+        with context.wrap_socket(socket.create_connection(host_and_port(address))) as tls:
+            return heard(tls)
+
+    def heard(connection: socket.socket) -> bool:
+        connection.settimeout(1.0)
+        try:
+            connection.sendall(spoken)
+            return bool(connection.recv(10))
+        except OSError:
+            return False
+
+    assert answers(certificates)
+    assert not answers(None)
+    assert not answers(others)
+    with socket.create_connection(host_and_port(address)) as plain:
+        assert not heard(plain)
+
+
+def test_a_worker_with_other_sources_is_left_out(
+    engine: Engine, certificates: Certificates, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with started(dask_worker(engine.joined_at or "", *certificates.dask_options), other_sources(tmp_path)) as worker:
+        wait_until(lambda: engine.workers == 3, "the worker has joined")
+        while "left out" not in caplog.text:
+            assert len({*engine.map(eval, [PROCESS] * 30)}) == 2
+        assert worker.wait() == 0
+    (line,) = [record.getMessage() for record in caplog.records if record.name == "gough"]
+    assert line.startswith("the worker at tls://127.0.0.1:")
+    assert "has other sources" in line
+    assert engine.workers == 2
+
+
+def other_sources(folder: Path) -> Path:
+    """A folder that has gough with another constant, from which Python takes it."""
+    here = Path(__file__).resolve().parents[3]
+    for package in ("plant", "controller", "hil", "fmus"):
+        shutil.copytree(here / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+    changed = folder / "controller" / "settings.py"
+    changed.write_text(f"{changed.read_text()}\nCHANGED = 1.0\n")
+    return folder
