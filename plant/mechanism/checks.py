@@ -1,5 +1,6 @@
 """What every mechanism must satisfy, and the limits of its actuators."""
 
+import copyreg
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from types import MappingProxyType
@@ -57,12 +58,20 @@ def checked_plant(values: Mapping[str, ArrayLike] | None, table: VariableTable) 
                 f"drive.compensation x nominal_resistance is {compensated:g} Ohm; the drive is stable only below the motors' "
                 f"resistance of {least:g} Ohm: choose a smaller compensation"
             )
-    return MappingProxyType(parameters)
+    return _table(parameters)
 
 
 def read_only(settings: Mapping[str, Mapping[str, Any]] | None) -> Mapping[str, Mapping[str, Any]]:
     """A read-only copy of the tables for the controller."""
-    return MappingProxyType({name: MappingProxyType(dict(table)) for name, table in (settings or {}).items()})
+    return _table({name: _table(dict(table)) for name, table in (settings or {}).items()})
+
+
+def _table(content: dict[str, Any]) -> MappingProxyType[str, Any]:
+    return MappingProxyType(content)
+
+
+# Python cannot pickle read-only tables by itself, and mechanisms go to other processes.
+copyreg.pickle(MappingProxyType, lambda table: (_table, (dict(table),)))
 
 
 @dataclass(frozen=True, eq=False)

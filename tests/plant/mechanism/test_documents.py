@@ -1,5 +1,6 @@
 """Documents of mechanisms: what a file may say, what it may be based on, and what is refused."""
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -211,3 +212,18 @@ def test_a_planar_mechanism_without_a_home_is_none_for_the_loop(tmp_path: Path) 
     assert isinstance(load_mechanism(path), PlanarMechanism)
     with pytest.raises(InputError, match="the mechanism 'custom' has no home pose: give one"):
         load_in_space(path)
+
+
+@pytest.mark.parametrize("name", ["hexapod", "planar-3rpr"])
+def test_a_mechanism_arrives_in_another_process_bit_for_bit(name: str) -> None:
+    mechanism = load_mechanism(name)
+    came = pickle.loads(pickle.dumps(mechanism))
+    assert came.base_joints.tobytes() == mechanism.base_joints.tobytes()
+    assert came.limits.stroke.tobytes() == mechanism.limits.stroke.tobytes()
+    assert {key: value.tobytes() for key, value in came.plant.items()} == {
+        key: value.tobytes() for key, value in mechanism.plant.items()
+    }
+    assert came.settings == mechanism.settings and came.name == name
+    for table in (came.plant, came.settings):
+        with pytest.raises(TypeError):
+            table["mass"] = 1.0
