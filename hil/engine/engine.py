@@ -2,9 +2,10 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from functools import cache, partial
 from importlib.util import find_spec
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from hil.engine.batches import Failure, attempt, no_kind
 from hil.engine.settings import EngineSettings
@@ -42,13 +43,14 @@ class Engine(ABC):
         """
 
     def map(self, function: Callable[[Item], Result], items: Sequence[Item], progress: Progress = no_progress) -> list[Result]:
-        """The results in the order of the items.
+        """The results in the order of the items, which all need the same machine code and FMU.
 
         Raises:
             GoughError: an item has failed, or as for `run`.
         """
         results: dict[int, Result] = {}
-        for number, outcome in self.run(function, items):
+        kind = _name(function)
+        for number, outcome in self.run(function, items, lambda item: kind):
             if isinstance(outcome, Failure):
                 if outcome.error is not None:
                     raise outcome.error
@@ -56,6 +58,23 @@ class Engine(ABC):
             results[number] = outcome
             progress(len(results) / len(items))
         return [results[number] for number in range(len(items))]
+
+    def starmap(
+        self, function: Callable[..., Result], items: Sequence[tuple[Any, ...]], progress: Progress = no_progress
+    ) -> list[Result]:
+        """As `map`, where an item has the function's arguments."""
+        return self.map(partial(_spread, function), items, progress)
+
+
+def _spread(function: Callable[..., Result], arguments: tuple[Any, ...]) -> Result:
+    return function(*arguments)
+
+
+def _name(function: Any) -> str:
+    """The module and the name of a function, or of the one that a partial one calls."""
+    while isinstance(function, partial):
+        function = function.args[0] if function.func is _spread else function.func
+    return f"{function.__module__}.{function.__qualname__}"
 
 
 class InOneProcess(Engine):
@@ -66,6 +85,22 @@ class InOneProcess(Engine):
     ) -> Iterator[tuple[int, Result | Failure]]:
         """As `Engine.run`, in the order of the items."""
         return ((number, attempt(function, item)) for number, item in enumerate(items))
+
+
+IN_ONE_PROCESS = InOneProcess()
+
+
+class _WhenNeeded(Engine):
+    """An engine that is opened with its first work."""
+
+    def __init__(self, opened: Callable[[], Engine]) -> None:
+        self._opened = opened
+
+    def run(
+        self, function: Callable[[Item], Result], items: Sequence[Item], kind: Callable[[Item], str] = no_kind
+    ) -> Iterator[tuple[int, Result | Failure]]:
+        """As `Engine.run`."""
+        return self._opened().run(function, items, kind)
 
 
 @contextmanager
@@ -86,3 +121,21 @@ def open_engine(settings: EngineSettings | None = None) -> Iterator[Engine]:
 
     with connected(settings) as engine:
         yield cast(Engine, engine)
+
+
+@contextmanager
+def engine_when_needed(settings: EngineSettings, tell: Callable[[str], object]) -> Iterator[Engine]:
+    """As `open_engine`, but opened with its first work: what is wrong with a study is told before any process starts.
+
+    `tell` is called with the address of the dashboard, if there is one.
+    """
+    with ExitStack() as stack:
+
+        @cache
+        def opened() -> Engine:
+            engine = stack.enter_context(open_engine(settings))
+            if engine.dashboard:
+                tell(engine.dashboard)
+            return engine
+
+        yield _WhenNeeded(opened)
