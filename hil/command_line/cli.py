@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from hil.engine.settings import EngineSettings
 from hil.option import Option
 from plant.errors import GoughError, InputError
 from plant.extras import check_installed
@@ -136,6 +137,23 @@ def options_of(config: "type[C]", *names: str, **changes: Mapping[str, Any]) -> 
             _add_option(parser, name, default, replace(declared[name].metadata["option"], **form))
 
     return add
+
+
+def engine_options(few: str = "") -> Argument:
+    """The options of a study's engine; `few` says why it stays in one process unless they ask for more."""
+
+    def add(parser: ArgumentParser) -> None:
+        options_of(EngineSettings, workers={"shown": f"1, as {few}"} if few else {})(parser)
+        options_of(EngineSettings, *names_of(EngineSettings, "workers"))(parser)
+        parser.set_defaults(few=bool(few))
+
+    return add
+
+
+def engine_of(options: Namespace) -> EngineSettings:
+    """The settings that `engine_options` ask for."""
+    settings = config_of(options, EngineSettings)
+    return replace(settings, workers=1) if options.few and settings == EngineSettings() else settings
 
 
 def _add_option(parser: ArgumentParser, name: str, default: Any, option: Option) -> None:

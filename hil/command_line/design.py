@@ -4,7 +4,7 @@ from argparse import Namespace
 from dataclasses import asdict
 
 from hil.command_line import cli
-from hil.command_line.terminal import deg, mm, progress_bar
+from hil.command_line.terminal import deg, engine_at_work, mm
 from hil.runs.config import SimulationConfig
 from hil.studies.config import TuningConfig
 from hil.table import Table
@@ -45,6 +45,7 @@ def gough_classify(options: Namespace) -> None:
 @cli.command(
     cli.options_of(SimulationConfig, seed={"text": "seed of mechanisms, poses and noise"}),
     cli.markdown("docs/classes.md"),
+    cli.engine_options(),
     cli.JSON,
 )
 def gough_classes(options: Namespace) -> None:
@@ -57,8 +58,8 @@ def gough_classes(options: Namespace) -> None:
 
     from hil.studies.accuracy import class_table, evaluate_classes
 
-    with progress_bar("classes") as progress:
-        rows = evaluate_classes(options.seed, progress)
+    with engine_at_work(cli.engine_of(options), "classes") as (engine, progress):
+        rows = evaluate_classes(options.seed, engine, progress)
     about = {"seed": options.seed, "version": version("gough")}
     cli.write_json(options.json, about | {"classes": [asdict(row) for row in rows]})
     class_table(rows).print(options.markdown)
@@ -68,6 +69,7 @@ def gough_classes(options: Namespace) -> None:
     cli.options_of(SimulationConfig, "mechanism"),
     cli.setting("--poses", 2000, "number of random poses"),
     cli.options_of(SimulationConfig, seed={"text": "seed of poses and noise"}),
+    cli.engine_options(few="it takes seconds"),
     cli.JSON,
 )
 def gough_accuracy(options: Namespace) -> None:
@@ -79,7 +81,8 @@ def gough_accuracy(options: Namespace) -> None:
     from hil.studies.accuracy import evaluate_accuracy
     from plant.mechanism import load_spatial
 
-    accuracy = evaluate_accuracy(load_spatial(options.mechanism), options.poses, options.seed)
+    with engine_at_work(cli.engine_of(options), "methods") as (engine, _):
+        accuracy = evaluate_accuracy(load_spatial(options.mechanism), options.poses, options.seed, engine)
     cli.write_json(options.json, accuracy.summary())
     table = Table("RMS errors", "position [mm]", "rotation [deg]", "over the bound", "NEES", "solved [%]")
     for estimator, errors in accuracy.errors.items():
@@ -103,6 +106,7 @@ def gough_accuracy(options: Namespace) -> None:
     cli.argument("--mechanism", nargs="+", metavar="NAME", help="presets or TOML files (default: one of each type)"),
     cli.options_of(SimulationConfig, "seed", duration={"text": "duration of each motion"}),
     cli.markdown("docs/sensor_sets.md"),
+    cli.engine_options(),
     cli.JSON,
 )
 def gough_sensor_sets(options: Namespace) -> None:
@@ -114,12 +118,11 @@ def gough_sensor_sets(options: Namespace) -> None:
     """
     from importlib.metadata import version
 
-    from hil.studies.sensor_sets import MECHANISMS, evaluate_sensor_sets, reasons, table
+    from hil.studies.sensor_sets import MECHANISMS, SETS, evaluate_sensor_sets, reasons, table
 
-    with progress_bar("sets of sensors") as progress:
-        outcomes = evaluate_sensor_sets(
-            options.mechanism or MECHANISMS, duration=options.duration, seed=options.seed, progress=progress
-        )
+    with engine_at_work(cli.engine_of(options), "sets of sensors") as (engine, progress):
+        names = options.mechanism or MECHANISMS
+        outcomes = evaluate_sensor_sets(names, SETS, options.duration, options.seed, engine, progress)
     about = {"duration": options.duration, "seed": options.seed, "version": version("gough")}
     cli.write_json(options.json, about | {"sets": [asdict(outcome) for outcome in outcomes]})
     if options.markdown:
@@ -151,6 +154,7 @@ def gough_tune(options: Namespace) -> None:
 @cli.command(
     cli.output("output", "FILE.toml", "the mechanism to write, for --mechanism"),
     cli.options_of(TuningConfig),
+    cli.engine_options(),
     cli.JSON,
 )
 def gough_tune_fusion(options: Namespace) -> None:
@@ -163,8 +167,8 @@ def gough_tune_fusion(options: Namespace) -> None:
     from hil.studies.fusion_tuning import tune_fusion, tuned_text
 
     config = cli.config_of(options, TuningConfig)
-    with progress_bar(f"noise of {config.mechanism} with {config.imu}") as progress:
-        figures = tune_fusion(config, progress)
+    with engine_at_work(cli.engine_of(options), f"noise of {config.mechanism} with {config.imu}") as (engine, progress):
+        figures = tune_fusion(config, engine, progress)
     settings = figures["settings"]
     found = {name: values["after"] for name, values in settings.items()}
     write_whole(options.output, tuned_text(config.mechanism, found).encode())

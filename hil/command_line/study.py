@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hil.command_line import cli
-from hil.command_line.terminal import deg, duration, mm, mm_deg, progress_bar
+from hil.command_line.terminal import deg, duration, engine_at_work, mm, mm_deg, progress_bar
 from hil.engine.settings import EngineSettings
 from hil.runs.config import SimulationConfig
 from hil.studies.config import SECTIONS, ComparisonConfig, EvaluationConfig
@@ -42,7 +42,6 @@ def gough_sweep(options: Namespace) -> int:
     reason.
     """
     check_installed("pyarrow")
-    from hil.engine.engine import open_engine
     from hil.sweep.store import TABLE
     from hil.sweep.study import read_study
     from hil.sweep.sweep import estimate, run_study
@@ -59,9 +58,7 @@ def gough_sweep(options: Namespace) -> int:
         )
         cli.write_json(options.json, {**asdict(found), "total_seconds": total, "version": version("gough")})
         return 0
-    with progress_bar(study.name) as progress, open_engine(settings) as engine:
-        if engine.dashboard:
-            print(f"the workers at their work: {engine.dashboard}", file=sys.stderr)
+    with engine_at_work(settings, study.name) as (engine, progress):
         result = run_study(study, folder, engine, progress)
     cli.write_json(options.json, result.summary())
     cli.write_report(options, "sweep", result)
@@ -152,18 +149,18 @@ def _with_interval(quantile: "Quantile", scale: float) -> tuple[str, str]:
     return f"{scale * quantile.value:.3g}", f"{low} to {high}"
 
 
-@cli.command(cli.options_of(ComparisonConfig), cli.JSON)
+@cli.command(cli.options_of(ComparisonConfig), cli.engine_options(few="several would slow each other's cycles"), cli.JSON)
 def gough_compare_fusion(options: Namespace) -> None:
     """Compare every way to fuse the IMUs, on one motion.
 
     The platform moves as prescribed, 30 mm and 10 deg along and about every axis. Prints errors after the first 20 s, NEES (6
-    is consistent) and microseconds of a cycle.
+    is consistent) and microseconds of a cycle, which are those of a busy machine if there are several workers.
     """
     from hil.studies.fusion_comparison import compare
 
     config = cli.config_of(options, ComparisonConfig)
-    with progress_bar("every way to fuse") as progress:
-        figures = compare(config, progress)
+    with engine_at_work(cli.engine_of(options), "every way to fuse") as (engine, progress):
+        figures = compare(config, engine, progress)
     cli.write_json(options.json, figures)
     table = Table(f"{config.imu}, {config.motion}", "position RMS [mm]", "rotation RMS [deg]", "NEES", "us", "seeds")
     for name, method in figures["methods"].items():
@@ -175,6 +172,7 @@ def gough_compare_fusion(options: Namespace) -> None:
 @cli.command(
     cli.options_of(EvaluationConfig),
     cli.argument("--only", choices=SECTIONS, nargs="+", default=SUPPRESS, help="these sections instead of all"),
+    cli.engine_options(),
     cli.JSON,
 )
 def gough_evaluate_fusion(options: Namespace) -> None:
@@ -183,13 +181,14 @@ def gough_evaluate_fusion(options: Namespace) -> None:
     The raw IMUs of several rigs are calibrated on themselves; then their platforms move as prescribed, 30 mm and 10 deg along
     and about every axis at 0.5, 1, 2 and 0.1 to 1 Hz, and stand still. Prints errors after the first 20 s with exact and with
     wrong joints, with a dead IMU, of starts in the middle of a motion, over minutes of standing still, in the closed loop, and
-    the cost of a cycle, beside the leg filters with the refined pose. Ten minutes in all.
+    the cost of a cycle, beside the leg filters with the refined pose. The cost is measured in one process, with no other work.
+    Ten minutes of processor time in all.
     """
     from hil.studies.fusion_evaluation import evaluate
 
     config = cli.config_of(options, EvaluationConfig)
-    with progress_bar("calibration") as progress:
-        figures = evaluate(config, lambda label, share: progress(share, label))
+    with engine_at_work(cli.engine_of(options), "calibration") as (engine, progress):
+        figures = evaluate(config, engine, lambda label, share: progress(share, label))
     cli.write_json(options.json, figures)
     for section, show in _EVALUATED.items():
         if section in figures:
@@ -276,6 +275,7 @@ _EVALUATED: dict[str, Callable[[dict[str, Any]], None]] = {
     cli.setting("--seeds", 20, "how often each case is tried"),
     cli.argument("--only", metavar="TEXT", help="only cases with this text in their names"),
     cli.markdown("docs/faults.md"),
+    cli.engine_options(),
     cli.JSON,
 )
 def gough_faults(options: Namespace) -> int:
@@ -291,8 +291,8 @@ def gough_faults(options: Namespace) -> int:
     cases = tuple(case for case in CASES if options.only is None or options.only in case.name)
     if not cases:
         raise InputError(f"no case has {options.only!r} in its name")
-    with progress_bar("faults") as progress:
-        outcomes = run_matrix(options.seeds, cases, progress)
+    with engine_at_work(cli.engine_of(options), "faults") as (engine, progress):
+        outcomes = run_matrix(options.seeds, cases, engine, progress)
     table(outcomes).print(options.markdown)
     cli.write_json(options.json, summary(outcomes, options.seeds))
     findings = [finding for outcome in outcomes for finding in outcome.findings]
@@ -341,19 +341,22 @@ def gough_planar(options: Namespace) -> None:
         "here is unknown and counts as noise, far above the sensor's own",
     ),
     cli.setting("--bias-walk", 1e-4, "random walk of the gyroscope's bias that the filter assumes [rad/s/sqrt(s)]"),
+    cli.engine_options(few="it takes seconds"),
     cli.JSON,
 )
 def gough_broad(options: Namespace) -> None:
     """Run the platform's filter alone, on real IMU data.
 
     The filter, and the vqf package, run on trials of the BROAD benchmark: an IMU moved by hand, with an optical reference.
-    Prints the RMS of the inclination's error where the benchmark counts it.
+    Prints the RMS of the inclination's error where the benchmark counts it, and microseconds of a sample, which are those of a
+    busy machine if there are several workers.
     """
     from controller.settings import FusionSettings
     from hil.studies.broad import evaluate
 
     fusion = FusionSettings(platform_accelerometer_noise=options.accelerometer_noise, bias_walk=options.bias_walk)
-    figures = evaluate(options.folder, fusion)
+    with engine_at_work(cli.engine_of(options), "trials") as (engine, _):
+        figures = evaluate(options.folder, fusion, engine)
     cli.write_json(options.json, figures)
     table = Table("inclination RMS", "filter [deg]", "vqf [deg]", "filter [us]", "vqf [us]", "samples")
     for name, trial in figures["trials"].items():

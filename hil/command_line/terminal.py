@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 from hil.table import Table
 
 if TYPE_CHECKING:
+    from hil.engine.engine import Engine
+    from hil.engine.settings import EngineSettings
     from hil.runs.run_state import RunState
 
 QUANTILES = {"p50": "p50", "p99": "p99", "p99.9": "p999", "max": "max"}
@@ -66,6 +68,22 @@ def progress_bar(label: str) -> Iterator[Callable[..., None]]:
 
         with compilation_reported(compiling):
             yield show
+
+
+@contextmanager
+def engine_at_work(settings: "EngineSettings", label: str) -> Iterator[tuple["Engine", Callable[..., None]]]:
+    """The engine of a study, opened when there is work for it, and the bar of its progress."""
+    with progress_bar(label) as progress:
+        from hil.engine.engine import engine_when_needed
+
+        def tell(opened: "Engine") -> None:
+            if opened.dashboard:
+                print(f"the workers at their work: {opened.dashboard}", file=sys.stderr)
+            if opened.joined_at:
+                print(f"other workers join with: dask worker {opened.joined_at}", file=sys.stderr)
+
+        with engine_when_needed(settings, tell) as engine:
+            yield engine, progress
 
 
 @contextmanager

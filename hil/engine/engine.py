@@ -124,18 +124,17 @@ def open_engine(settings: EngineSettings | None = None) -> Iterator[Engine]:
 
 
 @contextmanager
-def engine_when_needed(settings: EngineSettings, tell: Callable[[str], object]) -> Iterator[Engine]:
+def engine_when_needed(settings: EngineSettings, tell: Callable[[Engine], object]) -> Iterator[Engine]:
     """As `open_engine`, but opened with its first work: what is wrong with a study is told before any process starts.
 
-    `tell` is called with the address of the dashboard, if there is one.
+    `tell` is called with the engine that was opened.
     """
     with ExitStack() as stack:
 
         @cache
         def opened() -> Engine:
             engine = stack.enter_context(open_engine(settings))
-            if engine.dashboard:
-                tell(engine.dashboard)
+            tell(engine)
             return engine
 
         yield _WhenNeeded(opened)

@@ -6,6 +6,7 @@ The noise is 0.05 deg on legs, roll and pitch, and 1.5 deg on a magnetic yaw.
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from importlib.metadata import version
 from itertools import combinations
 from typing import Any
@@ -17,7 +18,8 @@ from scipy.stats import chi2
 from controller.direct_kinematics import Solutions, required_measurements, solve_batch, solve_planar
 from controller.direct_kinematics.spatial import LEG_SIGMA, TILT_SIGMA, YAW_SIGMA
 from controller.direct_kinematics.synthetic import TILT, draw_measurements, draw_poses, measurements_of
-from hil.progress import Progress, in_parts, no_progress
+from hil.engine.engine import IN_ONE_PROCESS, Engine
+from hil.progress import Progress, no_progress
 from hil.table import Cell, Table
 from plant.checks import checked_seed
 from plant.errors import InputError, SingularConfigurationError
@@ -32,6 +34,7 @@ from plant.mechanism.classification import (
 )
 from plant.pose import Array, pose_errors, rms_figures, rotation_angle
 
+Measurements = dict[str, Array]
 ALL_LEGS = tuple(range(LEGS))
 _TWO_LEGS = (0, 3)
 _NEES_BOUNDS = 0.005, 0.995
@@ -88,7 +91,7 @@ class Accuracy:
         }
 
 
-def evaluate_accuracy(mechanism: Mechanism, poses: int = 2000, seed: int = 0) -> Accuracy:
+def evaluate_accuracy(mechanism: Mechanism, poses: int = 2000, seed: int = 0, engine: Engine = IN_ONE_PROCESS) -> Accuracy:
     """Errors of the paper's algorithms, and with all legs, at random poses about home.
 
     Raises:
@@ -100,10 +103,7 @@ def evaluate_accuracy(mechanism: Mechanism, poses: int = 2000, seed: int = 0) ->
     positions, rotations = draw_poses(mechanism, poses, random)
     noisy = draw_measurements(mechanism, positions, rotations, random, 1.0)
     exact = draw_measurements(mechanism, positions, rotations, random, 0.0)
-    errors = {}
-    for estimator in _estimators(mechanism):
-        bounds = _run(mechanism, estimator, exact).covariances
-        errors[estimator] = _errors(_run(mechanism, estimator, noisy), positions, rotations, bounds)
+    errors = dict(engine.map(partial(_errors, mechanism, positions, rotations, noisy, exact), _estimators(mechanism)))
     low, high = chi2.ppf(_NEES_BOUNDS, 6 * poses) / poses
     return Accuracy(mechanism.name, classify(mechanism), errors, poses, seed, (float(low), float(high)))
 
@@ -134,21 +134,24 @@ def _best_legs(mechanism: Mechanism, method: str, count: int) -> tuple[int, ...]
     return choices[int(np.argmax([np.median(solutions.conditionings) for solutions in found]))]
 
 
-def _run(mechanism: Mechanism, estimator: Estimator, measurements: dict[str, Array]) -> Solutions:
+def _run(mechanism: Mechanism, estimator: Estimator, measurements: Measurements) -> Solutions:
     given = measurements_of(estimator.method, measurements)
     given["leg_directions"] = given["leg_directions"].copy()
     given["leg_directions"][:, [leg for leg in ALL_LEGS if leg not in estimator.legs]] = np.nan
     return solve_batch(mechanism, **given, method=estimator.method, refine=estimator.refine)
 
 
-def _errors(found: Solutions, positions: Array, rotations: Array, bounds: Array) -> Errors:
+def _errors(
+    mechanism: Mechanism, positions: Array, rotations: Array, noisy: Measurements, exact: Measurements, estimator: Estimator
+) -> tuple[Estimator, Errors]:
+    found, bounds = _run(mechanism, estimator, noisy), _run(mechanism, estimator, exact).covariances
     kept = found.solved & np.isfinite(bounds[:, 0, 0])
     error = pose_errors(found.positions[kept], found.rotations[kept], positions[kept], rotations[kept])
     nees = np.einsum("ni,ni->n", error, np.linalg.solve(found.covariances[kept], error[..., None])[..., 0])
     variances = np.diagonal(bounds[kept], axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=2).mean(axis=0)
     rms = tuple(rms_figures(error).values())
     over = rms / np.sqrt(variances)
-    return Errors(*(float(value) for value in (*rms, *over, nees.mean(), kept.mean())))
+    return estimator, Errors(*(float(value) for value in (*rms, *over, nees.mean(), kept.mean())))
 
 
 @dataclass(frozen=True)
@@ -168,16 +171,16 @@ class ClassAccuracy:
     vertical_errors: tuple[float, float]
 
 
-def evaluate_classes(seed: int = 0, progress: Progress = no_progress) -> list[ClassAccuracy]:
+def evaluate_classes(seed: int = 0, engine: Engine = IN_ONE_PROCESS, progress: Progress = no_progress) -> list[ClassAccuracy]:
     """The needs and errors of every class, spatial and planar."""
-    checked_seed(seed)
-    spatial = [(_evaluate_class, each, number) for number, each in enumerate(spatial_classes())]
-    planar = [(_evaluate_planar_class, each, LEGS**3 + number) for number, each in enumerate(planar_classes())]
-    classes = in_parts(spatial + planar, progress)
-    return [evaluate(each, np.random.default_rng((seed, number))) for (evaluate, each, number), _ in classes]
+    numbered = [*enumerate(spatial_classes()), *enumerate(planar_classes(), start=LEGS**3)]
+    return engine.starmap(partial(_evaluate_class, checked_seed(seed)), numbered, progress)
 
 
-def _evaluate_class(mechanism_class: MechanismClass, random: np.random.Generator) -> ClassAccuracy:
+def _evaluate_class(seed: int, number: int, mechanism_class: MechanismClass) -> ClassAccuracy:
+    random = np.random.default_rng((seed, number))
+    if mechanism_class.planar:
+        return _evaluate_planar_class(mechanism_class, random)
     if mechanism_class.group == "n-3-I":
         paper_method, paper_legs, paper_needs = "section-3.1.1", 6, "6 legs"
     elif mechanism_class.platform_count < LEGS:

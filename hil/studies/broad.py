@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from controller.estimation.platform_filter import STATES, start_platform, step_platform
 from controller.settings import FusionSettings
+from hil.engine.engine import IN_ONE_PROCESS, Engine
 from hil.studies.fusion_comparison import vqf_verticals
 from plant.compiled import kernel
 from plant.errors import InputError
@@ -56,7 +57,7 @@ class Trial:
         return float(np.sqrt(np.mean(angles**2)))
 
 
-def evaluate(folder: str | Path, fusion: FusionSettings) -> dict[str, Any]:
+def evaluate(folder: str | Path, fusion: FusionSettings, engine: Engine = IN_ONE_PROCESS) -> dict[str, Any]:
     """Run the platform filter and the `vqf` package on every trial `*.npz` of a folder.
 
     The noise in `fusion` includes the IMU's own acceleration, which nothing measures here.
@@ -71,20 +72,20 @@ def evaluate(folder: str | Path, fusion: FusionSettings) -> dict[str, Any]:
     paths = sorted(Path(folder).glob("*.npz"))
     if not paths:
         raise InputError(f"{folder} is no folder with trials *.npz: give one with trials of BROAD")
-    trials = [load_trial(path) for path in paths]
     return {
-        "trials": {
-            trial.name: {
-                "filter": _score(trial, partial(_filter, trial, fusion)),
-                "vqf": _score(trial, partial(vqf_verticals, 1.0 / trial.rate, trial.rates, trial.forces)),
-                "samples": len(trial.rates),
-                "rate": trial.rate,
-            }
-            for trial in trials
-        },
+        "trials": dict(engine.map(partial(_evaluate, fusion), [load_trial(path) for path in paths])),
         "accelerometer_noise": fusion.platform_accelerometer_noise,
         "bias_walk": fusion.bias_walk,
         "version": version("gough"),
+    }
+
+
+def _evaluate(fusion: FusionSettings, trial: Trial) -> tuple[str, dict[str, Any]]:
+    return trial.name, {
+        "filter": _score(trial, partial(_filter, trial, fusion)),
+        "vqf": _score(trial, partial(vqf_verticals, 1.0 / trial.rate, trial.rates, trial.forces)),
+        "samples": len(trial.rates),
+        "rate": trial.rate,
     }
 
 

@@ -5,7 +5,7 @@ from math import inf
 
 from hil.option import integers, option
 from hil.runs.config import CALIBRATION, FUSIONS, IMU, MECHANISM
-from plant.checks import check_rate
+from plant.checks import check_rate, checked_seed
 from plant.errors import InputError, UnknownNameError
 
 LEARNING_S = 20.0
@@ -22,6 +22,8 @@ def _check(rate: float, seeds: tuple[int, ...]) -> None:
     check_rate(rate)
     if not seeds:
         raise InputError("there must be a seed at least")
+    for seed in seeds:
+        checked_seed(seed)
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,11 @@ Loop, messages and emulated rig are the real ones, connected in memory and on vi
 """
 
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
 from functools import partial
 from importlib.metadata import version
+from itertools import islice, product
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,9 @@ from controller.inverse_kinematics import leg_lengths
 from controller.planning.plan_handover import STREAM, note_sample, rest
 from controller.planning.stream_planner import StreamPlanner
 from controller.safety.causes import Cause, DriveState, Mode, Reaction, Request
+from hil.engine.engine import IN_ONE_PROCESS, Engine
 from hil.loop.records import RECORD, Link, StopRequest
-from hil.progress import Progress, in_parts, no_progress
+from hil.progress import Progress, no_progress
 from hil.realtime.clock import SCRIPTED, new_clock
 from hil.rigs.emulation import fault, new_emulated, sample
 from hil.rigs.udp.emulator import check_watchdog, new_udp_emulator
@@ -173,19 +175,22 @@ class Outcome:
     travel_m: list[float] = field(default_factory=list)
     findings: list[str] = field(default_factory=list)
 
+    def __add__(self, other: "Outcome") -> "Outcome":
+        """The outcome over the seeds of both."""
+        return Outcome(self.case, *(getattr(self, each.name) + getattr(other, each.name) for each in fields(self)[1:]))
+
     def summary(self) -> dict[str, Any]:
         """The figures, for JSON."""
         figures = {name: value for name, value in vars(self).items() if name != "case"}
         return {"case": self.case.name, "expected": self.case.expected.text, **figures}
 
 
-def run_matrix(seeds: int, cases: tuple[Case, ...] = CASES, progress: Progress = no_progress) -> list[Outcome]:
+def run_matrix(
+    seeds: int, cases: Sequence[Case] = CASES, engine: Engine = IN_ONE_PROCESS, progress: Progress = no_progress
+) -> list[Outcome]:
     """Run the cases, each with so many seeds of IMUs and faults, their times and places."""
-    outcomes = [Outcome(case) for case in cases]
-    for outcome, of_case in in_parts(outcomes, progress):
-        for seed, _ in in_parts(range(seeds), of_case):
-            _try(outcome, seed)
-    return outcomes
+    tried = iter(engine.starmap(_try, list(product(cases, range(seeds))), progress))
+    return [sum(islice(tried, seeds), Outcome(case)) for case in cases]
 
 
 def summary(outcomes: list[Outcome], seeds: int) -> dict[str, Any]:
@@ -206,8 +211,8 @@ def table(outcomes: list[Outcome]) -> Table:
     return result
 
 
-def _try(outcome: Outcome, seed: int) -> None:
-    case, random = outcome.case, np.random.default_rng([seed, len(outcome.case.name), 6])
+def _try(case: Case, seed: int) -> Outcome:
+    random = np.random.default_rng([seed, len(case.name), 6])
     at = _FIRST_S + _SPREAD_S * random.random()
     k, j = random.permutation(LEGS)[:2].tolist()
     begin = "" if case.from_start else f",at={round(at, 4)}"
@@ -225,7 +230,7 @@ def _try(outcome: Outcome, seed: int) -> None:
             case.act(loop)
         cause = loop.follow(hold + round(MOTION_S * RATE_HZ))
         _stand(loop)
-        _judge(case, seed, loop, cause, onset, outcome)
+        return _judge(case, seed, loop, cause, onset)
 
 
 def _join(loop: PreparedLoop, faults: list[Record], seed: int) -> None:
@@ -272,9 +277,10 @@ def _follow_stream(loop: PreparedLoop, what: str, onset: int) -> None:
         reception.plan()
 
 
-def _judge(case: Case, seed: int, loop: PreparedLoop, cause: int, onset: int, outcome: Outcome) -> None:
+def _judge(case: Case, seed: int, loop: PreparedLoop, cause: int, onset: int) -> Outcome:
     """Compare the run with its specification."""
     assert loop.emulator is not None
+    outcome = Outcome(case)
     limits, period = loop.mechanism.require_limits(), 1.0 / RATE_HZ
     records, rig = loop.records[: int(loop.link[Link.HEAD])], loop.emulator.rig
 
@@ -329,3 +335,4 @@ def _judge(case: Case, seed: int, loop: PreparedLoop, cause: int, onset: int, ou
     find(most(rig["velocity"]) > 0.0 or (rig["drive"] == DriveState.FOLLOWING).any(), "a drive still moves")
     expected_cycles = np.arange(len(records)) + np.cumsum(records["missed"])
     find(not np.array_equal(records["cycle"], expected_cycles), "a cycle is not recorded")
+    return outcome

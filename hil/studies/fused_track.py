@@ -1,7 +1,8 @@
 """Poses that the cycle estimates from raw IMU samples of an imposed motion, and their errors."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -11,8 +12,8 @@ from controller.estimation.whole_mechanism.filter import extrapolate_covariance
 from controller.settings import control_settings, sensor_settings
 from hil.runs.config import FUSIONS
 from plant.compiled import Record, kernel, record_dtype
-from plant.dynamics.imposed_motion import ImposedMotion
-from plant.imu import load_imu, measure
+from plant.dynamics.imposed_motion import ImposedMotion, impose
+from plant.imu import imu_state, load_imu, measure
 from plant.imu_wiring import ALL_IMUS
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, pose_errors, rms_figures
@@ -32,6 +33,10 @@ FUSED = record_dtype(
     ns=(np.int64, 4),  # from the raw sample to each step [ns]
 )
 """Estimates for a sample."""
+
+Figures = dict[str, Any]
+"""Errors by name; `nees` is None without covariances."""
+RMS = ("position_rms", "rotation_rms")
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +60,11 @@ class PoseTrack:
         """Errors (N, 6) against the true poses [m, rad]."""
         return pose_errors(self.positions, self.rotations, truth.positions, truth.rotations)
 
+    def figures(self, truth: "PoseTrack") -> Figures:
+        """`position_rms` [m], `rotation_rms` [rad] and `nees` against the true poses, and `us`."""
+        errors = self.errors(truth)
+        return rms_figures(errors) | {"nees": self.nees(errors), "us": self.us}
+
     def nees(self, errors: Array) -> float | None:
         """Mean NEES of the errors (N, 6): 6 is consistent; None without covariances."""
         information = self.information if self.covariances is None else np.linalg.inv(self.covariances)
@@ -63,37 +73,12 @@ class PoseTrack:
         return float(np.einsum("ni,nij,nj->n", errors, information, errors).mean())
 
 
-def poses_of(motion: ImposedMotion, samples: slice) -> PoseTrack:
-    """The true poses of a motion in some samples, copied, so that its readings need not be kept."""
-    return PoseTrack(motion.positions[samples].copy(), motion.rotations[samples].copy())
-
-
-def pooled_rms(figures: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """`position_rms` and `rotation_rms` over several runs that count the same."""
-    return {key: float(np.sqrt(np.mean([each[key] ** 2 for each in figures]))) for key in ("position_rms", "rotation_rms")}
-
-
-class PoseErrors:
-    """Errors of tracks, pooled: every track counts the same."""
-
-    def __init__(self) -> None:
-        self._rms: list[dict[str, float]] = []
-        self._nees: list[float] = []
-
-    def add(self, track: PoseTrack, truth: PoseTrack) -> None:
-        """Add the errors of a track against the true poses."""
-        errors = track.errors(truth)
-        self._rms.append(rms_figures(errors))
-        if (nees := track.nees(errors)) is not None:
-            self._nees.append(nees)
-
-    def figures(self) -> dict[str, float | None]:
-        """`position_rms` [m] and `rotation_rms` [rad] over all tracks, and the mean `nees` or None."""
-        return pooled_rms(self._rms) | {"nees": float(np.mean(self._nees)) if self._nees else None}
-
-    def worst(self) -> dict[str, float]:
-        """RMS errors of the worst tracks."""
-        return {f"worst_{key}": max(each[key] for each in self._rms) for key in self._rms[0]}
+def pooled(figures: Sequence[Figures], worst: bool = False) -> Figures:
+    """The errors over several tracks that count the same; `worst_position_rms` and `worst_rotation_rms` if asked for."""
+    result: Figures = {key: float(np.sqrt(np.mean([each[key] ** 2 for each in figures]))) for key in RMS}
+    if "nees" in figures[0]:
+        result["nees"] = None if figures[0]["nees"] is None else float(np.mean([each["nees"] for each in figures]))
+    return result | ({f"worst_{key}": max(each[key] for each in figures) for key in RMS} if worst else {})
 
 
 def track(fused: Record, step: int) -> PoseTrack:
@@ -114,11 +99,20 @@ def constants(mechanism: Mechanism, imu: str, rate: float, fusion: str, calibrat
     return cycle_parameters(mechanism, rate, control, sensors, ALL_IMUS, FUSIONS[fusion], calibration, section_5, section_5)
 
 
-def read(motion: ImposedMotion, imu: Record) -> Array:
-    """Raw samples (N, 3, 7, 3) of imperfect IMUs, whose state goes on, on a motion."""
+def read(motion: ImposedMotion, imu: Record, late: slice) -> tuple[Array, PoseTrack]:
+    """Raw samples (N, 3, 7, 3) of imperfect IMUs, whose state goes on, on a motion; and the true poses in some of them."""
     raw = np.empty_like(motion.signals)
     _measure(imu, motion.signals, raw)
-    return raw
+    # Copies, so that the motion's readings need not be kept.
+    return raw, PoseTrack(motion.positions[late].copy(), motion.rotations[late].copy())
+
+
+def imposed(
+    mechanism: Mechanism, kind: str, duration: float, rate: float, seed: int, imu: str, late: slice, imu_seed: int | None = None
+) -> tuple[Array, PoseTrack]:
+    """As `read`, of the IMUs of this name on an imposed motion; `imu_seed` is another seed for them."""
+    motion = impose(mechanism, kind, duration, rate, seed)
+    return read(motion, imu_state(load_imu(imu), seed if imu_seed is None else imu_seed, 1.0 / rate), late)
 
 
 @kernel

@@ -18,18 +18,18 @@ from controller.cycle import MARKS, STATE, CycleStage, run_stages
 from controller.direct_kinematics import solve_batch
 from controller.estimation.filterpy_filters import FilterpyFilters
 from controller.estimation.leg_filter import leg_direction, start_leg
-from hil.progress import Progress, in_parts, no_progress
+from hil.engine.engine import IN_ONE_PROCESS, Engine
+from hil.progress import Progress, no_progress
 from hil.studies.config import LEARNING_S, WHOLE_FUSIONS, ComparisonConfig
-from hil.studies.fused_track import CLOSED, FUSED, REFINED, WHOLE, PoseErrors, PoseTrack, constants, fuse, poses_of, read, track
+from hil.studies.fused_track import CLOSED, FUSED, REFINED, WHOLE, Figures, PoseTrack, constants, fuse, imposed, pooled, track
 from plant.compiled import Record, kernel
-from plant.dynamics.imposed_motion import impose
 from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
-from plant.imu import ACCELEROMETER, GYROSCOPE, imu_state, load_imu
+from plant.imu import ACCELEROMETER, GYROSCOPE
 from plant.mechanism import LEGS, load_spatial
 from plant.pose import Array
 
 
-def compare(config: ComparisonConfig, progress: Progress = no_progress) -> dict[str, Any]:
+def compare(config: ComparisonConfig, engine: Engine = IN_ONE_PROCESS, progress: Progress = no_progress) -> dict[str, Any]:
     """Run every method.
 
     Returns:
@@ -40,23 +40,21 @@ def compare(config: ComparisonConfig, progress: Progress = no_progress) -> dict[
         GoughError: something in the configuration cannot be used.
     """
     calibration = Calibration() if config.calibration is None else load_calibration(config.calibration)
-    errors: dict[str, PoseErrors] = {}
-    times: dict[str, list[float]] = {}
-    for seed, of_seed in in_parts(config.seeds, progress):
-        readings = _Readings(config, calibration, seed)
-        methods = METHODS if errors else METHODS | SLOW_METHODS
-        for name, _ in in_parts(methods, of_seed):
-            found = methods[name](readings)
-            errors.setdefault(name, PoseErrors()).add(found, readings.truth)
-            times.setdefault(name, []).append(found.us)
+    of_seeds = engine.starmap(partial(_compare, config, calibration), list(enumerate(config.seeds)), progress)
+    by_name = {name: [each[name] for each in of_seeds if name in each] for name in of_seeds[0]}
     return {
         "methods": {
-            name: pooled.figures() | {"us": float(np.median(times[name])), "seeds": len(times[name])}
-            for name, pooled in errors.items()
+            name: pooled(runs) | {"us": float(np.median([each["us"] for each in runs])), "seeds": len(runs)}
+            for name, runs in by_name.items()
         },
         "config": asdict(config),
         "version": version("gough"),
     }
+
+
+def _compare(config: ComparisonConfig, calibration: Calibration, number: int, seed: int) -> dict[str, Figures]:
+    readings, methods = _Readings(config, calibration, seed), METHODS if number else METHODS | SLOW_METHODS
+    return {name: method(readings).figures(readings.truth) for name, method in methods.items()}
 
 
 class _Readings:
@@ -64,11 +62,10 @@ class _Readings:
 
     def __init__(self, config: ComparisonConfig, calibration: Calibration, seed: int) -> None:
         nominal = load_spatial(config.mechanism)
-        motion = impose(nominal, config.motion, config.duration, config.rate, seed)
         self.rate = config.rate
         self.late = slice(round(LEARNING_S * config.rate), None)
-        self.raw = read(motion, imu_state(load_imu(config.imu), seed, 1.0 / config.rate))
-        self.truth = poses_of(motion, self.late)
+        of_imus = config.motion, config.duration, config.rate, seed, config.imu
+        self.raw, self.truth = imposed(nominal, *of_imus, self.late)
         self.calibration = calibration
         self.mechanism = nominal.moved_joints(calibration.joints)
         self.imu = config.imu

@@ -5,14 +5,13 @@ The noise of each estimator is scaled until it is consistent, unless its errors 
 open minimise the errors. The simulated joints are exact, so the result does not allow for wrong joints.
 """
 
-import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from importlib.metadata import version
 from itertools import chain, product
 from typing import Any
+from uuid import uuid4
 
 import numpy as np
 import tomlkit
@@ -22,14 +21,14 @@ from scipy.stats import chi2
 
 from controller.cycle import cycle_parameters
 from controller.settings import FusionSettings, control_settings, sensor_settings
-from hil.progress import Progress, in_parts, no_progress, part_of
+from hil.engine.engine import IN_ONE_PROCESS, Engine
+from hil.progress import Progress, no_progress
 from hil.runs.config import FUSIONS
 from hil.studies.config import TuningConfig
-from hil.studies.fused_track import REFINED, WHOLE, PoseTrack, fuse, poses_of, read, track
+from hil.studies.fused_track import REFINED, WHOLE, PoseTrack, fuse, imposed, track
 from plant.compiled import Record
-from plant.dynamics.imposed_motion import impose
 from plant.errors import InputError
-from plant.imu import imu_state, load_imu
+from plant.imu import load_imu
 from plant.mechanism import LEGS, Mechanism, load_spatial, mechanism_text
 from plant.pose import Array
 
@@ -44,6 +43,8 @@ _MOST_WORSE = 1.02
 _REACH, _COARSE, _FINE = np.log(4.0), 0.3, 0.02
 """Range and tolerances of a search, as logarithms of factors; coarse at least errors, which are flat."""
 _DIGITS = 4
+_KEPT = 32
+"""Motions of which a process keeps the samples, 8 MB of each at 1 kHz."""
 _MOST_LEG_ERROR = np.radians(5.0)
 """RMS up to which noise can explain the errors."""
 
@@ -163,35 +164,34 @@ def _seek_least_errors(evaluate: Evaluate, components: int) -> float:
     return float(found.x)
 
 
-class _Runs:
-    """Every motion with every seed: raw samples (N, 3, 7, 3), and the true poses that count."""
+def _consistency(
+    config: TuningConfig, engine: Engine, tuning: str, fusion: FusionSettings, names: Sequence[str] = tuple(ESTIMATORS)
+) -> dict[str, Consistency]:
+    """Consistency of estimators by name with these settings, over every motion with every seed."""
+    judge = partial(_judge, config, tuning, fusion, names)
+    figures = {}
+    for name, runs in zip(names, zip(*engine.starmap(judge, list(product(MOTIONS, config.seeds))), strict=True), strict=True):
+        nees, squares = zip(*runs, strict=True)
+        figures[name] = Consistency(np.array(nees), np.sqrt(np.mean(squares, axis=0)))
+    return figures
 
-    def __init__(self, config: TuningConfig, mechanism: Mechanism, progress: Progress) -> None:
-        self.mechanism, self.rate = mechanism, config.rate
-        self.late = slice(round(SETTLING_S * config.rate), None, max(1, round(_SAMPLE_S * config.rate)))
-        self.motions: list[tuple[Array, PoseTrack]] = []
-        for (kind, seed), _ in in_parts(list(product(MOTIONS, config.seeds)), progress):
-            motion = impose(mechanism, kind, DURATION_S, config.rate, seed)
-            raw = read(motion, imu_state(load_imu(config.imu), seed, 1.0 / config.rate))
-            self.motions.append((raw, poses_of(motion, self.late)))
 
-    def evaluate(self, fusion: FusionSettings, names: Sequence[str] = tuple(ESTIMATORS)) -> dict[str, Consistency]:
-        """Consistency of estimators by name with these settings."""
-        control, filters = control_settings(self.mechanism), {ESTIMATORS[name].whole for name in names}
-        parameters = {whole: cycle_parameters(self.mechanism, self.rate, control, fusion, whole=whole) for whole in filters}
+def _judge(
+    config: TuningConfig, tuning: str, fusion: FusionSettings, names: Sequence[str], kind: str, seed: int
+) -> list[tuple[float, Array]]:
+    """What `Estimator.judge` says of each estimator in a motion."""
+    mechanism, raw, truth, late = _motion(config, tuning, kind, seed)
+    filters, of_loop = {ESTIMATORS[name].whole for name in names}, (config.rate, control_settings(mechanism))
+    fused = {whole: fuse(cycle_parameters(mechanism, *of_loop, fusion, whole=whole), raw)[late] for whole in filters}
+    return [ESTIMATORS[name].judge(mechanism, fused[ESTIMATORS[name].whole], truth) for name in names]
 
-        def judge(motion: tuple[Array, PoseTrack]) -> list[tuple[float, Array]]:
-            raw, truth = motion
-            fused = {whole: fuse(each, raw)[self.late] for whole, each in parameters.items()}
-            return [ESTIMATORS[name].judge(self.mechanism, fused[ESTIMATORS[name].whole], truth) for name in names]
 
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            judged = zip(*pool.map(judge, self.motions), strict=True)
-        figures = {}
-        for name, runs in zip(names, judged, strict=True):
-            nees, squares = zip(*runs, strict=True)
-            figures[name] = Consistency(np.array(nees), np.sqrt(np.mean(squares, axis=0)))
-        return figures
+@lru_cache(_KEPT)
+def _motion(config: TuningConfig, tuning: str, kind: str, seed: int) -> tuple[Mechanism, Array, PoseTrack, slice]:
+    """The mechanism, the samples of a motion, and the true poses that count; the `tuning` of this name needs it often."""
+    mechanism = load_spatial(config.mechanism)
+    late = slice(round(SETTLING_S * config.rate), None, max(1, round(_SAMPLE_S * config.rate)))
+    return mechanism, *imposed(mechanism, kind, DURATION_S, config.rate, seed, config.imu, late), late
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ class _Step:
     seek: Callable[[Evaluate, int], float]
     settings: tuple[str, ...]
 
-    def tuned(self, fusion: FusionSettings, runs: _Runs) -> FusionSettings:
+    def tuned(self, fusion: FusionSettings, consistency: Callable[..., dict[str, Consistency]]) -> FusionSettings:
         """The settings with the result of the search."""
 
         def scaled(change: float) -> FusionSettings:
@@ -211,7 +211,7 @@ class _Step:
 
         @cache
         def evaluate(change: float) -> Consistency:
-            return runs.evaluate(scaled(change), (self.estimator,))[self.estimator]
+            return consistency(scaled(change), (self.estimator,))[self.estimator]
 
         return scaled(self.seek(evaluate, ESTIMATORS[self.estimator].components))
 
@@ -226,7 +226,7 @@ STEPS = (
 """In the order of the estimators: each builds upon the one before."""
 
 
-def tune_fusion(config: TuningConfig, progress: Progress = no_progress) -> dict[str, Any]:
+def tune_fusion(config: TuningConfig, engine: Engine = IN_ONE_PROCESS, progress: Progress = no_progress) -> dict[str, Any]:
     """Find the noise that makes the estimators consistent.
 
     Returns:
@@ -236,11 +236,10 @@ def tune_fusion(config: TuningConfig, progress: Progress = no_progress) -> dict[
     Raises:
         GoughError: something in the configuration cannot be used, or noise cannot explain the IMUs' errors.
     """
-    mechanism = load_spatial(config.mechanism)
-    before = fusion = sensor_settings(mechanism, load_imu(config.imu))
-    stages = len(STEPS) + 3  # Motions and first figures before, last figures after.
-    runs = _Runs(config, mechanism, part_of(progress, 0.0, 1.0 / stages))
-    figures_before = runs.evaluate(before)
+    before = fusion = sensor_settings(load_spatial(config.mechanism), load_imu(config.imu))
+    consistency = partial(_consistency, config, engine, uuid4().hex)
+    stages = len(STEPS) + 2  # First figures before, last figures after.
+    figures_before = consistency(before)
     worst = float(figures_before["leg filters"].rms[0])
     if not worst < _MOST_LEG_ERROR:
         raise InputError(
@@ -248,12 +247,12 @@ def tune_fusion(config: TuningConfig, progress: Progress = no_progress) -> dict[
             f"{np.degrees(_MOST_LEG_ERROR):g} deg no noise accounts for it: tune for calibrated ones"
         )
     names: dict[str, list[str]] = {name: [] for name in ESTIMATORS}
-    for i, step in enumerate(STEPS, start=2):
+    for i, step in enumerate(STEPS, start=1):
         progress(i / stages)
-        fusion = step.tuned(fusion, runs)
+        fusion = step.tuned(fusion, consistency)
         names[step.estimator] += [name for name in step.settings if name not in names[step.estimator]]
     progress((stages - 1) / stages)
-    figures_after = runs.evaluate(fusion)
+    figures_after = consistency(fusion)
     return {
         "settings": {
             name: {"before": getattr(before, name), "after": getattr(fusion, name)} for name in chain(*names.values())
@@ -262,7 +261,7 @@ def tune_fusion(config: TuningConfig, progress: Progress = no_progress) -> dict[
             name: {
                 "settings": names[name],
                 "consistent": estimator.components,
-                "bounds": estimator.bounds(len(runs.motions)),
+                "bounds": estimator.bounds(len(MOTIONS) * len(config.seeds)),
                 "before": figures_before[name].summary(),
                 "after": figures_after[name].summary(),
             }

@@ -5,13 +5,14 @@ The IMUs of a set sit on those legs that give the best conditioning at the worst
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
 
 from controller.imu_set import check_imus
-from hil.progress import Progress, in_parts, no_progress
+from hil.engine.engine import IN_ONE_PROCESS, Engine
+from hil.progress import Progress, no_progress
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import SimulationStoppedError, simulate
 from hil.table import Table
@@ -85,6 +86,7 @@ def evaluate_sensor_sets(
     sets: Sequence[SensorSet] = SETS,
     duration: float = 10.0,
     seed: int = 0,
+    engine: Engine = IN_ONE_PROCESS,
     progress: Progress = no_progress,
 ) -> list[Outcome]:
     """Follow `sines` for `duration` [s] with every set of sensors, on presets or TOML files; `seed` is that of the IMUs.
@@ -92,17 +94,17 @@ def evaluate_sensor_sets(
     Raises:
         GoughError: a mechanism, the duration or the seed cannot be used.
     """
-    outcomes = []
-    for name, of_mechanism in in_parts(mechanisms, progress):
-        mechanism = load_spatial(name)
-        minimum = paper_set(classify(mechanism))
-        for sensors, _ in in_parts(sets, of_mechanism):
-            paper = sensors.label == minimum
-            imus, conditioning, refused = choose_imus(mechanism, sensors, paper)
-            config = SimulationConfig(name, "sines", duration, seed=seed, imus=imus, magnetometer=sensors.magnetometer)
-            runs = {fusion: _follow(replace(config, fusion=fusion)) for fusion in sensors.fusions if imus}
-            outcomes.append(Outcome(name, sensors.label, paper, imus, conditioning, refused, runs))
-    return outcomes
+    configs = [SimulationConfig(name, "sines", duration, seed=seed) for name in mechanisms]
+    least = {name: paper_set(classify(load_spatial(name))) for name in mechanisms}
+    items = [(config, sensors, sensors.label == least[config.mechanism]) for config, sensors in product(configs, sets)]
+    return engine.starmap(_evaluate, items, progress)
+
+
+def _evaluate(config: SimulationConfig, sensors: SensorSet, paper: bool) -> Outcome:
+    imus, conditioning, refused = choose_imus(load_spatial(config.mechanism), sensors, paper)
+    config = replace(config, imus=imus, magnetometer=sensors.magnetometer)
+    runs = {fusion: _follow(replace(config, fusion=fusion)) for fusion in sensors.fusions if imus}
+    return Outcome(config.mechanism, sensors.label, paper, imus, conditioning, refused, runs)
 
 
 def choose_imus(mechanism: Mechanism, sensors: SensorSet, paper: bool) -> tuple[tuple[int, ...], float, str]:

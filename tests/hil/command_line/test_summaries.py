@@ -291,7 +291,7 @@ def test_the_comparison_of_fusions_is_printed(monkeypatch, tables):
         "a": pose_figures(1.0) | {"nees": 6.25, "us": 12.5, "seeds": 6},
         "b": pose_figures(2.0) | {"nees": None, "us": 7.0, "seeds": 1},
     }
-    monkeypatch.setattr("hil.studies.fusion_comparison.compare", lambda config, progress: {"methods": methods})
+    monkeypatch.setattr("hil.studies.fusion_comparison.compare", lambda config, engine, progress: {"methods": methods})
     assert main(["compare-fusion"]) == 0
     assert tables == [[
         ["mpu9150-calibrated, 1", "position RMS [mm]", "rotation RMS [deg]", "NEES", "us", "seeds"],
@@ -340,7 +340,9 @@ def test_the_errors_of_a_planar_rig_are_printed(tables, tmp_path):
 
 def test_the_scores_of_trials_are_printed(monkeypatch, tables):
     methods = {name: {"inclination_rms": radians(k), "us": 10.0 * k} for k, name in enumerate(("filter", "vqf"), start=1)}
-    monkeypatch.setattr("hil.studies.broad.evaluate", lambda folder, fusion: {"trials": {"t": methods | {"samples": 99}}})
+    monkeypatch.setattr(
+        "hil.studies.broad.evaluate", lambda folder, fusion, engine: {"trials": {"t": methods | {"samples": 99}}}
+    )
     assert main(["broad", "."]) == 0
     assert tables[0][1] == ["t", "1.000", "2.000", "10.00", "20.00", "99"]
     assert tables[0][0] == ["inclination RMS", "filter [deg]", "vqf [deg]", "filter [us]", "vqf [us]", "samples"]

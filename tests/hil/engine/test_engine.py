@@ -152,7 +152,7 @@ def test_an_engine_is_opened_with_its_first_work_and_its_workers_end_with_it():
         for process in processes:
             os.kill(process, 0)
     assert len(processes) == 2 and os.getpid() not in processes
-    assert len(told) == 1 and told[0].startswith("http://127.0.0.1:")
+    assert [each.dashboard.startswith("http://127.0.0.1:") for each in told] == [True]
     for process in processes:
         with pytest.raises(ProcessLookupError):
             os.kill(process, 0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hil.studies.fused_track import PoseErrors, PoseTrack
+from hil.studies.fused_track import PoseTrack, pooled
 from plant.pose import rotation_from_vector
 
 
@@ -34,11 +34,20 @@ def test_errors_of_the_stated_covariance_are_consistent(truth):
 
 
 def test_pooled_errors_count_each_track_the_same_and_know_the_worst(truth):
-    errors = PoseErrors()
-    for seed, size in enumerate((1e-3, 3e-3)):
-        errors.add(PoseTrack(*disturbed(truth, np.diag([size] * 3 + [2.0 * size] * 3), seed)), truth)
-    figures, expected = errors.figures(), np.sqrt(3.0 * (1e-6 + 9e-6) / 2.0)
-    assert figures["position_rms"] == pytest.approx(expected, rel=0.03)
-    assert figures["rotation_rms"] == pytest.approx(2.0 * expected, rel=0.03)
-    assert figures["nees"] is None
-    assert errors.worst()["worst_position_rms"] == pytest.approx(np.sqrt(27.0) * 1e-3, rel=0.03)
+    tracks = [
+        PoseTrack(*disturbed(truth, np.diag([size] * 3 + [2.0 * size] * 3), seed), us=8.0)
+        for seed, size in enumerate((1e-3, 3e-3))
+    ]
+    figures = [track.figures(truth) for track in tracks]
+    expected = np.sqrt(3.0 * (1e-6 + 9e-6) / 2.0)
+    assert pooled(figures)["position_rms"] == pytest.approx(expected, rel=0.03)
+    assert pooled(figures)["rotation_rms"] == pytest.approx(2.0 * expected, rel=0.03)
+    assert pooled(figures)["nees"] is None and figures[0]["us"] == 8.0
+    assert set(pooled(figures)) == {"position_rms", "rotation_rms", "nees"}
+    assert pooled(figures, worst=True)["worst_position_rms"] == pytest.approx(np.sqrt(27.0) * 1e-3, rel=0.03)
+
+
+def test_the_pooled_consistency_is_the_mean_where_it_is_known():
+    rms = {"position_rms": 1e-3, "rotation_rms": 2e-3}
+    assert pooled([rms | {"nees": 3.0}, rms | {"nees": 8.0}])["nees"] == 5.5
+    assert pooled([rms, rms]) == pytest.approx(rms)

@@ -14,7 +14,7 @@ from plant.mechanism import load_spatial
 @pytest.fixture(scope="module")
 def figures(tmp_path_factory):
     file = tmp_path_factory.mktemp("evaluation") / "figures.json"
-    options = ("--rate", "500", "--seeds", "1", "--starts", "4", "--still", "80", "--json", str(file))
+    options = ("--rate", "500", "--seeds", "1", "--starts", "4", "--still", "80", "--workers", "1", "--json", str(file))
     assert main(["evaluate-fusion", *options]) == 0
     return json.loads(file.read_text())
 
@@ -30,7 +30,20 @@ def without_calibration(monkeypatch):
 
 def test_calibrated_imus_start_in_motion_bear_a_dead_one_and_do_not_drift(without_calibration, tmp_path):
     file = tmp_path / "figures.json"
-    options = ("--imu", "mpu9150-calibrated", "--rate", "250", "--seeds", "1", "--starts", "2", "--still", "25")
+    options = (
+        "--imu",
+        "mpu9150-calibrated",
+        "--rate",
+        "250",
+        "--seeds",
+        "1",
+        "--starts",
+        "2",
+        "--still",
+        "25",
+        "--workers",
+        "1",
+    )
     sections = ("faults", "start", "drift")
     assert main(["evaluate-fusion", *options, "--joint-error", "0", "--only", *sections, "--json", str(file)]) == 0
     figures = json.loads(file.read_text())
@@ -90,6 +103,8 @@ def test_what_a_cycle_costs_is_told(figures):
         (("--still", "5"), "the platform is to stand still for 5 s; it can for 20 to 3600 s"),
         (("--starts", "0"), "0 starts are asked for; there can be 1 to 10000"),
         (("--joint-error", "-1"), "the joint error is -1 mm; it must be at least 0"),
+        (("--seeds", "0,-1"), "the seed is -1"),
+        (("--imu", "best"), "no IMU preset 'best'"),
     ],
 )
 def test_what_cannot_be_evaluated_is_refused(options, complaint, capsys):

@@ -14,6 +14,7 @@ from plant.mechanism import load_mechanism
 from plant.pose import rotation_from_vector
 
 HEXAPOD = (resources.files("plant.mechanism") / "presets" / "hexapod.toml").read_text()
+SHORT = ("--seeds", "0,1", "--rate", "250", "--workers", "1")
 NAMES = [
     "leg_accelerometer_noise", "platform_accelerometer_noise", "tilt_sigma", "leg_sigma", "noise_inflation",
 ]  # fmt: skip
@@ -23,7 +24,7 @@ NAMES = [
 def tuned(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tuning")
     mechanism, figures = folder / "tuned.toml", folder / "tuned.json"
-    assert main(["tune-fusion", str(mechanism), "--seeds", "0,1", "--rate", "250", "--json", str(figures)]) == 0
+    assert main(["tune-fusion", str(mechanism), *SHORT, "--json", str(figures)]) == 0
     return mechanism, json.loads(figures.read_text())
 
 
@@ -141,7 +142,7 @@ def test_the_rest_of_a_file_stays_as_it_is(tmp_path):
     ],
 )
 def test_bad_input_is_refused_in_a_line(arguments, said, tmp_path, capsys):
-    assert main(["tune-fusion", str(tmp_path / "tuned.toml"), *arguments]) == 2
+    assert main(["tune-fusion", str(tmp_path / "tuned.toml"), "--workers", "1", *arguments]) == 2
     complaint = capsys.readouterr().err
     assert said in complaint
     assert complaint.count("\n") == 1

@@ -1,0 +1,69 @@
+"""Every study gives the same figures, bit for bit, in one process and on workers."""
+
+import json
+
+import numpy as np
+import pytest
+
+from controller.settings import FusionSettings
+from hil.engine.engine import IN_ONE_PROCESS, open_engine
+from hil.engine.settings import EngineSettings
+from hil.studies import broad, fusion_comparison, fusion_evaluation, fusion_tuning
+from hil.studies.accuracy import evaluate_accuracy, evaluate_classes
+from hil.studies.config import ComparisonConfig, EvaluationConfig, TuningConfig
+from hil.studies.fault_matrix import CASES, run_matrix
+from hil.studies.sensor_sets import SETS, evaluate_sensor_sets
+from plant.mechanism import load_spatial
+
+CALIBRATED = EvaluationConfig(imu="mpu9150-calibrated", rate=250.0, seeds=(1, 2), starts=3, still=70.0)
+
+
+@pytest.fixture(scope="module")
+def workers():
+    with open_engine(EngineSettings(workers=2, dashboard="127.0.0.1:0")) as engine:
+        yield engine
+
+
+@pytest.fixture(scope="module")
+def trials(tmp_path_factory):
+    """Two trials of made-up data."""
+    folder, random = tmp_path_factory.mktemp("trials"), np.random.default_rng(0)
+    for name in ("first", "second"):
+        arrays = {"imu_gyr": random.normal(size=(500, 3)), "imu_acc": random.normal(size=(500, 3)) + [0.0, 0.0, 9.81]}
+        turns = np.tile([1.0, 0.0, 0.0, 0.0], (500, 1))
+        np.savez(folder / f"{name}.npz", **arrays, opt_quat=turns, movement=np.ones(500), sampling_rate=250.0)
+    return folder
+
+
+def faults(engine):
+    return [outcome.summary() for outcome in run_matrix(2, CASES[30:32] + CASES[33:34], engine)]
+
+
+STUDIES = {
+    "accuracy": lambda engine, trials: evaluate_accuracy(load_spatial("6-4-I"), 40, 1, engine).summary(),
+    "broad": lambda engine, trials: broad.evaluate(trials, FusionSettings(), engine),
+    "faults": lambda engine, trials: faults(engine),
+    "sensor-sets": lambda engine, trials: list(map(vars, evaluate_sensor_sets(["6-3-II"], SETS[:4], 0.3, 1, engine))),
+    "tune-fusion": lambda engine, trials: fusion_tuning.tune_fusion(TuningConfig(seeds=(0,), rate=50.0), engine),
+}
+LONG_STUDIES = {
+    "classes": lambda engine, trials: list(map(vars, evaluate_classes(1, engine))),
+    "compare-fusion": lambda engine, trials: fusion_comparison.compare(
+        ComparisonConfig(duration=20.5, rate=100.0, seeds=(0, 1)), engine
+    ),
+    "evaluate-fusion": lambda engine, trials: fusion_evaluation.evaluate(CALIBRATED, engine),
+}
+
+
+def without_times(figures):
+    if isinstance(figures, dict):
+        return {name: without_times(each) for name, each in figures.items() if name not in ("us", "cost")}
+    return [without_times(each) for each in figures] if isinstance(figures, list | tuple) else figures
+
+
+@pytest.mark.parametrize("study", [*STUDIES, *(pytest.param(name, marks=pytest.mark.slow) for name in LONG_STUDIES)])
+def test_figures_do_not_depend_on_the_engine(study, workers, trials):
+    evaluate = (STUDIES | LONG_STUDIES)[study]
+    here, there = (json.dumps(without_times(evaluate(engine, trials)), default=str) for engine in (IN_ONE_PROCESS, workers))
+    assert here == there
+    assert len(here) > 200
