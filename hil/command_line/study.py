@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hil.command_line import cli
-from hil.command_line.terminal import deg, duration, engine_at_work, mm, mm_deg, progress_bar
+from hil.command_line.terminal import deg, duration, engine_at_work, mm, mm_deg, number_text, progress_bar
 from hil.engine.settings import EngineSettings
 from hil.runs.config import SimulationConfig
 from hil.studies.config import SECTIONS, ComparisonConfig, EvaluationConfig
@@ -49,12 +49,13 @@ def gough_sweep(options: Namespace) -> int:
     study, settings = read_study(options.study), cli.config_of(options, EngineSettings)
     folder = options.results or options.study.with_suffix(".results")
     if options.dry_run:
-        with progress_bar("the first run") as progress:
+        with progress_bar("the first run"):
             found = estimate(study, folder)
-        total = found.total(settings.processes)
+        workers = 1 if settings.scheduler else settings.processes
+        total = found.total(workers)
         print(
-            f"{found.points} runs, of which {found.known} are in {folder} already; a run takes {found.seconds:.3g} s: "
-            f"{duration(total)} on {settings.processes} processors"
+            f"{found.points} runs, of which {found.known} are in {folder} already; a run takes {found.seconds:.3g} s on this "
+            f"machine: {duration(total)} with {workers} worker{'s' * (workers > 1)}"
         )
         cli.write_json(options.json, {**asdict(found), "total_seconds": total, "version": version("gough")})
         return 0
@@ -62,14 +63,15 @@ def gough_sweep(options: Namespace) -> int:
         result = run_study(study, folder, engine, progress)
     cli.write_json(options.json, result.summary())
     cli.write_report(options, "sweep", result)
+    _print_sweep(result)
+    print(f"{len(result.table)} runs, {result.ran} of them new, in {folder / TABLE}")
+    if result.failed:
+        reason, *_ = result.first_reason.partition("\n")
+        print(f"{result.failed} of {len(result.table)} runs failed; why the first one did: {reason}", file=sys.stderr)
     if options.picture is not None:
         from hil.reports.sweep_picture import write_picture
 
         write_picture(result, options.picture)
-    _print_sweep(result)
-    print(f"{len(result.table)} runs, {result.ran} of them new, in {folder / TABLE}")
-    if result.failed:
-        print(f"{result.failed} runs have failed, the first one: {result.first_reason}", file=sys.stderr)
     return int(result.failed > 0)
 
 
@@ -89,6 +91,9 @@ def _print_sweep(result: "SweepResult") -> None:
         table.add(headed(name, unit), half, *cells[1:])
     if known:
         table.print()
+    for name in result.figures():
+        if name not in known and result.failed < len(result.table):
+            print(f"{name}: no run has a finite number")
     for name in known[:_MOST_PRINTED]:
         _print_by_factor(result, name)
     for name in known[:_MOST_PRINTED]:
@@ -110,7 +115,7 @@ def _print_by_factor(result: "SweepResult", name: str) -> None:
         if levels or factor.name in shares:
             table.add(headed(factor.name, factor_unit), *[""] * 6, shares.pop(factor.name, ""))
         for level in levels:
-            half, most = _with_interval(level.quantiles[0], scale), f"{scale * level.quantiles[1].value:.3g}"
+            half, most = _with_interval(level.quantiles[0], scale), number_text(scale * level.quantiles[1].value)
             change = level.difference
             effect = f"{scale * change.value:+.3g}", f"± {scale * (change.high - change.value):.2g}".replace("± inf", "?")
             table.add(f"  {label_of(level.value, factor_scale)}", f"{level.runs}", *half, most, *effect, "")
@@ -145,8 +150,8 @@ def _print_sensitivities(result: "SweepResult", name: str) -> None:
 
 
 def _with_interval(quantile: "Quantile", scale: float) -> tuple[str, str]:
-    low, high = (f"{scale * end:.3g}" if isfinite(end) else "?" for end in (quantile.low, quantile.high))
-    return f"{scale * quantile.value:.3g}", f"{low} to {high}"
+    low, high = (number_text(scale * end) if isfinite(end) else "?" for end in (quantile.low, quantile.high))
+    return number_text(scale * quantile.value), f"{low} to {high}"
 
 
 @cli.command(cli.options_of(ComparisonConfig), cli.engine_options(few="several would slow each other's cycles"), cli.JSON)

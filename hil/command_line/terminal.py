@@ -30,6 +30,11 @@ def deg(angle: float, digits: int = 3) -> str:
     return f"{degrees(angle):.{digits}f}"
 
 
+def number_text(value: float) -> str:
+    """A number with three digits, or all before the point."""
+    return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
+
+
 def duration(seconds: float) -> str:
     """A time [s] in the unit that suits it."""
     for unit, length in (("days", 86400.0), ("hours", 3600.0), ("minutes", 60.0)):

@@ -120,7 +120,8 @@ def _row(
         for k, place in enumerate(places)
         if (level := result.analysis.level(name, None, panel.chosen & each.chosen & place.chosen))
     }
-    most = scale * max(max(level.quantiles[1].value, *filter(isfinite, [level.quantiles[0].high])) for level in levels.values())
+    ends = [end for level in levels.values() for end in (level.quantiles[0].high, level.quantiles[1].value)]
+    most = scale * max(filter(isfinite, ends))
     step = _step(most)
     middle = top + _HEIGHT / 2
     drawn = [

@@ -74,9 +74,12 @@ class UserFunction:
         value = self.function()(*arguments, **named)
         found = value if isinstance(value, Mapping) else {self.name: value}
         try:
-            return {str(name): float(each) for name, each in found.items()}
+            figures = {str(name): float(each) for name, each in found.items()}
         except (TypeError, ValueError):
-            raise InputError(f"{self.name} returned {value!r}: it must return a number, or numbers by name") from None
+            figures = {}
+        if not figures:
+            raise InputError(f"{self.name} returned {value!r}: it must return a number, or numbers by name")
+        return figures
 
 
 @cache

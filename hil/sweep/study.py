@@ -1,7 +1,8 @@
 """A study as its TOML file or a Python program describes it: what is run, what varies, what is measured."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from inspect import signature
 from itertools import product
 from math import prod, sqrt
 from pathlib import Path
@@ -9,13 +10,16 @@ from typing import Any
 
 import numpy as np
 
+from controller.settings import ControlSettings, FusionSettings, SafetySettings
 from hil.option import nearest
 from hil.runs.config import SimulationConfig
 from hil.sweep.function import UserFunction
 from plant.checks import checked_seed
+from plant.dynamics.variables import PLANAR, SPATIAL
 from plant.errors import GoughError, InputError
 from plant.files import read_toml, unknown_entries
 from plant.fmu.settings import Setting
+from plant.mechanism.checks import Limits
 
 METHODS = ("sobol", "latin-hypercube", "saltelli")
 """How ranges without steps are sampled; `saltelli` is Sobol's sequence in the form that sensitivity indices need."""
@@ -159,10 +163,24 @@ class Study:
         if self.model is None:
             for name in names:
                 _check_factor(name)
+            for name in (*names, *(f"mechanism.{entry}" for entry in self.mechanism)):
+                _check_entry(name)
+            if self.run.plant is None and "run.plant" not in names:
+                for name in (*names, *(f"plant.{setting.name}" for setting in self.run.settings)):
+                    _check_parameter(name)
+        if self.model is not None:
+            self._check_arguments(self.model, names)
         if self.function is None and self.model is None and not self.figures:
             object.__setattr__(self, "figures", FIGURES)
         if self.sampling.method == "saltelli" and not any(factor.sampled for factor in self.factors):
             raise InputError("saltelli samples ranges, and none varies: give one, such as { from = 1.0, to = 2.0 }")
+
+    @staticmethod
+    def _check_arguments(model: UserFunction, names: Sequence[str]) -> None:
+        try:
+            signature(model.function()).bind(**dict.fromkeys(names))
+        except TypeError as error:
+            raise InputError(f"{model.name} does not take the factors {', '.join(names)}: {error}") from None
 
     @property
     def sampled(self) -> list[Factor]:
@@ -362,6 +380,34 @@ def _check_factor(name: str) -> None:
         )
     if part == "run":
         _check_entries({rest: None}, _run_fields(), "a run")
+
+
+def _check_entry(name: str) -> None:
+    """Check the name of an entry of the mechanism's file, as far as its tables have the same entries in all mechanisms."""
+    part, _, entry = name.partition(".")
+    if part != "mechanism":
+        return
+    table, _, rest = entry.partition(".")
+    _check_entries({table: None}, ("name", "based_on", "geometry", "home", *_SETTINGS, "plant"), "a mechanism")
+    if table in _SETTINGS:
+        _check_entries({rest.partition(".")[0]: None}, sorted(each.name for each in fields(_SETTINGS[table])), f"[{table}]")
+    elif table == "plant" and not any(rest == known or rest.startswith(f"{known}.") for known in _PARAMETERS):
+        raise InputError(f"[plant] has no entry {rest!r}{nearest(rest, _PARAMETERS)}; docs/fmu.md lists the plant's parameters")
+
+
+def _check_parameter(name: str) -> None:
+    """Check the name of a parameter or input of gough's own plant."""
+    part, _, rest = name.partition(".")
+    known = [*_PARAMETERS, *(each.name for table in (SPATIAL, PLANAR) for each in table.inputs)]
+    if part == "plant" and rest not in known:
+        raise InputError(f"the plant has no parameter or input {rest!r}{nearest(rest, known)}; docs/fmu.md lists them")
+
+
+_SETTINGS: dict[str, Any] = {
+    "limits": Limits, "control": ControlSettings, "fusion": FusionSettings, "safety": SafetySettings,
+}  # fmt: skip
+"""Tables of a mechanism's file, and what has their entries."""
+_PARAMETERS = [each.name for table in (SPATIAL, PLANAR) for each in table.parameters]
 
 
 def _parsed(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
-from hil.engine.batches import Failure, fingerprint
+from hil.engine.batches import Failure, attempt, fingerprint
 from hil.engine.engine import Engine
 from hil.option import nearest
 from hil.sweep.analysis import Analysis
 from hil.sweep.case import Case, cases_of, kind_of, measure, own_figures
 from hil.sweep.store import DIED, DONE, FAILED, KEY, REASON, STATUS, Store, rows_of
 from hil.sweep.study import Study
-from plant.errors import InputError
+from plant.errors import GoughError, InputError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -164,11 +164,15 @@ def estimate(study: Study, folder: Path) -> Estimate:
     """Measure the first point of a study, after machine code and FMU are there.
 
     Raises:
-        GoughError: the study, or its first point, cannot be used.
+        GoughError: the study cannot be used, or its first run fails.
     """
     cases = _unique(study)
     known = {*Store(folder).table()[KEY].to_pylist()} & {case.key for case in cases}
-    check_figures(study, measure(cases[0]))
+    first = attempt(measure, cases[0])
+    if isinstance(first, Failure):
+        reason, *_ = first.reason.partition("\n")
+        raise GoughError(f"the first run fails: {reason}")
+    check_figures(study, first)
     began = time.perf_counter()
     measure(cases[0])
     return Estimate(len(cases), len(known), time.perf_counter() - began)

@@ -14,7 +14,7 @@ from hil.sweep.study import Factor, Sampling, Study
 TRIALS = 400
 CERTAIN = 0.95 - 3.0 * np.sqrt(0.95 * 0.05 / TRIALS)
 """The share of the intervals that must hold the true value: 95 %, less three standard deviations of so many trials."""
-MODEL = UserFunction("model", "", "here", len)
+MODEL = UserFunction("model", "", "here", lambda **factors: 0.0)
 PI = np.pi
 
 
