@@ -13,7 +13,7 @@ import pytest
 from hil.engine.engine import InOneProcess
 from hil.sweep.store import DIED, DONE, KEY, REASON, STATUS, TABLE
 from hil.sweep.study import read_study
-from hil.sweep.sweep import sweep
+from hil.sweep.sweep import run_study
 from tests.hil.processes import Process, dask_scheduler, dask_worker, gough_sweep, started, wait_until
 
 RUNS = """
@@ -154,7 +154,7 @@ class Sweeps:
 @pytest.fixture
 def reference(folder: Path) -> dict[str, dict[str, object]]:
     """What a sweep gives that nothing disturbs, in one process."""
-    sweep(read_study(folder / "runs.toml"), folder / "undisturbed", InOneProcess())
+    run_study(read_study(folder / "runs.toml"), folder / "undisturbed", InOneProcess())
     return rows(folder / "undisturbed")
 
 
