@@ -4,6 +4,8 @@ import os
 import shutil
 import socket
 import ssl
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -119,6 +121,7 @@ def test_nobody_connects_without_a_certificate(
         assert not heard(plain)
 
 
+@pytest.mark.slow
 def test_a_worker_with_other_sources_is_left_out(
     engine: Engine, certificates: Certificates, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -131,6 +134,52 @@ def test_a_worker_with_other_sources_is_left_out(
     assert line.startswith("the worker at tls://127.0.0.1:")
     assert "has other sources" in line
     assert engine.workers == 2
+
+
+PROGRAM = """
+import os
+from pathlib import Path
+from hil.engine.engine import open_engine
+from hil.engine.settings import EngineSettings
+from plant.compiled import keyed_folder
+
+print("the program runs")
+FACTOR = 3
+
+def work(item):
+    return FACTOR * item, os.getpid(), str(keyed_folder("kernels", "some"))
+
+with open_engine(EngineSettings(workers=2)) as engine:
+    results = engine.map(work, range(40))
+    print(sorted(number for number, _, _ in results) == [3 * item for item in range(40)])
+    print(len({process for _, process, _ in results}), len({folder for _, _, folder in results}))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["file", "standard input", "module"])
+def test_a_program_needs_no_guard_and_no_cache(where: str, tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text(PROGRAM)
+    (tmp_path / "a file").touch()
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    command = [sys.executable, *{"file": ["program.py"], "standard input": ["-"], "module": ["-m", "program"]}[where]]
+    environment = os.environ | {"GOUGH_CACHE": str(tmp_path / "a file" / "cache"), "TMPDIR": str(temporary)}
+    finished = subprocess.run(
+        command, cwd=tmp_path, env=environment, input=PROGRAM, capture_output=True, text=True, timeout=120.0, check=False
+    )
+    # Both workers work, and share the program's cache, as nothing can be written where the user's should be.
+    assert finished.stdout.splitlines() == ["the program runs", "True", "2 1"], finished.stderr
+    assert finished.stderr == ""
+    assert not list(temporary.glob("gough-*"))
+
+
+@pytest.mark.slow
+def test_two_programs_at_a_time(tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text(PROGRAM)
+    both = [subprocess.Popen([sys.executable, "program.py"], cwd=tmp_path, stderr=subprocess.PIPE) for _ in range(2)]
+    assert [each.communicate(timeout=120.0)[1] for each in both] == [b"", b""]
+    assert [each.returncode for each in both] == [0, 0]
 
 
 def other_sources(folder: Path) -> Path:
