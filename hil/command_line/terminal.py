@@ -85,7 +85,8 @@ def engine_at_work(settings: "EngineSettings", label: str) -> Iterator[tuple["En
             if opened.dashboard:
                 print(f"the workers at their work: {opened.dashboard}", file=sys.stderr)
             if opened.joined_at:
-                print(f"other workers join with: dask worker {opened.joined_at}", file=sys.stderr)
+                files = "".join(f" --tls-{name} FILE.pem" for name in ("ca-file", "cert", "key")) if settings.tls else ""
+                print(f"other machines join with: dask worker {opened.joined_at} --nthreads 1{files}", file=sys.stderr)
 
         with engine_when_needed(settings, tell) as engine:
             yield engine, progress

@@ -100,7 +100,7 @@ class _WhenNeeded(Engine):
         self, function: Callable[[Item], Result], items: Sequence[Item], kind: Callable[[Item], str] = no_kind
     ) -> Iterator[tuple[int, Result | Failure]]:
         """As `Engine.run`."""
-        return self._opened().run(function, items, kind)
+        return self._opened().run(function, items, kind) if items else iter(())
 
 
 @contextmanager
