@@ -6,7 +6,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -32,6 +32,7 @@ class Failure:
     reason: str
     trace: str = ""  # where it was raised, if that is an error of the program
     died: bool = False  # whether the workers died
+    exit_status: int | None = None  # of a command that fails for this reason, if the error says so
     error: Exception | None = field(default=None, compare=False)  # in the process that raised it
 
 
@@ -65,7 +66,7 @@ def attempt(function: Callable[[Item], Result], item: Item) -> Result | Failure:
     try:
         return function(item)
     except GoughError as error:
-        return Failure(str(error), error=error)
+        return Failure(str(error), exit_status=getattr(error, "exit_status", None), error=error)
     except Exception as error:
         return Failure(f"{type(error).__name__}: {error}", traceback.format_exc(), error=error)
 
@@ -104,7 +105,7 @@ def _run_batch(function: Callable[[Item], Result], items: Sequence[Item], kinds:
             if not first:
                 times.append(time.perf_counter() - began)
         if isinstance(outcome, Failure):
-            outcome = Failure(outcome.reason, outcome.trace)
+            outcome = replace(outcome, error=None)
         results.append(outcome)
     return Batch(results, sum(times) / len(times) if times else float("nan"))
 

@@ -17,6 +17,15 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+class WorkFailedError(GoughError, RuntimeError):
+    """An item of a study has failed in another process."""
+
+    def __init__(self, reason: str, exit_status: int | None) -> None:
+        super().__init__(reason)
+        if exit_status is not None:
+            self.exit_status = exit_status
+
+
 class Engine(ABC):
     """Does work item by item. Functions, items and results go to other processes, so they can be pickled."""
 
@@ -54,7 +63,7 @@ class Engine(ABC):
             if isinstance(outcome, Failure):
                 if outcome.error is not None:
                     raise outcome.error
-                raise GoughError(outcome.reason) if not outcome.trace else RuntimeError(outcome.trace)
+                raise RuntimeError(outcome.trace) if outcome.trace else WorkFailedError(outcome.reason, outcome.exit_status)
             results[number] = outcome
             progress(len(results) / len(items))
         return [results[number] for number in range(len(items))]

@@ -13,6 +13,7 @@ import pytest
 from hil.engine.batches import Failure
 from hil.engine.engine import IN_ONE_PROCESS, InOneProcess, engine_when_needed, open_engine
 from hil.engine.settings import EngineSettings
+from hil.runs.simulation import SimulationStoppedError
 from plant.errors import GoughError, InputError, MissingPackageError, UnreachableError
 from plant.mechanism import load_mechanism
 
@@ -41,6 +42,10 @@ def below_three(number):
     if number == 3:
         raise UnreachableError("leg 3 is too long: take a shorter one")
     return number / (number - 5)
+
+
+def ended_early(at):
+    raise SimulationStoppedError(f"the run ended early, at {at} s", lambda: "which cannot be pickled")
 
 
 def difference(much, less, least=0.0):
@@ -76,6 +81,10 @@ def test_what_an_item_raises_ends_the_work_with_its_message(engine):
     with pytest.raises(GoughError, match="leg 3 is too long: take a shorter one") as raised:
         engine.map(below_three, [1, 3])
     assert isinstance(raised.value, UnreachableError) == (engine is IN_ONE_PROCESS)
+    assert not hasattr(raised.value, "exit_status")
+    with pytest.raises(GoughError, match="the run ended early") as raised:
+        engine.map(ended_early, [2.0])
+    assert raised.value.exit_status == 1
     with pytest.raises((ZeroDivisionError, RuntimeError), match="division by zero") as raised:
         engine.map(below_three, [1, 5])
     assert not isinstance(raised.value, GoughError)
