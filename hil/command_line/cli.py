@@ -141,10 +141,13 @@ def options_of(config: "type[C]", *names: str, **changes: Mapping[str, Any]) -> 
 
 def engine_options(few: str = "") -> Argument:
     """The options of a study's engine; `few` says why it stays in one process unless they ask for more."""
+    texts = {each.name: each.metadata["option"].text for each in fields(EngineSettings)}
+    workers = {"shown": f"1, as {few}"} if few else {}
+    where = {"text": f"{texts['scheduler']}; files that are named here have the same paths there"}
 
     def add(parser: ArgumentParser) -> None:
-        options_of(EngineSettings, workers={"shown": f"1, as {few}"} if few else {})(parser)
-        options_of(EngineSettings, *names_of(EngineSettings, "workers"))(parser)
+        options_of(EngineSettings, workers=workers, scheduler=where)(parser)
+        options_of(EngineSettings, *names_of(EngineSettings, "workers", "scheduler"))(parser)
         parser.set_defaults(few=bool(few))
 
     return add

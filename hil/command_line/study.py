@@ -186,7 +186,7 @@ def gough_evaluate_fusion(options: Namespace) -> None:
     The raw IMUs of several rigs are calibrated on themselves; then their platforms move as prescribed, 30 mm and 10 deg along
     and about every axis at 0.5, 1, 2 and 0.1 to 1 Hz, and stand still. Prints errors after the first 20 s with exact and with
     wrong joints, with a dead IMU, of starts in the middle of a motion, over minutes of standing still, in the closed loop, and
-    the cost of a cycle, beside the leg filters with the refined pose. The cost is measured in one process, with no other work.
+    the cost of a cycle, beside the leg filters with the refined pose. The cost is measured first, in one process.
     Ten minutes of processor time in all.
     """
     from hil.studies.fusion_evaluation import evaluate

@@ -66,7 +66,7 @@ def evaluate(
 ) -> dict[str, Any]:
     """Evaluate the fusion; `progress` is called with the name of a part and its share that is done.
 
-    The engine does all but `cost`, which is measured in this process, beside no other work.
+    The engine does all but `cost`, which is measured first, in this process.
 
     Returns:
         The figures in SI units by section (`SECTIONS` and `calibration`), and `config` and `version`.
@@ -77,6 +77,8 @@ def evaluate(
     figures: dict[str, Any] = {}
     load_imu(config.imu)
     load_spatial(config.mechanism).built(config.joint_error, 0)
+    # Before the engine has work, and so before it has other processes.
+    cost = {"cost": _of_cost(config, partial(progress, "cost"))} if "cost" in config.only else {}
     if set(config.only) - {"follow", "cost"}:
         rigs, moved = {}, {}
         for error in dict.fromkeys((0.0, config.joint_error) if "motions" in config.only else (0.0,)):
@@ -94,9 +96,7 @@ def evaluate(
         followed = engine.map(partial(_followed, config), config.seeds, partial(progress, "closed loop"))
         about = {"target": config.target, "fusion": _FOLLOWING, "imu": _CALIBRATED_IMU}
         figures["follow"] = about | pooled(followed, worst=True)
-    if "cost" in config.only:
-        figures["cost"] = _of_cost(config, partial(progress, "cost"))
-    return figures | {"config": asdict(config), "version": version("gough")}
+    return figures | cost | {"config": asdict(config), "version": version("gough")}
 
 
 def _calibrated(config: EvaluationConfig, joint_error: float, seed: int) -> _Rig:

@@ -188,7 +188,7 @@ def _judge(
 
 @lru_cache(_KEPT)
 def _motion(config: TuningConfig, tuning: str, kind: str, seed: int) -> tuple[Mechanism, Array, PoseTrack, slice]:
-    """The mechanism, the samples of a motion, and the true poses that count; the `tuning` of this name needs it often."""
+    """The mechanism, the samples of a motion, and the true poses that count; kept for one `tuning`, as files may change."""
     mechanism = load_spatial(config.mechanism)
     late = slice(round(SETTLING_S * config.rate), None, max(1, round(_SAMPLE_S * config.rate)))
     return mechanism, *imposed(mechanism, kind, DURATION_S, config.rate, seed, config.imu, late), late

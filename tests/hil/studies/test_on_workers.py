@@ -1,11 +1,13 @@
-"""Every study gives the same figures, bit for bit, in one process and on workers."""
+"""Every study gives the same figures, bit for bit, in one process and on workers, and needs no Dask."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
 
 from controller.settings import FusionSettings
+from hil.command_line import main
 from hil.engine.engine import IN_ONE_PROCESS, open_engine
 from hil.engine.settings import EngineSettings
 from hil.studies import broad, fusion_comparison, fusion_evaluation, fusion_tuning
@@ -13,6 +15,7 @@ from hil.studies.accuracy import evaluate_accuracy, evaluate_classes
 from hil.studies.config import ComparisonConfig, EvaluationConfig, TuningConfig
 from hil.studies.fault_matrix import CASES, run_matrix
 from hil.studies.sensor_sets import SETS, evaluate_sensor_sets
+from plant.extras import EXTRAS
 from plant.mechanism import load_spatial
 
 CALIBRATED = EvaluationConfig(imu="mpu9150-calibrated", rate=250.0, seeds=(1, 2), starts=3, still=70.0)
@@ -67,3 +70,34 @@ def test_figures_do_not_depend_on_the_engine(study, workers, trials):
     here, there = (json.dumps(without_times(evaluate(engine, trials)), default=str) for engine in (IN_ONE_PROCESS, workers))
     assert here == there
     assert len(here) > 200
+
+
+COMMANDS = ["accuracy --poses 20", "broad TRIALS", "faults --seeds 1 --only emergency"]
+LONG_COMMANDS = [
+    "classes",
+    "compare-fusion --duration 20.5 --rate 100 --seeds 0",
+    "evaluate-fusion --imu mpu9150-calibrated --rate 250 --seeds 1 --starts 1 --still 21",
+    "sensor-sets --mechanism 6-3-II --duration 0.3",
+    "tune-fusion TUNED --seeds 0 --rate 50",
+]
+
+
+@pytest.mark.parametrize("line", [*COMMANDS, *(pytest.param(line, marks=pytest.mark.slow) for line in LONG_COMMANDS)])
+def test_without_the_packages_for_sweeps_studies_run_in_this_process(line, trials, tmp_path, monkeypatch, capsys):
+    for package in (name for name, extra in EXTRAS.items() if extra == "sweep"):
+        monkeypatch.setitem(sys.modules, package, None)
+    arguments = line.replace("TRIALS", str(trials)).replace("TUNED", str(tmp_path / "tuned.toml")).split()
+    assert main(arguments) == 0
+    assert "the workers at their work" not in capsys.readouterr().err
+    assert main([*arguments, "--workers", "2"]) == 2
+    assert "this needs distributed, which is not installed: pip install 'gough[sweep]'" in capsys.readouterr().err
+
+
+def test_the_share_that_is_done_grows_to_all_of_it():
+    shares = []
+    run_matrix(2, CASES[30:32], progress=shares.append)
+    assert shares == [0.25, 0.5, 0.75, 1.0]
+    parts = []
+    config = EvaluationConfig(rate=50.0, only=("cost",))
+    fusion_evaluation.evaluate(config, progress=lambda part, share: parts.append((part, share)))
+    assert parts == [("cost", pytest.approx(k / 3)) for k in (1, 2, 3)]
