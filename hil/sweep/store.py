@@ -69,7 +69,7 @@ class Store:
         parts = [part for part in (_read(self.folder / TABLE), *new) if part is not None]
         try:
             table = pa.concat_tables([_schema([]).empty_table(), *parts], promote_options="permissive")
-        except pa.ArrowInvalid as error:
+        except (pa.ArrowInvalid, pa.ArrowTypeError) as error:
             text = str(error).splitlines()[0]
             raise InputError(
                 f"the rows in {self.folder} are of several kinds ({text}): give another folder for these"
@@ -78,7 +78,7 @@ class Store:
         return table if len(last) == len(table) else table.take(sorted(last.values()))
 
     def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Add rows, which are on the disk when this returns."""
+        """Add rows, which are in a file when this returns."""
         if rows:
             stored = [{name: as_stored(value) for name, value in row.items()} for row in rows]
             try:
