@@ -12,6 +12,7 @@ from plant.compiled import filled
 from plant.errors import InputError
 from plant.imu_wiring import ALL_IMUS, PLATFORM_IMU
 from plant.mechanism import LEGS, Mechanism, six_rows
+from plant.pose import Array
 
 _LEAST_FIELD = 5.0
 """Least horizontal magnetic field from which a heading can be taken [uT]."""
@@ -68,17 +69,7 @@ def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool =
             f"the IMUs {names} determine the pose of {mechanism.name!r} up to its two assembly modes at best, which the loop "
             "cannot tell apart: add the platform's IMU (6), whose roll does"
         )
-    positions, rotations = sample_workspace(mechanism, 50, seed=0)
-    rig = filled(RIG, geometry=geometry_of(mechanism), vectors_in_base=field.vectors, planar=mechanism.planar)
-    parameters, pose = filled(PARAMETERS, section_5=section_5), np.zeros((), STATE)
-    leg_used = np.array([float(leg in imus_of(mechanism, imus)) for leg in range(LEGS)])
-    worst = np.inf
-    for position, rotation in zip(positions, rotations, strict=True):
-        legs = position + mechanism.platform_joints @ rotation.T - mechanism.base_joints
-        directions = six_rows(legs / np.linalg.norm(legs, axis=1, keepdims=True))
-        pose["vectors"] = field.vectors @ rotation
-        used = (int(PLATFORM_IMU in imus), int(magnetometer))
-        worst = min(worst, find_pose(parameters[()], pose[()], rig[()], directions, leg_used, *used))
+    worst = float(conditionings(mechanism, *sample_workspace(mechanism, 50, seed=0), imus, magnetometer, section_5).min())
     if worst < WORST_CONDITIONING:
         remedies = ["legs"]
         if PLATFORM_IMU not in imus:
@@ -90,3 +81,26 @@ def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool =
             f"{worst:.1e}; at least {WORST_CONDITIONING:g} is needed): add {', or '.join(remedies)}"
         )
     return worst
+
+
+def conditionings(
+    mechanism: Mechanism,
+    positions: Array,
+    rotations: Array,
+    imus: Collection[int] = ALL_IMUS,
+    magnetometer: bool = False,
+    section_5: bool = False,
+) -> Array:
+    """The conditioning (N,) of direct kinematics with these IMUs at positions (N, 3) [m] and rotations (N, 3, 3); unchecked."""
+    field = field_of(mechanism)
+    rig = filled(RIG, geometry=geometry_of(mechanism), vectors_in_base=field.vectors, planar=mechanism.planar)
+    parameters, pose = filled(PARAMETERS, section_5=section_5), np.zeros((), STATE)
+    leg_used = np.array([float(leg in imus_of(mechanism, imus)) for leg in range(LEGS)])
+    used = (int(PLATFORM_IMU in imus), int(magnetometer))
+    found = np.empty(len(positions))
+    for row, (position, rotation) in enumerate(zip(positions, rotations, strict=True)):
+        legs = position + mechanism.platform_joints @ rotation.T - mechanism.base_joints
+        directions = six_rows(legs / np.linalg.norm(legs, axis=1, keepdims=True))
+        pose["vectors"] = field.vectors @ rotation
+        found[row] = find_pose(parameters[()], pose[()], rig[()], directions, leg_used, *used)
+    return found

@@ -1,14 +1,25 @@
-"""The commands about mechanisms, sensors and gains: classify, classes, accuracy, sensor-sets, tune, tune-fusion."""
+"""The commands about mechanisms, sensors and gains: classify, classes, accuracy, sensor-sets, tune, tune-fusion, optimise."""
 
+import sys
 from argparse import Namespace
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from hil.command_line import cli
 from hil.command_line.terminal import deg, engine_at_work, mm
+from hil.engine.settings import EngineSettings
 from hil.runs.config import SimulationConfig
 from hil.studies.config import TuningConfig
 from hil.table import Table
+from plant.errors import InputError
+from plant.extras import check_installed
 from plant.files import write_whole
+
+if TYPE_CHECKING:
+    from hil.sweep.optimisation import OptimisationResult, Trial
+    from hil.sweep.trials import Comparison
 
 
 @cli.command(
@@ -195,3 +206,82 @@ def _rms(errors: list[float]) -> str:
     """The RMS error of an angle, or of a position and a rotation."""
     angle = f"{deg(errors[-1])} deg"
     return angle if len(errors) == 1 else f"{mm(errors[0])} mm, {angle}"
+
+
+@cli.command(
+    cli.source("design", "DESIGN.toml", "what is run, what varies, what is better and what is allowed (docs/optimisation.md)"),
+    cli.argument("--results", type=Path, metavar="FOLDER", help="where the results are kept (default: DESIGN.results)"),
+    cli.argument("--choose", type=int, metavar="N", help="a trial of the front, by its number (default: the knee)"),
+    cli.output("--write", "FILE.toml", "write the chosen mechanism, for 'gough simulate --mechanism'"),
+    cli.options_of(EngineSettings),
+    cli.report("write a report with the front and all trials"),
+    cli.JSON,
+)
+def gough_optimise(options: Namespace) -> None:
+    """Look for the best geometry, IMUs and gains, within bounds.
+
+    The design's file says what varies, which figures should be small or large, and which must stay within bounds. An
+    optimisation that was interrupted goes on where it stopped. Prints the Pareto front: the trials that no other beats in
+    all objectives; the knee is the one nearest to the best of all. If the file has a check, the chosen trial is compared with
+    the design as it is, on seeds that the search did not use.
+    """
+    check_installed("optuna")
+    check_installed("pyarrow")
+    from hil.engine.engine import open_engine
+    from hil.sweep.design import read_design
+    from hil.sweep.optimisation import check, mechanism_of, optimise
+
+    cli.check_outputs(options, [options.design])
+    design, settings = read_design(options.design), cli.config_of(options, EngineSettings)
+    if options.write is not None and design.study.model is not None:
+        raise InputError("a model has no mechanism that could be written: leave --write out")
+    folder = options.results or options.design.with_suffix(".results")
+    with progress_bar(design.study.name) as progress, open_engine(settings) as engine:
+        if engine.dashboard:
+            print(f"the workers at their work: {engine.dashboard}", file=sys.stderr)
+        result = optimise(design, folder, engine, progress)
+        trial = result.chosen(options.choose)
+        comparisons = check(result, trial, engine, progress)
+    if options.write is not None:
+        write_whole(options.write, mechanism_of(result, trial).encode())
+    about = {"chosen": trial.number, "check": [asdict(each) for each in comparisons]}
+    cli.write_json(options.json, result.summary() | about)
+    cli.write_report(options, "optimisation", result, trial, comparisons)
+    _print_front(result, trial)
+    if comparisons:
+        _print_check(design.search.seeds, comparisons)
+    if options.write is not None:
+        print(f"trial {trial.number} is written to {options.write}")
+
+
+def _print_front(result: "OptimisationResult", chosen: "Trial") -> None:
+    factors, figures = list(chosen.point), list(result.design.pools)
+    table = Table("trial", *factors, *figures)
+    if result.start:
+        table.add("as it was", *("" for _ in factors), *(f"{result.start[name]:.4g}" for name in figures))
+    for trial in result.front:
+        mark = f"{trial.number} *" if trial is chosen else f"{trial.number}"
+        table.add(mark, *map(_value, trial.point.values()), *(f"{trial.figures[name]:.4g}" for name in figures))
+    table.print()
+    count = result.summary()["trials"]
+    print(
+        f"{len(result.trials)} trials, {result.ran} new runs; {count['run']} within all bounds, {count['refused']} not, "
+        f"{count['given up']} given up early; * is chosen; in {result.folder}"
+    )
+
+
+def _print_check(first: int, comparisons: "Sequence[Comparison]") -> None:
+    table = Table(f"check, {comparisons[0].seeds} seeds from {first} on", "as it was", "chosen", "change", "better at")
+    for each in comparisons:
+        change = f"{100.0 * (each.chosen / each.start - 1.0):+.1f} %" if each.start else ""
+        better = "" if each.better is None else f"{each.better} of {each.seeds} seeds"
+        table.add(f"{each.figure}{_values(each.values)}", f"{each.start:.4g}", f"{each.chosen:.4g}", change, better)
+    table.print()
+
+
+def _values(values: Mapping[str, Any]) -> str:
+    return f" ({', '.join(map(_value, values.values()))})" if values else ""
+
+
+def _value(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -13,14 +13,17 @@ from hil.engine.batches import fingerprint
 from hil.option import nearest
 from hil.runs.config import SimulationConfig
 from hil.sweep.function import UserFunction
-from hil.sweep.study import FILES, Study
+from hil.sweep.study import FILES, Study, part_of
 from plant.compiled import keyed_folder
 from plant.errors import GoughError, InputError, UnknownNameError
 from plant.files import write_whole
 from plant.imu import load_imu
 from plant.mechanism import load_in_space
-from plant.mechanism.documents import mechanism_text
+from plant.mechanism.documents import mechanism_from_text, mechanism_text
+from plant.mechanism.joint_circles import reshaped
 
+GEOMETRY_FIGURE = "geometry."
+"""How the names of figures begin that need no run."""
 _OF_THIS_RUN = ("config", "version", "real_time_factor", "cycle_us")
 """Parts of a summary that are no figures, or not the same each time."""
 _OF_SUMMARY = ("truth_known", "estimation", "tracking", "estimated_tracking", "target", "limits")
@@ -59,6 +62,7 @@ class Case:
         config: of the run; `files` are in it by name alone.
         files: the files that the configuration names.
         function, model: as in `Study`.
+        run, geometry: whether the figures of a run, and those of the geometry alone, are wanted.
     """
 
     key: str
@@ -68,6 +72,8 @@ class Case:
     files: tuple[SentFile, ...]
     function: UserFunction | None
     model: UserFunction | None
+    run: bool = True
+    geometry: bool = False
 
     def local_config(self) -> SimulationConfig:
         """The configuration with this machine's files."""
@@ -88,12 +94,21 @@ def measure(case: Case) -> dict[str, float]:
     """
     if case.model is not None:
         return case.model.figures(**case.point)
-    from hil.runs.simulation import simulate
+    config = case.local_config()
+    figures: dict[str, float] = {}
+    if case.geometry:
+        from controller.design.workspace import geometry_figures
 
-    result = simulate(case.local_config())
-    summary = {name: value for name, value in result.summary().items() if name not in _OF_THIS_RUN}
-    own = case.function.figures(result) if case.function else {}
-    return dict(_flat(summary)) | own
+        section_5 = config.fusion == "section-5"
+        found = geometry_figures(load_in_space(config.mechanism), config.imus, config.magnetometer, section_5)
+        figures = {GEOMETRY_FIGURE + name: value for name, value in found.items()}
+    if case.run:
+        from hil.runs.simulation import simulate
+
+        result = simulate(config)
+        summary = {name: value for name, value in result.summary().items() if name not in _OF_THIS_RUN}
+        figures |= dict(_flat(summary)) | (case.function.figures(result) if case.function else {})
+    return figures
 
 
 def own_figures(names: Iterable[str]) -> list[str]:
@@ -108,36 +123,58 @@ def cases_of(study: Study) -> Iterator[Case]:
     Raises:
         GoughError: a point cannot be run.
     """
+    geometry = any(name.startswith(GEOMETRY_FIGURE) for name in study.figures)
+    run = bool(study.function) or not all(name.startswith(GEOMETRY_FIGURE) for name in study.figures)
     for point in study.points():
-        try:
-            yield _case(study, point)
-        except TypeError as error:
-            raise InputError(f"at {_text(point)}: {error}") from None
-        except GoughError as error:
-            raise type(error)(f"at {_text(point)}: {error}") from None
+        yield case_of(study, point, run, geometry)
 
 
-def _case(study: Study, point: Mapping[str, Any]) -> Case:
+def case_of(study: Study, point: Mapping[str, Any], run: bool = True, geometry: bool = False) -> Case:
+    """The case of a study at a point, with the figures of a run, of the geometry alone, or both.
+
+    Raises:
+        GoughError: the point cannot be run.
+    """
+    try:
+        return _case(study, point, run, geometry)
+    except TypeError as error:
+        raise InputError(f"at {_text(point)}: {error}") from None
+    except GoughError as error:
+        raise type(error)(f"at {_text(point)}: {error}") from None
+
+
+def _case(study: Study, point: Mapping[str, Any], run: bool, geometry: bool) -> Case:
     if study.model is not None:
         key = _key({"model": study.model.source, "name": study.model.name, "point": dict(point)})
         return Case(key, "", point, study.run, (), None, study.model)
-    config, changes = study.config_at(point), study.mechanism_at(point)
+    config = study.config_at(point)
     _check_names(config)
     files = []
     for field in FILES:
         name = getattr(config, field)
-        if field == "mechanism" and (changes or Path(name).is_file()):
-            content = _changed_mechanism(name, tuple(changes.items())) if changes else _content(name)
+        if field == "mechanism" and (content := mechanism_at(study, point)) is not None:
             files.append(SentFile(field, f"{Path(name).stem}.toml", content))
         elif field != "mechanism" and name is not None and Path(name).is_file():
             files.append(SentFile(field, Path(name).name, _content(name)))
     config_of_key = asdict(config) | {file.field: file.digest for file in files}
     function = study.function and (study.function.name, study.function.source)
     planar = _is_planar(config.mechanism)
-    kind = f"{config.fusion} {planar} {config.plant and _digest(_content(config.plant))}"
-    key = _key({"config": config_of_key, "function": function})
+    kind = f"{config.fusion} {planar} {config.plant and _digest(_content(config.plant))}" if run else "geometry"
+    key = _key({"config": config_of_key, "function": function, "run": run, "geometry": geometry})
     without: dict[str, Any] = {file.field: file.name for file in files}
-    return Case(key, kind, point, replace(config, **without), tuple(files), study.function, None)
+    return Case(key, kind, point, replace(config, **without), tuple(files), study.function, None, run, geometry)
+
+
+def mechanism_at(study: Study, point: Mapping[str, Any]) -> bytes | None:
+    """The mechanism's file at a point; None for a preset as it is.
+
+    Raises:
+        GoughError: the mechanism cannot be changed like this.
+    """
+    name, changes, shape = study.config_at(point).mechanism, study.mechanism_at(point), part_of(point, "geometry")
+    if changes or shape:
+        return _changed_mechanism(name, tuple(changes.items()), tuple(shape.items()))
+    return _content(name) if Path(name).is_file() else None
 
 
 def _check_names(config: SimulationConfig) -> None:
@@ -166,8 +203,8 @@ def _content(path: str) -> bytes:
 
 
 @cache
-def _changed_mechanism(name: str, changes: tuple[tuple[str, Any], ...]) -> bytes:
-    """The TOML text of a mechanism with other entries."""
+def _changed_mechanism(name: str, changes: tuple[tuple[str, Any], ...], shape: tuple[tuple[str, float], ...]) -> bytes:
+    """The TOML text of a mechanism with other entries, and then other numbers of its geometry."""
     import tomlkit
 
     document: Any = tomlkit.parse(mechanism_text(name))
@@ -184,6 +221,11 @@ def _changed_mechanism(name: str, changes: tuple[tuple[str, Any], ...]) -> bytes
             inner[last] = value
         else:
             raise UnknownNameError(f"the mechanism has no entry {entry}: {'.'.join(tables)} is no table")
+    if shape:
+        base, platform, position = reshaped(mechanism_from_text(tomlkit.dumps(document), name), dict(shape))
+        geometry, home = (document.setdefault(table, tomlkit.table()) for table in ("geometry", "home"))
+        geometry["base_joints"], geometry["platform_joints"] = base.tolist(), platform.tolist()
+        home["position"] = position.tolist()
     return tomlkit.dumps(document).encode()
 
 

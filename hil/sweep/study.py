@@ -20,6 +20,7 @@ from plant.errors import GoughError, InputError
 from plant.files import read_toml, unknown_entries
 from plant.fmu.settings import Setting
 from plant.mechanism.checks import Limits
+from plant.mechanism.joint_circles import ENTRIES as GEOMETRY
 
 METHODS = ("sobol", "latin-hypercube", "saltelli")
 """How ranges without steps are sampled; `saltelli` is Sobol's sequence in the form that sensitivity indices need."""
@@ -31,7 +32,7 @@ FILES = ("mechanism", "target", "calibration", "plant", "binding")
 """Fields of a run's configuration that may name files."""
 SEED = "seed"
 """The last part of the name of factors that replicate."""
-_PARTS = ("run", "mechanism", "plant")
+_PARTS = ("run", "mechanism", "geometry", "plant")
 _MOST_RUNS = 10_000_000
 
 
@@ -39,8 +40,9 @@ _MOST_RUNS = 10_000_000
 class Factor:
     """Something that varies: with `values` they are crossed with all others, else it is sampled from `low` to `high`.
 
-    The name is `run.FIELD`, a field of the run's configuration; `mechanism.TABLE.ENTRY`, an entry of the mechanism's file; or
-    `plant.PARAMETER`, a parameter or input of the FMU. For a `model`, it is an argument of that function.
+    The name is `run.FIELD`, a field of the run's configuration; `mechanism.TABLE.ENTRY`, an entry of the mechanism's file;
+    `geometry.NUMBER`, one of the numbers in `plant.mechanism.joint_circles`; or `plant.PARAMETER`, a parameter or input of the
+    FMU. For a `model`, it is an argument of that function.
     """
 
     name: str
@@ -225,14 +227,17 @@ class Study:
         Raises:
             GoughError: a value cannot be used.
         """
-        changes = {name.removeprefix("run."): value for name, value in point.items() if name.startswith("run.")}
-        settings = [_setting(name.removeprefix("plant."), value) for name, value in point.items() if name.startswith("plant.")]
-        return replace(self.run, **_parsed(changes), settings=(*self.run.settings, *settings))
+        settings = [_setting(name, value) for name, value in part_of(point, "plant").items()]
+        return replace(self.run, **_parsed(part_of(point, "run")), settings=(*self.run.settings, *settings))
 
     def mechanism_at(self, point: Mapping[str, Any]) -> dict[str, Any]:
         """The entries that replace those of the mechanism's file at a point, by name with dots."""
-        changes = {name.removeprefix("mechanism."): value for name, value in point.items() if name.startswith("mechanism.")}
-        return {**self.mechanism, **changes}
+        return {**self.mechanism, **part_of(point, "mechanism")}
+
+
+def part_of(point: Mapping[str, Any], part: str) -> dict[str, Any]:
+    """The values of a point that belong to run, mechanism, geometry or plant, by their names in there."""
+    return {name.removeprefix(f"{part}."): value for name, value in point.items() if name.startswith(f"{part}.")}
 
 
 def read_study(path: Path | str) -> Study:
@@ -243,12 +248,13 @@ def read_study(path: Path | str) -> Study:
     """
     path, document = Path(path), read_toml(path)
     try:
-        return _study(document, path)
+        return study_of(document, path)
     except GoughError as error:
         raise type(error)(f"{path}: {error}") from None
 
 
-def _study(document: dict[str, Any], path: Path) -> Study:
+def study_of(document: dict[str, Any], path: Path) -> Study:
+    """The study of a document that was read from a path; errors as for `read_study`."""
     _check_entries(document, ("name", "run", "mechanism", "plant", "vary", "sampling", "measure", "model"), "the study")
     for entry, value in document.items():
         kind: type = str if entry in ("name", "model") else dict
@@ -260,12 +266,8 @@ def _study(document: dict[str, Any], path: Path) -> Study:
     _check_entries(measure, ("figures", "function"), "[measure]")
     _check_entries(sampling, [each.name for each in fields(Sampling)], "[sampling]")
     model = document.get("model")
-    factors = tuple(_factors(document.get("vary", {}), "", model is None))
+    factors = factors_of(document.get("vary", {}), path)
     run = {name: _beside(path, name, value) for name, value in _parsed(document.get("run", {})).items()}
-    factors = tuple(
-        replace(each, values=tuple(_beside(path, each.name.removeprefix("run."), value) for value in each.values))
-        for each in factors
-    )
     settings = tuple(_setting(name, value) for name, value in _flat(document.get("plant", {})).items())
     figures, function = measure.get("figures", []), measure.get("function")
     if not (isinstance(figures, list) and all(isinstance(each, str) for each in figures)):
@@ -288,6 +290,18 @@ def _study(document: dict[str, Any], path: Path) -> Study:
         raise InputError(f"a value has the wrong kind: {error}") from None
 
 
+def factors_of(table: Mapping[str, Any], path: Path) -> tuple[Factor, ...]:
+    """The factors of a table; names of files are relative to the folder of `path`.
+
+    Raises:
+        InputError: an entry is no factor.
+    """
+    return tuple(
+        replace(each, values=tuple(_beside(path, each.name.removeprefix("run."), value) for value in each.values))
+        for each in _factors(table, "")
+    )
+
+
 def _beside(path: Path, field: str, value: Any) -> Any:
     """A name of a file beside the study's, if there is such a file; any other value as it is."""
     if field in FILES and isinstance(value, str) and (path.parent / value).is_file():
@@ -306,7 +320,7 @@ def _check_entries(table: Mapping[str, Any], known: Iterable[str], title: str) -
             raise InputError(f"{message}{nearest(entry, names)}")
 
 
-def _factors(table: Mapping[str, Any], prefix: str, of_run: bool) -> "list[Factor]":
+def _factors(table: Mapping[str, Any], prefix: str) -> list[Factor]:
     found = []
     for name, value in table.items():
         full = prefix + name
@@ -314,7 +328,7 @@ def _factors(table: Mapping[str, Any], prefix: str, of_run: bool) -> "list[Facto
             _check_entries(value, _SPECIFICATION, full)
             found.append(_factor(full, value))
         elif isinstance(value, dict):
-            found += _factors(value, f"{full}.", of_run)
+            found += _factors(value, f"{full}.")
         elif isinstance(value, list) and value:
             found.append(Factor(full, tuple(value)))
         else:
@@ -376,10 +390,13 @@ def _check_factor(name: str) -> None:
     part, _, rest = name.partition(".")
     if part not in _PARTS or not rest:
         raise InputError(
-            f"{name} cannot vary: a factor is run.FIELD, mechanism.TABLE.ENTRY or plant.PARAMETER{nearest(part, _PARTS)}"
+            f"{name} cannot vary: a factor is run.FIELD, mechanism.TABLE.ENTRY, geometry.NUMBER or plant.PARAMETER"
+            f"{nearest(part, _PARTS)}"
         )
     if part == "run":
         _check_entries({rest: None}, _run_fields(), "a run")
+    if part == "geometry":
+        _check_entries({rest: None}, GEOMETRY, "the geometry")
 
 
 def _check_entry(name: str) -> None:

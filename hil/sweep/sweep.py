@@ -1,7 +1,7 @@
 """A sweep: all points of a study, run on an engine, into a table."""
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -23,6 +23,9 @@ from plant.errors import GoughError, InputError
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
+
+Report = Callable[[float, str], None]
+"""Called with the share that is done, and what is going on in words."""
 
 _FLUSH_S = 0.1
 """The least time between files of new rows [s]; a batch of two seconds is written as it comes."""
@@ -117,7 +120,7 @@ def no_report(share: float, label: str) -> None:
     """Report nothing."""
 
 
-def run_study(study: Study, folder: Path, engine: Engine, progress: Callable[[float, str], None] = no_report) -> SweepResult:
+def run_study(study: Study, folder: Path, engine: Engine, progress: Report = no_report) -> SweepResult:
     """Run all points of a study that are not in the table of a folder yet.
 
     Args:
@@ -136,28 +139,39 @@ def run_study(study: Study, folder: Path, engine: Engine, progress: Callable[[fl
             key for key, status in zip(*(known[name].to_pylist() for name in (KEY, STATUS)), strict=True) if status != DIED
         }
         left = [case for case in cases if case.key not in settled]
-        rows: list[dict[str, Any]] = []
-        began = flushed = time.monotonic()
-        checked = False
-        try:
-            for done, (number, outcome) in enumerate(engine.run(measure, left, kind_of), start=1):
-                rows.append(_row(left[number], outcome))
-                if not (checked or isinstance(outcome, Failure)):
-                    check_figures(study, outcome)
-                    checked = True
-                now = time.monotonic()
-                if now - flushed > _FLUSH_S:
-                    store.add(rows)
-                    rows, flushed = [], now
-                share = (len(cases) - len(left) + done) / len(cases)
-                progress(share, f"{round(share * len(cases))} of {len(cases)} runs, {done / (now - began):.3g} a second")
-        finally:
-            store.add(rows)
+        began, checked = time.monotonic(), False
+        for done, row in enumerate(run_cases(left, engine, store), start=1):
+            if not checked and row[STATUS] == DONE:
+                check_figures(study.figures, figures_in(row, study))
+                checked = True
+            share = (len(cases) - len(left) + done) / len(cases)
+            rate = done / (time.monotonic() - began)
+            progress(share, f"{round(share * len(cases))} of {len(cases)} runs, {rate:.3g} a second")
         table = rows_of(store.table(), [case.key for case in cases])
     result = SweepResult(study, folder, table, len(left))
     if result.failed < len(table):
-        check_figures(study, result.analysis.names())
+        check_figures(study.figures, result.analysis.names())
     return result
+
+
+def run_cases(cases: Sequence[Case], engine: Engine, store: Store) -> Iterator[dict[str, Any]]:
+    """Run cases and yield their rows as they come; the rows go to the store soon after they came.
+
+    Raises:
+        GoughError: the engine's workers have gone, or the store cannot be written.
+    """
+    rows: list[dict[str, Any]] = []
+    flushed = time.monotonic()
+    try:
+        for number, outcome in engine.run(measure, cases, kind_of):
+            row = _row(cases[number], outcome)
+            rows.append(row)
+            if time.monotonic() - flushed > _FLUSH_S:
+                store.add(rows)
+                rows, flushed = [], time.monotonic()
+            yield row
+    finally:
+        store.add(rows)
 
 
 def estimate(study: Study, folder: Path) -> Estimate:
@@ -172,19 +186,25 @@ def estimate(study: Study, folder: Path) -> Estimate:
     if isinstance(first, Failure):
         reason, *_ = first.reason.partition("\n")
         raise GoughError(f"the first run fails: {reason}")
-    check_figures(study, first)
+    check_figures(study.figures, first)
     began = time.perf_counter()
     measure(cases[0])
     return Estimate(len(cases), len(known), time.perf_counter() - began)
 
 
-def check_figures(study: Study, names: Collection[str]) -> None:
-    """Check that a run, which has figures of these names, has those that a study shows.
+def figures_in(row: Mapping[str, Any], study: Study) -> list[str]:
+    """The names of the figures that a row has."""
+    others = (KEY, STATUS, REASON, *(factor.name for factor in study.factors))
+    return [name for name, value in row.items() if value is not None and name not in others]
+
+
+def check_figures(wanted: Iterable[str], names: Collection[str]) -> None:
+    """Check that a run, which has figures of these names, has those that are wanted.
 
     Raises:
         InputError: it lacks one.
     """
-    for name in study.figures:
+    for name in wanted:
         if name not in names:
             raise InputError(f"no run has the figure {name!r}{nearest(name, names)}; there are {', '.join(names)}")
 

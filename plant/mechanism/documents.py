@@ -27,12 +27,25 @@ def load_mechanism(name_or_path: str | Path) -> Mechanism | PlanarMechanism:
         UnknownNameError: no such preset, and no such file.
         InputError: the content is not a mechanism.
     """
-    source = str(name_or_path)
-    document = parse_toml(mechanism_text(name_or_path), source)
+    return mechanism_from_text(mechanism_text(name_or_path), str(name_or_path))
+
+
+def mechanism_from_text(text: str, source: str) -> Mechanism | PlanarMechanism:
+    """The mechanism of a TOML text, which messages call `source`; errors as for `load_mechanism`."""
     try:
-        return mechanism_from_document(_completed(document, source))
+        return mechanism_from_document(mechanism_document(text, source))
     except (InputError, UnknownNameError) as error:
         raise type(error)(f"{source}: {error}") from None
+
+
+def mechanism_document(text: str, source: str) -> dict[str, Any]:
+    """The document of a TOML text, laid over the presets that it is based on.
+
+    Raises:
+        UnknownNameError: no such preset.
+        InputError: the text is not TOML.
+    """
+    return _completed(parse_toml(text, source), source)
 
 
 def load_spatial(name_or_path: str | Path) -> Mechanism:
