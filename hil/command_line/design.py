@@ -1,6 +1,5 @@
 """The commands about mechanisms, sensors and gains: classify, classes, accuracy, sensor-sets, tune, tune-fusion, optimise."""
 
-import sys
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -211,7 +210,7 @@ def _rms(errors: list[float]) -> str:
 @cli.command(
     cli.source("design", "DESIGN.toml", "what is run, what varies, what is better and what is allowed (docs/optimisation.md)"),
     cli.argument("--results", type=Path, metavar="FOLDER", help="where the results are kept (default: DESIGN.results)"),
-    cli.argument("--choose", type=int, metavar="N", help="a trial of the front, by its number (default: the knee)"),
+    cli.setting("--choose", "knee", "a trial of the front: its number, knee, or first for the best in the first objective"),
     cli.output("--write", "FILE.toml", "write the chosen mechanism, for 'gough simulate --mechanism'"),
     cli.options_of(EngineSettings),
     cli.report("write a report with the front and all trials"),
@@ -227,7 +226,6 @@ def gough_optimise(options: Namespace) -> None:
     """
     check_installed("optuna")
     check_installed("pyarrow")
-    from hil.engine.engine import open_engine
     from hil.sweep.design import read_design
     from hil.sweep.optimisation import check, mechanism_of, optimise
 
@@ -236,9 +234,7 @@ def gough_optimise(options: Namespace) -> None:
     if options.write is not None and design.study.model is not None:
         raise InputError("a model has no mechanism that could be written: leave --write out")
     folder = options.results or options.design.with_suffix(".results")
-    with progress_bar(design.study.name) as progress, open_engine(settings) as engine:
-        if engine.dashboard:
-            print(f"the workers at their work: {engine.dashboard}", file=sys.stderr)
+    with engine_at_work(settings, design.study.name) as (engine, progress):
         result = optimise(design, folder, engine, progress)
         trial = result.chosen(options.choose)
         comparisons = check(result, trial, engine, progress)
@@ -254,15 +250,23 @@ def gough_optimise(options: Namespace) -> None:
         print(f"trial {trial.number} is written to {options.write}")
 
 
+_MOST_COLUMNS = 8
+
+
 def _print_front(result: "OptimisationResult", chosen: "Trial") -> None:
-    factors, figures = list(chosen.point), list(result.design.pools)
-    table = Table("trial", *factors, *figures)
+    figures = list(result.design.pools)
+    names = {trial.number: f"{trial.number} *" if trial is chosen else f"{trial.number}" for trial in result.front}
+    table = Table("trial", *map(_heading, figures))
     if result.start:
-        table.add("as it was", *("" for _ in factors), *(f"{result.start[name]:.4g}" for name in figures))
+        table.add("as it was", *(f"{result.start[name]:.4g}" for name in figures))
     for trial in result.front:
-        mark = f"{trial.number} *" if trial is chosen else f"{trial.number}"
-        table.add(mark, *map(_value, trial.point.values()), *(f"{trial.figures[name]:.4g}" for name in figures))
+        table.add(names[trial.number], *(f"{trial.figures[name]:.4g}" for name in figures))
     table.print()
+    if len(chosen.point) <= _MOST_COLUMNS:
+        table = Table("trial", *map(_heading, chosen.point))
+        for trial in result.front:
+            table.add(names[trial.number], *map(_value, trial.point.values()))
+        table.print()
     count = result.summary()["trials"]
     print(
         f"{len(result.trials)} trials, {result.ran} new runs; {count['run']} within all bounds, {count['refused']} not, "
@@ -277,6 +281,11 @@ def _print_check(first: int, comparisons: "Sequence[Comparison]") -> None:
         better = "" if each.better is None else f"{each.better} of {each.seeds} seeds"
         table.add(f"{each.figure}{_values(each.values)}", f"{each.start:.4g}", f"{each.chosen:.4g}", change, better)
     table.print()
+
+
+def _heading(name: str) -> str:
+    """A name that breaks into short lines."""
+    return name.replace(".", ". ").replace("_", " ")
 
 
 def _values(values: Mapping[str, Any]) -> str:

@@ -22,6 +22,8 @@ POOLS = ("rms", "mean", "max", "min")
 METHODS = ("nsga2", "tpe")
 _BATCHES = {"nsga2": 40, "tpe": 8}
 _SEED = "run.seed"
+_ROUNDING = 1e-9
+"""Share of a bound by which rounding may break it."""
 
 
 def pooled(values: ArrayLike, pool: str | float) -> float:
@@ -72,13 +74,13 @@ class Constraint:
                 raise InputError(f'{self.figure}: a bound is {bound!r}; it is a number or "{START}"')
 
     def violation(self, value: float, start: float) -> float:
-        """By which share of a bound a value breaks it; not positive if it is within the bounds."""
+        """By which share of a bound a value breaks it; not positive if it is within the bounds, but for rounding."""
         worst = -np.inf
         for bound, sign in ((self.least, -1.0), (self.most, 1.0)):
             if bound is not None:
                 limit = float(start if bound == START else bound)
                 worst = max(worst, sign * (value - limit) / (abs(limit) or 1.0))
-        return worst
+        return worst - _ROUNDING
 
 
 @dataclass(frozen=True)

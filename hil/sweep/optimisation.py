@@ -100,19 +100,20 @@ class OptimisationResult:
         shares = (values - values.min(axis=0)) / np.where(span > 0.0, span, 1.0)
         return self.front[int(np.argmin(np.linalg.norm(shares, axis=1)))]
 
-    def chosen(self, number: int | None = None) -> Trial:
-        """The trial of the front with a number; the knee without one.
+    def chosen(self, which: str = "knee") -> Trial:
+        """The trial of the front with a number, the "knee", or the "first", which is the best in the first objective.
 
         Raises:
-            InputError: no trial of the front has it.
+            InputError: no trial of the front has this number.
         """
-        if number is None:
+        if which == "knee":
             return self.knee
-        for trial in self.front:
-            if trial.number == number:
-                return trial
-        known = ", ".join(str(trial.number) for trial in self.front)
-        raise InputError(f"trial {number} is not on the front; on it are {known or 'none'}")
+        known = {str(trial.number): trial for trial in self.front}
+        if self.front:
+            known["first"] = self.front[0]
+        if which not in known:
+            raise InputError(f"{which!r} is not on the front; on it are knee, {', '.join(known) or 'no trials'}")
+        return known[which]
 
     def summary(self) -> dict[str, Any]:
         """The front, the start, and how many trials there are, for JSON."""
@@ -150,7 +151,7 @@ def optimise(design: Design, folder: Path, engine: Engine, progress: Report = no
         GoughError: the design or the folder cannot be used, none of the first trials can be run, or the engine's workers
             have gone.
     """
-    with Store.opened(folder) as store, _quiet():
+    with Store.opened(folder) as store, quiet():
         done, wanted = 0, design.search.trials
 
         def tell() -> None:
@@ -381,8 +382,8 @@ def _within(factor: Factor, value: Any) -> bool:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Optuna tells of every trial, and that some of its parts are young."""
+def quiet() -> Iterator[None]:
+    """Keep Optuna quiet, which tells of every trial, and that some of its parts are young."""
     level = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     try:

@@ -17,7 +17,7 @@ from hil.option import nearest
 from hil.sweep.analysis import Analysis
 from hil.sweep.case import Case, cases_of, kind_of, measure, own_figures
 from hil.sweep.store import DIED, DONE, FAILED, KEY, REASON, STATUS, Store, rows_of
-from hil.sweep.study import Study
+from hil.sweep.study import SEED, Study
 from plant.errors import GoughError, InputError
 
 if TYPE_CHECKING:
@@ -194,7 +194,7 @@ def estimate(study: Study, folder: Path) -> Estimate:
 
 def figures_in(row: Mapping[str, Any], study: Study) -> list[str]:
     """The names of the figures that a row has."""
-    others = (KEY, STATUS, REASON, *(factor.name for factor in study.factors))
+    others = (KEY, STATUS, REASON, f"run.{SEED}", *(factor.name for factor in study.factors))
     return [name for name, value in row.items() if value is not None and name not in others]
 
 
