@@ -1,10 +1,10 @@
 """The commands about mechanisms, sensors and gains: classify, classes, accuracy, sensor-sets, tune, tune-fusion, optimise."""
 
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hil.command_line import cli
 from hil.command_line.terminal import deg, engine_at_work, mm
@@ -254,18 +254,22 @@ _MOST_COLUMNS = 8
 
 
 def _print_front(result: "OptimisationResult", chosen: "Trial") -> None:
-    figures = list(result.design.pools)
-    names = {trial.number: f"{trial.number} *" if trial is chosen else f"{trial.number}" for trial in result.front}
-    table = Table("trial", *map(_heading, figures))
-    if result.start:
-        table.add("as it was", *(f"{result.start[name]:.4g}" for name in figures))
-    for trial in result.front:
-        table.add(names[trial.number], *(f"{trial.figures[name]:.4g}" for name in figures))
+    from hil.sweep.units import headed, label_of, unit_of_factor, unit_of_figure
+
+    study, marks = result.design.study, {chosen.number: " *"}
+    units = {name: unit_of_figure(name) for name in result.design.pools}
+    table = Table("trial", *(headed(_broken(name), unit) for name, (unit, _) in units.items()))
+    rows = [("as it was", result.start)] if result.start else []
+    rows += [(f"{trial.number}{marks.get(trial.number, '')}", trial.figures) for trial in result.front]
+    for label, figures in rows:
+        table.add(label, *(f"{scale * figures[name]:.4g}" for name, (_, scale) in units.items()))
     table.print()
     if len(chosen.point) <= _MOST_COLUMNS:
-        table = Table("trial", *map(_heading, chosen.point))
+        units = {name: unit_of_factor(study, name) for name in chosen.point}
+        table = Table("trial", *(headed(_broken(name), unit) for name, (unit, _) in units.items()))
         for trial in result.front:
-            table.add(names[trial.number], *map(_value, trial.point.values()))
+            cells = (label_of(value, units[name][1]) for name, value in trial.point.items())
+            table.add(f"{trial.number}{marks.get(trial.number, '')}", *cells)
         table.print()
     count = result.summary()["trials"]
     print(
@@ -275,22 +279,19 @@ def _print_front(result: "OptimisationResult", chosen: "Trial") -> None:
 
 
 def _print_check(first: int, comparisons: "Sequence[Comparison]") -> None:
+    from hil.sweep.units import headed, label_of, unit_of_figure
+
     table = Table(f"check, {comparisons[0].seeds} seeds from {first} on", "as it was", "chosen", "change", "better at")
     for each in comparisons:
+        unit, scale = unit_of_figure(each.figure)
+        where = f" ({', '.join(map(label_of, each.values.values()))})" if each.values else ""
         change = f"{100.0 * (each.chosen / each.start - 1.0):+.1f} %" if each.start else ""
         better = "" if each.better is None else f"{each.better} of {each.seeds} seeds"
-        table.add(f"{each.figure}{_values(each.values)}", f"{each.start:.4g}", f"{each.chosen:.4g}", change, better)
+        cells = (f"{scale * each.start:.4g}", f"{scale * each.chosen:.4g}", change, better)
+        table.add(f"{headed(each.figure, unit)}{where}", *cells)
     table.print()
 
 
-def _heading(name: str) -> str:
+def _broken(name: str) -> str:
     """A name that breaks into short lines."""
     return name.replace(".", ". ").replace("_", " ")
-
-
-def _values(values: Mapping[str, Any]) -> str:
-    return f" ({', '.join(map(_value, values.values()))})" if values else ""
-
-
-def _value(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

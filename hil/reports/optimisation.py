@@ -61,9 +61,16 @@ _IMPORTANCE = "Share of each factor in what makes a trial one of the best (PED-A
 
 def _kept(result: OptimisationResult) -> optuna.Study:
     """Optuna's study without the trials that break a bound or were given up, which have no figures to draw."""
-    trials = result.study.get_trials(deepcopy=False)
     study = optuna.create_study(directions=result.study.directions)
-    study.add_trials([trials[trial.number] for trial in result.trials if trial.state == RUN])
+    for trial in result.study.get_trials(deepcopy=False):
+        if trial.number < len(result.trials) and result.trials[trial.number].state == RUN:
+            kept = optuna.trial.create_trial(
+                values=trial.values,
+                params=trial.params,
+                distributions=trial.distributions,
+                user_attrs={"trial": trial.number},  # in this study it has another number
+            )
+            study.add_trial(kept)
     return study
 
 

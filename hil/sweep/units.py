@@ -10,11 +10,19 @@ from plant.dynamics.variables import SPATIAL
 
 _FIGURES = {"position": ("mm", 1e3), "rotation": ("deg", degrees(1.0))}
 """Unit, and the factor to it from SI, of figures that have this word in their name."""
+_GEOMETRY = {
+    "reach": ("dm3", 1e3), "reach_rotation": ("rad3", 1.0), "reach_share": ("%", 100.0), "force_max": ("N", 1.0),
+    "force_per_torque": ("1/m", 1.0),
+}  # fmt: skip
+"""The same for the figures of the geometry alone."""
 _FACTORS = {"mm": ("mm", 1e3), "ms": ("ms", 1e3)}
 
 
 def unit_of_figure(name: str) -> tuple[str, float]:
     """The unit of a figure, "" if that is not known, and the factor to it from SI."""
+    part, _, rest = name.partition(".")
+    if part == "geometry":
+        return _GEOMETRY.get(rest, ("", 1.0))
     words = name.replace(".", "_").split("_")
     return next((unit for word, unit in _FIGURES.items() if word in words), ("", 1.0))
 
@@ -28,6 +36,8 @@ def unit_of_factor(study: Study, name: str) -> tuple[str, float]:
         option = next((each.metadata.get("option") for each in fields(SimulationConfig) if each.name == rest), None)
         unit = "s" if rest == "hold" else option.unit if option else ""
         return _FACTORS.get(unit, (unit, 1.0))
+    if part == "geometry":
+        return ("deg", degrees(1.0)) if rest.endswith("angle") else ("mm", 1e3)
     variable = rest.removeprefix("plant.") if part == "mechanism" else rest
     known = (*SPATIAL.parameters, *SPATIAL.inputs)
     return next((each.unit for each in known if each.name == variable and each.unit != "1"), ""), 1.0
