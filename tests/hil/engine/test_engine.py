@@ -9,6 +9,8 @@ from functools import partial
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from hil.engine.batches import Failure
 from hil.engine.engine import IN_ONE_PROCESS, InOneProcess, engine_when_needed, open_engine
@@ -60,6 +62,12 @@ def test_results_come_in_the_order_of_the_items_whatever_their_times(engine):
     processes = {process for _, process in results}
     assert processes == {os.getpid()} if engine is IN_ONE_PROCESS else len(processes) == 2 and os.getpid() not in processes
     assert engine.map(late, []) == []
+
+
+@given(items=st.lists(st.floats() | st.text() | st.tuples(st.integers(), st.booleans()), max_size=40))
+def test_every_item_has_one_result_in_its_place(engine, items):
+    assert engine.map(repr, items) == list(map(repr, items))
+    assert sorted(engine.run(repr, items)) == list(enumerate(map(repr, items)))
 
 
 def test_an_item_may_have_several_arguments_and_others_may_be_given_beforehand(engine):
