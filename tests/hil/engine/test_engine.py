@@ -29,7 +29,7 @@ def two():
         yield engine
 
 
-@pytest.fixture(params=["in one process", "on two workers"])
+@pytest.fixture(params=["in one process", "on two workers"], scope="module")
 def engine(request):
     return IN_ONE_PROCESS if request.param == "in one process" else request.getfixturevalue("two")
 
@@ -64,7 +64,7 @@ def test_results_come_in_the_order_of_the_items_whatever_their_times(engine):
     assert engine.map(late, []) == []
 
 
-@given(items=st.lists(st.floats() | st.text() | st.tuples(st.integers(), st.booleans()), max_size=40))
+@given(items=st.lists(st.floats() | st.text() | st.tuples(st.integers(), st.booleans()), max_size=10))
 def test_every_item_has_one_result_in_its_place(engine, items):
     assert engine.map(repr, items) == list(map(repr, items))
     assert sorted(engine.run(repr, items)) == list(enumerate(map(repr, items)))
