@@ -2,6 +2,7 @@
 
 import logging
 import math
+import pickle
 import signal
 import ssl
 import threading
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 from uuid import uuid4
 
+import cloudpickle
 import dask
 from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
 from distributed.comm.core import CommClosedError
@@ -93,7 +95,8 @@ class DaskEngine(Engine):
                 workers = self.workers
                 while len(running) < _AHEAD * workers and (numbers := queue.next(list(running.values()), workers)):
                     batch, kinds = [items[n] for n in numbers], [kind(items[n]) for n in numbers]
-                    future = self._client.submit(run_batch, function, batch, kinds, fingerprint(), key=next(names), pure=False)
+                    call = cloudpickle.dumps(_Call(run_batch, function, batch, kinds, fingerprint()))
+                    future = self._client.submit(pickle.loads, call, key=next(names), pure=False)
                     running[future] = numbers
                     completed.add(future)
                 if not running:
@@ -147,6 +150,16 @@ class DaskEngine(Engine):
         if not self._present():
             raise WorkerRefusedError(text)
         _LOG.warning(text)
+
+
+class _Call:
+    """A call that is made where its pickled form is read: a scheduler and a worker pass it on without knowing what it needs."""
+
+    def __init__(self, function: Callable[..., Any], *arguments: Any) -> None:
+        self._call = function, arguments
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        return self._call
 
 
 class _Queue:

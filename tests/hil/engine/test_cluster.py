@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hil.engine.cluster import _AHEAD, _TRIES, _Queue
+from hil.engine.cluster import _AHEAD, _TRIES, WorkerRefusedError, _Queue
 from hil.engine.engine import Engine, open_engine
 from hil.engine.settings import EngineSettings, host_and_port
+from hil.runs.config import SimulationConfig
+from hil.sweep.case import cases_of, kind_of, measure
+from hil.sweep.study import Factor, Study
 from tests.hil.engine.certificates import Certificates, make_certificates
-from tests.hil.processes import dask_worker, started, wait_until
+from tests.hil.processes import dask_scheduler, dask_worker, started, wait_until
 
 LOOPBACK = ("127.0.0.1", "::1", "::ffff:127.0.0.1")
 
@@ -134,6 +138,47 @@ def test_a_worker_with_other_sources_is_left_out(
     assert line.startswith("the worker at tls://127.0.0.1:")
     assert "has other sources" in line
     assert engine.workers == 2
+
+
+@pytest.mark.slow
+def test_a_scheduler_needs_no_gough_and_a_worker_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    empty = tmp_path / "empty"
+    for package in ("hil", "plant"):
+        (empty / package).mkdir(parents=True)
+        (empty / package / "__init__.py").write_text(f"raise ModuleNotFoundError('No module named {package}')")
+    with ExitStack() as stack:
+        monkeypatch.setenv("PYTHONPATH", str(empty))
+        _, address = stack.enter_context(dask_scheduler(tmp_path))
+        with (
+            started(dask_worker(address), tmp_path),
+            open_engine(EngineSettings(scheduler=address)) as engine,
+            pytest.raises(WorkerRefusedError, match="cannot take part: No module named hil; install the same gough"),
+        ):
+            engine.map(eval, ["1"])
+        monkeypatch.setenv("PYTHONPATH", str(Path(__file__).resolve().parents[3]))
+        stack.enter_context(started(dask_worker(address), tmp_path))
+        with open_engine(EngineSettings(scheduler=address)) as engine:
+            assert engine.map(eval, ["1", "2"]) == [1, 2]
+
+
+@pytest.mark.slow
+def test_a_worker_stays_as_large_as_it_is() -> None:
+    runs, grown = 300, 10e6
+    study = Study((Factor("run.seed", tuple(range(runs))),), run=SimulationConfig(duration=0.5, rate=250.0))
+    with open_engine(EngineSettings(workers=1, listen="localhost:0")) as engine:
+        # A profile of the work, which Dask keeps unless told otherwise, would make it grow for an hour.
+        assert engine.map(eval, ["__import__('dask').config.get('distributed.worker.profile.enabled')"]) == [False]
+        (worker,) = {*engine.map(eval, [PROCESS] * 4)}
+        sizes, files = [], []
+        for _, outcome in engine.run(measure, list(cases_of(study)), kind_of):
+            assert isinstance(outcome, dict), outcome
+            sizes.append(psutil.Process(worker).memory_info().rss)
+            files.append(psutil.Process(worker).num_fds())
+    print(
+        f"{sizes[0] / 1e6:.1f} MB after the first run, {sizes[150] / 1e6:.1f} in the middle, {sizes[-1] / 1e6:.1f} at the end"
+    )
+    assert sizes[-1] - sizes[100] < grown
+    assert max(files[100:]) <= max(files[:100]) + 2
 
 
 PROGRAM = """
