@@ -293,7 +293,8 @@ class Analysis:
     def _grid(self, figure: str) -> tuple[Values | None, list[str]]:
         """A figure (samples, values of each crossed factor ...), None if a run lacks it; and what the axes are."""
         values, crossed = self.values(figure), self.study.crossed
-        axes = [" + ".join(each.name for each in self.study.sampled), *(each.name for each in crossed)]
+        sampled = [each.name for each in self.study.sampled]
+        axes = [" + ".join(sampled) if len(sampled) < 3 else "all sampled factors", *(each.name for each in crossed)]
         if not self._complete or not np.isfinite(values).all():
             return None, axes
         return values.reshape(-1, *(len(each.values) for each in crossed)), axes
