@@ -43,6 +43,7 @@ def test_the_example_reads_its_table_and_goes_on(folder: Path, capsys: pytest.Ca
         names = runpy.run_path("again.py", run_name="__main__")
     assert names["result"].ran == 0
     assert dict(names["cube"].sizes) == {"sample": 3, "run.imu": 2, "run.joint_error": 2, "run.seed": 2}
+    assert names["cube"]["run.imu"].values.tolist() == ["mpu9150-calibrated", "icm42688"]
     assert set(names["cube"].coords) > {"mechanism.control.proportional", "plant.payload.mass"}
     point = names["cube"].isel({"sample": 2, "run.seed": 1, "run.imu": 0, "run.joint_error": 1})
     frame = names["result"].frame()

@@ -99,7 +99,8 @@ def quantile(values: ArrayLike, share: float, groups: Sequence[Groups] = ()) -> 
     low, high = binom.ppf([_TAIL, 1.0 - _TAIL], independent, share)
     padded = np.concatenate([[-inf], ordered, [inf]])
     first, last = int(low * n / independent), min(n + 1, int(np.ceil((high + 1.0) * n / independent)))
-    return Quantile(value, float(padded[first]), float(padded[last]), share)
+    # The value lies between two of them, so that with few runs an end could be beyond it.
+    return Quantile(value, min(value, float(padded[first])), max(value, float(padded[last])), share)
 
 
 def mean(values: ArrayLike, groups: Sequence[Groups] = ()) -> Interval:

@@ -16,7 +16,7 @@ from hil.engine.engine import Engine
 from hil.option import nearest
 from hil.sweep.analysis import Analysis
 from hil.sweep.case import Case, cases_of, kind_of, measure, own_figures
-from hil.sweep.store import DIED, DONE, FAILED, KEY, REASON, STATUS, Store, rows_of
+from hil.sweep.store import DIED, DONE, FAILED, KEY, REASON, STATUS, Store, as_stored, rows_of
 from hil.sweep.study import SEED, Study
 from plant.errors import GoughError, InputError
 
@@ -99,6 +99,7 @@ class SweepResult:
             frame["sample"] = np.arange(len(frame)) // (len(frame) // self.study.samples)
             dimensions.insert(0, "sample")
         dataset: xr.Dataset = frame.drop(columns=sampled).set_index(dimensions).to_xarray()
+        dataset = dataset.sel({each.name: list(map(as_stored, each.values)) for each in self.study.crossed})
         first = frame.groupby("sample")[sampled].first() if sampled else {}
         return dataset.assign_coords({name: ("sample", first[name].to_numpy()) for name in sampled})
 

@@ -62,6 +62,8 @@ def test_too_few_runs_tell_no_end():
     found = quantile(np.arange(20.0), 0.99)
     assert np.isfinite(found.low) and found.high == np.inf
     assert quantile([3.0], 0.5).low == -np.inf
+    few = quantile([1.0, 2.0], 0.99)
+    assert few.low <= few.value <= few.high == np.inf
     assert (mean([3.0]).low, mean([3.0]).value) == (-np.inf, 3.0)
 
 
