@@ -51,7 +51,7 @@ def gough_sweep(options: Namespace) -> int:
     if options.dry_run:
         with progress_bar("the first run"):
             found = estimate(study, folder)
-        workers = 1 if settings.scheduler else settings.processes
+        workers = 1 if settings.scheduler else max(1, settings.processes)
         total = found.total(workers)
         print(
             f"{found.points} runs, of which {found.known} are in {folder} already; a run takes {found.seconds:.3g} s on this "
