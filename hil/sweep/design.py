@@ -93,7 +93,7 @@ class Search:
         seed: of the search itself.
         method: nsga2, or tpe; by default tpe for one objective and nsga2 for several.
         batch: how many trials are asked for before their results are told; nsga2's population. 0: 40 for nsga2, 8 for tpe.
-        group: with one objective, a trial is given up after each group of so many seeds if it is worse than the best one.
+        group: with tpe and one objective, a trial that is worse than the best is given up after each group of so many seeds.
     """
 
     trials: int = 200

@@ -164,6 +164,7 @@ def optimise(design: Design, folder: Path, engine: Engine, progress: Report = no
         kept = saved.get_trials(deepcopy=False)
         study.add_trials(kept[: saved.user_attrs.get(_WHOLE, 0)])
         count_saved = len(kept)
+        _remember_parents(design, study)
         if not study.trials and (first := _start_point(design)):
             study.enqueue_trial(first)
         while (done := len(_finished(study))) < wanted:
@@ -315,9 +316,20 @@ def _sampler(design: Design, done: int) -> BaseSampler:
     return NSGAIISampler(population_size=design.batch, seed=seed, crossover=crossover, mutation=PolynomialMutation(20.0))
 
 
+def _remember_parents(design: Design, study: optuna.Study) -> None:
+    """Select the parents of all generations again, one after the other as without an interruption.
+
+    NSGA-II would do it backwards, and then breaks ties otherwise.
+    """
+    sampler = _sampler(design, 0)
+    if isinstance(sampler, NSGAIISampler):
+        for generation in range(1, -(-len(study.trials) // design.batch)):
+            sampler.get_parent_population(study, generation)
+
+
 def _pruner(design: Design) -> optuna.pruners.BasePruner:
     """Gives a trial up when a signed-rank test over the seeds says that it is worse than the best one."""
-    if len(design.objectives) > 1:
+    if len(design.objectives) > 1 or design.method != "tpe":
         return optuna.pruners.NopPruner()
     return optuna.pruners.WilcoxonPruner(p_threshold=_P_OF_GIVING_UP)
 

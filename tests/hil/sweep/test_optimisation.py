@@ -117,13 +117,13 @@ def test_one_objective_is_found_by_tpe(tmp_path):
 
 @pytest.mark.parametrize("method", ["nsga2", "tpe"])
 def test_the_seed_alone_decides_and_an_interruption_changes_nothing(method, tmp_path):
-    design = two(search=Search(trials=50, method=method, batch=8, seed=4))
+    design = two(search=Search(trials=60, method=method, batch=6, seed=4))
     whole = run(design, tmp_path / "whole")
     assert points_of(run(design, tmp_path / "again")) == points_of(whole)
     other = replace(design, search=replace(design.search, seed=5))
     assert points_of(run(other, tmp_path / "other")) != points_of(whole)
     CALLS.clear()
-    for stop in (0.1, 0.3, 0.3, 0.7):
+    for stop in (0.1, 0.3, 0.3, 0.7, 0.9):
 
         def interrupt(share: float, label: str, stop: float = stop) -> None:
             if share >= stop:
@@ -305,7 +305,7 @@ def test_zdt1_is_solved_to_95_percent_of_the_hypervolume(tmp_path, seed):
     with open_engine(EngineSettings(workers=2, dashboard="127.0.0.1:0")) as engine:
         result = optimise(zdt1(tmp_path, 4000, seed), tmp_path / "results", engine)
     front = [(float(first), float(second)) for first, second in result.objectives_of(result.front)]
-    assert result.ran == 4000
+    assert result.ran <= len(result.trials) == 4000
     assert volume(front) >= 0.95 * ZDT1_VOLUME
 
 
@@ -327,11 +327,10 @@ def test_a_process_that_is_killed_loses_nothing(tmp_path):
         process.send_signal(signal.SIGKILL)
         process.wait()
     subprocess.run(command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(root)}, check=True)
-    # What a batch of the last tenth of a second had done is done again.
-    assert 200 <= len((tmp_path / "calls").read_text().splitlines()) <= 200 + 4 * 20
-    (tmp_path / "zdt1.py").write_text(f"import time\n{slow}")
     found = run(read_design(tmp_path / "zdt1.toml"), tmp_path / "zdt1.results")
     assert (found.ran, len(found.trials)) == (0, 200)
-    assert [trial.figures for trial in found.trials] == [
-        trial.figures for trial in run(design, tmp_path / "uninterrupted").trials
-    ]
+    whole = run(design, tmp_path / "uninterrupted")
+    assert [trial.figures for trial in found.trials] == [trial.figures for trial in whole.trials]
+    # What had not been written when a process was killed is done again: a tenth of a second of runs.
+    calls = len((tmp_path / "calls").read_text().splitlines())
+    assert whole.ran <= calls <= whole.ran + 4 * 30
