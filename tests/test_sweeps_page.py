@@ -12,8 +12,9 @@ import pytest
 
 from hil.command_line import parse
 from hil.runs.config import SimulationConfig
+from hil.sweep.names import run_fields
 from hil.sweep.store import KEY, REASON, STATUS
-from hil.sweep.study import METHODS, Sampling, _run_fields, read_study
+from hil.sweep.study import METHODS, Sampling, read_study
 from tests.hil.commands import gough
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -63,7 +64,7 @@ def test_the_columns_are_those_of_the_page(folder: Path) -> None:
 def test_the_fields_of_a_run_and_their_defaults_are_those_of_the_source() -> None:
     section = PAGE[PAGE.index("| field |") : PAGE.index("A field that does not exist")]
     rows = dict(re.findall(r"^\| `(\w+)` \|.*\| (.*?) \|$", section, re.MULTILINE))
-    assert rows.keys() == _run_fields().keys()
+    assert rows.keys() == run_fields().keys()
     defaults = {each.name: each.default for each in fields(SimulationConfig)}
     for name, shown in rows.items():
         default = defaults[name]

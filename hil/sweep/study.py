@@ -1,6 +1,6 @@
 """A study as its TOML file or a Python program describes it: what is run, what varies, what is measured."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from inspect import signature
 from itertools import product
@@ -10,17 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from controller.settings import ControlSettings, FusionSettings, SafetySettings
 from hil.option import nearest
 from hil.runs.config import SimulationConfig
 from hil.sweep.function import UserFunction
+from hil.sweep.names import PARTS, check_entries, check_entry, check_factor, check_parameter, is_whole, parsed
 from plant.checks import checked_seed
-from plant.dynamics.variables import PLANAR, SPATIAL
 from plant.errors import GoughError, InputError
-from plant.files import read_toml, unknown_entries
+from plant.files import read_toml
 from plant.fmu.settings import Setting
-from plant.mechanism.checks import Limits
-from plant.mechanism.joint_circles import ENTRIES as GEOMETRY
 
 METHODS = ("sobol", "latin-hypercube", "saltelli")
 """How ranges without steps are sampled; `saltelli` is Sobol's sequence in the form that sensitivity indices need."""
@@ -32,7 +29,6 @@ FILES = ("mechanism", "target", "calibration", "plant", "binding")
 """Fields of a run's configuration that may name files."""
 SEED = "seed"
 """The last part of the name of factors that replicate."""
-_PARTS = ("run", "mechanism", "geometry", "plant")
 _MOST_RUNS = 10_000_000
 
 
@@ -164,12 +160,12 @@ class Study:
             raise InputError("a model is in place of a run, of which a function takes the result: leave one of them out")
         if self.model is None:
             for name in names:
-                _check_factor(name)
+                check_factor(name)
             for name in (*names, *(f"mechanism.{entry}" for entry in self.mechanism)):
-                _check_entry(name)
+                check_entry(name)
             if self.run.plant is None and "run.plant" not in names:
                 for name in (*names, *(f"plant.{setting.name}" for setting in self.run.settings)):
-                    _check_parameter(name)
+                    check_parameter(name)
         if self.model is not None:
             self._check_arguments(self.model, names)
         if self.function is None and self.model is None and not self.figures:
@@ -228,7 +224,7 @@ class Study:
             GoughError: a value cannot be used.
         """
         settings = [_setting(name, value) for name, value in part_of(point, "plant").items()]
-        return replace(self.run, **_parsed(part_of(point, "run")), settings=(*self.run.settings, *settings))
+        return replace(self.run, **parsed(part_of(point, "run")), settings=(*self.run.settings, *settings))
 
     def mechanism_at(self, point: Mapping[str, Any]) -> dict[str, Any]:
         """The entries that replace those of the mechanism's file at a point, by name with dots."""
@@ -255,25 +251,25 @@ def read_study(path: Path | str) -> Study:
 
 def study_of(document: dict[str, Any], path: Path) -> Study:
     """The study of a document that was read from a path; errors as for `read_study`."""
-    _check_entries(document, ("name", "run", "mechanism", "plant", "vary", "sampling", "measure", "model"), "the study")
+    check_entries(document, ("name", "run", "mechanism", "plant", "vary", "sampling", "measure", "model"), "the study")
     for entry, value in document.items():
         kind: type = str if entry in ("name", "model") else dict
         if not isinstance(value, kind):
             raise InputError(f"{entry} = {value!r} must be {'text' if kind is str else f'a table [{entry}]'}")
-    if "model" in document and (table := next((part for part in _PARTS if part in document), None)):
+    if "model" in document and (table := next((part for part in PARTS if part in document), None)):
         raise InputError(f"a model takes the place of a run: leave out [{table}], or model")
     measure, sampling = document.get("measure", {}), document.get("sampling", {})
-    _check_entries(measure, ("figures", "function"), "[measure]")
-    _check_entries(sampling, [each.name for each in fields(Sampling)], "[sampling]")
+    check_entries(measure, ("figures", "function"), "[measure]")
+    check_entries(sampling, [each.name for each in fields(Sampling)], "[sampling]")
     model = document.get("model")
     factors = factors_of(document.get("vary", {}), path)
-    run = {name: _beside(path, name, value) for name, value in _parsed(document.get("run", {})).items()}
+    run = {name: _beside(path, name, value) for name, value in parsed(document.get("run", {})).items()}
     settings = tuple(_setting(name, value) for name, value in _flat(document.get("plant", {})).items())
     figures, function = measure.get("figures", []), measure.get("function")
     if not (isinstance(figures, list) and all(isinstance(each, str) for each in figures)):
         raise InputError(f"[measure] figures = {figures!r} must be a list of texts, such as [{FIGURES[0]!r}]")
     for entry, value in sampling.items():
-        if not (isinstance(value, str) if entry == "method" else _is_whole(value)):
+        if not (isinstance(value, str) if entry == "method" else is_whole(value)):
             raise InputError(f"[sampling] {entry} = {value!r} must be {'text' if entry == 'method' else 'a whole number'}")
     try:
         return Study(
@@ -312,20 +308,12 @@ def _beside(path: Path, field: str, value: Any) -> Any:
 _SPECIFICATION = ("from", "to", "steps", "logarithmic", "seeds")
 
 
-def _check_entries(table: Mapping[str, Any], known: Iterable[str], title: str) -> None:
-    """As `plant.files.check_entries`, with the name that may be meant."""
-    names = list(known)
-    for entry in table:
-        for message in unknown_entries({entry: None}, names, title):
-            raise InputError(f"{message}{nearest(entry, names)}")
-
-
 def _factors(table: Mapping[str, Any], prefix: str) -> list[Factor]:
     found = []
     for name, value in table.items():
         full = prefix + name
         if isinstance(value, dict) and value.keys() & {*_SPECIFICATION}:
-            _check_entries(value, _SPECIFICATION, full)
+            check_entries(value, _SPECIFICATION, full)
             found.append(_factor(full, value))
         elif isinstance(value, dict):
             found += _factors(value, f"{full}.")
@@ -338,7 +326,7 @@ def _factors(table: Mapping[str, Any], prefix: str) -> list[Factor]:
 
 def _factor(name: str, table: Mapping[str, Any]) -> Factor:
     if "seeds" in table:
-        if len(table) > 1 or not _is_whole(table["seeds"]) or table["seeds"] < 1:
+        if len(table) > 1 or not is_whole(table["seeds"]) or table["seeds"] < 1:
             raise InputError(f"{name}: seeds = {table['seeds']!r} must be a whole number, 1 at least, and stand alone")
         factor = Factor(name, tuple(range(table["seeds"])))
         if not factor.is_seed:
@@ -354,7 +342,7 @@ def _factor(name: str, table: Mapping[str, Any]) -> Factor:
     factor = Factor(name, (), float(table["from"]), float(table["to"]), table.get("logarithmic", False))
     if "steps" not in table:
         return factor
-    if not _is_whole(table["steps"]) or table["steps"] < 2:
+    if not is_whole(table["steps"]) or table["steps"] < 2:
         raise InputError(f"{name}: steps = {table['steps']!r} must be a whole number, 2 at least")
     return Factor(name, tuple(factor.at(share) for share in np.linspace(0.0, 1.0, table["steps"]).tolist()))
 
@@ -366,95 +354,8 @@ def _setting(name: str, value: Any) -> Setting:
     return Setting(name, tuple(map(float, numbers)))
 
 
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
 def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for name, value in table.items():
         flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
     return flat
-
-
-def _run_fields() -> dict[str, Any]:
-    """The fields of a run's configuration that a study can set, with how their text is read."""
-    return {
-        each.name: each.metadata["option"].parse
-        for each in fields(SimulationConfig)
-        if "option" in each.metadata and each.name not in ("settings", "rig", "rig_at", "arm")
-    } | {"hold": None}
-
-
-def _check_factor(name: str) -> None:
-    part, _, rest = name.partition(".")
-    if part not in _PARTS or not rest:
-        raise InputError(
-            f"{name} cannot vary: a factor is run.FIELD, mechanism.TABLE.ENTRY, geometry.NUMBER or plant.PARAMETER"
-            f"{nearest(part, _PARTS)}"
-        )
-    if part == "run":
-        _check_entries({rest: None}, _run_fields(), "a run")
-    if part == "geometry":
-        _check_entries({rest: None}, GEOMETRY, "the geometry")
-
-
-def _check_entry(name: str) -> None:
-    """Check the name of an entry of the mechanism's file, as far as its tables have the same entries in all mechanisms."""
-    part, _, entry = name.partition(".")
-    if part != "mechanism":
-        return
-    table, _, rest = entry.partition(".")
-    _check_entries({table: None}, ("name", "based_on", "geometry", "home", *_SETTINGS, "plant"), "a mechanism")
-    if table in _SETTINGS:
-        _check_entries({rest.partition(".")[0]: None}, sorted(each.name for each in fields(_SETTINGS[table])), f"[{table}]")
-    elif table == "plant" and not any(rest == known or rest.startswith(f"{known}.") for known in _PARAMETERS):
-        raise InputError(f"[plant] has no entry {rest!r}{nearest(rest, _PARAMETERS)}; docs/fmu.md lists the plant's parameters")
-
-
-def _check_parameter(name: str) -> None:
-    """Check the name of a parameter or input of gough's own plant."""
-    part, _, rest = name.partition(".")
-    known = [*_PARAMETERS, *(each.name for table in (SPATIAL, PLANAR) for each in table.inputs)]
-    if part == "plant" and rest not in known:
-        raise InputError(f"the plant has no parameter or input {rest!r}{nearest(rest, known)}; docs/fmu.md lists them")
-
-
-_SETTINGS: dict[str, Any] = {
-    "limits": Limits, "control": ControlSettings, "fusion": FusionSettings, "safety": SafetySettings,
-}  # fmt: skip
-"""Tables of a mechanism's file, and what has their entries."""
-_PARAMETERS = [each.name for table in (SPATIAL, PLANAR) for each in table.parameters]
-
-
-def _parsed(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values of a run's fields, read as the command line reads them if they are text."""
-    readers: dict[str, Callable[[str], Any] | None] = _run_fields()
-    _check_entries(values, readers, "[run]")
-    return {name: _read(name, value, readers[name]) for name, value in values.items()}
-
-
-def _read(name: str, value: Any, read: Callable[[str], Any] | None) -> Any:
-    default = SimulationConfig.__dataclass_fields__[name].default
-    if default is None:
-        default = 0.0 if name == "hold" else ""
-    if read is not None and isinstance(value, str):
-        return read(value)
-    if isinstance(default, tuple) and isinstance(value, list | tuple) and all(map(_is_whole, value)):
-        return tuple(value)
-    if isinstance(default, float) and _is_whole(value):
-        return float(value)
-    kind, words = next(each for each in _KINDS if isinstance(default, each[0]))
-    if isinstance(value, bool) != (kind is bool) or not isinstance(value, kind):
-        raise InputError(f"run.{name} = {value!r} must be {words}")
-    return value
-
-
-_KINDS: tuple[tuple[type, str], ...] = (
-    (bool, "true or false"),
-    (int, "a whole number"),
-    (float, "a number"),
-    (tuple, "a list of whole numbers, or text"),
-    (str, "text"),
-)
-"""What a run's field takes, by the kind of its default; checked in this order, as a switch is a whole number, too."""
