@@ -122,8 +122,11 @@ class FmuPlant(FmuInstance):
         size = struct.calcsize(_CLOCK)
         if len(state) < size:
             raise FmuError(f"{self.path.name} cannot restore a state of {len(state)} bytes, which is no state of this plant")
+        clock = dict(zip(_CLOCKED, struct.unpack(_CLOCK, state[:size]), strict=True))
+        if not 0 <= clock["changed"] <= self.handle["change_count"]:
+            raise FmuError(f"{self.path.name} cannot restore a state after {clock['changed']} changes: it has not so many")
         super().restore(state[size:])
-        for name, value in zip(_CLOCKED, struct.unpack(_CLOCK, state[:size]), strict=True):
+        for name, value in clock.items():
             self.handle[name] = value
 
     def failure(self) -> FmuError:
