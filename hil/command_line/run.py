@@ -1,5 +1,6 @@
 """The commands that run the loop: simulate, run, replay, stream-target."""
 
+import sys
 from argparse import SUPPRESS, ArgumentTypeError, Namespace
 from dataclasses import fields, replace
 from math import inf
@@ -111,9 +112,15 @@ def gough_run(options: Namespace) -> int:
     whatever is measured.
     """
     keep_to_one_thread()
-    from hil.runs.executive import RunStoppedError, run
+    from hil.runs.executive import RunStoppedError, ignored_signals, run
 
     config, settings = cli.config_of(options, SimulationConfig), cli.config_of(options, RealTimeSettings)
+    if ignored := ignored_signals():
+        unheard = " and ".join(ignored)
+        print(
+            f"ignored, as what started this run asks: {unheard}; SIGTERM ends it by a controlled stop, SIGQUIT by an emergency stop",
+            file=sys.stderr,
+        )
     stopped: Exception | None = None
     with live_view(config.mechanism, config.target, config.rate) as show:
         try:

@@ -51,6 +51,7 @@ from plant.mechanism import load_spatial
 _BUFFER_S = 8.0
 _LEAST_RECORDS = 1024
 _LOOK_S = 0.1
+_STOPPING = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)
 
 
 class RunStoppedError(GoughError, RuntimeError):
@@ -72,8 +73,8 @@ def run(
 ) -> dict[str, Any]:
     """Run the closed loop on the machine's clock, to the end of its motion or until it is asked to stop.
 
-    SIGINT, SIGTERM and SIGHUP ask for a controlled stop, SIGQUIT for an emergency stop. Call it from the main thread, while no
-    other thread runs.
+    SIGINT, SIGTERM and SIGHUP ask for a controlled stop, unless they are ignored (`ignored_signals`). SIGQUIT always asks for an
+    emergency stop. Call it from the main thread, while no other thread runs.
 
     Args:
         config, settings: what to run, and how.
@@ -140,15 +141,22 @@ def _reported(state: RunState, recorders: Recorders) -> Iterator[None]:
         raise RunStoppedError("; ".join([str(error), *state.events, *files])) from None
 
 
+def ignored_signals() -> list[str]:
+    """The signals that cannot stop a run, because this process has been started to ignore them: as nohup asks for SIGHUP, and
+    the shell of a script for SIGINT of what it starts in the background.
+    """
+    return [each.name for each in _STOPPING if signal.getsignal(each) == signal.SIG_IGN]
+
+
 @contextmanager
 def _asked_to_stop(link: NDArray[np.int64]) -> Iterator[None]:
     def ask(number: int, frame: object) -> None:
         del frame
         link[Link.STOP] = max(int(link[Link.STOP]), StopRequest.QUICK if number == signal.SIGQUIT else StopRequest.CONTROLLED)
 
-    numbers = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM)
-    # A signal that is ignored, as under nohup, stays ignored.
-    before = {each: signal.signal(each, ask) for each in numbers if signal.getsignal(each) != signal.SIG_IGN}
+    # What is to be ignored stays ignored, but an emergency stop is always heard.
+    heard = (signal.SIGQUIT, *(each for each in _STOPPING if each.name not in ignored_signals()))
+    before = {each: signal.signal(each, ask) for each in heard}
     try:
         yield
     finally:

@@ -284,6 +284,27 @@ def test_a_signal_ends_the_motion_by_a_controlled_stop(tmp_path, number, whom):
     assert replay([path]).same
 
 
+def ignore_as_a_script_asks_of_its_background():
+    for number in (signal.SIGINT, signal.SIGQUIT):
+        signal.signal(number, signal.SIG_IGN)
+
+
+def test_an_emergency_stop_is_heard_by_a_run_that_was_told_to_ignore_it(tmp_path):
+    path = tmp_path / "run.mcap"
+    process, *others = started(path, preexec_fn=ignore_as_a_script_asks_of_its_background)
+    for pid in (process.pid, *others):
+        os.kill(pid, signal.SIGINT)
+    cycles = recorded_cycles(path)
+    wait_for(lambda: recorded_cycles(path) > cycles + 300 or process.poll() is not None)
+    process.send_signal(signal.SIGQUIT)
+    _, errors = process.communicate(timeout=30.0)
+    assert errors.splitlines()[0].startswith("ignored, as what started this run asks: SIGINT; SIGTERM ends it")
+    assert process.returncode == 1 and "emergency stop" in errors
+    found = read(path)
+    assert [cycle for cycle, text in found.events if "emergency stop" in text][0] > cycles + 300
+    assert (found.records["request"][-5:] != 1).all()
+
+
 @pytest.mark.slow
 def test_when_the_supervisor_is_killed_the_loop_stops_by_itself_and_the_file_is_complete(tmp_path):
     path = tmp_path / "run.mcap"
