@@ -5,6 +5,7 @@ counts those that were overwritten before. A record's layout is that of a ROS 2 
 bytes, and Foxglove and PlotJuggler open the file. Its attachments hold what a replay needs.
 """
 
+import errno
 import hashlib
 import io
 import json
@@ -40,6 +41,7 @@ _CHUNK_S = 0.25
 _POLL_S = 0.05
 _MOST_BYTES = 1 << 20
 _MOST_CHUNK = 16 * _MOST_BYTES  # even if another tool has written the file anew
+_NUMBERS = 1 << 32  # sequence numbers
 _CDR_TYPES = {"i4": "int32", "i8": "int64", "f4": "float32", "f8": "float64"}
 _EVENT_SCHEMA = "int64 cycle  # the period in which it happened\nstring text\n"
 
@@ -68,6 +70,7 @@ class Recorder:
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any], epoch_ns: int) -> None:
+        self._path, self._size = path, 0
         self._file = path.open("wb")
         self._epoch = epoch_ns
         self._writer: Any = Writer(self._file, chunk_size=_MOST_BYTES)
@@ -90,6 +93,19 @@ class Recorder:
         """Complete the chunk, so that all of it is in the file, whatever happens."""
         self._writer.flush()
         self._file.flush()
+        self._size = self._file.tell()
+
+    def check_file(self) -> None:
+        """Check that the path still names the file that was begun, and that nothing of it has been cut off.
+
+        Raises:
+            OSError: with `errno.ESTALE`; it was deleted, cut or replaced.
+        """
+        with suppress(FileNotFoundError):
+            ours = os.fstat(self._file.fileno())
+            if os.path.samestat(ours, self._path.stat()) and ours.st_size >= self._size:
+                return
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(self._path))
 
     def write(self, records: Record) -> None:
         """Append records (n,), dtype `RECORD`, and their events."""
@@ -105,7 +121,8 @@ class Recorder:
         """Append records (n,) alone."""
         for record in records:
             at = self._epoch + int(record["time_ns"])
-            self._writer.add_message(self._cycles, at, _LITTLE_ENDIAN_CDR + record.tobytes(), at, int(record["cycle"]))
+            number = int(record["cycle"]) % _NUMBERS
+            self._writer.add_message(self._cycles, at, _LITTLE_ENDIAN_CDR + record.tobytes(), at, number)
 
     def _news(self, record: Record) -> Iterator[str]:
         """The events of a cycle, and what has changed since the last eventful one."""
@@ -174,19 +191,30 @@ def take(records: Record, link: NDArray[np.int64], tail: int) -> tuple[Record, i
 
 
 def record(path: Path, header: Mapping[str, Any], records: Record, link: NDArray[np.int64]) -> None:
-    """Copy the loop's records to a file until it has ended; this is what the recorder's process runs."""
+    """Copy the loop's records to a file until it has ended; this is what the recorder's process runs.
+
+    Raises:
+        OSError: the file cannot be written; with `errno.ESTALE`, it was deleted, cut or replaced.
+    """
     supervisor = int(link[Link.SUPERVISOR])
     while not link[Link.HEAD] and not link[Link.DONE]:
         time.sleep(_POLL_S)
         if os.getppid() != supervisor:
             return
     recorder = Recorder(path, header, time.time_ns() - time.monotonic_ns() + int(link[Link.START]))
-    tail, kept, flushed = int(link[Link.TAIL]), int(link[Link.KEPT]), time.monotonic()
+    begin, kept_before, flushed = int(link[Link.TAIL]), int(link[Link.KEPT]), time.monotonic()
+    tail, kept = begin, kept_before
     ended = False
     while not ended:
         time.sleep(_POLL_S)
         done = bool(link[Link.DONE]) or (os.getppid() != supervisor and _has_ended(link))
         taken, tail, lost = take(records, link, tail)
+        try:
+            recorder.check_file()
+        except OSError:
+            # The next recorder writes what this file had, as far as it is in memory.
+            link[Link.KEPT], link[Link.TAIL] = kept_before, begin
+            raise
         if lost:
             recorder.write_event(tail, f"{lost} cycles lost: the recorder came too late")
         recorder.write(taken)

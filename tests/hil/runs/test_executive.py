@@ -301,7 +301,7 @@ def test_an_emergency_stop_is_heard_by_a_run_that_was_told_to_ignore_it(tmp_path
     assert errors.splitlines()[0].startswith("ignored, as what started this run asks: SIGINT; SIGTERM ends it")
     assert process.returncode == 1 and "emergency stop" in errors
     found = read(path)
-    assert [cycle for cycle, text in found.events if "emergency stop" in text][0] > cycles + 300
+    assert next(cycle for cycle, text in found.events if "emergency stop" in text) > cycles + 300
     assert (found.records["request"][-5:] != 1).all()
 
 
@@ -350,6 +350,53 @@ def test_when_the_recorder_is_killed_another_goes_on_and_no_cycle_is_lost_or_dou
     records = np.concatenate([read(each).records for each in (path, second)])
     assert accounted(records["cycle"], records["missed"])
     assert replay([path, second]).same
+
+
+def deleted(path):
+    path.unlink()
+
+
+def cut(path):
+    os.truncate(path, 1000)
+
+
+def replaced(path):
+    path.with_suffix(".other").write_bytes(b"of someone else")
+    path.with_suffix(".other").replace(path)
+
+
+@pytest.mark.parametrize(
+    "spoil", [deleted, pytest.param(cut, marks=pytest.mark.slow), pytest.param(replaced, marks=pytest.mark.slow)]
+)
+def test_a_recording_that_is_spoiled_while_it_goes_on_is_noticed_and_the_rest_is_kept(tmp_path, spoil):
+    path, second, figures = tmp_path / "run.mcap", tmp_path / "run-2.mcap", tmp_path / "run.json"
+    process, *_ = started(path, "--json", figures)
+    spoil(path)
+    left = path.read_bytes() if path.exists() else None
+    wait_for(lambda: recorded_cycles(second) > 300 or process.poll() is not None)
+    process.send_signal(signal.SIGTERM)
+    output, errors = process.communicate(timeout=30.0)
+    assert process.returncode == 0, errors
+    assert f"{path} was deleted, cut or replaced while it was recorded" in output
+    assert f"another recorder goes on in {second}" in output
+    summary = json.loads(figures.read_text())
+    # All that the first file had was still in memory.
+    assert summary["recording"] == {"files": [str(second)], "lost": 0}
+    assert len(read(second).records) == summary["cycles"] and replay([second]).same
+    assert (path.read_bytes() if path.exists() else None) == left
+
+
+def test_a_recording_that_is_deleted_in_the_end_is_written_again(tmp_path):
+    path, second = tmp_path / "run.mcap", tmp_path / "run-2.mcap"
+    process, _, recorder = started(path)
+    os.kill(recorder, signal.SIGSTOP)
+    path.unlink()
+    process.send_signal(signal.SIGTERM)
+    wait_for(lambda: not any(is_ours(child) for child in children(process.pid) if child != recorder))
+    os.kill(recorder, signal.SIGCONT)
+    output, errors = process.communicate(timeout=30.0)
+    assert process.returncode == 0 and f"{path} was deleted" in output, errors
+    assert read(second).complete and replay([second]).same
 
 
 # --------------------------------------------------------------------------------------------------------------- what is taken
