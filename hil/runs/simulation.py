@@ -9,6 +9,7 @@ import numpy as np
 
 from controller.direct_kinematics import poses_from_lengths
 from controller.planning.offline_planner import Reference
+from controller.planning.pace import required_stretch
 from controller.planning.target import Target
 from controller.safety.causes import Cause
 from hil.loop.records import COMPUTED
@@ -97,6 +98,7 @@ class SimulationResult:
             "estimated_tracking": _figures(estimate, reference),
             "target": planned if truth is None else _figures(truth, target) | planned,
             "limits": {"violations": self.reference.violations},
+            "target_stretch": required_stretch(self.mechanism, self.target),
             "real_time_factor": self.real_time_factor,
             "cycle_us": percentiles(self.records["stage_ns"][:, COMPUTED].sum(axis=1), tuple(QUANTILES)),
             "config": asdict(self.config),
