@@ -107,13 +107,15 @@ RUN = {
     "events": ["cycle 3: armed"],
     "recording": {"files": ["a.mcap", "b.mcap"], "lost": 200},
     "round_trip_bars": [[8.0, 9.5, 16.0], [3.0, 1.0, 2.0]],
-    "identity": {"name": "rig", "parts": {"drive": "1"}},
+    "identity": {"name": "rig", "parts": {"drive": "1", "IMU": "2"}},
+    "config": {"fusion": "compiled"},
+    "target_stretch": 1.0,
     "obstacle": None,
 }  # fmt: skip
 
 
 def test_a_run_prints_its_figures(tables, capsys, monkeypatch):
-    monkeypatch.setattr("hil.loop.stage_times.budget", lambda: {"wake": {"p50": 1.0, "p99": 19.0, "max": 5000.0}})
+    monkeypatch.setattr("hil.loop.stage_times.budget", lambda fusion: {"wake": {"p50": 1.0, "p99": 19.0, "max": 5000.0}})
     run._print_run(RUN)
     ((headings, *rows),) = tables
     assert headings == ["us", "p50 / budget", "p99 / budget", "p99.9 / budget", "max / budget"]
@@ -122,7 +124,7 @@ def test_a_run_prints_its_figures(tables, capsys, monkeypatch):
     lines = capsys.readouterr().out.splitlines()
     for line in (
         "cycle 3: armed",
-        "within the timing budget (hil/loop/budget.toml)",
+        "over budget, as the table shows: wake p99",
         "without locked memory",
         "1200 cycles; periods missed: 1 by own work, 2 woken late, 3 held up by the host",
         "the loop's thread: 4 major and 5 minor page faults, 6 involuntary switches, 7 bytes of growth; first cycle 1.25 s "
@@ -131,8 +133,8 @@ def test_a_run_prints_its_figures(tables, capsys, monkeypatch):
         "round trip to the rig p50 11, p99 12, p99.9 13, max 14 us",
         "8 exchanges late, 9 packets refused",
         "1000 cycles recorded in a.mcap, b.mcap; 200 cycles lost",
-        "rig: rig {'drive': '1'}",
-        "stopped on the brakes: end of the motion",
+        "rig: rig; drive 1, IMU 2",
+        "the motion went to its end, and the brakes hold",
     ):
         assert line in lines
     assert not any("arming" in line or "supervisor came too late" in line for line in lines)
@@ -141,7 +143,20 @@ def test_a_run_prints_its_figures(tables, capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "line", "without"),
     [
-        ({"over_budget": ["wake p50"]}, "over budget: wake p50", "within the timing budget"),
+        (
+            {"timing_us": {"record": FIGURES_US, "compute": FIGURES_US}},
+            "over budget, as the table shows: record p99, p999, max; compute p999, max",
+            "within the timing budget",
+        ),
+        ({}, "within the timing budget (hil/loop/budget.toml)", "over budget"),
+        ({"cause": "asked for"}, "stopped on the brakes: asked for", "went to its end"),
+        (
+            {"target_stretch": 10.25},
+            "the target is too fast for the legs' limits, so the reference stays behind it: stretched in time by 10.2, it "
+            "could be followed",
+            "rig: rig {",
+        ),
+        ({"identity": {"name": "template", "parts": {}}}, "rig: template", "rig: template;"),
         ({"errors_m": RUN["errors_m"] | {"known": 0}}, "the truth is not known; reference - length 0.500 mm RMS", "estimate -"),
         ({"timing_us": {"wake": FIGURES_US}}, "1000 cycles recorded in a.mcap, b.mcap; 200 cycles lost", "round trip"),
         ({"unseen": 17}, "17 cycles are in none of these figures: the supervisor came too late", "nothing was moved"),
