@@ -200,7 +200,9 @@ def run_stages(
         return Cause.NONE.value
     t = now(m.timespec)
     if first <= CycleStage.SCREENING < last:
-        imu_health.screen_imus(p.imus, s.imus, rig.legs, time, s.safety.watch.silent, measurement, s.safety.events)
+        imu_health.screen_imus(
+            p.imus, s.imus, rig, time, s.safety.watch.silent, measurement, s.reference.motion, s.safety.events
+        )  # fmt: skip
         t = _mark(m, CycleStage.SCREENING, t)
     if first <= CycleStage.LEGS < last:
         leg_filter.step_leg_filters(p.legs, s.legs, rig, time, s.imus)
@@ -289,10 +291,12 @@ def skip_periods(state: Record, missed: int) -> None:
 
 
 @kernel
-def hear_rig(parameters: Record, state: Record, sample_age: Array, drive: Array, silent: int) -> None:
+def hear_rig(parameters: Record, state: Record, sample_age: Array, drive: Array, drive_code: Array, silent: int) -> None:
     """Before a cycle: take the rig's report, as `controller.safety.watch.update_rig_status` has it."""
     p, s = parameters[()], state[()]
-    watch.update_rig_status(p.safety, s.safety, p.rig, s.time, s.imus, s.reference, s.pid, sample_age, drive, silent)
+    watch.update_rig_status(
+        p.safety, s.safety, p.rig, s.time, s.imus, s.reference, s.pid, sample_age, drive, drive_code, silent
+    )  # fmt: skip
 
 
 @kernel

@@ -69,13 +69,13 @@ def watch_parameters(settings: SafetySettings, rate: float, limits: Limits) -> R
 @kernel
 def update_rig_status(
     p: Record, s: Record, rig: Record, time: Record, imus: Record, reference: Record, pid: Record, sample_age: Array,
-    drive: Array, silent: int,
+    drive: Array, drive_code: Array, silent: int,
 ) -> None:  # fmt: skip
     """Before a cycle: take the rig's report, and react to a lost bus and to drives that left their operation.
 
     Args:
         sample_age: (7,), of each IMU's sample, in cycles.
-        drive: (6,), of each drive its `DriveState`.
+        drive, drive_code: (6,), of each drive its `DriveState` and its own fault code.
         silent: for how many cycles the rig has not answered.
     """
     w = s.watch
@@ -92,18 +92,14 @@ def update_rig_status(
     if s.request != Request.ENABLED:
         return
     if silent >= most or w.unanswered >= 2 * most:
-        handle_cause(p, s, rig, time, reference, pid, Cause.BUS_LOST, -1, unanswered_for(w), float(most))
+        handle_cause(
+            p, s, rig, time, reference, pid, Cause.BUS_LOST, -1, float(max(silent, w.unanswered)), float(most)
+        )  # fmt: skip
     for k in range(rig.legs):
         if drive[k] == DriveState.FAULTY:
-            handle_cause(p, s, rig, time, reference, pid, Cause.DRIVE_FAULT, k, np.nan, np.nan)
+            handle_cause(p, s, rig, time, reference, pid, Cause.DRIVE_FAULT, k, float(drive_code[k]), np.nan)
         elif s.mode != Mode.ARMED and drive[k] != DriveState.FOLLOWING:
             handle_cause(p, s, rig, time, reference, pid, Cause.DRIVE_OFF, k, np.nan, np.nan)
-
-
-@kernel
-def unanswered_for(w: Record) -> float:
-    """For how many cycles the rig has not answered, in a row or more often than it did."""
-    return float(max(w.silent, w.unanswered))
 
 
 @kernel

@@ -2,7 +2,7 @@
 
 import inspect
 import json
-from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from argparse import SUPPRESS, ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
@@ -122,10 +122,11 @@ def names_of(config: "type[C]", *without: str) -> list[str]:
     return [each.name for each in fields(config) if "option" in each.metadata and each.name not in without]
 
 
-def options_of(config: "type[C]", *names: str, **changes: Mapping[str, Any]) -> Argument:
+def options_of(config: "type[C]", *names: str, only_given: bool = False, **changes: Mapping[str, Any]) -> Argument:
     """The options of a configuration's fields; all of them without names or changes.
 
-    `changes` has by field what is different in this command: `default`, or attributes of `Option`.
+    `changes` has by field what is different in this command: `default`, or attributes of `Option`. With `only_given`, an option
+    that is not given is no attribute of the parsed ones, and `config_of` takes the field's default.
     """
 
     def add(parser: ArgumentParser) -> None:
@@ -134,6 +135,8 @@ def options_of(config: "type[C]", *names: str, **changes: Mapping[str, Any]) -> 
             form = dict(changes.get(name, {}))
             default = form.pop("default", declared[name].default)
             _add_option(parser, name, default, replace(declared[name].metadata["option"], **form))
+            if only_given:
+                parser.set_defaults(**{name: SUPPRESS})
 
     return add
 

@@ -165,12 +165,12 @@ def _kinematics(_: Namespace, figures: dict[str, Any]) -> None:
         cells = []
         for name in names:
             found = [methods[name] for methods in members if name in methods]
-            medians = (f"{median(each[kind] for each in found):.2f}" for kind in ("closed_form", "refined"))
+            medians = (f"{median(each[kind] for each in found):.3g}" for kind in ("closed_form", "refined"))
             cells.append(" / ".join(medians) if found else "-")
         table.add(group, *cells)
     newton = measured["newton"]
     times = {name: f"{ratio['closed_form']:.1f} / {ratio['refined']:.1f}" for name, ratio in newton["ratios"].items()}
-    table.add("hexapod, over Newton", *(times.get(name, "-") for name in names))
+    table.add("over Newton", *(times.get(name, "-") for name in names))
     table.print()
     rates = ", ".join(f"{name} {rate / 1e3:.0f}" for name, rate in measured["batch_per_s"].items())
     print(f"refined poses per second on all cores [thousands]: {rates}; one call from Python {measured['call_us']:.0f} us")

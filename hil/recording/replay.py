@@ -154,7 +154,7 @@ def _replay(
             react(parameters, state, Cause.RIG_FAILED, -1, np.nan, np.nan)
             ramp_down(p.safety.stop, p.rig, s.time, s.pid)
         else:
-            hear_rig(parameters, state, recorded.sample_age, recorded.drive, recorded.silent)
+            hear_rig(parameters, state, recorded.sample_age, recorded.drive, recorded.drive_code, recorded.silent)
             cycle(parameters, state, measurement, segments, marks)
         record_state(state, again[k])
         prepare_next(parameters, state, segments)

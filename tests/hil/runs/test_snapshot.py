@@ -103,6 +103,12 @@ def test_what_does_not_go_together_is_refused(saved: tuple[SimulationConfig, Pat
     assert "another motion was planned" in refused(replace(config, target="sines", duration=1.0), path)
     assert main(["simulate", "--load-state", str(path), "--rate", "500"]) == 2
     assert "the snapshot was taken with rate 1000.0, and cannot go on with 500.0: leave it out" in capsys.readouterr().err
+    # What is given counts, even if it is the default.
+    slower = simulate(replace(config, rate=500.0, duration=0.1), save_at=0.1).snapshot
+    assert slower is not None
+    write_snapshot(slower, path.with_name("slower"))
+    assert main(["simulate", "--load-state", str(path.with_name("slower")), "--rate", "1000"]) == 2
+    assert "the snapshot was taken with rate 500.0, and cannot go on with 1000.0: leave it out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("save_at", [-1.0, 0.6, np.nan])
