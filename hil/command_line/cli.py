@@ -2,7 +2,7 @@
 
 import inspect
 import json
-from argparse import SUPPRESS, ArgumentParser, ArgumentTypeError, Namespace
+from argparse import SUPPRESS, Action, ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
@@ -134,25 +134,24 @@ def options_of(config: "type[C]", *names: str, only_given: bool = False, **chang
         for name in (*names, *changes) or names_of(config):
             form = dict(changes.get(name, {}))
             default = form.pop("default", declared[name].default)
-            _add_option(parser, name, default, replace(declared[name].metadata["option"], **form))
+            added = _add_option(parser, name, default, replace(declared[name].metadata["option"], **form))
             if only_given:
-                parser.set_defaults(**{name: SUPPRESS})
+                added.default = SUPPRESS
 
     return add
 
 
-def _add_option(parser: ArgumentParser, name: str, default: Any, option: Option) -> None:
+def _add_option(parser: ArgumentParser, name: str, default: Any, option: Option) -> Action:
     flag = option.flag or f"--{'no-' if default is True else ''}{name.replace('_', '-')}"
     if isinstance(default, bool):
         action = "store_false" if default else "store_true"
-        parser.add_argument(flag, dest=name, action=action, help=option.text)
-        return
+        return parser.add_argument(flag, dest=name, action=action, help=option.text)
     scale = _SCALES.get(option.unit, 1.0)
     parse = option.parse or (type(default) if isinstance(default, int | float) else str)
     text = option.text + (f" [{option.unit}]" if option.unit else "")
     if not option.required and (shown := option.shown or _shown(default, scale)):
         text += f" (default: {shown})"
-    parser.add_argument(
+    return parser.add_argument(
         flag,
         dest=name,
         default=list(default) if option.several else default,

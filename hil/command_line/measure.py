@@ -165,8 +165,8 @@ def _kinematics(_: Namespace, figures: dict[str, Any]) -> None:
         cells = []
         for name in names:
             found = [methods[name] for methods in members if name in methods]
-            medians = (f"{median(each[kind] for each in found):.3g}" for kind in ("closed_form", "refined"))
-            cells.append(" / ".join(medians) if found else "-")
+            medians = (median(each[kind] for each in found) for kind in ("closed_form", "refined") if found)
+            cells.append(" / ".join(f"{us:.{2 if us < 10.0 else 1}f}" for us in medians) or "-")
         table.add(group, *cells)
     newton = measured["newton"]
     times = {name: f"{ratio['closed_form']:.1f} / {ratio['refined']:.1f}" for name, ratio in newton["ratios"].items()}

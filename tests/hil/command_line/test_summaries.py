@@ -65,6 +65,7 @@ def simulated(truth_known):
         "estimated_tracking": pose_figures(5.0),
         "target": target,
         "limits": {"violations": 7},
+        "target_stretch": 1.0,
         "real_time_factor": 12.34,
         "cycle_us": {"p50": 1.0, "p99": 2.0, "p999": 3.0},
     }
@@ -420,7 +421,7 @@ def test_plant_and_kinematics_are_printed_in_their_units(monkeypatch, tables, ca
     }  # fmt: skip
     monkeypatch.setattr("hil.benchmarks.kinematics.measure_kinematics", lambda progress: kinematics)
     measure._kinematics(SimpleNamespace(), {})
-    assert tables[2][1:] == [["n-6", "3.00 / 6.00"], ["hexapod", "3.00 / 6.00"], ["hexapod, over Newton", "0.5 / 1.0"]]
+    assert tables[2][1:] == [["n-6", "3.00 / 6.00"], ["hexapod", "3.00 / 6.00"], ["over Newton", "0.5 / 1.0"]]
     assert tables[3][1:] == [["hexapod, wide", "50.0", "25.0", "100.0", "0.0"]]
     printed = capsys.readouterr().out
     assert "[thousands]: legs 2000; one call from Python 40 us" in printed and "warm: 6.00 us per pose" in printed

@@ -72,8 +72,8 @@ def only(count, *where, value):
 @pytest.mark.parametrize(
     "wrong, clause, count, text",
     [
-        ({"command": -1.0}, "commands", 6, "Leg 0 moved by -2.0"),
-        ({"command": only(6, 4, value=-1.0)}, "commands", 1, "Leg 4 moved by -2.0"),
+        ({"command": -1.0}, "commands", 6, "Leg 0 moved by -"),
+        ({"command": only(6, 4, value=-1.0)}, "commands", 1, "Leg 4 moved by -"),
         ({"command": only(6, 2, value=0.3)}, "commands", 1, "Leg 2 moved by 0."),
         ({"gyroscope": np.degrees(1.0)}, "gyroscopes", 6, "The gyroscope of IMU 0 reads other turns"),
         ({"gyroscope": -1.0}, "gyroscopes", 7, "The gyroscope of IMU 0 reads other turns than the motion makes, -1"),
