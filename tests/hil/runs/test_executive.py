@@ -298,7 +298,8 @@ def test_an_emergency_stop_is_heard_by_a_run_that_was_told_to_ignore_it(tmp_path
     wait_for(lambda: recorded_cycles(path) > cycles + 300 or process.poll() is not None)
     process.send_signal(signal.SIGQUIT)
     _, errors = process.communicate(timeout=30.0)
-    assert errors.splitlines()[0].startswith("ignored, as what started this run asks: SIGINT; SIGTERM ends it")
+    said = errors.splitlines()[0]
+    assert said.startswith("ignored, as what started this run asks: ") and "SIGINT; SIGTERM ends it" in said
     assert process.returncode == 1 and "emergency stop" in errors
     found = read(path)
     assert next(cycle for cycle, text in found.events if "emergency stop" in text) > cycles + 300
