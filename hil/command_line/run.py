@@ -7,6 +7,7 @@ from math import inf
 from typing import TYPE_CHECKING, Any
 
 from hil.command_line import cli
+from hil.command_line.apart import go_on_apart
 from hil.command_line.terminal import QUANTILES, deg, live_view, mm, progress_bar
 from hil.realtime.scheduling import RealTimeSettings, keep_to_one_thread
 from hil.runs.config import SimulationConfig
@@ -36,6 +37,8 @@ _NOTICED_STRETCH = 1.05
 )
 def gough_simulate(options: Namespace) -> None:
     """Follow a target on the FMU plant, as fast as the machine can."""
+    if options.own_process and (options.plant or options.load_state):
+        go_on_apart(f"the FMU {options.plant or f'of the snapshot {options.load_state}'}")
     from hil.runs.simulation import SimulationStoppedError, simulate
     from hil.runs.snapshot import read_snapshot, write_snapshot
 
