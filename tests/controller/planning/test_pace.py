@@ -32,7 +32,7 @@ def behind(mechanism, target):
     return np.abs(planned - leg_lengths(mechanism, *target.at(times))).max()
 
 
-@pytest.mark.parametrize("faster", [1.0, 10.0, 20.0])
+@pytest.mark.parametrize("faster", [1.0, 6.0, 10.0])
 def test_a_target_that_is_stretched_by_it_is_followed(hexapod, faster):
     target = heave(hexapod, 0.02, 2.0 / faster)
     stretch = required_stretch(hexapod, target)
