@@ -37,8 +37,9 @@ _NOTICED_STRETCH = 1.05
 )
 def gough_simulate(options: Namespace) -> None:
     """Follow a target on the FMU plant, as fast as the machine can."""
-    if options.own_process and (options.plant or options.load_state):
-        go_on_apart(f"the FMU {options.plant or f'of the snapshot {options.load_state}'}")
+    plant = getattr(options, "plant", None) or (options.load_state and f"of the snapshot {options.load_state}")
+    if options.own_process and plant:
+        go_on_apart(f"the FMU {plant}")
     from hil.runs.simulation import SimulationStoppedError, simulate
     from hil.runs.snapshot import read_snapshot, write_snapshot
 
