@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from controller.direct_kinematics.solver import METHODS
 from controller.safety.causes import Cause, Mode
 from hil.command_line import calibrate, main, measure, run, study
 from hil.command_line.terminal import _view, deg, mm, mm_deg
@@ -425,3 +426,17 @@ def test_plant_and_kinematics_are_printed_in_their_units(monkeypatch, tables, ca
     assert tables[3][1:] == [["hexapod, wide", "50.0", "25.0", "100.0", "0.0"]]
     printed = capsys.readouterr().out
     assert "[thousands]: legs 2000; one call from Python 40 us" in printed and "warm: 6.00 us per pose" in printed
+
+
+def test_the_table_of_kinematics_fits_100_columns(monkeypatch, capsys):
+    times = {name: {"closed_form": 12.34, "refined": 23.45} for name in METHODS}
+    kinematics = {
+        "solve_us": {"n-4-II.1": times}, "hexapod_us": times, "call_us": 40.0, "batch_per_s": {}, "cold_starts": {},
+        "newton": {"warm_us": 6.0, "ratios": times},
+    }  # fmt: skip
+    monkeypatch.setattr("hil.benchmarks.kinematics.measure_kinematics", lambda progress: kinematics)
+    measure._kinematics(SimpleNamespace(), {})
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines[:7])) <= 100
+    assert any(all(name in line for name in METHODS) for line in lines)
+    assert sum(line.count("12.3 / 23.4") == len(METHODS) for line in lines) == 3
