@@ -160,7 +160,7 @@ def _kinematics(_: Namespace, figures: dict[str, Any]) -> None:
         groups.setdefault(label.rpartition(".")[0], []).append(methods)
     groups["hexapod"] = [measured["hexapod_us"]]
     names = list(dict.fromkeys(name for methods in groups.values() for name in methods[0]))
-    table = Table("us, closed / refined", *names)
+    table = Table("us", *names)
     for group, members in groups.items():
         cells = []
         for name in names:
@@ -172,6 +172,7 @@ def _kinematics(_: Namespace, figures: dict[str, Any]) -> None:
     times = {name: f"{ratio['closed_form']:.1f} / {ratio['refined']:.1f}" for name, ratio in newton["ratios"].items()}
     table.add("over Newton", *(times.get(name, "-") for name in names))
     table.print()
+    print("closed form / refined")
     rates = ", ".join(f"{name} {rate / 1e3:.0f}" for name, rate in measured["batch_per_s"].items())
     print(f"refined poses per second on all cores [thousands]: {rates}; one call from Python {measured['call_us']:.0f} us")
     print(f"Newton's method from lengths, warm: {newton['warm_us']:.2f} us per pose")
