@@ -22,9 +22,12 @@ import numpy as np
 from controller import load_feed_forward, pid, reference
 from controller import safety as safety_stage
 from controller.calibration.file import Calibration
+from controller.direct_kinematics.geometry import LINEAR_RANK
 from controller.estimation import heading_filter, imu_health, imu_monitor, leg_filter, platform_filter, pose_estimator
 from controller.estimation.whole_mechanism import trust
-from controller.estimation.whole_mechanism.parameters import filter_parameters
+from controller.estimation.whole_mechanism.imu_errors import ERRORS
+from controller.estimation.whole_mechanism.parameters import MOST_STATES, filter_parameters
+from controller.estimation.whole_mechanism.readings import MOTION_STATES, RIG_ERRORS
 from controller.imu_set import check_imus, imus_of
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import RANK_TOLERANCE
@@ -34,10 +37,11 @@ from controller.safety.causes import Cause, Mode, Request
 from controller.safety.stop import handle_cause, ramp_down
 from controller.settings import ControlSettings, FusionSettings, SafetySettings
 from plant.checks import check_rate
-from plant.compiled import Record, filled, kernel, record_dtype
+from plant.compiled import MOST, Limits, Record, filled, kernel, record_dtype
 from plant.errors import InputError
 from plant.imu_wiring import ALL_IMUS
-from plant.mechanism import Mechanism
+from plant.mechanism import LEGS, Mechanism
+from plant.mechanism.planar import PLANAR_LEGS
 from plant.pose import Array
 from plant.stopwatch import now
 
@@ -57,6 +61,17 @@ PARAMETERS = record_dtype(
 )
 """The constants of the cycle by stage, in SI units."""
 
+PARAMETER_LIMITS: Limits = {
+    "rig.legs": (PLANAR_LEGS, LEGS),
+    "rig.geometry.ranks": (0, LINEAR_RANK),
+    "heading.sample_cycles": (1, MOST),
+    "mechanism.filter.window": (1, MOST),
+    "mechanism.filter.errors": (0, ERRORS),
+    "mechanism.filter.rig": (0, RIG_ERRORS),
+    "mechanism.filter.states": (MOTION_STATES, MOST_STATES),
+}
+"""Least and greatest of the constants that count, index or divide."""
+
 STATE = record_dtype(
     time=TIME,
     imus=imu_health.STATE,
@@ -71,6 +86,17 @@ STATE = record_dtype(
     safety=safety_stage.STATE,
 )
 """The state of the cycle by stage; zeros before the first cycle."""
+
+RUNNING_LIMITS: Limits = {
+    "time.cycle": (0, MOST),
+    "reference.index": (0, MOST),
+    "safety.mode": (Mode.IDLE, Mode.RUNNING),
+    "safety.stop.cause": (Cause.NONE, Cause.NONE),
+    "safety.stop.earlier_cause": (Cause.NONE, Cause.NONE),
+    "safety.arming.obstacle": (Cause.NONE, max(Cause)),
+    "safety.events.count": (0, 0),
+}
+"""The same of the state between two cycles of a run that is not stopping."""
 
 
 class CycleStage(IntEnum):
@@ -174,7 +200,9 @@ def run_stages(
         return Cause.NONE.value
     t = now(m.timespec)
     if first <= CycleStage.SCREENING < last:
-        imu_health.screen_imus(p.imus, s.imus, rig.legs, time, s.safety.watch.silent, measurement, s.safety.events)
+        imu_health.screen_imus(
+            p.imus, s.imus, rig, time, s.safety.watch.silent, measurement, s.reference.motion, s.safety.events
+        )  # fmt: skip
         t = _mark(m, CycleStage.SCREENING, t)
     if first <= CycleStage.LEGS < last:
         leg_filter.step_leg_filters(p.legs, s.legs, rig, time, s.imus)
@@ -263,10 +291,12 @@ def skip_periods(state: Record, missed: int) -> None:
 
 
 @kernel
-def hear_rig(parameters: Record, state: Record, sample_age: Array, drive: Array, silent: int) -> None:
+def hear_rig(parameters: Record, state: Record, sample_age: Array, drive: Array, drive_code: Array, silent: int) -> None:
     """Before a cycle: take the rig's report, as `controller.safety.watch.update_rig_status` has it."""
     p, s = parameters[()], state[()]
-    watch.update_rig_status(p.safety, s.safety, p.rig, s.time, s.imus, s.reference, s.pid, sample_age, drive, silent)
+    watch.update_rig_status(
+        p.safety, s.safety, p.rig, s.time, s.imus, s.reference, s.pid, sample_age, drive, drive_code, silent
+    )  # fmt: skip
 
 
 @kernel

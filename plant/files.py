@@ -14,6 +14,13 @@ from plant.errors import InputError
 
 _LOCK = "gough.lock"
 
+_MOST_UNPACKED, _MOST_TIMES = 64 << 20, 100
+
+
+def most_unpacked(packed: int) -> int:
+    """The most bytes that a file of `packed` bytes may hold unpacked: real ones hold ten times as many at most, or few."""
+    return _MOST_UNPACKED + _MOST_TIMES * packed
+
 
 def read_text(path: Path | str) -> str:
     """The text of a file, or an `InputError`."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from plant.checks import checked_seed
-from plant.compiled import Record, kernel, record_dtype
+from plant.compiled import MOST, Limits, Record, kernel, record_dtype
 from plant.errors import InputError, UnknownNameError
 from plant.imu_wiring import IMU_COUNT, RIGHT_WIRING, Wiring
 from plant.pose import Array, rotation_from_vector
@@ -147,6 +147,14 @@ IMU_STATE = record_dtype(
     normals=(np.float64, 6),
 )
 """Constants and state of the imperfections of seven IMUs; a copy is a snapshot."""
+
+IMU_LIMITS: Limits = {
+    "place": (0, IMU_COUNT - 1),
+    "delay": (0, _LONGEST_DELAY),
+    "magnetometer_every": (1, MOST),
+    "cycle": (0, MOST),
+}
+"""Least and greatest of what counts, indexes or divides in them."""
 
 
 Word = np.uint64 | int

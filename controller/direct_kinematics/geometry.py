@@ -20,7 +20,7 @@ ROTATION_EQUATIONS = 20  # that the elements of a rotation obey, quadratic ones
 _SETS = 1 << LEGS
 # Greatest rank that is used of the legs' equations. With three parameters open, the equations of a rotation settle those with
 # a sixth of the error that the last three pivots of a 6-6 mechanism would bring.
-_LINEAR_RANK = 9
+LINEAR_RANK = 9
 
 GEOMETRY = record_dtype(
     base_joints=(np.float64, (LEGS, 3)),  # [m]
@@ -74,7 +74,7 @@ def geometry_of(mechanism: Mechanism) -> Record:
             if len(legs) > 3:
                 geometry["bulges"][number] = spread[2] / size
         # Two legs of one platform joint already fix it as a point: further legs add nothing to the rank.
-        geometry["ranks"][number] = min(_LINEAR_RANK, int(np.minimum(2 * np.bincount(numbers[legs]), 3).sum()))
+        geometry["ranks"][number] = min(LINEAR_RANK, int(np.minimum(2 * np.bincount(numbers[legs]), 3).sum()))
     return geometry[()]
 
 

@@ -6,9 +6,11 @@ their normal matrix gives the covariance.
 
 import operator
 import os
+import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from controller.direct_kinematics import solver
 from controller.direct_kinematics.geometry import geometry_of
 from controller.direct_kinematics.solver import METHODS, SOLVED, WORK, Measurements, Results, solve_rows
+from plant.compiled import Record
 from plant.errors import InputError, SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import UNIT_TOLERANCE, Array, Pose, numbers, rotation_angle
@@ -98,11 +101,16 @@ class Solutions:
         row = range(len(self))[operator.index(index)]
         if not self.solved[row]:
             raise self.errors[row]
-        return Solution(
-            self.positions[index], self.rotations[index], self.covariances[index], self.residuals[index],
-            float(self.chi_squares[index]), int(self.degrees_of_freedom[index]), METHODS[self.methods[index]],
-            float(self.conditionings[index]),
-        )  # fmt: skip
+        return _solution(self, row)
+
+
+def _solution(found: "Solutions | Results", row: int) -> Solution:
+    """The solution of a row, with views of its arrays."""
+    return Solution(
+        found.positions[row], found.rotations[row], found.covariances[row], found.residuals[row],
+        float(found.chi_squares[row]), int(found.degrees_of_freedom[row]), METHODS[found.methods[row]],
+        float(found.conditionings[row]),
+    )  # fmt: skip
 
 
 def solve(
@@ -142,7 +150,10 @@ def solve(
     """
     given = _shapes_checked(leg_directions, rotation, normal, up_in_platform)
     arrays = {name: array[None] for name, array in given.items()}
-    return _solve(mechanism, arrays, method, refine, (leg_sigma, tilt_sigma, yaw_sigma), 1, "")[0]
+    results = _solve(mechanism, arrays, method, refine, (leg_sigma, tilt_sigma, yaw_sigma), 1, "")
+    if results.statuses[0] != SOLVED:
+        raise _error(mechanism, arrays, method, results.statuses[0], 0, "")
+    return _solution(results, 0)
 
 
 def solve_batch(
@@ -171,7 +182,12 @@ def solve_batch(
     arrays = _shapes_checked(directions, rotation, normal, up_in_platform, len(directions) if directions.ndim else 0)
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return _solve(mechanism, arrays, method, refine, (leg_sigma, tilt_sigma, yaw_sigma), workers, " of row {row}")
+    where = " of row {row}"
+    results = _solve(mechanism, arrays, method, refine, (leg_sigma, tilt_sigma, yaw_sigma), workers, where)
+    solved = results.statuses == SOLVED
+    unsolved = np.flatnonzero(~solved).tolist()
+    errors = {row: _error(mechanism, arrays, method, results.statuses[row], row, where) for row in unsolved}
+    return Solutions(*results[:-1], solved, errors)
 
 
 def pose_difference(first: Solution | Pose, second: Solution | Pose) -> tuple[float, float]:
@@ -207,32 +223,26 @@ def _solve(
     sigmas: tuple[float, float, float],
     workers: int,
     where: str,
-) -> Solutions:
+) -> Results:
+    """Solve all rows; an `InputError` if one is refused."""
     check_spatial(mechanism)
     if not isinstance(refine, bool | np.bool_):
         raise InputError(f"refine must be True or False, got {refine!r}")
     if not isinstance(workers, int) or workers < 1:
         raise InputError(f"workers is {workers!r}; it must be a whole number of threads, 1 at least")
-    candidates = _candidates(method, arrays)
-    weights = []
-    for name, sigma in zip(("leg_sigma", "tilt_sigma", "yaw_sigma"), sigmas, strict=True):
-        value = _shaped(sigma, (), name)
-        if not LEAST_SIGMA <= value < np.inf:
-            raise InputError(f"{name} is {sigma}; it must be at least {LEAST_SIGMA:g} and finite [rad]")
-        weights.append(float(value) ** -2)
+    candidates = _candidates(method, tuple(arrays))
+    weights = [_weight(name, sigma) for name, sigma in zip(_SIGMAS, sigmas, strict=True)]
     count = len(arrays["leg_directions"])
     measurements = Measurements(
-        arrays["leg_directions"], arrays.get("rotation", np.empty((0, 3, 3))), arrays.get("up_in_platform", np.empty((0, 3))),
-        arrays.get("normal", np.empty((0, 3))), _axes_about(mechanism.up_in_base), *weights,
+        arrays["leg_directions"], arrays.get("rotation", _NO_ROTATIONS), arrays.get("up_in_platform", _NO_VECTORS),
+        arrays.get("normal", _NO_VECTORS), _axes_of(mechanism), *weights,
     )  # fmt: skip
-    results = Results(
-        *(np.full((count, *shape), np.nan) for shape in ((3,), (3, 3), (6, 6), (LEGS, 3), ())),
-        *(np.zeros(count, kind) for kind in (np.int64, np.int64, np.float64, np.int64)),
-    )
+    # Copies take a third of the time, which counts where Python closes a loop.
+    results = Results._make([each.copy() for each in _ONE_ROW]) if count == 1 else _no_results(count)
 
     def solve_chunk(start: int) -> None:
         stop = min(start + _CHUNK, count)
-        solve_rows(geometry_of(mechanism), np.zeros((), WORK), measurements, candidates, refine, results, start, stop)
+        solve_rows(geometry_of(mechanism), _memory.work, measurements, candidates, refine, results, start, stop)
 
     starts = range(0, count, _CHUNK)
     if workers == 1 or len(starts) <= 1:
@@ -241,12 +251,30 @@ def _solve(
     else:
         with ThreadPoolExecutor(workers) as pool:
             list(pool.map(solve_chunk, starts))
-    for row in np.flatnonzero(results.statuses == solver.REFUSED).tolist():
+    if (refused := results.statuses == solver.REFUSED).any():
+        row = int(refused.argmax())
         raise _refusal(arrays, row, where.format(row=row))
-    solved = results.statuses == SOLVED
-    unsolved = np.flatnonzero(~solved).tolist()
-    errors = {row: _error(mechanism, arrays, method, results.statuses[row], row, where) for row in unsolved}
-    return Solutions(*results[:-1], solved, errors)
+    return results
+
+
+_SIGMAS = ("leg_sigma", "tilt_sigma", "yaw_sigma")
+_NO_ROTATIONS, _NO_VECTORS = np.empty((0, 3, 3)), np.empty((0, 3))
+
+
+def _weight(name: str, sigma: float) -> float:
+    """The inverse variance."""
+    value = sigma if isinstance(sigma, float) else float(_shaped(sigma, (), name))
+    if not LEAST_SIGMA <= value < np.inf:
+        raise InputError(f"{name} is {sigma}; it must be at least {LEAST_SIGMA:g} and finite [rad]")
+    return float(value) ** -2
+
+
+def _no_results(count: int) -> Results:
+    """Results of so many rows, before they are found."""
+    return Results(
+        *(np.full((count, *shape), np.nan) for shape in ((3,), (3, 3), (6, 6), (LEGS, 3), ())),
+        *(np.zeros(count, kind) for kind in (np.int64, np.int64, np.float64, np.int64)),
+    )
 
 
 def check_spatial(mechanism: Mechanism) -> None:
@@ -255,18 +283,38 @@ def check_spatial(mechanism: Mechanism) -> None:
         raise InputError(f"the mechanism must be a Mechanism of six legs, not a {type(mechanism).__name__}")
 
 
-def _candidates(method: str, arrays: dict[str, Array]) -> NDArray[np.int64]:
+_ONE_ROW = _no_results(1)
+
+
+class _Memory(threading.local):
+    """The solver's memory, which it keeps for no longer than a row: one for each thread."""
+
+    def __init__(self) -> None:
+        self.work: Record = np.zeros((), WORK)
+
+
+_memory = _Memory()
+
+
+def _candidates(method: str, measured: tuple[str, ...]) -> NDArray[np.int64]:
     if not isinstance(method, str) or method not in ("auto", *METHODS):
         raise InputError(f"there is no method {method!r}; there are auto, {', '.join(METHODS)}")
+    return _possible(method, measured)
+
+
+@lru_cache
+def _possible(method: str, measured: tuple[str, ...]) -> NDArray[np.int64]:
     names = _AUTOMATIC if method == "auto" else (method,)
-    given = [name for name in names if NEEDS.get(name, "leg_directions") in arrays]
+    given = [name for name in names if NEEDS.get(name, "leg_directions") in measured]
     if not given:
         raise InputError(f"the method {method!r} needs {NEEDS[method]}: give it, or choose another method")
     return np.array([METHODS.index(name) for name in given])
 
 
-def _axes_about(up: Array) -> Array:
+@lru_cache(maxsize=256)
+def _axes_of(mechanism: Mechanism) -> Array:
     """Orthonormal rows (3, 3), the first of which is the vertical."""
+    up = mechanism.up_in_base
     across = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.8 else [0.0, 1.0, 0.0])
     level = across / np.linalg.norm(across)
     return np.array([up, level, np.cross(up, level)])

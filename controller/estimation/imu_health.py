@@ -12,7 +12,10 @@ from plant.dynamics.variables import IMU_COUNT
 from plant.pose import Array
 
 _FROZEN_S = 0.01
-"""How long an IMU may repeat its reading while others do not [s]."""
+"""How long an IMU may repeat its reading while others do not, or while the legs must have moved [s]."""
+
+_SURELY_MOVED_M = 1e-3
+"""When the reference has moved a leg so far since the last change of any reading, some should have changed [m]."""
 
 _HEALTHY_S = 0.02
 """How long an IMU that was left out must be healthy before it is used again [s]."""
@@ -47,7 +50,8 @@ STATE = record_dtype(
     sample=(np.float64, (3, IMU_COUNT, 3)),  # last reading, calibrated
     sample_age=(np.int64, IMU_COUNT),  # how many cycles old the sample is, as the rig reports it
     unchanged=(np.int64, IMU_COUNT),  # whether the IMU repeats its reading
-    frozen_for=(np.int64, IMU_COUNT),  # for how many cycles it has done so while others did not
+    frozen_for=(np.int64, IMU_COUNT),  # for how many cycles it has done so although it must have changed
+    moved_since=np.float64,  # how far the reference has moved a leg since the last change of any reading [m]
     healthy_for=(np.int64, IMU_COUNT),  # for how many cycles the IMU has been healthy
     used=(np.int64, IMU_COUNT),  # whether the filters use it
     excluded=(np.int64, IMU_COUNT),  # whether it contradicted the others, which excludes it for good
@@ -80,16 +84,19 @@ def imu_parameters(
 
 
 @kernel
-def screen_imus(p: Record, s: Record, legs: int, time: Record, silent: int, measurement: Array, events: Record) -> None:
+def screen_imus(
+    p: Record, s: Record, rig: Record, time: Record, silent: int, measurement: Array, motion: Array, events: Record
+) -> None:
     """Calibrate a raw measurement (3, 7, 3), and find out which IMUs are healthy.
 
-    An IMU is left out while its readings are not finite, out of range, noisy, or frozen or stale while others are not. It is
-    used again when it has been healthy for a while. An IMU that contradicted the others stays out.
+    An IMU is left out while its readings are not finite, out of range, noisy, or stale while others are not, or frozen while
+    others are not or the legs must have moved. It is used again when it has been healthy for a while. An IMU that contradicted
+    the others stays out.
 
     Args:
-        legs: how many legs there are.
         silent: for how many cycles the rig has not answered.
         measurement: raw [rad/s, m/s^2, uT].
+        motion: (6, 3), the reference: length, rate [m/s] and acceleration of each leg.
         events: dtype `EVENTS`.
     """
     calibrate_samples(p.gain, p.offset, measurement, s.sample)
@@ -104,10 +111,16 @@ def screen_imus(p: Record, s: Record, legs: int, time: Record, silent: int, meas
         changed += p.present[k] != 0 and s.unchanged[k] == 0
         _update_noise(p, s, time.cycle, measurement, k)
         total_noise += s.noise[k]
+    fastest = 0.0
+    for k in range(rig.legs):
+        fastest = max(fastest, abs(motion[k, 1]))
+    # A rig that does not answer repeats every reading.
+    s.moved_since = 0.0 if changed > 0 or silent > 0 else s.moved_since + (1 + time.missed) * rig.period * fastest
+    must_change = changed > 0 or s.moved_since > _SURELY_MOVED_M
     for k in range(IMU_COUNT):
         if s.unchanged[k] == 0:
             s.frozen_for[k] = 0
-        elif changed > 0:
+        elif must_change:
             s.frozen_for[k] += 1
         cause = Cause.NONE.value
         value, limit = np.nan, np.nan
@@ -116,7 +129,7 @@ def screen_imus(p: Record, s: Record, legs: int, time: Record, silent: int, meas
         elif s.frozen_for[k] >= p.frozen_cycles:
             cause, value, limit = Cause.IMU_FROZEN.value, float(s.frozen_for[k]), float(p.frozen_cycles)
         noise = s.noise[k]
-        if cause == Cause.NONE and noise > max(1.0, _NOISIER * (total_noise - noise) / legs):
+        if cause == Cause.NONE and noise > max(1.0, _NOISIER * (total_noise - noise) / rig.legs):
             cause, value, limit = Cause.IMU_NOISY.value, noise, 1.0
         for kind in range(3):
             for i in range(3):

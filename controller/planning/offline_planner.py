@@ -18,7 +18,7 @@ from controller.planning.motions import SAMPLE_PERIOD_S
 from controller.planning.segments import state_after, stop_phases, write_segment
 from controller.planning.target import Target
 from plant.compiled import kernel
-from plant.errors import PlanningError
+from plant.errors import PlanningError, UnreachableError
 from plant.mechanism import Limits, Mechanism, six_rows
 from plant.pose import Array
 from plant.vectors import Vector
@@ -54,7 +54,7 @@ def plan(mechanism: Mechanism, target: Target, duration: float) -> Reference:
         PlanningError: ruckig found no motion, not even a stop.
     """
     limits = mechanism.require_limits()
-    mechanism.check_lengths(leg_lengths(mechanism, target.positions, target.rotations), f"the target {target.name}")
+    _check_reach(mechanism, target)
     knots = max(1, int(np.ceil(duration / SAMPLE_PERIOD_S - 1e-9)))
     positions, rates, accelerations = _aims(mechanism, target, knots)
     start = leg_lengths(mechanism, target.start.position, target.start.rotation)
@@ -64,6 +64,19 @@ def plan(mechanism: Mechanism, target: Target, duration: float) -> Reference:
     segments = planner.segments()
     horizon = knots * SAMPLE_PERIOD_S
     return Reference(six_rows(segments), count_violations(segments, horizon, limits))
+
+
+def _check_reach(mechanism: Mechanism, target: Target) -> None:
+    """Check a target against the strokes; if it would be inside when read in another way, the error says so."""
+    try:
+        mechanism.check_lengths(leg_lengths(mechanism, target.positions, target.rotations), f"the target {target.name}")
+    except UnreachableError as error:
+        least, most = mechanism.require_limits().stroke.T
+        for reading, positions in target.other_readings(mechanism):
+            lengths = leg_lengths(mechanism, positions, target.rotations)
+            if ((lengths >= least) & (lengths <= most)).all():
+                raise UnreachableError(f"{str(error).rpartition(':')[0]}: {reading}") from None
+        raise
 
 
 def count_violations(segments: Array, horizon: float, limits: Limits) -> int:

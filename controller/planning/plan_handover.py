@@ -23,7 +23,7 @@ FOLLOWED_SEGMENTS = 2 * PLAN_SEGMENTS
 CYCLE, LATEST, SEEN, TAKEN, CAUSE, SAMPLE_NS, END_PLANNER = range(7)
 """Places in `shared`: cycles since the motion began; the numbers of the latest plan, of the last plan that the loop has seen,
 and of the plan that it follows; why the stream has failed; when the last sample came [ns of CLOCK_MONOTONIC, 0 before the
-first]; whether the planner's process must end."""
+first and after the end of the stream]; whether the planner's process must end."""
 
 STREAM = record_dtype(
     shared=(np.int64, 8),
@@ -163,7 +163,7 @@ def fail_stream(stream: Record, cause: int, index: int, value: float, limit: flo
 
 @kernel
 def note_sample(stream: Record, time_ns: int) -> None:
-    """Report when the last sample came [ns of CLOCK_MONOTONIC]."""
+    """Report when the last sample came [ns of CLOCK_MONOTONIC], or 0: the stream has ended, and no further one is due."""
     store_release(stream[()].shared, SAMPLE_NS, time_ns)
 
 
@@ -171,7 +171,8 @@ def note_sample(stream: Record, time_ns: int) -> None:
 def stream_cause(stream: Record, now_ns: int, patience_ns: int) -> tuple[int, int, float, float]:
     """Why the stream has failed: cause, leg, value and limit; `NO_CAUSE` if it has not.
 
-    The stream is lost when no sample has come for longer than the patience. It cannot be lost before the first sample.
+    The stream is lost when no sample has come for longer than the patience. It cannot be lost before the first sample,
+    nor after its end.
     """
     s = stream[()]
     cause = load_acquire(s.shared, CAUSE)

@@ -11,7 +11,8 @@ from plant.mechanism import LEGS
 from plant.pose import Array
 from plant.vectors import Vector
 
-START, LENGTH, RATE, ACCELERATION, JERK = range(5)
+SEGMENT_SIZE = 5
+START, LENGTH, RATE, ACCELERATION, JERK = range(SEGMENT_SIZE)
 
 STOP_SEGMENTS = 4
 """A stop has three phases of constant jerk, and rest."""

@@ -129,12 +129,13 @@ class StreamPlanner:
                 raise TargetRefusedError(Cause.TARGET_JUMPS, int(step.argmax()), float(step.max()), most)
         self._samples.append((time_s, np.clip(lengths, stroke[:, 0], stroke[:, 1])))
 
-    def plan(self, at_s: float, ahead_s: float) -> Plan | None:
+    def plan(self, at_s: float, ahead_s: float, ended: bool = False) -> Plan | None:
         """Plan how to follow the target. The plan takes effect only after `follow(plan)`.
 
         Args:
             at_s: motion time at which the plan begins [s], no earlier than the current plan.
             ahead_s: time from the newest sample to that begin [s].
+            ended: whether the target stays at its newest sample.
 
         Returns:
             The plan; None if the current plan goes on.
@@ -150,7 +151,7 @@ class StreamPlanner:
             raise InputError("there is no sample to plan for: add one first")
         state = np.empty((LEGS, 3))
         evaluate_reference(self.current.segments, at_s, np.zeros(LEGS, np.int64), state)
-        motion = self._fit()
+        motion = self._samples[-1][1][np.newaxis] if ended else self._fit()
         if not motion[1:].any():
             goal = motion[0]
             if self.current.goal is not None and np.abs(goal - self.current.goal).max() < _STILL_M:

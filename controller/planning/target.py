@@ -1,5 +1,6 @@
 """Target motions: poses over time, from a CSV file or a built-in motion."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,6 +47,17 @@ class Target:
         between = _interpolate(self.times, np.hstack([self.positions, quaternions]), times)
         turns = between[:, 3:] / np.linalg.norm(between[:, 3:], axis=1, keepdims=True)
         return between[:, :3], rotations_from_quaternions(turns)
+
+    def other_readings(self, mechanism: Mechanism) -> Iterator[tuple[str, Array]]:
+        """What the positions of a file may have been meant as, in words, and the positions (N, 3) [m] then."""
+        if self.name in NAMES:
+            return
+        home = mechanism.require_home().position
+        given = self.positions - home
+        yield "its positions fit as absolute ones, so give displacements from home", given
+        yield "its positions fit as absolute ones in mm, so give displacements from home in m", 1e-3 * given
+        if np.abs(given).max() > mechanism.require_limits().stroke.max():
+            yield "its displacements fit in mm, so give them in m", home + 1e-3 * given
 
 
 def _interpolate(knots: Array, values: Array, times: Array) -> Array:

@@ -81,14 +81,24 @@ def run_arming_checks(
 
 @kernel
 def postpones_arming(p: Record, s: Record, rig: Record, time: Record, cause: int) -> bool:
-    """Whether a cause only prevents arming: nothing has been armed, and there is still time."""
+    """Whether a cause only prevents arming: nothing has been armed, and there is still time. A rig that does not answer is the
+    obstacle before anything that its samples tell.
+    """
     a = s.arming
     if s.mode != Mode.IDLE:
         return False
     a.obstacle, a.index, a.value, a.limit = cause, -1, np.nan, np.nan
+    if s.watch.unanswered > 0:
+        a.obstacle, a.value, a.limit = Cause.BUS_LOST, _unanswered_for(s.watch), 0.0
     if time.cycle >= rig.hold_cycles and p.arming.active != 0:
         a.delay = time.cycle + 1 - rig.hold_cycles
     return bool(a.delay <= p.arming.cycles)
+
+
+@kernel
+def _unanswered_for(watch: Record) -> float:
+    """For how many cycles the rig has not answered, in a row or more often than it did."""
+    return float(max(watch.silent, watch.unanswered))
 
 
 @kernel
@@ -96,6 +106,9 @@ def _find_obstacle(
     p: Record, s: Record, rig: Record, imu_parameters: Record, imus: Record, pose: Record, pid: Record
 ) -> tuple[int, int, float, float]:
     """The first obstacle: a `Cause` with its leg or IMU, value and limit."""
+    # Without answers, nothing below is about the present.
+    if s.watch.unanswered > 0:
+        return Cause.BUS_LOST.value, -1, _unanswered_for(s.watch), 0.0
     lost, lengths, error = 0, pose.lengths, pid.error
     for k in range(IMU_COUNT):
         off = contradiction(s.monitor, k)
@@ -112,6 +125,4 @@ def _find_obstacle(
             return Cause.NO_AGREEMENT.value, k, abs(error[k]), p.arming.distance
         if s.watch.drive[k] != DriveState.READY and s.watch.drive[k] != DriveState.FOLLOWING:
             return Cause.NO_DRIVES.value, k, np.nan, np.nan
-    if s.watch.silent > 0:
-        return Cause.BUS_LOST.value, -1, float(s.watch.silent), 0.0
     return Cause.NONE.value, 0, np.nan, np.nan

@@ -104,7 +104,7 @@ class Cause(IntEnum):
     SATURATED = 24, "the command of leg {} stays at its limit", Reaction.STOP, "s"
     ANSWER_LATE = 25, "an exchange with the rig was late or its answer was refused", Reaction.GO_ON
     BUS_LOST = 26, "the bus is lost: the rig does not answer", Reaction.QUICK_STOP, "cycles"
-    DRIVE_FAULT = 27, "drive {} reports a fault", Reaction.QUICK_STOP
+    DRIVE_FAULT = 27, "drive {} reports a fault", Reaction.QUICK_STOP, "code"
     DRIVE_OFF = 28, "drive {} has left its operation", Reaction.QUICK_STOP
     DRIVE_DEVIATES = 29, "drive {} does not do what it is told", Reaction.BRAKE, "m/s"
     ARMED = 30, "armed", Reaction.GO_ON
@@ -136,6 +136,8 @@ class Cause(IntEnum):
         text = (self.text if index >= 0 else self.text.replace(_WORST, "")).format(index)
         if np.isnan(value):
             return text
+        if self.unit == "code":
+            return f"{text} (code {int(value):#06x})"
         unit = f" {self.unit}" if self.unit else ""
         limited = "" if np.isnan(limit) else f", the limit is {limit:.4g}{unit}"
         return f"{text} ({value:.4g}{unit}{limited})"

@@ -37,7 +37,7 @@ PARAMETERS = record_dtype(
 STATE = record_dtype(
     drive=(np.int64, LEGS),  # the `DriveState` of each drive
     silent=np.int64,  # for how many cycles the rig has not answered
-    unanswered=np.int64,  # how many more exchanges failed than succeeded
+    unanswered=np.int64,  # how many more exchanges failed than succeeded, up to twice the limit
     contradicted_for=np.float64,  # how long the IMUs have contradicted each other [s]
     off_reference_for=(np.float64, LEGS),  # how long each leg has been off its reference [s]
     deviating_for=(np.float64, LEGS),  # how long each drive has been off its command [s]
@@ -69,13 +69,13 @@ def watch_parameters(settings: SafetySettings, rate: float, limits: Limits) -> R
 @kernel
 def update_rig_status(
     p: Record, s: Record, rig: Record, time: Record, imus: Record, reference: Record, pid: Record, sample_age: Array,
-    drive: Array, silent: int,
+    drive: Array, drive_code: Array, silent: int,
 ) -> None:  # fmt: skip
     """Before a cycle: take the rig's report, and react to a lost bus and to drives that left their operation.
 
     Args:
         sample_age: (7,), of each IMU's sample, in cycles.
-        drive: (6,), of each drive its `DriveState`.
+        drive, drive_code: (6,), of each drive its `DriveState` and its own fault code.
         silent: for how many cycles the rig has not answered.
     """
     w = s.watch
@@ -86,17 +86,18 @@ def update_rig_status(
     if silent > 0 and w.silent == 0:
         report_event(s.events, Cause.ANSWER_LATE, -1, np.nan, np.nan)
     w.silent = silent
-    w.unanswered = max(w.unanswered + (1 if silent > 0 else -1), 0)
+    most = p.watch.bus_cycles
+    # What was missed on the brakes may delay arming by a limited time only.
+    w.unanswered = min(max(w.unanswered + (1 if silent > 0 else -1), 0), 2 * most)
     if s.request != Request.ENABLED:
         return
-    most = p.watch.bus_cycles
     if silent >= most or w.unanswered >= 2 * most:
         handle_cause(
             p, s, rig, time, reference, pid, Cause.BUS_LOST, -1, float(max(silent, w.unanswered)), float(most)
         )  # fmt: skip
     for k in range(rig.legs):
         if drive[k] == DriveState.FAULTY:
-            handle_cause(p, s, rig, time, reference, pid, Cause.DRIVE_FAULT, k, np.nan, np.nan)
+            handle_cause(p, s, rig, time, reference, pid, Cause.DRIVE_FAULT, k, float(drive_code[k]), np.nan)
         elif s.mode != Mode.ARMED and drive[k] != DriveState.FOLLOWING:
             handle_cause(p, s, rig, time, reference, pid, Cause.DRIVE_OFF, k, np.nan, np.nan)
 

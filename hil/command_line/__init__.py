@@ -36,8 +36,13 @@ class _Parser(argparse.ArgumentParser):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line and return its exit status."""
+    """Run the command line and return its exit status.
+
+    Args:
+        arguments: of a call from Python; by default those of this process, which is then the command's own.
+    """
     options = parse(sys.argv[1:] if arguments is None else arguments)
+    options.own_process = arguments is None
     try:
         check_outputs(options)
         with missing_extras_named():

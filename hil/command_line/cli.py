@@ -2,7 +2,7 @@
 
 import inspect
 import json
-from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from argparse import SUPPRESS, Action, ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
@@ -123,10 +123,11 @@ def names_of(config: "type[C]", *without: str) -> list[str]:
     return [each.name for each in fields(config) if "option" in each.metadata and each.name not in without]
 
 
-def options_of(config: "type[C]", *names: str, **changes: Mapping[str, Any]) -> Argument:
+def options_of(config: "type[C]", *names: str, only_given: bool = False, **changes: Mapping[str, Any]) -> Argument:
     """The options of a configuration's fields; all of them without names or changes.
 
-    `changes` has by field what is different in this command: `default`, or attributes of `Option`.
+    `changes` has by field what is different in this command: `default`, or attributes of `Option`. With `only_given`, an option
+    that is not given is no attribute of the parsed ones, and `config_of` takes the field's default.
     """
 
     def add(parser: ArgumentParser) -> None:
@@ -134,7 +135,9 @@ def options_of(config: "type[C]", *names: str, **changes: Mapping[str, Any]) -> 
         for name in (*names, *changes) or names_of(config):
             form = dict(changes.get(name, {}))
             default = form.pop("default", declared[name].default)
-            _add_option(parser, name, default, replace(declared[name].metadata["option"], **form))
+            added = _add_option(parser, name, default, replace(declared[name].metadata["option"], **form))
+            if only_given:
+                added.default = SUPPRESS
 
     return add
 
@@ -159,18 +162,17 @@ def engine_of(options: Namespace) -> EngineSettings:
     return replace(settings, workers=1) if options.few and settings == EngineSettings() else settings
 
 
-def _add_option(parser: ArgumentParser, name: str, default: Any, option: Option) -> None:
+def _add_option(parser: ArgumentParser, name: str, default: Any, option: Option) -> Action:
     flag = option.flag or f"--{'no-' if default is True else ''}{name.replace('_', '-')}"
     if isinstance(default, bool):
         action = "store_false" if default else "store_true"
-        parser.add_argument(flag, dest=name, action=action, help=option.text)
-        return
+        return parser.add_argument(flag, dest=name, action=action, help=option.text)
     scale = _SCALES.get(option.unit, 1.0)
     parse = option.parse or (type(default) if isinstance(default, int | float) else str)
     text = option.text + (f" [{option.unit}]" if option.unit else "")
     if not option.required and (shown := option.shown or _shown(default, scale)):
         text += f" (default: {shown})"
-    parser.add_argument(
+    return parser.add_argument(
         flag,
         dest=name,
         default=list(default) if option.several else default,

@@ -39,7 +39,11 @@ def gough_classify(options: Namespace) -> None:
     cli.write_json(options.json, description.summary())
     cli.write_report(options, "classification", description)
     found = description.mechanism_class
-    print(f"{description.mechanism.name}: class {found.label}, a {found.name} with the graph\n  {found.drawing}")
+    print(
+        f"{description.mechanism.name}: class {found.label}, a {found.name}; its legs, from base joints below to platform "
+        "joints above:"
+    )
+    print(f"  {found.drawing}")
     table = Table("method", "needs", "section", "poses", "conditioning: home", "worst")
     for need in description.needs:
         method, text = need.requirement.method, need.requirement.text

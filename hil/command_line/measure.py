@@ -160,18 +160,19 @@ def _kinematics(_: Namespace, figures: dict[str, Any]) -> None:
         groups.setdefault(label.rpartition(".")[0], []).append(methods)
     groups["hexapod"] = [measured["hexapod_us"]]
     names = list(dict.fromkeys(name for methods in groups.values() for name in methods[0]))
-    table = Table("us, closed / refined", *names)
+    table = Table("us", *names)
     for group, members in groups.items():
         cells = []
         for name in names:
             found = [methods[name] for methods in members if name in methods]
-            medians = (f"{median(each[kind] for each in found):.2f}" for kind in ("closed_form", "refined"))
-            cells.append(" / ".join(medians) if found else "-")
+            medians = (median(each[kind] for each in found) for kind in ("closed_form", "refined") if found)
+            cells.append(" / ".join(f"{us:.{2 if us < 10.0 else 1}f}" for us in medians) or "-")
         table.add(group, *cells)
     newton = measured["newton"]
     times = {name: f"{ratio['closed_form']:.1f} / {ratio['refined']:.1f}" for name, ratio in newton["ratios"].items()}
-    table.add("hexapod, over Newton", *(times.get(name, "-") for name in names))
+    table.add("over Newton", *(times.get(name, "-") for name in names))
     table.print()
+    print("closed form / refined")
     rates = ", ".join(f"{name} {rate / 1e3:.0f}" for name, rate in measured["batch_per_s"].items())
     print(f"refined poses per second on all cores [thousands]: {rates}; one call from Python {measured['call_us']:.0f} us")
     print(f"Newton's method from lengths, warm: {newton['warm_us']:.2f} us per pose")

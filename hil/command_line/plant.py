@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hil.command_line import cli
+from hil.command_line.apart import go_on_apart
 from hil.command_line.terminal import progress_bar
 from hil.runs.config import SimulationConfig
 from hil.table import Table
@@ -71,14 +72,19 @@ def gough_fmu_table(_: Namespace) -> None:
 @cli.command(_FILE, cli.JSON)
 def gough_fmu_info(options: Namespace) -> None:
     """Show what any FMU for Co-Simulation is, its variables, and whether the loop can use it as it is."""
+    from plant.dynamics.variables import PLANAR, SPATIAL
     from plant.fmu.binding import OWN_BINDING, bind
     from plant.fmu.check import platforms_of
     from plant.fmu.description_reader import FmuDescription
+    from plant.fmu.plant import takes_parameters
+    from plant.mechanism import LEGS
 
     description = FmuDescription(options.file)
     try:
-        bind(OWN_BINDING, description)
-        use = "runs in the loop as it is (gough simulate --plant)"
+        legs = bind(OWN_BINDING, description).legs
+        own = not takes_parameters(description, [each.name for each in (SPATIAL if legs == LEGS else PLANAR).parameters])
+        parameters = ", with its own parameters, from the home of --mechanism" if own else ""
+        use = f"runs in the loop as it is (gough simulate --plant){parameters}"
     except GoughError:
         use = "runs in the loop with a binding (docs/fmu.md)"
     facts = {
@@ -101,7 +107,7 @@ def gough_fmu_info(options: Namespace) -> None:
     cli.write_json(options.json, facts | {"variables": variables})
 
 
-@cli.command(_FILE, cli.JSON)
+@cli.command(_FILE, cli.JSON, cli.setting("--limit", 60.0, "how long a trial may take before its process is ended [s]"))
 def gough_fmu_validate(options: Namespace) -> int:
     """Check that any FMU for Co-Simulation keeps what it promises.
 
@@ -111,7 +117,7 @@ def gough_fmu_validate(options: Namespace) -> int:
     from plant.fmu.check import check_fmu
 
     with progress_bar(f"trying {options.file}"):
-        checks = check_fmu(options.file)
+        checks = check_fmu(options.file, options.limit)
     problems = {check.name: check.problems for check in checks}
     _print_pairs({name: "not promised" if found is None else "; ".join(found) or "ok" for name, found in problems.items()})
     cli.write_json(options.json, {"file": str(options.file), "checks": problems})
@@ -131,19 +137,26 @@ def gough_fmu_linearize(options: Namespace) -> None:
     The plant is linearised about its start, with the drives following their commands, by its directional derivatives: matrices
     of x' = A x + B u, y = C x + D u, and the poles.
     """
+    if options.own_process and options.file:
+        go_on_apart(f"the FMU {options.file}")
     import numpy as np
 
     from controller.design.linearization import state_space
     from plant.dynamics.variables import VELOCITY
+    from plant.fmu.binding import OWN_BINDING, load_binding
     from plant.fmu.build import default_fmu, model_of
     from plant.fmu.calls import write_drive_mode
-    from plant.fmu.plant import FmuPlant
+    from plant.fmu.description_reader import FmuDescription
+    from plant.fmu.plant import FmuPlant, takes_parameters
     from plant.mechanism import load_in_space
 
     mechanism = load_in_space(options.mechanism)
     path = options.file or default_fmu(model_of(mechanism))
-    parameters = mechanism.plant_parameters() if options.binding is None else {}
-    with FmuPlant(path, parameters, 1e-3, options.binding) as plant:
+    binding = OWN_BINDING if options.binding is None else load_binding(options.binding)
+    parameters = mechanism.plant_parameters() if binding.native else {}
+    if options.file is not None and binding.native and not takes_parameters(FmuDescription(path), [*parameters]):
+        parameters = {}
+    with FmuPlant(path, parameters, 1e-3, binding) as plant:
         write_drive_mode(plant.handle, VELOCITY)
         system = state_space(plant, options.inputs, options.outputs)
     poles = sorted(system.poles(), key=abs)

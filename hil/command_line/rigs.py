@@ -19,7 +19,10 @@ from plant.errors import InputError
         mechanism={},
         rate={"default": 200.0, "text": "exchanges per second, 50 to 4000"},
     ),
-    cli.flag("--move", "enable the drives, and move all legs by 0.2 mm at 1 mm/s"),
+    cli.flag(
+        "--move",
+        "enable the drives, move all legs by 0.2 mm and each by 2 mm, at 5 mm/s at most, and compare signs and units",
+    ),
     cli.argument(
         "--beyond",
         type=float,
@@ -31,14 +34,17 @@ from plant.errors import InputError
 def gough_check_rig(options: Namespace) -> int:
     """Check that a rig does what the loop relies on.
 
-    The rig is put through its contract, clause by clause. Nothing moves without --move. The exit status is 1 if anything is
-    found.
+    The rig is put through its contract, clause by clause. Nothing moves without --move. With it, bring the platform near home
+    first: the signs and units of commands, gyroscopes and accelerometers are compared with each other, with gravity, and with
+    what the mechanism's file expects of small motions there. The exit status is 1 if anything is found.
     """
     from importlib.metadata import version
 
     keep_to_one_thread()
-    from hil.rigs.contract import CLAUSES, examine_rig
+    from hil.rigs.clauses import CLAUSES
+    from hil.rigs.contract import examine_rig
     from hil.runs.prepare import rig_of
+    from plant.mechanism import load_in_space
 
     if options.beyond is not None and not options.move:
         raise InputError("--beyond is a command to the drives: it needs --move")
@@ -50,7 +56,9 @@ def gough_check_rig(options: Namespace) -> int:
             raise InputError("the FMU plant is no rig of its own: choose udp, canopen, replay or python:MODULE:CLASS")
         return rig
 
-    examination = examine_rig(made, 1.0 / options.rate, options.move, options.beyond)
+    # A recording moves as it was recorded.
+    mechanism = None if options.rig == "replay" else load_in_space(config.mechanism)
+    examination = examine_rig(made, 1.0 / options.rate, options.move, options.beyond, mechanism=mechanism)
     table = Table("clause", "outcome", "what it asks for", left=(0, 2))
     for clause, findings in examination.findings.items():
         table.add(clause, Cell(f"{len(findings)} found" if findings else "ok", alarm=bool(findings)), CLAUSES[clause])
@@ -62,6 +70,11 @@ def gough_check_rig(options: Namespace) -> int:
         p50, p99, most, count = (examination.exchange_us[name] for name in ("p50", "p99", "max", "n"))
         print(f"exchange p50/p99/max {p50:.0f}/{p99:.0f}/{most:.0f} us of {1e6 / options.rate:g}, {count:g} exchanges")
     moved = "and the drives moved" if options.move else "and nothing was moved"
+    if "commands" in examination.findings:
+        print(
+            f"compared: the accelerometers with gravity at home in {config.mechanism}; the commands and the gyroscopes with "
+            "how the accelerometers tilt when a leg moves"
+        )
     print(f"{len(examination.findings)} clauses checked, {len(found)} findings, {moved}")
     asked = {"rig": options.rig, "rig_at": options.rig_at, "rate": options.rate, "moved": options.move}
     cli.write_json(options.json, {**asked, **asdict(examination), "version": version("gough")})
@@ -99,12 +112,14 @@ def gough_emulate(options: Namespace) -> None:
     cli.argument("fault", nargs="?", metavar="KIND[:N][,for=S][,size=X]", help="the fault, from now on"),
     cli.flag("--list", "list the kinds of faults"),
     cli.flag("--clear", "take all faults away"),
-    cli.setting("--to", EmulatorConfig.control, "the emulator's control channel", metavar="HOST:PORT"),
+    cli.argument(
+        "--to", metavar="HOST:PORT", help="the emulator's control channel; needed unless one emulator of this user runs here"
+    ),
 )
 def gough_inject(options: Namespace) -> None:
     """Inject a fault into an emulated rig that is running, or ask for its state."""
     from hil.rigs.emulation import FaultKind
-    from hil.runs.emulator_process import ask
+    from hil.runs.emulator_process import ask, own_control
 
     if options.list:
         table = Table("fault", "number", "size by default", "")
@@ -113,5 +128,5 @@ def gough_inject(options: Namespace) -> None:
         table.print()
         return
     question = "clear" if options.clear else f"fault {options.fault}" if options.fault else "state"
-    for name, value in ask(options.to, question).items():
+    for name, value in ask(options.to or own_control(), question).items():
         print(f"{name}: {value}")

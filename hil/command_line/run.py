@@ -1,11 +1,13 @@
 """The commands that run the loop: simulate, run, replay, stream-target."""
 
+import sys
 from argparse import SUPPRESS, ArgumentTypeError, Namespace
 from dataclasses import fields, replace
 from math import inf
 from typing import TYPE_CHECKING, Any
 
 from hil.command_line import cli
+from hil.command_line.apart import go_on_apart
 from hil.command_line.terminal import QUANTILES, deg, live_view, mm, progress_bar
 from hil.realtime.scheduling import RealTimeSettings, keep_to_one_thread
 from hil.runs.config import SimulationConfig
@@ -15,14 +17,12 @@ from plant.errors import InputError
 if TYPE_CHECKING:
     from hil.runs.snapshot import Snapshot
 
+_NOTICED_STRETCH = 1.05
+
 
 @cli.command(
-    cli.options_of(
-        SimulationConfig,
-        *cli.names_of(SimulationConfig, "duration", "rig", "rig_at", "arm"),
-        # A resumed run keeps the duration of its snapshot, unless this option is given.
-        duration={"default": SUPPRESS, "parse": float, "shown": f"{SimulationConfig.duration:g}"},
-    ),
+    # A resumed run keeps what its snapshot was taken with, and must tell what is given from what is not.
+    cli.options_of(SimulationConfig, *cli.names_of(SimulationConfig, "rig", "rig_at", "arm"), only_given=True),
     cli.report("write a report with plots and a moving 3-D view"),
     cli.JSON,
     cli.output("--save-state", "FILE", "write a snapshot, from which a run can go on"),
@@ -37,6 +37,9 @@ if TYPE_CHECKING:
 )
 def gough_simulate(options: Namespace) -> None:
     """Follow a target on the FMU plant, as fast as the machine can."""
+    plant = getattr(options, "plant", None) or (options.load_state and f"of the snapshot {options.load_state}")
+    if options.own_process and plant:
+        go_on_apart(f"the FMU {plant}")
     from hil.runs.simulation import SimulationStoppedError, simulate
     from hil.runs.snapshot import read_snapshot, write_snapshot
 
@@ -68,7 +71,7 @@ def _resumed_config(options: Namespace, config: SimulationConfig, resumed: "Snap
     kept = SimulationConfig.from_plain(resumed.config)
     for field in fields(config):
         given, was = getattr(config, field.name), getattr(kept, field.name)
-        if field.name != "duration" and given not in (was, field.default):
+        if field.name != "duration" and hasattr(options, field.name) and given != was:
             raise InputError(f"the snapshot was taken with {field.name} {was}, and cannot go on with {given}: leave it out")
     return replace(kept, duration=getattr(options, "duration", kept.duration))
 
@@ -89,12 +92,22 @@ def _print_simulation(summary: dict[str, Any]) -> None:
     table.print()
     if not summary["truth_known"]:
         print("the truth is not known: the plant does not give its pose")
+    _print_pace(summary)
     cycle = summary["cycle_us"]
     print(
         f"limits violated by the reference: {summary['limits']['violations']}; "
         f"{summary['real_time_factor']:.1f} times real time; "
         f"cycle p50/p99/p99.9 {cycle['p50']:.1f}/{cycle['p99']:.1f}/{cycle['p999']:.1f} us"
     )
+
+
+def _print_pace(summary: dict[str, Any]) -> None:
+    """Say if the target is too fast."""
+    if (stretch := summary["target_stretch"]) > _NOTICED_STRETCH:
+        print(
+            f"the target is too fast for the legs' limits, so the reference stays behind it: stretched in time by "
+            f"{stretch:.3g}, it could be followed"
+        )
 
 
 @cli.command(
@@ -111,9 +124,16 @@ def gough_run(options: Namespace) -> int:
     whatever is measured.
     """
     keep_to_one_thread()
-    from hil.runs.executive import RunStoppedError, run
+    from hil.runs.executive import RunStoppedError, ignored_signals, run
 
     config, settings = cli.config_of(options, SimulationConfig), cli.config_of(options, RealTimeSettings)
+    if ignored := ignored_signals():
+        unheard = " and ".join(ignored)
+        print(
+            f"ignored, as what started this run asks: {unheard}; SIGTERM ends it by a controlled stop, SIGQUIT by an emergency "
+            "stop",
+            file=sys.stderr,
+        )
     stopped: Exception | None = None
     with live_view(config.mechanism, config.target, config.rate) as show:
         try:
@@ -137,17 +157,19 @@ def gough_run(options: Namespace) -> int:
 
 
 def _print_run(summary: dict[str, Any]) -> None:
-    from hil.loop.stage_times import budget
+    from controller.safety.causes import Cause
+    from hil.loop.stage_times import budget, exceeded
 
+    fusion = summary["config"]["fusion"]
     table = Table("us", *(f"{label} / budget" for label in QUANTILES))
     for stage, figures in summary["timing_us"].items():
-        limits = budget().get(stage, {})
+        limits = budget(fusion).get(stage, {})
         table.add(stage, *(_timing_cell(figures[name], limits.get(name, inf)) for name in QUANTILES.values()))
     table.print()
-    for line in (*(f"over budget: {text}" for text in summary["over_budget"]), *summary["events"]):
+    for line in summary["events"]:
         print(line)
-    if not summary["over_budget"]:
-        print("within the timing budget (hil/loop/budget.toml)")
+    over = "; ".join(f"{stage} {', '.join(names)}" for stage, names in exceeded(summary["timing_us"], fusion).items())
+    print(f"over budget, as the table shows: {over}" if over else "within the timing budget (hil/loop/budget.toml)")
     for text in summary["refused"]:
         print(f"without {text}")
     used, errors = summary["usage"], summary["errors_m"]
@@ -162,6 +184,7 @@ def _print_run(summary: dict[str, Any]) -> None:
     )
     truth = f"estimate - truth {mm(errors['estimation'])} mm RMS" if errors["known"] else "the truth is not known"
     print(f"{truth}; reference - length {mm(errors['tracking'])} mm RMS")
+    _print_pace(summary)
     if trip := summary["timing_us"].get("round trip"):
         figures = ", ".join(f"{label} {trip[name]:.0f}" for label, name in QUANTILES.items())
         print(f"round trip to the rig {figures} us")
@@ -173,10 +196,12 @@ def _print_run(summary: dict[str, Any]) -> None:
     if files:
         print(f"{summary['cycles'] - lost} cycles recorded in {', '.join(files)}; {lost} cycles lost")
     if summary["identity"]:
-        print(f"rig: {summary['identity']['name']} {summary['identity']['parts']}")
+        parts = ", ".join(f"{name} {value}" for name, value in summary["identity"]["parts"].items())
+        print(f"rig: {summary['identity']['name']}; {parts}" if parts else f"rig: {summary['identity']['name']}")
     if summary["obstacle"] is not None:
         print(summary["obstacle"] or "nothing was moved; all is well for arming")
-    print(f"stopped on the brakes: {summary['cause']}")
+    whole = summary["cause"] == Cause.END_OF_MOTION.text
+    print("the motion went to its end, and the brakes hold" if whole else f"stopped on the brakes: {summary['cause']}")
 
 
 def _bars(bars: list[list[float]]) -> str:
@@ -236,8 +261,9 @@ def _address(text: str) -> tuple[str, int]:
 def gough_stream_target(options: Namespace) -> None:
     """Send a target pose by pose to a run that follows a stream.
 
-    Each pose is one UDP datagram, in real time. The stream can also go wrong on purpose, to show that the run then stops as it
-    should.
+    Each pose is one UDP datagram, in real time. In the end the sender says so, and the run holds the last pose until its own
+    end; a sender that falls silent without that is lost. The stream can also go wrong on purpose, to show that the run then
+    stops as it should.
     """
     from controller.planning.target import load_target
     from hil.runs.target_stream import Faults, send_target

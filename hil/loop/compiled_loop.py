@@ -168,7 +168,7 @@ def process_feedback(parameters: Record, state: Record, work: Record, status: in
         react(parameters, state, Cause.RIG_FAILED, -1, float(status), np.nan)
         ramp_down(p.safety.stop, p.rig, s.time, s.pid)
         return Cause.RIG_FAILED.value
-    hear_rig(parameters, state, w.sample_age, feedback.drive, w.silent)
+    hear_rig(parameters, state, w.sample_age, feedback.drive, feedback.drive_code, w.silent)
     return Cause.NONE.value
 
 

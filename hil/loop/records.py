@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from controller.cycle import MARKS
-from controller.safety.causes import EVENT_SLOTS
+from controller.safety.causes import EVENT_SLOTS, Cause
 from hil.rigs import FEEDBACK
-from plant.compiled import Record, record_dtype
+from plant.compiled import MOST, Limits, Record, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS
 from plant.truth import TRUTH_SIZE
@@ -82,6 +82,9 @@ RECORD_FIELDS = (
 """What is kept of a cycle: name, type, shape and meaning. A recording's schema is made from it."""
 
 RECORD = np.dtype([(name, kind, shape) for name, kind, shape, _ in RECORD_FIELDS], align=True)
+
+RECORD_LIMITS: Limits = {"missed": (0, MOST), "status": (Cause.NONE, max(Cause)), "asked": (Cause.NONE, max(Cause))}
+"""Least and greatest of what a replay takes from a record."""
 
 
 class Link(IntEnum):

@@ -3,6 +3,7 @@
 import tomllib
 from functools import cache
 from importlib.resources import files
+from typing import Any
 
 from hil.loop.records import COMPUTED, STAGES, TO_COMMAND
 from hil.realtime.durations import Histogram
@@ -34,18 +35,31 @@ class Timing:
 
 
 @cache
-def budget() -> dict[str, dict[str, float]]:
-    """The timing budget of `hil/loop/budget.toml`: by stage, p50, p99, p999 and max [us]."""
-    table: dict[str, dict[str, float]] = tomllib.loads((files("hil.loop") / "budget.toml").read_text())
-    return table
+def budget(fusion: str = "") -> dict[str, dict[str, float]]:
+    """The timing budget of `hil/loop/budget.toml` with this fusion: by stage, p50, p99, p999 and max [us]."""
+    table: dict[str, Any] = tomllib.loads((files("hil.loop") / "budget.toml").read_text())
+    of_fusion: dict[str, dict[str, float]] = table.pop("fusion").get(fusion, {})
+    return table | of_fusion
 
 
-def over_budget(figures: dict[str, dict[str, float]]) -> list[str]:
-    """The figures that exceed the budget, in words. A bus has none: its round trip is part of `sense` and `latency`."""
+def exceeded(figures: dict[str, dict[str, float]], fusion: str = "") -> dict[str, list[str]]:
+    """The figures that exceed the budget: their names by stage. A bus has none: its round trip is part of `sense` and
+    `latency`.
+    """
     on_bus = ("sense", "latency") if "round trip" in figures else ()
+    found = {}
+    for stage, limits in budget(fusion).items():
+        measured = figures.get(stage, {"n": 0})
+        names = [name for name, limit in limits.items() if measured["n"] and measured[name] > limit]
+        if names and stage not in on_bus:
+            found[stage] = names
+    return found
+
+
+def over_budget(figures: dict[str, dict[str, float]], fusion: str = "") -> list[str]:
+    """The figures that exceed the budget, in words."""
     return [
-        f"{stage} {name} {figures[stage][name]:.1f} us, budget {limit:g} us"
-        for stage, limits in budget().items()
-        for name, limit in limits.items()
-        if stage not in on_bus and figures[stage]["n"] and figures[stage][name] > limit
+        f"{stage} {name} {figures[stage][name]:.1f} us, budget {budget(fusion)[stage][name]:g} us"
+        for stage, names in exceeded(figures, fusion).items()
+        for name in names
     ]

@@ -16,14 +16,17 @@ _ENDING = (
 
 
 def started(target: Callable[..., None], *arguments: Any) -> BaseProcess:
-    """Start a process that runs a function. The signals that end or stop a process are blocked; the supervisor handles them."""
+    """Start a process that runs a function. The signals that end or stop a process are blocked, because the supervisor handles
+    them; those that it ignores are ignored.
+    """
     process = FORK.Process(target=_run, args=(target, *arguments))
     process.start()
     return process
 
 
 def _run(target: Callable[..., None], *arguments: Any) -> None:
-    signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
+    # A signal that is ignored would be pending, and so heard, if it were blocked, too.
+    signal.pthread_sigmask(signal.SIG_BLOCK, [each for each in _ENDING if signal.getsignal(each) != signal.SIG_IGN])
     target(*arguments)
 
 

@@ -5,20 +5,25 @@ counts those that were overwritten before. A record's layout is that of a ROS 2 
 bytes, and Foxglove and PlotJuggler open the file. Its attachments hold what a replay needs.
 """
 
+import errno
 import hashlib
 import io
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from importlib.metadata import version
+from math import prod
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
 import numpy as np
-from mcap.records import Attachment, Channel, Footer, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader
+import zstandard
+from mcap.records import Attachment, Channel, Chunk, Footer, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
 from numpy.typing import NDArray
 
@@ -27,6 +32,7 @@ from hil.loop.records import RECORD, RECORD_FIELDS, Link
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import GoughError
+from plant.files import most_unpacked
 
 _LITTLE_ENDIAN_CDR = b"\x00\x01\x00\x00"
 _CYCLE_TOPIC, _EVENT_TOPIC = "/cycle", "/event"
@@ -34,6 +40,8 @@ _CYCLE_SCHEMA = "gough/Cycle"
 _CHUNK_S = 0.25
 _POLL_S = 0.05
 _MOST_BYTES = 1 << 20
+_MOST_CHUNK = 16 * _MOST_BYTES  # even if another tool has written the file anew
+_NUMBERS = 1 << 32  # sequence numbers
 _CDR_TYPES = {"i4": "int32", "i8": "int64", "f4": "float32", "f8": "float64"}
 _EVENT_SCHEMA = "int64 cycle  # the period in which it happened\nstring text\n"
 
@@ -62,6 +70,7 @@ class Recorder:
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any], epoch_ns: int) -> None:
+        self._path, self._size = path, 0
         self._file = path.open("wb")
         self._epoch = epoch_ns
         self._writer: Any = Writer(self._file, chunk_size=_MOST_BYTES)
@@ -84,6 +93,19 @@ class Recorder:
         """Complete the chunk, so that all of it is in the file, whatever happens."""
         self._writer.flush()
         self._file.flush()
+        self._size = self._file.tell()
+
+    def check_file(self) -> None:
+        """Check that the path still names the file that was begun, and that nothing of it has been cut off.
+
+        Raises:
+            OSError: with `errno.ESTALE`; it was deleted, cut or replaced.
+        """
+        with suppress(FileNotFoundError):
+            ours = os.fstat(self._file.fileno())
+            if os.path.samestat(ours, self._path.stat()) and ours.st_size >= self._size:
+                return
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(self._path))
 
     def write(self, records: Record) -> None:
         """Append records (n,), dtype `RECORD`, and their events."""
@@ -99,7 +121,8 @@ class Recorder:
         """Append records (n,) alone."""
         for record in records:
             at = self._epoch + int(record["time_ns"])
-            self._writer.add_message(self._cycles, at, _LITTLE_ENDIAN_CDR + record.tobytes(), at, int(record["cycle"]))
+            number = int(record["cycle"]) % _NUMBERS
+            self._writer.add_message(self._cycles, at, _LITTLE_ENDIAN_CDR + record.tobytes(), at, number)
 
     def _news(self, record: Record) -> Iterator[str]:
         """The events of a cycle, and what has changed since the last eventful one."""
@@ -145,6 +168,17 @@ def _saved(array: Record) -> bytes:
     return content.getvalue()
 
 
+def _loaded(content: bytes) -> Record:
+    """The array of `_saved`, or an error; memory is taken only for the size that it has."""
+    file = io.BytesIO(content)
+    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    shape, _, dtype = read_header[np.lib.format.read_magic(file)](file)
+    if prod(shape) * dtype.itemsize != len(content) - file.tell():
+        raise ValueError("an array of another size")
+    file.seek(0)
+    return np.load(file)
+
+
 def take(records: Record, link: NDArray[np.int64], tail: int) -> tuple[Record, int, int]:
     """Copy what the loop has written since record `tail`: the records, the new tail, and how many were overwritten before."""
     capacity = len(records)
@@ -157,19 +191,30 @@ def take(records: Record, link: NDArray[np.int64], tail: int) -> tuple[Record, i
 
 
 def record(path: Path, header: Mapping[str, Any], records: Record, link: NDArray[np.int64]) -> None:
-    """Copy the loop's records to a file until it has ended; this is what the recorder's process runs."""
+    """Copy the loop's records to a file until it has ended; this is what the recorder's process runs.
+
+    Raises:
+        OSError: the file cannot be written; with `errno.ESTALE`, it was deleted, cut or replaced.
+    """
     supervisor = int(link[Link.SUPERVISOR])
     while not link[Link.HEAD] and not link[Link.DONE]:
         time.sleep(_POLL_S)
         if os.getppid() != supervisor:
             return
     recorder = Recorder(path, header, time.time_ns() - time.monotonic_ns() + int(link[Link.START]))
-    tail, kept, flushed = int(link[Link.TAIL]), int(link[Link.KEPT]), time.monotonic()
+    begin, kept_before, flushed = int(link[Link.TAIL]), int(link[Link.KEPT]), time.monotonic()
+    tail, kept = begin, kept_before
     ended = False
     while not ended:
         time.sleep(_POLL_S)
         done = bool(link[Link.DONE]) or (os.getppid() != supervisor and _has_ended(link))
         taken, tail, lost = take(records, link, tail)
+        try:
+            recorder.check_file()
+        except OSError:
+            # The next recorder writes what this file had, as far as it is in memory.
+            link[Link.KEPT], link[Link.TAIL] = kept_before, begin
+            raise
         if lost:
             recorder.write_event(tail, f"{lost} cycles lost: the recorder came too late")
         recorder.write(taken)
@@ -216,7 +261,8 @@ def read(path: Path | str) -> Recording:
     """Read a recording, even one that was cut short.
 
     Raises:
-        RecordingError: there is no such file, it is not a recording of gough, or its records have another layout.
+        RecordingError: there is no such file, it is not a recording of gough, its records have another layout, or it unpacks
+            to far more than any recording.
     """
     config: dict[str, Any] | None = None
     arrays: dict[str, Record] = {}
@@ -236,15 +282,20 @@ def read(path: Path | str) -> Recording:
             elif isinstance(item, Channel):
                 topics[item.id] = item.topic
             elif isinstance(item, Metadata) and item.name == "gough":
-                config, digests = json.loads(item.metadata["config"]), item.metadata
+                content, digests = json.loads(item.metadata["config"]), item.metadata
+                config = content if isinstance(content, dict) else None
             elif isinstance(item, Attachment):
                 name = item.name.removesuffix(".npy")
                 if hashlib.sha256(item.data).hexdigest() == digests.get(name):
-                    arrays[name] = np.load(io.BytesIO(item.data))
+                    with suppress(Exception):
+                        arrays[name] = _loaded(item.data)
             elif isinstance(item, Message) and topics[item.channel_id] == _CYCLE_TOPIC:
                 if not cycles:
                     began = item.log_time
-                cycles += item.data[len(_LITTLE_ENDIAN_CDR) :]
+                content = item.data[len(_LITTLE_ENDIAN_CDR) :]
+                if len(content) != RECORD.itemsize:
+                    break
+                cycles += content
             elif isinstance(item, Message):
                 text = item.data[len(_LITTLE_ENDIAN_CDR) :]
                 events.append((int.from_bytes(text[:8], "little", signed=True), text[12:-1].decode()))
@@ -255,7 +306,7 @@ def read(path: Path | str) -> Recording:
         raise RecordingError(f"{path} is a folder, not a recording") from None
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror}") from None
-    except MemoryError:
+    except (MemoryError, RecordingError):
         raise
     except Exception:
         # Whatever the decoder raises for the part after the last whole chunk.
@@ -273,8 +324,30 @@ def read(path: Path | str) -> Recording:
 
 
 def _items(path: Path | str) -> Iterator[Any]:
+    """The records of a file in their order, those of a chunk one by one."""
+    size = Path(path).stat().st_size
+    left = most_unpacked(size)
     with Path(path).open("rb") as file:
-        yield from StreamReader(file, validate_crcs=True).records
+        for item in StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=size).records:
+            if not isinstance(item, Chunk):
+                yield item
+                continue
+            left -= item.uncompressed_size
+            if left < 0 or item.uncompressed_size > _MOST_CHUNK:
+                raise RecordingError(
+                    f"{path} has {size / 1e3:.0f} kB and would unpack to more than {most_unpacked(size) / 1e6:.0f} MB, or to "
+                    f"{_MOST_CHUNK / 1e6:.0f} MB at once, as no recording does: it was forged or is damaged"
+                )
+            content = _UNPACK[item.compression](item.data, item.uncompressed_size)
+            yield from breakup_chunk(replace(item, compression="", data=content), validate_crc=True)
+
+
+_UNPACK: dict[str, Callable[[bytes, int], bytes]] = {
+    "": lambda content, _: content,
+    "zstd": lambda content, size: zstandard.ZstdDecompressor().stream_reader(content).read(size),
+    "lz4": lambda content, size: lz4.frame.LZ4FrameDecompressor().decompress(content, max_length=size),
+}
+"""How the content of a chunk is unpacked, to `size` bytes and never more; its checksum tells whether they are all."""
 
 
 def repair(path: Path) -> bool:

@@ -8,15 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from controller.cycle import MARKS, PARAMETERS, STATE, cycle, hear_rig, prepare_next, react, skip_periods
+from controller.cycle import MARKS, PARAMETER_LIMITS, PARAMETERS, STATE, cycle, hear_rig, prepare_next, react, skip_periods
 from controller.planning import STREAM_TARGET
+from controller.planning.segments import SEGMENT_SIZE
 from controller.safety.causes import Cause
 from controller.safety.stop import ramp_down
 from hil.loop.compiled_loop import record_state
-from hil.loop.records import RECORD
+from hil.loop.records import RECORD, RECORD_LIMITS
 from hil.recording.mcap import RecordingError, read_run
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, out_of_limits
 from plant.dynamics.variables import IMU_COUNT
+from plant.mechanism import LEGS
 from plant.pose import Array
 
 COMPARED = ("position", "rotation", "lengths", "reference", "command", "conditioning", "mode", "stop")
@@ -63,8 +65,8 @@ def replay(paths: Sequence[Path | str]) -> Replay:
     """Replay the files of one run.
 
     Raises:
-        RecordingError: as `read_run`; a file's beginning is damaged; or another version recorded it, whose cycle has other
-            parameters.
+        RecordingError: as `read_run`; a file's beginning is damaged; another version recorded it, whose cycle has other
+            parameters; or what it holds is nothing that a cycle can take.
     """
     recordings, records = read_run(paths)
     for each in recordings:
@@ -77,9 +79,13 @@ def replay(paths: Sequence[Path | str]) -> Replay:
             f"{first.path} was recorded by gough {first.version}, whose cycle has other parameters than that of this gough "
             f"{version('gough')}: replay it with the version that recorded it; everything else reads it as it is"
         )
+    broken = _broken(parameters, segments, records)
+    if broken is not None:
+        raise RecordingError(f"{first.path} cannot be replayed, as {broken}: it was forged or is damaged")
     # Aligned, as the loop had them; a file does not keep that.
     constants: Record = np.zeros((), PARAMETERS)
     constants[()] = parameters
+    segments = np.ascontiguousarray(segments)
     again = np.zeros(len(records), RECORD)
     streamed = str(first.config.get("target")).partition(":")[0] == STREAM_TARGET
     count = int(_replay(constants, np.zeros((), STATE), segments, records, again, np.zeros((), MARKS)[()], streamed))
@@ -102,6 +108,16 @@ def replay(paths: Sequence[Path | str]) -> Replay:
         replayed_by=version("gough"),
         cut_short=tuple(str(each.path) for each in recordings if not each.complete),
     )
+
+
+def _broken(parameters: Record, segments: Array, records: Record) -> str | None:
+    """What compiled code could not take, in words; None if there is nothing."""
+    if parameters.shape != ():
+        return f"its parameters have the shape {parameters.shape}, and must have none"
+    legs, count, width = segments.shape if segments.ndim == 3 else (0, 0, 0)
+    if (legs, width) != (LEGS, SEGMENT_SIZE) or count < 1 or segments.dtype != np.float64:
+        return f"its reference is {segments.dtype} {segments.shape}, and must be float64 ({LEGS}, n, {SEGMENT_SIZE})"
+    return out_of_limits(parameters, PARAMETER_LIMITS) or out_of_limits(records, RECORD_LIMITS)
 
 
 def _bits(values: Array) -> Any:
@@ -138,7 +154,7 @@ def _replay(
             react(parameters, state, Cause.RIG_FAILED, -1, np.nan, np.nan)
             ramp_down(p.safety.stop, p.rig, s.time, s.pid)
         else:
-            hear_rig(parameters, state, recorded.sample_age, recorded.drive, recorded.silent)
+            hear_rig(parameters, state, recorded.sample_age, recorded.drive, recorded.drive_code, recorded.silent)
             cycle(parameters, state, measurement, segments, marks)
         record_state(state, again[k])
         prepare_next(parameters, state, segments)

@@ -1,7 +1,8 @@
 """A recording as a rig: the loop runs on the clock with recorded samples, and nothing moves."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,9 +38,9 @@ class ReplayRig:
         self._paths = [path] if isinstance(path, str | Path) else list(path)
         self._period, self._mechanism = period, mechanism
         self._identity: Identity | None = None
-        self._records, self._rows = np.zeros(0, RECORD), np.zeros(0, np.int64)
+        self._records = np.zeros(0, RECORD)
         self._numbers = np.zeros((0, IMU_COUNT), np.int64)
-        self._cycle = 0
+        self._cycle = self._row = 0
 
     def open(self) -> None:
         """Read the recording; a `RigError` if there is none, or its rate, mechanism or run is another."""
@@ -48,23 +49,27 @@ class ReplayRig:
         except RecordingError as error:
             raise RigError(str(error)) from None
         where, config = ", ".join(map(str, self._paths)), first.config
-        rate = float(config["rate"])
-        if abs(rate * self._period - 1.0) > 1e-9:
+        rate = self._rate(config)
+        if not abs(rate * self._period - 1.0) <= 1e-9:
             raise RigError(
                 f"{where} was recorded at {rate:g} Hz and cannot be replayed at {1.0 / self._period:g} Hz: give its rate"
             )
-        name = config["mechanism_name"]
+        name = config.get("mechanism_name")
         if self._mechanism is not None and self._mechanism.name != name:
             raise RigError(f"{where} was recorded on the mechanism {name}, not on {self._mechanism.name}: give that")
         self._records = records
-        self._rows = np.full(int(records["cycle"][-1]) + 1, -1)
-        self._rows[records["cycle"]] = np.arange(len(records))
         self._numbers = np.cumsum(records["sample_age"] == 0, axis=0)
-        self._cycle, self.failure = 0, ""
+        self._cycle, self._row, self.failure = 0, 0, ""
         if "parameters" in first.arrays:
             self.command_delay = float(first.constant("load", "command_delay"))
         parts = {"rig": str(config.get("rig")), "run": str(config.get("run")), "recorded by": f"gough {first.version}"}
         self._identity = Identity(f"recording {where}", parts)
+
+    def _rate(self, config: Mapping[str, Any]) -> float:
+        try:
+            return float(config["rate"])
+        except (KeyError, TypeError, ValueError):
+            raise RigError(f"{', '.join(map(str, self._paths))} does not say at what rate it was recorded") from None
 
     def identify(self) -> Identity:
         """The recorded run; a `RigError` if it is not open."""
@@ -78,13 +83,13 @@ class ReplayRig:
     def exchange(self, command: Array, request: int, feedback: Record) -> int:
         """Return the recording of the next period, as `Rig` describes."""
         del command, request
-        if self._cycle >= len(self._rows):
+        if self._row >= len(self._records):
             return self._fail(ENDED)
-        row = self._rows[self._cycle]
+        record, measurement = self._records[self._row], feedback["measurement"]
         self._cycle += 1
-        if row < 0:
+        if record["cycle"] >= self._cycle:
             return SILENT
-        record, measurement = self._records[row], feedback["measurement"]
+        row, self._row = self._row, self._row + 1
         measurement[0], measurement[1] = record["angular_velocity"], record["specific_force"]
         measurement[2] = record["magnetic_field"]
         feedback["sequence"] = self._numbers[row]
@@ -103,4 +108,4 @@ class ReplayRig:
 
     def close(self) -> None:
         """Release the recording."""
-        self._identity, self._records, self._rows = None, self._records[:0], self._rows[:0]
+        self._identity, self._records = None, self._records[:0]

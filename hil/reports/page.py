@@ -106,8 +106,9 @@ dd.bad { color: #c02f3f; }
 dt { color: var(--faint); font-size: 13px; }
 figure { margin: 0; min-width: 0; }
 figure.time { margin-top: 32px; border-top: 1px solid var(--line); padding-top: 18px; }
-.pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(420px, 1fr)); gap: 28px; }
+.pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr)); gap: 28px; }
 table + figure { margin-top: 22px; }
 figcaption { color: var(--faint); font-size: 13px; }
-@media (max-width: 960px) { .overview { grid-template-columns: 1fr; } }
+@media (max-width: 960px) { .overview { grid-template-columns: minmax(0, 1fr); } }
+@media (max-width: 600px) { body { padding: 16px 12px 32px; } table { display: block; overflow-x: auto; } }
 """

@@ -310,6 +310,7 @@ def _mechanism_view(result: SimulationResult) -> tuple[str, go.Figure]:
     )
     speed = span / count / frame_s
     pace = "in real time" if speed < 1.05 else f"at {speed:.2g} times real speed"
+    pace += ", or as fast as the browser draws them"
     return f"{real} poses {pace}; the path of the origin in grey. Drag to turn, scroll to zoom.", figure
 
 

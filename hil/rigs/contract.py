@@ -1,31 +1,31 @@
 """The contract of a rig: what the loop relies on, clause by clause, checked on any rig from outside.
 
 By default the drives are only asked to hold on their brakes. With `moving` they are enabled, all legs extend and retract at
-1 mm/s for 0.2 s each, and the drives are stopped; the rig must have room for that.
+1 mm/s for 0.2 s each, and the drives are stopped. With a mechanism, one leg after the other also extends by 2 mm at 5 mm/s, and
+signs and units are compared (`hil.rigs.comparison`). The rig must have room for that.
 """
 
 import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from hil.realtime.durations import percentiles
 from hil.rigs import ANSWERED, FEEDBACK, SILENT, DriveState, Identity, Request, Rig, RigError, missing_members, new_feedback
+from hil.rigs.clauses import FOLLOWED_WITHIN, Examination
+from hil.rigs.comparison import SmallMotions
+from hil.rigs.contents import missing_contents
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import GoughError
-from plant.mechanism import LEGS
+from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array
 from plant.truth import TRUTH_LENGTHS
 
 MakeRig = Callable[[], Rig]
-
-FOLLOWED_WITHIN = 20
-"""Exchanges within which the drives must do what is requested."""
 
 SENT_WITHIN = 2
 """Exchanges within which the feedback must report a command as sent."""
@@ -33,59 +33,34 @@ SENT_WITHIN = 2
 SPEED, STROKE_S = 1e-3, 0.2
 """Speed of the moving legs [m/s], and duration of the motion each way [s]."""
 
+LEG_SPEED, LEG_STROKE_S = 5e-3, 0.4
+"""The same of a single leg, whose motion is compared with what the IMUs read."""
+
+_SETTLED_S, _AVERAGED_S = 0.15, 0.3
+"""Time after a motion for the rig to come to rest, and over which the rest is averaged [s]."""
+
 _ROUNDING = 1e-5
 _STANDSTILL_S = 0.5
 _MOST_SILENT = 0.1
 _STALE_S = 0.01
-_REST_FORCE, _REST_RATE = (5.0, 15.0), 0.5
 _CLOSED_WITHIN_S = 1.0
 _REQUESTS = ("to hold on their brakes", "to follow", "to stop quickly")
 _DRIVES = tuple(state.name.lower().replace("_", " ") for state in DriveState)
 _GUARD, _GUARD_BYTES = 0xA5, 64
 
-CLAUSES = {
-    "interface": "it has all methods, and its command_delay",
-    "stops at any time": "quick_stop and close raise nothing: before open, twice, and after close",
-    "opens": "it can be opened, or says in a RigError why not",
-    "identifies": "identify returns its identity",
-    "arms": "arm makes the drives ready and requests nothing else of them",
-    "threads": "no thread runs beside the exchanges, and none is left",
-    "exchanges": "exchange raises nothing and gives answers",
-    "feedback": "the feedback keeps its layout, and every required value is there",
-    "order in time": "sample numbers, sample times and the count of refused packets never go back",
-    "sample age": "new samples arrive in time",
-    "drives": f"the drives do what is requested within {FOLLOWED_WITHIN} exchanges",
-    "sent": "what was sent is what was commanded, within limits",
-    "motion": "the legs move as commanded, where the truth is known",
-    "period": "an exchange returns within the period (p99)",
-    "opens again": "after close it can be opened again",
-    "absent": "a rig that is not there raises a RigError with a message",
-}
-
-
-@dataclass
-class Examination:
-    """The result of an examination."""
-
-    findings: dict[str, list[str]] = field(default_factory=dict)  # by clause, of the clauses that were checked
-    exchange_us: dict[str, float] = field(default_factory=dict)  # durations p50, p99 and max [us], and their number n
-    identity: Identity | None = None
-
-    def all_findings(self) -> list[str]:
-        """The findings of all clauses."""
-        return [text for each in self.findings.values() for text in each]
-
 
 def check_rig(
-    make_rig: MakeRig, period: float, moving: bool = True, beyond: float | None = None, absent: MakeRig | None = None
-) -> list[str]:
+    make_rig: MakeRig, period: float, moving: bool = True, beyond: float | None = None, absent: MakeRig | None = None,
+    mechanism: Mechanism | None = None,
+) -> list[str]:  # fmt: skip
     """Check a rig against the contract; returns the findings, one sentence each (see `examine_rig`)."""
-    return examine_rig(make_rig, period, moving, beyond, absent).all_findings()
+    return examine_rig(make_rig, period, moving, beyond, absent, mechanism).all_findings()
 
 
 def examine_rig(
-    make_rig: MakeRig, period: float, moving: bool = True, beyond: float | None = None, absent: MakeRig | None = None
-) -> Examination:
+    make_rig: MakeRig, period: float, moving: bool = True, beyond: float | None = None, absent: MakeRig | None = None,
+    mechanism: Mechanism | None = None,
+) -> Examination:  # fmt: skip
     """Check a rig against the contract.
 
     Args:
@@ -95,8 +70,9 @@ def examine_rig(
         beyond: a command beyond the limits [m/s] that is tried for one exchange, with `moving` only: for emulated rigs, never
             for hardware.
         absent: makes a rig of the same kind that is not there.
+        mechanism: what the rig drives, near its home; with `moving`, signs and units are compared with it.
     """
-    return _Examiner(make_rig, period, moving, beyond, absent).examine()
+    return _Examiner(make_rig, period, moving, beyond, absent, mechanism).examine()
 
 
 class _BrokenOffError(Exception):
@@ -106,8 +82,12 @@ class _BrokenOffError(Exception):
 class _Examiner:
     """One examination: it calls the rig clause by clause, and notes what it finds. The arguments are those of `examine_rig`."""
 
-    def __init__(self, make_rig: MakeRig, period: float, moving: bool, beyond: float | None, absent: MakeRig | None) -> None:
+    def __init__(
+        self, make_rig: MakeRig, period: float, moving: bool, beyond: float | None, absent: MakeRig | None,
+        mechanism: Mechanism | None,
+    ) -> None:  # fmt: skip
         self._make, self._period, self._moving, self._beyond, self._absent = make_rig, period, moving, beyond, absent
+        self._motions = SmallMotions(mechanism) if moving and mechanism is not None and mechanism.legs == LEGS else None
         self._result = Examination()
         self._noted: set[tuple[str, str]] = set()
         self._rig: Rig = make_rig()
@@ -238,12 +218,13 @@ class _Examiner:
         zero, up = np.zeros(LEGS), np.full(LEGS, SPEED)
         count = max(3, round(STROKE_S / self._period))
         self._request(Request.ENABLED, zero, (DriveState.FOLLOWING,))
+        self._rest()
         lengths = [self._feedback["truth"][TRUTH_LENGTHS].copy()]
         for command in (up, -up):
-            for _ in range(count):
-                self._exchange(command, Request.ENABLED)
+            self._move(command, count)
             lengths.append(self._feedback["truth"][TRUTH_LENGTHS].copy())
         self._check_motion(lengths, count)
+        self._compare()
         if self._beyond is not None:
             self._check_limit(self._beyond)
             self._exchange(np.full(LEGS, np.nan), Request.ENABLED)
@@ -251,6 +232,46 @@ class _Examiner:
         self._request(Request.BRAKED, zero, (DriveState.READY,))
         self._request(Request.ENABLED, zero, (DriveState.FOLLOWING,))
         self._exchange(up, Request.ENABLED)
+
+    def _compare(self) -> None:
+        """Move one leg after the other, and all of them back, and compare what the IMUs read with it."""
+        if self._motions is None:
+            return
+        count, single = max(3, round(LEG_STROKE_S / self._period)), LEG_SPEED * np.eye(LEGS)
+        self._rest()
+        for command in (*single, -single.sum(axis=0)):
+            self._move(command, count)
+            self._rest()
+        self._tell_motions()
+
+    def _tell_motions(self) -> None:
+        self._begin("gravity", "commands", "gyroscopes", "accelerometers")
+        for clause, text in self._motions.findings() if self._motions is not None else ():
+            self._find(clause, text)
+
+    def _move(self, command: Array, count: int) -> None:
+        """Move with a command for some exchanges, unless the IMUs show a motion that it should not make."""
+        for _ in range(count):
+            self._exchange(command, Request.ENABLED)
+            alarm = self._motions.add_motion(command, self._period, self._feedback) if self._motions is not None else ""
+            if alarm:
+                self._rest(Request.QUICK_STOP)
+                self._tell_motions()
+                self._find("commands", alarm)
+                raise _BrokenOffError
+
+    def _rest(self, request: int = Request.ENABLED) -> None:
+        """Let the rig come to rest after a motion, and average what the IMUs read then, if they are compared."""
+        if self._motions is None:
+            return
+        zero = np.zeros(LEGS)
+        for _ in range(round(_SETTLED_S / self._period)):
+            self._exchange(zero, request)
+            if self._motions.begun:
+                self._motions.add_motion(zero, self._period, self._feedback)
+        for _ in range(max(2, round(_AVERAGED_S / self._period))):
+            self._exchange(zero, request)
+            self._motions.add_rest(self._feedback)
 
     def _check_motion(self, lengths: list[Array], count: int) -> None:
         """Check the lengths at the motion's start, turn and end. The mean of both ways cancels a drive's sag under load."""
@@ -374,27 +395,9 @@ class _Examiner:
 
     def _check_contents(self) -> None:
         """Check the feedback's values after a while at rest."""
-        feedback = self._feedback
-        measurement, present = feedback["measurement"], self._present()
-        self._expect(present.any(), "feedback", "No IMU has given readings: the measurement is NaN.")
-        for imu in np.flatnonzero(present).tolist():
-            if not np.isfinite(measurement[:2, imu]).all():
-                self._find("feedback", f"IMU {imu} gives some axes that are not finite; NaN is for an IMU that is not there.")
-                continue
-            rate, force = (float(np.linalg.norm(measurement[kind, imu])) for kind in range(2))
-            text = f"IMU {imu} reads {force:.3g} m/s^2 at rest instead of gravity: check its unit."
-            self._expect(_REST_FORCE[0] <= force <= _REST_FORCE[1], "feedback", text)
-            self._expect(rate <= _REST_RATE, "feedback", f"IMU {imu} reads {rate:.3g} rad/s at rest: check its unit.")
-            text = f"The magnetic field of IMU {imu} must be finite, or NaN on all axes."
-            self._expect(_is_whole(measurement[2, imu]), "feedback", text)
-            text = f"IMU {imu} has readings, but its samples have no number."
-            self._expect(feedback["sequence"][imu] >= 0, "feedback", text)
-        states = feedback["drive"].tolist()
-        text = f"The drives' states are {states}; they must be 0 to {len(_DRIVES) - 1}."
-        self._expect(np.isin(states, range(len(_DRIVES))).all(), "feedback", text)
-        self._expect(feedback["round_trip_ns"] >= 0, "feedback", f"The round trip is {feedback['round_trip_ns']} ns.")
-        text = "The truth must have position, quaternion and lengths, or be NaN where it is not known."
-        self._expect(_is_whole(feedback["truth"][:13]), "feedback", text)
+        self._begin("feedback")
+        for text in missing_contents(self._feedback, self._present()):
+            self._find("feedback", text)
 
     # ------------------------------------------------------------------------------------------------------------ end
 
@@ -439,8 +442,3 @@ class _Examiner:
         finally:
             with suppress(Exception):
                 rig.close()
-
-
-def _is_whole(values: Array) -> bool:
-    """Whether all values are finite, or all are NaN."""
-    return bool(np.isfinite(values).all() or np.isnan(values).all())

@@ -1,5 +1,7 @@
 """A hexapod without dynamics, in the place of the template's hardware: drives of the first order, and ideal IMUs."""
 
+from collections.abc import Callable
+
 import casadi as ca
 import numpy as np
 
@@ -8,13 +10,29 @@ from controller.inverse_kinematics import inverse_kinematics
 from plant.dynamics.spatial import imu_signals
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS, Mechanism
-from plant.pose import Array, quaternion_from_rotation
+from plant.pose import Array, Pose, quaternion_from_rotation
 
 _DRIVE_S = 0.02
 """Time constant of a drive's velocity [s]."""
 
 _WATCHDOG_S = 0.1
 """Time without a command after which the legs stop, as with real drives [s]."""
+
+
+def ideal_signals(mechanism: Mechanism) -> Callable[[Pose, Array, Array], Array]:
+    """A function from pose, twist (6,) and acceleration (6,) to the signals (3, 7, 3) of ideal IMUs [rad/s, m/s^2, uT]."""
+    position, velocity, omega = (ca.SX.sym(name, 3) for name in ("position", "velocity", "omega"))
+    rotation, acceleration = ca.SX.sym("rotation", 3, 3), ca.SX.sym("acceleration", 6)
+    constants = {name: ca.SX(ca.DM(value)) for name, value in mechanism.plant_parameters().items()}
+    ideal = imu_signals(position, rotation, velocity, omega, acceleration, constants)
+    outputs = [ca.vec(ca.densify(value).T) for value in ideal.values()]
+    function = ca.Function("signals", [position, rotation, velocity, omega, acceleration], outputs, {"cse": True})
+
+    def signals(pose: Pose, twist: Array, acceleration: Array) -> Array:
+        found = function(pose.position, pose.rotation, twist[:3], twist[3:], acceleration)
+        return np.array([np.array(kind).reshape(IMU_COUNT, 3) for kind in found])
+
+    return signals
 
 
 class KinematicHexapod:
@@ -29,12 +47,7 @@ class KinematicHexapod:
         self.signals: Array = np.zeros((3, IMU_COUNT, 3))  # of the IMUs [rad/s, m/s^2, uT]
         self._mechanism = mechanism
         self._twist: Array = np.zeros(6)
-        position, velocity, omega = (ca.SX.sym(name, 3) for name in ("position", "velocity", "omega"))
-        rotation, acceleration = ca.SX.sym("rotation", 3, 3), ca.SX.sym("acceleration", 6)
-        constants = {name: ca.SX(ca.DM(value)) for name, value in mechanism.plant_parameters().items()}
-        ideal = imu_signals(position, rotation, velocity, omega, acceleration, constants)
-        outputs = [ca.vec(ca.densify(value).T) for value in ideal.values()]
-        self._signals = ca.Function("signals", [position, rotation, velocity, omega, acceleration], outputs, {"cse": True})
+        self._signals = ideal_signals(mechanism)
         self.advance(1)
 
     def advance(self, time_ns: int) -> None:
@@ -50,8 +63,7 @@ class KinematicHexapod:
         self.pose = pose_from_lengths(self._mechanism, self.lengths, self.pose)
         twist = np.linalg.solve(inverse_kinematics(self._mechanism, self.pose).jacobian, self.velocities)
         acceleration, self._twist = (twist - self._twist) / duration, twist
-        signals = self._signals(self.pose.position, self.pose.rotation, twist[:3], twist[3:], acceleration)
-        self.signals = np.array([np.array(kind).reshape(IMU_COUNT, 3) for kind in signals])
+        self.signals = self._signals(self.pose, twist, acceleration)
 
     def _follow(self, duration: float) -> None:
         lag = self.velocities - self.commands

@@ -122,6 +122,10 @@ class SimulationConfig:
             raise UnknownNameError(f"no fusion {self.fusion!r}; there are {', '.join(FUSIONS)}")
         if self.rig not in RIGS and not self.rig.startswith(PYTHON_RIG):
             raise UnknownNameError(f"no rig {self.rig!r}; there are {', '.join(RIGS)} and {PYTHON_RIG}MODULE:CLASS")
+        if self.rig_at is not None and self.rig == "fmu":
+            raise InputError(
+                f"--rig-at {self.rig_at} says where a rig is, but not which: name it with --rig, such as --rig udp"
+            )
         if self.binding is not None and self.plant is None:
             raise InputError(f"{self.binding} binds an FMU, and none is given: name it with --plant FILE.fmu")
         if self.settings and self.rig != "fmu":

@@ -4,26 +4,29 @@ It uses the bus as hardware would, and knows nothing of the controller. A sessio
 control channel, with one text datagram per question and answer, injects faults and reports the rig's state.
 """
 
+import getpass
 import json
+import os
 import select
 import signal
 import socket
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controller.planning.target import load_target
 from hil.loop.driver import prevent_compilation
 from hil.realtime.scheduling import RealTimeSettings, real_time
-from hil.rigs import DriveState
 from hil.rigs.emulation import add_fault, fault, new_emulated
 from hil.rigs.udp.datagrams import HELLO_DATAGRAM, WELCOME_DATAGRAM, DatagramKind, decode, encode
 from hil.rigs.udp.emulator import UdpEmulator, new_udp_emulator, serve
-from hil.rigs.udp.link import DEFAULT_ADDRESS, bound_socket, parse_address, socket_address
+from hil.rigs.udp.link import DEFAULT_ADDRESS, address_in, bound_socket, parse_address, socket_address
 from hil.runs.config import EmulatorConfig
 from hil.runs.prepare import simulated_plant
 from plant.compiled import Record
@@ -36,8 +39,11 @@ from plant.truth import TRUTH_LENGTHS
 _STEP_NS = 1_000_000
 _TURN_NS = 20_000_000
 _IDLE_S = 0.1
-_NAME = np.frombuffer(b"gough emulated hexapod".ljust(32, b"\0"), np.uint8)
-_FIRMWARE = np.frombuffer(b"1".ljust(16, b"\0"), np.uint8)
+_MOST_QUESTIONS = 16
+"""How many questions the control channel answers at a time, so that a flood of them does not keep the rig waiting."""
+
+_MOST_STRANGERS = 10
+_FOUND_AS = "gough-emulator"
 
 _Address = tuple[str, int]
 
@@ -54,7 +60,8 @@ def emulate(config: EmulatorConfig, settings: RealTimeSettings, say: Callable[[s
     """
     faults = [fault(text) for text in config.faults]
     with ExitStack() as stack:
-        control = _Control(stack.enter_context(_listen(config.control)))
+        control = _Control(stack.enter_context(_listen(config.control)), _name_of(config))
+        stack.enter_context(_findable(config.control))
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, control.stop)
         if config.bus == "canopen":
@@ -95,6 +102,41 @@ def _announce(config: EmulatorConfig, where: str, refused: list[str], say: Calla
     say(f"the rig {config.simulated.mechanism} listens at {where}, its control at {config.control}")
 
 
+def _name_of(config: EmulatorConfig) -> str:
+    """The emulator's name, for whoever asks its control channel."""
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):
+        user = f"user {os.getuid()}"
+    return f"{config.simulated.mechanism} on {config.bus}, of {user}, process {os.getpid()}"
+
+
+def _findable(control: str) -> socket.socket:
+    """A name in the kernel's list of abstract sockets, by which `own_control` finds this emulator as long as it runs."""
+    named = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with suppress(OSError):
+        named.bind(f"\0{_FOUND_AS}/{os.getuid()}/{control}")
+    return named
+
+
+def own_control() -> str:
+    """The control channel of the one emulator that this user has running on this machine.
+
+    Raises:
+        GoughError: there is none, or there are several.
+    """
+    prefix = f"@{_FOUND_AS}/{os.getuid()}/"
+    names = (line.rpartition(" ")[2] for line in Path("/proc/net/unix").read_text().splitlines())
+    found = sorted({name.removeprefix(prefix) for name in names if name.startswith(prefix)})
+    if not found:
+        raise BusyError(
+            "no emulator of this user runs on this machine: start one with 'gough emulate', or name another's with --to"
+        )
+    if len(found) > 1:
+        raise InputError(f"there are emulators with their control at {' and '.join(found)}: name one with --to")
+    return found[0]
+
+
 def _listen(address: str) -> socket.socket:
     try:
         return bound_socket(*parse_address(address))
@@ -103,10 +145,10 @@ def _listen(address: str) -> socket.socket:
 
 
 class _Control:
-    """The control channel."""
+    """The control channel; each answer says whose it is by the emulator's `name`."""
 
-    def __init__(self, opened: socket.socket) -> None:
-        self.socket, self.stopped = opened, False
+    def __init__(self, opened: socket.socket, name: str) -> None:
+        self.socket, self.stopped, self._name = opened, False, name
         opened.setblocking(False)
 
     def stop(self, *signalled: object) -> None:
@@ -115,8 +157,10 @@ class _Control:
         self.stopped = True
 
     def answer(self, rig: Record | None, bus: dict[str, Any] | None = None) -> None:
-        """Answer all questions that have arrived. There is no `rig` without a session; `bus` becomes part of the state."""
-        while True:
+        """Answer some of the questions that have arrived. There is no `rig` without a session; `bus` becomes part of the
+        state.
+        """
+        for _ in range(_MOST_QUESTIONS):
             try:
                 content, sender = self.socket.recvfrom(4096)
             except OSError:
@@ -126,7 +170,8 @@ class _Control:
                 reply = self._do(command, argument.strip(), rig, bus or {})
             except GoughError as error:
                 reply = {"error": str(error)}
-            self.socket.sendto(json.dumps(reply).encode(), sender)
+            with suppress(OSError):
+                self.socket.sendto(json.dumps({"emulator": self._name, **reply}).encode(), sender)
 
     def _do(self, command: str, argument: str, rig: Record | None, bus: dict[str, Any]) -> dict[str, Any]:
         if command == "stop":
@@ -219,30 +264,48 @@ class _UdpSessions:
 
     def _welcome(self, hello: Record, sender: _Address) -> None:
         watchdog_us = round(1e6 * self.config.watchdog_for(int(hello["period_us"])))
-        fields = {"session": hello["session"], "watchdog_us": watchdog_us, "truthful": 1, "name": _NAME, "firmware": _FIRMWARE}
+        name = _padded(f"gough emulated {load_spatial(self.config.simulated.mechanism).name}", 32)
+        fields = {
+            "session": hello["session"],
+            "watchdog_us": watchdog_us,
+            "truthful": 1,
+            "name": name,
+            "firmware": _padded("1", 16),
+        }
         self.opened.sendto(encode(WELCOME_DATAGRAM, kind=DatagramKind.WELCOME, **fields), sender)
 
     def _serve_session(self, emulator: UdpEmulator, sender: _Address) -> tuple[Record | None, _Address]:
         """Serve a session to its end; returns the hello that begins the next one, and its sender."""
         started, timespec = time.monotonic_ns(), np.zeros(2, np.int64)
+        strangers: set[_Address] = set()
         rig, session, link = emulator.rig, emulator.session, emulator.link
         with prevent_compilation():
             while not self.control.stopped:
                 met = serve(emulator, started, _TURN_NS, timespec)
                 self.control.answer(rig, {"refused": int(session["refused"])})
+                self._tell_stranger(address_in(bytes(session["stranger"])), strangers)
                 if not met:
                     continue
                 hello = _hello(link.command_bytes[: HELLO_DATAGRAM.itemsize].tobytes())
-                address = bytes(link.socket["sender"])
-                sender = (socket.inet_ntoa(address[4:8]), int.from_bytes(address[2:4], "big"))
-                # A moving rig has one controller.
-                if hello is None or np.isin(rig["drive"], (DriveState.FOLLOWING, DriveState.QUICK_STOPPING)).any():
+                sender = address_in(bytes(link.socket["sender"]))
+                if hello is None:
                     session["refused"] += 1
                 elif hello["session"] == session["id"]:
                     self._welcome(hello, sender)
                 else:
                     return hello, sender
         return None, sender
+
+    def _tell_stranger(self, stranger: _Address, told: set[_Address]) -> None:
+        """Say once of each, but of no more than some, who else sends datagrams to this rig during a session."""
+        if stranger[1] and stranger not in told and len(told) < _MOST_STRANGERS:
+            told.add(stranger)
+            self.say(f"refused: {stranger[0]}:{stranger[1]} sends datagrams that are none of this session's")
+
+
+def _padded(text: str, size: int) -> NDArray[np.uint8]:
+    """A text in ASCII, cut or padded with zeros to this size."""
+    return np.frombuffer(text.encode("ascii", "replace")[:size].ljust(size, b"\0"), np.uint8)
 
 
 def _hello(content: bytes) -> Record | None:

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.inverse_kinematics import leg_lengths
+from controller.planning.pace import required_stretch
 from controller.planning.plan_handover import END_PLANNER, STREAM
 from controller.planning.stream_planner import StreamPlanner
 from controller.safety.arming import describe_obstacle
@@ -51,6 +52,7 @@ from plant.mechanism import load_spatial
 _BUFFER_S = 8.0
 _LEAST_RECORDS = 1024
 _LOOK_S = 0.1
+_STOPPING = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)
 
 
 class RunStoppedError(GoughError, RuntimeError):
@@ -72,8 +74,8 @@ def run(
 ) -> dict[str, Any]:
     """Run the closed loop on the machine's clock, to the end of its motion or until it is asked to stop.
 
-    SIGINT, SIGTERM and SIGHUP ask for a controlled stop, SIGQUIT for an emergency stop. Call it from the main thread, while no
-    other thread runs.
+    SIGINT, SIGTERM and SIGHUP ask for a controlled stop, unless they are ignored (`ignored_signals`). SIGQUIT always asks for
+    an emergency stop. Call it from the main thread, while no other thread runs.
 
     Args:
         config, settings: what to run, and how.
@@ -83,9 +85,10 @@ def run(
 
     Returns:
         The summary: `cause` of the stop, `cycles`, missed periods by cause, `timing_us` and which of it is `over_budget`,
-        `errors_m`, the number of cycles `unseen` by these three, `usage` of the loop's thread, `start_up_s`, `recording`
-        (files, cycles lost), `refused`, `events`, `config`, `version`; of a rig on a bus `identity`, `late` exchanges,
-        `refused_packets` and `round_trip_bars`; and of a dry run the `obstacle` to arming, "" if there is none.
+        `target_stretch` (`controller.planning.pace`), `errors_m`, the number of cycles `unseen` by these, `usage` of the loop's
+        thread, `start_up_s`, `recording` (files, cycles lost), `refused`, `events`, `config`, `version`; of a rig on a bus
+        `identity`, `late` exchanges, `refused_packets` and `round_trip_bars`; and of a dry run the `obstacle` to arming, "" if
+        there is none.
 
     Raises:
         GoughError: something in the configuration or the settings cannot be used; nothing has run.
@@ -140,15 +143,22 @@ def _reported(state: RunState, recorders: Recorders) -> Iterator[None]:
         raise RunStoppedError("; ".join([str(error), *state.events, *files])) from None
 
 
+def ignored_signals() -> list[str]:
+    """The signals that cannot stop a run, because this process has been started to ignore them: as nohup asks for SIGHUP, and
+    the shell of a script for SIGINT of what it starts in the background.
+    """
+    return [each.name for each in _STOPPING if signal.getsignal(each) == signal.SIG_IGN]
+
+
 @contextmanager
 def _asked_to_stop(link: NDArray[np.int64]) -> Iterator[None]:
     def ask(number: int, frame: object) -> None:
         del frame
         link[Link.STOP] = max(int(link[Link.STOP]), StopRequest.QUICK if number == signal.SIGQUIT else StopRequest.CONTROLLED)
 
-    numbers = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM)
-    # A signal that is ignored, as under nohup, stays ignored.
-    before = {each: signal.signal(each, ask) for each in numbers if signal.getsignal(each) != signal.SIG_IGN}
+    # What is to be ignored stays ignored, but an emergency stop is always heard.
+    heard = (signal.SIGQUIT, *(each for each in _STOPPING if each.name not in ignored_signals()))
+    before = {each: signal.signal(each, ask) for each in heard}
     try:
         yield
     finally:
@@ -266,6 +276,7 @@ def _prepare_and_follow(
             **{name: int(loop.clock[name]) for name in ("missed_late", "missed_own", "missed_host")},
             "usage": used,
             "identity": header["config"].get("identity"),
+            "target_stretch": 1.0 if config.streamed else required_stretch(loop.mechanism, loop.target),
             "obstacle": None if config.arm else describe_obstacle(loop.state),
         }
         pipe.send((cause, int(loop.state["safety"]["stop"]["cycle"]), int(loop.clock["start"]), figures))
@@ -279,7 +290,7 @@ def _summary(
     return {
         **figures,
         "timing_us": timing,
-        "over_budget": over_budget(timing),
+        "over_budget": over_budget(timing, config.fusion),
         "errors_m": state.errors(),
         "start_up_s": since_process_start() - (time.monotonic() - first),
         **{name: getattr(state, name) for name in ("unseen", "refused", "late", "refused_packets", "events")},

@@ -26,6 +26,7 @@ from hil.rigs.by_name import check_legs, python_rig
 from hil.rigs.udp.link import DEFAULT_ADDRESS
 from hil.rigs.udp.rig import UdpRig
 from hil.runs.config import FUSIONS, PYTHON_RIG, SimulationConfig
+from hil.runs.plant_start import check_start
 from plant.compiled import Record
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import GoughError, InputError
@@ -33,7 +34,8 @@ from plant.extras import missing_extras_named
 from plant.fmu.binding import OWN_BINDING, load_binding
 from plant.fmu.build import building_default_fmu, default_fmu, model_of
 from plant.fmu.calls import FMU_HANDLE
-from plant.fmu.plant import FmuPlant
+from plant.fmu.description_reader import FmuDescription
+from plant.fmu.plant import FmuPlant, takes_parameters
 from plant.imu import imu_state, load_imu
 from plant.mechanism import Mechanism, load_in_space
 from plant.pose import Pose
@@ -106,13 +108,15 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             _check_memory(config, count)
         # Loads the planner, so that the planning time is that of the plan alone.
         plan(mechanism, load_target("hold", mechanism, 0.1), 0.1)
-        plant = stack.enter_context(simulated_plant(config, nominal, target.start, fmu)) if config.rig == "fmu" else None
         began = time.perf_counter()
         if config.streamed:
             lengths = leg_lengths(mechanism, target.start.position, target.start.rotation)
             reference = Reference(rest(lengths), 0)
         else:
             reference = plan(mechanism, target, config.duration)
+        planning_time = time.perf_counter() - began
+        # A plant can be started only at a pose that the plan has found within the strokes.
+        plant = stack.enter_context(simulated_plant(config, nominal, target.start, fmu)) if config.rig == "fmu" else None
         loop = PreparedLoop(
             fmu=np.zeros((), FMU_HANDLE) if plant is None else plant.handle,
             imu=imu,
@@ -125,7 +129,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             mechanism=mechanism,
             target=target,
             reference=reference,
-            planning_time=time.perf_counter() - began,
+            planning_time=planning_time,
         )
         loop.load(python=config.fusion == "filterpy")
         yield loop
@@ -151,7 +155,7 @@ def _check_planar(config: SimulationConfig, calibration: Calibration) -> None:
 def simulated_plant(
     config: SimulationConfig, nominal: Mechanism, start: Pose, built_fmu: Callable[[], Path] | None = None
 ) -> FmuPlant:
-    """The plant of a configuration, at rest at `start`; a plant with a binding starts where its binding says.
+    """The plant of a configuration, at rest at `start`; one with parameters of its own starts where these say.
 
     `nominal` is the mechanism as it was designed. `built_fmu` waits for gough's own FMU and returns its path; without it, that
     is built now.
@@ -164,8 +168,6 @@ def simulated_plant(
     else:
         fmu = default_fmu(model_of(nominal)) if built_fmu is None else built_fmu()
     binding = OWN_BINDING if config.binding is None else load_binding(config.binding)
-    if config.joint_error and not binding.native:
-        raise InputError(f"{binding.source} binds an FMU with joints of its own, which have no joint error: leave it out")
     built = nominal.built(config.joint_error, config.seed)
     hold = control_settings(nominal).hold if config.hold is None else config.hold
     settings = [each if each.at is None else replace(each, at=each.at + hold) for each in config.settings]
@@ -173,9 +175,16 @@ def simulated_plant(
     if late:
         raise InputError(f"{late[0].name} is set at {late[0].at:g} s, when the motion of {config.duration:g} s is over")
     parameters = built.plant_parameters(start) if binding.native else {}
+    if config.plant is not None and binding.native and not takes_parameters(FmuDescription(fmu), [*parameters]):
+        parameters = {}
+    if config.joint_error and not parameters:
+        binds = f"{binding.source} binds" if binding.source else f"{fmu} is"
+        raise InputError(f"{binds} an FMU with joints of its own, which have no joint error: leave it out")
     plant = FmuPlant(fmu, parameters, 1.0 / config.rate, binding, settings, nominal.legs)
     try:
         _check_plant(config, plant, nominal)
+        if not parameters:
+            check_start(plant, nominal, start)
     except GoughError:
         plant.close()
         raise

@@ -5,7 +5,7 @@ import fcntl
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -55,8 +55,9 @@ def claimed(path: Path | None) -> Iterator[None]:
                 )
             yield
         finally:
-            if fresh and not path.stat().st_size:
-                path.unlink()
+            with suppress(OSError):
+                if fresh and not path.stat().st_size:
+                    path.unlink()
 
 
 class Recorders:
@@ -70,16 +71,18 @@ class Recorders:
         self._path, self._records, self._link, self._supervisors, self._events = path, records, link, supervisors, events
         self._header: dict[str, Any] = {}
         self._process: BaseProcess | None = None
+        self._started = 0  # recorders
 
     @property
     def lost(self) -> int:
         """Number of cycles that are in no file."""
-        return int(self._link[Link.HEAD] - self._link[Link.KEPT]) if self.files else 0
+        return int(self._link[Link.HEAD] - self._link[Link.KEPT]) if self._started else 0
 
     def start(self, header: dict[str, Any]) -> None:
         """Start the first recorder."""
         self._header = header
         if self._path is not None:
+            self._started = 1
             self._start(self._path)
 
     def _start(self, path: Path) -> None:
@@ -87,21 +90,28 @@ class Recorders:
         self._process = started(_recorder_process, path, self._header, self._records, self._link, self._supervisors)
 
     def watch(self) -> None:
-        """If the recorder has been killed, start a successor with a file of its own."""
-        if self._process is None or self._process.is_alive():
-            return
-        killed = self._report_death(self._process) < 0
-        self._process = None
-        if killed and len(self.files) < _MOST_RECORDERS:
-            first, numbers = self.files[0], range(len(self.files) + 1, 10_000)
-            path = next(each for n in numbers if not (each := first.with_stem(f"{first.stem}-{n}")).exists())
-            self._events.append(f"another recorder goes on in {path}")
-            self._start(path)
+        """If the recorder has been killed, or its file has gone, start a successor with a file of its own."""
+        if self._process is not None and not self._process.is_alive():
+            code = self._report_end(self._process)
+            if code < 0 or code == errno.ESTALE:
+                self._start_another()
 
-    def _report_death(self, recorder: BaseProcess) -> int:
+    def _start_another(self) -> None:
+        self._started += 1
+        if self._path is None or self._started > _MOST_RECORDERS:
+            return
+        path, numbers = self._path, range(self._started, 10_000)
+        another = next(each for n in numbers if not (each := path.with_stem(f"{path.stem}-{n}")).exists())
+        self._events.append(f"another recorder goes on in {another}")
+        self._start(another)
+
+    def _report_end(self, recorder: BaseProcess) -> int:
         """Note why a recorder has ended, if it was not asked to; returns its exit code."""
-        code = recorder.exitcode or 0
-        if code > 0:
+        code, self._process = recorder.exitcode or 0, None
+        if code == errno.ESTALE:
+            # It is no file of this run any more, so nothing is read from it or mended in it.
+            self._events.append(f"{self.files.pop()} was deleted, cut or replaced while it was recorded")
+        elif code > 0:
             self._events.append(f"{self.files[-1]} cannot be written: {os.strerror(code)}: the rest is not recorded")
         elif code < 0:
             self._events.append(f"the recorder died (exit code {code})")
@@ -110,9 +120,10 @@ class Recorders:
     def finish(self) -> None:
         """Let the recorder write what is left, and complete the files of those that died."""
         self._link[Link.DONE] = 1
-        if self._process is not None:
+        while self._process is not None:
             join_or_kill(self._process)
-            self._report_death(self._process)
+            if self._report_end(self._process) == errno.ESTALE:
+                self._start_another()
         for path in self.files:
             try:
                 if path.exists():

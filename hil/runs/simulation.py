@@ -9,6 +9,7 @@ import numpy as np
 
 from controller.direct_kinematics import poses_from_lengths
 from controller.planning.offline_planner import Reference
+from controller.planning.pace import required_stretch
 from controller.planning.target import Target
 from controller.safety.causes import Cause
 from hil.loop.records import COMPUTED
@@ -23,7 +24,8 @@ from plant.mechanism import Mechanism
 from plant.pose import Array, pose_errors, rms_figures, rotations_from_quaternions
 from plant.truth import TRUTH_POSITION, TRUTH_QUATERNION
 
-_CHUNK_S = 0.25
+_CHUNK_S = 0.1
+"""How long the loop may run before it looks for Ctrl-C [s]."""
 
 
 class SimulationStoppedError(GoughError, RuntimeError):
@@ -97,6 +99,7 @@ class SimulationResult:
             "estimated_tracking": _figures(estimate, reference),
             "target": planned if truth is None else _figures(truth, target) | planned,
             "limits": {"violations": self.reference.violations},
+            "target_stretch": required_stretch(self.mechanism, self.target),
             "real_time_factor": self.real_time_factor,
             "cycle_us": percentiles(self.records["stage_ns"][:, COMPUTED].sum(axis=1), tuple(QUANTILES)),
             "config": asdict(self.config),
@@ -135,16 +138,18 @@ def simulate(
 
             filters = FilterpyFilters(loop.parameters)
         cause, took = Cause.NONE.value, loop.planning_time
-        chunk = max(1, round(_CHUNK_S * config.rate))
-        for last in sorted({*range(first + chunk, count, chunk), count, saved or count}):
+        done, chunk = first, 1
+        while cause == Cause.NONE and done < count:
+            last = min(done + chunk, saved if saved is not None and done < saved else count)
             began = time.perf_counter()
             cause = loop.run(last, filters)
-            took += time.perf_counter() - began
-            if cause != Cause.NONE:
-                break
-            if last == saved and stop["cause"] == Cause.NONE:
+            passed = time.perf_counter() - began
+            took, done = took + passed, last
+            # As many cycles as fit, whatever a cycle costs on this plant.
+            chunk = max(1, min(2 * chunk, int(chunk * _CHUNK_S / max(passed, 1e-6))))
+            if cause == Cause.NONE and last == saved and stop["cause"] == Cause.NONE:
                 snapshot = take_snapshot(asdict(config), loop)
-            progress((last - first) / (count - first))
+            progress((done - first) / (count - first))
         result = _result(config, loop, first, snapshot, took)
         if stop["cause"] != Cause.NONE:
             how = "stopped on the brakes" if cause != Cause.NONE else "still stopping at the end, from"

@@ -12,15 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
+import numpy as np
 
-from controller.cycle import PARAMETERS, STATE
+from controller.cycle import PARAMETERS, RUNNING_LIMITS, STATE
 from controller.planning.segments import START
 from hil.loop.records import WORK
-from hil.realtime.clock import CLOCK
+from hil.realtime.clock import CLOCK, FREE
 from hil.runs.prepare import PreparedLoop
+from plant.compiled import Record, out_of_limits
 from plant.errors import InputError
 from plant.files import write_whole
-from plant.imu import IMU_STATE
+from plant.imu import IMU_LIMITS, IMU_STATE
 
 _KIND = "gough snapshot"
 
@@ -76,15 +78,31 @@ def resume_snapshot(snapshot: Snapshot, loop: PreparedLoop) -> None:
         )
     if {name: len(kept) for name, kept in snapshot.memory.items()} != {name: array.nbytes for name, array in memory.items()}:
         raise InputError(f"{refused} its memory has another layout")
+    kept: dict[str, Record] = {name: np.frombuffer(snapshot.memory[name], array.dtype) for name, array in memory.items()}
+    broken = _broken(snapshot, kept)
+    if broken is not None:
+        raise InputError(f"{refused} {broken}: its file was forged or is damaged")
     loop.simulated.restore(snapshot.plant)
     for name, array in memory.items():
-        array.reshape(-1).view("u1")[:] = memoryview(snapshot.memory[name])
+        array[...] = kept[name].reshape(array.shape)
+    # The place in the segments is found again.
+    loop.state["reference"]["index"] = 0
+
+
+def _broken(snapshot: Snapshot, kept: Mapping[str, Record]) -> str | None:
+    """What compiled code could not take of the loop's arrays, in words; None if there is nothing."""
+    for name, limits in (("state", RUNNING_LIMITS), ("imu", IMU_LIMITS), ("clock", {"mode": (FREE, FREE)})):
+        if broken := out_of_limits(kept[name], limits):
+            return f"in its {name} {broken}"
+    cycle = int(kept["state"]["time"]["cycle"][0])
+    return None if cycle == snapshot.cycle else f"its state is that of cycle {cycle}, and it is to be of {snapshot.cycle}"
 
 
 def write_snapshot(snapshot: Snapshot, path: Path) -> None:
     """Write a snapshot's file, which appears only when it is complete; an `InputError` if it cannot be written."""
-    content = {"kind": _KIND, "version": version("gough"), "layout": _layout(), **vars(snapshot)}
-    write_whole(path, msgpack.packb(content))
+    content = msgpack.packb(vars(snapshot))
+    whole = {"kind": _KIND, "version": version("gough"), "layout": _layout(), "digest": _hash(content), "content": content}
+    write_whole(path, msgpack.packb(whole))
 
 
 def read_snapshot(path: Path) -> Snapshot:
@@ -94,23 +112,32 @@ def read_snapshot(path: Path) -> Snapshot:
         InputError: it cannot be read, or is no snapshot of this version.
     """
     try:
-        content = msgpack.unpackb(path.read_bytes())
+        whole = msgpack.unpackb(path.read_bytes())
     except OSError as error:
         raise InputError(f"cannot read the snapshot {path}: {error.strerror}") from None
     except Exception:
-        content = None
-    if not isinstance(content, dict) or content.pop("kind", None) != _KIND:
+        whole = None
+    if not isinstance(whole, dict) or whole.get("kind") != _KIND:
         raise InputError(f"{path} is no snapshot of 'gough simulate --save-state'")
-    of, layout = content.pop("version", None), content.pop("layout", None)
+    of, layout = whole.get("version"), whole.get("layout")
     if of != version("gough") or layout != _layout():
         raise InputError(
             f"{path} is of gough {of}, and this is gough {version('gough')} with another layout of the state: go on with the "
             "version that saved it, or simulate from the start"
         )
+    content = whole.get("content")
+    if not isinstance(content, bytes) or whole.get("digest") != _hash(content):
+        raise InputError(f"{path} is damaged, as its digest is not that of its content: save the snapshot again")
     try:
-        return Snapshot(**content)
-    except TypeError:
+        snapshot = Snapshot(**msgpack.unpackb(content))
+    except Exception:
         raise InputError(f"{path} is a snapshot with missing or unknown parts") from None
+    kinds = {"config": dict, "cycle": int, "settings": bytes, "motion": bytes, "memory": dict, "plant": bytes}
+    wrong = [name for name, kind in kinds.items() if type(getattr(snapshot, name)) is not kind]
+    wrong += [f"memory.{name}" for name, part in snapshot.memory.items() if type(part) is not bytes] if not wrong else []
+    if wrong:
+        raise InputError(f"{path} is a snapshot whose {wrong[0]} is of another kind: it was forged")
+    return snapshot
 
 
 def _hash(content: bytes) -> bytes:

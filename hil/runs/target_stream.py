@@ -5,8 +5,10 @@
 
 A datagram of version 1 is little-endian and packed, 78 bytes: `GGHT`, version (2 bytes), sequence number (4), time of the pose
 on the sender's clock [ns] (8), displacement from home x, y, z [m] and rotation from home as a unit quaternion, w first (7
-doubles), and the CRC-32 of all these bytes (4). UDP does not authenticate senders: by default the receiver listens only to this
-machine, and only to the first sender.
+doubles), and the CRC-32 of all these bytes (4). One that begins with `GGHE` instead ends the stream: the platform comes to rest
+at its pose and stays there. A sender that falls silent without it is lost.
+
+UDP does not authenticate senders: by default the receiver listens only to this machine, and only to the first sender.
 """
 
 import math
@@ -15,7 +17,7 @@ import select
 import socket
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 from typing import Any
@@ -49,7 +51,10 @@ HOST, PORT = "127.0.0.1", 47200
 _HEAD = [("magic", "u4"), ("version", "u2"), ("sequence", "u4"), ("time_ns", "u8")]
 TARGET_DATAGRAM = np.dtype([*_HEAD, ("displacement", "f8", 3), ("quaternion", "f8", 4), ("crc", "u4")])
 _NUMBERS = 1 << 32
-_KIND = {"magic": int.from_bytes(b"GGHT", "little"), "version": 1}
+_POSE, _END = ({"magic": int.from_bytes(magic, "little"), "version": 1} for magic in (b"GGHT", b"GGHE"))
+
+FAREWELLS = 5
+"""How often a sender sends the end of its stream, because datagrams can be lost."""
 
 LEAD_S = 0.01
 """How long before its start a plan is made: the delay that planner and loop together may have [s]."""
@@ -69,15 +74,23 @@ class StreamError(GoughError, OSError):
     """The network refuses what a stream needs."""
 
 
-def encode(number: int, time_ns: int, displacement: ArrayLike, quaternion: ArrayLike) -> bytes:
-    """The datagram of a pose; its number wraps."""
-    pose = {"displacement": displacement, "quaternion": quaternion}
-    return datagrams.encode(TARGET_DATAGRAM, **_KIND, sequence=number % _NUMBERS, time_ns=time_ns, **pose)
+def encode(number: int, time_ns: int, displacement: ArrayLike, quaternion: ArrayLike, last: bool = False) -> bytes:
+    """The datagram of a pose, or of the last one, which ends the stream; its number wraps."""
+    kind, pose = _END if last else _POSE, {"displacement": displacement, "quaternion": quaternion}
+    return datagrams.encode(TARGET_DATAGRAM, **kind, sequence=number % _NUMBERS, time_ns=time_ns, **pose)
 
 
 def decode(content: bytes) -> Record | None:
-    """The pose (dtype `TARGET_DATAGRAM`) of a datagram; None if it is malformed, damaged, or of another version."""
-    return datagrams.decode(TARGET_DATAGRAM, content, **_KIND)
+    """The pose (dtype `TARGET_DATAGRAM`) of a datagram, which may be the last one; None if it is malformed, damaged, or of
+    another version.
+    """
+    pose = datagrams.decode(TARGET_DATAGRAM, content, **_POSE)
+    return datagrams.decode(TARGET_DATAGRAM, content, **_END) if pose is None else pose
+
+
+def is_last(pose: Record) -> bool:
+    """Whether a pose ends its stream."""
+    return bool(pose["magic"] == _END["magic"])
 
 
 def open_socket(host: str = HOST, port: int = PORT) -> socket.socket:
@@ -137,7 +150,7 @@ class Reception:
         self._number, self._time_ns, self._first_ns, self._at = 0, 0, 0, 0.0
         self._offsets: deque[float] = deque(maxlen=_CLOCK_SAMPLES)
         self._pending: tuple[int, Plan] | None = None
-        self._fresh = False
+        self._fresh = self._ended = False
 
     @property
     def waits(self) -> bool:
@@ -155,7 +168,7 @@ class Reception:
             stream["strange"] += 1
             return
         newer = 0 < (number - self._number) % _NUMBERS < _NUMBERS // 2 and time_ns > self._time_ns
-        if not first and not newer:
+        if self._ended or (not first and not newer):
             stream["stale"] += 1
             return
         if self._shared[CAUSE] != Cause.NONE:
@@ -175,7 +188,9 @@ class Reception:
             self._offsets.clear()
         self._offsets.append(cycle * self._period - at)
         stream["accepted"] += 1
-        note_sample(stream, time.monotonic_ns())
+        self._ended = is_last(pose)
+        # After the last sample none is missed.
+        note_sample(stream, 0 if self._ended else time.monotonic_ns())
 
     def plan(self) -> None:
         """Note the loop's decision on the last plan, and make a plan for the newest sample."""
@@ -189,11 +204,13 @@ class Reception:
                 self._planner.follow(plan)
             else:
                 stream["late"] += 1
+                # No further sample would bring another plan.
+                self._fresh |= self._ended
         if not self._fresh or shared[CAUSE] != Cause.NONE:
             return
         self._fresh = False
         begin = max((int(shared[CYCLE]) + self._lead) * self._period, self._planner.current.begin)
-        made = self._planner.plan(begin, begin - (self._at + median(self._offsets)))
+        made = self._planner.plan(begin, begin - (self._at + median(self._offsets)), self._ended)
         if made is not None:
             self._pending = publish_plan(stream, made.segments, made.begin, int(shared[TAKEN])), made
             stream["planned"] += 1
@@ -246,25 +263,28 @@ def send_target(
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         with socket.socket(family, socket.SOCK_DGRAM) as sender:
-            return _send(sender, address, rate, zip(displacements, quaternions, strict=True))
+            # One that falls silent on purpose does not say so.
+            return _send(sender, address, rate, list(zip(displacements, quaternions, strict=True)), faults.stop_at >= duration)
     except (OSError, OverflowError) as error:
         raise StreamError(f"cannot send a target to {host}:{port}: {error}: choose another address or port") from None
 
 
-def _send(sender: socket.socket, address: Any, rate: float, poses: Iterable[tuple[Array, Array]]) -> int:
-    began, sent = time.monotonic_ns(), 0
-    for k, pose in enumerate(poses):
+def _send(sender: socket.socket, address: Any, rate: float, poses: Sequence[tuple[Array, Array]], ends: bool) -> int:
+    """Send poses, each when it is due, and the last one again as the end of the stream if it `ends`; returns their number."""
+    began, sent, count = time.monotonic_ns(), 0, len(poses)
+    for k in range(count + FAREWELLS * ends):
+        pose, last = poses[min(k, count - 1)], k >= count
         due = began + round(1e9 * k / rate)
         late = time.monotonic_ns() - due
-        if late > 1e9 / rate:
+        if late > 1e9 / rate and not last:
             # A sender that is held up leaves out the poses whose time is over.
             continue
         if late < 0:
             time.sleep(-1e-9 * late)
         try:
-            sender.sendto(encode(k, due, *pose), address)
+            sender.sendto(encode(k, due, *pose, last), address)
         except ConnectionRefusedError:
             # Nobody listens yet, or nobody listens any more.
             continue
-        sent += 1
+        sent += not last
     return sent

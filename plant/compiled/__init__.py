@@ -3,8 +3,11 @@
 from plant.compiled.atomics import fence, load_acquire, store_release
 from plant.compiled.cache import hash_of_files, keyed_folder, user_cache
 from plant.compiled.kernels import Record, compilation_reported, filled, kernel, record_dtype
+from plant.compiled.limits import MOST, Limits, out_of_limits
 
 __all__ = [
+    "MOST",
+    "Limits",
     "Record",
     "compilation_reported",
     "fence",
@@ -13,6 +16,7 @@ __all__ = [
     "kernel",
     "keyed_folder",
     "load_acquire",
+    "out_of_limits",
     "record_dtype",
     "store_release",
     "user_cache",

@@ -218,6 +218,7 @@ class Bound:
     knows_pose: bool
     planar_angle: bool  # in place of the quaternion
     driven: frozenset[str]  # scalars that the loop sets
+    read: tuple[str, ...]  # scalars that the loop reads, in the order of `sensed` and `known`
 
 
 def check_settable(variable: FmuVariable, owner: str, driven: frozenset[str], running: bool = False) -> None:
@@ -296,6 +297,12 @@ class _Binder:
             knows_pose=all(knows),
             planar_angle="angle" in self._found,
             driven=self._driven,
+            read=tuple(
+                scalar
+                for name in (*IMU_SIGNALS, *TRUTH_PLACES)
+                for each in self._found.get(name, ())
+                for scalar in each.element_names
+            ),
         )
 
     def _variables(self, name: str, signal: SignalBinding) -> list[FmuVariable]:

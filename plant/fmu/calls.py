@@ -10,7 +10,7 @@ from numba.extending import intrinsic
 
 from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.variables import DRIVE_MODES, IMU_COUNT, VELOCITY
-from plant.fmu.instance import ASKS_TO_END, ERROR, NEEDS_EVENTS, OK
+from plant.fmu.instance import ASKS_TO_END, ERROR, NEEDS_EVENTS, NOT_FINITE, OK
 from plant.mechanism import LEGS
 from plant.pose import Array
 from plant.truth import TRUTH_SIZE
@@ -151,14 +151,17 @@ def _access(c: Record, call: int, function: int, references: int, reference_coun
 
 @kernel
 def _read(c: Record, call: int, scalars: Record, into: Array) -> int:
-    """Read scalars, each to its place."""
+    """Read scalars, each to its place; one that is not finite is left out, and is a failure of the FMU."""
     if scalars.count == 0:
         return OK
     raw, references = scalars.raw, scalars.references
     status = _access(c, call, c.get, references.ctypes.data, scalars.reference_count, raw.ctypes.data, scalars.count)
     places, factors, offsets = scalars.places, scalars.factors, scalars.offsets
     for i in range(scalars.count):
-        into[places[i]] = factors[i] * raw[i] + offsets[i]
+        if np.isfinite(raw[i]):
+            into[places[i]] = factors[i] * raw[i] + offsets[i]
+        elif status == OK:
+            status = _keep_failure(c, call, NOT_FINITE)
     return status
 
 
@@ -176,7 +179,7 @@ def _write(c: Record, call: int, scalars: Record, values: Array) -> int:
 
 @kernel
 def read_imus(fmu: Record) -> int:
-    """Read the ideal IMU signals into `imu`; returns FMI's status, 0 for success."""
+    """Read the ideal IMU signals into `imu`; returns FMI's status or `NOT_FINITE`, 0 for success."""
     c = fmu[()]
     return _read(c, _READ_IMUS, c.sensed, c.imu.reshape(-1))
 

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import zipfile
 from collections.abc import Callable, Iterable
+from math import inf
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from fmpy.validation import validate_fmu
 
+from plant.errors import InputError
 from plant.fmu.description_reader import FmuDescription, FmuVariable
 from plant.fmu.instance import FmuInstance
 from plant.pose import Array
@@ -41,19 +43,22 @@ def platforms_of(path: Path) -> list[str]:
     return sorted({parts[1] for parts in names if parts[0] == "binaries" and len(parts) > 2 and parts[2]})
 
 
-def check_fmu(path: Path) -> list[Check]:
-    """Validate an FMU and try it on this machine, in a separate process, which may crash.
+def check_fmu(path: Path, limit: float = 60.0) -> list[Check]:
+    """Validate an FMU and try it on this machine, in a separate process, which may crash, or take longer than `limit` [s].
 
     Raises:
         FmuError: the file is no FMU for Co-Simulation.
+        InputError: the limit is not positive.
     """
+    if not 0.0 < limit < inf:
+        raise InputError(f"the limit is {limit:g} s; it must be positive and finite")
     FmuDescription(path)
     valid = Check("description and units (FMPy)", _found(lambda: validate_fmu(str(path))))
-    return [valid, *map(Check, _TRIALS, _try_apart(path))]
+    return [valid, *map(Check, _TRIALS, _try_apart(path, limit))]
 
 
-def _try_apart(path: Path) -> list[Found]:
-    """The result of each trial; after a crash, another process continues with the next."""
+def _try_apart(path: Path, limit: float) -> list[Found]:
+    """The result of each trial; after a crash or the time limit, another process continues with the next."""
     found: list[Found] = []
     context = multiprocessing.get_context("spawn")
     while len(found) < len(_TRIALS):
@@ -61,13 +66,18 @@ def _try_apart(path: Path) -> list[Found]:
         process = context.Process(target=_try, args=(path, len(found), sender), daemon=True)
         process.start()
         sender.close()
-        with receiver, contextlib.suppress(EOFError):
-            while True:
-                found.append(receiver.recv())
+        ending = f"took longer than {limit:g} s"
+        with receiver:
+            try:
+                while receiver.poll(limit):
+                    found.append(receiver.recv())
+                process.kill()
+            except EOFError:
+                process.join()
+                status = process.exitcode or 0
+                ending = f"crashed with signal {-status}" if status < 0 else f"ended its process with status {status}"
         process.join()
         if len(found) < len(_TRIALS):
-            status = process.exitcode or 0
-            ending = f"crashed with signal {-status}" if status < 0 else f"ended its process with status {status}"
             found.append((ending,))
     return found
 

@@ -2,6 +2,7 @@
 
 import itertools
 import re
+import stat
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plant.errors import FmuError, InputError, UnknownNameError
+from plant.files import most_unpacked
 
 _FLOAT, _INTEGER = np.dtype(np.float64), np.dtype(np.int32)
 _SIZED = [f"{sign}{bits}" for sign in ("Int", "UInt") for bits in (8, 16, 32, 64)]
@@ -39,6 +41,9 @@ _TYPES: dict[int, dict[str, tuple[str, np.dtype[Any]]]] = {
 """The ending of the functions' names and their number type, by FMI version and type of the variable."""
 
 _ELEMENT = re.compile(r"(.+)\[(\d+(?:, ?\d+)*)\]")
+
+_MOST_ELEMENTS = 1_000_000
+"""The most elements of one variable."""
 
 
 @dataclass(frozen=True)
@@ -140,9 +145,12 @@ class FmuDescription:
         if path.is_dir():
             raise FmuError(f"{path} is a folder: name the FMU's file")
         try:
+            _check_archive(path)
             read = fmpy.read_model_description(str(path), validate=True)
         except FileNotFoundError:
             raise FmuError(f"there is no FMU at {path}") from None
+        except FmuError:
+            raise
         except Exception as error:
             raise FmuError(f"{path} is not a usable FMU: {' '.join(str(error).split())}") from None
         if not str(read.fmiVersion).startswith(("2.", "3.")):
@@ -202,6 +210,11 @@ class FmuDescription:
         return _assembled(name, self._elements[name])
 
     def _variable(self, each: Any) -> FmuVariable:
+        if not 0 <= prod(each.shape) <= _MOST_ELEMENTS:
+            raise FmuError(
+                f"{each.name} of {self.path.name} has {prod(each.shape)} elements, and may have {_MOST_ELEMENTS} at most: "
+                "export a smaller one"
+            )
         ending, dtype = _TYPES[self.version].get(each.type, ("", _FLOAT))
         limits = float(-np.inf if each.min is None else each.min), float(np.inf if each.max is None else each.max)
         startable = each.causality in ("input", "parameter") or each.initial in ("exact", "approx")
@@ -217,6 +230,8 @@ def _assembled(name: str, elements: dict[tuple[int, ...], FmuVariable]) -> FmuVa
     if len({len(indices) for indices in elements}) > 1:
         return None
     shape = tuple(map(max, zip(*elements, strict=True)))
+    if prod(shape) != len(elements):
+        return None
     order = list(itertools.product(*(range(1, length + 1) for length in shape)))
     kinds = {(each.type, each.causality, each.variability, each.unit, each.startable) for each in elements.values()}
     if set(order) != set(elements) or len(kinds) > 1:
@@ -229,3 +244,27 @@ def _assembled(name: str, elements: dict[tuple[int, ...], FmuVariable]) -> FmuVa
         limits=tuple(each.limits[0] for each in scalars),
         references=tuple(each.references[0] for each in scalars),
     )
+
+
+def _check_archive(path: Path) -> None:
+    """Check what an FMU's archive claims, before it is unpacked; a `FmuError` if it would do harm or is ambiguous."""
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+    names = [member.filename for member in members]
+    outside = [name for name in names if name.startswith(("/", "\\")) or ".." in re.split(r"[/\\]", name) or name[1:2] == ":"]
+    links = [each.filename for each in members if stat.S_ISLNK(each.external_attr >> 16)]
+    locked = [each.filename for each in members if each.flag_bits & 1]
+    found = {
+        "leads out of its folder": outside,
+        "is a link": links,
+        "is encrypted": locked,
+        "is in it twice": [name for i, name in enumerate(names) if name in names[:i]] if len(set(names)) < len(names) else [],
+    }
+    for what, wrong in found.items():
+        if wrong:
+            raise FmuError(f"{path} is not a usable FMU: its entry {wrong[0]!r} {what}: export it again")
+    size, most = sum(member.file_size for member in members), most_unpacked(path.stat().st_size)
+    if size > most:
+        raise FmuError(
+            f"{path} is not a usable FMU: it would unpack to {size / 1e6:.0f} MB, and may to {most / 1e6:.0f} MB for its size"
+        )

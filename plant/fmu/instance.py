@@ -24,8 +24,8 @@ from plant.files import temporary_folder
 from plant.fmu.description_reader import FmuDescription, FmuVariable
 from plant.pose import Array
 
-OK, WARNING, DISCARD, ERROR, FATAL, PENDING, ASKS_TO_END, NEEDS_EVENTS = range(8)
-"""FMI's statuses, and two for flags of `fmi3DoStep`."""
+OK, WARNING, DISCARD, ERROR, FATAL, PENDING, ASKS_TO_END, NEEDS_EVENTS, NOT_FINITE = range(9)
+"""FMI's statuses, two for flags of `fmi3DoStep`, and one for values that are not finite."""
 
 _ENDINGS = {
     WARNING: "gave a warning",

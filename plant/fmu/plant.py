@@ -14,7 +14,7 @@ from plant.errors import FmuError, InputError
 from plant.fmu.binding import OWN_BINDING, Binding, Modes, Scalars, bind, check_settable, load_binding
 from plant.fmu.calls import CALLED, FMU_HANDLE, MOST_CHANGES, advance
 from plant.fmu.description_reader import FmuDescription, FmuVariable
-from plant.fmu.instance import OK, FmuInstance
+from plant.fmu.instance import NOT_FINITE, OK, FmuInstance
 from plant.fmu.settings import Setting
 from plant.mechanism import LEGS
 from plant.pose import Array
@@ -122,13 +122,25 @@ class FmuPlant(FmuInstance):
         size = struct.calcsize(_CLOCK)
         if len(state) < size:
             raise FmuError(f"{self.path.name} cannot restore a state of {len(state)} bytes, which is no state of this plant")
+        clock = dict(zip(_CLOCKED, struct.unpack(_CLOCK, state[:size]), strict=True))
+        if not 0 <= clock["changed"] <= self.handle["change_count"]:
+            raise FmuError(f"{self.path.name} cannot restore a state after {clock['changed']} changes: it has not so many")
         super().restore(state[size:])
-        for name, value in zip(_CLOCKED, struct.unpack(_CLOCK, state[:size]), strict=True):
+        for name, value in clock.items():
             self.handle[name] = value
 
     def failure(self) -> FmuError:
         """The error for the first compiled call that failed, with the FMU's own reason."""
+        if self.handle["status"] == NOT_FINITE:
+            return FmuError(f"{self.path.name} gives {self._not_finite()}, which is not finite: mend its model")
         return self._failed(CALLED[int(self.handle["call"])], int(self.handle["status"]))
+
+    def _not_finite(self) -> str:
+        """The first value that was read and is not finite, with the name of its variable."""
+        groups = [(self.handle[name]["raw"], getattr(self.bound, name).places.size) for name in ("sensed", "known")]
+        values = np.concatenate([raw[:count] for raw, count in groups])
+        first = int(np.argmin(np.isfinite(values)))
+        return f"{values[first]} for {self.bound.read[first]}"
 
     def _values(self, name: str, value: ArrayLike, spread: bool = False) -> tuple[FmuVariable, NDArray[Any]]:
         variable = self.description[name]
@@ -202,6 +214,22 @@ class FmuPlant(FmuInstance):
         change["references"], change["reference_count"] = references.ctypes.data, references.size
         change["values"], change["count"] = values.ctypes.data, values.size
         return [references, values]
+
+
+def takes_parameters(description: FmuDescription, names: Sequence[str]) -> bool:
+    """Whether an FMU with the signals of gough's own plants takes their parameters, too; one that has none keeps its own.
+
+    Raises:
+        FmuError: it has some of them, and lacks others.
+    """
+    absent = [name for name in names if name not in description]
+    if absent and len(absent) < len(names):
+        raise FmuError(
+            f"{description.path.name} has {len(names) - len(absent)} of the {len(names)} parameters of gough's own plants and "
+            f"lacks {', '.join(absent[:3])}{', ...' if len(absent) > 3 else ''}: add them, or bind its signals with --binding "
+            "(docs/fmu.md), and it keeps its own values"
+        )
+    return not absent
 
 
 _CLOCKED = ("time", "since", "length", "steps", "changed")

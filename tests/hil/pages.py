@@ -31,15 +31,40 @@ def figures_in(page):
     return re.findall(r'<div id="(\w+)" class="plotly-graph-div"', page)
 
 
-def draw_in_browser(report, count):
-    """Draw so many figures without an error."""
+def dumped(page, profile):
+    """What a browser makes of a page, and its errors."""
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if not browser:
         pytest.skip("no browser here")
     flags = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-component-update"
     run = subprocess.run(
-        [browser, *flags.split(), "--virtual-time-budget=10000", f"--user-data-dir={report.parent.parent / 'profile'}",
-         "--dump-dom", f"file://{report}"], capture_output=True, text=True, check=False, timeout=120,
+        [browser, *flags.split(), "--virtual-time-budget=10000", f"--user-data-dir={profile}", "--dump-dom", f"file://{page}"],
+        capture_output=True, text=True, check=False, timeout=120,
     )  # fmt: skip
-    assert len(re.findall(r'class="[^"]*js-plotly-plot', run.stdout)) >= count, run.stderr[-2000:]
-    assert "Uncaught" not in run.stderr
+    return run.stdout, run.stderr
+
+
+def draw_in_browser(report, count):
+    """Draw so many figures without an error."""
+    drawn, errors = dumped(report, report.parent.parent / "profile")
+    assert len(re.findall(r'class="[^"]*js-plotly-plot', drawn)) >= count, errors[-2000:]
+    assert "Uncaught" not in errors
+
+
+_TELL_WIDTHS = """<script>window.addEventListener("load", () => setTimeout(() => {
+const { scrollWidth, clientWidth } = document.documentElement;
+parent.postMessage(`${scrollWidth} ${clientWidth}`, "*"); }, 1000))</script></body>"""
+_FRAME = """<body><iframe width="{}" height="900" style="border: 0" src="narrow.html"></iframe>
+<script>addEventListener("message", event => document.body.dataset.widths = event.data)</script></body>"""
+
+
+def widths_in_browser(report, width):
+    """The width that a report takes in a window so narrow [px], and the one that it has."""
+    head, _, tail = report.read_text(encoding="utf-8").rpartition("</body>")
+    (report.parent / "narrow.html").write_text(head + _TELL_WIDTHS + tail, encoding="utf-8")
+    frame = report.parent / "frame.html"
+    frame.write_text(_FRAME.format(width), encoding="utf-8")
+    drawn, errors = dumped(frame, report.parent.parent / "profile")
+    found = re.search(r'data-widths="(\d+) (\d+)"', drawn)
+    assert found, errors[-2000:]
+    return int(found[1]), int(found[2])

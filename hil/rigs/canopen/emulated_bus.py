@@ -46,7 +46,7 @@ class EmulatedBus:
         self._machine, self._fd = machine, settings.bus.fd
         self._channel = channel or (lambda message, outgoing: ((0.0, message),))
         self._scales = settings.imus.scales
-        self._bus = can.Bus(**settings.bus.arguments())
+        self._bus = settings.bus.opened()
         # The network sends by this object's `send`.
         self._network = canopen.Network(self)
         self.drives = [EmulatedDrive(leg, settings, machine, self._network) for leg in range(LEGS)]

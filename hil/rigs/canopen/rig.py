@@ -74,7 +74,7 @@ class CanopenRig:
         """
         bus, drives, imus = self._settings.bus, self._settings.drives, self._settings.imus
         try:
-            self._bus = can.Bus(**bus.arguments())
+            self._bus = bus.opened()
             self.decoder, self._misses = Decoder(self._settings), [0] * len(self._misses)
             network = canopen.Network(self._bus)
             self._nodes = [

@@ -1,12 +1,16 @@
 """Settings of the CANopen rig, from a TOML file: bus, node ids, units, signs and gear ratios; and the load on the bus."""
 
 import configparser
+import os
+import socket
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from math import ceil, isfinite
 from pathlib import Path
 from typing import Any
 
+import can
 import canopen
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +76,24 @@ _positive = _must(lambda value: isfinite(value) and value > 0.0, "it must be pos
 _node_id = _must(lambda value: type(value) is int and 1 <= value <= 127, "a node id is a number from 1 to 127")
 
 
+def _confine_to_loopback(bus: can.BusABC, group: str) -> None:
+    """Let a multicast bus of python-can, which listens on every interface, listen and send on the loopback alone."""
+    loopback = socket.if_nametoindex("lo")
+    with socket.socket(fileno=os.dup(bus.fileno())) as opened:
+        address = socket.inet_pton(opened.family, str(socket.getaddrinfo(group, None, opened.family)[0][4][0]))
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo\0")
+        index = loopback.to_bytes(4, sys.byteorder)
+        if opened.family == socket.AF_INET:
+            nowhere = bytes(4)
+            opened.setsockopt(socket.IPPROTO_IP, socket.IP_DROP_MEMBERSHIP, address + nowhere)
+            opened.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, address + nowhere + index)
+            opened.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, address + nowhere + index)
+        else:
+            opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_LEAVE_GROUP, address + bytes(4))
+            opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP, address + index)
+            opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_IF, loopback)
+
+
 @dataclass(frozen=True)
 class BusSettings:
     """The bus, as python-can names it."""
@@ -79,7 +101,7 @@ class BusSettings:
     interface: str = _entry(f"one of {', '.join(INTERFACES)}", _one_of(*INTERFACES))
     channel: str = _entry("such as can0, or the multicast group")
     port: int = _entry("port of the multicast group", _within(1, 65535))
-    hop_limit: int = _entry("hop limit of the multicast group; 0 stays on this machine", _within(0, 255))
+    hop_limit: int = _entry("hop limit of the multicast group; 0 keeps to this machine's loopback", _within(0, 255))
     fd: bool = _entry("CAN FD, PDOs with bit rate switching; SDO, NMT, SYNC and heartbeats stay classic frames")
     bitrate: int = _entry("[bit/s]", _within(10_000, 1_000_000))
     data_bitrate: int = _entry("bit rate of CAN FD's data phase [bit/s], at least the other one")
@@ -91,6 +113,21 @@ class BusSettings:
         """The arguments of `can.Bus`."""
         needed = {"virtual": (), "socketcan": ("fd",), "udp_multicast": ("port", "hop_limit", "fd")}[self.interface]
         return {name: getattr(self, name) for name in ("interface", "channel", *needed)}
+
+    def opened(self) -> can.BusABC:
+        """The bus, opened. A multicast group without hops neither hears nor reaches anything but this machine's loopback.
+
+        Raises:
+            can.CanError, OSError: it cannot be opened.
+        """
+        bus = can.Bus(**self.arguments())
+        if self.interface == "udp_multicast" and self.hop_limit == 0:
+            try:
+                _confine_to_loopback(bus, self.channel)
+            except OSError:
+                bus.shutdown()
+                raise
+        return bus
 
 
 @dataclass(frozen=True)

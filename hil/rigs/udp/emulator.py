@@ -45,6 +45,7 @@ UDP_SESSION = record_dtype(
     commanded_ns=np.int64,  # its time
     watchdog_ns=np.int64,  # time without a command after which the drives stop
     refused=np.int64,  # datagrams
+    stranger=(np.uint8, 16),  # who sent the last one that came from elsewhere or wanted another session, sockaddr_in
     held_back=(np.int64, 2),  # whether a packet arrives after the next, each way
     packet=(PACKET, _PACKETS),  # in transit
 )
@@ -196,8 +197,19 @@ def exchange_in_memory(
 
 
 @kernel
+def _moves(rig: Record) -> bool:
+    """Whether a drive follows or slows down."""
+    for k in range(LEGS):
+        drive = rig[()].drive[k]
+        if drive == DriveState.FOLLOWING or drive == DriveState.QUICK_STOPPING:
+            return True
+    return False
+
+
+@kernel
 def serve(emulator: UdpEmulator, started_ns: int, duration_ns: int, timespec: NDArray[np.int64]) -> int:
-    """Serve the socket for a duration on the machine's clock. Returns 1 as soon as a possible hello arrives, else 0.
+    """Serve the socket for a duration on the machine's clock. Returns 1 as soon as a possible hello arrives, else 0; a rig
+    whose drives move has one controller, and refuses every hello.
 
     Args:
         emulator: with a bound socket and its peer.
@@ -216,10 +228,12 @@ def serve(emulator: UdpEmulator, started_ns: int, duration_ns: int, timespec: ND
         if time_ns - emulator.rig[()].time_ns >= _IDLE_NS:
             check_watchdog(emulator, time_ns)
         length = receive_datagram(link.socket, link.command_bytes)
-        if length == _HELLO_BYTES:
+        greeting = length == _HELLO_BYTES
+        if greeting and not _moves(emulator.rig):
             return 1
-        if length == 0 or (length > 0 and link.socket[()].stranger != 0):
+        if greeting or length == 0 or (length > 0 and link.socket[()].stranger != 0):
             session.refused += 1
+            session.stranger[:] = link.socket[()].sender
         elif length > 0:
             post_packet(emulator, link.command_bytes, min(length, LONGEST), _TO_RIG, time_ns)
         i = next_packet(emulator.session)

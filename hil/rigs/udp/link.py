@@ -78,6 +78,11 @@ def socket_address(address: tuple[str, int]) -> NDArray[np.uint8]:
     return np.frombuffer(content, np.uint8)
 
 
+def address_in(content: bytes) -> tuple[str, int]:
+    """Host and port in the bytes of a `sockaddr_in`."""
+    return socket.inet_ntoa(content[4:8]), int.from_bytes(content[2:4], "big")
+
+
 SOCKET = record_dtype(
     descriptor=np.int64,
     session=np.uint32,

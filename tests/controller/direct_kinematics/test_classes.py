@@ -6,6 +6,7 @@ other frames and units there is never a wrong pose. Ten thousand examples instea
 --hypothesis-show-statistics`.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations
 
 import numpy as np
@@ -483,6 +484,17 @@ def test_any_number_of_workers_gives_the_same(hexapod):
         assert all(np.array_equal(getattr(one, name), getattr(other, name), equal_nan=True) for name in FIELDS)
         said, said_too = ([(row, str(error)) for row, error in found.errors.items()] for found in (one, other))
         assert said == said_too
+
+
+def test_calls_at_once_in_several_threads_do_not_meet(hexapod):
+    random = np.random.default_rng(20)
+    positions, rotations = any_poses(random, hexapod, np.eye(3), np.zeros(3), 500)
+    directions = seen(hexapod, positions, rotations)
+    expected = solve_batch(hexapod, directions, workers=1)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda each: solve(hexapod, each), directions))
+    np.testing.assert_array_equal([each.position for each in found], expected.positions)
+    np.testing.assert_array_equal([each.covariance for each in found], expected.covariances)
 
 
 def test_a_row_without_a_pose_is_nan_and_raises_when_it_is_asked_for(hexapod):

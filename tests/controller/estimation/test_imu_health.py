@@ -132,6 +132,29 @@ def test_an_imu_that_stands_still_while_another_moves_is_left_out_from_its_limit
     assert settled.used == settled.without(imu)
 
 
+def test_all_imus_are_frozen_when_none_changes_although_the_reference_moves(settled):
+    def freeze(reading):
+        reading[:2] = settled.before[:2]
+
+    def cycles_until(speed, most=500, **given):
+        settled.state["reference"]["motion"] = 0.0
+        settled.step()
+        settled.state["reference"]["motion"][4, 1] = speed
+        for cycle in range(most):
+            if told := settled.step(freeze, **given):
+                return cycle, told
+        return most, []
+
+    # 1 mm takes 10 cycles of 0.2 mm and five more of being frozen, this and that way.
+    assert cycles_until(0.0) == (500, [])
+    for speed in (0.1, -0.1):
+        assert cycles_until(speed, most=9) == (9, [])
+        assert cycles_until(speed, silent=1) == (500, [])
+    cycle, told = cycles_until(-0.1)
+    assert [(cause, imu) for cause, imu, *_ in told] == [(Cause.IMU_FROZEN, imu) for imu in ALL_IMUS]
+    assert cycle == pytest.approx(5 + FROZEN, abs=1) and settled.used == []
+
+
 @pytest.mark.parametrize(("kind", "axis"), [(kind, axis) for kind in (GYROSCOPE, ACCELEROMETER) for axis in range(3)])
 def test_one_number_that_changes_shows_that_an_imu_lives_and_its_magnetometer_does_not(settled, kind, axis):
     def freeze(reading):

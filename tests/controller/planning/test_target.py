@@ -12,7 +12,7 @@ from controller.inverse_kinematics import leg_lengths
 from controller.planning.motions import MARGIN_S, MOTIONS, REST_S, SAMPLE_PERIOD_S
 from controller.planning.offline_planner import plan
 from controller.planning.target import COLUMNS, Target, load_target
-from plant.errors import GoughError, InputError, UnknownNameError
+from plant.errors import GoughError, InputError, UnknownNameError, UnreachableError
 from plant.mechanism import Mechanism, load_in_space, load_spatial
 from plant.pose import Pose
 from tests.controller.leg_geometry import angle_between, rotation_of, unit
@@ -406,3 +406,23 @@ def test_asking_for_poses_does_not_change_the_target(hexapod):
 def test_no_two_rests_near_home_are_alike(name):
     target = load_target("near-rests", load_spatial(name), 8 * REST_S)
     assert len(np.unique(target.positions.round(6), axis=0)) == 9
+
+
+# --------------------------------------------------------------------------------------------------- files in another reading
+
+
+@pytest.mark.parametrize(
+    ("start", "said"),
+    [
+        ((0.0, 0.0, "home"), "its positions fit as absolute ones, so give displacements from home"),
+        ((0.0, 0.0, "1e3 home"), "its positions fit as absolute ones in mm, so give displacements from home in m"),
+        ((2.0, -1.0, 1.0), "its displacements fit in mm, so give them in m"),
+        ((0.3, 0.0, 0.0), "choose a smaller motion"),
+    ],
+)
+def test_a_target_outside_the_stroke_says_how_it_may_have_been_meant(hexapod, tmp_path, start, said):
+    height = float(hexapod.home.position[2])
+    x, y, z = ({"home": height, "1e3 home": 1e3 * height}.get(each, each) for each in start)
+    path = write(tmp_path, HEADER, f"0,{x},{y},{z},1,0,0,0", f"1,{x},{y},{z},1,0,0,0")
+    with pytest.raises(UnreachableError, match=rf"the target motion.csv needs leg \d at .* mm outside its stroke .*: {said}$"):
+        plan(hexapod, load_target(path, hexapod, 1.0), 1.0)

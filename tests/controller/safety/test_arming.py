@@ -71,6 +71,38 @@ def test_a_rig_that_does_not_answer_is_waited_for(hexapod):
     assert describe_obstacle(bench.state) == ""
 
 
+def test_a_rig_that_missed_many_exchanges_is_armed_only_when_it_has_answered_as_often(hexapod):
+    bench, most = Bench(hexapod), 10
+    # The bus counts as lost after 20 ms; what was missed before counts twice that at most.
+    bench.steps(bench.hold, silent=1)
+    bench.steps(2 * most - 1)
+    assert (bench.mode, obstacle(bench)) == (Mode.IDLE, (Cause.BUS_LOST, -1, 1.0, 0.0))
+    told = bench.steps(3)
+    assert told == [Cause.ARMED] and bench.mode == Mode.RUNNING
+
+
+def test_a_rig_that_answers_now_and_then_is_not_armed(hexapod):
+    bench = Bench(hexapod)
+    for _ in range(bench.hold + ARMING_CYCLES):
+        bench.step(silent=1)
+        bench.step(silent=0)
+        bench.step(silent=1)
+    assert bench.request == Request.BRAKED
+    assert bench.state["safety"]["stop"]["cause"] == Cause.BUS_LOST
+
+
+@pytest.mark.parametrize("to_arm", [True, False])
+@pytest.mark.parametrize("lost", ["readings", "agreement"])
+def test_without_answers_the_bus_is_blamed_and_no_imu(hexapod, to_arm, lost):
+    bench = Bench(hexapod, to_arm=to_arm)
+    if lost == "readings":
+        bench.signals[:] = np.nan
+    bench.steps(bench.hold, silent=1)
+    bench.state["safety"]["monitor"]["contradiction"][6] = (0.0, np.nan, 0.0)
+    bench.steps(20, silent=1)
+    assert (bench.mode, obstacle(bench)[0]) == (Mode.IDLE, Cause.BUS_LOST)
+
+
 def test_an_imu_that_contradicts_the_others_is_in_the_way(hexapod):
     bench = Bench(hexapod)
     bench.steps(bench.hold - 1)

@@ -45,7 +45,7 @@ class Bench:
         drives = np.full(6, drive, np.int64) if np.isscalar(drive) else np.array(drive, np.int64)
         if cause is not None:
             react(self.parameters, self.state, cause, -1, np.nan, np.nan)
-        hear_rig(self.parameters, self.state, age, drives, silent)
+        hear_rig(self.parameters, self.state, age, drives, np.zeros(6, np.int64), silent)
         cycle(self.parameters, self.state, self.signals, self.segments)
         safety = self.state["safety"]
         told = safety["events"]["cause"][: min(int(safety["events"]["count"]), 8)].tolist()

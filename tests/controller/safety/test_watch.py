@@ -7,6 +7,7 @@ from controller.cycle import hear_rig
 from controller.inverse_kinematics import leg_lengths
 from controller.safety import watch_nothing
 from controller.safety.causes import Cause, DriveState, Mode, Request
+from controller.safety.stop import describe_end
 from controller.safety.watch import check_limits, exclude_imu, watch_parameters
 from controller.settings import SafetySettings
 from plant.mechanism import Limits
@@ -245,8 +246,11 @@ def test_it_is_watched_while_anything_may_move(mode, request_, watched):
 # ------------------------------------------------------------------------------------------------------------ the rig's report
 
 
+CODES = 0x7500 + np.arange(6)
+
+
 def hear(parameters, state, drive=FOLLOWING, silent=0, age=None):
-    hear_rig(parameters, state, np.zeros(7, np.int64) if age is None else age, drive, silent)
+    hear_rig(parameters, state, np.zeros(7, np.int64) if age is None else age, drive, CODES, silent)
 
 
 def test_what_the_rig_reports_is_noted():
@@ -315,6 +319,8 @@ def test_a_drive_that_leaves_its_operation_is_named(mode, drive, cause, leg):
     drives[leg] = drive
     hear(parameters, state, drives)
     assert stop_of(state)[:2] == ((cause, leg) if cause != Cause.NONE else (cause, 0))
+    if cause == Cause.DRIVE_FAULT:
+        assert describe_end(state) == f"drive {leg} reports a fault (code 0x750{leg})"
 
 
 def test_drives_that_a_planar_mechanism_lacks_do_not_count():

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from controller.direct_kinematics.solver import METHODS
 from controller.safety.causes import Cause, Mode
 from hil.command_line import calibrate, main, measure, run, study
 from hil.command_line.terminal import _view, deg, mm, mm_deg
@@ -65,6 +66,7 @@ def simulated(truth_known):
         "estimated_tracking": pose_figures(5.0),
         "target": target,
         "limits": {"violations": 7},
+        "target_stretch": 1.0,
         "real_time_factor": 12.34,
         "cycle_us": {"p50": 1.0, "p99": 2.0, "p999": 3.0},
     }
@@ -107,13 +109,15 @@ RUN = {
     "events": ["cycle 3: armed"],
     "recording": {"files": ["a.mcap", "b.mcap"], "lost": 200},
     "round_trip_bars": [[8.0, 9.5, 16.0], [3.0, 1.0, 2.0]],
-    "identity": {"name": "rig", "parts": {"drive": "1"}},
+    "identity": {"name": "rig", "parts": {"drive": "1", "IMU": "2"}},
+    "config": {"fusion": "compiled"},
+    "target_stretch": 1.0,
     "obstacle": None,
 }  # fmt: skip
 
 
 def test_a_run_prints_its_figures(tables, capsys, monkeypatch):
-    monkeypatch.setattr("hil.loop.stage_times.budget", lambda: {"wake": {"p50": 1.0, "p99": 19.0, "max": 5000.0}})
+    monkeypatch.setattr("hil.loop.stage_times.budget", lambda fusion: {"wake": {"p50": 1.0, "p99": 19.0, "max": 5000.0}})
     run._print_run(RUN)
     ((headings, *rows),) = tables
     assert headings == ["us", "p50 / budget", "p99 / budget", "p99.9 / budget", "max / budget"]
@@ -122,7 +126,7 @@ def test_a_run_prints_its_figures(tables, capsys, monkeypatch):
     lines = capsys.readouterr().out.splitlines()
     for line in (
         "cycle 3: armed",
-        "within the timing budget (hil/loop/budget.toml)",
+        "over budget, as the table shows: wake p99",
         "without locked memory",
         "1200 cycles; periods missed: 1 by own work, 2 woken late, 3 held up by the host",
         "the loop's thread: 4 major and 5 minor page faults, 6 involuntary switches, 7 bytes of growth; first cycle 1.25 s "
@@ -131,8 +135,8 @@ def test_a_run_prints_its_figures(tables, capsys, monkeypatch):
         "round trip to the rig p50 11, p99 12, p99.9 13, max 14 us",
         "8 exchanges late, 9 packets refused",
         "1000 cycles recorded in a.mcap, b.mcap; 200 cycles lost",
-        "rig: rig {'drive': '1'}",
-        "stopped on the brakes: end of the motion",
+        "rig: rig; drive 1, IMU 2",
+        "the motion went to its end, and the brakes hold",
     ):
         assert line in lines
     assert not any("arming" in line or "supervisor came too late" in line for line in lines)
@@ -141,7 +145,20 @@ def test_a_run_prints_its_figures(tables, capsys, monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "line", "without"),
     [
-        ({"over_budget": ["wake p50"]}, "over budget: wake p50", "within the timing budget"),
+        (
+            {"timing_us": {"record": FIGURES_US, "compute": FIGURES_US}},
+            "over budget, as the table shows: record p99, p999, max; compute p999, max",
+            "within the timing budget",
+        ),
+        ({}, "within the timing budget (hil/loop/budget.toml)", "over budget"),
+        ({"cause": "asked for"}, "stopped on the brakes: asked for", "went to its end"),
+        (
+            {"target_stretch": 10.25},
+            "the target is too fast for the legs' limits, so the reference stays behind it: stretched in time by 10.2, it "
+            "could be followed",
+            "rig: rig {",
+        ),
+        ({"identity": {"name": "template", "parts": {}}}, "rig: template", "rig: template;"),
         ({"errors_m": RUN["errors_m"] | {"known": 0}}, "the truth is not known; reference - length 0.500 mm RMS", "estimate -"),
         ({"timing_us": {"wake": FIGURES_US}}, "1000 cycles recorded in a.mcap, b.mcap; 200 cycles lost", "round trip"),
         ({"unseen": 17}, "17 cycles are in none of these figures: the supervisor came too late", "nothing was moved"),
@@ -407,7 +424,21 @@ def test_plant_and_kinematics_are_printed_in_their_units(monkeypatch, tables, ca
     }  # fmt: skip
     monkeypatch.setattr("hil.benchmarks.kinematics.measure_kinematics", lambda progress: kinematics)
     measure._kinematics(SimpleNamespace(), {})
-    assert tables[2][1:] == [["n-6", "3.00 / 6.00"], ["hexapod", "3.00 / 6.00"], ["hexapod, over Newton", "0.5 / 1.0"]]
+    assert tables[2][1:] == [["n-6", "3.00 / 6.00"], ["hexapod", "3.00 / 6.00"], ["over Newton", "0.5 / 1.0"]]
     assert tables[3][1:] == [["hexapod, wide", "50.0", "25.0", "100.0", "0.0"]]
     printed = capsys.readouterr().out
     assert "[thousands]: legs 2000; one call from Python 40 us" in printed and "warm: 6.00 us per pose" in printed
+
+
+def test_the_table_of_kinematics_fits_100_columns(monkeypatch, capsys):
+    times = {name: {"closed_form": 12.34, "refined": 23.45} for name in METHODS}
+    kinematics = {
+        "solve_us": {"n-4-II.1": times}, "hexapod_us": times, "call_us": 40.0, "batch_per_s": {}, "cold_starts": {},
+        "newton": {"warm_us": 6.0, "ratios": times},
+    }  # fmt: skip
+    monkeypatch.setattr("hil.benchmarks.kinematics.measure_kinematics", lambda progress: kinematics)
+    measure._kinematics(SimpleNamespace(), {})
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines[:7])) <= 100
+    assert any(all(name in line for name in METHODS) for line in lines)
+    assert sum(line.count("12.3 / 23.4") == len(METHODS) for line in lines) == 3

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hil.loop.records import RECORD, STAGES
-from hil.loop.stage_times import Timing, budget, over_budget
+from hil.loop.stage_times import Timing, budget, exceeded, over_budget
 
 
 def test_sums_are_of_the_stages_that_they_name():
@@ -38,6 +38,14 @@ def test_only_answered_exchanges_have_a_round_trip():
 
 def of(value, n=10):
     return dict.fromkeys(("p50", "p99", "p999", "max"), value) | {"n": n}
+
+
+def test_the_longer_filter_has_a_budget_of_its_own():
+    figures = {name: of(0.1) for name in budget()}
+    figures["whole mechanism"] = of(0.1) | {"p50": 15.9}
+    assert over_budget(figures) == over_budget(figures, "whole") == ["whole mechanism p50 15.9 us, budget 8 us"]
+    assert over_budget(figures, "whole-alignments") == []
+    assert exceeded(figures | {"record": of(600.0)}) == {"whole mechanism": ["p50"], "record": ["p50", "p99", "p999", "max"]}
 
 
 @pytest.mark.parametrize("stage", list(budget()))

@@ -12,7 +12,7 @@ from hil.runs.simulation import simulate
 from plant.errors import InputError
 from plant.pose import pose_errors, rotation_angle, rotation_from_vector
 from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS
-from tests.hil.pages import draw_in_browser, figures_in, json_after, numbers, traces_of
+from tests.hil.pages import draw_in_browser, figures_in, json_after, numbers, traces_of, widths_in_browser
 
 CURVES = {"pose": 12, "errors": 12, "lengths": 12, "motion": 12, "drives": 18}
 FIGURES = ["mechanism", *CURVES]
@@ -161,3 +161,9 @@ def test_a_file_that_cannot_be_written_is_refused(result, tmp_path):
         with pytest.raises(InputError, match=re.escape(str(path))):
             write_report(result, path)
     assert [file.name for file in tmp_path.iterdir()] == ["folder"]
+
+
+@pytest.mark.parametrize("width", [320, 420])
+def test_in_a_narrow_window_nothing_is_beyond_its_edge(report, width):
+    takes, has = widths_in_browser(report, width)
+    assert takes <= has <= width

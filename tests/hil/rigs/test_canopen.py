@@ -1,10 +1,12 @@
 """The CANopen rig against emulated nodes, with real frames on python-can's virtual bus, and between processes by multicast."""
 
 import multiprocessing
+import os
+import socket
 import threading
 import time
 from collections import Counter
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import count
 
 import can
@@ -566,11 +568,25 @@ def _serve_in_process(config, ready, stop):
     nodes.close()
 
 
+def test_a_multicast_bus_without_hops_hears_the_loopback_alone():
+    """Without hops and beyond the loopback: what another machine's frame would be to this one."""
+    bus = canopen_settings(bus={"port": 43_218}).bus
+    assert bus.hop_limit == 0
+    with bus.opened() as one, bus.opened() as other, can.Bus(**bus.arguments()) as stranger:
+        for each in (one, other):
+            with socket.socket(fileno=os.dup(each.fileno())) as opened:
+                assert opened.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16).rstrip(b"\0") == b"lo"
+        with suppress(can.CanError, OSError):
+            stranger.send(can.Message(arbitration_id=0x77))
+        one.send(can.Message(arbitration_id=0x123))
+        assert [message and message.arbitration_id for message in (other.recv(0.5), other.recv(0.05))] == [0x123, None]
+
+
 def test_two_processes_by_multicast():
     patient = {"controller": {"heartbeat_timeout": 1.0}, "drives": {"command_timeout": 1.0, "silence": 1.0}}
     config = canopen_settings(bus={"port": 43_217}, **patient)
     try:
-        with can.Bus(**config.bus.arguments()) as one, can.Bus(**config.bus.arguments()) as other:
+        with config.bus.opened() as one, config.bus.opened() as other:
             one.send(can.Message(arbitration_id=0x123))
             if other.recv(0.5) is None:
                 pytest.skip("multicast frames do not arrive on this machine")

@@ -26,7 +26,8 @@ from hil.rigs import ANSWERED, BRAKED, ENABLED, FOLLOWING, READY, SILENT, Identi
 from hil.rigs.by_name import python_rig
 from hil.rigs.canopen.rig import CanopenRig
 from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings
-from hil.rigs.contract import CLAUSES, check_rig, examine_rig
+from hil.rigs.clauses import CLAUSES
+from hil.rigs.contract import check_rig, examine_rig
 from hil.rigs.emulation import fault, new_emulated
 from hil.rigs.template import TemplateRig
 from hil.rigs.udp.emulator import new_udp_emulator
@@ -127,12 +128,12 @@ class Plant:
 
 @on_virtual_time
 def test_the_plant_keeps_the_contract():
-    assert check_rig(Plant, PERIOD) == []
+    assert check_rig(Plant, PERIOD, mechanism=HEXAPOD) == []
 
 
 @on_virtual_time
 def test_the_template_keeps_the_contract():
-    found = examine_rig(template, PERIOD, beyond=10.0, absent=lambda: template("nowhere"))
+    found = examine_rig(template, PERIOD, beyond=10.0, absent=lambda: template("nowhere"), mechanism=HEXAPOD)
     assert found.all_findings() == []
     assert set(found.findings) == set(CLAUSES)
     assert found.identity.name == "template"
@@ -183,7 +184,7 @@ def multicast(tmp_path):
     path.write_text(text)
     bus = canopen_settings(path).bus
     try:
-        with can.Bus(**bus.arguments()) as one, can.Bus(**bus.arguments()) as other:
+        with bus.opened() as one, bus.opened() as other:
             one.send(can.Message(arbitration_id=0x123))
             if other.recv(0.5) is None:
                 pytest.skip("multicast frames do not arrive on this machine")

@@ -42,8 +42,9 @@ from hil.rigs.udp.datagrams import (
     decode,
     encode,
 )
-from hil.rigs.udp.emulator import WATCHDOG_CODE, answer_command, new_udp_emulator
+from hil.rigs.udp.emulator import WATCHDOG_CODE, answer_command, new_udp_emulator, serve
 from hil.rigs.udp.link import (
+    address_in,
     await_datagram,
     bound_socket,
     decode_answer,
@@ -445,7 +446,9 @@ def test_injected_faults_change_what_is_measured(emulator, capsys):
         assert later["drive"].tolist() == [READY, READY, FAULTY, READY, READY, READY] and later["drive_code"][2] == 0x7500
         capsys.readouterr()
         inject(emulator)
-        assert "code: [0, 0, 29952, 0, 0, 0]" in capsys.readouterr().out
+        output = capsys.readouterr().out
+        assert "code: [0, 0, 29952, 0, 0, 0]" in output
+        assert output.startswith("emulator: hexapod on udp, of ")
         inject(emulator, "--clear")
         rig.arm()
         assert (exchange(rig, np.zeros(6), BRAKED)["drive"] == READY).all()
@@ -630,6 +633,29 @@ def test_the_rig_does_nothing_that_is_wrong():
         emulator.link.command_bytes[: len(good)] = good
         assert answer_command(emulator, len(good), 2_000_000) > 0
         np.testing.assert_allclose(rig["velocity"], -SPEEDS, rtol=1e-6)
+
+
+def test_a_flood_of_old_hellos_does_not_keep_a_moving_rig_from_its_controller():
+    plant, imu, rig = _rig_of(EmulatorConfig(SimulationConfig(imu="ideal")), PERIOD, [])
+    with plant, closing(bound_socket("127.0.0.1", 0)) as own, senders("127.0.0.1:1", 2) as (controller, stranger):
+        emulator = new_udp_emulator(plant.handle, imu, rig, controller.session)
+        link, timespec, began = emulator.link.socket, np.zeros(2, np.int64), time.monotonic_ns()
+        link["descriptor"], link["peer"] = own.fileno(), socket_address(controller.socket.getsockname())
+        controller.rig = stranger.rig = own.getsockname()
+        old = encode(HELLO_DATAGRAM, kind=DatagramKind.HELLO, session=5, period_us=10_000)
+        stranger.socket.sendto(old, stranger.rig)
+        assert serve(emulator, began, 1_000_000_000, timespec) == 1 and emulator.session["refused"] == 0
+        rig["drive"] = FOLLOWING
+        for _ in range(100):
+            stranger.socket.sendto(old, stranger.rig)
+        controller.socket.sendto(controller.encoded(request=ENABLED), controller.rig)
+        assert serve(emulator, began, 50_000_000, timespec) == 0
+        assert emulator.session["refused"] == 100
+        assert address_in(bytes(emulator.session["stranger"])) == stranger.socket.getsockname()
+        controller.socket.settimeout(2.0)
+        assert decode(
+            MEASUREMENT_DATAGRAM, controller.socket.recv(2048)[: MEASUREMENT_DATAGRAM.itemsize], kind=DatagramKind.MEASUREMENT
+        )
 
 
 def test_only_datagrams_from_the_peers_host_and_port_are_its_own():

@@ -27,6 +27,12 @@ def test_imus_have_names_and_numbers(text, imus):
     assert imus_from_text(text) == imus
 
 
+def test_an_address_without_a_rig_is_refused():
+    with pytest.raises(InputError, match=r"--rig-at 127\.0\.0\.1:1 says where a rig is, but not which: name it with --rig"):
+        SimulationConfig(rig_at="127.0.0.1:1")
+    assert SimulationConfig(rig="udp", rig_at="127.0.0.1:1").rig_at == "127.0.0.1:1"
+
+
 def test_the_emulated_drives_have_one_watchdog():
     assert EmulatorConfig().watchdog == WATCHDOG_S
     with pytest.raises(InputError, match="the watchdog is 0 ms"):

@@ -1,5 +1,7 @@
 """The control channel of an emulated rig: what it answers, and when a fault that is injected begins and ends."""
 
+import json
+import os
 import socket
 
 import numpy as np
@@ -7,14 +9,14 @@ import pytest
 
 from hil.rigs.emulation import new_emulated
 from hil.runs.config import EmulatorConfig
-from hil.runs.emulator_process import _Control, _hello
+from hil.runs.emulator_process import BusyError, _Control, _findable, _hello, _padded, own_control
 from plant.errors import GoughError, InputError
 
 
 @pytest.fixture
 def control():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
-        yield _Control(opened)
+        yield _Control(opened, "of mine")
 
 
 @pytest.fixture
@@ -79,3 +81,40 @@ def test_the_watchdog_waits_for_three_periods_at_least(watchdog, period_us, seco
 
 def test_what_is_no_greeting_begins_no_session():
     assert _hello(b"") is None and _hello(bytes(64)) is None
+
+
+def test_each_answer_says_whose_it_is_and_a_flood_is_answered_in_parts(control, rig):
+    control.socket.bind(("127.0.0.1", 0))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asker:
+        asker.settimeout(2.0)
+        for _ in range(20):
+            asker.sendto(b"state", control.socket.getsockname())
+        control.answer(rig)
+        answers = [json.loads(asker.recv(65536)) for _ in range(16)]
+        assert all(answer["emulator"] == "of mine" for answer in answers)
+        asker.settimeout(0.05)
+        with pytest.raises(TimeoutError):
+            asker.recv(65536)
+        control.answer(rig)
+        assert json.loads(asker.recv(65536))["emulator"] == "of mine"
+
+
+def test_the_one_emulator_of_this_user_is_found_and_of_several_one_must_be_named(monkeypatch):
+    # A user of the tests' own, whom no other emulator on this machine has.
+    monkeypatch.setattr(os, "getuid", lambda: 3_000_000_000 + os.getpid())
+    with pytest.raises(BusyError, match="no emulator of this user runs on this machine: start one with 'gough emulate'"):
+        own_control()
+    with _findable("127.0.0.1:5001"):
+        assert own_control() == "127.0.0.1:5001"
+        with (
+            _findable("127.0.0.1:5002"),
+            pytest.raises(InputError, match=r"at 127\.0\.0\.1:5001 and 127\.0\.0\.1:5002: name one"),
+        ):
+            own_control()
+    with pytest.raises(BusyError):
+        own_control()
+
+
+def test_a_rig_is_named_after_its_mechanism():
+    assert bytes(_padded("gough emulated 6-3-II", 32)) == b"gough emulated 6-3-II" + 11 * b"\0"
+    assert bytes(_padded("\u00e9" + 40 * "x", 32)) == b"?" + 31 * b"x"

@@ -284,6 +284,28 @@ def test_a_signal_ends_the_motion_by_a_controlled_stop(tmp_path, number, whom):
     assert replay([path]).same
 
 
+def ignore_as_a_script_asks_of_its_background():
+    for number in (signal.SIGINT, signal.SIGQUIT):
+        signal.signal(number, signal.SIG_IGN)
+
+
+def test_an_emergency_stop_is_heard_by_a_run_that_was_told_to_ignore_it(tmp_path):
+    path = tmp_path / "run.mcap"
+    process, *others = started(path, preexec_fn=ignore_as_a_script_asks_of_its_background)
+    for pid in (process.pid, *others):
+        os.kill(pid, signal.SIGINT)
+    cycles = recorded_cycles(path)
+    wait_for(lambda: recorded_cycles(path) > cycles + 300 or process.poll() is not None)
+    process.send_signal(signal.SIGQUIT)
+    _, errors = process.communicate(timeout=30.0)
+    said = errors.splitlines()[0]
+    assert said.startswith("ignored, as what started this run asks: ") and "SIGINT; SIGTERM ends it" in said
+    assert process.returncode == 1 and "emergency stop" in errors
+    found = read(path)
+    assert next(cycle for cycle, text in found.events if "emergency stop" in text) > cycles + 300
+    assert (found.records["request"][-5:] != 1).all()
+
+
 @pytest.mark.slow
 def test_when_the_supervisor_is_killed_the_loop_stops_by_itself_and_the_file_is_complete(tmp_path):
     path = tmp_path / "run.mcap"
@@ -329,6 +351,53 @@ def test_when_the_recorder_is_killed_another_goes_on_and_no_cycle_is_lost_or_dou
     records = np.concatenate([read(each).records for each in (path, second)])
     assert accounted(records["cycle"], records["missed"])
     assert replay([path, second]).same
+
+
+def deleted(path):
+    path.unlink()
+
+
+def cut(path):
+    os.truncate(path, 1000)
+
+
+def replaced(path):
+    path.with_suffix(".other").write_bytes(b"of someone else")
+    path.with_suffix(".other").replace(path)
+
+
+@pytest.mark.parametrize(
+    "spoil", [deleted, pytest.param(cut, marks=pytest.mark.slow), pytest.param(replaced, marks=pytest.mark.slow)]
+)
+def test_a_recording_that_is_spoiled_while_it_goes_on_is_noticed_and_the_rest_is_kept(tmp_path, spoil):
+    path, second, figures = tmp_path / "run.mcap", tmp_path / "run-2.mcap", tmp_path / "run.json"
+    process, *_ = started(path, "--json", figures)
+    spoil(path)
+    left = path.read_bytes() if path.exists() else None
+    wait_for(lambda: recorded_cycles(second) > 300 or process.poll() is not None)
+    process.send_signal(signal.SIGTERM)
+    output, errors = process.communicate(timeout=30.0)
+    assert process.returncode == 0, errors
+    assert f"{path} was deleted, cut or replaced while it was recorded" in output
+    assert f"another recorder goes on in {second}" in output
+    summary = json.loads(figures.read_text())
+    # All that the first file had was still in memory.
+    assert summary["recording"] == {"files": [str(second)], "lost": 0}
+    assert len(read(second).records) == summary["cycles"] and replay([second]).same
+    assert (path.read_bytes() if path.exists() else None) == left
+
+
+def test_a_recording_that_is_deleted_in_the_end_is_written_again(tmp_path):
+    path, second = tmp_path / "run.mcap", tmp_path / "run-2.mcap"
+    process, _, recorder = started(path)
+    os.kill(recorder, signal.SIGSTOP)
+    path.unlink()
+    process.send_signal(signal.SIGTERM)
+    wait_for(lambda: not any(is_ours(child) for child in children(process.pid) if child != recorder))
+    os.kill(recorder, signal.SIGCONT)
+    output, errors = process.communicate(timeout=30.0)
+    assert process.returncode == 0 and f"{path} was deleted" in output, errors
+    assert read(second).complete and replay([second]).same
 
 
 # --------------------------------------------------------------------------------------------------------------- what is taken

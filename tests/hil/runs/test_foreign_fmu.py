@@ -1,7 +1,12 @@
 """A foreign FMU in the closed loop: it follows the target, with the truth and without, and fails in a controlled way."""
 
 import json
+import os
 import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +17,7 @@ from plant.errors import InputError
 from plant.fmu.settings import Setting
 from plant.truth import TRUTH_CURRENTS
 from tests.hil.commands import gough
-from tests.plant.fmu.foreign import BINDING, BINDING_3, TRUTH
+from tests.plant.fmu.foreign import BINDING, BINDING_3, TRUTH, edited
 
 MM, DEG = 1e-3, np.radians(1.0)
 
@@ -162,3 +167,109 @@ def test_the_payload_of_our_own_plant_changes_during_a_run():
     before, after = (currents[np.abs(heavier.times - at) < 0.05].mean() for at in (0.4, 0.9))
     # The legs carry 13 kg and their own weight, and then 5 kg more.
     assert 1.25 < after / before < 5.0 / 13.0 + 1.05
+
+
+# -------------------------------------------------------------------------------- values that do not fit
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (
+            'unit = "mm"\n\n[quat',
+            'unit = "m"\n\n[quat',
+            "begins with position .* m, .*: they would fit as mm, in [position] of",
+        ),
+        ("offset = 0.3", "offset = 0.8", "begins with leg_length .* m, .*: check their unit, sign and offset, in [leg_length]"),
+        ('unit = "g"', 'unit = "m/s2"', "begins with the accelerometer of IMU 0 at rest 1 m/s2, .*: they would fit as g, in"),
+        ('"g"\nsign = -1', '"g"\nsign = 1', "the accelerometer of IMU 0 reads -.* m/s2 along its z axis at rest, where 'hex"),
+    ],
+)
+def test_a_start_that_does_not_fit_the_mechanism_is_refused(foreign_fmu, tmp_path, old, new, said):
+    assert old in BINDING + TRUTH
+    (tmp_path / "wrong.toml").write_text((BINDING + TRUTH).replace(old, new))
+    with pytest.raises(InputError, match=said.replace("[", r"\[").replace("]", r"\]")) as caught:
+        simulate(SimulationConfig(plant=str(foreign_fmu), binding=str(tmp_path / "wrong.toml"), imu="ideal"))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("fault", "said"), [(95, "inf for pose.y"), (96, "nan for top.acc.z")])
+def test_a_value_that_is_not_finite_ends_the_run_and_names_its_variable(foreign_fmu, binding, tmp_path, fault, said):
+    figures = tmp_path / "figures.json"
+    faults = ("--set", f"fault.status={fault}", "--set", "fault.at=0.5")
+    plant = ("--plant", foreign_fmu, "--binding", binding)
+    run = gough("simulate", *plant, *faults, "--duration", 1, "--imu", "ideal", "--json", figures)
+    assert run.returncode == 1
+    assert f"foreign.fmu gives {said}, which is not finite: mend its model" in run.stderr
+    assert not {"inf", "nan"} & set(re.findall(r"\w+", run.stdout))
+    assert not {"Infinity", "NaN"} & set(re.findall(r"\w+", figures.read_text()))
+
+
+def test_the_loop_looks_for_ctrl_c_often_on_a_slow_fmu_too(foreign_fmu, binding):
+    slow = (Setting.parse("fault.status=94"), Setting.parse("fault.at=0.001"))
+    binding.write_text(binding.read_text().replace("step = 0.0005", ""))
+    config = SimulationConfig(
+        plant=str(foreign_fmu), binding=str(binding), settings=slow, duration=0.1, rate=200.0, target="hold"
+    )
+    shares = []
+    simulate(config, shares.append)
+    # 60 cycles of 10 ms at least: 10 of them in 0.1 s, and as many as 250 before.
+    assert len(shares) >= 6 and shares[-1] == 1.0 and shares == sorted(shares)
+
+
+def started(*arguments, cwd):
+    """The command in a process of its own."""
+    environment = os.environ | {"PYTHONPATH": str(Path.cwd())}
+    command = [sys.executable, "-m", "hil.command_line", *map(str, arguments)]
+    return subprocess.Popen(command, cwd=cwd, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"), [(97, "ended the process with status 7"), (99, "crashed with signal 11")]
+)  # fmt: skip
+def test_an_fmu_that_ends_the_process_is_told_of(foreign_fmu, binding, tmp_path, fault, said):
+    plant = ("--plant", foreign_fmu, "--binding", binding, "--set", f"fault.status={fault}", "--set", "fault.at=0.01")
+    run = started("simulate", *plant, "--duration", 0.2, cwd=tmp_path)
+    _, errors = run.communicate()
+    assert run.returncode == 1
+    assert f"gough: the FMU {foreign_fmu} has {said}, and nothing is left of the run: try it with 'gough fmu valid" in errors
+
+
+@pytest.mark.slow
+def test_a_step_that_never_returns_ends_after_a_signal(foreign_fmu, binding, tmp_path):
+    plant = ("--plant", foreign_fmu, "--binding", binding, "--set", "fault.status=98", "--set", "fault.at=0.01")
+    run = started("simulate", *plant, "--duration", 0.2, cwd=tmp_path)
+    while "hanging" not in run.stderr.readline():
+        assert run.poll() is None
+    run.send_signal(signal.SIGINT)
+    _, errors = run.communicate()
+    assert run.returncode == 130
+    assert f"gough: the FMU {foreign_fmu} did not return from a call within 5 s, and its process was ended" in errors
+
+
+# -------------------------------------------------------------------------------- gough's names, other parameters
+
+
+def renamed(path, fmu, *names):
+    """A copy of gough's own FMU in which some parameters have other names."""
+    return edited(fmu, path, *((f'name="{name}"', f'name="my.{name}"') for name in names))
+
+
+def test_an_fmu_with_the_signals_alone_keeps_its_parameters_and_one_with_some_of_them_is_refused(fmu_path, hexapod, tmp_path):
+    some, none = tmp_path / "some.fmu", tmp_path / "none.fmu"
+    renamed(some, fmu_path, "brake.force", "gravity")
+    renamed(none, fmu_path, *hexapod.plant_parameters())
+    (tmp_path / "empty.toml").write_text("[fmu]\nstep = 0.001\n")
+    assert "runs in the loop with a binding" in gough("fmu", "info", some).stdout
+    shown = gough("fmu", "info", none).stdout
+    assert "runs in the loop as it is (gough simulate --plant), with its own parameters, from the home of --mech" in shown
+    said = "some.fmu has 38 of the 40 parameters of gough's own plants and lacks brake.force, gravity: add them, or bind its"
+    for bound in ((), ("--binding", tmp_path / "empty.toml")):
+        for command in (("simulate", "--plant", some), ("fmu", "linearize", some)):
+            run = gough(*command, *bound)
+            assert run.returncode == 2 and re.sub(r"\d+ of the \d+", "38 of the 40", run.stderr).startswith(f"gough: {said}")
+        run = gough("simulate", "--plant", none, *bound, "--duration", 0.3, "--target", "hold")
+        assert run.returncode == 0, run.stderr
+        assert gough("fmu", "linearize", none, *bound).returncode == 0
+    run = gough("simulate", "--plant", none, "--joint-error", 1)
+    assert run.returncode == 2 and "none.fmu is an FMU with joints of its own, which have no joint error" in run.stderr

@@ -175,6 +175,10 @@ def test_an_unreachable_pose_names_the_leg_and_by_how_much(tmp_path):
     path.write_text("time_s,x_m,y_m,z_m,qw,qx,qy,qz\n0,0,0,0,1,0,0,0\n1,0,0,0.09,1,0,0,0\n")
     with pytest.raises(UnreachableError, match=r"leg \d at .* mm, .* mm outside its stroke"):
         simulate(SimulationConfig(target=str(path)))
+    # A plant cannot be started out there; the target is refused before.
+    path.write_text("time_s,x_m,y_m,z_m,qw,qx,qy,qz\n0,0,0,0.35,1,0,0,0\n1,0,0,0.36,1,0,0,0\n")
+    with pytest.raises(UnreachableError, match=r"the target far\.csv needs leg"):
+        simulate(SimulationConfig(target=str(path)))
 
 
 def test_the_process_of_a_loop_loads_no_design_or_plotting_library():

@@ -5,9 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from controller.planning.target import load_target
 from hil.loop.records import RECORD, STAGES
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import SimulationResult
+from plant.mechanism import load_spatial
 from plant.pose import quaternion_from_rotation, rotation_from_vector
 
 CYCLES, HOLD = 60, 20
@@ -34,7 +36,9 @@ def made_up(known=True):
     # Each stage takes a microsecond times a power of two.
     records["stage_ns"] = 1000 * 2 ** np.arange(len(STAGES))
     times = (np.arange(CYCLES) - HOLD) / 1000.0
-    parts = SimulationConfig(), None, None, SimpleNamespace(violations=3), times, records
+    mechanism = load_spatial("hexapod")
+    target = load_target("hold", mechanism, 1.0)
+    parts = SimulationConfig(), mechanism, target, SimpleNamespace(violations=3), times, records
     return SimulationResult(*parts, *poses("reference"), *poses("target"), 12.0, None)
 
 
@@ -63,6 +67,7 @@ def test_every_figure_compares_its_own_two_poses_after_the_hold(known):
         expected = [1e-3 * rms, 1e-3 * most, np.radians(0.1 * rms), np.radians(0.1 * most)]
         assert found == pytest.approx(expected, rel=1e-6), group
     assert (summary["truth_known"], summary["limits"], summary["real_time_factor"]) == (known, {"violations": 3}, 12.0)
+    assert summary["target_stretch"] == 1.0
     # From the leg filters to the control: the second to the seventh stage.
     assert summary["cycle_us"] == pytest.approx(dict.fromkeys(("p50", "p99", "p999"), 126.0))
 

@@ -1,10 +1,14 @@
 """A simulation that goes on from a snapshot is the one that was never interrupted, to the bit."""
 
+import hashlib
 import os
+import re
+import struct
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import msgpack
 import numpy as np
@@ -12,15 +16,21 @@ import pytest
 
 from controller.cycle import STATE
 from hil.command_line import main
+from hil.loop.records import WORK
+from hil.realtime.clock import CLOCK
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import SimulationStoppedError, simulate
 from hil.runs.snapshot import read_snapshot, write_snapshot
 from plant.errors import GoughError, InputError
 from plant.fmu.settings import Setting
+from plant.imu import IMU_STATE
 from tests.plant.fmu.foreign import BINDING, TRUTH
 
 TIMED = ("time_ns", "late_ns", "stage_ns", "cpu_ns")
 """What of a record the machine's own time is in."""
+
+MEMORY = {"imu": IMU_STATE, "state": STATE, "clock": CLOCK, "work": WORK}
+"""The arrays of a snapshot that have fields."""
 
 
 def bits(records: np.ndarray) -> dict[str, bytes]:
@@ -93,6 +103,12 @@ def test_what_does_not_go_together_is_refused(saved: tuple[SimulationConfig, Pat
     assert "another motion was planned" in refused(replace(config, target="sines", duration=1.0), path)
     assert main(["simulate", "--load-state", str(path), "--rate", "500"]) == 2
     assert "the snapshot was taken with rate 1000.0, and cannot go on with 500.0: leave it out" in capsys.readouterr().err
+    # What is given counts, even if it is the default.
+    slower = simulate(replace(config, rate=500.0, duration=0.1), save_at=0.1).snapshot
+    assert slower is not None
+    write_snapshot(slower, path.with_name("slower"))
+    assert main(["simulate", "--load-state", str(path.with_name("slower")), "--rate", "1000"]) == 2
+    assert "the snapshot was taken with rate 500.0, and cannot go on with 1000.0: leave it out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("save_at", [-1.0, 0.6, np.nan])
@@ -112,17 +128,132 @@ def test_other_files_are_refused(saved: tuple[SimulationConfig, Path], tmp_path:
         ({"version": "0.0.1"}, "is of gough 0.0.1, and this is gough"),
         ({"layout": b""}, "with another layout of the state: go on with the version that saved it, or simulate from the start"),
         ({"layout": None}, "with another layout of the state"),
+        ({"digest": bytes(32)}, "is damaged, as its digest is not that of its content"),
+        ({"content": whole["content"][:-1]}, "is damaged, as its digest is not that of its content"),
+        ({"content": None}, "is damaged, as its digest is not that of its content"),
+    ):
+        (tmp_path / "broken").write_bytes(msgpack.packb(whole | changes))
+        with pytest.raises(InputError, match=said):
+            read_snapshot(tmp_path / "broken")
+    flipped = bytearray(content)
+    flipped[len(content) // 2] ^= 1
+    (tmp_path / "broken").write_bytes(flipped)
+    with pytest.raises(InputError, match="its digest is not that of its content"):
+        read_snapshot(tmp_path / "broken")
+
+
+def forged(saved: Path, path: Path, **changes: Any) -> Path:
+    """A snapshot with other content, and its digest."""
+    whole = msgpack.unpackb(saved.read_bytes())
+    content = msgpack.packb(msgpack.unpackb(whole["content"]) | changes)
+    path.write_bytes(msgpack.packb(whole | {"content": content, "digest": hashlib.sha256(content).digest()}))
+    return path
+
+
+def resumed(path: Path) -> None:
+    snapshot = read_snapshot(path)
+    simulate(replace(SimulationConfig.from_plain(snapshot.config), duration=0.6), resumed=snapshot)
+
+
+def test_forged_parts_are_refused(saved: tuple[SimulationConfig, Path], tmp_path: Path) -> None:
+    whole = msgpack.unpackb(msgpack.unpackb(saved[1].read_bytes())["content"])
+    for changes, said in (
         ({"more": 1}, "missing or unknown parts"),
+        ({"cycle": "1"}, "a snapshot whose cycle is of another kind"),
+        ({"memory": []}, "a snapshot whose memory is of another kind"),
+        ({"memory": whole["memory"] | {"imu": 1}}, "a snapshot whose memory.imu is of another kind"),
+        ({"plant": None}, "a snapshot whose plant is of another kind"),
+        ({"cycle": whole["cycle"] - 1}, "its state is that of cycle"),
+        ({"plant": whole["plant"][:32] + struct.pack("<q", -5) + whole["plant"][40:]}, "after -5 changes: it has not so many"),
         ({"memory": whole["memory"] | {"imu": b""}}, "memory has another layout"),
         ({"config": whole["config"] | {"speed": 1}}, "no configuration of a simulation"),
         ({"plant": whole["plant"][:-1]}, "wrong size"),
     ):
-        (tmp_path / "broken").write_bytes(msgpack.packb(whole | changes))
-        with pytest.raises(GoughError, match=said):
-            snapshot = read_snapshot(tmp_path / "broken")
-            simulate(replace(SimulationConfig.from_plain(snapshot.config), duration=0.6), resumed=snapshot)
+        with pytest.raises(GoughError, match=said) as caught:
+            resumed(forged(saved[1], tmp_path / "forged", **changes))
+        assert "\n" not in str(caught.value)
     with pytest.raises(InputError, match="cannot read the snapshot"):
         read_snapshot(tmp_path / "missing")
+
+
+@pytest.mark.parametrize(
+    ("array", "path", "value"),
+    [
+        ("imu", "delay", 10**6), ("imu", "delay", -1), ("imu", "place", 10**9), ("imu", "magnetometer_every", 0),
+        ("state", "safety.stop.cause", 21), ("state", "safety.mode", 3), ("state", "safety.events.count", -10**6),
+        ("state", "safety.arming.obstacle", 10**6), ("state", "time.cycle", -1), ("clock", "mode", 1),
+    ],
+)  # fmt: skip
+def test_memory_beyond_its_limits_is_refused(
+    array: str, path: str, value: int, saved: tuple[SimulationConfig, Path], tmp_path: Path
+) -> None:
+    with pytest.raises(
+        InputError, match=rf"in its {array} {re.escape(path)} is {value}, and must be at least .*: its file was"
+    ):
+        resumed(forged(saved[1], tmp_path / "forged", memory=changed(saved[1], array, path, value)))
+
+
+def changed(saved: Path, array: str, path: str, value: float) -> dict[str, bytes]:
+    """The memory of a snapshot with another value in one field."""
+    memory: dict[str, bytes] = msgpack.unpackb(msgpack.unpackb(saved.read_bytes())["content"])["memory"]
+    record = np.frombuffer(memory[array], MEMORY[array]).copy()
+    *stages, name = path.split(".")
+    field = record
+    for stage in stages:
+        field = field[stage]
+    field[name] = value
+    return memory | {array: record.tobytes()}
+
+
+def test_a_wrong_place_in_the_reference_is_found_again(saved: tuple[SimulationConfig, Path], tmp_path: Path) -> None:
+    config, path = saved
+    wrong = forged(path, tmp_path / "forged", memory=changed(path, "state", "reference.index", 10**9))
+    rest = [simulate(replace(config, duration=0.6), resumed=read_snapshot(each)).records for each in (path, wrong)]
+    assert bits(rest[0]) == bits(rest[1])
+
+
+@pytest.mark.slow
+def test_no_value_in_a_snapshot_ends_the_process(saved: tuple[SimulationConfig, Path]) -> None:
+    done = subprocess.run([sys.executable, "-c", _TRY_ALL, str(saved[1])], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-500:]
+    assert int(done.stdout) > 500
+
+
+_TRY_ALL = """
+import sys
+from dataclasses import replace
+from pathlib import Path
+import numpy as np
+from hil.runs.config import SimulationConfig
+from hil.runs.prepare import prepared_loop
+from hil.runs.snapshot import read_snapshot, resume_snapshot
+from plant.errors import GoughError
+from tests.hil.runs.test_snapshot import MEMORY, changed
+
+def fields(dtype, path=()):
+    for name, (kind, *_) in dtype.fields.items():
+        if kind.fields:
+            yield from fields(kind, (*path, name))
+        else:
+            yield (*path, name), kind.base
+
+path = Path(sys.argv[1])
+good, tried = read_snapshot(path), 0
+with prepared_loop(replace(SimulationConfig.from_plain(good.config), duration=0.6)) as loop:
+    for array, dtype in MEMORY.items():
+        for field, kind in fields(dtype):
+            whole = kind.kind != "f"
+            for value in (10**6, -1, -(2**62), 2**62) if whole else (float("nan"), float("inf")):
+                if not whole or np.iinfo(kind).min <= value <= np.iinfo(kind).max:
+                    print(array, *field, value, file=sys.stderr)
+                    try:
+                        resume_snapshot(replace(good, memory=changed(path, array, ".".join(field), value)), loop)
+                        loop.run(good.cycle + 20)
+                    except GoughError:
+                        pass
+                    tried += 1
+print(tried)
+"""
 
 
 def test_a_time_without_a_file_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

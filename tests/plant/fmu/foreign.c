@@ -9,12 +9,13 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 #include "fmi2Functions.h"
 #include "geometry.h"
 
 enum { RETRACT = 0, LAG = 6, FAULT_AT = 7, LEG_GYRO = 8, LEG_ACC = 26, TOP_GYRO = 44, TOP_ACC = 47, POSE = 50, ATTITUDE = 53,
-       EXTENSION = 57, REALS = 63, CRASH = 99 };
+       EXTENSION = 57, REALS = 63, SLOW = 94, INFINITE = 95, NOT_A_NUMBER = 96, EXIT = 97, HANG = 98, CRASH = 99 };
 #define FIRST_REAL 1000
 #define TUBE 300.0
 #define G 9806.65
@@ -248,8 +249,13 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real step, fmi2Boolean
     double length[6], speed[6];
     /* This FMU can save its state, and wants to know that an earlier one may come back. */
     if (no_set) return fmi2Error;
-    if (time >= s->reals[FAULT_AT]) {
-        if (s->fault_status == CRASH) raise(SIGSEGV);
+    int fault = time >= s->reals[FAULT_AT] ? s->fault_status : 0;
+    if (fault == CRASH) raise(SIGSEGV);
+    if (fault == EXIT) exit(7);
+    if (fault == SLOW) usleep(10000);
+    if (fault == HANG) fputs("hanging\n", stderr);
+    while (fault == HANG) pause();
+    if (fault && fault < SLOW) {
         h->call.logger(h->call.componentEnvironment, h->name, s->fault_status, "servo", "servo %d is at %.1f degrees after %s", 3, 91.5, "a while");
         return (fmi2Status)s->fault_status;
     }
@@ -257,7 +263,10 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real step, fmi2Boolean
     memcpy(s->length, length, sizeof length);
     memcpy(s->speed, speed, sizeof speed);
     s->time = time + step;
-    return measure(s) ? fmi2OK : fmi2Error;
+    int good = measure(s);
+    if (fault == INFINITE) s->reals[POSE + 1] = INFINITY;
+    if (fault == NOT_A_NUMBER) s->reals[TOP_ACC + 2] = NAN;
+    return good ? fmi2OK : fmi2Error;
 }
 
 fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state) {

@@ -392,6 +392,8 @@ def test_a_state_that_cannot_be_saved_or_is_none_is_an_error(load: Load, foreign
     with pytest.raises(FmuError, match=r"cannot restore a state of 3 bytes"):
         load().restore(b"abc")
     with pytest.raises(FmuError, match=r"foreign.fmu: restoring a state failed"):
+        load().restore(bytes(40))
+    with pytest.raises(FmuError, match=r"cannot restore a state after 3472328296227680304 changes: it has not so many"):
         load().restore(b"0" * 40)
     path = edited(foreign_fmu, tmp_path / "stateless.fmu", (' canSerializeFMUstate="true"', ""))
     with pytest.raises(FmuError, match=r"stateless.fmu cannot save its state: export it with canSerializeFMUState"):

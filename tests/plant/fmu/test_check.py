@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from plant.errors import InputError
 from plant.fmu.check import check_fmu, platforms_of
 from tests.plant.fmu.foreign import edited
 
@@ -36,3 +37,11 @@ def test_platforms_are_the_folders_that_hold_binaries(tmp_path: Path) -> None:
         ):  # fmt: skip
             archive.writestr(name, b"")
     assert platforms_of(path) == ["linux64", "win64"]
+
+
+def test_a_trial_that_never_ends_is_ended_at_the_limit(foreign_fmu: Path, tmp_path: Path) -> None:
+    path = edited(foreign_fmu, tmp_path / "hangs.fmu", ('guid="{foreign}"', 'guid="{fault 98}"'))
+    checks = check_fmu(path, limit=1.0)
+    assert [check.problems for check in checks] == [(), ("took longer than 1 s",), ("took longer than 1 s",), None]
+    with pytest.raises(InputError, match="the limit is 0 s; it must be positive and finite"):
+        check_fmu(path, limit=0.0)

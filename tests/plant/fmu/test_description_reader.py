@@ -1,5 +1,6 @@
 """Descriptions of FMUs: what each variable is, scalars that form an array, and values of every type."""
 
+import re
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 
 from plant.errors import FmuError, InputError, UnknownNameError
 from plant.fmu.description_reader import FmuDescription, FmuVariable, element_names
+from tests.plant.fmu.foreign import edited
 
 TUNABLE = 'causality="parameter" variability="tunable"'
 
@@ -215,3 +217,53 @@ def test_elements_are_counted_from_one_and_inside_a_derivative() -> None:
     assert element_names("x", (2, 3))[3:] == ["x[2,1]", "x[2,2]", "x[2,3]"]
     assert element_names("der(x)", (2,)) == ["der(x[1])", "der(x[2])"]
     assert element_names("der(x)", ()) == ["der(x)"]
+
+
+def packed(path: Path, *entries: tuple[str, bytes], link: str = "") -> Path:
+    """An FMU with further entries, and one that is a symbolic link."""
+    write(path.parent).rename(path)
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in entries:
+            archive.writestr(name, content)
+        if link:
+            entry = zipfile.ZipInfo(link)
+            entry.external_attr = 0o120777 << 16
+            archive.writestr(entry, "/etc/passwd")
+    return path
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+@pytest.mark.parametrize(
+    ("entries", "link", "said"),
+    [
+        ([("modelDescription.xml", b"")], "", "its entry 'modelDescription.xml' is in it twice"),
+        ([("resources/../../x", b"")], "", "its entry 'resources/../../x' leads out of its folder"),
+        ([("..\\x", b"")], "", "leads out of its folder"),
+        ([("/x", b"")], "", "its entry '/x' leads out of its folder"),
+        ([("C:/x", b"")], "", "its entry 'C:/x' leads out of its folder"),
+        ([], "resources/secret", "its entry 'resources/secret' is a link"),
+        ([(f"resources/{i}", bytes(20 << 20)) for i in range(6)], "", "it would unpack to 126 MB, and may to"),
+    ],
+)
+def test_archives_that_would_do_harm_are_refused(
+    tmp_path: Path, entries: list[tuple[str, bytes]], link: str, said: str
+) -> None:
+    with pytest.raises(FmuError, match=re.escape(said)) as caught:
+        FmuDescription(packed(tmp_path / "bad.fmu", *entries, link=link))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("size", [1_000_001, 10**8, 1_250_000_000])
+def test_a_variable_with_too_many_elements_is_refused(foreign_fmu_3: Path, tmp_path: Path, size: int) -> None:
+    path = edited(foreign_fmu_3, tmp_path / "long.fmu", ('<Dimension start="7"/>', f'<Dimension start="{size}"/>'))
+    with pytest.raises(FmuError, match=rf"imu.turn of long.fmu has {3 * size} elements, and may have 1000000 at most: export"):
+        FmuDescription(path)
+
+
+def test_an_element_far_away_makes_no_array(tmp_path: Path) -> None:
+    far = [*VARIABLES[:-1], scalar("far[1250000000]", 90, 'causality="input"', '<Real start="0"/>'), VARIABLES[-1]]
+    outputs, OUTPUTS[:] = list(OUTPUTS), [len(far)]
+    try:
+        assert "far" not in FmuDescription(write(tmp_path, variables=far))
+    finally:
+        OUTPUTS[:] = outputs
