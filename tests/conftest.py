@@ -22,6 +22,7 @@ settings.register_profile("thorough", max_examples=10_000, deadline=None)
 # A session in the background ignores these, and so would the processes of its tests.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGQUIT, signal.SIG_DFL)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 SHARED_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 

@@ -31,11 +31,11 @@ from plant.compiled import Record
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import GoughError, InputError
 from plant.extras import missing_extras_named
-from plant.fmu.binding import OWN_BINDING, load_binding
+from plant.fmu.binding import OWN_BINDING, bind, load_binding
 from plant.fmu.build import building_default_fmu, default_fmu, model_of
 from plant.fmu.calls import FMU_HANDLE
 from plant.fmu.description_reader import FmuDescription
-from plant.fmu.plant import FmuPlant, takes_parameters
+from plant.fmu.plant import FmuPlant, check_number_of_legs, takes_parameters
 from plant.imu import imu_state, load_imu
 from plant.mechanism import Mechanism, load_in_space
 from plant.pose import Pose
@@ -175,8 +175,11 @@ def simulated_plant(
     if late:
         raise InputError(f"{late[0].name} is set at {late[0].at:g} s, when the motion of {config.duration:g} s is over")
     parameters = built.plant_parameters(start) if binding.native else {}
-    if config.plant is not None and binding.native and not takes_parameters(FmuDescription(fmu), [*parameters]):
-        parameters = {}
+    if config.plant is not None and binding.native:
+        description = FmuDescription(fmu)
+        check_number_of_legs(fmu, bind(binding, description), nominal.legs)
+        if not takes_parameters(description, [*parameters]):
+            parameters = {}
     if config.joint_error and not parameters:
         binds = f"{binding.source} binds" if binding.source else f"{fmu} is"
         raise InputError(f"{binds} an FMU with joints of its own, which have no joint error: leave it out")

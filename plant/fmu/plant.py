@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from plant.compiled import Record
 from plant.errors import FmuError, InputError
-from plant.fmu.binding import OWN_BINDING, Binding, Modes, Scalars, bind, check_settable, load_binding
+from plant.fmu.binding import OWN_BINDING, Binding, Bound, Modes, Scalars, bind, check_settable, load_binding
 from plant.fmu.calls import CALLED, FMU_HANDLE, MOST_CHANGES, advance
 from plant.fmu.description_reader import FmuDescription, FmuVariable
 from plant.fmu.instance import NOT_FINITE, OK, FmuInstance
@@ -66,8 +66,8 @@ class FmuPlant(FmuInstance):
         super().__init__(FmuDescription(Path(path)))
         self.handle: Record = np.zeros((), FMU_HANDLE)
         self.bound = bind(binding, self.description)
-        if legs not in (None, self.bound.legs):
-            raise InputError(f"{self.path.name} has {self.bound.legs} legs, and the mechanism has {legs}: choose another one")
+        if legs is not None:
+            check_number_of_legs(self.path, self.bound, legs)
         self._check_period(period, binding.step)
         values = [self._values(name, value) for name, value in {**parameters, **binding.start}.items()]
         values += [self._setting(each) for each in settings if each.at is None]
@@ -214,6 +214,12 @@ class FmuPlant(FmuInstance):
         change["references"], change["reference_count"] = references.ctypes.data, references.size
         change["values"], change["count"] = values.ctypes.data, values.size
         return [references, values]
+
+
+def check_number_of_legs(path: Path, bound: Bound, legs: int) -> None:
+    """Check that an FMU has as many legs as a mechanism, or raise an `InputError`."""
+    if legs != bound.legs:
+        raise InputError(f"{path.name} has {bound.legs} legs, and the mechanism has {legs}: choose another one")
 
 
 def takes_parameters(description: FmuDescription, names: Sequence[str]) -> bool:

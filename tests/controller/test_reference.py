@@ -73,7 +73,9 @@ def test_a_reference_that_was_prepared_is_not_used_after_missed_periods(hexapod,
     home = leg_lengths(hexapod, hexapod.home.position, hexapod.home.rotation)
     segments, state = moving(home, SPEEDS), np.zeros((), STATE)
     signals = static_signals(hexapod, hexapod.home.position, hexapod.home.rotation)
-    for _ in range(HOLD + 5):
+    for number in range(HOLD + 5):
+        # IMUs that repeat their readings while the legs move are frozen.
+        signals[0, :, 0] = 1e-9 * (-1.0) ** number
         assert cycle(parameters, state, signals, segments) == Cause.NONE
         prepare_next(parameters, state, segments)
     if missed:
