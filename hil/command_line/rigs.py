@@ -109,7 +109,7 @@ def gough_emulate(options: Namespace) -> None:
 
 
 @cli.command(
-    cli.argument("fault", nargs="?", metavar="KIND[:N][,for=S][,size=X]", help="the fault, from now on"),
+    cli.argument("fault", nargs="?", metavar="KIND[:N][,WORD=VALUE]", help="the fault, from now on"),
     cli.flag("--list", "list the kinds of faults"),
     cli.flag("--clear", "take all faults away"),
     cli.argument(
@@ -120,11 +120,20 @@ def gough_inject(options: Namespace) -> None:
     """Inject a fault into an emulated rig that is running, or ask for its state."""
     from hil.rigs.emulation import FaultKind
     from hil.runs.emulator_process import ask, own_control
+    from plant.imu_disturbances import WORDS, DisturbanceKind
 
     if options.list:
         table = Table("fault", "number", "size by default", "")
         for kind in FaultKind:
             table.add(kind.label, f"0 to {kind.count - 1}" if kind.count else "", f"{kind.default:g}", kind.text)
+        table.print()
+        table = Table("disturbance", "size", "where", "")
+        for each in DisturbanceKind:
+            table.add(each.label, ", ".join(each.sizes), ", ".join(("imus", *each.places)), each.text)
+        table.print()
+        table = Table("word", "")
+        for word, meaning in WORDS.items():
+            table.add(word, meaning)
         table.print()
         return
     question = "clear" if options.clear else f"fault {options.fault}" if options.fault else "state"

@@ -53,13 +53,16 @@ def exchange_fmu(
     stage_ns[Stage.PLANT] = now(timespec) - began
     if status == 0:
         status = read_imus(fmu) | read_truth(fmu)
+        m = imu[()]
+        m.time = fmu[()].time
         measure(imu, fmu[()].imu, feedback.measurement)
         feedback.truth[:] = fmu[()].truth
         for k in range(LEGS):
             feedback.sent[k] = 0.0 if request == Request.BRAKED else command[k]
         for k in range(IMU_COUNT):
-            feedback.sequence[k] += 1
-            feedback.sample_ns[k] = np.int64(np.rint(1e9 * fmu[()].time))
+            if m.fresh[k] > 0:
+                feedback.sequence[k] += m.fresh[k]
+                feedback.sample_ns[k] = np.int64(np.rint(1e9 * m.sampled_at[k]))
     return ANSWERED if status == 0 else SILENT + status
 
 

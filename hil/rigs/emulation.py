@@ -6,21 +6,22 @@ happens there: `disturb` only says what becomes of a message.
 """
 
 from collections.abc import Iterable
+from dataclasses import replace
 from enum import IntEnum
 from math import inf, radians
+from typing import Any
 
 import numpy as np
 
 from hil.rigs import DriveState, Request
-from plant.compiled import Record, kernel, record_dtype
+from plant.compiled import Record, filled, kernel, record_dtype
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
 from plant.errors import InputError, UnknownNameError
 from plant.fmu.calls import advance, read_imus, read_truth, write_command, write_drive_modes, write_payload_mass
-from plant.imu import measure
+from plant.imu import DISTURBANCE, MOST_DISTURBANCES, disturbance_record, measure
+from plant.imu_disturbances import DisturbanceKind, disturbance, disturbance_of_text
 from plant.mechanism import LEGS, Mechanism
-from plant.pose import rotate_by_vector
 from plant.truth import TRUTH_SIZE
-from plant.vectors import rotate, vector
 
 
 class FaultKind(IntEnum):
@@ -63,11 +64,12 @@ class FaultKind(IntEnum):
 
 
 FAULT = record_dtype(
-    kind=np.int64,
+    kind=np.int64,  # FaultKind; 0: a disturbance of IMUs alone
     index=np.int64,  # of the IMU or drive
     begin_ns=np.int64,  # since the drives were first enabled; below 0: from the start
     end_ns=np.int64,
     size=np.float64,
+    disturbance=DISTURBANCE,  # of IMUs, as long as the fault is there
 )
 """A fault."""
 
@@ -77,7 +79,8 @@ _FOREVER = np.iinfo(np.int64).max
 
 def fault(text: str) -> Record:
     """A fault (dtype `FAULT`) from its text: the kind, then index, `at` and `for` [s] and `size` where they matter, such as
-    `imu-biased:3,at=5,for=2,size=2`. Without `at` the fault is there from the start.
+    `imu-biased:3,at=5,for=2,size=2`; or a disturbance of IMUs, as `plant.imu_disturbances` has them. Without `at` the fault is
+    there from the start.
 
     Raises:
         UnknownNameError: there is no such kind.
@@ -85,9 +88,12 @@ def fault(text: str) -> Record:
     """
     head, *options = text.split(",")
     name, _, index = head.partition(":")
-    kinds = {kind.label: kind for kind in FaultKind}
+    kinds, disturbances = {kind.label: kind for kind in FaultKind}, [kind.label for kind in DisturbanceKind]
+    if name in disturbances:
+        meant = disturbance_of_text(text)
+        return _made(0, meant.begin, meant.duration, disturbance=disturbance_record(replace(meant, begin=0.0, duration=inf)))
     if name not in kinds:
-        raise UnknownNameError(f"there is no fault {name!r}; there are {', '.join(kinds)}")
+        raise UnknownNameError(f"there is no fault {name!r}; there are {', '.join((*kinds, *disturbances))}")
     kind = kinds[name]
     if kind.count and not (index.isdecimal() and int(index) < kind.count):
         raise InputError(f"the fault {text!r} needs the number of an IMU or drive, 0 to {kind.count - 1}: such as {name}:0")
@@ -104,12 +110,16 @@ def fault(text: str) -> Record:
             raise InputError(f"{option!r} in the fault {text!r} is none of at=SECONDS, for=SECONDS, size=NUMBER") from None
     if not (np.isfinite(values["size"]) and np.isfinite(values["at"]) and values["for"] > 0.0):
         raise InputError(f"the fault {text!r} has a wrong number: size and at must be finite, for must be positive")
-    made: Record = np.zeros((), FAULT)
-    made["kind"], made["index"], made["size"] = kind, int(index or 0), values["size"] * kind.scale
-    made["begin_ns"] = -1 if values["at"] < 0.0 else round(1e9 * values["at"])
-    ends = made["begin_ns"] + 1e9 * values["for"]
-    made["end_ns"] = _FOREVER if ends >= _FOREVER else round(ends)
-    return made
+    turned = {}
+    if kind == FaultKind.IMU_BIASED:
+        turned = {"disturbance": disturbance_record(disturbance("turn", imus=index, axis="x", size_deg=values["size"]))}
+    return _made(kind, values["at"], values["for"], index=int(index or 0), size=values["size"] * kind.scale, **turned)
+
+
+def _made(kind: int, at: float, duration: float, **fields: Any) -> Record:
+    begin = -1 if at < 0.0 else round(1e9 * at)
+    ends = begin + 1e9 * duration
+    return filled(FAULT, kind=kind, begin_ns=begin, end_ns=_FOREVER if ends >= _FOREVER else round(ends), **fields)
 
 
 EMULATED = record_dtype(
@@ -133,9 +143,7 @@ EMULATED = record_dtype(
     fault=(FAULT, MOST_FAULTS),
     faults=np.int64,
     random=(np.uint64, 1),  # state of the faults' random numbers
-    ideal=(np.float64, (3, IMU_COUNT, 3)),  # scratch, as the rest
-    turn=(np.float64, (3, 3)),
-    axis=(np.float64, 3),
+    ideal=(np.float64, (3, IMU_COUNT, 3)),  # scratch
 )
 """State of an emulated rig. A bus sets `request`, `target` and `reset`, and reads the drives and the IMUs' last samples."""
 
@@ -181,28 +189,32 @@ def add_fault(rig: Record, fault: Record) -> None:
 @kernel
 def sample(fmu: Record, imu: Record, rig: Record, now_ns: int) -> int:
     """Move the plant on to `now_ns` on the rig's clock, and read the IMUs; returns FMI's status."""
-    r, c = rig[()], fmu[()]
+    r, c, m = rig[()], fmu[()], imu[()]
     status = move(fmu, rig, now_ns)
     status |= read_imus(fmu) | read_truth(fmu)
     r.truth[:] = c.truth
     r.ideal[:] = c.imu
+    m.time, m.disturbances = 1e-9 * r.time_ns, m.lasting
     for i in range(r.faults):
         f = r.fault[i]
         if not is_active(f, r.enabled_ns, r.time_ns):
             continue
         if f.kind == FaultKind.IMU_SWAPPED:
-            k, m = f.index, min(max(int(f.size), 0), IMU_COUNT - 1)
+            k, other = f.index, min(max(int(f.size), 0), IMU_COUNT - 1)
             for kind in range(3):
                 for j in range(3):
-                    r.ideal[kind, k, j], r.ideal[kind, m, j] = r.ideal[kind, m, j], r.ideal[kind, k, j]
-        elif f.kind == FaultKind.IMU_BIASED:
-            _turn(r, f.index, f.size)
+                    r.ideal[kind, k, j], r.ideal[kind, other, j] = r.ideal[kind, other, j], r.ideal[kind, k, j]
+        if f.disturbance.kind != 0 and m.disturbances < MOST_DISTURBANCES:
+            m.disturbance[m.disturbances] = f.disturbance
+            if f.begin_ns >= 0:
+                m.disturbance[m.disturbances].begin = 1e-9 * (r.enabled_ns + f.begin_ns)
+            m.disturbances += 1
     measure(imu, r.ideal, c.imu)
     for k in range(IMU_COUNT):
-        if find_fault(r, FaultKind.IMU_DEAD, k) >= 0:
+        if m.fresh[k] == 0 or find_fault(r, FaultKind.IMU_DEAD, k) >= 0:
             continue
-        r.sequence[k] += 1
-        r.sample_ns[k] = r.time_ns
+        r.sequence[k] += m.fresh[k]
+        r.sample_ns[k] = np.int64(np.rint(1e9 * m.sampled_at[k]))
         if find_fault(r, FaultKind.IMU_FROZEN, k) >= 0:
             continue
         noisy = find_fault(r, FaultKind.IMU_NOISY, k)
@@ -213,20 +225,6 @@ def sample(fmu: Record, imu: Record, rig: Record, now_ns: int) -> int:
                 if noise > 0.0 and kind < 2:
                     r.measurement[kind, k, j] += draw_normal(r.random) * noise * (np.pi / 180.0 if kind == 0 else 0.1)
     return status
-
-
-@kernel
-def _turn(r: Record, k: int, angle: float) -> None:
-    """Turn an IMU by an angle about its x axis; its readings turn the other way."""
-    for i in range(3):
-        for j in range(3):
-            r.turn[i, j] = 1.0 if i == j else 0.0
-        r.axis[i] = 0.0
-    r.axis[0] = -angle
-    rotate_by_vector(r.turn, r.axis)
-    for kind in range(3):
-        ideal = r.ideal[kind, k]
-        ideal[0], ideal[1], ideal[2] = rotate(r.turn, vector(ideal))
 
 
 @kernel

@@ -9,6 +9,7 @@ from hil.option import integers, option
 from plant.checks import check_duration, check_rate, checked_seed
 from plant.errors import InputError, UnknownNameError
 from plant.fmu.settings import Setting
+from plant.imu_disturbances import disturbance_of_text
 from plant.imu_wiring import ALL_IMUS, RIGHT_WIRING, Wiring
 
 FUSIONS = {
@@ -26,7 +27,10 @@ PYTHON_RIG = "python:"
 """The prefix of a rig in the user's own Python class, such as python:my_rig:MyRig (module and class)."""
 
 MECHANISM = "preset, or a TOML file"
-IMU = "ideal, mpu9150, mpu9150-calibrated or icm42688"
+IMU = (
+    "ideal, mpu9150, mpu9150-calibrated, icm42688, or mpu9150-nominal and icm42688-nominal, which have all that real ones do; "
+    "or a TOML file (docs/imus.md)"
+)
 CALIBRATION = "the IMUs' constants, as 'gough calibrate' writes them; without it the readings are used as they are"
 """Help of options that several configurations have."""
 
@@ -92,6 +96,15 @@ class SimulationConfig:
         ALL_IMUS, "which IMUs there are: all, legs, or a list such as 0,2,4,6", parse=imus_from_text, shown="all"
     )
     wiring: Wiring = RIGHT_WIRING
+    faults: tuple[str, ...] = option(
+        (),
+        "simulated: what happens to IMUs, from the start or from a time of the motion on, such as "
+        "imu-offset:all,axis=y,size_m_per_s2=0.5,at_s=5,ramp_s=10; 'gough inject --list' lists all; can be given several times",
+        flag="--fault",
+        metavar="KIND:IMUS[,WORD=VALUE]",
+        parse=str,
+        several=True,
+    )
     joint_error: float = option(
         0.0, "simulated: standard deviation of each coordinate of the joints from their places", unit="mm"
     )
@@ -130,6 +143,12 @@ class SimulationConfig:
             raise InputError(f"{self.binding} binds an FMU, and none is given: name it with --plant FILE.fmu")
         if self.settings and self.rig != "fmu":
             raise InputError(f"--set is for the plant's FMU, not for the rig {self.rig}: leave it out")
+        if self.faults and self.rig != "fmu":
+            raise InputError(
+                f"--fault is for simulated IMUs, not for the rig {self.rig}: tell it to 'gough emulate' or 'inject'"
+            )
+        for text in self.faults:
+            disturbance_of_text(text)
 
     @classmethod
     def from_plain(cls, values: Mapping[str, Any]) -> "SimulationConfig":

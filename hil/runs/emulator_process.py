@@ -184,6 +184,8 @@ class _Control:
             if made["begin_ns"] < 0 and rig["enabled_ns"] >= 0:
                 passed = int(rig["time_ns"] - rig["enabled_ns"])
                 made["begin_ns"], made["end_ns"] = passed, min(int(made["end_ns"]), 2**62) + passed
+            # Before the drives are enabled, the course of a disturbance begins now.
+            made["disturbance"]["begin"] = 1e-9 * int(rig["time_ns"])
             add_fault(rig, made)
             return {"fault": argument}
         if command == "clear":

@@ -36,7 +36,8 @@ from plant.fmu.build import building_default_fmu, default_fmu, model_of
 from plant.fmu.calls import FMU_HANDLE
 from plant.fmu.description_reader import FmuDescription
 from plant.fmu.plant import FmuPlant, check_number_of_legs, takes_parameters
-from plant.imu import imu_state, load_imu
+from plant.imu import add_disturbances, imu_state, load_imu
+from plant.imu_disturbances import disturbance_of_text
 from plant.mechanism import Mechanism, load_in_space
 from plant.pose import Pose
 
@@ -97,6 +98,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         least, most = HOLD_RANGE_S
         if not least <= control.hold <= most:
             raise InputError(f"hold is {control.hold:g} s; the estimate settles in {least:g} to {most:g} s")
+        add_disturbances(imu, (disturbance_of_text(text).later(control.hold) for text in config.faults))
         fusion, safety = sensor_settings(mechanism, model), safety_settings(mechanism)
         parameters = cycle_parameters(
             mechanism, config.rate, control, fusion, config.imus, FUSIONS[config.fusion], calibration, config.magnetometer,

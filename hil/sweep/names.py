@@ -31,12 +31,12 @@ def is_whole(value: Any) -> bool:
 
 
 def run_fields() -> dict[str, Any]:
-    """The fields of a run's configuration that a study can set, with how their text is read."""
+    """The fields of a run's configuration that a study can set, with how their text is read; faults have spaces in between."""
     return {
         each.name: each.metadata["option"].parse
         for each in fields(SimulationConfig)
-        if "option" in each.metadata and each.name not in ("settings", "rig", "rig_at", "arm")
-    } | {"hold": None}
+        if "option" in each.metadata and each.name not in ("settings", "faults", "rig", "rig_at", "arm")
+    } | {"hold": None, "faults": lambda text: tuple(text.split())}
 
 
 def check_factor(name: str) -> None:

@@ -23,6 +23,7 @@ from hil.rigs.emulation import (
 from hil.runs.config import EmulatorConfig, SimulationConfig
 from hil.runs.emulator_process import _rig_of
 from plant.errors import InputError, UnknownNameError
+from plant.imu import imu_state, load_imu
 from plant.mechanism import load_spatial
 from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS
 
@@ -73,6 +74,8 @@ class Emulated:
 @pytest.mark.parametrize(
     "text, kind, index, begin, end, size",
     [
+        ("imu-turn:0,axis=z,size_deg=2,at=0.5,for=1", 0, 0, 500_000_000, 1_500_000_000, 0.0),
+        ("imu-supply:all,size_v=2", 0, 0, -1, FOREVER, 0.0),
         ("imu-frozen:0", FaultKind.IMU_FROZEN, 0, -1, FOREVER, 0.0),
         ("imu-dead:6,at=2", FaultKind.IMU_DEAD, 6, 2_000_000_000, FOREVER, 0.0),
         ("imu-noisy:2,at=0.25,for=0.5", FaultKind.IMU_NOISY, 2, 250_000_000, 750_000_000, 20.0),
@@ -135,7 +138,9 @@ def test_an_option_that_is_none_is_refused(text):
 
 
 def test_an_unknown_fault_is_told_with_those_that_there_are():
-    with pytest.raises(UnknownNameError, match=r"there is no fault 'imu'; there are imu-frozen, .*, payload-jumps"):
+    with pytest.raises(
+        UnknownNameError, match=r"there is no fault 'imu'; there are imu-frozen, .*, payload-jumps, imu-offset, .*, imu-jitter"
+    ):
         fault("imu:3")
 
 
@@ -352,6 +357,38 @@ def test_an_imu_that_is_turned_reads_the_vectors_in_its_turned_axes(made, degree
     expected[:, 4] = right[:, 4] @ about_x(radians(degrees))
     assert abs(expected - right)[1].max() > 0.5
     np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_an_imu_that_has_come_loose_is_one_that_is_turned_about_some_axis(made):
+    one, other = (Emulated(made, text).read() for text in ("imu-biased:4,size=-25", "imu-turn:4,axis=x,size_deg=-25"))
+    np.testing.assert_array_equal(one, other)
+
+
+def test_a_disturbance_begins_with_the_drives_and_ends_with_its_time(made):
+    texts = ("imu-offset:2+6,axis=y,size_m_per_s2=0.5,ramp_s=0.01,at=0.02,for=0.03", "imu-supply:all,size_v=1,at=1")
+    healthy, rig = Emulated(made), Emulated((made[0], imu_state(load_imu("ideal"), 0, 1e-3)), *texts)
+    base = healthy.read()[1, :, 1]
+    for milliseconds, share in ((0, 0.0), (19, 0.0), (24, 0.4), (35, 1.0), (49, 1.0), (50, 0.0), (60, 0.0)):
+        # The drives are enabled at 5 ms; the plant itself stands still.
+        rig.rig["enabled_ns"], rig.rig["time_ns"] = 5 * MS, (5 + milliseconds) * MS
+        expected = base + 0.5 * share * np.isin(np.arange(7), (2, 6))
+        np.testing.assert_allclose(rig.read()[1, :, 1], expected, atol=1e-12, err_msg=str(milliseconds))
+    rig.rig["faults"] = 0
+    np.testing.assert_array_equal(rig.read(), healthy.read())
+    assert int(rig.imu["disturbances"]) == 0
+
+
+def test_the_samples_of_an_imu_with_a_slow_clock_are_counted_and_dated(made):
+    rig = Emulated((made[0], imu_state(load_imu("ideal"), 0, 1e-3)), "imu-clock:3,size_percent=-50")
+    numbers, times = [], []
+    for _ in range(20):
+        rig.step().read()
+        numbers.append(rig["sequence"])
+        times.append(rig["sample_ns"])
+    news, dated = np.diff(numbers, axis=0), np.array(times)
+    assert (np.delete(news, 3, axis=1) == 1).all() and news[:, 3].sum() in (9, 10)
+    assert set(np.diff(dated[:, 3]).tolist()) == {0, 2 * MS}
+    np.testing.assert_array_equal(dated[:, 0], np.arange(1, 21) * MS)
 
 
 @pytest.mark.parametrize(

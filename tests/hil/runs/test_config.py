@@ -6,7 +6,7 @@ import pytest
 
 from hil.rigs.udp.emulator import WATCHDOG_S
 from hil.runs.config import EmulatorConfig, SimulationConfig, imus_from_text
-from plant.errors import InputError
+from plant.errors import InputError, UnknownNameError
 from plant.fmu.settings import Setting
 from plant.imu_wiring import Wiring
 
@@ -31,6 +31,18 @@ def test_an_address_without_a_rig_is_refused():
     with pytest.raises(InputError, match=r"--rig-at 127\.0\.0\.1:1 says where a rig is, but not which: name it with --rig"):
         SimulationConfig(rig_at="127.0.0.1:1")
     assert SimulationConfig(rig="udp", rig_at="127.0.0.1:1").rig_at == "127.0.0.1:1"
+
+
+def test_faults_of_imus_are_checked_and_are_for_simulated_ones():
+    texts = ("imu-offset:all,axis=y,size_m_per_s2=0.5,at=5,ramp_s=10", "imu-turn:6,axis=z,size_deg=3")
+    config = SimulationConfig(faults=texts)
+    assert SimulationConfig.from_plain(asdict(config) | {"faults": list(texts)}) == config
+    with pytest.raises(UnknownNameError, match="there is no disturbance 'drive-stuck' of an IMU"):
+        SimulationConfig(faults=("drive-stuck:1",))
+    with pytest.raises(InputError, match="needs one of size_deg"):
+        SimulationConfig(faults=("imu-turn:6,axis=z",))
+    with pytest.raises(InputError, match="--fault is for simulated IMUs, not for the rig udp: tell it to 'gough emulate'"):
+        SimulationConfig(rig="udp", faults=texts)
 
 
 def test_the_emulated_drives_have_one_watchdog():

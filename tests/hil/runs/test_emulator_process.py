@@ -50,6 +50,14 @@ def test_a_fault_before_the_drives_are_enabled_is_there_from_the_start(control, 
     assert injected(control, rig, "imu-dead:4")[0] == 0
 
 
+def test_the_course_of_a_disturbance_begins_when_it_is_injected(control, rig):
+    injected(control, rig, "imu-offset:all,axis=y,size_m_per_s2=0.5,ramp_s=10")
+    assert float(rig["fault"][0]["disturbance"]["begin"]) == pytest.approx(7.5)
+    assert (int(rig["fault"][0]["begin_ns"]), int(rig["fault"][0]["kind"])) == (-1, 0)
+    with pytest.raises(InputError, match="'offset' needs one of size_deg_per_s"):
+        control._do("fault", "imu-offset:all,axis=y", rig, {})
+
+
 def test_the_state_is_that_of_the_rig_and_its_bus(control, rig):
     rig["drive"], rig["code"], rig["velocity"] = np.arange(6) % 5, 10 * np.arange(6), 0.1 * np.arange(6)
     rig["truth"] = np.arange(19.0)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from math import inf, nan, pi, radians, sqrt
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
-from plant.errors import InputError, UnknownNameError
+from plant.errors import GoughError, InputError, UnknownNameError
 from plant.imu import (
     ACCELEROMETER,
     GYROSCOPE,
@@ -25,6 +26,7 @@ from plant.imu import (
     measure,
     philox,
 )
+from plant.imu_disturbances import disturbance_of_text
 from plant.pose import Array
 
 RATE = 1000.0
@@ -407,7 +409,7 @@ def test_a_slow_magnetometer_keeps_its_noise_at_any_rate_of_the_loop(rate: float
 
 
 def test_presets_have_the_noise_of_their_data_sheets() -> None:
-    assert set(PRESETS) == {"ideal", "mpu9150", "mpu9150-calibrated", "icm42688"}
+    assert set(PRESETS) == {"ideal", "mpu9150", "mpu9150-calibrated", "icm42688", "mpu9150-nominal", "icm42688-nominal"}
     for name, gyroscope, accelerometer in (
         ("mpu9150", 0.005, 400e-3),
         ("mpu9150-calibrated", 0.005, 400e-3),
@@ -568,3 +570,84 @@ def test_presets_have_the_figures_of_their_data_sheets() -> None:
 @pytest.mark.parametrize(("delay", "cycles"), [(0.0324, 32), (0.0004, 0), (0.0006, 1)])
 def test_the_longest_delay_is_kept_and_the_shortest_is_none(delay: float, cycles: int) -> None:
     assert imu_state(ImuModel("late", delay=delay), 0, PERIOD)["delay"] == cycles
+
+
+# ---- files ----
+
+FILE = """
+based_on = "icm42688"
+sample_rate_hz = 500
+clock_error_percent = 1
+jitter_ms = 0.02
+conversion_rate_hz = 8000.0
+misalignment_deg = 0.5
+delay_ms = 2
+
+[accelerometer]
+bandwidth_hz = 100.0
+order = 2
+reach_m_per_s2 = 78.5
+bias_m_per_s2_per_k = [0.001, 0.002]
+scale_percent_per_k = [0.002, 0.005]
+rectification_per_m_per_s2 = 1.8e-4
+
+[gyroscope]
+noise_deg_per_s_per_root_hz = 0.01
+bias_deg_per_s = [0.1, 0.3]
+
+[[disturbances]]
+kind = "offset"
+imus = [0, 3]
+axis = [0, 3, 4]
+size_m_per_s2 = 0.5
+at_s = 5
+"""
+
+
+def test_a_file_describes_a_kind_of_imu_in_words_with_units(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(FILE)
+    model, preset = load_imu(str(path)), load_imu("icm42688")
+    assert model == replace(
+        preset,
+        name="mine",
+        sample_rate=500.0,
+        clock_error=0.01,
+        jitter=1e-3 * 0.02,
+        conversion_rate=8000.0,
+        misalignment=radians(1.0) * 0.5,
+        delay=0.002,
+        accelerometer=replace(
+            preset.accelerometer, bandwidth=100.0, order=2, reach=78.5, bias_per_kelvin=(0.001, 0.002),
+            scale_per_kelvin=(0.01 * 0.002, 0.01 * 0.005), rectification=1.8e-4,
+        ),
+        gyroscope=replace(preset.gyroscope, noise=radians(1.0) * 0.01, bias=(radians(1.0) * 0.1, radians(1.0) * 0.3)),
+        disturbances=(disturbance_of_text("imu-offset:0+3,axis=0/0.6/0.8,size_m_per_s2=0.5,at=5"),),
+    )  # fmt: skip
+    # Half a sample's wait, the delay, and the mean of both low-passes.
+    section = 100.0 / sqrt(sqrt(2.0) - 1.0)
+    assert model.latency == pytest.approx(0.001 + 0.002 + 0.5 * 2.0 / (2.0 * pi * section) + 0.5 / (2.0 * pi * 400.0))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("colour = 1", "has no entry 'colour'; it has based_on, magnetometer_rate_hz"),
+        ("[gyroscope]\nnoise = 1", "gyroscope. of .* has no entry 'noise'; it has noise_deg_per_s_per_root_hz"),
+        ("[gyroscope]\norder = 5", "the order of a sensor is 5; it must be a whole number from 1 to 4"),
+        ("[accelerometer]\nbias_m_per_s2 = 1", "it must be a list of two numbers"),
+        ("[accelerometer]\nreach_m_per_s2 = 'far'", "is 'far'; it must be a number"),
+        ("sample_rate_hz = -1", "the sample_rate of an IMU is -1.0"),
+        ("clock_error_percent = 100", "its clock_error below 1"),
+        ("[[disturbances]]\nkind = 'turn'\nimus = 3\nsize_deg = 1", "has axis = None"),
+        ("based_on = 'mpu6050'", "no IMU preset 'mpu6050'"),
+        ("sample_rate_hz", "is not valid TOML"),
+    ],
+)
+def test_what_is_wrong_in_a_file_is_told(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "wrong.toml"
+    path.write_text(text)
+    with pytest.raises(GoughError, match=message):
+        load_imu(str(path))
+    with pytest.raises(InputError, match="cannot read"):
+        load_imu(str(tmp_path / "none.toml"))

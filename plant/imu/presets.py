@@ -1,0 +1,183 @@
+"""Kinds of IMUs by name: presets with the figures of data sheets, and TOML files that change them."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from math import radians
+from pathlib import Path
+from typing import Any
+
+from plant.errors import InputError, UnknownNameError
+from plant.files import check_entries, read_toml
+from plant.imu.model import MILLI_G, STANDARD_GRAVITY, ImuModel, SensorErrors
+from plant.imu_disturbances import SENSORS, disturbance, disturbance_of_table
+
+# InvenSense MPU-9150, +-4 g, +-250 deg/s, widest filter, as in its product specification; with iron of a motor beside it. It
+# has the dies of the MPU-6050, whose specification gives, off 25 C, 20 deg/s and 2 % over -40 to 85 C, 35 mg over 0 to 70 C,
+# 0.02 %/K, and 0.2 deg/s for 0.1 V of supply. Assumed, as no data sheet tells: half of each is common to all IMUs, and the
+# accelerometer's supply counts 7 mg/V.
+_MPU9150 = ImuModel(
+    "mpu9150",
+    gyroscope=SensorErrors(
+        noise=radians(0.005), bias=(radians(20.0), radians(20.0)), scale=0.03, cross_axis=0.02,
+        bandwidth=256.0, reach=radians(250.0), resolution=radians(1.0 / 131.0),
+        bias_per_kelvin=(radians(0.15), radians(0.15)), scale_per_kelvin=(1.6e-4, 1.6e-4),
+        bias_per_volt=(radians(1.0), radians(1.0)),
+    ),
+    accelerometer=SensorErrors(
+        noise=0.4 * MILLI_G, bias=(50.0 * MILLI_G, 80.0 * MILLI_G), scale=0.03, cross_axis=0.02,
+        bandwidth=260.0, reach=4.0 * STANDARD_GRAVITY, resolution=STANDARD_GRAVITY / 8192.0,
+        bias_per_kelvin=(0.4 * MILLI_G, 0.4 * MILLI_G), scale_per_kelvin=(1e-4, 1e-4),
+        bias_per_volt=(3.5 * MILLI_G, 3.5 * MILLI_G),
+    ),
+    magnetometer=SensorErrors(noise=0.05, bias=(20.0, 20.0), scale=0.05, cross_axis=0.05, reach=1200.0, resolution=0.3),
+    magnetometer_rate=100.0,
+    misalignment=radians(1.0),
+)  # fmt: skip
+
+_CALIBRATED = replace(
+    _MPU9150,
+    name="mpu9150-calibrated",
+    gyroscope=replace(_MPU9150.gyroscope, bias=(radians(0.2), radians(0.2)), scale=0.0, cross_axis=0.0),
+    accelerometer=replace(_MPU9150.accelerometer, bias=(MILLI_G, MILLI_G), scale=1e-3, cross_axis=0.0),
+    magnetometer=replace(_MPU9150.magnetometer, bias=(0.3, 0.3), scale=5e-3, cross_axis=5e-3),
+    misalignment=0.0,
+)
+
+# TDK ICM-42688-P after the same calibration; it has no magnetometer, so the MPU-9150's is used. Its data sheet gives, from 0 to
+# 70 C, 0.005 deg/s and 0.15 mg per kelvin, and 0.005 %/K for both; the supply counts as in the MPU-9150, by a tenth.
+_ICM42688 = replace(
+    _CALIBRATED,
+    name="icm42688",
+    gyroscope=replace(
+        _CALIBRATED.gyroscope, noise=radians(0.0028), bandwidth=400.0,
+        bias_per_kelvin=(radians(0.0025), radians(0.0025)), scale_per_kelvin=(2.5e-5, 2.5e-5),
+        bias_per_volt=(radians(0.1), radians(0.1)),
+    ),
+    accelerometer=replace(
+        _CALIBRATED.accelerometer, noise=0.07 * MILLI_G, bandwidth=400.0,
+        bias_per_kelvin=(0.075 * MILLI_G, 0.075 * MILLI_G), scale_per_kelvin=(2.5e-5, 2.5e-5),
+        bias_per_volt=(0.35 * MILLI_G, 0.35 * MILLI_G),
+    ),
+)  # fmt: skip
+
+_NOMINAL_LIFE = (
+    disturbance("temperature", imus="all", size_k=3.0, settle_s=300.0),
+    disturbance("vibration", imus="all", axis="1/1/1", size_g=0.02, sine_hz=173.0),
+    disturbance("supply", imus="all", size_v=0.02, sine_hz=0.7),
+)
+"""3 K warmer with the time constant of a rig's housing, drives that shake by 0.02 g, and a supply that gives way by 20 mV."""
+
+
+def _nominal(model: ImuModel, conversion_rate: float, order: int) -> ImuModel:
+    """The kind with its imperfections of nominal size: a clock of its own, conversions, rectification, and `_NOMINAL_LIFE`.
+
+    Clocks are 1 % off, as the MPU-6050's specification and the ICM-42688-P's data sheet allow; rectification is that of the
+    ADXL357 (at most 0.1 g for 7.5 g RMS), as neither of them tells.
+    """
+    accelerometer = replace(model.accelerometer, order=order, rectification=1.8 * MILLI_G / STANDARD_GRAVITY**2)
+    return replace(
+        model,
+        name=f"{model.name.removesuffix('-calibrated')}-nominal",
+        gyroscope=replace(model.gyroscope, order=order),
+        accelerometer=accelerometer,
+        sample_rate=1000.0,
+        clock_error=0.01,
+        jitter=20e-6,
+        conversion_rate=conversion_rate,
+        disturbances=_NOMINAL_LIFE,
+    )
+
+
+PRESETS = {
+    model.name: model
+    for model in (
+        ImuModel("ideal"), _MPU9150, _CALIBRATED, _ICM42688, _nominal(_CALIBRATED, 8000.0, 1), _nominal(_ICM42688, 8000.0, 2),
+    )
+}  # fmt: skip
+
+
+def load_imu(name: str) -> ImuModel:
+    """The preset of that name, or the kind that a TOML file describes.
+
+    Raises:
+        UnknownNameError: there is neither.
+        InputError: the file cannot be used.
+    """
+    if name in PRESETS:
+        return PRESETS[name]
+    if not name.endswith(".toml"):
+        raise UnknownNameError(f"no IMU preset {name!r}; there are {', '.join(PRESETS)}, or a TOML file")
+    return imu_of_table(read_toml(name), Path(name).stem, name)
+
+
+_WORDS = {
+    "magnetometer_rate_hz": ("magnetometer_rate", 1.0),
+    "misalignment_deg": ("misalignment", radians(1.0)),
+    "delay_ms": ("delay", 1e-3),
+    "dropout": ("dropout", 1.0),
+    "sample_rate_hz": ("sample_rate", 1.0),
+    "clock_error_percent": ("clock_error", 0.01),
+    "jitter_ms": ("jitter", 1e-3),
+    "conversion_rate_hz": ("conversion_rate", 1.0),
+}
+"""The words of an IMU's file: the field, and the factor to its unit."""
+
+
+def _sensor_words(unit: str, factor: float) -> dict[str, tuple[str, float]]:
+    return {
+        f"noise_{unit}_per_root_hz": ("noise", factor),
+        f"bias_{unit}": ("bias", factor),
+        "scale_percent": ("scale", 0.01),
+        "cross_axis_percent": ("cross_axis", 0.01),
+        f"drift_{unit}_per_root_s": ("drift", factor),
+        "bandwidth_hz": ("bandwidth", 1.0),
+        "order": ("order", 1),
+        f"reach_{unit}": ("reach", factor),
+        f"resolution_{unit}": ("resolution", factor),
+        f"bias_{unit}_per_k": ("bias_per_kelvin", factor),
+        "scale_percent_per_k": ("scale_per_kelvin", 0.01),
+        f"bias_{unit}_per_v": ("bias_per_volt", factor),
+        f"rectification_per_{unit}": ("rectification", 1.0 / factor),
+    }
+
+
+_UNITS = {"gyroscope": ("deg_per_s", radians(1.0)), "accelerometer": ("m_per_s2", 1.0), "magnetometer": ("ut", 1.0)}
+_PAIRS = ("bias", "bias_per_kelvin", "scale_per_kelvin", "bias_per_volt")
+
+
+def imu_of_table(table: Mapping[str, Any], name: str, title: str) -> ImuModel:
+    """The kind of IMU that the content of a TOML file describes; messages call it `title`.
+
+    Raises:
+        GoughError: an entry is unknown or out of range.
+    """
+    check_entries(table, ("based_on", *_WORDS, *SENSORS, "disturbances"), title)
+    model = load_imu(table.get("based_on", "ideal"))
+    changes = _values({word: value for word, value in table.items() if word in _WORDS}, _WORDS, title)
+    for sensor in (sensor for sensor in SENSORS if sensor in table):
+        words = _sensor_words(*_UNITS[sensor])
+        check_entries(table[sensor], words, f"[{sensor}] of {title}")
+        changes[sensor] = replace(getattr(model, sensor), **_values(table[sensor], words, f"[{sensor}] of {title}"))
+    if "disturbances" in table:
+        changes["disturbances"] = tuple(disturbance_of_table(each) for each in table["disturbances"])
+    return replace(model, name=name, **changes)
+
+
+def _values(table: Mapping[str, Any], words: Mapping[str, tuple[str, float]], title: str) -> dict[str, Any]:
+    """The fields that a table gives, in their units."""
+    values: dict[str, Any] = {}
+    for word, value in table.items():
+        field, factor = words[word]
+        numbers = value if isinstance(value, list) else [value]
+        count = 2 if field in _PAIRS else 1
+        if (
+            len(numbers) != count
+            or isinstance(value, list) != (count > 1)
+            or not all(type(each) in (int, float) for each in numbers)
+        ):
+            raise InputError(
+                f"{word} of {title} is {value!r}; it must be {'a number' if count == 1 else 'a list of two numbers'}"
+            )
+        scaled = tuple(factor * each for each in numbers)
+        values[field] = scaled if count > 1 else scaled[0]
+    return values
