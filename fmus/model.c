@@ -44,21 +44,30 @@ static void require_constants(State *s) {
     s->constants_known = 1;
 }
 
-static void rates(const State *s, const double *x, double *dx) {
-    CALL(plant_rates, (x, s->values + INPUTS_AT, s->constants), (dx));
+/* The ideal case has shorter equations. */
+static int is_ideal(const State *s) {
+    for (int i = 0; i < DISTURBANCES; i++)
+        if (s->values[disturbance_at[i]] != 0) return 0;
+    return 1;
+}
+
+static void rates(const State *s, int ideal, const double *x, double *dx) {
+    if (ideal) CALL(plant_ideal_rates, (x, s->values + INPUTS_AT, s->constants), (dx));
+    else CALL(plant_rates, (x, s->values + INPUTS_AT, s->constants), (dx));
 }
 
 static void require_rates(State *s) {
     if (s->rates_known) return;
     require_constants(s);
-    rates(s, s->values, s->values + RATES_AT);
+    rates(s, is_ideal(s), s->values, s->values + RATES_AT);
     s->rates_known = 1;
 }
 
 static void require_outputs(State *s) {
     if (s->outputs_known) return;
     require_constants(s);
-    CALL(plant_outputs, (s->values, s->values + INPUTS_AT, s->constants), (s->values + OUTPUTS_AT));
+    if (is_ideal(s)) CALL(plant_ideal_outputs, (s->values, s->values + INPUTS_AT, s->constants), (s->values + OUTPUTS_AT));
+    else CALL(plant_outputs, (s->values, s->values + INPUTS_AT, s->constants), (s->values + OUTPUTS_AT));
     s->outputs_known = 1;
 }
 
@@ -75,15 +84,16 @@ static void place_at_start(State *s) {
 /* The classical Runge-Kutta method with equal substeps. */
 static void integrate(State *s, double duration, long steps) {
     double h = duration / steps, *x = s->values, k[4][STATES], at[STATES];
+    int ideal = is_ideal(s);
     require_constants(s);
     for (long step = 0; step < steps; step++) {
-        rates(s, x, k[0]);
+        rates(s, ideal, x, k[0]);
         for (int i = 0; i < STATES; i++) at[i] = x[i] + h / 2 * k[0][i];
-        rates(s, at, k[1]);
+        rates(s, ideal, at, k[1]);
         for (int i = 0; i < STATES; i++) at[i] = x[i] + h / 2 * k[1][i];
-        rates(s, at, k[2]);
+        rates(s, ideal, at, k[2]);
         for (int i = 0; i < STATES; i++) at[i] = x[i] + h * k[2][i];
-        rates(s, at, k[3]);
+        rates(s, ideal, at, k[3]);
         for (int i = 0; i < STATES; i++) {
             x[i] += h / 6 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i]);
             if (fabs(x[i]) < NEGLIGIBLE) x[i] = 0;

@@ -1,6 +1,6 @@
 """A plant's expressions as CasADi functions of flat vectors, in the order of its variable table."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import casadi as ca
@@ -14,7 +14,10 @@ Values = dict[str, SX]
 
 @dataclass(frozen=True)
 class Dynamics:
-    """A plant as functions of flat vectors; `conditions` and `limits` return values and their greatest values."""
+    """A plant as functions of flat vectors; `conditions` and `limits` return values and their greatest values.
+
+    `ideal_rates` and `ideal_outputs` are the same functions with all disturbances at zero, and much shorter.
+    """
 
     constants: ca.Function  # of the parameters
     start: ca.Function  # the states, of the parameters
@@ -24,6 +27,8 @@ class Dynamics:
     limit_texts: tuple[str, ...]
     rates: ca.Function  # of states, inputs and constants
     outputs: ca.Function  # of the same
+    ideal_rates: ca.Function
+    ideal_outputs: ca.Function
 
 
 def assemble(
@@ -39,22 +44,39 @@ def assemble(
     # In `rates` and `outputs`, symbols replace the computed constants.
     symbols = {name: SX.sym(name, *value.shape) for name, value in constants.items()}
     states, inputs = variable_symbols(table.states), variable_symbols(table.inputs)
-    rates, outputs = plant(states, inputs, symbols)
     arguments = [_flat(states), _flat(inputs), _flat(symbols)]
     given = [_flat(parameters)]
     options = {"cse": True}
     watched = limits(states, symbols)
-    resting = {variable.name: SX.zeros(variable.size) for variable in table.states}
+
+    def running(prefix: str, changed: Values) -> tuple[ca.Function, ca.Function]:
+        """Rates and outputs; CasADi leaves out what zeros among the changed values make vanish."""
+        sides = ({name: changed.get(name, value) for name, value in side.items()} for side in (states, inputs, symbols))
+        rates, outputs = plant(*sides)
+        return (
+            ca.Function(f"plant_{prefix}rates", arguments, [_in_order(rates, table.states)], options),
+            ca.Function(f"plant_{prefix}outputs", arguments, [_in_order(outputs, table.outputs)], options),
+        )
+
+    rates, outputs = running("", {})
+    ideal_rates, ideal_outputs = running("ideal_", zeros(each for each in table.variables if each.disturbance))
     return Dynamics(
         constants=ca.Function("plant_constants", given, [_flat(constants)], options),
-        start=ca.Function("plant_start", given, [_in_order(resting | start, table.states)], options),
+        start=ca.Function("plant_start", given, [_in_order(zeros(table.states) | start, table.states)], options),
         conditions=ca.Function("plant_conditions", given, _sides(conditions), options),
         condition_texts=tuple(condition.text for condition in conditions),
         limits=ca.Function("plant_limits", [_flat(states), _flat(symbols)], _sides(watched), options),
         limit_texts=tuple(condition.text for condition in watched),
-        rates=ca.Function("plant_rates", arguments, [_in_order(rates, table.states)], options),
-        outputs=ca.Function("plant_outputs", arguments, [_in_order(outputs, table.outputs)], options),
+        rates=rates,
+        outputs=outputs,
+        ideal_rates=ideal_rates,
+        ideal_outputs=ideal_outputs,
     )
+
+
+def zeros(variables: Iterable[Variable]) -> Values:
+    """Zeros for each variable, in its shape."""
+    return {variable.name: SX.zeros(*(*variable.shape, 1, 1)[:2]) for variable in variables}
 
 
 def variable_symbols(variables: tuple[Variable, ...]) -> Values:

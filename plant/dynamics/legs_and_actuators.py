@@ -3,7 +3,7 @@
 A leg is a universal joint (first axis e1 fixed in the base, second e2 = n x e1 / |n x e1|) with a lower part and a rod, both
 symmetric about the leg's axis n = s / l. Since the leg's angular velocity lies in the plane of e1 and e2,
 `omega = n x s' / l + omega_n n` with `omega_n = k e1 . (s x s') / (l (l^2 - k^2))`, k = e1 . s. In a planar mechanism e1 is
-the plane's normal, so k and omega_n are zero.
+the plane's normal, so k and omega_n are zero. All this is seen in {1}, whose own motion is added to it.
 
 Each leg is driven through a screw by a DC motor on an encoderless drive that turns a velocity command u into the voltage
 `n k u + kappa R_nominal i`, n = 2 pi / lead.
@@ -15,6 +15,7 @@ from math import pi
 
 import casadi as ca
 
+from plant.dynamics.base_motion import BaseMotion
 from plant.dynamics.variables import BRAKE, OPEN, VELOCITY
 
 SX = ca.SX
@@ -46,6 +47,7 @@ def body_constants(p: dict[str, SX], about_offset: Callable[[SX], SX]) -> dict[s
     return {name: p[name] for name in _UNCHANGED} | {
         "transverse_inertia": p[lower + "inertia"] + p[upper + "inertia"] + p[lower + "mass"] * p[lower + "center"] ** 2,
         "lower_moment": p[lower + "mass"] * p[lower + "center"],
+        "lower_mass": p[lower + "mass"],
         "rod_mass": p[upper + "mass"],
         "rod_center": p[upper + "center"],
         "sliding_mass": p[upper + "mass"] + p["motor.rotor_inertia"] * turns**2,
@@ -144,16 +146,18 @@ def _substep_conditions(p: dict[str, SX], beyond_stop: SX) -> list[Condition]:
 
 @dataclass(frozen=True)
 class Leg:
-    """One leg at one instant; vectors (3, 1) seen in {1}.
+    """One leg at one instant; vectors (3, 1) and their derivatives seen in {1}.
 
     `mass` (3, 3) and `force` (3, 1) are M_s and h in `M_s s'' + h = F`, with F the force on the platform joint. `arm` points
-    from the platform's origin to that joint, and `bias` is s'' without acceleration of the platform.
+    from the platform's origin to that joint, and `bias` is s'' without acceleration of the platform. `gravity` is what a body
+    at rest on the base joint feels.
     """
 
     s: SX
     velocity: SX
     arm: SX
     bias: SX
+    gravity: SX
     length: SX
     speed: SX
     direction: SX
@@ -163,11 +167,11 @@ class Leg:
     potential: SX
 
 
-def _leg_at(s: SX, velocity: SX, arm: SX, bias: SX, e1: SX, c: dict[str, SX]) -> Leg:
-    """Lagrange's equations of one leg with its motor.
+def _leg_at(s: SX, velocity: SX, arm: SX, bias: SX, joint: SX, e1: SX, base: BaseMotion, c: dict[str, SX]) -> Leg:
+    """Lagrange's equations of one leg with its motor, on its base joint and its first axis e1.
 
     The leg slides with the mass m, swings with the transverse inertia I(l), and turns about its axis with the rate that the
-    universal joint imposes, `w = kappa q`, kappa = k / (l^3 - l k^2), q = (e1 x s) . s'.
+    universal joint imposes, `w = kappa q + omega . n`, kappa = k / (l^3 - l k^2), q = (e1 x s) . s', omega of the base.
     """
     # One square root and no division: CasADi would make a separate division of every product with 1 / l.
     square = ca.dot(s, s)
@@ -176,13 +180,17 @@ def _leg_at(s: SX, velocity: SX, arm: SX, bias: SX, e1: SX, c: dict[str, SX]) ->
     n = s * inverse
     speed = ca.dot(n, velocity)
     across = velocity - speed * n
-    swing2 = ca.dot(across, across) * inverse**2
+    # Slide and swing are those in a frame that moves with the base joint, but does not turn.
+    swing = across + ca.cross(base.omega, s)
+    swing2 = ca.dot(swing, swing) * inverse**2
+    carried = base.acceleration(s, velocity)
+    gravity, joint_velocity = base.gravity - base.carry @ joint, ca.cross(base.omega, joint)
 
     lever = length - c["rod_center"]
     inertia = c["transverse_inertia"] + c["rod_mass"] * lever**2
     inertia_slope = 2 * c["rod_mass"] * lever
     weight_lever = c["lower_moment"] + c["rod_mass"] * lever
-    gravity_along = ca.dot(c["gravity"], n)
+    gravity_along = ca.dot(gravity, n)
 
     k = ca.dot(e1, s)
     inverse_cubic = inverse / (square - k**2)
@@ -192,8 +200,11 @@ def _leg_at(s: SX, velocity: SX, arm: SX, bias: SX, e1: SX, c: dict[str, SX]) ->
     q = ca.dot(turned, velocity)
     kappa_rate = ca.dot(kappa_gradient, velocity)
     axial = c["axial_inertia"]
-    gyroscopic = kappa_rate * q * kappa * turned + kappa * q * (
-        kappa_rate * turned + 2 * kappa * ca.cross(e1, velocity) - q * kappa_gradient
+    along = ca.dot(base.omega, n)
+    spin = kappa * q + along
+    spin_rate = kappa_rate * q + ca.dot(base.alpha, n) + ca.dot(base.omega, across) * inverse
+    gyroscopic = spin_rate * kappa * turned + spin * (
+        kappa_rate * turned + 2 * kappa * ca.cross(e1, velocity) - q * kappa_gradient - (base.omega - along * n) * inverse
     )
 
     swing_mass = inertia * inverse**2
@@ -203,29 +214,37 @@ def _leg_at(s: SX, velocity: SX, arm: SX, bias: SX, e1: SX, c: dict[str, SX]) ->
         velocity=velocity,
         arm=arm,
         bias=bias,
+        gravity=gravity,
         length=length,
         speed=speed,
         direction=n,
         mass=swing_mass * SX.eye(3) + (sliding_mass - swing_mass) * n @ n.T + axial * kappa**2 * turned @ turned.T,
         force=(
             (sliding_mass * length * swing2 - inertia_slope * swing2 / 2 - c["rod_mass"] * gravity_along) * n
-            + (inertia_slope - 2 * inertia * inverse) * speed * inverse**2 * across
-            - weight_lever * inverse * (c["gravity"] - gravity_along * n)
+            + (inertia_slope - 2 * inertia * inverse) * speed * inverse**2 * swing
+            - weight_lever * inverse * (gravity - gravity_along * n)
             + axial * gyroscopic
+            + swing_mass * carried
+            + (sliding_mass - swing_mass) * ca.dot(n, carried) * n
         ),
-        kinetic=(inertia * swing2 + sliding_mass * speed**2 + axial * (kappa * q) ** 2) / 2,
-        potential=-gravity_along * weight_lever,
+        kinetic=(
+            (inertia * swing2 + sliding_mass * speed**2 + axial * spin**2) / 2
+            + (c["lower_mass"] + c["rod_mass"]) * ca.dot(joint_velocity, joint_velocity) / 2
+            + ca.dot(joint_velocity, weight_lever * inverse * swing + c["rod_mass"] * speed * n)
+        ),
+        potential=-ca.dot(base.gravity, n) * weight_lever,
     )
 
 
-def legs_at(position: SX, rotation: SX, velocity: SX, omega: SX, c: dict[str, SX]) -> list[Leg]:
-    """The legs, whose constants include joints and axes (n, 3), for a motion of {2}."""
+def legs_at(position: SX, rotation: SX, velocity: SX, omega: SX, base: BaseMotion, c: dict[str, SX]) -> list[Leg]:
+    """The legs, whose constants include joints and axes (n, 3), for a motion of {2} in {1}."""
     legs = []
     for k in range(c["base_joints"].shape[0]):
-        arm = rotation @ row(c["platform_joints"], k)
-        s = position + arm - row(c["base_joints"], k)
+        arm, joint = rotation @ row(c["platform_joints"], k), row(c["base_joints"], k)
         turning = ca.cross(omega, arm)
-        legs.append(_leg_at(s, velocity + turning, arm, ca.cross(omega, turning), row(c["base_joint_axes"], k), c))
+        bias = ca.cross(omega, turning)
+        axis = row(c["base_joint_axes"], k)
+        legs.append(_leg_at(position + arm - joint, velocity + turning, arm, bias, joint, axis, base, c))
     return legs
 
 
@@ -353,11 +372,14 @@ def _leg_turning(s: SX, velocity: SX, acceleration: SX, e1: SX) -> tuple[SX, SX,
     return ca.horzcat(ca.cross(e2, n), e2, n), turning, angular
 
 
-def imu_signals_of(legs: list[Leg], rotation: SX, omega: SX, acceleration: SX, c: dict[str, SX]) -> dict[str, SX]:
+def imu_signals_of(
+    legs: list[Leg], rotation: SX, omega: SX, acceleration: SX, carried: SX, base: BaseMotion, c: dict[str, SX]
+) -> dict[str, SX]:
     """Ideal IMU signals (n + 1, 3) of legs and platform, by their names in the table.
 
     Signals of a leg are seen in the leg frame, whose z axis is the leg and whose y axis is e2; those of the platform in {2}.
-    The `acceleration` (6, 1) is that of the origin of {2}, then angular.
+    The `acceleration` (6, 1) is that of the origin of {2} in {1}, then angular; `carried` (6, 1) is what the motion of {1}
+    adds to it.
     """
     signals: list[tuple[SX, SX, SX]] = []
     for i, leg in enumerate(legs):
@@ -365,11 +387,13 @@ def imu_signals_of(legs: list[Leg], rotation: SX, omega: SX, acceleration: SX, c
         frame, turning, angular = _leg_turning(
             leg.s, leg.velocity, acceleration[:3] + ca.cross(acceleration[3:], leg.arm) + leg.bias, e1
         )
-        rate = frame.T @ turning
-        force = ca.cross(frame.T @ angular, arm) + ca.cross(rate, ca.cross(rate, arm)) - frame.T @ c["gravity"]
-        signals.append((rate, force, frame.T @ c["magnetic_field"]))
+        angular += base.alpha + ca.cross(base.omega, turning)
+        rate = frame.T @ (turning + base.omega)
+        force = ca.cross(frame.T @ angular, arm) + ca.cross(rate, ca.cross(rate, arm)) - frame.T @ leg.gravity
+        signals.append((rate, force, frame.T @ base.magnetic_field))
     place = rotation @ c["platform_imu_position"]
-    at_imu = acceleration[:3] + ca.cross(acceleration[3:], place) + ca.cross(omega, ca.cross(omega, place))
-    signals.append((rotation.T @ omega, rotation.T @ (at_imu - c["gravity"]), rotation.T @ c["magnetic_field"]))
+    whole, turning = acceleration + carried, omega + base.omega
+    at_imu = whole[:3] + ca.cross(whole[3:], place) + ca.cross(turning, ca.cross(turning, place))
+    signals.append((rotation.T @ turning, rotation.T @ (at_imu - base.gravity), rotation.T @ base.magnetic_field))
     names = ("imu_angular_velocity", "imu_specific_force", "imu_magnetic_field")
     return {name: ca.horzcat(*values).T for name, values in zip(names, zip(*signals, strict=True), strict=True)}

@@ -1,12 +1,14 @@
 """Rigid-body and drive dynamics of a planar three-leg mechanism, as CasADi expressions in one set of symbols.
 
 The equations are those of `plant.dynamics.spatial`, with J = [1, e_z x R a]. The legs are in space: the plane is the xy-plane
-of {1}, and its normal is the first axis of every leg's joint. The joints bear the forces across the plane.
+of {1}, and its normal is the first axis of every leg's joint. The joints bear the forces across the plane. When the base
+turns out of the plane, platform and payload count as symmetric about the normal.
 """
 
 import casadi as ca
 
 from plant.dynamics.assembly import Dynamics, Values, assemble, variable_symbols
+from plant.dynamics.base_motion import base_motion
 from plant.dynamics.legs_and_actuators import (
     SX,
     Condition,
@@ -33,7 +35,9 @@ def build_dynamics() -> Dynamics:
 
 def _constants(p: Values) -> Values:
     joints = {name: p[name] for name in ("base_joints", "platform_joints")}
-    return joints | body_constants(p, lambda center: ca.dot(center, center))
+    centers = [(p[f"{body}.mass"], p[f"{body}.center_of_mass"]) for body in ("platform", "payload")]
+    spread = {"centers_spread": sum((mass * center @ center.T for mass, center in centers), SX.zeros(2, 2))}
+    return joints | spread | body_constants(p, lambda center: ca.dot(center, center))
 
 
 def _conditions(p: Values) -> list[Condition]:
@@ -62,19 +66,32 @@ def _in_space(vectors: SX) -> SX:
 def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
     position, velocity, turning = x["state.position"], x["state.velocity"], x["state.angular_velocity"]
     rotation = _rotation(x["state.angle"])
-    in_plane = c["gravity"][:2]
+    base = base_motion(u, c)
+    in_plane = base.gravity[:2]
     moment = rotation[:2, :2] @ c["first_moment"]
     across = ca.vertcat(-moment[1], moment[0])
     omega = turning * _NORMAL
     joints = {name: _in_space(c[name]) for name in ("base_joints", "platform_joints")}
     c = c | joints | {"base_joint_axes": ca.repmat(_NORMAL.T, 3, 1), "axial_inertia": SX(0)}
-    legs = legs_at(_in_space(position.T).T, rotation, _in_space(velocity.T).T, omega, c)
+    place, moving, first_moment = (_in_space(vector.T).T for vector in (position, velocity, moment))
+    legs = legs_at(place, rotation, moving, omega, base, c)
     actuators = actuators_at(legs, x, u, c)
     forces = actuators.force
 
     mass = ca.blockcat([[c["mass"] * SX.eye(2), across], [across.T, c["inertia"]]])
     external = ca.vertcat(u["external_wrench.force"], u["external_wrench.torque"])
+    # The acceleration that the base's motion adds is linear in place and velocity: a body feels it by its moments.
+    carried = base.acceleration(place, moving)
+    carried_force = c["mass"] * carried + base.acceleration(first_moment, ca.cross(omega, first_moment))
+    spread = rotation[:2, :2] @ c["centers_spread"] @ rotation[:2, :2].T
+    carried_torque = (
+        ca.dot(across, carried[:2])
+        + c["inertia"] * base.alpha[2]
+        + base.omega[0] * base.omega[1] * (spread[0, 0] - spread[1, 1])
+        + (base.omega[1] ** 2 - base.omega[0] ** 2) * spread[0, 1]
+    )
     wrench = external + ca.vertcat(c["mass"] * in_plane + turning**2 * moment, ca.dot(across, in_plane))
+    wrench -= ca.vertcat(carried_force[:2], carried_torque)
     for k, leg in enumerate(legs):
         jacobian = ca.horzcat(SX.eye(2), ca.cross(_NORMAL, leg.arm)[:2])
         leg_mass = leg.mass[:2, :2]
@@ -91,16 +108,19 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
         "state.brake_deflection": actuators.brake_rate,
     }
     in_space = ca.vertcat(acceleration[:2], 0, 0, 0, acceleration[2])
-    imu = imu_signals_of(legs, rotation, omega, in_space, c)
+    carried = ca.vertcat(carried, base.alpha + ca.cross(base.omega, omega))
+    imu = imu_signals_of(legs, rotation, omega, in_space, carried, base, c)
+    whole_velocity, whole_turning = moving + ca.cross(base.omega, place), turning + base.omega[2]
     outputs = {
         "position": position,
         "angle": x["state.angle"],
         "velocity": velocity,
         "angular_velocity": turning,
         "kinetic_energy": (
-            c["mass"] * ca.dot(velocity, velocity) / 2
-            + turning * ca.dot(velocity, across)
-            + c["inertia"] * turning**2 / 2
+            c["mass"] * ca.dot(whole_velocity, whole_velocity) / 2
+            + whole_turning * ca.dot(whole_velocity[:2], across)
+            + whole_velocity[2] * ca.cross(base.omega, first_moment)[2]
+            + c["inertia"] * whole_turning**2 / 2
             + sum(leg.kinetic for leg in legs)
         ),
         "potential_energy": -ca.dot(in_plane, c["mass"] * position + moment) + sum(leg.potential for leg in legs),

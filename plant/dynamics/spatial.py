@@ -2,12 +2,14 @@
 
 Generalised coordinates are the platform's pose and twist; the legs follow. For a leg with the vector `s = p + R a - b`, the
 kinetic energy `T(s, s')` and the potential `V(s)` give `M_s s'' + h = F`. With `s'' = J nu' + J' nu` the platform's equation is
-`(M + sum J^T M_s J) nu' = wrench - sum J^T (h + M_s J' nu - F n)`.
+`(M + sum J^T M_s J) nu' = wrench - sum J^T (h + M_s J' nu - F n)`. Pose and twist are those in {1}, which may move itself:
+the accelerations that its motion adds are part of h and of the wrench.
 """
 
 import casadi as ca
 
-from plant.dynamics.assembly import Dynamics, Values, assemble, variable_symbols
+from plant.dynamics.assembly import Dynamics, Values, assemble, variable_symbols, zeros
+from plant.dynamics.base_motion import base_motion
 from plant.dynamics.legs_and_actuators import (
     SX,
     Condition,
@@ -126,18 +128,25 @@ def _limits(x: Values, c: Values) -> list[Condition]:
 def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
     rotation = _rotation(x["state.quaternion"])
     position, velocity, omega = x["state.position"], x["state.velocity"], x["state.angular_velocity"]
-    gravity = c["gravity"]
+    base = base_motion(u, c)
+    gravity = base.gravity
     moment = rotation @ c["first_moment"]
     inertia = rotation @ c["inertia"] @ rotation.T
-    legs = legs_at(position, rotation, velocity, omega, c)
+    legs = legs_at(position, rotation, velocity, omega, base, c)
     actuators = actuators_at(legs, x, u, c)
     forces = actuators.force
 
+    # Twist and acceleration in a frame that moves with the base's origin, but does not turn.
+    whole_velocity, whole_omega = velocity + ca.cross(base.omega, position), omega + base.omega
+    carried = base.acceleration(position, velocity)
+    carried_angular = base.alpha + ca.cross(base.omega, omega)
     linear, coupling, angular = c["mass"] * SX.eye(3), ca.skew(moment), inertia
     external = ca.vertcat(u["external_wrench.force"], u["external_wrench.torque"])
     wrench = external + ca.vertcat(
-        c["mass"] * gravity - ca.cross(omega, ca.cross(omega, moment)),
-        ca.cross(moment, gravity) - ca.cross(omega, inertia @ omega),
+        c["mass"] * (gravity - carried)
+        - ca.cross(whole_omega, ca.cross(whole_omega, moment))
+        - ca.cross(carried_angular, moment),
+        ca.cross(moment, gravity - carried) - ca.cross(whole_omega, inertia @ whole_omega) - inertia @ carried_angular,
     )
     for k, leg in enumerate(legs):
         turned = ca.skew(leg.arm) @ leg.mass
@@ -166,16 +175,16 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
         "state.current": actuators.current_rate,
         "state.brake_deflection": actuators.brake_rate,
     }
-    imu = imu_signals_of(legs, rotation, omega, acceleration, c)
+    imu = imu_signals_of(legs, rotation, omega, acceleration, ca.vertcat(carried, carried_angular), base, c)
     outputs = {
         "position": position,
         "quaternion": x["state.quaternion"],
         "velocity": velocity,
         "angular_velocity": omega,
         "kinetic_energy": (
-            c["mass"] * ca.dot(velocity, velocity) / 2
-            + ca.dot(velocity, ca.cross(omega, moment))
-            + ca.dot(omega, inertia @ omega) / 2
+            c["mass"] * ca.dot(whole_velocity, whole_velocity) / 2
+            + ca.dot(whole_velocity, ca.cross(whole_omega, moment))
+            + ca.dot(whole_omega, inertia @ whole_omega) / 2
             + sum(leg.kinetic for leg in legs)
         ),
         "potential_energy": -ca.dot(gravity, c["mass"] * position + moment) + sum(leg.potential for leg in legs),
@@ -185,10 +194,11 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
 
 
 def imu_signals(position: SX, rotation: SX, velocity: SX, omega: SX, acceleration: SX, parameters: Values) -> Values:
-    """Ideal IMU signals (7, 3) by name, for a motion of {2} seen in {1}.
+    """Ideal IMU signals (7, 3) by name, for a motion of {2} in {1}, which rests.
 
     Its rotation is (3, 3), its acceleration (6, 1), of the origin and then angular; the other arguments are (3, 1).
     """
     c = _constants(parameters)
-    legs = legs_at(position, rotation, velocity, omega, c)
-    return imu_signals_of(legs, rotation, omega, acceleration, c)
+    base = base_motion(zeros(SPATIAL.inputs), c)
+    legs = legs_at(position, rotation, velocity, omega, base, c)
+    return imu_signals_of(legs, rotation, omega, acceleration, SX.zeros(6), base, c)

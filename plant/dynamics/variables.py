@@ -34,7 +34,7 @@ class Variable:
     """One variable of a plant, with the names of FMI; the shape of a scalar is ().
 
     A parameter outside its range is refused; other variables stay inside. A `tunable` parameter may change during a run.
-    `discrete` marks the drive modes, an enumeration.
+    `discrete` marks the drive modes, an enumeration. A `disturbance` is zero in the ideal case, which has shorter equations.
     """
 
     name: str
@@ -47,6 +47,7 @@ class Variable:
     causality: Causality
     tunable: bool = False
     discrete: bool = False
+    disturbance: bool = False
 
     @property
     def size(self) -> int:
@@ -63,6 +64,11 @@ class VariableTable:
     parameters: tuple[Variable, ...]
     outputs: tuple[Variable, ...]
 
+    @property
+    def variables(self) -> tuple[Variable, ...]:
+        """All of them."""
+        return (*self.states, *self.inputs, *self.parameters, *self.outputs)
+
 
 Shape = tuple[int, ...]
 Maker = Callable[..., Variable]
@@ -70,6 +76,7 @@ Maker = Callable[..., Variable]
 
 _state: Maker = partial(Variable, causality="state")
 _input: Maker = partial(Variable, causality="input")
+_disturbing: Maker = partial(Variable, causality="input", disturbance=True)
 _fixed: Maker = partial(Variable, causality="parameter")
 _tunable: Maker = partial(Variable, causality="parameter", tunable=True)
 _output: Maker = partial(Variable, causality="output")
@@ -110,7 +117,20 @@ def _inputs(legs: int, dimensions: int) -> tuple[Variable, ...]:
         _input("drive_mode", (legs,), "1", "0 open, 1 brake, 2 velocity", OPEN, VELOCITY, 1, discrete=True),
         _input("external_wrench.force", (dimensions,), "N", "force on the origin of {2}", -1e6, 1e6, 100),
         _input("external_wrench.torque", _turning(dimensions), "N.m", f"torque on the platform{sense}", -1e6, 1e6, 10),
+        *(
+            _disturbing(f"base_motion.{name}", (3,), unit, description, -most, most, nominal)
+            for name, unit, description, most, nominal in _BASE_MOTION
+        ),
     )
+
+
+_BASE_MOTION = (
+    ("rotation", "rad", "rotation vector that has turned the base {1} from the attitude in which gravity is given", 1e3, 0.1),
+    ("angular_velocity", "rad/s", "angular velocity of the base", 1e3, 0.1),
+    ("angular_acceleration", "rad/s2", "angular acceleration of the base", 1e5, 1),
+    ("acceleration", "m/s2", "acceleration of the origin of {1}, without gravity", 1e5, 1),
+)
+"""Name, unit, description, greatest and nominal value of what the inputs tell of the base's motion."""
 
 
 def _body(make: Maker, body: str, dimensions: int, least: float) -> tuple[Variable, ...]:
@@ -170,8 +190,8 @@ def _parameters(legs: int, dimensions: int) -> tuple[Variable, ...]:
         _fixed("stop.maximum_length", each, "m", "leg length at which the upper end stop touches", TINY, 100, 0.1),
         _fixed("stop.stiffness", (), "N/m", "stiffness of the end stops", 0, 1e10, 1e6),
         _fixed("stop.damping", (), "s/m", "damping of the end stops relative to their force", 0, 1e4, 1),
-        _tunable("gravity", (3,), "m/s2", "acceleration of gravity", -1e3, 1e3, 10),
-        _fixed("magnetic_field", (3,), "uT", "magnetic field of the earth", -1e4, 1e4, 10),
+        _tunable("gravity", (3,), "m/s2", "acceleration of gravity, before the base has turned", -1e3, 1e3, 10),
+        _fixed("magnetic_field", (3,), "uT", "magnetic field of the earth, before the base has turned", -1e4, 1e4, 10),
         _fixed("leg_imu_position", (legs, 3), "m", "each leg's IMU from the base joint, in the leg frame", -100, 100, 0.1),
         _fixed("platform_imu_position", (3,), "m", "the platform's IMU, in {2}", -100, 100, 0.1),
         *_pose(_fixed, "initial_", dimensions, " at the start"),
@@ -191,8 +211,10 @@ def _outputs(legs: int, dimensions: int) -> tuple[Variable, ...]:
         _output("leg_velocity", (legs,), "m/s", "rates of the lengths", -1e3, 1e3, 0.1),
         _output("current", (legs,), "A", "motor currents", -1e4, 1e4, 1),
         _output("voltage", (legs,), "V", "voltages that the drives ask for, within the voltage limit", -1e5, 1e5, 10),
-        _output("kinetic_energy", (), "J", "of all bodies and rotors", 0, 1e9, 1),
-        _output("potential_energy", (), "J", "of all bodies in the field of gravity", -1e9, 1e9, 10),
+        _output("kinetic_energy", (), "J", "of all bodies and rotors, seen from the base without its turning", 0, 1e9, 1),
+        _output(
+            "potential_energy", (), "J", "of all bodies in the field of gravity, less the base's acceleration", -1e9, 1e9, 10
+        ),
         _output("power.drive", (), "W", "mechanical power of the motors", -1e9, 1e9, 10),
         _output("power.friction", (), "W", "power lost in friction, as a negative number", -1e9, 0, 1),
         _output("power.brake", (), "W", "power of the brakes on the legs", -1e9, 1e9, 1),

@@ -31,6 +31,8 @@ TRUTH_PLACES = {
 """Where a signal lies in the truth. A planar plant's angle is in the first place of the quaternion."""
 
 COMMANDS, MODES, PAYLOAD = "velocity_command", "drive_mode", "payload.mass"
+BASE = tuple(f"base_motion.{name}" for name in ("rotation", "angular_velocity", "angular_acceleration", "acceleration"))
+"""The signals of the base's motion, in the order of `plant.dynamics.base_course`."""
 
 UNITS: dict[str, dict[str, float]] = {
     "m": {"m": 1.0, "dm": 0.1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254},
@@ -39,6 +41,7 @@ UNITS: dict[str, dict[str, float]] = {
     "rad": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180},
     "rad/s": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": np.pi / 180, "rpm": np.pi / 30, "1/min": np.pi / 30},
     "uT": {"uT": 1.0, "nT": 1e-3, "mT": 1e3, "T": 1e6, "G": 100.0, "mG": 0.1},
+    "rad/s2": {"rad/s2": 1.0, "rad/s^2": 1.0, "deg/s2": np.pi / 180, "deg/s^2": np.pi / 180},
     "A": {"A": 1.0, "mA": 1e-3},
     "kg": {"kg": 1.0, "g": 1e-3, "t": 1e3},
     "1": {"1": 1.0, "": 1.0},
@@ -48,11 +51,12 @@ UNITS: dict[str, dict[str, float]] = {
 SIGNAL_UNITS = {
     COMMANDS: "m/s", MODES: "1", "imu_angular_velocity": "rad/s", "imu_specific_force": "m/s2", "imu_magnetic_field": "uT",
     "position": "m", "quaternion": "1", "angle": "rad", "leg_length": "m", "current": "A", PAYLOAD: "kg",
+    **dict(zip(BASE, ("rad", "rad/s", "rad/s2", "m/s2"), strict=True)),
 }  # fmt: skip
 """The loop's unit of every signal."""
 
 REQUIRED = (COMMANDS, "imu_angular_velocity", "imu_specific_force")
-WRITTEN = (COMMANDS, MODES, PAYLOAD)
+WRITTEN = (COMMANDS, MODES, PAYLOAD, *BASE)
 _MODE_NAMES = tuple(DRIVE_MODES.values())
 _ENTRIES = ("offset", "sign", "unit", "variables")
 
@@ -214,6 +218,7 @@ class Bound:
     known: Scalars  # the truth, in (19,)
     commanded: Scalars  # in (legs,)
     loaded: Scalars  # the payload's mass, in (1,)
+    based: Scalars  # the base's motion, in (12,)
     modes: Modes
     knows_pose: bool
     planar_angle: bool  # in place of the quaternion
@@ -278,6 +283,7 @@ class _Binder:
             "known": self._group({name: self._truth_places(name) for name in TRUTH_PLACES if name in self._found}),
             "commanded": self._group({name: range(self._legs) for name in (COMMANDS,) if name in self._found}),
             "loaded": self._group({name: range(1) for name in (PAYLOAD,) if name in self._found}),
+            "based": self._group({name: range(3 * i, 3 * i + 3) for i, name in enumerate(BASE) if name in self._found}),
         }
         modes = self._modes()
         knows = "position" in self._found, "quaternion" in self._found or "angle" in self._found

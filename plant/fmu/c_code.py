@@ -17,6 +17,7 @@ def write_functions(dynamics: Dynamics, folder: Path) -> None:
     """Write plant.c and derivatives.c with their headers."""
     plant = (
         dynamics.constants, dynamics.start, dynamics.conditions, dynamics.limits, dynamics.rates, dynamics.outputs,
+        dynamics.ideal_rates, dynamics.ideal_outputs,
     )  # fmt: skip
     for file, functions in (("plant", plant), ("derivatives", _derivatives(dynamics))):
         generator = ca.CodeGenerator(f"{file}.c", {"with_header": True})
@@ -88,6 +89,7 @@ def layout_header(layout: Layout, starts: Mapping[str, Array], token: str, dynam
     """The text of layout.h: sizes, offsets, and a table for each property of the variables."""
     table, exposed = layout.table, layout.exposed
     blocks = {"INPUTS": table.inputs, "PARAMETERS": table.parameters, "OUTPUTS": table.outputs, "RATES": layout.rates}
+    disturbances = [place for variable in exposed if variable.disturbance for place in layout.places(variable)]
     places = sorted((place, v) for v, variable in enumerate(exposed) for place in layout.places(variable))
 
     def array(kind: str, name: str, values: Sequence[object]) -> str:
@@ -113,6 +115,7 @@ def layout_header(layout: Layout, starts: Mapping[str, Array], token: str, dynam
         "LAYOUT": f"0x{token[1:17]}ULL",
         **{f"{block}_AT": layout.offsets[variables[0].name] for block, variables in blocks.items()},
         "SUBSTEP_AT": layout.offsets["substep"],
+        "DISTURBANCES": len(disturbances),
     }
     if "state.quaternion" in layout.offsets:
         macros["QUATERNION_AT"] = layout.offsets["state.quaternion"]
@@ -134,6 +137,7 @@ def layout_header(layout: Layout, starts: Mapping[str, Array], token: str, dynam
         array("double", "minimum", [float(v.minimum) for v in exposed]),
         array("double", "maximum", [float(v.maximum) for v in exposed]),
         array("double", "nominal", [float(v.nominal) for v in exposed]),
+        array("int", "disturbance_at", disturbances),
         array("double", "start", [value.hex() for v in layout.stored for value in start_of(v, starts)]),
         "",
     ]

@@ -9,6 +9,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from plant.compiled import Record, kernel, record_dtype
+from plant.dynamics.base_course import BASE_MOTION, BASE_SIZE, MOST_BASE_MOTIONS, base_motion_at
 from plant.dynamics.variables import DRIVE_MODES, IMU_COUNT, VELOCITY
 from plant.fmu.instance import ASKS_TO_END, ERROR, NEEDS_EVENTS, NOT_FINITE, OK
 from plant.mechanism import LEGS
@@ -19,10 +20,10 @@ MOST_CHANGES = 32
 """The most parameters that may change during a run."""
 
 _SENSED = 3 * IMU_COUNT * 3
-_READ_IMUS, _READ_TRUTH, _WRITE_COMMAND, _WRITE_MODES, _WRITE_PAYLOAD, _CHANGE_VALUE, _STEP = range(7)
+_READ_IMUS, _READ_TRUTH, _WRITE_COMMAND, _WRITE_MODES, _WRITE_PAYLOAD, _WRITE_BASE, _CHANGE_VALUE, _STEP = range(8)
 CALLED = (
     "reading the IMUs", "reading the truth", "setting the commands", "setting the drives' modes", "setting the payload",
-    "changing a parameter", "a step",
+    "moving the base", "changing a parameter", "a step",
 )  # fmt: skip
 """The name of each call in messages, by the `call` of `FMU_HANDLE`."""
 
@@ -68,6 +69,7 @@ FMU_HANDLE = record_dtype(
     known=_scalars(TRUTH_SIZE),
     commanded=_scalars(LEGS),
     loaded=_scalars(1),
+    based=_scalars(BASE_SIZE),
     mode_references=(np.uint32, LEGS),
     mode_reference_count=np.int64,
     mode_count=np.int64,
@@ -81,6 +83,9 @@ FMU_HANDLE = record_dtype(
     command=(np.float64, LEGS),
     mode=(np.int64, LEGS),
     payload=(np.float64, 1),
+    base=(np.float64, BASE_SIZE),
+    base_motions=(BASE_MOTION, MOST_BASE_MOTIONS),
+    base_motion_count=np.int64,
     reached=(np.float64, 1),
     flags=(np.uint8, 3),
     changes=(_CHANGE, MOST_CHANGES),
@@ -92,8 +97,8 @@ FMU_HANDLE = record_dtype(
 `imu` is angular velocity [rad/s], specific force [m/s^2] and magnetic field [uT] of the seven IMUs; `truth` is that of
 `plant.truth`; both are NaN where the FMU has no value. A planar plant's truth has its pose in space, with z = 0, and its first
 three legs. `step` is the communication step [s], or 0 to step by the duration of each call. `time` is `steps` steps of one
-`length` [s] after `since` [s]: a count, because a sum would drift. `final` is whether no earlier state will be restored.
-`status` is the status of the first call that failed, and `call` is that call.
+`length` [s] after `since` [s]: a count, because a sum would drift. The base's motions count from time 0. `final` is whether
+no earlier state will be restored. `status` is the status of the first call that failed, and `call` is that call.
 """
 
 
@@ -249,8 +254,18 @@ def write_payload_mass(fmu: Record, mass: float) -> int:
 
 
 @kernel
+def _move_base(c: Record, time: float) -> int:
+    """Set the motion that the base has at a time [s]; returns FMI's status."""
+    base_motion_at(c.base_motions, c.base_motion_count, time, c.base)
+    return _write(c, _WRITE_BASE, c.based, c.base)
+
+
+@kernel
 def advance(fmu: Record, duration: float) -> int:
-    """Step the FMU by `duration` [s], in steps of `step` if that is set; returns FMI's status."""
+    """Step the FMU by `duration` [s], in steps of `step` if that is set; returns FMI's status.
+
+    The base's motion is that of the middle of each step, and afterwards that of the present.
+    """
     c = fmu[()]
     steps = 1 if c.step == 0.0 else max(int(np.rint(duration / c.step)), 1)
     status = OK
@@ -261,7 +276,11 @@ def advance(fmu: Record, duration: float) -> int:
                 c, _CHANGE_VALUE, change.function, change.references, change.reference_count, change.values, change.count
             )  # fmt: skip
             c.changed += 1
+        if c.base_motion_count > 0:
+            status |= _move_base(c, c.time + 0.5 * duration / steps)
         status |= _step(c, duration / steps)
+    if c.base_motion_count > 0:
+        status |= _move_base(c, c.time)
     return status
 
 

@@ -187,7 +187,7 @@ class FmuPlant(FmuInstance):
         for field, function in (("get", f"Get{real}"), ("set", f"Set{real}"), ("do_step", "DoStep")):
             handle[field] = self.address(function)
         handle["step"], handle["final"] = step or 0.0, not self.description.saves_state
-        for group in ("sensed", "known", "commanded", "loaded"):
+        for group in ("sensed", "known", "commanded", "loaded", "based"):
             _fill(handle[group], getattr(bound, group))
         if bound.modes.variable is not None:
             self._prepare_modes(bound.modes, bound.modes.variable)

@@ -1,8 +1,9 @@
 """A second derivation of the mechanism, body by body and by finite differences, that the plant must agree with.
 
 Every body has a mass, a place, an attitude and an inertia tensor; the leg frames are built from the angles of their
-universal joints. Velocities and accelerations are differences along a path of the platform, and the equations of motion
-are d'Alembert's principle with virtual displacements that are differences too. Nothing is shared with `plant.dynamics.spatial`.
+universal joints. Velocities and accelerations are differences along a path of the platform on a base that may move, both seen
+from the earth, and the equations of motion are d'Alembert's principle with virtual displacements that are differences too.
+Nothing is shared with `plant.dynamics.spatial`.
 """
 
 from collections.abc import Callable, Mapping
@@ -10,12 +11,19 @@ from dataclasses import dataclass
 from math import pi
 
 import numpy as np
+from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
 from plant.pose import Array
 
-PlatformPath = Callable[[float], tuple[Array, Array]]
-"""Position (3,) and rotation (3, 3) of the platform against time [s]."""
+Path = Callable[[float], tuple[Array, Array]]
+"""Position (3,) and rotation (3, 3) of the platform in {1}, or of the base on the earth, against time [s]."""
+
+
+def at_rest(_: float) -> tuple[Array, Array]:
+    """The path of a base that stands still and upright."""
+    return np.zeros(3), np.eye(3)
+
 
 FIRST = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60.0
 SECOND = np.array([2.0, -27.0, 270.0, -490.0, 270.0, -27.0, 2.0]) / 180.0
@@ -94,8 +102,8 @@ def bodies_at(p: Mapping[str, Array], position: Array, rotation: Array) -> Bodie
 
 @dataclass(frozen=True)
 class Motion:
-    """First and second derivatives of the bodies: velocity, acceleration, angular velocity and acceleration (14, 3) in
-    {1}, and rates and accelerations of the leg lengths (6,).
+    """First and second derivatives of the bodies: velocity, acceleration, angular velocity and acceleration (14, 3) on the
+    earth, and rates and accelerations of the leg lengths (6,).
     """
 
     velocity: Array
@@ -106,9 +114,14 @@ class Motion:
     length_acceleration: Array
 
 
-def motion_along(p: Mapping[str, Array], path: PlatformPath, step: float = 2e-3) -> Motion:
+def on_earth(bodies: Bodies, place: Array, turn: Array) -> Bodies:
+    """Bodies in {1}, seen from the earth."""
+    return Bodies(place + bodies.places @ turn.T, turn @ bodies.attitudes, bodies.lengths)
+
+
+def motion_along(p: Mapping[str, Array], path: Path, base: Path = at_rest, step: float = 2e-3) -> Motion:
     """The motion of all bodies at time 0 of a path of the platform."""
-    samples = [bodies_at(p, *path(i * step)) for i in range(-3, 4)]
+    samples = [on_earth(bodies_at(p, *path(i * step)), *base(i * step)) for i in range(-3, 4)]
     velocity, acceleration = derivatives(np.array([b.places for b in samples]), step)
     rate, rate_change = derivatives(np.array([b.attitudes for b in samples]), step)
     back = np.swapaxes(samples[3].attitudes, 1, 2)
@@ -119,13 +132,39 @@ def motion_along(p: Mapping[str, Array], path: PlatformPath, step: float = 2e-3)
     )
 
 
-def path_of(position: Array, rotation: Array, twist: Array) -> PlatformPath:
+def path_of(position: Array, rotation: Array, twist: Array) -> Path:
     """The path through a pose with a constant twist (6,)."""
+    return bent_path(position, rotation, twist, np.zeros(6))
+
+
+def bent_path(position: Array, rotation: Array, twist: Array, acceleration: Array) -> Path:
+    """The path through a pose with a twist (6,) and an acceleration (6,) at time 0."""
 
     def path(t: float) -> tuple[Array, Array]:
-        return position + twist[:3] * t, Rotation.from_rotvec(twist[3:] * t).as_matrix() @ rotation
+        moved = twist * t + acceleration * t**2 / 2.0
+        return position + moved[:3], Rotation.from_rotvec(moved[3:]).as_matrix() @ rotation
 
     return path
+
+
+def random_base(random: Generator, size: float) -> dict[str, Array]:
+    """A motion of the base as the plant's inputs; of size 1, as lively as that of a platform."""
+    spread = {"rotation": 1.0, "angular_velocity": 3.0, "angular_acceleration": 30.0, "acceleration": 10.0}
+    return {f"base_motion.{name}": size * random.normal(0.0, each, 3) for name, each in spread.items()}
+
+
+def base_path(inputs: Mapping[str, Array]) -> Path:
+    """A path of the base with the plant's inputs at time 0, which are seen in {1}; it starts without velocity."""
+    turn, omega, alpha, acceleration = (
+        inputs[f"base_motion.{name}"] for name in ("rotation", "angular_velocity", "angular_acceleration", "acceleration")
+    )
+    attitude = Rotation.from_rotvec(turn).as_matrix()
+    return bent_path(
+        np.zeros(3),
+        attitude,
+        np.hstack([np.zeros(3), attitude @ omega]),
+        np.hstack([attitude @ acceleration, attitude @ alpha]),
+    )
 
 
 def reflected_mass(p: Mapping[str, Array]) -> float:
@@ -133,14 +172,14 @@ def reflected_mass(p: Mapping[str, Array]) -> float:
     return float(p["motor.rotor_inertia"] * (2.0 * pi / p["motor.screw_lead"]) ** 2)
 
 
-def _world_inertias(p: Mapping[str, Array], position: Array, rotation: Array) -> Array:
-    attitudes = bodies_at(p, position, rotation).attitudes
+def _world_inertias(p: Mapping[str, Array], position: Array, rotation: Array, base: Path = at_rest) -> Array:
+    attitudes = on_earth(bodies_at(p, position, rotation), *base(0.0)).attitudes
     return attitudes @ inertias(p) @ np.swapaxes(attitudes, 1, 2)
 
 
-def virtual_motions(p: Mapping[str, Array], position: Array, rotation: Array) -> list[Motion]:
-    """The motions that belong to the six unit twists of the platform."""
-    return [motion_along(p, path_of(position, rotation, unit)) for unit in np.eye(6)]
+def virtual_motions(p: Mapping[str, Array], position: Array, rotation: Array, base: Path = at_rest) -> list[Motion]:
+    """The motions that belong to the six unit twists of the platform on a base that is held."""
+    return [motion_along(p, path_of(position, rotation, unit), lambda _: base(0.0)) for unit in np.eye(6)]
 
 
 def inertia_matrix(p: Mapping[str, Array], position: Array, rotation: Array) -> Array:
@@ -157,10 +196,10 @@ def inertia_matrix(p: Mapping[str, Array], position: Array, rotation: Array) -> 
     )
 
 
-def bias_force(p: Mapping[str, Array], position: Array, rotation: Array, twist: Array) -> Array:
-    """The generalised force (6,) that gravity and a constant twist take: force and torque on the platform's origin."""
-    motion = motion_along(p, path_of(position, rotation, twist))
-    tensors = _world_inertias(p, position, rotation)
+def bias_force(p: Mapping[str, Array], position: Array, rotation: Array, twist: Array, base: Path = at_rest) -> Array:
+    """The generalised force (6,) that gravity, the base and a constant twist take, on the platform's origin."""
+    motion = motion_along(p, path_of(position, rotation, twist), base)
+    tensors = _world_inertias(p, position, rotation, base)
     spin = np.einsum("kij,kj->ki", tensors, motion.angular_velocity)
     torque = np.einsum("kij,kj->ki", tensors, motion.angular_acceleration) + np.cross(motion.angular_velocity, spin)
     force = masses(p)[:, None] * (motion.acceleration - p["gravity"])
@@ -169,21 +208,29 @@ def bias_force(p: Mapping[str, Array], position: Array, rotation: Array, twist: 
             np.sum(force * virtual.velocity)
             + np.sum(torque * virtual.angular_velocity)
             + reflected_mass(p) * motion.length_acceleration @ virtual.length_rate
-            for virtual in virtual_motions(p, position, rotation)
+            for virtual in virtual_motions(p, position, rotation, base)
         ]
     )
 
 
-def energies(p: Mapping[str, Array], position: Array, rotation: Array, twist: Array) -> tuple[float, float]:
-    """Kinetic and potential energy [J]."""
-    motion = motion_along(p, path_of(position, rotation, twist))
-    tensors = _world_inertias(p, position, rotation)
+def energies(
+    p: Mapping[str, Array],
+    position: Array,
+    rotation: Array,
+    twist: Array,
+    base: Path = at_rest,
+    acceleration: Array | float = 0.0,
+) -> tuple[float, float]:
+    """Kinetic energy, and potential energy less the base's acceleration (3,) on the earth [J]."""
+    motion = motion_along(p, path_of(position, rotation, twist), base)
+    tensors = _world_inertias(p, position, rotation, base)
     kinetic = (
         masses(p) @ np.sum(motion.velocity**2, axis=1)
         + np.einsum("ki,kij,kj->", motion.angular_velocity, tensors, motion.angular_velocity)
         + reflected_mass(p) * np.sum(motion.length_rate**2)
     ) / 2.0
-    return float(kinetic), float(-masses(p) @ bodies_at(p, position, rotation).places @ p["gravity"])
+    places = on_earth(bodies_at(p, position, rotation), *base(0.0)).places
+    return float(kinetic), float(-masses(p) @ places @ (p["gravity"] - acceleration))
 
 
 def static_forces(p: Mapping[str, Array], position: Array, rotation: Array) -> Array:

@@ -3,10 +3,11 @@
 Platform with payload, six lower parts and six rods each have a place, a quaternion, a velocity and an angular velocity; each
 rotor has an angle and a speed. The joints are equations between places and attitudes, which CasADi differentiates; the
 equations of motion are Newton's, Euler's and the joints' second derivatives. Nothing is eliminated, no leg's length or
-angle is a coordinate, and nothing is shared with `plant.dynamics.spatial`. Brakes and end stops are left out.
+angle is a coordinate, and nothing is shared with `plant.dynamics.spatial`. All is seen from the earth: a base that moves
+carries its joints along, as a function of time. Brakes and end stops are left out.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import pi
 
@@ -25,6 +26,46 @@ LOWER, UPPER = range(1, 1 + LEGS), range(1 + LEGS, BODIES)
 PLACES = 7 * BODIES + LEGS
 SPEEDS = 6 * BODIES + LEGS
 """Sizes of the coordinates (place and quaternion of each body, rotor angles) and of their velocities."""
+
+
+Base = Callable[[ca.SX], tuple[ca.SX, ca.SX]]
+"""Place (3, 1) of the origin of {1} on the earth, and the rotation (3, 3) from {1} to the earth, against time [s]."""
+
+
+def still(_: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """A base at rest."""
+    return ca.SX.zeros(3), ca.SX.eye(3)
+
+
+class MovingBase:
+    """A base's motion against time, by CasADi's derivatives: what the plant takes as inputs, by name."""
+
+    def __init__(self, base: Base) -> None:
+        t = ca.SX.sym("t")
+        place, turn = base(t)
+        rate, speed = ca.jacobian(ca.vec(turn), t), ca.jacobian(place, t)
+        skew = turn.T @ ca.reshape(rate, 3, 3)
+        omega = ca.vertcat(skew[2, 1], skew[0, 2], skew[1, 0])
+        values = [place, turn, speed, omega, ca.jacobian(omega, t), turn.T @ ca.jacobian(speed, t)]
+        self._at = ca.Function("base", [t], [ca.densify(value) for value in values])
+
+    def _values(self, t: float) -> list[Array]:
+        return [value.full() if value.shape[1] > 1 else value.full().ravel() for value in self._at(t)]
+
+    def place(self, t: float) -> tuple[Array, Array, Array, Array]:
+        """Place, rotation, velocity on the earth and angular velocity in {1}."""
+        place, turn, speed, omega = self._values(t)[:4]
+        return place, turn, speed, omega
+
+    def inputs(self, t: float) -> dict[str, Array]:
+        """The inputs of the plant."""
+        _, turn, _, omega, alpha, acceleration = self._values(t)
+        return {
+            "base_motion.rotation": Rotation.from_matrix(turn).as_rotvec(),
+            "base_motion.angular_velocity": omega,
+            "base_motion.angular_acceleration": alpha,
+            "base_motion.acceleration": acceleration,
+        }
 
 
 @dataclass(frozen=True)
@@ -59,11 +100,13 @@ class MaximalModel:
     """The equations of one mechanism, whose parameters are given by name, and their integration.
 
     Attributes:
-        state: coordinates, velocities and motor currents, one vector; at first at rest at the initial pose.
+        state: coordinates, velocities and motor currents, one vector; at first at rest in {1} at the initial pose.
+        time: [s].
     """
 
-    def __init__(self, parameters: Mapping[str, Array]) -> None:
+    def __init__(self, parameters: Mapping[str, Array], base: Base = still) -> None:
         self._p = p = parameters
+        self._base, self._moving, self.time = base, MovingBase(base), 0.0
         self._turns = 2 * pi / float(p["motor.screw_lead"])
         self._bodies = [
             _platform(p),
@@ -74,21 +117,27 @@ class MaximalModel:
         legs, frames = leg_vectors(p, p["initial_position"], rotation), leg_frames(p, p["initial_position"], rotation)
         origins = [p["initial_position"], *p["base_joints"], *(p["base_joints"] + legs)]
         attitudes = [rotation, *frames, *frames]
-        places = [o + a @ b.center for o, a, b in zip(origins, attitudes, self._bodies, strict=True)]
-        quaternions = [quaternion_from_rotation(a) for a in attitudes]
-        coordinates = np.hstack([np.ravel(places), np.ravel(quaternions), np.zeros(LEGS)])
-        self.state = np.hstack([coordinates, np.zeros(SPEEDS + LEGS)])
+        origin, turn, speed, omega = self._moving.place(0.0)
+        spin = turn @ omega
+        arms = [turn @ (o + a @ b.center) for o, a, b in zip(origins, attitudes, self._bodies, strict=True)]
+        quaternions = [quaternion_from_rotation(turn @ a) for a in attitudes]
+        coordinates = np.hstack([np.ravel(origin + arms), np.ravel(quaternions), np.zeros(LEGS)])
+        speeds = np.hstack([np.ravel(speed + np.cross(spin, arms)), np.tile(spin, BODIES), np.zeros(LEGS)])
+        self.state = np.hstack([coordinates, speeds, np.zeros(LEGS)])
         self._slides = np.linalg.norm(legs, axis=1)
         self._equations = self._derive()
 
     def _derive(self) -> ca.Function:
-        """Of (state, command, whether driven, wrench): the rates of coordinates and currents, the velocities' rates without
-        joints, what the joints' forces add to them, how those rates part the joints in turn, and how far apart these are.
+        """Of (state, command, whether driven, wrench, time): the rates of coordinates and currents, the velocities' rates
+        without joints, what the joints' forces add to them, how those rates part the joints in turn, and how far apart
+        these are.
         """
         p, bodies = self._p, self._bodies
         q, v = ca.SX.sym("q", PLACES), ca.SX.sym("v", SPEEDS)
         current, command, wrench = ca.SX.sym("i", LEGS), ca.SX.sym("u", LEGS), ca.SX.sym("w", 6)
-        driven = ca.SX.sym("driven")
+        driven, time = ca.SX.sym("driven"), ca.SX.sym("t")
+        origin, turn = self._base(time)
+        force, torque = turn @ wrench[:3], turn @ wrench[3:]
         places, quaternions = ca.horzsplit(ca.reshape(q[: 3 * BODIES], 3, BODIES)), ca.reshape(q[3 * BODIES : -LEGS], 4, BODIES)
         attitudes = [_rotation(quaternions[:, k]) for k in range(BODIES)]
         moves = ca.horzsplit(ca.reshape(v[: 3 * BODIES], 3, BODIES))
@@ -103,8 +152,8 @@ class MaximalModel:
         forces = [b.mass * p["gravity"] for b in bodies]
         tensors = [a @ b.inertia @ a.T for a, b in zip(attitudes, bodies, strict=True)]
         torques = [-ca.cross(w, t @ w) for w, t in zip(spins, tensors, strict=True)]
-        forces[0] += wrench[:3]
-        torques[0] += wrench[3:] - ca.cross(attitudes[0] @ bodies[0].center, wrench[:3])
+        forces[0] += force
+        torques[0] += torque - ca.cross(attitudes[0] @ bodies[0].center, force)
         joints: list[ca.SX] = []
         for k, (low, up) in enumerate(zip(LOWER, UPPER, strict=True)):
             x, y, z = ca.horzsplit(attitudes[low])
@@ -113,8 +162,8 @@ class MaximalModel:
             length = ca.dot(z, apart) + float(p["leg.lower.center"]) + float(p["leg.upper.center"])
             joints += [
                 # The lower part turns about the base joint, its y axis square to the joint's first axis.
-                places[low] - attitudes[low] @ bodies[low].center - p["base_joints"][k],
-                ca.dot(p["base_joint_axes"][k], y),
+                places[low] - attitudes[low] @ bodies[low].center - origin - turn @ p["base_joints"][k],
+                ca.dot(turn @ p["base_joint_axes"][k], y),
                 # The rod slides along it and does not turn in it.
                 ca.vertcat(ca.dot(x, apart), ca.dot(y, apart), ca.dot(x, rod_y), ca.dot(y, rod_z), ca.dot(z, rod_x)),
                 # A spherical joint ties the rod to the platform, and a screw the rotor to the rod.
@@ -136,17 +185,18 @@ class MaximalModel:
         constant = float(p["motor.torque_constant"])
         applied = ca.vertcat(*forces, *torques, constant * current)
         closure = ca.vertcat(*joints)
-        closing_speed = ca.jtimes(closure, q, coordinate_rates)
+        moving, rates = ca.vertcat(q, time), ca.vertcat(coordinate_rates, 1)
+        closing_speed = ca.jtimes(closure, moving, rates)
         limit = float(p["drive.voltage_limit"])
         asked = constant * self._turns * command + float(p["drive.compensation"] * p["drive.nominal_resistance"]) * current
         voltage = ca.fmax(ca.fmin(asked, limit), -limit)
         current_rates = driven * (voltage - p["motor.resistance"] * current - constant * rotors) / float(p["motor.inductance"])
         joints = ca.jacobian(closing_speed, v)
         responses = inverse @ joints.T
-        bias = ca.jtimes(closing_speed, q, coordinate_rates)
+        bias = ca.jtimes(closing_speed, moving, rates)
         return ca.Function(
             "maximal",
-            [ca.vertcat(q, v, current), command, driven, wrench],
+            [ca.vertcat(q, v, current), command, driven, wrench, time],
             [
                 coordinate_rates,
                 current_rates,
@@ -159,35 +209,35 @@ class MaximalModel:
             {"cse": True},
         )
 
-    def rates(self, state: Array, command: Array, modes: Array, wrench: Array) -> Array:
+    def rates(self, state: Array, command: Array, modes: Array, wrench: Array, time: float) -> Array:
         """The time derivative of the state, the joints' forces solved for; drives are all open or all driven."""
-        values = self._equations(state, command, float((modes != OPEN).all()), wrench)
+        values = self._equations(state, command, float((modes != OPEN).all()), wrench, time)
         coordinate_rates, current_rates, free, responses, mobility, parting = (value.full() for value in values[:6])
         acceleration = free - responses @ np.linalg.solve(mobility, parting)
         return np.vstack([coordinate_rates, acceleration, current_rates]).ravel()
 
     def go_on(self, duration: float, command: Array, modes: Array, wrench: Array) -> None:
         """Integrate with held inputs by an adaptive method of eighth order."""
-        arguments = (command, modes, wrench)
-        end = solve_ivp(
-            lambda _, state: self.rates(state, *arguments),
-            (0.0, duration), self.state, method="DOP853", rtol=1e-11, atol=1e-12, t_eval=[duration],
+        end = self.time + duration
+        solution = solve_ivp(
+            lambda t, state: self.rates(state, command, modes, wrench, t),
+            (self.time, end), self.state, method="DOP853", rtol=1e-11, atol=1e-12, t_eval=[end],
         )  # fmt: skip
-        self.state = end.y[:, -1]
+        self.state, self.time = solution.y[:, -1], end
 
     def gap(self) -> float:
         """How far the joints have come apart [m and rad; the rotors' in turns of the screw]."""
         zeros = np.zeros(LEGS)
-        return float(np.abs(self._equations(self.state, zeros, 0.0, zeros)[6].full()).max())
+        return float(np.abs(self._equations(self.state, zeros, 0.0, zeros, self.time)[6].full()).max())
 
     def attitude(self, body: int) -> Array:
-        """The rotation (3, 3) of a body's frame to {1}."""
+        """The rotation (3, 3) of a body's frame to the earth."""
         at = 3 * BODIES + 4 * body
         return Rotation.from_quat(self.state[at : at + 4], scalar_first=True).as_matrix()
 
     def outputs(self, command: Array, modes: Array, wrench: Array) -> dict[str, Array]:
         """What the plant puts out of the same names."""
-        rates = self.rates(self.state, command, modes, wrench)
+        rates = self.rates(self.state, command, modes, wrench, self.time)
         moves, spins = (rates[PLACES + at : PLACES + at + 3 * BODIES].reshape(BODIES, 3) for at in (0, 3 * BODIES))
         spin = self.state[PLACES + 3 * BODIES : PLACES + 6 * BODIES].reshape(BODIES, 3)
         rotation = self.attitude(0)
@@ -201,11 +251,13 @@ class MaximalModel:
             acceleration = moves[body] + np.cross(spins[body], arm) + np.cross(spin[body], np.cross(spin[body], arm))
             rate.append(to_sensor @ spin[body])
             force.append(to_sensor @ (acceleration - p["gravity"]))
+        origin, turn, _, omega = self._moving.place(self.time)
         return {
-            "position": self.state[:3] - rotation @ center,
-            "quaternion": quaternion_from_rotation(rotation),
-            "angular_velocity": spin[0],
+            "position": turn.T @ (self.state[:3] - rotation @ center - origin),
+            "quaternion": quaternion_from_rotation(turn.T @ rotation),
+            "angular_velocity": turn.T @ spin[0] - omega,
             "current": self.state[-LEGS:],
             "imu_angular_velocity": np.array(rate),
             "imu_specific_force": np.array(force),
+            "imu_magnetic_field": np.array([self.attitude(body).T @ p["magnetic_field"] for body in [*LOWER, 0]]),
         }

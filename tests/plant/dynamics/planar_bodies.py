@@ -1,13 +1,14 @@
 """A second derivation of planar mechanisms, body by body, that the planar plant and its control must agree with.
 
 Bodies with a place and an angle each, in the plane; their Jacobians by complex steps, and Lagrange's equations from the
-inertia matrix by differences. Nothing is shared with `plant.dynamics.planar`.
+inertia matrix by differences; on a base that moves, the same bodies in space. Nothing is shared with `plant.dynamics.planar`.
 """
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from plant.pose import Array
-from tests.plant.dynamics.explicit_bodies import derivatives, reflected_mass
+from tests.plant.dynamics.explicit_bodies import Path, derivatives, reflected_mass, vector_of
 
 Values = dict[str, Array]
 LEGS = 3
@@ -61,6 +62,40 @@ def bias_force(p: Values, q: Array, rate: Array) -> Array:
         for unit in np.eye(3)
     ]
     return along @ rate - 0.5 * np.array(slopes)
+
+
+def force_in_space(p: Values, q: Array, rate: Array, acceleration: Array, base: Path) -> Array:
+    """The generalised force (3,) that a motion of the platform takes on a base that moves, by d'Alembert's principle in space.
+
+    Platform and payload are thin plates, legs thin rods.
+    """
+    step, count = 5e-4, len(weights(p)) // LEGS - 1
+    shares = weights(p)[:-LEGS].reshape(count, 3)
+    plates, rods = np.array([0.5, 0.5, 1.0]), np.array([0.0, 1.0, 1.0])
+    tensors = shares[:, 2, None, None] * np.array([np.diag(plates)] * 2 + [np.diag(rods)] * (count - 2))
+
+    def seen(t: float) -> tuple[Array, Array, Array]:
+        """Places and attitudes of the bodies on the earth, and lengths."""
+        values = coordinates(p, q + rate * t + acceleration * t**2 / 2.0)
+        x, y, angle = values[:-LEGS].reshape(count, 3).T
+        place, turn = base(t)
+        places = place + np.column_stack([x, y, np.zeros(count)]) @ turn.T
+        return places, turn @ Rotation.from_rotvec(np.outer(angle, [0.0, 0.0, 1.0])).as_matrix(), values[-LEGS:]
+
+    samples = [np.array(values) for values in zip(*(seen(i * step) for i in range(-3, 4)), strict=True)]
+    moved, spun, grown = (derivatives(values, step) for values in samples)
+    attitudes = samples[1][3]
+    back = np.swapaxes(attitudes, 1, 2)
+    omega, alpha = vector_of(spun[0] @ back), vector_of(spun[1] @ back)
+    turned = attitudes @ tensors @ back
+    torque = np.einsum("kij,kj->ki", turned, alpha) + np.cross(omega, np.einsum("kij,kj->ki", turned, omega))
+    force = shares[:, 0, None] * (moved[1] - p["gravity"])
+    slopes, turn = jacobian(p, q), base(0.0)[1]
+    bodies = slopes[:-LEGS].reshape(count, 3, 3)
+    pushed = np.einsum("kx,xi,kij->j", force, turn[:, :2], bodies[:, :2]) + np.einsum(
+        "kx,x,kj->j", torque, turn[:, 2], bodies[:, 2]
+    )
+    return pushed + reflected_mass(p) * slopes[-LEGS:].T @ grown[1]
 
 
 def frames_at(p: Values, position: Array, angle: float) -> tuple[Array, Array]:

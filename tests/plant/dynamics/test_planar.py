@@ -15,17 +15,21 @@ from plant.fmu.build import PLANAR_MODEL, SPATIAL_MODEL, Model, default_fmu
 from plant.fmu.plant import FmuPlant
 from plant.mechanism import Mechanism, load_in_space
 from plant.pose import Array
-from tests.plant.dynamics.explicit_bodies import derivatives, vector_of
+from tests.plant.dynamics.explicit_bodies import base_path, derivatives, random_base, vector_of
 from tests.plant.dynamics.planar_bodies import (
     LEGS,
     Values,
     bias_force,
     coordinates,
+    force_in_space,
     frames_at,
     inertia_matrix,
     jacobian,
     weight_force,
 )
+
+STILL = random_base(np.random.default_rng(0), 0.0)
+"""A base at rest."""
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +84,7 @@ def random_state(p: Values, random: Generator) -> tuple[Values, Values]:
         "external_wrench.force": random.normal(0.0, 10.0, 2),
         "external_wrench.torque": np.array(random.normal(0.0, 1.0)),
     }
-    return states, inputs
+    return states, inputs | random_base(random, 0.0)
 
 
 def axial_forces(p: Values, states: Values, inputs: Values, length: Array, speed: Array) -> dict[str, Array]:
@@ -133,6 +137,40 @@ def test_motion_energies_and_powers_agree_with_explicit_bodies(dynamics: Dynamic
     np.testing.assert_allclose(-np.array(gradient), weight_force(p, q), rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_motion_and_imus_on_a_base_that_moves_agree_with_bodies_in_space(dynamics: Dynamics, rig: Mechanism, seed: int) -> None:
+    random = np.random.default_rng(30 + seed)
+    p = odd_rig(rig, random)
+    states, inputs = random_state(p, random)
+    inputs |= random_base(random, 1.0)
+    base = base_path(inputs)
+    held = (flat(states, PLANAR.states), flat(inputs, PLANAR.inputs), dynamics.constants(flat(p, PLANAR.parameters)))
+    rates, outputs = named(dynamics.rates(*held), PLANAR.states), named(dynamics.outputs(*held), PLANAR.outputs)
+    q = np.append(states["state.position"], states["state.angle"])
+    rate = np.append(states["state.velocity"], states["state.angular_velocity"])
+    acceleration = np.append(rates["state.velocity"], rates["state.angular_velocity"])
+    length, to_lengths = coordinates(p, q)[-LEGS:], jacobian(p, q)[-LEGS:]
+    forces = axial_forces(p, states, inputs, length, to_lengths @ rate)
+    wrench = np.append(inputs["external_wrench.force"], inputs["external_wrench.torque"])
+    applied = wrench + to_lengths.T @ sum(forces.values(), np.zeros(LEGS))
+    taken = force_in_space(p, q, rate, acceleration, base)
+    np.testing.assert_allclose(taken, applied, rtol=0.0, atol=1e-8 * np.abs(applied).max())
+
+    step, samples = 2.5e-4, []
+    for i in range(-3, 4):
+        t = i * step
+        moved, (place, turn) = q + rate * t + acceleration * t**2 / 2.0, base(t)
+        attitudes, places = frames_at(p, moved[:2], moved[2])
+        samples.append((place + places @ turn.T, turn @ attitudes))
+    places, attitudes = (np.array(values) for values in zip(*samples, strict=True))
+    to_sensor = np.swapaxes(attitudes[3], 1, 2)
+    force = np.einsum("kij,kj->ki", to_sensor, derivatives(places, step)[1] - p["gravity"])
+    turning = vector_of(to_sensor @ derivatives(attitudes, step)[0])
+    np.testing.assert_allclose(outputs["imu_angular_velocity"], turning, rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(outputs["imu_specific_force"], force, rtol=0.0, atol=1e-7 * np.abs(force).max())
+    np.testing.assert_allclose(outputs["imu_magnetic_field"], to_sensor @ p["magnetic_field"], rtol=0.0, atol=1e-11)
+
+
 def integrator(dynamics: Dynamics, p: Values, step: float) -> Callable[[Array, Array], Array]:
     """Steps of Runge and Kutta's method for states and inputs as flat vectors."""
     constants = dynamics.constants(flat(p, PLANAR.parameters))
@@ -166,6 +204,7 @@ def test_energy_changes_by_the_work_of_all_forces(dynamics: Dynamics, rig: Mecha
             "drive_mode": np.full(3, BRAKE if 0.2 <= t < 0.25 else VELOCITY),
             "external_wrench.force": 5.0 * np.sin([20.0 * t, 30.0 * t]),
             "external_wrench.torque": np.array(0.1 * np.sin(40.0 * t)),
+            **STILL,
         }
         u = flat(inputs, PLANAR.inputs)
         for sample, weight in enumerate((1.0, 4.0, 1.0)):
@@ -266,6 +305,8 @@ def test_the_fmu_integrates_the_derived_rates(dynamics: Dynamics, rig: Mechanism
                 "external_wrench.force": random.normal(0.0, 3.0, 2),
                 "external_wrench.torque": np.array(random.normal(0.0, 0.1)),
             }
+            # The base rests, moves, and rests again.
+            inputs |= random_base(random, 0.1 * (20 <= cycle < 40))
             for name, value in inputs.items():
                 plant.set(name, value)
             plant.step(2 * substep)

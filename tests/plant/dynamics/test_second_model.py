@@ -20,7 +20,7 @@ SEGMENT_S = 0.07
 
 TOLERANCES = {
     "position": 1e-11, "quaternion": 1e-11, "angular_velocity": 1e-10, "current": 1e-10,
-    "imu_angular_velocity": 1e-10, "imu_specific_force": 1e-9,
+    "imu_angular_velocity": 1e-10, "imu_specific_force": 1e-9, "imu_magnetic_field": 1e-9,
 }  # fmt: skip
 """Of the second model's own integration at a relative 1e-11; the plant's substep of 1/32 ms is finer than that."""
 

@@ -14,6 +14,8 @@ from plant.fmu.plant import FmuPlant
 from plant.mechanism import Mechanism
 from plant.pose import Array, quaternion_from_rotation, rotation_from_quaternion
 from tests.plant.dynamics.explicit_bodies import (
+    base_path,
+    bent_path,
     bias_force,
     bodies_at,
     derivatives,
@@ -22,6 +24,7 @@ from tests.plant.dynamics.explicit_bodies import (
     jacobian,
     leg_frames,
     leg_vectors,
+    random_base,
     static_forces,
     vector_of,
 )
@@ -94,7 +97,7 @@ def random_state(p: Values, random: Generator) -> tuple[Values, Values]:
         "external_wrench.force": random.normal(0.0, 20.0, 3),
         "external_wrench.torque": random.normal(0.0, 20.0, 3),
     }
-    return states, inputs
+    return states, inputs | random_base(random, 0.0)
 
 
 def external_wrench(inputs: Values) -> Array:
@@ -123,30 +126,62 @@ def axial_forces(p: Values, states: Values, inputs: Values) -> dict[str, Array]:
     }
 
 
+MOVING = pytest.mark.parametrize("moving", [0.0, 1.0], ids=["base at rest", "base moves"])
+
+
+@MOVING
 @pytest.mark.parametrize("seed", range(20))
-def test_the_equations_of_motion_agree_with_explicit_bodies(dynamics: Dynamics, hexapod: Mechanism, seed: int) -> None:
+def test_the_equations_of_motion_agree_with_explicit_bodies(
+    dynamics: Dynamics, hexapod: Mechanism, seed: int, moving: float
+) -> None:
     random = np.random.default_rng(seed)
     p = odd_mechanism(hexapod, random)
     states, inputs = random_state(p, random)
+    inputs |= random_base(random, moving)
+    base = base_path(inputs)
     constants = dynamics.constants(flat(p, SPATIAL.parameters))
-    rates = named(
-        np.array(dynamics.rates(flat(states, SPATIAL.states), flat(inputs, SPATIAL.inputs), constants)).ravel(), SPATIAL.states
-    )
+    held = flat(states, SPATIAL.states), flat(inputs, SPATIAL.inputs), constants
+    rates = named(np.array(dynamics.rates(*held)).ravel(), SPATIAL.states)
     position, rotation, twist = pose_and_twist(states)
     acceleration = np.hstack([rates["state.velocity"], rates["state.angular_velocity"]])
 
     applied = external_wrench(inputs) + jacobian(p, position, rotation).T @ sum(axial_forces(p, states, inputs).values())
     inertia = inertia_matrix(p, position, rotation) @ acceleration
-    bias = bias_force(p, position, rotation, twist)
+    bias = bias_force(p, position, rotation, twist, base)
     np.testing.assert_allclose(inertia + bias, applied, rtol=0.0, atol=1e-8 * np.abs(bias).max())
     np.testing.assert_array_equal(rates["state.position"], states["state.velocity"])
 
+    # All IMUs, carried along the path that has these accelerations.
+    outputs = named(np.array(dynamics.outputs(*held)).ravel(), SPATIAL.outputs)
+    path, step = bent_path(position, rotation, twist, acceleration), 5e-4
+    seen = [imus_on_earth(p, *path(i * step), *base(i * step)) for i in range(-3, 4)]
+    places, attitudes = (np.array(values) for values in zip(*seen, strict=True))
+    to_sensor = np.swapaxes(attitudes[3], 1, 2)
+    force = np.einsum("kij,kj->ki", to_sensor, derivatives(places, step)[1] - p["gravity"])
+    rate = vector_of(to_sensor @ derivatives(attitudes, step)[0])
+    np.testing.assert_allclose(outputs["imu_angular_velocity"], rate, rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(outputs["imu_specific_force"], force, rtol=0.0, atol=1e-6 * np.abs(force).max())
+    np.testing.assert_allclose(outputs["imu_magnetic_field"], to_sensor @ p["magnetic_field"], rtol=0.0, atol=1e-11)
 
+
+def imus_on_earth(p: Values, position: Array, rotation: Array, place: Array, turn: Array) -> tuple[Array, Array]:
+    """Places (7, 3) and attitudes (7, 3, 3) of the IMUs on a base at a place with a rotation."""
+    frames = leg_frames(p, position, rotation)
+    at_legs = p["base_joints"] + np.einsum("kij,kj->ki", frames, p["leg_imu_position"])
+    places = np.vstack([at_legs, position + rotation @ p["platform_imu_position"]])
+    return place + places @ turn.T, turn @ np.concatenate([frames, rotation[None]])
+
+
+@MOVING
 @pytest.mark.parametrize("seed", range(20))
-def test_energies_and_powers_agree_with_explicit_bodies(dynamics: Dynamics, hexapod: Mechanism, seed: int) -> None:
+def test_energies_and_powers_agree_with_explicit_bodies(
+    dynamics: Dynamics, hexapod: Mechanism, seed: int, moving: float
+) -> None:
     random = np.random.default_rng(100 + seed)
     p = odd_mechanism(hexapod, random)
     states, inputs = random_state(p, random)
+    inputs |= random_base(random, moving)
+    base = base_path(inputs)
     constants = dynamics.constants(flat(p, SPATIAL.parameters))
 
     def outputs_at(states: Values) -> Values:
@@ -155,13 +190,16 @@ def test_energies_and_powers_agree_with_explicit_bodies(dynamics: Dynamics, hexa
             SPATIAL.outputs,
         )
 
+    def expected_energies(states: Values) -> tuple[float, float]:
+        return energies(p, *pose_and_twist(states), base, base(0.0)[1] @ inputs["base_motion.acceleration"])
+
     outputs = outputs_at(states)
     position, rotation, twist = pose_and_twist(states)
-    kinetic, potential = energies(p, position, rotation, twist)
+    kinetic, potential = expected_energies(states)
     assert outputs["kinetic_energy"] == pytest.approx(kinetic, rel=1e-9)
     elsewhere = random_state(p, random)[0]
     change = outputs["potential_energy"] - outputs_at(elsewhere)["potential_energy"]
-    assert change == pytest.approx(potential - energies(p, *pose_and_twist(elsewhere))[1], abs=1e-12)
+    assert change == pytest.approx(potential - expected_energies(elsewhere)[1], abs=1e-11)
 
     speed = jacobian(p, position, rotation) @ twist
     np.testing.assert_allclose(outputs["leg_velocity"], speed, rtol=1e-12, atol=1e-14)
@@ -235,6 +273,7 @@ def test_motors_in_equilibrium_push_as_virtual_work_demands_at_a_thousand_poses(
             "drive_mode": np.full(6, OPEN),
             "external_wrench.force": wrench[:3],
             "external_wrench.torque": wrench[3:],
+            **random_base(random, 0.0),
         }
         inputs += [flat(held, SPATIAL.inputs)] * 7
     constants = dynamics.constants(flat(p, SPATIAL.parameters))
@@ -299,6 +338,8 @@ def test_the_fmu_integrates_the_derived_rates(dynamics: Dynamics, hexapod: Mecha
             "external_wrench.force": random.normal(0.0, 10.0, 3),
             "external_wrench.torque": random.normal(0.0, 10.0, 3),
         }
+        # The base rests, moves, and rests again.
+        inputs |= random_base(random, 0.3 * (30 <= cycle < 60))
         for name, value in inputs.items():
             plant.set(name, value)
         plant.step(2 * substep)
@@ -334,10 +375,9 @@ def test_ideal_imu_signals_are_derivatives_of_the_trajectory(hexapod: Mechanism,
         if sample:
             plant.step(step)
         position, rotation = plant.get("position"), rotation_from_quaternion(plant.get("quaternion"))
-        frames = leg_frames(p, position, rotation)
-        at_legs = p["base_joints"] + np.einsum("kij,kj->ki", frames, p["leg_imu_position"])
-        places.append(np.vstack([at_legs, position + rotation @ p["platform_imu_position"]]))
-        attitudes.append(np.concatenate([frames, rotation[None]]))
+        place, attitude = imus_on_earth(p, position, rotation, np.zeros(3), np.eye(3))
+        places.append(place)
+        attitudes.append(attitude)
         if sample == 3:
             signals = {name: plant.get(f"imu_{name}") for name in ("angular_velocity", "specific_force", "magnetic_field")}
     to_sensor = np.swapaxes(attitudes[3], 1, 2)

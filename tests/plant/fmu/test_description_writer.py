@@ -12,6 +12,7 @@ import pytest
 from fmpy.validation import validate_fmu
 
 from plant.dynamics.variables import BRAKE, DRIVE_MODES, PLANAR, SPATIAL, VELOCITY, VariableTable
+from plant.fmu.binding import BASE
 from plant.fmu.description_writer import QUANTITIES, Layout
 from plant.fmu.plant import FmuPlant
 from plant.mechanism import Mechanism
@@ -121,12 +122,14 @@ def test_outputs_depend_on_the_listed_inputs_and_on_no_others(description: Any, 
         "drive_mode": [[mode] * 6 for mode in DRIVE_MODES],
         "external_wrench.force": [[1.0, 2.0, 3.0]],
         "external_wrench.torque": [[4.0, 5.0, 6.0]],
+        **{name: [[0.1, -0.2, 0.3]] for name in BASE},
     }
     held: dict[str, Any] = {
         "velocity_command": plant.get("velocity_command"),
         "drive_mode": [VELOCITY, BRAKE, BRAKE, VELOCITY, VELOCITY, VELOCITY],
         "external_wrench.force": np.zeros(3),
         "external_wrench.torque": np.zeros(3),
+        **{name: np.zeros(3) for name in BASE},
     }
     for changed, values in others.items():
         for value in values:

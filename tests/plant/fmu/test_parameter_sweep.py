@@ -195,7 +195,7 @@ def run_at_random(plant: FmuPlant, random: Generator, sweep: Sweep) -> tuple[Arr
     table = sweep.model.table
     energies = ("kinetic_energy", "potential_energy", *(f"power.{name}" for name in POWERS))
     reader = Reader(plant, table, (*energies, "quaternion" if table is SPATIAL else "angle"))
-    _, modes, force, torque = table.inputs
+    _, modes, force, torque = table.inputs[:4]
     legs, forces = modes.size, force.size
     sensed = [*range(legs), PLATFORM_IMU]
     amplitude = sweep.speed * spread(random, 4.0)
