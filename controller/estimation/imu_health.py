@@ -14,6 +14,9 @@ from plant.pose import Array
 _FROZEN_S = 0.01
 """How long an IMU may repeat its reading while others do not, or while the legs must have moved [s]."""
 
+_ROUNDING = 1e-9
+"""Smaller changes of a reading show nothing: no sensor resolves them, and a simulation at rest rounds so [rad/s, m/s^2]."""
+
 _SURELY_MOVED_M = 1e-3
 """When the reference has moved a leg so far since the last change of any reading, some should have changed [m]."""
 
@@ -103,12 +106,14 @@ def screen_imus(
     changed, total_noise = 0, 0.0
     for k in range(IMU_COUNT):
         s.unchanged[k] = 1
+        most = 0.0
         for kind in range(2):
             for i in range(3):
                 raw = measurement[kind, k, i]
                 if np.isfinite(raw) and raw != s.raw[kind, k, i]:
                     s.unchanged[k] = 0
-        changed += p.present[k] != 0 and s.unchanged[k] == 0
+                    most = max(most, abs(raw - s.raw[kind, k, i]))
+        changed += p.present[k] != 0 and most > _ROUNDING
         _update_noise(p, s, time.cycle, measurement, k)
         total_noise += s.noise[k]
     fastest = 0.0

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from plant.dynamics.legs_and_actuators import SX, Condition
+from plant.dynamics.legs_and_actuators import SX, Condition, brake_deflections
 from plant.dynamics.variables import Variable, VariableTable
 
 Values = dict[str, SX]
@@ -40,7 +40,7 @@ def assemble(
     limits: Callable[[Values, Values], list[Condition]],
     plant: Callable[[Values, Values, Values], tuple[Values, Values]],
 ) -> Dynamics:
-    """The functions of a plant from its expressions; `start` has the states that are not zero."""
+    """The functions of a plant from its expressions; `start` has the states that are not zero, without those of the brakes."""
     # In `rates` and `outputs`, symbols replace the computed constants.
     symbols = {name: SX.sym(name, *value.shape) for name, value in constants.items()}
     states, inputs = variable_symbols(table.states), variable_symbols(table.inputs)
@@ -62,7 +62,7 @@ def assemble(
     ideal_rates, ideal_outputs = running("ideal_", zeros(each for each in table.variables if each.disturbance))
     return Dynamics(
         constants=ca.Function("plant_constants", given, [_flat(constants)], options),
-        start=ca.Function("plant_start", given, [_in_order(zeros(table.states) | start, table.states)], options),
+        start=ca.Function("plant_start", given, [_in_order(_braked(table, start, constants, plant), table.states)], options),
         conditions=ca.Function("plant_conditions", given, _sides(conditions), options),
         condition_texts=tuple(condition.text for condition in conditions),
         limits=ca.Function("plant_limits", [_flat(states), _flat(symbols)], _sides(watched), options),
@@ -72,6 +72,19 @@ def assemble(
         ideal_rates=ideal_rates,
         ideal_outputs=ideal_outputs,
     )
+
+
+def _braked(
+    table: VariableTable, start: Values, constants: Values, plant: Callable[[Values, Values, Values], tuple[Values, Values]]
+) -> Values:
+    """The states of a plant that stands on brakes that carry the load, by its own equations, which are linear in that."""
+    resting = zeros(table.states) | start
+    deflection = SX.sym("deflection", *resting["state.brake_deflection"].shape)
+    rates, _ = plant(resting | {"state.brake_deflection": deflection}, zeros(table.inputs), constants)
+    acceleration = ca.vertcat(rates["state.velocity"], rates["state.angular_velocity"])
+    effect = -ca.jacobian(acceleration, deflection)
+    falling = ca.substitute(acceleration, deflection, SX.zeros(deflection.shape[0]))
+    return resting | {"state.brake_deflection": brake_deflections(effect, falling, constants["brake_slip"])}
 
 
 def zeros(variables: Iterable[Variable]) -> Values:

@@ -332,6 +332,23 @@ def _brake_rate(deflection: SX, speed: SX, closed: SX, c: dict[str, SX]) -> SX:
     return closed * speed * (1 - slipping * load) - (1 - closed) * c["release_rate"] * deflection
 
 
+_SINGULAR = 1e-12
+"""Directions in which the brakes have less than this share of their effect bear nothing."""
+
+
+def brake_deflections(effect: SX, falling: SX, slip: SX) -> SX:
+    """The deflections (n, 1) of closed brakes that leave a platform at rest.
+
+    Without them it would accelerate by `falling` (d, 1), of which a deflection takes away its column of `effect` (d, n). Brakes
+    that would slip, beyond the deflection `slip`, carry an equal share of each leg's load. What no leg bears falls.
+    """
+    scales = 1 / ca.sqrt(ca.sum2(effect**2) + _SINGULAR * ca.sumsqr(effect))
+    rows = effect * ca.repmat(scales, 1, effect.shape[1])
+    square = rows @ rows.T + _SINGULAR * SX.eye(rows.shape[0])
+    wanted = rows.T @ solve(square, falling * scales)
+    return wanted * (slip / ca.fmax(slip, ca.mmax(ca.fabs(wanted))))
+
+
 def solve(matrix: SX, right: SX) -> SX:
     """Solve a positive definite system by Cholesky's method; only the lower triangle is read."""
     n = right.shape[0]

@@ -132,6 +132,18 @@ def test_an_imu_that_stands_still_while_another_moves_is_left_out_from_its_limit
     assert settled.used == settled.without(imu)
 
 
+def test_rounding_does_not_show_that_others_live(settled):
+    """A simulated rig at rest, whose IMUs have no noise: some readings change by their last digits, and others do not."""
+
+    def round_off(reading):
+        reading[:2] = settled.before[:2]
+        reading[0, 3, 1] += 1e-12 if settled.state["time"]["cycle"] % 2 else -1e-12
+
+    for _ in range(10 * FROZEN):
+        assert settled.step(round_off) == []
+    assert settled.used == list(ALL_IMUS)
+
+
 def test_all_imus_are_frozen_when_none_changes_although_the_reference_moves(settled):
     def freeze(reading):
         reading[:2] = settled.before[:2]

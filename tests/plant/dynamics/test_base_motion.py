@@ -15,7 +15,7 @@ from plant.fmu.plant import FmuPlant
 from plant.mechanism import load_in_space, load_spatial
 from plant.pose import Array
 from tests.plant.dynamics.maximal_coordinates import MaximalModel, MovingBase
-from tests.plant.dynamics.test_second_model import TOLERANCES, leaning
+from tests.plant.dynamics.test_second_model import NO_BRAKES, TOLERANCES, leaning
 from tests.plant.dynamics.test_spatial import flat, imus_on_earth, named
 
 MakePlant = Callable[..., FmuPlant]
@@ -100,8 +100,8 @@ def ends(plant: FmuPlant, inputs: dict[str, Array], names: tuple[str, ...] = SEE
 
 def test_a_base_that_accelerates_is_another_gravity(make_plant: MakePlant) -> None:
     pull = np.array([1.5, -2.0, 3.0])
-    accelerated = ends(make_plant(), {"base_motion.acceleration": pull})
-    heavier = ends(make_plant({"gravity": np.array([0.0, 0.0, -9.81]) - pull}), {})
+    accelerated = ends(make_plant(NO_BRAKES), {"base_motion.acceleration": pull})
+    heavier = ends(make_plant(NO_BRAKES | {"gravity": np.array([0.0, 0.0, -9.81]) - pull}), {})
     for name in SEEN:
         np.testing.assert_allclose(accelerated[name], heavier[name], rtol=0.0, atol=1e-11, err_msg=name)
 
@@ -110,15 +110,15 @@ def test_a_base_that_accelerates_is_another_gravity(make_plant: MakePlant) -> No
 def test_a_base_that_leans_is_a_turned_gravity_and_field(make_plant: MakePlant, tilt: list[float]) -> None:
     gravity, field = np.array([0.0, 0.0, -9.81]), np.array([20.0, 5.0, -40.0])
     turn = Rotation.from_rotvec(tilt).as_matrix()
-    leaning = ends(make_plant({"magnetic_field": field}), {"base_motion.rotation": tilt})
-    turned = ends(make_plant({"gravity": turn.T @ gravity, "magnetic_field": turn.T @ field}), {})
+    leaning = ends(make_plant(NO_BRAKES | {"magnetic_field": field}), {"base_motion.rotation": tilt})
+    turned = ends(make_plant(NO_BRAKES | {"gravity": turn.T @ gravity, "magnetic_field": turn.T @ field}), {})
     for name in SEEN:
         np.testing.assert_allclose(leaning[name], turned[name], rtol=0.0, atol=1e-11, err_msg=name)
 
 
 def test_a_planar_base_that_leans_and_accelerates_is_another_gravity() -> None:
     rig = load_in_space("planar-3rpr")
-    p, pull, tilt = rig.plant_parameters(), np.array([1.0, -2.0, 3.0]), np.array([0.3, -0.2, 0.5])
+    p, pull, tilt = rig.plant_parameters() | NO_BRAKES, np.array([1.0, -2.0, 3.0]), np.array([0.3, -0.2, 0.5])
     turn = Rotation.from_rotvec(tilt).as_matrix()
     names = ("position", "angle", "velocity", "current", *IMUS)
     changed = {"gravity": turn.T @ p["gravity"] - pull, "magnetic_field": turn.T @ p["magnetic_field"]}

@@ -1,6 +1,6 @@
 """Actuators of the plant: drives, friction, brakes and end stops, and where the energy goes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from math import pi
 
 import numpy as np
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from plant.dynamics.variables import BRAKE, OPEN, VELOCITY
 from plant.fmu.plant import FmuPlant
-from plant.mechanism import Mechanism
+from plant.mechanism import Mechanism, load_spatial
 from plant.pose import Array, quaternion_from_rotation, rotation_from_quaternion
 from tests.plant.dynamics.explicit_bodies import static_forces
 
@@ -20,6 +20,7 @@ MakePlant = Callable[..., FmuPlant]
 
 WEIGHTLESS: dict[str, ArrayLike] = {"gravity": [0.0, 0.0, 0.0]}
 FRICTIONLESS: dict[str, ArrayLike] = {"friction.coulomb": 0.0, "friction.viscous": 0.0}
+BRAKELESS: dict[str, ArrayLike] = {"brake.force": 1e-9, "brake.stiffness": 1e-9}
 RESISTANCE = 0.6
 COMPENSATING_RESISTANCE = 0.5 * 0.6
 FORCE_CONSTANT = 2.0 * pi / 0.005 * 0.05
@@ -182,9 +183,75 @@ def test_under_gravity_each_leg_creeps_at_the_rate_of_its_load(
         np.testing.assert_allclose(plant.get("current"), loads / FORCE_CONSTANT, rtol=0.01)
 
 
+def loads_at_start(p: Mapping[str, Array]) -> Array:
+    """The forces (6,) [N] that hold all weights at the initial pose."""
+    return static_forces(p, p["initial_position"], rotation_from_quaternion(p["initial_quaternion"]))
+
+
+@pytest.mark.parametrize("preset", ["hexapod", "6-3-I", "6-3-II", "6-4-I", "6-4-II", "6-5", "genhexkins"])
+@pytest.mark.parametrize("mode", [BRAKE, VELOCITY, OPEN])
+def test_the_plant_begins_on_brakes_that_carry_the_load(make_plant: MakePlant, preset: str, mode: int) -> None:
+    """Whatever the drives do at first, every accelerometer reads gravity alone; on the brakes nothing moves."""
+    p = load_spatial(preset).plant_parameters() | {"payload.center_of_mass": np.array([0.02, 0.01, 0.1])}
+    plant = make_plant(p)
+    set_all(plant, mode)
+    np.testing.assert_allclose(plant.get("state.brake_deflection"), -loads_at_start(p) / p["brake.stiffness"], rtol=1e-7)
+    size = np.linalg.norm(p["gravity"])
+    np.testing.assert_allclose(np.linalg.norm(plant.get("imu_specific_force"), axis=1), size, rtol=1e-7)
+    if mode == BRAKE:
+        lengths, brake = run(plant, 1.0, "leg_length", "power.brake")
+        assert np.ptp(lengths, axis=0).max() < 1e-12 and np.abs(brake).max() < 1e-9
+    elif mode == VELOCITY:
+        # The drives take the load over while the brakes let go.
+        (forces,) = run(plant, 0.1, "imu_specific_force")
+        assert np.abs(np.linalg.norm(forces, axis=2) - size).max() < 0.3 * size
+
+
+def test_brakes_too_weak_for_the_load_begin_at_their_force(make_plant: MakePlant, hexapod: Mechanism) -> None:
+    """They carry an equal share of each leg's load, and the rest of gravity accelerates the platform."""
+    p = hexapod.plant_parameters() | {name: np.asarray(value) for name, value in leaning(hexapod).items()}
+    loads = loads_at_start(p)
+    share = 0.4
+    plant = make_plant(leaning(hexapod) | {"brake.force": share * np.abs(loads).max(), "brake.stiffness": 1e5})
+    np.testing.assert_allclose(plant.get("state.brake_deflection"), -share * loads / 1e5, rtol=1e-7)
+    falling = make_plant(leaning(hexapod) | BRAKELESS)
+    held, free = (each.get("imu_specific_force")[6] for each in (plant, falling))
+    gravity = rotation_from_quaternion(p["initial_quaternion"]).T @ p["gravity"]
+    np.testing.assert_allclose(held + gravity, (1.0 - share) * (free + gravity), atol=1e-7)
+
+
+def test_a_stop_that_is_touched_at_the_start_counts_as_load(make_plant: MakePlant, hexapod: Mechanism) -> None:
+    lengths = make_plant().get("leg_length")
+    plant = make_plant({"stop.minimum_length": lengths + 1e-4})
+    loads = loads_at_start(hexapod.plant_parameters())
+    np.testing.assert_allclose(plant.get("state.brake_deflection"), -(loads - 1e6 * 1e-4) / 5e6, rtol=1e-7)
+    run(plant, 0.2)
+    np.testing.assert_allclose(plant.get("leg_length"), lengths, rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("lean", [0.0, 1e-9, 1e-6, 1e-3])
+def test_a_start_at_a_singular_pose_falls_no_faster_than_free(make_plant: MakePlant, hexapod: Mechanism, lean: float) -> None:
+    """Six parallel legs, or nearly so, bear no load across themselves: what the brakes cannot hold falls."""
+    base = np.array(hexapod.base_joints)
+    changes = {
+        "base_joints": base,
+        "platform_joints": (1.0 + lean) * base,
+        "base_joint_axes": np.tile([1.0, 0.0, 0.0], (6, 1)),
+        "gravity": [3.0, 0.0, -9.0],
+        "stop.minimum_length": 0.2,
+        "stop.maximum_length": 0.5,
+    }
+    held, free = (make_plant(changes | more) for more in ({}, BRAKELESS))
+    assert np.abs(held.get("state.brake_deflection")).max() <= 1500.0 / 5e6 * (1.0 + 1e-12)
+    forces = np.array([plant.get("imu_specific_force")[6] for plant in (held, free)])
+    accelerations = np.linalg.norm(forces + changes["gravity"], axis=1)
+    assert accelerations[0] <= accelerations[1] * (1.0 + 1e-6)
+
+
 def test_a_braked_platform_does_not_drift(make_plant: MakePlant, hexapod: Mechanism) -> None:
     plant = make_plant(leaning(hexapod))
     set_all(plant, BRAKE)
+    plant.set("external_wrench.force", [30.0, -20.0, 40.0])
     run(plant, 0.5)
     settled = plant.get("leg_length")
     assert 0.0 < np.abs(settled - make_plant(leaning(hexapod)).get("leg_length")).max() < 1e-4
@@ -247,7 +314,7 @@ def test_an_unloaded_leg_follows_its_command(make_plant: MakePlant) -> None:
 
 
 def test_an_open_motor_carries_no_current_and_falls(make_plant: MakePlant) -> None:
-    plant = make_plant(FRICTIONLESS)
+    plant = make_plant(FRICTIONLESS | BRAKELESS)
     set_all(plant, OPEN, 0.2)
     current, voltage, kinetic, potential = run(plant, 0.15, "current", "voltage", "kinetic_energy", "potential_energy")
     np.testing.assert_array_equal(current, 0.0)

@@ -246,8 +246,23 @@ def test_the_start_is_the_initial_pose_at_rest(dynamics: Dynamics, rig: Mechanis
     start = named(dynamics.start(flat(rig.plant_parameters(), PLANAR.parameters)), PLANAR.states)
     np.testing.assert_array_equal(start["state.position"], [0.1, 0.205])
     assert start["state.angle"] == pytest.approx(-0.4, abs=1e-15)
-    for name in ("velocity", "angular_velocity", "current", "brake_deflection"):
+    for name in ("velocity", "angular_velocity", "current"):
         assert not start[f"state.{name}"].any()
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_at_the_start_the_brakes_carry_the_weight(dynamics: Dynamics, rig: Mechanism, seed: int) -> None:
+    """Virtual work of the explicit bodies, and no acceleration in the plant's own equations."""
+    p = odd_rig(rig, np.random.default_rng(seed)) | {"brake.force": np.array(1e5), "stop.stiffness": np.array(0.0)}
+    states = named(np.array(dynamics.start(flat(p, PLANAR.parameters))).ravel(), PLANAR.states)
+    q = np.append(states["state.position"], states["state.angle"])
+    pushed = jacobian(p, q)[-LEGS:].T @ (-p["brake.stiffness"] * states["state.brake_deflection"])
+    np.testing.assert_allclose(pushed, -weight_force(p, q), rtol=0.0, atol=1e-6)
+    assert np.abs(pushed).max() > 1.0
+    inputs = {variable.name: np.zeros(variable.shape) for variable in PLANAR.inputs}
+    held = flat(states, PLANAR.states), flat(inputs, PLANAR.inputs), dynamics.constants(flat(p, PLANAR.parameters))
+    rates = named(dynamics.rates(*held), PLANAR.states)
+    assert np.abs(rates["state.velocity"]).max() < 1e-6 and abs(rates["state.angular_velocity"]) < 1e-5
 
 
 def broken(dynamics: Dynamics, p: Values) -> list[str]:

@@ -15,6 +15,9 @@ from tests.plant.dynamics.maximal_coordinates import MaximalModel
 MakePlant = Callable[..., FmuPlant]
 Values = dict[str, Array]
 
+NO_BRAKES = {"brake.stiffness": np.array(1e-9), "brake.force": np.array(1e-9)}
+"""A plant whose brakes carry nothing at the start."""
+
 SEGMENT_S = 0.07
 """How long inputs are held: they jump between segments, which neither integrator steps across."""
 
@@ -26,7 +29,8 @@ TOLERANCES = {
 
 
 def leaning(name: str) -> Values:
-    """A preset at an odd start, with bodies, gravity and IMUs off its symmetries, light rotors, and no end stops in reach."""
+    """A preset at an odd start, with bodies, gravity and IMUs off its symmetries, light rotors, and neither
+    end stops in reach nor brakes."""
     random = np.random.default_rng(1)
     p = load_spatial(name).plant_parameters()
     changes = {
@@ -39,6 +43,7 @@ def leaning(name: str) -> Values:
         "friction.velocity": 0.01,
         "drive.current_limit": 1000.0,
         "stop.stiffness": 0.0,
+        **NO_BRAKES,
         "gravity": [1.0, -2.0, -9.0],
         "leg_imu_position": random.normal(0.0, 0.1, (6, 3)),
         "platform_imu_position": random.normal(0.0, 0.1, 3),

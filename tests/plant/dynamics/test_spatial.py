@@ -291,10 +291,11 @@ def test_motors_in_equilibrium_push_as_virtual_work_demands_at_a_thousand_poses(
 def test_forces_along_the_legs_that_hold_the_weight_leave_the_fmu_at_rest(
     make_plant: MakePlant, hexapod: Mechanism, seed: int
 ) -> None:
-    """Open drives, and on the platform J^T times the static forces: all accelerometers read gravity alone."""
+    """No brakes, open drives, and on the platform J^T times the static forces: all accelerometers read gravity alone."""
     random = np.random.default_rng(210 + seed)
     ((position, rotation),) = poses_in_the_stroke(hexapod, 1, random)
     p = hexapod.plant_parameters() | {"gravity": 9.81 * unit(random), "payload.center_of_mass": random.normal(0.0, 0.05, 3)}
+    p |= {"brake.force": np.array(1e-9), "brake.stiffness": np.array(1e-9)}
     plant = make_plant(p | {"initial_position": position, "initial_quaternion": quaternion_from_rotation(rotation)})
     plant.set("drive_mode", np.full(6, OPEN))
     wrench = jacobian(p, position, rotation).T @ static_forces(p, position, rotation)
@@ -329,8 +330,7 @@ def test_the_fmu_integrates_the_derived_rates(dynamics: Dynamics, hexapod: Mecha
     p = odd_mechanism(hexapod, random)
     substep = float(p["substep"])
     plant = make_plant(p)
-    states = {variable.name: np.zeros(variable.shape) for variable in SPATIAL.states}
-    states |= {"state.position": p["initial_position"], "state.quaternion": p["initial_quaternion"]}
+    states = named(np.array(dynamics.start(flat(p, SPATIAL.parameters))).ravel(), SPATIAL.states)
     for cycle in range(100):
         inputs = {
             "velocity_command": 0.05 * np.sin(0.3 * cycle + np.arange(6)),
@@ -502,8 +502,23 @@ def test_a_start_is_the_initial_pose_at_rest(dynamics: Dynamics, hexapod: Mechan
     states = named(np.array(dynamics.start(flat(p, SPATIAL.parameters))).ravel(), SPATIAL.states)
     np.testing.assert_array_equal(states["state.position"], [0.01, -0.02, 0.34])
     np.testing.assert_allclose(states["state.quaternion"], start, atol=1e-15)
-    for name in ("velocity", "angular_velocity", "current", "brake_deflection"):
+    for name in ("velocity", "angular_velocity", "current"):
         assert not states[f"state.{name}"].any()
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_at_the_start_the_brakes_carry_the_weight(dynamics: Dynamics, hexapod: Mechanism, seed: int) -> None:
+    """The equilibrium of each body, and no acceleration in the plant's own equations."""
+    random = np.random.default_rng(seed)
+    p = odd_mechanism(hexapod, random) | {"brake.force": np.array(1e5), "stop.stiffness": np.array(0.0)}
+    states = named(np.array(dynamics.start(flat(p, SPATIAL.parameters))).ravel(), SPATIAL.states)
+    position, rotation, _ = pose_and_twist(states)
+    loads = static_forces(p, position, rotation)
+    np.testing.assert_allclose(-p["brake.stiffness"] * states["state.brake_deflection"], loads, atol=1e-6 * np.abs(loads).max())
+    inputs = {variable.name: np.zeros(variable.shape) for variable in SPATIAL.inputs}
+    held = flat(states, SPATIAL.states), flat(inputs, SPATIAL.inputs), dynamics.constants(flat(p, SPATIAL.parameters))
+    rates = named(np.array(dynamics.rates(*held)).ravel(), SPATIAL.states)
+    assert np.abs(rates["state.velocity"]).max() < 1e-6 and np.abs(rates["state.angular_velocity"]).max() < 1e-5
 
 
 def broken(dynamics: Dynamics, p: Values) -> list[str]:
