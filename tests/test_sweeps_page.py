@@ -68,7 +68,7 @@ def test_the_fields_of_a_run_and_their_defaults_are_those_of_the_source() -> Non
     defaults = {each.name: each.default for each in fields(SimulationConfig)}
     for name, shown in rows.items():
         default = defaults[name]
-        if default is None:
+        if default is None or default == ():
             assert shown in ("none", "the built one", "that of the mechanism")
         elif isinstance(default, bool | int | float):
             assert shown == f"{default:g}" or shown == str(default).lower()

@@ -27,6 +27,8 @@ GYROSCOPE, ACCELEROMETER, MAGNETOMETER = 0, 1, 2
 """First index of a measurement (3, 7, 3) [rad/s, m/s^2, uT]: sensor, IMU, axis."""
 
 _LONGEST_DELAY = 32
+_AT_ONCE = 1e-6
+"""The share of its step by which a conversion may come after a cycle and count as its own, as rounding shifts both."""
 _MOST_CONVERSIONS = 4096
 """The most conversions of an IMU in a cycle; what else fell due in a long gap is left out."""
 
@@ -75,11 +77,12 @@ IMU_STATE = record_dtype(
     fresh=(np.int64, IMU_COUNT),  # samples since the cycle before
     sampled_at=(np.float64, IMU_COUNT),  # time of the latest sample [s]
     bias_walk=(np.float64, (2, IMU_COUNT, 3)),
-    sections=(np.float64, (3, IMU_COUNT, 3, MOST_SECTIONS + 1)),  # of the low-pass: its input, and the output of each
+    sections=(np.float64, (MOST_SECTIONS + 1, 3, IMU_COUNT, 3)),  # of the low-pass: its input, and the output of each
     queue=(np.float64, (_LONGEST_DELAY + 1, 3, IMU_COUNT, 3)),
     reading=(np.float64, (3, IMU_COUNT, 3)),
     normals=(np.float64, 6),
-    effect=EFFECT,  # scratch
+    sensed=(np.float64, 3),  # scratch, as the rest
+    effect=EFFECT,
 )
 """Constants and state of the imperfections of seven IMUs; a copy is a snapshot."""
 
@@ -243,7 +246,7 @@ def _convert_when_due(s: Record, imu: int, ideal: Array) -> None:
     for _ in range(_MOST_CONVERSIONS):
         complete = s.part[imu] + 1 >= s.conversions
         due = s.converted_at[imu] + step
-        if own and due > s.time:
+        if own and due > s.time + _AT_ONCE * step:
             return
         if not own and complete:
             due = s.time
@@ -253,7 +256,7 @@ def _convert_when_due(s: Record, imu: int, ideal: Array) -> None:
             draw_normals(s.normals, conversion, imu, _TIMES, s.seed)
             early = min(jitter * abs(s.normals[0]), 0.9 * step)
         sample = s.sample[imu] if own else s.cycle
-        _convert_at(s, imu, ideal, due - early, conversion, complete, sample)
+        _convert_at(s, imu, ideal, min(due, s.time) - early, conversion, complete, sample)
         s.converted_at[imu] = due
         s.conversion[imu] = conversion + 1
         s.part[imu] += 1
@@ -300,34 +303,45 @@ def _filter(s: Record, imu: int, conversion: int, with_field: bool) -> bool:
             break
         if magnetic and s.noise[kind] > 0.0:
             draw_normals(normals, conversion, imu, _MAGNETIC, s.seed)
-        gain, signal = s.gain[kind, imu], e.signal[kind]
-        before, share = s.smoothing[kind, 0], s.smoothing[kind, 1]
+        gain, signal, sensed = s.gain[kind, imu], e.signal[kind], s.sensed
+        x, y, z = signal[0], signal[1], signal[2]
         for axis in range(3):
-            sensed = gain[axis, 0] * signal[0] + gain[axis, 1] * signal[1] + gain[axis, 2] * signal[2]
-            if s.rectification[kind] != 0.0:
-                sensed += s.rectification[kind] * sensed * sensed
-            if s.disturbances > 0:
-                sensed += (e.scale[kind, axis] + e.warmer * s.scale_per_kelvin[kind, imu, axis]) * sensed
-                sensed += e.added[kind, axis]
-                sensed += e.warmer * s.bias_per_kelvin[kind, imu, axis] + e.supply * s.bias_per_volt[kind, imu, axis]
-            value = s.offset[kind, imu, axis]
-            value += sensed
-            if magnetic:
-                value += s.noise[kind] * normals[axis]
-            else:
-                value += s.bias_walk[kind, imu, axis] + s.noise[kind] * normals[3 * kind + axis]
-            if s.conversions > 1:
-                value = min(max(value, -s.reach[kind]), s.reach[kind])
-            sections = s.sections[kind, imu, axis]
-            entered, sections[0] = sections[0], value
-            for k in range(1, s.order[kind] + 1):
-                left = sections[k]
-                smoothed = value
-                if not first and share != 1.0:
-                    smoothed = left + (before * (entered - left) + share * (value - left))
-                sections[k] = smoothed
-                entered, value = left, smoothed
+            sensed[axis] = gain[axis, 0] * x + gain[axis, 1] * y + gain[axis, 2] * z
+        if s.rectification[kind] != 0.0:
+            for axis in range(3):
+                sensed[axis] += s.rectification[kind] * sensed[axis] * sensed[axis]
+        if s.disturbances > 0:
+            for axis in range(3):
+                sensed[axis] += (e.scale[kind, axis] + e.warmer * s.scale_per_kelvin[kind, imu, axis]) * sensed[axis]
+                sensed[axis] += e.added[kind, axis]
+                sensed[axis] += e.warmer * s.bias_per_kelvin[kind, imu, axis] + e.supply * s.bias_per_volt[kind, imu, axis]
+        noise, first_normal = s.noise[kind], 0 if magnetic else 3 * kind
+        for axis in range(3):
+            walk = 0.0 if magnetic else s.bias_walk[kind, imu, axis]
+            sensed[axis] = s.offset[kind, imu, axis] + sensed[axis] + (walk + noise * normals[first_normal + axis])
+        if s.conversions > 1:
+            for axis in range(3):
+                sensed[axis] = min(max(sensed[axis], -s.reach[kind]), s.reach[kind])
+        _smooth(s, kind, imu, first)
     return dropped
+
+
+@kernel
+def _smooth(s: Record, kind: int, imu: int, first: bool) -> None:
+    """Pass what is sensed through the sections of a low-pass, which begins settled."""
+    before, share = s.smoothing[kind, 0], s.smoothing[kind, 1]
+    passes = first or share == 1.0
+    entered = s.sections[0, kind, imu]
+    for k in range(1, s.order[kind] + 1):
+        left = s.sections[k, kind, imu]
+        for axis in range(3):
+            was, value, now = entered[axis], s.sensed[axis], left[axis]
+            smoothed = value if passes else now + (before * (was - now) + share * (value - now))
+            entered[axis] = value
+            s.sensed[axis] = smoothed
+        entered = left
+    for axis in range(3):
+        entered[axis] = s.sensed[axis]
 
 
 @kernel
@@ -336,15 +350,16 @@ def _take_sample(s: Record, imu: int, sample: int, dropped: bool) -> None:
     first, disturbed = s.cycle == 0, s.disturbances > 0
     slot = sample % (s.delay + 1)
     for kind in range(3):
+        filtered, reach, resolution = s.sections[s.order[kind], kind, imu], s.reach[kind], s.resolution[kind]
         for axis in range(3):
-            delayed = s.sections[kind, imu, axis, s.order[kind]]
+            delayed = filtered[axis]
             if s.delay > 0:
                 if first:
                     s.queue[:, kind, imu, axis] = delayed
                 s.queue[slot, kind, imu, axis] = delayed
                 delayed = s.queue[(slot + 1) % (s.delay + 1), kind, imu, axis]
-            delayed = min(max(delayed, -s.reach[kind]), s.reach[kind])
-            if s.resolution[kind] > 0.0:
-                delayed = np.rint(delayed / s.resolution[kind]) * s.resolution[kind]
+            delayed = min(max(delayed, -reach), reach)
+            if resolution > 0.0:
+                delayed = np.rint(delayed / resolution) * resolution
             if not dropped and (first or not disturbed or s.effect.stuck[kind, axis] == 0):
                 s.reading[kind, imu, axis] = delayed

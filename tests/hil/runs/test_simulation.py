@@ -92,6 +92,28 @@ def test_one_seed_gives_one_result_bit_for_bit_and_another_seed_another():
     assert first["command"].tobytes() != other["command"].tobytes()
 
 
+def test_a_fault_of_imus_begins_at_its_time_of_the_motion():
+    fault = "imu-offset:all,axis=y,size_m_per_s2=0.5,ramp_s=0.01,at=0.6"
+    healthy, disturbed = (
+        simulate(SimulationConfig(target="hold", duration=0.7, faults=each)).records for each in ((), (fault,))
+    )
+    begun = round((0.2 + 0.6) * 1000)
+    for field in set(healthy.dtype.names) - {"stage_ns"}:
+        assert healthy[field][:begun].tobytes() == disturbed[field][:begun].tobytes(), field
+    # The low-pass is late by 0.6 cycles, and the loop has not reacted much yet.
+    added = (disturbed["specific_force"] - healthy["specific_force"])[begun : begun + 5, :, 1].mean(axis=1)
+    np.testing.assert_allclose(added, 0.5 * np.clip((np.arange(5) - 0.6) / 10.0, 0.0, 1.0), atol=0.03)
+
+
+def test_the_samples_of_imus_with_clocks_of_their_own_have_their_ages_and_times():
+    records = simulate(SimulationConfig(target="hold", duration=1.0, faults=("imu-clock:3,size_percent=-50,at=0",))).records
+    age, begun = records["sample_age"], 210
+    assert (np.delete(age, 3, axis=1) == 0).all() and (age[:190] == 0).all()
+    assert set(age[begun:, 3].tolist()) == {0, 1} and age[begun:, 3].mean() == pytest.approx(0.5, abs=0.01)
+    late = records["time_ns"][begun:] - records["sample_ns"][begun:, 3]
+    assert late.min() >= 0 and late.max() < 2_000_000
+
+
 def test_a_run_taken_up_from_its_arrays_goes_on_bit_for_bit():
     config = SimulationConfig(duration=0.5)
     with prepared_loop(config) as whole, prepared_loop(config) as parts:

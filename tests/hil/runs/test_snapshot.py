@@ -48,6 +48,7 @@ LIVELY = SimulationConfig(
         (LIVELY, 0.7),
         (replace(LIVELY, fusion="compiled", rate=250.0, imu="icm42688"), 1.5),
         (replace(LIVELY, joint_error=1e-4), -0.1),
+        (replace(LIVELY, imu="icm42688-nominal", faults=("imu-offset:2,axis=x,size_deg_per_s=0.05,ramp_s=1,at=0.3",)), 0.7),
         (SimulationConfig(mechanism="planar-3rpr", duration=1.0), 0.4),
     ],
 )

@@ -40,6 +40,17 @@ def test_what_is_not_as_specified_is_found(case, finding):
     assert any(finding in each for each in outcome.findings)
 
 
+def test_a_case_may_disturb_imus_over_the_bus():
+    """A clock that is 1 % off, some vibration and 1 K are borne by any rig; a leg's IMU that turns by 5 deg is told."""
+    borne = "imu-clock:{k},size_percent=1 imu-vibration:all,axis=x,size_g=0.05,sine_hz=97 imu-temperature:{j},size_k=1,ramp_s=1"
+    cases = (
+        Case("borne", Cause.NONE, Reaction.GO_ON, 0, 3e-3, borne),
+        Case("turned", Cause.IMU_DISAGREES, Reaction.GO_ON, 2500, 15e-3, "imu-turn:{k},axis=x,size_deg=5"),
+    )
+    for outcome in run_matrix(1, cases):
+        assert outcome.findings == []
+
+
 def test_a_case_comes_out_the_same_every_time():
     first, again = (run_matrix(2, CASES[3:4])[0].summary() for _ in range(2))
     assert first == again

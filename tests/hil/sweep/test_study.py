@@ -206,3 +206,11 @@ def test_a_factor_varies_once_and_points_are_limited() -> None:
         Study((SEEDS, SEEDS))
     with pytest.raises(InputError, match="vary less"):
         Study((Factor("run.seed", tuple(range(4000))), Factor("run.rate", tuple(range(4000))))).points()
+
+
+def test_faults_of_imus_are_values_as_one_text() -> None:
+    turned, slow = "imu-turn:6,axis=z,size_deg=3", "imu-clock:3,size_percent=-50"
+    study = Study((Factor("run.faults", ("", turned, f"{turned} {slow}")),))
+    assert [study.config_at(point).faults for point in study.points()] == [(), (turned,), (turned, slow)]
+    with pytest.raises(InputError, match="needs one of size_deg"):
+        [study.config_at(point) for point in Study((Factor("run.faults", ("imu-turn:6,axis=z",)),)).points()]
