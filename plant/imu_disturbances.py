@@ -66,6 +66,8 @@ class DisturbanceKind(IntEnum):
         ("sensor", "axis"),
         "the IMU is shaken or struck; the sensor rectifies, filters and clips it",
     )
+    NOISE = _OF_A_SENSOR, ("sensor", "axis"), "each conversion has white noise of this RMS in addition"
+    RANGE = _OF_A_SENSOR, ("sensor",), "conversions and readings are clipped at this size"
     TURN = ("size_deg",), ("axis",), "the IMU is turned on its mounting about this axis"
     STUCK = (), ("sensor", "axis"), "the axis keeps its reading"
     TEMPERATURE = ("size_k",), (), "the IMU gets warmer; its bias and scale follow by its model's figures per kelvin"
@@ -134,7 +136,8 @@ def disturbance(kind: str, **words: Any) -> Disturbance:
     """A disturbance from its words.
 
     Args:
-        kind: offset, scale, vibration, turn, stuck, temperature, supply, clock or jitter; `DisturbanceKind` says what each is.
+        kind: offset, scale, vibration, noise, range, turn, stuck, temperature, supply, clock or jitter; `DisturbanceKind` says
+            what each is.
         words: those of `WORDS`, and the size by one of those that the kind has. `imus` may be a list of numbers, `axis` one of
             three numbers.
 
@@ -158,8 +161,8 @@ def disturbance(kind: str, **words: Any) -> Disturbance:
         raise InputError(f"{title} has for_s = {duration:g}; it must be positive")
     if made == DisturbanceKind.CLOCK and not -1.0 < size <= 100.0:
         raise InputError(f"{title} has size_percent = {100.0 * size:g}; a clock needs more than -100, and at most 10000")
-    if made == DisturbanceKind.JITTER and size < 0.0:
-        raise InputError(f"{title} has size_ms = {1e3 * size:g}; it must not be negative")
+    if made in (DisturbanceKind.JITTER, DisturbanceKind.RANGE) and size < 0.0:
+        raise InputError(f"{title} has {sizes[0]} = {size / factor:g}; it must not be negative")
     sensor = _sensor(words, of, title) if "sensor" in made.places else -1
     axis = _axis(words, title, made != DisturbanceKind.TURN) if "axis" in made.places else (0.0, 0.0, 0.0)
     return Disturbance(made, _imus(words.get("imus"), title), sensor, axis, size, course, span, every, begin, duration)

@@ -28,6 +28,10 @@ EFFECT = record_dtype(
     signal=(np.float64, (3, 3)),  # sensor, axis: the true signal
     added=(np.float64, (3, 3)),  # to the reading
     scale=(np.float64, (3, 3)),  # error of the axis
+    noise=(np.float64, (3, 3)),  # RMS, of each conversion
+    noisy=np.int64,  # whether there is any
+    normals=(np.float64, 6),  # scratch
+    reach=(np.float64, 3),
     stuck=(np.int64, (3, 3)),
     warmer=np.float64,  # [K]
     supply=np.float64,  # above nominal [V]
@@ -77,10 +81,12 @@ def disturb(disturbances: Record, count: int, imu: int, time: float, effect: Rec
     """Apply those that are there for an IMU at a time [s] to its true signal, in their order, and note the rest."""
     e = effect
     for sensor in range(3):
+        e.reach[sensor] = np.inf
         for axis in range(3):
-            e.added[sensor, axis] = e.scale[sensor, axis] = 0.0
+            e.added[sensor, axis] = e.scale[sensor, axis] = e.noise[sensor, axis] = 0.0
             e.stuck[sensor, axis] = 0
     e.warmer = e.supply = 0.0
+    e.noisy = 0
     for i in range(count):
         d = disturbances[i]
         if not concerns(d, imu, time):
@@ -92,13 +98,18 @@ def disturb(disturbances: Record, count: int, imu: int, time: float, effect: Rec
             e.warmer += size
         elif d.kind == DisturbanceKind.SUPPLY:
             e.supply += size
+        elif d.kind == DisturbanceKind.RANGE:
+            e.reach[d.sensor] = min(e.reach[d.sensor], size)
         elif d.sensor >= 0:
+            e.noisy = 1 if d.kind == DisturbanceKind.NOISE else e.noisy
             for axis in range(3):
                 share = size * d.axis[axis]
                 if d.kind == DisturbanceKind.OFFSET:
                     e.added[d.sensor, axis] += share
                 elif d.kind == DisturbanceKind.SCALE:
                     e.scale[d.sensor, axis] += share
+                elif d.kind == DisturbanceKind.NOISE:
+                    e.noise[d.sensor, axis] = np.hypot(e.noise[d.sensor, axis], share)
                 elif d.kind == DisturbanceKind.VIBRATION:
                     e.signal[d.sensor, axis] += share
                 elif d.kind == DisturbanceKind.STUCK and d.axis[axis] != 0.0:

@@ -196,7 +196,8 @@ def _smoothing(bandwidth: float, period: float) -> tuple[float, float]:
     return share / ratio - exp(-ratio), 1.0 - share / ratio
 
 
-_MEASURE, _MAGNETIC, _WALK, _TIMES = 0, 1, 2, 3
+_MEASURE, _MAGNETIC, _WALK, _TIMES, _DISTURBED = range(5)
+"""Purposes of random numbers; a sensor's number is added to the last."""
 
 
 @kernel
@@ -315,15 +316,26 @@ def _filter(s: Record, imu: int, conversion: int, with_field: bool) -> bool:
                 sensed[axis] += (e.scale[kind, axis] + e.warmer * s.scale_per_kelvin[kind, imu, axis]) * sensed[axis]
                 sensed[axis] += e.added[kind, axis]
                 sensed[axis] += e.warmer * s.bias_per_kelvin[kind, imu, axis] + e.supply * s.bias_per_volt[kind, imu, axis]
+            if e.noisy != 0:
+                draw_normals(e.normals, conversion, imu, _DISTURBED + kind, s.seed)
+                for axis in range(3):
+                    sensed[axis] += e.noise[kind, axis] * e.normals[axis]
         noise, first_normal = s.noise[kind], 0 if magnetic else 3 * kind
         for axis in range(3):
             walk = 0.0 if magnetic else s.bias_walk[kind, imu, axis]
             sensed[axis] = s.offset[kind, imu, axis] + sensed[axis] + (walk + noise * normals[first_normal + axis])
         if s.conversions > 1:
+            reach = _reach(s, kind)
             for axis in range(3):
-                sensed[axis] = min(max(sensed[axis], -s.reach[kind]), s.reach[kind])
+                sensed[axis] = min(max(sensed[axis], -reach), reach)
         _smooth(s, kind, imu, first)
     return dropped
+
+
+@kernel
+def _reach(s: Record, kind: int) -> float:
+    """The largest reading of a sensor."""
+    return float(min(s.reach[kind], s.effect.reach[kind]) if s.disturbances > 0 else s.reach[kind])
 
 
 @kernel
@@ -350,7 +362,7 @@ def _take_sample(s: Record, imu: int, sample: int, dropped: bool) -> None:
     first, disturbed = s.cycle == 0, s.disturbances > 0
     slot = sample % (s.delay + 1)
     for kind in range(3):
-        filtered, reach, resolution = s.sections[s.order[kind], kind, imu], s.reach[kind], s.resolution[kind]
+        filtered, reach, resolution = s.sections[s.order[kind], kind, imu], _reach(s, kind), s.resolution[kind]
         for axis in range(3):
             delayed = filtered[axis]
             if s.delay > 0:

@@ -266,6 +266,34 @@ def test_an_imu_that_loosens_reads_in_its_turned_axes() -> None:
         np.testing.assert_allclose(read[:, sensor, 6], turned.inv().apply(signals[:, sensor, 6]), atol=1e-12)
 
 
+def test_added_noise_has_its_size_and_is_keyed_by_seed_imu_and_conversion() -> None:
+    texts = ("imu-noise:2+3,axis=y,size_g=0.3", "imu-noise:2,axis=all,size_ut=5")
+    first, again, other = (run(disturbed(ImuModel("bare"), *texts, seed=seed), at_rest(5000))[0] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    noise = first - at_rest(5000)
+    there = np.zeros((3, 7, 3), bool)
+    there[ACCELEROMETER, 2:4, 1] = there[MAGNETOMETER, 2] = True
+    assert (noise[:, ~there] == 0.0).all() and (first != other)[:, there].mean() > 0.99
+    np.testing.assert_allclose(noise[:, there].std(axis=0), [0.3 * G, 0.3 * G, 5.0, 5.0, 5.0], rtol=0.05)
+    assert np.abs(np.corrcoef(noise[:, there].T) - np.eye(5)).max() < 5.0 / sqrt(5000)
+    # A cycle can be made again on its own, with other noise unchanged.
+    late = disturbed(ImuModel("bare"), *texts, seed=1)
+    late["cycle"] = 4000
+    np.testing.assert_array_equal(run(late, at_rest(3))[0], first[4000:4003])
+    healthy, noisy = (run(disturbed(load_imu("mpu9150"), *each, seed=1), at_rest(50))[0] for each in ((), texts))
+    np.testing.assert_array_equal(healthy[:, GYROSCOPE], noisy[:, GYROSCOPE])
+
+
+@pytest.mark.parametrize("conversion_rate", [0.0, 8000.0])
+def test_a_range_that_is_told_clips(conversion_rate: float) -> None:
+    model = ImuModel("bare", conversion_rate=conversion_rate)
+    state = disturbed(model, "imu-range:1,size_g=1.5,at=0.0995", "imu-vibration:all,axis=z,size_g=3,sine_hz=2.5")
+    read = run(state, at_rest(400))[0][:, ACCELEROMETER, :, 2] / G
+    free = 1.0 + 3.0 * np.sin(2.0 * pi * 2.5 * PERIOD * np.arange(400))
+    np.testing.assert_allclose(read[:, 0], free, atol=1e-9)
+    np.testing.assert_allclose(read[:, 1], np.where(np.arange(400) < 100, free, np.clip(free, -1.5, 1.5)), atol=1e-9)
+
+
 def test_a_stuck_axis_keeps_its_reading_and_the_others_go_on() -> None:
     signals = np.random.default_rng(1).normal(size=(100, 3, 7, 3))
     read = run(disturbed(ImuModel("bare"), "imu-stuck:4,sensor=gyroscope,axis=y,at=0.0395,for=0.03"), signals)[0]
