@@ -154,9 +154,9 @@ def disturbance(kind: str, **words: Any) -> Disturbance:
     if len(sizes) != min(1, len(made.sizes)):
         raise InputError(f"{title} needs one of {', '.join(made.sizes)}, and it has {', '.join(sizes) or 'none'}")
     factor, of = _SIZES[sizes[0]] if sizes else (0.0, "")
-    size = _number(words, sizes[0], title) * factor if sizes else 0.0
-    course, span, every = _course(words, title)
-    begin, duration = _number(words, "at_s", title, -1.0), _number(words, "for_s", title, inf)
+    size = number_in(words, sizes[0], title) * factor if sizes else 0.0
+    course, span, every = course_in(words, title)
+    begin, duration = number_in(words, "at_s", title, -1.0), number_in(words, "for_s", title, inf)
     if not duration > 0.0:
         raise InputError(f"{title} has for_s = {duration:g}; it must be positive")
     if made == DisturbanceKind.CLOCK and not -1.0 < size <= 100.0:
@@ -164,7 +164,7 @@ def disturbance(kind: str, **words: Any) -> Disturbance:
     if made in (DisturbanceKind.JITTER, DisturbanceKind.RANGE) and size < 0.0:
         raise InputError(f"{title} has {sizes[0]} = {size / factor:g}; it must not be negative")
     sensor = _sensor(words, of, title) if "sensor" in made.places else -1
-    axis = _axis(words, title, made != DisturbanceKind.TURN) if "axis" in made.places else (0.0, 0.0, 0.0)
+    axis = axis_in(words, title, made != DisturbanceKind.TURN) if "axis" in made.places else (0.0, 0.0, 0.0)
     return Disturbance(made, _imus(words.get("imus"), title), sensor, axis, size, course, span, every, begin, duration)
 
 
@@ -174,16 +174,22 @@ def disturbance_of_text(text: str) -> Disturbance:
     Raises:
         GoughError: as `disturbance`.
     """
+    name, imus, words = words_of_text(text)
+    return disturbance(name.removeprefix(PREFIX), **({"imus": imus} if imus else {}), **words)
+
+
+def words_of_text(text: str) -> tuple[str, str, dict[str, str]]:
+    """The name before the first colon, what follows it, and the words with their values; `InputError` if it is no such text."""
     head, *options = text.split(",")
-    name, _, imus = head.partition(":")
-    words = {"imus": imus} if imus else {}
+    name, _, what = head.partition(":")
+    words: dict[str, str] = {}
     for option in options:
         word, equals, value = option.partition("=")
         word = _SHORT.get(word, word)
         if not equals or word in words:
             raise InputError(f"{option!r} in {text!r} is no word with a value, such as axis=y, or comes twice")
         words[word] = value
-    return disturbance(name.removeprefix(PREFIX), **words)
+    return name, what, words
 
 
 def disturbance_of_table(table: Mapping[str, Any]) -> Disturbance:
@@ -199,7 +205,8 @@ def disturbance_of_table(table: Mapping[str, Any]) -> Disturbance:
     return disturbance(kind, **words)
 
 
-def _number(words: Mapping[str, Any], word: str, title: str, default: float = nan) -> float:
+def number_in(words: Mapping[str, Any], word: str, title: str, default: float = nan) -> float:
+    """The number that a word has; `title` begins the message of an `InputError`."""
     value = words.get(word, default)
     try:
         number = float(value)
@@ -210,7 +217,7 @@ def _number(words: Mapping[str, Any], word: str, title: str, default: float = na
     return number
 
 
-def _course(words: Mapping[str, Any], title: str) -> tuple[Course, float, float]:
+def course_in(words: Mapping[str, Any], title: str) -> tuple[Course, float, float]:
     """The course, its time [s], and the time from pulse to pulse [s]."""
     given = [word for word in _COURSES if word in words]
     if len(given) > 1:
@@ -219,7 +226,7 @@ def _course(words: Mapping[str, Any], title: str) -> tuple[Course, float, float]
         raise InputError(f"{title} has repeat_hz, which goes with pulse_ms")
     if not given:
         return Course.STEP, 0.0, inf
-    values = {word: _number(words, word, title) for word in (*given, "repeat_hz") if word in words}
+    values = {word: number_in(words, word, title) for word in (*given, "repeat_hz") if word in words}
     for word, value in values.items():
         if not value > 0.0:
             raise InputError(f"{title} has {word} = {value:g}; it must be positive")
@@ -239,7 +246,8 @@ def _sensor(words: Mapping[str, Any], of: str, title: str) -> int:
     return SENSORS.index(sensor)
 
 
-def _axis(words: Mapping[str, Any], title: str, can_be_all: bool) -> tuple[float, float, float]:
+def axis_in(words: Mapping[str, Any], title: str, can_be_all: bool) -> tuple[float, float, float]:
+    """The unit vector of `axis`, or ones for all."""
     axis = words.get("axis")
     if axis == "all" and can_be_all:
         return 1.0, 1.0, 1.0

@@ -120,6 +120,7 @@ def gough_inject(options: Namespace) -> None:
     """Inject a fault into an emulated rig that is running, or ask for its state."""
     from hil.rigs.emulation import FaultKind
     from hil.runs.emulator_process import ask, own_control
+    from plant.dynamics.base_course import BaseMotionKind
     from plant.imu_disturbances import WORDS, DisturbanceKind
 
     if options.list:
@@ -130,6 +131,8 @@ def gough_inject(options: Namespace) -> None:
         table = Table("disturbance", "size", "where", "")
         for each in DisturbanceKind:
             table.add(each.label, ", ".join(each.sizes), ", ".join(("imus", *each.places)), each.text)
+        for motion in BaseMotionKind:
+            table.add(motion.label, ", ".join(motion.sizes), "axis", motion.text)
         table.print()
         table = Table("word", "")
         for word, meaning in WORDS.items():

@@ -15,6 +15,7 @@ import numpy as np
 
 from hil.rigs import DriveState, Request
 from plant.compiled import Record, filled, kernel, record_dtype
+from plant.dynamics.base_course import BASE_MOTION, MOST_BASE_MOTIONS, BaseMotionKind, base_motion_of_text, placed
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
 from plant.errors import InputError, UnknownNameError
 from plant.fmu.calls import advance, read_imus, read_truth, write_command, write_drive_modes, write_payload_mass
@@ -70,6 +71,7 @@ FAULT = record_dtype(
     end_ns=np.int64,
     size=np.float64,
     disturbance=DISTURBANCE,  # of IMUs, as long as the fault is there
+    base=BASE_MOTION,  # of the base
 )
 """A fault."""
 
@@ -79,8 +81,8 @@ _FOREVER = np.iinfo(np.int64).max
 
 def fault(text: str) -> Record:
     """A fault (dtype `FAULT`) from its text: the kind, then index, `at` and `for` [s] and `size` where they matter, such as
-    `imu-biased:3,at=5,for=2,size=2`; or a disturbance of IMUs, as `plant.imu_disturbances` has them. Without `at` the fault is
-    there from the start.
+    `imu-biased:3,at=5,for=2,size=2`; or a disturbance of IMUs, as `plant.imu_disturbances` has them; or a motion of the base,
+    as `plant.dynamics.base_course` has them. Without `at` the fault is there from the start.
 
     Raises:
         UnknownNameError: there is no such kind.
@@ -92,8 +94,13 @@ def fault(text: str) -> Record:
     if name in disturbances:
         meant = disturbance_of_text(text)
         return _made(0, meant.begin, meant.duration, disturbance=disturbance_record(replace(meant, begin=0.0, duration=inf)))
+    moves = [kind.label for kind in BaseMotionKind]
+    if name in moves:
+        motion = base_motion_of_text(text)
+        begin, lasting = float(motion["begin"]), float(motion["end"] - max(motion["begin"], 0.0))
+        return _made(0, begin, lasting, base=placed(motion, 0.0))
     if name not in kinds:
-        raise UnknownNameError(f"there is no fault {name!r}; there are {', '.join((*kinds, *disturbances))}")
+        raise UnknownNameError(f"there is no fault {name!r}; there are {', '.join((*kinds, *disturbances, *moves))}")
     kind = kinds[name]
     if kind.count and not (index.isdecimal() and int(index) < kind.count):
         raise InputError(f"the fault {text!r} needs the number of an IMU or drive, 0 to {kind.count - 1}: such as {name}:0")
@@ -238,6 +245,7 @@ def move(fmu: Record, rig: Record, now_ns: int) -> int:
         for i in range(r.faults):
             if r.fault[i].kind == FaultKind.PAYLOAD_JUMPS and is_active(r.fault[i], r.enabled_ns, r.time_ns):
                 added += r.fault[i].size
+        _set_base(c, r)
         if added != r.added:
             status |= write_payload_mass(fmu, r.payload + added)
             r.added = added
@@ -249,6 +257,21 @@ def move(fmu: Record, rig: Record, now_ns: int) -> int:
         status |= advance(fmu, 1e-9 * step)
         r.time_ns += step
     return status
+
+
+@kernel
+def _set_base(c: Record, r: Record) -> None:
+    """Give the plant the motions of its base; those that have ended still have to come to rest."""
+    c.base_motion_count = 0
+    for i in range(r.faults):
+        f, n = r.fault[i], c.base_motion_count
+        if f.base.kind == 0 or (f.begin_ns >= 0 and r.enabled_ns < 0) or n >= MOST_BASE_MOTIONS:
+            continue
+        c.base_motions[n] = f.base
+        if f.begin_ns >= 0:
+            begin = c.time - 1e-9 * (r.time_ns - r.enabled_ns - f.begin_ns)
+            c.base_motions[n].begin, c.base_motions[n].end = begin, begin + 1e-9 * (f.end_ns - f.begin_ns)
+        c.base_motion_count += 1
 
 
 @kernel

@@ -7,9 +7,12 @@ from typing import Any
 from controller.planning import STREAM_TARGET
 from hil.option import integers, option
 from plant.checks import check_duration, check_rate, checked_seed
+from plant.compiled import Record
+from plant.dynamics.base_course import PREFIX as BASE_PREFIX
+from plant.dynamics.base_course import base_motion_of_text
 from plant.errors import InputError, UnknownNameError
 from plant.fmu.settings import Setting
-from plant.imu_disturbances import disturbance_of_text
+from plant.imu_disturbances import Disturbance, disturbance_of_text
 from plant.imu_wiring import ALL_IMUS, RIGHT_WIRING, Wiring
 
 FUSIONS = {
@@ -98,10 +101,11 @@ class SimulationConfig:
     wiring: Wiring = RIGHT_WIRING
     faults: tuple[str, ...] = option(
         (),
-        "simulated: what happens to IMUs, from the start or from a time of the motion on, such as "
-        "imu-offset:all,axis=y,size_m_per_s2=0.5,at_s=5,ramp_s=10; 'gough inject --list' lists all; can be given several times",
+        "simulated: what happens to IMUs or to the base, from the start or from a time of the motion on, such as "
+        "imu-offset:all,axis=y,size_m_per_s2=0.5,at_s=5,ramp_s=10 or base-tilt,axis=x,size_deg=2,at_s=3,ramp_s=4; "
+        "'gough inject --list' lists all; can be given several times",
         flag="--fault",
-        metavar="KIND:IMUS[,WORD=VALUE]",
+        metavar="KIND[:IMUS][,WORD=VALUE]",
         parse=str,
         several=True,
     )
@@ -145,10 +149,20 @@ class SimulationConfig:
             raise InputError(f"--set is for the plant's FMU, not for the rig {self.rig}: leave it out")
         if self.faults and self.rig != "fmu":
             raise InputError(
-                f"--fault is for simulated IMUs, not for the rig {self.rig}: tell it to 'gough emulate' or 'inject'"
+                f"--fault is for a simulated plant, not for the rig {self.rig}: tell it to 'gough emulate' or 'inject'"
             )
         for text in self.faults:
-            disturbance_of_text(text)
+            base_motion_of_text(text) if text.startswith(BASE_PREFIX) else disturbance_of_text(text)
+
+    @property
+    def disturbances(self) -> list[Disturbance]:
+        """What happens to IMUs."""
+        return [disturbance_of_text(text) for text in self.faults if not text.startswith(BASE_PREFIX)]
+
+    @property
+    def base_motions(self) -> list[Record]:
+        """How the base moves (dtype `plant.dynamics.base_course.BASE_MOTION`)."""
+        return [base_motion_of_text(text) for text in self.faults if text.startswith(BASE_PREFIX)]
 
     @classmethod
     def from_plain(cls, values: Mapping[str, Any]) -> "SimulationConfig":

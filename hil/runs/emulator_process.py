@@ -185,7 +185,9 @@ class _Control:
                 passed = int(rig["time_ns"] - rig["enabled_ns"])
                 made["begin_ns"], made["end_ns"] = passed, min(int(made["end_ns"]), 2**62) + passed
             # Before the drives are enabled, the course of a disturbance begins now.
-            made["disturbance"]["begin"] = 1e-9 * int(rig["time_ns"])
+            now = 1e-9 * int(rig["time_ns"])
+            made["disturbance"]["begin"], made["base"]["begin"] = now, now
+            made["base"]["end"] += now
             add_fault(rig, made)
             return {"fault": argument}
         if command == "clear":

@@ -28,6 +28,7 @@ from hil.rigs.udp.rig import UdpRig
 from hil.runs.config import FUSIONS, PYTHON_RIG, SimulationConfig
 from hil.runs.plant_start import check_start
 from plant.compiled import Record
+from plant.dynamics.base_course import placed
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import GoughError, InputError
 from plant.extras import missing_extras_named
@@ -37,7 +38,6 @@ from plant.fmu.calls import FMU_HANDLE
 from plant.fmu.description_reader import FmuDescription
 from plant.fmu.plant import FmuPlant, check_number_of_legs, takes_parameters
 from plant.imu import add_disturbances, imu_state, load_imu
-from plant.imu_disturbances import disturbance_of_text
 from plant.mechanism import Mechanism, load_in_space
 from plant.pose import Pose
 
@@ -98,7 +98,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         least, most = HOLD_RANGE_S
         if not least <= control.hold <= most:
             raise InputError(f"hold is {control.hold:g} s; the estimate settles in {least:g} to {most:g} s")
-        add_disturbances(imu, (disturbance_of_text(text).later(control.hold) for text in config.faults))
+        add_disturbances(imu, (each.later(control.hold) for each in config.disturbances))
         fusion, safety = sensor_settings(mechanism, model), safety_settings(mechanism)
         parameters = cycle_parameters(
             mechanism, config.rate, control, fusion, config.imus, FUSIONS[config.fusion], calibration, config.magnetometer,
@@ -187,6 +187,7 @@ def simulated_plant(
         raise InputError(f"{binds} an FMU with joints of its own, which have no joint error: leave it out")
     plant = FmuPlant(fmu, parameters, 1.0 / config.rate, binding, settings, nominal.legs)
     try:
+        plant.move_base([placed(each, hold) for each in config.base_motions])
         _check_plant(config, plant, nominal)
         if not parameters:
             check_start(plant, nominal, start)

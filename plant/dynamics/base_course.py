@@ -1,19 +1,59 @@
-"""The course of a base's motion over time, for an FMU that takes one: tilts about axes of {1}, and accelerations along them."""
+"""How a base moves over time: tilts about axes of {1}, and accelerations along them, in the words of `imu_disturbances`:
+
+    base-tilt,axis=x,size_deg=2,at=3,ramp_s=4
+    base-acceleration,axis=0/0.6/0.8,size_g=0.1,sine_hz=3
+
+A base has inertia: a ramp begins and ends gently, and a step takes a tenth of a second. Axes are those of {1}; a base tilts
+about its origin.
+"""
+
+from enum import IntEnum
+from math import inf, radians
+from typing import Any
 
 import numpy as np
 
-from plant.compiled import Record, kernel, record_dtype
+from plant.compiled import Record, filled, kernel, record_dtype
+from plant.errors import InputError, UnknownNameError
+from plant.files import check_entries
+from plant.imu_disturbances import WORDS, Course, axis_in, course_in, number_in, words_of_text
 from plant.pose import Array
+
+PREFIX = "base-"
+"""What the text of a base's motion begins with."""
 
 MOST_BASE_MOTIONS = 8
 """The most that act on a base."""
 
-TILT, SHAKE = range(2)
-STEADY, SETTLE, SINE, PULSES = range(4)
+STEP_S = 0.1
+"""How long a step of a base takes, and how long it takes at the end of any motion but a ramp or pulses [s]."""
+
+
+class BaseMotionKind(IntEnum):
+    """What a base does."""
+
+    sizes: dict[str, float]  # words for its size, with the factor to SI units
+    text: str
+
+    def __new__(cls, sizes: dict[str, float], text: str) -> "BaseMotionKind":
+        """The next member."""
+        kind = int.__new__(cls, len(cls.__members__) + 1)
+        kind._value_ = len(cls.__members__) + 1
+        kind.sizes, kind.text = sizes, text
+        return kind
+
+    @property
+    def label(self) -> str:
+        """The kind's name as text, such as base-tilt."""
+        return PREFIX + self.name.lower()
+
+    TILT = {"size_deg": radians(1.0)}, "the base tilts about this axis of {1} through its origin"
+    ACCELERATION = {"size_m_per_s2": 1.0, "size_g": 9.80665}, "the base is accelerated along this axis of {1}"
+
 
 BASE_MOTION = record_dtype(
-    kind=np.int64,  # TILT or SHAKE
-    course=np.int64,  # STEADY, SETTLE, SINE or PULSES
+    kind=np.int64,  # BaseMotionKind; 0: none
+    course=np.int64,  # Course
     axis=(np.float64, 3),  # unit vector, in {1}
     size=np.float64,  # angle [rad], or acceleration [m/s^2]
     rise=np.float64,  # time in which it comes, and goes at its end [s]; 0 for pulses
@@ -22,7 +62,62 @@ BASE_MOTION = record_dtype(
     begin=np.float64,  # [s]
     end=np.float64,  # [s]
 )
-"""One motion of a base. Steady ones with a rise are steps and ramps."""
+"""One motion of a base."""
+
+
+def base_motion(kind: str, **words: Any) -> Record:
+    """A motion of the base (dtype `BASE_MOTION`) from its words, which begins below 0 if it is there from the start.
+
+    Args:
+        kind: tilt or acceleration.
+        words: `axis`, the size by one of `size_deg`, `size_m_per_s2` and `size_g`, and the times and courses of
+            `plant.imu_disturbances.WORDS`.
+
+    Raises:
+        UnknownNameError: there is no such kind.
+        InputError: a word is missing, unknown or out of range.
+    """
+    kinds = {each.name.lower(): each for each in BaseMotionKind}
+    if kind not in kinds:
+        raise UnknownNameError(f"there is no motion {kind!r} of a base; there are {', '.join(kinds)}")
+    made, title = kinds[kind], f"the base's {kind}"
+    check_entries(words, [word for word in WORDS if word not in ("imus", "sensor")] + [*made.sizes], title)
+    sizes = [word for word in made.sizes if word in words]
+    if len(sizes) != 1:
+        raise InputError(f"{title} needs one of {', '.join(made.sizes)}, and it has {' and '.join(sizes) or 'none'}")
+    size = number_in(words, sizes[0], title) * made.sizes[sizes[0]]
+    course, span, every = course_in(words, title)
+    rise = {Course.RAMP: span, Course.PULSES: 0.0}.get(course, STEP_S)
+    begin, duration = number_in(words, "at_s", title, -1.0), number_in(words, "for_s", title, inf)
+    if not duration > 0.0:
+        raise InputError(f"{title} has for_s = {duration:g}; it must be positive")
+    return filled(
+        BASE_MOTION, kind=made, course=course, axis=axis_in(words, title, False), size=size, rise=rise, span=span, every=every,
+        begin=begin, end=max(begin, 0.0) + duration,
+    )  # fmt: skip
+
+
+def placed(motion: Record, origin: float) -> Record:
+    """A motion whose times count from `origin` [s]; one from the start is there at 0, and a step has been there before."""
+    made: Record = motion.copy()
+    if motion["begin"] < 0.0:
+        made["begin"] = -motion["rise"] if motion["course"] == Course.STEP else 0.0
+    else:
+        made["begin"], made["end"] = motion["begin"] + origin, motion["end"] + origin
+    return made
+
+
+def base_motion_of_text(text: str) -> Record:
+    """A motion of the base (dtype `BASE_MOTION`) from text; `at` and `for` do for `at_s` and `for_s`.
+
+    Raises:
+        GoughError: as `base_motion`.
+    """
+    name, which, words = words_of_text(text)
+    if which:
+        raise InputError(f"{text!r} names {which!r} after a colon, and there is one base: leave it out")
+    return base_motion(name.removeprefix(PREFIX), **words)
+
 
 BASE_SIZE = 12
 """Rotation vector [rad], angular velocity [rad/s], angular acceleration [rad/s^2] and acceleration [m/s^2], three of each."""
@@ -43,13 +138,13 @@ def _window(time: float, rise: float) -> tuple[float, float, float]:
 @kernel
 def _course(m: Record, time: float) -> tuple[float, float, float]:
     """The size of a motion at a time since its begin [s], as if it went on for ever, and two derivatives."""
-    if m.course == SETTLE:
+    if m.course == Course.SETTLE:
         left = np.exp(-time / m.span)
         return 1.0 - left, left / m.span, -left / m.span**2
-    if m.course == STEADY:
+    if m.course == Course.STEP or m.course == Course.RAMP:
         return 1.0, 0.0, 0.0
     turns = 2.0 * np.pi / m.span
-    if m.course == PULSES:
+    if m.course == Course.PULSES:
         turns *= 0.5
         if time >= m.every:
             time -= np.floor(time / m.every) * m.every
@@ -85,7 +180,7 @@ def base_motion_at(motions: Record, count: int, time: float, motion: Array) -> N
         m = motions[i]
         size, rate, change = level(m, time)
         for j in range(3):
-            if m.kind == SHAKE:
+            if m.kind == BaseMotionKind.ACCELERATION:
                 motion[9 + j] += size * m.axis[j]
             else:
                 motion[j] += size * m.axis[j]

@@ -86,6 +86,7 @@ FMU_HANDLE = record_dtype(
     base=(np.float64, BASE_SIZE),
     base_motions=(BASE_MOTION, MOST_BASE_MOTIONS),
     base_motion_count=np.int64,
+    base_moved=np.uint8,
     reached=(np.float64, 1),
     flags=(np.uint8, 3),
     changes=(_CHANGE, MOST_CHANGES),
@@ -255,8 +256,11 @@ def write_payload_mass(fmu: Record, mass: float) -> int:
 
 @kernel
 def _move_base(c: Record, time: float) -> int:
-    """Set the motion that the base has at a time [s]; returns FMI's status."""
+    """Set the motion that the base has at a time [s], if it has one or had one; returns FMI's status."""
+    if c.base_motion_count == 0 and c.base_moved == 0:
+        return OK
     base_motion_at(c.base_motions, c.base_motion_count, time, c.base)
+    c.base_moved = 1 if c.base_motion_count > 0 else 0
     return _write(c, _WRITE_BASE, c.based, c.base)
 
 
@@ -276,12 +280,9 @@ def advance(fmu: Record, duration: float) -> int:
                 c, _CHANGE_VALUE, change.function, change.references, change.reference_count, change.values, change.count
             )  # fmt: skip
             c.changed += 1
-        if c.base_motion_count > 0:
-            status |= _move_base(c, c.time + 0.5 * duration / steps)
+        status |= _move_base(c, c.time + 0.5 * duration / steps)
         status |= _step(c, duration / steps)
-    if c.base_motion_count > 0:
-        status |= _move_base(c, c.time)
-    return status
+    return status | _move_base(c, c.time)
 
 
 _INSTANT_S = 1e-9

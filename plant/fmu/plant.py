@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plant.compiled import Record
+from plant.dynamics.base_course import BASE_SIZE, MOST_BASE_MOTIONS
 from plant.errors import FmuError, InputError
-from plant.fmu.binding import OWN_BINDING, Binding, Bound, Modes, Scalars, bind, check_settable, load_binding
+from plant.fmu.binding import BASE, OWN_BINDING, Binding, Bound, Modes, Scalars, bind, check_settable, load_binding
 from plant.fmu.calls import CALLED, FMU_HANDLE, MOST_CHANGES, advance
 from plant.fmu.description_reader import FmuDescription, FmuVariable
 from plant.fmu.instance import NOT_FINITE, OK, FmuInstance
@@ -84,6 +85,17 @@ class FmuPlant(FmuInstance):
         """Free the instance and remove the extracted files; a second call does nothing."""
         self.status = max(self.status, int(self.handle["status"]))
         super().close()
+
+    def move_base(self, motions: Sequence[Record]) -> None:
+        """Let the base move (dtype `plant.dynamics.base_course.BASE_MOTION`) from now on; times count from time 0.
+
+        Raises:
+            InputError: the FMU takes no motion of its base, or there are too many.
+        """
+        check_base(self.path, self.bound, len(motions))
+        for place, motion in enumerate(motions):
+            self.handle["base_motions"][place] = motion
+        self.handle["base_motion_count"] = len(motions)
 
     def step(self, duration: float) -> None:
         """Advance by `duration` [s].
@@ -214,6 +226,14 @@ class FmuPlant(FmuInstance):
         change["references"], change["reference_count"] = references.ctypes.data, references.size
         change["values"], change["count"] = values.ctypes.data, values.size
         return [references, values]
+
+
+def check_base(path: Path, bound: Bound, count: int) -> None:
+    """Check that the base of an FMU can have so many motions, or raise an `InputError`."""
+    if count and bound.based.places.size < BASE_SIZE:
+        raise InputError(f"{path.name} takes no motion of its base: bind {', '.join(BASE)}, or leave the motion out")
+    if count > MOST_BASE_MOTIONS:
+        raise InputError(f"the base has {count} motions, and at most {MOST_BASE_MOTIONS} are possible: leave some out")
 
 
 def check_number_of_legs(path: Path, bound: Bound, legs: int) -> None:

@@ -25,6 +25,7 @@ from hil.runs.emulator_process import _rig_of
 from plant.errors import InputError, UnknownNameError
 from plant.imu import imu_state, load_imu
 from plant.mechanism import load_spatial
+from plant.pose import rotation_from_quaternion
 from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS
 
 MS = 1_000_000
@@ -139,7 +140,8 @@ def test_an_option_that_is_none_is_refused(text):
 
 def test_an_unknown_fault_is_told_with_those_that_there_are():
     with pytest.raises(
-        UnknownNameError, match=r"there is no fault 'imu'; there are imu-frozen, .*, payload-jumps, imu-offset, .*, imu-jitter"
+        UnknownNameError,
+        match=r"there is no fault 'imu'; there are imu-frozen, .*, payload-jumps, imu-offset, .*, imu-jitter, base-tilt",
     ):
         fault("imu:3")
 
@@ -423,6 +425,38 @@ def test_a_noisy_imu_has_noise_of_its_size_on_rates_and_a_tenth_on_forces(made):
     np.testing.assert_allclose(found[:, 1, 2].std(axis=0), 3.0, rtol=0.12)
     np.testing.assert_allclose(found[:, 2, 2], 0.0, atol=1e-12)
     np.testing.assert_allclose(found[:, 0, 2].mean(axis=0), 0.0, atol=0.2 * radians(30.0))
+
+
+# ----------------------------------------------------------------------------------------------------------------- base
+
+
+def test_a_base_that_leans_turns_gravity_for_all_imus_until_the_fault_is_cleared(made):
+    rig = Emulated(made, "base-tilt,axis=x,size_deg=5")
+    p = load_spatial("hexapod").plant_parameters()
+    upright = Emulated(made).step(BRAKED, count=1500).read()
+    for tilt in (5.0, 0.0):
+        readings = rig.step(BRAKED, count=1500).read()
+        to_platform = (about_x(radians(tilt)) @ rotation_from_quaternion(rig.plant.get("quaternion"))).T
+        np.testing.assert_allclose(readings[1, 6], -to_platform @ p["gravity"], atol=0.02)
+        np.testing.assert_allclose(readings[2, 6], to_platform @ p["magnetic_field"], atol=1e-9)
+        assert ((np.linalg.norm(readings[1] - upright[1], axis=1) > 0.3) == (tilt > 0.0)).all()
+        rig.rig["faults"] = 0
+    assert not rig.plant.get("base_motion.rotation").any()
+
+
+def test_the_time_of_a_moving_base_counts_from_when_the_drives_were_enabled(made):
+    rig = Emulated(made, "base-tilt,axis=-y,size_deg=4,at=0.02,ramp_s=0.1,for=0.2").step(BRAKED, count=50)
+    assert not rig.plant.get("base_motion.rotation").any()
+    rig.step(ENABLED, 0.0, count=20)
+    assert not rig.plant.get("base_motion.rotation").any()
+    rig.step(count=50)
+    # In the middle of its ramp.
+    np.testing.assert_allclose(rig.plant.get("base_motion.rotation"), [0.0, -radians(2.0), 0.0], atol=1e-9)
+    np.testing.assert_allclose(rig.plant.get("base_motion.angular_velocity"), [0.0, -1.875 * radians(40.0), 0.0], rtol=1e-7)
+    rig.step(count=60)
+    np.testing.assert_allclose(rig.plant.get("base_motion.rotation"), [0.0, -radians(4.0), 0.0], atol=1e-12)
+    rig.step(BRAKED, count=300)
+    assert not rig.plant.get("base_motion.rotation").any()
 
 
 # ------------------------------------------------------------------------------------------------------------------ bus

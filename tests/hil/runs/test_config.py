@@ -41,7 +41,11 @@ def test_faults_of_imus_are_checked_and_are_for_simulated_ones():
         SimulationConfig(faults=("drive-stuck:1",))
     with pytest.raises(InputError, match="needs one of size_deg"):
         SimulationConfig(faults=("imu-turn:6,axis=z",))
-    with pytest.raises(InputError, match="--fault is for simulated IMUs, not for the rig udp: tell it to 'gough emulate'"):
+    moved = SimulationConfig(faults=(texts[0], "base-tilt,axis=x,size_deg=2,at=3,ramp_s=4"))
+    assert [len(moved.disturbances), len(moved.base_motions)] == [1, 1]
+    with pytest.raises(InputError, match="the base's tilt needs one of size_deg"):
+        SimulationConfig(faults=("base-tilt,axis=z",))
+    with pytest.raises(InputError, match="--fault is for a simulated plant, not for the rig udp: tell it to 'gough emulate'"):
         SimulationConfig(rig="udp", faults=texts)
 
 

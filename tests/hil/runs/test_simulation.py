@@ -17,6 +17,7 @@ from hil.runs.simulation import SimulationStoppedError, simulate
 from plant.errors import InputError, UnknownNameError, UnreachableError
 from plant.fmu.settings import Setting
 from plant.mechanism import load_mechanism
+from plant.pose import rotation_from_quaternion, rotation_from_vector
 
 MM, DEG = 1e-3, np.radians(1.0)
 
@@ -233,3 +234,19 @@ def test_the_loop_allocates_nothing_per_cycle():
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     ten_cycles, many_cycles = map(int, run.stdout.split())
     assert ten_cycles == many_cycles
+
+
+def test_a_simulated_base_tilts_and_the_imus_turn_with_it():
+    """The platform's magnetometer sees the field through the base's attitude, from the time of the motion on."""
+    config = SimulationConfig(
+        target="hold", duration=0.3, imu="ideal", faults=("base-tilt,axis=x,size_deg=3,at=0.1,ramp_s=0.1",)
+    )
+    with prepared_loop(config) as loop:
+        plant, hold = loop.simulated, int(loop.parameters["rig"]["hold_cycles"])
+        for cycle, tilt in ((101, 0.0), (151, 1.5), (290, 3.0)):
+            loop.run(hold + cycle)
+            turn = plant.get("base_motion.rotation")
+            np.testing.assert_allclose(np.degrees(turn), [tilt, 0.0, 0.0], atol=1e-6)
+            attitude = rotation_from_vector(turn) @ rotation_from_quaternion(plant.get("quaternion"))
+            seen = attitude.T @ loop.mechanism.plant["magnetic_field"]
+            np.testing.assert_allclose(plant.get("imu_magnetic_field")[6], seen, atol=1e-9)

@@ -1,6 +1,6 @@
-"""Courses of a base's motion over time: kernels against differences, and against rotations that are put together."""
+"""Courses of a base's motion over time: words, and kernels against differences and against rotations that are put together."""
 
-from math import inf
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,26 +10,20 @@ from plant.compiled import Record
 from plant.dynamics.base_course import (
     BASE_MOTION,
     BASE_SIZE,
-    PULSES,
-    SETTLE,
-    SHAKE,
-    SINE,
-    STEADY,
-    TILT,
+    STEP_S,
+    base_motion,
     base_motion_at,
+    base_motion_of_text,
     level,
+    placed,
 )
+from plant.errors import GoughError
 from plant.pose import Array
 from tests.plant.dynamics.explicit_bodies import derivatives, vector_of
 
 
-def motions(*each: dict[str, object]) -> Record:
-    made: Record = np.zeros(len(each), BASE_MOTION)
-    for one, fields in zip(made, each, strict=True):
-        one["begin"], one["end"], one["every"] = 0.0, inf, inf
-        for name, value in fields.items():
-            one[name] = value
-    return made
+def motions(*each: Record) -> Record:
+    return np.array([placed(one, 0.0) for one in each], BASE_MOTION)
 
 
 def at(made: Record, time: float) -> Array:
@@ -39,10 +33,10 @@ def at(made: Record, time: float) -> Array:
 
 
 TILTS = motions(
-    {"kind": TILT, "course": SINE, "axis": [0.6, 0.0, 0.8], "size": 0.4, "rise": 0.1, "span": 0.7},
-    {"kind": TILT, "course": STEADY, "axis": [0.0, 1.0, 0.0], "size": -0.8, "rise": 0.5, "begin": 0.2, "end": 1.1},
-    {"kind": TILT, "course": SETTLE, "axis": [1.0, 0.0, 0.0], "size": 1.5, "rise": 0.1, "span": 0.3, "begin": 0.3},
-    {"kind": SHAKE, "course": SINE, "axis": [0.0, 0.0, 1.0], "size": 2.0, "rise": 0.1, "span": 0.2},
+    base_motion("tilt", axis=[0.6, 0.0, 0.8], size_deg=23.0, at_s=0.0, sine_hz=1.4),
+    base_motion("tilt", axis="-y", size_deg=46.0, at_s=0.2, for_s=0.9, ramp_s=0.5),
+    base_motion("tilt", axis="x", size_deg=86.0, at_s=0.3, settle_s=0.3),
+    base_motion("acceleration", axis="z", size_m_per_s2=2.0, sine_hz=5.0),
 )
 
 
@@ -52,27 +46,22 @@ def test_rates_are_derivatives_of_the_attitude(time: float) -> None:
     samples = np.array([at(TILTS, time + i * step) for i in range(-3, 4)])
     turns = Rotation.from_rotvec(samples[:, :3]).as_matrix()
     rate = vector_of(turns[3].T @ derivatives(turns, step)[0])
-    np.testing.assert_allclose(samples[3, 3:6], rate, rtol=0.0, atol=1e-9)
-    np.testing.assert_allclose(samples[3, 6:9], derivatives(samples[:, 3:6], step)[0], rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(samples[3, 3:6], rate, rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(samples[3, 6:9], derivatives(samples[:, 3:6], step)[0], rtol=0.0, atol=1e-5)
 
 
-def test_small_and_large_angles_meet(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On both sides of the angle where the formulas change, and at zero."""
-    two = [
-        {"kind": TILT, "course": SINE, "axis": axis, "size": 0.1, "span": span}
-        for axis, span in (([1, 0, 0], 1), ([0, 1, 0], 1.7))
-    ]
-    made = motions(*two)
-    times = np.linspace(1e-3, 0.12, 400)
-    angles = np.array([at(made, t) for t in times])
-    lengths = np.linalg.norm(angles[:, :3], axis=1)
-    assert lengths.min() ** 2 < 1e-3 < lengths.max() ** 2
-    smooth = np.diff(angles[:, 3:9], 3, axis=0)
-    assert np.abs(smooth).max() < 1e-5
+def test_small_and_large_angles_meet() -> None:
+    """Through the angle where the formulas change, without a jump in rate or acceleration."""
+    sines = (base_motion("tilt", axis=axis, size_deg=4.4, at_s=0.0, sine_hz=hz) for axis, hz in (("x", 0.5), ("y", 0.3)))
+    made, times = motions(*sines), np.linspace(0.105, 0.16, 400)
+    values = np.array([at(made, time) for time in times])
+    squares = np.sum(values[:, :3] ** 2, axis=1)
+    assert squares[0] < 1e-3 < squares[-1]
+    assert np.abs(np.diff(values[:, 3:9], 3, axis=0)).max() < 1e-9
 
 
-def test_a_step_and_a_ramp_come_and_go_smoothly() -> None:
-    (ramp,) = motions({"kind": TILT, "course": STEADY, "axis": [1, 0, 0], "size": 2.0, "rise": 4.0, "begin": 1.0, "end": 7.0})
+def test_a_ramp_comes_and_goes_smoothly() -> None:
+    (ramp,) = motions(base_motion("acceleration", axis="x", size_m_per_s2=2.0, at_s=1.0, for_s=6.0, ramp_s=4.0))
     times = np.linspace(0.0, 12.0, 12001)
     values, rates, changes = np.array([level(ramp, t) for t in times]).T
     np.testing.assert_allclose(np.gradient(values, times)[1:-1], rates[1:-1], atol=1e-5)
@@ -82,9 +71,54 @@ def test_a_step_and_a_ramp_come_and_go_smoothly() -> None:
 
 
 def test_pulses_repeat_and_end() -> None:
-    (pulses,) = motions(
-        {"kind": SHAKE, "course": PULSES, "axis": [1, 0, 0], "size": 9.0, "span": 0.01, "every": 0.05, "end": 0.12}
-    )
+    words = {"axis": "x", "size_m_per_s2": 9.0, "pulse_ms": 10.0, "repeat_hz": 20.0, "at_s": 0.0, "for_s": 0.12}
+    (pulses,) = motions(base_motion("acceleration", **words))
     assert level(pulses, 0.005)[0] == pytest.approx(9.0) == level(pulses, 0.105)[0]
     assert level(pulses, 0.03)[0] == 0.0 == level(pulses, 0.155)[0]
     assert at(np.array([pulses]), 0.005)[9:].tolist() == pytest.approx([9.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("base-tilt,axis=x,size_deg=2,at=3,ramp_s=4", {"axis": "x", "size_deg": 2.0, "at_s": 3.0, "ramp_s": 4.0}),
+        ("base-acceleration,axis=0/3/-4,size_g=0.5", {"axis": [0.0, 3.0, -4.0], "size_m_per_s2": 4.903325}),
+        ("base-acceleration,axis=-z,size_g=1,pulse_ms=8,for=2", {"axis": "-z", "size_g": 1, "pulse_ms": 8.0, "for_s": 2.0}),
+    ],
+)
+def test_words_and_text_make_the_same_motion(text: str, words: dict[str, Any]) -> None:
+    assert base_motion_of_text(text) == base_motion(text.split(",")[0].removeprefix("base-"), **words)
+
+
+def test_times_count_from_an_origin_or_from_the_start() -> None:
+    texts = (
+        "base-tilt,axis=x,size_deg=2,at=3,for=2",
+        "base-tilt,axis=x,size_deg=2",
+        "base-tilt,axis=x,size_deg=2,sine_hz=0.25",
+    )
+    later, always, swinging = np.array([placed(base_motion_of_text(text), 1.0) for text in texts], BASE_MOTION)
+    assert level(later, 3.9)[0] == 0.0
+    assert level(later, 4.0 + STEP_S)[0] == pytest.approx(np.radians(2.0)) == level(later, 5.9)[0]
+    assert level(later, 6.0 + STEP_S)[0] == 0.0
+    assert level(always, 0.0) == pytest.approx((np.radians(2.0), 0.0, 0.0))
+    assert level(swinging, 1.0)[0] == pytest.approx(np.radians(2.0))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("base-shift,axis=x,size_deg=2", "no motion 'shift' of a base; there are tilt, acceleration"),
+        ("base-tilt:3,axis=x,size_deg=2", "there is one base"),
+        ("base-tilt,axis=x", "needs one of size_deg, and it has none"),
+        ("base-tilt,axis=x,size_g=2", "size_g"),
+        ("base-tilt,axis=all,size_deg=2", "axis = 'all'; it must be x, -y, z, or a direction"),
+        ("base-tilt,size_deg=2", "axis = None"),
+        ("base-tilt,axis=x,size_deg=much", "size_deg = 'much'; it must be a finite number"),
+        ("base-tilt,axis=x,size_deg=2,for=0", "for_s = 0; it must be positive"),
+        ("base-tilt,axis=x,size_deg=2,imus=3", "imus"),
+        ("base-tilt,axis=x,size_deg=2,ramp_s=1,sine_hz=2", "it has one course"),
+    ],
+)
+def test_what_is_no_motion_of_a_base_is_told(text: str, message: str) -> None:
+    with pytest.raises(GoughError, match=message):
+        base_motion_of_text(text)
