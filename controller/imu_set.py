@@ -9,6 +9,7 @@ from controller.estimation.pose_estimator import PARAMETERS, STATE, WORST_CONDIT
 from controller.inverse_kinematics import sample_workspace
 from controller.rig import RIG, field_of
 from plant.compiled import filled
+from plant.dynamics.variables import TINY
 from plant.errors import InputError
 from plant.imu_wiring import ALL_IMUS, PLATFORM_IMU
 from plant.mechanism import LEGS, Mechanism, six_rows
@@ -18,8 +19,14 @@ _LEAST_FIELD = 5.0
 """Least horizontal magnetic field from which a heading can be taken [uT]."""
 
 _LEAST_OBSERVABILITY = 0.2
-"""Least component of the vertical across both axes of a universal joint at home; with less, gravity does not show the joint's
-angles."""
+"""Least component of the vertical across both axes of a universal joint, anywhere in the workspace; with less, gravity does not
+show the joint's angles, and where it vanishes the two solutions for them meet."""
+
+_MOST_ALONG = 0.99
+"""Greatest component of a leg along the first axis of its joint, which is singular where the two are parallel."""
+
+_LEAST_LEVEL = 1e-6
+"""Least level component of a leg that counts as one."""
 
 
 def imus_of(mechanism: Mechanism, imus: Collection[int] = ALL_IMUS) -> tuple[int, ...]:
@@ -56,20 +63,16 @@ def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool =
             f"gravity hardly tells the angles in the plane of {mechanism.name!r}: of the vertical only {in_plane:.2g} lies in "
             f"it, and {_LEAST_OBSERVABILITY:g} is needed: set the plant's gravity"
         )
-    across = np.abs(mechanism.joint_rotations[:, :, 2] @ mechanism.up_in_base)
-    for leg in range(mechanism.legs):
-        if not mechanism.planar and leg in imus and across[leg] < _LEAST_OBSERVABILITY:
-            raise InputError(
-                f"gravity hardly tells the angles of leg {leg}: of the vertical only {across[leg]:.2g} lies across the axes "
-                f"of its joint, and {_LEAST_OBSERVABILITY:g} is needed: turn base_joint_axes[{leg}], or leave its IMU out"
-            )
+    positions, rotations = sample_workspace(mechanism, 50, seed=0)
+    if not mechanism.planar:
+        _check_joints(mechanism, positions, rotations, imus)
     names = ", ".join(str(imu) for imu in imus_of(mechanism, imus)) or "none"
     if mechanism.planar and PLATFORM_IMU not in imus:
         raise InputError(
             f"the IMUs {names} determine the pose of {mechanism.name!r} up to its two assembly modes at best, which the loop "
             "cannot tell apart: add the platform's IMU (6), whose roll does"
         )
-    worst = float(conditionings(mechanism, *sample_workspace(mechanism, 50, seed=0), imus, magnetometer, section_5).min())
+    worst = float(conditionings(mechanism, positions, rotations, imus, magnetometer, section_5).min())
     if worst < WORST_CONDITIONING:
         remedies = ["legs"]
         if PLATFORM_IMU not in imus:
@@ -81,6 +84,65 @@ def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool =
             f"{worst:.1e}; at least {WORST_CONDITIONING:g} is needed): add {', or '.join(remedies)}"
         )
     return worst
+
+
+def _check_joints(mechanism: Mechanism, positions: Array, rotations: Array, imus: Collection[int]) -> None:
+    """Check that gravity tells the angles of every universal joint whose leg has an IMU, at home and at the N poses."""
+    home, up = mechanism.require_home(), mechanism.up_in_base
+    poses = zip([home.position, *positions], [home.rotation, *rotations], strict=True)
+    directions = np.array([_directions(mechanism, *pose) for pose in poses])
+    for leg in (leg for leg in range(mechanism.legs) if leg in imus):
+        least, most = _joint_shares(directions[:, leg], mechanism.base_joint_axes[leg], up)
+        if least >= _LEAST_OBSERVABILITY and most <= _MOST_ALONG:
+            continue
+        remedy, better = "", _better_axis(directions[:, leg], up)
+        if better is not None:
+            remedy = f"turn base_joint_axes[{leg}], such as to [{', '.join(f'{part:.2f}' for part in better)}], or "
+        if most > _MOST_ALONG:
+            near, needed = np.degrees(np.arccos([most, _MOST_ALONG]))
+            raise InputError(
+                f"within its workspace leg {leg} comes to within {near:.2g} deg of the first axis of its joint, where that is "
+                f"singular; {needed:.2g} deg are needed: {remedy}leave its IMU out"
+            )
+        raise InputError(
+            f"gravity hardly tells the angles of leg {leg}: of the vertical only {least:.2g} lies across the axes of its joint "
+            f"somewhere in its workspace, and {_LEAST_OBSERVABILITY:g} is needed: {remedy}leave its IMU out"
+        )
+
+
+def _joint_shares(directions: Array, axis: Array, up: Array) -> tuple[float, float]:
+    """Of a leg with directions (N, 3), the first one at home: the least component of the vertical across both axes of its
+    joint, counted positive where it has the sign that it has at home, and the leg's greatest component along the first axis.
+    """
+    along = directions @ axis
+    # Across both axes is what of the leg is across the first one.
+    across = (directions - along[:, None] * axis) @ up / np.sqrt(np.maximum(1.0 - along**2, TINY))
+    return float((across * np.sign(across[0])).min()), float(np.abs(along).max())
+
+
+def _better_axis(directions: Array, up: Array) -> Array | None:
+    """A first axis with which gravity tells the angles of a leg with directions (N, 3); None if there is none.
+
+    It lies in the vertical plane of the leg at home. Level, it would be best for a leg that swings little across that plane;
+    across the leg, for one that swings much.
+    """
+    home = directions[0]
+    level = home - home @ up * up
+    level = level if np.linalg.norm(level) > _LEAST_LEVEL else np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    level = level / np.linalg.norm(level)
+    elevations = np.arctan2(home @ up, home @ level) + np.radians(np.arange(30.0, 151.0, 15.0))
+    axes = np.round(np.outer(np.cos(elevations), level) + np.outer(np.sin(elevations), up), 2)
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    shares = np.array([_joint_shares(directions, axis, up) for axis in axes])
+    best = int(np.argmax(np.where(shares[:, 1] <= _MOST_ALONG, shares[:, 0], 0.0)))
+    return axes[best] if shares[best, 0] >= _LEAST_OBSERVABILITY else None
+
+
+def _directions(mechanism: Mechanism, position: Array, rotation: Array) -> Array:
+    """The directions (n, 3) of the legs at a pose."""
+    legs = position + mechanism.platform_joints @ rotation.T - mechanism.base_joints
+    directions: Array = legs / np.linalg.norm(legs, axis=1, keepdims=True)
+    return directions
 
 
 def conditionings(

@@ -118,7 +118,9 @@ def start_leg(
 ) -> None:
     """Start the filter from its first sample, taking the force for gravity.
 
-    Of the two pairs of angles that agree with a vertical, the one nearer to the joint's rest is taken.
+    Two pairs of angles agree with a vertical. Their verticals have opposite components across both axes, and a leg never
+    passes the angle at which that component vanishes, so it has the sign that it has at rest. The other pair is right only
+    where the first has turned the leg by more than a right angle, as in a planar mechanism.
     """
     p, q, r = vector(up_in_joint)
     force = vector(accelerometer)
@@ -126,15 +128,14 @@ def start_leg(
     u0, u1, u2 = force[0] / norm, force[1] / norm, force[2] / norm
     middle = np.arctan2(r, q)
     spread = np.arccos(min(1.0, max(-1.0, u1 / np.sqrt(q * q + r * r))))
-    best = np.inf
-    for sign in (-1.0, 1.0):
+    side = -1.0 if r >= 0.0 else 1.0
+    for sign in (side, -side):
         a = middle + sign * spread
         a -= 2.0 * np.pi * np.rint(a / (2.0 * np.pi))
         z = r * np.cos(a) - q * np.sin(a)
-        b = np.arctan2(p * u2 - z * u0, p * u0 + z * u2)
-        if abs(a) + abs(b) < best:
-            best = abs(a) + abs(b)
-            x[0], x[1] = a, b
+        x[0], x[1] = a, np.arctan2(p * u2 - z * u0, p * u0 + z * u2)
+        if abs(x[1]) <= 0.5 * np.pi:
+            break
     x[2] = gyroscope[0] * np.cos(x[1]) + gyroscope[2] * np.sin(x[1])
     x[3] = gyroscope[1]
     x[4:] = 0.0
