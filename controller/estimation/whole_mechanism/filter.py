@@ -12,8 +12,8 @@ pose that the other IMUs know better.
 
 Samples are averaged over a window of 5 ms; an update takes its 42 scalars one after the other, spread over the cycles until
 the next window is full, so that every cycle costs about the same. What is told of the motion is carried to the present by the
-motion model. The Jacobian is taken at a motion low-passed over 30 ms: at the noisy one, the noise would be taken for
-excitation, and the biases would drift at rest.
+motion model. The Jacobian is taken at a motion low-passed over 30 ms, and at rest while that is within its own uncertainty: at
+the noisy one, the noise would be taken for excitation, and what rest does not tell of the errors would drift.
 """
 
 import numpy as np
@@ -50,6 +50,9 @@ _FIRST_SIGMAS = (0.01, 0.05, 0.1, 0.5, 5.0, 50.0)
 
 _PREPARING_ROWS = 14
 """What prediction costs, in scalar updates."""
+
+_REST_SIGMAS = 3.0
+"""Within how many standard deviations of none a motion counts as none."""
 
 _OFFSET_LASTS_S = 100.0
 """Time in which the offset of the heading may change by as much as its uncertainty at the start [s]."""
@@ -180,6 +183,8 @@ def _predict(p: Record, f: Record, period: float) -> None:
             f.low_passed[1, block, i] += share * (f.low_passed[0, block, i] - f.low_passed[1, block, i])
             # Low-passed once and twice, these have one and two lags.
             f.smooth_motion[block, i] = 2.0 * f.low_passed[0, block, i] - f.low_passed[1, block, i]
+    if np.isfinite(p.smoothing) and _is_at_rest(f):
+        f.smooth_motion[:] = 0.0
     # theta+ = (I + skew(turn)) theta + t d_omega + t^2/2 d_alpha, first by rows and then by columns.
     states = p.states
     r0, r1, r2 = f.turn[0], f.turn[1], f.turn[2]
@@ -214,6 +219,20 @@ def _predict(p: Record, f: Record, period: float) -> None:
             mean = 0.5 * (c[i, j] + c[j, i])
             c[i, j] = mean
             c[j, i] = mean
+
+
+@kernel
+def _is_at_rest(f: Record) -> bool:
+    """Whether no part of the low-passed motion is more than its uncertainty."""
+    for block in range(4):
+        square = variance = 0.0
+        for i in range(3):
+            at = 6 + 3 * block + i
+            square += f.smooth_motion[block, i] ** 2
+            variance += f.covariance[at, at]
+        if square > _REST_SIGMAS**2 * variance:
+            return False
+    return True
 
 
 @kernel

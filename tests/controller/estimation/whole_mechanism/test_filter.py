@@ -135,6 +135,7 @@ class Twin:
 
     def predict(self, t):
         v, w, a, e = self.motion
+        uncertain = np.diag(self.covariance)[6:18].reshape(4, 3).sum(axis=1)
         turn = w * t + e * t * t / 2.0
         transition = np.eye(len(self.covariance))
         for i in range(3):
@@ -160,6 +161,8 @@ class Twin:
         first = first + t / (t + 0.03) * (self.motion - first)
         second = second + t / (t + 0.03) * (first - second)
         self.low_passed, self.smooth = [first, second], 2.0 * first - second
+        if (np.square(self.smooth).sum(axis=1) <= 9.0 * uncertain).all():
+            self.smooth = np.zeros((4, 3))
 
     def by_rig(self):
         """Derivatives (7, 6, 38) of ideal readings by joints and tilt, by differences."""
