@@ -109,4 +109,7 @@ def sample_workspace(mechanism: Mechanism, count: int, seed: int) -> tuple[Array
         lengths = leg_lengths(mechanism, drawn, turned)
         inside = ((lengths > limits.stroke[:, 0]) & (lengths < limits.stroke[:, 1])).all(axis=1)
         positions, rotations = np.concatenate([positions, drawn[inside]]), np.concatenate([rotations, turned[inside]])
-    raise InputError(f"the workspace of {mechanism.name!r} is too small to draw {count} poses: check the strokes")
+    raise InputError(
+        f"the workspace of {mechanism.name!r} is too small to draw {count} poses, with legs of {limits.stroke.mean():.3g} m "
+        f"and a stroke of {np.diff(limits.stroke).min():.3g} m: check the strokes, and that both are in metres"
+    )

@@ -17,7 +17,13 @@ from plant.pose import Array, checked_array, numbers
 SAME_JOINT_M = 1e-9
 """Joints closer than this are one joint."""
 
-_DERIVED = (
+_LARGEST_M = 10.0
+"""Radius and height of the largest mechanisms."""
+
+_LEAST_ROOM = 0.02
+"""Least distance of home from either end of the stroke, as a share of it."""
+
+DERIVED = (
     "base_joints", "platform_joints", "base_joint_axes", "stop.minimum_length", "stop.maximum_length", "initial_position",
     "initial_quaternion", "initial_angle",
 )  # fmt: skip
@@ -27,8 +33,18 @@ _DERIVED = (
 def checked_joints(base_joints: ArrayLike, platform_joints: ArrayLike, shape: tuple[int, int]) -> tuple[Array, Array]:
     """The joints of base and platform, each of `shape`, or an `InputError`."""
     base, platform = checked_array(base_joints, shape, "base_joints"), checked_array(platform_joints, shape, "platform_joints")
+    for name, joints in (("base_joints", base), ("platform_joints", platform)):
+        check_size(f"{name} reach {{:g}} m from their middle", np.linalg.norm(joints - joints.mean(axis=0), axis=1).max())
     check_legs_differ(base, platform)
     return base, platform
+
+
+def check_size(what: str, size: float) -> None:
+    """Check that a length [m] of a mechanism, which the text `what` shows, is not in another unit, or raise an `InputError`."""
+    if size > _LARGEST_M:
+        raise InputError(
+            f"{what.format(size)}; the largest mechanisms have {_LARGEST_M:g} m: lengths are in metres, so write 0.3 for 300 mm"
+        )
 
 
 def check_legs_differ(base: Array, platform: Array) -> None:
@@ -48,7 +64,7 @@ def checked_plant(values: Mapping[str, ArrayLike] | None, table: VariableTable) 
         InputError: wrong shape, out of range, a parameter that follows from the geometry, or an unstable drive.
     """
     parameters = checked_parameters(values or {}, table)
-    for name in parameters.keys() & _DERIVED:
+    for name in parameters.keys() & DERIVED:
         raise InputError(f"the plant's {name} follows from the geometry, the home pose and the limits: leave it out")
     if {"drive.compensation", "drive.nominal_resistance", "motor.resistance"} <= parameters.keys():
         compensated = float(parameters["drive.compensation"] * parameters["drive.nominal_resistance"])
@@ -74,6 +90,10 @@ def _table(content: dict[str, Any]) -> MappingProxyType[str, Any]:
 copyreg.pickle(MappingProxyType, lambda table: (_table, (dict(table),)))
 
 
+_MOST = {"velocity": (10.0, "m/s"), "acceleration": (1e4, "m/s2"), "jerk": (1e8, "m/s3"), "stop_clearance": (1.0, "m")}
+"""The largest plausible limits, and their units."""
+
+
 @dataclass(frozen=True, eq=False)
 class Limits:
     """Limits of the actuators of n legs.
@@ -94,13 +114,17 @@ class Limits:
         for leg, (least, greatest) in enumerate(stroke):
             if not 0.0 < least < greatest:
                 raise InputError(
-                    f"the stroke of leg {leg} runs from {least:g} m to {greatest:g} m; it needs 0 < least < greatest length"
+                    f"the stroke of leg {leg} runs from {least:g} m to {greatest:g} m; it needs 0 < least < greatest length, "
+                    "in metres"
                 )
         for name in ("velocity", "acceleration", "jerk", "stop_clearance"):
             value = float(checked_array(getattr(self, name), (), f"limit of {name}"))
             object.__setattr__(self, name, value)
             if value <= 0.0:
                 raise InputError(f"the limit of {name} is {value:g}; it must be positive")
+            most, unit = _MOST[name]
+            if value > most:
+                raise InputError(f"the limit of {name} is {value:g} {unit}; no leg has more than {most:g}: give it in {unit}")
 
 
 def checked_limits(limits: Mapping[str, Any], legs: int, lengths: Array | None) -> Limits:
@@ -128,3 +152,15 @@ def checked_limits(limits: Mapping[str, Any], legs: int, lengths: Array | None) 
                 "move the home pose or the stroke"
             )
     return checked
+
+
+def check_room(limits: Limits, lengths: Array) -> None:
+    """Check that legs of these lengths (n,) [m], at home, have room either way, or raise an `InputError`."""
+    spans = np.diff(limits.stroke)[:, 0]
+    rooms = np.minimum(lengths - limits.stroke[:, 0], limits.stroke[:, 1] - lengths)
+    leg = int(np.argmin(rooms / spans))
+    if rooms[leg] < _LEAST_ROOM * spans[leg]:
+        raise InputError(
+            f"leg {leg} is {1e3 * rooms[leg]:.3g} mm from an end of its stroke at home, and a run begins and ends there: at "
+            f"least {1e3 * _LEAST_ROOM * spans[leg]:.3g} mm are needed either way; move the home pose or the stroke"
+        )

@@ -9,13 +9,16 @@ from numpy.typing import ArrayLike
 
 from plant.errors import InputError, UnknownNameError
 from plant.files import check_entries, parse_toml, read_text
+from plant.mechanism.checks import checked_joints
 from plant.mechanism.planar import PlanarMechanism, PlanarPose
-from plant.mechanism.spatial import Mechanism
+from plant.mechanism.spatial import LEGS, Mechanism
 from plant.pose import Pose, checked_array, checked_unit, rotation_from_quaternion
 
 _PRESETS = resources.files("plant.mechanism") / "presets"
 
 _JOINTS = ("base_joints", "platform_joints")
+_MUCH_SHORTER = 0.8
+_MOST_MASS_RATIO = 3.0
 _ANY_ENTRY = ("limits", "plant", "control", "fusion", "safety")
 """Tables whose entries are checked by those who read them."""
 
@@ -93,16 +96,34 @@ def mechanism_from_document(document: dict[str, Any]) -> Mechanism | PlanarMecha
         if joints not in document.get("geometry", {}):
             rows = "three rows of two" if planar else "six rows of three"
             raise InputError(f"[geometry] lacks {joints}, an array of {rows} numbers in metres")
+    home = _home(document["home"], planar) if "home" in document else None
+    if isinstance(home, Pose) and "quaternion" in document["home"]:
+        _check_quaternion_order(home, document["home"]["quaternion"], document["geometry"])
     kind: Any = PlanarMechanism if planar else Mechanism
     mechanism: Mechanism | PlanarMechanism = kind.from_legs(
         **document["geometry"],
         name=str(document.get("name", "custom")),
-        home=_home(document["home"], planar) if "home" in document else None,
+        home=home,
         limits=document.get("limits") or None,
         plant=_flattened(document.get("plant", {})),
         settings={name: document.get(name, {}) for name in ("control", "fusion", "safety")},
     )
     return mechanism
+
+
+def _check_quaternion_order(home: Pose, quaternion: Any, geometry: dict[str, Any]) -> None:
+    """Check that the legs would not be much shorter with the quaternion's numbers in the order x, y, z, w."""
+    x, y, z, w = checked_array(quaternion, (4,), "home.quaternion").tolist()
+    base, platform = checked_joints(geometry["base_joints"], geometry["platform_joints"], (LEGS, 3))
+    given, other = (
+        float(np.linalg.norm(home.position + platform @ rotation.T - base, axis=1).mean())
+        for rotation in (home.rotation, rotation_from_quaternion(np.array([w, x, y, z])))
+    )
+    if other < _MUCH_SHORTER * given:
+        raise InputError(
+            f"home.quaternion is {quaternion}, with which the legs are {given:.3g} m long on average; in the order x, "
+            f"y, z, w they would be {other:.3g} m: quaternions are w first, so write {[w, x, y, z]}"
+        )
 
 
 def _preset_names() -> list[str]:
@@ -120,8 +141,28 @@ def _completed(document: dict[str, Any], source: str) -> dict[str, Any]:
             raise InputError(f"based_on goes round in a circle, {' -> '.join(names)}: leave one out")
         preset = parse_toml(mechanism_text(names[-1]), names[-1])
         preset.pop("name", None)
+        _check_inertias(document, preset, names[-1])
         document = _merged(preset, document)
     return document
+
+
+def _check_inertias(document: dict[str, Any], preset: dict[str, Any], name: str) -> None:
+    """Check that no body has a mass of its own, and the inertia of a preset's body of another mass."""
+    for body in ("platform", "payload"):
+        own, under = (_table_of(_table_of(each, "plant"), body) for each in (document, preset))
+        if "inertia" in own or "inertia" not in under or "mass" not in own.keys() & under.keys():
+            continue
+        mass, before = (float(checked_array(each["mass"], (), f"{body}.mass")) for each in (own, under))
+        if mass > _MOST_MASS_RATIO * before or before > _MOST_MASS_RATIO * mass:
+            raise InputError(
+                f"{body}.mass is {mass:g} kg, and {body}.inertia is left as {name}'s, for {before:g} kg: give the "
+                f"inertia in [plant.{body}], too"
+            )
+
+
+def _table_of(table: dict[str, Any], name: str) -> dict[str, Any]:
+    inner = table.get(name, {})
+    return inner if isinstance(inner, dict) else {}
 
 
 def _merged(under: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:

@@ -12,17 +12,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plant.checks import checked_seed
-from plant.dynamics.variables import PLANAR, SPATIAL, TINY, checked_parameters
+from plant.dynamics.variables import PLANAR, SPATIAL, TINY, VariableTable, checked_parameters
 from plant.errors import InputError, UnreachableError
 from plant.mechanism.checks import (
+    DERIVED,
     SAME_JOINT_M,
     Limits,
     check_legs_differ,
+    check_room,
+    check_size,
     checked_joints,
     checked_limits,
     checked_plant,
     read_only,
 )
+from plant.mechanism.loads import check_reach
 from plant.mechanism.planar import PLANAR_LEGS, PlanarMechanism
 from plant.pose import (
     Array,
@@ -104,13 +108,17 @@ class Mechanism:
             limits: the fields of `Limits`; a stroke of (2,) [m] counts from the home lengths, (6, 2) is absolute.
 
         Raises:
-            InputError: geometry, a limit or a parameter that makes no sense.
+            InputError: geometry, a limit or a parameter that makes no sense, or for a run no room about home or limits
+                that the drives do not reach.
             UnknownNameError: a plant parameter that does not exist.
         """
         base, platform = checked_joints(base_joints, platform_joints, (LEGS, 3))
         _check_spread(base, platform)
         if home is not None:
             home = Pose(checked_array(home.position, (3,), "home.position"), checked_rotation(home.rotation, "home.rotation"))
+            check_size(
+                "home.position is {:g} m from the middle of the base", float(np.linalg.norm(home.position - base.mean(axis=0)))
+            )
         up = checked_unit(up_in_base, 3, "up_in_base")
         directions = _home_directions(base, platform, home, up)
         parameters = checked_plant(plant, SPATIAL)
@@ -127,7 +135,7 @@ class Mechanism:
             limits=None if limits is None else checked_limits(limits, LEGS, lengths),
             plant=parameters,
             settings=read_only(settings),
-        )
+        )._fit_to_run()
 
     @classmethod
     def from_planar(cls, planar: PlanarMechanism) -> "Mechanism":
@@ -152,7 +160,15 @@ class Mechanism:
             limits=planar.limits,
             plant=planar.plant,
             settings=planar.settings,
-        )
+        )._fit_to_run()
+
+    def _fit_to_run(self) -> "Mechanism":
+        """This mechanism. If it has all that a run needs, home and limits must leave room, and the drives must reach them."""
+        if self.home is not None and self.limits is not None and not self._lacking():
+            arms = self.platform_joints @ self.home.rotation.T
+            check_room(self.limits, np.linalg.norm(self.home.position + arms - self.base_joints, axis=1))
+            check_reach(self)
+        return self
 
     @property
     def legs(self) -> int:
@@ -257,11 +273,17 @@ class Mechanism:
             "initial_angle": np.arctan2(start.rotation[1, 0], start.rotation[0, 0]),
             **self.plant,
         }
-        table = PLANAR if self.planar else SPATIAL
-        names = [variable.name for variable in table.parameters]
-        if missing := [name for name in names if name not in values]:
+        if missing := self._lacking():
             raise InputError(f"the mechanism {self.name!r} lacks plant parameters: {', '.join(missing)}")
-        return checked_parameters({name: values[name] for name in names}, table)
+        return checked_parameters({variable.name: values[variable.name] for variable in self._table.parameters}, self._table)
+
+    @property
+    def _table(self) -> VariableTable:
+        return PLANAR if self.planar else SPATIAL
+
+    def _lacking(self) -> list[str]:
+        """The plant's parameters that follow from nothing."""
+        return [each.name for each in self._table.parameters if each.name not in {*self.plant, *DERIVED}]
 
 
 def _check_spread(base: Array, platform: Array) -> None:

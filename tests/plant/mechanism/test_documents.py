@@ -227,3 +227,70 @@ def test_a_mechanism_arrives_in_another_process_bit_for_bit(name: str) -> None:
     for table in (came.plant, came.settings):
         with pytest.raises(TypeError):
             table["mass"] = 1.0
+
+
+# ---- what is hardly meant ----
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        # The order x, y, z, w: no turn, read as a half turn about z, with which the legs cross.
+        ('based_on = "hexapod"\n[home]\nquaternion = [0.0, 0.0, 0.0, 1.0]', r"w first, so write \[1.0, 0.0, 0.0, 0.0\]"),
+        ('based_on = "hexapod"\n[home]\nquaternion = [0, 0, 0.0348995, 0.9993908]', r"0\.\d+ m: quaternions are w first"),
+        ('based_on = "6-3-I"\n[home]\nquaternion = [0.0, 0.0, 0.0, -1.0]', r"write \[-1.0, 0.0, 0.0, 0.0\]"),
+        # Other units.
+        (
+            'based_on = "hexapod"\n[geometry]\nbase_joints = ' + str((1e3 * np.array(BASE)).tolist()),
+            "base_joints reach 304.795 m from their middle; the largest mechanisms have 10 m: lengths are in metres, so write",
+        ),
+        (
+            replaced("platform_joints = ", "platform_joints = " + str((1e3 * np.array(PLATFORM)).tolist()) + "#"),
+            "platform_joints reach 19",
+        ),
+        (
+            replaced("position = [0.0, 0.0, 0.35]", "position = [0, 0, 350]"),
+            "home.position is 350 m from the middle of the base",
+        ),
+        (replaced("[-0.05, 0.05]", "[-50, 50]"), "it needs 0 < least < greatest length, in metres"),
+        ('based_on = "hexapod"\n[limits]\nvelocity = 400.0', "velocity is 400 m/s; no leg has more than 10: give it in m/s"),
+        # Home at an end of the stroke.
+        (
+            'based_on = "hexapod"\n[limits]\nstroke = [0.0, 0.1]',
+            "leg 0 is .* mm from an end of its stroke at home, and a run .*: at least 2 mm",
+        ),
+        ('based_on = "hexapod"\n[limits]\nstroke = [-0.1, 0.001]', "leg 0 is 1 mm from an end of its stroke at home"),
+        # Another mass with the old inertia.
+        (
+            'based_on = "hexapod"\n[plant.platform]\nmass = 60.0',
+            r"platform.mass is 60 kg, and platform.inertia is left as hexapod's, for 3 kg: give the inertia in \[plant.plat",
+        ),
+        ('based_on = "genhexkins"\n[plant.payload]\nmass = 1', "payload.inertia is left as genhexkins's, for 15 kg"),
+        # What the drives cannot do.
+        (
+            'based_on = "hexapod"\n[limits]\nvelocity = 2.0',
+            r"leg \d reaches 0\.3\d+ m/s at home with its drive.voltage_limit of 24 V",
+        ),
+    ],
+)
+def test_what_is_hardly_meant_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        load_mechanism(write(tmp_path, text))
+    assert str(caught.value).count("\n") == 0 and "mine.toml" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        # A frame {2} that is turned by half a turn, with joints to match.
+        f"[geometry]\nbase_joints = {BASE}\nplatform_joints = {[[-x, -y, z] for x, y, z in PLATFORM]}\n"
+        "[home]\nposition = [0, 0, 0.35]\nquaternion = [0.0, 0.0, 0.0, 1.0]\n[limits]\nstroke = [-0.05, 0.05]",
+        'based_on = "hexapod"\n[home]\nquaternion = [0.9961947, 0.0, 0.0, 0.0871557]',
+        'based_on = "hexapod"\n[limits]\nstroke = [-0.01, 0.05]',
+        'based_on = "hexapod"\n[plant.payload]\nmass = 5.0',
+        'based_on = "hexapod"\n[plant.platform]\nmass = 12.0\ninertia = [[0.12, 0, 0], [0, 0.12, 0], [0, 0, 0.24]]',
+        'based_on = "planar-3rpr"\n[home]\nangle = -0.41',
+    ],
+)
+def test_what_is_unusual_and_right_is_taken(tmp_path: Path, text: str) -> None:
+    load_in_space(write(tmp_path, text))
