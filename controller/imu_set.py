@@ -1,4 +1,4 @@
-"""Which sets of IMUs can be used: whether they determine the pose everywhere in the workspace."""
+"""Which sets of IMUs can be used: whether they determine the pose everywhere in the workspace, and check each other."""
 
 from collections.abc import Collection
 
@@ -8,6 +8,7 @@ from controller.direct_kinematics.geometry import geometry_of
 from controller.estimation.pose_estimator import PARAMETERS, STATE, WORST_CONDITIONING, find_pose
 from controller.inverse_kinematics import sample_workspace
 from controller.rig import RIG, field_of
+from controller.settings import FusionSettings
 from plant.compiled import filled
 from plant.dynamics.variables import TINY
 from plant.errors import InputError
@@ -27,6 +28,12 @@ _MOST_ALONG = 0.99
 
 _LEAST_LEVEL = 1e-6
 """Least level component of a leg that counts as one."""
+
+_LEAST_SHARE = 0.08
+"""How much of an IMU's error must show in what the pose leaves over."""
+
+_SINGULAR = 1e-12
+"""Directions with a smaller share of the information are those in which a planar mechanism cannot move."""
 
 
 def imus_of(mechanism: Mechanism, imus: Collection[int] = ALL_IMUS) -> tuple[int, ...]:
@@ -143,6 +150,74 @@ def _directions(mechanism: Mechanism, position: Array, rotation: Array) -> Array
     legs = position + mechanism.platform_joints @ rotation.T - mechanism.base_joints
     directions: Array = legs / np.linalg.norm(legs, axis=1, keepdims=True)
     return directions
+
+
+def integrity_remark(
+    mechanism: Mechanism, fusion: FusionSettings, imus: Collection[int] = ALL_IMUS, magnetometer: bool = False
+) -> str:
+    """What a user should know of IMUs that hardly check each other, in a line; "" of those that do.
+
+    The error of an IMU has two components, in a planar mechanism one. As many numbers beyond those that the pose needs tell
+    that there is an error, and twice as many whose it is. How an error moves the pose is that of least squares at home.
+    """
+    measured = _measured_rows(mechanism, fusion, imus, magnetometer)
+    whole = np.vstack([rows for rows, _ in measured.values()])
+    covariance = np.linalg.pinv(whole.T @ whole, rcond=_SINGULAR, hermitian=True)
+    components, needed = (1, 3) if mechanism.planar else (2, 6)
+    spare = len(whole) - needed
+    shares = {imu: np.linalg.eigvalsh(np.eye(len(rows)) - rows @ covariance @ rows.T)[0] for imu, (rows, _) in measured.items()}
+    blind = [imu for imu, share in shares.items() if share < _LEAST_SHARE]
+    if spare >= 2 * components and not blind:
+        return ""
+    shifts = {imu: np.radians(1.0) * (covariance @ rows.T) / sigmas for imu, (rows, sigmas) in measured.items()}
+    moved, turned = ({imu: np.linalg.norm(shift[part], 2) for imu, shift in shifts.items()} for part in (slice(3), slice(3, 6)))
+    suspects = blind or [*measured]
+    far, names = max(suspects, key=lambda imu: moved[imu]), ", ".join(map(str, measured))
+    whose = "one of them" if len(suspects) == len(measured) else f"IMU {', '.join(map(str, suspects))}"
+    told = "is told, but not whose it is" if spare >= components and not blind else "is not told"
+    remedy = "" if len(measured) == len(imus_of(mechanism)) else ": add IMUs"
+    return (
+        f"the IMUs {names} hardly check each other: an error of {whose} {told}, and 1 deg of IMU {far} moves the pose by "
+        f"{1e3 * moved[far]:.1f} mm and {np.degrees(turned[far]):.1f} deg{remedy}"
+    )
+
+
+def _measured_rows(
+    mechanism: Mechanism, fusion: FusionSettings, imus: Collection[int], magnetometer: bool
+) -> dict[int, tuple[Array, Array]]:
+    """By IMU, how its direction changes across itself with a small move (6,) of the platform at home, over its standard
+    deviations, and these [rad].
+    """
+    home = mechanism.require_home()
+    arms = mechanism.platform_joints @ home.rotation.T
+    legs = home.position + arms - mechanism.base_joints
+    rows: dict[int, tuple[Array, Array]] = {}
+    for imu in imus_of(mechanism, imus):
+        if imu == PLATFORM_IMU:
+            turns = [np.cross(mechanism.up_in_base, t) for t in _across(mechanism, mechanism.up_in_base)]
+            sigmas = [fusion.tilt_sigma] * len(turns)
+            if magnetometer:
+                turns.append(mechanism.up_in_base)
+                sigmas.append(fusion.heading_sigma)
+            jacobian = np.hstack([np.zeros((len(turns), 3)), turns])
+        else:
+            length = np.linalg.norm(legs[imu])
+            sideways = _across(mechanism, legs[imu] / length)
+            jacobian = np.hstack([sideways, np.cross(arms[imu], sideways)]) / length
+            sigmas = [fusion.leg_sigma] * len(jacobian)
+        if mechanism.planar:
+            jacobian[:, 2:5] = 0.0
+        rows[imu] = jacobian / np.array(sigmas)[:, None], np.array(sigmas)
+    return rows
+
+
+def _across(mechanism: Mechanism, direction: Array) -> Array:
+    """The unit vectors (2, 3) across a direction (3,); of a planar mechanism the one in its plane (1, 3)."""
+    if mechanism.planar:
+        t = np.cross([0.0, 0.0, 1.0], direction)
+        return np.array([t / np.linalg.norm(t)])
+    across: Array = np.linalg.svd(direction[None])[2][1:]
+    return across
 
 
 def conditionings(

@@ -4,10 +4,15 @@ One matrix, the gain, holds `T S` and the mounting, and the offset holds `T S b`
 A file gives bias, scale, axes and mounting of each sensor of each IMU:
 
     gain = R(mounting) T(axes) diag(scale),  T = I + upper triangle (xy, xz, yz),  R that of a rotation vector
+
+A file that gough writes begins with a digest of all that follows, except comments and layout: a cut or a change shows. What a
+file written by hand leaves out counts as free of errors, which `Calibration.remark` says.
 """
 
+import hashlib
 import json
-from collections.abc import Mapping
+import tomllib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -20,7 +25,7 @@ from controller.estimation.whole_mechanism.imu_errors import ERRORS
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import InputError
 from plant.files import check_entries, read_toml, write_whole
-from plant.mechanism import LEGS
+from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, checked_array, rotation_from_vector, vector_from_rotation
 
 SENSORS = ("gyroscope", "accelerometer", "magnetometer")
@@ -29,6 +34,8 @@ _FIELDS = {"bias": np.zeros(3), "scale": np.ones(3), "axes": np.zeros(3), "mount
 _SIDES = ("base", "platform")
 _LEAST_MOVE_M = 1e-9
 _MOST_TILT = 0.8
+_MOST_LISTED = 4
+_DIGEST_SIZE = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +49,8 @@ class Calibration:
         joints: (2, 6, 3) [m], corrections of the mechanism's base and platform joints.
         floor: (2,) [m, rad], standard deviations of position and rotation that tilt and joints leave.
         covariance: (147, 147), of the remaining errors, in the order of `imu_errors.ERROR_NAMES` for each IMU, if it is known.
-        about: further facts: date, residuals, source of the data.
+        about: further facts: the rig (`calibrated_rig`), date, residuals.
+        remark: what its file does not tell, in a line; "" if it tells all.
     """
 
     gain: Array = field(default_factory=lambda: np.tile(np.eye(3), (3, IMU_COUNT, 1, 1)))
@@ -52,6 +60,7 @@ class Calibration:
     floor: Array = field(default_factory=lambda: np.zeros(2))
     covariance: Array | None = None
     about: dict[str, Any] = field(default_factory=dict)
+    remark: str = ""
 
     def apply(self, measurements: Array) -> Array:
         """Calibrated measurements (..., 3, 7, 3) of raw ones."""
@@ -88,16 +97,47 @@ def join_gain(scale: Array, axes: Array, mounting: Array) -> Array:
     return gain
 
 
+def calibrated_rig(mechanism: Mechanism, imu: str) -> dict[str, str]:
+    """What a file tells in `about` of the rig that it is of: the mechanism, its geometry as a digest, and the kind of IMU."""
+    arrays = [mechanism.base_joints, mechanism.platform_joints, mechanism.base_joint_axes]
+    arrays += [mechanism.plant[name] for name in ("leg_imu_position", "platform_imu_position") if name in mechanism.plant]
+    geometry = _hash(json.dumps([(np.round(array, 9) + 0.0).tolist() for array in arrays]))
+    return {"mechanism": mechanism.name, "geometry": geometry, "imu": imu}
+
+
+def calibration_for(path: Path | str, mechanism: Mechanism, imu: str) -> Calibration:
+    """Read a calibration file for a mechanism with IMUs of this kind, a preset's name.
+
+    Raises:
+        InputError: as `load_calibration`, or the file is of another mechanism, geometry or kind of IMU.
+    """
+    calibration = load_calibration(path)
+    compared = {
+        "mechanism": ("mechanism", "give that with --mechanism"),
+        "geometry": ("geometry", f"joints, axes or places of the IMUs of {mechanism.name!r} have changed since"),
+        "imu": ("kind of IMU", "give that with --imu"),
+    }
+    for name, used in calibrated_rig(mechanism, imu).items():
+        what, remedy = compared[name]
+        if (of := calibration.about.get(name, used)) != used:
+            raise InputError(
+                f"{path} is a calibration of the {what} {of!r}, and this run has {used!r}: {remedy}, or calibrate this "
+                "rig with 'gough calibrate rig'"
+            )
+    return calibration
+
+
 def load_calibration(path: Path | str) -> Calibration:
     """Read a calibration file.
 
     Raises:
-        InputError: there is no such file, or it is malformed; the message names the entry.
+        InputError: there is no such file, it is malformed, or it was cut off or changed; the message names the entry.
     """
     document = read_toml(path)
     for name, table in document.items():
         if not isinstance(table, dict):
             raise InputError(f"{path}: {name} must be a table, got {table!r}")
+    remark = _check_whole(document, path)
     about, base, joints = (document.pop(name, {}) for name in ("about", "base", "joints"))
     remaining = document.pop("covariance", None)
     calibration = Calibration(about=about)
@@ -118,7 +158,53 @@ def load_calibration(path: Path | str) -> Calibration:
         raise InputError(f"{path}: base.tilt must be within {_MOST_TILT:g} rad of level, and base.floor not negative")
     moves = [checked_array(joints.get(side, np.zeros((LEGS, 3))), (LEGS, 3), f"{path}: joints.{side}") for side in _SIDES]
     covariance = None if remaining is None else _read_covariance(remaining, path)
-    return replace(calibration, tilt=tilt, floor=floor, joints=np.stack(moves), covariance=covariance)
+    return replace(calibration, tilt=tilt, floor=floor, joints=np.stack(moves), covariance=covariance, remark=remark)
+
+
+def _check_whole(document: dict[str, Any], path: Path | str) -> str:
+    """Check the digest of a file, which is then removed; returns what the file does not tell, or "".
+
+    Raises:
+        InputError: the file was cut off or changed, or holds no constants.
+    """
+    about = document.get("about", {})
+    written, lacking = about.pop("digest", None), _lacking(document)
+    what = f"it lacks {_listed(lacking)}" if lacking else "nothing is missing"
+    if written is not None and written != _digest(document):
+        raise InputError(
+            f"{path} was cut off or changed after it was written, as its digest shows ({what}): calibrate again; if you have "
+            "changed it on purpose, remove its digest"
+        )
+    if not document.keys() - {"about"}:
+        raise InputError(f"{path} holds no constants: it is empty or was cut off; calibrate again")
+    if written is None and lacking and "version" in about:
+        raise InputError(f"{path} was cut off, as gough {about['version']} writes all constants and {what}: calibrate again")
+    untold = [] if written else ["no digest, which would show a cut or a change"]
+    untold += [f"no {name}" for name in ("mechanism", "imu") if name not in about]
+    untold += [f"nothing of {_listed(lacking)}, taken as free of errors"] if lacking else []
+    return f"{path} has {'; '.join(untold)}" if untold else ""
+
+
+def _lacking(document: Mapping[str, Any]) -> list[str]:
+    """The sensors of which a file lacks a constant, and the tables that gough always writes."""
+    names = [f"imu_{imu}.{sensor}" for imu, sensor in product(range(IMU_COUNT), SENSORS)]
+    found = {f"{name}.{sensor}": entries for name, table in document.items() for sensor, entries in table.items()}
+    lacking = [name for name in names if not (isinstance(found.get(name), dict) and found[name].keys() >= _FIELDS.keys())]
+    return lacking if "base" in document else [*lacking, "base"]
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = len(names) - _MOST_LISTED
+    return ", ".join(names[:_MOST_LISTED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _digest(document: Mapping[str, Any]) -> str:
+    """Of what a file says, whatever its comments, layout and order of entries."""
+    return _hash(json.dumps(document, sort_keys=True, default=str))
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:_DIGEST_SIZE]
 
 
 def _read_sensor(calibration: Calibration, sensor: int, imu: int, entries: Any, where: str) -> None:
@@ -149,17 +235,20 @@ def _read_covariance(table: dict[str, ArrayLike], path: Path | str) -> Array:
 
 
 def save_calibration(path: Path, calibration: Calibration) -> None:
-    """Write a calibration file.
+    """Write a calibration file, with a digest of its content.
 
     Raises:
         InputError: a gain that no sensor has.
         OSError: it cannot be written.
     """
-    lines = [
+    head = [
         "# Calibration of the IMUs: 0 to 5 on the legs, 6 on the platform.",
         "# calibrated = R(mounting) T(axes) S(scale) (raw + bias)",
+        "# Whoever changes a number removes the digest.",
         "",
         "[about]",
+    ]
+    lines = [
         *_entries(calibration.about),
         "",
         "# By which the vertical is turned about x and y, in rad; what tilt and joints leave of the pose, in m and rad.",
@@ -187,7 +276,8 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
             *(f"    [{', '.join(f'{value:.6g}' for value in row[: i + 1])}]," for i, row in enumerate(factor)),
             "]",
         ]
-    write_whole(path, ("\n".join(lines) + "\n").encode())
+    digest = _digest(tomllib.loads("\n".join(["[about]", *lines])))
+    write_whole(path, ("\n".join([*head, *_entries({"digest": digest}), *lines]) + "\n").encode())
 
 
 def _entries(values: Mapping[str, Any]) -> list[str]:

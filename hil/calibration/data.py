@@ -77,6 +77,7 @@ class CalibrationData:
     """The rests of all runs so far.
 
     Attributes:
+        imu: the kind of IMU, a preset's name.
         fusion: settings of the sensors.
         zero: (7, 3) [rad/s], the gyroscopes' offsets.
         readings: (R, 7, 6), mean rates and forces of each rest.
@@ -85,7 +86,7 @@ class CalibrationData:
 
     def __init__(self, mechanism: Mechanism, imu: str, rate: float, knowledge: Knowledge, seed: int) -> None:
         """Start without a rest; `rate` is in Hz, and `seed` that of the noise of measured lengths."""
-        self.mechanism, self.rate, self.knowledge = mechanism, rate, knowledge
+        self.mechanism, self.imu, self.rate, self.knowledge = mechanism, imu, rate, knowledge
         self.fusion = sensor_settings(mechanism, load_imu(imu))
         self.zero = np.zeros((IMU_COUNT, 3))
         self.readings = np.zeros((0, IMU_COUNT, 6))

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from controller.calibration.at_rest import RestCalibration
-from controller.calibration.file import Calibration, save_calibration
+from controller.calibration.file import Calibration, calibrated_rig, save_calibration
 from controller.calibration.in_motion import calibrate_in_motion
 from controller.estimation.whole_mechanism.parameters import ALL_ERRORS
 from controller.planning.motions import REST_S
@@ -177,7 +177,7 @@ def _finish(
     about = {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "version": version("gough"),
-        "mechanism": data.mechanism.name,
+        **calibrated_rig(data.mechanism, data.imu),
         **{f"residual_{name}_mg": round(value, 4) for name, value in summary["residual_mg"].items()},
     }
     result = calibration if known is None else known

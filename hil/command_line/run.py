@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from hil.command_line import cli
 from hil.command_line.apart import go_on_apart
-from hil.command_line.terminal import QUANTILES, deg, live_view, mm, progress_bar
+from hil.command_line.terminal import QUANTILES, deg, live_view, mm, progress_bar, say
 from hil.realtime.scheduling import RealTimeSettings, keep_to_one_thread
 from hil.runs.config import SimulationConfig
 from hil.table import Cell, Table
@@ -53,7 +53,7 @@ def gough_simulate(options: Namespace) -> None:
     stopped = None
     with progress_bar(f"{config.mechanism} follows {config.target}") as progress:
         try:
-            result = simulate(config, progress, resumed, save_at)
+            result = simulate(config, progress, resumed, save_at, say)
         except SimulationStoppedError as error:
             stopped, result = error, error.result
     if result.snapshot is not None and options.save_state is not None:
@@ -137,7 +137,7 @@ def gough_run(options: Namespace) -> int:
     stopped: Exception | None = None
     with live_view(config.mechanism, config.target, config.rate) as show:
         try:
-            summary = run(config, settings, options.record, show)
+            summary = run(config, settings, options.record, show, say=say)
         except RunStoppedError as error:
             if error.summary is None:
                 raise

@@ -20,6 +20,11 @@ _COMPILED_FUNCTIONS = 280
 """How many functions numba compiles for the first simulation on a machine."""
 
 
+def say(text: str) -> None:
+    """Print a line that is no result."""
+    print(text, file=sys.stderr)
+
+
 def mm(metres: float, digits: int = 3) -> str:
     """A length [m] in millimetres."""
     return f"{1e3 * metres:.{digits}f}"

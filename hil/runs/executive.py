@@ -34,6 +34,7 @@ from controller.safety.causes import Cause, Reaction
 from hil.loop.driver import Loop, prevent_compilation, stop_quickly
 from hil.loop.records import LINK_SIZE, RECORD, Link, StopRequest, shared_array
 from hil.loop.stage_times import over_budget
+from hil.progress import Say, say_nothing
 from hil.realtime.clock import REAL, new_clock
 from hil.realtime.processes import FORK, PATIENCE_S, join_or_kill, started
 from hil.realtime.scheduling import RealTimeSettings, real_time, since_process_start, usage
@@ -71,6 +72,7 @@ def run(
     recording: Path | None = None,
     show: Callable[[RunState], None] = lambda state: None,
     rig: Callable[[Loop], Rig] | None = None,
+    say: Say = say_nothing,
 ) -> dict[str, Any]:
     """Run the closed loop on the machine's clock, to the end of its motion or until it is asked to stop.
 
@@ -82,13 +84,14 @@ def run(
         recording: the MCAP file to write.
         show: called ten times a second.
         rig: makes a rig in Python, in the loop's process, instead of the configuration's. Its threads must have ended then.
+        say: called with each remark before the loop runs.
 
     Returns:
         The summary: `cause` of the stop, `cycles`, missed periods by cause, `timing_us` and which of it is `over_budget`,
         `target_stretch` (`controller.planning.pace`), `errors_m`, the number of cycles `unseen` by these, `usage` of the loop's
-        thread, `start_up_s`, `recording` (files, cycles lost), `refused`, `events`, `config`, `version`; of a rig on a bus
-        `identity`, `late` exchanges, `refused_packets` and `round_trip_bars`; and of a dry run the `obstacle` to arming, "" if
-        there is none.
+        thread, `start_up_s`, `recording` (files, cycles lost), `remarks`, `refused`, `events`, `config`, `version`; of a rig on
+        a bus `identity`, `late` exchanges, `refused_packets` and `round_trip_bars`; and of a dry run the `obstacle` to arming,
+        "" if there is none.
 
     Raises:
         GoughError: something in the configuration or the settings cannot be used; nothing has run.
@@ -111,6 +114,8 @@ def run(
         at_end.callback(_end, loop, link, leftovers)
         leftovers.append(_prepared(ours, loop, link, show, state))
         header, state.refused = _prepared(ours, loop, link, show, state)
+        for remark in header["config"]["remarks"]:
+            say(remark)
         recorders.start(header)
         with contextlib.suppress(BrokenPipeError):
             ours.send("go")
@@ -244,7 +249,13 @@ def _prepare_and_follow(
         loop.clock = new_clock(REAL, round(1e9 / config.rate))
         run_id = f"{time.time_ns():x}-{os.getpid()}"
         header = {
-            "config": {**asdict(config), "mechanism_name": loop.mechanism.name, "version": version("gough"), "run": run_id},
+            "config": {
+                **asdict(config),
+                "mechanism_name": loop.mechanism.name,
+                "version": version("gough"),
+                "run": run_id,
+                "remarks": list(loop.remarks),
+            },
             "parameters": loop.parameters,
             "reference": loop.segments,
         }
@@ -274,6 +285,7 @@ def _prepare_and_follow(
             "cause": ": ".join(filter(None, [loop.reason(), loop.failure or getattr(rig, "failure", "")])),
             "cycles": int(link[Link.HEAD]),
             **{name: int(loop.clock[name]) for name in ("missed_late", "missed_own", "missed_host")},
+            "remarks": list(loop.remarks),
             "usage": used,
             "identity": header["config"].get("identity"),
             "target_stretch": 1.0 if config.streamed else required_stretch(loop.mechanism, loop.target),

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from controller.calibration.file import Calibration, load_calibration
+from controller.calibration.file import Calibration, calibration_for
 from controller.cycle import STATE, cycle_parameters
-from controller.imu_set import imus_of
+from controller.imu_set import imus_of, integrity_remark
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.offline_planner import Reference, plan
 from controller.planning.plan_handover import rest
@@ -56,6 +56,7 @@ class PreparedLoop(Loop):
     reference: Reference
     end: int  # the cycle after the last of the motion
     planning_time: float  # [s]
+    remarks: tuple[str, ...]  # what a user should know before it runs, a line each
 
     @property
     def simulated(self) -> FmuPlant:
@@ -86,7 +87,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         if config.rig == "fmu" and config.plant is None:
             # The FMU is built while kernels compile.
             fmu = stack.enter_context(building_default_fmu(model_of(nominal)))
-        calibration = Calibration() if config.calibration is None else load_calibration(config.calibration)
+        calibration = Calibration() if config.calibration is None else calibration_for(config.calibration, nominal, config.imu)
         if nominal.planar:
             check_legs(config.rig, nominal)
             _check_planar(config, calibration)
@@ -105,6 +106,10 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             config.fusion == "section-5", safety.for_raw_imus() if config.raw_imus else safety,
             0.0 if config.rig == "fmu" else period, config.arm,
         )  # fmt: skip
+        remarks = [
+            calibration.remark,
+            integrity_remark(mechanism, fusion, config.imus, config.magnetometer),
+        ]
         count = int(parameters["rig"]["hold_cycles"]) + round(config.duration * config.rate)
         if records is None:
             _check_memory(config, count)
@@ -132,6 +137,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             target=target,
             reference=reference,
             planning_time=planning_time,
+            remarks=tuple(filter(None, remarks)),
         )
         loop.load(python=config.fusion == "filterpy")
         yield loop

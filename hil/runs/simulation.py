@@ -13,7 +13,7 @@ from controller.planning.pace import required_stretch
 from controller.planning.target import Target
 from controller.safety.causes import Cause
 from hil.loop.records import COMPUTED
-from hil.progress import Progress, no_progress
+from hil.progress import Progress, Say, no_progress, say_nothing
 from hil.realtime.durations import QUANTILES, percentiles
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import PreparedLoop, prepared_loop
@@ -48,6 +48,7 @@ class SimulationResult:
         reference_positions, reference_rotations: (N, 3) [m] and (N, 3, 3), the planned poses.
         target_positions, target_rotations: (N, 3) [m] and (N, 3, 3), the raw target.
         real_time_factor: simulated time over the time that planning and loop took.
+        remarks: what was said before it began.
     """
 
     config: SimulationConfig
@@ -62,6 +63,7 @@ class SimulationResult:
     target_rotations: Array
     real_time_factor: float
     snapshot: Snapshot | None
+    remarks: tuple[str, ...]
 
     @property
     def moved(self) -> bool:
@@ -102,13 +104,18 @@ class SimulationResult:
             "target_stretch": required_stretch(self.mechanism, self.target),
             "real_time_factor": self.real_time_factor,
             "cycle_us": percentiles(self.records["stage_ns"][:, COMPUTED].sum(axis=1), tuple(QUANTILES)),
+            "remarks": list(self.remarks),
             "config": asdict(self.config),
             "version": version("gough"),
         }
 
 
 def simulate(
-    config: SimulationConfig, progress: Progress = no_progress, resumed: Snapshot | None = None, save_at: float | None = None
+    config: SimulationConfig,
+    progress: Progress = no_progress,
+    resumed: Snapshot | None = None,
+    save_at: float | None = None,
+    say: Say = say_nothing,
 ) -> SimulationResult:
     """Run a simulation.
 
@@ -117,6 +124,7 @@ def simulate(
         progress: called with the share of the run that is done.
         resumed: where to go on; the result then covers the rest of the run.
         save_at: the time in the motion at which to take a snapshot [s], its duration for the end; None for never.
+        say: called with each remark before the loop runs.
 
     Raises:
         GoughError: something in the configuration cannot be used; nothing has run.
@@ -127,6 +135,8 @@ def simulate(
     if config.fusion == "filterpy" and (resumed is not None or save_at is not None):
         raise InputError("filters on filterpy cannot be saved: choose another fusion")
     with prepared_loop(config) as loop:
+        for remark in loop.remarks:
+            say(remark)
         count = len(loop.records)
         if resumed is not None:
             resume_snapshot(resumed, loop)
@@ -176,7 +186,7 @@ def _result(
     return SimulationResult(
         config, loop.mechanism, loop.target, loop.reference, times, records,
         *poses_from_lengths(loop.mechanism, lengths, loop.target.start), *loop.target.at(times),
-        (done - first) / config.rate / took, snapshot,
+        (done - first) / config.rate / took, snapshot, loop.remarks,
     )  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from vqf import VQF
 
-from controller.calibration.file import Calibration, load_calibration
+from controller.calibration.file import Calibration, calibration_for
 from controller.cycle import MARKS, STATE, CycleStage, run_stages
 from controller.direct_kinematics import solve_batch
 from controller.estimation.filterpy_filters import FilterpyFilters
@@ -39,7 +39,8 @@ def compare(config: ComparisonConfig, engine: Engine = IN_ONE_PROCESS, progress:
     Raises:
         GoughError: something in the configuration cannot be used.
     """
-    calibration = Calibration() if config.calibration is None else load_calibration(config.calibration)
+    mechanism = load_spatial(config.mechanism)
+    calibration = Calibration() if config.calibration is None else calibration_for(config.calibration, mechanism, config.imu)
     of_seeds = engine.starmap(partial(_compare, config, calibration), list(enumerate(config.seeds)), progress)
     by_name = {name: [each[name] for each in of_seeds if name in each] for name in of_seeds[0]}
     return {

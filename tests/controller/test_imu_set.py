@@ -2,12 +2,15 @@
 magnetic field tell.
 """
 
+import re
+
 import numpy as np
 import pytest
 
-from controller.direct_kinematics import solve_batch
-from controller.imu_set import check_imus, imus_of
+from controller.direct_kinematics import integrity, solve, solve_batch
+from controller.imu_set import check_imus, imus_of, integrity_remark
 from controller.inverse_kinematics import sample_workspace
+from controller.settings import FusionSettings
 from plant.errors import InputError
 from plant.imu_wiring import ALL_IMUS
 from plant.mechanism import Mechanism, load_in_space, load_mechanism
@@ -131,3 +134,66 @@ def test_the_heading_and_two_legs_are_conditioned_as_section_5_is(hexapod):
     told = check_imus(mechanism, (0, 3, 6), magnetometer=True)
     assert told == pytest.approx(found.conditionings.min(), rel=1e-9)
     assert check_imus(mechanism, ALL_IMUS, magnetometer=True, section_5=True) > told
+
+
+# ---- how well they check each other ----
+
+FUSION = FusionSettings()
+
+
+@pytest.mark.parametrize(
+    ("name", "imus", "magnetometer", "told"),
+    [
+        ("hexapod", range(7), False, None),
+        ("hexapod", range(6), False, None),
+        ("hexapod", range(1, 7), False, "IMU 6 is not told"),
+        ("hexapod", range(7), True, None),
+        ("hexapod", (0, 1, 3, 4, 6), False, "IMU 6 is not told"),
+        ("hexapod", (0, 1, 3, 4), False, "one of them is not told"),
+        ("hexapod", (0, 2, 4, 6), False, "IMU 6 is not told"),
+        ("hexapod", (0, 5, 6), True, "one of them is not told"),
+        ("planar-3rpr", range(7), False, "IMU 6 is not told"),
+        ("planar-3rpr", (0, 2, 6), False, "one of them is not told"),
+    ],
+)
+def test_few_imus_that_hardly_check_each_other_are_named(name, imus, magnetometer, told):
+    mechanism = load_in_space(name)
+    remark = integrity_remark(mechanism, FUSION, imus, magnetometer)
+    if told is None:
+        assert remark == ""
+        return
+    names = ", ".join(map(str, imus_of(mechanism, imus)))
+    assert remark.startswith(f"the IMUs {names} hardly check each other: an error of {told}, and 1 deg of IMU")
+    assert remark.endswith(": add IMUs") == (imus != range(7))
+
+
+def test_an_error_moves_the_pose_as_the_remark_says(hexapod):
+    """Four legs without the platform, one of them turned by a little: the public solver agrees on how far, and that it
+    cannot say whose error it is.
+    """
+    imus = (0, 1, 3, 4)
+    remark = integrity_remark(hexapod, FUSION, imus)
+    far, mm, deg = re.fullmatch(
+        r".*1 deg of IMU (\d) moves the pose by ([\d.]+) mm and ([\d.]+) deg: add IMUs", remark
+    ).groups()
+    home = hexapod.home
+    directions = leg_directions(hexapod, home.position, home.rotation)
+    directions[[2, 5]] = np.nan
+    furthest = np.zeros(2)
+    for leg in imus:
+        sideways = np.linalg.svd(directions[leg][None])[2][1:]
+        for angle in np.linspace(0.0, np.pi, 37):
+            turned = directions.copy()
+            turned[leg] = unit(turned[leg] + 1e-4 * np.array([np.cos(angle), np.sin(angle)]) @ sideways)
+            found = solve(hexapod, turned, method="legs", refine=True)
+            turn = np.arccos(np.clip((np.trace(found.rotation @ home.rotation.T) - 1.0) / 2.0, -1.0, 1.0))
+            moved = np.array([np.linalg.norm(found.position - home.position), turn]) / 1e-4
+            if leg == int(far):
+                furthest = np.maximum(furthest, moved)
+            assert moved[0] <= 1.01 * float(mm) / np.radians(1.0) * 1e-3 + 1e-2
+    assert 1e3 * furthest[0] * np.radians(1.0) == pytest.approx(float(mm), rel=0.02)
+    assert furthest[1] == pytest.approx(float(deg), rel=0.02)
+    turned = directions.copy()
+    turned[3] = unit(turned[3] + np.radians(2.0) * np.linalg.svd(turned[3][None])[2][1])
+    found = integrity(hexapod, turned)
+    assert found.detected and found.faulty is None

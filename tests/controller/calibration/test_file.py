@@ -9,13 +9,22 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from controller.calibration.file import Calibration, join_gain, load_calibration, save_calibration, split_gain
+from controller.calibration.file import (
+    Calibration,
+    calibrated_rig,
+    calibration_for,
+    join_gain,
+    load_calibration,
+    save_calibration,
+    split_gain,
+)
 from controller.cycle import STATE, cycle_parameters
 from controller.estimation.whole_mechanism.imu_errors import ERRORS
 from controller.safety.causes import Cause
 from controller.settings import control_settings, fusion_settings
 from plant.errors import InputError
 from plant.imu import imu_state, load_imu, measure
+from plant.mechanism import load_spatial
 from tests.controller.cycles import cycle
 from tests.controller.leg_geometry import angle_between, rotation_of, static_signals
 
@@ -217,3 +226,107 @@ def test_one_calibration_after_another_is_both():
     twice = np.einsum("skij,nskj->nski", gains[1], once) + offsets[1]
     np.testing.assert_allclose(both.apply(raw), twice, rtol=0.0, atol=1e-13)
     assert (both.tilt.tolist(), both.floor.tolist()) == ([0.03, 0.0], [1e-4, 2e-4])
+
+
+# ---- of which rig, and whether it is whole ----
+
+
+def written(tmp_path, hexapod, imu="mpu9150"):
+    """A file with everything in it, as gough writes it; its calibration."""
+    calibration = of_true_errors(imu_state(load_imu("mpu9150"), 4, 1e-3), np.random.default_rng(4))
+    calibration = replace(calibration, about={"version": "0", **calibrated_rig(hexapod, imu)})
+    save_calibration(tmp_path / "c.toml", calibration)
+    return tmp_path / "c.toml", calibration
+
+
+def test_a_whole_file_of_this_rig_is_taken_without_a_remark(tmp_path, hexapod):
+    path, calibration = written(tmp_path, hexapod)
+    found = calibration_for(path, hexapod, "mpu9150")
+    assert found.remark == ""
+    assert found.about == calibration.about
+    np.testing.assert_allclose(found.gain, calibration.gain, atol=1e-12)
+
+
+def test_a_file_of_another_rig_is_refused_with_what_differs(tmp_path, hexapod):
+    path, _ = written(tmp_path, hexapod)
+    moved = hexapod.moved_joints(np.pad([[[1e-4, 0.0, 0.0]]], ((1, 0), (0, 5), (0, 0))))
+    own = replace(hexapod, plant=hexapod.plant | {"platform_imu_position": np.array([0.0, 0.01, 0.0])})
+    for mechanism, imu, said in (
+        (load_spatial("6-3-I"), "mpu9150", "of the mechanism 'hexapod', and this run has '6-3-I': give that with --mechanism"),
+        (hexapod, "icm42688", "of the kind of IMU 'mpu9150', and this run has 'icm42688': give that with --imu"),
+        (moved, "mpu9150", "of the geometry '.*', .*: joints, axes or places of the IMUs of 'hexapod' have changed since"),
+        (own, "mpu9150", "of the geometry"),
+    ):
+        with pytest.raises(InputError, match=rf"c\.toml is a calibration {said}.*, or calibrate this rig"):
+            calibration_for(path, mechanism, imu)
+    # What does not belong to the IMUs may change.
+    heavier = replace(hexapod, plant=hexapod.plant | {"payload.mass": np.array(12.0)}, limits=None)
+    calibration_for(path, heavier, "mpu9150")
+
+
+def test_no_cut_of_a_file_is_taken(tmp_path, hexapod):
+    path, _ = written(tmp_path, hexapod)
+    text = path.read_text()
+    lines = text.splitlines(keepends=True)
+    ends = [*np.cumsum([len(line) for line in lines])[:-1], *np.random.default_rng(0).integers(0, len(text) - 1, 50)]
+    said = set()
+    for end in ends:
+        path.write_text(text[:end])
+        with pytest.raises(InputError, match=r"c\.toml") as caught:
+            load_calibration(path)
+        said |= {
+            word for word in ("was cut off or changed", "holds no constants", "is not valid TOML") if word in str(caught.value)
+        }
+    assert len(said) == 3
+    path.write_text(text[: text.index("[imu_4.accelerometer]")])
+    with pytest.raises(
+        InputError, match=r"it lacks imu_4\.accelerometer, imu_4\.magnetometer, imu_5\.\w+, imu_5\.\w+ and 4 more"
+    ):
+        load_calibration(path)
+
+
+def test_a_changed_number_is_told_and_a_comment_is_not(tmp_path, hexapod):
+    path, calibration = written(tmp_path, hexapod)
+    text = path.read_text()
+    path.write_text("# the second rig\n\n" + text.replace("\n[base]", "\n\n[base]  # of the hall").replace(" = [", "=[ "))
+    np.testing.assert_allclose(load_calibration(path).gain, calibration.gain, atol=1e-12)
+    for old, new in (("tilt = [0.01,", "tilt = [0.02,"), ('mechanism = "hexapod"', 'mechanism = "6-5"'), ("version", "of")):
+        assert text.count(old) == 1
+        path.write_text(text.replace(old, new))
+        with pytest.raises(InputError, match=r"as its digest shows \(nothing is missing\): .* on purpose, remove its digest"):
+            load_calibration(path)
+    # On purpose, and so without the digest.
+    path.write_text("".join(line for line in text.splitlines(keepends=True) if not line.startswith("digest")))
+    assert load_calibration(path).remark == f"{path} has no digest, which would show a cut or a change"
+
+
+def test_what_a_file_by_hand_lacks_is_said(tmp_path, hexapod):
+    path = tmp_path / "mine.toml"
+    path.write_text("[imu_2.accelerometer]\nbias = [0.1, 0.0, 0.0]\n")
+    remark = calibration_for(path, hexapod, "ideal").remark
+    assert remark == (
+        f"{path} has no digest, which would show a cut or a change; no mechanism; no imu; nothing of imu_0.gyroscope, "
+        "imu_0.accelerometer, imu_0.magnetometer, imu_1.gyroscope and 18 more, taken as free of errors"
+    )
+    path.write_text('[about]\nmechanism = "6-5"\n[imu_2.accelerometer]\nbias = [0.1, 0.0, 0.0]\n')
+    with pytest.raises(InputError, match="of the mechanism '6-5'"):
+        calibration_for(path, hexapod, "ideal")
+    for text in ("", "# empty\n", '[about]\nmechanism = "hexapod"\n'):
+        path.write_text(text)
+        with pytest.raises(InputError, match="holds no constants: it is empty or was cut off"):
+            load_calibration(path)
+
+
+def test_a_file_of_an_older_version_is_taken_whole_and_refused_cut(tmp_path, hexapod):
+    """They have a version and no digest."""
+    path, calibration = written(tmp_path, hexapod)
+    old = [line for line in path.read_text().splitlines(keepends=True) if not line.startswith(("digest", "geometry", "imu ="))]
+    path.write_text("".join(old))
+    found = calibration_for(path, hexapod, "icm42688")
+    assert found.remark == f"{path} has no digest, which would show a cut or a change; no imu"
+    np.testing.assert_allclose(found.gain, calibration.gain, atol=1e-12)
+    last = next(i for i, line in enumerate(old) if line.startswith("[imu_6.magnetometer]"))
+    for end in (last, last + 1, last + 4):
+        path.write_text("".join(old[:end]))
+        with pytest.raises(InputError, match=r"was cut off, as gough 0 writes all constants and it lacks imu_6\.magnetometer"):
+            load_calibration(path)

@@ -785,3 +785,15 @@ def test_a_terminal_shows_the_run_as_it_goes():
     assert process.wait(30.0) == 0
     for text in (b"hexapod follows circle at 200 Hz", b"roll, pitch, yaw [deg]", b"woken late p50", b"running"):
         assert text in shown
+
+
+def test_what_a_calibration_does_not_tell_is_said_before_the_run_and_recorded(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("[imu_2.accelerometer]\nbias = [1e-4, 0.0, 0.0]\n")
+    said = []
+    summary = run(
+        SimulationConfig(target="hold", duration=0.2, rate=500.0, calibration=str(path)), SETTINGS, tmp_path / "run.mcap",
+        say=said.append,
+    )  # fmt: skip
+    assert len(said) == 1 and said[0].startswith(f"{path} has no digest")
+    assert summary["remarks"] == said == read(tmp_path / "run.mcap").config["remarks"]

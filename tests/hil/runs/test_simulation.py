@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from controller.calibration.file import Calibration, calibrated_rig, save_calibration
 from controller.estimation.filterpy_filters import FilterpyLeg, FilterpyPlatform
 from controller.settings import control_settings
 from hil.runs.config import SimulationConfig
@@ -18,6 +19,7 @@ from plant.errors import InputError, UnknownNameError, UnreachableError
 from plant.fmu.settings import Setting
 from plant.mechanism import load_mechanism
 from plant.pose import rotation_from_quaternion, rotation_from_vector
+from plant.truth import TRUTH_POSITION
 
 MM, DEG = 1e-3, np.radians(1.0)
 
@@ -54,6 +56,38 @@ def test_every_named_motion_is_followed(target):
     result = simulate(SimulationConfig(target=target, duration=4.0, imu="ideal"))
     assert errors(result, "tracking")[0] < 0.15
     assert result.reference.violations == 0
+
+
+@pytest.mark.parametrize("mechanism", ["hexapod", "6-4-II", "planar-3rpr"])
+def test_a_run_begins_at_rest_on_its_brakes_with_a_true_estimate(mechanism):
+    """From the very first sample: the plant stands, and accelerometers that read gravity alone tell the pose."""
+    result = simulate(SimulationConfig(mechanism=mechanism, target="hold", duration=0.01, imu="ideal"))
+    held = result.records[result.times < 0.0]
+    gravity = np.linalg.norm(result.mechanism.plant["gravity"])
+    used = [*range(result.mechanism.legs), 6]
+    np.testing.assert_allclose(np.linalg.norm(held["specific_force"][:, used], axis=2), gravity, rtol=1e-6)
+    assert np.abs(held["position"] - result.true_positions[result.times < 0.0]).max() < 1e-6
+    assert np.ptp(held["truth"][:, TRUTH_POSITION], axis=0).max() < 1e-9
+
+
+def test_what_a_calibration_does_not_tell_is_said_before_the_run_and_recorded(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("[imu_2.accelerometer]\nbias = [1e-4, 0.0, 0.0]\n")
+    said = []
+    result = simulate(SimulationConfig(duration=0.05, calibration=str(path)), say=said.append)
+    assert said == result.summary()["remarks"]
+    assert said[0].startswith(f"{path} has no digest, which would show a cut or a change; no mechanism; no imu; nothing of")
+    assert simulate(SimulationConfig(duration=0.05)).summary()["remarks"] == []
+
+
+def test_a_calibration_of_another_rig_is_refused_before_anything_runs(tmp_path):
+    path = tmp_path / "rig.toml"
+    about = calibrated_rig(load_mechanism("hexapod"), "mpu9150-calibrated")
+    save_calibration(path, Calibration(about=about))
+    assert simulate(SimulationConfig(duration=0.05, calibration=str(path))).summary()["remarks"] == []
+    for changes, said in (({"mechanism": "6-5"}, "of the mechanism 'hexapod'"), ({"imu": "icm42688"}, "of the kind of IMU")):
+        with pytest.raises(InputError, match=said):
+            simulate(SimulationConfig(duration=0.05, calibration=str(path), **changes))
 
 
 @pytest.mark.parametrize("rate", [50.0, 250.0, 4000.0])
