@@ -160,7 +160,7 @@ def integrity_remark(
     The error of an IMU has two components, in a planar mechanism one. As many numbers beyond those that the pose needs tell
     that there is an error, and twice as many whose it is. How an error moves the pose is that of least squares at home.
     """
-    measured = _measured_rows(mechanism, fusion, imus, magnetometer)
+    measured = measured_rows(mechanism, fusion, imus, magnetometer)
     whole = np.vstack([rows for rows, _ in measured.values()])
     covariance = np.linalg.pinv(whole.T @ whole, rcond=_SINGULAR, hermitian=True)
     components, needed = (1, 3) if mechanism.planar else (2, 6)
@@ -182,8 +182,8 @@ def integrity_remark(
     )
 
 
-def _measured_rows(
-    mechanism: Mechanism, fusion: FusionSettings, imus: Collection[int], magnetometer: bool
+def measured_rows(
+    mechanism: Mechanism, fusion: FusionSettings, imus: Collection[int] = ALL_IMUS, magnetometer: bool = False
 ) -> dict[int, tuple[Array, Array]]:
     """By IMU, how its direction changes across itself with a small move (6,) of the platform at home, over its standard
     deviations, and these [rad].
@@ -194,7 +194,7 @@ def _measured_rows(
     rows: dict[int, tuple[Array, Array]] = {}
     for imu in imus_of(mechanism, imus):
         if imu == PLATFORM_IMU:
-            turns = [np.cross(mechanism.up_in_base, t) for t in _across(mechanism, mechanism.up_in_base)]
+            turns = [np.cross(mechanism.up_in_base, t) for t in across(mechanism, mechanism.up_in_base)]
             sigmas = [fusion.tilt_sigma] * len(turns)
             if magnetometer:
                 turns.append(mechanism.up_in_base)
@@ -202,7 +202,7 @@ def _measured_rows(
             jacobian = np.hstack([np.zeros((len(turns), 3)), turns])
         else:
             length = np.linalg.norm(legs[imu])
-            sideways = _across(mechanism, legs[imu] / length)
+            sideways = across(mechanism, legs[imu] / length)
             jacobian = np.hstack([sideways, np.cross(arms[imu], sideways)]) / length
             sigmas = [fusion.leg_sigma] * len(jacobian)
         if mechanism.planar:
@@ -211,13 +211,13 @@ def _measured_rows(
     return rows
 
 
-def _across(mechanism: Mechanism, direction: Array) -> Array:
+def across(mechanism: Mechanism, direction: Array) -> Array:
     """The unit vectors (2, 3) across a direction (3,); of a planar mechanism the one in its plane (1, 3)."""
     if mechanism.planar:
         t = np.cross([0.0, 0.0, 1.0], direction)
         return np.array([t / np.linalg.norm(t)])
-    across: Array = np.linalg.svd(direction[None])[2][1:]
-    return across
+    found: Array = np.linalg.svd(direction[None])[2][1:]
+    return found
 
 
 def conditionings(

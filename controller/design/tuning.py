@@ -17,6 +17,7 @@ import numpy as np
 
 from controller.cycle import MARKS, STATE, CycleStage, cycle_parameters, run_stages
 from controller.inverse_kinematics import leg_lengths
+from controller.loop_margins import SENSITIVITY_LIMIT
 from controller.settings import ControlSettings, control_settings, fusion_settings
 from plant.checks import check_rate
 from plant.compiled import Record
@@ -30,7 +31,6 @@ from plant.pose import Array
 STATES, INPUTS = SPATIAL.states, SPATIAL.inputs
 
 INTEGRAL_TIME_S = 0.3
-SENSITIVITY_LIMIT = 2.0
 PHASE_MARGIN_DEG, GAIN_MARGIN_DB = 65.0, 12.0
 _SETTLE_S = 10.0
 _SMALL_STEP = 1e-3

@@ -137,7 +137,7 @@ def gough_run(options: Namespace) -> int:
     stopped: Exception | None = None
     with live_view(config.mechanism, config.target, config.rate) as show:
         try:
-            summary = run(config, settings, options.record, show, say=say)
+            summary = run(config, settings, options.record, show, None, say)
         except RunStoppedError as error:
             if error.summary is None:
                 raise

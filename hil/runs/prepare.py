@@ -12,6 +12,7 @@ from controller.calibration.file import Calibration, calibration_for
 from controller.cycle import STATE, cycle_parameters
 from controller.imu_set import imus_of, integrity_remark
 from controller.inverse_kinematics import leg_lengths
+from controller.loop_margins import margin_remark
 from controller.planning.offline_planner import Reference, plan
 from controller.planning.plan_handover import rest
 from controller.planning.target import Target, load_target
@@ -108,6 +109,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         )  # fmt: skip
         remarks = [
             calibration.remark,
+            margin_remark(mechanism, control, fusion, config.rate, config.imus, config.magnetometer),
             integrity_remark(mechanism, fusion, config.imus, config.magnetometer),
         ]
         count = int(parameters["rig"]["hold_cycles"]) + round(config.duration * config.rate)

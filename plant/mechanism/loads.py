@@ -23,11 +23,17 @@ class HomeLoads(NamedTuple):
 
     forces: Array  # (n,) that hold all weights, positive when the leg pushes [N]
     masses: Array  # (n, n) from the accelerations of the lengths to the forces along the legs [kg]
+    jacobian: Array  # (n, n) from the twist along `moving_axes` to the rates of the lengths
 
 
 def force_constant(mechanism: "Mechanism") -> float:
     """Force along a leg per current of its motor [N/A], and back-EMF per speed of the leg [V s/m]."""
     return float(2.0 * np.pi / mechanism.plant["motor.screw_lead"] * mechanism.plant["motor.torque_constant"])
+
+
+def moving_axes(mechanism: "Mechanism") -> list[int]:
+    """The components of the twist (6,) that the platform has: all, or those in the plane."""
+    return [0, 1, 5] if mechanism.planar else [*range(6)]
 
 
 def home_loads(mechanism: "Mechanism") -> HomeLoads | None:
@@ -37,7 +43,7 @@ def home_loads(mechanism: "Mechanism") -> HomeLoads | None:
         InputError: the mechanism lacks home, limits or a parameter of the dynamics.
     """
     p, home = mechanism.plant_parameters(), mechanism.require_home()
-    moving = [0, 1, 5] if mechanism.planar else [*range(6)]
+    moving = moving_axes(mechanism)
     arms = mechanism.platform_joints @ home.rotation.T
     vectors = home.position + arms - mechanism.base_joints
     lengths = np.linalg.norm(vectors, axis=1)
@@ -49,7 +55,7 @@ def home_loads(mechanism: "Mechanism") -> HomeLoads | None:
     for body in ("platform", "payload"):
         center = home.rotation @ np.pad(p[f"{body}.center_of_mass"], (0, 3 - p[f"{body}.center_of_mass"].size))
         inertia = np.diag([0.0, 0.0, float(p[f"{body}.inertia"])]) if mechanism.planar else p[f"{body}.inertia"]
-        to_center = _point_jacobian(center)
+        to_center = point_jacobian(center)
         mass += p[f"{body}.mass"] * to_center.T @ to_center
         mass[3:, 3:] += home.rotation @ inertia @ home.rotation.T
         wrench += p[f"{body}.mass"] * to_center.T @ p["gravity"]
@@ -57,16 +63,16 @@ def home_loads(mechanism: "Mechanism") -> HomeLoads | None:
     sliding = rod + p["motor.rotor_inertia"] * (2.0 * np.pi / p["motor.screw_lead"]) ** 2
     swinging = p["leg.lower.inertia"] + p["leg.upper.inertia"] + p["leg.lower.mass"] * p["leg.lower.center"] ** 2
     for length, n, arm in zip(lengths, along, arms, strict=True):
-        to_joint, axial = _point_jacobian(arm), np.outer(n, n)
+        to_joint, axial = point_jacobian(arm), np.outer(n, n)
         swing = (swinging + rod * (length - rod_center) ** 2) / length**2
         mass += to_joint.T @ (swing * (np.eye(3) - axial) + sliding * axial) @ to_joint
         lever = (p["leg.lower.mass"] * p["leg.lower.center"] + rod * (length - rod_center)) / length
         wrench += to_joint.T @ (rod * axial + lever * (np.eye(3) - axial)) @ p["gravity"]
     inverse = np.linalg.inv(jacobian)
-    return HomeLoads(-inverse.T @ wrench[moving], inverse.T @ mass[np.ix_(moving, moving)] @ inverse)
+    return HomeLoads(-inverse.T @ wrench[moving], inverse.T @ mass[np.ix_(moving, moving)] @ inverse, jacobian)
 
 
-def _point_jacobian(arm: Array) -> Array:
+def point_jacobian(arm: Array) -> Array:
     """From a twist (6,) to the velocity of the point at `arm` (3,) from the origin of {2}."""
     x, y, z = arm
     return np.hstack([np.eye(3), [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]])
