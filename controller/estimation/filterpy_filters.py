@@ -8,15 +8,30 @@ share no line with the compiled filters.
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
+from controller.estimation.excess import INNOVATION_LIMIT, MEMORY_S
 from controller.estimation.leg_filter import start_leg, update_leg_directions
-from controller.estimation.platform_filter import INNOVATION_LIMIT, begin_platform_step, end_platform_step
+from controller.estimation.platform_filter import (
+    BIAS,
+    CORRELATION_S,
+    ERRORS,
+    FASTEST_MOTION,
+    LEVEL,
+    RATE_NOISE,
+    SLOWEST_CORRECTION,
+    START_CORRECTION,
+    VELOCITY,
+    YOUNGEST_S,
+    begin_platform_step,
+    end_platform_step,
+)
+from controller.estimation.platform_filter import STATE as PLATFORM
+from controller.rig import elapsed
 from plant.compiled import Record
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.imu import ACCELEROMETER, GYROSCOPE
-from plant.pose import Array, skew
+from plant.pose import Array, rotation_from_vector, skew
 
 STATES = 9
-PLATFORM_STATES = 6
 
 
 class _Filterpy(ExtendedKalmanFilter):  # type: ignore[misc]
@@ -116,42 +131,70 @@ class FilterpyLeg(_Filterpy):
 
 
 class FilterpyPlatform(_Filterpy):
-    """The platform's filter on filterpy; the state is that of `platform_filter`.
+    """The platform's filter on filterpy, which has the errors; the state is beside it, and takes the errors after each step.
 
     Args:
         gravity: [m/s^2].
-        period: [s].
-        rate_density, bias_walk, vertical_variance: as in `platform_filter.PARAMETERS`.
+        rate_density, bias_walk, force_variance: as in `platform_filter.PARAMETERS`.
     """
 
-    def __init__(self, gravity: float, period: float, rate_density: float, bias_walk: float, vertical_variance: float) -> None:
-        super().__init__(dim_x=PLATFORM_STATES, dim_z=1)
-        self.gravity, self.period = gravity, period
-        self.Q = period * np.diag([rate_density] * 3 + [bias_walk] * 3)
-        self.R = np.array([[vertical_variance]])
+    def __init__(self, gravity: float, rate_density: float, bias_walk: float, force_variance: float) -> None:
+        super().__init__(dim_x=ERRORS, dim_z=1)
+        self.gravity, self.rate_density, self.bias_walk, self.force_variance = gravity, rate_density, bias_walk, force_variance
+        self.take_over(np.zeros((), PLATFORM))
 
-    def step(self, gyroscope: Array, accelerometer: Array, acceleration: Array) -> None:
-        """Predict over one period and take a sample [rad/s, m/s^2], without the IMU's own acceleration (3,) in {2}."""
-        self._turn(gyroscope)
-        for axis, reading in zip(np.eye(3, PLATFORM_STATES), (accelerometer - acceleration) / self.gravity, strict=True):
-            jacobian = axis[None]
-            self.update(reading, lambda x, h: h, lambda x, h: h @ x, args=jacobian, hx_args=jacobian, residual=self._cut)
-        self.x[:3] /= np.linalg.norm(self.x[:3])
+    def take_over(self, state: Record) -> None:
+        """Take over a state (dtype `platform_filter.STATE`)."""
+        up, self.bias, first, self.velocity = np.split(state["x"].copy(), (BIAS, LEVEL, VELOCITY))
+        self.axes = np.stack([first, np.cross(up, first), up])
+        self.running, self.noise, self.unknown = float(state["running"]), float(state["noise"]), float(state["unknown"])
+        self.start(np.zeros(ERRORS), state["covariance"])
 
-    def _turn(self, gyroscope: Array) -> None:
-        """`u' = u x (rate - bias)`: the state to second order, its covariance to first."""
-        t, u, bias = self.period, self.state[:3], self.state[3:]
-        turn = -t * skew(gyroscope - bias)
-        turned = (np.eye(3) + turn + turn @ turn / 2.0) @ u
-        self.F = np.eye(PLATFORM_STATES)
-        self.F[:3] += np.hstack([turn, -t * skew(u)])
+    def hand_over(self, state: Record) -> None:
+        """Write the state (dtype `platform_filter.STATE`)."""
+        state["x"] = np.concatenate([self.axes[2], self.bias, self.axes[0], self.velocity])
+        state["covariance"], state["running"], state["noise"], state["unknown"] = self.P, self.running, self.noise, self.unknown
+
+    def step(self, gyroscope: Array, accelerometer: Array, acceleration: Array, period: float) -> None:
+        """Predict over a period [s] and take a sample [rad/s, m/s^2], without the IMU's own acceleration (3,) in {2}."""
+        rate = gyroscope - self.bias
+        self.axes = self.axes @ rotation_from_vector(period * rate)
+        shown = period * self.axes[:2] @ (accelerometer - acceleration)
+        seen = float(np.mean((self.velocity + shown) ** 2))
+        variance = self.force_variance + self.gravity**2 * np.trace(self.P[:2, :2]) / 2.0 + FASTEST_MOTION**2 * self.unknown
+        bound = INNOVATION_LIMIT * period * np.sqrt(variance)
+        self.velocity = self.velocity + np.clip(shown, -bound, bound)
+        self._predict_errors(rate, period)
+        self.noise += self.force_variance * period**2
+        faded = self.unknown - min(1.0, period / MEMORY_S) * (self.unknown + self.noise)
+        self.unknown = max(0.0, faded, seen - INNOVATION_LIMIT**2 * self.noise)
+        # The velocity is measured to be zero, along one axis after the other.
+        self.R = np.array([[2.0 * CORRELATION_S * self.unknown / period]])
+        both = np.trace(self.P[2:4, 2:4])
+        self.noise *= (1.0 - both / (both + 2.0 * self.R.item())) ** 2
+        for velocity, axis in zip(self.velocity, np.eye(ERRORS)[2:4], strict=True):
+            self.update(-velocity, lambda x, h: h, lambda x, h: h @ x, args=axis[None], hx_args=axis[None])
+        self._correct()
+
+    def _predict_errors(self, rate: Array, period: float) -> None:
+        self.running += period
+        slowest = max(SLOWEST_CORRECTION, START_CORRECTION / (self.running + YOUNGEST_S))
+        unknown = (slowest**2 / self.gravity) ** 2 * 2.0 * CORRELATION_S * self.unknown
+        turn = self.rate_density + RATE_NOISE * float(rate @ rate) + unknown
+        self.Q = period * np.diag([turn] * 2 + [self.force_variance * period] * 2 + [self.bias_walk] * 3)
+        self.F = np.eye(ERRORS)
+        self.F[2:4, :2] = period * self.gravity * np.array([[0.0, 1.0], [-1.0, 0.0]])
+        self.F[:2, 4:] = -period * self.axes[:2]
         self.predict()
-        self.x = np.concatenate([turned, bias]).reshape(-1, 1)
 
-    def _cut(self, reading: Array, expected: Array) -> Array:
-        """The innovation, within `INNOVATION_LIMIT` standard deviations."""
-        bound = INNOVATION_LIMIT * np.sqrt(self.S)
-        return np.clip(reading - expected, -bound, bound)
+    def _correct(self) -> None:
+        turn, velocity, bias = np.split(self.state, (2, 4))
+        self.velocity, self.bias = self.velocity + velocity, self.bias + bias
+        first, _, up = self.axes + skew(np.array([*turn, 0.0])) @ self.axes
+        up = up / np.linalg.norm(up)
+        first = first - first @ up * up
+        first = first / np.linalg.norm(first)
+        self.axes, self.x = np.stack([first, np.cross(up, first), up]), np.zeros((ERRORS, 1))
 
 
 class FilterpyFilters:
@@ -167,8 +210,8 @@ class FilterpyFilters:
         noise = [float(p["legs"][name]) for name in ("jerk", "bias_walk", "rate_variance", "force_variance")]
         places = zip(sensors["up_in_joint"], sensors["leg_imu_position"], strict=True)
         self._legs = [FilterpyLeg(up, position, *constants, *noise) for up, position in places]
-        noise = [float(p["platform"][name]) for name in ("rate_density", "bias_walk", "vertical_variance")]
-        self._platform = FilterpyPlatform(*constants, *noise)
+        noise = [float(p["platform"][name]) for name in ("rate_density", "bias_walk", "force_variance")]
+        self._platform = FilterpyPlatform(float(sensors["gravity"]), *noise)
 
     def step_legs(self, state: Record) -> None:
         """Step the leg filters, as `leg_filter.step_leg_filters` does; `state` has dtype `controller.cycle.STATE`."""
@@ -193,8 +236,8 @@ class FilterpyFilters:
         p, s = self._parameters, state[()]
         imus, platform = s["imus"], s["platform"]
         if begin_platform_step(p["platform"], platform, p["rig"], s["time"], imus, s["pose"]):
-            self._platform.start(platform["x"], platform["covariance"])
+            self._platform.take_over(platform)
             rate, force = imus["sample"][GYROSCOPE, PLATFORM_IMU], imus["sample"][ACCELEROMETER, PLATFORM_IMU]
-            self._platform.step(rate, force, platform["imu_acceleration"])
-            platform["x"], platform["covariance"] = self._platform.state, self._platform.P
+            self._platform.step(rate, force, platform["imu_acceleration"], elapsed(p["rig"], s["time"]))
+            self._platform.hand_over(platform)
             end_platform_step(p["platform"], platform, imus)

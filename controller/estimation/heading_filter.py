@@ -8,7 +8,7 @@ compensation. Errors (2) are the angle about u by which the true n is turned fro
 import numpy as np
 
 from controller.estimation.leg_filter import SETTLING_S
-from controller.estimation.platform_filter import cut_innovation, extrapolate_direction, turn_direction
+from controller.estimation.platform_filter import cut_innovation, extrapolate_direction, make_level, turn_direction
 from controller.rig import MagneticField, elapsed
 from controller.settings import FusionSettings
 from plant.compiled import Record, filled, kernel, record_dtype
@@ -118,7 +118,7 @@ def start_heading(x: Array, covariance: Array, field: Array, vertical: Array, va
     for i in range(3):
         x[i] = field[i]
     x[3] = 0.0
-    _level(x, vertical)
+    make_level(x, vector(vertical))
     covariance[0, 0], covariance[1, 1] = variance, bias_sigma**2
     covariance[0, 1] = covariance[1, 0] = 0.0
 
@@ -135,7 +135,7 @@ def predict_heading(
     """
     t = period
     turn_direction(x, subtract(vector(rate), scale(x[3], vector(vertical))), t)
-    _level(x, vertical)
+    make_level(x, vector(vertical))
     # Too large a bias turns n too far against the rate: the angle's error grows by that of the bias.
     mixed = covariance[0, 1] + t * covariance[1, 1]
     covariance[0, 0] += t * (covariance[0, 1] + mixed) + t * rate_density
@@ -159,13 +159,3 @@ def update_heading(x: Array, covariance: Array, field: Array, vertical: Array, v
     covariance[0, 0] *= 1.0 - k0
     covariance[0, 1] *= 1.0 - k0
     covariance[1, 0] = covariance[0, 1]
-
-
-@kernel
-def _level(x: Array, vertical: Array) -> None:
-    """Make n a unit vector across the vertical."""
-    north, up = vector(x), vector(vertical)
-    level = subtract(north, scale(dot(north, up), up))
-    size = np.sqrt(dot(level, level))
-    for i in range(3):
-        x[i] = level[i] / size

@@ -1,33 +1,59 @@
 """The platform's roll-pitch filter: a Kalman filter for the vertical seen in {2}.
 
-State (6): the unit vertical u in {2} and the gyroscope's bias [rad/s]. The vertical turns with `u' = u x (rate - bias)`,
-and once the platform's own acceleration is taken out the accelerometer measures `g u`.
+The vertical u turns with `u' = u x (rate - bias)`. Once the acceleration that is known from the legs is taken out, the
+accelerometer measures `g u`, its noise, and what is unknown of the platform's acceleration. The latter is no white noise: its
+integral, a velocity, stays small. So the filter integrates what the accelerometer shows along two level axes, and measures that
+this velocity is zero, with a noise as large as the velocity is seen to be (`excess`). If the acceleration is known, that noise
+is zero, and the filter takes each reading for gravity. If it is not, the filter averages over seconds.
+
+State (11): u, the gyroscope's bias [rad/s], the first level axis in {2}, and the unknown velocity along both level axes [m/s].
+The second level axis is u x the first. Both turn with the rate less its bias, as u does, and point to no heading of note.
+
+Errors (7): the small turn about both level axes that leads from the estimate to the truth, and the errors of velocity and bias.
 """
 
 import numpy as np
 
+from controller.estimation.excess import INNOVATION_LIMIT, faded_excess
 from controller.estimation.leg_filter import SETTLING_S
 from controller.rig import elapsed
 from controller.settings import FusionSettings
 from plant.compiled import Record, filled, kernel, record_dtype
 from plant.dynamics.variables import PLATFORM_IMU
-from plant.imu import ACCELEROMETER, GYROSCOPE, STANDARD_GRAVITY
+from plant.imu import ACCELEROMETER, GYROSCOPE
 from plant.pose import Array
-from plant.vectors import Vector, cross, dot, rotate_back, subtract, vector
+from plant.vectors import Vector, add, cross, dot, rotate_back, scale, subtract, vector
 
-STATES = 6
+STATES = 11
+BIAS, LEVEL, VELOCITY = 3, 6, 9
+"""Where bias, level axis and velocity begin in the state; the vertical is its beginning."""
+
+ERRORS = 7
 TILT_SIGMA = 0.15
 """Uncertainty of the vertical after the first sample [rad]."""
 
-INNOVATION_LIMIT = 3.0
-"""Innovations are cut to this many standard deviations: a jolt between two samples, as when the brakes open, is in the
-accelerometer's reading but not in the acceleration known from the legs."""
+CORRELATION_S = 0.1
+"""For how long the unknown velocity stays alike: with its square this gives its density."""
+
+FASTEST_MOTION = 300.0
+"""How fast the unknown velocity may change, as a multiple of itself [1/s]: beyond that, a sample is cut as a jolt."""
+
+SLOWEST_CORRECTION = 0.4
+"""At least so fast the vertical follows the accelerometer, however large the unknown velocity [rad/s]."""
+
+START_CORRECTION = 1.5
+"""The same soon after the start, times the filter's age [rad]: it forgets what it took for gravity in its first samples."""
+
+YOUNGEST_S = 0.01
+
+RATE_NOISE = 1e-7
+"""Density of the gyroscope's noise that its scales and axes cause, by the square of the rate [1/Hz]."""
 
 PARAMETERS = record_dtype(
     rate_density=np.float64,  # spectral density of the gyroscope's noise
     bias_walk=np.float64,  # spectral density of the gyroscope's bias
     bias_sigma=np.float64,  # uncertainty of the gyroscope's bias at the start [rad/s]
-    vertical_variance=np.float64,  # of each component of the accelerometer's reading over g
+    force_variance=np.float64,  # of each component of the accelerometer's reading [m^2/s^4]
     weight=np.float64,  # of the vertical in the refinement, 1 / variance [1/rad^2]
     delay=np.float64,  # of the sensors [s]
     settling_cycles=np.int64,  # how long the filter is not relied upon
@@ -36,17 +62,18 @@ PARAMETERS = record_dtype(
 
 STATE = record_dtype(
     x=(np.float64, STATES),
-    covariance=(np.float64, (STATES, STATES)),
+    covariance=(np.float64, (ERRORS, ERRORS)),  # of the errors
+    unknown=np.float64,  # square of the velocity beyond what noise explains, faded [m^2/s^2]
+    noise=np.float64,  # variance of the velocity that the accelerometer's noise alone would cause [m^2/s^2]
+    running=np.float64,  # time since the start [s]
     age=np.int64,  # for how many cycles the filter has run
     used=np.int64,  # whether the vertical is used
     weight=np.float64,  # of the vertical in the refinement
     vertical=(np.float64, 3),  # in {2}, without the sensors' delay
     rate=(np.float64, 3),  # angular velocity in {2} [rad/s]
     imu_acceleration=(np.float64, 3),  # of the IMU in {2} [m/s^2]
-    transition=(np.float64, (STATES, STATES)),  # from here on scratch
-    work=(np.float64, (STATES, STATES)),
-    gain=(np.float64, STATES),
-    change=(np.float64, STATES),
+    gain=(np.float64, ERRORS),  # from here on scratch
+    change=(np.float64, ERRORS),
 )
 """State of the filter."""
 
@@ -58,7 +85,7 @@ def platform_parameters(fusion: FusionSettings, rate: float) -> Record:
         rate_density=fusion.gyroscope_noise**2,
         bias_walk=fusion.bias_walk**2,
         bias_sigma=fusion.bias_sigma,
-        vertical_variance=(fusion.platform_accelerometer_noise / STANDARD_GRAVITY) ** 2 * rate / 2.0,
+        force_variance=fusion.platform_accelerometer_noise**2 * rate / 2.0,
         weight=1.0 / fusion.tilt_sigma**2,
         delay=fusion.sensor_delay,
         settling_cycles=round(SETTLING_S * rate),
@@ -72,11 +99,8 @@ def step_platform_filter(p: Record, s: Record, rig: Record, time: Record, imus: 
     """
     if not begin_platform_step(p, s, rig, time, imus, pose):
         return
-    step_platform(
-        s.x, s.covariance, imus.sample[GYROSCOPE, PLATFORM_IMU], imus.sample[ACCELEROMETER, PLATFORM_IMU], s.imu_acceleration,
-        elapsed(rig, time), rig.sensors.gravity, p.rate_density, p.bias_walk, p.vertical_variance, s.transition, s.work, s.gain,
-        s.change,
-    )  # fmt: skip
+    rate, force = imus.sample[GYROSCOPE, PLATFORM_IMU], imus.sample[ACCELEROMETER, PLATFORM_IMU]
+    step_platform(p, s, rate, force, s.imu_acceleration, elapsed(rig, time), rig.sensors.gravity)
     end_platform_step(p, s, imus)
 
 
@@ -91,10 +115,10 @@ def begin_platform_step(p: Record, s: Record, rig: Record, time: Record, imus: R
         return False
     rate, force = imus.sample[GYROSCOPE, PLATFORM_IMU], imus.sample[ACCELEROMETER, PLATFORM_IMU]
     if age == 0:
-        start_platform(s.x, s.covariance, force, p.bias_sigma)
+        start_platform(p, s, force)
     # The acceleration of the origin, and what turning adds at the IMU's place d.
     d = vector(rig.sensors.platform_imu_position)
-    w = subtract(vector(rate), vector(s.x[3:]))
+    w = subtract(vector(rate), vector(s.x[BIAS:]))
     wd, ww = dot(w, d), dot(w, w)
     of_origin = rotate_back(pose.rotation, vector(pose.acceleration))
     tangential = cross(rotate_back(pose.rotation, vector(pose.acceleration[3:])), d)
@@ -108,7 +132,7 @@ def end_platform_step(p: Record, s: Record, imus: Record) -> None:
     """After the filter's step: the platform's angular velocity and the vertical in {2}, without the sensors' delay."""
     rate = imus.sample[GYROSCOPE, PLATFORM_IMU]
     for i in range(3):
-        s.rate[i] = rate[i] - s.x[3 + i]
+        s.rate[i] = rate[i] - s.x[BIAS + i]
     extrapolate_direction(s.x, s.rate, p.delay, s.vertical)
 
 
@@ -122,16 +146,36 @@ def extrapolate_direction(x: Array, rate: Array, delay: float, carried: Array) -
 
 @kernel
 def turn_direction(x: Array, rate: Vector, t: float) -> None:
-    """Carry on a direction that is fixed in {1}, seen in {2}, by a time t [s]: x' = x x rate, to second order."""
-    turning, half = cross(vector(x), rate), 0.5 * t * t
-    twice = cross(turning, rate)
+    """Carry on a direction that is fixed in {1}, seen in {2}, at a rate [rad/s] over a time t [s]: x' = x x rate.
+
+    A rotation by the tangent of half its angle, with three terms of its series: exact to 6e-8 of the angle up to 0.2 rad, and
+    it keeps lengths and angles.
+    """
+    square = 0.25 * t * t * dot(rate, rate)
+    half = scale(0.5 * t * (1.0 + square * (1.0 / 3.0 + square * (2.0 / 15.0))), rate)
+    turning = cross(vector(x), half)
+    twice, factor = cross(turning, half), 2.0 / (1.0 + dot(half, half))
     for i in range(3):
-        x[i] += t * turning[i] + half * twice[i]
+        x[i] += factor * (turning[i] + twice[i])
+
+
+@kernel
+def make_level(x: Array, vertical: Vector) -> None:
+    """Make a direction (3,) a unit vector across the vertical."""
+    direction = vector(x)
+    level = subtract(direction, scale(dot(direction, vertical), vertical))
+    size = np.sqrt(dot(level, level))
+    for i in range(3):
+        x[i] = level[i] / size
 
 
 @kernel
 def cut_innovation(innovation: float, variance: float) -> float:
-    """An innovation of this variance, within `INNOVATION_LIMIT` standard deviations."""
+    """An innovation of this variance, within `INNOVATION_LIMIT` standard deviations.
+
+    A jolt between two samples, as when the brakes open, is in the accelerometer's reading but not in the acceleration known
+    from the legs.
+    """
     bound = INNOVATION_LIMIT * np.sqrt(variance)
     return float(min(max(innovation, -bound), bound))
 
@@ -153,73 +197,126 @@ def take_scalar(covariance: Array, gain: Array, change: Array, states: int, inno
 
 
 @kernel
-def start_platform(x: Array, covariance: Array, accelerometer: Array, bias_sigma: float) -> None:
+def start_platform(p: Record, s: Record, accelerometer: Array) -> None:
     """Start the filter from its first sample, taking the force for gravity."""
     force = vector(accelerometer)
-    norm = np.sqrt(dot(force, force))
-    for i in range(STATES):
-        x[i] = accelerometer[i] / norm if i < 3 else 0.0
-        for j in range(STATES):
-            covariance[i, j] = 0.0
-        covariance[i, i] = TILT_SIGMA**2 if i < 3 else bias_sigma**2
+    up = scale(1.0 / np.sqrt(dot(force, force)), force)
+    s.x[:], s.covariance[:] = 0.0, 0.0
+    for i in range(3):
+        s.x[i] = up[i]
+        s.covariance[4 + i, 4 + i] = p.bias_sigma**2
+    # That axis of {2} which is the least upright.
+    s.x[LEVEL + np.argmin(np.abs(s.x[:3]))] = 1.0
+    make_level(s.x[LEVEL:VELOCITY], up)
+    s.covariance[0, 0] = s.covariance[1, 1] = TILT_SIGMA**2
+    s.unknown = s.noise = s.running = 0.0
 
 
 @kernel
 def step_platform(
-    x: Array, covariance: Array, gyroscope: Array, accelerometer: Array, acceleration: Array, period: float, gravity: float,
-    rate_density: float, bias_walk: float, vertical_variance: float, transition: Array, work: Array, gain: Array, change: Array,
-) -> None:  # fmt: skip
+    p: Record, s: Record, gyroscope: Array, accelerometer: Array, acceleration: Array, period: float, gravity: float
+) -> None:
     """Take one sample [rad/s, m/s^2] into state and covariance.
 
     Args:
-        acceleration: (3,) [m/s^2], of the IMU itself without gravity, in {2}; it is taken out of the reading.
-        rate_density, bias_walk: spectral densities of the gyroscope's noise and of its bias.
-        vertical_variance: of each component of the accelerometer's reading over g.
-        transition, work, gain, change: scratch (6, 6), (6, 6), (6,), (6,).
+        acceleration: (3,) [m/s^2], what is known of the acceleration of the IMU itself, in {2}; it is taken out of the reading.
+        period: since the sample before [s].
+        gravity: [m/s^2].
     """
-    rate, t = subtract(vector(gyroscope), vector(x[3:])), period
-    w0, w1, w2 = rate
-    u0, u1, u2 = vector(x)
+    x, t = s.x, period
+    rate = subtract(vector(gyroscope), vector(x[BIAS:]))
     turn_direction(x, rate, t)
-    for i in range(STATES):
-        change[i] = 0.0
-        for j in range(STATES):
-            transition[i, j] = 1.0 if i == j else 0.0
-    transition[0, 1], transition[0, 2] = t * w2, -t * w1
-    transition[1, 0], transition[1, 2] = -t * w2, t * w0
-    transition[2, 0], transition[2, 1] = t * w1, -t * w0
-    transition[0, 4], transition[0, 5] = t * u2, -t * u1
-    transition[1, 3], transition[1, 5] = -t * u2, t * u0
-    transition[2, 3], transition[2, 4] = t * u1, -t * u0
-    # The lower half of the transition is the identity.
-    for i in range(STATES):
-        for j in range(STATES):
-            total = covariance[i, j]
-            if i < 3:
-                total = 0.0
-                for k in range(STATES):
-                    total += transition[i, k] * covariance[k, j]
-            work[i, j] = total
-    for i in range(STATES):
-        for j in range(i + 1):
-            total = work[i, j]
-            if j < 3:
-                total = 0.0
-                for k in range(STATES):
-                    total += work[i, k] * transition[j, k]
-            covariance[i, j] = total
-            covariance[j, i] = total
+    turn_direction(x[LEVEL:], rate, t)
+    first = vector(x[LEVEL:])
+    second = cross(vector(x), first)
+    force = subtract(vector(accelerometer), vector(acceleration))
+    shown = t * dot(first, force), t * dot(second, force)
+    seen = 0.5 * ((x[VELOCITY] + shown[0]) ** 2 + (x[VELOCITY + 1] + shown[1]) ** 2)
+    tilt_variance = 0.5 * (s.covariance[0, 0] + s.covariance[1, 1])
+    variance = t * t * (p.force_variance + gravity**2 * tilt_variance + FASTEST_MOTION**2 * s.unknown)
+    for i in range(2):
+        x[VELOCITY + i] += cut_innovation(shown[i], variance)
+    _predict_covariance(p, s, first, second, rate, t, gravity)
+    s.noise += p.force_variance * t * t
+    s.unknown = faded_excess(s.unknown, seen, s.noise, t)
+    _measure_no_velocity(s, velocity_density(s.unknown) / t)
+    _correct(s, first, second)
+
+
+@kernel
+def velocity_density(square: float) -> float:
+    """Spectral density of a velocity of this square [m^2/s^2]."""
+    return 2.0 * CORRELATION_S * square
+
+
+@kernel
+def _predict_covariance(p: Record, s: Record, first: Vector, second: Vector, rate: Vector, t: float, gravity: float) -> None:
+    """Carry the errors on: the bias turns the level axes, and their turn lets gravity into the velocity."""
+    c, lean = s.covariance, t * gravity
+    s.running += t
+    slowest = max(SLOWEST_CORRECTION, START_CORRECTION / (s.running + YOUNGEST_S))
+    turn = p.rate_density + RATE_NOISE * dot(rate, rate) + slowest**4 / gravity**2 * velocity_density(s.unknown)
+    for i in range(ERRORS):
+        c[2, i] += lean * c[1, i]
+        c[3, i] -= lean * c[0, i]
+    for i in range(ERRORS):
+        c[i, 2] += lean * c[i, 1]
+        c[i, 3] -= lean * c[i, 0]
+    for i in range(ERRORS):
+        c[0, i] -= t * (first[0] * c[4, i] + first[1] * c[5, i] + first[2] * c[6, i])
+        c[1, i] -= t * (second[0] * c[4, i] + second[1] * c[5, i] + second[2] * c[6, i])
+    for i in range(ERRORS):
+        c[i, 0] -= t * (first[0] * c[i, 4] + first[1] * c[i, 5] + first[2] * c[i, 6])
+        c[i, 1] -= t * (second[0] * c[i, 4] + second[1] * c[i, 5] + second[2] * c[i, 6])
+    for i in range(2):
+        c[i, i] += turn * t
+        c[2 + i, 2 + i] += p.force_variance * t * t
+    for i in range(4, ERRORS):
+        c[i, i] += p.bias_walk * t
+
+
+@kernel
+def _measure_no_velocity(s: Record, variance: float) -> None:
+    """Take for a measurement of this variance [m^2/s^2] that the velocity along each level axis is zero."""
+    c, gain = s.covariance, s.gain
+    kept = variance / (0.5 * (c[2, 2] + c[3, 3]) + variance)
+    s.noise *= kept * kept
+    s.change[:] = 0.0
+    for m in range(2, 4):
+        inverse = 1.0 / (c[m, m] + variance)
+        innovation = -s.x[VELOCITY + m - 2] - s.change[m]
+        for i in range(ERRORS):
+            gain[i] = c[i, m]
+        for i in range(ERRORS):
+            weight = gain[i] * inverse
+            s.change[i] += weight * innovation
+            for j in range(i + 1):
+                c[i, j] -= weight * gain[j]
+                c[j, i] = c[i, j]
+
+
+@kernel
+def _correct(s: Record, first: Vector, second: Vector) -> None:
+    """Move the state by the errors that were found."""
+    x, change = s.x, s.change
+    up = vector(x)
+    moved = add(up, subtract(scale(change[0], second), scale(change[1], first)))
+    size = np.sqrt(dot(moved, moved))
     for i in range(3):
-        covariance[i, i] += rate_density * t
-        covariance[3 + i, 3 + i] += bias_walk * t
-    for m in range(3):
-        innovation = (accelerometer[m] - acceleration[m]) / gravity - x[m] - change[m]
-        variance = covariance[m, m] + vertical_variance
-        for i in range(STATES):
-            gain[i] = covariance[i, m]
-        take_scalar(covariance, gain, change, STATES, cut_innovation(innovation, variance), variance)
-    for i in range(STATES):
-        x[i] += change[i]
-    norm = np.sqrt(dot(vector(x), vector(x)))
+        x[i] = moved[i] / size
+        x[LEVEL + i] += change[1] * up[i]
+        x[BIAS + i] += change[4 + i]
+    make_level(x[LEVEL:VELOCITY], vector(x))
+    for i in range(2):
+        x[VELOCITY + i] += change[2 + i]
+
+
+@kernel
+def vertical_covariance(s: Record, covariance: Array) -> None:
+    """Write the covariance (3, 3) of the vertical in {2} [rad^2]; along the vertical itself it is zero."""
+    c, first = s.covariance, vector(s.x[LEVEL:])
+    second = cross(vector(s.x), first)
     for i in range(3):
-        x[i] /= norm
+        for j in range(3):
+            mixed = first[i] * second[j] + second[i] * first[j]
+            covariance[i, j] = c[0, 0] * second[i] * second[j] + c[1, 1] * first[i] * first[j] - c[0, 1] * mixed

@@ -3,12 +3,13 @@
 import sys
 from argparse import SUPPRESS, Namespace
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from controller.settings import FusionSettings
 from hil.command_line import cli
 from hil.command_line.terminal import deg, duration, engine_at_work, mm, mm_deg, number_text, progress_bar
 from hil.engine.settings import EngineSettings
@@ -21,6 +22,9 @@ from plant.extras import check_installed
 if TYPE_CHECKING:
     from hil.sweep.analysis import Quantile
     from hil.sweep.sweep import SweepResult
+
+_LOOP = FusionSettings()
+"""What the filters assume in the closed loop."""
 
 
 @cli.command(
@@ -338,33 +342,33 @@ def gough_planar(options: Namespace) -> None:
 
 
 @cli.command(
-    cli.source("folder", "FOLDER", "folder with the trials *.npz"),
+    cli.source("folder", "FOLDER", "folder with the trials *.npz (default: only simulated motions)", nargs="?"),
+    cli.setting("--seeds", 1, "simulated motions of each kind"),
     cli.setting(
         "--accelerometer-noise",
-        0.25,
-        "noise that the filter assumes [m/s2/sqrt(Hz)]; on a mechanism the legs give the platform's acceleration, which "
-        "here is unknown and counts as noise, far above the sensor's own",
+        _LOOP.platform_accelerometer_noise,
+        "noise of the accelerometer that the filter assumes, as in the closed loop [m/s2/sqrt(Hz)]; the filter adds by itself "
+        "what it sees of the acceleration, which here is unknown",
     ),
-    cli.setting("--bias-walk", 1e-4, "random walk of the gyroscope's bias that the filter assumes [rad/s/sqrt(s)]"),
+    cli.setting("--bias-walk", _LOOP.bias_walk, "random walk of the gyroscope's bias that the filter assumes [rad/s/sqrt(s)]"),
     cli.engine_options(few="it takes seconds"),
     cli.JSON,
 )
 def gough_broad(options: Namespace) -> None:
-    """Run the platform's filter alone, on real IMU data.
+    """Run the platform's filter alone, on real and on simulated IMU data.
 
-    The filter, and the vqf package, run on trials of the BROAD benchmark: an IMU moved by hand, with an optical reference.
-    Prints the RMS of the inclination's error where the benchmark counts it, and microseconds of a sample, which are those of a
-    busy machine if there are several workers.
+    The filter, and the vqf package, run on trials of the BROAD benchmark, an IMU moved by hand with an optical reference, and
+    on simulated motions of 10 m/s2 with several spectra. Prints the RMS of the inclination's error in motion, and microseconds
+    of a sample, which are those of a busy machine if there are several workers.
     """
-    from controller.settings import FusionSettings
     from hil.studies.broad import evaluate
 
-    fusion = FusionSettings(platform_accelerometer_noise=options.accelerometer_noise, bias_walk=options.bias_walk)
+    fusion = replace(_LOOP, platform_accelerometer_noise=options.accelerometer_noise, bias_walk=options.bias_walk)
     with engine_at_work(cli.engine_of(options), "trials") as (engine, _):
-        figures = evaluate(options.folder, fusion, engine)
+        figures = evaluate(options.folder, fusion, options.seeds, engine)
     cli.write_json(options.json, figures)
     table = Table("inclination RMS", "filter [deg]", "vqf [deg]", "filter [us]", "vqf [us]", "samples")
-    for name, trial in figures["trials"].items():
+    for name, trial in {**figures["trials"], **figures["simulated"]}.items():
         methods = trial["filter"], trial["vqf"]
         errors = (deg(method["inclination_rms"]) for method in methods)
         times = (f"{method['us']:.2f}" for method in methods)

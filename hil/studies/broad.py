@@ -1,4 +1,6 @@
-"""The platform filter by itself on trials of the BROAD benchmark: a real IMU, moved by hand, with an optical reference.
+"""The platform filter by itself, where nothing tells the platform's acceleration: on real and on simulated IMUs.
+
+The real ones are trials of the BROAD benchmark, moved by hand, with an optical reference.
 
 D. Laidig, M. Caruso, A. Cereatti, T. Seel, *BROAD - A Benchmark for Robust Inertial Orientation Estimation*, Data 6(7), 2021,
 doi 10.3390/data6070072. A trial is a NumPy archive with
@@ -7,6 +9,8 @@ doi 10.3390/data6070072. A trial is a NumPy archive with
 - `opt_quat`: (N, 4), maps the sensor's frame to one with z up; NaN where the optics lost the sensor,
 - `movement`: (N,), true for samples that count,
 - `sampling_rate`: [Hz].
+
+The simulated ones move freely (`plant.dynamics.free_motion`).
 """
 
 import timeit
@@ -21,18 +25,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.estimation.platform_filter import STATES, start_platform, step_platform
+from controller.estimation.platform_filter import STATE, platform_parameters, start_platform, step_platform
 from controller.settings import FusionSettings
 from hil.engine.engine import IN_ONE_PROCESS, Engine
 from hil.studies.fusion_comparison import vqf_verticals
-from plant.compiled import kernel
+from plant.compiled import Record, kernel
+from plant.dynamics.free_motion import SPECTRA, STILL_S, move_freely
+from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
 from plant.errors import InputError
-from plant.imu import STANDARD_GRAVITY
+from plant.imu import ACCELEROMETER, GYROSCOPE, STANDARD_GRAVITY, imu_state, load_imu, measure
 from plant.pose import Array, rotations_from_quaternions
 
 SHAPES = {"imu_gyr": (3,), "imu_acc": (3,), "opt_quat": (4,), "movement": ()}
 """Arrays of a trial, and the shape of a sample of each."""
 _REPEATS = 5
+_IMU = "mpu9150-calibrated"
 _UNIT_TOLERANCE = 1e-3
 
 
@@ -57,23 +64,33 @@ class Trial:
         return float(np.sqrt(np.mean(angles**2)))
 
 
-def evaluate(folder: str | Path, fusion: FusionSettings, engine: Engine = IN_ONE_PROCESS) -> dict[str, Any]:
-    """Run the platform filter and the `vqf` package on every trial `*.npz` of a folder.
+def evaluate(
+    folder: str | Path | None, fusion: FusionSettings, seeds: int = 0, engine: Engine = IN_ONE_PROCESS
+) -> dict[str, Any]:
+    """Run the platform filter and the `vqf` package on every trial `*.npz` of a folder, and on simulated motions.
 
-    The noise in `fusion` includes the IMU's own acceleration, which nothing measures here.
+    Args:
+        folder: of the trials; None for none.
+        fusion: what the filter assumes.
+        seeds: how many simulated motions there are of each kind, those of the seeds 1, 2 ...
 
     Returns:
-        `trials`: by name and method (`filter`, `vqf`) the `inclination_rms` [rad] and the `us` of a sample; the noise that the
-        filter assumed [m/s^2/sqrt(Hz), rad/s/sqrt(s)], and the `version`.
+        `trials` and `simulated`: by name and method (`filter`, `vqf`) the `inclination_rms` [rad] and the `us` of a sample; the
+        noise that the filter assumed [m/s^2/sqrt(Hz), rad/s/sqrt(s)], and the `version`.
 
     Raises:
-        InputError: the folder is missing or has no trial, or a file is not a trial.
+        InputError: the folder is missing or has no trial, a file is not a trial, or there is nothing to run on.
     """
-    paths = sorted(Path(folder).glob("*.npz"))
-    if not paths:
+    paths = [] if folder is None else sorted(Path(folder).glob("*.npz"))
+    if folder is not None and not paths:
         raise InputError(f"{folder} is no folder with trials *.npz: give one with trials of BROAD")
+    if not paths and seeds < 1:
+        raise InputError(f"no folder with trials and {seeds} simulated motions of each kind: give a folder, or at least 1")
+    motions = [(kind, seed) for kind in SPECTRA for seed in range(1, seeds + 1)]
+    of_motions = engine.starmap(partial(_evaluate_motion, fusion), motions) if motions else []
     return {
-        "trials": dict(engine.map(partial(_evaluate, fusion), [load_trial(path) for path in paths])),
+        "trials": dict(engine.map(partial(_evaluate, fusion), [load_trial(path) for path in paths])) if paths else {},
+        "simulated": dict(of_motions),
         "accelerometer_noise": fusion.platform_accelerometer_noise,
         "bias_walk": fusion.bias_walk,
         "version": version("gough"),
@@ -82,11 +99,26 @@ def evaluate(folder: str | Path, fusion: FusionSettings, engine: Engine = IN_ONE
 
 def _evaluate(fusion: FusionSettings, trial: Trial) -> tuple[str, dict[str, Any]]:
     return trial.name, {
-        "filter": _score(trial, partial(_filter, trial, fusion)),
+        "filter": _score(trial, partial(filter_verticals, trial, fusion)),
         "vqf": _score(trial, partial(vqf_verticals, 1.0 / trial.rate, trial.rates, trial.forces)),
         "samples": len(trial.rates),
         "rate": trial.rate,
     }
+
+
+def _evaluate_motion(fusion: FusionSettings, kind: str, seed: int) -> tuple[str, dict[str, Any]]:
+    return _evaluate(fusion, simulated_trial(kind, seed))
+
+
+def simulated_trial(kind: str, seed: int, duration: float = 120.0, rate: float = 250.0) -> Trial:
+    """A trial of a free motion (`move_freely`) with an IMU `mpu9150-calibrated`, whose errors have the same seed."""
+    motion, imu = move_freely(kind, duration, rate, seed), imu_state(load_imu(_IMU), seed, 1.0 / rate)
+    ideal, raw = np.zeros((3, IMU_COUNT, 3)), np.empty((len(motion.times), 3, IMU_COUNT, 3))
+    for rates, forces, sample in zip(motion.rates, motion.forces, raw, strict=True):
+        ideal[GYROSCOPE, PLATFORM_IMU], ideal[ACCELEROMETER, PLATFORM_IMU] = rates, forces
+        measure(imu, ideal, sample)
+    gyroscope, accelerometer = (np.ascontiguousarray(raw[:, kind, PLATFORM_IMU]) for kind in (GYROSCOPE, ACCELEROMETER))
+    return Trial(f"{kind}, seed {seed}", rate, gyroscope, accelerometer, motion.rotations[:, 2], motion.times >= STILL_S)
 
 
 def load_trial(path: Path) -> Trial:
@@ -97,7 +129,11 @@ def load_trial(path: Path) -> Trial:
     """
     try:
         with np.load(path) as file:
-            arrays = {name: np.asarray(file[name], dtype=float) for name in file.files if name in {*SHAPES, "sampling_rate"}}
+            arrays = {
+                name: np.asarray(file[name], dtype=float, order="C")
+                for name in file.files
+                if name in {*SHAPES, "sampling_rate"}
+            }
     except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
         raise InputError(f"{path} is no NumPy archive that can be read: {error}") from None
     if missing := [name for name in (*SHAPES, "sampling_rate") if name not in arrays]:
@@ -133,25 +169,18 @@ def _score(trial: Trial, method: Callable[[], Array]) -> dict[str, float]:
     return {"inclination_rms": trial.inclination_rms(verticals), "us": 1e6 * float(np.median(took)) / len(verticals)}
 
 
-def _filter(trial: Trial, fusion: FusionSettings) -> Array:
-    variance = (fusion.platform_accelerometer_noise / STANDARD_GRAVITY) ** 2 * trial.rate / 2.0
-    densities = fusion.gyroscope_noise**2, fusion.bias_walk**2
-    return _follow(trial.rates, trial.forces, 1.0 / trial.rate, *densities, variance, fusion.bias_sigma)
+def filter_verticals(trial: Trial, fusion: FusionSettings) -> Array:
+    """The verticals (N, 3) by the platform filter, which does not know the acceleration."""
+    parameters = platform_parameters(fusion, trial.rate)
+    return _follow(parameters, np.zeros((), STATE), trial.rates, trial.forces, 1.0 / trial.rate)
 
 
 @kernel
-def _follow(
-    rates: Array, forces: Array, period: float, rate_density: float, bias_walk: float, variance: float, bias_sigma: float
-) -> Array:
-    """The verticals (N, 3) by the platform filter without a measured acceleration."""
-    x, gain, change = np.zeros(STATES), np.zeros(STATES), np.zeros(STATES)
-    covariance, transition, work = np.zeros((STATES, STATES)), np.zeros((STATES, STATES)), np.zeros((STATES, STATES))
+def _follow(parameters: Record, state: Record, rates: Array, forces: Array, period: float) -> Array:
+    p, s = parameters[()], state[()]
     acceleration, verticals = np.zeros(3), np.empty_like(forces)
-    start_platform(x, covariance, forces[0], bias_sigma)
+    start_platform(p, s, forces[0])
     for i in range(rates.shape[0]):
-        step_platform(
-            x, covariance, rates[i], forces[i], acceleration, period, STANDARD_GRAVITY, rate_density, bias_walk, variance,
-            transition, work, gain, change,
-        )  # fmt: skip
-        verticals[i] = x[:3]
+        step_platform(p, s, rates[i], forces[i], acceleration, period, STANDARD_GRAVITY)
+        verticals[i] = s.x[:3]
     return verticals

@@ -8,6 +8,7 @@ import numpy as np
 
 from controller.calibration.file import Calibration
 from controller.cycle import MARKS, STATE, CycleStage, cycle_parameters, run_stages
+from controller.estimation.platform_filter import vertical_covariance
 from controller.estimation.whole_mechanism.filter import extrapolate_covariance
 from controller.settings import control_settings, sensor_settings
 from hil.runs.config import FUSIONS
@@ -138,7 +139,8 @@ def _follow(parameters: Record, state: Record, raw: Array, fused: Record, segmen
         run_stages(parameters, state, raw[i], segments, marks, CycleStage.SCREENING, CycleStage.REFINEMENT)
         f.positions[CLOSED], f.rotations[CLOSED] = s.pose.position, s.pose.rotation
         f.directions[:], f.vertical[:] = s.legs.directions, s.platform.vertical
-        f.leg_covariances[:], f.vertical_covariance[:] = s.legs.covariance[:, :2, :2], s.platform.covariance[:3, :3]
+        f.leg_covariances[:] = s.legs.covariance[:, :2, :2]
+        vertical_covariance(s.platform, f.vertical_covariance)
         run_stages(parameters, state, raw[i], segments, marks, CycleStage.REFINEMENT, CycleStage.MECHANISM)
         f.positions[REFINED], f.rotations[REFINED] = s.pose.position, s.pose.rotation
         for j in range(6):

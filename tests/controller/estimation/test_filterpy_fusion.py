@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from controller.estimation.filterpy_filters import PLATFORM_STATES, STATES, FilterpyLeg, FilterpyPlatform
+from controller.estimation.filterpy_filters import STATES, FilterpyLeg, FilterpyPlatform
 from controller.estimation.leg_filter import predict_leg, predict_measurement, start_leg, update_leg
-from controller.estimation.platform_filter import INNOVATION_LIMIT, start_platform, step_platform
+from controller.estimation.platform_filter import STATE, platform_parameters, start_platform, step_platform
 from controller.settings import FusionSettings
 from tests.controller.leg_geometry import unit
 from tests.controller.leg_motion import observe, sines
@@ -97,30 +97,33 @@ def test_a_prediction_agrees_for_any_covariance_and_period(seed, exponent):
     np.testing.assert_allclose(covariance, reference.P, rtol=1e-13, atol=1e-13)
 
 
-@pytest.mark.parametrize(("rate", "seed"), [(1000.0, 0), (250.0, 1), (4000.0, 2)])
-def test_five_thousand_steps_of_the_platform_agree_with_the_compiled_filter(rate, seed):
+@pytest.mark.parametrize(("rate", "known", "seed"), [(1000.0, 1.0, 0), (250.0, 1.0, 1), (4000.0, 1.0, 2), (500.0, 0.0, 3)])
+def test_five_thousand_steps_of_the_platform_agree_with_the_compiled_filter(rate, known, seed):
+    """With an acceleration that is known, or is not, jolts, and a rest: with and without an unknown velocity."""
     random, fusion = np.random.default_rng(seed), FusionSettings()
-    noise = (fusion.gyroscope_noise**2, fusion.bias_walk**2, 1e-3)
     times = np.arange(5000)[:, None] / rate
+    moving = np.where(np.arange(5000) < 3000, 1.0, 0.0)[:, None]
     gyroscope = 0.01 + 2.0 * np.sin(times * [3.0, 5.0, 7.0] + [0.0, 1.0, 2.0]) + random.normal(scale=2e-3, size=(5000, 3))
-    acceleration = random.normal(size=(5000, 3))
-    force = GRAVITY * unit([0.1, -0.2, 1.0]) + acceleration + random.normal(scale=0.3, size=(5000, 3))
-    jolts = random.random((5000, 3)) < 0.02
+    acceleration = moving * 5.0 * np.sin(times * [9.0, 7.0, 5.0])
+    force = GRAVITY * unit([0.1, -0.2, 1.0]) + acceleration + random.normal(scale=0.1, size=(5000, 3))
+    jolts = random.random((5000, 3)) < 0.02 * moving
     force[jolts] += 60.0
-    x, covariance = np.zeros(PLATFORM_STATES), np.zeros((PLATFORM_STATES, PLATFORM_STATES))
-    start_platform(x, covariance, force[0], fusion.bias_sigma)
-    reference = FilterpyPlatform(GRAVITY, 1.0 / rate, *noise)
-    reference.start(x, covariance)
-    scratch = (np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(6))
-    worst, cut = np.zeros(2), 0
-    for sample in zip(gyroscope, force, acceleration, strict=True):
-        reference.step(*sample)
-        step_platform(x, covariance, *sample, 1.0 / rate, GRAVITY, *noise, *scratch)
-        deviation = np.sqrt(np.diag(covariance))
-        off = (covariance - reference.P) / np.outer(deviation, deviation)
-        worst = np.maximum(worst, [np.abs(x - reference.state).max(), np.abs(off).max()])
-        innovation = reference.y.item() / np.sqrt(reference.S.item())
-        assert abs(innovation) < INNOVATION_LIMIT * (1.0 + 1e-12)
-        cut += abs(innovation) > INNOVATION_LIMIT * (1.0 - 1e-12)
-    assert worst.max() < 1e-12
-    assert cut > 50
+    parameters, state = platform_parameters(fusion, rate)[()], np.zeros((), STATE)[()]
+    start_platform(parameters, state, force[0])
+    constants = (float(parameters[name]) for name in ("rate_density", "bias_walk", "force_variance"))
+    reference, handed = FilterpyPlatform(GRAVITY, *constants), np.zeros((), STATE)[()]
+    reference.take_over(state)
+    worst, excess = np.zeros(3), []
+    velocity_noise = float(parameters["force_variance"]) / rate**2
+    for rates, forces, own in zip(gyroscope, force, known * acceleration, strict=True):
+        reference.step(rates, forces, own, 1.0 / rate)
+        step_platform(parameters, state, rates, forces, own, 1.0 / rate, GRAVITY)
+        reference.hand_over(handed)
+        # Where the velocity is known to be zero, it has no variance of its own.
+        deviation = np.sqrt(np.diag(state["covariance"]) + velocity_noise * np.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0]))
+        off = (state["covariance"] - handed["covariance"]) / np.outer(deviation, deviation)
+        unknown = state["unknown"] - handed["unknown"], state["noise"] - handed["noise"]
+        worst = np.maximum(worst, [np.abs(difference).max() for difference in (state["x"] - handed["x"], off, unknown)])
+        excess.append(float(state["unknown"]))
+    assert worst.max() < 1e-11
+    assert max(excess) > 0.0

@@ -357,11 +357,11 @@ def test_the_errors_of_a_planar_rig_are_printed(tables, tmp_path):
 
 def test_the_scores_of_trials_are_printed(monkeypatch, tables):
     methods = {name: {"inclination_rms": radians(k), "us": 10.0 * k} for k, name in enumerate(("filter", "vqf"), start=1)}
-    monkeypatch.setattr(
-        "hil.studies.broad.evaluate", lambda folder, fusion, engine: {"trials": {"t": methods | {"samples": 99}}}
-    )
+    figures = {"trials": {"t": methods | {"samples": 99}}, "simulated": {"s": methods | {"samples": 98}}}
+    monkeypatch.setattr("hil.studies.broad.evaluate", lambda folder, fusion, seeds, engine: figures)
     assert main(["broad", "."]) == 0
     assert tables[0][1] == ["t", "1.000", "2.000", "10.00", "20.00", "99"]
+    assert tables[0][2] == ["s", "1.000", "2.000", "10.00", "20.00", "98"]
     assert tables[0][0] == ["inclination RMS", "filter [deg]", "vqf [deg]", "filter [us]", "vqf [us]", "samples"]
 
 
