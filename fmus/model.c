@@ -83,18 +83,19 @@ static void place_at_start(State *s) {
 
 /* The classical Runge-Kutta method with equal substeps. */
 static void integrate(State *s, double duration, long steps) {
+    /* The states of disturbances, which are the last, stay zero in the ideal case. */
     double h = duration / steps, *x = s->values, k[4][STATES], at[STATES];
-    int ideal = is_ideal(s);
+    int ideal = is_ideal(s), states = ideal ? IDEAL_STATES : STATES;
     require_constants(s);
     for (long step = 0; step < steps; step++) {
         rates(s, ideal, x, k[0]);
-        for (int i = 0; i < STATES; i++) at[i] = x[i] + h / 2 * k[0][i];
+        for (int i = 0; i < states; i++) at[i] = x[i] + h / 2 * k[0][i];
         rates(s, ideal, at, k[1]);
-        for (int i = 0; i < STATES; i++) at[i] = x[i] + h / 2 * k[1][i];
+        for (int i = 0; i < states; i++) at[i] = x[i] + h / 2 * k[1][i];
         rates(s, ideal, at, k[2]);
-        for (int i = 0; i < STATES; i++) at[i] = x[i] + h * k[2][i];
+        for (int i = 0; i < states; i++) at[i] = x[i] + h * k[2][i];
         rates(s, ideal, at, k[3]);
-        for (int i = 0; i < STATES; i++) {
+        for (int i = 0; i < states; i++) {
             x[i] += h / 6 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i]);
             if (fabs(x[i]) < NEGLIGIBLE) x[i] = 0;
         }
@@ -131,7 +132,8 @@ static Status check_conditions(const Plant *plant) {
 
 static Status check_limits(const Plant *plant) {
     double values[LIMITS + 1], limits[LIMITS + 1];
-    CALL(plant_limits, (plant->state.values, plant->state.constants), (values, limits));
+    if (is_ideal(&plant->state)) CALL(plant_ideal_limits, (plant->state.values, plant->state.constants), (values, limits));
+    else CALL(plant_limits, (plant->state.values, plant->state.constants), (values, limits));
     for (int i = 0; i < LIMITS; i++)
         if (!(values[i] <= limits[i])) return model_fail(plant, limit_texts[i], values[i], limits[i]);
     return OK;

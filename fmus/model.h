@@ -2,12 +2,13 @@
  *
  * layout.h is generated from the plant's variable table. One vector `values` holds all variables, states first and their
  * derivatives last; variable v is `length[v]` scalars at `offset[v]`. The whole state is one plain struct, which is copied to
- * save, restore and serialise it. plant.h and derivatives.h are generated from the plant's dynamics.
+ * save, restore and serialise it. plant.h, disturbed.h and derivatives.h are generated from the plant's dynamics.
  */
 #pragma once
 #include <stddef.h>
 
 #include "derivatives.h"
+#include "disturbed.h"
 #include "layout.h"
 #include "plant.h"
 

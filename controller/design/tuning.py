@@ -145,7 +145,7 @@ def linear_plant(mechanism: Mechanism, rate: float) -> tuple[Linear, Array]:
     """The plant at home under its load, from velocity commands to ideal IMU signals (42,), and the signals at home.
 
     The signals are the angular velocities of the seven IMUs, then their specific forces. The attitude's state is a rotation
-    vector.
+    vector. Legs count as perfect, and the base as at rest.
     """
     values = mechanism.plant_parameters()
     friction = {"friction.coulomb": np.zeros(LEGS)}
@@ -155,11 +155,11 @@ def linear_plant(mechanism: Mechanism, rate: float) -> tuple[Linear, Array]:
     x, u = (np.zeros(sum(variable.size for variable in variables)) for variables in (STATES, INPUTS))
     x[:7] = *values["initial_position"], *values["initial_quaternion"]
     u[_slice(INPUTS, "drive_mode")] = VELOCITY
-    _balance(dynamics.rates, x, u, constants)
+    _balance(dynamics.ideal_rates, x, u, constants)
 
     states, inputs = ca.SX.sym("x", len(x)), ca.SX.sym("u", len(u))
-    rates = dynamics.rates(states, inputs, constants)
-    signals = dynamics.outputs(states, inputs, constants)[:_SIGNALS]
+    rates = dynamics.ideal_rates(states, inputs, constants)
+    signals = dynamics.ideal_outputs(states, inputs, constants)[:_SIGNALS]
     a, b, c = (
         np.array(ca.Function("jacobian", [states, inputs], [ca.jacobian(of, by)])(x, u))
         for of, by in ((rates, states), (rates, inputs), (signals, states))
@@ -170,7 +170,7 @@ def linear_plant(mechanism: Mechanism, rate: float) -> tuple[Linear, Array]:
         reduce @ a @ expand, reduce @ b[:, _slice(INPUTS, "velocity_command")], c @ expand, np.zeros((_SIGNALS, LEGS))
     )
     discrete = control.sample_system(continuous, 1.0 / rate, method="zoh")
-    at_rest = np.array(dynamics.outputs(x, u, constants)[:_SIGNALS]).ravel()
+    at_rest = np.array(dynamics.ideal_outputs(x, u, constants)[:_SIGNALS]).ravel()
     return Linear(discrete.A, discrete.B, discrete.C, discrete.D), at_rest
 
 

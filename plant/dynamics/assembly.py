@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from plant.dynamics.legs_and_actuators import SX, Condition, brake_deflections
+from plant.dynamics.play import PLAYS, play_under
 from plant.dynamics.variables import Variable, VariableTable
 
 Values = dict[str, SX]
@@ -16,7 +17,7 @@ Values = dict[str, SX]
 class Dynamics:
     """A plant as functions of flat vectors; `conditions` and `limits` return values and their greatest values.
 
-    `ideal_rates` and `ideal_outputs` are the same functions with all disturbances at zero, and much shorter.
+    `ideal_limits`, `ideal_rates` and `ideal_outputs` are the same functions with all disturbances at zero, and much shorter.
     """
 
     constants: ca.Function  # of the parameters
@@ -27,6 +28,7 @@ class Dynamics:
     limit_texts: tuple[str, ...]
     rates: ca.Function  # of states, inputs and constants
     outputs: ca.Function  # of the same
+    ideal_limits: ca.Function
     ideal_rates: ca.Function
     ideal_outputs: ca.Function
 
@@ -49,26 +51,28 @@ def assemble(
     options = {"cse": True}
     watched = limits(states, symbols)
 
-    def running(prefix: str, changed: Values) -> tuple[ca.Function, ca.Function]:
-        """Rates and outputs; CasADi leaves out what zeros among the changed values make vanish."""
-        sides = ({name: changed.get(name, value) for name, value in side.items()} for side in (states, inputs, symbols))
-        rates, outputs = plant(*sides)
+    def running(prefix: str, changed: Values) -> tuple[ca.Function, ca.Function, ca.Function]:
+        """Limits, rates and outputs; CasADi leaves out what zeros among the changed values make vanish."""
+        x, u, c = ({name: changed.get(name, value) for name, value in side.items()} for side in (states, inputs, symbols))
+        rates, outputs = plant(x, u, c)
         return (
+            ca.Function(f"plant_{prefix}limits", [arguments[0], arguments[2]], _sides(limits(x, c)), options),
             ca.Function(f"plant_{prefix}rates", arguments, [_in_order(rates, table.states)], options),
             ca.Function(f"plant_{prefix}outputs", arguments, [_in_order(outputs, table.outputs)], options),
         )
 
-    rates, outputs = running("", {})
-    ideal_rates, ideal_outputs = running("ideal_", zeros(each for each in table.variables if each.disturbance))
+    within, rates, outputs = running("", {})
+    ideal_within, ideal_rates, ideal_outputs = running("ideal_", zeros(each for each in table.variables if each.disturbance))
     return Dynamics(
         constants=ca.Function("plant_constants", given, [_flat(constants)], options),
         start=ca.Function("plant_start", given, [_in_order(_braked(table, start, constants, plant), table.states)], options),
         conditions=ca.Function("plant_conditions", given, _sides(conditions), options),
         condition_texts=tuple(condition.text for condition in conditions),
-        limits=ca.Function("plant_limits", [_flat(states), _flat(symbols)], _sides(watched), options),
+        limits=within,
         limit_texts=tuple(condition.text for condition in watched),
         rates=rates,
         outputs=outputs,
+        ideal_limits=ideal_within,
         ideal_rates=ideal_rates,
         ideal_outputs=ideal_outputs,
     )
@@ -77,14 +81,24 @@ def assemble(
 def _braked(
     table: VariableTable, start: Values, constants: Values, plant: Callable[[Values, Values, Values], tuple[Values, Values]]
 ) -> Values:
-    """The states of a plant that stands on brakes that carry the load, by its own equations, which are linear in that."""
+    """The states of a plant that stands on brakes that carry the load, by its own equations, which are linear in that.
+
+    Its play is taken up by the load, and its legs are bent by their weight.
+    """
     resting = zeros(table.states) | start
     deflection = SX.sym("deflection", *resting["state.brake_deflection"].shape)
-    rates, _ = plant(resting | {"state.brake_deflection": deflection}, zeros(table.inputs), constants)
+    tight = constants | {name: SX.zeros(*constants[name].shape) for name in PLAYS}
+    rates, _ = plant(resting | {"state.brake_deflection": deflection}, zeros(table.inputs), tight)
     acceleration = ca.vertcat(rates["state.velocity"], rates["state.angular_velocity"])
     effect = -ca.jacobian(acceleration, deflection)
     falling = ca.substitute(acceleration, deflection, SX.zeros(deflection.shape[0]))
-    return resting | {"state.brake_deflection": brake_deflections(effect, falling, constants["brake_slip"])}
+    braked = resting | {"state.brake_deflection": brake_deflections(effect, falling, constants["brake_slip"])}
+    rates, _ = plant(braked, zeros(table.inputs), tight)
+    return braked | {
+        "state.play": play_under(-constants["brake.stiffness"] * braked["state.brake_deflection"], constants),
+        # An oscillator at rest, whose centre is away by its acceleration over the square of its frequency.
+        "state.bending": rates["state.bending_rate"] / (2 * ca.pi * constants["leg.bending_frequency"]) ** 2,
+    }
 
 
 def zeros(variables: Iterable[Variable]) -> Values:

@@ -16,6 +16,8 @@ from math import pi
 import casadi as ca
 
 from plant.dynamics.base_motion import BaseMotion
+from plant.dynamics.play import Play, play_at, width_of
+from plant.dynamics.universal_joint import Reach, reach_at
 from plant.dynamics.variables import BRAKE, OPEN, VELOCITY
 
 SX = ca.SX
@@ -29,7 +31,9 @@ def row(matrix: SX, k: int) -> SX:
 _UNCHANGED = (
     "motor.resistance", "drive.voltage_limit", "drive.current_limit", "friction.coulomb", "friction.viscous",
     "friction.velocity", "brake.stiffness", "brake.damping", "stop.minimum_length", "stop.maximum_length", "stop.stiffness",
-    "stop.damping", "gravity", "magnetic_field", "leg_imu_position", "platform_imu_position",
+    "stop.damping", "screw.backlash", "joint.clearance", "screw.stiffness", "screw.damping", "leg.lower.mass",
+    "leg.lower.center", "leg.lower.inertia", "leg.upper.inertia", "leg.bending_compliance", "leg.guide",
+    "leg.bending_frequency", "leg.bending_damping", "gravity", "magnetic_field", "leg_imu_position", "platform_imu_position",
 )  # fmt: skip
 
 
@@ -47,10 +51,10 @@ def body_constants(p: dict[str, SX], about_offset: Callable[[SX], SX]) -> dict[s
     return {name: p[name] for name in _UNCHANGED} | {
         "transverse_inertia": p[lower + "inertia"] + p[upper + "inertia"] + p[lower + "mass"] * p[lower + "center"] ** 2,
         "lower_moment": p[lower + "mass"] * p[lower + "center"],
-        "lower_mass": p[lower + "mass"],
         "rod_mass": p[upper + "mass"],
         "rod_center": p[upper + "center"],
         "sliding_mass": p[upper + "mass"] + p["motor.rotor_inertia"] * turns**2,
+        "rotor_mass": p["motor.rotor_inertia"] * turns**2,
         "force_constant": turns * p["motor.torque_constant"],
         "compensating_resistance": p["drive.compensation"] * p["drive.nominal_resistance"],
         "inverse_inductance": 1 / p["motor.inductance"],
@@ -87,6 +91,13 @@ def leg_conditions(p: dict[str, SX], lengths: SX) -> list[Condition]:
                 f"stop.minimum_length of leg {k} is %g m, beyond its stop.maximum_length of %g m",
             ),
         ]
+    conditions.append(
+        Condition(
+            (ca.mmax(p["leg.bending_compliance"]) > 0) * p["leg.guide"],
+            ca.mmin(lengths),
+            "leg.guide is at %g m, beyond the end of a leg of %g m that bends: move it to where the rod leaves the lower part",
+        )
+    )
     outside = ca.vertcat(p["stop.minimum_length"] - lengths, lengths - p["stop.maximum_length"])
     return conditions + _substep_conditions(p, ca.fmax(ca.mmax(outside), 0))
 
@@ -105,6 +116,9 @@ _RUNGE_KUTTA_REACH = 2.5
 _CONTACT_REACH = 1.5
 """The same for the end stops, found with 800 random sets of parameters."""
 
+_STRIKE = 0.1
+"""The speed at which flanks strike one another after the short way through their play [m/s]."""
+
 
 def _substep_conditions(p: dict[str, SX], beyond_stop: SX) -> list[Condition]:
     """The substep is short enough for the fastest modes of the legs.
@@ -114,13 +128,17 @@ def _substep_conditions(p: dict[str, SX], beyond_stop: SX) -> list[Condition]:
     leg: at most the drive's voltage over its force constant, or that of a leg that starts `beyond_stop` [m] beyond its stop.
     """
     turns = 2 * pi / p["motor.screw_lead"]
-    sliding_mass = p["leg.upper.mass"] + p["motor.rotor_inertia"] * turns**2
+    rotor_mass, rod_mass, loose = p["motor.rotor_inertia"] * turns**2, p["leg.upper.mass"], ca.mmax(width_of(p)) > 0
+    sliding_mass = rotor_mass + (1 - loose) * rod_mass
     constant = turns * p["motor.torque_constant"]
     speed = p["drive.voltage_limit"] / constant
     slope = ca.mmax(p["friction.viscous"] + p["friction.coulomb"] / p["friction.velocity"]) + p["brake.damping"]
     fading = ca.fmax(slope / sliding_mass, ca.mmax(p["motor.resistance"]) / p["motor.inductance"])
     storing = (constant**2 / p["motor.inductance"] + p["brake.stiffness"]) / sliding_mass
-    bounce = ca.sqrt(p["stop.stiffness"] / sliding_mass)
+    # An end stop acts on the rotor, or beside play on the platform, at whose rim a leg moves about a quarter of its mass.
+    share = (p["platform.mass"] + p["payload.mass"]) / 4
+    bounce = ca.sqrt(p["stop.stiffness"] / (rod_mass + (1 - loose) * rotor_mass + loose * share))
+    rattle = loose * ca.sqrt(p["screw.stiffness"] * (1 / rod_mass + 1 / rotor_mass))
     rates = [
         (
             ca.sqrt(fading**2 + storing) / _RUNGE_KUTTA_REACH,
@@ -137,6 +155,19 @@ def _substep_conditions(p: dict[str, SX], beyond_stop: SX) -> list[Condition]:
             bounce * (1 + p["stop.damping"] * ca.fmax(speed, beyond_stop * bounce)) / _CONTACT_REACH,
             "the end stops, the square root of stop.stiffness over the sliding mass, and stop.damping",
         ),
+        (
+            rattle * (1 + p["screw.damping"] * _STRIKE) / _CONTACT_REACH,
+            "the play, the square root of screw.stiffness over the mass of rod or rotor, and screw.damping",
+        ),
+        (
+            (ca.mmax(p["leg.bending_compliance"]) > 0)
+            * 2
+            * pi
+            * p["leg.bending_frequency"]
+            * (1 + p["leg.bending_damping"])
+            / _RUNGE_KUTTA_REACH,
+            "the bending, leg.bending_frequency and leg.bending_damping",
+        ),
     ]
     return [
         Condition(p["substep"], 1 / rate, f"substep is %g s, and may be at most %g s because of {what}: reduce it")
@@ -148,13 +179,13 @@ def _substep_conditions(p: dict[str, SX], beyond_stop: SX) -> list[Condition]:
 class Leg:
     """One leg at one instant; vectors (3, 1) and their derivatives seen in {1}.
 
-    `mass` (3, 3) and `force` (3, 1) are M_s and h in `M_s s'' + h = F`, with F the force on the platform joint. `arm` points
-    from the platform's origin to that joint, and `bias` is s'' without acceleration of the platform. `gravity` is what a body
-    at rest on the base joint feels.
+    r is the vector from base joint to platform joint, and s that from the second axis of the base joint. `mass` (3, 3) and
+    `force` (3, 1) are M and h in `M r'' + h = F`, with F the force on the platform joint. `arm` points from the platform's
+    origin to that joint, and `bias` is r'' without acceleration of the platform. `gravity` is what a body at rest on the base
+    joint feels.
     """
 
-    s: SX
-    velocity: SX
+    reach: Reach
     arm: SX
     bias: SX
     gravity: SX
@@ -165,14 +196,25 @@ class Leg:
     force: SX
     kinetic: SX
     potential: SX
+    swing2: SX  # square of the rate at which the leg swings in {1}
+
+    def accelerations(self, platform: SX) -> tuple[SX, SX]:
+        """The second derivatives of r and s, for an acceleration (6, 1) of the platform."""
+        whole = platform[:3] + ca.cross(platform[3:], self.arm) + self.bias
+        return whole, self.reach.slope @ whole + self.reach.bias
+
+    def length_acceleration(self, platform: SX) -> SX:
+        """The second derivative of the length, for an acceleration (6, 1) of the platform."""
+        return ca.dot(self.reach.s, self.accelerations(platform)[1]) / self.length + self.length * self.swing2
 
 
-def _leg_at(s: SX, velocity: SX, arm: SX, bias: SX, joint: SX, e1: SX, base: BaseMotion, c: dict[str, SX]) -> Leg:
+def _leg_at(reach: Reach, arm: SX, bias: SX, joint: SX, e1: SX, sliding_mass: SX, base: BaseMotion, c: dict[str, SX]) -> Leg:
     """Lagrange's equations of one leg with its motor, on its base joint and its first axis e1.
 
     The leg slides with the mass m, swings with the transverse inertia I(l), and turns about its axis with the rate that the
     universal joint imposes, `w = kappa q + omega . n`, kappa = k / (l^3 - l k^2), q = (e1 x s) . s', omega of the base.
     """
+    s, velocity = reach.s, reach.velocity
     # One square root and no division: CasADi would make a separate division of every product with 1 / l.
     square = ca.dot(s, s)
     inverse = ca.sqrt(1 / square)
@@ -184,7 +226,11 @@ def _leg_at(s: SX, velocity: SX, arm: SX, bias: SX, joint: SX, e1: SX, base: Bas
     swing = across + ca.cross(base.omega, s)
     swing2 = ca.dot(swing, swing) * inverse**2
     carried = base.acceleration(s, velocity)
-    gravity, joint_velocity = base.gravity - base.carry @ joint, ca.cross(base.omega, joint)
+    on_joint = base.gravity - base.carry @ joint
+    # The second axis moves about the first: its acceleration is `beyond r'' - reach.bias` in {1}.
+    beyond = SX.eye(3) - reach.slope
+    gravity = on_joint - base.acceleration(reach.beyond, reach.beyond_velocity) + reach.bias
+    axis_velocity = ca.cross(base.omega, joint + reach.beyond) + reach.beyond_velocity
 
     lever = length - c["rod_center"]
     inertia = c["transverse_inertia"] + c["rod_mass"] * lever**2
@@ -208,43 +254,52 @@ def _leg_at(s: SX, velocity: SX, arm: SX, bias: SX, joint: SX, e1: SX, base: Bas
     )
 
     swing_mass = inertia * inverse**2
-    sliding_mass = c["sliding_mass"]
+    # Of the leg's first moment about its second axis, the slope by s and the acceleration without s''.
+    moment_slope = weight_lever * inverse * (SX.eye(3) - n @ n.T) + c["rod_mass"] * n @ n.T
+    moment_rate = weight_lever * inverse * across + c["rod_mass"] * speed * n
+    moment_bias = (c["rod_mass"] * length - weight_lever) * inverse**2 * (2 * speed * across + ca.dot(across, across) * n)
+    leg_mass = c["leg.lower.mass"] + c["rod_mass"]
+    dragged = moment_slope @ reach.bias + moment_bias + base.acceleration(weight_lever * n, moment_rate) - leg_mass * gravity
+    coupling = beyond @ moment_slope @ reach.slope
+    mass = swing_mass * SX.eye(3) + (sliding_mass - swing_mass) * n @ n.T + axial * kappa**2 * turned @ turned.T
+    force = (
+        (sliding_mass * length * swing2 - inertia_slope * swing2 / 2 - c["rod_mass"] * gravity_along) * n
+        + (inertia_slope - 2 * inertia * inverse) * speed * inverse**2 * swing
+        - weight_lever * inverse * (gravity - gravity_along * n)
+        + axial * gyroscopic
+        + swing_mass * carried
+        + (sliding_mass - swing_mass) * ca.dot(n, carried) * n
+    )
     return Leg(
-        s=s,
-        velocity=velocity,
+        reach=reach,
         arm=arm,
         bias=bias,
-        gravity=gravity,
+        gravity=on_joint,
         length=length,
         speed=speed,
         direction=n,
-        mass=swing_mass * SX.eye(3) + (sliding_mass - swing_mass) * n @ n.T + axial * kappa**2 * turned @ turned.T,
-        force=(
-            (sliding_mass * length * swing2 - inertia_slope * swing2 / 2 - c["rod_mass"] * gravity_along) * n
-            + (inertia_slope - 2 * inertia * inverse) * speed * inverse**2 * swing
-            - weight_lever * inverse * (gravity - gravity_along * n)
-            + axial * gyroscopic
-            + swing_mass * carried
-            + (sliding_mass - swing_mass) * ca.dot(n, carried) * n
-        ),
+        mass=reach.slope @ mass @ reach.slope + leg_mass * beyond @ beyond + coupling + coupling.T,
+        force=reach.slope @ (force + mass @ reach.bias) + beyond @ dragged,
         kinetic=(
             (inertia * swing2 + sliding_mass * speed**2 + axial * spin**2) / 2
-            + (c["lower_mass"] + c["rod_mass"]) * ca.dot(joint_velocity, joint_velocity) / 2
-            + ca.dot(joint_velocity, weight_lever * inverse * swing + c["rod_mass"] * speed * n)
+            + leg_mass * ca.dot(axis_velocity, axis_velocity) / 2
+            + ca.dot(axis_velocity, weight_lever * inverse * swing + c["rod_mass"] * speed * n)
         ),
-        potential=-ca.dot(base.gravity, n) * weight_lever,
+        potential=-ca.dot(base.gravity, n) * weight_lever - leg_mass * ca.dot(base.gravity, reach.beyond),
+        swing2=ca.dot(across, across) * inverse**2,
     )
 
 
 def legs_at(position: SX, rotation: SX, velocity: SX, omega: SX, base: BaseMotion, c: dict[str, SX]) -> list[Leg]:
     """The legs, whose constants include joints and axes (n, 3), for a motion of {2} in {1}."""
-    legs = []
+    legs, widths = [], width_of(c)
     for k in range(c["base_joints"].shape[0]):
         arm, joint = rotation @ row(c["platform_joints"], k), row(c["base_joints"], k)
         turning = ca.cross(omega, arm)
         bias = ca.cross(omega, turning)
-        axis = row(c["base_joint_axes"], k)
-        legs.append(_leg_at(position + arm - joint, velocity + turning, arm, bias, joint, axis, base, c))
+        axis, sliding_mass = row(c["base_joint_axes"], k), c["sliding_mass"] - (widths[k] > 0) * c["rotor_mass"]
+        reach = reach_at(position + arm - joint, velocity + turning, axis, c["base_joint_offset"][k])
+        legs.append(_leg_at(reach, arm, bias, joint, axis, sliding_mass, base, c))
     return legs
 
 
@@ -259,16 +314,32 @@ class Actuators:
     voltage: SX
     current_rate: SX
     brake_rate: SX
+    speed: SX  # of the motors, along the legs
+    play: Play
+
+    @property
+    def driving(self) -> SX:
+        """The force of all that acts on the motors."""
+        return self.motor - self.friction + self.brake
 
     @property
     def force(self) -> SX:
-        """The total force, positive when it pushes."""
-        return self.motor - self.friction + self.brake + self.stop
+        """The total force on the legs, positive when it pushes."""
+        return self.driving + self.stop + (self.play.force - self.play.loose * self.driving)
+
+    def play_velocity_rate(self, length_acceleration: SX, c: dict[str, SX]) -> SX:
+        """The rate of `state.play_velocity`, for accelerations of the lengths (n, 1)."""
+        return self.play.loose * ((self.driving - self.play.force) / c["rotor_mass"] - length_acceleration)
+
+    def kinetic(self, c: dict[str, SX]) -> SX:
+        """The kinetic energy of motors that are apart from their rods."""
+        return ca.dot(self.play.loose, self.speed**2) * c["rotor_mass"] / 2
 
 
 def actuators_at(legs: list[Leg], x: dict[str, SX], u: dict[str, SX], c: dict[str, SX]) -> Actuators:
     """The actuators, from states, inputs and constants."""
-    speeds, current = _speeds(legs), x["state.current"]
+    play, current = play_at(x, c), x["state.current"]
+    speeds = _speeds(legs) + play.speed
     mode = u["drive_mode"]
     closed, driven = mode == BRAKE, mode == VELOCITY
     friction = c["friction.viscous"] * speeds + c["friction.coulomb"] * speeds / ca.sqrt(
@@ -291,22 +362,25 @@ def actuators_at(legs: list[Leg], x: dict[str, SX], u: dict[str, SX], c: dict[st
             ca.fmin(free, c["limiter_rate"] * (c["drive.current_limit"] - current)),
             c["limiter_rate"] * (-c["drive.current_limit"] - current),
         ),
-        brake_rate=ca.vertcat(*[_brake_rate(deflections[k], leg.speed, closed[k], c) for k, leg in enumerate(legs)]),
+        brake_rate=ca.vertcat(*[_brake_rate(deflections[k], speeds[k], closed[k], c) for k in range(len(legs))]),
+        speed=speeds,
+        play=play,
     )
 
 
 def leg_outputs(legs: list[Leg], actuators: Actuators, x: dict[str, SX]) -> dict[str, SX]:
     """What the table has of legs and actuators, by name."""
-    speeds = _speeds(legs)
+    speeds, motors = _speeds(legs), actuators.speed
     return {
         "leg_length": ca.vertcat(*[leg.length for leg in legs]),
         "leg_velocity": speeds,
         "current": x["state.current"],
         "voltage": actuators.voltage,
-        "power.drive": ca.dot(actuators.motor, speeds),
-        "power.friction": -ca.dot(actuators.friction, speeds),
-        "power.brake": ca.dot(actuators.brake, speeds),
+        "power.drive": ca.dot(actuators.motor, motors),
+        "power.friction": -ca.dot(actuators.friction, motors),
+        "power.brake": ca.dot(actuators.brake, motors),
         "power.stop": ca.dot(actuators.stop, speeds),
+        "power.play": -ca.dot(actuators.play.force, actuators.play.speed),
     }
 
 
@@ -365,52 +439,3 @@ def solve(matrix: SX, right: SX) -> SX:
     for i in reversed(range(n)):
         z[i] = (z[i] - sum(lower[k, i] * z[k] for k in range(i + 1, n))) * inverses[i]
     return ca.vertcat(*z)
-
-
-def _leg_turning(s: SX, velocity: SX, acceleration: SX, e1: SX) -> tuple[SX, SX, SX]:
-    """The leg frame (3, 3), and the leg's angular velocity and acceleration (3, 1) in {1}, from the leg vector and its
-    derivatives.
-
-    With `h = k q / d`, `k = e1 . s`, `q = e1 . (s x s')` and `d = s . s - k^2 = |s x e1|^2`, the angular velocity of the
-    module's text is `omega = (s x s' + h s) / (s . s)`.
-    """
-    square, k = ca.dot(s, s), ca.dot(e1, s)
-    across = square - k**2
-    # Square roots instead of divisions, as in `_leg_at`.
-    inverse, inverse_across = ca.sqrt(1 / square), ca.sqrt(1 / across)
-    n, e2 = s * inverse, ca.cross(s, e1) * inverse_across
-    swing, swing_rate = ca.cross(s, velocity), ca.cross(s, acceleration)
-    k_rate, q, q_rate = ca.dot(e1, velocity), ca.dot(e1, swing), ca.dot(e1, swing_rate)
-    growth = ca.dot(s, velocity)
-    h = k * q * inverse_across**2
-    h_rate = (k_rate * q + k * q_rate - 2 * h * (growth - k * k_rate)) * inverse_across**2
-    turning = (swing + h * s) * inverse**2
-    angular = (swing_rate + h_rate * s + h * velocity - 2 * growth * turning) * inverse**2
-    return ca.horzcat(ca.cross(e2, n), e2, n), turning, angular
-
-
-def imu_signals_of(
-    legs: list[Leg], rotation: SX, omega: SX, acceleration: SX, carried: SX, base: BaseMotion, c: dict[str, SX]
-) -> dict[str, SX]:
-    """Ideal IMU signals (n + 1, 3) of legs and platform, by their names in the table.
-
-    Signals of a leg are seen in the leg frame, whose z axis is the leg and whose y axis is e2; those of the platform in {2}.
-    The `acceleration` (6, 1) is that of the origin of {2} in {1}, then angular; `carried` (6, 1) is what the motion of {1}
-    adds to it.
-    """
-    signals: list[tuple[SX, SX, SX]] = []
-    for i, leg in enumerate(legs):
-        e1, arm = row(c["base_joint_axes"], i), row(c["leg_imu_position"], i)
-        frame, turning, angular = _leg_turning(
-            leg.s, leg.velocity, acceleration[:3] + ca.cross(acceleration[3:], leg.arm) + leg.bias, e1
-        )
-        angular += base.alpha + ca.cross(base.omega, turning)
-        rate = frame.T @ (turning + base.omega)
-        force = ca.cross(frame.T @ angular, arm) + ca.cross(rate, ca.cross(rate, arm)) - frame.T @ leg.gravity
-        signals.append((rate, force, frame.T @ base.magnetic_field))
-    place = rotation @ c["platform_imu_position"]
-    whole, turning = acceleration + carried, omega + base.omega
-    at_imu = whole[:3] + ca.cross(whole[3:], place) + ca.cross(turning, ca.cross(turning, place))
-    signals.append((rotation.T @ turning, rotation.T @ (at_imu - base.gravity), rotation.T @ base.magnetic_field))
-    names = ("imu_angular_velocity", "imu_specific_force", "imu_magnetic_field")
-    return {name: ca.horzcat(*values).T for name, values in zip(names, zip(*signals, strict=True), strict=True)}

@@ -9,12 +9,12 @@ import casadi as ca
 
 from plant.dynamics.assembly import Dynamics, Values, assemble, variable_symbols
 from plant.dynamics.base_motion import base_motion
+from plant.dynamics.imu_signals import bending_changes, imu_signals_of, leg_frames
 from plant.dynamics.legs_and_actuators import (
     SX,
     Condition,
     actuators_at,
     body_constants,
-    imu_signals_of,
     leg_conditions,
     leg_outputs,
     legs_at,
@@ -73,6 +73,7 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
     omega = turning * _NORMAL
     joints = {name: _in_space(c[name]) for name in ("base_joints", "platform_joints")}
     c = c | joints | {"base_joint_axes": ca.repmat(_NORMAL.T, 3, 1), "axial_inertia": SX(0)}
+    c["base_joint_offset"] = SX.zeros(3)
     place, moving, first_moment = (_in_space(vector.T).T for vector in (position, velocity, moment))
     legs = legs_at(place, rotation, moving, omega, base, c)
     actuators = actuators_at(legs, x, u, c)
@@ -99,6 +100,10 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
         wrench += jacobian.T @ (forces[k] * leg.direction[:2] - leg.force[:2] - leg_mass @ leg.bias[:2])
     acceleration = solve(mass, wrench)
 
+    in_space = ca.vertcat(acceleration[:2], 0, 0, 0, acceleration[2])
+    frames = leg_frames(legs, in_space, base, c)
+    bend = bending_changes(legs, frames, x, c)
+    lengthening = ca.vertcat(*[leg.length_acceleration(in_space) for leg in legs])
     rates = {
         "state.position": velocity,
         "state.angle": turning,
@@ -106,10 +111,14 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
         "state.angular_velocity": acceleration[2],
         "state.current": actuators.current_rate,
         "state.brake_deflection": actuators.brake_rate,
+        "state.bending": x["state.bending_rate"],
+        "state.bending_rate": bend,
+        "state.play": actuators.play.speed,
+        "state.play_velocity": actuators.play_velocity_rate(lengthening, c),
     }
-    in_space = ca.vertcat(acceleration[:2], 0, 0, 0, acceleration[2])
     carried = ca.vertcat(carried, base.alpha + ca.cross(base.omega, omega))
-    imu = imu_signals_of(legs, rotation, omega, in_space, carried, base, c)
+    bending = x["state.bending"], x["state.bending_rate"], bend
+    imu = imu_signals_of(frames, bending, rotation, omega, in_space, carried, base, c)
     whole_velocity, whole_turning = moving + ca.cross(base.omega, place), turning + base.omega[2]
     outputs = {
         "position": position,
@@ -122,6 +131,7 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
             + whole_velocity[2] * ca.cross(base.omega, first_moment)[2]
             + c["inertia"] * whole_turning**2 / 2
             + sum(leg.kinetic for leg in legs)
+            + actuators.kinetic(c)
         ),
         "potential_energy": -ca.dot(in_plane, c["mass"] * position + moment) + sum(leg.potential for leg in legs),
         "power.external": ca.dot(external, ca.vertcat(velocity, turning)),

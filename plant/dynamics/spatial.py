@@ -10,12 +10,12 @@ import casadi as ca
 
 from plant.dynamics.assembly import Dynamics, Values, assemble, variable_symbols, zeros
 from plant.dynamics.base_motion import base_motion
+from plant.dynamics.imu_signals import bending_changes, imu_signals_of, leg_frames
 from plant.dynamics.legs_and_actuators import (
     SX,
     Condition,
     actuators_at,
     body_constants,
-    imu_signals_of,
     leg_conditions,
     leg_outputs,
     legs_at,
@@ -23,6 +23,7 @@ from plant.dynamics.legs_and_actuators import (
     row,
     solve,
 )
+from plant.dynamics.universal_joint import reach_at
 from plant.dynamics.variables import SPATIAL, TINY
 from plant.mechanism import LEGS
 
@@ -54,7 +55,7 @@ def _rotation(q: SX) -> SX:
 
 
 def _constants(p: Values) -> Values:
-    joints = {name: p[name] for name in ("base_joints", "platform_joints", "base_joint_axes")}
+    joints = {name: p[name] for name in ("base_joints", "platform_joints", "base_joint_axes", "base_joint_offset")}
     bodies = body_constants(p, lambda center: ca.dot(center, center) * SX.eye(3) - center @ center.T)
     return joints | bodies | {"axial_inertia": p["leg.lower.axial_inertia"] + p["leg.upper.axial_inertia"]}
 
@@ -111,8 +112,12 @@ def _conditions(p: Values) -> list[Condition]:
 
 
 def _leg_vectors(position: SX, rotation: SX, joints: Values) -> list[SX]:
-    """From base to platform joint, (3, 1) each."""
-    return [position + rotation @ row(joints["platform_joints"], k) - row(joints["base_joints"], k) for k in range(LEGS)]
+    """From second axis of base joint to platform joint, (3, 1) each."""
+    vectors = []
+    for k in range(LEGS):
+        whole = position + rotation @ row(joints["platform_joints"], k) - row(joints["base_joints"], k)
+        vectors.append(reach_at(whole, SX.zeros(3), row(joints["base_joint_axes"], k), joints["base_joint_offset"][k]).s)
+    return vectors
 
 
 def _limits(x: Values, c: Values) -> list[Condition]:
@@ -157,6 +162,9 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
         wrench += ca.vertcat(force, ca.cross(leg.arm, force))
     acceleration = solve(ca.blockcat([[linear, coupling.T], [coupling, angular]]), wrench)
 
+    frames = leg_frames(legs, acceleration, base, c)
+    bend = bending_changes(legs, frames, x, c)
+    lengthening = ca.vertcat(*[leg.length_acceleration(acceleration) for leg in legs])
     w, q1, q2, q3 = ca.vertsplit(x["state.quaternion"])
     ox, oy, oz = ca.vertsplit(omega)
     quaternion_rate = 0.5 * ca.vertcat(
@@ -174,8 +182,13 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
         "state.angular_velocity": acceleration[3:],
         "state.current": actuators.current_rate,
         "state.brake_deflection": actuators.brake_rate,
+        "state.bending": x["state.bending_rate"],
+        "state.bending_rate": bend,
+        "state.play": actuators.play.speed,
+        "state.play_velocity": actuators.play_velocity_rate(lengthening, c),
     }
-    imu = imu_signals_of(legs, rotation, omega, acceleration, ca.vertcat(carried, carried_angular), base, c)
+    bending = x["state.bending"], x["state.bending_rate"], bend
+    imu = imu_signals_of(frames, bending, rotation, omega, acceleration, ca.vertcat(carried, carried_angular), base, c)
     outputs = {
         "position": position,
         "quaternion": x["state.quaternion"],
@@ -186,6 +199,7 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
             + ca.dot(whole_velocity, ca.cross(whole_omega, moment))
             + ca.dot(whole_omega, inertia @ whole_omega) / 2
             + sum(leg.kinetic for leg in legs)
+            + actuators.kinetic(c)
         ),
         "potential_energy": -ca.dot(gravity, c["mass"] * position + moment) + sum(leg.potential for leg in legs),
         "power.external": ca.dot(external, ca.vertcat(velocity, omega)),
@@ -201,4 +215,6 @@ def imu_signals(position: SX, rotation: SX, velocity: SX, omega: SX, acceleratio
     c = _constants(parameters)
     base = base_motion(zeros(SPATIAL.inputs), c)
     legs = legs_at(position, rotation, velocity, omega, base, c)
-    return imu_signals_of(legs, rotation, omega, acceleration, SX.zeros(6), base, c)
+    straight = (SX.zeros(len(legs), 2),) * 3
+    frames = leg_frames(legs, acceleration, base, c)
+    return imu_signals_of(frames, straight, rotation, omega, acceleration, SX.zeros(6), base, c)

@@ -35,6 +35,7 @@ class Variable:
 
     A parameter outside its range is refused; other variables stay inside. A `tunable` parameter may change during a run.
     `discrete` marks the drive modes, an enumeration. A `disturbance` is zero in the ideal case, which has shorter equations.
+    A mechanism that gives no value has the `default`.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Variable:
     tunable: bool = False
     discrete: bool = False
     disturbance: bool = False
+    default: float | None = None
 
     @property
     def size(self) -> int:
@@ -75,9 +77,11 @@ Maker = Callable[..., Variable]
 
 
 _state: Maker = partial(Variable, causality="state")
+_resting: Maker = partial(Variable, causality="state", disturbance=True)
 _input: Maker = partial(Variable, causality="input")
 _disturbing: Maker = partial(Variable, causality="input", disturbance=True)
 _fixed: Maker = partial(Variable, causality="parameter")
+_imperfect: Maker = partial(Variable, causality="parameter", disturbance=True, default=0.0)
 _tunable: Maker = partial(Variable, causality="parameter", tunable=True)
 _output: Maker = partial(Variable, causality="output")
 
@@ -107,6 +111,12 @@ def _states(legs: int, dimensions: int) -> tuple[Variable, ...]:
         *_twist(_state, "state.", dimensions),
         _state("state.current", (legs,), "A", "motor currents", -1e4, 1e4, 1),
         _state("state.brake_deflection", (legs,), "m", "elastic deflection of the brakes", -0.1, 0.1, 1e-4),
+        _resting(
+            "state.bending", (legs, 2), "rad", "bending: further angles of the base joints about their two axes", -1, 1, 1e-3
+        ),
+        _resting("state.bending_rate", (legs, 2), "rad/s", "rate of the bending", -100, 100, 0.1),
+        _resting("state.play", (legs,), "m", "how far the motor is ahead of the middle of its play", -1, 1, 1e-4),
+        _resting("state.play_velocity", (legs,), "m/s", "velocity of the motor ahead of the rod", -10, 10, 0.01),
     )
 
 
@@ -160,20 +170,49 @@ def _parameters(legs: int, dimensions: int) -> tuple[Variable, ...]:
     axes = _fixed(
         "base_joint_axes", joints, "1", "unit first axis of each universal joint, fixed in the base", -1.001, 1.001, 1
     )
+    offset = _imperfect("base_joint_offset", each, "m", "from first to second axis of each universal joint", -1, 1, 1e-3)
+    flanks, guide = (1e6, 0.2) if dimensions == 3 else (1e5, 0.1)
     lower = "motor, gearbox and IMU: everything that turns about the base joint"
     return (
         _fixed("base_joints", joints, "m", "base joint of each leg", -100, 100, 0.1),
         _fixed("platform_joints", joints, "m", "platform joint of each leg, in {2}", -100, 100, 0.1),
         *((axes,) if dimensions == 3 else ()),
+        *((offset,) if dimensions == 3 else ()),
         *_body(_fixed, "platform", dimensions, TINY),
         *_body(_tunable, "payload", dimensions, 0.0),
         *_leg_part("lower", "lower part", lower, "base joint along", dimensions),
         *_leg_part("upper", "rod", "mass of the rod", "platform joint back along", dimensions),
+        _imperfect("leg.bending_compliance", each, "rad/N.m", "bend of each leg in its guide", 0, 1, 1e-4),
+        _fixed(
+            "leg.guide",
+            (),
+            "m",
+            "guide of the rod, where the leg bends, from the base joint along the leg",
+            0,
+            100,
+            0.1,
+            default=guide,
+        ),
+        _fixed("leg.bending_frequency", (), "1/s", "natural frequency of the bending", TINY, 1e5, 100, default=80.0),
+        _fixed("leg.bending_damping", (), "1", "damping of the bending, relative to the critical one", 0, 10, 0.1, default=0.1),
         _fixed("motor.resistance", each, "Ohm", "winding resistance", TINY, 1e6, 1),
         _fixed("motor.inductance", (), "H", "winding inductance", TINY, 1e3, 1e-3),
         _fixed("motor.torque_constant", (), "N.m/A", "torque constant, equal to the back-EMF constant", TINY, 1e3, 0.1),
         _fixed("motor.rotor_inertia", (), "kg.m2", "inertia of rotor and screw", TINY, 1e3, 1e-5),
         _fixed("motor.screw_lead", (), "m", "advance of the leg per turn", 1e-6, 10, 0.01),
+        _imperfect("screw.backlash", each, "m", "play between motor and rod", 0, 0.1, 1e-4),
+        _imperfect("joint.clearance", each, "m", "play of base and platform joint together, along the leg", 0, 0.1, 1e-4),
+        _fixed(
+            "screw.stiffness",
+            (),
+            "N/m",
+            "stiffness of the screw's flanks, where there is play",
+            TINY,
+            1e10,
+            1e6,
+            default=flanks,
+        ),
+        _fixed("screw.damping", (), "s/m", "damping of the flanks relative to their force", 0, 1e4, 1, default=5.0),
         _fixed("drive.nominal_resistance", (), "Ohm", "winding resistance that the drive assumes", 0, 1e6, 1),
         _fixed("drive.compensation", (), "1", "share kappa of the resistive drop that the drive compensates", 0, 10, 1),
         _fixed("drive.voltage_limit", (), "V", "largest voltage of the drive", TINY, 1e5, 10),
@@ -219,6 +258,7 @@ def _outputs(legs: int, dimensions: int) -> tuple[Variable, ...]:
         _output("power.friction", (), "W", "power lost in friction, as a negative number", -1e9, 0, 1),
         _output("power.brake", (), "W", "power of the brakes on the legs", -1e9, 1e9, 1),
         _output("power.stop", (), "W", "power of the end stops on the legs", -1e9, 1e9, 1),
+        _output("power.play", (), "W", "power of the screws' flanks where there is play", -1e9, 1e9, 1),
         _output("power.external", (), "W", "power of the external wrench", -1e9, 1e9, 1),
     )
 

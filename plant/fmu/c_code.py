@@ -14,12 +14,12 @@ from plant.pose import Array
 
 
 def write_functions(dynamics: Dynamics, folder: Path) -> None:
-    """Write plant.c and derivatives.c with their headers."""
+    """Write plant.c, disturbed.c and derivatives.c with their headers."""
     plant = (
-        dynamics.constants, dynamics.start, dynamics.conditions, dynamics.limits, dynamics.rates, dynamics.outputs,
-        dynamics.ideal_rates, dynamics.ideal_outputs,
+        dynamics.constants, dynamics.conditions, dynamics.ideal_limits, dynamics.ideal_rates, dynamics.ideal_outputs,
     )  # fmt: skip
-    for file, functions in (("plant", plant), ("derivatives", _derivatives(dynamics))):
+    disturbed = dynamics.start, dynamics.limits, dynamics.rates, dynamics.outputs
+    for file, functions in (("plant", plant), ("disturbed", disturbed), ("derivatives", _derivatives(dynamics))):
         generator = ca.CodeGenerator(f"{file}.c", {"with_header": True})
         for function in functions:
             generator.add(function)
@@ -116,6 +116,7 @@ def layout_header(layout: Layout, starts: Mapping[str, Array], token: str, dynam
         **{f"{block}_AT": layout.offsets[variables[0].name] for block, variables in blocks.items()},
         "SUBSTEP_AT": layout.offsets["substep"],
         "DISTURBANCES": len(disturbances),
+        "IDEAL_STATES": sum(variable.size for variable in table.states if not variable.disturbance),
     }
     if "state.quaternion" in layout.offsets:
         macros["QUATERNION_AT"] = layout.offsets["state.quaternion"]

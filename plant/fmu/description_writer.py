@@ -21,6 +21,7 @@ QUANTITIES: dict[str, tuple[str, dict[str, int | str]]] = {
     "rad": ("Angle", {"rad": 1}),
     "rad/s": ("AngularVelocity", {"rad": 1, "s": -1}),
     "rad/s2": ("AngularAcceleration", {"rad": 1, "s": -2}),
+    "rad/N.m": ("RotationalCompliance", {"rad": 1, "kg": -1, "m": -2, "s": 2}),
     "1/s": ("Frequency", {"s": -1}),
     "A/s": ("ElectricCurrentSlope", {"A": 1, "s": -1}),
     "kg": ("Mass", {"kg": 1}),

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from plant.compiled import Record
 from plant.dynamics.base_course import BASE_SIZE, MOST_BASE_MOTIONS
+from plant.dynamics.variables import PLANAR, SPATIAL
 from plant.errors import FmuError, InputError
 from plant.fmu.binding import BASE, OWN_BINDING, Binding, Bound, Modes, Scalars, bind, check_settable, load_binding
 from plant.fmu.calls import CALLED, FMU_HANDLE, MOST_CHANGES, advance
@@ -109,7 +110,7 @@ class FmuPlant(FmuInstance):
             raise self.failure()
 
     def linearize(self, inputs: Sequence[str], outputs: Sequence[str]) -> LinearPlant:
-        """The plant linearised at its present state.
+        """The plant linearised at its present state, without states of imperfections that it does not have.
 
         Raises:
             UnknownNameError: the FMU has no such variable.
@@ -122,8 +123,13 @@ class FmuPlant(FmuInstance):
         u, y = [self.description[name] for name in inputs], [self.description[name] for name in outputs]
         n = sum(each.size for each in states)
         whole = self.jacobian([*rates, *y], [*states, *u])
-        names = tuple(tuple(name for each in side for name in each.element_names) for side in (states, u, y))
-        return LinearPlant(whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:], *names)
+        named, *others = (tuple(name for each in side for name in each.element_names) for side in (states, u, y))
+        still = _still([state.name in _DISTURBED for state in states for _ in range(state.size)], whole[:n])
+        kept = [i for i in range(whole.shape[1]) if i >= n or not still[i]]
+        rows, m = [i for i in range(len(whole)) if i >= n or not still[i]], n - int(still.sum())
+        part = whole[np.ix_(rows, kept)]
+        left = tuple(name for name, none in zip(named, still, strict=True) if not none)
+        return LinearPlant(part[:m, :m], part[:m, m:], part[m:, :m], part[m:, m:], left, *others)
 
     def state(self) -> bytes:
         """The plant's whole state, with its clock."""
@@ -256,6 +262,20 @@ def takes_parameters(description: FmuDescription, names: Sequence[str]) -> bool:
             "(docs/fmu.md), and it keeps its own values"
         )
     return not absent
+
+
+_DISTURBED = {each.name for table in (SPATIAL, PLANAR) for each in table.states if each.disturbance}
+"""States of gough's own plants that stay zero without the imperfection that they belong to."""
+
+
+def _still(disturbed: Sequence[bool], rates: Array) -> NDArray[np.bool_]:
+    """Which of these states (n,) no other state and no input moves, by the Jacobian (n, n + m) of the rates."""
+    still = np.array(disturbed)
+    while True:
+        moved = still & (rates[:, [*~still, *[True] * (rates.shape[1] - len(still))]] != 0.0).any(axis=1)
+        if not moved.any():
+            return still
+        still &= ~moved
 
 
 _CLOCKED = ("time", "since", "length", "steps", "changed")

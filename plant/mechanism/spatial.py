@@ -263,6 +263,7 @@ class Mechanism:
         limits = self.require_limits()
         axes = slice(2 if self.planar else 3)
         values: dict[str, ArrayLike] = {
+            **{each.name: np.full(each.shape, each.default) for each in self._table.parameters if each.default is not None},
             "base_joints": self.base_joints[:, axes],
             "platform_joints": self.platform_joints[:, axes],
             "base_joint_axes": self.base_joint_axes,
@@ -283,7 +284,8 @@ class Mechanism:
 
     def _lacking(self) -> list[str]:
         """The plant's parameters that follow from nothing."""
-        return [each.name for each in self._table.parameters if each.name not in {*self.plant, *DERIVED}]
+        needed = (each.name for each in self._table.parameters if each.default is None)
+        return [name for name in needed if name not in {*self.plant, *DERIVED}]
 
 
 def _check_spread(base: Array, platform: Array) -> None:

@@ -42,7 +42,18 @@ def vector_of(skew: Array) -> Array:
 
 
 def leg_vectors(parameters: Mapping[str, Array], position: Array, rotation: Array) -> Array:
-    return position + parameters["platform_joints"] @ rotation.T - parameters["base_joints"]
+    """(6, 3): from the second axes of the base joints, which lie beyond the first ones, to the platform joints."""
+    vectors = position + parameters["platform_joints"] @ rotation.T - parameters["base_joints"]
+    axes = parameters["base_joint_axes"]
+    square = vectors - np.sum(vectors * axes, axis=1, keepdims=True) * axes
+    beyond: Array = vectors - parameters["base_joint_offset"][:, None] * square / np.linalg.norm(square, axis=1, keepdims=True)
+    return beyond
+
+
+def second_axes(parameters: Mapping[str, Array], position: Array, rotation: Array) -> Array:
+    """(6, 3): places of the second axes of the base joints in {1}."""
+    places: Array = position + parameters["platform_joints"] @ rotation.T - leg_vectors(parameters, position, rotation)
+    return places
 
 
 def leg_frames(parameters: Mapping[str, Array], position: Array, rotation: Array) -> Array:
@@ -88,14 +99,14 @@ def inertias(p: Mapping[str, Array]) -> Array:
 
 
 def bodies_at(p: Mapping[str, Array], position: Array, rotation: Array) -> Bodies:
-    legs = leg_vectors(p, position, rotation)
+    legs, origins = leg_vectors(p, position, rotation), second_axes(p, position, rotation)
     lengths = np.linalg.norm(legs, axis=1)
     frames = leg_frames(p, position, rotation)
     along = frames[:, :, 2]
     places = [
         [position + rotation @ p["platform.center_of_mass"], position + rotation @ p["payload.center_of_mass"]],
-        p["base_joints"] + p["leg.lower.center"] * along,
-        p["base_joints"] + legs - p["leg.upper.center"] * along,
+        origins + p["leg.lower.center"] * along,
+        origins + legs - p["leg.upper.center"] * along,
     ]
     return Bodies(np.vstack(places), np.concatenate([[rotation, rotation], frames, frames]), lengths)
 
@@ -167,9 +178,30 @@ def base_path(inputs: Mapping[str, Array]) -> Path:
     )
 
 
-def reflected_mass(p: Mapping[str, Array]) -> float:
-    """Inertia of rotor and screw, as a mass that moves with the leg's length."""
+def rotor_mass(p: Mapping[str, Array]) -> float:
+    """Inertia of rotor and screw, as a mass that moves along the leg."""
     return float(p["motor.rotor_inertia"] * (2.0 * pi / p["motor.screw_lead"]) ** 2)
+
+
+def play(p: Mapping[str, Array]) -> Array:
+    """The play of each leg between its motor and its rod [m]."""
+    width: Array = p["screw.backlash"] + p["joint.clearance"]
+    return width
+
+
+def reflected_mass(p: Mapping[str, Array]) -> Array:
+    """The mass of the rotor of each leg that moves with its length, as those do that have no play."""
+    return np.where(play(p) > 0.0, 0.0, rotor_mass(p))
+
+
+def flanks(p: Mapping[str, Array], ahead: Array, speed: Array) -> Array:
+    """The forces of the screws' flanks on the rods [N], zero where there is no play."""
+    forces = []
+    for width, z, v in zip(play(p), ahead, speed, strict=True):
+        depth = abs(z) - width / 2.0
+        pressing = max(1.0 + float(p["screw.damping"]) * v * np.sign(z), 0.0)
+        forces.append(np.sign(z) * p["screw.stiffness"] * depth * pressing if width > 0.0 < depth else 0.0)
+    return np.array(forces)
 
 
 def _world_inertias(p: Mapping[str, Array], position: Array, rotation: Array, base: Path = at_rest) -> Array:
@@ -192,7 +224,7 @@ def inertia_matrix(p: Mapping[str, Array], position: Array, rotation: Array) -> 
     return (
         np.einsum("aki,k,bki->ab", velocity, masses(p), velocity)
         + np.einsum("aki,kij,bkj->ab", spin, tensors, spin)
-        + reflected_mass(p) * rate @ rate.T
+        + (reflected_mass(p) * rate) @ rate.T
     )
 
 
@@ -207,7 +239,7 @@ def bias_force(p: Mapping[str, Array], position: Array, rotation: Array, twist: 
         [
             np.sum(force * virtual.velocity)
             + np.sum(torque * virtual.angular_velocity)
-            + reflected_mass(p) * motion.length_acceleration @ virtual.length_rate
+            + (reflected_mass(p) * motion.length_acceleration) @ virtual.length_rate
             for virtual in virtual_motions(p, position, rotation, base)
         ]
     )
@@ -227,7 +259,7 @@ def energies(
     kinetic = (
         masses(p) @ np.sum(motion.velocity**2, axis=1)
         + np.einsum("ki,kij,kj->", motion.angular_velocity, tensors, motion.angular_velocity)
-        + reflected_mass(p) * np.sum(motion.length_rate**2)
+        + reflected_mass(p) @ motion.length_rate**2
     ) / 2.0
     places = on_earth(bodies_at(p, position, rotation), *base(0.0)).places
     return float(kinetic), float(-masses(p) @ places @ (p["gravity"] - acceleration))

@@ -4,7 +4,8 @@ Platform with payload, six lower parts and six rods each have a place, a quatern
 rotor has an angle and a speed. The joints are equations between places and attitudes, which CasADi differentiates; the
 equations of motion are Newton's, Euler's and the joints' second derivatives. Nothing is eliminated, no leg's length or
 angle is a coordinate, and nothing is shared with `plant.dynamics.spatial`. All is seen from the earth: a base that moves
-carries its joints along, as a function of time. Brakes and end stops are left out.
+carries its joints along, as a function of time. The second axis of a base joint may lie beyond the first, a screw may have
+play, and a leg may bend: its rod then turns in the guide of the lower part against a spring. Brakes and end stops are left out.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from plant.dynamics.variables import OPEN
 from plant.pose import Array, quaternion_from_rotation
-from tests.plant.dynamics.explicit_bodies import leg_frames, leg_vectors
+from tests.plant.dynamics.explicit_bodies import leg_frames, leg_vectors, play, second_axes
 
 LEGS = 6
 BODIES = 1 + 2 * LEGS
@@ -99,13 +100,16 @@ def _rotation(q: ca.SX) -> ca.SX:
 class MaximalModel:
     """The equations of one mechanism, whose parameters are given by name, and their integration.
 
+    Springs in the guides of legs that bend have a damping [N m s/rad].
+
     Attributes:
         state: coordinates, velocities and motor currents, one vector; at first at rest in {1} at the initial pose.
         time: [s].
     """
 
-    def __init__(self, parameters: Mapping[str, Array], base: Base = still) -> None:
+    def __init__(self, parameters: Mapping[str, Array], base: Base = still, bending_damping: float = 0.0) -> None:
         self._p = p = parameters
+        self._bending_damping = bending_damping
         self._base, self._moving, self.time = base, MovingBase(base), 0.0
         self._turns = 2 * pi / float(p["motor.screw_lead"])
         self._bodies = [
@@ -115,7 +119,8 @@ class MaximalModel:
         ]
         rotation = Rotation.from_quat(p["initial_quaternion"], scalar_first=True).as_matrix()
         legs, frames = leg_vectors(p, p["initial_position"], rotation), leg_frames(p, p["initial_position"], rotation)
-        origins = [p["initial_position"], *p["base_joints"], *(p["base_joints"] + legs)]
+        axes = second_axes(p, p["initial_position"], rotation)
+        origins = [p["initial_position"], *axes, *(axes + legs)]
         attitudes = [rotation, *frames, *frames]
         origin, turn, speed, omega = self._moving.place(0.0)
         spin = turn @ omega
@@ -155,35 +160,70 @@ class MaximalModel:
         forces[0] += force
         torques[0] += torque - ca.cross(attitudes[0] @ bodies[0].center, force)
         joints: list[ca.SX] = []
+        on_rotors: list[ca.SX] = []
         for k, (low, up) in enumerate(zip(LOWER, UPPER, strict=True)):
             x, y, z = ca.horzsplit(attitudes[low])
             rod_x, rod_y, rod_z = ca.horzsplit(attitudes[up])
-            apart = places[up] - places[low]
-            length = ca.dot(z, apart) + float(p["leg.lower.center"]) + float(p["leg.upper.center"])
+            first = turn @ p["base_joint_axes"][k]
+            beyond = float(p["base_joint_offset"][k]) * ca.cross(first, y)
+            guide = places[low] + attitudes[low] @ (np.array([0.0, 0.0, float(p["leg.guide"])]) - bodies[low].center)
+            apart = places[up] - guide
+            length = ca.dot(rod_z, apart) + float(p["leg.guide"]) + float(p["leg.upper.center"])
             joints += [
-                # The lower part turns about the base joint, its y axis square to the joint's first axis.
-                places[low] - attitudes[low] @ bodies[low].center - origin - turn @ p["base_joints"][k],
-                ca.dot(turn @ p["base_joint_axes"][k], y),
-                # The rod slides along it and does not turn in it.
-                ca.vertcat(ca.dot(x, apart), ca.dot(y, apart), ca.dot(x, rod_y), ca.dot(y, rod_z), ca.dot(z, rod_x)),
-                # A spherical joint ties the rod to the platform, and a screw the rotor to the rod.
+                # The lower part turns about the second axis of the base joint, which turns about the first and is its y axis.
+                places[low] - attitudes[low] @ bodies[low].center - origin - turn @ p["base_joints"][k] - beyond,
+                ca.dot(first, y),
+                # The rod slides through the guide and does not turn in it.
+                ca.vertcat(ca.dot(rod_x, apart), ca.dot(rod_y, apart), ca.dot(x, rod_y)),
+                # A spherical joint ties the rod to the platform.
                 places[up] - attitudes[up] @ bodies[up].center
                 - places[0] - attitudes[0] @ (p["platform_joints"][k] - bodies[0].center),
-                (length - self._slides[k]) * self._turns - q[7 * BODIES + k],
             ]  # fmt: skip
+            bend = float(p["leg.bending_compliance"][k])
+            if bend > 0.0:
+                across = ca.cross(z, rod_z)
+                rate = spins[up] - spins[low]
+                spring = -across / bend - self._bending_damping * (rate - ca.dot(rate, rod_z) * rod_z)
+                torques[up] = torques[up] + spring
+                torques[low] = torques[low] - spring
+            else:
+                joints.append(ca.vertcat(ca.dot(y, rod_z), ca.dot(z, rod_x)))
             speed = ca.jtimes(length, q, coordinate_rates)
+            extension = length - self._slides[k]
+            motor, motor_speed = q[7 * BODIES + k] / self._turns, rotors[k] / self._turns
+            if width := float(play(p)[k]):
+                # The rotor pushes the rod by either flank of its screw.
+                ahead, faster = motor - extension, motor_speed - speed
+                damping = float(p["screw.damping"]) * faster
+                push = float(p["screw.stiffness"]) * (
+                    ca.fmax(ahead - width / 2, 0) * ca.fmax(1 + damping, 0)
+                    - ca.fmax(-ahead - width / 2, 0) * ca.fmax(1 - damping, 0)
+                )
+                forces[up] = forces[up] + push * rod_z
+                forces[low] = forces[low] - push * rod_z
+                torques[low] = torques[low] - ca.cross(guide - places[low], push * rod_z)
+                on_rotors.append(-push / self._turns)
+            else:
+                # A screw ties the rotor to the rod.
+                joints.append((extension - motor) * self._turns)
+                on_rotors.append(ca.SX(0))
+            speed = motor_speed if width else speed
             lost = p["friction.viscous"][k] * speed + p["friction.coulomb"][k] * speed / ca.sqrt(
                 speed**2 + float(p["friction.velocity"]) ** 2
             )
-            forces[up] = forces[up] - lost * z
-            forces[low] = forces[low] + lost * z
+            if width:
+                on_rotors[k] -= lost / self._turns
+                continue
+            forces[up] = forces[up] - lost * rod_z
+            forces[low] = forces[low] + lost * rod_z
+            torques[low] = torques[low] + ca.cross(guide - places[low], lost * rod_z)
         inverse = ca.diagcat(
             *[np.eye(3) / b.mass for b in bodies],
             *[a @ np.linalg.inv(b.inertia) @ a.T for a, b in zip(attitudes, bodies, strict=True)],
             np.eye(LEGS) / float(p["motor.rotor_inertia"]),
         )
         constant = float(p["motor.torque_constant"])
-        applied = ca.vertcat(*forces, *torques, constant * current)
+        applied = ca.vertcat(*forces, *torques, constant * current + ca.vertcat(*on_rotors))
         closure = ca.vertcat(*joints)
         moving, rates = ca.vertcat(q, time), ca.vertcat(coordinate_rates, 1)
         closing_speed = ca.jtimes(closure, moving, rates)
@@ -216,12 +256,12 @@ class MaximalModel:
         acceleration = free - responses @ np.linalg.solve(mobility, parting)
         return np.vstack([coordinate_rates, acceleration, current_rates]).ravel()
 
-    def go_on(self, duration: float, command: Array, modes: Array, wrench: Array) -> None:
-        """Integrate with held inputs by an adaptive method of eighth order."""
+    def go_on(self, duration: float, command: Array, modes: Array, wrench: Array, tolerance: float = 1e-11) -> None:
+        """Integrate with held inputs by an adaptive method of eighth order, with a relative tolerance."""
         end = self.time + duration
         solution = solve_ivp(
             lambda t, state: self.rates(state, command, modes, wrench, t),
-            (self.time, end), self.state, method="DOP853", rtol=1e-11, atol=1e-12, t_eval=[end],
+            (self.time, end), self.state, method="DOP853", rtol=tolerance, atol=0.1 * tolerance, t_eval=[end],
         )  # fmt: skip
         self.state, self.time = solution.y[:, -1], end
 

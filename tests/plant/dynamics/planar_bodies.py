@@ -39,7 +39,7 @@ def weights(p: Values) -> Array:
     """(27,), the mass or inertia of each coordinate."""
     parts = [(p[f"{body}.mass"], p[f"{body}.inertia"]) for body in ("platform", "payload")]
     parts += [(p[f"leg.{part}.mass"], p[f"leg.{part}.inertia"]) for part in ("lower", "upper") for _ in range(LEGS)]
-    return np.concatenate([[m, m, i] for m, i in parts] + [np.full(LEGS, reflected_mass(p))])
+    return np.concatenate([[m, m, i] for m, i in parts] + [reflected_mass(p)])
 
 
 def inertia_matrix(p: Values, q: Array) -> Array:
@@ -95,7 +95,7 @@ def force_in_space(p: Values, q: Array, rate: Array, acceleration: Array, base: 
     pushed = np.einsum("kx,xi,kij->j", force, turn[:, :2], bodies[:, :2]) + np.einsum(
         "kx,x,kj->j", torque, turn[:, 2], bodies[:, 2]
     )
-    return pushed + reflected_mass(p) * slopes[-LEGS:].T @ grown[1]
+    return pushed + slopes[-LEGS:].T @ (reflected_mass(p) * grown[1])
 
 
 def frames_at(p: Values, position: Array, angle: float) -> tuple[Array, Array]:

@@ -15,7 +15,15 @@ from plant.fmu.build import PLANAR_MODEL, SPATIAL_MODEL, Model, default_fmu
 from plant.fmu.plant import FmuPlant
 from plant.mechanism import Mechanism, load_in_space
 from plant.pose import Array
-from tests.plant.dynamics.explicit_bodies import base_path, derivatives, random_base, vector_of
+from tests.plant.dynamics.explicit_bodies import (
+    base_path,
+    derivatives,
+    flanks,
+    play,
+    random_base,
+    rotor_mass,
+    vector_of,
+)
 from tests.plant.dynamics.planar_bodies import (
     LEGS,
     Values,
@@ -66,6 +74,8 @@ def odd_rig(rig: Mechanism, random: Generator) -> Values:
     p["leg_imu_position"] = random.normal(0.0, 0.05, (3, 3))
     p["platform_imu_position"] = random.normal(0.0, 0.05, 3)
     p["brake.stiffness"], p["brake.damping"], p["stop.stiffness"] = np.array(1e4), np.array(50.0), np.array(1e4)
+    p["screw.backlash"], p["joint.clearance"] = random.permutation([0.0, 1e-3, 0.0]), random.permutation([0.0, 1e-3, 0.0])
+    p["screw.stiffness"] = np.array(1e4)
     return p
 
 
@@ -77,6 +87,10 @@ def random_state(p: Values, random: Generator) -> tuple[Values, Values]:
         "state.angular_velocity": np.array(random.normal(0.0, 3.0)),
         "state.current": random.normal(0.0, 1.0, 3),
         "state.brake_deflection": random.normal(0.0, 1e-4, 3),
+        "state.bending": np.zeros((3, 2)),
+        "state.bending_rate": np.zeros((3, 2)),
+        "state.play": play(p) * random.uniform(-0.6, 0.6, 3),
+        "state.play_velocity": np.sign(play(p)) * random.normal(0.0, 0.02, 3),
     }
     inputs = {
         "velocity_command": random.normal(0.0, 0.05, 3),
@@ -87,11 +101,12 @@ def random_state(p: Values, random: Generator) -> tuple[Values, Values]:
     return states, inputs | random_base(random, 0.0)
 
 
-def axial_forces(p: Values, states: Values, inputs: Values, length: Array, speed: Array) -> dict[str, Array]:
-    """What motor, friction, brake and end stop push with along each leg [N]."""
+def axial_forces(p: Values, states: Values, inputs: Values, length: Array, leg_speed: Array) -> dict[str, Array]:
+    """What motor, friction, brake, end stop and play push with along each leg [N]."""
+    speed = leg_speed + states["state.play_velocity"]
     below = np.maximum(p["stop.minimum_length"] - length, 0.0)
     above = np.maximum(length - p["stop.maximum_length"], 0.0)
-    give = p["stop.damping"] * speed
+    give = p["stop.damping"] * leg_speed
     return {
         "drive": 2.0 * np.pi / p["motor.screw_lead"] * p["motor.torque_constant"] * states["state.current"],
         "friction": -p["friction.viscous"] * speed - p["friction.coulomb"] * speed / np.hypot(speed, p["friction.velocity"]),
@@ -100,7 +115,13 @@ def axial_forces(p: Values, states: Values, inputs: Values, length: Array, speed
             - (inputs["drive_mode"] == BRAKE) * p["brake.damping"] * speed
         ),
         "stop": p["stop.stiffness"] * (below * np.maximum(1.0 - give, 0.0) - above * np.maximum(1.0 + give, 0.0)),
+        "play": -flanks(p, states["state.play"], states["state.play_velocity"]),
     }
+
+
+def force_on_legs(p: Values, forces: dict[str, Array]) -> Array:
+    """What pushes the rods along the legs [N]: the motors, or the flanks of screws with play."""
+    return forces["stop"] + np.where(play(p) > 0.0, -forces["play"], forces["drive"] + forces["friction"] + forces["brake"])
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -117,15 +138,18 @@ def test_motion_energies_and_powers_agree_with_explicit_bodies(dynamics: Dynamic
     speed = to_lengths @ rate
     forces = axial_forces(p, states, inputs, length, speed)
     wrench = np.append(inputs["external_wrench.force"], inputs["external_wrench.torque"])
-    applied = wrench + weight_force(p, q) + to_lengths.T @ sum(forces.values(), np.zeros(LEGS))
+    applied = wrench + weight_force(p, q) + to_lengths.T @ force_on_legs(p, forces)
     inertia = inertia_matrix(p, q)
     np.testing.assert_allclose(inertia @ acceleration + bias_force(p, q, rate), applied, rtol=0.0, atol=1e-8)
 
-    assert outputs["kinetic_energy"] == pytest.approx(0.5 * rate @ inertia @ rate, rel=1e-12)
+    motors = speed + states["state.play_velocity"]
+    apart = 0.5 * rotor_mass(p) * float(np.sum(motors[play(p) > 0.0] ** 2))
+    assert outputs["kinetic_energy"] == pytest.approx(0.5 * rate @ inertia @ rate + apart, rel=1e-12)
     np.testing.assert_allclose(outputs["leg_length"], length, rtol=1e-14)
     np.testing.assert_allclose(outputs["leg_velocity"], speed, rtol=1e-12, atol=1e-14)
+    pushed = {"stop": speed, "play": states["state.play_velocity"]}
     for source, force in forces.items():
-        assert outputs[f"power.{source}"] == pytest.approx(force @ speed, rel=1e-11, abs=1e-11)
+        assert outputs[f"power.{source}"] == pytest.approx(force @ pushed.get(source, motors), rel=1e-11, abs=1e-11)
     assert outputs["power.external"] == pytest.approx(wrench @ rate, rel=1e-12)
 
     def potential(q: Array) -> float:
@@ -152,7 +176,7 @@ def test_motion_and_imus_on_a_base_that_moves_agree_with_bodies_in_space(dynamic
     length, to_lengths = coordinates(p, q)[-LEGS:], jacobian(p, q)[-LEGS:]
     forces = axial_forces(p, states, inputs, length, to_lengths @ rate)
     wrench = np.append(inputs["external_wrench.force"], inputs["external_wrench.torque"])
-    applied = wrench + to_lengths.T @ sum(forces.values(), np.zeros(LEGS))
+    applied = wrench + to_lengths.T @ force_on_legs(p, forces)
     taken = force_in_space(p, q, rate, acceleration, base)
     np.testing.assert_allclose(taken, applied, rtol=0.0, atol=1e-8 * np.abs(applied).max())
 

@@ -20,11 +20,15 @@ from tests.plant.dynamics.explicit_bodies import (
     bodies_at,
     derivatives,
     energies,
+    flanks,
     inertia_matrix,
     jacobian,
     leg_frames,
     leg_vectors,
+    play,
     random_base,
+    rotor_mass,
+    second_axes,
     static_forces,
     vector_of,
 )
@@ -80,6 +84,17 @@ def odd_mechanism(hexapod: Mechanism, random: Generator) -> Values:
     return p
 
 
+def imperfect_legs(p: Values, random: Generator) -> Values:
+    """The same with axes that do not meet, and with play in some legs."""
+    return p | {
+        "base_joint_offset": random.normal(0.0, 0.02, 6),
+        "screw.backlash": random.permutation([0.0, 0.0, 0.0, 1e-3, 2e-3, 0.0]),
+        "joint.clearance": random.permutation([0.0, 0.0, 0.0, 0.0, 1e-3, 2e-3]),
+        "screw.stiffness": np.array(1e5),
+        "screw.damping": np.array(15.0),
+    }
+
+
 def random_state(p: Values, random: Generator) -> tuple[Values, Values]:
     """A fast state somewhere in the workspace, and inputs."""
     turned = Rotation.from_rotvec(random.normal(0.0, 0.2, 3)).as_matrix()
@@ -90,6 +105,11 @@ def random_state(p: Values, random: Generator) -> tuple[Values, Values]:
         "state.angular_velocity": random.normal(0.0, 3.0, 3),
         "state.current": random.normal(0.0, 5.0, 6),
         "state.brake_deflection": random.normal(0.0, 1e-4, 6),
+        "state.bending": np.zeros((6, 2)),
+        "state.bending_rate": np.zeros((6, 2)),
+        # Some legs with play are pushed either way, and some are free.
+        "state.play": play(p) * random.uniform(-0.6, 0.6, 6),
+        "state.play_velocity": np.sign(play(p)) * random.normal(0.0, 0.02, 6),
     }
     inputs = {
         "velocity_command": random.normal(0.0, 0.1, 6),
@@ -109,21 +129,34 @@ def pose_and_twist(states: Values) -> tuple[Array, Array, Array]:
     return states["state.position"], rotation, np.hstack([states["state.velocity"], states["state.angular_velocity"]])
 
 
-def axial_forces(p: Values, states: Values, inputs: Values) -> dict[str, Array]:
-    """What motor, friction, brake and end stop push with along each leg [N]."""
+def axial_forces(p: Values, states: Values, inputs: Values) -> dict[str, tuple[Array, Array]]:
+    """What motor, friction, brake, end stop and play push with along each leg [N], and the speeds of what they push [m/s]."""
     position, rotation, twist = pose_and_twist(states)
-    speed = jacobian(p, position, rotation) @ twist
+    leg_speed = jacobian(p, position, rotation) @ twist
+    speed = leg_speed + states["state.play_velocity"]
     length = bodies_at(p, position, rotation).lengths
     below = np.maximum(p["stop.minimum_length"] - length, 0.0)
     above = np.maximum(length - p["stop.maximum_length"], 0.0)
-    give = p["stop.damping"] * speed
+    give = p["stop.damping"] * leg_speed
     closed = inputs["drive_mode"] == BRAKE
-    return {
+    stops = p["stop.stiffness"] * (below * np.maximum(1.0 - give, 0.0) - above * np.maximum(1.0 + give, 0.0))
+    on_motors = {
         "drive": 2.0 * np.pi / p["motor.screw_lead"] * p["motor.torque_constant"] * states["state.current"],
         "friction": -p["friction.viscous"] * speed - p["friction.coulomb"] * speed / np.hypot(speed, p["friction.velocity"]),
         "brake": -p["brake.stiffness"] * states["state.brake_deflection"] - closed * p["brake.damping"] * speed,
-        "stop": p["stop.stiffness"] * (below * np.maximum(1.0 - give, 0.0) - above * np.maximum(1.0 + give, 0.0)),
     }
+    between = flanks(p, states["state.play"], states["state.play_velocity"])
+    return {name: (force, speed) for name, force in on_motors.items()} | {
+        "stop": (stops, leg_speed),
+        "play": (-between, states["state.play_velocity"]),
+    }
+
+
+def forces_on_legs(p: Values, forces: dict[str, tuple[Array, Array]]) -> tuple[Array, Array]:
+    """Along each leg, what pushes the rod, and what pushes a motor that is apart from it [N]."""
+    on_motor, loose = sum(forces[name][0] for name in ("drive", "friction", "brake")), play(p) > 0.0
+    between = -forces["play"][0]
+    return forces["stop"][0] + np.where(loose, between, on_motor), np.where(loose, on_motor - between, 0.0)
 
 
 MOVING = pytest.mark.parametrize("moving", [0.0, 1.0], ids=["base at rest", "base moves"])
@@ -135,7 +168,7 @@ def test_the_equations_of_motion_agree_with_explicit_bodies(
     dynamics: Dynamics, hexapod: Mechanism, seed: int, moving: float
 ) -> None:
     random = np.random.default_rng(seed)
-    p = odd_mechanism(hexapod, random)
+    p = imperfect_legs(odd_mechanism(hexapod, random), random)
     states, inputs = random_state(p, random)
     inputs |= random_base(random, moving)
     base = base_path(inputs)
@@ -145,15 +178,20 @@ def test_the_equations_of_motion_agree_with_explicit_bodies(
     position, rotation, twist = pose_and_twist(states)
     acceleration = np.hstack([rates["state.velocity"], rates["state.angular_velocity"]])
 
-    applied = external_wrench(inputs) + jacobian(p, position, rotation).T @ sum(axial_forces(p, states, inputs).values())
+    on_legs, on_motors = forces_on_legs(p, axial_forces(p, states, inputs))
+    applied = external_wrench(inputs) + jacobian(p, position, rotation).T @ on_legs
     inertia = inertia_matrix(p, position, rotation) @ acceleration
     bias = bias_force(p, position, rotation, twist, base)
     np.testing.assert_allclose(inertia + bias, applied, rtol=0.0, atol=1e-8 * np.abs(bias).max())
     np.testing.assert_array_equal(rates["state.position"], states["state.velocity"])
 
-    # All IMUs, carried along the path that has these accelerations.
+    # All IMUs, and the motors apart from their rods, carried along the path that has these accelerations.
     outputs = named(np.array(dynamics.outputs(*held)).ravel(), SPATIAL.outputs)
-    path, step = bent_path(position, rotation, twist, acceleration), 5e-4
+    path, step = bent_path(position, rotation, twist, acceleration), 1.5e-4
+    lengths = np.array([bodies_at(p, *path(i * step)).lengths for i in range(-3, 4)])
+    ahead = (play(p) > 0.0) * (on_motors / rotor_mass(p) - derivatives(lengths, step)[1])
+    np.testing.assert_allclose(rates["state.play_velocity"], ahead, rtol=0.0, atol=1e-6 * np.abs(ahead).max())
+    np.testing.assert_array_equal(rates["state.play"], states["state.play_velocity"])
     seen = [imus_on_earth(p, *path(i * step), *base(i * step)) for i in range(-3, 4)]
     places, attitudes = (np.array(values) for values in zip(*seen, strict=True))
     to_sensor = np.swapaxes(attitudes[3], 1, 2)
@@ -167,7 +205,7 @@ def test_the_equations_of_motion_agree_with_explicit_bodies(
 def imus_on_earth(p: Values, position: Array, rotation: Array, place: Array, turn: Array) -> tuple[Array, Array]:
     """Places (7, 3) and attitudes (7, 3, 3) of the IMUs on a base at a place with a rotation."""
     frames = leg_frames(p, position, rotation)
-    at_legs = p["base_joints"] + np.einsum("kij,kj->ki", frames, p["leg_imu_position"])
+    at_legs = second_axes(p, position, rotation) + np.einsum("kij,kj->ki", frames, p["leg_imu_position"])
     places = np.vstack([at_legs, position + rotation @ p["platform_imu_position"]])
     return place + places @ turn.T, turn @ np.concatenate([frames, rotation[None]])
 
@@ -178,7 +216,7 @@ def test_energies_and_powers_agree_with_explicit_bodies(
     dynamics: Dynamics, hexapod: Mechanism, seed: int, moving: float
 ) -> None:
     random = np.random.default_rng(100 + seed)
-    p = odd_mechanism(hexapod, random)
+    p = imperfect_legs(odd_mechanism(hexapod, random), random)
     states, inputs = random_state(p, random)
     inputs |= random_base(random, moving)
     base = base_path(inputs)
@@ -196,6 +234,8 @@ def test_energies_and_powers_agree_with_explicit_bodies(
     outputs = outputs_at(states)
     position, rotation, twist = pose_and_twist(states)
     kinetic, potential = expected_energies(states)
+    motors = jacobian(p, position, rotation) @ twist + states["state.play_velocity"]
+    kinetic += 0.5 * rotor_mass(p) * float(np.sum(motors[play(p) > 0.0] ** 2))
     assert outputs["kinetic_energy"] == pytest.approx(kinetic, rel=1e-9)
     elsewhere = random_state(p, random)[0]
     change = outputs["potential_energy"] - outputs_at(elsewhere)["potential_energy"]
@@ -204,8 +244,8 @@ def test_energies_and_powers_agree_with_explicit_bodies(
     speed = jacobian(p, position, rotation) @ twist
     np.testing.assert_allclose(outputs["leg_velocity"], speed, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(outputs["leg_length"], bodies_at(p, position, rotation).lengths, rtol=1e-14)
-    for source, force in axial_forces(p, states, inputs).items():
-        assert outputs[f"power.{source}"] == pytest.approx(force @ speed, rel=1e-11, abs=1e-11)
+    for source, (force, pushed) in axial_forces(p, states, inputs).items():
+        assert outputs[f"power.{source}"] == pytest.approx(force @ pushed, rel=1e-11, abs=1e-11)
     assert outputs["power.external"] == pytest.approx(external_wrench(inputs) @ twist, rel=1e-12)
 
 
@@ -327,7 +367,7 @@ def rk4(dynamics: Dynamics, p: Values, states: Values, inputs: Values, step: flo
 def test_the_fmu_integrates_the_derived_rates(dynamics: Dynamics, hexapod: Mechanism, make_plant: MakePlant) -> None:
     """The C code, its layout and its Runge-Kutta steps against the same method in Python, for odd parameters."""
     random = np.random.default_rng(5)
-    p = odd_mechanism(hexapod, random)
+    p = imperfect_legs(odd_mechanism(hexapod, random), random)
     substep = float(p["substep"])
     plant = make_plant(p)
     states = named(np.array(dynamics.start(flat(p, SPATIAL.parameters))).ravel(), SPATIAL.states)
@@ -467,7 +507,7 @@ def brake_rates(p: Values, mode: Array, deflection: Array, speed: Array) -> Arra
 @pytest.mark.parametrize("seed", range(6))
 def test_currents_brakes_and_attitude_change_at_their_rates(dynamics: Dynamics, hexapod: Mechanism, seed: int) -> None:
     random = np.random.default_rng(400 + seed)
-    p = odd_drives(odd_mechanism(hexapod, random), random)
+    p = odd_drives(imperfect_legs(odd_mechanism(hexapod, random), random), random)
     states, inputs = random_state(p, random)
     slip = p["brake.force"] / p["brake.stiffness"]
     states["state.brake_deflection"] = slip * random.permutation([0.69, -0.69, 1.0, -1.0, 1.2, -1.2])
@@ -480,7 +520,7 @@ def test_currents_brakes_and_attitude_change_at_their_rates(dynamics: Dynamics, 
     rates = named(np.array(dynamics.rates(*held)).ravel(), SPATIAL.states)
     outputs = named(np.array(dynamics.outputs(*held)).ravel(), SPATIAL.outputs)
     position, rotation, twist = pose_and_twist(states)
-    speed = jacobian(p, position, rotation) @ twist
+    speed = jacobian(p, position, rotation) @ twist + states["state.play_velocity"]
     mode, current = inputs["drive_mode"], states["state.current"]
     expected, voltage = current_rates(p, mode, current, inputs["velocity_command"], speed)
     np.testing.assert_allclose(rates["state.current"], expected, rtol=1e-10, atol=1e-9)

@@ -65,6 +65,7 @@ def regular_start(random: Generator) -> Values:
         position = mechanism.nominal_home.position + random.uniform(-0.03, 0.03, 3)
         rotation = Rotation.from_rotvec(random.uniform(-0.15, 0.15, 3)).as_matrix()
         p = {name: getattr(mechanism, name) for name in ("base_joints", "platform_joints", "base_joint_axes")}
+        p["base_joint_offset"] = np.zeros(6)
         legs = leg_vectors(p, position, rotation)
         lengths = np.linalg.norm(legs, axis=1)
         sines = np.linalg.norm(np.cross(legs, p["base_joint_axes"]), axis=1) / lengths

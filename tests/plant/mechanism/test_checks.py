@@ -76,7 +76,7 @@ def test_what_follows_from_the_geometry_is_no_parameter_of_a_mechanism(table):
     derived |= {"base_joint_axes", "initial_quaternion"} if table is SPATIAL else {"initial_angle"}
     refused = set()
     for variable in table.parameters:
-        value = np.ones(variable.shape) * (0.05 if variable.name == "substep" else 1.0)
+        value = np.full(variable.shape, min(1.0, 0.5 * variable.maximum))
         try:
             checked_plant({variable.name: value}, table)
         except InputError as error:
