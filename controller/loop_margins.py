@@ -13,6 +13,7 @@ and integrates the gyroscope by rectangles. The least squares of the pose spread
 """
 
 from collections.abc import Collection, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,7 @@ SENSITIVITY_LIMIT = 2.0
 _NOTICED_PEAK = 3.0
 """The peak from which on a run says so; the presets stay below it from 250 Hz on."""
 
-Complex = NDArray[np.complex128]
+Complex = NDArray[np.complexfloating[Any, Any]]
 
 _FREQUENCIES = 400
 _SETTLED_S, _STEP_S, _TILT_SIGMA = 10.0, 0.01, 0.15
