@@ -20,6 +20,9 @@ PLAN_SEGMENTS = 24
 FOLLOWED_SEGMENTS = 2 * PLAN_SEGMENTS
 """Rows of the array that the cycle follows: the rest of the previous plan, and the new one."""
 
+STREAM_PATIENCE_S = 0.1
+"""How long a stream may be silent before the motion stops."""
+
 CYCLE, LATEST, SEEN, TAKEN, CAUSE, SAMPLE_NS, END_PLANNER = range(7)
 """Places in `shared`: cycles since the motion began; the numbers of the latest plan, of the last plan that the loop has seen,
 and of the plan that it follows; why the stream has failed; when the last sample came [ns of CLOCK_MONOTONIC, 0 before the

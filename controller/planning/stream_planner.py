@@ -1,12 +1,12 @@
 """The planner of a streamed target: from each sample a plan of cubic segments, within all limits, that ends at rest.
 
-The target's motion is fitted to its last samples. ruckig plans from the state of the previous plan to where the target will be
-a moment later, with the target's velocity there; a moment at that velocity follows, and a stop. A plan is accepted only if all
-of it stays inside the limits and the stroke. Otherwise the planner tries a gentler plan. If none is accepted, the previous plan
-goes on, which also ends at rest. So no limit is left, whatever the samples are and whenever they end.
+The target's motion is fitted to its last samples (see `controller.planning.target_motion`). ruckig plans from the state of the
+previous plan to where the target will be a moment later, with the target's velocity there; a moment at that velocity follows,
+and a stop. A plan is accepted only if all of it stays inside the limits and the stroke. Otherwise the planner tries a gentler
+plan. If none is accepted, the previous plan goes on, which also ends at rest. So no limit is left, whatever the samples are and
+whenever they end.
 """
 
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,19 +15,14 @@ from ruckig import ControlInterface, Ruckig, Trajectory
 
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.offline_planner import PREVIEW_S, calculate, count_violations, phases_of, ruckig_input
-from controller.planning.plan_handover import PLAN_SEGMENTS, rest
+from controller.planning.plan_handover import PLAN_SEGMENTS, STREAM_PATIENCE_S, rest
 from controller.planning.segments import LENGTH, START, evaluate_reference, state_after, stop_phases, write_segment
+from controller.planning.target_motion import STILL_M, TargetMotion
 from controller.safety.causes import Cause
 from plant.compiled import kernel
 from plant.errors import GoughError, InputError
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import UNIT_TOLERANCE, Array, rotation_from_quaternion
-
-_WINDOW_S, _LEAST_SAMPLES, _MOST_SAMPLES = 0.08, 5, 64
-"""The target's motion is fitted to the samples of the first number [s], but to at least and at most so many samples."""
-
-_CURVED_S = 0.05
-"""Time after the last sample for which the target is taken to accelerate as before; then its motion is taken as uniform."""
 
 _PREVIEWS_S = (PREVIEW_S, 0.045, 0.06, 0.08, 0.1, 0.15, 0.25)
 """Times in which a plan may meet the target; the first that the limits allow is chosen."""
@@ -39,10 +34,7 @@ _COAST_S = 0.02
 """Time for which a plan keeps the target's velocity after it has met the target, if the stroke allows."""
 
 _JUMP_FACTOR, _JUMP_M = 1.5, 1e-3
-"""Between samples, a leg may go this many times as far as its velocity limit allows, and this much further."""
-
-_STILL_M = 1e-9
-"""A target that moves no leg by more than this stands still."""
+"""Between any two samples, a leg may go this many times as far as its velocity limit allows, and this much further."""
 
 _STROKE_SLACK_M = 1e-9
 """Rounding by which a sample may be outside the stroke."""
@@ -84,7 +76,9 @@ class StreamPlanner:
         self._mechanism, self._home, self._limits = mechanism, mechanism.require_home(), mechanism.require_limits()
         mechanism.check_lengths(lengths, "the start of the stream")
         self.current = Plan(0.0, rest(lengths, PLAN_SEGMENTS), None)
-        self._samples: deque[tuple[float, Array]] = deque(maxlen=_MOST_SAMPLES)
+        self._motion: TargetMotion | None = None
+        self._sent_s = 0.0  # time stamp of the newest sample
+        self._within = lengths, lengths  # least and greatest lengths (6,) at that time that no sample so far makes a jump
         self._otg = Ruckig(LEGS)
         self._trajectory = Trajectory(LEGS)
         self._follow = ruckig_input(self._limits, ControlInterface.Position, None)
@@ -119,15 +113,27 @@ class StreamPlanner:
         leg = int(excess.argmax())
         if excess[leg] > _STROKE_SLACK_M:
             raise TargetRefusedError(Cause.BEYOND_STROKE, leg, lengths[leg], stroke[leg, int(lengths[leg] > stroke[leg, 1])])
-        if self._samples:
-            before, was = self._samples[-1]
-            if not time_s > before:
-                raise InputError(f"a sample of {time_s:g} s does not come after {before:g} s: send samples in their order")
-            step = np.abs(lengths - was)
-            most = _JUMP_FACTOR * self._limits.velocity * (time_s - before) + _JUMP_M
-            if step.max() > most:
-                raise TargetRefusedError(Cause.TARGET_JUMPS, int(step.argmax()), float(step.max()), most)
-        self._samples.append((time_s, np.clip(lengths, stroke[:, 0], stroke[:, 1])))
+        lengths = np.clip(lengths, stroke[:, 0], stroke[:, 1])
+        motion = self._motion
+        if motion is None:
+            self._motion = TargetMotion(0.0, lengths, self._limits.velocity)
+            self._within = lengths - _JUMP_M, lengths + _JUMP_M
+        else:
+            if not time_s > self._sent_s:
+                raise InputError(
+                    f"a sample of {time_s:g} s does not come after {self._sent_s:g} s: send samples in their order"
+                )
+            elapsed = min(time_s - self._sent_s, STREAM_PATIENCE_S)
+            way = _JUMP_FACTOR * self._limits.velocity * elapsed
+            least, most = self._within[0] - way, self._within[1] + way
+            step = lengths - motion.lengths
+            room = np.where(step > 0.0, most - motion.lengths, motion.lengths - least)
+            leg = int((np.abs(step) - room).argmax())
+            if abs(step[leg]) > room[leg]:
+                raise TargetRefusedError(Cause.TARGET_JUMPS, leg, abs(step[leg]), room[leg])
+            self._within = np.maximum(least, lengths - _JUMP_M), np.minimum(most, lengths + _JUMP_M)
+            motion.add(motion.time + elapsed, lengths)
+        self._sent_s = time_s
 
     def plan(self, at_s: float, ahead_s: float, ended: bool = False) -> Plan | None:
         """Plan how to follow the target. The plan takes effect only after `follow(plan)`.
@@ -147,50 +153,36 @@ class StreamPlanner:
             raise InputError(
                 f"a plan from {at_s:g} s on would begin before the current plan, at {self.current.begin:g} s: plan for later"
             )
-        if not self._samples:
+        motion = self._motion
+        if motion is None:
             raise InputError("there is no sample to plan for: add one first")
         state = np.empty((LEGS, 3))
         evaluate_reference(self.current.segments, at_s, np.zeros(LEGS, np.int64), state)
-        motion = self._samples[-1][1][np.newaxis] if ended else self._fit()
-        if not motion[1:].any():
-            goal = motion[0]
-            if self.current.goal is not None and np.abs(goal - self.current.goal).max() < _STILL_M:
+        ahead = max(ahead_s, 0.0)
+        goal, rates = self._aim(motion, ahead + PREVIEW_S)
+        if ended or not rates.any():
+            goal = motion.lengths if ended else goal
+            if self.current.goal is not None and np.abs(goal - self.current.goal).max() < STILL_M:
                 return None
             return self._plan_towards(at_s, state, goal, None, PREVIEW_S)
         for preview in _PREVIEWS_S:
-            aim, rates = self._aim(motion, max(ahead_s, 0.0), preview)
-            plan = self._plan_towards(at_s, state, aim, rates, preview)
+            plan = self._plan_towards(at_s, state, *self._aim(motion, ahead + preview), preview)
             if plan is not None:
                 return plan
-        aim, _ = self._aim(motion, max(ahead_s, 0.0), PREVIEW_S)
-        return self._plan_towards(at_s, state, aim, None, PREVIEW_S)
+        return self._plan_towards(at_s, state, goal, None, PREVIEW_S)
 
     def follow(self, plan: Plan) -> None:
         """Follow a plan from its begin on; the next plan comes after it."""
         self.current = plan
 
-    def _fit(self) -> Array:
-        """The target's motion (m, 6) by powers of the time since its newest sample; one row if it stands still."""
-        newest = self._samples[-1][0]
-        chosen = [each for each in self._samples if each[0] > newest - _WINDOW_S]
-        if len(chosen) < _LEAST_SAMPLES:
-            chosen = list(self._samples)[-_LEAST_SAMPLES:]
-        times, lengths = np.array([each[0] for each in chosen]), np.array([each[1] for each in chosen])
-        if len(times) < 3 or np.ptp(lengths, axis=0).max() < _STILL_M:
-            return lengths[-1:]
-        fit: Array = np.linalg.pinv(np.vander(times - newest, 3, increasing=True)) @ lengths
-        return fit
-
-    def _aim(self, motion: Array, ahead: float, preview: float) -> tuple[Array, Array]:
-        """Lengths and rates (6,) of the target `ahead` and `preview` [s] after its newest sample, within the limits."""
+    def _aim(self, motion: TargetMotion, ahead: float) -> tuple[Array, Array]:
+        """Lengths and rates (6,) of the target `ahead` [s] of its newest sample, within the limits."""
         limits = self._limits
-        curved = min(ahead + preview, _CURVED_S)
-        rates = np.clip(motion[1] + 2.0 * curved * motion[2], -limits.velocity, limits.velocity)
-        aim = motion[0] + curved * (motion[1] + curved * motion[2]) + (ahead + preview - curved) * rates
-        aim = np.clip(aim, limits.stroke[:, 0], limits.stroke[:, 1])
+        lengths, rates = motion.at(ahead)
+        aim = np.clip(lengths, limits.stroke[:, 0], limits.stroke[:, 1])
         # The way that a leg has left to stop in.
         room = np.where(rates > 0.0, limits.stroke[:, 1] - aim, aim - limits.stroke[:, 0])
-        most = _stoppable(room, limits.acceleration, limits.jerk)
+        most = np.minimum(_stoppable(room, limits.acceleration, limits.jerk), limits.velocity)
         return aim, np.clip(rates, -most, most)
 
     def _plan_towards(self, begin: float, state: Array, aim: Array, rates: Array | None, preview: float) -> Plan | None:

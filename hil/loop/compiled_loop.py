@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from controller.cycle import CycleStage, hear_rig, prepare_next, react, run_stages, skip_periods
 from controller.estimation.whole_mechanism.filter import extrapolate_covariance
 from controller.least_squares import factor_cholesky, invert_cholesky
-from controller.planning.plan_handover import stream_cause, take_plan
+from controller.planning.plan_handover import STREAM_PATIENCE_S, stream_cause, take_plan
 from controller.reference import motion_cycle
 from controller.safety.causes import EVENT_SLOTS, REACTION, Cause, Request
 from controller.safety.stop import has_stopped, ramp_down
@@ -27,8 +27,7 @@ from plant.pose import Array
 from plant.stopwatch import now
 
 _LOOK_NS = 100_000_000
-_STREAM_PATIENCE_NS = 100_000_000
-"""How long a streamed target may be silent before the motion stops."""
+_STREAM_PATIENCE_NS = round(1e9 * STREAM_PATIENCE_S)
 
 _SIGQUIT = 1 << 2
 _SIGNALS = 1 << 0 | 1 << 1 | 1 << 2 | 1 << 14

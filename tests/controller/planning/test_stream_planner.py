@@ -199,7 +199,7 @@ def followed(mechanism, name, noise=0.0, rate=100, duration=4.0, kept=lambda k: 
         ("shaking", {}, 0.6e-3),
         ("sines", {"noise": 2e-5}, 0.2e-3),
         ("sines", {"rate": 30}, 0.3e-3),
-        ("sines", {"rate": 500}, 0.06e-3),
+        ("sines", {"rate": 500}, 0.08e-3),
         ("sines", {"kept": lambda k: k % 7 not in (2, 3)}, 0.2e-3),
     ],
 )
@@ -455,3 +455,87 @@ def test_from_the_speeds_that_a_leg_may_arrive_with_it_stops_within_the_way_that
     # 7.5 mm from 0.15 m/s, 22.5 mm from 0.3 m/s.
     np.testing.assert_allclose(speeds[4:6], [0.15, 0.3], rtol=1e-12)
     assert _stoppable(np.array([-1e-3, 0.0]), 3.0, 60.0).tolist() == [0.0, 0.0]
+
+
+def swing(mechanism, times, displacements):
+    """By how much a leg goes beyond all that was sent [m]."""
+    follower, sent = Follower(mechanism), [home_lengths(mechanism)]
+    for at, displacement in zip(times, displacements, strict=True):
+        cycle = round(at / PERIOD)
+        follower.run(cycle, points=1)
+        refused = follower.refused
+        follower.add(at, displacement)
+        if follower.refused > refused:
+            break
+        sent.append(leg_lengths(mechanism, mechanism.home.position + displacement, mechanism.home.rotation))
+        if follower.planner.current.begin <= (cycle + 10) * PERIOD:
+            follower.plan(cycle + 10, 0.01)
+    follower.run(follower.cycle + 600, points=1)
+    lengths, sent = np.array(follower.pieces)[:, :, 0], np.array(sent)
+    return max((lengths.max(axis=0) - sent.max(axis=0)).max(), (sent.min(axis=0) - lengths.min(axis=0)).max())
+
+
+SLOW, DENSE = 0.01 * np.arange(150), 0.0002 * np.arange(5000)
+
+
+def waves(times):
+    return np.sin(np.pi * times)[:, None] * np.array([10e-3, 5e-3, 5e-3])
+
+
+@pytest.mark.parametrize("seed", [31, 32])
+@pytest.mark.parametrize(
+    ("times", "made", "most"),
+    [
+        (SLOW, lambda t, noise: 1e-4 * noise, 2e-3),
+        (SLOW, lambda t, noise: 0.58e-3 * noise.clip(-2.5, 2.5), 6e-3),
+        (SLOW, lambda t, noise: 0.58e-3 * noise.clip(-2.5, 2.5) * (t > 0.5)[:, None], 6e-3),
+        (SLOW, lambda t, noise: np.round(waves(t), 3), 2.5e-3),
+        (SLOW, lambda t, noise: waves(t) + 1e-4 * noise, 4e-3),
+        (DENSE, lambda t, noise: 1e-4 * noise.clip(-3.0, 3.0), 0.5e-3),
+        (DENSE, lambda t, noise: waves(t) + 1e-4 * noise.clip(-3.0, 3.0), 4e-3),
+        (DENSE, lambda t, noise: 4e-3 * np.abs((25.0 * t[:, None]) % 2.0 - 1.0) * [0.0, 0.0, 1.0] - [0.0, 0.0, 4e-3], 2e-3),
+    ],
+    ids=["noise", "much noise", "noise from 0.5 s on", "rounded", "noisy waves", "dense noise", "dense waves", "dense teeth"],
+)
+def test_legs_do_not_swing_beyond_what_was_sent(hexapod, times, made, most, seed):
+    """A curve through the last samples took them up to 39 mm beyond. Waves end at full speed, from which legs need 3 mm."""
+    noise = np.random.default_rng(seed).normal(size=(len(times), 3))
+    assert swing(hexapod, times, made(times, noise)) < most
+
+
+def test_a_time_stamp_far_ahead_moves_nothing_by_itself(hexapod):
+    times = np.append(SLOW[:100], 2.0**64 * 1e-9)
+    follower = Follower(hexapod)
+    for at, displacement in zip(times, waves(SLOW[:101]), strict=True):
+        follower.run(follower.cycle + 10, points=1)
+        follower.add(at, displacement)
+        follower.plan(follower.cycle + 10, 0.01)
+    follower.run(follower.cycle + 600, points=1)
+    lengths = np.array(follower.pieces)[:, :, 0]
+    sent = leg_lengths(hexapod, hexapod.home.position + waves(SLOW[:101]), np.tile(hexapod.home.rotation, (101, 1, 1)))
+    # What was sent, and the way to come to rest from its speed.
+    assert (lengths.max(axis=0) - sent.max(axis=0)).max() < 3e-3 and (sent.min(axis=0) - lengths.min(axis=0)).max() < 3e-3
+
+
+def test_samples_that_come_more_often_may_not_jump_farther(hexapod):
+    """Each sample by itself went less than a millimetre, and they 50 mm/s faster than a leg may."""
+    planner = StreamPlanner(hexapod, home_lengths(hexapod))
+    speed, found = 2.0 * hexapod.limits.velocity, None
+    for k in range(200):
+        try:
+            planner.add(0.0002 * k, [0.0, 0.0, speed * 0.0002 * k], LEVEL)
+        except TargetRefusedError as refusal:
+            found = refusal
+            break
+    assert found is not None and found.cause == Cause.TARGET_JUMPS
+    # At the greatest speed allowed, and one millimetre.
+    assert 0.0002 * k * (speed * 0.9 - 1.5 * hexapod.limits.velocity) < 1e-3 + 0.0002 * speed
+    assert found.value > found.limit
+
+
+def test_a_gap_lets_a_target_jump_no_farther_than_the_patience_with_it(hexapod):
+    planner = StreamPlanner(hexapod, home_lengths(hexapod))
+    planner.add(0.0, np.zeros(3), LEVEL)
+    with pytest.raises(TargetRefusedError, match=r"the limit is 0.0385 m"):
+        planner.add(1e6, [0.0, 0.0, 0.05], LEVEL)
+    planner.add(1e6, [0.0, 0.0, 0.03], LEVEL)
