@@ -125,8 +125,14 @@ def tune(mechanism: Mechanism, rate: float) -> Design:
     while high / low > 1.002:
         middle = float(np.sqrt(low * high))
         low, high = (middle, high) if margins(loop, response, with_proportional(middle), rate).sound else (low, middle)
-    gains = with_proportional(round(low, 1))
+    gains = with_proportional(_rounded_down(low))
+    gains = replace(gains, integral=_rounded_down(gains.integral))
     return Design(rate, gains, margins(loop, response, gains, rate), preset, margins(loop, response, preset, rate))
+
+
+def _rounded_down(gain: float) -> float:
+    """A gain as it is shown, and not above what was found: a greater one would break the rule."""
+    return float(np.floor(10.0 * gain) / 10.0)
 
 
 def open_loop(mechanism: Mechanism, rate: float) -> Linear:

@@ -125,7 +125,7 @@ def fault(text: str) -> Record:
 
 def _made(kind: int, at: float, duration: float, **fields: Any) -> Record:
     begin = -1 if at < 0.0 else round(1e9 * at)
-    ends = begin + 1e9 * duration
+    ends = max(begin, 0) + 1e9 * duration
     return filled(FAULT, kind=kind, begin_ns=begin, end_ns=_FOREVER if ends >= _FOREVER else round(ends), **fields)
 
 

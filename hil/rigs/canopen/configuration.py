@@ -27,6 +27,7 @@ from hil.rigs.canopen.frames import (
     imu_pdos,
 )
 from hil.rigs.canopen.settings import CanopenSettings, ControllerSettings, DriveSettings, object_dictionary
+from plant.errors import InputError
 
 BUS_ERRORS = (can.CanError, OSError, ValueError)
 """What python-can raises when a bus fails."""
@@ -211,12 +212,19 @@ def switch_on(node: RemoteNode, controller: ControllerSettings) -> int:
 
 
 def interpolation_period(period: float) -> tuple[int, int]:
-    """A period [s] in the form of CiA 402's object 60C2h: a number of units (at most 255), and a unit's exponent of ten."""
-    exponents = range(-3, -7, -1)
+    """A period [s] in the form of CiA 402's object 60C2h: a number of units (at most 255), and a unit's exponent of ten.
+
+    Raises:
+        InputError: the period is longer than 255 s.
+    """
+    if not period <= 255.0:
+        raise InputError(f"the period is {period:g} s, and object 60C2h holds 255 s at most: raise the rate")
+    # Drives know the first ones best.
+    exponents = (-3, -4, -5, -6, -2, -1, 0)
     exact = (each for each in exponents if abs(period * 10.0**-each - round(period * 10.0**-each)) < 1e-6)
     exponent = next((each for each in exact if 1 <= round(period * 10.0**-each) <= 255), None)
     if exponent is None:
-        exponent = min((each for each in exponents if period * 10.0**-each <= 255.0), default=-3)
+        exponent = min(each for each in exponents if period * 10.0**-each <= 255.0)
     return max(1, round(period * 10.0**-exponent)), exponent
 
 

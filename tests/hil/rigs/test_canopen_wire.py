@@ -15,6 +15,7 @@ from hil.rigs.canopen.configuration import RemoteNode, configure_drive, configur
 from hil.rigs.canopen.frames import Pdo, new_message, pack_imu
 from hil.rigs.canopen.rig import CanopenRig
 from hil.rigs.canopen.settings import canopen_settings
+from plant.errors import InputError
 
 DRIVES, IMUS = [41, 7, 23, 3, 55, 12], [70, 64, 99, 61, 88, 93, 62]
 SIGNS = np.array([1, -1, -1, 1, -1, 1])
@@ -324,10 +325,22 @@ def test_imus_take_turns_with_their_magnetometers_on_classic_can(fd):
         (1.0 / 3000.0, 33, -5),
         (1.0 / 600.0, 167, -5),
         (0.0000004, 1, -6),
+        (0.256, 26, -2),
+        (0.3, 30, -2),
+        (2.55, 255, -2),
+        (0.3001, 30, -2),
+        (25.0, 250, -1),
+        (255.0, 255, 0),
     ],
 )
 def test_a_period_in_units_of_a_power_of_ten(period, units, exponent):
     assert interpolation_period(period) == (units, exponent)
+
+
+@pytest.mark.parametrize("period", [255.5, np.inf, np.nan])
+def test_a_period_that_the_object_cannot_hold_is_refused(period):
+    with pytest.raises(InputError, match=f"the period is {period:g} s, and object 60C2h holds 255 s at most"):
+        interpolation_period(period)
 
 
 class PoweredNode(Node):

@@ -152,7 +152,7 @@ def test_an_unknown_fault_is_told_with_those_that_there_are():
         # Without `at` from the start, before the drives are enabled, too; `for` counts from when they are.
         ("bus-down", -1, 0, True),
         ("bus-down,for=2", -1, 10**12, True),
-        ("bus-down,for=2", 10**9, 2_999_999_998, True),
+        ("bus-down,for=2", 10**9, 2_999_999_999, True),
         ("bus-down,for=2", 10**9, 3_000_000_000, False),
         # With `at` from then on after the drives were enabled; the first instant counts, the last does not.
         ("bus-down,at=2,for=1", -1, 2_500_000_000, False),
