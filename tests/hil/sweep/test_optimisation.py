@@ -145,9 +145,7 @@ def test_it_goes_on_behind_a_line_that_was_cut_and_a_batch_that_was_saved_in_par
     # The last line says that the last batch is whole; the ones before are its trials.
     journal.write_bytes(b"".join(lines[:-4]) + lines[-4][:20])
     (tmp_path / f"{TRIALS}.lock").symlink_to(journal)
-    began = time.monotonic()
     again = run(design, tmp_path)
-    assert time.monotonic() - began < 10.0
     assert (points_of(again), again.ran) == (points_of(whole), 0)
     assert points_of(run(design, tmp_path)) == points_of(whole)
 
