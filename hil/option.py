@@ -1,6 +1,6 @@
 """Fields of configurations that are options of the command line, too."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -28,13 +28,6 @@ def option(default: T, text: str, **form: Any) -> T:
     """A dataclass field with this default in SI units, and its option."""
     made: T = field(default=default, metadata={"option": Option(text, **form)})
     return made
-
-
-def nearest(text: str, names: Iterable[str]) -> str:
-    """A question for the name that a mistyped text may mean; "" if none is near."""
-    from difflib import get_close_matches
-
-    return "".join(f"; did you mean {name!r}?" for name in get_close_matches(text, names, 1))
 
 
 def integers(text: str) -> tuple[int, ...]:

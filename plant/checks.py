@@ -1,5 +1,6 @@
-"""Checks of numbers that several configurations share."""
+"""Checks of numbers that several configurations share, and foreign texts and wrong names as messages show them."""
 
+from collections.abc import Iterable
 from math import inf
 
 from plant.errors import InputError
@@ -24,3 +25,15 @@ def checked_seed(seed: int) -> int:
     if not 0 <= seed < 2**63:
         raise InputError(f"the seed is {seed}; it must lie between 0 and 2^63 - 1")
     return seed
+
+
+def printable(text: str) -> str:
+    """A foreign text as it may be shown: what would act on a terminal, such as control characters, is escaped."""
+    return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
+
+
+def nearest(text: str, names: Iterable[str]) -> str:
+    """A question for the name that a mistyped text may mean; "" if none is near."""
+    from difflib import get_close_matches
+
+    return "".join(f"; did you mean {name!r}?" for name in get_close_matches(text, names, 1))

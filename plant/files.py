@@ -1,6 +1,7 @@
 """Files: TOML files that a user writes, files that are written whole or not at all, and temporary folders."""
 
 import fcntl
+import json
 import os
 import shutil
 import tempfile
@@ -43,6 +44,19 @@ def parse_toml(text: str, name: str) -> dict[str, Any]:
 def read_toml(path: Path | str) -> dict[str, Any]:
     """The content of a TOML file, or an `InputError`."""
     return parse_toml(read_text(path), str(path))
+
+
+def toml_entries(values: Mapping[str, Any]) -> list[str]:
+    """The TOML lines of texts, switches, numbers, and lists or arrays of numbers; a number is read again as it was."""
+    return [f"{name} = {_toml(value.tolist() if hasattr(value, 'tolist') else value)}" for name, value in values.items()]
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    return f"{value!r}".lower()
 
 
 def unknown_entries(table: Mapping[str, Any], known: Iterable[str], title: str) -> list[str]:

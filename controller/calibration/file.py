@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from controller.estimation.whole_mechanism.imu_errors import ERRORS
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import InputError
-from plant.files import check_entries, read_toml, write_whole
+from plant.files import check_entries, read_toml, toml_entries, write_whole
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, checked_array, rotation_from_vector, vector_from_rotation
 
@@ -249,20 +249,20 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
         "[about]",
     ]
     lines = [
-        *_entries(calibration.about),
+        *toml_entries(calibration.about),
         "",
         "# By which the vertical is turned about x and y, in rad; what tilt and joints leave of the pose, in m and rad.",
         "[base]",
-        *_entries({"tilt": calibration.tilt, "floor": calibration.floor}),
+        *toml_entries({"tilt": calibration.tilt, "floor": calibration.floor}),
     ]
     if np.abs(calibration.joints).max() >= _LEAST_MOVE_M:
         moves = dict(zip(_SIDES, calibration.joints, strict=True))
-        lines += ["", "[joints]  # what must be added to their places, in m", *_entries(moves)]
+        lines += ["", "[joints]  # what must be added to their places, in m", *toml_entries(moves)]
     for imu, (sensor, name) in product(range(IMU_COUNT), enumerate(SENSORS)):
         gain, offset = calibration.gain[sensor, imu], calibration.offset[sensor, imu]
         scale, axes, mounting = split_gain(gain)
         values = {"bias": np.linalg.solve(gain, offset), "scale": scale, "axes": axes, "mounting": mounting}
-        lines += ["", f"[imu_{imu}.{name}]  # bias in {UNITS[sensor]}, mounting in rad", *_entries(values)]
+        lines += ["", f"[imu_{imu}.{name}]  # bias in {UNITS[sensor]}, mounting in rad", *toml_entries(values)]
     if calibration.covariance is not None:
         sigmas = np.sqrt(np.diag(calibration.covariance))
         # Positive definite whatever rounding has done to the correlation.
@@ -271,22 +271,10 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
             "",
             "# Of the errors that are left: standard deviations, and the Cholesky factor of their correlation.",
             "[covariance]",
-            *_entries({"sigmas": sigmas}),
+            *toml_entries({"sigmas": sigmas}),
             "factor = [",
             *(f"    [{', '.join(f'{value:.6g}' for value in row[: i + 1])}]," for i, row in enumerate(factor)),
             "]",
         ]
     digest = _digest(tomllib.loads("\n".join(["[about]", *lines])))
-    write_whole(path, ("\n".join([*head, *_entries({"digest": digest}), *lines]) + "\n").encode())
-
-
-def _entries(values: Mapping[str, Any]) -> list[str]:
-    return [f"{name} = {_toml(value.tolist() if isinstance(value, np.ndarray) else value)}" for name, value in values.items()]
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, list):
-        return f"[{', '.join(map(_toml, value))}]"
-    return f"{value!r}".lower()
+    write_whole(path, ("\n".join([*head, *toml_entries({"digest": digest}), *lines]) + "\n").encode())

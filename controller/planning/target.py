@@ -7,13 +7,17 @@ from pathlib import Path
 import numpy as np
 
 from controller.planning.motions import HELD, MARGIN_S, NAMES, named_motion
-from plant.checks import check_duration
+from plant.checks import check_duration, nearest
 from plant.csv import read_csv
 from plant.errors import InputError, UnknownNameError
 from plant.mechanism import Mechanism
 from plant.pose import UNIT_TOLERANCE, Array, Pose, checked_unit, quaternion_from_rotation, rotations_from_quaternions
 
 COLUMNS = ("time_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
+"""Of a motion through poses."""
+
+HELD_COLUMNS = ("from_s", *COLUMNS[1:])
+"""Of poses that are held, each from its time on."""
 
 _IN_PLANE_M, _IN_PLANE_RAD = 1e-9, 1e-6
 """Largest deviation from the plane that counts as in the plane."""
@@ -85,7 +89,8 @@ def _interpolate(knots: Array, values: Array, times: Array) -> Array:
 
 
 def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float) -> Target:
-    """A built-in motion by its name, or the displacements from home in a CSV file, cut to `duration` [s].
+    """A built-in motion by its name, or the displacements from home in a CSV file, cut to `duration` [s]; in a file whose
+    header begins with `from_s` instead of `time_s`, each pose is held until the next one.
 
     Raises:
         UnknownNameError: neither a motion nor a file.
@@ -96,17 +101,41 @@ def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float)
     name = str(name_or_path)
     if name in NAMES:
         return Target(name, *named_motion(name, mechanism, duration), held=name in HELD)
-    path = Path(name_or_path)
-    if not path.is_file():
-        raise UnknownNameError(f"no target {name!r}: neither a motion ({', '.join(NAMES)}) nor a CSV file")
-    target = _cut(_read_csv(path, mechanism), duration)
+    check_target(name)
+    target = _cut(_read_csv(Path(name_or_path), mechanism), duration)
     if mechanism.planar:
         _check_in_plane(target, mechanism)
     return target
 
 
+def check_target(name: str) -> None:
+    """Check that there is a motion or a file of this name, or raise an `UnknownNameError`."""
+    if name not in NAMES and not Path(name).is_file():
+        raise UnknownNameError(
+            f"no target {name!r}: neither a motion ({', '.join(NAMES)}) nor a CSV file{nearest(name, NAMES)}"
+        )
+
+
+def text_of_target(target: Target, mechanism: Mechanism) -> str:
+    """The CSV text of a target as displacements from a mechanism's home, which `load_target` reads again from a file.
+
+    Raises:
+        InputError: times, positions and rotations are not of one length of at least 2, or not finite.
+    """
+    home, count = mechanism.require_home(), len(target.times)
+    if not (count >= 2 and np.shape(target.positions) == (count, 3) and np.shape(target.rotations) == (count, 3, 3)):
+        raise InputError(
+            f"the target {target.name!r} has times {np.shape(target.times)}, positions {np.shape(target.positions)} and "
+            f"rotations {np.shape(target.rotations)}; it needs (N,), (N, 3) and (N, 3, 3), N at least 2"
+        )
+    quaternions = quaternion_from_rotation(target.rotations @ home.rotation.T)
+    rows = np.column_stack([target.times, target.positions - home.position, quaternions])
+    header = ",".join(HELD_COLUMNS if target.held else COLUMNS)
+    return "\n".join([header, *(",".join(map(repr, row)) for row in rows.tolist())]) + "\n"
+
+
 def _read_csv(path: Path, mechanism: Mechanism) -> Target:
-    _, table, lines = read_csv(path, COLUMNS)
+    columns, table, lines = read_csv(path, COLUMNS, HELD_COLUMNS)
     for i, (time, norm) in enumerate(zip(table[:, 0], np.linalg.norm(table[:, 4:], axis=1), strict=True)):
         if i and time <= table[i - 1, 0]:
             raise InputError(f"{path}, line {lines[i]}: time {time:g} s does not come after {table[i - 1, 0]:g} s")
@@ -123,6 +152,7 @@ def _read_csv(path: Path, mechanism: Mechanism) -> Target:
         times=table[:, 0] - table[0, 0],
         positions=home.position + table[:, 1:4],
         rotations=rotations_from_quaternions(quaternions) @ home.rotation,
+        held=columns == HELD_COLUMNS,
     )
 
 

@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import NoReturn
 
 from hil.command_line.cli import Command, check_outputs
-from hil.option import nearest
+from plant.checks import nearest, printable
 from plant.errors import GoughError
 from plant.extras import missing_extras_named
 
@@ -50,7 +50,7 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stdout.flush()
     except GoughError as error:
         with suppress(OSError):
-            print(f"gough: {error}", file=sys.stderr)
+            print(f"gough: {printable(str(error))}", file=sys.stderr)
         return getattr(error, "exit_status", REFUSED)
     except OSError as error:
         # The reader of the output has gone, or its disk is full; nothing more is flushed there.

@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from controller.safety.causes import DriveState, Request
+from plant.checks import printable
 from plant.compiled import Record, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import GoughError
@@ -70,6 +71,11 @@ class Identity:
 
     name: str
     parts: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        # Devices name themselves.
+        object.__setattr__(self, "name", printable(self.name))
+        object.__setattr__(self, "parts", {printable(name): printable(part) for name, part in self.parts.items()})
 
 
 class Rig(Protocol):

@@ -6,7 +6,8 @@ from typing import Any
 
 from controller.planning import STREAM_TARGET
 from hil.option import integers, option
-from plant.checks import check_duration, check_rate, checked_seed
+from hil.runs.names import name_objects
+from plant.checks import check_duration, check_rate, checked_seed, nearest
 from plant.compiled import Record
 from plant.dynamics.base_course import PREFIX as BASE_PREFIX
 from plant.dynamics.base_course import base_motion_of_text
@@ -56,7 +57,10 @@ def imus_from_text(text: str) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class SimulationConfig:
-    """What to simulate, or to run on the clock. Fields that are options say below what they mean; the others:
+    """What to simulate, or to run on the clock.
+
+    Where a mechanism, a target or a calibration is named, the object itself will do, too; the field then names a file in
+    gough's cache that holds it. Fields that are options say below what they mean; the others:
 
     Attributes:
         hold: how long the brakes hold first [s]; None for the time in the mechanism's settings.
@@ -129,6 +133,7 @@ class SimulationConfig:
     raw_imus: bool = False
 
     def __post_init__(self) -> None:
+        name_objects(self)
         check_rate(self.rate)
         checked_seed(self.seed)
         check_duration(self.duration)
@@ -136,9 +141,10 @@ class SimulationConfig:
         if round(cycles) < 1:
             raise InputError(f"the duration is {self.duration:g} s, less than one cycle of {1.0 / self.rate:g} s")
         if self.fusion not in FUSIONS:
-            raise UnknownNameError(f"no fusion {self.fusion!r}; there are {', '.join(FUSIONS)}")
+            raise UnknownNameError(f"no fusion {self.fusion!r}; there are {', '.join(FUSIONS)}{nearest(self.fusion, FUSIONS)}")
         if self.rig not in RIGS and not self.rig.startswith(PYTHON_RIG):
-            raise UnknownNameError(f"no rig {self.rig!r}; there are {', '.join(RIGS)} and {PYTHON_RIG}MODULE:CLASS")
+            names = f"{', '.join(RIGS)} and {PYTHON_RIG}MODULE:CLASS"
+            raise UnknownNameError(f"no rig {self.rig!r}; there are {names}{nearest(self.rig, (*RIGS, PYTHON_RIG))}")
         if self.rig_at is not None and self.rig == "fmu":
             raise InputError(
                 f"--rig-at {self.rig_at} says where a rig is, but not which: name it with --rig, such as --rig udp"

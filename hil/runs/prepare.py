@@ -27,6 +27,7 @@ from hil.rigs.by_name import check_legs, python_rig
 from hil.rigs.udp.link import DEFAULT_ADDRESS
 from hil.rigs.udp.rig import UdpRig
 from hil.runs.config import FUSIONS, PYTHON_RIG, SimulationConfig
+from hil.runs.names import check_names
 from hil.runs.plant_start import check_start
 from plant.compiled import Record
 from plant.dynamics.base_course import placed
@@ -82,6 +83,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
     Raises:
         GoughError: something in the configuration cannot be used.
     """
+    check_names(config)
     nominal, period = load_in_space(config.mechanism), 1.0 / config.rate
     with ExitStack() as stack:
         fmu = None

@@ -5,7 +5,8 @@ from math import inf
 
 from hil.option import integers, option
 from hil.runs.config import CALIBRATION, FUSIONS, IMU, MECHANISM
-from plant.checks import check_rate, checked_seed
+from hil.runs.names import name_objects
+from plant.checks import check_rate, checked_seed, nearest
 from plant.errors import InputError, UnknownNameError
 
 LEARNING_S = 20.0
@@ -39,6 +40,7 @@ class ComparisonConfig:
     seeds: tuple[int, ...] = option(_SEEDS, "seeds of the IMUs' imperfections; errors are pooled over them", parse=integers)
 
     def __post_init__(self) -> None:
+        name_objects(self)
         _check(self.rate, self.seeds)
         if not LEARNING_S < self.duration < 3600.0:
             raise InputError(f"the duration is {self.duration:g} s; it must be more than {LEARNING_S:g} s, which do not count")
@@ -62,10 +64,13 @@ class EvaluationConfig:
     only: tuple[str, ...] = SECTIONS
 
     def __post_init__(self) -> None:
+        name_objects(self)
         _check(self.rate, self.seeds)
         if self.fusion not in WHOLE_FUSIONS:
             names = ", ".join(WHOLE_FUSIONS)
-            raise UnknownNameError(f"no fusion of the whole mechanism {self.fusion!r}; there are {names}")
+            raise UnknownNameError(
+                f"no fusion of the whole mechanism {self.fusion!r}; there are {names}{nearest(self.fusion, WHOLE_FUSIONS)}"
+            )
         if not 0.0 <= self.joint_error < inf:
             raise InputError(f"the joint error is {1e3 * self.joint_error:g} mm; it must be at least 0 and finite")
         if not 1 <= self.starts <= 10000:
@@ -84,4 +89,5 @@ class TuningConfig:
     rate: float = option(1000.0, _RATE, unit="Hz")
 
     def __post_init__(self) -> None:
+        name_objects(self)
         _check(self.rate, self.seeds)

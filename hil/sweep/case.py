@@ -1,6 +1,5 @@
 """One point of a study as a worker gets it: it needs no file of the machine that asks."""
 
-import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -8,16 +7,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from controller.planning.motions import NAMES
 from hil.engine.batches import fingerprint
-from hil.option import nearest
 from hil.runs.config import SimulationConfig
+from hil.runs.names import check_names, digest_of, kept_file
 from hil.sweep.function import UserFunction
 from hil.sweep.study import FILES, Study, part_of
-from plant.compiled import keyed_folder
 from plant.errors import GoughError, InputError, UnknownNameError
-from plant.files import write_whole
-from plant.imu import load_imu
 from plant.mechanism import load_in_space
 from plant.mechanism.documents import mechanism_from_text, mechanism_text
 from plant.mechanism.joint_circles import reshaped
@@ -41,14 +36,11 @@ class SentFile:
     @property
     def digest(self) -> str:
         """A hash of the content."""
-        return _digest(self.content)
+        return digest_of(self.content)
 
     def local(self) -> Path:
         """The file in this machine's cache."""
-        path = keyed_folder("files", self.digest) / self.name
-        if not path.is_file():
-            write_whole(path, self.content)
-        return path
+        return kept_file(self.name, self.content)
 
 
 @dataclass(frozen=True)
@@ -148,7 +140,7 @@ def _case(study: Study, point: Mapping[str, Any], run: bool, geometry: bool) -> 
         key = _key({"model": study.model.source, "name": study.model.name, "point": dict(point)})
         return Case(key, "", point, study.run, (), None, study.model)
     config = study.config_at(point)
-    _check_names(config)
+    check_names(config)
     files = []
     for field in FILES:
         name = getattr(config, field)
@@ -159,7 +151,7 @@ def _case(study: Study, point: Mapping[str, Any], run: bool, geometry: bool) -> 
     config_of_key = asdict(config) | {file.field: file.digest for file in files}
     function = study.function and (study.function.name, study.function.source)
     planar = _is_planar(config.mechanism)
-    kind = f"{config.fusion} {planar} {config.plant and _digest(_content(config.plant))}" if run else "geometry"
+    kind = f"{config.fusion} {planar} {config.plant and digest_of(_content(config.plant))}" if run else "geometry"
     key = _key({"config": config_of_key, "function": function, "run": run, "geometry": geometry})
     without: dict[str, Any] = {file.field: file.name for file in files}
     return Case(key, kind, point, replace(config, **without), tuple(files), study.function, None, run, geometry)
@@ -175,18 +167,6 @@ def mechanism_at(study: Study, point: Mapping[str, Any]) -> bytes | None:
     if changes or shape:
         return _changed_mechanism(name, tuple(changes.items()), tuple(shape.items()))
     return _content(name) if Path(name).is_file() else None
-
-
-def _check_names(config: SimulationConfig) -> None:
-    """Check that what a configuration names is there, before any run."""
-    load_imu(config.imu)
-    if config.target not in NAMES and not Path(config.target).is_file():
-        question = nearest(config.target, NAMES)
-        raise UnknownNameError(f"no target {config.target!r}: neither a motion ({', '.join(NAMES)}) nor a CSV file{question}")
-    for field in ("calibration", "plant", "binding"):
-        name = getattr(config, field)
-        if name is not None and not Path(name).is_file():
-            raise InputError(f"{field} = {name!r}: there is no such file")
 
 
 @cache
@@ -245,11 +225,7 @@ def _flat(figures: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, f
 
 def _key(content: Mapping[str, Any]) -> str:
     text = json.dumps({**content, "sources": fingerprint()}, sort_keys=True, default=str)
-    return _digest(text.encode())
-
-
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()[:24]
+    return digest_of(text.encode())
 
 
 def _text(point: Mapping[str, Any]) -> str:

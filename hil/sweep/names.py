@@ -5,8 +5,8 @@ from dataclasses import fields
 from typing import Any
 
 from controller.settings import ControlSettings, FusionSettings, SafetySettings
-from hil.option import nearest
 from hil.runs.config import SimulationConfig
+from plant.checks import nearest
 from plant.dynamics.variables import PLANAR, SPATIAL
 from plant.errors import InputError
 from plant.files import unknown_entries

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from hil.option import nearest
 from hil.runs.config import SimulationConfig
+from hil.runs.names import name_of
 from hil.sweep.function import UserFunction
 from hil.sweep.names import PARTS, check_entries, check_entry, check_factor, check_parameter, is_whole, parsed
-from plant.checks import checked_seed
+from plant.checks import checked_seed, nearest
 from plant.errors import GoughError, InputError
 from plant.files import read_toml
 from plant.fmu.settings import Setting
@@ -49,6 +49,8 @@ class Factor:
 
     def __post_init__(self) -> None:
         if self.values:
+            field = self.name[4:] if self.name.startswith("run.") else ""
+            object.__setattr__(self, "values", tuple(name_of(field, value) for value in self.values))
             self._check_values()
             return
         if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):

@@ -13,11 +13,11 @@ import pyarrow as pa
 
 from hil.engine.batches import Failure, attempt, fingerprint
 from hil.engine.engine import Engine
-from hil.option import nearest
 from hil.sweep.analysis import Analysis
 from hil.sweep.case import Case, cases_of, kind_of, measure, own_figures
 from hil.sweep.store import DIED, DONE, FAILED, KEY, REASON, STATUS, Store, as_stored, rows_of
 from hil.sweep.study import SEED, Study
+from plant.checks import nearest
 from plant.errors import GoughError, InputError
 
 if TYPE_CHECKING:

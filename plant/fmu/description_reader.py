@@ -3,6 +3,7 @@
 import itertools
 import re
 import stat
+import unicodedata
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ import fmpy.fmi3
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from plant.checks import printable
 from plant.errors import FmuError, InputError, UnknownNameError
 from plant.files import most_unpacked
 
@@ -152,7 +154,7 @@ class FmuDescription:
         except FmuError:
             raise
         except Exception as error:
-            raise FmuError(f"{path} is not a usable FMU: {' '.join(str(error).split())}") from None
+            raise FmuError(f"{path} is not a usable FMU: {printable(' '.join(str(error).split()))}") from None
         if not str(read.fmiVersion).startswith(("2.", "3.")):
             raise FmuError(f"{path.name} is of FMI {read.fmiVersion}, not 2.0 or 3.0: export it for one of these")
         if read.coSimulation is None:
@@ -163,7 +165,9 @@ class FmuDescription:
         )  # fmt: skip
         with zipfile.ZipFile(path) as archive:
             # FMPy omits some abilities of FMI 3.0.
-            element = ElementTree.fromstring(archive.read("modelDescription.xml")).find("CoSimulation")
+            root = ElementTree.fromstring(archive.read("modelDescription.xml"))
+        _check_texts(path, root)
+        element = root.find("CoSimulation")
         abilities = {} if element is None else element.attrib
         self.abilities = frozenset(name for name, value in abilities.items() if value in ("true", "1"))
         self._variables = {each.name: self._variable(each) for each in read.modelVariables}
@@ -244,6 +248,17 @@ def _assembled(name: str, elements: dict[tuple[int, ...], FmuVariable]) -> FmuVa
         limits=tuple(each.limits[0] for each in scalars),
         references=tuple(each.references[0] for each in scalars),
     )
+
+
+def _check_texts(path: Path, root: ElementTree.Element) -> None:
+    """Check that names, units and other texts of a description do nothing to a terminal that shows them."""
+    for element in root.iter():
+        for name, value in element.attrib.items():
+            if any(unicodedata.category(each) == "Cc" and each not in "\t\n\r" for each in value):
+                raise FmuError(
+                    f"{path} is not a usable FMU: {name} {printable(value)!r} in its description has control characters: "
+                    "export it again"
+                )
 
 
 def _check_archive(path: Path) -> None:

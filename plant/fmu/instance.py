@@ -19,6 +19,7 @@ import fmpy.fmi3
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from plant.checks import printable
 from plant.errors import FmuError, InputError
 from plant.files import temporary_folder
 from plant.fmu.description_reader import FmuDescription, FmuVariable
@@ -287,7 +288,7 @@ class FmuInstance:
 
     def _log(self, status: int, message: bytes | None) -> None:
         if status:
-            self.messages.append(" ".join((message or b"").decode("utf-8", "replace").split()))
+            self.messages.append(printable(" ".join((message or b"").decode("utf-8", "replace").split())))
 
 
 _LOGS: dict[int, Callable[[int, bytes | None], None]] = {}

@@ -6,6 +6,7 @@ from math import radians
 from pathlib import Path
 from typing import Any
 
+from plant.checks import nearest
 from plant.errors import InputError, UnknownNameError
 from plant.files import check_entries, read_toml
 from plant.imu.model import MILLI_G, STANDARD_GRAVITY, ImuModel, SensorErrors
@@ -106,7 +107,8 @@ def load_imu(name: str) -> ImuModel:
     if name in PRESETS:
         return PRESETS[name]
     if not name.endswith(".toml"):
-        raise UnknownNameError(f"no IMU preset {name!r}; there are {', '.join(PRESETS)}, or a TOML file")
+        question = nearest(name, PRESETS)
+        raise UnknownNameError(f"no IMU preset {name!r}; there are {', '.join(PRESETS)}, or a TOML file{question}")
     return imu_of_table(read_toml(name), Path(name).stem, name)
 
 

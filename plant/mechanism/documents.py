@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from plant.checks import nearest
 from plant.errors import InputError, UnknownNameError
-from plant.files import check_entries, parse_toml, read_text
+from plant.files import check_entries, parse_toml, read_text, toml_entries
 from plant.mechanism.checks import checked_joints
 from plant.mechanism.planar import PlanarMechanism, PlanarPose
 from plant.mechanism.spatial import LEGS, Mechanism
-from plant.pose import Pose, checked_array, checked_unit, rotation_from_quaternion
+from plant.pose import Pose, checked_array, checked_unit, quaternion_from_rotation, rotation_from_quaternion
 
 _PRESETS = resources.files("plant.mechanism") / "presets"
 
@@ -21,6 +22,9 @@ _MUCH_SHORTER = 0.8
 _MOST_MASS_RATIO = 3.0
 _ANY_ENTRY = ("limits", "plant", "control", "fusion", "safety")
 """Tables whose entries are checked by those who read them."""
+
+_SAME_FRAMES = 1e-9
+"""Largest difference in an entry of rotations that are the same."""
 
 
 def load_mechanism(name_or_path: str | Path) -> Mechanism | PlanarMechanism:
@@ -71,7 +75,10 @@ def mechanism_text(name_or_path: str | Path) -> str:
         return (_PRESETS / f"{name_or_path}.toml").read_text()
     path = Path(name_or_path)
     if not path.is_file():
-        raise UnknownNameError(f"no mechanism {str(path)!r}: neither a preset ({', '.join(_preset_names())}) nor a file")
+        names = _preset_names()
+        raise UnknownNameError(
+            f"no mechanism {str(path)!r}: neither a preset ({', '.join(names)}) nor a file{nearest(str(path), names)}"
+        )
     return read_text(path)
 
 
@@ -126,6 +133,50 @@ def _check_quaternion_order(home: Pose, quaternion: Any, geometry: dict[str, Any
         )
 
 
+def text_of_mechanism(mechanism: Mechanism | PlanarMechanism) -> str:
+    """The TOML text of a mechanism, which `mechanism_from_text` reads again.
+
+    Raises:
+        InputError: its joints were moved after it was made, so that its leg frames do not follow from them.
+    """
+    planar = isinstance(mechanism, PlanarMechanism) or mechanism.planar
+    axes = slice(2 if planar else 3)
+    geometry = {"base_joints": mechanism.base_joints[:, axes], "platform_joints": mechanism.platform_joints[:, axes]}
+    if isinstance(mechanism, Mechanism) and not planar:
+        geometry |= {"base_joint_axes": mechanism.base_joint_axes, "up_in_base": mechanism.up_in_base}
+    tables = {
+        "geometry": geometry,
+        "home": _home_entries(mechanism.home, planar),
+        "limits": {} if mechanism.limits is None else vars(mechanism.limits),
+        "plant": mechanism.plant,
+        **mechanism.settings,
+    }
+    lines = toml_entries({"name": mechanism.name})
+    for name, entries in tables.items():
+        if entries:
+            lines += ["", f"[{name}]", *toml_entries(entries)]
+    text = "\n".join(lines) + "\n"
+    if isinstance(mechanism, Mechanism):
+        again = mechanism_from_text(text, mechanism.name)
+        frames = Mechanism.from_planar(again) if isinstance(again, PlanarMechanism) else again
+        if np.abs(frames.joint_rotations - mechanism.joint_rotations).max() > _SAME_FRAMES:
+            raise InputError(
+                f"the joints of {mechanism.name!r} were moved after it was made, and its leg frames were not: give the "
+                "mechanism as it was designed, and the moves in a calibration"
+            )
+    return text
+
+
+def _home_entries(home: Pose | PlanarPose | None, planar: bool) -> dict[str, Any]:
+    if isinstance(home, PlanarPose):
+        return {"position": home.position, "angle": home.angle}
+    if home is None:
+        return {}
+    if planar:
+        return {"position": home.position[:2], "angle": float(np.arctan2(home.rotation[1, 0], home.rotation[0, 0]))}
+    return {"position": home.position, "quaternion": quaternion_from_rotation(home.rotation)}
+
+
 def _preset_names() -> list[str]:
     return sorted(entry.name.removesuffix(".toml") for entry in _PRESETS.iterdir() if entry.name.endswith(".toml"))
 
@@ -136,7 +187,9 @@ def _completed(document: dict[str, Any], source: str) -> dict[str, Any]:
     while "based_on" in document:
         names.append(document.pop("based_on"))
         if names[-1] not in _preset_names():
-            raise UnknownNameError(f"based_on names no preset: {names[-1]!r}; there are {', '.join(_preset_names())}")
+            presets = _preset_names()
+            question = nearest(str(names[-1]), presets)
+            raise UnknownNameError(f"based_on names no preset: {names[-1]!r}; there are {', '.join(presets)}{question}")
         if names[-1] in names[:-1]:
             raise InputError(f"based_on goes round in a circle, {' -> '.join(names)}: leave one out")
         preset = parse_toml(mechanism_text(names[-1]), names[-1])

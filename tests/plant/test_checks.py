@@ -1,10 +1,10 @@
-"""Checks of numbers that several configurations share: each limit, from both sides."""
+"""Checks of numbers that several configurations share: each limit, from both sides; texts and names in messages."""
 
 from math import inf, nan
 
 import pytest
 
-from plant.checks import check_duration, check_rate, checked_seed
+from plant.checks import check_duration, check_rate, checked_seed, nearest, printable
 from plant.errors import InputError
 
 
@@ -31,3 +31,21 @@ def test_a_seed_is_returned_and_has_63_bits():
     for seed in (-1, 2**63):
         with pytest.raises(InputError, match=f"the seed is {seed}; it must lie between 0 and"):
             checked_seed(seed)
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("Motor 1, Größe µm 漢", "Motor 1, Größe µm 漢"),
+        ("\x1b[2Jred", "\\x1b[2Jred"),
+        ("a\x9b31mb\x85", "a\\x9b31mb\\x85"),
+        ("\u202eabc\x7f\n", "\\u202eabc\\x7f\\n"),
+    ],
+)
+def test_a_foreign_text_does_nothing_to_a_terminal(text, shown):
+    assert printable(text) == shown and printable(text).isprintable()
+
+
+def test_the_nearest_name_is_asked_for():
+    assert nearest("hexapot", ("6-5", "hexapod")) == "; did you mean 'hexapod'?"
+    assert nearest("xyz", ("6-5", "hexapod")) == ""

@@ -160,6 +160,24 @@ def test_what_is_no_description_is_refused(tmp_path: Path) -> None:
         FmuDescription(write(tmp_path, variables=twice))
 
 
+@pytest.mark.parametrize("control", ["\x9b31m", "&#x9b;31m", "&#x85;", "&#x7f;"])
+@pytest.mark.parametrize("where", ["name", "unit", "tool"])
+def test_control_characters_in_a_description_are_refused_and_not_shown(tmp_path: Path, control: str, where: str) -> None:
+    more: dict[str, Any] = {"head": f' generationTool="a{control}"'} if where == "tool" else {}
+    if where == "name":
+        more["variables"] = [*VARIABLES, scalar(f"a{control}", 99, 'causality="local"', "<Real/>")]
+    if where == "unit":
+        more["variables"] = [*VARIABLES, scalar("a", 99, 'causality="local"', f'<Real unit="{control}"/>')]
+    with pytest.raises(FmuError) as refused:
+        FmuDescription(write(tmp_path, **more))
+    assert str(refused.value).isprintable() and "small.fmu is not a usable FMU" in str(refused.value)
+
+
+def test_a_description_may_have_lines_and_letters_of_any_script(tmp_path: Path) -> None:
+    found = FmuDescription(write(tmp_path, head=' description="a&#10;b &#9;" generationTool="Größe 漢"'))
+    assert found.tool == "Größe 漢"
+
+
 # ---- values ----
 
 

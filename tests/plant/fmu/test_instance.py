@@ -22,6 +22,8 @@ def test_the_latest_hundred_messages_that_say_more_than_ok_are_kept_in_one_line_
     assert list(fmu.messages) == [f"message {i}" for i in range(50, 150)]
     fmu._logged(None, WARNING, b"category", b"not \xff text")
     assert fmu.messages[-1] == "not \ufffd text"
+    fmu._logged(None, WARNING, b"category", "\x1b[2J red \x9b31m".encode())
+    assert fmu.messages[-1] == "\\x1b[2J red \\x9b31m"
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,129 @@
+"""What a configuration names: whether it is there, and objects in place of names.
+
+A program may give a mechanism, a target or a calibration as an object. It is written to a file in gough's cache, in a folder
+named after its content, and the file's path is its name. So configurations stay plain: they are compared, hashed, recorded, and
+sent to other machines as those with names are.
+"""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from plant.errors import InputError
+from plant.files import temporary_folder, write_whole
+
+if TYPE_CHECKING:
+    from hil.runs.config import SimulationConfig
+
+
+def digest_of(content: bytes) -> str:
+    """A hash of a file's content."""
+    return hashlib.sha256(content).hexdigest()[:24]
+
+
+def kept_file(name: str, content: bytes) -> Path:
+    """A file of this name and content in this machine's cache."""
+    from plant.compiled import keyed_folder
+
+    path = keyed_folder("files", digest_of(content)) / name
+    if not path.is_file():
+        write_whole(path, content)
+    return path
+
+
+def check_names(config: "SimulationConfig") -> None:
+    """Check that what a configuration names is there, before anything is built or compiled for it.
+
+    Raises:
+        UnknownNameError: no such mechanism, IMU or motion.
+        InputError: a file is not there.
+    """
+    from controller.planning.target import check_target
+    from plant.imu import load_imu
+    from plant.mechanism import mechanism_text
+
+    mechanism_text(config.mechanism)
+    load_imu(config.imu)
+    if not config.streamed:
+        check_target(config.target)
+    for field in ("calibration", "plant", "binding"):
+        name = getattr(config, field)
+        if name is not None and not Path(name).exists():
+            raise InputError(f"{field} = {name!r}: there is no such file")
+
+
+def name_objects(config: Any) -> None:
+    """Put names in place of objects into a configuration that is being made, a frozen dataclass.
+
+    Raises:
+        InputError: an object that its file cannot hold.
+    """
+    for each in fields(config):
+        object.__setattr__(config, each.name, name_of(each.name, getattr(config, each.name), config))
+
+
+def name_of(field: str, given: Any, config: Any = None) -> Any:
+    """The name of what is given for a field of a configuration; what is no object with a file remains as it is.
+
+    Raises:
+        InputError: an object that the field cannot name, or that its file cannot hold.
+    """
+    if isinstance(given, Path):
+        return str(given)
+    if field not in _NAMED or given is None or isinstance(given, str):
+        return given
+    return str(kept_file(*_NAMED[field](given, config)))
+
+
+def _mechanism_file(given: Any, config: Any) -> tuple[str, bytes]:
+    del config
+    from plant.mechanism import Mechanism, PlanarMechanism
+    from plant.mechanism.documents import text_of_mechanism
+
+    _check_kind("mechanism", given, Mechanism, PlanarMechanism)
+    return f"{_stem(given.name)}.toml", text_of_mechanism(given).encode()
+
+
+def _target_file(given: Any, config: Any) -> tuple[str, bytes]:
+    """The displacements of a target from the home of the configuration's mechanism."""
+    from controller.planning.target import Target, text_of_target
+    from plant.mechanism import load_in_space
+
+    _check_kind("target", given, Target)
+    if config is None:
+        raise InputError(
+            f"the target {given.name!r} has no mechanism from whose home it counts: give a motion or a file by name"
+        )
+    return f"{_stem(given.name)}.csv", text_of_target(given, load_in_space(config.mechanism)).encode()
+
+
+def _calibration_file(given: Any, config: Any) -> tuple[str, bytes]:
+    del config
+    from controller.calibration.file import Calibration, save_calibration
+
+    _check_kind("calibration", given, Calibration)
+    with temporary_folder("gough-calibration-") as folder:
+        save_calibration(folder / "calibration.toml", given)
+        return "calibration.toml", (folder / "calibration.toml").read_bytes()
+
+
+def _check_kind(field: str, given: object, *kinds: type) -> None:
+    if not isinstance(given, kinds):
+        names = ", ".join(kind.__name__ for kind in kinds)
+        raise InputError(f"the {field} is a {type(given).__name__}; it must be a name, a path, or one of {names}")
+
+
+def _stem(name: str) -> str:
+    """A file's name without its ending, from the name of what is in it."""
+    kept = "".join(letter if letter.isalnum() or letter in "-_+" else "_" for letter in Path(name).stem)
+    return kept[:60] or "unnamed"
+
+
+_NAMED: dict[str, Callable[[Any, Any], tuple[str, bytes]]] = {
+    "mechanism": _mechanism_file,
+    "target": _target_file,
+    "calibration": _calibration_file,
+}
+"""The fields of configurations that objects may stand for, with the name and content of their file."""
