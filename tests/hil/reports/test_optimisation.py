@@ -31,8 +31,8 @@ def result_of(objectives, tmp_path):
     "objectives",
     [
         (Objective("a"),),
-        (Objective("a"), Objective("b", "maximise")),
-        (Objective("a"), Objective("b", "maximise"), Objective("c")),
+        pytest.param((Objective("a"), Objective("b", "maximise")), marks=pytest.mark.slow),
+        pytest.param((Objective("a"), Objective("b", "maximise"), Objective("c")), marks=pytest.mark.slow),
         (Objective("a"), Objective("b", "maximise"), Objective("c"), Objective("d")),
     ],
     ids=len,

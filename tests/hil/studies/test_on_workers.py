@@ -47,7 +47,6 @@ STUDIES = {
     "broad": lambda engine, trials: broad.evaluate(trials, FusionSettings(), engine),
     "faults": lambda engine, trials: faults(engine),
     "sensor-sets": lambda engine, trials: list(map(vars, evaluate_sensor_sets(["6-3-II"], SETS[:4], 0.3, 1, engine))),
-    "tune-fusion": lambda engine, trials: fusion_tuning.tune_fusion(TuningConfig(seeds=(0,), rate=50.0), engine),
 }
 LONG_STUDIES = {
     "classes": lambda engine, trials: list(map(vars, evaluate_classes(1, engine))),
@@ -55,6 +54,7 @@ LONG_STUDIES = {
         ComparisonConfig(duration=20.5, rate=100.0, seeds=(0, 1)), engine
     ),
     "evaluate-fusion": lambda engine, trials: fusion_evaluation.evaluate(CALIBRATED, engine),
+    "tune-fusion": lambda engine, trials: fusion_tuning.tune_fusion(TuningConfig(seeds=(0,), rate=50.0), engine),
 }
 
 

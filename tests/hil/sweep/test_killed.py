@@ -81,6 +81,7 @@ def rows(folder: Path) -> dict[str, dict[str, object]]:
     return found
 
 
+@pytest.mark.slow
 def test_a_sweep_goes_on_after_a_worker_and_the_program_died(folder: Path) -> None:
     results = folder / "deadly.results"
     command = gough_sweep("deadly.toml", "--workers", 2)
