@@ -32,6 +32,7 @@ class Failure:
     reason: str
     trace: str = ""  # where it was raised, if that is an error of the program
     died: bool = False  # whether the workers died
+    again: bool = False  # whether another try may succeed: the machine or the program is to blame, not the item
     exit_status: int | None = None  # of a command that fails for this reason, if the error says so
     error: Exception | None = field(default=None, compare=False)  # in the process that raised it
 
@@ -61,14 +62,19 @@ def fingerprint() -> str:
     return hash_of_files([root / file for file in sorted(kept)], *(f"{name} {version(name)}" for name in _LIBRARIES))
 
 
+_OF_MACHINE = (OSError, ImportError)
+"""Errors of the machine that does the work, such as a full disk and a missing compiler or package."""
+
+
 def attempt(function: Callable[[Item], Result], item: Item) -> Result | Failure:
     """What a function gives for an item, or why it failed."""
     try:
         return function(item)
     except GoughError as error:
-        return Failure(str(error), exit_status=getattr(error, "exit_status", None), error=error)
+        again = any(isinstance(each, _OF_MACHINE) for each in (error, error.__context__))
+        return Failure(str(error), again=again, exit_status=getattr(error, "exit_status", None), error=error)
     except Exception as error:
-        return Failure(f"{type(error).__name__}: {error}", traceback.format_exc(), error=error)
+        return Failure(f"{type(error).__name__}: {error}", traceback.format_exc(), again=True, error=error)
 
 
 _ONE_AT_A_TIME = threading.Lock()

@@ -139,7 +139,7 @@ def test_shares_and_indices_are_drawn(sampled, tmp_path):
 
 def test_failures_are_listed_with_their_reason_and_first_point(crossed, tmp_path):
     _, page = written(crossed, tmp_path)
-    assert re.search(r"<th>ValueError: the &lt;bad&gt; one &amp; its rate</th><td>6</td><td>failed</td>", page)
+    assert re.search(r"<th>ValueError: the &lt;bad&gt; one &amp; its rate</th><td>6</td><td>error</td>", page)
     assert "grade = bad, rate = 500.0, seed = 0" in page
     assert f"<h1>gough: {escape('grade <1> & rate')}</h1>" in page
 
