@@ -52,6 +52,8 @@ class Factor:
         if self.values:
             self._check_values()
             return
+        if self.is_seed:
+            raise InputError(f"{self.name} is a seed, a whole number, and has no range: give {{ seeds = 10 }}, or a list")
         if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):
             raise InputError(f"{self.name} goes from {self.low:g} to {self.high:g}: give a finite range that goes up")
         if self.logarithmic and self.low <= 0.0:

@@ -134,7 +134,7 @@ def run_study(study: Study, folder: Path, engine: Engine, progress: Report = no_
     Raises:
         GoughError: the study, or the folder, cannot be used; or the engine's workers have gone.
     """
-    cases = _unique(study)
+    cases = _unique(study, progress)
     with Store.opened(folder) as store:
         known = {*settled(store.table())[KEY].to_pylist()}
         left = [case for case in cases if case.key not in known]
@@ -214,9 +214,13 @@ def check_figures(wanted: Iterable[str], names: Collection[str]) -> None:
             raise InputError(f"no run has the figure {name!r}{nearest(name, names)}; there are {', '.join(names)}")
 
 
-def _unique(study: Study) -> list[Case]:
+def _unique(study: Study, progress: Report = no_report) -> list[Case]:
     """The cases of a study, without those that are the same run."""
-    return list({case.key: case for case in cases_of(study)}.values())
+    cases: dict[str, Case] = {}
+    for number, case in enumerate(cases_of(study), start=1):
+        cases[case.key] = case
+        progress(0.0, f"preparing {number} of {study.size} runs")
+    return list(cases.values())
 
 
 def _table(study: Study, cases: Sequence[Case], store: Store) -> pa.Table:

@@ -271,10 +271,20 @@ def test_the_command_prints_the_front_and_writes_the_figures(tmp_path):
     for arguments, message in (
         (["--write", "m.toml"], "a model has no mechanism that could be written: leave --write out"),
         (["--choose", "99"], "'99' is not on the front"),
+        (["--choose", "nee", "--results", "other"], "--choose nee is no trial: give its number, knee, or first"),
     ):
         refused = gough("optimise", "one.toml", "--workers", 1, *arguments, cwd=tmp_path)
         assert refused.returncode == 2
         assert message in refused.stderr and refused.stderr.count("\n") == 1
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_search_that_finds_nothing_writes_its_figures(tmp_path):
+    (tmp_path / "model.py").write_text("def f(x):\n    return (x - 0.25) ** 2\n")
+    (tmp_path / "one.toml").write_text(f"{ONE}[constraints]\nf = {{ most = -1.0 }}\n")
+    refused = gough("optimise", "one.toml", "--workers", 1, "--json", "one.json", cwd=tmp_path)
+    assert refused.returncode == 2 and refused.stderr.count("\n") == 1
+    assert json.loads((tmp_path / "one.json").read_text())["trials"] == {"run": 0, "given up": 0, "refused": 20}
 
 
 def test_the_command_writes_a_mechanism(tmp_path):

@@ -187,6 +187,7 @@ def test_what_does_not_vary_is_that_of_a_simulation() -> None:
         ("[vary]\nrun.seed = []\n", "does not vary"),
         ("[vary]\nrun.seed = { seeds = 0 }\n", "seeds = 0 must be a whole number, 1 to 10000000"),
         ("[vary]\nrun.seed = { seeds = 100000000 }\n", "seeds = 100000000 must be a whole number, 1 to 10000000"),
+        ("[vary]\nrun.seed = { from = 0, to = 9 }\n", "a seed, a whole number, and has no range: give { seeds = 10 }"),
         ("[vary]\nrun.seed = { seeds = 2, from = 1 }\n", "stand alone"),
         ("[vary]\nrun.seed = { seeds = 2.5 }\n", "seeds = 2.5 must be a whole number"),
         ("[vary]\nrun.rate = { seeds = 2 }\n", "run.rate is no seed"),

@@ -122,6 +122,13 @@ def test_it_goes_on_where_it_was_interrupted(study: Study, tmp_path: Path) -> No
     assert (len(result.table), result.ran) == (6, 2)
 
 
+def test_whoever_waits_is_told_that_runs_are_prepared(study: Study, tmp_path: Path) -> None:
+    told: list[tuple[float, int]] = []
+    run_study(study, tmp_path, InOneProcess(), lambda share, label: told.append((share, len(CALLS))))
+    assert told[:6] == [(0.0, 0)] * 6
+    assert told[-1] == (1.0, 6)
+
+
 def test_a_study_that_grows_runs_what_is_new(study: Study, tmp_path: Path) -> None:
     run(study, tmp_path)
     larger = Study((Factor("x", (1.0, 2.0, 3.0, 4.0)), Factor("y", (1.0, 2.0))), model=study.model)
