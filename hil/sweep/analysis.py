@@ -95,7 +95,9 @@ def quantile(values: ArrayLike, share: float, groups: Sequence[Groups] = ()) -> 
     """
     ordered = np.sort(np.asarray(values, np.float64))
     n, value = len(ordered), float(np.quantile(ordered, share))
-    independent = _independent(np.asarray(values, np.float64) <= value, groups)
+    known = np.asarray(values, np.float64)
+    # A few values beyond an extreme quantile hardly tell how alike those of a group are; the median does.
+    independent = min(_independent(known <= limit, groups) for limit in (value, np.median(known)))
     low, high = binom.ppf([_TAIL, 1.0 - _TAIL], independent, share)
     padded = np.concatenate([[-inf], ordered, [inf]])
     # Each independent value stands for n / independent ordered ones: the low end is the first of those, the high end the last.

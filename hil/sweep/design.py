@@ -185,7 +185,8 @@ class Design:
     @property
     def pools(self) -> dict[str, str | float]:
         """How each figure is pooled, the objectives first."""
-        return {each.figure: each.pool for each in (*self.objectives, *self.constraints)}
+        by_objective = {each.figure: each.pool for each in self.objectives}
+        return by_objective | {each.figure: each.pool for each in self.constraints}
 
     @property
     def of_geometry(self) -> bool:
