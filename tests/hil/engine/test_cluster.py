@@ -84,6 +84,7 @@ def engine(certificates: Certificates) -> Iterator[Engine]:
         yield engine
 
 
+@pytest.mark.slow
 def test_all_workers_work_and_nothing_listens_beyond_this_machine(engine: Engine) -> None:
     pids = {*engine.map(eval, [PROCESS] * 50)}
     assert engine.workers == 2
@@ -95,6 +96,7 @@ def test_all_workers_work_and_nothing_listens_beyond_this_machine(engine: Engine
 
 
 # Dask speaks first.
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "spoken"), [("joined_at", b""), ("dashboard", b"GET /status HTTP/1.0\r\n\r\n")])
 def test_nobody_connects_without_a_certificate(
     engine: Engine, certificates: Certificates, name: str, spoken: bytes, tmp_path: Path

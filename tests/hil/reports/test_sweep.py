@@ -69,6 +69,7 @@ def test_every_part_is_there_once_and_drawn(crossed, tmp_path):
     draw_in_browser(path, 4)
 
 
+@pytest.mark.slow
 def test_a_dozen_factors_are_drawn(sampled, tmp_path):
     path, page = written(sampled, tmp_path)
     assert figures_in(page) == ["distributions", "effects0", "effects1", "shares", "sobol0", "sobol1", "pairs"]
