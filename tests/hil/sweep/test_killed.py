@@ -160,10 +160,10 @@ def reference(folder: Path) -> dict[str, dict[str, object]]:
     return rows(folder / "undisturbed")
 
 
-@pytest.mark.slow
-def test_twelve_deaths_of_programs_and_their_workers(folder: Path, reference: dict[str, dict[str, object]]) -> None:
+@pytest.mark.parametrize("deaths", [pytest.param(2, marks=pytest.mark.slow), pytest.param(12, marks=pytest.mark.endurance)])
+def test_deaths_of_programs_and_their_workers(folder: Path, reference: dict[str, dict[str, object]], deaths: int) -> None:
     sweeps = Sweeps(folder, reference, 1)
-    plan = ["worker", "program", "worker", "program", "worker", "worker"] * 2
+    plan = (["worker", "worker", "worker", "program", "worker", "program"] * 2)[-deaths:]
     while plan:
         results, ended = folder / f"{sweeps.sweeps}.results", False
         while not ended:
@@ -184,13 +184,15 @@ def test_twelve_deaths_of_programs_and_their_workers(folder: Path, reference: di
                 if ended:
                     sweeps.check(process, results)
     print(f"killed {dict(sweeps.killed)} in {sweeps.sweeps} sweeps")
-    assert sweeps.killed.total() == 12
+    assert sweeps.killed.total() == deaths
 
 
-@pytest.mark.slow
-def test_eight_deaths_of_an_external_scheduler_and_its_workers(folder: Path, reference: dict[str, dict[str, object]]) -> None:
+@pytest.mark.parametrize("deaths", [pytest.param(2, marks=pytest.mark.slow), pytest.param(8, marks=pytest.mark.endurance)])
+def test_deaths_of_an_external_scheduler_and_its_workers(
+    folder: Path, reference: dict[str, dict[str, object]], deaths: int
+) -> None:
     sweeps = Sweeps(folder, reference, 2)
-    plan = ["scheduler", "worker", "nanny", "program", "scheduler", "nanny", "worker", "scheduler"]
+    plan = ["scheduler", "worker", "nanny", "program", "scheduler", "nanny", "worker", "scheduler"][-deaths:]
     while plan:
         results, ended = folder / f"external-{sweeps.sweeps}.results", False
         while not ended:
@@ -225,7 +227,7 @@ def test_eight_deaths_of_an_external_scheduler_and_its_workers(folder: Path, ref
                     if not scheduler.running:
                         break
     print(f"killed {dict(sweeps.killed)} in {sweeps.sweeps} sweeps")
-    assert sweeps.killed.total() == 8
+    assert sweeps.killed.total() == deaths
 
 
 @pytest.mark.slow
