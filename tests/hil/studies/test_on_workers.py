@@ -64,7 +64,13 @@ def without_times(figures):
     return [without_times(each) for each in figures] if isinstance(figures, list | tuple) else figures
 
 
-@pytest.mark.parametrize("study", [*STUDIES, *(pytest.param(name, marks=pytest.mark.slow) for name in LONG_STUDIES)])
+@pytest.mark.parametrize(
+    "study",
+    [
+        *STUDIES,
+        *(pytest.param(n, marks=pytest.mark.endurance if n == "evaluate-fusion" else pytest.mark.slow) for n in LONG_STUDIES),
+    ],
+)
 def test_figures_do_not_depend_on_the_engine(study, workers, trials):
     evaluate = (STUDIES | LONG_STUDIES)[study]
     here, there = (json.dumps(without_times(evaluate(engine, trials)), default=str) for engine in (IN_ONE_PROCESS, workers))

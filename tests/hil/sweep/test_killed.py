@@ -1,6 +1,7 @@
 """Sweeps whose processes are killed: all of them go on, and no run is lost or counted twice."""
 
 import re
+import signal
 from collections import Counter
 from contextlib import ExitStack
 from pathlib import Path
@@ -242,7 +243,8 @@ def test_ctrl_c_ends_all_processes_and_keeps_the_rows(folder: Path, after: float
                 process.popen.wait(after)
         family = process.family()
         process.interrupt()
-        assert process.wait() == 130, process.text
+        # A shell says 130 of both: before the command is under way, the signal itself ends the process.
+        assert process.wait() in (130, -signal.SIGINT), process.text
         wait_until(lambda: not any(each.is_running() for each in family), "all have ended", 10.0)
         lines = process.text.splitlines()
         assert lines[-1] == "gough: interrupted"
