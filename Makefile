@@ -1,11 +1,11 @@
-# make demo | test | test-all | bench | lint: each sets up what it needs in .venv first.
+# make demo | test | test-all | test-endurance | bench | lint: each sets up what it needs in .venv first.
 SHELL := /bin/bash
 PYTHON ?= python3
 BIN := .venv/bin
 OUT := out
 WORKERS ?= 2
 
-.PHONY: demo test test-all bench lint clean
+.PHONY: demo test test-all test-endurance bench lint clean
 .DELETE_ON_ERROR:
 
 demo: .venv/installed
@@ -14,13 +14,16 @@ demo: .venv/installed
 	@echo "Open $(OUT)/demo.html in a browser to see it move."
 
 # The matrices are small: threads of BLAS would only wait for each other.
-test test-all: export OPENBLAS_NUM_THREADS = 1
+test test-all test-endurance: export OPENBLAS_NUM_THREADS = 1
 
 test: .venv/installed-test
-	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "not slow"
+	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "not slow and not endurance"
 
 test-all: test
-	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "slow or hypothesis" --hypothesis-profile=all
+	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "slow or hypothesis" --hypothesis-profile=all --durations=15
+
+test-endurance: .venv/installed-test
+	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m endurance
 
 bench: .venv/installed-all
 	@mkdir -p $(OUT)

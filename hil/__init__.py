@@ -22,6 +22,13 @@ Many runs, as `gough sweep` (docs/sweeps.md):
         with open_engine() as engine:
             print(run_study(study, Path("imus.results"), engine).frame())
 
+The best design within bounds, as `gough optimise` (docs/optimisation.md):
+
+    from hil import optimise, read_design
+
+    with open_engine() as engine:
+        print(optimise(read_design("design.toml"), Path("design.results"), engine).knee)
+
 Whatever refuses its input raises a `GoughError`. This package loads nothing until a name is used.
 """
 
@@ -41,7 +48,9 @@ if TYPE_CHECKING:
     from hil.runs.run_state import RunState
     from hil.runs.simulation import SimulationResult, SimulationStoppedError, simulate
     from hil.runs.snapshot import Snapshot, read_snapshot, write_snapshot
+    from hil.sweep.design import Design, read_design
     from hil.sweep.function import UserFunction
+    from hil.sweep.optimisation import OptimisationResult, optimise
     from hil.sweep.study import Factor, Sampling, Study, read_study
     from hil.sweep.sweep import SweepResult, run_study
     from plant.errors import GoughError
@@ -50,10 +59,11 @@ if TYPE_CHECKING:
     from plant.mechanism import Mechanism, PlanarMechanism, load_mechanism
 
 __all__ = [
-    "EngineSettings", "Factor", "GoughError", "Knowledge", "Mechanism", "PlanarMechanism", "RealTimeSettings", "RunState",
-    "RunStoppedError", "Sampling", "Setting", "SimulationConfig", "SimulationResult", "SimulationStoppedError", "Snapshot",
-    "Study", "SweepResult", "UserFunction", "Wiring", "calibrate_recordings", "calibrate_rig", "load_mechanism", "open_engine",
-    "read_snapshot", "read_study", "replay", "run", "run_study", "simulate", "write_report", "write_snapshot",
+    "Design", "EngineSettings", "Factor", "GoughError", "Knowledge", "Mechanism", "OptimisationResult", "PlanarMechanism",
+    "RealTimeSettings", "RunState", "RunStoppedError", "Sampling", "Setting", "SimulationConfig", "SimulationResult",
+    "SimulationStoppedError", "Snapshot", "Study", "SweepResult", "UserFunction", "Wiring", "calibrate_recordings",
+    "calibrate_rig", "load_mechanism", "open_engine", "optimise", "read_design", "read_snapshot", "read_study", "replay", "run",
+    "run_study", "simulate", "write_report", "write_snapshot",
 ]  # fmt: skip
 
 _HOMES = {
@@ -69,7 +79,9 @@ _HOMES = {
     "hil.runs.run_state": ("RunState",),
     "hil.runs.simulation": ("SimulationResult", "SimulationStoppedError", "simulate"),
     "hil.runs.snapshot": ("Snapshot", "read_snapshot", "write_snapshot"),
+    "hil.sweep.design": ("Design", "read_design"),
     "hil.sweep.function": ("UserFunction",),
+    "hil.sweep.optimisation": ("OptimisationResult", "optimise"),
     "hil.sweep.study": ("Factor", "Sampling", "Study", "read_study"),
     "hil.sweep.sweep": ("SweepResult", "run_study"),
     "plant.errors": ("GoughError",),

@@ -237,9 +237,13 @@ def gough_optimise(options: Namespace) -> None:
     design, settings = read_design(options.design), cli.config_of(options, EngineSettings)
     if options.write is not None and design.study.model is not None:
         raise InputError("a model has no mechanism that could be written: leave --write out")
+    if options.choose not in ("knee", "first") and not options.choose.isdecimal():
+        raise InputError(f"--choose {options.choose} is no trial: give its number, knee, or first")
     folder = options.results or options.design.with_suffix(".results")
     with engine_at_work(settings, design.study.name) as (engine, progress):
         result = optimise(design, folder, engine, progress)
+        # A search may have found nothing to choose.
+        cli.write_json(options.json, result.summary())
         trial = result.chosen(options.choose)
         comparisons = check(result, trial, engine, progress)
     if options.write is not None:

@@ -46,11 +46,15 @@ def gough_sweep(options: Namespace) -> int:
     reason.
     """
     check_installed("pyarrow")
+    from hil.reports.sweep_picture import drawn_factors, write_picture
     from hil.sweep.store import TABLE
     from hil.sweep.study import read_study
     from hil.sweep.sweep import estimate, run_study
 
+    cli.check_outputs(options, [options.study])
     study, settings = read_study(options.study), cli.config_of(options, EngineSettings)
+    if options.picture is not None:
+        drawn_factors(study)
     folder = options.results or options.study.with_suffix(".results")
     if options.dry_run:
         with progress_bar("the first run"):
@@ -73,8 +77,6 @@ def gough_sweep(options: Namespace) -> int:
         reason, *_ = result.first_reason.partition("\n")
         print(f"{result.failed} of {len(result.table)} runs failed; why the first one did: {reason}", file=sys.stderr)
     if options.picture is not None:
-        from hil.reports.sweep_picture import write_picture
-
         write_picture(result, options.picture)
     return int(result.failed > 0)
 

@@ -91,7 +91,11 @@ def engine_at_work(settings: "EngineSettings", label: str) -> Iterator[tuple["En
                 print(f"the workers at their work: {opened.dashboard}", file=sys.stderr)
             if opened.joined_at:
                 files = "".join(f" --tls-{name} FILE.pem" for name in ("ca-file", "cert", "key")) if settings.tls else ""
-                print(f"other machines join with: dask worker {opened.joined_at} --nthreads 1{files}", file=sys.stderr)
+                print(
+                    "other machines join with: DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED=False dask worker "
+                    f"{opened.joined_at} --nworkers -1 --nthreads 1 --dashboard-address 127.0.0.1:0{files}",
+                    file=sys.stderr,
+                )
 
         with engine_when_needed(settings, tell) as engine:
             yield engine, progress

@@ -7,9 +7,11 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
+from platform import python_version
 from typing import Any, Generic, TypeVar
 
 from plant.compiled import hash_of_files, keyed_folder
@@ -22,7 +24,8 @@ _PACKAGES = ("plant", "controller", "hil", "fmus")
 _SOURCES = (".py", ".c", ".h", ".toml")
 _WITHOUT_RESULTS = ("command_line", "reports")
 """Rooms that show results and make none."""
-_LIBRARIES = ("casadi", "numba", "numpy", "ruckig")
+_LIBRARIES = ("casadi", "filterpy", "fmpy", "llvmlite", "numba", "numpy", "ruckig", "scipy", "vqf")
+"""What computes; some are there only with extras."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,7 @@ class Failure:
     reason: str
     trace: str = ""  # where it was raised, if that is an error of the program
     died: bool = False  # whether the workers died
+    again: bool = False  # whether another try may succeed: the machine or the program is to blame, not the item
     exit_status: int | None = None  # of a command that fails for this reason, if the error says so
     error: Exception | None = field(default=None, compare=False)  # in the process that raised it
 
@@ -54,11 +58,16 @@ class Refusal:
 
 @cache
 def fingerprint() -> str:
-    """A hash of all that determines results: gough's sources and the versions of the libraries that compute."""
+    """A hash of all that determines results: gough's sources, and the versions of Python and the libraries that compute."""
     root = Path(__file__).resolve().parents[2]
     files = (file.relative_to(root) for package in _PACKAGES for file in (root / package).rglob("*.*"))
     kept = (file for file in files if file.suffix in _SOURCES and not {*_WITHOUT_RESULTS} & {*file.parts})
-    return hash_of_files([root / file for file in sorted(kept)], *(f"{name} {version(name)}" for name in _LIBRARIES))
+    installed = (f"{name} {version(name)}" for name in _LIBRARIES if find_spec(name))
+    return hash_of_files([root / file for file in sorted(kept)], python_version(), *installed)
+
+
+_OF_MACHINE = (OSError, ImportError)
+"""Errors of the machine that does the work, such as a full disk and a missing compiler or package."""
 
 
 def attempt(function: Callable[[Item], Result], item: Item) -> Result | Failure:
@@ -66,9 +75,10 @@ def attempt(function: Callable[[Item], Result], item: Item) -> Result | Failure:
     try:
         return function(item)
     except GoughError as error:
-        return Failure(str(error), exit_status=getattr(error, "exit_status", None), error=error)
+        again = any(isinstance(each, _OF_MACHINE) for each in (error, error.__context__))
+        return Failure(str(error), again=again, exit_status=getattr(error, "exit_status", None), error=error)
     except Exception as error:
-        return Failure(f"{type(error).__name__}: {error}", traceback.format_exc(), error=error)
+        return Failure(f"{type(error).__name__}: {error}", traceback.format_exc(), again=True, error=error)
 
 
 _ONE_AT_A_TIME = threading.Lock()
@@ -97,28 +107,36 @@ def run_batch(
 
 def _run_batch(function: Callable[[Item], Result], items: Sequence[Item], kinds: Sequence[str]) -> Batch[Result]:
     results: list[Result | Failure] = []
-    times = []
+    times: list[float] = []
     for item, kind in zip(items, kinds, strict=True):
-        with alone_if_first(kind) as first:
-            began = time.perf_counter()
-            outcome = attempt(function, item)
-            if not first:
-                times.append(time.perf_counter() - began)
+        outcome = attempt(partial(_timed, function, kind, times), item)
         if isinstance(outcome, Failure):
             outcome = replace(outcome, error=None)
         results.append(outcome)
     return Batch(results, sum(times) / len(times) if times else float("nan"))
 
 
+def _timed(function: Callable[[Item], Result], kind: str, times: list[float], item: Item) -> Result:
+    """What a function gives for an item; adds the time [s] that it took, unless it had to wait for machine code."""
+    with alone_if_first(kind) as first:
+        began = time.perf_counter()
+        try:
+            return function(item)
+        finally:
+            if not first:
+                times.append(time.perf_counter() - began)
+
+
 _prepared: set[str] = set()
-"""Kinds of work that this process has done."""
+"""Kinds of work that this process has begun."""
 
 
 @contextmanager
 def alone_if_first(kind: str) -> Iterator[bool]:
     """Let no other process of this machine do work of a kind that was never done on it, as that builds what all need.
 
-    Yields whether this process has not done such work yet.
+    Yields whether this process has not begun such work yet. Work that raises an error may have built nothing, so the next
+    process is alone, too.
     """
     if kind in _prepared:
         yield False
@@ -128,9 +146,9 @@ def alone_if_first(kind: str) -> Iterator[bool]:
     with (folder / "lock").open("w") as lock:
         if not done.exists():
             fcntl.flock(lock, fcntl.LOCK_EX)
+        _prepared.add(kind)
         yield True
         done.touch()
-    _prepared.add(kind)
 
 
 def no_kind(item: Any) -> str:

@@ -18,7 +18,7 @@ class EngineSettings:
 
     workers: int | None = option(
         None,
-        "processes of this machine that do the work; 1 needs no Dask; 0 leaves the work to workers that join at --listen",
+        "processes of this machine that do the work; 1 alone needs no Dask; 0 leaves the work to workers that join at --listen",
         parse=int,
         shown="one for each processor",
     )
@@ -81,7 +81,8 @@ class EngineSettings:
     @property
     def alone(self) -> bool:
         """Whether one process does everything."""
-        return self.scheduler is None and self.listen == _LISTEN and self.processes == 1
+        own = self.listen, self.dashboard, self.tls
+        return self.scheduler is None and own == (_LISTEN, _DASHBOARD, False) and self.processes == 1
 
     @property
     def others_join(self) -> bool:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hil.sweep.analysis import Level
-from hil.sweep.study import Factor
+from hil.sweep.study import Factor, Study
 from hil.sweep.sweep import SweepResult
 from hil.sweep.units import headed, label_of, unit_of_factor, unit_of_figure
 from plant.errors import InputError
@@ -60,13 +60,29 @@ def write_picture(result: SweepResult, path: Path) -> None:
     write_whole(path, f"{picture_svg(result)}\n".encode())
 
 
+def drawn_factors(study: Study) -> list[Factor]:
+    """Up to three factors that a picture shows: along the axis, by colour, by column.
+
+    Raises:
+        InputError: nothing but the seed varies, or a factor has too many values.
+    """
+    factors = [each for each in study.factors if not each.is_seed]
+    if not factors:
+        raise InputError("a picture needs a factor besides the seed: leave it out")
+    drawn = [factors[-1], *factors[:-1][:2]]
+    for each in drawn:
+        if len(each.values) > _MOST:
+            raise InputError(f"{each.name} has {len(each.values)} values, and a picture shows at most {_MOST}: take a report")
+    return drawn
+
+
 def picture_svg(result: SweepResult) -> str:
     """The SVG text of `write_picture`."""
     figures = [name for name in result.figures() if result.analysis.over_all(name)][:_MOST]
-    factors = [each for each in result.study.factors if not each.is_seed]
-    if not figures or not factors:
-        raise InputError("a picture needs a figure of a run, and a factor besides the seed: leave it out")
-    along, colored, columned = factors[-1], factors[:1] if len(factors) > 1 else [], factors[1:2] if len(factors) > 2 else []
+    along, *others = drawn_factors(result.study)
+    if not figures:
+        raise InputError("a picture needs a figure of a run, and none has one: leave it out")
+    colored, columned = others[:1], others[1:]
     places = _parts(result, along)
     series, panels = (_parts(result, *each) for each in (colored, columned))
     body = _legend(colored[0], series) if colored else []
@@ -88,10 +104,7 @@ def _parts(result: SweepResult, *factors: Factor) -> list[_Part]:
     if not factors:
         return [_Part("", np.ones(len(result.table), np.bool_))]
     scale = unit_of_factor(result.study, factors[0].name)[1]
-    parts = [_Part(label_of(value, scale), chosen) for value, chosen in result.analysis.parts(factors[0])]
-    if len(parts) > _MOST and not factors[0].sampled:
-        raise InputError(f"{factors[0].name} has {len(parts)} values, and a picture shows at most {_MOST}: take a report")
-    return parts
+    return [_Part(label_of(value, scale), chosen) for value, chosen in result.analysis.parts(factors[0])]
 
 
 def _heading(result: SweepResult, factor: Factor) -> str:

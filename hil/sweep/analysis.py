@@ -95,10 +95,14 @@ def quantile(values: ArrayLike, share: float, groups: Sequence[Groups] = ()) -> 
     """
     ordered = np.sort(np.asarray(values, np.float64))
     n, value = len(ordered), float(np.quantile(ordered, share))
-    independent = _independent(np.asarray(values, np.float64) <= value, groups)
+    known = np.asarray(values, np.float64)
+    # A few values beyond an extreme quantile hardly tell how alike those of a group are; the median does.
+    independent = min(_independent(known <= limit, groups) for limit in (value, np.median(known)))
     low, high = binom.ppf([_TAIL, 1.0 - _TAIL], independent, share)
     padded = np.concatenate([[-inf], ordered, [inf]])
-    first, last = int(low * n / independent), min(n + 1, int(np.ceil((high + 1.0) * n / independent)))
+    # Each independent value stands for n / independent ordered ones: the low end is the first of those, the high end the last.
+    first = int((low - 1.0) * n / independent) + 1 if low else 0
+    last = min(n + 1, int(np.ceil((high + 1.0) * n / independent)))
     # The value lies between two of them, so that with few runs an end could be beyond it.
     return Quantile(value, min(value, float(padded[first])), max(value, float(padded[last])), share)
 

@@ -1,11 +1,11 @@
 """One point of a study as a worker gets it: it needs no file of the machine that asks."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from hil.engine.batches import fingerprint
 from hil.runs.config import SimulationConfig
@@ -19,9 +19,10 @@ from plant.mechanism.joint_circles import reshaped
 
 GEOMETRY_FIGURE = "geometry."
 """How the names of figures begin that need no run."""
+Result = TypeVar("Result")
 _OF_THIS_RUN = ("config", "version", "real_time_factor", "cycle_us")
 """Parts of a summary that are no figures, or not the same each time."""
-_OF_SUMMARY = ("truth_known", "estimation", "tracking", "estimated_tracking", "target", "limits")
+_OF_SUMMARY = ("truth_known", "estimation", "tracking", "estimated_tracking", "target", "limits", "target_stretch")
 """The other parts."""
 
 
@@ -165,16 +166,30 @@ def mechanism_at(study: Study, point: Mapping[str, Any]) -> bytes | None:
     """
     name, changes, shape = study.config_at(point).mechanism, study.mechanism_at(point), part_of(point, "geometry")
     if changes or shape:
-        return _changed_mechanism(name, tuple(changes.items()), tuple(shape.items()))
+        return _changed_mechanism(name, json.dumps(changes), json.dumps(shape))
     return _content(name) if Path(name).is_file() else None
 
 
-@cache
+def _kept(function: Callable[..., Result]) -> Callable[..., Result]:
+    """Keep what a function gives for a file, or a preset, and more arguments, until the file changes."""
+
+    @cache
+    def known(state: tuple[int, ...], path: str, *others: Any) -> Result:
+        return function(path, *others)
+
+    def asked(path: str, *others: Any) -> Result:
+        found = Path(path).stat() if Path(path).exists() else None
+        return known((found.st_ino, found.st_ctime_ns, found.st_size) if found else (), path, *others)
+
+    return asked
+
+
+@_kept
 def _is_planar(mechanism: str) -> bool:
     return load_in_space(mechanism).planar
 
 
-@cache
+@_kept
 def _content(path: str) -> bytes:
     try:
         return Path(path).read_bytes()
@@ -182,14 +197,14 @@ def _content(path: str) -> bytes:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
 
 
-@cache
-def _changed_mechanism(name: str, changes: tuple[tuple[str, Any], ...], shape: tuple[tuple[str, float], ...]) -> bytes:
-    """The TOML text of a mechanism with other entries, and then other numbers of its geometry."""
+@_kept
+def _changed_mechanism(name: str, changes: str, shape: str) -> bytes:
+    """The TOML text of a mechanism with other entries, and then other numbers of its geometry, both as JSON."""
     import tomlkit
 
     document: Any = tomlkit.parse(mechanism_text(name))
     document["name"] = document.get("name", Path(name).stem)
-    for entry, value in changes:
+    for entry, value in json.loads(changes).items():
         *tables, last = entry.split(".")
         inner = document
         for part in tables:
@@ -201,8 +216,8 @@ def _changed_mechanism(name: str, changes: tuple[tuple[str, Any], ...], shape: t
             inner[last] = value
         else:
             raise UnknownNameError(f"the mechanism has no entry {entry}: {'.'.join(tables)} is no table")
-    if shape:
-        base, platform, position = reshaped(mechanism_from_text(tomlkit.dumps(document), name), dict(shape))
+    if numbers := json.loads(shape):
+        base, platform, position = reshaped(mechanism_from_text(tomlkit.dumps(document), name), numbers)
         geometry, home = (document.setdefault(table, tomlkit.table()) for table in ("geometry", "home"))
         geometry["base_joints"], geometry["platform_joints"] = base.tolist(), platform.tolist()
         home["position"] = position.tolist()

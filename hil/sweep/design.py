@@ -158,6 +158,12 @@ class Design:
             for name in names:
                 if names.count(name) > 1:
                     raise InputError(f"{name} stands twice in the objectives or in the constraints: leave one out")
+        for each in self.objectives:
+            if self.pools[each.figure] != each.pool:
+                raise InputError(
+                    f"{each.figure} is pooled by {each.pool} as an objective and by {self.pools[each.figure]} as a constraint: "
+                    "give both the same pool"
+                )
         if any(factor.name == _SEED for factor in self.study.factors):
             raise InputError(f"{_SEED} is no part of a design: [search] seeds says how many there are")
         of_model = self.study.model is not None
@@ -178,10 +184,9 @@ class Design:
 
     @property
     def pools(self) -> dict[str, str | float]:
-        """How each figure is pooled, the objectives first; a figure that is in both is pooled as the objective says."""
-        by_constraint = {each.figure: each.pool for each in self.constraints}
+        """How each figure is pooled, the objectives first."""
         by_objective = {each.figure: each.pool for each in self.objectives}
-        return by_objective | {name: pool for name, pool in by_constraint.items() if name not in by_objective}
+        return by_objective | {each.figure: each.pool for each in self.constraints}
 
     @property
     def of_geometry(self) -> bool:

@@ -1,12 +1,14 @@
 """Functions of the user's own, which go to the workers with the text of their module."""
 
+import hashlib
 import inspect
+import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from types import CodeType, ModuleType
+from typing import Any, ClassVar
 
 from plant.errors import InputError
 from plant.files import read_text
@@ -14,7 +16,11 @@ from plant.files import read_text
 
 @dataclass(frozen=True)
 class UserFunction:
-    """A function, by its name in a module of which the text is known; `local` is one that has no module of its own."""
+    """A function, by its name in a module of which the text is known.
+
+    One that is not to be found by its name, as in a notebook or within another, is `local`: as it was when this was made, with
+    the values that it uses from around it. A hash of all that takes the place of the text.
+    """
 
     name: str
     source: str
@@ -41,11 +47,13 @@ class UserFunction:
         """A function of the program that runs.
 
         Raises:
-            InputError: its source cannot be found.
+            InputError: its source cannot be found, or it uses what cannot go to another process.
         """
         try:
             if function.__module__ == "__main__" or "<" in function.__qualname__:
-                return cls(function.__name__, inspect.getsource(function), "<program>", function)
+                own = "" if function.__module__ == "__main__" else read_text(inspect.getsourcefile(function) or "")
+                source, copy = _frozen(function, own)
+                return cls(function.__name__, source, "<program>", copy)
             path = inspect.getsourcefile(function) or ""
             return cls(function.__qualname__, read_text(path), path)
         except (OSError, TypeError, AttributeError):
@@ -80,6 +88,29 @@ class UserFunction:
         if not figures:
             raise InputError(f"{self.name} returned {value!r}: it must return a number, or numbers by name")
         return figures
+
+
+def _frozen(function: Callable[..., Any], module: str) -> tuple[str, Callable[..., Any]]:
+    """A hash of a function, of the values that it uses and of its module's text, and a copy with these values."""
+    import cloudpickle
+
+    reduced = cloudpickle.Pickler.dispatch_table
+
+    def code_alone(code: CodeType) -> Any:
+        # Neither where it stands, which a notebook changes, nor the order of sets, which each process has its own of.
+        constants = tuple(sorted(map(repr, each)) if isinstance(each, frozenset) else each for each in code.co_consts)
+        return reduced[CodeType](code.replace(co_filename="", co_firstlineno=1, co_linetable=b"", co_consts=constants))
+
+    class Pickler(cloudpickle.Pickler):  # type: ignore[misc]
+        dispatch_table: ClassVar = {**reduced, CodeType: code_alone}
+
+    content = io.BytesIO()
+    try:
+        Pickler(content).dump((function, module))
+        copy: Callable[..., Any] = cloudpickle.loads(cloudpickle.dumps(function))
+    except Exception as error:
+        raise InputError(f"{function.__name__} cannot go to another process: {error}; write it in a file") from None
+    return hashlib.sha256(content.getvalue()).hexdigest(), copy
 
 
 @cache

@@ -39,6 +39,12 @@ def run_fields() -> dict[str, Any]:
     } | {"hold": None, "faults": lambda text: tuple(text.split())}
 
 
+def is_factor(name: str) -> bool:
+    """Whether this is the name of a factor of runs; a figure of the geometry's has none of the geometry's numbers."""
+    part, _, rest = name.partition(".")
+    return part in PARTS and (part != "geometry" or rest in GEOMETRY)
+
+
 def check_factor(name: str) -> None:
     """Check the name of a factor of runs."""
     part, _, rest = name.partition(".")
@@ -70,6 +76,7 @@ def check_parameter(name: str) -> None:
     """Check the name of a parameter or input of gough's own plant."""
     part, _, rest = name.partition(".")
     known = [*_PARAMETERS, *(each.name for table in (SPATIAL, PLANAR) for each in table.inputs)]
+    rest, *_ = rest.partition("@")
     if part == "plant" and rest not in known:
         raise InputError(f"the plant has no parameter or input {rest!r}{nearest(rest, known)}; docs/fmu.md lists them")
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from plant.errors import InputError
@@ -21,8 +22,9 @@ TABLE = "runs.parquet"
 _PARTS = ".*.parquet.*"
 """What a process that died in the middle of `write_whole` has left."""
 KEY, STATUS, REASON = "key", "status", "reason"
-DONE, FAILED, DIED = "done", "failed", "died"
-"""A row's status: figures are there, the run gave the reason, the worker died."""
+DONE, FAILED, ERROR, DIED = "done", "failed", "error", "died"
+"""A row's status: figures are there, the run gave the reason, program or machine failed, the worker died."""
+_SETTLED = (DONE, FAILED)
 _ALWAYS = {KEY: str, STATUS: str, REASON: str}
 """Columns that every table has."""
 _MOST_FILES = 1000
@@ -36,6 +38,7 @@ class Store:
         self.folder = folder
         self._new = folder / "new"
         self._number = 0
+        self._schema = _schema([])
 
     @classmethod
     @contextmanager
@@ -59,6 +62,7 @@ class Store:
             for part in (*folder.glob(_PARTS), *store._new.glob(_PARTS)):
                 part.unlink()
             store.compact()
+            store._schema = store.table().schema
             yield store
             store.compact()
 
@@ -67,25 +71,31 @@ class Store:
         # The table is read last, as another process may just be taking new rows into it.
         new = [_read(file) for file in sorted(self._new.glob("*.parquet"))]
         parts = [part for part in (_read(self.folder / TABLE), *new) if part is not None]
-        try:
-            table = pa.concat_tables([_schema([]).empty_table(), *parts], promote_options="permissive")
-        except (pa.ArrowInvalid, pa.ArrowTypeError) as error:
-            text = str(error).splitlines()[0]
-            raise InputError(
-                f"the rows in {self.folder} are of several kinds ({text}): give another folder for these"
-            ) from None
+        table = pa.concat_tables([_schema([]).empty_table(), *parts], promote_options="permissive")
         last = {key: row for row, key in enumerate(table[KEY].to_pylist())}
         return table if len(last) == len(table) else table.take(sorted(last.values()))
 
+    def as_table(self, rows: Sequence[Mapping[str, Any]]) -> pa.Table:
+        """Rows, or parts of them, as they can be added.
+
+        Raises:
+            InputError: a column has values of several kinds, here or with those that are there.
+        """
+        stored = [{name: as_stored(value) for name, value in row.items()} for row in rows]
+        try:
+            table = pa.Table.from_pylist(stored, _schema(rows))
+            self._schema = pa.unify_schemas([self._schema, table.schema], promote_options="permissive")
+        except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError) as error:
+            text, *_ = str(error).splitlines()
+            raise InputError(
+                f"a factor or figure has values of several kinds in {self.folder} ({text}): give another folder for these"
+            ) from None
+        return table
+
     def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Add rows, which are in a file when this returns."""
+        """Add rows, which are in a file when this returns; errors as for `as_table`."""
         if rows:
-            stored = [{name: as_stored(value) for name, value in row.items()} for row in rows]
-            try:
-                table = pa.Table.from_pylist(stored, _schema(rows))
-            except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError) as error:
-                raise InputError(f"the values of a factor or figure are of several kinds: {error}") from None
-            self._write(self._new / f"{self._number:08d}.parquet", table)
+            self._write(self._new / f"{self._number:08d}.parquet", self.as_table(rows))
             self._number += 1
         if self._number >= _MOST_FILES:
             self.compact()
@@ -110,6 +120,11 @@ def rows_of(table: pa.Table, keys: Iterable[str]) -> pa.Table:
     """The rows with these keys, in their order."""
     place = {key: row for row, key in enumerate(table[KEY].to_pylist())}
     return table.take([place[key] for key in keys if key in place])
+
+
+def settled(table: pa.Table) -> pa.Table:
+    """The rows of runs that are not tried again."""
+    return table.filter(pc.is_in(table[STATUS], pa.array(_SETTLED)))
 
 
 def _read(file: Path) -> pa.Table | None:

@@ -38,7 +38,7 @@ class Factor:
 
     The name is `run.FIELD`, a field of the run's configuration; `mechanism.TABLE.ENTRY`, an entry of the mechanism's file;
     `geometry.NUMBER`, one of the numbers in `plant.mechanism.joint_circles`; or `plant.PARAMETER`, a parameter or input of the
-    FMU. For a `model`, it is an argument of that function.
+    FMU, from a time of the motion on as `plant.PARAMETER@SECONDS`. For a `model`, it is an argument of that function.
     """
 
     name: str
@@ -48,29 +48,35 @@ class Factor:
     logarithmic: bool = False
 
     def __post_init__(self) -> None:
+        part, _, field = self.name.partition(".")
+        plain = map(_plain, self.values)
+        object.__setattr__(self, "values", tuple(name_of(field, value) if part == "run" else value for value in plain))
         if self.values:
-            field = self.name[4:] if self.name.startswith("run.") else ""
-            object.__setattr__(self, "values", tuple(name_of(field, value) for value in self.values))
             self._check_values()
             return
+        if self.is_seed:
+            raise InputError(f"{self.name} is a seed, a whole number, and has no range: give {{ seeds = 10 }}, or a list")
         if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):
             raise InputError(f"{self.name} goes from {self.low:g} to {self.high:g}: give a finite range that goes up")
         if self.logarithmic and self.low <= 0.0:
             raise InputError(f"{self.name} begins at {self.low:g}, and a logarithmic range must be positive")
 
     def _check_values(self) -> None:
-        kinds = {float if type(value) is int else list if type(value) is tuple else type(value) for value in self.values}
+        kinds = {float if type(value) is int else type(value) for value in self.values}
         if len(kinds) > 1:
             raise InputError(
                 f"{self.name} has values of several kinds, {list(self.values)}: give numbers, switches or texts alone"
             )
-        known: list[Any] = []
+        if not kinds <= {float, bool, str, list}:
+            raise InputError(f"{self.name} has the value {self.values[0]!r}: give numbers, switches, texts or lists")
+        known: set[Any] = set()
         for value in self.values:
             if isinstance(value, float) and not np.isfinite(value):
                 raise InputError(f"{self.name} has the value {value}: give finite numbers")
-            if value in known:
+            hashed = str(value) if isinstance(value, list) else value
+            if hashed in known:
                 raise InputError(f"{self.name} has the value {value!r} twice: leave one out")
-            known.append(value)
+            known.add(hashed)
 
     @property
     def is_seed(self) -> bool:
@@ -233,6 +239,13 @@ class Study:
         return {**self.mechanism, **part_of(point, "mechanism")}
 
 
+def _plain(value: Any) -> Any:
+    """A value, or a list of values, without NumPy's types, which neither TOML nor JSON has."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return [_plain(each) for each in value] if isinstance(value, list | tuple) else value
+
+
 def part_of(point: Mapping[str, Any], part: str) -> dict[str, Any]:
     """The values of a point that belong to run, mechanism, geometry or plant, by their names in there."""
     return {name.removeprefix(f"{part}."): value for name, value in point.items() if name.startswith(f"{part}.")}
@@ -328,8 +341,8 @@ def _factors(table: Mapping[str, Any], prefix: str) -> list[Factor]:
 
 def _factor(name: str, table: Mapping[str, Any]) -> Factor:
     if "seeds" in table:
-        if len(table) > 1 or not is_whole(table["seeds"]) or table["seeds"] < 1:
-            raise InputError(f"{name}: seeds = {table['seeds']!r} must be a whole number, 1 at least, and stand alone")
+        if len(table) > 1 or not is_whole(table["seeds"]) or not 1 <= table["seeds"] <= _MOST_RUNS:
+            raise InputError(f"{name}: seeds = {table['seeds']!r} must be a whole number, 1 to {_MOST_RUNS}, and stand alone")
         factor = Factor(name, tuple(range(table["seeds"])))
         if not factor.is_seed:
             raise InputError(f"{name} is no seed: {{ seeds = N }} is for run.seed, or for a model's argument called seed")
@@ -344,16 +357,17 @@ def _factor(name: str, table: Mapping[str, Any]) -> Factor:
     factor = Factor(name, (), float(table["from"]), float(table["to"]), table.get("logarithmic", False))
     if "steps" not in table:
         return factor
-    if not is_whole(table["steps"]) or table["steps"] < 2:
-        raise InputError(f"{name}: steps = {table['steps']!r} must be a whole number, 2 at least")
+    if not is_whole(table["steps"]) or not 2 <= table["steps"] <= _MOST_RUNS:
+        raise InputError(f"{name}: steps = {table['steps']!r} must be a whole number, 2 to {_MOST_RUNS}")
     return Factor(name, tuple(factor.at(share) for share in np.linspace(0.0, 1.0, table["steps"]).tolist()))
 
 
 def _setting(name: str, value: Any) -> Setting:
+    variable, at, seconds = name.partition("@")
     numbers = value if isinstance(value, list | tuple) else [value]
     if not numbers or not all(isinstance(each, int | float) and np.isfinite(each) for each in numbers):
         raise InputError(f"plant.{name} = {value!r} must be a finite number, or a list of them")
-    return Setting(name, tuple(map(float, numbers)))
+    return Setting.parse(f"{variable}={','.join(str(float(each)) for each in numbers)}{at}{seconds}")
 
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -15,8 +15,9 @@ from hil.engine.batches import Failure, attempt, fingerprint
 from hil.engine.engine import Engine
 from hil.sweep.analysis import Analysis
 from hil.sweep.case import Case, cases_of, kind_of, measure, own_figures
-from hil.sweep.store import DIED, DONE, FAILED, KEY, REASON, STATUS, Store, as_stored, rows_of
-from hil.sweep.study import SEED, Study
+from hil.sweep.names import is_factor
+from hil.sweep.store import DIED, DONE, ERROR, FAILED, KEY, REASON, STATUS, Store, as_stored, rows_of, settled
+from hil.sweep.study import Study
 from plant.checks import nearest
 from plant.errors import GoughError, InputError
 
@@ -28,14 +29,14 @@ Report = Callable[[float, str], None]
 """Called with the share that is done, and what is going on in words."""
 
 _FLUSH_S = 0.1
-"""The least time between files of new rows [s]; a batch of two seconds is written as it comes."""
+"""The least time between files of new rows [s], on average: rows that come more slowly are written as they come."""
 
 
 @dataclass(frozen=True, eq=False)
 class SweepResult:
     """The table of a study, a row for each point in the study's order.
 
-    Its columns: `key`, `status` (done, failed or died), `reason`, the factors, and the figures.
+    Its columns: `key`, `status` (done, failed, error or died), `reason`, the factors, and the figures.
     """
 
     study: Study
@@ -133,13 +134,10 @@ def run_study(study: Study, folder: Path, engine: Engine, progress: Report = no_
     Raises:
         GoughError: the study, or the folder, cannot be used; or the engine's workers have gone.
     """
-    cases = _unique(study)
+    cases = _unique(study, progress)
     with Store.opened(folder) as store:
-        known = store.table()
-        settled = {
-            key for key, status in zip(*(known[name].to_pylist() for name in (KEY, STATUS)), strict=True) if status != DIED
-        }
-        left = [case for case in cases if case.key not in settled]
+        known = {*settled(store.table())[KEY].to_pylist()}
+        left = [case for case in cases if case.key not in known]
         began, checked = time.monotonic(), False
         for done, row in enumerate(run_cases(left, engine, store), start=1):
             if not checked and row[STATUS] == DONE:
@@ -148,7 +146,7 @@ def run_study(study: Study, folder: Path, engine: Engine, progress: Report = no_
             share = (len(cases) - len(left) + done) / len(cases)
             rate = done / (time.monotonic() - began)
             progress(share, f"{round(share * len(cases))} of {len(cases)} runs, {rate:.3g} a second")
-        table = rows_of(store.table(), [case.key for case in cases])
+        table = _table(study, cases, store)
     result = SweepResult(study, folder, table, len(left))
     if result.failed < len(table):
         check_figures(study.figures, result.analysis.names())
@@ -161,15 +159,16 @@ def run_cases(cases: Sequence[Case], engine: Engine, store: Store) -> Iterator[d
     Raises:
         GoughError: the engine's workers have gone, or the store cannot be written.
     """
+    store.as_table([case.point for case in cases])
     rows: list[dict[str, Any]] = []
-    flushed = time.monotonic()
+    began, files = time.monotonic(), 0
     try:
         for number, outcome in engine.run(measure, cases, kind_of):
             row = _row(cases[number], outcome)
             rows.append(row)
-            if time.monotonic() - flushed > _FLUSH_S:
+            if time.monotonic() - began > files * _FLUSH_S:
                 store.add(rows)
-                rows, flushed = [], time.monotonic()
+                rows, files = [], files + 1
             yield row
     finally:
         store.add(rows)
@@ -182,7 +181,7 @@ def estimate(study: Study, folder: Path) -> Estimate:
         GoughError: the study cannot be used, or its first run fails.
     """
     cases = _unique(study)
-    known = {*Store(folder).table()[KEY].to_pylist()} & {case.key for case in cases}
+    known = {*settled(Store(folder).table())[KEY].to_pylist()} & {case.key for case in cases}
     first = attempt(measure, cases[0])
     if isinstance(first, Failure):
         reason, *_ = first.reason.partition("\n")
@@ -195,8 +194,13 @@ def estimate(study: Study, folder: Path) -> Estimate:
 
 def figures_in(row: Mapping[str, Any], study: Study) -> list[str]:
     """The names of the figures that a row has."""
-    others = (KEY, STATUS, REASON, f"run.{SEED}", *(factor.name for factor in study.factors))
-    return [name for name, value in row.items() if value is not None and name not in others]
+    return [name for name, value in row.items() if value is not None and _is_figure(name, study)]
+
+
+def _is_figure(name: str, study: Study) -> bool:
+    """Whether a column is a figure; of the factors of runs, a table has also those that this study does not vary."""
+    others = (KEY, STATUS, REASON, *(factor.name for factor in study.factors))
+    return name not in others and not (study.model is None and is_factor(name))
 
 
 def check_figures(wanted: Iterable[str], names: Collection[str]) -> None:
@@ -210,17 +214,32 @@ def check_figures(wanted: Iterable[str], names: Collection[str]) -> None:
             raise InputError(f"no run has the figure {name!r}{nearest(name, names)}; there are {', '.join(names)}")
 
 
-def _unique(study: Study) -> list[Case]:
+def _unique(study: Study, progress: Report = no_report) -> list[Case]:
     """The cases of a study, without those that are the same run."""
-    return list({case.key: case for case in cases_of(study)}.values())
+    cases: dict[str, Case] = {}
+    for number, case in enumerate(cases_of(study), start=1):
+        cases[case.key] = case
+        progress(0.0, f"preparing {number} of {study.size} runs")
+    return list(cases.values())
+
+
+def _table(study: Study, cases: Sequence[Case], store: Store) -> pa.Table:
+    """The rows of cases, with the factors of this study alone: the same runs may be there from one with others."""
+    rows = rows_of(store.table(), [case.key for case in cases])
+    points = store.as_table([case.point for case in cases])
+    figures = [name for name in rows.column_names if _is_figure(name, study) and rows[name].null_count < len(rows)]
+    columns = {name: rows[name] for name in (KEY, STATUS, REASON)}
+    columns |= {factor.name: points[factor.name] for factor in study.factors}
+    return pa.table(columns | {name: rows[name] for name in figures})
 
 
 def _row(case: Case, outcome: dict[str, float] | Failure) -> dict[str, Any]:
     if isinstance(outcome, Failure):
-        return {KEY: case.key, STATUS: DIED if outcome.died else FAILED, REASON: outcome.reason, **case.point}
+        status = DIED if outcome.died else ERROR if outcome.again else FAILED
+        return {KEY: case.key, STATUS: status, REASON: outcome.reason, **case.point}
     row = {KEY: case.key, STATUS: DONE, REASON: None, **case.point}
     for name in outcome:
-        if name in row:
+        if name in row or (case.model is None and is_factor(name)):
             reason = f"the figure {name!r} has the name of a factor, or of a column of the table: give it another one"
             return {**row, STATUS: FAILED, REASON: reason}
     return {**row, **outcome}

@@ -11,7 +11,7 @@ import numpy as np
 from hil.engine.engine import Engine
 from hil.sweep.case import GEOMETRY_FIGURE, Case, case_of
 from hil.sweep.design import Design, pooled
-from hil.sweep.store import DIED, DONE, KEY, REASON, STATUS, Store
+from hil.sweep.store import DONE, KEY, REASON, STATUS, Store, settled
 from hil.sweep.sweep import check_figures, figures_in, run_cases
 from plant.errors import GoughError, InputError
 
@@ -36,7 +36,7 @@ class TrialRunner:
     def __init__(self, design: Design, engine: Engine, store: Store, ran: Callable[[], None]) -> None:
         self.design, self.ran = design, 0
         self._engine, self._store, self._told = engine, store, ran
-        self._rows = {row[KEY]: row for row in store.table().to_pylist() if row[STATUS] != DIED}
+        self._rows = {row[KEY]: row for row in settled(store.table()).to_pylist()}
         self._began = time.monotonic()
 
     @property

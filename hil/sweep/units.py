@@ -38,7 +38,7 @@ def unit_of_factor(study: Study, name: str) -> tuple[str, float]:
         return _FACTORS.get(unit, (unit, 1.0))
     if part == "geometry":
         return ("deg", degrees(1.0)) if rest.endswith("angle") else ("mm", 1e3)
-    variable = rest.removeprefix("plant.") if part == "mechanism" else rest
+    variable = rest.removeprefix("plant.") if part == "mechanism" else rest.partition("@")[0]
     known = (*SPATIAL.parameters, *SPATIAL.inputs)
     return next((each.unit for each in known if each.name == variable and each.unit != "1"), ""), 1.0
 

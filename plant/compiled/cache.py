@@ -31,7 +31,7 @@ def hash_of_files(files: Iterable[Path], *extra: str) -> str:
 
 
 def keyed_folder(kind: str, key: str) -> Path:
-    """The cache folder of this kind and key; folders long unused are removed.
+    """The cache folder of this kind and key; folders long unused are removed, once in a process.
 
     Without a cache that can be written, it lasts as long as the process.
     """
@@ -44,11 +44,17 @@ def keyed_folder(kind: str, key: str) -> Path:
         folder = _temporary_cache() / kind / key
         folder.mkdir(parents=True, exist_ok=True)
         return folder
-    for other in folder.parent.iterdir():
-        with suppress(OSError):
-            if other != folder and time.time() - other.stat().st_mtime > STALE_AFTER_S:
-                shutil.rmtree(other, ignore_errors=True)
+    _remove_stale(folder.parent)
     return folder
+
+
+@cache
+def _remove_stale(folders: Path) -> None:
+    """Once in a process, as there may be thousands: a sweep keeps a folder for each of its mechanisms."""
+    for each in folders.iterdir():
+        with suppress(OSError):
+            if time.time() - each.stat().st_mtime > STALE_AFTER_S:
+                shutil.rmtree(each, ignore_errors=True)
 
 
 @cache

@@ -87,9 +87,10 @@ def test_the_hash_changes_with_content_name_order_and_extra(tmp_path: Path) -> N
 
 def test_folders_long_unused_are_swept_away(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("GOUGH_CACHE", str(tmp_path))
-    old, recent = keyed_folder("things", "old"), keyed_folder("things", "recent")
+    old, recent, elsewhere = tmp_path / "things/old", tmp_path / "things/recent", tmp_path / "others/old"
+    for folder in (old, recent, elsewhere):
+        folder.mkdir(parents=True)
     (old / "file").write_text("x")
-    elsewhere = keyed_folder("others", "old")
     now = old.stat().st_mtime
     os.utime(old, (now - STALE_AFTER_S - 60.0,) * 2)
     os.utime(recent, (now - STALE_AFTER_S + 60.0,) * 2)
@@ -101,12 +102,24 @@ def test_folders_long_unused_are_swept_away(monkeypatch: pytest.MonkeyPatch, tmp
 
 def test_use_keeps_a_folder_fresh(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("GOUGH_CACHE", str(tmp_path))
-    folder = keyed_folder("things", "key")
+    folder = tmp_path / "things/key"
+    folder.mkdir(parents=True)
     (folder / "file").write_text("x")
     os.utime(folder, (1.0, 1.0))
     assert keyed_folder("things", "key") == folder
-    keyed_folder("things", "another")
+    assert folder.stat().st_mtime > 1.0
     assert (folder / "file").exists()
+
+
+def test_a_folder_takes_as_long_to_find_among_thousands(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("GOUGH_CACHE", str(tmp_path))
+    looked = []
+    listed = Path.iterdir
+    monkeypatch.setattr(Path, "iterdir", lambda folder: looked.append(folder) or listed(folder))
+    for number in range(20):
+        keyed_folder("things", str(number % 3))
+    keyed_folder("others", "0")
+    assert looked == [tmp_path / "things", tmp_path / "others"]
 
 
 def test_a_cache_that_cannot_be_written_gives_way_to_temporary_files(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ def figures():
     return {"machine": "m", "date": "2026-11-21", "version": "0", "real_time": measure_real_time({500.0: 2.0})}
 
 
+@pytest.mark.slow
 def test_every_condition_of_a_rate_is_measured(figures):
     measured = figures["real_time"]
     assert json.loads(json.dumps(measured)) == measured
@@ -39,6 +40,7 @@ def test_every_condition_of_a_rate_is_measured(figures):
     assert set(measured["rates"]["500"]) >= {IDLE, BUSY}
 
 
+@pytest.mark.slow
 def test_the_check_passes_what_is_measured_and_fails_gross_excess(figures):
     measured = figures["real_time"]
     assert gross_excess(measured) == []
@@ -48,7 +50,9 @@ def test_the_check_passes_what_is_measured_and_fails_gross_excess(figures):
         altered["rates"]["500"][IDLE] |= values
         return gross_excess(altered)
 
-    assert changed(missed_own=3) == ["500 Hz, idle: 3 periods missed by our own work"]
+    # The host of a virtual machine holds up a few cycles of either loop.
+    assert changed(overran={"ours": 3, "bare": 0}) == changed(overran={"ours": 300, "bare": 290}) == []
+    assert changed(overran={"ours": 30, "bare": 2}) == ["500 Hz, idle: ours overran in 30 cycles, the bare loop in 2"]
     slow = dict.fromkeys(("p50", "p99", "p999", "max"), 900.0) | {"n": 1000}
     assert any("computing takes 900 us" in text for text in changed(compute_us=slow))
     if not measured["refused"]:
@@ -68,6 +72,7 @@ def test_quantiles_of_whole_microseconds_are_those_of_the_durations():
     assert found["max"] == 123_000.0
 
 
+@pytest.mark.slow
 def test_a_report_shows_histograms_and_earlier_figures(figures, tmp_path):
     earlier = tmp_path / "earlier.json"
     earlier.write_text(json.dumps({**figures, "date": "2026-11-01"}))

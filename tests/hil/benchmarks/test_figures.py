@@ -11,8 +11,9 @@ from hil.reports.benchmark import _sentence
 from plant.pose import Pose, rotation_from_vector
 
 
-def measured(compute=10.0, bare=9.0, own=0, faults=0):
-    return {"compute_us": {"p50": compute}, "bare_us": {"p50": bare}, "missed_own": own, "usage": {"major_faults": faults}}
+def measured(compute=10.0, bare=9.0, overran=(0, 0), faults=0):
+    figures = {"compute_us": {"p50": compute, "n": 900}, "bare_us": {"p50": bare, "n": 1100}}
+    return figures | {"overran": dict(zip(("ours", "bare"), overran, strict=True)), "usage": {"major_faults": faults}}
 
 
 @pytest.mark.parametrize(
@@ -25,7 +26,12 @@ def measured(compute=10.0, bare=9.0, own=0, faults=0):
         (BUSY, {"compute": 10.0, "bare": 0.5}, [], []),
         (BUSY, {"compute": 11.0, "bare": 0.5}, [], ["computing takes 11 times as long as a bare loop of the same work"]),
         (BUSY, {"compute": 91.0}, [], ["computing takes 10 times as long as a bare loop of the same work"]),
-        (IDLE, {"own": 1}, ["x"], ["1 periods missed by our own work"]),
+        # 0.45^8 is 1.7e-3, and 0.45^9 less than 1e-3.
+        (IDLE, {"overran": (8, 0)}, [], []),
+        (IDLE, {"overran": (9, 0)}, ["x"], ["ours overran in 9 cycles, the bare loop in 0"]),
+        (BUSY, {"overran": (90, 100)}, [], []),
+        (BUSY, {"overran": (0, 100)}, [], []),
+        (BUSY, {"overran": (120, 80)}, [], ["ours overran in 120 cycles, the bare loop in 80"]),
         (IDLE, {"faults": 1}, [], ["1 major page faults in the loop"]),
         (IDLE, {"faults": 1}, ["locked memory"], []),
     ],
@@ -65,8 +71,10 @@ def test_a_pool_has_its_figures_under_their_names():
     pool.counts.update({"missed_own": 10, "missed_host": 20, "major_faults": 30})
     pool.bare.add(np.full(3, 50_000))
     pool.bare_wake.add(np.full(2, 70_000))
+    pool.overran[:] = 7, 5
     figures = pool.figures()
     assert (figures["missed_own"], figures["missed_host"], figures["usage"]) == (11, 22, {"major_faults": 33})
+    assert figures["overran"] == {"ours": 7, "bare": 5}
     greatest = {name: figures[f"{name}_us"]["max"] for name in ("compute", "latency", "wake", "bare", "bare_wake")}
     assert greatest == {"compute": 6.0, "latency": 7.0, "wake": 3.0, "bare": 50.0, "bare_wake": 70.0}
     assert (figures["bare_us"]["n"], figures["bare_wake_us"]["n"]) == (3, 2)

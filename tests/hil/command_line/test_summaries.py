@@ -375,7 +375,13 @@ def percentiles(number):
 def test_a_condition_of_the_clock_is_printed(tables, capsys):
     figures = {f"{name}_us": percentiles(10**k) for k, name in enumerate(("compute", "bare", "latency", "wake", "cyclictest"))}
     usage = {"major_faults": 1, "minor_faults": 2, "involuntary_switches": 3, "resident": 4096}
-    measured = figures | {"usage": usage, "missed_own": 5, "missed_host": 6, "over_budget": []}
+    measured = figures | {
+        "usage": usage,
+        "missed_own": 5,
+        "missed_host": 6,
+        "overran": {"ours": 7, "bare": 8},
+        "over_budget": [],
+    }
     measure._print_condition("title", measured)
     measure._print_condition("title", measured | {"cyclictest_us": None, "over_budget": ["a", "b"]})
     assert tables[0] == [
@@ -388,10 +394,11 @@ def test_a_condition_of_the_clock_is_printed(tables, capsys):
     ]
     assert tables[1] == tables[0][:-1]
     assert capsys.readouterr().out.splitlines() == [
-        "periods missed by own work 5, by the host 6; page faults 1 major, 2 minor; involuntary switches 3; growth 4096 bytes; "
-        "woken late over cyclictest: p50 0.10, p99.9 0.10",
+        "periods missed by own work 5, by the host 6; cycles longer than a period 7, of the bare loop 8; page faults 1 major, "
+        "2 minor; involuntary switches 3; growth 4096 bytes; woken late over cyclictest: p50 0.10, p99.9 0.10",
         "within the timing budget (hil/loop/budget.toml)",
-        "periods missed by own work 5, by the host 6; page faults 1 major, 2 minor; involuntary switches 3; growth 4096 bytes",
+        "periods missed by own work 5, by the host 6; cycles longer than a period 7, of the bare loop 8; page faults 1 major, "
+        "2 minor; involuntary switches 3; growth 4096 bytes",
         "over budget: a, b",
     ]
 

@@ -50,7 +50,8 @@ def folder(tmp_path: Path) -> Path:
 
 def sweep(folder: Path, text: str, *options: object, workers: int = 1):
     (folder / "study.toml").write_text(text)
-    return gough("sweep", "study.toml", "--workers", workers, "--dashboard", "127.0.0.1:0", *options, cwd=folder)
+    page = ("--dashboard", "127.0.0.1:0") if workers > 1 else ()
+    return gough("sweep", "study.toml", "--workers", workers, *page, *options, cwd=folder)
 
 
 def of_model(name: str, more: str = "") -> str:
@@ -171,6 +172,15 @@ def test_a_study_that_is_not_there_and_outputs_that_cannot_be_written_are_refuse
         refused = sweep(folder, of_model("half"), option, "no/such.file")
         assert refused.returncode == 2 and "cannot write no/such.file" in refused.stderr
         assert not (folder / "study.results").exists()
+    kept = sweep(folder, of_model("half"), "--json", "study.toml")
+    assert kept.returncode == 2 and "study.toml is named twice" in kept.stderr
+    assert (folder / "study.toml").read_text() == of_model("half")
+
+
+def test_a_picture_of_too_many_values_is_refused_before_anything_runs(folder: Path) -> None:
+    finished = sweep(folder, 'model = "functions.py:half"\n[vary]\nx = [0, 1, 2, 3, 4, 5, 6]\n', "--picture", "out.svg")
+    assert finished.returncode == 2 and not (folder / "study.results").exists()
+    assert "x has 7 values, and a picture shows at most 6: take a report" in finished.stderr
 
 
 def test_a_dry_run_says_why_the_first_run_fails(folder: Path) -> None:

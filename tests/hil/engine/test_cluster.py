@@ -84,6 +84,7 @@ def engine(certificates: Certificates) -> Iterator[Engine]:
         yield engine
 
 
+@pytest.mark.slow
 def test_all_workers_work_and_nothing_listens_beyond_this_machine(engine: Engine) -> None:
     pids = {*engine.map(eval, [PROCESS] * 50)}
     assert engine.workers == 2
@@ -95,6 +96,7 @@ def test_all_workers_work_and_nothing_listens_beyond_this_machine(engine: Engine
 
 
 # Dask speaks first.
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "spoken"), [("joined_at", b""), ("dashboard", b"GET /status HTTP/1.0\r\n\r\n")])
 def test_nobody_connects_without_a_certificate(
     engine: Engine, certificates: Certificates, name: str, spoken: bytes, tmp_path: Path
@@ -108,10 +110,10 @@ def test_nobody_connects_without_a_certificate(
         if shown:
             context.load_cert_chain(shown.cert, shown.key)
         with context.wrap_socket(socket.create_connection(host_and_port(address))) as tls:
-            return heard(tls)
+            return heard(tls, 60.0 if shown is certificates else 2.0)
 
-    def heard(connection: socket.socket) -> bool:
-        connection.settimeout(1.0)
+    def heard(connection: socket.socket, patience: float) -> bool:
+        connection.settimeout(patience)
         try:
             connection.sendall(spoken)
             return bool(connection.recv(10))
@@ -122,7 +124,7 @@ def test_nobody_connects_without_a_certificate(
     assert not answers(None)
     assert not answers(others)
     with socket.create_connection(host_and_port(address)) as plain:
-        assert not heard(plain)
+        assert not heard(plain, 2.0)
 
 
 @pytest.mark.slow

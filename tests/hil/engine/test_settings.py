@@ -25,6 +25,11 @@ def test_one_worker_is_this_process_unless_others_join() -> None:
     assert not EngineSettings(scheduler="tcp://127.0.0.1:8786").alone
 
 
+def test_whoever_asks_for_a_page_or_certificates_gets_them_with_one_worker_too() -> None:
+    assert not EngineSettings(workers=1, dashboard="127.0.0.1:0").alone
+    assert not EngineSettings(workers=1, **TLS).alone
+
+
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "[::1]"])
 def test_this_machine_needs_no_certificate(host: str) -> None:
     assert not EngineSettings(listen=f"{host}:8786", dashboard=f"{host}:0").tls

@@ -30,9 +30,9 @@ def result_of(objectives, tmp_path):
 @pytest.mark.parametrize(
     "objectives",
     [
-        (Objective("a"),),
-        (Objective("a"), Objective("b", "maximise")),
-        (Objective("a"), Objective("b", "maximise"), Objective("c")),
+        pytest.param((Objective("a"),), marks=pytest.mark.slow),
+        pytest.param((Objective("a"), Objective("b", "maximise")), marks=pytest.mark.slow),
+        pytest.param((Objective("a"), Objective("b", "maximise"), Objective("c")), marks=pytest.mark.slow),
         (Objective("a"), Objective("b", "maximise"), Objective("c"), Objective("d")),
     ],
     ids=len,

@@ -69,6 +69,7 @@ def test_every_part_is_there_once_and_drawn(crossed, tmp_path):
     draw_in_browser(path, 4)
 
 
+@pytest.mark.slow
 def test_a_dozen_factors_are_drawn(sampled, tmp_path):
     path, page = written(sampled, tmp_path)
     assert figures_in(page) == ["distributions", "effects0", "effects1", "shares", "sobol0", "sobol1", "pairs"]
@@ -139,7 +140,7 @@ def test_shares_and_indices_are_drawn(sampled, tmp_path):
 
 def test_failures_are_listed_with_their_reason_and_first_point(crossed, tmp_path):
     _, page = written(crossed, tmp_path)
-    assert re.search(r"<th>ValueError: the &lt;bad&gt; one &amp; its rate</th><td>6</td><td>failed</td>", page)
+    assert re.search(r"<th>ValueError: the &lt;bad&gt; one &amp; its rate</th><td>6</td><td>error</td>", page)
     assert "grade = bad, rate = 500.0, seed = 0" in page
     assert f"<h1>gough: {escape('grade <1> & rate')}</h1>" in page
 

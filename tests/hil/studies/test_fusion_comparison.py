@@ -17,6 +17,7 @@ def figures(tmp_path_factory):
     return json.loads(path.read_text())["methods"]
 
 
+@pytest.mark.slow
 def test_every_method_is_there(figures):
     assert list(figures) == [*METHODS, *SLOW_METHODS]
     for name, method in figures.items():
@@ -24,6 +25,7 @@ def test_every_method_is_there(figures):
         assert method["seeds"] == 1
 
 
+@pytest.mark.slow
 def test_the_whole_mechanism_beats_its_parts_and_the_parts_what_knows_no_joints(figures):
     error = {name: method["position_rms"] for name, method in figures.items()}
     assert error["whole"] < 0.5 * error["refined (compiled)"]
@@ -32,6 +34,7 @@ def test_the_whole_mechanism_beats_its_parts_and_the_parts_what_knows_no_joints(
     assert error["refined (filterpy)"] == pytest.approx(error["refined (compiled)"], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_covariances_are_of_the_size_of_the_errors(figures):
     assert 0.5 < figures["whole"]["nees"] < 15.0
     assert figures["section 5, magnetometer"]["nees"] is None

@@ -28,6 +28,7 @@ def tuned(tmp_path_factory):
     return mechanism, json.loads(figures.read_text())
 
 
+@pytest.mark.slow
 def test_the_tuned_file_is_the_mechanism_with_what_was_found(tuned):
     path, figures = tuned
     found = {name: values["after"] for name, values in figures["settings"].items()}
@@ -38,6 +39,7 @@ def test_the_tuned_file_is_the_mechanism_with_what_was_found(tuned):
     assert path.read_text().startswith(HEXAPOD)
 
 
+@pytest.mark.slow
 def test_the_estimators_are_more_consistent_and_no_worse(tuned):
     for name, figures in tuned[1]["estimators"].items():
         off = [abs(np.log(figures[when]["nees"] / figures["consistent"])) for when in ("before", "after")]

@@ -47,7 +47,6 @@ STUDIES = {
     "broad": lambda engine, trials: broad.evaluate(trials, FusionSettings(), engine),
     "faults": lambda engine, trials: faults(engine),
     "sensor-sets": lambda engine, trials: list(map(vars, evaluate_sensor_sets(["6-3-II"], SETS[:4], 0.3, 1, engine))),
-    "tune-fusion": lambda engine, trials: fusion_tuning.tune_fusion(TuningConfig(seeds=(0,), rate=50.0), engine),
 }
 LONG_STUDIES = {
     "classes": lambda engine, trials: list(map(vars, evaluate_classes(1, engine))),
@@ -55,6 +54,7 @@ LONG_STUDIES = {
         ComparisonConfig(duration=20.5, rate=100.0, seeds=(0, 1)), engine
     ),
     "evaluate-fusion": lambda engine, trials: fusion_evaluation.evaluate(CALIBRATED, engine),
+    "tune-fusion": lambda engine, trials: fusion_tuning.tune_fusion(TuningConfig(seeds=(0,), rate=50.0), engine),
 }
 
 
@@ -64,7 +64,13 @@ def without_times(figures):
     return [without_times(each) for each in figures] if isinstance(figures, list | tuple) else figures
 
 
-@pytest.mark.parametrize("study", [*STUDIES, *(pytest.param(name, marks=pytest.mark.slow) for name in LONG_STUDIES)])
+@pytest.mark.parametrize(
+    "study",
+    [
+        *STUDIES,
+        *(pytest.param(n, marks=pytest.mark.endurance if n == "evaluate-fusion" else pytest.mark.slow) for n in LONG_STUDIES),
+    ],
+)
 def test_figures_do_not_depend_on_the_engine(study, workers, trials):
     evaluate = (STUDIES | LONG_STUDIES)[study]
     here, there = (json.dumps(without_times(evaluate(engine, trials)), default=str) for engine in (IN_ONE_PROCESS, workers))

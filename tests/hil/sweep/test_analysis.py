@@ -5,7 +5,7 @@ import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import beta, lognorm
+from scipy.stats import beta, lognorm, norm
 
 from hil.sweep.analysis import INTERACTIONS, QUANTILES, Analysis, difference, mean, quantile
 from hil.sweep.function import UserFunction
@@ -94,6 +94,20 @@ def test_runs_of_the_same_seed_are_no_independent_runs(seeds, cells, common):
     assert np.mean(hits, axis=0).min() >= CERTAIN
     if common:
         assert np.mean(naive) < 0.8
+
+
+@pytest.mark.parametrize("seeds", [2, 3, 4, 5])
+@pytest.mark.parametrize("common", [0.0, 0.5, 0.9])
+def test_with_few_seeds_no_end_of_a_quantile_promises_more_than_it_holds(seeds, common):
+    """Two seeds count as one or two independent values, which must not make the greatest of 24 runs the lower end."""
+    random, groups = np.random.default_rng(6), [np.repeat(np.arange(seeds), 12)]
+    beyond = []
+    for _ in range(TRIALS):
+        own, shared = random.standard_normal((seeds, 12)), random.standard_normal((seeds, 1))
+        values = (np.sqrt(common) * shared + np.sqrt(1.0 - common) * own).ravel()
+        found = [quantile(values, share, groups) for share in QUANTILES]
+        beyond.append([(each.low > norm.ppf(each.share), each.high < norm.ppf(each.share)) for each in found])
+    assert np.mean(beyond, axis=0).max() <= 0.025 + 3.0 * np.sqrt(0.025 * 0.975 / TRIALS)
 
 
 def test_what_a_seed_does_to_all_values_alike_is_no_uncertainty_of_a_difference():

@@ -65,6 +65,11 @@ def test_a_file_says_it_all(tmp_path):
         ("[vary]", "[vary]\nrun.seed = { seeds = 3 }", r"run.seed is no part of a design"),
         ('"maximise"', '"larger"', "the goal is 'larger'; it is minimise or maximise"),
         ('pool = "rms"', 'pool = "median"', "pool is 'median'; it is rms, mean, max, min, or a quantile"),
+        (
+            "tracking.position_max =",
+            "estimation.rotation_rms = { most = 0.1 }\ntracking.position_max =",
+            "estimation.rotation_rms is pooled by rms as an objective and by mean as a constraint: give both the same pool",
+        ),
         ("pool = 0.9", "pool = 1.5", "pool is 1.5"),
         ('least = "start"', 'least = "begin"', "a bound is 'begin'"),
         ("most = 0.005, ", "", "tracking.position_max has no bound"),

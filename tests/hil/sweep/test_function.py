@@ -1,5 +1,10 @@
 """Functions of the user's own: from files and programs, to other processes and back."""
 
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import cloudpickle
@@ -7,6 +12,8 @@ import pytest
 
 from hil.sweep.function import UserFunction
 from plant.errors import InputError
+
+GAIN = 2.0
 
 
 def doubled(x: float) -> float:
@@ -34,6 +41,62 @@ def test_one_within_another_goes_with_what_it_needs() -> None:
         return x + offset
 
     assert cloudpickle.loads(cloudpickle.dumps(UserFunction.of(shifted))).figures(1.0) == {"shifted": 6.0}
+
+
+def amplified(gain: float) -> Callable[[float], float]:
+    return lambda x: gain * GAIN * x
+
+
+def test_one_within_another_is_as_it_was_with_what_it_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = UserFunction.of(amplified(1.0))
+    assert made == UserFunction.of(amplified(1.0))
+    assert made != UserFunction.of(amplified(10.0))
+    monkeypatch.setattr(sys.modules[__name__], "GAIN", 3.0)
+    assert made != UserFunction.of(amplified(1.0))
+    assert made.function()(1.0) == 2.0
+    assert UserFunction.of(amplified(1.0)).function()(1.0) == 3.0
+
+
+def test_one_of_a_program_stays_the_same_but_for_what_it_uses(tmp_path: Path) -> None:
+    """In each process, wherever it stands in the program; a set has an order of its own in each."""
+    text = """
+from hil import UserFunction
+
+{lines}
+
+def helper(x):
+    return {gain} * x
+
+def figure(x):
+    return helper(x) if {{"a", "b", "c", "d"}} else 0.0
+
+print(UserFunction.of(figure).source)
+"""
+    program = tmp_path / "program.py"
+
+    def source(seed: int, lines: str = "", gain: float = 2.0) -> str:
+        program.write_text(text.format(lines=lines, gain=gain))
+        done = subprocess.run(
+            [sys.executable, str(program)],
+            env={**os.environ, "PYTHONHASHSEED": str(seed)},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        return done.stdout
+
+    assert source(1) == source(2) == source(3, lines="x = 1\n\n")
+    assert source(1) != source(1, gain=3.0)
+
+
+def test_one_that_uses_what_cannot_travel_is_refused() -> None:
+    lock = threading.Lock()
+
+    def locked() -> bool:
+        return lock.locked()
+
+    with pytest.raises(InputError, match=r"locked cannot go to another process.*write it in a file"):
+        UserFunction.of(locked)
 
 
 def test_it_may_give_several_figures(tmp_path: Path) -> None:

@@ -269,10 +269,20 @@ def test_the_command_prints_the_front_and_writes_the_figures(tmp_path):
     for arguments, message in (
         (["--write", "m.toml"], "a model has no mechanism that could be written: leave --write out"),
         (["--choose", "99"], "'99' is not on the front"),
+        (["--choose", "nee", "--results", "other"], "--choose nee is no trial: give its number, knee, or first"),
     ):
         refused = gough("optimise", "one.toml", "--workers", 1, *arguments, cwd=tmp_path)
         assert refused.returncode == 2
         assert message in refused.stderr and refused.stderr.count("\n") == 1
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_search_that_finds_nothing_writes_its_figures(tmp_path):
+    (tmp_path / "model.py").write_text("def f(x):\n    return (x - 0.25) ** 2\n")
+    (tmp_path / "one.toml").write_text(f"{ONE}[constraints]\nf = {{ most = -1.0 }}\n")
+    refused = gough("optimise", "one.toml", "--workers", 1, "--json", "one.json", cwd=tmp_path)
+    assert refused.returncode == 2 and refused.stderr.count("\n") == 1
+    assert json.loads((tmp_path / "one.json").read_text())["trials"] == {"run": 0, "given up": 0, "refused": 20}
 
 
 def test_the_command_writes_a_mechanism(tmp_path):
@@ -281,7 +291,7 @@ def test_the_command_writes_a_mechanism(tmp_path):
         '[objectives]\ngeometry.force_max = "minimise"\n[search]\ntrials = 12\n'
     )
     done = gough("optimise", "shape.toml", "--workers", 1, "--write", "best.toml", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.returncode == 0, done.stderr
     run = gough("simulate", "--mechanism", "best.toml", "--target", "hold", "--duration", 0.2, cwd=tmp_path)
     assert run.returncode == 0
     assert "as it was" in done.stdout and "is written to best.toml" in done.stdout
@@ -296,8 +306,10 @@ def zdt1(folder: Path, trials: int, seed: int) -> Design:
     return read_design(folder / "zdt1.toml")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [11, 12, 13, 14, 15])
+@pytest.mark.parametrize(
+    "seed",
+    [pytest.param(11, marks=pytest.mark.slow), *(pytest.param(seed, marks=pytest.mark.endurance) for seed in range(12, 16))],
+)
 def test_zdt1_is_solved_to_95_percent_of_the_hypervolume(tmp_path, seed):
     """On the engine's processes, with seeds that the settings of the search were not chosen on."""
     with open_engine(EngineSettings(workers=2, dashboard="127.0.0.1:0")) as engine:

@@ -1,6 +1,8 @@
 """Studies: what varies, at which points, and what a file may say."""
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from scipy.stats import qmc
 from hil.runs.config import SimulationConfig
 from hil.sweep.study import METHODS, Factor, Sampling, Study, read_study
 from plant.errors import GoughError, InputError
+from plant.fmu.settings import Setting
 
 SEEDS = Factor("run.seed", (0, 1, 2))
 GAIN = Factor("mechanism.control.proportional", (), 40.0, 80.0)
@@ -38,6 +41,40 @@ def test_values_are_crossed_and_ranges_are_sampled() -> None:
     # Samples are the outer loop: what is crossed changes first.
     assert [point["run.imu"] for point in points[:4]] == ["ideal", "mpu9150", "ideal", "mpu9150"]
     assert len({point["mechanism.control.proportional"] for point in points[:6]}) == 1
+
+
+def test_a_value_of_the_plant_may_have_a_time(written) -> None:
+    text = '[plant]\n"friction.viscous@1" = 90\n[vary]\nplant."payload.mass@3.5" = [8.1, 9.1]\n'
+    study = read_study(written(text))
+    assert study.config_at(study.points()[1]).settings == (
+        Setting("friction.viscous", (90.0,), 1.0), Setting("payload.mass", (9.1,), 3.5),
+    )  # fmt: skip
+    with pytest.raises(InputError, match=r"input 'payload.mas'; did"):
+        read_study(written(text.replace("mass", "mas")))
+
+
+@pytest.mark.parametrize(
+    ("values", "plain"),
+    [
+        (np.linspace(0.0, 1.0, 3), (0.0, 0.5, 1.0)),
+        (tuple(np.arange(3)), (0, 1, 2)),
+        ([np.float32(0.5), 1], (0.5, 1)),
+        (np.array(["a", "b"]), ("a", "b")),
+        ((np.True_, False), (True, False)),
+        (np.eye(2), ([1.0, 0.0], [0.0, 1.0])),
+        (((np.int64(1), 2), [np.int32(3)]), ([1, 2], [3])),
+        (range(2), (0, 1)),
+    ],
+)
+def test_values_of_numpy_are_plain_ones(values: Any, plain: tuple[Any, ...]) -> None:
+    found = Factor("x", values).values
+    assert found == plain
+    assert json.loads(json.dumps(found)) == list(plain)
+
+
+def test_values_that_no_table_can_have_are_refused() -> None:
+    with pytest.raises(InputError, match=r"x has the value .*Path.*give numbers, switches, texts or lists"):
+        Factor("x", (Path("a.toml"),))
 
 
 def test_without_a_range_nothing_is_sampled() -> None:
@@ -148,7 +185,9 @@ def test_what_does_not_vary_is_that_of_a_simulation() -> None:
         ("name = 3\n[vary]\nrun.seed = [1]\n", "name = 3 must be text"),
         ("[vary]\nrun.seed = 3\n", "does not vary"),
         ("[vary]\nrun.seed = []\n", "does not vary"),
-        ("[vary]\nrun.seed = { seeds = 0 }\n", "seeds = 0 must be a whole number, 1 at least"),
+        ("[vary]\nrun.seed = { seeds = 0 }\n", "seeds = 0 must be a whole number, 1 to 10000000"),
+        ("[vary]\nrun.seed = { seeds = 100000000 }\n", "seeds = 100000000 must be a whole number, 1 to 10000000"),
+        ("[vary]\nrun.seed = { from = 0, to = 9 }\n", "a seed, a whole number, and has no range: give { seeds = 10 }"),
         ("[vary]\nrun.seed = { seeds = 2, from = 1 }\n", "stand alone"),
         ("[vary]\nrun.seed = { seeds = 2.5 }\n", "seeds = 2.5 must be a whole number"),
         ("[vary]\nrun.rate = { seeds = 2 }\n", "run.rate is no seed"),
@@ -168,7 +207,7 @@ def test_what_does_not_vary_is_that_of_a_simulation() -> None:
         ("[vary]\nrun.rate = { from = 200.0, to = 100.0 }\n", "goes up"),
         ("[vary]\nrun.rate = { from = 1.0, to = nan }\n", "finite"),
         ("[vary]\nrun.rate = { from = 0.0, to = 1.0, logarithmic = true }\n", "must be positive"),
-        ("[vary]\nrun.rate = { from = 1.0, to = 2.0, steps = 1 }\n", "2 at least"),
+        ("[vary]\nrun.rate = { from = 1.0, to = 2.0, steps = 1 }\n", "a whole number, 2 to 10000000"),
         ('[vary]\nrun.rate = { from = "a", to = 2.0 }\n', "run.rate"),
         ("[sampling]\ncount = 1\n[vary]\nrun.seed = [1]\n", "2 to"),
         ("[sampling]\ncount = 100\n[vary]\nrun.seed = [1]\n", "64 or 128"),
