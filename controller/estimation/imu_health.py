@@ -24,7 +24,7 @@ _HEALTHY_S = 0.02
 """How long an IMU that was left out must be healthy before it is used again [s]."""
 
 _STALE_S = 0.01
-"""How old a sample may be while others are new [s]."""
+"""How long a rig that answers may leave an IMU without a new sample [s]."""
 
 _NOISE_S = 0.02
 """Time constant over which the noise of an IMU is averaged [s]."""
@@ -52,6 +52,7 @@ STATE = record_dtype(
     raw=(np.float64, (3, IMU_COUNT, 3)),  # last reading [rad/s, m/s^2, uT]
     sample=(np.float64, (3, IMU_COUNT, 3)),  # last reading, calibrated
     sample_age=(np.int64, IMU_COUNT),  # how many cycles old the sample is, as the rig reports it
+    passed_over=(np.int64, IMU_COUNT),  # how many answers of the rig in a row had no new sample of the IMU
     unchanged=(np.int64, IMU_COUNT),  # whether the IMU repeats its reading
     frozen_for=(np.int64, IMU_COUNT),  # for how many cycles it has done so although it must have changed
     moved_since=np.float64,  # how far the reference has moved a leg since the last change of any reading [m]
@@ -129,8 +130,13 @@ def screen_imus(
             s.frozen_for[k] += 1
         cause = Cause.NONE.value
         value, limit = np.nan, np.nan
-        if s.sample_age[k] >= p.stale_cycles and silent == 0:
-            cause, value, limit = Cause.IMU_STALE.value, float(s.sample_age[k]), float(p.stale_cycles)
+        if s.sample_age[k] == 0:
+            s.passed_over[k] = 0
+        elif silent == 0:
+            # Periods in which nobody answered or the loop was held up age all samples, and are no fault of an IMU.
+            s.passed_over[k] += 1
+        if s.passed_over[k] >= p.stale_cycles:
+            cause, value, limit = Cause.IMU_STALE.value, float(s.passed_over[k]), float(p.stale_cycles)
         elif s.frozen_for[k] >= p.frozen_cycles:
             cause, value, limit = Cause.IMU_FROZEN.value, float(s.frozen_for[k]), float(p.frozen_cycles)
         noise = s.noise[k]
