@@ -19,6 +19,7 @@ from controller.inverse_kinematics import legs_at
 from controller.rig import elapsed
 from controller.settings import FusionSettings
 from plant.compiled import Record, filled, kernel, record_dtype
+from plant.imu_wiring import IMU_COUNT
 from plant.mechanism import LEGS
 from plant.pose import Array
 
@@ -51,6 +52,7 @@ STATE = record_dtype(
     closed_rotation=(np.float64, (3, 3)),
     twist=(np.float64, 6),  # of the filter
     acceleration=(np.float64, 6),  # of the filter
+    fresh=(np.int64, IMU_COUNT),  # whether the IMU is used and has a new sample
 )
 """State of the filter and of the trust in it."""
 
@@ -83,7 +85,10 @@ def step_mechanism_filter(
             s.due = time.cycle + p.settling_cycles
         _fade_step(s, rig, time, pose)
         return found
-    accumulate_sample(f, imus.sample, imus.used, now - p.delay)
+    for k in range(IMU_COUNT):
+        # A sample that is repeated is of another time.
+        s.fresh[k] = 1 if imus.used[k] != 0 and imus.sample_age[k] == 0 else 0
+    accumulate_sample(f, imus.sample, s.fresh, now - p.delay)
     if heading.used != 0 and heading.fresh != 0:
         accumulate_field(f, heading.field, now - p.delay)
     step_filter(p.filter, rig.sensors, f)
