@@ -128,11 +128,14 @@ WORDS = {
 }
 """The words of a disturbance beside those of its size, with their meaning."""
 
+_GREATEST = 1e6
+"""The greatest value of a word for a course."""
+
 _SHORT = {"at": "at_s", "for": "for_s"}
 """Words that faults of drives and of the bus have, too."""
 
 
-def disturbance(kind: str, **words: Any) -> Disturbance:
+def disturbance(kind: str, /, **words: Any) -> Disturbance:
     """A disturbance from its words.
 
     Args:
@@ -175,7 +178,9 @@ def disturbance_of_text(text: str) -> Disturbance:
         GoughError: as `disturbance`.
     """
     name, imus, words = words_of_text(text)
-    return disturbance(name.removeprefix(PREFIX), **({"imus": imus} if imus else {}), **words)
+    if imus and "imus" in words:
+        raise InputError(f"the IMUs come twice in {text!r}: {imus} and {words['imus']}")
+    return disturbance(name.removeprefix(PREFIX), **(words | ({"imus": imus} if imus else {})))
 
 
 def words_of_text(text: str) -> tuple[str, str, dict[str, str]]:
@@ -228,8 +233,8 @@ def course_in(words: Mapping[str, Any], title: str) -> tuple[Course, float, floa
         return Course.STEP, 0.0, inf
     values = {word: number_in(words, word, title) for word in (*given, "repeat_hz") if word in words}
     for word, value in values.items():
-        if not value > 0.0:
-            raise InputError(f"{title} has {word} = {value:g}; it must be positive")
+        if not 0.0 < value <= _GREATEST:
+            raise InputError(f"{title} has {word} = {value:g}; it must be positive, and at most {_GREATEST:g}")
     (word,) = given
     span = 1.0 / values[word] if word == "sine_hz" else values[word] * (1e-3 if word == "pulse_ms" else 1.0)
     every = 1.0 / values["repeat_hz"] if "repeat_hz" in values else inf

@@ -29,6 +29,8 @@ GYROSCOPE, ACCELEROMETER, MAGNETOMETER = 0, 1, 2
 _LONGEST_DELAY = 32
 _AT_ONCE = 1e-6
 """The share of its step by which a conversion may come after a cycle and count as its own, as rounding shifts both."""
+_SLOWEST = 1e-3
+"""The slowest clock over its nominal rate; several disturbances may add up to less."""
 _MOST_CONVERSIONS = 4096
 """The most conversions of an IMU in a cycle; what else fell due in a long gap is left out."""
 
@@ -239,7 +241,7 @@ def _convert_when_due(s: Record, imu: int, ideal: Array) -> None:
     own, faster, jitter = clock_of(s.disturbance, s.disturbances, imu, s.time)
     own, jitter, rate = own or s.rate[imu] > 0.0, jitter + s.jitter, s.rate[imu]
     if own:
-        step = 1.0 / ((rate if rate > 0.0 else 1.0 / s.period) * (1.0 + faster) * s.conversions)
+        step = 1.0 / ((rate if rate > 0.0 else 1.0 / s.period) * max(1.0 + faster, _SLOWEST) * s.conversions)
     else:
         # The loop begins each sample, which is complete at the time of the cycle.
         step = (s.time - s.before) / s.conversions

@@ -105,7 +105,8 @@ def test_times_are_read_by_both_of_their_names(at, lasting):
         ("imu-turn:1,size_deg=big,axis=x", "has size_deg = 'big'; it must be a finite number"),
         ("imu-supply:1,size_v=1,ramp_s=1,sine_hz=3", "has ramp_s and sine_hz; it has one course, or none for a step"),
         ("imu-supply:1,size_v=1,repeat_hz=1", "has repeat_hz, which goes with pulse_ms"),
-        ("imu-supply:1,size_v=1,sine_hz=0", "has sine_hz = 0; it must be positive"),
+        ("imu-supply:1,size_v=1,sine_hz=0", "has sine_hz = 0; it must be positive, and at most 1e.06"),
+        ("imu-supply:1,size_v=1,sine_hz=1e300", "has sine_hz = 1e.300; it must be positive, and at most 1e.06"),
         ("imu-supply:1,size_v=1,for=0", "has for_s = 0; it must be positive"),
         ("imu-supply:1,size_v=1,pulse_ms=30,repeat_hz=50", "has pulses of 30 ms every 20 ms: they must not overlap"),
         ("imu-clock:1,size_percent=-100", "a clock needs more than -100"),
@@ -114,6 +115,9 @@ def test_times_are_read_by_both_of_their_names(at, lasting):
         ("imu-range:1,size_g=2,axis=x", "has no entry 'axis'"),
         ("imu-supply:1,size_v", "'size_v' in 'imu-supply:1,size_v' is no word with a value"),
         ("imu-supply:1,size_v=1,at=1,at_s=2", "or comes twice"),
+        ("imu-supply:1,size_v=1,imus=2", "the IMUs come twice in 'imu-supply:1,size_v=1,imus=2': 1 and 2"),
+        ("imu-supply:1,size_v=1,kind=turn", "has no entry 'kind'"),
+        ("imu-supply:1,size_v=1,=3", "has no entry ''"),
     ],
 )
 def test_what_is_wrong_is_told_with_the_remedy(text, message):

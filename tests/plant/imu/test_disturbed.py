@@ -187,6 +187,12 @@ def test_a_clock_told_to_halve_its_rate_gives_every_other_cycle_a_new_sample(rat
     assert fresh[begun:, 3].mean() == pytest.approx(0.5, abs=2.0 / rate)
 
 
+def test_clocks_that_together_would_stand_still_go_on_slowly() -> None:
+    state = disturbed(ImuModel("bare"), "imu-clock:3,size_percent=-60,at=0.0105", "imu-clock:3,size_percent=-60,at=0.0105")
+    fresh = run(state, at_rest(2100))[1]
+    assert fresh[11:, 3].sum() == 2 and fresh[:, 4].sum() == 2100
+
+
 def test_jitter_is_that_of_a_half_normal_distribution_and_reproducible() -> None:
     state, again = (disturbed(ImuModel("bare"), "imu-jitter:1,size_ms=0.05") for _ in range(2))
     _, _, times = run(state, at_rest(8000))
