@@ -5,6 +5,15 @@ BIN := .venv/bin
 OUT := out
 WORKERS ?= 2
 
+comma := ,
+
+# Installs with pip, and says every ten seconds that it goes on.
+define install
+@echo "Installing $(1) into .venv, once; all that a first run needs takes 1.1 GB and some minutes."
+@( for ((s = 10; ; s += 10)); do sleep 10 >/dev/null 2>&1 </dev/null; echo "  still installing: $$s s"; done ) & \
+	clock=$$!; trap "kill $$clock" EXIT; $(BIN)/pip install --quiet --constraint constraints.txt --editable '$(1)'
+endef
+
 .PHONY: demo test test-all test-endurance bench lint clean
 .DELETE_ON_ERROR:
 
@@ -49,17 +58,17 @@ clean:
 	@command -v cc >/dev/null || command -v gcc >/dev/null || command -v clang >/dev/null || \
 		{ echo "a C compiler is missing (it builds the plant): install one, on Debian with 'apt install gcc libc6-dev'"; exit 1; }
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[reports]'
+	$(call install,.[reports])
 	@touch $@
 
 .venv/installed-all: .venv/installed
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[all]'
+	$(call install,.[all])
 	@touch $@
 
 .venv/installed-test: .venv/installed-all
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[test]'
+	$(call install,.[test])
 	@touch $@
 
 .venv/installed-lint: .venv/installed-test
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[test,lint]'
+	$(call install,.[test$(comma)lint])
 	@touch $@

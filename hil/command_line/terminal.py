@@ -1,6 +1,7 @@
 """What the terminal shows: numbers, progress, and the state of a run."""
 
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from math import asin, atan2, degrees
@@ -17,7 +18,10 @@ QUANTILES = {"p50": "p50", "p99": "p99", "p99.9": "p999", "max": "max"}
 """How each quantile is printed, and its name in the figures."""
 
 _COMPILED_FUNCTIONS = 280
-"""How many functions numba compiles for the first simulation on a machine."""
+"""About how many functions numba compiles for the first simulation on a machine."""
+
+_QUIET_S = 10.0
+"""Without a terminal, a line tells at most so often that work goes on [s]."""
 
 
 def say(text: str) -> None:
@@ -62,13 +66,14 @@ def progress_bar(label: str) -> Iterator[Callable[..., None]]:
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     terminal = sys.stderr.isatty()
     with Progress(*columns, console=Console(stderr=True), transient=True, disable=not terminal) as bar:
-        task = bar.add_task(label, total=None)
+        task, tell = bar.add_task(label, total=None), _told_now_and_then()
 
         def compiling(functions: int) -> None:
-            if functions == 1 and not terminal:
-                print("compiling the controller, once: the next start takes seconds", file=sys.stderr)
             text = f"compiling function {functions} of about {_COMPILED_FUNCTIONS} (once; the next start takes seconds)"
-            bar.update(task, total=max(_COMPILED_FUNCTIONS, functions), completed=functions, description=text)
+            if not terminal:
+                tell(text)
+            # A bar that has reached its end would stand still, and its clock, too.
+            bar.update(task, total=max(_COMPILED_FUNCTIONS, functions + 1), completed=functions, description=text)
 
         def show(share: float, now: str = label) -> None:
             bar.update(task, total=1.0, completed=share, description=now)
@@ -78,6 +83,19 @@ def progress_bar(label: str) -> Iterator[Callable[..., None]]:
 
         with compilation_reported(compiling):
             yield show
+
+
+def _told_now_and_then() -> Callable[[str], None]:
+    """What prints a line if none was printed for a while."""
+    last = -_QUIET_S
+
+    def tell(text: str) -> None:
+        nonlocal last
+        if time.monotonic() - last >= _QUIET_S:
+            print(text, file=sys.stderr, flush=True)
+            last = time.monotonic()
+
+    return tell
 
 
 @contextmanager
@@ -103,19 +121,21 @@ def engine_at_work(settings: "EngineSettings", label: str) -> Iterator[tuple["En
 
 @contextmanager
 def live_view(mechanism: str, target: str, rate: float) -> Iterator[Callable[["RunState"], None]]:
-    """A view of a run, updated whenever it is called; nothing without a terminal."""
+    """A view of a run, updated whenever it is called; without a terminal, only a line now and then until it begins."""
     from rich.console import Console
     from rich.live import Live
 
+    title, began = f"{mechanism} follows {target} at {rate:g} Hz", time.monotonic()
     if not sys.stderr.isatty():
-        yield lambda state: None
+        tell = _told_now_and_then()
+        yield lambda state: tell(_preparing(began)) if state.latest is None and time.monotonic() - began > _QUIET_S else None
         return
     live = Live(console=Console(stderr=True), auto_refresh=False, transient=True)
 
     def show(state: "RunState") -> None:
         # The motion goes on when the terminal has gone.
         with suppress(OSError):
-            live.update(_view(f"{mechanism} follows {target} at {rate:g} Hz", state).rich(), refresh=True)
+            live.update(_view(title, state, began).rich(), refresh=True)
 
     live.start()
     try:
@@ -125,13 +145,18 @@ def live_view(mechanism: str, target: str, rate: float) -> Iterator[Callable[["R
             live.stop()
 
 
-def _view(title: str, state: "RunState") -> Table:
+def _preparing(began: float) -> str:
+    waited = time.monotonic() - began
+    return f"preparing plan, plant and machine code (compiled once: the next start takes seconds), {waited:.0f} s"
+
+
+def _view(title: str, state: "RunState", began: float) -> Table:
     from controller.safety.causes import Cause, Mode
 
     table = Table(title, "")
     latest: Any = state.latest
     if latest is None:
-        table.add("state", "preparing plan, plant and machine code (compiled once: the next start takes seconds)")
+        table.add("state", _preparing(began))
         return table
     position, r = 1e3 * latest["position"], latest["rotation"]
     angles = (atan2(r[2, 1], r[2, 2]), asin(max(-1.0, min(1.0, -r[2, 0]))), atan2(r[1, 0], r[0, 0]))

@@ -67,8 +67,9 @@ class SimulationResult:
 
     @property
     def moved(self) -> bool:
-        """Whether the run went beyond the hold on the brakes."""
-        return bool(len(self.times)) and bool(self.times[-1] >= 0.0)
+        """Whether the run went beyond the hold on the brakes, with a reference that is a pose."""
+        first = int(np.searchsorted(self.times, 0.0))
+        return first < len(self.times) and bool(np.isfinite(self.reference_positions[first]).all())
 
     @property
     def truth_known(self) -> bool:

@@ -236,7 +236,7 @@ def test_a_replay_says_how_it_came_out(monkeypatch, capsys, tmp_path, changes, s
 
 def test_the_view_of_a_run_shows_the_latest_cycle():
     records, link, state = np.zeros(5, RECORD), np.zeros(LINK_SIZE, np.int64), RunState()
-    assert "preparing" in _view("title", state).rows[0][1].text
+    assert "preparing" in _view("title", state, 0.0).rows[0][1].text
     roll, pitch, yaw = np.radians([10.0, -20.0, 30.0])
     turns = [rotation_from_vector(vector) for vector in ([0, 0, yaw], [0, pitch, 0], [roll, 0, 0])]
     records["cycle"] = np.arange(5)
@@ -249,7 +249,7 @@ def test_the_view_of_a_run_shows_the_latest_cycle():
     link[Link.HEAD] = 4
     state.update(records, link)
     state.refused, state.events = ["a"], ["b"]
-    rows = {row[0].text: row[1].text for row in _view("title", state).rows}
+    rows = {row[0].text: row[1].text for row in _view("title", state, 0.0).rows}
     assert rows["state"] == "stopping: asked for, 2.5 s"
     assert rows["position [mm]"].split() == ["1.000", "-2.000", "500.000"]
     assert rows["roll, pitch, yaw [deg]"].split() == ["10.000", "-20.000", "30.000"]

@@ -1,6 +1,8 @@
-"""What the terminal shows of an engine."""
+"""What the terminal shows of an engine, and while numba compiles: it never stands still, with a terminal or without."""
 
 import os
+import pty
+import re
 import signal
 import subprocess
 import sys
@@ -8,9 +10,66 @@ from pathlib import Path
 
 import pytest
 
+from hil.command_line import terminal
 from hil.command_line.terminal import engine_at_work
 from hil.engine.settings import EngineSettings
+from hil.runs.run_state import RunState
 from tests.hil.processes import wait_until
+
+COMPILES = """
+import time
+from numba.core import event
+from hil.command_line import terminal
+terminal._COMPILED_FUNCTIONS, terminal._QUIET_S = 3, {quiet}
+with terminal.progress_bar("hexapod follows circle"):
+    for _ in range(8):
+        event.start_event("numba:compile")
+        time.sleep(0.4)
+"""
+
+
+def on_a_terminal(code):
+    """What a program draws on a terminal."""
+    ours, theirs = pty.openpty()
+    environment = {**os.environ, "COLUMNS": "160", "TERM": "xterm"}
+    process = subprocess.Popen([sys.executable, "-c", code], stderr=theirs, stdout=theirs, env=environment)
+    os.close(theirs)
+    drawn = b""
+    try:
+        while chunk := os.read(ours, 1 << 16):
+            drawn += chunk
+    except OSError:
+        # The other side has closed.
+        pass
+    os.close(ours)
+    assert process.wait() == 0
+    return drawn.decode()
+
+
+def test_the_clock_of_the_bar_goes_on_when_more_functions_are_compiled_than_expected():
+    drawn = on_a_terminal(COMPILES.format(quiet=10.0))
+    frames = re.findall(r"compiling function (\d+) of about 3.*?(\d+:\d\d:\d\d)", drawn)
+    beyond = {clock for number, clock in frames if int(number) > 3}
+    assert {"0:00:01", "0:00:02"} <= beyond
+
+
+def test_without_a_terminal_a_line_tells_now_and_then_that_it_goes_on():
+    run = subprocess.run([sys.executable, "-c", COMPILES.format(quiet=1.0)], capture_output=True, text=True, check=True)
+    numbers = [int(each) for each in re.findall(r"^compiling function (\d+) of about 3 ", run.stderr, re.MULTILINE)]
+    assert numbers[0] == 1 and 2 <= len(numbers) <= 5 and numbers[-1] > 3
+
+
+@pytest.mark.parametrize(("waited", "lines"), [(5.0, 0), (35.0, 1)])
+def test_without_a_terminal_a_run_that_takes_long_to_begin_says_so(monkeypatch, capsys, waited, lines):
+    now = [100.0]
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
+    with terminal.live_view("hexapod", "circle", 1000.0) as show:
+        now[0] += waited
+        for _ in range(3):
+            show(RunState())
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == lines
+    assert all("preparing" in line and "35 s" in line for line in told)
 
 
 @pytest.mark.slow
