@@ -33,9 +33,9 @@ def pose_from_lengths(mechanism: Mechanism, lengths: ArrayLike, guess: Pose | No
     return Pose(positions[0], rotations[0])
 
 
-def poses_from_lengths(mechanism: Mechanism, lengths: ArrayLike, guess: Pose) -> tuple[Array, Array]:
+def poses_from_lengths(mechanism: Mechanism, lengths: ArrayLike, guess: Pose, partial: bool = False) -> tuple[Array, Array]:
     """Positions (N, 3) [m] and rotations (N, 3, 3) of a motion given by lengths (N, n) [m] of n legs. Each pose is the first
-    guess for the next.
+    guess for the next. If `partial`, all from the first one on that is not found are NaN.
 
     Raises:
         InputError: wrong shape or not finite, or the guess is no pose.
@@ -44,7 +44,8 @@ def poses_from_lengths(mechanism: Mechanism, lengths: ArrayLike, guess: Pose) ->
     given = numbers(lengths, "lengths", f"(N, {mechanism.legs})")
     given = checked_array(given, (len(given) if given.ndim else 0, mechanism.legs), "lengths")
     positions, rotations, found, _ = _follow(mechanism, given, guess)
-    if found < len(given):
+    positions[found:], rotations[found:] = np.nan, np.nan
+    if found < len(given) and not partial:
         raise SingularConfigurationError(f"no pose near the one before has the lengths of row {found}")
     return positions, rotations
 

@@ -6,6 +6,7 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controller.direct_kinematics import poses_from_lengths
 from controller.planning.offline_planner import Reference
@@ -45,7 +46,8 @@ class SimulationResult:
     Attributes:
         times: (N,) [s]; 0 is the end of the hold.
         records: (N,), dtype `hil.loop.records.RECORD`.
-        reference_positions, reference_rotations: (N, 3) [m] and (N, 3, 3), the planned poses.
+        reference_positions, reference_rotations: (N, 3) [m] and (N, 3, 3), the planned poses; NaN from where on the planned
+            lengths belong to no pose near the one before, as they may in a stop.
         target_positions, target_rotations: (N, 3) [m] and (N, 3, 3), the raw target.
         real_time_factor: simulated time over the time that planning and loop took.
         remarks: what was said before it began.
@@ -88,18 +90,22 @@ class SimulationResult:
         return rotations_from_quaternions(np.ascontiguousarray(self.records["truth"][:, TRUTH_QUATERNION]))
 
     def summary(self) -> dict[str, Any]:
-        """The figures, in SI units, over the time after the hold; None for those that need the truth where it is not known."""
+        """The figures, in SI units, over the time after the hold; None for those that need the truth where it is not known.
+
+        What is compared with the reference counts where that is a pose.
+        """
         moving = self.times >= 0.0
         estimate = (self.records["position"][moving], self.records["rotation"][moving])
         reference = (self.reference_positions[moving], self.reference_rotations[moving])
         target = (self.target_positions[moving], self.target_rotations[moving])
         truth = (self.true_positions[moving], self.true_rotations[moving]) if self.truth_known else None
-        planned = {f"reference_{name}": value for name, value in _figures(reference, target).items()}
+        known = np.isfinite(reference[0]).all(axis=1)
+        planned = {f"reference_{name}": value for name, value in _figures(reference, target, known).items()}
         return {
             "truth_known": self.truth_known,
             "estimation": None if truth is None else _figures(estimate, truth),
-            "tracking": None if truth is None else _figures(truth, reference),
-            "estimated_tracking": _figures(estimate, reference),
+            "tracking": None if truth is None else _figures(truth, reference, known),
+            "estimated_tracking": _figures(estimate, reference, known),
             "target": planned if truth is None else _figures(truth, target) | planned,
             "limits": {"violations": self.reference.violations},
             "target_stretch": required_stretch(self.mechanism, self.target),
@@ -186,13 +192,14 @@ def _result(
     lengths = records["reference"][:, : loop.mechanism.legs, 0]
     return SimulationResult(
         config, loop.mechanism, loop.target, loop.reference, times, records,
-        *poses_from_lengths(loop.mechanism, lengths, loop.target.start), *loop.target.at(times),
+        *poses_from_lengths(loop.mechanism, lengths, loop.target.start, partial=True), *loop.target.at(times),
         (done - first) / config.rate / took, snapshot, loop.remarks,
     )  # fmt: skip
 
 
-def _figures(poses: tuple[Array, Array], true: tuple[Array, Array]) -> dict[str, float]:
-    """RMS and largest errors of poses, positions (N, 3) and rotations (N, 3, 3)."""
+def _figures(poses: tuple[Array, Array], true: tuple[Array, Array], known: NDArray[np.bool_] | None = None) -> dict[str, float]:
+    """RMS and largest errors of poses, positions (N, 3) and rotations (N, 3, 3), of those that are `known`."""
     errors = pose_errors(*poses, *true)
+    errors = errors if known is None else errors[known]
     largest = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2).max(axis=0)
     return rms_figures(errors) | {"position_max": float(largest[0]), "rotation_max": float(largest[1])}
