@@ -684,6 +684,10 @@ def test_a_motion_of_lengths_is_followed_row_by_row(hexapod):
     lengths[150, 2] = 5.0
     with pytest.raises(SingularConfigurationError, match="row 150"):
         poses_from_lengths(hexapod, lengths, hexapod.home)
+    some, some_turned = poses_from_lengths(hexapod, lengths, hexapod.home, partial=True)
+    np.testing.assert_array_equal(some[:150], found[:150])
+    np.testing.assert_array_equal(some_turned[:150], turned[:150])
+    assert np.isnan(some[150:]).all() and np.isnan(some_turned[150:]).all()
 
 
 @settings(max_examples=60, deadline=None)

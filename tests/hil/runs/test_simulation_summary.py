@@ -72,6 +72,17 @@ def test_every_figure_compares_its_own_two_poses_after_the_hold(known):
     assert summary["cycle_us"] == pytest.approx(dict.fromkeys(("p50", "p99", "p999"), 126.0))
 
 
+def test_figures_are_of_the_reference_as_far_as_it_is_a_pose():
+    whole, result = made_up(), made_up()
+    last = len(result.times) - 5
+    result.reference_positions[last:], result.reference_rotations[last:] = np.nan, np.nan
+    cut = {name: value[:last] for name, value in vars(whole).items() if isinstance(value, np.ndarray) and value.ndim}
+    expected = SimulationResult(**vars(whole) | cut).summary()
+    for group in ("tracking", "estimated_tracking"):
+        assert result.summary()[group] == expected[group]
+    assert result.summary()["estimation"] == whole.summary()["estimation"]
+
+
 def test_a_run_has_moved_from_the_end_of_the_hold_on():
     result = made_up()
     assert result.moved
