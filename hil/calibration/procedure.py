@@ -6,11 +6,13 @@
 4. With this it rests at twenty wide poses: a better one.
 5. With that it shakes: the constants that rests alone leave open.
 
-Between these runs the rig stands on its brakes. Recordings can replace all runs.
+Between these runs the rig stands on its brakes. The motions keep to what the drives can do with all legs at once. If it fails,
+the last run can be kept. Recordings can replace all runs.
 """
 
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -27,13 +29,15 @@ from controller.planning.motions import REST_S
 from controller.safety import watch_nothing
 from hil.calibration.assessment import assess, constants, cross_validate
 from hil.calibration.data import CalibrationData, Knowledge
+from hil.calibration.drives import within_drives
 from hil.calibration.known_poses import calibrate_by_known_poses
 from hil.loop.records import Link
 from hil.progress import Progress, no_progress, part_of
-from hil.recording.mcap import Recording, RecordingError, read
+from hil.recording.mcap import Recorder, Recording, RecordingError, read
 from hil.runs.config import SimulationConfig
+from hil.runs.names import name_of
 from hil.runs.prepare import prepared_loop
-from hil.runs.simulation import SimulationStoppedError, simulate
+from hil.runs.simulation import SimulationResult, SimulationStoppedError, simulate
 from plant.compiled import Record
 from plant.errors import CalibrationError
 from plant.imu import GYROSCOPE
@@ -54,8 +58,72 @@ class RigCalibration:
     summary: dict[str, Any]
 
 
+class FailedCalibrationError(CalibrationError):
+    """A calibration on the rig has failed; `result` is its last run, if the loop was closed."""
+
+    def __init__(self, message: str, result: SimulationResult | None) -> None:
+        super().__init__(message)
+        self.result = result
+
+
+@dataclass(eq=False)
+class _Rig:
+    """Drives the rig, and keeps the last run: the configuration, its constants and reference, and its records."""
+
+    header: dict[str, Any] = field(default_factory=dict)
+    records: Record | None = None
+    result: SimulationResult | None = None
+
+    def run_open(self, config: SimulationConfig, blind: bool = False) -> Record:
+        """The records of a run with the loop open: the IMUs do not matter, and the drives follow the planned speeds.
+
+        If `blind`, there is no feed-forward for the load: the platform sinks by millimetres.
+        """
+        with prepared_loop(config) as loop:
+            loop.parameters["pid"]["gains"] = 0.0
+            watch_nothing(loop.parameters)
+            if blind:
+                loop.parameters["load"]["droop"] = 0.0
+            loop.run(len(loop.records))
+            records = loop.records[: int(loop.link[Link.HEAD])].copy()
+            self._note(config, loop.mechanism, loop.parameters.copy(), loop.segments, records, None)
+        return records
+
+    def run_closed(self, config: SimulationConfig, progress: Progress) -> Record:
+        """The records of a run with the loop closed."""
+        stopped = None
+        try:
+            result = simulate(config, progress)
+        except SimulationStoppedError as error:
+            stopped, result = error, error.result
+        self._note(config, result.mechanism, result.parameters, result.reference.segments, result.records, result)
+        if stopped is not None:
+            raise CalibrationError(f"the rig stopped at {config.target}: {stopped}: check the IMUs' errors and the drives")
+        return result.records
+
+    def _note(
+        self, config: SimulationConfig, mechanism: Mechanism, parameters: Any, reference: Any, records: Record, result: Any
+    ) -> None:
+        about = {"mechanism_name": mechanism.name, "version": version("gough"), "run": f"{time.time_ns():x}"}
+        self.header = {"config": {**asdict(config), **about}, "parameters": parameters, "reference": reference}
+        self.records, self.result = records, result
+
+    def keep(self, path: Path) -> str:
+        """Record the last run, if there was one, in an MCAP file; returns words that say so."""
+        if self.records is None:
+            return ""
+        recorder = Recorder(path, self.header, time.time_ns())
+        recorder.write(self.records)
+        recorder.close()
+        return f"; its last run is recorded in {path}"
+
+
 def calibrate_rig(
-    config: SimulationConfig, knowledge: Knowledge = _NOTHING, progress: Progress = no_progress, validate: bool = True
+    config: SimulationConfig,
+    knowledge: Knowledge = _NOTHING,
+    progress: Progress = no_progress,
+    validate: bool = True,
+    failed: Path | None = None,
 ) -> RigCalibration:
     """Drive the rig and calibrate its IMUs.
 
@@ -63,14 +131,27 @@ def calibrate_rig(
         config: mechanism, IMUs, seed, rate and plant; target and durations do not matter.
         knowledge: besides the samples.
         validate: whether to compare calibrations by parts of the data as well.
+        failed: the MCAP file that keeps the last run if the calibration fails.
 
     Raises:
-        CalibrationError: an IMU is not as it should be, or the data do not give a calibration.
+        FailedCalibrationError: an IMU is not as it should be, or the data do not give a calibration.
         GoughError: something in the configuration cannot be used.
     """
+    rig = _Rig()
+    try:
+        return _calibrate(rig, config, knowledge, progress, validate)
+    except CalibrationError as error:
+        kept = "" if failed is None else rig.keep(failed)
+        raise FailedCalibrationError(f"{error}{kept}", rig.result) from None
+
+
+def _calibrate(rig: _Rig, config: SimulationConfig, knowledge: Knowledge, progress: Progress, validate: bool) -> RigCalibration:
+    mechanism = load_spatial(config.mechanism)
+    data = CalibrationData(mechanism, config.imu, config.rate, knowledge, config.seed)
+    if (driven := within_drives(mechanism)) is not mechanism:
+        config = replace(config, mechanism=name_of("mechanism", driven))
     config = replace(config, raw_imus=True)
-    data = CalibrationData(load_spatial(config.mechanism), config.imu, config.rate, knowledge, config.seed)
-    probing = run_open(replace(config, target="probing", duration=_PROBING_S, hold=_ZEROING_S), blind=True)
+    probing = rig.run_open(replace(config, target="probing", duration=_PROBING_S, hold=_ZEROING_S), blind=True)
     data.begin(probing, round(_ZEROING_S * config.rate))
     data.check_places(probing)
     calibration, known = Calibration(), None
@@ -83,13 +164,13 @@ def calibrate_rig(
         shaking = replace(config, target="shaking", duration=_SHAKING_S)
         save_calibration(file, calibration)
         if knowledge.known_poses:
-            known = calibrate_by_known_poses(data, [run_open(wide)])
-        data.add_rests(run_open(near))
+            known = calibrate_by_known_poses(data, [rig.run_open(wide)])
+        data.add_rests(rig.run_open(near))
         save_calibration(file, data.at_rest().calibration())
-        data.add_rests(_run_closed(wide, part_of(progress, _NEAR_S / _WHOLE_S, _WIDE_S / _WHOLE_S)))
+        data.add_rests(rig.run_closed(wide, part_of(progress, _NEAR_S / _WHOLE_S, _WIDE_S / _WHOLE_S)))
         at_rest = data.at_rest()
         save_calibration(file, at_rest.calibration())
-        motion = _run_closed(shaking, part_of(progress, 1.0 - _SHAKING_S / _WHOLE_S, _SHAKING_S / _WHOLE_S))
+        motion = rig.run_closed(shaking, part_of(progress, 1.0 - _SHAKING_S / _WHOLE_S, _SHAKING_S / _WHOLE_S))
     return _finish(data, at_rest, [motion], known, validate)
 
 
@@ -133,28 +214,6 @@ def _every_cycle(records: Record) -> Record:
     cycles = records["cycle"]
     filled: Record = records[np.searchsorted(cycles, np.arange(cycles[0], cycles[-1] + 1), side="right") - 1]
     return filled
-
-
-def run_open(config: SimulationConfig, blind: bool = False) -> Record:
-    """The records of a run with the loop open: the IMUs do not matter, and the drives follow the planned speeds.
-
-    If `blind`, there is no feed-forward for the load: the platform sinks by millimetres.
-    """
-    with prepared_loop(config) as loop:
-        loop.parameters["pid"]["gains"] = 0.0
-        watch_nothing(loop.parameters)
-        if blind:
-            loop.parameters["load"]["droop"] = 0.0
-        loop.run(len(loop.records))
-        return loop.records[: int(loop.link[Link.HEAD])].copy()
-
-
-def _run_closed(config: SimulationConfig, progress: Progress) -> Record:
-    """The records of a run with the loop closed."""
-    try:
-        return simulate(config, progress).records
-    except SimulationStoppedError as error:
-        raise CalibrationError(f"the rig stopped at {config.target}: {error}: check the IMUs' errors and the drives") from None
 
 
 def _finish(

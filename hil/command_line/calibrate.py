@@ -46,12 +46,12 @@ def gough_calibrate_rig(options: Namespace) -> None:
 
     The mechanism rests at wide poses, which need not be known, and shakes for 40 s. Before that it finds out, with the loop
     open, whether each IMU works, and is mounted and wired correctly. Writes bias, scale, axes and mounting of every sensor,
-    with their covariance.
+    with their covariance. If it fails, the last run is recorded beside the output, and the report is that of this run.
     """
     from controller.calibration.at_rest import Prior
     from controller.calibration.file import save_calibration
     from hil.calibration.data import Knowledge
-    from hil.calibration.procedure import calibrate_recordings, calibrate_rig
+    from hil.calibration.procedure import FailedCalibrationError, calibrate_recordings, calibrate_rig
 
     if not 0.0 < options.tilt < 45.0:
         raise InputError(f"--tilt is {options.tilt:g} deg; it must be between 0 and 45")
@@ -71,7 +71,13 @@ def gough_calibrate_rig(options: Namespace) -> None:
         if options.recording:
             result = calibrate_recordings(options.recording, knowledge)
         else:
-            result = calibrate_rig(config, knowledge, progress)
+            failed = options.output.with_suffix(".failed.mcap")
+            try:
+                result = calibrate_rig(config, knowledge, progress, failed=failed)
+            except FailedCalibrationError as error:
+                if error.result is not None:
+                    cli.write_report(options, "run", error.result)
+                raise
     save_calibration(options.output, result.calibration)
     cli.write_json(options.json, result.summary)
     cli.write_report(options, "calibration", result)

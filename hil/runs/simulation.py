@@ -51,6 +51,7 @@ class SimulationResult:
         target_positions, target_rotations: (N, 3) [m] and (N, 3, 3), the raw target.
         real_time_factor: simulated time over the time that planning and loop took.
         remarks: what was said before it began.
+        parameters: the constants of the cycle, for a recording.
     """
 
     config: SimulationConfig
@@ -66,6 +67,7 @@ class SimulationResult:
     real_time_factor: float
     snapshot: Snapshot | None
     remarks: tuple[str, ...]
+    parameters: Record | None = None
 
     @property
     def moved(self) -> bool:
@@ -193,7 +195,7 @@ def _result(
     return SimulationResult(
         config, loop.mechanism, loop.target, loop.reference, times, records,
         *poses_from_lengths(loop.mechanism, lengths, loop.target.start, partial=True), *loop.target.at(times),
-        (done - first) / config.rate / took, snapshot, loop.remarks,
+        (done - first) / config.rate / took, snapshot, loop.remarks, loop.parameters.copy(),
     )  # fmt: skip
 
 

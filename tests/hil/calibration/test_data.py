@@ -9,7 +9,7 @@ from controller.calibration.file import Calibration
 from controller.inverse_kinematics import leg_lengths
 from hil.calibration import data as calibration_data
 from hil.calibration.data import CalibrationData, Knowledge, find_rests, is_long
-from hil.calibration.procedure import _every_cycle, run_open
+from hil.calibration.procedure import _every_cycle, _Rig
 from hil.loop.records import RECORD
 from hil.runs.config import SimulationConfig
 from plant.errors import CalibrationError
@@ -20,7 +20,7 @@ def test_the_rest_at_home_is_the_one_on_the_brakes():
     config = SimulationConfig(imu="mpu9150", seed=7, target="hold", duration=0.1, hold=1.0)
     mechanism = load_spatial(config.mechanism)
     data = CalibrationData(mechanism, config.imu, config.rate, Knowledge(home=True), config.seed)
-    data.begin(run_open(config, blind=True), 1000)
+    data.begin(_Rig().run_open(config, blind=True), 1000)
     assert data.rests.home and len(data.rests.readings) == 1
     np.testing.assert_allclose(data.truth[0, :3], mechanism.home.position, atol=2e-5)
 
