@@ -39,7 +39,7 @@ def made_up(known=True):
     mechanism = load_spatial("hexapod")
     target = load_target("hold", mechanism, 1.0)
     parts = SimulationConfig(), mechanism, target, SimpleNamespace(violations=3), times, records
-    return SimulationResult(*parts, *poses("reference"), *poses("target"), 12.0, None)
+    return SimulationResult(*parts, *poses("reference"), *poses("target"), 12.0, None, ())
 
 
 def distances(first, second):
