@@ -1,4 +1,4 @@
-"""The reference of each cycle: that of the motion, whose time begins when the run does, or that of a stop."""
+"""The reference of each cycle: that of the way to the motion's start, of the motion itself, or of a stop."""
 
 import numpy as np
 
@@ -24,10 +24,17 @@ def motion_cycle(rig: Record, time: Record, safety: Record) -> int:
 
 @kernel
 def update_reference(s: Record, rig: Record, time: Record, safety: Record, segments: Array) -> None:
-    """Evaluate the reference of this cycle, from the `segments` (6, n, 5) of the motion or those of a stop."""
-    stop = safety.stop
+    """Evaluate the reference of this cycle, from the `segments` (6, n, 5) of the motion, those of the approach, or those of a
+    stop.
+    """
+    stop, arming = safety.stop, safety.arming
+    to_go = rig.hold_cycles + arming.delay - time.cycle
     if stop.cause != Cause.NONE and safety.request == Request.ENABLED:
         evaluate_reference(stop.segments, (time.cycle - stop.cycle) * rig.period, s.index, s.motion)
+    elif safety.mode >= Mode.RUNNING and 0 < to_go <= arming.approach_cycles:
+        s.index[:] = 0
+        evaluate_reference(arming.approach, (arming.approach_cycles - to_go) * rig.period, s.index, s.motion)
+        s.index[:] = 0
     else:
         evaluate_reference(segments, motion_cycle(rig, time, safety) * rig.period, s.index, s.motion)
     s.due_cycle = time.cycle + 1

@@ -96,12 +96,15 @@ class SafetySettings(_Settings):
     patience: float = 0.05  # longest time of a deviation from a reference or of a drive [s]
     bus_patience: float = 0.02  # longest time without an answer of the rig [s]
     arming_distance: float = 0.01  # largest distance of a leg from the start of the target [m]
+    arming_drift: float = 1e-3  # largest change of a leg's mean length on the brakes, from one 50 ms to the next [m]
     arming_time: float = 1.0  # longest time for the checks before arming, and for the drives [s]
     watch_imus: float = 1.0  # 0 to ignore the disagreement of an IMU
 
     def for_raw_imus(self) -> "SafetySettings":
         """These settings for raw IMUs, whose errors move the pose by centimetres."""
-        wide = {name: max(getattr(self, name), _RAW_M) for name in ("stroke_margin", "following", "arming_distance")}
+        wide = {
+            name: max(getattr(self, name), _RAW_M) for name in ("stroke_margin", "following", "arming_distance", "arming_drift")
+        }
         return replace(self, watch_imus=0.0, **wide)
 
 

@@ -1,4 +1,5 @@
-"""The reference that the cycle follows: per actuator, cubic segments in time, evaluated every cycle; and the way to stop.
+"""The reference that the cycle follows: per actuator, cubic segments in time, evaluated every cycle; and the ways to the start
+of a motion and to a stop.
 
 `segments` (6, n, 5) holds rows for each actuator: start time [s], then length [m], rate, acceleration and jerk at the start.
 Unused rows start at infinity. The last segment never ends: a motion is planned for at least as long as it runs.
@@ -16,6 +17,9 @@ START, LENGTH, RATE, ACCELERATION, JERK = range(SEGMENT_SIZE)
 
 STOP_SEGMENTS = 4
 """A stop has three phases of constant jerk, and rest."""
+
+APPROACH_SEGMENTS = 4
+"""An approach has four phases of constant jerk, equally long."""
 
 
 @kernel
@@ -81,3 +85,29 @@ def plan_stop(reference: Array, most_acceleration: float, most_jerk: float, segm
         write_segment(segments[k, 3], at, (state[0], 0.0, 0.0), 0.0)
         longest = max(longest, at)
     return longest
+
+
+@kernel
+def approach_duration(distance: float, most_rate: float, most_acceleration: float, most_jerk: float) -> float:
+    """How long an approach over a distance [m] takes within the limits [s].
+
+    In a time T with four phases of the jerks j, -j, -j, j, an actuator moves by j T^3 / 32 from rest to rest, at most at a rate
+    of j T^2 / 16 and an acceleration of j T / 4.
+    """
+    by_rate, by_acceleration = 2.0 * distance / most_rate, np.sqrt(8.0 * distance / most_acceleration)
+    return float(max(by_rate, by_acceleration, (32.0 * distance / most_jerk) ** (1.0 / 3.0)))
+
+
+@kernel
+def plan_approach(lengths: Array, reference: Array, duration: float, segments: Array) -> None:
+    """Write the way (6, 4, 5) of every actuator from rest at its length (6,) to rest at the reference (6, 3), where all arrive
+    together after a duration [s].
+    """
+    phase = duration / APPROACH_SEGMENTS
+    for k in range(LEGS):
+        jerk = 32.0 * (reference[k, 0] - lengths[k]) / duration**3
+        state = lengths[k], 0.0, 0.0
+        for i in range(APPROACH_SEGMENTS):
+            j = jerk if i in (0, 3) else -jerk
+            write_segment(segments[k, i], i * phase, state, j)
+            state = state_after(state, j, phase)

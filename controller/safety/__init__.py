@@ -45,7 +45,8 @@ def watch_nothing(parameters: Record) -> None:
     """Let the cycle with these parameters arm and go on whatever it finds, for motions that do not rely on the estimate."""
     parameters["imus"]["noise"] = np.inf
     safety = parameters["safety"]
-    safety["monitor"]["active"], safety["arming"]["distance"] = 0, np.inf
+    safety["monitor"]["active"], safety["arming"]["approach"] = 0, 0
+    safety["arming"]["distance"] = safety["arming"]["drift"] = np.inf
     limits = safety["watch"]
     limits["most_lost_imus"], limits["conditioning"] = IMU_COUNT, 0.0
     limits["lengths"] = limits["plausible_lengths"] = -np.inf, np.inf

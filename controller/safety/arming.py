@@ -3,25 +3,44 @@
 import numpy as np
 
 from controller.estimation.imu_monitor import contradiction
+from controller.planning.segments import APPROACH_SEGMENTS, approach_duration, plan_approach
 from controller.safety.causes import Cause, DriveState, Mode, Request, report_event
 from controller.safety.stop import handle_cause
 from controller.settings import SafetySettings
 from plant.compiled import Record, filled, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
+from plant.mechanism import LEGS
+from plant.pose import Array
+
+_STILL_S = 0.05
+"""Over what time the estimate is averaged, to see whether it stands still [s]."""
+
+_AT_START_M = 1e-6
+"""Closer than this to the start of the target there is no way to go."""
 
 PARAMETERS = record_dtype(
     active=np.int64,  # whether the drives are to be enabled
     distance=np.float64,  # how far a leg may be from the start of the target [m]
     cycles=np.int64,  # how long arming may take
+    drift=np.float64,  # by how much a leg's mean length may change on the brakes, from one window to the next [m]
+    approach=np.int64,  # whether the reference begins at the estimated lengths
+    window=np.int64,  # samples of a length that are averaged
 )
 """The constants of arming."""
 
 STATE = record_dtype(
-    delay=np.int64,  # how many cycles arming took beyond the hold
+    delay=np.int64,  # how many cycles arming and the approach took beyond the hold
     obstacle=np.int64,  # what prevents it, a `Cause` with its leg or IMU, value and limit
     index=np.int64,
     value=np.float64,
     limit=np.float64,
+    samples=np.int64,  # of the lengths in the present window
+    sum=(np.float64, LEGS),  # of these lengths [m]
+    windows=np.int64,  # how many are full
+    mean=(np.float64, LEGS),  # of the lengths in the last full window [m]
+    drift=(np.float64, LEGS),  # by how much it has changed from that of the window before [m]
+    approach=(np.float64, (LEGS, APPROACH_SEGMENTS, 5)),  # the reference of the way to the start of the target
+    approach_cycles=np.int64,  # how long that takes
 )
 """How arming goes."""
 
@@ -29,7 +48,23 @@ STATE = record_dtype(
 def arming_parameters(settings: SafetySettings, rate: float, active: bool) -> Record:
     """The constants of arming (dtype `PARAMETERS`) in cycles of this rate [Hz]."""
     cycles = int(np.ceil(settings.arming_time * rate))
-    return filled(PARAMETERS, active=active, distance=settings.arming_distance, cycles=cycles)
+    return filled(
+        PARAMETERS,
+        active=active,
+        distance=settings.arming_distance,
+        cycles=cycles,
+        drift=settings.arming_drift,
+        approach=1,
+        window=max(1, round(_STILL_S * rate)),
+    )
+
+
+def longest_delay(parameters: Record) -> int:
+    """The most cycles by which a motion begins later than the hold ends, from the cycle's parameters."""
+    arming, limits = parameters["safety"]["arming"], parameters["safety"]["stop"]
+    names = ("velocity_limit", "acceleration_limit", "jerk_limit")
+    approach = approach_duration(float(arming["distance"]), *(float(limits[name]) for name in names))
+    return int(arming["cycles"]) + int(np.ceil(approach / float(parameters["rig"]["period"])))
 
 
 def describe_obstacle(state: Record) -> str:
@@ -48,10 +83,13 @@ def run_arming_checks(
 ) -> None:  # fmt: skip
     """Before the commands: from idle to armed, and from armed to running.
 
-    Idle becomes armed when the IMUs are plausible, the pose is in the workspace and where the target begins, and the drives
-    are there. Armed becomes running when all drives follow.
+    Idle becomes armed when the IMUs are plausible, the estimate stands still, the pose is in the workspace and where the target
+    begins, and the drives are there. Armed becomes running when all drives follow. The reference then begins where the legs
+    are, and the motion when they have come to its start.
     """
     a = s.arming
+    if s.mode == Mode.IDLE:
+        _take_lengths(p.arming, a, pose.lengths)
     if time.cycle < rig.hold_cycles or s.mode > Mode.ARMED:
         return
     if s.mode == Mode.IDLE:
@@ -70,13 +108,51 @@ def run_arming_checks(
                 a.obstacle, a.index, a.value, a.limit = Cause.NO_DRIVES, k, np.nan, np.nan
         if a.obstacle == Cause.NONE:
             s.mode = Mode.RUNNING
-            a.delay = time.cycle - rig.hold_cycles
+            if p.arming.approach != 0:
+                _begin_approach(p.stop, a, rig, pose.lengths, reference, pid)
+            a.delay = time.cycle + a.approach_cycles - rig.hold_cycles
             return
     if p.arming.active == 0:
         return
     a.delay = time.cycle + 1 - rig.hold_cycles
     if a.delay > p.arming.cycles:
         handle_cause(p, s, rig, time, reference, pid, a.obstacle, a.index, a.value, a.limit)
+
+
+@kernel
+def _take_lengths(p: Record, a: Record, lengths: Array) -> None:
+    """Add the legs' estimated lengths (6,) to the window, and compare it with the one before when it is full."""
+    a.samples += 1
+    for k in range(LEGS):
+        a.sum[k] += lengths[k]
+    if a.samples < p.window:
+        return
+    for k in range(LEGS):
+        mean = a.sum[k] / a.samples
+        a.drift[k] = abs(mean - a.mean[k])
+        a.mean[k] = mean
+        a.sum[k] = 0.0
+    a.samples = 0
+    a.windows += 1
+
+
+@kernel
+def _begin_approach(limits: Record, a: Record, rig: Record, lengths: Array, reference: Record, pid: Record) -> None:
+    """Plan the way from the estimated lengths (6,) to the reference, the start of the target, within the actuators' limits, and
+    let the reference begin there.
+    """
+    farthest = 0.0
+    for k in range(rig.legs):
+        farthest = max(farthest, abs(reference.motion[k, 0] - lengths[k]))
+    a.approach_cycles = 0
+    if farthest < _AT_START_M:
+        return
+    duration = approach_duration(farthest, limits.velocity_limit, limits.acceleration_limit, limits.jerk_limit)
+    a.approach_cycles = int(np.ceil(duration / rig.period))
+    plan_approach(lengths, reference.motion, a.approach_cycles * rig.period, a.approach)
+    for k in range(rig.legs):
+        reference.motion[k, 0] = lengths[k]
+        pid.error[k] = 0.0
 
 
 @kernel
@@ -117,6 +193,10 @@ def _find_obstacle(
         lost += imu_parameters.present[k] != 0 and imus.used[k] == 0
         if lost > p.watch.most_lost_imus:
             return Cause.NO_SENSORS.value, k, np.nan, np.nan
+    for k in range(rig.legs):
+        drift = s.arming.drift[k] if s.arming.windows > 1 else np.inf
+        if s.mode == Mode.IDLE and not drift <= p.arming.drift:
+            return Cause.NOT_STILL.value, k, drift, p.arming.drift
     for k in range(rig.legs):
         low, high = p.watch.lengths[k, 0], p.watch.lengths[k, 1]
         if not low <= lengths[k] <= high:

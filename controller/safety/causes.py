@@ -120,6 +120,7 @@ class Cause(IntEnum):
     TARGET_LOST = 35, "the target's stream has stopped", Reaction.STOP, "s"
     TARGET_JUMPS = 36, "the target jumps for leg {}", Reaction.STOP, "m"
     TARGET_NOT_FINITE = 37, "the target is not finite, or its quaternion is none", Reaction.STOP
+    NOT_STILL = 50, "not armed: the estimate of leg {} still drifts on the brakes within 50 ms", Reaction.STOP, "m"
 
     @property
     def short(self) -> str:
@@ -143,7 +144,8 @@ class Cause(IntEnum):
         return f"{text} ({value:.4g}{unit}{limited})"
 
 
-REACTION = np.array([cause.reaction.value for cause in Cause])
+REACTION = np.zeros(max(Cause) + 1, dtype=np.int64)
+REACTION[list(Cause)] = [cause.reaction.value for cause in Cause]
 """The reaction to each cause, by number."""
 
 EVENT_SLOTS = 8

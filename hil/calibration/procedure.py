@@ -84,7 +84,7 @@ class _Rig:
             watch_nothing(loop.parameters)
             if blind:
                 loop.parameters["load"]["droop"] = 0.0
-            loop.run(len(loop.records))
+            loop.run(loop.end)
             records = loop.records[: int(loop.link[Link.HEAD])].copy()
             self._note(config, loop.mechanism, loop.parameters.copy(), loop.segments, records, None)
         return records

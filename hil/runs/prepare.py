@@ -16,6 +16,7 @@ from controller.loop_margins import margin_remark
 from controller.planning.offline_planner import Reference, plan
 from controller.planning.plan_handover import rest
 from controller.planning.target import Target, load_target
+from controller.safety.arming import longest_delay
 from controller.safety.causes import Cause
 from controller.safety.stop import describe_end
 from controller.settings import control_settings, safety_settings, sensor_settings
@@ -56,7 +57,7 @@ class PreparedLoop(Loop):
     mechanism: Mechanism
     target: Target
     reference: Reference
-    end: int  # the cycle after the last of the motion
+    end: int  # the cycle after the last of the motion, if that begins with the end of the hold
     planning_time: float  # [s]
     remarks: tuple[str, ...]  # what a user should know before it runs, a line each
 
@@ -66,6 +67,16 @@ class PreparedLoop(Loop):
         if self.plant is None:
             raise InputError("this loop has no FMU")
         return self.plant
+
+    @property
+    def delay(self) -> int:
+        """By how many cycles the motion begins later than the hold ends, as far as that is known."""
+        return int(self.state["safety"]["arming"]["delay"])
+
+    def cycle_at(self, time: float) -> int:
+        """The cycle at a time of the motion [s], as far as it is known when the motion begins."""
+        rig = self.parameters["rig"]
+        return int(rig["hold_cycles"]) + self.delay + round(time / float(rig["period"]))
 
     def reason(self) -> str:
         """Why the run has ended, in words; if the plant has failed, its failure."""
@@ -115,8 +126,9 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             integrity_remark(mechanism, fusion, config.imus, config.magnetometer),
         ]
         count = int(parameters["rig"]["hold_cycles"]) + round(config.duration * config.rate)
+        most = count + longest_delay(parameters)
         if records is None:
-            _check_memory(config, count)
+            _check_memory(config, most)
         # Loads the planner, so that the planning time is that of the plan alone.
         plan(mechanism, load_target("hold", mechanism, 0.1), 0.1)
         began = time.perf_counter()
@@ -134,7 +146,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             parameters=parameters,
             state=np.zeros((), STATE),
             segments=reference.segments,
-            records=np.zeros(count, RECORD) if records is None else records,
+            records=np.zeros(most, RECORD) if records is None else records,
             end=count,
             plant=plant,
             mechanism=mechanism,

@@ -44,7 +44,7 @@ class SimulationResult:
     """What a simulation found.
 
     Attributes:
-        times: (N,) [s]; 0 is the end of the hold.
+        times: (N,) [s]; 0 is where the motion begins, after the hold and the approach to its start.
         records: (N,), dtype `hil.loop.records.RECORD`.
         reference_positions, reference_rotations: (N, 3) [m] and (N, 3, 3), the planned poses; NaN from where on the planned
             lengths belong to no pose near the one before, as they may in a stop.
@@ -101,7 +101,7 @@ class SimulationResult:
         reference = (self.reference_positions[moving], self.reference_rotations[moving])
         target = (self.target_positions[moving], self.target_rotations[moving])
         truth = (self.true_positions[moving], self.true_rotations[moving]) if self.truth_known else None
-        known = np.isfinite(reference[0]).all(axis=1)
+        known: NDArray[np.bool_] = np.isfinite(reference[0]).all(axis=1)
         planned = {f"reference_{name}": value for name, value in _figures(reference, target, known).items()}
         return {
             "truth_known": self.truth_known,
@@ -146,11 +146,11 @@ def simulate(
     with prepared_loop(config) as loop:
         for remark in loop.remarks:
             say(remark)
-        count = len(loop.records)
         if resumed is not None:
             resume_snapshot(resumed, loop)
         first, stop = int(loop.state["time"]["cycle"]), loop.state["safety"]["stop"]
-        saved = None if save_at is None else _cycle_at(save_at, loop, first)
+        if save_at is not None:
+            _check_time(save_at, loop, first)
         snapshot = filters = None
         if config.fusion == "filterpy":
             from controller.estimation.filterpy_filters import FilterpyFilters
@@ -158,31 +158,31 @@ def simulate(
             filters = FilterpyFilters(loop.parameters)
         cause, took = Cause.NONE.value, loop.planning_time
         done, chunk = first, 1
-        while cause == Cause.NONE and done < count:
-            last = min(done + chunk, saved if saved is not None and done < saved else count)
+        while cause == Cause.NONE and done < loop.cycle_at(config.duration):
+            saved = None if save_at is None else loop.cycle_at(save_at)
+            last = min(done + chunk, saved if saved is not None and done < saved else loop.cycle_at(config.duration))
             began = time.perf_counter()
             cause = loop.run(last, filters)
             passed = time.perf_counter() - began
             took, done = took + passed, last
             # As many cycles as fit, whatever a cycle costs on this plant.
             chunk = max(1, min(2 * chunk, int(chunk * _CHUNK_S / max(passed, 1e-6))))
-            if cause == Cause.NONE and last == saved and stop["cause"] == Cause.NONE:
+            if cause == Cause.NONE and save_at is not None and last == loop.cycle_at(save_at) and stop["cause"] == Cause.NONE:
                 snapshot = take_snapshot(asdict(config), loop)
-            progress((done - first) / (count - first))
+            progress(min((done - first) / (loop.cycle_at(config.duration) - first), 1.0))
         result = _result(config, loop, first, snapshot, took)
         if stop["cause"] != Cause.NONE:
             how = "stopped on the brakes" if cause != Cause.NONE else "still stopping at the end, from"
+            count = loop.cycle_at(config.duration)
             raise SimulationStoppedError(f"{how} at cycle {stop['cycle']} of {count}: {loop.reason()}", result)
     return result
 
 
-def _cycle_at(at: float, loop: PreparedLoop, first: int) -> int:
-    period, hold = float(loop.parameters["rig"]["period"]), int(loop.parameters["rig"]["hold_cycles"])
-    cycle = hold + round(at / period) if np.isfinite(at) else -1
-    if not first < cycle <= len(loop.records):
-        least, most = ((cycle - hold) * period for cycle in (first, len(loop.records)))
+def _check_time(at: float, loop: PreparedLoop, first: int) -> None:
+    period, begin, end = float(loop.parameters["rig"]["period"]), loop.cycle_at(0.0), loop.end + loop.delay
+    if not (np.isfinite(at) and first < loop.cycle_at(at) <= end):
+        least, most = ((cycle - begin) * period for cycle in (first, end))
         raise InputError(f"a snapshot at {at:g} s is not within the motion: choose more than {least:g}, and at most {most:g} s")
-    return cycle
 
 
 def _result(
@@ -190,7 +190,7 @@ def _result(
 ) -> SimulationResult:
     done = int(loop.state["time"]["cycle"])
     records = loop.records[first:done]
-    times = (np.arange(first, done) - int(loop.parameters["rig"]["hold_cycles"])) / config.rate
+    times = (np.arange(first, done) - loop.cycle_at(0.0)) / config.rate
     lengths = records["reference"][:, : loop.mechanism.legs, 0]
     return SimulationResult(
         config, loop.mechanism, loop.target, loop.reference, times, records,

@@ -72,16 +72,16 @@ def resume_snapshot(snapshot: Snapshot, loop: PreparedLoop) -> None:
     if snapshot.motion != _motion(loop, snapshot.cycle):
         remedy = "take the snapshot in a run of the same duration, with --save-at"
         raise InputError(f"{refused} another motion was planned until then: {remedy}")
-    if snapshot.cycle >= len(loop.records):
-        raise InputError(
-            f"the snapshot is of the end of its motion of {snapshot.config['duration']:g} s: go on with a longer --duration"
-        )
     if {name: len(kept) for name, kept in snapshot.memory.items()} != {name: array.nbytes for name, array in memory.items()}:
         raise InputError(f"{refused} its memory has another layout")
     kept: dict[str, Record] = {name: np.frombuffer(snapshot.memory[name], array.dtype) for name, array in memory.items()}
     broken = _broken(snapshot, kept)
     if broken is not None:
         raise InputError(f"{refused} {broken}: its file was forged or is damaged")
+    if snapshot.cycle >= loop.end + int(kept["state"]["safety"]["arming"]["delay"][0]):
+        raise InputError(
+            f"the snapshot is of the end of its motion of {snapshot.config['duration']:g} s: go on with a longer --duration"
+        )
     loop.simulated.restore(snapshot.plant)
     for name, array in memory.items():
         array[...] = kept[name].reshape(array.shape)

@@ -13,6 +13,13 @@ def cycle(parameters, state, measurement, segments):
     return compiled.cycle(parameters, state, measurement, segments, _MARKS)
 
 
+def follow_at_once(parameters):
+    """Parameters with which the reference is the motion's after the hold, wherever the legs are and however short that is."""
+    arming = parameters["safety"]["arming"]
+    arming["drift"], arming["approach"] = np.inf, 0
+    return parameters
+
+
 def run_stages(parameters, state, measurement, first, last=None):
     """The stages from `first` up to `last`, by default the first alone; the time stands still."""
     last = compiled.CycleStage(first + 1) if last is None else last

@@ -23,7 +23,7 @@ from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER, imu_state, load_im
 from plant.imu_wiring import ALL_IMUS
 from plant.mechanism import Mechanism, load_in_space
 from plant.pose import Pose
-from tests.controller.cycles import cycle, refine
+from tests.controller.cycles import cycle, follow_at_once, refine
 from tests.controller.leg_geometry import (
     angle_between,
     leg_directions,
@@ -46,7 +46,7 @@ DEGREE = np.pi / 180.0
 
 def parameters_of(mechanism, imus=ALL_IMUS, rate=RATE_HZ, **control):
     settings = control_settings(mechanism, **control), fusion_settings(mechanism)
-    return cycle_parameters(mechanism, rate, *settings, imus, safety=UNWATCHED)
+    return follow_at_once(cycle_parameters(mechanism, rate, *settings, imus, safety=UNWATCHED))
 
 
 def resting(lengths):

@@ -12,7 +12,7 @@ from controller.safety.causes import Cause
 from controller.settings import control_settings, fusion_settings
 from plant.mechanism import Mechanism, load_in_space
 from plant.pose import Pose
-from tests.controller.cycles import cycle
+from tests.controller.cycles import cycle, follow_at_once
 from tests.controller.leg_geometry import rotation_of, static_signals
 
 PLANT = {
@@ -62,7 +62,7 @@ def test_the_reference_is_sent_ahead_by_the_rigs_delay(mechanism, delay):
     lengths = leg_lengths(mechanism, mechanism.home.position, mechanism.home.rotation)
     signals = static_signals(mechanism, mechanism.home.position, mechanism.home.rotation)
     settings = control_settings(mechanism, hold=1e-3), fusion_settings(mechanism)
-    parameters = cycle_parameters(mechanism, 1000.0, *settings, command_delay=delay)
+    parameters = follow_at_once(cycle_parameters(mechanism, 1000.0, *settings, command_delay=delay))
     speeds, accelerations = np.linspace(-0.05, 0.05, 6), np.array([1.0, -2.0, 0.5, -0.5, 2.0, 0.0])
     found = []
     for motion in (np.zeros((6, 2)), np.column_stack([speeds, accelerations])):

@@ -7,7 +7,7 @@ from controller.cycle import STATE, cycle_parameters, prepare_next, skip_periods
 from controller.inverse_kinematics import leg_lengths
 from controller.safety.causes import Cause, Mode, Request
 from controller.settings import SafetySettings, control_settings, fusion_settings
-from tests.controller.cycles import cycle
+from tests.controller.cycles import cycle, follow_at_once
 from tests.controller.leg_geometry import static_signals
 
 RATE_HZ, PERIOD_S, HOLD = 500.0, 2e-3, 10
@@ -27,7 +27,7 @@ def moving(starts, speeds):
 @pytest.fixture
 def parameters(hexapod):
     settings = control_settings(hexapod, hold=HOLD * PERIOD_S), fusion_settings(hexapod)
-    return cycle_parameters(hexapod, RATE_HZ, *settings, safety=UNWATCHED)
+    return follow_at_once(cycle_parameters(hexapod, RATE_HZ, *settings, safety=UNWATCHED))
 
 
 def state_at(cycle_number, mode, delay=0, request=Request.ENABLED):

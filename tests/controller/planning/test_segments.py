@@ -7,7 +7,15 @@ from hypothesis import strategies as st
 from ruckig import ControlInterface, Ruckig, Trajectory
 
 from controller.planning.offline_planner import calculate, ruckig_input
-from controller.planning.segments import STOP_SEGMENTS, evaluate_reference, plan_stop, stop_phases
+from controller.planning.segments import (
+    APPROACH_SEGMENTS,
+    STOP_SEGMENTS,
+    approach_duration,
+    evaluate_reference,
+    plan_approach,
+    plan_stop,
+    stop_phases,
+)
 from plant.mechanism import Limits
 from tests.controller.planning.sampled_reference import sample_reference
 
@@ -169,3 +177,24 @@ def test_every_leg_stops_by_itself_and_the_slowest_tells_how_long_it_takes():
     np.testing.assert_allclose(np.diff(found[:-1], axis=0)[np.diff(times) < 1e-12], 0.0, atol=1e-9)
     np.testing.assert_allclose(found[-1, :, 0], reference[:, 0] + [state[0] for _, state, _ in each], atol=1e-12)
     np.testing.assert_array_equal(found[-1, :, 1:], 0.0)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(1e-6, 0.5), st.floats(0.01, 1.0), st.floats(0.1, 20.0), st.floats(1.0, 500.0))
+def test_an_approach_goes_from_rest_to_rest_at_one_of_the_limits(seed, farthest, rate, acceleration, jerk):
+    random = np.random.default_rng(seed)
+    lengths, ways = random.uniform(0.3, 0.5, 6), random.uniform(-1.0, 1.0, 6)
+    ways *= farthest / np.abs(ways).max()
+    reference, segments = np.zeros((6, 3)), np.full((6, APPROACH_SEGMENTS, 5), np.nan)
+    reference[:, 0] = lengths + ways
+    duration = approach_duration(farthest, rate, acceleration, jerk)
+    plan_approach(lengths, reference, duration, segments)
+    found, _ = evaluated(segments, np.linspace(0.0, duration, 41))
+    scale = [farthest, rate, acceleration]
+    np.testing.assert_allclose(found[0], np.column_stack([lengths, np.zeros((6, 2))]), rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose((found[-1] - reference) / scale, 0.0, atol=1e-9)
+    # All arrive together, on ways that are alike.
+    np.testing.assert_allclose(found[:, :, 0] - lengths, np.outer((found[:, 0, 0] - lengths[0]) / ways[0], ways), atol=1e-12)
+    used = np.abs(found[:, :, 1]).max() / rate, np.abs(found[:, :, 2]).max() / acceleration
+    used += (np.abs(segments[:, :, 4]).max() / jerk,)
+    assert max(used) == pytest.approx(1.0, rel=1e-9)

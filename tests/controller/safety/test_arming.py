@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from controller.cycle import skip_periods
+from controller.safety import watch_nothing
 from controller.safety.arming import arming_parameters, describe_obstacle
 from controller.safety.causes import Cause, DriveState, Mode, Request
 from controller.settings import SafetySettings
+from tests.controller.leg_geometry import static_signals
 from tests.controller.safety.test_safety import RATE_HZ, Bench
 
 ARMING_CYCLES = 500
@@ -130,7 +132,10 @@ def test_a_pose_that_is_lost_before_arming_is_waited_for(hexapod):
     bench.steps(bench.hold + 100)
     assert (bench.mode, obstacle(bench)[:2]) == (Mode.IDLE, (Cause.POSE_LOST, -1))
     bench.signals[:] = kept
-    bench.steps(100)
+    # The filters settle for 0.1 s, and the estimate stands still for another.
+    bench.steps(99)
+    assert (bench.mode, obstacle(bench)[0]) == (Mode.IDLE, Cause.NOT_STILL)
+    bench.steps(20)
     assert bench.mode == Mode.RUNNING
 
 
@@ -154,3 +159,71 @@ def test_a_pose_that_is_lost_between_armed_and_running_is_a_fault_at_once(hexapo
     without_pose(bench)
     bench.step(drive=DriveState.READY)
     assert (bench.mode, bench.state["safety"]["stop"]["cause"]) == (Mode.FAULT, Cause.POSE_LOST)
+
+
+@pytest.mark.parametrize(("factor", "armed"), [(1.01, True), (0.99, False)])
+def test_an_estimate_that_drifts_on_the_brakes_is_not_armed(hexapod, factor, armed):
+    """A platform that sinks; the limit is around what the means of the lengths over 50 ms change by, from one to the next."""
+    bench, home, lengths = Bench(hexapod), hexapod.home, []
+    window = int(bench.parameters["safety"]["arming"]["window"])
+    assert window == 0.05 * RATE_HZ
+    for number in range(bench.hold):
+        bench.signals[:] = static_signals(hexapod, home.position - [0.0, 0.0, 3e-5 * number], home.rotation)
+        bench.step()
+        lengths.append(bench.state["pose"]["lengths"].copy())
+    means = np.mean(np.reshape(lengths, (-1, window, 6)), axis=1)
+    drift = np.abs(means[-1] - means[-2])
+    np.testing.assert_allclose(bench.state["safety"]["arming"]["drift"], drift, rtol=1e-9)
+    assert drift.min() > 1e-4
+    limit = bench.parameters["safety"]["arming"]["drift"] = factor * drift.max()
+    bench.step()
+    assert (bench.mode == Mode.RUNNING) == armed
+    if armed:
+        return
+    first = int(np.argmax(drift > limit))
+    assert obstacle(bench) == (Cause.NOT_STILL, first, pytest.approx(drift[first]), limit)
+    assert f"the estimate of leg {first} still drifts on the brakes" in describe_obstacle(bench.state)
+    # When it stands still, two windows must pass.
+    assert Cause.ARMED in bench.steps(3 * window)
+
+
+@pytest.mark.parametrize("off", [0.009, -0.0075, 0.0004, 5e-6])
+def test_the_reference_begins_where_the_legs_are_and_comes_to_the_target_within_the_limits(hexapod, off):
+    bench, limits, period = Bench(hexapod), hexapod.limits, 1.0 / RATE_HZ
+    bench.segments[:, 0, 1] += off * np.array([1.0, -0.5, 0.2, 0.0, 0.7, 1.0])
+    bench.steps(bench.hold)
+    lengths, references = bench.state["pose"]["lengths"].copy(), []
+    # The legs stay, which these limits would end.
+    for name in ("following", "drive_deviation", "saturation"):
+        bench.parameters["safety"]["watch"][name] = np.inf
+    for number in range(200):
+        bench.signals[0, :, 0] = 1e-9 * (-1.0) ** number
+        bench.step()
+        references.append(bench.state["reference"]["motion"].copy())
+        assert bench.mode == Mode.RUNNING
+    references, arrived = np.array(references), int(bench.state["safety"]["arming"]["delay"])
+    # What is kept is the reference of the next cycle.
+    np.testing.assert_allclose(references[0, :, 0], lengths, rtol=0.0, atol=limits.jerk * period**3 / 6.0 + 1e-9)
+    assert 0 < arrived < 150
+    at_target = np.broadcast_to(bench.segments[:, 0], (201 - arrived, 6, 5))
+    np.testing.assert_allclose(references[arrived - 1 :], at_target[:, :, 1:4], rtol=0.0, atol=1e-9)
+    rates, accelerations = references[:, :, 1], references[:, :, 2]
+    assert np.abs(rates).max() <= limits.velocity and np.abs(accelerations).max() <= limits.acceleration
+    assert np.abs(np.diff(accelerations, axis=0)).max() <= 1.0001 * limits.jerk * period
+    # No leg need take longer: one cycle less would break a limit.
+    shorter = (arrived - 1) * period
+    needed = [
+        abs(off) * 2.0 / limits.velocity,
+        np.sqrt(abs(off) * 8.0 / limits.acceleration),
+        np.cbrt(abs(off) * 32.0 / limits.jerk),
+    ]
+    assert max(needed) > shorter
+
+
+def test_where_the_estimate_is_not_relied_upon_the_reference_begins_with_the_target(hexapod):
+    bench = Bench(hexapod)
+    watch_nothing(bench.parameters)
+    bench.segments[:, 0, 1] += 0.02
+    bench.steps(bench.hold + 1)
+    assert bench.mode == Mode.RUNNING and bench.state["safety"]["arming"]["delay"] == 0
+    np.testing.assert_array_equal(bench.state["reference"]["motion"][:, 0], bench.segments[:, 0, 1])

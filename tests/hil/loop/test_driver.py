@@ -162,7 +162,7 @@ def test_the_end_of_a_motion_is_a_stop_within_the_limits_and_the_brakes():
     with prepared_loop(CONFIG) as loop:
         cause, records = follow(scripted(loop), 1.234)
         assert cause == loop.state["safety"]["stop"]["cause"] == Cause.END_OF_MOTION
-        assert records["stop"].nonzero()[0][0] == 1234 + loop.parameters["rig"]["hold_cycles"]
+        assert records["stop"].nonzero()[0][0] == 1234 + loop.parameters["rig"]["hold_cycles"] + loop.delay
         stops_within_limits(loop, records)
         assert (loop.fmu["mode"] == BRAKE).all()
 

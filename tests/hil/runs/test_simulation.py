@@ -11,6 +11,7 @@ import pytest
 
 from controller.calibration.file import Calibration, calibrated_rig, save_calibration
 from controller.estimation.filterpy_filters import FilterpyLeg, FilterpyPlatform
+from controller.safety.causes import Mode
 from controller.settings import control_settings
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import prepared_loop
@@ -198,8 +199,12 @@ def test_imus_that_do_not_determine_the_pose_are_refused():
 
 def test_nothing_moves_while_the_brakes_hold():
     result = simulate(SimulationConfig(target="sines", duration=0.2))
-    hold = result.times < 0.0
+    hold = result.records["mode"] < Mode.RUNNING
     assert hold.sum() == 200
+    # Then the legs are brought to the start of the target, and its time begins.
+    approach = (result.times < 0.0) & ~hold
+    assert 0 < approach.sum() < 150 and len(result.times) == 400 + approach.sum()
+    assert result.times[-1] == pytest.approx(0.199)
     assert (result.records["command"][hold] == 0.0).all()
     moved = np.linalg.norm(result.true_positions[hold] - result.true_positions[0], axis=1)
     assert moved.max() < 20e-6
