@@ -71,7 +71,7 @@ class SimulationResult:
 
     @property
     def moved(self) -> bool:
-        """Whether the run went beyond the hold on the brakes, with a reference that is a pose."""
+        """Whether the run came to the start of the motion, with a reference that is a pose there."""
         first = int(np.searchsorted(self.times, 0.0))
         return first < len(self.times) and bool(np.isfinite(self.reference_positions[first]).all())
 
@@ -92,7 +92,7 @@ class SimulationResult:
         return rotations_from_quaternions(np.ascontiguousarray(self.records["truth"][:, TRUTH_QUATERNION]))
 
     def summary(self) -> dict[str, Any]:
-        """The figures, in SI units, over the time after the hold; None for those that need the truth where it is not known.
+        """The figures, in SI units, over the time of the motion; None for those that need the truth where it is not known.
 
         What is compared with the reference counts where that is a pose.
         """
@@ -101,7 +101,7 @@ class SimulationResult:
         reference = (self.reference_positions[moving], self.reference_rotations[moving])
         target = (self.target_positions[moving], self.target_rotations[moving])
         truth = (self.true_positions[moving], self.true_rotations[moving]) if self.truth_known else None
-        known: NDArray[np.bool_] = np.isfinite(reference[0]).all(axis=1)
+        known = np.isfinite(reference[0][:, 0])
         planned = {f"reference_{name}": value for name, value in _figures(reference, target, known).items()}
         return {
             "truth_known": self.truth_known,
