@@ -132,8 +132,10 @@ def refine_pose(p: Record, s: Record, rig: Record, time: Record, legs: Record, p
     )  # fmt: skip
     if time.cycle == 0:
         s.smooth_twist[:] = s.twist
-    share = min(1.0, elapsed(rig, time) * p.acceleration_rate)
+    # A period that is longer than the time constant takes the whole change of the twist.
+    period = elapsed(rig, time)
+    share, rate = min(1.0, period * p.acceleration_rate), min(p.acceleration_rate, 1.0 / period)
     for i in range(6):
-        s.acceleration[i] = (s.twist[i] - s.smooth_twist[i]) * p.acceleration_rate
+        s.acceleration[i] = (s.twist[i] - s.smooth_twist[i]) * rate
         s.smooth_twist[i] += share * (s.twist[i] - s.smooth_twist[i])
     return True

@@ -323,6 +323,23 @@ def test_the_acceleration_is_the_derivative_of_the_twist_with_its_time_constant(
     np.testing.assert_allclose(share, 1.0 - np.exp(-1.0), atol=0.05)
 
 
+@pytest.mark.parametrize(("rate", "missed"), [(50.0, 0), (70.0, 0), (100.0, 0), (400.0, 7)])
+def test_with_periods_longer_than_that_time_the_acceleration_is_the_change_of_the_twist(hexapod, rate, missed):
+    parameters, state, h = parameters_of(hexapod, rate=rate), np.zeros((), STATE), 1e-6
+    position, acceleration, period = hexapod.home.position, np.array([0.5, -0.3, 0.2]), (1 + missed) / rate
+    state["legs"]["directions"], state["pose"]["vectors"][0] = leg_directions(hexapod, position, np.eye(3)), hexapod.up_in_base
+    state["time"]["missed"] = missed
+    weigh(state, ALL_IMUS)
+    for k in range(5):
+        velocity = acceleration * k * period
+        ahead, behind = (leg_directions(hexapod, position + sign * h * velocity, np.eye(3)) for sign in (1.0, -1.0))
+        state["legs"]["rates"] = (ahead - behind) / (2.0 * h)
+        state["pose"]["position"], state["pose"]["rotation"] = position, np.eye(3)
+        assert refine(parameters, state)
+        state["time"]["cycle"] += 1
+    np.testing.assert_allclose(state["pose"]["acceleration"], [*acceleration, 0.0, 0.0, 0.0], atol=1e-6)
+
+
 # ---------------------------------------------------------------------------------------------------------------- the state
 
 
