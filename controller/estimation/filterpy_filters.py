@@ -165,9 +165,9 @@ class FilterpyPlatform(_Filterpy):
         bound = INNOVATION_LIMIT * period * np.sqrt(variance)
         self.velocity = self.velocity + np.clip(shown, -bound, bound)
         self._predict_errors(rate, period)
-        self.noise += self.force_variance * period**2
         faded = self.unknown - min(1.0, period / MEMORY_S) * (self.unknown + self.noise)
         self.unknown = max(0.0, faded, seen - INNOVATION_LIMIT**2 * self.noise)
+        self.noise += self.force_variance * period**2
         # The velocity is measured to be zero, along one axis after the other.
         self.R = np.array([[2.0 * CORRELATION_S * self.unknown / period]])
         both = np.trace(self.P[2:4, 2:4])

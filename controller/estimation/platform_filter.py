@@ -237,8 +237,9 @@ def step_platform(
     for i in range(2):
         x[VELOCITY + i] += cut_innovation(shown[i], variance)
     _predict_covariance(p, s, first, second, rate, t, gravity)
-    s.noise += p.force_variance * t * t
+    # This sample's own noise is left out: accelerations as small, which last, would be taken for gravity.
     s.unknown = faded_excess(s.unknown, seen, s.noise, t)
+    s.noise += p.force_variance * t * t
     _measure_no_velocity(s, velocity_density(s.unknown) / t)
     _correct(s, first, second)
 
