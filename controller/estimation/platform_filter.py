@@ -32,7 +32,7 @@ ERRORS = 7
 TILT_SIGMA = 0.15
 """Uncertainty of the vertical after the first sample [rad]."""
 
-CORRELATION_S = 0.025
+CORRELATION_S = 0.1
 """For how long the unknown velocity stays alike: with its square this gives its density."""
 
 FASTEST_MOTION = 300.0
