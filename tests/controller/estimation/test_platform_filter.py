@@ -130,7 +130,7 @@ def test_a_direction_turns_exactly(rate, period):
 
 @pytest.mark.parametrize(("noise", "seed"), [(0.05, 0), (0.1, 1), (0.15, 2)])
 def test_with_a_known_acceleration_it_is_the_kalman_filter_that_takes_the_rest_for_gravity(noise, seed):
-    """Over three thousand steps, to a tenth of the standard deviations, with less noise than the assumed 0.3 m/s2."""
+    """Over three thousand steps, to a fifth of the standard deviations, with less noise than the assumed 0.3 m/s2."""
     random = np.random.default_rng(seed)
     rotations, rates = tumbling(seed, 3000, speed=2.0)
     accelerations = random.normal(size=(3000, 3))
@@ -143,8 +143,8 @@ def test_with_a_known_acceleration_it_is_the_kalman_filter_that_takes_the_rest_f
         twin.step(*sample)
         if k > 100:
             off = np.concatenate([platform.vertical, platform.bias]) - twin.x
-            assert np.linalg.norm(off[:3]) < 0.1 * np.sqrt(np.trace(twin.covariance[:3, :3]))
-            assert np.linalg.norm(off[3:]) < 0.1 * np.sqrt(np.trace(twin.covariance[3:, 3:]))
+            assert np.linalg.norm(off[:3]) < 0.2 * np.sqrt(np.trace(twin.covariance[:3, :3]))
+            assert np.linalg.norm(off[3:]) < 0.2 * np.sqrt(np.trace(twin.covariance[3:, 3:]))
     across = np.linalg.svd(platform.vertical[None])[2][1:]
     for part, axes in ((slice(3), across), (slice(3, 6), np.eye(3))):
         np.testing.assert_allclose(
