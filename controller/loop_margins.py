@@ -115,7 +115,7 @@ def _estimate(
     felt = sideways @ point_jacobian(place)[:, moving] / np.linalg.norm(mechanism.plant["gravity"])
     gain, share = _tilt_gain(fusion) * period, min(1.0, period / fusion.acceleration_time)
     tilting = gain / (1.0 - (1.0 - gain) / z) * s**2
-    expected = (1.0 - share / z / (1.0 - (1.0 - share) / z)) / (fusion.acceleration_time * s) / z
+    expected = (1.0 - share / z / (1.0 - (1.0 - share) / z)) / (max(period, fusion.acceleration_time) * s) / z
     rectangles = s * period / (1.0 - 1.0 / z) - 1.0
     moved = one - _by_matrix(tilting) * (spread @ felt) + _by_matrix(rectangles) * (spread @ turns)
     pose = np.linalg.solve(one - _by_matrix(tilting * expected) * (spread @ felt), moved)

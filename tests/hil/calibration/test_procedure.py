@@ -10,6 +10,7 @@ import pytest
 from hil.calibration.data import Knowledge
 from hil.calibration.procedure import calibrate_recordings, calibrate_rig
 from hil.command_line import main
+from hil.loop.records import Link
 from hil.recording.mcap import Recorder
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import prepared_loop
@@ -40,12 +41,13 @@ def recorded(calibrated, tmp_path_factory):
 
 def record(path, config, truth=None):
     with prepared_loop(config) as loop:
-        loop.run(len(loop.records))
+        loop.run(loop.end)
+        records = loop.records[: int(loop.link[Link.HEAD])]
         if truth is not None:
-            loop.records["truth"] = truth
+            records["truth"] = truth
         header = {"config": {**asdict(config), "version": "0"}, "parameters": loop.parameters, "reference": loop.segments}
         recorder = Recorder(path, header, 0)
-        recorder.write(loop.records)
+        recorder.write(records)
         recorder.close()
 
 

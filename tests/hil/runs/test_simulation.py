@@ -91,18 +91,29 @@ def test_a_calibration_of_another_rig_is_refused_before_anything_runs(tmp_path):
             simulate(SimulationConfig(duration=0.05, calibration=str(path), **changes))
 
 
+def suited(tmp_path, rate):
+    """The hexapod with gains that suit the rate, as a run says that its own do not."""
+    if not 50.0 <= rate <= 100.0:
+        return "hexapod"
+    path = tmp_path / "slow.toml"
+    path.write_text('based_on = "hexapod"\n[control]\nproportional = 30.0\nintegral = 50.0\n')
+    return str(path)
+
+
 @pytest.mark.parametrize("rate", [50.0, 250.0, 4000.0])
-def test_the_loop_follows_at_other_rates(rate):
-    result = simulate(SimulationConfig(target="sines", duration=4.0, rate=rate))
+def test_the_loop_follows_at_other_rates(tmp_path, rate):
+    result = simulate(SimulationConfig(suited(tmp_path, rate), "sines", 4.0, rate=rate))
+    assert not any("gains" in remark for remark in result.remarks)
     assert errors(result, "tracking") < (3.0, 0.6)
 
 
 @pytest.mark.parametrize("rate", [50.0, 70.0, 100.0, 150.0, 200.0, 300.0, 500.0, 2000.0])
 @pytest.mark.parametrize("seeds", [1, pytest.param(4, marks=pytest.mark.slow)])
-def test_no_watch_stops_a_sound_run_at_any_rate(rate, seeds):
+def test_no_watch_stops_a_sound_run_at_any_rate(tmp_path, rate, seeds):
+    mechanism = suited(tmp_path, rate)
     for seed in range(seeds):
         for target in ("circle", "sines"):
-            records = simulate(SimulationConfig(target=target, duration=3.0, rate=rate, seed=seed)).records
+            records = simulate(SimulationConfig(mechanism, target, 3.0, rate=rate, seed=seed)).records
             # Armed, and nothing else: no IMU is left out.
             assert records["event_count"].sum() == 1, (seed, target)
 

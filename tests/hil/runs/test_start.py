@@ -38,7 +38,10 @@ def errors_after_a_tenth_of_a_second(path, fusion):
 )  # fmt: skip
 def test_with_a_home_that_is_shifted_the_estimate_is_right_or_the_axes_are_named(tmp_path, home, accepted, fusion):
     path = tmp_path / "shifted.toml"
-    path.write_text(f'based_on = "hexapod"\n[home]\nposition = {home}\n')
+    drives = (
+        "[limits]\nacceleration = 0.3\n[plant.drive]\ncurrent_limit = 30.0\nvoltage_limit = 48.0\n[plant.brake]\nforce = 5e3\n"
+    )
+    path.write_text(f'based_on = "hexapod"\n[home]\nposition = {home}\n{drives}')
     if accepted:
         assert errors_after_a_tenth_of_a_second(path, fusion).max() < 0.01
     else:
