@@ -17,6 +17,7 @@ from plant.errors import InputError
         rig={"required": True},
         rig_at={},
         mechanism={},
+        imu={},
         rate={"default": 200.0, "text": "exchanges per second, 50 to 4000"},
     ),
     cli.flag(
@@ -44,6 +45,7 @@ def gough_check_rig(options: Namespace) -> int:
     from hil.rigs.clauses import CLAUSES
     from hil.rigs.contract import examine_rig
     from hil.runs.prepare import rig_of
+    from plant.imu import aliasing_remark, load_imu
     from plant.mechanism import load_in_space
 
     if options.beyond is not None and not options.move:
@@ -75,6 +77,8 @@ def gough_check_rig(options: Namespace) -> int:
             f"compared: the accelerometers with gravity at home in {config.mechanism}; the commands and the gyroscopes with "
             "how the accelerometers tilt when a leg moves"
         )
+    if remark := aliasing_remark(load_imu(config.imu), config.rate):
+        print(remark)
     print(f"{len(examination.findings)} clauses checked, {len(found)} findings, {moved}")
     asked = {"rig": options.rig, "rig_at": options.rig_at, "rate": options.rate, "moved": options.move}
     cli.write_json(options.json, {**asked, **asdict(examination), "version": version("gough")})

@@ -1,6 +1,7 @@
 """The report of a simulation: summary, the moving mechanism and time series."""
 
 from collections.abc import Sequence
+from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,7 +43,8 @@ def write_report(result: SimulationResult, path: Path) -> None:
     """
     summary = result.summary()
     mechanism = figure_html("mechanism", "The mechanism", *_mechanism_view(result), "view")
-    body = overview(f"{_error_table(summary).html()}\n{_facts(summary)}", mechanism)
+    remarks = "".join(f"<p>{escape(remark[0].upper() + remark[1:])}.</p>" for remark in result.remarks)
+    body = overview(f"{_error_table(summary).html()}\n{_facts(summary)}{remarks}", mechanism)
     body += "".join(figure_html(*figure) for figure in _time_figures(result))
     title = f"gough: {result.mechanism.name} follows {result.target.name}"
     write_page(path, title, _configuration(result, summary), body, _SHARED_TIME)

@@ -40,7 +40,7 @@ from plant.fmu.build import building_default_fmu, default_fmu, model_of
 from plant.fmu.calls import FMU_HANDLE
 from plant.fmu.description_reader import FmuDescription
 from plant.fmu.plant import FmuPlant, check_number_of_legs, takes_parameters
-from plant.imu import add_disturbances, imu_state, load_imu
+from plant.imu import add_disturbances, aliasing_remark, imu_state, load_imu
 from plant.mechanism import Mechanism, load_in_space
 from plant.pose import Pose
 
@@ -124,6 +124,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             calibration.remark,
             margin_remark(mechanism, control, fusion, config.rate, config.imus, config.magnetometer),
             integrity_remark(mechanism, fusion, config.imus, config.magnetometer),
+            aliasing_remark(model, config.rate),
         ]
         count = int(parameters["rig"]["hold_cycles"]) + round(config.duration * config.rate)
         most = count + longest_delay(parameters)

@@ -1,5 +1,6 @@
 """IMU imperfections: from the ideal signals of a plant to the raw data of its IMUs."""
 
+from plant.imu.aliasing import aliasing_remark
 from plant.imu.disturbed import DISTURBANCE, MOST_DISTURBANCES, disturbance_record
 from plant.imu.model import MILLI_G, STANDARD_GRAVITY, ImuModel, SensorErrors
 from plant.imu.presets import PRESETS, load_imu
@@ -31,6 +32,7 @@ __all__ = [
     "SensorErrors",
     "Wiring",
     "add_disturbances",
+    "aliasing_remark",
     "disturbance_record",
     "imu_state",
     "load_imu",

@@ -130,6 +130,16 @@ def _turn(e: Record, d: Record, angle: float) -> None:
 
 
 @kernel
+def shakes(disturbances: Record, count: int, imu: int, since: float, until: float) -> bool:
+    """Whether vibration or shocks shake an IMU at some time from `since` to `until` [s]."""
+    for i in range(count):
+        d = disturbances[i]
+        if d.kind == DisturbanceKind.VIBRATION and (d.imus >> imu) & 1 != 0 and d.begin <= until and since < d.end:
+            return True
+    return False
+
+
+@kernel
 def clock_of(disturbances: Record, count: int, imu: int, time: float) -> tuple[bool, float, float]:
     """Whether an IMU has got a clock of its own, by how much that is faster than nominal (relative), and its jitter [s]."""
     own, faster, jitter = False, 0.0, 0.0

@@ -70,6 +70,8 @@ class ImuModel:
     clock_error: float = 0.0  # greatest relative error of its own clock, uniform
     jitter: float = 0.0  # RMS of the time by which a conversion comes early [s]
     conversion_rate: float = 0.0  # of the conversions that the low-pass takes in, a multiple of the samples' [Hz]; 0: one each
+    low_passes: tuple[tuple[float, float, int], ...] = ()  # its settings: bandwidth of gyroscope, accelerometer [Hz]; order
+    sparing: bool = False  # whether it converts once a sample while nothing shakes it, as signals hardly curve between samples
     disturbances: tuple[Disturbance, ...] = ()  # that are part of its normal life
 
     def __post_init__(self) -> None:

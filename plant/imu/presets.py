@@ -12,6 +12,14 @@ from plant.files import check_entries, read_toml
 from plant.imu.model import MILLI_G, STANDARD_GRAVITY, ImuModel, SensorErrors
 from plant.imu_disturbances import SENSORS, disturbance, disturbance_of_table
 
+_MPU9150_LOW_PASSES = (
+    (256.0, 260.0, 1), (188.0, 184.0, 4), (98.0, 94.0, 4), (42.0, 44.0, 2), (20.0, 21.0, 1), (10.0, 10.0, 1), (5.0, 5.0, 1),
+)  # fmt: skip
+"""DLPF_CFG of the MPU-9150 (register map RM-MPU-9150A, register 26), with the order that comes nearest to its delays."""
+
+_ICM42688_LOW_PASSES = tuple((width, width, 2) for width in (500.0, 250.0, 200.0, 125.0, 100.0, 62.5, 50.0, 25.0))
+"""GYRO_UI_FILT_BW and ACCEL_UI_FILT_BW of the ICM-42688-P at 1000 samples a second (DS-000347); the order as after a reset."""
+
 # InvenSense MPU-9150, +-4 g, +-250 deg/s, widest filter, as in its product specification; with iron of a motor beside it. It
 # has the dies of the MPU-6050, whose specification gives, off 25 C, 20 deg/s and 2 % over -40 to 85 C, 35 mg over 0 to 70 C,
 # 0.02 %/K, and 0.2 deg/s for 0.1 V of supply. Assumed, as no data sheet tells: half of each is common to all IMUs, and the
@@ -33,6 +41,9 @@ _MPU9150 = ImuModel(
     magnetometer=SensorErrors(noise=0.05, bias=(20.0, 20.0), scale=0.05, cross_axis=0.05, reach=1200.0, resolution=0.3),
     magnetometer_rate=100.0,
     misalignment=radians(1.0),
+    conversion_rate=8000.0,
+    low_passes=_MPU9150_LOW_PASSES,
+    sparing=True,
 )  # fmt: skip
 
 _CALIBRATED = replace(
@@ -59,6 +70,7 @@ _ICM42688 = replace(
         bias_per_kelvin=(0.075 * MILLI_G, 0.075 * MILLI_G), scale_per_kelvin=(2.5e-5, 2.5e-5),
         bias_per_volt=(0.35 * MILLI_G, 0.35 * MILLI_G),
     ),
+    low_passes=_ICM42688_LOW_PASSES,
 )  # fmt: skip
 
 _NOMINAL_LIFE = (
@@ -85,6 +97,7 @@ def _nominal(model: ImuModel, conversion_rate: float, order: int) -> ImuModel:
         clock_error=0.01,
         jitter=20e-6,
         conversion_rate=conversion_rate,
+        sparing=False,
         disturbances=_NOMINAL_LIFE,
     )
 
@@ -153,8 +166,10 @@ def imu_of_table(table: Mapping[str, Any], name: str, title: str) -> ImuModel:
     Raises:
         GoughError: an entry is unknown or out of range.
     """
-    check_entries(table, ("based_on", *_WORDS, *SENSORS, "disturbances"), title)
+    check_entries(table, ("based_on", "low_pass", *_WORDS, *SENSORS, "disturbances"), title)
     model = load_imu(table.get("based_on", "ideal"))
+    if "low_pass" in table:
+        model = _with_low_pass(model, table["low_pass"], title)
     changes = _values({word: value for word, value in table.items() if word in _WORDS}, _WORDS, title)
     for sensor in (sensor for sensor in SENSORS if sensor in table):
         words = _sensor_words(*_UNITS[sensor])
@@ -163,6 +178,20 @@ def imu_of_table(table: Mapping[str, Any], name: str, title: str) -> ImuModel:
     if "disturbances" in table:
         changes["disturbances"] = tuple(disturbance_of_table(each) for each in table["disturbances"])
     return replace(model, name=name, **changes)
+
+
+def _with_low_pass(model: ImuModel, setting: Any, title: str) -> ImuModel:
+    """A kind of IMU with another setting of its own low-pass."""
+    if type(setting) is not int or not 0 <= setting < len(model.low_passes):
+        last = len(model.low_passes) - 1
+        known = f"those of {model.name} are 0 to {last}" if last >= 0 else f"{model.name} has none: give bandwidth_hz and order"
+        raise InputError(f"low_pass of {title} is {setting!r}, which is no setting; {known}")
+    of_gyroscope, of_accelerometer, order = model.low_passes[setting]
+    return replace(
+        model,
+        gyroscope=replace(model.gyroscope, bandwidth=of_gyroscope, order=order),
+        accelerometer=replace(model.accelerometer, bandwidth=of_accelerometer, order=order),
+    )
 
 
 def _values(table: Mapping[str, Any], words: Mapping[str, tuple[str, float]], title: str) -> dict[str, Any]:

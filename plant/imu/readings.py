@@ -3,8 +3,9 @@
 The raw reading inverts the paper's (37), `a_cal = T S (a_u + b)`: with the mounting misalignment M,
 `a_u = S^-1 T^-1 M a - b + noise`. A low-pass, a delay, range, resolution and dropouts follow. Each section of the low-pass is
 exact for signals that are linear between conversions. An IMU converts once a cycle, or several times (its oversampling), or on
-a clock of its own, of which the loop reads the latest sample; between cycles the ideal signals are linear, and disturbances as
-they are. All noise is keyed by (seed, IMU, conversion), so every cycle can be reproduced on its own.
+a clock of its own, of which the loop reads the latest sample. It may spare the conversions between samples while nothing shakes
+it. Between cycles the ideal signals are linear, and disturbances as they are. All noise is keyed by (seed, IMU, conversion), so
+every cycle can be reproduced on its own.
 """
 
 import re
@@ -16,7 +17,7 @@ import numpy as np
 from plant.checks import checked_seed
 from plant.compiled import MOST, Limits, Record, kernel, record_dtype
 from plant.errors import InputError
-from plant.imu.disturbed import DISTURBANCE, EFFECT, MOST_DISTURBANCES, clock_of, disturb, disturbance_record
+from plant.imu.disturbed import DISTURBANCE, EFFECT, MOST_DISTURBANCES, clock_of, disturb, disturbance_record, shakes
 from plant.imu.model import MOST_SECTIONS, ImuModel, SensorErrors
 from plant.imu.random_numbers import draw_normals
 from plant.imu_disturbances import Disturbance
@@ -49,9 +50,9 @@ IMU_STATE = record_dtype(
     bias_per_volt=(np.float64, (3, IMU_COUNT, 3)),
     rectification=(np.float64, 3),
     place=(np.int64, IMU_COUNT),
-    noise=(np.float64, 3),
+    noise=(np.float64, (2, 3)),  # this and `smoothing` of conversions, and of samples where those between them are spared
     drift=(np.float64, 2),
-    smoothing=(np.float64, (3, 2)),
+    smoothing=(np.float64, (2, 3, 2)),
     order=(np.int64, 3),
     reach=(np.float64, 3),
     resolution=(np.float64, 3),
@@ -61,6 +62,8 @@ IMU_STATE = record_dtype(
     period=np.float64,  # of the cycles [s]
     rate=(np.float64, IMU_COUNT),  # of the samples on a clock of its own [Hz]; 0: once a cycle
     conversions=np.int64,  # of a sample
+    sparing=np.int64,  # whether those between samples are spared while nothing shakes the IMU
+    spared=np.int64,  # whether they are at present
     jitter=np.float64,  # [s]
     timed=np.int64,  # whether any IMU converts at other times than the cycles'
     disturbance=(DISTURBANCE, MOST_DISTURBANCES),
@@ -117,7 +120,8 @@ def imu_state(model: ImuModel, seed: int, period: float, wiring: Wiring = RIGHT_
     conversions = min(max(1, round(model.conversion_rate * sampling)), _MOST_CONVERSIONS)
     every = max(1, round(1.0 / (model.magnetometer_rate * sampling)))
     for kind, sensor in enumerate((model.gyroscope, model.accelerometer, model.magnetometer)):
-        converting = every * sampling if kind == MAGNETOMETER else sampling / conversions
+        samples = every * sampling if kind == MAGNETOMETER else sampling
+        periods = samples if kind == MAGNETOMETER else sampling / conversions, samples
         axes = (wiring.gyroscopes, wiring.accelerometers, RIGHT_WIRING.gyroscopes)[kind]
         changes = _changes(sensor, life)
         for imu in range(IMU_COUNT):
@@ -129,8 +133,9 @@ def imu_state(model: ImuModel, seed: int, period: float, wiring: Wiring = RIGHT_
                 # A change of scale has no direction: what counts is the axis of the sensor that is read.
                 state[name][kind, imu] = (np.abs(read) if name.startswith("scale") else read) @ change[imu]
         state["rectification"][kind] = sensor.rectification
-        state["noise"][kind] = sensor.noise * sqrt(0.5 / converting)
-        state["smoothing"][kind] = _smoothing(sensor.section_bandwidth, converting)
+        for spared, converting in enumerate(periods):
+            state["noise"][spared, kind] = sensor.noise * sqrt(0.5 / converting)
+            state["smoothing"][spared, kind] = _smoothing(sensor.section_bandwidth, converting)
         state["order"][kind] = sensor.order
         state["reach"][kind] = sensor.reach
         state["resolution"][kind] = sensor.resolution
@@ -142,7 +147,8 @@ def imu_state(model: ImuModel, seed: int, period: float, wiring: Wiring = RIGHT_
     state["rate"] = model.sample_rate * (1.0 + life.uniform(-model.clock_error, model.clock_error, IMU_COUNT))
     state["converted_at"] = life.random(IMU_COUNT) * sampling - sampling / conversions
     state["jitter"], state["conversions"], state["period"] = model.jitter, conversions, period
-    state["timed"] = bool(model.sample_rate or model.jitter or conversions > 1)
+    state["sparing"] = model.sparing and conversions > 1
+    state["timed"] = bool(model.sample_rate or model.jitter or (conversions > 1 and not model.sparing))
     state["place"] = wiring.places
     state["delay"] = delay
     state["magnetometer_every"] = every
@@ -219,6 +225,7 @@ def measure(state: Record, ideal: Array, measurement: Array) -> None:
         if timed and s.cycle > 0:
             _convert_when_due(s, imu, ideal)
         else:
+            s.spared = s.sparing
             _convert_at(s, imu, ideal, s.time, s.cycle, True, s.cycle)
             s.conversion[imu] = s.sample[imu] = s.cycle + 1
             if s.rate[imu] == 0.0:
@@ -240,20 +247,22 @@ def _convert_when_due(s: Record, imu: int, ideal: Array) -> None:
     """Make an IMU's conversions and samples since the cycle before."""
     own, faster, jitter = clock_of(s.disturbance, s.disturbances, imu, s.time)
     own, jitter, rate = own or s.rate[imu] > 0.0, jitter + s.jitter, s.rate[imu]
+    s.spared = 1 if s.sparing != 0 and not shakes(s.disturbance, s.disturbances, imu, s.before, s.time) else 0
+    conversions = 1 if s.spared != 0 else s.conversions
     if own:
-        step = 1.0 / ((rate if rate > 0.0 else 1.0 / s.period) * max(1.0 + faster, _SLOWEST) * s.conversions)
+        step = 1.0 / ((rate if rate > 0.0 else 1.0 / s.period) * max(1.0 + faster, _SLOWEST) * conversions)
     else:
         # The loop begins each sample, which is complete at the time of the cycle.
-        step = (s.time - s.before) / s.conversions
+        step = (s.time - s.before) / conversions
         s.converted_at[imu], s.part[imu] = s.before, 0
     for _ in range(_MOST_CONVERSIONS):
-        complete = s.part[imu] + 1 >= s.conversions
+        complete = s.part[imu] + 1 >= conversions
         due = s.converted_at[imu] + step
         if own and due > s.time + _AT_ONCE * step:
             return
         if not own and complete:
             due = s.time
-        conversion = s.conversion[imu] if own else s.cycle * s.conversions + s.part[imu]
+        conversion = s.conversion[imu] if own else s.cycle * conversions + s.part[imu]
         early = 0.0
         if jitter > 0.0:
             draw_normals(s.normals, conversion, imu, _TIMES, s.seed)
@@ -296,7 +305,8 @@ def _convert_at(s: Record, imu: int, ideal: Array, time: float, conversion: int,
 def _filter(s: Record, imu: int, conversion: int, with_field: bool) -> bool:
     """Pass a conversion, and the magnetometer's with `with_field`, through the low-passes; returns whether it drops out."""
     e, normals, first, dropped = s.effect, s.normals, s.cycle == 0, False
-    if s.noise[GYROSCOPE] > 0.0 or s.noise[ACCELEROMETER] > 0.0 or s.dropout > 0.0:
+    noise = s.noise[s.spared]
+    if noise[GYROSCOPE] > 0.0 or noise[ACCELEROMETER] > 0.0 or s.dropout > 0.0:
         dropped = draw_normals(normals, conversion, imu, _MEASURE, s.seed) < s.dropout and not first
     else:
         normals[:] = 0.0
@@ -304,7 +314,7 @@ def _filter(s: Record, imu: int, conversion: int, with_field: bool) -> bool:
         magnetic = kind == MAGNETOMETER
         if magnetic and not with_field:
             break
-        if magnetic and s.noise[kind] > 0.0:
+        if magnetic and noise[kind] > 0.0:
             draw_normals(normals, conversion, imu, _MAGNETIC, s.seed)
         gain, signal, sensed = s.gain[kind, imu], e.signal[kind], s.sensed
         x, y, z = signal[0], signal[1], signal[2]
@@ -322,10 +332,10 @@ def _filter(s: Record, imu: int, conversion: int, with_field: bool) -> bool:
                 draw_normals(e.normals, conversion, imu, _DISTURBED + kind, s.seed)
                 for axis in range(3):
                     sensed[axis] += e.noise[kind, axis] * e.normals[axis]
-        noise, first_normal = s.noise[kind], 0 if magnetic else 3 * kind
+        first_normal = 0 if magnetic else 3 * kind
         for axis in range(3):
             walk = 0.0 if magnetic else s.bias_walk[kind, imu, axis]
-            sensed[axis] = s.offset[kind, imu, axis] + sensed[axis] + (walk + noise * normals[first_normal + axis])
+            sensed[axis] = s.offset[kind, imu, axis] + sensed[axis] + (walk + noise[kind] * normals[first_normal + axis])
         if s.conversions > 1:
             reach = _reach(s, kind)
             for axis in range(3):
@@ -343,7 +353,8 @@ def _reach(s: Record, kind: int) -> float:
 @kernel
 def _smooth(s: Record, kind: int, imu: int, first: bool) -> None:
     """Pass what is sensed through the sections of a low-pass, which begins settled."""
-    before, share = s.smoothing[kind, 0], s.smoothing[kind, 1]
+    smoothing = s.smoothing[s.spared, kind]
+    before, share = smoothing[0], smoothing[1]
     passes = first or share == 1.0
     entered = s.sections[0, kind, imu]
     for k in range(1, s.order[kind] + 1):

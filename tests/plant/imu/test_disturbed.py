@@ -444,7 +444,12 @@ def test_readings_are_those_of_a_slow_twin(
         for name in ("gyroscope", "accelerometer", "magnetometer")
     }  # fmt: skip
     model = replace(
-        raw, **sensors, sample_rate=rate, clock_error=0.01 if rate else 0.0, conversion_rate=conversions * (rate or 1000.0)
+        raw,
+        **sensors,
+        sample_rate=rate,
+        clock_error=0.01 if rate else 0.0,
+        conversion_rate=conversions * (rate or 1000.0),
+        sparing=False,
     )
     random = np.random.default_rng(9)
     times = PERIOD * np.arange(200)[:, None, None, None]
