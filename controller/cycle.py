@@ -158,7 +158,7 @@ def cycle_parameters(
         rig=rig_parameters(mechanism, rate, control.hold, calibration.tilt),
         imus=imu_health.imu_parameters(present, calibration.gain, calibration.offset, fusion, watched, rate),
         legs=leg_filter.leg_parameters(fusion, rate),
-        platform=platform_filter.platform_parameters(fusion, rate),
+        platform=platform_filter.platform_parameters(fusion, rate, limits.jerk),
         heading=heading_filter.heading_parameters(fusion, rate, field, magnetometer),
         pose=pose_estimator.pose_parameters(fusion, section_5),
         mechanism=trust.trust_parameters(fusion, rate, filter_parameters(fusion, rate, whole, *errors, of_heading)),
@@ -266,6 +266,7 @@ def _control(parameters: Record, state: Record, segments: Array) -> int:
     else:
         load_feed_forward.find_feed_forward(p.load, s.load, rig, pose, s.reference)
         pid.step_pid(p.pid, s.pid, s.load.feed_forward, elapsed(rig, time))
+    watch.check_carried(p.safety, s.safety, rig, time, s.imus.shaking, s.legs, s.mechanism, s.reference, s.pid)
     time.cycle += 1
     return watch.check_limits(
         p.safety, s.safety, rig, time, p.imus, s.imus, pose, s.mechanism.trusted, s.reference, p.pid.limit, s.pid

@@ -65,23 +65,24 @@ def track(
     else:
         parameters = parameters.copy()
         parameters["smoothing"] = np.inf
+    weights = np.repeat(used[:, None, :], 2, axis=1).astype(float)
     pose, twist = start
     start_filter(parameters[()], state[()], 0.0, pose.position, pose.rotation, twist)
     run = Track(positions, rotations, motions, covariances, state)
-    _track(parameters[()], geometry[()], state[()], samples, used, 1.0 / rate, delay, guide, *run[:-1])
+    _track(parameters[()], geometry[()], state[()], samples, weights, 1.0 / rate, delay, guide, *run[:-1])
     return run
 
 
 @kernel
 def _track(
-    parameters: Record, geometry: Record, state: Record, samples: Array, used: NDArray[np.int64], period: float, delay: float,
+    parameters: Record, geometry: Record, state: Record, samples: Array, weights: Array, period: float, delay: float,
     guide: Array, positions: Array, rotations: Array, motions: Array, covariances: Array,
 ) -> None:  # fmt: skip
     for i in range(samples.shape[0]):
         if guide.shape[0] > 0:
             state.low_passed[:] = guide[i]
         if i > 0:
-            accumulate_sample(state, samples[i], used[i], i * period - delay)
+            accumulate_sample(state, samples[i], weights[i], i * period - delay)
             step_filter(parameters, geometry, state)
         motion = motions[i].reshape(12)
         extrapolate(state, i * period, positions[i], rotations[i], motion[:6], motion[6:])

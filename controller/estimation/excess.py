@@ -14,7 +14,7 @@ MEMORY_S = 4.0
 
 
 @kernel
-def faded_excess(excess: float, squared: float, variance: float, period: float) -> float:
+def faded_excess(excess: float, squared: float, variance: float, period: float, memory: float = MEMORY_S) -> float:
     """The excess after another innovation.
 
     A new excess counts at once and in full, before it can bend the filter. It fades exponentially towards less than zero, so
@@ -25,6 +25,7 @@ def faded_excess(excess: float, squared: float, variance: float, period: float) 
         squared: square of the innovation.
         variance: of the innovation by what is explained.
         period: since the innovation before [s].
+        memory: time in which the excess fades to the share 1/e [s].
     """
-    faded = excess - min(1.0, period / MEMORY_S) * (excess + variance)
+    faded = excess - min(1.0, period / memory) * (excess + variance)
     return float(max(0.0, faded, squared - INNOVATION_LIMIT**2 * variance))

@@ -8,6 +8,7 @@ share no line with the compiled filters.
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
+from controller.estimation import shaking
 from controller.estimation.excess import INNOVATION_LIMIT, MEMORY_S
 from controller.estimation.leg_filter import start_leg, update_leg_directions
 from controller.estimation.platform_filter import (
@@ -32,6 +33,11 @@ from plant.imu import ACCELEROMETER, GYROSCOPE
 from plant.pose import Array, rotation_from_vector, skew
 
 STATES = 9
+
+
+def _faded(excess: float, squared: float, explained: float, share: float) -> float:
+    """The excess after another innovation, of which a share has faded."""
+    return max(0.0, excess - min(1.0, share) * (excess + explained), squared - INNOVATION_LIMIT**2 * explained)
 
 
 class _Filterpy(ExtendedKalmanFilter):  # type: ignore[misc]
@@ -77,17 +83,24 @@ class FilterpyLeg(_Filterpy):
         self.F, self.Q = np.eye(STATES), np.diag([0.0] * 6 + [bias_walk * t] * 3)
         self.F[:6, :6] = np.kron([[1.0, t, t**2 / 2], [0.0, 1.0, t], [0.0, 0.0, 1.0]], np.eye(2))
         self.Q[:6, :6] += np.kron(jerk * noise, np.eye(2))
-        self.R = np.diag([rate_variance] * 3 + [force_variance] * 3)
+        self.variances, self.period = np.array([rate_variance, force_variance]), period
+        self.excess = self.shaken = 0.0
 
     def step(self, gyroscope: Array, accelerometer: Array) -> None:
         """Predict over one period and take a sample [rad/s, m/s^2]."""
         self.predict()
         self.take(gyroscope, accelerometer)
 
-    def take(self, gyroscope: Array, accelerometer: Array) -> None:
-        """Take a sample [rad/s, m/s^2] without predicting."""
+    def take(self, gyroscope: Array, accelerometer: Array, clipped: tuple[int, int] = (0, 0)) -> None:
+        """Take a sample [rad/s, m/s^2] without predicting; `clipped` says which sensor is at the end of its range."""
         sample = np.concatenate([gyroscope, accelerometer]).reshape(6, 1)
-        self.update(sample, self.measurement_jacobian, self.measurement)
+        off, doubt = accelerometer - self.measurement(self.x)[3:, 0], np.diag(self.P)
+        lever = self.imu_position @ self.imu_position
+        explained = self.variances[1] + self.gravity**2 * doubt[:2].sum() + lever * doubt[4:6].sum()
+        self.excess = _faded(self.excess, float(off @ off), explained, self.period / shaking.MEMORY_S)
+        hidden = float(np.clip(self.shaken - explained, 0.0, INNOVATION_LIMIT**2 * explained)) / 3.0
+        variances = self.variances + [0.0, self.excess + hidden] + shaking.SAYS_NOTHING * np.array(clipped)
+        self.update(sample, self.measurement_jacobian, self.measurement, R=np.diag(np.repeat(variances, 3)))
 
     def measurement(self, x: Array) -> Array:
         """Expected rate and force (6, 1) at a state (9, 1)."""
@@ -140,14 +153,17 @@ class FilterpyPlatform(_Filterpy):
 
     def __init__(self, gravity: float, rate_density: float, bias_walk: float, force_variance: float) -> None:
         super().__init__(dim_x=ERRORS, dim_z=1)
-        self.gravity, self.rate_density, self.bias_walk, self.force_variance = gravity, rate_density, bias_walk, force_variance
-        self.take_over(np.zeros((), PLATFORM))
+        self.gravity, self.rate_density, self.bias_walk = gravity, rate_density, bias_walk
+        nothing = np.zeros((), PLATFORM)
+        nothing["force_variance"] = self.nominal_variance = force_variance
+        self.take_over(nothing)
 
     def take_over(self, state: Record) -> None:
         """Take over a state (dtype `platform_filter.STATE`)."""
         up, self.bias, first, self.velocity = np.split(state["x"].copy(), (BIAS, LEVEL, VELOCITY))
         self.axes = np.stack([first, np.cross(up, first), up])
         self.running, self.noise, self.unknown = float(state["running"]), float(state["noise"]), float(state["unknown"])
+        self.force_variance = float(state["force_variance"])
         self.start(np.zeros(ERRORS), state["covariance"])
 
     def hand_over(self, state: Record) -> None:
@@ -165,9 +181,9 @@ class FilterpyPlatform(_Filterpy):
         bound = INNOVATION_LIMIT * period * np.sqrt(variance)
         self.velocity = self.velocity + np.clip(shown, -bound, bound)
         self._predict_errors(rate, period)
-        faded = self.unknown - min(1.0, period / MEMORY_S) * (self.unknown + self.noise)
-        self.unknown = max(0.0, faded, seen - INNOVATION_LIMIT**2 * self.noise)
-        self.noise += self.force_variance * period**2
+        self.noise += (self.force_variance - self.nominal_variance) * period**2
+        self.unknown = _faded(self.unknown, seen, self.noise, period / MEMORY_S)
+        self.noise += self.nominal_variance * period**2
         # The velocity is measured to be zero, along one axis after the other.
         self.R = np.array([[2.0 * CORRELATION_S * self.unknown / period]])
         both = np.trace(self.P[2:4, 2:4])
@@ -225,9 +241,11 @@ class FilterpyFilters:
                 x, covariance = legs["x"][k], legs["covariance"][k]
                 start_leg(x, covariance, rate, force, leg.up_in_joint, float(p["legs"]["bias_sigma"]))
                 leg.start(x, covariance)
-                leg.take(rate, force)
             else:
-                leg.step(rate, force)
+                leg.predict()
+            leg.excess, leg.shaken = float(imus["shaking"]["excess"][k]), float(imus["shaking"]["mean"][k])
+            leg.take(rate, force, tuple(imus["shaking"]["clipped"][:, k]))
+            imus["shaking"]["excess"][k] = leg.excess
             legs["x"][k], legs["covariance"][k] = leg.state, leg.P
         update_leg_directions(p["legs"], legs, p["rig"], s["time"], imus)
 
@@ -237,7 +255,7 @@ class FilterpyFilters:
         imus, platform = s["imus"], s["platform"]
         if begin_platform_step(p["platform"], platform, p["rig"], s["time"], imus, s["pose"]):
             self._platform.take_over(platform)
-            rate, force = imus["sample"][GYROSCOPE, PLATFORM_IMU], imus["sample"][ACCELEROMETER, PLATFORM_IMU]
-            self._platform.step(rate, force, platform["imu_acceleration"], elapsed(p["rig"], s["time"]))
+            force = imus["sample"][ACCELEROMETER, PLATFORM_IMU]
+            self._platform.step(platform["gyroscope"], force, platform["imu_acceleration"], elapsed(p["rig"], s["time"]))
             self._platform.hand_over(platform)
-            end_platform_step(p["platform"], platform, imus)
+            end_platform_step(p["platform"], platform)

@@ -4,6 +4,7 @@ from collections.abc import Collection
 
 import numpy as np
 
+from controller.estimation import shaking
 from controller.estimation.imu_calibration import calibrate_samples
 from controller.safety.causes import Cause, report_event
 from controller.settings import FusionSettings, SafetySettings
@@ -45,6 +46,7 @@ PARAMETERS = record_dtype(
     frozen_cycles=np.int64,  # these three: the durations above
     healthy_cycles=np.int64,
     stale_cycles=np.int64,
+    shaking=shaking.PARAMETERS,
 )
 """Constants of the IMUs."""
 
@@ -62,6 +64,7 @@ STATE = record_dtype(
     earlier=(np.float64, (2, 2, IMU_COUNT, 3)),  # the last two raw samples
     variance=(np.float64, (2, IMU_COUNT)),  # of each sensor's noise, averaged
     noise=(np.float64, IMU_COUNT),  # of each IMU over its limit
+    shaking=shaking.STATE,
 )
 """State of the IMUs."""
 
@@ -84,6 +87,7 @@ def imu_parameters(
         frozen_cycles=max(3, round(_FROZEN_S * rate)),
         healthy_cycles=round(_HEALTHY_S * rate),
         stale_cycles=max(3, round(_STALE_S * rate)),
+        shaking=shaking.shaking_parameters(safety.vibration, rate),
     )
 
 
@@ -93,9 +97,9 @@ def screen_imus(
 ) -> None:
     """Calibrate a raw measurement (3, 7, 3), and find out which IMUs are healthy.
 
-    An IMU is left out while its readings are not finite, out of range, noisy, or stale while others are not, or frozen while
-    others are not or the legs must have moved. It is used again when it has been healthy for a while. An IMU that contradicted
-    the others stays out.
+    An IMU is left out while its readings are not finite, at the end of their range for longer than others can bridge, noisy,
+    or stale while others are not, or frozen while others are not or the legs must have moved. It is used again when it has been
+    healthy for a while. An IMU that contradicted the others stays out.
 
     Args:
         silent: for how many cycles the rig has not answered.
@@ -142,15 +146,22 @@ def screen_imus(
         noise = s.noise[k]
         if cause == Cause.NONE and noise > max(1.0, _NOISIER * (total_noise - noise) / rig.legs):
             cause, value, limit = Cause.IMU_NOISY.value, noise, 1.0
+        finite, reached = True, 0.0
         for kind in range(3):
+            most = 0.0
             for i in range(3):
                 raw = measurement[kind, k, i]
                 s.raw[kind, k, i] = raw
-                # NaN is not below the limit either.
-                if kind < 2 and not abs(raw) < p.range[kind]:
-                    cause, value, limit = Cause.IMU_OUT_OF_RANGE.value, abs(raw) / p.range[kind], 1.0
-                    if not np.isfinite(raw):
-                        cause, value, limit = Cause.IMU_NOT_FINITE.value, np.nan, np.nan
+                if kind < 2:
+                    finite = finite and bool(np.isfinite(raw))
+                    most = max(most, abs(raw) / p.range[kind])
+            if kind < 2:
+                s.shaking.clipped[kind, k] = most >= 1.0
+                reached = max(reached, most)
+        if not finite:
+            cause, value, limit = Cause.IMU_NOT_FINITE.value, np.nan, np.nan
+        elif not shaking.bridges(p.shaking, s.shaking, k, s.used[k], time.missed):
+            cause, value, limit = Cause.IMU_OUT_OF_RANGE.value, reached, 1.0
         if p.present[k] == 0 or s.excluded[k] != 0:
             s.used[k] = 0
             continue
@@ -162,6 +173,7 @@ def screen_imus(
             report_event(events, cause, k, value, limit)
         elif s.used[k] > used and time.cycle > 0:
             report_event(events, Cause.IMU_BACK, k, np.nan, np.nan)
+    shaking.tell_shaking(p.shaking, s.shaking, s.used, time.missed, events)
 
 
 @kernel

@@ -13,13 +13,14 @@ once, which equals the joint update. `filterpy_filters` is the slow clear twin.
 
 import numpy as np
 
+from controller.estimation.shaking import note_force, variance_of
 from controller.rig import elapsed
 from controller.settings import FusionSettings
 from plant.compiled import Record, filled, kernel, record_dtype
 from plant.imu import ACCELEROMETER, GYROSCOPE
 from plant.mechanism import LEGS
 from plant.pose import Array
-from plant.vectors import dot, rotate, vector
+from plant.vectors import dot, rotate, subtract, vector
 
 STATES = 9
 ANGLE_SIGMA, RATE_SIGMA, ACCELERATION_SIGMA = 0.15, 0.05, 40.0
@@ -91,11 +92,22 @@ def step_leg_filters(p: Record, s: Record, rig: Record, time: Record, imus: Reco
             predict_leg(x, covariance, period, p.jerk, p.bias_walk)
         if rig.planar != 0:
             lock_second_axis(x, covariance)
-        update_leg(
-            x, covariance, rate, force, up, rig.sensors.leg_imu_position[k], rig.sensors.gravity, p.rate_variance,
-            p.force_variance, s.expected, s.jacobian, s.gain, s.change,
+        d, gravity = rig.sensors.leg_imu_position[k], rig.sensors.gravity
+        predict_measurement(x, up, d, gravity, s.expected, s.jacobian)
+        off = subtract(vector(force), vector(s.expected[3:]))
+        note_force(imus.shaking, k, dot(off, off), p.force_variance + force_doubt(covariance, d, gravity), period)
+        take_leg_sample(
+            x, covariance, rate, force, variance_of(imus.shaking, GYROSCOPE, k, p.rate_variance),
+            variance_of(imus.shaking, ACCELEROMETER, k, p.force_variance), s.expected, s.jacobian, s.gain, s.change,
         )  # fmt: skip
     update_leg_directions(p, s, rig, time, imus)
+
+
+@kernel
+def force_doubt(covariance: Array, d: Array, gravity: float) -> float:
+    """The mean square [m^2/s^4] by which an expected force is off, as angles and angular accelerations are uncertain."""
+    angles, accelerations = covariance[0, 0] + covariance[1, 1], covariance[4, 4] + covariance[5, 5]
+    return float(gravity * gravity * angles + dot(vector(d), vector(d)) * accelerations)
 
 
 @kernel
@@ -237,12 +249,17 @@ def predict_measurement(x: Array, up_in_joint: Array, d: Array, gravity: float, 
 
 
 @kernel
-def update_leg(
-    x: Array, covariance: Array, gyroscope: Array, accelerometer: Array, up_in_joint: Array, d: Array, gravity: float,
-    rate_variance: float, force_variance: float, h: Array, jacobian: Array, gain: Array, change: Array,
+def take_leg_sample(
+    x: Array, covariance: Array, gyroscope: Array, accelerometer: Array, rate_variance: float, force_variance: float, h: Array,
+    jacobian: Array, gain: Array, change: Array,
 ) -> None:  # fmt: skip
-    """Take one sample into state and covariance; the last four arguments are scratch (6,), (6, 9), (9,), (9,)."""
-    predict_measurement(x, up_in_joint, d, gravity, h, jacobian)
+    """Take one sample into state and covariance.
+
+    Args:
+        rate_variance, force_variance: of each component.
+        h, jacobian: of `predict_measurement` at `x`.
+        gain, change: scratch (9,).
+    """
     change[:] = 0.0
     for m in range(6):
         rate = m < 3

@@ -16,6 +16,7 @@ import numpy as np
 
 from controller.estimation.excess import INNOVATION_LIMIT, faded_excess
 from controller.estimation.leg_filter import SETTLING_S
+from controller.estimation.shaking import is_clipped, note_force, variance_of
 from controller.rig import elapsed
 from controller.settings import FusionSettings
 from plant.compiled import Record, filled, kernel, record_dtype
@@ -46,6 +47,9 @@ START_CORRECTION = 1.5
 
 YOUNGEST_S = 0.01
 
+ACCELERATION_SIGMA = 2.0
+"""Least uncertainty of what is known of the IMU's own acceleration: as the brakes open, and as legs jerk [m/s^2]."""
+
 RATE_NOISE = 1e-7
 """Density of the gyroscope's noise that its scales and axes cause, by the square of the rate [1/Hz]."""
 
@@ -53,10 +57,11 @@ PARAMETERS = record_dtype(
     rate_density=np.float64,  # spectral density of the gyroscope's noise
     bias_walk=np.float64,  # spectral density of the gyroscope's bias
     bias_sigma=np.float64,  # uncertainty of the gyroscope's bias at the start [rad/s]
-    force_variance=np.float64,  # of each component of the accelerometer's reading [m^2/s^4]
+    force_variance=np.float64,  # of each component of the accelerometer's reading by noise alone [m^2/s^4]
     weight=np.float64,  # of the vertical in the refinement, 1 / variance [1/rad^2]
     delay=np.float64,  # of the sensors [s]
     settling_cycles=np.int64,  # how long the filter is not relied upon
+    acceleration_variance=np.float64,  # of what is known of the IMU's own acceleration [m^2/s^4]
 )
 """Constants of the filter."""
 
@@ -71,6 +76,8 @@ STATE = record_dtype(
     weight=np.float64,  # of the vertical in the refinement
     vertical=(np.float64, 3),  # in {2}, without the sensors' delay
     rate=(np.float64, 3),  # angular velocity in {2} [rad/s]
+    gyroscope=(np.float64, 3),  # what it reads, or would read if it were not clipped [rad/s]
+    force_variance=np.float64,  # of each component of the accelerometer's present reading [m^2/s^4]
     imu_acceleration=(np.float64, 3),  # of the IMU in {2} [m/s^2]
     gain=(np.float64, ERRORS),  # from here on scratch
     change=(np.float64, ERRORS),
@@ -78,8 +85,8 @@ STATE = record_dtype(
 """State of the filter."""
 
 
-def platform_parameters(fusion: FusionSettings, rate: float) -> Record:
-    """The constants of the filter (dtype `PARAMETERS`) in cycles of this rate [Hz]."""
+def platform_parameters(fusion: FusionSettings, rate: float, jerk: float = 0.0) -> Record:
+    """The constants of the filter (dtype `PARAMETERS`) in cycles of this rate [Hz]; `jerk` is the legs' limit [m/s^3]."""
     return filled(
         PARAMETERS,
         rate_density=fusion.gyroscope_noise**2,
@@ -89,6 +96,8 @@ def platform_parameters(fusion: FusionSettings, rate: float) -> Record:
         weight=1.0 / fusion.tilt_sigma**2,
         delay=fusion.sensor_delay,
         settling_cycles=round(SETTLING_S * rate),
+        # The known acceleration lags, and the platform may jerk twice as much as its legs.
+        acceleration_variance=max(ACCELERATION_SIGMA, 2.0 * jerk * fusion.acceleration_time) ** 2,
     )
 
 
@@ -99,9 +108,9 @@ def step_platform_filter(p: Record, s: Record, rig: Record, time: Record, imus: 
     """
     if not begin_platform_step(p, s, rig, time, imus, pose):
         return
-    rate, force = imus.sample[GYROSCOPE, PLATFORM_IMU], imus.sample[ACCELEROMETER, PLATFORM_IMU]
-    step_platform(p, s, rate, force, s.imu_acceleration, elapsed(rig, time), rig.sensors.gravity)
-    end_platform_step(p, s, imus)
+    force, period, gravity = imus.sample[ACCELEROMETER, PLATFORM_IMU], elapsed(rig, time), rig.sensors.gravity
+    step_platform(p, s, s.gyroscope, force, s.imu_acceleration, period, gravity)
+    end_platform_step(p, s)
 
 
 @kernel
@@ -113,9 +122,16 @@ def begin_platform_step(p: Record, s: Record, rig: Record, time: Record, imus: R
     s.weight = p.weight if s.used != 0 else 0.0
     if imus.used[PLATFORM_IMU] == 0:
         return False
-    rate, force = imus.sample[GYROSCOPE, PLATFORM_IMU], imus.sample[ACCELEROMETER, PLATFORM_IMU]
+    force = imus.sample[ACCELEROMETER, PLATFORM_IMU]
     if age == 0:
         start_platform(p, s, force)
+    rate = s.gyroscope
+    rate[:] = imus.sample[GYROSCOPE, PLATFORM_IMU]
+    if is_clipped(imus.shaking, GYROSCOPE, PLATFORM_IMU):
+        # The others know the platform's rate, too.
+        known = rotate_back(pose.rotation, vector(pose.twist[3:]))
+        for i in range(3):
+            rate[i] = known[i] + s.x[BIAS + i]
     # The acceleration of the origin, and what turning adds at the IMU's place d.
     d = vector(rig.sensors.platform_imu_position)
     w = subtract(vector(rate), vector(s.x[BIAS:]))
@@ -124,15 +140,19 @@ def begin_platform_step(p: Record, s: Record, rig: Record, time: Record, imus: R
     tangential = cross(rotate_back(pose.rotation, vector(pose.acceleration[3:])), d)
     for i in range(3):
         s.imu_acceleration[i] = of_origin[i] + (tangential[i] + w[i] * wd - d[i] * ww)
+    off = subtract(subtract(vector(force), vector(s.imu_acceleration)), scale(rig.sensors.gravity, vector(s.x)))
+    tilt = s.covariance[0, 0] + s.covariance[1, 1]
+    explained = p.force_variance + p.acceleration_variance + rig.sensors.gravity**2 * tilt
+    note_force(imus.shaking, PLATFORM_IMU, dot(off, off), explained, elapsed(rig, time))
+    s.force_variance = variance_of(imus.shaking, ACCELEROMETER, PLATFORM_IMU, p.force_variance)
     return True
 
 
 @kernel
-def end_platform_step(p: Record, s: Record, imus: Record) -> None:
+def end_platform_step(p: Record, s: Record) -> None:
     """After the filter's step: the platform's angular velocity and the vertical in {2}, without the sensors' delay."""
-    rate = imus.sample[GYROSCOPE, PLATFORM_IMU]
     for i in range(3):
-        s.rate[i] = rate[i] - s.x[BIAS + i]
+        s.rate[i] = s.gyroscope[i] - s.x[BIAS + i]
     extrapolate_direction(s.x, s.rate, p.delay, s.vertical)
 
 
@@ -210,6 +230,7 @@ def start_platform(p: Record, s: Record, accelerometer: Array) -> None:
     make_level(s.x[LEVEL:VELOCITY], up)
     s.covariance[0, 0] = s.covariance[1, 1] = TILT_SIGMA**2
     s.unknown = s.noise = s.running = 0.0
+    s.force_variance = p.force_variance
 
 
 @kernel
@@ -233,11 +254,12 @@ def step_platform(
     shown = t * dot(first, force), t * dot(second, force)
     seen = 0.5 * ((x[VELOCITY] + shown[0]) ** 2 + (x[VELOCITY + 1] + shown[1]) ** 2)
     tilt_variance = 0.5 * (s.covariance[0, 0] + s.covariance[1, 1])
-    variance = t * t * (p.force_variance + gravity**2 * tilt_variance + FASTEST_MOTION**2 * s.unknown)
+    variance = t * t * (s.force_variance + gravity**2 * tilt_variance + FASTEST_MOTION**2 * s.unknown)
     for i in range(2):
         x[VELOCITY + i] += cut_innovation(shown[i], variance)
     _predict_covariance(p, s, first, second, rate, t, gravity)
-    # This sample's own noise is left out: accelerations as small, which last, would be taken for gravity.
+    # This sample's own noise is left out, as small accelerations that last would be taken for gravity; what shakes it is not.
+    s.noise += (s.force_variance - p.force_variance) * t * t
     s.unknown = faded_excess(s.unknown, seen, s.noise, t)
     s.noise += p.force_variance * t * t
     _measure_no_velocity(s, velocity_density(s.unknown) / t)
@@ -271,7 +293,7 @@ def _predict_covariance(p: Record, s: Record, first: Vector, second: Vector, rat
         c[i, 1] -= t * (second[0] * c[i, 4] + second[1] * c[i, 5] + second[2] * c[i, 6])
     for i in range(2):
         c[i, i] += turn * t
-        c[2 + i, 2 + i] += p.force_variance * t * t
+        c[2 + i, 2 + i] += s.force_variance * t * t
     for i in range(4, ERRORS):
         c[i, i] += p.bias_walk * t
 

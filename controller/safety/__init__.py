@@ -43,12 +43,12 @@ def safety_parameters(settings: SafetySettings, rate: float, limits: Limits, arm
 
 def watch_nothing(parameters: Record) -> None:
     """Let the cycle with these parameters arm and go on whatever it finds, for motions that do not rely on the estimate."""
-    parameters["imus"]["noise"] = np.inf
+    parameters["imus"]["noise"] = parameters["imus"]["shaking"]["limit"] = np.inf
     safety = parameters["safety"]
     safety["monitor"]["active"], safety["arming"]["approach"] = 0, 0
     safety["arming"]["distance"] = safety["arming"]["drift"] = np.inf
     limits = safety["watch"]
     limits["most_lost_imus"], limits["conditioning"] = IMU_COUNT, 0.0
     limits["lengths"] = limits["plausible_lengths"] = -np.inf, np.inf
-    for name in ("speed", "following", "saturation", "drive_deviation"):
+    for name in ("speed", "following", "saturation", "drive_deviation", "carried"):
         limits[name] = np.inf

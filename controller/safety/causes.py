@@ -121,6 +121,15 @@ class Cause(IntEnum):
     TARGET_JUMPS = 36, "the target jumps for leg {}", Reaction.STOP, "m"
     TARGET_NOT_FINITE = 37, "the target is not finite, or its quaternion is none", Reaction.STOP
     NOT_STILL = 50, "not armed: the estimate of leg {} still drifts on the brakes within 50 ms", Reaction.STOP, "m"
+    SHAKEN = 51, "the IMUs are shaken, the worst is IMU {}: accelerometers count less", Reaction.GO_ON, "m/s^2 RMS"
+    BRIDGED = 52, "readings of IMU {} at the end of their range are bridged by the other sensors", Reaction.GO_ON
+    CALM = 53, "the IMUs are no longer shaken", Reaction.GO_ON
+    NOT_CARRIED = (
+        54,
+        "the accelerometers have been shaken for too long for gyroscopes to carry the pose",
+        Reaction.STOP,
+        "rad of uncertainty",
+    )
 
     @property
     def short(self) -> str:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from controller.estimation.imu_monitor import contradiction, reset
+from controller.estimation.shaking import is_shaken
 from controller.safety.causes import Cause, DriveState, Mode, Request, report_event
 from controller.safety.stop import handle_cause
 from controller.settings import SafetySettings
@@ -31,6 +32,7 @@ PARAMETERS = record_dtype(
     drive_deviation=np.float64,  # [m/s]
     patience=np.float64,  # [s]
     bus_cycles=np.int64,
+    carried=np.float64,  # [rad^2]
 )
 """The limits. Durations that are compared with sums of periods are in s."""
 
@@ -63,6 +65,7 @@ def watch_parameters(settings: SafetySettings, rate: float, limits: Limits) -> R
         drive_deviation=settings.drive_deviation,
         patience=max(settings.patience, _LEAST_CYCLES / rate),
         bus_cycles=max(3, round(settings.bus_patience * rate)),
+        carried=settings.carried**2,
     )
 
 
@@ -138,6 +141,29 @@ def exclude_imu(
     for k in range(IMU_COUNT):
         reset(m, k)
     report_event(s.events, Cause.IMU_DISAGREES, worst, off, limit)
+
+
+@kernel
+def check_carried(
+    p: Record, s: Record, rig: Record, time: Record, shaking: Record, legs: Record, mechanism: Record, reference: Record,
+    pid: Record,
+) -> None:  # fmt: skip
+    """While IMUs are shaken: stop when what the pose comes from no longer knows a direction: the leg filters, or the
+    whole-mechanism filter's rotation.
+    """
+    if not is_shaken(shaking) or s.mode != Mode.RUNNING:
+        return
+    worst, variance = -1, 0.0
+    if mechanism.trusted != 0:
+        for i in range(3, 6):
+            variance = max(variance, mechanism.filter.published_covariance[i, i])
+    else:
+        for k in range(rig.legs):
+            own = legs.covariance[k, 0, 0] + legs.covariance[k, 1, 1]
+            if legs.used[k] != 0.0 and own > variance:
+                worst, variance = k, own
+    if variance > p.watch.carried:
+        handle_cause(p, s, rig, time, reference, pid, Cause.NOT_CARRIED, worst, np.sqrt(variance), np.sqrt(p.watch.carried))
 
 
 @kernel

@@ -100,21 +100,22 @@ def start_filter(p: Record, f: Record, time: float, position: Array, rotation: A
 
 
 @kernel
-def accumulate_sample(f: Record, sample: Array, used: Array, time: float) -> None:
-    """Add a calibrated sample (3, 7, 3) of the IMUs that are `used` (7,) to the window."""
+def accumulate_sample(f: Record, sample: Array, weights: Array, time: float) -> None:
+    """Add a calibrated sample (3, 7, 3) to the window, with the weight of each sensor (2, 7): 1 for noise alone, 0 for none."""
     if f.collected == 0:
         f.sum[:] = 0.0
-        f.samples[:] = 0
+        f.weight[:] = 0.0
         f.sum_time = 0.0
     f.collected += 1
     f.sum_time += time
-    for k in range(IMU_COUNT):
-        if used[k] == 0:
-            continue
-        f.samples[k] += 1
-        for i in range(3):
-            f.sum[k, i] += sample[0, k, i]
-            f.sum[k, 3 + i] += sample[1, k, i]
+    for sensor in range(2):
+        for k in range(IMU_COUNT):
+            weight = weights[sensor, k]
+            if weight == 0.0:
+                continue
+            f.weight[sensor, k] += weight
+            for i in range(3):
+                f.sum[k, 3 * sensor + i] += weight * sample[sensor, k, i]
 
 
 @kernel
@@ -144,10 +145,11 @@ def _begin_update(p: Record, geometry: Record, f: Record) -> None:
         # The windows have overtaken the update, which happens when cycles are missed.
         _update_rows(p, f, ROWS)
     time = f.sum_time / f.collected
+    f.sample_weight[:] = f.weight
     for k in range(IMU_COUNT):
-        f.sample_used[k] = f.samples[k]
         for i in range(READINGS):
-            f.sample[k, i] = f.sum[k, i] / max(f.samples[k], 1)
+            weight = f.weight[i // 3, k]
+            f.sample[k, i] = f.sum[k, i] / weight if weight > 0.0 else 0.0
     f.collected = 0
     _predict(p, f, time - f.time)
     f.time = time
@@ -249,14 +251,14 @@ def _update_rows(p: Record, f: Record, last: int) -> None:
 def _update_scalar(p: Record, f: Record, row: int) -> None:
     """Take one scalar of the sample into covariance and change."""
     k, m = row // READINGS, row % READINGS
-    if f.sample_used[k] == 0:
-        return
     sensor = m // 3
+    if f.sample_weight[sensor, k] == 0.0:
+        return
     states, start = p.states, MOTION_STATES + k * p.errors
     h, gain, change, c = f.jacobian[k, m], f.gain, f.change, f.covariance
     expected = distort(f.errors[k], sensor, vector(f.predicted[k, 3 * sensor :]))
     innovation = f.sample[k, m] - expected[m % 3] - f.errors[k, m]
-    variance = p.variance[sensor] / f.sample_used[k]
+    variance = p.variance[sensor] / f.sample_weight[sensor, k]
     for i in range(states):
         gain[i] = 0.0
     for j in range(MOTION_STATES):

@@ -7,6 +7,7 @@ When the source changes, the step between the two poses fades away.
 import numpy as np
 
 from controller.direct_kinematics.refinement import move_pose
+from controller.estimation.shaking import worth_of
 from controller.estimation.whole_mechanism.filter import (
     accumulate_field,
     accumulate_sample,
@@ -52,7 +53,7 @@ STATE = record_dtype(
     closed_rotation=(np.float64, (3, 3)),
     twist=(np.float64, 6),  # of the filter
     acceleration=(np.float64, 6),  # of the filter
-    fresh=(np.int64, IMU_COUNT),  # whether the IMU is used and has a new sample
+    weights=(np.float64, (2, IMU_COUNT)),  # of the sensors' samples
 )
 """State of the filter and of the trust in it."""
 
@@ -87,8 +88,10 @@ def step_mechanism_filter(
         return found
     for k in range(IMU_COUNT):
         # A sample that is repeated is of another time.
-        s.fresh[k] = 1 if imus.used[k] != 0 and imus.sample_age[k] == 0 else 0
-    accumulate_sample(f, imus.sample, s.fresh, now - p.delay)
+        fresh = imus.used[k] != 0 and imus.sample_age[k] == 0
+        for sensor in range(2):
+            s.weights[sensor, k] = worth_of(imus.shaking, sensor, k, p.filter.variance[sensor]) if fresh else 0.0
+    accumulate_sample(f, imus.sample, s.weights, now - p.delay)
     if heading.used != 0 and heading.fresh != 0:
         accumulate_field(f, heading.field, now - p.delay)
     step_filter(p.filter, rig.sensors, f)

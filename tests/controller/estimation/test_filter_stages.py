@@ -80,10 +80,11 @@ def test_the_constants_of_the_filters_are_those_of_the_settings_in_cycles_of_the
         "jerk": 49.0, "bias_walk": 4e-8, "bias_sigma": 0.03, "rate_variance": 4e-6 * 400.0, "force_variance": 2.5e-3 * 400.0,
         "weight": 62500.0, "delay": 0.004, "settling_cycles": 80,
     }  # fmt: skip
-    platform = platform_parameters(fusion, 800.0)
+    platform = platform_parameters(fusion, 800.0, 60.0)
+    assert float(platform_parameters(fusion, 800.0)["acceleration_variance"]) == 4.0
     of_platform = {
         "rate_density": 4e-6, "bias_walk": 4e-8, "bias_sigma": 0.03, "force_variance": 4e-4 * 400.0,
-        "weight": 40000.0, "delay": 0.004, "settling_cycles": 80,
+        "weight": 40000.0, "delay": 0.004, "settling_cycles": 80, "acceleration_variance": (2.0 * 60.0 * 0.025) ** 2,
     }  # fmt: skip
     heading = heading_parameters(fusion, 800.0, MagneticField(np.eye(3)[:2], 15.0, -36.0), True)
     of_heading = {
@@ -353,24 +354,30 @@ def test_the_stages_on_filterpy_do_the_same_over_failures_and_new_starts(incline
         used = np.ones(7, np.int64)
         used[2], used[PLATFORM_IMU] = not 20 <= k < 40, not 30 <= k < 60
         sample = still + random.normal(size=still.shape) * np.array([2e-3, 0.2, 0.0])[:, None, None]
+        # A shock on each IMU in turn, and readings that are clipped.
+        sample[ACCELEROMETER, k % 7] += (k % 5 == 0) * random.normal(scale=30.0, size=3)
+        clipped = random.random((2, 7)) < 0.05
         for state in (compiled, twin):
-            state["imus"]["used"], state["imus"]["sample"] = used, sample
+            state["imus"]["used"], state["imus"]["sample"], state["imus"]["shaking"]["clipped"] = used, sample, clipped
+            state["imus"]["shaking"]["mean"] = (k // 25) % 2 * np.linspace(0.1, 30.0, 7)
+            state["pose"]["twist"] = 0.1
             state["pose"]["acceleration"] = random.normal(size=6) if state is compiled else compiled["pose"]["acceleration"]
         step(parameters, compiled, last=CycleStage.HEADING)
         filters.step_legs(twin)
         filters.step_platform(twin)
         twin["time"]["cycle"] += 1
         for stage, names in (
+            ("imus", ("shaking",)),
             ("legs", ("x", "age", "used", "weights", "directions", "rates")),
             ("platform", ("x", "unknown", "noise", "running", "age", "used", "weight", "vertical", "rate", "imu_acceleration")),
         ):
             for name in names:
-                np.testing.assert_allclose(
-                    twin[stage][name], compiled[stage][name], rtol=1e-9, atol=1e-9, err_msg=f"{name} {k}"
-                )
-        # Where the platform's velocity is known to be zero, it has no variance.
-        for stage, least in (("legs", 1e-300), ("platform", 1e-6)):
-            scale = np.sqrt(np.diagonal(compiled[stage]["covariance"], axis1=-2, axis2=-1)) + least
+                pair = [state[stage][name] if name != "shaking" else state[stage][name]["excess"] for state in (twin, compiled)]
+                np.testing.assert_allclose(*pair, rtol=1e-9, atol=1e-9, err_msg=f"{name} {k}")
+        # Where the platform's velocity is known to be zero, it has no variance but rounding's of that of a clipped reading.
+        for stage, least in (("legs", 1e-300), ("platform", 1e-3)):
+            variances = np.diagonal(compiled[stage]["covariance"], axis1=-2, axis2=-1)
+            scale = np.sqrt(np.maximum(variances, 0.0)) + least
             off = (twin[stage]["covariance"] - compiled[stage]["covariance"]) / scale[..., :, None] / scale[..., None, :]
             assert np.abs(off).max() < 1e-9
 

@@ -5,10 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from controller.estimation import shaking
 from controller.estimation.filterpy_filters import STATES, FilterpyLeg, FilterpyPlatform
-from controller.estimation.leg_filter import predict_leg, predict_measurement, start_leg, update_leg
+from controller.estimation.leg_filter import force_doubt, predict_leg, predict_measurement, start_leg, take_leg_sample
 from controller.estimation.platform_filter import STATE, platform_parameters, start_platform, step_platform
 from controller.settings import FusionSettings
+from plant.imu import GYROSCOPE
 from tests.controller.leg_geometry import unit
 from tests.controller.leg_motion import observe, sines
 
@@ -24,21 +26,32 @@ class Twins:
         fusion = FusionSettings()
         self.noise = (1.0 / rate, fusion.leg_jerk**2, fusion.bias_walk**2)
         variances = (fusion.gyroscope_noise**2 * rate / 2.0, fusion.leg_accelerometer_noise**2 * rate / 2.0)
-        self.arguments = (up, d, GRAVITY, *variances)
+        self.place, self.variances, self.period = (up, d, GRAVITY), variances, 1.0 / rate
+        self.shaking = np.zeros((), shaking.STATE)[()]
         self.reference = FilterpyLeg(up, d, GRAVITY, *self.noise, *variances)
         self.x, self.covariance = np.zeros(STATES), np.zeros((STATES, STATES))
         self.scratch = (np.zeros(6), np.zeros((6, STATES)), np.zeros(STATES), np.zeros(STATES))
 
     def start(self, gyroscope, accelerometer):
-        start_leg(self.x, self.covariance, gyroscope, accelerometer, self.arguments[0], FusionSettings().bias_sigma)
+        start_leg(self.x, self.covariance, gyroscope, accelerometer, self.place[0], FusionSettings().bias_sigma)
         self.reference.start(self.x, self.covariance)
         self.reference.take(gyroscope, accelerometer)
-        update_leg(self.x, self.covariance, gyroscope, accelerometer, *self.arguments, *self.scratch)
+        self.take(gyroscope, accelerometer)
 
-    def step(self, gyroscope, accelerometer):
-        self.reference.step(gyroscope, accelerometer)
+    def step(self, gyroscope, accelerometer, clipped=(0, 0)):
+        self.reference.predict()
+        self.reference.take(gyroscope, accelerometer, clipped)
         predict_leg(self.x, self.covariance, *self.noise)
-        update_leg(self.x, self.covariance, gyroscope, accelerometer, *self.arguments, *self.scratch)
+        self.take(gyroscope, accelerometer, clipped)
+
+    def take(self, gyroscope, accelerometer, clipped=(0, 0)):
+        s, nominal = self.shaking, self.variances
+        s["clipped"][:, 0] = clipped
+        predict_measurement(self.x, *self.place, *self.scratch[:2])
+        squared = float(np.sum((accelerometer - self.scratch[0][3:]) ** 2))
+        shaking.note_force(s, 0, squared, nominal[1] + force_doubt(self.covariance, *self.place[1:]), self.period)
+        variances = [shaking.variance_of(s, sensor, 0, nominal[sensor]) for sensor in range(2)]
+        take_leg_sample(self.x, self.covariance, gyroscope, accelerometer, *variances, *self.scratch)
 
 
 @pytest.mark.parametrize(("rate", "seed"), [(1000.0, 0), (1000.0, 1), (250.0, 2), (4000.0, 3)])
@@ -47,14 +60,20 @@ def test_five_thousand_steps_agree_with_the_compiled_filter(rate, seed):
     motion = observe(sines(random, size=0.3), np.arange(5000) / rate, UP_IN_JOINT, IMU_POSITION, GRAVITY)
     gyroscope = motion.gyroscope + 0.004 + random.normal(scale=2e-3, size=(5000, 3))
     accelerometer = motion.accelerometer + random.normal(scale=0.4, size=(5000, 3))
-    twins = Twins(rate)
+    # Shocks, and readings that are clipped.
+    shocks = random.random(5000) < 0.02
+    accelerometer[shocks] += random.normal(scale=30.0, size=(int(shocks.sum()), 3))
+    clipped = (random.random((5000, 2)) < 0.01).astype(int)
+    gyroscope[clipped[:, GYROSCOPE] != 0] = 4.4
+    twins, excess = Twins(rate), []
     twins.start(gyroscope[0], accelerometer[0])
     # Relative to the size of each state in this motion, a bias being part of a rate, and of each covariance to its variances.
     size = np.abs(motion.states).max(axis=0)
     size[6:] = size[2:4].min()
     worst = np.zeros(2)
-    for sample in zip(gyroscope[1:], accelerometer[1:], strict=True):
+    for sample in zip(gyroscope[1:], accelerometer[1:], clipped[1:], strict=True):
         twins.step(*sample)
+        excess.append(float(twins.shaking["excess"][0]))
         deviation = np.sqrt(np.diag(twins.covariance))
         off = twins.covariance - twins.reference.P
         worst = np.maximum(
@@ -62,6 +81,7 @@ def test_five_thousand_steps_agree_with_the_compiled_filter(rate, seed):
         )
     assert worst[0] < 1e-12
     assert worst[1] < 5e-12
+    assert max(excess) > 900.0 and np.count_nonzero(excess) > 0.8 * shocks.sum()
     # The motion was followed, so the agreement is not that of two filters at rest.
     assert np.ptp(motion.angles, axis=0).min() > 0.1
     assert np.abs(twins.x[:2] - motion.angles[-1]).max() < 0.01

@@ -1,5 +1,7 @@
 """Which IMUs are used: every limit on both of its sides, what is told, and when an IMU comes back."""
 
+from unittest.mock import ANY
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ from plant.mechanism import load_in_space
 from tests.controller.cycles import run_stages
 
 RATE_HZ = 500.0
-FROZEN, HEALTHY, STALE = 5, 10, 5
+FROZEN, HEALTHY, STALE, BRIDGED = 5, 10, 5, 25
 """How many cycles the durations last at this rate."""
 
 
@@ -224,14 +226,21 @@ def test_a_reading_is_in_range_below_the_limit_and_out_of_it_at_the_limit(hexapo
     for _ in range(2 * HEALTHY):
         screening.step()
     assert screening.step(spoil(1.0 - 1e-9)) == []
-    assert screening.step(spoil(1.0)) == [(Cause.IMU_OUT_OF_RANGE, imu, 1.0, 1.0)]
-    for _ in range(2 * HEALTHY):
-        screening.step()
+    # For 50 ms, others bridge it; that is told once.
+    ((cause, at, *_),) = screening.step(spoil(1.0))
+    assert (cause, at) == (Cause.BRIDGED, imu) and screening.used == list(ALL_IMUS)
+    for _ in range(BRIDGED - 1):
+        assert screening.step(spoil(1.0)) == []
     ((cause, at, value, limit),) = screening.step(spoil(1.5))
-    assert (cause, at, limit) == (Cause.IMU_OUT_OF_RANGE, imu, 1.0)
+    assert (cause, at, limit) == (Cause.IMU_OUT_OF_RANGE, imu, 1.0) and screening.used == screening.without(imu)
     assert value == pytest.approx(1.5, rel=1e-12)
-    for _ in range(2 * HEALTHY):
+    # While it is left out, one such reading begins the wait anew.
+    for _ in range(HEALTHY):
         screening.step()
+    assert screening.step(spoil(1.0)) == []
+    for _ in range(HEALTHY):
+        assert screening.step() == []
+    assert screening.step() == [(Cause.IMU_BACK, imu, ANY, ANY)]
     ((cause, at, value, limit),) = screening.step(spoil(np.nan))
     assert (cause, at) == (Cause.IMU_NOT_FINITE, imu)
     assert np.isnan(value) and np.isnan(limit)

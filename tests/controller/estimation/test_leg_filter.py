@@ -14,7 +14,7 @@ from controller.estimation.leg_filter import (
     predict_measurement,
     start_leg,
     step_leg_filters,
-    update_leg,
+    take_leg_sample,
 )
 from controller.inverse_kinematics import sample_workspace
 from controller.settings import FusionSettings, control_settings, fusion_settings
@@ -51,9 +51,8 @@ class Leg:
         self.update(gyroscope, accelerometer)
 
     def update(self, gyroscope, accelerometer):
-        samples = (gyroscope, accelerometer)
-        place = (UP_IN_JOINT, IMU_POSITION, GRAVITY)
-        update_leg(self.x, self.covariance, *samples, *place, *self.variances, *self._scratch)
+        predict_measurement(self.x, UP_IN_JOINT, IMU_POSITION, GRAVITY, *self._scratch[:2])
+        take_leg_sample(self.x, self.covariance, gyroscope, accelerometer, *self.variances, *self._scratch)
 
     def run(self, gyroscope, accelerometer):
         """States (N, 9) after each sample of a record."""

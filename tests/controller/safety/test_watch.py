@@ -8,7 +8,7 @@ from controller.inverse_kinematics import leg_lengths
 from controller.safety import watch_nothing
 from controller.safety.causes import Cause, DriveState, Mode, Request
 from controller.safety.stop import describe_end
-from controller.safety.watch import check_limits, exclude_imu, watch_parameters
+from controller.safety.watch import check_carried, check_limits, exclude_imu, watch_parameters
 from controller.settings import SafetySettings
 from plant.mechanism import Limits
 from plant.pose import rotation_from_vector
@@ -51,12 +51,12 @@ def test_limits_are_those_of_the_settings_with_their_margins():
     limits = Limits(stroke, velocity=0.3, acceleration=2.0, jerk=50.0)
     settings = SafetySettings(
         most_lost_imus=2.0, conditioning=0.01, stroke_margin=0.004, velocity_margin=1.5, following=0.02, saturation=0.3,
-        drive_deviation=0.11, patience=0.06, bus_patience=0.05,
+        drive_deviation=0.11, patience=0.06, bus_patience=0.05, carried=0.02,
     )  # fmt: skip
     p = watch_parameters(settings, 200.0, limits)
     assert (p["most_lost_imus"], p["conditioning"], p["following"]) == (2, 0.01, 0.02)
     assert (p["saturation"], p["drive_deviation"], p["patience"], p["bus_cycles"]) == (0.3, 0.11, 0.06, 10)
-    assert p["speed"] == pytest.approx(0.45)
+    assert p["speed"] == pytest.approx(0.45) and p["carried"] == pytest.approx(4e-4)
     np.testing.assert_allclose(p["lengths"], stroke + [-0.004, 0.004])
     # A quarter of the stroke's 100 to 150 mm.
     away = (0.1 + 0.01 * np.arange(6)) / 4.0
@@ -421,3 +421,49 @@ def test_only_in_motion_an_imu_is_left_out(mode):
     _, parameters, state = contradicted(4, mode=mode)
     exclude(parameters, state)
     assert told(state) == [] and not state["imus"]["excluded"].any()
+
+
+# ------------------------------------------------------------------------------------------------------------- shaken IMUs
+
+
+def check_shaken(parameters, state):
+    p, s = parameters["safety"][()], state
+    check_carried(
+        p, s["safety"][()], parameters["rig"][()], s["time"][()], s["imus"]["shaking"][()], s["legs"][()], s["mechanism"][()],
+        s["reference"][()], s["pid"][()],
+    )  # fmt: skip
+    return s["safety"]["stop"]["cause"] != Cause.NONE
+
+
+@pytest.mark.parametrize("sign", ["told", "bridging"])
+def test_a_run_with_shaken_imus_ends_when_a_leg_is_known_no_better_than_the_limit(sign):
+    _, parameters, state = moving()
+    limit, legs = SafetySettings().carried, state["legs"]
+    legs["used"][:5] = 1.0
+    for k, share in ((2, 1.01), (5, 9.0)):
+        legs["covariance"][k, 0, 0], legs["covariance"][k, 1, 1] = 0.3 * (share * limit) ** 2, 0.7 * (share * limit) ** 2
+    # As long as nothing shakes, and while nothing moves.
+    assert not check_shaken(parameters, state)
+    state["imus"]["shaking"][sign] = 1
+    state["safety"]["mode"] = Mode.ARMED
+    assert not check_shaken(parameters, state)
+    state["safety"]["mode"] = Mode.RUNNING
+    legs["covariance"][2] *= 0.97
+    assert not check_shaken(parameters, state)
+    legs["covariance"][2] /= 0.97
+    assert check_shaken(parameters, state)
+    cause, leg, value, most = stop_of(state)
+    assert (cause, leg, most) == (Cause.NOT_CARRIED, 2, pytest.approx(limit)) and value == pytest.approx(1.01 * limit)
+
+
+def test_while_the_whole_mechanism_filter_is_trusted_its_rotation_counts():
+    _, parameters, state = moving()
+    limit, mechanism = SafetySettings().carried, state["mechanism"]
+    state["imus"]["shaking"]["told"], mechanism["trusted"] = 1, 1
+    state["legs"]["used"], state["legs"]["covariance"] = 1.0, 1.0
+    mechanism["filter"]["published_covariance"][:3, :3] = 1.0
+    mechanism["filter"]["published_covariance"][4, 4] = (0.99 * limit) ** 2
+    assert not check_shaken(parameters, state)
+    mechanism["filter"]["published_covariance"][4, 4] = (1.01 * limit) ** 2
+    assert check_shaken(parameters, state)
+    assert stop_of(state)[:2] == (Cause.NOT_CARRIED, -1)

@@ -28,6 +28,12 @@ RATE_HZ = 1000.0
 
 
 @njit
+def weights_of(used):
+    """Weights (2, 7) of both sensors of the IMUs that are `used` (7,)."""
+    return np.stack((used, used)).astype(np.float64)
+
+
+@njit
 def follow(parameters, geometry, state, imu, signals, used, delay, start, position, rotation, twist, positions, rotations):
     """Run the filter over signals (N, 3, 7, 3), from a pose and twist; `used` (N, 7)."""
     measurement, rate, acceleration = np.zeros((3, 7, 3)), np.zeros(6), np.zeros(6)
@@ -37,7 +43,7 @@ def follow(parameters, geometry, state, imu, signals, used, delay, start, positi
         if i == start:
             start_filter(parameters, state, time, position, rotation, twist)
         if i > start:
-            accumulate_sample(state, measurement, used[i], time - delay)
+            accumulate_sample(state, measurement, weights_of(used[i]), time - delay)
             step_filter(parameters, geometry, state)
         extrapolate(state, time, positions[i], rotations[i], rate, acceleration)
 
@@ -249,7 +255,7 @@ def test_taken_bit_by_bit_it_equals_its_dense_twin(hexapod, errors, rig, toleran
     start_filter(parameters[()], state[()], 0.0, *start)
     window = 5
     for i in range(1, len(samples)):
-        accumulate_sample(state[()], samples[i], used[i], i / RATE_HZ)
+        accumulate_sample(state[()], samples[i], weights_of(used[i]), i / RATE_HZ)
         step_filter(parameters[()], geometry, state[()])
         if i % window == 0:
             taken, block = used[i - window + 1 : i + 1], samples[i - window + 1 : i + 1]
@@ -323,7 +329,7 @@ def test_every_cycle_of_a_window_takes_its_share(hexapod):
     signals = impose(hexapod, "static", 0.1, RATE_HZ, 0).signals[0]
     rows = []
     for i in range(1, 21):
-        accumulate_sample(state[()], signals, np.ones(7, np.int64), i / RATE_HZ)
+        accumulate_sample(state[()], signals, np.ones((2, 7)), i / RATE_HZ)
         step_filter(parameters[()], geometry, state[()])
         rows.append(int(state["row"]))
     assert rows[4:9] == [0, 9, 20, 31, -1]
@@ -351,7 +357,7 @@ def test_the_heading_is_taken_as_a_kalman_filter_takes_it(hexapod, off):
     for each in (state, without):
         for i in range(1, 10):
             # No IMU is used, so that nothing but the field is taken.
-            accumulate_sample(each[()], np.zeros((3, 7, 3)), np.zeros(7, np.int64), i / RATE_HZ)
+            accumulate_sample(each[()], np.zeros((3, 7, 3)), np.zeros((2, 7)), i / RATE_HZ)
             step_filter(parameters[()], geometry, each[()])
     assert state["row"] == without["row"] == -1 and state["field_used"] == 0
     predicted, spread = without["rotation"], without["covariance"][:n, :n]
@@ -404,22 +410,45 @@ def test_what_is_published_is_carried_to_the_present_by_its_motion():
     np.testing.assert_allclose(acceleration, motion[2:].ravel(), atol=1e-14)
 
 
-def test_a_window_is_the_mean_of_the_samples_of_each_imu_that_were_used(hexapod):
+def test_a_window_is_the_weighted_mean_of_the_samples_of_each_sensor(hexapod):
     random, parameters = np.random.default_rng(10), filter_parameters(FusionSettings(), RATE_HZ, "accelerometers", None)
     state, geometry = np.zeros((), FILTER_STATE), sensor_geometry(hexapod)[()]
     start_filter(parameters[()], state[()], 0.0, hexapod.home.position, np.eye(3), np.zeros(6))
     for window in range(2):
-        samples, used = random.normal(size=(5, 3, 7, 3)), random.integers(0, 2, (5, 7))
-        used[:, 0], used[:, 6] = 0, 1
+        samples, weights = (
+            random.normal(size=(5, 3, 7, 3)),
+            random.integers(0, 2, (5, 2, 7)) * random.uniform(1e-4, 1.0, (5, 2, 7)),
+        )
+        weights[:, :, 0], weights[:, :, 6] = 0.0, 1.0
         for i in range(5):
-            accumulate_sample(state[()], samples[i], used[i], (5 * window + i) / RATE_HZ)
+            accumulate_sample(state[()], samples[i], weights[i], (5 * window + i) / RATE_HZ)
             step_filter(parameters[()], geometry, state[()])
-        np.testing.assert_array_equal(state["sample_used"], used.sum(axis=0))
-        for imu in range(1, 7):
-            if used[:, imu].any():
-                mean = samples[used[:, imu] > 0][:, :2, imu].mean(axis=0).ravel()
-                np.testing.assert_allclose(state["sample"][imu], mean, rtol=0.0, atol=1e-14)
+        np.testing.assert_allclose(state["sample_weight"], weights.sum(axis=0), rtol=1e-14)
+        for sensor in range(2):
+            for imu in range(1, 7):
+                if weights[:, sensor, imu].any():
+                    mean = np.average(samples[:, sensor, imu], axis=0, weights=weights[:, sensor, imu])
+                    found = state["sample"][imu, 3 * sensor : 3 * sensor + 3]
+                    np.testing.assert_allclose(found, mean, rtol=0.0, atol=1e-13)
         assert state["time"] == pytest.approx((5 * window + 2) / RATE_HZ)
+
+
+def test_a_reading_counts_in_the_update_by_its_weight(hexapod):
+    """A thousandth of the weight is a thousand times the variance: the same as a filter with that noise."""
+    random, home = np.random.default_rng(3), hexapod.home
+    samples = random.normal(size=(5, 3, 7, 3))
+    found = []
+    for weight, inflation in ((1e-3, 1.0), (1.0, 1e3)):
+        parameters = filter_parameters(FusionSettings(), RATE_HZ, "accelerometers", None)
+        parameters["variance"] *= inflation
+        state = np.zeros((), FILTER_STATE)
+        start_filter(parameters[()], state[()], 0.0, home.position, np.eye(3), np.zeros(6))
+        for i in range(10):
+            accumulate_sample(state[()], samples[i % 5], np.full((2, 7), weight), i / RATE_HZ)
+            step_filter(parameters[()], sensor_geometry(hexapod)[()], state[()])
+        found.append(state)
+    np.testing.assert_allclose(found[0]["covariance"], found[1]["covariance"], rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(found[0]["published_position"], found[1]["published_position"], rtol=0.0, atol=1e-10)
 
 
 def test_an_unknown_block_of_errors_is_refused():

@@ -27,12 +27,12 @@ def positions_at_rest(hexapod, errors, minutes, seed):
     biases = np.array([np.radians(0.2), 1e-3 * STANDARD_GRAVITY])[:, None, None] * unit(random.normal(size=(2, 7, 3)))
     mean = ideal * (1.0 + 1e-3 * random.uniform(-1.0, 1.0, (2, 7, 3))) + biases
     start_filter(parameters[()], f[()], 0.0, home.position, home.rotation, np.zeros(6))
-    sample, used, found, number = np.zeros((3, 7, 3)), np.ones(7), [], 0
+    sample, weights, found, number = np.zeros((3, 7, 3)), np.ones((2, 7)), [], 0
     for _ in range(round(60 * minutes)):
         for noise in NOISE * random.normal(size=(round(RATE_HZ), 2, 7, 3)):
             number += 1
             sample[:2] = mean + noise
-            accumulate_sample(f[()], sample, used, number / RATE_HZ)
+            accumulate_sample(f[()], sample, weights, number / RATE_HZ)
             step_filter(parameters[()], geometry[()], f[()])
         found.append(f["published_position"].copy())
     return np.array(found), np.sqrt(np.trace(f["published_covariance"][:3, :3]))

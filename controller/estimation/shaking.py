@@ -1,0 +1,141 @@
+"""Vibration, shocks and clipped readings: how uncertain each sensor's reading is in this cycle, for all filters.
+
+The filters know what an accelerometer should read: gravity, and the motion that the gyroscopes show. What it reads beyond that,
+more than noise and the filter's own uncertainty explain, is vibration or a shock. Its square is added to the variance of the
+reading, so that the filters go on with the gyroscopes for as long as it lasts. That needs no knowledge of its frequency. While
+an IMU is shaken, a reading that could be explained may still hide as much vibration as would not show.
+
+A reading at the end of its sensor's range is clipped. It says nothing, and the others bridge it.
+"""
+
+import numpy as np
+
+from controller.estimation.excess import INNOVATION_LIMIT, faded_excess
+from controller.safety.causes import Cause, report_event
+from plant.compiled import Record, kernel, record_dtype
+from plant.imu import ACCELEROMETER
+from plant.imu_wiring import IMU_COUNT
+from plant.pose import Array
+
+MEMORY_S = 0.002
+"""Time in which the excess of a reading fades to the share 1/e: sensors' low-passes let a shock fade so."""
+
+_AVERAGE_S = 0.3
+"""Time constant of the mean square that is told [s]."""
+
+CALM_S = 1.0
+"""For how long nothing may shake before that is told [s]."""
+
+_BRIDGED_S = 0.05
+"""For how long readings may be clipped before the IMU is left out; as long without restores it [s]."""
+
+SAYS_NOTHING = 1e4
+"""Variance of a clipped reading [m^2/s^4, rad^2/s^2]: so much more than that of any other that it does not count."""
+
+_CALM_SHARE = 0.5
+"""Below this share of the limit nothing shakes."""
+
+PARAMETERS = record_dtype(
+    limit=np.float64,  # of vibration, RMS, from which on it is told [m/s^2]
+    bridged_cycles=np.int64,
+    calm_cycles=np.int64,
+    smoothing=np.float64,  # share of a new excess in the mean
+)
+"""Constants."""
+
+STATE = record_dtype(
+    clipped=(np.int64, (2, IMU_COUNT)),  # whether the reading is at the end of its range
+    clipped_for=(np.int64, IMU_COUNT),  # cycles with clipped readings, less those without
+    excess=(np.float64, IMU_COUNT),  # of the square of each accelerometer's reading over what is explained, faded [m^2/s^4]
+    mean=(np.float64, IMU_COUNT),  # of that, averaged
+    hidden=(np.float64, IMU_COUNT),  # mean square of what readings hide that could be explained [m^2/s^4]
+    told=np.int64,  # whether it has been told that IMUs are shaken
+    bridging=np.int64,  # the same of clipped readings
+    calm_for=np.int64,  # for how many cycles nothing has shaken them
+)
+"""State."""
+
+
+def shaking_parameters(limit: float, rate: float) -> Record:
+    """The constants (dtype `PARAMETERS`) in cycles of this rate [Hz]; `limit` is that of vibration [m/s^2]."""
+    made: Record = np.zeros((), PARAMETERS)
+    made["limit"] = limit
+    made["bridged_cycles"] = max(2, round(_BRIDGED_S * rate))
+    made["calm_cycles"] = round(CALM_S * rate)
+    made["smoothing"] = 1.0 / (_AVERAGE_S * rate)
+    return made
+
+
+@kernel
+def note_force(s: Record, k: int, squared: float, explained: float, period: float) -> None:
+    """Note by how much the accelerometer of IMU `k` reads what is not explained.
+
+    Args:
+        squared: square of the difference of reading and expectation [m^2/s^4].
+        explained: mean of it by noise and the filter's uncertainty.
+        period: since the sample before [s].
+    """
+    s.excess[k] = faded_excess(s.excess[k], squared, explained, period, MEMORY_S)
+    # Anything up to the limit is as likely, as long as there is much beyond it.
+    s.hidden[k] = min(max(s.mean[k] - explained, 0.0), INNOVATION_LIMIT**2 * explained) / 3.0
+
+
+@kernel
+def variance_of(s: Record, sensor: int, k: int, nominal: float) -> float:
+    """The variance of a sensor's reading in this cycle, of which `nominal` is noise."""
+    clipped = SAYS_NOTHING if s.clipped[sensor, k] != 0 else 0.0
+    return float(nominal + clipped + (s.excess[k] + s.hidden[k] if sensor == ACCELEROMETER else 0.0))
+
+
+@kernel
+def worth_of(s: Record, sensor: int, k: int, nominal: float) -> float:
+    """The weight of a sensor's reading in this cycle, as a share of that of one with its noise alone."""
+    return float(nominal / variance_of(s, sensor, k, nominal))
+
+
+@kernel
+def bridges(p: Record, s: Record, k: int, used: int, missed: int) -> bool:
+    """Whether IMU `k` can be used although its readings may be clipped: it is in use, and they have not been for long."""
+    if s.clipped[0, k] == 0 and s.clipped[1, k] == 0:
+        s.clipped_for[k] = max(s.clipped_for[k] - 1 - missed, 0)
+        return True
+    s.clipped_for[k] = min(s.clipped_for[k] + 1 + missed, p.bridged_cycles + 1)
+    return bool(used != 0 and s.clipped_for[k] <= p.bridged_cycles)
+
+
+@kernel
+def tell_shaking(p: Record, s: Record, used: Array, missed: int, events: Record) -> None:
+    """Report once that IMUs are shaken and that readings at the end of their range are bridged, and when all is calm again."""
+    worst, clipped = 0, -1
+    share = min(1.0, (1 + missed) * p.smoothing)
+    for k in range(IMU_COUNT):
+        if used[k] == 0:
+            s.excess[k] = s.hidden[k] = 0.0
+        elif s.clipped[0, k] != 0 or s.clipped[1, k] != 0:
+            clipped = k
+        s.mean[k] += share * (s.excess[k] - s.mean[k])
+        if s.mean[k] > s.mean[worst]:
+            worst = k
+    if s.told == 0 and s.mean[worst] > p.limit**2:
+        s.told = 1
+        report_event(events, Cause.SHAKEN, worst, np.sqrt(s.mean[worst]), p.limit)
+    if s.bridging == 0 and clipped >= 0:
+        s.bridging = 1
+        report_event(events, Cause.BRIDGED, clipped, np.nan, np.nan)
+    calm = clipped < 0 and s.mean[worst] < (_CALM_SHARE * p.limit) ** 2
+    s.calm_for = s.calm_for + 1 + missed if calm else 0
+    if s.calm_for > p.calm_cycles and (s.told != 0 or s.bridging != 0):
+        s.told = s.bridging = 0
+        report_event(events, Cause.CALM, -1, np.nan, np.nan)
+
+
+@kernel
+def is_clipped(s: Record, sensor: int, k: int) -> bool:
+    """Whether a sensor's reading is at the end of its range."""
+    return bool(s.clipped[sensor, k] != 0)
+
+
+@kernel
+def is_shaken(s: Record) -> bool:
+    """Whether it has been told that IMUs are shaken, or that readings are bridged, and not that all is calm."""
+    return bool(s.told != 0 or s.bridging != 0)
