@@ -1,0 +1,171 @@
+"""What the IMUs and the legs do while the platform moves: exact kinematics of a mechanism of six legs, in NumPy.
+
+This is code of its own, on purpose: it shares nothing with the loop's filters, whose figures it bounds. From the vector of a
+leg in its joint's frame, s = L (sin b, -sin a cos b, cos a cos b), follow the angles a and b of its universal joint with two
+derivatives, from these the angular velocity and acceleration in the leg's frame, and the specific force at the IMU.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation
+
+from controller.planning.target import Target
+from plant.errors import InputError
+from plant.imu_wiring import IMU_COUNT, PLATFORM_IMU
+from plant.mechanism import LEGS, Mechanism
+from plant.pose import Array
+
+POSE = 6
+"""Position and rotation vector of a pose error."""
+
+JET = 3 * POSE
+"""A pose error, its rate and its second derivative."""
+
+_DIFFERENCE_S = 1e-4
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The platform's motion in {1} at N times: (N, 3) each, the rotation (N, 3, 3) maps {2} to {1}."""
+
+    position: Array
+    rotation: Array
+    velocity: Array
+    angular_velocity: Array
+    acceleration: Array
+    angular_acceleration: Array
+
+    def shifted(self, jet: Array) -> "Motion":
+        """The motion with a pose error (18,) that changes: `exp(error) rotation`, and its two derivatives to first order."""
+        position, rotation, velocity, turning, acceleration, hurry = jet.reshape(POSE, 3)
+        omega = self.angular_velocity
+        return Motion(
+            self.position + position,
+            Rotation.from_rotvec(rotation).as_matrix() @ self.rotation,
+            self.velocity + velocity,
+            omega + turning + np.cross(rotation, omega),
+            self.acceleration + acceleration,
+            self.angular_acceleration + hurry + np.cross(turning, omega) + np.cross(rotation, self.angular_acceleration),
+        )
+
+
+class Signals(NamedTuple):
+    """What is measured, without any error, and where the IMUs are."""
+
+    angular_velocity: Array  # (N, 7, 3) [rad/s], in each IMU's axes
+    specific_force: Array  # (N, 7, 3) [m/s^2], likewise
+    leg_rates: Array  # (N, 6) [m/s]
+    axes: Array  # (N, 7, 3, 3), from each IMU's axes to {1}
+    places: Array  # (N, 7, 3) [m], in {1}
+    velocities: Array  # (N, 7, 3) [m/s], in {1}
+
+    def data(self) -> Array:
+        """(N, 48): angular velocity and specific force IMU by IMU, then the rates of the legs."""
+        imus = np.concatenate([self.angular_velocity, self.specific_force], axis=2).reshape(-1, 2 * 3 * IMU_COUNT)
+        return np.concatenate([imus, self.leg_rates], axis=1)
+
+
+def motion_along(target: Target, mechanism: Mechanism, times: Array) -> Motion:
+    """A target's motion at times (N,) [s], through a spline with four continuous derivatives; before 0 it stands at the start.
+
+    Raises:
+        InputError: the target holds its poses, between which only a planner knows the way.
+    """
+    if target.held:
+        raise InputError(f"the target {target.name!r} jumps from pose to pose; choose one that moves on, such as sines")
+    home = mechanism.require_home()
+    turns = Rotation.from_matrix(target.rotations @ home.rotation.T).as_rotvec()
+    spline = make_interp_spline(target.times, np.hstack([target.positions, turns]), k=5)
+    velocity, acceleration = spline.derivative(1), spline.derivative(2)
+
+    def turning(at: Array) -> Array:
+        """The angular velocity of a rotation vector: phi' + b phi x phi' + c phi x (phi x phi')."""
+        phi, rate = spline(at)[:, 3:], velocity(at)[:, 3:]
+        angle = np.maximum(np.linalg.norm(phi, axis=1, keepdims=True), 1e-4)
+        across = np.cross(phi, rate)
+        b, c = (1.0 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+        omega: Array = rate + b * across + c * np.cross(phi, across)
+        return omega
+
+    at, moving = np.maximum(times, 0.0), (times > 0.0)[:, None]
+    hurry = (turning(at + _DIFFERENCE_S) - turning(at - _DIFFERENCE_S)) / (2.0 * _DIFFERENCE_S)
+    return Motion(
+        spline(at)[:, :3],
+        Rotation.from_rotvec(spline(at)[:, 3:]).as_matrix() @ home.rotation,
+        velocity(at)[:, :3] * moving,
+        turning(at) * moving,
+        acceleration(at)[:, :3] * moving,
+        hurry * moving,
+    )
+
+
+def signals(mechanism: Mechanism, motion: Motion) -> Signals:
+    """The signals along a motion, on a base that stands still."""
+    arms = np.einsum("nij,kj->nki", motion.rotation, mechanism.platform_joints)
+    omega, alpha = motion.angular_velocity[:, None], motion.angular_acceleration[:, None]
+    turned = np.cross(omega, arms)
+    s = motion.position[:, None] + arms - mechanism.base_joints
+    ds = motion.velocity[:, None] + turned
+    dds = motion.acceleration[:, None] + np.cross(alpha, arms) + np.cross(omega, np.cross(omega, arms))
+    rates = np.sum(s * ds, axis=2) / np.linalg.norm(s, axis=2)
+    axes, leg_omega, leg_alpha = _universal_joints(mechanism.joint_rotations, s, ds, dds)
+
+    platform = motion.rotation[:, None]
+    axes = np.concatenate([axes, platform], axis=1)
+    own_omega = np.concatenate([leg_omega, _seen(platform, omega)], axis=1)
+    own_alpha = np.concatenate([leg_alpha, _seen(platform, alpha)], axis=1)
+    levers = np.vstack([mechanism.plant["leg_imu_position"], mechanism.plant["platform_imu_position"]])
+    # Of the points about which the IMUs turn, the base joints stand still.
+    origin = np.zeros((len(s), IMU_COUNT, 3))
+    origin[:, :LEGS] = mechanism.base_joints
+    origin[:, PLATFORM_IMU] = motion.position
+    moving, speeding = np.zeros_like(origin), np.zeros_like(origin)
+    moving[:, PLATFORM_IMU], speeding[:, PLATFORM_IMU] = motion.velocity, motion.acceleration
+    speeding -= mechanism.plant["gravity"]
+    force = _seen(axes, speeding) + np.cross(own_alpha, levers) + np.cross(own_omega, np.cross(own_omega, levers))
+    places = origin + np.einsum("nkij,kj->nki", axes, levers)
+    velocities = moving + np.einsum("nkij,nkj->nki", axes, np.cross(own_omega, levers))
+    return Signals(own_omega, force, rates, axes, places, velocities)
+
+
+def sensitivity(mechanism: Mechanism, motion: Motion) -> Array:
+    """The derivative (N, 48, 18) of the data with respect to a pose error and its two derivatives, by central differences."""
+    derivative = np.empty((len(motion.position), signals(mechanism, motion).data().shape[1], JET))
+    for i in range(JET):
+        step = np.zeros(JET)
+        step[i] = 1e-5
+        ahead, behind = (signals(mechanism, motion.shifted(sign * step)).data() for sign in (1.0, -1.0))
+        derivative[:, :, i] = (ahead - behind) / 2e-5
+    return derivative
+
+
+def _seen(axes: Array, vectors: Array) -> Array:
+    """Vectors (N, K, 3) of {1} in the axes (N, K, 3, 3)."""
+    seen: Array = np.einsum("nkji,nkj->nki", axes, np.broadcast_to(vectors, axes.shape[:3]))
+    return seen
+
+
+def _universal_joints(joints: Array, s: Array, ds: Array, dds: Array) -> tuple[Array, Array, Array]:
+    """Axes (N, 6, 3, 3) of the legs in {1}, their angular velocity and angular acceleration (N, 6, 3) in these axes."""
+    (x, y, z), (dx, dy, dz), (ddx, ddy, ddz) = (
+        np.moveaxis(np.einsum("kji,nkj->nki", joints, each), 2, 0) for each in (s, ds, dds)
+    )
+    square = y * y + z * z
+    dsquare = 2.0 * (y * dy + z * dz)
+    da = (y * dz - dy * z) / square
+    dda = (y * ddz - ddy * z - da * dsquare) / square
+    height = np.sqrt(square)
+    dheight = 0.5 * dsquare / height
+    ddheight = (dy * dy + dz * dz + y * ddy + z * ddz - dheight * dheight) / height
+    length = x * x + square
+    db = (dx * height - x * dheight) / length
+    ddb = (ddx * height - x * ddheight - 2.0 * db * (x * dx + height * dheight)) / length
+    sa, ca, sb, cb = -y / height, z / height, x / np.sqrt(length), height / np.sqrt(length)
+    zero = np.zeros_like(sa)
+    turns = np.stack([cb, zero, sb, sa * sb, ca, -sa * cb, -ca * sb, sa, ca * cb], axis=-1).reshape(*sa.shape, 3, 3)
+    omega = np.stack([da * cb, db, da * sb], axis=-1)
+    alpha = np.stack([dda * cb - da * db * sb, ddb, dda * sb + da * db * cb], axis=-1)
+    return joints @ turns, omega, alpha
