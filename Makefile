@@ -39,7 +39,7 @@ bench: .venv/installed-all
 	$(BIN)/gough bench --json $(OUT)/bench.json $(BENCH)
 	$(BIN)/gough compare-fusion --json $(OUT)/fusion.json $(FUSION)
 	$(BIN)/gough evaluate-fusion --json $(OUT)/evaluation.json $(EVALUATION)
-	$(BIN)/gough faults --json $(OUT)/faults.json $(FAULTS)
+	$(BIN)/gough faults --results $(OUT)/faults --json $(OUT)/faults.json $(FAULTS)
 
 lint: .venv/installed-lint
 	$(BIN)/ruff check .

@@ -284,32 +284,74 @@ _EVALUATED: dict[str, Callable[[dict[str, Any]], None]] = {
 
 @cli.command(
     cli.setting("--seeds", 20, "how often each case is tried"),
-    cli.argument("--only", metavar="TEXT", help="only cases with this text in their names"),
+    cli.argument(
+        "--only",
+        metavar="TEXT",
+        action="append",
+        help="only cases with this text in their names or kinds, such as 'base' or vibration; can be given several times",
+    ),
+    cli.flag("--list", "print which cases there are, and run nothing"),
+    cli.setting("--fusion", "compiled,whole", "ways to fuse the IMUs, as for 'gough simulate', with commas in between"),
+    cli.argument(
+        "--results",
+        type=Path,
+        metavar="FOLDER",
+        help="keep every run in a table in Parquet in this folder; one that was interrupted goes on there",
+    ),
+    cli.flag("--worst", "sort the disturbances, the worst first"),
     cli.markdown("docs/faults.md"),
     cli.engine_options(),
     cli.JSON,
 )
 def gough_faults(options: Namespace) -> int:
-    """Try every fault many times, and compare with the specified reaction.
+    """Try every fault and disturbance many times.
 
-    Every case of the fault matrix runs on the emulated rig, on virtual time. Prints the reported cause, how the run ends, how
-    soon, and how far a leg gets off its reference. The exit status is 1 if any reaction differs from the specified one.
+    First come faults with a specified reaction, on the emulated rig: the reported cause, how the run ends, how soon, and how
+    far a leg gets off its reference. Then come disturbances of IMUs, base, mechanism, loads and drives, with each way to fuse
+    the IMUs: the greatest error of the pose until something was told, and afterwards; what was told, and when; and how often a
+    sound IMU was left out and the error then exceeded 5 mm or 1 deg, which is forbidden. All runs are on virtual time. The exit
+    status is 1 if a reaction differs from the specified one, or if there is a forbidden outcome.
     """
-    from hil.studies.fault_matrix import CASES, run_matrix, summary, table
+    from hil.faults.reactions import CASES, Case, table
+    from hil.faults.rows import Row, all_rows
+    from hil.faults.tables import disturbance_table, disturbances_of, list_table, summary, worst_first
+    from hil.faults.trials import outcomes_of, run_trials, trials_of
 
     if options.seeds < 1:
         raise InputError(f"there are {options.seeds} seeds; at least 1 is needed")
-    cases = tuple(case for case in CASES if options.only is None or options.only in case.name)
-    if not cases:
-        raise InputError(f"no case has {options.only!r} in its name")
+    fusions = tuple(options.fusion.split(","))
+    for fusion in fusions:
+        SimulationConfig(fusion=fusion)
+    only: list[str] = options.only or [""]
+    everything: list[Case | Row] = [*CASES, *all_rows()]
+    items = [item for item in everything if any(text in item.name or text in item.kind for text in only)]
+    if not items:
+        raise InputError(f"no case has {' or '.join(map(repr, only))} in its name")
+    if options.list:
+        list_table(items).print(options.markdown)
+        return 0
+    if options.results is not None:
+        check_installed("pyarrow")
     with engine_at_work(cli.engine_of(options), "faults") as (engine, progress):
-        outcomes = run_matrix(options.seeds, cases, engine, progress)
-    table(outcomes).print(options.markdown)
-    cli.write_json(options.json, summary(outcomes, options.seeds))
+        found = run_trials(trials_of(items, options.seeds, fusions), engine, progress, options.results)
+    cases = [item for item in items if isinstance(item, Case)]
+    outcomes, disturbances = outcomes_of(cases, found), disturbances_of(found)
+    if outcomes:
+        table(outcomes).print(options.markdown)
+    if disturbances:
+        disturbance_table(worst_first(disturbances) if options.worst else disturbances).print(options.markdown)
+    cli.write_json(options.json, summary(outcomes, disturbances, options.seeds))
     findings = [finding for outcome in outcomes for finding in outcome.findings]
     for finding in findings:
         print(finding, file=sys.stderr)
-    return int(bool(findings))
+    forbidden, runs = (sum(each[name] for each in disturbances) for name in ("forbidden", "runs"))
+    if disturbances:
+        print(
+            f"a sound IMU was left out, and the error then exceeded 5 mm or 1 deg: in {forbidden} of {runs} runs "
+            f"with {', '.join(fusions)}",
+            file=sys.stderr if forbidden else sys.stdout,
+        )
+    return int(bool(findings) or forbidden > 0)
 
 
 @cli.command(

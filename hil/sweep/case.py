@@ -74,11 +74,6 @@ class Case:
         return replace(self.config, **local)
 
 
-def kind_of(case: Case) -> str:
-    """`Case.kind`."""
-    return case.kind
-
-
 def measure(case: Case) -> dict[str, float]:
     """The figures of a case.
 

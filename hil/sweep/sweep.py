@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -14,7 +14,7 @@ import pyarrow as pa
 from hil.engine.batches import Failure, attempt, fingerprint
 from hil.engine.engine import Engine
 from hil.sweep.analysis import Analysis
-from hil.sweep.case import Case, cases_of, kind_of, measure, own_figures
+from hil.sweep.case import Case, cases_of, measure, own_figures
 from hil.sweep.names import is_factor
 from hil.sweep.store import DIED, DONE, ERROR, FAILED, KEY, REASON, STATUS, Store, as_stored, rows_of, settled
 from hil.sweep.study import Study
@@ -27,6 +27,20 @@ if TYPE_CHECKING:
 
 Report = Callable[[float, str], None]
 """Called with the share that is done, and what is going on in words."""
+
+
+class Keyed(Protocol):
+    """A run whose row is kept: what its figures depend on, in a hash, the `kind` for the engine, and its row's other values."""
+
+    @property
+    def key(self) -> str: ...  # noqa: D102
+    @property
+    def kind(self) -> str: ...  # noqa: D102
+    @property
+    def point(self) -> Mapping[str, Any]: ...  # noqa: D102
+
+
+Run = TypeVar("Run", bound=Keyed)
 
 _FLUSH_S = 0.1
 """The least time between files of new rows [s], on average: rows that come more slowly are written as they come."""
@@ -136,25 +150,47 @@ def run_study(study: Study, folder: Path, engine: Engine, progress: Report = no_
     """
     cases = _unique(study, progress)
     with Store.opened(folder) as store:
-        known = {*settled(store.table())[KEY].to_pylist()}
-        left = [case for case in cases if case.key not in known]
-        began, checked = time.monotonic(), False
-        for done, row in enumerate(run_cases(left, engine, store), start=1):
+        checked, ran = False, 0
+        for row in run_missing(cases, measure, engine, store, progress):
+            ran += 1
             if not checked and row[STATUS] == DONE:
                 check_figures(study.figures, figures_in(row, study))
                 checked = True
-            share = (len(cases) - len(left) + done) / len(cases)
-            rate = done / (time.monotonic() - began)
-            progress(share, f"{round(share * len(cases))} of {len(cases)} runs, {rate:.3g} a second")
         table = _table(study, cases, store)
-    result = SweepResult(study, folder, table, len(left))
+    result = SweepResult(study, folder, table, ran)
     if result.failed < len(table):
         check_figures(study.figures, result.analysis.names())
     return result
 
 
-def run_cases(cases: Sequence[Case], engine: Engine, store: Store) -> Iterator[dict[str, Any]]:
+def run_missing(
+    runs: Sequence[Run], work: Callable[[Run], Mapping[str, Any]], engine: Engine, store: Store, progress: Report = no_report
+) -> Iterator[dict[str, Any]]:
+    """Run what is not in a store yet, or died there, as `run_cases` does, and report the progress.
+
+    Raises:
+        GoughError: as for `run_cases`.
+    """
+    known = {*settled(store.table())[KEY].to_pylist()}
+    left = [run for run in runs if run.key not in known]
+    began = time.monotonic()
+    for done, row in enumerate(run_cases(left, engine, store, work), start=1):
+        yield row
+        there = len(runs) - len(left) + done
+        rate = done / (time.monotonic() - began)
+        progress(there / len(runs), f"{there} of {len(runs)} runs, {rate:.3g} a second")
+
+
+def run_cases(
+    cases: Sequence[Run], engine: Engine, store: Store, work: Callable[[Run], Mapping[str, Any]]
+) -> Iterator[dict[str, Any]]:
     """Run cases and yield their rows as they come; the rows go to the store soon after they came.
+
+    Args:
+        cases: each with a key of its own.
+        engine: where to run them.
+        store: where their rows are kept.
+        work: gives the figures of a case.
 
     Raises:
         GoughError: the engine's workers have gone, or the store cannot be written.
@@ -163,7 +199,7 @@ def run_cases(cases: Sequence[Case], engine: Engine, store: Store) -> Iterator[d
     rows: list[dict[str, Any]] = []
     began, files = time.monotonic(), 0
     try:
-        for number, outcome in engine.run(measure, cases, kind_of):
+        for number, outcome in engine.run(work, cases, _kind_of):
             row = _row(cases[number], outcome)
             rows.append(row)
             if time.monotonic() - began > files * _FLUSH_S:
@@ -233,7 +269,11 @@ def _table(study: Study, cases: Sequence[Case], store: Store) -> pa.Table:
     return pa.table(columns | {name: rows[name] for name in figures})
 
 
-def _row(case: Case, outcome: dict[str, float] | Failure) -> dict[str, Any]:
+def _kind_of(case: Keyed) -> str:
+    return case.kind
+
+
+def _row(case: Keyed, outcome: Mapping[str, Any] | Failure) -> dict[str, Any]:
     if isinstance(outcome, Failure):
         status = DIED if outcome.died else ERROR if outcome.again else FAILED
         return {KEY: case.key, STATUS: status, REASON: outcome.reason, **case.point}

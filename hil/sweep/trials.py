@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hil.engine.engine import Engine
-from hil.sweep.case import GEOMETRY_FIGURE, Case, case_of
+from hil.sweep.case import GEOMETRY_FIGURE, Case, case_of, measure
 from hil.sweep.design import Design, pooled
 from hil.sweep.store import DONE, KEY, REASON, STATUS, Store, settled
 from hil.sweep.sweep import check_figures, figures_in, run_cases
@@ -84,7 +84,7 @@ class TrialRunner:
             except GoughError as error:
                 outcome.reason, outcome.left = str(error), False
         new = {case.key: case for outcome, case in cases if outcome.left and case.key not in self._rows}
-        for row in run_cases(list(new.values()), self._engine, self._store):
+        for row in run_cases(list(new.values()), self._engine, self._store, measure):
             self._rows[row[KEY]] = row
             self.ran += 1
             self._told()

@@ -52,15 +52,22 @@ class RemoteNode(SdoClient):  # type: ignore[misc]
         eds: electronic data sheet.
         network: canopen's.
         receive: returns the next frame within a time [s], or None.
+        clock: [ns].
     """
 
     RESPONSE_TIMEOUT = 1.0
 
     def __init__(
-        self, name: str, node: int, eds: Any, network: canopen.Network, receive: Callable[[float], can.Message | None]
+        self, name: str, node: int, eds: Any, network: canopen.Network, receive: Callable[[float], can.Message | None],
+        clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:  # fmt: skip
         super().__init__(CobId.SDO_REQUEST + node, CobId.SDO_ANSWER + node, object_dictionary(eds, node))
+        self._clock = clock
         self.name, self.node, self.network, self._receive = f"{name} (node {node})", node, network, receive
+
+    def now(self) -> float:
+        """The present on its clock [s]."""
+        return 1e-9 * self._clock()
 
     def send_request(self, request: bytes) -> None:
         """Send a request; frames that an earlier one has left are no answer to it."""
@@ -71,9 +78,9 @@ class RemoteNode(SdoClient):  # type: ignore[misc]
 
     def read_response(self) -> bytes:
         """Wait for the answer."""
-        deadline = time.monotonic() + self.RESPONSE_TIMEOUT
+        deadline = self.now() + self.RESPONSE_TIMEOUT
         while self.responses.empty():
-            left = deadline - time.monotonic()
+            left = deadline - self.now()
             if left <= 0.0:
                 raise SdoCommunicationError("no answer")
             message = self._receive(left)
@@ -103,9 +110,9 @@ class RemoteNode(SdoClient):  # type: ignore[misc]
 
     def check(self, index: int, subindex: int, value: Any, within: float = 0.0) -> None:
         """Check that an object has this value, or takes it within a time [s]."""
-        deadline = time.monotonic() + within
+        deadline = self.now() + within
         found = self.read(index, subindex)
-        while found != value and time.monotonic() < deadline:
+        while found != value and self.now() < deadline:
             found = self.read(index, subindex)
         if found != value:
             raise RigError(
@@ -190,14 +197,14 @@ def switch_on(node: RemoteNode, controller: ControllerSettings) -> int:
     """Reset a drive's fault and lead the drive to Switched on; returns its statusword."""
     # Written each time: a drive begins to watch for the heartbeat at its next one, which comes with the first exchange.
     node.configure(Object.CONSUMER_HEARTBEAT, 1, controller.node << 16 | round(controller.heartbeat_timeout * 1e3))
-    deadline = time.monotonic() + _SWITCH_ON_TIMEOUT_S
+    deadline = node.now() + _SWITCH_ON_TIMEOUT_S
     code, resets = 0, 0
     while True:
         word = int(node.read(Object.STATUSWORD))
         state = state_of(word)
         if state == PowerState.SWITCHED_ON:
             return word
-        if time.monotonic() > deadline or (state == PowerState.FAULT and resets == 2):
+        if node.now() > deadline or (state == PowerState.FAULT and resets == 2):
             where = f"statusword 0x{word:04X}" if state is None else state.label
             raise RigError(
                 f"{node.name} does not reach {PowerState.SWITCHED_ON.label}: it stays in {where}, error code "

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from copy import deepcopy
 from itertools import count
+from typing import Any
 
 import can
 import canopen
@@ -24,7 +25,7 @@ from plant.mechanism import LEGS
 Channel = Callable[[can.Message, bool], Iterable[tuple[float, can.Message]]]
 """The bus's effect on a frame, with whether the nodes send it: the frames that arrive instead, each with its delay [s]."""
 
-_POLL_S, _HELD_BACK_S = 0.005, 0.002
+_POLL_NS, _HELD_BACK_S = 5_000_000, 0.002
 
 
 def faulty_channel(rig: Record) -> Channel:
@@ -40,17 +41,32 @@ def faulty_channel(rig: Record) -> Channel:
 
 
 class EmulatedBus:
-    """Six drives and seven IMUs around a machine, on a bus of their own."""
+    """Six drives and seven IMUs around a machine, on a bus of their own.
 
-    def __init__(self, settings: CanopenSettings, machine: PlantMachine, channel: Channel | None = None) -> None:
-        self._machine, self._fd = machine, settings.bus.fd
+    Args:
+        settings: of the bus and its nodes.
+        machine: what they drive and read.
+        channel: what happens to frames; by default nothing.
+        bus: by default that of the settings.
+        clock: [ns], also the machine's.
+    """
+
+    def __init__(
+        self,
+        settings: CanopenSettings,
+        machine: PlantMachine,
+        channel: Channel | None = None,
+        bus: Any = None,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._machine, self._fd, self._clock = machine, settings.bus.fd, clock
         self._channel = channel or (lambda message, outgoing: ((0.0, message),))
         self._scales = settings.imus.scales
-        self._bus = settings.bus.opened()
+        self._bus = settings.bus.opened() if bus is None else bus
         # The network sends by this object's `send`.
         self._network = canopen.Network(self)
-        self.drives = [EmulatedDrive(leg, settings, machine, self._network) for leg in range(LEGS)]
-        self.imus = [EmulatedImu(imu, settings, self._network) for imu in range(IMU_COUNT)]
+        self.drives = [EmulatedDrive(leg, settings, machine, self._network, clock) for leg in range(LEGS)]
+        self.imus = [EmulatedImu(imu, settings, self._network, clock) for imu in range(IMU_COUNT)]
         self.lost = 0  # frames that could not be sent or read
         self._nodes: list[EmulatedNode] = [*self.drives, *self.imus]
         self._controller = CobId.HEARTBEAT + settings.controller.node
@@ -66,26 +82,39 @@ class EmulatedBus:
     def serve(self, stop: Callable[[], bool], report: Callable[[], None] = lambda: None) -> None:
         """Answer the bus until `stop` returns true; `report` is called every few milliseconds."""
         while not stop():
-            now = time.monotonic_ns()
-            due = self._polled_ns + round(_POLL_S * 1e9)
-            if self._held:
-                due = min(due, self._held[0][0])
             try:
-                message = self._bus.recv(max(due - now, 0) * 1e-9)
+                message = self._bus.recv(max(self.due_ns - self._clock(), 0) * 1e-9)
             except (can.CanError, OSError, ValueError):
                 self.lost += 1
                 message = None
                 time.sleep(0.001)
-            # Some buses return the frames that the nodes have sent.
-            if message is not None and message.arbitration_id in self._heard:
-                self._pass(message, False)
-            now = time.monotonic_ns()
-            while self._held and self._held[0][0] <= now:
-                _, _, outgoing, frame = heapq.heappop(self._held)
-                self._arrive(frame, outgoing)
-            if now - self._polled_ns >= _POLL_S * 1e9:
-                self._poll(now)
+            if message is not None:
+                self.hear(message)
+            if self.catch_up():
                 report()
+
+    @property
+    def due_ns(self) -> int:
+        """When the nodes have something to do of their own accord."""
+        polled = self._polled_ns + _POLL_NS
+        return min(polled, self._held[0][0]) if self._held else polled
+
+    def hear(self, message: can.Message) -> None:
+        """Take a frame from the bus."""
+        # Some buses return the frames that the nodes have sent.
+        if message.arbitration_id in self._heard:
+            self._pass(message, False)
+
+    def catch_up(self) -> bool:
+        """Do what is due by now; returns whether the nodes have looked at their watchdogs."""
+        now = self._clock()
+        while self._held and self._held[0][0] <= now:
+            _, _, outgoing, frame = heapq.heappop(self._held)
+            self._arrive(frame, outgoing)
+        if now - self._polled_ns < _POLL_NS:
+            return False
+        self._poll(now)
+        return True
 
     def close(self) -> None:
         """Leave the bus."""
@@ -114,7 +143,7 @@ class EmulatedBus:
     def _pass(self, message: can.Message, outgoing: bool) -> None:
         for delay, frame in self._channel(message, outgoing):
             if delay > 0.0:
-                due = time.monotonic_ns() + round(delay * 1e9)
+                due = self._clock() + round(delay * 1e9)
                 heapq.heappush(self._held, (due, next(self._numbers), outgoing, frame))
             else:
                 self._arrive(frame, outgoing)
@@ -135,12 +164,12 @@ class EmulatedBus:
         elif identifier == CobId.SYNC:
             self._on_sync(data[0] if len(data) == 1 else 0)
         elif identifier == self._controller:
-            now = time.monotonic_ns()
+            now = self._clock()
             for drive in self.drives:
                 if drive.controller == identifier - CobId.HEARTBEAT:
                     drive.controller_ns = now
         elif identifier in self._requests:
-            self._machine.advance(time.monotonic_ns())
+            self._machine.advance(self._clock())
             # A request that is not an SDO frame is ignored.
             with suppress(Exception):
                 self._network.notify(identifier, data, 0.0)
@@ -148,7 +177,7 @@ class EmulatedBus:
             self._on_nmt(data[0], data[1])
 
     def _on_sync(self, sync: int) -> None:
-        machine, rig, now = self._machine, self._machine.rig, time.monotonic_ns()
+        machine, rig, now = self._machine, self._machine.rig, self._clock()
         machine.advance(now)
         for drive in self.drives:
             drive.settle()

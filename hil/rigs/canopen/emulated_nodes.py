@@ -45,21 +45,24 @@ class PlantMachine:
 
     Args:
         make: makes the plant at its start, its IMUs' imperfections, and the drives (dtype `EMULATED`).
+        clock: [ns].
     """
 
-    def __init__(self, make: Callable[[], tuple[FmuPlant, Record, Record]]) -> None:
-        self._make = make
+    def __init__(
+        self, make: Callable[[], tuple[FmuPlant, Record, Record]], clock: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._make, self._clock = make, clock
         self.rig: Record = np.zeros((), EMULATED)  # the nodes write `request` and `target`, and read the rest
         self._started = 0
         self._begin()
         # The clock starts when the machine code is loaded: a node that waits for it would not answer over SDO in time.
         self.sample(self._started)
         self.advance(self._started)
-        self._started = time.monotonic_ns()
+        self._started = self._clock()
 
     def _begin(self) -> None:
         self._plant, self._imu, self.rig[()] = self._make()
-        self._started = time.monotonic_ns()
+        self._started = self._clock()
 
     def advance(self, now_ns: int) -> None:
         """Move the plant on to this time of the machine's clock."""
@@ -93,8 +96,10 @@ class PlantMachine:
 class EmulatedNode:
     """What drives and IMUs have in common: object dictionary, NMT state, heartbeat and configuration of the PDOs."""
 
-    def __init__(self, node: int, eds: Any, pdos: tuple[Pdo, ...], fd: bool, network: canopen.Network) -> None:
-        self.node, self.pdos, self.network = node, pdos, network
+    def __init__(
+        self, node: int, eds: Any, pdos: tuple[Pdo, ...], fd: bool, network: canopen.Network, clock: Callable[[], int]
+    ) -> None:
+        self.node, self.pdos, self.network, self._clock = node, pdos, network, clock
         self.local = canopen.LocalNode(node, object_dictionary(eds, node))
         # canopen's own callback would start a thread that sends the heartbeat.
         self.local._write_callbacks.clear()
@@ -147,7 +152,7 @@ class EmulatedNode:
                 self._check_mapping(pdo, subindex, number)
         if index == Object.PRODUCER_HEARTBEAT:
             self.heartbeat_ns = number * 1_000_000
-            self.heartbeat_due = time.monotonic_ns() + self.heartbeat_ns
+            self.heartbeat_due = self._clock() + self.heartbeat_ns
 
     def _check_mapping(self, pdo: Pdo, subindex: int, number: int) -> None:
         if not self.value(pdo.communication, Parameter.COB_ID) & INVALID_COB_ID or self.state == NodeState.OPERATIONAL:
@@ -173,13 +178,15 @@ class EmulatedNode:
 class EmulatedDrive(EmulatedNode):
     """A CiA 402 drive, whose mechanics are the machine's."""
 
-    def __init__(self, leg: int, settings: CanopenSettings, machine: PlantMachine, network: canopen.Network) -> None:
+    def __init__(
+        self, leg: int, settings: CanopenSettings, machine: PlantMachine, network: canopen.Network, clock: Callable[[], int]
+    ) -> None:
         node, fd = settings.drives.nodes[leg], settings.bus.fd
         self.leg, self.machine = leg, machine
         self.commanded_ns = 0
         self._scale = settings.drives.scales[leg]
         self.answer = new_message(CobId.TPDO + node, dlc=ANSWER.size, is_fd=fd, bitrate_switch=fd)
-        super().__init__(node, settings.drives.eds, DRIVE_PDOS, fd, network)
+        super().__init__(node, settings.drives.eds, DRIVE_PDOS, fd, network, clock)
 
     def reset(self) -> None:
         """Return to the values of the EDS, without power."""
@@ -243,7 +250,7 @@ class EmulatedDrive(EmulatedNode):
         """Let a command take effect."""
         before = self.power
         self.power = commanded(before, controlword, self.controlword)
-        self.controlword, self.target, self.commanded_ns = controlword, target, time.monotonic_ns()
+        self.controlword, self.target, self.commanded_ns = controlword, target, self._clock()
         if before == PowerState.FAULT and self.power != PowerState.FAULT:
             self.code = 0
             self.machine.reset(self.leg)
@@ -302,10 +309,10 @@ class EmulatedDrive(EmulatedNode):
 class EmulatedImu(EmulatedNode):
     """An IMU, whose readings are the machine's."""
 
-    def __init__(self, imu: int, settings: CanopenSettings, network: canopen.Network) -> None:
+    def __init__(self, imu: int, settings: CanopenSettings, network: canopen.Network, clock: Callable[[], int]) -> None:
         node, fd = settings.imus.nodes[imu], settings.bus.fd
         self.imu = imu
-        super().__init__(node, settings.imus.eds, imu_pdos(fd), fd, network)
+        super().__init__(node, settings.imus.eds, imu_pdos(fd), fd, network, clock)
         self.answers = {pdo.cob_id: new_message(pdo.cob_id + node, is_fd=fd, bitrate_switch=fd) for pdo in self.pdos}
         self.magnetometer_start = 0
 

@@ -6,6 +6,7 @@ thread runs beside it. Commands take effect at the SYNC after them.
 
 import struct
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
@@ -40,8 +41,20 @@ _REMEDIES = {
 class CanopenRig:
     """A rig on CANopen (see `hil.rigs.Rig`)."""
 
-    def __init__(self, settings: CanopenSettings, period: float) -> None:
+    def __init__(
+        self,
+        settings: CanopenSettings,
+        period: float,
+        opened: Callable[[], Any] | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
         """Prepare a rig for exchanges every `period` [s].
+
+        Args:
+            settings: of the bus and its nodes.
+            period: [s].
+            opened: opens the bus, by default that of the settings.
+            clock: [ns].
 
         Raises:
             RigError: the bus cannot carry that many frames.
@@ -49,7 +62,7 @@ class CanopenRig:
         self.command_delay = period
         self.bus_load = settings.check_bus_load(1.0 / period)  # in the worst case
         self.decoder = Decoder(settings)
-        self._settings = settings
+        self._settings, self._open, self._clock = settings, opened or settings.bus.opened, clock
         self._bus: Any = None
         self._nodes: list[RemoteNode] = []
         self._configured = False
@@ -74,11 +87,11 @@ class CanopenRig:
         """
         bus, drives, imus = self._settings.bus, self._settings.drives, self._settings.imus
         try:
-            self._bus = bus.opened()
+            self._bus = self._open()
             self.decoder, self._misses = Decoder(self._settings), [0] * len(self._misses)
             network = canopen.Network(self._bus)
             self._nodes = [
-                RemoteNode(f"{name} {number}", node, table.eds, network, self._receive)
+                RemoteNode(f"{name} {number}", node, table.eds, network, self._receive, self._clock)
                 for name, table in (("drive", drives), ("IMU", imus))
                 for number, node in enumerate(table.nodes)
             ]
@@ -122,7 +135,7 @@ class CanopenRig:
         """Send the commands (6,) [m/s] and SYNC, and receive the answers to it (see `hil.rigs.Rig.exchange`)."""
         if self._bus is None:
             return SILENT
-        decoder, start = self.decoder, time.monotonic_ns()
+        decoder, start = self.decoder, self._clock()
         decoder.now_ns, decoder.answered = start, False
         try:
             self._drain()
@@ -186,7 +199,7 @@ class CanopenRig:
             self.decoder.refused += 1
             raise
         if message is not None:
-            self.decoder.now_ns = time.monotonic_ns()
+            self.decoder.now_ns = self._clock()
             self.decoder.take(message)
         return message
 
@@ -204,10 +217,10 @@ class CanopenRig:
         """Send the nodes an NMT command until each has reported a state; the `complaint` names those that have not."""
         self.decoder.nmt[:] = [-1] * (LEGS + IMU_COUNT)
         missing = list(enumerate(self._nodes))
-        deadline = time.monotonic() + self._settings.controller.boot_timeout
+        deadline = 1e-9 * self._clock() + self._settings.controller.boot_timeout
         reminder = 0.0
         while missing := [(i, node) for i, node in missing if self.decoder.nmt[i] != state]:
-            now = time.monotonic()
+            now = 1e-9 * self._clock()
             if now > deadline:
                 raise RigError(complaint.format(", ".join(node.name for _, node in missing)))
             if now > reminder:
@@ -244,7 +257,7 @@ class CanopenRig:
         """Read the answers to SYNC, until all awaited frames are there or until the deadline."""
         decoder, awaited, errors = self.decoder, self.decoder.awaited, 0
         while awaited & ~decoder.received and errors < _MOST_ERRORS:
-            left = deadline - time.monotonic_ns()
+            left = deadline - self._clock()
             try:
                 if left <= 0 or self._read(left * 1e-9) is None:
                     return
@@ -259,7 +272,7 @@ class CanopenRig:
                 self.decoder.awaited &= ~(1 << bit)
 
     def _fill(self, feedback: Record, start: int) -> None:
-        decoder, now = self.decoder, time.monotonic_ns()
+        decoder, now = self.decoder, self._clock()
         decoder.write_measurement(feedback["measurement"])
         feedback["sample_ns"] = decoder.sample_ns
         feedback["sequence"] = decoder.sequence

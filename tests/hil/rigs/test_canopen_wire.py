@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 from hil.rigs import ANSWERED, BRAKED, ENABLED, FOLLOWING, OFF, QUICK_STOP, SILENT, RigError, new_feedback
-from hil.rigs.canopen import configuration
-from hil.rigs.canopen import rig as rig_module
 from hil.rigs.canopen.cia402 import PowerState, commanded, statusword
 from hil.rigs.canopen.configuration import RemoteNode, configure_drive, configure_imu, interpolation_period, switch_on
 from hil.rigs.canopen.frames import Pdo, new_message, pack_imu
@@ -76,12 +74,10 @@ class Wire:
 
 
 @pytest.fixture
-def wired(monkeypatch):
+def wired():
     """An open rig whose drives follow, and its wire."""
     clock = Clock()
-    for module in (rig_module, configuration):
-        monkeypatch.setattr(module, "time", clock)
-    rig = CanopenRig(settings(), PERIOD)
+    rig = CanopenRig(settings(), PERIOD, clock=clock.monotonic_ns)
     rig._bus = wire = Wire(clock)
     rig.decoder.statuswords = [FOLLOWS] * 6
     rig.decoder.nmt[:6] = [5] * 6
@@ -264,6 +260,9 @@ class Node:
 
     def has(self, index, subindex=0):
         return (index, subindex) not in self._lacks
+
+    def now(self):
+        return 0.0
 
 
 def test_a_pdo_is_off_while_it_is_mapped():

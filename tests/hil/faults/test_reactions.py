@@ -6,9 +6,14 @@ import pytest
 
 from controller.safety.causes import Cause, Reaction
 from hil.command_line import main
-from hil.studies.fault_matrix import CASES, Case, Outcome, run_matrix, table
+from hil.faults.reactions import CASES, Case, Outcome, table
+from hil.faults.trials import outcomes_of, run_trials, trials_of
 
 DOCS = Path(__file__).parents[3] / "docs" / "faults.md"
+
+
+def run_matrix(seeds, cases):
+    return outcomes_of(cases, run_trials(trials_of(cases, seeds)))
 
 
 @pytest.mark.parametrize("seeds", [1, pytest.param(2, marks=pytest.mark.slow)])

@@ -1,15 +1,14 @@
-"""The fault matrix: every case of a table of faults, run with many seeds and compared with its specified reaction.
+"""The matrix of reactions: a table of faults, each of which has a specified reaction.
 
 Loop, messages and emulated rig are the real ones, connected in memory and on virtual time: results are reproducible.
 """
 
+import json
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import partial
-from importlib.metadata import version
-from itertools import islice, product
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -17,19 +16,14 @@ from controller.inverse_kinematics import leg_lengths
 from controller.planning.plan_handover import STREAM, note_sample, rest
 from controller.planning.stream_planner import StreamPlanner
 from controller.safety.causes import Cause, DriveState, Mode, Reaction, Request
-from hil.engine.engine import IN_ONE_PROCESS, Engine
+from hil.faults.links import join_udp
 from hil.loop.records import RECORD, Link, StopRequest
-from hil.progress import Progress, no_progress
-from hil.realtime.clock import SCRIPTED, new_clock
-from hil.rigs.emulation import fault, new_emulated, sample
-from hil.rigs.udp.emulator import check_watchdog, new_udp_emulator
-from hil.rigs.udp.link import new_link
-from hil.rigs.udp.rig import TIMEOUT_SHARE
+from hil.rigs.emulation import fault, sample
+from hil.rigs.udp.emulator import check_watchdog
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import PreparedLoop, prepared_loop
 from hil.runs.target_stream import Reception, encode
 from hil.table import Table
-from plant.compiled import Record
 from plant.mechanism import LEGS
 from plant.pose import Array, quaternion_from_rotation
 from plant.truth import TRUTH_LENGTHS
@@ -37,7 +31,7 @@ from plant.truth import TRUTH_LENGTHS
 RATE_HZ = 1000.0
 MOTION_S = 4.5
 _FIRST_S, _SPREAD_S = 1.5, 1.0
-_SESSION, _SAMPLE_CYCLES = 1, 10
+_SAMPLE_CYCLES = 10
 _SMOOTH = 20
 """Cycles over which a true acceleration is averaged: the IMUs' noise in the commands is no motion."""
 MOST_TRAVEL_M = 0.03
@@ -63,6 +57,8 @@ class Case:
         streamed: the fault of a streamed target.
         also: other causes that may end the run.
     """
+
+    kind: ClassVar[str] = "reactions"
 
     name: str
     expected: Cause
@@ -179,23 +175,23 @@ class Outcome:
         """The outcome over the seeds of both."""
         return Outcome(self.case, *(getattr(self, each.name) + getattr(other, each.name) for each in fields(self)[1:]))
 
+    def row(self) -> dict[str, Any]:
+        """The outcome with one seed, as a row of a table."""
+        (reaction,), (peak,), (travel,) = self.reactions, self.peak_m, self.travel_m
+        cycles = self.cycles[0] if self.cycles else None
+        findings = json.dumps(self.findings)
+        return {"reaction": reaction, "told_cycles": cycles, "peak": peak, "travel": travel, "findings": findings}
+
+    def with_row(self, row: Mapping[str, Any]) -> "Outcome":
+        """The outcome with that of one more seed, from its `row`."""
+        cycles = [] if row.get("told_cycles") is None else [int(row["told_cycles"])]
+        findings = json.loads(row["findings"])
+        return self + Outcome(self.case, Counter([row["reaction"]]), cycles, [row["peak"]], [row["travel"]], findings)
+
     def summary(self) -> dict[str, Any]:
         """The figures, for JSON."""
         figures = {name: value for name, value in vars(self).items() if name != "case"}
         return {"case": self.case.name, "expected": self.case.expected.text, **figures}
-
-
-def run_matrix(
-    seeds: int, cases: Sequence[Case] = CASES, engine: Engine = IN_ONE_PROCESS, progress: Progress = no_progress
-) -> list[Outcome]:
-    """Run the cases, each with so many seeds of IMUs and faults, their times and places."""
-    tried = iter(engine.starmap(_try, list(product(cases, range(seeds))), progress))
-    return [sum(islice(tried, seeds), Outcome(case)) for case in cases]
-
-
-def summary(outcomes: list[Outcome], seeds: int) -> dict[str, Any]:
-    """Everything, for JSON."""
-    return {"cases": [each.summary() for each in outcomes], "seeds": seeds, "rate_hz": RATE_HZ, "version": version("gough")}
 
 
 def table(outcomes: list[Outcome]) -> Table:
@@ -211,7 +207,12 @@ def table(outcomes: list[Outcome]) -> Table:
     return result
 
 
-def _try(case: Case, seed: int) -> Outcome:
+def try_case(case: Case, seed: int) -> Outcome:
+    """The outcome of a case with one seed of IMUs and fault, its time and place.
+
+    Raises:
+        GoughError: it cannot be run.
+    """
     random = np.random.default_rng([seed, len(case.name), 6])
     at = _FIRST_S + _SPREAD_S * random.random()
     k, j = random.permutation(LEGS)[:2].tolist()
@@ -219,7 +220,8 @@ def _try(case: Case, seed: int) -> Outcome:
     faults = [fault(text.format(k=k, j=j) + begin) for text in case.faults.split()]
     config = SimulationConfig(target="sines", duration=MOTION_S, rate=RATE_HZ, seed=seed)
     with prepared_loop(config) as loop:
-        _join(loop, faults, seed)
+        join_udp(loop, faults, seed)
+        loop.records = np.zeros(1 << 14, RECORD)
         hold = int(loop.parameters["rig"]["hold_cycles"])
         onset = hold if case.from_start else hold + round(at * RATE_HZ)
         if case.streamed:
@@ -231,19 +233,6 @@ def _try(case: Case, seed: int) -> Outcome:
         cause = loop.follow(hold + round(MOTION_S * RATE_HZ))
         _stand(loop)
         return _judge(case, seed, loop, cause, onset)
-
-
-def _join(loop: PreparedLoop, faults: list[Record], seed: int) -> None:
-    """Put the emulated rig between the loop and its plant, on a scripted clock."""
-    rig = new_emulated(loop.mechanism, round(1e9 / RATE_HZ), seed, faults)
-    loop.emulator = new_udp_emulator(loop.fmu, loop.imu, rig, _SESSION)
-    loop.udp = new_link()
-    loop.udp.socket["session"] = _SESSION
-    loop.udp.socket["timeout_ns"] = round(1e9 * TIMEOUT_SHARE / RATE_HZ)
-    loop.parameters["load"]["command_delay"] = 1.0 / RATE_HZ
-    loop.clock = new_clock(SCRIPTED, round(1e9 / RATE_HZ))
-    loop.script = np.zeros((1 << 14, 3), np.int64)
-    loop.records = np.zeros(1 << 14, RECORD)
 
 
 def _stand(loop: PreparedLoop) -> None:

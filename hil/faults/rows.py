@@ -1,0 +1,186 @@
+"""The rows of disturbances, from `rows.toml`, and what a seed makes of them."""
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, dataclass, fields, replace
+from functools import cache
+from itertools import product
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+
+from hil.rigs.emulation import FaultKind
+from hil.runs.config import SimulationConfig
+from plant.errors import InputError
+from plant.files import check_entries, read_toml
+from plant.fmu.settings import Setting
+from plant.imu_disturbances import DisturbanceKind, disturbance_of_text
+from plant.mechanism import LEGS, load_in_space
+
+FILE = Path(__file__).with_name("rows.toml")
+LINKS = ("fmu", "udp", "canopen")
+"""Between the loop and its plant: nothing, or a bus in memory, on virtual time, with the emulated rig behind it."""
+MOST_GUILTY = 3
+"""So many IMUs with the same disturbance are each at fault; what more of them share is not mended by leaving one out."""
+
+_EARLIEST_S, _SPREAD_S = 2.0, 3.0
+"""When a disturbance begins, and for how long it may be later [s]."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A disturbance of the loop.
+
+    Attributes:
+        name, kind: in the table.
+        faults: texts of `--fault`, or of `gough inject` behind a bus.
+        settings: of the plant, texts of `--set`; what they name is there from the start, or at a time.
+        mechanism, target, imu, rate, duration, joint_error: as in `SimulationConfig`.
+        base_bend_mm: how far the base plate is bent: its joints leave the plane by a saddle of this height [mm].
+        joint_off_mm: how far base joint {k} is off, in a random direction [mm].
+        link: one of `LINKS`.
+        guilty: the IMUs that may rightly be left out; None for those that have a disturbance alone, or with a few others.
+    """
+
+    name: str
+    kind: str
+    faults: tuple[str, ...] = ()
+    settings: tuple[str, ...] = ()
+    mechanism: str = "hexapod"
+    target: str = "sines"
+    imu: str = "mpu9150-calibrated"
+    rate: float = 1000.0
+    duration: float = 20.0
+    joint_error: float = 0.0
+    base_bend_mm: float = 0.0
+    joint_off_mm: float = 0.0
+    link: str = "fmu"
+    guilty: tuple[int, ...] | None = None
+
+    def drawn(self, seed: int, fusion: str) -> "Drawn":
+        """What a seed makes of the row: IMUs, place, sign and time."""
+        random = np.random.default_rng([seed, crc32(self.name.encode())])
+        at = round(_EARLIEST_S + _SPREAD_S * random.random(), 3)
+        k, j, i = random.permutation(LEGS)[:3].tolist()
+        values = {"k": k, "j": j, "i": i, "sign": "-" if random.random() < 0.5 else ""}
+        values |= {"at": at} | {f"at{n}": round(at + n, 3) for n in (1, 2, 3)}
+        texts = " ".join(self.faults).format_map(values).split()
+        faults = tuple(text if re.search(r",at(_s)?=", text) else f"{text},at={at:g}" for text in texts)
+        settings = [Setting.parse(text.format_map(values)) for text in self.settings]
+        if self.base_bend_mm or self.joint_off_mm:
+            settings.append(self._base_joints(k, random))
+        config = SimulationConfig(
+            mechanism=self.mechanism, target=self.target, duration=self.duration, rate=self.rate, imu=self.imu, seed=seed,
+            fusion=fusion, joint_error=self.joint_error, settings=tuple(settings), faults=faults if self.link == "fmu" else (),
+        )  # fmt: skip
+        guilty = guilty_of(faults) if self.guilty is None else frozenset(self.guilty)
+        late = any(f"={at:g}" in text for text in faults) or any(each.at is not None for each in settings)
+        return Drawn(config, self.link, faults, guilty, at if late else 0.0)
+
+    def _base_joints(self, k: int, random: np.random.Generator) -> Setting:
+        """The true places of the base joints, of which the controller does not know."""
+        joints = load_in_space(self.mechanism).base_joints.copy()
+        angles = np.arctan2(joints[:, 1], joints[:, 0])
+        joints[:, 2] += 1e-3 * self.base_bend_mm * np.cos(2.0 * angles)
+        direction = random.standard_normal(3)
+        joints[k] += 1e-3 * self.joint_off_mm * direction / np.linalg.norm(direction)
+        return Setting("base_joints", tuple(joints.ravel().tolist()))
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A row as a seed has it.
+
+    Attributes:
+        config: of the loop; the faults are in it if there is no bus.
+        link: one of `LINKS`.
+        faults: texts.
+        guilty: the IMUs that may rightly be left out.
+        begin: when the disturbance begins, after the hold or, behind a bus, after the drives were enabled [s].
+    """
+
+    config: SimulationConfig
+    link: str
+    faults: tuple[str, ...]
+    guilty: frozenset[int]
+    begin: float
+
+
+def guilty_of(faults: tuple[str, ...]) -> frozenset[int]:
+    """The IMUs that are disturbed alone, or with at most `MOST_GUILTY` in all by the same text."""
+    found: set[int] = set()
+    disturbances = [kind.label for kind in DisturbanceKind]
+    of_one = [kind.label for kind in FaultKind if kind.label.startswith("imu-")]
+    for text in faults:
+        name = text.partition(",")[0].partition(":")[0]
+        if name in disturbances:
+            imus = disturbance_of_text(text).imus
+            found |= {*imus} if len(imus) <= MOST_GUILTY else set()
+        elif name in of_one:
+            found.add(int(text.partition(":")[2].partition(",")[0]))
+    return frozenset(found)
+
+
+@cache
+def all_rows() -> tuple[Row, ...]:
+    """Every row of `rows.toml`."""
+    return rows_of(read_toml(FILE))
+
+
+def rows_of(document: Mapping[str, Any]) -> tuple[Row, ...]:
+    """The rows of a document.
+
+    Raises:
+        InputError: an entry is unknown, has a value of the wrong kind, or two rows have the same name.
+    """
+    rows = tuple(row for kind, entries in document.items() for entry in entries for row in _rows(kind, entry))
+    for name, count in Counter(row.name for row in rows).items():
+        if count > 1:
+            raise InputError(f"{count} rows are called {name!r}: give each a name of its own")
+    return rows
+
+
+_KINDS = {each.name: each.default for each in fields(Row)}
+
+
+class _Known(dict[str, Any]):
+    """Values for texts, in which other names stay as they are."""
+
+    def __missing__(self, key: str) -> str:
+        return "{" + key + "}"
+
+
+def _rows(kind: str, entry: Mapping[str, Any]) -> Iterator[Row]:
+    check_entries(entry, [name for name in _KINDS if name != "kind"] + ["vary", "cross"], f"a row of [[{kind}]]")
+    for values in (crossed | varied for crossed, varied in product(_points(entry, "cross"), _points(entry, "vary"))):
+        own = {name: value for name, value in entry.items() if name not in ("vary", "cross")}
+        own |= {name: value for name, value in values.items() if name in _KINDS}
+        known = _Known(values)
+        row = Row(kind=kind, **{name: _value(name, value, known) for name, value in own.items()})
+        if row.link not in LINKS:
+            raise InputError(f"the row {row.name!r} has link = {row.link!r}; there are {', '.join(LINKS)}")
+        yield replace(row, name=row.name.format_map(known))
+
+
+def _points(entry: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
+    """The values to take: those of a list of tables, or all combinations of a table of lists."""
+    table = entry.get(name, [{}])
+    if isinstance(table, list):
+        return table
+    return [dict(zip(table, values, strict=True)) for values in product(*table.values())]
+
+
+def _value(name: str, value: Any, known: Mapping[str, Any]) -> Any:
+    default = _KINDS[name]
+    if name == "guilty" or default is MISSING:
+        return tuple(value) if name == "guilty" else value
+    if isinstance(default, tuple):
+        return tuple(each.format_map(known) for each in value)
+    filled = value.format_map(known) if isinstance(value, str) else value
+    try:
+        return type(default)(filled)
+    except ValueError:
+        raise InputError(f"{name} = {value!r} must be a {type(default).__name__}") from None

@@ -1,0 +1,135 @@
+"""Tables and summaries of what `gough faults` has run."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from importlib.metadata import version
+from math import degrees, inf
+from typing import Any
+
+import numpy as np
+
+from hil.faults.reactions import RATE_HZ, Case, Outcome
+from hil.faults.rows import Row
+from hil.faults.trials import Figures
+from hil.table import Table
+
+_MM, _DEG = 1e3, degrees(1.0)
+_NOTHING = "nothing"
+_GREATEST = (
+    "position_before", "rotation_before", "position_after", "rotation_after", "position_then", "rotation_then", "deviation",
+    "level_position", "level_rotation", "told_s",
+)  # fmt: skip
+"""Of these figures the greatest over the seeds is shown; a table has no column for what no run has."""
+
+
+def summary(outcomes: list[Outcome], disturbances: list[dict[str, Any]], seeds: int) -> dict[str, Any]:
+    """Everything, for JSON, in SI units; what is not finite is null."""
+    finite = [{name: None if value in (inf, -inf) else value for name, value in each.items()} for each in disturbances]
+    return {
+        "cases": [each.summary() for each in outcomes],
+        "disturbances": finite,
+        "seeds": seeds,
+        "rate_hz": RATE_HZ,
+        "version": version("gough"),
+    }
+
+
+def disturbances_of(found: Iterable[Figures]) -> list[dict[str, Any]]:
+    """What each row has shown with each fusion, over all seeds, from the figures of their trials.
+
+    Returns:
+        By row and fusion: the greatest of each error, level and time (`verdict.judge`), how often what was `told` first, how
+        often and why the run `ended` early, the numbers of `runs`, of those with `alarms` before the begin, and of `forbidden`
+        ones, and the share of cycles that the protection level has `covered`, if there is one.
+    """
+    groups: dict[tuple[str, str, str], list[Figures]] = {}
+    for figures in found:
+        if figures["kind"] != Case.kind:
+            groups.setdefault((figures["kind"], figures["row"], figures["fusion"]), []).append(figures)
+    return [{"kind": kind, "row": row, "fusion": fusion, **_over_seeds(runs)} for (kind, row, fusion), runs in groups.items()]
+
+
+def _over_seeds(runs: list[Figures]) -> dict[str, Any]:
+    covered = [(each["covered"], each["cycles"]) for each in runs if each.get("covered") is not None]
+    ended = Counter(each["ended"] for each in runs if each["ended"] != "end of the motion")
+    return {
+        "runs": len(runs),
+        **{name: max((each[name] for each in runs if each.get(name) is not None), default=None) for name in _GREATEST},
+        "told": dict(Counter(each["told"] or _NOTHING for each in runs).most_common()),
+        "ended": dict(ended.most_common()),
+        "alarms": sum(each["alarms"] > 0 for each in runs),
+        "sound_left_out": sum(bool(each["sound_left_out"]) for each in runs),
+        "forbidden": sum(each["forbidden"] for each in runs),
+        "covered": float(np.divide(*np.sum(covered, axis=0))) if covered else None,
+    }
+
+
+def disturbance_table(disturbances: Sequence[dict[str, Any]]) -> Table:
+    """A line for each row; where there are several fusions, their cells have a stroke between them.
+
+    Errors are the greatest over the seeds, `silent` until something is told, and `told` from then on. `first told` has what
+    most runs told, and in how many, and `s` the longest time until then.
+    """
+    covered = any(each["covered"] is not None for each in disturbances)
+    headings = ("disturbance", "silent [mm]", "[deg]", "told [mm]", "[deg]", "first told", "s", "stops", "forbidden")
+    table = Table(*headings, *(["covered [%]"] if covered else []), left=(0, 5))
+    by_row: dict[str, list[dict[str, Any]]] = {}
+    for each in disturbances:
+        by_row.setdefault(each["row"], []).append(each)
+    for name, group in by_row.items():
+        told = [_told(each) for each in group]
+        table.add(
+            name,
+            _joined(group, lambda each: _number(each["position_before"], _MM)),
+            _joined(group, lambda each: _number(each["rotation_before"], _DEG, 2)),
+            _joined(group, lambda each: _number(each["position_after"], _MM)),
+            _joined(group, lambda each: _number(each["rotation_after"], _DEG, 2)),
+            " / ".join(told if len(set(told)) > 1 else told[:1]),
+            _joined(group, lambda each: _number(each["told_s"], 1.0)),
+            _joined(group, lambda each: f"{sum(each['ended'].values())}"),
+            _joined(group, lambda each: f"{each['forbidden']}"),
+            *([_joined(group, lambda each: _number(each["covered"], 100.0, 2))] if covered else []),
+        )
+    return table
+
+
+def worst_first(disturbances: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Forbidden outcomes first, and then by the greatest error before anything was told: 1 deg counts as much as 5 mm."""
+
+    def badness(each: dict[str, Any]) -> tuple[int, float]:
+        position, rotation = ((each[f"{part}_before"] or 0.0) for part in ("position", "rotation"))
+        return each["forbidden"], max(position / 5e-3, _DEG * rotation)
+
+    return sorted(disturbances, key=badness, reverse=True)
+
+
+def list_table(items: Iterable[Case | Row]) -> Table:
+    """What there is, for `--list`."""
+    table = Table("kind", "name", "link", "Hz", "s", "faults and settings", left=(0, 1, 2, 5))
+    for item in items:
+        if isinstance(item, Row):
+            what = (*item.faults, *item.settings) or _built(item)
+            table.add(item.kind, item.name, item.link, f"{item.rate:g}", f"{item.duration:g}", " ".join(what))
+        else:
+            table.add("reactions", item.name, "udp", f"{RATE_HZ:g}", "4.5", item.faults or item.streamed)
+    return table
+
+
+def _built(row: Row) -> tuple[str, ...]:
+    sizes = {"base_bend_mm": row.base_bend_mm, "joint_off_mm": row.joint_off_mm, "joint_error_mm": 1e3 * row.joint_error}
+    return tuple(f"{name}={size:g}" for name, size in sizes.items() if size)
+
+
+def _joined(group: Sequence[dict[str, Any]], cell: Callable[[dict[str, Any]], str]) -> str:
+    return " / ".join(map(cell, group))
+
+
+def _told(each: dict[str, Any]) -> str:
+    what, count = next(iter(each["told"].items()))
+    return what if count == each["runs"] else f"{what} ({count} of {each['runs']})"
+
+
+def _number(value: float | None, scale: float, digits: int = 1) -> str:
+    if value is None:
+        return "-"
+    return "none" if value == inf else f"{scale * value:.{digits}f}"
