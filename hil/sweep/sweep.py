@@ -278,8 +278,9 @@ def _row(case: Keyed, outcome: Mapping[str, Any] | Failure) -> dict[str, Any]:
         status = DIED if outcome.died else ERROR if outcome.again else FAILED
         return {KEY: case.key, STATUS: status, REASON: outcome.reason, **case.point}
     row = {KEY: case.key, STATUS: DONE, REASON: None, **case.point}
+    of_runs = isinstance(case, Case) and case.model is None
     for name in outcome:
-        if name in row or (case.model is None and is_factor(name)):
+        if name in row or (of_runs and is_factor(name)):
             reason = f"the figure {name!r} has the name of a factor, or of a column of the table: give it another one"
             return {**row, STATUS: FAILED, REASON: reason}
     return {**row, **outcome}

@@ -397,7 +397,7 @@ def test_a_value_is_awaited_for_as_long_as_it_may_take(wired):
         wire.clock.now_ns += 40 * MS
         return next(found)
 
-    node = SimpleNamespace(name="drive 2 (node 23)", read=read)
+    node = SimpleNamespace(name="drive 2 (node 23)", read=read, now=wire.clock.monotonic)
     RemoteNode.check(node, 0x6061, 0, 9, 0.15)
     found = iter([-1] * 9)
     with pytest.raises(RigError, match=r"drive 2 \(node 23\) has 0xFFFFFFFF in object 6061h:00; it must be 0x9"):

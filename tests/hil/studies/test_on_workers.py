@@ -48,7 +48,7 @@ def faults(engine):
 
 STUDIES = {
     "accuracy": lambda engine, trials: evaluate_accuracy(load_spatial("6-4-I"), 40, 1, engine).summary(),
-    "broad": lambda engine, trials: broad.evaluate(trials, FusionSettings(), engine),
+    "broad": lambda engine, trials: broad.evaluate(trials, FusionSettings(), engine=engine),
     "faults": lambda engine, trials: faults(engine),
     "sensor-sets": lambda engine, trials: list(map(vars, evaluate_sensor_sets(["6-3-II"], SETS[:4], 0.3, 1, engine))),
 }
