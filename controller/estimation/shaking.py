@@ -133,9 +133,3 @@ def tell_shaking(p: Record, s: Record, used: Array, missed: int, events: Record)
 def is_clipped(s: Record, sensor: int, k: int) -> bool:
     """Whether a sensor's reading is at the end of its range."""
     return bool(s.clipped[sensor, k] != 0)
-
-
-@kernel
-def is_shaken(s: Record) -> bool:
-    """Whether it has been told that IMUs are shaken, or that readings are bridged, and not that all is calm."""
-    return bool(s.told != 0 or s.bridging != 0)

@@ -3,7 +3,6 @@
 import numpy as np
 
 from controller.estimation.imu_monitor import contradiction, reset
-from controller.estimation.shaking import is_shaken
 from controller.safety.causes import Cause, DriveState, Mode, Request, report_event
 from controller.safety.stop import handle_cause
 from controller.settings import SafetySettings
@@ -151,7 +150,8 @@ def check_carried(
     """While IMUs are shaken: stop when what the pose comes from no longer knows a direction: the leg filters, or the
     whole-mechanism filter's rotation.
     """
-    if not is_shaken(shaking) or s.mode != Mode.RUNNING:
+    shaken = shaking.told != 0 or shaking.bridging != 0
+    if not shaken or s.mode != Mode.RUNNING:
         return
     worst, variance = -1, 0.0
     if mechanism.trusted != 0:
