@@ -21,6 +21,9 @@ from plant.imu_wiring import ALL_IMUS, IMU_COUNT
 PREFIX = "imu-"
 """What the text of a disturbance begins with."""
 
+BASE_PREFIX = "base-"
+"""What the text of a motion of the base begins with (`plant.dynamics.base_course`)."""
+
 SENSORS = ("gyroscope", "accelerometer", "magnetometer")
 """The sensors of an IMU, in the order of a measurement's first index."""
 

@@ -2,19 +2,19 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from controller.planning import STREAM_TARGET
 from hil.option import integers, option
 from hil.runs.names import name_objects
 from plant.checks import check_duration, check_rate, checked_seed, nearest
-from plant.compiled import Record
-from plant.dynamics.base_course import PREFIX as BASE_PREFIX
-from plant.dynamics.base_course import base_motion_of_text
 from plant.errors import InputError, UnknownNameError
 from plant.fmu.settings import Setting
-from plant.imu_disturbances import Disturbance, disturbance_of_text
+from plant.imu_disturbances import BASE_PREFIX, Disturbance, disturbance_of_text
 from plant.imu_wiring import ALL_IMUS, RIGHT_WIRING, Wiring
+
+if TYPE_CHECKING:
+    from plant.compiled import Record
 
 FUSIONS = {
     "compiled": None,
@@ -157,8 +157,8 @@ class SimulationConfig:
             raise InputError(
                 f"--fault is for a simulated plant, not for the rig {self.rig}: tell it to 'gough emulate' or 'inject'"
             )
-        for text in self.faults:
-            base_motion_of_text(text) if text.startswith(BASE_PREFIX) else disturbance_of_text(text)
+        # Refuses words that none understands.
+        self.base_motions, self.disturbances  # noqa: B018
 
     @property
     def disturbances(self) -> list[Disturbance]:
@@ -166,9 +166,15 @@ class SimulationConfig:
         return [disturbance_of_text(text) for text in self.faults if not text.startswith(BASE_PREFIX)]
 
     @property
-    def base_motions(self) -> list[Record]:
+    def base_motions(self) -> "list[Record]":
         """How the base moves (dtype `plant.dynamics.base_course.BASE_MOTION`)."""
-        return [base_motion_of_text(text) for text in self.faults if text.startswith(BASE_PREFIX)]
+        moved = [text for text in self.faults if text.startswith(BASE_PREFIX)]
+        if not moved:
+            return []
+        # It compiles.
+        from plant.dynamics.base_course import base_motion_of_text
+
+        return [base_motion_of_text(text) for text in moved]
 
     @classmethod
     def from_plain(cls, values: Mapping[str, Any]) -> "SimulationConfig":

@@ -16,11 +16,8 @@ import numpy as np
 from plant.compiled import Record, filled, kernel, record_dtype
 from plant.errors import InputError, UnknownNameError
 from plant.files import check_entries
-from plant.imu_disturbances import WORDS, Course, axis_in, course_in, number_in, words_of_text
+from plant.imu_disturbances import BASE_PREFIX, WORDS, Course, axis_in, course_in, number_in, words_of_text
 from plant.pose import Array
-
-PREFIX = "base-"
-"""What the text of a base's motion begins with."""
 
 MOST_BASE_MOTIONS = 8
 """The most that act on a base."""
@@ -45,7 +42,7 @@ class BaseMotionKind(IntEnum):
     @property
     def label(self) -> str:
         """The kind's name as text, such as base-tilt."""
-        return PREFIX + self.name.lower()
+        return BASE_PREFIX + self.name.lower()
 
     TILT = {"size_deg": radians(1.0)}, "the base tilts about this axis of {1} through its origin"
     ACCELERATION = {"size_m_per_s2": 1.0, "size_g": 9.80665}, "the base is accelerated along this axis of {1}"
@@ -116,7 +113,7 @@ def base_motion_of_text(text: str) -> Record:
     name, which, words = words_of_text(text)
     if which:
         raise InputError(f"{text!r} names {which!r} after a colon, and there is one base: leave it out")
-    return base_motion(name.removeprefix(PREFIX), **words)
+    return base_motion(name.removeprefix(BASE_PREFIX), **words)
 
 
 BASE_SIZE = 12

@@ -124,7 +124,9 @@ class FmuPlant(FmuInstance):
         n = sum(each.size for each in states)
         whole = self.jacobian([*rates, *y], [*states, *u])
         named, *others = (tuple(name for each in side for name in each.element_names) for side in (states, u, y))
-        still = _still([state.name in _DISTURBED for state in states for _ in range(state.size)], whole[:n])
+        # FMI 2.0 has a variable for each element, such as bending[1].
+        disturbed = [state.name.partition("[")[0] in _DISTURBED for state in states for _ in range(state.size)]
+        still = _still(disturbed, whole[:n])
         kept = [i for i in range(whole.shape[1]) if i >= n or not still[i]]
         rows, m = [i for i in range(len(whole)) if i >= n or not still[i]], n - int(still.sum())
         part = whole[np.ix_(rows, kept)]

@@ -171,7 +171,7 @@ def test_many_samples_at_once_are_what_each_gives_alone(seed):
         np.testing.assert_allclose(positions[where][order], [mode.position for mode in modes], rtol=0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("unit", [1e3, 1e-6])
+@pytest.mark.parametrize("unit", [20.0, 1e-6])
 @pytest.mark.parametrize("seed", range(6))
 def test_neither_units_nor_the_choice_of_frames_matter(seed, unit):
     mechanism, _, _, leg_angles = random_case(seed)

@@ -208,7 +208,7 @@ def test_the_platforms_own_acceleration_is_taken_out_when_it_is_given():
     assert uninformed_rms > 50.0 * informed_rms
 
 
-@pytest.mark.parametrize("rate", [100.0, 1000.0])
+@pytest.mark.parametrize("rate", [100.0, pytest.param(1000.0, marks=pytest.mark.slow)])
 def test_an_unknown_acceleration_of_10_m_s2_moves_the_vertical_by_less_than_a_degree_and_is_forgotten_at_rest(rate):
     """Half a minute of sines along all axes, then rest: the filter sees both, and weighs the accelerometer accordingly."""
     random, times = np.random.default_rng(7), np.arange(round(60.0 * rate)) / rate

@@ -21,7 +21,7 @@ def test_a_planar_fmu_is_built_told_tried_and_linearised(
     assert main(["fmu", "info", str(path), "--json", "info.json"]) == 0
     said, figures = capsys.readouterr().out, json.loads(Path("info.json").read_text())
     assert "runs in the loop as it is" in said and "leg_length[3]" in said
-    assert figures["FMI"] == "2.0" and figures["states"] == 12
+    assert figures["FMI"] == "2.0" and figures["states"] == 30
     assert {"name": "leg_length[3]", "shape": [], "type": "Real", "unit": "m"}.items() <= figures["variables"][
         [v["name"] for v in figures["variables"]].index("leg_length[3]")
     ].items()

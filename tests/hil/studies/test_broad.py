@@ -76,6 +76,7 @@ def test_in_fast_motions_nearly_as_good_as_vqf(kind):
     assert trial.inclination_rms(filter_verticals(trial, FusionSettings())) < 1.5 * trial.inclination_rms(by_vqf)
 
 
+@pytest.mark.slow
 def test_simulated_motions_are_beside_the_trials_or_alone(trial, tmp_path, capsys):
     np.savez(tmp_path / "rest.npz", **trial)
     path = tmp_path / "broad.json"

@@ -39,6 +39,7 @@ def swaying(t: ca.SX) -> tuple[ca.SX, ca.SX]:
     return place, turn
 
 
+@pytest.mark.slow
 def test_motion_on_a_swaying_base_agrees_with_maximal_coordinates_on_the_earth(make_plant: MakePlant) -> None:
     """The equations agree to rounding; in the FMU, inputs held over a step cost the step's second order."""
     p = leaning("hexapod")

@@ -72,6 +72,7 @@ def bent_frequency(p: Values, length: float, compliance: float) -> tuple[float, 
     return float(1.0 / np.sqrt(compliance * inertia) / (2.0 * np.pi)), inertia
 
 
+@pytest.mark.slow
 def test_bending_agrees_with_a_rod_that_turns_in_its_guide_against_a_spring() -> None:
     """A compliance of 1 mrad/(N m): the IMUs turn as in the second model, where bending acts on the platform, too."""
     p, compliance, damping = leaning("hexapod"), 1e-3, 0.7

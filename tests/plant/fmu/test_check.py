@@ -41,7 +41,7 @@ def test_platforms_are_the_folders_that_hold_binaries(tmp_path: Path) -> None:
 
 def test_a_trial_that_never_ends_is_ended_at_the_limit(foreign_fmu: Path, tmp_path: Path) -> None:
     path = edited(foreign_fmu, tmp_path / "hangs.fmu", ('guid="{foreign}"', 'guid="{fault 98}"'))
-    checks = check_fmu(path, limit=1.0)
-    assert [check.problems for check in checks] == [(), ("took longer than 1 s",), ("took longer than 1 s",), None]
+    checks = check_fmu(path, limit=3.0)
+    assert [check.problems for check in checks] == [(), ("took longer than 3 s",), ("took longer than 3 s",), None]
     with pytest.raises(InputError, match="the limit is 0 s; it must be positive and finite"):
         check_fmu(path, limit=0.0)

@@ -18,6 +18,7 @@ from plant.pose import Array
 from tests.plant.dynamics.explicit_bodies import static_forces
 
 PRESETS = ["hexapod", "6-3-I", "6-3-II", "6-4-I", "6-4-II", "6-5", "genhexkins", "planar-3rpr"]
+QUICK = ["hexapod", "6-4-II", "planar-3rpr"]
 MOVED: dict[str, Any] = {
     "payload.center_of_mass": np.array([0.03, -0.02, 0.1]),
     "platform.center_of_mass": np.array([0.0, 0.02, 0.01]),
@@ -37,7 +38,9 @@ def flat(values: Mapping[str, Array], variables: tuple[Any, ...]) -> Array:
     return np.concatenate([np.ravel(values.get(variable.name, np.zeros(variable.shape))) for variable in variables])
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize(
+    "name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in PRESETS if name not in QUICK)]
+)
 def test_forces_and_masses_at_home_are_those_of_the_plants_equations(name: str) -> None:
     """Motors that push with the forces leave the plant at rest; one ampere more accelerates the lengths as the masses say."""
     mechanism = lopsided(name)
