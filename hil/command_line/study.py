@@ -3,13 +3,12 @@
 import sys
 from argparse import SUPPRESS, Namespace
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from importlib.metadata import version
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from controller.settings import FusionSettings
 from hil.command_line import cli
 from hil.command_line.terminal import deg, duration, engine_at_work, mm, mm_deg, number_text, progress_bar
 from hil.engine.settings import EngineSettings
@@ -22,9 +21,6 @@ from plant.extras import check_installed
 if TYPE_CHECKING:
     from hil.sweep.analysis import Quantile
     from hil.sweep.sweep import SweepResult
-
-_LOOP = FusionSettings()
-"""What the filters assume in the closed loop."""
 
 
 @cli.command(
@@ -388,13 +384,17 @@ def gough_planar(options: Namespace) -> None:
 @cli.command(
     cli.source("folder", "FOLDER", "folder with the trials *.npz (default: only simulated motions)", nargs="?"),
     cli.setting("--seeds", 1, "simulated motions of each kind"),
-    cli.setting(
+    cli.argument(
         "--accelerometer-noise",
-        _LOOP.platform_accelerometer_noise,
-        "noise of the accelerometer that the filter assumes, as in the closed loop [m/s2/sqrt(Hz)]; the filter adds by itself "
-        "what it sees of the acceleration, which here is unknown",
+        type=float,
+        help="noise of the accelerometer that the filter assumes [m/s2/sqrt(Hz)] (default: as in the closed loop); the filter "
+        "adds by itself what it sees of the acceleration, which here is unknown",
     ),
-    cli.setting("--bias-walk", _LOOP.bias_walk, "random walk of the gyroscope's bias that the filter assumes [rad/s/sqrt(s)]"),
+    cli.argument(
+        "--bias-walk",
+        type=float,
+        help="random walk of the gyroscope's bias that the filter assumes [rad/s/sqrt(s)] (default: as in the closed loop)",
+    ),
     cli.engine_options(few="it takes seconds"),
     cli.JSON,
 )
@@ -405,9 +405,11 @@ def gough_broad(options: Namespace) -> None:
     on simulated motions of 10 m/s2 with several spectra. Prints the RMS of the inclination's error in motion, and microseconds
     of a sample, which are those of a busy machine if there are several workers.
     """
+    from controller.settings import FusionSettings
     from hil.studies.broad import evaluate
 
-    fusion = replace(_LOOP, platform_accelerometer_noise=options.accelerometer_noise, bias_walk=options.bias_walk)
+    given = {"platform_accelerometer_noise": options.accelerometer_noise, "bias_walk": options.bias_walk}
+    fusion = FusionSettings(**{name: value for name, value in given.items() if value is not None})
     with engine_at_work(cli.engine_of(options), "trials") as (engine, _):
         figures = evaluate(options.folder, fusion, options.seeds, engine)
     cli.write_json(options.json, figures)
