@@ -84,7 +84,7 @@ class FilterpyLeg(_Filterpy):
         self.F[:6, :6] = np.kron([[1.0, t, t**2 / 2], [0.0, 1.0, t], [0.0, 0.0, 1.0]], np.eye(2))
         self.Q[:6, :6] += np.kron(jerk * noise, np.eye(2))
         self.variances, self.period = np.array([rate_variance, force_variance]), period
-        self.excess = self.shaken = 0.0
+        self.excess = self.passed = 0.0
 
     def step(self, gyroscope: Array, accelerometer: Array) -> None:
         """Predict over one period and take a sample [rad/s, m/s^2]."""
@@ -98,7 +98,9 @@ class FilterpyLeg(_Filterpy):
         lever = self.imu_position @ self.imu_position
         explained = self.variances[1] + self.gravity**2 * doubt[:2].sum() + lever * doubt[4:6].sum()
         self.excess = _faded(self.excess, float(off @ off), explained, self.period / shaking.MEMORY_S)
-        hidden = float(np.clip(self.shaken - explained, 0.0, INNOVATION_LIMIT**2 * explained)) / 3.0
+        if self.excess == 0.0:
+            self.passed += min(1.0, self.period / shaking.AVERAGE_S) * (float(off @ off) - self.passed)
+        hidden = max(0.0, self.passed - explained)
         variances = self.variances + [0.0, self.excess + hidden] + shaking.SAYS_NOTHING * np.array(clipped)
         self.update(sample, self.measurement_jacobian, self.measurement, R=np.diag(np.repeat(variances, 3)))
 
@@ -243,9 +245,9 @@ class FilterpyFilters:
                 leg.start(x, covariance)
             else:
                 leg.predict()
-            leg.excess, leg.shaken = float(imus["shaking"]["excess"][k]), float(imus["shaking"]["mean"][k])
+            leg.excess, leg.passed = (float(imus["shaking"][name][k]) for name in ("excess", "passed"))
             leg.take(rate, force, tuple(imus["shaking"]["clipped"][:, k]))
-            imus["shaking"]["excess"][k] = leg.excess
+            imus["shaking"]["excess"][k], imus["shaking"]["passed"][k] = leg.excess, leg.passed
             legs["x"][k], legs["covariance"][k] = leg.state, leg.P
         update_leg_directions(p["legs"], legs, p["rig"], s["time"], imus)
 

@@ -2,15 +2,15 @@
 
 The filters know what an accelerometer should read: gravity, and the motion that the gyroscopes show. What it reads beyond that,
 more than noise and the filter's own uncertainty explain, is vibration or a shock. Its square is added to the variance of the
-reading, so that the filters go on with the gyroscopes for as long as it lasts. That needs no knowledge of its frequency. While
-an IMU is shaken, a reading that could be explained may still hide as much vibration as would not show.
+reading, so that the filters go on with the gyroscopes for as long as it lasts. That needs no knowledge of its frequency. What
+stays below that limit counts on average, too: readings of a vibration that happen to be near zero, unlike those between shocks.
 
 A reading at the end of its sensor's range is clipped. It says nothing, and the others bridge it.
 """
 
 import numpy as np
 
-from controller.estimation.excess import INNOVATION_LIMIT, faded_excess
+from controller.estimation.excess import faded_excess
 from controller.safety.causes import Cause, report_event
 from plant.compiled import Record, kernel, record_dtype
 from plant.imu import ACCELEROMETER
@@ -20,7 +20,7 @@ from plant.pose import Array
 MEMORY_S = 0.002
 """Time in which the excess of a reading fades to the share 1/e: sensors' low-passes let a shock fade so."""
 
-_AVERAGE_S = 0.3
+AVERAGE_S = 0.3
 """Time constant of the mean square that is told [s]."""
 
 CALM_S = 1.0
@@ -48,7 +48,8 @@ STATE = record_dtype(
     clipped_for=(np.int64, IMU_COUNT),  # cycles with clipped readings, less those without
     excess=(np.float64, IMU_COUNT),  # of the square of each accelerometer's reading over what is explained, faded [m^2/s^4]
     mean=(np.float64, IMU_COUNT),  # of that, averaged
-    hidden=(np.float64, IMU_COUNT),  # mean square of what readings hide that could be explained [m^2/s^4]
+    passed=(np.float64, IMU_COUNT),  # square of the readings without an excess, averaged [m^2/s^4]
+    hidden=(np.float64, IMU_COUNT),  # by how much that is more than what is explained [m^2/s^4]
     told=np.int64,  # whether it has been told that IMUs are shaken
     bridging=np.int64,  # the same of clipped readings
     calm_for=np.int64,  # for how many cycles nothing has shaken them
@@ -62,7 +63,7 @@ def shaking_parameters(limit: float, rate: float) -> Record:
     made["limit"] = limit
     made["bridged_cycles"] = max(2, round(_BRIDGED_S * rate))
     made["calm_cycles"] = round(CALM_S * rate)
-    made["smoothing"] = 1.0 / (_AVERAGE_S * rate)
+    made["smoothing"] = 1.0 / (AVERAGE_S * rate)
     return made
 
 
@@ -76,8 +77,9 @@ def note_force(s: Record, k: int, squared: float, explained: float, period: floa
         period: since the sample before [s].
     """
     s.excess[k] = faded_excess(s.excess[k], squared, explained, period, MEMORY_S)
-    # Anything up to the limit is as likely, as long as there is much beyond it.
-    s.hidden[k] = min(max(s.mean[k] - explained, 0.0), INNOVATION_LIMIT**2 * explained) / 3.0
+    if s.excess[k] == 0.0:
+        s.passed[k] += min(1.0, period / AVERAGE_S) * (squared - s.passed[k])
+    s.hidden[k] = max(s.passed[k] - explained, 0.0)
 
 
 @kernel

@@ -359,7 +359,8 @@ def test_the_stages_on_filterpy_do_the_same_over_failures_and_new_starts(incline
         clipped = random.random((2, 7)) < 0.05
         for state in (compiled, twin):
             state["imus"]["used"], state["imus"]["sample"], state["imus"]["shaking"]["clipped"] = used, sample, clipped
-            state["imus"]["shaking"]["mean"] = (k // 25) % 2 * np.linspace(0.1, 30.0, 7)
+            if k % 50 == 25:
+                state["imus"]["shaking"]["passed"] = np.linspace(0.1, 30.0, 7)
             state["pose"]["twist"] = 0.1
             state["pose"]["acceleration"] = random.normal(size=6) if state is compiled else compiled["pose"]["acceleration"]
         step(parameters, compiled, last=CycleStage.HEADING)
