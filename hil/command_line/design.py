@@ -1,16 +1,17 @@
-"""The commands about mechanisms, sensors and gains: classify, classes, accuracy, sensor-sets, tune, tune-fusion, optimise."""
+"""The commands about mechanisms, sensors and gains: from classify to optimise."""
 
 from argparse import Namespace
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hil.command_line import cli
-from hil.command_line.terminal import deg, engine_at_work, mm
+from hil.command_line.terminal import deg, engine_at_work, mm, say
 from hil.engine.settings import EngineSettings
 from hil.runs.config import SimulationConfig
 from hil.studies.config import TuningConfig
+from hil.studies.detectability.uncertainty import Uncertainty
 from hil.table import Table
 from plant.errors import InputError
 from plant.extras import check_installed
@@ -146,6 +147,57 @@ def gough_sensor_sets(options: Namespace) -> None:
             table(outcomes, mechanism).print()
     for reason in reasons(outcomes):
         print(f"{'- ' if options.markdown else ''}{reason}")
+
+
+@cli.command(
+    cli.argument(
+        "rows", nargs="*", metavar="TEXT", help="rows of gough faults with this in their names or kinds (default: all)"
+    ),
+    cli.options_of(SimulationConfig, "mechanism", "target", "duration", "rate", "imu", only_given=True),
+    cli.options_of(
+        SimulationConfig, faults={"text": "instead of rows: what happens, as for 'gough simulate'; several act together"}
+    ),
+    cli.setting("--seeds", 20, "how often each row is drawn: its IMUs, signs and times"),
+    cli.source("--measured", "FILE.json", "figures of 'gough faults --json', to compare"),
+    cli.options_of(Uncertainty),
+    cli.markdown("docs/detectability.md"),
+    cli.engine_options(),
+    cli.JSON,
+)
+def gough_detectability(options: Namespace) -> int:
+    """Compute how far off a pose can be before any test could tell.
+
+    For each row of the disturbances of gough faults, the likelihood-ratio test of this fault against none, on the same data:
+    accelerometers, gyroscopes and the drives' model, with less than one false alarm in 100 h. Prints when it tells the fault
+    with a probability of 99.9 %, how much of the fault is there then, and the error of the pose until then [mm / deg]: 99.9 %
+    of all errors are smaller, and what the fault does alone; 1.5 times this error, and the limit for faults of few IMUs (3 mm,
+    0.7 deg) or shared ones (5 mm, 1 deg) where that is greater; the least share of the fault that would be told in the run,
+    and the error by it.
+    With --measured, the exit status is 1 if an error until something was told is beyond the limit. Nothing is simulated.
+    """
+    from hil.faults.bounds import bounds_of_rows, left_out, read_figures, summary, table
+    from hil.faults.rows import Row, all_rows
+
+    if options.seeds < 1:
+        raise InputError(f"there are {options.seeds} seeds; at least 1 is needed")
+    texts = options.rows or [""]
+    rows = [row for row in all_rows() if any(text in row.name or text in row.kind for text in texts)]
+    if options.faults:
+        rows = [Row(" ".join(options.faults), "own", tuple(options.faults))]
+    if not rows:
+        raise InputError(f"no row has {' or '.join(map(repr, texts))} in its name")
+    given = {
+        name: getattr(options, name) for name in ("mechanism", "target", "duration", "rate", "imu") if hasattr(options, name)
+    }
+    measured = read_figures(options.measured) if options.measured else None
+    uncertainty = cli.config_of(options, Uncertainty)
+    with engine_at_work(cli.engine_of(options), "rows") as (engine, progress):
+        found = bounds_of_rows([replace(row, **given) for row in rows], options.seeds, uncertainty, engine, progress)
+    table(found, measured).print(options.markdown)
+    cli.write_json(options.json, summary(found, uncertainty, measured))
+    for line in left_out(found):
+        say(f"no bound for {line}")
+    return int(measured is not None and any(row.beyond(measured) for row in found))
 
 
 @cli.command(cli.options_of(SimulationConfig, "mechanism", "rate"), cli.JSON)

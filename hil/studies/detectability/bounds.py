@@ -2,7 +2,7 @@
 
 The signature of a fault is whitened by the model without a fault. The sum of the squares of what comes out until a time is the
 noncentrality of the likelihood-ratio test at this time, and the best estimate that knows of no fault makes of the signature the
-error that the fault causes. `docs/faults.md` derives this.
+error that the fault causes. `docs/detectability.md` derives this.
 """
 
 from collections.abc import Sequence
