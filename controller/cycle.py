@@ -24,9 +24,11 @@ from controller import safety as safety_stage
 from controller.calibration.file import Calibration
 from controller.direct_kinematics.geometry import LINEAR_RANK
 from controller.estimation import heading_filter, imu_health, imu_monitor, leg_filter, platform_filter, pose_estimator
+from controller.estimation.integrity import stage as integrity
+from controller.estimation.integrity.protection import end_level
 from controller.estimation.whole_mechanism import trust
 from controller.estimation.whole_mechanism.imu_errors import ERRORS
-from controller.estimation.whole_mechanism.parameters import MOST_STATES, filter_parameters
+from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, MOST_STATES, filter_parameters
 from controller.estimation.whole_mechanism.readings import MOTION_STATES, RIG_ERRORS
 from controller.imu_set import check_imus, imus_of
 from controller.inverse_kinematics import legs_at
@@ -55,6 +57,7 @@ PARAMETERS = record_dtype(
     heading=heading_filter.PARAMETERS,
     pose=pose_estimator.PARAMETERS,
     mechanism=trust.PARAMETERS,
+    integrity=integrity.PARAMETERS,
     load=load_feed_forward.PARAMETERS,
     pid=pid.PARAMETERS,
     safety=safety_stage.PARAMETERS,
@@ -80,6 +83,7 @@ STATE = record_dtype(
     heading=heading_filter.STATE,
     pose=pose_estimator.STATE,
     mechanism=trust.STATE,
+    integrity=integrity.STATE,
     reference=reference.STATE,
     load=load_feed_forward.STATE,
     pid=pid.STATE,
@@ -102,7 +106,7 @@ RUNNING_LIMITS: Limits = {
 class CycleStage(IntEnum):
     """The stages, in their order."""
 
-    SCREENING, LEGS, PLATFORM, HEADING, POSE, REFINEMENT, MECHANISM, CONTROL, END = range(9)
+    SCREENING, LEGS, PLATFORM, HEADING, POSE, REFINEMENT, MECHANISM, INTEGRITY, CONTROL, END = range(10)
 
 
 MARKS = record_dtype(ns=(np.int64, CycleStage.END), timespec=(np.int64, 2))
@@ -153,6 +157,8 @@ def cycle_parameters(
         )
     present = imus_of(mechanism, imus)
     errors, of_heading = (calibration.covariance, calibration.floor), field if magnetometer else None
+    filtered = filter_parameters(fusion, rate, whole, *errors, of_heading)
+    watch_evidence = bool(watched.watch_imus) and not mechanism.planar and not section_5
     return filled(
         PARAMETERS,
         rig=rig_parameters(mechanism, rate, control.hold, calibration.tilt),
@@ -161,7 +167,8 @@ def cycle_parameters(
         platform=platform_filter.platform_parameters(fusion, rate, limits.jerk),
         heading=heading_filter.heading_parameters(fusion, rate, field, magnetometer),
         pose=pose_estimator.pose_parameters(fusion, section_5),
-        mechanism=trust.trust_parameters(fusion, rate, filter_parameters(fusion, rate, whole, *errors, of_heading)),
+        mechanism=trust.trust_parameters(fusion, rate, filtered),
+        integrity=integrity.integrity_parameters(fusion, rate, filtered["prior"][:ALL_ERRORS, :ALL_ERRORS], watch_evidence),
         load=load_feed_forward.load_parameters(mechanism, command_delay),
         pid=pid.pid_parameters(control, limits.velocity),
         safety=safety_stage.safety_parameters(watched, rate, limits, to_arm),
@@ -222,7 +229,7 @@ def run_stages(
     if first <= CycleStage.REFINEMENT < last:
         if s.pose.found != 0:
             s.pose.found = pose_estimator.refine_pose(p.pose, s.pose, rig, time, s.legs, s.platform.rate)
-        if s.pose.found != 0 and p.safety.monitor.active != 0 and p.pose.section_5 == 0:
+        if s.pose.found != 0 and p.safety.monitor.active != 0 and p.pose.section_5 == 0 and p.integrity.filter.active == 0:
             imu_monitor.look_at_next(
                 p.safety.monitor, s.safety.monitor, s.pose, s.legs.directions, s.legs.weights, rig.vectors_in_base[0]
             )
@@ -231,6 +238,23 @@ def run_stages(
     if first <= CycleStage.MECHANISM < last:
         s.pose.found = trust.step_mechanism_filter(p.mechanism, s.mechanism, rig, time, s.imus, s.legs, s.heading, s.pose)
         t = _mark(m, CycleStage.MECHANISM, t)
+    if first <= CycleStage.INTEGRITY < last:
+        if s.pose.found != 0:
+            integrity.step_integrity(p.integrity, s.integrity, rig, time, s.imus, s.pose, s.reference.motion)
+        if s.integrity.contradicts != 0 and watch.judge_parity(
+            p.safety, s.safety, rig, time, s.imus, s.integrity.parity, s.reference, s.pid
+        ):  # fmt: skip
+            trust.restart_filter(s.mechanism, time, s.pose)
+            integrity.restart_integrity(s.integrity)
+        if s.integrity.fresh != 0:
+            level = s.integrity.protection
+            trust.find_covariance(p.mechanism, s.mechanism, rig, time, s.pose, level.scratch, level.covariance)
+            end_level(level, level.covariance)
+            watch.check_level(p.safety, s.safety, rig, time, level.level, s.reference, s.pid)
+            if watch.judge_evidence(p.safety, s.safety, rig, time, s.imus, s.integrity, s.reference, s.pid):
+                trust.restart_filter(s.mechanism, time, s.pose)
+                integrity.restart_integrity(s.integrity)
+        t = _mark(m, CycleStage.INTEGRITY, t)
     cause = Cause.NONE.value
     if first <= CycleStage.CONTROL < last:
         cause = _control(parameters, state, segments) if s.pose.found != 0 else _lose_pose(parameters, state)
@@ -260,7 +284,7 @@ def _control(parameters: Record, state: Record, segments: Array) -> int:
         reference.update_reference(s.reference, rig, time, s.safety, segments)
     for k in range(rig.legs):
         s.pid.error[k] = s.reference.motion[k, 0] - pose.lengths[k]
-    arming.run_arming_checks(p.safety, s.safety, rig, time, p.imus, s.imus, pose, s.reference, s.pid)
+    arming.run_arming_checks(p.safety, s.safety, rig, time, p.imus, s.imus, s.integrity, pose, s.reference, s.pid)
     if s.safety.request != Request.ENABLED or s.safety.mode < Mode.RUNNING:
         pid.hold_still(s.pid, rig.legs)
     else:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from controller.least_squares import RANK_TOLERANCE, solve_square
 from plant.compiled import kernel
 from plant.errors import InputError, SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
@@ -83,6 +84,38 @@ def jacobian_at(arms: Array, directions: Array, legs: int, jacobian: Array) -> N
         direction = vector(directions[k])
         jacobian[k, 0], jacobian[k, 1], jacobian[k, 2] = direction
         jacobian[k, 3], jacobian[k, 4], jacobian[k, 5] = cross(vector(arms[k]), direction)
+
+
+@kernel
+def motion_of_legs(arms: Array, directions: Array, lengths: Array, legs: Array, jacobian: Array, right: Array) -> bool:
+    """Write into `right` (2, 6) the twist and the acceleration of the platform at which the legs have their rates.
+
+    With r the direction of a leg, a its arm, v + omega x a the velocity of its joint, and l its length,
+
+        l' = r (v + omega x a),  l'' = r (v' + omega' x a + omega x (omega x a)) + (|v + omega x a|^2 - l'^2) / l
+
+    Args:
+        arms, directions, lengths: (6, 3), (6, 3), (6,), of the legs.
+        legs: (6, 3), length, rate and acceleration of each leg.
+        jacobian: (6, 6), scratch.
+
+    Returns:
+        Whether the Jacobian can be inverted; if not, `right` is zero.
+    """
+    for order in range(2):
+        jacobian_at(arms, directions, LEGS, jacobian)
+        for k in range(LEGS):
+            right[order, k] = legs[k, 1 + order]
+            if order == 1:
+                omega, arm = vector(right[0, 3:]), vector(arms[k])
+                turning = cross(omega, arm)
+                speed = add(vector(right[0]), turning)
+                right[1, k] -= dot(vector(directions[k]), cross(omega, turning))
+                right[1, k] -= (dot(speed, speed) - legs[k, 1] ** 2) / lengths[k]
+        if solve_square(jacobian, right[order]) < RANK_TOLERANCE:
+            right[:] = 0.0
+            return False
+    return True
 
 
 def sample_workspace(mechanism: Mechanism, count: int, seed: int) -> tuple[Array, Array]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from math import radians
+from math import inf, radians
 from typing import TypeVar
 
 from plant.errors import InputError
@@ -12,6 +12,7 @@ from plant.mechanism import Mechanism
 
 _ENDLESS = 1e300
 _RAW_M = 0.05
+_ENDLESS_ALLOWED = ("protection_position", "protection_rotation")
 _ZERO_ALLOWED = ("integral", "derivative", "sensor_delay", "most_lost_imus", "watch_imus")
 
 S = TypeVar("S", "ControlSettings", "FusionSettings", "SafetySettings")
@@ -19,12 +20,14 @@ S = TypeVar("S", "ControlSettings", "FusionSettings", "SafetySettings")
 
 @dataclass(frozen=True)
 class _Settings:
-    """Settings that must be positive and finite, except where zero is allowed."""
+    """Settings that must be positive and finite, except zero or no limit is allowed."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if not 0.0 <= value < float("inf") or (value == 0.0 and field.name not in _ZERO_ALLOWED):
+            if value == inf and field.name in _ENDLESS_ALLOWED:
+                continue
+            if not 0.0 <= value < inf or (value == 0.0 and field.name not in _ZERO_ALLOWED):
                 raise InputError(f"{field.name} is {value}; it must be positive and finite")
 
 
@@ -85,6 +88,9 @@ class SafetySettings(_Settings):
 
     most_lost_imus: float = 1.0  # that may be left out at once
     disagreement: float = radians(1.0)  # of an IMU's direction and that of all others, beyond which it is left out [rad]
+    evidence: float = 8.0  # that something is wrong with the readings, beyond which an IMU is left out or a run stops [sigma]
+    protection_position: float = inf  # largest protection level of the position [m]
+    protection_rotation: float = inf  # largest protection level of the rotation [rad]
     gyroscope_noise: float = radians(5.0)  # RMS beyond which an IMU is left out [rad/s]
     accelerometer_noise: float = 5.0  # RMS beyond which an IMU is left out [m/s^2]
     vibration: float = 1.5  # RMS of what accelerometers read beyond the motion, from which on it is told [m/s^2]

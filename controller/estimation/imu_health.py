@@ -59,8 +59,9 @@ STATE = record_dtype(
     frozen_for=(np.int64, IMU_COUNT),  # for how many cycles it has done so although it must have changed
     moved_since=np.float64,  # how far the reference has moved a leg since the last change of any reading [m]
     healthy_for=(np.int64, IMU_COUNT),  # for how many cycles the IMU has been healthy
+    healthy=(np.int64, IMU_COUNT),  # whether its readings are fit for use
     used=(np.int64, IMU_COUNT),  # whether the filters use it
-    excluded=(np.int64, IMU_COUNT),  # whether it contradicted the others, which excludes it for good
+    excluded=(np.int64, IMU_COUNT),  # whether it contradicts the others
     earlier=(np.float64, (2, 2, IMU_COUNT, 3)),  # the last two raw samples
     variance=(np.float64, (2, IMU_COUNT)),  # of each sensor's noise, averaged
     noise=(np.float64, IMU_COUNT),  # of each IMU over its limit
@@ -160,15 +161,15 @@ def screen_imus(
                 reached = max(reached, most)
         if not finite:
             cause, value, limit = Cause.IMU_NOT_FINITE.value, np.nan, np.nan
-        elif not shaking.bridges(p.shaking, s.shaking, k, s.used[k], time.missed):
+        elif not shaking.bridges(p.shaking, s.shaking, k, s.healthy[k], time.missed):
             cause, value, limit = Cause.IMU_OUT_OF_RANGE.value, reached, 1.0
-        if p.present[k] == 0 or s.excluded[k] != 0:
-            s.used[k] = 0
+        if p.present[k] == 0:
             continue
-        used = s.used[k]
-        healthy = cause == Cause.NONE
+        before, healthy = s.healthy[k], cause == Cause.NONE
         s.healthy_for[k] = s.healthy_for[k] + 1 + time.missed if healthy else 0
-        s.used[k] = 1 if healthy and (used != 0 or s.healthy_for[k] > min(time.cycle, p.healthy_cycles)) else 0
+        s.healthy[k] = 1 if healthy and (before != 0 or s.healthy_for[k] > min(time.cycle, p.healthy_cycles)) else 0
+        used = s.used[k]
+        s.used[k] = s.healthy[k] if s.excluded[k] == 0 else 0
         if not healthy and (used != 0 or time.cycle == 0):
             report_event(events, cause, k, value, limit)
         elif s.used[k] > used and time.cycle > 0:

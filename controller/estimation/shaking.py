@@ -96,13 +96,13 @@ def worth_of(s: Record, sensor: int, k: int, nominal: float) -> float:
 
 
 @kernel
-def bridges(p: Record, s: Record, k: int, used: int, missed: int) -> bool:
-    """Whether IMU `k` can be used although its readings may be clipped: it is in use, and they have not been for long."""
+def bridges(p: Record, s: Record, k: int, healthy: int, missed: int) -> bool:
+    """Whether IMU `k` is healthy although its readings may be clipped: it was, and they have not been for long."""
     if s.clipped[0, k] == 0 and s.clipped[1, k] == 0:
         s.clipped_for[k] = max(s.clipped_for[k] - 1 - missed, 0)
         return True
     s.clipped_for[k] = min(s.clipped_for[k] + 1 + missed, p.bridged_cycles + 1)
-    return bool(used != 0 and s.clipped_for[k] <= p.bridged_cycles)
+    return bool(healthy != 0 and s.clipped_for[k] <= p.bridged_cycles)
 
 
 @kernel

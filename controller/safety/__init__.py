@@ -49,6 +49,7 @@ def watch_nothing(parameters: Record) -> None:
     safety["arming"]["distance"] = safety["arming"]["drift"] = np.inf
     limits = safety["watch"]
     limits["most_lost_imus"], limits["conditioning"] = IMU_COUNT, 0.0
+    limits["evidence"] = limits["level"] = np.inf
     limits["lengths"] = limits["plausible_lengths"] = -np.inf, np.inf
     for name in ("speed", "following", "saturation", "drive_deviation", "carried"):
         limits[name] = np.inf

@@ -78,8 +78,8 @@ def describe_obstacle(state: Record) -> str:
 
 @kernel
 def run_arming_checks(
-    p: Record, s: Record, rig: Record, time: Record, imu_parameters: Record, imus: Record, pose: Record, reference: Record,
-    pid: Record,
+    p: Record, s: Record, rig: Record, time: Record, imu_parameters: Record, imus: Record, integrity: Record, pose: Record,
+    reference: Record, pid: Record,
 ) -> None:  # fmt: skip
     """Before the commands: from idle to armed, and from armed to running.
 
@@ -93,12 +93,12 @@ def run_arming_checks(
     if time.cycle < rig.hold_cycles or s.mode > Mode.ARMED:
         return
     if s.mode == Mode.IDLE:
-        a.obstacle, a.index, a.value, a.limit = _find_obstacle(p, s, rig, imu_parameters, imus, pose, pid)
+        a.obstacle, a.index, a.value, a.limit = _find_obstacle(p, s, rig, imu_parameters, imus, integrity, pose, pid)
         if a.obstacle == Cause.NONE and p.arming.active != 0:
             s.mode, s.request = Mode.ARMED, Request.ENABLED
             report_event(s.events, Cause.ARMED, -1, np.nan, np.nan)
     if s.mode == Mode.ARMED:
-        a.obstacle, a.index, a.value, a.limit = _find_obstacle(p, s, rig, imu_parameters, imus, pose, pid)
+        a.obstacle, a.index, a.value, a.limit = _find_obstacle(p, s, rig, imu_parameters, imus, integrity, pose, pid)
         if a.obstacle != Cause.NONE:
             # The drives are enabled already, so arming does not wait here.
             handle_cause(p, s, rig, time, reference, pid, a.obstacle, a.index, a.value, a.limit)
@@ -179,13 +179,17 @@ def _unanswered_for(watch: Record) -> float:
 
 @kernel
 def _find_obstacle(
-    p: Record, s: Record, rig: Record, imu_parameters: Record, imus: Record, pose: Record, pid: Record
+    p: Record, s: Record, rig: Record, imu_parameters: Record, imus: Record, integrity: Record, pose: Record, pid: Record
 ) -> tuple[int, int, float, float]:
     """The first obstacle: a `Cause` with its leg or IMU, value and limit."""
     # Without answers, nothing below is about the present.
     if s.watch.unanswered > 0:
         return Cause.BUS_LOST.value, -1, _unanswered_for(s.watch), 0.0
     lost, lengths, error = 0, pose.lengths, pid.error
+    if integrity.evaluations > 0 and integrity.best_evidence > p.watch.evidence:
+        blamed = integrity.blamed
+        cause = Cause.NO_TRUST.value if blamed < 0 else Cause.NO_SENSORS.value
+        return cause, blamed, np.sqrt(integrity.best_evidence), np.sqrt(p.watch.evidence)
     for k in range(IMU_COUNT):
         off = contradiction(s.monitor, k)
         if not off <= p.monitor.disagreement:

@@ -112,7 +112,7 @@ class Cause(IntEnum):
         31,
         "not armed: IMU {} is not plausible: a raw one needs a calibration, else check its place",
         Reaction.STOP,
-        "rad",
+        "sigma",
     )
     NO_AGREEMENT = 32, "not armed: leg {} is not where the target begins", Reaction.STOP, "m"
     NO_WORKSPACE = 33, "not armed: leg {} is outside its stroke", Reaction.STOP, "m"
@@ -120,6 +120,18 @@ class Cause(IntEnum):
     TARGET_LOST = 35, "the target's stream has stopped", Reaction.STOP, "s"
     TARGET_JUMPS = 36, "the target jumps for leg {}", Reaction.STOP, "m"
     TARGET_NOT_FINITE = 37, "the target is not finite, or its quaternion is none", Reaction.STOP
+    GYROSCOPES_SHARE = 38, "all gyroscopes share an error", Reaction.QUICK_STOP, "sigma"
+    ACCELEROMETERS_SHARE = 39, "all accelerometers share an error", Reaction.QUICK_STOP, "sigma"
+    BASE_TURNS = 40, "the base turns", Reaction.QUICK_STOP, "sigma"
+    BASE_MOVES = 41, "the base tilts or accelerates", Reaction.QUICK_STOP, "sigma"
+    RIVAL_IMU = 42, "it may as well be IMU {}", Reaction.GO_ON, "sigma"
+    RIVAL_GYROSCOPES = 43, "it may as well be all gyroscopes", Reaction.GO_ON, "sigma"
+    RIVAL_ACCELEROMETERS = 44, "it may as well be all accelerometers", Reaction.GO_ON, "sigma"
+    RIVAL_BASE_TURNS = 45, "it may as well be a base that turns", Reaction.GO_ON, "sigma"
+    RIVAL_BASE_MOVES = 46, "it may as well be a base that tilts or accelerates", Reaction.GO_ON, "sigma"
+    IMU_CONTRADICTED = 47, "IMU {} is left out: the others contradict it", Reaction.GO_ON, "sigma"
+    IMUS_CONTRADICT = 48, f"the IMUs contradict each other{_WORST}", Reaction.QUICK_STOP, "sigma"
+    NO_TRUST = 49, "not armed: the IMUs share an error, or the base is not at rest", Reaction.STOP, "sigma"
     NOT_STILL = 50, "not armed: the estimate of leg {} still drifts on the brakes within 50 ms", Reaction.STOP, "m"
     SHAKEN = 51, "the IMUs are shaken, the worst is IMU {}: accelerometers count less", Reaction.GO_ON, "m/s^2 RMS"
     BRIDGED = 52, "readings of IMU {} at the end of their range are bridged by the other sensors", Reaction.GO_ON
@@ -130,6 +142,10 @@ class Cause(IntEnum):
         Reaction.STOP,
         "rad of uncertainty",
     )
+    GYROSCOPE_OFF = 58, "IMU {} is left out: its gyroscope contradicts the others", Reaction.GO_ON, "rad/s"
+    GYROSCOPES_CONTRADICT = 59, f"the gyroscopes contradict each other{_WORST}", Reaction.QUICK_STOP, "rad/s"
+    POSITION_UNSURE = 60, "the position may be off by more than the limit", Reaction.STOP, "m"
+    ROTATION_UNSURE = 61, "the rotation may be off by more than the limit", Reaction.STOP, "rad"
 
     @property
     def short(self) -> str:

@@ -17,6 +17,25 @@ _IMPLAUSIBLE_SHARE = 0.25
 _LEAST_CYCLES = 10
 """For how many cycles a deviation must last, at low rates."""
 
+_CLEARED, _CLEARED_EVALUATIONS = 0.3, 6
+"""An IMU is taken back when the evidence against it is below this share of the limit in so many evaluations, in twice as many
+after each time.
+"""
+
+_MOST_DOUBLINGS = 20
+
+_CLEARLY, _CLEARLY_OF_ALL = 0.5, 0.25
+"""How much less than for the named IMU the evidence for anything else must be: of the limit, and of that evidence."""
+
+_REST, _REST_OF_ALL = 1.0, 0.05
+"""How much evidence for further faults may be left without the named IMU: times the limit, and of the evidence for it."""
+
+_PATIENT = 2.0
+"""How many times the limit evidence may reach while more of it may tell what is wrong."""
+
+_NEARLY = 0.7
+"""Share of the evidence from which on something else explains the readings as well."""
+
 _CLEARER = 1.3
 """How much more of the residuals the named IMU must explain than any other."""
 
@@ -32,6 +51,8 @@ PARAMETERS = record_dtype(
     patience=np.float64,  # [s]
     bus_cycles=np.int64,
     carried=np.float64,  # [rad^2]
+    evidence=np.float64,  # for a fault, twice a logarithm
+    level=(np.float64, 2),  # of protection, position [m] and rotation [rad]
 )
 """The limits. Durations that are compared with sums of periods are in s."""
 
@@ -44,6 +65,8 @@ STATE = record_dtype(
     deviating_for=(np.float64, LEGS),  # how long each drive has been off its command [s]
     saturated_for=(np.float64, LEGS),  # how long each command has been at its limit [s]
     speed=(np.float64, LEGS),  # estimated, of each leg [m/s]
+    returns=(np.int64, IMU_COUNT),  # how often each IMU was taken back
+    cleared_for=(np.int64, IMU_COUNT),  # in how many evaluations there has been little evidence against an IMU left out
 )
 """What the rig has reported, and what lasts."""
 
@@ -65,6 +88,8 @@ def watch_parameters(settings: SafetySettings, rate: float, limits: Limits) -> R
         patience=max(settings.patience, _LEAST_CYCLES / rate),
         bus_cycles=max(3, round(settings.bus_patience * rate)),
         carried=settings.carried**2,
+        evidence=settings.evidence**2,
+        level=(settings.protection_position, settings.protection_rotation),
     )
 
 
@@ -164,6 +189,81 @@ def check_carried(
                 worst, variance = k, own
     if variance > p.watch.carried:
         handle_cause(p, s, rig, time, reference, pid, Cause.NOT_CARRIED, worst, np.sqrt(variance), np.sqrt(p.watch.carried))
+
+
+@kernel
+def check_level(p: Record, s: Record, rig: Record, time: Record, level: Array, reference: Record, pid: Record) -> None:
+    """After an evaluation of the evidence for faults: stop when the protection level (2,) [m, rad] is beyond its limit."""
+    for part, cause in enumerate((Cause.POSITION_UNSURE.value, Cause.ROTATION_UNSURE.value)):
+        if s.mode == Mode.RUNNING and not level[part] <= p.watch.level[part]:
+            handle_cause(p, s, rig, time, reference, pid, cause, -1, level[part], p.watch.level[part])
+
+
+@kernel
+def judge_parity(
+    p: Record, s: Record, rig: Record, time: Record, imus: Record, parity: Record, reference: Record, pid: Record
+) -> bool:
+    """When the gyroscopes contradict each other: leave out the one that is named, else stop. Returns whether it is left out."""
+    if s.mode != Mode.RUNNING:
+        return False
+    lost = 0
+    for k in range(IMU_COUNT):
+        lost += imus.excluded[k]
+    if parity.named != 0 and lost < p.watch.most_lost_imus:
+        imus.excluded[parity.worst] = 1
+        report_event(s.events, Cause.GYROSCOPE_OFF, parity.worst, parity.error, parity.limit)
+        return True
+    handle_cause(
+        p, s, rig, time, reference, pid, Cause.GYROSCOPES_CONTRADICT, parity.worst, parity.error, parity.limit
+    )  # fmt: skip
+    return False
+
+
+@kernel
+def judge_evidence(
+    p: Record, s: Record, rig: Record, time: Record, imus: Record, integrity: Record, reference: Record, pid: Record
+) -> bool:
+    """After an evaluation of the evidence for faults: leave out the IMU that it is against, if it is against no other and the
+    rest agrees; take back one that it is no longer against; else stop. Returns whether the set of IMUs has changed.
+    """
+    w, limit, e = s.watch, p.watch.evidence, integrity
+    back = False
+    for at in range(e.evidence.apart):
+        k = e.evidence.order[at]
+        w.cleared_for[k] = w.cleared_for[k] + 1 if e.evidence.apart_evidence[at] < _CLEARED * limit else 0
+        if w.cleared_for[k] >= _CLEARED_EVALUATIONS << min(w.returns[k], _MOST_DOUBLINGS):
+            w.cleared_for[k] = imus.excluded[k] = 0
+            w.returns[k] += 1
+            back = True
+    if back or not e.best_evidence >= limit or s.mode != Mode.RUNNING:
+        return back
+    k, most = e.blamed, np.sqrt(limit)
+    if k < 0:
+        cause = Cause.GYROSCOPES_SHARE + e.shared
+        _report_rival(s, e, most)
+        handle_cause(p, s, rig, time, reference, pid, cause, -1, np.sqrt(e.best_evidence), most)
+        return False
+    clear = e.rival_evidence < e.imu_evidence - max(_CLEARLY * limit, _CLEARLY_OF_ALL * e.imu_evidence)
+    rest_agrees = e.all_evidence - e.imu_evidence < _REST * limit + _REST_OF_ALL * e.imu_evidence
+    alone = clear and rest_agrees and e.evidence.of_learned == 0
+    if alone and e.evidence.apart < p.watch.most_lost_imus:
+        imus.excluded[k] = 1
+        report_event(s.events, Cause.IMU_CONTRADICTED, k, np.sqrt(e.imu_evidence), most)
+        return True
+    if (clear and rest_agrees) or e.best_evidence >= _PATIENT * limit:
+        _report_rival(s, e, most)
+        handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, k, np.sqrt(e.imu_evidence), most)
+    return False
+
+
+@kernel
+def _report_rival(s: Record, e: Record, limit: float) -> None:
+    """Say what else explains the readings nearly as well."""
+    if s.stop.cause != Cause.NONE or e.rival_evidence < _NEARLY * e.best_evidence:
+        return
+    k = e.rival_blamed
+    cause = Cause.RIVAL_IMU if k >= 0 else Cause.RIVAL_GYROSCOPES + e.rival_shared
+    report_event(s.events, cause, k, np.sqrt(e.rival_evidence), limit)
 
 
 @kernel

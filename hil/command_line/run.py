@@ -92,6 +92,16 @@ def _print_simulation(summary: dict[str, Any]) -> None:
     table.print()
     if not summary["truth_known"]:
         print("the truth is not known: the plant does not give its pose")
+    if level := summary["protection"]:
+        covered = f"; it covers the error in {100 * level['covered']:.3f} % of the cycles" if "covered" in level else ""
+        print(
+            "protection level p50/p99/max "
+            + " mm, ".join(
+                "/".join(unit(level[f"{name}_{label}"], 3) for label in ("p50", "p99", "max"))
+                for name, unit in (("position", mm), ("rotation", deg))
+            )
+            + f" deg{covered}"
+        )
     _print_pace(summary)
     cycle = summary["cycle_us"]
     print(
@@ -184,6 +194,8 @@ def _print_run(summary: dict[str, Any]) -> None:
     )
     truth = f"estimate - truth {mm(errors['estimation'])} mm RMS" if errors["known"] else "the truth is not known"
     print(f"{truth}; reference - length {mm(errors['tracking'])} mm RMS")
+    if level := summary["protection"]:
+        print(f"greatest protection level {mm(level['position'])} mm, {deg(level['rotation'])} deg")
     _print_pace(summary)
     if trip := summary["timing_us"].get("round trip"):
         figures = ", ".join(f"{label} {trip[name]:.0f}" for label, name in QUANTILES.items())

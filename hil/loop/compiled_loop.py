@@ -7,8 +7,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from controller.cycle import CycleStage, hear_rig, prepare_next, react, run_stages, skip_periods
-from controller.estimation.whole_mechanism.filter import extrapolate_covariance
-from controller.least_squares import factor_cholesky, invert_cholesky
+from controller.estimation.whole_mechanism.trust import find_covariance
 from controller.planning.plan_handover import STREAM_PATIENCE_S, stream_cause, take_plan
 from controller.reference import motion_cycle
 from controller.safety.causes import EVENT_SLOTS, REACTION, Cause, Request
@@ -211,8 +210,11 @@ def record_cycle(parameters: Record, state: Record, clock: Record, work: Record,
     for k in range(LEGS):
         for i in range(3):
             record.residuals[k, i] = s.legs.directions[k, i] - s.pose.directions[k, i] if s.legs.used[k] != 0.0 else np.nan
-    update_covariance(p.mechanism, p.rig, s.time, s.mechanism, s.pose, w)
+    find_covariance(p.mechanism, s.mechanism, p.rig, s.time, s.pose, w.factor, w.covariance)
     record.covariance[:] = w.covariance
+    record.protection[:] = s.integrity.protection.level
+    if s.integrity.evaluations == 0:
+        record.protection[:] = np.nan
     record_state(state, record)
 
 
@@ -227,18 +229,6 @@ def record_state(state: Record, record: Record) -> None:
     record.reference[:] = s.reference.motion
     record.command[:] = s.pid.command
     record.mode, record.stop = s.safety.mode, s.safety.stop.cause
-
-
-@kernel
-def update_covariance(p: Record, rig: Record, time: Record, mechanism: Record, pose: Record, work: Record) -> None:
-    """The whole-mechanism filter's covariance if it is trusted, else the refinement's; NaN if there is none."""
-    work.factor[:] = pose.information
-    if mechanism.trusted != 0:
-        extrapolate_covariance(p.filter, mechanism.filter, time.cycle * rig.period, work.covariance)
-    elif factor_cholesky(work.factor):
-        invert_cholesky(work.factor, work.covariance)
-    else:
-        work.covariance[:] = np.nan
 
 
 @kernel

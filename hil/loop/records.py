@@ -21,6 +21,7 @@ STAGES = (
     "direct kinematics",
     "refinement",
     "whole mechanism",
+    "integrity",
     "control",
     "record",
     "plant",
@@ -33,7 +34,7 @@ next reference. `plant` is the time that a simulated plant takes."""
 class Stage(IntEnum):
     """Places of the stages in the durations of a cycle."""
 
-    SENSE, LEGS, PLATFORM, POSE, REFINEMENT, MECHANISM, CONTROL, RECORD, PLANT = range(len(STAGES))
+    SENSE, LEGS, PLATFORM, POSE, REFINEMENT, MECHANISM, INTEGRITY, CONTROL, RECORD, PLANT = range(len(STAGES))
 
 
 COMPUTED, TO_COMMAND = slice(Stage.LEGS, Stage.RECORD), slice(Stage.SENSE, Stage.RECORD)
@@ -72,6 +73,7 @@ RECORD_FIELDS = (
     ("position", "f8", 3, "m, of {2} in {1}"),
     ("rotation", "f8", (3, 3), "row by row, maps {2} to {1}"),
     ("covariance", "f4", (6, 6), "row by row, of translation [m] and rotation [rad] in {1}"),
+    ("protection", "f4", 2, "protection level of position [m] and rotation [rad]; NaN: not known"),
     ("residuals", "f4", (LEGS, 3), "measured less predicted direction, six legs by three"),
     ("conditioning", "f8", (), "1 is best, 0 singular"),
     ("lengths", "f8", LEGS, "m; 0 for legs that a planar mechanism lacks"),

@@ -16,6 +16,8 @@ LEG_NAMES = tuple(f"leg {k}" for k in range(LEGS))
 COLORS = {
     **dict(zip(AXIS_NAMES, ("#d1495b", "#2a9d5c", "#2f6fb5"), strict=True)),
     **dict(zip(LEG_NAMES, ("#3b6fb6", "#e8871e", "#3a9d6e", "#c8403f", "#8a5fb0", "#3fa7b8"), strict=True)),
+    "error": "#d1495b",
+    "level": "#26323d",
 }
 INK, FAINT = "#26323d", "#9aa5b1"
 

@@ -141,7 +141,16 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
     ]
     if np.isfinite(currents[:1]).all():
         drives.append(_Panel("motor current [A]", names, currents))
-    return [
+    level = 1e3 * records["protection"][:, :1].astype(float), np.degrees(records["protection"][:, 1:].astype(float))
+    sizes: list[Array] = []
+    if result.truth_known:
+        off = _differences(estimate, actual)
+        sizes = [np.linalg.norm(off[:, part], axis=1, keepdims=True) for part in (slice(3), slice(3, 6))]
+    protection = [
+        _Panel(f"{name} [{unit}]", ("level", "error")[: 1 + len(sizes) // 2], np.hstack([level[k], *sizes[k : k + 1]]))
+        for k, (name, unit) in enumerate((("position", "mm"), ("rotation", "deg")))
+    ]
+    figures = [
         (
             "pose",
             "Pose",
@@ -171,6 +180,11 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
             _plot(times, drives),
         ),
     ]
+    if np.isfinite(level[0]).any():
+        caption = "How far the estimate may be off, whatever single fault the readings cannot show"
+        caption += ", and how far it is." if result.truth_known else "."
+        figures.append(("protection", "Protection level", caption, _plot(times, protection, columns=2)))
+    return figures
 
 
 def _drawn_poses(result: SimulationResult) -> tuple[str, Array, Array]:

@@ -304,6 +304,7 @@ def _summary(
         "timing_us": timing,
         "over_budget": over_budget(timing, config.fusion),
         "errors_m": state.errors(),
+        "protection": state.level(),
         "start_up_s": since_process_start() - (time.monotonic() - first),
         **{name: getattr(state, name) for name in ("unseen", "refused", "late", "refused_packets", "events")},
         "recording": {"files": [str(path) for path in recorders.files], "lost": recorders.lost},

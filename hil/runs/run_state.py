@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from controller.safety.causes import Mode
 from hil.loop.stage_times import Timing
 from hil.recording.mcap import events_of, take
 from plant.compiled import Record
@@ -26,6 +27,7 @@ class RunState:
         refused_packets: number of packets that a rig on a bus refused.
         unseen: number of cycles that were overwritten before the supervisor saw them; no figure includes them.
         events: the loop's, by cycle, and the supervisor's own.
+        protection: the greatest protection level (2,) of the motion [m, rad]; NaN until there is one.
     """
 
     latest: Record | None = None
@@ -36,6 +38,7 @@ class RunState:
     refused_packets: int = 0
     unseen: int = 0
     events: list[str] = field(default_factory=list)
+    protection: NDArray[np.float64] = field(default_factory=lambda: np.full(2, np.nan))
     _seen: int = 0
     _squares: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
     _counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(2, np.int64))
@@ -54,6 +57,9 @@ class RunState:
         for eventful in records[records["event_count"] > 0]:
             for text in events_of(eventful):
                 self._note(int(eventful["cycle"]), text)
+        moving = records["mode"] == Mode.RUNNING
+        if moving.any():
+            self.protection = np.fmax(self.protection, np.fmax.reduce(records["protection"][moving].astype(float)))
         # Before the rig is armed there may be cycles without a pose.
         posed = records[records["status"] == 0]
         known = posed[np.isfinite(posed["truth"][:, 0])]
@@ -70,6 +76,11 @@ class RunState:
             self.events.append(f"cycle {cycle}: {text}")
         elif len(self.events) == _MOST_EVENTS:
             self.events.append("later events are in the recording only")
+
+    def level(self) -> dict[str, float] | None:
+        """The greatest protection level of the motion, `position` [m] and `rotation` [rad]; None if there was none."""
+        position, rotation = self.protection.tolist()
+        return None if np.isnan(position) else {"position": position, "rotation": rotation}
 
     def errors(self) -> dict[str, float]:
         """RMS errors [m]: `estimation` of the position against the truth, over the `known` cycles that have a truth; `tracking`

@@ -109,6 +109,7 @@ class SimulationResult:
             "tracking": None if truth is None else _figures(truth, reference, known),
             "estimated_tracking": _figures(estimate, reference, known),
             "target": planned if truth is None else _figures(truth, target) | planned,
+            "protection": self._protection(moving, truth and pose_errors(*estimate, *truth)),
             "limits": {"violations": self.reference.violations},
             "target_stretch": required_stretch(self.mechanism, self.target),
             "real_time_factor": self.real_time_factor,
@@ -117,6 +118,24 @@ class SimulationResult:
             "config": asdict(self.config),
             "version": version("gough"),
         }
+
+    def _protection(self, moving: NDArray[np.bool_], errors: Array | None) -> dict[str, float] | None:
+        """Median, 99th percentile and maximum of the protection level, and in which share of cycles it covers both errors; None
+        without a level.
+        """
+        levels = self.records["protection"][moving].astype(float)
+        known = np.isfinite(levels[:, 0])
+        if not known.any():
+            return None
+        figures = {
+            f"{name}_{label}": float(np.quantile(levels[known, part], share))
+            for part, name in enumerate(("position", "rotation"))
+            for label, share in (("p50", 0.5), ("p99", 0.99), ("max", 1.0))
+        }
+        if errors is None:
+            return figures
+        sizes = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2)
+        return figures | {"covered": float((sizes <= levels)[known].all(axis=1).mean())}
 
 
 def simulate(

@@ -684,8 +684,8 @@ def test_every_stage_that_runs_is_timed_and_no_other(hexapod):
         (stages.SCREENING, stages.LEGS, [0]),
         (stages.LEGS, stages.POSE, [1, 3]),
         (stages.POSE, stages.REFINEMENT, [4]),
-        (stages.REFINEMENT, stages.CONTROL, [5, 6]),
-        (stages.CONTROL, stages.END, [7]),
+        (stages.REFINEMENT, stages.CONTROL, [5, 6, 7]),
+        (stages.CONTROL, stages.END, [8]),
     ):
         marks["ns"] = -1
         assert state["time"]["cycle"] == 0

@@ -199,7 +199,7 @@ def find_rig_jacobian(
         for k in range(IMU_COUNT):
             in_frame = rotate_back(rotation, turned)
             if k < LEGS:
-                x, y, z = _leg_axes(geometry, k, position, rotation)
+                x, y, z = leg_axes(geometry, k, position, rotation)
                 in_frame = dot(x, turned), dot(y, turned), dot(z, turned)
             read = distort(errors[k], 1, scale(geometry.gravity, in_frame))
             for i in range(3):
@@ -208,7 +208,7 @@ def find_rig_jacobian(
 
 
 @kernel
-def _leg_axes(geometry: Record, k: int, position: Array, rotation: Array) -> tuple[Vector, Vector, Vector]:
+def leg_axes(geometry: Record, k: int, position: Array, rotation: Array) -> tuple[Vector, Vector, Vector]:
     """The axes of the frame of leg `k` in {1}: z along the leg, y across the joint's first axis, too."""
     joint, frame = geometry.platform_joints[k], geometry.joint_rotations[k]
     z = subtract(vector(position), vector(geometry.base_joints[k]))

@@ -12,11 +12,13 @@ from controller.estimation.whole_mechanism.filter import (
     accumulate_field,
     accumulate_sample,
     extrapolate,
+    extrapolate_covariance,
     start_filter,
     step_filter,
 )
 from controller.estimation.whole_mechanism.parameters import FILTER_PARAMETERS, FILTER_STATE
 from controller.inverse_kinematics import legs_at
+from controller.least_squares import factor_cholesky, invert_cholesky
 from controller.rig import elapsed
 from controller.settings import FusionSettings
 from plant.compiled import Record, filled, kernel, record_dtype
@@ -119,6 +121,31 @@ def step_mechanism_filter(
         pose.rotation[:] = s.closed_rotation
     _fade_step(s, rig, time, pose)
     return True
+
+
+@kernel
+def restart_filter(s: Record, time: Record, pose: Record) -> None:
+    """Let the filter begin anew, as an IMU on which it relied has been left out or one has come back."""
+    if s.filter.running == 0:
+        return
+    s.filter.running = 0
+    s.due = time.cycle
+    if s.trusted != 0:
+        s.trusted = 0
+        s.blend_offset[:] = 0.0
+        _add_step(pose.position, pose.rotation, s.closed_position, s.closed_rotation, s.blend_offset)
+
+
+@kernel
+def find_covariance(p: Record, s: Record, rig: Record, time: Record, pose: Record, factor: Array, covariance: Array) -> None:
+    """Write the pose's covariance (6, 6): the filter's if it is trusted, else the refinement's; NaN if there is none."""
+    factor[:] = pose.information
+    if s.trusted != 0:
+        extrapolate_covariance(p.filter, s.filter, time.cycle * rig.period, covariance)
+    elif factor_cholesky(factor):
+        invert_cholesky(factor, covariance)
+    else:
+        covariance[:] = np.nan
 
 
 @kernel

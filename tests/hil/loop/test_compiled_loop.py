@@ -177,12 +177,13 @@ def test_a_record_holds_what_each_part_has_found_in_its_place(loop):
     root = random.normal(size=(6, 6))
     information = root @ root.T + np.eye(6)
     state["pose"]["information"] = information
+    state["integrity"]["protection"]["level"], state["integrity"]["evaluations"] = [0.125, 0.25], 1
     loop.clock["late"], loop.clock["start"], loop.clock["woke"] = 4321, 1_000_000, 9_500_000
     events = safety["events"]
     events["count"], events["cause"], events["index"] = 2, np.arange(20, 28), np.arange(8)
     events["value"], events["limit"] = 0.5 * np.arange(8) + 1.0, 2.0 * np.arange(8) + 1.0
     safety["mode"], safety["stop"]["cause"] = Mode.STOPPING, Cause.TOO_FAST
-    work["marks"]["ns"] = [1, 20, 300, 4000, 50_000, 600_000, 7_000_000, 80_000_000]
+    work["marks"]["ns"] = [1, 20, 300, 4000, 50_000, 600_000, 7_000_000, 80_000_000, 900_000_000]
     work["stage_ns"][Stage.SENSE], work["stage_ns"][Stage.PLANT] = 9, 13
     expected = {
         "cycle": 700, "time_ns": 8_500_000, "late_ns": 4321, "missed": 4, "status": Cause.RIG_FAILED,
@@ -195,7 +196,7 @@ def test_a_record_holds_what_each_part_has_found_in_its_place(loop):
         "magnetic_field": feedback["measurement"][2], "truth": feedback["truth"], "position": state["pose"]["position"],
         "rotation": state["pose"]["rotation"], "lengths": state["pose"]["lengths"],
         "conditioning": state["pose"]["conditioning"], "reference": state["reference"]["motion"],
-        "command": state["pid"]["command"],
+        "command": state["pid"]["command"], "protection": [0.125, 0.25],
     }  # fmt: skip
     expected = {name: np.array(value) for name, value in expected.items()}
     off = np.where(state["legs"]["used"][:, None] != 0, state["legs"]["directions"] - state["pose"]["directions"], np.nan)
@@ -222,11 +223,13 @@ def test_a_record_holds_what_each_part_has_found_in_its_place(loop):
     assert stages.pop("record") > 0
     assert stages == {
         "sense": 9, "leg filters": 21, "platform filter": 4300, "direct kinematics": 50_000, "refinement": 600_000,
-        "whole mechanism": 7_000_000, "control": 80_000_000, "plant": 13,
+        "whole mechanism": 7_000_000, "integrity": 80_000_000, "control": 900_000_000, "plant": 13,
     }  # fmt: skip
     # Information that is none has no covariance; a second record goes behind the first.
     state["pose"]["information"] = -np.eye(6)
+    state["integrity"]["evaluations"] = 0
     end_cycle(loop.parameters, state, loop.segments, loop.records, loop.clock, loop.script, loop.link, work, None, 0)
+    assert np.isnan(loop.records[6]["protection"]).all()
     assert np.isnan(loop.records[6]["covariance"]).all() and loop.records[6]["status"] == 0
     assert loop.records[6]["event_count"] == 0
 

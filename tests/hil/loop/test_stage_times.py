@@ -9,18 +9,18 @@ from hil.loop.stage_times import Timing, budget, exceeded, over_budget
 
 def test_sums_are_of_the_stages_that_they_name():
     records = np.zeros(1, RECORD)
-    records["stage_ns"] = 1000 * 2 ** np.arange(9)
+    records["stage_ns"] = 1000 * 2 ** np.arange(10)
     records["late_ns"], records["round_trip_ns"] = 3_000_000, 5_000_000
     timing = Timing()
     timing.add(records)
     figures = timing.figures()
     assert {name: figures[name]["max"] for name in STAGES} == {
         "sense": 1.0, "leg filters": 2.0, "platform filter": 4.0, "direct kinematics": 8.0, "refinement": 16.0,
-        "whole mechanism": 32.0, "control": 64.0, "record": 128.0, "plant": 256.0,
+        "whole mechanism": 32.0, "integrity": 64.0, "control": 128.0, "record": 256.0, "plant": 512.0,
     }  # fmt: skip
-    assert figures["compute"]["max"] == 2.0 + 4.0 + 8.0 + 16.0 + 32.0 + 64.0
+    assert figures["compute"]["max"] == 2.0 + 4.0 + 8.0 + 16.0 + 32.0 + 64.0 + 128.0
     # From the wake-up to the command: neither the record nor a simulated plant delays that.
-    assert figures["latency"]["max"] == 1.0 + 2.0 + 4.0 + 8.0 + 16.0 + 32.0 + 64.0
+    assert figures["latency"]["max"] == 1.0 + 2.0 + 4.0 + 8.0 + 16.0 + 32.0 + 64.0 + 128.0
     assert (figures["wake"]["max"], figures["round trip"]["max"]) == (3000.0, 5000.0)
     assert {each["n"] for each in figures.values()} == {1}
 

@@ -1,0 +1,371 @@
+"""The fault filter: what all readings say together about the error of the pose and the faults of the sensors.
+
+The loop has a pose, whichever fusion found it. The truth is off by a small error m of the motion (18, as in
+`whole_mechanism.readings`), and every axis of every sensor reads wrong by f (42). Both are estimated around the loop's pose, in
+information form: Y x = y for x = (m, f), which begins with nothing known. Of a window of T seconds,
+
+    carry    Y <- Phi^-T Y Phi^-1, y <- Phi^-T y + Y d      Phi: constant acceleration; d: how the loop's pose left that path
+    forget   Y <- Y - Z^T Z, y <- y - Z^T u                 white jerk; then Y and y fade with a time constant of 1 s
+    update   Y <- Y + H^T R^-1 H, y <- y + H^T R^-1 z       z: mean reading less what the loop's pose predicts; H = (J, 1)
+
+so that Y and y hold what the last second says about f, and how much the pose depends on that. The filter feeds nothing: no
+fault of its own can bend the pose. The work of a window is spread over the cycles of the next one.
+"""
+
+import numpy as np
+
+from controller.estimation.whole_mechanism.readings import (
+    ACCELERATION,
+    ANGULAR_ACCELERATION,
+    MOTION_STATES,
+    RATE,
+    READINGS,
+    READINGS_SCRATCH,
+    VELOCITY,
+    predict_readings,
+)
+from controller.inverse_kinematics import motion_of_legs
+from controller.least_squares import factor_cholesky
+from controller.settings import FusionSettings
+from plant.compiled import Record, filled, kernel, record_dtype
+from plant.dynamics.variables import IMU_COUNT
+from plant.mechanism import LEGS
+from plant.pose import Array, rotate_by_vector
+
+FAULTS = IMU_COUNT * READINGS
+"""One for every axis of every sensor: angular velocity and specific force of IMU after IMU."""
+
+UNKNOWNS = MOTION_STATES + FAULTS
+
+_WINDOW_S = 0.01
+MEMORY_S = 0.5
+_RIPPLE_HZ = 150.0
+"""At this rate, the steps of the commands would make a sample of the acceleration as wrong as it is large."""
+
+_LEAST_SAMPLES = 2.5
+"""Into how many parts the samples that an IMU gives may divide a window: IMUs may be half as fast as the loop."""
+
+_TIMING_S = 3e-4
+"""How far the times of samples may be off: IMUs have clocks of their own [s]."""
+
+_JERKS, _NEXT = 6, 3
+_FAULT_STIFFNESS = 1e-4
+"""Variance of a window's mean over that by which the fault of an IMU that has been left out changes between two windows."""
+_JOBS = _NEXT + IMU_COUNT
+"""Jobs of a window: the readings, carrying, forgetting, and each IMU."""
+
+PATH = record_dtype(
+    position=(np.float64, 3),  # [m]
+    rotation=(np.float64, (3, 3)),
+    motion=(np.float64, (4, 3)),  # rows as in `readings`
+)
+"""Where the loop believed the platform to be in the middle of a window."""
+
+PARAMETERS = record_dtype(
+    active=np.int64,  # whether the filter runs
+    window=np.int64,  # cycles
+    duration=np.float64,  # of a window [s]
+    keep=np.float64,  # what is left of the information after a window
+    ripple=np.float64,  # error of a mean specific force for an acceleration of a leg: commands are steps
+    variance=(np.float64, 2),  # of a sample's noise, angular velocity and specific force
+    stiffness=(np.float64, 2),  # inverse variance of the jerk in a window, linear and angular
+)
+"""Constants of the filter."""
+
+STATE = record_dtype(
+    windows=np.int64,  # so many have been taken since the filter began
+    job=np.int64,  # the next job of the last full window
+    step=np.int64,  # cycles since that window was full
+    collected=np.int64,  # cycles in the present window
+    sum=(np.float64, (IMU_COUNT, READINGS)),  # of their samples
+    samples=(np.int64, IMU_COUNT),
+    acceleration=(np.float64, LEGS),  # of the legs at the end of the last window
+    next_path=PATH,  # in the middle of the present window
+    path=PATH,  # in the middle of the last full window
+    mean=(np.float64, (IMU_COUNT, READINGS)),  # of that window's samples
+    counted=(np.int64, IMU_COUNT),  # whether the IMU gave enough of them
+    turning=np.float64,  # greatest angular acceleration of platform and legs that was planned for it [rad/s^2]
+    weight=(np.float64, (IMU_COUNT, 2)),  # of the means, angular velocity and specific force
+    information=(np.float64, (UNKNOWNS, UNKNOWNS)),
+    vector=(np.float64, UNKNOWNS),
+    turn=(np.float64, 3),  # from here on scratch
+    shift=(np.float64, MOTION_STATES),
+    predicted=(np.float64, (IMU_COUNT, READINGS)),
+    jacobian=(np.float64, (IMU_COUNT, READINGS, MOTION_STATES)),
+    root=(np.float64, (_JERKS, UNKNOWNS)),
+    root_vector=(np.float64, _JERKS),
+    factor=(np.float64, (_JERKS, _JERKS)),
+    derivatives=(np.float64, (2, 6)),
+    readings_scratch=READINGS_SCRATCH,
+)
+"""State of the filter."""
+
+
+def fault_filter_parameters(fusion: FusionSettings, rate: float, active: bool) -> Record:
+    """The constants of the filter (dtype `PARAMETERS`) in cycles of this rate [Hz]."""
+    window = max(2, round(_WINDOW_S * rate))
+    duration = window / rate
+    noise = np.array([fusion.mechanism_gyroscope_noise, fusion.mechanism_accelerometer_noise])
+    jerk = np.array([fusion.platform_jerk, fusion.platform_angular_jerk])
+    return filled(
+        PARAMETERS,
+        active=active,
+        window=window,
+        duration=duration,
+        keep=np.exp(-duration / MEMORY_S),
+        ripple=min(1.0, (_RIPPLE_HZ / rate) ** 2),
+        variance=noise**2 * rate / 2.0,
+        stiffness=duration / jerk**2,
+    )
+
+
+@kernel
+def step_fault_filter(p: Record, s: Record, sensors: Record, imus: Record, missed: int, pose: Record, legs: Array) -> bool:
+    """Take the calibrated samples of a cycle from the IMUs that are healthy, and do the cycle's share of work.
+
+    Args:
+        p, s: dtypes `PARAMETERS` and `STATE`.
+        sensors: dtype `SENSOR_GEOMETRY`.
+        imus: samples and health; dtype `imu_health.STATE`.
+        missed: periods that were missed before this cycle; the filter then begins anew.
+        pose: of the loop; dtype `pose_estimator.STATE`.
+        legs: (6, 3), length, rate and acceleration that each leg should have. The path takes its motion from them: noise in
+            the estimated one would turn the directions of which nothing is known, and pretend to know something of them.
+
+    Returns:
+        Whether a window has been taken with this cycle.
+    """
+    if missed > 0:
+        begin_anew(s)
+    _collect(p, s, imus, pose, legs)
+    took = False
+    if s.job < _JOBS and s.windows > 0:
+        s.step += 1
+        due = min(_JOBS, -(-_JOBS * s.step // (p.window - 1)))
+        while s.job < due:
+            _do(p, s, sensors, imus.excluded, s.job)
+            s.job += 1
+        took = s.job == _JOBS
+    if s.collected == p.window:
+        _close_window(p, s, imus.variance, imus.shaking, legs)
+    return took
+
+
+@kernel
+def begin_anew(s: Record) -> None:
+    """Forget all that was read."""
+    s.windows = s.collected = 0
+    s.job = _JOBS
+    s.information[:] = 0.0
+    s.vector[:] = 0.0
+
+
+@kernel
+def _collect(p: Record, s: Record, imus: Record, pose: Record, legs: Array) -> None:
+    if s.collected == 0:
+        s.sum[:] = 0.0
+        s.samples[:] = 0
+    s.collected += 1
+    for k in range(IMU_COUNT):
+        clipped = imus.shaking.clipped[0, k] != 0 or imus.shaking.clipped[1, k] != 0
+        if imus.healthy[k] == 0 or imus.sample_age[k] != 0 or clipped:
+            continue
+        s.samples[k] += 1
+        for i in range(3):
+            s.sum[k, i] += imus.sample[0, k, i]
+            s.sum[k, 3 + i] += imus.sample[1, k, i]
+    if s.collected == (p.window + 1) // 2:
+        at = s.next_path
+        at.position[:] = pose.position
+        at.rotation[:] = pose.rotation
+        motion_of_legs(pose.arms, pose.directions, pose.lengths, legs, s.factor, s.derivatives)
+        for i in range(3):
+            at.motion[VELOCITY, i] = s.derivatives[0, i]
+            at.motion[RATE, i] = s.derivatives[0, 3 + i]
+            at.motion[ACCELERATION, i] = s.derivatives[1, i]
+            at.motion[ANGULAR_ACCELERATION, i] = s.derivatives[1, 3 + i]
+
+
+@kernel
+def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: Array) -> None:
+    """Keep the full window for its jobs, and find how the loop's pose has left the path of constant acceleration."""
+    fastest, change, turning = 0.0, 0.0, 0.0
+    for i in range(3):
+        turning += s.next_path.motion[ANGULAR_ACCELERATION, i] ** 2
+    turning = np.sqrt(turning)
+    for k in range(LEGS):
+        fastest = max(fastest, abs(legs[k, 2]))
+        turning = max(turning, abs(legs[k, 2]) / legs[k, 0])
+        change = max(change, abs(legs[k, 2] - s.acceleration[k]))
+        s.acceleration[k] = legs[k, 2]
+    s.turning = turning
+    rough = p.window * ((p.ripple * fastest) ** 2 + (_TIMING_S / p.duration * change) ** 2)
+    for k in range(IMU_COUNT):
+        # Samples from one side of the window would not be its mean.
+        s.counted[k] = _LEAST_SAMPLES * s.samples[k] >= s.collected
+        if s.counted[k] == 0:
+            continue
+        shaken = shaking.excess[k] + shaking.hidden[k] + shaking.mean[k]
+        # What shakes an IMU beyond its noise makes its mean as uncertain.
+        s.weight[k, 0] = s.samples[k] / (max(p.variance[0], variance[0, k]) + p.window * (_TIMING_S * turning) ** 2)
+        s.weight[k, 1] = s.samples[k] / (max(p.variance[1], variance[1, k]) + rough + p.window * shaken)
+        for i in range(READINGS):
+            s.mean[k, i] = s.sum[k, i] / s.samples[k]
+    if s.windows > 0:
+        _find_shift(p.duration, s.path, s.next_path, s.turn, s.shift)
+    s.path.position[:] = s.next_path.position
+    s.path.rotation[:] = s.next_path.rotation
+    s.path.motion[:] = s.next_path.motion
+    s.windows += 1
+    s.collected = s.job = s.step = 0
+
+
+@kernel
+def _find_shift(t: float, old: Record, new: Record, turn: Array, shift: Array) -> None:
+    """Write by how much the old path, carried on for a time `t`, is ahead of the new one (18,), and its turn (3,) meanwhile."""
+    x, y, half = old.motion, new.motion, 0.5 * t * t
+    for i in range(3):
+        turn[i] = t * x[RATE, i] + half * x[ANGULAR_ACCELERATION, i]
+        shift[i] = old.position[i] + t * x[VELOCITY, i] + half * x[ACCELERATION, i] - new.position[i]
+        shift[6 + i] = x[VELOCITY, i] + t * x[ACCELERATION, i] - y[VELOCITY, i]
+        shift[9 + i] = x[RATE, i] + t * x[ANGULAR_ACCELERATION, i] - y[RATE, i]
+        shift[12 + i] = x[ACCELERATION, i] - y[ACCELERATION, i]
+        shift[15 + i] = x[ANGULAR_ACCELERATION, i] - y[ANGULAR_ACCELERATION, i]
+    rotate_by_vector(old.rotation, turn)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        angle = 0.0
+        for m in range(3):
+            angle += 0.5 * (old.rotation[k, m] * new.rotation[j, m] - old.rotation[j, m] * new.rotation[k, m])
+        shift[3 + i] = angle
+
+
+@kernel
+def _do(p: Record, s: Record, sensors: Record, excluded: Array, job: int) -> None:
+    if job == 0:
+        at = s.path
+        predict_readings(sensors, at.position, at.rotation, at.motion, True, s.predicted, s.jacobian, s.readings_scratch)
+    elif job == 1:
+        _carry(p.duration, s.turn, s.shift, s.information, s.vector)
+    elif job == 2:
+        _forget(p, s, s.information, s.vector)
+    else:
+        k = job - _NEXT
+        _update(p, s, k, excluded[k] != 0)
+
+
+@kernel
+def _carry(t: float, turn: Array, shift: Array, information: Array, vector: Array) -> None:
+    """Y <- Phi^-T Y Phi^-1 and y <- Phi^-T y + Y d; the small turn's inverse is I - skew(turn)."""
+    a, half = information, 0.5 * t * t
+    t0, t1, t2 = turn[0], turn[1], turn[2]
+    for j in range(UNKNOWNS):
+        x0, x1, x2 = a[3, j], a[4, j], a[5, j]
+        a[3, j] += t1 * x2 - t2 * x1
+        a[4, j] += t2 * x0 - t0 * x2
+        a[5, j] += t0 * x1 - t1 * x0
+    for i in range(6):
+        place, speed, change = a[i], a[6 + i], a[12 + i]
+        for j in range(UNKNOWNS):
+            change[j] += half * place[j] - t * speed[j]
+            speed[j] -= t * place[j]
+    for j in range(UNKNOWNS):
+        row = a[j]
+        x0, x1, x2 = row[3], row[4], row[5]
+        row[3] += t1 * x2 - t2 * x1
+        row[4] += t2 * x0 - t0 * x2
+        row[5] += t0 * x1 - t1 * x0
+        for i in range(6):
+            row[12 + i] += half * row[i] - t * row[6 + i]
+            row[6 + i] -= t * row[i]
+        # Rounding must not make the matrix unsymmetric.
+        for i in range(j):
+            a[i, j] = row[i]
+    x0, x1, x2 = vector[3], vector[4], vector[5]
+    vector[3] += t1 * x2 - t2 * x1
+    vector[4] += t2 * x0 - t0 * x2
+    vector[5] += t0 * x1 - t1 * x0
+    for i in range(6):
+        vector[12 + i] += half * vector[i] - t * vector[6 + i]
+        vector[6 + i] -= t * vector[i]
+    for i in range(MOTION_STATES):
+        ahead, row = shift[i], a[i]
+        for j in range(UNKNOWNS):
+            vector[j] += ahead * row[j]
+
+
+@kernel
+def _forget(p: Record, s: Record, information: Array, vector: Array) -> None:
+    """Let jerk, constant for the window and different in each, take away information, and let all of it fade."""
+    t, a, z, u = p.duration, information, s.root, s.root_vector
+    by_place, by_speed = t * t * t / 6.0, 0.5 * t * t
+    for n in range(_JERKS):
+        row, place, speed, change = z[n], a[n], a[6 + n], a[12 + n]
+        for j in range(UNKNOWNS):
+            row[j] = by_place * place[j] + by_speed * speed[j] + t * change[j]
+        u[n] = by_place * vector[n] + by_speed * vector[6 + n] + t * vector[12 + n]
+    for n in range(_JERKS):
+        for m in range(_JERKS):
+            s.factor[n, m] = by_place * z[n, m] + by_speed * z[n, 6 + m] + t * z[n, 12 + m]
+        s.factor[n, n] += p.stiffness[n // 3]
+    _take_away(s, information, vector, p.keep)
+
+
+@kernel
+def _forget_fault(p: Record, s: Record, k: int, information: Array, vector: Array) -> None:
+    """Let what IMU `k` reads wrong change freely between windows."""
+    first = MOTION_STATES + READINGS * k
+    for n in range(READINGS):
+        s.root[n] = information[first + n]
+        s.root_vector[n] = vector[first + n]
+        for m in range(READINGS):
+            s.factor[n, m] = s.root[n, first + m]
+        s.factor[n, n] += _FAULT_STIFFNESS * s.weight[k, n // 3]
+    _take_away(s, information, vector, 1.0)
+
+
+@kernel
+def _take_away(s: Record, information: Array, vector: Array, keep: float) -> None:
+    """Y <- keep (Y - K^T M^-1 K) and y <- keep (y - K^T M^-1 u), for K, u and M in `root`, `root_vector` and `factor`."""
+    a, z, u = information, s.root, s.root_vector
+    factor_cholesky(s.factor)
+    for n in range(_JERKS):
+        row = z[n]
+        for m in range(n):
+            share, other = s.factor[n, m], z[m]
+            u[n] -= share * u[m]
+            for j in range(UNKNOWNS):
+                row[j] -= share * other[j]
+        inverse = 1.0 / s.factor[n, n]
+        u[n] *= inverse
+        for j in range(UNKNOWNS):
+            row[j] *= inverse
+    z0, z1, z2, z3, z4, z5 = z[0], z[1], z[2], z[3], z[4], z[5]
+    for i in range(UNKNOWNS):
+        row = a[i]
+        x0, x1, x2, x3, x4, x5 = z0[i], z1[i], z2[i], z3[i], z4[i], z5[i]
+        for j in range(UNKNOWNS):
+            row[j] = keep * (row[j] - (x0 * z0[j] + x1 * z1[j] + x2 * z2[j] + x3 * z3[j] + x4 * z4[j] + x5 * z5[j]))
+        vector[i] = keep * (vector[i] - (x0 * u[0] + x1 * u[1] + x2 * u[2] + x3 * u[3] + x4 * u[4] + x5 * u[5]))
+
+
+@kernel
+def _update(p: Record, s: Record, k: int, excluded: bool) -> None:
+    """Take what IMU `k` has read on average; what one that has been left out reads wrong may be something else each time."""
+    if excluded:
+        _forget_fault(p, s, k, s.information, s.vector)
+    if s.counted[k] == 0:
+        return
+    a, y = s.information, s.vector
+    for m in range(READINGS):
+        weight, h, fault = s.weight[k, m // 3], s.jacobian[k, m], MOTION_STATES + READINGS * k + m
+        off = weight * (s.mean[k, m] - s.predicted[k, m])
+        for i in range(MOTION_STATES):
+            share, row = weight * h[i], a[i]
+            for j in range(MOTION_STATES):
+                row[j] += share * h[j]
+            row[fault] += share
+            a[fault, i] += share
+            y[i] += off * h[i]
+        a[fault, fault] += weight
+        y[fault] += off

@@ -1,0 +1,102 @@
+"""Parity of the gyroscopes: a large error of an angular velocity is told within two windows of the fault filter.
+
+All gyroscopes see one motion. Mean readings of a window less what the plan predicts, z (21), are J t for an error t (6) of the
+planned twist, so that what least squares leaves, z - J t, is errors of gyroscopes alone. It counts by its length at each IMU. A
+gyroscope is named if the rest agrees without it. Small errors, common ones and those of accelerometers are left to the evidence
+for hypotheses, which takes a tenth of a second: until then they move the pose little.
+"""
+
+from math import radians
+
+import numpy as np
+
+from controller.least_squares import factor_cholesky, solve_cholesky
+from plant.compiled import Record, kernel, record_dtype
+from plant.dynamics.variables import IMU_COUNT
+from plant.pose import Array
+
+_TWIST, _FIRST = 6, 6
+"""Size of the twist, and its place in the states of the motion."""
+
+_LIMIT = radians(2.0)
+"""Error of an angular velocity that is told: several times what calibrated gyroscopes have [rad/s]."""
+
+_LATE_S = 1e-3
+"""By how much of the angular acceleration the limit is larger, as sample times and angular velocities are uncertain [s]."""
+
+_WINDOWS = 2
+"""In how many windows in a row the limit must be broken."""
+
+_AGREE, _AGREE_OF_ALL = 0.7, 0.15
+"""How large the error without the named gyroscope may be: of the limit, and of the error with it."""
+
+STATE = record_dtype(
+    error=np.float64,  # the greatest of an IMU in the last window [rad/s]
+    limit=np.float64,  # for it
+    off_for=np.int64,  # for how many windows it has been beyond the limit
+    worst=np.int64,  # the IMU without which the rest agrees best
+    named=np.int64,  # whether it agrees
+    normal=(np.float64, (_TWIST, _TWIST)),  # from here on scratch
+    twist=(np.float64, _TWIST),
+)
+"""What the last window has shown."""
+
+
+@kernel
+def step_parity(s: Record, f: Record, excluded: Array) -> bool:
+    """Look at the last full window, once its readings are predicted; returns whether gyroscopes contradict each other.
+
+    Args:
+        s: dtype `STATE`.
+        f: dtype `fault_filter.STATE`.
+        excluded: (7,), which IMUs have been left out.
+    """
+    s.limit = _LIMIT + _LATE_S * f.turning
+    s.error = _error_without(s, f, excluded, -1)
+    s.off_for = s.off_for + 1 if s.error > s.limit else 0
+    if s.off_for < _WINDOWS:
+        return False
+    s.off_for = 0
+    s.worst, least = 0, np.inf
+    for k in range(IMU_COUNT):
+        if f.counted[k] != 0 and excluded[k] == 0:
+            error = _error_without(s, f, excluded, k)
+            if error < least:
+                s.worst, least = k, error
+    s.named = least < max(_AGREE * s.limit, _AGREE_OF_ALL * s.error)
+    return True
+
+
+@kernel
+def _error_without(s: Record, f: Record, excluded: Array, left_out: int) -> float:
+    """The greatest error of a gyroscope when the twist fits all but one; 0 where fewer determine it than could contradict."""
+    used = 0
+    s.normal[:] = 0.0
+    s.twist[:] = 0.0
+    for k in range(IMU_COUNT):
+        if f.counted[k] == 0 or excluded[k] != 0 or k == left_out:
+            continue
+        used += 1
+        for m in range(3):
+            row = f.jacobian[k, m]
+            off = f.mean[k, m] - f.predicted[k, m]
+            for i in range(_TWIST):
+                share = row[_FIRST + i]
+                s.twist[i] += share * off
+                for j in range(i + 1):
+                    s.normal[i, j] += share * row[_FIRST + j]
+    if 3 * used <= _TWIST or not factor_cholesky(s.normal):
+        return 0.0
+    solve_cholesky(s.normal, s.twist)
+    greatest = 0.0
+    for k in range(IMU_COUNT):
+        if f.counted[k] == 0 or excluded[k] != 0 or k == left_out:
+            continue
+        squared = 0.0
+        for m in range(3):
+            off = f.mean[k, m] - f.predicted[k, m]
+            for i in range(_TWIST):
+                off -= f.jacobian[k, m, _FIRST + i] * s.twist[i]
+            squared += off * off
+        greatest = max(greatest, squared)
+    return float(np.sqrt(greatest))

@@ -1,0 +1,153 @@
+"""The stage of the cycle: the fault filter, after each window the gyroscopes' parity, and ten times a second the evidence for
+every hypothesis.
+"""
+
+import numpy as np
+
+from controller.estimation.integrity import evidence, fault_filter, hypotheses, parity, protection
+from controller.estimation.integrity.hypotheses import (
+    HYPOTHESES,
+    OF_ONE_IMU,
+    directions_of,
+    evidence_for,
+    find_frames,
+    imu_of,
+    kind_of,
+)
+from controller.settings import FusionSettings
+from plant.compiled import Record, filled, kernel, record_dtype
+from plant.dynamics.variables import IMU_COUNT
+from plant.pose import Array
+
+PARAMETERS = record_dtype(
+    filter=fault_filter.PARAMETERS,
+    evidence=evidence.PARAMETERS,
+    cycles=np.int64,  # over which an evaluation is spread
+)
+"""Constants."""
+
+STATE = record_dtype(
+    filter=fault_filter.STATE,
+    evidence=evidence.STATE,
+    hypotheses=hypotheses.SCRATCH,
+    protection=protection.STATE,
+    parity=parity.STATE,
+    compared=np.int64,  # the last window of which the gyroscopes have been compared
+    contradicts=np.int64,  # whether they have been found to contradict each other in this cycle
+    step=np.int64,  # next of the evaluation
+    cycle=np.int64,  # of the evaluation
+    found=(np.float64, HYPOTHESES),  # evidence for each, of the evaluation under way
+    evaluations=np.int64,  # how many are complete
+    fresh=np.int64,  # whether the last one has become complete in this cycle
+    best=np.int64,  # the hypothesis with the most evidence
+    best_evidence=np.float64,
+    blamed=np.int64,  # the IMU that it blames; -1 if it is shared by all
+    shared=np.int64,  # if it is: 0 all gyroscopes, 1 all accelerometers, 2 a base that turns, 3 one that accelerates
+    rival_blamed=np.int64,
+    rival_shared=np.int64,
+    rival=np.int64,  # the one with the most evidence among those that do not blame the same IMU
+    rival_evidence=np.float64,
+    imu_evidence=np.float64,  # for the whole IMU that the best one blames
+    all_evidence=np.float64,  # for faults of any kind
+)
+"""State of the filter and of the evaluation, and what the last evaluation has found."""
+
+_FRAMES = evidence.STEPS
+_FIRST_HYPOTHESIS = _FRAMES + 1
+_FIRST_TOTAL = _FIRST_HYPOTHESIS + HYPOTHESES
+STEPS = _FIRST_TOTAL + IMU_COUNT
+"""Steps of an evaluation."""
+
+_FIRST_WINDOWS = 7
+"""When the first evaluation begins, so that it is complete when the brakes have held for 0.2 s."""
+
+
+def integrity_parameters(fusion: FusionSettings, rate: float, prior: Array, active: bool) -> Record:
+    """The constants (dtype `PARAMETERS`) in cycles of this rate [Hz]; `prior` is the covariance (147, 147) of the IMUs' errors
+    that the whole-mechanism filter begins with.
+    """
+    filtered = fault_filter.fault_filter_parameters(fusion, rate, active)
+    return filled(
+        PARAMETERS,
+        filter=filtered,
+        evidence=evidence.evidence_parameters(prior, float(filtered["duration"])),
+        cycles=evidence.EVALUATION_WINDOWS * int(filtered["window"]),
+    )
+
+
+@kernel
+def step_integrity(p: Record, s: Record, rig: Record, time: Record, imus: Record, pose: Record, legs: Array) -> None:
+    """Take a cycle's samples, and do its share of the evaluation; a new one begins when the one before is complete."""
+    s.fresh = s.contradicts = 0
+    if p.filter.active == 0:
+        return
+    if time.missed > 0:
+        s.step = s.cycle = 0
+    took = fault_filter.step_fault_filter(p.filter, s.filter, rig.sensors, imus, time.missed, pose, legs)
+    if s.filter.job > 0 and s.compared != s.filter.windows:
+        s.compared = s.filter.windows
+        s.contradicts = s.filter.windows > 0 and parity.step_parity(s.parity, s.filter, imus.excluded)
+    if s.step == 0 and not (took and s.filter.windows >= _FIRST_WINDOWS):
+        return
+    s.cycle += 1
+    # One window less, in which the next beginning is waited for.
+    due = min(STEPS, -(-STEPS * s.cycle // (p.cycles - p.filter.window)))
+    while s.step < due:
+        _do(p, s, rig, imus, s.step)
+        s.step += 1
+    if s.step == STEPS:
+        s.step = s.cycle = 0
+        s.fresh = 1
+        s.evaluations += 1
+
+
+@kernel
+def restart_integrity(s: Record) -> None:
+    """Forget the last second, as the set of IMUs that are relied upon has changed; what was learned before it stays."""
+    s.step = s.cycle = 0
+    fault_filter.begin_anew(s.filter)
+
+
+@kernel
+def _do(p: Record, s: Record, rig: Record, imus: Record, step: int) -> None:
+    e, t = s.evidence, s.hypotheses
+    if step < _FRAMES:
+        evidence.step_evidence(p.evidence, e, s.filter, imus.excluded, step)
+    elif step == _FRAMES:
+        find_frames(rig.sensors, s.filter.path, t.frames)
+        if e.of_learned == 0:
+            protection.begin_level(s.protection, e)
+    elif step < _FIRST_TOTAL:
+        h = step - _FIRST_HYPOTHESIS
+        count = directions_of(h, t.frames, s.filter.predicted, e.place, t.directions)
+        s.found[h] = evidence_for(count, e.weight, e.vector, t)
+        if e.of_learned == 0:
+            protection.take_hypothesis(s.protection, e, h, count, s.found[h], t)
+    else:
+        at = step - _FIRST_TOTAL
+        if at == 0:
+            s.all_evidence = 0.0
+        if at >= e.apart:
+            s.all_evidence += evidence.evidence_against(e, at)
+        if at == IMU_COUNT - 1:
+            _compare(s)
+
+
+@kernel
+def _compare(s: Record) -> None:
+    """Find the hypothesis with the most evidence, and its strongest rival."""
+    s.best = s.rival = 0
+    for h in range(1, HYPOTHESES):
+        if s.found[h] > s.found[s.best]:
+            s.best = h
+    blamed = s.blamed = imu_of(s.best)
+    s.shared = kind_of(s.best) - OF_ONE_IMU
+    s.best_evidence, s.rival_evidence = s.found[s.best], -1.0
+    s.imu_evidence = s.best_evidence
+    for h in range(HYPOTHESES):
+        if blamed >= 0 and imu_of(h) == blamed:
+            s.imu_evidence = max(s.imu_evidence, s.found[h])
+        elif h != s.best and s.found[h] > s.rival_evidence:
+            s.rival, s.rival_evidence = h, s.found[h]
+    s.rival_blamed = imu_of(s.rival)
+    s.rival_shared = kind_of(s.rival) - OF_ONE_IMU

@@ -1,0 +1,99 @@
+"""The fault filter beside a batch of least squares, and what it does not depend on."""
+
+import numpy as np
+import pytest
+
+from controller.estimation.integrity.fault_filter import FAULTS, MEMORY_S, UNKNOWNS
+from controller.estimation.whole_mechanism.readings import MOTION_STATES
+from tests.controller.estimation.integrity.made_up import RATE_HZ, constants, filtered, readings
+
+FIRST_ROWS = slice(0, MOTION_STATES)
+
+
+def faults_of(state, known):
+    """What the filter believes of the faults, with a weak belief that they are zero, and its covariance."""
+    f = state["integrity"]["filter"]
+    information = f["information"] + np.diag(np.r_[np.full(MOTION_STATES, 1e-9), 1.0 / known**2])
+    covariance = np.linalg.inv(information)
+    return covariance @ f["vector"], covariance
+
+
+KNOWN = np.tile(np.repeat([0.01, 0.1], 3), 7)
+
+
+@pytest.mark.parametrize("kind", ["static", "0.5", "mixed"])
+def test_without_a_fault_what_is_found_is_as_small_as_it_claims(kind):
+    squares = []
+    for seed in range(6):
+        mechanism, r = readings(kind, 2.0, seed)
+        parameters, state = constants(mechanism)
+        assert filtered(mechanism, r, parameters, state) == 2.0 * RATE_HZ / 5 - 1
+        found, covariance = faults_of(state, KNOWN)
+        seen = covariance[MOTION_STATES:, MOTION_STATES:]
+        share = np.diag(seen) < 0.1 * KNOWN**2
+        squares.append((found[MOTION_STATES:] ** 2 / np.diag(seen))[share].mean())
+    # With a memory that fades, noise counts half of what the information says, and in motion its times are not off here.
+    assert 0.03 < np.mean(squares) < 1.2
+
+
+@pytest.mark.parametrize("fault", [3, 8, 22, 40])
+def test_a_fault_is_found_with_its_size(fault):
+    mechanism, r = readings("0.5", 3.0, 1)
+    size = 0.3 if fault % 6 >= 3 else 0.02
+    r.samples[:, fault % 6 // 3, fault // 6, fault % 3] += size
+    parameters, state = constants(mechanism)
+    filtered(mechanism, r, parameters, state)
+    found, covariance = faults_of(state, KNOWN)
+    at = MOTION_STATES + fault
+    assert found[at] == pytest.approx(size, abs=0.01 * size + 4.0 * np.sqrt(covariance[at, at]))
+
+
+def test_it_does_not_matter_around_which_pose_it_works():
+    """A pose that is off by 0.3 mm and 0.3 mrad gives another error of the pose, and the same faults."""
+    mechanism, r = readings("0.5", 2.0, 2)
+    off = np.array([3e-4, -2e-4, 1e-4, 2e-4, -1e-4, 3e-4])
+    found = []
+    for shift in (0.0 * off, off):
+        parameters, state = constants(mechanism)
+        filtered(mechanism, r, parameters, state, tuple(shift))
+        found.append(faults_of(state, KNOWN))
+    (here, covariance), (there, _) = found
+    sigmas = np.sqrt(np.diag(covariance))
+    assert (np.abs(there - here)[MOTION_STATES:] < 0.1 * sigmas[MOTION_STATES:]).all()
+    np.testing.assert_allclose((here - there)[:6], off, atol=3e-5)
+
+
+def test_its_information_is_symmetric_and_no_unknown_has_a_negative_one():
+    mechanism, r = readings("mixed", 4.0, 3)
+    parameters, state = constants(mechanism)
+    filtered(mechanism, r, parameters, state)
+    information = state["integrity"]["filter"]["information"]
+    assert information.shape == (UNKNOWNS, UNKNOWNS) and FAULTS == 42
+    np.testing.assert_allclose(information, information.T, rtol=0.0, atol=1e-12 * np.abs(information).max())
+    assert np.linalg.eigvalsh(information)[0] > -1e-9 * np.abs(information).max()
+
+
+def test_it_forgets():
+    """What was read two memories ago counts e^-2 of what is read now."""
+    mechanism, r = readings("static", 8.0, 4)
+    parameters, state = constants(mechanism)
+    filtered(mechanism, r, parameters, state)
+    weights = np.diag(state["integrity"]["filter"]["information"])[MOTION_STATES:]
+    window = 5 / RATE_HZ
+    expected = 5.0 / parameters["integrity"]["filter"]["variance"] / (1.0 - np.exp(-window / MEMORY_S))
+    weights = weights.reshape(7, 2, 3)
+    np.testing.assert_allclose(weights[:, 1], expected[1], rtol=0.1)
+    # Of angular velocity, the unknown jerk takes a part away.
+    assert (weights[:, 0] < 1.001 * expected[0]).all()
+
+
+def test_an_imu_that_is_not_healthy_tells_nothing():
+    mechanism, r = readings("0.5", 1.0, 5)
+    r.samples[:, :, 3] = np.nan
+    parameters, state = constants(mechanism)
+    state["imus"]["healthy"][3] = 0
+    filtered(mechanism, r, parameters, state)
+    information = state["integrity"]["filter"]["information"]
+    assert np.isfinite(information).all()
+    assert not information[MOTION_STATES + 18 : MOTION_STATES + 24].any()
+    assert information[MOTION_STATES + 12, MOTION_STATES + 12] > 0.0
