@@ -54,7 +54,7 @@ STATE = record_dtype(
     raw=(np.float64, (3, IMU_COUNT, 3)),  # last reading [rad/s, m/s^2, uT]
     sample=(np.float64, (3, IMU_COUNT, 3)),  # last reading, calibrated
     sample_age=(np.int64, IMU_COUNT),  # how many cycles old the sample is, as the rig reports it
-    passed_over=(np.int64, IMU_COUNT),  # how many answers of the rig in a row had no new sample of the IMU
+    stale_for=(np.int64, IMU_COUNT),  # how many answers of the rig in a row had no new sample of the IMU
     unchanged=(np.int64, IMU_COUNT),  # whether the IMU repeats its reading
     frozen_for=(np.int64, IMU_COUNT),  # for how many cycles it has done so although it must have changed
     moved_since=np.float64,  # how far the reference has moved a leg since the last change of any reading [m]
@@ -98,9 +98,10 @@ def screen_imus(
 ) -> None:
     """Calibrate a raw measurement (3, 7, 3), and find out which IMUs are healthy.
 
-    An IMU is left out while its readings are not finite, at the end of their range for longer than others can bridge, noisy,
-    or stale while others are not, or frozen while others are not or the legs must have moved. It is used again when it has been
-    healthy for a while. An IMU that contradicted the others stays out.
+    An IMU is left out while its readings are not finite or noisy, at the end of their range for longer than others can bridge,
+    or while the rig answers without a new sample of it. It is also left out while its readings are frozen although others
+    change or the legs must have moved. It is used again when it has been healthy for a while. An IMU that contradicted the
+    others stays out.
 
     Args:
         silent: for how many cycles the rig has not answered.
@@ -136,12 +137,12 @@ def screen_imus(
         cause = Cause.NONE.value
         value, limit = np.nan, np.nan
         if s.sample_age[k] == 0:
-            s.passed_over[k] = 0
+            s.stale_for[k] = 0
         elif silent == 0:
-            # Periods in which nobody answered or the loop was held up age all samples, and are no fault of an IMU.
-            s.passed_over[k] += 1
-        if s.passed_over[k] >= p.stale_cycles:
-            cause, value, limit = Cause.IMU_STALE.value, float(s.passed_over[k]), float(p.stale_cycles)
+            # Answers are counted, not periods: in a pause of the bus or of the loop, the samples of all IMUs grow old.
+            s.stale_for[k] += 1
+        if s.stale_for[k] >= p.stale_cycles:
+            cause, value, limit = Cause.IMU_STALE.value, float(s.stale_for[k]), float(p.stale_cycles)
         elif s.frozen_for[k] >= p.frozen_cycles:
             cause, value, limit = Cause.IMU_FROZEN.value, float(s.frozen_for[k]), float(p.frozen_cycles)
         noise = s.noise[k]

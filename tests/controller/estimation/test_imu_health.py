@@ -54,7 +54,7 @@ class Screening:
         events["count"] = 0
         return told
 
-    def pass_over(self, imu, answers):
+    def leave_stale(self, imu, answers):
         """Answers of the rig without a new sample of this IMU; what they have told."""
         return [told for age in range(1, answers + 1) for told in self.step(age=[(imu, age)])]
 
@@ -112,7 +112,7 @@ def test_every_sample_is_calibrated_by_its_own_constants(hexapod):
 
 @pytest.mark.parametrize("imu", ALL_IMUS)
 def test_a_stale_sample_is_left_out_from_its_limit_on_unless_the_whole_rig_is_silent(settled, imu):
-    assert settled.pass_over(imu, STALE - 1) == []
+    assert settled.leave_stale(imu, STALE - 1) == []
     assert settled.step(age=[(imu, STALE + 7)], silent=1) == []
     assert settled.used == list(ALL_IMUS)
     assert settled.step(age=[(imu, STALE + 8)]) == [(Cause.IMU_STALE, imu, STALE, STALE)]
@@ -254,7 +254,7 @@ def test_a_reading_is_in_range_below_the_limit_and_out_of_it_at_the_limit(hexapo
 @pytest.mark.parametrize("missed", [0, 1, 3, 30])
 def test_an_imu_comes_back_when_it_has_been_healthy_for_so_long_missed_periods_counted(settled, missed):
     imu = 4
-    settled.pass_over(imu, STALE)
+    settled.leave_stale(imu, STALE)
     healthy = 0
     while imu not in settled.used:
         told = settled.step(missed=missed)
@@ -263,10 +263,10 @@ def test_an_imu_comes_back_when_it_has_been_healthy_for_so_long_missed_periods_c
                         if healthy > HEALTHY else [])  # fmt: skip
         assert (imu in settled.used) == (healthy > HEALTHY)
     # A relapse on the way begins the count anew.
-    settled.pass_over(imu, STALE)
+    settled.leave_stale(imu, STALE)
     for _ in range(HEALTHY):
         settled.step()
-    settled.pass_over(imu, STALE)
+    settled.leave_stale(imu, STALE)
     for _ in range(HEALTHY):
         assert settled.step() == []
         assert settled.used == settled.without(imu)

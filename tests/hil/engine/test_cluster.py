@@ -180,7 +180,8 @@ def test_a_worker_stays_as_large_as_it_is() -> None:
         f"{sizes[0] / 1e6:.1f} MB after the first run, {sizes[150] / 1e6:.1f} in the middle, {sizes[-1] / 1e6:.1f} at the end"
     )
     assert sizes[-1] - sizes[100] < grown
-    assert max(files[100:]) <= max(files[:100]) + 2
+    # A run that is under way has some files open. A file that is never closed raises the least number as well.
+    assert min(files[200:]) <= min(files[:100]) + 2
 
 
 PROGRAM = """
