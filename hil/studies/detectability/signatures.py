@@ -17,12 +17,11 @@ from scipy.spatial.transform import Rotation
 from hil.studies.detectability.kinematics import Motion, signals
 from hil.studies.detectability.model import DATA
 from plant.compiled import Record
-from plant.dynamics.base_course import PREFIX as BASE_PREFIX
 from plant.dynamics.base_course import BaseMotionKind, base_motion_of_text
 from plant.errors import InputError
 from plant.imu import ImuModel, imu_state
 from plant.imu.model import SensorErrors
-from plant.imu_disturbances import Course, Disturbance, DisturbanceKind, disturbance_of_text
+from plant.imu_disturbances import BASE_PREFIX, Course, Disturbance, DisturbanceKind, disturbance_of_text
 from plant.mechanism import Mechanism
 from plant.pose import Array
 
