@@ -13,7 +13,7 @@ from plant.mechanism import Mechanism
 _ENDLESS = 1e300
 _RAW_M = 0.05
 _ENDLESS_ALLOWED = ("protection_position", "protection_rotation")
-_ZERO_ALLOWED = ("integral", "derivative", "sensor_delay", "most_lost_imus", "watch_imus")
+_ZERO_ALLOWED = ("integral", "derivative", "sensor_delay", "most_lost_imus", "watch_imus", "need_platform_imu")
 
 S = TypeVar("S", "ControlSettings", "FusionSettings", "SafetySettings")
 
@@ -107,6 +107,7 @@ class SafetySettings(_Settings):
     arming_drift: float = 1e-3  # largest change of a leg's mean length on the brakes, from one 50 ms to the next [m]
     arming_time: float = 1.0  # longest time for the checks before arming, and for the drives [s]
     watch_imus: float = 1.0  # 0 to ignore the disagreement of an IMU
+    need_platform_imu: float = 1.0  # 0 to go on while the platform's IMU is left out, which checks all legs at once
 
     def for_raw_imus(self) -> "SafetySettings":
         """These settings for raw IMUs, whose errors move the pose by centimetres."""

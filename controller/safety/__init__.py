@@ -51,5 +51,5 @@ def watch_nothing(parameters: Record) -> None:
     limits["most_lost_imus"], limits["conditioning"] = IMU_COUNT, 0.0
     limits["evidence"] = limits["level"] = np.inf
     limits["lengths"] = limits["plausible_lengths"] = -np.inf, np.inf
-    for name in ("speed", "following", "saturation", "drive_deviation", "carried"):
+    for name in ("speed", "following", "saturation", "drive_deviation", "carried", "without_platform_imu"):
         limits[name] = np.inf

@@ -8,7 +8,7 @@ from controller.safety.causes import Cause, DriveState, Mode, Request, report_ev
 from controller.safety.stop import handle_cause
 from controller.settings import SafetySettings
 from plant.compiled import Record, filled, kernel, record_dtype
-from plant.dynamics.variables import IMU_COUNT
+from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
 from plant.mechanism import LEGS
 from plant.pose import Array
 
@@ -194,9 +194,12 @@ def _find_obstacle(
         off = contradiction(s.monitor, k)
         if not off <= p.monitor.disagreement:
             return Cause.NO_SENSORS.value, k, off, p.monitor.disagreement
-        lost += imu_parameters.present[k] != 0 and imus.used[k] == 0
+        out = imu_parameters.present[k] != 0 and imus.used[k] == 0
+        lost += out
         if lost > p.watch.most_lost_imus:
             return Cause.NO_SENSORS.value, k, np.nan, np.nan
+        if out and k == PLATFORM_IMU and p.watch.without_platform_imu < np.inf:
+            return Cause.PLATFORM_IMU_LOST.value, k, np.nan, np.nan
     for k in range(rig.legs):
         drift = s.arming.drift[k] if s.arming.windows > 1 else np.inf
         if s.mode == Mode.IDLE and not drift <= p.arming.drift:

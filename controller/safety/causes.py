@@ -146,6 +146,12 @@ class Cause(IntEnum):
     GYROSCOPES_CONTRADICT = 59, f"the gyroscopes contradict each other{_WORST}", Reaction.QUICK_STOP, "rad/s"
     POSITION_UNSURE = 60, "the position may be off by more than the limit", Reaction.STOP, "m"
     ROTATION_UNSURE = 61, "the rotation may be off by more than the limit", Reaction.STOP, "rad"
+    PLATFORM_IMU_LOST = (
+        62,
+        "without IMU {} nothing shows an error that the legs' IMUs share: need_platform_imu = 0 in [safety] goes on without it",
+        Reaction.STOP,
+        "s",
+    )
 
     @property
     def short(self) -> str:

@@ -7,7 +7,7 @@ from controller.safety.causes import Cause, DriveState, Mode, Request, report_ev
 from controller.safety.stop import handle_cause
 from controller.settings import SafetySettings
 from plant.compiled import Record, filled, kernel, record_dtype
-from plant.dynamics.variables import IMU_COUNT
+from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
 from plant.mechanism import LEGS, Limits, six_rows
 from plant.pose import Array
 
@@ -49,6 +49,7 @@ PARAMETERS = record_dtype(
     saturation=np.float64,  # [s]
     drive_deviation=np.float64,  # [m/s]
     patience=np.float64,  # [s]
+    without_platform_imu=np.float64,  # [s]
     bus_cycles=np.int64,
     carried=np.float64,  # [rad^2]
     evidence=np.float64,  # for a fault, twice a logarithm
@@ -61,6 +62,7 @@ STATE = record_dtype(
     silent=np.int64,  # for how many cycles the rig has not answered
     unanswered=np.int64,  # how many more exchanges failed than succeeded, up to twice the limit
     contradicted_for=np.float64,  # how long the IMUs have contradicted each other [s]
+    without_platform_imu=np.float64,  # for how long the platform's IMU, where there is one, has been left out [s]
     off_reference_for=(np.float64, LEGS),  # how long each leg has been off its reference [s]
     deviating_for=(np.float64, LEGS),  # how long each drive has been off its command [s]
     saturated_for=(np.float64, LEGS),  # how long each command has been at its limit [s]
@@ -75,6 +77,7 @@ def watch_parameters(settings: SafetySettings, rate: float, limits: Limits) -> R
     """The limits (dtype `PARAMETERS`) in cycles of this rate [Hz]."""
     stroke = limits.stroke
     margin = _IMPLAUSIBLE_SHARE * (stroke[:, 1] - stroke[:, 0])
+    patience = max(settings.patience, _LEAST_CYCLES / rate)
     return filled(
         PARAMETERS,
         most_lost_imus=settings.most_lost_imus,
@@ -85,7 +88,8 @@ def watch_parameters(settings: SafetySettings, rate: float, limits: Limits) -> R
         following=settings.following,
         saturation=settings.saturation,
         drive_deviation=settings.drive_deviation,
-        patience=max(settings.patience, _LEAST_CYCLES / rate),
+        patience=patience,
+        without_platform_imu=patience if settings.need_platform_imu else np.inf,
         bus_cycles=max(3, round(settings.bus_patience * rate)),
         carried=settings.carried**2,
         evidence=settings.evidence**2,
@@ -287,6 +291,13 @@ def check_limits(
     if lost > limits.most_lost_imus:
         handle_cause(
             p, s, rig, time, reference, pid, Cause.IMUS_LOST, -1, float(lost), float(limits.most_lost_imus)
+        )  # fmt: skip
+    out = imu_parameters.present[PLATFORM_IMU] != 0 and imus.used[PLATFORM_IMU] == 0
+    w.without_platform_imu = w.without_platform_imu + rig.period if out else 0.0
+    if w.without_platform_imu > limits.without_platform_imu:
+        handle_cause(
+            p, s, rig, time, reference, pid, Cause.PLATFORM_IMU_LOST, PLATFORM_IMU, w.without_platform_imu,
+            limits.without_platform_imu,
         )  # fmt: skip
     if pose.conditioning < limits.conditioning and filter_trusted == 0:
         handle_cause(p, s, rig, time, reference, pid, Cause.ILL_CONDITIONED, -1, pose.conditioning, limits.conditioning)

@@ -103,6 +103,8 @@ def _print_simulation(summary: dict[str, Any]) -> None:
             + f" deg{covered}"
         )
     _print_pace(summary)
+    for line in summary["events"]:
+        print(line)
     cycle = summary["cycle_us"]
     print(
         f"limits violated by the reference: {summary['limits']['violations']}; "

@@ -101,9 +101,12 @@ CASES = (
         "two legs' IMUs are swapped from the start", Cause.IMUS_DISAGREE, STOP, 4000, 25e-3,
         "imu-swapped:{k},size={j}", from_start=True, also=(Cause.DRIVE_DEVIATES,),
     ),
-    Case("the platform's IMU is frozen", Cause.IMU_FROZEN, GO_ON, 15, 2e-3, "imu-frozen:6"),
-    Case("the platform's IMU is dead", Cause.IMU_STALE, GO_ON, 15, 2e-3, "imu-dead:6"),
-    Case("the platform's IMU is biased by 2 deg", Cause.IMU_DISAGREES, GO_ON, 2500, 10e-3, "imu-biased:6"),
+    Case("the platform's IMU is frozen", Cause.PLATFORM_IMU_LOST, STOP, 65, 2e-3, "imu-frozen:6"),
+    Case("the platform's IMU is dead", Cause.PLATFORM_IMU_LOST, STOP, 65, 2e-3, "imu-dead:6"),
+    Case(
+        "the platform's IMU is biased by 2 deg", Cause.IMUS_CONTRADICT, QUICK_STOP, 2550, 10e-3, "imu-biased:6",
+        also=(Cause.PLATFORM_IMU_LOST,),
+    ),
     Case("two IMUs are dead", Cause.IMUS_LOST, STOP, 15, 4e-3, "imu-dead:{k} imu-dead:{j}"),
     Case(
         "two IMUs are biased by 2 deg", Cause.IMUS_DISAGREE, STOP, 2500, 30e-3,

@@ -14,6 +14,16 @@ from plant.truth import TRUTH_POSITION
 _MOST_EVENTS = 100
 
 
+def note_events(records: Record, noted: list[str]) -> None:
+    """Add the events in these records to those that are noted: cycle and words."""
+    for eventful in records[records["event_count"] > 0]:
+        for text in events_of(eventful):
+            if len(noted) < _MOST_EVENTS:
+                noted.append(f"cycle {eventful['cycle']}: {text}")
+            elif len(noted) == _MOST_EVENTS:
+                noted.append("later events are not listed")
+
+
 @dataclass(eq=False)
 class RunState:
     """State and figures of a run until now.
@@ -54,9 +64,7 @@ class RunState:
         self.missed += int(records["missed"].sum())
         self.late += int((records["silent"] > 0).sum())
         self.refused_packets = int(records["refused"][-1])
-        for eventful in records[records["event_count"] > 0]:
-            for text in events_of(eventful):
-                self._note(int(eventful["cycle"]), text)
+        note_events(records, self.events)
         moving = records["mode"] == Mode.RUNNING
         if moving.any():
             self.protection = np.fmax(self.protection, np.fmax.reduce(records["protection"][moving].astype(float)))
@@ -70,12 +78,6 @@ class RunState:
         )
         self._counts += (len(known), len(posed))
         return True
-
-    def _note(self, cycle: int, text: str) -> None:
-        if len(self.events) < _MOST_EVENTS:
-            self.events.append(f"cycle {cycle}: {text}")
-        elif len(self.events) == _MOST_EVENTS:
-            self.events.append("later events are in the recording only")
 
     def level(self) -> dict[str, float] | None:
         """The greatest protection level of the motion, `position` [m] and `rotation` [rad]; None if there was none."""

@@ -18,6 +18,7 @@ from hil.progress import Progress, Say, no_progress, say_nothing
 from hil.realtime.durations import QUANTILES, percentiles
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import PreparedLoop, prepared_loop
+from hil.runs.run_state import note_events
 from hil.runs.snapshot import Snapshot, resume_snapshot, take_snapshot
 from plant.compiled import Record
 from plant.errors import GoughError, InputError
@@ -91,6 +92,13 @@ class SimulationResult:
         """(N, 3, 3); NaN if the truth is not known."""
         return rotations_from_quaternions(np.ascontiguousarray(self.records["truth"][:, TRUTH_QUATERNION]))
 
+    @property
+    def events(self) -> list[str]:
+        """What happened, by cycle: the first hundred events."""
+        noted: list[str] = []
+        note_events(self.records, noted)
+        return noted
+
     def summary(self) -> dict[str, Any]:
         """The figures, in SI units, over the time of the motion; None for those that need the truth where it is not known.
 
@@ -115,6 +123,7 @@ class SimulationResult:
             "real_time_factor": self.real_time_factor,
             "cycle_us": percentiles(self.records["stage_ns"][:, COMPUTED].sum(axis=1), tuple(QUANTILES)),
             "remarks": list(self.remarks),
+            "events": self.events,
             "config": asdict(self.config),
             "version": version("gough"),
         }

@@ -51,14 +51,20 @@ def test_in_its_last_cycle_it_is_still_armed(hexapod):
     assert bench.state["safety"]["arming"]["delay"] == ARMING_CYCLES
 
 
-@pytest.mark.parametrize(("lost", "armed"), [((2,), True), ((6,), True), ((2, 5), False), ((0, 6), False)])
-def test_as_many_imus_may_be_lost_as_in_motion(hexapod, lost, armed):
+@pytest.mark.parametrize(
+    ("lost", "need_platform", "armed"),
+    [((2,), True, True), ((6,), True, False), ((6,), False, True), ((2, 5), True, False), ((0, 6), False, False)],
+)
+def test_as_many_imus_may_be_lost_as_in_motion(hexapod, lost, need_platform, armed):
     bench = Bench(hexapod)
+    if not need_platform:
+        bench.parameters["safety"]["watch"]["without_platform_imu"] = np.inf
     bench.signals[:, list(lost)] = np.nan
     bench.steps(bench.hold + 5)
     assert bench.mode == (Mode.RUNNING if armed else Mode.IDLE)
     if not armed:
-        assert obstacle(bench)[:2] == (Cause.NO_SENSORS, lost[-1])
+        cause = Cause.PLATFORM_IMU_LOST if lost == (6,) else Cause.NO_SENSORS
+        assert obstacle(bench)[:2] == (cause, lost[-1])
         assert np.isnan(obstacle(bench)[2:]).all()
 
 
@@ -165,6 +171,8 @@ def test_a_pose_that_is_lost_between_armed_and_running_is_a_fault_at_once(hexapo
 def test_an_estimate_that_drifts_on_the_brakes_is_not_armed(hexapod, factor, armed):
     """A platform that sinks; the limit is around what the means of the lengths over 50 ms change by, from one to the next."""
     bench, home, lengths = Bench(hexapod), hexapod.home, []
+    # Its platform's IMU reads the same for ever.
+    bench.parameters["safety"]["watch"]["without_platform_imu"] = np.inf
     window = int(bench.parameters["safety"]["arming"]["window"])
     assert window == 0.05 * RATE_HZ
     for number in range(bench.hold):

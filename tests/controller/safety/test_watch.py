@@ -215,6 +215,32 @@ def test_a_badly_determined_pose_is_a_stop_unless_the_filter_is_trusted():
         assert stop_of(state)[0] == cause
 
 
+@pytest.mark.parametrize("preset", ["hexapod", "planar-3rpr"])
+def test_without_the_platforms_imu_it_goes_on_for_a_moment_only(preset):
+    _, parameters, state = moving(preset)
+    patience = round(float(parameters["safety"]["watch"]["patience"]) / PERIOD_S)
+    for _ in range(3):
+        # A break begins the time anew.
+        state["imus"]["used"][6] = 0
+        assert cycles_until_a_stop(parameters, state, patience) is None
+        state["imus"]["used"][6] = 1
+        check(parameters, state)
+    state["imus"]["used"][6] = 0
+    assert abs(cycles_until_a_stop(parameters, state) - patience) <= 1
+    assert stop_of(state)[:2] == (Cause.PLATFORM_IMU_LOST, 6) and state["safety"]["mode"] == Mode.STOPPING
+    assert "without IMU 6 nothing shows an error that the legs' IMUs share" in describe_end(state)
+
+
+@pytest.mark.parametrize("allowed", [True, False])
+def test_a_run_without_the_platforms_imu_goes_on_if_that_is_allowed_or_there_is_none(allowed):
+    mechanism, parameters, state = moving()
+    settings = SafetySettings(need_platform_imu=0.0 if allowed else 1.0)
+    parameters["safety"]["watch"] = watch_parameters(settings, 1.0 / PERIOD_S, mechanism.limits)
+    parameters["imus"]["present"][6] = allowed
+    state["imus"]["used"][6] = 0
+    assert cycles_until_a_stop(parameters, state, 1000) is None
+
+
 @pytest.mark.parametrize("lost", [(0, 6), (4, 5), (6,), (0,)])
 def test_more_lost_imus_than_may_be_are_a_stop_and_absent_ones_are_not_lost(lost):
     _, parameters, state = moving()

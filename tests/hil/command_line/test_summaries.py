@@ -57,6 +57,9 @@ def test_lengths_and_angles_have_their_units():
 # ------------------------------------------------------------------------------------------------------ simulate, run, replay
 
 
+LEVELS = ("p50", "p99", "max")
+
+
 def simulated(truth_known):
     target = pose_figures(4.0, "reference_") | (pose_figures(3.0) if truth_known else {})
     return {
@@ -65,8 +68,11 @@ def simulated(truth_known):
         "tracking": pose_figures(2.0) if truth_known else None,
         "estimated_tracking": pose_figures(5.0),
         "target": target,
+        "protection": {f"{name}_{at}": i * 1e-3 for i, name in enumerate(("position", "rotation"), 2) for at in LEVELS}
+        | ({"covered": 0.99875} if truth_known else {}),
         "limits": {"violations": 7},
         "target_stretch": 1.0,
+        "events": ["cycle 812: IMU 3 is left out: it is frozen"],
         "real_time_factor": 12.34,
         "cycle_us": {"p50": 1.0, "p99": 2.0, "p999": 3.0},
     }
@@ -89,6 +95,9 @@ def test_a_simulation_prints_its_errors(tables, capsys, truth_known, rows):
     assert found == [[label, *shown_figures(number)] for label, number in rows.items()]
     printed = capsys.readouterr().out
     assert ("the truth is not known" in printed) == (not truth_known)
+    assert "protection level p50/p99/max 2.000/2.000/2.000 mm, 0.172/0.172/0.172 deg" in printed
+    assert ("; it covers the error in 99.875 % of the cycles" in printed) == truth_known
+    assert "cycle 812: IMU 3 is left out: it is frozen\n" in printed
     assert "limits violated by the reference: 7; 12.3 times real time; cycle p50/p99/p99.9 1.0/2.0/3.0 us" in printed
 
 
@@ -113,6 +122,7 @@ RUN = {
     "config": {"fusion": "compiled"},
     "target_stretch": 1.0,
     "obstacle": None,
+    "protection": {"position": 2.5e-3, "rotation": 0.01},
 }  # fmt: skip
 
 
@@ -127,6 +137,7 @@ def test_a_run_prints_its_figures(tables, capsys, monkeypatch):
     for line in (
         "cycle 3: armed",
         "over budget, as the table shows: wake p99",
+        "greatest protection level 2.500 mm, 0.573 deg",
         "without locked memory",
         "1200 cycles; periods missed: 1 by own work, 2 woken late, 3 held up by the host",
         "the loop's thread: 4 major and 5 minor page faults, 6 involuntary switches, 7 bytes of growth; first cycle 1.25 s "
@@ -256,7 +267,7 @@ def test_the_view_of_a_run_shows_the_latest_cycle():
     assert rows["estimate - truth, RMS [mm]"] == "the truth is not known"
     assert rows["reference - length, RMS [mm]"] == "2.000"
     assert rows["woken late p50, p99.9, max [us]"].split() == ["7", "7", "7"]
-    assert rows["computing p50, p99.9, max [us]"].split() == ["12", "12", "12"]
+    assert rows["computing p50, p99.9, max [us]"].split() == ["14", "14", "14"]
     assert rows["periods missed, exchanges late"] == "4, 1"
     assert (rows["without"], rows[""]) == ("a", "b")
 

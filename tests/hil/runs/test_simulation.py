@@ -1,6 +1,7 @@
 """The main job: a hexapod follows a motion on its FMU plant."""
 
 import os
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -161,6 +162,13 @@ def test_the_samples_of_imus_with_clocks_of_their_own_have_their_ages_and_times(
     assert late.min() >= 0 and late.max() < 2_000_000
 
 
+def test_what_was_left_out_is_in_the_summary():
+    result = simulate(SimulationConfig(target="sines", duration=1.2, faults=("imu-noise:3,axis=all,size_deg_per_s=20,at=0.8",)))
+    events = result.summary()["events"]
+    assert events[0].endswith(": armed")
+    assert any(re.fullmatch(r"cycle \d+: IMU 3 is left out: it is noisy \(.*\)", event) for event in events)
+
+
 @pytest.mark.parametrize("imu", [3, 6])
 def test_a_slow_imu_among_others_does_not_bend_the_pose(imu):
     """The samples that it repeats are up to 3 ms old; taken as new, they cost 17 mm, or a leg off its reference."""
@@ -182,16 +190,17 @@ def test_a_run_taken_up_from_its_arrays_goes_on_bit_for_bit():
 
 def test_filterpy_closes_the_same_loop(monkeypatch):
     taken = Counter()
-    for kind in (FilterpyLeg, FilterpyPlatform):
+    for kind, name in ((FilterpyLeg, "take"), (FilterpyPlatform, "step")):
+        whole = getattr(kind, name)
 
-        def step(self, *sample, kind=kind, whole=kind.step):
+        def step(self, *sample, kind=kind, whole=whole):
             taken[kind] += 1
             whole(self, *sample)
 
-        monkeypatch.setattr(kind, "step", step)
+        monkeypatch.setattr(kind, name, step)
     compiled = simulate(SimulationConfig(target="sines", duration=0.8)).records
     filterpy = simulate(SimulationConfig(target="sines", duration=0.8, fusion="filterpy")).records
-    assert taken == {FilterpyLeg: 6 * (len(filterpy) - 1), FilterpyPlatform: len(filterpy)}
+    assert taken == {FilterpyLeg: 6 * len(filterpy), FilterpyPlatform: len(filterpy)}
     np.testing.assert_allclose(filterpy["position"], compiled["position"], atol=1e-11)
     np.testing.assert_allclose(filterpy["command"], compiled["command"], atol=1e-9)
 
