@@ -10,7 +10,7 @@ import numpy as np
 from hil.command_line import parse
 from hil.faults.rows import all_rows, rows_of
 from hil.faults.tables import disturbance_table
-from hil.faults.verdict import PROTECTION, judge
+from hil.faults.verdict import judge
 from hil.loop.records import RECORD
 
 PAGE = (Path(__file__).parent.parent / "docs" / "disturbances.md").read_text()
@@ -33,8 +33,7 @@ def test_the_example_is_read() -> None:
 
 
 def test_the_figures_are_those_of_a_run() -> None:
-    fields = [(name, *RECORD.fields[name][:1]) for name in RECORD.names] if RECORD.fields and RECORD.names else []
-    records = np.zeros(3, [*fields, (PROTECTION, "f8", 2)])
+    records = np.zeros(3, RECORD)
     records["mode"], records["truth"][:, 3], records["rotation"] = 2, 1.0, np.eye(3)
     figures = judge(records, 0, frozenset(), 1, 1.0)
     named = {name for line in re.findall(r"^\| (`.*?) \|", PAGE, re.MULTILINE) for name in re.findall(r"`(\w+)`", line)}

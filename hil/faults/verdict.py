@@ -15,9 +15,6 @@ from plant.truth import TRUTH_LENGTHS, TRUTH_POSITION, TRUTH_QUATERNION
 FORBIDDEN_POSITION_M, FORBIDDEN_ROTATION_RAD = 5e-3, float(np.radians(1.0))
 """No pose may be off by more after a sound IMU was left out."""
 
-PROTECTION = "protection"
-"""The field of records that bound the errors of position [m] and rotation [rad], of loops that have one."""
-
 _SAY_NOTHING = (
     Cause.NONE, Cause.END_OF_MOTION, Cause.STOP_REQUESTED, Cause.IMU_BACK, Cause.ANSWER_LATE, Cause.ARMED,
 )  # fmt: skip
@@ -43,7 +40,7 @@ def judge(records: Record, begin: int, guilty: frozenset[int], cause: int, rate:
         `forbidden`: whether a sound one was left out and the error then exceeded 5 mm or 1 deg; `position_then`,
         `rotation_then`: the greatest errors since then.
         `deviation`: the greatest of a leg from its reference.
-        `cycles` in motion, and, if the records have a protection level, how many of them it has `covered`, and its 99th
+        `cycles` in motion, and, if the loop has a protection level, how many of them it has `covered`, and its 99th
         percentiles `level_position` and `level_rotation`.
     """
     steering = np.isin(records["mode"], (Mode.RUNNING, Mode.STOPPING))
@@ -110,9 +107,9 @@ def _count_alarms(records: Record, where: NDArray[np.bool_]) -> int:
 
 
 def _protection(records: Record, steering: NDArray[np.bool_], position: Array, rotation: Array) -> dict[str, Any]:
-    if PROTECTION not in (records.dtype.names or ()) or not steering.any():
+    levels = records["protection"][steering].astype(float)
+    if np.isnan(levels).all():
         return {}
-    levels = records[PROTECTION][steering]
     covered = (position[steering] <= levels[:, 0]) & (rotation[steering] <= levels[:, 1])
     high = np.quantile(np.nan_to_num(levels, nan=np.inf), 0.99, axis=0, method="higher")
     return {"covered": int(covered.sum()), "level_position": float(high[0]), "level_rotation": float(high[1])}

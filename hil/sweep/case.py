@@ -22,7 +22,16 @@ GEOMETRY_FIGURE = "geometry."
 Result = TypeVar("Result")
 _OF_THIS_RUN = ("config", "version", "real_time_factor", "cycle_us")
 """Parts of a summary that are no figures, or not the same each time."""
-_OF_SUMMARY = ("truth_known", "estimation", "tracking", "estimated_tracking", "target", "limits", "target_stretch")
+_OF_SUMMARY = (
+    "truth_known",
+    "estimation",
+    "tracking",
+    "estimated_tracking",
+    "target",
+    "protection",
+    "limits",
+    "target_stretch",
+)
 """The other parts."""
 
 

@@ -9,6 +9,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from hil.engine.cluster import _AHEAD, _TRIES, WorkerRefusedError, _Queue
 from hil.engine.engine import Engine, open_engine
 from hil.engine.settings import EngineSettings, host_and_port
 from hil.runs.config import SimulationConfig
-from hil.sweep.case import cases_of, kind_of, measure
+from hil.sweep.case import cases_of, measure
 from hil.sweep.study import Factor, Study
 from tests.hil.engine.certificates import Certificates, make_certificates
 from tests.hil.processes import dask_scheduler, dask_worker, started, wait_until
@@ -172,7 +173,7 @@ def test_a_worker_stays_as_large_as_it_is() -> None:
         assert engine.map(eval, ["__import__('dask').config.get('distributed.worker.profile.enabled')"]) == [False]
         (worker,) = {*engine.map(eval, [PROCESS] * 4)}
         sizes, files = [], []
-        for _, outcome in engine.run(measure, list(cases_of(study)), kind_of):
+        for _, outcome in engine.run(measure, list(cases_of(study)), attrgetter("kind")):
             assert isinstance(outcome, dict), outcome
             sizes.append(psutil.Process(worker).memory_info().rss)
             files.append(psutil.Process(worker).num_fds())

@@ -7,18 +7,15 @@ import pytest
 
 from controller.safety.causes import Cause, Mode
 from hil.faults.tables import disturbance_table, disturbances_of, summary, worst_first
-from hil.faults.verdict import PROTECTION, judge
+from hil.faults.verdict import judge
 from hil.loop.records import RECORD
 
 RATE, CYCLES, BEGIN = 100.0, 400, 100
 
 
-def records(protection=None):
+def records(protection=np.nan):
     """Four seconds, of which the last half second is on the brakes; the error grows by 1 mm and 0.1 deg a second."""
-    dtype = (
-        RECORD if protection is None else np.dtype([*((n, RECORD.fields[n][0]) for n in RECORD.names), (PROTECTION, "f8", 2)])
-    )
-    made = np.zeros(CYCLES, dtype)
+    made = np.zeros(CYCLES, RECORD)
     times = np.arange(CYCLES) / RATE
     made["mode"] = Mode.RUNNING
     made["mode"][:20], made["mode"][350:] = Mode.IDLE, Mode.FAULT
@@ -29,8 +26,7 @@ def records(protection=None):
     made["rotation"] = np.eye(3)
     made["rotation"][:, 0, 0] = made["rotation"][:, 1, 1] = np.cos(turns)
     made["rotation"][:, 0, 1], made["rotation"][:, 1, 0] = -np.sin(turns), np.sin(turns)
-    if protection is not None:
-        made[PROTECTION] = protection
+    made["protection"] = protection
     return made
 
 

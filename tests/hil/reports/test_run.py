@@ -14,7 +14,7 @@ from plant.pose import pose_errors, rotation_angle, rotation_from_vector
 from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS
 from tests.hil.pages import draw_in_browser, figures_in, json_after, numbers, traces_of, widths_in_browser
 
-CURVES = {"pose": 12, "errors": 12, "lengths": 12, "motion": 12, "drives": 18}
+CURVES = {"pose": 12, "errors": 12, "lengths": 12, "motion": 12, "drives": 18, "protection": 4}
 FIGURES = ["mechanism", *CURVES]
 
 
