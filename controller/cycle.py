@@ -236,7 +236,9 @@ def run_stages(
             watch.exclude_imu(p.safety, s.safety, rig, time, s.imus, p.legs.weight, s.reference, s.pid)
         t = _mark(m, CycleStage.REFINEMENT, t)
     if first <= CycleStage.MECHANISM < last:
-        s.pose.found = trust.step_mechanism_filter(p.mechanism, s.mechanism, rig, time, s.imus, s.legs, s.heading, s.pose)
+        s.pose.found = trust.step_mechanism_filter(
+            p.mechanism, s.mechanism, rig, time, s.imus, s.legs, s.heading, s.pose, s.safety.events
+        )  # fmt: skip
         t = _mark(m, CycleStage.MECHANISM, t)
     if first <= CycleStage.INTEGRITY < last:
         if s.pose.found != 0:

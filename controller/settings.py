@@ -79,7 +79,7 @@ class FusionSettings(_Settings):
     axes_sigma: float = 1e-3  # [rad]
     noise_inflation: float = 2.75  # factor on the whole-mechanism filter's noises and the platform's jerk
     # RMS angle between the leg filters' directions and the whole-mechanism filter's pose that ends the use of that pose [rad].
-    disagreement: float = radians(1.0)
+    disagreement: float = radians(0.6)
 
 
 @dataclass(frozen=True)

@@ -84,7 +84,7 @@ class FilterpyLeg(_Filterpy):
         self.F[:6, :6] = np.kron([[1.0, t, t**2 / 2], [0.0, 1.0, t], [0.0, 0.0, 1.0]], np.eye(2))
         self.Q[:6, :6] += np.kron(jerk * noise, np.eye(2))
         self.variances, self.period = np.array([rate_variance, force_variance]), period
-        self.excess = self.passed = 0.0
+        self.excess, self.passed = np.zeros(2), 0.0
 
     def step(self, gyroscope: Array, accelerometer: Array) -> None:
         """Predict over one period and take a sample [rad/s, m/s^2]."""
@@ -94,14 +94,15 @@ class FilterpyLeg(_Filterpy):
     def take(self, gyroscope: Array, accelerometer: Array, clipped: tuple[int, int] = (0, 0)) -> None:
         """Take a sample [rad/s, m/s^2] without predicting; `clipped` says which sensor is at the end of its range."""
         sample = np.concatenate([gyroscope, accelerometer]).reshape(6, 1)
-        off, doubt = accelerometer - self.measurement(self.x)[3:, 0], np.diag(self.P)
-        lever = self.imu_position @ self.imu_position
-        explained = self.variances[1] + self.gravity**2 * doubt[:2].sum() + lever * doubt[4:6].sum()
-        self.excess = _faded(self.excess, float(off @ off), explained, self.period / shaking.MEMORY_S)
-        if self.excess == 0.0:
-            self.passed += min(1.0, self.period / shaking.AVERAGE_S) * (float(off @ off) - self.passed)
-        hidden = max(0.0, self.passed - explained)
-        variances = self.variances + [0.0, self.excess + hidden] + shaking.SAYS_NOTHING * np.array(clipped)
+        off, doubt = (sample - self.measurement(self.x)).reshape(2, 3), np.diag(self.P)
+        squared, lever = (off**2).sum(axis=1), self.imu_position @ self.imu_position
+        of_force = self.variances[1] + self.gravity**2 * doubt[:2].sum() + lever * doubt[4:6].sum()
+        for sensor, explained in enumerate((3.0 * self.variances[0] + doubt[2:4].sum(), of_force)):
+            self.excess[sensor] = _faded(self.excess[sensor], squared[sensor], explained, self.period / shaking.MEMORY_S)
+        if self.excess[1] == 0.0:
+            self.passed += min(1.0, self.period / shaking.AVERAGE_S) * (squared[1] - self.passed)
+        hidden = max(0.0, self.passed - of_force)
+        variances = self.variances + self.excess + [0.0, hidden] + shaking.SAYS_NOTHING * np.array(clipped)
         self.update(sample, self.measurement_jacobian, self.measurement, R=np.diag(np.repeat(variances, 3)))
 
     def measurement(self, x: Array) -> Array:
@@ -245,9 +246,10 @@ class FilterpyFilters:
                 leg.start(x, covariance)
             else:
                 leg.predict()
-            leg.excess, leg.passed = (float(imus["shaking"][name][k]) for name in ("excess", "passed"))
-            leg.take(rate, force, tuple(imus["shaking"]["clipped"][:, k]))
-            imus["shaking"]["excess"][k], imus["shaking"]["passed"][k] = leg.excess, leg.passed
+            shaken = imus["shaking"]
+            leg.excess[:], leg.passed = shaken["excess"][:, k], float(shaken["passed"][k])
+            leg.take(rate, force, tuple(shaken["clipped"][:, k]))
+            shaken["excess"][:, k], shaken["passed"][k] = leg.excess, leg.passed
             legs["x"][k], legs["covariance"][k] = leg.state, leg.P
         update_leg_directions(p["legs"], legs, p["rig"], s["time"], imus)
 

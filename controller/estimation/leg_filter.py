@@ -13,7 +13,7 @@ once, which equals the joint update. `filterpy_filters` is the slow clear twin.
 
 import numpy as np
 
-from controller.estimation.shaking import note_force, variance_of
+from controller.estimation.shaking import note_force, note_rate, variance_of
 from controller.rig import elapsed
 from controller.settings import FusionSettings
 from plant.compiled import Record, filled, kernel, record_dtype
@@ -94,6 +94,8 @@ def step_leg_filters(p: Record, s: Record, rig: Record, time: Record, imus: Reco
             lock_second_axis(x, covariance)
         d, gravity = rig.sensors.leg_imu_position[k], rig.sensors.gravity
         predict_measurement(x, up, d, gravity, s.expected, s.jacobian)
+        off = subtract(vector(rate), vector(s.expected))
+        note_rate(imus.shaking, k, dot(off, off), 3.0 * p.rate_variance + covariance[2, 2] + covariance[3, 3], period)
         off = subtract(vector(force), vector(s.expected[3:]))
         note_force(imus.shaking, k, dot(off, off), p.force_variance + force_doubt(covariance, d, gravity), period)
         take_leg_sample(

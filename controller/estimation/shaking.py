@@ -1,9 +1,10 @@
 """Vibration, shocks and clipped readings: how uncertain each sensor's reading is in this cycle, for all filters.
 
-The filters know what an accelerometer should read: gravity, and the motion that the gyroscopes show. What it reads beyond that,
-more than noise and the filter's own uncertainty explain, is vibration or a shock. Its square is added to the variance of the
-reading, so that the filters go on with the gyroscopes for as long as it lasts. That needs no knowledge of its frequency. What
-stays below that limit counts on average, too: readings of a vibration that happen to be near zero, unlike those between shocks.
+The filters know what a sensor should read: an accelerometer gravity and the motion that the gyroscopes show, a leg's gyroscope
+the motion so far. What it reads beyond that, more than noise and the filter's own uncertainty explain, is vibration, a shock or
+a fault. Its square is added to the variance of the reading, so that the filters go on with the other sensors for as long as it
+lasts. That needs no knowledge of its frequency. What an accelerometer reads below that limit counts on average, too: readings
+of a vibration that happen to be near zero, unlike those between shocks.
 
 A reading at the end of its sensor's range is clipped. It says nothing, and the others bridge it.
 """
@@ -13,7 +14,7 @@ import numpy as np
 from controller.estimation.excess import faded_excess
 from controller.safety.causes import Cause, report_event
 from plant.compiled import Record, kernel, record_dtype
-from plant.imu import ACCELEROMETER
+from plant.imu import ACCELEROMETER, GYROSCOPE
 from plant.imu_wiring import IMU_COUNT
 from plant.pose import Array
 
@@ -46,8 +47,8 @@ PARAMETERS = record_dtype(
 STATE = record_dtype(
     clipped=(np.int64, (2, IMU_COUNT)),  # whether the reading is at the end of its range
     clipped_for=(np.int64, IMU_COUNT),  # cycles with clipped readings, less those without
-    excess=(np.float64, IMU_COUNT),  # of the square of each accelerometer's reading over what is explained, faded [m^2/s^4]
-    mean=(np.float64, IMU_COUNT),  # of that, averaged
+    excess=(np.float64, (2, IMU_COUNT)),  # of each reading's square over what is explained, faded [rad^2/s^2, m^2/s^4]
+    mean=(np.float64, IMU_COUNT),  # of the accelerometers', averaged [m^2/s^4]
     passed=(np.float64, IMU_COUNT),  # square of the readings without an excess, averaged [m^2/s^4]
     hidden=(np.float64, IMU_COUNT),  # by how much that is more than what is explained [m^2/s^4]
     told=np.int64,  # whether it has been told that IMUs are shaken
@@ -76,17 +77,23 @@ def note_force(s: Record, k: int, squared: float, explained: float, period: floa
         explained: mean of it by noise and the filter's uncertainty.
         period: since the sample before [s].
     """
-    s.excess[k] = faded_excess(s.excess[k], squared, explained, period, MEMORY_S)
-    if s.excess[k] == 0.0:
+    s.excess[ACCELEROMETER, k] = faded_excess(s.excess[ACCELEROMETER, k], squared, explained, period, MEMORY_S)
+    if s.excess[ACCELEROMETER, k] == 0.0:
         s.passed[k] += min(1.0, period / AVERAGE_S) * (squared - s.passed[k])
     s.hidden[k] = max(s.passed[k] - explained, 0.0)
+
+
+@kernel
+def note_rate(s: Record, k: int, squared: float, explained: float, period: float) -> None:
+    """Note by how much the gyroscope of IMU `k` reads what is not explained [rad^2/s^2], as `note_force`."""
+    s.excess[GYROSCOPE, k] = faded_excess(s.excess[GYROSCOPE, k], squared, explained, period, MEMORY_S)
 
 
 @kernel
 def variance_of(s: Record, sensor: int, k: int, nominal: float) -> float:
     """The variance of a sensor's reading in this cycle, of which `nominal` is noise."""
     clipped = SAYS_NOTHING if s.clipped[sensor, k] != 0 else 0.0
-    return float(nominal + clipped + (s.excess[k] + s.hidden[k] if sensor == ACCELEROMETER else 0.0))
+    return float(nominal + clipped + s.excess[sensor, k] + (s.hidden[k] if sensor == ACCELEROMETER else 0.0))
 
 
 @kernel
@@ -112,10 +119,10 @@ def tell_shaking(p: Record, s: Record, used: Array, missed: int, events: Record)
     share = min(1.0, (1 + missed) * p.smoothing)
     for k in range(IMU_COUNT):
         if used[k] == 0:
-            s.excess[k] = s.hidden[k] = 0.0
+            s.excess[GYROSCOPE, k] = s.excess[ACCELEROMETER, k] = s.hidden[k] = 0.0
         elif s.clipped[0, k] != 0 or s.clipped[1, k] != 0:
             clipped = k
-        s.mean[k] += share * (s.excess[k] - s.mean[k])
+        s.mean[k] += share * (s.excess[ACCELEROMETER, k] - s.mean[k])
         if s.mean[k] > s.mean[worst]:
             worst = k
     if s.told == 0 and s.mean[worst] > p.limit**2:

@@ -142,6 +142,12 @@ class Cause(IntEnum):
         Reaction.STOP,
         "rad of uncertainty",
     )
+    FILTER_DISAGREES = (
+        55,
+        "the whole-mechanism filter disagrees with the leg filters, which give the pose for a while",
+        Reaction.GO_ON,
+        "rad RMS",
+    )
     GYROSCOPE_OFF = 58, "IMU {} is left out: its gyroscope contradicts the others", Reaction.GO_ON, "rad/s"
     GYROSCOPES_CONTRADICT = 59, f"the gyroscopes contradict each other{_WORST}", Reaction.QUICK_STOP, "rad/s"
     POSITION_UNSURE = 60, "the position may be off by more than the limit", Reaction.STOP, "m"

@@ -29,6 +29,7 @@ from controller.least_squares import factor_cholesky
 from controller.settings import FusionSettings
 from plant.compiled import Record, filled, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
+from plant.imu import ACCELEROMETER
 from plant.mechanism import LEGS
 from plant.pose import Array, rotate_by_vector
 
@@ -205,7 +206,7 @@ def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: 
         s.counted[k] = _LEAST_SAMPLES * s.samples[k] >= s.collected
         if s.counted[k] == 0:
             continue
-        shaken = shaking.excess[k] + shaking.hidden[k] + shaking.mean[k]
+        shaken = shaking.excess[ACCELEROMETER, k] + shaking.hidden[k] + shaking.mean[k]
         # What shakes an IMU beyond its noise makes its mean as uncertain.
         s.weight[k, 0] = s.samples[k] / (max(p.variance[0], variance[0, k]) + p.window * (_TIMING_S * turning) ** 2)
         s.weight[k, 1] = s.samples[k] / (max(p.variance[1], variance[1, k]) + rough + p.window * shaken)

@@ -20,6 +20,7 @@ from controller.estimation.whole_mechanism.parameters import FILTER_PARAMETERS, 
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import factor_cholesky, invert_cholesky
 from controller.rig import elapsed
+from controller.safety.causes import Cause, report_event
 from controller.settings import FusionSettings
 from plant.compiled import Record, filled, kernel, record_dtype
 from plant.imu_wiring import IMU_COUNT
@@ -29,8 +30,11 @@ from plant.pose import Array
 _START_S, _SETTLING_S = 0.3, 0.3
 """When the filter is started after it was stopped, and how long it is not relied upon [s]."""
 
-_PATIENCE_S = 0.05
-"""How long the leg filters may disagree with the filter [s]."""
+_AVERAGE_S = 0.05
+"""Time constant of the mean square of the angles between the leg filters' directions and the filter's pose [s]."""
+
+_MOST_DOUBLINGS = 10
+"""The filter is started later each time that the leg filters have disagreed: twice as late, so many times at most."""
 
 _FADING_S = 0.1
 """Time constant with which the step between two sources of the pose fades away [s]."""
@@ -40,8 +44,8 @@ PARAMETERS = record_dtype(
     delay=np.float64,  # of the sensors [s]
     start_cycles=np.int64,  # this and the next: the durations above
     settling_cycles=np.int64,
-    disagreement=np.float64,  # limit [rad]
-    patience_cycles=np.int64,  # how long the leg filters may disagree
+    disagreement=np.float64,  # of the leg filters with the filter, limit of the mean square [rad^2]
+    smoothing=np.float64,  # share of a cycle's in that mean
 )
 """Constants."""
 
@@ -49,7 +53,8 @@ STATE = record_dtype(
     filter=FILTER_STATE,
     due=np.int64,  # the cycle in which the filter is started, or from which on it may be trusted
     trusted=np.int64,  # whether the pose is the filter's
-    disagreeing_for=np.int64,  # for how many cycles the leg filters have disagreed
+    disagreement=np.float64,  # of the leg filters with the filter, mean square [rad^2]
+    stops=np.int64,  # how often that has stopped the filter
     blend_offset=(np.float64, 6),  # what is left of the step between two sources of the pose [m, rad]
     closed_position=(np.float64, 3),  # of the pose in closed form [m]
     closed_rotation=(np.float64, (3, 3)),
@@ -68,14 +73,14 @@ def trust_parameters(fusion: FusionSettings, rate: float, filter_constants: Reco
         delay=fusion.sensor_delay,
         start_cycles=round(_START_S * rate),
         settling_cycles=round(_SETTLING_S * rate),
-        disagreement=fusion.disagreement,
-        patience_cycles=round(_PATIENCE_S * rate),
+        disagreement=fusion.disagreement**2,
+        smoothing=1.0 / max(1.0, _AVERAGE_S * rate),
     )
 
 
 @kernel
 def step_mechanism_filter(
-    p: Record, s: Record, rig: Record, time: Record, imus: Record, legs: Record, heading: Record, pose: Record
+    p: Record, s: Record, rig: Record, time: Record, imus: Record, legs: Record, heading: Record, pose: Record, events: Record
 ) -> bool:
     """Step the filter, and let its pose replace the one in closed form while it is trusted; returns whether there is a pose."""
     f, found = s.filter, bool(pose.found != 0)
@@ -86,6 +91,7 @@ def step_mechanism_filter(
         if found and time.cycle >= s.due:
             start_filter(p.filter, f, now, pose.position, pose.rotation, pose.twist)
             s.due = time.cycle + p.settling_cycles
+            s.disagreement = 0.0
         _fade_step(s, rig, time, pose)
         return found
     for k in range(IMU_COUNT):
@@ -100,12 +106,14 @@ def step_mechanism_filter(
     s.closed_position[:] = pose.position
     s.closed_rotation[:] = pose.rotation
     extrapolate(f, now, pose.position, pose.rotation, s.twist, s.acceleration)
-    agree = _agree(p, rig, legs, pose)
-    s.disagreeing_for = 0 if agree else s.disagreeing_for + 1 + time.missed
-    if s.disagreeing_for > p.patience_cycles:
+    s.disagreement += min(1.0, (1 + time.missed) * p.smoothing) * (_disagreement(rig, legs, pose) - s.disagreement)
+    if not s.disagreement <= p.disagreement:
         f.running = 0
-        s.due = time.cycle + p.start_cycles
-    elif time.cycle >= s.due and agree:
+        s.due = time.cycle + (p.start_cycles << min(s.stops, _MOST_DOUBLINGS))
+        if s.trusted != 0:
+            s.stops += 1
+            report_event(events, Cause.FILTER_DISAGREES, -1, np.sqrt(s.disagreement), np.sqrt(p.disagreement))
+    elif time.cycle >= s.due:
         if s.trusted == 0:
             s.trusted = 1
             _add_step(s.closed_position, s.closed_rotation, pose.position, pose.rotation, s.blend_offset)
@@ -173,13 +181,14 @@ def _add_step(position: Array, rotation: Array, new_position: Array, new_rotatio
 
 
 @kernel
-def _agree(p: Record, rig: Record, legs: Record, pose: Record) -> bool:
-    """Whether the leg filters' directions are near those of the filter's pose.
+def _disagreement(rig: Record, legs: Record, pose: Record) -> float:
+    """The mean square of the angles between the leg filters' directions and those of the filter's pose [rad^2]; NaN if that is
+    not finite.
 
-    If the leg filters have no pose, it is enough that the filter's pose is finite.
+    If the leg filters have no pose, there is nothing to compare.
     """
     if pose.found == 0:
-        return bool(np.isfinite(pose.position.sum() + pose.rotation.sum()))
+        return 0.0 if np.isfinite(pose.position.sum() + pose.rotation.sum()) else np.nan
     legs_at(
         rig.geometry.base_joints, rig.geometry.platform_joints, pose.position, pose.rotation, pose.arms, pose.directions,
         pose.lengths,
@@ -190,4 +199,4 @@ def _agree(p: Record, rig: Record, legs: Record, pose: Record) -> bool:
             count += 1.0
             for i in range(3):
                 total += (legs.directions[k, i] - pose.directions[k, i]) ** 2
-    return bool(total <= count * p.disagreement**2)
+    return total / max(count, 1.0)
