@@ -250,8 +250,9 @@ def run_stages(
             integrity.restart_integrity(s.integrity)
         if s.integrity.fresh != 0:
             level = s.integrity.protection
-            trust.find_covariance(p.mechanism, s.mechanism, rig, time, s.pose, level.scratch, level.covariance)
-            end_level(level, level.covariance)
+            trust.find_closed_covariance(s.pose, level.scratch, level.covariance[0])
+            trust.find_covariance(p.mechanism, s.mechanism, rig, time, s.pose, level.scratch, level.covariance[1])
+            end_level(level, time.cycle * rig.period)
             watch.check_level(p.safety, s.safety, rig, time, level.level, s.reference, s.pid)
             if watch.judge_evidence(p.safety, s.safety, rig, time, s.imus, s.integrity, s.reference, s.pid):
                 trust.restart_filter(s.mechanism, time, s.pose)

@@ -39,6 +39,9 @@ FAULTS = IMU_COUNT * READINGS
 UNKNOWNS = MOTION_STATES + FAULTS
 
 _WINDOW_S = 0.01
+_LEAST_HZ = 120.0
+"""At lower rates the steps of the commands look like faults, and the filter does not run."""
+
 MEMORY_S = 0.5
 _RIPPLE_HZ = 150.0
 """At this rate, the steps of the commands would make a sample of the acceleration as wrong as it is large."""
@@ -110,7 +113,7 @@ def fault_filter_parameters(fusion: FusionSettings, rate: float, active: bool) -
     jerk = np.array([fusion.platform_jerk, fusion.platform_angular_jerk])
     return filled(
         PARAMETERS,
-        active=active,
+        active=active and rate >= _LEAST_HZ,
         window=window,
         duration=duration,
         keep=np.exp(-duration / MEMORY_S),

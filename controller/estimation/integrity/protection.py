@@ -3,14 +3,19 @@
 As satellite navigation has it (RAIM), the level counts what a fault could do unseen, and the worst hypothesis gives it. With
 the error m of the pose from C_mm m + C_mf f = c_m (`evidence`, errors learned eliminated), a hypothesis D with its most likely
 sizes a, of covariance (D^T W D)^-1, moves the pose by -C_mm^-1 C_mf D a, of covariance V, and leaves it off by
-m = C_mm^-1 (c_m - C_mf D a). Its evidence exceeds the number n of its directions by e; chance alone hardly ever lifts e to 6.
+m = C_mm^-1 (c_m - C_mf D a). Its evidence exceeds the number n of its directions, and what chance and errors of calibrated IMUs
+explain, by e.
 
     no fault       |C_mm^-1 c_m|
-    unseen fault   sqrt(max(e, 1/2) tr V): what could be there by its odds, few where readings would show it
-    seen fault     sqrt(e tr V) + 3 |m|, for e > 6
+    unseen fault   sqrt(tr V / 2): what could be there by its odds, little where readings would show it
+    seen fault     sqrt((e + 1/2) tr V) + 3 |m| min(1, e / 8), for e > 0
 
 The 3 is for faults that grow: one is larger at the end of the filter's memory than on average, and has moved the pose before.
-The level is the root of the squares of the greatest of these and of 2.2 standard deviations of the pose as its filter has it.
+A fault that has come up since the loop began has had little time to move the pose: all this grows over the first second.
+
+The level is the root of the squares of the greatest of these and of two standard deviations: that of the pose in closed form,
+and that which the source of the pose has, which may be the whole-mechanism filter. The former does not shrink while the latter
+learns: what calibrated IMUs and joints leave, no filter knows of.
 """
 
 import numpy as np
@@ -21,16 +26,23 @@ from plant.compiled import Record, kernel, record_dtype
 from plant.pose import Array
 
 POSE = 6
-_CHANCE = 6.0
-"""By how much the evidence may exceed the number of directions by chance."""
+_CHANCE = 8.0
+"""By how much evidence exceeds the number of directions without a fault."""
 
 _UNSEEN = 0.5
 """What counts as evidence for a fault for which there is none."""
 
+_SURELY = 8.0
+"""Evidence beyond chance from which on a fault is taken to be there."""
+
+_BENDING_S = 1.0
+"""How long a fault takes to move the pose [s]."""
+
 _GROWN = 3.0
 """How many times the mean error within the last second the present one may be."""
 
-_SIGMAS = 2.2
+_OF_CLOSED_FORM, _OF_SOURCE = 2.0, 1.1
+"""How many standard deviations count: of the pose in closed form, and as the source of the pose has it."""
 
 STATE = record_dtype(
     level=(np.float64, 2),  # of position [m] and rotation [rad], of the last complete evaluation
@@ -42,7 +54,7 @@ STATE = record_dtype(
     error=(np.float64, POSE),  # of the pose without a fault
     effect=(np.float64, (POSE, POSE)),  # of the directions of a hypothesis on the pose, a direction a row
     shift=(np.float64, POSE),  # of the pose by the fault
-    covariance=(np.float64, (POSE, POSE)),  # of the pose as its own filter has it
+    covariance=(np.float64, (2, POSE, POSE)),  # of the pose in closed form, and as its source has it
     scratch=(np.float64, (POSE, POSE)),
 )
 """The level, and scratch."""
@@ -95,27 +107,35 @@ def take_hypothesis(s: Record, e: Record, hypothesis: int, count: int, found: fl
         for i in range(POSE):
             effect[i] /= t.matrix[n, n]
             s.shift[i] += effect[i] * t.right[n]
-    seen = found - count
+    seen = max(found - count - _CHANCE, 0.0)
     for part in range(2):
         squared = variance = 0.0
         for i in range(3 * part, 3 * part + 3):
             squared += (s.error[i] - s.shift[i]) ** 2
             for n in range(count):
                 variance += s.effect[n, i] ** 2
-        fault = np.sqrt(max(seen, _UNSEEN) * variance)
-        if seen > _CHANCE:
-            fault += _GROWN * np.sqrt(squared)
+        fault = np.sqrt((seen + _UNSEEN) * variance) + _GROWN * np.sqrt(squared) * min(1.0, seen / _SURELY)
         if fault > s.fault[part]:
             s.fault[part] = fault
             s.next_hypothesis[part] = hypothesis
 
 
 @kernel
-def end_level(s: Record, covariance: Array) -> None:
-    """Publish the level, infinite where the readings do not determine the pose, with the pose's own `covariance` (6, 6)."""
+def end_level(s: Record, age: float) -> None:
+    """Publish the level, infinite where the readings do not determine the pose.
+
+    Args:
+        s: dtype `STATE`, with the covariances of the pose.
+        age: for how long the loop has run [s].
+    """
+    bent = np.sqrt(min(1.0, age / _BENDING_S))
     for part in range(2):
-        variance = 0.0
+        closed = own = 0.0
         for i in range(3 * part, 3 * part + 3):
-            variance += covariance[i, i]
-        s.level[part] = np.sqrt(_SIGMAS**2 * variance + s.fault[part] ** 2) if s.determined != 0 else np.inf
+            closed += s.covariance[0, i, i]
+            own += s.covariance[1, i, i]
+        if not np.isfinite(closed):
+            closed = own
+        variance = _OF_CLOSED_FORM**2 * closed + _OF_SOURCE**2 * own
+        s.level[part] = np.sqrt(variance + (bent * s.fault[part]) ** 2) if s.determined != 0 else np.inf
         s.hypothesis[part] = s.next_hypothesis[part]

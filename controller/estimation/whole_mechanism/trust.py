@@ -147,10 +147,17 @@ def restart_filter(s: Record, time: Record, pose: Record) -> None:
 @kernel
 def find_covariance(p: Record, s: Record, rig: Record, time: Record, pose: Record, factor: Array, covariance: Array) -> None:
     """Write the pose's covariance (6, 6): the filter's if it is trusted, else the refinement's; NaN if there is none."""
-    factor[:] = pose.information
     if s.trusted != 0:
         extrapolate_covariance(p.filter, s.filter, time.cycle * rig.period, covariance)
-    elif factor_cholesky(factor):
+    else:
+        find_closed_covariance(pose, factor, covariance)
+
+
+@kernel
+def find_closed_covariance(pose: Record, factor: Array, covariance: Array) -> None:
+    """Write the covariance (6, 6) of the refined pose in closed form; NaN if there is none."""
+    factor[:] = pose.information
+    if factor_cholesky(factor):
         invert_cholesky(factor, covariance)
     else:
         covariance[:] = np.nan
