@@ -4,7 +4,8 @@ The filters know what a sensor should read: an accelerometer gravity and the mot
 the motion so far. What it reads beyond that, more than noise and the filter's own uncertainty explain, is vibration, a shock or
 a fault. Its square is added to the variance of the reading, so that the filters go on with the other sensors for as long as it
 lasts. That needs no knowledge of its frequency. What an accelerometer reads below that limit counts on average, too: readings
-of a vibration that happen to be near zero, unlike those between shocks.
+of a vibration that happen to be near zero, unlike those between shocks. So does what the mean forces of a few samples show
+that is no motion of the gyroscopes together (`integrity.parity`): a vibration that aliases to a slow one, a common error.
 
 A reading at the end of its sensor's range is clipped. It says nothing, and the others bridge it.
 """
@@ -51,6 +52,7 @@ STATE = record_dtype(
     mean=(np.float64, IMU_COUNT),  # of the accelerometers', averaged [m^2/s^4]
     passed=(np.float64, IMU_COUNT),  # square of the readings without an excess, averaged [m^2/s^4]
     hidden=(np.float64, IMU_COUNT),  # by how much that is more than what is explained [m^2/s^4]
+    no_motion=(np.float64, IMU_COUNT),  # variance of a reading for the mean force that is no motion [m^2/s^4]
     told=np.int64,  # whether it has been told that IMUs are shaken
     bridging=np.int64,  # the same of clipped readings
     calm_for=np.int64,  # for how many cycles nothing has shaken them
@@ -93,7 +95,8 @@ def note_rate(s: Record, k: int, squared: float, explained: float, period: float
 def variance_of(s: Record, sensor: int, k: int, nominal: float) -> float:
     """The variance of a sensor's reading in this cycle, of which `nominal` is noise."""
     clipped = SAYS_NOTHING if s.clipped[sensor, k] != 0 else 0.0
-    return float(nominal + clipped + s.excess[sensor, k] + (s.hidden[k] if sensor == ACCELEROMETER else 0.0))
+    beyond = s.hidden[k] + s.no_motion[k] if sensor == ACCELEROMETER else 0.0
+    return float(nominal + clipped + s.excess[sensor, k] + beyond)
 
 
 @kernel
@@ -115,23 +118,24 @@ def bridges(p: Record, s: Record, k: int, healthy: int, missed: int) -> bool:
 @kernel
 def tell_shaking(p: Record, s: Record, used: Array, missed: int, events: Record) -> None:
     """Report once that IMUs are shaken and that readings at the end of their range are bridged, and when all is calm again."""
-    worst, clipped = 0, -1
+    worst, most, clipped = 0, 0.0, -1
     share = min(1.0, (1 + missed) * p.smoothing)
     for k in range(IMU_COUNT):
         if used[k] == 0:
-            s.excess[GYROSCOPE, k] = s.excess[ACCELEROMETER, k] = s.hidden[k] = 0.0
+            s.excess[GYROSCOPE, k] = s.excess[ACCELEROMETER, k] = s.hidden[k] = s.no_motion[k] = 0.0
         elif s.clipped[0, k] != 0 or s.clipped[1, k] != 0:
             clipped = k
         s.mean[k] += share * (s.excess[ACCELEROMETER, k] - s.mean[k])
-        if s.mean[k] > s.mean[worst]:
-            worst = k
-    if s.told == 0 and s.mean[worst] > p.limit**2:
+        beyond = s.mean[k] + s.no_motion[k]
+        if beyond > most:
+            worst, most = k, beyond
+    if s.told == 0 and most > p.limit**2:
         s.told = 1
-        report_event(events, Cause.SHAKEN, worst, np.sqrt(s.mean[worst]), p.limit)
+        report_event(events, Cause.SHAKEN, worst, np.sqrt(most), p.limit)
     if s.bridging == 0 and clipped >= 0:
         s.bridging = 1
         report_event(events, Cause.BRIDGED, clipped, np.nan, np.nan)
-    calm = clipped < 0 and s.mean[worst] < (_CALM_SHARE * p.limit) ** 2
+    calm = clipped < 0 and most < (_CALM_SHARE * p.limit) ** 2
     s.calm_for = s.calm_for + 1 + missed if calm else 0
     if s.calm_for > p.calm_cycles and (s.told != 0 or s.bridging != 0):
         s.told = s.bridging = 0

@@ -89,6 +89,7 @@ STATE = record_dtype(
     mean=(np.float64, (IMU_COUNT, READINGS)),  # of that window's samples
     counted=(np.int64, IMU_COUNT),  # whether the IMU gave enough of them
     turning=np.float64,  # greatest angular acceleration of platform and legs that was planned for it [rad/s^2]
+    rough=np.float64,  # standard deviation of a mean specific force by what is not known of the motion [m/s^2]
     weight=(np.float64, (IMU_COUNT, 2)),  # of the means, angular velocity and specific force
     information=(np.float64, (UNKNOWNS, UNKNOWNS)),
     vector=(np.float64, UNKNOWNS),
@@ -203,7 +204,7 @@ def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: 
         change = max(change, abs(legs[k, 2] - s.acceleration[k]))
         s.acceleration[k] = legs[k, 2]
     s.turning = turning
-    rough = p.window * ((p.ripple * fastest) ** 2 + (_TIMING_S / p.duration * change) ** 2)
+    s.rough = np.sqrt((p.ripple * fastest) ** 2 + (_TIMING_S / p.duration * change) ** 2)
     for k in range(IMU_COUNT):
         # Samples from one side of the window would not be its mean.
         s.counted[k] = _LEAST_SAMPLES * s.samples[k] >= s.collected
@@ -212,7 +213,7 @@ def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: 
         shaken = shaking.excess[ACCELEROMETER, k] + shaking.hidden[k] + shaking.mean[k]
         # What shakes an IMU beyond its noise makes its mean as uncertain.
         s.weight[k, 0] = s.samples[k] / (max(p.variance[0], variance[0, k]) + p.window * (_TIMING_S * turning) ** 2)
-        s.weight[k, 1] = s.samples[k] / (max(p.variance[1], variance[1, k]) + rough + p.window * shaken)
+        s.weight[k, 1] = s.samples[k] / (max(p.variance[1], variance[1, k]) + p.window * (s.rough**2 + shaken))
         for i in range(READINGS):
             s.mean[k, i] = s.sum[k, i] / s.samples[k]
     if s.windows > 0:

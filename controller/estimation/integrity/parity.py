@@ -1,9 +1,13 @@
-"""Parity of the gyroscopes: a large error of an angular velocity is told within two windows of the fault filter.
+"""Parity of the gyroscopes, and of accelerometers with them: large errors are told within two windows of the fault filter.
 
 All gyroscopes see one motion. Mean readings of a window less what the plan predicts, z (21), are J t for an error t (6) of the
 planned twist, so that what least squares leaves, z - J t, is errors of gyroscopes alone. It counts by its length at each IMU. A
-gyroscope is named if the rest agrees without it. Small errors, common ones and those of accelerometers are left to the evidence
-for hypotheses, which takes a tenth of a second: until then they move the pose little.
+gyroscope is named if the rest agrees without it.
+
+From window to window, t changes with the acceleration that was not planned. What the mean forces of both windows say beyond
+that is no motion: vibration, or errors of accelerometers, common ones as well. It makes them count less at once.
+
+Small errors are left to the evidence for hypotheses, which takes a tenth of a second: until then they move the pose little.
 """
 
 from math import radians
@@ -18,7 +22,7 @@ from plant.pose import Array
 _TWIST, _FIRST = 6, 6
 """Size of the twist, and its place in the states of the motion."""
 
-_LIMIT = radians(1.0)
+_LIMIT = radians(0.75)
 """Error of an angular velocity that is told: several times what calibrated gyroscopes have [rad/s]."""
 
 _LATE_S = 1e-3
@@ -27,15 +31,21 @@ _LATE_S = 1e-3
 _WINDOWS = 2
 """In how many windows in a row the limit must be broken."""
 
-_AGREE, _AGREE_OF_ALL = 0.7, 0.15
+_AGREE, _AGREE_OF_ALL = 0.6, 0.15
 """How large the error without the named gyroscope may be: of the limit, and of the error with it."""
 
+_FORCE_LIMIT, _ROUGH_SIGMAS = 0.9, 3.0
+"""Error of a mean force that is told: this [m/s^2], and some standard deviations of what is not known of the motion."""
+
 STATE = record_dtype(
+    off_motion=(np.float64, IMU_COUNT),  # mean force of two windows that is no motion [m/s^2]
     error=np.float64,  # the greatest of an IMU in the last window [rad/s]
     limit=np.float64,  # for it
     off_for=np.int64,  # for how many windows it has been beyond the limit
     worst=np.int64,  # the IMU without which the rest agrees best
     named=np.int64,  # whether it agrees
+    twist_before=(np.float64, _TWIST),  # of the window before
+    force_before=(np.float64, (IMU_COUNT, 3)),  # beyond what the planned acceleration and this twist explain
     normal=(np.float64, (_TWIST, _TWIST)),  # from here on scratch
     twist=(np.float64, _TWIST),
 )
@@ -43,16 +53,21 @@ STATE = record_dtype(
 
 
 @kernel
-def step_parity(s: Record, f: Record, excluded: Array) -> bool:
+def step_parity(s: Record, f: Record, excluded: Array, samples: int, period: float, no_motion: Array) -> bool:
     """Look at the last full window, once its readings are predicted; returns whether gyroscopes contradict each other.
 
     Args:
         s: dtype `STATE`.
         f: dtype `fault_filter.STATE`.
         excluded: (7,), which IMUs have been left out.
+        samples: of an IMU in a window.
+        period: of the samples [s].
+        no_motion: (7,), is written: the variance of a sample that stands for what an accelerometer reads that is no motion
+            [m^2/s^4]; all samples of a window share it. 0 within the limit.
     """
     s.limit = _LIMIT + _LATE_S * f.turning
     s.error = _error_without(s, f, excluded, -1)
+    _compare_forces(s, f, samples, period, no_motion)
     s.off_for = s.off_for + 1 if s.error > s.limit else 0
     if s.off_for < _WINDOWS:
         return False
@@ -100,3 +115,29 @@ def _error_without(s: Record, f: Record, excluded: Array, left_out: int) -> floa
             squared += off * off
         greatest = max(greatest, squared)
     return float(np.sqrt(greatest))
+
+
+@kernel
+def _compare_forces(s: Record, f: Record, samples: int, period: float, no_motion: Array) -> None:
+    """Find what the mean forces of this window and the last one say beyond the change of the twist between them."""
+    follows = f.windows > 1
+    for k in range(IMU_COUNT):
+        s.off_motion[k] = no_motion[k] = 0.0
+        if f.counted[k] == 0:
+            continue
+        squared = 0.0
+        for m in range(3):
+            row = f.jacobian[k, 3 + m]
+            off = f.mean[k, 3 + m] - f.predicted[k, 3 + m]
+            for i in range(_TWIST):
+                off -= row[_FIRST + i] * s.twist[i]
+            beyond = 0.5 * (off + s.force_before[k, m])
+            s.force_before[k, m] = off
+            for i in range(_TWIST):
+                beyond -= row[_FIRST + _TWIST + i] * (s.twist[i] - s.twist_before[i]) / (samples * period)
+            squared += beyond * beyond
+        if follows:
+            s.off_motion[k] = np.sqrt(squared)
+            if s.off_motion[k] > _FORCE_LIMIT + _ROUGH_SIGMAS * f.rough:
+                no_motion[k] = samples * squared
+    s.twist_before[:] = s.twist

@@ -23,7 +23,6 @@ import numpy as np
 from controller.estimation.integrity.fault_filter import FAULTS
 from controller.least_squares import factor_cholesky, solve_cholesky
 from plant.compiled import Record, kernel, record_dtype
-from plant.pose import Array
 
 POSE = 6
 _CHANCE = 8.0

@@ -86,7 +86,9 @@ def step_integrity(p: Record, s: Record, rig: Record, time: Record, imus: Record
     took = fault_filter.step_fault_filter(p.filter, s.filter, rig.sensors, imus, time.missed, pose, legs)
     if s.filter.job > 0 and s.compared != s.filter.windows:
         s.compared = s.filter.windows
-        s.contradicts = s.filter.windows > 0 and parity.step_parity(s.parity, s.filter, imus.excluded)
+        s.contradicts = s.filter.windows > 0 and parity.step_parity(
+            s.parity, s.filter, imus.excluded, p.filter.window, rig.period, imus.shaking.no_motion
+        )  # fmt: skip
     if s.step == 0 and not (took and s.filter.windows >= _FIRST_WINDOWS):
         return
     s.cycle += 1
