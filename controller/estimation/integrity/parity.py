@@ -34,6 +34,7 @@ _WINDOWS = 2
 _AGREE, _AGREE_OF_ALL = 0.6, 0.15
 """How large the error without the named gyroscope may be: of the limit, and of the error with it."""
 
+_SHARE = 0.25
 _FORCE_LIMIT, _ROUGH_SIGMAS = 0.9, 3.0
 """Error of a mean force that is told: this [m/s^2], and some standard deviations of what is not known of the motion."""
 
@@ -44,6 +45,8 @@ STATE = record_dtype(
     off_for=np.int64,  # for how many windows it has been beyond the limit
     worst=np.int64,  # the IMU without which the rest agrees best
     named=np.int64,  # whether it agrees
+    steady=np.float64,  # greatest of those, averaged over some windows [m/s^2]
+    average=(np.float64, (IMU_COUNT, 3)),  # of them, in the axes of the IMUs [m/s^2]
     twist_before=(np.float64, _TWIST),  # of the window before
     force_before=(np.float64, (IMU_COUNT, 3)),  # beyond what the planned acceleration and this twist explain
     normal=(np.float64, (_TWIST, _TWIST)),  # from here on scratch
@@ -121,6 +124,7 @@ def _error_without(s: Record, f: Record, excluded: Array, left_out: int) -> floa
 def _compare_forces(s: Record, f: Record, samples: int, period: float, no_motion: Array) -> None:
     """Find what the mean forces of this window and the last one say beyond the change of the twist between them."""
     follows = f.windows > 1
+    s.steady = 0.0
     for k in range(IMU_COUNT):
         s.off_motion[k] = no_motion[k] = 0.0
         if f.counted[k] == 0:
@@ -136,6 +140,8 @@ def _compare_forces(s: Record, f: Record, samples: int, period: float, no_motion
             for i in range(_TWIST):
                 beyond -= row[_FIRST + _TWIST + i] * (s.twist[i] - s.twist_before[i]) / (samples * period)
             squared += beyond * beyond
+            s.average[k, m] += _SHARE * (beyond - s.average[k, m]) if follows else 0.0
+        s.steady = max(s.steady, np.sqrt(s.average[k, 0]**2+s.average[k, 1]**2+s.average[k, 2]**2))
         if follows:
             s.off_motion[k] = np.sqrt(squared)
             if s.off_motion[k] > _FORCE_LIMIT + _ROUGH_SIGMAS * f.rough:
