@@ -240,26 +240,35 @@ def run_stages(
         t = _mark(m, CycleStage.MECHANISM, t)
     if first <= CycleStage.INTEGRITY < last:
         if s.pose.found != 0:
-            integrity.step_integrity(p.integrity, s.integrity, rig, time, s.imus, s.pose, s.reference.motion)
-        if s.integrity.contradicts != 0 and watch.judge_parity(
-            p.safety, s.safety, rig, time, s.imus, s.integrity.parity, s.reference, s.pid
-        ):  # fmt: skip
-            trust.restart_filter(s.mechanism, time, s.pose)
-            integrity.restart_integrity(s.integrity)
-        if s.integrity.fresh != 0:
-            level = s.integrity.protection
-            trust.find_covariance(p.mechanism, s.mechanism, rig, time, s.pose, level.scratch, level.covariance)
-            end_level(level, level.covariance)
-            watch.check_level(p.safety, s.safety, rig, time, level.level, s.reference, s.pid)
-            if watch.judge_evidence(p.safety, s.safety, rig, time, s.imus, s.integrity, s.reference, s.pid):
-                trust.restart_filter(s.mechanism, time, s.pose)
-                integrity.restart_integrity(s.integrity)
+            _check_integrity(parameters, state)
         t = _mark(m, CycleStage.INTEGRITY, t)
     cause = Cause.NONE.value
     if first <= CycleStage.CONTROL < last:
         cause = _control(parameters, state, segments) if s.pose.found != 0 else _lose_pose(parameters, state)
         _mark(m, CycleStage.CONTROL, t)
     return cause
+
+
+@kernel
+def _check_integrity(parameters: Record, state: Record) -> None:
+    """Look for faults in the samples of the cycle, and react to what has been found with them."""
+    p, s = parameters[()], state[()]
+    rig, time = p.rig, s.time
+    integrity.step_integrity(p.integrity, s.integrity, rig, time, s.imus, s.pose, s.reference.motion)
+    changed = s.integrity.contradicts != 0 and watch.judge_parity(
+        p.safety, s.safety, rig, time, s.imus, s.integrity.parity, s.reference, s.pid
+    )
+    if changed:
+        trust.restart_filter(s.mechanism, time, s.pose)
+        integrity.restart_integrity(s.integrity)
+    if s.integrity.fresh != 0:
+        level = s.integrity.protection
+        trust.find_covariance(p.mechanism, s.mechanism, rig, time, s.pose, level.scratch, level.covariance)
+        end_level(level, level.covariance)
+        watch.check_level(p.safety, s.safety, rig, time, level.level, s.reference, s.pid)
+        if watch.judge_evidence(p.safety, s.safety, rig, time, s.imus, s.integrity, s.reference, s.pid):
+            trust.restart_filter(s.mechanism, time, s.pose)
+            integrity.restart_integrity(s.integrity)
 
 
 @kernel
