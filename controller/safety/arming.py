@@ -41,7 +41,7 @@ STATE = record_dtype(
     drift=(np.float64, LEGS),  # by how much it has changed from that of the window before [m]
     approach=(np.float64, (LEGS, APPROACH_SEGMENTS, 5)),  # the reference of the way to the start of the target
     approach_cycles=np.int64,  # how long that takes
-    evidence=(np.float64, 2),  # for a fault, of the last evaluation of the last second, and of the last one of what was learned
+    evidence=(np.float64, 2),  # for a fault, of the last evaluation of recent readings, and of the last one of what was learned
     blamed=(np.int64, 2),  # the IMU that it is against; -1 if it is against all
 )
 """How arming goes."""

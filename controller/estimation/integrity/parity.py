@@ -1,9 +1,9 @@
 """Parity of the gyroscopes: a large error of an angular velocity is told within two windows of the fault filter.
 
-All gyroscopes see one motion. Mean readings of a window less what the plan predicts, z (21), are J t for an error t (6) of the
-planned twist, so that what least squares leaves, z - J t, is errors of gyroscopes alone. It counts by its length at each IMU. A
-gyroscope is named if the rest agrees without it. Small errors, common ones and those of accelerometers are left to the evidence
-for hypotheses, which takes a tenth of a second: until then they move the pose little.
+All gyroscopes see one motion. Let z (21) be the mean readings of a window less those of the planned motion. If the planned
+twist is wrong by t (6), sound gyroscopes give z = J t. So what least squares leaves, z - J t, shows errors of gyroscopes
+alone. Its length at each IMU counts. A gyroscope is named if the rest agrees without it. Small errors, common ones and those
+of accelerometers are left to the evidence for hypotheses, which takes 0.1 to 0.2 s. Until then they move the pose little.
 """
 
 from math import radians
@@ -22,7 +22,7 @@ _LIMIT = radians(2.0)
 """Error of an angular velocity that is told: several times what calibrated gyroscopes have [rad/s]."""
 
 _LATE_S = 1e-3
-"""By how much of the angular acceleration the limit is larger, as sample times and angular velocities are uncertain [s]."""
+"""The limit grows by the angular acceleration times this, as the times of samples are uncertain [s]."""
 
 _WINDOWS = 2
 """In how many windows in a row the limit must be broken."""

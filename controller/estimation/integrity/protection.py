@@ -1,16 +1,17 @@
 """The protection level: how far the pose may be off, fault or none.
 
-As satellite navigation has it (RAIM), the level counts what a fault could do unseen, and the worst hypothesis gives it. With
-the error m of the pose from C_mm m + C_mf f = c_m (`evidence`, errors learned eliminated), a hypothesis D with its most likely
-sizes a, of covariance (D^T W D)^-1, moves the pose by -C_mm^-1 C_mf D a, of covariance V, and leaves it off by
-m = C_mm^-1 (c_m - C_mf D a). Its evidence exceeds the number n of its directions by e; chance alone hardly ever lifts e to 6.
+As satellite navigation has it (RAIM), the level counts what a fault could do unseen, and the worst hypothesis gives it.
+`evidence` leaves C_mm m + C_mf f = c_m for the error m of the pose. The most likely sizes a of a hypothesis D have the
+covariance (D^T W D)^-1. Such a fault moves the pose by -C_mm^-1 C_mf D a, of covariance V, and leaves it off by
+m = C_mm^-1 (c_m - C_mf D a). Let e be its evidence less the number of its directions: by chance, e hardly ever exceeds 6.
 
     no fault       |C_mm^-1 c_m|
-    unseen fault   sqrt(max(e, 1/2) tr V): what could be there by its odds, few where readings would show it
+    unseen fault   sqrt(max(e, 1/2) tr V): what could be there unseen; little where the readings would show it
     seen fault     sqrt(e tr V) + 3 |m|, for e > 6
 
-The 3 is for faults that grow: one is larger at the end of the filter's memory than on average, and has moved the pose before.
-The level is the root of the squares of the greatest of these and of 2.2 standard deviations of the pose as its filter has it.
+The 3 is for faults that grow: such a fault is larger at the end of the filter's memory than on average over it, and has moved
+the pose before. The level is the root of the squares of the greatest of these and of 2.2 standard deviations of the pose as
+its filter has it.
 """
 
 import numpy as np
@@ -25,12 +26,13 @@ _CHANCE = 6.0
 """By how much the evidence may exceed the number of directions by chance."""
 
 _UNSEEN = 0.5
-"""What counts as evidence for a fault for which there is none."""
+"""Evidence ascribed to a fault for which there is less [-]."""
 
 _GROWN = 3.0
-"""How many times the mean error within the last second the present one may be."""
+"""By which factor the present error may exceed the mean one within the fault filter's memory."""
 
 _SIGMAS = 2.2
+"""So many standard deviations of the pose, as its own filter has it, count in the level."""
 
 STATE = record_dtype(
     level=(np.float64, 2),  # of position [m] and rotation [rad], of the last complete evaluation

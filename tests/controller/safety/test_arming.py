@@ -183,7 +183,7 @@ def test_evidence_is_told_in_the_cycle_of_its_evaluation_alone(hexapod):
 @pytest.mark.parametrize("blamed", [-1, 3])
 @pytest.mark.parametrize("kind", [0, 1])
 def test_evidence_of_either_kind_prevents_arming(hexapod, kind, blamed):
-    """That of the last second, and that of all that was learned; the other evaluations are silent meanwhile."""
+    """That of the last half second, and that of all that was learned; the other evaluations are silent meanwhile."""
     bench = Bench(hexapod)
     bench.steps(bench.hold - 1)
     limit = float(bench.parameters["safety"]["watch"]["evidence"])
