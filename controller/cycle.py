@@ -48,6 +48,8 @@ from plant.pose import Array
 from plant.stopwatch import now
 
 _LEAST_GRAVITY = 0.1
+_LEAST_EVIDENCE_HZ = 125.0
+"""Below this rate the motion between two commands is not known well enough for sound IMUs to agree with it."""
 
 PARAMETERS = record_dtype(
     rig=RIG,
@@ -144,7 +146,8 @@ def cycle_parameters(
         to_arm: whether the drives are enabled; else everything is read and nothing moves.
 
     Raises:
-        InputError: a rate out of range, an IMU that cannot be, or IMUs that do not determine the pose.
+        InputError: a rate out of range, an IMU that cannot be, IMUs that do not determine the pose, or a limit of the
+            protection level where there is none.
     """
     check_rate(rate)
     check_imus(mechanism, imus, magnetometer, section_5)
@@ -158,7 +161,13 @@ def cycle_parameters(
     present = imus_of(mechanism, imus)
     errors, of_heading = (calibration.covariance, calibration.floor), field if magnetometer else None
     filtered = filter_parameters(fusion, rate, whole, *errors, of_heading)
-    watch_evidence = bool(watched.watch_imus) and not mechanism.planar and not section_5
+    able = not mechanism.planar and not section_5 and rate >= _LEAST_EVIDENCE_HZ
+    if watched.watch_imus and not able and min(watched.protection_position, watched.protection_rotation) < np.inf:
+        raise InputError(
+            f"[safety] limits the protection level, which there is only in space, from {_LEAST_EVIDENCE_HZ:g} Hz on (this is "
+            f"{rate:g} Hz) and without the paper's section 5: leave out protection_position and protection_rotation"
+        )
+    watch_evidence = bool(watched.watch_imus) and able
     return filled(
         PARAMETERS,
         rig=rig_parameters(mechanism, rate, control.hold, calibration.tilt),
