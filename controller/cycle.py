@@ -48,6 +48,8 @@ from plant.pose import Array
 from plant.stopwatch import now
 
 _LEAST_GRAVITY = 0.1
+_LEAST_EVIDENCE_HZ = 125.0
+"""Below this rate the motion between two commands is not known well enough for sound IMUs to agree with it."""
 
 PARAMETERS = record_dtype(
     rig=RIG,
@@ -144,7 +146,8 @@ def cycle_parameters(
         to_arm: whether the drives are enabled; else everything is read and nothing moves.
 
     Raises:
-        InputError: a rate out of range, an IMU that cannot be, or IMUs that do not determine the pose.
+        InputError: a rate out of range, an IMU that cannot be, IMUs that do not determine the pose, or a limit of the
+            protection level where there is none.
     """
     check_rate(rate)
     check_imus(mechanism, imus, magnetometer, section_5)
@@ -158,7 +161,13 @@ def cycle_parameters(
     present = imus_of(mechanism, imus)
     errors, of_heading = (calibration.covariance, calibration.floor), field if magnetometer else None
     filtered = filter_parameters(fusion, rate, whole, *errors, of_heading)
-    watch_evidence = bool(watched.watch_imus) and not mechanism.planar and not section_5
+    able = not mechanism.planar and not section_5 and rate >= _LEAST_EVIDENCE_HZ
+    if watched.watch_imus and not able and min(watched.protection_position, watched.protection_rotation) < np.inf:
+        raise InputError(
+            f"[safety] limits the protection level, which there is only in space, from {_LEAST_EVIDENCE_HZ:g} Hz on (this is "
+            f"{rate:g} Hz) and without the paper's section 5: leave out protection_position and protection_rotation"
+        )
+    watch_evidence = bool(watched.watch_imus) and able
     return filled(
         PARAMETERS,
         rig=rig_parameters(mechanism, rate, control.hold, calibration.tilt),
@@ -242,27 +251,37 @@ def run_stages(
         t = _mark(m, CycleStage.MECHANISM, t)
     if first <= CycleStage.INTEGRITY < last:
         if s.pose.found != 0:
-            integrity.step_integrity(p.integrity, s.integrity, rig, time, s.imus, s.pose, s.reference.motion)
-        if s.integrity.contradicts != 0 and watch.judge_parity(
-            p.safety, s.safety, rig, time, s.imus, s.integrity.parity, s.reference, s.pid
-        ):  # fmt: skip
-            trust.restart_filter(s.mechanism, time, s.pose)
-            integrity.restart_integrity(s.integrity)
-        if s.integrity.fresh != 0:
-            level = s.integrity.protection
-            trust.find_closed_covariance(s.pose, level.scratch, level.covariance[0])
-            trust.find_covariance(p.mechanism, s.mechanism, rig, time, s.pose, level.scratch, level.covariance[1])
-            end_level(level, time.cycle * rig.period)
-            watch.check_level(p.safety, s.safety, rig, time, level.level, s.reference, s.pid)
-            if watch.judge_evidence(p.safety, s.safety, rig, time, s.imus, s.integrity, s.reference, s.pid):
-                trust.restart_filter(s.mechanism, time, s.pose)
-                integrity.restart_integrity(s.integrity)
+            _check_integrity(parameters, state)
         t = _mark(m, CycleStage.INTEGRITY, t)
     cause = Cause.NONE.value
     if first <= CycleStage.CONTROL < last:
         cause = _control(parameters, state, segments) if s.pose.found != 0 else _lose_pose(parameters, state)
         _mark(m, CycleStage.CONTROL, t)
     return cause
+
+
+@kernel
+def _check_integrity(parameters: Record, state: Record) -> None:
+    """Look for faults in the samples of the cycle, and react to what has been found with them."""
+    p, s = parameters[()], state[()]
+    rig, time = p.rig, s.time
+    integrity.step_integrity(p.integrity, s.integrity, rig, time, s.imus, s.pose, s.reference.motion)
+    changed = s.integrity.contradicts != 0 and watch.judge_parity(
+        p.safety, s.safety, rig, time, s.imus, s.integrity.parity, s.reference, s.pid
+    )
+    if changed:
+        trust.restart_filter(s.mechanism, time, s.pose)
+        integrity.restart_integrity(s.integrity)
+    if s.integrity.evaluations > 0:
+        watch.check_level(p.safety, s.safety, rig, time, s.integrity.protection.level, s.reference, s.pid)
+    if s.integrity.fresh != 0:
+        level = s.integrity.protection
+        trust.find_closed_covariance(s.pose, level.scratch, level.covariance[0])
+        trust.find_covariance(p.mechanism, s.mechanism, rig, time, s.pose, level.scratch, level.covariance[1])
+        end_level(level, time.cycle * rig.period)
+        if watch.judge_evidence(p.safety, s.safety, rig, time, s.imus, s.integrity, s.reference, s.pid):
+            trust.restart_filter(s.mechanism, time, s.pose)
+            integrity.restart_integrity(s.integrity)
 
 
 @kernel

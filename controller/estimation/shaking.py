@@ -1,11 +1,13 @@
 """Vibration, shocks and clipped readings: how uncertain each sensor's reading is in this cycle, for all filters.
 
 The filters know what a sensor should read: an accelerometer gravity and the motion that the gyroscopes show, a leg's gyroscope
-the motion so far. What it reads beyond that, more than noise and the filter's own uncertainty explain, is vibration, a shock or
-a fault. Its square is added to the variance of the reading, so that the filters go on with the other sensors for as long as it
-lasts. That needs no knowledge of its frequency. What an accelerometer reads below that limit counts on average, too: readings
-of a vibration that happen to be near zero, unlike those between shocks. So does what the mean forces of a few samples show
-that is no motion of the gyroscopes together (`integrity.parity`): a vibration that aliases to a slow one, a common error.
+the motion so far. If it reads more than noise and the filter's own uncertainty explain, that is vibration, a shock or a fault.
+The square of this excess is added to the variance of the reading. So the filters go on with the other sensors for as long as it
+lasts, whatever its frequency is.
+
+Some readings of a vibration happen to be near what is expected, and have no excess. They are not better for that, so the mean
+square of such readings counts as well. Between shocks it is small. Mean forces of some samples that are no motion of all
+gyroscopes (`integrity.parity`) count, too: a vibration that aliases to a slow one, or an error that accelerometers share.
 
 A reading at the end of its sensor's range is clipped. It says nothing, and the others bridge it.
 """
@@ -20,7 +22,7 @@ from plant.imu_wiring import IMU_COUNT
 from plant.pose import Array
 
 MEMORY_S = 0.002
-"""Time in which the excess of a reading fades to the share 1/e: sensors' low-passes let a shock fade so."""
+"""Time constant with which the excess of a reading fades, as a shock does in the sensors' low-passes [s]."""
 
 AVERAGE_S = 0.3
 """Time constant of the mean square that is told [s]."""
@@ -35,7 +37,7 @@ SAYS_NOTHING = 1e4
 """Variance of a clipped reading [m^2/s^4, rad^2/s^2]: so much more than that of any other that it does not count."""
 
 _CALM_SHARE = 0.5
-"""Below this share of the limit nothing shakes."""
+"""Below this share of the limit the IMUs count as calm."""
 
 PARAMETERS = record_dtype(
     limit=np.float64,  # of vibration, RMS, from which on it is told [m/s^2]

@@ -41,6 +41,8 @@ STATE = record_dtype(
     drift=(np.float64, LEGS),  # by how much it has changed from that of the window before [m]
     approach=(np.float64, (LEGS, APPROACH_SEGMENTS, 5)),  # the reference of the way to the start of the target
     approach_cycles=np.int64,  # how long that takes
+    evidence=(np.float64, 2),  # for a fault, of the last evaluation of recent readings, and of the last one of what was learned
+    blamed=(np.int64, 2),  # the IMU that it is against; -1 if it is against all
 )
 """How arming goes."""
 
@@ -90,15 +92,18 @@ def run_arming_checks(
     a = s.arming
     if s.mode == Mode.IDLE:
         _take_lengths(p.arming, a, pose.lengths)
+    if integrity.fresh != 0:
+        kind = integrity.evidence.of_learned
+        a.evidence[kind], a.blamed[kind] = integrity.best_evidence, integrity.blamed
     if time.cycle < rig.hold_cycles or s.mode > Mode.ARMED:
         return
     if s.mode == Mode.IDLE:
-        a.obstacle, a.index, a.value, a.limit = _find_obstacle(p, s, rig, imu_parameters, imus, integrity, pose, pid)
+        a.obstacle, a.index, a.value, a.limit = _find_obstacle(p, s, rig, imu_parameters, imus, pose, pid)
         if a.obstacle == Cause.NONE and p.arming.active != 0:
             s.mode, s.request = Mode.ARMED, Request.ENABLED
             report_event(s.events, Cause.ARMED, -1, np.nan, np.nan)
     if s.mode == Mode.ARMED:
-        a.obstacle, a.index, a.value, a.limit = _find_obstacle(p, s, rig, imu_parameters, imus, integrity, pose, pid)
+        a.obstacle, a.index, a.value, a.limit = _find_obstacle(p, s, rig, imu_parameters, imus, pose, pid)
         if a.obstacle != Cause.NONE:
             # The drives are enabled already, so arming does not wait here.
             handle_cause(p, s, rig, time, reference, pid, a.obstacle, a.index, a.value, a.limit)
@@ -179,17 +184,19 @@ def _unanswered_for(watch: Record) -> float:
 
 @kernel
 def _find_obstacle(
-    p: Record, s: Record, rig: Record, imu_parameters: Record, imus: Record, integrity: Record, pose: Record, pid: Record
+    p: Record, s: Record, rig: Record, imu_parameters: Record, imus: Record, pose: Record, pid: Record
 ) -> tuple[int, int, float, float]:
     """The first obstacle: a `Cause` with its leg or IMU, value and limit."""
     # Without answers, nothing below is about the present.
     if s.watch.unanswered > 0:
         return Cause.BUS_LOST.value, -1, _unanswered_for(s.watch), 0.0
     lost, lengths, error = 0, pose.lengths, pid.error
-    if integrity.evaluations > 0 and integrity.best_evidence > p.watch.evidence:
-        blamed = integrity.blamed
+    # The two take turns: a fault that is there from the start shows in the first alone, until it has been learned.
+    most = 0 if s.arming.evidence[0] > s.arming.evidence[1] else 1
+    if s.arming.evidence[most] > p.watch.evidence:
+        blamed = s.arming.blamed[most]
         cause = Cause.NO_TRUST.value if blamed < 0 else Cause.NO_SENSORS.value
-        return cause, blamed, np.sqrt(integrity.best_evidence), np.sqrt(p.watch.evidence)
+        return cause, blamed, np.sqrt(s.arming.evidence[most]), np.sqrt(p.watch.evidence)
     for k in range(IMU_COUNT):
         off = contradiction(s.monitor, k)
         if not off <= p.monitor.disagreement:

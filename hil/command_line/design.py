@@ -167,12 +167,14 @@ def gough_sensor_sets(options: Namespace) -> None:
 def gough_detectability(options: Namespace) -> int:
     """Compute how far off a pose can be before any test could tell.
 
-    For each row of the disturbances of gough faults, the likelihood-ratio test of this fault against none, on the same data:
-    accelerometers, gyroscopes and the drives' model, with less than one false alarm in 100 h. Prints when it tells the fault
-    with a probability of 99.9 %, how much of the fault is there then, and the error of the pose until then [mm / deg]: 99.9 %
-    of all errors are smaller, and what the fault does alone; 1.5 times this error, and the limit for faults of few IMUs (3 mm,
-    0.7 deg) or shared ones (5 mm, 1 deg) where that is greater; the least share of the fault that would be told in the run,
-    and the error by it.
+    For each row of the disturbances of gough faults, this is the likelihood-ratio test of the fault against none. It has the
+    data of the loop: accelerometers, gyroscopes and the drives' model. It gives less than one false alarm in 100 h.
+
+    The table has: when the test tells the fault with a probability of 99.9 % [s], and how much of the fault is there then; the
+    error of the pose until then [mm / deg], of which 99.9 % of all errors are below, and the part that the fault alone
+    contributes; 1.5 times this error; the limit, which is that or, if greater, 3 mm and 0.7 deg for faults of few IMUs and
+    5 mm and 1 deg for shared ones; the least share of the fault that would be told in the run, and the error by it.
+
     With --measured, the exit status is 1 if an error until something was told is beyond the limit. Nothing is simulated.
     """
     from hil.faults.bounds import bounds_of_rows, left_out, read_figures, summary, table

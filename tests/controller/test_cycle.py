@@ -669,6 +669,17 @@ def test_too_little_gravity_is_refused(hexapod, gravity, told):
 # ------------------------------------------------------------------------------------------------------- around the cycle
 
 
+def test_a_limit_of_the_protection_level_needs_one(hexapod):
+    settings, limited = (control_settings(hexapod), fusion_settings(hexapod)), SafetySettings(protection_rotation=0.01)
+    for rate, active in ((124.0, 0), (125.0, 1)):
+        assert cycle_parameters(hexapod, rate, *settings)["integrity"]["filter"]["active"] == active
+    cycle_parameters(hexapod, 125.0, *settings, safety=limited)
+    with pytest.raises(InputError, match=r"from 125 Hz on \(this is 124 Hz\).*leave out protection_position"):
+        cycle_parameters(hexapod, 124.0, *settings, safety=limited)
+    # Raw IMUs are not watched, as whoever runs them says.
+    cycle_parameters(hexapod, 124.0, *settings, safety=limited.for_raw_imus())
+
+
 def test_missed_periods_are_counted_and_forgotten_with_the_next_cycle():
     state = np.zeros((), STATE)
     state["time"]["cycle"] = 7

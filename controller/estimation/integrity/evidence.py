@@ -1,19 +1,21 @@
-"""The evidence for faults that have come up: the last second against all that was learned before.
+"""The evidence for faults that have come up: the last half second is compared with all that was learned before.
 
 What was learned of the sensors' constant errors b, Y_b with right side y_b, begins with the calibration's uncertainty. The last
-second, as the fault filter has it, sees b + f, where f has come up since. Together, with the error m of the motion,
+half second, as the fault filter has it, sees b + f, where f has come up since. Together, with the error m of the motion,
 
     [ Y_ff + Y_b   Y_fm   Y_ff ] [b]   [ y_f + y_b ]
     [ Y_mf         Y_mm   Y_mf ] [m] = [ y_m       ]
     [ Y_ff         Y_fm   Y_ff ] [f]   [ y_f       ]
 
-Elimination of b leaves what ties the pose to faults; elimination of m, too, leaves W f = w. The logarithm of the likelihood
-of a fault f is w^T f - f^T W f / 2 more than that of none. For faults f = D a in some directions D with any sizes a, twice its
-greatest value is (D^T w)^T (D^T W D)^-1 (D^T w): the generalised likelihood ratio of Willsky and Jones (1976), for a fault that
-came up within the last second. Where nothing can be seen, W is nearly zero, and there is no evidence.
+Elimination of b leaves what ties the pose to faults. Elimination of m as well leaves W f = w. A fault f has the likelihood of
+no fault times exp(w^T f - f^T W f / 2). For faults f = D a in some directions D with any sizes a, twice the greatest value of
+this exponent is (D^T w)^T (D^T W D)^-1 (D^T w). That is twice the logarithm of the generalised likelihood ratio of Willsky and
+Jones (1976), for a fault that came up within the last half second. Where the readings do not show a fault, W is nearly zero,
+and there is no evidence.
 
-What comes up too slowly for that is learned. So after each time of learning, all that was learned takes the place of the last
-second once, and the calibration, as far as it is relied upon, that of what was learned before.
+What comes up too slowly for that is learned. So after each time of learning there is one evaluation of another kind: all that
+was learned takes the place of the last half second, and the calibration, as far as it is relied upon, that of what was
+learned.
 
 The errors of an IMU that has been left out are eliminated as well: whatever it reads is no evidence for anything else.
 """
@@ -34,39 +36,40 @@ REST = MOTION_STATES - POSE
 _SIZE = 2 * FAULTS + POSE
 
 _LEARNING_S, _LATE = 0.5, 2
-"""How often what is learned grows, and how many times as late: a fault is not learned before it is told [s]."""
+"""What is learned grows every `_LEARNING_S` seconds, by what was read `_LATE` times as long ago. So a fault is told before it
+is learned.
+"""
 
 EVALUATION_WINDOWS = 10
 """How many windows of the fault filter an evaluation takes."""
 
 _LEARNED_S = 10.0
-"""For how long what was learned counts [s]."""
+"""Time constant with which what was learned fades [s]."""
 
 _POSE_ERRORS = 1.5e-4, 3e-3
-"""Standard deviation of what looks like another error of a sensor at another pose [rad/s, m/s^2].
-
-Errors of joints, scales and axes do.
+"""By how much a sensor's constant error seems to change from pose to pose, because of errors of joints, scales and axes:
+standard deviations of a gyroscope and an accelerometer [rad/s, m/s^2].
 """
 
 _LARGEST = 0.1, 5.0
-"""A fault that nothing can tell is of this size: a larger one tells itself [rad/s, m/s^2]."""
+"""Standard deviation of a fault about which the readings say nothing [rad/s, m/s^2]."""
 
 _AGED = radians(1.0), 0.015
-"""A calibration is not relied upon to be better than this for long [rad/s, m/s^2]."""
+"""Least standard deviation of the calibration when all that was learned is compared with it [rad/s, m/s^2]."""
 
 _STILL = 0.8
-"""What is left of the evidence against an IMU that has been left out in the next evaluation."""
+"""Share of the evidence against an IMU that has been left out which still counts in the next evaluation."""
 
 _LEAST_PIVOT = 1e-9
 
 PARAMETERS = record_dtype(
     prior=(np.float64, (FAULTS, FAULTS)),  # information on the sensors' errors before anything is read
-    aged=(np.float64, (FAULTS, FAULTS)),  # the same for what is learned over many seconds
+    aged=(np.float64, (FAULTS, FAULTS)),  # the same, when all that was learned is compared with it
     learning_windows=np.int64,  # between two times of learning
-    share=np.float64,  # of the last second's information that is new at such a time
+    share=np.float64,  # of the information of the last half second that is new at such a time
     keep=np.float64,  # what is left of the information that was learned before
-    stiffness=(np.float64, 2),  # inverse variance of what looks like another error of a sensor at another pose
-    least=(np.float64, 2),  # information on a fault that nothing tells
+    stiffness=(np.float64, 2),  # inverse variance of the change of a constant error from pose to pose
+    least=(np.float64, 2),  # information on a fault about which the readings say nothing
 )
 """Constants."""
 
@@ -84,9 +87,9 @@ STATE = record_dtype(
     order=(np.int64, IMU_COUNT),  # of the IMUs in the matrices, those that are left out first
     place=(np.int64, IMU_COUNT),  # of each IMU in that order
     apart=np.int64,  # how many are left out
-    recent=(np.float64, (UNKNOWNS, UNKNOWNS + 1)),  # the last second: rest of the motion, pose, faults
+    recent=(np.float64, (UNKNOWNS, UNKNOWNS + 1)),  # the last half second: rest of the motion, pose, faults
     system=(np.float64, (_SIZE, _SIZE + 1)),  # the whole: errors learned, pose, faults
-    pose_information=(np.float64, (POSE, POSE)),  # of the whole without the errors learned: of the pose's error, lower triangle
+    pose_information=(np.float64, (POSE, POSE)),  # on the pose's error, when the errors learned are eliminated; lower triangle
     pose_by_fault=(np.float64, (POSE, FAULTS)),  # what ties it to the faults
     pose_vector=(np.float64, POSE),
     weight=(np.float64, (FAULTS, FAULTS)),  # W, in that order
@@ -104,8 +107,8 @@ _APART = _BUILD + 1 + FAULTS
 _TAKE = _APART + 1 + POSE
 _LEARN = _TAKE + 1
 STEPS = _LEARN + 1 + IMU_COUNT
-"""Steps of an evaluation: copying the last second, eliminating the rest of its motion, putting the system together, eliminating
-the errors learned and what is left out, keeping what ties the pose to faults, eliminating the pose, and learning.
+"""Steps of an evaluation: copying the last half second, eliminating the rest of its motion, putting the system together,
+eliminating the errors learned and what is left out, keeping what ties the pose to faults, eliminating the pose, and learning.
 """
 
 
@@ -216,7 +219,7 @@ def _copy_recent(s: Record, information: Array, vector: Array) -> None:
 
 @kernel
 def _copy_learned(p: Record, s: Record) -> None:
-    """Take all that was learned in place of the last second."""
+    """Take all that was learned in place of the last half second."""
     s.recent[:] = 0.0
     for i in range(FAULTS):
         known, row = READINGS * s.order[i // READINGS] + i % READINGS, s.recent[MOTION_STATES + i]
@@ -325,7 +328,7 @@ def _take_weight(p: Record, s: Record) -> None:
 def _evidence_still(s: Record, at: int) -> float:
     """The evidence of the last evaluations against the IMU at a place in the order, which has been left out.
 
-    What it reads wrong may change from window to window, so an evaluation knows it from one window, and several are added.
+    What it reads wrong may change from window to window, so one evaluation knows little of it. Several are added.
     """
     first, found = _fault_row(s, READINGS * at), 0.0
     kept, scratch = s.apart_system[s.order[at]], s.apart_scratch
@@ -355,7 +358,7 @@ def evidence_against(s: Record, at: int) -> float:
 
 @kernel
 def _learn(p: Record, s: Record) -> None:
-    """Every half second, learn what the last second said of the sensors' errors a second ago."""
+    """Every `_LEARNING_S`, learn what was read of the sensors' errors `_LATE` times as long ago."""
     s.windows += EVALUATION_WINDOWS
     if s.windows < p.learning_windows or s.of_learned != 0:
         return

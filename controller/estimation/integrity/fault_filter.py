@@ -5,11 +5,12 @@ The loop has a pose, whichever fusion found it. The truth is off by a small erro
 information form: Y x = y for x = (m, f), which begins with nothing known. Of a window of T seconds,
 
     carry    Y <- Phi^-T Y Phi^-1, y <- Phi^-T y + Y d      Phi: constant acceleration; d: how the loop's pose left that path
-    forget   Y <- Y - Z^T Z, y <- y - Z^T u                 white jerk; then Y and y fade with a time constant of 1 s
+    forget   Y <- Y - Z^T Z, y <- y - Z^T u                 white jerk; then Y and y fade with `MEMORY_S`
     update   Y <- Y + H^T R^-1 H, y <- y + H^T R^-1 z       z: mean reading less what the loop's pose predicts; H = (J, 1)
 
-so that Y and y hold what the last second says about f, and how much the pose depends on that. The filter feeds nothing: no
-fault of its own can bend the pose. The work of a window is spread over the cycles of the next one.
+so that Y and y hold what the last half second says about f, and how much the pose depends on that. No other part of the loop
+uses this filter's estimate, so that no fault of its own can bend the pose. The work of a window is spread over the cycles of
+the next one.
 """
 
 import numpy as np
@@ -39,22 +40,24 @@ FAULTS = IMU_COUNT * READINGS
 UNKNOWNS = MOTION_STATES + FAULTS
 
 _WINDOW_S = 0.01
-_LEAST_HZ = 120.0
-"""At lower rates the steps of the commands look like faults, and the filter does not run."""
-
 MEMORY_S = 0.5
+"""Time constant with which information fades [s]."""
+
 _RIPPLE_HZ = 150.0
-"""At this rate, the steps of the commands would make a sample of the acceleration as wrong as it is large."""
+"""At this rate of the loop [Hz], the steps of the commands make a sample of the acceleration as wrong as it is large."""
 
 _LEAST_SAMPLES = 2.5
-"""Into how many parts the samples that an IMU gives may divide a window: IMUs may be half as fast as the loop."""
+"""An IMU counts in a window if it gives a sample at least every so many cycles: it may be half as fast as the loop."""
 
 _TIMING_S = 3e-4
-"""How far the times of samples may be off: IMUs have clocks of their own [s]."""
+"""How far the times of samples may be off, as IMUs have clocks of their own [s]."""
 
 _JERKS, _NEXT = 6, 3
 _FAULT_STIFFNESS = 1e-4
-"""Variance of a window's mean over that by which the fault of an IMU that has been left out changes between two windows."""
+"""How well the fault of an IMU that has been left out is known from the window before: the variance of a window's mean,
+divided by the variance of the change between two windows.
+"""
+
 _JOBS = _NEXT + IMU_COUNT
 """Jobs of a window: the readings, carrying, forgetting, and each IMU."""
 
@@ -114,7 +117,7 @@ def fault_filter_parameters(fusion: FusionSettings, rate: float, active: bool) -
     jerk = np.array([fusion.platform_jerk, fusion.platform_angular_jerk])
     return filled(
         PARAMETERS,
-        active=active and rate >= _LEAST_HZ,
+        active=active,
         window=window,
         duration=duration,
         keep=np.exp(-duration / MEMORY_S),
@@ -193,7 +196,7 @@ def _collect(p: Record, s: Record, imus: Record, pose: Record, legs: Array) -> N
 
 @kernel
 def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: Array) -> None:
-    """Keep the full window for its jobs, and find how the loop's pose has left the path of constant acceleration."""
+    """Keep the full window for its jobs, and find how far the loop's pose has left the path of constant acceleration."""
     fastest, change, turning = 0.0, 0.0, 0.0
     for i in range(3):
         turning += s.next_path.motion[ANGULAR_ACCELERATION, i] ** 2

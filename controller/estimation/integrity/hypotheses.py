@@ -1,9 +1,13 @@
 """The hypotheses: what may be wrong, as directions in the space of faults, and the evidence for each.
 
 A fault is a reading that is off by (7, 6), angular velocity and specific force of each IMU. Each hypothesis has up to six
-directions, of any sizes: a gyroscope, an accelerometer or both of an IMU; its mounting, turned by a small angle, which turns
-what it reads; an error that all gyroscopes or all accelerometers share, each in its own axes; and a base that turns or that
-tilts or accelerates, which adds one vector of the base frame to what all of them read.
+directions, of any sizes:
+
+- a gyroscope, an accelerometer, or both of one IMU;
+- the mounting of an IMU, turned by a small angle, which turns what it reads;
+- an error that all gyroscopes or all accelerometers share, each in its own axes;
+- a base that turns, which adds one angular velocity of the base frame to what all gyroscopes read;
+- a base that tilts or accelerates, which adds one specific force of the base frame to what all accelerometers read.
 """
 
 from enum import IntEnum
@@ -31,7 +35,7 @@ HYPOTHESES = OF_ONE_IMU * IMU_COUNT + len(Kind) - OF_ONE_IMU
 """Numbers: kind by kind, and for those of one IMU, IMU by IMU."""
 
 _NEGLIGIBLE = 1e-9
-"""Share of what is known of a direction beyond what is known of those before it, below which it counts as one of them."""
+"""A direction counts as a combination of those before it if less than this share of what is known of it is its own."""
 
 SCRATCH = record_dtype(
     frames=(np.float64, (IMU_COUNT, 3, 3)),  # axes of the IMUs in {1}, by rows

@@ -1,13 +1,13 @@
 """Parity of the gyroscopes, and of accelerometers with them: large errors are told within two windows of the fault filter.
 
-All gyroscopes see one motion. Mean readings of a window less what the plan predicts, z (21), are J t for an error t (6) of the
-planned twist, so that what least squares leaves, z - J t, is errors of gyroscopes alone. It counts by its length at each IMU. A
-gyroscope is named if the rest agrees without it.
+All gyroscopes see one motion. Let z (21) be the mean readings of a window less those of the planned motion. If the planned
+twist is wrong by t (6), sound gyroscopes give z = J t. So what least squares leaves, z - J t, shows errors of gyroscopes
+alone. Its length at each IMU counts. A gyroscope is named if the rest agrees without it.
 
-From window to window, t changes with the acceleration that was not planned. What the mean forces of both windows say beyond
-that is no motion: vibration, or errors of accelerometers, common ones as well. It makes them count less at once.
+From one window to the next, t changes with the acceleration that was not planned. If the mean forces of both windows show more
+than that, it is no motion: it is vibration, or accelerometers are off, perhaps all alike. They then count less at once.
 
-Small errors are left to the evidence for hypotheses, which takes a tenth of a second: until then they move the pose little.
+Smaller errors are left to the evidence for hypotheses, which takes 0.1 to 0.2 s. Until then they move the pose little.
 """
 
 from math import radians
@@ -26,7 +26,7 @@ _LIMIT = radians(0.75)
 """Error of an angular velocity that is told: several times what calibrated gyroscopes have [rad/s]."""
 
 _LATE_S = 1e-3
-"""By how much of the angular acceleration the limit is larger, as sample times and angular velocities are uncertain [s]."""
+"""The limit grows by the angular acceleration times this, as the times of samples are uncertain [s]."""
 
 _WINDOWS = 2
 """In how many windows in a row the limit must be broken."""
@@ -34,9 +34,11 @@ _WINDOWS = 2
 _AGREE, _AGREE_OF_ALL = 0.6, 0.15
 """How large the error without the named gyroscope may be: of the limit, and of the error with it."""
 
-_SHARE = 0.25
 _FORCE_LIMIT, _ROUGH_SIGMAS = 0.9, 3.0
 """Error of a mean force that is told: this [m/s^2], and some standard deviations of what is not known of the motion."""
+
+_AVERAGED = 0.25
+"""Share of a window in the average of such errors."""
 
 STATE = record_dtype(
     off_motion=(np.float64, IMU_COUNT),  # mean force of two windows that is no motion [m/s^2]
@@ -70,7 +72,7 @@ def step_parity(s: Record, f: Record, excluded: Array, samples: int, period: flo
     """
     s.limit = _LIMIT + _LATE_S * f.turning
     s.error = _error_without(s, f, excluded, -1)
-    _compare_forces(s, f, samples, period, no_motion)
+    _compare_forces(s, f, excluded, samples, period, no_motion)
     s.off_for = s.off_for + 1 if s.error > s.limit else 0
     if s.off_for < _WINDOWS:
         return False
@@ -104,6 +106,7 @@ def _error_without(s: Record, f: Record, excluded: Array, left_out: int) -> floa
                 for j in range(i + 1):
                     s.normal[i, j] += share * row[_FIRST + j]
     if 3 * used <= _TWIST or not factor_cholesky(s.normal):
+        s.twist[:] = 0.0
         return 0.0
     solve_cholesky(s.normal, s.twist)
     greatest = 0.0
@@ -121,15 +124,16 @@ def _error_without(s: Record, f: Record, excluded: Array, left_out: int) -> floa
 
 
 @kernel
-def _compare_forces(s: Record, f: Record, samples: int, period: float, no_motion: Array) -> None:
-    """Find what the mean forces of this window and the last one say beyond the change of the twist between them."""
+def _compare_forces(s: Record, f: Record, excluded: Array, samples: int, period: float, no_motion: Array) -> None:
+    """Find what the mean forces of this window and the last one show beyond the change of the twist between them."""
     follows = f.windows > 1
     s.steady = 0.0
     for k in range(IMU_COUNT):
         s.off_motion[k] = no_motion[k] = 0.0
-        if f.counted[k] == 0:
+        if f.counted[k] == 0 or excluded[k] != 0:
+            s.average[k] = 0.0
             continue
-        squared = 0.0
+        squared = averaged = 0.0
         for m in range(3):
             row = f.jacobian[k, 3 + m]
             off = f.mean[k, 3 + m] - f.predicted[k, 3 + m]
@@ -140,8 +144,10 @@ def _compare_forces(s: Record, f: Record, samples: int, period: float, no_motion
             for i in range(_TWIST):
                 beyond -= row[_FIRST + _TWIST + i] * (s.twist[i] - s.twist_before[i]) / (samples * period)
             squared += beyond * beyond
-            s.average[k, m] += _SHARE * (beyond - s.average[k, m]) if follows else 0.0
-        s.steady = max(s.steady, np.sqrt(s.average[k, 0]**2+s.average[k, 1]**2+s.average[k, 2]**2))
+            if follows:
+                s.average[k, m] += _AVERAGED * (beyond - s.average[k, m])
+            averaged += s.average[k, m] ** 2
+        s.steady = max(s.steady, np.sqrt(averaged))
         if follows:
             s.off_motion[k] = np.sqrt(squared)
             if s.off_motion[k] > _FORCE_LIMIT + _ROUGH_SIGMAS * f.rough:

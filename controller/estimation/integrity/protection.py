@@ -1,21 +1,21 @@
 """The protection level: how far the pose may be off, fault or none.
 
-As satellite navigation has it (RAIM), the level counts what a fault could do unseen, and the worst hypothesis gives it. With
-the error m of the pose from C_mm m + C_mf f = c_m (`evidence`, errors learned eliminated), a hypothesis D with its most likely
-sizes a, of covariance (D^T W D)^-1, moves the pose by -C_mm^-1 C_mf D a, of covariance V, and leaves it off by
-m = C_mm^-1 (c_m - C_mf D a). Its evidence exceeds the number n of its directions, and what chance and errors of calibrated IMUs
-explain, by e.
+As satellite navigation has it (RAIM), the level counts what a fault could do unseen, and the worst hypothesis gives it.
+`evidence` leaves C_mm m + C_mf f = c_m for the error m of the pose. The most likely sizes a of a hypothesis D have the
+covariance (D^T W D)^-1. Such a fault moves the pose by -C_mm^-1 C_mf D a, of covariance V, and leaves it off by
+m = C_mm^-1 (c_m - C_mf D a). Let e be its evidence less the number of its directions and less 8, which calibrated IMUs hardly
+ever exceed without a fault; e is at least 0.
 
     no fault       |C_mm^-1 c_m|
-    unseen fault   sqrt(tr V / 2): what could be there by its odds, little where readings would show it
-    seen fault     sqrt((e + 1/2) tr V) + 3 |m| min(1, e / 8), for e > 0
+    unseen fault   sqrt(tr V / 2): what could be there unseen; little where the readings would show it
+    seen fault     sqrt((e + 1/2) tr V) + 3 |m| min(1, e / 8)
 
-The 3 is for faults that grow: one is larger at the end of the filter's memory than on average, and has moved the pose before.
-A fault that has come up since the loop began has had little time to move the pose: all this grows over the first second.
+The 3 is for faults that grow: such a fault is larger at the end of the filter's memory than on average over it, and has moved
+the pose before. A fault since the loop began has had little time to move the pose: these terms grow over the first second.
 
-The level is the root of the squares of the greatest of these and of two standard deviations: that of the pose in closed form,
-and that which the source of the pose has, which may be the whole-mechanism filter. The former does not shrink while the latter
-learns: what calibrated IMUs and joints leave, no filter knows of.
+The level is the root of the squares of three terms: the greatest of these; the standard deviations of the pose, both that of the
+closed form and that of the pose's own source (what IMUs and joints leave after calibration, no filter knows of); and what
+`parity` and `shaking` say between two evaluations of the evidence: forces that are no motion may have moved the pose.
 """
 
 import numpy as np
@@ -29,7 +29,7 @@ _CHANCE = 8.0
 """By how much evidence exceeds the number of directions without a fault."""
 
 _UNSEEN = 0.5
-"""What counts as evidence for a fault for which there is none."""
+"""Evidence ascribed to a fault for which there is less [-]."""
 
 _SURELY = 8.0
 """Evidence beyond chance from which on a fault is taken to be there."""
@@ -38,13 +38,22 @@ _BENDING_S = 1.0
 """How long a fault takes to move the pose [s]."""
 
 _GROWN = 3.0
-"""How many times the mean error within the last second the present one may be."""
+"""By which factor the present error may exceed the mean one within the fault filter's memory."""
 
 _OF_CLOSED_FORM, _OF_SOURCE = 2.0, 1.1
 """How many standard deviations count: of the pose in closed form, and as the source of the pose has it."""
 
+_SOUND, _MOST, _SHAKEN = 0.2, 0.4, 0.1
+"""Mean forces that are no motion count beyond the first of these, which sound IMUs hardly ever exceed, up to the second; so does a
+share of vibration [m/s^2].
+"""
+
+_MOVED = 0.04, 0.06
+"""How far such a force moves the pose [m, rad per m/s^2]: legs of 0.4 m that lean by its share of gravity."""
+
 STATE = record_dtype(
-    level=(np.float64, 2),  # of position [m] and rotation [rad], of the last complete evaluation
+    level=(np.float64, 2),  # of position [m] and rotation [rad]
+    evaluated=(np.float64, 2),  # its square without what forces add, of the last complete evaluation
     hypothesis=(np.int64, 2),  # that gives the level; -1: none
     fault=(np.float64, 2),  # the greatest effect of a fault, of the evaluation under way
     next_hypothesis=(np.int64, 2),  # that has it; -1: none
@@ -121,7 +130,7 @@ def take_hypothesis(s: Record, e: Record, hypothesis: int, count: int, found: fl
 
 @kernel
 def end_level(s: Record, age: float) -> None:
-    """Publish the level, infinite where the readings do not determine the pose.
+    """End an evaluation; the level is infinite where the readings do not determine the pose.
 
     Args:
         s: dtype `STATE`, with the covariances of the pose.
@@ -135,6 +144,20 @@ def end_level(s: Record, age: float) -> None:
             own += s.covariance[1, i, i]
         if not np.isfinite(closed):
             closed = own
-        variance = _OF_CLOSED_FORM**2 * closed + _OF_SOURCE**2 * own
-        s.level[part] = np.sqrt(variance + (bent * s.fault[part]) ** 2) if s.determined != 0 else np.inf
+        squared = _OF_CLOSED_FORM**2 * closed + _OF_SOURCE**2 * own + (bent * s.fault[part]) ** 2
+        s.evaluated[part] = squared if s.determined != 0 else np.inf
         s.hypothesis[part] = s.next_hypothesis[part]
+
+
+@kernel
+def publish_level(s: Record, steady: float, shaken: float) -> None:
+    """Publish the level after a window of the fault filter, with what has come up since the last evaluation.
+
+    Args:
+        s: dtype `STATE`.
+        steady: greatest mean force that is no motion [m/s^2], `parity.STATE`.
+        shaken: greatest mean square of vibration [m^2/s^4], `shaking.STATE`.
+    """
+    force = min(max(steady - _SOUND, 0.0) + _SHAKEN * np.sqrt(shaken), _MOST)
+    for part, moved in enumerate(_MOVED):
+        s.level[part] = np.sqrt(s.evaluated[part] + (moved * force) ** 2)

@@ -59,7 +59,7 @@ STEPS = _FIRST_TOTAL + IMU_COUNT
 """Steps of an evaluation."""
 
 _FIRST_WINDOWS = 7
-"""When the first evaluation begins, so that it is complete when the brakes have held for 0.2 s."""
+"""After how many windows the first evaluation begins: it is complete before the brakes have held for 0.2 s."""
 
 
 def integrity_parameters(fusion: FusionSettings, rate: float, prior: Array, active: bool) -> Record:
@@ -89,10 +89,12 @@ def step_integrity(p: Record, s: Record, rig: Record, time: Record, imus: Record
         s.contradicts = s.filter.windows > 0 and parity.step_parity(
             s.parity, s.filter, imus.excluded, p.filter.window, rig.period, imus.shaking.no_motion
         )  # fmt: skip
+        if s.evaluations > 0:
+            protection.publish_level(s.protection, s.parity.steady, imus.shaking.mean.max())
     if s.step == 0 and not (took and s.filter.windows >= _FIRST_WINDOWS):
         return
     s.cycle += 1
-    # One window less, in which the next beginning is waited for.
+    # One window is left for waiting until the next evaluation may begin.
     due = min(STEPS, -(-STEPS * s.cycle // (p.cycles - p.filter.window)))
     while s.step < due:
         _do(p, s, rig, imus, s.step)
@@ -105,7 +107,7 @@ def step_integrity(p: Record, s: Record, rig: Record, time: Record, imus: Record
 
 @kernel
 def restart_integrity(s: Record) -> None:
-    """Forget the last second, as the set of IMUs that are relied upon has changed; what was learned before it stays."""
+    """Forget the last half second, as the set of IMUs that are relied upon has changed; what was learned before it stays."""
     s.step = s.cycle = 0
     fault_filter.begin_anew(s.filter)
 

@@ -167,6 +167,37 @@ def test_a_pose_that_is_lost_between_armed_and_running_is_a_fault_at_once(hexapo
     assert (bench.mode, bench.state["safety"]["stop"]["cause"]) == (Mode.FAULT, Cause.POSE_LOST)
 
 
+def test_evidence_is_told_in_the_cycle_of_its_evaluation_alone(hexapod):
+    """A pose that is lost in the next cycle must not have it told again."""
+    bench = Bench(hexapod)
+    bench.steps(bench.hold + 5)
+    assert bench.mode == Mode.RUNNING
+    integrity = bench.state["integrity"]
+    integrity["fresh"], integrity["blamed"], integrity["rival_evidence"] = 1, 3, 0.0
+    integrity["best_evidence"] = integrity["imu_evidence"] = integrity["all_evidence"] = 1e4
+    without_pose(bench)
+    told = bench.step()
+    assert Cause.POSE_LOST in told and Cause.IMU_CONTRADICTED not in told
+
+
+@pytest.mark.parametrize("blamed", [-1, 3])
+@pytest.mark.parametrize("kind", [0, 1])
+def test_evidence_of_either_kind_prevents_arming(hexapod, kind, blamed):
+    """That of the last half second, and that of all that was learned; the other evaluations are silent meanwhile."""
+    bench = Bench(hexapod)
+    bench.steps(bench.hold - 1)
+    limit = float(bench.parameters["safety"]["watch"]["evidence"])
+    arming = bench.state["safety"]["arming"]
+    for size, armed in ((1.01, False), (0.99, True)):
+        arming["evidence"][kind], arming["blamed"][kind] = size * limit, blamed
+        bench.step()
+        bench.step()
+        assert (bench.mode == Mode.RUNNING) == armed
+        if not armed:
+            cause = Cause.NO_TRUST if blamed < 0 else Cause.NO_SENSORS
+            assert obstacle(bench) == (cause, blamed, pytest.approx(np.sqrt(size * limit)), np.sqrt(limit))
+
+
 @pytest.mark.parametrize(("factor", "armed"), [(1.01, True), (0.99, False)])
 def test_an_estimate_that_drifts_on_the_brakes_is_not_armed(hexapod, factor, armed):
     """A platform that sinks; the limit is around what the means of the lengths over 50 ms change by, from one to the next."""

@@ -181,6 +181,15 @@ def test_events_come_once_in_words_with_their_cycle_and_time(tmp_path, first):
     assert [(logged, each.cycle) for logged, _, each in messages(path, "/cycle")] == [(at, k) for k, at in times.items()]
 
 
+def test_numbers_of_messages_begin_anew_after_32_bits_and_those_of_cycles_do_not(tmp_path):
+    records = np.zeros(3, RECORD)
+    records["cycle"] = 2**32 + np.arange(-1, 2)
+    path = written(tmp_path / "run.mcap", records)
+    with path.open("rb") as file:
+        assert [message.sequence for _, _, message in make_reader(file).iter_messages(topics=["/cycle"])] == [2**32 - 1, 0, 1]
+    assert read(path).records["cycle"].tolist() == records["cycle"].tolist()
+
+
 def test_a_filter_that_is_relied_upon_from_the_first_cycle_is_told(tmp_path):
     records, _ = eventful_records()
     records["trusted"] = 1

@@ -93,7 +93,9 @@ def test_a_calibration_of_another_rig_is_refused_before_anything_runs(tmp_path):
 
 
 def suited(tmp_path, rate):
-    """The hexapod with gains that suit the rate, as a run says that its own do not."""
+    """The hexapod with gains that suit the rate: with its own it rings for a second, which is told, or a run says that they do
+    not suit.
+    """
     if not 50.0 <= rate < 200.0:
         return "hexapod"
     path = tmp_path / "slow.toml"

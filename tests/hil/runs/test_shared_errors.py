@@ -1,0 +1,81 @@
+"""Errors that all IMUs share, and the only IMU that shows them: what the closed loop tells, before a motion and in it."""
+
+import pytest
+
+from controller.safety.causes import Cause, Mode
+from hil.runs.config import SimulationConfig
+from hil.runs.simulation import SimulationStoppedError, simulate
+
+MM = 1e-3
+
+
+def stopped(**changes):
+    """The result and the reason of a run that ends early."""
+    with pytest.raises(SimulationStoppedError) as ended:
+        simulate(SimulationConfig(**changes))
+    return ended.value.result, str(ended.value)
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        ("imu-offset:all,axis=z,size_m_per_s2=1.5", "the IMUs share an error, or the base is not at rest"),
+        ("imu-offset:legs,axis=z,size_m_per_s2=1.5", "the IMUs share an error, or the base is not at rest"),
+        ("imu-scale:all,sensor=accelerometer,axis=all,size_percent=15", "the IMUs share an error, or the base is not at rest"),
+        ("imu-turn:3,axis=x,size_deg=2", "IMU 3 is not plausible"),
+    ],
+)
+def test_what_is_wrong_from_the_start_is_never_armed(fault, reason):
+    """Neither when the first evaluations see it, nor when it begins to be learned."""
+    result, said = stopped(duration=1.5, faults=(fault,))
+    assert f"not armed: {reason}" in said
+    assert (result.records["mode"] != Mode.RUNNING).all()
+    assert result.events[0].endswith(said.split(": ", 1)[1])
+
+
+@pytest.mark.parametrize("fusion", ["compiled", "whole"])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"faults": ("imu-offset:all,axis=z,size_m_per_s2=1.5,ramp_s=30,at=1",)},
+        {"faults": ("imu-scale:all,sensor=accelerometer,axis=all,size_percent=15,ramp_s=4,at=1",)},
+    ],
+    ids=["offset", "scale"],
+)
+def test_what_all_accelerometers_share_is_told_in_motion_before_the_pose_is_5_mm_off(changes, fusion):
+    result, _ = stopped(duration=4.0, fusion=fusion, **changes)
+    shared = (Cause.ACCELEROMETERS_SHARE, Cause.BASE_MOVES, Cause.BASE_TURNS)
+    assert int(result.records["stop"][-1]) in shared
+    assert result.summary()["estimation"]["position_max"] < 5.0 * MM
+
+
+@pytest.mark.parametrize(
+    "fault", ["imu-turn:6,axis=y,size_deg=3,at=1", "imu-noise:6,axis=all,size_deg_per_s=60,at=1"], ids=["turned", "noisy"]
+)
+def test_a_run_whose_platform_imu_is_left_out_ends_unless_that_is_allowed(tmp_path, fault):
+    result, said = stopped(duration=2.0, faults=(fault,))
+    events = [event.split(": ", 1)[1] for event in result.summary()["events"]]
+    out = next(n for n, event in enumerate(events) if event.startswith("IMU 6 is left out"))
+    assert "without IMU 6 nothing shows an error that the legs' IMUs share: need_platform_imu = 0" in said
+    assert "controlled stop: without IMU 6" in events[out + 1]
+    allowing = tmp_path / "allowing.toml"
+    allowing.write_text('based_on = "hexapod"\n[safety]\nneed_platform_imu = 0\n')
+    events = simulate(SimulationConfig(str(allowing), duration=2.0, faults=(fault,))).summary()["events"]
+    assert any("IMU 6 is left out" in event for event in events) and not any("stop" in event for event in events)
+
+
+@pytest.mark.parametrize("imus", [(0, 1, 2, 3, 4, 5), (0, 1, 3, 4)])
+def test_a_set_that_never_had_the_platforms_imu_runs(imus):
+    result = simulate(SimulationConfig(duration=1.0, imus=imus))
+    assert len(result.events) == 1 and result.events[0].endswith(": armed")
+
+
+def test_the_protection_level_shows_that_few_imus_do_not_check_each_other():
+    """An error of the platform's IMU that nothing contradicts: 10 mm, without a word."""
+    sound = simulate(SimulationConfig(duration=4.0)).summary()
+    few = {"imus": (0, 5, 6), "magnetometer": True}
+    wrong = simulate(SimulationConfig(duration=4.0, **few, faults=("imu-turn:6,axis=x,size_deg=2,at=1.5",))).summary()
+    assert wrong["estimation"]["position_max"] > 8.0 * MM
+    assert wrong["protection"]["covered"] > 0.9
+    for level in ("position_p50", "rotation_p50"):
+        assert wrong["protection"][level] > 3.0 * sound["protection"][level]
