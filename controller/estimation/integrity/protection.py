@@ -13,9 +13,9 @@ ever exceed without a fault; e is at least 0.
 The 3 is for faults that grow: such a fault is larger at the end of the filter's memory than on average over it, and has moved
 the pose before. A fault since the loop began has had little time to move the pose: these terms grow over the first second.
 
-The level is the root of the squares of three terms: the greatest of these; the standard deviations of the pose, both that of the
-closed form and that of the pose's own source (what IMUs and joints leave after calibration, no filter knows of); and what
-`parity` and `shaking` say between two evaluations of the evidence: forces that are no motion may have moved the pose.
+The level is the root of the sum of the squares of three terms. One is the greatest of these. One is the standard deviation of
+the pose, both that of the closed form and that of the pose's own source: no filter knows what calibrations of IMUs and joints
+leave. One is what `parity` and `shaking` tell between two evaluations: forces that are no motion may have moved the pose.
 """
 
 import numpy as np
@@ -44,8 +44,8 @@ _OF_CLOSED_FORM, _OF_SOURCE = 2.0, 1.1
 """How many standard deviations count: of the pose in closed form, and as the source of the pose has it."""
 
 _SOUND, _MOST, _SHAKEN = 0.2, 0.4, 0.1
-"""Mean forces that are no motion count beyond the first of these, which sound IMUs hardly ever exceed, up to the second; so does a
-share of vibration [m/s^2].
+"""Mean forces that are no motion count beyond what sound IMUs hardly ever exceed, and up to this much [m/s^2]; the share of the
+vibration's RMS that counts with them.
 """
 
 _MOVED = 0.04, 0.06
