@@ -10,6 +10,7 @@ from controller.estimation.shaking import (
     STATE,
     bridges,
     note_force,
+    note_rate,
     shaking_parameters,
     tell_shaking,
     variance_of,
@@ -38,7 +39,7 @@ class Teller:
         events = np.zeros((), EVENTS)[()]
         self.state["excess"] = 0.0
         for imu, value in (excess or {}).items():
-            self.state["excess"][imu] = value
+            self.state["excess"][ACCELEROMETER, imu] = value
         self.state["clipped"] = 0
         for imu in clipped:
             self.state["clipped"][ACCELEROMETER, imu] = 1
@@ -59,7 +60,7 @@ def test_a_shock_is_as_uncertain_as_it_is_large_and_fades_as_a_low_pass_does(sha
     # The gyroscope and the other IMUs are as they were.
     assert variance_of(shaking, GYROSCOPE, 2, nominal) == variance_of(shaking, ACCELEROMETER, 1, nominal) == nominal
     cycles = 0
-    while shaking["excess"][2] > 0.0:
+    while shaking["excess"][ACCELEROMETER, 2] > 0.0:
         note_force(shaking, 2, 0.0, explained, 1e-4)
         cycles += 1
     assert cycles * 1e-4 == pytest.approx(MEMORY_S * np.log(1.0 + 898.2 / explained), rel=0.05)
@@ -81,6 +82,27 @@ def test_a_clipped_reading_says_nothing(shaking, sensor):
     shaking["clipped"][sensor, 4] = 1
     assert variance_of(shaking, sensor, 4, 0.1) == SAYS_NOTHING + 0.1
     assert variance_of(shaking, 1 - sensor, 4, 0.1) == variance_of(shaking, sensor, 3, 0.1) == 0.1
+
+
+def test_a_gyroscope_counts_less_by_what_it_reads_beyond_the_motion_so_far(shaking):
+    explained, nominal = 1e-5, 4e-6
+    note_rate(shaking, 4, 9.0 * explained, explained, 1e-3)
+    assert variance_of(shaking, GYROSCOPE, 4, nominal) == nominal
+    note_rate(shaking, 4, 0.01, explained, 1e-3)
+    assert variance_of(shaking, GYROSCOPE, 4, nominal) == pytest.approx(nominal + 0.01 - 9.0 * explained)
+    assert variance_of(shaking, ACCELEROMETER, 4, nominal) == variance_of(shaking, GYROSCOPE, 3, nominal) == nominal
+
+
+def test_a_mean_force_that_is_no_motion_counts_and_is_told_at_once(shaking):
+    teller = Teller(shaking)
+    shaking["no_motion"][2] = 10.0
+    assert variance_of(shaking, ACCELEROMETER, 2, 0.16) == 10.16 and variance_of(shaking, GYROSCOPE, 2, 0.16) == 0.16
+    ((cause, imu, value),) = teller.step()
+    assert (cause, imu) == (Cause.SHAKEN, 2) and value == pytest.approx(np.sqrt(10.0))
+    assert all(not teller.step() for _ in range(2000))
+    shaking["no_motion"] = 0.0
+    told = [event for _ in range(1100) for event in teller.step()]
+    assert [cause for cause, *_ in told] == [Cause.CALM]
 
 
 def test_vibration_is_told_once_with_its_size_and_once_when_it_is_over(shaking):

@@ -4,13 +4,21 @@ import numpy as np
 import pytest
 
 from controller.estimation.integrity.hypotheses import HYPOTHESES, directions_of, evidence_for
-from controller.estimation.integrity.protection import begin_level, end_level, take_hypothesis
+from controller.estimation.integrity.protection import begin_level, end_level, publish_level, take_hypothesis
 from tests.controller.estimation.integrity.made_up import constants
 from tests.controller.estimation.integrity.test_evidence import evaluated
 from tests.controller.estimation.integrity.test_hypotheses import all_steps, readings
 
-OWN = np.diag([4e-8, 1e-8, 9e-8, 1e-6, 4e-6, 1e-6])
-"""The pose's own covariance."""
+OWN = np.array([np.diag([4e-8, 1e-8, 9e-8, 1e-6, 4e-6, 1e-6]), np.diag([1e-8, 2e-8, 3e-8, 2e-6, 1e-6, 3e-6])])
+"""Covariances of the pose, in closed form and of its source."""
+
+
+def ended(level, age=2.0, steady=0.0, shaken=0.0, own=OWN):
+    """The level (2,) at the end of an evaluation."""
+    level["covariance"] = own
+    end_level(level[()], age)
+    publish_level(level[()], steady, shaken)
+    return level["level"].copy()
 
 
 def level_of(state, frames, predicted, place):
@@ -26,17 +34,17 @@ def level_of(state, frames, predicted, place):
         used = d[:count]
         matrix, right = used @ e["weight"] @ used.T, used @ e["vector"]
         inverse = np.linalg.pinv(matrix, rcond=1e-9, hermitian=True)
-        seen = right @ inverse @ right - count
+        seen = max(right @ inverse @ right - count - 8.0, 0.0)
         spread = effect @ used.T @ inverse @ used @ effect.T
         m = error - effect @ used.T @ inverse @ right
         faults.append(
             [
-                np.sqrt(max(seen, 0.5) * np.trace(spread[s, s])) + (3.0 * np.linalg.norm(m[s]) if seen > 6.0 else 0.0)
+                np.sqrt((seen + 0.5) * np.trace(spread[s, s])) + 3.0 * np.linalg.norm(m[s]) * min(1.0, seen / 8.0)
                 for s in (slice(0, 3), slice(3, 6))
             ]
         )
-    own = np.trace(OWN[:3, :3]), np.trace(OWN[3:, 3:])
-    return np.sqrt(2.2**2 * np.array(own) + np.max(faults, axis=0) ** 2)
+    closed, own = (np.array([np.trace(c[:3, :3]), np.trace(c[3:, 3:])]) for c in OWN)
+    return np.sqrt(2.0**2 * closed + 1.1**2 * own + np.max(faults, axis=0) ** 2)
 
 
 @pytest.mark.parametrize("fault", [None, (1, 2, 0, 0.2), (0, 6, 1, 0.05)])
@@ -49,8 +57,8 @@ def test_it_is_the_greatest_over_the_hypotheses(fault):
     for h in range(HYPOTHESES):
         count = directions_of(h, frames, s["filter"]["predicted"], e["place"], t["directions"])
         take_hypothesis(level[()], e[()], h, count, evidence_for(count, e["weight"], e["vector"], t[()]), t[()])
-    end_level(level[()], OWN)
-    np.testing.assert_allclose(level["level"], level_of(state, frames, s["filter"]["predicted"], e["place"]), rtol=2e-3)
+    expected = level_of(state, frames, s["filter"]["predicted"], e["place"])
+    np.testing.assert_allclose(ended(level), expected, rtol=2e-3)
 
 
 def test_where_the_pose_is_not_determined_there_is_no_level():
@@ -58,8 +66,35 @@ def test_where_the_pose_is_not_determined_there_is_no_level():
     s = state["integrity"]
     s["evidence"]["pose_information"] = 0.0
     begin_level(s["protection"][()], s["evidence"][()])
-    end_level(s["protection"][()], OWN)
-    assert np.isinf(s["protection"]["level"]).all()
+    assert np.isinf(ended(s["protection"])).all()
+
+
+def test_a_fault_has_had_as_much_time_as_the_loop_to_move_the_pose():
+    _, state = evaluated("mixed", (), 1.5, 3, None)
+    level = state["integrity"]["protection"]
+    level["determined"], level["fault"] = 1, [0.01, 0.1]
+    own = ended(level, age=0.0)
+    for age, share in ((0.25, 0.5), (1.0, 1.0), (100.0, 1.0)):
+        np.testing.assert_allclose(ended(level, age), np.hypot(own, share * np.array([0.01, 0.1])))
+
+
+def test_forces_that_are_no_motion_raise_the_level_between_evaluations():
+    _, state = evaluated()
+    level = state["integrity"]["protection"]
+    level["determined"] = 1
+    sound = ended(level)
+    np.testing.assert_array_equal(ended(level, steady=0.2), sound)
+    np.testing.assert_allclose(ended(level, steady=0.3), np.hypot(sound, [0.004, 0.006]))
+    np.testing.assert_allclose(ended(level, shaken=4.0), np.hypot(sound, [0.008, 0.012]))
+    np.testing.assert_allclose(ended(level, steady=5.0, shaken=9.0), np.hypot(sound, [0.016, 0.024]))
+
+
+def test_without_a_covariance_of_the_closed_form_that_of_the_source_counts_for_both():
+    _, state = evaluated()
+    level = state["integrity"]["protection"]
+    level["determined"] = 1
+    own = np.array([np.full((6, 6), np.nan), OWN[1]])
+    np.testing.assert_array_equal(ended(level, own=own), ended(level, own=OWN[[1, 1]]))
 
 
 def test_it_covers_the_error_of_the_pose_without_and_with_a_fault():
@@ -70,10 +105,10 @@ def test_it_covers_the_error_of_the_pose_without_and_with_a_fault():
         r.positions[:] += [0.002 * (spoil != 0.0), 0.0, 0.0]
         parameters, state = constants(mechanism)
         s = all_steps(mechanism, r, parameters, state)
-        end_level(s["protection"][()], OWN)
-        least = 0.002 if spoil else 2.2 * np.sqrt(np.trace(OWN[:3, :3]))
-        assert least < s["protection"]["level"][0] < 0.02
-        assert 0.0 < s["protection"]["level"][1] < 0.05
+        position, rotation = ended(s["protection"])
+        least = 0.002 if spoil else 2.0 * np.sqrt(np.trace(OWN[0, :3, :3]))
+        assert least < position < 0.02
+        assert 0.0 < rotation < 0.05
 
 
 def test_it_grows_where_nothing_is_redundant():
@@ -84,6 +119,5 @@ def test_it_grows_where_nothing_is_redundant():
         parameters, state = constants(mechanism)
         state["imus"]["healthy"][3:] = healthy
         s = all_steps(mechanism, r, parameters, state)
-        end_level(s["protection"][()], OWN)
-        levels.append(s["protection"]["level"].copy())
+        levels.append(ended(s["protection"]))
     assert (levels[1] > 8.0 * levels[0]).all()

@@ -71,7 +71,7 @@ def test_when_the_filter_is_no_longer_trusted_the_pose_fades_to_the_closed_form(
     np.testing.assert_allclose(at_rest, 0.0, atol=1e-6)
     # No reading changes the filter any more, so that it stays where it has been moved.
     rest.parameters["mechanism"]["filter"]["variance"] = 1e30
-    rest.parameters["mechanism"]["disagreement"] = 1e-3
+    rest.parameters["mechanism"]["disagreement"] = 1e-6
     rest.move_filter()
     errors = rest.step_until(trusted=0)
     np.testing.assert_allclose(errors[:-1], np.broadcast_to(AWAY, errors[:-1].shape), rtol=0.0, atol=1e-4)
@@ -98,7 +98,7 @@ def test_when_the_filter_is_trusted_the_pose_fades_to_the_filters(hexapod):
 
 
 SETTLING, PATIENCE = 150, 25
-"""Cycles of settling, of waiting for a new start, and for which the leg filters may disagree."""
+"""Cycles of settling or of waiting for a new start, and the time constant of the leg filters' disagreement."""
 
 
 class Stage:
@@ -168,61 +168,84 @@ def test_the_filter_starts_with_the_first_pose_and_is_trusted_when_it_has_settle
 
 
 @pytest.mark.parametrize("missed", [0, 3, 25])
-def test_leg_filters_that_disagree_for_long_stop_the_filter_missed_periods_counted(hexapod, missed):
+def test_leg_filters_that_disagree_on_average_stop_the_filter_missed_periods_counted(hexapod, missed):
     stage = Stage(hexapod).trusted()
-    stage.state["legs"]["directions"] = stage.directions @ rotation_of([0.0, 0.05, 0.0]).T
-    disagreeing = 0
+    stage.state["legs"]["directions"] = stage.directions @ rotation_of([0.0, 0.02, 0.0]).T
+    # Legs across the axis of the turn show all of it.
+    seen = np.mean(np.sum((stage.state["legs"]["directions"] - stage.directions) ** 2, axis=1))
+    share, limit, mean = min(1.0, (1 + missed) / PATIENCE), fusion_settings(hexapod).disagreement ** 2, 0.0
     while stage.stands == (True, True):
-        # A lapse that is over in time counts no more.
-        if disagreeing == 0:
-            for _ in range(PATIENCE):
-                assert stage.step() and stage.stands == (True, True)
-            stage.state["legs"]["directions"], kept = stage.directions, stage.state["legs"]["directions"].copy()
-            stage.step()
-            assert stage.trust["disagreeing_for"] == 0
-            stage.state["legs"]["directions"] = kept
         stage.step(missed=missed)
-        disagreeing += 1 + missed
-        assert stage.trust["disagreeing_for"] == disagreeing
-        assert stage.stands == ((True, True) if disagreeing <= PATIENCE else (False, False))
+        mean += share * (seen - mean)
+        assert stage.trust["disagreement"] == pytest.approx(mean, rel=1e-3, abs=1e-9)
+        assert stage.stands == ((True, True) if mean <= limit else (False, False))
     due = int(stage.time["cycle"]) - 1 + SETTLING
     assert stage.trust["due"] == due
     stage.state["legs"]["directions"] = stage.directions
     while stage.time["cycle"] <= due:
         assert stage.stands == (False, False)
         assert stage.step()
-    assert stage.stands == (True, False)
+    assert stage.stands == (True, False) and stage.trust["disagreement"] == 0.0
     assert stage.trust["due"] == due + SETTLING
 
 
-def test_the_limit_is_the_root_of_the_mean_square_over_the_legs_that_are_used(hexapod):
-    stage = Stage(hexapod, disagreement=0.02).trusted()
+def test_a_short_lapse_of_the_leg_filters_stops_nothing(hexapod):
+    stage = Stage(hexapod).trusted()
+    away = stage.directions @ rotation_of([0.0, 0.02, 0.0]).T
+    for _ in range(20):
+        stage.state["legs"]["directions"] = away
+        assert stage.step() and stage.step() and stage.stands == (True, True)
+        stage.state["legs"]["directions"] = stage.directions
+        for _ in range(2 * PATIENCE):
+            assert stage.step() and stage.stands == (True, True)
 
-    def agrees(chords):
+
+def test_a_filter_with_which_they_disagree_is_told_and_starts_later_each_time(hexapod):
+    stage, waits = Stage(hexapod), []
+    for _ in range(4):
+        stage.trusted()
+        stage.state["safety"]["events"]["count"] = 0
+        stage.state["legs"]["directions"] = stage.directions @ rotation_of([0.0, 0.05, 0.0]).T
+        while stage.trust["trusted"]:
+            stage.step()
+        events = stage.state["safety"]["events"]
+        assert (events["count"], events["cause"][0]) == (1, Cause.FILTER_DISAGREES)
+        assert events["value"][0] > events["limit"][0] == pytest.approx(fusion_settings(hexapod).disagreement)
+        waits.append(int(stage.trust["due"]) - int(stage.time["cycle"]) + 1)
+        stage.state["legs"]["directions"] = stage.directions
+    assert waits == [SETTLING, 2 * SETTLING, 4 * SETTLING, 8 * SETTLING]
+    # One that has not been trusted yet waits no longer.
+    while not stage.trust["filter"]["running"]:
+        stage.step()
+    stage.state["legs"]["directions"] = stage.directions @ rotation_of([0.0, 0.05, 0.0]).T
+    stage.state["safety"]["events"]["count"] = 0
+    while stage.trust["filter"]["running"]:
+        stage.step()
+    assert (stage.trust["stops"], stage.state["safety"]["events"]["count"]) == (4, 0)
+
+
+def test_the_disagreement_is_the_mean_square_over_the_legs_that_are_used(hexapod):
+    stage = Stage(hexapod, disagreement=0.5).trusted()
+
+    def disagreement(chords):
         """With leg directions moved by so much across themselves, without a change of their state."""
         across = np.cross(stage.directions, [0.0, 0.0, 1.0])
         across *= (np.asarray(chords) / np.linalg.norm(across, axis=1))[:, None]
         stage.state["legs"]["directions"] = stage.directions + across
+        stage.trust["disagreement"] = 0.0
         stage.step()
-        stage.state["legs"]["directions"], found = stage.directions, stage.trust["disagreeing_for"] == 0
-        stage.step()
-        return bool(found)
+        stage.state["legs"]["directions"] = stage.directions
+        return float(stage.trust["disagreement"]) * PATIENCE
 
-    assert agrees(np.full(6, 0.0199)) and agrees(np.full(6, -0.0199))
-    assert not agrees(np.full(6, 0.0201)) and not agrees(np.full(6, -0.0201))
-    for leg in (0, 5):
-        alone = np.zeros(6)
-        alone[leg] = 0.0199 * np.sqrt(6.0)
-        assert agrees(alone)
-        alone[leg] = 0.0201 * np.sqrt(6.0)
-        assert not agrees(alone)
-        # Of five legs, the same counts more; and a leg that is not used, not at all.
-        alone[leg] = 0.0199 * np.sqrt(6.0)
-        stage.state["legs"]["used"][3] = 0.0
-        assert not agrees(alone)
-        stage.state["legs"]["used"][[leg, 3]] = 0.0, 1.0
-        assert agrees(100.0 * alone)
-        stage.state["legs"]["used"] = 1.0
+    for chords in (np.full(6, 0.02), np.full(6, -0.03), 0.01 * np.arange(6)):
+        assert disagreement(chords) == pytest.approx(np.mean(np.square(chords)), rel=1e-3)
+    # Of five legs, one counts more; and a leg that is not used, not at all.
+    alone = np.zeros(6)
+    alone[5] = 0.02
+    stage.state["legs"]["used"][3] = 0.0
+    assert disagreement(alone) == pytest.approx(0.02**2 / 5.0, rel=1e-3)
+    stage.state["legs"]["used"][[5, 3]] = 0.0, 1.0
+    assert disagreement(100.0 * alone) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_without_a_pose_in_closed_form_the_trusted_filters_pose_goes_on_and_another_does_not(hexapod):
@@ -261,7 +284,7 @@ def test_what_is_left_of_a_step_fades_over_missed_periods_too(hexapod, missed, l
 
 @pytest.mark.parametrize("delay", [0.0, 0.007])
 def test_samples_and_field_are_older_than_the_cycle_by_the_sensors_delay(hexapod, delay):
-    stage = Stage(hexapod, magnetometer=True, sensor_delay=delay)
+    stage = Stage(hexapod, magnetometer=True, sensor_delay=delay, disagreement=10.0)
     heading, f = stage.state["heading"], stage.trust["filter"]
     window = int(stage.parameters["mechanism"]["filter"]["window"])
     stage.step()
