@@ -265,7 +265,7 @@ def _check_integrity(parameters: Record, state: Record) -> None:
     """Look for faults in the samples of the cycle, and react to what has been found with them."""
     p, s = parameters[()], state[()]
     rig, time = p.rig, s.time
-    integrity.step_integrity(p.integrity, s.integrity, rig, time, s.imus, s.pose, s.reference.motion)
+    integrity.step_integrity(p.integrity, s.integrity, rig, time, s.imus, s.pose, s.reference.motion, s.pid.command)
     changed = s.integrity.contradicts != 0 and watch.judge_parity(
         p.safety, s.safety, rig, time, s.imus, s.integrity.parity, s.reference, s.pid
     )

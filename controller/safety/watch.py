@@ -210,10 +210,7 @@ def judge_parity(
     """When the gyroscopes contradict each other: leave out the one that is named, else stop. Returns whether it is left out."""
     if s.mode != Mode.RUNNING:
         return False
-    lost = 0
-    for k in range(IMU_COUNT):
-        lost += imus.excluded[k]
-    if parity.named != 0 and lost < p.watch.most_lost_imus:
+    if parity.named != 0 and _may_leave_out(p.watch, imus, parity.worst):
         imus.excluded[parity.worst] = 1
         report_event(s.events, Cause.GYROSCOPE_OFF, parity.worst, parity.error, parity.limit)
         return True
@@ -250,7 +247,7 @@ def judge_evidence(
     clear = e.rival_evidence < e.imu_evidence - max(_CLEARLY * limit, _CLEARLY_OF_ALL * e.imu_evidence)
     rest_agrees = e.all_evidence - e.imu_evidence < _REST * limit + _REST_OF_ALL * e.imu_evidence
     alone = clear and rest_agrees and e.evidence.of_learned == 0
-    if alone and e.evidence.apart < p.watch.most_lost_imus:
+    if alone and _may_leave_out(p.watch, imus, k):
         imus.excluded[k] = 1
         report_event(s.events, Cause.IMU_CONTRADICTED, k, np.sqrt(e.imu_evidence), most)
         return True
@@ -258,6 +255,15 @@ def judge_evidence(
         _report_rival(s, e, most)
         handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, k, np.sqrt(e.imu_evidence), most)
     return False
+
+
+@kernel
+def _may_leave_out(p: Record, imus: Record, k: int) -> bool:
+    """Whether the run may go on without IMU `k`; it may not without the platform's if that is needed."""
+    lost = 0
+    for other in range(IMU_COUNT):
+        lost += imus.excluded[other]
+    return bool(lost < p.most_lost_imus and not (k == PLATFORM_IMU and np.isfinite(p.without_platform_imu)))
 
 
 @kernel

@@ -49,6 +49,12 @@ _RIPPLE_HZ = 150.0
 _LEAST_SAMPLES = 2.5
 """An IMU counts in a window if it gives a sample at least every so many cycles: it may be half as fast as the loop."""
 
+_UNEVEN = 0.2
+"""A slower one counts if the mean place of its samples is so near the middle of the window, as a share of half of it."""
+
+_STEADY_FEEDBACK = 0.5
+"""How much feedback changes the rate of a leg without being an acceleration that was not planned [m/s^2]."""
+
 _TIMING_S = 3e-4
 """How far the times of samples may be off, as IMUs have clocks of their own [s]."""
 
@@ -85,6 +91,9 @@ STATE = record_dtype(
     step=np.int64,  # cycles since that window was full
     collected=np.int64,  # cycles in the present window
     sum=(np.float64, (IMU_COUNT, READINGS)),  # of their samples
+    places=(np.int64, IMU_COUNT),  # of the samples around the middle of the window, sum, in half cycles
+    feedback=(np.float64, LEGS),  # what feedback adds to the planned rate of each leg, sum [m/s]
+    feedback_before=(np.float64, LEGS),  # its mean in the last full window [m/s]
     samples=(np.int64, IMU_COUNT),
     acceleration=(np.float64, LEGS),  # of the legs at the end of the last window
     next_path=PATH,  # in the middle of the present window
@@ -128,7 +137,9 @@ def fault_filter_parameters(fusion: FusionSettings, rate: float, active: bool) -
 
 
 @kernel
-def step_fault_filter(p: Record, s: Record, sensors: Record, imus: Record, missed: int, pose: Record, legs: Array) -> bool:
+def step_fault_filter(
+    p: Record, s: Record, sensors: Record, imus: Record, missed: int, pose: Record, legs: Array, commands: Array
+) -> bool:
     """Take the calibrated samples of a cycle from the IMUs that are healthy, and do the cycle's share of work.
 
     Args:
@@ -139,13 +150,14 @@ def step_fault_filter(p: Record, s: Record, sensors: Record, imus: Record, misse
         pose: of the loop; dtype `pose_estimator.STATE`.
         legs: (6, 3), length, rate and acceleration that each leg should have. The path takes its motion from them: noise in
             the estimated one would turn the directions of which nothing is known, and pretend to know something of them.
+        commands: (6,), the rate of each leg that its drive was last told [m/s]: feedback moves the legs off the path.
 
     Returns:
         Whether a window has been taken with this cycle.
     """
     if missed > 0:
         begin_anew(s)
-    _collect(p, s, imus, pose, legs)
+    _collect(p, s, imus, pose, legs, commands)
     took = False
     if s.job < _JOBS and s.windows > 0:
         s.step += 1
@@ -169,16 +181,21 @@ def begin_anew(s: Record) -> None:
 
 
 @kernel
-def _collect(p: Record, s: Record, imus: Record, pose: Record, legs: Array) -> None:
+def _collect(p: Record, s: Record, imus: Record, pose: Record, legs: Array, commands: Array) -> None:
     if s.collected == 0:
         s.sum[:] = 0.0
         s.samples[:] = 0
+        s.places[:] = 0
+        s.feedback[:] = 0.0
     s.collected += 1
+    for k in range(LEGS):
+        s.feedback[k] += commands[k] - legs[k, 1]
     for k in range(IMU_COUNT):
         clipped = imus.shaking.clipped[0, k] != 0 or imus.shaking.clipped[1, k] != 0
         if imus.healthy[k] == 0 or imus.sample_age[k] != 0 or clipped:
             continue
         s.samples[k] += 1
+        s.places[k] += 2 * s.collected - p.window - 1
         for i in range(3):
             s.sum[k, i] += imus.sample[0, k, i]
             s.sum[k, 3 + i] += imus.sample[1, k, i]
@@ -197,7 +214,7 @@ def _collect(p: Record, s: Record, imus: Record, pose: Record, legs: Array) -> N
 @kernel
 def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: Array) -> None:
     """Keep the full window for its jobs, and find how far the loop's pose has left the path of constant acceleration."""
-    fastest, change, turning = 0.0, 0.0, 0.0
+    fastest, change, turning, corrected = 0.0, 0.0, 0.0, 0.0
     for i in range(3):
         turning += s.next_path.motion[ANGULAR_ACCELERATION, i] ** 2
     turning = np.sqrt(turning)
@@ -206,11 +223,16 @@ def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: 
         turning = max(turning, abs(legs[k, 2]) / legs[k, 0])
         change = max(change, abs(legs[k, 2] - s.acceleration[k]))
         s.acceleration[k] = legs[k, 2]
+        feedback = s.feedback[k] / s.collected
+        corrected = max(corrected, abs(feedback - s.feedback_before[k]) / p.duration)
+        s.feedback_before[k] = feedback
     s.turning = turning
-    s.rough = np.sqrt((p.ripple * fastest) ** 2 + (_TIMING_S / p.duration * change) ** 2)
+    corrected = max(corrected - _STEADY_FEEDBACK, 0.0)
+    s.rough = np.sqrt((p.ripple * fastest) ** 2 + (_TIMING_S / p.duration * change) ** 2 + corrected**2)
     for k in range(IMU_COUNT):
         # Samples from one side of the window would not be its mean.
-        s.counted[k] = _LEAST_SAMPLES * s.samples[k] >= s.collected
+        even = abs(s.places[k]) <= _UNEVEN * s.samples[k] * s.collected
+        s.counted[k] = _LEAST_SAMPLES * s.samples[k] >= s.collected or (s.samples[k] > 1 and even)
         if s.counted[k] == 0:
             continue
         shaken = shaking.excess[ACCELEROMETER, k] + shaking.hidden[k] + shaking.mean[k]

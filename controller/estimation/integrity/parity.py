@@ -37,6 +37,9 @@ _AGREE, _AGREE_OF_ALL = 0.6, 0.15
 _FORCE_LIMIT, _ROUGH_SIGMAS = 0.9, 3.0
 """Error of a mean force that is told: this [m/s^2], and some standard deviations of what is not known of the motion."""
 
+_ENOUGH = 5
+"""So many gyroscopes know the change of the twist well enough for that."""
+
 _AVERAGED = 0.25
 """Share of a window in the average of such errors."""
 
@@ -126,11 +129,13 @@ def _error_without(s: Record, f: Record, excluded: Array, left_out: int) -> floa
 @kernel
 def _compare_forces(s: Record, f: Record, excluded: Array, samples: int, period: float, no_motion: Array) -> None:
     """Find what the mean forces of this window and the last one show beyond the change of the twist between them."""
-    follows = f.windows > 1
+    follows, used = f.windows > 1, 0
+    for k in range(IMU_COUNT):
+        used += f.counted[k] != 0 and excluded[k] == 0
     s.steady = 0.0
     for k in range(IMU_COUNT):
         s.off_motion[k] = no_motion[k] = 0.0
-        if f.counted[k] == 0 or excluded[k] != 0:
+        if f.counted[k] == 0 or excluded[k] != 0 or used < _ENOUGH:
             s.average[k] = 0.0
             continue
         squared = averaged = 0.0

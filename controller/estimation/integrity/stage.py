@@ -76,14 +76,16 @@ def integrity_parameters(fusion: FusionSettings, rate: float, prior: Array, acti
 
 
 @kernel
-def step_integrity(p: Record, s: Record, rig: Record, time: Record, imus: Record, pose: Record, legs: Array) -> None:
+def step_integrity(
+    p: Record, s: Record, rig: Record, time: Record, imus: Record, pose: Record, legs: Array, commands: Array
+) -> None:
     """Take a cycle's samples, and do its share of the evaluation; a new one begins when the one before is complete."""
     s.fresh = s.contradicts = 0
     if p.filter.active == 0:
         return
     if time.missed > 0:
         s.step = s.cycle = 0
-    took = fault_filter.step_fault_filter(p.filter, s.filter, rig.sensors, imus, time.missed, pose, legs)
+    took = fault_filter.step_fault_filter(p.filter, s.filter, rig.sensors, imus, time.missed, pose, legs, commands)
     if s.filter.job > 0 and s.compared != s.filter.windows:
         s.compared = s.filter.windows
         s.contradicts = s.filter.windows > 0 and parity.step_parity(

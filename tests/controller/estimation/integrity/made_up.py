@@ -60,8 +60,9 @@ def filtered(mechanism, r, parameters, state, off=(0.0,) * 6, count=None):
         place_legs(mechanism, s["pose"])
         s["reference"]["motion"] = r.legs[i]
         f = s["integrity"]["filter"]
+        legs = s["reference"]["motion"]
         taken += step_fault_filter(
-            p["integrity"]["filter"], f, p["rig"]["sensors"], s["imus"], 0, s["pose"], s["reference"]["motion"]
+            p["integrity"]["filter"], f, p["rig"]["sensors"], s["imus"], 0, s["pose"], legs, legs[:, 1].copy()
         )  # fmt: skip
     return taken
 

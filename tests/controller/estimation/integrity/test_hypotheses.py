@@ -92,7 +92,10 @@ def all_steps(mechanism, r, parameters, state):
         s["pose"]["position"], s["pose"]["rotation"] = r.positions[i], r.rotations[i]
         place_legs(mechanism, s["pose"])
         s["reference"]["motion"] = r.legs[i]
-        step_integrity(p["integrity"], s["integrity"], p["rig"], s["time"], s["imus"], s["pose"], s["reference"]["motion"])
+        legs = s["reference"]["motion"]
+        step_integrity(
+            p["integrity"], s["integrity"], p["rig"], s["time"], s["imus"], s["pose"], legs, legs[:, 1].copy()
+        )  # fmt: skip
         s["time"]["cycle"] += 1
     return s["integrity"]
 

@@ -100,7 +100,7 @@ def test_sound_accelerometers_read_the_motion_of_the_gyroscopes(kind):
 def test_a_force_that_is_no_motion_is_known_in_the_second_window_of_one_imu_or_of_all(imu, size):
     """The first window has nothing before it; a force since then is in both."""
     fault = size * np.array([0.0, 0.8, 0.6])
-    mechanism, r = readings("0.5", 1.0, 2)
+    mechanism, _ = readings("0.5", 1.0, 2)
     _, state = constants(mechanism)
     sound, _ = look(windows=2)
     s, told = look(imu, fault, windows=2, sensor=1, state=state)
