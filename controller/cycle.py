@@ -271,7 +271,7 @@ def _check_integrity(parameters: Record, state: Record) -> None:
     )
     if changed:
         trust.restart_filter(s.mechanism, time, s.pose)
-        integrity.restart_integrity(s.integrity)
+        integrity.restart_integrity(p.integrity, s.integrity)
     if s.integrity.evaluations > 0:
         watch.check_level(p.safety, s.safety, rig, time, s.integrity.protection.level, s.reference, s.pid)
     if s.integrity.fresh != 0:
@@ -281,7 +281,7 @@ def _check_integrity(parameters: Record, state: Record) -> None:
         end_level(level, time.cycle * rig.period)
         if watch.judge_evidence(p.safety, s.safety, rig, time, s.imus, s.integrity, s.reference, s.pid):
             trust.restart_filter(s.mechanism, time, s.pose)
-            integrity.restart_integrity(s.integrity)
+            integrity.restart_integrity(p.integrity, s.integrity)
 
 
 @kernel

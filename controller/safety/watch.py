@@ -27,8 +27,11 @@ _MOST_DOUBLINGS = 20
 _CLEARLY, _CLEARLY_OF_ALL = 0.5, 0.25
 """How much less than for the named IMU the evidence for anything else must be: of the limit, and of that evidence."""
 
-_REST, _REST_OF_ALL = 1.0, 0.05
-"""How much evidence for further faults may be left without the named IMU: times the limit, and of the evidence for it."""
+_REST, _REST_OF_ALL = 1.0, 0.35
+"""How much evidence for further faults may be left without the named IMU: times the limit, and of the evidence for it.
+
+A fault that has just come up is not constant over the memory of the fault filter, and leaves up to a third of its own evidence.
+"""
 
 _PATIENT = 2.0
 """How many times the limit evidence may reach while more of it may tell what is wrong."""

@@ -97,6 +97,8 @@ IMU_LIMITS: Limits = {
     "delay": (0, _LONGEST_DELAY),
     "magnetometer_every": (1, MOST),
     "conversions": (1, _MOST_CONVERSIONS),
+    "sparing": (0, 1),
+    "spared": (0, 1),
     "disturbance.sensor": (-1, 2),
     "lasting": (0, MOST_DISTURBANCES),
     "disturbances": (0, MOST_DISTURBANCES),

@@ -23,6 +23,7 @@ PARAMETERS = record_dtype(
     filter=fault_filter.PARAMETERS,
     evidence=evidence.PARAMETERS,
     cycles=np.int64,  # over which an evaluation is spread
+    correction_cycles=np.int64,  # how long the loop takes to correct the pose
 )
 """Constants."""
 
@@ -34,6 +35,7 @@ STATE = record_dtype(
     parity=parity.STATE,
     compared=np.int64,  # the last window of which the gyroscopes have been compared
     contradicts=np.int64,  # whether they have been found to contradict each other in this cycle
+    waits=np.int64,  # for how many more cycles nothing is taken
     step=np.int64,  # next of the evaluation
     cycle=np.int64,  # of the evaluation
     found=(np.float64, HYPOTHESES),  # evidence for each, of the evaluation under way
@@ -58,6 +60,9 @@ _FIRST_TOTAL = _FIRST_HYPOTHESIS + HYPOTHESES
 STEPS = _FIRST_TOTAL + IMU_COUNT
 """Steps of an evaluation."""
 
+_CORRECTION_S = 0.1
+"""How long the loop takes to correct the pose when an IMU has been left out or taken back [s]; no plan has that motion."""
+
 _FIRST_WINDOWS = 7
 """After how many windows the first evaluation begins: it is complete before the brakes have held for 0.2 s."""
 
@@ -72,6 +77,7 @@ def integrity_parameters(fusion: FusionSettings, rate: float, prior: Array, acti
         filter=filtered,
         evidence=evidence.evidence_parameters(prior, float(filtered["duration"])),
         cycles=evidence.EVALUATION_WINDOWS * int(filtered["window"]),
+        correction_cycles=round(_CORRECTION_S * rate),
     )
 
 
@@ -82,6 +88,9 @@ def step_integrity(
     """Take a cycle's samples, and do its share of the evaluation; a new one begins when the one before is complete."""
     s.fresh = s.contradicts = 0
     if p.filter.active == 0:
+        return
+    if s.waits > 0:
+        s.waits -= 1
         return
     if time.missed > 0:
         s.step = s.cycle = 0
@@ -108,8 +117,9 @@ def step_integrity(
 
 
 @kernel
-def restart_integrity(s: Record) -> None:
+def restart_integrity(p: Record, s: Record) -> None:
     """Forget the last half second, as the set of IMUs that are relied upon has changed; what was learned before it stays."""
+    s.waits = p.correction_cycles
     s.step = s.cycle = 0
     fault_filter.begin_anew(s.filter)
 

@@ -28,7 +28,7 @@ name = "files"
 mechanism = "rig.toml"
 target = "motion.csv"
 calibration = "imus.toml"
-imu = "mpu9150"
+imu = "mpu9150-calibrated"
 duration = 1.0
 rate = 250.0
 [vary]
@@ -149,7 +149,7 @@ def test_two_machines_that_share_nothing(machines: Machines, certificates: Certi
     for row in table[::7]:
         (tmp_path / "rig.toml").write_text(f"{rig[0]}proportional = {row['mechanism.control.proportional']}{rig[2]}")
         files = ["--mechanism", tmp_path / "rig.toml", "--target", study / "motion.csv", "--calibration", study / "imus.toml"]
-        values = ["--imu", "mpu9150", "--duration", 1, "--rate", 250, "--seed", row["run.seed"]]
+        values = ["--imu", "mpu9150-calibrated", "--duration", 1, "--rate", 250, "--seed", row["run.seed"]]
         finished = gough("simulate", *files, *values, "--json", tmp_path / "run.json")
         assert finished.returncode == 0, finished.stderr
         figures = json.loads((tmp_path / "run.json").read_text())

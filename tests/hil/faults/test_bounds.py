@@ -146,4 +146,4 @@ def test_only_shocks_and_joints_that_are_off_come_near_the_limits_before_they_ar
     assert len(found) > 100
     share = [max(np.divide(each.errors(), LIMITS[each.single])) for each in found]
     beyond = {each.row.kind for each, size in zip(found, share, strict=True) if size > 2.0 / 3.0}
-    assert beyond <= {"vibration", "mechanism", "base", "other-rates"}
+    assert beyond <= {"vibration", "mechanism", "base", "other-rates", "other-imus"}

@@ -50,7 +50,7 @@ def test_a_case_may_disturb_imus_over_the_bus():
     borne = "imu-clock:{k},size_percent=1 imu-vibration:all,axis=x,size_g=0.05,sine_hz=97 imu-temperature:{j},size_k=1,ramp_s=1"
     cases = (
         Case("borne", Cause.NONE, Reaction.GO_ON, 0, 3e-3, borne),
-        Case("turned", Cause.IMU_DISAGREES, Reaction.GO_ON, 2500, 15e-3, "imu-turn:{k},axis=x,size_deg=5"),
+        Case("turned", Cause.IMU_CONTRADICTED, Reaction.GO_ON, 600, 15e-3, "imu-turn:{k},axis=x,size_deg=5"),
     )
     for outcome in run_matrix(1, cases):
         assert outcome.findings == []

@@ -688,7 +688,7 @@ sys.exit(main(sys.argv[1:]))
 def test_a_recording_that_cannot_go_on_is_told_in_a_line_and_the_run_goes_on(tmp_path):
     """A limit on the size of files stands in for a full disk; the plant's library is smaller."""
     path = tmp_path / "run.mcap"
-    arguments = ["run", "--duration", "4", "--rate", "1000", "--most-missed", "2000", "--record", str(path)]
+    arguments = ["run", "--duration", "5", "--rate", "1000", "--most-missed", "2000", "--record", str(path)]
     command = [sys.executable, "-c", LIMITED, *arguments]
     process = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60.0)
     assert process.returncode == 1
