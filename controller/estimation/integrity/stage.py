@@ -35,7 +35,7 @@ STATE = record_dtype(
     parity=parity.STATE,
     compared=np.int64,  # the last window of which the gyroscopes have been compared
     contradicts=np.int64,  # whether they have been found to contradict each other in this cycle
-    waits=np.int64,  # for how many more cycles nothing is taken
+    waits=np.int64,  # for how many more cycles what is read counts for the gyroscopes' parity alone
     step=np.int64,  # next of the evaluation
     cycle=np.int64,  # of the evaluation
     found=(np.float64, HYPOTHESES),  # evidence for each, of the evaluation under way
@@ -89,9 +89,6 @@ def step_integrity(
     s.fresh = s.contradicts = 0
     if p.filter.active == 0:
         return
-    if s.waits > 0:
-        s.waits -= 1
-        return
     if time.missed > 0:
         s.step = s.cycle = 0
     took = fault_filter.step_fault_filter(p.filter, s.filter, rig.sensors, imus, time.missed, pose, legs, commands)
@@ -102,6 +99,11 @@ def step_integrity(
         )  # fmt: skip
         if s.evaluations > 0:
             protection.publish_level(s.protection, s.parity.steady, imus.shaking.mean.max())
+    if s.waits > 0:
+        s.waits -= 1
+        if s.waits == 0:
+            fault_filter.begin_anew(s.filter)
+        return
     if s.step == 0 and not (took and s.filter.windows >= _FIRST_WINDOWS):
         return
     s.cycle += 1
