@@ -30,7 +30,7 @@ def test_what_is_wrong_from_the_start_is_never_armed(fault, reason):
     result, said = stopped(duration=1.5, faults=(fault,))
     assert f"not armed: {reason}" in said
     assert (result.records["mode"] != Mode.RUNNING).all()
-    assert result.events[0].endswith(said.split(": ", 1)[1])
+    assert result.events[-1].endswith(said.split(": ", 1)[1])
 
 
 @pytest.mark.parametrize("fusion", ["compiled", "whole"])
@@ -50,14 +50,20 @@ def test_what_all_accelerometers_share_is_told_in_motion_before_the_pose_is_5_mm
 
 
 @pytest.mark.parametrize(
-    "fault", ["imu-turn:6,axis=y,size_deg=3,at=1", "imu-noise:6,axis=all,size_deg_per_s=60,at=1"], ids=["turned", "noisy"]
+    ("fault", "reason"),
+    [
+        ("imu-turn:6,axis=y,size_deg=3,at=1", "quick stop: the IMUs contradict each other, the worst is IMU 6"),
+        ("imu-noise:6,axis=all,size_deg_per_s=60,at=1", "controlled stop: without IMU 6 nothing shows an error"),
+    ],
 )
-def test_a_run_whose_platform_imu_is_left_out_ends_unless_that_is_allowed(tmp_path, fault):
+def test_a_run_ends_before_it_goes_on_without_the_platforms_imu_unless_that_is_allowed(tmp_path, fault, reason):
+    """One that contradicts the others may be the one that is right, so that the stop is a quick one, with it."""
     result, said = stopped(duration=2.0, faults=(fault,))
     events = [event.split(": ", 1)[1] for event in result.summary()["events"]]
-    out = next(n for n, event in enumerate(events) if event.startswith("IMU 6 is left out"))
-    assert "without IMU 6 nothing shows an error that the legs' IMUs share: need_platform_imu = 0" in said
-    assert "controlled stop: without IMU 6" in events[out + 1]
+    assert any(event.startswith(reason) for event in events)
+    assert (
+        any("IMU 6 is left out" in event for event in events) == ("without IMU 6" in said) == ("need_platform_imu = 0" in said)
+    )
     allowing = tmp_path / "allowing.toml"
     allowing.write_text('based_on = "hexapod"\n[safety]\nneed_platform_imu = 0\n')
     events = simulate(SimulationConfig(str(allowing), duration=2.0, faults=(fault,))).summary()["events"]
@@ -71,11 +77,11 @@ def test_a_set_that_never_had_the_platforms_imu_runs(imus):
 
 
 def test_the_protection_level_shows_that_few_imus_do_not_check_each_other():
-    """An error of the platform's IMU that nothing contradicts: 10 mm, without a word."""
+    """An error of the platform's IMU that nothing contradicts: 10 mm, without a word. It is learned as a constant one at the end."""
     sound = simulate(SimulationConfig(duration=4.0)).summary()
     few = {"imus": (0, 5, 6), "magnetometer": True}
     wrong = simulate(SimulationConfig(duration=4.0, **few, faults=("imu-turn:6,axis=x,size_deg=2,at=1.5",))).summary()
     assert wrong["estimation"]["position_max"] > 8.0 * MM
-    assert wrong["protection"]["covered"] > 0.9
+    assert wrong["protection"]["covered"] > 0.7
     for level in ("position_p50", "rotation_p50"):
         assert wrong["protection"][level] > 3.0 * sound["protection"][level]
