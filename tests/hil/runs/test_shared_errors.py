@@ -30,7 +30,8 @@ def test_what_is_wrong_from_the_start_is_never_armed(fault, reason):
     result, said = stopped(duration=1.5, faults=(fault,))
     assert f"not armed: {reason}" in said
     assert (result.records["mode"] != Mode.RUNNING).all()
-    assert result.events[-1].endswith(said.split(": ", 1)[1])
+    # A large offset is also noted as shaking.
+    assert any(event.endswith(said.split(": ", 1)[1]) for event in result.events)
 
 
 @pytest.mark.parametrize("fusion", ["compiled", "whole"])
@@ -50,20 +51,24 @@ def test_what_all_accelerometers_share_is_told_in_motion_before_the_pose_is_5_mm
 
 
 @pytest.mark.parametrize(
-    ("fault", "reason"),
+    ("fault", "reason", "out"),
     [
-        ("imu-turn:6,axis=y,size_deg=3,at=1", "quick stop: the IMUs contradict each other, the worst is IMU 6"),
-        ("imu-noise:6,axis=all,size_deg_per_s=60,at=1", "controlled stop: without IMU 6 nothing shows an error"),
+        ("imu-turn:6,axis=y,size_deg=3,at=1", "the IMUs contradict each other, the worst is IMU 6", False),
+        (
+            "imu-noise:6,axis=all,size_deg_per_s=60,at=1",
+            "without IMU 6 nothing shows an error that the legs' IMUs share: need_platform_imu = 0",
+            True,
+        ),
     ],
+    ids=["turned", "noisy"],
 )
-def test_a_run_ends_before_it_goes_on_without_the_platforms_imu_unless_that_is_allowed(tmp_path, fault, reason):
-    """One that contradicts the others may be the one that is right, so that the stop is a quick one, with it."""
+def test_a_run_that_cannot_rely_on_the_platforms_imu_ends_unless_that_is_allowed(tmp_path, fault, reason, out):
+    """A contradiction ends it at once; what the IMU's own readings show leaves it out first."""
     result, said = stopped(duration=2.0, faults=(fault,))
+    assert reason in said
     events = [event.split(": ", 1)[1] for event in result.summary()["events"]]
-    assert any(event.startswith(reason) for event in events)
-    assert (
-        any("IMU 6 is left out" in event for event in events) == ("without IMU 6" in said) == ("need_platform_imu = 0" in said)
-    )
+    assert any(event.startswith("IMU 6 is left out") for event in events) == out
+    assert f"stop: {reason}" in events[-1]
     allowing = tmp_path / "allowing.toml"
     allowing.write_text('based_on = "hexapod"\n[safety]\nneed_platform_imu = 0\n')
     events = simulate(SimulationConfig(str(allowing), duration=2.0, faults=(fault,))).summary()["events"]
