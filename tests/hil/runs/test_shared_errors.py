@@ -82,7 +82,7 @@ def test_a_set_that_never_had_the_platforms_imu_runs(imus):
 
 
 def test_the_protection_level_shows_that_few_imus_do_not_check_each_other():
-    """An error of the platform's IMU that nothing contradicts: 10 mm, without a word. In the end it is learned as a constant one."""
+    """An error of the platform's IMU that nothing contradicts: 10 mm without a word, which is learned as a constant one."""
     sound = simulate(SimulationConfig(duration=4.0)).summary()
     few = {"imus": (0, 5, 6), "magnetometer": True}
     wrong = simulate(SimulationConfig(duration=4.0, **few, faults=("imu-turn:6,axis=x,size_deg=2,at=1.5",))).summary()
