@@ -84,7 +84,7 @@ class FilterpyLeg(_Filterpy):
         self.F[:6, :6] = np.kron([[1.0, t, t**2 / 2], [0.0, 1.0, t], [0.0, 0.0, 1.0]], np.eye(2))
         self.Q[:6, :6] += np.kron(jerk * noise, np.eye(2))
         self.variances, self.period = np.array([rate_variance, force_variance]), period
-        self.excess, self.passed = np.zeros(2), 0.0
+        self.excess, self.passed, self.shaken = np.zeros(2), 0.0, 0.0
 
     def step(self, gyroscope: Array, accelerometer: Array) -> None:
         """Predict over one period and take a sample [rad/s, m/s^2]."""
@@ -99,6 +99,8 @@ class FilterpyLeg(_Filterpy):
         of_force = self.variances[1] + self.gravity**2 * doubt[:2].sum() + lever * doubt[4:6].sum()
         for sensor, explained in enumerate((3.0 * self.variances[0] + doubt[2:4].sum(), of_force)):
             self.excess[sensor] = _faded(self.excess[sensor], squared[sensor], explained, self.period / shaking.MEMORY_S)
+        if self.shaken > shaking.SHAKEN:
+            self.excess[0] = 0.0
         if self.excess[1] == 0.0:
             self.passed += min(1.0, self.period / shaking.AVERAGE_S) * (squared[1] - self.passed)
         hidden = max(0.0, self.passed - of_force)
@@ -247,7 +249,7 @@ class FilterpyFilters:
             else:
                 leg.predict()
             shaken = imus["shaking"]
-            leg.excess[:], leg.passed = shaken["excess"][:, k], float(shaken["passed"][k])
+            leg.excess[:], leg.passed, leg.shaken = shaken["excess"][:, k], float(shaken["passed"][k]), float(shaken["mean"][k])
             leg.take(rate, force, tuple(shaken["clipped"][:, k]))
             shaken["excess"][:, k], shaken["passed"][k] = leg.excess, leg.passed
             legs["x"][k], legs["covariance"][k] = leg.state, leg.P

@@ -36,6 +36,9 @@ _BRIDGED_S = 0.05
 SAYS_NOTHING = 1e4
 """Variance of a clipped reading [m^2/s^4, rad^2/s^2]: so much more than that of any other that it does not count."""
 
+SHAKEN = 0.25
+"""Mean square from which on an accelerometer is shaken for its gyroscope [m^2/s^4]."""
+
 _CALM_SHARE = 0.5
 """Below this share of the limit the IMUs count as calm."""
 
@@ -89,8 +92,14 @@ def note_force(s: Record, k: int, squared: float, explained: float, period: floa
 
 @kernel
 def note_rate(s: Record, k: int, squared: float, explained: float, period: float) -> None:
-    """Note by how much the gyroscope of IMU `k` reads what is not explained [rad^2/s^2], as `note_force`."""
-    s.excess[GYROSCOPE, k] = faded_excess(s.excess[GYROSCOPE, k], squared, explained, period, MEMORY_S)
+    """Note by how much the gyroscope of IMU `k` reads what is not explained [rad^2/s^2], as `note_force`.
+
+    While its accelerometer is shaken, the motion so far is the worse witness.
+    """
+    if s.mean[k] > SHAKEN:
+        s.excess[GYROSCOPE, k] = 0.0
+    else:
+        s.excess[GYROSCOPE, k] = faded_excess(s.excess[GYROSCOPE, k], squared, explained, period, MEMORY_S)
 
 
 @kernel

@@ -39,6 +39,7 @@ class Twins:
         self.take(gyroscope, accelerometer)
 
     def step(self, gyroscope, accelerometer, clipped=(0, 0)):
+        self.reference.shaken = float(self.shaking["mean"][0])
         self.reference.predict()
         self.reference.take(gyroscope, accelerometer, clipped)
         predict_leg(self.x, self.covariance, *self.noise)

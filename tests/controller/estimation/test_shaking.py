@@ -91,6 +91,10 @@ def test_a_gyroscope_counts_less_by_what_it_reads_beyond_the_motion_so_far(shaki
     note_rate(shaking, 4, 0.01, explained, 1e-3)
     assert variance_of(shaking, GYROSCOPE, 4, nominal) == pytest.approx(nominal + 0.01 - 9.0 * explained)
     assert variance_of(shaking, ACCELEROMETER, 4, nominal) == variance_of(shaking, GYROSCOPE, 3, nominal) == nominal
+    # Of a motion that a shaken accelerometer has bent, the gyroscope is the better witness.
+    shaking["mean"][4] = 1.0
+    note_rate(shaking, 4, 0.01, explained, 1e-3)
+    assert variance_of(shaking, GYROSCOPE, 4, nominal) == nominal
 
 
 def test_a_mean_force_that_is_no_motion_counts_and_is_told_at_once(shaking):
