@@ -15,6 +15,7 @@ kinematics and refinement stay in the plane.
 """
 
 from collections.abc import Collection
+from dataclasses import replace
 from enum import IntEnum
 
 import numpy as np
@@ -48,6 +49,9 @@ from plant.pose import Array
 from plant.stopwatch import now
 
 _LEAST_GRAVITY = 0.1
+_LEAST_JUDGED_IMUS = 5
+"""With fewer, too little contradicts the evidence for a fault; the residuals of the closed form and the level remain."""
+
 _LEAST_EVIDENCE_HZ = 125.0
 """Below this rate the motion between two commands is not known well enough for sound IMUs to agree with it."""
 
@@ -71,6 +75,7 @@ PARAMETER_LIMITS: Limits = {
     "rig.geometry.ranks": (0, LINEAR_RANK),
     "heading.sample_cycles": (1, MOST),
     "mechanism.filter.window": (1, MOST),
+    "integrity.filter.window": (2, MOST),
     "mechanism.filter.errors": (0, ERRORS),
     "mechanism.filter.rig": (0, RIG_ERRORS),
     "mechanism.filter.states": (MOTION_STATES, MOST_STATES),
@@ -101,6 +106,7 @@ RUNNING_LIMITS: Limits = {
     "safety.stop.earlier_cause": (Cause.NONE, Cause.NONE),
     "safety.arming.obstacle": (Cause.NONE, max(Cause)),
     "safety.events.count": (0, 0),
+    **{f"integrity.{name}": limits for name, limits in integrity.LIMITS.items()},
 }
 """The same of the state between two cycles of a run that is not stopping."""
 
@@ -168,6 +174,8 @@ def cycle_parameters(
             f"{rate:g} Hz) and without the paper's section 5: leave out protection_position and protection_rotation"
         )
     watch_evidence = bool(watched.watch_imus) and able
+    if len(present) < _LEAST_JUDGED_IMUS:
+        watched = replace(watched, evidence=np.inf)
     return filled(
         PARAMETERS,
         rig=rig_parameters(mechanism, rate, control.hold, calibration.tilt),
@@ -238,7 +246,8 @@ def run_stages(
     if first <= CycleStage.REFINEMENT < last:
         if s.pose.found != 0:
             s.pose.found = pose_estimator.refine_pose(p.pose, s.pose, rig, time, s.legs, s.platform.rate)
-        if s.pose.found != 0 and p.safety.monitor.active != 0 and p.pose.section_5 == 0 and p.integrity.filter.active == 0:
+        judged = p.integrity.filter.active != 0 and np.isfinite(p.safety.watch.evidence)
+        if s.pose.found != 0 and p.safety.monitor.active != 0 and p.pose.section_5 == 0 and not judged:
             imu_monitor.look_at_next(
                 p.safety.monitor, s.safety.monitor, s.pose, s.legs.directions, s.legs.weights, rig.vectors_in_base[0]
             )

@@ -12,7 +12,7 @@ from plant.mechanism import Mechanism
 
 _ENDLESS = 1e300
 _RAW_M = 0.05
-_ENDLESS_ALLOWED = ("protection_position", "protection_rotation")
+_ENDLESS_ALLOWED = ("evidence", "protection_position", "protection_rotation")
 _ZERO_ALLOWED = ("integral", "derivative", "sensor_delay", "most_lost_imus", "watch_imus", "need_platform_imu")
 
 S = TypeVar("S", "ControlSettings", "FusionSettings", "SafetySettings")
@@ -79,7 +79,7 @@ class FusionSettings(_Settings):
     axes_sigma: float = 1e-3  # [rad]
     noise_inflation: float = 2.75  # factor on the whole-mechanism filter's noises and the platform's jerk
     # RMS angle between the leg filters' directions and the whole-mechanism filter's pose that ends the use of that pose [rad].
-    disagreement: float = radians(0.6)
+    disagreement: float = radians(1.0)
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class SafetySettings(_Settings):
     gyroscope_noise: float = radians(5.0)  # RMS beyond which an IMU is left out [rad/s]
     accelerometer_noise: float = 5.0  # RMS beyond which an IMU is left out [m/s^2]
     vibration: float = 1.5  # RMS of what accelerometers read beyond the motion, from which on it is told [m/s^2]
-    carried: float = radians(0.3)  # uncertainty of a direction, beyond which a run with shaken IMUs ends [rad]
+    carried: float = radians(0.4)  # uncertainty of a direction, beyond which a run with shaken IMUs ends [rad]
     conditioning: float = 5e-3  # least of the closed form
     stroke_margin: float = 0.003  # largest distance of an estimated length beyond its stroke [m]
     velocity_margin: float = 2.0  # largest estimated speed of a leg, as a multiple of its limit

@@ -70,6 +70,7 @@ STATE = record_dtype(
     deviating_for=(np.float64, LEGS),  # how long each drive has been off its command [s]
     saturated_for=(np.float64, LEGS),  # how long each command has been at its limit [s]
     speed=(np.float64, LEGS),  # estimated, of each leg [m/s]
+    calm_variance=np.float64,  # of the least known direction when nothing shook the IMUs last [rad^2]
     returns=(np.int64, IMU_COUNT),  # how often each IMU was taken back
     cleared_for=(np.int64, IMU_COUNT),  # in how many evaluations there has been little evidence against an IMU left out
 )
@@ -179,12 +180,9 @@ def check_carried(
     p: Record, s: Record, rig: Record, time: Record, shaking: Record, legs: Record, mechanism: Record, reference: Record,
     pid: Record,
 ) -> None:  # fmt: skip
-    """While IMUs are shaken: stop when what the pose comes from no longer knows a direction: the leg filters, or the
-    whole-mechanism filter's rotation.
+    """While IMUs are shaken: stop when what the pose comes from knows a direction much less well than before: the leg filters,
+    or the whole-mechanism filter's rotation.
     """
-    shaken = shaking.told != 0 or shaking.bridging != 0
-    if not shaken or s.mode != Mode.RUNNING:
-        return
     worst, variance = -1, 0.0
     if mechanism.trusted != 0:
         for i in range(3, 6):
@@ -194,8 +192,11 @@ def check_carried(
             own = legs.covariance[k, 0, 0] + legs.covariance[k, 1, 1]
             if legs.used[k] != 0.0 and own > variance:
                 worst, variance = k, own
-    if variance > p.watch.carried:
-        handle_cause(p, s, rig, time, reference, pid, Cause.NOT_CARRIED, worst, np.sqrt(variance), np.sqrt(p.watch.carried))
+    if shaking.told == 0 and shaking.bridging == 0:
+        s.watch.calm_variance = variance
+    limit = p.watch.carried + s.watch.calm_variance
+    if variance > limit and s.mode == Mode.RUNNING:
+        handle_cause(p, s, rig, time, reference, pid, Cause.NOT_CARRIED, worst, np.sqrt(variance), np.sqrt(limit))
 
 
 @kernel
@@ -210,8 +211,11 @@ def check_level(p: Record, s: Record, rig: Record, time: Record, level: Array, r
 def judge_parity(
     p: Record, s: Record, rig: Record, time: Record, imus: Record, parity: Record, reference: Record, pid: Record
 ) -> bool:
-    """When the gyroscopes contradict each other: leave out the one that is named, else stop. Returns whether it is left out."""
-    if s.mode != Mode.RUNNING:
+    """When the gyroscopes contradict each other: leave out the one that is named, else stop. Returns whether it is left out.
+
+    Where no evidence counts, they do not either.
+    """
+    if s.mode != Mode.RUNNING or not np.isfinite(p.watch.evidence):
         return False
     if parity.named != 0 and _may_leave_out(p.watch, imus, parity.worst):
         imus.excluded[parity.worst] = 1

@@ -35,8 +35,8 @@ POSE = 6
 REST = MOTION_STATES - POSE
 _SIZE = 2 * FAULTS + POSE
 
-_LEARNING_S, _LATE = 0.5, 2
-"""What is learned grows every `_LEARNING_S` seconds, by what was read `_LATE` times as long ago. So a fault is told before it
+_LEARNING_S, LATE = 0.5, 2
+"""What is learned grows every `_LEARNING_S` seconds, by what was read `LATE` times as long ago. So a fault is told before it
 is learned.
 """
 
@@ -80,8 +80,8 @@ STATE = record_dtype(
     learned_vector=(np.float64, FAULTS),
     expected=(np.float64, (FAULTS, FAULTS)),  # the same at any pose
     expected_vector=(np.float64, FAULTS),
-    waiting=(np.float64, (_LATE, FAULTS, FAULTS)),  # what is learned later
-    waiting_vector=(np.float64, (_LATE, FAULTS)),
+    waiting=(np.float64, (LATE, FAULTS, FAULTS)),  # what is learned later
+    waiting_vector=(np.float64, (LATE, FAULTS)),
     waits=np.int64,  # how many there are
     windows=np.int64,  # since the last time of learning
     order=(np.int64, IMU_COUNT),  # of the IMUs in the matrices, those that are left out first
@@ -154,7 +154,7 @@ def step_evidence(p: Record, s: Record, filtered: Record, excluded: Array, step:
             s.expected_vector[:] = 0.0
             s.waits = s.windows = 0
         _order_imus(s, excluded)
-        s.of_learned = s.windows == 0 and s.waits == _LATE
+        s.of_learned = s.windows == 0 and s.waits == LATE
         if s.of_learned != 0:
             _copy_learned(p, s)
         else:
@@ -358,14 +358,14 @@ def evidence_against(s: Record, at: int) -> float:
 
 @kernel
 def _learn(p: Record, s: Record) -> None:
-    """Every `_LEARNING_S`, learn what was read of the sensors' errors `_LATE` times as long ago."""
+    """Every `_LEARNING_S`, learn what was read of the sensors' errors `LATE` times as long ago."""
     s.windows += EVALUATION_WINDOWS
     if s.windows < p.learning_windows or s.of_learned != 0:
         return
     s.windows = 0
     for i in range(POSE):
         _eliminate(s.recent, REST + i)
-    late = s.waits == _LATE
+    late = s.waits == LATE
     for i in range(FAULTS):
         known = READINGS * s.order[i // READINGS] + i % READINGS
         for j in range(i, FAULTS):
@@ -375,18 +375,18 @@ def _learn(p: Record, s: Record) -> None:
                 value += p.share * s.waiting[0, known, other]
             s.learned[known, other] = s.learned[other, known] = value
             s.expected[known, other] = s.expected[other, known] = value
-            for n in range(_LATE - 1):
+            for n in range(LATE - 1):
                 s.waiting[n, known, other] = s.waiting[n, other, known] = s.waiting[n + 1, known, other]
             new = s.recent[MOTION_STATES + i, MOTION_STATES + j]
-            s.waiting[_LATE - 1, known, other] = s.waiting[_LATE - 1, other, known] = new
+            s.waiting[LATE - 1, known, other] = s.waiting[LATE - 1, other, known] = new
         s.learned_vector[known] *= p.keep
         if late:
             s.learned_vector[known] += p.share * s.waiting_vector[0, known]
-        for n in range(_LATE - 1):
+        for n in range(LATE - 1):
             s.waiting_vector[n, known] = s.waiting_vector[n + 1, known]
-        s.waiting_vector[_LATE - 1, known] = s.recent[MOTION_STATES + i, UNKNOWNS]
+        s.waiting_vector[LATE - 1, known] = s.recent[MOTION_STATES + i, UNKNOWNS]
         s.expected_vector[known] = s.learned_vector[known]
-    s.waits = min(s.waits + 1, _LATE)
+    s.waits = min(s.waits + 1, LATE)
 
 
 @kernel

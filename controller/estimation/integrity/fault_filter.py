@@ -64,7 +64,7 @@ _FAULT_STIFFNESS = 1e-4
 divided by the variance of the change between two windows.
 """
 
-_JOBS = _NEXT + IMU_COUNT
+JOBS = _NEXT + IMU_COUNT
 """Jobs of a window: the readings, carrying, forgetting, and each IMU."""
 
 PATH = record_dtype(
@@ -159,13 +159,13 @@ def step_fault_filter(
         begin_anew(s)
     _collect(p, s, imus, pose, legs, commands)
     took = False
-    if s.job < _JOBS and s.windows > 0:
+    if s.job < JOBS and s.windows > 0:
         s.step += 1
-        due = min(_JOBS, -(-_JOBS * s.step // (p.window - 1)))
+        due = min(JOBS, -(-JOBS * s.step // (p.window - 1)))
         while s.job < due:
             _do(p, s, sensors, imus.excluded, s.job)
             s.job += 1
-        took = s.job == _JOBS
+        took = s.job == JOBS
     if s.collected == p.window:
         _close_window(p, s, imus.variance, imus.shaking, legs)
     return took
@@ -175,7 +175,7 @@ def step_fault_filter(
 def begin_anew(s: Record) -> None:
     """Forget all that was read."""
     s.windows = s.collected = 0
-    s.job = _JOBS
+    s.job = JOBS
     s.information[:] = 0.0
     s.vector[:] = 0.0
 

@@ -15,7 +15,7 @@ from controller.estimation.integrity.hypotheses import (
     kind_of,
 )
 from controller.settings import FusionSettings
-from plant.compiled import Record, filled, kernel, record_dtype
+from plant.compiled import MOST, Limits, Record, filled, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.pose import Array
 
@@ -62,6 +62,27 @@ STEPS = _FIRST_TOTAL + IMU_COUNT
 
 _CORRECTION_S = 0.1
 """How long the loop takes to correct the pose when an IMU has been left out or taken back [s]; no plan has that motion."""
+
+LIMITS: Limits = {
+    "filter.windows": (0, MOST),
+    "filter.job": (0, fault_filter.JOBS),
+    "filter.step": (0, MOST),
+    "filter.collected": (0, MOST),
+    "evidence.waits": (0, evidence.LATE),
+    "evidence.windows": (0, MOST),
+    "evidence.order": (0, IMU_COUNT - 1),
+    "evidence.place": (0, IMU_COUNT - 1),
+    "evidence.apart": (0, IMU_COUNT),
+    "parity.worst": (0, IMU_COUNT - 1),
+    "waits": (0, MOST),
+    "step": (0, STEPS),
+    "cycle": (0, MOST),
+    "best": (0, HYPOTHESES - 1),
+    "rival": (0, HYPOTHESES - 1),
+    "blamed": (-1, IMU_COUNT - 1),
+    "rival_blamed": (-1, IMU_COUNT - 1),
+}
+"""Least and greatest of what counts or indexes in the state."""
 
 _FIRST_WINDOWS = 7
 """After how many windows the first evaluation begins: it is complete before the brakes have held for 0.2 s."""

@@ -468,8 +468,7 @@ def test_a_run_with_shaken_imus_ends_when_a_leg_is_known_no_better_than_the_limi
     legs["used"][:5] = 1.0
     for k, share in ((2, 1.01), (5, 9.0)):
         legs["covariance"][k, 0, 0], legs["covariance"][k, 1, 1] = 0.3 * (share * limit) ** 2, 0.7 * (share * limit) ** 2
-    # As long as nothing shakes, and while nothing moves.
-    assert not check_shaken(parameters, state)
+    # As long as nothing moves.
     state["imus"]["shaking"][sign] = 1
     state["safety"]["mode"] = Mode.ARMED
     assert not check_shaken(parameters, state)
@@ -480,6 +479,21 @@ def test_a_run_with_shaken_imus_ends_when_a_leg_is_known_no_better_than_the_limi
     assert check_shaken(parameters, state)
     cause, leg, value, most = stop_of(state)
     assert (cause, leg, most) == (Cause.NOT_CARRIED, 2, pytest.approx(limit)) and value == pytest.approx(1.01 * limit)
+
+
+def test_what_shaking_adds_to_the_uncertainty_of_before_counts():
+    """A few IMUs know some directions no better than the limit at any time."""
+    _, parameters, state = moving()
+    limit, legs = SafetySettings().carried, state["legs"]
+    legs["used"][:] = 1.0
+    legs["covariance"][3, 0, 0] = (2.0 * limit) ** 2
+    assert not check_shaken(parameters, state)
+    state["imus"]["shaking"]["told"] = 1
+    legs["covariance"][3, 0, 0] = 4.99 * limit**2
+    assert not check_shaken(parameters, state)
+    legs["covariance"][3, 0, 0] = 5.01 * limit**2
+    assert check_shaken(parameters, state)
+    assert stop_of(state)[3] == pytest.approx(np.sqrt(5.0) * limit)
 
 
 def test_while_the_whole_mechanism_filter_is_trusted_its_rotation_counts():

@@ -233,8 +233,8 @@ from tests.hil.runs.test_snapshot import MEMORY, changed
 
 def fields(dtype, path=()):
     for name, (kind, *_) in dtype.fields.items():
-        if kind.fields:
-            yield from fields(kind, (*path, name))
+        if kind.base.fields:
+            yield from fields(kind.base, (*path, name))
         else:
             yield (*path, name), kind.base
 
