@@ -84,7 +84,7 @@ class FilterpyLeg(_Filterpy):
         self.F[:6, :6] = np.kron([[1.0, t, t**2 / 2], [0.0, 1.0, t], [0.0, 0.0, 1.0]], np.eye(2))
         self.Q[:6, :6] += np.kron(jerk * noise, np.eye(2))
         self.variances, self.period = np.array([rate_variance, force_variance]), period
-        self.excess, self.passed, self.shaken = np.zeros(2), 0.0, 0.0
+        self.excess, self.passed, self.shaken, self.no_motion = np.zeros(2), 0.0, 0.0, 0.0
 
     def step(self, gyroscope: Array, accelerometer: Array) -> None:
         """Predict over one period and take a sample [rad/s, m/s^2]."""
@@ -104,7 +104,7 @@ class FilterpyLeg(_Filterpy):
         if self.excess[1] == 0.0:
             self.passed += min(1.0, self.period / shaking.AVERAGE_S) * (squared[1] - self.passed)
         hidden = max(0.0, self.passed - of_force)
-        variances = self.variances + self.excess + [0.0, hidden] + shaking.SAYS_NOTHING * np.array(clipped)
+        variances = self.variances + self.excess + [0.0, hidden + self.no_motion] + shaking.SAYS_NOTHING * np.array(clipped)
         self.update(sample, self.measurement_jacobian, self.measurement, R=np.diag(np.repeat(variances, 3)))
 
     def measurement(self, x: Array) -> Array:
@@ -250,6 +250,7 @@ class FilterpyFilters:
                 leg.predict()
             shaken = imus["shaking"]
             leg.excess[:], leg.passed, leg.shaken = shaken["excess"][:, k], float(shaken["passed"][k]), float(shaken["mean"][k])
+            leg.no_motion = float(shaken["no_motion"][k])
             leg.take(rate, force, tuple(shaken["clipped"][:, k]))
             shaken["excess"][:, k], shaken["passed"][k] = leg.excess, leg.passed
             legs["x"][k], legs["covariance"][k] = leg.state, leg.P

@@ -146,7 +146,7 @@ def _follow(parameters: Record, state: Record, raw: Array, fused: Record, segmen
         for j in range(6):
             for k in range(6):
                 f.information[j, k] = s.pose.information[max(j, k), min(j, k)]
-        run_stages(parameters, state, raw[i], segments, marks, CycleStage.MECHANISM, CycleStage.CONTROL)
+        run_stages(parameters, state, raw[i], segments, marks, CycleStage.MECHANISM, CycleStage.INTEGRITY)
         f.positions[WHOLE], f.rotations[WHOLE] = s.pose.position, s.pose.rotation
         extrapolate_covariance(p.mechanism.filter, s.mechanism.filter, s.time.cycle * p.rig.period, f.covariance)
         f.ns[LEGS_ALONE] = marks.ns[CycleStage.LEGS]
