@@ -228,7 +228,7 @@ def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: 
         s.feedback_before[k] = feedback
     s.turning = turning
     corrected = max(corrected - _STEADY_FEEDBACK, 0.0)
-    s.rough = np.sqrt((p.ripple * fastest) ** 2 + (_TIMING_S / p.duration * change) ** 2 + corrected**2)
+    s.rough = np.sqrt((p.ripple * fastest) ** 2 + (_TIMING_S / p.duration * change) ** 2)
     for k in range(IMU_COUNT):
         # Samples from one side of the window would not be its mean.
         even = abs(s.places[k]) <= _UNEVEN * s.samples[k] * s.collected
@@ -238,7 +238,7 @@ def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: 
         shaken = shaking.excess[ACCELEROMETER, k] + shaking.hidden[k] + shaking.mean[k]
         # What shakes an IMU beyond its noise makes its mean as uncertain.
         s.weight[k, 0] = s.samples[k] / (max(p.variance[0], variance[0, k]) + p.window * (_TIMING_S * turning) ** 2)
-        s.weight[k, 1] = s.samples[k] / (max(p.variance[1], variance[1, k]) + p.window * (s.rough**2 + shaken))
+        s.weight[k, 1] = s.samples[k] / (max(p.variance[1], variance[1, k]) + p.window * (s.rough**2 + corrected**2 + shaken))
         for i in range(READINGS):
             s.mean[k, i] = s.sum[k, i] / s.samples[k]
     if s.windows > 0:
