@@ -40,7 +40,7 @@ from controller.safety.causes import Cause, Mode, Request
 from controller.safety.stop import handle_cause, ramp_down
 from controller.settings import ControlSettings, FusionSettings, SafetySettings
 from plant.checks import check_rate
-from plant.compiled import MOST, Limits, Record, filled, kernel, record_dtype
+from plant.compiled import MOST, Limits, Record, filled, kernel, record_dtype, shared_kernel
 from plant.errors import InputError
 from plant.imu_wiring import ALL_IMUS
 from plant.mechanism import LEGS, Mechanism
@@ -209,7 +209,7 @@ def cycle(parameters: Record, state: Record, measurement: Array, segments: Array
     return run_stages(parameters, state, measurement, segments, marks, CycleStage.SCREENING, CycleStage.END)
 
 
-@kernel
+@shared_kernel
 def run_stages(
     parameters: Record, state: Record, measurement: Array, segments: Array, marks: Record, first: int, last: int
 ) -> int:

@@ -8,7 +8,7 @@ from controller.estimation import shaking
 from controller.estimation.imu_calibration import calibrate_samples
 from controller.safety.causes import Cause, report_event
 from controller.settings import FusionSettings, SafetySettings
-from plant.compiled import Record, filled, kernel, record_dtype
+from plant.compiled import Record, filled, kernel, record_dtype, shared_kernel
 from plant.dynamics.variables import IMU_COUNT
 from plant.pose import Array
 
@@ -92,7 +92,7 @@ def imu_parameters(
     )
 
 
-@kernel
+@shared_kernel
 def screen_imus(
     p: Record, s: Record, rig: Record, time: Record, silent: int, measurement: Array, motion: Array, events: Record
 ) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from controller.estimation.shaking import note_force, note_rate, variance_of
 from controller.rig import elapsed
 from controller.settings import FusionSettings
-from plant.compiled import Record, filled, kernel, record_dtype
+from plant.compiled import Record, filled, kernel, record_dtype, shared_kernel
 from plant.imu import ACCELEROMETER, GYROSCOPE
 from plant.mechanism import LEGS
 from plant.pose import Array
@@ -75,7 +75,7 @@ def leg_parameters(fusion: FusionSettings, rate: float) -> Record:
     )
 
 
-@kernel
+@shared_kernel
 def step_leg_filters(p: Record, s: Record, rig: Record, time: Record, imus: Record) -> None:
     """Step the filters of the legs whose IMUs are used."""
     period = elapsed(rig, time)

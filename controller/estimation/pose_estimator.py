@@ -18,7 +18,7 @@ from controller.direct_kinematics.refinement import (
 )
 from controller.rig import elapsed
 from controller.settings import FusionSettings
-from plant.compiled import Record, filled, kernel, record_dtype
+from plant.compiled import Record, filled, kernel, record_dtype, shared_kernel
 from plant.mechanism import LEGS
 from plant.pose import Array
 from plant.vectors import rotate, vector
@@ -68,7 +68,7 @@ def take_vectors(s: Record, platform: Record, heading: Record) -> None:
     s.vector_weights[0], s.vector_weights[1] = platform.weight, heading.weight
 
 
-@kernel
+@shared_kernel
 def find_pose(
     p: Record, s: Record, rig: Record, directions: Array, leg_used: Array, platform_used: int, heading_used: int
 ) -> float:

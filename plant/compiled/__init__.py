@@ -2,7 +2,7 @@
 
 from plant.compiled.atomics import fence, load_acquire, store_release
 from plant.compiled.cache import hash_of_files, keyed_folder, user_cache
-from plant.compiled.kernels import Record, compilation_reported, filled, kernel, record_dtype
+from plant.compiled.kernels import Record, compilation_reported, filled, kernel, record_dtype, shared_kernel
 from plant.compiled.limits import MOST, Limits, out_of_limits
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "load_acquire",
     "out_of_limits",
     "record_dtype",
+    "shared_kernel",
     "store_release",
     "user_cache",
 ]

@@ -18,7 +18,7 @@ from numba.core import event
 from numba.extending import lower_cast
 
 from plant.compiled.cache import hash_of_files, keyed_folder
-from plant.compiled.linking import linked_flat
+from plant.compiled.linking import linked_flat, linked_shared
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -76,13 +76,7 @@ def kernel(function: F) -> F:
     Division by zero gives inf or NaN as in NumPy. fastmath stays off, so that NaN checks mean something. Only a kernel that
     Python calls gets machine code, with all its callees in it, one for all constants and shapes of arrays.
     """
-    settings: Any = numba.config
-    before = settings.CACHE_DIR
-    settings.CACHE_DIR = str(_kernel_folder())
-    try:
-        compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    finally:
-        settings.CACHE_DIR = before
+    compiled = _cached(function)
 
     @cache
     def inner() -> Any:
@@ -93,11 +87,37 @@ def kernel(function: F) -> F:
         return made
 
     compiled.compile = linked_flat(compiled.compile)
-    compiled.get_call_template = lambda args, kws: inner().get_call_template(
-        tuple(_general(each) for each in args), {name: _general(each) for name, each in kws.items()}
-    )
+    compiled.get_call_template = lambda args, kws: inner().get_call_template(*_generals(args, kws))
     compiled.get_overload = lambda signature: inner().get_overload(signature)
     return cast(F, compiled)
+
+
+def shared_kernel(function: F) -> F:
+    """As `kernel`, with machine code of its own, which callers call instead of having it in theirs: for large functions that
+    are part of several programs, as they are compiled once.
+    """
+    compiled = _cached(function)
+    find_template = compiled.get_call_template
+    compiled.compile = linked_shared(compiled)
+    compiled.get_call_template = lambda args, kws: find_template(*_generals(args, kws))
+    return cast(F, compiled)
+
+
+def _cached(function: Callable[..., Any]) -> Any:
+    """Numba's dispatcher, with the cache in our folder."""
+    settings: Any = numba.config
+    before = settings.CACHE_DIR
+    settings.CACHE_DIR = str(_kernel_folder())
+    try:
+        compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    finally:
+        settings.CACHE_DIR = before
+    return compiled
+
+
+def _generals(args: Any, kws: Any) -> tuple[Any, Any]:
+    """The general types of arguments, see `_general`."""
+    return tuple(_general(each) for each in args), {name: _general(each) for name, each in kws.items()}
 
 
 def _general(kind: Any) -> Any:

@@ -1,20 +1,26 @@
-"""Faster compilation: kernels are linked once, flat, instead of at every level of calls.
+"""Faster compilation: kernels are linked once, flat, instead of at every level of calls, or not at all into their callers.
 
-This module replaces parts of numba while a kernel compiles. It halves the first start on a machine.
+This module replaces parts of numba while a kernel compiles. It halves the first start on a machine, and more loops than one
+share the machine code of the cycle.
 """
 
 import gc
+import hashlib
+import itertools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from types import SimpleNamespace
 from typing import Any, cast
 
 from llvmlite.binding import Linkage, parse_assembly
+from numba.core.bytecode import FunctionIdentity
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.environment import lookup_environment
 from numba.core.registry import cpu_target
 from numba.core.targetconfig import ConfigStack
+from numba.core.types import Record
 from numba.core.types.functions import BaseFunction
 
 _Library: Any = JITCodeLibrary
@@ -22,13 +28,20 @@ _environment_of: Any = lookup_environment
 
 
 class FlatLibrary(_Library):  # type: ignore[misc]
-    """The code of one function: machine code if Python calls it, else only bitcode, which is linked into its callers.
+    """The code of one function: machine code if Python calls it or callers share it, else only bitcode, which is linked into
+    its callers.
 
     numba itself links and optimises each function with all its callees, again at every level; here it is done once. The
     arithmetic does not depend on it, because fastmath is off.
     """
 
     inner = False
+    origin: tuple[str, str, Any] | None = None
+    """Module, name and types of arguments of a shared kernel."""
+
+    calls: tuple[tuple[str, str, Any], ...] = ()
+    """The origins of the shared kernels that this code calls: they must be loaded with it."""
+
     _shared_module: Any = None
 
     @property
@@ -65,12 +78,14 @@ class FlatLibrary(_Library):  # type: ignore[misc]
             elif each not in inner:
                 inner[each] = None
                 to_do.extend(each._linking_libraries)
+        self.calls = tuple({each.origin: None for each in others if getattr(each, "origin", None) is not None})
         own = {each.name for each in module.functions if not each.is_declaration}
         for each in inner:
             module.link_in(each._final_module, preserve=True)
         # A weak function is linked only where a function that is there already calls it, so these come last.
         for each in others:
-            module.link_in(each._get_module_for_linking(), preserve=True)
+            if getattr(each, "origin", None) is None:
+                module.link_in(each._get_module_for_linking(), preserve=True)
         # numba 0.68 has it, 0.62 does not.
         for each in (*inner, *others):
             if hasattr(self, "_reload_init"):
@@ -78,8 +93,10 @@ class FlatLibrary(_Library):  # type: ignore[misc]
         _weaken(module, lambda name: name not in own)
 
     def _get_module_for_linking(self) -> Any:
-        """The module with all callees, for a caller that is not a kernel."""
+        """The module with all callees, for a caller that is not a kernel; an empty one if the code is shared."""
         self._ensure_finalized()
+        if self.origin is not None:
+            return parse_assembly("")
         if self.inner and self._shared_module is None:
             module = self._final_module.clone()
             self._link_callees(module)
@@ -92,7 +109,15 @@ class FlatLibrary(_Library):  # type: ignore[misc]
         self._ensure_finalized()
         names = [each.name for each in self._final_module.functions if not each.is_declaration]
         stub = parse_assembly("\n".join(f'define void @"{name}"() {{ ret void }}' for name in names))
-        return self.name, "object", (self._get_compiled_object(), stub.as_bitcode())
+        return self.name, "object", (self._get_compiled_object(), stub.as_bitcode(), self.calls)
+
+    @classmethod
+    def _unserialize(cls, codegen: Any, state: Any) -> Any:
+        """As numba, after the shared kernels that the code calls."""
+        name, kind, (machine_code, stub, calls) = state
+        for module, kernel, arguments in calls:
+            getattr(import_module(module), kernel).compile(arguments)
+        return super()._unserialize(codegen, (name, kind, (machine_code, stub)))
 
 
 def _weaken(module: Any, which: Callable[[str], bool]) -> None:
@@ -121,6 +146,19 @@ def _resolve_once(self: Any, context: Any, args: Any, kws: Any) -> Any:
     return signature
 
 
+def _stable_name(self: Any) -> tuple[str, tuple[int]]:
+    """As `mangling_args` of a record, with a number that is the same in every process."""
+    known = self.__dict__
+    if "_gough_number" not in known:
+        known["_gough_number"] = _number_of(str(self))
+    return "Record", (known["_gough_number"],)
+
+
+def _number_of(text: str) -> int:
+    return int(hashlib.sha256(text.encode()).hexdigest()[:15], 16)
+
+
+_mangling_args: Any = Record.mangling_args
 _depth = 0
 
 
@@ -132,9 +170,11 @@ def flat_linking() -> Iterator[None]:
     cpu_target.target_context.refresh()
     codegen: Any = cpu_target.target_context.codegen()
     collection, functions = gc.get_threshold(), cast(Any, BaseFunction)
+    records: Any = Record
     _depth += 1
     if _depth == 1:
         codegen._library_class, functions.get_call_type = FlatLibrary, _resolve_once
+        records.mangling_args = property(_stable_name)
         # Collecting the many small objects as often as usual would take a third of the time.
         gc.set_threshold(*_LAZY_COLLECTION)
     try:
@@ -143,6 +183,7 @@ def flat_linking() -> Iterator[None]:
         _depth -= 1
         if _depth == 0:
             codegen._library_class, functions.get_call_type = JITCodeLibrary, _resolve
+            records.mangling_args = _mangling_args
             gc.set_threshold(*collection)
 
 
@@ -154,3 +195,29 @@ def linked_flat(compile_kernel: Callable[[Any], Any]) -> Callable[[Any], Any]:
             return compile_kernel(signature)
 
     return compile_flat
+
+
+def linked_shared(dispatcher: Any) -> Callable[[Any], Any]:
+    """The `compile` of a dispatcher whose machine code is shared by its callers: with flat linking, and a name in the machine
+    code that is the same in every process.
+    """
+    compile_flat = linked_flat(dispatcher.compile)
+    module, name = dispatcher.py_func.__module__, dispatcher.py_func.__qualname__
+    number = _number_of(f"{module}.{name}")
+    identities: Any = FunctionIdentity
+
+    def compile_shared(signature: Any) -> Any:
+        arguments = tuple(signature)
+        if arguments in dispatcher.overloads:
+            return dispatcher.overloads[arguments].entry_point
+        with global_compiler_lock:
+            others = identities._unique_ids
+            identities._unique_ids = itertools.chain((number,), others)
+            try:
+                entry = compile_flat(arguments)
+            finally:
+                identities._unique_ids = others
+            dispatcher.overloads[arguments].library.origin = module, name, arguments
+        return entry
+
+    return compile_shared

@@ -179,6 +179,67 @@ def test_machine_code_that_calls_other_kernels_is_loaded_whole(tmp_path: Path) -
     assert (said[0][1], said[1][1]) == ("1", "0")
 
 
+SHARED = """
+from plant.compiled import filled, kernel, record_dtype, shared_kernel
+
+DTYPE = record_dtype(count=int, values=(float, 3))
+
+@kernel
+def scaled(values, by):
+    return by * values.sum()
+
+@shared_kernel
+def inner(record, by):
+    record.count += 1
+    return scaled(record.values, by) / record.count
+
+@shared_kernel
+def middle(record):
+    return inner(record, 2.0) + inner(record, by=2.0)
+
+@kernel
+def first(records):
+    return middle(records[()]) - 1.0
+
+@kernel
+def second(records):
+    return middle(records[()]) + inner(records[()], 1.0)
+"""
+
+
+def test_a_shared_kernel_is_compiled_once_for_all_callers_and_processes(tmp_path: Path) -> None:
+    """Whichever is compiled first, and if the machine code of the shared ones is lost, those of their callers remain."""
+    (tmp_path / "shared_example.py").write_text(SHARED)
+    cache = tmp_path / "cache"
+
+    def called(*names: str, before: str = "", after: str = "") -> list[str]:
+        """What comes out, and what was compiled for it."""
+        code = (
+            "import numba; from numba.core import event; from shared_example import *; compiled = []\n"
+            "class Listener(event.Listener):\n"
+            "    def on_start(self, event): compiled.append(event.data['dispatcher'].py_func.__name__)\n"
+            "    def on_end(self, event): pass\n"
+            f"{before}\n"
+            "with event.install_listener('numba:compile', Listener()):\n"
+            f"    for each in ({', '.join(names)},): print(each(filled(DTYPE, values=(1.0, 2.0, 3.0))))\n"
+            f"    {after}\n"
+            "print(*(each for each in compiled if each in ('inner', 'middle', 'first', 'second')))"
+        )
+        paths = os.pathsep.join((str(tmp_path), str(Path(__file__).resolve().parents[2])))
+        environment = os.environ | {"GOUGH_CACHE": str(cache), "PYTHONPATH": paths}
+        run = subprocess.run([sys.executable, "-c", code], env=environment, check=True, capture_output=True, text=True)
+        return run.stdout.splitlines()
+
+    alone = "numba.njit(lambda records: middle(records[()]))"
+    assert called("first", alone) == ["17.0", "18.0", "first middle inner"]
+    assert called("first", "second") == ["17.0", "20.0", "second"]
+    assert called("second", "first") == ["20.0", "17.0", ""]
+    for lost in cache.rglob("shared_example.inner-*"):
+        lost.unlink()
+    assert called("second", before="numba.njit(lambda: 1)()") == ["20.0", "inner"]
+    assert called("inner.py_func", "first", before="inner.py_func = lambda record: 0.0") == ["0.0", "17.0", ""]
+
+
 def test_an_edit_where_kernels_are_gives_a_new_folder(tmp_path: Path) -> None:
     """The sources are copied, one file is edited, and the kernels of another file move to another folder."""
     root = Path(__file__).resolve().parents[2]
@@ -213,7 +274,7 @@ def test_rooms_that_leave_machine_code_as_it_is_serve_no_kernel() -> None:
     sources = {file: file.read_text() for package in PACKAGES for file in (root / package).rglob("*.py")}
     rooms = "|".join(WITHOUT_KERNELS)
     with_kernels = {
-        file: text for file, text in sources.items() if re.search(r"^\s*@kernel|record_dtype\(", text, re.MULTILINE)
+        file: text for file, text in sources.items() if re.search(r"^\s*@(shared_)?kernel|record_dtype\(", text, re.MULTILINE)
     }
     assert len(with_kernels) > 50
     for file, text in with_kernels.items():

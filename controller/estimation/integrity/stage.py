@@ -15,7 +15,7 @@ from controller.estimation.integrity.hypotheses import (
     kind_of,
 )
 from controller.settings import FusionSettings
-from plant.compiled import MOST, Limits, Record, filled, kernel, record_dtype
+from plant.compiled import MOST, Limits, Record, filled, kernel, record_dtype, shared_kernel
 from plant.dynamics.variables import IMU_COUNT
 from plant.pose import Array
 
@@ -102,7 +102,7 @@ def integrity_parameters(fusion: FusionSettings, rate: float, prior: Array, acti
     )
 
 
-@kernel
+@shared_kernel
 def step_integrity(
     p: Record, s: Record, rig: Record, time: Record, imus: Record, pose: Record, legs: Array, commands: Array
 ) -> None:

@@ -1,6 +1,7 @@
 """Whether the whole-mechanism filter is trusted: when it starts, when its pose is used, and how the source of the pose changes.
 
-The filter starts from the pose in closed form. Its pose is used once it has settled, as long as the leg filters agree with it.
+The filter starts from the pose in closed form. Its pose is used once it has settled and knows its rotation, as long as the leg
+filters agree with it.
 When the source changes, the step between the two poses fades away.
 """
 
@@ -22,7 +23,7 @@ from controller.least_squares import factor_cholesky, invert_cholesky
 from controller.rig import elapsed
 from controller.safety.causes import Cause, report_event
 from controller.settings import FusionSettings
-from plant.compiled import Record, filled, kernel, record_dtype
+from plant.compiled import Record, filled, kernel, record_dtype, shared_kernel
 from plant.imu_wiring import IMU_COUNT
 from plant.mechanism import LEGS
 from plant.pose import Array
@@ -78,7 +79,7 @@ def trust_parameters(fusion: FusionSettings, rate: float, filter_constants: Reco
     )
 
 
-@kernel
+@shared_kernel
 def step_mechanism_filter(
     p: Record, s: Record, rig: Record, time: Record, imus: Record, legs: Record, heading: Record, pose: Record, events: Record
 ) -> bool:
@@ -113,20 +114,20 @@ def step_mechanism_filter(
         if s.trusted != 0:
             s.stops += 1
             report_event(events, Cause.FILTER_DISAGREES, -1, np.sqrt(s.disagreement), np.sqrt(p.disagreement))
-    elif time.cycle >= s.due:
-        if s.trusted == 0:
-            s.trusted = 1
-            _add_step(s.closed_position, s.closed_rotation, pose.position, pose.rotation, s.blend_offset)
-        pose.twist[:] = s.twist
-        pose.acceleration[:] = s.acceleration
+    elif s.trusted == 0 and time.cycle >= s.due and _knows_rotation(f, p.disagreement):
+        s.trusted = 1
+        _add_step(s.closed_position, s.closed_rotation, pose.position, pose.rotation, s.blend_offset)
     if s.trusted != 0 and f.running == 0:
         s.trusted = 0
         _add_step(pose.position, pose.rotation, s.closed_position, s.closed_rotation, s.blend_offset)
-    if s.trusted == 0:
-        if not found:
-            return False
+    if s.trusted != 0:
+        pose.twist[:] = s.twist
+        pose.acceleration[:] = s.acceleration
+    elif found:
         pose.position[:] = s.closed_position
         pose.rotation[:] = s.closed_rotation
+    else:
+        return False
     _fade_step(s, rig, time, pose)
     return True
 
@@ -185,6 +186,12 @@ def _add_step(position: Array, rotation: Array, new_position: Array, new_rotatio
     for i in range(6):
         if not np.isfinite(offset[i]):
             offset[:] = 0.0
+
+
+@kernel
+def _knows_rotation(f: Record, variance: float) -> bool:
+    """Whether the filter's own rotation is known to this variance [rad^2], which it is not at rest with few IMUs."""
+    return bool(f.published_covariance[3, 3] + f.published_covariance[4, 4] + f.published_covariance[5, 5] <= variance)
 
 
 @kernel
