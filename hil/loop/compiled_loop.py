@@ -17,7 +17,7 @@ from hil.realtime.clock import FREE, REAL, finish, start, wait
 from hil.rigs import ANSWERED, SILENT
 from hil.rigs.udp.emulator import UdpEmulator, exchange_in_memory
 from hil.rigs.udp.link import UdpLink, exchange_udp, send_command
-from plant.compiled import Record, kernel, store_release
+from plant.compiled import Record, kernel, shared_kernel, store_release
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
 from plant.fmu.calls import advance, read_imus, read_truth, write_command, write_drive_mode
 from plant.imu import measure
@@ -36,7 +36,7 @@ _getppid: Any = types.ExternalFunction("getppid", types.int32())
 _sigpending: Any = types.ExternalFunction("sigpending", types.int32(types.intp))
 
 
-@kernel
+@shared_kernel
 def exchange_fmu(
     fmu: Record, imu: Record, command: Array, request: int, periods: int, period: float, feedback: Record,
     stage_ns: NDArray[np.int64], timespec: NDArray[np.int64],
@@ -155,7 +155,7 @@ def _ask(work: Record, cause: int) -> None:
         work[()].asked = cause
 
 
-@kernel
+@shared_kernel
 def process_feedback(parameters: Record, state: Record, work: Record, status: int) -> int:
     """Note which samples are new, and react to the rig's status; returns a cause if the cycle cannot run."""
     p, s, w = parameters[()], state[()], work[()]
@@ -173,7 +173,7 @@ def process_feedback(parameters: Record, state: Record, work: Record, status: in
     return Cause.NONE.value
 
 
-@kernel
+@shared_kernel
 def record_cycle(parameters: Record, state: Record, clock: Record, work: Record, failed: int, record: Record) -> None:
     """Fill in the record of a cycle except its durations."""
     p, s, c, w = parameters[()], state[()], clock[()], work[()]

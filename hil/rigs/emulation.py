@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from hil.rigs import DriveState, Request
-from plant.compiled import Record, filled, kernel, record_dtype
+from plant.compiled import Record, filled, kernel, record_dtype, shared_kernel
 from plant.dynamics.base_course import BASE_MOTION, MOST_BASE_MOTIONS, BaseMotionKind, base_motion_of_text, placed
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
 from plant.errors import InputError, UnknownNameError
@@ -193,7 +193,7 @@ def add_fault(rig: Record, fault: Record) -> None:
     rig["faults"] = count + 1
 
 
-@kernel
+@shared_kernel
 def sample(fmu: Record, imu: Record, rig: Record, now_ns: int) -> int:
     """Move the plant on to `now_ns` on the rig's clock, and read the IMUs; returns FMI's status."""
     r, c, m = rig[()], fmu[()], imu[()]

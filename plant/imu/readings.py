@@ -15,7 +15,7 @@ from math import exp, expm1, inf, pi, sqrt
 import numpy as np
 
 from plant.checks import checked_seed
-from plant.compiled import MOST, Limits, Record, kernel, record_dtype
+from plant.compiled import MOST, Limits, Record, kernel, record_dtype, shared_kernel
 from plant.errors import InputError
 from plant.imu.disturbed import DISTURBANCE, EFFECT, MOST_DISTURBANCES, clock_of, disturb, disturbance_record, shakes
 from plant.imu.model import MOST_SECTIONS, ImuModel, SensorErrors
@@ -210,7 +210,7 @@ _MEASURE, _MAGNETIC, _WALK, _TIMES, _DISTURBED = range(5)
 """Purposes of random numbers; a sensor's number is added to the last."""
 
 
-@kernel
+@shared_kernel
 def measure(state: Record, ideal: Array, measurement: Array) -> None:
     """Write the IMUs' raw readings (3, 7, 3) of ideal signals (3, 7, 3), and advance `state` by one cycle."""
     s = state[()]
