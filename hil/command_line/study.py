@@ -305,12 +305,13 @@ def gough_faults(options: Namespace) -> int:
     First come faults with a specified reaction, on the emulated rig: the reported cause, how the run ends, how soon, and how
     far a leg gets off its reference. Then come disturbances of IMUs, base, mechanism, loads and drives, with each way to fuse
     the IMUs: the greatest error of the pose until something was told, and afterwards; what was told, and when; and how often a
-    sound IMU was left out and the error then exceeded 5 mm or 1 deg, which is forbidden. All runs are on virtual time. The exit
-    status is 1 if a reaction differs from the specified one, or if there is a forbidden outcome.
+    sound IMU was left out and the error then exceeded 5 mm or 1 deg, which is forbidden. Last come runs in which nothing is
+    wrong: how often anything was told, and the protection level beside the error. All runs are on virtual time. The exit status
+    is 1 if a reaction differs from the specified one, or if there is a forbidden outcome.
     """
     from hil.faults.reactions import CASES, Case, table
     from hil.faults.rows import Row, all_rows
-    from hil.faults.tables import disturbance_table, disturbances_of, list_table, summary, worst_first
+    from hil.faults.tables import disturbance_table, disturbances_of, list_table, sound_of, sound_table, summary, worst_first
     from hil.faults.trials import outcomes_of, run_trials, trials_of
 
     if options.seeds < 1:
@@ -336,7 +337,10 @@ def gough_faults(options: Namespace) -> int:
         table(outcomes).print(options.markdown)
     if disturbances:
         disturbance_table(worst_first(disturbances) if options.worst else disturbances).print(options.markdown)
-    cli.write_json(options.json, summary(outcomes, disturbances, options.seeds))
+    sound = sound_of(found)
+    if sound:
+        sound_table(sound).print(options.markdown)
+    cli.write_json(options.json, summary(outcomes, disturbances, sound, options.seeds))
     findings = [finding for outcome in outcomes for finding in outcome.findings]
     for finding in findings:
         print(finding, file=sys.stderr)

@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from controller.safety.causes import Cause
 from hil.faults.reactions import RATE_HZ, Case, Outcome
-from hil.faults.rows import Row
+from hil.faults.rows import SOUND, Row
 from hil.faults.trials import Figures
 from hil.table import Table
 
 _MM, _DEG = 1e3, degrees(1.0)
-_NOTHING = "nothing"
+_NOTHING, _END = "nothing", Cause.END_OF_MOTION.short
 _GREATEST = (
     "position_before", "rotation_before", "position_after", "rotation_after", "position_then", "rotation_then", "deviation",
     "level_position", "level_rotation", "told_s",
@@ -22,12 +23,15 @@ _GREATEST = (
 """Of these figures the greatest over the seeds is shown; a table has no column for what no run has."""
 
 
-def summary(outcomes: list[Outcome], disturbances: list[dict[str, Any]], seeds: int) -> dict[str, Any]:
+def summary(
+    outcomes: list[Outcome], disturbances: list[dict[str, Any]], sound: list[dict[str, Any]], seeds: int
+) -> dict[str, Any]:
     """Everything, for JSON, in SI units; what is not finite is null."""
     finite = [{name: None if value in (inf, -inf) else value for name, value in each.items()} for each in disturbances]
     return {
         "cases": [each.summary() for each in outcomes],
         "disturbances": finite,
+        "sound": sound,
         "seeds": seeds,
         "rate_hz": RATE_HZ,
         "version": version("gough"),
@@ -51,7 +55,7 @@ def disturbances_of(found: Iterable[Figures]) -> list[dict[str, Any]]:
 
 def _over_seeds(runs: list[Figures]) -> dict[str, Any]:
     covered = [(each["covered"], each["cycles"]) for each in runs if each.get("covered") is not None]
-    ended = Counter(each["ended"] for each in runs if each["ended"] != "end of the motion")
+    ended = Counter(each["ended"] for each in runs if each["ended"] != _END)
     return {
         "runs": len(runs),
         **{name: max((each[name] for each in runs if each.get(name) is not None), default=None) for name in _GREATEST},
@@ -90,6 +94,53 @@ def disturbance_table(disturbances: Sequence[dict[str, Any]]) -> Table:
             _joined(group, lambda each: f"{each['forbidden']}"),
             *([_joined(group, lambda each: _number(each["covered"], 100.0, 2))] if covered else []),
         )
+    return table
+
+
+def sound_of(found: Iterable[Figures]) -> list[dict[str, Any]]:
+    """What the rows of the kind "sound" have shown with each fusion, in which nothing is wrong.
+
+    Returns:
+        By fusion: the numbers of `runs`, of those that `told` anything, that left an IMU out, and that `ended` early; the
+        `seconds` in motion; the RMS errors, over all cycles; the share of cycles that the protection level has `covered`; and
+        `level_position` and `level_rotation`, the medians over the runs of its 99th percentiles, in RMS errors.
+    """
+    groups: dict[str, list[Figures]] = {}
+    for figures in found:
+        if figures["kind"] == SOUND and figures["cycles"]:
+            groups.setdefault(figures["fusion"], []).append(figures)
+    return [{"fusion": fusion, **_of_sound(runs)} for fusion, runs in groups.items()]
+
+
+def _of_sound(runs: list[Figures]) -> dict[str, Any]:
+    cycles = np.array([each["cycles"] for each in runs], float)
+    known = [each for each in runs if each.get("covered") is not None]
+    result: dict[str, Any] = {
+        "runs": len(runs),
+        "seconds": sum(each["ended_s"] for each in runs),
+        "told": sum(bool(each["told"]) for each in runs),
+        "left_out": sum(bool(each["left_out"]) for each in runs),
+        "ended": sum(each["ended"] != _END for each in runs),
+        "covered": sum(each["covered"] for each in known) / max(sum(each["cycles"] for each in known), 1),
+    }
+    for part in ("position", "rotation"):
+        errors = np.array([each[f"rms_{part}"] for each in runs])
+        rms = float(np.sqrt(np.average(errors**2, weights=cycles)))
+        levels = [each[f"level_{part}"] for each in known]
+        result |= {f"rms_{part}": rms, f"level_{part}": float(np.median(levels)) / rms if levels else None}
+    return result
+
+
+def sound_table(sound: Iterable[dict[str, Any]]) -> Table:
+    """A line for each fusion; the level's columns are medians over the runs of its 99th percentile, in RMS errors."""
+    headings = ("nothing is wrong", "runs", "hours", "told", "left out", "ended", "RMS [mm]", "[deg]", "covered [%]")
+    table = Table(*headings, "level of position / RMS", "of rotation")
+    for each in sound:
+        counts = (f"{each[name]}" for name in ("told", "left_out", "ended"))
+        errors = _number(each["rms_position"], _MM, 3), _number(each["rms_rotation"], _DEG, 3)
+        levels = (_number(each[f"level_{part}"], 1.0) for part in ("position", "rotation"))
+        hours = f"{each['seconds'] / 3600.0:.2f}"
+        table.add(each["fusion"], f"{each['runs']}", hours, *counts, *errors, _number(each["covered"], 100.0, 2), *levels)
     return table
 
 

@@ -40,7 +40,7 @@ def judge(records: Record, begin: int, guilty: frozenset[int], cause: int, rate:
         `forbidden`: whether a sound one was left out and the error then exceeded 5 mm or 1 deg; `position_then`,
         `rotation_then`: the greatest errors since then.
         `deviation`: the greatest of a leg from its reference.
-        `cycles` in motion, and, if the loop has a protection level, how many of them it has `covered`, and its 99th
+        `cycles` in motion, in which the error was `rms_position` and `rms_rotation`, and, if the loop has a protection level, how many of them it has `covered`, and its 99th
         percentiles `level_position` and `level_rotation`.
     """
     steering = np.isin(records["mode"], (Mode.RUNNING, Mode.STOPPING))
@@ -78,6 +78,8 @@ def judge(records: Record, begin: int, guilty: frozenset[int], cause: int, rate:
         "rotation_then": rotation_then,
         "deviation": _most(np.abs(records["truth"][:, TRUTH_LENGTHS] - references).max(axis=1), steering & (cycles >= begin)),
         "cycles": int(steering.sum()),
+        "rms_position": _rms(position[steering]),
+        "rms_rotation": _rms(rotation[steering]),
         **_protection(records, steering, position, rotation),
     }
 
@@ -117,6 +119,10 @@ def _protection(records: Record, steering: NDArray[np.bool_], position: Array, r
 
 def _most(values: Array, where: NDArray[np.bool_]) -> float | None:
     return float(values[where].max()) if where.any() else None
+
+
+def _rms(values: Array) -> float | None:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else None
 
 
 def _listed(imus: list[int]) -> str:

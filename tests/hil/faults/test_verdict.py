@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from controller.safety.causes import Cause, Mode
-from hil.faults.tables import disturbance_table, disturbances_of, summary, worst_first
+from hil.faults.rows import SOUND
+from hil.faults.tables import disturbance_table, disturbances_of, sound_of, sound_table, summary, worst_first
 from hil.faults.verdict import judge
 from hil.loop.records import RECORD
 
@@ -100,7 +101,7 @@ def test_an_estimate_that_is_no_number_is_infinitely_far_off_and_null_in_json():
     found = judge(made, BEGIN, frozenset(), Cause.END_OF_MOTION, RATE)
     assert found["position_before"] == np.inf
     (each,) = disturbances_of([{"kind": "x", "row": "a", "fusion": "whole", "seed": 0, **found}])
-    json.dumps(summary([], [each], 1), allow_nan=False)
+    json.dumps(summary([], [each], [], 1), allow_nan=False)
     assert disturbance_table([each]).rows[0][1].text == "none"
 
 
@@ -124,6 +125,28 @@ def test_the_protection_level_is_judged_in_every_cycle_in_motion():
     levels = np.full((CYCLES, 2), (1.0, np.radians(0.2)))
     found = judge(records(levels), BEGIN, frozenset(), Cause.END_OF_MOTION, RATE)
     assert found["covered"] == pytest.approx(181, abs=1) and found["level_position"] == 1.0
+
+
+def test_runs_in_which_nothing_is_wrong_are_counted_and_their_errors_taken_together():
+    quiet, loud, never = records(np.full((CYCLES, 2), (4e-3, 1.0))), records(np.full((CYCLES, 2), (8e-3, 1.0))), records()
+    loud["position"] *= 2.0
+    loud["imus"][300:320] = 0x3F
+    tell(loud, 50, Cause.IMU_NOISY, 2)
+    never["mode"] = Mode.IDLE
+    ends = Cause.END_OF_MOTION, Cause.DRIVE_DEVIATES, Cause.NO_SENSORS
+    found = [
+        {"kind": kind, "row": "a", "fusion": "whole", "seed": 0, **judge(made, 0, frozenset(), end, RATE)}
+        for made, end in zip((quiet, loud, never), ends, strict=True)
+        for kind in (SOUND, "other")
+    ]
+    (each,) = sound_of(found)
+    assert (each["runs"], each["told"], each["left_out"], each["ended"], each["seconds"]) == (2, 1, 1, 1, 8.0)
+    # Errors of 0.2 to 3.49 mm, and twice as large ones.
+    rms = np.sqrt(2.5 * np.mean((1e-5 * np.arange(20, 350)) ** 2))
+    assert each["rms_position"] == pytest.approx(rms) and each["covered"] == 1.0
+    assert each["level_position"] == pytest.approx(6e-3 / rms)
+    (cells,) = sound_table([each]).rows
+    assert [cell.text for cell in cells[:6]] == ["whole", "2", "0.00", "1", "1", "1"]
 
 
 def test_a_row_of_the_table_has_the_greatest_of_all_seeds_and_the_worst_come_first():
