@@ -167,6 +167,22 @@ def test_the_filter_starts_with_the_first_pose_and_is_trusted_when_it_has_settle
     np.testing.assert_allclose(stage.pose["twist"], 0.0, atol=1e-3)
 
 
+def test_a_filter_that_hardly_knows_its_rotation_is_not_trusted_and_once_trusted_it_stays(hexapod):
+    stage = Stage(hexapod)
+    limit = fusion_settings(hexapod).disagreement
+    stage.parameters["mechanism"]["filter"]["variance"] = 1e30
+    stage.step()
+    f = stage.trust["filter"]
+    for sigma, trusted in ((1.001, False), (0.999, True), (2.0, True)):
+        for _ in range(2 * SETTLING):
+            f["motion"] = f["published_motion"] = f["low_passed"] = f["smooth_motion"] = 0.0
+            f["covariance"] = f["published_covariance"] = 0.0
+            f["published_covariance"][3:6, 3:6] = np.diag([0.5, 0.3, 0.2]) * (sigma * limit) ** 2
+            f["collected"] = 0
+            assert stage.step()
+        assert stage.stands == (True, trusted)
+
+
 @pytest.mark.parametrize("missed", [0, 3, 25])
 def test_leg_filters_that_disagree_on_average_stop_the_filter_missed_periods_counted(hexapod, missed):
     stage = Stage(hexapod).trusted()
