@@ -25,10 +25,12 @@ class _Settings:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if value == inf and field.name in _ENDLESS_ALLOWED:
+            endless = field.name in _ENDLESS_ALLOWED
+            if value == inf and endless:
                 continue
             if not 0.0 <= value < inf or (value == 0.0 and field.name not in _ZERO_ALLOWED):
-                raise InputError(f"{field.name} is {value}; it must be positive and finite")
+                allowed = "positive; inf is no limit" if endless else "positive and finite"
+                raise InputError(f"{field.name} is {value}; it must be {allowed}")
 
 
 @dataclass(frozen=True)

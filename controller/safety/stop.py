@@ -4,7 +4,7 @@ import numpy as np
 
 from controller.planning.segments import STOP_SEGMENTS, plan_stop
 from controller.safety.causes import REACTION, Cause, Mode, Reaction, Request, report_event
-from plant.compiled import Record, filled, kernel, record_dtype
+from plant.compiled import Record, filled, kernel, record_dtype, shared_kernel
 from plant.mechanism import LEGS, Limits
 
 STOP_SETTLING_S = 0.1
@@ -50,7 +50,7 @@ def describe_end(state: Record) -> str:
     return first + Cause(int(stop["cause"])).describe(int(stop["index"]), float(stop["value"]), float(stop["limit"]))
 
 
-@kernel
+@shared_kernel
 def handle_cause(
     p: Record, s: Record, rig: Record, time: Record, reference: Record, pid: Record,
     cause: int, index: int, value: float, limit: float,

@@ -27,7 +27,7 @@ import numpy as np
 from controller.estimation.integrity.fault_filter import FAULTS, MEMORY_S, UNKNOWNS
 from controller.estimation.whole_mechanism.imu_errors import ERRORS
 from controller.estimation.whole_mechanism.readings import MOTION_STATES, READINGS
-from plant.compiled import Record, filled, kernel, record_dtype
+from plant.compiled import Record, filled, kernel, record_dtype, shared_kernel
 from plant.dynamics.variables import IMU_COUNT
 from plant.pose import Array
 
@@ -135,7 +135,7 @@ def evidence_parameters(prior: Array, window: float) -> Record:
     )
 
 
-@kernel
+@shared_kernel
 def step_evidence(p: Record, s: Record, filtered: Record, excluded: Array, step: int) -> None:
     """Do one step of an evaluation; after the last one, the results are those of the time of the first.
 

@@ -28,7 +28,7 @@ from controller.estimation.whole_mechanism.readings import (
 from controller.inverse_kinematics import motion_of_legs
 from controller.least_squares import factor_cholesky
 from controller.settings import FusionSettings
-from plant.compiled import Record, filled, kernel, record_dtype
+from plant.compiled import Record, filled, kernel, record_dtype, shared_kernel
 from plant.dynamics.variables import IMU_COUNT
 from plant.imu import ACCELEROMETER
 from plant.mechanism import LEGS
@@ -136,7 +136,7 @@ def fault_filter_parameters(fusion: FusionSettings, rate: float, active: bool) -
     )
 
 
-@kernel
+@shared_kernel
 def step_fault_filter(
     p: Record, s: Record, sensors: Record, imus: Record, missed: int, pose: Record, legs: Array, commands: Array
 ) -> bool:

@@ -39,7 +39,7 @@ from controller.estimation.whole_mechanism.readings import (
     predict_readings,
     rig_state,
 )
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, shared_kernel
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS
 from plant.pose import Array, rotate_by_vector
@@ -58,7 +58,7 @@ _OFFSET_LASTS_S = 100.0
 """Time in which the offset of the heading may change by as much as its uncertainty at the start [s]."""
 
 
-@kernel
+@shared_kernel
 def start_filter(p: Record, f: Record, time: float, position: Array, rotation: Array, twist: Array) -> None:
     """Start from a pose (3,), (3, 3) and twist (6,) at `time`."""
     f.running = 1
@@ -126,7 +126,7 @@ def accumulate_field(f: Record, field: Array, time: float) -> None:
     f.field_used = 1
 
 
-@kernel
+@shared_kernel
 def step_filter(p: Record, geometry: Record, f: Record) -> None:
     """The share of this cycle in the update; a new one begins when the window is full."""
     if f.collected >= p.window:

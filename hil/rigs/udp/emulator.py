@@ -13,7 +13,7 @@ from hil.rigs import ANSWERED, SILENT, DriveState, Request
 from hil.rigs.emulation import disturb, draw, move, sample
 from hil.rigs.udp.datagrams import HELLO_DATAGRAM, LONGEST, MAGIC, VERSION, Bytes, DatagramKind, crc32, is_valid
 from hil.rigs.udp.link import UdpLink, await_datagram, decode_answer, encode_command, new_link, receive_datagram, send_datagram
-from plant.compiled import Record, kernel, record_dtype
+from plant.compiled import Record, kernel, record_dtype, shared_kernel
 from plant.mechanism import LEGS
 from plant.pose import Array
 from plant.stopwatch import now
@@ -76,7 +76,7 @@ def is_later(sequence: int, last: int) -> bool:
     return bool(0 < ahead < 0x80000000)
 
 
-@kernel
+@shared_kernel
 def answer_command(emulator: UdpEmulator, length: int, now_ns: int) -> int:
     """Apply the received command of `length` bytes, and write the answer; returns its length, 0 without one."""
     rig, session, link = emulator.rig[()], emulator.session[()], emulator.link
