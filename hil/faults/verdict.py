@@ -40,8 +40,8 @@ def judge(records: Record, begin: int, guilty: frozenset[int], cause: int, rate:
         `forbidden`: whether a sound one was left out and the error then exceeded 5 mm or 1 deg; `position_then`,
         `rotation_then`: the greatest errors since then.
         `deviation`: the greatest of a leg from its reference.
-        `cycles` in motion, in which the error was `rms_position` and `rms_rotation`, and, if the loop has a protection level, how many of them it has `covered`, and its 99th
-        percentiles `level_position` and `level_rotation`.
+        `cycles` in motion, in which the error was `rms_position` and `rms_rotation`, and, if the loop has a protection level,
+        how many of them it has `covered`, and its 99th percentiles `level_position` and `level_rotation`.
     """
     steering = np.isin(records["mode"], (Mode.RUNNING, Mode.STOPPING))
     position, rotation = _errors(records)
