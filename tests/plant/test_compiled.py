@@ -157,6 +157,7 @@ def test_machine_code_is_kept_in_the_cache_alone(tmp_path: Path) -> None:
     assert sorted(package.rglob("*.nb?")) == before
 
 
+@pytest.mark.slow
 def test_machine_code_that_calls_other_kernels_is_loaded_whole(tmp_path: Path) -> None:
     """The callees have no machine code of their own in the cache; the next process finds them in their caller's."""
     code = (

@@ -15,6 +15,7 @@ from plant.pose import Pose, vector_from_rotation
 from tests.controller.calibration.rest_readings import RAW, pose_errors, rests_of
 
 
+@pytest.mark.slow
 def test_motion_brings_it_to_a_tenth_of_a_millimetre(hexapod):
     fusion = sensor_settings(hexapod, RAW)
     readings, _, _ = rests_of(hexapod, 20, 1)

@@ -46,6 +46,7 @@ def on_a_terminal(code):
     return drawn.decode()
 
 
+@pytest.mark.slow
 def test_the_clock_of_the_bar_goes_on_when_more_functions_are_compiled_than_expected():
     drawn = on_a_terminal(COMPILES.format(quiet=10.0))
     frames = re.findall(r"compiling function (\d+) of about 3.*?(\d+:\d\d:\d\d)", drawn)

@@ -165,6 +165,7 @@ def test_a_recording_keeps_the_contract(tmp_path):
     assert found.all_findings() == []
 
 
+@pytest.mark.slow
 def test_the_udp_rig_keeps_the_contract():
     address, nowhere = (f"127.0.0.1:{free_port()}" for _ in range(2))
     period = 0.02
@@ -193,6 +194,7 @@ def multicast(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_the_canopen_rig_keeps_the_contract(multicast):
     settings = canopen_settings(multicast)
     # On a loaded machine two processes need a while to take turns.

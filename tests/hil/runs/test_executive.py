@@ -685,6 +685,7 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
+@pytest.mark.slow
 def test_a_recording_that_cannot_go_on_is_told_in_a_line_and_the_run_goes_on(tmp_path):
     """A limit on the size of files stands in for a full disk; the plant's library is smaller."""
     path = tmp_path / "run.mcap"

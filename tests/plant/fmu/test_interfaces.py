@@ -267,7 +267,7 @@ def drive_as_plant(path: Path) -> Array:
     ("model", "fmi"),
     [
         pytest.param(SPATIAL_MODEL, 3, marks=pytest.mark.slow, id="spatial, FMI 3"),
-        pytest.param(PLANAR_MODEL, 2, id="planar, FMI 2"),
+        pytest.param(PLANAR_MODEL, 2, marks=pytest.mark.slow, id="planar, FMI 2"),
     ],
 )
 def test_the_recompiled_fmu_behaves_the_same(model: Model, fmi: int, tmp_path: Path) -> None:

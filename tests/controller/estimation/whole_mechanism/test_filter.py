@@ -226,7 +226,7 @@ class Twin:
     [
         ("gyroscopes", False, 1.0),
         *(pytest.param(name, False, 1.0, marks=pytest.mark.slow) for name in list(BLOCKS)[1:]),
-        ("axes", True, 300.0),
+        pytest.param("axes", True, 300.0, marks=pytest.mark.slow),
     ],
 )
 def test_taken_bit_by_bit_it_equals_its_dense_twin(hexapod, errors, rig, tolerance):
