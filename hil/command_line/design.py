@@ -178,12 +178,12 @@ def gough_detectability(options: Namespace) -> int:
     With --measured, the exit status is 1 if an error until something was told is beyond the limit. Nothing is simulated.
     """
     from hil.faults.bounds import bounds_of_rows, left_out, read_figures, summary, table
-    from hil.faults.rows import Row, all_rows
+    from hil.faults.rows import SOUND, Row, all_rows
 
     if options.seeds < 1:
         raise InputError(f"there are {options.seeds} seeds; at least 1 is needed")
     texts = options.rows or [""]
-    rows = [row for row in all_rows() if any(text in row.name or text in row.kind for text in texts)]
+    rows = [row for row in all_rows() if row.kind != SOUND and any(text in row.name or text in row.kind for text in texts)]
     if options.faults:
         rows = [Row(" ".join(options.faults), "own", tuple(options.faults))]
     if not rows:

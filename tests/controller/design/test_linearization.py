@@ -18,7 +18,7 @@ from plant.mechanism import Mechanism
 @pytest.mark.parametrize(
     "model", [pytest.param(SPATIAL_MODEL, marks=pytest.mark.slow), PLANAR_MODEL], ids=lambda model: model.identifier
 )
-@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize("fmi", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_the_linear_plant_is_casadis(model: Model, fmi: int) -> None:
     """About a lively state, as python-control gets it; poles and matrices by their names."""
     dynamics, table = model.dynamics(), model.table

@@ -119,7 +119,9 @@ def displacements(random, kind, count):
     return waves
 
 
-@pytest.mark.parametrize("kind", ["waves", "noise", "steps", "leaps", "ramps"])
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.slow) for kind in ("waves", "leaps")] + ["noise", "steps", "ramps"]
+)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_no_limit_is_left_whatever_comes(hexapod, kind, seed):
     random = np.random.default_rng(seed)

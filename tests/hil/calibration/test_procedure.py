@@ -18,6 +18,9 @@ from hil.runs.simulation import simulate
 from plant.errors import CalibrationError
 from plant.imu import Wiring, imu_state, load_imu
 
+pytestmark = pytest.mark.slow
+"""The calibration takes 20 s; `test_drives` and the calibrations of `controller` stay in `make test`."""
+
 
 @pytest.fixture(scope="module")
 def calibrated(tmp_path_factory):

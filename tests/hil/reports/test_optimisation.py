@@ -31,9 +31,9 @@ def result_of(objectives, tmp_path):
     "objectives",
     [
         pytest.param((Objective("a"),), marks=pytest.mark.slow),
-        pytest.param((Objective("a"), Objective("b", "maximise")), marks=pytest.mark.slow),
+        (Objective("a"), Objective("b", "maximise")),
         pytest.param((Objective("a"), Objective("b", "maximise"), Objective("c")), marks=pytest.mark.slow),
-        (Objective("a"), Objective("b", "maximise"), Objective("c"), Objective("d")),
+        pytest.param((Objective("a"), Objective("b", "maximise"), Objective("c"), Objective("d")), marks=pytest.mark.slow),
     ],
     ids=len,
 )

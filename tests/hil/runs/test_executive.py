@@ -387,6 +387,7 @@ def test_a_recording_that_is_spoiled_while_it_goes_on_is_noticed_and_the_rest_is
     assert (path.read_bytes() if path.exists() else None) == left
 
 
+@pytest.mark.slow
 def test_a_recording_that_is_deleted_in_the_end_is_written_again(tmp_path):
     path, second = tmp_path / "run.mcap", tmp_path / "run-2.mcap"
     process, _, recorder = started(path)
@@ -641,6 +642,7 @@ def test_filters_in_python_are_refused_on_the_clock():
         run(SimulationConfig(duration=0.5, fusion="filterpy"), RealTimeSettings())
 
 
+@pytest.mark.slow
 def test_the_whole_mechanism_filter_runs_on_the_clock_and_replays_bit_for_bit(tmp_path):
     path = tmp_path / "run.mcap"
     config = SimulationConfig(target="sines", duration=2.0, rate=500.0, fusion="whole")
@@ -730,6 +732,7 @@ class Refusing(FmuRig):
         return 104 if self._loop.state["time"]["cycle"] > 60 else super().exchange(command, request, feedback)
 
 
+@pytest.mark.slow
 def test_an_exchange_that_fails_is_told_and_replayed(tmp_path):
     path = tmp_path / "run.mcap"
     with pytest.raises(RunStoppedError, match=r"the rig reports failure \(104\)"):

@@ -146,8 +146,8 @@ def test_a_streamed_motion_is_followed_and_ends_at_rest_when_the_stream_does(hex
     ("faults", "cause"),
     [
         (Faults(stop_at=0.7), Cause.TARGET_LOST),
-        (Faults(jump_at=0.7), Cause.TARGET_JUMPS),
-        (Faults(nan_at=0.7), Cause.TARGET_NOT_FINITE),
+        pytest.param(Faults(jump_at=0.7), Cause.TARGET_JUMPS, marks=pytest.mark.slow),
+        pytest.param(Faults(nan_at=0.7), Cause.TARGET_NOT_FINITE, marks=pytest.mark.slow),
     ],
 )
 def test_a_stream_that_goes_wrong_fails_with_its_cause_and_ends_at_rest(hexapod, faults, cause):
