@@ -23,6 +23,7 @@ from plant.mechanism import LEGS, load_in_space
 FILE = Path(__file__).with_name("rows.toml")
 LINKS = ("fmu", "udp", "canopen")
 """Between the loop and its plant: nothing, or a bus in memory, on virtual time, with the emulated rig behind it."""
+
 SOUND = "sound"
 """The kind of rows in which nothing is wrong."""
 

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import version
-from math import degrees, inf
+from math import degrees, inf, isfinite
 from typing import Any
 
 import numpy as np
@@ -27,15 +27,21 @@ def summary(
     outcomes: list[Outcome], disturbances: list[dict[str, Any]], sound: list[dict[str, Any]], seeds: int
 ) -> dict[str, Any]:
     """Everything, for JSON, in SI units; what is not finite is null."""
-    finite = [{name: None if value in (inf, -inf) else value for name, value in each.items()} for each in disturbances]
     return {
         "cases": [each.summary() for each in outcomes],
-        "disturbances": finite,
-        "sound": sound,
+        "disturbances": _finite(disturbances),
+        "sound": _finite(sound),
         "seeds": seeds,
         "rate_hz": RATE_HZ,
         "version": version("gough"),
     }
+
+
+def _finite(figures: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    def or_none(value: Any) -> Any:
+        return None if isinstance(value, float) and not isfinite(value) else value
+
+    return [{name: or_none(value) for name, value in each.items()} for each in figures]
 
 
 def disturbances_of(found: Iterable[Figures]) -> list[dict[str, Any]]:
@@ -101,33 +107,34 @@ def sound_of(found: Iterable[Figures]) -> list[dict[str, Any]]:
     """What the rows of the kind "sound" have shown with each fusion, in which nothing is wrong.
 
     Returns:
-        By fusion: the numbers of `runs`, of those that `told` anything, that left an IMU out, and that `ended` early; the
-        `seconds` in motion; the RMS errors, over all cycles; the share of cycles that the protection level has `covered`; and
-        `level_position` and `level_rotation`, the medians over the runs of its 99th percentiles, in RMS errors.
+        By fusion: the numbers of `runs`, of those that `told` anything, that left an IMU out, and that `ended` early, before
+        they moved or later; the `seconds` that they took; the RMS errors, over all cycles in motion; the share of these that
+        the protection level has `covered`; and `level_position` and `level_rotation`, the medians over the runs of its 99th
+        percentiles, in RMS errors. None where nothing has moved, or there is no level.
     """
     groups: dict[str, list[Figures]] = {}
     for figures in found:
-        if figures["kind"] == SOUND and figures["cycles"]:
+        if figures["kind"] == SOUND:
             groups.setdefault(figures["fusion"], []).append(figures)
     return [{"fusion": fusion, **_of_sound(runs)} for fusion, runs in groups.items()]
 
 
 def _of_sound(runs: list[Figures]) -> dict[str, Any]:
-    cycles = np.array([each["cycles"] for each in runs], float)
-    known = [each for each in runs if each.get("covered") is not None]
+    moved = [each for each in runs if each["cycles"]]
+    known = [each for each in moved if each.get("covered") is not None]
     result: dict[str, Any] = {
         "runs": len(runs),
         "seconds": sum(each["ended_s"] for each in runs),
         "told": sum(bool(each["told"]) for each in runs),
         "left_out": sum(bool(each["left_out"]) for each in runs),
         "ended": sum(each["ended"] != _END for each in runs),
-        "covered": sum(each["covered"] for each in known) / max(sum(each["cycles"] for each in known), 1),
+        "covered": sum(each["covered"] for each in known) / sum(each["cycles"] for each in known) if known else None,
     }
     for part in ("position", "rotation"):
-        errors = np.array([each[f"rms_{part}"] for each in runs])
-        rms = float(np.sqrt(np.average(errors**2, weights=cycles)))
+        squares, cycles = [each[f"rms_{part}"] ** 2 for each in moved], [each["cycles"] for each in moved]
+        rms = float(np.sqrt(np.average(squares, weights=cycles))) if moved else None
         levels = [each[f"level_{part}"] for each in known]
-        result |= {f"rms_{part}": rms, f"level_{part}": float(np.median(levels)) / rms if levels else None}
+        result |= {f"rms_{part}": rms, f"level_{part}": float(np.median(levels)) / rms if rms and levels else None}
     return result
 
 

@@ -140,13 +140,23 @@ def test_runs_in_which_nothing_is_wrong_are_counted_and_their_errors_taken_toget
         for kind in (SOUND, "other")
     ]
     (each,) = sound_of(found)
-    assert (each["runs"], each["told"], each["left_out"], each["ended"], each["seconds"]) == (2, 1, 1, 1, 8.0)
+    # A run that never moves is a false alarm as well.
+    assert (each["runs"], each["told"], each["left_out"], each["ended"], each["seconds"]) == (3, 1, 1, 2, 12.0)
     # Errors of 0.2 to 3.49 mm, and twice as large ones.
     rms = np.sqrt(2.5 * np.mean((1e-5 * np.arange(20, 350)) ** 2))
     assert each["rms_position"] == pytest.approx(rms) and each["covered"] == 1.0
     assert each["level_position"] == pytest.approx(6e-3 / rms)
     (cells,) = sound_table([each]).rows
-    assert [cell.text for cell in cells[:6]] == ["whole", "2", "0.00", "1", "1", "1"]
+    assert [cell.text for cell in cells[:6]] == ["whole", "3", "0.00", "1", "1", "2"]
+    (alone,) = sound_of([figures for figures in found if not figures["cycles"]])
+    assert (alone["runs"], alone["ended"], alone["rms_position"], alone["covered"], alone["level_position"]) == (
+        1,
+        1,
+        *3 * [None],
+    )
+    assert sound_table([alone]).rows[0][6].text == "-"
+    lost = {**found[0], "rms_position": np.inf, "level_position": np.inf}
+    json.dumps(summary([], [], sound_of([lost]), 1), allow_nan=False)
 
 
 def test_a_row_of_the_table_has_the_greatest_of_all_seeds_and_the_worst_come_first():
