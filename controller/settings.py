@@ -96,7 +96,7 @@ class SafetySettings(_Settings):
     gyroscope_noise: float = radians(5.0)  # RMS beyond which an IMU is left out [rad/s]
     accelerometer_noise: float = 5.0  # RMS beyond which an IMU is left out [m/s^2]
     vibration: float = 1.5  # RMS of what accelerometers read beyond the motion, from which on it is told [m/s^2]
-    carried: float = radians(0.3)  # uncertainty of a direction, beyond which a run with shaken IMUs ends [rad]
+    carried: float = radians(0.3)  # uncertainty of a direction that shaking adds, beyond which a run ends [rad]
     conditioning: float = 5e-3  # least of the closed form
     stroke_margin: float = 0.003  # largest distance of an estimated length beyond its stroke [m]
     velocity_margin: float = 2.0  # largest estimated speed of a leg, as a multiple of its limit

@@ -94,7 +94,7 @@ def note_force(s: Record, k: int, squared: float, explained: float, period: floa
 def note_rate(s: Record, k: int, squared: float, explained: float, period: float) -> None:
     """Note by how much the gyroscope of IMU `k` reads what is not explained [rad^2/s^2], as `note_force`.
 
-    While its accelerometer is shaken, the motion so far is the worse witness.
+    While its accelerometer is shaken, the estimated motion is less certain than the gyroscope, which keeps its weight.
     """
     if s.mean[k] > SHAKEN:
         s.excess[GYROSCOPE, k] = 0.0

@@ -213,7 +213,7 @@ def judge_parity(
 ) -> bool:
     """When the gyroscopes contradict each other: leave out the one that is named, else stop. Returns whether it is left out.
 
-    Where no evidence counts, they do not either.
+    If `evidence` has no limit, nothing happens.
     """
     if s.mode != Mode.RUNNING or not np.isfinite(p.watch.evidence):
         return False
