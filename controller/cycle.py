@@ -279,7 +279,7 @@ def _check_integrity(parameters: Record, state: Record) -> None:
         p.safety, s.safety, rig, time, s.imus, s.integrity.parity, s.reference, s.pid
     )
     if changed:
-        trust.restart_filter(s.mechanism, time, s.pose)
+        trust.restart_filter(s.mechanism, time)
         integrity.restart_integrity(p.integrity, s.integrity)
     if s.integrity.evaluations > 0:
         watch.check_level(p.safety, s.safety, rig, time, s.integrity.protection.level, s.reference, s.pid)
@@ -289,7 +289,7 @@ def _check_integrity(parameters: Record, state: Record) -> None:
         trust.find_covariance(p.mechanism, s.mechanism, rig, time, s.pose, level.scratch, level.covariance[1])
         end_level(level, time.cycle * rig.period)
         if watch.judge_evidence(p.safety, s.safety, rig, time, s.imus, s.integrity, s.reference, s.pid):
-            trust.restart_filter(s.mechanism, time, s.pose)
+            trust.restart_filter(s.mechanism, time)
             integrity.restart_integrity(p.integrity, s.integrity)
 
 

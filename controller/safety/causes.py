@@ -158,6 +158,12 @@ class Cause(IntEnum):
         Reaction.STOP,
         "s",
     )
+    FORCES_SHARE = (
+        64,
+        "all accelerometers read a force that is no motion: they share an error, or the base tilts or accelerates",
+        Reaction.QUICK_STOP,
+        "m/s^2",
+    )
 
     @property
     def short(self) -> str:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from controller.estimation.imu_monitor import contradiction, reset
+from controller.estimation.integrity.parity import SHARED
 from controller.safety.causes import Cause, DriveState, Mode, Request, report_event
 from controller.safety.stop import handle_cause
 from controller.settings import SafetySettings
@@ -213,9 +214,12 @@ def judge_parity(
 ) -> bool:
     """When the gyroscopes contradict each other: leave out the one that is named, else stop. Returns whether it is left out.
 
-    If `evidence` has no limit, nothing happens.
+    When all accelerometers show a force that is no motion, stop. If `evidence` has no limit, nothing happens.
     """
     if s.mode != Mode.RUNNING or not np.isfinite(p.watch.evidence):
+        return False
+    if parity.share != 0:
+        handle_cause(p, s, rig, time, reference, pid, Cause.FORCES_SHARE, -1, parity.common, SHARED)
         return False
     if parity.named != 0 and _may_leave_out(p.watch, imus, parity.worst):
         imus.excluded[parity.worst] = 1

@@ -91,6 +91,7 @@ STATE = record_dtype(
     step=np.int64,  # cycles since that window was full
     collected=np.int64,  # cycles in the present window
     sum=(np.float64, (IMU_COUNT, READINGS)),  # of their samples
+    trend_sum=(np.float64, (IMU_COUNT, 3)),  # of the forces, with weights from -1 to 1 over the window
     places=(np.int64, IMU_COUNT),  # of the samples around the middle of the window, sum, in half cycles
     feedback=(np.float64, LEGS),  # what feedback adds to the planned rate of each leg, sum [m/s]
     feedback_before=(np.float64, LEGS),  # its mean in the last full window [m/s]
@@ -99,6 +100,7 @@ STATE = record_dtype(
     next_path=PATH,  # in the middle of the present window
     path=PATH,  # in the middle of the last full window
     mean=(np.float64, (IMU_COUNT, READINGS)),  # of that window's samples
+    trend=(np.float64, (IMU_COUNT, 3)),  # of the forces about their mean, with those weights
     counted=(np.int64, IMU_COUNT),  # whether the IMU gave enough of them
     turning=np.float64,  # greatest angular acceleration of platform and legs that was planned for it [rad/s^2]
     rough=np.float64,  # standard deviation of a mean specific force by what is not known of the motion [m/s^2]
@@ -184,6 +186,7 @@ def begin_anew(s: Record) -> None:
 def _collect(p: Record, s: Record, imus: Record, pose: Record, legs: Array, commands: Array) -> None:
     if s.collected == 0:
         s.sum[:] = 0.0
+        s.trend_sum[:] = 0.0
         s.samples[:] = 0
         s.places[:] = 0
         s.feedback[:] = 0.0
@@ -194,11 +197,13 @@ def _collect(p: Record, s: Record, imus: Record, pose: Record, legs: Array, comm
         clipped = imus.shaking.clipped[0, k] != 0 or imus.shaking.clipped[1, k] != 0
         if imus.healthy[k] == 0 or imus.sample_age[k] != 0 or clipped:
             continue
+        place = 2 * s.collected - p.window - 1
         s.samples[k] += 1
-        s.places[k] += 2 * s.collected - p.window - 1
+        s.places[k] += place
         for i in range(3):
             s.sum[k, i] += imus.sample[0, k, i]
             s.sum[k, 3 + i] += imus.sample[1, k, i]
+            s.trend_sum[k, i] += place * imus.sample[1, k, i] / p.window
     if s.collected == (p.window + 1) // 2:
         at = s.next_path
         at.position[:] = pose.position
@@ -241,6 +246,9 @@ def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: 
         s.weight[k, 1] = s.samples[k] / (max(p.variance[1], variance[1, k]) + p.window * (s.rough**2 + corrected**2 + shaken))
         for i in range(READINGS):
             s.mean[k, i] = s.sum[k, i] / s.samples[k]
+        place = s.places[k] / p.window
+        for i in range(3):
+            s.trend[k, i] = (s.trend_sum[k, i] - place * s.mean[k, 3 + i]) / s.samples[k]
     if s.windows > 0:
         _find_shift(p.duration, s.path, s.next_path, s.turn, s.shift)
     s.path.position[:] = s.next_path.position

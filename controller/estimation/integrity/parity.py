@@ -1,11 +1,15 @@
 """Parity of the gyroscopes, and of accelerometers with them: large errors are told within two windows of the fault filter.
 
 All gyroscopes see one motion. Let z (21) be the mean readings of a window less those of the planned motion. If the planned
-twist is wrong by t (6), sound gyroscopes give z = J t. So what least squares leaves, z - J t, shows errors of gyroscopes
-alone. Its length at each IMU counts. A gyroscope is named if the rest agrees without it.
+twist is wrong by t (6), sound gyroscopes give z = J t. So what least squares leaves, e = z - J t, shows errors of gyroscopes
+alone. Let H = J (J^T J)^-1 J^T, with the block H_k of IMU k. Without this IMU, the sum of squares is less by
+e_k^T (I - H_k)^-1 e_k (Cook and Weisberg, Residuals and influence in regression, 1982). The root of this is how far its
+gyroscope is off, however much the fit follows it. A gyroscope is named if the rest agrees without it. What a gyroscope has been
+off for many seconds is no large error: it is left to the evidence.
 
-From one window to the next, t changes with the acceleration that was not planned. If the mean forces of both windows show more
-than that, it is no motion: it is vibration, or accelerometers are off, perhaps all alike. They then count less at once.
+From one window to the next, t changes with the acceleration that was not planned, averaged with weights that rise in the first
+window and fall in the second one. If the forces, averaged alike, show more than that, it is no motion: it is vibration, or
+accelerometers are off, perhaps all alike. They then count less at once. If all of them go on to show such a force, the run ends.
 
 Smaller errors are left to the evidence for hypotheses, which takes 0.1 to 0.2 s. Until then they move the pose little.
 """
@@ -31,6 +35,9 @@ _LATE_S = 1e-3
 _WINDOWS = 2
 """In how many windows in a row the limit must be broken."""
 
+_USUAL_S = 10.0
+"""Time constant of what counts as usual for a gyroscope [s]."""
+
 _AGREE, _AGREE_OF_ALL = 0.6, 0.15
 """How large the error without the named gyroscope may be: of the limit, and of the error with it."""
 
@@ -43,19 +50,30 @@ _ENOUGH = 5
 _AVERAGED = 0.25
 """Share of a window in the average of such errors."""
 
+SHARED, _SHARED_WINDOWS = 0.15, 10
+"""The average that all accelerometers show in so many windows in a row before the run ends [m/s^2]."""
+
 STATE = record_dtype(
     off_motion=(np.float64, IMU_COUNT),  # mean force of two windows that is no motion [m/s^2]
-    error=np.float64,  # the greatest of an IMU in the last window [rad/s]
+    usual=(np.float64, (IMU_COUNT, 3)),  # what each gyroscope has been off for long, in its axes [rad/s]
+    error=np.float64,  # the greatest of a gyroscope in the last window [rad/s]
     limit=np.float64,  # for it
     off_for=np.int64,  # for how many windows it has been beyond the limit
-    worst=np.int64,  # the IMU without which the rest agrees best
-    named=np.int64,  # whether it agrees
-    steady=np.float64,  # greatest of those, averaged over some windows [m/s^2]
-    average=(np.float64, (IMU_COUNT, 3)),  # of them, in the axes of the IMUs [m/s^2]
+    worst=np.int64,  # the IMU that has it, without which the rest agrees best
+    named=np.int64,  # whether the rest then agrees
+    steady=np.float64,  # greatest mean force that is no motion, averaged over some windows [m/s^2]
+    common=np.float64,  # the least, which all show
+    common_for=np.int64,  # for how many windows that has been beyond the limit
+    share=np.int64,  # whether for too many
+    average=(np.float64, (IMU_COUNT, 3)),  # of these forces, in the axes of the IMUs [m/s^2]
     twist_before=(np.float64, _TWIST),  # of the window before
-    force_before=(np.float64, (IMU_COUNT, 3)),  # beyond what the planned acceleration and this twist explain
+    force_before=(np.float64, (IMU_COUNT, 3)),  # its part in the forces beyond the planned acceleration and the twist
     normal=(np.float64, (_TWIST, _TWIST)),  # from here on scratch
     twist=(np.float64, _TWIST),
+    columns=(np.float64, (3, _TWIST)),
+    left=(np.float64, (3, 3)),
+    residual=(np.float64, 3),
+    solved=(np.float64, 3),
 )
 """What the last window has shown."""
 
@@ -73,36 +91,42 @@ def step_parity(s: Record, f: Record, excluded: Array, samples: int, period: flo
         no_motion: (7,), is written: the variance of a sample that stands for what an accelerometer reads that is no motion
             [m^2/s^4]; all samples of a window share it. 0 within the limit.
     """
-    s.limit = _LIMIT + _LATE_S * f.turning
-    s.error = _error_without(s, f, excluded, -1)
-    _compare_forces(s, f, excluded, samples, period, no_motion)
+    duration = samples * period
+    s.worst, s.error = _find_worst(s, f, excluded, -1)
+    s.limit = _LIMIT + _LATE_S * (f.turning + _unplanned_turning(s, f, duration))
+    if s.error <= s.limit:
+        _learn_usual(s, f, excluded, duration / _USUAL_S)
+    _compare_forces(s, f, excluded, samples, duration, no_motion)
     s.off_for = s.off_for + 1 if s.error > s.limit else 0
     if s.off_for < _WINDOWS:
         return False
     s.off_for = 0
-    s.worst, least = 0, np.inf
-    for k in range(IMU_COUNT):
-        if f.counted[k] != 0 and excluded[k] == 0:
-            error = _error_without(s, f, excluded, k)
-            if error < least:
-                s.worst, least = k, error
-    s.named = least < max(_AGREE * s.limit, _AGREE_OF_ALL * s.error)
+    _, without = _find_worst(s, f, excluded, s.worst)
+    s.named = without < max(_AGREE * s.limit, _AGREE_OF_ALL * s.error)
     return True
 
 
 @kernel
-def _error_without(s: Record, f: Record, excluded: Array, left_out: int) -> float:
-    """The greatest error of a gyroscope when the twist fits all but one; 0 where fewer determine it than could contradict."""
+def _counts(f: Record, excluded: Array, k: int) -> bool:
+    return bool(f.counted[k] != 0 and excluded[k] == 0)
+
+
+@kernel
+def _find_worst(s: Record, f: Record, excluded: Array, left_out: int) -> tuple[int, float]:
+    """Fit the twist to all gyroscopes but one; returns which is off most, and by how much.
+
+    The error is 0 where too few are left to contradict each other.
+    """
     used = 0
     s.normal[:] = 0.0
     s.twist[:] = 0.0
     for k in range(IMU_COUNT):
-        if f.counted[k] == 0 or excluded[k] != 0 or k == left_out:
+        if not _counts(f, excluded, k) or k == left_out:
             continue
         used += 1
         for m in range(3):
             row = f.jacobian[k, m]
-            off = f.mean[k, m] - f.predicted[k, m]
+            off = f.mean[k, m] - f.predicted[k, m] - s.usual[k, m]
             for i in range(_TWIST):
                 share = row[_FIRST + i]
                 s.twist[i] += share * off
@@ -110,32 +134,87 @@ def _error_without(s: Record, f: Record, excluded: Array, left_out: int) -> floa
                     s.normal[i, j] += share * row[_FIRST + j]
     if 3 * used <= _TWIST or not factor_cholesky(s.normal):
         s.twist[:] = 0.0
-        return 0.0
+        return 0, 0.0
     solve_cholesky(s.normal, s.twist)
-    greatest = 0.0
+    worst, most = 0, 0.0
     for k in range(IMU_COUNT):
-        if f.counted[k] == 0 or excluded[k] != 0 or k == left_out:
-            continue
-        squared = 0.0
-        for m in range(3):
-            off = f.mean[k, m] - f.predicted[k, m]
-            for i in range(_TWIST):
-                off -= f.jacobian[k, m, _FIRST + i] * s.twist[i]
-            squared += off * off
-        greatest = max(greatest, squared)
-    return float(np.sqrt(greatest))
+        if _counts(f, excluded, k) and k != left_out:
+            squared = _squared_error(s, f, k)
+            if squared > most:
+                worst, most = k, squared
+    return worst, float(np.sqrt(most))
 
 
 @kernel
-def _compare_forces(s: Record, f: Record, excluded: Array, samples: int, period: float, no_motion: Array) -> None:
-    """Find what the mean forces of this window and the last one show beyond the change of the twist between them."""
+def _find_residual(s: Record, f: Record, k: int) -> None:
+    """What the fitted twist leaves of a gyroscope's reading, into `residual`."""
+    for m in range(3):
+        off = f.mean[k, m] - f.predicted[k, m] - s.usual[k, m]
+        for i in range(_TWIST):
+            off -= f.jacobian[k, m, _FIRST + i] * s.twist[i]
+        s.residual[m] = off
+
+
+@kernel
+def _squared_error(s: Record, f: Record, k: int) -> float:
+    """By how much the sum of squares is less without a gyroscope; 0 if nothing else knows what it reads."""
+    _find_residual(s, f, k)
+    for m in range(3):
+        for i in range(_TWIST):
+            s.columns[m, i] = f.jacobian[k, m, _FIRST + i]
+        solve_cholesky(s.normal, s.columns[m])
+        for n in range(3):
+            known = 0.0
+            for i in range(_TWIST):
+                known += f.jacobian[k, n, _FIRST + i] * s.columns[m, i]
+            s.left[n, m] = (1.0 if n == m else 0.0) - known
+        s.solved[m] = s.residual[m]
+    if not factor_cholesky(s.left):
+        return 0.0
+    solve_cholesky(s.left, s.solved)
+    squared = 0.0
+    for m in range(3):
+        squared += s.residual[m] * s.solved[m]
+    return squared
+
+
+@kernel
+def _unplanned_turning(s: Record, f: Record, duration: float) -> float:
+    """The greatest angular acceleration of an IMU that was not planned, by the change of the twist [rad/s^2]."""
+    most = 0.0
+    if f.windows <= 1:
+        return most
+    for k in range(IMU_COUNT):
+        squared = 0.0
+        for m in range(3):
+            change = 0.0
+            for i in range(_TWIST):
+                change += f.jacobian[k, m, _FIRST + i] * (s.twist[i] - s.twist_before[i])
+            squared += change * change
+        most = max(most, squared)
+    return float(np.sqrt(most) / duration)
+
+
+@kernel
+def _learn_usual(s: Record, f: Record, excluded: Array, share: float) -> None:
+    for k in range(IMU_COUNT):
+        if _counts(f, excluded, k):
+            _find_residual(s, f, k)
+            for m in range(3):
+                s.usual[k, m] += share * s.residual[m]
+
+
+@kernel
+def _compare_forces(s: Record, f: Record, excluded: Array, samples: int, duration: float, no_motion: Array) -> None:
+    """Find what the forces of this window and the last one show beyond the change of the twist between them."""
     follows, used = f.windows > 1, 0
     for k in range(IMU_COUNT):
-        used += f.counted[k] != 0 and excluded[k] == 0
-    s.steady = 0.0
+        used += _counts(f, excluded, k)
+    rough = _ROUGH_SIGMAS * f.rough
+    s.steady, s.common = 0.0, np.inf
     for k in range(IMU_COUNT):
         s.off_motion[k] = no_motion[k] = 0.0
-        if f.counted[k] == 0 or excluded[k] != 0 or used < _ENOUGH:
+        if not _counts(f, excluded, k) or used < _ENOUGH:
             s.average[k] = 0.0
             continue
         squared = averaged = 0.0
@@ -144,17 +223,20 @@ def _compare_forces(s: Record, f: Record, excluded: Array, samples: int, period:
             off = f.mean[k, 3 + m] - f.predicted[k, 3 + m]
             for i in range(_TWIST):
                 off -= row[_FIRST + i] * s.twist[i]
-            beyond = 0.5 * (off + s.force_before[k, m])
-            s.force_before[k, m] = off
+            beyond = 0.5 * (s.force_before[k, m] + off - f.trend[k, m])
+            s.force_before[k, m] = off + f.trend[k, m]
             for i in range(_TWIST):
-                beyond -= row[_FIRST + _TWIST + i] * (s.twist[i] - s.twist_before[i]) / (samples * period)
+                beyond -= row[_FIRST + _TWIST + i] * (s.twist[i] - s.twist_before[i]) / duration
             squared += beyond * beyond
             if follows:
                 s.average[k, m] += _AVERAGED * (beyond - s.average[k, m])
             averaged += s.average[k, m] ** 2
-        s.steady = max(s.steady, np.sqrt(averaged))
+        averaged = max(np.sqrt(averaged) - rough, 0.0)
+        s.steady, s.common = max(s.steady, averaged), min(s.common, averaged)
         if follows:
             s.off_motion[k] = np.sqrt(squared)
-            if s.off_motion[k] > _FORCE_LIMIT + _ROUGH_SIGMAS * f.rough:
+            if s.off_motion[k] > _FORCE_LIMIT + rough:
                 no_motion[k] = samples * squared
     s.twist_before[:] = s.twist
+    s.common_for = s.common_for + 1 if used >= _ENOUGH and s.common > SHARED else 0
+    s.share = s.common_for >= _SHARED_WINDOWS

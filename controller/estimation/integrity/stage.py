@@ -34,7 +34,7 @@ STATE = record_dtype(
     protection=protection.STATE,
     parity=parity.STATE,
     compared=np.int64,  # the last window of which the gyroscopes have been compared
-    contradicts=np.int64,  # whether they have been found to contradict each other in this cycle
+    contradicts=np.int64,  # whether they contradict each other, or all accelerometers show no motion, found in this cycle
     waits=np.int64,  # for how many more cycles what is read counts for the gyroscopes' parity alone
     step=np.int64,  # next of the evaluation
     cycle=np.int64,  # of the evaluation
@@ -115,9 +115,10 @@ def step_integrity(
     took = fault_filter.step_fault_filter(p.filter, s.filter, rig.sensors, imus, time.missed, pose, legs, commands)
     if s.filter.job > 0 and s.compared != s.filter.windows:
         s.compared = s.filter.windows
-        s.contradicts = s.filter.windows > 0 and parity.step_parity(
-            s.parity, s.filter, imus.excluded, p.filter.window, rig.period, imus.shaking.no_motion
-        )  # fmt: skip
+        s.contradicts = s.filter.windows > 0 and (
+            parity.step_parity(s.parity, s.filter, imus.excluded, p.filter.window, rig.period, imus.shaking.no_motion)
+            or s.parity.share != 0
+        )
         if s.evaluations > 0:
             protection.publish_level(s.protection, s.parity.steady, imus.shaking.mean.max())
     if s.waits > 0:

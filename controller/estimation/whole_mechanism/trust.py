@@ -2,7 +2,11 @@
 
 The filter starts from the pose in closed form. Its pose is used once it has settled and knows its rotation, as long as the leg
 filters agree with it.
-When the source changes, the step between the two poses fades away.
+
+The filter knows the pose better than the closed form, but it expects less jerk than joints with clearance or screws with
+backlash have, and is late for what is fast. A loop that is closed by a late pose chatters. So the loop's pose is the one in
+closed form, moved by the step from there to the filter's pose, low-passed. It takes what is slow from the filter, and what is
+fast from the closed form. When the filter is not used, the step fades away.
 """
 
 import numpy as np
@@ -37,8 +41,8 @@ _AVERAGE_S = 0.05
 _MOST_DOUBLINGS = 10
 """The filter is started later each time that the leg filters have disagreed: twice as late, so many times at most."""
 
-_FADING_S = 0.1
-"""Time constant with which the step between two sources of the pose fades away [s]."""
+_BLENDING_S = 0.03
+"""Time constant of the low-pass of the step from the pose in closed form to the filter's [s]."""
 
 PARAMETERS = record_dtype(
     filter=FILTER_PARAMETERS,
@@ -56,7 +60,9 @@ STATE = record_dtype(
     trusted=np.int64,  # whether the pose is the filter's
     disagreement=np.float64,  # of the leg filters with the filter, mean square [rad^2]
     stops=np.int64,  # how often that has stopped the filter
-    blend_offset=(np.float64, 6),  # what is left of the step between two sources of the pose [m, rad]
+    step=(np.float64, 6),  # from the pose in closed form to the filter's [m, rad]
+    correction=(np.float64, 6),  # this step, low-passed, which moves the pose
+    alone=np.int64,  # whether the filter's pose was the only one
     closed_position=(np.float64, 3),  # of the pose in closed form [m]
     closed_rotation=(np.float64, (3, 3)),
     twist=(np.float64, 6),  # of the filter
@@ -93,7 +99,8 @@ def step_mechanism_filter(
             start_filter(p.filter, f, now, pose.position, pose.rotation, pose.twist)
             s.due = time.cycle + p.settling_cycles
             s.disagreement = 0.0
-        _fade_step(s, rig, time, pose)
+        if found:
+            _correct(s, rig, time, pose)
         return found
     for k in range(IMU_COUNT):
         # A sample that is repeated is of another time.
@@ -116,33 +123,27 @@ def step_mechanism_filter(
             report_event(events, Cause.FILTER_DISAGREES, -1, np.sqrt(s.disagreement), np.sqrt(p.disagreement))
     elif s.trusted == 0 and time.cycle >= s.due and _knows_rotation(f, p.disagreement):
         s.trusted = 1
-        _add_step(s.closed_position, s.closed_rotation, pose.position, pose.rotation, s.blend_offset)
-    if s.trusted != 0 and f.running == 0:
+    if f.running == 0:
         s.trusted = 0
-        _add_step(pose.position, pose.rotation, s.closed_position, s.closed_rotation, s.blend_offset)
     if s.trusted != 0:
         pose.twist[:] = s.twist
         pose.acceleration[:] = s.acceleration
-    elif found:
+    if found:
+        _find_step(s.closed_position, s.closed_rotation, pose.position, pose.rotation, s.step)
         pose.position[:] = s.closed_position
         pose.rotation[:] = s.closed_rotation
-    else:
-        return False
-    _fade_step(s, rig, time, pose)
-    return True
+        _correct(s, rig, time, pose)
+        return True
+    s.alone = s.trusted
+    return bool(s.trusted != 0)
 
 
 @kernel
-def restart_filter(s: Record, time: Record, pose: Record) -> None:
+def restart_filter(s: Record, time: Record) -> None:
     """Let the filter begin anew, as an IMU on which it relied has been left out or one has come back."""
-    if s.filter.running == 0:
-        return
-    s.filter.running = 0
-    s.due = time.cycle
-    if s.trusted != 0:
-        s.trusted = 0
-        s.blend_offset[:] = 0.0
-        _add_step(pose.position, pose.rotation, s.closed_position, s.closed_rotation, s.blend_offset)
+    if s.filter.running != 0:
+        s.filter.running = s.trusted = 0
+        s.due = time.cycle
 
 
 @kernel
@@ -165,27 +166,25 @@ def find_closed_covariance(pose: Record, factor: Array, covariance: Array) -> No
 
 
 @kernel
-def _fade_step(s: Record, rig: Record, time: Record, pose: Record) -> None:
-    """Move the pose by what is left of the step between two sources, and let that fade."""
-    share = max(1.0 - elapsed(rig, time) / _FADING_S, 0.0)
+def _correct(s: Record, rig: Record, time: Record, pose: Record) -> None:
+    """Move the pose in closed form by the low-passed step to the filter's pose, or by what is left of it without the filter."""
+    share = 1.0 if s.alone != 0 else min(1.0, elapsed(rig, time) / _BLENDING_S)
+    s.alone = 0
     for i in range(6):
-        s.blend_offset[i] *= share
-    move_pose(s.blend_offset, pose.position, pose.rotation)
+        s.correction[i] += share * ((s.step[i] if s.trusted != 0 else 0.0) - s.correction[i])
+    move_pose(s.correction, pose.position, pose.rotation)
 
 
 @kernel
-def _add_step(position: Array, rotation: Array, new_position: Array, new_rotation: Array, offset: Array) -> None:
-    """Add to `offset` (6,) the small step from the new pose to the earlier one."""
+def _find_step(position: Array, rotation: Array, new_position: Array, new_rotation: Array, step: Array) -> None:
+    """Write the small step (6,) from one pose to the new one [m, rad]."""
     for i in range(3):
-        offset[i] += position[i] - new_position[i]
+        step[i] = new_position[i] - position[i]
         j, k = (i + 1) % 3, (i + 2) % 3
         turn = 0.0
         for m in range(3):
-            turn += 0.5 * (rotation[k, m] * new_rotation[j, m] - rotation[j, m] * new_rotation[k, m])
-        offset[3 + i] += turn
-    for i in range(6):
-        if not np.isfinite(offset[i]):
-            offset[:] = 0.0
+            turn += 0.5 * (rotation[j, m] * new_rotation[k, m] - rotation[k, m] * new_rotation[j, m])
+        step[3 + i] = turn
 
 
 @kernel
