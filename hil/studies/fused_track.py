@@ -9,7 +9,7 @@ import numpy as np
 from controller.calibration.file import Calibration
 from controller.cycle import MARKS, STATE, CycleStage, cycle_parameters, run_stages
 from controller.estimation.platform_filter import vertical_covariance
-from controller.estimation.whole_mechanism.filter import extrapolate_covariance
+from controller.estimation.whole_mechanism.trust import find_covariance
 from controller.settings import control_settings, sensor_settings
 from hil.runs.config import FUSIONS
 from plant.compiled import Record, kernel, record_dtype
@@ -26,7 +26,7 @@ FUSED = record_dtype(
     positions=(np.float64, (3, 3)),  # of each step [m]
     rotations=(np.float64, (3, 3, 3)),
     information=(np.float64, (6, 6)),  # of the refined pose: the inverse of its covariance
-    covariance=(np.float64, (6, 6)),  # of the whole-mechanism filter's pose
+    covariance=(np.float64, (6, 6)),  # of the pose of all
     directions=(np.float64, (LEGS, 3)),  # of the legs, by the leg filters
     leg_covariances=(np.float64, (LEGS, 2, 2)),  # of the angles of each leg [rad^2]
     vertical=(np.float64, 3),  # in {2}, by the platform filter
@@ -133,7 +133,7 @@ def fuse(parameters: Record, raw: Array, state: Record | None = None) -> Record:
 
 @kernel
 def _follow(parameters: Record, state: Record, raw: Array, fused: Record, segments: Array, marks: Record) -> None:
-    p, s = parameters[()], state[()]
+    p, s, factor = parameters[()], state[()], np.zeros((6, 6))
     for i in range(raw.shape[0]):
         f = fused[i]
         run_stages(parameters, state, raw[i], segments, marks, CycleStage.SCREENING, CycleStage.REFINEMENT)
@@ -148,7 +148,7 @@ def _follow(parameters: Record, state: Record, raw: Array, fused: Record, segmen
                 f.information[j, k] = s.pose.information[max(j, k), min(j, k)]
         run_stages(parameters, state, raw[i], segments, marks, CycleStage.MECHANISM, CycleStage.INTEGRITY)
         f.positions[WHOLE], f.rotations[WHOLE] = s.pose.position, s.pose.rotation
-        extrapolate_covariance(p.mechanism.filter, s.mechanism.filter, s.time.cycle * p.rig.period, f.covariance)
+        find_covariance(p.mechanism, s.mechanism, p.rig, s.time, s.pose, factor, f.covariance)
         f.ns[LEGS_ALONE] = marks.ns[CycleStage.LEGS]
         f.ns[CLOSED] = marks.ns[: CycleStage.REFINEMENT].sum()
         f.ns[REFINED] = f.ns[CLOSED] + marks.ns[CycleStage.REFINEMENT]

@@ -9,7 +9,7 @@ off for many seconds is no large error: it is left to the evidence.
 
 From one window to the next, t changes with the acceleration that was not planned, averaged with weights that rise in the first
 window and fall in the second one. If the forces, averaged alike, show more than that, it is no motion: it is vibration, or
-accelerometers are off, perhaps all alike. They then count less at once. If all of them go on to show such a force, the run ends.
+accelerometers are off, perhaps all alike. They then count less at once. If all of them go on to show it, the run ends.
 
 Smaller errors are left to the evidence for hypotheses, which takes 0.1 to 0.2 s. Until then they move the pose little.
 """

@@ -186,9 +186,7 @@ def test_the_change_of_the_gyroscopes_twist_is_the_acceleration_that_was_not_pla
         if n > 0:
             (before, force, rises), (_, now, falls) = found[-2:]
             beyond = 0.5 * (force + rises + now - falls) - j[:, 3:, 12:] @ (twist - before) * RATE_HZ / 5
-            np.testing.assert_allclose(
-                state["integrity"]["parity"]["off_motion"], np.linalg.norm(beyond, axis=1), rtol=1e-5
-            )
+            np.testing.assert_allclose(state["integrity"]["parity"]["off_motion"], np.linalg.norm(beyond, axis=1), rtol=1e-5)
 
 
 def test_what_is_left_out_shows_no_force():

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from controller.cycle import STATE, CycleStage, cycle_parameters
+from controller.estimation.whole_mechanism.filter import extrapolate_covariance
+from controller.estimation.whole_mechanism.trust import find_covariance
 from controller.inverse_kinematics import leg_lengths
 from controller.safety.causes import Cause
 from controller.settings import SafetySettings, control_settings, fusion_settings
@@ -12,7 +14,7 @@ from tests.controller.cycles import cycle, run_stages
 from tests.controller.leg_geometry import leg_directions, rotation_of, static_signals
 
 RATE_HZ = 500.0
-FADING_S = 0.1
+BLENDING_S = 0.03
 MOVE = np.array([2e-3, -1e-3, 3e-3])
 TURN = np.array([0.01, 0.02, -0.015])
 
@@ -57,10 +59,15 @@ class Rest:
 AWAY = np.concatenate([MOVE, TURN])
 
 
-def fades(errors, first, last):
-    """Whether pose errors (n, 6) go from one to the other within `FADING_S`, by no more than a share of it in each cycle."""
-    left = (1.0 - 1.0 / (FADING_S * RATE_HZ)) ** np.arange(1, len(errors) + 1)
-    np.testing.assert_allclose(errors, last + left[:, None] * (first - last), rtol=0.0, atol=0.02 * np.abs(AWAY).max())
+def blended(steps, errors, trusted=True):
+    """How a low-pass of second order, without lag for steady growth, follows steps (n, 6); or how they fade from the first."""
+    share, found, growth, followed = 1.0 / (BLENDING_S * RATE_HZ), errors.copy(), np.zeros(6), []
+    for step in steps:
+        left = step - found
+        growth = growth + share * left if trusted else growth
+        found = found + share * (left + growth)
+        followed.append(found)
+    return np.array(followed)
 
 
 def test_when_the_filter_is_no_longer_trusted_the_pose_fades_to_the_closed_form(hexapod):
@@ -71,16 +78,18 @@ def test_when_the_filter_is_no_longer_trusted_the_pose_fades_to_the_closed_form(
     np.testing.assert_allclose(at_rest, 0.0, atol=1e-6)
     # No reading changes the filter any more, so that it stays where it has been moved.
     rest.parameters["mechanism"]["filter"]["variance"] = 1e30
-    rest.parameters["mechanism"]["disagreement"] = 1e-6
+    rest.parameters["mechanism"]["disagreement"] = 1e-4
     rest.move_filter()
     errors = rest.step_until(trusted=0)
-    np.testing.assert_allclose(errors[:-1], np.broadcast_to(AWAY, errors[:-1].shape), rtol=0.0, atol=1e-4)
+    assert len(errors) > 10
+    np.testing.assert_allclose(errors[:-1], blended(np.tile(AWAY, (len(errors) - 1, 1)), np.zeros(6)), atol=2e-5)
     # Beyond the restart of the filter, too.
-    fades(np.array([errors[-1], *(rest.step() for _ in range(200))]), AWAY, 0.0)
+    errors = np.array([errors[-1], *(rest.step() for _ in range(200))])
+    np.testing.assert_allclose(errors[1:], blended(np.zeros((200, 6)), errors[0], trusted=False), rtol=0.0, atol=2e-5)
     assert rest.trust["filter"]["running"] == 1
 
 
-def test_when_the_filter_is_trusted_the_pose_fades_to_the_filters(hexapod):
+def test_when_the_filter_is_trusted_the_pose_goes_to_the_filters(hexapod):
     rest = Rest(hexapod)
     # The leg filters agree, whatever the filter says.
     rest.parameters["mechanism"]["disagreement"] = 1.0
@@ -91,7 +100,25 @@ def test_when_the_filter_is_trusted_the_pose_fades_to_the_filters(hexapod):
     assert rest.trust["trusted"] == 0
     errors = np.array([rest.step() for _ in range(100)])
     assert rest.trust["trusted"] == 1
-    fades(errors[np.abs(errors).max(axis=1) > 1e-6], 0.0, AWAY)
+    moved = errors[np.abs(errors).max(axis=1) > 1e-6]
+    np.testing.assert_allclose(moved, blended(np.tile(AWAY, (len(moved), 1)), np.zeros(6)), rtol=0.0, atol=2e-5)
+    np.testing.assert_allclose(moved[-1], AWAY, atol=0.05 * np.abs(AWAY).max())
+
+
+def test_the_pose_takes_what_is_slow_from_the_filter_and_what_is_fast_from_the_closed_form(hexapod):
+    """A closed form that swings about a filter that stands still: by how much the pose swings, beside the transfer function."""
+    stage = Stage(hexapod, disagreement=1.0).trusted()
+    stage.parameters["mechanism"]["filter"]["variance"] = 1e30
+    home = stage.home.position
+    for hertz in (1.0, 5.0, 28.0):
+        found = []
+        for n in range(round(3.0 * RATE_HZ)):
+            closed = home + [1e-3 * np.sin(2.0 * np.pi * hertz * n / RATE_HZ), 0.0, 0.0]
+            stage.step(closed=closed)
+            found.append(stage.pose["position"][0] - home[0])
+        swing = np.ptp(found[-round(2.0 * RATE_HZ) :]) / 2e-3
+        s = 2j * np.pi * hertz * BLENDING_S
+        assert swing == pytest.approx(abs(s**2 / (s**2 + s + 1.0)), rel=0.1, abs=0.005)
 
 
 # ------------------------------------------------------------------------------------------------------ its stage alone
@@ -269,33 +296,51 @@ def test_without_a_pose_in_closed_form_the_trusted_filters_pose_goes_on_and_anot
     stage.step()
     assert not stage.step(found=False, closed=np.nan)
     stage = Stage(hexapod).trusted()
-    stage.trust["blend_offset"] = 0.0
     for _ in range(2 * PATIENCE):
         assert stage.step(found=False, closed=np.nan)
         assert stage.stands == (True, True)
         np.testing.assert_allclose(stage.pose["position"], stage.home.position, rtol=0.0, atol=1e-6)
-    # A filter that is no longer finite is not trusted either, and what is not finite does not stay in the step.
+    # Once there is one again, the pose goes on from the filter's.
+    assert stage.step(closed=stage.home.position + [1e-3, 0.0, 0.0])
+    np.testing.assert_allclose(stage.pose["position"], stage.home.position, rtol=0.0, atol=1e-6)
+    # A filter that is no longer finite is not trusted either, and what is not finite does not stay in the pose.
     stage.trust["filter"]["published_position"] = np.nan
     stage.trust["filter"]["position"] = np.nan
     for _ in range(PATIENCE + 1):
         stage.step()
     assert stage.stands == (False, False)
-    np.testing.assert_array_equal(stage.trust["blend_offset"], 0.0)
-    assert stage.step()
-    np.testing.assert_array_equal(stage.pose["position"], stage.home.position)
+    for _ in range(10 * round(BLENDING_S * RATE_HZ)):
+        assert stage.step()
+    np.testing.assert_allclose(stage.pose["position"], stage.home.position, rtol=0.0, atol=1e-7)
 
 
-@pytest.mark.parametrize(("missed", "left"), [(0, 0.98), (4, 0.9), (48, 0.02), (49, 0.0), (300, 0.0)])
+@pytest.mark.parametrize(("missed", "left"), [(0, 14 / 15), (4, 10 / 15), (14, 0.0), (300, 0.0)])
 def test_what_is_left_of_a_step_fades_over_missed_periods_too(hexapod, missed, left):
-    stage, offset = Stage(hexapod), np.array([1e-3, -2e-3, 3e-3, 0.01, -0.02, 0.03])
+    stage, step = Stage(hexapod), np.array([1e-3, -2e-3, 3e-3, 0.01, -0.02, 0.03])
     stage.step()
-    stage.step()
-    stage.trust["blend_offset"] = offset
+    stage.trust["correction"] = step
     stage.step(missed=missed)
-    np.testing.assert_allclose(stage.trust["blend_offset"], left * offset, rtol=1e-12, atol=1e-18)
-    np.testing.assert_allclose(stage.pose["position"], stage.home.position + left * offset[:3], rtol=0.0, atol=1e-15)
-    turned = rotation_of(left * offset[3:]) @ stage.home.rotation
+    np.testing.assert_allclose(stage.trust["correction"], left * step, rtol=1e-12, atol=1e-18)
+    np.testing.assert_allclose(stage.pose["position"], stage.home.position + left * step[:3], rtol=0.0, atol=1e-15)
+    turned = rotation_of(left * step[3:]) @ stage.home.rotation
     np.testing.assert_allclose(stage.pose["rotation"], turned, rtol=0.0, atol=1e-12)
+
+
+def test_the_covariance_is_the_filters_with_what_is_fast_in_the_closed_forms(hexapod):
+    stage = Stage(hexapod).trusted()
+    p = stage.parameters[()]
+    stage.pose["information"] = np.diag(1.0 / np.array([1e-6, 2e-6, 3e-6, 4e-4, 5e-4, 6e-4]))
+    factor, found, own = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
+    extrapolate_covariance(p["mechanism"]["filter"], stage.trust["filter"][()], stage.time["cycle"] / RATE_HZ, own)
+    find_covariance(p["mechanism"], stage.trust[()], p["rig"], stage.time[()], stage.pose[()], factor, found)
+    np.testing.assert_allclose(found, own + 0.01 * np.diag([1e-6, 2e-6, 3e-6, 4e-4, 5e-4, 6e-4]), rtol=1e-9, atol=1e-18)
+    # Without a pose in closed form, the filter's alone; without the filter, that of the closed form, or none.
+    stage.pose["information"] = 0.0
+    find_covariance(p["mechanism"], stage.trust[()], p["rig"], stage.time[()], stage.pose[()], factor, found)
+    np.testing.assert_allclose(found, own, rtol=1e-9)
+    stage.trust["trusted"] = 0
+    find_covariance(p["mechanism"], stage.trust[()], p["rig"], stage.time[()], stage.pose[()], factor, found)
+    assert np.isnan(found).all()
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.007])
