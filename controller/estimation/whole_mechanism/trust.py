@@ -153,8 +153,9 @@ def restart_filter(s: Record, time: Record) -> None:
 
 @kernel
 def find_covariance(p: Record, s: Record, rig: Record, time: Record, pose: Record, factor: Array, covariance: Array) -> None:
-    """Write the pose's covariance (6, 6), NaN if there is none: the refinement's, or that of a filter that is trusted and what is
-    fast in the refinement's.
+    """Write the pose's covariance (6, 6), NaN if there is none.
+
+    It is that of the refinement, or of a filter that is trusted, with what is fast in the refinement's.
     """
     find_closed_covariance(pose, factor, covariance)
     if s.trusted == 0:
