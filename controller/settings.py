@@ -158,6 +158,12 @@ def sensor_settings(mechanism: Mechanism, imu: ImuModel) -> FusionSettings:
     return fusion_settings(mechanism, **{name: value for name, value in known.items() if name not in own})
 
 
+def tables_with(name: str) -> list[str]:
+    """The tables of settings in a mechanism's file that have an entry of this name."""
+    kinds = {"control": ControlSettings, "fusion": FusionSettings, "safety": SafetySettings}
+    return [table for table, kind in kinds.items() if name in (field.name for field in fields(kind))]
+
+
 def _read(kind: type[S], name: str, mechanism: Mechanism, changes: Mapping[str, float]) -> S:
     table = {**mechanism.settings.get(name, {}), **changes}
     check_entries(table, sorted(field.name for field in fields(kind)), f"[{name}]")
