@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from math import inf, radians
+from math import hypot, inf, radians
 from typing import TypeVar
 
 from plant.errors import InputError
@@ -25,11 +25,12 @@ class _Settings:
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            endless = field.name in _ENDLESS_ALLOWED
+            endless, zero = field.name in _ENDLESS_ALLOWED, field.name in _ZERO_ALLOWED
             if value == inf and endless:
                 continue
-            if not 0.0 <= value < inf or (value == 0.0 and field.name not in _ZERO_ALLOWED):
-                allowed = "positive; inf is no limit" if endless else "positive and finite"
+            if not 0.0 <= value < inf or (value == 0.0 and not zero):
+                sign = "0 or positive" if zero else "positive"
+                allowed = f"{sign}; inf is no limit" if endless else f"{sign} and finite"
                 raise InputError(f"{field.name} is {value}; it must be {allowed}")
 
 
@@ -139,15 +140,28 @@ def safety_settings(mechanism: Mechanism, **changes: float) -> SafetySettings:
 
 
 def sensor_settings(mechanism: Mechanism, imu: ImuModel) -> FusionSettings:
-    """The fusion settings of a mechanism, with delay, magnetometer rate and ranges of its IMUs where its file has none."""
+    """The fusion settings of a mechanism, with what its IMUs tell where its file has none.
+
+    That is their delay, magnetometer rate and ranges, and the standard deviations that grow with their `accelerometer_wander`.
+    """
+    wander = imu.accelerometer_wander
     known = {
         "sensor_delay": imu.latency,
         "magnetometer_rate": min(imu.magnetometer_rate, _ENDLESS),
         "gyroscope_range": min(imu.gyroscope.reach, _ENDLESS),
         "accelerometer_range": min(imu.accelerometer.reach, _ENDLESS),
+        "leg_sigma": hypot(FusionSettings.leg_sigma, wander / STANDARD_GRAVITY),
+        "tilt_sigma": hypot(FusionSettings.tilt_sigma, wander / STANDARD_GRAVITY),
+        "accelerometer_bias_sigma": hypot(FusionSettings.accelerometer_bias_sigma, wander),
     }
     own = mechanism.settings.get("fusion", {})
     return fusion_settings(mechanism, **{name: value for name, value in known.items() if name not in own})
+
+
+def tables_with(name: str) -> list[str]:
+    """The tables of settings in a mechanism's file that have an entry of this name."""
+    kinds = {"control": ControlSettings, "fusion": FusionSettings, "safety": SafetySettings}
+    return [table for table, kind in kinds.items() if name in (field.name for field in fields(kind))]
 
 
 def _read(kind: type[S], name: str, mechanism: Mechanism, changes: Mapping[str, float]) -> S:

@@ -110,6 +110,13 @@ class Disturbance:
     begin: float = -1.0
     duration: float = inf
 
+    @property
+    def mean_square(self) -> float:
+        """The mean square of its size over time; a ramp or an exponential has come to its end."""
+        if self.course == Course.SINE:
+            return 0.5 * self.size**2
+        return self.size**2 * (0.5 * self.span / self.every if self.course == Course.PULSES else 1.0)
+
     def later(self, by: float) -> "Disturbance":
         """The same, with a begin that counts from a time `by` [s]; what is there from the start stays so."""
         return self if self.begin < 0.0 else replace(self, begin=self.begin + by)

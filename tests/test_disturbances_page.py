@@ -30,6 +30,7 @@ def test_the_example_is_read() -> None:
     assert (first.name, second.name) == tuple(f"a leg's IMU turns by {size} deg about x within 15 s" for size in (1, 3))
     drawn = first.drawn(0, "whole")
     assert drawn.config.settings[0].at == drawn.begin + 1.0 and len(drawn.guilty) == 1
+    assert 8.0 <= drawn.begin <= 10.0
 
 
 def test_the_figures_are_those_of_a_run() -> None:

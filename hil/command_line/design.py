@@ -183,11 +183,19 @@ def gough_detectability(options: Namespace) -> int:
     if options.seeds < 1:
         raise InputError(f"there are {options.seeds} seeds; at least 1 is needed")
     texts = options.rows or [""]
-    rows = [row for row in all_rows() if row.kind != SOUND and any(text in row.name or text in row.kind for text in texts)]
+    asked = [row for row in all_rows() if any(text in row.name or text in row.kind for text in texts)]
+    rows = [row for row in asked if row.kind != SOUND]
     if options.faults:
         rows = [Row(" ".join(options.faults), "own", tuple(options.faults))]
     if not rows:
-        raise InputError(f"no row has {' or '.join(map(repr, texts))} in its name")
+        called = " or ".join(map(repr, texts))
+        if asked:
+            raise InputError(
+                f"in the rows with {called} in their names or kinds nothing is disturbed, so there is nothing to detect: "
+                "choose others ('gough faults --list' has all), or see what the loop tells in these: "
+                f"gough faults --only {SOUND}"
+            )
+        raise InputError(f"no row has {called} in its name: 'gough faults --list' has all")
     given = {
         name: getattr(options, name) for name in ("mechanism", "target", "duration", "rate", "imu") if hasattr(options, name)
     }

@@ -30,9 +30,6 @@ SOUND = "sound"
 MOST_GUILTY = 3
 """So many IMUs with the same disturbance are each at fault; what more of them share is not mended by leaving one out."""
 
-_EARLIEST_S, _SPREAD_S = 2.0, 3.0
-"""When a disturbance begins, and for how long it may be later [s]."""
-
 
 @dataclass(frozen=True)
 class Row:
@@ -43,6 +40,7 @@ class Row:
         faults: texts of `--fault`, or of `gough inject` behind a bus.
         settings: of the plant, texts of `--set`; what they name is there from the start, or at a time.
         mechanism, target, imu, rate, duration, joint_error: as in `SimulationConfig`.
+        earliest, latest: bounds of the time at which it begins, after the motion has begun [s].
         base_bend_mm: how far the base plate is bent: its joints leave the plane by a saddle of this height [mm].
         joint_off_mm: how far base joint {k} is off, in a random direction [mm].
         link: one of `LINKS`.
@@ -58,6 +56,8 @@ class Row:
     imu: str = "mpu9150-calibrated"
     rate: float = 1000.0
     duration: float = 20.0
+    earliest: float = 2.0
+    latest: float = 5.0
     joint_error: float = 0.0
     base_bend_mm: float = 0.0
     joint_off_mm: float = 0.0
@@ -67,7 +67,7 @@ class Row:
     def drawn(self, seed: int, fusion: str) -> "Drawn":
         """What a seed makes of the row: IMUs, place, sign and time."""
         random = np.random.default_rng([seed, crc32(self.name.encode())])
-        at = round(_EARLIEST_S + _SPREAD_S * random.random(), 3)
+        at = round(self.earliest + (self.latest - self.earliest) * random.random(), 3)
         k, j, i = random.permutation(LEGS)[:3].tolist()
         values = {"k": k, "j": j, "i": i, "sign": "-" if random.random() < 0.5 else ""}
         values |= {"at": at} | {f"at{n}": round(at + n, 3) for n in (1, 2, 3)}
@@ -138,7 +138,7 @@ def rows_of(document: Mapping[str, Any]) -> tuple[Row, ...]:
     """The rows of a document.
 
     Raises:
-        InputError: an entry is unknown, has a value of the wrong kind, or two rows have the same name.
+        InputError: an entry is unknown, has a value of the wrong kind or out of range, or two rows have the same name.
     """
     rows = tuple(row for kind, entries in document.items() for entry in entries for row in _rows(kind, entry))
     for name, count in Counter(row.name for row in rows).items():
@@ -164,9 +164,15 @@ def _rows(kind: str, entry: Mapping[str, Any]) -> Iterator[Row]:
         own |= {name: value for name, value in values.items() if name in _KINDS}
         known = _Known(values)
         row = Row(kind=kind, **{name: _value(name, value, known) for name, value in own.items()})
+        row = replace(row, name=row.name.format_map(known))
         if row.link not in LINKS:
             raise InputError(f"the row {row.name!r} has link = {row.link!r}; there are {', '.join(LINKS)}")
-        yield replace(row, name=row.name.format_map(known))
+        if not 0.0 <= row.earliest <= row.latest < row.duration:
+            raise InputError(
+                f"the row {row.name!r} has earliest = {row.earliest:g} and latest = {row.latest:g}; its disturbance must begin "
+                f"from 0 s on, and before the end of the motion: choose 0 <= earliest <= latest < duration = {row.duration:g}"
+            )
+        yield row
 
 
 def _points(entry: Mapping[str, Any], name: str) -> list[dict[str, Any]]:

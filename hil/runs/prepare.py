@@ -19,7 +19,7 @@ from controller.planning.target import Target, load_target
 from controller.safety.arming import longest_delay
 from controller.safety.causes import Cause
 from controller.safety.stop import describe_end
-from controller.settings import control_settings, safety_settings, sensor_settings
+from controller.settings import control_settings, safety_settings, sensor_settings, tables_with
 from hil.loop.driver import Loop
 from hil.loop.records import RECORD
 from hil.recording.replay_rig import ReplayRig
@@ -33,7 +33,7 @@ from hil.runs.plant_start import check_start
 from plant.compiled import Record
 from plant.dynamics.base_course import placed
 from plant.dynamics.variables import PLATFORM_IMU
-from plant.errors import GoughError, InputError
+from plant.errors import GoughError, InputError, UnknownNameError
 from plant.extras import missing_extras_named
 from plant.fmu.binding import OWN_BINDING, bind, load_binding
 from plant.fmu.build import building_default_fmu, default_fmu, model_of
@@ -208,7 +208,11 @@ def simulated_plant(
     if config.joint_error and not parameters:
         binds = f"{binding.source} binds" if binding.source else f"{fmu} is"
         raise InputError(f"{binds} an FMU with joints of its own, which have no joint error: leave it out")
-    plant = FmuPlant(fmu, parameters, 1.0 / config.rate, binding, settings, nominal.legs)
+    try:
+        plant = FmuPlant(fmu, parameters, 1.0 / config.rate, binding, settings, nominal.legs)
+    except UnknownNameError:
+        _check_settings(config, FmuDescription(fmu))
+        raise
     try:
         plant.move_base([placed(each, hold) for each in config.base_motions])
         _check_plant(config, plant, nominal)
@@ -218,6 +222,24 @@ def simulated_plant(
         plant.close()
         raise
     return plant
+
+
+def _check_settings(config: SimulationConfig, description: FmuDescription) -> None:
+    """Say where a setting of the controller belongs that was given as one of the plant."""
+    for each in config.settings:
+        of, _, name = each.name.rpartition(".")
+        tables = " or ".join(f"[{table}]" for table in tables_with(name) if of in ("", table))
+        if tables and each.name not in description:
+            line = replace(each, name=name, at=None).text.replace("=", " = ")
+            if config.mechanism.endswith(".toml"):
+                remedy = f"write {line} into that table of {config.mechanism}"
+            else:
+                lines = f'based_on = "{config.mechanism}", {tables} and {line}'
+                remedy = f"write a file with the lines {lines}, and name it by --mechanism FILE.toml"
+            raise InputError(
+                f"{each.name} is no variable of {description.path.name}: it is a setting of the controller, in the table "
+                f"{tables} of the mechanism's file; {remedy}"
+            )
 
 
 def _check_plant(config: SimulationConfig, plant: FmuPlant, nominal: Mechanism) -> None:

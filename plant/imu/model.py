@@ -5,7 +5,7 @@ from math import inf, pi, sqrt
 from typing import Any
 
 from plant.errors import InputError
-from plant.imu_disturbances import Disturbance
+from plant.imu_disturbances import SENSORS, Disturbance, DisturbanceKind
 
 STANDARD_GRAVITY = 9.80665
 MILLI_G = 1e-3 * STANDARD_GRAVITY
@@ -98,3 +98,26 @@ class ImuModel:
             0.5 * sensor.order / (2.0 * pi * sensor.section_bandwidth) for sensor in (self.gyroscope, self.accelerometer)
         )
         return self.delay + filters + (0.5 / self.sample_rate if self.sample_rate else 0.0)
+
+    @property
+    def accelerometer_wander(self) -> float:
+        """By how much an axis of the accelerometer wanders in the IMU's normal life, after a calibration [m/s^2].
+
+        This is a standard deviation over IMUs, axes and times: of what temperature and supply do to bias and scale, and of the
+        bias that rectified vibration leaves. Axes are in any direction to gravity, and `disturbances` are independent.
+        """
+        sensor, variance = self.accelerometer, 0.0
+        # The mean square along an axis of a random direction is a third, and so is that of a uniform number.
+        bias_per_kelvin, bias_per_volt = (
+            (common**2 + own**2 / 3.0) / 3.0 for common, own in (sensor.bias_per_kelvin, sensor.bias_per_volt)
+        )
+        scale_per_kelvin = sum(part**2 for part in sensor.scale_per_kelvin) / 3.0
+        for each in self.disturbances:
+            if each.kind == DisturbanceKind.TEMPERATURE:
+                variance += each.mean_square * (bias_per_kelvin + scale_per_kelvin * STANDARD_GRAVITY**2 / 3.0)
+            elif each.kind == DisturbanceKind.SUPPLY:
+                variance += each.mean_square * bias_per_volt
+            elif each.kind == DisturbanceKind.VIBRATION and SENSORS[each.sensor] == "accelerometer":
+                rectified = sensor.rectification * each.mean_square
+                variance += sum((rectified * part**2) ** 2 for part in each.axis) / 3.0
+        return sqrt(variance)

@@ -102,6 +102,15 @@ def test_zero_is_allowed_only_where_it_switches_something_off(hexapod):
                     read(hexapod, **{field.name: 0.0})
 
 
+def test_the_message_tells_whether_zero_is_allowed(hexapod):
+    with pytest.raises(InputError, match=r"most_lost_imus is -1\.0; it must be 0 or positive and finite"):
+        safety_settings(hexapod, most_lost_imus=-1.0)
+    with pytest.raises(InputError, match=r"carried is 0\.0; it must be positive and finite"):
+        safety_settings(hexapod, carried=0.0)
+    with pytest.raises(InputError, match=r"evidence is -1\.0; it must be positive; inf is no limit"):
+        safety_settings(hexapod, evidence=-1.0)
+
+
 def test_settings_do_not_change_once_built():
     with pytest.raises(FrozenInstanceError):
         ControlSettings().proportional = 1.0
@@ -130,6 +139,24 @@ def test_what_the_mechanisms_file_says_of_its_imus_goes_before_what_they_tell(he
     assert getattr(own, name) == 7.0
     for field in fields(FusionSettings):
         assert field.name == name or getattr(own, field.name) == getattr(told, field.name)
+
+
+WANDERING = ("leg_sigma", "tilt_sigma", "accelerometer_bias_sigma")
+
+
+def test_accelerometers_that_wander_make_directions_and_biases_less_certain(hexapod):
+    imu = load_imu("mpu9150-nominal")
+    found, usual = sensor_settings(hexapod, imu), fusion_settings(hexapod)
+    for name, wander in zip(WANDERING, np.array([1.0, 1.0, 9.80665]) * imu.accelerometer_wander / 9.80665, strict=True):
+        assert getattr(found, name) ** 2 - getattr(usual, name) ** 2 == pytest.approx(wander**2)
+    own = sensor_settings(mechanism_with(hexapod, fusion={"leg_sigma": 2e-3}), imu)
+    assert (own.leg_sigma, own.tilt_sigma, own.accelerometer_bias_sigma) == (2e-3, *(getattr(found, n) for n in WANDERING[1:]))
+
+
+@pytest.mark.parametrize("name", ["ideal", "mpu9150", "mpu9150-calibrated", "icm42688"])
+def test_imus_that_do_not_wander_leave_the_standard_deviations_to_the_bit(hexapod, name):
+    found = sensor_settings(hexapod, load_imu(name))
+    assert all(getattr(found, each) == getattr(fusion_settings(hexapod), each) for each in WANDERING)
 
 
 def test_ranges_and_rates_without_an_end_are_finite_settings(hexapod):

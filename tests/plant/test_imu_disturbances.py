@@ -3,11 +3,14 @@
 import tomllib
 from math import inf, pi, radians, sqrt
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from plant.errors import InputError, UnknownNameError
+from plant.imu import disturbance_record
+from plant.imu.disturbed import level
 from plant.imu_disturbances import (
     WORDS,
     Course,
@@ -143,3 +146,11 @@ def test_each_word_is_of_some_kind_and_every_kind_has_a_text():
     assert places <= set(WORDS)
     for kind in DisturbanceKind:
         assert kind.text and kind.label == "imu-" + kind.name.lower()
+
+
+@pytest.mark.parametrize("course", ["", "ramp_s=2", "settle_s=0.1", "sine_hz=50", "pulse_ms=4,repeat_hz=50", "pulse_ms=20"])
+def test_the_mean_square_is_that_of_the_sizes_over_time(course):
+    made = disturbance_of_text(f"imu-vibration:all,axis=x,size_m_per_s2=-3,{course}".rstrip(","))
+    record = disturbance_record(made)[()]
+    sizes = [level(record, time) for time in 1000.0 + np.linspace(0.0, 0.2, 2000, endpoint=False)]
+    assert made.mean_square == pytest.approx(np.mean(np.square(sizes)), rel=1e-6)

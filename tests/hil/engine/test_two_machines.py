@@ -5,7 +5,7 @@ import os
 import shutil
 import subprocess
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ import pytest
 
 from controller.calibration.file import Calibration, save_calibration
 from hil.sweep.store import DONE, STATUS, TABLE
+from plant.compiled.cache import user_cache
 from plant.mechanism import load_mechanism
 from plant.mechanism.documents import mechanism_text
 from tests.hil.commands import gough
@@ -74,12 +75,16 @@ class Machines:
         return ["ip", "netns", "exec", self.names[number], "unshare", "--mount", "sh", "-c", f'{mounts} && exec "$@"', "sh"]
 
     def environment(self, number: int) -> dict[str, str]:
-        """Empty folders of its own for all that a process keeps."""
+        """Folders of its own for all that a process keeps: empty ones, but for a copy of the code that is compiled here."""
         own = self.folder / f"{number}"
         named = {}
         for name in ("GOUGH_CACHE", "HOME", "TMPDIR", "XDG_CACHE_HOME"):
             (own / name).mkdir(exist_ok=True)
             named[name] = str(own / name)
+        for kind in ("kernels", "fmus"):
+            # Another process may remove a file that it has just written.
+            with suppress(shutil.Error, FileNotFoundError):
+                shutil.copytree(user_cache() / kind, own / "GOUGH_CACHE" / kind, dirs_exist_ok=True)
         others = {f"OTHER{other}": str(self.folder / f"{other}") for other in range(len(self.names)) if other != number}
         return named | others | {"MACHINE": str(number), "PYTHONPATH": str(Path(__file__).resolve().parents[3])}
 

@@ -125,6 +125,8 @@ def test_the_command_takes_a_fault_of_one_s_own_and_other_uncertainties(capsys):
     ("options", "message"),
     [
         (["no such row"], "no row has 'no such row' in its name"),
+        (["sound"], "nothing is disturbed, so there is nothing to detect"),
+        (["nothing is wrong, 6-5", "nothing is wrong, 6-4"], "or see what the loop tells in these: gough faults --only sound"),
         (["--seeds", "0"], "at least 1 is needed"),
         (["--fault", "imu-offset:9,axis=y,size_m_per_s2=1"], "imus = '9'"),
         (["--fault", "base-tilt,axis=x,size_deg=1", "--target", "steps"], "choose one that moves on"),

@@ -1,6 +1,7 @@
 """The rows of disturbances: there are enough of every kind, each is read, and a seed makes a run of it."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -54,7 +55,7 @@ def test_a_seed_makes_a_run_of_every_row(name):
     drawn, again, other = (row.drawn(seed, "whole") for seed in (3, 3, 4))
     assert drawn == again
     assert drawn.config.seed == 3 and drawn.config.fusion == "whole" and drawn.config.rate == row.rate
-    assert drawn.begin == 0.0 or 2.0 <= drawn.begin <= 5.0 < row.duration
+    assert drawn.begin == 0.0 or row.earliest <= drawn.begin <= row.latest < row.duration
     assert drawn.begin != other.begin or drawn.begin == 0.0
     for text in drawn.faults:
         assert "{" not in text
@@ -71,6 +72,17 @@ def test_what_begins_late_begins_at_the_time_that_is_judged():
     assert f",at={drawn.begin:g}" in drawn.faults[0]
     assert [each.at for each in drawn.config.settings] == [drawn.begin, pytest.approx(drawn.begin + 2.0)]
     assert Row("x", "y", settings=("screw.backlash=1e-4",)).drawn(7, "whole").begin == 0.0
+
+
+def test_the_begin_is_drawn_between_its_bounds_and_by_default_as_ever():
+    bounded = Row("x", "y", ("imu-turn:{k},axis=x,size_deg=1",), earliest=7.0, latest=7.5)
+    begins = [bounded.drawn(seed, "whole").begin for seed in range(100)]
+    assert 7.0 <= min(begins) < 7.05 and 7.45 < max(begins) <= 7.5
+    # Of one seed, both draw the same share of their time.
+    usual = [replace(bounded, earliest=2.0, latest=5.0).drawn(seed, "whole").begin for seed in range(100)]
+    np.testing.assert_allclose((np.array(usual) - 2.0) / 3.0, (np.array(begins) - 7.0) / 0.5, atol=2e-3)
+    assert Row("x", "y", bounded.faults).drawn(3, "whole").begin == usual[3]
+    assert replace(bounded, earliest=7.5).drawn(3, "whole").begin == 7.5
 
 
 def test_legs_are_different_and_every_one_comes_up():
@@ -123,6 +135,13 @@ def test_values_are_crossed_and_listed():
         ({"name": "a", "link": "usb"}, "'a' has link = 'usb'; there are fmu, udp, canopen"),
         ({"name": "a", "rate": "{x}"}, "rate = '{x}' must be a float"),
         ({"name": "a", "vary": {"b": [1, 2]}}, "2 rows are called 'a'"),
+        (
+            {"name": "a", "earliest": -1},
+            "'a' has earliest = -1 and latest = 5; its .* choose 0 <= earliest <= latest < duration = 20",
+        ),
+        ({"name": "a", "earliest": 6}, "earliest = 6 and latest = 5"),
+        ({"name": "a", "latest": 9, "duration": 9}, "latest = 9; .* latest < duration = 9"),
+        ({"name": "a {b}", "vary": {"b": [1], "latest": ["nan"]}}, "'a 1' has earliest = 2 and latest = nan"),
     ],
 )
 def test_a_wrong_entry_is_refused(entry, message):

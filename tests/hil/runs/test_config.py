@@ -6,9 +6,11 @@ import pytest
 
 from hil.rigs.udp.emulator import WATCHDOG_S
 from hil.runs.config import EmulatorConfig, SimulationConfig, imus_from_text
+from hil.runs.prepare import simulated_plant
 from plant.errors import InputError, UnknownNameError
 from plant.fmu.settings import Setting
 from plant.imu_wiring import Wiring
+from plant.mechanism import load_in_space
 
 
 def test_a_configuration_comes_back_from_its_plain_values():
@@ -47,6 +49,38 @@ def test_faults_of_imus_are_checked_and_are_for_simulated_ones():
         SimulationConfig(faults=("base-tilt,axis=z",))
     with pytest.raises(InputError, match="--fault is for a simulated plant, not for the rig udp: tell it to 'gough emulate'"):
         SimulationConfig(rig="udp", faults=texts)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("need_platform_imu=0", 'in the table [safety] .* lines based_on = "hexapod", [safety] and need_platform_imu = 0, and'),
+        ("safety.disagreement=0.1@3", "safety.disagreement is no variable .* [safety] and disagreement = 0.1, and"),
+        ("disagreement=0.1", "in the table [fusion] or [safety] of the mechanism's file"),
+        ("hold=0.5", "in the table [control]"),
+    ],
+)
+def test_a_setting_of_the_controller_is_told_from_one_of_the_plant(text, message):
+    config = SimulationConfig(settings=(Setting.parse("payload.mass=12"), Setting.parse(text)))
+    mechanism = load_in_space(config.mechanism)
+    with pytest.raises(InputError, match=message.replace("[", r"\[").replace("]", r"\]")):
+        simulated_plant(config, mechanism, mechanism.home)
+
+
+def test_a_setting_of_the_controller_belongs_into_a_mechanism_s_own_file(tmp_path):
+    path = tmp_path / "own.toml"
+    path.write_text('based_on = "hexapod"')
+    mechanism = load_in_space(str(path))
+    config = SimulationConfig(mechanism=str(path), settings=(Setting.parse("leg_sigma=1e-3"),))
+    with pytest.raises(InputError, match=r"write leg_sigma = 0\.001 into that table of .*own\.toml"):
+        simulated_plant(config, mechanism, mechanism.home)
+
+
+def test_what_is_no_setting_of_anything_keeps_its_message():
+    mechanism = load_in_space("hexapod")
+    for text in ("payload.hold=1", "colour=1"):
+        with pytest.raises(UnknownNameError, match="has no variable"):
+            simulated_plant(SimulationConfig(settings=(Setting.parse(text),)), mechanism, mechanism.home)
 
 
 def test_the_emulated_drives_have_one_watchdog():

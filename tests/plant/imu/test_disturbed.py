@@ -480,3 +480,49 @@ def test_the_figures_of_data_sheets_over_temperature() -> None:
         assert np.degrees(sum(model.gyroscope.bias_per_kelvin)) == pytest.approx(gyroscope, rel=0.05)
         assert sum(model.accelerometer.bias_per_kelvin) / G * 1e3 == pytest.approx(accelerometer, rel=0.05)
     assert sum(load_imu("icm42688").gyroscope.scale_per_kelvin) == pytest.approx(5e-5)
+
+
+def wander_of(model: ImuModel, seed: int, frequency: float, phases: int = 8) -> Array:
+    """By how much gravity's reading (7, 3) changes with the kind's disturbances, which have settled, without what vibrates."""
+    random = np.random.default_rng(seed)
+    ideal = np.zeros((3, 7, 3))
+    up = random.normal(size=(7, 3))
+    ideal[ACCELEROMETER] = G * up / np.linalg.norm(up, axis=1, keepdims=True)
+    time, readings = random.uniform(1e5, 2e5), np.empty((2, phases, 3, 7, 3))
+    for kind, reading in zip((model, replace(model, disturbances=())), readings, strict=True):
+        start = imu_state(kind, seed, PERIOD)
+        for phase in range(phases):
+            state = start.copy()
+            state["time"] = time + phase / (phases * frequency)
+            measure(state, ideal, reading[phase])
+    changed: Array = np.mean(readings[0] - readings[1], axis=0)[ACCELEROMETER]
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("mpu9150-nominal", ()),
+        ("icm42688-nominal", ()),
+        ("mpu9150", ("imu-supply:all,size_v=0.5,sine_hz=0.01", "imu-vibration:all,axis=z,size_deg_per_s=5,sine_hz=173")),
+        ("mpu9150-nominal", ("imu-vibration:all,axis=1/2/0,size_g=2,sine_hz=173", "imu-temperature:all,size_k=-1,ramp_s=9")),
+    ],
+)
+def test_the_accelerometer_wanders_by_what_its_kind_says(name: str, words: tuple[str, ...]) -> None:
+    model = load_imu(name)
+    sensor = replace(model.accelerometer, resolution=0.0)
+    disturbances = tuple(map(disturbance_of_text, words)) or model.disturbances
+    model = replace(model, accelerometer=sensor, disturbances=disturbances)
+    squares = np.array([np.mean(wander_of(model, seed, 173.0) ** 2) for seed in range(100)])
+    error = np.std(squares) / sqrt(len(squares))
+    assert error < 0.1 * np.mean(squares)
+    assert np.mean(squares) == pytest.approx(model.accelerometer_wander**2, abs=4.0 * error)
+
+
+@pytest.mark.parametrize("name", ["ideal", "mpu9150", "mpu9150-calibrated", "icm42688"])
+def test_an_accelerometer_whose_kind_has_no_disturbances_does_not_wander(name: str) -> None:
+    model = load_imu(name)
+    assert model.accelerometer_wander == 0.0
+    # Nor does one that a disturbance of another sensor or kind concerns alone.
+    others = "imu-vibration:all,axis=z,size_deg_per_s=9,sine_hz=50", "imu-clock:all,size_percent=1"
+    assert replace(model, disturbances=tuple(map(disturbance_of_text, others))).accelerometer_wander == 0.0
