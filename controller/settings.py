@@ -13,7 +13,7 @@ from plant.mechanism import Mechanism
 _ENDLESS = 1e300
 _RAW_M = 0.05
 _ENDLESS_ALLOWED = ("evidence", "protection_position", "protection_rotation")
-_ZERO_ALLOWED = ("integral", "derivative", "sensor_delay", "most_lost_imus", "watch_imus", "need_platform_imu")
+_ZERO_ALLOWED = ("integral", "derivative", "sensor_delay", "sensor_timing", "most_lost_imus", "watch_imus", "need_platform_imu")
 
 S = TypeVar("S", "ControlSettings", "FusionSettings", "SafetySettings")
 
@@ -67,6 +67,7 @@ class FusionSettings(_Settings):
     heading_sigma: float = radians(1.0)  # of the heading that its calibration leaves, for the refinement [rad]
     acceleration_time: float = 0.01  # time constant of the platform's acceleration, the derivative of its twist [s]
     sensor_delay: float = 0.0  # age of the IMUs' readings [s]
+    sensor_timing: float = 0.0  # standard deviation of that age [s]
     gyroscope_range: float = radians(250.0)  # from this size on, a reading is not used [rad/s]
     accelerometer_range: float = 4.0 * STANDARD_GRAVITY  # from this size on, a reading is not used [m/s^2]
     # For the whole-mechanism filter, the noise with calibrated IMUs.
@@ -147,6 +148,7 @@ def sensor_settings(mechanism: Mechanism, imu: ImuModel) -> FusionSettings:
     wander = imu.accelerometer_wander
     known = {
         "sensor_delay": imu.latency,
+        "sensor_timing": imu.timing,
         "magnetometer_rate": min(imu.magnetometer_rate, _ENDLESS),
         "gyroscope_range": min(imu.gyroscope.reach, _ENDLESS),
         "accelerometer_range": min(imu.accelerometer.reach, _ENDLESS),

@@ -1,7 +1,7 @@
 """A kind of IMU: its sensors' errors, low-passes and clock."""
 
 from dataclasses import dataclass, fields
-from math import inf, pi, sqrt
+from math import hypot, inf, pi, sqrt
 from typing import Any
 
 from plant.errors import InputError
@@ -98,6 +98,11 @@ class ImuModel:
             0.5 * sensor.order / (2.0 * pi * sensor.section_bandwidth) for sensor in (self.gyroscope, self.accelerometer)
         )
         return self.delay + filters + (0.5 / self.sample_rate if self.sample_rate else 0.0)
+
+    @property
+    def timing(self) -> float:
+        """Standard deviation of that delay from sample to sample, by jitter and the wait for the loop [s]."""
+        return hypot(self.jitter, 1.0 / (self.sample_rate * sqrt(12.0)) if self.sample_rate else 0.0)
 
     @property
     def accelerometer_wander(self) -> float:

@@ -94,7 +94,7 @@ def test_zero_is_allowed_only_where_it_switches_something_off(hexapod):
     assert fusion_settings(hexapod, sensor_delay=0.0).sensor_delay == 0.0
     unwatched = safety_settings(hexapod, most_lost_imus=0.0, watch_imus=0.0)
     assert (unwatched.most_lost_imus, unwatched.watch_imus) == (0.0, 0.0)
-    switches = {"integral", "derivative", "sensor_delay", "most_lost_imus", "watch_imus", "need_platform_imu"}
+    switches = {"integral", "derivative", "sensor_delay", "sensor_timing", "most_lost_imus", "watch_imus", "need_platform_imu"}
     for kind, read, _ in KINDS:
         for field in fields(kind):
             if field.name not in switches:
@@ -157,6 +157,15 @@ def test_accelerometers_that_wander_make_directions_and_biases_less_certain(hexa
 def test_imus_that_do_not_wander_leave_the_standard_deviations_to_the_bit(hexapod, name):
     found = sensor_settings(hexapod, load_imu(name))
     assert all(getattr(found, each) == getattr(fusion_settings(hexapod), each) for each in WANDERING)
+
+
+def test_clocks_of_their_own_make_the_times_of_samples_uncertain(hexapod):
+    """A sample waits up to its period for the loop, and jitters."""
+    imu = load_imu("icm42688-nominal")
+    waits = np.random.default_rng(0).uniform(0.0, 1.0 / imu.sample_rate, 20000)
+    times = waits + imu.jitter * np.random.default_rng(1).normal(size=waits.size)
+    assert sensor_settings(hexapod, imu).sensor_timing == pytest.approx(np.std(times), rel=0.02)
+    assert sensor_settings(hexapod, load_imu("mpu9150")).sensor_timing == 0.0
 
 
 def test_ranges_and_rates_without_an_end_are_finite_settings(hexapod):

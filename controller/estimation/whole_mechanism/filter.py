@@ -54,6 +54,9 @@ _PREPARING_ROWS = 14
 _REST_SIGMAS = 3.0
 """Within how many standard deviations of none a motion counts as none."""
 
+_LONGEST_CHANGE_S = 0.1
+"""Beyond this time between two updates, how fast the readings change is not known [s]."""
+
 _OFFSET_LASTS_S = 100.0
 """Time in which the offset of the heading may change by as much as its uncertainty at the start [s]."""
 
@@ -160,11 +163,25 @@ def _begin_update(p: Record, geometry: Record, f: Record) -> None:
     x, smooth = f.motion, f.smooth_motion
     predict_readings(geometry, f.position, f.rotation, smooth, True, f.smooth_predicted, f.jacobian, f.readings_scratch)
     predict_readings(geometry, f.position, f.rotation, x, False, f.predicted, f.jacobian, f.readings_scratch)
+    _find_changes(p, f)
     if p.errors > ACCELEROMETER_SCALE:
         for k in range(IMU_COUNT):
             distort_jacobian(f.errors[k], f.jacobian[k])
     if p.rig > 0:
         find_rig_jacobian(geometry, f.position, f.rotation, smooth, f.errors, f.jacobian, f.rig_jacobian)
+
+
+@kernel
+def _find_changes(p: Record, f: Record) -> None:
+    """Find how fast the readings change, by which the uncertain times of samples make them uncertain."""
+    passed = f.time - f.predicted_time
+    known = p.timing_variance > 0.0 and 0.0 < passed < _LONGEST_CHANGE_S
+    for k in range(IMU_COUNT):
+        for i in range(READINGS):
+            change = f.smooth_predicted[k, i] - f.smooth_predicted_before[k, i]
+            f.change_per_second[k, i] = change / passed if known else 0.0
+    f.smooth_predicted_before[:] = f.smooth_predicted
+    f.predicted_time = f.time
 
 
 @kernel
@@ -258,7 +275,7 @@ def _update_scalar(p: Record, f: Record, row: int) -> None:
     h, gain, change, c = f.jacobian[k, m], f.gain, f.change, f.covariance
     expected = distort(f.errors[k], sensor, vector(f.predicted[k, 3 * sensor :]))
     innovation = f.sample[k, m] - expected[m % 3] - f.errors[k, m]
-    variance = p.variance[sensor] / f.sample_weight[sensor, k]
+    variance = p.variance[sensor] / f.sample_weight[sensor, k] + p.timing_variance * f.change_per_second[k, m] ** 2
     for i in range(states):
         gain[i] = 0.0
     for j in range(MOTION_STATES):

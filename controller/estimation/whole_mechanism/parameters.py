@@ -22,6 +22,11 @@ ROWS = IMU_COUNT * READINGS
 WINDOW_S = 0.005
 _SMOOTHING_S = 0.03
 
+_LASTING = 6.0
+"""What the time of a sample is off lasts for a whole acceleration, some thirty windows. So each counts as the root of that
+number; chosen on steps with two kinds of IMUs.
+"""
+
 FILTER_PARAMETERS = record_dtype(
     window=np.int64,  # samples that are averaged
     errors=np.int64,  # estimated errors of each IMU, 0 for no filter
@@ -31,6 +36,7 @@ FILTER_PARAMETERS = record_dtype(
     jerk=(np.float64, 2),  # spectral densities of the platform's jerk, linear and angular
     bias_walk=(np.float64, 2),  # spectral densities of the biases' walks, gyroscope and accelerometer
     variance=(np.float64, 2),  # of one sample, rate [(rad/s)^2] and force [(m/s^2)^2]
+    timing_variance=np.float64,  # of the time of a sample [s^2]
     prior=(np.float64, (ALL_ERRORS + RIG_ERRORS, ALL_ERRORS + RIG_ERRORS)),  # covariance of the errors at the start
     floor=(np.float64, 2),  # variances of position and rotation that are left as the rig's errors are not estimated
     heading=np.int64,  # whether there is one
@@ -73,6 +79,9 @@ FILTER_STATE = record_dtype(
     turn=(np.float64, 3),
     predicted=(np.float64, (IMU_COUNT, READINGS)),
     smooth_predicted=(np.float64, (IMU_COUNT, READINGS)),
+    smooth_predicted_before=(np.float64, (IMU_COUNT, READINGS)),  # of the update before
+    predicted_time=np.float64,
+    change_per_second=(np.float64, (IMU_COUNT, READINGS)),  # from there to here
     jacobian=(np.float64, (IMU_COUNT, READINGS, MOTION_STATES)),
     rig_jacobian=(np.float64, (IMU_COUNT, READINGS, 8)),  # by a leg's two joints and the tilt
     gradient=(np.float64, ERRORS),
@@ -127,6 +136,7 @@ def filter_parameters(
         jerk=jerk**2,
         bias_walk=(fusion.bias_walk**2, fusion.accelerometer_bias_walk**2),
         variance=noise**2 * rate / 2.0,
+        timing_variance=(_LASTING * fusion.sensor_timing) ** 2,
         prior=prior,
         floor=np.zeros(2) if floor is None else floor**2 / 3.0,
     )

@@ -6,6 +6,7 @@ from numba import njit
 from scipy.spatial.transform import Rotation
 
 from controller.estimation.whole_mechanism.filter import (
+    _update_rows,
     accumulate_sample,
     extrapolate,
     extrapolate_covariance,
@@ -449,6 +450,34 @@ def test_a_reading_counts_in_the_update_by_its_weight(hexapod):
         found.append(state)
     np.testing.assert_allclose(found[0]["covariance"], found[1]["covariance"], rtol=1e-7, atol=1e-12)
     np.testing.assert_allclose(found[0]["published_position"], found[1]["published_position"], rtol=0.0, atol=1e-10)
+
+
+@pytest.mark.parametrize("kind", ["1", "2"])
+def test_how_fast_readings_change_is_their_derivative_where_times_are_uncertain(hexapod, kind):
+    run = Run(hexapod, kind, "accelerometers", seconds=3.0, sensor_timing=3e-4)
+    signals = np.concatenate([run.motion.signals[:, 0], run.motion.signals[:, 1]], axis=2)
+    at = round(run.state["predicted_time"] * RATE_HZ)
+    true = (signals[at] - signals[at - 5]) * RATE_HZ / 5
+    found = run.state["change_per_second"]
+    for part in (slice(0, 3), slice(3, 6)):
+        np.testing.assert_allclose(found[:, part], true[:, part], atol=0.2 * np.abs(true[:, part]).max())
+    assert not Run(hexapod, kind, "accelerometers", seconds=0.5).state["change_per_second"].any()
+
+
+def test_a_reading_that_changes_counts_less_where_times_are_uncertain(hexapod):
+    """As much as with the noise that the change makes of the uncertain time, for all samples of a window alike."""
+    found, late = [], 2e-3
+    for timing, noise in ((late, 0.0), (0.0, late)):
+        parameters = filter_parameters(FusionSettings(), RATE_HZ, "accelerometers", None)
+        state = np.zeros((), FILTER_STATE)
+        start_filter(parameters[()], state[()], 0.0, hexapod.home.position, np.eye(3), np.zeros(6))
+        state["change_per_second"] = 0.4
+        parameters["timing_variance"] = timing**2
+        parameters["variance"] += 5 * (noise * 0.4) ** 2
+        state["sample_weight"], state["row"] = 5.0, 0
+        _update_rows(parameters[()], state[()], 42)
+        found.append(state["covariance"].copy())
+    np.testing.assert_allclose(*found, rtol=1e-12, atol=1e-18)
 
 
 def test_an_unknown_block_of_errors_is_refused():
