@@ -58,6 +58,7 @@ def gough_classify(options: Namespace) -> None:
 
 
 @cli.command(
+    cli.setting("--mechanisms", 20, "number of random mechanisms of each class"),
     cli.options_of(SimulationConfig, seed={"text": "seed of mechanisms, poses and noise"}),
     cli.markdown("docs/classes.md"),
     cli.engine_options(),
@@ -74,8 +75,8 @@ def gough_classes(options: Namespace) -> None:
     from hil.studies.accuracy import class_table, evaluate_classes
 
     with engine_at_work(cli.engine_of(options), "classes") as (engine, progress):
-        rows = evaluate_classes(options.seed, engine, progress)
-    about = {"seed": options.seed, "version": version("gough")}
+        rows = evaluate_classes(options.seed, engine, progress, options.mechanisms)
+    about = {"mechanisms": options.mechanisms, "seed": options.seed, "version": version("gough")}
     cli.write_json(options.json, about | {"classes": [asdict(row) for row in rows]})
     class_table(rows).print(options.markdown)
 

@@ -38,7 +38,7 @@ Measurements = dict[str, Array]
 ALL_LEGS = tuple(range(LEGS))
 _TWO_LEGS = (0, 3)
 _NEES_BOUNDS = 0.005, 0.995
-_CLASS_MECHANISMS, _CLASS_POSES = 20, 50
+_CLASS_POSES = 50
 
 
 @dataclass(frozen=True)
@@ -171,16 +171,24 @@ class ClassAccuracy:
     vertical_errors: tuple[float, float]
 
 
-def evaluate_classes(seed: int = 0, engine: Engine = IN_ONE_PROCESS, progress: Progress = no_progress) -> list[ClassAccuracy]:
-    """The needs and errors of every class, spatial and planar."""
+def evaluate_classes(
+    seed: int = 0, engine: Engine = IN_ONE_PROCESS, progress: Progress = no_progress, mechanisms: int = 20
+) -> list[ClassAccuracy]:
+    """The needs and errors of every class, spatial and planar, over so many random mechanisms of each.
+
+    Raises:
+        InputError: the seed is out of range, or there are no mechanisms.
+    """
+    if mechanisms < 1:
+        raise InputError(f"there are {mechanisms} mechanisms of each class; at least 1 is needed")
     numbered = [*enumerate(spatial_classes()), *enumerate(planar_classes(), start=LEGS**3)]
-    return engine.starmap(partial(_evaluate_class, checked_seed(seed)), numbered, progress)
+    return engine.starmap(partial(_evaluate_class, checked_seed(seed), mechanisms), numbered, progress)
 
 
-def _evaluate_class(seed: int, number: int, mechanism_class: MechanismClass) -> ClassAccuracy:
+def _evaluate_class(seed: int, mechanisms: int, number: int, mechanism_class: MechanismClass) -> ClassAccuracy:
     random = np.random.default_rng((seed, number))
     if mechanism_class.planar:
-        return _evaluate_planar_class(mechanism_class, random)
+        return _evaluate_planar_class(mechanism_class, mechanisms, random)
     if mechanism_class.group == "n-3-I":
         paper_method, paper_legs, paper_needs = "section-3.1.1", 6, "6 legs"
     elif mechanism_class.platform_count < LEGS:
@@ -188,7 +196,7 @@ def _evaluate_class(seed: int, number: int, mechanism_class: MechanismClass) -> 
     else:
         paper_method, paper_legs, paper_needs = "section-5", 2, "2 legs + rotation"
     errors: dict[str, list[Array]] = {"paper": [], "legs": [], "up": []}
-    for _ in range(_CLASS_MECHANISMS):
+    for _ in range(mechanisms):
         mechanism = draw_mechanism(mechanism_class, random)
         positions, rotations = draw_poses(mechanism, _CLASS_POSES, random)
         measurements = draw_measurements(mechanism, positions, rotations, random, 1.0)
@@ -202,9 +210,9 @@ def _evaluate_class(seed: int, number: int, mechanism_class: MechanismClass) -> 
     return _class_accuracy(mechanism_class, (paper_needs, needs["legs"], needs["up"]), *errors.values())
 
 
-def _evaluate_planar_class(mechanism_class: MechanismClass, random: np.random.Generator) -> ClassAccuracy:
+def _evaluate_planar_class(mechanism_class: MechanismClass, mechanisms: int, random: np.random.Generator) -> ClassAccuracy:
     errors: dict[str, list[tuple[float, float]]] = {"paper": [], "alone": [], "roll": []}
-    for _ in range(_CLASS_MECHANISMS):
+    for _ in range(mechanisms):
         mechanism = draw_planar_mechanism(mechanism_class, random)
         for _ in range(_CLASS_POSES):
             position, angle = random.uniform(-0.05, 0.05, 2), random.uniform(-TILT, TILT)

@@ -105,7 +105,8 @@ def _motion(name: str, target: str, duration: float, period: float, first: float
     return mechanism, motion_along(load_target(target, mechanism, duration), mechanism, times), times
 
 
-@lru_cache(maxsize=8)
+# Each takes 100 MB for 20 s.
+@lru_cache(maxsize=4)
 def _model(name: str, target: str, duration: float, imu: str, uncertainty: Uncertainty) -> LinearModel:
     mechanism, motion, _ = _motion(name, target, duration, STEP_S, 0.5 * STEP_S - REST_S)
     return linear_model(mechanism, motion, load_imu(imu), uncertainty, STEP_S)

@@ -9,6 +9,8 @@ read on average over each of its steps, and the leg rates that the drives' model
 deviation, is the data multiplied by a triangular root of the inverse covariance of the whole batch, unknowns included.
 """
 
+from dataclasses import dataclass
+from functools import cached_property
 from math import exp
 from typing import NamedTuple
 
@@ -32,7 +34,16 @@ _START = np.repeat([0.1, 0.5, 0.1, 0.5, 1.0, 5.0], 3)
 """Standard deviations of the pose's error and its derivatives before any data: the IMUs alone say where the platform is."""
 
 
-class LinearModel(NamedTuple):
+class Filter(NamedTuple):
+    """What the Kalman filter of a model does in each step, whatever the data are."""
+
+    whitening: Array  # (M, 48, 48), of innovations: the inverse of their covariance's root
+    gains: Array  # (M, 48, 108), of the states from the whitened innovations
+    covariances: Array  # (M, 6, 6), of the pose's estimate
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
     """The data of M steps: `data = sensitivity @ states + noise`, `next states = transition @ states + driving noise`."""
 
     sensitivity: Array  # (M, 48, 108)
@@ -40,6 +51,22 @@ class LinearModel(NamedTuple):
     transition: Array  # (108, 108)
     driving: Array  # (108, 108), covariance
     prior: Array  # (108,), variances
+
+    @cached_property
+    def filter(self) -> Filter:
+        """Its Kalman filter."""
+        steps, covariance = len(self.sensitivity), np.diag(self.prior)
+        found = Filter(np.empty((steps, DATA, DATA)), np.empty((steps, DATA, STATES)), np.empty((steps, POSE, POSE)))
+        for n, seen in enumerate(self.sensitivity):
+            across = seen @ covariance
+            root = np.linalg.cholesky(across @ seen.T + np.diag(self.noise))
+            found.whitening[n] = solve_triangular(root, np.eye(DATA), lower=True)
+            found.gains[n] = gain = found.whitening[n] @ across
+            covariance -= gain.T @ gain
+            found.covariances[n] = covariance[:POSE, :POSE]
+            covariance = self.transition @ covariance @ self.transition.T + self.driving
+            covariance = 0.5 * (covariance + covariance.T)
+        return found
 
 
 class Whitened(NamedTuple):
@@ -90,18 +117,11 @@ def _per_axis(gyroscope: float, accelerometer: float) -> Array:
 def whitened(model: LinearModel, data: Array) -> Whitened:
     """Whiten columns of data (M, 48, C), each a record of all steps, and estimate the pose's error from each."""
     steps, columns = len(data), data.shape[2]
-    state, covariance = np.zeros((STATES, columns)), np.diag(model.prior)
-    innovations = np.empty((steps, DATA, columns))
-    estimates, covariances = np.empty((steps, POSE, columns)), np.empty((steps, POSE, POSE))
-    for n, seen in enumerate(model.sensitivity):
-        across = seen @ covariance
-        root = np.linalg.cholesky(across @ seen.T + np.diag(model.noise))
-        gain = solve_triangular(root, across, lower=True)
-        innovations[n] = solve_triangular(root, data[n] - seen @ state, lower=True)
+    state = np.zeros((STATES, columns))
+    innovations, estimates = np.empty((steps, DATA, columns)), np.empty((steps, POSE, columns))
+    for n, (seen, whitening, gain) in enumerate(zip(model.sensitivity, *model.filter[:2], strict=True)):
+        innovations[n] = whitening @ (data[n] - seen @ state)
         state += gain.T @ innovations[n]
-        covariance -= gain.T @ gain
-        estimates[n], covariances[n] = state[:POSE], covariance[:POSE, :POSE]
+        estimates[n] = state[:POSE]
         state = model.transition @ state
-        covariance = model.transition @ covariance @ model.transition.T + model.driving
-        covariance = 0.5 * (covariance + covariance.T)
-    return Whitened(innovations, estimates, covariances)
+    return Whitened(innovations, estimates, model.filter.covariances)

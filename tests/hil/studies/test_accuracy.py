@@ -58,10 +58,15 @@ def test_seeds_settle_the_figures():
         evaluate_accuracy(mechanism, 0)
 
 
+def test_classes_need_a_mechanism():
+    with pytest.raises(InputError, match="there are 0 mechanisms of each class; at least 1 is needed"):
+        evaluate_classes(mechanisms=0)
+
+
 def few_classes():
     """Some rows of `evaluate_classes`, by their numbers."""
     classes = spatial_classes()
-    return {k: accuracy._evaluate_class(0, k, classes[k]) for k in (0, 17, 34, 51)}
+    return {k: accuracy._evaluate_class(0, 20, k, classes[k]) for k in (0, 17, 34, 51)}
 
 
 def all_classes():

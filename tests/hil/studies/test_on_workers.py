@@ -53,7 +53,7 @@ STUDIES = {
     "sensor-sets": lambda engine, trials: list(map(vars, evaluate_sensor_sets(["6-3-II"], SETS[:4], 0.3, 1, engine))),
 }
 LONG_STUDIES = {
-    "classes": lambda engine, trials: list(map(vars, evaluate_classes(1, engine))),
+    "classes": lambda engine, trials: list(map(vars, evaluate_classes(1, engine, mechanisms=3))),
     "compare-fusion": lambda engine, trials: fusion_comparison.compare(
         ComparisonConfig(duration=20.5, rate=100.0, seeds=(0, 1)), engine
     ),
@@ -84,7 +84,7 @@ def test_figures_do_not_depend_on_the_engine(study, workers, trials):
 
 COMMANDS = ["accuracy --poses 20", "broad TRIALS", "faults --seeds 1 --only emergency"]
 LONG_COMMANDS = [
-    "classes",
+    "classes --mechanisms 3",
     "compare-fusion --duration 20.5 --rate 100 --seeds 0",
     "evaluate-fusion --imu mpu9150-calibrated --rate 250 --seeds 1 --starts 1 --still 21",
     "sensor-sets --mechanism 6-3-II --duration 0.3",

@@ -1,5 +1,7 @@
 """The step-by-step algebra against the whole batch at once, against draws, and the figures of one pose at home."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
@@ -34,7 +36,7 @@ def batch(model):
 
 
 def test_whitening_step_by_step_is_the_algebra_of_the_whole_batch(short_model):
-    part = short_model._replace(sensitivity=short_model.sensitivity[:8])
+    part = replace(short_model, sensitivity=short_model.sensitivity[:8])
     random = np.random.default_rng(0)
     data = random.standard_normal((8, DATA, 5)) * np.sqrt(part.noise)[:, None]
     found = whitened(part, data)
