@@ -14,7 +14,7 @@ def cycle(parameters, state, measurement, segments):
 
 
 def follow_at_once(parameters):
-    """Parameters with which the reference is the motion's after the hold, wherever the legs are and whether they move or not."""
+    """Parameters with which the reference is the motion's after the hold, wherever the legs are, even if they never move."""
     arming = parameters["safety"]["arming"]
     arming["drift"], arming["approach"] = np.inf, 0
     parameters["safety"]["drives"]["slack"] = np.inf

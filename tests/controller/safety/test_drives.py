@@ -11,7 +11,12 @@ from controller.safety import watch_nothing
 from controller.safety.causes import Cause, Mode, Request
 from controller.safety.drives import check_drives, drive_parameters, expect_rates
 from controller.settings import DriveSettings
+from hil.runs.config import SimulationConfig
+from hil.runs.prepare import prepared_loop
+from hil.runs.simulation import simulate
+from plant.fmu.settings import Setting
 from plant.mechanism import load_in_space
+from plant.truth import TRUTH_LENGTHS
 from tests.controller.safety.moving import PERIOD_S, moving, stop_of
 
 MM = 1e-3
@@ -205,3 +210,105 @@ def test_without_a_limit_nothing_is_told(how):
     for n in range(50):
         state["pose"]["lengths"] += (-1.0) ** n
         assert check(parameters, state) == Cause.NONE
+
+
+# ------------------------------------------------------------------------------------------------------------ in closed loop
+
+SOUND = [
+    {"settings": "payload.mass=20@5"},
+    {"settings": "payload.mass=0.5@5"},
+    {"settings": "motor.resistance=0.48"},
+    {"settings": "motor.resistance=0.72 payload.mass=20@2 friction.coulomb=30"},
+    {"settings": "friction.coulomb=30 friction.viscous=100"},
+    {"settings": "friction.coulomb=0 friction.viscous=0"},
+    {"settings": "screw.backlash=0.0003"},
+    {"settings": "joint.clearance=0.0003"},
+    {"target": "steps", "rate": 4000.0},
+    {"target": "circle", "rate": 250.0},
+    {"target": "sines", "rate": 50.0, "imu": "icm42688"},
+    {"target": "hold", "duration": 60.0, "settings": "motor.resistance=0.72 payload.mass=20@5"},
+    {"target": "shaking"},
+    {"fusion": "whole", "settings": "payload.mass=20@5"},
+    {"fusion": "whole-gyroscopes"},
+    {"fusion": "whole-alignments"},
+    {"fusion": "section-5", "magnetometer": True},
+    {"fusion": "filterpy", "duration": 3.0},
+    {"imus": (0, 5, 6), "magnetometer": True},
+    {"mechanism": "6-3-I", "settings": "payload.mass=20@5"},
+    {"mechanism": "6-4-II", "settings": "payload.mass=20@5"},
+    {"mechanism": "genhexkins", "settings": "payload.mass=30@5"},
+    {"mechanism": "planar-3rpr", "settings": "payload.mass=1@5 friction.coulomb=4"},
+]
+"""What a sound loop may be asked to do, and how its mechanism may be other than the controller believes."""
+
+
+def told_in(changes, seed):
+    """Whether a sound run tells that an estimate has moved otherwise, and whether it comes to its end."""
+    config = {"target": "sines", "duration": 10.0, "seed": seed, **changes}
+    config["settings"] = tuple(map(Setting.parse, config.get("settings", "").split()))
+    return (simulate(SimulationConfig(**config)).records["event_cause"] == Cause.MOVED_OTHERWISE).any()
+
+
+@pytest.mark.parametrize("changes", [{"duration": 3.0, "settings": "payload.mass=20@1"}, {"mechanism": "planar-3rpr"}])
+def test_a_sound_run_is_never_told(changes):
+    assert not told_in({"duration": 3.0, **changes}, 11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("changes", SOUND, ids=str)
+def test_no_sound_run_is_told(changes):
+    """The slack was chosen on seeds 0 to 4."""
+    assert not told_in(changes, 12)
+
+
+def run_until_told(tmp_path, drives, fault, **changes):
+    """A run in which nothing else watches; why and when it ended [s], how far each leg's estimate has then moved off since the
+    fault began at 1 s, and by how much it may [m].
+    """
+    unwatched = "evidence = inf\nwatch_imus = 0\n"
+    mechanism = tmp_path / "unwatched.toml"
+    mechanism.write_text(f'based_on = "hexapod"\n[safety]\n{unwatched}[drives]\n{drives}')
+    config = SimulationConfig(str(mechanism), faults=(f"{fault},at=1",), **changes)
+    with prepared_loop(config) as loop:
+        s, period = loop.state["safety"]["drives"], 1.0 / config.rate
+        loop.run(loop.cycle_at(1.0))
+        first = loop.cycle_at(1.0)
+        loop.run(first)
+        widths, cause = np.zeros(6), 0
+        while cause == Cause.NONE and loop.state["safety"]["mode"] == Mode.RUNNING:
+            widths += (s["high"] - s["low"]) * period
+            cause = loop.run(int(loop.state["time"]["cycle"]) + 1)
+        stop = loop.state["safety"]["stop"]
+        last = int(stop["cycle"]) - 1
+        off = loop.records["lengths"][[first, last]] - loop.records["truth"][[first, last]][:, TRUTH_LENGTHS]
+        slack = float(loop.parameters["safety"]["drives"]["slack"])
+        return Cause(int(stop["cause"])), (last - first) * period, off[1] - off[0], slack + widths
+
+
+KNOWN_TABLE = "load = 0.1\nresistance = 0.05\nfriction = 1.2\n"
+
+
+def test_an_estimate_that_creeps_away_is_told(tmp_path):
+    """All accelerometers tilt the estimate within a second."""
+    cause, after, off, bound = run_until_told(
+        tmp_path, KNOWN_TABLE, "imu-offset:all,axis=y,size_m_per_s2=0.5,ramp_s=1", target="hold", duration=5.0
+    )
+    assert cause == Cause.MOVED_OTHERWISE and after < 1.5
+    assert 0.5 * DriveSettings().slack < np.abs(off).max() and (np.abs(off) < bound).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fusion", ["compiled", "whole"])
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "imu-offset:all,axis=z,size_m_per_s2=1.5,ramp_s=10",
+        "imu-offset:all,axis=y,size_m_per_s2=0.5,ramp_s=10",
+        "imu-offset:all,axis=z,size_deg_per_s=10,ramp_s=20",
+        "base-tilt,axis=x,size_deg=5,ramp_s=5",
+    ],
+)
+def test_what_is_told_is_within_the_bound(tmp_path, fault, fusion):
+    cause, after, off, bound = run_until_told(tmp_path, KNOWN_TABLE, fault, target="sines", duration=9.0, fusion=fusion)
+    assert cause == Cause.MOVED_OTHERWISE and after < 6.0
+    assert (np.abs(off) < bound).all()
