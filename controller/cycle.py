@@ -35,10 +35,10 @@ from controller.imu_set import check_imus, imus_of
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import RANK_TOLERANCE
 from controller.rig import RIG, TIME, elapsed, field_of, rig_parameters
-from controller.safety import arming, watch
+from controller.safety import arming, drives, watch
 from controller.safety.causes import Cause, Mode, Request
 from controller.safety.stop import handle_cause, ramp_down
-from controller.settings import ControlSettings, FusionSettings, SafetySettings
+from controller.settings import ControlSettings, DriveSettings, FusionSettings, SafetySettings
 from plant.checks import check_rate
 from plant.compiled import MOST, Limits, Record, filled, kernel, record_dtype, shared_kernel
 from plant.errors import InputError
@@ -132,6 +132,7 @@ def cycle_parameters(
     magnetometer: bool = False,
     section_5: bool = False,
     safety: SafetySettings | None = None,
+    drive_settings: DriveSettings | None = None,
     command_delay: float = 0.0,
     to_arm: bool = True,
 ) -> Record:
@@ -148,6 +149,7 @@ def cycle_parameters(
         magnetometer: whether the platform's magnetometer gives its heading.
         section_5: whether the pose is that of the paper's section 5, unrefined; that needs the magnetometer.
         safety: limits that are watched; by default those of `SafetySettings`.
+        drive_settings: what is known of the drives; by default as `DriveSettings` has it.
         command_delay: of the rig, from a sample to the command computed from it [s].
         to_arm: whether the drives are enabled; else everything is read and nothing moves.
 
@@ -188,7 +190,7 @@ def cycle_parameters(
         integrity=integrity.integrity_parameters(fusion, rate, filtered["prior"][:ALL_ERRORS, :ALL_ERRORS], watch_evidence),
         load=load_feed_forward.load_parameters(mechanism, command_delay),
         pid=pid.pid_parameters(control, limits.velocity),
-        safety=safety_stage.safety_parameters(watched, rate, limits, to_arm),
+        safety=safety_stage.safety_parameters(watched, drive_settings or DriveSettings(), mechanism, rate, to_arm),
     )
 
 
@@ -323,9 +325,12 @@ def _control(parameters: Record, state: Record, segments: Array) -> int:
         pid.step_pid(p.pid, s.pid, s.load.feed_forward, elapsed(rig, time))
     watch.check_carried(p.safety, s.safety, rig, time, s.imus.shaking, s.legs, s.mechanism, s.reference, s.pid)
     time.cycle += 1
-    return watch.check_limits(
+    cause = watch.check_limits(
         p.safety, s.safety, rig, time, p.imus, s.imus, pose, s.mechanism.trusted, s.reference, p.pid.limit, s.pid
     )
+    if cause != Cause.NONE:
+        return cause
+    return drives.check_drives(p.safety, s.safety, rig, time, p.load.command_delay, s.load, pose, s.reference, s.pid)
 
 
 @kernel

@@ -27,6 +27,7 @@ PARAMETERS = record_dtype(
 
 STATE = record_dtype(
     feed_forward=(np.float64, LEGS),
+    drive=(np.float64, LEGS),
     wrench=(np.float64, 6),
     force=(np.float64, 6),
     jacobian=(np.float64, (6, 6)),
@@ -34,7 +35,7 @@ STATE = record_dtype(
     norms=(np.float64, 6),
     order=(np.float64, 6),
 )
-"""The feed-forward [m/s], and scratch."""
+"""The feed-forward [m/s], the load of each drive [N], the static forces on the platform [N], and scratch."""
 
 
 def load_parameters(mechanism: Mechanism, command_delay: float) -> Record:
@@ -60,7 +61,7 @@ def load_parameters(mechanism: Mechanism, command_delay: float) -> Record:
 
 @kernel
 def find_feed_forward(p: Record, s: Record, rig: Record, pose: Record, reference: Record) -> None:
-    """Write the feed-forward of each leg."""
+    """Write the feed-forward of each leg, and the load of its drive."""
     up, gravity = vector(rig.sensors.up_in_base[0]), rig.sensors.gravity
     wrench, force = s.wrench, s.force
     jacobian_at(pose.arms, pose.directions, rig.legs, s.jacobian)
@@ -83,5 +84,5 @@ def find_feed_forward(p: Record, s: Record, rig: Record, pose: Record, reference
             force[k] = 0.0
     for k in range(rig.legs):
         own = p.rod_mass * gravity * dot(vector(pose.directions[k]), up)
-        load = force[k] + own + p.moving_mass * reference.motion[k, 2]
-        s.feed_forward[k] = reference.motion[k, 1] + p.command_delay * reference.motion[k, 2] + p.droop * load
+        s.drive[k] = force[k] + own + p.moving_mass * reference.motion[k, 2]
+        s.feed_forward[k] = reference.motion[k, 1] + p.command_delay * reference.motion[k, 2] + p.droop * s.drive[k]

@@ -1,4 +1,4 @@
-"""Settings of the controller: the tables `control`, `fusion` and `safety` of a mechanism's file, checked when they are read."""
+"""Settings of the controller: `control`, `fusion`, `safety` and `drives` in a mechanism's file, checked when they are read."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -12,10 +12,13 @@ from plant.mechanism import Mechanism
 
 _ENDLESS = 1e300
 _RAW_M = 0.05
-_ENDLESS_ALLOWED = ("evidence", "protection_position", "protection_rotation")
-_ZERO_ALLOWED = ("integral", "derivative", "sensor_delay", "sensor_timing", "most_lost_imus", "watch_imus", "need_platform_imu")
+_ENDLESS_ALLOWED = ("evidence", "protection_position", "protection_rotation", "slack")
+_ZERO_ALLOWED = (
+    "integral", "derivative", "sensor_delay", "sensor_timing", "most_lost_imus", "watch_imus", "need_platform_imu", "load",
+    "resistance", "friction",
+)  # fmt: skip
 
-S = TypeVar("S", "ControlSettings", "FusionSettings", "SafetySettings")
+S = TypeVar("S", "ControlSettings", "FusionSettings", "SafetySettings", "DriveSettings")
 
 
 @dataclass(frozen=True)
@@ -121,6 +124,20 @@ class SafetySettings(_Settings):
         return replace(self, watch_imus=0.0, **wide)
 
 
+@dataclass(frozen=True)
+class DriveSettings(_Settings):
+    """How far a drive may do otherwise than its model says: what is not known of its load, its motor and its friction."""
+
+    load: float = 1.0  # unknown load of a leg, as a share of what the legs carry on average
+    resistance: float = 0.2  # by which share a winding's resistance may be off
+    friction: float = 2.5  # greatest friction, as a multiple of the Coulomb friction in the plant data
+    slack: float = 0.008  # what lag, play, noise and an IMU before it is left out may leave; inf to ignore the drives [m]
+
+    def for_raw_imus(self) -> "DriveSettings":
+        """These settings for raw IMUs, whose errors move the pose by centimetres."""
+        return replace(self, slack=max(self.slack, _RAW_M))
+
+
 def control_settings(mechanism: Mechanism, **changes: float) -> ControlSettings:
     """The control settings of a mechanism, with changes by name.
 
@@ -138,6 +155,11 @@ def fusion_settings(mechanism: Mechanism, **changes: float) -> FusionSettings:
 def safety_settings(mechanism: Mechanism, **changes: float) -> SafetySettings:
     """The safety settings of a mechanism, as `control_settings`."""
     return _read(SafetySettings, "safety", mechanism, changes)
+
+
+def drive_settings(mechanism: Mechanism, **changes: float) -> DriveSettings:
+    """What is known of the drives of a mechanism, as `control_settings`."""
+    return _read(DriveSettings, "drives", mechanism, changes)
 
 
 def sensor_settings(mechanism: Mechanism, imu: ImuModel) -> FusionSettings:
@@ -162,7 +184,7 @@ def sensor_settings(mechanism: Mechanism, imu: ImuModel) -> FusionSettings:
 
 def tables_with(name: str) -> list[str]:
     """The tables of settings in a mechanism's file that have an entry of this name."""
-    kinds = {"control": ControlSettings, "fusion": FusionSettings, "safety": SafetySettings}
+    kinds = {"control": ControlSettings, "fusion": FusionSettings, "safety": SafetySettings, "drives": DriveSettings}
     return [table for table, kind in kinds.items() if name in (field.name for field in fields(kind))]
 
 

@@ -3,17 +3,18 @@
 import numpy as np
 
 from controller.estimation import imu_monitor
-from controller.safety import arming, stop, watch
+from controller.safety import arming, drives, stop, watch
 from controller.safety.causes import EVENTS
-from controller.settings import SafetySettings
+from controller.settings import DriveSettings, SafetySettings
 from plant.compiled import Record, filled, record_dtype
 from plant.dynamics.variables import IMU_COUNT
-from plant.mechanism import Limits
+from plant.mechanism import Mechanism
 
 PARAMETERS = record_dtype(
     arming=arming.PARAMETERS,
     monitor=imu_monitor.PARAMETERS,
     watch=watch.PARAMETERS,
+    drives=drives.PARAMETERS,
     stop=stop.PARAMETERS,
 )
 """The constants of each part."""
@@ -25,18 +26,23 @@ STATE = record_dtype(
     arming=arming.STATE,
     monitor=imu_monitor.STATE,
     watch=watch.STATE,
+    drives=drives.STATE,
     stop=stop.STATE,
 )
 """The `Mode` of the run, the `Request` to the drives, the events of the cycle, and the state of each part."""
 
 
-def safety_parameters(settings: SafetySettings, rate: float, limits: Limits, arm: bool) -> Record:
+def safety_parameters(
+    settings: SafetySettings, drive_settings: DriveSettings, mechanism: Mechanism, rate: float, arm: bool
+) -> Record:
     """The constants (dtype `PARAMETERS`) in cycles of this rate [Hz]; the drives are enabled only if `arm`."""
+    limits = mechanism.require_limits()
     return filled(
         PARAMETERS,
         arming=arming.arming_parameters(settings, rate, arm),
         monitor=imu_monitor.monitor_parameters(settings, rate),
         watch=watch.watch_parameters(settings, rate, limits),
+        drives=drives.drive_parameters(drive_settings, mechanism),
         stop=stop.stop_parameters(limits, rate),
     )
 
@@ -53,3 +59,4 @@ def watch_nothing(parameters: Record) -> None:
     limits["lengths"] = limits["plausible_lengths"] = -np.inf, np.inf
     for name in ("speed", "following", "saturation", "drive_deviation", "carried", "without_platform_imu"):
         limits[name] = np.inf
+    safety["drives"]["slack"] = np.inf

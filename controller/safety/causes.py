@@ -158,6 +158,12 @@ class Cause(IntEnum):
         Reaction.STOP,
         "s",
     )
+    MOVED_OTHERWISE = (
+        63,
+        "the estimate of leg {} has moved otherwise than its drive was told to: the IMUs or the drive are wrong",
+        Reaction.BRAKE,
+        "m",
+    )
     FORCES_SHARE = (
         64,
         "all accelerometers read a force that is no motion: they share an error, or the base tilts or accelerates",

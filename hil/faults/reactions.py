@@ -124,18 +124,9 @@ CASES = (
     Case("the rig is killed and started again", Cause.BUS_LOST, QUICK_STOP, 21, 20e-3, act=_kill_rig),
     Case("a drive has a fault", Cause.DRIVE_FAULT, QUICK_STOP, 3, 5e-3, "drive-faults:{k}"),
     Case("a drive loses its power", Cause.DRIVE_OFF, QUICK_STOP, 3, 5e-3, "drive-unpowered:{k}"),
-    Case(
-        "a drive ignores its commands", Cause.FOLLOWING_ERROR, BRAKE, 1500, 25e-3, "drive-ignores:{k}",
-        also=(Cause.DRIVE_DEVIATES,),
-    ),
-    Case(
-        "a drive stands still", Cause.FOLLOWING_ERROR, BRAKE, 1500, 25e-3, "drive-stuck:{k}",
-        also=(Cause.DRIVE_DEVIATES,),
-    ),
-    Case(
-        "a drive runs away", Cause.DRIVE_DEVIATES, BRAKE, 250, 30e-3, "drive-runs-away:{k}",
-        also=(Cause.FOLLOWING_ERROR,),
-    ),
+    Case("a drive ignores its commands", Cause.MOVED_OTHERWISE, BRAKE, 1000, 10e-3, "drive-ignores:{k}"),
+    Case("a drive stands still", Cause.MOVED_OTHERWISE, BRAKE, 1000, 10e-3, "drive-stuck:{k}"),
+    Case("a drive runs away", Cause.MOVED_OTHERWISE, BRAKE, 60, 10e-3, "drive-runs-away:{k}"),
     Case("the payload gains 5 kg", Cause.NONE, GO_ON, 0, 3e-3, "payload-jumps"),
     Case("the payload loses 8 kg", Cause.NONE, GO_ON, 0, 3e-3, "payload-jumps,size=-8"),
     Case("5 periods are missed", Cause.NONE, GO_ON, 0, 3e-3, act=partial(_miss, 5)),

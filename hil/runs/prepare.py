@@ -19,7 +19,7 @@ from controller.planning.target import Target, load_target
 from controller.safety.arming import longest_delay
 from controller.safety.causes import Cause
 from controller.safety.stop import describe_end
-from controller.settings import control_settings, safety_settings, sensor_settings, tables_with
+from controller.settings import control_settings, drive_settings, safety_settings, sensor_settings, tables_with
 from hil.loop.driver import Loop
 from hil.loop.records import RECORD
 from hil.recording.replay_rig import ReplayRig
@@ -114,11 +114,13 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         if not least <= control.hold <= most:
             raise InputError(f"hold is {control.hold:g} s; the estimate settles in {least:g} to {most:g} s")
         add_disturbances(imu, (each.later(control.hold) for each in config.disturbances))
-        fusion, safety = sensor_settings(mechanism, model), safety_settings(mechanism)
+        fusion, safety, drives = sensor_settings(mechanism, model), safety_settings(mechanism), drive_settings(mechanism)
+        if config.raw_imus:
+            safety, drives = safety.for_raw_imus(), drives.for_raw_imus()
         parameters = cycle_parameters(
             mechanism, config.rate, control, fusion, config.imus, FUSIONS[config.fusion], calibration, config.magnetometer,
-            config.fusion == "section-5", safety.for_raw_imus() if config.raw_imus else safety,
-            0.0 if config.rig == "fmu" else period, config.arm,
+            config.fusion == "section-5", safety, drives, 0.0 if config.rig == "fmu" else period,
+            config.arm,
         )  # fmt: skip
         remarks = [
             calibration.remark,

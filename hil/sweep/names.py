@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields
 from typing import Any
 
-from controller.settings import ControlSettings, FusionSettings, SafetySettings
+from controller.settings import ControlSettings, DriveSettings, FusionSettings, SafetySettings
 from hil.runs.config import SimulationConfig
 from plant.checks import nearest
 from plant.dynamics.variables import PLANAR, SPATIAL
@@ -83,6 +83,7 @@ def check_parameter(name: str) -> None:
 
 _SETTINGS: dict[str, Any] = {
     "limits": Limits, "control": ControlSettings, "fusion": FusionSettings, "safety": SafetySettings,
+    "drives": DriveSettings,
 }  # fmt: skip
 """Tables of a mechanism's file, and what has their entries."""
 _PARAMETERS = [each.name for table in (SPATIAL, PLANAR) for each in table.parameters]

@@ -20,7 +20,8 @@ _PRESETS = resources.files("plant.mechanism") / "presets"
 _JOINTS = ("base_joints", "platform_joints")
 _MUCH_SHORTER = 0.8
 _MOST_MASS_RATIO = 3.0
-_ANY_ENTRY = ("limits", "plant", "control", "fusion", "safety")
+_SETTINGS = ("control", "fusion", "safety", "drives")
+_ANY_ENTRY = ("limits", "plant", *_SETTINGS)
 """Tables whose entries are checked by those who read them."""
 
 _SAME_FRAMES = 1e-9
@@ -94,7 +95,9 @@ def mechanism_from_document(document: dict[str, Any]) -> Mechanism | PlanarMecha
         if name == "name":
             continue
         if name not in tables:
-            raise InputError(f"unknown entry {name!r}; a mechanism has name, {', '.join(tables)}, based_on")
+            raise InputError(
+                f"unknown entry {name!r}; a mechanism has name, {', '.join(tables)}, based_on{nearest(name, tables)}"
+            )
         if not isinstance(table, dict):
             raise InputError(f"{name!r} must be a table")
         if (known := tables[name]) is not None:
@@ -113,7 +116,7 @@ def mechanism_from_document(document: dict[str, Any]) -> Mechanism | PlanarMecha
         home=home,
         limits=document.get("limits") or None,
         plant=_flattened(document.get("plant", {})),
-        settings={name: document.get(name, {}) for name in ("control", "fusion", "safety")},
+        settings={name: document.get(name, {}) for name in _SETTINGS},
     )
     return mechanism
 

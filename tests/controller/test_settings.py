@@ -7,9 +7,11 @@ import pytest
 
 from controller.settings import (
     ControlSettings,
+    DriveSettings,
     FusionSettings,
     SafetySettings,
     control_settings,
+    drive_settings,
     fusion_settings,
     safety_settings,
     sensor_settings,
@@ -22,6 +24,7 @@ KINDS = [
     (ControlSettings, control_settings, "control"),
     (FusionSettings, fusion_settings, "fusion"),
     (SafetySettings, safety_settings, "safety"),
+    (DriveSettings, drive_settings, "drives"),
 ]
 
 
@@ -79,7 +82,7 @@ def test_what_is_no_number_is_refused_in_tables_and_changes(hexapod, value):
 @pytest.mark.parametrize(("kind", "read", "table"), KINDS)
 def test_a_bad_value_of_any_setting_is_refused_by_name(hexapod, kind, read, table, bad):
     for name in asdict(kind()):
-        if bad == np.inf and name in ("evidence", "protection_position", "protection_rotation"):
+        if bad == np.inf and name in ("evidence", "protection_position", "protection_rotation", "slack"):
             assert getattr(read(hexapod, **{name: bad}), name) == np.inf
             continue
         with pytest.raises(InputError, match=name):
@@ -94,7 +97,10 @@ def test_zero_is_allowed_only_where_it_switches_something_off(hexapod):
     assert fusion_settings(hexapod, sensor_delay=0.0).sensor_delay == 0.0
     unwatched = safety_settings(hexapod, most_lost_imus=0.0, watch_imus=0.0)
     assert (unwatched.most_lost_imus, unwatched.watch_imus) == (0.0, 0.0)
+    known = drive_settings(hexapod, load=0.0, resistance=0.0, friction=0.0)
+    assert (known.load, known.resistance, known.friction) == (0.0, 0.0, 0.0)
     switches = {"integral", "derivative", "sensor_delay", "sensor_timing", "most_lost_imus", "watch_imus", "need_platform_imu"}
+    switches |= {"load", "resistance", "friction"}
     for kind, read, _ in KINDS:
         for field in fields(kind):
             if field.name not in switches:
@@ -182,3 +188,4 @@ def test_for_raw_imus_the_distances_are_5_cm_at_least_and_no_imu_is_watched():
     assert asdict(raw) == asdict(usual) | changed
     wide = SafetySettings(stroke_margin=0.06, following=0.07, arming_distance=0.08).for_raw_imus()
     assert (wide.stroke_margin, wide.following, wide.arming_distance) == (0.06, 0.07, 0.08)
+    assert (DriveSettings().for_raw_imus().slack, DriveSettings(slack=0.07).for_raw_imus().slack) == (0.05, 0.07)

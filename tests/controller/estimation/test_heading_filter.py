@@ -12,7 +12,7 @@ from controller.estimation.heading_filter import ERRORS, STATES, predict_heading
 from controller.imu_set import check_imus
 from controller.inverse_kinematics import leg_lengths, sample_workspace
 from controller.safety.causes import Cause
-from controller.settings import FusionSettings, SafetySettings, control_settings, fusion_settings
+from controller.settings import DriveSettings, FusionSettings, SafetySettings, control_settings, fusion_settings
 from plant.dynamics.variables import PLATFORM_IMU
 from plant.errors import InputError
 from plant.imu import MAGNETOMETER, imu_state, load_imu, measure
@@ -103,7 +103,8 @@ def test_the_covariance_is_that_of_the_errors():
 def parameters_of(mechanism, imus=ALL_IMUS, **choices):
     settings = control_settings(mechanism), fusion_settings(mechanism)
     unwatched = SafetySettings(following=1e3, drive_deviation=1e3, saturation=1e3)
-    return cycle_parameters(mechanism, 1.0 / PERIOD_S, *settings, imus, safety=unwatched, **choices)
+    of_drives = DriveSettings(slack=np.inf)
+    return cycle_parameters(mechanism, 1.0 / PERIOD_S, *settings, imus, safety=unwatched, drive_settings=of_drives, **choices)
 
 
 def run(parameters, signals, count, state=None):

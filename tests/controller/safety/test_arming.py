@@ -235,6 +235,7 @@ def test_the_reference_begins_where_the_legs_are_and_comes_to_the_target_within_
     # The legs stay, which these limits would end.
     for name in ("following", "drive_deviation", "saturation"):
         bench.parameters["safety"]["watch"][name] = np.inf
+    bench.parameters["safety"]["drives"]["slack"] = np.inf
     for number in range(200):
         bench.signals[0, :, 0] = 1e-9 * (-1.0) ** number
         bench.step()

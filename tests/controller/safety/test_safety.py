@@ -145,6 +145,7 @@ def test_in_motion_a_leg_is_watched_in_both_directions(hexapod, leg, sign):
     def stopped(change):
         bench = running(hexapod)
         bench.parameters["safety"]["watch"]["drive_deviation"] = 1e3
+        bench.parameters["safety"]["drives"]["slack"] = np.inf
         change(bench)
         bench.steps(round(0.6 * RATE_HZ))
         return bench.state["safety"]["stop"]["cause"], bench.state["safety"]["stop"]["index"]

@@ -171,7 +171,7 @@ def test_every_table_reaches_the_mechanism(tmp_path: Path) -> None:
         "[-0.05, 0.05]", "[-0.04, 0.05]\nvelocity = 0.2\nacceleration = 2.0\njerk = 50.0\nstop_clearance = 0.003"
     )
     text += "[plant.leg.lower]\nmass = 1.5\n[plant.motor]\nresistance = [1, 2, 3, 4, 5, 6]\n"
-    text += "[fusion]\na = 1.0\n[safety]\nb = 2.0\n"
+    text += "[fusion]\na = 1.0\n[safety]\nb = 2.0\n[drives]\nc = 3.0\n"
     mechanism = load_mechanism(write(tmp_path, text))
     assert isinstance(mechanism, Mechanism)
     home, kept = mechanism.require_home(), mechanism.require_limits()
@@ -184,7 +184,8 @@ def test_every_table_reaches_the_mechanism(tmp_path: Path) -> None:
     assert set(mechanism.plant) == {"platform.mass", "leg.lower.mass", "motor.resistance"}
     assert mechanism.plant["leg.lower.mass"] == 1.5
     np.testing.assert_array_equal(mechanism.plant["motor.resistance"], [1, 2, 3, 4, 5, 6])
-    assert mechanism.settings == {"control": {"proportional": 30.0}, "fusion": {"a": 1.0}, "safety": {"b": 2.0}}
+    rest = {"fusion": {"a": 1.0}, "safety": {"b": 2.0}, "drives": {"c": 3.0}}
+    assert mechanism.settings == {"control": {"proportional": 30.0}, **rest}
 
 
 def test_without_a_name_and_an_attitude_it_is_custom_and_level(tmp_path: Path) -> None:
