@@ -7,15 +7,16 @@ m = C_mm^-1 (c_m - C_mf D a). Let e be its evidence less the number of its direc
 ever exceed without a fault; e is at least 0.
 
     no fault       |C_mm^-1 c_m|
-    unseen fault   sqrt(tr V / 2): what could be there unseen; little where the readings would show it
-    seen fault     sqrt((e + 1/2) tr V) + 3 |m| min(1, e / 8)
+    unseen fault   sqrt(tr V / 4): what could be there unseen; little where the readings would show it
+    seen fault     sqrt((e + 1/4) tr V) + 3 |m| min(1, e / 8)
 
 The 3 is for faults that grow: such a fault is larger at the end of the filter's memory than on average over it, and has moved
-the pose before. A fault since the loop began has had little time to move the pose: these terms grow over the first second.
+the pose before. A fault since the loop began has had little time to move the pose: these terms grow over the first two seconds.
 
 The level is the root of the sum of the squares of three terms. One is the greatest of these. One is the standard deviation of
-the pose, both that of the closed form and that of the pose's own source: no filter knows what calibrations of IMUs and joints
-leave. One is what `parity` and `shaking` tell between two evaluations: forces that are no motion may have moved the pose.
+the pose, both that of the closed form and that of the pose's own source if that is less: no filter knows what calibrations of
+IMUs and joints leave. It counts more in the first seconds, in which the filters learn what the gyroscopes are off. One is what
+`parity` and `shaking` tell between two evaluations: forces that are no motion may have moved the pose.
 """
 
 import numpy as np
@@ -28,20 +29,25 @@ POSE = 6
 _CHANCE = 8.0
 """By how much evidence exceeds the number of directions without a fault."""
 
-_UNSEEN = 0.5
+_UNSEEN = 0.25
 """Evidence ascribed to a fault for which there is less [-]."""
 
 _SURELY = 8.0
 """Evidence beyond chance from which on a fault is taken to be there."""
 
-_BENDING_S = 1.0
+_BENDING_S = 2.0
 """How long a fault takes to move the pose [s]."""
 
 _GROWN = 3.0
 """By which factor the present error may exceed the mean one within the fault filter's memory."""
 
-_OF_CLOSED_FORM, _OF_SOURCE = 2.0, 1.1
-"""How many standard deviations count: of the pose in closed form, and as the source of the pose has it."""
+_OF_CLOSED_FORM, _OF_SOURCE = (0.3, 1.2), (2.0, 0.9)
+"""How many standard deviations of position and rotation count: of the pose in closed form, and of the better known of this and
+the pose's source.
+"""
+
+_UNSETTLED, _SETTLING_S = 2.0, 2.0
+"""How many of the closed form's count at the start, and the time constant with which their square fades [s]."""
 
 _SOUND, _MOST, _SHAKEN = 0.2, 0.4, 0.1
 """Mean forces that are no motion count beyond what sound IMUs hardly ever exceed, and up to this much [m/s^2]; the share of the
@@ -136,7 +142,7 @@ def end_level(s: Record, age: float) -> None:
         s: dtype `STATE`, with the covariances of the pose.
         age: for how long the loop has run [s].
     """
-    bent = np.sqrt(min(1.0, age / _BENDING_S))
+    bent, unsettled = min(1.0, age / _BENDING_S), _UNSETTLED**2 * np.exp(-age / _SETTLING_S)
     for part in range(2):
         closed = own = 0.0
         for i in range(3 * part, 3 * part + 3):
@@ -144,7 +150,8 @@ def end_level(s: Record, age: float) -> None:
             own += s.covariance[1, i, i]
         if not np.isfinite(closed):
             closed = own
-        squared = _OF_CLOSED_FORM**2 * closed + _OF_SOURCE**2 * own + (bent * s.fault[part]) ** 2
+        squared = (_OF_CLOSED_FORM[part] ** 2 + unsettled) * closed + _OF_SOURCE[part] ** 2 * min(own, closed)
+        squared += (bent * s.fault[part]) ** 2
         s.evaluated[part] = squared if s.determined != 0 else np.inf
         s.hypothesis[part] = s.next_hypothesis[part]
 

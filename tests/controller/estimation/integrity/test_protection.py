@@ -13,7 +13,7 @@ OWN = np.array([np.diag([4e-8, 1e-8, 9e-8, 1e-6, 4e-6, 1e-6]), np.diag([1e-8, 2e
 """Covariances of the pose, in closed form and of its source."""
 
 
-def ended(level, age=2.0, steady=0.0, shaken=0.0, own=OWN):
+def ended(level, age=50.0, steady=0.0, shaken=0.0, own=OWN):
     """The level (2,) at the end of an evaluation."""
     level["covariance"] = own
     end_level(level[()], age)
@@ -39,12 +39,17 @@ def level_of(state, frames, predicted, place):
         m = error - effect @ used.T @ inverse @ right
         faults.append(
             [
-                np.sqrt((seen + 0.5) * np.trace(spread[s, s])) + 3.0 * np.linalg.norm(m[s]) * min(1.0, seen / 8.0)
+                np.sqrt((seen + 0.25) * np.trace(spread[s, s])) + 3.0 * np.linalg.norm(m[s]) * min(1.0, seen / 8.0)
                 for s in (slice(0, 3), slice(3, 6))
             ]
         )
-    closed, own = (np.array([np.trace(c[:3, :3]), np.trace(c[3:, 3:])]) for c in OWN)
-    return np.sqrt(2.0**2 * closed + 1.1**2 * own + np.max(faults, axis=0) ** 2)
+    closed, own = traces()
+    return np.sqrt([0.3**2, 1.2**2] * closed + [2.0**2, 0.9**2] * np.minimum(own, closed) + np.max(faults, axis=0) ** 2)
+
+
+def traces(covariances=OWN):
+    """Of position and rotation, (2,) each, of the closed form and the source."""
+    return (np.array([np.trace(c[:3, :3]), np.trace(c[3:, 3:])]) for c in covariances)
 
 
 @pytest.mark.parametrize("fault", [None, (1, 2, 0, 0.2), (0, 6, 1, 0.05)])
@@ -72,10 +77,30 @@ def test_where_the_pose_is_not_determined_there_is_no_level():
 def test_a_fault_has_had_as_much_time_as_the_loop_to_move_the_pose():
     _, state = evaluated("mixed", (), 1.5, 3, None)
     level = state["integrity"]["protection"]
-    level["determined"], level["fault"] = 1, [0.01, 0.1]
-    own = ended(level, age=0.0)
-    for age, share in ((0.25, 0.5), (1.0, 1.0), (100.0, 1.0)):
-        np.testing.assert_allclose(ended(level, age), np.hypot(own, share * np.array([0.01, 0.1])))
+    level["determined"] = 1
+    for age, share in ((0.0, 0.0), (0.5, 0.25), (2.0, 1.0), (100.0, 1.0)):
+        level["fault"] = 0.0
+        without = ended(level, age)
+        level["fault"] = fault = np.array([0.01, 0.1])
+        np.testing.assert_allclose(ended(level, age), np.hypot(without, share * fault))
+
+
+def test_in_the_first_seconds_the_closed_form_counts_more():
+    _, state = evaluated()
+    level = state["integrity"]["protection"]
+    level["determined"] = 1
+    closed, _ = traces()
+    for age in (0.0, 1.0, 5.0):
+        unsettled = ended(level, age) ** 2 - ended(level, 1e3) ** 2
+        np.testing.assert_allclose(unsettled, 4.0 * np.exp(-age / 2.0) * closed, rtol=1e-6)
+
+
+def test_a_source_that_is_less_certain_than_the_closed_form_does_not_raise_it():
+    _, state = evaluated()
+    level = state["integrity"]["protection"]
+    level["determined"] = 1
+    np.testing.assert_array_equal(ended(level, own=OWN[[0, 0]]), ended(level, own=OWN * [[[1.0]], [[100.0]]]))
+    assert (ended(level, own=OWN * [[[1.0]], [[0.01]]]) < ended(level, own=OWN[[0, 0]])).all()
 
 
 def test_forces_that_are_no_motion_raise_the_level_between_evaluations():
@@ -106,7 +131,7 @@ def test_it_covers_the_error_of_the_pose_without_and_with_a_fault():
         parameters, state = constants(mechanism)
         s = all_steps(mechanism, r, parameters, state)
         position, rotation = ended(s["protection"])
-        least = 0.002 if spoil else 2.0 * np.sqrt(np.trace(OWN[0, :3, :3]))
+        least = 0.002 if spoil else 2.0 * np.sqrt(np.trace(OWN[1, :3, :3]))
         assert least < position < 0.02
         assert 0.0 < rotation < 0.05
 
