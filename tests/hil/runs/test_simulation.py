@@ -145,7 +145,7 @@ def test_one_seed_gives_one_result_bit_for_bit_and_another_seed_another():
 def test_a_fault_of_imus_begins_at_its_time_of_the_motion():
     fault = "imu-offset:all,axis=y,size_m_per_s2=0.5,ramp_s=0.01,at=0.6"
     healthy, disturbed = (
-        simulate(SimulationConfig(target="hold", duration=0.7, faults=each)).records for each in ((), (fault,))
+        simulate(SimulationConfig(target="hold", duration=0.605, faults=each)).records for each in ((), (fault,))
     )
     begun = round((0.2 + 0.6) * 1000)
     for field in set(healthy.dtype.names) - {"stage_ns"}:

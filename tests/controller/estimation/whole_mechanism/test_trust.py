@@ -27,6 +27,7 @@ class Rest:
         safety = SafetySettings(watch_imus=0.0, following=1e3, drive_deviation=1e3, arming_distance=1e3)
         settings = control_settings(mechanism), fusion_settings(mechanism)
         self.parameters = cycle_parameters(mechanism, RATE_HZ, *settings, whole="gyroscopes", safety=safety)
+        self.parameters["safety"]["drives"]["slack"] = np.inf
         self.state = np.zeros((), STATE)
         self.home = home.position, home.rotation
         self.signals = static_signals(mechanism, *self.home)
