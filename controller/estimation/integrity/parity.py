@@ -62,7 +62,7 @@ STATE = record_dtype(
     worst=np.int64,  # the IMU that has it, without which the rest agrees best
     named=np.int64,  # whether the rest then agrees
     steady=np.float64,  # greatest mean force that is no motion, averaged over some windows [m/s^2]
-    common=np.float64,  # the least, which all show
+    common=np.float64,  # the least, averaged or not, which all show
     common_for=np.int64,  # for how many windows that has been beyond the limit
     share=np.int64,  # whether for too many
     average=(np.float64, (IMU_COUNT, 3)),  # of these forces, in the axes of the IMUs [m/s^2]
@@ -231,10 +231,12 @@ def _compare_forces(s: Record, f: Record, excluded: Array, samples: int, duratio
             if follows:
                 s.average[k, m] += _AVERAGED * (beyond - s.average[k, m])
             averaged += s.average[k, m] ** 2
-        averaged = max(np.sqrt(averaged) - rough, 0.0)
-        s.steady, s.common = max(s.steady, averaged), min(s.common, averaged)
+        averaged, own = max(np.sqrt(averaged) - rough, 0.0), np.sqrt(squared)
+        s.steady = max(s.steady, averaged)
+        # A shock is in the average for long, and in two windows.
+        s.common = min(s.common, averaged, max(own - rough, 0.0))
         if follows:
-            s.off_motion[k] = np.sqrt(squared)
+            s.off_motion[k] = own
             if s.off_motion[k] > _FORCE_LIMIT + rough:
                 no_motion[k] = samples * squared
     s.twist_before[:] = s.twist

@@ -203,3 +203,18 @@ def test_a_force_that_all_accelerometers_go_on_to_show_is_told_after_ten_windows
         s, _ = look(imu, size * np.array([0.0, 0.8, 0.6]), windows=40, sensor=1, state=state)
         assert bool(s["parity"]["share"]) == expected
         assert (s["parity"]["common"] > 0.15) == expected
+
+
+def test_shocks_that_all_accelerometers_show_are_no_error_that_they_share():
+    """Two of five windows are struck; the average is far beyond the limit all the time."""
+    mechanism, r = readings("0.5", 1.0, 2)
+    struck = (np.arange(len(r.samples)) // 5) % 5 < 2
+    r.samples[struck, 1] += [0.0, 0.0, 4.0]
+    parameters, state = constants(mechanism)
+    s = state["integrity"]["parity"]
+    for n in range(60):
+        part = type(r)(*(each[5 * n + (n > 0) : 5 * n + 6] for each in vars(r).values()))
+        filtered(mechanism, part, parameters, state)
+        parity(state)
+        assert not s["share"]
+        assert n < 5 or np.linalg.norm(s["average"], axis=1).min() > 0.5
