@@ -234,7 +234,7 @@ SOUND = [
     {"fusion": "whole-gyroscopes"},
     {"fusion": "whole-alignments"},
     {"fusion": "section-5", "magnetometer": True},
-    {"fusion": "filterpy", "duration": 3.0},
+    {"fusion": "filterpy", "duration": 1.5},
     {"imus": (0, 5, 6), "magnetometer": True},
     {"mechanism": "6-3-I", "settings": "payload.mass=20@5"},
     {"mechanism": "6-4-II", "settings": "payload.mass=20@5"},

@@ -86,7 +86,7 @@ COMMANDS = ["accuracy --poses 20", "broad TRIALS", "faults --seeds 1 --only emer
 LONG_COMMANDS = [
     "classes --mechanisms 3",
     "compare-fusion --duration 20.5 --rate 100 --seeds 0",
-    "evaluate-fusion --imu mpu9150-calibrated --rate 250 --seeds 1 --starts 1 --still 21",
+    "evaluate-fusion --imu mpu9150-calibrated --rate 250 --seeds 1 --starts 1 --joint-error 0 --only start",
     "sensor-sets --mechanism 6-3-II --duration 0.3",
     "tune-fusion TUNED --seeds 0 --rate 50",
 ]
