@@ -11,7 +11,7 @@ from plant.imu import STANDARD_GRAVITY, ImuModel
 from plant.mechanism import Mechanism
 
 _ENDLESS = 1e300
-_RAW_M = 0.05
+_RAW_M, _FEW_M = 0.05, 0.03
 _ENDLESS_ALLOWED = ("evidence", "protection_position", "protection_rotation", "slack")
 _ZERO_ALLOWED = (
     "integral", "derivative", "sensor_delay", "sensor_timing", "most_lost_imus", "watch_imus", "need_platform_imu", "load",
@@ -132,6 +132,10 @@ class DriveSettings(_Settings):
     resistance: float = 0.2  # by which share a winding's resistance may be off
     friction: float = 2.5  # greatest friction, as a multiple of the Coulomb friction in the plant data
     slack: float = 0.008  # what lag, play, noise and an IMU before it is left out may leave; inf to ignore the drives [m]
+
+    def for_few_imus(self) -> "DriveSettings":
+        """These settings for fewer than five IMUs, whose estimate of a leg moves by up to 23 mm while the filters settle."""
+        return replace(self, slack=max(self.slack, _FEW_M))
 
     def for_raw_imus(self) -> "DriveSettings":
         """These settings for raw IMUs, whose errors move the pose by centimetres."""

@@ -236,6 +236,8 @@ SOUND = [
     {"fusion": "section-5", "magnetometer": True},
     {"fusion": "filterpy", "duration": 1.5},
     {"imus": (0, 5, 6), "magnetometer": True},
+    {"imus": (1, 2, 3, 4), "duration": 4.0},
+    {"imus": (1, 3, 6), "magnetometer": True, "mechanism": "genhexkins", "duration": 4.0},
     {"mechanism": "6-3-I", "settings": "payload.mass=20@5"},
     {"mechanism": "6-4-II", "settings": "payload.mass=20@5"},
     {"mechanism": "genhexkins", "settings": "payload.mass=30@5"},
