@@ -218,7 +218,7 @@ def judge_parity(
     """
     if s.mode != Mode.RUNNING or not np.isfinite(p.watch.evidence):
         return False
-    if parity.share != 0:
+    if parity.shared != 0:
         handle_cause(p, s, rig, time, reference, pid, Cause.FORCES_SHARE, -1, parity.common, SHARED)
         return False
     if parity.named != 0 and _may_leave_out(p.watch, imus, parity.worst):

@@ -64,7 +64,7 @@ STATE = record_dtype(
     steady=np.float64,  # greatest mean force that is no motion, averaged over some windows [m/s^2]
     common=np.float64,  # the least, averaged or not, which all show
     common_for=np.int64,  # for how many windows that has been beyond the limit
-    share=np.int64,  # whether for too many
+    shared=np.int64,  # whether for so many that they share an error
     average=(np.float64, (IMU_COUNT, 3)),  # of these forces, in the axes of the IMUs [m/s^2]
     twist_before=(np.float64, _TWIST),  # of the window before
     force_before=(np.float64, (IMU_COUNT, 3)),  # its part in the forces beyond the planned acceleration and the twist
@@ -241,4 +241,4 @@ def _compare_forces(s: Record, f: Record, excluded: Array, samples: int, duratio
                 no_motion[k] = samples * squared
     s.twist_before[:] = s.twist
     s.common_for = s.common_for + 1 if used >= _ENOUGH and s.common > SHARED else 0
-    s.share = s.common_for >= _SHARED_WINDOWS
+    s.shared = s.common_for >= _SHARED_WINDOWS

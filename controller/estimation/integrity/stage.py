@@ -117,7 +117,7 @@ def step_integrity(
         s.compared = s.filter.windows
         s.contradicts = s.filter.windows > 0 and (
             parity.step_parity(s.parity, s.filter, imus.excluded, p.filter.window, rig.period, imus.shaking.no_motion)
-            or s.parity.share != 0
+            or s.parity.shared != 0
         )
         if s.evaluations > 0:
             protection.publish_level(s.protection, s.parity.steady, imus.shaking.mean.max())
