@@ -156,10 +156,10 @@ def screen_imus(
                 s.raw[kind, k, i] = raw
                 if kind < 2:
                     finite = finite and bool(np.isfinite(raw))
-                    most = max(most, abs(raw) / p.range[kind])
+                    most = max(most, abs(raw))
             if kind < 2:
-                s.shaking.clipped[kind, k] = most >= 1.0
-                reached = max(reached, most)
+                s.shaking.clipped[kind, k] = most >= p.range[kind]
+                reached = max(reached, most / p.range[kind])
         if not finite:
             cause, value, limit = Cause.IMU_NOT_FINITE.value, np.nan, np.nan
         elif not shaking.bridges(p.shaking, s.shaking, k, s.healthy[k], time.missed):
@@ -190,11 +190,11 @@ def _update_noise(p: Record, s: Record, cycle: int, measurement: Array, k: int) 
         for i in range(3):
             raw = measurement[kind, k, i]
             change = raw - 2.0 * s.earlier[0, kind, k, i] + s.earlier[1, kind, k, i]
-            total += change * change / 18.0
+            total += change * change
             s.earlier[1, kind, k, i] = s.earlier[0, kind, k, i]
             s.earlier[0, kind, k, i] = raw
         if cycle < 2 or not np.isfinite(total):
             total = 0.0
-        s.variance[kind, k] += p.noise_smoothing * (total - s.variance[kind, k])
+        s.variance[kind, k] += p.noise_smoothing * (total / 18.0 - s.variance[kind, k])
         worst = max(worst, s.variance[kind, k] / p.noise[kind] ** 2)
     s.noise[k] = np.sqrt(worst)

@@ -394,16 +394,21 @@ def _update(p: Record, s: Record, k: int, excluded: bool) -> None:
         _forget_fault(p, s, k, s.information, s.vector)
     if s.counted[k] == 0:
         return
-    a, y = s.information, s.vector
+    a, y, weight, h = s.information, s.vector, s.weight[k], s.jacobian[k]
+    gyroscope, accelerometer = weight[0], weight[1]
+    for i in range(MOTION_STATES):
+        row = a[i]
+        x0, x1, x2 = gyroscope * h[0, i], gyroscope * h[1, i], gyroscope * h[2, i]
+        x3, x4, x5 = accelerometer * h[3, i], accelerometer * h[4, i], accelerometer * h[5, i]
+        for j in range(MOTION_STATES):
+            row[j] += x0 * h[0, j] + x1 * h[1, j] + x2 * h[2, j] + x3 * h[3, j] + x4 * h[4, j] + x5 * h[5, j]
     for m in range(READINGS):
-        weight, h, fault = s.weight[k, m // 3], s.jacobian[k, m], MOTION_STATES + READINGS * k + m
-        off = weight * (s.mean[k, m] - s.predicted[k, m])
+        of_one, fault = weight[m // 3], MOTION_STATES + READINGS * k + m
+        off = of_one * (s.mean[k, m] - s.predicted[k, m])
         for i in range(MOTION_STATES):
-            share, row = weight * h[i], a[i]
-            for j in range(MOTION_STATES):
-                row[j] += share * h[j]
-            row[fault] += share
+            share = of_one * h[m, i]
+            a[i, fault] += share
             a[fault, i] += share
-            y[i] += off * h[i]
-        a[fault, fault] += weight
+            y[i] += off * h[m, i]
+        a[fault, fault] += of_one
         y[fault] += off

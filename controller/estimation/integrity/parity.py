@@ -18,7 +18,7 @@ from math import radians
 
 import numpy as np
 
-from controller.least_squares import factor_cholesky, solve_cholesky
+from controller.least_squares import factor_cholesky, invert_cholesky, solve_cholesky
 from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.pose import Array
@@ -40,6 +40,9 @@ _USUAL_S = 10.0
 
 _AGREE, _AGREE_OF_ALL = 0.6, 0.15
 """How large the error without the named gyroscope may be: of the limit, and of the error with it."""
+
+_LEAST_LEFT = 1e-4
+"""A gyroscope's axis is known from the others if this share of an error there would be left over."""
 
 _FORCE_LIMIT, _ROUGH_SIGMAS = 0.9, 3.0
 """Error of a mean force that is told: this [m/s^2], and some standard deviations of what is not known of the motion."""
@@ -69,8 +72,8 @@ STATE = record_dtype(
     twist_before=(np.float64, _TWIST),  # of the window before
     force_before=(np.float64, (IMU_COUNT, 3)),  # its part in the forces beyond the planned acceleration and the twist
     normal=(np.float64, (_TWIST, _TWIST)),  # from here on scratch
+    covariance=(np.float64, (_TWIST, _TWIST)),  # of the twist, for gyroscopes of variance 1
     twist=(np.float64, _TWIST),
-    columns=(np.float64, (3, _TWIST)),
     left=(np.float64, (3, 3)),
     residual=(np.float64, 3),
     solved=(np.float64, 3),
@@ -136,6 +139,7 @@ def _find_worst(s: Record, f: Record, excluded: Array, left_out: int) -> tuple[i
         s.twist[:] = 0.0
         return 0, 0.0
     solve_cholesky(s.normal, s.twist)
+    invert_cholesky(s.normal, s.covariance)
     worst, most = 0, 0.0
     for k in range(IMU_COUNT):
         if _counts(f, excluded, k) and k != left_out:
@@ -160,16 +164,17 @@ def _squared_error(s: Record, f: Record, k: int) -> float:
     """By how much the sum of squares is less without a gyroscope; 0 if nothing else knows what it reads."""
     _find_residual(s, f, k)
     for m in range(3):
+        row = f.jacobian[k, m]
+        for n in range(m + 1):
+            s.left[m, n] = 1.0 if n == m else 0.0
         for i in range(_TWIST):
-            s.columns[m, i] = f.jacobian[k, m, _FIRST + i]
-        solve_cholesky(s.normal, s.columns[m])
-        for n in range(3):
             known = 0.0
-            for i in range(_TWIST):
-                known += f.jacobian[k, n, _FIRST + i] * s.columns[m, i]
-            s.left[n, m] = (1.0 if n == m else 0.0) - known
+            for j in range(_TWIST):
+                known += s.covariance[i, j] * row[_FIRST + j]
+            for n in range(m + 1):
+                s.left[m, n] -= f.jacobian[k, n, _FIRST + i] * known
         s.solved[m] = s.residual[m]
-    if not factor_cholesky(s.left):
+    if not factor_cholesky(s.left) or min(s.left[0, 0], s.left[1, 1], s.left[2, 2]) < _LEAST_LEFT:
         return 0.0
     solve_cholesky(s.left, s.solved)
     squared = 0.0
