@@ -83,6 +83,30 @@ def normal_equations(
 
 
 @kernel
+def misfit(
+    directions: Array, weights: Array, predicted: Array, in_base: Array, in_platform: Array, vector_weights: Array,
+    rotation: Array,
+) -> float:  # fmt: skip
+    """The weighted sum of squares that a pose leaves, over the number of its degrees of freedom: 1 on average if the weights are
+    right; 0 if nothing is redundant.
+
+    Args: as for `normal_equations`; `predicted` are the legs' directions at the pose.
+    """
+    squares, freedom = 0.0, -6
+    for k in range(LEGS):
+        if weights[k] != 0.0:
+            off = subtract(vector(directions[k]), vector(predicted[k]))
+            squares += weights[k] * dot(off, off)
+            freedom += 2
+    for k in range(vector_weights.shape[0]):
+        if vector_weights[k] != 0.0:
+            off = subtract(vector(in_base[k]), rotate(rotation, vector(in_platform[k])))
+            squares += vector_weights[k] * dot(off, off)
+            freedom += 2
+    return squares / freedom if freedom > 0 else 0.0
+
+
+@kernel
 def stay_in_plane(information: Array, correction: Array) -> None:
     """Let normal equations move the pose in the xy-plane of {1} alone: no measurement outweighs that it stays there."""
     for i in range(2, 5):

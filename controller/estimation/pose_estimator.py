@@ -12,6 +12,7 @@ from controller.direct_kinematics.planar import pose_from_roll
 from controller.direct_kinematics.refinement import (
     find_twist,
     move_pose,
+    misfit,
     normal_equations,
     solve_normal_equations,
     stay_in_plane,
@@ -42,6 +43,7 @@ STATE = record_dtype(
     found=np.int64,  # whether the measurements determine the pose
     information=(np.float64, (6, 6)),  # inverse of the refined pose's covariance, lower triangle
     factor=(np.float64, (6, 6)),  # Cholesky factor of the information
+    misfit=np.float64,  # of the measurements about the refined pose, 1 on average if their covariances are right
     arms=(np.float64, (LEGS, 3)),  # the turned platform joints at the pose [m]
     directions=(np.float64, (LEGS, 3)),  # of the legs at the pose, unit
     lengths=(np.float64, LEGS),  # of the legs at the pose [m]
@@ -125,6 +127,7 @@ def refine_pose(p: Record, s: Record, rig: Record, time: Record, legs: Record, p
             s.information[:] = 0.0
             break
         move_pose(s.correction, s.position, s.rotation)
+    s.misfit = misfit(legs.directions, legs.weights, s.directions, rig.vectors_in_base, s.vectors, s.vector_weights, s.rotation)
     s.angular_velocity[0], s.angular_velocity[1], s.angular_velocity[2] = rotate(s.rotation, vector(platform_rate))
     find_twist(
         legs.rates, legs.weights, s.vectors, s.vector_weights, s.angular_velocity, s.rotation, s.arms, s.directions, s.lengths,

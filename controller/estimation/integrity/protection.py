@@ -13,10 +13,12 @@ ever exceed without a fault; e is at least 0.
 The 3 is for faults that grow: such a fault is larger at the end of the filter's memory than on average over it, and has moved
 the pose before. A fault since the loop began has had little time to move the pose: these terms grow over the first two seconds.
 
-The level is the root of the sum of the squares of three terms. One is the greatest of these. One is the standard deviation of
+The level is the root of the sum of the squares of four terms. One is the greatest of these. One is the standard deviation of
 the pose, both that of the closed form and that of the pose's own source if that is less: no filter knows what calibrations of
-IMUs and joints leave. It counts more in the first seconds, in which the filters learn what the gyroscopes are off. One is what
-`parity` and `shaking` tell between two evaluations: forces that are no motion may have moved the pose.
+IMUs and joints leave. It counts more in the first seconds, in which the filters learn what the gyroscopes are off. One is the standard deviation of
+the closed form again, by how much its measurements contradict each other: that is how joints that are off, and other errors
+that nothing models, show themselves. One is what `parity` and `shaking` tell: forces that are no motion may have moved the pose.
+The last two are renewed between two evaluations.
 """
 
 import numpy as np
@@ -49,6 +51,11 @@ the pose's source.
 _UNSETTLED, _SETTLING_S = 2.0, 2.0
 """How many of the closed form's count at the start, and the time constant with which their square fades [s]."""
 
+_USUAL_MISFIT, _OF_MISFIT, _MISFIT_S = 0.3, 3.0, 0.1
+"""From which misfit on the closed form's standard deviation counts again, and how often, times the root of what is beyond; time
+constant of its average [s]. Most of the errors that the weights stand for are alike in all measurements, or move the pose.
+"""
+
 _SOUND, _MOST, _SHAKEN = 0.2, 0.4, 0.1
 """Mean forces that are no motion count beyond what sound IMUs hardly ever exceed, and up to this much [m/s^2]; the share of the
 vibration's RMS that counts with them.
@@ -59,7 +66,9 @@ _MOVED = 0.04, 0.06
 
 STATE = record_dtype(
     level=(np.float64, 2),  # of position [m] and rotation [rad]
-    evaluated=(np.float64, 2),  # its square without what forces add, of the last complete evaluation
+    evaluated=(np.float64, 2),  # its square without what misfit and forces add, of the last complete evaluation
+    closed=(np.float64, 2),  # square of the closed form's standard deviation then
+    misfit=np.float64,  # of the closed form, averaged
     hypothesis=(np.int64, 2),  # that gives the level; -1: none
     fault=(np.float64, 2),  # the greatest effect of a fault, of the evaluation under way
     next_hypothesis=(np.int64, 2),  # that has it; -1: none
@@ -152,19 +161,24 @@ def end_level(s: Record, age: float) -> None:
             closed = own
         squared = (_OF_CLOSED_FORM[part] ** 2 + unsettled) * closed + _OF_SOURCE[part] ** 2 * min(own, closed)
         squared += (bent * s.fault[part]) ** 2
+        s.closed[part] = closed if np.isfinite(closed) else 0.0
         s.evaluated[part] = squared if s.determined != 0 else np.inf
         s.hypothesis[part] = s.next_hypothesis[part]
 
 
 @kernel
-def publish_level(s: Record, steady: float, shaken: float) -> None:
+def publish_level(s: Record, misfit: float, duration: float, steady: float, shaken: float) -> None:
     """Publish the level after a window of the fault filter, with what has come up since the last evaluation.
 
     Args:
         s: dtype `STATE`.
+        misfit: of the closed form now, `pose_estimator.STATE`.
+        duration: of the window [s].
         steady: greatest mean force that is no motion [m/s^2], `parity.STATE`.
         shaken: greatest mean square of vibration [m^2/s^4], `shaking.STATE`.
     """
+    s.misfit += min(1.0, duration / _MISFIT_S) * (misfit - s.misfit)
+    beyond = _OF_MISFIT**2 * max(s.misfit - _USUAL_MISFIT, 0.0)
     force = min(max(steady - _SOUND, 0.0) + _SHAKEN * np.sqrt(shaken), _MOST)
     for part, moved in enumerate(_MOVED):
-        s.level[part] = np.sqrt(s.evaluated[part] + (moved * force) ** 2)
+        s.level[part] = np.sqrt(s.evaluated[part] + beyond * s.closed[part] + (moved * force) ** 2)

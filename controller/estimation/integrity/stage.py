@@ -120,7 +120,9 @@ def step_integrity(
             or s.parity.shared != 0
         )
         if s.evaluations > 0:
-            protection.publish_level(s.protection, s.parity.steady, imus.shaking.mean.max())
+            protection.publish_level(
+                s.protection, pose.misfit, p.filter.duration, s.parity.steady, imus.shaking.mean.max()
+            )  # fmt: skip
     if s.waits > 0:
         s.waits -= 1
         if s.waits == 0:

@@ -1,7 +1,8 @@
-"""The refinement's twist against weighted least squares in numpy, on rates that contradict each other."""
+"""The refinement's twist against weighted least squares in numpy, on rates that contradict each other; its misfit against SciPy."""
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from controller.cycle import STATE, cycle_parameters
 from controller.settings import control_settings, fusion_settings
@@ -43,3 +44,36 @@ def test_the_twist_is_that_of_weighted_least_squares(hexapod, left_out, vector_w
         jacobian = np.vstack(rows)
         information = np.tril(pose["information"]) + np.tril(pose["information"], -1).T
         np.testing.assert_allclose(information, jacobian.T @ jacobian, rtol=1e-8, atol=1e-6 * np.abs(information).max())
+
+
+@pytest.mark.parametrize(
+    ("left_out", "vector_weights", "freedom"), [((), (4e5, 0.0), 8), ((2, 4), (4e5, 3e4), 6), ((0, 3, 5), (0.0, 0.0), 0)]
+)
+def test_the_misfit_is_what_the_best_pose_leaves_over(hexapod, left_out, vector_weights, freedom):
+    random = np.random.default_rng(11)
+    parameters = cycle_parameters(hexapod, 1000.0, control_settings(hexapod), fusion_settings(hexapod))
+    in_base = parameters["rig"]["vectors_in_base"]
+    position, rotation = hexapod.home.position, rotation_of(np.array([0.1, -0.2, 0.1]))
+    weights = random.uniform(1e5, 1e6, 6) * [leg not in left_out for leg in range(6)]
+    directions = leg_directions(hexapod, position, rotation) + 1e-4 * random.normal(size=(6, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, np.newaxis]
+    vectors = in_base @ rotation_of(1e-4 * random.normal(size=3)) @ rotation
+    state = np.zeros((), STATE)
+    legs, pose = state["legs"], state["pose"]
+    legs["directions"], legs["weights"] = directions, weights
+    pose["vectors"], pose["vector_weights"], pose["position"], pose["rotation"] = vectors, vector_weights, position, rotation
+
+    def left_over(step):
+        turned = rotation_of(step[3:]) @ rotation
+        off = directions - leg_directions(hexapod, position + step[:3], turned), in_base - vectors @ turned.T
+        return np.concatenate(
+            [
+                (np.sqrt(w)[:, np.newaxis] * each).ravel()
+                for w, each in zip((weights, np.array(vector_weights)), off, strict=True)
+            ]
+        )
+
+    best = least_squares(left_over, np.zeros(6), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    assert refine(parameters, state)
+    expected = 2.0 * best.cost / freedom if freedom else 0.0
+    np.testing.assert_allclose(pose["misfit"], expected, rtol=1e-4)

@@ -13,11 +13,11 @@ OWN = np.array([np.diag([4e-8, 1e-8, 9e-8, 1e-6, 4e-6, 1e-6]), np.diag([1e-8, 2e
 """Covariances of the pose, in closed form and of its source."""
 
 
-def ended(level, age=50.0, steady=0.0, shaken=0.0, own=OWN):
-    """The level (2,) at the end of an evaluation."""
-    level["covariance"] = own
+def ended(level, age=50.0, steady=0.0, shaken=0.0, own=OWN, misfit=0.0):
+    """The level (2,) at the end of an evaluation, with a misfit that lasts."""
+    level["covariance"], level["misfit"] = own, misfit
     end_level(level[()], age)
-    publish_level(level[()], steady, shaken)
+    publish_level(level[()], misfit, 0.01, steady, shaken)
     return level["level"].copy()
 
 
@@ -112,6 +112,20 @@ def test_forces_that_are_no_motion_raise_the_level_between_evaluations():
     np.testing.assert_allclose(ended(level, steady=0.3), np.hypot(sound, [0.004, 0.006]))
     np.testing.assert_allclose(ended(level, shaken=4.0), np.hypot(sound, [0.008, 0.012]))
     np.testing.assert_allclose(ended(level, steady=5.0, shaken=9.0), np.hypot(sound, [0.016, 0.024]))
+
+
+def test_measurements_that_contradict_each_other_raise_the_level_between_evaluations():
+    _, state = evaluated("mixed", (), 1.5, 3)
+    level = state["integrity"]["protection"]
+    calm = ended(level)
+    np.testing.assert_array_equal(ended(level, misfit=0.29), calm)
+    closed, _ = traces()
+    np.testing.assert_allclose(ended(level, misfit=2.3), np.sqrt(calm**2 + 9.0 * 2.0 * closed))
+    # A misfit that has just come up counts by its share of the average.
+    level["misfit"] = 0.3
+    publish_level(level[()], 2.3, 0.01, 0.0, 0.0)
+    np.testing.assert_allclose(level["level"], np.sqrt(calm**2 + 9.0 * 0.2 * closed))
+    assert np.isinf(ended(level, own=np.full_like(OWN, np.inf), misfit=2.3)).all()
 
 
 def test_without_a_covariance_of_the_closed_form_that_of_the_source_counts_for_both():
