@@ -87,8 +87,8 @@ def misfit(
     directions: Array, weights: Array, predicted: Array, in_base: Array, in_platform: Array, vector_weights: Array,
     rotation: Array,
 ) -> float:  # fmt: skip
-    """The weighted sum of squares that a pose leaves, over the number of its degrees of freedom: 1 on average if the weights are
-    right; 0 if nothing is redundant.
+    """The weighted sum of squares that a pose leaves, over its degrees of freedom: 1 on average if the weights are right; 0 if
+    nothing is redundant.
 
     Args: as for `normal_equations`; `predicted` are the legs' directions at the pose.
     """

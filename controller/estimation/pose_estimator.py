@@ -11,8 +11,8 @@ from controller.direct_kinematics.legs_and_attitude import pose_from_rotation, p
 from controller.direct_kinematics.planar import pose_from_roll
 from controller.direct_kinematics.refinement import (
     find_twist,
-    move_pose,
     misfit,
+    move_pose,
     normal_equations,
     solve_normal_equations,
     stay_in_plane,

@@ -15,10 +15,10 @@ the pose before. A fault since the loop began has had little time to move the po
 
 The level is the root of the sum of the squares of four terms. One is the greatest of these. One is the standard deviation of
 the pose, both that of the closed form and that of the pose's own source if that is less: no filter knows what calibrations of
-IMUs and joints leave. It counts more in the first seconds, in which the filters learn what the gyroscopes are off. One is the standard deviation of
-the closed form again, by how much its measurements contradict each other: that is how joints that are off, and other errors
-that nothing models, show themselves. One is what `parity` and `shaking` tell: forces that are no motion may have moved the pose.
-The last two are renewed between two evaluations.
+IMUs and joints leave. It counts more in the first seconds, in which the filters learn what the gyroscopes are off. One is the
+standard deviation of the closed form again, by how much its measurements contradict each other: so joints that are off show
+themselves, and other errors that nothing models. One is what `parity` and `shaking` tell: forces that are no motion may have
+moved the pose. The last two are renewed between two evaluations.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""The refinement's twist against weighted least squares in numpy, on rates that contradict each other; its misfit against SciPy."""
+"""The refinement's twist against weighted least squares in NumPy, its misfit against SciPy's least squares."""
 
 import numpy as np
 import pytest
