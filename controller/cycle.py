@@ -103,6 +103,7 @@ STATE = record_dtype(
 RUNNING_LIMITS: Limits = {
     "time.cycle": (0, MOST),
     "reference.index": (0, MOST),
+    "mechanism.again": (0, 1),
     "safety.mode": (Mode.IDLE, Mode.RUNNING),
     "safety.stop.cause": (Cause.NONE, Cause.NONE),
     "safety.stop.earlier_cause": (Cause.NONE, Cause.NONE),

@@ -15,6 +15,7 @@ the next one.
 
 import numpy as np
 
+from controller.estimation.whole_mechanism.parameters import ripple_at
 from controller.estimation.whole_mechanism.readings import (
     ACCELERATION,
     ANGULAR_ACCELERATION,
@@ -42,9 +43,6 @@ UNKNOWNS = MOTION_STATES + FAULTS
 _WINDOW_S = 0.01
 MEMORY_S = 0.5
 """Time constant with which information fades [s]."""
-
-_RIPPLE_HZ = 150.0
-"""At this rate of the loop [Hz], the steps of the commands make a sample of the acceleration as wrong as it is large."""
 
 _LEAST_SAMPLES = 2.5
 """An IMU counts in a window if it gives a sample at least every so many cycles: it may be half as fast as the loop."""
@@ -132,7 +130,7 @@ def fault_filter_parameters(fusion: FusionSettings, rate: float, active: bool) -
         window=window,
         duration=duration,
         keep=np.exp(-duration / MEMORY_S),
-        ripple=min(1.0, (_RIPPLE_HZ / rate) ** 2),
+        ripple=ripple_at(rate),
         variance=noise**2 * rate / 2.0,
         stiffness=duration / jerk**2,
     )

@@ -41,6 +41,7 @@ from controller.estimation.whole_mechanism.readings import (
 )
 from plant.compiled import Record, kernel, shared_kernel
 from plant.dynamics.variables import IMU_COUNT
+from plant.imu import ACCELEROMETER
 from plant.mechanism import LEGS
 from plant.pose import Array, rotate_by_vector
 from plant.vectors import dot, rotate, vector
@@ -276,6 +277,9 @@ def _update_scalar(p: Record, f: Record, row: int) -> None:
     expected = distort(f.errors[k], sensor, vector(f.predicted[k, 3 * sensor :]))
     innovation = f.sample[k, m] - expected[m % 3] - f.errors[k, m]
     variance = p.variance[sensor] / f.sample_weight[sensor, k] + p.timing_variance * f.change_per_second[k, m] ** 2
+    if sensor == ACCELEROMETER:
+        acceleration = vector(f.smooth_motion[ACCELERATION])
+        variance += p.ripple * dot(acceleration, acceleration)
     for i in range(states):
         gain[i] = 0.0
     for j in range(MOTION_STATES):

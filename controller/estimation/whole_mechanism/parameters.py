@@ -27,6 +27,9 @@ _LASTING = 6.0
 number; chosen on steps with two kinds of IMUs.
 """
 
+_RIPPLE_HZ = 150.0
+"""At this rate of the loop [Hz], the steps of the commands make a sample of the acceleration as wrong as it is large."""
+
 FILTER_PARAMETERS = record_dtype(
     window=np.int64,  # samples that are averaged
     errors=np.int64,  # estimated errors of each IMU, 0 for no filter
@@ -37,6 +40,7 @@ FILTER_PARAMETERS = record_dtype(
     bias_walk=(np.float64, 2),  # spectral densities of the biases' walks, gyroscope and accelerometer
     variance=(np.float64, 2),  # of one sample, rate [(rad/s)^2] and force [(m/s^2)^2]
     timing_variance=np.float64,  # of the time of a sample [s^2]
+    ripple=np.float64,  # square of a specific force's error for an acceleration: commands are steps
     prior=(np.float64, (ALL_ERRORS + RIG_ERRORS, ALL_ERRORS + RIG_ERRORS)),  # covariance of the errors at the start
     floor=(np.float64, 2),  # variances of position and rotation that are left as the rig's errors are not estimated
     heading=np.int64,  # whether there is one
@@ -137,6 +141,7 @@ def filter_parameters(
         bias_walk=(fusion.bias_walk**2, fusion.accelerometer_bias_walk**2),
         variance=noise**2 * rate / 2.0,
         timing_variance=(_LASTING * fusion.sensor_timing) ** 2,
+        ripple=(_LASTING * ripple_at(rate)) ** 2,
         prior=prior,
         floor=np.zeros(2) if floor is None else floor**2 / 3.0,
     )
@@ -147,6 +152,11 @@ def filter_parameters(
         parameters["heading_variance"] = field.heading_variance(fusion, rate)
         parameters["offset_variance"] = fusion.heading_sigma**2
     return parameters
+
+
+def ripple_at(rate: float) -> float:
+    """The error of a sample of the acceleration, as a share of it, by the steps of the commands at a rate of the loop [Hz]."""
+    return min(1.0, (_RIPPLE_HZ / rate) ** 2)
 
 
 @kernel

@@ -33,8 +33,10 @@ from plant.imu_wiring import IMU_COUNT
 from plant.mechanism import LEGS
 from plant.pose import Array
 
-_START_S, _SETTLING_S = 0.3, 0.3
-"""When the filter is started after it was stopped, and how long it is not relied upon [s]."""
+_START_S, _SETTLING_S, _SETTLING_AGAIN_S = 0.3, 0.3, 1.0
+"""When the filter is started after it was stopped; how long it is not relied upon at first, with the legs at rest, and when it
+has been started again [s].
+"""
 
 _AVERAGE_S = 0.05
 """Time constant of the mean square of the angles between the leg filters' directions and the filter's pose [s]."""
@@ -52,7 +54,7 @@ PARAMETERS = record_dtype(
     filter=FILTER_PARAMETERS,
     delay=np.float64,  # of the sensors [s]
     start_cycles=np.int64,  # this and the next: the durations above
-    settling_cycles=np.int64,
+    settling_cycles=(np.int64, 2),
     disagreement=np.float64,  # of the leg filters with the filter, limit of the mean square [rad^2]
     smoothing=np.float64,  # share of a cycle's in that mean
 )
@@ -61,6 +63,7 @@ PARAMETERS = record_dtype(
 STATE = record_dtype(
     filter=FILTER_STATE,
     due=np.int64,  # the cycle in which the filter is started, or from which on it may be trusted
+    again=np.int64,  # whether it has been started before
     trusted=np.int64,  # whether the pose is the filter's
     disagreement=np.float64,  # of the leg filters with the filter, mean square [rad^2]
     stops=np.int64,  # how often that has stopped the filter
@@ -84,7 +87,7 @@ def trust_parameters(fusion: FusionSettings, rate: float, filter_constants: Reco
         filter=filter_constants,
         delay=fusion.sensor_delay,
         start_cycles=round(_START_S * rate),
-        settling_cycles=round(_SETTLING_S * rate),
+        settling_cycles=(round(_SETTLING_S * rate), round(_SETTLING_AGAIN_S * rate)),
         disagreement=fusion.disagreement**2,
         smoothing=1.0 / max(1.0, _AVERAGE_S * rate),
     )
@@ -102,7 +105,8 @@ def step_mechanism_filter(
     if f.running == 0:
         if found and time.cycle >= s.due:
             start_filter(p.filter, f, now, pose.position, pose.rotation, pose.twist)
-            s.due = time.cycle + p.settling_cycles
+            s.due = time.cycle + p.settling_cycles[s.again]
+            s.again = 1
             s.disagreement = 0.0
         if found:
             _correct(s, rig, time, pose)
