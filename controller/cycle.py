@@ -31,7 +31,7 @@ from controller.estimation.whole_mechanism import trust
 from controller.estimation.whole_mechanism.imu_errors import ERRORS
 from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, MOST_STATES, filter_parameters
 from controller.estimation.whole_mechanism.readings import MOTION_STATES, RIG_ERRORS
-from controller.imu_set import check_imus, imus_of
+from controller.imu_set import are_few, check_imus, imus_of
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import RANK_TOLERANCE
 from controller.rig import RIG, TIME, elapsed, field_of, rig_parameters
@@ -49,11 +49,6 @@ from plant.pose import Array
 from plant.stopwatch import now
 
 _LEAST_GRAVITY = 0.1
-_LEAST_JUDGED_IMUS = 5
-"""With fewer, too little contradicts the evidence for a fault. The residuals of the closed form remain, the level, and a wider
-check of what was commanded.
-"""
-
 _LEAST_EVIDENCE_HZ = 125.0
 """Below this rate the motion between two commands is not known well enough for sound IMUs to agree with it."""
 
@@ -178,9 +173,8 @@ def cycle_parameters(
             f"{rate:g} Hz) and without the paper's section 5: leave out protection_position and protection_rotation"
         )
     watch_evidence = bool(watched.watch_imus) and able
-    drives_known = drive_settings or DriveSettings()
-    if len(present) < _LEAST_JUDGED_IMUS and not mechanism.planar:
-        watched, drives_known = replace(watched, evidence=np.inf), drives_known.for_few_imus()
+    if are_few(mechanism, imus):
+        watched = replace(watched, evidence=np.inf)
     return filled(
         PARAMETERS,
         rig=rig_parameters(mechanism, rate, control.hold, calibration.tilt),
@@ -193,7 +187,7 @@ def cycle_parameters(
         integrity=integrity.integrity_parameters(fusion, rate, filtered["prior"][:ALL_ERRORS, :ALL_ERRORS], watch_evidence),
         load=load_feed_forward.load_parameters(mechanism, command_delay),
         pid=pid.pid_parameters(control, limits.velocity),
-        safety=safety_stage.safety_parameters(watched, drives_known, mechanism, rate, to_arm),
+        safety=safety_stage.safety_parameters(watched, drive_settings or DriveSettings(), mechanism, rate, to_arm),
     )
 
 
