@@ -166,7 +166,7 @@ def cycle_parameters(
     present = imus_of(mechanism, imus)
     errors, of_heading = (calibration.covariance, calibration.floor), field if magnetometer else None
     filtered = filter_parameters(fusion, rate, whole, *errors, of_heading)
-    able = not mechanism.planar and not section_5 and rate >= _LEAST_EVIDENCE_HZ
+    able = not _without_evidence(mechanism, rate, section_5)
     if watched.watch_imus and not able and min(watched.protection_position, watched.protection_rotation) < np.inf:
         raise InputError(
             f"[safety] limits the protection level, which there is only in space, from {_LEAST_EVIDENCE_HZ:g} Hz on (this is "
@@ -189,6 +189,23 @@ def cycle_parameters(
         pid=pid.pid_parameters(control, limits.velocity),
         safety=safety_stage.safety_parameters(watched, drive_settings or DriveSettings(), mechanism, rate, to_arm),
     )
+
+
+def evidence_remark(mechanism: Mechanism, rate: float, section_5: bool = False) -> str:
+    """What a user should know where evidence judges no readings, in a line; "" where it does."""
+    where = _without_evidence(mechanism, rate, section_5)
+    return where and (
+        f"{where} an error that the IMUs share is told late, when the estimate has moved otherwise than commanded, and there "
+        "is no protection level (docs/integrity.md)"
+    )
+
+
+def _without_evidence(mechanism: Mechanism, rate: float, section_5: bool) -> str:
+    if mechanism.planar:
+        return "in a plane"
+    if section_5:
+        return "with the paper's section 5"
+    return f"below {_LEAST_EVIDENCE_HZ:g} Hz" if rate < _LEAST_EVIDENCE_HZ else ""
 
 
 @kernel

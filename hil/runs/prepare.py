@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from controller.calibration.file import Calibration, calibration_for
-from controller.cycle import STATE, cycle_parameters
+from controller.cycle import STATE, cycle_parameters, evidence_remark
 from controller.imu_set import are_few, imus_of, integrity_remark
 from controller.inverse_kinematics import leg_lengths
 from controller.loop_margins import margin_remark
@@ -127,6 +127,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             calibration.remark,
             margin_remark(mechanism, control, fusion, config.rate, config.imus, config.magnetometer),
             integrity_remark(mechanism, fusion, config.imus, config.magnetometer),
+            evidence_remark(mechanism, config.rate, config.fusion == "section-5"),
             aliasing_remark(model, config.rate),
         ]
         count = int(parameters["rig"]["hold_cycles"]) + round(config.duration * config.rate)

@@ -124,6 +124,7 @@ def suited(tmp_path, rate):
 def test_the_loop_follows_at_other_rates(tmp_path, rate):
     result = simulate(SimulationConfig(suited(tmp_path, rate), "sines", 4.0, rate=rate))
     assert not any("gains" in remark for remark in result.remarks)
+    assert any("there is no protection level" in remark for remark in result.remarks) == (rate < 125.0)
     assert errors(result, "tracking") < (3.0, 0.6)
 
 
