@@ -31,7 +31,7 @@ from controller.estimation.whole_mechanism import trust
 from controller.estimation.whole_mechanism.imu_errors import ERRORS
 from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, MOST_STATES, filter_parameters
 from controller.estimation.whole_mechanism.readings import MOTION_STATES, RIG_ERRORS
-from controller.imu_set import check_imus, imus_of
+from controller.imu_set import are_few, check_imus, imus_of
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import RANK_TOLERANCE
 from controller.rig import RIG, TIME, elapsed, field_of, rig_parameters
@@ -49,11 +49,6 @@ from plant.pose import Array
 from plant.stopwatch import now
 
 _LEAST_GRAVITY = 0.1
-_LEAST_JUDGED_IMUS = 5
-"""With fewer, too little contradicts the evidence for a fault. The residuals of the closed form remain, the level, and a wider
-check of what was commanded.
-"""
-
 _LEAST_EVIDENCE_HZ = 125.0
 """Below this rate the motion between two commands is not known well enough for sound IMUs to agree with it."""
 
@@ -172,16 +167,15 @@ def cycle_parameters(
     present = imus_of(mechanism, imus)
     errors, of_heading = (calibration.covariance, calibration.floor), field if magnetometer else None
     filtered = filter_parameters(fusion, rate, whole, *errors, of_heading)
-    able = not mechanism.planar and not section_5 and rate >= _LEAST_EVIDENCE_HZ
+    able = not _without_evidence(mechanism, rate, section_5)
     if watched.watch_imus and not able and min(watched.protection_position, watched.protection_rotation) < np.inf:
         raise InputError(
             f"[safety] limits the protection level, which there is only in space, from {_LEAST_EVIDENCE_HZ:g} Hz on (this is "
             f"{rate:g} Hz) and without the paper's section 5: leave out protection_position and protection_rotation"
         )
     watch_evidence = bool(watched.watch_imus) and able
-    drives_known = drive_settings or DriveSettings()
-    if len(present) < _LEAST_JUDGED_IMUS and not mechanism.planar:
-        watched, drives_known = replace(watched, evidence=np.inf), drives_known.for_few_imus()
+    if are_few(mechanism, imus):
+        watched = replace(watched, evidence=np.inf)
     return filled(
         PARAMETERS,
         rig=rig_parameters(mechanism, rate, control.hold, calibration.tilt),
@@ -194,8 +188,25 @@ def cycle_parameters(
         integrity=integrity.integrity_parameters(fusion, rate, filtered["prior"][:ALL_ERRORS, :ALL_ERRORS], watch_evidence),
         load=load_feed_forward.load_parameters(mechanism, command_delay),
         pid=pid.pid_parameters(control, limits.velocity),
-        safety=safety_stage.safety_parameters(watched, drives_known, mechanism, rate, to_arm),
+        safety=safety_stage.safety_parameters(watched, drive_settings or DriveSettings(), mechanism, rate, to_arm),
     )
+
+
+def evidence_remark(mechanism: Mechanism, rate: float, section_5: bool = False) -> str:
+    """What a user should know where evidence judges no readings, in a line; "" where it does."""
+    where = _without_evidence(mechanism, rate, section_5)
+    return where and (
+        f"{where} an error that the IMUs share is told late, when the estimate has moved otherwise than commanded, and there "
+        "is no protection level (docs/integrity.md)"
+    )
+
+
+def _without_evidence(mechanism: Mechanism, rate: float, section_5: bool) -> str:
+    if mechanism.planar:
+        return "in a plane"
+    if section_5:
+        return "with the paper's section 5"
+    return f"below {_LEAST_EVIDENCE_HZ:g} Hz" if rate < _LEAST_EVIDENCE_HZ else ""
 
 
 @kernel

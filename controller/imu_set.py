@@ -29,6 +29,9 @@ _MOST_ALONG = 0.99
 _LEAST_LEVEL = 1e-6
 """Least level component of a leg that counts as one."""
 
+_LEAST_JUDGED = 5
+"""Of fewer IMUs in space, evidence judges none."""
+
 _LEAST_SHARE = 0.08
 """How much of an IMU's error must show in what the pose leaves over."""
 
@@ -39,6 +42,11 @@ _SINGULAR = 1e-12
 def imus_of(mechanism: Mechanism, imus: Collection[int] = ALL_IMUS) -> tuple[int, ...]:
     """Those of `imus` that the legs of a mechanism and its platform can have."""
     return tuple(imu for imu in ALL_IMUS if imu in imus and (imu < mechanism.legs or imu == PLATFORM_IMU))
+
+
+def are_few(mechanism: Mechanism, imus: Collection[int]) -> bool:
+    """Whether so few IMUs in space contradict each other too little for evidence to judge them."""
+    return not mechanism.planar and len(imus_of(mechanism, imus)) < _LEAST_JUDGED
 
 
 def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool = False, section_5: bool = False) -> float:

@@ -133,10 +133,6 @@ class DriveSettings(_Settings):
     friction: float = 2.5  # greatest friction, as a multiple of the Coulomb friction in the plant data
     slack: float = 0.008  # what lag, play, noise and an IMU before it is left out may leave; inf to ignore the drives [m]
 
-    def for_few_imus(self) -> "DriveSettings":
-        """These settings for fewer than five IMUs, whose estimate of a leg moves by up to 23 mm while the filters settle."""
-        return replace(self, slack=max(self.slack, _FEW_M))
-
     def for_raw_imus(self) -> "DriveSettings":
         """These settings for raw IMUs, whose errors move the pose by centimetres."""
         return replace(self, slack=max(self.slack, _RAW_M))
@@ -161,8 +157,14 @@ def safety_settings(mechanism: Mechanism, **changes: float) -> SafetySettings:
     return _read(SafetySettings, "safety", mechanism, changes)
 
 
-def drive_settings(mechanism: Mechanism, **changes: float) -> DriveSettings:
-    """What is known of the drives of a mechanism, as `control_settings`."""
+def drive_settings(mechanism: Mechanism, few_imus: bool = False, **changes: float) -> DriveSettings:
+    """What is known of the drives of a mechanism, as `control_settings`.
+
+    With few IMUs, whose estimate of a leg moves by up to 23 mm while the filters settle, the slack is wider where the
+    mechanism's file has none.
+    """
+    if few_imus and "slack" not in mechanism.settings.get("drives", {}):
+        changes = {"slack": _FEW_M, **changes}
     return _read(DriveSettings, "drives", mechanism, changes)
 
 

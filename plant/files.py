@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from plant.checks import nearest
 from plant.errors import InputError
 
 _LOCK = "gough.lock"
@@ -60,9 +61,10 @@ def _toml(value: Any) -> str:
 
 
 def unknown_entries(table: Mapping[str, Any], known: Iterable[str], title: str) -> list[str]:
-    """A message for each entry that is not `known`; `title` is what messages call the table."""
+    """A message for each entry that is not `known`, with the one that may be meant; `title` is what messages call the table."""
     names = list(known)
-    return [f"{title} has no entry {entry!r}; it has {', '.join(names)}" for entry in table if entry not in names]
+    has = f"it has {', '.join(names)}"
+    return [f"{title} has no entry {entry!r}; {has}{nearest(entry, names)}" for entry in table if entry not in names]
 
 
 def check_entries(table: Mapping[str, Any], known: Iterable[str], title: str) -> None:

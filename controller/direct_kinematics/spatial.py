@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from controller.direct_kinematics import solver
 from controller.direct_kinematics.geometry import geometry_of
-from controller.direct_kinematics.solver import METHODS, SOLVED, WORK, Measurements, Results, solve_rows
+from controller.direct_kinematics.solver import METHODS, REFUSED, SOLVED, WORK, Measurements, Results, solve_rows
 from plant.compiled import Record
 from plant.errors import InputError, SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
@@ -150,9 +150,12 @@ def solve(
     """
     given = _shapes_checked(leg_directions, rotation, normal, up_in_platform)
     arrays = {name: array[None] for name, array in given.items()}
-    results = _solve(mechanism, arrays, method, refine, (leg_sigma, tilt_sigma, yaw_sigma), 1, "")
-    if results.statuses[0] != SOLVED:
-        raise _error(mechanism, arrays, method, results.statuses[0], 0, "")
+    results = _solve(mechanism, arrays, method, refine, (leg_sigma, tilt_sigma, yaw_sigma), 1)
+    status = results.statuses.item()
+    if status == REFUSED:
+        raise _refusal(arrays, 0, "")
+    if status != SOLVED:
+        raise _error(mechanism, arrays, method, status, 0, "")
     return _solution(results, 0)
 
 
@@ -183,7 +186,9 @@ def solve_batch(
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     where = " of row {row}"
-    results = _solve(mechanism, arrays, method, refine, (leg_sigma, tilt_sigma, yaw_sigma), workers, where)
+    results = _solve(mechanism, arrays, method, refine, (leg_sigma, tilt_sigma, yaw_sigma), workers)
+    for row in np.flatnonzero(results.statuses == REFUSED)[:1].tolist():
+        raise _refusal(arrays, row, where.format(row=row))
     solved = results.statuses == SOLVED
     unsolved = np.flatnonzero(~solved).tolist()
     errors = {row: _error(mechanism, arrays, method, results.statuses[row], row, where) for row in unsolved}
@@ -222,9 +227,8 @@ def _solve(
     refine: bool,
     sigmas: tuple[float, float, float],
     workers: int,
-    where: str,
 ) -> Results:
-    """Solve all rows; an `InputError` if one is refused."""
+    """Solve all rows; an `InputError` if what holds for all of them cannot be used."""
     check_spatial(mechanism)
     if not isinstance(refine, bool | np.bool_):
         raise InputError(f"refine must be True or False, got {refine!r}")
@@ -251,9 +255,6 @@ def _solve(
     else:
         with ThreadPoolExecutor(workers) as pool:
             list(pool.map(solve_chunk, starts))
-    if (refused := results.statuses == solver.REFUSED).any():
-        row = int(refused.argmax())
-        raise _refusal(arrays, row, where.format(row=row))
     return results
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from controller.calibration.file import Calibration, calibration_for
-from controller.cycle import STATE, cycle_parameters
-from controller.imu_set import imus_of, integrity_remark
+from controller.cycle import STATE, cycle_parameters, evidence_remark
+from controller.imu_set import are_few, imus_of, integrity_remark
 from controller.inverse_kinematics import leg_lengths
 from controller.loop_margins import margin_remark
 from controller.planning.offline_planner import Reference, plan
@@ -114,7 +114,8 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         if not least <= control.hold <= most:
             raise InputError(f"hold is {control.hold:g} s; the estimate settles in {least:g} to {most:g} s")
         add_disturbances(imu, (each.later(control.hold) for each in config.disturbances))
-        fusion, safety, drives = sensor_settings(mechanism, model), safety_settings(mechanism), drive_settings(mechanism)
+        fusion, safety = sensor_settings(mechanism, model), safety_settings(mechanism)
+        drives = drive_settings(mechanism, are_few(mechanism, config.imus))
         if config.raw_imus:
             safety, drives = safety.for_raw_imus(), drives.for_raw_imus()
         parameters = cycle_parameters(
@@ -126,6 +127,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             calibration.remark,
             margin_remark(mechanism, control, fusion, config.rate, config.imus, config.magnetometer),
             integrity_remark(mechanism, fusion, config.imus, config.magnetometer),
+            evidence_remark(mechanism, config.rate, config.fusion == "section-5"),
             aliasing_remark(model, config.rate),
         ]
         count = int(parameters["rig"]["hold_cycles"]) + round(config.duration * config.rate)

@@ -1,6 +1,6 @@
 """The names and values that a study may give: fields of a run, entries of a mechanism's file, parameters of the plant."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -9,20 +9,12 @@ from hil.runs.config import SimulationConfig
 from plant.checks import nearest
 from plant.dynamics.variables import PLANAR, SPATIAL
 from plant.errors import InputError
-from plant.files import unknown_entries
+from plant.files import check_entries
 from plant.mechanism.checks import Limits
 from plant.mechanism.joint_circles import ENTRIES as GEOMETRY
 
 PARTS = ("run", "mechanism", "geometry", "plant")
 """What the name of a factor begins with."""
-
-
-def check_entries(table: Mapping[str, Any], known: Iterable[str], title: str) -> None:
-    """As `plant.files.check_entries`, with the name that may be meant."""
-    names = list(known)
-    for entry in table:
-        for message in unknown_entries({entry: None}, names, title):
-            raise InputError(f"{message}{nearest(entry, names)}")
 
 
 def is_whole(value: Any) -> bool:

@@ -13,10 +13,10 @@ import numpy as np
 from hil.runs.config import SimulationConfig
 from hil.runs.names import name_of
 from hil.sweep.function import UserFunction
-from hil.sweep.names import PARTS, check_entries, check_entry, check_factor, check_parameter, is_whole, parsed
+from hil.sweep.names import PARTS, check_entry, check_factor, check_parameter, is_whole, parsed
 from plant.checks import checked_seed, nearest
 from plant.errors import GoughError, InputError
-from plant.files import read_toml
+from plant.files import check_entries, read_toml
 from plant.fmu.settings import Setting
 
 METHODS = ("sobol", "latin-hypercube", "saltelli")

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from plant.checks import nearest
 from plant.errors import InputError, UnknownNameError
 from plant.imu_wiring import IMU_COUNT as IMU_COUNT
 from plant.imu_wiring import PLATFORM_IMU as PLATFORM_IMU
@@ -280,7 +281,7 @@ def checked_parameters(values: Mapping[str, ArrayLike], table: VariableTable = S
     checked = {}
     for name, value in values.items():
         if name not in known:
-            raise UnknownNameError(f"the plant has no parameter {name!r}; it has {', '.join(known)}")
+            raise UnknownNameError(f"the plant has no parameter {name!r}; it has {', '.join(known)}{nearest(name, known)}")
         variable = known[name]
         given = numbers(value, name, variable.shape)
         if given.ndim == 0 and len(variable.shape) == 1:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from controller import cycle as compiled
 from controller.calibration.file import Calibration
-from controller.cycle import STATE, cycle_parameters
+from controller.cycle import STATE, cycle_parameters, evidence_remark
 from controller.direct_kinematics import solve
 from controller.imu_set import check_imus
 from controller.inverse_kinematics import leg_lengths, sample_workspace
@@ -673,6 +673,9 @@ def test_a_limit_of_the_protection_level_needs_one(hexapod):
     settings, limited = (control_settings(hexapod), fusion_settings(hexapod)), SafetySettings(protection_rotation=0.01)
     for rate, active in ((124.0, 0), (125.0, 1)):
         assert cycle_parameters(hexapod, rate, *settings)["integrity"]["filter"]["active"] == active
+        assert evidence_remark(hexapod, rate).startswith("below 125 Hz an error that the IMUs share is told late") != active
+    assert evidence_remark(hexapod, 1000.0, section_5=True).startswith("with the paper's section 5 an error")
+    assert evidence_remark(load_in_space("planar-3rpr"), 1000.0).startswith("in a plane an error")
     cycle_parameters(hexapod, 125.0, *settings, safety=limited)
     with pytest.raises(InputError, match=r"from 125 Hz on \(this is 124 Hz\).*leave out protection_position"):
         cycle_parameters(hexapod, 124.0, *settings, safety=limited)

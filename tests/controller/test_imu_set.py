@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from controller.direct_kinematics import integrity, solve, solve_batch
-from controller.imu_set import check_imus, imus_of, integrity_remark
+from controller.imu_set import are_few, check_imus, imus_of, integrity_remark
 from controller.inverse_kinematics import sample_workspace
 from controller.settings import FusionSettings
 from plant.errors import InputError
@@ -24,6 +24,12 @@ def test_a_planar_mechanism_has_the_imus_of_three_legs_and_the_platform(hexapod)
     assert imus_of(hexapod) == (0, 1, 2, 3, 4, 5, 6)
     assert imus_of(hexapod, [6, 4, 1]) == (1, 4, 6)
     assert imus_of(hexapod, {3}) == (3,)
+
+
+def test_few_are_fewer_than_five_in_space(hexapod):
+    planar = load_in_space("planar-3rpr")
+    assert are_few(hexapod, (0, 1, 3, 4)) and are_few(hexapod, {6, 0, 5}) and not are_few(hexapod, (0, 1, 2, 3, 6))
+    assert not are_few(planar, ALL_IMUS)
 
 
 @pytest.mark.parametrize(

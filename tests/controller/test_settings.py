@@ -59,6 +59,9 @@ def test_the_hexapods_gains_lie_in_the_range_of_the_design(hexapod):
 def test_an_unknown_name_in_a_table_is_refused_with_the_known_ones(hexapod, kind, read, table):
     with pytest.raises(InputError, match="nonsense") as caught:
         read(mechanism_with(hexapod, **{table: {"nonsense": 1.0}}))
+    first = fields(kind)[0].name
+    with pytest.raises(InputError, match=f"did you mean {first!r}"):
+        read(mechanism_with(hexapod, **{table: {first[:2] + first[3:]: 1.0}}))
     assert isinstance(caught.value, GoughError)
     for field in fields(kind):
         assert field.name in str(caught.value)
@@ -179,6 +182,12 @@ def test_ranges_and_rates_without_an_end_are_finite_settings(hexapod):
     assert found.sensor_delay == 0.0
     for value in (found.magnetometer_rate, found.gyroscope_range, found.accelerometer_range):
         assert 1e12 < value < np.inf
+
+
+@pytest.mark.parametrize(("own", "all_imus", "few_imus"), [({}, 0.008, 0.03), ({"slack": 0.004}, 0.004, 0.004)])
+def test_few_imus_have_a_wider_slack_unless_the_file_has_its_own(hexapod, own, all_imus, few_imus):
+    mechanism = mechanism_with(hexapod, drives=own)
+    assert (drive_settings(mechanism).slack, drive_settings(mechanism, few_imus=True).slack) == (all_imus, few_imus)
 
 
 def test_for_raw_imus_the_distances_are_5_cm_at_least_and_no_imu_is_watched():

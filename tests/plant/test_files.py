@@ -33,11 +33,11 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path, content, said):
         read_toml(path)
 
 
-def test_unknown_entries_are_named_with_the_known_ones():
-    table = {"speed": 1, "mass": 2, "color": 3}
+def test_unknown_entries_are_named_with_the_known_ones_and_the_nearest():
+    table = {"speed": 1, "mass": 2, "inertai": 3}
     assert unknown_entries(table, ("mass", "inertia"), "[body]") == [
         "[body] has no entry 'speed'; it has mass, inertia",
-        "[body] has no entry 'color'; it has mass, inertia",
+        "[body] has no entry 'inertai'; it has mass, inertia; did you mean 'inertia'?",
     ]
     check_entries({"mass": 2}, ("mass", "inertia"), "[body]")
     with pytest.raises(InputError, match=r"\[body\] has no entry 'speed'"):

@@ -5,10 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hil.calibration import procedure
 from hil.calibration.drives import within_drives
 from hil.calibration.procedure import FailedCalibrationError, _Rig, calibrate_rig
+from hil.command_line import main
 from hil.recording.mcap import read
 from hil.runs.config import SimulationConfig
+from hil.runs.simulation import simulate
 from plant.errors import InputError
 from plant.imu_wiring import Wiring
 from plant.mechanism import load_mechanism, load_spatial
@@ -68,3 +71,17 @@ def test_a_failure_keeps_its_last_run(tmp_path):
     found = read(kept)
     assert found.complete and len(found.records) == 2500 and found.config["target"] == "probing"
     assert found.arrays["reference"].shape[0] == 6
+
+
+@pytest.mark.slow
+def test_the_report_of_a_failure_is_that_of_its_last_run(tmp_path, monkeypatch, capsys):
+    result = simulate(SimulationConfig(target="rests", duration=0.1))
+
+    def fails(*arguments, **options):
+        raise FailedCalibrationError("the data do not give a calibration", result)
+
+    monkeypatch.setattr(procedure, "calibrate_rig", fails)
+    report = tmp_path / "rig.html"
+    assert main(["calibrate", "rig", str(tmp_path / "rig.toml"), "--report", str(report)]) == 2
+    assert "the data do not give a calibration" in capsys.readouterr().err
+    assert "gough: hexapod follows rests" in report.read_text()

@@ -57,6 +57,7 @@ def test_the_file_is_complete_in_itself_and_small(report, page):
 def test_every_figure_is_there_once(page, traces):
     assert figures_in(page) == FIGURES
     assert page.count("<figcaption>") == len(FIGURES)
+    assert "poses in real time, or as fast as the browser draws them" in page
     assert {name: len(traces[name]) for name in CURVES} == CURVES
 
 

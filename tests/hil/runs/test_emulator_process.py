@@ -9,7 +9,7 @@ import pytest
 
 from hil.rigs.emulation import new_emulated
 from hil.runs.config import EmulatorConfig
-from hil.runs.emulator_process import BusyError, _Control, _findable, _hello, _padded, own_control
+from hil.runs.emulator_process import BusyError, _Control, _findable, _hello, _padded, _UdpSessions, own_control
 from plant.errors import GoughError, InputError
 
 
@@ -126,3 +126,12 @@ def test_the_one_emulator_of_this_user_is_found_and_of_several_one_must_be_named
 def test_a_rig_is_named_after_its_mechanism():
     assert bytes(_padded("gough emulated 6-3-II", 32)) == b"gough emulated 6-3-II" + 11 * b"\0"
     assert bytes(_padded("\u00e9" + 40 * "x", 32)) == b"?" + 31 * b"x"
+
+
+def test_who_else_sends_datagrams_to_a_rig_is_said_once_of_each_and_of_ten_at_most(control):
+    said, told = [], set()
+    sessions = _UdpSessions(control.socket, EmulatorConfig(), [], control, said.append)
+    # Without a port, nobody has sent any yet.
+    for stranger in [("0.0.0.0", 0), *(("10.0.0.7", 4000 + port) for port in (1, 1, *range(1, 31)))]:
+        sessions._tell_stranger(stranger, told)
+    assert said == [f"refused: 10.0.0.7:{4000 + k} sends datagrams that are none of this session's" for k in range(1, 11)]

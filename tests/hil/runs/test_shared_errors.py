@@ -5,6 +5,7 @@ import pytest
 from controller.safety.causes import Cause, Mode
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import SimulationStoppedError, simulate
+from plant.fmu.settings import Setting
 
 MM = 1e-3
 
@@ -90,3 +91,14 @@ def test_the_protection_level_shows_that_few_imus_do_not_check_each_other():
     assert wrong["protection"]["covered"] > 0.7
     for level in ("position_p50", "rotation_p50"):
         assert wrong["protection"][level] > 3.0 * sound["protection"][level]
+
+
+@pytest.mark.parametrize("fusion", ["compiled", "whole"])
+def test_gravity_that_turns_for_all_imus_at_once_is_told_and_said_in_the_summary(fusion):
+    """By 1.5 deg, which looks like a tilt of the platform to all of them: 15 mm before it was told."""
+    turned = Setting.parse("gravity=0.2568,0,-9.8066@1")
+    result, said = stopped(target="hold", duration=2.0, fusion=fusion, settings=(turned,))
+    summary = result.summary()
+    assert int(result.records["stop"][-1]) in (Cause.FORCES_SHARE, Cause.BASE_MOVES)
+    assert summary["events"][-1].endswith(said.split(": ", 1)[1])
+    assert summary["estimation"]["position_max"] < 5.0 * MM

@@ -82,6 +82,23 @@ def test_what_a_calibration_does_not_tell_is_said_before_the_run_and_recorded(tm
     assert simulate(SimulationConfig(duration=0.05)).summary()["remarks"] == []
 
 
+def test_gains_that_do_not_suit_and_imus_that_hardly_check_each_other_are_said_before_the_run_and_recorded(tmp_path):
+    path, said = tmp_path / "quick.toml", []
+    path.write_text('based_on = "hexapod"\n[control]\nproportional = 120.0\nintegral = 400.0\n')
+    result = simulate(SimulationConfig(str(path), duration=0.05, imus=(0, 1, 3, 4, 6)), say=said.append)
+    assert said == result.summary()["remarks"]
+    assert [remark[:9] for remark in said] == ["the gains", "the IMUs "]
+    assert "do not suit" in said[0] and "hardly check each other" in said[1]
+
+
+@pytest.mark.parametrize(("own", "slack"), [("", 0.03), ("[drives]\nslack = 0.004\n", 0.004)])
+def test_a_slack_of_ones_own_holds_with_few_imus(tmp_path, own, slack):
+    path = tmp_path / "own.toml"
+    path.write_text(f'based_on = "hexapod"\n{own}')
+    with prepared_loop(SimulationConfig(str(path), duration=0.05, imus=(0, 1, 3, 4))) as loop:
+        assert loop.parameters["safety"]["drives"]["slack"] == slack
+
+
 def test_a_calibration_of_another_rig_is_refused_before_anything_runs(tmp_path):
     path = tmp_path / "rig.toml"
     about = calibrated_rig(load_mechanism("hexapod"), "mpu9150-calibrated")
@@ -107,6 +124,7 @@ def suited(tmp_path, rate):
 def test_the_loop_follows_at_other_rates(tmp_path, rate):
     result = simulate(SimulationConfig(suited(tmp_path, rate), "sines", 4.0, rate=rate))
     assert not any("gains" in remark for remark in result.remarks)
+    assert any("there is no protection level" in remark for remark in result.remarks) == (rate < 125.0)
     assert errors(result, "tracking") < (3.0, 0.6)
 
 

@@ -70,6 +70,7 @@ def test_the_command_prints_writes_and_draws(tmp_path, capsys):
     assert main(["classify", "6-3-I", "--report", str(report), "--json", str(figures)]) == 0
     printed = capsys.readouterr().out
     assert "n-3-I.1" in printed
+    assert "; its legs, from base joints below to platform joints above:" in printed
     assert "6 legs" in printed
     summary = json.loads(figures.read_text())
     assert summary["class"] == "n-3-I.1"

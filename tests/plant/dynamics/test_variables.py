@@ -54,6 +54,7 @@ def test_a_scalar_is_spread_over_the_legs() -> None:
     [
         ({"platform.weight": 1.0}, UnknownNameError, "the plant has no parameter 'platform.weight'; it has base_joints, "),
         ({"velocity_command": 0.0}, UnknownNameError, "no parameter 'velocity_command'"),
+        ({"platform.mas": 1.0}, UnknownNameError, "; did you mean 'platform.mass'\\?"),
         ({"platform.mass": -1.0}, InputError, "platform.mass is -1 kg; it must be 1e-09 to"),
         ({"motor.resistance": [1, 1, 0, 1, 1, 1]}, InputError, "motor.resistance is 0 Ohm; it must be 1e-09 to"),
         ({"platform.inertia": 1.0}, InputError, r"platform.inertia must have shape \(3, 3\), got \(\)"),
