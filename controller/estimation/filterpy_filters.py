@@ -20,6 +20,7 @@ from controller.estimation.platform_filter import (
     RATE_NOISE,
     SLOWEST_CORRECTION,
     START_CORRECTION,
+    UNSEEN_ACCELERATION,
     VELOCITY,
     YOUNGEST_S,
     begin_platform_step,
@@ -168,7 +169,7 @@ class FilterpyPlatform(_Filterpy):
         up, self.bias, first, self.velocity = np.split(state["x"].copy(), (BIAS, LEVEL, VELOCITY))
         self.axes = np.stack([first, np.cross(up, first), up])
         self.running, self.noise, self.unknown = float(state["running"]), float(state["noise"]), float(state["unknown"])
-        self.force_variance = float(state["force_variance"])
+        self.force_variance, self.clipped_for = float(state["force_variance"]), float(state["clipped_for"])
         self.start(np.zeros(ERRORS), state["covariance"])
 
     def hand_over(self, state: Record) -> None:
@@ -201,7 +202,7 @@ class FilterpyPlatform(_Filterpy):
         self.running += period
         slowest = max(SLOWEST_CORRECTION, START_CORRECTION / (self.running + YOUNGEST_S))
         unknown = (slowest**2 / self.gravity) ** 2 * 2.0 * CORRELATION_S * self.unknown
-        turn = self.rate_density + RATE_NOISE * float(rate @ rate) + unknown
+        turn = self.rate_density + RATE_NOISE * float(rate @ rate) + unknown + UNSEEN_ACCELERATION**2 * self.clipped_for**3
         self.Q = period * np.diag([turn] * 2 + [self.force_variance * period] * 2 + [self.bias_walk] * 3)
         self.F = np.eye(ERRORS)
         self.F[2:4, :2] = period * self.gravity * np.array([[0.0, 1.0], [-1.0, 0.0]])
