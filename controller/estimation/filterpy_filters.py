@@ -18,6 +18,9 @@ from controller.estimation.platform_filter import (
     FASTEST_MOTION,
     LEVEL,
     RATE_NOISE,
+    REST_RATE,
+    REST_VELOCITY,
+    SLOW_TURN,
     SLOWEST_CORRECTION,
     START_CORRECTION,
     UNSEEN_ACCELERATION,
@@ -196,6 +199,12 @@ class FilterpyPlatform(_Filterpy):
         self.noise *= (1.0 - both / (both + 2.0 * self.R.item())) ** 2
         for velocity, axis in zip(self.velocity, np.eye(ERRORS)[2:4], strict=True):
             self.update(-velocity, lambda x, h: h, lambda x, h: h @ x, args=axis[None], hx_args=axis[None])
+        about_vertical = np.array([*np.zeros(4), *self.axes[2]])
+        resting = np.linalg.norm(rate) < REST_RATE and self.unknown < REST_VELOCITY**2
+        if resting and about_vertical @ self.P @ about_vertical > SLOW_TURN**2:
+            self.R = np.array([[SLOW_TURN**2 / period]])
+            row = about_vertical[None]
+            self.update(rate @ self.axes[2], lambda x, h: h, lambda x, h: h @ x, args=row, hx_args=row)
         self._correct()
 
     def _predict_errors(self, rate: Array, period: float) -> None:

@@ -10,6 +10,10 @@ While the gyroscope's reading is clipped, the rate goes on beyond the range, uns
 there on leaves the vertical off by a t^2 / 2 after the time t. So its variance is a^2 t^4 / 4, which grows by a^2 t^3 dt, and
 the accelerometer corrects the vertical soon afterwards.
 
+The bias about the vertical does not show in u before the IMU tilts. So at rest the filter measures that it does not turn about
+the vertical, as `vqf` does (D. Laidig, T. Seel, *VQF: Highly accurate IMU orientation estimation with bias estimation and
+magnetic disturbance rejection*, Information Fusion 91, 2023), but only to `SLOW_TURN`, as a platform may turn slowly for long.
+
 State (11): u, the gyroscope's bias [rad/s], the first level axis in {2}, and the unknown velocity along both level axes [m/s].
 The second level axis is u x the first. Both turn with the rate less its bias, as u does, and point to no heading of note.
 
@@ -50,6 +54,12 @@ START_CORRECTION = 1.5
 """The same soon after the start, times the filter's age [rad]: it forgets what it took for gravity in its first samples."""
 
 YOUNGEST_S = 0.01
+
+REST_RATE, REST_VELOCITY = np.radians(1.0), 1e-3
+"""Below these the IMU seems to be at rest: its rate less its bias [rad/s], and its unknown velocity [m/s]."""
+
+SLOW_TURN = np.radians(0.1)
+"""How fast an IMU that seems to be at rest may turn about the vertical [rad/s]: so well it learns that bias."""
 
 UNSEEN_ACCELERATION = 4.0
 """How fast the rate may change while its reading is clipped [rad/s^2]."""
@@ -279,6 +289,8 @@ def step_platform(
     s.unknown = faded_excess(s.unknown, seen, s.noise, t)
     s.noise += p.force_variance * t * t
     _measure_no_velocity(s, velocity_density(s.unknown) / t)
+    if dot(rate, rate) < REST_RATE**2 and s.unknown < REST_VELOCITY**2:
+        _measure_no_turn(s, rate, t)
     _correct(s, first, second)
 
 
@@ -333,6 +345,18 @@ def _measure_no_velocity(s: Record, variance: float) -> None:
             for j in range(i + 1):
                 c[i, j] -= weight * gain[j]
                 c[j, i] = c[i, j]
+
+
+@kernel
+def _measure_no_turn(s: Record, rate: Vector, t: float) -> None:
+    """Take for a measurement, to `SLOW_TURN` in a second, that the rate [rad/s] about the vertical is bias."""
+    c, gain, up = s.covariance, s.gain, vector(s.x)
+    for i in range(ERRORS):
+        gain[i] = dot(vector(c[i, 4:]), up)
+    variance = dot(vector(gain[4:]), up)
+    if variance > SLOW_TURN**2:
+        innovation = dot(rate, up) - dot(vector(s.change[4:]), up)
+        take_scalar(c, gain, s.change, ERRORS, innovation, variance + SLOW_TURN**2 / t)
 
 
 @kernel

@@ -10,6 +10,7 @@ from controller.estimation.platform_filter import (
     BIAS,
     LEVEL,
     RATE_NOISE,
+    SLOW_TURN,
     STATE,
     TILT_SIGMA,
     UNSEEN_ACCELERATION,
@@ -190,6 +191,24 @@ def test_a_constant_turn_is_tracked_and_its_bias_found(axis):
     # About the vertical a gyroscope's bias cannot be seen; across it, it is found.
     across = np.eye(3) - np.outer(rotation.T @ UP, rotation.T @ UP)
     assert np.linalg.norm(across @ (platform.bias - BIAS_RATE)) < 0.05 * DEGREE
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+@pytest.mark.parametrize(("turn", "believed"), [(0.0, True), (0.05, True), (2.0, False)])
+def test_at_rest_the_bias_about_the_vertical_is_found_to_a_slow_turn_but_no_turn_is_taken_for_it(turn, believed, noise):
+    """Five seconds askew, turning about the vertical at so many deg/s, with the bias of a calibrated gyroscope."""
+    random, rotation = np.random.default_rng(3), rotation_of([0.3, -0.2, 0.0])
+    up = rotation.T @ UP
+    platform = Platform(GRAVITY * up)
+    for _ in range(5000):
+        rate = turn * DEGREE * up + BIAS_RATE
+        platform.step(rate + random.normal(scale=noise, size=3), GRAVITY * up + random.normal(scale=10.0 * noise, size=3))
+    deviation = np.sqrt(up @ platform.covariance[3:, 3:] @ up)
+    if believed:
+        assert abs(up @ (platform.bias - BIAS_RATE)) < 1.5 * SLOW_TURN
+        assert 0.95 * SLOW_TURN < deviation <= SLOW_TURN
+    else:
+        assert abs(up @ platform.bias) < 1e-3 * DEGREE and deviation > 0.99 * FUSION.bias_sigma
 
 
 def test_the_platforms_own_acceleration_is_taken_out_when_it_is_given():

@@ -78,7 +78,7 @@ def test_in_fast_motions_nearly_as_good_as_vqf(kind):
 
 
 def test_a_gyroscope_that_clips_for_a_fifth_of_a_second_costs_less_than_half_of_vqf_s_error():
-    """Of 5-40 Hz the worst motion of the seeds 10 to 19, on which nothing was chosen: 6 deg are lost, which vqf does not know."""
+    """Of 5-40 Hz the worst motion of seeds on which nothing was chosen: 6 deg are lost, which vqf does not know."""
     trial = simulated_trial("5-40 Hz", 15)
     by_vqf = vqf_verticals(1.0 / trial.rate, trial.rates, trial.forces)
     unaware = replace(trial, reach=np.inf)
