@@ -29,7 +29,7 @@ from controller.estimation.integrity import stage as integrity
 from controller.estimation.integrity.protection import end_level
 from controller.estimation.whole_mechanism import trust
 from controller.estimation.whole_mechanism.imu_errors import ERRORS
-from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, MOST_STATES, filter_parameters
+from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, MOST_STATES, filter_parameters, ripple_at
 from controller.estimation.whole_mechanism.readings import MOTION_STATES, RIG_ERRORS
 from controller.imu_set import are_few, check_imus, imus_of
 from controller.inverse_kinematics import legs_at
@@ -166,7 +166,7 @@ def cycle_parameters(
         )
     present = imus_of(mechanism, imus)
     errors, of_heading = (calibration.covariance, calibration.floor), field if magnetometer else None
-    filtered = filter_parameters(fusion, rate, whole, *errors, of_heading)
+    filtered = filter_parameters(fusion, rate, whole, *errors, of_heading, ripple=ripple_at(rate))
     able = not _without_evidence(mechanism, rate, section_5)
     if watched.watch_imus and not able and min(watched.protection_position, watched.protection_rotation) < np.inf:
         raise InputError(

@@ -71,8 +71,8 @@ class FusionSettings(_Settings):
     acceleration_time: float = 0.01  # time constant of the platform's acceleration, the derivative of its twist [s]
     sensor_delay: float = 0.0  # age of the IMUs' readings [s]
     sensor_timing: float = 0.0  # standard deviation of that age [s]
-    gyroscope_range: float = radians(250.0)  # from this size on, a reading is not used [rad/s]
-    accelerometer_range: float = 4.0 * STANDARD_GRAVITY  # from this size on, a reading is not used [m/s^2]
+    gyroscope_range: float = radians(250.0)  # at its end, a reading is not used [rad/s]
+    accelerometer_range: float = 4.0 * STANDARD_GRAVITY  # at its end, a reading is not used [m/s^2]
     # For the whole-mechanism filter, the noise with calibrated IMUs.
     platform_jerk: float = 6.0  # density [m/s^3/sqrt(Hz)]
     platform_angular_jerk: float = 35.0  # density [rad/s^3/sqrt(Hz)]

@@ -18,8 +18,12 @@ from controller.estimation.platform_filter import (
     FASTEST_MOTION,
     LEVEL,
     RATE_NOISE,
+    REST_RATE,
+    REST_VELOCITY,
+    SLOW_TURN,
     SLOWEST_CORRECTION,
     START_CORRECTION,
+    UNSEEN_ACCELERATION,
     VELOCITY,
     YOUNGEST_S,
     begin_platform_step,
@@ -168,7 +172,7 @@ class FilterpyPlatform(_Filterpy):
         up, self.bias, first, self.velocity = np.split(state["x"].copy(), (BIAS, LEVEL, VELOCITY))
         self.axes = np.stack([first, np.cross(up, first), up])
         self.running, self.noise, self.unknown = float(state["running"]), float(state["noise"]), float(state["unknown"])
-        self.force_variance = float(state["force_variance"])
+        self.force_variance, self.clipped_for = float(state["force_variance"]), float(state["clipped_for"])
         self.start(np.zeros(ERRORS), state["covariance"])
 
     def hand_over(self, state: Record) -> None:
@@ -195,13 +199,19 @@ class FilterpyPlatform(_Filterpy):
         self.noise *= (1.0 - both / (both + 2.0 * self.R.item())) ** 2
         for velocity, axis in zip(self.velocity, np.eye(ERRORS)[2:4], strict=True):
             self.update(-velocity, lambda x, h: h, lambda x, h: h @ x, args=axis[None], hx_args=axis[None])
+        about_vertical = np.array([*np.zeros(4), *self.axes[2]])
+        resting = np.linalg.norm(rate) < REST_RATE and self.unknown < REST_VELOCITY**2
+        if resting and about_vertical @ self.P @ about_vertical > SLOW_TURN**2:
+            self.R = np.array([[SLOW_TURN**2 / period]])
+            row = about_vertical[None]
+            self.update(rate @ self.axes[2], lambda x, h: h, lambda x, h: h @ x, args=row, hx_args=row)
         self._correct()
 
     def _predict_errors(self, rate: Array, period: float) -> None:
         self.running += period
         slowest = max(SLOWEST_CORRECTION, START_CORRECTION / (self.running + YOUNGEST_S))
         unknown = (slowest**2 / self.gravity) ** 2 * 2.0 * CORRELATION_S * self.unknown
-        turn = self.rate_density + RATE_NOISE * float(rate @ rate) + unknown
+        turn = self.rate_density + RATE_NOISE * float(rate @ rate) + unknown + UNSEEN_ACCELERATION**2 * self.clipped_for**3
         self.Q = period * np.diag([turn] * 2 + [self.force_variance * period] * 2 + [self.bias_walk] * 3)
         self.F = np.eye(ERRORS)
         self.F[2:4, :2] = period * self.gravity * np.array([[0.0, 1.0], [-1.0, 0.0]])

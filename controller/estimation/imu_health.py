@@ -12,6 +12,9 @@ from plant.compiled import Record, filled, kernel, record_dtype, shared_kernel
 from plant.dynamics.variables import IMU_COUNT
 from plant.pose import Array
 
+END_OF_RANGE = 0.999
+"""From this share of its range on a reading is clipped: the largest one of 12 bits is a step short of the range, 5e-4 of it."""
+
 _FROZEN_S = 0.01
 """How long an IMU may repeat its reading while others do not, or while the legs must have moved [s]."""
 
@@ -40,7 +43,7 @@ PARAMETERS = record_dtype(
     present=(np.int64, IMU_COUNT),  # which IMUs there are
     gain=(np.float64, (3, IMU_COUNT, 3, 3)),  # a calibrated reading is gain times the raw one plus offset
     offset=(np.float64, (3, IMU_COUNT, 3)),
-    range=(np.float64, 2),  # of gyroscope and accelerometer; a reading this large is invalid [rad/s, m/s^2]
+    range=(np.float64, 2),  # of gyroscope and accelerometer; the end of which is invalid [rad/s, m/s^2]
     noise=(np.float64, 2),  # limits of gyroscope and accelerometer, RMS [rad/s, m/s^2]
     noise_smoothing=np.float64,  # share of a new sample in the average
     frozen_cycles=np.int64,  # these three: the durations above
@@ -158,12 +161,12 @@ def screen_imus(
                     finite = finite and bool(np.isfinite(raw))
                     most = max(most, abs(raw))
             if kind < 2:
-                s.shaking.clipped[kind, k] = most >= p.range[kind]
+                s.shaking.clipped[kind, k] = most >= END_OF_RANGE * p.range[kind]
                 reached = max(reached, most / p.range[kind])
         if not finite:
             cause, value, limit = Cause.IMU_NOT_FINITE.value, np.nan, np.nan
         elif not shaking.bridges(p.shaking, s.shaking, k, s.healthy[k], time.missed):
-            cause, value, limit = Cause.IMU_OUT_OF_RANGE.value, reached, 1.0
+            cause, value, limit = Cause.IMU_OUT_OF_RANGE.value, reached, END_OF_RANGE
         if p.present[k] == 0:
             continue
         before, healthy = s.healthy[k], cause == Cause.NONE

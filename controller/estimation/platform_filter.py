@@ -6,6 +6,14 @@ integral, a velocity, stays small. So the filter integrates what the acceleromet
 this velocity is zero, with a noise as large as the velocity is seen to be (`excess`). If the acceleration is known, that noise
 is zero, and the filter takes each reading for gravity. If it is not, the filter averages over seconds.
 
+While the gyroscope's reading is clipped, the rate goes on beyond the range, unseen. A constant angular acceleration a from
+there on leaves the vertical off by a t^2 / 2 after the time t. So its variance is a^2 t^4 / 4, which grows by a^2 t^3 dt, and
+the accelerometer corrects the vertical soon afterwards.
+
+The bias about the vertical does not show in u before the IMU tilts. So at rest the filter measures that it does not turn about
+the vertical, as `vqf` does (D. Laidig, T. Seel, *VQF: Highly accurate IMU orientation estimation with bias estimation and
+magnetic disturbance rejection*, Information Fusion 91, 2023), but only to `SLOW_TURN`, as a platform may turn slowly for long.
+
 State (11): u, the gyroscope's bias [rad/s], the first level axis in {2}, and the unknown velocity along both level axes [m/s].
 The second level axis is u x the first. Both turn with the rate less its bias, as u does, and point to no heading of note.
 
@@ -47,6 +55,15 @@ START_CORRECTION = 1.5
 
 YOUNGEST_S = 0.01
 
+REST_RATE, REST_VELOCITY = np.radians(1.0), 1e-3
+"""Below these the IMU seems to be at rest: its rate less its bias [rad/s], and its unknown velocity [m/s]."""
+
+SLOW_TURN = np.radians(0.1)
+"""How fast an IMU that seems to be at rest may turn about the vertical [rad/s]: so well it learns that bias."""
+
+UNSEEN_ACCELERATION = 4.0
+"""How fast the rate may change while its reading is clipped [rad/s^2]."""
+
 ACCELERATION_SIGMA = 2.0
 """Least uncertainty of what is known of the IMU's own acceleration: as the brakes open, and as legs jerk [m/s^2]."""
 
@@ -71,6 +88,7 @@ STATE = record_dtype(
     unknown=np.float64,  # square of the velocity beyond what noise explains, faded [m^2/s^2]
     noise=np.float64,  # variance of the velocity that the accelerometer's noise alone would cause [m^2/s^2]
     running=np.float64,  # time since the start [s]
+    clipped_for=np.float64,  # time since the rate was last seen, as the gyroscope's reading is clipped [s]
     age=np.int64,  # for how many cycles the filter has run
     used=np.int64,  # whether the vertical is used
     weight=np.float64,  # of the vertical in the refinement
@@ -127,7 +145,9 @@ def begin_platform_step(p: Record, s: Record, rig: Record, time: Record, imus: R
         start_platform(p, s, force)
     rate = s.gyroscope
     rate[:] = imus.sample[GYROSCOPE, PLATFORM_IMU]
-    if is_clipped(imus.shaking, GYROSCOPE, PLATFORM_IMU):
+    clipped = is_clipped(imus.shaking, GYROSCOPE, PLATFORM_IMU)
+    note_clipping(s, clipped, elapsed(rig, time))
+    if clipped:
         # The others know the platform's rate, too.
         known = rotate_back(pose.rotation, vector(pose.twist[3:]))
         for i in range(3):
@@ -146,6 +166,12 @@ def begin_platform_step(p: Record, s: Record, rig: Record, time: Record, imus: R
     note_force(imus.shaking, PLATFORM_IMU, dot(off, off), explained, elapsed(rig, time))
     s.force_variance = variance_of(imus.shaking, ACCELEROMETER, PLATFORM_IMU, p.force_variance)
     return True
+
+
+@kernel
+def note_clipping(s: Record, clipped: bool, period: float) -> None:
+    """Note whether the gyroscope's reading is clipped, before the filter's step; `period` is since the sample before [s]."""
+    s.clipped_for = s.clipped_for + period if clipped else 0.0
 
 
 @kernel
@@ -229,7 +255,7 @@ def start_platform(p: Record, s: Record, accelerometer: Array) -> None:
     s.x[LEVEL + np.argmin(np.abs(s.x[:3]))] = 1.0
     make_level(s.x[LEVEL:VELOCITY], up)
     s.covariance[0, 0] = s.covariance[1, 1] = TILT_SIGMA**2
-    s.unknown = s.noise = s.running = 0.0
+    s.unknown = s.noise = s.running = s.clipped_for = 0.0
     s.force_variance = p.force_variance
 
 
@@ -263,6 +289,8 @@ def step_platform(
     s.unknown = faded_excess(s.unknown, seen, s.noise, t)
     s.noise += p.force_variance * t * t
     _measure_no_velocity(s, velocity_density(s.unknown) / t)
+    if dot(rate, rate) < REST_RATE**2 and s.unknown < REST_VELOCITY**2:
+        _measure_no_turn(s, rate, t)
     _correct(s, first, second)
 
 
@@ -279,6 +307,7 @@ def _predict_covariance(p: Record, s: Record, first: Vector, second: Vector, rat
     s.running += t
     slowest = max(SLOWEST_CORRECTION, START_CORRECTION / (s.running + YOUNGEST_S))
     turn = p.rate_density + RATE_NOISE * dot(rate, rate) + slowest**4 / gravity**2 * velocity_density(s.unknown)
+    turn += UNSEEN_ACCELERATION**2 * s.clipped_for**3
     for i in range(ERRORS):
         c[2, i] += lean * c[1, i]
         c[3, i] -= lean * c[0, i]
@@ -316,6 +345,18 @@ def _measure_no_velocity(s: Record, variance: float) -> None:
             for j in range(i + 1):
                 c[i, j] -= weight * gain[j]
                 c[j, i] = c[i, j]
+
+
+@kernel
+def _measure_no_turn(s: Record, rate: Vector, t: float) -> None:
+    """Take for a measurement, to `SLOW_TURN` in a second, that the rate [rad/s] about the vertical is bias."""
+    c, gain, up = s.covariance, s.gain, vector(s.x)
+    for i in range(ERRORS):
+        gain[i] = dot(vector(c[i, 4:]), up)
+    variance = dot(vector(gain[4:]), up)
+    if variance > SLOW_TURN**2:
+        innovation = dot(rate, up) - dot(vector(s.change[4:]), up)
+        take_scalar(c, gain, s.change, ERRORS, innovation, variance + SLOW_TURN**2 / t)
 
 
 @kernel

@@ -25,7 +25,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.estimation.platform_filter import STATE, platform_parameters, start_platform, step_platform
+from controller.estimation.imu_health import END_OF_RANGE
+from controller.estimation.platform_filter import STATE, note_clipping, platform_parameters, start_platform, step_platform
 from controller.settings import FusionSettings
 from hil.engine.engine import IN_ONE_PROCESS, Engine
 from hil.studies.fusion_comparison import vqf_verticals
@@ -47,7 +48,8 @@ _UNIT_TOLERANCE = 1e-3
 class Trial:
     """A trial: its rate [Hz], and the IMU's rates and forces (N, 3) [rad/s, m/s^2].
 
-    `verticals` (N, 3) are the true ones in the sensor's frame. Only samples with `counts` (N,) count.
+    `verticals` (N, 3) are the true ones in the sensor's frame. Only samples with `counts` (N,) count. The gyroscope's readings
+    are clipped at its `reach` [rad/s]; infinity if that is not known.
     """
 
     name: str
@@ -56,6 +58,7 @@ class Trial:
     forces: Array
     verticals: Array
     counts: NDArray[np.bool_]
+    reach: float = np.inf
 
     def inclination_rms(self, verticals: Array) -> float:
         """RMS of the angle between verticals (N, 3) and the true ones [rad], over the samples that count."""
@@ -112,13 +115,15 @@ def _evaluate_motion(fusion: FusionSettings, kind: str, seed: int) -> tuple[str,
 
 def simulated_trial(kind: str, seed: int, duration: float = 120.0, rate: float = 250.0) -> Trial:
     """A trial of a free motion (`move_freely`) with an IMU `mpu9150-calibrated`, whose errors have the same seed."""
-    motion, imu = move_freely(kind, duration, rate, seed), imu_state(load_imu(_IMU), seed, 1.0 / rate)
+    model = load_imu(_IMU)
+    motion, imu = move_freely(kind, duration, rate, seed), imu_state(model, seed, 1.0 / rate)
     ideal, raw = np.zeros((3, IMU_COUNT, 3)), np.empty((len(motion.times), 3, IMU_COUNT, 3))
     for rates, forces, sample in zip(motion.rates, motion.forces, raw, strict=True):
         ideal[GYROSCOPE, PLATFORM_IMU], ideal[ACCELEROMETER, PLATFORM_IMU] = rates, forces
         measure(imu, ideal, sample)
     gyroscope, accelerometer = (np.ascontiguousarray(raw[:, kind, PLATFORM_IMU]) for kind in (GYROSCOPE, ACCELEROMETER))
-    return Trial(f"{kind}, seed {seed}", rate, gyroscope, accelerometer, motion.rotations[:, 2], motion.times >= STILL_S)
+    verticals, counts = motion.rotations[:, 2], motion.times >= STILL_S
+    return Trial(f"{kind}, seed {seed}", rate, gyroscope, accelerometer, verticals, counts, model.gyroscope.reach)
 
 
 def load_trial(path: Path) -> Trial:
@@ -172,15 +177,17 @@ def _score(trial: Trial, method: Callable[[], Array]) -> dict[str, float]:
 def filter_verticals(trial: Trial, fusion: FusionSettings) -> Array:
     """The verticals (N, 3) by the platform filter, which does not know the acceleration."""
     parameters = platform_parameters(fusion, trial.rate)
-    return _follow(parameters, np.zeros((), STATE), trial.rates, trial.forces, 1.0 / trial.rate)
+    return _follow(parameters, np.zeros((), STATE), trial.rates, trial.forces, 1.0 / trial.rate, END_OF_RANGE * trial.reach)
 
 
 @kernel
-def _follow(parameters: Record, state: Record, rates: Array, forces: Array, period: float) -> Array:
+def _follow(parameters: Record, state: Record, rates: Array, forces: Array, period: float, end: float) -> Array:
     p, s = parameters[()], state[()]
     acceleration, verticals = np.zeros(3), np.empty_like(forces)
     start_platform(p, s, forces[0])
     for i in range(rates.shape[0]):
+        most = max(abs(rates[i, 0]), abs(rates[i, 1]), abs(rates[i, 2]))
+        note_clipping(s, most >= end, period)
         step_platform(p, s, rates[i], forces[i], acceleration, period, STANDARD_GRAVITY)
         verticals[i] = s.x[:3]
     return verticals

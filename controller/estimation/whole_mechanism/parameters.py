@@ -23,8 +23,8 @@ WINDOW_S = 0.005
 _SMOOTHING_S = 0.03
 
 _LASTING = 6.0
-"""What the time of a sample is off lasts for a whole acceleration, some thirty windows. So each counts as the root of that
-number; chosen on steps with two kinds of IMUs.
+"""What the time of a sample is off, or a ripple, lasts for a whole acceleration, some thirty windows. So each counts as the root
+of that number; chosen on steps with two kinds of IMUs.
 """
 
 _RIPPLE_HZ = 150.0
@@ -96,7 +96,7 @@ FILTER_STATE = record_dtype(
 
 def filter_parameters(
     fusion: FusionSettings, rate: float, errors: str | None, covariance: Array | None, floor: Array | None = None,
-    field: MagneticField | None = None, inflation: float | None = None,
+    field: MagneticField | None = None, inflation: float | None = None, ripple: float = 0.0,
 ) -> Record:  # fmt: skip
     """Constants of the filter.
 
@@ -109,6 +109,7 @@ def filter_parameters(
         floor: (2,) [m, rad], standard deviations of position and rotation that joints and tilt leave; None if they are exact.
         field: of the earth, for the platform's magnetometer; None without one.
         inflation: times the noise and the jerk; None for 1 with a covariance, and what the settings say without.
+        ripple: `ripple_at` the loop's rate if drives are commanded at this rate.
 
     Raises:
         UnknownNameError: no such block of errors.
@@ -141,7 +142,7 @@ def filter_parameters(
         bias_walk=(fusion.bias_walk**2, fusion.accelerometer_bias_walk**2),
         variance=noise**2 * rate / 2.0,
         timing_variance=(_LASTING * fusion.sensor_timing) ** 2,
-        ripple=(_LASTING * ripple_at(rate)) ** 2,
+        ripple=(_LASTING * ripple) ** 2,
         prior=prior,
         floor=np.zeros(2) if floor is None else floor**2 / 3.0,
     )

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from controller.estimation import shaking
 from controller.estimation.filterpy_filters import STATES, FilterpyLeg, FilterpyPlatform
 from controller.estimation.leg_filter import force_doubt, predict_leg, predict_measurement, start_leg, take_leg_sample
-from controller.estimation.platform_filter import STATE, platform_parameters, start_platform, step_platform
+from controller.estimation.platform_filter import STATE, note_clipping, platform_parameters, start_platform, step_platform
 from controller.settings import FusionSettings
 from plant.imu import GYROSCOPE
 from tests.controller.leg_geometry import unit
@@ -124,7 +124,7 @@ def test_a_prediction_agrees_for_any_covariance_and_period(seed, exponent):
 
 @pytest.mark.parametrize(("rate", "known", "seed"), [(1000.0, 1.0, 0), (250.0, 1.0, 1), (4000.0, 1.0, 2), (500.0, 0.0, 3)])
 def test_five_thousand_steps_of_the_platform_agree_with_the_compiled_filter(rate, known, seed):
-    """With an acceleration that is known, or is not, jolts, and a rest: with and without an unknown velocity."""
+    """With an acceleration that is known, or is not, jolts, clipped rates, and a rest: with and without an unknown velocity."""
     random, fusion = np.random.default_rng(seed), FusionSettings()
     times = np.arange(5000)[:, None] / rate
     moving = np.where(np.arange(5000) < 3000, 1.0, 0.0)[:, None]
@@ -140,7 +140,10 @@ def test_five_thousand_steps_of_the_platform_agree_with_the_compiled_filter(rate
     reference.take_over(state)
     worst, excess = np.zeros(3), []
     velocity_noise = float(parameters["force_variance"]) / rate**2
-    for rates, forces, own in zip(gyroscope, force, known * acceleration, strict=True):
+    clipped = np.abs(gyroscope).max(axis=1) > 1.98
+    for rates, forces, own, beyond in zip(gyroscope, force, known * acceleration, clipped, strict=True):
+        note_clipping(state, beyond, 1.0 / rate)
+        reference.clipped_for = float(state["clipped_for"])
         reference.step(rates, forces, own, 1.0 / rate)
         step_platform(parameters, state, rates, forces, own, 1.0 / rate, GRAVITY)
         reference.hand_over(handed)
@@ -151,4 +154,4 @@ def test_five_thousand_steps_of_the_platform_agree_with_the_compiled_filter(rate
         worst = np.maximum(worst, [np.abs(difference).max() for difference in (state["x"] - handed["x"], off, unknown)])
         excess.append(float(state["unknown"]))
     assert worst.max() < 1e-11
-    assert max(excess) > 0.0
+    assert max(excess) > 0.0 and clipped.sum() > 10

@@ -7,10 +7,10 @@ import pytest
 
 from controller.calibration.file import Calibration
 from controller.cycle import STATE, CycleStage, cycle_parameters
-from controller.estimation.imu_health import imu_parameters
+from controller.estimation.imu_health import END_OF_RANGE, imu_parameters
 from controller.safety.causes import Cause
 from controller.settings import FusionSettings, SafetySettings, control_settings, fusion_settings
-from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER
+from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER, PRESETS
 from plant.imu_wiring import ALL_IMUS
 from plant.mechanism import load_in_space
 from tests.controller.cycles import run_stages
@@ -213,6 +213,15 @@ def test_an_imu_that_is_not_there_does_not_show_that_others_stand_still(hexapod)
     assert screening.used == [0, 1, 2, 4, 5, 6]
 
 
+@pytest.mark.parametrize("imu", ["mpu9150", "icm42688-nominal"])
+@pytest.mark.parametrize("sensor", ["gyroscope", "accelerometer"])
+def test_the_largest_readings_of_12_bits_and_of_whole_steps_are_at_the_end_of_the_range(imu, sensor):
+    """Of 12 bits, the largest is a step short of the range; whole steps may add up to a rounding less than the range."""
+    errors = getattr(PRESETS[imu], sensor)
+    in_steps = np.rint(errors.reach / errors.resolution) * errors.resolution
+    assert END_OF_RANGE * errors.reach < min(in_steps, errors.reach * (1.0 - 2.0**-11))
+
+
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 @pytest.mark.parametrize(("kind", "reach"), [(GYROSCOPE, np.radians(250.0)), (ACCELEROMETER, 4.0 * 9.80665)])
 @pytest.mark.parametrize(("imu", "axis"), [(0, 0), (3, 1), (6, 2)])
@@ -225,14 +234,14 @@ def test_a_reading_is_in_range_below_the_limit_and_out_of_it_at_the_limit(hexapo
 
     for _ in range(2 * HEALTHY):
         screening.step()
-    assert screening.step(spoil(1.0 - 1e-9)) == []
+    assert screening.step(spoil(END_OF_RANGE - 1e-9)) == []
     # For 50 ms, others bridge it; that is told once.
     ((cause, at, *_),) = screening.step(spoil(1.0))
     assert (cause, at) == (Cause.BRIDGED, imu) and screening.used == list(ALL_IMUS)
     for _ in range(BRIDGED - 1):
         assert screening.step(spoil(1.0)) == []
     ((cause, at, value, limit),) = screening.step(spoil(1.5))
-    assert (cause, at, limit) == (Cause.IMU_OUT_OF_RANGE, imu, 1.0) and screening.used == screening.without(imu)
+    assert (cause, at, limit) == (Cause.IMU_OUT_OF_RANGE, imu, END_OF_RANGE) and screening.used == screening.without(imu)
     assert value == pytest.approx(1.5, rel=1e-12)
     # While it is left out, one such reading begins the wait anew.
     for _ in range(HEALTHY):

@@ -10,8 +10,11 @@ from controller.estimation.platform_filter import (
     BIAS,
     LEVEL,
     RATE_NOISE,
+    SLOW_TURN,
     STATE,
     TILT_SIGMA,
+    UNSEEN_ACCELERATION,
+    note_clipping,
     platform_parameters,
     start_platform,
     step_platform,
@@ -38,7 +41,8 @@ class Platform:
         self.state, self.period = np.zeros((), STATE)[()], period
         start_platform(self.parameters, self.state, accelerometer)
 
-    def step(self, gyroscope, accelerometer, acceleration=(0.0, 0.0, 0.0)):
+    def step(self, gyroscope, accelerometer, acceleration=(0.0, 0.0, 0.0), clipped=False):
+        note_clipping(self.state, clipped, self.period)
         sample = (gyroscope, accelerometer, np.asarray(acceleration, dtype=float))
         step_platform(self.parameters, self.state, *sample, self.period, GRAVITY)
 
@@ -189,6 +193,24 @@ def test_a_constant_turn_is_tracked_and_its_bias_found(axis):
     assert np.linalg.norm(across @ (platform.bias - BIAS_RATE)) < 0.05 * DEGREE
 
 
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+@pytest.mark.parametrize(("turn", "believed"), [(0.0, True), (0.05, True), (2.0, False)])
+def test_at_rest_the_bias_about_the_vertical_is_found_to_a_slow_turn_but_no_turn_is_taken_for_it(turn, believed, noise):
+    """Five seconds askew, turning about the vertical at so many deg/s, with the bias of a calibrated gyroscope."""
+    random, rotation = np.random.default_rng(3), rotation_of([0.3, -0.2, 0.0])
+    up = rotation.T @ UP
+    platform = Platform(GRAVITY * up)
+    for _ in range(5000):
+        rate = turn * DEGREE * up + BIAS_RATE
+        platform.step(rate + random.normal(scale=noise, size=3), GRAVITY * up + random.normal(scale=10.0 * noise, size=3))
+    deviation = np.sqrt(up @ platform.covariance[3:, 3:] @ up)
+    if believed:
+        assert abs(up @ (platform.bias - BIAS_RATE)) < 1.5 * SLOW_TURN
+        assert 0.95 * SLOW_TURN < deviation <= SLOW_TURN
+    else:
+        assert abs(up @ platform.bias) < 1e-3 * DEGREE and deviation > 0.99 * FUSION.bias_sigma
+
+
 def test_the_platforms_own_acceleration_is_taken_out_when_it_is_given():
     rotations, rates = tumbling(4, 4000, speed=0.3)
     times = PERIOD_S * np.arange(4000)[:, None]
@@ -231,6 +253,42 @@ def test_an_unknown_acceleration_of_10_m_s2_moves_the_vertical_by_less_than_a_de
     assert max(np.array(excess)[at_rest]) < 1e-4
     assert min(np.array(excess)[moved]) > 0.05
     assert excess[-1] < 0.02 * max(excess)
+
+
+def test_a_clipped_rate_leaves_the_vertical_as_uncertain_as_a_constant_acceleration_beyond_the_range_turns_it():
+    platform, period = Platform(GRAVITY * UP, period=1e-4), 1e-4
+    platform.parameters["force_variance"] = platform.state["force_variance"] = 1e12
+    before = platform.covariance
+    for k in range(1, 3001):
+        platform.step(np.zeros(3), GRAVITY * UP, clipped=True)
+        if k % 1000 == 0:
+            grown = np.diagonal(platform.covariance - before)[:2] - (k * period * FUSION.bias_sigma) ** 2
+            beyond = UNSEEN_ACCELERATION * (k * period) ** 2 / 2.0
+            np.testing.assert_allclose(np.sqrt(grown), beyond, rtol=5e-3)
+    platform.step(np.zeros(3), GRAVITY * UP)
+    assert platform.state["clipped_for"] == 0.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_a_clipped_rate_turns_the_vertical_is_forgotten_within_two_seconds_on_a_shaken_platform(seed):
+    """A turn of half a second at up to 4.8 rad/s, of which a gyroscope shows 4 rad/s: 15 degrees are lost."""
+    random, rate, reach = np.random.default_rng(seed), 250.0, 4.0
+    times = np.arange(round(14.0 * rate)) / rate
+    turns = np.zeros((len(times), 3))
+    turns[:, 0] = np.where(abs(times - 8.0) < 0.25, reach + 0.8 * np.cos(2.0 * np.pi * (times - 8.0)), 0.0)
+    shaking = 6.0 * np.sin(2.0 * np.pi * random.uniform(6.0, 20.0, 3) * times[:, None] + random.uniform(0.0, 6.3, 3))
+    rotation, errors = np.eye(3), []
+    knowing, ignorant = (Platform(GRAVITY * UP, period=1.0 / rate) for _ in range(2))
+    for turn, shaken in zip(turns, shaking, strict=True):
+        rotation = rotation @ rotation_of(turn / rate)
+        reading, force = np.minimum(turn, reach), rotation.T @ (GRAVITY * UP + shaken)
+        knowing.step(reading, force, clipped=turn[0] >= reach)
+        ignorant.step(reading, force)
+        errors.append([tilt_error(platform.vertical, rotation) for platform in (knowing, ignorant)])
+    errors, soon = np.array(errors), times > 10.25
+    assert np.max(errors[:, 0]) > 10.0 * DEGREE
+    assert np.max(errors[soon, 0]) < 0.5 * DEGREE
+    assert np.max(errors[soon, 1]) > 5.0 * DEGREE
 
 
 def test_the_vertical_stays_unit_and_the_covariance_positive_definite_over_twenty_seconds():

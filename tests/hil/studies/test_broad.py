@@ -1,6 +1,7 @@
 """The platform's filter on the BROAD benchmark: its real trials beside VQF, and made-up ones against what went in."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -74,6 +75,15 @@ def test_in_fast_motions_nearly_as_good_as_vqf(kind):
     trial = simulated_trial(kind, 31, duration=60.0)
     by_vqf = vqf_verticals(1.0 / trial.rate, trial.rates, trial.forces)
     assert trial.inclination_rms(filter_verticals(trial, FusionSettings())) < 1.5 * trial.inclination_rms(by_vqf)
+
+
+def test_a_gyroscope_that_clips_for_a_fifth_of_a_second_costs_less_than_half_of_vqf_s_error():
+    """Of 5-40 Hz the worst motion of seeds on which nothing was chosen: 6 deg are lost, which vqf does not know."""
+    trial = simulated_trial("5-40 Hz", 15)
+    by_vqf = vqf_verticals(1.0 / trial.rate, trial.rates, trial.forces)
+    unaware = replace(trial, reach=np.inf)
+    assert trial.inclination_rms(filter_verticals(trial, FusionSettings())) < 0.5 * trial.inclination_rms(by_vqf)
+    assert trial.inclination_rms(filter_verticals(unaware, FusionSettings())) > 1.5 * trial.inclination_rms(by_vqf)
 
 
 @pytest.mark.slow

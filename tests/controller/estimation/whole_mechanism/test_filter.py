@@ -15,7 +15,14 @@ from controller.estimation.whole_mechanism.filter import (
 )
 from controller.estimation.whole_mechanism.imu_errors import ERRORS, distort, error_gradient
 from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, BLOCKS, FILTER_STATE, MOTION_STATES, filter_parameters
-from controller.estimation.whole_mechanism.readings import JOINTS, READINGS_SCRATCH, RIG_ERRORS, TILT, predict_readings
+from controller.estimation.whole_mechanism.readings import (
+    ACCELERATION,
+    JOINTS,
+    READINGS_SCRATCH,
+    RIG_ERRORS,
+    TILT,
+    predict_readings,
+)
 from controller.rig import field_of, sensor_geometry
 from controller.settings import FusionSettings, fusion_settings
 from plant.dynamics.imposed_motion import impose
@@ -209,7 +216,8 @@ class Twin:
                 row[:, 18 + 7 * self.n :] = matrix @ back @ by_rig[k, part]
                 rows.append(row)
                 innovations.append(samples[k, part] - matrix @ x - self.errors[k, part] - row[:, 18 + 7 * self.n :] @ self.rig)
-                variances += [self.p["variance"][sensor] / count[k]] * 3
+                ripple = self.p["ripple"] * self.smooth[ACCELERATION] @ self.smooth[ACCELERATION] if sensor == 1 else 0.0
+                variances += [self.p["variance"][sensor] / count[k] + ripple] * 3
         h, innovation = np.vstack(rows), np.concatenate(innovations)
         gain = np.linalg.solve(h @ self.covariance @ h.T + np.diag(variances), h @ self.covariance).T
         change = gain @ innovation
@@ -247,6 +255,7 @@ def test_taken_bit_by_bit_it_equals_its_dense_twin(hexapod, errors, rig, toleran
         spread = np.diag(np.sqrt(np.concatenate([np.diag(prior), np.full(JOINTS, 1e-8), np.full(TILT, 1e-6)])))
         covariance = spread @ (np.eye(len(mixed)) + mixed @ mixed.T / len(mixed)) @ spread
         parameters = filter_parameters(settings, RATE_HZ, errors, covariance)
+    parameters["ripple"] = 0.04
     geometry, state = sensor_geometry(hexapod)[()], np.zeros((), FILTER_STATE)
     turn = (motion.rotations[1] @ motion.rotations[0].T - np.eye(3)) * RATE_HZ
     velocity = (motion.positions[1] - motion.positions[0]) * RATE_HZ
@@ -474,6 +483,22 @@ def test_a_reading_that_changes_counts_less_where_times_are_uncertain(hexapod):
         state["change_per_second"] = 0.4
         parameters["timing_variance"] = timing**2
         parameters["variance"] += 5 * (noise * 0.4) ** 2
+        state["sample_weight"], state["row"] = 5.0, 0
+        _update_rows(parameters[()], state[()], 42)
+        found.append(state["covariance"].copy())
+    np.testing.assert_allclose(*found, rtol=1e-12, atol=1e-18)
+
+
+def test_a_force_counts_less_while_steps_of_the_commands_make_it_ripple(hexapod):
+    """As much as with the noise of that ripple, for all samples of a window alike; angular velocities do not ripple."""
+    found, share, acceleration = [], 0.3, np.array([1.0, -2.0, 2.0])
+    for ripple, noise in ((share, 0.0), (0.0, 3.0 * share)):
+        parameters = filter_parameters(FusionSettings(), RATE_HZ, "accelerometers", None)
+        state = np.zeros((), FILTER_STATE)
+        start_filter(parameters[()], state[()], 0.0, hexapod.home.position, np.eye(3), np.zeros(6))
+        state["smooth_motion"][ACCELERATION] = acceleration
+        parameters["ripple"] = ripple**2
+        parameters["variance"][1] += 5 * noise**2
         state["sample_weight"], state["row"] = 5.0, 0
         _update_rows(parameters[()], state[()], 42)
         found.append(state["covariance"].copy())
