@@ -23,8 +23,8 @@ WINDOW_S = 0.005
 _SMOOTHING_S = 0.03
 
 _LASTING = 6.0
-"""What the time of a sample is off, or a ripple, lasts for a whole acceleration, some thirty windows. So each counts as the root
-of that number; chosen on steps with two kinds of IMUs.
+"""What the time of a sample is off, or a ripple, lasts for a whole acceleration, some thirty windows. So each counts as the
+root of that number; chosen on steps with two kinds of IMUs.
 """
 
 _RIPPLE_HZ = 150.0
