@@ -9,6 +9,9 @@ SLOW_WORKERS ?= 3
 
 comma := ,
 
+# Without Python's bytecode each of some hundred processes of the tests, and each worker at each collection, compiles all modules.
+unexport PYTHONDONTWRITEBYTECODE
+
 # Installs with pip, and says every ten seconds that it goes on.
 define install
 @echo "Installing $(1) into .venv, once; all that a first run needs takes 1.1 GB and some minutes."

@@ -1,5 +1,6 @@
 """Fixtures that all rooms share."""
 
+import gc
 import signal
 from pathlib import Path
 
@@ -23,6 +24,13 @@ settings.register_profile("thorough", max_examples=10_000, deadline=None)
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGQUIT, signal.SIG_DFL)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
+def pytest_collection_finish() -> None:
+    """What stays to the end, thousands of tests among it, need not be looked through at each collection of garbage."""
+    gc.collect()
+    gc.freeze()
+
 
 SHARED_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 
