@@ -59,12 +59,16 @@ def deadly(x):
 """
 
 
+def with_studies(folder: Path) -> Path:
+    for name, text in {"runs.toml": RUNS, "figures.py": FIGURES, "deadly.toml": MODEL, "model.py": DEADLY}.items():
+        (folder / name).write_text(text)
+    return folder
+
+
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("RAN", str(tmp_path / "ran"))
-    for name, text in {"runs.toml": RUNS, "figures.py": FIGURES, "deadly.toml": MODEL, "model.py": DEADLY}.items():
-        (tmp_path / name).write_text(text)
-    return tmp_path
+    return with_studies(tmp_path)
 
 
 def ran(folder: Path) -> Counter[str]:
@@ -154,10 +158,13 @@ class Sweeps:
         self.sweeps += 1
 
 
-@pytest.fixture
-def reference(folder: Path) -> dict[str, dict[str, object]]:
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, object]]:
     """What a sweep gives that nothing disturbs, in one process."""
-    run_study(read_study(folder / "runs.toml"), folder / "undisturbed", InOneProcess())
+    folder = with_studies(tmp_path_factory.mktemp("reference"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAN", str(folder / "ran"))
+        run_study(read_study(folder / "runs.toml"), folder / "undisturbed", InOneProcess())
     return rows(folder / "undisturbed")
 
 
