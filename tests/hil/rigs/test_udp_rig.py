@@ -639,7 +639,7 @@ def test_the_rig_does_nothing_that_is_wrong():
 def test_a_flood_of_old_hellos_does_not_keep_a_moving_rig_from_its_controller():
     plant, imu, rig = _rig_of(EmulatorConfig(SimulationConfig(imu="ideal")), PERIOD, [])
     with plant, closing(bound_socket("127.0.0.1", 0)) as own, senders("127.0.0.1:1", 2) as (controller, stranger):
-        # Its drives move as long as the test may pause.
+        # Its drives go on, however long the test pauses.
         emulator = new_udp_emulator(plant.handle, imu, rig, controller.session, watchdog_s=60.0)
         link, timespec, began = emulator.link.socket, np.zeros(2, np.int64), time.monotonic_ns()
         link["descriptor"], link["peer"] = own.fileno(), socket_address(controller.socket.getsockname())
@@ -647,7 +647,7 @@ def test_a_flood_of_old_hellos_does_not_keep_a_moving_rig_from_its_controller():
         old = encode(HELLO_DATAGRAM, kind=DatagramKind.HELLO, session=5, period_us=10_000)
         stranger.socket.sendto(old, stranger.rig)
         assert serve(emulator, began, 1_000_000_000, timespec) == 1 and emulator.session["refused"] == 0
-        rig["drive"] = FOLLOWING
+        rig["drive"], rig["request"] = FOLLOWING, ENABLED
         for _ in range(100):
             stranger.socket.sendto(old, stranger.rig)
         controller.socket.sendto(controller.encoded(request=ENABLED), controller.rig)
