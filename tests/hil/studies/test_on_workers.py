@@ -72,7 +72,10 @@ def without_times(figures):
     "study",
     [
         *STUDIES,
-        *(pytest.param(n, marks=pytest.mark.endurance if n == "evaluate-fusion" else pytest.mark.slow) for n in LONG_STUDIES),
+        *(
+            pytest.param(n, marks=pytest.mark.endurance if n == "evaluate-fusion" else pytest.mark.slow(seconds=40))
+            for n in LONG_STUDIES
+        ),
     ],
 )
 def test_figures_do_not_depend_on_the_engine(study, workers, trials):
