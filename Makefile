@@ -9,6 +9,9 @@ SLOW_WORKERS ?= 3
 
 comma := ,
 
+# Without Python's bytecode each of some hundred processes of the tests, and each worker at each collection, compiles all modules.
+unexport PYTHONDONTWRITEBYTECODE
+
 # Installs with pip, and says every ten seconds that it goes on.
 define install
 @echo "Installing $(1) into .venv, once; all that a first run needs takes 1.1 GB and some minutes."
@@ -16,7 +19,7 @@ define install
 	clock=$$!; trap "kill $$clock" EXIT; $(BIN)/pip install --quiet --constraint constraints.txt --editable '$(1)'
 endef
 
-.PHONY: demo test test-all test-endurance bench lint clean
+.PHONY: demo test test-all test-endurance bench bench-loop bench-fusion bench-faults lint clean
 .DELETE_ON_ERROR:
 
 demo: .venv/installed
@@ -36,11 +39,19 @@ test-all: test
 test-endurance: .venv/installed-test
 	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m endurance
 
-bench: .venv/installed-all
+bench: bench-loop bench-fusion bench-faults
+
+bench-loop: .venv/installed-all
 	@mkdir -p $(OUT)
 	$(BIN)/gough bench --json $(OUT)/bench.json $(BENCH)
+
+bench-fusion: .venv/installed-all
+	@mkdir -p $(OUT)
 	$(BIN)/gough compare-fusion --json $(OUT)/fusion.json $(FUSION)
 	$(BIN)/gough evaluate-fusion --json $(OUT)/evaluation.json $(EVALUATION)
+
+bench-faults: .venv/installed-all
+	@mkdir -p $(OUT)
 	$(BIN)/gough faults --results $(OUT)/faults --json $(OUT)/faults.json $(FAULTS)
 
 lint: .venv/installed-lint

@@ -1,5 +1,6 @@
 """Fixtures that all rooms share."""
 
+import gc
 import signal
 from pathlib import Path
 
@@ -23,6 +24,23 @@ settings.register_profile("thorough", max_examples=10_000, deadline=None)
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGQUIT, signal.SIG_DFL)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Modules with tests that are marked `slow(seconds=...)` come first, the longest first, so that no long one begins last."""
+    longest: dict[Path, float] = {}
+    for item in items:
+        seconds = max((mark.kwargs.get("seconds", 0.0) for mark in item.iter_markers("slow")), default=0.0)
+        longest[item.path] = max(longest.get(item.path, 0.0), seconds)
+    items.sort(key=lambda item: -longest[item.path])
+
+
+def pytest_collection_finish() -> None:
+    """What stays to the end, thousands of tests among it, need not be looked through at each collection of garbage."""
+    gc.collect()
+    gc.freeze()
+
 
 SHARED_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 

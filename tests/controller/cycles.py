@@ -23,7 +23,8 @@ def follow_at_once(parameters):
 
 def run_stages(parameters, state, measurement, first, last=None):
     """The stages from `first` up to `last`, by default the first alone; the time stands still."""
-    last = compiled.CycleStage(first + 1) if last is None else last
+    # Plain numbers, as compiled callers pass them: for members of an enumeration numba compiles the whole cycle a second time.
+    first, last = int(first), first + 1 if last is None else int(last)
     return compiled.run_stages(parameters, state, measurement, np.zeros((6, 1, 5)), _MARKS, first, last)
 
 

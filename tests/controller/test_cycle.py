@@ -703,7 +703,7 @@ def test_every_stage_that_runs_is_timed_and_no_other(hexapod):
     ):
         marks["ns"] = -1
         assert state["time"]["cycle"] == 0
-        compiled.run_stages(parameters, state, signals, resting(np.full(6, 0.394)), marks, first, last)
+        compiled.run_stages(parameters, state, signals, resting(np.full(6, 0.394)), marks, int(first), int(last))
         assert np.flatnonzero(marks["ns"] >= 0).tolist() == timed
     # After the control, the cycle is over.
     assert state["time"]["cycle"] == 1

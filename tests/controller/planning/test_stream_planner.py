@@ -30,6 +30,7 @@ from controller.planning.stream_planner import Plan, StreamPlanner, TargetRefuse
 from controller.planning.target import load_target
 from controller.safety.causes import Cause
 from hil.loop.records import shared_array
+from plant.compiled import kernel
 from plant.errors import InputError, UnreachableError
 from plant.pose import quaternion_from_rotation, rotation_from_vector
 
@@ -44,6 +45,18 @@ def home_lengths(mechanism):
 
 def new_stream():
     return shared_array(1, STREAM).reshape(())
+
+
+@kernel
+def follow(segments, first, index, references):
+    """The references (cycles, points, 6, 3) from a cycle on; the index stays where the last cycle began."""
+    ahead = index.copy()
+    for k in range(references.shape[0]):
+        ahead[:] = index
+        for point in range(references.shape[1]):
+            evaluate_reference(segments, (first + k + point / references.shape[1]) * PERIOD, ahead, references[k, point])
+            if point == 0:
+                index[:] = ahead
 
 
 class Follower:
@@ -79,15 +92,10 @@ class Follower:
 
     def run(self, cycle, points=8):
         """Follow the segments up to a cycle, sampled at several points of each."""
-        reference = np.zeros((6, 3))
-        while self.cycle < cycle:
-            index = self.index.copy()
-            for point in range(points):
-                evaluate_reference(self.segments, (self.cycle + point / points) * PERIOD, index, reference)
-                self.pieces.append(reference.copy())
-                if point == 0:
-                    self.index[:] = index
-            self.cycle += 1
+        references = np.zeros((max(cycle - self.cycle, 0), points, 6, 3))
+        follow(self.segments, self.cycle, self.index, references)
+        self.pieces.extend(references.reshape(-1, 6, 3))
+        self.cycle += len(references)
 
     def check(self, limits):
         """The limits, on the samples alone: differences show the jumps that rates and accelerations would hide."""

@@ -20,7 +20,7 @@ def figures():
     return {"machine": "m", "date": "2026-11-21", "version": "0", "real_time": measure_real_time({500.0: 2.0})}
 
 
-@pytest.mark.slow
+@pytest.mark.slow(seconds=35)
 def test_every_condition_of_a_rate_is_measured(figures):
     measured = figures["real_time"]
     assert json.loads(json.dumps(measured)) == measured

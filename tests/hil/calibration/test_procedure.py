@@ -18,7 +18,7 @@ from hil.runs.simulation import simulate
 from plant.errors import CalibrationError
 from plant.imu import Wiring, imu_state, load_imu
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.slow(seconds=60)
 """The calibration takes 20 s; `test_drives` and the calibrations of `controller` stay in `make test`."""
 
 

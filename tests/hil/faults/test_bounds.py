@@ -141,7 +141,7 @@ def test_bad_input_gets_one_line(options, message, capsys):
     assert message in errors[-1] and not any("Traceback" in line for line in errors)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(seconds=110)
 def test_only_shocks_and_joints_that_are_off_come_near_the_limits_before_they_are_told():
     """All other rows are told before the error exceeds two thirds of the limit."""
     found = [each for each in bounds_of_rows([row for row in all_rows() if row.kind != SOUND], 2) if each.bounds]

@@ -218,8 +218,8 @@ def test_filterpy_closes_the_same_loop(monkeypatch):
             whole(self, *sample)
 
         monkeypatch.setattr(kind, name, step)
-    compiled = simulate(SimulationConfig(target="sines", duration=0.8)).records
-    filterpy = simulate(SimulationConfig(target="sines", duration=0.8, fusion="filterpy")).records
+    config = SimulationConfig(target="sines", duration=0.8, rate=500.0)
+    compiled, filterpy = (simulate(replace(config, fusion=fusion)).records for fusion in ("compiled", "filterpy"))
     assert taken == {FilterpyLeg: 6 * len(filterpy), FilterpyPlatform: len(filterpy)}
     np.testing.assert_allclose(filterpy["position"], compiled["position"], atol=1e-11)
     np.testing.assert_allclose(filterpy["command"], compiled["command"], atol=1e-9)

@@ -56,9 +56,17 @@ def home_lengths(mechanism):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _loaded():
-    """What the loop runs is loaded before it is on the clock."""
+def _loaded(hexapod):
+    """What the loop and a receiver run is loaded before they are on the clock; a receiver's process is forked from this one."""
     follow(np.zeros((), STREAM), np.ones(6), PERIOD)
+    stream, planner = np.zeros((), STREAM), StreamPlanner(hexapod, home_lengths(hexapod))
+    reception = Reception(stream, planner, PERIOD)
+    for number in range(2):
+        sent(reception, number, 0.01 * number)
+        reception.plan()
+    stream["shared"][END_PLANNER] = 1
+    with open_socket(port=0) as listener:
+        receive(stream, planner, listener, PERIOD)
 
 
 @contextmanager

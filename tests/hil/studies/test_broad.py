@@ -17,6 +17,8 @@ from tests.conftest import SHARED_DATA
 DEG = np.radians(1.0)
 RATE_HZ = 250.0
 TILT = 3.0 * DEG
+WITHOUT_SIMULATED = ("--seeds", "0")
+"""Motions, which would come before the trials of a folder."""
 
 
 @pytest.fixture
@@ -61,7 +63,7 @@ def test_on_real_data_as_good_as_vqf_and_vqf_as_published(tmp_path):
     if not folder.exists():
         pytest.skip("the trials of BROAD are not here")
     path = tmp_path / "broad.json"
-    assert main(["broad", str(folder), "--seeds", "0", "--json", str(path)]) == 0
+    assert main(["broad", str(folder), *WITHOUT_SIMULATED, "--json", str(path)]) == 0
     trials = json.loads(path.read_text())["trials"]
     assert len(trials) == 2
     for figures, published in zip(trials.values(), (0.43, 0.42), strict=True):
@@ -95,7 +97,7 @@ def test_simulated_motions_are_beside_the_trials_or_alone(trial, tmp_path, capsy
     assert figures["trials"] == {}
     assert list(figures["simulated"]) == [f"{kind}, seed 1" for kind in SPECTRA]
     assert "bursts, seed 1" in capsys.readouterr().out
-    assert main(["broad", "--seeds", "0"]) == 2
+    assert main(["broad", *WITHOUT_SIMULATED]) == 2
     assert "no folder with trials and 0 simulated motions of each kind" in capsys.readouterr().err
 
 
@@ -114,7 +116,7 @@ def test_simulated_motions_are_beside_the_trials_or_alone(trial, tmp_path, capsy
 )
 def test_what_is_no_trial_is_refused_in_a_line(trial, tmp_path, capsys, changes, said):
     np.savez(tmp_path / "bad.npz", **{name: value for name, value in (trial | changes).items() if value is not None})
-    assert main(["broad", str(tmp_path)]) == 2
+    assert main(["broad", str(tmp_path), *WITHOUT_SIMULATED]) == 2
     complaint = capsys.readouterr().err
     assert f"bad.npz: {said}" in complaint or f"bad.npz {said}" in complaint
     assert complaint.count("\n") == 1
@@ -125,8 +127,8 @@ def test_a_folder_without_trials_a_broken_file_and_no_noise_are_refused(trial, t
         assert main(["broad", str(folder)]) == 2
         assert f"{folder} is no folder with trials *.npz" in capsys.readouterr().err
     np.savez(tmp_path / "rest.npz", **trial)
-    assert main(["broad", str(tmp_path), "--accelerometer-noise", "0"]) == 2
+    assert main(["broad", str(tmp_path), *WITHOUT_SIMULATED, "--accelerometer-noise", "0"]) == 2
     assert "platform_accelerometer_noise is 0.0; it must be positive" in capsys.readouterr().err
     (tmp_path / "torn.npz").write_bytes((tmp_path / "rest.npz").read_bytes()[:2000])
-    assert main(["broad", str(tmp_path)]) == 2
+    assert main(["broad", str(tmp_path), *WITHOUT_SIMULATED]) == 2
     assert "torn.npz is no NumPy archive that can be read" in capsys.readouterr().err

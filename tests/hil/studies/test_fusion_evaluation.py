@@ -57,7 +57,7 @@ def test_calibrated_imus_start_in_motion_bear_a_dead_one_and_do_not_drift(withou
     assert minute["position_rms"] < 0.3e-3
 
 
-@pytest.mark.slow
+@pytest.mark.slow(seconds=120)
 def test_raw_imus_come_to_tenths_of_a_millimetre(figures):
     for error, (position, rotation) in {"0": (0.2, 0.03), "0.0001": (0.4, 0.1)}.items():
         assert figures["calibration"][error]["least_improvement"] > 10.0

@@ -55,7 +55,7 @@ STUDIES = {
 LONG_STUDIES = {
     "classes": lambda engine, trials: list(map(vars, evaluate_classes(1, engine, mechanisms=3))),
     "compare-fusion": lambda engine, trials: fusion_comparison.compare(
-        ComparisonConfig(duration=20.5, rate=100.0, seeds=(0, 1)), engine
+        ComparisonConfig(duration=20.5, rate=50.0, seeds=(0, 1)), engine
     ),
     "evaluate-fusion": lambda engine, trials: fusion_evaluation.evaluate(CALIBRATED, engine),
     "tune-fusion": lambda engine, trials: fusion_tuning.tune_fusion(TuningConfig(seeds=(0,), rate=50.0), engine),
@@ -72,7 +72,10 @@ def without_times(figures):
     "study",
     [
         *STUDIES,
-        *(pytest.param(n, marks=pytest.mark.endurance if n == "evaluate-fusion" else pytest.mark.slow) for n in LONG_STUDIES),
+        *(
+            pytest.param(n, marks=pytest.mark.endurance if n == "evaluate-fusion" else pytest.mark.slow(seconds=40))
+            for n in LONG_STUDIES
+        ),
     ],
 )
 def test_figures_do_not_depend_on_the_engine(study, workers, trials):
@@ -82,10 +85,10 @@ def test_figures_do_not_depend_on_the_engine(study, workers, trials):
     assert len(here) > 200
 
 
-COMMANDS = ["accuracy --poses 20", "broad TRIALS", "faults --seeds 1 --only emergency"]
+COMMANDS = ["accuracy --poses 20", "broad TRIALS --seeds 0", "faults --seeds 1 --only emergency"]
 LONG_COMMANDS = [
     "classes --mechanisms 3",
-    "compare-fusion --duration 20.5 --rate 100 --seeds 0",
+    "compare-fusion --duration 20.5 --rate 50 --seeds 0",
     "evaluate-fusion --imu mpu9150-calibrated --rate 250 --seeds 1 --starts 1 --joint-error 0 --only start",
     "sensor-sets --mechanism 6-3-II --duration 0.3",
     "tune-fusion TUNED --seeds 0 --rate 50",

@@ -25,7 +25,7 @@ target = "sines"
 duration = 0.5
 rate = 500.0
 [vary]
-run.seed = { seeds = 40 }
+run.seed = { seeds = 24 }
 run.imu = ["ideal", "mpu9150-calibrated", "icm42688"]
 [measure]
 function = "figures.py:slowly"
@@ -59,12 +59,16 @@ def deadly(x):
 """
 
 
+def with_studies(folder: Path) -> Path:
+    for name, text in {"runs.toml": RUNS, "figures.py": FIGURES, "deadly.toml": MODEL, "model.py": DEADLY}.items():
+        (folder / name).write_text(text)
+    return folder
+
+
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("RAN", str(tmp_path / "ran"))
-    for name, text in {"runs.toml": RUNS, "figures.py": FIGURES, "deadly.toml": MODEL, "model.py": DEADLY}.items():
-        (tmp_path / name).write_text(text)
-    return tmp_path
+    return with_studies(tmp_path)
 
 
 def ran(folder: Path) -> Counter[str]:
@@ -118,13 +122,13 @@ def test_a_run_over_which_workers_died_is_tried_at_the_next_start_too(folder: Pa
     assert set(ran(folder)) == {"12"}
 
 
-@pytest.mark.slow
+@pytest.mark.slow(seconds=35)
 def test_a_worker_that_dies_costs_its_batch(folder: Path) -> None:
     with started(gough_sweep("runs.toml", "--workers", 2), folder) as process:
-        wait_until(lambda: ran(folder).total() > 60, "half of the runs are done")
+        wait_until(lambda: ran(folder).total() > 36, "half of the runs are done")
         process.workers()[0].kill()
         assert process.wait() == 0, process.text
-    assert len(rows(folder / "runs.results")) == 120
+    assert len(rows(folder / "runs.results")) == 72
     # A batch is two seconds of runs that take a tenth each, and its worker did them once more at most.
     again = [run for run, times in ran(folder).items() if times > 1]
     assert len(again) <= 22
@@ -154,10 +158,13 @@ class Sweeps:
         self.sweeps += 1
 
 
-@pytest.fixture
-def reference(folder: Path) -> dict[str, dict[str, object]]:
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, object]]:
     """What a sweep gives that nothing disturbs, in one process."""
-    run_study(read_study(folder / "runs.toml"), folder / "undisturbed", InOneProcess())
+    folder = with_studies(tmp_path_factory.mktemp("reference"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAN", str(folder / "ran"))
+        run_study(read_study(folder / "runs.toml"), folder / "undisturbed", InOneProcess())
     return rows(folder / "undisturbed")
 
 

@@ -308,7 +308,10 @@ def zdt1(folder: Path, trials: int, seed: int) -> Design:
 
 @pytest.mark.parametrize(
     "seed",
-    [pytest.param(11, marks=pytest.mark.slow), *(pytest.param(seed, marks=pytest.mark.endurance) for seed in range(12, 16))],
+    [
+        pytest.param(11, marks=pytest.mark.slow(seconds=55)),
+        *(pytest.param(seed, marks=pytest.mark.endurance) for seed in range(12, 16)),
+    ],
 )
 def test_zdt1_is_solved_to_95_percent_of_the_hypervolume(tmp_path, seed):
     """On the engine's processes, with seeds that the settings of the search were not chosen on."""

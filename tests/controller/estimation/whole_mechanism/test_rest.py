@@ -42,7 +42,7 @@ def positions_at_rest(hexapod, errors, minutes, seed):
     ("errors", "minutes", "seed"),
     [
         ("alignments", 1.0, 3),
-        pytest.param("alignments", 20.0, 4, marks=pytest.mark.slow),
+        pytest.param("alignments", 20.0, 4, marks=pytest.mark.slow(seconds=60)),
         pytest.param("accelerometers", 20.0, 5, marks=pytest.mark.slow),
     ],
 )
