@@ -281,15 +281,15 @@ def _eliminate(a: Array, k: int) -> None:
 
     An unknown about which nothing is known stays as it is.
     """
-    n = a.shape[0]
-    row = a[k]
-    pivot = row[k]
+    pivot = a[k, k]
     if not pivot > _LEAST_PIVOT:
         return
     inverse = 1.0 / pivot
-    for i in range(k + 1, n):
-        share, other = inverse * row[i], a[i]
-        for j in range(i, n + 1):
+    for i in range(k + 1, a.shape[0]):
+        # Indices that begin at 0 let the compiler use vectors.
+        row, other = a[k, i:], a[i, i:]
+        share = inverse * row[0]
+        for j in range(row.shape[0]):
             other[j] -= share * row[j]
 
 

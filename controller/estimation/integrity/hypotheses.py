@@ -104,6 +104,13 @@ def directions_of(hypothesis: int, frames: Array, predicted: Array, place: Array
 
 
 @kernel
+def span_of(hypothesis: int, place: Array) -> tuple[int, int]:
+    """The first fault that a hypothesis is about, and the one after the last, in the order of `place` (7,)."""
+    k = imu_of(hypothesis)
+    return (0, FAULTS) if k < 0 else (READINGS * int(place[k]), READINGS * (int(place[k]) + 1))
+
+
+@kernel
 def _write_turn(reading: Vector, at: int, directions: Array) -> None:
     """The change of a reading when the sensor turns by small angles about its axes: reading x angle."""
     x, y, z = reading
@@ -113,31 +120,32 @@ def _write_turn(reading: Vector, at: int, directions: Array) -> None:
 
 
 @kernel
-def evidence_for(count: int, weight: Array, evidence: Array, t: Record) -> float:
+def evidence_for(count: int, first: int, last: int, weight: Array, evidence: Array, t: Record) -> float:
     """Twice the logarithm of the likelihood ratio of a fault in the first `count` of the scratch's directions to none.
 
     Args:
         count: of directions.
+        first, last: their span, outside which they are zero.
         weight, evidence: (42, 42) and (42,), W and w as in `evidence`.
         t: dtype `SCRATCH`, with the directions. The Cholesky factor of D^T W D is left in `matrix`, zero in columns of
             directions about which nothing is known, and its solution of D^T w in `right`.
     """
-    found = 0.0
+    found, size = 0.0, last - first
     for n in range(count):
-        direction, weighted = t.directions[n], t.weighted[n]
+        direction, weighted = t.directions[n, first:last], t.weighted[n, first:last]
         weighted[:] = 0.0
         right = 0.0
-        for i in range(FAULTS):
-            size = direction[i]
-            if size != 0.0:
-                right += size * evidence[i]
-                row = weight[i]
-                for j in range(FAULTS):
-                    weighted[j] += size * row[j]
+        for i in range(size):
+            share = direction[i]
+            if share != 0.0:
+                right += share * evidence[first + i]
+                row = weight[first + i, first:last]
+                for j in range(size):
+                    weighted[j] += share * row[j]
         for m in range(n + 1):
-            value = 0.0
-            for i in range(FAULTS):
-                value += t.directions[m, i] * weighted[i]
+            other, value = t.directions[m, first:last], 0.0
+            for i in range(size):
+                value += other[i] * weighted[i]
             t.matrix[n, m] = value
         whole = t.matrix[n, n]
         for m in range(n):

@@ -23,7 +23,6 @@ moved the pose. The last two are renewed between two evaluations.
 
 import numpy as np
 
-from controller.estimation.integrity.fault_filter import FAULTS
 from controller.least_squares import factor_cholesky, solve_cholesky
 from plant.compiled import Record, kernel, record_dtype
 
@@ -100,13 +99,16 @@ def begin_level(s: Record, e: Record) -> None:
 
 
 @kernel
-def take_hypothesis(s: Record, e: Record, hypothesis: int, count: int, found: float, t: Record) -> None:
+def take_hypothesis(
+    s: Record, e: Record, hypothesis: int, count: int, first: int, last: int, found: float, t: Record
+) -> None:  # fmt: skip
     """Take the effect of a hypothesis, for which `evidence_for` has just been called, if it is the greatest so far.
 
     Args:
         s, e, t: dtypes `STATE`, `evidence.STATE` and `hypotheses.SCRATCH`.
         hypothesis: its number.
         count: of its directions.
+        first, last: their span.
         found: the evidence.
     """
     if s.determined == 0:
@@ -117,7 +119,7 @@ def take_hypothesis(s: Record, e: Record, hypothesis: int, count: int, found: fl
         effect[:] = 0.0
         if not t.matrix[n, n] > 0.0:
             continue
-        for j in range(FAULTS):
+        for j in range(first, last):
             size = t.directions[n, j]
             if size != 0.0:
                 for i in range(POSE):

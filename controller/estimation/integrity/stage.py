@@ -13,6 +13,7 @@ from controller.estimation.integrity.hypotheses import (
     find_frames,
     imu_of,
     kind_of,
+    span_of,
 )
 from controller.settings import FusionSettings
 from plant.compiled import MOST, Limits, Record, filled, kernel, record_dtype, shared_kernel
@@ -162,9 +163,10 @@ def _do(p: Record, s: Record, rig: Record, imus: Record, step: int) -> None:
     elif step < _FIRST_TOTAL:
         h = step - _FIRST_HYPOTHESIS
         count = directions_of(h, t.frames, s.filter.predicted, e.place, t.directions)
-        s.found[h] = evidence_for(count, e.weight, e.vector, t)
+        first, last = span_of(h, e.place)
+        s.found[h] = evidence_for(count, first, last, e.weight, e.vector, t)
         if e.of_learned == 0:
-            protection.take_hypothesis(s.protection, e, h, count, s.found[h], t)
+            protection.take_hypothesis(s.protection, e, h, count, first, last, s.found[h], t)
     else:
         at = step - _FIRST_TOTAL
         if at == 0:

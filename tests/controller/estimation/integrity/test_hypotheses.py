@@ -80,8 +80,8 @@ def test_the_evidence_is_the_greatest_of_the_likelihood(rank):
     t["directions"] = (random.normal(size=(6, rank)) @ chosen) if rank < 6 else chosen
     d = t["directions"]
     expected = (d @ vector) @ np.linalg.pinv(d @ weight @ d.T, rcond=1e-10) @ (d @ vector)
-    assert evidence_for(6, weight, vector, t[()]) == pytest.approx(expected, rel=1e-6)
-    assert evidence_for(6, 0.0 * weight, 0.0 * vector, t[()]) == 0.0
+    assert evidence_for(6, 0, 42, weight, vector, t[()]) == pytest.approx(expected, rel=1e-6)
+    assert evidence_for(6, 0, 42, 0.0 * weight, 0.0 * vector, t[()]) == 0.0
 
 
 def all_steps(mechanism, r, parameters, state):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from controller.estimation.integrity.hypotheses import HYPOTHESES, directions_of, evidence_for
+from controller.estimation.integrity.hypotheses import HYPOTHESES, directions_of, evidence_for, span_of
 from controller.estimation.integrity.protection import begin_level, end_level, publish_level, take_hypothesis
 from tests.controller.estimation.integrity.made_up import constants
 from tests.controller.estimation.integrity.test_evidence import evaluated
@@ -61,7 +61,8 @@ def test_it_is_the_greatest_over_the_hypotheses(fault):
     begin_level(level[()], e[()])
     for h in range(HYPOTHESES):
         count = directions_of(h, frames, s["filter"]["predicted"], e["place"], t["directions"])
-        take_hypothesis(level[()], e[()], h, count, evidence_for(count, e["weight"], e["vector"], t[()]), t[()])
+        span = span_of(h, e["place"])
+        take_hypothesis(level[()], e[()], h, count, *span, evidence_for(count, *span, e["weight"], e["vector"], t[()]), t[()])
     expected = level_of(state, frames, s["filter"]["predicted"], e["place"])
     np.testing.assert_allclose(ended(level), expected, rtol=2e-3)
 
