@@ -7,9 +7,12 @@ share the machine code of the cycle.
 import gc
 import hashlib
 import itertools
+import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
+from signal import default_int_handler
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -187,11 +190,32 @@ def flat_linking() -> Iterator[None]:
             gc.set_threshold(*collection)
 
 
+@contextmanager
+def _ctrl_c_kept() -> Iterator[None]:
+    """Let no Ctrl-C be lost: what is raised in a function that LLVM calls back goes no further."""
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is not default_int_handler:
+        yield
+        return
+    pressed: list[int] = []
+
+    def press(number: int, frame: Any) -> None:
+        pressed.append(number)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, press)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, default_int_handler)
+    if pressed:
+        raise KeyboardInterrupt
+
+
 def linked_flat(compile_kernel: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """The `compile` of a dispatcher, with flat linking."""
 
     def compile_flat(signature: Any) -> Any:
-        with global_compiler_lock, flat_linking():
+        with _ctrl_c_kept(), global_compiler_lock, flat_linking():
             return compile_kernel(signature)
 
     return compile_flat

@@ -1,8 +1,10 @@
 """Compiled kernels and the cache that keeps them."""
 
+import ctypes
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -16,6 +18,7 @@ import pytest
 from plant.compiled import hash_of_files, kernel, keyed_folder, user_cache
 from plant.compiled.cache import STALE_AFTER_S
 from plant.compiled.kernels import PACKAGES, WITHOUT_KERNELS
+from plant.compiled.linking import linked_flat
 
 
 @kernel
@@ -59,6 +62,30 @@ def test_a_function_of_numba_alone_calls_kernels_and_is_called_as_ever() -> None
         return _twice(values.sum()) + np.linalg.norm(values)
 
     assert alone(np.array([3.0, 4.0])) == 19.0
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_no_ctrl_c_is_lost_while_a_kernel_compiles() -> None:
+    """What Python raises in a function that compiled code calls back ends there, with a message on stderr."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    called: list[str] = []
+
+    def compile_with_callback(signature: Any) -> str:
+        ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()
+        called.append(signature)
+        return "compiled"
+
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            linked_flat(compile_with_callback)("while it compiles")
+        assert called and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        assert linked_flat(lambda signature: "compiled")("again") == "compiled"
+        # A handler of another kind, as a run has it, stays where it is.
+        signal.signal(signal.SIGINT, lambda number, frame: called.append("heard"))
+        assert linked_flat(compile_with_callback)("in a run") == "compiled"
+        assert called[1:] == ["heard", "in a run"]
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_the_cache_is_where_the_user_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
