@@ -63,9 +63,15 @@ def children(pid):
 
 
 def is_ours(pid):
-    """Whether it is a process of a run, and not of something that Python asks for when it starts."""
+    """Whether it is a process of a run, and not of something that Python asks for when it starts: such a one has the run's
+    command line until it has its own.
+    """
     with suppress(OSError):
-        return b"hil.command_line" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        looks = []
+        for _ in range(2):
+            looks.append(b"hil.command_line" in Path(f"/proc/{pid}/cmdline").read_bytes())
+            time.sleep(0.01)
+        return all(looks)
     return False
 
 
