@@ -26,7 +26,7 @@ from plant.pose import Array
 _TWIST, _FIRST = 6, 6
 """Size of the twist, and its place in the states of the motion."""
 
-_LIMIT = radians(0.75)
+_LIMIT = radians(0.55)
 """Error of an angular velocity that is told: several times what calibrated gyroscopes have [rad/s]."""
 
 _LATE_S = 1e-3

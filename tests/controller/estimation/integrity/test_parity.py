@@ -6,7 +6,7 @@ import pytest
 from controller.estimation.integrity.parity import step_parity
 from tests.controller.estimation.integrity.made_up import RATE_HZ, constants, filtered, readings
 
-LIMIT = np.radians(0.75)
+LIMIT = np.radians(0.55)
 
 
 def parity(state):
