@@ -87,8 +87,9 @@ def misfit(
     directions: Array, weights: Array, predicted: Array, in_base: Array, in_platform: Array, vector_weights: Array,
     rotation: Array,
 ) -> float:  # fmt: skip
-    """The weighted sum of squares that a pose leaves, over its degrees of freedom: 1 on average if the weights are right; 0 if
-    nothing is redundant.
+    """The weighted sum of squares that a pose in space leaves, over the number of redundant measurements.
+
+    It is 1 on average if the weights are right, and 0 if nothing is redundant.
 
     Args: as for `normal_equations`; `predicted` are the legs' directions at the pose.
     """

@@ -12,7 +12,6 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
-from signal import default_int_handler
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -192,8 +191,9 @@ def flat_linking() -> Iterator[None]:
 
 @contextmanager
 def _ctrl_c_kept() -> Iterator[None]:
-    """Let no Ctrl-C be lost: what is raised in a function that LLVM calls back goes no further."""
-    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is not default_int_handler:
+    """Let no Ctrl-C be lost: its exception ends in the function that LLVM calls back, so it is raised once more."""
+    before, main = signal.getsignal(signal.SIGINT), threading.current_thread() is threading.main_thread()
+    if not main or before is not signal.default_int_handler:
         yield
         return
     pressed: list[int] = []
@@ -206,7 +206,7 @@ def _ctrl_c_kept() -> Iterator[None]:
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, default_int_handler)
+        signal.signal(signal.SIGINT, before)
     if pressed:
         raise KeyboardInterrupt
 
