@@ -51,9 +51,9 @@ _UNSETTLED, _SETTLING_S = 2.0, 2.0
 """How many of the closed form's count at the start, and the time constant with which their square fades [s]."""
 
 _USUAL_MISFIT, _OF_MISFIT, _MISFIT_S = 0.3, 3.0, 0.1
-"""A misfit up to the first is usual. Beyond it, the closed form's standard deviation counts so many times, times the root of the
-excess. The misfit is averaged with the time constant [s]. Sound IMUs have less than 1, as most of the errors that the weights
-stand for are alike in all measurements, or move the pose.
+"""A misfit up to the first is usual. Beyond it, the closed form's standard deviation counts so many times, times the root of
+the excess. The misfit is averaged with the time constant [s]. Sound IMUs have less than 1, as most of the errors that the
+weights stand for are alike in all measurements, or move the pose.
 """
 
 _SOUND, _MOST, _SHAKEN = 0.2, 0.4, 0.1
