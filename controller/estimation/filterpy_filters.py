@@ -19,6 +19,7 @@ from controller.estimation.platform_filter import (
     LEVEL,
     RATE_NOISE,
     REST_RATE,
+    REST_S,
     REST_VELOCITY,
     SLOW_TURN,
     SLOWEST_CORRECTION,
@@ -172,13 +173,15 @@ class FilterpyPlatform(_Filterpy):
         up, self.bias, first, self.velocity = np.split(state["x"].copy(), (BIAS, LEVEL, VELOCITY))
         self.axes = np.stack([first, np.cross(up, first), up])
         self.running, self.noise, self.unknown = float(state["running"]), float(state["noise"]), float(state["unknown"])
-        self.force_variance, self.clipped_for = float(state["force_variance"]), float(state["clipped_for"])
+        self.force_variance = float(state["force_variance"])
+        self.resting_for, self.clipped_for = float(state["resting_for"]), float(state["clipped_for"])
         self.start(np.zeros(ERRORS), state["covariance"])
 
     def hand_over(self, state: Record) -> None:
         """Write the state (dtype `platform_filter.STATE`)."""
         state["x"] = np.concatenate([self.axes[2], self.bias, self.axes[0], self.velocity])
         state["covariance"], state["running"], state["noise"], state["unknown"] = self.P, self.running, self.noise, self.unknown
+        state["resting_for"] = self.resting_for
 
     def step(self, gyroscope: Array, accelerometer: Array, acceleration: Array, period: float) -> None:
         """Predict over a period [s] and take a sample [rad/s, m/s^2], without the IMU's own acceleration (3,) in {2}."""
@@ -200,8 +203,9 @@ class FilterpyPlatform(_Filterpy):
         for velocity, axis in zip(self.velocity, np.eye(ERRORS)[2:4], strict=True):
             self.update(-velocity, lambda x, h: h, lambda x, h: h @ x, args=axis[None], hx_args=axis[None])
         about_vertical = np.array([*np.zeros(4), *self.axes[2]])
-        resting = np.linalg.norm(rate) < REST_RATE and self.unknown < REST_VELOCITY**2
-        if resting and about_vertical @ self.P @ about_vertical > SLOW_TURN**2:
+        seems_at_rest = np.linalg.norm(rate) < REST_RATE and self.unknown < REST_VELOCITY**2
+        self.resting_for = self.resting_for + period if seems_at_rest else 0.0
+        if self.resting_for > REST_S and about_vertical @ self.P @ about_vertical > SLOW_TURN**2:
             self.R = np.array([[SLOW_TURN**2 / period]])
             row = about_vertical[None]
             self.update(rate @ self.axes[2], lambda x, h: h, lambda x, h: h @ x, args=row, hx_args=row)

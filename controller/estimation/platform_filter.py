@@ -10,8 +10,8 @@ While the gyroscope's reading is clipped, the rate goes on beyond the range, uns
 there on leaves the vertical off by a t^2 / 2 after the time t. So its variance is a^2 t^4 / 4, which grows by a^2 t^3 dt, and
 the accelerometer corrects the vertical soon afterwards.
 
-The bias about the vertical does not show in u before the IMU tilts. So at rest the filter measures that it does not turn about
-the vertical, as `vqf` does (D. Laidig, T. Seel, *VQF: Highly accurate IMU orientation estimation with bias estimation and
+The bias about the vertical does not show in u before the IMU tilts. So after `REST_S` at rest the filter measures that it does not
+turn about the vertical, as `vqf` does (D. Laidig, T. Seel, *VQF: Highly accurate IMU orientation estimation with bias estimation and
 magnetic disturbance rejection*, Information Fusion 91, 2023), but only to `SLOW_TURN`, as a platform may turn slowly for long.
 
 State (11): u, the gyroscope's bias [rad/s], the first level axis in {2}, and the unknown velocity along both level axes [m/s].
@@ -58,6 +58,9 @@ YOUNGEST_S = 0.01
 REST_RATE, REST_VELOCITY = np.radians(1.0), 1e-3
 """Below these the IMU seems to be at rest: its rate less its bias [rad/s], and its unknown velocity [m/s]."""
 
+REST_S = 1.5
+"""For how long it seems to be at rest before it is taken for that [s]."""
+
 SLOW_TURN = np.radians(0.1)
 """How fast an IMU that seems to be at rest may turn about the vertical [rad/s]: so well it learns that bias."""
 
@@ -88,6 +91,7 @@ STATE = record_dtype(
     unknown=np.float64,  # square of the velocity beyond what noise explains, faded [m^2/s^2]
     noise=np.float64,  # variance of the velocity that the accelerometer's noise alone would cause [m^2/s^2]
     running=np.float64,  # time since the start [s]
+    resting_for=np.float64,  # for how long the IMU has seemed to be at rest [s]
     clipped_for=np.float64,  # time since the rate was last seen, as the gyroscope's reading is clipped [s]
     age=np.int64,  # for how many cycles the filter has run
     used=np.int64,  # whether the vertical is used
@@ -255,7 +259,7 @@ def start_platform(p: Record, s: Record, accelerometer: Array) -> None:
     s.x[LEVEL + np.argmin(np.abs(s.x[:3]))] = 1.0
     make_level(s.x[LEVEL:VELOCITY], up)
     s.covariance[0, 0] = s.covariance[1, 1] = TILT_SIGMA**2
-    s.unknown = s.noise = s.running = s.clipped_for = 0.0
+    s.unknown = s.noise = s.running = s.resting_for = s.clipped_for = 0.0
     s.force_variance = p.force_variance
 
 
@@ -289,7 +293,9 @@ def step_platform(
     s.unknown = faded_excess(s.unknown, seen, s.noise, t)
     s.noise += p.force_variance * t * t
     _measure_no_velocity(s, velocity_density(s.unknown) / t)
-    if dot(rate, rate) < REST_RATE**2 and s.unknown < REST_VELOCITY**2:
+    seems_at_rest = dot(rate, rate) < REST_RATE**2 and s.unknown < REST_VELOCITY**2
+    s.resting_for = s.resting_for + t if seems_at_rest else 0.0
+    if s.resting_for > REST_S:
         _measure_no_turn(s, rate, t)
     _correct(s, first, second)
 

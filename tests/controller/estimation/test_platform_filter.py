@@ -193,6 +193,17 @@ def test_a_constant_turn_is_tracked_and_its_bias_found(axis):
     assert np.linalg.norm(across @ (platform.bias - BIAS_RATE)) < 0.05 * DEGREE
 
 
+@pytest.mark.parametrize("turn", [0.3, 0.8])
+def test_a_slow_turn_between_faster_ones_is_not_taken_for_a_bias(turn):
+    """As in a slow motion that turns back every now and then: a second of so many deg/s, then a quarter of 2 deg/s."""
+    up = rotation_of([0.3, -0.2, 0.0]).T @ UP
+    platform = Platform(GRAVITY * up)
+    for cycle in range(10_000):
+        rate = turn if cycle % 1250 < 1000 else -2.0
+        platform.step(rate * DEGREE * up, GRAVITY * up)
+    assert abs(up @ platform.bias) < 1e-3 * DEGREE
+
+
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
 @pytest.mark.parametrize(("turn", "believed"), [(0.0, True), (0.05, True), (2.0, False)])
 def test_at_rest_the_bias_about_the_vertical_is_found_to_a_slow_turn_but_no_turn_is_taken_for_it(turn, believed, noise):
