@@ -10,9 +10,10 @@ While the gyroscope's reading is clipped, the rate goes on beyond the range, uns
 there on leaves the vertical off by a t^2 / 2 after the time t. So its variance is a^2 t^4 / 4, which grows by a^2 t^3 dt, and
 the accelerometer corrects the vertical soon afterwards.
 
-The bias about the vertical does not show in u before the IMU tilts. So after `REST_S` at rest the filter measures that it does not
-turn about the vertical, as `vqf` does (D. Laidig, T. Seel, *VQF: Highly accurate IMU orientation estimation with bias estimation and
-magnetic disturbance rejection*, Information Fusion 91, 2023), but only to `SLOW_TURN`, as a platform may turn slowly for long.
+The bias about the vertical does not show in u before the IMU tilts. So after `REST_S` at rest the filter measures that it does
+not turn about the vertical, as `vqf` does (D. Laidig, T. Seel, *VQF: Highly accurate IMU orientation estimation with bias
+estimation and magnetic disturbance rejection*, Information Fusion 91, 2023), but only to `SLOW_TURN`, as a platform may turn
+slowly for long.
 
 State (11): u, the gyroscope's bias [rad/s], the first level axis in {2}, and the unknown velocity along both level axes [m/s].
 The second level axis is u x the first. Both turn with the rate less its bias, as u does, and point to no heading of note.
