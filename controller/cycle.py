@@ -175,7 +175,8 @@ def cycle_parameters(
         )
     watch_evidence = bool(watched.watch_imus) and able
     if are_few(mechanism, imus):
-        watched = replace(watched, evidence=np.inf)
+        # The noise of their estimate alone makes the commands go to and fro.
+        watched = replace(watched, evidence=np.inf, oscillation=np.inf)
     return filled(
         PARAMETERS,
         rig=rig_parameters(mechanism, rate, control.hold, calibration.tilt),
@@ -338,6 +339,9 @@ def _control(parameters: Record, state: Record, segments: Array) -> int:
     else:
         load_feed_forward.find_feed_forward(p.load, s.load, rig, pose, s.reference)
         pid.step_pid(p.pid, s.pid, s.load.feed_forward, elapsed(rig, time))
+        watch.check_oscillation(
+            p.safety, s.safety, rig, time, s.imus.shaking, s.load.feed_forward, s.reference, s.pid
+        )  # fmt: skip
     watch.check_carried(p.safety, s.safety, rig, time, s.imus.shaking, s.legs, s.mechanism, s.reference, s.pid)
     time.cycle += 1
     cause = watch.check_limits(

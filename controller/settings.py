@@ -12,7 +12,7 @@ from plant.mechanism import Mechanism
 
 _ENDLESS = 1e300
 _RAW_M, _FEW_M = 0.05, 0.03
-_ENDLESS_ALLOWED = ("evidence", "protection_position", "protection_rotation", "slack")
+_ENDLESS_ALLOWED = ("evidence", "protection_position", "protection_rotation", "oscillation", "slack")
 _ZERO_ALLOWED = (
     "integral", "derivative", "sensor_delay", "sensor_timing", "most_lost_imus", "watch_imus", "need_platform_imu", "load",
     "resistance", "friction",
@@ -106,6 +106,7 @@ class SafetySettings(_Settings):
     stroke_margin: float = 0.003  # largest distance of an estimated length beyond its stroke [m]
     velocity_margin: float = 2.0  # largest estimated speed of a leg, as a multiple of its limit
     following: float = 0.01  # largest deviation of a leg from its reference [m]
+    oscillation: float = 0.012  # RMS of fast corrections that shake the IMUs, beyond which a run ends [m/s]
     saturation: float = 0.25  # longest time for which a command may be at its limit [s]
     drive_deviation: float = 0.15  # largest difference between a drive's command and its leg's estimated speed [m/s]
     patience: float = 0.05  # longest time of a deviation from a reference or of a drive [s]

@@ -171,6 +171,13 @@ class Cause(IntEnum):
         "m/s^2",
     )
 
+    OSCILLATES = (
+        65,
+        "the commands oscillate, most of all that of leg {}: the mechanism has play, or the gains are too high",
+        Reaction.STOP,
+        "m/s RMS",
+    )
+
     @property
     def short(self) -> str:
         """The text without the number of a leg or an IMU."""

@@ -4,6 +4,7 @@ import numpy as np
 
 from controller.estimation.imu_monitor import contradiction, reset
 from controller.estimation.integrity.parity import SHARED
+from controller.rig import elapsed
 from controller.safety.causes import Cause, DriveState, Mode, Request, report_event
 from controller.safety.stop import handle_cause
 from controller.settings import SafetySettings
@@ -43,6 +44,12 @@ _NEARLY = 0.7
 _CLEARER = 1.3
 """How much more of the residuals the named IMU must explain than any other."""
 
+_FAST_S = 0.1
+"""Corrections that last longer than this are no oscillation; its mean square is taken over as long [s]."""
+
+_OSCILLATING_S = 1.0
+"""For how long a mean square must be beyond its limit: a step of the estimate is corrected in less [s]."""
+
 PARAMETERS = record_dtype(
     most_lost_imus=np.int64,
     conditioning=np.float64,
@@ -56,6 +63,7 @@ PARAMETERS = record_dtype(
     without_platform_imu=np.float64,  # [s]
     bus_cycles=np.int64,
     carried=np.float64,  # [rad^2]
+    oscillation=np.float64,  # [m^2/s^2]
     evidence=np.float64,  # for a fault, twice a logarithm
     level=(np.float64, 2),  # of protection, position [m] and rotation [rad]
 )
@@ -70,6 +78,9 @@ STATE = record_dtype(
     off_reference_for=(np.float64, LEGS),  # how long each leg has been off its reference [s]
     deviating_for=(np.float64, LEGS),  # how long each drive has been off its command [s]
     saturated_for=(np.float64, LEGS),  # how long each command has been at its limit [s]
+    correction=(np.float64, LEGS),  # of each command beyond its feed-forward, averaged [m/s]
+    oscillation=(np.float64, LEGS),  # square of what the correction is apart from that, averaged [m^2/s^2]
+    oscillating_for=np.float64,  # how long the mean of these squares has been beyond its limit [s]
     speed=(np.float64, LEGS),  # estimated, of each leg [m/s]
     calm_variance=np.float64,  # of the least known direction when nothing shook the IMUs last [rad^2]
     returns=(np.int64, IMU_COUNT),  # how often each IMU was taken back
@@ -97,6 +108,7 @@ def watch_parameters(settings: SafetySettings, rate: float, limits: Limits) -> R
         without_platform_imu=patience if settings.need_platform_imu else np.inf,
         bus_cycles=max(3, round(settings.bus_patience * rate)),
         carried=settings.carried**2,
+        oscillation=settings.oscillation**2,
         evidence=settings.evidence**2,
         level=(settings.protection_position, settings.protection_rotation),
     )
@@ -198,6 +210,29 @@ def check_carried(
     limit = p.watch.carried + s.watch.calm_variance
     if variance > limit and s.mode == Mode.RUNNING:
         handle_cause(p, s, rig, time, reference, pid, Cause.NOT_CARRIED, worst, np.sqrt(variance), np.sqrt(limit))
+
+
+@kernel
+def check_oscillation(
+    p: Record, s: Record, rig: Record, time: Record, shaking: Record, feed_forward: Array, reference: Record, pid: Record
+) -> None:
+    """After the commands: stop when what the controllers add to the feed-forward (6,) [m/s] goes to and fro for long, fast and
+    far, and shakes the IMUs, as it does where the legs have play. If it does not shake them, it is noise of the estimate.
+    """
+    w = s.watch
+    share = min(1.0, elapsed(rig, time) / _FAST_S)
+    total, worst = 0.0, 0
+    for k in range(rig.legs):
+        off = pid.command[k] - feed_forward[k] - w.correction[k]
+        w.correction[k] += share * off
+        w.oscillation[k] += share * (off * off - w.oscillation[k])
+        total += w.oscillation[k]
+        if w.oscillation[k] > w.oscillation[worst]:
+            worst = k
+    square, limit = total / rig.legs, p.watch.oscillation
+    w.oscillating_for = w.oscillating_for + elapsed(rig, time) if square > limit and shaking.told != 0 else 0.0
+    if w.oscillating_for > _OSCILLATING_S and s.mode == Mode.RUNNING:
+        handle_cause(p, s, rig, time, reference, pid, Cause.OSCILLATES, worst, np.sqrt(square), np.sqrt(limit))
 
 
 @kernel

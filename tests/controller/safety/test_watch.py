@@ -8,7 +8,7 @@ from controller.inverse_kinematics import leg_lengths
 from controller.safety import watch_nothing
 from controller.safety.causes import Cause, DriveState, Mode, Request
 from controller.safety.stop import describe_end
-from controller.safety.watch import check_carried, check_limits, exclude_imu, watch_parameters
+from controller.safety.watch import check_carried, check_limits, check_oscillation, exclude_imu, watch_parameters
 from controller.settings import SafetySettings
 from plant.mechanism import Limits
 from plant.pose import rotation_from_vector
@@ -51,12 +51,12 @@ def test_limits_are_those_of_the_settings_with_their_margins():
     limits = Limits(stroke, velocity=0.3, acceleration=2.0, jerk=50.0)
     settings = SafetySettings(
         most_lost_imus=2.0, conditioning=0.01, stroke_margin=0.004, velocity_margin=1.5, following=0.02, saturation=0.3,
-        drive_deviation=0.11, patience=0.06, bus_patience=0.05, carried=0.02,
+        drive_deviation=0.11, patience=0.06, bus_patience=0.05, carried=0.02, oscillation=0.02,
     )  # fmt: skip
     p = watch_parameters(settings, 200.0, limits)
     assert (p["most_lost_imus"], p["conditioning"], p["following"]) == (2, 0.01, 0.02)
     assert (p["saturation"], p["drive_deviation"], p["patience"], p["bus_cycles"]) == (0.3, 0.11, 0.06, 10)
-    assert p["speed"] == pytest.approx(0.45) and p["carried"] == pytest.approx(4e-4)
+    assert p["speed"] == pytest.approx(0.45) and p["carried"] == p["oscillation"] == pytest.approx(4e-4)
     np.testing.assert_allclose(p["lengths"], stroke + [-0.004, 0.004])
     # A quarter of the stroke's 100 to 150 mm.
     away = (0.1 + 0.01 * np.arange(6)) / 4.0
@@ -507,3 +507,41 @@ def test_while_the_whole_mechanism_filter_is_trusted_its_rotation_counts():
     mechanism["filter"]["published_covariance"][4, 4] = (1.01 * limit) ** 2
     assert check_shaken(parameters, state)
     assert stop_of(state)[:2] == (Cause.NOT_CARRIED, -1)
+
+
+# ------------------------------------------------------------------------------------------------------ commands that oscillate
+
+
+def corrections_bear(seconds, amplitude, frequency, told=1, mode=Mode.RUNNING, steady=0.0):
+    """Whether a run bears for so long that the commands of all legs go to and fro by so much [m/s] about their feed-forward."""
+    _, parameters, state = moving()
+    s, period = state["safety"], float(parameters["rig"]["period"])
+    state["imus"]["shaking"]["told"], s["mode"] = told, mode
+    feed_forward = np.linspace(-0.1, 0.1, 6)
+    phases = np.arange(6.0)
+    for cycle in range(round(seconds / period)):
+        turn = 2.0 * np.pi * frequency * period * cycle
+        state["pid"]["command"] = feed_forward + steady + amplitude * np.sin(turn + phases)
+        check_oscillation(
+            parameters["safety"][()], s[()], parameters["rig"][()], state["time"][()], state["imus"]["shaking"][()],
+            feed_forward, state["reference"][()], state["pid"][()],
+        )  # fmt: skip
+        if s["stop"]["cause"] != Cause.NONE:
+            return stop_of(state), period * cycle
+    return None
+
+
+@pytest.mark.parametrize("frequency", [10.0, 18.0, 60.0])
+def test_commands_that_oscillate_while_the_imus_are_shaken_end_a_run_after_a_second(frequency):
+    limit = SafetySettings().oscillation
+    assert corrections_bear(3.0, 0.95 * np.sqrt(2.0) * limit, frequency) is None
+    (cause, leg, value, most), after = corrections_bear(3.0, 1.2 * np.sqrt(2.0) * limit, frequency)
+    assert cause == Cause.OSCILLATES and 0 <= leg < 6 and limit < value < 1.25 * limit and most == pytest.approx(limit)
+    assert 1.0 < after < 1.4
+
+
+@pytest.mark.parametrize(
+    "bearing", [{"told": 0}, {"mode": Mode.STOPPING}, {"frequency": 0.2}, {"amplitude": 0.0, "steady": 0.2}]
+)
+def test_noise_of_the_estimate_a_stop_and_slow_corrections_are_no_oscillation(bearing):
+    assert corrections_bear(**{"seconds": 3.0, "amplitude": 0.05, "frequency": 18.0, **bearing}) is None

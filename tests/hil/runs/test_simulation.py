@@ -19,6 +19,7 @@ from hil.runs.prepare import prepared_loop
 from hil.runs.simulation import SimulationStoppedError, simulate
 from plant.errors import InputError, UnknownNameError, UnreachableError
 from plant.fmu.settings import Setting
+from plant.imu_wiring import ALL_IMUS
 from plant.mechanism import load_mechanism
 from plant.pose import rotation_from_quaternion, rotation_from_vector
 from plant.truth import TRUTH_POSITION
@@ -97,6 +98,21 @@ def test_a_slack_of_ones_own_holds_with_few_imus(tmp_path, own, slack):
     path.write_text(f'based_on = "hexapod"\n{own}')
     with prepared_loop(SimulationConfig(str(path), duration=0.05, imus=(0, 1, 3, 4))) as loop:
         assert loop.parameters["safety"]["drives"]["slack"] == slack
+
+
+@pytest.mark.parametrize(("imus", "limited"), [(ALL_IMUS, True), ((0, 1, 3, 4), False)])
+def test_the_noise_of_few_imus_is_no_oscillation(imus, limited):
+    with prepared_loop(SimulationConfig(duration=0.05, imus=imus)) as loop:
+        assert np.isfinite(loop.parameters["safety"]["watch"]["oscillation"]) == limited
+
+
+@pytest.mark.parametrize("fusion", ["compiled", "whole"])
+def test_a_mechanism_that_chatters_in_its_play_is_stopped(fusion):
+    """0.5 mm of clearance: from one second on the legs go to and fro by 1 mm at 18 Hz, and on and on."""
+    seed, play = {"compiled": 2, "whole": 17}[fusion], Setting("joint.clearance", (5e-4,))
+    with pytest.raises(SimulationStoppedError, match="the commands oscillate") as stopped:
+        simulate(SimulationConfig(target="sines", duration=8.0, seed=seed, fusion=fusion, settings=(play,)))
+    assert stopped.value.result.times[-1] < 4.0
 
 
 def test_a_calibration_of_another_rig_is_refused_before_anything_runs(tmp_path):
