@@ -110,7 +110,10 @@ RUNNING_LIMITS: Limits = {
 
 
 class CycleStage(IntEnum):
-    """The stages, in their order."""
+    """The stages, in their order.
+
+    Python calls kernels with their `value`: to tell a member of an enumeration takes numba 65 us, and it compiles anew for it.
+    """
 
     SCREENING, LEGS, PLATFORM, HEADING, POSE, REFINEMENT, MECHANISM, INTEGRITY, CONTROL, END = range(10)
 

@@ -219,7 +219,7 @@ def linear_estimator(mechanism: Mechanism, rate: float, signals: Array) -> Linea
 
     def step(state: Record, sample: Array) -> None:
         measurement[GYROSCOPE], measurement[ACCELEROMETER] = sample.reshape(2, 7, 3)
-        run_stages(parameters, state, measurement, no_reference, marks, CycleStage.SCREENING, CycleStage.CONTROL)
+        run_stages(parameters, state, measurement, no_reference, marks, CycleStage.SCREENING.value, CycleStage.CONTROL.value)
         state["time"]["cycle"] += 1
 
     def flat(state: Record) -> Array:

@@ -323,7 +323,7 @@ def gough_faults(options: Namespace) -> int:
     everything: list[Case | Row] = [*CASES, *all_rows()]
     items = [item for item in everything if any(text in item.name or text in item.kind for text in only)]
     if not items:
-        raise InputError(f"no case has {' or '.join(map(repr, only))} in its name")
+        raise InputError(f"no case has {' or '.join(map(repr, only))} in its name or kind: 'gough faults --list' prints all")
     if options.list:
         list_table(items).print(options.markdown)
         return 0

@@ -97,7 +97,7 @@ class Loop:
         load_kernel(now, clock["timespec"])
         load_kernel(begin_cycle, *cycle, clock, *shared, self.most_missed, 0)
         load_kernel(process_feedback, *cycle, work, 0)
-        stages = CycleStage.SCREENING, CycleStage.END
+        stages = CycleStage.SCREENING.value, CycleStage.END.value
         load_kernel(run_stages, *cycle, work["feedback"]["measurement"], segments, work["marks"][()], *stages)
         load_kernel(end_cycle, *cycle, segments, self.records, clock, *shared, 0)
 
@@ -124,16 +124,16 @@ class Loop:
             work["stage_ns"][Stage.SENSE] = now(timespec) - began
             failed = process_feedback(parameters, state, work, status)
             if not failed:
-                first = CycleStage.SCREENING
+                first = CycleStage.SCREENING.value
                 if filters is not None and safety["mode"] != Mode.FAULT:
-                    run_stages(parameters, state, measurement, segments, marks, CycleStage.SCREENING, CycleStage.LEGS)
+                    run_stages(parameters, state, measurement, segments, marks, first, CycleStage.LEGS.value)
                     t0 = now(timespec)
                     filters.step_legs(state)
                     t1 = now(timespec)
                     filters.step_platform(state)
                     marks["ns"][CycleStage.LEGS], marks["ns"][CycleStage.PLATFORM] = t1 - t0, now(timespec) - t1
-                    first = CycleStage.HEADING
-                failed = run_stages(parameters, state, measurement, segments, marks, first, CycleStage.END)
+                    first = CycleStage.HEADING.value
+                failed = run_stages(parameters, state, measurement, segments, marks, first, CycleStage.END.value)
             end_cycle(parameters, state, segments, self.records, clock, self.script, self.link, work, streamed, failed)
         if cause != Cause.NONE:
             stop_quickly(rig)

@@ -89,10 +89,11 @@ def evaluate(
         raise InputError(f"{folder} is no folder with trials *.npz: give one with trials of BROAD")
     if not paths and seeds < 1:
         raise InputError(f"no folder with trials and {seeds} simulated motions of each kind: give a folder, or at least 1")
+    trials = [load_trial(path) for path in paths]
     motions = [(kind, seed) for kind in SPECTRA for seed in range(1, seeds + 1)]
     of_motions = engine.starmap(partial(_evaluate_motion, fusion), motions) if motions else []
     return {
-        "trials": dict(engine.map(partial(_evaluate, fusion), [load_trial(path) for path in paths])) if paths else {},
+        "trials": dict(engine.map(partial(_evaluate, fusion), trials)) if trials else {},
         "simulated": dict(of_motions),
         "accelerometer_noise": fusion.platform_accelerometer_noise,
         "bias_walk": fusion.bias_walk,

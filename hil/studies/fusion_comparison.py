@@ -123,10 +123,10 @@ def _filterpy(readings: _Readings) -> PoseTrack:
     segments, marks, pose = np.zeros((LEGS, 1, 5)), np.zeros((), MARKS)[()], state["pose"]
     for i, raw in enumerate(readings.raw):
         began = time.perf_counter_ns()
-        run_stages(parameters, state, raw, segments, marks, CycleStage.SCREENING, CycleStage.LEGS)
+        run_stages(parameters, state, raw, segments, marks, CycleStage.SCREENING.value, CycleStage.LEGS.value)
         filters.step_legs(state)
         filters.step_platform(state)
-        run_stages(parameters, state, raw, segments, marks, CycleStage.HEADING, CycleStage.MECHANISM)
+        run_stages(parameters, state, raw, segments, marks, CycleStage.HEADING.value, CycleStage.MECHANISM.value)
         fused["ns"][i, REFINED] = time.perf_counter_ns() - began
         fused["positions"][i, REFINED], fused["rotations"][i, REFINED] = pose["position"], pose["rotation"]
         lower = np.tril(pose["information"])
