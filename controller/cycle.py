@@ -177,6 +177,8 @@ def cycle_parameters(
             f"{rate:g} Hz) and without the paper's section 5: leave out protection_position and protection_rotation"
         )
     watch_evidence = bool(watched.watch_imus) and able
+    if not able:
+        watched = replace(watched, misfit=np.inf)
     if are_few(mechanism, imus):
         # The noise of their estimate alone makes the commands go to and fro.
         watched = replace(watched, evidence=np.inf, oscillation=np.inf)
@@ -267,6 +269,8 @@ def run_stages(
     if first <= CycleStage.REFINEMENT < last:
         if s.pose.found != 0:
             s.pose.found = pose_estimator.refine_pose(p.pose, s.pose, rig, time, s.legs, s.platform.rate)
+            if s.pose.found != 0 and p.pose.section_5 == 0:
+                watch.check_misfit(p.safety, s.safety, rig, time, s.pose, s.reference, s.pid)
         judged = p.integrity.filter.active != 0 and np.isfinite(p.safety.watch.evidence)
         if s.pose.found != 0 and p.safety.monitor.active != 0 and p.pose.section_5 == 0 and not judged:
             imu_monitor.look_at_next(

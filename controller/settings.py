@@ -12,7 +12,7 @@ from plant.mechanism import Mechanism
 
 _ENDLESS = 1e300
 _RAW_M, _FEW_M = 0.05, 0.03
-_ENDLESS_ALLOWED = ("evidence", "protection_position", "protection_rotation", "oscillation", "slack")
+_ENDLESS_ALLOWED = ("misfit", "evidence", "protection_position", "protection_rotation", "oscillation", "slack")
 _ZERO_ALLOWED = (
     "integral", "derivative", "sensor_delay", "sensor_timing", "most_lost_imus", "watch_imus", "need_platform_imu", "load",
     "resistance", "friction",
@@ -95,6 +95,7 @@ class SafetySettings(_Settings):
 
     most_lost_imus: float = 1.0  # that may be left out at once
     disagreement: float = radians(1.0)  # of an IMU's direction and that of all others, beyond which it is left out [rad]
+    misfit: float = 5.0  # RMS of what a pose leaves of the IMUs' directions without the worst, beyond which a run stops [sigma]
     evidence: float = 8.0  # that something is wrong with the readings, beyond which an IMU is left out or a run stops [sigma]
     protection_position: float = inf  # largest protection level of the position [m]
     protection_rotation: float = inf  # largest protection level of the rotation [rad]

@@ -64,7 +64,7 @@ def look_at_next(p: Record, m: Record, pose: Record, measured: Array, leg_weight
 
     Args:
         p, m: dtypes `PARAMETERS` and `STATE`.
-        pose: state of the pose estimator: the pose, its legs, the Cholesky factor, and the measured vertical.
+        pose: state of the pose estimator: the pose, its legs, the Cholesky factor, its weights, and the measured vertical.
         measured, leg_weights: (6, 3) and (6,), the legs' measured directions and their weights.
         vertical_in_base: (3,), unit.
     """
@@ -74,6 +74,7 @@ def look_at_next(p: Record, m: Record, pose: Record, measured: Array, leg_weight
     if not weight > 0.0:
         reset(m, k)
         return
+    reduced = pose.weights[LEGS if platform else leg]
     direction = rotate(pose.rotation, vector(pose.vectors[0])) if platform else vector(pose.directions[leg])
     known = vector(vertical_in_base) if platform else vector(measured[leg])
     first, second = _across(direction)
@@ -91,9 +92,9 @@ def look_at_next(p: Record, m: Record, pose: Record, measured: Array, leg_weight
     s00 = s11 = 1.0
     s01 = 0.0
     for i in range(6):
-        s00 -= weight * m.jacobian[0, i] * m.solved[0, i]
-        s01 -= weight * m.jacobian[0, i] * m.solved[1, i]
-        s11 -= weight * m.jacobian[1, i] * m.solved[1, i]
+        s00 -= reduced * m.jacobian[0, i] * m.solved[0, i]
+        s01 -= reduced * m.jacobian[0, i] * m.solved[1, i]
+        s11 -= reduced * m.jacobian[1, i] * m.solved[1, i]
     least = 0.5 * (s00 + s11) - np.sqrt(0.25 * (s00 - s11) ** 2 + s01 * s01)
     off = subtract(known, direction)
     r0, r1 = dot(first, off), dot(second, off)

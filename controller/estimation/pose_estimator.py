@@ -10,8 +10,9 @@ from controller.direct_kinematics.legs_alone import pose_from_legs
 from controller.direct_kinematics.legs_and_attitude import pose_from_rotation, pose_from_vector, rotation_from_vectors
 from controller.direct_kinematics.planar import pose_from_roll
 from controller.direct_kinematics.refinement import (
+    find_doubts,
+    find_misfits,
     find_twist,
-    misfit,
     move_pose,
     normal_equations,
     solve_normal_equations,
@@ -44,11 +45,15 @@ STATE = record_dtype(
     information=(np.float64, (6, 6)),  # inverse of the refined pose's covariance, lower triangle
     factor=(np.float64, (6, 6)),  # Cholesky factor of the information
     misfit=np.float64,  # of the measurements about the refined pose, 1 on average if their covariances are right
+    rest_misfit=np.float64,  # the same without the worst of the measurements; 0 with few measurements
     arms=(np.float64, (LEGS, 3)),  # the turned platform joints at the pose [m]
     directions=(np.float64, (LEGS, 3)),  # of the legs at the pose, unit
     lengths=(np.float64, LEGS),  # of the legs at the pose [m]
     vectors=(np.float64, (2, 3)),  # the measured vertical and horizontal field in {2}
     vector_weights=(np.float64, 2),
+    misfits=(np.float64, LEGS + 2),  # of each leg's direction and each vector
+    doubts=(np.float64, LEGS + 2),  # by which their weights were reduced
+    weights=(np.float64, LEGS + 2),  # the reduced ones
     angular_velocity=(np.float64, 3),  # from here on scratch
     correction=(np.float64, 6),
     scratch=SCRATCH,
@@ -111,13 +116,19 @@ def find_pose(
 def refine_pose(p: Record, s: Record, rig: Record, time: Record, legs: Record, platform_rate: Array) -> bool:
     """Two Gauss-Newton steps for the pose; the twist comes with them, and the acceleration is its derivative.
 
+    What disagreed with the pose of the last cycle has less weight.
+
     The paper's section 5 does not move the pose and has no covariance. `platform_rate` (3,) is the angular velocity in {2}
     [rad/s]. False if the normal equations have no solution.
     """
+    weights, vector_weights = s.weights[:LEGS], s.weights[LEGS:]
+    for k in range(LEGS + 2):
+        weight = legs.weights[k] if k < LEGS else s.vector_weights[k - LEGS]
+        s.weights[k] = weight / (1.0 + s.doubts[k])
     for _ in range(2):
         normal_equations(
-            rig.geometry.base_joints, rig.geometry.platform_joints, legs.directions, legs.weights, rig.vectors_in_base,
-            s.vectors, s.vector_weights, s.position, s.rotation, s.arms, s.directions, s.lengths, s.information, s.correction,
+            rig.geometry.base_joints, rig.geometry.platform_joints, legs.directions, weights, rig.vectors_in_base,
+            s.vectors, vector_weights, s.position, s.rotation, s.arms, s.directions, s.lengths, s.information, s.correction,
         )  # fmt: skip
         if rig.planar != 0:
             stay_in_plane(s.information, s.correction)
@@ -127,10 +138,13 @@ def refine_pose(p: Record, s: Record, rig: Record, time: Record, legs: Record, p
             s.information[:] = 0.0
             break
         move_pose(s.correction, s.position, s.rotation)
-    s.misfit = misfit(legs.directions, legs.weights, s.directions, rig.vectors_in_base, s.vectors, s.vector_weights, s.rotation)
+    s.misfit = find_misfits(
+        legs.directions, legs.weights, s.directions, rig.vectors_in_base, s.vectors, s.vector_weights, s.rotation, s.misfits
+    )  # fmt: skip
+    s.rest_misfit = find_doubts(s.misfits, s.doubts)
     s.angular_velocity[0], s.angular_velocity[1], s.angular_velocity[2] = rotate(s.rotation, vector(platform_rate))
     find_twist(
-        legs.rates, legs.weights, s.vectors, s.vector_weights, s.angular_velocity, s.rotation, s.arms, s.directions, s.lengths,
+        legs.rates, weights, s.vectors, vector_weights, s.angular_velocity, s.rotation, s.arms, s.directions, s.lengths,
         s.factor, s.twist,
     )  # fmt: skip
     if time.cycle == 0:

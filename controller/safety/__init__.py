@@ -57,6 +57,15 @@ def watch_nothing(parameters: Record) -> None:
     limits["most_lost_imus"], limits["conditioning"] = IMU_COUNT, 0.0
     limits["evidence"] = limits["level"] = np.inf
     limits["lengths"] = limits["plausible_lengths"] = -np.inf, np.inf
-    for name in ("speed", "following", "saturation", "drive_deviation", "carried", "oscillation", "without_platform_imu"):
+    for name in (
+        "speed",
+        "following",
+        "saturation",
+        "drive_deviation",
+        "carried",
+        "oscillation",
+        "misfit",
+        "without_platform_imu",
+    ):
         limits[name] = np.inf
     safety["drives"]["slack"] = np.inf

@@ -178,6 +178,8 @@ class Cause(IntEnum):
         "m/s RMS",
     )
 
+    NO_POSE_FITS = 66, "no pose fits the IMUs, even without the worst of them", Reaction.QUICK_STOP, "sigma RMS"
+
     @property
     def short(self) -> str:
         """The text without the number of a leg or an IMU."""

@@ -44,6 +44,9 @@ _NEARLY = 0.7
 _CLEARER = 1.3
 """How much more of the residuals the named IMU must explain than any other."""
 
+_UNFIT_S = 0.005
+"""For how long the misfit must be beyond its limit, at least two cycles [s]."""
+
 _FAST_S = 0.1
 """Corrections that last longer than this are no oscillation; its mean square is taken over as long [s]."""
 
@@ -64,6 +67,8 @@ PARAMETERS = record_dtype(
     bus_cycles=np.int64,
     carried=np.float64,  # [rad^2]
     oscillation=np.float64,  # [m^2/s^2]
+    misfit=np.float64,  # square of the RMS
+    unfit=np.float64,  # [s]
     evidence=np.float64,  # for a fault, twice a logarithm
     level=(np.float64, 2),  # of protection, position [m] and rotation [rad]
 )
@@ -74,6 +79,7 @@ STATE = record_dtype(
     silent=np.int64,  # for how many cycles the rig has not answered
     unanswered=np.int64,  # how many more exchanges failed than succeeded, up to twice the limit
     contradicted_for=np.float64,  # how long the IMUs have contradicted each other [s]
+    unfit_for=np.float64,  # how long no pose has fitted the IMUs [s]
     without_platform_imu=np.float64,  # for how long the platform's IMU, where there is one, has been left out [s]
     off_reference_for=(np.float64, LEGS),  # how long each leg has been off its reference [s]
     deviating_for=(np.float64, LEGS),  # how long each drive has been off its command [s]
@@ -109,6 +115,8 @@ def watch_parameters(settings: SafetySettings, rate: float, limits: Limits) -> R
         bus_cycles=max(3, round(settings.bus_patience * rate)),
         carried=settings.carried**2,
         oscillation=settings.oscillation**2,
+        misfit=settings.misfit**2 if settings.watch_imus else np.inf,
+        unfit=max(_UNFIT_S, 2.0 / rate),
         evidence=settings.evidence**2,
         level=(settings.protection_position, settings.protection_rotation),
     )
@@ -186,6 +194,15 @@ def exclude_imu(
     for k in range(IMU_COUNT):
         reset(m, k)
     report_event(s.events, Cause.IMU_DISAGREES, worst, off, limit)
+
+
+@kernel
+def check_misfit(p: Record, s: Record, rig: Record, time: Record, pose: Record, reference: Record, pid: Record) -> None:
+    """After the refinement: stop when no pose fits the directions that the IMUs tell, whichever of them is left out."""
+    misfit, limit = pose.rest_misfit, p.watch.misfit
+    s.watch.unfit_for = s.watch.unfit_for + elapsed(rig, time) if misfit > limit else 0.0
+    if s.watch.unfit_for >= p.watch.unfit and s.mode == Mode.RUNNING:
+        handle_cause(p, s, rig, time, reference, pid, Cause.NO_POSE_FITS, -1, np.sqrt(misfit), np.sqrt(limit))
 
 
 @kernel

@@ -259,7 +259,10 @@ def test_a_moving_platform_is_followed_by_ideal_imus_wherever_they_sit(hexapod, 
 
 @pytest.mark.parametrize("imus", [ALL_IMUS, LEG_IMUS, (0, 1, 3, 4, PLATFORM_IMU)])
 def test_the_estimate_is_the_public_solvers_for_the_same_directions(hexapod, imus):
-    """Two Gauss-Newton steps against as many as it takes, over noisy data; and the information against its covariance."""
+    """Two Gauss-Newton steps against as many as it takes, over noisy data; and the information against its covariance.
+
+    The solver doubts nothing.
+    """
     parameters, fusion = parameters_of(hexapod, imus), FusionSettings()
     at, segments, state = wavy(hexapod, 4), resting(np.full(6, 0.394)), np.zeros((), STATE)
     for _ in range(10):
@@ -267,6 +270,8 @@ def test_the_estimate_is_the_public_solvers_for_the_same_directions(hexapod, imu
         directions = np.where(np.isin(np.arange(6), imus)[:, None], state["legs"]["directions"], np.nan)
         extra = {"up_in_platform": state["pose"]["vectors"][0], "tilt_sigma": fusion.tilt_sigma} if PLATFORM_IMU in imus else {}
         solution = solve(hexapod, directions, leg_sigma=fusion.leg_sigma, **extra)
+        state["pose"]["doubts"] = 0.0
+        assert refine(parameters, state)
         # A thousandth of what the noise leaves uncertain.
         assert np.linalg.norm(state["pose"]["position"] - solution.position) < 1e-6
         assert angle_between(state["pose"]["rotation"], solution.rotation) < 1e-6

@@ -85,7 +85,14 @@ def test_what_is_no_number_is_refused_in_tables_and_changes(hexapod, value):
 @pytest.mark.parametrize(("kind", "read", "table"), KINDS)
 def test_a_bad_value_of_any_setting_is_refused_by_name(hexapod, kind, read, table, bad):
     for name in asdict(kind()):
-        if bad == np.inf and name in ("evidence", "protection_position", "protection_rotation", "oscillation", "slack"):
+        if bad == np.inf and name in (
+            "misfit",
+            "evidence",
+            "protection_position",
+            "protection_rotation",
+            "oscillation",
+            "slack",
+        ):
             assert getattr(read(hexapod, **{name: bad}), name) == np.inf
             continue
         with pytest.raises(InputError, match=name):

@@ -53,7 +53,7 @@ _ENOUGH = 5
 _AVERAGED = 0.25
 """Share of a window in the average of such errors."""
 
-SHARED, _SHARED_WINDOWS = 0.15, 10
+SHARED, _SHARED_WINDOWS = 0.1, 10
 """The average that all accelerometers show in so many windows in a row before the run ends [m/s^2]."""
 
 STATE = record_dtype(

@@ -114,8 +114,10 @@ def step_mechanism_filter(
     for k in range(IMU_COUNT):
         # A sample that is repeated is of another time.
         fresh = imus.used[k] != 0 and imus.sample_age[k] == 0
+        # What the closed form doubts has bent one of the other filters, and counts less here as well.
+        share = 1.0 / (1.0 + pose.doubts[k]) if fresh else 0.0
         for sensor in range(2):
-            s.weights[sensor, k] = worth_of(imus.shaking, sensor, k, p.filter.variance[sensor]) if fresh else 0.0
+            s.weights[sensor, k] = share * worth_of(imus.shaking, sensor, k, p.filter.variance[sensor])
     accumulate_sample(f, imus.sample, s.weights, now - p.delay)
     if heading.used != 0 and heading.fresh != 0:
         accumulate_field(f, heading.field, now - p.delay)

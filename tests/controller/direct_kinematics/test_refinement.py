@@ -1,11 +1,15 @@
-"""The refinement's twist against weighted least squares in NumPy, its misfit against SciPy's least squares."""
+"""The refinement's twist against weighted least squares in NumPy, its misfit and its doubts against SciPy's least squares."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
 from controller.cycle import STATE, cycle_parameters
+from controller.direct_kinematics.refinement import find_doubts
 from controller.settings import control_settings, fusion_settings
+from plant.pose import pose_errors
 from tests.controller.cycles import refine
 from tests.controller.leg_geometry import leg_directions, leg_vectors, rotation_of, skew
 
@@ -75,5 +79,99 @@ def test_the_misfit_is_what_the_best_pose_leaves_over(hexapod, left_out, vector_
 
     best = least_squares(left_over, np.zeros(6), xtol=1e-15, ftol=1e-15, gtol=1e-15)
     assert refine(parameters, state)
+    # Each measurement by itself, -1 where there is none.
+    each = np.square(best.fun).reshape(8, 3).sum(axis=1)
+    there = np.concatenate([weights, vector_weights]) > 0.0
+    np.testing.assert_allclose(pose["misfits"][there], each[there], rtol=1e-3, atol=1e-7)
+    assert (pose["misfits"][~there] == -1.0).all()
     expected = 2.0 * best.cost / freedom if freedom else 0.0
     np.testing.assert_allclose(pose["misfit"], expected, rtol=1e-4)
+
+
+def wrong_directions(mechanism, wrong, angle):
+    """Parameters, and a state at the home pose with some legs' directions turned by an angle [rad]."""
+    parameters = cycle_parameters(mechanism, 1000.0, control_settings(mechanism), fusion_settings(mechanism))
+    state, home = np.zeros((), STATE), mechanism.home
+    directions, vectors = leg_directions(mechanism, home.position, home.rotation), np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    for k in wrong:
+        across = np.cross(directions[k], [1.0, 0.3, 0.2])
+        directions[k] = rotation_of(angle * across / np.linalg.norm(across)) @ directions[k]
+    state["legs"]["directions"], state["legs"]["weights"] = directions, 4e5
+    state["pose"]["vectors"], state["pose"]["vector_weights"] = vectors @ home.rotation, (4e5, 0.0)
+    state["pose"]["position"], state["pose"]["rotation"] = home.position, home.rotation
+    return parameters, state
+
+
+def moved_by(parameters, state, mechanism, cycles):
+    """How far refinements in so many cycles move the pose from home [m, rad]."""
+    for _ in range(cycles):
+        assert refine(parameters, state)
+    off = pose_errors(state["pose"]["position"], state["pose"]["rotation"], mechanism.home.position, mechanism.home.rotation)
+    return np.linalg.norm(off[:3]), np.linalg.norm(off[3:])
+
+
+@pytest.mark.parametrize("wrong", range(6))
+@pytest.mark.parametrize(("degrees", "share"), [(1.0, 0.2), (3.0, 0.02)])
+def test_one_leg_that_is_off_moves_the_pose_much_less_far_than_in_least_squares(hexapod, wrong, degrees, share):
+    """The first cycle has no doubts yet."""
+    parameters, state = wrong_directions(hexapod, [wrong], np.radians(degrees))
+    plain, doubting = (moved_by(parameters, state, hexapod, cycles) for cycles in (1, 20))
+    assert doubting[0] < share * plain[0] and doubting[1] < share * plain[1]
+    pose = state["pose"]
+    assert np.argmax(pose["doubts"]) == wrong and pose["doubts"][wrong] > 4.0
+    # The rest agrees.
+    assert pose["rest_misfit"] < 0.02 * pose["misfit"]
+
+
+def test_the_doubts_find_the_pose_of_their_own_weights(hexapod):
+    """After some cycles the pose is that of SciPy's least squares with the reduced weights."""
+    parameters, state = wrong_directions(hexapod, [2], np.radians(0.6))
+    moved_by(parameters, state, hexapod, 50)
+    pose, legs, home = state["pose"], state["legs"], hexapod.home
+    weights = np.concatenate([legs["weights"], pose["vector_weights"]]) / (1.0 + pose["doubts"])
+
+    def left_over(step):
+        turned = rotation_of(step[3:]) @ home.rotation
+        off = legs["directions"] - leg_directions(hexapod, home.position + step[:3], turned)
+        tilt = np.array([0.0, 0.0, 1.0]) - turned @ pose["vectors"][0]
+        return (np.sqrt(weights[:7])[:, np.newaxis] * np.vstack([off, tilt])).ravel()
+
+    best = least_squares(left_over, np.zeros(6), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    np.testing.assert_allclose(pose["position"], home.position + best.x[:3], rtol=0.0, atol=1e-8)
+    # Cauchy's weights, whose scale grows with what the others leave.
+    squares = np.square(left_over(best.x)).reshape(7, 3).sum(axis=1) * (1.0 + pose["doubts"][:7])
+    others = (squares.sum() - squares) / 6.0
+    np.testing.assert_allclose(pose["doubts"][:7], squares / (9.0 + 6.0 * others), rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(pose["rest_misfit"], (squares.sum() - squares.max()) / 6.0, rtol=1e-4)
+
+
+@given(st.lists(st.floats(0.0, 1e6), min_size=6, max_size=8))
+def test_what_all_are_off_alike_is_hardly_doubted_and_one_alone_the_more(squares):
+    misfits, doubts = np.array(squares), np.zeros(len(squares))
+    rest = find_doubts(misfits, doubts)
+    assert (doubts >= 0.0).all() and rest <= misfits.sum() / (2 * len(misfits) - 8) + 1e-9
+    # The order of the measurements does not matter, and a worse one is doubted more.
+    assert (np.diff(doubts[np.argsort(misfits)]) >= -1e-12 * doubts.max()).all()
+    alike = np.full(len(squares), squares[0])
+    find_doubts(alike, doubts)
+    assert (doubts <= 1.0 / 6.0 + 1e-12).all()
+
+
+@pytest.mark.parametrize("left_out", [(0, 1), (4, 6), (1, 2, 3)])
+def test_with_few_measurements_none_is_doubted(hexapod, left_out):
+    parameters, state = wrong_directions(hexapod, [5], np.radians(1.0))
+    for k in left_out:
+        if k == 6:
+            state["pose"]["vector_weights"][0] = 0.0
+        else:
+            state["legs"]["weights"][k] = 0.0
+    moved_by(parameters, state, hexapod, 3)
+    assert (state["pose"]["doubts"] == 0.0).all() and state["pose"]["rest_misfit"] == 0.0
+    assert state["pose"]["misfit"] > 1.0 or len(left_out) == 3
+
+
+@pytest.mark.parametrize("lost", [np.nan, np.inf])
+def test_what_is_not_finite_is_not_doubted_for_ever(lost):
+    doubts = np.full(7, np.nan)
+    find_doubts(np.array([lost, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]), doubts)
+    assert np.isfinite(doubts).all() and doubts[0] == 0.0

@@ -36,6 +36,7 @@ def monitored(mechanism, pose, directions, vertical, used=range(6), turns=1, smo
         s["correction"],
     )  # fmt: skip
     assert solve_normal_equations(s["information"], s["correction"], s["factor"])
+    s["weights"] = *weights, *s["vector_weights"]
     parameters, monitor = np.zeros((), imu_monitor.PARAMETERS), np.zeros((), imu_monitor.STATE)
     parameters["smoothing"] = smoothing
     monitor["contradiction"] = monitor["explained"] = monitor["squares"] = before

@@ -1,5 +1,7 @@
 """What is watched in motion: every limit, in both directions, as long as it lasts, and what the rig reports."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,14 @@ from controller.inverse_kinematics import leg_lengths
 from controller.safety import watch_nothing
 from controller.safety.causes import Cause, DriveState, Mode, Request
 from controller.safety.stop import describe_end
-from controller.safety.watch import check_carried, check_limits, check_oscillation, exclude_imu, watch_parameters
+from controller.safety.watch import (
+    check_carried,
+    check_limits,
+    check_misfit,
+    check_oscillation,
+    exclude_imu,
+    watch_parameters,
+)
 from controller.settings import SafetySettings
 from plant.mechanism import Limits
 from plant.pose import rotation_from_vector
@@ -545,3 +554,37 @@ def test_commands_that_oscillate_while_the_imus_are_shaken_end_a_run_after_a_sec
 )
 def test_noise_of_the_estimate_a_stop_and_slow_corrections_are_no_oscillation(bearing):
     assert corrections_bear(**{"seconds": 3.0, "amplitude": 0.05, "frequency": 18.0, **bearing}) is None
+
+
+# ------------------------------------------------------------------------------------------------------- no pose fits the IMUs
+
+
+def cycles_until_unfit(parameters, state, misfits):
+    """After how many of these cycles a run ends, with misfits without the worst measurement; None if it does not."""
+    s = state["safety"]
+    for cycle, misfit in enumerate(misfits):
+        state["pose"]["rest_misfit"] = misfit
+        check_misfit(
+            parameters["safety"][()], s[()], parameters["rig"][()], state["time"][()], state["pose"][()],
+            state["reference"][()], state["pid"][()],
+        )  # fmt: skip
+        if s["stop"]["cause"] != Cause.NONE:
+            return cycle + 1
+    return None
+
+
+def test_a_run_ends_within_5_ms_when_no_pose_fits_the_imus():
+    _, parameters, state = moving()
+    limit, lasting = SafetySettings().misfit ** 2, math.ceil(0.005 / float(parameters["rig"]["period"]))
+    assert cycles_until_unfit(parameters, state, [0.99 * limit] * 1000) is None
+    # Not if a pose fits every now and then.
+    assert cycles_until_unfit(parameters, state, ([9.0 * limit] * (lasting - 1) + [0.5 * limit]) * 50) is None
+    state["safety"]["mode"] = Mode.STOPPING
+    assert cycles_until_unfit(parameters, state, [9.0 * limit] * (lasting - 1)) is None
+    state["safety"]["mode"] = Mode.RUNNING
+    assert cycles_until_unfit(parameters, state, [4.0 * limit]) == 1
+    assert stop_of(state) == (Cause.NO_POSE_FITS, -1, pytest.approx(2.0 * np.sqrt(limit)), pytest.approx(np.sqrt(limit)))
+
+
+def test_whoever_ignores_the_imus_disagreement_ignores_their_misfit(hexapod):
+    assert watch_parameters(SafetySettings(watch_imus=0.0), 1000.0, hexapod.limits)["misfit"] == np.inf

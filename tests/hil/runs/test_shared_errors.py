@@ -1,11 +1,13 @@
 """Errors that all IMUs share, and the only IMU that shows them: what the closed loop tells, before a motion and in it."""
 
+import numpy as np
 import pytest
 
 from controller.safety.causes import Cause, Mode
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import SimulationStoppedError, simulate
 from plant.fmu.settings import Setting
+from plant.truth import TRUTH_POSITION
 
 MM = 1e-3
 
@@ -74,6 +76,27 @@ def test_a_run_that_cannot_rely_on_the_platforms_imu_ends_unless_that_is_allowed
     allowing.write_text('based_on = "hexapod"\n[safety]\nneed_platform_imu = 0\n')
     events = simulate(SimulationConfig(str(allowing), duration=2.0, faults=(fault,))).summary()["events"]
     assert any("IMU 6 is left out" in event for event in events) and not any("stop" in event for event in events)
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_gyroscopes_that_share_an_error_along_the_legs_are_told_by_legs_that_fit_no_pose(seed):
+    """A leg hardly turns about itself, so its filter takes that for a tilt, of 0.3 deg within 0.05 s."""
+    result, said = stopped(
+        target="sines", duration=5.0, seed=seed, faults=("imu-offset:legs,axis=z,size_deg_per_s=0.5,at=2.3",)
+    )
+    assert "the gyroscopes contradict each other" in said or "no pose fits the IMUs, even without the worst of them" in said
+    assert np.degrees(result.summary()["estimation"]["rotation_max"]) < 0.7
+
+
+@pytest.mark.parametrize("fusion", ["compiled", "whole"])
+def test_a_legs_imu_that_turns_hardly_moves_the_pose_although_it_takes_a_third_of_a_second_to_be_told(fusion):
+    result = simulate(
+        SimulationConfig(target="sines", duration=4.5, seed=5, fusion=fusion, faults=("imu-turn:1,axis=x,size_deg=3,at=3",))
+    )
+    assert any("IMU 1 is left out" in event for event in result.summary()["events"])
+    after = result.records[result.times > 3.0]
+    off = np.linalg.norm(after["position"] - after["truth"][:, TRUTH_POSITION], axis=1)
+    assert off.max() < 1.2 * MM
 
 
 @pytest.mark.parametrize("imus", [(0, 1, 2, 3, 4, 5), (0, 1, 3, 4)])

@@ -106,12 +106,12 @@ def test_the_noise_of_few_imus_is_no_oscillation(imus, limited):
         assert np.isfinite(loop.parameters["safety"]["watch"]["oscillation"]) == limited
 
 
-@pytest.mark.parametrize("fusion", ["compiled", "whole"])
-def test_a_mechanism_that_chatters_in_its_play_is_stopped(fusion):
+@pytest.mark.parametrize("seed", [2, 19])
+def test_a_mechanism_that_chatters_in_its_play_is_stopped(seed):
     """0.5 mm of clearance: from one second on the legs go to and fro by 1 mm at 18 Hz, and on and on."""
-    seed, play = {"compiled": 2, "whole": 17}[fusion], Setting("joint.clearance", (5e-4,))
+    play = Setting("joint.clearance", (5e-4,))
     with pytest.raises(SimulationStoppedError, match="the commands oscillate") as stopped:
-        simulate(SimulationConfig(target="sines", duration=8.0, seed=seed, fusion=fusion, settings=(play,)))
+        simulate(SimulationConfig(target="sines", duration=8.0, seed=seed, settings=(play,)))
     assert stopped.value.result.times[-1] < 4.0
 
 
