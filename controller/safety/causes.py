@@ -131,7 +131,12 @@ class Cause(IntEnum):
     RIVAL_BASE_MOVES = 46, "it may as well be a base that tilts or accelerates", Reaction.GO_ON, "sigma"
     IMU_CONTRADICTED = 47, "IMU {} is left out: the others contradict it", Reaction.GO_ON, "sigma"
     IMUS_CONTRADICT = 48, f"the IMUs contradict each other{_WORST}", Reaction.QUICK_STOP, "sigma"
-    NO_TRUST = 49, "not armed: the IMUs share an error, or the base is not at rest", Reaction.STOP, "sigma"
+    NO_TRUST = (
+        49,
+        "not armed: the IMUs share an error, or the base is not at rest: raw IMUs need a calibration",
+        Reaction.STOP,
+        "sigma",
+    )
     NOT_STILL = 50, "not armed: the estimate of leg {} still drifts on the brakes within 50 ms", Reaction.STOP, "m"
     SHAKEN = 51, "the IMUs are shaken, the worst is IMU {}: accelerometers count less", Reaction.GO_ON, "m/s^2 RMS"
     BRIDGED = 52, "readings of IMU {} at the end of their range are bridged by the other sensors", Reaction.GO_ON
