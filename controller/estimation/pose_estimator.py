@@ -30,6 +30,7 @@ WORST_CONDITIONING = 1e-2
 
 PARAMETERS = record_dtype(
     section_5=np.int64,  # whether the pose is that of the paper's section 5, unrefined
+    doubting=np.int64,  # whether what disagrees with the pose has less weight in the next cycle
     acceleration_rate=np.float64,  # corner of the acceleration's low-pass [1/s]
 )
 """Constants of the estimator."""
@@ -63,7 +64,7 @@ STATE = record_dtype(
 
 def pose_parameters(fusion: FusionSettings, section_5: bool) -> Record:
     """The constants of the estimator (dtype `PARAMETERS`)."""
-    return filled(PARAMETERS, section_5=section_5, acceleration_rate=1.0 / fusion.acceleration_time)
+    return filled(PARAMETERS, section_5=section_5, doubting=1, acceleration_rate=1.0 / fusion.acceleration_time)
 
 
 @kernel
@@ -141,7 +142,8 @@ def refine_pose(p: Record, s: Record, rig: Record, time: Record, legs: Record, p
     s.misfit = find_misfits(
         legs.directions, legs.weights, s.directions, rig.vectors_in_base, s.vectors, s.vector_weights, s.rotation, s.misfits
     )  # fmt: skip
-    s.rest_misfit = find_doubts(s.misfits, s.doubts)
+    if p.doubting != 0:
+        s.rest_misfit = find_doubts(s.misfits, s.doubts)
     s.angular_velocity[0], s.angular_velocity[1], s.angular_velocity[2] = rotate(s.rotation, vector(platform_rate))
     find_twist(
         legs.rates, weights, s.vectors, vector_weights, s.angular_velocity, s.rotation, s.arms, s.directions, s.lengths,

@@ -182,7 +182,12 @@ def _judge(
     """What `Estimator.judge` says of each estimator in a motion."""
     mechanism, raw, truth, late = _motion(config, tuning, kind, seed)
     filters, of_loop = {ESTIMATORS[name].whole for name in names}, (config.rate, control_settings(mechanism))
-    fused = {whole: fuse(cycle_parameters(mechanism, *of_loop, fusion, whole=whole), raw)[late] for whole in filters}
+    fused = {}
+    for whole in filters:
+        parameters = cycle_parameters(mechanism, *of_loop, fusion, whole=whole)
+        # Noise is what least squares leave: doubts would hide that it is assumed too small.
+        parameters["pose"]["doubting"] = 0
+        fused[whole] = fuse(parameters, raw)[late]
     return [ESTIMATORS[name].judge(mechanism, fused[ESTIMATORS[name].whole], truth) for name in names]
 
 
