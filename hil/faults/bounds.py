@@ -38,7 +38,7 @@ FACTOR = 1.5
 """The error before something is told may be so many times that of the best test."""
 
 LIMITS = {True: Errors(3e-3, radians(0.7)), False: Errors(5e-3, radians(1.0))}
-"""For faults of one IMU, and for what several share: the error that it may never exceed where `FACTOR` times that of the
+"""For faults of few IMUs, and for what more of them share: the error that it may never exceed where `FACTOR` times that of the
 best test is below it [m], [rad].
 """
 
@@ -110,8 +110,8 @@ def _bounds_of(row: Row, seeds: int, uncertainty: Uncertainty) -> RowBounds:
     try:
         bounds = find_bounds([Disturbed(each.config, each.faults, each.begin) for each in drawn], uncertainty)
     except NoSignatureError as error:
-        return RowBounds(row, len(drawn[0].guilty) == 1, reason=str(error))
-    return RowBounds(row, len(drawn[0].guilty) == 1, tuple(bounds))
+        return RowBounds(row, bool(drawn[0].guilty), reason=str(error))
+    return RowBounds(row, bool(drawn[0].guilty), tuple(bounds))
 
 
 def summary(found: Sequence[RowBounds], uncertainty: Uncertainty, measured: Mapping[str, Any] | None = None) -> dict[str, Any]:
