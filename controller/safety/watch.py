@@ -35,7 +35,7 @@ _REST, _REST_OF_ALL = 1.0, 0.35
 A fault that has just come up is not constant over the memory of the fault filter, and leaves up to a third of its own evidence.
 """
 
-_PATIENT = 2.0
+_PATIENT = 1.5
 """How many times the limit evidence may reach while more of it may tell what is wrong."""
 
 _NEARLY = 0.7
