@@ -370,10 +370,11 @@ def actuators_at(legs: list[Leg], x: dict[str, SX], u: dict[str, SX], c: dict[st
 
 def leg_outputs(legs: list[Leg], actuators: Actuators, x: dict[str, SX]) -> dict[str, SX]:
     """What the table has of legs and actuators, by name."""
-    speeds, motors = _speeds(legs), actuators.speed
+    lengths, speeds, motors = ca.vertcat(*[leg.length for leg in legs]), _speeds(legs), actuators.speed
     return {
-        "leg_length": ca.vertcat(*[leg.length for leg in legs]),
+        "leg_length": lengths,
         "leg_velocity": speeds,
+        "motor_length": lengths + actuators.play.loose * x["state.play"],
         "current": x["state.current"],
         "voltage": actuators.voltage,
         "power.drive": ca.dot(actuators.motor, motors),

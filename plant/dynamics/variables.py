@@ -249,6 +249,7 @@ def _outputs(legs: int, dimensions: int) -> tuple[Variable, ...]:
         *_twist(_output, "", dimensions),
         _output("leg_length", (legs,), "m", "lengths of the legs", 0, 400, 0.1),
         _output("leg_velocity", (legs,), "m/s", "rates of the lengths", -1e3, 1e3, 0.1),
+        _output("motor_length", (legs,), "m", "lengths at the motors, which have the play before them", 0, 400, 0.1),
         _output("current", (legs,), "A", "motor currents", -1e4, 1e4, 1),
         _output("voltage", (legs,), "V", "voltages that the drives ask for, within the voltage limit", -1e5, 1e5, 10),
         _output("kinetic_energy", (), "J", "of all bodies and rotors, seen from the base without its turning", 0, 1e9, 1),

@@ -31,6 +31,7 @@ TRUTH_PLACES = {
 """Where a signal lies in the truth. A planar plant's angle is in the first place of the quaternion."""
 
 COMMANDS, MODES, PAYLOAD = "velocity_command", "drive_mode", "payload.mass"
+MOTORS, LENGTHS = "motor_length", "leg_length"
 BASE = tuple(f"base_motion.{name}" for name in ("rotation", "angular_velocity", "angular_acceleration", "acceleration"))
 """The signals of the base's motion, in the order of `plant.dynamics.base_course`."""
 
@@ -50,7 +51,7 @@ UNITS: dict[str, dict[str, float]] = {
 
 SIGNAL_UNITS = {
     COMMANDS: "m/s", MODES: "1", "imu_angular_velocity": "rad/s", "imu_specific_force": "m/s2", "imu_magnetic_field": "uT",
-    "position": "m", "quaternion": "1", "angle": "rad", "leg_length": "m", "current": "A", PAYLOAD: "kg",
+    "position": "m", "quaternion": "1", "angle": "rad", LENGTHS: "m", MOTORS: "m", "current": "A", PAYLOAD: "kg",
     **dict(zip(BASE, ("rad", "rad/s", "rad/s2", "m/s2"), strict=True)),
 }  # fmt: skip
 """The loop's unit of every signal."""
@@ -216,6 +217,7 @@ class Bound:
     magnetometers: tuple[int, ...]
     sensed: Scalars  # in (3, 7, 3)
     known: Scalars  # the truth, in (19,)
+    encoded: Scalars  # the lengths that encoders read, in (legs,): the motors', or else the legs'
     commanded: Scalars  # in (legs,)
     loaded: Scalars  # the payload's mass, in (1,)
     based: Scalars  # the base's motion, in (12,)
@@ -223,7 +225,7 @@ class Bound:
     knows_pose: bool
     planar_angle: bool  # in place of the quaternion
     driven: frozenset[str]  # scalars that the loop sets
-    read: tuple[str, ...]  # scalars that the loop reads, in the order of `sensed` and `known`
+    read: tuple[str, ...]  # scalars that the loop reads, in the order of `sensed`, `known` and `encoded`
 
 
 def check_settable(variable: FmuVariable, owner: str, driven: frozenset[str], running: bool = False) -> None:
@@ -281,6 +283,7 @@ class _Binder:
         groups = {
             "sensed": self._group({name: self._imu_places(name, each) for name, each in imus.items()}),
             "known": self._group({name: self._truth_places(name) for name in TRUTH_PLACES if name in self._found}),
+            "encoded": self._group({name: range(self._legs) for name in self._encoded()}),
             "commanded": self._group({name: range(self._legs) for name in (COMMANDS,) if name in self._found}),
             "loaded": self._group({name: range(1) for name in (PAYLOAD,) if name in self._found}),
             "based": self._group({name: range(3 * i, 3 * i + 3) for i, name in enumerate(BASE) if name in self._found}),
@@ -305,7 +308,7 @@ class _Binder:
             driven=self._driven,
             read=tuple(
                 scalar
-                for name in (*IMU_SIGNALS, *TRUTH_PLACES)
+                for name in (*IMU_SIGNALS, *TRUTH_PLACES, *self._encoded())
                 for each in self._found.get(name, ())
                 for scalar in each.element_names
             ),
@@ -343,6 +346,10 @@ class _Binder:
         if beyond:
             self._problems.append(f"{name}: there is no imu {beyond[0]} on {self._legs} legs; there are {self._all_imus}")
         return [(IMU_SIGNALS[name] * IMU_COUNT + imu) * 3 + axis for imu in imus for axis in range(3)]
+
+    def _encoded(self) -> list[str]:
+        """The signal that encoders read, if there is one."""
+        return [name for name in (MOTORS, LENGTHS) if name in self._found][:1]
 
     def _truth_places(self, name: str) -> range:
         sizes = {"position": 2 if self._legs == PLANAR_LEGS else 3, "quaternion": 4, "angle": 1}

@@ -20,10 +20,12 @@ MOST_CHANGES = 32
 """The most parameters that may change during a run."""
 
 _SENSED = 3 * IMU_COUNT * 3
-_READ_IMUS, _READ_TRUTH, _WRITE_COMMAND, _WRITE_MODES, _WRITE_PAYLOAD, _WRITE_BASE, _CHANGE_VALUE, _STEP = range(8)
+(
+    _READ_IMUS, _READ_TRUTH, _READ_MOTORS, _WRITE_COMMAND, _WRITE_MODES, _WRITE_PAYLOAD, _WRITE_BASE, _CHANGE_VALUE, _STEP,
+) = range(9)  # fmt: skip
 CALLED = (
-    "reading the IMUs", "reading the truth", "setting the commands", "setting the drives' modes", "setting the payload",
-    "moving the base", "changing a parameter", "a step",
+    "reading the IMUs", "reading the truth", "reading the motors", "setting the commands", "setting the drives' modes",
+    "setting the payload", "moving the base", "changing a parameter", "a step",
 )  # fmt: skip
 """The name of each call in messages, by the `call` of `FMU_HANDLE`."""
 
@@ -67,6 +69,7 @@ FMU_HANDLE = record_dtype(
     call=np.int64,
     sensed=_scalars(_SENSED),
     known=_scalars(TRUTH_SIZE),
+    encoded=_scalars(LEGS),
     commanded=_scalars(LEGS),
     loaded=_scalars(1),
     based=_scalars(BASE_SIZE),
@@ -78,6 +81,7 @@ FMU_HANDLE = record_dtype(
     mode_raw=(np.uint64, LEGS),
     imu=(np.float64, (3, IMU_COUNT, 3)),
     truth=(np.float64, TRUTH_SIZE),
+    motors=(np.float64, LEGS),
     planar_angle=np.int64,
     legs=np.int64,
     command=(np.float64, LEGS),
@@ -96,10 +100,11 @@ FMU_HANDLE = record_dtype(
 """One FMU in compiled code: addresses, value references with their conversions, and buffers.
 
 `imu` is angular velocity [rad/s], specific force [m/s^2] and magnetic field [uT] of the seven IMUs; `truth` is that of
-`plant.truth`; both are NaN where the FMU has no value. A planar plant's truth has its pose in space, with z = 0, and its first
-three legs. `step` is the communication step [s], or 0 to step by the duration of each call. `time` is `steps` steps of one
-`length` [s] after `since` [s]: a count, because a sum would drift. The base's motions count from time 0. `final` is whether
-no earlier state will be restored. `status` is the status of the first call that failed, and `call` is that call.
+`plant.truth`; `motors` are the lengths of the legs that encoders read [m]; all are NaN where the FMU has no value. A planar
+plant's truth has its pose in space, with z = 0, and its first three legs. `step` is the communication step [s], or 0 to step by
+the duration of each call. `time` is `steps` steps of one `length` [s] after `since` [s]: a count, because a sum would drift.
+The base's motions count from time 0. `final` is whether no earlier state will be restored. `status` is the status of the first
+call that failed, and `call` is that call.
 """
 
 
@@ -200,6 +205,13 @@ def read_truth(fmu: Record) -> int:
         half = 0.5 * truth[3]
         truth[3], truth[4], truth[5], truth[6] = np.cos(half), 0.0, 0.0, np.sin(half)
     return status
+
+
+@kernel
+def read_motors(fmu: Record) -> int:
+    """Read the lengths that encoders read into `motors`; returns FMI's status."""
+    c = fmu[()]
+    return _read(c, _READ_MOTORS, c.encoded, c.motors)
 
 
 @kernel

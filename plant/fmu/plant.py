@@ -157,7 +157,7 @@ class FmuPlant(FmuInstance):
 
     def _not_finite(self) -> str:
         """The first value that was read and is not finite, with the name of its variable."""
-        groups = [(self.handle[name]["raw"], getattr(self.bound, name).places.size) for name in ("sensed", "known")]
+        groups = [(self.handle[name]["raw"], getattr(self.bound, name).places.size) for name in ("sensed", "known", "encoded")]
         values = np.concatenate([raw[:count] for raw, count in groups])
         first = int(np.argmin(np.isfinite(values)))
         return f"{values[first]} for {self.bound.read[first]}"
@@ -207,11 +207,11 @@ class FmuPlant(FmuInstance):
         for field, function in (("get", f"Get{real}"), ("set", f"Set{real}"), ("do_step", "DoStep")):
             handle[field] = self.address(function)
         handle["step"], handle["final"] = step or 0.0, not self.description.saves_state
-        for group in ("sensed", "known", "commanded", "loaded", "based"):
+        for group in ("sensed", "known", "encoded", "commanded", "loaded", "based"):
             _fill(handle[group], getattr(bound, group))
         if bound.modes.variable is not None:
             self._prepare_modes(bound.modes, bound.modes.variable)
-        handle["imu"], handle["truth"] = np.nan, np.nan
+        handle["imu"], handle["truth"], handle["motors"] = np.nan, np.nan, np.nan
         handle["legs"], handle["planar_angle"] = bound.legs, bound.planar_angle
         if bound.knows_pose and bound.legs < LEGS:
             handle["truth"][2] = 0.0

@@ -97,28 +97,32 @@ def parameters(changes: Mapping[str, ArrayLike]) -> Values:
     return load_spatial("hexapod").plant_parameters() | {name: np.asarray(value) for name, value in changes.items()}
 
 
-def lengths_under(plant: FmuPlant, force: float) -> Array:
-    """The lengths of the legs on their brakes, when the platform has come to rest under a vertical force [N]."""
+def lengths_under(plant: FmuPlant, force: float) -> tuple[Array, Array]:
+    """The lengths of the legs on their brakes, and at their motors, when the platform rests under a vertical force [N]."""
     plant.set("drive_mode", np.full(6, BRAKE))
     plant.set("external_wrench.force", [0.0, 0.0, force])
     for _ in range(1500):
         plant.step(1e-3)
-    return plant.get("leg_length")
+    return plant.get("leg_length"), plant.get("motor_length")
 
 
 @pytest.mark.parametrize("name", ["screw.backlash", "joint.clearance"])
 def test_a_load_that_turns_moves_the_legs_by_their_play(make_plant: MakePlant, name: str) -> None:
     """On closed brakes, from 300 N down to 300 N up; beyond the play the elastic change of legs without play is added."""
     weightless = {"gravity": [0.0, 0.0, 0.0], "screw.stiffness": 5e6, "substep": 2.5e-4}
-    moved = []
+    moved, of_motors = [], []
     for play in (0.0, 1e-4, 3e-4):
         plant = make_plant(weightless | {name: play})
         down = lengths_under(plant, -300.0)
-        moved.append(lengths_under(plant, 300.0) - down)
+        up = lengths_under(plant, 300.0)
+        moved.append(up[0] - down[0])
+        of_motors.append(up[1] - down[1])
     # The flanks are as stiff as the brakes.
     elastic = moved[0]
     np.testing.assert_allclose(moved[1] - 2.0 * elastic, 1e-4, rtol=0.02)
     np.testing.assert_allclose(moved[2] - moved[1], 2e-4, rtol=0.01)
+    # The brakes hold the motors, which see nothing of the play.
+    np.testing.assert_allclose(of_motors, np.broadcast_to(elastic, (3, 6)), rtol=0.02)
 
 
 def test_a_leg_whose_axes_do_not_meet_is_as_long_as_from_its_second_axis(make_plant: MakePlant) -> None:
