@@ -19,12 +19,13 @@ from dataclasses import replace
 from enum import IntEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controller import load_feed_forward, pid, reference
 from controller import safety as safety_stage
 from controller.calibration.file import Calibration
 from controller.direct_kinematics.geometry import LINEAR_RANK
-from controller.estimation import heading_filter, imu_health, imu_monitor, leg_filter, platform_filter, pose_estimator
+from controller.estimation import encoders, heading_filter, imu_health, imu_monitor, leg_filter, platform_filter, pose_estimator
 from controller.estimation.integrity import stage as integrity
 from controller.estimation.integrity.protection import end_level
 from controller.estimation.whole_mechanism import trust
@@ -35,12 +36,13 @@ from controller.imu_set import are_few, check_imus, imus_of
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import RANK_TOLERANCE
 from controller.rig import RIG, TIME, elapsed, field_of, rig_parameters
-from controller.safety import arming, drives, watch
+from controller.safety import arming, drives, encoder_watch, watch
 from controller.safety.causes import Cause, Mode, Request
 from controller.safety.stop import handle_cause, ramp_down
 from controller.settings import ControlSettings, DriveSettings, FusionSettings, SafetySettings
 from plant.checks import check_rate
 from plant.compiled import MOST, Limits, Record, filled, kernel, record_dtype, shared_kernel
+from plant.encoders import EncoderModel
 from plant.errors import InputError
 from plant.imu_wiring import ALL_IMUS
 from plant.mechanism import LEGS, Mechanism
@@ -55,6 +57,7 @@ _LEAST_EVIDENCE_HZ = 125.0
 PARAMETERS = record_dtype(
     rig=RIG,
     imus=imu_health.PARAMETERS,
+    encoders=encoders.PARAMETERS,
     legs=leg_filter.PARAMETERS,
     platform=platform_filter.PARAMETERS,
     heading=heading_filter.PARAMETERS,
@@ -82,6 +85,7 @@ PARAMETER_LIMITS: Limits = {
 STATE = record_dtype(
     time=TIME,
     imus=imu_health.STATE,
+    encoders=encoders.STATE,
     legs=leg_filter.STATE,
     platform=platform_filter.STATE,
     heading=heading_filter.STATE,
@@ -136,6 +140,7 @@ def cycle_parameters(
     drive_settings: DriveSettings | None = None,
     command_delay: float = 0.0,
     to_arm: bool = True,
+    encoder: EncoderModel | None = None,
 ) -> Record:
     """The constants of the cycle (dtype `PARAMETERS`).
 
@@ -153,6 +158,7 @@ def cycle_parameters(
         drive_settings: what is known of the drives; by default as `DriveSettings` has it.
         command_delay: of the rig, from a sample to the command computed from it [s].
         to_arm: whether the drives are enabled; else everything is read and nothing moves.
+        encoder: the kind of the encoders; None without encoders.
 
     Raises:
         InputError: a rate out of range, an IMU that cannot be, IMUs that do not determine the pose, or a limit of the
@@ -169,12 +175,13 @@ def cycle_parameters(
         )
     present = imus_of(mechanism, imus)
     errors, of_heading = (calibration.covariance, calibration.floor), field if magnetometer else None
-    filtered = filter_parameters(fusion, rate, whole, *errors, of_heading, ripple=ripple_at(rate))
+    filtered = filter_parameters(fusion, rate, whole, *errors, of_heading, ripple=ripple_at(rate), lengths=encoder is not None)
     able = not _without_evidence(mechanism, rate, section_5)
-    if watched.watch_imus and not able and min(watched.protection_position, watched.protection_rotation) < np.inf:
+    if min(watched.protection_position, watched.protection_rotation) < np.inf and not (able and watched.watch_imus):
         raise InputError(
             f"[safety] limits the protection level, which there is only in space, from {_LEAST_EVIDENCE_HZ:g} Hz on (this is "
-            f"{rate:g} Hz) and without the paper's section 5: leave out protection_position and protection_rotation"
+            f"{rate:g} Hz), without the paper's section 5 and with watch_imus = 1: leave out protection_position and "
+            "protection_rotation"
         )
     watch_evidence = bool(watched.watch_imus) and able
     if not able:
@@ -186,6 +193,7 @@ def cycle_parameters(
         PARAMETERS,
         rig=rig_parameters(mechanism, rate, control.hold, calibration.tilt),
         imus=imu_health.imu_parameters(present, calibration.gain, calibration.offset, fusion, watched, rate),
+        encoders=encoders.encoder_parameters(encoder, fusion, mechanism.legs),
         legs=leg_filter.leg_parameters(fusion, rate),
         platform=platform_filter.platform_parameters(fusion, rate, limits.jerk),
         heading=heading_filter.heading_parameters(fusion, rate, field, magnetometer),
@@ -271,16 +279,25 @@ def run_stages(
             s.pose.found = pose_estimator.refine_pose(p.pose, s.pose, rig, time, s.legs, s.platform.rate)
             if s.pose.found != 0 and p.pose.section_5 == 0:
                 watch.check_misfit(p.safety, s.safety, rig, time, s.pose, s.reference, s.pid)
+            if s.pose.found != 0 and p.pose.section_5 == 0 and p.encoders.count > 0:
+                encoders.compare_lengths(p.encoders, s.encoders, rig, s.pose)
+                if encoder_watch.judge_encoders(
+                    p.safety, s.safety, rig, time, p.encoders, s.encoders, s.pose.lengths, s.reference, s.pid
+                ):
+                    trust.restart_filter(s.mechanism, time)
+                s.pose.found = encoders.move_to_lengths(p.encoders, s.encoders, rig, time, s.pose)
         judged = p.integrity.filter.active != 0 and np.isfinite(p.safety.watch.evidence)
         if s.pose.found != 0 and p.safety.monitor.active != 0 and p.pose.section_5 == 0 and not judged:
             imu_monitor.look_at_next(
                 p.safety.monitor, s.safety.monitor, s.pose, s.legs.directions, s.legs.weights, rig.vectors_in_base[0]
             )
-            watch.exclude_imu(p.safety, s.safety, rig, time, s.imus, p.legs.weight, s.reference, s.pid)
+            if watch.exclude_imu(p.safety, s.safety, rig, time, s.imus, p.legs.weight, s.reference, s.pid):
+                trust.restart_filter(s.mechanism, time)
+                integrity.restart_integrity(p.integrity, s.integrity)
         t = _mark(m, CycleStage.REFINEMENT, t)
     if first <= CycleStage.MECHANISM < last:
         s.pose.found = trust.step_mechanism_filter(
-            p.mechanism, s.mechanism, rig, time, s.imus, s.legs, s.heading, s.pose, s.safety.events
+            p.mechanism, s.mechanism, rig, time, s.imus, s.encoders, s.legs, s.heading, s.pose, s.safety.events
         )  # fmt: skip
         t = _mark(m, CycleStage.MECHANISM, t)
     if first <= CycleStage.INTEGRITY < last:
@@ -306,8 +323,8 @@ def _check_integrity(parameters: Record, state: Record) -> None:
     if changed:
         trust.restart_filter(s.mechanism, time)
         integrity.restart_integrity(p.integrity, s.integrity)
-    if s.integrity.evaluations > 0:
-        watch.check_level(p.safety, s.safety, rig, time, s.integrity.protection.level, s.reference, s.pid)
+    if p.integrity.filter.active != 0:
+        watch.check_judgement(p.safety, s.safety, rig, time, s.integrity, s.reference, s.pid)
     if s.integrity.fresh != 0:
         level = s.integrity.protection
         trust.find_closed_covariance(s.pose, level.scratch, level.covariance[0])
@@ -384,6 +401,14 @@ def hear_rig(parameters: Record, state: Record, sample_age: Array, drive: Array,
     watch.update_rig_status(
         p.safety, s.safety, p.rig, s.time, s.imus, s.reference, s.pid, sample_age, drive, drive_code, silent
     )  # fmt: skip
+
+
+@kernel
+def hear_encoders(
+    parameters: Record, state: Record, silent: int, readings: Array, rates: Array, home: NDArray[np.int64]
+) -> None:
+    """Before a cycle: take the encoders' readings, as `controller.estimation.encoders.screen_encoders` has it."""
+    encoders.screen_encoders(parameters[()].encoders, state[()].encoders, silent, readings, rates, home)
 
 
 @kernel

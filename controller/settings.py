@@ -2,17 +2,27 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from math import hypot, inf, radians
+from math import hypot, inf, radians, sqrt
 from typing import TypeVar
 
+from plant.encoders import EncoderModel
 from plant.errors import InputError
 from plant.files import check_entries
 from plant.imu import STANDARD_GRAVITY, ImuModel
 from plant.mechanism import Mechanism
 
 _ENDLESS = 1e300
+_LEAST_LENGTH_NOISE = 1e-6
 _RAW_M, _FEW_M = 0.05, 0.03
-_ENDLESS_ALLOWED = ("misfit", "evidence", "protection_position", "protection_rotation", "oscillation", "slack")
+_ENDLESS_ALLOWED = (
+    "length_deviation",
+    "misfit",
+    "evidence",
+    "protection_position",
+    "protection_rotation",
+    "oscillation",
+    "slack",
+)
 _ZERO_ALLOWED = (
     "integral", "derivative", "sensor_delay", "sensor_timing", "most_lost_imus", "watch_imus", "need_platform_imu", "load",
     "resistance", "friction",
@@ -73,6 +83,9 @@ class FusionSettings(_Settings):
     sensor_timing: float = 0.0  # standard deviation of that age [s]
     gyroscope_range: float = radians(250.0)  # at its end, a reading is not used [rad/s]
     accelerometer_range: float = 4.0 * STANDARD_GRAVITY  # at its end, a reading is not used [m/s^2]
+    length_noise: float = 2e-6  # of an encoder's reading [m]
+    length_play: float = 1e-5  # what play and steps leave of it for a while [m]
+    length_zero: float = 0.05  # of an encoder's zero at the start [m]
     # For the whole-mechanism filter, the noise with calibrated IMUs.
     platform_jerk: float = 6.0  # density [m/s^3/sqrt(Hz)]
     platform_angular_jerk: float = 35.0  # density [rad/s^3/sqrt(Hz)]
@@ -108,6 +121,7 @@ class SafetySettings(_Settings):
     velocity_margin: float = 2.0  # largest estimated speed of a leg, as a multiple of its limit
     following: float = 0.01  # largest deviation of a leg from its reference [m]
     oscillation: float = 0.012  # RMS of fast corrections that shake the IMUs, beyond which a run ends [m/s]
+    length_deviation: float = 6.5e-4  # change of a length, within a second, of which IMUs and an encoder differ [m]
     saturation: float = 0.25  # longest time for which a command may be at its limit [s]
     drive_deviation: float = 0.15  # largest difference between a drive's command and its leg's estimated speed [m/s]
     patience: float = 0.05  # longest time of a deviation from a reference or of a drive [s]
@@ -123,7 +137,7 @@ class SafetySettings(_Settings):
         wide = {
             name: max(getattr(self, name), _RAW_M) for name in ("stroke_margin", "following", "arming_distance", "arming_drift")
         }
-        return replace(self, watch_imus=0.0, **wide)
+        return replace(self, watch_imus=0.0, protection_position=inf, protection_rotation=inf, **wide)
 
 
 @dataclass(frozen=True)
@@ -170,10 +184,11 @@ def drive_settings(mechanism: Mechanism, few_imus: bool = False, **changes: floa
     return _read(DriveSettings, "drives", mechanism, changes)
 
 
-def sensor_settings(mechanism: Mechanism, imu: ImuModel) -> FusionSettings:
-    """The fusion settings of a mechanism, with what its IMUs tell where its file has none.
+def sensor_settings(mechanism: Mechanism, imu: ImuModel, encoder: EncoderModel | None = None) -> FusionSettings:
+    """The fusion settings of a mechanism, with what its IMUs and encoders tell where its file has none.
 
-    That is their delay, magnetometer rate and ranges, and the standard deviations that grow with their `accelerometer_wander`.
+    That is the IMUs' delay, magnetometer rate and ranges, and the standard deviations that grow with their
+    `accelerometer_wander`; and the encoders' noise, play and zeros.
     """
     wander = imu.accelerometer_wander
     known = {
@@ -186,6 +201,11 @@ def sensor_settings(mechanism: Mechanism, imu: ImuModel) -> FusionSettings:
         "tilt_sigma": hypot(FusionSettings.tilt_sigma, wander / STANDARD_GRAVITY),
         "accelerometer_bias_sigma": hypot(FusionSettings.accelerometer_bias_sigma, wander),
     }
+    if encoder is not None:
+        step = encoder.resolution / sqrt(12.0)
+        known["length_noise"] = max(hypot(encoder.noise, step), _LEAST_LENGTH_NOISE)
+        known["length_play"] = max(hypot(0.5 * encoder.backlash, step), _LEAST_LENGTH_NOISE)
+        known["length_zero"] = max(encoder.zero, _LEAST_LENGTH_NOISE) if encoder.absolute else FusionSettings.length_zero
     own = mechanism.settings.get("fusion", {})
     return fusion_settings(mechanism, **{name: value for name, value in known.items() if name not in own})
 

@@ -2,7 +2,7 @@
 
 If this IMU alone is wrong, by f in the plane across its direction, the residual of the refined pose is r = S f with
 S = 1 - w J A^-1 J^T, where J is its Jacobian, w its weight and A the information of all; then f = S^-1 r, and it
-explains w f^T r of the sum of squares. `controller.direct_kinematics.integrity` finds the same from poses without each IMU.
+explains w f^T r of the sum of squares. `controller.direct_kinematics.consistency` finds the same from poses without each IMU.
 """
 
 import numpy as np

@@ -3,7 +3,7 @@
 import numpy as np
 
 from controller.estimation import imu_monitor
-from controller.safety import arming, drives, stop, watch
+from controller.safety import arming, drives, encoder_watch, stop, watch
 from controller.safety.causes import EVENTS
 from controller.settings import DriveSettings, SafetySettings
 from plant.compiled import Record, filled, record_dtype
@@ -15,6 +15,7 @@ PARAMETERS = record_dtype(
     monitor=imu_monitor.PARAMETERS,
     watch=watch.PARAMETERS,
     drives=drives.PARAMETERS,
+    encoders=encoder_watch.PARAMETERS,
     stop=stop.PARAMETERS,
 )
 """The constants of each part."""
@@ -27,6 +28,7 @@ STATE = record_dtype(
     monitor=imu_monitor.STATE,
     watch=watch.STATE,
     drives=drives.STATE,
+    encoders=encoder_watch.STATE,
     stop=stop.STATE,
 )
 """The `Mode` of the run, the `Request` to the drives, the events of the cycle, and the state of each part."""
@@ -43,6 +45,7 @@ def safety_parameters(
         monitor=imu_monitor.monitor_parameters(settings, rate),
         watch=watch.watch_parameters(settings, rate, limits),
         drives=drives.drive_parameters(drive_settings, mechanism),
+        encoders=encoder_watch.encoder_watch_parameters(settings, rate),
         stop=stop.stop_parameters(limits, rate),
     )
 
@@ -68,4 +71,4 @@ def watch_nothing(parameters: Record) -> None:
         "without_platform_imu",
     ):
         limits[name] = np.inf
-    safety["drives"]["slack"] = np.inf
+    safety["drives"]["slack"] = safety["encoders"]["deviation"] = np.inf

@@ -81,7 +81,7 @@ class Cause(IntEnum):
     RIG_FAILED = 7, "the rig reports failure", Reaction.BRAKE
     IMU_STALE = 8, "IMU {} is left out: its samples are stale", Reaction.GO_ON, "cycles"
     IMU_FROZEN = 9, "IMU {} is left out: it is frozen", Reaction.GO_ON, "cycles"
-    IMU_NOT_FINITE = 10, "IMU {} is left out: it gives what is not finite", Reaction.GO_ON
+    IMU_NOT_FINITE = 10, "IMU {} is left out: its readings are not finite", Reaction.GO_ON
     IMU_OUT_OF_RANGE = 11, "IMU {} is left out: it is at the end of its range", Reaction.GO_ON, "of the range"
     IMU_NOISY = 12, "IMU {} is left out: it is noisy", Reaction.GO_ON, "of the limit"
     IMU_DISAGREES = 13, "IMU {} is left out: it disagrees with the others", Reaction.GO_ON, "rad"
@@ -110,7 +110,7 @@ class Cause(IntEnum):
     ARMED = 30, "armed", Reaction.GO_ON
     NO_SENSORS = (
         31,
-        "not armed: IMU {} is not plausible: a raw one needs a calibration, else check its place",
+        "not armed: IMU {} is not plausible: calibrate it if it is raw, else check where it is mounted",
         Reaction.STOP,
         "sigma",
     )
@@ -137,7 +137,12 @@ class Cause(IntEnum):
         Reaction.STOP,
         "sigma",
     )
-    NOT_STILL = 50, "not armed: the estimate of leg {} still drifts on the brakes within 50 ms", Reaction.STOP, "m"
+    NOT_STILL = (
+        50,
+        "not armed: the estimate of leg {} changes too much within 50 ms on closed brakes",
+        Reaction.STOP,
+        "m",
+    )
     SHAKEN = 51, "the IMUs are shaken, the worst is IMU {}: accelerometers count less", Reaction.GO_ON, "m/s^2 RMS"
     BRIDGED = 52, "readings of IMU {} at the end of their range are bridged by the other sensors", Reaction.GO_ON
     CALM = 53, "the IMUs are no longer shaken", Reaction.GO_ON
@@ -181,6 +186,23 @@ class Cause(IntEnum):
         "the commands oscillate, most of all that of leg {}: the mechanism has play, or the gains are too high",
         Reaction.STOP,
         "m/s RMS",
+    )
+
+    ENCODER_SILENT = 67, "the encoder of leg {} reads nothing", Reaction.GO_ON
+    ENCODER_CONTRADICTED = 68, "the encoder of leg {} is left out: IMUs and other encoders contradict it", Reaction.GO_ON, "m"
+    ENCODER_BACK = 69, "the encoder of leg {} is used again", Reaction.GO_ON
+    ENCODERS_CONTRADICT = (
+        70,
+        "encoders and IMUs contradict each other, most of all on leg {}",
+        Reaction.STOP,
+        "m",
+    )
+
+    UNJUDGED = (
+        71,
+        "nothing judges the IMUs, and the protection level is not known: periods are missed too often",
+        Reaction.GO_ON,
+        "s",
     )
 
     NO_POSE_FITS = 66, "no pose fits the IMUs, even without the worst of them", Reaction.QUICK_STOP, "sigma RMS"

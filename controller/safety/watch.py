@@ -47,6 +47,9 @@ _CLEARER = 1.3
 _UNFIT_S = 0.005
 """For how long the misfit must be beyond its limit, at least two cycles [s]."""
 
+_UNJUDGED_S = 1.0
+"""After what time without an evaluation of the evidence that is told [s]."""
+
 _FAST_S = 0.1
 """Corrections that last longer than this are no oscillation; its mean square is taken over as long [s]."""
 
@@ -79,6 +82,7 @@ STATE = record_dtype(
     silent=np.int64,  # for how many cycles the rig has not answered
     unanswered=np.int64,  # how many more exchanges failed than succeeded, up to twice the limit
     contradicted_for=np.float64,  # how long the IMUs have contradicted each other [s]
+    unjudged=np.int64,  # whether there has been no evidence for too long
     unfit_for=np.float64,  # how long no pose has fitted the IMUs [s]
     without_platform_imu=np.float64,  # for how long the platform's IMU, where there is one, has been left out [s]
     off_reference_for=(np.float64, LEGS),  # how long each leg has been off its reference [s]
@@ -88,7 +92,8 @@ STATE = record_dtype(
     oscillation=(np.float64, LEGS),  # square of what the correction is apart from that, averaged [m^2/s^2]
     oscillating_for=np.float64,  # how long the mean of these squares has been beyond its limit [s]
     speed=(np.float64, LEGS),  # estimated, of each leg [m/s]
-    calm_variance=np.float64,  # of the least known direction when nothing shook the IMUs last [rad^2]
+    variance=(np.float64, 2),  # of the least known direction, of the leg filters and of the whole-mechanism filter [rad^2]
+    calm_variance=(np.float64, 2),  # the same when nothing shook the IMUs last
     returns=(np.int64, IMU_COUNT),  # how often each IMU was taken back
     cleared_for=(np.int64, IMU_COUNT),  # in how many evaluations there has been little evidence against an IMU left out
 )
@@ -159,10 +164,17 @@ def update_rig_status(
 
 
 @kernel
+def _moves(s: Record) -> bool:
+    """Whether the loop moves the legs: in the motion, and in a controlled stop, which needs the estimate as well."""
+    return bool(s.mode == Mode.RUNNING or s.mode == Mode.STOPPING)
+
+
+@kernel
 def exclude_imu(
     p: Record, s: Record, rig: Record, time: Record, imus: Record, leg_weight: float, reference: Record, pid: Record
-) -> None:
-    """After the refinement: leave out the IMU that contradicts the others, once, if it can be named; else stop.
+) -> bool:
+    """After the refinement: leave out the IMU that contradicts the others, once, if it can be named; else stop. Returns whether
+    it is left out.
 
     Three legs and the roll of a planar mechanism are one measurement more than its pose needs: they show that an IMU is
     wrong, not which one.
@@ -175,7 +187,7 @@ def exclude_imu(
     off, limit = contradiction(m, worst), p.monitor.disagreement
     s.watch.contradicted_for = s.watch.contradicted_for + rig.period if off > limit else 0.0
     if s.watch.contradicted_for < p.monitor.lasting or s.mode != Mode.RUNNING:
-        return
+        return False
     second = left = 0.0
     excluded = 0
     for k in range(IMU_COUNT):
@@ -188,12 +200,13 @@ def exclude_imu(
     if disagree or excluded > 0 or m.explained[worst] < _CLEARER * second or p.watch.most_lost_imus == 0:
         named = worst if rig.planar == 0 else -1
         handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_DISAGREE, named, off, limit)
-        return
+        return False
     imus.excluded[worst] = 1
     s.watch.contradicted_for = 0.0
     for k in range(IMU_COUNT):
         reset(m, k)
     report_event(s.events, Cause.IMU_DISAGREES, worst, off, limit)
+    return True
 
 
 @kernel
@@ -213,18 +226,20 @@ def check_carried(
     """While IMUs are shaken: stop when what the pose comes from knows a direction much less well than before: the leg filters,
     or the whole-mechanism filter's rotation.
     """
-    worst, variance = -1, 0.0
-    if mechanism.trusted != 0:
-        for i in range(3, 6):
-            variance = max(variance, mechanism.filter.published_covariance[i, i])
-    else:
-        for k in range(rig.legs):
-            own = legs.covariance[k, 0, 0] + legs.covariance[k, 1, 1]
-            if legs.used[k] != 0.0 and own > variance:
-                worst, variance = k, own
+    w, worst = s.watch, -1
+    w.variance[:] = 0.0
+    for k in range(rig.legs):
+        own = legs.covariance[k, 0, 0] + legs.covariance[k, 1, 1]
+        if legs.used[k] != 0.0 and own > w.variance[0]:
+            worst, w.variance[0] = k, own
+    for i in range(3, 6):
+        w.variance[1] = max(w.variance[1], mechanism.filter.published_covariance[i, i])
     if shaking.told == 0 and shaking.bridging == 0:
-        s.watch.calm_variance = variance
-    limit = p.watch.carried + s.watch.calm_variance
+        w.calm_variance[:] = w.variance
+    if mechanism.trusted != 0:
+        worst = -1
+    variance = w.variance[mechanism.trusted]
+    limit = p.watch.carried + w.calm_variance[mechanism.trusted]
     if variance > limit and s.mode == Mode.RUNNING:
         handle_cause(p, s, rig, time, reference, pid, Cause.NOT_CARRIED, worst, np.sqrt(variance), np.sqrt(limit))
 
@@ -253,8 +268,23 @@ def check_oscillation(
 
 
 @kernel
+def check_judgement(p: Record, s: Record, rig: Record, time: Record, integrity: Record, reference: Record, pid: Record) -> None:
+    """After the samples of a cycle: say once when no evidence could be taken for too long, as periods are missed too often. The
+    level is then unknown, and beyond every limit.
+    """
+    w, unjudged = s.watch, integrity.unjudged_for > _UNJUDGED_S
+    if unjudged and w.unjudged == 0 and _moves(s):
+        report_event(s.events, Cause.UNJUDGED, -1, integrity.unjudged_for, _UNJUDGED_S)
+    w.unjudged = 1 if unjudged else 0
+    if unjudged:
+        integrity.protection.level[:] = np.inf
+    if unjudged or integrity.evaluations > 0:
+        check_level(p, s, rig, time, integrity.protection.level, reference, pid)
+
+
+@kernel
 def check_level(p: Record, s: Record, rig: Record, time: Record, level: Array, reference: Record, pid: Record) -> None:
-    """After an evaluation of the evidence for faults: stop when the protection level (2,) [m, rad] is beyond its limit."""
+    """Stop when the protection level (2,) [m, rad] is beyond its limit."""
     for part, cause in enumerate((Cause.POSITION_UNSURE.value, Cause.ROTATION_UNSURE.value)):
         if s.mode == Mode.RUNNING and not level[part] <= p.watch.level[part]:
             handle_cause(p, s, rig, time, reference, pid, cause, -1, level[part], p.watch.level[part])
@@ -268,7 +298,7 @@ def judge_parity(
 
     When all accelerometers show a force that is no motion, stop. If `evidence` has no limit, nothing happens.
     """
-    if s.mode != Mode.RUNNING or not np.isfinite(p.watch.evidence):
+    if not _moves(s) or not np.isfinite(p.watch.evidence):
         return False
     if parity.shared != 0:
         handle_cause(p, s, rig, time, reference, pid, Cause.FORCES_SHARE, -1, parity.common, SHARED)
@@ -292,20 +322,23 @@ def judge_evidence(
     """
     w, limit, e = s.watch, p.watch.evidence, integrity
     back = False
-    for at in range(e.evidence.apart):
+    # What was learned tells nothing new of an IMU that is left out.
+    judged = np.isfinite(limit) and e.evidence.of_learned == 0
+    for at in range(e.evidence.apart if judged else 0):
         k = e.evidence.order[at]
-        w.cleared_for[k] = w.cleared_for[k] + 1 if e.evidence.apart_evidence[at] < _CLEARED * limit else 0
+        agrees = imus.healthy[k] != 0 and e.evidence.apart_evidence[at] < _CLEARED * limit
+        w.cleared_for[k] = w.cleared_for[k] + 1 if agrees else 0
         if w.cleared_for[k] >= _CLEARED_EVALUATIONS << min(w.returns[k], _MOST_DOUBLINGS):
             w.cleared_for[k] = imus.excluded[k] = 0
             w.returns[k] += 1
             back = True
-    if back or not e.best_evidence >= limit or s.mode != Mode.RUNNING:
+    if back or not e.best_evidence >= limit or not _moves(s):
         return back
     k, most = e.blamed, np.sqrt(limit)
     if k < 0:
         cause = Cause.GYROSCOPES_SHARE + e.shared
-        _report_rival(s, e, most)
         handle_cause(p, s, rig, time, reference, pid, cause, -1, np.sqrt(e.best_evidence), most)
+        _report_rival(s, e, most)
         return False
     clear = e.rival_evidence < e.imu_evidence - max(_CLEARLY * limit, _CLEARLY_OF_ALL * e.imu_evidence)
     rest_agrees = e.all_evidence - e.imu_evidence < _REST * limit + _REST_OF_ALL * e.imu_evidence
@@ -315,8 +348,8 @@ def judge_evidence(
         report_event(s.events, Cause.IMU_CONTRADICTED, k, np.sqrt(e.imu_evidence), most)
         return True
     if (clear and rest_agrees) or e.best_evidence >= _PATIENT * limit:
-        _report_rival(s, e, most)
         handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, k, np.sqrt(e.imu_evidence), most)
+        _report_rival(s, e, most)
     return False
 
 
@@ -332,7 +365,7 @@ def _may_leave_out(p: Record, imus: Record, k: int) -> bool:
 @kernel
 def _report_rival(s: Record, e: Record, limit: float) -> None:
     """Say what else explains the readings nearly as well."""
-    if s.stop.cause != Cause.NONE or e.rival_evidence < _NEARLY * e.best_evidence:
+    if e.rival_evidence < _NEARLY * e.best_evidence:
         return
     k = e.rival_blamed
     cause = Cause.RIVAL_IMU if k >= 0 else Cause.RIVAL_GYROSCOPES + e.rival_shared

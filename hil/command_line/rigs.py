@@ -18,6 +18,7 @@ from plant.errors import InputError
         rig_at={},
         mechanism={},
         imu={},
+        lengths={"text": "encoders that the rig has: none, incremental or absolute"},
         rate={"default": 200.0, "text": "exchanges per second, 50 to 4000"},
     ),
     cli.flag(
@@ -91,6 +92,7 @@ def gough_check_rig(options: Namespace) -> int:
         SimulationConfig,
         "mechanism",
         "imu",
+        "lengths",
         "plant",
         "binding",
         "joint_error",
@@ -125,6 +127,7 @@ def gough_inject(options: Namespace) -> None:
     from hil.rigs.emulation import FaultKind
     from hil.runs.emulator_process import ask, own_control
     from plant.dynamics.base_course import BaseMotionKind
+    from plant.encoders import EncoderFaultKind
     from plant.imu_disturbances import WORDS, DisturbanceKind
 
     if options.list:
@@ -137,6 +140,8 @@ def gough_inject(options: Namespace) -> None:
             table.add(each.label, ", ".join(each.sizes), ", ".join(("imus", *each.places)), each.text)
         for motion in BaseMotionKind:
             table.add(motion.label, ", ".join(motion.sizes), "axis", motion.text)
+        for broken in EncoderFaultKind:
+            table.add(broken.label, broken.size, "legs", broken.text)
         table.print()
         table = Table("word", "")
         for word, meaning in WORDS.items():

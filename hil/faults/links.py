@@ -8,6 +8,7 @@ from hil.faults.rows import Drawn
 from hil.loop.records import RECORD, Link
 from hil.realtime.clock import SCRIPTED, new_clock
 from hil.rigs.emulation import fault, new_emulated
+from hil.rigs.udp.datagrams import VERSION, WITH_LENGTHS
 from hil.rigs.udp.emulator import new_udp_emulator
 from hil.rigs.udp.link import new_link
 from hil.rigs.udp.rig import TIMEOUT_SHARE
@@ -53,8 +54,10 @@ def join_udp(loop: PreparedLoop, faults: Iterable[Record], seed: int) -> None:
     """
     period = _on_a_bus(loop)
     rig = new_emulated(loop.mechanism, round(1e9 * period), seed, faults)
-    loop.emulator = new_udp_emulator(loop.fmu, loop.imu, rig, _SESSION)
+    version = WITH_LENGTHS if loop.encoders["legs"] > 0 else VERSION
+    loop.emulator = new_udp_emulator(loop.fmu, loop.imu, loop.encoders, rig, _SESSION, version=version)
     loop.udp = new_link()
+    loop.udp.socket["version"] = version
     loop.udp.socket["session"] = _SESSION
     loop.udp.socket["timeout_ns"] = round(1e9 * TIMEOUT_SHARE * period)
 
@@ -66,7 +69,8 @@ def _follow_canopen(loop: PreparedLoop, faults: Iterable[Record], seed: int, end
         from hil.rigs.canopen.settings import canopen_settings
     period = _on_a_bus(loop)
     rig = new_emulated(loop.mechanism, round(1e9 * period), seed, faults)
-    canopen = CanopenInMemory(canopen_settings(), period, lambda: (loop.simulated, loop.imu, rig))
+    lengths = bool(loop.encoders["legs"] > 0)
+    canopen = CanopenInMemory(canopen_settings(), period, lambda: (loop.simulated, loop.imu, loop.encoders, rig), lengths)
     loop.load(python=True)
     try:
         canopen.open()

@@ -235,7 +235,7 @@ def _stand(loop: PreparedLoop) -> None:
     begin = int(loop.emulator.rig["time_ns"])
     for passed in range(0, 500_000_000, 10_000_000):
         check_watchdog(loop.emulator, begin + passed)
-    sample(loop.fmu, loop.imu, loop.emulator.rig, int(loop.emulator.rig["time_ns"]))
+    sample(loop.fmu, loop.imu, loop.encoders, loop.emulator.rig, int(loop.emulator.rig["time_ns"]))
 
 
 def _follow_stream(loop: PreparedLoop, what: str, onset: int) -> None:

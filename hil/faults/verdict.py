@@ -16,7 +16,7 @@ FORBIDDEN_POSITION_M, FORBIDDEN_ROTATION_RAD = 5e-3, float(np.radians(1.0))
 """No pose may be off by more after a sound IMU was left out."""
 
 _SAY_NOTHING = (
-    Cause.NONE, Cause.END_OF_MOTION, Cause.STOP_REQUESTED, Cause.IMU_BACK, Cause.ANSWER_LATE, Cause.ARMED,
+    Cause.NONE, Cause.END_OF_MOTION, Cause.STOP_REQUESTED, Cause.IMU_BACK, Cause.ENCODER_BACK, Cause.ANSWER_LATE, Cause.ARMED,
 )  # fmt: skip
 _MOST_EVENTS = 12
 

@@ -6,7 +6,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from controller.cycle import CycleStage, hear_rig, prepare_next, react, run_stages, skip_periods
+from controller.cycle import CycleStage, hear_encoders, hear_rig, prepare_next, react, run_stages, skip_periods
 from controller.estimation.whole_mechanism.trust import find_covariance
 from controller.planning.plan_handover import STREAM_PATIENCE_S, stream_cause, take_plan
 from controller.reference import motion_cycle
@@ -19,7 +19,8 @@ from hil.rigs.udp.emulator import UdpEmulator, exchange_in_memory
 from hil.rigs.udp.link import UdpLink, exchange_udp, send_command
 from plant.compiled import Record, kernel, shared_kernel, store_release
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
-from plant.fmu.calls import advance, read_imus, read_truth, write_command, write_drive_mode
+from plant.encoder_readings import read_encoders
+from plant.fmu.calls import advance, read_imus, read_motors, read_truth, write_command, write_drive_mode
 from plant.imu import measure
 from plant.mechanism import LEGS
 from plant.pose import Array
@@ -38,7 +39,7 @@ _sigpending: Any = types.ExternalFunction("sigpending", types.int32(types.intp))
 
 @shared_kernel
 def exchange_fmu(
-    fmu: Record, imu: Record, command: Array, request: int, periods: int, period: float, feedback: Record,
+    fmu: Record, imu: Record, encoders: Record, command: Array, request: int, periods: int, period: float, feedback: Record,
     stage_ns: NDArray[np.int64], timespec: NDArray[np.int64],
 ) -> int:  # fmt: skip
     """Let the plant move with the command for some periods, and read it; returns the status of the exchange."""
@@ -54,6 +55,10 @@ def exchange_fmu(
         m = imu[()]
         m.time = fmu[()].time
         measure(imu, fmu[()].imu, feedback.measurement)
+        if encoders[()].legs > 0:
+            status = read_motors(fmu)
+            encoders[()].time = m.time
+            read_encoders(encoders, fmu[()].motors, feedback.length, feedback.length_rate, feedback.home)
         feedback.truth[:] = fmu[()].truth
         for k in range(LEGS):
             feedback.sent[k] = 0.0 if request == Request.BRAKED else command[k]
@@ -66,8 +71,8 @@ def exchange_fmu(
 
 @kernel
 def exchange(
-    fmu: Record | None, imu: Record | None, udp: UdpLink | None, emulator: UdpEmulator | None, parameters: Record,
-    state: Record, work: Record, timespec: NDArray[np.int64],
+    fmu: Record | None, imu: Record | None, encoders: Record | None, udp: UdpLink | None, emulator: UdpEmulator | None,
+    parameters: Record, state: Record, work: Record, timespec: NDArray[np.int64],
 ) -> int:  # fmt: skip
     """Send the last commands, and read the sensors; returns the rig's status. numba leaves out the branches of what is None."""
     s, w, period = state[()], work[()], parameters[()].rig.period
@@ -75,7 +80,9 @@ def exchange(
     status = SILENT
     if fmu is not None:
         periods = periods_passed(state)
-        status = exchange_fmu(fmu, imu, s.pid.command, s.safety.request, periods, period, w.feedback, w.stage_ns, timespec)
+        status = exchange_fmu(
+            fmu, imu, encoders, s.pid.command, s.safety.request, periods, period, w.feedback, w.stage_ns, timespec
+        )  # fmt: skip
     if udp is not None and emulator is not None:
         at = int(np.rint(1e9 * period * s.time.cycle))
         status = exchange_in_memory(emulator, udp, s.pid.command, s.safety.request, w.feedback, at)
@@ -170,6 +177,7 @@ def process_feedback(parameters: Record, state: Record, work: Record, status: in
         ramp_down(p.safety.stop, p.rig, s.time, s.pid)
         return Cause.RIG_FAILED.value
     hear_rig(parameters, state, w.sample_age, feedback.drive, feedback.drive_code, w.silent)
+    hear_encoders(parameters, state, w.silent, feedback.length, feedback.length_rate, feedback.home)
     return Cause.NONE.value
 
 
@@ -206,6 +214,9 @@ def record_cycle(parameters: Record, state: Record, clock: Record, work: Record,
     record.angular_velocity[:] = w.feedback.measurement[0]
     record.specific_force[:] = w.feedback.measurement[1]
     record.magnetic_field[:] = w.feedback.measurement[2]
+    record.length[:] = w.feedback.length
+    record.length_rate[:] = w.feedback.length_rate
+    record.home[:] = w.feedback.home
     record.truth[:] = w.feedback.truth
     for k in range(LEGS):
         for i in range(3):
@@ -267,13 +278,14 @@ def end_cycle(
 
 @kernel
 def run_loop(
-    fmu: Record | None, imu: Record | None, udp: UdpLink | None, emulator: UdpEmulator | None, parameters: Record,
-    state: Record, segments: Array, records: Record, clock: Record, script: NDArray[np.int64], link: NDArray[np.int64],
-    work: Record, streamed: TargetStream | None, most_missed: int, last: int, end: int,
+    fmu: Record | None, imu: Record | None, encoders: Record | None, udp: UdpLink | None, emulator: UdpEmulator | None,
+    parameters: Record, state: Record, segments: Array, records: Record, clock: Record, script: NDArray[np.int64],
+    link: NDArray[np.int64], work: Record, streamed: TargetStream | None, most_missed: int, last: int, end: int,
 ) -> int:  # fmt: skip
     """Run cycles up to `last`, or until a stop that begins at `end` or earlier is over; returns its cause, or `Cause.NONE`.
 
-    The rig is the plant `fmu` with its `imu`, or the one on `udp`, in memory if that has an `emulator`; the rest is None.
+    The rig is the plant `fmu` with its `imu` and `encoders`, or the one on `udp`, in memory if that has an `emulator`; the
+    rest is None.
     """
     s, w, timespec = state[()], work[()], clock[()].timespec
     cause = Cause.NONE.value
@@ -281,7 +293,7 @@ def run_loop(
         cause = begin_cycle(parameters, state, clock, script, link, work, streamed, most_missed, end)
         if cause != Cause.NONE:
             break
-        status = exchange(fmu, imu, udp, emulator, parameters, state, work, timespec)
+        status = exchange(fmu, imu, encoders, udp, emulator, parameters, state, work, timespec)
         failed = process_feedback(parameters, state, work, status)
         if failed == Cause.NONE:
             failed = run_stages(

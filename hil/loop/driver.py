@@ -49,6 +49,7 @@ class Loop:
 
     fmu: Record  # dtype `FMU_HANDLE`
     imu: Record  # dtype `IMU_STATE`
+    encoders: Record  # dtype `ENCODER_STATE`
     parameters: Record
     state: Record
     segments: Array
@@ -85,7 +86,14 @@ class Loop:
 
     def memory(self) -> dict[str, Record]:
         """The arrays on which the rest of a run depends, except the plant's."""
-        return {"imu": self.imu, "state": self.state, "clock": self.clock, "link": self.link, "work": self._work}
+        return {
+            "imu": self.imu,
+            "encoders": self.encoders,
+            "state": self.state,
+            "clock": self.clock,
+            "link": self.link,
+            "work": self._work,
+        }
 
     def load(self, python: bool = False) -> None:
         """Load the machine code of the loop, or of the one in Python."""
@@ -102,7 +110,7 @@ class Loop:
         load_kernel(end_cycle, *cycle, segments, self.records, clock, *shared, 0)
 
     def _arguments(self, last: int, end: int) -> tuple[Any, ...]:
-        plant = (self.fmu, self.imu) if self.udp is None else (None, None)
+        plant = (self.fmu, self.imu, self.encoders) if self.udp is None else (None, None, None)
         return (
             *plant, self.udp, self.emulator, self.parameters, self.state, self.segments, self.records, self.clock, self.script,
             self.link, self._work, self._streamed(), self.most_missed, last, end,
@@ -188,7 +196,17 @@ class FmuRig:
         loop, feedback = self._loop, new_feedback()[()]
         load_kernel(periods_passed, loop.state)
         load_kernel(
-            exchange_fmu, loop.fmu, loop.imu, loop.state["pid"]["command"], 0, 0, 0.0, feedback, self._stage_ns, self._timespec
+            exchange_fmu,
+            loop.fmu,
+            loop.imu,
+            loop.encoders,
+            loop.state["pid"]["command"],
+            0,
+            0,
+            0.0,
+            feedback,
+            self._stage_ns,
+            self._timespec,
         )
         load_kernel(write_drive_mode, loop.fmu, BRAKE)
 
@@ -203,7 +221,8 @@ class FmuRig:
         """Drive the plant for the periods that have passed, and read it."""
         loop = self._loop
         periods, period = periods_passed(loop.state), float(loop.parameters["rig"]["period"])
-        return exchange_fmu(loop.fmu, loop.imu, command, request, periods, period, feedback, self._stage_ns, self._timespec)
+        stage_ns, timespec = self._stage_ns, self._timespec
+        return exchange_fmu(loop.fmu, loop.imu, loop.encoders, command, request, periods, period, feedback, stage_ns, timespec)
 
     def quick_stop(self) -> None:
         """Brake the drives."""

@@ -19,6 +19,11 @@ ENDED, FAILED = 2, 3
 _FAILURES = {ENDED: "the recording has come to its end", FAILED: "it did so when it was recorded"}
 """Statuses of an exchange that fails, and why."""
 
+_REPEATED = (
+    "sample_ns", "length", "length_rate", "home", "drive", "drive_code", "sent", "truth", "round_trip_ns", "refused",
+)  # fmt: skip
+"""What a record and the feedback have in common."""
+
 
 class ReplayRig:
     """A recording as a rig. Each exchange returns the next recorded period; commands are ignored.
@@ -93,7 +98,7 @@ class ReplayRig:
         measurement[0], measurement[1] = record["angular_velocity"], record["specific_force"]
         measurement[2] = record["magnetic_field"]
         feedback["sequence"] = self._numbers[row]
-        for name in ("sample_ns", "drive", "drive_code", "sent", "truth", "round_trip_ns", "refused"):
+        for name in _REPEATED:
             feedback[name] = record[name]
         if record["status"] == Cause.RIG_FAILED:
             return self._fail(FAILED)

@@ -42,6 +42,9 @@ FEEDBACK = record_dtype(
     drive=(np.int64, LEGS),  # DriveState
     drive_code=(np.int64, LEGS),  # fault code
     sent=(np.float64, LEGS),  # velocities after rounding and limits [m/s]
+    length=(np.float64, LEGS),  # that each encoder reads [m]; NaN without one
+    length_rate=(np.float64, LEGS),  # its rate [m/s]; NaN without one
+    home=(np.int64, LEGS),  # 1 beyond the home switch, 0 before it, -1 without one
     truth=(np.float64, TRUTH_SIZE),  # as the plant's buffer; NaN unless the rig is emulated
     round_trip_ns=np.int64,  # from the request to the answer
     refused=np.int64,  # frames or packets since the rig was opened
@@ -53,6 +56,7 @@ def new_feedback() -> Record:
     """Feedback (dtype `FEEDBACK`) of a rig that has sent nothing yet."""
     feedback: Record = np.zeros((), FEEDBACK)
     feedback["measurement"], feedback["truth"], feedback["sequence"] = np.nan, np.nan, -1
+    feedback["length"], feedback["length_rate"], feedback["home"] = np.nan, np.nan, -1
     return feedback
 
 

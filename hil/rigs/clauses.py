@@ -25,6 +25,7 @@ CLAUSES = {
     "commands": "the legs move as commanded, by how the accelerometers tilt",
     "gyroscopes": "the gyroscopes turn as the legs' motion makes them",
     "accelerometers": "each accelerometer tilts as the legs' motion makes it",
+    "encoders": "the encoders, where there are any, read the legs' motion",
     "period": "an exchange returns within the period (p99)",
     "opens again": "after close it can be opened again",
     "absent": "a rig that is not there raises a RigError with a message",

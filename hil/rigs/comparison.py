@@ -1,9 +1,10 @@
-"""Signs and units of a rig, by small motions from rest to rest: its commands, gyroscopes and accelerometers must agree.
+"""Signs and units of a rig, by small motions from rest to rest: its commands, IMUs and encoders must agree.
 
 The mechanism's file says how each IMU turns, and how gravity moves in its axes, when a leg moves a little near home. So the
 accelerometers at rest tell, first, whether they point as gravity does at home, and then by how much the legs have moved. With
-this motion are compared what was commanded, what each gyroscope has turned, and by what each accelerometer has tilted. A sign
-or a unit is wrong where the two are apart by more than a factor of two, and by more than the noise allows.
+this motion are compared what was commanded, what each gyroscope has turned, by what each accelerometer has tilted, and by what
+each encoder reads more, if there is one. A sign or a unit is wrong where the two are apart by more than a factor of two, and by
+more than the noise allows.
 """
 
 from collections.abc import Iterator, Sequence
@@ -76,11 +77,13 @@ class _Rest:
     spread: Array  # standard deviation of a sample
     error: Array  # standard error of the mean
     count: int
+    lengths: Array  # (6,), mean of what the encoders read [m]; NaN without one
 
 
-def _rest_of(samples: Array) -> _Rest:
+def _rest_of(samples: Array, lengths: Array) -> _Rest:
     parts = np.array([part.mean(axis=0) for part in np.array_split(samples, min(_BLOCKS, len(samples)))])
-    return _Rest(samples.mean(axis=0), samples.std(axis=0), parts.std(axis=0) / np.sqrt(max(len(parts) - 1, 1)), len(samples))
+    error = parts.std(axis=0) / np.sqrt(max(len(parts) - 1, 1))
+    return _Rest(samples.mean(axis=0), samples.std(axis=0), error, len(samples), lengths.mean(axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +95,7 @@ class _Motion:
     tilts: Array  # (7, 3), change of the specific force [m/s^2]
     turn_error: Array  # (7, 3), standard errors of both
     tilt_error: Array
+    lengths: Array  # (6,), by what the encoders read more [m]
 
 
 class SmallMotions:
@@ -101,6 +105,7 @@ class SmallMotions:
         self._expected = _responses_of(mechanism)
         self._motions: list[_Motion] = []
         self._rest: list[Array] = []
+        self._lengths: list[Array] = []
         self._turning: list[tuple[float, Array]] = []
         self._commanded = np.zeros(LEGS)
         self._at_ns = np.zeros(IMU_COUNT, np.int64)
@@ -115,6 +120,7 @@ class SmallMotions:
     def add_rest(self, feedback: Record) -> None:
         """Add a sample at rest."""
         self._rest.append(feedback["measurement"][:2].copy())
+        self._lengths.append(feedback["length"].copy())
         self._at_ns = feedback["sample_ns"].copy()
 
     def add_motion(self, command: Array, period: float, feedback: Record) -> str:
@@ -149,8 +155,8 @@ class SmallMotions:
 
     def _close_rest(self) -> None:
         """End a rest; with the one before, it encloses a motion."""
-        now, before = _rest_of(np.array(self._rest)), self._before
-        self._rest = []
+        now, before = _rest_of(np.array(self._rest), np.array(self._lengths)), self._before
+        self._rest, self._lengths = [], []
         if before is not None and self._turning:
             seconds = sum(each[0] for each in self._turning)
             self._motions.append(
@@ -160,6 +166,7 @@ class SmallMotions:
                     now.mean[1] - before.mean[1],
                     seconds * before.error[0] * np.sqrt(1.0 + before.count / len(self._turning)),
                     np.hypot(now.error[1], before.error[1]),
+                    now.lengths - before.lengths,
                 )
             )
         self._before, self._turning, self._commanded = now, [], np.zeros(LEGS)
@@ -191,6 +198,7 @@ class SmallMotions:
         tilts = [(m.tilts, expected.tilts @ m.commanded, m.tilt_error) for m in self._motions]
         yield from _wrong_axes("gyroscopes", "gyroscope", "turns", "about", turns, told, np.isfinite(off))
         yield from _wrong_axes("accelerometers", "accelerometer", "tilts", "along", tilts, told, sound)
+        yield from self._wrong_lengths(told)
 
     def _told_motion(self, motion: _Motion, sound: Array) -> tuple[float, float]:
         """The motion that the sound accelerometers tell, over the commanded one, and its standard error: the share that most
@@ -230,6 +238,23 @@ class SmallMotions:
                     "commands",
                     f"The accelerometers are too noisy to tell the sign of {who.lower()}'s motion by {most:.2f} mm: it is "
                     "not known whether its commands are right.",
+                )
+
+    def _wrong_lengths(self, told: list[tuple[float, float]]) -> Iterator[tuple[str, str]]:
+        """The encoders that read another motion than the accelerometers tell when their leg moves alone."""
+        for leg in range(LEGS):
+            alone = [
+                pair for pair in zip(self._motions, told, strict=True) if np.flatnonzero(pair[0].commanded).tolist() == [leg]
+            ]
+            parts = [(motion.lengths[leg], motion.commanded[leg], *each) for motion, each in alone]
+            read = sum(np.copysign(1.0, share) * moved * asked for moved, asked, share, _ in parts)
+            due = sum(abs(share) * asked**2 for _, asked, share, _ in parts)
+            unsure = np.sqrt(sum((asked**2 * min(error, 1e6)) ** 2 for _, asked, _, error in parts))
+            if np.isfinite(read) and due > 0.0 and _is_wrong(read, due, _SIGMAS * unsure):
+                yield (
+                    "encoders",
+                    f"The encoder of leg {leg} reads {read / due:.3g} times the motion that the accelerometers tell: check its "
+                    "sign and its unit.",
                 )
 
 

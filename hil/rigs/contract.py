@@ -245,7 +245,7 @@ class _Examiner:
         self._tell_motions()
 
     def _tell_motions(self) -> None:
-        self._begin("gravity", "commands", "gyroscopes", "accelerometers")
+        self._begin("gravity", "commands", "gyroscopes", "accelerometers", "encoders")
         for clause, text in self._motions.findings() if self._motions is not None else ():
             self._find(clause, text)
 

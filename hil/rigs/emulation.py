@@ -17,8 +17,12 @@ from hil.rigs import DriveState, Request
 from plant.compiled import Record, filled, kernel, record_dtype, shared_kernel
 from plant.dynamics.base_course import BASE_MOTION, MOST_BASE_MOTIONS, BaseMotionKind, base_motion_of_text, placed
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
+from plant.encoder_readings import ENCODER_FAULT, fault_record, read_encoders
+from plant.encoder_readings import MOST_FAULTS as MOST_ENCODER_FAULTS
+from plant.encoders import PREFIX as ENCODER_PREFIX
+from plant.encoders import EncoderFaultKind, encoder_fault
 from plant.errors import InputError, UnknownNameError
-from plant.fmu.calls import advance, read_imus, read_truth, write_command, write_drive_modes, write_payload_mass
+from plant.fmu.calls import advance, read_imus, read_motors, read_truth, write_command, write_drive_modes, write_payload_mass
 from plant.imu import DISTURBANCE, MOST_DISTURBANCES, disturbance_record, measure
 from plant.imu_disturbances import DisturbanceKind, disturbance, disturbance_of_text
 from plant.mechanism import LEGS, Mechanism
@@ -72,6 +76,7 @@ FAULT = record_dtype(
     size=np.float64,
     disturbance=DISTURBANCE,  # of IMUs, as long as the fault is there
     base=BASE_MOTION,  # of the base
+    encoder=ENCODER_FAULT,  # of encoders
 )
 """A fault."""
 
@@ -94,13 +99,20 @@ def fault(text: str) -> Record:
     if name in disturbances:
         meant = disturbance_of_text(text)
         return _made(0, meant.begin, meant.duration, disturbance=disturbance_record(replace(meant, begin=0.0, duration=inf)))
+    if name.startswith(ENCODER_PREFIX):
+        broken = encoder_fault(text)
+        return _made(
+            0, broken.begin, broken.duration, encoder=fault_record(replace(broken, begin=0.0, duration=inf))
+        )  # fmt: skip
     moves = [kind.label for kind in BaseMotionKind]
     if name in moves:
         motion = base_motion_of_text(text)
         begin, lasting = float(motion["begin"]), float(motion["end"] - max(motion["begin"], 0.0))
         return _made(0, begin, lasting, base=placed(motion, 0.0))
     if name not in kinds:
-        raise UnknownNameError(f"there is no fault {name!r}; there are {', '.join((*kinds, *disturbances, *moves))}")
+        of_encoders = [each.label for each in EncoderFaultKind]
+        known = ", ".join((*kinds, *disturbances, *moves, *of_encoders))
+        raise UnknownNameError(f"there is no fault {name!r}; there are {known}")
     kind = kinds[name]
     if kind.count and not (index.isdecimal() and int(index) < kind.count):
         raise InputError(f"the fault {text!r} needs the number of an IMU or drive, 0 to {kind.count - 1}: such as {name}:0")
@@ -146,6 +158,9 @@ EMULATED = record_dtype(
     measurement=(np.float64, (3, IMU_COUNT, 3)),  # the last sample [rad/s, m/s^2, uT]
     sample_ns=(np.int64, IMU_COUNT),
     sequence=(np.int64, IMU_COUNT),
+    length=(np.float64, LEGS),  # that the encoders read [m]
+    length_rate=(np.float64, LEGS),  # [m/s]
+    home=(np.int64, LEGS),  # as `plant.encoder_readings` has it
     truth=(np.float64, TRUTH_SIZE),
     fault=(FAULT, MOST_FAULTS),
     faults=np.int64,
@@ -174,6 +189,7 @@ def new_emulated(mechanism: Mechanism, step_ns: int, seed: int, faults: Iterable
     limits = mechanism.require_limits()
     rig["step_ns"], rig["deceleration"], rig["speed_limit"] = step_ns, limits.acceleration, _SPEED_RESERVE * limits.velocity
     rig["payload"] = mechanism.plant_parameters()["payload.mass"]
+    rig["length"], rig["length_rate"], rig["home"] = np.nan, np.nan, -1
     rig["enabled_ns"], rig["drive"], rig["random"] = -1, DriveState.READY, seed + 1
     for each in faults:
         add_fault(rig, each)
@@ -194,8 +210,8 @@ def add_fault(rig: Record, fault: Record) -> None:
 
 
 @shared_kernel
-def sample(fmu: Record, imu: Record, rig: Record, now_ns: int) -> int:
-    """Move the plant on to `now_ns` on the rig's clock, and read the IMUs; returns FMI's status."""
+def sample(fmu: Record, imu: Record, encoders: Record, rig: Record, now_ns: int) -> int:
+    """Move the plant on to `now_ns` on the rig's clock, and read the IMUs and the encoders; returns FMI's status."""
     r, c, m = rig[()], fmu[()], imu[()]
     status = move(fmu, rig, now_ns)
     status |= read_imus(fmu) | read_truth(fmu)
@@ -231,6 +247,26 @@ def sample(fmu: Record, imu: Record, rig: Record, now_ns: int) -> int:
                 r.measurement[kind, k, j] = c.imu[kind, k, j]
                 if noise > 0.0 and kind < 2:
                     r.measurement[kind, k, j] += draw_normal(r.random) * noise * (np.pi / 180.0 if kind == 0 else 0.1)
+    if encoders[()].legs > 0:
+        status |= _read_encoders(fmu, encoders, r)
+    return status
+
+
+@kernel
+def _read_encoders(fmu: Record, encoders: Record, r: Record) -> int:
+    """Read the encoders of a rig that has been moved on; returns FMI's status."""
+    e = encoders[()]
+    status = read_motors(fmu)
+    e.time, e.faults = 1e-9 * r.time_ns, e.lasting
+    for i in range(r.faults):
+        f = r.fault[i]
+        if f.encoder.kind == 0 or e.faults >= MOST_ENCODER_FAULTS or not is_active(f, r.enabled_ns, r.time_ns):
+            continue
+        e.fault[e.faults] = f.encoder
+        if f.begin_ns >= 0:
+            e.fault[e.faults].begin = 1e-9 * (r.enabled_ns + f.begin_ns)
+        e.faults += 1
+    read_encoders(encoders, fmu[()].motors, r.length, r.length_rate, r.home)
     return status
 
 

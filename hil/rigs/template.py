@@ -4,7 +4,7 @@
     gough check-rig --rig python:my_rig:MyRig --rig-at /dev/ttyUSB0 --rate 200 --move
     gough run       --rig python:my_rig:MyRig --rig-at /dev/ttyUSB0 --rate 200
 
-The places to change are marked by 1 to 5. Set the drives' own watchdog, too: drives without a command for some periods must
+The places to change are marked by 1 to 6. Set the drives' own watchdog, too: drives without a command for some periods must
 stop by themselves, because the loop may die.
 """
 
@@ -67,6 +67,7 @@ class TemplateRig:
         velocities = np.clip(wanted, -SPEED_LIMIT, SPEED_LIMIT)
         try:
             read_imus(hardware, began - self._opened_ns, feedback)
+            read_encoders(hardware, feedback)
             drive(hardware, velocities, feedback)
         except OSError:
             return SILENT
@@ -104,3 +105,10 @@ def read_imus(hardware: KinematicHexapod, time_ns: int, feedback: Record) -> Non
     feedback["sample_ns"] = time_ns
     feedback["sequence"] += 1
     feedback["truth"][:13] = hardware.truth()
+
+
+def read_encoders(hardware: KinematicHexapod, feedback: Record) -> None:
+    """6: Read the encoders, if there are any: lengths [m] from any zero, positive when a leg extends, their rates [m/s], and
+    home switches, 1 beyond the switch and 0 before it. Without encoders, leave this function out.
+    """
+    feedback["length"], feedback["length_rate"] = hardware.lengths, hardware.velocities

@@ -8,6 +8,8 @@ from controller.planning import STREAM_TARGET
 from hil.option import integers, option
 from hil.runs.names import name_objects
 from plant.checks import check_duration, check_rate, checked_seed, nearest
+from plant.encoders import PREFIX as ENCODER_PREFIX
+from plant.encoders import EncoderFault, encoder_fault
 from plant.errors import InputError, UnknownNameError
 from plant.fmu.settings import Setting
 from plant.imu_disturbances import BASE_PREFIX, Disturbance, disturbance_of_text
@@ -105,7 +107,7 @@ class SimulationConfig:
     wiring: Wiring = RIGHT_WIRING
     faults: tuple[str, ...] = option(
         (),
-        "simulated: what happens to IMUs or to the base, from the start or from a time of the motion on, such as "
+        "simulated: what happens to IMUs, to encoders or to the base, from the start or from a time of the motion on, such as "
         "imu-offset:all,axis=y,size_m_per_s2=0.5,at_s=5,ramp_s=10 or base-tilt,axis=x,size_deg=2,at_s=3,ramp_s=4; "
         "'gough inject --list' lists all; can be given several times",
         flag="--fault",
@@ -115,6 +117,9 @@ class SimulationConfig:
     )
     joint_error: float = option(
         0.0, "simulated: standard deviation of each coordinate of the joints from their places", unit="mm"
+    )
+    lengths: str = option(
+        "none", "encoders of the legs' lengths: none, incremental, absolute, or a TOML file (docs/encoders.md)", metavar="KIND"
     )
     magnetometer: bool = option(False, "the platform's magnetometer gives its heading")
     rig: str = option(
@@ -158,12 +163,17 @@ class SimulationConfig:
                 f"--fault is for a simulated plant, not for the rig {self.rig}: tell it to 'gough emulate' or 'inject'"
             )
         # Refuses words that none understands.
-        self.base_motions, self.disturbances  # noqa: B018
+        self.base_motions, self.disturbances, self.encoder_faults  # noqa: B018
 
     @property
     def disturbances(self) -> list[Disturbance]:
         """What happens to IMUs."""
-        return [disturbance_of_text(text) for text in self.faults if not text.startswith(BASE_PREFIX)]
+        return [disturbance_of_text(text) for text in self.faults if not text.startswith((BASE_PREFIX, ENCODER_PREFIX))]
+
+    @property
+    def encoder_faults(self) -> list[EncoderFault]:
+        """What happens to encoders."""
+        return [encoder_fault(text) for text in self.faults if text.startswith(ENCODER_PREFIX)]
 
     @property
     def base_motions(self) -> "list[Record]":

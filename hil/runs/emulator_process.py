@@ -24,12 +24,22 @@ from controller.planning.target import load_target
 from hil.loop.driver import prevent_compilation
 from hil.realtime.scheduling import RealTimeSettings, real_time
 from hil.rigs.emulation import add_fault, fault, new_emulated
-from hil.rigs.udp.datagrams import HELLO_DATAGRAM, WELCOME_DATAGRAM, DatagramKind, decode, encode
+from hil.rigs.udp.datagrams import (
+    HELLO_DATAGRAM,
+    VERSION,
+    WELCOME_DATAGRAM,
+    WITH_LENGTHS,
+    DatagramKind,
+    decode,
+    encode,
+)
 from hil.rigs.udp.emulator import UdpEmulator, new_udp_emulator, serve
 from hil.rigs.udp.link import DEFAULT_ADDRESS, address_in, bound_socket, parse_address, socket_address
 from hil.runs.config import EmulatorConfig
 from hil.runs.prepare import simulated_plant
 from plant.compiled import Record
+from plant.encoder_readings import encoder_state
+from plant.encoders import load_encoder
 from plant.errors import GoughError, InputError
 from plant.fmu.plant import FmuPlant
 from plant.imu import imu_state, load_imu
@@ -223,19 +233,20 @@ def ask(address: str, question: str, patience: float = 2.0) -> dict[str, Any]:
     return reply
 
 
-def _rig_of(config: EmulatorConfig, period: float, faults: list[Record]) -> tuple[FmuPlant, Record, Record]:
+def _rig_of(config: EmulatorConfig, period: float, faults: list[Record]) -> tuple[FmuPlant, Record, Record, Record]:
     simulated = config.simulated
     mechanism = load_spatial(simulated.mechanism)
     start = load_target(simulated.target, mechanism, 1.0).start
     plant = simulated_plant(simulated, mechanism, start)
     imu = imu_state(load_imu(simulated.imu), simulated.seed, period, simulated.wiring)
-    return plant, imu, new_emulated(mechanism, _STEP_NS, simulated.seed, faults)
+    encoders = encoder_state(load_encoder(simulated.lengths), simulated.seed, period, legs=mechanism.legs)
+    return plant, imu, encoders, new_emulated(mechanism, _STEP_NS, simulated.seed, faults)
 
 
 def _load(config: EmulatorConfig) -> None:
-    plant, imu, rig = _rig_of(config, 1e-3, [])
+    plant, *parts = _rig_of(config, 1e-3, [])
     with plant, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as scratch:
-        emulator = new_udp_emulator(plant.handle, imu, rig)
+        emulator = new_udp_emulator(plant.handle, *parts)
         emulator.link.socket["descriptor"] = scratch.fileno()
         serve(emulator, time.monotonic_ns(), 0, np.zeros(2, np.int64))
 
@@ -255,10 +266,11 @@ class _UdpSessions:
         hello = _hello(content)
         while hello is not None and not self.control.stopped:
             period = 1e-6 * int(hello["period_us"])
-            plant, imu, rig = _rig_of(self.config, period, self.faults)
+            plant, imu, encoders, rig = _rig_of(self.config, period, self.faults)
             with plant:
                 watchdog = self.config.watchdog_for(int(hello["period_us"]))
-                emulator = new_udp_emulator(plant.handle, imu, rig, int(hello["session"]), watchdog)
+                session, version = int(hello["session"]), int(hello["version"])
+                emulator = new_udp_emulator(plant.handle, imu, encoders, rig, session, watchdog, version)
                 link = emulator.link.socket
                 link["descriptor"], link["peer"] = self.opened.fileno(), socket_address(sender)
                 self._welcome(hello, sender)
@@ -270,6 +282,7 @@ class _UdpSessions:
         watchdog_us = round(1e6 * self.config.watchdog_for(int(hello["period_us"])))
         name = _padded(f"gough emulated {load_spatial(self.config.simulated.mechanism).name}", 32)
         fields = {
+            "version": hello["version"],
             "session": hello["session"],
             "watchdog_us": watchdog_us,
             "truthful": 1,
@@ -313,5 +326,6 @@ def _padded(text: str, size: int) -> NDArray[np.uint8]:
 
 
 def _hello(content: bytes) -> Record | None:
-    hello = decode(HELLO_DATAGRAM, content, kind=DatagramKind.HELLO)
+    decoded = (decode(HELLO_DATAGRAM, content, version=version, kind=DatagramKind.HELLO) for version in (VERSION, WITH_LENGTHS))
+    hello = next((each for each in decoded if each is not None), None)
     return hello if hello is not None and hello["session"] != 0 and hello["period_us"] != 0 else None

@@ -33,6 +33,8 @@ from hil.runs.plant_start import check_start
 from plant.compiled import Record
 from plant.dynamics.base_course import placed
 from plant.dynamics.variables import PLATFORM_IMU
+from plant.encoder_readings import encoder_state
+from plant.encoders import NO_LENGTHS, load_encoder
 from plant.errors import GoughError, InputError, UnknownNameError
 from plant.extras import missing_extras_named
 from plant.fmu.binding import OWN_BINDING, bind, load_binding
@@ -109,19 +111,21 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         target = load_target("hold" if config.streamed else config.target, mechanism, config.duration)
         model = load_imu(config.imu)
         imu = imu_state(model, config.seed, period, config.wiring)
+        encoder = load_encoder(config.lengths)
         control = control_settings(mechanism, **({} if config.hold is None else {"hold": config.hold}))
         least, most = HOLD_RANGE_S
         if not least <= control.hold <= most:
             raise InputError(f"hold is {control.hold:g} s; the estimate settles in {least:g} to {most:g} s")
         add_disturbances(imu, (each.later(control.hold) for each in config.disturbances))
-        fusion, safety = sensor_settings(mechanism, model), safety_settings(mechanism)
+        encoder_faults = [each.later(control.hold) for each in config.encoder_faults]
+        fusion, safety = sensor_settings(mechanism, model, encoder), safety_settings(mechanism)
         drives = drive_settings(mechanism, are_few(mechanism, config.imus))
         if config.raw_imus:
             safety, drives = safety.for_raw_imus(), drives.for_raw_imus()
         parameters = cycle_parameters(
             mechanism, config.rate, control, fusion, config.imus, FUSIONS[config.fusion], calibration, config.magnetometer,
             config.fusion == "section-5", safety, drives, 0.0 if config.rig == "fmu" else period,
-            config.arm,
+            config.arm, encoder,
         )  # fmt: skip
         remarks = [
             calibration.remark,
@@ -148,6 +152,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         loop = PreparedLoop(
             fmu=np.zeros((), FMU_HANDLE) if plant is None else plant.handle,
             imu=imu,
+            encoders=encoder_state(encoder, config.seed, period, encoder_faults, mechanism.legs),
             parameters=parameters,
             state=np.zeros((), STATE),
             segments=reference.segments,
@@ -265,13 +270,13 @@ def rig_of(config: SimulationConfig) -> Rig | None:
     mechanism, period = load_in_space(config.mechanism), 1.0 / config.rate
     check_legs(config.rig, mechanism)
     if config.rig == "udp":
-        return UdpRig(config.rig_at or DEFAULT_ADDRESS, period)
+        return UdpRig(config.rig_at or DEFAULT_ADDRESS, period, lengths=config.lengths != NO_LENGTHS)
     if config.rig == "canopen":
         with missing_extras_named():
             from hil.rigs.canopen.rig import CanopenRig
             from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings
 
-        return CanopenRig(canopen_settings(config.rig_at or DEFAULT_FILE), period)
+        return CanopenRig(canopen_settings(config.rig_at or DEFAULT_FILE), period, lengths=config.lengths != NO_LENGTHS)
     if config.rig == "replay":
         if not config.rig_at:
             raise InputError("a replay needs its recording: name it with --rig-at FILE.mcap")

@@ -20,6 +20,7 @@ from hil.loop.records import WORK
 from hil.realtime.clock import CLOCK, FREE
 from hil.runs.prepare import PreparedLoop
 from plant.compiled import Record, out_of_limits
+from plant.encoder_readings import ENCODER_LIMITS, ENCODER_STATE
 from plant.errors import InputError
 from plant.files import write_whole
 from plant.imu import IMU_LIMITS, IMU_STATE
@@ -91,7 +92,12 @@ def resume_snapshot(snapshot: Snapshot, loop: PreparedLoop) -> None:
 
 def _broken(snapshot: Snapshot, kept: Mapping[str, Record]) -> str | None:
     """What compiled code could not take of the loop's arrays, in words; None if there is nothing."""
-    for name, limits in (("state", RUNNING_LIMITS), ("imu", IMU_LIMITS), ("clock", {"mode": (FREE, FREE)})):
+    for name, limits in (
+        ("state", RUNNING_LIMITS),
+        ("imu", IMU_LIMITS),
+        ("encoders", ENCODER_LIMITS),
+        ("clock", {"mode": (FREE, FREE)}),
+    ):
         if broken := out_of_limits(kept[name], limits):
             return f"in its {name} {broken}"
     cycle = int(kept["state"]["time"]["cycle"][0])
@@ -145,7 +151,7 @@ def _hash(content: bytes) -> bytes:
 
 
 def _layout() -> bytes:
-    return _hash(repr((PARAMETERS, STATE, WORK, CLOCK, IMU_STATE)).encode())
+    return _hash(repr((PARAMETERS, STATE, WORK, CLOCK, IMU_STATE, ENCODER_STATE)).encode())
 
 
 def _settings(loop: PreparedLoop) -> bytes:

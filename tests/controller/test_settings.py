@@ -86,6 +86,7 @@ def test_what_is_no_number_is_refused_in_tables_and_changes(hexapod, value):
 def test_a_bad_value_of_any_setting_is_refused_by_name(hexapod, kind, read, table, bad):
     for name in asdict(kind()):
         if bad == np.inf and name in (
+            "length_deviation",
             "misfit",
             "evidence",
             "protection_position",

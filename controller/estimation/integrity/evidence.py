@@ -365,6 +365,10 @@ def _learn(p: Record, s: Record) -> None:
     s.windows = 0
     for i in range(POSE):
         _eliminate(s.recent, REST + i)
+    # What is left out comes first; what it reads wrong is not learned.
+    left_out = READINGS * s.apart
+    for i in range(left_out):
+        _eliminate(s.recent, MOTION_STATES + i)
     late = s.waits == LATE
     for i in range(FAULTS):
         known = READINGS * s.order[i // READINGS] + i % READINGS
@@ -377,16 +381,24 @@ def _learn(p: Record, s: Record) -> None:
             s.expected[known, other] = s.expected[other, known] = value
             for n in range(LATE - 1):
                 s.waiting[n, known, other] = s.waiting[n, other, known] = s.waiting[n + 1, known, other]
-            new = s.recent[MOTION_STATES + i, MOTION_STATES + j]
+            new = s.recent[MOTION_STATES + i, MOTION_STATES + j] if i >= left_out else 0.0
             s.waiting[LATE - 1, known, other] = s.waiting[LATE - 1, other, known] = new
         s.learned_vector[known] *= p.keep
         if late:
             s.learned_vector[known] += p.share * s.waiting_vector[0, known]
         for n in range(LATE - 1):
             s.waiting_vector[n, known] = s.waiting_vector[n + 1, known]
-        s.waiting_vector[LATE - 1, known] = s.recent[MOTION_STATES + i, UNKNOWNS]
+        s.waiting_vector[LATE - 1, known] = s.recent[MOTION_STATES + i, UNKNOWNS] if i >= left_out else 0.0
         s.expected_vector[known] = s.learned_vector[known]
     s.waits = min(s.waits + 1, LATE)
+
+
+@kernel
+def end_blur(p: Record, s: Record, step: int) -> None:
+    """Blur what was just learned of the IMUs that it has not come to, when an evaluation is broken off before this step."""
+    if s.windows == 0:
+        for k in range(max(step - _LEARN - 1, 0) if step > _LEARN else IMU_COUNT, IMU_COUNT):
+            _blur(p, s, k)
 
 
 @kernel

@@ -364,7 +364,11 @@ def _forget_fault(p: Record, s: Record, k: int, information: Array, vector: Arra
 def _take_away(s: Record, information: Array, vector: Array, keep: float) -> None:
     """Y <- keep (Y - K^T M^-1 K) and y <- keep (y - K^T M^-1 u), for K, u and M in `root`, `root_vector` and `factor`."""
     a, z, u = information, s.root, s.root_vector
-    factor_cholesky(s.factor)
+    if not factor_cholesky(s.factor):
+        # Rounding has spoilt it: nothing is known any more.
+        a[:] = 0.0
+        vector[:] = 0.0
+        return
     for n in range(_JERKS):
         row = z[n]
         for m in range(n):

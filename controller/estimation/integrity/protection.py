@@ -13,12 +13,17 @@ ever exceed without a fault; e is at least 0.
 The 3 is for faults that grow: such a fault is larger at the end of the filter's memory than on average over it, and has moved
 the pose before. A fault since the loop began has had little time to move the pose: these terms grow over the first two seconds.
 
-The level is the root of the sum of the squares of four terms. One is the greatest of these. One is the standard deviation of
-the pose, both that of the closed form and that of the pose's own source if that is less: no filter knows what calibrations of
-IMUs and joints leave. It counts more in the first seconds, in which the filters learn what the gyroscopes are off. One is the
-standard deviation of the closed form again, by how much its measurements contradict each other: so joints that are off show
-themselves, and other errors that nothing models. One is what `parity` and `shaking` tell: forces that are no motion may have
-moved the pose. The last two are renewed between two evaluations.
+The level is the root of the sum of the squares of four terms:
+
+1. The greatest of these.
+2. The standard deviation of the pose, both that of the closed form and that of the pose's own source if that is less: no filter
+   knows what calibrations of IMUs and joints leave. It counts more in the first seconds, in which the filters learn what the
+   gyroscopes are off.
+3. The standard deviation of the closed form again, by how much its measurements contradict each other: so joints that are off
+   show themselves, and other errors that nothing models.
+4. What `parity` and `shaking` tell: forces that are no motion may have moved the pose.
+
+Terms 3 and 4 are renewed after every window.
 """
 
 import numpy as np

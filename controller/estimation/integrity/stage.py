@@ -15,6 +15,7 @@ from controller.estimation.integrity.hypotheses import (
     kind_of,
     span_of,
 )
+from controller.rig import elapsed
 from controller.settings import FusionSettings
 from plant.compiled import MOST, Limits, Record, filled, kernel, record_dtype, shared_kernel
 from plant.dynamics.variables import IMU_COUNT
@@ -41,6 +42,7 @@ STATE = record_dtype(
     cycle=np.int64,  # of the evaluation
     found=(np.float64, HYPOTHESES),  # evidence for each, of the evaluation under way
     evaluations=np.int64,  # how many are complete
+    unjudged_for=np.float64,  # how long none has been completed [s]
     fresh=np.int64,  # whether the last one has become complete in this cycle
     best=np.int64,  # the hypothesis with the most evidence
     best_evidence=np.float64,
@@ -111,7 +113,9 @@ def step_integrity(
     s.fresh = s.contradicts = 0
     if p.filter.active == 0:
         return
+    s.unjudged_for += elapsed(rig, time)
     if time.missed > 0:
+        evidence.end_blur(p.evidence, s.evidence, s.step)
         s.step = s.cycle = 0
     took = fault_filter.step_fault_filter(p.filter, s.filter, rig.sensors, imus, time.missed, pose, legs, commands)
     if s.filter.job > 0 and s.compared != s.filter.windows:
@@ -140,6 +144,7 @@ def step_integrity(
     if s.step == STEPS:
         s.step = s.cycle = 0
         s.fresh = 1
+        s.unjudged_for = 0.0
         s.evaluations += 1
 
 
@@ -147,6 +152,7 @@ def step_integrity(
 def restart_integrity(p: Record, s: Record) -> None:
     """Forget the last half second, as the set of IMUs that are relied upon has changed; what was learned before it stays."""
     s.waits = p.correction_cycles
+    evidence.end_blur(p.evidence, s.evidence, s.step)
     s.step = s.cycle = 0
     fault_filter.begin_anew(s.filter)
 

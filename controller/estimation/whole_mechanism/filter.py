@@ -27,7 +27,7 @@ from controller.estimation.whole_mechanism.imu_errors import (
     distort_jacobian,
     error_gradient,
 )
-from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, ROWS, rig_start
+from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, ROWS, lengths_start, rig_start, rows_of
 from controller.estimation.whole_mechanism.readings import (
     ACCELERATION,
     ANGULAR_ACCELERATION,
@@ -44,7 +44,7 @@ from plant.dynamics.variables import IMU_COUNT
 from plant.imu import ACCELEROMETER
 from plant.mechanism import LEGS
 from plant.pose import Array, rotate_by_vector
-from plant.vectors import dot, rotate, vector
+from plant.vectors import add, cross, dot, rotate, scale, subtract, vector
 
 _FIRST_SIGMAS = (0.01, 0.05, 0.1, 0.5, 5.0, 50.0)
 """Uncertainty of the motion at the start: position [m], rotation [rad], and their derivatives."""
@@ -54,6 +54,9 @@ _PREPARING_ROWS = 14
 
 _REST_SIGMAS = 3.0
 """Within how many standard deviations of none a motion counts as none."""
+
+_PLAY_LASTS_S = 0.5
+"""Time constant of what play does to an encoder's reading [s]."""
 
 _LONGEST_CHANGE_S = 0.1
 """Beyond this time between two updates, how fast the readings change is not known [s]."""
@@ -79,6 +82,8 @@ def start_filter(p: Record, f: Record, time: float, position: Array, rotation: A
     f.rig[:] = 0.0
     f.heading_offset = 0.0
     f.field_used = 0
+    f.length_errors[:] = 0.0
+    f.length_count[:] = 0.0
     states, rig = p.states, rig_start(p)
     for i in range(states):
         for j in range(states):
@@ -96,6 +101,9 @@ def start_filter(p: Record, f: Record, time: float, position: Array, rotation: A
     for i in range(p.rig):
         for j in range(p.rig):
             f.covariance[rig + i, rig + j] = p.prior[ALL_ERRORS + i, ALL_ERRORS + j]
+    for i in range(p.lengths):
+        at = lengths_start(p) + i
+        f.covariance[at, at] = p.length_prior[i // LEGS]
     if p.heading != 0:
         f.covariance[states - 1, states - 1] = p.offset_variance
     f.row = -1
@@ -123,6 +131,23 @@ def accumulate_sample(f: Record, sample: Array, weights: Array, time: float) -> 
 
 
 @kernel
+def start_lengths(f: Record, zeros: Array) -> None:
+    """Take what is known of the encoders' zeros (6,) [m] at the start."""
+    for k in range(LEGS):
+        f.length_errors[0, k] = zeros[k]
+
+
+@kernel
+def accumulate_lengths(f: Record, readings: Array, used: Array, time: float) -> None:
+    """Add the encoders' readings (6,) [m] to the window, as far as they are `used` (6,)."""
+    for k in range(LEGS):
+        if used[k] != 0.0:
+            f.length_sum[k] += readings[k]
+            f.length_sum_time[k] += time
+            f.length_count[k] += 1.0
+
+
+@kernel
 def accumulate_field(f: Record, field: Array, time: float) -> None:
     """Keep a calibrated sample (3,) of the platform's magnetometer for the next update."""
     f.field[:] = field
@@ -138,8 +163,9 @@ def step_filter(p: Record, geometry: Record, f: Record) -> None:
     if f.row < 0:
         return
     f.update_step += 1
-    whole = _PREPARING_ROWS + ROWS
-    _update_rows(p, f, min(max(-(-whole * f.update_step // p.window) - _PREPARING_ROWS, 0), ROWS))
+    rows = rows_of(p)
+    whole = _PREPARING_ROWS + rows
+    _update_rows(p, geometry, f, min(max(-(-whole * f.update_step // p.window) - _PREPARING_ROWS, 0), rows))
 
 
 @kernel
@@ -147,7 +173,7 @@ def _begin_update(p: Record, geometry: Record, f: Record) -> None:
     """Begin an update with the samples of a full window: predict, take the heading, and predict the readings."""
     if f.row >= 0:
         # The windows have overtaken the update, which happens when cycles are missed.
-        _update_rows(p, f, ROWS)
+        _update_rows(p, geometry, f, rows_of(p))
     time = f.sum_time / f.collected
     f.sample_weight[:] = f.weight
     for k in range(IMU_COUNT):
@@ -168,6 +194,8 @@ def _begin_update(p: Record, geometry: Record, f: Record) -> None:
     if p.errors > ACCELEROMETER_SCALE:
         for k in range(IMU_COUNT):
             distort_jacobian(f.errors[k], f.jacobian[k])
+    if p.lengths > 0:
+        _predict_lengths(geometry, f)
     if p.rig > 0:
         find_rig_jacobian(geometry, f.position, f.rotation, smooth, f.errors, f.jacobian, f.rig_jacobian)
 
@@ -231,6 +259,8 @@ def _predict(p: Record, f: Record, period: float) -> None:
         for i in range(min(p.errors, ACCELEROMETER_SCALE)):
             at = MOTION_STATES + k * p.errors + i
             c[at, at] += p.bias_walk[i // 3] * t
+    if p.lengths > 0:
+        _forget_play(p, f, t)
     if p.heading != 0:
         c[states - 1, states - 1] += p.offset_variance * t / _OFFSET_LASTS_S
     # The updates take the matrix for symmetric.
@@ -256,18 +286,21 @@ def _is_at_rest(f: Record) -> bool:
 
 
 @kernel
-def _update_rows(p: Record, f: Record, last: int) -> None:
+def _update_rows(p: Record, geometry: Record, f: Record, last: int) -> None:
     """Take the scalars of the sample up to row `last`; the update ends with the last of all."""
     while f.row < last:
         _update_scalar(p, f, f.row)
         f.row += 1
-    if f.row == ROWS:
-        _end_update(p, f)
+    if f.row == rows_of(p):
+        _end_update(p, geometry, f)
 
 
 @kernel
 def _update_scalar(p: Record, f: Record, row: int) -> None:
     """Take one scalar of the sample into covariance and change."""
+    if row >= ROWS:
+        _update_length(p, f, row - ROWS)
+        return
     k, m = row // READINGS, row % READINGS
     sensor = m // 3
     if f.sample_weight[sensor, k] == 0.0:
@@ -311,6 +344,95 @@ def _update_scalar(p: Record, f: Record, row: int) -> None:
 
 
 @kernel
+def _find_length(geometry: Record, f: Record, k: int, gradient: Array) -> float:
+    """The length of leg `k` at the pose, and its gradient (6,): the direction d for a move of the platform, and a x d with the
+    arm a for a turn.
+    """
+    arm = rotate(f.rotation, vector(geometry.platform_joints[k]))
+    leg = subtract(add(vector(f.position), arm), vector(geometry.base_joints[k]))
+    length = float(np.sqrt(dot(leg, leg)))
+    d = scale(1.0 / length, leg)
+    gradient[0], gradient[1], gradient[2] = d
+    gradient[3], gradient[4], gradient[5] = cross(arm, d)
+    return length
+
+
+@kernel
+def _predict_lengths(geometry: Record, f: Record) -> None:
+    """Close the window of the encoders' readings; their mean time is not that of the update."""
+    for k in range(LEGS):
+        count = f.length_count[k]
+        f.length_weight[k], f.length_count[k] = count, 0.0
+        f.length_predicted[k] = _find_length(geometry, f, k, f.length_gradient[k])
+        f.length_later[k] = 0.0
+        if count > 0.0:
+            f.length[k], f.length_later[k] = f.length_sum[k] / count, f.length_sum_time[k] / count - f.time
+        f.length_sum[k] = f.length_sum_time[k] = 0.0
+
+
+@kernel
+def _keep_readings(p: Record, geometry: Record, f: Record) -> None:
+    """Let the zeros make up for how the lengths curve between the poses before and after an update.
+
+    An update knows the sum of a length and a zero, far better than either of them. It is linear at the pose before, so that at
+    the pose after it both the zeros and their covariance with the pose would contradict that sum, and the next readings would
+    seem to tell where the platform is.
+    """
+    c, states, change, gradient = f.covariance, p.states, f.change, f.gradient
+    for k in range(LEGS):
+        before, zero = f.length_gradient[k], lengths_start(p) + k
+        f.length_errors[0, k] += f.length_predicted[k] - _find_length(geometry, f, k, gradient)
+        for j in range(6):
+            f.length_errors[0, k] += before[j] * change[j]
+            left = before[j] - gradient[j]
+            for i in range(states):
+                c[zero, i] += left * c[j, i]
+        for j in range(6):
+            left = before[j] - gradient[j]
+            for i in range(states):
+                c[i, zero] += left * c[i, j]
+
+
+@kernel
+def _forget_play(p: Record, f: Record, period: float) -> None:
+    """Let what play does to the readings fade, as the legs turn back now and then, and be uncertain anew."""
+    c, left = f.covariance, np.exp(-period / _PLAY_LASTS_S)
+    first = lengths_start(p) + LEGS
+    for at in range(first, first + LEGS):
+        f.length_errors[1, at - first] *= left
+        for i in range(p.states):
+            c[at, i] *= left
+        for i in range(p.states):
+            c[i, at] *= left
+        c[at, at] += p.length_prior[1] * (1.0 - left * left)
+
+
+@kernel
+def _update_length(p: Record, f: Record, k: int) -> None:
+    """Take the encoder's readings of leg `k` into covariance and change."""
+    if f.length_weight[k] == 0.0:
+        return
+    states, gradient, gain, change, c, later = p.states, f.length_gradient[k], f.gain, f.change, f.covariance, f.length_later[k]
+    zero = lengths_start(p) + k
+    play = zero + LEGS
+    speed = dot(vector(gradient), vector(f.motion[VELOCITY])) + dot(vector(gradient[3:]), vector(f.motion[RATE]))
+    errors = f.length_errors[0, k] + f.length_errors[1, k] + change[zero] + change[play]
+    innovation = f.length[k] - f.length_predicted[k] - later * speed - errors
+    variance = p.length_variance / f.length_weight[k]
+    for i in range(states):
+        gain[i] = c[zero, i] + c[play, i]
+    for j in range(12):
+        weight = gradient[j] if j < 6 else later * gradient[j - 6]
+        innovation -= weight * change[j]
+        for i in range(states):
+            gain[i] += weight * c[j, i]
+    variance += gain[zero] + gain[play]
+    for j in range(12):
+        variance += (gradient[j] if j < 6 else later * gradient[j - 6]) * gain[j]
+    take_scalar(c, gain, change, states, innovation, variance)
+
+
+@kernel
 def _update_heading(p: Record, f: Record) -> None:
     """Take the sample of the magnetometer, before all others: the angle about the vertical by which the field, turned into {1},
     is off its direction. An error of the rotation turns it by -axis^T theta, and the offset adds to it.
@@ -329,7 +451,7 @@ def _update_heading(p: Record, f: Record) -> None:
 
 
 @kernel
-def _end_update(p: Record, f: Record) -> None:
+def _end_update(p: Record, geometry: Record, f: Record) -> None:
     """Put the change into the motion and the errors."""
     f.row = -1
     for i in range(3):
@@ -343,6 +465,10 @@ def _end_update(p: Record, f: Record) -> None:
             f.errors[k, i] += f.change[MOTION_STATES + k * p.errors + i]
     for i in range(p.rig):
         f.rig[i] += f.change[rig_start(p) + i]
+    if p.lengths > 0:
+        for i in range(p.lengths):
+            f.length_errors[i // LEGS, i % LEGS] += f.change[lengths_start(p) + i]
+        _keep_readings(p, geometry, f)
     if p.heading != 0:
         f.heading_offset += f.change[p.states - 1]
     _publish(f)

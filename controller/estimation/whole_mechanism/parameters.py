@@ -9,15 +9,19 @@ from controller.settings import FusionSettings
 from plant.compiled import Record, filled, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import UnknownNameError
+from plant.mechanism import LEGS
 from plant.pose import Array
 
 BLOCKS = {"gyroscopes": 3, "accelerometers": 6, "alignments": 15, "axes": ERRORS}
 """How many of an IMU's errors are estimated."""
 
 ALL_ERRORS = IMU_COUNT * ERRORS
-MOST_STATES = MOTION_STATES + ALL_ERRORS + RIG_ERRORS + 1
+LENGTH_ERRORS = 2 * LEGS
+"""How many errors of the encoders can be estimated: the zeros (6) and what play does to the readings (6) [m]."""
+
+MOST_STATES = MOTION_STATES + ALL_ERRORS + RIG_ERRORS + LENGTH_ERRORS + 1
 ROWS = IMU_COUNT * READINGS
-"""Scalars of one update."""
+"""Scalars of one update that are the IMUs'."""
 
 WINDOW_S = 0.005
 _SMOOTHING_S = 0.03
@@ -43,6 +47,9 @@ FILTER_PARAMETERS = record_dtype(
     ripple=np.float64,  # square of a specific force's error for an acceleration: commands are steps
     prior=(np.float64, (ALL_ERRORS + RIG_ERRORS, ALL_ERRORS + RIG_ERRORS)),  # covariance of the errors at the start
     floor=(np.float64, 2),  # variances of position and rotation that are left as the rig's errors are not estimated
+    lengths=np.int64,  # estimated errors of the encoders; 0 without encoders
+    length_variance=np.float64,  # of one reading of an encoder [m^2]
+    length_prior=(np.float64, 2),  # variances of an encoder's zero at the start, and of what play does to its reading [m^2]
     heading=np.int64,  # whether there is one
     field_axes=(np.float64, (3, 3)),  # north, east, and the axis about which a small turn changes the heading, in {1}
     heading_variance=np.float64,  # of a sample's heading [rad^2]
@@ -74,6 +81,15 @@ FILTER_STATE = record_dtype(
     field_time=np.float64,
     field_used=np.int64,  # whether the field is still to be taken
     heading_offset=np.float64,  # [rad]
+    length_errors=(np.float64, (2, LEGS)),  # of the encoders: zeros, and what play does [m]
+    length_sum=(np.float64, LEGS),  # of the readings in the present window, and their number and mean time
+    length_count=(np.float64, LEGS),
+    length_sum_time=(np.float64, LEGS),
+    length=(np.float64, LEGS),  # mean of the last full window [m]
+    length_weight=(np.float64, LEGS),  # the number of its readings
+    length_later=(np.float64, LEGS),  # their mean time after that of the motion [s]
+    length_predicted=(np.float64, LEGS),  # at the pose before the update [m]
+    length_gradient=(np.float64, (LEGS, 6)),  # there, by position and rotation
     sample=(np.float64, (IMU_COUNT, READINGS)),  # mean of the last full window
     sample_weight=(np.float64, (2, IMU_COUNT)),
     row=np.int64,  # next scalar of the sample to take, -1 when none is left
@@ -88,7 +104,7 @@ FILTER_STATE = record_dtype(
     change_per_second=(np.float64, (IMU_COUNT, READINGS)),  # from there to here
     jacobian=(np.float64, (IMU_COUNT, READINGS, MOTION_STATES)),
     rig_jacobian=(np.float64, (IMU_COUNT, READINGS, 8)),  # by a leg's two joints and the tilt
-    gradient=(np.float64, ERRORS),
+    gradient=(np.float64, ERRORS),  # by an IMU's errors, and scratch
     readings_scratch=READINGS_SCRATCH,
 )
 """State of the filter, whose update may be under way."""
@@ -96,7 +112,7 @@ FILTER_STATE = record_dtype(
 
 def filter_parameters(
     fusion: FusionSettings, rate: float, errors: str | None, covariance: Array | None, floor: Array | None = None,
-    field: MagneticField | None = None, inflation: float | None = None, ripple: float = 0.0,
+    field: MagneticField | None = None, inflation: float | None = None, ripple: float = 0.0, lengths: bool = False,
 ) -> Record:  # fmt: skip
     """Constants of the filter.
 
@@ -109,6 +125,7 @@ def filter_parameters(
         floor: (2,) [m, rad], standard deviations of position and rotation that joints and tilt leave; None if they are exact.
         field: of the earth, for the platform's magnetometer; None without one.
         inflation: times the noise and the jerk; None for 1 with a covariance, and what the settings say without.
+        lengths: whether there are encoders.
         ripple: `ripple_at` the loop's rate if drives are commanded at this rate.
 
     Raises:
@@ -136,7 +153,7 @@ def filter_parameters(
         window=max(1, round(WINDOW_S * rate)),
         errors=estimated,
         rig=len(known) - ALL_ERRORS,
-        states=MOTION_STATES + IMU_COUNT * estimated + len(known) - ALL_ERRORS + (field is not None),
+        states=MOTION_STATES + IMU_COUNT * estimated + len(known) - ALL_ERRORS + lengths * LENGTH_ERRORS + (field is not None),
         smoothing=_SMOOTHING_S,
         jerk=jerk**2,
         bias_walk=(fusion.bias_walk**2, fusion.accelerometer_bias_walk**2),
@@ -145,6 +162,9 @@ def filter_parameters(
         ripple=(_LASTING * ripple) ** 2,
         prior=prior,
         floor=np.zeros(2) if floor is None else floor**2 / 3.0,
+        lengths=lengths * LENGTH_ERRORS,
+        length_variance=fusion.length_noise**2,
+        length_prior=(fusion.length_zero**2, fusion.length_play**2),
     )
     if field is not None:
         up, north = field.vectors
@@ -164,3 +184,15 @@ def ripple_at(rate: float) -> float:
 def rig_start(parameters: Record) -> int:
     """The place of the first error of the rig among the states."""
     return int(MOTION_STATES + IMU_COUNT * parameters.errors)
+
+
+@kernel
+def lengths_start(parameters: Record) -> int:
+    """The place of the first error of the encoders among the states."""
+    return int(rig_start(parameters) + parameters.rig)
+
+
+@kernel
+def rows_of(parameters: Record) -> int:
+    """How many scalars an update has."""
+    return ROWS + LEGS if parameters.lengths > 0 else ROWS

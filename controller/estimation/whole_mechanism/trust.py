@@ -16,10 +16,12 @@ from controller.direct_kinematics.refinement import move_pose
 from controller.estimation.shaking import worth_of
 from controller.estimation.whole_mechanism.filter import (
     accumulate_field,
+    accumulate_lengths,
     accumulate_sample,
     extrapolate,
     extrapolate_covariance,
     start_filter,
+    start_lengths,
     step_filter,
 )
 from controller.estimation.whole_mechanism.parameters import FILTER_PARAMETERS, FILTER_STATE
@@ -95,8 +97,9 @@ def trust_parameters(fusion: FusionSettings, rate: float, filter_constants: Reco
 
 @shared_kernel
 def step_mechanism_filter(
-    p: Record, s: Record, rig: Record, time: Record, imus: Record, legs: Record, heading: Record, pose: Record, events: Record
-) -> bool:
+    p: Record, s: Record, rig: Record, time: Record, imus: Record, encoders: Record, legs: Record, heading: Record,
+    pose: Record, events: Record,
+) -> bool:  # fmt: skip
     """Step the filter, and let its pose replace the one in closed form while it is trusted; returns whether there is a pose."""
     f, found = s.filter, bool(pose.found != 0)
     if p.filter.errors == 0:
@@ -105,6 +108,8 @@ def step_mechanism_filter(
     if f.running == 0:
         if found and time.cycle >= s.due:
             start_filter(p.filter, f, now, pose.position, pose.rotation, pose.twist)
+            if p.filter.lengths > 0:
+                start_lengths(f, encoders.zero)
             s.due = time.cycle + p.settling_cycles[s.again]
             s.again = 1
             s.disagreement = 0.0
@@ -119,6 +124,8 @@ def step_mechanism_filter(
         for sensor in range(2):
             s.weights[sensor, k] = share * worth_of(imus.shaking, sensor, k, p.filter.variance[sensor])
     accumulate_sample(f, imus.sample, s.weights, now - p.delay)
+    if p.filter.lengths > 0:
+        accumulate_lengths(f, encoders.reading, encoders.used, now)
     if heading.used != 0 and heading.fresh != 0:
         accumulate_field(f, heading.field, now - p.delay)
     step_filter(p.filter, rig.sensors, f)

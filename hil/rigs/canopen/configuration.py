@@ -19,6 +19,7 @@ from hil.rigs.canopen.frames import (
     DRIVE_PDOS,
     INVALID_COB_ID,
     MAGNETOMETER_PDO,
+    POSITION_PDO,
     SYNC_OVERFLOW,
     CobId,
     Object,
@@ -156,10 +157,10 @@ class RemoteNode(SdoClient):  # type: ignore[misc]
         raise RigError(f"{self.name} does not answer over SDO: {reason}; check its power, wiring and bit rate")
 
 
-def configure_drive(node: RemoteNode, drives: DriveSettings, period: float) -> None:
-    """Configure a drive for commands every `period` [s]."""
+def configure_drive(node: RemoteNode, drives: DriveSettings, period: float, lengths: bool = False) -> None:
+    """Configure a drive for commands every `period` [s], and whether it tells what its encoder reads."""
     units, exponent = interpolation_period(period)
-    for pdo in DRIVE_PDOS:
+    for pdo in (*DRIVE_PDOS, POSITION_PDO) if lengths else DRIVE_PDOS:
         node.map_pdo(pdo)
     node.configure(Object.PRODUCER_HEARTBEAT, 0, round(drives.heartbeat * 1e3))
     node.configure(Object.QUICK_STOP_OPTION, 0, _QUICK_STOP_RAMP)

@@ -5,7 +5,19 @@ from collections.abc import Callable
 import can
 import numpy as np
 
-from hil.rigs.canopen.frames import ANSWER, CLASSIC_TAIL, FD_TAIL, NO_VALUE, SYNC_OVERFLOW, TRUTH, TRUTH_ID, CobId, NodeState
+from hil.rigs.canopen.frames import (
+    ANSWER,
+    CLASSIC_TAIL,
+    FD_TAIL,
+    HOME_INPUT,
+    NO_VALUE,
+    POSITION,
+    SYNC_OVERFLOW,
+    TRUTH,
+    TRUTH_ID,
+    CobId,
+    NodeState,
+)
 from hil.rigs.canopen.settings import FD_BYTES, CanopenSettings
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS
@@ -21,6 +33,7 @@ class Decoder:
 
     Attributes:
         statuswords, velocities, error_codes: of the drives; velocities in counts/s.
+        positions, homes: of their encoders, without wraps, and of their home switches; None before the first.
         nmt: state in the last heartbeat of each drive, then of each IMU; -1 before the first.
         heard_ns: time of each node's last frame on the controller's clock [ns].
         now_ns: that clock, set by the reader of the bus [ns].
@@ -32,14 +45,18 @@ class Decoder:
         truth: position, quaternion and lengths of an emulated rig; else NaN.
     """
 
-    def __init__(self, settings: CanopenSettings) -> None:
+    def __init__(self, settings: CanopenSettings, lengths: bool = False) -> None:
         fd, drives, imus = settings.bus.fd, settings.drives.nodes, settings.imus.nodes
+        count = LEGS + IMU_COUNT * (1 if fd else 2)
+        positions = 1 << count
         # By identifier: how to decode the data, the node's number, the bit in `awaited`, and the length; None for any.
         self._table: dict[int, tuple[Callable[[int, bytearray], bool], int, int, int | None]] = {}
         for drive, node in enumerate(drives):
             self._table[CobId.TPDO + node] = self._take_drive, drive, 1 << drive, ANSWER.size
             self._table[CobId.HEARTBEAT + node] = self._take_heartbeat, drive, 0, 1
             self._table[CobId.EMERGENCY + node] = self._take_emergency, drive, 0, 8
+            if lengths:
+                self._table[CobId.TPDO + 0x100 + node] = self._take_position, drive, positions << drive, POSITION.size
         for imu, node in enumerate(imus):
             first = 1 << LEGS + imu
             self._table[CobId.HEARTBEAT + node] = self._take_heartbeat, LEGS + imu, 0, 1
@@ -54,13 +71,16 @@ class Decoder:
         own = [CobId.NMT, CobId.SYNC, CobId.HEARTBEAT + settings.controller.node, *(CobId.RPDO + node for node in drives)]
         for each in own + [sdo + node for sdo in (CobId.SDO_ANSWER, CobId.SDO_REQUEST) for node in (*drives, *imus)]:
             self._table[each] = self._ignore, 0, 0, None
-        self.all_frames = (1 << LEGS + IMU_COUNT * (1 if fd else 2)) - 1
+        self.all_frames = (1 << count + lengths * LEGS) - 1
         self.statuswords, self.velocities, self.error_codes = [0] * LEGS, [0] * LEGS, [0] * LEGS
+        self.positions: list[int | None] = [None] * LEGS
+        self.homes: list[bool | None] = [None] * LEGS
         self.nmt, self.heard_ns = [-1] * (LEGS + IMU_COUNT), [0] * (LEGS + IMU_COUNT)
         self.awaited, self.received, self.refused, self.answered = self.all_frames, self.all_frames, 0, False
         self.sample_ns, self.sequence = [0] * IMU_COUNT, [-1] * IMU_COUNT
         self.truth: tuple[float, ...] = (float("nan"),) * 13
         self.now_ns, self._sync, self._syncs = 0, 0, 0
+        self._missing, self._positions = self.all_frames, positions
         self._sample_at, self._sample_sync = [0] * IMU_COUNT, [0] * IMU_COUNT
         self._stamps, self._counters = [0] * IMU_COUNT, [0] * IMU_COUNT
         self._pending: list[tuple[bytes, int]] = [(b"", 0)] * IMU_COUNT
@@ -76,9 +96,13 @@ class Decoder:
 
     def end(self) -> int:
         """Accept no more answers to this SYNC; returns a bit for each missing frame."""
-        missing = self.all_frames & ~self.received
+        self._missing = self.all_frames & ~self.received
         self.received = self.all_frames
-        return missing
+        return self._missing
+
+    def answered_position(self, drive: int) -> bool:
+        """Whether a drive has told its position in answer to the last SYNC that has ended."""
+        return not self._missing & self._positions << drive
 
     def take(self, message: can.Message) -> bool:
         """Decode a frame; returns whether it was valid."""
@@ -109,6 +133,14 @@ class Decoder:
     def _take_drive(self, drive: int, data: bytearray) -> bool:
         self.statuswords[drive], self.velocities[drive], self.error_codes[drive] = ANSWER.unpack_from(data)
         self.heard_ns[drive] = self.now_ns
+        return True
+
+    def _take_position(self, drive: int, data: bytearray) -> bool:
+        position, inputs = POSITION.unpack_from(data)
+        before = self.positions[drive]
+        # The counter wraps at 32 bits.
+        self.positions[drive] = position if before is None else before + (position - before + (1 << 31)) % (1 << 32) - (1 << 31)
+        self.homes[drive] = bool(inputs & HOME_INPUT)
         return True
 
     def _take_heartbeat(self, node: int, data: bytearray) -> bool:

@@ -15,7 +15,18 @@ import can
 import canopen
 
 from hil.rigs.canopen.emulated_nodes import EmulatedDrive, EmulatedImu, EmulatedNode, PlantMachine
-from hil.rigs.canopen.frames import ANSWER, COMMAND, CobId, NmtCommand, NodeState, pack_imu, raw_readings, truth_message
+from hil.rigs.canopen.frames import (
+    ANSWER,
+    COMMAND,
+    POSITION,
+    POSITION_PDO,
+    CobId,
+    NmtCommand,
+    NodeState,
+    pack_imu,
+    raw_readings,
+    truth_message,
+)
 from hil.rigs.canopen.settings import MAGNETOMETER_INTERVAL, CanopenSettings
 from hil.rigs.emulation import disturb
 from plant.compiled import Record
@@ -191,6 +202,9 @@ class EmulatedBus:
             if CobId.TPDO in drive.active:
                 drive.answer.data = bytearray(ANSWER.pack(drive.statusword(), drive.velocity(), drive.code))
                 self.send(drive.answer)
+            if POSITION_PDO.cob_id in drive.active:
+                drive.position_answer.data = bytearray(POSITION.pack(drive.position(), drive.inputs()))
+                self.send(drive.position_answer)
         raw = raw_readings(rig["measurement"], self._scales)
         for node in self.imus:
             if node.active:

@@ -18,8 +18,11 @@ from hil.rigs.canopen.frames import (
     ANSWER,
     COMMAND_PDO,
     DRIVE_PDOS,
+    HOME_INPUT,
     INVALID_COB_ID,
     MAGNETOMETER_PDO,
+    POSITION,
+    POSITION_PDO,
     CobId,
     NodeState,
     Object,
@@ -44,12 +47,12 @@ class PlantMachine:
     """The plant that the nodes drive and read, on a clock of its own.
 
     Args:
-        make: makes the plant at its start, its IMUs' imperfections, and the drives (dtype `EMULATED`).
+        make: makes the plant at its start, its IMUs' imperfections, its encoders, and the drives (dtype `EMULATED`).
         clock: [ns].
     """
 
     def __init__(
-        self, make: Callable[[], tuple[FmuPlant, Record, Record]], clock: Callable[[], int] = time.monotonic_ns
+        self, make: Callable[[], tuple[FmuPlant, Record, Record, Record]], clock: Callable[[], int] = time.monotonic_ns
     ) -> None:
         self._make, self._clock = make, clock
         self.rig: Record = np.zeros((), EMULATED)  # the nodes write `request` and `target`, and read the rest
@@ -61,7 +64,7 @@ class PlantMachine:
         self._started = self._clock()
 
     def _begin(self) -> None:
-        self._plant, self._imu, self.rig[()] = self._make()
+        self._plant, self._imu, self._encoders, self.rig[()] = self._make()
         self._started = self._clock()
 
     def advance(self, now_ns: int) -> None:
@@ -69,8 +72,8 @@ class PlantMachine:
         self._check(move(self._plant.handle, self.rig, now_ns - self._started))
 
     def sample(self, now_ns: int) -> None:
-        """Read the IMUs."""
-        self._check(sample(self._plant.handle, self._imu, self.rig, now_ns - self._started))
+        """Read the IMUs and the encoders."""
+        self._check(sample(self._plant.handle, self._imu, self._encoders, self.rig, now_ns - self._started))
 
     def reset(self, drive: int) -> None:
         """Reset a drive's fault."""
@@ -186,7 +189,9 @@ class EmulatedDrive(EmulatedNode):
         self.commanded_ns = 0
         self._scale = settings.drives.scales[leg]
         self.answer = new_message(CobId.TPDO + node, dlc=ANSWER.size, is_fd=fd, bitrate_switch=fd)
-        super().__init__(node, settings.drives.eds, DRIVE_PDOS, fd, network, clock)
+        self.position_answer = new_message(CobId.TPDO + 0x100 + node, dlc=POSITION.size, is_fd=fd, bitrate_switch=fd)
+        self._position = 0
+        super().__init__(node, settings.drives.eds, (*DRIVE_PDOS, POSITION_PDO), fd, network, clock)
 
     def reset(self) -> None:
         """Return to the values of the EDS, without power."""
@@ -214,6 +219,8 @@ class EmulatedDrive(EmulatedNode):
             Object.STATUSWORD: self.statusword(),
             Object.ERROR_CODE: self.code,
             Object.VELOCITY_ACTUAL: self.velocity(),
+            Object.POSITION_ACTUAL: self.position(),
+            Object.DIGITAL_INPUTS: self.inputs(),
             Object.ERROR_REGISTER: _DRIVE_ERROR if faulty else 0,
             Object.MODE_DISPLAY: self.mode,
         }
@@ -245,6 +252,17 @@ class EmulatedDrive(EmulatedNode):
         """[counts/s]."""
         counts = float(self.machine.rig["velocity"][self.leg]) * self._scale
         return round(min(max(counts, -_LARGEST), _LARGEST)) if counts == counts else 0
+
+    def position(self) -> int:
+        """What the encoder reads [counts], in 32 bits; the last value while it reads nothing."""
+        counts = float(self.machine.rig["length"][self.leg]) * self._scale
+        if counts == counts:
+            self._position = (round(counts) + 2**31) % 2**32 - 2**31
+        return self._position
+
+    def inputs(self) -> int:
+        """The digital inputs."""
+        return HOME_INPUT if self.machine.rig["home"][self.leg] == 1 else 0
 
     def obey(self, controlword: int, target: int) -> None:
         """Let a command take effect."""

@@ -59,8 +59,12 @@ NO_VALUE = -32768
 TRUTH_ID = 0x1F470001
 """Extended identifier of the frame with an emulated rig's truth, on CAN FD; no hardware sends it."""
 
-COMMAND, ANSWER = struct.Struct("<Hi"), struct.Struct("<HiH")
-"""A drive's PDOs: controlword and target velocity [counts/s]; statusword, velocity [counts/s] and error code."""
+COMMAND, ANSWER, POSITION = struct.Struct("<Hi"), struct.Struct("<HiH"), struct.Struct("<iI")
+"""A drive's PDOs: controlword and target velocity [counts/s]; statusword, velocity [counts/s] and error code;
+position [counts] and digital inputs."""
+
+HOME_INPUT = 1 << 2
+"""The home switch among a drive's digital inputs (CiA 402, object 60FDh)."""
 
 CLASSIC_TAIL, FD_TAIL = struct.Struct("<BB"), struct.Struct("<IIB")
 """Of an IMU's PDOs, behind the axes: sample counter and SYNC counter on classic CAN; sample counter, time [us] and SYNC counter
@@ -89,10 +93,12 @@ class Object(IntEnum):
     FAULT_REACTION_OPTION = 0x605E
     MODE = 0x6060
     MODE_DISPLAY = 0x6061
+    POSITION_ACTUAL = 0x6064
     VELOCITY_ACTUAL = 0x606C
     MAX_MOTOR_SPEED = 0x6080
     QUICK_STOP_DECELERATION = 0x6085
     INTERPOLATION_PERIOD = 0x60C2
+    DIGITAL_INPUTS = 0x60FD
     TARGET_VELOCITY = 0x60FF
 
 
@@ -128,6 +134,9 @@ _MICROSECONDS, _TENS_OF_MICROSECONDS = 0x20130020, 0x20140010
 
 COMMAND_PDO = Pdo(0x1400, 0x1600, CobId.RPDO, 1, (0x60400010, 0x60FF0020))
 ANSWER_PDO = Pdo(0x1800, 0x1A00, CobId.TPDO, 1, (0x60410010, 0x606C0020, 0x603F0010))
+POSITION_PDO = Pdo(0x1801, 0x1A01, CobId.TPDO + 0x100, 1, (0x60640020, 0x60FD0020))
+"""What an encoder reads; mapped only where the loop wants to know."""
+
 DRIVE_PDOS = (COMMAND_PDO, ANSWER_PDO)
 
 MAGNETOMETER_PDO = Pdo(0x1802, 0x1A02, CobId.TPDO + 0x200, MAGNETOMETER_INTERVAL, (*_MAGNETOMETER, _SYNC_COUNTER))

@@ -31,15 +31,22 @@ class CanopenInMemory:
         settings: of the bus and its nodes.
         period: [s].
         make: as for `PlantMachine`.
+        lengths: as for `CanopenRig`.
     """
 
-    def __init__(self, settings: CanopenSettings, period: float, make: Callable[[], tuple[FmuPlant, Record, Record]]) -> None:
+    def __init__(
+        self,
+        settings: CanopenSettings,
+        period: float,
+        make: Callable[[], tuple[FmuPlant, Record, Record, Record]],
+        lengths: bool = False,
+    ) -> None:
         self._now_ns, self._period_ns, self._next_ns = 0, round(1e9 * period), 0
         self._frames: deque[can.Message] = deque()
         to_controller = SimpleNamespace(send=self._frames.append, shutdown=lambda: None)
         self.machine = PlantMachine(make, self._clock)
         self.nodes = EmulatedBus(settings, self.machine, faulty_channel(self.machine.rig), to_controller, self._clock)
-        self._rig = CanopenRig(settings, period, lambda: self, self._clock)
+        self._rig = CanopenRig(settings, period, lambda: self, self._clock, lengths)
         self.command_delay = self._rig.command_delay
 
     def open(self) -> None:

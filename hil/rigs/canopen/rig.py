@@ -12,6 +12,7 @@ from typing import Any
 
 import can
 import canopen
+import numpy as np
 
 from hil.rigs import ANSWERED, SILENT, DriveState, Identity, Request, RigError
 from hil.rigs.canopen.cia402 import Controlword, controlword_towards, drive_state, state_of
@@ -47,6 +48,7 @@ class CanopenRig:
         period: float,
         opened: Callable[[], Any] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
+        lengths: bool = False,
     ) -> None:
         """Prepare a rig for exchanges every `period` [s].
 
@@ -55,13 +57,14 @@ class CanopenRig:
             period: [s].
             opened: opens the bus, by default that of the settings.
             clock: [ns].
+            lengths: whether the drives are to tell what their encoders read.
 
         Raises:
             RigError: the bus cannot carry that many frames.
         """
         self.command_delay = period
-        self.bus_load = settings.check_bus_load(1.0 / period)  # in the worst case
-        self.decoder = Decoder(settings)
+        self.bus_load = settings.check_bus_load(1.0 / period, lengths)  # in the worst case
+        self.decoder, self._lengths = Decoder(settings, lengths), lengths
         self._settings, self._open, self._clock = settings, opened or settings.bus.opened, clock
         self._bus: Any = None
         self._nodes: list[RemoteNode] = []
@@ -88,7 +91,7 @@ class CanopenRig:
         bus, drives, imus = self._settings.bus, self._settings.drives, self._settings.imus
         try:
             self._bus = self._open()
-            self.decoder, self._misses = Decoder(self._settings), [0] * len(self._misses)
+            self.decoder, self._misses = Decoder(self._settings, self._lengths), [0] * len(self._misses)
             network = canopen.Network(self._bus)
             self._nodes = [
                 RemoteNode(f"{name} {number}", node, table.eds, network, self._receive, self._clock)
@@ -174,7 +177,7 @@ class CanopenRig:
         try:
             self._command_nodes(NmtCommand.ENTER_PRE_OPERATIONAL)
             for node in self._nodes[:LEGS]:
-                configure_drive(node, self._settings.drives, self.command_delay)
+                configure_drive(node, self._settings.drives, self.command_delay, self._lengths)
             for imu, node in enumerate(self._nodes[LEGS:]):
                 configure_imu(node, imu, self._settings)
             complaint = f"{{}} does not become operational; read its error register, object {Object.ERROR_REGISTER:04X}h"
@@ -283,9 +286,20 @@ class CanopenRig:
             for drive in range(LEGS)
         ]
         feedback["drive_code"] = decoder.error_codes
+        if self._lengths:
+            self._fill_lengths(feedback)
         feedback["truth"][:13] = decoder.truth
         feedback["round_trip_ns"] = now - start
         feedback["refused"] = decoder.refused
+
+    def _fill_lengths(self, feedback: Record) -> None:
+        """What the encoders read; one that does not answer this SYNC reads nothing."""
+        decoder, lengths, rates, homes = self.decoder, feedback["length"], feedback["length_rate"], feedback["home"]
+        for drive, (position, home) in enumerate(zip(decoder.positions, decoder.homes, strict=True)):
+            there = position is not None and decoder.answered_position(drive)
+            lengths[drive] = position / self._scales[drive] if position is not None and there else np.nan
+            rates[drive] = decoder.velocities[drive] / self._scales[drive] if there else np.nan
+            homes[drive] = -1 if home is None else int(home)
 
     def _order(self, controlword: Controlword) -> None:
         """Send all drives a controlword, by SDO and by PDO with SYNC, whatever happens."""

@@ -218,29 +218,29 @@ class CanopenSettings:
             if not Path(eds).is_file():
                 raise InputError(f"there is no EDS file {eds}: name the one of the node's manufacturer")
 
-    def bus_load(self, rate: float) -> float:
+    def bus_load(self, rate: float, lengths: bool = False) -> float:
         """Share of the bus' time that the frames of a cycle take at `rate` [Hz] with the most stuff bits: the PDOs, SYNC and a
-        heartbeat; on classic CAN two frames per IMU and one magnetometer's.
+        heartbeat; on classic CAN two frames per IMU and one magnetometer's. With `lengths` each drive has another frame.
         """
-        bus = self.bus
+        bus, of_drive = self.bus, (COMMAND_BYTES, ANSWER_BYTES, *([ANSWER_BYTES] if lengths else []))
         if bus.fd:
-            drive = sum(fd_duration(count, bus.bitrate, bus.data_bitrate) for count in (COMMAND_BYTES, ANSWER_BYTES))
+            drive = sum(fd_duration(count, bus.bitrate, bus.data_bitrate) for count in of_drive)
             imus = IMU_COUNT * fd_duration(FD_BYTES, bus.bitrate, bus.data_bitrate)
         else:
-            drive = (classic_bits(COMMAND_BYTES) + classic_bits(ANSWER_BYTES)) / bus.bitrate
+            drive = sum(map(classic_bits, of_drive)) / bus.bitrate
             imus = (2 * IMU_COUNT + 1) * classic_bits(ANSWER_BYTES) / bus.bitrate
         return (LEGS * drive + imus + 2 * classic_bits(1) / bus.bitrate) * rate
 
-    def check_bus_load(self, rate: float) -> float:
+    def check_bus_load(self, rate: float, lengths: bool = False) -> float:
         """The bus load at `rate` [Hz]; an emulated bus has no limit.
 
         Raises:
             RigError: a real bus cannot carry the load.
         """
-        load = self.bus_load(rate)
+        load = self.bus_load(rate, lengths)
         if self.bus.interface == "socketcan" and load > LARGEST_LOAD:
             remedy = "" if self.bus.fd else ", or use CAN FD"
-            highest = int(LARGEST_LOAD / self.bus_load(1.0))
+            highest = int(LARGEST_LOAD / self.bus_load(1.0, lengths))
             raise RigError(
                 f"at {rate:g} Hz the frames of a cycle take {load:.0%} of the bus' time, more than {LARGEST_LOAD:.0%}: "
                 f"lower the rate to {highest} Hz, raise the bit rate{remedy}"

@@ -1,9 +1,11 @@
-"""Datagrams over UDP: how any of them is packed and checked, and those of the UDP rig, version 1.
+"""Datagrams over UDP: how any of them is packed and checked, and those of the UDP rig.
 
 The UDP rig's are one datagram in each direction per cycle, and a handshake before. docs/rigs.md and `hil/rigs/udp/gough_rig.h`
 describe them for firmware: little-endian, every field aligned to its size, SI units. A datagram ends with the CRC-32 (IEEE
 802.3, as in zlib) of all bytes before it. One with another length, magic number, version, kind or session, or with a wrong CRC,
 is refused.
+
+A session has the version of its hello: 1, or 2 with the lengths that encoders read.
 """
 
 import zlib
@@ -21,7 +23,8 @@ from plant.truth import TRUTH_SIZE
 MAGIC = 0x48475547
 """The bytes "GUGH"."""
 
-VERSION = 1
+VERSION, WITH_LENGTHS = 1, 2
+"""The version of a session without lengths, and of one with them."""
 
 
 class DatagramKind(IntEnum):
@@ -69,10 +72,16 @@ MEASUREMENT_DATAGRAM = np.dtype(
 it has refused; each drive's state (0 following, 1 ready, 2 not ready, 3 quick stop, 4 fault), fault code and velocity after
 limits [m/s]; and the raw IMU data [rad/s, m/s^2, uT], NaN without an IMU."""
 
-TRUTH_DATAGRAM = np.dtype([("truth", "f8", TRUTH_SIZE), ("reserved", "u4"), ("crc", "u4")])
-"""An emulated rig appends it to a measurement."""
+LENGTHS_DATAGRAM = np.dtype(
+    [("length", "f8", LEGS), ("rate", "f4", LEGS), ("home", "i1", LEGS), ("reserved", "u1", 2), ("crc", "u4")]
+)
+"""In version 2, a measurement goes on with what encoders read: lengths [m] and their rates [m/s], NaN without an encoder, and
+the home switches: 1 beyond the switch, 0 before it, -1 without one."""
 
-LONGEST = MEASUREMENT_DATAGRAM.itemsize + TRUTH_DATAGRAM.itemsize
+TRUTH_DATAGRAM = np.dtype([("truth", "f8", TRUTH_SIZE), ("reserved", "u4"), ("crc", "u4")])
+"""An emulated rig appends it to all that."""
+
+LONGEST = MEASUREMENT_DATAGRAM.itemsize + LENGTHS_DATAGRAM.itemsize + TRUTH_DATAGRAM.itemsize
 
 Bytes = NDArray[np.uint8]
 
@@ -114,12 +123,14 @@ def crc32(data: Bytes, length: int) -> int:
 
 
 @kernel
-def is_valid(data: Bytes, datagram: Record, length: int, expected: int, kind: int) -> bool:
-    """Whether `length` received bytes are a datagram of this kind with this `expected` length; `datagram` views `data`."""
+def is_valid(data: Bytes, datagram: Record, length: int, expected: int, kind: int, version: int) -> bool:
+    """Whether `length` received bytes are a datagram of this kind and version with this `expected` length; `datagram` views
+    `data`.
+    """
     return bool(
         length == expected
         and datagram.magic == MAGIC
-        and datagram.version == VERSION
+        and datagram.version == version
         and datagram.kind == kind
         and datagram.crc == crc32(data, expected - 4)
     )

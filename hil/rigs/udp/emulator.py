@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hil.rigs import ANSWERED, SILENT, DriveState, Request
 from hil.rigs.emulation import disturb, draw, move, sample
-from hil.rigs.udp.datagrams import HELLO_DATAGRAM, LONGEST, MAGIC, VERSION, Bytes, DatagramKind, crc32, is_valid
+from hil.rigs.udp.datagrams import HELLO_DATAGRAM, LONGEST, MAGIC, VERSION, WITH_LENGTHS, Bytes, DatagramKind, crc32, is_valid
 from hil.rigs.udp.link import UdpLink, await_datagram, decode_answer, encode_command, new_link, receive_datagram, send_datagram
 from plant.compiled import Record, kernel, record_dtype, shared_kernel
 from plant.mechanism import LEGS
@@ -57,16 +57,22 @@ class UdpEmulator(NamedTuple):
 
     fmu: Record  # the plant
     imu: Record  # its IMUs' imperfections
+    encoders: Record  # its encoders
     rig: Record  # dtype `hil.rigs.emulation.EMULATED`
     session: Record  # dtype `UDP_SESSION`
     link: UdpLink  # the rig's side; the rig is in memory if its socket has no descriptor
 
 
-def new_udp_emulator(fmu: Record, imu: Record, rig: Record, session: int = 0, watchdog_s: float = WATCHDOG_S) -> UdpEmulator:
+def new_udp_emulator(
+    fmu: Record, imu: Record, encoders: Record, rig: Record, session: int = 0, watchdog_s: float = WATCHDOG_S,
+    version: int = VERSION,
+) -> UdpEmulator:  # fmt: skip
     """An emulated rig on UDP that has received nothing yet."""
     made: Record = np.zeros((), UDP_SESSION)
     made["id"], made["watchdog_ns"] = session, round(1e9 * watchdog_s)
-    return UdpEmulator(fmu, imu, rig, made, new_link())
+    link = new_link()
+    link.socket["version"] = version
+    return UdpEmulator(fmu, imu, encoders, rig, made, link)
 
 
 @kernel
@@ -80,12 +86,12 @@ def is_later(sequence: int, last: int) -> bool:
 def answer_command(emulator: UdpEmulator, length: int, now_ns: int) -> int:
     """Apply the received command of `length` bytes, and write the answer; returns its length, 0 without one."""
     rig, session, link = emulator.rig[()], emulator.session[()], emulator.link
-    c, a, t = link.command[0], link.answer[0], link.truth[0]
+    c, a, b, version = link.command[0], link.answer[0], link.lengths[0], link.socket[()].version
     finite = True
     for k in range(LEGS):
         finite = finite and np.isfinite(c.velocity[k])
     if (
-        not is_valid(link.command_bytes, c, length, link.command.itemsize, DatagramKind.COMMAND)
+        not is_valid(link.command_bytes, c, length, link.command.itemsize, DatagramKind.COMMAND, version)
         or c.session != session.id
         or c.session == 0
         or not is_later(c.sequence, session.last)
@@ -101,18 +107,24 @@ def answer_command(emulator: UdpEmulator, length: int, now_ns: int) -> int:
         rig.reset[k] = 1 if c.reset != 0 and c.request == Request.BRAKED else 0
     # The request takes effect in this instant.
     move(emulator.fmu, emulator.rig, now_ns + 1)
-    if sample(emulator.fmu, emulator.imu, emulator.rig, now_ns + 1) != 0:
+    if sample(emulator.fmu, emulator.imu, emulator.encoders, emulator.rig, now_ns + 1) != 0:
         return 0
-    a.magic, a.version, a.kind = MAGIC, VERSION, DatagramKind.MEASUREMENT
+    a.magic, a.version, a.kind = MAGIC, version, DatagramKind.MEASUREMENT
     a.session, a.sequence, a.time_ns = c.session, c.sequence, now_ns
     a.refused = session.refused
     a.sample_ns[:], a.sample_number[:] = rig.sample_ns, rig.sequence
     a.measurement[:] = rig.measurement
     a.drive[:], a.code[:], a.velocity[:] = rig.drive, rig.code, rig.velocity
     a.crc = crc32(link.answer_bytes, link.answer.itemsize - 4)
+    t, written = link.truth[0][0], link.answer.itemsize
+    if version >= WITH_LENGTHS:
+        b.length[:], b.rate[:], b.home[:] = rig.length, rig.length_rate, rig.home
+        b.crc = crc32(link.answer_bytes[written:], link.lengths.itemsize - 4)
+        t = link.truth[1][0]
+        written += link.lengths.itemsize
     t.truth[:] = rig.truth
-    t.crc = crc32(link.answer_bytes[link.answer.itemsize :], link.truth.itemsize - 4)
-    return int(link.answer_bytes.size)
+    t.crc = crc32(link.answer_bytes[written:], link.truth[0].itemsize - 4)
+    return int(written + link.truth[0].itemsize)
 
 
 @kernel

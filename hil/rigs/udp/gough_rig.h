@@ -1,8 +1,11 @@
-/* Datagrams of gough's UDP rig, version 1, for firmware: C11, freestanding, for little-endian machines. docs/rigs.md describes
+/* Datagrams of gough's UDP rig, versions 1 and 2, for firmware: C11, freestanding, for little-endian machines. docs/rigs.md describes
  * the protocol, and hil/rigs/udp/reference_rig.c is a rig to start from.
  *
  * Every field is aligned to its size, so the structures need no packing. Padding at their end makes some longer in memory than
  * on the wire: a datagram ends with `crc`, and its length is GOUGH_..._LENGTH, not sizeof. SI units.
+ *
+ * A session has the version of its hello. In version 2, a struct gough_lengths follows each measurement. A rig without encoders
+ * may know version 1 only.
  */
 #ifndef GOUGH_RIG_H
 #define GOUGH_RIG_H
@@ -20,6 +23,7 @@
 
 #define GOUGH_MAGIC 0x48475547u /* the bytes "GUGH" */
 #define GOUGH_VERSION 1u
+#define GOUGH_WITH_LENGTHS 2u /* the version with lengths */
 #define GOUGH_PORT 47100
 
 enum gough_kind { GOUGH_HELLO = 1, GOUGH_WELCOME, GOUGH_COMMAND, GOUGH_MEASUREMENT };
@@ -85,7 +89,16 @@ struct gough_measurement {
     uint32_t crc;
 };
 
-/* An emulated rig appends it to a measurement. */
+/* In version 2, what the encoders read; it follows a measurement. */
+struct gough_lengths {
+    double length[GOUGH_LEGS]; /* [m], positive when the leg extends, from any zero; NaN without an encoder */
+    float rate[GOUGH_LEGS];    /* [m/s]; NaN without an encoder */
+    int8_t home[GOUGH_LEGS];   /* home switches: 1 beyond the switch, 0 before it, -1 without one */
+    uint8_t reserved[2];
+    uint32_t crc; /* of this structure alone */
+};
+
+/* An emulated rig appends it to all that. */
 struct gough_truth {
     double truth[19];
     uint32_t reserved;
@@ -97,6 +110,7 @@ struct gough_truth {
 #define GOUGH_WELCOME_LENGTH GOUGH_LENGTH(gough_welcome)
 #define GOUGH_COMMAND_LENGTH GOUGH_LENGTH(gough_command)
 #define GOUGH_MEASUREMENT_LENGTH GOUGH_LENGTH(gough_measurement)
+#define GOUGH_LENGTHS_LENGTH GOUGH_LENGTH(gough_lengths)
 #define GOUGH_TRUTH_LENGTH GOUGH_LENGTH(gough_truth)
 
 _Static_assert(sizeof(float) == 4 && sizeof(double) == 8, "IEEE 754");
@@ -117,6 +131,9 @@ _Static_assert(offsetof(struct gough_measurement, code) == 120, "measurement.cod
 _Static_assert(offsetof(struct gough_measurement, velocity) == 132, "measurement.velocity");
 _Static_assert(offsetof(struct gough_measurement, measurement) == 156, "measurement.measurement");
 _Static_assert(GOUGH_MEASUREMENT_LENGTH == 412, "measurement");
+_Static_assert(offsetof(struct gough_lengths, rate) == 48, "lengths.rate");
+_Static_assert(offsetof(struct gough_lengths, home) == 72, "lengths.home");
+_Static_assert(GOUGH_LENGTHS_LENGTH == 84, "lengths");
 _Static_assert(GOUGH_TRUTH_LENGTH == 160, "truth");
 
 /* CRC-32 (IEEE 802.3, as in zlib), without a table: 8 steps a byte. */
@@ -131,7 +148,7 @@ static inline uint32_t gough_crc32(const void *data, size_t length) {
     return crc ^ 0xFFFFFFFFu;
 }
 
-/* Whether the `received` bytes are a datagram of this kind and length. */
+/* Whether the `received` bytes are a datagram of this kind and length, in a version that this header knows. */
 static inline int gough_check(const void *data, size_t received, size_t length, enum gough_kind kind) {
     struct gough_head head;
     uint32_t crc;
@@ -139,17 +156,22 @@ static inline int gough_check(const void *data, size_t received, size_t length, 
         return 0;
     memcpy(&head, data, sizeof head);
     memcpy(&crc, (const uint8_t *)data + length - sizeof crc, sizeof crc);
-    return head.magic == GOUGH_MAGIC && head.version == GOUGH_VERSION && head.kind == kind &&
-           crc == gough_crc32(data, length - sizeof crc);
+    return head.magic == GOUGH_MAGIC && head.version >= GOUGH_VERSION && head.version <= GOUGH_WITH_LENGTHS &&
+           head.kind == kind && crc == gough_crc32(data, length - sizeof crc);
+}
+
+/* Write the CRC behind data of this length with it. */
+static inline void gough_seal(void *data, size_t length) {
+    uint32_t crc = gough_crc32(data, length - sizeof crc);
+    memcpy((uint8_t *)data + length - sizeof crc, &crc, sizeof crc);
 }
 
 /* Write the head and the CRC of a datagram of this kind and length, whose other fields have been written. */
-static inline void gough_finish(void *data, size_t length, enum gough_kind kind, uint32_t session, uint32_t sequence,
-                                int64_t time_ns) {
-    struct gough_head head = {GOUGH_MAGIC, GOUGH_VERSION, (uint16_t)kind, session, sequence, time_ns};
+static inline void gough_finish(void *data, size_t length, enum gough_kind kind, uint16_t version, uint32_t session,
+                                uint32_t sequence, int64_t time_ns) {
+    struct gough_head head = {GOUGH_MAGIC, version, (uint16_t)kind, session, sequence, time_ns};
     memcpy(data, &head, sizeof head);
-    uint32_t crc = gough_crc32(data, length - sizeof crc);
-    memcpy((uint8_t *)data + length - sizeof crc, &crc, sizeof crc);
+    gough_seal(data, length);
 }
 
 #endif

@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 from hil.rigs import ANSWERED, SILENT, DriveState
 from hil.rigs.udp.datagrams import (
     COMMAND_DATAGRAM,
+    LENGTHS_DATAGRAM,
     LONGEST,
     MAGIC,
     MEASUREMENT_DATAGRAM,
     TRUTH_DATAGRAM,
     VERSION,
+    WITH_LENGTHS,
     Bytes,
     DatagramKind,
     crc32,
@@ -86,6 +88,7 @@ def address_in(content: bytes) -> tuple[str, int]:
 SOCKET = record_dtype(
     descriptor=np.int64,
     session=np.uint32,
+    version=np.uint16,  # of the session's datagrams
     sequence=np.uint32,  # of the last command
     timeout_ns=np.int64,  # to wait for the answer
     reset=np.uint32,  # whether commands reset the drives' faults
@@ -106,17 +109,26 @@ class UdpLink(NamedTuple):
     command: Record  # from the controller
     command_bytes: Bytes  # its buffer
     answer: Record  # the measurement from the rig
-    truth: Record  # which may follow it
-    answer_bytes: Bytes  # the buffer of both
+    lengths: Record  # which follow it in version 2
+    truth: tuple[Record, Record]  # which may follow that: in version 1, and in version 2
+    answer_bytes: Bytes  # the buffer of all
 
 
 def new_link() -> UdpLink:
     """A link without a socket."""
-    command, answer, size = np.zeros(LONGEST, np.uint8), np.zeros(LONGEST, np.uint8), MEASUREMENT_DATAGRAM.itemsize
+    command, answer, socket = np.zeros(LONGEST, np.uint8), np.zeros(LONGEST, np.uint8), np.zeros((), SOCKET)
+    socket["version"] = VERSION
+    first = MEASUREMENT_DATAGRAM.itemsize
+    second = first + LENGTHS_DATAGRAM.itemsize
     return UdpLink(
-        np.zeros((), SOCKET), command[: COMMAND_DATAGRAM.itemsize].view(COMMAND_DATAGRAM), command,
-        answer[:size].view(MEASUREMENT_DATAGRAM), answer[size:].view(TRUTH_DATAGRAM), answer,
+        socket, command[: COMMAND_DATAGRAM.itemsize].view(COMMAND_DATAGRAM), command,
+        answer[:first].view(MEASUREMENT_DATAGRAM), answer[first:second].view(LENGTHS_DATAGRAM),
+        (_truth_at(answer, first), _truth_at(answer, second)), answer,
     )  # fmt: skip
+
+
+def _truth_at(answer: Bytes, place: int) -> Record:
+    return answer[place : place + TRUTH_DATAGRAM.itemsize].view(TRUTH_DATAGRAM)
 
 
 _POLLIN = 1
@@ -169,7 +181,7 @@ def encode_command(link: UdpLink, command: Array, request: int, time_ns: int) ->
     """Write the next command datagram."""
     s, c = link.socket[()], link.command[0]
     s.sequence += np.uint32(1)
-    c.magic, c.version, c.kind = MAGIC, VERSION, DatagramKind.COMMAND
+    c.magic, c.version, c.kind = MAGIC, s.version, DatagramKind.COMMAND
     c.session, c.sequence, c.time_ns = s.session, s.sequence, time_ns
     c.request, c.reset = request, s.reset
     c.velocity[:] = command
@@ -188,18 +200,27 @@ def decode_answer(link: UdpLink, length: int, feedback: Record) -> bool:
     """Accept the received datagram of `length` bytes if it is the answer to the last command; otherwise only count it as
     refused.
     """
-    s, a, t = link.socket[()], link.answer[0], link.truth[0]
-    size = link.answer.itemsize
-    with_truth = length == size + link.truth.itemsize
+    s, a, b = link.socket[()], link.answer[0], link.lengths[0]
+    size, with_lengths = link.answer.itemsize, s.version >= WITH_LENGTHS
+    t, whole = link.truth[0][0], size
+    if with_lengths:
+        t, whole = link.truth[1][0], size + link.lengths.itemsize
+    with_truth = length == whole + link.truth[0].itemsize
     if (
         s.stranger != 0
-        or not is_valid(link.answer_bytes, a, size if with_truth else length, size, DatagramKind.MEASUREMENT)
+        or (length != whole and not with_truth)
+        or not is_valid(link.answer_bytes, a, size, size, DatagramKind.MEASUREMENT, s.version)
         or a.session != s.session
         or a.sequence != s.sequence
-        or (with_truth and t.crc != crc32(link.answer_bytes[size:], link.truth.itemsize - 4))
+        or (with_lengths and b.crc != crc32(link.answer_bytes[size:], link.lengths.itemsize - 4))
+        or (with_truth and t.crc != crc32(link.answer_bytes[whole:], link.truth[0].itemsize - 4))
     ):
         feedback.refused += 1
         return False
+    for k in range(LEGS):
+        feedback.length[k] = b.length[k] if with_lengths else np.nan
+        feedback.length_rate[k] = b.rate[k] if with_lengths else np.nan
+        feedback.home[k] = b.home[k] if with_lengths else -1
     feedback.sample_ns[:], feedback.sequence[:] = a.sample_ns, a.sample_number
     feedback.measurement[:] = a.measurement
     for k in range(LEGS):

@@ -1,5 +1,5 @@
 /* The reference rig of gough's UDP protocol, on POSIX sockets: a start for firmware. It passes the tests that the emulated rig
- * passes (tests/hil/rigs/test_udp_rig.py). Replace `read_imu` and `drive`; every rig needs the rest.
+ * passes (tests/hil/rigs/test_udp_rig.py). Replace `read_imu`, `read_encoder` and `drive`; every rig needs the rest.
  *
  *     cc -std=c11 -O2 -o reference_rig reference_rig.c && ./reference_rig [PORT [WATCHDOG_MS [ADDRESS]]]
  *
@@ -36,6 +36,7 @@ static struct {
     int socket;
     struct sockaddr_in peer; /* the controller of the session */
     uint32_t session;        /* 0: none */
+    uint16_t version;        /* of its datagrams */
     uint32_t last;           /* sequence number of the last command */
     uint32_t refused;
     uint32_t request;
@@ -66,6 +67,13 @@ static int64_t read_imu(int imu, float gyroscope[3], float accelerometer[3], flo
         magnetometer[i] = NAN;
     }
     return now_ns();
+}
+
+/* Replace this: read a leg's encoder [m], [m/s], and return its home switch. Here the encoder counts from the start. */
+static int8_t read_encoder(const struct leg *leg, double *length, float *rate) {
+    *length = leg->moved;
+    *rate = leg->velocity;
+    return -1;
 }
 
 /* Replace this: move a drive at a velocity [m/s], here for `period` [s]; a drive that is not `powered` holds on its brake. */
@@ -150,6 +158,7 @@ static int take_hello(const struct gough_hello *hello, const struct sockaddr_in 
     if (!again) {
         rig.peer = *sender;
         rig.session = hello->head.session;
+        rig.version = hello->head.version;
         rig.last = rig.refused = 0;
         rig.commanded_ns = now;
         /* At least three periods, for slow controllers. */
@@ -159,7 +168,7 @@ static int take_hello(const struct gough_hello *hello, const struct sockaddr_in 
     struct gough_welcome welcome = {.watchdog_us = (uint32_t)(rig.watchdog_ns / 1000)};
     memcpy(welcome.name, "gough reference rig", sizeof "gough reference rig");
     memcpy(welcome.firmware, "1", sizeof "1");
-    gough_finish(&welcome, GOUGH_WELCOME_LENGTH, GOUGH_WELCOME, rig.session, 0, now);
+    gough_finish(&welcome, GOUGH_WELCOME_LENGTH, GOUGH_WELCOME, rig.version, rig.session, 0, now);
     answer_to(sender, &welcome, GOUGH_WELCOME_LENGTH);
     return 1;
 }
@@ -167,6 +176,7 @@ static int take_hello(const struct gough_hello *hello, const struct sockaddr_in 
 /* Apply a command, sample, answer. */
 static int take_command(const struct gough_command *command, const struct sockaddr_in *sender, int64_t now) {
     if (rig.session == 0 || !is_same(sender, &rig.peer) || command->head.session != rig.session ||
+        command->head.version != rig.version ||
         (int32_t)(command->head.sequence - rig.last) <= 0 || command->request > GOUGH_QUICK_STOP)
         return 0;
     for (int k = 0; k < GOUGH_LEGS; k++)
@@ -190,8 +200,19 @@ static int take_command(const struct gough_command *command, const struct sockad
         answer.code[k] = rig.leg[k].code;
         answer.velocity[k] = rig.leg[k].velocity;
     }
-    gough_finish(&answer, GOUGH_MEASUREMENT_LENGTH, GOUGH_MEASUREMENT, rig.session, rig.last, now);
-    answer_to(sender, &answer, GOUGH_MEASUREMENT_LENGTH);
+    gough_finish(&answer, GOUGH_MEASUREMENT_LENGTH, GOUGH_MEASUREMENT, rig.version, rig.session, rig.last, now);
+    uint8_t datagram[GOUGH_MEASUREMENT_LENGTH + GOUGH_LENGTHS_LENGTH];
+    size_t length = GOUGH_MEASUREMENT_LENGTH;
+    memcpy(datagram, &answer, length);
+    if (rig.version >= GOUGH_WITH_LENGTHS) {
+        struct gough_lengths lengths = {.reserved = {0, 0}};
+        for (int k = 0; k < GOUGH_LEGS; k++)
+            lengths.home[k] = read_encoder(&rig.leg[k], &lengths.length[k], &lengths.rate[k]);
+        gough_seal(&lengths, GOUGH_LENGTHS_LENGTH);
+        memcpy(datagram + length, &lengths, GOUGH_LENGTHS_LENGTH);
+        length += GOUGH_LENGTHS_LENGTH;
+    }
+    answer_to(sender, datagram, length);
     return 1;
 }
 

@@ -10,7 +10,7 @@ import time
 import numpy as np
 
 from hil.rigs import ANSWERED, SILENT, DriveState, Identity, Request, RigError, new_feedback
-from hil.rigs.udp.datagrams import HELLO_DATAGRAM, WELCOME_DATAGRAM, DatagramKind, decode, encode
+from hil.rigs.udp.datagrams import HELLO_DATAGRAM, VERSION, WELCOME_DATAGRAM, WITH_LENGTHS, DatagramKind, decode, encode
 from hil.rigs.udp.link import exchange_udp, new_link, parse_address, send_command, socket_address
 from plant.compiled import Record
 from plant.mechanism import LEGS
@@ -19,7 +19,7 @@ from plant.pose import Array
 TIMEOUT_SHARE = 0.5
 """Share of the period that an exchange may take."""
 
-_OPENING_S, _HANDSHAKE_S, _ARMING_S, _STOPPING_S = 2.0, 0.2, 2.0, 0.5
+_OPENING_S, _OLDER_S, _HANDSHAKE_S, _ARMING_S, _STOPPING_S = 2.0, 0.5, 0.2, 2.0, 0.5
 _FAREWELLS = 3
 
 
@@ -30,15 +30,17 @@ class UdpRig:
         address: of the rig, such as 127.0.0.1:47100.
         period: of the exchanges [s].
         anywhere: whether the address may be neither loopback nor of a private network.
+        lengths: whether the rig is to tell what its encoders read.
 
     Raises:
         InputError: the text is not an address, or the address is not allowed.
     """
 
-    def __init__(self, address: str, period: float, anywhere: bool = False) -> None:
+    def __init__(self, address: str, period: float, anywhere: bool = False, lengths: bool = False) -> None:
         self.address = parse_address(address, anywhere)
         self.command_delay = period
         self.link = new_link()
+        self.link.socket["version"] = WITH_LENGTHS if lengths else VERSION
         self.watchdog_s = 0.0
         self._socket: socket.socket | None = None
         self._timespec = np.zeros(2, np.int64)
@@ -50,26 +52,17 @@ class UdpRig:
         host, port = self.address
         self._socket = opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         opened.settimeout(_HANDSHAKE_S)
-        session = secrets.randbits(31) + 1
-        hello = encode(HELLO_DATAGRAM, kind=DatagramKind.HELLO, session=session, period_us=round(1e6 * self.command_delay))
-        welcome = None
-        deadline = time.monotonic() + _OPENING_S
-        while welcome is None and time.monotonic() < deadline:
-            try:
-                opened.sendto(hello, self.address)
-                content, sender = opened.recvfrom(2048)
-            except TimeoutError:
-                continue
-            except OSError as error:
-                self.close()
-                raise RigError(f"the rig at {host}:{port} cannot be reached: {error.strerror}") from None
-            if sender == self.address:
-                welcome = decode(WELCOME_DATAGRAM, content, kind=DatagramKind.WELCOME, session=session)
+        session, version = secrets.randbits(31) + 1, int(self.link.socket["version"])
+        welcome = self._greet(opened, session, version, _OPENING_S)
         if welcome is None:
+            older = version > VERSION and self._greet(opened, session + 1, VERSION, _OLDER_S) is not None
             self.close()
             raise RigError(
-                f"no rig answers at {host}:{port}: start it ('gough emulate --bus udp'), check the address, and that no other "
-                "controller has it"
+                f"the rig at {host}:{port} knows version {VERSION} of the datagrams only, which has no lengths: give it newer "
+                "firmware (docs/rigs.md), or do without --lengths"
+                if older
+                else f"no rig answers at {host}:{port}: start it ('gough emulate --bus udp'), check the address, and that no "
+                "other controller has it"
             )
         link = self.link.socket
         link["descriptor"], link["session"], link["sequence"] = opened.fileno(), session, 0
@@ -79,6 +72,26 @@ class UdpRig:
         name, firmware = (bytes(welcome[field]).rstrip(b"\0").decode("ascii", "replace") for field in ("name", "firmware"))
         parts = {"firmware": firmware, "address": f"{host}:{port}", "watchdog": f"{self.watchdog_s:g} s"}
         self._identity = Identity(name, parts)
+
+    def _greet(self, opened: socket.socket, session: int, version: int, patience: float) -> Record | None:
+        """The rig's answer to a hello, for which it waits so long [s]; None without one."""
+        (host, port), period_us = self.address, round(1e6 * self.command_delay)
+        hello = encode(HELLO_DATAGRAM, version=version, kind=DatagramKind.HELLO, session=session, period_us=period_us)
+        deadline = time.monotonic() + patience
+        while time.monotonic() < deadline:
+            try:
+                opened.sendto(hello, self.address)
+                content, sender = opened.recvfrom(2048)
+            except TimeoutError:
+                continue
+            except OSError as error:
+                self.close()
+                raise RigError(f"the rig at {host}:{port} cannot be reached: {error.strerror}") from None
+            if sender == self.address:
+                welcome = decode(WELCOME_DATAGRAM, content, version=version, kind=DatagramKind.WELCOME, session=session)
+                if welcome is not None:
+                    return welcome
+        return None
 
     def identify(self) -> Identity:
         """The identity that the rig has sent in the handshake.

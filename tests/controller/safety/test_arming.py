@@ -221,7 +221,7 @@ def test_an_estimate_that_drifts_on_the_brakes_is_not_armed(hexapod, factor, arm
         return
     first = int(np.argmax(drift > limit))
     assert obstacle(bench) == (Cause.NOT_STILL, first, pytest.approx(drift[first]), limit)
-    assert f"the estimate of leg {first} still drifts on the brakes" in describe_obstacle(bench.state)
+    assert f"the estimate of leg {first} changes too much within 50 ms on closed brakes" in describe_obstacle(bench.state)
     # When it stands still, two windows must pass.
     assert Cause.ARMED in bench.steps(3 * window)
 

@@ -12,10 +12,12 @@ from controller.safety.causes import Cause, DriveState, Mode, Request
 from controller.safety.stop import describe_end
 from controller.safety.watch import (
     check_carried,
+    check_judgement,
     check_limits,
     check_misfit,
     check_oscillation,
     exclude_imu,
+    judge_evidence,
     watch_parameters,
 )
 from controller.settings import SafetySettings
@@ -588,3 +590,60 @@ def test_a_run_ends_within_5_ms_when_no_pose_fits_the_imus():
 
 def test_whoever_ignores_the_imus_disagreement_ignores_their_misfit(hexapod):
     assert watch_parameters(SafetySettings(watch_imus=0.0), 1000.0, hexapod.limits)["misfit"] == np.inf
+
+
+def judge(parameters, state):
+    p, s = parameters, state
+    return judge_evidence(
+        p["safety"][()], s["safety"][()], p["rig"][()], s["time"][()], s["imus"][()], s["integrity"][()], s["reference"][()],
+        s["pid"][()],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("changes", [{}, {"limit": np.inf}, {"healthy": 0}, {"of_learned": 1}, {"evidence": 30.0}])
+def test_an_imu_is_taken_back_by_evidence_of_what_it_reads_alone(changes):
+    """Not without a limit, not while it gives nothing, and not by what was learned before."""
+    _, parameters, state = moving()
+    parameters["safety"]["watch"]["evidence"] = changes.get("limit", 64.0)
+    state["imus"]["excluded"][3], state["imus"]["healthy"] = 1, changes.get("healthy", 1)
+    evidence = state["integrity"]["evidence"]
+    evidence["apart"], evidence["order"][0], evidence["apart_evidence"][0] = 1, 3, changes.get("evidence", 1.0)
+    evidence["of_learned"] = changes.get("of_learned", 0)
+    back = [judge(parameters, state) for _ in range(12)]
+    assert back == ([False] * 5 + [True] + [False] * 6 if not changes else [False] * 12)
+    assert int(state["imus"]["excluded"][3]) == (1 if changes else 0)
+
+
+@pytest.mark.parametrize("mode", [Mode.RUNNING, Mode.STOPPING])
+def test_contradicting_evidence_ends_a_motion_and_a_controlled_stop_and_says_the_cause_first(mode):
+    _, parameters, state = moving(mode=mode)
+    integrity = state["integrity"]
+    integrity["best_evidence"] = integrity["imu_evidence"] = integrity["all_evidence"] = 200.0
+    integrity["blamed"], integrity["rival_blamed"], integrity["rival_evidence"] = 2, 4, 190.0
+    assert not judge(parameters, state)
+    assert stop_of(state) == (Cause.IMUS_CONTRADICT, 2, pytest.approx(np.sqrt(200.0)), pytest.approx(8.0))
+    assert told(state) == [Cause.IMUS_CONTRADICT, Cause.RIVAL_IMU]
+
+
+@pytest.mark.parametrize("limit", [np.inf, 0.05])
+def test_where_no_evidence_can_be_taken_that_is_told_and_the_level_is_unknown(limit):
+    _, parameters, state = moving()
+    parameters["safety"]["watch"]["level"][0] = limit
+    integrity = state["integrity"]
+    integrity["evaluations"], integrity["protection"]["level"] = 7, 1e-3
+
+    def check_it():
+        p, s = parameters, state
+        check_judgement(
+            p["safety"][()], s["safety"][()], p["rig"][()], s["time"][()], integrity[()], s["reference"][()], s["pid"][()]
+        )  # fmt: skip
+
+    integrity["unjudged_for"] = 0.9
+    check_it()
+    assert told(state) == [] and stop_of(state)[0] == Cause.NONE
+    integrity["unjudged_for"] = 1.1
+    for _ in range(3):
+        check_it()
+    stopped = [Cause.POSITION_UNSURE] if limit < np.inf else []
+    assert told(state) == [Cause.UNJUDGED, *stopped] and (integrity["protection"]["level"] == np.inf).all()
+    assert stop_of(state)[0] == (Cause.POSITION_UNSURE if stopped else Cause.NONE)

@@ -31,7 +31,7 @@ from hil.rigs.canopen.cia402 import HEARTBEAT_LOST, PDO_LOST
 from hil.rigs.canopen.configuration import configure_drive
 from hil.rigs.canopen.decoder import Decoder, advance_of
 from hil.rigs.canopen.emulated_bus import EmulatedBus
-from hil.rigs.canopen.frames import ANSWER, COMMAND_PDO, CobId, Object, Parameter, new_message, pack_imu, raw_readings
+from hil.rigs.canopen.frames import ANSWER, COMMAND_PDO, POSITION, CobId, Object, Parameter, new_message, pack_imu, raw_readings
 from hil.rigs.canopen.rig import CanopenRig
 from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings, classic_bits, fd_duration
 from plant.errors import InputError
@@ -45,13 +45,13 @@ class Kinematic:
 
     def __init__(self):
         self.request, self.drive, self.code = np.zeros(6, np.int64), np.full(6, READY), np.zeros(6, np.int64)
-        self.target, self.velocity, self.length = np.zeros(6), np.zeros(6), np.zeros(6)
+        self.target, self.velocity, self.length, self.home = np.zeros(6), np.zeros(6), np.zeros(6), np.full(6, -1)
         self.measurement = np.fromfunction(lambda s, i, a: (s + 1) * (i + 1) * 0.01 * (a - 1.5), (3, 7, 3))
         self.sample_ns, self.sequence = np.zeros(7, np.int64), np.zeros(7, np.int64)
         self.frozen, self.truth = np.zeros(7, bool), np.arange(19.0)
         self.now = None
-        names = ("request", "drive", "code", "target", "velocity", "measurement", "sample_ns", "sequence", "truth")
-        self.rig = {name: getattr(self, name) for name in names}
+        names = "request drive code target velocity length home measurement sample_ns sequence truth"
+        self.rig = {name: getattr(self, name) for name in names.split()}
 
     def advance(self, now_ns):
         dt = 0.0 if self.now is None else (now_ns - self.now) * 1e-9
@@ -112,9 +112,9 @@ def serving(config, machine=None, channel=None):
 
 
 @contextmanager
-def armed(config, machine=None, channel=None):
+def armed(config, machine=None, channel=None, lengths=False):
     with serving(config, machine, channel) as nodes:
-        rig = CanopenRig(config, PERIOD)
+        rig = CanopenRig(config, PERIOD, lengths=lengths)
         rig.open()
         rig.identify()
         rig.arm()
@@ -169,6 +169,45 @@ def test_it_runs_from_open_to_close(fd):
         wait_for(lambda: (machine.request == BRAKED).all())
         rig.close()
         rig.quick_stop()
+
+
+@pytest.mark.parametrize("fd", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_drives_tell_what_their_encoders_read_if_they_are_asked(fd):
+    machine, counts = Kinematic(), 65536 / 0.005
+    machine.length[:] = [-0.5, 0.4, 0.3, 0.2, 200.0, 0.0]
+    config = settings(bus={"fd": fd}, drives={"signs": [1, -1, 1, -1, 1, -1]})
+    with armed(config, machine, lengths=True) as (rig, _):
+        feedback, _ = run(rig, 10, request=BRAKED)
+        # A position has 32 bits, 328 m; what it was before the first reading nobody knows.
+        wrapped = (machine.length + 2**31 / counts) % (2**32 / counts) - 2**31 / counts
+        np.testing.assert_allclose(feedback["length"], wrapped, atol=0.6 / counts)
+        assert (feedback["home"] == 0).all() and not feedback["length_rate"].any()
+        before, start = machine.length.copy(), feedback["length"].copy()
+        machine.home[2] = 1
+        feedback, _ = run(rig, 40, np.array([0.1, -0.1, 0.05, 0.02, -0.2, 0.3]))
+        moved = machine.length - before
+        assert (np.abs(moved) > 0.005).all()
+        np.testing.assert_allclose(feedback["length"] - start, moved, atol=0.3 * PERIOD)
+        np.testing.assert_allclose(feedback["length_rate"], machine.velocity, atol=2.0 / counts)
+        assert feedback["home"].tolist() == [0, 0, 1, 0, 0, 0]
+    with armed(config, machine) as (rig, _):
+        feedback, _ = run(rig, 10, request=BRAKED)
+        assert np.isnan(feedback["length"]).all() and (feedback["home"] == -1).all()
+
+
+def test_a_position_goes_on_when_it_wraps():
+    decoder, node = Decoder(settings(), lengths=True), 3
+    positions = [2**31 - 2, -(2**31) + 1, -(2**31) + 5, 2**31 - 1, 0x7000_0000, -0x7000_0000]
+    for number, position in enumerate(positions):
+        decoder.begin(number + 1)
+        assert decoder.take(new_message(CobId.TPDO + 0x100 + node, POSITION.pack(position, 4 * (number % 2))))
+        assert decoder.homes[2] == bool(number % 2)
+        decoder.end()
+        assert decoder.answered_position(2) and not decoder.answered_position(1)
+    assert decoder.positions[2] == 2**32 - 0x7000_0000
+    decoder.begin(100)
+    decoder.end()
+    assert not decoder.answered_position(2)
 
 
 def test_it_says_who_is_there():

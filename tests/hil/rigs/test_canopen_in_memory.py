@@ -10,6 +10,8 @@ from hil.rigs.canopen.settings import canopen_settings
 from hil.rigs.emulation import fault, new_emulated
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import simulated_plant
+from plant.encoder_readings import encoder_state
+from plant.encoders import load_encoder
 from plant.imu import imu_state, load_imu
 from plant.mechanism import load_in_space
 
@@ -21,13 +23,14 @@ def made():
     """Makes an armed rig with faults."""
     opened = []
 
-    def make(*faults, fd=True):
+    def make(*faults, fd=True, lengths="none"):
         mechanism = load_in_space("hexapod")
         plant = simulated_plant(SimulationConfig(rate=1.0 / PERIOD), mechanism, mechanism.require_home())
         emulated = new_emulated(mechanism, round(1e9 * PERIOD), 1, [fault(text) for text in faults])
         state = imu_state(load_imu("ideal"), 1, PERIOD)
         settings = canopen_settings(bus={"fd": fd})
-        rig = CanopenInMemory(settings, PERIOD, lambda: (plant, state, emulated))
+        encoders = encoder_state(load_encoder(lengths), 1, PERIOD)
+        rig = CanopenInMemory(settings, PERIOD, lambda: (plant, state, encoders, emulated), lengths != "none")
         opened.append((rig, plant))
         rig.open()
         assert len(rig.identify().parts) == 13
@@ -58,6 +61,19 @@ def test_drives_follow_and_imus_sample_in_each_cycle(made):
     np.testing.assert_allclose(after["sample_ns"] - before["sample_ns"], 100 * PERIOD * 1e9, atol=2e5)
     # Commands take effect at the SYNC after them, and loaded drives are a little slower.
     np.testing.assert_allclose(after["truth"][7:13] - before["truth"][7:13], 99 * PERIOD * 0.05, rtol=0.1)
+
+
+@pytest.mark.parametrize("fd", [True, False])
+def test_encoders_follow_the_legs(made, fd):
+    rig = made("encoder-jumps:4,size_mm=2,at=0.1", fd=fd, lengths="ideal")
+    exchange(rig, 5)
+    found = []
+    for _ in range(100):
+        feedback, _ = exchange(rig, 1, 0.05)
+        found.append(feedback["length"] - rig.machine.rig["truth"][7:13])
+    off = np.array(found)
+    assert np.abs(np.delete(off, 4, axis=1)).max() < 1e-6
+    np.testing.assert_allclose(off[[0, 30, 60, 99], 4], [0.0, 0.0, 2e-3, 2e-3], atol=1e-6)
 
 
 def test_a_bus_that_is_down_is_silence_and_the_drives_stop_by_themselves(made):

@@ -18,9 +18,9 @@ GYROSCOPE, ACCELEROMETER = 0, 1
 class Miswired(TemplateRig):
     """The template with IMUs as they are sold, and with factors on commands and readings; like hardware, it knows no truth."""
 
-    def __init__(self, command=1.0, gyroscope=1.0, accelerometer=1.0, seed=3, imu="mpu9150-calibrated", start=0.0):
+    def __init__(self, command=1.0, gyroscope=1.0, accelerometer=1.0, seed=3, imu="mpu9150-calibrated", start=0.0, encoder=1.0):
         super().__init__(HEXAPOD, PERIOD, None)
-        self.factors, self.start, self.moved = (command, gyroscope, accelerometer), start, np.zeros(6)
+        self.factors, self.start, self.moved, self.encoder = (command, gyroscope, accelerometer), start, np.zeros(6), encoder
         self.imu, self.read = imu_state(load_imu(imu), seed, PERIOD), np.zeros((3, 7, 3))
 
     def open(self):
@@ -38,6 +38,7 @@ class Miswired(TemplateRig):
         feedback["measurement"] = self.read
         feedback["measurement"][GYROSCOPE] *= turned
         feedback["measurement"][ACCELEROMETER] *= tilted
+        feedback["length"] *= self.encoder
         feedback["truth"] = np.nan
         return status
 
@@ -98,3 +99,19 @@ def test_commands_in_another_unit_are_stopped_at_once_and_told():
     assert any("All legs moved by" in text for text in found["commands"])
     # A drive's own limit is 0.35 m/s; 0.2 s of it would be 70 mm.
     assert (rig.moved < 20e-3).all()
+
+
+@pytest.mark.parametrize(
+    ("factors", "texts"),
+    [
+        (np.array([1, 1, -1, 1, 1, 1]), ["The encoder of leg 2 reads -"]),
+        (np.full(6, 1e3), [f"The encoder of leg {k} reads " for k in range(6)]),
+        (np.array([1, np.nan, np.nan, np.nan, 1, 0.1]), ["The encoder of leg 5 reads 0."]),
+        (np.full(6, np.nan), []),
+    ],
+)
+def test_an_encoder_with_a_wrong_sign_or_unit_is_named(factors, texts):
+    found, _ = examined(encoder=factors)
+    assert {clause for clause, each in found.items() if each} == ({"encoders"} if texts else set())
+    for text, told in zip(texts, found.get("encoders", []), strict=True):
+        assert told.startswith(text) and told.endswith("check its sign and its unit.")

@@ -25,7 +25,7 @@ class Machine:
 
     def __init__(self):
         self.rig, self.resets, self.restarts = np.zeros((), EMULATED), [], 0
-        self.rig["drive"] = READY
+        self.rig["drive"], self.rig["length"], self.rig["home"] = READY, np.nan, -1
 
     def advance(self, now_ns):
         pass

@@ -22,6 +22,8 @@ from hil.rigs.emulation import (
 )
 from hil.runs.config import EmulatorConfig, SimulationConfig
 from hil.runs.emulator_process import _rig_of
+from plant.encoder_readings import encoder_state
+from plant.encoders import load_encoder
 from plant.errors import InputError, UnknownNameError
 from plant.imu import imu_state, load_imu
 from plant.mechanism import load_spatial
@@ -38,17 +40,17 @@ SPEEDS = np.array([0.01, -0.02, 0.03, -0.04, 0.05, -0.06])
 
 @pytest.fixture(scope="module")
 def made():
-    """A plant with ideal IMUs, and its IMUs' imperfections."""
-    plant, imu, _ = _rig_of(EmulatorConfig(SimulationConfig(imu="ideal")), 1e-3, [])
+    """A plant with ideal IMUs and encoders, and their imperfections."""
+    plant, imu, encoders, _ = _rig_of(EmulatorConfig(SimulationConfig(imu="ideal", lengths="ideal")), 1e-3, [])
     with plant:
-        yield plant, imu
+        yield plant, imu, encoders
 
 
 class Emulated:
     """An emulated rig that a test drives by the millisecond."""
 
     def __init__(self, made, *texts, step_ns=MS, seed=0):
-        self.plant, self.imu = made
+        self.plant, self.imu, self.encoders = made
         self.rig = new_emulated(load_spatial("hexapod"), step_ns, seed, [fault(text) for text in texts])
 
     def __getitem__(self, name):
@@ -65,7 +67,7 @@ class Emulated:
 
     def read(self):
         """The present readings, of a plant that stands still meanwhile."""
-        assert sample(self.plant.handle, self.imu, self.rig, int(self.rig["time_ns"])) == 0
+        assert sample(self.plant.handle, self.imu, self.encoders, self.rig, int(self.rig["time_ns"])) == 0
         return self["measurement"]
 
 
@@ -368,7 +370,7 @@ def test_an_imu_that_has_come_loose_is_one_that_is_turned_about_some_axis(made):
 
 def test_a_disturbance_begins_with_the_drives_and_ends_with_its_time(made):
     texts = ("imu-offset:2+6,axis=y,size_m_per_s2=0.5,ramp_s=0.01,at=0.02,for=0.03", "imu-supply:all,size_v=1,at=1")
-    healthy, rig = Emulated(made), Emulated((made[0], imu_state(load_imu("ideal"), 0, 1e-3)), *texts)
+    healthy, rig = Emulated(made), Emulated((made[0], imu_state(load_imu("ideal"), 0, 1e-3), made[2]), *texts)
     base = healthy.read()[1, :, 1]
     for milliseconds, share in ((0, 0.0), (19, 0.0), (24, 0.4), (35, 1.0), (49, 1.0), (50, 0.0), (60, 0.0)):
         # The drives are enabled at 5 ms; the plant itself stands still.
@@ -380,8 +382,23 @@ def test_a_disturbance_begins_with_the_drives_and_ends_with_its_time(made):
     assert int(rig.imu["disturbances"]) == 0
 
 
+def test_a_fault_of_an_encoder_begins_with_the_drives_and_ends_with_its_time(made):
+    encoders = encoder_state(load_encoder("ideal"), 0, 1e-3)
+    rig = Emulated((made[0], made[1], encoders), "encoder-dead:2+4,at=0.02,for=0.03", "encoder-jumps:5,size_mm=3,at=0.03")
+    true = Emulated(made)
+    true.read()
+    for milliseconds, dead in ((0, False), (19, False), (20, True), (49, True), (50, False), (60, False)):
+        rig.rig["enabled_ns"], rig.rig["time_ns"] = 5 * MS, (5 + milliseconds) * MS
+        rig.read()
+        expected = true["truth"][TRUTH_LENGTHS] + 3e-3 * (np.arange(6) == 5) * (milliseconds >= 30)
+        np.testing.assert_allclose(rig["length"], np.where(dead & np.isin(np.arange(6), (2, 4)), np.nan, expected), atol=1e-9)
+    rig.rig["faults"] = 0
+    rig.read()
+    assert np.isfinite(rig["length"]).all() and int(encoders["faults"]) == 0
+
+
 def test_the_samples_of_an_imu_with_a_slow_clock_are_counted_and_dated(made):
-    rig = Emulated((made[0], imu_state(load_imu("ideal"), 0, 1e-3)), "imu-clock:3,size_percent=-50")
+    rig = Emulated((made[0], imu_state(load_imu("ideal"), 0, 1e-3), made[2]), "imu-clock:3,size_percent=-50")
     numbers, times = [], []
     for _ in range(20):
         rig.step().read()

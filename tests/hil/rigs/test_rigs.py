@@ -30,6 +30,7 @@ from hil.rigs.clauses import CLAUSES
 from hil.rigs.contract import check_rig, examine_rig
 from hil.rigs.emulation import fault, new_emulated
 from hil.rigs.template import TemplateRig
+from hil.rigs.udp.datagrams import VERSION, WITH_LENGTHS
 from hil.rigs.udp.emulator import new_udp_emulator
 from hil.rigs.udp.link import new_link
 from hil.rigs.udp.rig import UdpRig
@@ -435,8 +436,10 @@ def recording(path, faults=None, **changes):
     with prepared_loop(replace(CONFIG, **changes), np.zeros(4000, RECORD)) as loop:
         if faults is not None:
             rig = new_emulated(loop.mechanism, 1_000_000, 0, [fault(text) for text in faults])
-            loop.udp, loop.emulator = new_link(), new_udp_emulator(loop.fmu, loop.imu, rig, 1)
-            loop.udp.socket["session"], loop.udp.socket["timeout_ns"] = 1, 1_000_000
+            version = WITH_LENGTHS if "lengths" in changes else VERSION
+            loop.udp = new_link()
+            loop.emulator = new_udp_emulator(loop.fmu, loop.imu, loop.encoders, rig, 1, version=version)
+            loop.udp.socket["session"], loop.udp.socket["version"], loop.udp.socket["timeout_ns"] = 1, version, 1_000_000
             loop.parameters["load"]["command_delay"] = 1.0 / CONFIG.rate
         assert loop.follow(loop.end) == Cause.END_OF_MOTION
         records = loop.records[: int(loop.state["time"]["cycle"])].copy()
@@ -467,14 +470,23 @@ def replayed(path, rig=None, **changes):
         return cause, loop.records[: int(loop.state["time"]["cycle"])].copy()
 
 
-@pytest.mark.parametrize("faults", [None, (), FAULTS], ids=["fmu", "udp", "faults"])
-def test_a_replayed_run_is_the_recorded_one_bit_for_bit(faults, tmp_path):
-    path, records = recording(tmp_path / "run.mcap", faults)
+@pytest.mark.parametrize(
+    ("faults", "changes"),
+    [
+        (None, {}),
+        ((), {}),
+        (FAULTS, {}),
+        ((*FAULTS, "encoder-jumps:2,size_mm=2,at=0.3"), {"lengths": "incremental", "fusion": "whole"}),
+    ],
+    ids=["fmu", "udp", "faults", "lengths"],
+)
+def test_a_replayed_run_is_the_recorded_one_bit_for_bit(faults, changes, tmp_path):
+    path, records = recording(tmp_path / "run.mcap", faults, **changes)
     if faults:
         assert 5 < np.count_nonzero(records["silent"]) < 100
         assert records["sample_age"][:, 3].max() > 80
         assert len(np.unique(records["imus"])) > 1
-    cause, again = replayed(path)
+    cause, again = replayed(path, **changes)
     assert cause == Cause.END_OF_MOTION
     assert len(again) == len(records) > 600
     for name in (*ESTIMATES, *FOLLOWED, "sample_ns", "drive", "sent", "truth", "silent", "refused", "event_cause"):

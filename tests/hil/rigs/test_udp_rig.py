@@ -34,10 +34,12 @@ from hil.rigs.udp import datagrams
 from hil.rigs.udp.datagrams import (
     COMMAND_DATAGRAM,
     HELLO_DATAGRAM,
+    LENGTHS_DATAGRAM,
     MEASUREMENT_DATAGRAM,
     TRUTH_DATAGRAM,
     VERSION,
     WELCOME_DATAGRAM,
+    WITH_LENGTHS,
     DatagramKind,
     crc32,
     decode,
@@ -64,7 +66,8 @@ SOURCES = Path(hil.rigs.udp.__file__).parent
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "rigs.md"
 COMPILE = (shutil.which("cc") or "gcc", "-std=c11", "-Wall", "-Wextra", "-Werror", "-Wpedantic", f"-I{SOURCES}")
 DATAGRAMS = {
-    name: getattr(datagrams, f"{name.upper()}_DATAGRAM") for name in ("hello", "welcome", "command", "measurement", "truth")
+    name: getattr(datagrams, f"{name.upper()}_DATAGRAM")
+    for name in ("hello", "welcome", "command", "measurement", "lengths", "truth")
 }
 HEAD = ("magic", "version", "kind", "session", "sequence", "time_ns")
 PERIOD = 0.01
@@ -84,7 +87,7 @@ def test_the_header_has_the_layout_of_the_datagrams(tmp_path):
     lines = []
     for name, dtype in DATAGRAMS.items():
         for field, _, _ in fields(dtype):
-            member = f"head.{field}" if field in HEAD and name != "truth" else field
+            member = f"head.{field}" if field in HEAD and name not in ("lengths", "truth") else field
             size = f"sizeof ((struct gough_{name} *)0)->{member}"
             lines.append(f'printf("{name} {field} %zu %zu\\n", offsetof(struct gough_{name}, {member}), {size});')
         lines.append(f'printf("{name} - %zu 0\\n", GOUGH_{name.upper()}_LENGTH);')
@@ -106,7 +109,8 @@ def test_the_header_has_the_constants_of_the_datagrams():
         name: int(value, 0) for name, value in re.findall(r"#define GOUGH_(\w+) (\w+?)u?\b", text) if value[0].isdigit()
     }
     assert constants == {
-        "LEGS": 6, "IMUS": 7, "MAGIC": datagrams.MAGIC, "VERSION": VERSION, "PORT": 47100, "WATCHDOG_CODE": WATCHDOG_CODE,
+        "LEGS": 6, "IMUS": 7, "MAGIC": datagrams.MAGIC, "VERSION": VERSION, "WITH_LENGTHS": WITH_LENGTHS, "PORT": 47100,
+        "WATCHDOG_CODE": WATCHDOG_CODE,
     }  # fmt: skip
     enums = {
         name: re.sub(r"GOUGH_| = 1", "", body).split(", ") for name, body in re.findall(r"enum gough_(\w+) \{ (.*) \}", text)
@@ -171,7 +175,8 @@ def program(tmp_path_factory):
 def emulator():
     """An emulated rig and its control channel."""
     address, control = (f"127.0.0.1:{free_port()}" for _ in range(2))
-    command = [sys.executable, "-m", "hil.command_line", "emulate", "--imu", "ideal", "--at", address, "--control", control]
+    command = [sys.executable, "-m", "hil.command_line", "emulate", "--imu", "ideal", "--lengths", "incremental"]
+    command += ["--at", address, "--control", control]
     with process(command):
         yield address, control
 
@@ -190,8 +195,8 @@ def address(request):
 
 
 @contextmanager
-def opened(address):
-    rig = UdpRig(address, PERIOD)
+def opened(address, lengths=False):
+    rig = UdpRig(address, PERIOD, lengths=lengths)
     rig.open()
     with closing(rig):
         yield rig
@@ -231,6 +236,34 @@ def test_a_rig_says_who_it_is_and_does_as_it_is_told(address):
         assert (feedback["sequence"] > before["sequence"]).all() and (feedback["sample_ns"] > before["sample_ns"]).all()
         feedback = exchange(rig, SPEEDS, BRAKED)
         assert (feedback["drive"] == READY).all() and (feedback["sent"] == 0.0).all()
+
+
+def test_in_version_2_a_rig_tells_what_its_encoders_read(address):
+    with opened(address, lengths=True) as rig:
+        enable(rig, SPEEDS)
+        before = exchange(rig, SPEEDS, ENABLED)
+        time.sleep(0.02)
+        feedback = exchange(rig, SPEEDS, ENABLED)
+        moved = feedback["length"] - before["length"]
+        # At most the watchdog's time and this pause.
+        assert np.isfinite(moved).all() and (np.sign(moved) == np.sign(SPEEDS)).all() and np.abs(moved).max() < 0.06 * 0.2
+        assert (feedback["home"] == -1).all() and np.isfinite(feedback["length_rate"]).all()
+    with opened(address) as rig:
+        assert np.isnan(exchange(rig, SPEEDS, BRAKED)["length"]).all()
+
+
+def test_a_rig_that_knows_no_lengths_is_told(tmp_path):
+    """With the rig as it was before there was a version 2."""
+    source = (SOURCES / "reference_rig.c").read_text()
+    old = source.replace("hello->head.session == 0 ||", "hello->head.version != GOUGH_VERSION || hello->head.session == 0 ||")
+    assert old != source
+    (tmp_path / "old.c").write_text(old)
+    subprocess.run([*COMPILE, "-o", tmp_path / "old", tmp_path / "old.c"], check=True)
+    port = free_port()
+    with process([tmp_path / "old", str(port)]), opened(f"127.0.0.1:{port}") as rig:
+        exchange(rig, SPEEDS, BRAKED)
+        with pytest.raises(RigError, match=r"knows version 1 .* has no lengths: give it newer firmware"):
+            UdpRig(f"127.0.0.1:{port}", PERIOD, lengths=True).open()
 
 
 def test_a_quick_stop_slows_down_and_then_holds(address):
@@ -480,6 +513,7 @@ def test_addresses_and_ports_that_cannot_be_used_are_told():
 
 ROUNDS = 1_000_000
 MEASUREMENT_BYTES = MEASUREMENT_DATAGRAM.itemsize
+WITH_LENGTHS_BYTES = MEASUREMENT_BYTES + LENGTHS_DATAGRAM.itemsize
 RANDOM, FLIPPED, CUT, HEADED = range(4)
 
 
@@ -521,7 +555,7 @@ def spoil(data, good, length, state, kind):
     if kind == CUT:
         size = int(next_random(state) % np.uint64(data.size + 200))
         # A measurement is sound without its truth.
-        return size + 1 if size in (length, MEASUREMENT_BYTES) else size
+        return size + 1 if size in (length, MEASUREMENT_BYTES, WITH_LENGTHS_BYTES) else size
     # A sound CRC is written later, for a head in which a byte is wrong, or the number is 0.
     at = int(next_random(state) % np.uint64(13))
     if at < 12:
@@ -587,11 +621,18 @@ def without_refused(record):
 
 
 @pytest.mark.parametrize("truthful", [False, True])
-def test_the_controller_takes_nothing_that_is_wrong(truthful):
+@pytest.mark.parametrize("version", [VERSION, WITH_LENGTHS])
+def test_the_controller_takes_nothing_that_is_wrong(truthful, version):
     link, feedback = new_link(), new_feedback()[()]
-    link.socket["session"], link.socket["sequence"] = 7, 9
+    link.socket["session"], link.socket["sequence"], link.socket["version"] = 7, 9, version
     values = np.random.default_rng(1).normal(size=(3, 7, 3))
-    sound = encode(MEASUREMENT_DATAGRAM, kind=DatagramKind.MEASUREMENT, session=7, sequence=9, measurement=values)
+    head = {"version": version, "kind": DatagramKind.MEASUREMENT, "session": 7, "sequence": 9}
+    sound = encode(MEASUREMENT_DATAGRAM, **head, measurement=values)
+    if version == WITH_LENGTHS:
+        lengths = np.zeros(1, LENGTHS_DATAGRAM)
+        lengths["length"], lengths["rate"], lengths["home"] = np.arange(6.0), -np.arange(6.0), [1, 0, -1, 1, 0, -1]
+        lengths["crc"] = crc32(lengths.view(np.uint8), LENGTHS_DATAGRAM.itemsize - 4)
+        sound += lengths.tobytes()
     if truthful:
         truth = np.zeros(1, TRUTH_DATAGRAM)
         truth["truth"] = np.arange(19.0)
@@ -602,6 +643,11 @@ def test_the_controller_takes_nothing_that_is_wrong(truthful):
     assert decode_answer(link, len(good), feedback) and feedback["refused"] == 0
     np.testing.assert_array_equal(feedback["measurement"], values.astype(np.float32))
     assert (feedback["truth"][3] == 3.0) == truthful
+    if version == WITH_LENGTHS:
+        assert feedback["length"].tolist() == [0, 1, 2, 3, 4, 5] and feedback["length_rate"].tolist() == [0, -1, -2, -3, -4, -5]
+        assert feedback["home"].tolist() == [1, 0, -1, 1, 0, -1]
+    else:
+        assert np.isnan(feedback["length"]).all() and (feedback["home"] == -1).all()
     before, state = without_refused(feedback), np.array([88172645463325252], np.uint64)
     assert fuzz_decode_answer(link, good, len(good), feedback, ROUNDS // 2, state) == 0
     assert bytes_changed_in_decode_answer(link, good, len(good), feedback) == 0
@@ -616,9 +662,9 @@ def test_the_controller_takes_nothing_that_is_wrong(truthful):
 
 
 def test_the_rig_does_nothing_that_is_wrong():
-    plant, imu, rig = _rig_of(EmulatorConfig(SimulationConfig(imu="ideal")), PERIOD, [])
+    plant, imu, encoders, rig = _rig_of(EmulatorConfig(SimulationConfig(imu="ideal")), PERIOD, [])
     with plant:
-        emulator = new_udp_emulator(plant.handle, imu, rig, session=7)
+        emulator = new_udp_emulator(plant.handle, imu, encoders, rig, session=7)
         content = encode(COMMAND_DATAGRAM, kind=DatagramKind.COMMAND, session=7, sequence=1, request=ENABLED, velocity=SPEEDS)
         emulator.link.command_bytes[: len(content)] = np.frombuffer(content, np.uint8)
         assert answer_command(emulator, len(content), 1_000_000) > 0
@@ -637,10 +683,10 @@ def test_the_rig_does_nothing_that_is_wrong():
 
 
 def test_a_flood_of_old_hellos_does_not_keep_a_moving_rig_from_its_controller():
-    plant, imu, rig = _rig_of(EmulatorConfig(SimulationConfig(imu="ideal")), PERIOD, [])
+    plant, imu, encoders, rig = _rig_of(EmulatorConfig(SimulationConfig(imu="ideal")), PERIOD, [])
     with plant, closing(bound_socket("127.0.0.1", 0)) as own, senders("127.0.0.1:1", 2) as (controller, stranger):
         # Its drives go on, however long the test pauses.
-        emulator = new_udp_emulator(plant.handle, imu, rig, controller.session, watchdog_s=60.0)
+        emulator = new_udp_emulator(plant.handle, imu, encoders, rig, controller.session, watchdog_s=60.0)
         link, timespec, began = emulator.link.socket, np.zeros(2, np.int64), time.monotonic_ns()
         link["descriptor"], link["peer"] = own.fileno(), socket_address(controller.socket.getsockname())
         controller.rig = stranger.rig = own.getsockname()

@@ -21,6 +21,7 @@ from hil.realtime.clock import CLOCK
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import SimulationStoppedError, simulate
 from hil.runs.snapshot import read_snapshot, write_snapshot
+from plant.encoder_readings import ENCODER_STATE
 from plant.errors import GoughError, InputError
 from plant.fmu.settings import Setting
 from plant.imu import IMU_STATE
@@ -29,7 +30,7 @@ from tests.plant.fmu.foreign import BINDING, TRUTH
 TIMED = ("time_ns", "late_ns", "stage_ns", "cpu_ns")
 """What of a record the machine's own time is in."""
 
-MEMORY = {"imu": IMU_STATE, "state": STATE, "clock": CLOCK, "work": WORK}
+MEMORY = {"imu": IMU_STATE, "encoders": ENCODER_STATE, "state": STATE, "clock": CLOCK, "work": WORK}
 """The arrays of a snapshot that have fields."""
 
 
@@ -49,7 +50,8 @@ LIVELY = SimulationConfig(
         (replace(LIVELY, fusion="compiled", rate=250.0, imu="icm42688"), 1.5),
         (replace(LIVELY, joint_error=1e-4), -0.1),
         (replace(LIVELY, imu="icm42688-nominal", faults=("imu-offset:2,axis=x,size_deg_per_s=0.05,ramp_s=1,at=0.3",)), 0.7),
-        (SimulationConfig(mechanism="planar-3rpr", duration=1.0), 0.4),
+        (replace(LIVELY, lengths="incremental", faults=("encoder-jumps:2,size_mm=2,at=1",)), 0.7),
+        (SimulationConfig(mechanism="planar-3rpr", duration=1.0, lengths="incremental"), 0.4),
     ],
 )
 def test_a_simulation_goes_on_to_the_bit(config: SimulationConfig, save_at: float, tmp_path: Path) -> None:

@@ -7,10 +7,12 @@ from scipy.spatial.transform import Rotation
 
 from controller.estimation.whole_mechanism.filter import (
     _update_rows,
+    accumulate_lengths,
     accumulate_sample,
     extrapolate,
     extrapolate_covariance,
     start_filter,
+    start_lengths,
     step_filter,
 )
 from controller.estimation.whole_mechanism.imu_errors import ERRORS, distort, error_gradient
@@ -23,6 +25,7 @@ from controller.estimation.whole_mechanism.readings import (
     TILT,
     predict_readings,
 )
+from controller.inverse_kinematics import leg_lengths
 from controller.rig import field_of, sensor_geometry
 from controller.settings import FusionSettings, fusion_settings
 from plant.dynamics.imposed_motion import impose
@@ -122,7 +125,10 @@ def test_at_rest_it_does_not_drift(hexapod):
 
 
 class Twin:
-    """The same filter with dense matrices and one joint update."""
+    """The same filter with dense matrices and one joint update.
+
+    In place of an encoder's zero it has what the encoder would read at the pose without play: a reading is linear in that.
+    """
 
     def __init__(self, parameters, mechanism, errors, position, rotation, twist):
         self.p, self.mechanism, self.n = parameters, mechanism, BLOCKS[errors]
@@ -133,9 +139,39 @@ class Twin:
         self.smooth = self.motion.copy()
         self.errors, self.time = np.zeros((7, ERRORS)), 0.0
         kept = [*(k * ERRORS + i for k in range(7) for i in range(self.n)), *range(ALL_ERRORS, ALL_ERRORS + len(self.rig))]
-        self.covariance = np.zeros((18 + len(kept), 18 + len(kept)))
+        self.encoders, self.play = 6 * int(parameters["lengths"] > 0), np.zeros(6)
+        self.covariance = np.zeros((18 + len(kept) + 2 * self.encoders,) * 2)
         self.covariance[:18, :18] = np.diag(np.repeat(np.square([0.01, 0.05, 0.1, 0.5, 5.0, 50.0]), 3))
-        self.covariance[18:, 18:] = parameters["prior"][np.ix_(kept, kept)]
+        self.covariance[18 : 18 + len(kept), 18 : 18 + len(kept)] = parameters["prior"][np.ix_(kept, kept)]
+        if self.encoders:
+            self.first = 18 + len(kept)
+            self.covariance[self.first :, self.first :] = np.diag(np.repeat(parameters["length_prior"], 6))
+            self.read, gradient = self.lengths()
+            self.shift_readings(gradient)
+
+    def lengths(self):
+        """The legs' lengths (6,) at the pose, and their gradients (6, 6) by central differences."""
+
+        def at(step):
+            moved = rotation_of(step[3:]) @ self.rotation
+            legs = self.position + step[:3] + self.mechanism.platform_joints @ moved.T - self.mechanism.base_joints
+            return np.linalg.norm(legs, axis=1)
+
+        steps = 1e-5 * np.eye(6)
+        return at(np.zeros(6)), np.stack([(at(step) - at(-step)) / 2e-5 for step in steps], axis=1)
+
+    def shift_readings(self, gradient):
+        """Add the lengths' errors by a gradient (6, 6) to those of the readings."""
+        shift = np.eye(len(self.covariance))
+        shift[self.first : self.first + 6, :6] = gradient
+        self.covariance = shift @ self.covariance @ shift.T
+
+    def zeros(self):
+        """The encoders' zeros (6,), and the covariance with them in place of the readings."""
+        lengths, gradient = self.lengths()
+        shift = np.eye(len(self.covariance))
+        shift[self.first : self.first + 6, :6] = -gradient
+        return self.read - lengths, shift @ self.covariance @ shift.T
 
     def matrices(self, errors):
         """Of gyroscope and accelerometer: I + diag(scale) + U(axes); and the alignment, turned back, to second order."""
@@ -167,10 +203,21 @@ class Twin:
         for k in range(7):
             for i in range(min(self.n, 6)):
                 noise[18 + k * self.n + i, 18 + k * self.n + i] = self.p["bias_walk"][i // 3] * t
+        if self.encoders:
+            before, gradient = self.lengths()
+            self.shift_readings(-gradient)
+            left = np.exp(-t / 0.5)
+            self.play = self.play * left
+            for i in range(self.first + 6, self.first + 12):
+                transition[i, i], noise[i, i] = left, self.p["length_prior"][1] * (1.0 - left**2)
         self.covariance = transition @ self.covariance @ transition.T + noise
         self.position = self.position + v * t + a * t * t / 2.0
         self.rotation = rotation_of(turn) @ self.rotation
         self.motion = np.array([v + a * t, w + e * t, a, e])
+        if self.encoders:
+            after, gradient = self.lengths()
+            self.read = self.read + after - before
+            self.shift_readings(gradient)
         first, second = self.low_passed
         first = first + t / (t + 0.03) * (self.motion - first)
         second = second + t / (t + 0.03) * (first - second)
@@ -191,7 +238,8 @@ class Twin:
         steps = 1e-6 * np.eye(len(self.rig))
         return np.stack([(ideal(step) - ideal(-step)) / 2e-6 for step in steps], axis=2) if len(steps) else np.zeros((7, 6, 0))
 
-    def update(self, samples, count, time):
+    def update(self, samples, count, time, readings=(), read=(), later=()):
+        """Take mean samples (7, 6) of `count` (7,), and mean `readings` (6,) of `read` (6,) that are `later` (6,) [s]."""
         self.predict(time - self.time)
         self.time = time
         scratch, ideal, at_smooth = np.zeros((), READINGS_SCRATCH), np.zeros((7, 6)), np.zeros((7, 6, MOTION_STATES))
@@ -213,11 +261,20 @@ class Twin:
                 row = np.zeros((3, len(self.covariance)))
                 row[:, :18] = matrix @ back @ at_smooth[k, part]
                 row[:, 18 + k * self.n : 18 + (k + 1) * self.n] = by_errors[:, : self.n]
-                row[:, 18 + 7 * self.n :] = matrix @ back @ by_rig[k, part]
+                row[:, 18 + 7 * self.n : 18 + 7 * self.n + len(self.rig)] = matrix @ back @ by_rig[k, part]
                 rows.append(row)
-                innovations.append(samples[k, part] - matrix @ x - self.errors[k, part] - row[:, 18 + 7 * self.n :] @ self.rig)
+                of_rig = matrix @ back @ by_rig[k, part] @ self.rig
+                innovations.append(samples[k, part] - matrix @ x - self.errors[k, part] - of_rig)
                 ripple = self.p["ripple"] * self.smooth[ACCELERATION] @ self.smooth[ACCELERATION] if sensor == 1 else 0.0
                 variances += [self.p["variance"][sensor] / count[k] + ripple] * 3
+        for k in np.flatnonzero(read):
+            gradient = self.lengths()[1][k]
+            row = np.zeros((1, len(self.covariance)))
+            row[0, [self.first + k, self.first + 6 + k]] = 1.0
+            row[0, 6:12] = later[k] * gradient
+            rows.append(row)
+            innovations.append([readings[k] - self.read[k] - self.play[k] - later[k] * gradient @ self.motion[:2].ravel()])
+            variances.append(self.p["length_variance"] / read[k])
         h, innovation = np.vstack(rows), np.concatenate(innovations)
         gain = np.linalg.solve(h @ self.covariance @ h.T + np.diag(variances), h @ self.covariance).T
         change = gain @ innovation
@@ -227,7 +284,10 @@ class Twin:
         self.rotation = rotation_of(change[3:6]) @ self.rotation
         self.motion = self.motion + change[6:18].reshape(4, 3)
         self.errors[:, : self.n] += change[18 : 18 + 7 * self.n].reshape(7, self.n)
-        self.rig = self.rig + change[18 + 7 * self.n :]
+        self.rig = self.rig + change[18 + 7 * self.n : 18 + 7 * self.n + len(self.rig)]
+        if self.encoders:
+            self.read = self.read + change[self.first : self.first + 6]
+            self.play = self.play + change[self.first + 6 :]
 
 
 @pytest.mark.parametrize(
@@ -284,6 +344,48 @@ def test_taken_bit_by_bit_it_equals_its_dense_twin(hexapod, errors, rig, toleran
             scale = np.sqrt(np.diag(twin.covariance))
             difference = (state["covariance"][:n, :n] - twin.covariance) / np.outer(scale, scale)
             assert np.abs(difference).max() < 1e-6 * tolerance
+
+
+@pytest.mark.parametrize("errors", ["gyroscopes", pytest.param("axes", marks=pytest.mark.slow)])
+def test_with_encoders_it_equals_its_twin_whose_states_are_their_readings(hexapod, errors):
+    """From a pose that is 5 mm and 0.6 deg off, with one encoder that reads nothing for a while, and one that never does."""
+    motion, window, delay = impose(hexapod, "1", 0.5, RATE_HZ, 4), 5, 2e-3
+    random = np.random.default_rng(5)
+    samples = motion.signals + random.normal(0.0, 1.0, motion.signals.shape) * np.array([0.002, 0.02, 0.0])[:, None, None]
+    zeros, count = random.normal(0.0, 0.03, 6), len(samples)
+    readings = leg_lengths(hexapod, motion.positions, motion.rotations) + zeros + random.normal(0.0, 3e-6, (count, 6))
+    used = np.ones((count, 6))
+    used[103:202, 2] = used[:, 4] = 0.0
+    parameters = filter_parameters(FusionSettings(length_noise=3e-6), RATE_HZ, errors, None, lengths=True)
+    geometry, state = sensor_geometry(hexapod)[()], np.zeros((), FILTER_STATE)
+    turn = (motion.rotations[1] @ motion.rotations[0].T - np.eye(3)) * RATE_HZ
+    velocity = (motion.positions[1] - motion.positions[0]) * RATE_HZ
+    twist = np.array([*velocity, turn[2, 1], turn[0, 2], turn[1, 0]])
+    start = motion.positions[0] + 3e-3, rotation_of([0.006, -0.006, 0.006]) @ motion.rotations[0], twist
+    twin = Twin(parameters, hexapod, errors, *start)
+    start_filter(parameters[()], state[()], 0.0, *start)
+    start_lengths(state[()], zeros)
+    twin.read = twin.read + zeros
+    for i in range(1, count):
+        accumulate_sample(state[()], samples[i], np.ones((2, 7)), i / RATE_HZ - delay)
+        accumulate_lengths(state[()], readings[i], used[i], i / RATE_HZ)
+        step_filter(parameters[()], geometry, state[()])
+        if i % window == 0:
+            rows = slice(i - window + 1, i + 1)
+            mean, read = samples[rows, :2].mean(axis=0).transpose(1, 0, 2).reshape(7, 6), used[rows].sum(axis=0)
+            of_lengths = (readings[rows] * used[rows]).sum(axis=0) / np.maximum(read, 1.0)
+            times = (np.arange(i - window + 1, i + 1)[:, None] * used[rows]).sum(axis=0) / np.maximum(read, 1.0) / RATE_HZ
+            time = (i - (window - 1) / 2.0) / RATE_HZ - delay
+            twin.update(mean, np.full(7, window), time, of_lengths, read, times - time)
+        if i % window == window - 1 and i > window:
+            found, covariance = twin.zeros()
+            np.testing.assert_allclose(state["position"], twin.position, rtol=0.0, atol=3e-9)
+            np.testing.assert_allclose(state["rotation"], twin.rotation, rtol=0.0, atol=3e-9)
+            np.testing.assert_allclose(state["length_errors"], [found, twin.play], rtol=0.0, atol=3e-9)
+            scale = np.sqrt(np.diag(covariance))
+            difference = (state["covariance"][: len(scale), : len(scale)] - covariance) / np.outer(scale, scale)
+            assert np.abs(difference).max() < 1e-4
+    assert np.linalg.norm(twin.position - motion.positions[i - window]) < 2e-3
 
 
 def test_what_is_known_grows_less_sure_on_the_way_to_the_present(hexapod):
@@ -484,7 +586,7 @@ def test_a_reading_that_changes_counts_less_where_times_are_uncertain(hexapod):
         parameters["timing_variance"] = timing**2
         parameters["variance"] += 5 * (noise * 0.4) ** 2
         state["sample_weight"], state["row"] = 5.0, 0
-        _update_rows(parameters[()], state[()], 42)
+        _update_rows(parameters[()], sensor_geometry(hexapod)[()], state[()], 42)
         found.append(state["covariance"].copy())
     np.testing.assert_allclose(*found, rtol=1e-12, atol=1e-18)
 
@@ -500,7 +602,7 @@ def test_a_force_counts_less_while_steps_of_the_commands_make_it_ripple(hexapod)
         parameters["ripple"] = ripple**2
         parameters["variance"][1] += 5 * noise**2
         state["sample_weight"], state["row"] = 5.0, 0
-        _update_rows(parameters[()], state[()], 42)
+        _update_rows(parameters[()], sensor_geometry(hexapod)[()], state[()], 42)
         found.append(state["covariance"].copy())
     np.testing.assert_allclose(*found, rtol=1e-12, atol=1e-18)
 

@@ -1,0 +1,157 @@
+"""The encoders of the legs: which readings are used, what their zeros are, and the pose with them.
+
+A reading is `length + zero`. Encoders tell how a length changes far better than IMUs do, and incremental ones tell nothing of
+where it began, which the IMUs do. So the pose that the IMUs have is moved to the lengths, as if their zeros were exact, and
+these are the mean differences between readings and the IMUs' lengths. The pose's covariance knows that they are no better than
+that. A zero is exact once its home switch has closed; an absolute encoder's is so from the start.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controller.direct_kinematics.refinement import move_pose, solve_normal_equations, stay_in_plane
+from controller.inverse_kinematics import legs_at
+from controller.rig import elapsed
+from controller.settings import FusionSettings
+from plant.compiled import Record, filled, kernel, record_dtype, shared_kernel
+from plant.encoders import EncoderModel
+from plant.mechanism import LEGS
+from plant.pose import Array
+from plant.vectors import cross, vector
+
+_FORGETTING_S = 30.0
+"""A zero is the mean over all the time that it has been followed, and at most over as long [s]."""
+
+PARAMETERS = record_dtype(
+    count=np.int64,  # how many encoders there are
+    present=(np.int64, LEGS),  # which legs have one
+    absolute=np.int64,  # whether their zeros are known
+    variance=np.float64,  # of a reading about its zero, play included [m^2]
+    zero_variance=np.float64,  # of a zero that is known [m^2]
+    switch=(np.float64, LEGS),  # length at which the home switch closes; NaN without one [m]
+)
+"""Constants of the encoders."""
+
+STATE = record_dtype(
+    reading=(np.float64, LEGS),  # last one [m]
+    rate=(np.float64, LEGS),  # its rate [m/s]
+    home=(np.int64, LEGS),  # last state of the home switch: 1 beyond it, 0 before it, -1 not known
+    used=(np.float64, LEGS),  # 1 if the reading is used
+    excluded=(np.int64, LEGS),  # whether the encoder contradicts the rest
+    zero=(np.float64, LEGS),  # what it reads more than the length [m]
+    followed_for=(np.float64, LEGS),  # how long the zero has been followed; infinite for one that is known [s]
+    off=(np.float64, LEGS),  # reading less zero and the IMUs' length [m]; NaN without a reading
+    information=(np.float64, (6, 6)),  # from here on scratch
+    factor=(np.float64, (6, 6)),
+    correction=(np.float64, 6),
+    row=(np.float64, 6),
+    scratch=(np.float64, 6),
+)
+"""State of the encoders."""
+
+
+def encoder_parameters(model: EncoderModel | None, fusion: FusionSettings, legs: int) -> Record:
+    """The constants of the encoders (dtype `PARAMETERS`); none are present without a model."""
+    p = filled(
+        PARAMETERS,
+        count=0 if model is None else legs,
+        present=[model is not None and leg < legs for leg in range(LEGS)],
+        absolute=model is not None and model.absolute,
+        variance=fusion.length_noise**2 + fusion.length_play**2,
+        zero_variance=fusion.length_zero**2,
+        switch=np.nan,
+    )
+    if model is not None:
+        p["switch"][: len(model.switches)] = model.switches
+    return p
+
+
+@shared_kernel
+def screen_encoders(p: Record, s: Record, silent: int, readings: Array, rates: Array, home: NDArray[np.int64]) -> None:
+    """Before a cycle: take readings [m], rates [m/s] and home switches (6,), and find out which of them can be used.
+
+    Args:
+        silent: for how many cycles the rig has not answered.
+    """
+    for k in range(LEGS):
+        s.reading[k], s.rate[k] = readings[k], rates[k]
+        good = p.present[k] != 0 and silent == 0 and np.isfinite(readings[k]) and s.excluded[k] == 0
+        s.used[k] = 1.0 if good else 0.0
+        switched = good and home[k] >= 0 and s.home[k] >= 0 and home[k] != s.home[k]
+        if switched and np.isfinite(p.switch[k]):
+            s.zero[k] = readings[k] - p.switch[k]
+            s.followed_for[k] = np.inf
+        if good:
+            s.home[k] = home[k]
+
+
+@kernel
+def compare_lengths(p: Record, s: Record, rig: Record, pose: Record) -> None:
+    """Find by how much the encoders' lengths are off those of the pose, which the IMUs have; a zero begins there."""
+    legs_at(
+        rig.geometry.base_joints, rig.geometry.platform_joints, pose.position, pose.rotation, pose.arms, pose.directions,
+        pose.lengths,
+    )  # fmt: skip
+    for k in range(rig.legs):
+        if s.used[k] != 0.0 and s.followed_for[k] == 0.0 and p.absolute == 0:
+            s.zero[k] = s.reading[k] - pose.lengths[k]
+        s.off[k] = s.reading[k] - s.zero[k] - pose.lengths[k]
+
+
+@kernel
+def move_to_lengths(p: Record, s: Record, rig: Record, time: Record, pose: Record) -> bool:
+    """Move the pose that has just been compared to the encoders' lengths; False if that has no solution."""
+    for i in range(6):
+        s.correction[i] = 0.0
+        for j in range(i + 1):
+            s.information[i, j] = pose.information[i, j]
+    used = 0
+    for k in range(rig.legs):
+        if s.used[k] == 0.0:
+            continue
+        used += 1
+        d, turn, row = pose.directions[k], cross(vector(pose.arms[k]), vector(pose.directions[k])), s.row
+        for i in range(3):
+            row[i], row[3 + i] = d[i], turn[i]
+        _follow_zero(p, s, elapsed(rig, time), k)
+        uncertain = p.zero_variance if s.followed_for[k] == np.inf else _variance_along(row, pose.factor, s.scratch)
+        weight, known = 1.0 / p.variance, 1.0 / (p.variance + uncertain)
+        for i in range(6):
+            s.correction[i] += weight * s.off[k] * row[i]
+            for j in range(i + 1):
+                s.information[i, j] += weight * row[i] * row[j]
+                pose.information[i, j] += known * row[i] * row[j]
+    if used == 0:
+        return True
+    if rig.planar != 0:
+        stay_in_plane(s.information, s.correction)
+        stay_in_plane(pose.information, pose.correction)
+    if not solve_normal_equations(s.information, s.correction, s.factor):
+        return False
+    move_pose(s.correction, pose.position, pose.rotation)
+    return True
+
+
+@kernel
+def _follow_zero(p: Record, s: Record, passed: float, k: int) -> None:
+    """Take what the encoder of leg `k` reads more than the IMUs' length into the mean that is its zero."""
+    if p.absolute != 0:
+        s.followed_for[k] = np.inf
+    s.followed_for[k] += passed
+    if s.followed_for[k] < np.inf:
+        change = passed / min(s.followed_for[k], _FORGETTING_S) * s.off[k]
+        s.zero[k] += change
+        s.off[k] -= change
+
+
+@kernel
+def _variance_along(row: Array, factor: Array, scratch: Array) -> float:
+    """The variance along a row (6,) of a pose whose information has this Cholesky factor (6, 6)."""
+    variance = 0.0
+    for i in range(6):
+        scratch[i] = row[i]
+        for j in range(i):
+            scratch[i] -= factor[i, j] * scratch[j]
+        scratch[i] /= factor[i, i]
+        variance += scratch[i] * scratch[i]
+    return variance

@@ -1,0 +1,93 @@
+"""Encoders in the closed loop: how good the pose is with them, where it is at power-on, and what is told when one is wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from controller.safety.causes import Cause, Mode
+from hil.faults.links import run
+from hil.faults.rows import Drawn
+from hil.runs.config import SimulationConfig
+from hil.runs.simulation import simulate
+from plant.pose import pose_errors, rotations_from_quaternions
+from plant.truth import TRUTH_LENGTHS, TRUTH_POSITION, TRUTH_QUATERNION
+
+SINES = SimulationConfig(target="sines", duration=20.0, fusion="whole", lengths="incremental")
+
+
+def errors_of(records):
+    """Errors of the pose in motion (N, 6) [mm, deg]."""
+    records = records[records["mode"] == Mode.RUNNING]
+    rotations = rotations_from_quaternions(np.ascontiguousarray(records["truth"][:, TRUTH_QUATERNION]))
+    errors = pose_errors(records["position"], records["rotation"], records["truth"][:, TRUTH_POSITION], rotations)
+    return errors.reshape(-1, 6) * np.repeat([1e3, np.degrees(1.0)], 3)
+
+
+def rms(errors):
+    return np.sqrt((errors.reshape(-1, 2, 3) ** 2).sum(axis=2).mean(axis=0))
+
+
+@pytest.mark.parametrize(
+    ("changes", "absolute", "relative"),
+    [
+        ({}, (0.10, 0.02), (0.03, 0.006)),
+        ({"fusion": "compiled"}, (0.4, 0.1), (0.06, 0.01)),
+        ({"lengths": "absolute"}, (0.03, 0.006), (0.01, 0.003)),
+        ({"lengths": "absolute", "fusion": "compiled", "imus": (0, 1, 2, 6)}, (0.03, 0.006), (0.01, 0.003)),
+        ({"rate": 250.0, "seed": 4}, (0.10, 0.02), (0.03, 0.006)),
+    ],
+)
+def test_the_pose_is_as_repeatable_as_the_encoders(changes, absolute, relative):
+    """In the second half of a run: absolute, and without the constant error."""
+    errors = errors_of(simulate(replace(SINES, **changes)).records)
+    late = errors[len(errors) // 2 :]
+    assert (rms(late) < absolute).all()
+    assert (rms(late - late.mean(axis=0)) < relative).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_at_power_on_the_pose_is_known_without_homing(seed):
+    records = simulate(replace(SINES, target="hold", duration=0.3, seed=seed)).records
+    rotations = rotations_from_quaternions(np.ascontiguousarray(records["truth"][:, TRUTH_QUATERNION]))
+    errors = pose_errors(records["position"], records["rotation"], records["truth"][:, TRUTH_POSITION], rotations)
+    position, rotation = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2).T
+    for cycle, most, turned in ((100, 1.5, 0.4), (300, 1.0, 0.3)):
+        assert 1e3 * position[cycle] < most and np.degrees(rotation[cycle]) < turned
+
+
+@pytest.mark.parametrize("link", ["fmu", "udp", "canopen"])
+@pytest.mark.parametrize("fault", ["jumps:2,size_mm=2", "reversed:2", "slips:2,size_percent=20", "frozen:2"])
+def test_an_encoder_that_is_wrong_is_named_and_left_out(fault, link):
+    """Before it is 1 mm off or within 50 ms, whichever is later; the pose is hardly moved."""
+    begin, text = 3.0, f"encoder-{fault},at=3"
+    config = replace(SINES, duration=4.0, fusion="compiled", rate=500.0, faults=(text,) if link == "fmu" else ())
+    records, first, cause = run(Drawn(config, link, (text,), frozenset(), begin))
+    told = np.argwhere(records["event_cause"] == Cause.ENCODER_CONTRADICTED)
+    assert cause == Cause.END_OF_MOTION and len(told) == 1
+    cycle, slot = told[0]
+    assert records["event_index"][cycle, slot] == 2
+    off = records["length"][:, 2] - records["truth"][:, TRUTH_LENGTHS][:, 2]
+    beyond = np.flatnonzero(np.abs(off - off[first - 10]) > 1e-3)
+    assert first <= cycle <= max(beyond[0], first + round(0.05 * config.rate))
+    errors = errors_of(records)
+    assert np.linalg.norm(errors[:, :3], axis=1).max() < 1.5
+
+
+def test_an_encoder_that_is_silent_is_told_and_used_again():
+    result = simulate(replace(SINES, duration=4.0, faults=("encoder-dead:1,at=2,for=0.5",)))
+    for event, text in zip(result.events[-2:], ("reads nothing", "is used again"), strict=True):
+        assert event.endswith(f"the encoder of leg 1 {text}")
+    assert np.linalg.norm(errors_of(result.records)[-1000:, :3], axis=1).max() < 0.5
+
+
+def test_an_encoder_that_has_lost_counts_is_used_again_with_a_new_zero():
+    result = simulate(replace(SINES, duration=12.0, fusion="compiled", faults=("encoder-jumps:4,size_mm=3,at=3",)))
+    told = [
+        (Cause(int(cause)), int(index))
+        for row, indices in zip(result.records["event_cause"], result.records["event_index"], strict=True)
+        for cause, index in zip(row, indices, strict=True)
+        if cause in (Cause.ENCODER_CONTRADICTED, Cause.ENCODER_BACK)
+    ]
+    assert told == [(Cause.ENCODER_CONTRADICTED, 4), (Cause.ENCODER_BACK, 4)]
+    assert np.linalg.norm(errors_of(result.records)[-500:, :3], axis=1).max() < 0.6
