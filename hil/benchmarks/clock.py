@@ -45,6 +45,9 @@ _SLICE_S = 2.0
 _BARE_SHARE = 1.0
 _SURE = 1e-3
 """How likely it may be by chance that our loop overran so much more often than the bare one, to be told as an excess."""
+_BURST_S = 0.05
+"""Overruns that follow each other sooner count once: a pause of the host spoils many cycles [s]."""
+
 _LONGEST_US = 20_000
 _ENDLESS = np.iinfo(np.int64).max
 
@@ -55,7 +58,7 @@ def measure_real_time(seconds: dict[float, float], progress: Progress = no_progr
     Returns:
         `rates`: by rate and condition, `compute_us`, `latency_us`, `wake_us`, `cyclictest_us` (None without it), and
         `bare_us` and `bare_wake_us` of the bare loop, each with p50, p99, p999, max and n; `stages_us`; `over_budget`;
-        `missed_own` and `missed_host` periods; in how many cycles ours and the bare loop `overran` their period; `usage`;
+        `missed_own` and `missed_host` periods; how often ours and the bare loop `overran` their period; `usage`;
         `histograms`. `refused`: measures for real time that the machine refuses. `missing`: programs that it lacks.
 
     Raises:
@@ -157,7 +160,8 @@ class _Bench:
         records, period = self._records[:count], 1e9 / self._config.rate
         pool.timing.add(records)
         pool.counts.update(counts)
-        pool.overran[0] += int((np.minimum(records["stage_ns"].sum(axis=1), records["cpu_ns"]) > period).sum())
+        busy = np.minimum(records["stage_ns"].sum(axis=1), records["cpu_ns"])
+        pool.overran[0] += count_bursts(busy > period, self._config.rate)
         if self._cyclictest:
             self._run_cyclictest(pool.cyclictest)
         if self._compare:
@@ -165,7 +169,7 @@ class _Bench:
             durations: Record = _in_a_process(self._bare, work)
             pool.bare_wake.add(durations[:, 0])
             pool.bare.add(durations[:, 1])
-            pool.overran[1] += int((durations[:, 1] > period).sum())
+            pool.overran[1] += count_bursts(durations[:, 1] > period, self._config.rate)
 
     def _ours(self) -> tuple[int, dict[str, Any]]:
         with prepared_loop(self._config, self._records) as loop:
@@ -349,13 +353,19 @@ def gross_excess(figures: dict[str, Any]) -> list[str]:
             compute, faults = measured["compute_us"]["p50"], measured["usage"]["major_faults"]
             slow, overran = compute / max(measured["bare_us"]["p50"], 1.0), measured["overran"]
             checks = (
-                (_own_overruns(measured), f"ours overran in {overran['ours']} cycles, the bare loop in {overran['bare']}"),
+                (_own_overruns(measured), f"ours overran {overran['ours']} times, the bare loop {overran['bare']}"),
                 (not figures["refused"] and faults, f"{faults:g} major page faults in the loop"),
                 (condition == IDLE and compute > 100.0, f"computing takes {compute:.0f} us"),
                 (slow > 10.0, f"computing takes {slow:.0f} times as long as a bare loop of the same work"),
             )
             found += [f"{rate} Hz, {condition}: {text}" for exceeded, text in checks if exceeded]
     return found
+
+
+def count_bursts(overran: NDArray[np.bool_], rate: float) -> int:
+    """How often cycles (N,) at this rate [Hz] overran their period, bursts counted once."""
+    cycles = np.flatnonzero(overran)
+    return int(len(cycles) > 0) + int((np.diff(cycles) > _BURST_S * rate).sum())
 
 
 def _own_overruns(measured: dict[str, Any]) -> bool:

@@ -103,7 +103,7 @@ def _print_condition(title: str, measured: dict[str, Any]) -> None:
         text = f"; woken late over cyclictest: {_ratios(measured['wake_us'], measured['cyclictest_us'])}"
     print(
         f"periods missed by own work {measured['missed_own']}, by the host {measured['missed_host']}; "
-        f"cycles longer than a period {measured['overran']['ours']}, of the bare loop {measured['overran']['bare']}; "
+        f"overran its period {measured['overran']['ours']} times, the bare loop {measured['overran']['bare']}; "
         f"page faults {used['major_faults']:g} major, {used['minor_faults']:g} minor; involuntary switches "
         f"{used['involuntary_switches']:g}; growth {used['resident']:g} bytes{text}"
     )

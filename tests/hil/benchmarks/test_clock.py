@@ -52,7 +52,7 @@ def test_the_check_passes_what_is_measured_and_fails_gross_excess(figures):
 
     # The host of a virtual machine holds up a few cycles of either loop.
     assert changed(overran={"ours": 3, "bare": 0}) == changed(overran={"ours": 300, "bare": 290}) == []
-    assert changed(overran={"ours": 30, "bare": 2}) == ["500 Hz, idle: ours overran in 30 cycles, the bare loop in 2"]
+    assert changed(overran={"ours": 30, "bare": 2}) == ["500 Hz, idle: ours overran 30 times, the bare loop 2"]
     slow = dict.fromkeys(("p50", "p99", "p999", "max"), 900.0) | {"n": 1000}
     assert any("computing takes 900 us" in text for text in changed(compute_us=slow))
     if not measured["refused"]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hil.benchmarks import clock
-from hil.benchmarks.clock import BUSY, IDLE, _Pool, _take_turns, durations_of, gross_excess
+from hil.benchmarks.clock import BUSY, IDLE, _Pool, _take_turns, count_bursts, durations_of, gross_excess
 from hil.benchmarks.kinematics import _score
 from hil.loop.records import RECORD
 from hil.reports.benchmark import _sentence
@@ -28,10 +28,10 @@ def measured(compute=10.0, bare=9.0, overran=(0, 0), faults=0):
         (BUSY, {"compute": 91.0}, [], ["computing takes 10 times as long as a bare loop of the same work"]),
         # 0.45^8 is 1.7e-3, and 0.45^9 less than 1e-3.
         (IDLE, {"overran": (8, 0)}, [], []),
-        (IDLE, {"overran": (9, 0)}, ["x"], ["ours overran in 9 cycles, the bare loop in 0"]),
+        (IDLE, {"overran": (9, 0)}, ["x"], ["ours overran 9 times, the bare loop 0"]),
         (BUSY, {"overran": (90, 100)}, [], []),
         (BUSY, {"overran": (0, 100)}, [], []),
-        (BUSY, {"overran": (120, 80)}, [], ["ours overran in 120 cycles, the bare loop in 80"]),
+        (BUSY, {"overran": (120, 80)}, [], ["ours overran 120 times, the bare loop 80"]),
         (IDLE, {"faults": 1}, [], ["1 major page faults in the loop"]),
         (IDLE, {"faults": 1}, ["locked memory"], []),
     ],
@@ -96,3 +96,10 @@ def test_a_pose_is_found_within_a_micrometre_and_a_microradian():
     found = [off(0), off(1, 0.9e-6), off(2, 0.0, 0.9e-6), off(3, 1.1e-6), off(4, 0.0, -1.1e-6), off(5, 0.1, 0.1), None, None]
     assert _score(found, truth) == {"success": 3 / 8, "wrong": 3 / 8}
     assert _score([None] * 8, truth) == {"success": 0.0, "wrong": 0.0}
+
+
+def test_a_pause_that_spoils_many_cycles_counts_once():
+    overran = np.zeros(4000, bool)
+    assert count_bursts(overran, 4000.0) == 0
+    overran[[100, 101, 102, 290, 1000, 1201, 3999]] = True
+    assert count_bursts(overran, 4000.0) == 4

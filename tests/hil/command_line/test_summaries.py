@@ -405,10 +405,10 @@ def test_a_condition_of_the_clock_is_printed(tables, capsys):
     ]
     assert tables[1] == tables[0][:-1]
     assert capsys.readouterr().out.splitlines() == [
-        "periods missed by own work 5, by the host 6; cycles longer than a period 7, of the bare loop 8; page faults 1 major, "
+        "periods missed by own work 5, by the host 6; overran its period 7 times, the bare loop 8; page faults 1 major, "
         "2 minor; involuntary switches 3; growth 4096 bytes; woken late over cyclictest: p50 0.10, p99.9 0.10",
         "within the timing budget (hil/loop/budget.toml)",
-        "periods missed by own work 5, by the host 6; cycles longer than a period 7, of the bare loop 8; page faults 1 major, "
+        "periods missed by own work 5, by the host 6; overran its period 7 times, the bare loop 8; page faults 1 major, "
         "2 minor; involuntary switches 3; growth 4096 bytes",
         "over budget: a, b",
     ]
