@@ -30,7 +30,13 @@ from controller.estimation.integrity import stage as integrity
 from controller.estimation.integrity.protection import end_level
 from controller.estimation.whole_mechanism import trust
 from controller.estimation.whole_mechanism.imu_errors import ERRORS
-from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, MOST_STATES, filter_parameters, ripple_at
+from controller.estimation.whole_mechanism.parameters import (
+    ALL_ERRORS,
+    LENGTH_ERRORS,
+    MOST_STATES,
+    filter_parameters,
+    ripple_at,
+)
 from controller.estimation.whole_mechanism.readings import MOTION_STATES, RIG_ERRORS
 from controller.imu_set import are_few, check_imus, imus_of
 from controller.inverse_kinematics import legs_at
@@ -78,6 +84,7 @@ PARAMETER_LIMITS: Limits = {
     "integrity.filter.window": (2, MOST),
     "mechanism.filter.errors": (0, ERRORS),
     "mechanism.filter.rig": (0, RIG_ERRORS),
+    "mechanism.filter.lengths": (0, LENGTH_ERRORS),
     "mechanism.filter.states": (MOTION_STATES, MOST_STATES),
 }
 """Least and greatest of the constants that count, index or divide."""

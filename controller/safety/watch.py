@@ -236,10 +236,10 @@ def check_carried(
         w.variance[1] = max(w.variance[1], mechanism.filter.published_covariance[i, i])
     if shaking.told == 0 and shaking.bridging == 0:
         w.calm_variance[:] = w.variance
+    source = 0
     if mechanism.trusted != 0:
-        worst = -1
-    variance = w.variance[mechanism.trusted]
-    limit = p.watch.carried + w.calm_variance[mechanism.trusted]
+        source, worst = 1, -1
+    variance, limit = w.variance[source], p.watch.carried + w.calm_variance[source]
     if variance > limit and s.mode == Mode.RUNNING:
         handle_cause(p, s, rig, time, reference, pid, Cause.NOT_CARRIED, worst, np.sqrt(variance), np.sqrt(limit))
 
