@@ -58,7 +58,10 @@ def main(arguments: list[str] | None = None) -> int:
         with suppress(OSError):
             print(f"gough: the output cannot be written: {error.strerror}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, ImportError) as error:
+        # Ctrl-C while an extension module initialises itself is an error of the import.
+        if not isinstance(error, KeyboardInterrupt) and not isinstance(error.__cause__, KeyboardInterrupt):
+            raise
         print("gough: interrupted", file=sys.stderr)
         return INTERRUPTED
     return status

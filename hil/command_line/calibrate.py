@@ -35,7 +35,12 @@ _DEFAULT_RIG = SimulationConfig(imu="mpu9150")
         "recordings of a rig that rested and shook, from which to take mechanism, IMUs, rate and data",
         nargs="+",
     ),
-    cli.flag("--lengths", "the rig measures by how much its lengths change (to 50 um)"),
+    cli.argument(
+        "--lengths",
+        action="store_true",
+        dest="changes_of_lengths",
+        help="the rig measures by how much its lengths change (to 50 um)",
+    ),
     cli.flag("--known-poses", "write the mounting alone, by comparing with the planned poses, as in the paper's section 7"),
     cli.report("write a report with plots"),
     cli.output("--picture", "FILE.svg", "draw the accuracy of each stage"),
@@ -64,7 +69,7 @@ def gough_calibrate_rig(options: Namespace) -> None:
             names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
             raise InputError(f"the recordings say what {names} would: leave it out with --recording")
     prior = Prior(tilt=radians(options.tilt), joints=1e-3 * options.joints)
-    knowledge = Knowledge(prior, options.home, options.lengths, options.known_poses)
+    knowledge = Knowledge(prior, options.home, options.changes_of_lengths, options.known_poses)
     config = cli.config_of(options, SimulationConfig)
     label = "recorded IMUs are calibrated" if options.recording else f"{config.mechanism} calibrates its IMUs"
     with progress_bar(label) as progress:

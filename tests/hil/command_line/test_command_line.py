@@ -5,10 +5,12 @@ import re
 import subprocess
 import sys
 import zipfile
+from argparse import Namespace
 from pathlib import Path
 
 import pytest
 
+from hil import command_line
 from tests.hil.commands import gough
 
 HEADER = "time_s,x_m,y_m,z_m,qw,qx,qy,qz"
@@ -158,3 +160,12 @@ def test_bench_prints_every_stage(tmp_path):
         assert stage in run.stdout
         assert 0.0 <= percentiles["p50"] <= percentiles["p99"] <= percentiles["p999"] <= percentiles["max"]
     assert figures["filterpy_slowdown"] > 1.0
+
+
+def test_ctrl_c_while_an_extension_is_imported_is_an_interruption(monkeypatch, capsys):
+    def interrupted(options):
+        raise ImportError("initialization failed") from KeyboardInterrupt()
+
+    monkeypatch.setattr(command_line, "parse", lambda arguments: Namespace(run=interrupted))
+    assert command_line.main([]) == 130
+    assert capsys.readouterr().err == "gough: interrupted\n"
