@@ -157,6 +157,9 @@ def _agrees_again(
     if w.agreed_for[k] < _AGREED_S or w.range[k, 1] - w.range[k, 0] < _MOVED_M:
         return False
     encoders.excluded[k] = 0
-    encoders.zero[k] += 0.0 if encoder_parameters.absolute != 0 else w.mean[k]
-    w.mean[k] = 0.0 if encoder_parameters.absolute == 0 else w.mean[k]
+    if encoder_parameters.absolute == 0:
+        # Even one that a home switch has told is now known from the IMUs alone.
+        encoders.zero[k] += w.mean[k]
+        encoders.followed_for[k] = min(encoders.followed_for[k], _AGREED_S)
+        w.mean[k] = 0.0
     return True

@@ -8,8 +8,8 @@ from controller.planning import STREAM_TARGET
 from hil.option import integers, option
 from hil.runs.names import name_objects
 from plant.checks import check_duration, check_rate, checked_seed, nearest
+from plant.encoders import NO_LENGTHS, EncoderFault, encoder_fault
 from plant.encoders import PREFIX as ENCODER_PREFIX
-from plant.encoders import EncoderFault, encoder_fault
 from plant.errors import InputError, UnknownNameError
 from plant.fmu.settings import Setting
 from plant.imu_disturbances import BASE_PREFIX, Disturbance, disturbance_of_text
@@ -119,7 +119,9 @@ class SimulationConfig:
         0.0, "simulated: standard deviation of each coordinate of the joints from their places", unit="mm"
     )
     lengths: str = option(
-        "none", "encoders of the legs' lengths: none, incremental, absolute, or a TOML file (docs/encoders.md)", metavar="KIND"
+        NO_LENGTHS,
+        "encoders of the legs' lengths: none, incremental, absolute, or a TOML file (docs/encoders.md)",
+        metavar="KIND",
     )
     magnetometer: bool = option(False, "the platform's magnetometer gives its heading")
     rig: str = option(
@@ -163,7 +165,11 @@ class SimulationConfig:
                 f"--fault is for a simulated plant, not for the rig {self.rig}: tell it to 'gough emulate' or 'inject'"
             )
         # Refuses words that none understands.
-        self.base_motions, self.disturbances, self.encoder_faults  # noqa: B018
+        self.base_motions, self.disturbances  # noqa: B018
+        if self.encoder_faults and self.lengths == NO_LENGTHS:
+            raise InputError("--fault breaks an encoder, and there is none: add --lengths incremental, or leave the fault out")
+        if self.lengths != NO_LENGTHS and self.fusion == "section-5":
+            raise InputError("the paper's section 5 takes no lengths: leave --lengths out, or take another --fusion")
 
     @property
     def disturbances(self) -> list[Disturbance]:

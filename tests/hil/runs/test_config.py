@@ -87,3 +87,15 @@ def test_the_emulated_drives_have_one_watchdog():
     assert EmulatorConfig().watchdog == WATCHDOG_S
     with pytest.raises(InputError, match="the watchdog is 0 ms"):
         EmulatorConfig(watchdog=0.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"faults": ("encoder-dead:2",)}, "--fault breaks an encoder, and there is none: add --lengths"),
+        ({"lengths": "incremental", "fusion": "section-5", "magnetometer": True}, "section 5 takes no lengths"),
+    ],
+)
+def test_what_would_do_nothing_with_encoders_is_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        SimulationConfig(**changes)
