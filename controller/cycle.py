@@ -1,6 +1,7 @@
 """The cycle: everything between raw IMU data and the six commands, the paper's Figure 4, as one compiled function.
 
-    raw IMU data -> screening -> leg, platform and heading filters -> closed form -> refinement -> whole-mechanism filter
+    raw IMU data -> screening -> the base's motion taken out -> leg, platform and heading filters
+        -> closed form -> refinement -> whole-mechanism filter
         -> inverse kinematics -> reference - length -> feed-forward and PID -> commands
 
 The cycle allocates nothing, raises nothing and knows no clock: time is counted in periods, missed ones included. Each stage
@@ -25,13 +26,23 @@ from controller import load_feed_forward, pid, reference
 from controller import safety as safety_stage
 from controller.calibration.file import Calibration
 from controller.direct_kinematics.geometry import LINEAR_RANK
-from controller.estimation import encoders, heading_filter, imu_health, imu_monitor, leg_filter, platform_filter, pose_estimator
+from controller.estimation import (
+    base_imu,
+    encoders,
+    heading_filter,
+    imu_health,
+    imu_monitor,
+    leg_filter,
+    platform_filter,
+    pose_estimator,
+)
 from controller.estimation.integrity import stage as integrity
 from controller.estimation.integrity.protection import end_level
 from controller.estimation.whole_mechanism import trust
 from controller.estimation.whole_mechanism.imu_errors import ERRORS
 from controller.estimation.whole_mechanism.parameters import (
     ALL_ERRORS,
+    BASE_ERRORS,
     LENGTH_ERRORS,
     MOST_STATES,
     filter_parameters,
@@ -63,6 +74,7 @@ _LEAST_EVIDENCE_HZ = 125.0
 PARAMETERS = record_dtype(
     rig=RIG,
     imus=imu_health.PARAMETERS,
+    base=base_imu.PARAMETERS,
     encoders=encoders.PARAMETERS,
     legs=leg_filter.PARAMETERS,
     platform=platform_filter.PARAMETERS,
@@ -85,6 +97,7 @@ PARAMETER_LIMITS: Limits = {
     "mechanism.filter.errors": (0, ERRORS),
     "mechanism.filter.rig": (0, RIG_ERRORS),
     "mechanism.filter.lengths": (0, LENGTH_ERRORS),
+    "mechanism.filter.base": (0, BASE_ERRORS),
     "mechanism.filter.states": (MOTION_STATES, MOST_STATES),
 }
 """Least and greatest of the constants that count, index or divide."""
@@ -92,6 +105,7 @@ PARAMETER_LIMITS: Limits = {
 STATE = record_dtype(
     time=TIME,
     imus=imu_health.STATE,
+    base=base_imu.STATE,
     encoders=encoders.STATE,
     legs=leg_filter.STATE,
     platform=platform_filter.STATE,
@@ -148,6 +162,7 @@ def cycle_parameters(
     command_delay: float = 0.0,
     to_arm: bool = True,
     encoder: EncoderModel | None = None,
+    on_base: bool = False,
 ) -> Record:
     """The constants of the cycle (dtype `PARAMETERS`).
 
@@ -166,6 +181,7 @@ def cycle_parameters(
         command_delay: of the rig, from a sample to the command computed from it [s].
         to_arm: whether the drives are enabled; else everything is read and nothing moves.
         encoder: the kind of the encoders; None without encoders.
+        on_base: whether there is an IMU on the base.
 
     Raises:
         InputError: a rate out of range, an IMU that cannot be, IMUs that do not determine the pose, or a limit of the
@@ -182,7 +198,16 @@ def cycle_parameters(
         )
     present = imus_of(mechanism, imus)
     errors, of_heading = (calibration.covariance, calibration.floor), field if magnetometer else None
-    filtered = filter_parameters(fusion, rate, whole, *errors, of_heading, ripple=ripple_at(rate), lengths=encoder is not None)
+    if on_base and magnetometer:
+        raise InputError(
+            "the field of the earth turns in the frame of a base that moves: leave out --magnetometer or --base-imu"
+        )
+    if on_base:
+        fusion = base_imu.with_its_noise(fusion)
+    filtered = filter_parameters(
+        fusion, rate, whole, *errors, of_heading, ripple=ripple_at(rate), lengths=encoder is not None, base=on_base
+    )
+    prior = filtered["prior"][:ALL_ERRORS, :ALL_ERRORS] + (base_imu.shared_errors(mechanism, fusion) if on_base else 0.0)
     able = not _without_evidence(mechanism, rate, section_5)
     if min(watched.protection_position, watched.protection_rotation) < np.inf and not (able and watched.watch_imus):
         raise InputError(
@@ -200,13 +225,16 @@ def cycle_parameters(
         PARAMETERS,
         rig=rig_parameters(mechanism, rate, control.hold, calibration.tilt),
         imus=imu_health.imu_parameters(present, calibration.gain, calibration.offset, fusion, watched, rate),
+        base=base_imu.base_imu_parameters(mechanism, fusion, on_base, calibration.base_gain, calibration.base_offset),
         encoders=encoders.encoder_parameters(encoder, fusion, mechanism.legs),
         legs=leg_filter.leg_parameters(fusion, rate),
         platform=platform_filter.platform_parameters(fusion, rate, limits.jerk),
         heading=heading_filter.heading_parameters(fusion, rate, field, magnetometer),
         pose=pose_estimator.pose_parameters(fusion, section_5),
         mechanism=trust.trust_parameters(fusion, rate, filtered),
-        integrity=integrity.integrity_parameters(fusion, rate, filtered["prior"][:ALL_ERRORS, :ALL_ERRORS], watch_evidence),
+        integrity=integrity.integrity_parameters(
+            fusion, rate, prior, watch_evidence, base_imu.SHARED_NOISE if on_base else 1.0
+        ),
         load=load_feed_forward.load_parameters(mechanism, command_delay),
         pid=pid.pid_parameters(control, limits.velocity),
         safety=safety_stage.safety_parameters(watched, drive_settings or DriveSettings(), mechanism, rate, to_arm),
@@ -265,6 +293,11 @@ def run_stages(
         imu_health.screen_imus(
             p.imus, s.imus, rig, time, s.safety.watch.silent, measurement, s.reference.motion, s.safety.events
         )  # fmt: skip
+        if p.base.present != 0:
+            base_imu.take_base_out(
+                p.base, s.base, p.safety, s.safety, rig, time, s.imus, s.legs, p.platform, s.platform, s.pose, s.reference,
+                s.pid,
+            )  # fmt: skip
         t = _mark(m, CycleStage.SCREENING, t)
     if first <= CycleStage.LEGS < last:
         leg_filter.step_leg_filters(p.legs, s.legs, rig, time, s.imus)
@@ -368,7 +401,8 @@ def _control(parameters: Record, state: Record, segments: Array) -> int:
     if s.safety.request != Request.ENABLED or s.safety.mode < Mode.RUNNING:
         pid.hold_still(s.pid, rig.legs)
     else:
-        load_feed_forward.find_feed_forward(p.load, s.load, rig, pose, s.reference)
+        up, gravity = base_imu.vertical(p.base, s.base, rig)
+        load_feed_forward.find_feed_forward(p.load, s.load, rig, pose, s.reference, up, gravity)
         pid.step_pid(p.pid, s.pid, s.load.feed_forward, elapsed(rig, time))
         watch.check_oscillation(
             p.safety, s.safety, rig, time, s.imus.shaking, s.load.feed_forward, s.reference, s.pid
@@ -416,6 +450,14 @@ def hear_encoders(
 ) -> None:
     """Before a cycle: take the encoders' readings, as `controller.estimation.encoders.screen_encoders` has it."""
     encoders.screen_encoders(parameters[()].encoders, state[()].encoders, silent, readings, rates, home)
+
+
+@kernel
+def hear_base_imu(parameters: Record, state: Record, reading: Array, age: int) -> None:
+    """Before a cycle: take the reading of the base's IMU, as `controller.estimation.base_imu.hear_base_imu` has it."""
+    p, s = parameters[()], state[()]
+    if p.base.present != 0:
+        base_imu.hear_base_imu(p.base, s.base, elapsed(p.rig, s.time), reading, age)
 
 
 @kernel

@@ -11,7 +11,7 @@ from controller.inverse_kinematics import jacobian_at
 from controller.least_squares import RANK_TOLERANCE, solve_least_squares
 from plant.compiled import Record, filled, kernel, record_dtype
 from plant.mechanism import LEGS, Mechanism
-from plant.vectors import cross, dot, rotate, scale, subtract, vector
+from plant.vectors import Vector, cross, dot, rotate, scale, subtract, vector
 
 PARAMETERS = record_dtype(
     command_delay=np.float64,  # of the rig, from a sample to the command computed from it [s]
@@ -60,9 +60,10 @@ def load_parameters(mechanism: Mechanism, command_delay: float) -> Record:
 
 
 @kernel
-def find_feed_forward(p: Record, s: Record, rig: Record, pose: Record, reference: Record) -> None:
-    """Write the feed-forward of each leg, and the load of its drive."""
-    up, gravity = vector(rig.sensors.up_in_base[0]), rig.sensors.gravity
+def find_feed_forward(
+    p: Record, s: Record, rig: Record, pose: Record, reference: Record, up: Vector, gravity: float
+) -> None:  # fmt: skip
+    """Write the feed-forward of each leg, and the load of its drive; `up` is the vertical in {1}, `gravity` in m/s^2."""
     wrench, force = s.wrench, s.force
     jacobian_at(pose.arms, pose.directions, rig.legs, s.jacobian)
     moment = cross(rotate(pose.rotation, vector(p.first_moment)), up)

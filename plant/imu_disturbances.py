@@ -16,7 +16,7 @@ from typing import Any
 
 from plant.errors import InputError, UnknownNameError
 from plant.files import check_entries
-from plant.imu_wiring import ALL_IMUS, IMU_COUNT
+from plant.imu_wiring import ALL_IMUS, BASE_IMU
 
 PREFIX = "imu-"
 """What the text of a disturbance begins with."""
@@ -280,7 +280,7 @@ def axis_in(words: Mapping[str, Any], title: str, can_be_all: bool) -> tuple[flo
 
 
 def _imus(imus: Any, title: str) -> tuple[int, ...]:
-    named = {"all": ALL_IMUS, "legs": ALL_IMUS[:-1]}
+    named = {"all": (*ALL_IMUS, BASE_IMU), "legs": ALL_IMUS[:-1]}
     if isinstance(imus, str) and imus in named:
         return named[imus]
     parts = imus.split("+") if isinstance(imus, str) else [imus] if isinstance(imus, int) else imus
@@ -288,6 +288,6 @@ def _imus(imus: Any, title: str) -> tuple[int, ...]:
         numbers = tuple(sorted({int(str(each)) for each in parts}))
     except (TypeError, ValueError):
         numbers = ()
-    if not numbers or not 0 <= numbers[0] <= numbers[-1] < IMU_COUNT:
-        raise InputError(f"{title} is for imus = {imus!r}; there are 0 to {IMU_COUNT - 1}, several such as 0+2+5, legs and all")
+    if not numbers or not 0 <= numbers[0] <= numbers[-1] <= BASE_IMU:
+        raise InputError(f"{title} is for imus = {imus!r}; there are 0 to {BASE_IMU}, several such as 0+2+5, legs and all")
     return numbers

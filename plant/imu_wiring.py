@@ -11,7 +11,12 @@ PLATFORM_IMU = 6
 
 ALL_IMUS = tuple(range(IMU_COUNT))
 
-_RIGHT_AXES = ("+x+y+z",) * IMU_COUNT
+BASE_IMU = 7
+"""Number of the IMU on the base, where there is one."""
+
+SLOTS = BASE_IMU + 1
+
+RIGHT_AXES = "+x+y+z"
 
 
 @dataclass(frozen=True)
@@ -24,8 +29,8 @@ class Wiring:
     """
 
     places: tuple[int, ...] = ALL_IMUS
-    gyroscopes: tuple[str, ...] = _RIGHT_AXES
-    accelerometers: tuple[str, ...] = _RIGHT_AXES
+    gyroscopes: tuple[str, ...] = (RIGHT_AXES,) * IMU_COUNT
+    accelerometers: tuple[str, ...] = (RIGHT_AXES,) * IMU_COUNT
 
     def __post_init__(self) -> None:
         if sorted(self.places) != list(ALL_IMUS):

@@ -25,6 +25,8 @@ from controller.estimation.whole_mechanism.imu_errors import ERRORS
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import InputError
 from plant.files import check_entries, read_toml, toml_entries, write_whole
+from plant.imu import MAGNETOMETER
+from plant.imu_wiring import BASE_IMU, SLOTS
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, checked_array, rotation_from_vector, vector_from_rotation
 
@@ -48,6 +50,7 @@ class Calibration:
         tilt: (2,) [rad], turns of the vertical about the axes x and y of {1}.
         joints: (2, 6, 3) [m], corrections of the mechanism's base and platform joints.
         floor: (2,) [m, rad], standard deviations of position and rotation that tilt and joints leave.
+        base_gain, base_offset: (2, 3, 3) and (2, 3), the same of the gyroscope and the accelerometer of an IMU on the base.
         covariance: (147, 147), of the remaining errors, in the order of `imu_errors.ERROR_NAMES` for each IMU, if it is known.
         about: further facts: the rig (`calibrated_rig`), date, residuals.
         remark: what its file does not tell, in a line; "" if it tells all.
@@ -58,6 +61,8 @@ class Calibration:
     tilt: Array = field(default_factory=lambda: np.zeros(2))
     joints: Array = field(default_factory=lambda: np.zeros((2, LEGS, 3)))
     floor: Array = field(default_factory=lambda: np.zeros(2))
+    base_gain: Array = field(default_factory=lambda: np.tile(np.eye(3), (2, 1, 1)))
+    base_offset: Array = field(default_factory=lambda: np.zeros((2, 3)))
     covariance: Array | None = None
     about: dict[str, Any] = field(default_factory=dict)
     remark: str = ""
@@ -143,14 +148,20 @@ def load_calibration(path: Path | str) -> Calibration:
     calibration = Calibration(about=about)
     for name, table in document.items():
         imu = name.removeprefix("imu_")
-        if not (name.startswith("imu_") and imu in map(str, range(IMU_COUNT))):
+        if not (name.startswith("imu_") and imu in map(str, range(SLOTS))):
             raise InputError(
-                f"{path}: no table {name!r} belongs in a calibration; imu_0 to imu_6, about, base, joints, covariance do"
+                f"{path}: no table {name!r} belongs in a calibration; imu_0 to imu_7, about, base, joints, covariance do"
             )
+        known = SENSORS if int(imu) < BASE_IMU else SENSORS[:MAGNETOMETER]
         for sensor, entries in table.items():
-            if sensor not in SENSORS:
-                raise InputError(f"{path}: {name} has no sensor {sensor!r}; it has {', '.join(SENSORS)}")
-            _read_sensor(calibration, SENSORS.index(sensor), int(imu), entries, f"{path}: {name}.{sensor}")
+            if sensor not in known:
+                raise InputError(f"{path}: {name} has no sensor {sensor!r}; it has {', '.join(known)}")
+            gain, offset = _read_sensor(entries, f"{path}: {name}.{sensor}")
+            at = SENSORS.index(sensor)
+            if int(imu) == BASE_IMU:
+                calibration.base_gain[at], calibration.base_offset[at] = gain, offset
+            else:
+                calibration.gain[at, int(imu)], calibration.offset[at, int(imu)] = gain, offset
     check_entries(base, ("tilt", "floor"), f"{path}: base")
     check_entries(joints, _SIDES, f"{path}: joints")
     tilt, floor = (checked_array(base.get(name, (0.0, 0.0)), (2,), f"{path}: base.{name}") for name in ("tilt", "floor"))
@@ -207,7 +218,8 @@ def _hash(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:_DIGEST_SIZE]
 
 
-def _read_sensor(calibration: Calibration, sensor: int, imu: int, entries: Any, where: str) -> None:
+def _read_sensor(entries: Any, where: str) -> tuple[Array, Array]:
+    """The gain (3, 3) and the offset (3,) of a sensor."""
     if not isinstance(entries, dict) or set(entries) - set(_FIELDS):
         raise InputError(f"{where} must be a table of {', '.join(_FIELDS)}")
     values = {entry: checked_array(entries.get(entry, usual), (3,), f"{where}.{entry}") for entry, usual in _FIELDS.items()}
@@ -215,8 +227,8 @@ def _read_sensor(calibration: Calibration, sensor: int, imu: int, entries: Any, 
         raise InputError(f"{where}.scale is {values['scale'].tolist()}; it must be positive")
     if np.abs(values["axes"]).max() > 1.0:
         raise InputError(f"{where}.axes is {values['axes'].tolist()}; an axis is at most 1 off a right angle")
-    calibration.gain[sensor, imu] = join_gain(values["scale"], values["axes"], values["mounting"])
-    calibration.offset[sensor, imu] = calibration.gain[sensor, imu] @ values["bias"]
+    gain = join_gain(values["scale"], values["axes"], values["mounting"])
+    return gain, gain @ values["bias"]
 
 
 def _read_covariance(table: dict[str, ArrayLike], path: Path | str) -> Array:
@@ -242,7 +254,7 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
         OSError: it cannot be written.
     """
     head = [
-        "# Calibration of the IMUs: 0 to 5 on the legs, 6 on the platform.",
+        "# Calibration of the IMUs: 0 to 5 on the legs, 6 on the platform, 7 on the base where there is one.",
         "# calibrated = R(mounting) T(axes) S(scale) (raw + bias)",
         "# Whoever changes a number removes the digest.",
         "",
@@ -258,11 +270,17 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
     if np.abs(calibration.joints).max() >= _LEAST_MOVE_M:
         moves = dict(zip(_SIDES, calibration.joints, strict=True))
         lines += ["", "[joints]  # what must be added to their places, in m", *toml_entries(moves)]
-    for imu, (sensor, name) in product(range(IMU_COUNT), enumerate(SENSORS)):
-        gain, offset = calibration.gain[sensor, imu], calibration.offset[sensor, imu]
+    constants = [
+        (f"imu_{imu}.{name}", UNITS[sensor], calibration.gain[sensor, imu], calibration.offset[sensor, imu])
+        for imu, (sensor, name) in product(range(IMU_COUNT), enumerate(SENSORS))
+    ]
+    if not (np.array_equal(calibration.base_gain, Calibration().base_gain) and not calibration.base_offset.any()):
+        of_base = zip(SENSORS, UNITS, calibration.base_gain, calibration.base_offset, strict=False)
+        constants += [(f"imu_{BASE_IMU}.{name}", unit, gain, offset) for name, unit, gain, offset in of_base]
+    for title, unit, gain, offset in constants:
         scale, axes, mounting = split_gain(gain)
         values = {"bias": np.linalg.solve(gain, offset), "scale": scale, "axes": axes, "mounting": mounting}
-        lines += ["", f"[imu_{imu}.{name}]  # bias in {UNITS[sensor]}, mounting in rad", *toml_entries(values)]
+        lines += ["", f"[{title}]  # bias in {unit}, mounting in rad", *toml_entries(values)]
     if calibration.covariance is not None:
         sigmas = np.sqrt(np.diag(calibration.covariance))
         # Positive definite whatever rounding has done to the correlation.

@@ -9,6 +9,16 @@ from plant.pose import Array
 
 
 @kernel
+def calibrate_reading(gain: Array, offset: Array, reading: Array, calibrated: Array) -> None:
+    """Write the calibrated reading (3,) of a raw one (3,): gain (3, 3) times that, plus offset (3,)."""
+    for i in range(3):
+        total = offset[i]
+        for j in range(3):
+            total += gain[i, j] * reading[j]
+        calibrated[i] = total
+
+
+@kernel
 def calibrate_samples(gain: Array, offset: Array, measurement: Array, sample: Array) -> None:
     """Write the calibrated samples (3, 7, 3) of a raw measurement (3, 7, 3) [rad/s, m/s^2, uT].
 
@@ -18,8 +28,4 @@ def calibrate_samples(gain: Array, offset: Array, measurement: Array, sample: Ar
     """
     for kind in range(3):
         for k in range(IMU_COUNT):
-            for i in range(3):
-                total = offset[kind, k, i]
-                for j in range(3):
-                    total += gain[kind, k, i, j] * measurement[kind, k, j]
-                sample[kind, k, i] = total
+            calibrate_reading(gain[kind, k], offset[kind, k], measurement[kind, k], sample[kind, k])

@@ -205,6 +205,8 @@ class Cause(IntEnum):
         "s",
     )
 
+    BASE_IMU_LOST = 72, "the IMU on the base has no readings that can be used", Reaction.STOP, "s"
+
     NO_POSE_FITS = 66, "no pose fits the IMUs, even without the worst of them", Reaction.QUICK_STOP, "sigma RMS"
 
     @property

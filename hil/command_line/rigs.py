@@ -19,6 +19,7 @@ from plant.errors import InputError
         mechanism={},
         imu={},
         lengths={"text": "encoders that the rig has: none, incremental or absolute"},
+        base_imu={"text": "the rig has an IMU on its base"},
         rate={"default": 200.0, "text": "exchanges per second, 50 to 4000"},
     ),
     cli.flag(
@@ -93,6 +94,7 @@ def gough_check_rig(options: Namespace) -> int:
         "mechanism",
         "imu",
         "lengths",
+        "base_imu",
         "plant",
         "binding",
         "joint_error",

@@ -8,13 +8,14 @@ from hil.faults.rows import Drawn
 from hil.loop.records import RECORD, Link
 from hil.realtime.clock import SCRIPTED, new_clock
 from hil.rigs.emulation import fault, new_emulated
-from hil.rigs.udp.datagrams import VERSION, WITH_LENGTHS
+from hil.rigs.udp.datagrams import version_for
 from hil.rigs.udp.emulator import new_udp_emulator
 from hil.rigs.udp.link import new_link
 from hil.rigs.udp.rig import TIMEOUT_SHARE
 from hil.runs.prepare import PreparedLoop, prepared_loop
 from plant.compiled import Record
 from plant.extras import missing_extras_named
+from plant.imu_wiring import IMU_COUNT
 
 _SESSION = 1
 _REST_S = 5.0
@@ -54,7 +55,7 @@ def join_udp(loop: PreparedLoop, faults: Iterable[Record], seed: int) -> None:
     """
     period = _on_a_bus(loop)
     rig = new_emulated(loop.mechanism, round(1e9 * period), seed, faults)
-    version = WITH_LENGTHS if loop.encoders["legs"] > 0 else VERSION
+    version = version_for(bool(loop.encoders["legs"] > 0), bool(loop.imu["count"] > IMU_COUNT))
     loop.emulator = new_udp_emulator(loop.fmu, loop.imu, loop.encoders, rig, _SESSION, version=version)
     loop.udp = new_link()
     loop.udp.socket["version"] = version
@@ -70,7 +71,12 @@ def _follow_canopen(loop: PreparedLoop, faults: Iterable[Record], seed: int, end
     period = _on_a_bus(loop)
     rig = new_emulated(loop.mechanism, round(1e9 * period), seed, faults)
     lengths = bool(loop.encoders["legs"] > 0)
-    canopen = CanopenInMemory(canopen_settings(), period, lambda: (loop.simulated, loop.imu, loop.encoders, rig), lengths)
+    canopen = CanopenInMemory(
+        canopen_settings(base_imu=loop.imu["count"] > IMU_COUNT),
+        period,
+        lambda: (loop.simulated, loop.imu, loop.encoders, rig),
+        lengths,
+    )
     loop.load(python=True)
     try:
         canopen.open()

@@ -6,7 +6,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from controller.cycle import CycleStage, hear_encoders, hear_rig, prepare_next, react, run_stages, skip_periods
+from controller.cycle import CycleStage, hear_base_imu, hear_encoders, hear_rig, prepare_next, react, run_stages, skip_periods
 from controller.estimation.whole_mechanism.trust import find_covariance
 from controller.planning.plan_handover import STREAM_PATIENCE_S, stream_cause, take_plan
 from controller.reference import motion_cycle
@@ -20,8 +20,9 @@ from hil.rigs.udp.link import UdpLink, exchange_udp, send_command
 from plant.compiled import Record, kernel, shared_kernel, store_release
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
 from plant.encoder_readings import read_encoders
-from plant.fmu.calls import advance, read_imus, read_motors, read_truth, write_command, write_drive_mode
+from plant.fmu.calls import advance, read_base_imu, read_imus, read_motors, read_truth, write_command, write_drive_mode
 from plant.imu import measure
+from plant.imu_wiring import BASE_IMU
 from plant.mechanism import LEGS
 from plant.pose import Array
 from plant.stopwatch import now
@@ -54,9 +55,12 @@ def exchange_fmu(
         status = read_imus(fmu) | read_truth(fmu)
         m = imu[()]
         m.time = fmu[()].time
+        if m.count > BASE_IMU:
+            status = read_base_imu(fmu)
+            m.base[:2] = fmu[()].base_imu
         measure(imu, fmu[()].imu, feedback.measurement)
         if encoders[()].legs > 0:
-            status = read_motors(fmu)
+            status |= read_motors(fmu)
             encoders[()].time = m.time
             read_encoders(encoders, fmu[()].motors, feedback.length, feedback.length_rate, feedback.home)
         feedback.truth[:] = fmu[()].truth
@@ -66,6 +70,10 @@ def exchange_fmu(
             if m.fresh[k] > 0:
                 feedback.sequence[k] += m.fresh[k]
                 feedback.sample_ns[k] = np.int64(np.rint(1e9 * m.sampled_at[k]))
+        if m.fresh[BASE_IMU] > 0:
+            feedback.base_imu[:] = m.reading[:2, BASE_IMU]
+            feedback.base_imu_sequence += m.fresh[BASE_IMU]
+            feedback.base_imu_ns = np.int64(np.rint(1e9 * m.sampled_at[BASE_IMU]))
     return ANSWERED if status == 0 else SILENT + status
 
 
@@ -172,11 +180,15 @@ def process_feedback(parameters: Record, state: Record, work: Record, status: in
         fresh = feedback.sequence[k] != w.sequence[k]
         w.sample_age[k] = 0 if fresh else w.sample_age[k] + 1 + missed
         w.sequence[k] = feedback.sequence[k]
+    fresh = feedback.base_imu_sequence != w.base_imu_sequence
+    w.base_imu_age = 0 if fresh else w.base_imu_age + 1 + missed
+    w.base_imu_sequence = feedback.base_imu_sequence
     if status != ANSWERED and status != SILENT:
         react(parameters, state, Cause.RIG_FAILED, -1, float(status), np.nan)
         ramp_down(p.safety.stop, p.rig, s.time, s.pid)
         return Cause.RIG_FAILED.value
     hear_rig(parameters, state, w.sample_age, feedback.drive, feedback.drive_code, w.silent)
+    hear_base_imu(parameters, state, feedback.base_imu, w.base_imu_age)
     hear_encoders(parameters, state, w.silent, feedback.length, feedback.length_rate, feedback.home)
     return Cause.NONE.value
 
@@ -217,6 +229,8 @@ def record_cycle(parameters: Record, state: Record, clock: Record, work: Record,
     record.length[:] = w.feedback.length
     record.length_rate[:] = w.feedback.length_rate
     record.home[:] = w.feedback.home
+    record.base_imu[:] = w.feedback.base_imu
+    record.base_imu_age, record.base_imu_ns = w.base_imu_age, w.feedback.base_imu_ns
     record.truth[:] = w.feedback.truth
     for k in range(LEGS):
         for i in range(3):

@@ -67,6 +67,7 @@ class Loop:
         self._stream_reader: Record = np.zeros((), STREAM_READER)
         self._work: Record = np.zeros((), WORK)
         self._work["feedback"], self._work["sequence"] = new_feedback(), -1
+        self._work["base_imu_sequence"] = -1
 
     def run(self, last: int, filters: PythonFilters | None = None) -> int:
         """Run up to, not including, cycle `last`; returns 0, or the cause if the run has ended on the brakes."""

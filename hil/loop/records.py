@@ -73,6 +73,9 @@ RECORD_FIELDS = (
     ("length", "f8", LEGS, "m, that each encoder reads; NaN: none; raw"),
     ("length_rate", "f8", LEGS, "m/s, its rate"),
     ("home", "i4", LEGS, "1 beyond the home switch, 0 before it, -1: none"),
+    ("base_imu", "f8", (2, 3), "rad/s and m/s^2, of an IMU on the base; NaN: none; raw"),
+    ("base_imu_age", "i4", (), "cycles since its sample was new"),
+    ("base_imu_ns", "i8", (), "time of its sample on the rig's clock"),
     ("position", "f8", 3, "m, of {2} in {1}"),
     ("rotation", "f8", (3, 3), "row by row, maps {2} to {1}"),
     ("covariance", "f4", (6, 6), "row by row, of translation [m] and rotation [rad] in {1}"),
@@ -126,6 +129,8 @@ WORK = record_dtype(
     silent=np.int64,  # cycles since the rig has answered
     sequence=(np.int64, IMU_COUNT),  # numbers of the last samples
     sample_age=(np.int64, IMU_COUNT),  # cycles since they were new
+    base_imu_sequence=np.int64,  # the same of the IMU on the base
+    base_imu_age=np.int64,
     feedback=FEEDBACK,
     factor=(np.float64, (6, 6)),
     covariance=(np.float64, (6, 6)),

@@ -8,7 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from controller.cycle import MARKS, PARAMETER_LIMITS, PARAMETERS, STATE, cycle, hear_rig, prepare_next, react, skip_periods
+from controller.cycle import (
+    MARKS,
+    PARAMETER_LIMITS,
+    PARAMETERS,
+    STATE,
+    cycle,
+    hear_base_imu,
+    hear_encoders,
+    hear_rig,
+    prepare_next,
+    react,
+    skip_periods,
+)
 from controller.planning import STREAM_TARGET
 from controller.planning.segments import SEGMENT_SIZE
 from controller.safety.causes import Cause
@@ -131,7 +143,7 @@ def _replay(
     parameters: Record, state: Record, segments: Array, records: Record, again: Record, marks: Record, streamed: bool
 ) -> int:
     """Run the cycle on the raw data of records (n,); returns the number of cycles before the first gap."""
-    p, s, measurement = parameters[()], state[()], np.zeros((3, IMU_COUNT, 3))
+    p, s, measurement, home = parameters[()], state[()], np.zeros((3, IMU_COUNT, 3)), np.zeros(LEGS, np.int64)
     for k in range(records.shape[0]):
         recorded = records[k]
         if recorded.cycle != s.time.cycle + recorded.missed:
@@ -155,6 +167,9 @@ def _replay(
             ramp_down(p.safety.stop, p.rig, s.time, s.pid)
         else:
             hear_rig(parameters, state, recorded.sample_age, recorded.drive, recorded.drive_code, recorded.silent)
+            hear_base_imu(parameters, state, recorded.base_imu, recorded.base_imu_age)
+            home[:] = recorded.home
+            hear_encoders(parameters, state, recorded.silent, recorded.length, recorded.length_rate, home)
             cycle(parameters, state, measurement, segments, marks)
         record_state(state, again[k])
         prepare_next(parameters, state, segments)

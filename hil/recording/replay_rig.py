@@ -20,7 +20,8 @@ _FAILURES = {ENDED: "the recording has come to its end", FAILED: "it did so when
 """Statuses of an exchange that fails, and why."""
 
 _REPEATED = (
-    "sample_ns", "length", "length_rate", "home", "drive", "drive_code", "sent", "truth", "round_trip_ns", "refused",
+    "sample_ns", "length", "length_rate", "home", "base_imu", "base_imu_ns", "drive", "drive_code", "sent", "truth",
+    "round_trip_ns", "refused",
 )  # fmt: skip
 """What a record and the feedback have in common."""
 
@@ -45,6 +46,7 @@ class ReplayRig:
         self._identity: Identity | None = None
         self._records = np.zeros(0, RECORD)
         self._numbers = np.zeros((0, IMU_COUNT), np.int64)
+        self._base_imu_numbers = np.zeros(0, np.int64)
         self._cycle = self._row = 0
 
     def open(self) -> None:
@@ -64,6 +66,7 @@ class ReplayRig:
             raise RigError(f"{where} was recorded on the mechanism {name}, not on {self._mechanism.name}: give that")
         self._records = records
         self._numbers = np.cumsum(records["sample_age"] == 0, axis=0)
+        self._base_imu_numbers = np.cumsum(records["base_imu_age"] == 0)
         self._cycle, self._row, self.failure = 0, 0, ""
         if "parameters" in first.arrays:
             self.command_delay = float(first.constant("load", "command_delay"))
@@ -97,7 +100,7 @@ class ReplayRig:
         row, self._row = self._row, self._row + 1
         measurement[0], measurement[1] = record["angular_velocity"], record["specific_force"]
         measurement[2] = record["magnetic_field"]
-        feedback["sequence"] = self._numbers[row]
+        feedback["sequence"], feedback["base_imu_sequence"] = self._numbers[row], self._base_imu_numbers[row]
         for name in _REPEATED:
             feedback[name] = record[name]
         if record["status"] == Cause.RIG_FAILED:

@@ -45,6 +45,9 @@ FEEDBACK = record_dtype(
     length=(np.float64, LEGS),  # that each encoder reads [m]; NaN without one
     length_rate=(np.float64, LEGS),  # its rate [m/s]; NaN without one
     home=(np.int64, LEGS),  # 1 beyond the home switch, 0 before it, -1 without one
+    base_imu=(np.float64, (2, 3)),  # raw, of an IMU on the base [rad/s, m/s^2]; NaN without one
+    base_imu_ns=np.int64,  # on the rig's own clock
+    base_imu_sequence=np.int64,  # number of the sample
     truth=(np.float64, TRUTH_SIZE),  # as the plant's buffer; NaN unless the rig is emulated
     round_trip_ns=np.int64,  # from the request to the answer
     refused=np.int64,  # frames or packets since the rig was opened
@@ -57,6 +60,7 @@ def new_feedback() -> Record:
     feedback: Record = np.zeros((), FEEDBACK)
     feedback["measurement"], feedback["truth"], feedback["sequence"] = np.nan, np.nan, -1
     feedback["length"], feedback["length_rate"], feedback["home"] = np.nan, np.nan, -1
+    feedback["base_imu"], feedback["base_imu_sequence"] = np.nan, -1
     return feedback
 
 

@@ -22,9 +22,19 @@ from plant.encoder_readings import MOST_FAULTS as MOST_ENCODER_FAULTS
 from plant.encoders import PREFIX as ENCODER_PREFIX
 from plant.encoders import EncoderFaultKind, encoder_fault
 from plant.errors import InputError, UnknownNameError
-from plant.fmu.calls import advance, read_imus, read_motors, read_truth, write_command, write_drive_modes, write_payload_mass
+from plant.fmu.calls import (
+    advance,
+    read_base_imu,
+    read_imus,
+    read_motors,
+    read_truth,
+    write_command,
+    write_drive_modes,
+    write_payload_mass,
+)
 from plant.imu import DISTURBANCE, MOST_DISTURBANCES, disturbance_record, measure
 from plant.imu_disturbances import DisturbanceKind, disturbance, disturbance_of_text
+from plant.imu_wiring import BASE_IMU, SLOTS
 from plant.mechanism import LEGS, Mechanism
 from plant.truth import TRUTH_SIZE
 
@@ -49,10 +59,10 @@ class FaultKind(IntEnum):
         """The kind's name on the command line, such as imu-frozen."""
         return self.name.lower().replace("_", "-")
 
-    IMU_FROZEN = IMU_COUNT, 0.0, 1.0, "the IMU repeats its last sample as if it were new"
-    IMU_DEAD = IMU_COUNT, 0.0, 1.0, "the IMU sends nothing any more"
-    IMU_NOISY = IMU_COUNT, 20.0, 1.0, "noise of this size [deg/s RMS], and a tenth of it [m/s2 RMS]"
-    IMU_BIASED = IMU_COUNT, 2.0, radians(1.0), "the IMU is turned on its leg by this angle [deg]"
+    IMU_FROZEN = SLOTS, 0.0, 1.0, "the IMU repeats its last sample as if it were new"
+    IMU_DEAD = SLOTS, 0.0, 1.0, "the IMU sends nothing any more"
+    IMU_NOISY = SLOTS, 20.0, 1.0, "noise of this size [deg/s RMS], and a tenth of it [m/s2 RMS]"
+    IMU_BIASED = SLOTS, 2.0, radians(1.0), "the IMU is turned on its leg by this angle [deg]"
     IMU_SWAPPED = IMU_COUNT, 0.0, 1.0, "the IMU and the one of this number have changed places"
     DRIVE_FAULTS = LEGS, 0x7500, 1.0, "the drive reports this fault code and stops"
     DRIVE_UNPOWERED = LEGS, 0.0, 1.0, "the drive loses its power, and its brake closes"
@@ -158,6 +168,9 @@ EMULATED = record_dtype(
     measurement=(np.float64, (3, IMU_COUNT, 3)),  # the last sample [rad/s, m/s^2, uT]
     sample_ns=(np.int64, IMU_COUNT),
     sequence=(np.int64, IMU_COUNT),
+    base_imu=(np.float64, (2, 3)),  # the same of an IMU on the base; NaN without one
+    base_imu_ns=np.int64,
+    base_imu_sequence=np.int64,
     length=(np.float64, LEGS),  # that the encoders read [m]
     length_rate=(np.float64, LEGS),  # [m/s]
     home=(np.int64, LEGS),  # as `plant.encoder_readings` has it
@@ -189,7 +202,7 @@ def new_emulated(mechanism: Mechanism, step_ns: int, seed: int, faults: Iterable
     limits = mechanism.require_limits()
     rig["step_ns"], rig["deceleration"], rig["speed_limit"] = step_ns, limits.acceleration, _SPEED_RESERVE * limits.velocity
     rig["payload"] = mechanism.plant_parameters()["payload.mass"]
-    rig["length"], rig["length_rate"], rig["home"] = np.nan, np.nan, -1
+    rig["length"], rig["length_rate"], rig["home"], rig["base_imu"] = np.nan, np.nan, -1, np.nan
     rig["enabled_ns"], rig["drive"], rig["random"] = -1, DriveState.READY, seed + 1
     for each in faults:
         add_fault(rig, each)
@@ -232,21 +245,33 @@ def sample(fmu: Record, imu: Record, encoders: Record, rig: Record, now_ns: int)
             if f.begin_ns >= 0:
                 m.disturbance[m.disturbances].begin = 1e-9 * (r.enabled_ns + f.begin_ns)
             m.disturbances += 1
+    if m.count > BASE_IMU:
+        status |= read_base_imu(fmu)
+        m.base[:2] = c.base_imu
     measure(imu, r.ideal, c.imu)
-    for k in range(IMU_COUNT):
+    for k in range(m.count):
         if m.fresh[k] == 0 or find_fault(r, FaultKind.IMU_DEAD, k) >= 0:
             continue
-        r.sequence[k] += m.fresh[k]
-        r.sample_ns[k] = np.int64(np.rint(1e9 * m.sampled_at[k]))
+        taken_ns = np.int64(np.rint(1e9 * m.sampled_at[k]))
+        if k == BASE_IMU:
+            r.base_imu_sequence += m.fresh[k]
+            r.base_imu_ns = taken_ns
+        else:
+            r.sequence[k] += m.fresh[k]
+            r.sample_ns[k] = taken_ns
         if find_fault(r, FaultKind.IMU_FROZEN, k) >= 0:
             continue
         noisy = find_fault(r, FaultKind.IMU_NOISY, k)
         noise = r.fault[noisy].size if noisy >= 0 else 0.0
         for kind in range(3):
             for j in range(3):
-                r.measurement[kind, k, j] = c.imu[kind, k, j]
+                read = m.reading[kind, k, j]
                 if noise > 0.0 and kind < 2:
-                    r.measurement[kind, k, j] += draw_normal(r.random) * noise * (np.pi / 180.0 if kind == 0 else 0.1)
+                    read += draw_normal(r.random) * noise * (np.pi / 180.0 if kind == 0 else 0.1)
+                if k < BASE_IMU:
+                    r.measurement[kind, k, j] = read
+                elif kind < 2:
+                    r.base_imu[kind, j] = read
     if encoders[()].legs > 0:
         status |= _read_encoders(fmu, encoders, r)
     return status

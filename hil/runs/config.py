@@ -28,6 +28,8 @@ FUSIONS = {
 }
 """Ways to fuse the IMUs, with the errors of the IMUs that the whole-mechanism filter estimates; None without that filter."""
 
+FUSIONS_ON_A_MOVING_BASE = tuple(name for name in FUSIONS if name not in ("filterpy", "section-5"))
+
 RIGS = ("fmu", "udp", "canopen", "replay")
 PYTHON_RIG = "python:"
 """The prefix of a rig in the user's own Python class, such as python:my_rig:MyRig (module and class)."""
@@ -123,6 +125,7 @@ class SimulationConfig:
         "encoders of the legs' lengths: none, incremental, absolute, or a TOML file (docs/encoders.md)",
         metavar="KIND",
     )
+    base_imu: bool = option(False, "IMU 7 is on the base, which may move then (docs/moving_base.md)")
     magnetometer: bool = option(False, "the platform's magnetometer gives its heading")
     rig: str = option(
         "fmu",
@@ -168,6 +171,11 @@ class SimulationConfig:
         self.base_motions, self.disturbances  # noqa: B018
         if self.encoder_faults and self.lengths == NO_LENGTHS:
             raise InputError("--fault breaks an encoder, and there is none: add --lengths incremental, or leave the fault out")
+        if self.base_imu and self.fusion not in FUSIONS_ON_A_MOVING_BASE:
+            raise InputError(
+                f"with --base-imu the fusion is one of {', '.join(FUSIONS_ON_A_MOVING_BASE)}, not {self.fusion}: choose one of "
+                "them, or leave --base-imu out"
+            )
         if self.lengths != NO_LENGTHS and self.fusion == "section-5":
             raise InputError("the paper's section 5 takes no lengths: leave --lengths out, or take another --fusion")
 

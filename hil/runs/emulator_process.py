@@ -26,9 +26,8 @@ from hil.realtime.scheduling import RealTimeSettings, real_time
 from hil.rigs.emulation import add_fault, fault, new_emulated
 from hil.rigs.udp.datagrams import (
     HELLO_DATAGRAM,
-    VERSION,
+    VERSIONS,
     WELCOME_DATAGRAM,
-    WITH_LENGTHS,
     DatagramKind,
     decode,
     encode,
@@ -96,7 +95,7 @@ def _emulate_canopen(
     from hil.rigs.canopen.emulated_nodes import PlantMachine
     from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings
 
-    bus = canopen_settings(config.at or DEFAULT_FILE)
+    bus = canopen_settings(config.at or DEFAULT_FILE, config.simulated.base_imu)
     with (
         closing(PlantMachine(lambda: _rig_of(config, 1.0 / config.simulated.rate, faults))) as machine,
         real_time(settings) as refused,
@@ -238,7 +237,7 @@ def _rig_of(config: EmulatorConfig, period: float, faults: list[Record]) -> tupl
     mechanism = load_spatial(simulated.mechanism)
     start = load_target(simulated.target, mechanism, 1.0).start
     plant = simulated_plant(simulated, mechanism, start)
-    imu = imu_state(load_imu(simulated.imu), simulated.seed, period, simulated.wiring)
+    imu = imu_state(load_imu(simulated.imu), simulated.seed, period, simulated.wiring, simulated.base_imu)
     encoders = encoder_state(load_encoder(simulated.lengths), simulated.seed, period, legs=mechanism.legs)
     return plant, imu, encoders, new_emulated(mechanism, _STEP_NS, simulated.seed, faults)
 
@@ -326,6 +325,6 @@ def _padded(text: str, size: int) -> NDArray[np.uint8]:
 
 
 def _hello(content: bytes) -> Record | None:
-    decoded = (decode(HELLO_DATAGRAM, content, version=version, kind=DatagramKind.HELLO) for version in (VERSION, WITH_LENGTHS))
+    decoded = (decode(HELLO_DATAGRAM, content, version=version, kind=DatagramKind.HELLO) for version in VERSIONS)
     hello = next((each for each in decoded if each is not None), None)
     return hello if hello is not None and hello["session"] != 0 and hello["period_us"] != 0 else None

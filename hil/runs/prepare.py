@@ -110,7 +110,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         mechanism = nominal.moved_joints(calibration.joints[:, : nominal.legs])
         target = load_target("hold" if config.streamed else config.target, mechanism, config.duration)
         model = load_imu(config.imu)
-        imu = imu_state(model, config.seed, period, config.wiring)
+        imu = imu_state(model, config.seed, period, config.wiring, config.base_imu)
         encoder = load_encoder(config.lengths)
         control = control_settings(mechanism, **({} if config.hold is None else {"hold": config.hold}))
         least, most = HOLD_RANGE_S
@@ -125,7 +125,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         parameters = cycle_parameters(
             mechanism, config.rate, control, fusion, config.imus, FUSIONS[config.fusion], calibration, config.magnetometer,
             config.fusion == "section-5", safety, drives, 0.0 if config.rig == "fmu" else period,
-            config.arm, encoder,
+            config.arm, encoder, config.base_imu,
         )  # fmt: skip
         remarks = [
             calibration.remark,
@@ -257,6 +257,11 @@ def _check_plant(config: SimulationConfig, plant: FmuPlant, nominal: Mechanism) 
     if absent:
         there = ",".join(map(str, bound.imus))
         raise InputError(f"{name} has no IMU {', '.join(map(str, sorted(absent)))}: leave it out with --imus {there}")
+    if config.base_imu and bound.base_sensed.places.size == 0:
+        raise InputError(
+            f"{name} has no IMU on its base: bind base_imu_angular_velocity and base_imu_specific_force (docs/fmu.md), or "
+            "leave out --base-imu"
+        )
     if config.magnetometer and PLATFORM_IMU not in bound.magnetometers:
         raise InputError(f"{name} has no magnetometer on the platform: bind imu_magnetic_field, or leave out --magnetometer")
 
@@ -270,13 +275,15 @@ def rig_of(config: SimulationConfig) -> Rig | None:
     mechanism, period = load_in_space(config.mechanism), 1.0 / config.rate
     check_legs(config.rig, mechanism)
     if config.rig == "udp":
-        return UdpRig(config.rig_at or DEFAULT_ADDRESS, period, lengths=config.lengths != NO_LENGTHS)
+        return UdpRig(config.rig_at or DEFAULT_ADDRESS, period, lengths=config.lengths != NO_LENGTHS, base_imu=config.base_imu)
     if config.rig == "canopen":
         with missing_extras_named():
             from hil.rigs.canopen.rig import CanopenRig
             from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings
 
-        return CanopenRig(canopen_settings(config.rig_at or DEFAULT_FILE), period, lengths=config.lengths != NO_LENGTHS)
+        return CanopenRig(
+            canopen_settings(config.rig_at or DEFAULT_FILE, config.base_imu), period, lengths=config.lengths != NO_LENGTHS
+        )
     if config.rig == "replay":
         if not config.rig_at:
             raise InputError("a replay needs its recording: name it with --rig-at FILE.mcap")

@@ -31,6 +31,10 @@ class BaseMotion:
         """What the turning of {1} adds to the acceleration of a point (3, 1), beside that of the origin of {1}."""
         return self.carry @ place + 2 * ca.cross(self.omega, velocity)
 
+    def imu_signals(self, place: SX) -> dict[str, SX]:
+        """Ideal signals (3, 1) of an IMU that is fixed to the base at `place` (3, 1), with the axes of {1}; by their names."""
+        return {"base_imu_angular_velocity": self.omega, "base_imu_specific_force": self.carry @ place - self.gravity}
+
 
 def base_motion(motion: dict[str, SX], constants: dict[str, SX]) -> BaseMotion:
     """The motion of {1} from the inputs `base_motion`, and from gravity and magnetic field in the constants."""

@@ -34,6 +34,7 @@ _UNCHANGED = (
     "stop.damping", "screw.backlash", "joint.clearance", "screw.stiffness", "screw.damping", "leg.lower.mass",
     "leg.lower.center", "leg.lower.inertia", "leg.upper.inertia", "leg.bending_compliance", "leg.guide",
     "leg.bending_frequency", "leg.bending_damping", "gravity", "magnetic_field", "leg_imu_position", "platform_imu_position",
+    "base_imu_position",
 )  # fmt: skip
 
 

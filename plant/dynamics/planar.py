@@ -136,4 +136,4 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
         "potential_energy": -ca.dot(in_plane, c["mass"] * position + moment) + sum(leg.potential for leg in legs),
         "power.external": ca.dot(external, ca.vertcat(velocity, turning)),
     }
-    return rates, imu | leg_outputs(legs, actuators, x) | outputs
+    return rates, imu | base.imu_signals(c["base_imu_position"]) | leg_outputs(legs, actuators, x) | outputs

@@ -204,7 +204,7 @@ def _plant(x: Values, u: Values, c: Values) -> tuple[Values, Values]:
         "potential_energy": -ca.dot(gravity, c["mass"] * position + moment) + sum(leg.potential for leg in legs),
         "power.external": ca.dot(external, ca.vertcat(velocity, omega)),
     }
-    return rates, imu | leg_outputs(legs, actuators, x) | outputs
+    return rates, imu | base.imu_signals(c["base_imu_position"]) | leg_outputs(legs, actuators, x) | outputs
 
 
 def imu_signals(position: SX, rotation: SX, velocity: SX, omega: SX, acceleration: SX, parameters: Values) -> Values:

@@ -234,6 +234,7 @@ def _parameters(legs: int, dimensions: int) -> tuple[Variable, ...]:
         _fixed("magnetic_field", (3,), "uT", "magnetic field of the earth, before the base has turned", -1e4, 1e4, 10),
         _fixed("leg_imu_position", (legs, 3), "m", "each leg's IMU from the base joint, in the leg frame", -100, 100, 0.1),
         _fixed("platform_imu_position", (3,), "m", "the platform's IMU, in {2}", -100, 100, 0.1),
+        _fixed("base_imu_position", (3,), "m", "the base's IMU, in {1}", -100, 100, 0.1, default=0.0),
         *_pose(_fixed, "initial_", dimensions, " at the start"),
         _fixed("substep", (), "s", "largest internal integration step", 1e-6, 0.1, 1e-3),
     )
@@ -245,6 +246,8 @@ def _outputs(legs: int, dimensions: int) -> tuple[Variable, ...]:
         _output("imu_angular_velocity", imus, "rad/s", f"ideal gyroscopes: {which}", -1e3, 1e3, 0.1),
         _output("imu_specific_force", imus, "m/s2", f"ideal accelerometers: {which}", -1e5, 1e5, 10),
         _output("imu_magnetic_field", imus, "uT", f"ideal magnetometers: {which}", -2e4, 2e4, 10),
+        _output("base_imu_angular_velocity", (3,), "rad/s", "ideal gyroscope of an IMU on the base, in {1}", -1e3, 1e3, 0.1),
+        _output("base_imu_specific_force", (3,), "m/s2", "ideal accelerometer of an IMU on the base, in {1}", -1e5, 1e5, 10),
         *_pose(_output, "", dimensions),
         *_twist(_output, "", dimensions),
         _output("leg_length", (legs,), "m", "lengths of the legs", 0, 400, 0.1),

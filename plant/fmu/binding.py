@@ -30,6 +30,7 @@ TRUTH_PLACES = {
 }  # fmt: skip
 """Where a signal lies in the truth. A planar plant's angle is in the first place of the quaternion."""
 
+BASE_IMU_SIGNALS = {"base_imu_angular_velocity": GYROSCOPE, "base_imu_specific_force": ACCELEROMETER}
 COMMANDS, MODES, PAYLOAD = "velocity_command", "drive_mode", "payload.mass"
 MOTORS, LENGTHS = "motor_length", "leg_length"
 BASE = tuple(f"base_motion.{name}" for name in ("rotation", "angular_velocity", "angular_acceleration", "acceleration"))
@@ -51,13 +52,17 @@ UNITS: dict[str, dict[str, float]] = {
 
 SIGNAL_UNITS = {
     COMMANDS: "m/s", MODES: "1", "imu_angular_velocity": "rad/s", "imu_specific_force": "m/s2", "imu_magnetic_field": "uT",
-    "position": "m", "quaternion": "1", "angle": "rad", LENGTHS: "m", MOTORS: "m", "current": "A", PAYLOAD: "kg",
+    "base_imu_angular_velocity": "rad/s", "base_imu_specific_force": "m/s2", "position": "m", "quaternion": "1",
+    "angle": "rad", LENGTHS: "m", MOTORS: "m", "current": "A", PAYLOAD: "kg",
     **dict(zip(BASE, ("rad", "rad/s", "rad/s2", "m/s2"), strict=True)),
 }  # fmt: skip
 """The loop's unit of every signal."""
 
 REQUIRED = (COMMANDS, "imu_angular_velocity", "imu_specific_force")
 WRITTEN = (COMMANDS, MODES, PAYLOAD, *BASE)
+READ_GROUPS = ("sensed", "known", "encoded", "base_sensed")
+"""The groups of scalars that the loop reads, as `Bound` has them."""
+
 _MODE_NAMES = tuple(DRIVE_MODES.values())
 _ENTRIES = ("offset", "sign", "unit", "variables")
 
@@ -218,6 +223,7 @@ class Bound:
     sensed: Scalars  # in (3, 7, 3)
     known: Scalars  # the truth, in (19,)
     encoded: Scalars  # the lengths that encoders read, in (legs,): the motors', or else the legs'
+    base_sensed: Scalars  # what an IMU on the base senses, in (2, 3)
     commanded: Scalars  # in (legs,)
     loaded: Scalars  # the payload's mass, in (1,)
     based: Scalars  # the base's motion, in (12,)
@@ -225,7 +231,7 @@ class Bound:
     knows_pose: bool
     planar_angle: bool  # in place of the quaternion
     driven: frozenset[str]  # scalars that the loop sets
-    read: tuple[str, ...]  # scalars that the loop reads, in the order of `sensed`, `known` and `encoded`
+    read: tuple[str, ...]  # scalars that the loop reads, in the order of `READ_GROUPS`
 
 
 def check_settable(variable: FmuVariable, owner: str, driven: frozenset[str], running: bool = False) -> None:
@@ -284,6 +290,9 @@ class _Binder:
             "sensed": self._group({name: self._imu_places(name, each) for name, each in imus.items()}),
             "known": self._group({name: self._truth_places(name) for name in TRUTH_PLACES if name in self._found}),
             "encoded": self._group({name: range(self._legs) for name in self._encoded()}),
+            "base_sensed": self._group(
+                {name: range(3 * i, 3 * i + 3) for name, i in BASE_IMU_SIGNALS.items() if name in self._found}
+            ),
             "commanded": self._group({name: range(self._legs) for name in (COMMANDS,) if name in self._found}),
             "loaded": self._group({name: range(1) for name in (PAYLOAD,) if name in self._found}),
             "based": self._group({name: range(3 * i, 3 * i + 3) for i, name in enumerate(BASE) if name in self._found}),
@@ -292,6 +301,8 @@ class _Binder:
         knows = "position" in self._found, "quaternion" in self._found or "angle" in self._found
         if any(knows) and not all(knows):
             self._problems.append("position, and quaternion or angle, are the pose only together: give both, or neither")
+        if len(BASE_IMU_SIGNALS.keys() & self._found.keys()) == 1:
+            self._problems.append(f"{' and '.join(BASE_IMU_SIGNALS)} are the base's IMU only together: give both, or neither")
         self._check_once()
         self._check_start()
         if self._problems:
@@ -308,7 +319,7 @@ class _Binder:
             driven=self._driven,
             read=tuple(
                 scalar
-                for name in (*IMU_SIGNALS, *TRUTH_PLACES, *self._encoded())
+                for name in (*IMU_SIGNALS, *TRUTH_PLACES, *self._encoded(), *BASE_IMU_SIGNALS)
                 for each in self._found.get(name, ())
                 for scalar in each.element_names
             ),

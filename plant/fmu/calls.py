@@ -21,11 +21,12 @@ MOST_CHANGES = 32
 
 _SENSED = 3 * IMU_COUNT * 3
 (
-    _READ_IMUS, _READ_TRUTH, _READ_MOTORS, _WRITE_COMMAND, _WRITE_MODES, _WRITE_PAYLOAD, _WRITE_BASE, _CHANGE_VALUE, _STEP,
-) = range(9)  # fmt: skip
+    _READ_IMUS, _READ_TRUTH, _READ_MOTORS, _READ_BASE_IMU, _WRITE_COMMAND, _WRITE_MODES, _WRITE_PAYLOAD, _WRITE_BASE,
+    _CHANGE_VALUE, _STEP,
+) = range(10)  # fmt: skip
 CALLED = (
-    "reading the IMUs", "reading the truth", "reading the motors", "setting the commands", "setting the drives' modes",
-    "setting the payload", "moving the base", "changing a parameter", "a step",
+    "reading the IMUs", "reading the truth", "reading the motors", "reading the base's IMU", "setting the commands",
+    "setting the drives' modes", "setting the payload", "moving the base", "changing a parameter", "a step",
 )  # fmt: skip
 """The name of each call in messages, by the `call` of `FMU_HANDLE`."""
 
@@ -70,6 +71,7 @@ FMU_HANDLE = record_dtype(
     sensed=_scalars(_SENSED),
     known=_scalars(TRUTH_SIZE),
     encoded=_scalars(LEGS),
+    base_sensed=_scalars(6),
     commanded=_scalars(LEGS),
     loaded=_scalars(1),
     based=_scalars(BASE_SIZE),
@@ -82,6 +84,7 @@ FMU_HANDLE = record_dtype(
     imu=(np.float64, (3, IMU_COUNT, 3)),
     truth=(np.float64, TRUTH_SIZE),
     motors=(np.float64, LEGS),
+    base_imu=(np.float64, (2, 3)),
     planar_angle=np.int64,
     legs=np.int64,
     command=(np.float64, LEGS),
@@ -100,7 +103,8 @@ FMU_HANDLE = record_dtype(
 """One FMU in compiled code: addresses, value references with their conversions, and buffers.
 
 `imu` is angular velocity [rad/s], specific force [m/s^2] and magnetic field [uT] of the seven IMUs; `truth` is that of
-`plant.truth`; `motors` are the lengths of the legs that encoders read [m]; all are NaN where the FMU has no value. A planar
+`plant.truth`; `motors` are the lengths of the legs that encoders read [m]; `base_imu` is what an IMU on the base senses, in its
+first two units; all are NaN where the FMU has no value. A planar
 plant's truth has its pose in space, with z = 0, and its first three legs. `step` is the communication step [s], or 0 to step by
 the duration of each call. `time` is `steps` steps of one `length` [s] after `since` [s]: a count, because a sum would drift.
 The base's motions count from time 0. `final` is whether no earlier state will be restored. `status` is the status of the first
@@ -212,6 +216,13 @@ def read_motors(fmu: Record) -> int:
     """Read the lengths that encoders read into `motors`; returns FMI's status."""
     c = fmu[()]
     return _read(c, _READ_MOTORS, c.encoded, c.motors)
+
+
+@kernel
+def read_base_imu(fmu: Record) -> int:
+    """Read the ideal signals of an IMU on the base into `base_imu`; returns FMI's status."""
+    c = fmu[()]
+    return _read(c, _READ_BASE_IMU, c.base_sensed, c.base_imu.reshape(-1))
 
 
 @kernel

@@ -13,7 +13,18 @@ from plant.compiled import Record
 from plant.dynamics.base_course import BASE_SIZE, MOST_BASE_MOTIONS
 from plant.dynamics.variables import PLANAR, SPATIAL
 from plant.errors import FmuError, InputError
-from plant.fmu.binding import BASE, OWN_BINDING, Binding, Bound, Modes, Scalars, bind, check_settable, load_binding
+from plant.fmu.binding import (
+    BASE,
+    OWN_BINDING,
+    READ_GROUPS,
+    Binding,
+    Bound,
+    Modes,
+    Scalars,
+    bind,
+    check_settable,
+    load_binding,
+)
 from plant.fmu.calls import CALLED, FMU_HANDLE, MOST_CHANGES, advance
 from plant.fmu.description_reader import FmuDescription, FmuVariable
 from plant.fmu.instance import NOT_FINITE, OK, FmuInstance
@@ -157,7 +168,7 @@ class FmuPlant(FmuInstance):
 
     def _not_finite(self) -> str:
         """The first value that was read and is not finite, with the name of its variable."""
-        groups = [(self.handle[name]["raw"], getattr(self.bound, name).places.size) for name in ("sensed", "known", "encoded")]
+        groups = [(self.handle[name]["raw"], getattr(self.bound, name).places.size) for name in READ_GROUPS]
         values = np.concatenate([raw[:count] for raw, count in groups])
         first = int(np.argmin(np.isfinite(values)))
         return f"{values[first]} for {self.bound.read[first]}"
@@ -207,11 +218,11 @@ class FmuPlant(FmuInstance):
         for field, function in (("get", f"Get{real}"), ("set", f"Set{real}"), ("do_step", "DoStep")):
             handle[field] = self.address(function)
         handle["step"], handle["final"] = step or 0.0, not self.description.saves_state
-        for group in ("sensed", "known", "encoded", "commanded", "loaded", "based"):
+        for group in (*READ_GROUPS, "commanded", "loaded", "based"):
             _fill(handle[group], getattr(bound, group))
         if bound.modes.variable is not None:
             self._prepare_modes(bound.modes, bound.modes.variable)
-        handle["imu"], handle["truth"], handle["motors"] = np.nan, np.nan, np.nan
+        handle["imu"], handle["truth"], handle["motors"], handle["base_imu"] = (np.nan,) * 4
         handle["legs"], handle["planar_angle"] = bound.legs, bound.planar_angle
         if bound.knows_pose and bound.legs < LEGS:
             handle["truth"][2] = 0.0

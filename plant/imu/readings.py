@@ -21,7 +21,7 @@ from plant.imu.disturbed import DISTURBANCE, EFFECT, MOST_DISTURBANCES, clock_of
 from plant.imu.model import MOST_SECTIONS, ImuModel, SensorErrors
 from plant.imu.random_numbers import draw_normals
 from plant.imu_disturbances import Disturbance
-from plant.imu_wiring import IMU_COUNT, RIGHT_WIRING, Wiring
+from plant.imu_wiring import BASE_IMU, IMU_COUNT, RIGHT_AXES, RIGHT_WIRING, SLOTS, Wiring
 from plant.pose import Array, rotation_from_vector
 
 GYROSCOPE, ACCELEROMETER, MAGNETOMETER = 0, 1, 2
@@ -43,13 +43,14 @@ def axes_matrix(axes: str) -> Array:
 
 
 IMU_STATE = record_dtype(
-    gain=(np.float64, (3, IMU_COUNT, 3, 3)),
-    offset=(np.float64, (3, IMU_COUNT, 3)),
-    bias_per_kelvin=(np.float64, (3, IMU_COUNT, 3)),
-    scale_per_kelvin=(np.float64, (3, IMU_COUNT, 3)),
-    bias_per_volt=(np.float64, (3, IMU_COUNT, 3)),
+    gain=(np.float64, (3, SLOTS, 3, 3)),
+    offset=(np.float64, (3, SLOTS, 3)),
+    bias_per_kelvin=(np.float64, (3, SLOTS, 3)),
+    scale_per_kelvin=(np.float64, (3, SLOTS, 3)),
+    bias_per_volt=(np.float64, (3, SLOTS, 3)),
     rectification=(np.float64, 3),
-    place=(np.int64, IMU_COUNT),
+    count=np.int64,  # how many IMUs there are
+    place=(np.int64, SLOTS),
     noise=(np.float64, (2, 3)),  # this and `smoothing` of conversions, and of samples where those between them are spared
     drift=(np.float64, 2),
     smoothing=(np.float64, (2, 3, 2)),
@@ -60,7 +61,7 @@ IMU_STATE = record_dtype(
     delay=np.int64,
     magnetometer_every=np.int64,
     period=np.float64,  # of the cycles [s]
-    rate=(np.float64, IMU_COUNT),  # of the samples on a clock of its own [Hz]; 0: once a cycle
+    rate=(np.float64, SLOTS),  # of the samples on a clock of its own [Hz]; 0: once a cycle
     conversions=np.int64,  # of a sample
     sparing=np.int64,  # whether those between samples are spared while nothing shakes the IMU
     spared=np.int64,  # whether they are at present
@@ -74,25 +75,27 @@ IMU_STATE = record_dtype(
     time=np.float64,  # of the cycle [s]; a caller may set it before each
     before=np.float64,  # time of the cycle before [s]
     kept=np.int64,  # whether `previous` has its signals
-    previous=(np.float64, (3, IMU_COUNT, 3)),
-    converted_at=(np.float64, IMU_COUNT),  # time of the last conversion on the IMU's clock, without jitter [s]
-    part=(np.int64, IMU_COUNT),  # conversions of the present sample
-    conversion=(np.int64, IMU_COUNT),  # number of the next conversion on a clock of its own
-    sample=(np.int64, IMU_COUNT),  # number of the next sample on it
-    fresh=(np.int64, IMU_COUNT),  # samples since the cycle before
-    sampled_at=(np.float64, IMU_COUNT),  # time of the latest sample [s]
-    bias_walk=(np.float64, (2, IMU_COUNT, 3)),
-    sections=(np.float64, (MOST_SECTIONS + 1, 3, IMU_COUNT, 3)),  # of the low-pass: its input, and the output of each
-    queue=(np.float64, (_LONGEST_DELAY + 1, 3, IMU_COUNT, 3)),
-    reading=(np.float64, (3, IMU_COUNT, 3)),
+    base=(np.float64, (3, 3)),  # ideal signals of the IMU on the base, which a caller sets before each cycle
+    previous=(np.float64, (3, SLOTS, 3)),
+    converted_at=(np.float64, SLOTS),  # time of the last conversion on the IMU's clock, without jitter [s]
+    part=(np.int64, SLOTS),  # conversions of the present sample
+    conversion=(np.int64, SLOTS),  # number of the next conversion on a clock of its own
+    sample=(np.int64, SLOTS),  # number of the next sample on it
+    fresh=(np.int64, SLOTS),  # samples since the cycle before
+    sampled_at=(np.float64, SLOTS),  # time of the latest sample [s]
+    bias_walk=(np.float64, (2, SLOTS, 3)),
+    sections=(np.float64, (MOST_SECTIONS + 1, 3, SLOTS, 3)),  # of the low-pass: its input, and the output of each
+    queue=(np.float64, (_LONGEST_DELAY + 1, 3, SLOTS, 3)),
+    reading=(np.float64, (3, SLOTS, 3)),
     normals=(np.float64, 6),
     sensed=(np.float64, 3),  # scratch, as the rest
     effect=EFFECT,
 )
-"""Constants and state of the imperfections of seven IMUs; a copy is a snapshot."""
+"""Constants and state of the imperfections of seven IMUs, and of one on the base; a copy is a snapshot."""
 
 IMU_LIMITS: Limits = {
-    "place": (0, IMU_COUNT - 1),
+    "count": (IMU_COUNT, SLOTS),
+    "place": (0, BASE_IMU),
     "order": (1, MOST_SECTIONS),
     "delay": (0, _LONGEST_DELAY),
     "magnetometer_every": (1, MOST),
@@ -108,8 +111,10 @@ IMU_LIMITS: Limits = {
 """Least and greatest of what counts, indexes or divides in them."""
 
 
-def imu_state(model: ImuModel, seed: int, period: float, wiring: Wiring = RIGHT_WIRING) -> Record:
-    """Draw the constant errors of seven IMUs, for cycles of `period` [s].
+def imu_state(
+    model: ImuModel, seed: int, period: float, wiring: Wiring = RIGHT_WIRING, on_base: bool = False
+) -> Record:  # fmt: skip
+    """Draw the constant errors of seven IMUs, and of one `on_base`, for cycles of `period` [s].
 
     Raises:
         InputError: a negative seed, or a delay longer than 32 samples.
@@ -117,17 +122,25 @@ def imu_state(model: ImuModel, seed: int, period: float, wiring: Wiring = RIGHT_
     checked_seed(seed)
     state: Record = np.zeros((), IMU_STATE)
     random, life = np.random.default_rng([seed, IMU_COUNT]), np.random.default_rng([seed, IMU_COUNT, 1])
-    alignments = [rotation_from_vector(random.uniform(-model.misalignment, model.misalignment, 3)) for _ in range(IMU_COUNT)]
+    # The errors of an IMU on the base leave those of the others as they are.
+    eighth = np.random.default_rng([seed, IMU_COUNT, 2])
+
+    def drawn(k: int) -> np.random.Generator:
+        return eighth if k == BASE_IMU else random
+
+    alignments = [
+        rotation_from_vector(drawn(k).uniform(-model.misalignment, model.misalignment, 3)) for k in range(SLOTS)
+    ]  # fmt: skip
     sampling = 1.0 / model.sample_rate if model.sample_rate else period
     conversions = min(max(1, round(model.conversion_rate * sampling)), _MOST_CONVERSIONS)
     every = max(1, round(1.0 / (model.magnetometer_rate * sampling)))
     for kind, sensor in enumerate((model.gyroscope, model.accelerometer, model.magnetometer)):
         samples = every * sampling if kind == MAGNETOMETER else sampling
         periods = samples if kind == MAGNETOMETER else sampling / conversions, samples
-        axes = (wiring.gyroscopes, wiring.accelerometers, RIGHT_WIRING.gyroscopes)[kind]
-        changes = _changes(sensor, life)
-        for imu in range(IMU_COUNT):
-            gain, offset = _constant_errors(sensor, random)
+        axes = (*(wiring.gyroscopes, wiring.accelerometers, RIGHT_WIRING.gyroscopes)[kind], RIGHT_AXES)
+        changes = _changes(sensor, life, eighth)
+        for imu in range(SLOTS):
+            gain, offset = _constant_errors(sensor, drawn(imu))
             read = axes_matrix(axes[imu])
             state["gain"][kind, imu] = read @ (gain @ alignments[imu])
             state["offset"][kind, imu] = read @ offset
@@ -146,12 +159,14 @@ def imu_state(model: ImuModel, seed: int, period: float, wiring: Wiring = RIGHT_
     delay = round(model.delay / sampling)
     if delay > _LONGEST_DELAY:
         raise InputError(f"the delay of the IMUs is {delay} cycles; at most {_LONGEST_DELAY} are kept")
-    state["rate"] = model.sample_rate * (1.0 + life.uniform(-model.clock_error, model.clock_error, IMU_COUNT))
-    state["converted_at"] = life.random(IMU_COUNT) * sampling - sampling / conversions
+    for imus, clocks in ((slice(IMU_COUNT), life), (slice(IMU_COUNT, SLOTS), eighth)):
+        count = len(range(SLOTS)[imus])
+        state["rate"][imus] = model.sample_rate * (1.0 + clocks.uniform(-model.clock_error, model.clock_error, count))
+        state["converted_at"][imus] = clocks.random(count) * sampling - sampling / conversions
     state["jitter"], state["conversions"], state["period"] = model.jitter, conversions, period
     state["sparing"] = model.sparing and conversions > 1
     state["timed"] = bool(model.sample_rate or model.jitter or (conversions > 1 and not model.sparing))
-    state["place"] = wiring.places
+    state["count"], state["place"] = SLOTS if on_base else IMU_COUNT, (*wiring.places, BASE_IMU)
     state["delay"] = delay
     state["magnetometer_every"] = every
     state["dropout"] = model.dropout
@@ -182,16 +197,23 @@ def _constant_errors(sensor: SensorErrors, random: np.random.Generator) -> tuple
     return np.linalg.inv(axes @ scale), -random.uniform(*sensor.bias) * direction / np.linalg.norm(direction)
 
 
-def _changes(sensor: SensorErrors, random: np.random.Generator) -> dict[str, Array]:
-    """What a sensor's bias and scale do per kelvin and per volt, common parts included: (7, 3) each, by the state's field."""
-    made = {}
+def _changes(sensor: SensorErrors, random: np.random.Generator, eighth: np.random.Generator) -> dict[str, Array]:
+    """What a sensor's bias and scale do per kelvin and per volt, common parts included: (8, 3) each, by the state's field.
+
+    `eighth` draws what is the own of the IMU on the base.
+    """
+    made: dict[str, Array] = {}
     for name in ("bias_per_kelvin", "bias_per_volt"):
         common, own = getattr(sensor, name)
-        directions = random.normal(size=(1 + IMU_COUNT, 3))
+        directions = np.concatenate([random.normal(size=(1 + IMU_COUNT, 3)), eighth.normal(size=(1, 3))])
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        made[name] = common * directions[0] + random.uniform(0.0, own, (IMU_COUNT, 1)) * directions[1:]
+        sizes = np.concatenate([random.uniform(0.0, own, (IMU_COUNT, 1)), eighth.uniform(0.0, own, (1, 1))])
+        made[name] = common * directions[0] + sizes * directions[1:]
     common, own = sensor.scale_per_kelvin
-    made["scale_per_kelvin"] = random.uniform(-common, common, 3) + random.uniform(-own, own, (IMU_COUNT, 3))
+    shared = random.uniform(-common, common, 3)
+    made["scale_per_kelvin"] = shared + np.concatenate(
+        [random.uniform(-own, own, (IMU_COUNT, 3)), eighth.uniform(-own, own, (1, 3))]
+    )  # fmt: skip
     return made
 
 
@@ -212,12 +234,15 @@ _MEASURE, _MAGNETIC, _WALK, _TIMES, _DISTURBED = range(5)
 
 @shared_kernel
 def measure(state: Record, ideal: Array, measurement: Array) -> None:
-    """Write the IMUs' raw readings (3, 7, 3) of ideal signals (3, 7, 3), and advance `state` by one cycle."""
+    """Write the IMUs' raw readings (3, 7, 3) of ideal signals (3, 7, 3), and advance `state` by one cycle.
+
+    The ideal signals of an IMU on the base are those in `state`, and so is its reading.
+    """
     s = state[()]
     # Otherwise the signals of this cycle are all that counts.
     timed = s.timed != 0 or s.disturbances > 0
     walking = s.drift[GYROSCOPE] > 0.0 or s.drift[ACCELEROMETER] > 0.0
-    for imu in range(IMU_COUNT):
+    for imu in range(s.count):
         s.fresh[imu] = 0
         if walking:
             draw_normals(s.normals, s.cycle, imu, _WALK, s.seed)
@@ -233,7 +258,11 @@ def measure(state: Record, ideal: Array, measurement: Array) -> None:
             if s.rate[imu] == 0.0:
                 s.converted_at[imu] = s.time
     if timed:
-        s.previous[:] = ideal
+        for kind in range(3):
+            for axis in range(3):
+                for imu in range(IMU_COUNT):
+                    s.previous[kind, imu, axis] = ideal[kind, imu, axis]
+                s.previous[kind, BASE_IMU, axis] = s.base[kind, axis]
     s.kept = 1 if timed else 0
     s.before = s.time
     s.time += s.period
@@ -290,7 +319,7 @@ def _convert_at(s: Record, imu: int, ideal: Array, time: float, conversion: int,
     weight = (time - s.before) / span if s.kept != 0 and time < s.time and span > 0.0 else 1.0
     for kind in range(3):
         for axis in range(3):
-            now = ideal[kind, place, axis]
+            now = s.base[kind, axis] if place == BASE_IMU else ideal[kind, place, axis]
             if weight < 1.0:
                 now = s.previous[kind, place, axis] + weight * (now - s.previous[kind, place, axis])
             e.signal[kind, axis] = now

@@ -82,7 +82,9 @@ def feed_forward(mechanism, arms, directions, lengths, rotation):
     parameters["rig"], parameters["load"] = rig_parameters(mechanism, 1000.0, 0.2, np.zeros(2)), load_parameters(mechanism, 0.0)
     pose, p, s = state["pose"], parameters[()], state[()]
     pose["arms"], pose["directions"], pose["lengths"], pose["rotation"] = arms, directions, lengths, rotation
-    find_feed_forward(p["load"], s["load"], p["rig"], s["pose"], s["reference"])
+    sensors = p["rig"]["sensors"]
+    up, gravity = tuple(sensors["up_in_base"][0].tolist()), float(sensors["gravity"])
+    find_feed_forward(p["load"], s["load"], p["rig"], s["pose"], s["reference"], up, gravity)
     return state["load"]["feed_forward"], float(p["load"]["droop"])
 
 

@@ -14,9 +14,9 @@ from enum import IntEnum
 
 import numpy as np
 
-from controller.estimation.whole_mechanism.readings import READINGS, leg_axes
+from controller.estimation.whole_mechanism.readings import READINGS
 from plant.compiled import Record, kernel, record_dtype
-from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
+from plant.dynamics.variables import IMU_COUNT
 from plant.pose import Array
 from plant.vectors import Vector, vector
 
@@ -57,17 +57,6 @@ def kind_of(hypothesis: int) -> int:
 def imu_of(hypothesis: int) -> int:
     """The IMU that a hypothesis blames; -1 if it is about all of them."""
     return int(hypothesis % IMU_COUNT if hypothesis < OF_ONE_IMU * IMU_COUNT else -1)
-
-
-@kernel
-def find_frames(sensors: Record, path: Record, frames: Array) -> None:
-    """Write the axes of all IMUs in {1} (7, 3, 3), an axis a row, where the platform is on a path (dtype `PATH`)."""
-    for k in range(PLATFORM_IMU):
-        for i, axis in enumerate(leg_axes(sensors, k, path.position, path.rotation)):
-            frames[k, i, 0], frames[k, i, 1], frames[k, i, 2] = axis
-    for i in range(3):
-        for j in range(3):
-            frames[PLATFORM_IMU, i, j] = path.rotation[j, i]
 
 
 @kernel

@@ -10,11 +10,11 @@ from controller.estimation.integrity.hypotheses import (
     OF_ONE_IMU,
     directions_of,
     evidence_for,
-    find_frames,
     imu_of,
     kind_of,
     span_of,
 )
+from controller.estimation.whole_mechanism.readings import find_frames
 from controller.rig import elapsed
 from controller.settings import FusionSettings
 from plant.compiled import MOST, Limits, Record, filled, kernel, record_dtype, shared_kernel
@@ -25,6 +25,7 @@ PARAMETERS = record_dtype(
     filter=fault_filter.PARAMETERS,
     evidence=evidence.PARAMETERS,
     cycles=np.int64,  # over which an evaluation is spread
+    shared_noise=np.float64,  # variance of the noise that hypotheses about all IMUs see, as a multiple of an IMU's own
     correction_cycles=np.int64,  # how long the loop takes to correct the pose
 )
 """Constants."""
@@ -91,9 +92,17 @@ _FIRST_WINDOWS = 7
 """After how many windows the first evaluation begins: it is complete before the brakes have held for 0.2 s."""
 
 
-def integrity_parameters(fusion: FusionSettings, rate: float, prior: Array, active: bool) -> Record:
-    """The constants (dtype `PARAMETERS`) in cycles of this rate [Hz]; `prior` is the covariance (147, 147) of the IMUs' errors
-    that the whole-mechanism filter begins with.
+def integrity_parameters(
+    fusion: FusionSettings, rate: float, prior: Array, active: bool, shared_noise: float = 1.0
+) -> Record:  # fmt: skip
+    """The constants (dtype `PARAMETERS`) in cycles of this rate [Hz].
+
+    Args:
+        fusion: settings.
+        rate: [Hz].
+        prior: covariance (147, 147) of the errors of the IMUs at the start.
+        active: whether readings are judged.
+        shared_noise: variance of the noise that hypotheses about all IMUs see, as a multiple of an IMU's own.
     """
     filtered = fault_filter.fault_filter_parameters(fusion, rate, active)
     return filled(
@@ -101,6 +110,7 @@ def integrity_parameters(fusion: FusionSettings, rate: float, prior: Array, acti
         filter=filtered,
         evidence=evidence.evidence_parameters(prior, float(filtered["duration"])),
         cycles=evidence.EVALUATION_WINDOWS * int(filtered["window"]),
+        shared_noise=shared_noise,
         correction_cycles=round(_CORRECTION_S * rate),
     )
 
@@ -163,7 +173,7 @@ def _do(p: Record, s: Record, rig: Record, imus: Record, step: int) -> None:
     if step < _FRAMES:
         evidence.step_evidence(p.evidence, e, s.filter, imus.excluded, step)
     elif step == _FRAMES:
-        find_frames(rig.sensors, s.filter.path, t.frames)
+        find_frames(rig.sensors, s.filter.path.position, s.filter.path.rotation, t.frames)
         if e.of_learned == 0:
             protection.begin_level(s.protection, e)
     elif step < _FIRST_TOTAL:
@@ -171,6 +181,8 @@ def _do(p: Record, s: Record, rig: Record, imus: Record, step: int) -> None:
         count = directions_of(h, t.frames, s.filter.predicted, e.place, t.directions)
         first, last = span_of(h, e.place)
         s.found[h] = evidence_for(count, first, last, e.weight, e.vector, t)
+        if imu_of(h) < 0:
+            s.found[h] /= p.shared_noise
         if e.of_learned == 0:
             protection.take_hypothesis(s.protection, e, h, count, first, last, s.found[h], t)
     else:

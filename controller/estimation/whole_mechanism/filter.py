@@ -27,7 +27,7 @@ from controller.estimation.whole_mechanism.imu_errors import (
     distort_jacobian,
     error_gradient,
 )
-from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, ROWS, lengths_start, rig_start, rows_of
+from controller.estimation.whole_mechanism.parameters import ALL_ERRORS, ROWS, base_start, lengths_start, rig_start, rows_of
 from controller.estimation.whole_mechanism.readings import (
     ACCELERATION,
     ANGULAR_ACCELERATION,
@@ -35,6 +35,7 @@ from controller.estimation.whole_mechanism.readings import (
     RATE,
     READINGS,
     VELOCITY,
+    find_frames,
     find_rig_jacobian,
     predict_readings,
     rig_state,
@@ -84,6 +85,7 @@ def start_filter(p: Record, f: Record, time: float, position: Array, rotation: A
     f.field_used = 0
     f.length_errors[:] = 0.0
     f.length_count[:] = 0.0
+    f.base_errors[:] = 0.0
     states, rig = p.states, rig_start(p)
     for i in range(states):
         for j in range(states):
@@ -104,6 +106,9 @@ def start_filter(p: Record, f: Record, time: float, position: Array, rotation: A
     for i in range(p.lengths):
         at = lengths_start(p) + i
         f.covariance[at, at] = p.length_prior[i // LEGS]
+    for i in range(p.base):
+        at = base_start(p) + i
+        f.covariance[at, at] = p.base_prior[i // 3]
     if p.heading != 0:
         f.covariance[states - 1, states - 1] = p.offset_variance
     f.row = -1
@@ -194,6 +199,8 @@ def _begin_update(p: Record, geometry: Record, f: Record) -> None:
     if p.errors > ACCELEROMETER_SCALE:
         for k in range(IMU_COUNT):
             distort_jacobian(f.errors[k], f.jacobian[k])
+    if p.base > 0:
+        find_frames(geometry, f.position, f.rotation, f.frames)
     if p.lengths > 0:
         _predict_lengths(geometry, f)
     if p.rig > 0:
@@ -259,6 +266,9 @@ def _predict(p: Record, f: Record, period: float) -> None:
         for i in range(min(p.errors, ACCELEROMETER_SCALE)):
             at = MOTION_STATES + k * p.errors + i
             c[at, at] += p.bias_walk[i // 3] * t
+    for i in range(p.base):
+        at = base_start(p) + i
+        c[at, at] += p.bias_walk[i // 3] * t
     if p.lengths > 0:
         _forget_play(p, f, t)
     if p.heading != 0:
@@ -334,12 +344,21 @@ def _update_scalar(p: Record, f: Record, row: int) -> None:
         innovation -= weight * (f.rig[which] + change[at])
         for i in range(states):
             gain[i] += weight * c[at, i]
+    # A bias of the base's IMU has been subtracted, seen in the axes of this one.
+    axis, first_base = f.frames[k, m % 3], base_start(p) + 3 * sensor
+    for j in range(3 if p.base > 0 else 0):
+        at = first_base + j
+        innovation += axis[j] * (f.base_errors[3 * sensor + j] + change[at])
+        for i in range(states):
+            gain[i] -= axis[j] * c[at, i]
     for j in range(MOTION_STATES):
         variance += h[j] * gain[j]
     for j in range(p.errors):
         variance += f.gradient[j] * gain[start + j]
     for j in range(first, 8):
         variance += f.rig_jacobian[k, m, j] * gain[rig_start(p) + rig_state(k, j)]
+    for j in range(3 if p.base > 0 else 0):
+        variance -= axis[j] * gain[first_base + j]
     take_scalar(c, gain, change, states, innovation, variance)
 
 
@@ -469,6 +488,8 @@ def _end_update(p: Record, geometry: Record, f: Record) -> None:
         for i in range(p.lengths):
             f.length_errors[i // LEGS, i % LEGS] += f.change[lengths_start(p) + i]
         _keep_readings(p, geometry, f)
+    for i in range(p.base):
+        f.base_errors[i] += f.change[base_start(p) + i]
     if p.heading != 0:
         f.heading_offset += f.change[p.states - 1]
     _publish(f)

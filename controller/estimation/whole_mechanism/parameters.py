@@ -19,7 +19,10 @@ ALL_ERRORS = IMU_COUNT * ERRORS
 LENGTH_ERRORS = 2 * LEGS
 """How many errors of the encoders can be estimated: the zeros (6) and what play does to the readings (6) [m]."""
 
-MOST_STATES = MOTION_STATES + ALL_ERRORS + RIG_ERRORS + LENGTH_ERRORS + 1
+BASE_ERRORS = 6
+"""How many errors of the base's IMU can be estimated: the biases of its gyroscope [rad/s] and accelerometer [m/s^2]."""
+
+MOST_STATES = MOTION_STATES + ALL_ERRORS + RIG_ERRORS + LENGTH_ERRORS + BASE_ERRORS + 1
 ROWS = IMU_COUNT * READINGS
 """Scalars of one update that are the IMUs'."""
 
@@ -50,6 +53,8 @@ FILTER_PARAMETERS = record_dtype(
     lengths=np.int64,  # estimated errors of the encoders; 0 without encoders
     length_variance=np.float64,  # of one reading of an encoder [m^2]
     length_prior=(np.float64, 2),  # variances of an encoder's zero at the start, and of what play does to its reading [m^2]
+    base=np.int64,  # estimated errors of the base's IMU; 0 without one
+    base_prior=(np.float64, 2),  # variances of its biases at the start
     heading=np.int64,  # whether there is one
     field_axes=(np.float64, (3, 3)),  # north, east, and the axis about which a small turn changes the heading, in {1}
     heading_variance=np.float64,  # of a sample's heading [rad^2]
@@ -81,6 +86,8 @@ FILTER_STATE = record_dtype(
     field_time=np.float64,
     field_used=np.int64,  # whether the field is still to be taken
     heading_offset=np.float64,  # [rad]
+    base_errors=(np.float64, BASE_ERRORS),
+    frames=(np.float64, (IMU_COUNT, 3, 3)),  # axes of the IMUs in {1}, by rows, at the pose before the update
     length_errors=(np.float64, (2, LEGS)),  # of the encoders: zeros, and what play does [m]
     length_sum=(np.float64, LEGS),  # of the readings in the present window, and their number and mean time
     length_count=(np.float64, LEGS),
@@ -113,6 +120,7 @@ FILTER_STATE = record_dtype(
 def filter_parameters(
     fusion: FusionSettings, rate: float, errors: str | None, covariance: Array | None, floor: Array | None = None,
     field: MagneticField | None = None, inflation: float | None = None, ripple: float = 0.0, lengths: bool = False,
+    base: bool = False,
 ) -> Record:  # fmt: skip
     """Constants of the filter.
 
@@ -126,6 +134,7 @@ def filter_parameters(
         field: of the earth, for the platform's magnetometer; None without one.
         inflation: times the noise and the jerk; None for 1 with a covariance, and what the settings say without.
         lengths: whether there are encoders.
+        base: whether there is an IMU on the base.
         ripple: `ripple_at` the loop's rate if drives are commanded at this rate.
 
     Raises:
@@ -148,12 +157,13 @@ def filter_parameters(
         inflation = 1.0 if covariance is not None else fusion.noise_inflation
     jerk = inflation * np.array([fusion.platform_jerk, fusion.platform_angular_jerk])
     noise = inflation * np.array([fusion.mechanism_gyroscope_noise, fusion.mechanism_accelerometer_noise])
+    rest = MOTION_STATES + len(known) - ALL_ERRORS
     parameters = filled(
         FILTER_PARAMETERS,
         window=max(1, round(WINDOW_S * rate)),
         errors=estimated,
         rig=len(known) - ALL_ERRORS,
-        states=MOTION_STATES + IMU_COUNT * estimated + len(known) - ALL_ERRORS + lengths * LENGTH_ERRORS + (field is not None),
+        states=rest + IMU_COUNT * estimated + lengths * LENGTH_ERRORS + base * BASE_ERRORS + (field is not None),
         smoothing=_SMOOTHING_S,
         jerk=jerk**2,
         bias_walk=(fusion.bias_walk**2, fusion.accelerometer_bias_walk**2),
@@ -163,6 +173,8 @@ def filter_parameters(
         prior=prior,
         floor=np.zeros(2) if floor is None else floor**2 / 3.0,
         lengths=lengths * LENGTH_ERRORS,
+        base=base * BASE_ERRORS,
+        base_prior=(fusion.bias_sigma**2, fusion.accelerometer_bias_sigma**2),
         length_variance=fusion.length_noise**2,
         length_prior=(fusion.length_zero**2, fusion.length_play**2),
     )
@@ -190,6 +202,12 @@ def rig_start(parameters: Record) -> int:
 def lengths_start(parameters: Record) -> int:
     """The place of the first error of the encoders among the states."""
     return int(rig_start(parameters) + parameters.rig)
+
+
+@kernel
+def base_start(parameters: Record) -> int:
+    """The place of the first error of the base's IMU among the states."""
+    return int(lengths_start(parameters) + parameters.lengths)
 
 
 @kernel

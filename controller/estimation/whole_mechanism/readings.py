@@ -219,6 +219,17 @@ def leg_axes(geometry: Record, k: int, position: Array, rotation: Array) -> tupl
 
 
 @kernel
+def find_frames(geometry: Record, position: Array, rotation: Array, frames: Array) -> None:
+    """Write the axes of all IMUs in {1} (7, 3, 3), an axis a row, at a pose."""
+    for k in range(PLATFORM_IMU):
+        for i, axis in enumerate(leg_axes(geometry, k, position, rotation)):
+            frames[k, i, 0], frames[k, i, 1], frames[k, i, 2] = axis
+    for i in range(3):
+        for j in range(3):
+            frames[PLATFORM_IMU, i, j] = rotation[j, i]
+
+
+@kernel
 def _unit(x: Vector) -> Vector:
     size = np.sqrt(dot(x, x))
     return x[0] / size, x[1] / size, x[2] / size

@@ -19,7 +19,7 @@ from hil.rigs.canopen.frames import (
     NodeState,
 )
 from hil.rigs.canopen.settings import FD_BYTES, CanopenSettings
-from plant.dynamics.variables import IMU_COUNT
+from plant.imu_wiring import BASE_IMU, IMU_COUNT
 from plant.mechanism import LEGS
 from plant.pose import Array
 
@@ -47,7 +47,8 @@ class Decoder:
 
     def __init__(self, settings: CanopenSettings, lengths: bool = False) -> None:
         fd, drives, imus = settings.bus.fd, settings.drives.nodes, settings.imus.nodes
-        count = LEGS + IMU_COUNT * (1 if fd else 2)
+        of_imus = len(imus)
+        count = LEGS + of_imus * (1 if fd else 2)
         positions = 1 << count
         # By identifier: how to decode the data, the node's number, the bit in `awaited`, and the length; None for any.
         self._table: dict[int, tuple[Callable[[int, bytearray], bool], int, int, int | None]] = {}
@@ -65,7 +66,7 @@ class Decoder:
                 self._table[CobId.TPDO + node] = self._take_fd, imu, first, FD_BYTES
             else:
                 self._table[CobId.TPDO + node] = self._take_gyroscope, imu, first, 8
-                self._table[CobId.TPDO + 0x100 + node] = self._take_accelerometer, imu, first << IMU_COUNT, 8
+                self._table[CobId.TPDO + 0x100 + node] = self._take_accelerometer, imu, first << of_imus, 8
                 self._table[CobId.TPDO + 0x200 + node] = self._take_magnetometer, imu, 0, 8
         # Frames of this side, which some buses return, and late answers to SDO requests.
         own = [CobId.NMT, CobId.SYNC, CobId.HEARTBEAT + settings.controller.node, *(CobId.RPDO + node for node in drives)]
@@ -75,18 +76,18 @@ class Decoder:
         self.statuswords, self.velocities, self.error_codes = [0] * LEGS, [0] * LEGS, [0] * LEGS
         self.positions: list[int | None] = [None] * LEGS
         self.homes: list[bool | None] = [None] * LEGS
-        self.nmt, self.heard_ns = [-1] * (LEGS + IMU_COUNT), [0] * (LEGS + IMU_COUNT)
+        self.nmt, self.heard_ns = [-1] * (LEGS + of_imus), [0] * (LEGS + of_imus)
         self.awaited, self.received, self.refused, self.answered = self.all_frames, self.all_frames, 0, False
-        self.sample_ns, self.sequence = [0] * IMU_COUNT, [-1] * IMU_COUNT
+        self.sample_ns, self.sequence = [0] * of_imus, [-1] * of_imus
         self.truth: tuple[float, ...] = (float("nan"),) * 13
         self.now_ns, self._sync, self._syncs = 0, 0, 0
         self._missing, self._positions = self.all_frames, positions
-        self._sample_at, self._sample_sync = [0] * IMU_COUNT, [0] * IMU_COUNT
-        self._stamps, self._counters = [0] * IMU_COUNT, [0] * IMU_COUNT
-        self._pending: list[tuple[bytes, int]] = [(b"", 0)] * IMU_COUNT
-        self._magnetic_sync = [0] * IMU_COUNT
-        self._raw = [bytearray(NO_VALUE.to_bytes(2, "little", signed=True) * (3 * IMU_COUNT)) for _ in range(3)]
-        self._readings = [np.frombuffer(sensor, "<i2").reshape(IMU_COUNT, 3) for sensor in self._raw]
+        self._sample_at, self._sample_sync = [0] * of_imus, [0] * of_imus
+        self._stamps, self._counters = [0] * of_imus, [0] * of_imus
+        self._pending: list[tuple[bytes, int]] = [(b"", 0)] * of_imus
+        self._magnetic_sync = [0] * of_imus
+        self._raw = [bytearray(NO_VALUE.to_bytes(2, "little", signed=True) * (3 * of_imus)) for _ in range(3)]
+        self._readings = [np.frombuffer(sensor, "<i2").reshape(of_imus, 3) for sensor in self._raw]
         self._scales = settings.imus.scales
 
     def begin(self, sync: int) -> None:
@@ -208,8 +209,14 @@ class Decoder:
     def write_measurement(self, measurement: Array) -> None:
         """Write the last readings (3, 7, 3) [rad/s, m/s^2, uT], NaN without a value."""
         for sensor, readings in enumerate(self._readings):
-            np.multiply(readings, self._scales[sensor], out=measurement[sensor])
-            measurement[sensor][readings == NO_VALUE] = np.nan
+            np.multiply(readings[:IMU_COUNT], self._scales[sensor, :IMU_COUNT], out=measurement[sensor])
+            measurement[sensor][readings[:IMU_COUNT] == NO_VALUE] = np.nan
+
+    def write_base_imu(self, measurement: Array) -> None:
+        """Write the last reading (2, 3) of the IMU on the base [rad/s, m/s^2], NaN without a value."""
+        for sensor, readings in enumerate(self._readings[:2]):
+            np.multiply(readings[BASE_IMU], self._scales[sensor, BASE_IMU], out=measurement[sensor])
+            measurement[sensor][readings[BASE_IMU] == NO_VALUE] = np.nan
 
 
 def advance_of(stamp: int, before: int, modulus: int, expected: float) -> int:

@@ -1,4 +1,4 @@
-"""The emulated nodes on a python-can bus: six drives and seven IMUs around a machine, served by one thread, with faults.
+"""The emulated nodes on a python-can bus: six drives and the IMUs around a machine, served by one thread, with faults.
 
 The object dictionaries are read and written over SDO; SYNC and PDOs bypass them.
 """
@@ -13,6 +13,7 @@ from typing import Any
 
 import can
 import canopen
+import numpy as np
 
 from hil.rigs.canopen.emulated_nodes import EmulatedDrive, EmulatedImu, EmulatedNode, PlantMachine
 from hil.rigs.canopen.frames import (
@@ -30,7 +31,7 @@ from hil.rigs.canopen.frames import (
 from hil.rigs.canopen.settings import MAGNETOMETER_INTERVAL, CanopenSettings
 from hil.rigs.emulation import disturb
 from plant.compiled import Record
-from plant.dynamics.variables import IMU_COUNT
+from plant.imu_wiring import BASE_IMU
 from plant.mechanism import LEGS
 
 Channel = Callable[[can.Message, bool], Iterable[tuple[float, can.Message]]]
@@ -52,7 +53,7 @@ def faulty_channel(rig: Record) -> Channel:
 
 
 class EmulatedBus:
-    """Six drives and seven IMUs around a machine, on a bus of their own.
+    """Six drives and the IMUs around a machine, on a bus of their own.
 
     Args:
         settings: of the bus and its nodes.
@@ -77,7 +78,7 @@ class EmulatedBus:
         # The network sends by this object's `send`.
         self._network = canopen.Network(self)
         self.drives = [EmulatedDrive(leg, settings, machine, self._network, clock) for leg in range(LEGS)]
-        self.imus = [EmulatedImu(imu, settings, self._network, clock) for imu in range(IMU_COUNT)]
+        self.imus = [EmulatedImu(imu, settings, self._network, clock) for imu in range(len(settings.imus.nodes))]
         self.lost = 0  # frames that could not be sent or read
         self._nodes: list[EmulatedNode] = [*self.drives, *self.imus]
         self._controller = CobId.HEARTBEAT + settings.controller.node
@@ -205,12 +206,18 @@ class EmulatedBus:
             if POSITION_PDO.cob_id in drive.active:
                 drive.position_answer.data = bytearray(POSITION.pack(drive.position(), drive.inputs()))
                 self.send(drive.position_answer)
-        raw = raw_readings(rig["measurement"], self._scales)
+        read, sequences, times = rig["measurement"], rig["sequence"], rig["sample_ns"]
+        if len(self.imus) > BASE_IMU:
+            # The node of the IMU on the base has no magnetometer.
+            on_base = np.concatenate([rig["base_imu"], np.full((1, 3), np.nan)])
+            read = np.concatenate([read, on_base[:, None]], axis=1)
+            sequences, times = np.append(sequences, rig["base_imu_sequence"]), np.append(times, rig["base_imu_ns"])
+        raw = raw_readings(read, self._scales)
         for node in self.imus:
             if node.active:
                 imu = node.imu
                 turn = (sync - node.magnetometer_start) % MAGNETOMETER_INTERVAL == 0
-                sequence, sample_ns = int(rig["sequence"][imu]), int(rig["sample_ns"][imu])
+                sequence, sample_ns = int(sequences[imu]), int(times[imu])
                 for cob_id, data in pack_imu(raw[:, imu], sequence, sample_ns, sync, self._fd, turn):
                     if cob_id in node.active:
                         answer = node.answers[cob_id]

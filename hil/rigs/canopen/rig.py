@@ -21,8 +21,8 @@ from hil.rigs.canopen.decoder import Decoder
 from hil.rigs.canopen.frames import COMMAND, SYNC_OVERFLOW, CobId, NmtCommand, NodeState, Object, new_message
 from hil.rigs.canopen.settings import CanopenSettings
 from plant.compiled import Record
-from plant.dynamics.variables import IMU_COUNT
 from plant.errors import GoughError
+from plant.imu_wiring import BASE_IMU, IMU_COUNT
 from plant.mechanism import LEGS
 from plant.pose import Array
 
@@ -218,7 +218,7 @@ class CanopenRig:
 
     def _lead_nodes(self, command: NmtCommand, state: NodeState, complaint: str, broadcast: bool) -> None:
         """Send the nodes an NMT command until each has reported a state; the `complaint` names those that have not."""
-        self.decoder.nmt[:] = [-1] * (LEGS + IMU_COUNT)
+        self.decoder.nmt[:] = [-1] * len(self._nodes)
         missing = list(enumerate(self._nodes))
         deadline = 1e-9 * self._clock() + self._settings.controller.boot_timeout
         reminder = 0.0
@@ -277,8 +277,11 @@ class CanopenRig:
     def _fill(self, feedback: Record, start: int) -> None:
         decoder, now = self.decoder, self._clock()
         decoder.write_measurement(feedback["measurement"])
-        feedback["sample_ns"] = decoder.sample_ns
-        feedback["sequence"] = decoder.sequence
+        feedback["sample_ns"] = decoder.sample_ns[:IMU_COUNT]
+        feedback["sequence"] = decoder.sequence[:IMU_COUNT]
+        if len(decoder.sequence) > BASE_IMU:
+            decoder.write_base_imu(feedback["base_imu"])
+            feedback["base_imu_ns"], feedback["base_imu_sequence"] = decoder.sample_ns[BASE_IMU], decoder.sequence[BASE_IMU]
         feedback["drive"] = [
             drive_state(decoder.statuswords[drive])
             if decoder.nmt[drive] == NodeState.OPERATIONAL and now - decoder.heard_ns[drive] <= self._silence_ns

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.rigs import RigError
-from plant.dynamics.variables import IMU_COUNT
 from plant.errors import InputError
 from plant.files import check_entries, read_toml
+from plant.imu_wiring import IMU_COUNT, SLOTS
 from plant.mechanism import LEGS
 
 DEFAULT_FILE = Path(__file__).with_name("canopen.toml")
@@ -61,10 +61,12 @@ def _one_of(*values: object) -> Check:
     return _must(lambda value: type(value) is type(values[0]) and value in values, text)
 
 
-def _list_of(count: int, check_element: Check) -> Check:
+def _list_of(counts: int | tuple[int, ...], check_element: Check) -> Check:
+    allowed = counts if isinstance(counts, tuple) else (counts,)
+
     def check(name: str, values: Any) -> None:
-        if not isinstance(values, tuple) or len(values) != count:
-            raise InputError(f"{name} is {values!r}; it must be a list of {count}")
+        if not isinstance(values, tuple) or len(values) not in allowed:
+            raise InputError(f"{name} is {values!r}; it must be a list of {' or '.join(map(str, allowed))}")
         for i, value in enumerate(values):
             check_element(f"{name}[{i}]", value)
 
@@ -181,19 +183,23 @@ class DriveSettings:
 
 @dataclass(frozen=True)
 class ImuSettings:
-    """The seven IMUs: those on the legs, and last the platform's."""
+    """The seven IMUs: those on the legs, then the platform's; with --base-imu, that on the base comes last."""
 
-    nodes: tuple[int, ...] = _entry("node ids", _list_of(IMU_COUNT, _node_id))
-    signs: tuple[tuple[int, ...], ...] = _entry("signs of the axes", _list_of(IMU_COUNT, _list_of(3, _one_of(1, -1))))
+    nodes: tuple[int, ...] = _entry("node ids", _list_of((IMU_COUNT, SLOTS), _node_id))
+    signs: tuple[tuple[int, ...], ...] = _entry("signs of the axes", _list_of((IMU_COUNT, SLOTS), _list_of(3, _one_of(1, -1))))
     eds: str = _entry("electronic data sheet; a relative path begins at the folder of the settings file")
     gyroscope_scale: float = _entry("value of one LSB of 16 bits [rad/s]", _positive)
     accelerometer_scale: float = _entry("value of one LSB of 16 bits [m/s^2]", _positive)
     magnetometer_scale: float = _entry("value of one LSB of 16 bits [uT]", _positive)
     heartbeat: float = _entry("interval of the heartbeats [s]", _TIME)
 
+    def __post_init__(self) -> None:
+        if len(self.nodes) != len(self.signs):
+            raise InputError(f"[imus] has {len(self.nodes)} nodes and signs of {len(self.signs)}: give as many of both")
+
     @property
     def scales(self) -> NDArray[np.float64]:
-        """Value of an LSB of each axis (3, 7, 3) [rad/s, m/s^2, uT], with its sign."""
+        """Value of an LSB of each axis (3, n, 3) [rad/s, m/s^2, uT], with its sign."""
         scales = self.gyroscope_scale, self.accelerometer_scale, self.magnetometer_scale
         return np.multiply.outer(scales, np.array(self.signs, np.float64))
 
@@ -222,13 +228,14 @@ class CanopenSettings:
         """Share of the bus' time that the frames of a cycle take at `rate` [Hz] with the most stuff bits: the PDOs, SYNC and a
         heartbeat; on classic CAN two frames per IMU and one magnetometer's. With `lengths` each drive has another frame.
         """
+        count = len(self.imus.nodes)
         bus, of_drive = self.bus, (COMMAND_BYTES, ANSWER_BYTES, *([ANSWER_BYTES] if lengths else []))
         if bus.fd:
             drive = sum(fd_duration(count, bus.bitrate, bus.data_bitrate) for count in of_drive)
-            imus = IMU_COUNT * fd_duration(FD_BYTES, bus.bitrate, bus.data_bitrate)
+            imus = count * fd_duration(FD_BYTES, bus.bitrate, bus.data_bitrate)
         else:
             drive = sum(map(classic_bits, of_drive)) / bus.bitrate
-            imus = (2 * IMU_COUNT + 1) * classic_bits(ANSWER_BYTES) / bus.bitrate
+            imus = (2 * count + 1) * classic_bits(ANSWER_BYTES) / bus.bitrate
         return (LEGS * drive + imus + 2 * classic_bits(1) / bus.bitrate) * rate
 
     def check_bus_load(self, rate: float, lengths: bool = False) -> float:
@@ -283,11 +290,14 @@ def fd_duration(count: int, bitrate: int, data_bitrate: int) -> float:
     return (head + stuff_of_head + 13) / bitrate + (body + stuff_of_body + crc + ceil(crc / 4)) / data_bitrate
 
 
-def canopen_settings(path: Path | str = DEFAULT_FILE, **changes: Mapping[str, Any]) -> CanopenSettings:
+def canopen_settings(
+    path: Path | str = DEFAULT_FILE, base_imu: bool = False, **changes: Mapping[str, Any]
+) -> CanopenSettings:  # fmt: skip
     """Read the settings of a CANopen rig.
 
     Args:
         path: a TOML file with all entries of the default one.
+        base_imu: whether there is an IMU on the base; else its entries are left out.
         changes: by table, such as `bus={"interface": "virtual"}`.
 
     Raises:
@@ -304,6 +314,11 @@ def canopen_settings(path: Path | str = DEFAULT_FILE, **changes: Mapping[str, An
         values = _checked(name, kind, {**document.get(name, {}), **changes.get(name, {})})
         if "eds" in values:
             values["eds"] = str(path.resolve().parent / values["eds"])
+        if kind is ImuSettings:
+            if base_imu and len(values["nodes"]) < SLOTS:
+                raise InputError(f"[imus] nodes of {path} has no eighth IMU, on the base: add it, or leave out --base-imu")
+            count = SLOTS if base_imu else IMU_COUNT
+            values |= {name: values[name][:count] for name in ("nodes", "signs")}
         made.append(kind(**values))
     return CanopenSettings(*made)
 

@@ -5,7 +5,7 @@ describe them for firmware: little-endian, every field aligned to its size, SI u
 802.3, as in zlib) of all bytes before it. One with another length, magic number, version, kind or session, or with a wrong CRC,
 is refused.
 
-A session has the version of its hello: 1, or 2 with the lengths that encoders read.
+A session has the version of its hello: 1, or 2 with the lengths that encoders read, or 3 with an IMU on the base besides.
 """
 
 import zlib
@@ -23,8 +23,8 @@ from plant.truth import TRUTH_SIZE
 MAGIC = 0x48475547
 """The bytes "GUGH"."""
 
-VERSION, WITH_LENGTHS = 1, 2
-"""The version of a session without lengths, and of one with them."""
+VERSION, WITH_LENGTHS, WITH_BASE_IMU = VERSIONS = 1, 2, 3
+"""The version of a session without lengths, of one with them, and of one with an IMU on the base besides."""
 
 
 class DatagramKind(IntEnum):
@@ -75,13 +75,25 @@ limits [m/s]; and the raw IMU data [rad/s, m/s^2, uT], NaN without an IMU."""
 LENGTHS_DATAGRAM = np.dtype(
     [("length", "f8", LEGS), ("rate", "f4", LEGS), ("home", "i1", LEGS), ("reserved", "u1", 2), ("crc", "u4")]
 )
-"""In version 2, a measurement goes on with what encoders read: lengths [m] and their rates [m/s], NaN without an encoder, and
-the home switches: 1 beyond the switch, 0 before it, -1 without one."""
+"""From version 2 on, a measurement goes on with what encoders read: lengths [m] and their rates [m/s], NaN without an encoder,
+and the home switches: 1 beyond the switch, 0 before it, -1 without one."""
+
+BASE_IMU_DATAGRAM = np.dtype([("sample_ns", "i8"), ("sample_number", "u4"), ("measurement", "f4", (2, 3)), ("crc", "u4")])
+"""In version 3, it then goes on with the IMU on the base: time and number of its sample, and its raw data [rad/s, m/s^2], NaN
+without one."""
 
 TRUTH_DATAGRAM = np.dtype([("truth", "f8", TRUTH_SIZE), ("reserved", "u4"), ("crc", "u4")])
 """An emulated rig appends it to all that."""
 
-LONGEST = MEASUREMENT_DATAGRAM.itemsize + LENGTHS_DATAGRAM.itemsize + TRUTH_DATAGRAM.itemsize
+LONGEST = sum(
+    each.itemsize for each in (MEASUREMENT_DATAGRAM, LENGTHS_DATAGRAM, BASE_IMU_DATAGRAM, TRUTH_DATAGRAM)
+)  # fmt: skip
+
+
+def version_for(lengths: bool, base_imu: bool) -> int:
+    """The version of a session that tells so much."""
+    return WITH_BASE_IMU if base_imu else WITH_LENGTHS if lengths else VERSION
+
 
 Bytes = NDArray[np.uint8]
 

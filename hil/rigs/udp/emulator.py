@@ -11,7 +11,18 @@ from numpy.typing import NDArray
 
 from hil.rigs import ANSWERED, SILENT, DriveState, Request
 from hil.rigs.emulation import disturb, draw, move, sample
-from hil.rigs.udp.datagrams import HELLO_DATAGRAM, LONGEST, MAGIC, VERSION, WITH_LENGTHS, Bytes, DatagramKind, crc32, is_valid
+from hil.rigs.udp.datagrams import (
+    HELLO_DATAGRAM,
+    LONGEST,
+    MAGIC,
+    VERSION,
+    WITH_BASE_IMU,
+    WITH_LENGTHS,
+    Bytes,
+    DatagramKind,
+    crc32,
+    is_valid,
+)
 from hil.rigs.udp.link import UdpLink, await_datagram, decode_answer, encode_command, new_link, receive_datagram, send_datagram
 from plant.compiled import Record, kernel, record_dtype, shared_kernel
 from plant.mechanism import LEGS
@@ -86,7 +97,7 @@ def is_later(sequence: int, last: int) -> bool:
 def answer_command(emulator: UdpEmulator, length: int, now_ns: int) -> int:
     """Apply the received command of `length` bytes, and write the answer; returns its length, 0 without one."""
     rig, session, link = emulator.rig[()], emulator.session[()], emulator.link
-    c, a, b, version = link.command[0], link.answer[0], link.lengths[0], link.socket[()].version
+    c, a, b, base, version = link.command[0], link.answer[0], link.lengths[0], link.base_imu[0], link.socket[()].version
     finite = True
     for k in range(LEGS):
         finite = finite and np.isfinite(c.velocity[k])
@@ -116,12 +127,16 @@ def answer_command(emulator: UdpEmulator, length: int, now_ns: int) -> int:
     a.measurement[:] = rig.measurement
     a.drive[:], a.code[:], a.velocity[:] = rig.drive, rig.code, rig.velocity
     a.crc = crc32(link.answer_bytes, link.answer.itemsize - 4)
-    t, written = link.truth[0][0], link.answer.itemsize
+    t, written = link.truth[version - VERSION][0], link.answer.itemsize
     if version >= WITH_LENGTHS:
         b.length[:], b.rate[:], b.home[:] = rig.length, rig.length_rate, rig.home
         b.crc = crc32(link.answer_bytes[written:], link.lengths.itemsize - 4)
-        t = link.truth[1][0]
         written += link.lengths.itemsize
+    if version >= WITH_BASE_IMU:
+        base.measurement[:] = rig.base_imu
+        base.sample_ns, base.sample_number = rig.base_imu_ns, rig.base_imu_sequence
+        base.crc = crc32(link.answer_bytes[written:], link.base_imu.itemsize - 4)
+        written += link.base_imu.itemsize
     t.truth[:] = rig.truth
     t.crc = crc32(link.answer_bytes[written:], link.truth[0].itemsize - 4)
     return int(written + link.truth[0].itemsize)

@@ -1,11 +1,11 @@
-/* Datagrams of gough's UDP rig, versions 1 and 2, for firmware: C11, freestanding, for little-endian machines. docs/rigs.md describes
+/* Datagrams of gough's UDP rig, versions 1 to 3, for firmware: C11, freestanding, for little-endian machines. docs/rigs.md describes
  * the protocol, and hil/rigs/udp/reference_rig.c is a rig to start from.
  *
  * Every field is aligned to its size, so the structures need no packing. Padding at their end makes some longer in memory than
  * on the wire: a datagram ends with `crc`, and its length is GOUGH_..._LENGTH, not sizeof. SI units.
  *
- * A session has the version of its hello. In version 2, a struct gough_lengths follows each measurement. A rig without encoders
- * may know version 1 only.
+ * A session has the version of its hello. From version 2 on, a struct gough_lengths follows each measurement; in version 3, a
+ * struct gough_base_imu follows that. A rig without encoders and without an IMU on its base may know version 1 only.
  */
 #ifndef GOUGH_RIG_H
 #define GOUGH_RIG_H
@@ -23,7 +23,8 @@
 
 #define GOUGH_MAGIC 0x48475547u /* the bytes "GUGH" */
 #define GOUGH_VERSION 1u
-#define GOUGH_WITH_LENGTHS 2u /* the version with lengths */
+#define GOUGH_WITH_LENGTHS 2u  /* the version with lengths */
+#define GOUGH_WITH_BASE_IMU 3u /* the version with an IMU on the base besides */
 #define GOUGH_PORT 47100
 
 enum gough_kind { GOUGH_HELLO = 1, GOUGH_WELCOME, GOUGH_COMMAND, GOUGH_MEASUREMENT };
@@ -89,13 +90,21 @@ struct gough_measurement {
     uint32_t crc;
 };
 
-/* In version 2, what the encoders read; it follows a measurement. */
+/* From version 2 on, what the encoders read; it follows a measurement. */
 struct gough_lengths {
     double length[GOUGH_LEGS]; /* [m], positive when the leg extends, from any zero; NaN without an encoder */
     float rate[GOUGH_LEGS];    /* [m/s]; NaN without an encoder */
     int8_t home[GOUGH_LEGS];   /* home switches: 1 beyond the switch, 0 before it, -1 without one */
     uint8_t reserved[2];
     uint32_t crc; /* of this structure alone */
+};
+
+/* In version 3, the IMU on the base; it follows the lengths. */
+struct gough_base_imu {
+    int64_t sample_ns;       /* time of its sample, on the rig's clock */
+    uint32_t sample_number;  /* the same when a sample is repeated */
+    float measurement[2][3]; /* angular velocity [rad/s] and specific force [m/s^2] along the axes of the base; NaN without it */
+    uint32_t crc;            /* of this structure alone */
 };
 
 /* An emulated rig appends it to all that. */
@@ -111,6 +120,7 @@ struct gough_truth {
 #define GOUGH_COMMAND_LENGTH GOUGH_LENGTH(gough_command)
 #define GOUGH_MEASUREMENT_LENGTH GOUGH_LENGTH(gough_measurement)
 #define GOUGH_LENGTHS_LENGTH GOUGH_LENGTH(gough_lengths)
+#define GOUGH_BASE_IMU_LENGTH GOUGH_LENGTH(gough_base_imu)
 #define GOUGH_TRUTH_LENGTH GOUGH_LENGTH(gough_truth)
 
 _Static_assert(sizeof(float) == 4 && sizeof(double) == 8, "IEEE 754");
@@ -134,6 +144,8 @@ _Static_assert(GOUGH_MEASUREMENT_LENGTH == 412, "measurement");
 _Static_assert(offsetof(struct gough_lengths, rate) == 48, "lengths.rate");
 _Static_assert(offsetof(struct gough_lengths, home) == 72, "lengths.home");
 _Static_assert(GOUGH_LENGTHS_LENGTH == 84, "lengths");
+_Static_assert(offsetof(struct gough_base_imu, measurement) == 12, "base_imu.measurement");
+_Static_assert(GOUGH_BASE_IMU_LENGTH == 40, "base_imu");
 _Static_assert(GOUGH_TRUTH_LENGTH == 160, "truth");
 
 /* CRC-32 (IEEE 802.3, as in zlib), without a table: 8 steps a byte. */
@@ -156,7 +168,7 @@ static inline int gough_check(const void *data, size_t received, size_t length, 
         return 0;
     memcpy(&head, data, sizeof head);
     memcpy(&crc, (const uint8_t *)data + length - sizeof crc, sizeof crc);
-    return head.magic == GOUGH_MAGIC && head.version >= GOUGH_VERSION && head.version <= GOUGH_WITH_LENGTHS &&
+    return head.magic == GOUGH_MAGIC && head.version >= GOUGH_VERSION && head.version <= GOUGH_WITH_BASE_IMU &&
            head.kind == kind && crc == gough_crc32(data, length - sizeof crc);
 }
 

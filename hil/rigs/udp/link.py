@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hil.rigs import ANSWERED, SILENT, DriveState
 from hil.rigs.udp.datagrams import (
+    BASE_IMU_DATAGRAM,
     COMMAND_DATAGRAM,
     LENGTHS_DATAGRAM,
     LONGEST,
@@ -21,6 +22,7 @@ from hil.rigs.udp.datagrams import (
     MEASUREMENT_DATAGRAM,
     TRUTH_DATAGRAM,
     VERSION,
+    WITH_BASE_IMU,
     WITH_LENGTHS,
     Bytes,
     DatagramKind,
@@ -109,8 +111,9 @@ class UdpLink(NamedTuple):
     command: Record  # from the controller
     command_bytes: Bytes  # its buffer
     answer: Record  # the measurement from the rig
-    lengths: Record  # which follow it in version 2
-    truth: tuple[Record, Record]  # which may follow that: in version 1, and in version 2
+    lengths: Record  # which follow it from version 2 on
+    base_imu: Record  # which follows these in version 3
+    truth: tuple[Record, Record, Record]  # which may follow all that, by version
     answer_bytes: Bytes  # the buffer of all
 
 
@@ -120,10 +123,12 @@ def new_link() -> UdpLink:
     socket["version"] = VERSION
     first = MEASUREMENT_DATAGRAM.itemsize
     second = first + LENGTHS_DATAGRAM.itemsize
+    third = second + BASE_IMU_DATAGRAM.itemsize
     return UdpLink(
         socket, command[: COMMAND_DATAGRAM.itemsize].view(COMMAND_DATAGRAM), command,
         answer[:first].view(MEASUREMENT_DATAGRAM), answer[first:second].view(LENGTHS_DATAGRAM),
-        (_truth_at(answer, first), _truth_at(answer, second)), answer,
+        answer[second:third].view(BASE_IMU_DATAGRAM),
+        (_truth_at(answer, first), _truth_at(answer, second), _truth_at(answer, third)), answer,
     )  # fmt: skip
 
 
@@ -200,11 +205,12 @@ def decode_answer(link: UdpLink, length: int, feedback: Record) -> bool:
     """Accept the received datagram of `length` bytes if it is the answer to the last command; otherwise only count it as
     refused.
     """
-    s, a, b = link.socket[()], link.answer[0], link.lengths[0]
-    size, with_lengths = link.answer.itemsize, s.version >= WITH_LENGTHS
-    t, whole = link.truth[0][0], size
-    if with_lengths:
-        t, whole = link.truth[1][0], size + link.lengths.itemsize
+    s, a, b, c = link.socket[()], link.answer[0], link.lengths[0], link.base_imu[0]
+    with_lengths, with_base_imu = s.version >= WITH_LENGTHS, s.version >= WITH_BASE_IMU
+    size = link.answer.itemsize
+    to_base_imu = size + (link.lengths.itemsize if with_lengths else 0)
+    whole = to_base_imu + (link.base_imu.itemsize if with_base_imu else 0)
+    t = link.truth[s.version - VERSION][0]
     with_truth = length == whole + link.truth[0].itemsize
     if (
         s.stranger != 0
@@ -213,6 +219,7 @@ def decode_answer(link: UdpLink, length: int, feedback: Record) -> bool:
         or a.session != s.session
         or a.sequence != s.sequence
         or (with_lengths and b.crc != crc32(link.answer_bytes[size:], link.lengths.itemsize - 4))
+        or (with_base_imu and c.crc != crc32(link.answer_bytes[to_base_imu:], link.base_imu.itemsize - 4))
         or (with_truth and t.crc != crc32(link.answer_bytes[whole:], link.truth[0].itemsize - 4))
     ):
         feedback.refused += 1
@@ -221,6 +228,9 @@ def decode_answer(link: UdpLink, length: int, feedback: Record) -> bool:
         feedback.length[k] = b.length[k] if with_lengths else np.nan
         feedback.length_rate[k] = b.rate[k] if with_lengths else np.nan
         feedback.home[k] = b.home[k] if with_lengths else -1
+    if with_base_imu:
+        feedback.base_imu[:] = c.measurement
+        feedback.base_imu_ns, feedback.base_imu_sequence = c.sample_ns, c.sample_number
     feedback.sample_ns[:], feedback.sequence[:] = a.sample_ns, a.sample_number
     feedback.measurement[:] = a.measurement
     for k in range(LEGS):

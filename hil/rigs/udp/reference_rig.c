@@ -76,6 +76,13 @@ static int8_t read_encoder(const struct leg *leg, double *length, float *rate) {
     return -1;
 }
 
+/* Replace this: read the IMU on the base, and return the time of its sample. Here it is at rest. */
+static int64_t read_base_imu(float measurement[2][3]) {
+    memset(measurement, 0, 2 * sizeof measurement[0]);
+    measurement[1][2] = 9.81f;
+    return now_ns();
+}
+
 /* Replace this: move a drive at a velocity [m/s], here for `period` [s]; a drive that is not `powered` holds on its brake. */
 static void drive(struct leg *leg, float velocity, int powered, double period) {
     leg->velocity = powered ? velocity : 0.0f;
@@ -201,7 +208,7 @@ static int take_command(const struct gough_command *command, const struct sockad
         answer.velocity[k] = rig.leg[k].velocity;
     }
     gough_finish(&answer, GOUGH_MEASUREMENT_LENGTH, GOUGH_MEASUREMENT, rig.version, rig.session, rig.last, now);
-    uint8_t datagram[GOUGH_MEASUREMENT_LENGTH + GOUGH_LENGTHS_LENGTH];
+    uint8_t datagram[GOUGH_MEASUREMENT_LENGTH + GOUGH_LENGTHS_LENGTH + GOUGH_BASE_IMU_LENGTH];
     size_t length = GOUGH_MEASUREMENT_LENGTH;
     memcpy(datagram, &answer, length);
     if (rig.version >= GOUGH_WITH_LENGTHS) {
@@ -211,6 +218,13 @@ static int take_command(const struct gough_command *command, const struct sockad
         gough_seal(&lengths, GOUGH_LENGTHS_LENGTH);
         memcpy(datagram + length, &lengths, GOUGH_LENGTHS_LENGTH);
         length += GOUGH_LENGTHS_LENGTH;
+    }
+    if (rig.version >= GOUGH_WITH_BASE_IMU) {
+        struct gough_base_imu base = {.sample_number = rig.samples};
+        base.sample_ns = read_base_imu(base.measurement);
+        gough_seal(&base, GOUGH_BASE_IMU_LENGTH);
+        memcpy(datagram + length, &base, GOUGH_BASE_IMU_LENGTH);
+        length += GOUGH_BASE_IMU_LENGTH;
     }
     answer_to(sender, datagram, length);
     return 1;

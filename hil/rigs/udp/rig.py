@@ -10,7 +10,7 @@ import time
 import numpy as np
 
 from hil.rigs import ANSWERED, SILENT, DriveState, Identity, Request, RigError, new_feedback
-from hil.rigs.udp.datagrams import HELLO_DATAGRAM, VERSION, WELCOME_DATAGRAM, WITH_LENGTHS, DatagramKind, decode, encode
+from hil.rigs.udp.datagrams import HELLO_DATAGRAM, WELCOME_DATAGRAM, WITH_BASE_IMU, DatagramKind, decode, encode, version_for
 from hil.rigs.udp.link import exchange_udp, new_link, parse_address, send_command, socket_address
 from plant.compiled import Record
 from plant.mechanism import LEGS
@@ -31,16 +31,19 @@ class UdpRig:
         period: of the exchanges [s].
         anywhere: whether the address may be neither loopback nor of a private network.
         lengths: whether the rig is to tell what its encoders read.
+        base_imu: whether it is to tell what an IMU on its base reads.
 
     Raises:
         InputError: the text is not an address, or the address is not allowed.
     """
 
-    def __init__(self, address: str, period: float, anywhere: bool = False, lengths: bool = False) -> None:
+    def __init__(
+        self, address: str, period: float, anywhere: bool = False, lengths: bool = False, base_imu: bool = False
+    ) -> None:  # fmt: skip
         self.address = parse_address(address, anywhere)
         self.command_delay = period
         self.link = new_link()
-        self.link.socket["version"] = WITH_LENGTHS if lengths else VERSION
+        self.link.socket["version"] = version_for(lengths, base_imu)
         self.watchdog_s = 0.0
         self._socket: socket.socket | None = None
         self._timespec = np.zeros(2, np.int64)
@@ -55,12 +58,15 @@ class UdpRig:
         session, version = secrets.randbits(31) + 1, int(self.link.socket["version"])
         welcome = self._greet(opened, session, version, _OPENING_S)
         if welcome is None:
-            older = version > VERSION and self._greet(opened, session + 1, VERSION, _OLDER_S) is not None
+            known = next(
+                (each for each in range(version - 1, 0, -1) if self._greet(opened, session + each, each, _OLDER_S)), None
+            )  # fmt: skip
             self.close()
             raise RigError(
-                f"the rig at {host}:{port} knows version {VERSION} of the datagrams only, which has no lengths: give it newer "
-                "firmware (docs/rigs.md), or do without --lengths"
-                if older
+                f"the rig at {host}:{port} knows the datagrams up to version {known} only, and this run needs version "
+                f"{version}, as 2 has lengths and 3 the base's IMU: give it newer firmware (docs/rigs.md), or do without "
+                f"{'--base-imu' if version == WITH_BASE_IMU else '--lengths'}"
+                if known is not None
                 else f"no rig answers at {host}:{port}: start it ('gough emulate --bus udp'), check the address, and that no "
                 "other controller has it"
             )

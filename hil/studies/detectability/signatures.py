@@ -22,6 +22,7 @@ from plant.errors import InputError
 from plant.imu import ImuModel, imu_state
 from plant.imu.model import SensorErrors
 from plant.imu_disturbances import BASE_PREFIX, Course, Disturbance, DisturbanceKind, disturbance_of_text
+from plant.imu_wiring import IMU_COUNT
 from plant.mechanism import Mechanism
 from plant.pose import Array
 
@@ -100,7 +101,7 @@ def directions_of(texts: Sequence[str]) -> int:
 
 def _disturb(stage: Stage, readings: Array, d: Disturbance) -> None:
     """Change the readings (2, N, 7, 3) of the IMUs as a disturbance does."""
-    imus, axis = list(d.imus), np.array(d.axis)
+    imus, axis = [imu for imu in d.imus if imu < IMU_COUNT], np.array(d.axis)
     begin = d.begin if d.begin >= 0.0 else stage.times[0]
     end = begin + d.duration
     there = (stage.times >= begin) & (stage.times < end)

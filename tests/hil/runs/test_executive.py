@@ -156,6 +156,18 @@ def test_a_replay_is_the_run_bit_for_bit(recorded):
     assert process.returncode == 0
 
 
+@pytest.mark.parametrize("fusion", ["compiled", "whole"])
+def test_a_replay_has_the_added_sensors(fusion, tmp_path):
+    """Lengths and the base's IMU are as much part of a recording as the other IMUs."""
+    added = ["--lengths", "incremental", "--base-imu", "--fault", "base-tilt,axis=x,size_deg=3,sine_hz=0.2,at=0.1"]
+    path = tmp_path / "run.mcap"
+    process = gough("run", "--duration", 1, "--rate", 200, "--most-missed", 2000, "--fusion", fusion, "--record", path, *added)
+    assert process.wait() == 0, process.communicate()
+    records = read(path).records
+    assert np.isfinite(records["base_imu"]).all() and np.isfinite(records["length"]).all()
+    assert replay([path]).same
+
+
 def rewritten(path, to, change):
     """A recording with its records changed."""
     found = read(path)

@@ -159,3 +159,21 @@ def test_a_base_that_is_back_at_rest_leaves_no_trace(make_plant: MakePlant) -> N
         plant.step(0.05)
     for name in SEEN:
         np.testing.assert_array_equal(one.get(name), other.get(name), err_msg=name)
+
+
+@pytest.mark.parametrize("name", ["hexapod", "planar-3rpr"])
+def test_an_imu_on_the_base_reads_what_its_path_on_the_earth_makes(name: str, make_plant: MakePlant) -> None:
+    """The path of its place is differentiated twice, by automatic differentiation of the swaying base alone."""
+    place = np.array([0.2, -0.1, 0.15])
+    moving, t, at = MovingBase(swaying), ca.SX.sym("t"), 0.37
+    origin, turn = swaying(t)
+    path = origin + turn @ place
+    felt = turn.T @ (ca.jacobian(ca.jacobian(path, t), t) - ca.DM([0.0, 0.0, -9.81]))
+    spin = turn.T @ ca.reshape(ca.jacobian(ca.vec(turn), t), 3, 3)
+    rate = ca.vertcat(spin[2, 1], spin[0, 2], spin[1, 0])
+    expected = [np.array(ca.Function("at", [t], [each])(at)).ravel() for each in (rate, felt)]
+    p = load_in_space(name).plant_parameters() | {"base_imu_position": place, "gravity": np.array([0.0, 0.0, -9.81])}
+    with make_plant(p) if name == "hexapod" else FmuPlant(default_fmu(PLANAR_MODEL), p, 1e-3) as plant:
+        move_base(plant, moving.inputs(at))
+        np.testing.assert_allclose(plant.get("base_imu_angular_velocity"), expected[0], atol=1e-12)
+        np.testing.assert_allclose(plant.get("base_imu_specific_force"), expected[1], atol=1e-10)

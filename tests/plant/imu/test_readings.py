@@ -652,3 +652,36 @@ def test_what_is_wrong_in_a_file_is_told(tmp_path: Path, text: str, message: str
         load_imu(str(path))
     with pytest.raises(InputError, match="cannot read"):
         load_imu(str(tmp_path / "none.toml"))
+
+
+# ---- an eighth IMU, on the base ----
+
+
+@pytest.mark.parametrize("name", ["mpu9150", "mpu9150-nominal"])
+def test_an_imu_on_the_base_leaves_the_others_as_they_are(name: str) -> None:
+    signals, model = np.random.default_rng(1).normal(size=(60, 3, 7, 3)), load_imu(name)
+    alone, beside = imu_state(model, 5, PERIOD), imu_state(model, 5, PERIOD, on_base=True)
+    np.testing.assert_array_equal(readings(alone, signals), readings(beside, signals))
+    assert not alone["reading"][:, 7].any() and beside["reading"][:2, 7].all()
+
+
+def test_an_imu_on_the_base_has_errors_of_its_own_and_reads_the_base() -> None:
+    state, ideal = (
+        imu_state(load_imu("mpu9150"), 5, PERIOD, on_base=True),
+        imu_state(load_imu("ideal"), 5, PERIOD, on_base=True),
+    )
+    assert not (state["offset"][:, 7:] == state["offset"][:, :7]).all(axis=2).any()
+    ideal["base"] = np.arange(9.0).reshape(3, 3)
+    readings(ideal, constant(0.5, 3))
+    np.testing.assert_array_equal(ideal["reading"][:, 7], np.arange(9.0).reshape(3, 3))
+    np.testing.assert_array_equal(ideal["reading"][:, :7], 0.5)
+
+
+def test_a_disturbance_of_the_imu_on_the_base_is_its_own() -> None:
+    models = replace(load_imu("ideal"), disturbances=(disturbance_of_text("imu-offset:7,axis=x,size_m_per_s2=0.5"),))
+    state = imu_state(models, 0, PERIOD, on_base=True)
+    assert not readings(state, constant(0.0, 2)).any()
+    np.testing.assert_array_equal(state["reading"][ACCELEROMETER, 7], [0.5, 0.0, 0.0])
+    assert disturbance_of_text("imu-noise:all,size_m_per_s2=1,axis=all").imus == (*range(8),)
+    with pytest.raises(InputError, match="there are 0 to 7"):
+        disturbance_of_text("imu-offset:8,axis=x,size_m_per_s2=0.5")

@@ -11,11 +11,11 @@ from controller.estimation.integrity.hypotheses import (
     Kind,
     directions_of,
     evidence_for,
-    find_frames,
     imu_of,
     kind_of,
 )
 from controller.estimation.integrity.stage import STEPS, step_integrity
+from controller.estimation.whole_mechanism.readings import find_frames
 from plant.pose import rotation_from_vector
 from tests.controller.estimation.integrity.made_up import constants, place_legs, readings
 
@@ -37,7 +37,7 @@ def scratch_at(mechanism, position, rotation):
     parameters, state = constants(mechanism)
     s = state["integrity"]
     s["filter"]["path"]["position"], s["filter"]["path"]["rotation"] = position, rotation
-    find_frames(parameters["rig"]["sensors"][()], s["filter"]["path"][()], s["hypotheses"]["frames"])
+    find_frames(parameters["rig"]["sensors"][()], position, rotation, s["hypotheses"]["frames"])
     return s
 
 

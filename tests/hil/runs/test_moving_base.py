@@ -1,0 +1,103 @@
+"""A base that moves, with an IMU on it: how good the pose is, over every link, and what is told when that IMU is lost."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from controller.safety.causes import Cause, Mode
+from hil.faults.links import run
+from hil.faults.rows import Drawn
+from hil.runs.config import SimulationConfig
+from hil.runs.simulation import SimulationStoppedError, simulate
+from plant.errors import InputError
+from tests.hil.runs.test_lengths import errors_of, rms
+
+SEA = (
+    "base-tilt,axis=x,size_deg=3,sine_hz=0.125,at=0.2", "base-tilt,axis=y,size_deg=1.5,sine_hz=0.0917,at=0.7",
+    "base-tilt,axis=z,size_deg=1,sine_hz=0.109,at=0.5", "base-acceleration,axis=z,size_m_per_s2=0.1,sine_hz=0.159,at=0.2",
+    "base-acceleration,axis=y,size_m_per_s2=0.16,sine_hz=0.2,at=0.9",
+)  # fmt: skip
+"""Tilts by degrees and moves of a decimetre, with periods of 5 to 11 s."""
+
+AT_SEA = SimulationConfig(target="sines", duration=8.0, base_imu=True, faults=SEA)
+
+
+def lasts(text):
+    return replace(AT_SEA, faults=(*SEA, text))
+
+
+@pytest.mark.parametrize("fusion", ["compiled", "whole"])
+def test_with_ideal_sensors_the_pose_on_a_base_that_moves_is_exact(fusion):
+    """As with a base at rest, once the base no longer begins to move within a tenth of a second."""
+    still, moved = (
+        rms(errors_of(simulate(replace(AT_SEA, imu="ideal", fusion=fusion, **changes)).records)[4000:])
+        for changes in ({"base_imu": False, "faults": ()}, {})
+    )
+    assert (moved < still + (5e-3, 1e-3)).all()
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(("fusion", "most"), [("compiled", (1.0, 0.2)), ("whole", (0.5, 0.1))])
+def test_with_calibrated_imus_the_pose_on_a_base_that_moves_is_as_good_as_at_rest(fusion, most, seed):
+    result = simulate(replace(AT_SEA, fusion=fusion, seed=seed))
+    assert (rms(errors_of(result.records)) < most).all()
+    assert not [event for event in result.events if "left out" in event or "share" in event]
+
+
+def test_without_an_imu_on_the_base_its_motion_is_told():
+    with pytest.raises(SimulationStoppedError, match=r"base|all accelerometers|all gyroscopes|contradict"):
+        simulate(replace(AT_SEA, base_imu=False))
+
+
+def test_a_base_that_leans_far_and_turns_fast():
+    """It heels by 20 deg from 6 deg at power-on, at up to 9 deg/s, and turns by 60 deg, at up to 19 deg/s."""
+    storm = (
+        "base-tilt,axis=y,size_deg=6",
+        "base-tilt,axis=x,size_deg=20,ramp_s=4,at=1",
+        "base-tilt,axis=z,size_deg=60,ramp_s=6,at=3",
+    )
+    records = simulate(replace(AT_SEA, faults=storm, duration=10.0)).records
+    assert np.linalg.norm(errors_of(records)[:, :3], axis=1).max() < 2.0
+
+
+@pytest.mark.parametrize("link", ["udp", "canopen"])
+def test_the_imu_on_the_base_comes_over_a_bus(link):
+    records, _, cause = run(Drawn(replace(AT_SEA, faults=(), duration=4.0, rate=500.0), link, SEA, frozenset(), 0.0))
+    assert cause == Cause.END_OF_MOTION
+    assert np.isfinite(records["base_imu"][10:]).all() and (records["base_imu_age"][10:] <= 1).all()
+    assert (rms(errors_of(records)) < (1.0, 0.25)).all()
+
+
+@pytest.mark.parametrize(
+    "fault", ["imu-dead:7,at=2", "imu-frozen:7,at=2"]
+)  # fmt: skip
+def test_a_lost_imu_on_the_base_ends_the_run(fault):
+    config = replace(AT_SEA, faults=(), duration=4.0, rate=500.0)
+    records, first, cause = run(Drawn(config, "udp", (*SEA, fault), frozenset(), 2.0))
+    assert cause == Cause.BASE_IMU_LOST
+    told = np.flatnonzero((records["event_cause"] == Cause.BASE_IMU_LOST).any(axis=1))[0]
+    assert first <= told <= first + 0.025 * config.rate
+    assert np.linalg.norm(errors_of(records)[:, :3], axis=1).max() < 2.0
+
+
+def test_an_imu_on_the_base_that_turns_on_its_mounting_is_told_before_the_pose_is_far_off():
+    """It looks like a base that tilts, or like an error that all share."""
+    with pytest.raises(SimulationStoppedError) as stopped:
+        simulate(lasts("imu-turn:7,axis=x,size_deg=5,at=3"))
+    records = stopped.value.result.records
+    running = records[records["mode"] == Mode.RUNNING]
+    assert np.linalg.norm(errors_of(running)[:, :3], axis=1).max() < 15.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"magnetometer": True}, "leave out --magnetometer or --base-imu"),
+        ({"fusion": "filterpy"}, "with --base-imu the fusion is one of compiled, whole"),
+        ({"fusion": "section-5", "magnetometer": True}, "with --base-imu the fusion is one of"),
+    ],
+)
+def test_what_has_no_moving_base_is_refused(changes, text):
+    with pytest.raises(InputError, match=text):
+        simulate(replace(AT_SEA, **changes))
