@@ -22,7 +22,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from controller import load_feed_forward, pid, reference
+from controller import level_frame, load_feed_forward, pid, reference
 from controller import safety as safety_stage
 from controller.calibration.file import Calibration
 from controller.direct_kinematics.geometry import LINEAR_RANK
@@ -66,6 +66,7 @@ from plant.mechanism import LEGS, Mechanism
 from plant.mechanism.planar import PLANAR_LEGS
 from plant.pose import Array
 from plant.stopwatch import now
+from plant.vectors import vector
 
 _LEAST_GRAVITY = 0.1
 _LEAST_EVIDENCE_HZ = 125.0
@@ -82,6 +83,7 @@ PARAMETERS = record_dtype(
     pose=pose_estimator.PARAMETERS,
     mechanism=trust.PARAMETERS,
     integrity=integrity.PARAMETERS,
+    level=level_frame.PARAMETERS,
     load=load_feed_forward.PARAMETERS,
     pid=pid.PARAMETERS,
     safety=safety_stage.PARAMETERS,
@@ -114,6 +116,7 @@ STATE = record_dtype(
     mechanism=trust.STATE,
     integrity=integrity.STATE,
     reference=reference.STATE,
+    level=level_frame.STATE,
     load=load_feed_forward.STATE,
     pid=pid.STATE,
     safety=safety_stage.STATE,
@@ -163,6 +166,7 @@ def cycle_parameters(
     to_arm: bool = True,
     encoder: EncoderModel | None = None,
     on_base: bool = False,
+    level: bool = False,
 ) -> Record:
     """The constants of the cycle (dtype `PARAMETERS`).
 
@@ -182,6 +186,7 @@ def cycle_parameters(
         to_arm: whether the drives are enabled; else everything is read and nothing moves.
         encoder: the kind of the encoders; None without encoders.
         on_base: whether there is an IMU on the base.
+        level: whether the target is in the level frame; that needs that IMU, and six legs.
 
     Raises:
         InputError: a rate out of range, an IMU that cannot be, IMUs that do not determine the pose, or a limit of the
@@ -198,6 +203,8 @@ def cycle_parameters(
         )
     present = imus_of(mechanism, imus)
     errors, of_heading = (calibration.covariance, calibration.floor), field if magnetometer else None
+    if level and (mechanism.planar or not on_base):
+        raise InputError("a target in the level frame needs six legs and an IMU on the base: add --base-imu")
     if on_base and magnetometer:
         raise InputError(
             "the field of the earth turns in the frame of a base that moves: leave out --magnetometer or --base-imu"
@@ -235,6 +242,7 @@ def cycle_parameters(
         integrity=integrity.integrity_parameters(
             fusion, rate, prior, watch_evidence, base_imu.SHARED_NOISE if on_base else 1.0
         ),
+        level=level_frame.level_parameters(mechanism, fusion, watched, level),
         load=load_feed_forward.load_parameters(mechanism, command_delay),
         pid=pid.pid_parameters(control, limits.velocity),
         safety=safety_stage.safety_parameters(watched, drive_settings or DriveSettings(), mechanism, rate, to_arm),
@@ -293,6 +301,11 @@ def run_stages(
         imu_health.screen_imus(
             p.imus, s.imus, rig, time, s.safety.watch.silent, measurement, s.reference.motion, s.safety.events
         )  # fmt: skip
+        if p.level.active != 0 and s.base.begun != 0:
+            level_frame.follow_attitude(
+                p.level, s.level, s.base.rate, s.base.force, vector(rig.sensors.up_in_base[0]), rig.sensors.gravity,
+                elapsed(rig, time),
+            )  # fmt: skip
         if p.base.present != 0:
             base_imu.take_base_out(
                 p.base, s.base, p.safety, s.safety, rig, time, s.imus, s.legs, p.platform, s.platform, s.pose, s.reference,
@@ -394,7 +407,7 @@ def _control(parameters: Record, state: Record, segments: Array) -> int:
     )  # fmt: skip
     pose.lengths[rig.legs :] = 0.0
     if s.reference.due_cycle != time.cycle + 1:
-        reference.update_reference(s.reference, rig, time, s.safety, segments)
+        _update_reference(parameters, state, segments)
     for k in range(rig.legs):
         s.pid.error[k] = s.reference.motion[k, 0] - pose.lengths[k]
     arming.run_arming_checks(p.safety, s.safety, rig, time, p.imus, s.imus, s.integrity, pose, s.reference, s.pid)
@@ -470,7 +483,16 @@ def react(parameters: Record, state: Record, cause: int, index: int, value: floa
 @kernel
 def prepare_next(parameters: Record, state: Record, segments: Array) -> None:
     """After a cycle, when its events have been read: the next reference, which need not lie between measurement and command."""
-    rig, s = parameters[()].rig, state[()]
+    s = state[()]
     s.safety.events.count = 0
     if s.safety.mode != Mode.FAULT:
-        reference.update_reference(s.reference, rig, s.time, s.safety, segments)
+        _update_reference(parameters, state, segments)
+
+
+@kernel
+def _update_reference(parameters: Record, state: Record, segments: Array) -> None:
+    """The reference of this cycle, in {1}."""
+    p, s = parameters[()], state[()]
+    reference.update_reference(s.reference, p.rig, s.time, s.safety, segments)
+    if p.level.active != 0:
+        level_frame.follow_level_target(p.level, s.level, p.rig, s.safety, s.base, s.reference)

@@ -65,7 +65,7 @@ def _find_poses(
     arms, directions, errors, jacobian = np.zeros((LEGS, 3)), np.zeros((LEGS, 3)), np.zeros(LEGS), np.zeros((6, 6))
     error = 0.0
     for i in range(lengths.shape[0]):
-        error = _find_pose(geometry, lengths[i], position, rotation, arms, directions, errors, jacobian)
+        error = find_pose(geometry, lengths[i], position, rotation, arms, directions, errors, jacobian)
         if not error < _REACHED_M:
             return i, error
         positions[i] = position
@@ -74,7 +74,7 @@ def _find_poses(
 
 
 @kernel
-def _find_pose(
+def find_pose(
     geometry: Record, target: Array, position: Array, rotation: Array, arms: Array, directions: Array, errors: Array,
     jacobian: Array,
 ) -> float:  # fmt: skip

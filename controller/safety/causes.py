@@ -207,6 +207,13 @@ class Cause(IntEnum):
 
     BASE_IMU_LOST = 72, "the IMU on the base has no readings that can be used", Reaction.STOP, "s"
 
+    LEVEL_BEYOND = (
+        73,
+        "leg {} cannot follow the target in the level frame: stroke or drive are at their limit",
+        Reaction.GO_ON,
+        "m",
+    )
+
     NO_POSE_FITS = 66, "no pose fits the IMUs, even without the worst of them", Reaction.QUICK_STOP, "sigma RMS"
 
     @property

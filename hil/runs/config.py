@@ -30,6 +30,9 @@ FUSIONS = {
 
 FUSIONS_ON_A_MOVING_BASE = tuple(name for name in FUSIONS if name not in ("filterpy", "section-5"))
 
+FRAMES = BASE, LEVEL = "base", "level"
+"""The frames of a target: {1}, or one that stays level."""
+
 RIGS = ("fmu", "udp", "canopen", "replay")
 PYTHON_RIG = "python:"
 """The prefix of a rig in the user's own Python class, such as python:my_rig:MyRig (module and class)."""
@@ -126,6 +129,11 @@ class SimulationConfig:
         metavar="KIND",
     )
     base_imu: bool = option(False, "IMU 7 is on the base, which may move then (docs/moving_base.md)")
+    frame: str = option(
+        BASE,
+        "frame of the target: base, or level, in which the platform keeps its attitude while the base rolls (needs --base-imu)",
+        choices=FRAMES,
+    )
     magnetometer: bool = option(False, "the platform's magnetometer gives its heading")
     rig: str = option(
         "fmu",
@@ -176,6 +184,10 @@ class SimulationConfig:
                 f"with --base-imu the fusion is one of {', '.join(FUSIONS_ON_A_MOVING_BASE)}, not {self.fusion}: choose one of "
                 "them, or leave --base-imu out"
             )
+        if self.frame not in FRAMES:
+            raise UnknownNameError(f"no frame {self.frame!r}; there are {', '.join(FRAMES)}{nearest(self.frame, FRAMES)}")
+        if self.frame == LEVEL and not self.base_imu:
+            raise InputError("a target in the level frame needs an IMU on the base: add --base-imu")
         if self.lengths != NO_LENGTHS and self.fusion == "section-5":
             raise InputError("the paper's section 5 takes no lengths: leave --lengths out, or take another --fusion")
 

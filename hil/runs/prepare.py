@@ -27,7 +27,7 @@ from hil.rigs import Rig
 from hil.rigs.by_name import check_legs, python_rig
 from hil.rigs.udp.link import DEFAULT_ADDRESS
 from hil.rigs.udp.rig import UdpRig
-from hil.runs.config import FUSIONS, PYTHON_RIG, SimulationConfig
+from hil.runs.config import FUSIONS, LEVEL, PYTHON_RIG, SimulationConfig
 from hil.runs.names import check_names
 from hil.runs.plant_start import check_start
 from plant.compiled import Record
@@ -125,7 +125,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         parameters = cycle_parameters(
             mechanism, config.rate, control, fusion, config.imus, FUSIONS[config.fusion], calibration, config.magnetometer,
             config.fusion == "section-5", safety, drives, 0.0 if config.rig == "fmu" else period,
-            config.arm, encoder, config.base_imu,
+            config.arm, encoder, config.base_imu, config.frame == LEVEL,
         )  # fmt: skip
         remarks = [
             calibration.remark,

@@ -16,11 +16,12 @@ from controller.safety.causes import Cause
 from hil.loop.records import COMPUTED
 from hil.progress import Progress, Say, no_progress, say_nothing
 from hil.realtime.durations import QUANTILES, percentiles
-from hil.runs.config import SimulationConfig
+from hil.runs.config import LEVEL, SimulationConfig
 from hil.runs.prepare import PreparedLoop, prepared_loop
 from hil.runs.run_state import note_events
 from hil.runs.snapshot import Snapshot, resume_snapshot, take_snapshot
 from plant.compiled import Record
+from plant.dynamics.base_course import attitudes_of, placed
 from plant.errors import GoughError, InputError
 from plant.mechanism import Mechanism
 from plant.pose import Array, pose_errors, rms_figures, rotations_from_quaternions
@@ -220,9 +221,14 @@ def _result(
     records = loop.records[first:done]
     times = (np.arange(first, done) - loop.cycle_at(0.0)) / config.rate
     lengths = records["reference"][:, : loop.mechanism.legs, 0]
+    target = loop.target.at(times)
+    if config.frame == LEVEL:
+        hold = float(loop.parameters["rig"]["hold_cycles"] * loop.parameters["rig"]["period"])
+        moved = attitudes_of([placed(each, hold) for each in config.base_motions], 1e-9 * records["time_ns"])
+        target = (target[0][:, None] @ moved)[:, 0], np.swapaxes(moved, 1, 2) @ target[1]
     return SimulationResult(
         config, loop.mechanism, loop.target, loop.reference, times, records,
-        *poses_from_lengths(loop.mechanism, lengths, loop.target.start, partial=True), *loop.target.at(times),
+        *poses_from_lengths(loop.mechanism, lengths, loop.target.start, partial=True), *target,
         (done - first) / config.rate / took, snapshot, loop.remarks, loop.parameters.copy(),
     )  # fmt: skip
 

@@ -7,6 +7,7 @@ A base has inertia: a ramp begins and ends gently, and a step takes a tenth of a
 about its origin.
 """
 
+from collections.abc import Sequence
 from enum import IntEnum
 from math import inf, radians
 from typing import Any
@@ -17,7 +18,7 @@ from plant.compiled import Record, filled, kernel, record_dtype
 from plant.errors import InputError, UnknownNameError
 from plant.files import check_entries
 from plant.imu_disturbances import BASE_PREFIX, WORDS, Course, axis_in, course_in, number_in, words_of_text
-from plant.pose import Array
+from plant.pose import Array, rotation_from_vector
 
 MOST_BASE_MOTIONS = 8
 """The most that act on a base."""
@@ -209,3 +210,15 @@ def base_motion_at(motions: Record, count: int, time: float, motion: Array) -> N
     motion[6] += c * (tx + ry * uz - rz * uy) - b * sx - bs * ux + cs * vx
     motion[7] += c * (ty + rz * ux - rx * uz) - b * sy - bs * uy + cs * vy
     motion[8] += c * (tz + rx * uy - ry * ux) - b * sz - bs * uz + cs * vz
+
+
+def attitudes_of(motions: Sequence[Record], times: Array) -> Array:
+    """The attitudes (N, 3, 3) of a base under such motions at times (N,) [s]: they turn {1} to where it was before."""
+    made, motion = np.zeros(max(len(motions), 1), BASE_MOTION), np.zeros(BASE_SIZE)
+    for place, each in enumerate(motions):
+        made[place] = each
+    attitudes = np.empty((len(times), 3, 3))
+    for attitude, time in zip(attitudes, times, strict=True):
+        base_motion_at(made, len(motions), time, motion)
+        attitude[:] = rotation_from_vector(motion[:3])
+    return attitudes
