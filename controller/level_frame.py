@@ -7,8 +7,8 @@ small error d of B, seen in the level frame,
     d' = c,   c = B (b - its truth),   B f x up / g = d + noise
 
 The noise is that of a base that is accelerated to and fro, so that a sample counts for tens of seconds. Nothing tells the
-heading. It is taken to be that at the start, with the same noise: the platform keeps its heading while the base yaws to and fro,
-and turns with a base that goes on turning.
+heading. It is taken to be that at the start, with the same noise: the platform keeps its heading while the base yaws to and
+fro, and turns with a base that goes on turning.
 
 A target pose p, R in the level frame is B^T p, B^T R in {1}. Its rate and acceleration there follow from those of the base. The
 reference of a leg follows that, within the limits of its drive and its stroke; where it cannot, that is told.
@@ -163,6 +163,7 @@ def follow_level_target(p: Record, s: Record, rig: Record, safety: Record, base:
         return
     first = s.running_for == 0.0
     if first:
+        motion[:] = planned
         s.position[:] = p.position
         s.rotation[:] = p.rotation
     t = (reference.due_cycle - s.due_cycle) * rig.period

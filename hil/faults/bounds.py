@@ -15,6 +15,7 @@ from hil.studies.detectability.bounds import Bound, Disturbed, find_bounds
 from hil.studies.detectability.signatures import NoSignatureError
 from hil.studies.detectability.uncertainty import Uncertainty
 from hil.table import Cell, Table
+from plant.encoders import NO_LENGTHS
 from plant.errors import InputError
 from plant.files import read_text
 
@@ -107,6 +108,8 @@ def bounds_of_rows(
 
 def _bounds_of(row: Row, seeds: int, uncertainty: Uncertainty) -> RowBounds:
     drawn = [row.drawn(seed, "whole") for seed in range(seeds)]
+    if row.base_imu or row.lengths != NO_LENGTHS:
+        return RowBounds(row, bool(drawn[0].guilty), reason="the test has neither lengths nor an IMU on the base")
     try:
         bounds = find_bounds([Disturbed(each.config, each.faults, each.begin) for each in drawn], uncertainty)
     except NoSignatureError as error:

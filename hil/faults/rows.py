@@ -14,6 +14,7 @@ import numpy as np
 
 from hil.rigs.emulation import FaultKind
 from hil.runs.config import SimulationConfig
+from plant.encoders import NO_LENGTHS
 from plant.errors import InputError
 from plant.files import check_entries, read_toml
 from plant.fmu.settings import Setting
@@ -44,6 +45,7 @@ class Row:
         base_bend_mm: how far the base plate is bent: its joints leave the plane by a saddle of this height [mm].
         joint_off_mm: how far base joint {k} is off, in a random direction [mm].
         link: one of `LINKS`.
+        lengths, base_imu: the added sensors, as in `SimulationConfig`.
         guilty: the IMUs that may rightly be left out; None for those that have a disturbance alone, or with a few others.
     """
 
@@ -62,6 +64,8 @@ class Row:
     base_bend_mm: float = 0.0
     joint_off_mm: float = 0.0
     link: str = "fmu"
+    lengths: str = NO_LENGTHS
+    base_imu: bool = False
     guilty: tuple[int, ...] | None = None
 
     def drawn(self, seed: int, fusion: str) -> "Drawn":
@@ -79,6 +83,7 @@ class Row:
         config = SimulationConfig(
             mechanism=self.mechanism, target=self.target, duration=self.duration, rate=self.rate, imu=self.imu, seed=seed,
             fusion=fusion, joint_error=self.joint_error, settings=tuple(settings), faults=faults if self.link == "fmu" else (),
+            lengths=self.lengths, base_imu=self.base_imu,
         )  # fmt: skip
         guilty = guilty_of(faults) if self.guilty is None else frozenset(self.guilty)
         late = any(f"={at:g}" in text for text in faults) or any(each.at is not None for each in settings)

@@ -10,7 +10,9 @@ from hil.faults.links import run
 from hil.faults.rows import Drawn
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import SimulationStoppedError, simulate
-from plant.errors import InputError
+from plant.errors import GoughError, InputError
+from plant.pose import pose_errors, vector_from_rotation
+from plant.truth import TRUTH_LENGTHS
 from tests.hil.runs.test_lengths import errors_of, rms
 
 SEA = (
@@ -101,3 +103,44 @@ def test_an_imu_on_the_base_that_turns_on_its_mounting_is_told_before_the_pose_i
 def test_what_has_no_moving_base_is_refused(changes, text):
     with pytest.raises(InputError, match=text):
         simulate(replace(AT_SEA, **changes))
+
+
+AT_LEVEL = replace(AT_SEA, frame="level", duration=60.0)
+
+
+@pytest.mark.parametrize("target", ["hold", "sines"])
+def test_a_target_in_the_level_frame_keeps_its_attitude_on_the_earth(target):
+    """Against the true motion of the base, of which the loop knows nothing."""
+    result = simulate(replace(AT_LEVEL, target=target))
+    late = result.times > 40.0
+    truth = result.true_positions[late], result.true_rotations[late]
+    off = pose_errors(*truth, result.target_positions[late], result.target_rotations[late]).reshape(-1, 6)
+    tilt, heading = np.degrees(np.sqrt((off[:, 3:5] ** 2).sum(axis=1).mean())), np.degrees(np.sqrt((off[:, 5] ** 2).mean()))
+    assert tilt < 0.1 and heading < 0.15
+    assert 1e3 * np.sqrt((off[:, :3] ** 2).sum(axis=1).mean()) < 2.0
+    rolled = pose_errors(*truth, *result.target.at(result.times[late])).reshape(-1, 6)
+    assert np.degrees(np.abs(rolled[:, 3]).max()) > 2.5
+
+
+def test_what_cannot_be_kept_level_is_told_and_stays_within_the_stroke():
+    heeling = ("base-tilt,axis=x,size_deg=15,ramp_s=6,at=3",)
+    result = simulate(replace(AT_LEVEL, target="hold", faults=heeling, duration=12.0))
+    assert any("cannot follow the target in the level frame" in event for event in result.events)
+    lengths, stroke = result.records["truth"][:, TRUTH_LENGTHS], result.mechanism.require_limits().stroke
+    assert (lengths >= stroke[:, 0]).all() and (lengths <= stroke[:, 1]).all()
+
+
+def test_the_platform_leaves_the_bases_frame_within_the_limits_of_its_drives():
+    """The base leans when the motion begins."""
+    result = simulate(replace(AT_LEVEL, target="hold", faults=("base-tilt,axis=y,size_deg=5",), duration=6.0))
+    limits, reference = result.mechanism.require_limits(), result.records["reference"]
+    assert np.abs(reference[:, :, 1]).max() <= limits.velocity and np.abs(reference[:, :, 2]).max() <= limits.acceleration
+    assert np.degrees(vector_from_rotation(result.true_rotations[-1] @ result.target_rotations[-1].T)[1]) == pytest.approx(
+        0, abs=0.3
+    )
+
+
+@pytest.mark.parametrize("frame", ["level", "sky"])
+def test_a_frame_without_its_sensor_is_refused(frame):
+    with pytest.raises(GoughError, match="add --base-imu" if frame == "level" else "there are base, level"):
+        replace(AT_SEA, base_imu=False, frame=frame)
