@@ -217,12 +217,12 @@ def scaled(values, by):
     return by * values.sum()
 
 @shared_kernel
-def inner(record, by):
+def inner(record, by) -> float:
     record.count += 1
     return scaled(record.values, by) / record.count
 
 @shared_kernel
-def middle(record):
+def middle(record) -> float:
     return inner(record, 2.0) + inner(record, by=2.0)
 
 @kernel
