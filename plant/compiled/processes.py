@@ -20,7 +20,8 @@ from numba import typeof
 from numba.core import event
 from numba.core.registry import cpu_target
 
-from plant.compiled.linking import Origin, shared_kernels_declared
+from plant.compiled.linking import Origin
+from plant.compiled.shared import shared_kernels_declared
 
 MOST_WORKERS = 4
 """More would wait for the largest kernels."""
@@ -135,8 +136,8 @@ def _start(others: list[_Worker]) -> _Worker:
 
 
 def _work(pipe: Connection) -> None:
-    """Compile what the parent sends. Answer with the name of each function, with the origin of each shared kernel that it calls,
-    and with None when a kernel is done, and when all are saved.
+    """Compile what the parent sends. Answer with the name of each function, the origin of each shared kernel that is called,
+    None when a kernel is done, and None when all are saved.
     """
     for each in _LEFT_TO_PARENT:
         signal.signal(each, signal.SIG_IGN)

@@ -13,7 +13,8 @@ from hil.loop.records import RECORD, STAGES, Link
 from hil.realtime.clock import REAL, SCRIPTED, new_clock
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import prepared_loop
-from plant.compiled.linking import described, flat_linking
+from plant.compiled.linking import flat_linking
+from plant.compiled.shared import described
 from plant.dynamics.variables import BRAKE
 from plant.imu import imu_state, load_imu
 from plant.truth import TRUTH_LENGTHS
