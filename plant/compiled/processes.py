@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, cast
 
 from numba import typeof
 from numba.core import event
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import cpu_target
 
 from plant.compiled.linking import Origin
@@ -45,7 +46,7 @@ def load_kernels(*calls: tuple[Any, ...]) -> None:
     typed = [(kernel, tuple(type_of(each) for each in arguments)) for kernel, *arguments in calls]
     missing = [_origin(kernel, types) for kernel, types in typed if not _is_cached(kernel, types)]
     workers = min(len(os.sched_getaffinity(0)), MOST_WORKERS)
-    # The workers of studies have threads, and are as many as there are processors.
+    # A study's workers compile in threads, and there is one for each processor already.
     if missing and workers > 1 and threading.current_thread() is threading.main_thread():
         with suppress(Exception), _workers() as started:
             _compile(missing, started, workers)
@@ -120,8 +121,8 @@ def _compile(kernels: list[Origin], workers: list[_Worker], most: int) -> None:
 
 def _start(others: list[_Worker]) -> _Worker:
     ours, theirs = Pipe()
-    with warnings.catch_warnings():
-        # A worker takes no lock of a thread, such as the one that draws the progress bar: it prints nothing.
+    # No lock that a worker takes may be held by another thread: it compiles, and prints nothing.
+    with global_compiler_lock, warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         pid = os.fork()
     if pid:
