@@ -116,7 +116,9 @@ class FlatLibrary(_Library):  # type: ignore[misc]
         name, kind, (machine_code, stub, calls) = state
         for module, kernel, arguments in calls:
             getattr(import_module(module), kernel).compile(arguments)
-        return super()._unserialize(codegen, (name, kind, (machine_code, stub)))
+        library = super()._unserialize(codegen, (name, kind, (machine_code, stub)))
+        library.calls = calls
+        return library
 
 
 def _weaken(module: Any, which: Callable[[str], bool]) -> None:
