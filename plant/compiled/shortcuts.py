@@ -4,6 +4,7 @@ import gc
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from functools import cache
 from typing import Any, cast
 
 from numba.core import event
@@ -18,7 +19,6 @@ _LAZY_COLLECTION = (50_000, 20, 20)
 """Collecting the many small objects as often as usual would take a third of the time."""
 
 _resolve: Any = BaseFunction.get_call_type
-_text_of_record: Any = Record.__repr__
 
 
 @contextmanager
@@ -63,15 +63,6 @@ def number_of(text: str) -> int:
     return int(hashlib.sha256(text.encode()).hexdigest()[:15], 16)
 
 
-def _text_once(self: Any) -> str:
-    """As the `repr` of a record, which numba writes at each of some 30 passes."""
-    known = self.__dict__
-    if "_gough_text" not in known:
-        known["_gough_text"] = _text_of_record(self)
-    text: str = known["_gough_text"]
-    return text
-
-
 def _variables(self: Any, value: Any) -> list[Any]:
     """As `_rec_list_vars` of numba's instructions, which takes all apart that they consist of."""
     if isinstance(value, dict):
@@ -105,7 +96,8 @@ def _compiled_refuse_shape(source: Any, target: Any) -> Any:
 _SHORTCUTS: tuple[tuple[Any, str, Any], ...] = (
     (BaseFunction, "get_call_type", _resolve_once),
     (Record, "mangling_args", property(_stable_name)),
-    (Record, "__repr__", _text_once),
+    # It is written for each of some 30 passes.
+    (Record, "__repr__", cache(Record.__repr__)),
     (Inst, "_rec_list_vars", _variables),
     (arrayobj, "raise_with_shape_context", _refuse_shape),
     # The timers of each function that is being compiled are called at each of LLVM's functions.
