@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 QUANTILES = {"p50": "p50", "p99": "p99", "p99.9": "p999", "max": "max"}
 """How each quantile is printed, and its name in the figures."""
 
-_COMPILED_FUNCTIONS = 360
-"""About how many functions numba compiles for the first simulation on a machine."""
+_COMPILED_FUNCTIONS = 420
+"""About how many functions numba compiles for the first simulation on a machine, in two processes."""
 
 _QUIET_S = 10.0
 """Without a terminal, a line tells at most so often that work goes on [s]."""

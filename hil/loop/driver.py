@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
-from numba import typeof
 from numba.core import event
 from numpy.typing import NDArray
 
@@ -22,7 +21,7 @@ from hil.realtime.clock import FREE, new_clock
 from hil.rigs import SILENT, Identity, Rig, new_feedback
 from hil.rigs.udp.emulator import UdpEmulator
 from hil.rigs.udp.link import UdpLink
-from plant.compiled import Record
+from plant.compiled import Record, load_kernels
 from plant.dynamics.variables import BRAKE
 from plant.fmu.calls import write_drive_mode
 from plant.pose import Array
@@ -99,16 +98,18 @@ class Loop:
     def load(self, python: bool = False) -> None:
         """Load the machine code of the loop, or of the one in Python."""
         if not python:
-            load_kernel(run_loop, *self._arguments(0, 0))
+            load_kernels((run_loop, *self._arguments(0, 0)))
             return
         cycle, work, segments, clock = (self.parameters, self.state), self._work, self.segments, self.clock
         shared = self.script, self.link, work, self._streamed()
-        load_kernel(now, clock["timespec"])
-        load_kernel(begin_cycle, *cycle, clock, *shared, self.most_missed, 0)
-        load_kernel(process_feedback, *cycle, work, 0)
         stages = CycleStage.SCREENING.value, CycleStage.END.value
-        load_kernel(run_stages, *cycle, work["feedback"]["measurement"], segments, work["marks"][()], *stages)
-        load_kernel(end_cycle, *cycle, segments, self.records, clock, *shared, 0)
+        load_kernels(
+            (now, clock["timespec"]),
+            (begin_cycle, *cycle, clock, *shared, self.most_missed, 0),
+            (process_feedback, *cycle, work, 0),
+            (run_stages, *cycle, work["feedback"]["measurement"], segments, work["marks"][()], *stages),
+            (end_cycle, *cycle, segments, self.records, clock, *shared, 0),
+        )
 
     def _arguments(self, last: int, end: int) -> tuple[Any, ...]:
         plant = (self.fmu, self.imu, self.encoders) if self.udp is None else (None, None, None)
@@ -156,12 +157,6 @@ class Loop:
             return _RAISED
 
 
-def load_kernel(kernel: Any, *arguments: Any) -> None:
-    """Load a kernel's machine code for arguments of these types, or compile it, without running it."""
-    type_of: Any = typeof
-    kernel.compile(tuple(type_of(argument) for argument in arguments))
-
-
 def stop_quickly(rig: Rig) -> None:
     """Stop a rig's drives; no exception hides the reason for the stop."""
     with suppress(Exception):
@@ -195,21 +190,12 @@ class FmuRig:
     def open(self) -> None:
         """Load the machine code that drives the plant."""
         loop, feedback = self._loop, new_feedback()[()]
-        load_kernel(periods_passed, loop.state)
-        load_kernel(
-            exchange_fmu,
-            loop.fmu,
-            loop.imu,
-            loop.encoders,
-            loop.state["pid"]["command"],
-            0,
-            0,
-            0.0,
-            feedback,
-            self._stage_ns,
-            self._timespec,
+        command, work = loop.state["pid"]["command"], (feedback, self._stage_ns, self._timespec)
+        load_kernels(
+            (periods_passed, loop.state),
+            (exchange_fmu, loop.fmu, loop.imu, loop.encoders, command, 0, 0, 0.0, *work),
+            (write_drive_mode, loop.fmu, BRAKE),
         )
-        load_kernel(write_drive_mode, loop.fmu, BRAKE)
 
     def identify(self) -> Identity:
         """The plant has no parts."""

@@ -4,6 +4,7 @@ from plant.compiled.atomics import fence, load_acquire, store_release
 from plant.compiled.cache import hash_of_files, keyed_folder, user_cache
 from plant.compiled.kernels import Record, compilation_reported, filled, kernel, record_dtype, shared_kernel
 from plant.compiled.limits import MOST, Limits, out_of_limits
+from plant.compiled.processes import load_kernels
 
 __all__ = [
     "MOST",
@@ -16,6 +17,7 @@ __all__ = [
     "kernel",
     "keyed_folder",
     "load_acquire",
+    "load_kernels",
     "out_of_limits",
     "record_dtype",
     "shared_kernel",

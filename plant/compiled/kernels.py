@@ -18,7 +18,8 @@ from numba.core import event
 from numba.extending import lower_cast
 
 from plant.compiled.cache import hash_of_files, keyed_folder
-from plant.compiled.linking import linked_flat, linked_shared
+from plant.compiled.linking import linked_flat
+from plant.compiled.shared import linked_shared
 
 F = TypeVar("F", bound=Callable[..., Any])
 

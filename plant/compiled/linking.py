@@ -1,29 +1,26 @@
 """Faster compilation: kernels are linked once, flat, instead of at every level of calls, or not at all into their callers.
 
-This module replaces parts of numba while a kernel compiles. It halves the first start on a machine, and more loops than one
-share the machine code of the cycle.
+This module replaces parts of numba while a kernel compiles.
 """
 
-import gc
-import hashlib
-import itertools
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from importlib import import_module
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 from llvmlite.binding import Linkage, parse_assembly
-from numba.core.bytecode import FunctionIdentity
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.environment import lookup_environment
 from numba.core.registry import cpu_target
-from numba.core.targetconfig import ConfigStack
-from numba.core.types import Record
-from numba.core.types.functions import BaseFunction
+
+from plant.compiled.shortcuts import shortcuts_taken
+
+Origin = tuple[str, str, tuple[Any, ...]]
+"""Module, name and types of arguments of a kernel."""
 
 _Library: Any = JITCodeLibrary
 _environment_of: Any = lookup_environment
@@ -38,10 +35,10 @@ class FlatLibrary(_Library):  # type: ignore[misc]
     """
 
     inner = False
-    origin: tuple[str, str, Any] | None = None
-    """Module, name and types of arguments of a shared kernel."""
+    origin: Origin | None = None
+    """Where a shared kernel comes from."""
 
-    calls: tuple[tuple[str, str, Any], ...] = ()
+    calls: tuple[Origin, ...] = ()
     """The origins of the shared kernels that this code calls: they must be loaded with it."""
 
     _shared_module: Any = None
@@ -119,7 +116,9 @@ class FlatLibrary(_Library):  # type: ignore[misc]
         name, kind, (machine_code, stub, calls) = state
         for module, kernel, arguments in calls:
             getattr(import_module(module), kernel).compile(arguments)
-        return super()._unserialize(codegen, (name, kind, (machine_code, stub)))
+        library = super()._unserialize(codegen, (name, kind, (machine_code, stub)))
+        library.calls = calls
+        return library
 
 
 def _weaken(module: Any, which: Callable[[str], bool]) -> None:
@@ -131,36 +130,6 @@ def _weaken(module: Any, which: Callable[[str], bool]) -> None:
 
 _NO_ENVIRONMENTS = SimpleNamespace(set_env=lambda name, environment: None)
 _MANGLED, _WRAPPER, _ENVIRONMENT = "_ZN", "_ZN7cpython", "_ZN08NumbaEnv"
-_LAZY_COLLECTION = (50_000, 20, 20)
-_resolve: Any = BaseFunction.get_call_type
-
-
-def _resolve_once(self: Any, context: Any, args: Any, kws: Any) -> Any:
-    """As `get_call_type`, which searches all candidates at each use."""
-    flags = cast(Any, ConfigStack).top_or_none()
-    known = self.__dict__.setdefault("_gough_resolved", {})
-    key = args, tuple(kws.items()), None if flags is None else repr(flags._values)
-    if key not in known:
-        signature = _resolve(self, context, args, kws)
-        known[key] = signature, self._impl_keys.get(signature.args)
-    signature, implementation = known[key]
-    self._impl_keys[signature.args] = implementation
-    return signature
-
-
-def _stable_name(self: Any) -> tuple[str, tuple[int]]:
-    """As `mangling_args` of a record, with a number that is the same in every process."""
-    known = self.__dict__
-    if "_gough_number" not in known:
-        known["_gough_number"] = _number_of(str(self))
-    return "Record", (known["_gough_number"],)
-
-
-def _number_of(text: str) -> int:
-    return int(hashlib.sha256(text.encode()).hexdigest()[:15], 16)
-
-
-_mangling_args: Any = Record.mangling_args
 _depth = 0
 
 
@@ -171,22 +140,15 @@ def flat_linking() -> Iterator[None]:
     # numba's own runtime must not be linked flat: build it first.
     cpu_target.target_context.refresh()
     codegen: Any = cpu_target.target_context.codegen()
-    collection, functions = gc.get_threshold(), cast(Any, BaseFunction)
-    records: Any = Record
     _depth += 1
-    if _depth == 1:
-        codegen._library_class, functions.get_call_type = FlatLibrary, _resolve_once
-        records.mangling_args = property(_stable_name)
-        # Collecting the many small objects as often as usual would take a third of the time.
-        gc.set_threshold(*_LAZY_COLLECTION)
     try:
-        yield
+        with shortcuts_taken() if _depth == 1 else nullcontext():
+            codegen._library_class = FlatLibrary
+            yield
     finally:
         _depth -= 1
         if _depth == 0:
-            codegen._library_class, functions.get_call_type = JITCodeLibrary, _resolve
-            records.mangling_args = _mangling_args
-            gc.set_threshold(*collection)
+            codegen._library_class = JITCodeLibrary
 
 
 @contextmanager
@@ -219,29 +181,3 @@ def linked_flat(compile_kernel: Callable[[Any], Any]) -> Callable[[Any], Any]:
             return compile_kernel(signature)
 
     return compile_flat
-
-
-def linked_shared(dispatcher: Any) -> Callable[[Any], Any]:
-    """The `compile` of a dispatcher whose machine code is shared by its callers: with flat linking, and a name in the machine
-    code that is the same in every process.
-    """
-    compile_flat = linked_flat(dispatcher.compile)
-    module, name = dispatcher.py_func.__module__, dispatcher.py_func.__qualname__
-    number = _number_of(f"{module}.{name}")
-    identities: Any = FunctionIdentity
-
-    def compile_shared(signature: Any) -> Any:
-        arguments = tuple(signature)
-        if arguments in dispatcher.overloads:
-            return dispatcher.overloads[arguments].entry_point
-        with global_compiler_lock:
-            others = identities._unique_ids
-            identities._unique_ids = itertools.chain((number,), others)
-            try:
-                entry = compile_flat(arguments)
-            finally:
-                identities._unique_ids = others
-            dispatcher.overloads[arguments].library.origin = module, name, arguments
-        return entry
-
-    return compile_shared

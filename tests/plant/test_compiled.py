@@ -14,11 +14,14 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
+from numba.core.compiler import run_frontend
 
-from plant.compiled import hash_of_files, kernel, keyed_folder, user_cache
+from controller.cycle import run_stages
+from controller.estimation.integrity.stage import step_integrity
+from plant.compiled import hash_of_files, kernel, keyed_folder, shortcuts, user_cache
 from plant.compiled.cache import STALE_AFTER_S
 from plant.compiled.kernels import PACKAGES, WITHOUT_KERNELS
-from plant.compiled.linking import linked_flat
+from plant.compiled.linking import flat_linking, linked_flat
 
 
 @kernel
@@ -62,6 +65,35 @@ def test_a_function_of_numba_alone_calls_kernels_and_is_called_as_ever() -> None
         return _twice(values.sum()) + np.linalg.norm(values)
 
     assert alone(np.array([3.0, 4.0])) == 19.0
+
+
+@kernel
+def _assign(target: Any, source: Any) -> None:
+    target[:] = source
+
+
+def test_arrays_whose_shapes_differ_are_refused_in_few_words() -> None:
+    target = np.zeros(3)
+    _assign(target, np.arange(3.0))
+    assert list(target) == [0.0, 1.0, 2.0]
+    with pytest.raises(ValueError, match="the shapes of an array and of what is assigned to it differ"):
+        _assign(target, np.arange(4.0))
+
+
+def test_numba_is_as_ever_when_nothing_compiles() -> None:
+    before = [getattr(owner, name) for owner, name, _ in shortcuts._SHORTCUTS]
+    with pytest.raises(InterruptedError), flat_linking():
+        assert all(getattr(owner, name) is shortcut for owner, name, shortcut in shortcuts._SHORTCUTS)
+        raise InterruptedError
+    assert [getattr(owner, name) for owner, name, _ in shortcuts._SHORTCUTS] == before
+
+
+@pytest.mark.parametrize("function", [run_stages, step_integrity, _ratio])
+def test_the_variables_of_instructions_are_those_that_numba_finds(function: Any) -> None:
+    blocks = run_frontend(function.py_func).blocks.values()
+    instructions = [instruction for block in blocks for instruction in block.body]
+    assert all(shortcuts._variables(each, vars(each)) == each._rec_list_vars(vars(each)) for each in instructions)
+    assert sum(len(shortcuts._variables(each, vars(each))) for each in instructions) > len(instructions)
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
@@ -217,12 +249,12 @@ def scaled(values, by):
     return by * values.sum()
 
 @shared_kernel
-def inner(record, by):
+def inner(record, by) -> float:
     record.count += 1
     return scaled(record.values, by) / record.count
 
 @shared_kernel
-def middle(record):
+def middle(record) -> float:
     return inner(record, 2.0) + inner(record, by=2.0)
 
 @kernel

@@ -1,15 +1,20 @@
 """The loop around the cycle on a scripted clock: its records, late wake-ups, long work, missed periods and stops."""
 
+from importlib import import_module
+
 import numpy as np
 import pytest
 
 from controller.cycle import STATE, prepare_next, skip_periods
 from controller.safety.causes import Cause
+from hil.loop.compiled_loop import run_loop
 from hil.loop.driver import FmuRig, Loop
 from hil.loop.records import RECORD, STAGES, Link
 from hil.realtime.clock import REAL, SCRIPTED, new_clock
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import prepared_loop
+from plant.compiled.linking import flat_linking
+from plant.compiled.shared import described
 from plant.dynamics.variables import BRAKE
 from plant.imu import imu_state, load_imu
 from plant.truth import TRUTH_LENGTHS
@@ -267,3 +272,18 @@ def test_recorded_covariance_is_that_of_the_errors_at_rest():
         np.testing.assert_array_equal(covariance, covariance.T)
         expected = np.linalg.inv(np.tril(loop.state["pose"]["information"]) + np.tril(loop.state["pose"]["information"], -1).T)
         np.testing.assert_allclose(covariance, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
+
+
+def test_the_loops_shared_kernels_are_what_their_callers_in_other_processes_expect():
+    """Each has the name in machine code, and the types, that follow from its declaration."""
+    with prepared_loop(CONFIG), flat_linking():
+        to_do, seen = [*run_loop.overloads.values()], set()
+        while to_do:
+            for module, name, arguments in to_do.pop().library.calls:
+                dispatcher = getattr(import_module(module), name)
+                compiled, expected = dispatcher.overloads[arguments], described(dispatcher, arguments)
+                for each in ("mangled_name", "restype", "argtypes", "args"):
+                    assert getattr(compiled.fndesc, each) == getattr(expected, each), name
+                seen.add(name)
+                to_do.append(compiled)
+    assert {"run_stages", "exchange_fmu", "step_integrity", "step_mechanism_filter"} <= seen

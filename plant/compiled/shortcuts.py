@@ -1,0 +1,105 @@
+"""What numba does again and again while it compiles, and what nobody reads, done once or not at all."""
+
+import gc
+import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from functools import cache
+from typing import Any, cast
+
+from numba.core import event
+from numba.core.ir import Inst, Var
+from numba.core.targetconfig import ConfigStack
+from numba.core.types import Record
+from numba.core.types.functions import BaseFunction
+from numba.extending import overload
+from numba.np import arrayobj
+
+_LAZY_COLLECTION = (50_000, 20, 20)
+"""Collecting the many small objects as often as usual would take a third of the time."""
+
+_resolve: Any = BaseFunction.get_call_type
+
+
+@contextmanager
+def shortcuts_taken() -> Iterator[None]:
+    """Replace parts of numba meanwhile; what it compiles is the same, but for the text of an error that no kernel raises."""
+    collection = gc.get_threshold()
+    gc.set_threshold(*_LAZY_COLLECTION)
+    before = [(owner, name, getattr(owner, name)) for owner, name, _ in _SHORTCUTS]
+    try:
+        for owner, name, shortcut in _SHORTCUTS:
+            setattr(owner, name, shortcut)
+        yield
+    finally:
+        for owner, name, original in before:
+            setattr(owner, name, original)
+        gc.set_threshold(*collection)
+
+
+def _resolve_once(self: Any, context: Any, args: Any, kws: Any) -> Any:
+    """As `get_call_type`, which searches all candidates at each use."""
+    flags = cast(Any, ConfigStack).top_or_none()
+    known = self.__dict__.setdefault("_gough_resolved", {})
+    key = args, tuple(kws.items()), None if flags is None else repr(flags._values)
+    if key not in known:
+        signature = _resolve(self, context, args, kws)
+        known[key] = signature, self._impl_keys.get(signature.args)
+    signature, implementation = known[key]
+    self._impl_keys[signature.args] = implementation
+    return signature
+
+
+def _stable_name(self: Any) -> tuple[str, tuple[int]]:
+    """As `mangling_args` of a record, with a number that is the same in every process."""
+    known = self.__dict__
+    if "_gough_number" not in known:
+        known["_gough_number"] = number_of(str(self))
+    return "Record", (known["_gough_number"],)
+
+
+def number_of(text: str) -> int:
+    """A number that is the same in every process."""
+    return int(hashlib.sha256(text.encode()).hexdigest()[:15], 16)
+
+
+def _variables(self: Any, value: Any) -> list[Any]:
+    """As `_rec_list_vars` of numba's instructions, which takes all apart that they consist of."""
+    if isinstance(value, dict):
+        value = value.values()
+    elif not isinstance(value, list | tuple):
+        value = (value,)
+    found: list[Any] = []
+    for each in value:
+        if isinstance(each, Var):
+            found.append(each)
+        elif isinstance(each, Inst):
+            found.extend(each.list_vars())  # type: ignore[no-untyped-call]
+        elif isinstance(each, dict | list | tuple):
+            found.extend(_variables(self, each))
+    return found
+
+
+def _refuse_shape(source: Any, target: Any) -> None:
+    """In place of what puts two shapes into words: numba compiles its functions of texts into each assignment of an array."""
+    raise NotImplementedError
+
+
+@overload(_refuse_shape)
+def _compiled_refuse_shape(source: Any, target: Any) -> Any:
+    def refuse(source: Any, target: Any) -> None:
+        raise ValueError("the shapes of an array and of what is assigned to it differ")
+
+    return refuse
+
+
+_SHORTCUTS: tuple[tuple[Any, str, Any], ...] = (
+    (BaseFunction, "get_call_type", _resolve_once),
+    (Record, "mangling_args", property(_stable_name)),
+    # It is written for each of some 30 passes.
+    (Record, "__repr__", cache(Record.__repr__)),
+    (Inst, "_rec_list_vars", _variables),
+    (arrayobj, "raise_with_shape_context", _refuse_shape),
+    # The timers of each function that is being compiled are called at each of LLVM's functions.
+    (event, "install_timer", lambda kind, callback: nullcontext()),
+)
