@@ -34,8 +34,8 @@ PYTHON_RIG = "python:"
 
 MECHANISM = "preset, or a TOML file"
 IMU = (
-    "ideal, mpu9150, mpu9150-calibrated, icm42688, or mpu9150-nominal and icm42688-nominal, which have all that real ones do; "
-    "or a TOML file (docs/imus.md)"
+    "ideal; mpu9150, icm20948, bmi088 or lsm6dso, raw, or followed by -calibrated, or by -nominal, which has all that real "
+    "ones do; icm42688, which is calibrated, or icm42688-nominal; or a TOML file, as of a data sheet (docs/imus.md)"
 )
 CALIBRATION = "the IMUs' constants, as 'gough calibrate' writes them; without it the readings are used as they are"
 """Help of options that several configurations have."""
