@@ -18,14 +18,14 @@ def within_drives(mechanism: Mechanism, force: float = inf) -> Mechanism:
     do with its own. None of them then needs more than `force` [N] at home, by the plant data.
 
     Raises:
-        InputError: the drives, or `force`, have nothing left for that; or `force` is given, and there are no plant data.
+        InputError: the drives, or `force`, have nothing left for that; or `force` is given, and home is singular.
     """
     loads = home_loads(mechanism)
     if loads is None:
         if force < inf:
             raise InputError(
-                f"--force needs masses and drives to know what a motion takes, and {mechanism.name!r} has none: give [plant] "
-                "in its file, or leave --force out and limit the current in the drives"
+                f"--force needs the loads of the legs at home, and the home of {mechanism.name!r} is singular: leave it out, "
+                "and limit the current in the drives"
             )
         return mechanism
     p, limits, constant = mechanism.plant_parameters(), mechanism.require_limits(), force_constant(mechanism)

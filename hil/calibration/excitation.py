@@ -70,11 +70,11 @@ def calibration_targets(mechanism: Mechanism, box: Box) -> dict[str, Target]:
 
 
 def _resting(name: str, times: Array, positions: Array, rotations: Array) -> Target:
-    """Poses to rest at, the last of which is the first again."""
-    ends = np.append(times, times[-1] + REST_S)
-    return Target(
-        name, ends, np.append(positions, positions[:1], axis=0), np.append(rotations, rotations[:1], axis=0), held=True
-    )
+    """Poses to rest at, and then at the first again."""
+    back = times[-1] + REST_S * np.array([1.0, 2.0])
+    homes = (np.repeat(each[:1], 2, axis=0) for each in (positions, rotations))
+    positions, rotations = (np.concatenate(each) for each in zip((positions, rotations), homes, strict=True))
+    return Target(name, np.append(times, back), positions, rotations, held=True)
 
 
 def extent(target: Target) -> tuple[float, float]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from controller.cycle import cycle_parameters
+from controller.inverse_kinematics import inverse_kinematics
 from controller.settings import control_settings, sensor_settings
 from hil.calibration.data import Knowledge
 from hil.calibration.excitation import MotionLimits
@@ -35,6 +36,7 @@ class Bench:
     def __init__(self, mechanism, turned=(), found=()):
         self.runs, self.announced, self.told, self.found = [], [], [], list(found)
         still = np.zeros(6)
+        self.lengths = inverse_kinematics(mechanism, mechanism.require_home()).lengths
         self.signals = ideal_signals(mechanism)(mechanism.require_home(), still, still)
         for imu in turned:
             self.signals[ACCELEROMETER, imu] *= -1.0
@@ -46,6 +48,7 @@ class Bench:
     def run(self, config, path):
         self.runs.append((config.target, config.arm, config.open_loop))
         records = np.zeros(round(config.rate * (config.duration + config.hold)), RECORD)
+        records["reference"][:, :, 0] = self.lengths
         records["cycle"] = np.arange(len(records))
         noise = np.random.default_rng(0).normal(0.0, 0.01, (len(records), 2, 7, 3))
         for sensor, name in ((GYROSCOPE, "angular_velocity"), (ACCELEROMETER, "specific_force")):
@@ -63,7 +66,7 @@ class Bench:
 
 def test_the_first_step_moves_nothing_and_a_failed_one_is_kept_and_gone_on_from(plan, tmp_path: Path) -> None:
     output, bench = tmp_path / "rig.toml", Bench(plan.mechanism)
-    with pytest.raises(FailedCalibrationError, match="step 3 of 6, probing, failed: the cable came off.*--resume") as failed:
+    with pytest.raises(FailedCalibrationError, match=r"step 3 of 6, probing, failed: the cable came off.*--resume") as failed:
         bench.calibrate(plan, output)
     assert bench.announced == [(1, 6, "reading"), (2, 6, "legs"), (3, 6, "probing")]
     assert [run[1:] for run in bench.runs] == [(False, True), (True, True)], "nothing is armed in the first"
@@ -75,7 +78,7 @@ def test_the_first_step_moves_nothing_and_a_failed_one_is_kept_and_gone_on_from(
         bench.calibrate(plan, output)
     again = Bench(plan.mechanism)
     # On a machine that does not move, the first run is now that of the probing, whose readings show no motion.
-    with pytest.raises(FailedCalibrationError, match="step 3 of 6, probing, failed: IMU 0 reads .* of the expected motion"):
+    with pytest.raises(FailedCalibrationError, match=r"step 3 of 6, probing, failed: the rig hardly moves"):
         again.calibrate(plan, output, resume=True)
     assert again.announced == [(3, 6, "probing")] and len(again.runs) == 1
     assert any("step 1 of 6 was done" in line for line in again.told)
@@ -86,14 +89,14 @@ def test_a_kept_recording_of_another_rig_is_refused(plan, tmp_path: Path) -> Non
     with pytest.raises(FailedCalibrationError):
         Bench(plan.mechanism).calibrate(plan, output)
     other = plan_calibration(SimulationConfig(imu="bmi088", rate=200.0), MotionLimits())
-    with pytest.raises(FailedCalibrationError, match="its imu is mpu9150, and this calibration's is bmi088.*remove it"):
+    with pytest.raises(FailedCalibrationError, match=r"its imu is mpu9150, and this calibration's is bmi088.*remove it"):
         Bench(plan.mechanism).calibrate(other, output, resume=True)
 
 
 def test_a_wrong_sign_at_rest_or_in_a_leg_ends_it_before_the_next_step(plan, tmp_path: Path) -> None:
     bench = Bench(plan.mechanism, turned=(2, 6))
     with pytest.raises(
-        FailedCalibrationError, match="step 1 .* gravity comes from elsewhere .* IMU 2 by 180 deg, IMU 6 by 180"
+        FailedCalibrationError, match=r"step 1 .* gravity comes from elsewhere .* IMU 2 by 180 deg, IMU 6 by 180"
     ):
         bench.calibrate(plan, tmp_path / "a.toml")
     assert len(bench.announced) == 1
