@@ -15,7 +15,7 @@ import numpy as np
 
 from controller.calibration.at_rest import RestCalibration, pose_covariance
 from controller.calibration.file import Calibration, save_calibration
-from controller.calibration.mounting_checks import check_gravity
+from controller.calibration.mounting_checks import check_gravity, spreads_of
 from controller.planning.target import Target
 from hil.calibration.data import CalibrationData, Knowledge
 from hil.calibration.excitation import (
@@ -39,6 +39,9 @@ from plant.mechanism import Mechanism, load_spatial
 
 ZEROING_S = 1.0
 """How long each run begins with the brakes on [s]."""
+_ON_THE_BRAKES: dict[str, Any] = {"target": "hold", "arm": False}
+_SAME_PLACE = np.radians(2.0)
+"""By how much gravity may have turned in an IMU since the first step, where the drives follow the plan alone [rad]."""
 _READING_S, _TRYING_S = 2.0, 12.0
 
 
@@ -150,17 +153,21 @@ def calibrate_guided(
         steps.config = replace(plan.config, calibration=str(file := Path(folder) / "calibration.toml"))
         save_calibration(file, Calibration())
         with steps.next() as (step, due):
-            reading = steps.records(step, due, target="hold", arm=False)
+            reading = steps.records(step, due, **_ON_THE_BRAKES)
             guide.tell(_begin(data, reading))
+        if not due and steps.next_follows_plan:
+            again = Path(folder) / "again.mcap"
+            machine.run(replace(steps.config, duration=ZEROING_S, hold=ZEROING_S, open_loop=True, **_ON_THE_BRAKES), again)
+            _check_same_place(reading, read(again).records)
+        calibration = Calibration()
+        calibration.offset[GYROSCOPE] = -data.zero
+        save_calibration(file, calibration)
         with steps.next() as (step, due):
             steps.try_legs(step, due)
             guide.tell("commands, gyroscopes and accelerometers agree with the mechanism")
         with steps.next() as (step, due):
             data.check_places(steps.records(step, due))
             guide.tell("every IMU reads the motion of its place")
-        calibration = Calibration()
-        calibration.offset[GYROSCOPE] = -data.zero
-        save_calibration(file, calibration)
         for open_loop in (True, False):
             with steps.next() as (step, due):
                 data.add_rests(steps.records(step, due, open_loop=open_loop))
@@ -185,6 +192,18 @@ def _begin(data: CalibrationData, records: Record) -> str:
     )
 
 
+def _check_same_place(before: Record, now: Record) -> None:
+    """Check that the platform stands where it stood when the calibration began, by the same raw accelerometers."""
+    forces = np.array([each["specific_force"].mean(axis=0) for each in (before, now)])
+    turned = np.degrees(spreads_of(forces))
+    if (most := float(turned.max())) > np.degrees(_SAME_PLACE):
+        raise FailedCalibrationError(
+            f"the platform does not stand where it stood in the first step: gravity has turned by {most:.2g} deg in IMU "
+            f"{int(turned.argmax())}, and at most {np.degrees(_SAME_PLACE):g} deg are allowed, as the drives follow the plan "
+            "alone next: bring it back near home, and give the same command"
+        )
+
+
 def _expected(mechanism: Mechanism, found: RestCalibration) -> str:
     home = mechanism.require_home()
     covariance = pose_covariance(mechanism, found.tilt, (home.position, home.rotation), found.covariance)
@@ -202,6 +221,12 @@ class _Steps:
         there = [file for each in plan.steps if (file := self._file(each)).exists()]
         if there and not resume:
             raise InputError(f"{there[0]} is there, of an earlier calibration: go on from it with --resume, or remove it")
+
+    @property
+    def next_follows_plan(self) -> bool:
+        """Whether the next step to be done relies on where the platform stands."""
+        due = (each.name for each in self._plan.steps if not self._file(each).exists())
+        return next(due, "") in ("legs", "probing", "near-rests")
 
     def _file(self, step: Step, kind: str = "") -> Path:
         return self._output.with_suffix(f".{step.name}{kind}{'.mcap' if step.recorded else '.txt'}")
@@ -224,8 +249,8 @@ class _Steps:
                 raise FailedCalibrationError(f"{file}: {error}; remove it to do step {self._number} again") from None
             where = f"; what it did is in {failed}" if failed.exists() else ""
             raise FailedCalibrationError(
-                f"step {self._number} of {count}, {step.name}, failed: {error}{where}; mend it, and go on from this step with "
-                "--resume"
+                f"step {self._number} of {count}, {step.name}, failed: {error}{where}; mend it, bring the platform near home, "
+                "and go on from this step with --resume"
             ) from None
         if due:
             # Only what has succeeded is taken by the next calibration.

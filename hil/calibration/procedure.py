@@ -26,6 +26,7 @@ from controller.calibration.file import Calibration, calibrated_rig, save_calibr
 from controller.calibration.in_motion import calibrate_in_motion
 from controller.estimation.whole_mechanism.parameters import ALL_ERRORS
 from controller.planning.motions import REST_S
+from controller.safety import watch_nothing
 from hil.calibration.assessment import assess, constants, cross_validate
 from hil.calibration.data import CalibrationData, Knowledge
 from hil.calibration.drives import within_drives
@@ -79,6 +80,7 @@ class SimulatedRig:
         If `blind`, there is no feed-forward for the load: the platform sinks by millimetres.
         """
         with prepared_loop(replace(config, open_loop=True)) as loop:
+            watch_nothing(loop.parameters)
             if blind:
                 loop.parameters["load"]["droop"] = 0.0
             loop.run(loop.end)

@@ -68,7 +68,7 @@ class SimulationConfig:
         hold: how long the brakes hold first [s]; None for the time in the mechanism's settings.
         wiring: how the IMUs are mounted and wired.
         raw_imus: whether the IMUs are known to be uncalibrated, so that disagreement between them says nothing.
-        open_loop: whether the drives follow the planned speeds whatever the IMUs read, for motions before a calibration.
+        open_loop: whether the drives follow the planned speeds, and IMUs only show a drive that does not: before a calibration.
     """
 
     mechanism: str = option("hexapod", MECHANISM)

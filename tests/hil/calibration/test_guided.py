@@ -21,6 +21,7 @@ from hil.rigs.kinematic import ideal_signals
 from hil.runs.config import SimulationConfig
 from plant.errors import CalibrationError, InputError
 from plant.imu import ACCELEROMETER, GYROSCOPE, load_imu
+from plant.pose import rotation_from_vector
 
 CONFIG = SimulationConfig(imu="mpu9150", rate=200.0)
 
@@ -34,7 +35,7 @@ class Bench:
     """A machine at rest at home, whatever it is asked to do, and what was told of it."""
 
     def __init__(self, mechanism, turned=(), found=()):
-        self.runs, self.announced, self.told, self.found = [], [], [], list(found)
+        self.runs, self.announced, self.told, self.found, self.tilt = [], [], [], list(found), 0.0
         still = np.zeros(6)
         self.lengths = inverse_kinematics(mechanism, mechanism.require_home()).lengths
         self.signals = ideal_signals(mechanism)(mechanism.require_home(), still, still)
@@ -52,12 +53,12 @@ class Bench:
         records["cycle"] = np.arange(len(records))
         noise = np.random.default_rng(0).normal(0.0, 0.01, (len(records), 2, 7, 3))
         for sensor, name in ((GYROSCOPE, "angular_velocity"), (ACCELEROMETER, "specific_force")):
-            records[name] = self.signals[sensor] + noise[:, sensor]
+            records[name] = self.signals[sensor] @ rotation_from_vector([0.0, self.tilt, 0.0]) + noise[:, sensor]
         header = {"config": {**asdict(config), "version": "0"}, "parameters": self.parameters, "reference": np.zeros((6, 1, 5))}
         recorder = Recorder(path, header, 0)
         recorder.write_cycles(records)
         recorder.close()
-        if len(self.runs) > 1:
+        if len(self.runs) > 1 and config.arm:
             raise CalibrationError("the cable came off")
 
     def calibrate(self, plan, output, resume=False):
@@ -77,11 +78,20 @@ def test_the_first_step_moves_nothing_and_a_failed_one_is_kept_and_gone_on_from(
     with pytest.raises(InputError, match=r"rig\.reading\.mcap is there.*--resume, or remove it"):
         bench.calibrate(plan, output)
     again = Bench(plan.mechanism)
-    # On a machine that does not move, the first run is now that of the probing, whose readings show no motion.
-    with pytest.raises(FailedCalibrationError, match=r"step 3 of 6, probing, failed: the rig hardly moves"):
+    with pytest.raises(FailedCalibrationError, match="step 3 of 6, probing, failed: the cable came off"):
         again.calibrate(plan, output, resume=True)
-    assert again.announced == [(3, 6, "probing")] and len(again.runs) == 1
+    assert again.announced == [(3, 6, "probing")] and [run[1] for run in again.runs] == [False, True]
     assert any("step 1 of 6 was done" in line for line in again.told)
+
+
+def test_it_does_not_go_on_blindly_from_another_place(plan, tmp_path: Path) -> None:
+    output, moved = tmp_path / "rig.toml", Bench(plan.mechanism)
+    with pytest.raises(FailedCalibrationError):
+        moved.calibrate(plan, output)
+    moved.runs, moved.announced, moved.tilt = [], [], np.radians(3.0)
+    with pytest.raises(FailedCalibrationError, match=r"does not stand where it stood in the first step: .* by 3\.? ?\d* ?deg"):
+        moved.calibrate(plan, output, resume=True)
+    assert not moved.announced and [run[1] for run in moved.runs] == [False], "nothing moves"
 
 
 def test_a_kept_recording_of_another_rig_is_refused(plan, tmp_path: Path) -> None:
