@@ -10,7 +10,8 @@ import numpy as np
 
 from controller.calibration.at_rest import Prior, Rests, calibrate_at_rest, pose_covariance
 from controller.calibration.mounting_checks import LEAST_RATE, LEAST_SPREAD, spreads_of
-from controller.planning.motions import EVERYWHERE, REST_S, Box, rests, shaking
+from controller.inverse_kinematics import leg_lengths
+from controller.planning.motions import EVERYWHERE, REST_S, Box, Poses, rests, shaking
 from controller.planning.target import Target
 from hil.calibration.drives import within_drives
 from hil.rigs.kinematic import ideal_signals
@@ -20,6 +21,8 @@ from plant.pose import Array, Pose, vector_from_rotation
 
 PROBING_S, SHAKING_S = 4.0, 40.0
 NEAR_RESTS, WIDE_RESTS = 8, 20
+_AT_REST_S, _WAY = 1.5, 1.4
+"""Least time at a pose to rest at [s], and the time of the way to it over that at the limit of speed."""
 _PROBING_SHARE, _PROBING_RATE = 0.3, np.radians(2.0)
 """Of the shaking, as far as some IMU turns at this rate (RMS) [rad/s]."""
 
@@ -63,18 +66,20 @@ def calibration_targets(mechanism: Mechanism, box: Box) -> dict[str, Target]:
     share = min(max(_PROBING_SHARE, _PROBING_RATE / _rate(mechanism, shaken)), 1.0)
     return {
         "probing": Target("probing", *shaking(mechanism, PROBING_S, share, box, back=True)),
-        "near-rests": _resting("near-rests", *rests(mechanism, NEAR_RESTS * REST_S, 0.4, 0.5, box)),
-        "rests": _resting("rests", *rests(mechanism, WIDE_RESTS * REST_S, box=box)),
+        "near-rests": _resting(mechanism, "near-rests", rests(mechanism, NEAR_RESTS * REST_S, 0.4, 0.5, box)),
+        "rests": _resting(mechanism, "rests", rests(mechanism, WIDE_RESTS * REST_S, box=box)),
         "shaking": shaken,
     }
 
 
-def _resting(name: str, times: Array, positions: Array, rotations: Array) -> Target:
-    """Poses to rest at, and then at the first again."""
-    back = times[-1] + REST_S * np.array([1.0, 2.0])
+def _resting(mechanism: Mechanism, name: str, poses: Poses) -> Target:
+    """Poses to rest at, and then at the first again; slow legs take longer from one to the next."""
+    _, positions, rotations = poses
     homes = (np.repeat(each[:1], 2, axis=0) for each in (positions, rotations))
     positions, rotations = (np.concatenate(each) for each in zip((positions, rotations), homes, strict=True))
-    return Target(name, np.append(times, back), positions, rotations, held=True)
+    longest = np.abs(np.diff(leg_lengths(mechanism, positions, rotations), axis=0)).max()
+    each = max(REST_S, _AT_REST_S + _WAY * longest / mechanism.require_limits().velocity)
+    return Target(name, each * np.arange(len(positions)), positions, rotations, held=True)
 
 
 def extent(target: Target) -> tuple[float, float]:

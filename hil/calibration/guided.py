@@ -40,6 +40,8 @@ from plant.mechanism import Mechanism, load_spatial
 ZEROING_S = 1.0
 """How long each run begins with the brakes on [s]."""
 _ON_THE_BRAKES: dict[str, Any] = {"target": "hold", "arm": False}
+_MOST_UNANSWERED = 0.1
+"""Share of the cycles of the first step that may be without an answer of the rig."""
 _SAME_PLACE = np.radians(2.0)
 """By how much gravity may have turned in an IMU since the first step, where the drives follow the plan alone [rad]."""
 _READING_S, _TRYING_S = 2.0, 12.0
@@ -180,6 +182,12 @@ def calibrate_guided(
 
 def _begin(data: CalibrationData, records: Record) -> str:
     """Check what was read while nothing moved; returns what was found, in words."""
+    unanswered = float((records["silent"] > 0).mean())
+    if unanswered > _MOST_UNANSWERED:
+        raise CalibrationError(
+            f"the rig has not answered in time in {100.0 * unanswered:.2g} % of {len(records)} cycles; at most "
+            f"{100.0 * _MOST_UNANSWERED:g} % may be lost: take a lower --rate, or see what 'gough check-rig' says of the bus"
+        )
     data.begin(records, len(records))
     forces, still = records["specific_force"].mean(axis=0), np.zeros(6)
     expected = ideal_signals(data.mechanism)(data.mechanism.require_home(), still, still)
@@ -194,7 +202,7 @@ def _begin(data: CalibrationData, records: Record) -> str:
 
 def _check_same_place(before: Record, now: Record) -> None:
     """Check that the platform stands where it stood when the calibration began, by the same raw accelerometers."""
-    forces = np.array([each["specific_force"].mean(axis=0) for each in (before, now)])
+    forces = np.array([np.nanmean(each["specific_force"], axis=0) for each in (before, now)])
     turned = np.degrees(spreads_of(forces))
     if (most := float(turned.max())) > np.degrees(_SAME_PLACE):
         raise FailedCalibrationError(
@@ -266,7 +274,9 @@ class _Steps:
         for name in ("mechanism", "imu", "rate"):
             if (was := recording.config[name]) != (now := getattr(self.config, name)):
                 raise InputError(f"its {name} is {was}, and this calibration's is {now}: give the same options as before")
-        return every_cycle(recording.records)
+        records = every_cycle(recording.records)
+        # A bus may need some cycles for the first samples.
+        return records[np.isfinite(records["angular_velocity"]).all(axis=(1, 2)).argmax() :]
 
     def try_legs(self, step: Step, due: bool) -> None:
         """Try the legs one by one, and note what was found."""

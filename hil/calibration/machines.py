@@ -37,7 +37,7 @@ def machine_on_clock(settings: RealTimeSettings, watched: Watched) -> Machine:
             raise CalibrationError(f"the run has not come to its end: {summary['cause']}")
 
     def try_legs(config: SimulationConfig) -> Sequence[str]:
-        slow = replace(config, rate=_TRYING_HZ)
+        slow = replace(config, rate=min(config.rate, _TRYING_HZ))
 
         def made() -> Rig:
             rig = rig_of(slow)

@@ -36,6 +36,7 @@ class Bench:
 
     def __init__(self, mechanism, turned=(), found=()):
         self.runs, self.announced, self.told, self.found, self.tilt = [], [], [], list(found), 0.0
+        self.silent = 400
         still = np.zeros(6)
         self.lengths = inverse_kinematics(mechanism, mechanism.require_home()).lengths
         self.signals = ideal_signals(mechanism)(mechanism.require_home(), still, still)
@@ -54,6 +55,7 @@ class Bench:
         noise = np.random.default_rng(0).normal(0.0, 0.01, (len(records), 2, 7, 3))
         for sensor, name in ((GYROSCOPE, "angular_velocity"), (ACCELEROMETER, "specific_force")):
             records[name] = self.signals[sensor] @ rotation_from_vector([0.0, self.tilt, 0.0]) + noise[:, sensor]
+        records["silent"][self.silent :] = 1
         header = {"config": {**asdict(config), "version": "0"}, "parameters": self.parameters, "reference": np.zeros((6, 1, 5))}
         recorder = Recorder(path, header, 0)
         recorder.write_cycles(records)
@@ -110,6 +112,10 @@ def test_a_wrong_sign_at_rest_or_in_a_leg_ends_it_before_the_next_step(plan, tmp
     ):
         bench.calibrate(plan, tmp_path / "a.toml")
     assert len(bench.announced) == 1
+    bench = Bench(plan.mechanism)
+    bench.silent = 30
+    with pytest.raises(FailedCalibrationError, match="has not answered in time in 92 % of 400 cycles; at most 10 %"):
+        bench.calibrate(plan, tmp_path / "c.toml")
     bench = Bench(plan.mechanism, found=["Leg 3 moves the wrong way."])
     with pytest.raises(FailedCalibrationError, match="step 2 of 6, legs, failed: Leg 3 moves the wrong way"):
         bench.calibrate(plan, tmp_path / "b.toml")

@@ -180,14 +180,14 @@ def test_parts_have_the_figures_of_their_data_sheets() -> None:
 
 @pytest.mark.parametrize("part", PARTS)
 def test_the_loop_runs_with_each_part(part: str) -> None:
-    """Calibrated and nominal ones follow to a few millimetres; of a raw one the readings alone are looked at."""
+    """Calibrated and nominal ones follow to a millimetre; of a raw one the readings alone are looked at."""
     for grade in ("-calibrated", "-nominal"):
         result = simulate(SimulationConfig(target="sines", duration=0.5, imu=part + grade))
         records, moving = result.records, result.times >= 0.0
         pose = records["position"], records["rotation"]
         errors = pose_errors(*pose, result.true_positions, result.true_rotations)[moving].reshape(-1, 2, 3)
         position, rotation = np.linalg.norm(errors, axis=2).max(axis=0)
-        assert position < 4e-3 and np.degrees(rotation) < 1.0, grade
+        assert position < 1.5e-3 and np.degrees(rotation) < 0.5, grade
         assert result.records["imus"].all()
     state, ideal, read = imu_state(PRESETS[part], 1, 1e-3), np.zeros((3, 7, 3)), np.empty((500, 3, 7, 3))
     ideal[ACCELEROMETER, :, 2] = STANDARD_GRAVITY
