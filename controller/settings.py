@@ -187,18 +187,23 @@ def drive_settings(mechanism: Mechanism, few_imus: bool = False, **changes: floa
 def sensor_settings(mechanism: Mechanism, imu: ImuModel, encoder: EncoderModel | None = None) -> FusionSettings:
     """The fusion settings of a mechanism, with what its IMUs and encoders tell where its file has none.
 
-    That is the IMUs' delay, magnetometer rate and ranges, and the standard deviations that grow with their
-    `accelerometer_wander`; and the encoders' noise, play and zeros.
+    That is the IMUs' delay, magnetometer rate and ranges, the noise of gyroscopes that have more than the defaults, and the
+    standard deviations that grow with it and with `accelerometer_wander`; and the encoders' noise, play and zeros.
     """
     wander = imu.accelerometer_wander
+    noisier = max(imu.gyroscope.noise / FusionSettings.gyroscope_noise, 1.0)
+    # A direction by gyroscopes and accelerometers is as uncertain as the root of the product of their noises.
+    leg_sigma, tilt_sigma = (sqrt(noisier) * each for each in (FusionSettings.leg_sigma, FusionSettings.tilt_sigma))
     known = {
         "sensor_delay": imu.latency,
         "sensor_timing": imu.timing,
         "magnetometer_rate": min(imu.magnetometer_rate, _ENDLESS),
         "gyroscope_range": min(imu.gyroscope.reach, _ENDLESS),
         "accelerometer_range": min(imu.accelerometer.reach, _ENDLESS),
-        "leg_sigma": hypot(FusionSettings.leg_sigma, wander / STANDARD_GRAVITY),
-        "tilt_sigma": hypot(FusionSettings.tilt_sigma, wander / STANDARD_GRAVITY),
+        "gyroscope_noise": noisier * FusionSettings.gyroscope_noise,
+        "mechanism_gyroscope_noise": noisier * FusionSettings.mechanism_gyroscope_noise,
+        "leg_sigma": hypot(leg_sigma, wander / STANDARD_GRAVITY),
+        "tilt_sigma": hypot(tilt_sigma, wander / STANDARD_GRAVITY),
         "accelerometer_bias_sigma": hypot(FusionSettings.accelerometer_bias_sigma, wander),
     }
     if encoder is not None:

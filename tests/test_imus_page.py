@@ -6,6 +6,7 @@ import tomllib
 from pathlib import Path
 
 from hil.command_line import parse
+from plant.imu.data_sheet import IMU_WORDS, SENSOR_WORDS
 from plant.imu.presets import PRESETS, imu_of_table
 from plant.imu_disturbances import WORDS, DisturbanceKind, disturbance, disturbance_of_table, disturbance_of_text
 
@@ -29,6 +30,10 @@ def test_python_and_toml_say_the_same() -> None:
     assert eval(line, {"disturbance": disturbance}) == disturbance_of_table(table)
     model = imu_of_table(tomllib.loads(toml[1]), "mine", "the page")
     assert (model.sample_rate, model.accelerometer.order, model.conversion_rate) == (500.0, 2, 8000.0)
+    part = imu_of_table(tomllib.loads(toml[2]), "part", "the page")
+    preset = PRESETS["bmi088-calibrated"]
+    assert (part.gyroscope.noise, part.accelerometer.noise) == (preset.gyroscope.noise, preset.accelerometer.noise)
+    assert part.gyroscope.resolution == preset.gyroscope.resolution and part.gyroscope.drift > 0.0
 
 
 def test_tables_are_those_of_the_source() -> None:
@@ -37,5 +42,7 @@ def test_tables_are_those_of_the_source() -> None:
         assert f"\n| `{kind.name.lower()}` | {sizes} | " in PAGE, kind
     for word in WORDS:
         assert f"`{word}`" in PAGE
+    for word in (*SENSOR_WORDS, *IMU_WORDS):
+        assert f"`{word}`" in PAGE or f"\n{word} = " in PAGE or f" {word} = " in PAGE, word
     for name in PRESETS:
         assert f"`{name}`" in PAGE

@@ -50,6 +50,23 @@ def check_alive(samples: Array) -> None:
             )
 
 
+def check_gravity(forces: Array, expected: Array) -> float:
+    """Check that gravity in raw mean forces (7, 3) at rest comes from where it does at home, `expected` (7, 3); returns the
+    greatest angle between them [rad].
+
+    Raises:
+        CalibrationError: it does not; the message names each such IMU.
+    """
+    cosines = (forces * expected).sum(axis=1) / (np.linalg.norm(forces, axis=1) * np.linalg.norm(expected, axis=1))
+    tilts = np.arccos(np.clip(cosines, -1.0, 1.0))
+    if found := [f"IMU {imu} by {np.degrees(tilts[imu]):.3g} deg" for imu in np.flatnonzero(tilts > MOST_TILT)]:
+        raise CalibrationError(
+            f"gravity comes from elsewhere than at home: {', '.join(found)}; at most {np.degrees(MOST_TILT):g} deg are "
+            "allowed: bring the platform near home, or check how these are mounted and in which order their axes are read"
+        )
+    return float(tilts.max())
+
+
 def check_all_along(samples: Array, rate: float) -> None:
     """Check all samples (N, 3, 7, 3) at this rate [Hz]: every IMU gives finite readings, and none is frozen for a tenth of a
     second while others are not.
@@ -72,15 +89,21 @@ def check_all_along(samples: Array, rate: float) -> None:
             )
 
 
+def spreads_of(forces: Array) -> Array:
+    """The greatest angle (7,) [rad] between two of each IMU's mean forces (N, 7, 3)."""
+    verticals = forces / np.linalg.norm(forces, axis=2, keepdims=True)
+    cosines = np.einsum("nki,mki->knm", verticals, verticals).min(axis=(1, 2))
+    angles: Array = np.arccos(np.clip(cosines, -1.0, 1.0))
+    return angles
+
+
 def check_spread(forces: Array) -> None:
     """Check by raw mean forces (N, 7, 3) that the rests differ enough, and that every leg takes part.
 
     Raises:
         CalibrationError: they do not, or one does not.
     """
-    verticals = forces / np.linalg.norm(forces, axis=2, keepdims=True)
-    cosines = np.einsum("nki,mki->knm", verticals, verticals).min(axis=(1, 2))
-    spreads = np.arccos(np.clip(cosines, -1.0, 1.0))
+    spreads = spreads_of(forces)
     if spreads.max() < LEAST_SPREAD:
         raise CalibrationError(
             f"the poses are too alike: between any two of {len(forces)} rests, no IMU turns by more than "

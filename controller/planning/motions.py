@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 from functools import partial
+from math import inf
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +27,16 @@ _STEP_S = 2.0
 
 Poses = tuple[Array, Array, Array]
 """Times (N,) [s], positions (N, 3) [m] and rotations (N, 3, 3)."""
+
+
+class Box(NamedTuple):
+    """How far a motion may lead from home."""
+
+    position: float = inf  # [m]
+    rotation: float = inf  # [rad]
+
+
+EVERYWHERE = Box()
 
 
 def named_motion(name: str, mechanism: Mechanism, duration: float) -> Poses:
@@ -82,11 +94,11 @@ def _steps(times: Array, planar: bool) -> Array:
     return poses[np.arange(len(times)) % len(poses)]
 
 
-def rests(mechanism: Mechanism, duration: float, share: float = 0.8, size: float = 1.0) -> Poses:
-    """Poses to rest at for `REST_S` each, home first, as different as this share of the strokes allows.
+def rests(mechanism: Mechanism, duration: float, share: float = 0.8, size: float = 1.0, box: Box = EVERYWHERE) -> Poses:
+    """Poses to rest at for `REST_S` each, home first, as different as this share of the strokes and the box allow.
 
-    They are chosen among random poses of the workspace, whose way from home is shortened to this `size`: without shortening,
-    hardly any pose is within a small share.
+    They are chosen among random poses of the workspace, whose way from home is shortened to this `size`, and to the box:
+    without shortening, hardly any pose is within a small share.
     """
     limits, home = mechanism.require_limits(), mechanism.require_home()
     lengths = leg_lengths(mechanism, home.position, home.rotation)
@@ -95,6 +107,10 @@ def rests(mechanism: Mechanism, duration: float, share: float = 0.8, size: float
         turns = size * vector_from_rotation(rotations @ home.rotation.T)
         positions = home.position + size * (positions - home.position)
         rotations = np.array([rotation_from_vector(turn) @ home.rotation for turn in turns])
+    if box != EVERYWHERE:
+        moves, turns = positions - home.position, vector_from_rotation(rotations @ home.rotation.T)
+        positions = home.position + _shortened(moves, box.position)
+        rotations = np.array([rotation_from_vector(turn) @ home.rotation for turn in _shortened(turns, box.rotation)])
     drawn = leg_lengths(mechanism, positions, rotations)
     middle, half = limits.stroke.mean(axis=1), 0.5 * (limits.stroke[:, 1] - limits.stroke[:, 0])
     inside = (np.abs(drawn - middle) <= share * half).all(axis=1)
@@ -114,13 +130,25 @@ def rests(mechanism: Mechanism, duration: float, share: float = 0.8, size: float
     )
 
 
-def shaking(mechanism: Mechanism, duration: float, share: float = 1.0) -> Poses:
-    """Sines about home on all axes at once, about 0.8 Hz and a few percent apart, at this share of what the limits allow."""
+def _shortened(vectors: Array, most: float) -> Array:
+    """Vectors (N, 3), those that are longer than `most` shortened to it."""
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    shortened: Array = vectors * np.minimum(1.0, most / np.maximum(lengths, 1e-12))
+    return shortened
+
+
+def shaking(mechanism: Mechanism, duration: float, share: float = 1.0, box: Box = EVERYWHERE, back: bool = False) -> Poses:
+    """Sines about home on all axes at once, about 0.8 Hz and a few percent apart, at this share of what the limits and the box
+    allow; with `back` they end at home.
+    """
     limits, home = mechanism.require_limits(), mechanism.require_home()
     times = np.arange(0.0, duration + MARGIN_S + SAMPLE_PERIOD_S, SAMPLE_PERIOD_S)
     spread = float(np.linalg.norm(mechanism.platform_joints, axis=1).mean())
     frequencies = _SHAKING_HZ * (1.0 + 0.04 * (np.arange(6.0) - 2.5))
     shape = np.sin(2.0 * np.pi * frequencies * times[:, None]) * _fade(times) * np.repeat([1.0, 1.0 / spread], 3)
+    if back:
+        shape *= _fade(duration - times)
+    farthest = np.linalg.norm(shape.reshape(-1, 2, 3), axis=2).max(axis=0)
     if mechanism.planar:
         shape[:, 2:5] = 0.0
 
@@ -138,6 +166,7 @@ def shaking(mechanism: Mechanism, duration: float, share: float = 1.0) -> Poses:
             float((np.abs(lengths - middle) / half).max()),
             float(np.abs(rates).max()) / limits.velocity,
             float(np.abs(np.gradient(rates, SAMPLE_PERIOD_S, axis=0)).max()) / limits.acceleration,
+            _SHAKING_SHARE * float((size * farthest / box).max()),
         )
         low, high = (size, high) if use < _SHAKING_SHARE else (low, size)
     return times, *at(share * low)

@@ -39,7 +39,7 @@ class Knowledge:
     Attributes:
         prior: standard deviations of the IMUs' errors and of the base's tilt.
         home: whether the rig's first pose is home exactly.
-        lengths: whether the rig measures the changes of its lengths.
+        lengths: whether the rig measures the changes of its lengths, by encoders, or in a simulation without them to 50 um.
         known_poses: whether to seek the mounting alone, from planned poses (the paper's section 7).
     """
 
@@ -133,7 +133,9 @@ class CalibrationData:
         truth = records["truth"].mean(axis=0)
         self.readings = np.append(self.readings, readings[None], axis=0)
         self.truth = np.append(self.truth, truth[None, :7], axis=0)
-        measured = truth[TRUTH_LENGTHS] + self._random.normal(0.0, _LENGTH_NOISE, LEGS)
+        measured = records["length"].mean(axis=0)
+        if not np.isfinite(measured).any():
+            measured = truth[TRUTH_LENGTHS] + self._random.normal(0.0, _LENGTH_NOISE, LEGS)
         self._lengths = np.append(self._lengths, measured[None], axis=0)
 
     @property
@@ -144,7 +146,7 @@ class CalibrationData:
             CalibrationError: they are too few or too alike, or there are no lengths.
         """
         if self.knowledge.lengths and not np.isfinite(self._lengths).all():
-            raise CalibrationError("there are no measured lengths in the recording: leave out --lengths")
+            raise CalibrationError("there are no measured lengths in the recording: leave out --length-changes and --encoders")
         if len(self.readings) >= LEAST_POSES:
             check_spread(self.readings[:, :, 3:])
         changes = self._lengths - self._lengths[:1] if self.knowledge.lengths else None

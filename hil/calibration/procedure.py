@@ -59,16 +59,16 @@ class RigCalibration:
 
 
 class FailedCalibrationError(CalibrationError):
-    """A calibration on the rig has failed; `result` is its last run, if the loop was closed."""
+    """A calibration on the rig has failed; `result` is its last run, if that was a simulation with the loop closed."""
 
-    def __init__(self, message: str, result: SimulationResult | None) -> None:
+    def __init__(self, message: str, result: SimulationResult | None = None) -> None:
         super().__init__(message)
         self.result = result
 
 
 @dataclass(eq=False)
-class _Rig:
-    """Drives the rig, and keeps the last run: the configuration, its constants and reference, and its records."""
+class SimulatedRig:
+    """Drives a simulated rig, and keeps the last run: the configuration, its constants and reference, and its records."""
 
     header: dict[str, Any] = field(default_factory=dict)
     records: Record | None = None
@@ -79,8 +79,7 @@ class _Rig:
 
         If `blind`, there is no feed-forward for the load: the platform sinks by millimetres.
         """
-        with prepared_loop(config) as loop:
-            loop.parameters["pid"]["gains"] = 0.0
+        with prepared_loop(replace(config, open_loop=True)) as loop:
             watch_nothing(loop.parameters)
             if blind:
                 loop.parameters["load"]["droop"] = 0.0
@@ -137,7 +136,7 @@ def calibrate_rig(
         FailedCalibrationError: an IMU is not as it should be, or the data do not give a calibration.
         GoughError: something in the configuration cannot be used.
     """
-    rig = _Rig()
+    rig = SimulatedRig()
     try:
         return _calibrate(rig, config, knowledge, progress, validate)
     except CalibrationError as error:
@@ -145,7 +144,9 @@ def calibrate_rig(
         raise FailedCalibrationError(f"{error}{kept}", rig.result) from None
 
 
-def _calibrate(rig: _Rig, config: SimulationConfig, knowledge: Knowledge, progress: Progress, validate: bool) -> RigCalibration:
+def _calibrate(
+    rig: SimulatedRig, config: SimulationConfig, knowledge: Knowledge, progress: Progress, validate: bool
+) -> RigCalibration:
     mechanism = load_spatial(config.mechanism)
     data = CalibrationData(mechanism, config.imu, config.rate, knowledge, config.seed)
     if (driven := within_drives(mechanism)) is not mechanism:
@@ -171,7 +172,7 @@ def _calibrate(rig: _Rig, config: SimulationConfig, knowledge: Knowledge, progre
         at_rest = data.at_rest()
         save_calibration(file, at_rest.calibration())
         motion = rig.run_closed(shaking, part_of(progress, 1.0 - _SHAKING_S / _WHOLE_S, _SHAKING_S / _WHOLE_S))
-    return _finish(data, at_rest, [motion], known, validate)
+    return finish(data, at_rest, [motion], known, validate)
 
 
 def calibrate_recordings(paths: Sequence[Path], knowledge: Knowledge = _NOTHING) -> RigCalibration:
@@ -183,7 +184,7 @@ def calibrate_recordings(paths: Sequence[Path], knowledge: Knowledge = _NOTHING)
         RecordingError: no recordings, or not of one rig.
         CalibrationError: as `calibrate_rig`.
     """
-    recordings = [_complete(path, read(path)) for path in paths]
+    recordings = [complete(path, read(path)) for path in paths]
     first = recordings[0].config
     for path, each in zip(paths, recordings, strict=True):
         for name in ("mechanism", "imu", "rate"):
@@ -192,16 +193,17 @@ def calibrate_recordings(paths: Sequence[Path], knowledge: Knowledge = _NOTHING)
                     f"the {name} of {path} is {each.config[name]} and of {paths[0]} {first[name]}: give recordings of one rig"
                 )
     data = CalibrationData(load_spatial(first["mechanism"]), first["imu"], first["rate"], knowledge, first["seed"])
-    runs = [_every_cycle(each.records) for each in recordings]
+    runs = [every_cycle(each.records) for each in recordings]
     data.begin(runs[0], int(recordings[0].constant("rig", "hold_cycles")))
     for records in runs:
         data.check_places(records)
         data.add_rests(records)
     known = calibrate_by_known_poses(data, runs) if knowledge.known_poses else None
-    return _finish(data, data.at_rest(), runs, known)
+    return finish(data, data.at_rest(), runs, known)
 
 
-def _complete(path: Path, recording: Recording) -> Recording:
+def complete(path: Path, recording: Recording) -> Recording:
+    """A recording with the constants of its run, from the first cycle on, or a `RecordingError`."""
     if "parameters" not in recording.arrays or not len(recording.records):
         raise RecordingError(f"{path} holds no cycle, or lacks the constants of its run: it is damaged")
     if recording.records["cycle"][0] != 0:
@@ -209,14 +211,14 @@ def _complete(path: Path, recording: Recording) -> Recording:
     return recording
 
 
-def _every_cycle(records: Record) -> Record:
+def every_cycle(records: Record) -> Record:
     """Records in which the last one before stands for each missed one."""
     cycles = records["cycle"]
     filled: Record = records[np.searchsorted(cycles, np.arange(cycles[0], cycles[-1] + 1), side="right") - 1]
     return filled
 
 
-def _finish(
+def finish(
     data: CalibrationData, at_rest: RestCalibration, runs: Sequence[Record], known: Calibration | None, validate: bool = True
 ) -> RigCalibration:
     """Calibrate in the longest motion, and assess every stage; the result is `known` if it is given."""

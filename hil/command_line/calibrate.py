@@ -1,19 +1,29 @@
 """The command calibrate."""
 
+import sys
 from argparse import Namespace
+from contextlib import nullcontext
 from dataclasses import asdict, replace
-from math import degrees, radians
+from functools import partial
+from math import degrees, inf, radians
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hil.command_line import cli
-from hil.command_line.terminal import deg, mm_deg, progress_bar
+from hil.command_line.terminal import deg, duration, live_view, mm_deg, progress_bar, say
+from hil.progress import no_progress
+from hil.realtime.scheduling import RealTimeSettings, keep_to_one_thread
 from hil.runs.config import SimulationConfig
 from hil.table import Table
+from plant.encoders import NO_LENGTHS
 from plant.errors import InputError
 from plant.imu_wiring import ALL_IMUS, PLATFORM_IMU
 
 if TYPE_CHECKING:
     from controller.calibration.file import Calibration
+    from hil.calibration.data import Knowledge
+    from hil.calibration.guided import Step
+    from hil.calibration.procedure import RigCalibration
 
 _DEFAULT_RIG = SimulationConfig(imu="mpu9150")
 """The rig that is driven without any option."""
@@ -22,8 +32,24 @@ _DEFAULT_RIG = SimulationConfig(imu="mpu9150")
 @cli.command(
     cli.output("output", "FILE.toml", "the calibration to write"),
     cli.options_of(
-        SimulationConfig, "mechanism", "rate", "seed", "joint_error", "plant", "binding", imu={"default": _DEFAULT_RIG.imu}
+        SimulationConfig, "mechanism", "rate", "seed", "joint_error", "plant", "binding", "rig", "rig_at",
+        imu={"default": _DEFAULT_RIG.imu},
+        lengths={"flag": "--encoders", "text": "encoders that the rig has: none, incremental, absolute, or a TOML file"},
     ),
+    cli.argument(
+        "--box", nargs=2, type=float, metavar=("MM", "DEG"),
+        help="how far the planned motions may lead the platform from home (default: as far as the strokes allow)",
+    ),
+    cli.argument(
+        "--speed", type=float, metavar="MM_PER_S", help="how fast the planned motions may move a leg (default: its limit)"
+    ),
+    cli.argument(
+        "--force", type=float, metavar="N",
+        help="which force the planned motions may need of a leg at home, by the plant data of the mechanism's file; it does "
+        "not limit what a drive does when something is in the way: limit its current for that",
+    ),
+    cli.flag("--yes", "ask nothing before a step: the space is clear, and somebody holds the emergency stop"),
+    cli.flag("--resume", "go on from the recordings that an earlier calibration has kept beside the output"),
     cli.flag("--home", "the rig stands exactly at home when it begins"),
     cli.setting("--tilt", 0.05, "by how much the base may be off level [deg]"),
     cli.setting(
@@ -36,23 +62,29 @@ _DEFAULT_RIG = SimulationConfig(imu="mpu9150")
         nargs="+",
     ),
     cli.argument(
-        "--lengths",
+        "--length-changes", "--lengths",
         action="store_true",
         dest="changes_of_lengths",
-        help="the rig measures by how much its lengths change (to 50 um)",
+        help="the rig measures by how much its lengths change: by its --encoders, or in a simulation without them to 50 um",
     ),
     cli.flag("--known-poses", "write the mounting alone, by comparing with the planned poses, as in the paper's section 7"),
+    cli.options_of(RealTimeSettings),
     cli.report("write a report with plots"),
     cli.output("--picture", "FILE.svg", "draw the accuracy of each stage"),
     cli.JSON,
-)
+)  # fmt: skip
 def gough_calibrate_rig(options: Namespace) -> None:
     """On the mechanism, from its redundancy.
 
     The mechanism rests at wide poses, which need not be known, and shakes for 40 s. Before that it finds out, with the loop
     open, whether each IMU works, and is mounted and wired correctly. Writes bias, scale, axes and mounting of every sensor,
     with their covariance. If it fails, the last run is recorded beside the output, and the report is that of this run.
+
+    A rig (--rig udp, canopen or python:MODULE:CLASS) is led through six steps, from reading to shaking. Each is described
+    before it begins, asks whether to go on, and leaves its recording beside the output; --resume goes on from these. With
+    --box, --speed or --force and no --rig, the simulated plant rehearses the same.
     """
+    keep_to_one_thread()
     from controller.calibration.at_rest import Prior
     from controller.calibration.file import save_calibration
     from hil.calibration.data import Knowledge
@@ -62,27 +94,34 @@ def gough_calibrate_rig(options: Namespace) -> None:
         raise InputError(f"--tilt is {options.tilt:g} deg; it must be between 0 and 45")
     if not 0.0 <= options.joints <= 10.0:
         raise InputError(f"--joints is {options.joints:g} mm; it must be between 0 and 10")
+    config = cli.config_of(options, SimulationConfig)
+    guided = (
+        config.rig != "fmu" or options.resume or any(each is not None for each in (options.box, options.speed, options.force))
+    )
     if options.recording:
         defaults = asdict(_DEFAULT_RIG)
         given = [name for name, value in vars(options).items() if name in defaults and value != defaults[name]]
-        if given:
-            names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
+        if given or guided:
+            names = ", ".join(f"--{name.replace('_', '-')}" for name in given) or "limits and --resume"
             raise InputError(f"the recordings say what {names} would: leave it out with --recording")
     prior = Prior(tilt=radians(options.tilt), joints=1e-3 * options.joints)
-    knowledge = Knowledge(prior, options.home, options.changes_of_lengths, options.known_poses)
-    config = cli.config_of(options, SimulationConfig)
-    label = "recorded IMUs are calibrated" if options.recording else f"{config.mechanism} calibrates its IMUs"
-    with progress_bar(label) as progress:
-        if options.recording:
-            result = calibrate_recordings(options.recording, knowledge)
-        else:
-            failed = options.output.with_suffix(".failed.mcap")
-            try:
-                result = calibrate_rig(config, knowledge, progress, failed=failed)
-            except FailedCalibrationError as error:
-                if error.result is not None:
-                    cli.write_report(options, "run", error.result)
-                raise
+    lengths = options.changes_of_lengths or config.lengths != NO_LENGTHS
+    knowledge = Knowledge(prior, options.home, lengths, options.known_poses)
+    if guided:
+        result = _guided(options, config, knowledge)
+    else:
+        label = "recorded IMUs are calibrated" if options.recording else f"{config.mechanism} calibrates its IMUs"
+        with progress_bar(label) as progress:
+            if options.recording:
+                result = calibrate_recordings(options.recording, knowledge)
+            else:
+                failed = options.output.with_suffix(".failed.mcap")
+                try:
+                    result = calibrate_rig(config, knowledge, progress, failed=failed)
+                except FailedCalibrationError as error:
+                    if error.result is not None:
+                        cli.write_report(options, "run", error.result)
+                    raise
     save_calibration(options.output, result.calibration)
     cli.write_json(options.json, result.summary)
     cli.write_report(options, "calibration", result)
@@ -92,6 +131,56 @@ def gough_calibrate_rig(options: Namespace) -> None:
         write_picture(result.summary, options.picture)
     _print_rig_calibration(result.summary)
     print(f"written to {options.output}")
+
+
+def _guided(options: Namespace, config: SimulationConfig, knowledge: "Knowledge") -> "RigCalibration":
+    """Lead through the calibration of a rig, or of the simulated plant."""
+    from controller.planning.motions import Box
+    from hil.calibration.excitation import MotionLimits
+    from hil.calibration.guided import Guide, calibrate_guided, lost_accuracy, plan_calibration
+    from hil.calibration.machines import machine_on_clock, simulated_machine
+
+    simulated = config.rig == "fmu"
+    if config.rig == "replay":
+        raise InputError("a replay cannot be driven: give its recording with --recording")
+    if options.known_poses:
+        raise InputError("--known-poses is for the simulated rig without limits, and for recordings: leave it out")
+    if not (simulated or options.yes or sys.stdin.isatty()):
+        raise InputError(
+            "there is no terminal to ask at before the rig moves: run it in one, or add --yes if the space is clear and "
+            "somebody holds the emergency stop"
+        )
+    box = Box() if options.box is None else Box(1e-3 * options.box[0], radians(options.box[1]))
+    limits = MotionLimits(
+        box, inf if options.speed is None else 1e-3 * options.speed, inf if options.force is None else options.force
+    )
+    plan = plan_calibration(config, limits)
+    if limits != MotionLimits():
+        say(lost_accuracy(plan, knowledge))
+    guide = Guide(partial(_announce, simulated, not options.yes), lambda text: say(f"  {text}"))
+    with progress_bar("the plant rehearses") if simulated else nullcontext(no_progress) as progress:
+        machine = (
+            simulated_machine(progress)
+            if simulated
+            else machine_on_clock(
+                cli.config_of(options, RealTimeSettings),
+                lambda run: live_view(plan.mechanism.name, Path(run.target).stem, run.rate),
+            )
+        )
+        return calibrate_guided(plan, knowledge, options.output, machine, guide, options.resume)
+
+
+def _announce(simulated: bool, asks: bool, number: int, count: int, step: "Step") -> None:
+    """Say what a step will do and what to do for it, and ask whether to go on."""
+    say(f"step {number} of {count}, {step.name}, {duration(step.seconds)}. {step.text}.")
+    if simulated:
+        return
+    if step.moves:
+        say("  Clear the space around the platform, and keep a hand on the emergency stop. Ctrl-C stops gently.")
+    if asks:
+        print("  Type yes to begin: ", end="", file=sys.stderr, flush=True)
+        if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+            raise InputError(f"stopped before step {number}, and nothing moves: go on from here with --resume")
 
 
 def _print_rig_calibration(summary: dict[str, Any]) -> None:

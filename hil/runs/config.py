@@ -39,8 +39,8 @@ PYTHON_RIG = "python:"
 
 MECHANISM = "preset, or a TOML file"
 IMU = (
-    "ideal, mpu9150, mpu9150-calibrated, icm42688, or mpu9150-nominal and icm42688-nominal, which have all that real ones do; "
-    "or a TOML file (docs/imus.md)"
+    "ideal; mpu9150, icm20948, bmi088 or lsm6dso, raw, or followed by -calibrated, or by -nominal, which has all that real "
+    "ones do; icm42688, which is calibrated, or icm42688-nominal; or a TOML file, as of a data sheet (docs/imus.md)"
 )
 CALIBRATION = "the IMUs' constants, as 'gough calibrate' writes them; without it the readings are used as they are"
 """Help of options that several configurations have."""
@@ -73,6 +73,7 @@ class SimulationConfig:
         hold: how long the brakes hold first [s]; None for the time in the mechanism's settings.
         wiring: how the IMUs are mounted and wired.
         raw_imus: whether the IMUs are known to be uncalibrated, so that disagreement between them says nothing.
+        open_loop: whether the drives follow the planned speeds, and IMUs only show a drive that does not: before a calibration.
     """
 
     mechanism: str = option("hexapod", MECHANISM)
@@ -149,6 +150,7 @@ class SimulationConfig:
     )
     arm: bool = option(True, "read everything, and move nothing")
     raw_imus: bool = False
+    open_loop: bool = False
 
     def __post_init__(self) -> None:
         name_objects(self)

@@ -16,6 +16,7 @@ from controller.loop_margins import margin_remark
 from controller.planning.offline_planner import Reference, plan
 from controller.planning.plan_handover import rest
 from controller.planning.target import Target, load_target
+from controller.safety import watch_drives_alone
 from controller.safety.arming import longest_delay
 from controller.safety.causes import Cause
 from controller.safety.stop import describe_end
@@ -138,6 +139,9 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         most = count + longest_delay(parameters)
         if records is None:
             _check_memory(config, most)
+        if config.open_loop:
+            parameters["pid"]["gains"] = 0.0
+            watch_drives_alone(parameters)
         # Loads the planner, so that the planning time is that of the plan alone.
         plan(mechanism, load_target("hold", mechanism, 0.1), 0.1)
         began = time.perf_counter()

@@ -1,15 +1,17 @@
-"""Kinds of IMUs by name: presets with the figures of data sheets, and TOML files that change them."""
+"""Kinds of IMUs by name: presets with the figures of data sheets, and TOML files that change them or describe a part."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from importlib import resources
 from math import radians
 from pathlib import Path
 from typing import Any
 
 from plant.checks import nearest
 from plant.errors import InputError, UnknownNameError
-from plant.files import check_entries, read_toml
-from plant.imu.model import MILLI_G, STANDARD_GRAVITY, ImuModel, SensorErrors
+from plant.files import check_entries, parse_toml, read_toml
+from plant.imu.data_sheet import IMU_WORDS, SENSOR_WORDS, figure, sensor_of_words
+from plant.imu.model import MILLI_G, MOST_SECTIONS, STANDARD_GRAVITY, ImuModel, SensorErrors
 from plant.imu_disturbances import SENSORS, disturbance, disturbance_of_table
 
 _MPU9150_LOW_PASSES = (
@@ -46,14 +48,20 @@ _MPU9150 = ImuModel(
     sparing=True,
 )  # fmt: skip
 
-_CALIBRATED = replace(
-    _MPU9150,
-    name="mpu9150-calibrated",
-    gyroscope=replace(_MPU9150.gyroscope, bias=(radians(0.2), radians(0.2)), scale=0.0, cross_axis=0.0),
-    accelerometer=replace(_MPU9150.accelerometer, bias=(MILLI_G, MILLI_G), scale=1e-3, cross_axis=0.0),
-    magnetometer=replace(_MPU9150.magnetometer, bias=(0.3, 0.3), scale=5e-3, cross_axis=5e-3),
-    misalignment=0.0,
-)
+
+def _calibrated(model: ImuModel) -> ImuModel:
+    """The kind with constant errors as a calibration on the rig leaves them."""
+    return replace(
+        model,
+        name=f"{model.name}-calibrated",
+        gyroscope=replace(model.gyroscope, bias=(radians(0.2), radians(0.2)), scale=0.0, cross_axis=0.0),
+        accelerometer=replace(model.accelerometer, bias=(MILLI_G, MILLI_G), scale=1e-3, cross_axis=0.0),
+        magnetometer=replace(model.magnetometer, bias=(0.3, 0.3), scale=5e-3, cross_axis=5e-3),
+        misalignment=0.0,
+    )
+
+
+_CALIBRATED = _calibrated(_MPU9150)
 
 # TDK ICM-42688-P after the same calibration; it has no magnetometer, so the MPU-9150's is used. Its data sheet gives, from 0 to
 # 70 C, 0.005 deg/s and 0.15 mg per kelvin, and 0.005 %/K for both; the supply counts as in the MPU-9150, by a tenth.
@@ -81,31 +89,44 @@ _NOMINAL_LIFE = (
 """3 K warmer with the time constant of a rig's housing, drives that shake by 0.02 g, and a supply that gives way by 20 mV."""
 
 
-def _nominal(model: ImuModel, conversion_rate: float, order: int) -> ImuModel:
-    """The kind with its imperfections of nominal size: a clock of its own, conversions, rectification, and `_NOMINAL_LIFE`.
+def _nominal(model: ImuModel) -> ImuModel:
+    """The kind after a calibration, with its imperfections of nominal size: a clock of its own, conversions, rectification,
+    and `_NOMINAL_LIFE`.
 
-    Clocks are 1 % off, as the MPU-6050's specification and the ICM-42688-P's data sheet allow; rectification is that of the
-    ADXL357 (at most 0.1 g for 7.5 g RMS), as neither of them tells.
+    Where the kind does not say it, it takes 1000 samples a second of 8000 conversions, and clocks are 1 % off, as the
+    MPU-6050's specification and the ICM-42688-P's data sheet allow. Rectification is that of the ADXL357 (at most 0.1 g for
+    7.5 g RMS), as none of them tells.
     """
-    accelerometer = replace(model.accelerometer, order=order, rectification=1.8 * MILLI_G / STANDARD_GRAVITY**2)
+    calibrated = _calibrated(model)
     return replace(
-        model,
-        name=f"{model.name.removesuffix('-calibrated')}-nominal",
-        gyroscope=replace(model.gyroscope, order=order),
-        accelerometer=accelerometer,
-        sample_rate=1000.0,
-        clock_error=0.01,
+        calibrated,
+        name=f"{model.name}-nominal",
+        accelerometer=replace(calibrated.accelerometer, rectification=1.8 * MILLI_G / STANDARD_GRAVITY**2),
+        sample_rate=model.sample_rate or 1000.0,
+        clock_error=model.clock_error or 0.01,
         jitter=20e-6,
-        conversion_rate=conversion_rate,
+        conversion_rate=model.conversion_rate or 8000.0,
         sparing=False,
         disturbances=_NOMINAL_LIFE,
     )
 
 
+_GRADES: dict[str, Callable[[ImuModel], ImuModel]] = {
+    "raw": lambda model: model,
+    "calibrated": _calibrated,
+    "nominal": _nominal,
+}
+"""What a file's `grade` makes of a kind."""
+
 PRESETS = {
     model.name: model
     for model in (
-        ImuModel("ideal"), _MPU9150, _CALIBRATED, _ICM42688, _nominal(_CALIBRATED, 8000.0, 1), _nominal(_ICM42688, 8000.0, 2),
+        ImuModel("ideal"), _MPU9150, _CALIBRATED, _ICM42688, _nominal(_MPU9150),
+        _nominal(replace(
+            _ICM42688,
+            gyroscope=replace(_ICM42688.gyroscope, order=2),
+            accelerometer=replace(_ICM42688.accelerometer, order=2),
+        )),
     )
 }  # fmt: skip
 
@@ -163,21 +184,79 @@ _PAIRS = ("bias", "bias_per_kelvin", "scale_per_kelvin", "bias_per_volt")
 def imu_of_table(table: Mapping[str, Any], name: str, title: str) -> ImuModel:
     """The kind of IMU that the content of a TOML file describes; messages call it `title`.
 
+    What is said in the words of a data sheet comes first, then `low_pass`, then `grade`; single figures come on top.
+
     Raises:
-        GoughError: an entry is unknown or out of range.
+        GoughError: an entry is unknown or out of range, figures contradict each other, or a data sheet's lacks one.
     """
-    check_entries(table, ("based_on", "low_pass", *_WORDS, *SENSORS, "disturbances"), title)
-    model = load_imu(table.get("based_on", "ideal"))
+    check_entries(
+        table, ("based_on", "grade", "low_passes_hz", "low_pass", "disturbances", *IMU_WORDS, *_WORDS, *SENSORS), title
+    )
+    model = _of_data_sheet(table, load_imu(table.get("based_on", "ideal")), title)
     if "low_pass" in table:
         model = _with_low_pass(model, table["low_pass"], title)
+    if "grade" in table:
+        if table["grade"] not in _GRADES:
+            raise InputError(f"grade of {title} is {table['grade']!r}; it must be one of {', '.join(_GRADES)}")
+        model = _GRADES[table["grade"]](model)
     changes = _values({word: value for word, value in table.items() if word in _WORDS}, _WORDS, title)
     for sensor in (sensor for sensor in SENSORS if sensor in table):
         words = _sensor_words(*_UNITS[sensor])
-        check_entries(table[sensor], words, f"[{sensor}] of {title}")
-        changes[sensor] = replace(getattr(model, sensor), **_values(table[sensor], words, f"[{sensor}] of {title}"))
+        single = {word: value for word, value in table[sensor].items() if word in words}
+        changes[sensor] = replace(getattr(model, sensor), **_values(single, words, f"[{sensor}] of {title}"))
     if "disturbances" in table:
         changes["disturbances"] = tuple(disturbance_of_table(each) for each in table["disturbances"])
     return replace(model, name=name, **changes)
+
+
+def _of_data_sheet(table: Mapping[str, Any], model: ImuModel, title: str) -> ImuModel:
+    """A kind of IMU with all that a file says of it in the words of a data sheet."""
+    changes: dict[str, Any] = {}
+    for word, (field, units) in IMU_WORDS.items():
+        if word in table:
+            _refuse_both(table, word, _WORDS, field, title)
+            changes[field] = figure(table[word], units, f"{word} of {title}")
+    for sensor in (sensor for sensor in SENSORS if sensor in table):
+        words, where = _sensor_words(*_UNITS[sensor]), f"[{sensor}] of {title}"
+        check_entries(table[sensor], (*words, *SENSOR_WORDS), where)
+        if not any(word in SENSOR_WORDS for word in table[sensor]):
+            continue
+        for word, field in SENSOR_WORDS.items():
+            if word in table[sensor]:
+                _refuse_both(table[sensor], word, words, field, where)
+        if "low_pass" in table and "bandwidth" in table[sensor]:
+            raise InputError(f"{title} gives low_pass, and bandwidth in [{sensor}]: leave one of them out")
+        fields = sensor_of_words(table[sensor], sensor, where)
+        # The settings of a low-pass are those of another part.
+        changes |= {sensor: SensorErrors(**fields), "low_passes": ()}
+    if "low_passes_hz" in table:
+        changes["low_passes"] = _low_passes(table["low_passes_hz"], title)
+    return replace(model, **changes)
+
+
+def _refuse_both(table: Mapping[str, Any], word: str, others: Mapping[str, tuple[str, float]], field: str, title: str) -> None:
+    """Refuse a table with a word of a data sheet and another word for the same field."""
+    for other in (other for other, (of, _) in others.items() if of == field and other in table):
+        raise InputError(f"{title} has {word} and {other}, which say the same: leave one of them out")
+
+
+def _low_passes(settings: Any, title: str) -> tuple[tuple[float, float, int], ...]:
+    """The settings of a part's low-pass that a file lists."""
+
+    def good(setting: Any) -> bool:
+        return (
+            isinstance(setting, list)
+            and len(setting) == 3
+            and all(type(each) in (int, float) and each > 0.0 for each in setting)
+            and setting[2] in range(1, MOST_SECTIONS + 1)
+        )
+
+    if not isinstance(settings, list) or not all(map(good, settings)):
+        raise InputError(
+            f"low_passes_hz of {title} is {settings!r}; it must be a list of settings: bandwidth of gyroscope and of "
+            f"accelerometer, and order from 1 to {MOST_SECTIONS}"
+        )
+    return tuple((float(gyroscope), float(accelerometer), int(order)) for gyroscope, accelerometer, order in settings)
 
 
 def _with_low_pass(model: ImuModel, setting: Any, title: str) -> ImuModel:
@@ -212,3 +291,12 @@ def _values(table: Mapping[str, Any], words: Mapping[str, tuple[str, float]], ti
         scaled = tuple(factor * each for each in numbers)
         values[field] = scaled if count > 1 else scaled[0]
     return values
+
+
+def _parts() -> Iterator[ImuModel]:
+    """The parts that come as data sheets in `parts`, raw."""
+    for file in sorted((resources.files("plant.imu") / "parts").iterdir(), key=lambda file: file.name):
+        yield imu_of_table(parse_toml(file.read_text(encoding="utf-8"), file.name), Path(file.name).stem, file.name)
+
+
+PRESETS |= {model.name: model for part in _parts() for model in (grade(part) for grade in _GRADES.values())}

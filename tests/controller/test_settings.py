@@ -176,6 +176,16 @@ def test_imus_that_do_not_wander_leave_the_standard_deviations_to_the_bit(hexapo
     assert all(getattr(found, each) == getattr(fusion_settings(hexapod), each) for each in WANDERING)
 
 
+def test_noisier_gyroscopes_count_less_and_make_directions_less_certain(hexapod):
+    imu, usual = load_imu("bmi088-calibrated"), fusion_settings(hexapod)
+    found = sensor_settings(hexapod, imu)
+    assert found.gyroscope_noise == pytest.approx(imu.gyroscope.noise)
+    for name, power in (("mechanism_gyroscope_noise", 1.0), ("leg_sigma", 0.5), ("tilt_sigma", 0.5)):
+        assert getattr(found, name) / getattr(usual, name) == pytest.approx((0.014 / 0.005) ** power)
+    quiet = sensor_settings(hexapod, load_imu("lsm6dso-calibrated"))
+    assert quiet.gyroscope_noise == usual.gyroscope_noise and quiet.leg_sigma == usual.leg_sigma
+
+
 def test_clocks_of_their_own_make_the_times_of_samples_uncertain(hexapod):
     """A sample waits up to its period for the loop, and jitters."""
     imu = load_imu("icm42688-nominal")

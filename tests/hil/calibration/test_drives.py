@@ -7,7 +7,7 @@ import pytest
 
 from hil.calibration import procedure
 from hil.calibration.drives import within_drives
-from hil.calibration.procedure import FailedCalibrationError, _Rig, calibrate_rig
+from hil.calibration.procedure import FailedCalibrationError, SimulatedRig, calibrate_rig
 from hil.command_line import main
 from hil.recording.mcap import read
 from hil.runs.config import SimulationConfig
@@ -50,7 +50,7 @@ def test_drives_that_are_too_weak_for_all_legs_at_once_get_gentler_motions(weak)
     limit = float(mechanism.plant["drive.current_limit"])
     largest = {}
     for each in (mechanism, gentle):
-        records = _Rig().run_open(SimulationConfig(each, "rests", 12.5, rate=500.0, imu="ideal"))
+        records = SimulatedRig().run_open(SimulationConfig(each, "rests", 12.5, rate=500.0, imu="ideal"))
         largest[each is gentle] = float(np.abs(records["truth"][:, TRUTH_CURRENTS]).max())
     assert largest[True] < 0.97 * limit < largest[False]
 

@@ -88,7 +88,7 @@ def loop_of(run):
 
 
 def finished(process):
-    output, errors = process.communicate(timeout=120.0)
+    output, errors = process.communicate(timeout=400.0)
     return process.returncode, output, errors
 
 
@@ -334,3 +334,35 @@ def moving(path):
     with suppress(GoughError):
         return bool((read(path).records["mode"] == Mode.RUNNING).any())
     return False
+
+
+# ------------------------------------------------------------------------------------------------------- it is calibrated
+
+
+@pytest.mark.slow(seconds=240)
+def test_a_machine_that_has_never_moved_is_led_through_its_calibration_and_goes_on_after_a_fault(tmp_path):
+    with emulated("--imu", "mpu9150", "--seed", 1) as (_, at, control):
+
+        def calibrating(*options):
+            return gough(
+                "calibrate", "rig", tmp_path / "rig.toml", "--rig", "udp", "--rig-at", at, "--rate", 500, *PATIENT,
+                "--box", 40, 8, "--speed", 100, "--yes", *options, stdin=subprocess.DEVNULL,
+            )  # fmt: skip
+
+        first = calibrating()
+        for line in first.stderr:
+            if "step 4 of 6" in line:
+                break
+        assert first.poll() is None, finished(first)
+        wait_for(lambda: first.poll() is not None or moves(state_of(control)))
+        ask(control, "fault drive-runs-away:3,size=0.2")
+        status, _, errors = finished(first)
+        assert status == 2 and "step 4 of 6, near-rests, failed" in errors and "drive 3 does not do what it is told" in errors
+        assert (tmp_path / "rig.near-rests.failed.mcap").exists() and "--resume" in errors
+        ask(control, "clear")
+        status, _, errors = finished(calibrating("--resume", "--json", tmp_path / "rig.json"))
+        assert status == 0, errors
+        assert "step 3 of 6 was done" in errors and "step 6 of 6, shaking" in errors
+    figures = json.loads((tmp_path / "rig.json").read_text())
+    true, predicted = (figures[kind]["motion"]["position_rms"] for kind in ("true", "predicted"))
+    assert true < 2.5 * predicted < 2e-3

@@ -409,7 +409,9 @@ def test_a_slow_magnetometer_keeps_its_noise_at_any_rate_of_the_loop(rate: float
 
 
 def test_presets_have_the_noise_of_their_data_sheets() -> None:
-    assert set(PRESETS) == {"ideal", "mpu9150", "mpu9150-calibrated", "icm42688", "mpu9150-nominal", "icm42688-nominal"}
+    parts = {f"{part}{grade}" for part in ("bmi088", "icm20948", "lsm6dso") for grade in ("", "-calibrated", "-nominal")}
+    first = {"ideal", "mpu9150", "mpu9150-calibrated", "icm42688", "mpu9150-nominal", "icm42688-nominal"}
+    assert set(PRESETS) == first | parts
     for name, gyroscope, accelerometer in (
         ("mpu9150", 0.005, 400e-3),
         ("mpu9150-calibrated", 0.005, 400e-3),
@@ -633,7 +635,7 @@ def test_a_file_describes_a_kind_of_imu_in_words_with_units(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("colour = 1", "has no entry 'colour'; it has based_on, low_pass, magnetometer_rate_hz"),
+        ("colour = 1", "has no entry 'colour'; it has based_on, grade, low_passes_hz, low_pass, disturbances, output"),
         ("[gyroscope]\nnoise = 1", "gyroscope. of .* has no entry 'noise'; it has noise_deg_per_s_per_root_hz"),
         ("[gyroscope]\norder = 5", "the order of a sensor is 5; it must be a whole number from 1 to 4"),
         ("[accelerometer]\nbias_m_per_s2 = 1", "it must be a list of two numbers"),
