@@ -151,6 +151,48 @@ def gough_sensor_sets(options: Namespace) -> None:
 
 
 @cli.command(
+    cli.options_of(
+        SimulationConfig,
+        "mechanism",
+        target={"default": "hold"},
+        duration={"default": 5.0},
+        rate={},
+        imu={},
+        imus={},
+        magnetometer={},
+        lengths={},
+        calibration={"text": "the covariance of a calibration instead of the errors that the kind of IMU has"},
+        joint_error={"text": "standard deviation of each coordinate of the joints from their places"},
+        fusion={"default": "whole", "text": "with --measured: how the loop fuses the IMUs, as for 'gough simulate'"},
+    ),
+    cli.flag("--measured", "run the closed loop, too, and print its errors over the bound"),
+    cli.setting("--seeds", 20, "with --measured: runs, each with other imperfections of the sensors"),
+    cli.markdown("docs/pose_bound.md"),
+    cli.engine_options(),
+    cli.JSON,
+)
+def gough_bounds(options: Namespace) -> None:
+    """Compute how well any estimate can know the pose with a set of sensors.
+
+    This is the Bayesian Cramer-Rao bound along a target, at rest by default: the least RMS errors of position and rotation that
+    the readings allow, if the errors of IMUs and encoders are drawn as their kinds say and nothing is known of the pose before.
+    It shares no code with the loop's filters. A dash stands for a pose that the sensors do not determine.
+
+    With --measured, the closed loop's errors over seeds stand beside it.
+    """
+    from hil.studies.pose_bound.bound import find_bound, measure, summary, table
+
+    config = cli.config_of(options, SimulationConfig)
+    with engine_at_work(cli.engine_of(options), "seeds") as (engine, progress):
+        bound = find_bound(config)
+        measured = measure(config, options.seeds, engine, progress) if options.measured else None
+    cli.write_json(options.json, summary(config, bound, measured))
+    table(bound, measured).print(options.markdown)
+    for reason in dict.fromkeys(measured.stopped if measured else ()):
+        say(f"a run ended early: {reason}")
+
+
+@cli.command(
     cli.argument(
         "rows", nargs="*", metavar="TEXT", help="rows of gough faults with this in their names or kinds (default: all)"
     ),
