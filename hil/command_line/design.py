@@ -31,7 +31,8 @@ def gough_classify(options: Namespace) -> None:
     """Show the class of a mechanism, and the sensors that it needs.
 
     For each method of direct kinematics: the sensors that it needs, whether its pose is unique, and its conditioning (1 is
-    best, 0 singular) at home and at worst.
+    best, 0 singular) at home and at worst. Then how many absolute encoders determine the pose beside how many leg IMUs, if it
+    is found from a first guess.
     """
     from hil.studies.classification import PAPER, describe
     from plant.mechanism import load_mechanism
@@ -55,6 +56,12 @@ def gough_classify(options: Namespace) -> None:
         if need.requirement.choice_text:
             print(f"{need.requirement.method}: legs {need.requirement.choice_text}")
     print(f"Worst over {description.where}. Sections are the paper's.")
+    lengths = Table("beside leg IMUs, the platform's", "leg IMUs", "encoders", "wherever they are")
+    for each in description.lengths:
+        always = "-" if each.any_choice is None else f"{each.any_choice}"
+        lengths.add(each.platform, f"{each.legs}", f"{each.fewest}", always)
+    if lengths.rows:
+        lengths.print()
 
 
 @cli.command(
@@ -121,6 +128,7 @@ def gough_accuracy(options: Namespace) -> None:
 @cli.command(
     cli.argument("--mechanism", nargs="+", metavar="NAME", help="presets or TOML files (default: one of each type)"),
     cli.options_of(SimulationConfig, "seed", duration={"text": "duration of each motion"}),
+    cli.flag("--bounds", "run nothing, and print what each set is worth at best, and when one sensor of it fails"),
     cli.markdown("docs/sensor_sets.md"),
     cli.engine_options(),
     cli.JSON,
@@ -131,11 +139,22 @@ def gough_sensor_sets(options: Namespace) -> None:
     It follows the target sines with every set of sensors, from the paper's least to all: legs alone, with the platform's roll
     and pitch, with its whole orientation (a magnetometer), by leg and platform filters and by the whole-mechanism filter.
     Prints the errors of the estimate, and the worst conditioning of direct kinematics.
+
+    With --bounds: the bound of 'gough bounds' after 1 s at rest, without lengths, with incremental and with absolute encoders
+    [mm / deg]; and that without the IMU, or the encoder, whose loss is worst. A dash stands for a pose that is not determined.
     """
     from importlib.metadata import version
 
     from hil.studies.sensor_sets import MECHANISMS, SETS, evaluate_sensor_sets, reasons, table
 
+    if options.bounds:
+        from hil.studies.pose_bound import sets
+
+        with engine_at_work(cli.engine_of(options), "sets of sensors") as (engine, progress):
+            worths = sets.evaluate_worth(options.mechanism or MECHANISMS, engine=engine, progress=progress)
+        cli.write_json(options.json, {"version": version("gough"), "sets": [asdict(worth) for worth in worths]})
+        sets.table(worths).print(options.markdown)
+        return
     with engine_at_work(cli.engine_of(options), "sets of sensors") as (engine, progress):
         names = options.mechanism or MECHANISMS
         outcomes = evaluate_sensor_sets(names, SETS, options.duration, options.seed, engine, progress)

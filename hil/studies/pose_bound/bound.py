@@ -85,11 +85,21 @@ def find_bound(config: SimulationConfig) -> PoseBound:
     )
     if not setup.imus and setup.encoder is None:
         raise InputError("there is no sensor: name IMUs with --imus, or encoders with --lengths")
-    hold = control_settings(mechanism).hold if config.hold is None else config.hold
-    times = STEP_S * (np.arange(max(1, round((hold + config.duration) / STEP_S))) + 0.5) - hold
-    motion = motion_along(load_target(config.target, mechanism, config.duration), mechanism, times)
+    return bound_of(
+        setup, config.target, config.duration, control_settings(mechanism).hold if config.hold is None else config.hold
+    )
+
+
+def bound_of(setup: Setup, target: str = "hold", duration: float = 1.0, hold: float = 0.0) -> PoseBound:
+    """The bound of a setup along a target of so many seconds, before which the platform stands for `hold` [s].
+
+    Raises:
+        GoughError: the target cannot be used.
+    """
+    times = STEP_S * (np.arange(max(1, round((hold + duration) / STEP_S))) + 0.5) - hold
+    motion = motion_along(load_target(target, setup.mechanism, duration), setup.mechanism, times)
     covariances = pose_covariances(LinearModel(setup), motion)
-    variances = np.diagonal(covariances, axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=2) + calibration.floor**2
+    variances = np.diagonal(covariances, axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=2) + setup.calibration.floor**2
     return PoseBound(times + 0.5 * STEP_S, *np.sqrt(variances).T)
 
 
@@ -98,14 +108,13 @@ def pose_covariances(model: LinearModel, motion: Motion) -> Array:
     found, covariance = np.empty((len(motion.position), POSE, POSE)), model.prior
     for first in range(0, len(found), _PART):
         part = Motion(*(each[first : first + _PART] for each in vars(motion).values()))
-        for n, seen in enumerate(model.seen(part), start=first):
+        for n, (seen, kept) in enumerate(zip(model.seen(part), model.kept(part), strict=True), start=first):
             across = seen @ covariance
             root = np.linalg.cholesky(across @ seen.T + np.diag(model.noise))
             gain = solve_triangular(root, across, lower=True)
             covariance = covariance - gain.T @ gain
             found[n] = covariance[:POSE, :POSE]
-            covariance = model.transition @ covariance @ model.transition.T + model.driving
-            covariance = 0.5 * (covariance + covariance.T)
+            covariance = model.carried(covariance, kept)
     return found
 
 

@@ -10,7 +10,7 @@ A sensor that is added here has rows of its own in `LinearModel.seen`, and its e
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from math import exp, inf
+from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ bounds are 1 to 3 % greater.
 """
 
 PLAY_S = 0.5
-"""Time after which play and steps have changed an encoder's error [s]."""
+"""Time after which play and steps have changed the error of an encoder whose leg moves [s]."""
 
 ERRORS = 21
 """Unknowns of an IMU: biases of gyroscope and accelerometer, scales of accelerometer and gyroscope, alignment, axes of both."""
@@ -49,7 +49,7 @@ _OUT_OF_PLANE = np.array([2, 3, 4])
 _ALIGNMENT = 12
 _MOVE = 1e-6
 _LEAST_NOISE = {"gyroscope": 1e-7, "accelerometer": 1e-6, "magnetometer": 1e-4}
-_LEAST_LENGTH_NOISE = 1e-7
+_LEAST_LENGTH_NOISE, _LEAST_TRAVEL = 1e-7, 1e-9
 """Ideal sensors have so much noise, so that every covariance can be inverted."""
 
 
@@ -125,7 +125,6 @@ class LinearModel:
         for i in range(3):
             for j in range(i, 3):
                 made[POSE * i : POSE * (i + 1), POSE * j : POSE * (j + 1)] = powers[j - i] * np.eye(POSE)
-        made[self._play, self._play] *= exp(-STEP_S / PLAY_S)
         return made
 
     @cached_property
@@ -142,8 +141,28 @@ class LinearModel:
         drift[:6] = np.repeat([self.setup.imu.gyroscope.drift, self.setup.imu.accelerometer.drift], 3)
         imus = slice(JET, JET + len(self._kept))
         made[imus, imus] = STEP_S * np.diag(np.tile(drift**2, len(self.setup.imus))[self._kept])
-        made[self._play, self._play] = (1.0 - exp(-2.0 * STEP_S / PLAY_S)) * self.prior[self._play, self._play]
         return made
+
+    def kept(self, motion: Motion) -> Array:
+        """(N, legs with an encoder): how much of what play and steps do to a reading is left after each of N steps; all of it
+        as long as the leg stands.
+        """
+        encoder, legs = self.setup.encoder, self.setup.legs_with_encoder
+        if encoder is None:
+            return np.zeros((len(motion.position), 0))
+        travel = STEP_S * np.abs(signals(self.setup.mechanism, motion).leg_rates[:, legs])
+        moving = np.minimum(1.0, travel / max(encoder.backlash + encoder.resolution, _LEAST_TRAVEL))
+        kept: Array = np.exp(-STEP_S / PLAY_S * moving)
+        return kept
+
+    def carried(self, covariance: Array, kept: Array) -> Array:
+        """A covariance (S, S) carried on by a step, of which `kept` is (legs with an encoder,)."""
+        whole = np.ones(len(covariance))
+        whole[len(whole) - len(kept) :] = kept
+        made = self.transition @ covariance @ self.transition.T * np.outer(whole, whole) + self.driving
+        renewed = np.arange(len(whole) - len(kept), len(whole))
+        made[renewed, renewed] += (1.0 - kept**2) * self.prior[renewed, renewed]
+        return 0.5 * (made + made.T)
 
     def seen(self, motion: Motion) -> Array:
         """(N, rows, S): the derivative of the data by the unknowns at N times."""
@@ -261,12 +280,6 @@ class LinearModel:
         zero = encoder.zero if encoder.absolute else _FREE_ZERO_M
         play = (0.5 * encoder.backlash) ** 2 + encoder.resolution**2 / 12.0
         return np.repeat([zero**2, encoder.scale**2 / 3.0, play], legs)
-
-    @property
-    def _play(self) -> NDArray[np.intp]:
-        """The places of what play does to each reading."""
-        legs = len(self.setup.legs_with_encoder)
-        return np.arange(len(self.prior) - legs, len(self.prior))
 
     @property
     def _moved_rigs(self) -> list[Callable[[float], Mechanism]]:

@@ -47,15 +47,21 @@ def test_the_recursion_is_the_algebra_of_all_data_at_once(hexapod):
     model = LinearModel(Setup(hexapod, (0, 4, 5, 6), CALIBRATED, magnetometer=True, encoder=INCREMENTAL))
     motion = motion_of(hexapod, 6, "sines", first=2.0)
     seen, steps = model.seen(motion), 6
-    covariances, reach = [model.prior], [np.eye(len(model.prior))]
-    for _ in range(steps - 1):
-        covariances.append(model.transition @ covariances[-1] @ model.transition.T + model.driving)
-        reach.append(model.transition @ reach[-1])
-    blocks = [[seen[i] @ reach[i - j] @ covariances[j] @ seen[j].T for j in range(i + 1)] for i in range(steps)]
+    covariances = [model.prior]
+    whole_steps = [model.transition @ np.diag(np.r_[np.ones(len(model.prior) - 6), kept]) for kept in model.kept(motion)]
+    for step, kept in zip(whole_steps, model.kept(motion), strict=True):
+        renewed = np.diag(np.r_[np.zeros(len(model.prior) - 6), (1.0 - kept**2) * np.diag(model.prior)[-6:]])
+        covariances.append(step @ covariances[-1] @ step.T + model.driving + renewed)
+
+    def reach(j, i):
+        """From step j to step i."""
+        return np.linalg.multi_dot([np.eye(len(model.prior)), *whole_steps[j:i][::-1], np.eye(len(model.prior))])
+
+    blocks = [[seen[i] @ reach(j, i) @ covariances[j] @ seen[j].T for j in range(i + 1)] for i in range(steps)]
     whole = np.block([[blocks[i][j] if j <= i else blocks[j][i].T for j in range(steps)] for i in range(steps)])
     whole += np.diag(np.tile(model.noise, steps))
-    across = np.concatenate([reach[steps - 1 - i] @ covariances[i] @ seen[i].T for i in range(steps)], axis=1)
-    expected = covariances[-1] - across @ np.linalg.solve(whole, across.T)
+    across = np.concatenate([reach(i, steps - 1) @ covariances[i] @ seen[i].T for i in range(steps)], axis=1)
+    expected = covariances[steps - 1] - across @ np.linalg.solve(whole, across.T)
     np.testing.assert_allclose(pose_covariances(model, motion)[-1], expected[:6, :6], rtol=1e-4, atol=1e-12)
 
 
