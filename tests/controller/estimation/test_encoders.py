@@ -1,9 +1,8 @@
-"""The pose of encoders that lead: against Newton's method on the lengths, and what has no solution."""
+"""The pose of encoders that lead: from home to any pose of the workspace, and what has no solution."""
 
 import numpy as np
 import pytest
 
-from controller.direct_kinematics import pose_from_lengths
 from controller.estimation import leg_filter, pose_estimator
 from controller.estimation.encoders import STATE, encoder_parameters, find_pose_by_lengths, screen_encoders
 from controller.inverse_kinematics import inverse_kinematics, leg_lengths, sample_workspace
@@ -41,19 +40,18 @@ class Bench:
         return bool(self.pose["found"])
 
 
-@pytest.mark.parametrize("name", ["hexapod", "6-3-II", "planar-3rpr"])
-def test_from_home_it_is_the_pose_of_newton_s_method_with_its_twist(name):
+@pytest.mark.parametrize("name", ["6-3-I", "6-3-II", "6-4-I", "6-4-II", "6-5", "hexapod", "genhexkins", "planar-3rpr"])
+def test_from_home_it_finds_every_pose_of_the_workspace_with_its_twist(name):
     random, bench = np.random.default_rng(0), Bench(name)
     mechanism = bench.mechanism
-    for position, rotation in zip(*sample_workspace(mechanism, 20, seed=1), strict=True):
+    for position, rotation in zip(*sample_workspace(mechanism, 200, seed=1), strict=True):
         bench.pose["found"] = 0
         lengths = leg_lengths(mechanism, position, rotation)
         twist = random.normal(size=6) * ([1.0, 1.0, 0.0, 0.0, 0.0, 1.0] if mechanism.planar else 1.0)
         assert bench.find(lengths, inverse_kinematics(mechanism, Pose(position, rotation)).jacobian @ twist)
-        expected = pose_from_lengths(mechanism, lengths)
-        np.testing.assert_allclose(bench.pose["position"], expected.position, atol=1e-9)
-        np.testing.assert_allclose(bench.pose["rotation"], expected.rotation, atol=1e-8)
-        np.testing.assert_allclose(bench.pose["twist"], twist, atol=1e-6)
+        np.testing.assert_allclose(bench.pose["position"], position, atol=1e-9)
+        np.testing.assert_allclose(bench.pose["rotation"], rotation, atol=1e-8)
+        np.testing.assert_allclose(bench.pose["twist"], twist, atol=1e-5)
         assert bench.pose["conditioning"] > 0.1
 
 
