@@ -49,7 +49,7 @@ from controller.estimation.whole_mechanism.parameters import (
     ripple_at,
 )
 from controller.estimation.whole_mechanism.readings import MOTION_STATES, RIG_ERRORS
-from controller.imu_set import are_few, check_imus, imus_of
+from controller.imu_set import are_few, check_imus, imus_of, length_share, lengths_lead
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import RANK_TOLERANCE
 from controller.rig import RIG, TIME, elapsed, field_of, rig_parameters
@@ -193,7 +193,7 @@ def cycle_parameters(
             protection level where there is none.
     """
     check_rate(rate)
-    check_imus(mechanism, imus, magnetometer, section_5)
+    check_imus(mechanism, imus, magnetometer, section_5, encoder)
     calibration, watched = calibration or Calibration(), safety or SafetySettings()
     limits, field = mechanism.require_limits(), field_of(mechanism, calibration.tilt)
     gravity = float(np.linalg.norm(mechanism.plant_parameters()["gravity"]))
@@ -214,7 +214,9 @@ def cycle_parameters(
     filtered = filter_parameters(
         fusion, rate, whole, *errors, of_heading, ripple=ripple_at(rate), lengths=encoder is not None, base=on_base
     )
-    prior = filtered["prior"][:ALL_ERRORS, :ALL_ERRORS] + (base_imu.shared_errors(mechanism, fusion) if on_base else 0.0)
+    prior = filtered["prior"][:ALL_ERRORS, :ALL_ERRORS]
+    if on_base and not mechanism.planar:
+        prior = prior + base_imu.shared_errors(mechanism, fusion)
     able = not _without_evidence(mechanism, rate, section_5)
     if min(watched.protection_position, watched.protection_rotation) < np.inf and not (able and watched.watch_imus):
         raise InputError(
@@ -225,6 +227,9 @@ def cycle_parameters(
     watch_evidence = bool(watched.watch_imus) and able
     if not able:
         watched = replace(watched, misfit=np.inf)
+    if encoder is not None:
+        share = length_share(mechanism, fusion, imus, magnetometer)
+        watched = replace(watched, length_deviation=watched.length_deviation * share)
     if are_few(mechanism, imus):
         # The noise of their estimate alone makes the commands go to and fro.
         watched = replace(watched, evidence=np.inf, oscillation=np.inf)
@@ -233,7 +238,7 @@ def cycle_parameters(
         rig=rig_parameters(mechanism, rate, control.hold, calibration.tilt),
         imus=imu_health.imu_parameters(present, calibration.gain, calibration.offset, fusion, watched, rate),
         base=base_imu.base_imu_parameters(mechanism, fusion, on_base, calibration.base_gain, calibration.base_offset),
-        encoders=encoders.encoder_parameters(encoder, fusion, mechanism.legs),
+        encoders=encoders.encoder_parameters(encoder, fusion, mechanism, lengths_lead(mechanism, imus, magnetometer, encoder)),
         legs=leg_filter.leg_parameters(fusion, rate),
         platform=platform_filter.platform_parameters(fusion, rate, limits.jerk),
         heading=heading_filter.heading_parameters(fusion, rate, field, magnetometer),
@@ -322,13 +327,18 @@ def run_stages(
         t = _mark(m, CycleStage.HEADING, t)
     if first <= CycleStage.POSE < last:
         pose_estimator.take_vectors(s.pose, s.platform, s.heading)
-        conditioning = pose_estimator.find_pose(
-            p.pose, s.pose, rig, s.legs.directions, s.legs.used, s.platform.used, s.heading.used
-        )
-        s.pose.found = conditioning >= RANK_TOLERANCE
+        if p.encoders.lead != 0:
+            s.pose.found = encoders.find_pose_by_lengths(
+                p.encoders, s.encoders, p.pose, rig, time, s.legs, s.platform.rate, s.pose
+            )
+        else:
+            conditioning = pose_estimator.find_pose(
+                p.pose, s.pose, rig, s.legs.directions, s.legs.used, s.platform.used, s.heading.used
+            )
+            s.pose.found = conditioning >= RANK_TOLERANCE
         t = _mark(m, CycleStage.POSE, t)
     if first <= CycleStage.REFINEMENT < last:
-        if s.pose.found != 0:
+        if s.pose.found != 0 and p.encoders.lead == 0:
             s.pose.found = pose_estimator.refine_pose(p.pose, s.pose, rig, time, s.legs, s.platform.rate)
             if s.pose.found != 0 and p.pose.section_5 == 0:
                 watch.check_misfit(p.safety, s.safety, rig, time, s.pose, s.reference, s.pid)

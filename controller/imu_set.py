@@ -1,16 +1,21 @@
-"""Which sets of IMUs can be used: whether they determine the pose everywhere in the workspace, and check each other."""
+"""Which sets of IMUs and encoders can be used: whether they determine the pose everywhere in the workspace, and check each
+other.
+"""
 
 from collections.abc import Collection
+from typing import Any
 
 import numpy as np
 
 from controller.direct_kinematics.geometry import geometry_of
+from controller.direct_kinematics.requirements import length_conditionings
 from controller.estimation.pose_estimator import PARAMETERS, STATE, WORST_CONDITIONING, find_pose
-from controller.inverse_kinematics import sample_workspace
+from controller.inverse_kinematics import inverse_kinematics, sample_workspace
 from controller.rig import RIG, field_of
 from controller.settings import FusionSettings
 from plant.compiled import filled
 from plant.dynamics.variables import TINY
+from plant.encoders import EncoderModel
 from plant.errors import InputError
 from plant.imu_wiring import ALL_IMUS, PLATFORM_IMU
 from plant.mechanism import LEGS, Mechanism, six_rows
@@ -28,6 +33,9 @@ _MOST_ALONG = 0.99
 
 _LEAST_LEVEL = 1e-6
 """Least level component of a leg that counts as one."""
+
+_POSES = 50
+"""Of the workspace, at which a set is tried."""
 
 _LEAST_JUDGED = 5
 """Of fewer IMUs in space, evidence judges none."""
@@ -49,9 +57,17 @@ def are_few(mechanism: Mechanism, imus: Collection[int]) -> bool:
     return not mechanism.planar and len(imus_of(mechanism, imus)) < _LEAST_JUDGED
 
 
-def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool = False, section_5: bool = False) -> float:
-    """Check that these IMUs, and the platform's magnetometer, determine the pose, at home and over the workspace; returns the
-    worst conditioning there.
+def check_imus(
+    mechanism: Mechanism,
+    imus: Collection[int],
+    magnetometer: bool = False,
+    section_5: bool = False,
+    encoder: EncoderModel | None = None,
+) -> float:
+    """Check that these IMUs, the platform's magnetometer and encoders of all legs determine the pose, at home and over the
+    workspace; returns the worst conditioning there, of the IMUs if they suffice, else of the lengths.
+
+    Incremental encoders tell no pose at power-on, so that the IMUs must.
 
     Raises:
         InputError: an IMU outside 0 to 6, no field for the magnetometer, or the set does not determine the pose.
@@ -78,27 +94,69 @@ def check_imus(mechanism: Mechanism, imus: Collection[int], magnetometer: bool =
             f"gravity hardly tells the angles in the plane of {mechanism.name!r}: of the vertical only {in_plane:.2g} lies in "
             f"it, and {_LEAST_OBSERVABILITY:g} is needed: set the plant's gravity"
         )
-    positions, rotations = sample_workspace(mechanism, 50, seed=0)
+    positions, rotations = sample_workspace(mechanism, _POSES, seed=0)
     if not mechanism.planar:
         _check_joints(mechanism, positions, rotations, imus)
-    names = ", ".join(str(imu) for imu in imus_of(mechanism, imus)) or "none"
+    worst = float(conditionings(mechanism, positions, rotations, imus, magnetometer, section_5).min())
+    if worst >= WORST_CONDITIONING:
+        return worst
+    if encoder is not None and encoder.absolute:
+        worst = float(length_conditionings(mechanism, positions, rotations).min())
+        if worst >= WORST_CONDITIONING:
+            return worst
+    names, powerless = ", ".join(str(imu) for imu in imus_of(mechanism, imus)) or "none", ""
+    if encoder is not None and not encoder.absolute:
+        powerless = ", and incremental encoders tell none at power-on"
     if mechanism.planar and PLATFORM_IMU not in imus:
         raise InputError(
             f"the IMUs {names} determine the pose of {mechanism.name!r} up to its two assembly modes at best, which the loop "
-            "cannot tell apart: add the platform's IMU (6), whose roll does"
+            f"cannot tell apart{powerless}: add the platform's IMU (6), whose roll does, or absolute encoders (--lengths "
+            "absolute)"
         )
-    worst = float(conditionings(mechanism, positions, rotations, imus, magnetometer, section_5).min())
-    if worst < WORST_CONDITIONING:
-        remedies = ["legs"]
-        if PLATFORM_IMU not in imus:
-            remedies.append("the platform's IMU (6)")
-        if not (magnetometer or mechanism.planar):
-            remedies.append("its magnetometer (--magnetometer)")
-        raise InputError(
-            f"the IMUs {names} do not determine the pose of {mechanism.name!r} everywhere in its workspace (conditioning "
-            f"{worst:.1e}; at least {WORST_CONDITIONING:g} is needed): add {', or '.join(remedies)}"
-        )
-    return worst
+    remedies = ["legs"]
+    if PLATFORM_IMU not in imus:
+        remedies.append("the platform's IMU (6)")
+    if not (magnetometer or mechanism.planar):
+        remedies.append("its magnetometer (--magnetometer)")
+    if not section_5:
+        remedies.append("absolute encoders (--lengths absolute)")
+    raise InputError(
+        f"the IMUs {names} do not determine the pose of {mechanism.name!r} everywhere in its workspace (conditioning "
+        f"{worst:.1e}; at least {WORST_CONDITIONING:g} is needed){powerless}: add {', or '.join(remedies)}"
+    )
+
+
+def lengths_lead(
+    mechanism: Mechanism, imus: Collection[int], magnetometer: bool = False, encoder: EncoderModel | None = None
+) -> bool:
+    """Whether the pose must be that of absolute encoders, as the IMUs of a set that `check_imus` allows do not determine it."""
+    if encoder is None or not encoder.absolute:
+        return False
+    return bool(
+        conditionings(mechanism, *sample_workspace(mechanism, _POSES, seed=0), imus, magnetometer).min() < WORST_CONDITIONING
+    )
+
+
+def length_share(mechanism: Mechanism, fusion: FusionSettings, imus: Collection[int], magnetometer: bool = False) -> float:
+    """How much less well these IMUs know the lengths of the legs at home than all IMUs do: 1 or more, of the worst leg."""
+
+    def worst(*chosen: Any) -> float:
+        rows = np.vstack([rows for rows, _ in measured_rows(mechanism, fusion, *chosen).values()])
+        covariance = np.linalg.pinv(rows.T @ rows, rcond=_SINGULAR, hermitian=True)
+        along = inverse_kinematics(mechanism, mechanism.require_home()).jacobian
+        return float(np.sqrt(np.einsum("ki,ij,kj->k", along, covariance, along).max()))
+
+    return max(1.0, worst(imus, magnetometer) / worst())
+
+
+def encoder_remark(lead: bool) -> str:
+    """What a user should know where the encoders lead, in a line; "" where the IMUs determine the pose."""
+    if not lead:
+        return ""
+    return (
+        "the IMUs do not determine the pose: it is that of the encoders, by iteration from home, so that the platform must be "
+        "nearer to home than to another pose with the same lengths, and nothing tells an encoder that has lost counts: add IMUs"
+    )
 
 
 def _check_joints(mechanism: Mechanism, positions: Array, rotations: Array, imus: Collection[int]) -> None:

@@ -4,23 +4,41 @@ A reading is `length + zero`. Encoders tell how a length changes far better than
 where it began, which the IMUs do. So the pose that the IMUs have is moved to the lengths, as if their zeros were exact, and
 these are the mean differences between readings and the IMUs' lengths. The pose's covariance knows that they are no better than
 that. A zero is exact once its home switch has closed; an absolute encoder's is so from the start.
+
+Where the IMUs do not determine the pose, absolute encoders lead: the pose is that of least squares over lengths and IMUs, found
+by iteration from home or from the last pose. Lengths alone belong to several poses, of which this finds the nearest.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.direct_kinematics.refinement import move_pose, solve_normal_equations, stay_in_plane
+from controller.direct_kinematics.refinement import (
+    find_twist,
+    move_pose,
+    normal_equations,
+    solve_normal_equations,
+    stay_in_plane,
+)
+from controller.estimation.pose_estimator import follow_twist
 from controller.inverse_kinematics import legs_at
+from controller.least_squares import solve_cholesky
 from controller.rig import elapsed
 from controller.settings import FusionSettings
 from plant.compiled import Record, filled, kernel, record_dtype, shared_kernel
 from plant.encoders import EncoderModel
-from plant.mechanism import LEGS
+from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array
-from plant.vectors import cross, vector
+from plant.vectors import cross, rotate, vector
 
 _FORGETTING_S = 30.0
 """A zero is the mean over all the time that it has been followed, and at most over as long [s]."""
+
+_MOST_STEPS = 20
+_SETTLED = 1e-9
+"""A step below this ends the iteration from a first guess [m, rad]."""
+
+_MOST_LEFT_M = 1e-3
+"""Lengths that a pose misses by more belong to no pose near the first guess [m]."""
 
 PARAMETERS = record_dtype(
     count=np.int64,  # how many encoders there are
@@ -29,6 +47,10 @@ PARAMETERS = record_dtype(
     variance=np.float64,  # of a reading about its zero, play included [m^2]
     zero_variance=np.float64,  # of a zero that is known [m^2]
     switch=(np.float64, LEGS),  # length at which the home switch closes; NaN without one [m]
+    lead=np.int64,  # whether the pose is the lengths', as the IMUs do not determine it
+    position=(np.float64, 3),  # of home [m]
+    rotation=(np.float64, (3, 3)),
+    leg_sigma=np.float64,  # of a leg's direction in the refinement [rad]
 )
 """Constants of the encoders."""
 
@@ -50,10 +72,19 @@ STATE = record_dtype(
 """State of the encoders."""
 
 
-def encoder_parameters(model: EncoderModel | None, fusion: FusionSettings, legs: int) -> Record:
-    """The constants of the encoders (dtype `PARAMETERS`); none are present without a model."""
+def encoder_parameters(model: EncoderModel | None, fusion: FusionSettings, mechanism: Mechanism, lead: bool = False) -> Record:
+    """The constants of the encoders (dtype `PARAMETERS`); none are present without a model.
+
+    Args:
+        lead: whether the pose is the lengths', as the IMUs do not determine it.
+    """
+    legs, home = mechanism.legs, mechanism.require_home()
     p = filled(
         PARAMETERS,
+        lead=lead,
+        position=home.position,
+        rotation=home.rotation,
+        leg_sigma=fusion.leg_sigma,
         count=0 if model is None else legs,
         present=[model is not None and leg < legs for leg in range(LEGS)],
         absolute=model is not None and model.absolute,
@@ -110,9 +141,8 @@ def move_to_lengths(p: Record, s: Record, rig: Record, time: Record, pose: Recor
         if s.used[k] == 0.0:
             continue
         used += 1
-        d, turn, row = pose.directions[k], cross(vector(pose.arms[k]), vector(pose.directions[k])), s.row
-        for i in range(3):
-            row[i], row[3 + i] = d[i], turn[i]
+        row = s.row
+        _find_row(pose, k, row)
         _follow_zero(p, s, elapsed(rig, time), k)
         uncertain = p.zero_variance if s.followed_for[k] == np.inf else _variance_along(row, pose.factor, s.scratch)
         weight, known = 1.0 / p.variance, 1.0 / (p.variance + uncertain)
@@ -130,6 +160,84 @@ def move_to_lengths(p: Record, s: Record, rig: Record, time: Record, pose: Recor
         return False
     move_pose(s.correction, pose.position, pose.rotation)
     return True
+
+
+@kernel
+def find_pose_by_lengths(
+    p: Record, s: Record, estimator: Record, rig: Record, time: Record, legs: Record, platform_rate: Array, pose: Record
+) -> bool:
+    """Find pose and twist from lengths and IMUs together, starting from the last pose, or from home if there is none; False if
+    there is none near.
+
+    Args:
+        estimator: constants of the pose's estimator.
+        platform_rate: (3,), angular velocity in {2} [rad/s].
+    """
+    if pose.found == 0:
+        pose.position[:] = p.position
+        pose.rotation[:] = p.rotation
+    pose.weights[:LEGS] = legs.weights
+    pose.weights[LEGS:] = pose.vector_weights
+    pose.misfit = pose.rest_misfit = 0.0
+    weight, settled = 1.0 / (p.variance + p.zero_variance), False
+    for _ in range(_MOST_STEPS):
+        normal_equations(
+            rig.geometry.base_joints, rig.geometry.platform_joints, legs.directions, pose.weights[:LEGS], rig.vectors_in_base,
+            pose.vectors, pose.vector_weights, pose.position, pose.rotation, pose.arms, pose.directions, pose.lengths,
+            pose.information, pose.correction,
+        )  # fmt: skip
+        for k in range(rig.legs):
+            if s.used[k] != 0.0:
+                s.off[k] = s.reading[k] - pose.lengths[k]
+                _find_row(pose, k, s.row)
+                for i in range(6):
+                    pose.correction[i] += weight * s.off[k] * s.row[i]
+                    for j in range(i + 1):
+                        pose.information[i, j] += weight * s.row[i] * s.row[j]
+        if rig.planar != 0:
+            stay_in_plane(pose.information, pose.correction)
+        if settled or not solve_normal_equations(pose.information, pose.correction, pose.factor):
+            break
+        move_pose(pose.correction, pose.position, pose.rotation)
+        longest = 0.0
+        for i in range(6):
+            longest = max(longest, abs(pose.correction[i]))
+        settled = longest < _SETTLED
+    if not settled:
+        return False
+    for k in range(rig.legs):
+        if s.used[k] != 0.0 and abs(s.off[k]) > _MOST_LEFT_M:
+            return False
+    turning = rotate(pose.rotation, vector(platform_rate))
+    pose.angular_velocity[0], pose.angular_velocity[1], pose.angular_velocity[2] = turning
+    find_twist(
+        legs.rates, pose.weights[:LEGS], pose.vectors, pose.vector_weights, pose.angular_velocity, pose.rotation, pose.arms,
+        pose.directions, pose.lengths, pose.factor, pose.twist,
+    )  # fmt: skip
+    s.correction[:] = 0.0
+    for k in range(rig.legs):
+        if s.used[k] != 0.0:
+            _find_row(pose, k, s.row)
+            for i in range(6):
+                s.correction[i] += weight * s.rate[k] * s.row[i]
+    solve_cholesky(pose.factor, s.correction)
+    for i in range(6):
+        pose.twist[i] += s.correction[i]
+    follow_twist(estimator, pose, rig, time)
+    pose.conditioning = 1.0
+    for i in range(6):
+        # Relative to a direction that a leg's IMU measures.
+        known = pose.factor[i, i] * p.leg_sigma * (rig.geometry.spreads[-1] if i < 3 else 1.0)
+        pose.conditioning = min(pose.conditioning, known)
+    return True
+
+
+@kernel
+def _find_row(pose: Record, k: int, row: Array) -> None:
+    """Write how the length of leg `k` changes with a small move (6,) of the platform."""
+    d, turn = pose.directions[k], cross(vector(pose.arms[k]), vector(pose.directions[k]))
+    for i in range(3):
+        row[i], row[3 + i] = d[i], turn[i]
 
 
 @kernel

@@ -149,6 +149,13 @@ def refine_pose(p: Record, s: Record, rig: Record, time: Record, legs: Record, p
         legs.rates, weights, s.vectors, vector_weights, s.angular_velocity, s.rotation, s.arms, s.directions, s.lengths,
         s.factor, s.twist,
     )  # fmt: skip
+    follow_twist(p, s, rig, time)
+    return True
+
+
+@kernel
+def follow_twist(p: Record, s: Record, rig: Record, time: Record) -> None:
+    """Low-pass the twist of this cycle; the acceleration is its derivative."""
     if time.cycle == 0:
         s.smooth_twist[:] = s.twist
     # A period that is longer than the time constant takes the whole change of the twist.
@@ -157,4 +164,3 @@ def refine_pose(p: Record, s: Record, rig: Record, time: Record, legs: Record, p
     for i in range(6):
         s.acceleration[i] = (s.twist[i] - s.smooth_twist[i]) * rate
         s.smooth_twist[i] += share * (s.twist[i] - s.smooth_twist[i])
-    return True

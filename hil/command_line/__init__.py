@@ -19,7 +19,7 @@ REFUSED, INTERRUPTED = 2, 130
 COMMANDS = {
     "run": ("simulate", "run", "replay", "stream-target"),
     "calibrate": ("calibrate",),
-    "design": ("classify", "classes", "accuracy", "sensor-sets", "detectability", "tune", "tune-fusion", "optimise"),
+    "design": ("classify", "classes", "accuracy", "sensor-sets", "bounds", "detectability", "tune", "tune-fusion", "optimise"),
     "rigs": ("check-rig", "emulate", "inject"),
     "plant": ("fmu",),
     "study": ("sweep", "compare-fusion", "evaluate-fusion", "faults", "planar", "broad"),

@@ -31,7 +31,8 @@ def gough_classify(options: Namespace) -> None:
     """Show the class of a mechanism, and the sensors that it needs.
 
     For each method of direct kinematics: the sensors that it needs, whether its pose is unique, and its conditioning (1 is
-    best, 0 singular) at home and at worst.
+    best, 0 singular) at home and at worst. Then how many absolute encoders determine the pose beside how many leg IMUs, if it
+    is found from a first guess.
     """
     from hil.studies.classification import PAPER, describe
     from plant.mechanism import load_mechanism
@@ -55,6 +56,12 @@ def gough_classify(options: Namespace) -> None:
         if need.requirement.choice_text:
             print(f"{need.requirement.method}: legs {need.requirement.choice_text}")
     print(f"Worst over {description.where}. Sections are the paper's.")
+    lengths = Table("beside leg IMUs, the platform's", "leg IMUs", "encoders", "wherever they are")
+    for each in description.lengths:
+        always = "-" if each.any_choice is None else f"{each.any_choice}"
+        lengths.add(each.platform, f"{each.legs}", f"{each.fewest}", always)
+    if lengths.rows:
+        lengths.print()
 
 
 @cli.command(
@@ -121,6 +128,7 @@ def gough_accuracy(options: Namespace) -> None:
 @cli.command(
     cli.argument("--mechanism", nargs="+", metavar="NAME", help="presets or TOML files (default: one of each type)"),
     cli.options_of(SimulationConfig, "seed", duration={"text": "duration of each motion"}),
+    cli.flag("--bounds", "run nothing, and print what each set is worth at best, and when one sensor of it fails"),
     cli.markdown("docs/sensor_sets.md"),
     cli.engine_options(),
     cli.JSON,
@@ -131,11 +139,22 @@ def gough_sensor_sets(options: Namespace) -> None:
     It follows the target sines with every set of sensors, from the paper's least to all: legs alone, with the platform's roll
     and pitch, with its whole orientation (a magnetometer), by leg and platform filters and by the whole-mechanism filter.
     Prints the errors of the estimate, and the worst conditioning of direct kinematics.
+
+    With --bounds: the bound of 'gough bounds' after 1 s at rest, without lengths, with incremental and with absolute encoders
+    [mm / deg]; and that without the IMU, or the encoder, whose loss is worst. A dash stands for a pose that is not determined.
     """
     from importlib.metadata import version
 
     from hil.studies.sensor_sets import MECHANISMS, SETS, evaluate_sensor_sets, reasons, table
 
+    if options.bounds:
+        from hil.studies.pose_bound import sets
+
+        with engine_at_work(cli.engine_of(options), "sets of sensors") as (engine, progress):
+            worths = sets.evaluate_worth(options.mechanism or MECHANISMS, engine=engine, progress=progress)
+        cli.write_json(options.json, {"version": version("gough"), "sets": [asdict(worth) for worth in worths]})
+        sets.table(worths).print(options.markdown)
+        return
     with engine_at_work(cli.engine_of(options), "sets of sensors") as (engine, progress):
         names = options.mechanism or MECHANISMS
         outcomes = evaluate_sensor_sets(names, SETS, options.duration, options.seed, engine, progress)
@@ -148,6 +167,48 @@ def gough_sensor_sets(options: Namespace) -> None:
             table(outcomes, mechanism).print()
     for reason in reasons(outcomes):
         print(f"{'- ' if options.markdown else ''}{reason}")
+
+
+@cli.command(
+    cli.options_of(
+        SimulationConfig,
+        "mechanism",
+        target={"default": "hold"},
+        duration={"default": 5.0},
+        rate={},
+        imu={},
+        imus={},
+        magnetometer={},
+        lengths={},
+        calibration={"text": "the covariance of a calibration instead of the errors that the kind of IMU has"},
+        joint_error={"text": "standard deviation of each coordinate of the joints from their places"},
+        fusion={"default": "whole", "text": "with --measured: how the loop fuses the IMUs, as for 'gough simulate'"},
+    ),
+    cli.flag("--measured", "run the closed loop, too, and print its errors over the bound"),
+    cli.setting("--seeds", 20, "with --measured: runs, each with other imperfections of the sensors"),
+    cli.markdown("docs/pose_bound.md"),
+    cli.engine_options(),
+    cli.JSON,
+)
+def gough_bounds(options: Namespace) -> None:
+    """Compute how well any estimate can know the pose with a set of sensors.
+
+    This is the Bayesian Cramer-Rao bound along a target, at rest by default: the least RMS errors of position and rotation that
+    the readings allow, if the errors of IMUs and encoders are drawn as their kinds say and nothing is known of the pose before.
+    It shares no code with the loop's filters. A dash stands for a pose that the sensors do not determine.
+
+    With --measured, the closed loop's errors over seeds stand beside it.
+    """
+    from hil.studies.pose_bound.bound import find_bound, measure, summary, table
+
+    config = cli.config_of(options, SimulationConfig)
+    with engine_at_work(cli.engine_of(options), "seeds") as (engine, progress):
+        bound = find_bound(config)
+        measured = measure(config, options.seeds, engine, progress) if options.measured else None
+    cli.write_json(options.json, summary(config, bound, measured))
+    table(bound, measured).print(options.markdown)
+    for reason in dict.fromkeys(measured.stopped if measured else ()):
+        say(f"a run ended early: {reason}")
 
 
 @cli.command(

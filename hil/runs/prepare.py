@@ -10,7 +10,7 @@ import numpy as np
 
 from controller.calibration.file import Calibration, calibration_for
 from controller.cycle import STATE, cycle_parameters, evidence_remark
-from controller.imu_set import are_few, imus_of, integrity_remark
+from controller.imu_set import are_few, encoder_remark, imus_of, integrity_remark
 from controller.inverse_kinematics import leg_lengths
 from controller.loop_margins import margin_remark
 from controller.planning.offline_planner import Reference, plan
@@ -128,10 +128,12 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             config.fusion == "section-5", safety, drives, 0.0 if config.rig == "fmu" else period,
             config.arm, encoder, config.base_imu, config.frame == LEVEL,
         )  # fmt: skip
+        lead = bool(parameters["encoders"]["lead"])
         remarks = [
             calibration.remark,
-            margin_remark(mechanism, control, fusion, config.rate, config.imus, config.magnetometer),
-            integrity_remark(mechanism, fusion, config.imus, config.magnetometer),
+            # Lengths need no IMU to close the loop.
+            margin_remark(mechanism, control, fusion, config.rate, () if lead else config.imus, config.magnetometer),
+            encoder_remark(lead) or integrity_remark(mechanism, fusion, config.imus, config.magnetometer),
             evidence_remark(mechanism, config.rate, config.fusion == "section-5"),
             aliasing_remark(model, config.rate),
         ]

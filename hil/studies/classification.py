@@ -8,7 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from controller.direct_kinematics import Requirement, required_measurements, solve_batch, solve_planar
+from controller.direct_kinematics import (
+    LengthRequirement,
+    Requirement,
+    required_lengths,
+    required_measurements,
+    solve_batch,
+    solve_planar,
+)
 from controller.direct_kinematics.synthetic import draw_measurements, draw_poses, measurements_of
 from controller.inverse_kinematics import sample_workspace
 from plant.errors import SingularConfigurationError
@@ -44,12 +51,16 @@ class Need:
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """A mechanism, its class and the needs of each method; the conditioning is the worst of the poses `where`."""
+    """A mechanism, its class and the needs of each method; the conditioning is the worst of the poses `where`.
+
+    `lengths` has what absolute encoders add; nothing for a planar mechanism without a home.
+    """
 
     mechanism: Mechanism | PlanarMechanism
     mechanism_class: MechanismClass
     needs: tuple[Need, ...]
     where: str
+    lengths: tuple[LengthRequirement, ...]
 
     def summary(self) -> dict[str, Any]:
         """Everything, for JSON."""
@@ -72,6 +83,7 @@ class Description:
                 }
                 for need in self.needs
             ],
+            "lengths": [asdict(need) for need in self.lengths],
             "version": version("gough"),
         }
 
@@ -100,7 +112,7 @@ def describe(mechanism: Mechanism | PlanarMechanism) -> Description:
         found = solve_batch(mechanism, **given, method=requirement.method, refine=False)
         conditionings = np.where(found.solved, found.conditionings, 0.0)
         needs.append(Need(requirement, 1, float(conditionings[0]), conditionings[1:]))
-    return Description(mechanism, mechanism_class, tuple(needs), where)
+    return Description(mechanism, mechanism_class, tuple(needs), where, required_lengths(mechanism))
 
 
 def _describe_planar(mechanism: PlanarMechanism) -> Description:
@@ -120,7 +132,8 @@ def _describe_planar(mechanism: PlanarMechanism) -> Description:
     (home_legs, home_roll), (of_legs, of_roll) = conditionings[0].tolist(), conditionings[1:].T
     needs = Need(by_legs, 2, home_legs, of_legs), Need(by_roll, 1, home_roll, of_roll)
     where = "poses within 15 % of the base's spread and 15 deg about a platform that stands off the base by its spread"
-    return Description(mechanism, classify(mechanism), needs, where)
+    lengths = () if mechanism.home is None else required_lengths(Mechanism.from_planar(mechanism))
+    return Description(mechanism, classify(mechanism), needs, where, lengths)
 
 
 def planar_home(mechanism: PlanarMechanism) -> tuple[Array, Array, float]:

@@ -17,6 +17,7 @@ from hil.runs.config import SimulationConfig
 from hil.runs.simulation import SimulationStoppedError, simulate
 from hil.table import Table
 from plant.dynamics.variables import PLATFORM_IMU
+from plant.encoders import NO_LENGTHS, load_encoder
 from plant.errors import InputError
 from plant.mechanism import LEGS, Mechanism, load_spatial
 from plant.mechanism.classification import MechanismClass, classify, joint_numbers
@@ -29,12 +30,13 @@ _SECTION_5 = ("section-5",)
 
 @dataclass(frozen=True)
 class SensorSet:
-    """IMUs on so many legs and on the platform, its magnetometer, and the fusions that use them."""
+    """IMUs on so many legs and on the platform, its magnetometer, encoders of all legs, and the fusions that use them."""
 
     label: str
     legs: int
     platform: bool = True
     magnetometer: bool = False
+    lengths: str = NO_LENGTHS
     fusions: tuple[str, ...] = ("compiled", "whole")
 
 
@@ -48,8 +50,13 @@ SETS = (
     SensorSet("6 legs + tilt", 6),
     SensorSet("6 legs + yaw, section 5", 6, magnetometer=True, fusions=_SECTION_5),
     SensorSet("6 legs + yaw", 6, magnetometer=True),
+    SensorSet("3 legs + tilt + incremental", 3, lengths="incremental"),
+    SensorSet("6 legs + tilt + incremental", 6, lengths="incremental"),
+    SensorSet("tilt + absolute", 0, lengths="absolute"),
+    SensorSet("2 legs + absolute", 2, platform=False, lengths="absolute"),
+    SensorSet("6 legs + tilt + absolute", 6, lengths="absolute"),
 )
-"""From the fewest to all. The tilt is the platform's roll and pitch."""
+"""From the fewest IMUs to all, then with encoders. The tilt is the platform's roll and pitch."""
 
 
 def paper_set(mechanism_class: MechanismClass) -> str:
@@ -102,7 +109,7 @@ def evaluate_sensor_sets(
 
 def _evaluate(config: SimulationConfig, sensors: SensorSet, paper: bool) -> Outcome:
     imus, conditioning, refused = choose_imus(load_spatial(config.mechanism), sensors, paper)
-    config = replace(config, imus=imus, magnetometer=sensors.magnetometer)
+    config = replace(config, imus=imus, magnetometer=sensors.magnetometer, lengths=sensors.lengths)
     runs = {fusion: _follow(replace(config, fusion=fusion)) for fusion in sensors.fusions if imus}
     return Outcome(config.mechanism, sensors.label, paper, imus, conditioning, refused, runs)
 
@@ -111,14 +118,14 @@ def choose_imus(mechanism: Mechanism, sensors: SensorSet, paper: bool) -> tuple[
     """The best IMUs of a set, the worst conditioning with them, and why there are none."""
     best, refused = 0.0, ""
     imus: tuple[int, ...] = ()
-    joints = joint_numbers(mechanism.platform_joints)
-    for legs in combinations(range(LEGS), sensors.legs):
-        if paper and sensors.legs == 4 and len(set(joints[list(legs)].tolist())) != 3:
+    encoder = load_encoder(sensors.lengths)
+    for legs in combinations(range(mechanism.legs), sensors.legs):
+        if paper and sensors.legs == 4 and len(set(joint_numbers(mechanism.platform_joints)[list(legs)].tolist())) != 3:
             # The paper's section 4 uses two legs that meet, and two that end elsewhere.
             continue
         choice = (*legs, PLATFORM_IMU) if sensors.platform else legs
         try:
-            conditioning = check_imus(mechanism, choice, sensors.magnetometer, sensors.fusions == _SECTION_5)
+            conditioning = check_imus(mechanism, choice, sensors.magnetometer, sensors.fusions == _SECTION_5, encoder)
         except InputError as error:
             refused = str(error)
             continue

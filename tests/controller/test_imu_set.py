@@ -8,9 +8,19 @@ import numpy as np
 import pytest
 
 from controller.direct_kinematics import integrity, solve, solve_batch
-from controller.imu_set import are_few, check_imus, imus_of, integrity_remark
-from controller.inverse_kinematics import sample_workspace
+from controller.imu_set import (
+    are_few,
+    check_imus,
+    encoder_remark,
+    imus_of,
+    integrity_remark,
+    length_share,
+    lengths_lead,
+    measured_rows,
+)
+from controller.inverse_kinematics import inverse_kinematics, sample_workspace
 from controller.settings import FusionSettings
+from plant.encoders import load_encoder
 from plant.errors import InputError
 from plant.imu_wiring import ALL_IMUS
 from plant.mechanism import Mechanism, load_in_space, load_mechanism
@@ -203,3 +213,55 @@ def test_an_error_moves_the_pose_as_the_remark_says(hexapod):
     turned[3] = unit(turned[3] + np.radians(2.0) * np.linalg.svd(turned[3][None])[2][1])
     found = integrity(hexapod, turned)
     assert found.detected and found.faulty is None
+
+
+INCREMENTAL, ABSOLUTE = load_encoder("incremental"), load_encoder("absolute")
+
+
+@pytest.mark.parametrize("imus", [(6,), (0, 3), (0, 6), (0, 1, 2)])
+def test_absolute_encoders_determine_the_pose_beside_any_imus(hexapod, imus):
+    assert check_imus(hexapod, imus, encoder=ABSOLUTE) > 0.1
+    assert lengths_lead(hexapod, imus, encoder=ABSOLUTE)
+    with pytest.raises(InputError, match=r"and incremental encoders tell none at power-on: add legs.*\(--lengths absolute\)$"):
+        check_imus(hexapod, imus, encoder=INCREMENTAL)
+    with pytest.raises(InputError, match=r"or absolute encoders \(--lengths absolute\)$"):
+        check_imus(hexapod, imus)
+
+
+def test_imus_that_determine_the_pose_lead_whatever_the_encoders(hexapod):
+    for encoder in (None, INCREMENTAL, ABSOLUTE):
+        assert check_imus(hexapod, (0, 2, 3, 6), encoder=encoder) == check_imus(hexapod, (0, 2, 3, 6))
+        assert not lengths_lead(hexapod, (0, 2, 3, 6), encoder=encoder)
+    assert not lengths_lead(hexapod, (0, 3, 6), magnetometer=True, encoder=ABSOLUTE)
+
+
+def test_absolute_encoders_tell_the_assembly_modes_of_a_planar_mechanism_apart():
+    planar = load_in_space("planar-3rpr")
+    assert check_imus(planar, (0, 1, 2), encoder=ABSOLUTE) > 0.01 and lengths_lead(planar, (0, 1, 2), encoder=ABSOLUTE)
+    for encoder in (None, INCREMENTAL):
+        with pytest.raises(InputError, match="add the platform's IMU"):
+            check_imus(planar, (0, 1, 2), encoder=encoder)
+    assert not lengths_lead(planar, ALL_IMUS, encoder=ABSOLUTE)
+
+
+def test_lengths_that_do_not_determine_the_pose_are_no_remedy(hexapod):
+    """Base and platform alike and level: to first order no length changes with a turn about the vertical."""
+    alike = Mechanism.from_legs(
+        hexapod.base_joints, hexapod.base_joints, home=hexapod.home, limits={"stroke": [-0.02, 0.02]}, plant=hexapod.plant
+    )
+    with pytest.raises(InputError, match="do not determine the pose"):
+        check_imus(alike, (6,), encoder=ABSOLUTE)
+
+
+def test_few_imus_know_the_lengths_less_well(hexapod):
+    """By as much as the standard deviations of simulated least squares at home."""
+    fusion, random = FusionSettings(), np.random.default_rng(0)
+    assert length_share(hexapod, fusion, ALL_IMUS) == 1.0
+
+    def deviation(imus):
+        rows = np.vstack([rows for rows, _ in measured_rows(hexapod, fusion, imus).values()])
+        poses = np.linalg.lstsq(rows, random.normal(size=(len(rows), 4000)), rcond=None)[0]
+        return (inverse_kinematics(hexapod, hexapod.home).jacobian @ poses).std(axis=1).max()
+
+    assert length_share(hexapod, fusion, (0, 4, 5, 6)) == pytest.approx(deviation((0, 4, 5, 6)) / deviation(ALL_IMUS), rel=0.05)
+    assert encoder_remark(False) == "" and "by iteration from home" in encoder_remark(True)

@@ -1,10 +1,11 @@
-"""What the IMUs and the legs do while the platform moves: exact kinematics of a mechanism of six legs, in NumPy.
+"""What the IMUs and the legs do while the platform moves: exact kinematics of a mechanism, in NumPy.
 
 This is code of its own, on purpose: it shares nothing with the loop's filters, whose figures it bounds. From the vector of a
 leg in its joint's frame, s = L (sin b, -sin a cos b, cos a cos b), follow the angles a and b of its universal joint with two
 derivatives, from these the angular velocity and acceleration in the leg's frame, and the specific force at the IMU.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,8 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from controller.planning.target import Target
 from plant.errors import InputError
-from plant.imu_wiring import IMU_COUNT, PLATFORM_IMU
-from plant.mechanism import LEGS, Mechanism
+from plant.mechanism import Mechanism
 from plant.pose import Array
 
 POSE = 6
@@ -53,18 +53,19 @@ class Motion:
 
 
 class Signals(NamedTuple):
-    """What is measured, without any error, and where the IMUs are."""
+    """What is measured on n legs and the platform, whose IMU is the last, without any error; and where the IMUs are."""
 
-    angular_velocity: Array  # (N, 7, 3) [rad/s], in each IMU's axes
-    specific_force: Array  # (N, 7, 3) [m/s^2], likewise
-    leg_rates: Array  # (N, 6) [m/s]
-    axes: Array  # (N, 7, 3, 3), from each IMU's axes to {1}
-    places: Array  # (N, 7, 3) [m], in {1}
-    velocities: Array  # (N, 7, 3) [m/s], in {1}
+    angular_velocity: Array  # (N, n + 1, 3) [rad/s], in each IMU's axes
+    specific_force: Array  # (N, n + 1, 3) [m/s^2], likewise
+    lengths: Array  # (N, n) [m]
+    leg_rates: Array  # (N, n) [m/s]
+    axes: Array  # (N, n + 1, 3, 3), from each IMU's axes to {1}
+    places: Array  # (N, n + 1, 3) [m], in {1}
+    velocities: Array  # (N, n + 1, 3) [m/s], in {1}
 
     def data(self) -> Array:
-        """(N, 48): angular velocity and specific force IMU by IMU, then the rates of the legs."""
-        imus = np.concatenate([self.angular_velocity, self.specific_force], axis=2).reshape(-1, 2 * 3 * IMU_COUNT)
+        """(N, 7 n + 6): angular velocity and specific force IMU by IMU, then the rates of the legs."""
+        imus = np.concatenate([self.angular_velocity, self.specific_force], axis=2).reshape(len(self.leg_rates), -1)
         return np.concatenate([imus, self.leg_rates], axis=1)
 
 
@@ -110,7 +111,8 @@ def signals(mechanism: Mechanism, motion: Motion) -> Signals:
     s = motion.position[:, None] + arms - mechanism.base_joints
     ds = motion.velocity[:, None] + turned
     dds = motion.acceleration[:, None] + np.cross(alpha, arms) + np.cross(omega, np.cross(omega, arms))
-    rates = np.sum(s * ds, axis=2) / np.linalg.norm(s, axis=2)
+    lengths = np.linalg.norm(s, axis=2)
+    rates = np.sum(s * ds, axis=2) / lengths
     axes, leg_omega, leg_alpha = _universal_joints(mechanism.joint_rotations, s, ds, dds)
 
     platform = motion.rotation[:, None]
@@ -119,25 +121,27 @@ def signals(mechanism: Mechanism, motion: Motion) -> Signals:
     own_alpha = np.concatenate([leg_alpha, _seen(platform, alpha)], axis=1)
     levers = np.vstack([mechanism.plant["leg_imu_position"], mechanism.plant["platform_imu_position"]])
     # Of the points about which the IMUs turn, the base joints stand still.
-    origin = np.zeros((len(s), IMU_COUNT, 3))
-    origin[:, :LEGS] = mechanism.base_joints
-    origin[:, PLATFORM_IMU] = motion.position
+    origin = np.zeros((len(s), mechanism.legs + 1, 3))
+    origin[:, :-1] = mechanism.base_joints
+    origin[:, -1] = motion.position
     moving, speeding = np.zeros_like(origin), np.zeros_like(origin)
-    moving[:, PLATFORM_IMU], speeding[:, PLATFORM_IMU] = motion.velocity, motion.acceleration
+    moving[:, -1], speeding[:, -1] = motion.velocity, motion.acceleration
     speeding -= mechanism.plant["gravity"]
     force = _seen(axes, speeding) + np.cross(own_alpha, levers) + np.cross(own_omega, np.cross(own_omega, levers))
     places = origin + np.einsum("nkij,kj->nki", axes, levers)
     velocities = moving + np.einsum("nkij,nkj->nki", axes, np.cross(own_omega, levers))
-    return Signals(own_omega, force, rates, axes, places, velocities)
+    return Signals(own_omega, force, lengths, rates, axes, places, velocities)
 
 
-def sensitivity(mechanism: Mechanism, motion: Motion) -> Array:
-    """The derivative (N, 48, 18) of the data with respect to a pose error and its two derivatives, by central differences."""
-    derivative = np.empty((len(motion.position), signals(mechanism, motion).data().shape[1], JET))
+def sensitivity(mechanism: Mechanism, motion: Motion, data: Callable[[Signals], Array] = Signals.data) -> Array:
+    """The derivative (N, m, 18) of data (N, m) of the signals with respect to a pose error and its two derivatives, by central
+    differences.
+    """
+    derivative = np.empty((len(motion.position), data(signals(mechanism, motion)).shape[1], JET))
     for i in range(JET):
         step = np.zeros(JET)
         step[i] = 1e-5
-        ahead, behind = (signals(mechanism, motion.shifted(sign * step)).data() for sign in (1.0, -1.0))
+        ahead, behind = (data(signals(mechanism, motion.shifted(sign * step))) for sign in (1.0, -1.0))
         derivative[:, :, i] = (ahead - behind) / 2e-5
     return derivative
 
@@ -149,7 +153,7 @@ def _seen(axes: Array, vectors: Array) -> Array:
 
 
 def _universal_joints(joints: Array, s: Array, ds: Array, dds: Array) -> tuple[Array, Array, Array]:
-    """Axes (N, 6, 3, 3) of the legs in {1}, their angular velocity and angular acceleration (N, 6, 3) in these axes."""
+    """Axes (N, n, 3, 3) of the legs in {1}, their angular velocity and angular acceleration (N, n, 3) in these axes."""
     (x, y, z), (dx, dy, dz), (ddx, ddy, ddz) = (
         np.moveaxis(np.einsum("kji,nkj->nki", joints, each), 2, 0) for each in (s, ds, dds)
     )

@@ -9,7 +9,7 @@ from controller.safety.causes import Cause, Mode
 from hil.faults.links import run
 from hil.faults.rows import Drawn
 from hil.runs.config import SimulationConfig
-from hil.runs.simulation import simulate
+from hil.runs.simulation import SimulationStoppedError, simulate
 from plant.pose import pose_errors, rotations_from_quaternions
 from plant.truth import TRUTH_LENGTHS, TRUTH_POSITION, TRUTH_QUATERNION
 
@@ -91,3 +91,33 @@ def test_an_encoder_that_has_lost_counts_is_used_again_with_a_new_zero():
     ]
     assert told == [(Cause.ENCODER_CONTRADICTED, 4), (Cause.ENCODER_BACK, 4)]
     assert np.linalg.norm(errors_of(result.records)[-500:, :3], axis=1).max() < 0.6
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"imus": (6,)},
+        {"imus": (6,), "fusion": "compiled", "rate": 250.0},
+        {"imus": (0, 3), "fusion": "compiled"},
+        {"imus": (0, 1), "fusion": "compiled", "mechanism": "planar-3rpr"},
+    ],
+)
+def test_absolute_encoders_lead_where_the_imus_do_not_determine_the_pose(changes):
+    result = simulate(replace(SINES, lengths="absolute", duration=3.0, **changes))
+    assert (rms(errors_of(result.records)) < (0.03, 0.01)).all()
+    assert any("it is that of the encoders" in remark for remark in result.remarks)
+
+
+def test_encoders_that_lead_do_without_one_that_is_silent_if_an_imu_makes_up_for_it():
+    """The platform's vertical does for one of them, not for three."""
+    led = replace(SINES, lengths="absolute", duration=3.0, imus=(6,), fusion="compiled")
+    records = simulate(replace(led, faults=("encoder-dead:1,at=1,for=1",))).records
+    assert np.linalg.norm(errors_of(records)[:, :3], axis=1).max() < 2.0
+    with pytest.raises(SimulationStoppedError, match="pose"):
+        simulate(replace(led, faults=("encoder-dead:1+2+3,at=1",)))
+
+
+def test_encoders_beside_few_imus_are_judged_by_what_these_know():
+    """Four legs alone know a length fifteen times less well than all IMUs do, which is no fault of an encoder."""
+    result = simulate(replace(SINES, target="hold", duration=2.0, fusion="compiled", imus=(1, 2, 3, 4)))
+    assert not (result.records["event_cause"] == Cause.ENCODER_CONTRADICTED).any()

@@ -1,0 +1,101 @@
+"""The pose of encoders that lead: from home to any pose of the workspace, and what has no solution."""
+
+import numpy as np
+import pytest
+
+from controller.estimation import leg_filter, pose_estimator
+from controller.estimation.encoders import STATE, encoder_parameters, find_pose_by_lengths, screen_encoders
+from controller.inverse_kinematics import inverse_kinematics, leg_lengths, sample_workspace
+from controller.rig import TIME, rig_parameters
+from controller.settings import FusionSettings, sensor_settings
+from plant.encoders import load_encoder
+from plant.imu import load_imu
+from plant.mechanism import LEGS, load_in_space, six_rows
+from plant.pose import Pose
+
+FUSION, NO_HOME = FusionSettings(), np.full(LEGS, -1)
+
+
+class Bench:
+    """Encoders on a mechanism without IMUs; the IMUs' weights are zero until they are given."""
+
+    def __init__(self, name):
+        self.mechanism = load_in_space(name)
+        encoder = load_encoder("ideal")
+        known = sensor_settings(self.mechanism, load_imu("ideal"), encoder)
+        self.parameters = encoder_parameters(encoder, known, self.mechanism, lead=True)
+        self.estimator = pose_estimator.pose_parameters(FUSION, False)
+        self.rig = rig_parameters(self.mechanism, 1000.0, 0.2, np.zeros(2))
+        self.time, self.encoders = np.zeros((), TIME), np.zeros((), STATE)
+        self.legs, self.pose = np.zeros((), leg_filter.STATE), np.zeros((), pose_estimator.STATE)
+
+    def find(self, lengths, rates=None):
+        """Whether there is a pose with these lengths (n,) [m]."""
+        readings, speeds = (np.pad(each, (0, LEGS - len(each))) for each in (lengths, lengths if rates is None else rates))
+        screen_encoders(self.parameters[()], self.encoders[()], 0, readings, speeds, NO_HOME)
+        self.pose["found"] = find_pose_by_lengths(
+            self.parameters[()], self.encoders[()], self.estimator[()], self.rig[()], self.time[()], self.legs[()], np.zeros(3),
+            self.pose[()],
+        )  # fmt: skip
+        return bool(self.pose["found"])
+
+
+@pytest.mark.parametrize("name", ["6-3-I", "6-3-II", "6-4-I", "6-4-II", "6-5", "hexapod", "genhexkins", "planar-3rpr"])
+def test_from_home_it_finds_every_pose_of_the_workspace_with_its_twist(name):
+    random, bench = np.random.default_rng(0), Bench(name)
+    mechanism = bench.mechanism
+    for position, rotation in zip(*sample_workspace(mechanism, 200, seed=1), strict=True):
+        bench.pose["found"] = 0
+        lengths = leg_lengths(mechanism, position, rotation)
+        twist = random.normal(size=6) * ([1.0, 1.0, 0.0, 0.0, 0.0, 1.0] if mechanism.planar else 1.0)
+        assert bench.find(lengths, inverse_kinematics(mechanism, Pose(position, rotation)).jacobian @ twist)
+        np.testing.assert_allclose(bench.pose["position"], position, atol=1e-9)
+        np.testing.assert_allclose(bench.pose["rotation"], rotation, atol=1e-8)
+        np.testing.assert_allclose(bench.pose["twist"], twist, atol=1e-5)
+        assert bench.pose["conditioning"] > 0.1
+
+
+def test_it_follows_from_the_last_pose():
+    """Across the workspace in small steps, without going back to home."""
+    bench = Bench("hexapod")
+    home = bench.mechanism.require_home()
+    assert bench.find(leg_lengths(bench.mechanism, home.position, home.rotation))
+    bench.parameters["position"] = np.nan
+    for share in np.linspace(0.0, 1.0, 20):
+        position = home.position + share * np.array([0.03, -0.02, 0.02])
+        assert bench.find(leg_lengths(bench.mechanism, position, home.rotation))
+        np.testing.assert_allclose(bench.pose["position"], position, atol=1e-9)
+
+
+def test_lengths_without_a_pose_have_none():
+    bench = Bench("hexapod")
+    home = bench.mechanism.require_home()
+    lengths = leg_lengths(bench.mechanism, home.position, home.rotation)
+    assert not bench.find(lengths * [1.0, 1.0, 1.0, 1.0, 1.0, 4.0])
+    bench.pose["found"] = 0
+    assert not bench.find(lengths + [0.0, 0.0, np.nan, 0.0, 0.0, 0.0])
+
+
+def test_where_an_encoder_is_silent_the_platform_s_vertical_makes_up_for_it():
+    bench = Bench("hexapod")
+    position, rotation = (each[0] for each in sample_workspace(bench.mechanism, 1, seed=2))
+    lengths = leg_lengths(bench.mechanism, position, rotation)
+    lengths[2] = np.nan
+    assert not bench.find(lengths)
+    bench.pose["found"] = 0
+    bench.pose["vectors"][0] = bench.mechanism.up_in_base @ rotation
+    bench.pose["vector_weights"][0] = 1.0 / FUSION.tilt_sigma**2
+    assert bench.find(lengths)
+    np.testing.assert_allclose(bench.pose["position"], position, atol=1e-7)
+
+
+def test_directions_of_legs_make_up_for_it_too():
+    bench = Bench("hexapod")
+    position, rotation = (each[0] for each in sample_workspace(bench.mechanism, 1, seed=3))
+    legs = inverse_kinematics(bench.mechanism, Pose(position, rotation))
+    bench.legs["directions"] = six_rows(legs.directions)
+    bench.legs["weights"][:2] = 1.0 / FUSION.leg_sigma**2
+    lengths = legs.lengths.copy()
+    lengths[3:5] = np.nan
+    assert bench.find(lengths)
+    np.testing.assert_allclose(bench.pose["position"], position, atol=1e-7)
