@@ -312,10 +312,8 @@ def run_stages(
                 elapsed(rig, time),
             )  # fmt: skip
         if p.base.present != 0:
-            base_imu.take_base_out(
-                p.base, s.base, p.safety, s.safety, rig, time, s.imus, s.legs, p.platform, s.platform, s.pose, s.reference,
-                s.pid,
-            )  # fmt: skip
+            base_imu.take_base_out(p.base, s.base, rig, time, s.imus, s.legs, p.platform, s.platform, s.pose)
+            watch.check_base_imu(p.safety, s.safety, rig, time, s.base, s.reference, s.pid)
         t = _mark(m, CycleStage.SCREENING, t)
     if first <= CycleStage.LEGS < last:
         leg_filter.step_leg_filters(p.legs, s.legs, rig, time, s.imus)

@@ -26,8 +26,6 @@ from controller.estimation.platform_filter import start_platform
 from controller.estimation.whole_mechanism.imu_errors import ACCELEROMETER_BIAS, ERRORS, GYROSCOPE_BIAS
 from controller.estimation.whole_mechanism.readings import find_frames, leg_axes
 from controller.rig import elapsed, sensor_geometry
-from controller.safety.causes import Cause
-from controller.safety.stop import handle_cause
 from controller.settings import FusionSettings
 from plant.compiled import Record, filled, kernel, record_dtype, shared_kernel
 from plant.imu import ACCELEROMETER, GYROSCOPE
@@ -38,12 +36,6 @@ from plant.vectors import Vector, add, cross, dot, rotate, rotate_back, scale, s
 
 _MEMORY_S = 0.015
 """Time constant with which the memory of the rate fades [s]."""
-
-_PATIENCE_S = 0.01
-"""How long the last reading is held when there is no new one that can be used [s]."""
-
-_FIRST_S = 1.0
-"""How long the first reading may take [s]."""
 
 _FROZEN_S = 0.01
 """How long a reading that says that the base turns may stay the same [s]."""
@@ -179,16 +171,10 @@ def vertical(p: Record, s: Record, rig: Record) -> tuple[Vector, float]:
 
 @shared_kernel
 def take_base_out(
-    p: Record, s: Record, safety_parameters: Record, safety: Record, rig: Record, time: Record, imus: Record, legs: Record,
-    platform_parameters: Record, platform: Record, pose: Record, reference: Record, pid: Record,
+    p: Record, s: Record, rig: Record, time: Record, imus: Record, legs: Record, platform_parameters: Record, platform: Record,
+    pose: Record,
 ) -> None:  # fmt: skip
-    """Take the base's motion out of the samples of all healthy IMUs.
-
-    Without readings of the base's IMU the last ones are held for a while, and then the run ends.
-    """
-    patience = _PATIENCE_S if s.begun != 0 else _FIRST_S
-    if s.lost_for > patience:
-        handle_cause(safety_parameters, safety, rig, time, reference, pid, Cause.BASE_IMU_LOST, -1, s.lost_for, patience)
+    """Take the base's motion out of the samples of all healthy IMUs; without a new reading of it, the last one is held."""
     if s.begun == 0:
         return
     period = elapsed(rig, time)

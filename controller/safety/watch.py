@@ -56,6 +56,9 @@ _FAST_S = 0.1
 _OSCILLATING_S = 1.0
 """For how long a mean square must be beyond its limit: a step of the estimate is corrected in less [s]."""
 
+_BASE_IMU_S, _FIRST_BASE_IMU_S = 0.01, 1.0
+"""How long there may be no reading of the base's IMU, and how long the first one may take [s]."""
+
 PARAMETERS = record_dtype(
     most_lost_imus=np.int64,
     conditioning=np.float64,
@@ -265,6 +268,14 @@ def check_oscillation(
     w.oscillating_for = w.oscillating_for + elapsed(rig, time) if square > limit and shaking.told != 0 else 0.0
     if w.oscillating_for > _OSCILLATING_S and s.mode == Mode.RUNNING:
         handle_cause(p, s, rig, time, reference, pid, Cause.OSCILLATES, worst, np.sqrt(square), np.sqrt(limit))
+
+
+@kernel
+def check_base_imu(p: Record, s: Record, rig: Record, time: Record, base: Record, reference: Record, pid: Record) -> None:
+    """End a run whose base IMU (dtype `base_imu.STATE`) has had no readings that can be used for too long."""
+    patience = _BASE_IMU_S if base.begun != 0 else _FIRST_BASE_IMU_S
+    if base.lost_for > patience:
+        handle_cause(p, s, rig, time, reference, pid, Cause.BASE_IMU_LOST, -1, base.lost_for, patience)
 
 
 @kernel
