@@ -9,7 +9,7 @@ from controller.calibration.file import Calibration
 from controller.inverse_kinematics import leg_lengths
 from hil.calibration import data as calibration_data
 from hil.calibration.data import CalibrationData, Knowledge, find_rests, is_long
-from hil.calibration.procedure import _every_cycle, _Rig
+from hil.calibration.procedure import SimulatedRig, every_cycle
 from hil.loop.records import RECORD
 from hil.runs.config import SimulationConfig
 from plant.errors import CalibrationError
@@ -20,7 +20,7 @@ def test_the_rest_at_home_is_the_one_on_the_brakes():
     config = SimulationConfig(imu="mpu9150", seed=7, target="hold", duration=0.1, hold=1.0)
     mechanism = load_spatial(config.mechanism)
     data = CalibrationData(mechanism, config.imu, config.rate, Knowledge(home=True), config.seed)
-    data.begin(_Rig().run_open(config, blind=True), 1000)
+    data.begin(SimulatedRig().run_open(config, blind=True), 1000)
     assert data.rests.home and len(data.rests.readings) == 1
     np.testing.assert_allclose(data.truth[0, :3], mechanism.home.position, atol=2e-5)
 
@@ -171,4 +171,4 @@ def test_the_gyroscopes_are_zeroed_while_the_brakes_hold():
 def test_the_record_before_stands_for_a_missed_one():
     records = np.zeros(4, RECORD)
     records["cycle"], records["missed"] = [0, 1, 4, 5], [0, 0, 2, 0]
-    assert _every_cycle(records)["cycle"].tolist() == [0, 1, 1, 1, 4, 5]
+    assert every_cycle(records)["cycle"].tolist() == [0, 1, 1, 1, 4, 5]
