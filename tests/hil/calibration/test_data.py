@@ -58,6 +58,7 @@ def phases(*seconds, turning=0.3):
     """Records at 500 Hz that rest and turn by turns, beginning at rest; the forces tell the number of the sample."""
     counts = [round(each * RATE) for each in seconds]
     records = np.zeros(sum(counts), RECORD)
+    records["length"] = np.nan
     moving = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
     records["cycle"] = np.arange(len(records))
     records["angular_velocity"] = 0.05
@@ -96,6 +97,12 @@ def test_a_rest_is_the_means_of_its_readings_and_what_was_true_then(monkeypatch)
     noise = changes[1] - (1999.5 - 624.5)
     assert (changes[0] == 0.0).all() and 1e-6 < np.abs(noise).max() < 5.0 * np.sqrt(2.0) * 5e-5
     assert new_data().rests.length_changes is None
+    # What encoders read counts as it is.
+    read = records.copy()
+    read["length"] = np.arange(len(records))[:, None]
+    by_encoders = new_data(lengths=True)
+    by_encoders.add_rests(read)
+    np.testing.assert_allclose(by_encoders.rests.length_changes[1], 1999.5 - 624.5)
     records["truth"] = np.nan
     data.add_rests(records)
     with pytest.raises(CalibrationError, match="leave out --lengths"):
