@@ -105,7 +105,7 @@ def test_a_rest_is_the_means_of_its_readings_and_what_was_true_then(monkeypatch)
     np.testing.assert_allclose(by_encoders.rests.length_changes[1], 1999.5 - 624.5)
     records["truth"] = np.nan
     data.add_rests(records)
-    with pytest.raises(CalibrationError, match="leave out --lengths"):
+    with pytest.raises(CalibrationError, match="leave out --length-changes"):
         _ = data.rests
 
 
