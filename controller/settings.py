@@ -134,9 +134,8 @@ class SafetySettings(_Settings):
 
     def for_raw_imus(self) -> "SafetySettings":
         """These settings for raw IMUs, whose errors move the pose by centimetres."""
-        wide = {
-            name: max(getattr(self, name), _RAW_M) for name in ("stroke_margin", "following", "arming_distance", "arming_drift")
-        }
+        distances = "stroke_margin", "following", "arming_distance", "arming_drift", "length_deviation"
+        wide = {name: max(getattr(self, name), _RAW_M) for name in distances}
         return replace(self, watch_imus=0.0, protection_position=inf, protection_rotation=inf, **wide)
 
 

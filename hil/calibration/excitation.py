@@ -8,11 +8,12 @@ from math import inf
 
 import numpy as np
 
-from controller.calibration.at_rest import Prior, Rests, calibrate_at_rest, pose_covariance
+from controller.calibration.at_rest import Rests, calibrate_at_rest, pose_covariance
 from controller.calibration.mounting_checks import LEAST_RATE, LEAST_SPREAD, spreads_of
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.motions import EVERYWHERE, REST_S, Box, Poses, rests, shaking
 from controller.planning.target import Target
+from hil.calibration.data import Knowledge
 from hil.calibration.drives import within_drives
 from hil.rigs.kinematic import ideal_signals
 from plant.errors import InputError
@@ -129,9 +130,11 @@ def _rate(mechanism: Mechanism, target: Target) -> float:
     return float(np.sqrt((rates**2).sum(axis=2).mean(axis=0)).max())
 
 
-def expected_accuracy(mechanism: Mechanism, resting: Target, prior: Prior) -> Accuracy:
+def expected_accuracy(mechanism: Mechanism, resting: Target, knowledge: Knowledge) -> Accuracy:
     """What the poses of `resting` would be worth: the accuracy of poses in the whole workspace after a calibration at them."""
-    found = calibrate_at_rest(mechanism, Rests(_readings(mechanism, resting)), prior)
+    lengths = leg_lengths(mechanism, resting.positions, resting.rotations)
+    changes = lengths - lengths[:1] if knowledge.lengths else None
+    found = calibrate_at_rest(mechanism, Rests(_readings(mechanism, resting), knowledge.home, changes), knowledge.prior)
     _, positions, rotations = rests(mechanism, WIDE_RESTS * REST_S)
     poses = zip(positions, rotations, strict=True)
     covariance = np.mean([pose_covariance(mechanism, found.tilt, pose, found.covariance) for pose in poses], axis=0)

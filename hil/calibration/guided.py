@@ -124,7 +124,7 @@ def plan_calibration(config: SimulationConfig, limits: MotionLimits) -> Plan:
 def lost_accuracy(plan: Plan, knowledge: Knowledge) -> str:
     """What the limits cost, in words: the accuracy at rest, within them and in the whole workspace."""
     whole = calibration_targets(plan.mechanism, MotionLimits().box)["rests"]
-    within, best = (expected_accuracy(plan.mechanism, each, knowledge.prior) for each in (plan.targets["rests"], whole))
+    within, best = (expected_accuracy(plan.mechanism, each, knowledge) for each in (plan.targets["rests"], whole))
     return (
         "calibrated at rest within these limits, poses in the whole workspace are expected to be "
         f"{1e3 * within.position:.2g} mm and {np.degrees(within.rotation):.2g} deg off (RMS), instead of "

@@ -211,7 +211,8 @@ def test_few_imus_have_a_wider_slack_unless_the_file_has_its_own(hexapod, own, a
 def test_for_raw_imus_the_distances_are_5_cm_at_least_and_no_imu_is_watched():
     usual = SafetySettings(following=0.02, velocity_margin=3.0, saturation=0.4)
     raw = usual.for_raw_imus()
-    changed = {"stroke_margin": 0.05, "following": 0.05, "arming_distance": 0.05, "arming_drift": 0.05, "watch_imus": 0.0}
+    distances = "stroke_margin", "following", "arming_distance", "arming_drift", "length_deviation"
+    changed = dict.fromkeys(distances, 0.05) | {"watch_imus": 0.0}
     assert asdict(raw) == asdict(usual) | changed
     wide = SafetySettings(stroke_margin=0.06, following=0.07, arming_distance=0.08).for_raw_imus()
     assert (wide.stroke_margin, wide.following, wide.arming_distance) == (0.06, 0.07, 0.08)

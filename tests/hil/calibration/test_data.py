@@ -9,7 +9,7 @@ from controller.calibration.file import Calibration
 from controller.inverse_kinematics import leg_lengths
 from hil.calibration import data as calibration_data
 from hil.calibration.data import CalibrationData, Knowledge, find_rests, is_long
-from hil.calibration.procedure import _every_cycle, _Rig
+from hil.calibration.procedure import SimulatedRig, every_cycle
 from hil.loop.records import RECORD
 from hil.runs.config import SimulationConfig
 from plant.errors import CalibrationError
@@ -20,7 +20,7 @@ def test_the_rest_at_home_is_the_one_on_the_brakes():
     config = SimulationConfig(imu="mpu9150", seed=7, target="hold", duration=0.1, hold=1.0)
     mechanism = load_spatial(config.mechanism)
     data = CalibrationData(mechanism, config.imu, config.rate, Knowledge(home=True), config.seed)
-    data.begin(_Rig().run_open(config, blind=True), 1000)
+    data.begin(SimulatedRig().run_open(config, blind=True), 1000)
     assert data.rests.home and len(data.rests.readings) == 1
     np.testing.assert_allclose(data.truth[0, :3], mechanism.home.position, atol=2e-5)
 
@@ -58,6 +58,7 @@ def phases(*seconds, turning=0.3):
     """Records at 500 Hz that rest and turn by turns, beginning at rest; the forces tell the number of the sample."""
     counts = [round(each * RATE) for each in seconds]
     records = np.zeros(sum(counts), RECORD)
+    records["length"] = np.nan
     moving = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
     records["cycle"] = np.arange(len(records))
     records["angular_velocity"] = 0.05
@@ -96,9 +97,15 @@ def test_a_rest_is_the_means_of_its_readings_and_what_was_true_then(monkeypatch)
     noise = changes[1] - (1999.5 - 624.5)
     assert (changes[0] == 0.0).all() and 1e-6 < np.abs(noise).max() < 5.0 * np.sqrt(2.0) * 5e-5
     assert new_data().rests.length_changes is None
+    # What encoders read counts as it is.
+    read = records.copy()
+    read["length"] = np.arange(len(records))[:, None]
+    by_encoders = new_data(lengths=True)
+    by_encoders.add_rests(read)
+    np.testing.assert_allclose(by_encoders.rests.length_changes[1], 1999.5 - 624.5)
     records["truth"] = np.nan
     data.add_rests(records)
-    with pytest.raises(CalibrationError, match="leave out --lengths"):
+    with pytest.raises(CalibrationError, match="leave out --length-changes"):
         _ = data.rests
 
 
@@ -171,4 +178,4 @@ def test_the_gyroscopes_are_zeroed_while_the_brakes_hold():
 def test_the_record_before_stands_for_a_missed_one():
     records = np.zeros(4, RECORD)
     records["cycle"], records["missed"] = [0, 1, 4, 5], [0, 0, 2, 0]
-    assert _every_cycle(records)["cycle"].tolist() == [0, 1, 1, 1, 4, 5]
+    assert every_cycle(records)["cycle"].tolist() == [0, 1, 1, 1, 4, 5]

@@ -5,11 +5,11 @@ from math import inf, radians
 import numpy as np
 import pytest
 
-from controller.calibration.at_rest import Prior
 from controller.direct_kinematics import poses_from_lengths
 from controller.planning.motions import EVERYWHERE, Box, rests, shaking
 from controller.planning.offline_planner import plan
 from controller.planning.segments import evaluate_reference
+from hil.calibration.data import Knowledge
 from hil.calibration.drives import within_drives
 from hil.calibration.excitation import (
     MotionLimits,
@@ -63,8 +63,10 @@ def test_without_limits_the_motions_are_the_named_ones(hexapod: Mechanism) -> No
 
 def test_a_box_costs_accuracy_and_one_that_is_too_small_is_refused(hexapod: Mechanism) -> None:
     within, best = (
-        expected_accuracy(hexapod, calibration_targets(hexapod, box)["rests"], Prior()) for box in (BOX, EVERYWHERE)
+        expected_accuracy(hexapod, calibration_targets(hexapod, box)["rests"], Knowledge()) for box in (BOX, EVERYWHERE)
     )
+    measured = expected_accuracy(hexapod, calibration_targets(hexapod, BOX)["rests"], Knowledge(lengths=True))
+    assert measured.position < 0.7 * within.position, "encoders help"
     assert 1.5 * best.position < within.position < 10.0 * best.position and within.rotation > 1.5 * best.rotation
     for limits, message in (
         (MotionLimits(Box(0.005, radians(1.0))), "--box is too small: between any two poses of near-rests, no IMU would turn"),

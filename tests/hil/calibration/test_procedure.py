@@ -111,7 +111,7 @@ def test_recordings_that_do_not_suffice_are_refused(recorded, tmp_path, capsys):
     rests, shaking, blind = (str(recorded / f"{name}.mcap") for name in ("rests", "shaking", "blind"))
     assert "at least 10 s are needed" in refusal(rests)
     assert "0 poses at rest" in refusal(shaking)
-    assert "leave out --lengths" in refusal(blind, shaking, "--lengths")
+    assert "leave out --length-changes" in refusal(blind, shaking, "--lengths")
     assert "no recording" in refusal(str(tmp_path / "none.mcap"))
     record(other := tmp_path / "other.mcap", SimulationConfig(target="hold", duration=0.2, rate=500.0))
     assert "give recordings of one rig" in refusal(rests, str(other))
