@@ -132,11 +132,12 @@ def hear_base_imu(p: Record, s: Record, period: float, reading: Array, age: int)
     turns = reading[GYROSCOPE, 0] != 0.0 or reading[GYROSCOPE, 1] != 0.0 or reading[GYROSCOPE, 2] != 0.0
     s.unchanged_for = s.unchanged_for + period if same and turns and age == 0 else 0.0
     good = good and s.unchanged_for < _FROZEN_S
-    s.lost_for = 0.0 if good else s.lost_for + period
+    since = s.lost_for + period
+    s.lost_for = 0.0 if good else since
     if good:
         calibrate_reading(p.gain[GYROSCOPE], p.offset[GYROSCOPE], s.raw[GYROSCOPE], s.rate)
         calibrate_reading(p.gain[ACCELEROMETER], p.offset[ACCELEROMETER], s.raw[ACCELEROMETER], s.force)
-        _fit_rate(s, period)
+        _fit_rate(s, since)
 
 
 @kernel
