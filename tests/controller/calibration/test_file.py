@@ -35,8 +35,8 @@ def numbers(low, high):
 
 def of_true_errors(imu, random):
     """The calibration that undoes an IMU layer's constant errors, with a covariance."""
-    gain = np.linalg.inv(imu["gain"])
-    offset = -(gain @ imu["offset"][..., None])[..., 0]
+    gain = np.linalg.inv(imu["gain"][:, :7])
+    offset = -(gain @ imu["offset"][:, :7, :, None])[..., 0]
     root = random.normal(size=(7 * ERRORS, 7 * ERRORS)) * 10.0 ** random.uniform(-6.0, 0.0, 7 * ERRORS)[:, None]
     return Calibration(
         gain,
@@ -144,7 +144,8 @@ def test_what_it_leaves_is_what_the_filter_knows_of_the_sensors(hexapod):
     ("text", "complaint"),
     [
         ("imu_0 = [", "is not valid TOML"),
-        ("[imu_7.gyroscope]\nbias = [0, 0, 0]", "no table 'imu_7'"),
+        ("[imu_8.gyroscope]\nbias = [0, 0, 0]", "no table 'imu_8'"),
+        ("[imu_7.magnetometer]\nbias = [0, 0, 0]", "imu_7 has no sensor 'magnetometer'"),
         ("[imu_0.compass]\nbias = [0, 0, 0]", "has no sensor 'compass'; it has gyroscope, accelerometer, magnetometer"),
         ("[imu_0.gyroscope]\noffset = [0, 0, 0]", "imu_0.gyroscope must be a table of bias, scale, axes, mounting"),
         ("[imu_0.gyroscope]\nbias = [0, 0]", r"imu_0.gyroscope.bias must have shape \(3,\)"),

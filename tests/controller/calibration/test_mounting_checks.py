@@ -28,7 +28,7 @@ def read(motion, wiring, seed=2):
     imu, samples = imu_state(load_imu("mpu9150"), seed, 1.0 / RATE, wiring), np.zeros_like(motion.signals)
     for signals, sample in zip(motion.signals, samples, strict=True):
         measure(imu, signals, sample)
-    samples[:, 0] -= imu["offset"][0]
+    samples[:, 0] -= imu["offset"][0, :7]
     return np.concatenate([samples[:, 0], samples[:, 1]], axis=2)
 
 
