@@ -20,7 +20,7 @@ from plant.imu_disturbances import (
     disturbance_of_text,
 )
 
-ALL = (0, 1, 2, 3, 4, 5, 6)
+ALL = (0, 1, 2, 3, 4, 5, 6, 7)
 
 
 @pytest.mark.parametrize(
@@ -101,8 +101,8 @@ def test_times_are_read_by_both_of_their_names(at, lasting):
             "sensor = 'gyroscope'; it must be accelerometer, which has that unit",
         ),
         ("imu-scale:all,size_percent=1,axis=x", "sensor = ''; it must be gyroscope or accelerometer or magnetometer"),
-        ("imu-turn:7,size_deg=1,axis=x", "is for imus = '7'; there are 0 to 6"),
-        ("imu-turn,size_deg=1,axis=x", "is for imus = None; there are 0 to 6"),
+        ("imu-turn:8,size_deg=1,axis=x", "is for imus = '8'; there are 0 to 7"),
+        ("imu-turn,size_deg=1,axis=x", "is for imus = None; there are 0 to 7"),
         ("imu-turn:x,size_deg=1,axis=x", "is for imus = 'x'"),
         ("imu-turn:1,size_deg=nan,axis=x", "has size_deg = 'nan'; it must be a finite number"),
         ("imu-turn:1,size_deg=big,axis=x", "has size_deg = 'big'; it must be a finite number"),

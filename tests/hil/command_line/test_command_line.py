@@ -126,9 +126,11 @@ def test_a_corrupt_fmu_and_one_that_lacks_a_variable_are_one_clear_line(tmp_path
         for name in whole.namelist():
             data = whole.read(name)
             if name == "modelDescription.xml":
-                data = data.replace(b'name="imu_specific_force"', b'name="imu_force"')
+                data = data.replace(b'name="imu_specific_force"', b'name="imu_specific_forces"')
             archive.writestr(name, data)
-    assert "has no variable 'imu_specific_force'; did you mean imu_force?" in refused(gough("simulate", "--plant", poor))
+    assert "has no variable 'imu_specific_force'; did you mean imu_specific_forces?" in refused(
+        gough("simulate", "--plant", poor)
+    )
 
 
 @pytest.mark.slow

@@ -67,7 +67,7 @@ DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "rigs.md"
 COMPILE = (shutil.which("cc") or "gcc", "-std=c11", "-Wall", "-Wextra", "-Werror", "-Wpedantic", f"-I{SOURCES}")
 DATAGRAMS = {
     name: getattr(datagrams, f"{name.upper()}_DATAGRAM")
-    for name in ("hello", "welcome", "command", "measurement", "lengths", "truth")
+    for name in ("hello", "welcome", "command", "measurement", "lengths", "base_imu", "truth")
 }
 HEAD = ("magic", "version", "kind", "session", "sequence", "time_ns")
 PERIOD = 0.01
@@ -87,7 +87,7 @@ def test_the_header_has_the_layout_of_the_datagrams(tmp_path):
     lines = []
     for name, dtype in DATAGRAMS.items():
         for field, _, _ in fields(dtype):
-            member = f"head.{field}" if field in HEAD and name not in ("lengths", "truth") else field
+            member = f"head.{field}" if field in HEAD and name not in ("lengths", "base_imu", "truth") else field
             size = f"sizeof ((struct gough_{name} *)0)->{member}"
             lines.append(f'printf("{name} {field} %zu %zu\\n", offsetof(struct gough_{name}, {member}), {size});')
         lines.append(f'printf("{name} - %zu 0\\n", GOUGH_{name.upper()}_LENGTH);')
@@ -109,8 +109,8 @@ def test_the_header_has_the_constants_of_the_datagrams():
         name: int(value, 0) for name, value in re.findall(r"#define GOUGH_(\w+) (\w+?)u?\b", text) if value[0].isdigit()
     }
     assert constants == {
-        "LEGS": 6, "IMUS": 7, "MAGIC": datagrams.MAGIC, "VERSION": VERSION, "WITH_LENGTHS": WITH_LENGTHS, "PORT": 47100,
-        "WATCHDOG_CODE": WATCHDOG_CODE,
+        "LEGS": 6, "IMUS": 7, "MAGIC": datagrams.MAGIC, "VERSION": VERSION, "WITH_LENGTHS": WITH_LENGTHS,
+        "WITH_BASE_IMU": datagrams.WITH_BASE_IMU, "PORT": 47100, "WATCHDOG_CODE": WATCHDOG_CODE,
     }  # fmt: skip
     enums = {
         name: re.sub(r"GOUGH_| = 1", "", body).split(", ") for name, body in re.findall(r"enum gough_(\w+) \{ (.*) \}", text)
@@ -262,7 +262,7 @@ def test_a_rig_that_knows_no_lengths_is_told(tmp_path):
     port = free_port()
     with process([tmp_path / "old", str(port)]), opened(f"127.0.0.1:{port}") as rig:
         exchange(rig, SPEEDS, BRAKED)
-        with pytest.raises(RigError, match=r"knows version 1 .* has no lengths: give it newer firmware"):
+        with pytest.raises(RigError, match=r"up to version 1 only.* 2 has lengths .*: give it newer firmware"):
             UdpRig(f"127.0.0.1:{port}", PERIOD, lengths=True).open()
 
 

@@ -104,7 +104,7 @@ def test_units_are_defined_by_si_base_units(description: Any) -> None:
 
 def test_outputs_depend_on_the_listed_inputs_and_on_no_others(description: Any, make_plant: MakePlant) -> None:
     """Every input is changed at a lively moment; the outputs that change at once are those the description lists."""
-    plant = make_plant()
+    plant = make_plant({"base_imu_position": np.array([0.3, 0.1, -0.2])})
     plant.set("drive_mode", np.full(6, VELOCITY))
     for cycle in range(50):
         plant.set("velocity_command", 0.1 * np.sin(0.2 * cycle + np.arange(6)))
