@@ -74,6 +74,7 @@ STATE = record_dtype(
     arms=(np.float64, (LEGS, 3)),  # from here on scratch
     directions=(np.float64, (LEGS, 3)),
     lengths=(np.float64, LEGS),
+    wanted=(np.float64, LEGS),
     jacobian=(np.float64, (6, 6)),
     twist=(np.float64, (2, 6)),
     turn=(np.float64, 3),
@@ -193,8 +194,8 @@ def _find_target(s: Record, rig: Record, base: Record, legs: Array) -> bool:
     """
     geometry, b = rig.geometry, s.attitude
     for k in range(LEGS):
-        s.lengths[k] = legs[k, 0]
-    if not find_pose(geometry, s.lengths.copy(), s.position, s.rotation, s.arms, s.directions, s.lengths, s.jacobian) < 1e-9:
+        s.wanted[k] = legs[k, 0]
+    if not find_pose(geometry, s.wanted, s.position, s.rotation, s.arms, s.directions, s.lengths, s.jacobian) < 1e-9:
         return False
     legs_at(geometry.base_joints, geometry.platform_joints, s.position, s.rotation, s.arms, s.directions, s.lengths)
     if not motion_of_legs(s.arms, s.directions, s.lengths, legs, s.jacobian, s.twist):

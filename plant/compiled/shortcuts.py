@@ -12,7 +12,7 @@ from numba.core.ir import Inst, Var
 from numba.core.targetconfig import ConfigStack
 from numba.core.types import Record
 from numba.core.types.functions import BaseFunction
-from numba.extending import overload
+from numba.extending import register_jitable
 from numba.np import arrayobj
 
 _LAZY_COLLECTION = (50_000, 20, 20)
@@ -80,17 +80,10 @@ def _variables(self: Any, value: Any) -> list[Any]:
     return found
 
 
+@register_jitable
 def _refuse_shape(source: Any, target: Any) -> None:
     """In place of what puts two shapes into words: numba compiles its functions of texts into each assignment of an array."""
-    raise NotImplementedError
-
-
-@overload(_refuse_shape)
-def _compiled_refuse_shape(source: Any, target: Any) -> Any:
-    def refuse(source: Any, target: Any) -> None:
-        raise ValueError("the shapes of an array and of what is assigned to it differ")
-
-    return refuse
+    raise ValueError("the shapes of an array and of what is assigned to it differ")
 
 
 _SHORTCUTS: tuple[tuple[Any, str, Any], ...] = (
