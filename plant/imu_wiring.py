@@ -1,6 +1,7 @@
 """How the seven IMUs are mounted and wired."""
 
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from plant.errors import InputError
@@ -17,6 +18,18 @@ BASE_IMU = 7
 SLOTS = BASE_IMU + 1
 
 RIGHT_AXES = "+x+y+z"
+
+
+def require_imus(imus: Collection[int], base_imu: bool, title: str) -> None:
+    """Check that the IMUs which `title` is for are there. What is for all is for those that there are.
+
+    Raises:
+        InputError: it is for the base's, and there is none.
+    """
+    if not base_imu and BASE_IMU in imus and len(imus) < SLOTS:
+        raise InputError(
+            f"{title} is for IMU {BASE_IMU}, on the base, and there is none: name one of 0 to {PLATFORM_IMU}, or add --base-imu"
+        )
 
 
 @dataclass(frozen=True)

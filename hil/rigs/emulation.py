@@ -34,7 +34,7 @@ from plant.fmu.calls import (
 )
 from plant.imu import DISTURBANCE, MOST_DISTURBANCES, disturbance_record, measure
 from plant.imu_disturbances import DisturbanceKind, disturbance, disturbance_of_text
-from plant.imu_wiring import BASE_IMU, SLOTS
+from plant.imu_wiring import BASE_IMU, SLOTS, require_imus
 from plant.mechanism import LEGS, Mechanism
 from plant.truth import TRUTH_SIZE
 
@@ -94,20 +94,25 @@ MOST_FAULTS = 32
 _FOREVER = np.iinfo(np.int64).max
 
 
-def fault(text: str) -> Record:
+def fault(text: str, base_imu: bool = True) -> Record:
     """A fault (dtype `FAULT`) from its text: the kind, then index, `at` and `for` [s] and `size` where they matter, such as
     `imu-biased:3,at=5,for=2,size=2`; or a disturbance of IMUs, as `plant.imu_disturbances` has them; or a motion of the base,
     as `plant.dynamics.base_course` has them. Without `at` the fault is there from the start.
 
+    Args:
+        text: as above.
+        base_imu: whether the rig has an IMU on its base.
+
     Raises:
         UnknownNameError: there is no such kind.
-        InputError: an index or a number is out of range.
+        InputError: an index or a number is out of range, or the fault is of an IMU that is not there.
     """
     head, *options = text.split(",")
     name, _, index = head.partition(":")
     kinds, disturbances = {kind.label: kind for kind in FaultKind}, [kind.label for kind in DisturbanceKind]
     if name in disturbances:
         meant = disturbance_of_text(text)
+        require_imus(meant.imus, base_imu, f"the fault {text!r}")
         return _made(0, meant.begin, meant.duration, disturbance=disturbance_record(replace(meant, begin=0.0, duration=inf)))
     if name.startswith(ENCODER_PREFIX):
         broken = encoder_fault(text)
@@ -128,6 +133,8 @@ def fault(text: str) -> Record:
         raise InputError(f"the fault {text!r} needs the number of an IMU or drive, 0 to {kind.count - 1}: such as {name}:0")
     if not kind.count and index:
         raise InputError(f"the fault {text!r} has a number, but {name} takes none")
+    if kind.count == SLOTS:
+        require_imus([int(index)], base_imu, f"the fault {text!r}")
     values = {"at": -1.0, "for": inf, "size": kind.default}
     for option in options:
         key, _, value = option.partition("=")

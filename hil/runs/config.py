@@ -13,7 +13,7 @@ from plant.encoders import PREFIX as ENCODER_PREFIX
 from plant.errors import InputError, UnknownNameError
 from plant.fmu.settings import Setting
 from plant.imu_disturbances import BASE_PREFIX, Disturbance, disturbance_of_text
-from plant.imu_wiring import ALL_IMUS, RIGHT_WIRING, Wiring
+from plant.imu_wiring import ALL_IMUS, RIGHT_WIRING, Wiring, require_imus
 
 if TYPE_CHECKING:
     from plant.compiled import Record
@@ -178,7 +178,9 @@ class SimulationConfig:
                 f"--fault is for a simulated plant, not for the rig {self.rig}: tell it to 'gough emulate' or 'inject'"
             )
         # Refuses words that none understands.
-        self.base_motions, self.disturbances  # noqa: B018
+        self.base_motions  # noqa: B018
+        for each in self.disturbances:
+            require_imus(each.imus, self.base_imu, f"--fault {each.kind.label}")
         if self.encoder_faults and self.lengths == NO_LENGTHS:
             raise InputError("--fault breaks an encoder, and there is none: add --lengths incremental, or leave the fault out")
         if self.base_imu and self.fusion not in FUSIONS_ON_A_MOVING_BASE:

@@ -67,9 +67,10 @@ def emulate(config: EmulatorConfig, settings: RealTimeSettings, say: Callable[[s
     Raises:
         GoughError: something in the configuration cannot be used, or an address is taken.
     """
-    faults = [fault(text) for text in config.faults]
+    base_imu = config.simulated.base_imu
+    faults = [fault(text, base_imu) for text in config.faults]
     with ExitStack() as stack:
-        control = _Control(stack.enter_context(_listen(config.control)), _name_of(config))
+        control = _Control(stack.enter_context(_listen(config.control)), _name_of(config), base_imu)
         stack.enter_context(_findable(config.control))
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, control.stop)
@@ -154,10 +155,10 @@ def _listen(address: str) -> socket.socket:
 
 
 class _Control:
-    """The control channel; each answer says whose it is by the emulator's `name`."""
+    """The control channel of a rig with or without an IMU on its base; each answer says whose it is by the emulator's `name`."""
 
-    def __init__(self, opened: socket.socket, name: str) -> None:
-        self.socket, self.stopped, self._name = opened, False, name
+    def __init__(self, opened: socket.socket, name: str, base_imu: bool) -> None:
+        self.socket, self.stopped, self._name, self._base_imu = opened, False, name, base_imu
         opened.setblocking(False)
 
     def stop(self, *signalled: object) -> None:
@@ -189,7 +190,7 @@ class _Control:
         if rig is None:
             raise InputError("no controller has begun a session: the rig has no state and cannot be disturbed")
         if command == "fault":
-            made = fault(argument)
+            made = fault(argument, self._base_imu)
             if made["begin_ns"] < 0 and rig["enabled_ns"] >= 0:
                 passed = int(rig["time_ns"] - rig["enabled_ns"])
                 made["begin_ns"], made["end_ns"] = passed, min(int(made["end_ns"]), 2**62) + passed

@@ -47,6 +47,10 @@ def test_faults_of_imus_are_checked_and_are_for_simulated_ones():
     assert [len(moved.disturbances), len(moved.base_motions)] == [1, 1]
     with pytest.raises(InputError, match="the base's tilt needs one of size_deg"):
         SimulationConfig(faults=("base-tilt,axis=z",))
+    of_the_base = ("imu-offset:7,axis=y,size_m_per_s2=0.5",)
+    with pytest.raises(InputError, match="--fault imu-offset is for IMU 7, on the base, and there is none"):
+        SimulationConfig(faults=of_the_base)
+    assert SimulationConfig(faults=of_the_base, base_imu=True).disturbances[0].imus == (7,)
     with pytest.raises(InputError, match="--fault is for a simulated plant, not for the rig udp: tell it to 'gough emulate'"):
         SimulationConfig(rig="udp", faults=texts)
 

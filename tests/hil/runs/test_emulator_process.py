@@ -16,7 +16,7 @@ from plant.errors import GoughError, InputError
 @pytest.fixture
 def control():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
-        yield _Control(opened, "of mine")
+        yield _Control(opened, "of mine", base_imu=False)
 
 
 @pytest.fixture
@@ -48,6 +48,15 @@ def test_a_fault_before_the_drives_are_enabled_is_there_from_the_start(control, 
     assert injected(control, rig, "imu-dead:3")[0] == -1
     rig["enabled_ns"] = 7_500_000_000
     assert injected(control, rig, "imu-dead:4")[0] == 0
+
+
+@pytest.mark.parametrize("text", ["imu-dead:7", "imu-offset:2+7,axis=y,size_m_per_s2=0.5"])
+def test_a_fault_of_the_bases_imu_is_refused_where_there_is_none(control, rig, text):
+    with pytest.raises(InputError, match="on the base, and there is none: name one of 0 to 6, or add --base-imu"):
+        control._do("fault", text, rig, {})
+    assert rig["faults"] == 0
+    control._base_imu = True
+    assert control._do("fault", text, rig, {}) == {"fault": text}
 
 
 def test_the_course_of_a_disturbance_begins_when_it_is_injected(control, rig):
