@@ -59,13 +59,17 @@ class Prior:
     reading_rate: float = radians(0.02)  # of a mean over a rest, beyond the sensors' noise [rad/s]
     reading_force: float = 2e-4 * STANDARD_GRAVITY  # likewise [m/s^2]
 
-    def error_sigmas(self) -> Array:
-        """(147,), in the order of the errors."""
+    def of_an_imu(self) -> Array:
+        """(21,), in the order of the errors."""
         each = (
             self.gyroscope_bias, self.accelerometer_bias, self.accelerometer_scale, self.gyroscope_scale, self.alignment,
             self.axes, self.axes,
         )  # fmt: skip
-        return np.tile(np.repeat(each, 3), IMU_COUNT)
+        return np.repeat(each, 3)
+
+    def error_sigmas(self) -> Array:
+        """(147,), of the seven IMUs."""
+        return np.tile(self.of_an_imu(), IMU_COUNT)
 
     def sigmas(self) -> Array:
         """(185,), of the errors, the joints and the tilt."""
@@ -103,11 +107,35 @@ def undo(errors: Array) -> tuple[Array, Array]:
     """Gain (3, 7, 3, 3) and offset (3, 7, 3) that undo errors (7, 21), the mounting of the magnetometers too."""
     gain, offset = np.empty((3, IMU_COUNT, 3, 3)), np.zeros((3, IMU_COUNT, 3))
     for k in range(IMU_COUNT):
-        for sensor in range(2):
-            gain[sensor, k] = np.linalg.inv(error_matrix(errors[k], sensor))
-            offset[sensor, k] = -gain[sensor, k] @ errors[k, 3 * sensor : 3 * sensor + 3]
+        gain[:2, k], offset[:2, k] = undo_one(errors[k])
         gain[2, k] = rotation_from_vector(errors[k, ALIGNMENT : ALIGNMENT + 3])
     return gain, offset
+
+
+def undo_one(errors: Array) -> tuple[Array, Array]:
+    """Gain (2, 3, 3) and offset (2, 3) that undo the errors (21,) of the gyroscope and the accelerometer of an IMU."""
+    gain = np.stack([np.linalg.inv(error_matrix(errors, sensor)) for sensor in range(2)])
+    return gain, -(gain @ errors[:6].reshape(2, 3, 1))[..., 0]
+
+
+def errors_of_base_imu(mechanism: Mechanism, tilt: Array, reading: Array, prior: Prior = Prior()) -> Array:
+    """The errors (21,) of an IMU on the base that explain its mean reading (6,) at rest best, given the base's tilt (2,).
+
+    One orientation does not tell bias, scale and mounting of the accelerometer apart: each takes the share that the prior
+    expects. The heading of the mounting does not show at all.
+    """
+    geometry = sensor_geometry(mechanism, tilt)
+    ideal = np.concatenate([np.zeros(3), float(geometry["gravity"]) * geometry["up_in_base"]])
+    sigmas = prior.of_an_imu()
+
+    def residuals(x: Array) -> Array:
+        """The weighted residuals (27,) at errors in standard deviations."""
+        errors = sigmas * x
+        expected = [error_matrix(errors, sensor) @ ideal[3 * sensor : 3 * sensor + 3] for sensor in range(2)]
+        off = (np.concatenate(expected) + errors[:6] - reading) / np.repeat([prior.reading_rate, prior.reading_force], 3)
+        return np.concatenate([off, x])
+
+    return sigmas * np.asarray(least_squares(residuals, np.zeros(ERRORS)).x)
 
 
 def _ideal_readings(geometry: Record, position: Array, rotation: Array) -> tuple[Array, Array]:

@@ -67,6 +67,11 @@ class Calibration:
     about: dict[str, Any] = field(default_factory=dict)
     remark: str = ""
 
+    def put(self, imu: int, sensor: int, gain: Array, offset: Array) -> None:
+        """Take the gain (3, 3) and the offset (3,) of a sensor of an IMU, 0 to 7, in place."""
+        gains, offsets = (self.base_gain, self.base_offset) if imu == BASE_IMU else (self.gain[:, imu], self.offset[:, imu])
+        gains[sensor], offsets[sensor] = gain, offset
+
     def apply(self, measurements: Array) -> Array:
         """Calibrated measurements (..., 3, 7, 3) of raw ones."""
         calibrated: Array = (self.gain @ measurements[..., None])[..., 0] + self.offset
@@ -157,11 +162,7 @@ def load_calibration(path: Path | str) -> Calibration:
             if sensor not in known:
                 raise InputError(f"{path}: {name} has no sensor {sensor!r}; it has {', '.join(known)}")
             gain, offset = _read_sensor(entries, f"{path}: {name}.{sensor}")
-            at = SENSORS.index(sensor)
-            if int(imu) == BASE_IMU:
-                calibration.base_gain[at], calibration.base_offset[at] = gain, offset
-            else:
-                calibration.gain[at, int(imu)], calibration.offset[at, int(imu)] = gain, offset
+            calibration.put(int(imu), SENSORS.index(sensor), gain, offset)
     check_entries(base, ("tilt", "floor"), f"{path}: base")
     check_entries(joints, _SIDES, f"{path}: joints")
     tilt, floor = (checked_array(base.get(name, (0.0, 0.0)), (2,), f"{path}: base.{name}") for name in ("tilt", "floor"))

@@ -1,13 +1,22 @@
 """Data for a calibration on the rig: the rests and the motion in the records of its runs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.calibration.at_rest import LEAST_POSES, Prior, RestCalibration, Rests, calibrate_at_rest, fit_pose
+from controller.calibration.at_rest import (
+    LEAST_POSES,
+    Prior,
+    RestCalibration,
+    Rests,
+    calibrate_at_rest,
+    errors_of_base_imu,
+    fit_pose,
+    undo_one,
+)
 from controller.calibration.file import Calibration
 from controller.calibration.mounting_checks import check_alive, check_all_along, check_motion, check_places, check_spread
 from controller.direct_kinematics import poses_from_lengths
@@ -17,7 +26,7 @@ from controller.settings import sensor_settings
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import CalibrationError
-from plant.imu import ACCELEROMETER, GYROSCOPE, load_imu
+from plant.imu import ACCELEROMETER, GYROSCOPE, STANDARD_GRAVITY, load_imu
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, Pose
 from plant.truth import TRUTH_LENGTHS
@@ -28,6 +37,8 @@ _SHORTEST_REST_S, _SHORTEST_MOTION_S = 0.4, 10.0
 _MEAN_S, _CHECKED_S = 0.1, 0.04
 _MOST_RATE = np.radians(0.5)
 """Greatest rate of a rest, in means over `_MEAN_S` [rad/s]."""
+_BASE_TURNS, _BASE_TILTS = np.radians(0.2), np.radians(0.2)
+"""Greatest rate [rad/s] and tilt [rad] from rest to rest of a base that stands, by its IMU."""
 _LENGTH_NOISE = 5e-5
 """Standard deviation of the lengths that a simulated rig measures [m]."""
 
@@ -81,6 +92,7 @@ class CalibrationData:
         fusion: settings of the sensors.
         zero: (7, 3) [rad/s], the gyroscopes' offsets.
         readings: (R, 7, 6), mean rates and forces of each rest.
+        base_readings: (R, 6), the same of an IMU on the base; NaN without one.
         truth: (R, 7), true position and quaternion of each rest; NaN where they are not known.
     """
 
@@ -89,7 +101,7 @@ class CalibrationData:
         self.mechanism, self.imu, self.rate, self.knowledge = mechanism, imu, rate, knowledge
         self.fusion = sensor_settings(mechanism, load_imu(imu))
         self.zero = np.zeros((IMU_COUNT, 3))
-        self.readings = np.zeros((0, IMU_COUNT, 6))
+        self.readings, self.base_readings = np.zeros((0, IMU_COUNT, 6)), np.zeros((0, 6))
         self.truth, self._lengths = np.zeros((0, 7)), np.zeros((0, LEGS))
         self._random = np.random.default_rng([seed, LEGS])
 
@@ -98,6 +110,7 @@ class CalibrationData:
 
         At home the rig rests only now: a loop that closes over raw IMUs leaves it.
         """
+        self._hear_base(records[:hold])
         samples = raw_samples(records[:hold])
         check_alive(samples)
         self.zero = samples[:, GYROSCOPE].mean(axis=0)
@@ -129,6 +142,7 @@ class CalibrationData:
             self._add_rest(records[rest])
 
     def _add_rest(self, records: Record) -> None:
+        self._hear_base(records)
         readings = np.concatenate([records["angular_velocity"], records["specific_force"]], axis=2).mean(axis=0)
         truth = records["truth"].mean(axis=0)
         self.readings = np.append(self.readings, readings[None], axis=0)
@@ -137,6 +151,40 @@ class CalibrationData:
         if not np.isfinite(measured).any():
             measured = truth[TRUTH_LENGTHS] + self._random.normal(0.0, _LENGTH_NOISE, LEGS)
         self._lengths = np.append(self._lengths, measured[None], axis=0)
+
+    def _hear_base(self, records: Record) -> None:
+        """Take what an IMU on the base reads while the platform rests.
+
+        Raises:
+            CalibrationError: the base moves.
+        """
+        if not np.isfinite(records["base_imu"]).any():
+            return
+        reading = np.nanmean(records["base_imu"], axis=0).reshape(1, 6)
+        self.base_readings = np.append(self.base_readings, reading, axis=0)
+        off = self.base_readings - self.base_readings[0]
+        turns, tilts = np.linalg.norm(off[:, :3], axis=1).max(), np.linalg.norm(off[:, 3:], axis=1).max() / STANDARD_GRAVITY
+        if turns > _BASE_TURNS or tilts > _BASE_TILTS:
+            raise CalibrationError(
+                f"the base moves: from one rest to another its IMU differs by {np.degrees(turns):.2g} deg/s and "
+                f"{np.degrees(tilts):.2g} deg of tilt; at most {np.degrees(_BASE_TURNS):g} deg/s and "
+                f"{np.degrees(_BASE_TILTS):g} deg are allowed: calibrate while it stands"
+            )
+
+    def with_base(self, calibration: Calibration) -> Calibration:
+        """A calibration with the constants of the base's IMU, if there is one."""
+        if not len(self.base_readings):
+            return calibration
+        prior = self.knowledge.prior
+        errors = errors_of_base_imu(self.mechanism, calibration.tilt, self.base_readings.mean(axis=0), prior)
+        gain, offset = undo_one(errors)
+        return replace(calibration, base_gain=gain, base_offset=offset)
+
+    def zeroed(self) -> Calibration:
+        """What is known after `begin`: the zeros of the gyroscopes, and the base's IMU."""
+        calibration = Calibration()
+        calibration.offset[GYROSCOPE] = -self.zero
+        return self.with_base(calibration)
 
     @property
     def rests(self) -> Rests:

@@ -34,7 +34,7 @@ from hil.runs.names import name_of
 from plant.compiled import Record
 from plant.errors import CalibrationError, GoughError, InputError
 from plant.files import write_whole
-from plant.imu import ACCELEROMETER, GYROSCOPE, STANDARD_GRAVITY
+from plant.imu import ACCELEROMETER, STANDARD_GRAVITY
 from plant.mechanism import Mechanism, load_spatial
 
 ZEROING_S = 1.0
@@ -161,9 +161,7 @@ def calibrate_guided(
             again = Path(folder) / "again.mcap"
             machine.run(replace(steps.config, duration=ZEROING_S, hold=ZEROING_S, open_loop=True, **_ON_THE_BRAKES), again)
             _check_same_place(reading, read(again).records)
-        calibration = Calibration()
-        calibration.offset[GYROSCOPE] = -data.zero
-        save_calibration(file, calibration)
+        save_calibration(file, data.zeroed())
         with steps.next() as (step, due):
             steps.try_legs(step, due)
             guide.tell("commands, gyroscopes and accelerometers agree with the mechanism")
@@ -174,7 +172,7 @@ def calibrate_guided(
             with steps.next() as (step, due):
                 data.add_rests(steps.records(step, due, open_loop=open_loop))
                 at_rest = data.at_rest()
-                save_calibration(file, at_rest.calibration())
+                save_calibration(file, data.with_base(at_rest.calibration()))
                 guide.tell(f"{len(data.readings)} poses at rest: {_expected(plan.mechanism, at_rest)}")
         with steps.next() as (step, due):
             return finish(data, at_rest, [steps.records(step, due, open_loop=False)], None, validate)

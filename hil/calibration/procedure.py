@@ -40,7 +40,6 @@ from hil.runs.prepare import prepared_loop
 from hil.runs.simulation import SimulationResult, SimulationStoppedError, simulate
 from plant.compiled import Record
 from plant.errors import CalibrationError
-from plant.imu import GYROSCOPE
 from plant.mechanism import Mechanism, load_spatial
 
 _NOTHING = Knowledge()
@@ -155,22 +154,21 @@ def _calibrate(
     probing = rig.run_open(replace(config, target="probing", duration=_PROBING_S, hold=_ZEROING_S), blind=True)
     data.begin(probing, round(_ZEROING_S * config.rate))
     data.check_places(probing)
-    calibration, known = Calibration(), None
-    calibration.offset[GYROSCOPE] = -data.zero
+    known = None
     with TemporaryDirectory(prefix="gough-calibration-") as folder:
         file = Path(folder) / "calibration.toml"
         config = replace(config, calibration=str(file))
         near = replace(config, target="near-rests", duration=_NEAR_S)
         wide = replace(config, target="rests", duration=_WIDE_S)
         shaking = replace(config, target="shaking", duration=_SHAKING_S)
-        save_calibration(file, calibration)
+        save_calibration(file, data.zeroed())
         if knowledge.known_poses:
             known = calibrate_by_known_poses(data, [rig.run_open(wide)])
         data.add_rests(rig.run_open(near))
-        save_calibration(file, data.at_rest().calibration())
+        save_calibration(file, data.with_base(data.at_rest().calibration()))
         data.add_rests(rig.run_closed(wide, part_of(progress, _NEAR_S / _WHOLE_S, _WIDE_S / _WHOLE_S)))
         at_rest = data.at_rest()
-        save_calibration(file, at_rest.calibration())
+        save_calibration(file, data.with_base(at_rest.calibration()))
         motion = rig.run_closed(shaking, part_of(progress, 1.0 - _SHAKING_S / _WHOLE_S, _SHAKING_S / _WHOLE_S))
     return finish(data, at_rest, [motion], known, validate)
 
@@ -241,5 +239,5 @@ def finish(
         **calibrated_rig(data.mechanism, data.imu),
         **{f"residual_{name}_mg": round(value, 4) for name, value in summary["residual_mg"].items()},
     }
-    result = calibration if known is None else known
+    result = data.with_base(calibration if known is None else known)
     return RigCalibration(data.mechanism, replace(result, about=about), summary)

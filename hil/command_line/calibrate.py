@@ -2,6 +2,7 @@
 
 import sys
 from argparse import Namespace
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from functools import partial
@@ -17,7 +18,7 @@ from hil.runs.config import SimulationConfig
 from hil.table import Table
 from plant.encoders import NO_LENGTHS
 from plant.errors import InputError
-from plant.imu_wiring import ALL_IMUS, PLATFORM_IMU
+from plant.imu_wiring import ALL_IMUS, BASE_IMU, PLATFORM_IMU
 
 if TYPE_CHECKING:
     from controller.calibration.file import Calibration
@@ -32,7 +33,7 @@ _DEFAULT_RIG = SimulationConfig(imu="mpu9150")
 @cli.command(
     cli.output("output", "FILE.toml", "the calibration to write"),
     cli.options_of(
-        SimulationConfig, "mechanism", "rate", "seed", "joint_error", "plant", "binding", "rig", "rig_at",
+        SimulationConfig, "mechanism", "rate", "seed", "joint_error", "plant", "binding", "rig", "rig_at", "base_imu",
         imu={"default": _DEFAULT_RIG.imu},
         lengths={"flag": "--encoders", "text": "encoders that the rig has: none, incremental, absolute, or a TOML file"},
     ),
@@ -201,11 +202,11 @@ def _print_rig_calibration(summary: dict[str, Any]) -> None:
         print(line)
 
 
-def _single(number: int, text: str) -> list[cli.Argument]:
+def _single(number: int, text: str, imus: Sequence[int]) -> list[cli.Argument]:
     """The arguments that single IMUs and magnetometers have in common."""
     return [
         cli.output("output", "FILE.toml", "the calibration to write, or to add this sensor to"),
-        cli.setting("--number", number, text, choices=ALL_IMUS),
+        cli.setting("--number", number, text, choices=imus),
         cli.setting("--gravity", 9.80665, "gravity at the place [m/s2]"),
         cli.JSON,
     ]
@@ -213,7 +214,7 @@ def _single(number: int, text: str) -> list[cli.Argument]:
 
 @cli.command(
     cli.source("data", "FILE", "CSV with time_s,wx,wy,wz,ax,ay,az (rad/s, m/s2), or an MCAP recording"),
-    *_single(0, "which IMU of the mechanism it is"),
+    *_single(0, "which IMU of the mechanism it is: 0-5 on the legs, 6 on the platform, 7 on the base", (*ALL_IMUS, BASE_IMU)),
 )
 def gough_calibrate_imu(options: Namespace) -> None:
     """A single IMU, turned by hand.
@@ -225,13 +226,14 @@ def gough_calibrate_imu(options: Namespace) -> None:
     from controller.calibration.file import save_calibration
     from controller.calibration.single_imu import calibrate_imu
     from hil.recording.imu_data import read_imu
-    from plant.imu import STANDARD_GRAVITY
+    from plant.imu import ACCELEROMETER, GYROSCOPE, STANDARD_GRAVITY
 
-    calibration, sensors = _checked(options), (slice(2), options.number)
+    calibration = _checked(options)
     found = calibrate_imu(*read_imu(options.data, options.number), options.gravity)
-    calibration.gain[sensors], calibration.offset[sensors] = found.gain, found.offset
+    for sensor in (GYROSCOPE, ACCELEROMETER):
+        calibration.put(options.number, sensor, found.gain[sensor], found.offset[sensor])
     # The covariance of the remaining errors belongs to the constants that are replaced.
-    save_calibration(options.output, replace(calibration, covariance=None))
+    save_calibration(options.output, calibration if options.number == BASE_IMU else replace(calibration, covariance=None))
     cli.write_json(options.json, vars(found))
     table = Table(f"IMU {options.number}", "x", "y", "z")
     rows = (("gyroscope: ", "deg/s", degrees(1.0)), ("accelerometer: ", "mg", 1e3 / STANDARD_GRAVITY))
@@ -267,7 +269,7 @@ def _add_constants(table: Table, name: str, unit: tuple[str, float], gain: Any, 
     cli.source(
         "data", "FILE", "CSV with time_s,wx,wy,wz,ax,ay,az,mx,my,mz or time_s,mx,my,mz (rad/s, m/s2, uT), or an MCAP recording"
     ),
-    *_single(PLATFORM_IMU, "which IMU of the mechanism it is in"),
+    *_single(PLATFORM_IMU, "which IMU of the mechanism it is in", ALL_IMUS),
     cli.setting("--field", 49.4, "strength of the magnetic field at the place [uT]"),
 )
 def gough_calibrate_magnetometer(options: Namespace) -> None:

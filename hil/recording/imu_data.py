@@ -11,6 +11,7 @@ import numpy as np
 from hil.recording.mcap import read
 from plant.csv import read_csv
 from plant.errors import InputError
+from plant.imu_wiring import BASE_IMU
 from plant.pose import Array
 
 COLUMNS = ("time_s", "wx", "wy", "wz", "ax", "ay", "az")
@@ -27,7 +28,9 @@ def read_imu(path: Path, number: int) -> tuple[Array, Array, Array]:
     """
     if path.suffix == ".mcap":
         records = read(path).records
-        return records["time_ns"] / 1e9, records["angular_velocity"][:, number], records["specific_force"][:, number]
+        pair = records["angular_velocity"], records["specific_force"]
+        rates, forces = np.moveaxis(records["base_imu"], 1, 0) if number == BASE_IMU else (each[:, number] for each in pair)
+        return records["time_ns"] / 1e9, rates, forces
     table = _read_table(path, COLUMNS, (*COLUMNS, *FIELD_COLUMNS))
     return table[:, 0], table[:, 1:4], table[:, 4:7]
 

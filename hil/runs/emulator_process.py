@@ -155,7 +155,7 @@ def _listen(address: str) -> socket.socket:
 
 
 class _Control:
-    """The control channel of a rig with or without an IMU on its base; each answer says whose it is by the emulator's `name`."""
+    """The control channel of a rig with or without an IMU on its base; each answer has the emulator's `name`."""
 
     def __init__(self, opened: socket.socket, name: str, base_imu: bool) -> None:
         self.socket, self.stopped, self._name, self._base_imu = opened, False, name, base_imu

@@ -9,10 +9,12 @@ from controller.calibration.at_rest import (
     Prior,
     Rests,
     calibrate_at_rest,
+    errors_of_base_imu,
     expected_forces,
     fit_pose,
     pose_covariance,
     undo,
+    undo_one,
 )
 from controller.calibration.file import Calibration
 from controller.estimation.whole_mechanism.imu_errors import ALIGNMENT, ERROR_NAMES, ERRORS, error_matrix
@@ -113,6 +115,26 @@ def test_the_mounting_of_the_magnetometers_is_undone_as_that_of_the_acceleromete
         np.testing.assert_allclose(gain[2, k], rotation_of(errors[k, ALIGNMENT : ALIGNMENT + 3]), rtol=0.0, atol=1e-15)
         np.testing.assert_allclose(gain[2, k], gain[1, k], rtol=0.0, atol=1e-5)
     assert not offset[2].any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_imu_on_the_base_errs_less_on_a_tilted_base_once_its_share_of_each_error_is_known(hexapod, seed):
+    random, prior = np.random.default_rng(seed), Prior(accelerometer_bias=0.1, alignment=np.radians(1.0))
+    level = hexapod.up_in_base * 9.80665
+    # The base leans by 20 deg in a direction that no rest has shown.
+    leaning = rotation_of(np.radians([14.0, -14.0, 0.0])) @ level
+    left = {"shares": [], "bias alone": []}
+    for _ in range(200):
+        errors = prior.of_an_imu() * random.normal(size=ERRORS)
+        raw = [error_matrix(errors, 1) @ force + errors[3:6] for force in (level, leaning)]
+        reading = np.concatenate([errors[:3], raw[0]])
+        gain, offset = undo_one(errors_of_base_imu(hexapod, np.zeros(2), reading, prior))
+        np.testing.assert_allclose(gain[0] @ reading[:3] + offset[0], 0.0, atol=1e-3)
+        np.testing.assert_allclose(gain[1] @ raw[0] + offset[1], level, atol=1e-3)
+        left["shares"].append(gain[1] @ raw[1] + offset[1] - leaning)
+        left["bias alone"].append(raw[1] - raw[0] + level - leaning)
+    shares, bias_alone = (np.sqrt(np.mean(np.square(each))) for each in left.values())
+    assert shares < 0.9 * bias_alone
 
 
 def test_the_prior_is_in_the_order_of_the_errors():

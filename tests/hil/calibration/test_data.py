@@ -58,7 +58,7 @@ def phases(*seconds, turning=0.3):
     """Records at 500 Hz that rest and turn by turns, beginning at rest; the forces tell the number of the sample."""
     counts = [round(each * RATE) for each in seconds]
     records = np.zeros(sum(counts), RECORD)
-    records["length"] = np.nan
+    records["length"], records["base_imu"] = np.nan, np.nan
     moving = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
     records["cycle"] = np.arange(len(records))
     records["angular_velocity"] = 0.05
@@ -107,6 +107,39 @@ def test_a_rest_is_the_means_of_its_readings_and_what_was_true_then(monkeypatch)
     data.add_rests(records)
     with pytest.raises(CalibrationError, match="leave out --length-changes"):
         _ = data.rests
+
+
+def on_a_base(records, degrees=0.0, rate=0.0):
+    """The records with an IMU on the base, whose biases are 0.1 rad/s and 0.3 m/s^2; it tilts in the end, or turns."""
+    records["base_imu"] = [[0.1, 0.0, 0.0], [0.0, 0.3, 9.80665]]
+    last = records["base_imu"][-500:]
+    last[:, 1, 0], last[:, 0, 2] = 9.80665 * np.radians(degrees), np.radians(rate)
+    return records
+
+
+def test_an_imu_on_the_base_is_calibrated_beside_the_others(monkeypatch):
+    monkeypatch.setattr(calibration_data, "check_all_along", lambda samples, rate: None)
+    data = new_data()
+    data.add_rests(on_a_base(phases(2.0, 1.0, 1.5)))
+    calibration = data.with_base(Calibration(tilt=np.array([0.002, 0.0])))
+    rate, force = (calibration.base_gain @ data.base_readings[0].reshape(2, 3, 1))[..., 0] + calibration.base_offset
+    np.testing.assert_allclose(rate, 0.0, atol=1e-4)
+    # A turn by 0.002 rad about x takes the vertical towards -y.
+    np.testing.assert_allclose(force, [0.0, -0.002 * 9.80665, 9.80665], atol=1e-4)
+    without = new_data()
+    without.add_rests(phases(2.0, 1.0, 1.5))
+    untouched = Calibration()
+    assert without.with_base(untouched) is untouched
+
+
+@pytest.mark.parametrize(
+    ("moved", "said"), [({"degrees": 0.3}, "0 deg/s and 0.3 deg of tilt"), ({"rate": 0.3}, "0.3 deg/s and 0 deg")]
+)
+def test_a_base_that_moves_is_told_while_its_imu_is_calibrated(monkeypatch, moved, said):
+    monkeypatch.setattr(calibration_data, "check_all_along", lambda samples, rate: None)
+    new_data().add_rests(on_a_base(phases(2.0, 1.0, 1.5), **{name: 0.5 * value for name, value in moved.items()}))
+    with pytest.raises(CalibrationError, match=f"the base moves: .*{said}.*calibrate while it stands"):
+        new_data().add_rests(on_a_base(phases(2.0, 1.0, 1.5), **moved))
 
 
 @pytest.mark.parametrize(("kept", "home"), [([0, 2, 3], True), ([1, 3], False), (None, True)])

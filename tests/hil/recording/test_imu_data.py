@@ -52,6 +52,7 @@ def test_a_recording_gives_the_imu_of_the_number_in_seconds(tmp_path):
     records["cycle"], records["time_ns"] = np.arange(3), [7, 2_000_000_007, 4_000_000_007]
     for name in ("angular_velocity", "specific_force", "magnetic_field"):
         records[name] = np.random.default_rng(len(name)).normal(size=(3, 7, 3))
+    records["base_imu"] = np.random.default_rng(0).normal(size=(3, 2, 3))
     recorder = Recorder(path, {"config": {"version": "0"}}, 10**18)
     recorder.write(records)
     recorder.close()
@@ -59,6 +60,8 @@ def test_a_recording_gives_the_imu_of_the_number_in_seconds(tmp_path):
     assert times == pytest.approx([7e-9, 2.0 + 7e-9, 4.0 + 7e-9], rel=1e-15)
     np.testing.assert_array_equal(rates, records["angular_velocity"][:, 5])
     np.testing.assert_array_equal(forces, records["specific_force"][:, 5])
+    _, rates, forces = read_imu(path, 7)
+    np.testing.assert_array_equal(np.stack([rates, forces], axis=1), records["base_imu"])
     fields, forces = read_field(path, 2)
     np.testing.assert_array_equal(fields, records["magnetic_field"][:, 2])
     np.testing.assert_array_equal(forces, records["specific_force"][:, 2])

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from controller.calibration.file import load_calibration
 from controller.safety.causes import Cause, DriveState, Mode
 from hil.recording.mcap import read
 from hil.recording.replay import replay
@@ -341,12 +342,12 @@ def moving(path):
 
 @pytest.mark.slow(seconds=240)
 def test_a_machine_that_has_never_moved_is_led_through_its_calibration_and_goes_on_after_a_fault(tmp_path):
-    with emulated("--imu", "mpu9150", "--seed", 1) as (_, at, control):
+    with emulated("--imu", "mpu9150", "--seed", 1, "--base-imu") as (_, at, control):
 
         def calibrating(*options):
             return gough(
                 "calibrate", "rig", tmp_path / "rig.toml", "--rig", "udp", "--rig-at", at, "--rate", 500, *PATIENT,
-                "--box", 40, 8, "--speed", 100, "--yes", *options, stdin=subprocess.DEVNULL,
+                "--box", 40, 8, "--speed", 100, "--base-imu", "--yes", *options, stdin=subprocess.DEVNULL,
             )  # fmt: skip
 
         first = calibrating()
@@ -366,3 +367,9 @@ def test_a_machine_that_has_never_moved_is_led_through_its_calibration_and_goes_
     figures = json.loads((tmp_path / "rig.json").read_text())
     true, predicted = (figures[kind]["motion"]["position_rms"] for kind in ("true", "predicted"))
     assert true < 2.5 * predicted < 2e-3
+    calibration = load_calibration(tmp_path / "rig.toml")
+    raw = np.nanmean(read(tmp_path / "rig.reading.mcap").records["base_imu"], axis=0)
+    rate, force = (calibration.base_gain @ raw[..., None])[..., 0] + calibration.base_offset
+    up = [calibration.tilt[1], -calibration.tilt[0], 1.0]
+    assert np.abs(raw[0]).max() > 0.01 > 10 * np.abs(rate).max()
+    np.testing.assert_allclose(force / 9.80665, up, atol=5e-4)
