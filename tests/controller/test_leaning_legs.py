@@ -18,7 +18,11 @@ from tests.controller.leaning_legs import AXES, leaning, with_axis
 from tests.controller.leg_geometry import static_signals
 
 RATE_HZ, CYCLES = 1000.0, 100
-SEEDS = [range(60), pytest.param(range(60, 1200), marks=pytest.mark.slow(seconds=50))]
+SEEDS = [
+    range(60),
+    pytest.param(range(60, 240), marks=pytest.mark.slow),
+    pytest.param(range(240, 1200), marks=pytest.mark.endurance),
+]
 JOINTS_REFUSED = r"(gravity hardly tells|within its workspace leg)"
 REMEDY = re.compile(r"turn base_joint_axes\[(\d)\], such as to \[(.+)\], or leave its IMU out")
 

@@ -148,7 +148,7 @@ def test_what_cannot_be_led_through_is_refused_before_anything_moves(arguments, 
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow(seconds=120)
+@pytest.mark.endurance
 def test_the_plant_rehearses_it_within_a_box(tmp_path: Path, capsys) -> None:
     output, figures = tmp_path / "rig.toml", tmp_path / "rig.json"
     arguments = ["calibrate", "rig", str(output), "--seed", "1", "--box", "40", "8", "--speed", "100", "--json", str(figures)]

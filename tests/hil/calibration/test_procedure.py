@@ -17,6 +17,7 @@ from hil.runs.prepare import prepared_loop
 from hil.runs.simulation import simulate
 from plant.errors import CalibrationError
 from plant.imu import Wiring, imu_state, load_imu
+from tests.once import made_once
 
 pytestmark = pytest.mark.slow(seconds=60)
 """The calibration takes 20 s; `test_drives` and the calibrations of `controller` stay in `make test`."""
@@ -24,22 +25,27 @@ pytestmark = pytest.mark.slow(seconds=60)
 
 @pytest.fixture(scope="module")
 def calibrated(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("calibration")
-    files = {name: folder / f"rig.{name}" for name in ("toml", "json", "html", "svg")}
-    outputs = (str(files["toml"]), "--json", files["json"], "--report", files["html"], "--picture", files["svg"])
-    assert main(["calibrate", "rig", "--seed", "1", *map(str, outputs)]) == 0
-    return files["toml"], json.loads(files["json"].read_text())
+    def calibrate(folder):
+        outputs = [folder / "rig.toml"]
+        for option, name in (("--json", "json"), ("--report", "html"), ("--picture", "svg")):
+            outputs += [option, folder / f"rig.{name}"]
+        assert main(["calibrate", "rig", "--seed", "1", *map(str, outputs)]) == 0
+
+    file = made_once(tmp_path_factory, "calibration", calibrate) / "rig.toml"
+    return file, json.loads(file.with_suffix(".json").read_text())
 
 
 @pytest.fixture(scope="module")
 def recorded(calibrated, tmp_path_factory):
     """Runs of a rig that has been calibrated, with what it really did, and without."""
-    folder = tmp_path_factory.mktemp("recordings")
     common = {"imu": "mpu9150", "seed": 1, "calibration": str(calibrated[0])}
-    for target, duration in (("rests", 30.0), ("shaking", 20.0)):
-        record(folder / f"{target}.mcap", SimulationConfig(target=target, duration=duration, **common))
-    record(folder / "blind.mcap", SimulationConfig(target="rests", duration=30.0, **common), np.nan)
-    return folder
+
+    def record_all(folder):
+        for target, duration in (("rests", 30.0), ("shaking", 20.0)):
+            record(folder / f"{target}.mcap", SimulationConfig(target=target, duration=duration, **common))
+        record(folder / "blind.mcap", SimulationConfig(target="rests", duration=30.0, **common), np.nan)
+
+    return made_once(tmp_path_factory, "recordings", record_all)
 
 
 def record(path, config, truth=None):

@@ -32,10 +32,10 @@ def errors(result, group):
     return figures["position_rms"] / MM, figures["rotation_rms"] / DEG
 
 
-@pytest.mark.slow
-def test_low_cost_imus_follow_a_real_motion_within_the_promise(motion_capture):
+@pytest.mark.parametrize("seeds", [pytest.param(4, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.endurance)])
+def test_low_cost_imus_follow_a_real_motion_within_the_promise(motion_capture, seeds):
     estimation, tracking = [], []
-    for seed in range(20):
+    for seed in range(seeds):
         result = simulate(SimulationConfig(target=str(motion_capture), duration=60.0, seed=seed))
         assert result.summary()["limits"]["violations"] == 0
         estimation.append(errors(result, "estimation"))

@@ -57,7 +57,7 @@ def test_calibrated_imus_start_in_motion_bear_a_dead_one_and_do_not_drift(withou
     assert minute["position_rms"] < 0.3e-3
 
 
-@pytest.mark.slow(seconds=120)
+@pytest.mark.endurance
 def test_raw_imus_come_to_tenths_of_a_millimetre(figures):
     for error, (position, rotation) in {"0": (0.2, 0.03), "0.0001": (0.4, 0.1)}.items():
         assert figures["calibration"][error]["least_improvement"] > 10.0
@@ -69,7 +69,7 @@ def test_raw_imus_come_to_tenths_of_a_millimetre(figures):
             assert each["refined"]["position_rms"] < 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_a_dead_imu_costs_little(figures):
     faults = figures["faults"]
     assert faults["leg"]["position_rms_ratio"] < 1.5
@@ -77,7 +77,7 @@ def test_a_dead_imu_costs_little(figures):
     assert faults["leg"]["position_rms"] != faults["none"]["position_rms"] != faults["platform"]["position_rms"]
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_it_starts_in_motion_and_does_not_drift(figures):
     assert figures["start"]["succeeded"] == figures["start"]["starts"] == 4
     first, last = figures["drift"]["minutes"]
@@ -85,7 +85,7 @@ def test_it_starts_in_motion_and_does_not_drift(figures):
     assert figures["follow"]["position_rms"] < 0.2e-3
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_what_a_cycle_costs_is_told(figures):
     cost = figures["cost"]
     assert 0.0 < cost["whole-gyroscopes"]["mean_us"] < cost["whole-alignments"]["mean_us"]

@@ -306,13 +306,8 @@ def zdt1(folder: Path, trials: int, seed: int) -> Design:
     return read_design(folder / "zdt1.toml")
 
 
-@pytest.mark.parametrize(
-    "seed",
-    [
-        pytest.param(11, marks=pytest.mark.slow(seconds=55)),
-        *(pytest.param(seed, marks=pytest.mark.endurance) for seed in range(12, 16)),
-    ],
-)
+@pytest.mark.endurance
+@pytest.mark.parametrize("seed", range(11, 16))
 def test_zdt1_is_solved_to_95_percent_of_the_hypervolume(tmp_path, seed):
     """On the engine's processes, with seeds that the settings of the search were not chosen on."""
     with open_engine(EngineSettings(workers=2, dashboard="127.0.0.1:0")) as engine:

@@ -42,8 +42,9 @@ def positions_at_rest(hexapod, errors, minutes, seed):
     ("errors", "minutes", "seed"),
     [
         ("alignments", 1.0, 3),
-        pytest.param("alignments", 20.0, 4, marks=pytest.mark.slow(seconds=60)),
-        pytest.param("accelerometers", 20.0, 5, marks=pytest.mark.slow),
+        pytest.param("accelerometers", 4.0, 5, marks=pytest.mark.slow),
+        pytest.param("alignments", 20.0, 4, marks=pytest.mark.endurance),
+        pytest.param("accelerometers", 20.0, 5, marks=pytest.mark.endurance),
     ],
 )
 def test_the_pose_stays_where_it_is_within_its_own_uncertainty(hexapod, errors, minutes, seed):
