@@ -125,7 +125,7 @@ def errors_of_base_imu(mechanism: Mechanism, tilt: Array, reading: Array, prior:
     expects. The heading of the mounting does not show at all.
     """
     geometry = sensor_geometry(mechanism, tilt)
-    ideal = np.concatenate([np.zeros(3), float(geometry["gravity"]) * geometry["up_in_base"]])
+    ideal = np.concatenate([np.zeros(3), float(geometry["gravity"]) * geometry["up_in_base"].ravel()])
     sigmas = prior.of_an_imu()
 
     def residuals(x: Array) -> Array:

@@ -166,8 +166,8 @@ class CalibrationData:
         turns, tilts = np.linalg.norm(off[:, :3], axis=1).max(), np.linalg.norm(off[:, 3:], axis=1).max() / STANDARD_GRAVITY
         if turns > _BASE_TURNS or tilts > _BASE_TILTS:
             raise CalibrationError(
-                f"the base moves: from one rest to another its IMU differs by {np.degrees(turns):.2g} deg/s and "
-                f"{np.degrees(tilts):.2g} deg of tilt; at most {np.degrees(_BASE_TURNS):g} deg/s and "
+                f"the base moves: from one rest to another its IMU differs by {np.degrees(turns):.2f} deg/s and "
+                f"{np.degrees(tilts):.2f} deg of tilt; at most {np.degrees(_BASE_TURNS):g} deg/s and "
                 f"{np.degrees(_BASE_TILTS):g} deg are allowed: calibrate while it stands"
             )
 

@@ -125,7 +125,7 @@ def test_an_imu_on_the_base_is_calibrated_beside_the_others(monkeypatch):
     rate, force = (calibration.base_gain @ data.base_readings[0].reshape(2, 3, 1))[..., 0] + calibration.base_offset
     np.testing.assert_allclose(rate, 0.0, atol=1e-4)
     # A turn by 0.002 rad about x takes the vertical towards -y.
-    np.testing.assert_allclose(force, [0.0, -0.002 * 9.80665, 9.80665], atol=1e-4)
+    np.testing.assert_allclose(force, [0.0, -0.002 * 9.81, 9.81], atol=1e-4)
     without = new_data()
     without.add_rests(phases(2.0, 1.0, 1.5))
     untouched = Calibration()
@@ -133,7 +133,7 @@ def test_an_imu_on_the_base_is_calibrated_beside_the_others(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("moved", "said"), [({"degrees": 0.3}, "0 deg/s and 0.3 deg of tilt"), ({"rate": 0.3}, "0.3 deg/s and 0 deg")]
+    ("moved", "said"), [({"degrees": 0.3}, "0.00 deg/s and 0.30 deg of tilt"), ({"rate": 0.3}, "0.30 deg/s and 0.00 deg")]
 )
 def test_a_base_that_moves_is_told_while_its_imu_is_calibrated(monkeypatch, moved, said):
     monkeypatch.setattr(calibration_data, "check_all_along", lambda samples, rate: None)
