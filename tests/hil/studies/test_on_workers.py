@@ -72,10 +72,7 @@ def without_times(figures):
     "study",
     [
         *STUDIES,
-        *(
-            pytest.param(n, marks=pytest.mark.endurance if n == "evaluate-fusion" else pytest.mark.slow(seconds=40))
-            for n in LONG_STUDIES
-        ),
+        *(pytest.param(n, marks=pytest.mark.slow if n == "tune-fusion" else pytest.mark.endurance) for n in LONG_STUDIES),
     ],
 )
 def test_figures_do_not_depend_on_the_engine(study, workers, trials):
@@ -95,7 +92,7 @@ LONG_COMMANDS = [
 ]
 
 
-@pytest.mark.parametrize("line", [*COMMANDS, *(pytest.param(line, marks=pytest.mark.slow) for line in LONG_COMMANDS)])
+@pytest.mark.parametrize("line", [*COMMANDS, *(pytest.param(line, marks=pytest.mark.endurance) for line in LONG_COMMANDS)])
 def test_without_the_packages_for_sweeps_studies_run_in_this_process(line, trials, tmp_path, monkeypatch, capsys):
     for package in (name for name, extra in EXTRAS.items() if extra == "sweep"):
         monkeypatch.setitem(sys.modules, package, None)

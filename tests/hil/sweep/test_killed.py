@@ -168,7 +168,8 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, o
     return rows(folder / "undisturbed")
 
 
-@pytest.mark.parametrize("deaths", [pytest.param(2, marks=pytest.mark.slow), pytest.param(12, marks=pytest.mark.endurance)])
+@pytest.mark.endurance
+@pytest.mark.parametrize("deaths", [12])
 def test_deaths_of_programs_and_their_workers(folder: Path, reference: dict[str, dict[str, object]], deaths: int) -> None:
     sweeps = Sweeps(folder, reference, 1)
     plan = (["worker", "worker", "worker", "program", "worker", "program"] * 2)[-deaths:]
