@@ -11,6 +11,7 @@ PAGE = (Path(__file__).parent.parent / "docs" / "optimisation.md").read_text()
 EXAMPLES = dict(re.findall(r"<!-- example: (\S+) -->\n```\w+\n(.*?)```", PAGE, re.DOTALL))
 
 
+@pytest.mark.slow
 def test_the_example_finds_a_better_design_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, text in EXAMPLES.items():
         (tmp_path / name).write_text(text)

@@ -37,6 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
+@pytest.mark.slow
 def test_the_example_reads_its_table_and_goes_on(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with contextlib.chdir(folder):
         runpy.run_path("read.py", run_name="__main__")

@@ -267,6 +267,7 @@ def second(records):
 """
 
 
+@pytest.mark.slow
 def test_a_shared_kernel_is_compiled_once_for_all_callers_and_processes(tmp_path: Path) -> None:
     """Whichever is compiled first, and if the machine code of the shared ones is lost, those of their callers remain."""
     (tmp_path / "shared_example.py").write_text(SHARED)

@@ -41,6 +41,7 @@ COMMANDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", COMMANDS)
 def test_a_command_names_the_extra_in_one_line(package, tmp_path):
     code = "from hil.command_line import main; sys.exit(main(sys.argv[1:]))"

@@ -55,6 +55,7 @@ def test_a_known_home_and_measured_length_changes_help(hexapod):
     assert errors[1] < 0.5
 
 
+@pytest.mark.slow
 def test_a_tilted_base_is_found_if_it_is_looked_for(hexapod):
     tilt = np.radians([0.6, -0.4])
     up = rotation_of([*tilt, 0.0])[:, 2]

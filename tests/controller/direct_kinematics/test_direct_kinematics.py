@@ -434,6 +434,7 @@ def consistency(mechanism, known, legs, tilt_sigma, yaw_sigma, runs=1000):
     return total, chi2.ppf([0.005, 0.995], 6 * runs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("known", "legs", "tilt_deg", "yaw_deg"),
     [

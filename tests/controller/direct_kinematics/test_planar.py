@@ -305,6 +305,7 @@ def test_three_legs_and_the_roll_give_the_position_of_least_squares(seed):
 # --------------------------------------------------------------------------------------------------------- covariance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("roll_sigma", "left_out"),
     [(None, None), (0.02 * DEGREE, None), (0.5 * DEGREE, None), (0.02 * DEGREE, 1), (0.5 * DEGREE, 1)],

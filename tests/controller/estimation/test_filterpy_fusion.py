@@ -124,6 +124,7 @@ def test_a_prediction_agrees_for_any_covariance_and_period(seed, exponent):
     np.testing.assert_allclose(covariance, reference.P, rtol=1e-13, atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rate", "known", "seed"), [(1000.0, 1.0, 0), (250.0, 1.0, 1), (4000.0, 1.0, 2), (500.0, 0.0, 3)])
 def test_five_thousand_steps_of_the_platform_agree_with_the_compiled_filter(rate, known, seed):
     """With an acceleration that is known, or is not, jolts, clipped rates, and a rest: with and without an unknown velocity."""

@@ -88,6 +88,7 @@ def test_tilt_is_compensated_and_the_bias_found():
     assert states[-1, 3] == pytest.approx(BIAS, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_covariance_is_that_of_the_errors():
     motion = turning(4000)
     runs = [follow(*motion, np.random.default_rng(seed)) for seed in range(40)]

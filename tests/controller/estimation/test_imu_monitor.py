@@ -81,6 +81,7 @@ def test_a_contradiction_is_the_difference_to_the_pose_solved_without_the_imu(he
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mechanism", ["hexapod", "6-4-I", "genhexkins"])
 @pytest.mark.parametrize("faulty", range(7))
 def test_the_imu_that_explains_most_is_the_one_that_is_wrong_and_the_slow_twin_names_it_too(mechanism, faulty):

@@ -177,6 +177,7 @@ def test_a_single_jolt_tilts_a_settled_filter_by_less_than_an_ordinary_sample_mi
         platform.step(np.zeros(3), GRAVITY * UP)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.6, 0.0, 0.8), (0.0, 0.0, 1.0)])
 def test_a_constant_turn_is_tracked_and_its_bias_found(axis):
     """Ten seconds of 1 rad/s, upside down and back again, with a bias on every axis."""

@@ -152,6 +152,7 @@ def check(mechanism, target, duration):
 # ------------------------------------------------------------------------------------------------------------------ limits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
 def test_no_target_makes_a_leg_leave_a_limit(hexapod, family):
     busy = 0

@@ -200,6 +200,7 @@ def followed(mechanism, name, noise=0.0, rate=100, duration=4.0, kept=lambda k: 
     return sampled - leg_lengths(mechanism, *target.at(np.arange(len(sampled)) * PERIOD))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "how", "most"),
     [
@@ -326,6 +327,7 @@ def hammer(stream):
         publish_plan(stream, moved(value), 1e9, int(stream["shared"][TAKEN]))
 
 
+@pytest.mark.slow
 def test_no_plan_is_ever_torn():
     """However long it takes: the writer goes on until the reader has seen enough plans."""
     stream, reader = new_stream(), np.zeros((), STREAM_READER)

@@ -46,6 +46,7 @@ def test_a_target_that_stands_still_does_so_to_the_bit():
     assert (found == lengths[-1]).all() and not rates.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [11, 12, 13])
 @pytest.mark.parametrize("rate", [100.0, 1000.0])
 def test_noise_of_a_standing_target_is_not_taken_for_motion(rate, seed):

@@ -36,6 +36,7 @@ def followed(mechanism: Mechanism, target, seconds: float):
     return *poses_from_lengths(mechanism, states[:, :, 0], target.start), np.abs(states[:, :, 1]).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["probing", "near-rests", "rests", "shaking"])
 def test_what_is_planned_stays_in_the_box_and_below_the_speed_and_ends_at_home(hexapod: Mechanism, name: str) -> None:
     limits = MotionLimits(BOX, speed=0.06)
@@ -50,6 +51,7 @@ def test_what_is_planned_stays_in_the_box_and_below_the_speed_and_ends_at_home(h
         assert moved.max() > 0.9 * BOX.position and turned.max() > 0.9 * BOX.rotation, "the box is used"
 
 
+@pytest.mark.slow
 def test_without_limits_the_motions_are_the_named_ones(hexapod: Mechanism) -> None:
     assert gentle_mechanism(hexapod, MotionLimits()) is hexapod
     for ours, named in zip(rests(hexapod, 50.0, box=EVERYWHERE), rests(hexapod, 50.0), strict=True):
@@ -61,6 +63,7 @@ def test_without_limits_the_motions_are_the_named_ones(hexapod: Mechanism) -> No
     np.testing.assert_allclose(back[1][middle], positions[middle], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_box_costs_accuracy_and_one_that_is_too_small_is_refused(hexapod: Mechanism) -> None:
     within, best = (
         expected_accuracy(hexapod, calibration_targets(hexapod, box)["rests"], Knowledge()) for box in (BOX, EVERYWHERE)
@@ -92,6 +95,7 @@ def test_what_the_motions_need_stays_below_the_force(hexapod: Mechanism) -> None
     assert within_drives(hexapod, inf) is hexapod
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["6-3-I", "6-5", "genhexkins"])
 def test_other_mechanisms_have_motions_too(name: str) -> None:
     mechanism = load_spatial(name)

@@ -67,6 +67,7 @@ class Bench:
         return calibrate_guided(plan, Knowledge(), output, self.machine, self.guide, resume)
 
 
+@pytest.mark.slow
 def test_the_first_step_moves_nothing_and_a_failed_one_is_kept_and_gone_on_from(plan, tmp_path: Path) -> None:
     output, bench = tmp_path / "rig.toml", Bench(plan.mechanism)
     with pytest.raises(FailedCalibrationError, match=r"step 3 of 6, probing, failed: the cable came off.*--resume") as failed:
@@ -96,6 +97,7 @@ def test_it_does_not_go_on_blindly_from_another_place(plan, tmp_path: Path) -> N
     assert not moved.announced and [run[1] for run in moved.runs] == [False], "nothing moves"
 
 
+@pytest.mark.slow
 def test_a_kept_recording_of_another_rig_is_refused(plan, tmp_path: Path) -> None:
     output = tmp_path / "rig.toml"
     with pytest.raises(FailedCalibrationError):

@@ -143,6 +143,7 @@ def test_fmu_build_writes_an_fmu_that_simulate_takes(tmp_path):
     assert "cannot write" in refused(gough("fmu", "build", "--output", "missing/plant.fmu", cwd=tmp_path))
 
 
+@pytest.mark.slow
 def test_tune_prints_gains_and_margins(tmp_path):
     run = gough("tune", "--json", "gains.json", cwd=tmp_path)
     assert run.returncode == 0, run.stderr
@@ -154,6 +155,7 @@ def test_tune_prints_gains_and_margins(tmp_path):
     refused(gough("tune", "--rate", "0"))
 
 
+@pytest.mark.slow
 def test_bench_prints_every_stage(tmp_path):
     run = gough("bench", "--only", "loop", "--duration", "0.5", "--json", "bench.json", cwd=tmp_path)
     assert run.returncode == 0, run.stderr

@@ -10,6 +10,7 @@ import pytest
 from hil.command_line import main
 
 
+@pytest.mark.slow
 def test_a_planar_fmu_is_built_told_tried_and_linearised(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

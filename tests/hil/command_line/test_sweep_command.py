@@ -80,6 +80,7 @@ def test_the_indices_of_ishigami_by_two_processes(folder: Path, seed: int) -> No
     assert again.stdout.partition("5120")[0] == finished.stdout.partition("5120")[0]
 
 
+@pytest.mark.slow
 def test_runs_are_printed_in_mm_and_deg_and_a_dry_run_counts_them(folder: Path) -> None:
     study = (
         '[run]\nduration = 0.5\n[vary]\nrun.imu = ["ideal", "mpu9150-calibrated"]\nrun.joint_error = [0.0, 1e-4]\n'

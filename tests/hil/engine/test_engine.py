@@ -154,6 +154,7 @@ def test_one_process_needs_no_dask():
     assert run.stdout.split("\n")[:2] == ["[1, 2]", "[]"]
 
 
+@pytest.mark.slow
 def test_an_engine_is_opened_with_its_first_work_and_its_workers_end_with_it():
     told = []
     with socket.create_server(("127.0.0.1", 0)) as taken:

@@ -21,6 +21,7 @@ from tests.hil.processes import started, wait_until
 NOISY = Row("noisy", "a", ("imu-noise:{k},axis=all,size_deg_per_s=2",), target="hold", duration=5.5, rate=250.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("link", ["fmu", "udp", "canopen"])
 def test_a_disturbance_begins_when_it_is_due_on_every_link_and_comes_out_the_same_again(link):
     drawn = replace(NOISY, link=link).drawn(2, "compiled")

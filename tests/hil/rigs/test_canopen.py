@@ -481,6 +481,7 @@ def test_the_decoder_takes_anything(fd):
     assert np.nanmax(np.abs(measurement[0])) < 4.4
 
 
+@pytest.mark.slow
 def test_nodes_take_anything():
     config = settings()
     machine = Kinematic()

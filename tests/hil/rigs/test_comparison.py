@@ -70,6 +70,7 @@ def only(count, *where, value):
     return factors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "wrong, clause, count, text",
     [
@@ -101,6 +102,7 @@ def test_commands_in_another_unit_are_stopped_at_once_and_told():
     assert (rig.moved < 20e-3).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("factors", "texts"),
     [

@@ -620,6 +620,7 @@ def without_refused(record):
     return {name: record[name].tobytes() for name in record.dtype.names if name != "refused"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("truthful", [False, True])
 @pytest.mark.parametrize("version", [VERSION, WITH_LENGTHS])
 def test_the_controller_takes_nothing_that_is_wrong(truthful, version):
@@ -707,6 +708,7 @@ def test_a_flood_of_old_hellos_does_not_keep_a_moving_rig_from_its_controller():
         )
 
 
+@pytest.mark.slow
 def test_only_datagrams_from_the_peers_host_and_port_are_its_own():
     with ExitStack() as stack:
 

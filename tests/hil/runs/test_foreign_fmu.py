@@ -225,6 +225,7 @@ def started(*arguments, cwd):
     return subprocess.Popen(command, cwd=cwd, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "said"), [(97, "ended the process with status 7"), (99, "crashed with signal 11")]
 )  # fmt: skip

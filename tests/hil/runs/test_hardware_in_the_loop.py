@@ -203,6 +203,7 @@ def test_a_dry_run_reads_everything_and_moves_nothing(tmp_path):
 # ------------------------------------------------------------------------------------------------------------ it ends safely
 
 
+@pytest.mark.slow
 def test_when_the_loop_is_killed_the_drives_stop_by_themselves(tmp_path):
     with emulated() as (_, at, control):
         run = started(at, control)

@@ -28,6 +28,7 @@ def rms(errors):
     return np.sqrt((errors.reshape(-1, 2, 3) ** 2).sum(axis=2).mean(axis=0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "absolute", "relative"),
     [
@@ -56,6 +57,7 @@ def test_at_power_on_the_pose_is_known_without_homing(seed):
         assert 1e3 * position[cycle] < most and np.degrees(rotation[cycle]) < turned
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("link", ["fmu", "udp", "canopen"])
 @pytest.mark.parametrize("fault", ["jumps:2,size_mm=2", "reversed:2", "slips:2,size_percent=20", "frozen:2"])
 def test_an_encoder_that_is_wrong_is_named_and_left_out(fault, link):

@@ -63,6 +63,7 @@ def test_a_base_that_leans_far_and_turns_fast():
     assert np.linalg.norm(errors_of(records)[:, :3], axis=1).max() < 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("link", ["udp", "canopen"])
 def test_the_imu_on_the_base_comes_over_a_bus(link):
     records, _, cause = run(Drawn(replace(AT_SEA, faults=(), duration=4.0, rate=500.0), link, SEA, frozenset(), 0.0))
@@ -108,6 +109,7 @@ def test_what_has_no_moving_base_is_refused(changes, text):
 AT_LEVEL = replace(AT_SEA, frame="level", duration=60.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", ["hold", "sines"])
 def test_a_target_in_the_level_frame_keeps_its_attitude_on_the_earth(target):
     """Against the true motion of the base, of which the loop knows nothing."""

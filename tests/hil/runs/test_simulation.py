@@ -224,6 +224,7 @@ def test_a_run_taken_up_from_its_arrays_goes_on_bit_for_bit():
         assert whole.imu.tobytes() == parts.imu.tobytes()
 
 
+@pytest.mark.slow
 def test_filterpy_closes_the_same_loop(monkeypatch):
     taken = Counter()
     for kind, name in ((FilterpyLeg, "take"), (FilterpyPlatform, "step")):

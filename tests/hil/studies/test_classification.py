@@ -50,6 +50,7 @@ def test_choices_of_legs_do_what_is_claimed():
         np.testing.assert_allclose(solve(mechanism, kept).position, position, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mechanism_class", planar_classes(), ids=str)
 def test_every_planar_class_is_described(mechanism_class):
     from plant.mechanism.classification import draw_planar_mechanism

@@ -28,6 +28,7 @@ def without_calibration(monkeypatch):
     monkeypatch.setattr("hil.studies.fusion_evaluation.calibrate_rig", lambda *arguments, **options: found)
 
 
+@pytest.mark.slow
 def test_calibrated_imus_start_in_motion_bear_a_dead_one_and_do_not_drift(without_calibration, tmp_path):
     file = tmp_path / "figures.json"
     options = (

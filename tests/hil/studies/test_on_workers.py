@@ -103,6 +103,7 @@ def test_without_the_packages_for_sweeps_studies_run_in_this_process(line, trial
     assert "this needs distributed, which is not installed: pip install 'gough[sweep]'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_share_that_is_done_grows_to_all_of_it():
     shares = []
     run_trials(trials_of(CASES[30:32], 2), progress=shares.append)

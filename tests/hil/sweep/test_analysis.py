@@ -37,6 +37,7 @@ def study_of(*factors, **sampling):
     return Study(factors, sampling=Sampling(**sampling), model=MODEL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", QUANTILES)
 @pytest.mark.parametrize("count", [40, 600])
 def test_intervals_of_quantiles_hold_the_quantile_of_the_distribution(share, count):
@@ -67,6 +68,7 @@ def test_too_few_runs_tell_no_end():
     assert (mean([3.0]).low, mean([3.0]).value) == (-np.inf, 3.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seeds", "cells", "common"), [(20, 9, 0.8), (12, 4, 1.0), (60, 6, 0.0)])
 def test_runs_of_the_same_seed_are_no_independent_runs(seeds, cells, common):
     """Values with a part that all runs of a seed share, as IMUs have: their intervals hold, and naive ones would not."""

@@ -115,6 +115,7 @@ def test_one_objective_is_found_by_tpe(tmp_path):
     assert run(largest, tmp_path).knee.figures["sum"] > 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["nsga2", "tpe"])
 def test_the_seed_alone_decides_and_an_interruption_changes_nothing(method, tmp_path):
     design = two(search=Search(trials=60, method=method, batch=6, seed=4))
@@ -179,6 +180,7 @@ def hexapod(objectives: Sequence[Objective], *factors: Factor, **others: Any) ->
     return Design(study, tuple(objectives), **others)
 
 
+@pytest.mark.slow
 def test_geometry_alone_needs_no_run_and_begins_at_the_start(tmp_path):
     design = hexapod(
         [Objective("geometry.force_per_torque"), Objective("geometry.reach_rotation", "maximise")],
@@ -198,6 +200,7 @@ def test_geometry_alone_needs_no_run_and_begins_at_the_start(tmp_path):
     assert ends[0]["geometry.platform_radius"] > 0.21 > 0.19 > ends[1]["geometry.platform_radius"]
 
 
+@pytest.mark.slow
 def test_the_chosen_mechanism_is_a_file_that_runs_as_the_trial_did(tmp_path):
     design = hexapod(
         [Objective("estimation.rotation_rms", pool="rms"), Objective("geometry.reach", "maximise")],
@@ -240,6 +243,7 @@ def test_the_chosen_mechanism_is_a_file_that_runs_as_the_trial_did(tmp_path):
     assert found[1].better is not None and 0 <= found[1].better <= 2
 
 
+@pytest.mark.slow
 def test_a_trial_that_is_worse_at_each_seed_is_given_up(tmp_path):
     design = hexapod(
         [Objective("estimation.rotation_rms", pool="rms")],

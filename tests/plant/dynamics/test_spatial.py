@@ -292,6 +292,7 @@ def wrench_of_legs(p: Values, position: Array, rotation: Array, wrench: Array) -
     return static_forces(p, position, rotation) - np.linalg.solve(jacobian(p, position, rotation).T, wrench)
 
 
+@pytest.mark.slow
 def test_motors_in_equilibrium_push_as_virtual_work_demands_at_a_thousand_poses(dynamics: Dynamics, hexapod: Mechanism) -> None:
     """The motor forces that leave the derived equations at rest, under a tilted gravity and a random wrench."""
     random = np.random.default_rng(6)

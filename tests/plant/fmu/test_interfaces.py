@@ -129,6 +129,7 @@ def cosimulate(path: Path, duration: float, substep: float) -> Array:
     return np.array(poses)
 
 
+@pytest.mark.slow
 def test_co_simulation_agrees_with_model_exchange_by_an_adaptive_integrator(fmu_path: Path, hexapod: Mechanism) -> None:
     """10 s at a tolerance of 1e-10: within 1e-8 m and rad at any time, with substeps of 0.25 ms."""
     exact = exchange(fmu_path, 10.0)

@@ -499,6 +499,7 @@ def wander_of(model: ImuModel, seed: int, frequency: float, phases: int = 8) -> 
     return changed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "words"),
     [

@@ -65,6 +65,7 @@ def test_the_recursion_is_the_algebra_of_all_data_at_once(hexapod):
     np.testing.assert_allclose(pose_covariances(model, motion)[-1], expected[:6, :6], rtol=1e-4, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("imu", ["mpu9150", "mpu9150-calibrated", "icm42688"])
 def test_the_errors_of_imus_are_as_large_as_the_imu_layer_draws_them(hexapod, imu):
     """The second moments of constant errors, over 400 seeds of seven IMUs, at a pose and in a motion."""

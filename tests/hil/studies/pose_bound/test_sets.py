@@ -22,6 +22,7 @@ def test_the_documented_table_has_every_set():
     assert list(documented()) == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["hexapod", "planar-3rpr"])
 def test_the_documented_bounds_are_what_is_computed(name):
     sets = [each for each in SETS if each.label in ("tilt", "3 legs + tilt")]
@@ -35,6 +36,7 @@ def test_the_documented_bounds_are_what_is_computed(name):
                 assert list(next(figures)) == pytest.approx(next(figures), rel=0.02, abs=0.0011)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_fails_never_makes_it_better():
     for each in evaluate_worth(["6-4-I"], [SETS[4], SETS[6]]):
         for whole, less in ((each.none, each.imu_less), (each.incremental, each.incremental_imu_less)):
@@ -43,6 +45,7 @@ def test_a_sensor_that_fails_never_makes_it_better():
         assert each.absolute[0] < each.incremental[0] < each.none[0]
 
 
+@pytest.mark.slow
 def test_the_command_prints_it(tmp_path, capsys):
     path = tmp_path / "worth.json"
     arguments = ["sensor-sets", "--bounds", "--mechanism", "planar-3rpr", "--workers", "1", "--markdown", "--json", str(path)]
