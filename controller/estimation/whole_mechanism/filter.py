@@ -292,7 +292,7 @@ def _renew_base_noise(p: Record, f: Record) -> None:
     for at in range(first, first + p.base):
         for i in range(p.states):
             c[at, i] = c[i, at] = 0.0
-        c[at, at] = p.variance[(at - first) // 3] / f.collected
+        c[at, at] = p.base_variance[(at - first) // 3] / f.collected
 
 
 @kernel

@@ -291,7 +291,7 @@ class Twin:
         h, innovation = np.vstack(rows), np.concatenate(innovations)
         noise = np.diag(variances)
         if self.base:
-            noise += h[:, -6:] @ np.diag(np.repeat(self.p["variance"], 3) / self.p["window"]) @ h[:, -6:].T
+            noise += h[:, -6:] @ np.diag(np.repeat(self.p["base_variance"], 3) / self.p["window"]) @ h[:, -6:].T
         gain = np.linalg.solve(h @ self.covariance @ h.T + noise, h @ self.covariance).T
         change = gain @ innovation
         self.covariance = self.covariance - gain @ h @ self.covariance
