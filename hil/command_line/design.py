@@ -180,12 +180,18 @@ def gough_sensor_sets(options: Namespace) -> None:
         imus={},
         magnetometer={},
         lengths={},
+        base_imu={},
+        faults={
+            "text": "with --base-imu: how the base moves, as for 'gough simulate', such as "
+            "base-tilt,axis=x,size_deg=3,sine_hz=0.125; can be given several times"
+        },
         calibration={"text": "the covariance of a calibration instead of the errors that the kind of IMU has"},
         joint_error={"text": "standard deviation of each coordinate of the joints from their places"},
         fusion={"default": "whole", "text": "with --measured: how the loop fuses the IMUs, as for 'gough simulate'"},
     ),
     cli.flag("--measured", "run the closed loop, too, and print its errors over the bound"),
     cli.setting("--seeds", 20, "with --measured: runs, each with other imperfections of the sensors"),
+    cli.argument("--since", type=float, metavar="SECONDS", help="also over the motion from this time of it on [s]"),
     cli.markdown("docs/pose_bound.md"),
     cli.engine_options(),
     cli.JSON,
@@ -197,16 +203,19 @@ def gough_bounds(options: Namespace) -> None:
     the readings allow, if the errors of IMUs and encoders are drawn as their kinds say and nothing is known of the pose before.
     It shares no code with the loop's filters. A dash stands for a pose that the sensors do not determine.
 
+    With --base-imu the base may move, and how it does is not known either.
+
     With --measured, the closed loop's errors over seeds stand beside it.
     """
-    from hil.studies.pose_bound.bound import find_bound, measure, summary, table
+    from hil.studies.pose_bound.bound import check_since, find_bound, measure, summary, table
 
     config = cli.config_of(options, SimulationConfig)
+    check_since(config, options.since)
     with engine_at_work(cli.engine_of(options), "seeds") as (engine, progress):
         bound = find_bound(config)
         measured = measure(config, options.seeds, engine, progress) if options.measured else None
-    cli.write_json(options.json, summary(config, bound, measured))
-    table(bound, measured).print(options.markdown)
+    cli.write_json(options.json, summary(config, bound, measured, options.since))
+    table(bound, measured, options.since).print(options.markdown)
     for reason in dict.fromkeys(measured.stopped if measured else ()):
         say(f"a run ended early: {reason}")
 

@@ -212,13 +212,19 @@ def base_motion_at(motions: Record, count: int, time: float, motion: Array) -> N
     motion[8] += c * (tz + rx * uy - ry * ux) - b * sz - bs * uz + cs * vz
 
 
-def attitudes_of(motions: Sequence[Record], times: Array) -> Array:
-    """The attitudes (N, 3, 3) of a base under such motions at times (N,) [s]: they turn {1} to where it was before."""
-    made, motion = np.zeros(max(len(motions), 1), BASE_MOTION), np.zeros(BASE_SIZE)
+def base_motions_at(motions: Sequence[Record], times: Array) -> Array:
+    """The motion (N, 12) of a base under such motions at times (N,) [s], each as `base_motion_at` has it."""
+    made, found = np.zeros(max(len(motions), 1), BASE_MOTION), np.empty((len(times), BASE_SIZE))
     for place, each in enumerate(motions):
         made[place] = each
-    attitudes = np.empty((len(times), 3, 3))
-    for attitude, time in zip(attitudes, times, strict=True):
+    for motion, time in zip(found, times, strict=True):
         base_motion_at(made, len(motions), time, motion)
+    return found
+
+
+def attitudes_of(motions: Sequence[Record], times: Array) -> Array:
+    """The attitudes (N, 3, 3) of a base under such motions at times (N,) [s]: they turn {1} to where it was before."""
+    attitudes = np.empty((len(times), 3, 3))
+    for attitude, motion in zip(attitudes, base_motions_at(motions, times), strict=True):
         attitude[:] = rotation_from_vector(motion[:3])
     return attitudes

@@ -7,6 +7,9 @@ for a calibration the places of the joints (36) and the tilt of the base (2). An
 
     rate  = (I + diag(scale) + U(axes)) R(-alignment) ideal + bias,   U upper triangular, R the rotation, the force likewise
 
+With an IMU on the base, all other samples are less what it reads (`base_imu`). Its biases are six more states, and so is its
+noise in a window: all rows of an update share it, and the next window has another.
+
 With the platform's magnetometer, the last error is a constant offset of its heading, so that what iron is left does not turn a
 pose that the other IMUs know better.
 
@@ -185,8 +188,9 @@ def _begin_update(p: Record, geometry: Record, f: Record) -> None:
         for i in range(READINGS):
             weight = f.weight[i // 3, k]
             f.sample[k, i] = f.sum[k, i] / weight if weight > 0.0 else 0.0
-    f.collected = 0
     _predict(p, f, time - f.time)
+    _renew_base_noise(p, f)
+    f.collected = 0
     f.time = time
     f.change[:] = 0.0
     f.row = f.update_step = 0
@@ -282,6 +286,16 @@ def _predict(p: Record, f: Record, period: float) -> None:
 
 
 @kernel
+def _renew_base_noise(p: Record, f: Record) -> None:
+    """Let the noise of the base's IMU be that of a full window of which nothing is known yet."""
+    c, first = f.covariance, base_start(p) + p.base
+    for at in range(first, first + p.base):
+        for i in range(p.states):
+            c[at, i] = c[i, at] = 0.0
+        c[at, at] = p.base_variance[(at - first) // 3] / f.collected
+
+
+@kernel
 def _is_at_rest(f: Record) -> bool:
     """Whether no part of the low-passed motion is more than its uncertainty."""
     for block in range(4):
@@ -344,13 +358,13 @@ def _update_scalar(p: Record, f: Record, row: int) -> None:
         innovation -= weight * (f.rig[which] + change[at])
         for i in range(states):
             gain[i] += weight * c[at, i]
-    # A bias of the base's IMU has been subtracted, seen in the axes of this one.
+    # Bias and noise of the base's IMU have been subtracted, seen in the axes of this one.
     axis, first_base = f.frames[k, m % 3], base_start(p) + 3 * sensor
     for j in range(3 if p.base > 0 else 0):
-        at = first_base + j
-        innovation += axis[j] * (f.base_errors[3 * sensor + j] + change[at])
+        bias, noise = first_base + j, first_base + p.base + j
+        innovation += axis[j] * (f.base_errors[3 * sensor + j] + change[bias] + change[noise])
         for i in range(states):
-            gain[i] -= axis[j] * c[at, i]
+            gain[i] -= axis[j] * (c[bias, i] + c[noise, i])
     for j in range(MOTION_STATES):
         variance += h[j] * gain[j]
     for j in range(p.errors):
@@ -358,7 +372,7 @@ def _update_scalar(p: Record, f: Record, row: int) -> None:
     for j in range(first, 8):
         variance += f.rig_jacobian[k, m, j] * gain[rig_start(p) + rig_state(k, j)]
     for j in range(3 if p.base > 0 else 0):
-        variance -= axis[j] * gain[first_base + j]
+        variance -= axis[j] * (gain[first_base + j] + gain[first_base + p.base + j])
     take_scalar(c, gain, change, states, innovation, variance)
 
 

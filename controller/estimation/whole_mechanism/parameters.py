@@ -22,7 +22,7 @@ LENGTH_ERRORS = 2 * LEGS
 BASE_ERRORS = 6
 """How many errors of the base's IMU can be estimated: the biases of its gyroscope [rad/s] and accelerometer [m/s^2]."""
 
-MOST_STATES = MOTION_STATES + ALL_ERRORS + RIG_ERRORS + LENGTH_ERRORS + BASE_ERRORS + 1
+MOST_STATES = MOTION_STATES + ALL_ERRORS + RIG_ERRORS + LENGTH_ERRORS + 2 * BASE_ERRORS + 1
 ROWS = IMU_COUNT * READINGS
 """Scalars of one update that are the IMUs'."""
 
@@ -53,8 +53,9 @@ FILTER_PARAMETERS = record_dtype(
     lengths=np.int64,  # estimated errors of the encoders; 0 without encoders
     length_variance=np.float64,  # of one reading of an encoder [m^2]
     length_prior=(np.float64, 2),  # variances of an encoder's zero at the start, and of what play does to its reading [m^2]
-    base=np.int64,  # estimated errors of the base's IMU; 0 without one
+    base=np.int64,  # estimated biases of the base's IMU, which its noise follows among the states; 0 without one
     base_prior=(np.float64, 2),  # variances of its biases at the start
+    base_variance=(np.float64, 2),  # of its noise in one sample, rate [(rad/s)^2] and force [(m/s^2)^2]
     heading=np.int64,  # whether there is one
     field_axes=(np.float64, (3, 3)),  # north, east, and the axis about which a small turn changes the heading, in {1}
     heading_variance=np.float64,  # of a sample's heading [rad^2]
@@ -134,7 +135,7 @@ def filter_parameters(
         field: of the earth, for the platform's magnetometer; None without one.
         inflation: times the noise and the jerk; None for 1 with a covariance, and what the settings say without.
         lengths: whether there are encoders.
-        base: whether there is an IMU on the base.
+        base: whether there is an IMU on the base, which makes half of the noise.
         ripple: `ripple_at` the loop's rate if drives are commanded at this rate.
 
     Raises:
@@ -163,7 +164,7 @@ def filter_parameters(
         window=max(1, round(WINDOW_S * rate)),
         errors=estimated,
         rig=len(known) - ALL_ERRORS,
-        states=rest + IMU_COUNT * estimated + lengths * LENGTH_ERRORS + base * BASE_ERRORS + (field is not None),
+        states=rest + IMU_COUNT * estimated + lengths * LENGTH_ERRORS + base * 2 * BASE_ERRORS + (field is not None),
         smoothing=_SMOOTHING_S,
         jerk=jerk**2,
         bias_walk=(fusion.bias_walk**2, fusion.accelerometer_bias_walk**2),
@@ -175,6 +176,7 @@ def filter_parameters(
         lengths=lengths * LENGTH_ERRORS,
         base=base * BASE_ERRORS,
         base_prior=(fusion.bias_sigma**2, fusion.accelerometer_bias_sigma**2),
+        base_variance=base * noise**2 * rate / 4.0,
         length_variance=fusion.length_noise**2,
         length_prior=(fusion.length_zero**2, fusion.length_play**2),
     )
@@ -206,7 +208,7 @@ def lengths_start(parameters: Record) -> int:
 
 @kernel
 def base_start(parameters: Record) -> int:
-    """The place of the first error of the base's IMU among the states."""
+    """The place of the first bias of the base's IMU among the states."""
     return int(lengths_start(parameters) + parameters.lengths)
 
 

@@ -2,11 +2,12 @@
 
 This is code of its own, on purpose: it shares nothing with the loop's filters, whose figures it bounds. From the vector of a
 leg in its joint's frame, s = L (sin b, -sin a cos b, cos a cos b), follow the angles a and b of its universal joint with two
-derivatives, from these the angular velocity and acceleration in the leg's frame, and the specific force at the IMU.
+derivatives, from these the angular velocity and acceleration in the leg's frame, and the specific force at the IMU. A base that
+moves adds what it gives to a point that is fixed in {1}, and the Coriolis acceleration.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,8 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from controller.planning.target import Target
+from plant.compiled import Record
+from plant.dynamics.base_course import base_motions_at
 from plant.errors import InputError
 from plant.mechanism import Mechanism
 from plant.pose import Array
@@ -24,12 +27,29 @@ POSE = 6
 JET = 3 * POSE
 """A pose error, its rate and its second derivative."""
 
+BASE_JET = 9
+"""Errors of the base's angular velocity, angular acceleration and specific force."""
+
 _DIFFERENCE_S = 1e-4
 
 
 @dataclass(frozen=True)
+class BaseMotion:
+    """How {1} moves at N times, seen in {1}: (N, 3) each. The specific force is that of a body at rest in its origin."""
+
+    angular_velocity: Array
+    angular_acceleration: Array
+    specific_force: Array
+
+    def shifted(self, jet: Array) -> "BaseMotion":
+        """The motion with errors (9,)."""
+        turning, hurry, force = jet.reshape(-1, 3)
+        return BaseMotion(self.angular_velocity + turning, self.angular_acceleration + hurry, self.specific_force + force)
+
+
+@dataclass(frozen=True)
 class Motion:
-    """The platform's motion in {1} at N times: (N, 3) each, the rotation (N, 3, 3) maps {2} to {1}."""
+    """The platform's motion in {1} at N times: (N, 3) each, the rotation (N, 3, 3) maps {2} to {1}. {1} may move itself."""
 
     position: Array
     rotation: Array
@@ -37,10 +57,23 @@ class Motion:
     angular_velocity: Array
     acceleration: Array
     angular_acceleration: Array
+    base: BaseMotion | None = None
+
+    @property
+    def unknowns(self) -> int:
+        """The number of its errors."""
+        return JET if self.base is None else JET + BASE_JET
+
+    def part(self, steps: slice) -> "Motion":
+        """The motion at some of the times."""
+        base = self.base and BaseMotion(*(each[steps] for each in vars(self.base).values()))
+        return replace(self, **{name: each[steps] for name, each in vars(self).items() if name != "base"}, base=base)
 
     def shifted(self, jet: Array) -> "Motion":
-        """The motion with a pose error (18,) that changes: `exp(error) rotation`, and its two derivatives to first order."""
-        position, rotation, velocity, turning, acceleration, hurry = jet.reshape(POSE, 3)
+        """The motion with a pose error (18,) that changes: `exp(error) rotation`, and its two derivatives to first order; with
+        those of the base's motion (9,), if it moves, behind it.
+        """
+        position, rotation, velocity, turning, acceleration, hurry = jet[:JET].reshape(POSE, 3)
         omega = self.angular_velocity
         return Motion(
             self.position + position,
@@ -49,22 +82,23 @@ class Motion:
             omega + turning + np.cross(rotation, omega),
             self.acceleration + acceleration,
             self.angular_acceleration + hurry + np.cross(turning, omega) + np.cross(rotation, self.angular_acceleration),
+            self.base and self.base.shifted(jet[JET:]),
         )
 
 
 class Signals(NamedTuple):
-    """What is measured on n legs and the platform, whose IMU is the last, without any error; and where the IMUs are."""
+    """What K IMUs measure on n legs, the platform and, if it moves, the base, without any error; and where the IMUs are."""
 
-    angular_velocity: Array  # (N, n + 1, 3) [rad/s], in each IMU's axes
-    specific_force: Array  # (N, n + 1, 3) [m/s^2], likewise
+    angular_velocity: Array  # (N, K, 3) [rad/s], in each IMU's axes
+    specific_force: Array  # (N, K, 3) [m/s^2], likewise
     lengths: Array  # (N, n) [m]
     leg_rates: Array  # (N, n) [m/s]
-    axes: Array  # (N, n + 1, 3, 3), from each IMU's axes to {1}
-    places: Array  # (N, n + 1, 3) [m], in {1}
-    velocities: Array  # (N, n + 1, 3) [m/s], in {1}
+    axes: Array  # (N, K, 3, 3), from each IMU's axes to {1}
+    places: Array  # (N, K, 3) [m], in {1}
+    velocities: Array  # (N, K, 3) [m/s], in {1}
 
     def data(self) -> Array:
-        """(N, 7 n + 6): angular velocity and specific force IMU by IMU, then the rates of the legs."""
+        """(N, 6 K + n): angular velocity and specific force IMU by IMU, then the rates of the legs."""
         imus = np.concatenate([self.angular_velocity, self.specific_force], axis=2).reshape(len(self.leg_rates), -1)
         return np.concatenate([imus, self.leg_rates], axis=1)
 
@@ -103,8 +137,15 @@ def motion_along(target: Target, mechanism: Mechanism, times: Array) -> Motion:
     )
 
 
+def base_motion_along(motions: Sequence[Record], mechanism: Mechanism, times: Array) -> BaseMotion:
+    """The motion of a base under motions (dtype `plant.dynamics.base_course.BASE_MOTION`) at times (N,) [s]."""
+    turn, omega, alpha, acceleration = np.moveaxis(base_motions_at(motions, times).reshape(-1, 4, 3), 1, 0)
+    gravity = mechanism.plant["gravity"] @ Rotation.from_rotvec(turn).as_matrix()
+    return BaseMotion(omega, alpha, acceleration - gravity)
+
+
 def signals(mechanism: Mechanism, motion: Motion) -> Signals:
-    """The signals along a motion, on a base that stands still."""
+    """The signals along a motion."""
     arms = np.einsum("nij,kj->nki", motion.rotation, mechanism.platform_joints)
     omega, alpha = motion.angular_velocity[:, None], motion.angular_acceleration[:, None]
     turned = np.cross(omega, arms)
@@ -130,16 +171,34 @@ def signals(mechanism: Mechanism, motion: Motion) -> Signals:
     force = _seen(axes, speeding) + np.cross(own_alpha, levers) + np.cross(own_omega, np.cross(own_omega, levers))
     places = origin + np.einsum("nkij,kj->nki", axes, levers)
     velocities = moving + np.einsum("nkij,nkj->nki", axes, np.cross(own_omega, levers))
-    return Signals(own_omega, force, lengths, rates, axes, places, velocities)
+    still = Signals(own_omega, force, lengths, rates, axes, places, velocities)
+    return still if motion.base is None else _on_moving_base(mechanism, motion.base, still)
+
+
+def _on_moving_base(mechanism: Mechanism, base: BaseMotion, still: Signals) -> Signals:
+    """The signals on a base that moves, from those on one that stands still."""
+    gravity, zero = mechanism.plant["gravity"], np.zeros((len(still.lengths), 1, 3))
+    place = zero + mechanism.plant_parameters()["base_imu_position"]
+    places, velocities = np.concatenate([still.places, place], axis=1), np.concatenate([still.velocities, zero], axis=1)
+    axes = np.concatenate([still.axes, np.broadcast_to(np.eye(3), (len(zero), 1, 3, 3))], axis=1)
+    omega, alpha, force = (each[:, None] for each in vars(base).values())
+    added = force + gravity + np.cross(alpha, places) + np.cross(omega, np.cross(omega, places) + 2.0 * velocities)
+    return still._replace(
+        angular_velocity=np.concatenate([still.angular_velocity, zero], axis=1) + _seen(axes, omega),
+        specific_force=np.concatenate([still.specific_force, zero - gravity], axis=1) + _seen(axes, added),
+        axes=axes,
+        places=places,
+        velocities=velocities,
+    )
 
 
 def sensitivity(mechanism: Mechanism, motion: Motion, data: Callable[[Signals], Array] = Signals.data) -> Array:
     """The derivative (N, m, 18) of data (N, m) of the signals with respect to a pose error and its two derivatives, by central
-    differences.
+    differences; on a base that moves (N, m, 27), with respect to the errors of its motion, too.
     """
-    derivative = np.empty((len(motion.position), data(signals(mechanism, motion)).shape[1], JET))
-    for i in range(JET):
-        step = np.zeros(JET)
+    derivative = np.empty((len(motion.position), data(signals(mechanism, motion)).shape[1], motion.unknowns))
+    for i in range(motion.unknowns):
+        step = np.zeros(motion.unknowns)
         step[i] = 1e-5
         ahead, behind = (data(signals(mechanism, motion.shifted(sign * step))) for sign in (1.0, -1.0))
         derivative[:, :, i] = (ahead - behind) / 2e-5

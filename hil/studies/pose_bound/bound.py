@@ -5,9 +5,10 @@ are needed, as the model is linear along the true motion. No estimate that is li
 error, whatever the distribution of the errors.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
+from operator import methodcaller
 from typing import Any
 
 import numpy as np
@@ -21,13 +22,16 @@ from hil.engine.engine import IN_ONE_PROCESS, Engine
 from hil.progress import Progress, no_progress
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import SimulationStoppedError, simulate
-from hil.studies.detectability.kinematics import POSE, Motion, motion_along
+from hil.studies.detectability.kinematics import POSE, Motion, base_motion_along, motion_along
 from hil.studies.pose_bound.model import STEP_S, LinearModel, Setup
 from hil.table import Table
+from plant.compiled import Record
+from plant.dynamics.base_course import placed
 from plant.encoders import load_encoder
 from plant.errors import InputError
 from plant.imu import load_imu
-from plant.imu_wiring import PLATFORM_IMU
+from plant.imu_disturbances import BASE_PREFIX
+from plant.imu_wiring import BASE_IMU, PLATFORM_IMU
 from plant.mechanism import load_in_space
 from plant.pose import Array, pose_errors
 
@@ -56,14 +60,13 @@ class PoseBound:
         n = int(np.argmin(np.abs(self.times - time)))
         return float(self.position[n]), float(self.rotation[n])
 
-    @property
-    def over_the_motion(self) -> tuple[float, float]:
-        """The roots of the mean squares from the begin of the motion on [m, rad]."""
-        return _rms(self.position[self.times > 0.0]), _rms(self.rotation[self.times > 0.0])
+    def over_the_motion(self, begin: float = 0.0) -> tuple[float, float]:
+        """The roots of the mean squares from a time of the motion on [m, rad]."""
+        return _rms(self.position[self.times > begin]), _rms(self.rotation[self.times > begin])
 
 
 def find_bound(config: SimulationConfig) -> PoseBound:
-    """The bound of a configuration's mechanism, IMUs, magnetometer, encoders, target, duration and calibration.
+    """The bound of a configuration's mechanism, IMUs, magnetometer, encoders, target, duration, calibration and base's motion.
 
     Raises:
         GoughError: something in the configuration cannot be used.
@@ -73,9 +76,11 @@ def find_bound(config: SimulationConfig) -> PoseBound:
     mechanism = mechanism.moved_joints(calibration.joints[:, : mechanism.legs])
     if config.magnetometer and (PLATFORM_IMU not in config.imus or mechanism.planar):
         raise InputError("the magnetometer is part of the platform's IMU of a mechanism in space: add IMU 6, or leave it out")
+    _check_base(config, calibration)
+    imus = imus_of(mechanism, config.imus)
     setup = Setup(
         mechanism,
-        imus_of(mechanism, config.imus),
+        (*imus, BASE_IMU) if config.base_imu else imus,
         load_imu(config.imu),
         rate=config.rate,
         magnetometer=config.magnetometer,
@@ -83,21 +88,44 @@ def find_bound(config: SimulationConfig) -> PoseBound:
         calibration=calibration,
         joint_error=config.joint_error,
     )
-    if not setup.imus and setup.encoder is None:
+    if not imus and setup.encoder is None:
         raise InputError("there is no sensor: name IMUs with --imus, or encoders with --lengths")
-    return bound_of(
-        setup, config.target, config.duration, control_settings(mechanism).hold if config.hold is None else config.hold
-    )
+    hold = control_settings(mechanism).hold if config.hold is None else config.hold
+    return bound_of(setup, config.target, config.duration, hold, config.base_motions)
 
 
-def bound_of(setup: Setup, target: str = "hold", duration: float = 1.0, hold: float = 0.0) -> PoseBound:
+def _check_base(config: SimulationConfig, calibration: Calibration) -> None:
+    """Refuse what the bound has no model of."""
+    others = [text for text in config.faults if not text.startswith(BASE_PREFIX)]
+    if others:
+        raise InputError(f"the bound is that of sensors in order, and {others[0]!r} is a fault of some: leave it out")
+    if config.base_motions and not config.base_imu:
+        raise InputError("the base moves, and a loop without an IMU on it takes it to rest: add --base-imu")
+    if config.base_imu and config.magnetometer:
+        raise InputError(
+            "the field of the earth turns in the frame of a base that moves: leave out --magnetometer or --base-imu"
+        )
+    if config.base_imu and calibration.covariance is not None:
+        raise InputError(
+            f"{config.calibration} does not say how well the IMU on the base is known: leave out --calibration or --base-imu"
+        )
+
+
+def bound_of(
+    setup: Setup, target: str = "hold", duration: float = 1.0, hold: float = 0.0, base_motions: Sequence[Record] = ()
+) -> PoseBound:
     """The bound of a setup along a target of so many seconds, before which the platform stands for `hold` [s].
+
+    `base_motions` have the dtype `plant.dynamics.base_course.BASE_MOTION`, with times that count from the begin of the target.
 
     Raises:
         GoughError: the target cannot be used.
     """
     times = STEP_S * (np.arange(max(1, round((hold + duration) / STEP_S))) + 0.5) - hold
     motion = motion_along(load_target(target, setup.mechanism, duration), setup.mechanism, times)
+    if setup.base_moves:
+        moved = [placed(each, hold) for each in base_motions]
+        motion = replace(motion, base=base_motion_along(moved, setup.mechanism, times + hold))
     covariances = pose_covariances(LinearModel(setup), motion)
     variances = np.diagonal(covariances, axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=2) + setup.calibration.floor**2
     return PoseBound(times + 0.5 * STEP_S, *np.sqrt(variances).T)
@@ -107,7 +135,7 @@ def pose_covariances(model: LinearModel, motion: Motion) -> Array:
     """The covariances (N, 6, 6) of the pose, given all data until each of the N steps of a motion."""
     found, covariance = np.empty((len(motion.position), POSE, POSE)), model.prior
     for first in range(0, len(found), _PART):
-        part = Motion(*(each[first : first + _PART] for each in vars(motion).values()))
+        part = motion.part(slice(first, first + _PART))
         for n, (seen, kept) in enumerate(zip(model.seen(part), model.kept(part), strict=True), start=first):
             across = seen @ covariance
             root = np.linalg.cholesky(across @ seen.T + np.diag(model.noise))
@@ -133,15 +161,14 @@ class Measured:
     rotation: Array
     stopped: tuple[str, ...]
 
-    @property
-    def at_the_end(self) -> tuple[float, float]:
-        """RMS over the seeds [m, rad]."""
-        return _rms(self.position[:, -1]), _rms(self.rotation[:, -1])
+    def at(self, time: float) -> tuple[float, float]:
+        """RMS over the seeds at a time [s]: position [m] and rotation [rad]."""
+        n = int(np.argmin(np.abs(self.times - time)))
+        return _rms(self.position[:, n]), _rms(self.rotation[:, n])
 
-    @property
-    def over_the_motion(self) -> tuple[float, float]:
-        """RMS over seeds and motion [m, rad]."""
-        return _rms(self.position), _rms(self.rotation)
+    def over_the_motion(self, begin: float = 0.0) -> tuple[float, float]:
+        """RMS over seeds and motion, from a time of it on [m, rad]."""
+        return _rms(self.position[:, self.times > begin]), _rms(self.rotation[:, self.times > begin])
 
 
 def measure(
@@ -186,10 +213,24 @@ def _rms(errors: Array) -> float:
     return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
 
 
-def ratios(bound: PoseBound, measured: Measured) -> dict[str, float]:
-    """The measured errors over the bound: position and rotation, at the end and over the motion."""
-    pairs = {"end": (measured.at_the_end, bound.at(bound.times[-1]))}
-    pairs["motion"] = (measured.over_the_motion, bound.over_the_motion)
+def check_since(config: SimulationConfig, since: float | None) -> None:
+    """Check a time of the motion from which errors are to count [s].
+
+    Raises:
+        InputError: it is not within the motion.
+    """
+    if since is not None and not 0.0 <= since <= config.duration - STEP_S:
+        raise InputError(
+            f"--since {since:g} is not within the motion of {config.duration:g} s: choose less, or a longer --duration"
+        )
+
+
+def ratios(bound: PoseBound, measured: Measured, since: float | None = None) -> dict[str, float]:
+    """The measured errors over the bound: position and rotation, at the end, over the motion, and from a time of it on [s]."""
+    end = float(bound.times[-1])
+    pairs = {"end": (measured.at(end), bound.at(end)), "motion": (measured.over_the_motion(), bound.over_the_motion())}
+    if since is not None:
+        pairs["since"] = measured.over_the_motion(since), bound.over_the_motion(since)
     return {
         f"{name}_{when}": found / least
         for when, each in pairs.items()
@@ -197,18 +238,21 @@ def ratios(bound: PoseBound, measured: Measured) -> dict[str, float]:
     }
 
 
-def summary(config: SimulationConfig, bound: PoseBound, measured: Measured | None) -> dict[str, Any]:
+def summary(
+    config: SimulationConfig, bound: PoseBound, measured: Measured | None, since: float | None = None
+) -> dict[str, Any]:  # fmt: skip
     """Everything, for JSON, in SI units."""
-    found: dict[str, Any] = {"config": asdict(config), "version": version("gough"), "bound": vars(bound)}
+    found: dict[str, Any] = {"config": asdict(config), "version": version("gough"), "bound": vars(bound), "since": since}
     if measured is not None:
+        position, rotation = measured.over_the_motion()
         found["measured"] = {
             "seeds": len(measured.position),
             "position_end": measured.position[:, -1],
             "rotation_end": measured.rotation[:, -1],
-            "position_rms": measured.over_the_motion[0],
-            "rotation_rms": measured.over_the_motion[1],
+            "position_rms": position,
+            "rotation_rms": rotation,
             "stopped": measured.stopped,
-            "over_bound": ratios(bound, measured),
+            "over_bound": ratios(bound, measured, since),
         }
     return found
 
@@ -221,20 +265,27 @@ def text(errors: tuple[float, float]) -> str:
     return f"{1e3 * position:.3f} / {np.degrees(rotation):.3f}"
 
 
-def table(bound: PoseBound, measured: Measured | None = None, moments: Sequence[float] = (0.1, 1.0, 10.0)) -> Table:
-    """The bound at some moments, at the end and over the motion, in mm and deg; beside it what was measured, and the ratio."""
+def table(
+    bound: PoseBound,
+    measured: Measured | None = None,
+    since: float | None = None,
+    moments: Sequence[float] = (0.1, 1.0, 10.0),
+) -> Table:
+    """The bound at some moments, at the end, over the motion, and from a time of it on [s], in mm and deg; beside it what was
+    measured, and the ratio.
+    """
     made = Table("standard deviation [mm / deg]", "bound", *(["measured", "over the bound"] if measured else []))
     end = float(bound.times[-1])
-    at = {f"after {moment:g} s": moment for moment in moments if moment < end - STEP_S}
-    rows = {name: bound.at(moment) for name, moment in at.items()}
-    rows |= {f"at the end, {end:g} s": bound.at(end), "over the motion": bound.over_the_motion}
-    for name, least in rows.items():
-        cells = [name, text(least)]
+    rows: dict[str, Callable[[PoseBound | Measured], tuple[float, float]]] = {
+        f"after {moment:g} s": methodcaller("at", moment) for moment in moments if moment < end - STEP_S
+    }
+    rows |= {f"at the end, {end:g} s": methodcaller("at", end), "over the motion": methodcaller("over_the_motion")}
+    if since is not None:
+        rows[f"from {since:g} s on"] = methodcaller("over_the_motion", since)
+    for name, errors in rows.items():
+        cells = [name, text(least := errors(bound))]
         if measured is not None:
-            found = measured.over_the_motion
-            if not name.startswith("over"):
-                n = int(np.argmin(np.abs(measured.times - at.get(name, end))))
-                found = _rms(measured.position[:, n]), _rms(measured.rotation[:, n])
+            found = errors(measured)
             cells += [text(found), " / ".join(f"{each / bounded:.2f}" for each, bounded in zip(found, least, strict=True))]
         made.add(*cells)
     return made

@@ -1,8 +1,9 @@
 """What is not known while a set of sensors measures a pose, as a linear model along the true motion: y = H x + n.
 
-The unknowns x are the pose's error with its rate and second derivative; the errors of each IMU and of the magnetometer; of each
-encoder its zero, the error of its lead, and what play and steps do to its reading; and, where they are not exact, joints and
-vertical. The data y are the means of all readings over each step. `docs/pose_bound.md` says how large each unknown is.
+The unknowns x are the pose's error with its rate and second derivative; those of a base that may move, its angular velocity,
+angular acceleration and specific force; the errors of each IMU and of the magnetometer; of each encoder its zero, the error of
+its lead, and what play and steps do to its reading; and, where they are not exact, joints and vertical. The data y are the
+means of all readings over each step. `docs/pose_bound.md` says how large each unknown is.
 
 A sensor that is added here has rows of its own in `LinearModel.seen`, and its errors are one more block of unknowns.
 """
@@ -17,10 +18,10 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from controller.calibration.file import Calibration
-from hil.studies.detectability.kinematics import JET, POSE, Motion, Signals, sensitivity, signals
+from hil.studies.detectability.kinematics import BASE_JET, JET, POSE, Motion, Signals, sensitivity, signals
 from plant.encoders import EncoderModel
 from plant.imu.model import ImuModel, SensorErrors
-from plant.imu_wiring import IMU_COUNT, PLATFORM_IMU
+from plant.imu_wiring import BASE_IMU, IMU_COUNT, PLATFORM_IMU
 from plant.mechanism import Mechanism
 from plant.pose import Array, rotation_from_vector
 
@@ -28,9 +29,9 @@ STEP_S = 0.02
 """Duration of a step."""
 
 JERK, ANGULAR_JERK = 0.2, 1.0
-"""White noise of the platform's jerk, RMS in a bandwidth of 1 Hz [m/s^3, rad/s^3]. The motion is free within 8 Hz, which is
-what steps of 20 ms can show; what is faster, gyroscopes tell by themselves. With 6 m/s^3 and 35 rad/s^3 and steps of 1 ms, the
-bounds are 1 to 3 % greater.
+"""White noise of the jerk of platform and base, RMS in a bandwidth of 1 Hz [m/s^3, rad/s^3]. The motion is free within 8 Hz,
+which is what steps of 20 ms can show; what is faster, gyroscopes tell by themselves. With 6 m/s^3 and 35 rad/s^3 and steps of
+1 ms, the bounds are 1 to 3 % greater.
 """
 
 PLAY_S = 0.5
@@ -42,9 +43,13 @@ ERRORS = 21
 _START = np.repeat([0.1, 0.5, 0.1, 0.5, 1.0, 5.0], 3)
 """Standard deviations of the pose's error and its derivatives before any data: nothing says where the platform is."""
 
+_BASE_START = np.repeat([0.5, 5.0, 10.0], 3)
+"""The same of the base's angular velocity [rad/s], angular acceleration [rad/s^2] and specific force [m/s^2]."""
+
 _FREE_ZERO_M = 0.05
 """Standard deviation of where an incremental encoder begins to count [m]."""
 
+_BASE_RATE, _BASE_HURRY, _BASE_FORCE = (slice(JET + i, JET + i + 3) for i in (0, 3, 6))
 _OUT_OF_PLANE = np.array([2, 3, 4])
 _ALIGNMENT = 12
 _MOVE = 1e-6
@@ -59,7 +64,7 @@ class Setup:
 
     Attributes:
         mechanism: as the loop knows it.
-        imus: which there are, 0-5 on the legs and 6 on the platform.
+        imus: which there are, 0-5 on the legs, 6 on the platform, and 7 on the base, which may move then.
         imu: their kind.
         rate: of the loop's samples [Hz].
         magnetometer: whether the platform's is read.
@@ -82,7 +87,13 @@ class Setup:
     @property
     def rows_of_imus(self) -> list[int]:
         """The rows of the present IMUs in `Signals`."""
-        return [self.mechanism.legs if imu == PLATFORM_IMU else imu for imu in self.imus]
+        behind = self.mechanism.legs - PLATFORM_IMU
+        return [imu + behind if imu >= PLATFORM_IMU else imu for imu in self.imus]
+
+    @property
+    def base_moves(self) -> bool:
+        """Whether the base may move, as there is an IMU on it."""
+        return BASE_IMU in self.imus
 
     @property
     def legs_with_encoder(self) -> list[int]:
@@ -94,9 +105,14 @@ class Setup:
 
 @dataclass(frozen=True, eq=False)
 class LinearModel:
-    """The linear model of a setup; `seen` gives H along a motion."""
+    """The linear model of a setup; `seen` gives H along a motion, which has the base's if there is an IMU on it."""
 
     setup: Setup
+
+    @property
+    def _motion(self) -> int:
+        """The unknowns of the motions; those of sensors and rig are behind them."""
+        return JET + BASE_JET if self.setup.base_moves else JET
 
     @cached_property
     def prior(self) -> Array:
@@ -104,7 +120,8 @@ class LinearModel:
         jet: Array = np.reshape(_START**2, (-1, POSE))
         if self.setup.mechanism.planar:
             jet[:, _OUT_OF_PLANE] = 0.0
-        blocks = [np.diag(jet.ravel()), self._fixed, np.diag(self._field_prior), np.diag(self._length_prior)]
+        motion = np.concatenate([jet.ravel(), _BASE_START**2])[: self._motion]
+        blocks = [np.diag(motion), self._fixed, np.diag(self._field_prior), np.diag(self._length_prior)]
         return np.asarray(block_diag(*(block for block in blocks if block.size)))
 
     @cached_property
@@ -125,6 +142,8 @@ class LinearModel:
         for i in range(3):
             for j in range(i, 3):
                 made[POSE * i : POSE * (i + 1), POSE * j : POSE * (j + 1)] = powers[j - i] * np.eye(POSE)
+        if self.setup.base_moves:
+            made[_BASE_RATE, _BASE_HURRY] = STEP_S * np.eye(3)
         return made
 
     @cached_property
@@ -137,9 +156,15 @@ class LinearModel:
             block = STEP_S**power / divisor * np.diag(free)
             made[POSE * i : POSE * (i + 1), POSE * j : POSE * (j + 1)] = block
             made[POSE * j : POSE * (j + 1), POSE * i : POSE * (i + 1)] = block
+        if self.setup.base_moves:
+            for one, other, power, divisor in (
+                (_BASE_RATE, _BASE_RATE, 3, 3), (_BASE_RATE, _BASE_HURRY, 2, 2), (_BASE_HURRY, _BASE_HURRY, 1, 1)
+            ):  # fmt: skip
+                made[one, other] = made[other, one] = ANGULAR_JERK**2 * STEP_S**power / divisor * np.eye(3)
+            made[_BASE_FORCE, _BASE_FORCE] = JERK**2 * STEP_S * np.eye(3)
         drift = np.zeros(ERRORS)
         drift[:6] = np.repeat([self.setup.imu.gyroscope.drift, self.setup.imu.accelerometer.drift], 3)
-        imus = slice(JET, JET + len(self._kept))
+        imus = slice(self._motion, self._motion + len(self._kept))
         made[imus, imus] = STEP_S * np.diag(np.tile(drift**2, len(self.setup.imus))[self._kept])
         return made
 
@@ -166,24 +191,24 @@ class LinearModel:
 
     def seen(self, motion: Motion) -> Array:
         """(N, rows, S): the derivative of the data by the unknowns at N times."""
-        mechanism, data = self.setup.mechanism, self._data
+        mechanism, data, first = self.setup.mechanism, self._data, self._motion
         ideal = signals(mechanism, motion)
         made = np.zeros((len(motion.position), len(self.noise), len(self.prior)))
-        made[:, :, :JET] = sensitivity(mechanism, motion, data)
+        made[:, :, :first] = sensitivity(mechanism, motion, data)
         imus = 6 * len(self.setup.imus)
-        made[:, :imus, JET : JET + len(self._kept)] = self._errors_of_imus(ideal)
-        start, row = JET + len(self._kept), imus
+        made[:, :imus, first : first + len(self._kept)] = self._errors_of_imus(ideal)
+        start, row = first + len(self._kept), imus
         for i, moved in enumerate(self._moved_rigs):
             ahead, behind = (data(signals(moved(size), motion)) for size in (_MOVE, -_MOVE))
             made[:, :, start + i] = (ahead - behind) / (2.0 * _MOVE)
-        start = JET + len(self._fixed)
+        start = first + len(self._fixed)
         if self.setup.magnetometer:
             bias, scale, axes, alignment = _errors_of_sensor(self._field(ideal))
             made[:, row : row + 3, start : start + 9] = np.concatenate([bias, scale, axes], axis=2)
             every = np.zeros((len(bias), 3, ERRORS * len(self.setup.imus)))
             at = ERRORS * self.setup.imus.index(PLATFORM_IMU) + _ALIGNMENT
             every[:, :, at : at + 3] = alignment
-            made[:, row : row + 3, JET : JET + len(self._kept)] = every[:, :, self._kept]
+            made[:, row : row + 3, first : first + len(self._kept)] = every[:, :, self._kept]
             start, row = start + 9, row + 3
         if self.setup.encoder is not None:
             legs = len(self.setup.legs_with_encoder)

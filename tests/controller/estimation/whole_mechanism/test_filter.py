@@ -23,6 +23,7 @@ from controller.estimation.whole_mechanism.readings import (
     READINGS_SCRATCH,
     RIG_ERRORS,
     TILT,
+    find_frames,
     predict_readings,
 )
 from controller.inverse_kinematics import leg_lengths
@@ -127,7 +128,8 @@ def test_at_rest_it_does_not_drift(hexapod):
 class Twin:
     """The same filter with dense matrices and one joint update.
 
-    In place of an encoder's zero it has what the encoder would read at the pose without play: a reading is linear in that.
+    In place of an encoder's zero it has what the encoder would read at the pose without play: a reading is linear in that. The
+    noise of the base's IMU makes the noise of all readings one full matrix.
     """
 
     def __init__(self, parameters, mechanism, errors, position, rotation, twist):
@@ -140,7 +142,8 @@ class Twin:
         self.errors, self.time = np.zeros((7, ERRORS)), 0.0
         kept = [*(k * ERRORS + i for k in range(7) for i in range(self.n)), *range(ALL_ERRORS, ALL_ERRORS + len(self.rig))]
         self.encoders, self.play = 6 * int(parameters["lengths"] > 0), np.zeros(6)
-        self.covariance = np.zeros((18 + len(kept) + 2 * self.encoders,) * 2)
+        self.base, self.base_errors = int(parameters["base"]), np.zeros(6)
+        self.covariance = np.zeros((18 + len(kept) + 2 * self.encoders + self.base,) * 2)
         self.covariance[:18, :18] = np.diag(np.repeat(np.square([0.01, 0.05, 0.1, 0.5, 5.0, 50.0]), 3))
         self.covariance[18 : 18 + len(kept), 18 : 18 + len(kept)] = parameters["prior"][np.ix_(kept, kept)]
         if self.encoders:
@@ -148,6 +151,8 @@ class Twin:
             self.covariance[self.first :, self.first :] = np.diag(np.repeat(parameters["length_prior"], 6))
             self.read, gradient = self.lengths()
             self.shift_readings(gradient)
+        if self.base:
+            self.covariance[-6:, -6:] = np.diag(np.repeat(parameters["base_prior"], 3))
 
     def lengths(self):
         """The legs' lengths (6,) at the pose, and their gradients (6, 6) by central differences."""
@@ -210,6 +215,8 @@ class Twin:
             self.play = self.play * left
             for i in range(self.first + 6, self.first + 12):
                 transition[i, i], noise[i, i] = left, self.p["length_prior"][1] * (1.0 - left**2)
+        if self.base:
+            noise[-6:, -6:] = np.diag(np.repeat(self.p["bias_walk"], 3)) * t
         self.covariance = transition @ self.covariance @ transition.T + noise
         self.position = self.position + v * t + a * t * t / 2.0
         self.rotation = rotation_of(turn) @ self.rotation
@@ -246,7 +253,8 @@ class Twin:
         smooth = np.zeros((7, 6))
         predict_readings(self.geometry, self.position, self.rotation, self.smooth, True, smooth, at_smooth, scratch[()])
         predict_readings(self.geometry, self.position, self.rotation, self.motion, False, ideal, at_smooth.copy(), scratch[()])
-        by_rig = self.by_rig()
+        by_rig, frames = self.by_rig(), np.zeros((7, 3, 3))
+        find_frames(self.geometry, self.position, self.rotation, frames)
         rows, innovations, variances = [], [], []
         for k in np.flatnonzero(count):
             matrices, back = self.matrices(self.errors[k])
@@ -263,8 +271,13 @@ class Twin:
                 row[:, 18 + k * self.n : 18 + (k + 1) * self.n] = by_errors[:, : self.n]
                 row[:, 18 + 7 * self.n : 18 + 7 * self.n + len(self.rig)] = matrix @ back @ by_rig[k, part]
                 rows.append(row)
-                of_rig = matrix @ back @ by_rig[k, part] @ self.rig
-                innovations.append(samples[k, part] - matrix @ x - self.errors[k, part] - of_rig)
+                rest = matrix @ back @ by_rig[k, part] @ self.rig
+                if self.base:
+                    of_base = np.zeros((3, 6))
+                    of_base[:, part] = -frames[k]
+                    row[:, -6:] = of_base
+                    rest = rest + of_base @ self.base_errors
+                innovations.append(samples[k, part] - matrix @ x - self.errors[k, part] - rest)
                 ripple = self.p["ripple"] * self.smooth[ACCELERATION] @ self.smooth[ACCELERATION] if sensor == 1 else 0.0
                 variances += [self.p["variance"][sensor] / count[k] + ripple] * 3
         for k in np.flatnonzero(read):
@@ -276,7 +289,10 @@ class Twin:
             innovations.append([readings[k] - self.read[k] - self.play[k] - later[k] * gradient @ self.motion[:2].ravel()])
             variances.append(self.p["length_variance"] / read[k])
         h, innovation = np.vstack(rows), np.concatenate(innovations)
-        gain = np.linalg.solve(h @ self.covariance @ h.T + np.diag(variances), h @ self.covariance).T
+        noise = np.diag(variances)
+        if self.base:
+            noise += h[:, -6:] @ np.diag(np.repeat(self.p["base_variance"], 3) / self.p["window"]) @ h[:, -6:].T
+        gain = np.linalg.solve(h @ self.covariance @ h.T + noise, h @ self.covariance).T
         change = gain @ innovation
         self.covariance = self.covariance - gain @ h @ self.covariance
         self.covariance = (self.covariance + self.covariance.T) / 2.0
@@ -288,24 +304,28 @@ class Twin:
         if self.encoders:
             self.read = self.read + change[self.first : self.first + 6]
             self.play = self.play + change[self.first + 6 :]
+        if self.base:
+            self.base_errors = self.base_errors + change[-6:]
 
 
 @pytest.mark.parametrize(
-    ("errors", "rig", "tolerance"),
+    ("errors", "rig", "base", "tolerance"),
     [
-        ("gyroscopes", False, 1.0),
-        *(pytest.param(name, False, 1.0, marks=pytest.mark.slow) for name in list(BLOCKS)[1:]),
-        pytest.param("axes", True, 300.0, marks=pytest.mark.slow),
+        ("gyroscopes", False, False, 1.0),
+        ("gyroscopes", False, True, 1.0),
+        *(pytest.param(name, False, False, 1.0, marks=pytest.mark.slow) for name in list(BLOCKS)[1:]),
+        pytest.param("accelerometers", False, True, 1.0, marks=pytest.mark.slow),
+        pytest.param("axes", True, False, 300.0, marks=pytest.mark.slow),
     ],
 )
-def test_taken_bit_by_bit_it_equals_its_dense_twin(hexapod, errors, rig, tolerance):
+def test_taken_bit_by_bit_it_equals_its_dense_twin(hexapod, errors, rig, base, tolerance):
     motion = impose(hexapod, "1", 0.5, RATE_HZ, 4)
     random = np.random.default_rng(4)
     samples = motion.signals + random.normal(0.0, 1.0, motion.signals.shape) * np.array([0.002, 0.02, 0.0])[:, None, None]
     used = np.ones((len(samples), 7), np.int64)
     used[103:202, 2] = used[151:251, 6] = 0
     settings = FusionSettings(accelerometer_bias_sigma=0.1, scale_sigma=0.02, alignment_sigma=0.02, axes_sigma=0.02)
-    parameters = filter_parameters(settings, RATE_HZ, errors, None)
+    parameters = filter_parameters(settings, RATE_HZ, errors, None, base=base)
     if rig:
         # Correlated, as rests leave it; the twin's derivatives are differences.
         prior, mixed = (
@@ -340,6 +360,7 @@ def test_taken_bit_by_bit_it_equals_its_dense_twin(hexapod, errors, rig, toleran
             np.testing.assert_allclose(state["motion"], twin.motion, rtol=1e-8, atol=1e-7 * tolerance)
             np.testing.assert_allclose(state["errors"], twin.errors, rtol=0.0, atol=1e-9 * tolerance)
             np.testing.assert_allclose(state["rig"][: len(twin.rig)], twin.rig, rtol=0.0, atol=1e-9)
+            np.testing.assert_allclose(state["base_errors"], twin.base_errors, rtol=0.0, atol=1e-9)
             n = len(twin.covariance)
             scale = np.sqrt(np.diag(twin.covariance))
             difference = (state["covariance"][:n, :n] - twin.covariance) / np.outer(scale, scale)

@@ -45,6 +45,14 @@ def test_noise_and_jerk_are_inflated_where_the_imus_are_not_calibrated(covarianc
     assert found["smoothing"] == 0.03
 
 
+def test_an_imu_on_the_base_has_biases_and_half_of_the_noise_of_a_difference():
+    found, without = (filter_parameters(FUSION, 800.0, "accelerometers", None, base=base) for base in (True, False))
+    assert (int(found["base"]), int(without["base"])) == (6, 0)
+    assert int(found["states"]) - int(without["states"]) == 6 + 6
+    np.testing.assert_allclose(found["base_variance"], found["variance"] / 2.0, rtol=1e-12)
+    np.testing.assert_allclose(found["base_prior"], [0.01, 0.04], rtol=1e-12)
+
+
 def test_without_a_calibration_the_prior_is_that_of_the_settings():
     prior = filter_parameters(FUSION, 800.0, "axes", None)["prior"]
     # Biases of gyroscope and accelerometer, scales of accelerometer and gyroscope, alignment, axes of both.

@@ -1,10 +1,22 @@
 """The signals of a motion against frames that are built without angles and differentiated numerically."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from controller.planning.target import load_target
-from hil.studies.detectability.kinematics import POSE, Motion, motion_along, sensitivity, signals
+from hil.studies.detectability.kinematics import (
+    JET,
+    POSE,
+    BaseMotion,
+    Motion,
+    base_motion_along,
+    motion_along,
+    sensitivity,
+    signals,
+)
+from plant.dynamics.base_course import attitudes_of, base_motion_of_text
 from plant.errors import InputError
 from plant.mechanism import load_spatial
 from plant.pose import rotation_from_vector
@@ -39,11 +51,15 @@ FIRST, SECOND = np.array([1, -8, 0, 8, -1]) / (12 * H), np.array([-1, 16, -30, 1
 """Five-point differences."""
 
 
-def differentiated(mechanism, poses):
-    """The data (48,) in the middle of five poses, by differences of frames and lengths."""
+def differentiated(mechanism, poses, bases=None):
+    """The data (48,) in the middle of five poses, by differences of frames and lengths; (54,) on a base with five poses."""
     imus = [list(frames(mechanism, *pose)) for pose in poses]
-    data = np.empty((7, 6))
-    for k in range(7):
+    if bases is not None:
+        # On the earth; the last IMU is the base's.
+        on_base = [(mechanism.plant["base_imu_position"], np.eye(3))]
+        imus = [[(p + r @ place, r @ axes) for place, axes in each + on_base] for each, (p, r) in zip(imus, bases, strict=True)]
+    data = np.empty((len(imus[0]), 6))
+    for k in range(len(data)):
         places, axes = (np.array([imu[k][i] for imu in imus]) for i in (0, 1))
         spin = axes[2].T @ np.tensordot(FIRST, axes, 1)
         data[k, :3] = spin[2, 1], spin[0, 2], spin[1, 0]
@@ -67,6 +83,20 @@ def motion_of(path, time):
         0.5 * np.array([hurry[2, 1] - hurry[1, 2], hurry[0, 2] - hurry[2, 0], hurry[1, 0] - hurry[0, 1]]),
     )  # fmt: skip
     return Motion(*(np.array(each)[None] for each in (places[2], turns[2], velocity, omega, acceleration, alpha)))
+
+
+def base_motion_of(path, mechanism):
+    """The motion of a base whose pose on the earth follows a path, at time 0."""
+    on_earth = motion_of(path, 0.0)
+    force = on_earth.acceleration - mechanism.plant["gravity"]
+    return BaseMotion(
+        *(each @ on_earth.rotation[0] for each in (on_earth.angular_velocity, on_earth.angular_acceleration, force))
+    )
+
+
+def with_base_imu(mechanism):
+    """A mechanism whose base has its IMU beside the origin of {1}."""
+    return replace(mechanism, plant={**mechanism.plant, "base_imu_position": np.array([0.2, -0.1, 0.05])})
 
 
 def paths(mechanism, count, seed):
@@ -104,6 +134,56 @@ def test_the_sensitivity_is_that_of_paths_with_an_error_that_changes():
             return differentiated(mechanism, [(p + e[:3], rotation_from_vector(e[3:]) @ r) for (p, r), e in poses])
 
         np.testing.assert_allclose(derivative @ jet.ravel(), (bent(1e-5) - bent(-1e-5)) / 2e-5, rtol=2e-4, atol=2e-3)
+
+
+@pytest.mark.parametrize("name", ["hexapod", "6-3-II"])
+def test_signals_on_a_base_that_moves_are_those_of_frames_on_the_earth(name):
+    mechanism = with_base_imu(load_spatial(name))
+    for path, base in zip(paths(mechanism, 4, 4), paths(mechanism, 4, 5), strict=True):
+        motion = replace(motion_of(path, 0.0), base=base_motion_of(base, mechanism))
+        expected = differentiated(mechanism, poses_about(path, 0.0), poses_about(base, 0.0))
+        np.testing.assert_allclose(signals(mechanism, motion).data()[0], expected, rtol=1e-6, atol=1e-5)
+
+
+def test_the_sensitivity_to_a_base_is_that_of_a_base_with_an_error_that_changes():
+    mechanism = with_base_imu(load_spatial("hexapod"))
+    random, path, base = np.random.default_rng(6), next(paths(mechanism, 1, 7)), next(paths(mechanism, 1, 8))
+    motion = replace(motion_of(path, 0.0), base=base_motion_of(base, mechanism))
+    derivative = sensitivity(mechanism, motion)[0, :, JET:]
+    turning, hurry, force = jet = random.normal(size=(3, 3))
+    # A base that turns by exp(e) first: its angular acceleration changes by e'' less e' x omega.
+    growing = hurry + np.cross(turning, motion.base.angular_velocity[0])
+
+    def bent(size):
+        moved = []
+        for (p, r), n in zip(poses_about(base, 0.0), STEPS, strict=True):
+            t, attitude = n * H, pose_at(base, 0.0)[1]
+            turn = size * (turning * t + 0.5 * growing * t * t)
+            moved.append((p + 0.5 * size * t * t * attitude @ force, r @ rotation_from_vector(turn)))
+        return differentiated(mechanism, poses_about(path, 0.0), moved)
+
+    np.testing.assert_allclose(derivative @ jet.ravel(), (bent(1e-4) - bent(-1e-4)) / 2e-4, rtol=2e-4, atol=2e-3)
+
+
+def test_the_motion_of_a_base_is_that_of_its_attitude_and_acceleration():
+    mechanism = load_spatial("hexapod")
+    texts = (
+        "base-tilt,axis=x,size_deg=20,sine_hz=0.7", "base-tilt,axis=z,size_deg=40,ramp_s=1",
+        "base-acceleration,axis=y,size_m_per_s2=2,sine_hz=0.5",
+    )  # fmt: skip
+    motions = [base_motion_of_text(f"{text},at=0") for text in texts]
+    for time in (0.3, 0.8):
+        found = base_motion_along(motions, mechanism, np.array([time]))
+        turns = attitudes_of(motions, time + H * np.array(STEPS))
+        rates = [base_motion_along(motions, mechanism, np.array([time + n * H])).angular_velocity[0] for n in STEPS]
+        spin = turns[2].T @ np.tensordot(FIRST, turns, 1)
+        np.testing.assert_allclose(found.angular_velocity[0], [spin[2, 1], spin[0, 2], spin[1, 0]], atol=1e-8)
+        np.testing.assert_allclose(found.angular_acceleration[0], FIRST @ np.array(rates), atol=1e-7)
+        # After a tenth of a second a sine is there.
+        accelerated = [0.0, 2.0 * np.sin(np.pi * time), 0.0]
+        np.testing.assert_allclose(
+            found.specific_force[0], accelerated - turns[2].T @ mechanism.plant["gravity"], atol=1e-9
+        )  # fmt: skip
 
 
 def test_a_motion_has_the_derivatives_of_its_target_and_stands_before_it_begins():

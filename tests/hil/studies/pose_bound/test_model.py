@@ -9,13 +9,14 @@ from scipy.linalg import block_diag
 
 from controller.calibration.file import Calibration
 from controller.planning.target import load_target
-from hil.studies.detectability.kinematics import motion_along, sensitivity, signals
+from hil.studies.detectability.kinematics import base_motion_along, motion_along, sensitivity, signals
 from hil.studies.pose_bound import model as model_module
 from hil.studies.pose_bound.bound import pose_covariances
 from hil.studies.pose_bound.model import ERRORS, STEP_S, LinearModel, Setup
+from plant.dynamics.base_course import base_motion_of_text
 from plant.encoders import EncoderModel, load_encoder
 from plant.imu import MILLI_G, ImuModel, SensorErrors, imu_state, load_imu
-from plant.imu_wiring import ALL_IMUS
+from plant.imu_wiring import ALL_IMUS, BASE_IMU
 from plant.mechanism import load_in_space
 
 CALIBRATED, INCREMENTAL = load_imu("mpu9150-calibrated"), load_encoder("incremental")
@@ -29,6 +30,16 @@ def hexapod():
 def motion_of(mechanism, steps, target="hold", step=STEP_S, first=0.0):
     times = first + step * (np.arange(steps) + 0.5)
     return motion_along(load_target(target, mechanism, 10.0), mechanism, times)
+
+
+SEA = "base-tilt,axis=x,size_deg=3,sine_hz=0.125", "base-acceleration,axis=z,size_m_per_s2=0.1,sine_hz=0.159"
+ON_BASE = (*ALL_IMUS, BASE_IMU)
+
+
+def on_base(mechanism, motion, *texts):
+    """The same motion on a base that moves, by default one that rests."""
+    times = STEP_S * (np.arange(len(motion.position)) + 0.5)
+    return replace(motion, base=base_motion_along([base_motion_of_text(f"{text},at=0") for text in texts], mechanism, times))
 
 
 def last(setup, steps=20, **motion):
@@ -99,6 +110,47 @@ def test_at_rest_only_biases_of_accelerometers_are_left_in_the_end(hexapod):
     np.testing.assert_allclose(sizes(found), sizes(expected), rtol=0.02)
 
 
+@pytest.mark.parametrize("size", [1e-4, 1.0, 1e3])
+def test_an_imu_on_the_base_tells_its_force_as_well_as_its_bias_allows(hexapod, size):
+    """Biases alone leave those of least squares of 24 forces, three of which are the base's, by pose and the base's force. With
+    the base's known, this is the bound of a base at rest; with a huge bias, that of a base of which nothing is known.
+    """
+    kind = ImuModel("biased", SensorErrors(noise=1e-6), SensorErrors(noise=1e-5, bias=(MILLI_G, MILLI_G)))
+    still = motion_of(hexapod, 1)
+    by_pose = sensitivity(hexapod, still, lambda ideal: ideal.specific_force.reshape(1, -1))[0, :, :6]
+    by_force = np.swapaxes(signals(hexapod, still).axes[0], 1, 2).reshape(21, 3)
+    jacobian = np.block([[by_pose, by_force], [np.zeros((3, 6)), np.eye(3) / size]])
+    model = LinearModel(Setup(hexapod, ON_BASE, kind))
+    model.prior[-3:, -3:] *= size**2
+    found = pose_covariances(model, on_base(hexapod, motion_of(hexapod, 300)))[-1]
+    expected = MILLI_G**2 / 3.0 * np.linalg.inv(jacobian.T @ jacobian)[:6, :6]
+    np.testing.assert_allclose(sizes(found), sizes(expected), rtol=0.03)
+    known = MILLI_G**2 / 3.0 * np.linalg.inv(by_pose.T @ by_pose)
+    assert (size < 0.1) == np.allclose(sizes(expected), sizes(known), rtol=1e-3)
+
+
+def test_with_an_ideal_imu_on_the_base_the_bound_is_that_of_a_base_at_rest(hexapod):
+    """In motion, with the others as they are, if the base turns steadily; and a base that moves is then like one at rest."""
+    still = sizes(last(Setup(hexapod, ALL_IMUS, CALIBRATED), 150, target="sines"))
+    for texts in ((), SEA):
+        model = LinearModel(Setup(hexapod, ON_BASE, CALIBRATED))
+        own = len(model.prior) - (len(model.prior) - 27) // 8
+        model.prior[own:, own:] *= 1e-8
+        model.noise[-6:] *= 1e-4
+        model.driving[18:24, 18:24] *= 1e-6
+        found = pose_covariances(model, on_base(hexapod, motion_of(hexapod, 150, "sines"), *texts))[-1]
+        np.testing.assert_allclose(sizes(found), still, rtol=0.01)
+
+
+def test_an_imu_on_the_base_costs_something_and_is_worth_something(hexapod):
+    """Between a base at rest, and one that the other seven alone know: they feel more than pose and base have unknowns."""
+    still = last(Setup(hexapod, ALL_IMUS, CALIBRATED), 100, target="sines")
+    models = [LinearModel(Setup(hexapod, ON_BASE, CALIBRATED)) for _ in range(2)]
+    models[1].noise[-6:] *= 1e8
+    known, unknown = (pose_covariances(model, on_base(hexapod, motion_of(hexapod, 100, "sines"), *SEA))[-1] for model in models)
+    assert (1.1 * np.array(sizes(still)) < sizes(known)).all() and (1.05 * np.array(sizes(known)) < sizes(unknown)).all()
+
+
 def test_absolute_encoders_alone_leave_their_zeros_and_steps(hexapod):
     encoder = EncoderModel("absolute", absolute=True, resolution=0.0, backlash=0.0, zero=5e-6)
     jacobian = sensitivity(hexapod, motion_of(hexapod, 1), lambda ideal: ideal.lengths)[0, :, :6]
@@ -129,14 +181,21 @@ def test_incremental_encoders_tell_nothing_at_power_on_and_much_in_motion(hexapo
     assert sizes(last(alone, 1))[0] > 50.0
 
 
-def test_steps_of_20_ms_lose_little_of_a_motion_that_is_as_free_as_the_filters_take_it(hexapod, monkeypatch):
-    coarse = sizes(last(Setup(hexapod, ALL_IMUS, CALIBRATED), 25))
+@pytest.mark.parametrize(("imus", "most"), [(ALL_IMUS, 1.06), (ON_BASE, 1.09)])
+def test_steps_of_20_ms_lose_little_of_a_motion_that_is_as_free_as_the_filters_take_it(hexapod, monkeypatch, imus, most):
+    setup = Setup(hexapod, imus, CALIBRATED)
+
+    def found(steps, **step):
+        motion = motion_of(hexapod, steps, **step)
+        return sizes(pose_covariances(LinearModel(setup), on_base(hexapod, motion) if setup.base_moves else motion)[-1])
+
+    coarse = found(25)
     monkeypatch.setattr(model_module, "STEP_S", 1e-3)
     monkeypatch.setattr(model_module, "JERK", 6.0)
     monkeypatch.setattr(model_module, "ANGULAR_JERK", 35.0)
-    fine = sizes(last(Setup(hexapod, ALL_IMUS, CALIBRATED), 500, step=1e-3))
+    fine = found(500, step=1e-3)
     assert coarse[0] < fine[0] < 1.03 * coarse[0]
-    assert coarse[1] < fine[1] < 1.06 * coarse[1]
+    assert coarse[1] < fine[1] < most * coarse[1]
 
 
 def test_joints_that_are_not_exact_cost_what_their_leverage_says(hexapod):
