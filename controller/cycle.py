@@ -49,7 +49,7 @@ from controller.estimation.whole_mechanism.parameters import (
     ripple_at,
 )
 from controller.estimation.whole_mechanism.readings import MOTION_STATES, RIG_ERRORS
-from controller.imu_set import are_few, check_imus, imus_of, length_share, lengths_lead
+from controller.imu_set import are_few, check_imus, imus_of, length_share, lengths_lead, pose_share
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import RANK_TOLERANCE
 from controller.rig import RIG, TIME, elapsed, field_of, rig_parameters
@@ -211,9 +211,11 @@ def cycle_parameters(
         )
     if on_base:
         fusion = base_imu.with_its_noise(fusion)
+    lead = lengths_lead(mechanism, imus, magnetometer, encoder)
     filtered = filter_parameters(
-        fusion, rate, whole, *errors, of_heading, ripple=ripple_at(rate), lengths=encoder is not None, base=on_base
-    )
+        fusion, rate, whole, *errors, of_heading, ripple=ripple_at(rate), lengths=encoder is not None, base=on_base,
+        start_share=1.0 if lead else pose_share(mechanism, fusion, imus, magnetometer),
+    )  # fmt: skip
     prior = filtered["prior"][:ALL_ERRORS, :ALL_ERRORS]
     if on_base and not mechanism.planar:
         prior = prior + base_imu.shared_errors(mechanism, fusion)
@@ -238,7 +240,7 @@ def cycle_parameters(
         rig=rig_parameters(mechanism, rate, control.hold, calibration.tilt),
         imus=imu_health.imu_parameters(present, calibration.gain, calibration.offset, fusion, watched, rate),
         base=base_imu.base_imu_parameters(mechanism, fusion, on_base, calibration.base_gain, calibration.base_offset),
-        encoders=encoders.encoder_parameters(encoder, fusion, mechanism, lengths_lead(mechanism, imus, magnetometer, encoder)),
+        encoders=encoders.encoder_parameters(encoder, fusion, mechanism, lead),
         legs=leg_filter.leg_parameters(fusion, rate),
         platform=platform_filter.platform_parameters(fusion, rate, limits.jerk),
         heading=heading_filter.heading_parameters(fusion, rate, field, magnetometer),
@@ -357,8 +359,9 @@ def run_stages(
                 integrity.restart_integrity(p.integrity, s.integrity)
         t = _mark(m, CycleStage.REFINEMENT, t)
     if first <= CycleStage.MECHANISM < last:
+        standing = s.safety.mode == Mode.IDLE and p.safety.arming.active != 0
         s.pose.found = trust.step_mechanism_filter(
-            p.mechanism, s.mechanism, rig, time, s.imus, s.encoders, s.legs, s.heading, s.pose, s.safety.events
+            p.mechanism, s.mechanism, rig, time, standing, s.imus, s.encoders, s.legs, s.heading, s.pose, s.safety.events
         )  # fmt: skip
         t = _mark(m, CycleStage.MECHANISM, t)
     if first <= CycleStage.INTEGRITY < last:

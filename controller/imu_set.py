@@ -139,14 +139,30 @@ def lengths_lead(
 
 def length_share(mechanism: Mechanism, fusion: FusionSettings, imus: Collection[int], magnetometer: bool = False) -> float:
     """How much less well these IMUs know the lengths of the legs at home than all IMUs do: 1 or more, of the worst leg."""
+    along = inverse_kinematics(mechanism, mechanism.require_home()).jacobian
 
     def worst(*chosen: Any) -> float:
-        rows = np.vstack([rows for rows, _ in measured_rows(mechanism, fusion, *chosen).values()])
-        covariance = np.linalg.pinv(rows.T @ rows, rcond=_SINGULAR, hermitian=True)
-        along = inverse_kinematics(mechanism, mechanism.require_home()).jacobian
+        covariance = _pose_covariance(mechanism, fusion, *chosen)
         return float(np.sqrt(np.einsum("ki,ij,kj->k", along, covariance, along).max()))
 
     return max(1.0, worst(imus, magnetometer) / worst())
+
+
+def pose_share(mechanism: Mechanism, fusion: FusionSettings, imus: Collection[int], magnetometer: bool = False) -> float:
+    """How much less well these IMUs know the pose at home than all IMUs do: 1 or more, of position or rotation."""
+
+    def variances(*chosen: Any) -> Array:
+        covariance = _pose_covariance(mechanism, fusion, *chosen)
+        return np.diag(covariance).reshape(2, 3).sum(axis=1)
+
+    return max(1.0, float(np.sqrt((variances(imus, magnetometer) / variances()).max())))
+
+
+def _pose_covariance(mechanism: Mechanism, fusion: FusionSettings, *chosen: Any) -> Array:
+    """The covariance (6, 6) of the pose at home by least squares, of IMUs chosen as for `measured_rows`."""
+    rows = np.vstack([rows for rows, _ in measured_rows(mechanism, fusion, *chosen).values()])
+    covariance: Array = np.linalg.pinv(rows.T @ rows, rcond=_SINGULAR, hermitian=True)
+    return covariance
 
 
 def encoder_remark(lead: bool) -> str:

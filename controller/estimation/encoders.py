@@ -247,7 +247,8 @@ def _follow_zero(p: Record, s: Record, passed: float, k: int) -> None:
         s.followed_for[k] = np.inf
     s.followed_for[k] += passed
     if s.followed_for[k] < np.inf:
-        change = passed / min(s.followed_for[k], _FORGETTING_S) * s.off[k]
+        # The IMUs' lengths are means over time themselves: the later ones are better, and count more.
+        change = min(1.0, passed / min(0.5 * s.followed_for[k], _FORGETTING_S)) * s.off[k]
         s.zero[k] += change
         s.off[k] -= change
 

@@ -17,6 +17,7 @@ from controller.imu_set import (
     length_share,
     lengths_lead,
     measured_rows,
+    pose_share,
 )
 from controller.inverse_kinematics import inverse_kinematics, sample_workspace
 from controller.settings import FusionSettings
@@ -253,15 +254,19 @@ def test_lengths_that_do_not_determine_the_pose_are_no_remedy(hexapod):
         check_imus(alike, (6,), encoder=ABSOLUTE)
 
 
-def test_few_imus_know_the_lengths_less_well(hexapod):
+def test_few_imus_know_lengths_and_pose_less_well(hexapod):
     """By as much as the standard deviations of simulated least squares at home."""
     fusion, random = FusionSettings(), np.random.default_rng(0)
-    assert length_share(hexapod, fusion, ALL_IMUS) == 1.0
+    assert length_share(hexapod, fusion, ALL_IMUS) == pose_share(hexapod, fusion, ALL_IMUS) == 1.0
 
-    def deviation(imus):
+    def poses(imus):
         rows = np.vstack([rows for rows, _ in measured_rows(hexapod, fusion, imus).values()])
-        poses = np.linalg.lstsq(rows, random.normal(size=(len(rows), 4000)), rcond=None)[0]
-        return (inverse_kinematics(hexapod, hexapod.home).jacobian @ poses).std(axis=1).max()
+        return np.linalg.lstsq(rows, random.normal(size=(len(rows), 4000)), rcond=None)[0]
 
-    assert length_share(hexapod, fusion, (0, 4, 5, 6)) == pytest.approx(deviation((0, 4, 5, 6)) / deviation(ALL_IMUS), rel=0.05)
+    few, many = poses((0, 4, 5, 6)), poses(ALL_IMUS)
+    of_lengths = [(inverse_kinematics(hexapod, hexapod.home).jacobian @ each).std(axis=1).max() for each in (few, many)]
+    assert length_share(hexapod, fusion, (0, 4, 5, 6)) == pytest.approx(of_lengths[0] / of_lengths[1], rel=0.05)
+    for imus, part in (((0, 4, 5, 6), slice(3)), ((1, 2, 3, 4), slice(3, 6))):
+        share = poses(imus)[part].std() / many[part].std()
+        assert pose_share(hexapod, fusion, imus) == pytest.approx(share, rel=0.05)
     assert encoder_remark(False) == "" and "by iteration from home" in encoder_remark(True)

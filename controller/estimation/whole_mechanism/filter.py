@@ -51,13 +51,16 @@ from plant.pose import Array, rotate_by_vector
 from plant.vectors import add, cross, dot, rotate, scale, subtract, vector
 
 _FIRST_SIGMAS = (0.01, 0.05, 0.1, 0.5, 5.0, 50.0)
-"""Uncertainty of the motion at the start: position [m], rotation [rad], and their derivatives."""
+"""Uncertainty of the motion at the start: position [m] and rotation [rad] as all IMUs tell them, and their derivatives."""
 
 _PREPARING_ROWS = 14
 """What prediction costs, in scalar updates."""
 
 _REST_SIGMAS = 3.0
 """Within how many standard deviations of none a motion counts as none."""
+
+_STANDING = 1e-3
+"""How fast a platform may move whose brakes hold, as far as one window tells [m/s, rad/s]."""
 
 _PLAY_LASTS_S = 0.5
 """Time constant of what play does to an encoder's reading [s]."""
@@ -94,7 +97,7 @@ def start_filter(p: Record, f: Record, time: float, position: Array, rotation: A
         for j in range(states):
             f.covariance[i, j] = 0.0
     for i in range(MOTION_STATES):
-        f.covariance[i, i] = _FIRST_SIGMAS[i // 3] ** 2
+        f.covariance[i, i] = ((p.start_share if i < 6 else 1.0) * _FIRST_SIGMAS[i // 3]) ** 2
     for k in range(IMU_COUNT):
         for i in range(p.errors):
             at, known = MOTION_STATES + k * p.errors + i, p.prior[k * ERRORS + i]
@@ -196,6 +199,8 @@ def _begin_update(p: Record, geometry: Record, f: Record) -> None:
     f.row = f.update_step = 0
     if f.field_used != 0:
         _update_heading(p, f)
+    if f.standing != 0:
+        _take_standing(p, f)
     x, smooth = f.motion, f.smooth_motion
     predict_readings(geometry, f.position, f.rotation, smooth, True, f.smooth_predicted, f.jacobian, f.readings_scratch)
     predict_readings(geometry, f.position, f.rotation, x, False, f.predicted, f.jacobian, f.readings_scratch)
@@ -209,6 +214,20 @@ def _begin_update(p: Record, geometry: Record, f: Record) -> None:
         _predict_lengths(geometry, f)
     if p.rig > 0:
         find_rig_jacobian(geometry, f.position, f.rotation, smooth, f.errors, f.jacobian, f.rig_jacobian)
+
+
+@kernel
+def _take_standing(p: Record, f: Record) -> None:
+    """Take for a measurement that the platform does not move.
+
+    Few IMUs hardly tell some motions from the gyroscopes' biases. Taken for motion, these would seem to be information about
+    the pose, on which a motion's readings depend.
+    """
+    for i in range(6, 12):
+        for j in range(p.states):
+            f.gain[j] = f.covariance[j, i]
+        innovation = -f.motion[i // 3 - 2, i % 3] - f.change[i]
+        take_scalar(f.covariance, f.gain, f.change, p.states, innovation, f.covariance[i, i] + _STANDING**2)
 
 
 @kernel

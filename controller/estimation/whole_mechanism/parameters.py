@@ -43,6 +43,7 @@ FILTER_PARAMETERS = record_dtype(
     rig=np.int64,  # estimated errors of the rig
     states=np.int64,  # all states
     smoothing=np.float64,  # time constant of the motion at which the Jacobian is taken; infinite if set from outside [s]
+    start_share=np.float64,  # how much less well the first pose is known than with all IMUs, 1 or more
     jerk=(np.float64, 2),  # spectral densities of the platform's jerk, linear and angular
     bias_walk=(np.float64, 2),  # spectral densities of the biases' walks, gyroscope and accelerometer
     variance=(np.float64, 2),  # of one sample, rate [(rad/s)^2] and force [(m/s^2)^2]
@@ -86,6 +87,7 @@ FILTER_STATE = record_dtype(
     field=(np.float64, 3),  # the magnetometer's last sample [uT]
     field_time=np.float64,
     field_used=np.int64,  # whether the field is still to be taken
+    standing=np.int64,  # whether the platform is known to stand
     heading_offset=np.float64,  # [rad]
     base_errors=(np.float64, BASE_ERRORS),
     frames=(np.float64, (IMU_COUNT, 3, 3)),  # axes of the IMUs in {1}, by rows, at the pose before the update
@@ -121,7 +123,7 @@ FILTER_STATE = record_dtype(
 def filter_parameters(
     fusion: FusionSettings, rate: float, errors: str | None, covariance: Array | None, floor: Array | None = None,
     field: MagneticField | None = None, inflation: float | None = None, ripple: float = 0.0, lengths: bool = False,
-    base: bool = False,
+    base: bool = False, start_share: float = 1.0,
 ) -> Record:  # fmt: skip
     """Constants of the filter.
 
@@ -136,6 +138,7 @@ def filter_parameters(
         inflation: times the noise and the jerk; None for 1 with a covariance, and what the settings say without.
         lengths: whether there are encoders.
         base: whether there is an IMU on the base, which makes half of the noise.
+        start_share: how much less well the first pose is known than with all IMUs, 1 or more.
         ripple: `ripple_at` the loop's rate if drives are commanded at this rate.
 
     Raises:
@@ -166,6 +169,7 @@ def filter_parameters(
         rig=len(known) - ALL_ERRORS,
         states=rest + IMU_COUNT * estimated + lengths * LENGTH_ERRORS + base * 2 * BASE_ERRORS + (field is not None),
         smoothing=_SMOOTHING_S,
+        start_share=start_share,
         jerk=jerk**2,
         bias_walk=(fusion.bias_walk**2, fusion.accelerometer_bias_walk**2),
         variance=noise**2 * rate / 2.0,

@@ -35,9 +35,19 @@ from plant.imu_wiring import IMU_COUNT
 from plant.mechanism import LEGS
 from plant.pose import Array
 
-_START_S, _SETTLING_S, _SETTLING_AGAIN_S = 0.3, 0.3, 1.0
-"""When the filter is started after it was stopped; how long it is not relied upon at first, with the legs at rest, and when it
-has been started again [s].
+_FIRST_S, _START_S, _SETTLING_S, _SETTLING_AGAIN_S = 0.1, 0.3, 0.3, 1.0
+"""When the filter is started with few IMUs, and after it was stopped; how long it is not relied upon at first, with the legs at
+rest, and when it has been started again [s].
+"""
+
+_FAR_OFF = 4.0
+"""With IMUs that know the pose so many times less well than all do, that from the first sample is degrees off, and no place to
+start a filter that is linear about it.
+"""
+
+_OVERRATED = 10.0
+"""Beside such IMUs, the filter with encoders takes a few millimetres of motion for much more than they tell: it states 0.2 deg
+where it is 1 deg off. So it must state so many times less before it is trusted.
 """
 
 _AVERAGE_S = 0.05
@@ -55,9 +65,11 @@ _FAST = 0.1
 PARAMETERS = record_dtype(
     filter=FILTER_PARAMETERS,
     delay=np.float64,  # of the sensors [s]
+    first_cycle=np.int64,  # before which the filter does not start
     start_cycles=np.int64,  # this and the next: the durations above
     settling_cycles=(np.int64, 2),
     disagreement=np.float64,  # of the leg filters with the filter, limit of the mean square [rad^2]
+    known=np.float64,  # variance of the filter's rotation from which on it may be trusted [rad^2]
     smoothing=np.float64,  # share of a cycle's in that mean
 )
 """Constants."""
@@ -84,29 +96,37 @@ STATE = record_dtype(
 
 def trust_parameters(fusion: FusionSettings, rate: float, filter_constants: Record) -> Record:
     """The constants (dtype `PARAMETERS`) in cycles of this rate [Hz], around those of the filter itself."""
+    far_off = filter_constants["start_share"] > _FAR_OFF
+    overrated = _OVERRATED if far_off and filter_constants["lengths"] > 0 else 1.0
     return filled(
         PARAMETERS,
         filter=filter_constants,
         delay=fusion.sensor_delay,
+        first_cycle=round(_FIRST_S * rate) if far_off else 0,
         start_cycles=round(_START_S * rate),
         settling_cycles=(round(_SETTLING_S * rate), round(_SETTLING_AGAIN_S * rate)),
         disagreement=fusion.disagreement**2,
+        known=(fusion.disagreement / overrated) ** 2,
         smoothing=1.0 / max(1.0, _AVERAGE_S * rate),
     )
 
 
 @shared_kernel
 def step_mechanism_filter(
-    p: Record, s: Record, rig: Record, time: Record, imus: Record, encoders: Record, legs: Record, heading: Record,
-    pose: Record, events: Record,
+    p: Record, s: Record, rig: Record, time: Record, standing: bool, imus: Record, encoders: Record, legs: Record,
+    heading: Record, pose: Record, events: Record,
 ) -> bool:  # fmt: skip
-    """Step the filter, and let its pose replace the one in closed form while it is trusted; returns whether there is a pose."""
+    """Step the filter, and let its pose replace the one in closed form while it is trusted; returns whether there is a pose.
+
+    Args:
+        standing: whether the brakes hold the platform.
+    """
     f, found = s.filter, bool(pose.found != 0)
     if p.filter.errors == 0:
         return found
     now = time.cycle * rig.period
     if f.running == 0:
-        if found and time.cycle >= s.due:
+        if found and time.cycle >= max(s.due, p.first_cycle):
             start_filter(p.filter, f, now, pose.position, pose.rotation, pose.twist)
             if p.filter.lengths > 0:
                 start_lengths(f, encoders.zero)
@@ -128,6 +148,7 @@ def step_mechanism_filter(
         accumulate_lengths(f, encoders.reading, encoders.used, now)
     if heading.used != 0 and heading.fresh != 0:
         accumulate_field(f, heading.field, now - p.delay)
+    f.standing = standing and p.filter.start_share > 1.0
     step_filter(p.filter, rig.sensors, f)
     s.closed_position[:] = pose.position
     s.closed_rotation[:] = pose.rotation
@@ -139,7 +160,7 @@ def step_mechanism_filter(
         if s.trusted != 0:
             s.stops += 1
             report_event(events, Cause.FILTER_DISAGREES, -1, np.sqrt(s.disagreement), np.sqrt(p.disagreement))
-    elif s.trusted == 0 and time.cycle >= s.due and _knows_rotation(f, p.disagreement):
+    elif s.trusted == 0 and time.cycle >= s.due and _knows_rotation(f, p.known):
         s.trusted = 1
     if f.running == 0:
         s.trusted = 0

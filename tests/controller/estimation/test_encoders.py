@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from controller.estimation import leg_filter, pose_estimator
-from controller.estimation.encoders import STATE, encoder_parameters, find_pose_by_lengths, screen_encoders
+from controller.estimation.encoders import (
+    STATE,
+    compare_lengths,
+    encoder_parameters,
+    find_pose_by_lengths,
+    move_to_lengths,
+    screen_encoders,
+)
 from controller.inverse_kinematics import inverse_kinematics, leg_lengths, sample_workspace
 from controller.rig import TIME, rig_parameters
 from controller.settings import FusionSettings, sensor_settings
@@ -99,3 +106,22 @@ def test_directions_of_legs_make_up_for_it_too():
     lengths[3:5] = np.nan
     assert bench.find(lengths)
     np.testing.assert_allclose(bench.pose["position"], position, atol=1e-7)
+
+
+def test_a_zero_is_the_mean_of_what_the_imus_say_weighted_by_the_time_before():
+    """Their lengths are means over time themselves, and get better; without new ones the pose stays where the encoders are."""
+    mechanism, encoder = load_in_space("hexapod"), load_encoder("incremental")
+    parameters = encoder_parameters(encoder, sensor_settings(mechanism, load_imu("ideal"), encoder), mechanism)
+    rig, home = rig_parameters(mechanism, 1000.0, 0.2, np.zeros(2)), mechanism.home
+    encoders, pose, time = np.zeros((), STATE), np.zeros((), pose_estimator.STATE), np.zeros((), TIME)
+    pose["information"], pose["factor"] = np.eye(6), np.eye(6)
+    random, heights, readings = np.random.default_rng(4), [], leg_lengths(mechanism, home.position, home.rotation)
+    for _ in range(50):
+        heights.append(random.normal(0.0, 1e-5))
+        pose["position"], pose["rotation"] = home.position + [0.0, 0.0, heights[-1]], home.rotation
+        screen_encoders(parameters[()], encoders[()], 0, readings, np.zeros(LEGS), NO_HOME)
+        compare_lengths(parameters[()], encoders[()], rig[()], pose[()])
+        assert move_to_lengths(parameters[()], encoders[()], rig[()], time[()], pose[()])
+        time["cycle"] += 1
+    expected = np.average(heights, weights=np.arange(50))
+    assert pose["position"][2] - home.position[2] == pytest.approx(expected, rel=1e-3)

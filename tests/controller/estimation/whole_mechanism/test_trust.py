@@ -6,9 +6,11 @@ import pytest
 from controller.cycle import STATE, CycleStage, cycle_parameters
 from controller.estimation.whole_mechanism.filter import extrapolate_covariance
 from controller.estimation.whole_mechanism.trust import find_covariance
+from controller.imu_set import pose_share
 from controller.inverse_kinematics import leg_lengths
 from controller.safety.causes import Cause
 from controller.settings import SafetySettings, control_settings, fusion_settings
+from plant.imu_wiring import ALL_IMUS
 from plant.pose import pose_errors
 from tests.controller.cycles import cycle, run_stages
 from tests.controller.leg_geometry import leg_directions, rotation_of, static_signals
@@ -125,15 +127,17 @@ def test_the_pose_takes_what_is_slow_from_the_filter_and_what_is_fast_from_the_c
 # ------------------------------------------------------------------------------------------------------ its stage alone
 
 
-SETTLING, SETTLING_AGAIN, PATIENCE = 150, 500, 25
-"""Cycles of settling or of waiting for a new start, and the time constant of the leg filters' disagreement."""
+FIRST, SETTLING, SETTLING_AGAIN, PATIENCE = 50, 150, 500, 25
+"""Cycles before few IMUs' first start, of settling or of waiting for a new start, and the time constant of the leg filters'
+disagreement.
+"""
 
 
 class Stage:
     """The stage of the filter alone, at rest at home, with a pose in closed form and leg filters as a test has them."""
 
-    def __init__(self, mechanism, magnetometer=False, **fusion):
-        settings = control_settings(mechanism), fusion_settings(mechanism, **fusion)
+    def __init__(self, mechanism, magnetometer=False, imus=ALL_IMUS, **fusion):
+        settings = control_settings(mechanism), fusion_settings(mechanism, **fusion), imus
         self.parameters = cycle_parameters(mechanism, RATE_HZ, *settings, whole="gyroscopes", magnetometer=magnetometer)
         self.state = np.zeros((), STATE)
         self.home = mechanism.home
@@ -193,6 +197,19 @@ def test_the_filter_starts_with_the_first_pose_and_is_trusted_when_it_has_settle
     np.testing.assert_array_equal(stage.pose["twist"], stage.trust["twist"])
     np.testing.assert_array_equal(stage.pose["acceleration"], stage.trust["acceleration"])
     np.testing.assert_allclose(stage.pose["twist"], 0.0, atol=1e-3)
+
+
+def test_with_fewer_imus_it_starts_when_the_leg_filters_have_settled_and_knows_less(hexapod):
+    imus = 1, 2, 3, 4
+    stage, share = Stage(hexapod, imus=imus), pose_share(hexapod, fusion_settings(hexapod), imus)
+    stage.pose["twist"] = 0.0
+    for _ in range(FIRST + 1):
+        assert stage.stands == (False, False)
+        stage.step()
+    assert stage.stands == (True, False)
+    sigmas = np.sqrt(np.diag(stage.trust["filter"]["published_covariance"]))
+    np.testing.assert_allclose(sigmas[:9], np.repeat([share * 0.01, share * 0.05, 0.1], 3), rtol=1e-12)
+    assert share > 5.0
 
 
 def test_a_filter_that_hardly_knows_its_rotation_is_not_trusted_and_once_trusted_it_stays(hexapod):
