@@ -59,7 +59,12 @@ class PoseBound:
     @property
     def over_the_motion(self) -> tuple[float, float]:
         """The roots of the mean squares from the begin of the motion on [m, rad]."""
-        return _rms(self.position[self.times > 0.0]), _rms(self.rotation[self.times > 0.0])
+        return self.after(0.0)
+
+    def after(self, time: float) -> tuple[float, float]:
+        """The roots of the mean squares after a time [s] [m, rad]."""
+        late = self.times > time
+        return _rms(self.position[late]), _rms(self.rotation[late])
 
 
 def find_bound(config: SimulationConfig) -> PoseBound:

@@ -17,7 +17,7 @@ def test_the_bound_falls_with_time_at_rest_and_faster_in_motion():
     moving = find_bound(SimulationConfig(target="sines", duration=2.0, lengths="incremental"))
     assert (np.diff(still.position) <= 1e-9).all() and still.times[-1] == pytest.approx(2.0)
     assert moving.at(2.0)[0] < 0.7 * still.at(2.0)[0]
-    assert still.over_the_motion[0] > still.at(2.0)[0]
+    assert still.over_the_motion[0] > still.after(1.0)[0] > still.at(2.0)[0]
 
 
 @pytest.mark.parametrize(
