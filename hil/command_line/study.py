@@ -262,10 +262,9 @@ def _print_following(figures: dict[str, Any]) -> None:
 
 
 def _print_encoders(figures: dict[str, Any]) -> None:
-    table = Table(
-        f"{figures['kind']}, {Path(figures['target']).stem}, RMS [mm, deg]",
-        "relative", "worst seed", "absolute", "worst seed", "bound", "over it", "NEES",
-    )  # fmt: skip
+    print(f"closed loop with encoders, {figures['kind']}, {figures['fusion']}, {figures['target']}")
+    headings = ("relative", "worst seed", "absolute", "worst seed", "bound", "over it", "NEES")
+    table = Table("RMS [mm, deg]", *headings)
     for error, each in figures["joints"].items():
         cells = (mm_deg(each[name], which) for name in ("relative", "absolute") for which in ("", "worst_"))
         over = " / ".join(f"{each['over_bound'][key]:.2f}" for key in ("position_rms", "rotation_rms"))

@@ -67,10 +67,8 @@ def test_encoders_tell_more_than_a_longer_motion_without(hexapod):
     lengths[random.random(lengths.shape) < 0.1] = np.nan
     turn = vector_from_rotation(motion.rotations[1] @ motion.rotations[0].T)
     twist = 1000.0 * np.array([*(motion.positions[1] - motion.positions[0]), *turn])
-    start, fusion = (
-        (Pose(motion.positions[0], motion.rotations[0]), twist),
-        sensor_settings(hexapod, RAW, PRESETS["incremental"]),
-    )
+    start = Pose(motion.positions[0], motion.rotations[0]), twist
+    fusion = sensor_settings(hexapod, RAW, PRESETS["incremental"])
     others = rests_of(hexapod, 10, 1, poses=sample_workspace(hexapod, 10, seed=999))
     errors, predicted = [], []
     for read in (lengths, None):

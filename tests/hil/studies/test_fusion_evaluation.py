@@ -96,7 +96,7 @@ def test_a_rig_calibrated_with_its_encoders_is_as_repeatable_as_they_are(tmp_pat
     assert found["relative"]["position_rms"] < 0.03e-3 and found["absolute"]["position_rms"] < 0.1e-3
     assert np.degrees(found["relative"]["rotation_rms"]) < 0.01 and np.degrees(found["absolute"]["rotation_rms"]) < 0.02
     assert 0.1 < found["over_bound"]["position_rms"] < 1.5
-    assert "incremental, sines" in capsys.readouterr().out
+    assert "closed loop with encoders, incremental, whole-alignments, sines" in capsys.readouterr().out
 
 
 @pytest.mark.slow
