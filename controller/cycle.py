@@ -47,8 +47,9 @@ from controller.estimation.whole_mechanism.parameters import (
     MOST_STATES,
     filter_parameters,
     ripple_at,
+    with_biases_for_the_rest,
 )
-from controller.estimation.whole_mechanism.readings import MOTION_STATES, RIG_ERRORS
+from controller.estimation.whole_mechanism.readings import MOTION_STATES, READINGS, RIG_ERRORS, find_frames
 from controller.imu_set import are_few, check_imus, imus_of, length_share, lengths_lead, pose_share
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import RANK_TOLERANCE
@@ -61,7 +62,7 @@ from plant.checks import check_rate
 from plant.compiled import MOST, Limits, Record, filled, kernel, record_dtype, shared_kernel
 from plant.encoders import EncoderModel
 from plant.errors import InputError
-from plant.imu_wiring import ALL_IMUS
+from plant.imu_wiring import ALL_IMUS, IMU_COUNT
 from plant.mechanism import LEGS, Mechanism
 from plant.mechanism.planar import PLANAR_LEGS
 from plant.pose import Array
@@ -202,7 +203,7 @@ def cycle_parameters(
             f"gravity is {gravity:g} m/s2; the accelerometers need at least {_LEAST_GRAVITY:g} to tell a direction"
         )
     present = imus_of(mechanism, imus)
-    errors, of_heading = (calibration.covariance, calibration.floor), field if magnetometer else None
+    of_heading = field if magnetometer else None
     if level and (mechanism.planar or not on_base):
         raise InputError("a target in the level frame needs six legs and an IMU on the base: add --base-imu")
     if on_base and magnetometer:
@@ -211,12 +212,15 @@ def cycle_parameters(
         )
     if on_base:
         fusion = base_imu.with_its_noise(fusion)
+    rig, covariance = rig_parameters(mechanism, rate, control.hold, calibration.tilt), calibration.covariance
+    if whole is not None and covariance is not None:
+        covariance = with_biases_for_the_rest(covariance, whole, _readings_at_home(mechanism, rig["sensors"]))
     lead = lengths_lead(mechanism, imus, magnetometer, encoder)
     filtered = filter_parameters(
-        fusion, rate, whole, *errors, of_heading, ripple=ripple_at(rate), lengths=encoder is not None, base=on_base,
-        start_share=1.0 if lead else pose_share(mechanism, fusion, imus, magnetometer),
+        fusion, rate, whole, covariance, calibration.floor, of_heading, ripple=ripple_at(rate), lengths=encoder is not None,
+        base=on_base, start_share=1.0 if lead else pose_share(mechanism, fusion, imus, magnetometer),
     )  # fmt: skip
-    prior = filtered["prior"][:ALL_ERRORS, :ALL_ERRORS]
+    prior = filtered["prior"][:ALL_ERRORS, :ALL_ERRORS] if calibration.covariance is None else calibration.covariance
     if on_base and not mechanism.planar:
         prior = prior + base_imu.shared_errors(mechanism, fusion)
     able = not _without_evidence(mechanism, rate, section_5)
@@ -237,7 +241,7 @@ def cycle_parameters(
         watched = replace(watched, evidence=np.inf, oscillation=np.inf)
     return filled(
         PARAMETERS,
-        rig=rig_parameters(mechanism, rate, control.hold, calibration.tilt),
+        rig=rig,
         imus=imu_health.imu_parameters(present, calibration.gain, calibration.offset, fusion, watched, rate),
         base=base_imu.base_imu_parameters(mechanism, fusion, on_base, calibration.base_gain, calibration.base_offset),
         encoders=encoders.encoder_parameters(encoder, fusion, mechanism, lead),
@@ -254,6 +258,14 @@ def cycle_parameters(
         pid=pid.pid_parameters(control, limits.velocity),
         safety=safety_stage.safety_parameters(watched, drive_settings or DriveSettings(), mechanism, rate, to_arm),
     )
+
+
+def _readings_at_home(mechanism: Mechanism, geometry: Record) -> Array:
+    """What ideal IMUs read (7, 6) while the platform stands at home; `geometry` has the dtype `SENSOR_GEOMETRY`."""
+    home, readings, axes = mechanism.require_home(), np.zeros((IMU_COUNT, READINGS)), np.zeros((IMU_COUNT, 3, 3))
+    find_frames(geometry[()], home.position, home.rotation, axes)
+    readings[:, 3:] = geometry["gravity"] * axes @ geometry["up_in_base"][0]
+    return readings
 
 
 def evidence_remark(mechanism: Mechanism, rate: float, section_5: bool = False) -> str:
@@ -314,7 +326,7 @@ def run_stages(
                 elapsed(rig, time),
             )  # fmt: skip
         if p.base.present != 0:
-            base_imu.take_base_out(p.base, s.base, rig, time, s.imus, s.legs, p.platform, s.platform, s.pose)
+            base_imu.remove_base_motion(p.base, s.base, rig, time, s.imus, s.legs, p.platform, s.platform, s.pose)
             watch.check_base_imu(p.safety, s.safety, rig, time, s.base, s.reference, s.pid)
         t = _mark(m, CycleStage.SCREENING, t)
     if first <= CycleStage.LEGS < last:

@@ -153,7 +153,7 @@ def pose_share(mechanism: Mechanism, fusion: FusionSettings, imus: Collection[in
 
     def variances(*chosen: Any) -> Array:
         covariance = _pose_covariance(mechanism, fusion, *chosen)
-        return np.diag(covariance).reshape(2, 3).sum(axis=1)
+        return np.asarray(np.diag(covariance).reshape(2, 3).sum(axis=1))
 
     return max(1.0, float(np.sqrt((variances(imus, magnetometer) / variances()).max())))
 

@@ -200,13 +200,13 @@ def _find_target(s: Record, rig: Record, base: Record, legs: Array) -> bool:
     legs_at(geometry.base_joints, geometry.platform_joints, s.position, s.rotation, s.arms, s.directions, s.lengths)
     if not motion_of_legs(s.arms, s.directions, s.lengths, legs, s.jacobian, s.twist):
         return False
-    w, turning_faster = subtract(vector(base.fitted[0]), vector(s.bias)), vector(base.fitted[1])
+    w, angular_acceleration = subtract(vector(base.fitted[0]), vector(s.bias)), vector(base.fitted[1])
     place = rotate_back(b, vector(s.position))
     turning = subtract(rotate_back(b, vector(s.twist[0, 3:])), w)
     speed = subtract(rotate_back(b, vector(s.twist[0])), cross(w, place))
-    carried = add(cross(turning_faster, place), cross(w, add(cross(w, place), scale(2.0, speed))))
+    carried = add(cross(angular_acceleration, place), cross(w, add(cross(w, place), scale(2.0, speed))))
     acceleration = subtract(rotate_back(b, vector(s.twist[1])), carried)
-    angular = subtract(rotate_back(b, vector(s.twist[1, 3:])), add(turning_faster, cross(w, turning)))
+    angular = subtract(rotate_back(b, vector(s.twist[1, 3:])), add(angular_acceleration, cross(w, turning)))
     s.seen_position[0], s.seen_position[1], s.seen_position[2] = place
     for j in range(3):
         column = rotate_back(b, (s.rotation[0, j], s.rotation[1, j], s.rotation[2, j]))
@@ -216,9 +216,9 @@ def _find_target(s: Record, rig: Record, base: Record, legs: Array) -> bool:
         d, arm = vector(s.directions[k]), vector(s.arms[k])
         across = cross(turning, arm)
         joint = add(speed, across)
-        pull = add(acceleration, add(cross(angular, arm), cross(turning, across)))
+        joint_acceleration = add(acceleration, add(cross(angular, arm), cross(turning, across)))
         legs[k, 0], legs[k, 1] = s.lengths[k], dot(d, joint)
-        legs[k, 2] = dot(d, pull) + (dot(joint, joint) - legs[k, 1] ** 2) / s.lengths[k]
+        legs[k, 2] = dot(d, joint_acceleration) + (dot(joint, joint) - legs[k, 1] ** 2) / s.lengths[k]
     return True
 
 
@@ -232,10 +232,10 @@ def _follow(p: Record, k: int, target: Array, offset: float, motion: Array, t: f
     inside = min(max(wanted, low), high)
     free = wanted == inside
     rate = target[1] if free else 0.0
-    pull = _BANDWIDTH * (2.0 * (rate - motion[1]) + _BANDWIDTH * (inside - motion[0])) + (target[2] if free else 0.0)
-    pull = min(max(pull, -p.acceleration), p.acceleration)
+    acceleration = _BANDWIDTH * (2.0 * (rate - motion[1]) + _BANDWIDTH * (inside - motion[0])) + (target[2] if free else 0.0)
+    acceleration = min(max(acceleration, -p.acceleration), p.acceleration)
     before = motion[1]
-    motion[1] = min(max(before + t * pull, -p.velocity), p.velocity)
+    motion[1] = min(max(before + t * acceleration, -p.velocity), p.velocity)
     motion[2] = (motion[1] - before) / t
     motion[0] += 0.5 * t * (before + motion[1])
     return float(abs(wanted - motion[0]))

@@ -11,6 +11,7 @@ from math import radians
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
@@ -38,10 +39,9 @@ LEAST_POSES = 5
 
 _MOST_STEPS = 50
 _TILT_STEP = 1e-7
-_LENGTH_STEP = 1e-6
+_JOINT_STEP = 1e-6
 _EXACT_M = 1e-8
 _HOME_SIGMAS = np.array([5e-5, 5e-5, 5e-5, 2e-4, 2e-4, 2e-4])
-_LENGTH_SIGMA = 5e-5
 
 
 @dataclass(frozen=True)
@@ -76,13 +76,27 @@ class Prior:
         return np.concatenate([self.error_sigmas(), np.full(JOINTS, max(self.joints, _EXACT_M)), np.full(TILT, self.tilt)])
 
 
+class MeasuredLengths(NamedTuple):
+    """What encoders read at N rests."""
+
+    values: Array  # (N, 6) [m]
+    covariance: Array  # (N, N) [m^2], of their errors on each leg: an unknown zero is common to all rests of a run
+
+
 @dataclass(frozen=True, eq=False)
 class Rests:
     """Readings of the IMUs at rest, by pose."""
 
     readings: Array  # (N, 7, 6), raw means of rate [rad/s] and force [m/s^2]
     home: bool = False  # whether the first pose is exactly home
-    length_changes: Array | None = None  # (N, 6) [m], of each leg since the first rest, if a rig measures them
+    lengths: MeasuredLengths | None = None  # if a rig measures them
+
+    def part(self, kept: NDArray[np.int64]) -> "Rests":
+        """Some of the rests, by their numbers in ascending order."""
+        lengths = self.lengths
+        if lengths is not None:
+            lengths = MeasuredLengths(lengths.values[kept], lengths.covariance[np.ix_(kept, kept)])
+        return Rests(self.readings[kept], self.home and kept[0] == 0, lengths)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +149,8 @@ def errors_of_base_imu(mechanism: Mechanism, tilt: Array, reading: Array, prior:
         off = (np.concatenate(expected) + errors[:6] - reading) / np.repeat([prior.reading_rate, prior.reading_force], 3)
         return np.concatenate([off, x])
 
-    return sigmas * np.asarray(least_squares(residuals, np.zeros(ERRORS)).x)
+    found: Array = sigmas * least_squares(residuals, np.zeros(ERRORS)).x
+    return found
 
 
 def _ideal_readings(geometry: Record, position: Array, rotation: Array) -> tuple[Array, Array]:
@@ -157,10 +172,17 @@ def _readings_by_rig(mechanism: Mechanism, tilt: Array, position: Array, rotatio
     legs, by_joints = np.arange(LEGS), np.zeros((IMU_COUNT, READINGS, 2, LEGS, 3))
     for side, axis in np.ndindex(2, 3):
         moves = np.zeros((2, LEGS, 3))
-        moves[side, :, axis] = _LENGTH_STEP
+        moves[side, :, axis] = _JOINT_STEP
         moved, _ = _ideal_readings(sensor_geometry(mechanism.moved_joints(moves), tilt), position, rotation)
-        by_joints[legs, :, side, legs, axis] = (moved - ideal)[:LEGS] / _LENGTH_STEP
+        by_joints[legs, :, side, legs, axis] = (moved - ideal)[:LEGS] / _JOINT_STEP
     return np.concatenate([by_joints.reshape(IMU_COUNT, READINGS, JOINTS), by_tilt], axis=2)
+
+
+def _lengths_by_rig(legs: Legs, rotation: Array) -> Array:
+    """The derivative (6, 38) of the lengths by joints and tilt."""
+    every, by_joints = np.arange(LEGS), np.zeros((LEGS, 2, LEGS, 3))
+    by_joints[every, 0, every], by_joints[every, 1, every] = -legs.directions, legs.directions @ rotation
+    return np.hstack([by_joints.reshape(LEGS, JOINTS), np.zeros((LEGS, TILT))])
 
 
 def calibrate_at_rest(mechanism: Mechanism, rests: Rests, prior: Prior = Prior()) -> RestCalibration:
@@ -195,12 +217,16 @@ class _State(NamedTuple):
     tilt: Array
     mechanism: Mechanism
 
+    def legs(self, n: int) -> Legs:
+        """The legs at rest `n`."""
+        return inverse_kinematics(self.mechanism, Pose(self.positions[n], self.rotations[n]))
+
 
 class _Problem:
     """Least squares for the unknowns x: of each rest the translation and the rotation vector from its first pose, then the
     errors (147), each distinct joint (3) and the tilt (2).
 
-    The weighted residuals are those of the readings, of home, of the length changes, and of the prior.
+    The weighted residuals are those of the readings, of home, of the lengths, and of the prior.
     """
 
     def __init__(self, mechanism: Mechanism, rests: Rests, prior: Prior) -> None:
@@ -217,6 +243,8 @@ class _Problem:
         self._sigmas = np.concatenate([prior.error_sigmas(), rig_sigmas])
         own = 6 * self._count
         self._errors, self._rig = slice(own, own + ALL_ERRORS), slice(own + ALL_ERRORS, own + len(self._sigmas))
+        if rests.lengths is not None:
+            self._whiten = np.linalg.inv(np.linalg.cholesky(rests.lengths.covariance))
         # The first poses explain the forces best if the accelerometers have no errors.
         self.start = np.zeros(self._rig.stop)
         self.start[self._errors].reshape(IMU_COUNT, ERRORS)[:, :3] = rests.readings[:, :, :3].mean(axis=0)
@@ -242,18 +270,15 @@ class _Problem:
     def residuals(self, x: Array) -> Array:
         """The weighted residuals (M,)."""
         state = self._state(x)
-        parts = [((self._expected(state) - self._rests.readings) * self._weights).ravel()]
+        parts: list[Array] = [((self._expected(state) - self._rests.readings) * self._weights).ravel()]
         if self._rests.home:
             turn = 0.5 * (state.rotations[0] @ self._home.rotation.T - self._home.rotation @ state.rotations[0].T)
             away = np.array([*(state.positions[0] - self._home.position), turn[2, 1], turn[0, 2], turn[1, 0]])
             parts.append(away / _HOME_SIGMAS)
-        if self._rests.length_changes is not None:
-            lengths = np.array([self._legs(state, n).lengths for n in range(self._count)])
-            parts.append(((lengths - lengths[0] - self._rests.length_changes)[1:] / _LENGTH_SIGMA).ravel())
+        if self._rests.lengths is not None:
+            lengths = np.array([state.legs(n).lengths for n in range(self._count)])
+            parts.append((self._whiten @ (lengths - self._rests.lengths.values)).ravel())
         return np.concatenate([*parts, x[self._errors.start :] / self._sigmas])
-
-    def _legs(self, state: _State, n: int) -> Legs:
-        return inverse_kinematics(self._mechanism, Pose(state.positions[n], state.rotations[n]))
 
     def jacobian(self, x: Array) -> Array:
         """The derivatives (M, size) of the residuals."""
@@ -276,11 +301,13 @@ class _Problem:
         parts = [(rows * self._weights[:, None]).reshape(-1, len(x))]
         if self._rests.home:
             parts.append(np.eye(6, len(x)) / _HOME_SIGMAS[:, None])
-        if self._rests.length_changes is not None:
-            changes = np.zeros((self._count, LEGS, len(x)))
+        if self._rests.lengths is not None:
+            lengths = np.zeros((self._count, LEGS, len(x)))
             for n in range(self._count):
-                changes[n, :, 6 * n : 6 * n + 6] = self._legs(state, n).jacobian / _LENGTH_SIGMA
-            parts.append((changes - changes[0])[1:].reshape(-1, len(x)))
+                legs = state.legs(n)
+                lengths[n, :, 6 * n : 6 * n + 6] = legs.jacobian
+                lengths[n, :, self._rig] = _lengths_by_rig(legs, state.rotations[n]) @ self._rig_of
+            parts.append(np.tensordot(self._whiten, lengths, 1).reshape(-1, len(x)))
         jacobian = np.concatenate([*parts, np.eye(len(self._sigmas), len(x), self._errors.start) / self._sigmas[:, None]])
         for n in range(self._count):
             turn = slice(6 * n + 3, 6 * n + 6)

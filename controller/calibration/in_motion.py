@@ -13,6 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from controller.calibration.at_rest import RestCalibration, pose_covariance, undo
 from controller.calibration.file import Calibration
 from controller.estimation.whole_mechanism.filter import (
+    accumulate_lengths,
     accumulate_sample,
     extrapolate,
     extrapolate_covariance,
@@ -34,6 +35,14 @@ _INFLATION = 1.5
 _GUIDE_SIGMA_S = 0.02  # of the Gaussian low-pass of a motion at which the filter is linearised
 
 
+class Motion(NamedTuple):
+    """What was read in a motion that begins at a pose that is about known."""
+
+    samples: Array  # (N, 3, 7, 3), raw
+    start: tuple[Pose, Array]  # pose and twist (6,) at the first sample
+    lengths: Array | None = None  # (N, 6) [m], by encoders, NaN for none
+
+
 class Track(NamedTuple):
     """Estimates of the whole-mechanism filter."""
 
@@ -46,7 +55,7 @@ class Track(NamedTuple):
 
 def track(
     parameters: Record, geometry: Record, samples: Array, used: NDArray[np.int64], rate: float, delay: float,
-    start: tuple[Pose, Array], guide: Array | None = None,
+    start: tuple[Pose, Array], guide: Array | None = None, lengths: Array | None = None,
 ) -> Track:  # fmt: skip
     """Run the whole-mechanism filter (dtypes `FILTER_PARAMETERS` and `SENSOR_GEOMETRY`) alone.
 
@@ -57,9 +66,12 @@ def track(
         delay: of the sensors [s].
         start: pose and twist (6,) at the first sample.
         guide: (N, 4, 3), motions at which the Jacobian is taken instead of the filter's own, low-passed one.
+        lengths: (N, 6) [m], by encoders, NaN for none.
     """
     shapes, state = ((3,), (3, 3), (4, 3), (6, 6)), np.zeros((), FILTER_STATE)
     positions, rotations, motions, covariances = (np.zeros((len(samples), *shape)) for shape in shapes)
+    if lengths is None:
+        lengths = np.zeros((0, LEGS))
     if guide is None:
         guide = np.zeros((0, 4, 3))
     else:
@@ -69,20 +81,24 @@ def track(
     pose, twist = start
     start_filter(parameters[()], state[()], 0.0, pose.position, pose.rotation, twist)
     run = Track(positions, rotations, motions, covariances, state)
-    _track(parameters[()], geometry[()], state[()], samples, weights, 1.0 / rate, delay, guide, *run[:-1])
+    _track(parameters[()], geometry[()], state[()], samples, weights, 1.0 / rate, delay, guide, lengths, *run[:-1])
     return run
 
 
 @kernel
 def _track(
     parameters: Record, geometry: Record, state: Record, samples: Array, weights: Array, period: float, delay: float,
-    guide: Array, positions: Array, rotations: Array, motions: Array, covariances: Array,
+    guide: Array, lengths: Array, positions: Array, rotations: Array, motions: Array, covariances: Array,
 ) -> None:  # fmt: skip
+    measured = np.zeros(LEGS)
     for i in range(samples.shape[0]):
         if guide.shape[0] > 0:
             state.low_passed[:] = guide[i]
         if i > 0:
             accumulate_sample(state, samples[i], weights[i], i * period - delay)
+            if lengths.shape[0] > 0:
+                measured[:] = np.isfinite(lengths[i])
+                accumulate_lengths(state, lengths[i], measured, i * period)
             step_filter(parameters, geometry, state)
         motion = motions[i].reshape(12)
         extrapolate(state, i * period, positions[i], rotations[i], motion[:6], motion[6:])
@@ -90,7 +106,7 @@ def _track(
 
 
 def calibrate_in_motion(
-    mechanism: Mechanism, found: RestCalibration, samples: Array, rate: float, start: tuple[Pose, Array], fusion: FusionSettings
+    mechanism: Mechanism, found: RestCalibration, motion: Motion, rate: float, fusion: FusionSettings
 ) -> tuple[Calibration, Array]:
     """Improve what was found at rest by a motion.
 
@@ -99,9 +115,9 @@ def calibrate_in_motion(
 
     Args:
         found: by `calibrate_at_rest`, for the same mechanism.
-        samples: (N, 3, 7, 3), raw.
+        motion: with lengths if a rig measures them.
         rate: samples per second [Hz].
-        start: pose and twist (6,) at the first sample.
+        fusion: with the noise, play and zeros of the encoders.
 
     Returns:
         The calibration, and the covariance (185, 185) of the remaining errors of IMUs, joints and tilt.
@@ -109,13 +125,18 @@ def calibrate_in_motion(
     Raises:
         CalibrationError: the filter does not follow the motion.
     """
-    plain, inflated = (filter_parameters(fusion, rate, "axes", found.covariance, inflation=by) for by in (1.0, _INFLATION))
-    used = np.ones((len(samples), IMU_COUNT), np.int64)
+    measured = motion.lengths is not None
+    plain, inflated = (
+        filter_parameters(fusion, rate, "axes", found.covariance, inflation=by, lengths=measured) for by in (1.0, _INFLATION)
+    )
+    used = np.ones((len(motion.samples), IMU_COUNT), np.int64)
     geometry = sensor_geometry(mechanism.moved_joints(found.joints), found.tilt)
-    calibrated, guide = found.calibration().apply(samples), None
+    calibrated, guide = found.calibration().apply(motion.samples), None
     states = []
     for parameters in (plain, plain, inflated):
-        run = track(parameters, geometry, calibrated, used, rate, fusion.sensor_delay, start, guide)
+        run = track(
+            parameters, geometry, calibrated, used, rate, fusion.sensor_delay, motion.start, guide, motion.lengths
+        )  # fmt: skip
         if not (np.isfinite(run.state["errors"]).all() and np.isfinite(run.positions).all()):
             raise CalibrationError("the whole-mechanism filter does not follow the motion: check the calibration at rest")
         guide = gaussian_filter1d(run.motions, _GUIDE_SIGMA_S * rate, axis=0, mode="nearest")

@@ -1,4 +1,4 @@
-"""The IMU on the base: it takes the base's motion out of what the other IMUs read.
+"""The IMU on the base: what the base's motion adds to the readings of the other IMUs is subtracted.
 
 While the base {1} turns with `w` and `w'` and its IMU at p feels the specific force f, an IMU at r that moves with the velocity
 v in {1} reads, beside what its motion in {1} makes,
@@ -175,26 +175,26 @@ def vertical(p: Record, s: Record, rig: Record) -> tuple[Vector, float]:
 
 
 @shared_kernel
-def take_base_out(
+def remove_base_motion(
     p: Record, s: Record, rig: Record, time: Record, imus: Record, legs: Record, platform_parameters: Record, platform: Record,
     pose: Record,
 ) -> None:  # fmt: skip
-    """Take the base's motion out of the samples of all healthy IMUs; without a new reading of it, the last one is held."""
+    """Subtract the base's motion from the samples of all healthy IMUs; without a new reading of it, the last one is held."""
     if s.begun == 0:
         return
     period = elapsed(rig, time)
     known = time.cycle > 0 and pose.found != 0
     for k in range(rig.legs):
         if imus.healthy[k] != 0:
-            _take_out_of_leg(p, s, rig, imus, legs, pose, known, k, period)
+            _remove_from_leg(p, s, rig, imus, legs, pose, known, k, period)
     if imus.healthy[PLATFORM_IMU] != 0:
-        _take_out_of_platform(p, s, rig, imus, pose, known, period)
+        _remove_from_platform(p, s, rig, imus, pose, known, period)
         if imus.used[PLATFORM_IMU] != 0 and time.cycle < _FIRST_CYCLES:
             start_platform(platform_parameters, platform, imus.sample[ACCELEROMETER, PLATFORM_IMU])
 
 
 @kernel
-def _take_out_of_leg(
+def _remove_from_leg(
     p: Record, s: Record, rig: Record, imus: Record, legs: Record, pose: Record, known: bool, k: int, period: float
 ) -> None:  # fmt: skip
     """The leg's attitude is that of its filter; without one, that of the pose, or that in which it feels the base's force."""
@@ -229,11 +229,11 @@ def _take_out_of_leg(
         turning = rotate(s.rotation, (x[2] * cb, x[3], x[2] * sb))
         moving = cross(turning, rotate(s.rotation, vector(sensors.leg_imu_position[k])))
     place = add(vector(sensors.base_joints[k]), rotate(s.rotation, vector(sensors.leg_imu_position[k])))
-    _take_out(p, s, rig, imus, k, place, moving)
+    _remove(p, s, rig, imus, k, place, moving)
 
 
 @kernel
-def _take_out_of_platform(
+def _remove_from_platform(
     p: Record, s: Record, rig: Record, imus: Record, pose: Record, known: bool, period: float
 ) -> None:  # fmt: skip
     """The platform's attitude is that of the pose, or that at home."""
@@ -248,11 +248,11 @@ def _take_out_of_platform(
         s.rotation[:] = p.home_rotation
         origin, velocity, turning = vector(p.home_position), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     arm = rotate(s.rotation, vector(rig.sensors.platform_imu_position))
-    _take_out(p, s, rig, imus, PLATFORM_IMU, add(origin, arm), add(velocity, cross(turning, arm)))
+    _remove(p, s, rig, imus, PLATFORM_IMU, add(origin, arm), add(velocity, cross(turning, arm)))
 
 
 @kernel
-def _take_out(p: Record, s: Record, rig: Record, imus: Record, k: int, place: Vector, velocity: Vector) -> None:
+def _remove(p: Record, s: Record, rig: Record, imus: Record, k: int, place: Vector, velocity: Vector) -> None:
     """Subtract what the base's motion adds to the readings of IMU `k` with the axes `s.rotation` at a place."""
     w, arm = vector(s.rate), subtract(place, vector(p.place))
     force = add(vector(s.force), cross(vector(s.fitted[1]), arm))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from controller.calibration.at_rest import LEAST_POSES, expected_forces, fit_pose, pose_covariance
 from controller.calibration.file import Calibration, split_gain
-from controller.calibration.in_motion import calibrate_in_motion, track
+from controller.calibration.in_motion import Motion, calibrate_in_motion, track
 from controller.estimation.whole_mechanism.imu_errors import ERROR_NAMES
 from controller.estimation.whole_mechanism.parameters import filter_parameters
 from controller.estimation.whole_mechanism.readings import RATE, VELOCITY
@@ -72,9 +72,7 @@ def _fit(data: CalibrationData, calibration: Calibration, kept: NDArray[np.int64
     return positions, rotations, np.array(residuals) * np.sqrt(21.0 / 15.0)
 
 
-def cross_validate(
-    data: CalibrationData, calibration: Calibration, samples: Array, start: tuple[Pose, Array]
-) -> dict[str, dict[str, float]]:
+def cross_validate(data: CalibrationData, calibration: Calibration, motion: Motion) -> dict[str, dict[str, float]]:
     """The accuracy as far as it shows without the truth; empty for too few rests.
 
     `left_out_mg` is the residual at rests that the calibration had not seen, in five parts. `position_rms` and `rotation_rms`
@@ -83,8 +81,7 @@ def cross_validate(
     Args:
         data: with the rests.
         calibration: from all data.
-        samples: (N, 3, 7, 3), of the motion.
-        start: pose and twist (6,) at the first.
+        motion: in which it was found.
     """
     everything = np.arange(len(data.readings))
     if len(everything) < 2 * LEAST_POSES:
@@ -94,17 +91,18 @@ def cross_validate(
         part = data.at_rest(everything[everything % _FOLDS != fold])
         left_out.append(_fit(data, part.calibration(), everything[everything % _FOLDS == fold])[2])
     # The second half of the motion begins where the filter with the whole calibration was.
-    middle = len(samples) // 2
+    middle = len(motion.samples) // 2
     parameters = filter_parameters(data.fusion, data.rate, "axes", calibration.covariance)
-    first = calibration.apply(samples[: middle + 1])
+    first = calibration.apply(motion.samples[: middle + 1])
     used = np.ones((middle + 1, IMU_COUNT), np.int64)
-    way = track(parameters, data.geometry(calibration), first, used, data.rate, data.fusion.sensor_delay, start)
+    way = track(parameters, data.geometry(calibration), first, used, data.rate, data.fusion.sensor_delay, motion.start)
     there = Pose(way.positions[-1], way.rotations[-1]), way.motions[-1, [VELOCITY, RATE]].ravel()
     poses: dict[str, list[Array]] = {"rests": [], "motion": []}
-    parts = ((0, samples[:middle], start), (1, samples[middle:], there))
-    for first_rest, motion, begin in parts:
+    for first_rest, samples, begin in ((0, slice(middle), motion.start), (1, slice(middle, None), there)):
         half = data.at_rest(everything[first_rest::2])
-        moved, _ = calibrate_in_motion(data.mechanism, half, motion, data.rate, begin, data.fusion)
+        lengths = None if motion.lengths is None else motion.lengths[samples]
+        half_motion = Motion(motion.samples[samples], begin, lengths)
+        moved, _ = calibrate_in_motion(data.mechanism, half, half_motion, data.rate, data.fusion)
         poses["rests"] += _fit(data, half.calibration(), everything)[:2]
         poses["motion"] += _fit(data, moved, everything)[:2]
     figures = {name: rms_figures(pose_errors(*each)) for name, each in poses.items()}

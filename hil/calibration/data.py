@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from controller.calibration.at_rest import (
     LEAST_POSES,
+    MeasuredLengths,
     Prior,
     RestCalibration,
     Rests,
@@ -18,13 +19,16 @@ from controller.calibration.at_rest import (
     undo_one,
 )
 from controller.calibration.file import Calibration
+from controller.calibration.in_motion import Motion
 from controller.calibration.mounting_checks import check_alive, check_all_along, check_motion, check_places, check_spread
 from controller.direct_kinematics import poses_from_lengths
 from controller.estimation.whole_mechanism.readings import readings_along
+from controller.inverse_kinematics import inverse_kinematics
 from controller.rig import sensor_geometry
-from controller.settings import sensor_settings
+from controller.settings import FusionSettings, sensor_settings
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
+from plant.encoders import EncoderModel
 from plant.errors import CalibrationError
 from plant.imu import ACCELEROMETER, GYROSCOPE, STANDARD_GRAVITY, load_imu
 from plant.mechanism import LEGS, Mechanism
@@ -39,8 +43,8 @@ _MOST_RATE = np.radians(0.5)
 """Greatest rate of a rest, in means over `_MEAN_S` [rad/s]."""
 _BASE_TURNS, _BASE_TILTS = np.radians(0.2), np.radians(0.2)
 """Greatest rate [rad/s] and tilt [rad] from rest to rest of a base that stands, by its IMU."""
-_LENGTH_NOISE = 5e-5
-"""Standard deviation of the lengths that a simulated rig measures [m]."""
+TO_50_UM = EncoderModel("to 50 um", resolution=0.0, backlash=0.0, noise=5e-5)
+"""What a simulated rig without encoders measures its lengths with, if it is to."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +54,14 @@ class Knowledge:
     Attributes:
         prior: standard deviations of the IMUs' errors and of the base's tilt.
         home: whether the rig's first pose is home exactly.
-        lengths: whether the rig measures the changes of its lengths, by encoders, or in a simulation without them to 50 um.
+        encoder: with which the rig measures its lengths; None if it does not. A simulation without encoders measures with the
+            encoder's noise at every rest.
         known_poses: whether to seek the mounting alone, from planned poses (the paper's section 7).
     """
 
     prior: Prior = field(default_factory=Prior)
     home: bool = False
-    lengths: bool = False
+    encoder: EncoderModel | None = None
     known_poses: bool = False
 
 
@@ -84,12 +89,18 @@ def is_long(rest: slice, rate: float) -> bool:
     return int(rest.stop) - int(rest.start) >= (_SETTLED_S + _SHORTEST_REST_S) * rate
 
 
+def measured_lengths(values: Array, runs: Array, fusion: FusionSettings) -> MeasuredLengths:
+    """Lengths (N, 6) [m] with their covariance, by encoders whose zeros are anew in each of the runs (N,)."""
+    zeros = fusion.length_zero**2 * (runs[:, None] == runs)
+    return MeasuredLengths(values, zeros + (fusion.length_noise**2 + fusion.length_play**2) * np.eye(len(runs)))
+
+
 class CalibrationData:
     """The rests of all runs so far.
 
     Attributes:
         imu: the kind of IMU, a preset's name.
-        fusion: settings of the sensors.
+        fusion: settings of the sensors, the encoders among them.
         zero: (7, 3) [rad/s], the gyroscopes' offsets.
         readings: (R, 7, 6), mean rates and forces of each rest.
         base_readings: (R, 6), the same of an IMU on the base; NaN without one.
@@ -99,10 +110,10 @@ class CalibrationData:
     def __init__(self, mechanism: Mechanism, imu: str, rate: float, knowledge: Knowledge, seed: int) -> None:
         """Start without a rest; `rate` is in Hz, and `seed` that of the noise of measured lengths."""
         self.mechanism, self.imu, self.rate, self.knowledge = mechanism, imu, rate, knowledge
-        self.fusion = sensor_settings(mechanism, load_imu(imu))
+        self.fusion = sensor_settings(mechanism, load_imu(imu), knowledge.encoder)
         self.zero = np.zeros((IMU_COUNT, 3))
         self.readings, self.base_readings = np.zeros((0, IMU_COUNT, 6)), np.zeros((0, 6))
-        self.truth, self._lengths = np.zeros((0, 7)), np.zeros((0, LEGS))
+        self.truth, self._lengths, self._runs = np.zeros((0, 7)), np.zeros((0, LEGS)), np.zeros(0)
         self._random = np.random.default_rng([seed, LEGS])
 
     def begin(self, records: Record, hold: int) -> None:
@@ -115,7 +126,7 @@ class CalibrationData:
         check_alive(samples)
         self.zero = samples[:, GYROSCOPE].mean(axis=0)
         if self.knowledge.home:
-            self._add_rest(records[:hold])
+            self._add(records, [slice(hold)])
 
     def check_places(self, records: Record) -> None:
         """Check that each IMU reads the planned motion of its place."""
@@ -136,21 +147,39 @@ class CalibrationData:
         return [slice(rest.start + settled, rest.stop) for rest in rests if is_long(rest, self.rate)]
 
     def add_rests(self, records: Record) -> None:
-        """Add the rests in records."""
+        """Add the rests in the records of a run."""
         check_all_along(raw_samples(records), self.rate)
-        for rest in self.rests_in(records):
-            self._add_rest(records[rest])
+        self._add(records, self.rests_in(records))
 
-    def _add_rest(self, records: Record) -> None:
-        self._hear_base(records)
-        readings = np.concatenate([records["angular_velocity"], records["specific_force"]], axis=2).mean(axis=0)
-        truth = records["truth"].mean(axis=0)
-        self.readings = np.append(self.readings, readings[None], axis=0)
-        self.truth = np.append(self.truth, truth[None, :7], axis=0)
-        measured = records["length"].mean(axis=0)
-        if not np.isfinite(measured).any():
-            measured = truth[TRUTH_LENGTHS] + self._random.normal(0.0, _LENGTH_NOISE, LEGS)
-        self._lengths = np.append(self._lengths, measured[None], axis=0)
+    def _add(self, records: Record, rests: Sequence[slice]) -> None:
+        lengths, encoder = self._lengths_in(records), self.knowledge.encoder
+        run = 0.0 if encoder is None or encoder.absolute else self._runs.max(initial=0.0) + 1.0
+        for rest in rests:
+            during = records[rest]
+            self._hear_base(during)
+            readings = np.concatenate([during["angular_velocity"], during["specific_force"]], axis=2).mean(axis=0)
+            truth = during["truth"].mean(axis=0)
+            measured = np.full(LEGS, np.nan)
+            if lengths is not None:
+                measured = np.nanmean(lengths[rest], axis=0)
+            elif encoder is not None:
+                measured = truth[TRUTH_LENGTHS] + self._random.normal(0.0, encoder.noise, LEGS)
+            self.readings = np.append(self.readings, readings[None], axis=0)
+            self.truth = np.append(self.truth, truth[None, :7], axis=0)
+            self._lengths = np.append(self._lengths, measured[None], axis=0)
+            self._runs = np.append(self._runs, run)
+
+    def _lengths_in(self, records: Record) -> Array | None:
+        """The lengths (N, 6) [m] by encoders in the records of a run, as if it had begun at home if their zeros are not known;
+        None without encoders.
+        """
+        lengths, encoder = np.asarray(records["length"], float), self.knowledge.encoder
+        read = np.isfinite(lengths).all(axis=1)
+        if encoder is None or not read.any():
+            return None
+        if not encoder.absolute:
+            lengths += inverse_kinematics(self.mechanism, self.mechanism.require_home()).lengths - lengths[read.argmax()]
+        return lengths
 
     def _hear_base(self, records: Record) -> None:
         """Take what an IMU on the base reads while the platform rests.
@@ -193,25 +222,21 @@ class CalibrationData:
         Raises:
             CalibrationError: they are too few or too alike, or there are no lengths.
         """
-        if self.knowledge.lengths and not np.isfinite(self._lengths).all():
+        measured = self.knowledge.encoder is not None
+        if measured and not np.isfinite(self._lengths).all():
             raise CalibrationError("there are no measured lengths in the recording: leave out --length-changes and --encoders")
         if len(self.readings) >= LEAST_POSES:
             check_spread(self.readings[:, :, 3:])
-        changes = self._lengths - self._lengths[:1] if self.knowledge.lengths else None
-        return Rests(self.readings, self.knowledge.home, changes)
+        lengths = measured_lengths(self._lengths, self._runs, self.fusion) if measured else None
+        return Rests(self.readings, self.knowledge.home, lengths)
 
     def at_rest(self, kept: NDArray[np.int64] | None = None) -> RestCalibration:
         """Calibrate by all rests, or by some of them alone."""
-        rests = self.rests
-        if kept is not None:
-            changes = rests.length_changes
-            if changes is not None:
-                changes = changes[kept] - changes[kept[0]]
-            rests = Rests(rests.readings[kept], rests.home and kept[0] == 0, changes)
+        rests = self.rests if kept is None else self.rests.part(kept)
         return calibrate_at_rest(self.mechanism, rests, self.knowledge.prior)
 
-    def longest_motion(self, runs: Sequence[Record], at_rest: RestCalibration) -> tuple[Array, tuple[Pose, Array]]:
-        """The longest motion that begins at rest: its samples (N, 3, 7, 3), and the pose and twist (6,) at the first.
+    def longest_motion(self, runs: Sequence[Record], at_rest: RestCalibration) -> Motion:
+        """The longest motion that begins at rest.
 
         Raises:
             CalibrationError: it is too short.
@@ -235,7 +260,8 @@ class CalibrationData:
         calibration = at_rest.calibration()
         mean = calibration.apply(samples[first:last].mean(axis=0))
         pose = fit_pose(self.geometry(calibration), mean[ACCELEROMETER], self.mechanism.require_home())
-        return samples[last:], (Pose(*pose), np.zeros(6))
+        lengths = self._lengths_in(runs[number])
+        return Motion(samples[last:], (Pose(*pose), np.zeros(6)), None if lengths is None else lengths[whole][last:])
 
     def geometry(self, calibration: Calibration) -> Record:
         """Places of the sensors for the joints and the tilt of a calibration."""

@@ -13,10 +13,12 @@ from controller.calibration.mounting_checks import LEAST_RATE, LEAST_SPREAD, spr
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.motions import EVERYWHERE, REST_S, Box, Poses, rests, shaking
 from controller.planning.target import Target
-from hil.calibration.data import Knowledge
+from controller.settings import sensor_settings
+from hil.calibration.data import Knowledge, measured_lengths
 from hil.calibration.drives import within_drives
 from hil.rigs.kinematic import ideal_signals
 from plant.errors import InputError
+from plant.imu import load_imu
 from plant.mechanism import Mechanism
 from plant.pose import Array, Pose, vector_from_rotation
 
@@ -132,9 +134,12 @@ def _rate(mechanism: Mechanism, target: Target) -> float:
 
 def expected_accuracy(mechanism: Mechanism, resting: Target, knowledge: Knowledge) -> Accuracy:
     """What the poses of `resting` would be worth: the accuracy of poses in the whole workspace after a calibration at them."""
-    lengths = leg_lengths(mechanism, resting.positions, resting.rotations)
-    changes = lengths - lengths[:1] if knowledge.lengths else None
-    found = calibrate_at_rest(mechanism, Rests(_readings(mechanism, resting), knowledge.home, changes), knowledge.prior)
+    lengths = None
+    if knowledge.encoder is not None:
+        exact = leg_lengths(mechanism, resting.positions, resting.rotations)
+        fusion = sensor_settings(mechanism, load_imu("ideal"), knowledge.encoder)
+        lengths = measured_lengths(exact, np.zeros(len(exact)), fusion)
+    found = calibrate_at_rest(mechanism, Rests(_readings(mechanism, resting), knowledge.home, lengths), knowledge.prior)
     _, positions, rotations = rests(mechanism, WIDE_RESTS * REST_S)
     poses = zip(positions, rotations, strict=True)
     covariance = np.mean([pose_covariance(mechanism, found.tilt, pose, found.covariance) for pose in poses], axis=0)

@@ -39,6 +39,7 @@ from hil.runs.names import name_of
 from hil.runs.prepare import prepared_loop
 from hil.runs.simulation import SimulationResult, SimulationStoppedError, simulate
 from plant.compiled import Record
+from plant.encoders import NO_LENGTHS, load_encoder
 from plant.errors import CalibrationError
 from plant.mechanism import Mechanism, load_spatial
 
@@ -190,6 +191,8 @@ def calibrate_recordings(paths: Sequence[Path], knowledge: Knowledge = _NOTHING)
                 raise RecordingError(
                     f"the {name} of {path} is {each.config[name]} and of {paths[0]} {first[name]}: give recordings of one rig"
                 )
+    if knowledge.encoder is not None and (recorded := load_encoder(first.get("lengths", NO_LENGTHS))) is not None:
+        knowledge = replace(knowledge, encoder=recorded)
     data = CalibrationData(load_spatial(first["mechanism"]), first["imu"], first["rate"], knowledge, first["seed"])
     runs = [every_cycle(each.records) for each in recordings]
     data.begin(runs[0], int(recordings[0].constant("rig", "hold_cycles")))
@@ -220,8 +223,8 @@ def finish(
     data: CalibrationData, at_rest: RestCalibration, runs: Sequence[Record], known: Calibration | None, validate: bool = True
 ) -> RigCalibration:
     """Calibrate in the longest motion, and assess every stage; the result is `known` if it is given."""
-    samples, start = data.longest_motion(runs, at_rest)
-    calibration, covariance = calibrate_in_motion(data.mechanism, at_rest, samples, data.rate, start, data.fusion)
+    motion = data.longest_motion(runs, at_rest)
+    calibration, covariance = calibrate_in_motion(data.mechanism, at_rest, motion, data.rate, data.fusion)
     before = np.diag(data.knowledge.prior.sigmas() ** 2)
     cases = {"before": (Calibration(), before)}
     if known is not None:
@@ -230,7 +233,7 @@ def finish(
     cases |= {"rests": (at_rest.calibration(), at_rest.covariance), "motion": (calibration, covariance)}
     summary = assess(data, cases) | {
         "positions": at_rest.positions.tolist(),
-        "validated": cross_validate(data, calibration, samples, start) if validate else {},
+        "validated": cross_validate(data, calibration, motion) if validate else {},
         **constants(calibration, data.knowledge.prior.error_sigmas()),
     }
     about = {

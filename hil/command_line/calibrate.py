@@ -16,7 +16,7 @@ from hil.progress import no_progress
 from hil.realtime.scheduling import RealTimeSettings, keep_to_one_thread
 from hil.runs.config import SimulationConfig
 from hil.table import Table
-from plant.encoders import NO_LENGTHS
+from plant.encoders import load_encoder
 from plant.errors import InputError
 from plant.imu_wiring import ALL_IMUS, BASE_IMU, PLATFORM_IMU
 
@@ -88,7 +88,7 @@ def gough_calibrate_rig(options: Namespace) -> None:
     keep_to_one_thread()
     from controller.calibration.at_rest import Prior
     from controller.calibration.file import save_calibration
-    from hil.calibration.data import Knowledge
+    from hil.calibration.data import TO_50_UM, Knowledge
     from hil.calibration.procedure import FailedCalibrationError, calibrate_recordings, calibrate_rig
 
     if not 0.0 < options.tilt < 45.0:
@@ -106,8 +106,8 @@ def gough_calibrate_rig(options: Namespace) -> None:
             names = ", ".join(f"--{name.replace('_', '-')}" for name in given) or "limits and --resume"
             raise InputError(f"the recordings say what {names} would: leave it out with --recording")
     prior = Prior(tilt=radians(options.tilt), joints=1e-3 * options.joints)
-    lengths = options.changes_of_lengths or config.lengths != NO_LENGTHS
-    knowledge = Knowledge(prior, options.home, lengths, options.known_poses)
+    encoder = load_encoder(config.lengths) or (TO_50_UM if options.changes_of_lengths else None)
+    knowledge = Knowledge(prior, options.home, encoder, options.known_poses)
     if guided:
         result = _guided(options, config, knowledge)
     else:

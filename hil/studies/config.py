@@ -13,8 +13,8 @@ LEARNING_S = 20.0
 """The filters learn for this time [s]; errors count after it."""
 WHOLE_FUSIONS = tuple(name for name, errors in FUSIONS.items() if errors is not None)
 """Names of the whole-mechanism filters."""
-SECTIONS = ("motions", "faults", "start", "drift", "follow", "cost")
-"""Sections of an evaluation."""
+SECTIONS = ("motions", "faults", "start", "drift", "follow", "cost", "encoders")
+"""Sections of an evaluation, of which the last is run only if it is asked for."""
 _SEEDS = (0, 1, 2, 3, 4, 5)
 _RATE = "samples per second, 50 to 4000"
 
@@ -61,7 +61,10 @@ class EvaluationConfig:
     starts: int = option(100, "number of starts in motion")
     still: float = option(600.0, "how long the platform stands still", unit="s")
     target: str = option("sines", "motion or CSV file for a minute in the closed loop")
-    only: tuple[str, ...] = SECTIONS
+    lengths: str = option(
+        "incremental", "encoders of the section 'encoders': incremental, absolute, or a TOML file", metavar="KIND"
+    )
+    only: tuple[str, ...] = SECTIONS[:-1]
 
     def __post_init__(self) -> None:
         name_objects(self)

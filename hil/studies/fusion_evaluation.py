@@ -4,7 +4,7 @@ Every seed is a rig of its own, calibrated by `hil.calibration.procedure` and th
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from itertools import product
@@ -20,15 +20,18 @@ from hil.calibration.procedure import calibrate_rig
 from hil.engine.engine import IN_ONE_PROCESS, Engine
 from hil.progress import Progress
 from hil.runs.config import SimulationConfig
+from hil.runs.names import name_of
 from hil.runs.simulation import simulate
 from hil.studies.config import LEARNING_S, WHOLE_FUSIONS, EvaluationConfig
-from hil.studies.fused_track import LEGS_ALONE, REFINED, WHOLE, PoseTrack, constants, fuse, imposed, pooled, read, track
+from hil.studies.fused_track import LEGS_ALONE, REFINED, RMS, WHOLE, PoseTrack, constants, fuse, imposed, pooled, read, track
+from hil.studies.pose_bound.bound import find_bound
 from plant.compiled import Record
 from plant.dynamics.imposed_motion import impose
 from plant.dynamics.variables import PLATFORM_IMU
+from plant.encoders import load_encoder
 from plant.imu import imu_state, load_imu
 from plant.mechanism import LEGS, Mechanism, load_spatial
-from plant.pose import Array
+from plant.pose import Array, rms_figures
 
 MOTIONS = ("static", "0.5", "1", "2", "mixed")
 _MOTION_S = LEARNING_S + 10.0
@@ -40,6 +43,8 @@ _STARTED_M, _STARTED_RAD = 1e-3, np.radians(0.2)
 _CHUNK_S = 60.0
 _FOLLOW_S, _FOLLOWING = 60.0, "whole"
 _COST_S, _COST_REPEATS = 10.0, 7
+_FOUND_S = 5.0
+"""After this time the zeros of incremental encoders are found, and errors count [s]."""
 _CALIBRATED_IMU = "mpu9150-calibrated"
 
 
@@ -76,13 +81,14 @@ def evaluate(
     """
     figures: dict[str, Any] = {}
     load_imu(config.imu)
+    load_encoder(config.lengths)
     load_spatial(config.mechanism).built(config.joint_error, 0)
     # Before the engine has work, and so before it has other processes.
     cost = {"cost": _of_cost(config, partial(progress, "cost"))} if "cost" in config.only else {}
-    if set(config.only) - {"follow", "cost"}:
+    if set(config.only) - {"follow", "cost", "encoders"}:
         rigs, moved = {}, {}
         for error in dict.fromkeys((0.0, config.joint_error) if "motions" in config.only else (0.0,)):
-            name, joints = f"{error:g}", f"joints {1e3 * error:g} mm off"
+            name, joints = f"{error:g}", _joints(error)
             calibrated = partial(_calibrated, config, error)
             rigs[name] = engine.map(calibrated, config.seeds, partial(progress, f"calibration, {joints}"))
             if "motions" in config.only:
@@ -96,7 +102,18 @@ def evaluate(
         followed = engine.map(partial(_followed, config), config.seeds, partial(progress, "closed loop"))
         about = {"target": config.target, "fusion": _FOLLOWING, "imu": _CALIBRATED_IMU}
         figures["follow"] = about | pooled(followed, worst=True)
+    if "encoders" in config.only:
+        figures["encoders"] = {"kind": config.lengths, "target": config.target, "fusion": config.fusion, "joints": {}}
+        for error in dict.fromkeys((0.0, config.joint_error)):
+            runs = engine.map(
+                partial(_with_encoders, config, error), config.seeds, partial(progress, f"encoders, {_joints(error)}")
+            )
+            figures["encoders"]["joints"][f"{error:g}"] = _of_encoders(runs)
     return figures | cost | {"config": asdict(config), "version": version("gough")}
+
+
+def _joints(error: float) -> str:
+    return f"joints {1e3 * error:g} mm off"
 
 
 def _calibrated(config: EvaluationConfig, joint_error: float, seed: int) -> _Rig:
@@ -201,6 +218,34 @@ def _followed(config: EvaluationConfig, seed: int) -> dict[str, Any]:
     records, truth = run.records[late], PoseTrack(run.true_positions[late], run.true_rotations[late])
     estimates = PoseTrack(records["position"], records["rotation"], covariances=records["covariance"].astype(float))
     return estimates.figures(truth)
+
+
+def _with_encoders(config: EvaluationConfig, joint_error: float, seed: int) -> dict[str, Any]:
+    """Errors in the closed loop of a rig that was calibrated with its encoders: `absolute`, and `relative` without
+    their mean; the `bound` of the absolute ones.
+    """
+    rig = SimulationConfig(
+        config.mechanism, rate=config.rate, imu=config.imu, seed=seed, joint_error=joint_error, lengths=config.lengths
+    )
+    knowledge = Knowledge(Prior(joints=joint_error), encoder=load_encoder(config.lengths))
+    calibration = name_of("calibration", calibrate_rig(rig, knowledge, validate=False).calibration)
+    rig = replace(rig, target=config.target, duration=_FOLLOW_S, fusion=config.fusion, calibration=calibration)
+    run, bound = simulate(rig), find_bound(rig)
+    late = run.times >= _FOUND_S
+    records, truth = run.records[late], PoseTrack(run.true_positions[late], run.true_rotations[late])
+    estimates = PoseTrack(records["position"], records["rotation"], covariances=records["covariance"].astype(float))
+    errors = estimates.errors(truth)
+    return {
+        "absolute": estimates.figures(truth),
+        "relative": rms_figures(errors - errors.mean(axis=0)),
+        "bound": dict(zip(RMS, bound.over_the_motion(_FOUND_S), strict=True)),
+    }
+
+
+def _of_encoders(runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The figures over all rigs, and how many times the bound the absolute errors are."""
+    found: dict[str, Any] = _by_name(runs)
+    return found | {"over_bound": {key: found["absolute"][key] / found["bound"][key] for key in RMS}}
 
 
 def _of_cost(config: EvaluationConfig, progress: Progress) -> dict[str, Any]:

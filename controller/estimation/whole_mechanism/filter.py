@@ -48,7 +48,7 @@ from plant.dynamics.variables import IMU_COUNT
 from plant.imu import ACCELEROMETER
 from plant.mechanism import LEGS
 from plant.pose import Array, rotate_by_vector
-from plant.vectors import add, cross, dot, rotate, scale, subtract, vector
+from plant.vectors import add, cross, dot, rotate, rotate_back, scale, subtract, vector
 
 _FIRST_SIGMAS = (0.01, 0.05, 0.1, 0.5, 5.0, 50.0)
 """Uncertainty of the motion at the start: position [m] and rotation [rad] as all IMUs tell them, and their derivatives."""
@@ -461,7 +461,7 @@ def _forget_play(p: Record, f: Record, period: float) -> None:
 
 @kernel
 def _update_length(p: Record, f: Record, k: int) -> None:
-    """Take the encoder's readings of leg `k` into covariance and change."""
+    """Take the encoder's readings of leg `k` into covariance and change; a joint's error acts along the leg."""
     if f.length_weight[k] == 0.0:
         return
     states, gradient, gain, change, c, later = p.states, f.length_gradient[k], f.gain, f.change, f.covariance, f.length_later[k]
@@ -478,9 +478,19 @@ def _update_length(p: Record, f: Record, k: int) -> None:
         innovation -= weight * change[j]
         for i in range(states):
             gain[i] += weight * c[j, i]
+    at_base, at_platform = vector(gradient), rotate_back(f.rotation, vector(gradient))
+    joints = 6 if p.rig > 0 else 0
+    for j in range(joints):
+        weight, which = -at_base[j] if j < 3 else at_platform[j - 3], rig_state(k, j)
+        at = rig_start(p) + which
+        innovation -= weight * (f.rig[which] + change[at])
+        for i in range(states):
+            gain[i] += weight * c[at, i]
     variance += gain[zero] + gain[play]
     for j in range(12):
         variance += (gradient[j] if j < 6 else later * gradient[j - 6]) * gain[j]
+    for j in range(joints):
+        variance += (-at_base[j] if j < 3 else at_platform[j - 3]) * gain[rig_start(p) + rig_state(k, j)]
     take_scalar(c, gain, change, states, innovation, variance)
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from controller.estimation.whole_mechanism.imu_errors import ERRORS
+from controller.estimation.whole_mechanism.imu_errors import ERRORS, error_gradient
 from controller.estimation.whole_mechanism.readings import MOTION_STATES, READINGS, READINGS_SCRATCH, RIG_ERRORS
 from controller.rig import MagneticField
 from controller.settings import FusionSettings
@@ -191,6 +191,22 @@ def filter_parameters(
         parameters["heading_variance"] = field.heading_variance(fusion, rate)
         parameters["offset_variance"] = fusion.heading_sigma**2
     return parameters
+
+
+def with_biases_for_the_rest(covariance: Array, errors: str, readings: Array) -> Array:
+    """The covariance (147, 147) of the IMUs' errors for a filter that does not estimate all of them: its biases have, besides
+    their own, what the other errors do to these readings (7, 6).
+
+    What a calibration has left of a bias and of a scale cancels at the readings of its poses. Without the scale, the bias alone
+    would be far less certain than their sum.
+    """
+    mixed, gradient, estimated = np.eye(ALL_ERRORS), np.zeros(ERRORS), BLOCKS[errors]
+    for k in range(IMU_COUNT):
+        for m in range(min(estimated, READINGS)):
+            error_gradient(np.zeros(ERRORS), readings[k], m, gradient)
+            mixed[ERRORS * k + m, ERRORS * k + estimated : ERRORS * (k + 1)] = gradient[estimated:]
+    found: Array = mixed @ covariance @ mixed.T
+    return found
 
 
 def ripple_at(rate: float) -> float:

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from controller.calibration.at_rest import (
+    MeasuredLengths,
     Prior,
     Rests,
+    _Problem,
     calibrate_at_rest,
     errors_of_base_imu,
     expected_forces,
@@ -41,14 +43,14 @@ def test_rests_at_unknown_poses_bring_the_error_down(hexapod, seed):
 
 
 @pytest.mark.slow
-def test_a_known_home_and_measured_length_changes_help(hexapod):
+def test_a_known_home_and_measured_lengths_help(hexapod):
     poses = sample_workspace(hexapod, 20, seed=7)
     poses[0][0], poses[1][0] = hexapod.home.position, hexapod.home.rotation
     readings, positions, rotations = rests_of(hexapod, 20, 4, poses=poses)
     lengths = leg_lengths(hexapod, positions, rotations)
     others = rests_of(hexapod, 10, 4, poses=sample_workspace(hexapod, 10, seed=999))
     errors = []
-    for rests in (Rests(readings), Rests(readings, home=True, length_changes=lengths - lengths[0])):
+    for rests in (Rests(readings), Rests(readings, home=True, lengths=measured(lengths, 5e-5))):
         found = calibrate_at_rest(hexapod, rests)
         errors.append(pose_errors(hexapod, found.calibration(), found.tilt, *others)[0])
     assert errors[1] < 0.7 * errors[0]
@@ -174,20 +176,62 @@ def skewed(hexapod):
     return exact_rests(hexapod, errors, poses), poses, errors
 
 
+def measured(lengths, sigma, zero=0.05):
+    """Lengths (N, 6) [m] of one run, by encoders with this noise and these zeros [m]."""
+    return MeasuredLengths(lengths, zero**2 + sigma**2 * np.eye(len(lengths)))
+
+
 def test_a_known_home_and_known_length_changes_bind_the_poses_and_the_joints_stay_in_their_prior(hexapod, skewed):
     readings, (positions, rotations), _ = skewed
     changes = leg_lengths(hexapod, positions, rotations)
+    # What the encoders' zeros are does not matter.
+    lengths = measured(changes + np.random.default_rng(6).normal(0.0, 0.02, 6), 5e-5)
     changes -= changes[0]
     free = calibrate_at_rest(hexapod, Rests(readings))
-    bound = calibrate_at_rest(hexapod, Rests(readings, home=True, length_changes=changes), Prior(joints=1e-4))
+    bound = calibrate_at_rest(hexapod, Rests(readings, home=True, lengths=lengths), Prior(joints=1e-4))
     assert np.linalg.norm(free.positions - positions, axis=1).max() > 3e-4
     np.testing.assert_allclose(bound.positions[0], hexapod.home.position, rtol=0.0, atol=2e-5)
     np.testing.assert_allclose(bound.rotations[0], hexapod.home.rotation, rtol=0.0, atol=1e-4)
-    lengths = leg_lengths(hexapod, bound.positions, bound.rotations)
-    np.testing.assert_allclose(lengths - lengths[0], changes, rtol=0.0, atol=3e-5)
+    found = leg_lengths(hexapod.moved_joints(bound.joints), bound.positions, bound.rotations)
+    np.testing.assert_allclose(found - found[0], changes, rtol=0.0, atol=3e-5)
     np.testing.assert_allclose(bound.positions, positions, rtol=0.0, atol=1e-4)
     assert 0.0 < np.abs(bound.joints).max() < 3e-4 and not np.allclose(bound.joints, 0.0, atol=1e-9)
     assert np.abs(free.joints).max() < 1e-9
+
+
+def test_lengths_with_known_zeros_tell_the_poses_themselves(hexapod, skewed):
+    readings, poses, _ = skewed
+    found = calibrate_at_rest(hexapod, Rests(readings, lengths=measured(leg_lengths(hexapod, *poses), 2e-6, zero=5e-6)))
+    np.testing.assert_allclose(found.positions, poses[0], rtol=0.0, atol=1e-6)
+
+
+def test_a_zero_that_changes_between_two_runs_does_not_matter_if_that_is_known(hexapod, skewed):
+    readings, poses, _ = skewed
+    lengths, runs = leg_lengths(hexapod, *poses), np.arange(8) // 4
+    lengths[4:] += 0.01
+    errors = []
+    for of_zeros in (runs[:, None] == runs, np.ones((8, 8))):
+        known = MeasuredLengths(lengths, 0.05**2 * of_zeros + 1e-5**2 * np.eye(8))
+        found = calibrate_at_rest(hexapod, Rests(readings, lengths=known))
+        errors.append(np.linalg.norm(found.positions - poses[0], axis=1).max())
+    assert errors[0] < 1e-4 < 2e-3 < errors[1]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_derivatives_of_the_residuals_are_their_differences(hexapod, skewed, seed):
+    """At random unknowns, with home, lengths and joints."""
+    random = np.random.default_rng(seed)
+    lengths = measured(leg_lengths(hexapod, *skewed[1]), 5e-5)
+    problem = _Problem(hexapod, Rests(skewed[0], home=True, lengths=lengths), Prior(joints=1e-4))
+    x = problem.start.copy()
+    x[: 6 * 8] = random.normal(0.0, 1e-3, 6 * 8)
+    x[6 * 8 :] += 0.1 * random.normal(size=len(x) - 6 * 8) * problem._sigmas
+    direction = random.normal(size=len(x)) * np.concatenate([np.full(6 * 8, 1e-5), 1e-3 * problem._sigmas])
+    change = (problem.residuals(x + direction) - problem.residuals(x - direction)) / 2.0
+    expected = problem.jacobian(x) @ direction
+    of_lengths = slice(8 * 42 + 6, 8 * 42 + 6 + 48)
+    assert np.linalg.norm(change[of_lengths]) > 0.01
+    np.testing.assert_allclose(change[of_lengths], expected[of_lengths], rtol=0.0, atol=1e-4 * np.abs(expected).max())
 
 
 def test_the_result_explains_the_readings_and_its_residuals_are_read_minus_expected(hexapod, skewed):

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from controller.calibration.at_rest import Prior, Rests, calibrate_at_rest, pose_covariance
-from controller.calibration.in_motion import calibrate_in_motion
+from controller.calibration.in_motion import Motion, calibrate_in_motion
 from controller.estimation.whole_mechanism.imu_errors import ERRORS
 from controller.estimation.whole_mechanism.readings import JOINTS
-from controller.inverse_kinematics import sample_workspace
+from controller.inverse_kinematics import leg_lengths, sample_workspace
 from controller.settings import sensor_settings
 from plant.dynamics.imposed_motion import impose
+from plant.encoders import PRESETS
 from plant.imu import imu_state, measure
 from plant.pose import Pose, vector_from_rotation
 from tests.controller.calibration.rest_readings import RAW, pose_errors, rests_of
@@ -27,7 +28,7 @@ def test_motion_brings_it_to_a_tenth_of_a_millimetre(hexapod):
     turn = (motion.rotations[1] @ motion.rotations[0].T - np.eye(3)) * 1000.0
     velocity = (motion.positions[1] - motion.positions[0]) * 1000.0
     start = Pose(motion.positions[0], motion.rotations[0]), np.array([*velocity, turn[2, 1], turn[0, 2], turn[1, 0]])
-    calibration, covariance = calibrate_in_motion(hexapod, found, samples, 1000.0, start, fusion)
+    calibration, covariance = calibrate_in_motion(hexapod, found, Motion(samples, start), 1000.0, fusion)
     others = rests_of(hexapod, 10, 1, poses=sample_workspace(hexapod, 10, seed=999))
     true = pose_errors(hexapod, calibration, calibration.tilt, *others)
     assert true[0] < 0.5
@@ -52,6 +53,34 @@ def test_motion_brings_it_to_a_tenth_of_a_millimetre(hexapod):
 
 
 @pytest.mark.slow
+def test_encoders_tell_more_than_a_longer_motion_without(hexapod):
+    """With zeros that are centimetres off, and some readings lost."""
+    readings, _, _ = rests_of(hexapod, 20, 1)
+    found = calibrate_at_rest(hexapod, Rests(readings))
+    motion = impose(hexapod, "0.8", 10.0, 1000.0, 3, size=(0.02, np.radians(6.0)))
+    imu, samples = imu_state(RAW, 1, 1e-3), np.zeros_like(motion.signals)
+    for signals, sample in zip(motion.signals, samples, strict=True):
+        measure(imu, signals, sample)
+    random = np.random.default_rng(2)
+    lengths = leg_lengths(hexapod, motion.positions, motion.rotations) + random.normal(0.0, 0.03, 6)
+    lengths = 5e-6 * np.rint(lengths / 5e-6)
+    lengths[random.random(lengths.shape) < 0.1] = np.nan
+    turn = vector_from_rotation(motion.rotations[1] @ motion.rotations[0].T)
+    twist = 1000.0 * np.array([*(motion.positions[1] - motion.positions[0]), *turn])
+    start = Pose(motion.positions[0], motion.rotations[0]), twist
+    fusion = sensor_settings(hexapod, RAW, PRESETS["incremental"])
+    others = rests_of(hexapod, 10, 1, poses=sample_workspace(hexapod, 10, seed=999))
+    errors, predicted = [], []
+    for read in (lengths, None):
+        calibration, covariance = calibrate_in_motion(hexapod, found, Motion(samples, start, read), 1000.0, fusion)
+        errors.append(pose_errors(hexapod, calibration, calibration.tilt, *others)[0])
+        of_poses = [pose_covariance(hexapod, calibration.tilt, pose, covariance) for pose in zip(*others[1:], strict=True)]
+        predicted.append(1e3 * np.sqrt(np.trace(np.mean(of_poses, axis=0)[:3, :3])))
+    assert predicted[0] < 0.7 * predicted[1]
+    assert errors[0] < 0.8 * errors[1] and 0.3 < errors[0] / predicted[0] < 2.5
+
+
+@pytest.mark.slow
 def test_joints_that_are_off_are_sought_with_the_rest(hexapod):
     built, fusion = hexapod.built(2e-4, 3), sensor_settings(hexapod, RAW)
     readings, _, _ = rests_of(built, 20, 1)
@@ -73,7 +102,7 @@ def test_joints_that_are_off_are_sought_with_the_rest(hexapod):
 
     for joints in (0.0, 2e-4):
         found = calibrate_at_rest(hexapod, Rests(readings), Prior(joints=joints))
-        calibration, covariance = calibrate_in_motion(hexapod, found, samples, 1000.0, start, fusion)
+        calibration, covariance = calibrate_in_motion(hexapod, found, Motion(samples, start), 1000.0, fusion)
         known = hexapod.moved_joints(calibration.joints)
         error = 1e-3 * pose_errors(known, calibration, calibration.tilt, *others)[0]
         surprise.append(error / np.sqrt(predicted(known, calibration.tilt, covariance)[:3].sum()))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from controller.cycle import PARAMETERS, STATE
-from controller.estimation.base_imu import base_imu_parameters, hear_base_imu, shared_errors, take_base_out
+from controller.estimation.base_imu import base_imu_parameters, hear_base_imu, shared_errors, remove_base_motion
 from controller.rig import rig_parameters
 from controller.settings import fusion_settings
 from plant.mechanism import load_spatial
@@ -31,7 +31,7 @@ def cycle(mechanism):
 
 
 def take_out(p, s):
-    take_base_out(p["base"], s["base"], p["rig"], s["time"], s["imus"], s["legs"], p["platform"], s["platform"], s["pose"])
+    remove_base_motion(p["base"], s["base"], p["rig"], s["time"], s["imus"], s["legs"], p["platform"], s["platform"], s["pose"])
 
 
 @pytest.mark.parametrize("ages", [(0, 0, 0), (0, 1, 0), (1, 0, 2)])

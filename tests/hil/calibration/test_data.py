@@ -8,10 +8,11 @@ import pytest
 from controller.calibration.file import Calibration
 from controller.inverse_kinematics import leg_lengths
 from hil.calibration import data as calibration_data
-from hil.calibration.data import CalibrationData, Knowledge, find_rests, is_long
+from hil.calibration.data import TO_50_UM, CalibrationData, Knowledge, find_rests, is_long, measured_lengths
 from hil.calibration.procedure import SimulatedRig, every_cycle
 from hil.loop.records import RECORD
 from hil.runs.config import SimulationConfig
+from plant.encoders import PRESETS
 from plant.errors import CalibrationError
 from plant.mechanism import load_spatial
 
@@ -85,24 +86,17 @@ def test_a_rest_is_the_means_of_its_readings_and_what_was_true_then(monkeypatch)
     records, random = phases(2.0, 1.0, 1.5), np.random.default_rng(4)
     for name in ("angular_velocity", "specific_force"):
         records[name] += 1e-4 * random.normal(size=(1, 7, 3))
-    data = new_data(lengths=True)
+    data = new_data(encoder=TO_50_UM)
     data.add_rests(records)
     assert data.readings.shape == (2, 7, 6)
     for rest, found, true in zip((slice(250, 1000), slice(1750, 2250)), data.readings, data.truth, strict=True):
         np.testing.assert_allclose(found[:, :3], records["angular_velocity"][rest].mean(axis=0), rtol=1e-12)
         np.testing.assert_allclose(found[:, 3:], records["specific_force"][rest].mean(axis=0), rtol=1e-12)
         np.testing.assert_allclose(true, records["truth"][rest].mean(axis=0)[:7], rtol=1e-12)
-    # The lengths that a rig measures have a noise of 50 um, and count from the first rest on.
-    changes = data.rests.length_changes
-    noise = changes[1] - (1999.5 - 624.5)
-    assert (changes[0] == 0.0).all() and 1e-6 < np.abs(noise).max() < 5.0 * np.sqrt(2.0) * 5e-5
-    assert new_data().rests.length_changes is None
-    # What encoders read counts as it is.
-    read = records.copy()
-    read["length"] = np.arange(len(records))[:, None]
-    by_encoders = new_data(lengths=True)
-    by_encoders.add_rests(read)
-    np.testing.assert_allclose(by_encoders.rests.length_changes[1], 1999.5 - 624.5)
+    # The lengths that a rig without encoders measures have a noise of 50 um.
+    first, second = data.rests.lengths.values
+    assert 1e-6 < np.abs(second - first - (1999.5 - 624.5)).max() < 5.0 * np.sqrt(2.0) * 5e-5
+    assert new_data().rests.lengths is None
     records["truth"] = np.nan
     data.add_rests(records)
     with pytest.raises(CalibrationError, match="leave out --length-changes"):
@@ -142,18 +136,43 @@ def test_a_base_that_moves_is_told_while_its_imu_is_calibrated(monkeypatch, move
         new_data().add_rests(on_a_base(phases(2.0, 1.0, 1.5), **moved))
 
 
+@pytest.mark.parametrize("kind", ["incremental", "absolute"])
+def test_encoders_count_from_home_in_every_run_unless_their_zeros_are_known(monkeypatch, hexapod, kind):
+    monkeypatch.setattr(calibration_data, "check_all_along", lambda samples, rate: None)
+    monkeypatch.setattr(calibration_data, "check_spread", lambda forces: None)
+    data, encoder, known = new_data(encoder=PRESETS[kind]), PRESETS[kind], kind == "absolute"
+    home = leg_lengths(hexapod, hexapod.home.position, hexapod.home.rotation)
+    for zero in (0.3, 0.5):
+        records = phases(2.0, 1.0, 1.5)
+        records["length"] = zero + 1e-5 * np.arange(len(records))[:, None] + 0.01 * np.arange(6)
+        # Lost readings are none.
+        records["length"][[0, 624, 625], [1, 2, 2]] = np.nan
+        data.add_rests(records)
+    lengths = data.rests.lengths
+    first = [0.3, 0.3, 0.5, 0.5] if known else [0.0] * 4
+    moved = 1e-5 * (np.array([624.5, 1999.5] * 2) - (0 if known else 1))
+    legs = 0.01 * np.arange(6) if known else home
+    np.testing.assert_allclose(lengths.values, np.add.outer(first + moved, legs), atol=2e-8)
+    spread = (0.5 * encoder.backlash) ** 2 + 2.0 * encoder.resolution**2 / 12.0
+    runs = np.zeros(4) if known else np.array([0, 0, 1, 1])
+    zeros = (5e-6 if known else 0.05) ** 2 * (runs[:, None] == runs)
+    np.testing.assert_allclose(lengths.covariance, zeros + spread * np.eye(4), rtol=1e-9)
+
+
 @pytest.mark.parametrize(("kept", "home"), [([0, 2, 3], True), ([1, 3], False), (None, True)])
-def test_parts_of_the_rests_count_from_their_own_first(monkeypatch, kept, home):
+def test_parts_of_the_rests_keep_what_is_known_of_them(monkeypatch, kept, home):
     monkeypatch.setattr(calibration_data, "check_spread", lambda forces: None)
     monkeypatch.setattr(calibration_data, "calibrate_at_rest", lambda mechanism, rests, prior: rests)
-    data = new_data(lengths=True, home=True)
+    data = new_data(encoder=PRESETS["incremental"], home=True)
     data.readings = np.random.default_rng(0).normal(size=(4, 7, 6))
-    data._lengths = np.random.default_rng(1).normal(size=(4, 6))
+    data._lengths, data._runs = np.random.default_rng(1).normal(size=(4, 6)), np.array([1.0, 1.0, 2.0, 2.0])
     rests = data.at_rest(None if kept is None else np.array(kept))
     chosen = kept or [0, 1, 2, 3]
     assert rests.home == home
     np.testing.assert_array_equal(rests.readings, data.readings[chosen])
-    np.testing.assert_allclose(rests.length_changes, data._lengths[chosen] - data._lengths[chosen[0]], atol=1e-15)
+    np.testing.assert_array_equal(rests.lengths.values, data._lengths[chosen])
+    known = measured_lengths(data._lengths[chosen], data._runs[chosen], data.fusion)
+    np.testing.assert_array_equal(rests.lengths.covariance, known.covariance)
 
 
 def longest(monkeypatch, data, runs, calibration):
@@ -163,19 +182,24 @@ def longest(monkeypatch, data, runs, calibration):
     monkeypatch.setattr(
         calibration_data, "fit_pose", lambda geometry, forces, home: fitted.append(forces) or (np.ones(3), np.eye(3))
     )
-    samples, (pose, twist) = data.longest_motion(runs, SimpleNamespace(calibration=lambda: calibration))
+    motion = data.longest_motion(runs, SimpleNamespace(calibration=lambda: calibration))
+    pose, twist = motion.start
     assert (pose.position == 1.0).all() and (twist == 0.0).all() and twist.shape == (6,)
-    return samples, fitted[0]
+    return motion, fitted[0]
 
 
 def test_the_longest_motion_begins_with_the_last_tenth_of_its_rest(monkeypatch):
     runs = [phases(1.0, 12.0, 5.0), phases(2.0, 3.0, 1.6, 14.0, 1.0, 2.0), phases(1.0, 13.0)]
     calibration = Calibration()
     calibration.offset[1] = 0.25
-    samples, forces = longest(monkeypatch, new_data(), runs, calibration)
+    for records in runs:
+        records["length"] = 1e-4 * records["cycle"][:, None]
+    motion, forces = longest(monkeypatch, new_data(encoder=PRESETS["absolute"]), runs, calibration)
+    samples = motion.samples
     # It begins at 6.6 s, and the pose is that of the half second before its last tenth at rest.
     first = round(6.5 * RATE)
     assert samples[0, 1, 0, 0] == first and samples[-1, 1, 0, 0] == round(20.6 * RATE) - 1
+    np.testing.assert_allclose(motion.lengths, 1e-4 * samples[:, 1, :6, 0], rtol=1e-6)
     assert (np.diff(samples[:, 1, 3, 1]) == 1.0).all()
     np.testing.assert_allclose(forces, np.arange(first - 250, first).mean() + 0.25)
 
@@ -187,7 +211,8 @@ def test_a_motion_of_ten_seconds_is_long_enough(monkeypatch, seconds, said):
         with pytest.raises(CalibrationError, match=said):
             longest(monkeypatch, new_data(), runs, Calibration())
     else:
-        assert len(longest(monkeypatch, new_data(), runs, Calibration())[0]) == 5050
+        motion = longest(monkeypatch, new_data(), runs, Calibration())[0]
+        assert len(motion.samples) == 5050 and motion.lengths is None
 
 
 def test_the_planned_poses_are_those_of_the_planned_lengths(hexapod):

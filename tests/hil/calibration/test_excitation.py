@@ -9,7 +9,7 @@ from controller.direct_kinematics import poses_from_lengths
 from controller.planning.motions import EVERYWHERE, Box, rests, shaking
 from controller.planning.offline_planner import plan
 from controller.planning.segments import evaluate_reference
-from hil.calibration.data import Knowledge
+from hil.calibration.data import TO_50_UM, Knowledge
 from hil.calibration.drives import within_drives
 from hil.calibration.excitation import (
     MotionLimits,
@@ -68,7 +68,7 @@ def test_a_box_costs_accuracy_and_one_that_is_too_small_is_refused(hexapod: Mech
     within, best = (
         expected_accuracy(hexapod, calibration_targets(hexapod, box)["rests"], Knowledge()) for box in (BOX, EVERYWHERE)
     )
-    measured = expected_accuracy(hexapod, calibration_targets(hexapod, BOX)["rests"], Knowledge(lengths=True))
+    measured = expected_accuracy(hexapod, calibration_targets(hexapod, BOX)["rests"], Knowledge(encoder=TO_50_UM))
     assert measured.position < 0.7 * within.position, "encoders help"
     assert 1.5 * best.position < within.position < 10.0 * best.position and within.rotation > 1.5 * best.rotation
     for limits, message in (

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from hil.calibration.data import Knowledge
+from hil.calibration.data import TO_50_UM, Knowledge
 from hil.calibration.procedure import calibrate_recordings, calibrate_rig
 from hil.command_line import main
 from hil.loop.records import Link
@@ -94,7 +94,7 @@ def test_recordings_tell_the_same_and_known_poses_less(recorded):
     files = [recorded / "shaking.mcap", recorded / "rests.mcap"]
     summary = calibrate_recordings(files).summary
     assert summary["true"]["motion"]["position_rms"] < 0.4e-3
-    result = calibrate_recordings(files, Knowledge(known_poses=True, lengths=True))
+    result = calibrate_recordings(files, Knowledge(known_poses=True, encoder=TO_50_UM))
     true = result.summary["true"]
     assert true["rests"]["position_rms"] < summary["true"]["rests"]["position_rms"]
     assert true["motion"]["rotation_rms"] < 0.1 * true["known"]["rotation_rms"]

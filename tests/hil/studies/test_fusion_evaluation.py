@@ -86,6 +86,20 @@ def test_it_starts_in_motion_and_does_not_drift(figures):
     assert figures["follow"]["position_rms"] < 0.2e-3
 
 
+@pytest.mark.slow
+def test_a_rig_calibrated_with_its_encoders_is_as_repeatable_as_they_are(tmp_path, capsys):
+    file = tmp_path / "figures.json"
+    options = ("--rate", "250", "--seeds", "1", "--joint-error", "0", "--workers", "1", "--json", str(file))
+    assert main(["evaluate-fusion", "--only", "encoders", *options]) == 0
+    figures = json.loads(file.read_text())["encoders"]
+    assert figures["kind"] == "incremental" and list(figures["joints"]) == ["0"]
+    found = figures["joints"]["0"]
+    assert found["relative"]["position_rms"] < 0.03e-3 and found["absolute"]["position_rms"] < 0.1e-3
+    assert np.degrees(found["relative"]["rotation_rms"]) < 0.01 and np.degrees(found["absolute"]["rotation_rms"]) < 0.02
+    assert 0.1 < found["over_bound"]["position_rms"] < 1.5
+    assert "closed loop with encoders, incremental, whole-alignments, sines" in capsys.readouterr().out
+
+
 @pytest.mark.endurance
 def test_what_a_cycle_costs_is_told(figures):
     cost = figures["cost"]
@@ -106,6 +120,7 @@ def test_what_a_cycle_costs_is_told(figures):
         (("--joint-error", "-1"), "the joint error is -1 mm; it must be at least 0"),
         (("--seeds", "0,-1"), "the seed is -1"),
         (("--imu", "best"), "no IMU preset 'best'"),
+        (("--only", "encoders", "--lengths", "best"), "no encoder 'best'"),
     ],
 )
 def test_what_cannot_be_evaluated_is_refused(options, complaint, capsys):

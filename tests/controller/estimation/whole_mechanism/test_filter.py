@@ -283,10 +283,17 @@ class Twin:
         for k in np.flatnonzero(read):
             gradient = self.lengths()[1][k]
             row = np.zeros((1, len(self.covariance)))
+            of_rig = 0.0
+            if len(self.rig):
+                by_joints = np.zeros((2, 6, 3))
+                by_joints[:, k] = -gradient[:3], gradient[:3] @ self.rotation
+                row[0, 18 + 7 * self.n : 54 + 7 * self.n] = by_joints.ravel()
+                of_rig = by_joints.ravel() @ self.rig[:36]
             row[0, [self.first + k, self.first + 6 + k]] = 1.0
             row[0, 6:12] = later[k] * gradient
             rows.append(row)
-            innovations.append([readings[k] - self.read[k] - self.play[k] - later[k] * gradient @ self.motion[:2].ravel()])
+            at_mean = later[k] * gradient @ self.motion[:2].ravel()
+            innovations.append([readings[k] - self.read[k] - self.play[k] - at_mean - of_rig])
             variances.append(self.p["length_variance"] / read[k])
         h, innovation = np.vstack(rows), np.concatenate(innovations)
         noise = np.diag(variances)
@@ -367,8 +374,14 @@ def test_taken_bit_by_bit_it_equals_its_dense_twin(hexapod, errors, rig, base, t
             assert np.abs(difference).max() < 1e-6 * tolerance
 
 
-@pytest.mark.parametrize("errors", ["gyroscopes", pytest.param("axes", marks=pytest.mark.slow)])
-def test_with_encoders_it_equals_its_twin_whose_states_are_their_readings(hexapod, errors):
+@pytest.mark.parametrize(
+    ("errors", "rig"),
+    [
+        ("gyroscopes", False),
+        *(pytest.param("axes", rig, marks=pytest.mark.slow) for rig in (False, True)),
+    ],
+)
+def test_with_encoders_it_equals_its_twin_whose_states_are_their_readings(hexapod, errors, rig):
     """From a pose that is 5 mm and 0.6 deg off, with one encoder that reads nothing for a while, and one that never does."""
     motion, window, delay = impose(hexapod, "1", 0.5, RATE_HZ, 4), 5, 2e-3
     random = np.random.default_rng(5)
@@ -377,7 +390,12 @@ def test_with_encoders_it_equals_its_twin_whose_states_are_their_readings(hexapo
     readings = leg_lengths(hexapod, motion.positions, motion.rotations) + zeros + random.normal(0.0, 3e-6, (count, 6))
     used = np.ones((count, 6))
     used[103:202, 2] = used[:, 4] = 0.0
-    parameters = filter_parameters(FusionSettings(length_noise=3e-6), RATE_HZ, errors, None, lengths=True)
+    settings = FusionSettings(length_noise=3e-6)
+    parameters = filter_parameters(settings, RATE_HZ, errors, None, lengths=True)
+    if rig:
+        of_imus = np.diag(parameters["prior"])[:ALL_ERRORS]
+        covariance = np.diag(np.concatenate([of_imus, np.full(JOINTS, 1e-8), np.full(TILT, 1e-6)]))
+        parameters = filter_parameters(settings, RATE_HZ, errors, covariance, inflation=settings.noise_inflation, lengths=True)
     geometry, state = sensor_geometry(hexapod)[()], np.zeros((), FILTER_STATE)
     turn = (motion.rotations[1] @ motion.rotations[0].T - np.eye(3)) * RATE_HZ
     velocity = (motion.positions[1] - motion.positions[0]) * RATE_HZ
@@ -403,6 +421,7 @@ def test_with_encoders_it_equals_its_twin_whose_states_are_their_readings(hexapo
             np.testing.assert_allclose(state["position"], twin.position, rtol=0.0, atol=3e-9)
             np.testing.assert_allclose(state["rotation"], twin.rotation, rtol=0.0, atol=3e-9)
             np.testing.assert_allclose(state["length_errors"], [found, twin.play], rtol=0.0, atol=3e-9)
+            np.testing.assert_allclose(state["rig"][: len(twin.rig)], twin.rig, rtol=0.0, atol=3e-9)
             scale = np.sqrt(np.diag(covariance))
             difference = (state["covariance"][: len(scale), : len(scale)] - covariance) / np.outer(scale, scale)
             assert np.abs(difference).max() < 1e-4

@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 
-from controller.estimation.whole_mechanism.parameters import filter_parameters, rig_start
+from controller.calibration.file import Calibration
+from controller.cycle import cycle_parameters
+from controller.estimation.whole_mechanism.imu_errors import ERRORS, distort
+from controller.estimation.whole_mechanism.parameters import BLOCKS, filter_parameters, rig_start
 from controller.rig import field_of
-from controller.settings import FusionSettings
+from controller.settings import ControlSettings, FusionSettings
 from plant.mechanism import Mechanism
-from tests.controller.leg_geometry import rotation_of, unit
+from tests.controller.leg_geometry import rotation_of, static_signals, unit
 
 FUSION = FusionSettings(
     platform_jerk=2.0, platform_angular_jerk=3.0, mechanism_gyroscope_noise=0.01, mechanism_accelerometer_noise=0.02,
@@ -62,6 +65,27 @@ def test_without_a_calibration_the_prior_is_that_of_the_settings():
     floor = filter_parameters(FUSION, 800.0, "axes", None, np.array([3e-3, 6e-2]))["floor"]
     # A standard deviation of the whole, shared by three components.
     np.testing.assert_allclose(floor, [3e-6, 1.2e-3], rtol=1e-12)
+
+
+@pytest.mark.parametrize("errors", ["gyroscopes", "accelerometers", "alignments", "axes"])
+def test_biases_stand_for_the_errors_that_are_not_estimated_at_the_readings_at_home(hexapod, errors):
+    random, estimated, home = np.random.default_rng(8), BLOCKS[errors], hexapod.home
+    ideal = np.concatenate(static_signals(hexapod, home.position, home.rotation)[:2], axis=1)
+    off = 1e-4 * random.normal(size=(7, ERRORS))
+    calibration = Calibration(covariance=np.outer(off, off))
+    found = cycle_parameters(hexapod, 1000.0, ControlSettings(), FusionSettings(), whole=errors, calibration=calibration)[
+        "mechanism"
+    ]["filter"]["prior"][:147, :147]
+    some = (found[:, 20] / off[0, 20]).reshape(7, ERRORS)
+    some[:, estimated:] = 0.0
+    for sensor in range(min(estimated, 6) // 3):
+        part = slice(3 * sensor, 3 * sensor + 3)
+        for k in range(7):
+            whole = np.array(distort(off[k], sensor, tuple(ideal[k, part]))) + off[k, part]
+            seen = np.array(distort(some[k], sensor, tuple(ideal[k, part]))) + some[k, part]
+            np.testing.assert_allclose(seen - ideal[k, part], whole - ideal[k, part], rtol=0.0, atol=3e-6)
+    # The others are as they were, for those who estimate them.
+    np.testing.assert_allclose(found[20::21, 20::21], np.outer(off[:, 20], off[:, 20]), rtol=1e-9)
 
 
 @pytest.mark.parametrize(("rate", "window"), [(4000.0, 20), (1000.0, 5), (250.0, 1), (50.0, 1)])
