@@ -1,6 +1,6 @@
 """The cycle: everything between raw IMU data and the six commands, the paper's Figure 4, as one compiled function.
 
-    raw IMU data -> screening -> the base's motion taken out -> leg, platform and heading filters
+    raw IMU data -> screening -> the base's motion subtracted -> leg, platform and heading filters
         -> closed form -> refinement -> whole-mechanism filter
         -> inverse kinematics -> reference - length -> feed-forward and PID -> commands
 

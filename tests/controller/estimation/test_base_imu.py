@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from controller.cycle import PARAMETERS, STATE
-from controller.estimation.base_imu import base_imu_parameters, hear_base_imu, shared_errors, remove_base_motion
+from controller.estimation.base_imu import base_imu_parameters, hear_base_imu, remove_base_motion, shared_errors
 from controller.rig import rig_parameters
 from controller.settings import fusion_settings
 from plant.mechanism import load_spatial
