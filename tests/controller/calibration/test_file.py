@@ -132,7 +132,7 @@ def test_the_cycle_applies_it(hexapod):
 def test_what_it_leaves_is_what_the_filter_knows_of_the_sensors(hexapod):
     calibration = Calibration(covariance=np.diag(np.linspace(1.0, 2.0, 7 * ERRORS)))
     parameters = cycle_parameters(
-        hexapod, 1000.0, control_settings(hexapod), fusion_settings(hexapod), whole="alignments", calibration=calibration
+        hexapod, 1000.0, control_settings(hexapod), fusion_settings(hexapod), whole="axes", calibration=calibration
     )
     prior = parameters["mechanism"]["filter"]["prior"]
     np.testing.assert_array_equal(prior[: 7 * ERRORS, : 7 * ERRORS], calibration.covariance)
