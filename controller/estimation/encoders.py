@@ -34,7 +34,7 @@ _FORGETTING_S = 30.0
 """A zero is the mean over all the time that it has been followed, and at most over as long [s]."""
 
 _SETTLING_S = 0.25
-"""For twice as long a difference counts in that mean by the time before it, as the IMUs' lengths are means that get better [s]."""
+"""For twice as long a difference counts in that mean by the time before it: the IMUs' lengths are means that get better [s]."""
 
 _MOST_STEPS = 20
 _SETTLED = 1e-9
