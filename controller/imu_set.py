@@ -152,8 +152,8 @@ def pose_share(mechanism: Mechanism, fusion: FusionSettings, imus: Collection[in
     """How much less well these IMUs know the pose at home than all IMUs do: 1 or more, of position or rotation."""
 
     def variances(*chosen: Any) -> Array:
-        covariance = _pose_covariance(mechanism, fusion, *chosen)
-        return np.asarray(np.diag(covariance).reshape(2, 3).sum(axis=1))
+        found: Array = np.diag(_pose_covariance(mechanism, fusion, *chosen)).reshape(2, 3).sum(axis=1)
+        return found
 
     return max(1.0, float(np.sqrt((variances(imus, magnetometer) / variances()).max())))
 

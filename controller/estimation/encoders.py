@@ -33,6 +33,9 @@ from plant.vectors import cross, rotate, vector
 _FORGETTING_S = 30.0
 """A zero is the mean over all the time that it has been followed, and at most over as long [s]."""
 
+_SETTLING_S = 0.25
+"""For twice as long a difference counts in that mean by the time before it: the IMUs' lengths are means that get better [s]."""
+
 _MOST_STEPS = 20
 _SETTLED = 1e-9
 """A step below this ends the iteration from a first guess [m, rad]."""
@@ -247,8 +250,8 @@ def _follow_zero(p: Record, s: Record, passed: float, k: int) -> None:
         s.followed_for[k] = np.inf
     s.followed_for[k] += passed
     if s.followed_for[k] < np.inf:
-        # The IMUs' lengths are means over time themselves: the later ones are better, and count more.
-        change = min(1.0, passed / min(0.5 * s.followed_for[k], _FORGETTING_S)) * s.off[k]
+        span = min(max(0.5 * s.followed_for[k], s.followed_for[k] - _SETTLING_S), _FORGETTING_S)
+        change = min(1.0, passed / span) * s.off[k]
         s.zero[k] += change
         s.off[k] -= change
 

@@ -106,6 +106,13 @@ def test_the_noise_of_few_imus_is_no_oscillation(imus, limited):
         assert np.isfinite(loop.parameters["safety"]["watch"]["oscillation"]) == limited
 
 
+@pytest.mark.parametrize("seed", [2, 11])
+def test_four_legs_alone_hold_the_platform_with_the_whole_mechanism_filter(seed):
+    """The filter began at the pose of the first sample, up to 12 deg off, as sure as with all IMUs: these runs ended."""
+    result = simulate(SimulationConfig(target="hold", duration=1.0, imus=(1, 2, 3, 4), fusion="whole", seed=seed))
+    assert result.summary()["estimation"]["position_rms"] < 4e-3
+
+
 @pytest.mark.parametrize("seed", [2, 19])
 def test_a_mechanism_that_chatters_in_its_play_is_stopped(seed):
     """0.5 mm of clearance: from one second on the legs go to and fro by 1 mm at 18 Hz, and on and on."""

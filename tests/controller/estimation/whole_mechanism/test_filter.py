@@ -122,6 +122,23 @@ def test_at_rest_it_does_not_drift(hexapod):
     assert distance[-5000:].mean() < 1.5 * distance[10_000:15_000].mean() + 0.1
 
 
+@pytest.mark.parametrize(("standing", "least", "most"), [(1, 0.0, 0.02), (0, 0.1, 1.0)])
+def test_a_platform_that_stands_tells_the_biases_of_the_gyroscopes_at_once(hexapod, standing, least, most):
+    """Within 0.2 s, where four legs alone tell some motions by biases of a few hundredths of a degree per second."""
+    motion, state = impose(hexapod, "static", 0.2, RATE_HZ, 0), np.zeros((), FILTER_STATE)
+    parameters, geometry = filter_parameters(FusionSettings(), RATE_HZ, "accelerometers", None), sensor_geometry(hexapod)
+    biases, used = np.radians(np.random.default_rng(6).normal(0.0, 0.2, (7, 3))), np.isin(np.arange(7), (1, 2, 3, 4))
+    start_filter(parameters[()], state[()], 0.0, motion.positions[0], motion.rotations[0], np.zeros(6))
+    state["standing"] = standing
+    for i, signal in enumerate(motion.signals[1:], start=1):
+        sample = signal.copy()
+        sample[0, :7] += biases
+        accumulate_sample(state[()], sample, weights_of(used), i / RATE_HZ)
+        step_filter(parameters[()], geometry[()], state[()])
+    left = np.degrees(np.abs(state["errors"][used, :3] - biases[used])).max()
+    assert least <= left < most
+
+
 # -------------------------------------------------------------------------------------------------------- the slow clear twin
 
 

@@ -8,8 +8,9 @@ from controller.estimation.whole_mechanism.filter import extrapolate_covariance
 from controller.estimation.whole_mechanism.trust import find_covariance
 from controller.imu_set import pose_share
 from controller.inverse_kinematics import leg_lengths
-from controller.safety.causes import Cause
+from controller.safety.causes import Cause, Mode
 from controller.settings import SafetySettings, control_settings, fusion_settings
+from plant.encoders import load_encoder
 from plant.imu_wiring import ALL_IMUS
 from plant.pose import pose_errors
 from tests.controller.cycles import cycle, run_stages
@@ -210,6 +211,38 @@ def test_with_fewer_imus_it_starts_when_the_leg_filters_have_settled_and_knows_l
     sigmas = np.sqrt(np.diag(stage.trust["filter"]["published_covariance"]))
     np.testing.assert_allclose(sigmas[:9], np.repeat([share * 0.01, share * 0.05, 0.1], 3), rtol=1e-12)
     assert share > 5.0
+
+
+@pytest.mark.parametrize(
+    ("imus", "mode", "armed", "standing"),
+    [
+        ((1, 2, 3, 4), Mode.IDLE, 1, 1),
+        ((1, 2, 3, 4), Mode.RUNNING, 1, 0),
+        ((1, 2, 3, 4), Mode.IDLE, 0, 0),
+        (ALL_IMUS, Mode.IDLE, 1, 0),
+    ],
+)
+def test_with_fewer_imus_it_knows_that_the_brakes_hold_if_they_are_the_loops_to_open(hexapod, imus, mode, armed, standing):
+    stage = Stage(hexapod, imus=imus)
+    stage.parameters["mechanism"]["first_cycle"] = 0
+    stage.parameters["safety"]["arming"]["active"], stage.state["safety"]["mode"] = armed, mode
+    stage.step()
+    stage.step()
+    assert stage.trust["filter"]["standing"] == standing
+
+
+@pytest.mark.parametrize(
+    ("imus", "lengths", "share"),
+    [((1, 2, 3, 4), "incremental", 0.1), ((1, 2, 3, 4), "none", 1.0), ((0, 4, 5, 6), "incremental", 1.0)],
+)
+def test_beside_encoders_a_filter_of_imus_that_hardly_determine_the_pose_must_know_its_rotation_better(
+    hexapod, imus, lengths, share
+):
+    fusion = fusion_settings(hexapod)
+    found = cycle_parameters(
+        hexapod, RATE_HZ, control_settings(hexapod), fusion, imus, whole="gyroscopes", encoder=load_encoder(lengths)
+    )  # fmt: skip
+    assert found["mechanism"]["known"] == pytest.approx((share * fusion.disagreement) ** 2, rel=1e-12)
 
 
 def test_a_filter_that_hardly_knows_its_rotation_is_not_trusted_and_once_trusted_it_stays(hexapod):
