@@ -178,7 +178,9 @@ class CalibrationData:
         if encoder is None or not read.any():
             return None
         if not encoder.absolute:
-            lengths += inverse_kinematics(self.mechanism, self.mechanism.require_home()).lengths - lengths[read.argmax()]
+            lengths = (
+                lengths + inverse_kinematics(self.mechanism, self.mechanism.require_home()).lengths - lengths[read.argmax()]
+            )
         return lengths
 
     def _hear_base(self, records: Record) -> None:

@@ -147,7 +147,9 @@ def test_encoders_count_from_home_in_every_run_unless_their_zeros_are_known(monk
         records["length"] = zero + 1e-5 * np.arange(len(records))[:, None] + 0.01 * np.arange(6)
         # Lost readings are none.
         records["length"][[0, 624, 625], [1, 2, 2]] = np.nan
+        as_read = records["length"].copy()
         data.add_rests(records)
+        np.testing.assert_array_equal(records["length"], as_read)
     lengths = data.rests.lengths
     first = [0.3, 0.3, 0.5, 0.5] if known else [0.0] * 4
     moved = 1e-5 * (np.array([624.5, 1999.5] * 2) - (0 if known else 1))
