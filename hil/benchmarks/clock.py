@@ -107,7 +107,7 @@ def _take_turns(benches: list["_Bench"], shares: dict[str, float], seconds: floa
     counts = {condition: max(1, round(seconds * share / _SLICE_S)) for condition, share in shares.items()}
     whole, done = len(benches) * sum(counts.values()), 0
     for condition, count in counts.items():
-        with _circumstances(condition):
+        with _circumstances(condition, len(benches) * count * _SLICE_S):
             for bench in benches * count:
                 bench.add_slice(condition)
                 done += 1
@@ -288,12 +288,15 @@ def _run_bare(clock: Record, cycles: int, turns: int, durations: NDArray[np.int6
 
 
 @contextmanager
-def _circumstances(condition: str) -> Iterator[None]:
+def _circumstances(condition: str, seconds: float) -> Iterator[None]:
+    """The load, if this is the condition, for slices of so many seconds."""
     if condition != LOAD:
         yield
         return
     cores = str(os.cpu_count() or 1)
     command = ["stress-ng", "--cpu", cores, "--vm", "1", "--vm-bytes", "128M", "--hdd", "1", "--hdd-bytes", "16M", "--quiet"]
+    # It ends some time even if this process is killed.
+    command += ["--timeout", f"{60 + round(10.0 * seconds)}s"]
     with (
         tempfile.TemporaryDirectory(prefix="gough-load-") as folder,
         subprocess.Popen([*command, "--temp-path", folder]) as load,

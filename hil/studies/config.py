@@ -7,6 +7,7 @@ from hil.option import integers, option
 from hil.runs.config import CALIBRATION, FUSIONS, IMU, MECHANISM
 from hil.runs.names import name_objects
 from plant.checks import check_rate, checked_seed, nearest
+from plant.encoders import NO_LENGTHS
 from plant.errors import InputError, UnknownNameError
 
 LEARNING_S = 20.0
@@ -80,6 +81,11 @@ class EvaluationConfig:
             raise InputError(f"{self.starts} starts are asked for; there can be 1 to 10000")
         if not LEARNING_S < self.still <= 3600.0:
             raise InputError(f"the platform is to stand still for {self.still:g} s; it can for {LEARNING_S:g} to 3600 s")
+        if "encoders" in self.only and self.lengths == NO_LENGTHS:
+            raise InputError(
+                f"lengths {NO_LENGTHS!r} leave the section 'encoders' nothing to evaluate; choose incremental, absolute or a "
+                "TOML file"
+            )
 
 
 @dataclass(frozen=True)

@@ -36,18 +36,18 @@ from plant.mechanism import LEGS
 from plant.pose import Array
 
 _FIRST_S, _START_S, _SETTLING_S, _SETTLING_AGAIN_S = 0.1, 0.3, 0.3, 1.0
-"""When the filter is started with few IMUs, and after it was stopped; how long it is not relied upon at first, with the legs at
-rest, and when it has been started again [s].
+"""The filter starts after the first time with few IMUs, and after the second when it was stopped. Its pose is used after the
+third time at the first start, when the legs are at rest, and after the last at each later start [s].
 """
 
-_FAR_OFF = 4.0
-"""With IMUs that know the pose so many times less well than all do, that from the first sample is degrees off, and no place to
-start a filter that is linear about it.
+_FEW_IMUS = 4.0
+"""IMUs are few if they leave the pose so many times more uncertain than all do. Their first pose may be degrees off, and the
+filter, which is linear about its start, must wait for a better one.
 """
 
-_OVERRATED = 10.0
-"""Beside such IMUs, the filter with encoders takes a few millimetres of motion for much more than they tell: it states 0.2 deg
-where it is 1 deg off. So it must state so many times less before it is trusted.
+_OVERCONFIDENCE = 10.0
+"""With few IMUs and encoders the filter learns less from a few millimetres of motion than its covariance says: it states
+0.2 deg where it is 1 deg off. So its rotation must be known so many times better before it is trusted.
 """
 
 _AVERAGE_S = 0.05
@@ -69,7 +69,7 @@ PARAMETERS = record_dtype(
     start_cycles=np.int64,  # this and the next: the durations above
     settling_cycles=(np.int64, 2),
     disagreement=np.float64,  # of the leg filters with the filter, limit of the mean square [rad^2]
-    known=np.float64,  # variance of the filter's rotation from which on it may be trusted [rad^2]
+    known=np.float64,  # greatest variance of the filter's rotation with which it may be trusted [rad^2]
     smoothing=np.float64,  # share of a cycle's in that mean
 )
 """Constants."""
@@ -96,17 +96,17 @@ STATE = record_dtype(
 
 def trust_parameters(fusion: FusionSettings, rate: float, filter_constants: Record) -> Record:
     """The constants (dtype `PARAMETERS`) in cycles of this rate [Hz], around those of the filter itself."""
-    far_off = filter_constants["start_share"] > _FAR_OFF
-    overrated = _OVERRATED if far_off and filter_constants["lengths"] > 0 else 1.0
+    few = filter_constants["start_share"] > _FEW_IMUS
+    overconfidence = _OVERCONFIDENCE if few and filter_constants["lengths"] > 0 else 1.0
     return filled(
         PARAMETERS,
         filter=filter_constants,
         delay=fusion.sensor_delay,
-        first_cycle=round(_FIRST_S * rate) if far_off else 0,
+        first_cycle=round(_FIRST_S * rate) if few else 0,
         start_cycles=round(_START_S * rate),
         settling_cycles=(round(_SETTLING_S * rate), round(_SETTLING_AGAIN_S * rate)),
         disagreement=fusion.disagreement**2,
-        known=(fusion.disagreement / overrated) ** 2,
+        known=(fusion.disagreement / overconfidence) ** 2,
         smoothing=1.0 / max(1.0, _AVERAGE_S * rate),
     )
 

@@ -16,19 +16,24 @@ from plant.pose import Pose, vector_from_rotation
 from tests.controller.calibration.rest_readings import RAW, pose_errors, rests_of
 
 
+def moved(mechanism, duration):
+    """State of raw IMUs, an imposed motion, and what these IMUs read of it with the pose and twist at its start."""
+    imposed = impose(mechanism, "0.8", duration, 1000.0, 3, size=(0.02, np.radians(6.0)))
+    imu, samples = imu_state(RAW, 1, 1e-3), np.zeros_like(imposed.signals)
+    for signals, sample in zip(imposed.signals, samples, strict=True):
+        measure(imu, signals, sample)
+    (first, second), (start, later) = imposed.positions[:2], imposed.rotations[:2]
+    twist = 1000.0 * np.array([*(second - first), *vector_from_rotation(later @ start.T)])
+    return imu, imposed, Motion(samples, (Pose(first, start), twist))
+
+
 @pytest.mark.slow
 def test_motion_brings_it_to_a_tenth_of_a_millimetre(hexapod):
     fusion = sensor_settings(hexapod, RAW)
     readings, _, _ = rests_of(hexapod, 20, 1)
     found = calibrate_at_rest(hexapod, Rests(readings))
-    motion = impose(hexapod, "0.8", 20.0, 1000.0, 3, size=(0.02, np.radians(6.0)))
-    imu, samples = imu_state(RAW, 1, 1e-3), np.zeros_like(motion.signals)
-    for signals, sample in zip(motion.signals, samples, strict=True):
-        measure(imu, signals, sample)
-    turn = (motion.rotations[1] @ motion.rotations[0].T - np.eye(3)) * 1000.0
-    velocity = (motion.positions[1] - motion.positions[0]) * 1000.0
-    start = Pose(motion.positions[0], motion.rotations[0]), np.array([*velocity, turn[2, 1], turn[0, 2], turn[1, 0]])
-    calibration, covariance = calibrate_in_motion(hexapod, found, Motion(samples, start), 1000.0, fusion)
+    imu, _, motion = moved(hexapod, 20.0)
+    calibration, covariance = calibrate_in_motion(hexapod, found, motion, 1000.0, fusion)
     others = rests_of(hexapod, 10, 1, poses=sample_workspace(hexapod, 10, seed=999))
     true = pose_errors(hexapod, calibration, calibration.tilt, *others)
     assert true[0] < 0.5
@@ -57,22 +62,16 @@ def test_encoders_tell_more_than_a_longer_motion_without(hexapod):
     """With zeros that are centimetres off, and some readings lost."""
     readings, _, _ = rests_of(hexapod, 20, 1)
     found = calibrate_at_rest(hexapod, Rests(readings))
-    motion = impose(hexapod, "0.8", 10.0, 1000.0, 3, size=(0.02, np.radians(6.0)))
-    imu, samples = imu_state(RAW, 1, 1e-3), np.zeros_like(motion.signals)
-    for signals, sample in zip(motion.signals, samples, strict=True):
-        measure(imu, signals, sample)
+    _, imposed, motion = moved(hexapod, 10.0)
     random = np.random.default_rng(2)
-    lengths = leg_lengths(hexapod, motion.positions, motion.rotations) + random.normal(0.0, 0.03, 6)
+    lengths = leg_lengths(hexapod, imposed.positions, imposed.rotations) + random.normal(0.0, 0.03, 6)
     lengths = 5e-6 * np.rint(lengths / 5e-6)
     lengths[random.random(lengths.shape) < 0.1] = np.nan
-    turn = vector_from_rotation(motion.rotations[1] @ motion.rotations[0].T)
-    twist = 1000.0 * np.array([*(motion.positions[1] - motion.positions[0]), *turn])
-    start = Pose(motion.positions[0], motion.rotations[0]), twist
     fusion = sensor_settings(hexapod, RAW, PRESETS["incremental"])
     others = rests_of(hexapod, 10, 1, poses=sample_workspace(hexapod, 10, seed=999))
     errors, predicted = [], []
     for read in (lengths, None):
-        calibration, covariance = calibrate_in_motion(hexapod, found, Motion(samples, start, read), 1000.0, fusion)
+        calibration, covariance = calibrate_in_motion(hexapod, found, motion._replace(lengths=read), 1000.0, fusion)
         errors.append(pose_errors(hexapod, calibration, calibration.tilt, *others)[0])
         of_poses = [pose_covariance(hexapod, calibration.tilt, pose, covariance) for pose in zip(*others[1:], strict=True)]
         predicted.append(1e3 * np.sqrt(np.trace(np.mean(of_poses, axis=0)[:3, :3])))
@@ -84,15 +83,7 @@ def test_encoders_tell_more_than_a_longer_motion_without(hexapod):
 def test_joints_that_are_off_are_sought_with_the_rest(hexapod):
     built, fusion = hexapod.built(2e-4, 3), sensor_settings(hexapod, RAW)
     readings, _, _ = rests_of(built, 20, 1)
-    motion = impose(built, "0.8", 20.0, 1000.0, 3, size=(0.02, np.radians(6.0)))
-    imu, samples = imu_state(RAW, 1, 1e-3), np.zeros_like(motion.signals)
-    for signals, sample in zip(motion.signals, samples, strict=True):
-        measure(imu, signals, sample)
-    velocity = [
-        *(motion.positions[1] - motion.positions[0]),
-        *vector_from_rotation(motion.rotations[1] @ motion.rotations[0].T),
-    ]
-    start = Pose(motion.positions[0], motion.rotations[0]), 1000.0 * np.array(velocity)
+    _, _, motion = moved(built, 20.0)
     others, surprise = rests_of(built, 10, 1, poses=sample_workspace(built, 10, seed=999)), []
     true = np.stack([built.base_joints - hexapod.base_joints, built.platform_joints - hexapod.platform_joints])
 
@@ -102,7 +93,7 @@ def test_joints_that_are_off_are_sought_with_the_rest(hexapod):
 
     for joints in (0.0, 2e-4):
         found = calibrate_at_rest(hexapod, Rests(readings), Prior(joints=joints))
-        calibration, covariance = calibrate_in_motion(hexapod, found, Motion(samples, start), 1000.0, fusion)
+        calibration, covariance = calibrate_in_motion(hexapod, found, motion, 1000.0, fusion)
         known = hexapod.moved_joints(calibration.joints)
         error = 1e-3 * pose_errors(known, calibration, calibration.tilt, *others)[0]
         surprise.append(error / np.sqrt(predicted(known, calibration.tilt, covariance)[:3].sum()))

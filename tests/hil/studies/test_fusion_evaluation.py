@@ -117,6 +117,7 @@ def test_what_a_cycle_costs_is_told(figures):
         ),
         (("--still", "5"), "the platform is to stand still for 5 s; it can for 20 to 3600 s"),
         (("--starts", "0"), "0 starts are asked for; there can be 1 to 10000"),
+        (("--only", "encoders", "--lengths", "none"), "lengths 'none' leave the section 'encoders' nothing to evaluate"),
         (("--joint-error", "-1"), "the joint error is -1 mm; it must be at least 0"),
         (("--seeds", "0,-1"), "the seed is -1"),
         (("--imu", "best"), "no IMU preset 'best'"),

@@ -145,7 +145,7 @@ def test_the_rest_of_a_file_stays_as_it_is(tmp_path):
 )
 def test_bad_input_is_refused_in_a_line(arguments, said, tmp_path, capsys):
     assert main(["tune-fusion", str(tmp_path / "tuned.toml"), "--workers", "1", *arguments]) == 2
-    complaint = capsys.readouterr().err
+    # A first start may say that it compiles.
+    (complaint,) = (line for line in capsys.readouterr().err.splitlines() if not line.startswith("compiling"))
     assert said in complaint
-    assert complaint.count("\n") == 1
     assert not list(tmp_path.iterdir())

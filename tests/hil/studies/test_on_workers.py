@@ -82,8 +82,9 @@ def test_figures_do_not_depend_on_the_engine(study, workers, trials):
     assert len(here) > 200
 
 
-COMMANDS = ["accuracy --poses 20", "broad TRIALS --seeds 0", "faults --seeds 1 --only emergency"]
+COMMANDS = ["accuracy --poses 20", "broad TRIALS --seeds 0"]
 LONG_COMMANDS = [
+    "faults --seeds 1 --only emergency",
     "classes --mechanisms 3",
     "compare-fusion --duration 20.5 --rate 50 --seeds 0",
     "evaluate-fusion --imu mpu9150-calibrated --rate 250 --seeds 1 --starts 1 --joint-error 0 --only start",
