@@ -20,7 +20,7 @@ def figures():
     return {"machine": "m", "date": "2026-11-21", "version": "0", "real_time": measure_real_time({500.0: 2.0})}
 
 
-@pytest.mark.slow(seconds=35)
+@pytest.mark.endurance
 def test_every_condition_of_a_rate_is_measured(figures):
     measured = figures["real_time"]
     assert json.loads(json.dumps(measured)) == measured
@@ -40,7 +40,7 @@ def test_every_condition_of_a_rate_is_measured(figures):
     assert set(measured["rates"]["500"]) >= {IDLE, BUSY}
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_the_check_passes_what_is_measured_and_fails_gross_excess(figures):
     measured = figures["real_time"]
     assert gross_excess(measured) == []
@@ -72,7 +72,7 @@ def test_quantiles_of_whole_microseconds_are_those_of_the_durations():
     assert found["max"] == 123_000.0
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_a_report_shows_histograms_and_earlier_figures(figures, tmp_path):
     earlier = tmp_path / "earlier.json"
     earlier.write_text(json.dumps({**figures, "date": "2026-11-01"}))

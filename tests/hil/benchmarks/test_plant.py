@@ -1,8 +1,11 @@
 """The benchmark of the plant measures what it says, and the plant is as exact as promised."""
 
+import pytest
+
 from hil.benchmarks.plant import measure_plant
 
 
+@pytest.mark.slow
 def test_the_plant_is_measured_and_exact() -> None:
     """Its speed is for a quiet machine to judge."""
     shares: list[float] = []

@@ -89,7 +89,7 @@ def test_what_it_says_of_itself_without_the_truth_is_honest(calibrated):
     assert f"{1e3 * figures['true']['motion']['position_rms']:.3g}" in {text.text for text in picture.iter() if text.text}
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_recordings_tell_the_same_and_known_poses_less(recorded):
     files = [recorded / "shaking.mcap", recorded / "rests.mcap"]
     summary = calibrate_recordings(files).summary

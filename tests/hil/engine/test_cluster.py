@@ -164,7 +164,7 @@ def test_a_scheduler_needs_no_gough_and_a_worker_does(tmp_path: Path, monkeypatc
             assert engine.map(eval, ["1", "2"]) == [1, 2]
 
 
-@pytest.mark.slow(seconds=60)
+@pytest.mark.endurance
 def test_a_worker_stays_as_large_as_it_is() -> None:
     runs, grown = 150, 10e6
     study = Study((Factor("run.seed", tuple(range(runs))),), run=SimulationConfig(duration=0.5, rate=250.0))

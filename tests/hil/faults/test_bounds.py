@@ -141,12 +141,10 @@ def test_bad_input_gets_one_line(options, message, capsys):
     assert message in errors[-1] and not any("Traceback" in line for line in errors)
 
 
-@pytest.mark.parametrize(
-    "seeds", [pytest.param(1, marks=pytest.mark.slow(seconds=60)), pytest.param(2, marks=pytest.mark.endurance)]
-)
-def test_only_shocks_and_joints_that_are_off_come_near_the_limits_before_they_are_told(seeds):
+@pytest.mark.endurance
+def test_only_shocks_and_joints_that_are_off_come_near_the_limits_before_they_are_told():
     """All other rows are told before the error exceeds two thirds of the limit."""
-    found = [each for each in bounds_of_rows([row for row in all_rows() if row.kind != SOUND], seeds) if each.bounds]
+    found = [each for each in bounds_of_rows([row for row in all_rows() if row.kind != SOUND], 2) if each.bounds]
     assert len(found) > 100
     share = [max(np.divide(each.errors(), LIMITS[each.single])) for each in found]
     beyond = {each.row.kind for each, size in zip(found, share, strict=True) if size > 2.0 / 3.0}

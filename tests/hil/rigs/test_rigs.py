@@ -157,6 +157,7 @@ def test_nothing_is_asked_of_the_drives_unless_they_may_move():
     assert set(asked) == {(BRAKED, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)}
 
 
+@pytest.mark.slow
 @on_virtual_time
 def test_a_recording_keeps_the_contract(tmp_path):
     path, _ = recording(tmp_path / "run.mcap", (), arm=False)
@@ -493,6 +494,7 @@ def test_a_replayed_run_is_the_recorded_one_bit_for_bit(faults, changes, tmp_pat
         assert again[name].tobytes() == records[name].tobytes(), name
 
 
+@pytest.mark.slow
 def test_a_replay_on_the_clock(recorded, tmp_path):
     path, records = recorded
     config = replace(CONFIG, rig="replay", rig_at=str(path))

@@ -260,6 +260,7 @@ def test_a_fault_that_is_injected_is_told_and_the_run_goes_on_without_the_imu(tm
         assert status == 2 and "0 to 6" in errors
 
 
+@pytest.mark.slow
 def test_the_emergency_key_stops_the_drives_quickly():
     with emulated() as (_, at, control):
         run = started(at, control)

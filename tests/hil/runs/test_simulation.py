@@ -32,7 +32,7 @@ def errors(result, group):
     return figures["position_rms"] / MM, figures["rotation_rms"] / DEG
 
 
-@pytest.mark.parametrize("seeds", [pytest.param(4, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.endurance)])
+@pytest.mark.parametrize("seeds", [pytest.param(2, marks=pytest.mark.slow), pytest.param(20, marks=pytest.mark.endurance)])
 def test_low_cost_imus_follow_a_real_motion_within_the_promise(motion_capture, seeds):
     estimation, tracking = [], []
     for seed in range(seeds):

@@ -215,7 +215,7 @@ def test_a_wrong_place_in_the_reference_is_found_again(saved: tuple[SimulationCo
     assert bits(rest[0]) == bits(rest[1])
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_no_value_in_a_snapshot_ends_the_process(saved: tuple[SimulationConfig, Path]) -> None:
     done = subprocess.run([sys.executable, "-c", _TRY_ALL, str(saved[1])], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-500:]

@@ -17,7 +17,7 @@ def figures(tmp_path_factory):
     return json.loads(path.read_text())["methods"]
 
 
-@pytest.mark.slow(seconds=35)
+@pytest.mark.endurance
 def test_every_method_is_there(figures):
     assert list(figures) == [*METHODS, *SLOW_METHODS]
     for name, method in figures.items():

@@ -86,7 +86,7 @@ def test_it_starts_in_motion_and_does_not_drift(figures):
     assert figures["follow"]["position_rms"] < 0.2e-3
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_a_rig_calibrated_with_its_encoders_is_as_repeatable_as_they_are(tmp_path, capsys):
     file = tmp_path / "figures.json"
     options = ("--rate", "250", "--seeds", "1", "--joint-error", "0", "--workers", "1", "--json", str(file))

@@ -28,7 +28,7 @@ def tuned(tmp_path_factory):
     return mechanism, json.loads(figures.read_text())
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_the_tuned_file_is_the_mechanism_with_what_was_found(tuned):
     path, figures = tuned
     found = {name: values["after"] for name, values in figures["settings"].items()}

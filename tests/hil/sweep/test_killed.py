@@ -196,7 +196,8 @@ def test_deaths_of_programs_and_their_workers(folder: Path, reference: dict[str,
     assert sweeps.killed.total() == deaths
 
 
-@pytest.mark.parametrize("deaths", [pytest.param(2, marks=pytest.mark.slow), pytest.param(8, marks=pytest.mark.endurance)])
+@pytest.mark.endurance
+@pytest.mark.parametrize("deaths", [2, 8])
 def test_deaths_of_an_external_scheduler_and_its_workers(
     folder: Path, reference: dict[str, dict[str, object]], deaths: int
 ) -> None:

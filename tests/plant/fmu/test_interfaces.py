@@ -297,7 +297,7 @@ BEGINS = {
 @pytest.mark.parametrize(
     "platforms",
     [
-        pytest.param(["linux", "darwin"], marks=pytest.mark.slow),
+        pytest.param(["linux", "darwin"], marks=pytest.mark.endurance),
         # The first link for Windows builds its libraries, which takes minutes.
         pytest.param(["linux", "windows"], marks=pytest.mark.endurance),
     ],
