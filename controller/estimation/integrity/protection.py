@@ -3,27 +3,27 @@
 As satellite navigation has it (RAIM), the level counts what a fault could do unseen, and the worst hypothesis gives it.
 `evidence` leaves C_mm m + C_mf f = c_m for the error m of the pose. The most likely sizes a of a hypothesis D have the
 covariance (D^T W D)^-1. Such a fault moves the pose by -C_mm^-1 C_mf D a, of covariance V, and leaves it off by
-m = C_mm^-1 (c_m - C_mf D a). Let e be its evidence less the number of its directions and less 8, which calibrated IMUs hardly
-ever exceed without a fault; e is at least 0.
+m = C_mm^-1 (c_m - C_mf D a). Let e be its evidence less the number of its directions and less 1, but at least 0: what
+chance alone gives.
 
     no fault       |C_mm^-1 c_m|
     unseen fault   sqrt(tr V / 4): what could be there unseen; little where the readings would show it
-    seen fault     sqrt((e + 1/4) tr V) + 3 |m| min(1, e / 8)
+    seen fault     sqrt((e + 1/4) tr V) + 8 |m| min(1, e / 7)
 
-The 3 is for faults that grow: such a fault is larger at the end of the filter's memory than on average over it, and has moved
-the pose before. A fault since the loop began has had little time to move the pose: these terms grow over the first two seconds.
+The 8 is for faults that grow: such a fault is larger at the end of the filter's memory than on average over it, and has moved
+the pose before, and goes on until the next evaluation. A fault since the loop began has had little time to move the pose: these
+terms grow over the first four seconds.
 
 The level is the root of the sum of the squares of four terms:
 
 1. The greatest of these.
 2. The standard deviation of the pose, both that of the closed form and that of the pose's own source if that is less: no filter
-   knows what calibrations of IMUs and joints leave. It counts more in the first seconds, in which the filters learn what the
-   gyroscopes are off.
+   knows what calibrations of IMUs and joints leave.
 3. The standard deviation of the closed form again, by how much its measurements contradict each other: so joints that are off
    show themselves, and other errors that nothing models.
 4. What `parity` and `shaking` tell: forces that are no motion may have moved the pose.
 
-Terms 3 and 4 are renewed after every window.
+Terms 3 and 4 are renewed in every cycle.
 """
 
 import numpy as np
@@ -32,36 +32,33 @@ from controller.least_squares import factor_cholesky, solve_cholesky
 from plant.compiled import Record, kernel, record_dtype
 
 POSE = 6
-_CHANCE = 8.0
-"""By how much evidence exceeds the number of directions without a fault."""
+_CHANCE = 1.0
+"""By how much evidence may exceed the number of directions before a fault counts as seen."""
 
 _UNSEEN = 0.25
 """Evidence ascribed to a fault for which there is less [-]."""
 
-_SURELY = 8.0
+_SURELY = 7.0
 """Evidence beyond chance from which on a fault is taken to be there."""
 
-_BENDING_S = 2.0
+_BENDING_S = 4.0
 """How long a fault takes to move the pose [s]."""
 
-_GROWN = 3.0
+_GROWN = 8.0
 """By which factor the present error may exceed the mean one within the fault filter's memory."""
 
-_OF_CLOSED_FORM, _OF_SOURCE = (0.3, 1.2), (2.0, 0.9)
+_OF_CLOSED_FORM, _OF_SOURCE = (0.5, 1.4), (2.5, 1.4)
 """How many standard deviations of position and rotation count: of the pose in closed form, and of the better known of this and
 the pose's source.
 """
 
-_UNSETTLED, _SETTLING_S = 2.0, 2.0
-"""How many of the closed form's count at the start, and the time constant with which their square fades [s]."""
-
-_USUAL_MISFIT, _OF_MISFIT, _MISFIT_S = 0.3, 3.0, 0.1
+_USUAL_MISFIT, _OF_MISFIT, _MISFIT_S = 0.4, 2.0, 0.1
 """A misfit up to the first is usual. Beyond it, the closed form's standard deviation counts so many times, times the root of
 the excess. The misfit is averaged with the time constant [s]. Sound IMUs have less than 1, as most of the errors that the
 weights stand for are alike in all measurements, or move the pose.
 """
 
-_SOUND, _MOST, _SHAKEN = 0.2, 0.4, 0.1
+_SOUND, _MOST, _SHAKEN = 0.2, 1.0, 0.3
 """Mean forces that are no motion count beyond what sound IMUs hardly ever exceed, and up to this much [m/s^2]; the share of the
 vibration's RMS that counts with them.
 """
@@ -159,7 +156,7 @@ def end_level(s: Record, age: float) -> None:
         s: dtype `STATE`, with the covariances of the pose.
         age: for how long the loop has run [s].
     """
-    bent, unsettled = min(1.0, age / _BENDING_S), _UNSETTLED**2 * np.exp(-age / _SETTLING_S)
+    bent = min(1.0, age / _BENDING_S)
     for part in range(2):
         closed = own = 0.0
         for i in range(3 * part, 3 * part + 3):
@@ -167,7 +164,7 @@ def end_level(s: Record, age: float) -> None:
             own += s.covariance[1, i, i]
         if not np.isfinite(closed):
             closed = own
-        squared = (_OF_CLOSED_FORM[part] ** 2 + unsettled) * closed + _OF_SOURCE[part] ** 2 * min(own, closed)
+        squared = _OF_CLOSED_FORM[part] ** 2 * closed + _OF_SOURCE[part] ** 2 * min(own, closed)
         squared += (bent * s.fault[part]) ** 2
         s.closed[part] = closed if np.isfinite(closed) else 0.0
         s.evaluated[part] = squared if s.determined != 0 else np.inf
@@ -176,12 +173,12 @@ def end_level(s: Record, age: float) -> None:
 
 @kernel
 def publish_level(s: Record, misfit: float, duration: float, steady: float, shaken: float) -> None:
-    """Publish the level after a window of the fault filter, with what has come up since the last evaluation.
+    """Publish the level of a cycle, with what has come up since the last evaluation.
 
     Args:
         s: dtype `STATE`.
         misfit: of the closed form now, `pose_estimator.STATE`.
-        duration: of the window [s].
+        duration: since the last cycle [s].
         steady: greatest mean force that is no motion [m/s^2], `parity.STATE`.
         shaken: greatest mean square of vibration [m^2/s^4], `shaking.STATE`.
     """

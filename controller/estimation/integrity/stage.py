@@ -134,10 +134,8 @@ def step_integrity(
             parity.step_parity(s.parity, s.filter, imus.excluded, p.filter.window, rig.period, imus.shaking.no_motion)
             or s.parity.shared != 0
         )
-        if s.evaluations > 0:
-            protection.publish_level(
-                s.protection, pose.misfit, p.filter.duration, s.parity.steady, imus.shaking.mean.max()
-            )  # fmt: skip
+    if s.evaluations > 0:
+        protection.publish_level(s.protection, pose.misfit, elapsed(rig, time), s.parity.steady, imus.shaking.mean.max())
     if s.waits > 0:
         s.waits -= 1
         if s.waits == 0:

@@ -34,17 +34,17 @@ def level_of(state, frames, predicted, place):
         used = d[:count]
         matrix, right = used @ e["weight"] @ used.T, used @ e["vector"]
         inverse = np.linalg.pinv(matrix, rcond=1e-9, hermitian=True)
-        seen = max(right @ inverse @ right - count - 8.0, 0.0)
+        seen = max(right @ inverse @ right - count - 1.0, 0.0)
         spread = effect @ used.T @ inverse @ used @ effect.T
         m = error - effect @ used.T @ inverse @ right
         faults.append(
             [
-                np.sqrt((seen + 0.25) * np.trace(spread[s, s])) + 3.0 * np.linalg.norm(m[s]) * min(1.0, seen / 8.0)
+                np.sqrt((seen + 0.25) * np.trace(spread[s, s])) + 8.0 * np.linalg.norm(m[s]) * min(1.0, seen / 7.0)
                 for s in (slice(0, 3), slice(3, 6))
             ]
         )
     closed, own = traces()
-    return np.sqrt([0.3**2, 1.2**2] * closed + [2.0**2, 0.9**2] * np.minimum(own, closed) + np.max(faults, axis=0) ** 2)
+    return np.sqrt([0.5**2, 1.4**2] * closed + [2.5**2, 1.4**2] * np.minimum(own, closed) + np.max(faults, axis=0) ** 2)
 
 
 def traces(covariances=OWN):
@@ -79,21 +79,11 @@ def test_a_fault_has_had_as_much_time_as_the_loop_to_move_the_pose():
     _, state = evaluated("mixed", (), 1.5, 3, None)
     level = state["integrity"]["protection"]
     level["determined"] = 1
-    for age, share in ((0.0, 0.0), (0.5, 0.25), (2.0, 1.0), (100.0, 1.0)):
+    for age, share in ((0.0, 0.0), (1.0, 0.25), (4.0, 1.0), (100.0, 1.0)):
         level["fault"] = 0.0
         without = ended(level, age)
         level["fault"] = fault = np.array([0.01, 0.1])
         np.testing.assert_allclose(ended(level, age), np.hypot(without, share * fault))
-
-
-def test_in_the_first_seconds_the_closed_form_counts_more():
-    _, state = evaluated()
-    level = state["integrity"]["protection"]
-    level["determined"] = 1
-    closed, _ = traces()
-    for age in (0.0, 1.0, 5.0):
-        unsettled = ended(level, age) ** 2 - ended(level, 1e3) ** 2
-        np.testing.assert_allclose(unsettled, 4.0 * np.exp(-age / 2.0) * closed, rtol=1e-6)
 
 
 def test_a_source_that_is_less_certain_than_the_closed_form_does_not_raise_it():
@@ -111,21 +101,21 @@ def test_forces_that_are_no_motion_raise_the_level_between_evaluations():
     sound = ended(level)
     np.testing.assert_array_equal(ended(level, steady=0.2), sound)
     np.testing.assert_allclose(ended(level, steady=0.3), np.hypot(sound, [0.004, 0.006]))
-    np.testing.assert_allclose(ended(level, shaken=4.0), np.hypot(sound, [0.008, 0.012]))
-    np.testing.assert_allclose(ended(level, steady=5.0, shaken=9.0), np.hypot(sound, [0.016, 0.024]))
+    np.testing.assert_allclose(ended(level, shaken=4.0), np.hypot(sound, [0.024, 0.036]))
+    np.testing.assert_allclose(ended(level, steady=5.0, shaken=9.0), np.hypot(sound, [0.04, 0.06]))
 
 
 def test_measurements_that_contradict_each_other_raise_the_level_between_evaluations():
     _, state = evaluated("mixed", (), 1.5, 3)
     level = state["integrity"]["protection"]
     calm = ended(level)
-    np.testing.assert_array_equal(ended(level, misfit=0.29), calm)
+    np.testing.assert_array_equal(ended(level, misfit=0.39), calm)
     closed, _ = traces()
-    np.testing.assert_allclose(ended(level, misfit=2.3), np.sqrt(calm**2 + 9.0 * 2.0 * closed))
+    np.testing.assert_allclose(ended(level, misfit=2.4), np.sqrt(calm**2 + 4.0 * 2.0 * closed))
     # A misfit that has just come up counts by its share of the average.
-    level["misfit"] = 0.3
-    publish_level(level[()], 2.3, 0.01, 0.0, 0.0)
-    np.testing.assert_allclose(level["level"], np.sqrt(calm**2 + 9.0 * 0.2 * closed))
+    level["misfit"] = 0.4
+    publish_level(level[()], 2.4, 0.01, 0.0, 0.0)
+    np.testing.assert_allclose(level["level"], np.sqrt(calm**2 + 4.0 * 0.2 * closed))
     assert np.isinf(ended(level, own=np.full_like(OWN, np.inf), misfit=2.3)).all()
 
 
@@ -147,7 +137,7 @@ def test_it_covers_the_error_of_the_pose_without_and_with_a_fault():
         s = all_steps(mechanism, r, parameters, state)
         position, rotation = ended(s["protection"])
         least = 0.002 if spoil else 2.0 * np.sqrt(np.trace(OWN[1, :3, :3]))
-        assert least < position < 0.02
+        assert least < position < 0.03
         assert 0.0 < rotation < 0.05
 
 
