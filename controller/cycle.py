@@ -485,7 +485,8 @@ def hear_encoders(
     parameters: Record, state: Record, silent: int, readings: Array, rates: Array, home: NDArray[np.int64]
 ) -> None:
     """Before a cycle: take the encoders' readings, as `controller.estimation.encoders.screen_encoders` has it."""
-    encoders.screen_encoders(parameters[()].encoders, state[()].encoders, silent, readings, rates, home)
+    p, s = parameters[()], state[()]
+    encoders.screen_encoders(p.encoders, s.encoders, elapsed(p.rig, s.time), silent, readings, rates, home)
 
 
 @kernel

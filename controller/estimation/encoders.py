@@ -5,6 +5,9 @@ where it began, which the IMUs do. So the pose that the IMUs have is moved to th
 these are the mean differences between readings and the IMUs' lengths. The pose's covariance knows that they are no better than
 that. A zero is exact once its home switch has closed; an absolute encoder's is so from the start.
 
+Without a reading, as when an answer of the rig is lost, the last difference from the IMUs counts for a moment: the pose goes on
+from where it is, instead of to that of the IMUs and back.
+
 Where the IMUs do not determine the pose, absolute encoders lead: the pose is that of least squares over lengths and IMUs, found
 by iteration from home or from the last pose. Lengths alone belong to several poses, of which this finds the nearest.
 """
@@ -36,6 +39,9 @@ _FORGETTING_S = 30.0
 _SETTLING_S = 0.25
 """For twice as long a difference counts in that mean by the time before it: the IMUs' lengths are means that get better [s]."""
 
+_HELD_S = 0.03
+"""For so long an encoder without a reading counts by its last one: longer than it takes to tell that the bus is lost [s]."""
+
 _MOST_STEPS = 20
 _SETTLED = 1e-9
 """A step below this ends the iteration from a first guess [m, rad]."""
@@ -58,14 +64,17 @@ PARAMETERS = record_dtype(
 """Constants of the encoders."""
 
 STATE = record_dtype(
-    reading=(np.float64, LEGS),  # last one [m]
-    rate=(np.float64, LEGS),  # its rate [m/s]
+    reading=(np.float64, LEGS),  # last one; NaN for none [m]
+    carried=(np.float64, LEGS),  # the same, carried on at its rate while there is none [m]
+    rate=(np.float64, LEGS),  # of the last one [m/s]
+    silent_for=(np.float64, LEGS),  # how long there has been none [s]
     home=(np.int64, LEGS),  # last state of the home switch: 1 beyond it, 0 before it, -1 not known
     used=(np.float64, LEGS),  # 1 if the reading is used
+    counts=(np.float64, LEGS),  # the same, or whether the last one was, for `_HELD_S`
     excluded=(np.int64, LEGS),  # whether the encoder contradicts the rest
     zero=(np.float64, LEGS),  # what it reads more than the length [m]
     followed_for=(np.float64, LEGS),  # how long the zero has been followed; infinite for one that is known [s]
-    off=(np.float64, LEGS),  # reading less zero and the IMUs' length [m]; NaN without a reading
+    off=(np.float64, LEGS),  # reading less zero and the IMUs' length [m]; NaN without a reading for `_HELD_S`
     information=(np.float64, (6, 6)),  # from here on scratch
     factor=(np.float64, (6, 6)),
     correction=(np.float64, 6),
@@ -101,15 +110,23 @@ def encoder_parameters(model: EncoderModel | None, fusion: FusionSettings, mecha
 
 
 @shared_kernel
-def screen_encoders(p: Record, s: Record, silent: int, readings: Array, rates: Array, home: NDArray[np.int64]) -> None:
+def screen_encoders(
+    p: Record, s: Record, passed: float, silent: int, readings: Array, rates: Array, home: NDArray[np.int64]
+) -> None:
     """Before a cycle: take readings [m], rates [m/s] and home switches (6,), and find out which of them can be used.
 
     Args:
+        passed: time since the last cycle [s].
         silent: for how many cycles the rig has not answered.
     """
     for k in range(LEGS):
-        s.reading[k], s.rate[k] = readings[k], rates[k]
-        good = p.present[k] != 0 and silent == 0 and np.isfinite(readings[k]) and s.excluded[k] == 0
+        s.reading[k] = readings[k]
+        if silent == 0 and np.isfinite(readings[k]):
+            s.carried[k], s.rate[k], s.silent_for[k] = readings[k], rates[k], 0.0
+        else:
+            s.carried[k] += passed * s.rate[k]
+            s.silent_for[k] += passed
+        good = p.present[k] != 0 and s.silent_for[k] == 0.0 and s.excluded[k] == 0
         s.used[k] = 1.0 if good else 0.0
         switched = good and home[k] >= 0 and s.home[k] >= 0 and home[k] != s.home[k]
         if switched and np.isfinite(p.switch[k]):
@@ -129,7 +146,20 @@ def compare_lengths(p: Record, s: Record, rig: Record, pose: Record) -> None:
     for k in range(rig.legs):
         if s.used[k] != 0.0 and s.followed_for[k] == 0.0 and p.absolute == 0:
             s.zero[k] = s.reading[k] - pose.lengths[k]
-        s.off[k] = s.reading[k] - s.zero[k] - pose.lengths[k]
+        if s.silent_for[k] == 0.0:
+            s.off[k] = s.reading[k] - s.zero[k] - pose.lengths[k]
+        elif s.followed_for[k] == 0.0 or s.silent_for[k] > _HELD_S:
+            s.off[k] = np.nan
+
+
+@kernel
+def _count(s: Record, k: int) -> bool:
+    """Find out whether the encoder of leg `k` counts, after it has been judged."""
+    if s.silent_for[k] == 0.0:
+        s.counts[k] = s.used[k]
+    elif s.silent_for[k] > _HELD_S or s.excluded[k] != 0:
+        s.counts[k] = 0.0
+    return bool(s.counts[k] != 0.0)
 
 
 @kernel
@@ -141,12 +171,13 @@ def move_to_lengths(p: Record, s: Record, rig: Record, time: Record, pose: Recor
             s.information[i, j] = pose.information[i, j]
     used = 0
     for k in range(rig.legs):
-        if s.used[k] == 0.0:
+        if not _count(s, k):
             continue
         used += 1
         row = s.row
         _find_row(pose, k, row)
-        _follow_zero(p, s, elapsed(rig, time), k)
+        if s.silent_for[k] == 0.0:
+            _follow_zero(p, s, elapsed(rig, time), k)
         uncertain = p.zero_variance if s.followed_for[k] == np.inf else _variance_along(row, pose.factor, s.scratch)
         weight, known = 1.0 / p.variance, 1.0 / (p.variance + uncertain)
         for i in range(6):
@@ -183,6 +214,8 @@ def find_pose_by_lengths(
     pose.weights[LEGS:] = pose.vector_weights
     pose.misfit = pose.rest_misfit = 0.0
     weight, settled = 1.0 / (p.variance + p.zero_variance), False
+    for k in range(rig.legs):
+        _count(s, k)
     for _ in range(_MOST_STEPS):
         normal_equations(
             rig.geometry.base_joints, rig.geometry.platform_joints, legs.directions, pose.weights[:LEGS], rig.vectors_in_base,
@@ -190,8 +223,8 @@ def find_pose_by_lengths(
             pose.information, pose.correction,
         )  # fmt: skip
         for k in range(rig.legs):
-            if s.used[k] != 0.0:
-                s.off[k] = s.reading[k] - pose.lengths[k]
+            if s.counts[k] != 0.0:
+                s.off[k] = s.carried[k] - pose.lengths[k]
                 _find_row(pose, k, s.row)
                 for i in range(6):
                     pose.correction[i] += weight * s.off[k] * s.row[i]
@@ -209,7 +242,7 @@ def find_pose_by_lengths(
     if not settled:
         return False
     for k in range(rig.legs):
-        if s.used[k] != 0.0 and abs(s.off[k]) > _MOST_LEFT_M:
+        if s.counts[k] != 0.0 and abs(s.off[k]) > _MOST_LEFT_M:
             return False
     turning = rotate(pose.rotation, vector(platform_rate))
     pose.angular_velocity[0], pose.angular_velocity[1], pose.angular_velocity[2] = turning
@@ -219,7 +252,7 @@ def find_pose_by_lengths(
     )  # fmt: skip
     s.correction[:] = 0.0
     for k in range(rig.legs):
-        if s.used[k] != 0.0:
+        if s.counts[k] != 0.0:
             _find_row(pose, k, s.row)
             for i in range(6):
                 s.correction[i] += weight * s.rate[k] * s.row[i]

@@ -15,6 +15,7 @@ from hil.engine.settings import EngineSettings
 from hil.runs.config import SimulationConfig
 from hil.studies.config import SECTIONS, ComparisonConfig, EvaluationConfig
 from hil.table import Table
+from plant.encoders import NO_LENGTHS, load_encoder
 from plant.errors import InputError
 from plant.extras import check_installed
 
@@ -307,6 +308,13 @@ _EVALUATED: dict[str, Callable[[dict[str, Any]], None]] = {
         metavar="FOLDER",
         help="keep every run in a table in Parquet in this folder; one that was interrupted goes on there",
     ),
+    cli.argument(
+        "--lengths",
+        default=NO_LENGTHS,
+        metavar="KIND",
+        help="give the rig encoders, as for 'gough simulate', and try nothing but the faults with a specified reaction, with "
+        "each fusion, after the zeros are known: the pose may then be 1 mm and 0.3 deg off until one is told",
+    ),
     cli.flag("--worst", "sort the disturbances, the worst first"),
     cli.markdown("docs/faults.md"),
     cli.engine_options(),
@@ -322,18 +330,30 @@ def gough_faults(options: Namespace) -> int:
     wrong: how often anything was told, and the protection level beside the error. All runs are on virtual time. The exit status
     is 1 if a reaction differs from the specified one, or if there is a forbidden outcome.
     """
-    from hil.faults.reactions import CASES, Case, table
+    from hil.faults.reactions import CASES, Case, pose_table, table, with_encoders
     from hil.faults.rows import Row, all_rows
-    from hil.faults.tables import disturbance_table, disturbances_of, list_table, sound_of, sound_table, summary, worst_first
+    from hil.faults.tables import (
+        disturbance_table,
+        disturbances_of,
+        encoder_table,
+        list_table,
+        sound_of,
+        sound_table,
+        summary,
+        worst_first,
+    )
     from hil.faults.trials import outcomes_of, run_trials, trials_of
 
     if options.seeds < 1:
         raise InputError(f"there are {options.seeds} seeds; at least 1 is needed")
     fusions = tuple(options.fusion.split(","))
     for fusion in fusions:
-        SimulationConfig(fusion=fusion)
+        SimulationConfig(fusion=fusion, lengths=options.lengths)
+    load_encoder(options.lengths)
     only: list[str] = options.only or [""]
     everything: list[Case | Row] = [*CASES, *all_rows()]
+    if options.lengths != NO_LENGTHS:
+        everything = [*with_encoders(CASES, options.lengths)]
     items = [item for item in everything if any(text in item.name or text in item.kind for text in only)]
     if not items:
         raise InputError(f"no case has {' or '.join(map(repr, only))} in its name or kind: 'gough faults --list' prints all")
@@ -347,9 +367,12 @@ def gough_faults(options: Namespace) -> int:
     cases = [item for item in items if isinstance(item, Case)]
     outcomes, disturbances = outcomes_of(cases, found), disturbances_of(found)
     if outcomes:
-        table(outcomes).print(options.markdown)
+        (table if options.lengths == NO_LENGTHS else pose_table)(outcomes).print(options.markdown)
     if disturbances:
         disturbance_table(worst_first(disturbances) if options.worst else disturbances).print(options.markdown)
+    encoders = encoder_table(disturbances)
+    if encoders.rows:
+        encoders.print(options.markdown)
     sound = sound_of(found)
     if sound:
         sound_table(sound).print(options.markdown)

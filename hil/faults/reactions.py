@@ -5,8 +5,8 @@ Loop, messages and emulated rig are the real ones, connected in memory and on vi
 
 import json
 from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -17,6 +17,7 @@ from controller.planning.plan_handover import STREAM, note_sample, rest
 from controller.planning.stream_planner import StreamPlanner
 from controller.safety.causes import Cause, DriveState, Mode, Reaction, Request
 from hil.faults.links import join_udp
+from hil.faults.verdict import judge
 from hil.loop.records import RECORD, Link, StopRequest
 from hil.rigs.emulation import fault, sample
 from hil.rigs.udp.emulator import check_watchdog
@@ -24,6 +25,7 @@ from hil.runs.config import SimulationConfig
 from hil.runs.prepare import PreparedLoop, prepared_loop
 from hil.runs.target_stream import Reception, encode
 from hil.table import Table
+from plant.encoders import NO_LENGTHS
 from plant.mechanism import LEGS
 from plant.pose import Array, quaternion_from_rotation
 from plant.truth import TRUTH_LENGTHS
@@ -31,6 +33,10 @@ from plant.truth import TRUTH_LENGTHS
 RATE_HZ = 1000.0
 MOTION_S = 4.5
 _FIRST_S, _SPREAD_S = 1.5, 1.0
+_ZEROS_S = 3.5
+"""With encoders everything is so much later: their zeros are known then."""
+MOST_OFF_M, MOST_TURNED_RAD = 1e-3, float(np.radians(0.3))
+"""With encoders, the greatest allowed error of the pose until a fault is told."""
 _SAMPLE_CYCLES = 10
 _SMOOTH = 20
 """Cycles over which a true acceleration is averaged: the IMUs' noise in the commands is no motion."""
@@ -56,6 +62,8 @@ class Case:
         act: makes a fault that is not the rig's.
         streamed: the fault of a streamed target.
         also: other causes that may end the run.
+        followed: whether it is known where the platform is until the fault is told; it is not if the rig has been killed.
+        lengths: the encoders, as in `SimulationConfig`.
     """
 
     kind: ClassVar[str] = "reactions"
@@ -70,6 +78,8 @@ class Case:
     act: Callable[[PreparedLoop], None] | None = None
     streamed: str = ""
     also: tuple[Cause, ...] = ()
+    followed: bool = True
+    lengths: str = NO_LENGTHS
 
 
 def _ask(how: int, loop: PreparedLoop) -> None:
@@ -121,7 +131,7 @@ CASES = (
     Case("10 % of the packets come twice", Cause.NONE, GO_ON, 0, 2e-3, "bus-repeats"),
     Case("10 % of the packets are damaged", Cause.NONE, GO_ON, 0, 2e-3, "bus-corrupts"),
     Case("the bus is down", Cause.BUS_LOST, QUICK_STOP, 21, 5e-3, "bus-down"),
-    Case("the rig is killed and started again", Cause.BUS_LOST, QUICK_STOP, 21, 20e-3, act=_kill_rig),
+    Case("the rig is killed and started again", Cause.BUS_LOST, QUICK_STOP, 21, 20e-3, act=_kill_rig, followed=False),
     Case("a drive has a fault", Cause.DRIVE_FAULT, QUICK_STOP, 3, 5e-3, "drive-faults:{k}"),
     Case("a drive loses its power", Cause.DRIVE_OFF, QUICK_STOP, 3, 5e-3, "drive-unpowered:{k}"),
     Case("a drive ignores its commands", Cause.MOVED_OTHERWISE, BRAKE, 1000, 10e-3, "drive-ignores:{k}"),
@@ -146,6 +156,11 @@ CASES = (
 )  # fmt: skip
 
 
+def with_encoders(cases: Iterable[Case], lengths: str) -> list[Case]:
+    """The cases whose faults begin after the encoders' zeros are known."""
+    return [replace(case, lengths=lengths) for case in cases if not case.from_start]
+
+
 @dataclass
 class Outcome:
     """The outcome of a case over all seeds.
@@ -155,7 +170,9 @@ class Outcome:
         cycles: from the fault to its event; empty if none was expected.
         peak_m: greatest deviation of a leg from its reference since the fault, by seed.
         travel_m: greatest travel of a leg from the event to rest, by seed.
+        position_m, rotation_rad: greatest errors of the pose from the fault to the event, or to the end, by seed.
         findings: differences from the specification, in words.
+        fusion: how the IMUs are fused.
     """
 
     case: Case
@@ -163,29 +180,43 @@ class Outcome:
     cycles: list[int] = field(default_factory=list)
     peak_m: list[float] = field(default_factory=list)
     travel_m: list[float] = field(default_factory=list)
+    position_m: list[float] = field(default_factory=list)
+    rotation_rad: list[float] = field(default_factory=list)
     findings: list[str] = field(default_factory=list)
+    fusion: str = "compiled"
 
     def __add__(self, other: "Outcome") -> "Outcome":
         """The outcome over the seeds of both."""
-        return Outcome(self.case, *(getattr(self, each.name) + getattr(other, each.name) for each in fields(self)[1:]))
+        names = [each.name for each in fields(self)[1:-1]]
+        return replace(self, **{name: getattr(self, name) + getattr(other, name) for name in names})
 
     def row(self) -> dict[str, Any]:
         """The outcome with one seed, as a row of a table."""
-        (reaction,), (peak,), (travel,) = self.reactions, self.peak_m, self.travel_m
-        cycles = self.cycles[0] if self.cycles else None
-        findings = json.dumps(self.findings)
-        return {"reaction": reaction, "told_cycles": cycles, "peak": peak, "travel": travel, "findings": findings}
+        (reaction,) = self.reactions
+        return {
+            "reaction": reaction,
+            "told_cycles": self.cycles[0] if self.cycles else None,
+            "peak": self.peak_m[0],
+            "travel": self.travel_m[0],
+            "position_before": self.position_m[0],
+            "rotation_before": self.rotation_rad[0],
+            "findings": json.dumps(self.findings),
+        }
 
     def with_row(self, row: Mapping[str, Any]) -> "Outcome":
         """The outcome with that of one more seed, from its `row`."""
         cycles = [] if row.get("told_cycles") is None else [int(row["told_cycles"])]
+        before = [row["position_before"]], [row["rotation_before"]]
         findings = json.loads(row["findings"])
-        return self + Outcome(self.case, Counter([row["reaction"]]), cycles, [row["peak"]], [row["travel"]], findings)
+        reactions = Counter([row["reaction"]])
+        return self + Outcome(
+            self.case, reactions, cycles, [row["peak"]], [row["travel"]], *before, findings, self.fusion
+        )  # fmt: skip
 
     def summary(self) -> dict[str, Any]:
         """The figures, for JSON."""
         figures = {name: value for name, value in vars(self).items() if name != "case"}
-        return {"case": self.case.name, "expected": self.case.expected.text, **figures}
+        return {"case": self.case.name, "lengths": self.case.lengths, "expected": self.case.expected.text, **figures}
 
 
 def table(outcomes: list[Outcome]) -> Table:
@@ -201,18 +232,45 @@ def table(outcomes: list[Outcome]) -> Table:
     return result
 
 
-def try_case(case: Case, seed: int) -> Outcome:
+def pose_table(outcomes: Iterable[Outcome]) -> Table:
+    """The errors of the pose with encoders until the fault is told, median and greatest over the seeds.
+
+    Where there are several fusions, their cells have a stroke between them.
+    """
+    result = Table("case, with encoders", "fusion", "cycles until told", "pose until told [mm]", "[deg]")
+    groups: dict[str, list[Outcome]] = {}
+    for each in outcomes:
+        groups.setdefault(each.case.name, []).append(each)
+    for name, group in groups.items():
+        cells = zip(*(_pose_cells(each) for each in group), strict=True)
+        result.add(name, *(" / ".join(parts) for parts in cells))
+    return result
+
+
+def _pose_cells(each: Outcome) -> tuple[str, ...]:
+    cycles = f"{np.median(each.cycles):.0f}, {max(each.cycles)}" if each.cycles else "-"
+    positions, angles = 1e3 * np.array(each.position_m), np.degrees(each.rotation_rad)
+    errors = f"{np.median(positions):.2f}, {positions.max():.2f}", f"{np.median(angles):.2f}, {angles.max():.2f}"
+    return each.fusion, cycles, *(errors if each.case.followed else ("-", "-"))
+
+
+def try_case(case: Case, seed: int, fusion: str) -> Outcome:
     """The outcome of a case with one seed of IMUs and fault, its time and place.
+
+    With encoders it begins after their zeros are known.
 
     Raises:
         GoughError: it cannot be run.
     """
     random = np.random.default_rng([seed, len(case.name), 6])
-    at = _FIRST_S + _SPREAD_S * random.random()
+    later = 0.0 if case.lengths == NO_LENGTHS else _ZEROS_S
+    at, duration = later + _FIRST_S + _SPREAD_S * random.random(), later + MOTION_S
     k, j = random.permutation(LEGS)[:2].tolist()
     begin = "" if case.from_start else f",at={round(at, 4)}"
     faults = [fault(text.format(k=k, j=j) + begin) for text in case.faults.split()]
-    config = SimulationConfig(target="sines", duration=MOTION_S, rate=RATE_HZ, seed=seed)
+    config = SimulationConfig(
+        target="sines", duration=duration, rate=RATE_HZ, seed=seed, fusion=fusion, lengths=case.lengths
+    )  # fmt: skip
     with prepared_loop(config) as loop:
         join_udp(loop, faults, seed)
         loop.records = np.zeros(1 << 14, RECORD)
@@ -224,9 +282,9 @@ def try_case(case: Case, seed: int) -> Outcome:
         elif case.act is not None:
             loop.run(onset)
             case.act(loop)
-        cause = loop.follow(hold + round(MOTION_S * RATE_HZ))
+        cause = loop.follow(hold + round(duration * RATE_HZ))
         _stand(loop)
-        return _judge(case, seed, loop, cause, onset)
+        return _judge(Outcome(case, fusion=fusion), seed, loop, cause, onset)
 
 
 def _stand(loop: PreparedLoop) -> None:
@@ -260,10 +318,10 @@ def _follow_stream(loop: PreparedLoop, what: str, onset: int) -> None:
         reception.plan()
 
 
-def _judge(case: Case, seed: int, loop: PreparedLoop, cause: int, onset: int) -> Outcome:
+def _judge(outcome: Outcome, seed: int, loop: PreparedLoop, cause: int, onset: int) -> Outcome:
     """Compare the run with its specification."""
     assert loop.emulator is not None
-    outcome = Outcome(case)
+    case = outcome.case
     limits, period = loop.mechanism.require_limits(), 1.0 / RATE_HZ
     records, rig = loop.records[: int(loop.link[Link.HEAD])], loop.emulator.rig
 
@@ -296,6 +354,16 @@ def _judge(case: Case, seed: int, loop: PreparedLoop, cause: int, onset: int) ->
     off = most(followed["truth"][:, TRUTH_LENGTHS] - followed["reference"][:, :, 0])
     outcome.peak_m.append(off)
     find(off > case.peak, f"a leg was {1e3 * off:.2f} mm off, and {1e3 * case.peak:g} are allowed")
+    figures = judge(records, int(np.searchsorted(records["cycle"], onset)), frozenset(), cause, RATE_HZ)
+    position, rotation = (float(figures[f"{part}_before"] or 0.0) for part in ("position", "rotation"))
+    outcome.position_m.append(position)
+    outcome.rotation_rad.append(rotation)
+    limited = case.lengths != NO_LENGTHS and case.followed
+    find(
+        limited and (position > MOST_OFF_M or rotation > MOST_TURNED_RAD),
+        f"the pose was {1e3 * position:.2f} mm and {np.degrees(rotation):.2f} deg off before it was told, and "
+        f"{1e3 * MOST_OFF_M:g} and {np.degrees(MOST_TURNED_RAD):.1f} are allowed",
+    )
     travel = 0.0
     after = records[(records["mode"] >= Mode.RUNNING) & (records["cycle"] >= begin)]["truth"][:, TRUTH_LENGTHS]
     if len(after) and case.reaction != GO_ON:

@@ -28,6 +28,9 @@ LINKS = ("fmu", "udp", "canopen")
 SOUND = "sound"
 """The kind of rows in which nothing is wrong."""
 
+ENCODERS = "encoders"
+"""The kind of rows with encoders."""
+
 MOST_GUILTY = 3
 """So many IMUs with the same disturbance are each at fault; what more of them share is not mended by leaving one out."""
 

@@ -10,15 +10,17 @@ import numpy as np
 
 from controller.safety.causes import Cause
 from hil.faults.reactions import RATE_HZ, Case, Outcome
-from hil.faults.rows import SOUND, Row
+from hil.faults.rows import ENCODERS, SOUND, Row
 from hil.faults.trials import Figures
 from hil.table import Table
 
 _MM, _DEG = 1e3, degrees(1.0)
+_ENCODER_OFF_M, _ENCODER_S = 1e-3, 0.05
+"""An encoder that is wrong is named before it is so far off, or within so long, whichever is later."""
 _NOTHING, _END = "nothing", Cause.END_OF_MOTION.short
 _GREATEST = (
     "position_before", "rotation_before", "position_after", "rotation_after", "position_then", "rotation_then", "deviation",
-    "level_position", "level_rotation", "told_s",
+    "level_position", "level_rotation", "told_s", "encoder_off",
 )  # fmt: skip
 """Of these figures the greatest over the seeds is shown; a table has no column for what no run has."""
 
@@ -49,8 +51,9 @@ def disturbances_of(found: Iterable[Figures]) -> list[dict[str, Any]]:
 
     Returns:
         By row and fusion: the greatest of each error, level and time (`verdict.judge`), how often what was `told` first, how
-        often and why the run `ended` early, the numbers of `runs`, of those with `alarms` before the begin, and of `forbidden`
-        ones, and the share of cycles that the protection level has `covered`, if there is one.
+        often and why the run `ended` early, the numbers of `runs`, of those with `alarms` before the begin, of `forbidden`
+        ones, and of those that named an encoder too `late`, and the share of cycles that the protection level has `covered`, if
+        there is one.
     """
     groups: dict[tuple[str, str, str], list[Figures]] = {}
     for figures in found:
@@ -70,8 +73,25 @@ def _over_seeds(runs: list[Figures]) -> dict[str, Any]:
         "alarms": sum(each["alarms"] > 0 for each in runs),
         "sound_left_out": sum(bool(each["sound_left_out"]) for each in runs),
         "forbidden": sum(each["forbidden"] for each in runs),
+        "late": sum(map(_is_late, runs)),
         "covered": float(np.divide(*np.sum(covered, axis=0))) if covered else None,
     }
+
+
+def _is_late(figures: Figures) -> bool:
+    """Whether nothing was told until an encoder was 1 mm off and 50 ms had passed."""
+    off, told = figures.get("encoder_off"), figures.get("told_s")
+    return off is not None and off > _ENCODER_OFF_M and (told is None or told > _ENCODER_S)
+
+
+def encoder_table(disturbances: Iterable[dict[str, Any]]) -> Table:
+    """A line for each row of faults of encoders: how far one was off when it was told, and the longest time until then."""
+    table = Table("encoders", "fusion", "off when told [mm]", "s", "later than 1 mm and 50 ms")
+    for each in disturbances:
+        if each["kind"] == ENCODERS and each["encoder_off"] is not None:
+            off, told = _number(each["encoder_off"], _MM, 2), _number(each["told_s"], 1.0, 3)
+            table.add(each["row"], each["fusion"], off, told, f"{each['late']} of {each['runs']}")
+    return table
 
 
 def disturbance_table(disturbances: Sequence[dict[str, Any]]) -> Table:

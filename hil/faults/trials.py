@@ -17,6 +17,7 @@ from hil.faults.reactions import Case, Outcome, try_case
 from hil.faults.rows import Row
 from hil.faults.verdict import judge
 from hil.runs.names import digest_of
+from plant.encoders import NO_LENGTHS
 
 FUSIONS = ("compiled", "whole")
 """The ways to fuse the IMUs with which every disturbance is tried."""
@@ -30,7 +31,7 @@ Report = Callable[..., None]
 
 @dataclass(frozen=True)
 class Trial:
-    """One run: a case or a row, with a seed; a case has the default fusion."""
+    """One run: a case or a row, with a seed; a case without encoders has the default fusion."""
 
     what: Case | Row
     seed: int
@@ -40,13 +41,13 @@ class Trial:
     def key(self) -> str:
         """A hash of all that determines the figures."""
         # What a case is stands in the sources.
-        content = asdict(self.what) if isinstance(self.what, Row) else {}
+        content = asdict(self.what) if isinstance(self.what, Row) else {"lengths": self.what.lengths}
         return digest_of(json.dumps({**content, **self.point, "sources": fingerprint()}, sort_keys=True).encode())
 
     @property
     def kind(self) -> str:
         """Trials of a kind need the same machine code and FMU."""
-        return f"{self.what.link} {self.fusion}" if isinstance(self.what, Row) else "udp compiled"
+        return f"{self.what.link if isinstance(self.what, Row) else 'udp'} {self.fusion}"
 
     @property
     def point(self) -> dict[str, Any]:
@@ -59,7 +60,7 @@ def trials_of(items: Iterable[Case | Row], seeds: int, fusions: Sequence[str] = 
     return [
         Trial(item, seed, fusion)
         for item in items
-        for fusion in (fusions if isinstance(item, Row) else FUSIONS[:1])
+        for fusion in (fusions if isinstance(item, Row) or item.lengths != NO_LENGTHS else FUSIONS[:1])
         for seed in range(seeds)
     ]
 
@@ -71,7 +72,7 @@ def figures_of(trial: Trial) -> dict[str, Any]:
         GoughError: it cannot be run.
     """
     if isinstance(trial.what, Case):
-        return try_case(trial.what, trial.seed).row()
+        return try_case(trial.what, trial.seed, trial.fusion).row()
     drawn = trial.what.drawn(trial.seed, trial.fusion)
     records, begin, cause = run(drawn)
     return judge(records, begin, drawn.guilty, cause, drawn.config.rate)
@@ -111,9 +112,11 @@ def run_trials(
 
 
 def outcomes_of(cases: Iterable[Case], rows: Iterable[Figures]) -> list[Outcome]:
-    """The outcomes of cases over all seeds, from the figures of their trials."""
-    outcomes = {case.name: Outcome(case) for case in cases}
+    """The outcomes of cases with each fusion over all seeds, from the figures of their trials."""
+    by_name = {case.name: case for case in cases}
+    outcomes: dict[tuple[str, str], Outcome] = {}
     for row in rows:
         if row["kind"] == Case.kind:
-            outcomes[row["row"]] = outcomes[row["row"]].with_row(row)
+            key = row["row"], row["fusion"]
+            outcomes[key] = outcomes.get(key, Outcome(by_name[key[0]], fusion=key[1])).with_row(row)
     return list(outcomes.values())

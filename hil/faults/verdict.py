@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from controller.safety.causes import Cause, Mode
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
-from plant.pose import Array, pose_errors, rotations_from_quaternions
+from plant.pose import Array, pose_errors, rotation_from_vector, rotations_from_quaternions, vector_from_rotation
 from plant.truth import TRUTH_LENGTHS, TRUTH_POSITION, TRUTH_QUATERNION
 
 FORBIDDEN_POSITION_M, FORBIDDEN_ROTATION_RAD = 5e-3, float(np.radians(1.0))
@@ -40,6 +40,8 @@ def judge(records: Record, begin: int, guilty: frozenset[int], cause: int, rate:
         `forbidden`: whether a sound one was left out and the error then exceeded 5 mm or 1 deg; `position_then`,
         `rotation_then`: the greatest errors since then.
         `deviation`: the greatest of a leg from its reference.
+        `encoder_off`: how far the reading of any encoder had changed otherwise than its length when something was told; None
+        without encoders.
         `cycles` in motion, in which the error was `rms_position` and `rms_rotation`, and, if the loop has a protection level,
         how many of them it has `covered`, and its 99th percentiles `level_position` and `level_rotation`.
     """
@@ -49,6 +51,7 @@ def judge(records: Record, begin: int, guilty: frozenset[int], cause: int, rate:
     events = _events(records, begin)
     first = events[0] if events else None
     told_at = first[0] if first else len(records)
+    encoder_off = _encoder_off(records, begin, told_at)
     before, after = steering & (cycles >= begin) & (cycles <= told_at), steering & (cycles > told_at)
     used = (records["imus"][:, None] >> np.arange(IMU_COUNT)) & 1 != 0
     lost = ~used & (steering & (cycles >= begin))[:, None]
@@ -77,6 +80,7 @@ def judge(records: Record, begin: int, guilty: frozenset[int], cause: int, rate:
         "position_then": position_then,
         "rotation_then": rotation_then,
         "deviation": _most(np.abs(records["truth"][:, TRUTH_LENGTHS] - references).max(axis=1), steering & (cycles >= begin)),
+        "encoder_off": encoder_off,
         "cycles": int(steering.sum()),
         "rms_position": _rms(position[steering]),
         "rms_rotation": _rms(rotation[steering]),
@@ -86,11 +90,38 @@ def judge(records: Record, begin: int, guilty: frozenset[int], cause: int, rate:
 
 def _errors(records: Record) -> tuple[Array, Array]:
     """The distance [m] and the angle [rad] of the estimate from the truth, (N,) each; NaN counts as infinitely far."""
-    truth = records["truth"]
-    rotations = rotations_from_quaternions(np.ascontiguousarray(truth[:, TRUTH_QUATERNION]))
-    errors = pose_errors(records["position"], records["rotation"], truth[:, TRUTH_POSITION], rotations)
+    errors = pose_errors(records["position"], records["rotation"], *_true_poses(records))
     position, rotation = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2).T
     return np.nan_to_num(position, nan=np.inf, posinf=np.inf), np.nan_to_num(rotation, nan=np.inf, posinf=np.inf)
+
+
+def _true_poses(records: Record) -> tuple[Array, Array]:
+    """Positions (N, 3) [m] and rotations (N, 3, 3).
+
+    While the rig does not answer, the truth in the records is that of its last answer. Its drives go on at their last speed,
+    and so does the pose here.
+    """
+    positions = records["truth"][:, TRUTH_POSITION].copy()
+    rotations = rotations_from_quaternions(np.ascontiguousarray(records["truth"][:, TRUTH_QUATERNION]))
+    periods = 1 + records["missed"]
+    shift, turn = np.zeros(3), np.zeros(3)
+    for cycle in np.flatnonzero(records["silent"] > 0).tolist():
+        if cycle > 1 and records["silent"][cycle - 1] == 0:
+            shift = (positions[cycle - 1] - positions[cycle - 2]) / periods[cycle - 1]
+            turn = vector_from_rotation(rotations[cycle - 1] @ rotations[cycle - 2].T) / periods[cycle - 1]
+        positions[cycle] = positions[cycle - 1] + periods[cycle] * shift
+        rotations[cycle] = rotation_from_vector(periods[cycle] * turn) @ rotations[cycle - 1]
+    return positions, rotations
+
+
+def _encoder_off(records: Record, begin: int, told_at: int) -> float | None:
+    """How far any encoder's reading changed otherwise than its length, from a cycle before `begin` until one [m]."""
+    off = records["length"] - records["truth"][:, TRUTH_LENGTHS]
+    answered = records["silent"] == 0
+    first = max(begin - 1, 0)
+    until = off[first : told_at + 1][answered[first : told_at + 1]]
+    changes = np.abs(until - until[:1])
+    return float(np.nanmax(changes)) if np.isfinite(changes).any() else None
 
 
 def _events(records: Record, begin: int) -> list[tuple[int, int, int]]:

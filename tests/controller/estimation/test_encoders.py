@@ -39,7 +39,7 @@ class Bench:
     def find(self, lengths, rates=None):
         """Whether there is a pose with these lengths (n,) [m]."""
         readings, speeds = (np.pad(each, (0, LEGS - len(each))) for each in (lengths, lengths if rates is None else rates))
-        screen_encoders(self.parameters[()], self.encoders[()], 0, readings, speeds, NO_HOME)
+        screen_encoders(self.parameters[()], self.encoders[()], 1e-3, 0, readings, speeds, NO_HOME)
         self.pose["found"] = find_pose_by_lengths(
             self.parameters[()], self.encoders[()], self.estimator[()], self.rig[()], self.time[()], self.legs[()], np.zeros(3),
             self.pose[()],
@@ -79,8 +79,20 @@ def test_lengths_without_a_pose_have_none():
     home = bench.mechanism.require_home()
     lengths = leg_lengths(bench.mechanism, home.position, home.rotation)
     assert not bench.find(lengths * [1.0, 1.0, 1.0, 1.0, 1.0, 4.0])
-    bench.pose["found"] = 0
-    assert not bench.find(lengths + [0.0, 0.0, np.nan, 0.0, 0.0, 0.0])
+    assert not Bench("hexapod").find(lengths + [0.0, 0.0, np.nan, 0.0, 0.0, 0.0])
+
+
+def test_for_30_ms_a_silent_encoder_counts_by_its_last_reading_and_its_rate():
+    bench = Bench("hexapod")
+    home = bench.mechanism.require_home()
+    speed, nothing = np.array([0.05, -0.02, 0.03, 0.0, 0.0, 0.0]), np.full(6, np.nan)
+    rates = inverse_kinematics(bench.mechanism, home).jacobian @ speed
+    assert bench.find(leg_lengths(bench.mechanism, home.position, home.rotation), rates)
+    for cycle in range(1, 30):
+        assert bench.find(nothing, nothing)
+        moved = bench.pose["position"] - home.position
+        np.testing.assert_allclose(moved, 1e-3 * cycle * speed[:3], atol=0.02e-3)
+    assert not [bench.find(nothing, nothing) for _ in range(2)][-1]
 
 
 def test_where_an_encoder_is_silent_the_platform_s_vertical_makes_up_for_it():
@@ -119,7 +131,7 @@ def test_a_zero_is_the_mean_of_what_the_imus_say_weighted_by_the_time_before():
     for _ in range(50):
         heights.append(random.normal(0.0, 1e-5))
         pose["position"], pose["rotation"] = home.position + [0.0, 0.0, heights[-1]], home.rotation
-        screen_encoders(parameters[()], encoders[()], 0, readings, np.zeros(LEGS), NO_HOME)
+        screen_encoders(parameters[()], encoders[()], 1e-3, 0, readings, np.zeros(LEGS), NO_HOME)
         compare_lengths(parameters[()], encoders[()], rig[()], pose[()])
         assert move_to_lengths(parameters[()], encoders[()], rig[()], time[()], pose[()])
         time["cycle"] += 1

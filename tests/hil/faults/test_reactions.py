@@ -6,7 +6,7 @@ import pytest
 
 from controller.safety.causes import Cause, Reaction
 from hil.command_line import main
-from hil.faults.reactions import CASES, Case, Outcome, table
+from hil.faults.reactions import CASES, MOST_OFF_M, MOST_TURNED_RAD, Case, Outcome, pose_table, table, with_encoders
 from hil.faults.trials import outcomes_of, run_trials, trials_of
 
 DOCS = Path(__file__).parents[3] / "docs" / "faults.md"
@@ -23,6 +23,34 @@ def test_the_reaction_is_the_specified_one(case, seeds):
     assert outcome.findings == []
     assert sum(outcome.reactions.values()) == seeds
     assert len(outcome.cycles) == (seeds if case.expected else 0)
+
+
+ENCODERS = with_encoders(CASES, "incremental")
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        each if each.name == "a leg's IMU is biased by 2 deg" else pytest.param(each, marks=pytest.mark.slow)
+        for each in ENCODERS
+    ],
+    ids=[each.name for each in ENCODERS],
+)
+def test_with_encoders_the_pose_is_within_1_mm_and_0_3_deg_until_a_fault_is_told(case):
+    outcomes = run_matrix(1, (case,))
+    assert [outcome.fusion for outcome in outcomes] == ["compiled", "whole"]
+    for outcome in outcomes:
+        assert outcome.findings == []
+        # Errors are those of this run: nothing is exact, and what the limit is for is within it.
+        assert outcome.position_m[0] > 1e-5 and (not case.followed or outcome.position_m[0] <= MOST_OFF_M)
+        assert outcome.rotation_rad[0] > 1e-5 and (not case.followed or outcome.rotation_rad[0] <= MOST_TURNED_RAD)
+
+
+def test_with_encoders_an_error_before_a_fault_is_told_is_found():
+    """Two IMUs on one leg's side that are biased so far that the pose moves at once, and nothing is asked to be told."""
+    (case,) = with_encoders([Case("turned", Cause.NONE, Reaction.GO_ON, 0, 15e-3, "imu-biased:{k},size=60")], "incremental")
+    found = [finding for outcome in run_matrix(1, (case,)) for finding in outcome.findings]
+    assert found
 
 
 @pytest.mark.parametrize(
@@ -81,6 +109,16 @@ def test_the_table_has_the_median_and_the_greatest_of_each_figure():
     assert [cell.text for cell in table([quiet]).rows[0]] == ["q", "-", "goes on", "-", "0.50, 0.50", "-"]
 
 
+def test_the_table_with_encoders_has_the_fusions_side_by_side():
+    case = Case("frozen", Cause.IMU_FROZEN, Reaction.GO_ON, 15, 2e-3)
+    outcomes = [
+        Outcome(case, {"goes on": 2}, [10, 12], [], [], [3e-4, 5e-4], [0.001, 0.002], fusion="compiled"),
+        Outcome(case, {"goes on": 2}, [10, 10], [], [], [1e-4, 1e-4], [0.0005, 0.0005], fusion="whole"),
+    ]
+    rows = [[cell.text for cell in row] for row in pose_table(outcomes).rows]
+    assert rows == [["frozen", "compiled / whole", "11, 12 / 10, 10", "0.40, 0.50 / 0.10, 0.10", "0.09, 0.11 / 0.03, 0.03"]]
+
+
 def test_the_command_prints_the_table_and_its_status_says_whether_all_is_well(capsys, tmp_path):
     emergency = ("--seeds", "1", "--only", "emergency", "--workers", "1")
     assert main(["faults", *emergency, "--markdown", "--json", str(tmp_path / "x.json")]) == 0
@@ -88,4 +126,7 @@ def test_the_command_prints_the_table_and_its_status_says_whether_all_is_well(ca
     assert (tmp_path / "x.json").exists()
     assert main(["faults", "--only", "nothing like this"]) == 2
     assert main(["faults", "--seeds", "0"]) == 2
+    assert main(["faults", *emergency, "--lengths", "incremental", "--markdown"]) == 0
+    assert "| an emergency stop is asked for | compiled / whole | 0, 0 / 0, 0 |" in capsys.readouterr().out
+    assert main(["faults", "--lengths", "none-such"]) == 2
     assert table([]).rows == []

@@ -7,9 +7,18 @@ import pytest
 
 from controller.safety.causes import Cause, Mode
 from hil.faults.rows import SOUND
-from hil.faults.tables import disturbance_table, disturbances_of, sound_of, sound_table, summary, worst_first
+from hil.faults.tables import (
+    disturbance_table,
+    disturbances_of,
+    encoder_table,
+    sound_of,
+    sound_table,
+    summary,
+    worst_first,
+)
 from hil.faults.verdict import judge
 from hil.loop.records import RECORD
+from plant.pose import rotations_from_quaternions
 
 RATE, CYCLES, BEGIN = 100.0, 400, 100
 
@@ -47,6 +56,41 @@ def test_errors_are_told_apart_by_the_moment_at_which_something_is_told():
     assert json.loads(found["events"]) == [[1.5, "IMU is left out: it disagrees with the others", 3]]
     assert (found["ended"], found["ended_s"], found["alarms"]) == ("drive does not do what it is told", 3.0, 0)
     assert found["cycles"] == 330 and not found["forbidden"] and "covered" not in found
+
+
+def test_while_the_rig_is_silent_the_platform_goes_on_at_its_last_speed():
+    """The records then have the truth of the last answer."""
+    made = records()
+    times = np.arange(CYCLES) / RATE
+    made["truth"][:, 0] = made["position"][:, 0] = 0.02 * times
+    half = np.radians(5.0) * times
+    made["truth"][:, 3], made["truth"][:, 6] = np.cos(half), np.sin(half)
+    made["rotation"] = rotations_from_quaternions(np.ascontiguousarray(made["truth"][:, 3:7]))
+    made["position"][:, 2] = 0.0
+    made["truth"][200:230] = made["truth"][199]
+    made["silent"][200:230] = np.arange(1, 31)
+    found = judge(made, BEGIN, frozenset(), Cause.END_OF_MOTION, RATE)
+    assert found["position_before"] < 1e-12 and found["rotation_before"] < 1e-6
+    made["position"][215, 0] += 1e-3
+    assert judge(made, BEGIN, frozenset(), Cause.END_OF_MOTION, RATE)["position_before"] == pytest.approx(1e-3)
+
+
+def test_an_encoder_is_as_far_off_as_its_reading_changes_otherwise_than_its_length():
+    made = records()
+    made["truth"][:, 7:13] = 0.4 + 1e-3 * np.arange(CYCLES)[:, None] / RATE
+    made["length"] = made["truth"][:, 7:13] - 0.3
+    made["length"][BEGIN:, 2] -= 1e-5 * np.arange(CYCLES - BEGIN)
+    tell(made, 180, Cause.ENCODER_CONTRADICTED, 2)
+    found = {"kind": "encoders", "row": "a", "fusion": "whole", **judge(made, BEGIN, frozenset(), Cause.END_OF_MOTION, RATE)}
+    assert found["encoder_off"] == pytest.approx(0.8e-3)
+    (each,) = disturbances_of([found])
+    assert each["late"] == 0
+    assert [cell.text for cell in encoder_table([each]).rows[0]] == ["a", "whole", "0.80", "0.800", "0 of 1"]
+    slow = {**found, "encoder_off": 1.2e-3}
+    assert disturbances_of([slow])[0]["late"] == 1
+    assert disturbances_of([{**slow, "told_s": 0.04}])[0]["late"] == 0
+    made["length"] = np.nan
+    assert judge(made, BEGIN, frozenset(), Cause.END_OF_MOTION, RATE)["encoder_off"] is None
 
 
 def test_without_a_word_all_errors_are_silent():

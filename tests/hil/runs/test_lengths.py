@@ -83,6 +83,25 @@ def test_an_encoder_that_is_silent_is_told_and_used_again():
     assert np.linalg.norm(errors_of(result.records)[-1000:, :3], axis=1).max() < 0.5
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"fusion": "compiled"},
+        {"fusion": "compiled", "lengths": "absolute", "imus": (6,)},
+        pytest.param({}, marks=pytest.mark.slow),
+        pytest.param({"lengths": "absolute", "imus": (6,)}, marks=pytest.mark.slow),
+    ],
+)
+def test_lost_answers_move_neither_the_pose_nor_the_commands(changes):
+    """For a cycle without a reading the pose was that of the IMUs alone, 0.4 mm away, or there was none."""
+    config, text = replace(SINES, duration=3.0, seed=1, **changes), "bus-drops,size=0.1,at=1"
+    records, _, cause = run(Drawn(config, "udp", (text,), frozenset(), 1.0))
+    assert cause == Cause.END_OF_MOTION and (records["silent"] > 0).sum() > 100
+    moving = records[records["mode"] == Mode.RUNNING]
+    steps = np.linalg.norm(np.diff(moving["position"], axis=0), axis=1)
+    assert steps.max() < 0.1e-3 and np.abs(np.diff(moving["command"], axis=0)).max() < 8e-3
+
+
 def test_an_encoder_that_has_lost_counts_is_used_again_with_a_new_zero():
     result = simulate(replace(SINES, duration=12.0, fusion="compiled", faults=("encoder-jumps:4,size_mm=3,at=3",)))
     told = [
