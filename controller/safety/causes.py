@@ -214,6 +214,7 @@ class Cause(IntEnum):
         "m",
     )
 
+    TWO_FORCES = 74, "two IMUs or more read a force that is no motion", Reaction.QUICK_STOP, "m/s^2"
     NO_POSE_FITS = 66, "no pose fits the IMUs, even without the worst of them", Reaction.QUICK_STOP, "sigma RMS"
 
     @property

@@ -3,7 +3,7 @@
 import numpy as np
 
 from controller.estimation.imu_monitor import contradiction, reset
-from controller.estimation.integrity.parity import SHARED
+from controller.estimation.integrity.parity import OF_TWO, SHARED
 from controller.rig import elapsed
 from controller.safety.causes import Cause, DriveState, Mode, Request, report_event
 from controller.safety.stop import handle_cause
@@ -37,6 +37,14 @@ A fault that has just come up is not constant over the memory of the fault filte
 
 _PATIENT = 1.5
 """How many times the limit evidence may reach while more of it may tell what is wrong."""
+
+_UNEXPLAINED, _UNEXPLAINED_EVALUATIONS = 1.25, 2
+"""Nor may more be left than so many times the limit, and the share above, in so many evaluations in a row: then more than
+one IMU is wrong, though none of them may be beyond the limit.
+"""
+
+_LASTING, _LASTING_EVALUATIONS = 0.6, 10
+"""Evidence against an IMU that cannot be left out may be beyond this share of the limit in fewer evaluations in a row."""
 
 _NEARLY = 0.7
 """Share of the evidence from which on something else explains the readings as well."""
@@ -99,6 +107,8 @@ STATE = record_dtype(
     calm_variance=(np.float64, 2),  # the same when nothing shook the IMUs last
     returns=(np.int64, IMU_COUNT),  # how often each IMU was taken back
     cleared_for=(np.int64, IMU_COUNT),  # in how many evaluations there has been little evidence against an IMU left out
+    unexplained_for=np.int64,  # in how many more than one IMU has been wrong
+    lasting_for=np.int64,  # in how many there has been evidence against an IMU that is needed
 )
 """What the rig has reported, and what lasts."""
 
@@ -307,12 +317,15 @@ def judge_parity(
 ) -> bool:
     """When the gyroscopes contradict each other: leave out the one that is named, else stop. Returns whether it is left out.
 
-    When all accelerometers show a force that is no motion, stop. If `evidence` has no limit, nothing happens.
+    When all accelerometers or two show a force that is no motion, stop. If `evidence` has no limit, nothing happens.
     """
     if not _moves(s) or not np.isfinite(p.watch.evidence):
         return False
     if parity.shared != 0:
         handle_cause(p, s, rig, time, reference, pid, Cause.FORCES_SHARE, -1, parity.common, SHARED)
+        return False
+    if parity.two != 0:
+        handle_cause(p, s, rig, time, reference, pid, Cause.TWO_FORCES, -1, parity.second, OF_TWO)
         return False
     if parity.named != 0 and _may_leave_out(p.watch, imus, parity.worst):
         imus.excluded[parity.worst] = 1
@@ -330,6 +343,9 @@ def judge_evidence(
 ) -> bool:
     """After an evaluation of the evidence for faults: leave out the IMU that it is against, if it is against no other and the
     rest agrees; take back one that it is no longer against; else stop. Returns whether the set of IMUs has changed.
+
+    Below the limit, stop if two evaluations in a row leave too much unexplained, or if evidence against an IMU that cannot be
+    left out lasts.
     """
     w, limit, e = s.watch, p.watch.evidence, integrity
     back = False
@@ -343,34 +359,62 @@ def judge_evidence(
             w.cleared_for[k] = imus.excluded[k] = 0
             w.returns[k] += 1
             back = True
-    if back or not e.best_evidence >= limit or not _moves(s):
+    rest, usual_rest = e.all_evidence - e.imu_evidence, _REST_OF_ALL * e.imu_evidence
+    if judged:
+        _count_evaluations(p.watch, w, e, rest - usual_rest)
+    if back or not _moves(s):
         return back
     k, most = e.blamed, np.sqrt(limit)
+    if not e.best_evidence >= limit:
+        if judged and w.unexplained_for >= _UNEXPLAINED_EVALUATIONS:
+            least = np.sqrt(_UNEXPLAINED * limit + usual_rest)
+            handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, k, np.sqrt(rest), least)
+        elif judged and w.lasting_for >= _LASTING_EVALUATIONS:
+            least = np.sqrt(_LASTING * limit)
+            handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, k, np.sqrt(e.imu_evidence), least)
+        return False
     if k < 0:
         cause = Cause.GYROSCOPES_SHARE + e.shared
         handle_cause(p, s, rig, time, reference, pid, cause, -1, np.sqrt(e.best_evidence), most)
         _report_rival(s, e, most)
         return False
     clear = e.rival_evidence < e.imu_evidence - max(_CLEARLY * limit, _CLEARLY_OF_ALL * e.imu_evidence)
-    rest_agrees = e.all_evidence - e.imu_evidence < _REST * limit + _REST_OF_ALL * e.imu_evidence
+    rest_agrees = rest < _REST * limit + usual_rest
     alone = clear and rest_agrees and e.evidence.of_learned == 0
     if alone and _may_leave_out(p.watch, imus, k):
         imus.excluded[k] = 1
+        w.unexplained_for = 0
         report_event(s.events, Cause.IMU_CONTRADICTED, k, np.sqrt(e.imu_evidence), most)
         return True
-    if (clear and rest_agrees) or e.best_evidence >= _PATIENT * limit:
+    # Nothing is gained by waiting where the IMU cannot be left out.
+    certain = (clear and rest_agrees) or e.best_evidence >= _PATIENT * limit or _is_needed(p.watch, k)
+    if certain or (judged and w.unexplained_for >= _UNEXPLAINED_EVALUATIONS):
         handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, k, np.sqrt(e.imu_evidence), most)
         _report_rival(s, e, most)
     return False
 
 
 @kernel
+def _count_evaluations(p: Record, w: Record, e: Record, unexplained: float) -> None:
+    """Count the evaluations in a row that leave too much unexplained, and those that are against an IMU that is needed."""
+    w.unexplained_for = w.unexplained_for + 1 if unexplained >= _UNEXPLAINED * p.evidence else 0
+    lasts = e.best_evidence >= _LASTING * p.evidence and _is_needed(p, e.blamed)
+    w.lasting_for = w.lasting_for + 1 if lasts else 0
+
+
+@kernel
+def _is_needed(p: Record, k: int) -> bool:
+    """Whether IMU `k` is the platform's, without which a run may not go on."""
+    return bool(k == PLATFORM_IMU and np.isfinite(p.without_platform_imu))
+
+
+@kernel
 def _may_leave_out(p: Record, imus: Record, k: int) -> bool:
-    """Whether the run may go on without IMU `k`; it may not without the platform's if that is needed."""
+    """Whether the run may go on without IMU `k`."""
     lost = 0
     for other in range(IMU_COUNT):
         lost += imus.excluded[other]
-    return bool(lost < p.most_lost_imus and not (k == PLATFORM_IMU and np.isfinite(p.without_platform_imu)))
+    return bool(lost < p.most_lost_imus and not _is_needed(p, k))
 
 
 @kernel

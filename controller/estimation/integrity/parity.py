@@ -9,7 +9,8 @@ off for many seconds is no large error: it is left to the evidence.
 
 From one window to the next, t changes with the acceleration that was not planned, averaged with weights that rise in the first
 window and fall in the second one. If the forces, averaged alike, show more than that, it is no motion: it is vibration, or
-accelerometers are off, perhaps all alike. They then count less at once. If all of them go on to show it, the run ends.
+accelerometers are off, perhaps all alike. They then count less at once. If all of them go on to show it, or two show more, the
+run ends.
 
 Smaller errors are left to the evidence for hypotheses, which takes 0.1 to 0.2 s. Until then they move the pose little.
 """
@@ -53,8 +54,8 @@ _ENOUGH = 5
 _AVERAGED = 0.25
 """Share of a window in the average of such errors."""
 
-SHARED, _SHARED_WINDOWS = 0.1, 10
-"""The average that all accelerometers show in so many windows in a row before the run ends [m/s^2]."""
+SHARED, OF_TWO, _LASTING_WINDOWS = 0.1, 0.18, 10
+"""The average that all accelerometers, or two of them, show in so many windows in a row before the run ends [m/s^2]."""
 
 STATE = record_dtype(
     off_motion=(np.float64, IMU_COUNT),  # mean force of two windows that is no motion [m/s^2]
@@ -68,6 +69,9 @@ STATE = record_dtype(
     common=np.float64,  # the least, averaged or not, which all show
     common_for=np.int64,  # for how many windows that has been beyond the limit
     shared=np.int64,  # whether for so many that they share an error
+    second=np.float64,  # the second greatest of these averages: two show it
+    two_for=np.int64,  # for how many windows that has been beyond the limit
+    two=np.int64,  # whether for so many that no single IMU is the cause
     average=(np.float64, (IMU_COUNT, 3)),  # of these forces, in the axes of the IMUs [m/s^2]
     twist_before=(np.float64, _TWIST),  # of the window before
     force_before=(np.float64, (IMU_COUNT, 3)),  # its part in the forces beyond the planned acceleration and the twist
@@ -216,7 +220,7 @@ def _compare_forces(s: Record, f: Record, excluded: Array, samples: int, duratio
     for k in range(IMU_COUNT):
         used += _counts(f, excluded, k)
     rough = _ROUGH_SIGMAS * f.rough
-    s.steady, s.common = 0.0, np.inf
+    s.steady, s.second, s.common = 0.0, 0.0, np.inf
     for k in range(IMU_COUNT):
         s.off_motion[k] = no_motion[k] = 0.0
         if not _counts(f, excluded, k) or used < _ENOUGH:
@@ -237,6 +241,7 @@ def _compare_forces(s: Record, f: Record, excluded: Array, samples: int, duratio
                 s.average[k, m] += _AVERAGED * (beyond - s.average[k, m])
             averaged += s.average[k, m] ** 2
         averaged, own = max(np.sqrt(averaged) - rough, 0.0), np.sqrt(squared)
+        s.second = max(s.second, min(s.steady, averaged))
         s.steady = max(s.steady, averaged)
         # A shock is in the average for long, and in two windows.
         s.common = min(s.common, averaged, max(own - rough, 0.0))
@@ -246,4 +251,6 @@ def _compare_forces(s: Record, f: Record, excluded: Array, samples: int, duratio
                 no_motion[k] = samples * squared
     s.twist_before[:] = s.twist
     s.common_for = s.common_for + 1 if used >= _ENOUGH and s.common > SHARED else 0
-    s.shared = s.common_for >= _SHARED_WINDOWS
+    s.shared = s.common_for >= _LASTING_WINDOWS
+    s.two_for = s.two_for + 1 if s.second > OF_TWO else 0
+    s.two = s.two_for >= _LASTING_WINDOWS

@@ -37,7 +37,7 @@ STATE = record_dtype(
     protection=protection.STATE,
     parity=parity.STATE,
     compared=np.int64,  # the last window of which the gyroscopes have been compared
-    contradicts=np.int64,  # whether they contradict each other, or all accelerometers show no motion, found in this cycle
+    contradicts=np.int64,  # whether they contradict each other, or accelerometers show no motion, found in this cycle
     waits=np.int64,  # for how many more cycles what is read counts for the gyroscopes' parity alone
     step=np.int64,  # next of the evaluation
     cycle=np.int64,  # of the evaluation
@@ -133,6 +133,7 @@ def step_integrity(
         s.contradicts = s.filter.windows > 0 and (
             parity.step_parity(s.parity, s.filter, imus.excluded, p.filter.window, rig.period, imus.shaking.no_motion)
             or s.parity.shared != 0
+            or s.parity.two != 0
         )
     if s.evaluations > 0:
         protection.publish_level(s.protection, pose.misfit, elapsed(rig, time), s.parity.steady, imus.shaking.mean.max())
