@@ -119,8 +119,8 @@ CASES = (
     ),
     Case("two IMUs are dead", Cause.IMUS_LOST, STOP, 15, 4e-3, "imu-dead:{k} imu-dead:{j}"),
     Case(
-        "two IMUs are biased by 2 deg", Cause.IMUS_CONTRADICT, QUICK_STOP, 600, 10e-3,
-        "imu-biased:{k} imu-biased:{j}",
+        "two IMUs are biased by 2 deg", Cause.TWO_FORCES, QUICK_STOP, 600, 10e-3,
+        "imu-biased:{k} imu-biased:{j}", also=(Cause.IMUS_CONTRADICT,),
     ),
     Case("1 % of the packets are lost", Cause.NONE, GO_ON, 0, 2e-3, "bus-drops,size=0.01"),
     Case("10 % of the packets are lost", Cause.NONE, GO_ON, 0, 2e-3, "bus-drops,size=0.1"),

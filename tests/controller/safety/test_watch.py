@@ -18,6 +18,7 @@ from controller.safety.watch import (
     check_oscillation,
     exclude_imu,
     judge_evidence,
+    judge_parity,
     watch_parameters,
 )
 from controller.settings import SafetySettings
@@ -623,6 +624,82 @@ def test_contradicting_evidence_ends_a_motion_and_a_controlled_stop_and_says_the
     assert not judge(parameters, state)
     assert stop_of(state) == (Cause.IMUS_CONTRADICT, 2, pytest.approx(np.sqrt(200.0)), pytest.approx(8.0))
     assert told(state) == [Cause.IMUS_CONTRADICT, Cause.RIVAL_IMU]
+
+
+def weigh(state, imu, evidence, in_all, rival=0.0):
+    """Let an evaluation have found evidence in sigma: against an IMU, for faults of any kind, and for something else."""
+    integrity = state["integrity"]
+    integrity["best_evidence"] = integrity["imu_evidence"] = evidence**2
+    integrity["blamed"], integrity["all_evidence"] = imu, in_all**2
+    integrity["rival_blamed"], integrity["rival_evidence"] = -1, rival**2
+
+
+def evaluations_until_a_stop(parameters, state, most=30):
+    for n in range(1, most):
+        assert not judge(parameters, state)
+        if state["safety"]["stop"]["cause"] != Cause.NONE:
+            return n
+    return None
+
+
+@pytest.mark.parametrize(("in_all", "expected"), [(10.0, None), (12.0, 2)])
+def test_two_evaluations_that_no_single_imu_explains_end_a_motion_below_the_limit(in_all, expected):
+    """With 6 of 8 sigma against IMU 2, the limit is the root of 1.25 x 64 and 0.35 x 36."""
+    _, parameters, state = moving()
+    weigh(state, 2, 6.0, in_all)
+    assert evaluations_until_a_stop(parameters, state) == expected
+    if expected:
+        left = np.sqrt(in_all**2 - 36.0)
+        assert stop_of(state) == (Cause.IMUS_CONTRADICT, 2, pytest.approx(left), pytest.approx(np.sqrt(80.0 + 12.6)))
+
+
+def test_unexplained_evidence_must_come_in_two_evaluations_in_a_row_of_recent_readings():
+    _, parameters, state = moving()
+    for n in range(20):
+        weigh(state, 2, 6.0, 12.0 if n % 2 else 7.0)
+        assert evaluations_until_a_stop(parameters, state, 2) is None
+    state["integrity"]["evidence"]["of_learned"] = 1
+    weigh(state, 2, 6.0, 12.0)
+    assert evaluations_until_a_stop(parameters, state) is None
+    parameters["safety"]["watch"]["evidence"] = np.inf
+    state["integrity"]["evidence"]["of_learned"] = 0
+    assert evaluations_until_a_stop(parameters, state) is None
+
+
+@pytest.mark.parametrize(
+    ("imu", "needed", "evidence", "expected"), [(6, 1, 6.5, 10), (6, 1, 6.0, None), (6, 0, 6.5, None), (3, 1, 6.5, None)]
+)
+def test_evidence_that_lasts_against_the_platforms_imu_ends_a_motion_below_the_limit(imu, needed, evidence, expected):
+    """The run may not go on without it unless the settings allow it; the limit is the root of 0.6 x 64."""
+    _, parameters, state = moving()
+    if not needed:
+        parameters["safety"]["watch"]["without_platform_imu"] = np.inf
+    weigh(state, imu, evidence, 7.0)
+    assert evaluations_until_a_stop(parameters, state) == expected
+    if expected:
+        assert stop_of(state) == (Cause.IMUS_CONTRADICT, 6, pytest.approx(6.5), pytest.approx(np.sqrt(38.4)))
+
+
+@pytest.mark.parametrize(("imu", "expected"), [(6, 1), (3, None)])
+def test_only_for_an_imu_that_may_be_left_out_more_evidence_is_awaited(imu, expected):
+    """Something else explains the readings as well."""
+    _, parameters, state = moving()
+    weigh(state, imu, 8.5, 9.0, rival=8.0)
+    assert evaluations_until_a_stop(parameters, state) == expected
+
+
+@pytest.mark.parametrize("two", [0, 1])
+def test_two_imus_that_read_a_force_that_is_no_motion_end_a_run(two):
+    _, parameters, state = moving()
+    p, s = parameters, state
+    parity = state["integrity"]["parity"]
+    parity["two"], parity["shared"], parity["second"], parity["common"] = two, 1 - two, 0.3, 0.2
+    assert not judge_parity(
+        p["safety"][()], s["safety"][()], p["rig"][()], s["time"][()], s["imus"][()], parity[()], s["reference"][()],
+        s["pid"][()],
+    )  # fmt: skip
+    expected = (Cause.TWO_FORCES, -1, 0.3, 0.18) if two else (Cause.FORCES_SHARE, -1, 0.2, 0.1)
+    assert stop_of(state) == tuple(pytest.approx(each) if isinstance(each, float) else each for each in expected)
 
 
 @pytest.mark.parametrize("limit", [np.inf, 0.05])

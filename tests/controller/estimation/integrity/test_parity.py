@@ -206,6 +206,25 @@ def test_a_force_that_all_accelerometers_go_on_to_show_is_told_after_ten_windows
         assert (s["parity"]["common"] > 0.15) == expected
 
 
+@pytest.mark.parametrize("imus", [(2,), (2, 4), (0, 6)])
+def test_a_force_that_two_accelerometers_go_on_to_show_is_told_after_ten_windows(imus):
+    """The average is beyond the limit after some windows; one alone is none, however far it is off."""
+    mechanism, r = readings("0.5", 1.0, 2)
+    fault = (0.5 if len(imus) == 2 else 5.0) * np.array([0.0, 0.8, 0.6])
+    r.samples[:, 1, list(imus)] += fault
+    parameters, state = constants(mechanism)
+    s, first = state["integrity"]["parity"], None
+    for n in range(40):
+        part = type(r)(*(each[5 * n + (n > 0) : 5 * n + 6] for each in vars(r).values()))
+        filtered(mechanism, part, parameters, state)
+        parity(state)
+        shown = sorted(np.linalg.norm(s["average"], axis=1))
+        assert s["second"] == pytest.approx(max(shown[-2] - 3.0 * state["integrity"]["filter"]["rough"], 0.0))
+        first = n if s["two"] and first is None else first
+    assert (first is not None) == (len(imus) == 2)
+    assert first is None or 10 <= first <= 16
+
+
 def test_shocks_that_all_accelerometers_show_are_no_error_that_they_share():
     """Two of five windows are struck; the average is far beyond the limit all the time."""
     mechanism, r = readings("0.5", 1.0, 2)
