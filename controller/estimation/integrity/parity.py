@@ -54,8 +54,12 @@ _ENOUGH = 5
 _AVERAGED = 0.25
 """Share of a window in the average of such errors."""
 
-SHARED, OF_TWO, _LASTING_WINDOWS = 0.1, 0.18, 10
+SHARED, _SHARED_WINDOWS = 0.1, 10
+OF_TWO, _WINDOWS_OF_TWO = 0.2, 12
 """The average that all accelerometers, or two of them, show in so many windows in a row before the run ends [m/s^2]."""
+
+_OF_VIBRATION = 0.5
+"""Share of the RMS of vibration that is none of such an error of two: it moves slowly now and then."""
 
 STATE = record_dtype(
     off_motion=(np.float64, IMU_COUNT),  # mean force of two windows that is no motion [m/s^2]
@@ -69,9 +73,9 @@ STATE = record_dtype(
     common=np.float64,  # the least, averaged or not, which all show
     common_for=np.int64,  # for how many windows that has been beyond the limit
     shared=np.int64,  # whether for so many that they share an error
-    second=np.float64,  # the second greatest of these averages: two show it
-    two_for=np.int64,  # for how many windows that has been beyond the limit
-    two=np.int64,  # whether for so many that no single IMU is the cause
+    second=np.float64,  # the second greatest of what each shows, averaged or not: two show it
+    shown_for=(np.int64, IMU_COUNT),  # for how many windows that of each has been beyond the limit
+    two=np.int64,  # whether that of two has been for so many that no single IMU is the cause
     average=(np.float64, (IMU_COUNT, 3)),  # of these forces, in the axes of the IMUs [m/s^2]
     twist_before=(np.float64, _TWIST),  # of the window before
     force_before=(np.float64, (IMU_COUNT, 3)),  # its part in the forces beyond the planned acceleration and the twist
@@ -86,7 +90,7 @@ STATE = record_dtype(
 
 
 @kernel
-def step_parity(s: Record, f: Record, excluded: Array, samples: int, period: float, no_motion: Array) -> bool:
+def step_parity(s: Record, f: Record, excluded: Array, samples: int, period: float, shaking: Record) -> bool:
     """Look at the last full window, once its readings are predicted; returns whether gyroscopes contradict each other.
 
     Args:
@@ -95,15 +99,15 @@ def step_parity(s: Record, f: Record, excluded: Array, samples: int, period: flo
         excluded: (7,), which IMUs have been left out.
         samples: of an IMU in a window.
         period: of the samples [s].
-        no_motion: (7,), is written: the variance of a sample that stands for what an accelerometer reads that is no motion
-            [m^2/s^4]; all samples of a window share it. 0 within the limit.
+        shaking: dtype `shaking.STATE`. Its `no_motion` is written: the variance of a sample that stands for what an
+            accelerometer reads that is no motion [m^2/s^4]; all samples of a window share it. 0 within the limit.
     """
     duration = samples * period
     s.worst, s.error = _find_worst(s, f, excluded, -1)
     s.limit = _LIMIT + _LATE_S * (f.turning + _unplanned_turning(s, f, duration))
     if s.error <= s.limit:
         _learn_usual(s, f, excluded, duration / _USUAL_S)
-    _compare_forces(s, f, excluded, samples, duration, no_motion)
+    _compare_forces(s, f, excluded, samples, duration, shaking)
     s.off_for = s.off_for + 1 if s.error > s.limit else 0
     if s.off_for < _WINDOWS:
         return False
@@ -214,17 +218,19 @@ def _learn_usual(s: Record, f: Record, excluded: Array, share: float) -> None:
 
 
 @kernel
-def _compare_forces(s: Record, f: Record, excluded: Array, samples: int, duration: float, no_motion: Array) -> None:
+def _compare_forces(s: Record, f: Record, excluded: Array, samples: int, duration: float, shaking: Record) -> None:
     """Find what the forces of this window and the last one show beyond the change of the twist between them."""
-    follows, used = f.windows > 1, 0
+    follows, used, lasting, no_motion = f.windows > 1, 0, 0, shaking.no_motion
     for k in range(IMU_COUNT):
         used += _counts(f, excluded, k)
     rough = _ROUGH_SIGMAS * f.rough
-    s.steady, s.second, s.common = 0.0, 0.0, np.inf
+    s.steady = s.second = most = 0.0
+    s.common = np.inf
     for k in range(IMU_COUNT):
         s.off_motion[k] = no_motion[k] = 0.0
         if not _counts(f, excluded, k) or used < _ENOUGH:
             s.average[k] = 0.0
+            s.shown_for[k] = 0
             continue
         squared = averaged = 0.0
         for m in range(3):
@@ -241,16 +247,19 @@ def _compare_forces(s: Record, f: Record, excluded: Array, samples: int, duratio
                 s.average[k, m] += _AVERAGED * (beyond - s.average[k, m])
             averaged += s.average[k, m] ** 2
         averaged, own = max(np.sqrt(averaged) - rough, 0.0), np.sqrt(squared)
-        s.second = max(s.second, min(s.steady, averaged))
         s.steady = max(s.steady, averaged)
         # A shock is in the average for long, and in two windows.
-        s.common = min(s.common, averaged, max(own - rough, 0.0))
+        shown = min(averaged, max(own - rough, 0.0))
+        s.common = min(s.common, shown)
+        s.second, most = max(s.second, min(shown, most)), max(shown, most)
+        lasts = follows and shown > max(OF_TWO, _OF_VIBRATION * np.sqrt(shaking.mean[k] + shaking.hidden[k]))
+        s.shown_for[k] = s.shown_for[k] + 1 if lasts else 0
+        lasting += s.shown_for[k] >= _WINDOWS_OF_TWO
         if follows:
             s.off_motion[k] = own
             if s.off_motion[k] > _FORCE_LIMIT + rough:
                 no_motion[k] = samples * squared
     s.twist_before[:] = s.twist
     s.common_for = s.common_for + 1 if used >= _ENOUGH and s.common > SHARED else 0
-    s.shared = s.common_for >= _LASTING_WINDOWS
-    s.two_for = s.two_for + 1 if s.second > OF_TWO else 0
-    s.two = s.two_for >= _LASTING_WINDOWS
+    s.shared = s.common_for >= _SHARED_WINDOWS
+    s.two = lasting > 1

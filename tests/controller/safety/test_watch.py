@@ -698,7 +698,7 @@ def test_two_imus_that_read_a_force_that_is_no_motion_end_a_run(two):
         p["safety"][()], s["safety"][()], p["rig"][()], s["time"][()], s["imus"][()], parity[()], s["reference"][()],
         s["pid"][()],
     )  # fmt: skip
-    expected = (Cause.TWO_FORCES, -1, 0.3, 0.18) if two else (Cause.FORCES_SHARE, -1, 0.2, 0.1)
+    expected = (Cause.TWO_FORCES, -1, 0.3, 0.2) if two else (Cause.FORCES_SHARE, -1, 0.2, 0.1)
     assert stop_of(state) == tuple(pytest.approx(each) if isinstance(each, float) else each for each in expected)
 
 
