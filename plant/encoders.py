@@ -19,7 +19,7 @@ from typing import Any
 
 from plant.checks import nearest
 from plant.errors import InputError, UnknownNameError
-from plant.files import check_entries, read_toml
+from plant.files import check_entries, read_toml, toml_entries
 from plant.imu_disturbances import number_in, words_of_text
 from plant.imu_wiring import PLATFORM_IMU as LEGS
 
@@ -109,6 +109,13 @@ def load_encoder(name: str) -> EncoderModel | None:
             raise InputError(f"switches_m of {name} is {switches!r}; it must be a list of lengths")
         changes["switches"] = tuple(map(float, switches))
     return replace(base, name=Path(name).stem, **changes)
+
+
+def text_of_encoder(model: EncoderModel) -> str:
+    """The TOML text of a kind of encoder, which `load_encoder` reads again, to rounding."""
+    words = {word: getattr(model, field) / by for word, (field, by) in _WORDS.items()}
+    switches = [float(each) for each in model.switches]
+    return "\n".join(toml_entries({"absolute": model.absolute, "switches_m": switches, **words})) + "\n"
 
 
 def _number(table: Mapping[str, Any], word: str, title: str) -> float:

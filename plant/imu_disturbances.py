@@ -220,6 +220,29 @@ def disturbance_of_table(table: Mapping[str, Any]) -> Disturbance:
     return disturbance(kind, **words)
 
 
+def words_of(disturbance: Disturbance) -> dict[str, Any]:
+    """The words of a disturbance, with its kind, from which `disturbance_of_table` makes it again."""
+    kind = disturbance.kind
+    words: dict[str, Any] = {"kind": kind.name.lower(), "imus": list(disturbance.imus)}
+    if "sensor" in kind.places:
+        words["sensor"] = SENSORS[disturbance.sensor]
+    if "axis" in kind.places:
+        words["axis"] = "all" if disturbance.axis == (1.0, 1.0, 1.0) else list(disturbance.axis)
+    for word in (each for each in kind.sizes if _SIZES[each][1] in ("", words.get("sensor"))):
+        words[word] = disturbance.size / _SIZES[word][0]
+        break
+    if disturbance.course != Course.STEP:
+        word = next(each for each, course in _COURSES.items() if course == disturbance.course)
+        words[word] = {"sine_hz": 1.0 / disturbance.span, "pulse_ms": 1e3 * disturbance.span}.get(word, disturbance.span)
+    if isfinite(disturbance.every):
+        words["repeat_hz"] = 1.0 / disturbance.every
+    if disturbance.begin >= 0.0:
+        words["at_s"] = disturbance.begin
+    if isfinite(disturbance.duration):
+        words["for_s"] = disturbance.duration
+    return words
+
+
 def number_in(words: Mapping[str, Any], word: str, title: str, default: float = nan) -> float:
     """The number that a word has; `title` begins the message of an `InputError`."""
     value = words.get(word, default)

@@ -25,7 +25,7 @@ from controller.estimation.whole_mechanism.imu_errors import ERRORS
 from plant.dynamics.variables import IMU_COUNT
 from plant.errors import InputError
 from plant.files import check_entries, read_toml, toml_entries, write_whole
-from plant.imu import MAGNETOMETER
+from plant.imu import MAGNETOMETER, PRESETS, load_imu
 from plant.imu_wiring import BASE_IMU, SLOTS
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, checked_array, rotation_from_vector, vector_from_rotation
@@ -108,15 +108,21 @@ def join_gain(scale: Array, axes: Array, mounting: Array) -> Array:
 
 
 def calibrated_rig(mechanism: Mechanism, imu: str) -> dict[str, str]:
-    """What a file tells in `about` of the rig that it is of: the mechanism, its geometry as a digest, and the kind of IMU."""
+    """What a file tells in `about` of the rig that it is of: the mechanism, its geometry as a digest, and the kind of IMU.
+
+    A kind that a TOML file describes has a digest of its figures beside its name, wherever the file lies.
+    """
     arrays = [mechanism.base_joints, mechanism.platform_joints, mechanism.base_joint_axes]
     arrays += [mechanism.plant[name] for name in ("leg_imu_position", "platform_imu_position") if name in mechanism.plant]
     geometry = _hash(json.dumps([(np.round(array, 9) + 0.0).tolist() for array in arrays]))
+    if imu not in PRESETS:
+        model = load_imu(imu)
+        imu = f"{model.name} {_hash(repr(model))[:8]}"
     return {"mechanism": mechanism.name, "geometry": geometry, "imu": imu}
 
 
 def calibration_for(path: Path | str, mechanism: Mechanism, imu: str) -> Calibration:
-    """Read a calibration file for a mechanism with IMUs of this kind, a preset's name.
+    """Read a calibration file for a mechanism with IMUs of this kind, a preset or a file.
 
     Raises:
         InputError: as `load_calibration`, or the file is of another mechanism, geometry or kind of IMU.

@@ -212,10 +212,13 @@ def _print_run(summary: dict[str, Any]) -> None:
     if summary["identity"]:
         parts = ", ".join(f"{name} {value}" for name, value in summary["identity"]["parts"].items())
         print(f"rig: {summary['identity']['name']}; {parts}" if parts else f"rig: {summary['identity']['name']}")
-    if summary["obstacle"] is not None:
+    dry = summary["obstacle"] is not None
+    if dry:
         print(summary["obstacle"] or "nothing was moved; all is well for arming")
-    whole = summary["cause"] == Cause.END_OF_MOTION.text
-    print("the motion went to its end, and the brakes hold" if whole else f"stopped on the brakes: {summary['cause']}")
+    if summary["cause"] != Cause.END_OF_MOTION.text:
+        print(f"stopped on the brakes: {summary['cause']}")
+    else:
+        print("the dry run went to its end" if dry else "the motion went to its end, and the brakes hold")
 
 
 def _bars(bars: list[list[float]]) -> str:

@@ -66,8 +66,8 @@ def imus_from_text(text: str) -> tuple[int, ...]:
 class SimulationConfig:
     """What to simulate, or to run on the clock.
 
-    Where a mechanism, a target or a calibration is named, the object itself will do, too; the field then names a file in
-    gough's cache that holds it. Fields that are options say below what they mean; the others:
+    Where a mechanism, target, IMU, encoder, calibration or binding is named, the object itself will do, too; the field then
+    names a preset, or a file in gough's cache that holds it. Fields that are options say below what they mean; the others:
 
     Attributes:
         hold: how long the brakes hold first [s]; None for the time in the mechanism's settings.

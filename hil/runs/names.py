@@ -1,8 +1,8 @@
 """What a configuration names: whether it is there, and objects in place of names.
 
-A program may give a mechanism, a target or a calibration as an object. It is written to a file in gough's cache, in a folder
-named after its content, and the file's path is its name. So configurations stay plain: they are compared, hashed, recorded, and
-sent to other machines as those with names are.
+A program may give what a file describes as an object: mechanism, target, IMU, encoder, calibration or binding. It is written to
+a file in gough's cache, in a folder named after its content, and the file's path is its name. So configurations stay plain:
+they are compared, hashed, recorded, and sent to other machines as those with names are.
 """
 
 import hashlib
@@ -37,15 +37,17 @@ def check_names(config: "SimulationConfig") -> None:
     """Check that what a configuration names is there, before anything is built or compiled for it.
 
     Raises:
-        UnknownNameError: no such mechanism, IMU or motion.
+        UnknownNameError: no such mechanism, IMU, encoder or motion.
         InputError: a file is not there.
     """
     from controller.planning.target import check_target
+    from plant.encoders import load_encoder
     from plant.imu import load_imu
     from plant.mechanism import mechanism_text
 
     mechanism_text(config.mechanism)
     load_imu(config.imu)
+    load_encoder(config.lengths)
     if not config.streamed:
         check_target(config.target)
     for field in ("calibration", "plant", "binding"):
@@ -74,7 +76,8 @@ def name_of(field: str, given: Any, config: Any = None) -> Any:
         return str(given)
     if field not in _NAMED or given is None or isinstance(given, str):
         return given
-    return str(kept_file(*_NAMED[field](given, config)))
+    named = _NAMED[field](given, config)
+    return named if isinstance(named, str) else str(kept_file(*named))
 
 
 def _mechanism_file(given: Any, config: Any) -> tuple[str, bytes]:
@@ -109,6 +112,48 @@ def _calibration_file(given: Any, config: Any) -> tuple[str, bytes]:
         return "calibration.toml", (folder / "calibration.toml").read_bytes()
 
 
+def _imu_file(given: Any, config: Any) -> str | tuple[str, bytes]:
+    """A preset has its name, by which calibrations know it."""
+    del config
+    from plant.imu import PRESETS, ImuModel, text_of_imu
+
+    _check_kind("imu", given, ImuModel)
+    if given == PRESETS.get(given.name):
+        return str(given.name)
+    return f"{_stem(given.name)}.toml", text_of_imu(given).encode()
+
+
+def _encoder_file(given: Any, config: Any) -> tuple[str, bytes]:
+    del config
+    from plant.encoders import EncoderModel, text_of_encoder
+
+    _check_kind("lengths", given, EncoderModel)
+    return f"{_stem(given.name)}.toml", text_of_encoder(given).encode()
+
+
+def _binding_file(given: Any, config: Any) -> tuple[str, bytes]:
+    del config
+    from plant.fmu.binding import Binding, text_of_binding
+
+    _check_kind("binding", given, Binding)
+    return f"{_stem(given.source)}.toml", text_of_binding(given).encode()
+
+
+def _no_object(given: Any, config: Any) -> str:
+    """A plant is an instance with a state; what a run begins with is its file."""
+    del config
+    raise InputError(f"the plant is a {type(given).__name__}; it must be the path of an FMU")
+
+
+def _rig_name(given: Any, config: Any) -> str:
+    """A rig is made when the run is prepared, so that its class stands for it."""
+    del config
+    from hil.runs.config import PYTHON_RIG
+
+    _check_kind("rig", given, type)
+    return f"{PYTHON_RIG}{given.__module__}:{given.__qualname__}"
+
+
 def _check_kind(field: str, given: object, *kinds: type) -> None:
     if not isinstance(given, kinds):
         names = ", ".join(kind.__name__ for kind in kinds)
@@ -121,9 +166,14 @@ def _stem(name: str) -> str:
     return kept[:60] or "unnamed"
 
 
-_NAMED: dict[str, Callable[[Any, Any], tuple[str, bytes]]] = {
+_NAMED: dict[str, Callable[[Any, Any], str | tuple[str, bytes]]] = {
     "mechanism": _mechanism_file,
     "target": _target_file,
+    "imu": _imu_file,
+    "lengths": _encoder_file,
     "calibration": _calibration_file,
+    "plant": _no_object,
+    "binding": _binding_file,
+    "rig": _rig_name,
 }
-"""The fields of configurations that objects may stand for, with the name and content of their file."""
+"""The fields of configurations that objects may stand for, with the name and content of their file, or their name."""

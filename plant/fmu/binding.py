@@ -4,6 +4,7 @@ A signal has the name of gough's own variable (`plant.dynamics.variables`). One 
 In the binding of gough's own plants, every signal is the variable of its name.
 """
 
+import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from plant.dynamics.variables import BRAKE, DRIVE_MODES, IMU_COUNT, OPEN, PLATFORM_IMU, VELOCITY
 from plant.errors import FmuError, GoughError, InputError
-from plant.files import read_toml, unknown_entries
+from plant.files import read_toml, toml_entries, unknown_entries
 from plant.fmu.description_reader import FmuDescription, FmuVariable
 from plant.imu import ACCELEROMETER, GYROSCOPE, MAGNETOMETER
 from plant.mechanism import LEGS
@@ -114,6 +115,20 @@ def load_binding(path: Path | str) -> Binding:
     signals = {name: reader.signal(name, tables[name]) for name in SIGNAL_UNITS if name in tables}
     problems = tuple(reader.problems)
     return Binding(Path(path).name, signals or _OWN_SIGNALS, step, tables.get("start", {}), not signals, problems)
+
+
+def text_of_binding(binding: Binding) -> str:
+    """The TOML text of a binding, which `load_binding` reads again."""
+    tables: dict[str, dict[str, Any]] = {
+        "fmu": {} if binding.step is None else {"step": binding.step},
+        "start": {json.dumps(name): value for name, value in binding.start.items()},
+    }
+    for name, signal in ({} if binding.native else binding.signals).items():
+        entries: dict[str, Any] = {"variables": signal.variables, "unit": signal.unit, "imus": signal.imus}
+        entries |= dict(zip(_MODE_NAMES, signal.modes, strict=True)) if name == MODES else {}
+        entries |= {"sign": signal.sign, "offset": signal.offset} if name != MODES else {}
+        tables[name] = {entry: value for entry, value in entries.items() if value is not None}
+    return "\n".join(line for name, entries in tables.items() for line in (f"[{json.dumps(name)}]", *toml_entries(entries), ""))
 
 
 class _Reader:

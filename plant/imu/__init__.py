@@ -3,7 +3,7 @@
 from plant.imu.aliasing import aliasing_remark
 from plant.imu.disturbed import DISTURBANCE, MOST_DISTURBANCES, disturbance_record
 from plant.imu.model import MILLI_G, STANDARD_GRAVITY, ImuModel, SensorErrors
-from plant.imu.presets import PRESETS, load_imu
+from plant.imu.presets import PRESETS, load_imu, text_of_imu
 from plant.imu.random_numbers import philox
 from plant.imu.readings import (
     ACCELEROMETER,
@@ -38,4 +38,5 @@ __all__ = [
     "load_imu",
     "measure",
     "philox",
+    "text_of_imu",
 ]

@@ -7,12 +7,14 @@ from math import radians
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from plant.checks import nearest
 from plant.errors import InputError, UnknownNameError
-from plant.files import check_entries, parse_toml, read_toml
+from plant.files import check_entries, parse_toml, read_toml, toml_entries
 from plant.imu.data_sheet import IMU_WORDS, SENSOR_WORDS, figure, sensor_of_words
 from plant.imu.model import MILLI_G, MOST_SECTIONS, STANDARD_GRAVITY, ImuModel, SensorErrors
-from plant.imu_disturbances import SENSORS, disturbance, disturbance_of_table
+from plant.imu_disturbances import SENSORS, disturbance, disturbance_of_table, words_of
 
 _MPU9150_LOW_PASSES = (
     (256.0, 260.0, 1), (188.0, 184.0, 4), (98.0, 94.0, 4), (42.0, 44.0, 2), (20.0, 21.0, 1), (10.0, 10.0, 1), (5.0, 5.0, 1),
@@ -207,6 +209,29 @@ def imu_of_table(table: Mapping[str, Any], name: str, title: str) -> ImuModel:
     if "disturbances" in table:
         changes["disturbances"] = tuple(disturbance_of_table(each) for each in table["disturbances"])
     return replace(model, name=name, **changes)
+
+
+def text_of_imu(model: ImuModel) -> str:
+    """The TOML text of a kind of IMU, which `imu_of_table` reads again, to rounding."""
+    # Only a kind that is sparing makes another one so.
+    lines = toml_entries(
+        {
+            "based_on": _MPU9150.name if model.sparing else "ideal",
+            "low_passes_hz": model.low_passes,
+            **_entries(model, _WORDS),
+        }
+    )
+    for sensor in SENSORS:
+        lines += ["", f"[{sensor}]", *toml_entries(_entries(getattr(model, sensor), _sensor_words(*_UNITS[sensor])))]
+    for each in model.disturbances:
+        lines += ["", "[[disturbances]]", *toml_entries(words_of(each))]
+    return "\n".join(lines) + "\n"
+
+
+def _entries(of: ImuModel | SensorErrors, words: Mapping[str, tuple[str, float]]) -> dict[str, Any]:
+    """The fields that words stand for, in the words' units."""
+    values = {word: (np.array(getattr(of, field)), factor) for word, (field, factor) in words.items()}
+    return {word: value if factor == 1.0 else value / factor for word, (value, factor) in values.items()}
 
 
 def _of_data_sheet(table: Mapping[str, Any], model: ImuModel, title: str) -> ImuModel:

@@ -265,6 +265,20 @@ def test_a_file_of_another_rig_is_refused_with_what_differs(tmp_path, hexapod):
     calibration_for(path, heavier, "mpu9150")
 
 
+def test_a_file_of_imus_of_ones_own_is_taken_wherever_their_file_lies_until_its_figures_change(tmp_path, hexapod):
+    mine, elsewhere = tmp_path / "mine.toml", tmp_path / "elsewhere" / "mine.toml"
+    elsewhere.parent.mkdir()
+    text = 'based_on = "mpu9150"\ndelay_ms = 2\n'
+    mine.write_text(text)
+    path, _ = written(tmp_path, hexapod, str(mine))
+    elsewhere.write_text(f"# the same\n{text}")
+    assert calibration_for(path, hexapod, str(elsewhere)).remark == ""
+    elsewhere.write_text(text.replace("2", "3"))
+    said = r"is a calibration of the kind of IMU 'mine \w{8}', and this run has 'mine \w{8}': give that with --imu"
+    with pytest.raises(InputError, match=said):
+        calibration_for(path, hexapod, str(elsewhere))
+
+
 def test_no_cut_of_a_file_is_taken(tmp_path, hexapod):
     path, _ = written(tmp_path, hexapod)
     text = path.read_text()

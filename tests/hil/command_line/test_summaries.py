@@ -175,6 +175,7 @@ def test_a_run_prints_its_figures(tables, capsys, monkeypatch):
         ({"unseen": 17}, "17 cycles are in none of these figures: the supervisor came too late", "nothing was moved"),
         ({"obstacle": ""}, "nothing was moved; all is well for arming", "not armed"),
         ({"obstacle": "not armed: drive 1"}, "not armed: drive 1", "all is well"),
+        ({"obstacle": ""}, "the dry run went to its end", "the motion went"),
         ({"recording": {"files": [], "lost": 0}}, "8 exchanges late, 9 packets refused", "recorded in"),
     ],
 )

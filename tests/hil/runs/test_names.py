@@ -9,6 +9,7 @@ import pytest
 
 from controller.calibration.file import Calibration, load_calibration
 from controller.planning.target import Target, load_target
+from hil.rigs.template import TemplateRig
 from hil.runs import prepare
 from hil.runs.config import SimulationConfig
 from hil.runs.names import check_names
@@ -17,11 +18,27 @@ from hil.runs.simulation import simulate
 from hil.studies.config import EvaluationConfig
 from hil.sweep.case import cases_of
 from hil.sweep.study import Factor, Study
+from plant.encoders import EncoderModel, load_encoder
 from plant.errors import InputError, UnknownNameError
+from plant.fmu.binding import load_binding
+from plant.imu import PRESETS as IMUS
+from plant.imu import ImuModel, load_imu
+from plant.imu_disturbances import disturbance_of_text
 from plant.mechanism import Mechanism, load_in_space, load_mechanism, load_spatial
 from plant.pose import rotation_from_vector
+from tests.plant.fmu.foreign import BINDING, BINDING_3, TRUTH
 
 PRESETS = ("hexapod", "6-3-I", "6-5", "genhexkins", "planar-3rpr")
+
+
+def flat(values):
+    """The numbers and names in tuples and dictionaries, by their place."""
+    if isinstance(values, dict):
+        values = values.items()
+    elif not isinstance(values, tuple | list):
+        return {"": values}
+    each = dict(values) if not isinstance(values, tuple | list) else dict(enumerate(values))
+    return {f"{name} {place}": value for name, part in each.items() for place, value in flat(part).items() if name != "name"}
 
 
 def spiral(mechanism):
@@ -85,9 +102,62 @@ def test_a_calibration_is_kept():
     assert kept.about == given.about
 
 
+@pytest.mark.parametrize("name", sorted(IMUS))
+def test_an_imu_is_kept_and_a_preset_has_its_name(name):
+    preset = load_imu(name)
+    assert SimulationConfig(imu=preset).imu == name
+    given = replace(preset, name="mine", delay=0.002, gyroscope=replace(preset.gyroscope, noise=1e-4, order=2))
+    path = SimulationConfig(imu=given).imu
+    assert Path(path).name == "mine.toml"
+    kept, expected = asdict(load_imu(path)), asdict(given)
+    assert flat(kept) == pytest.approx(flat(expected), rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "imu-offset:0+3,axis=0/0.6/0.8,size_m_per_s2=0.5,at=5,ramp_s=2",
+        "imu-scale:6,sensor=gyroscope,axis=all,size_percent=-3",
+        "imu-vibration:all,axis=-x,size_g=3,pulse_ms=4,repeat_hz=20,for=7",
+        "imu-noise:0,axis=z,size_ut=3",
+        "imu-range:2,size_deg_per_s=100",
+        "imu-turn:5,axis=y,size_deg=3,sine_hz=0.5",
+        "imu-stuck:1,sensor=magnetometer,axis=z,at=0",
+        "imu-temperature:4,size_k=10,at=1,for=2",
+        "imu-supply:all,size_v=0.1,settle_s=3",
+        "imu-clock:2,size_percent=-50",
+        "imu-jitter:2,size_ms=0.1",
+    ],
+)
+def test_whatever_happens_to_an_imu_of_its_kind_is_kept(text):
+    given = ImuModel("shaken", disturbances=(disturbance_of_text(text),))
+    (kept,) = load_imu(SimulationConfig(imu=given).imu).disturbances
+    assert flat(asdict(kept)) == pytest.approx(flat(asdict(given.disturbances[0])), rel=1e-14)
+
+
+def test_an_encoder_is_kept():
+    given = EncoderModel("mine", True, 1e-6, 30e-6, 2e-6, 1e-4, 7e-6, 0.01, (0.39, 0.4), 3e-6)
+    path = SimulationConfig(lengths=given).lengths
+    assert Path(path).name == "mine.toml"
+    assert flat(asdict(load_encoder(path))) == pytest.approx(flat(asdict(given)), rel=1e-14)
+
+
+@pytest.mark.parametrize("text", [BINDING + TRUTH, BINDING_3, '[start]\n"payload.mass" = 12.0\n'])
+def test_a_binding_is_kept(tmp_path, text):
+    path = tmp_path / "foreign.toml"
+    path.write_text(text)
+    given = load_binding(path)
+    assert not given.problems
+    assert load_binding(SimulationConfig(plant="some.fmu", binding=given).binding) == given
+
+
+def test_a_rig_is_named_by_its_class():
+    assert SimulationConfig(rig=TemplateRig).rig == "python:hil.rigs.template:TemplateRig"
+
+
 def test_a_run_with_objects_is_that_with_their_files_and_recordings_can_name_it(tmp_path, hexapod):
     with_names = simulate(SimulationConfig(target="sines", duration=0.3))
-    with_objects = simulate(SimulationConfig(hexapod, "sines", 0.3))
+    with_objects = simulate(SimulationConfig(hexapod, "sines", 0.3, imu=load_imu("mpu9150-calibrated")))
     assert same_figures(with_objects, with_names)
     whole = load_target("sines", hexapod, 0.3)
     result = simulate(SimulationConfig(hexapod, whole, 0.3))
@@ -126,6 +196,11 @@ def test_a_sweep_takes_objects_and_hashes_what_is_in_them(tmp_path, hexapod):
         ({"mechanism": 3}, "the mechanism is a int; it must be a name, a path, or one of Mechanism, PlanarMechanism"),
         ({"target": Calibration()}, "the target is a Calibration; it must be a name, a path, or one of Target"),
         ({"calibration": [1]}, "the calibration is a list"),
+        ({"imu": EncoderModel("mine")}, "the imu is a EncoderModel; it must be a name, a path, or one of ImuModel"),
+        ({"lengths": True}, "the lengths is a bool; it must be a name, a path, or one of EncoderModel"),
+        ({"binding": {"step": 1}}, "the binding is a dict; it must be a name, a path, or one of Binding"),
+        ({"plant": Calibration()}, "the plant is a Calibration; it must be the path of an FMU"),
+        ({"rig": 3}, "the rig is a int"),
         ({"target": Target("one", np.zeros(1), np.zeros((1, 3)), np.eye(3)[None])}, "N at least 2"),
     ],
 )
@@ -149,6 +224,7 @@ def test_paths_are_names(tmp_path, hexapod):
     [
         ({"mechanism": "hexapot"}, "no mechanism 'hexapot'.*did you mean 'hexapod'"),
         ({"imu": "mpu9150-calibratet"}, "no IMU preset .*did you mean 'mpu9150-calibrated'"),
+        ({"lengths": "incremntal"}, "no encoder 'incremntal'.*did you mean 'incremental'"),
         ({"target": "sine"}, "no target 'sine'.*did you mean 'sines'"),
         ({"target": "/nowhere/x.csv"}, "no target '/nowhere/x.csv'"),
         ({"plant": "no.fmu"}, "plant = 'no.fmu': there is no such file"),

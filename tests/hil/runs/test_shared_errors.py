@@ -116,6 +116,18 @@ def test_the_protection_level_shows_that_few_imus_do_not_check_each_other():
         assert wrong["protection"][level] > 3.0 * sound["protection"][level]
 
 
+@pytest.mark.parametrize("imu", ["ideal", pytest.param("mpu9150-calibrated", marks=pytest.mark.slow)])
+def test_a_target_that_is_rounded_to_a_millimetre_is_no_error_of_accelerometers(tmp_path, imu):
+    """It makes the plan jerk to and fro within 10 ms, again and again."""
+    times = 0.01 * np.arange(301)
+    waves = np.round(np.array([5e-3, 3e-3, 4e-3]) * np.sin(np.outer(times, [2.0, 3.0, 2.5])), 3)
+    path = tmp_path / "rounded.csv"
+    rows = [f"{t:.2f},{x},{y},{z},1,0,0,0\n" for t, (x, y, z) in zip(times, waves, strict=True)]
+    path.write_text("time_s,x_m,y_m,z_m,qw,qx,qy,qz\n" + "".join(rows))
+    result = simulate(SimulationConfig(target=str(path), duration=2.9, imu=imu))
+    assert [event.partition(": ")[2] for event in result.summary()["events"]] == ["armed"]
+
+
 @pytest.mark.parametrize("fusion", ["compiled", "whole"])
 def test_gravity_that_turns_for_all_imus_at_once_is_told_and_said_in_the_summary(fusion):
     """By 1.5 deg, which looks like a tilt of the platform to all of them: 15 mm before it was told."""
