@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from ruckig import ControlInterface, Ruckig, Trajectory
 
+from controller.frames import ActiveFrames
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.offline_planner import PREVIEW_S, calculate, count_violations, phases_of, ruckig_input
 from controller.planning.plan_handover import PLAN_SEGMENTS, STREAM_PATIENCE_S, rest
 from controller.planning.segments import LENGTH, START, evaluate_reference, state_after, stop_phases, write_segment
+from controller.planning.target import poses_of
 from controller.planning.target_motion import STILL_M, TargetMotion
 from controller.safety.causes import Cause
 from plant.compiled import kernel
@@ -63,6 +65,7 @@ class StreamPlanner:
     Args:
         mechanism: with home and limits.
         lengths: (6,) [m], at which the legs rest when the motion begins.
+        frames: in which the samples are; None for displacements from home in {1}.
 
     Attributes:
         current: the plan that is followed.
@@ -72,8 +75,9 @@ class StreamPlanner:
         InputError: the mechanism has no home or no limits.
     """
 
-    def __init__(self, mechanism: Mechanism, lengths: Array) -> None:
+    def __init__(self, mechanism: Mechanism, lengths: Array, frames: ActiveFrames | None = None) -> None:
         self._mechanism, self._home, self._limits = mechanism, mechanism.require_home(), mechanism.require_limits()
+        self._frames = frames
         mechanism.check_lengths(lengths, "the start of the stream")
         self.current = Plan(0.0, rest(lengths, PLAN_SEGMENTS), None)
         self._motion: TargetMotion | None = None
@@ -93,8 +97,8 @@ class StreamPlanner:
 
         Args:
             time_s: of the sample, on the sender's clock [s].
-            displacement: (3,) [m] from home.
-            quaternion: (4,), unit, w first; the turn from home.
+            displacement: (3,) [m] from home, or the tool's position in the work frame.
+            quaternion: (4,), unit, w first; the turn from home, or the tool's orientation in the work frame.
 
         Raises:
             TargetRefusedError: the sample is not finite, off unit length, out of reach, or a jump.
@@ -106,8 +110,8 @@ class StreamPlanner:
         norm = float(np.linalg.norm(turn))
         if abs(norm - 1.0) > UNIT_TOLERANCE:
             raise TargetRefusedError(Cause.TARGET_NOT_FINITE, 0, abs(norm - 1.0), UNIT_TOLERANCE)
-        rotation = rotation_from_quaternion(turn / norm) @ self._home.rotation
-        lengths = leg_lengths(self._mechanism, self._home.position + position, rotation)
+        pose = poses_of(position, rotation_from_quaternion(turn / norm), self._home, self._frames)
+        lengths = leg_lengths(self._mechanism, *pose)
         stroke = self._limits.stroke
         excess = np.maximum(stroke[:, 0] - lengths, lengths - stroke[:, 1])
         leg = int(excess.argmax())

@@ -1,12 +1,13 @@
 """Target motions: poses over time, from a CSV file or a built-in motion."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from controller.planning.motions import HELD, MARGIN_S, NAMES, named_motion
+from controller.frames import ActiveFrames
+from controller.planning.motions import HELD, MARGIN_S, MOTIONS, NAMES, named_motion
 from plant.checks import check_duration, nearest
 from plant.csv import read_csv
 from plant.errors import InputError, UnknownNameError
@@ -32,6 +33,7 @@ class Target:
     positions: Array  # (N, 3) [m], origin of {2} in {1}
     rotations: Array  # (N, 3, 3), map {2} to {1}
     held: bool = False  # whether each pose is held until the time of the next one; else the platform passes through it
+    absolute: bool = False  # whether its file has poses in a frame, not displacements from home
 
     @property
     def start(self) -> Pose:
@@ -54,7 +56,7 @@ class Target:
 
     def other_readings(self, mechanism: Mechanism) -> Iterator[tuple[str, Array]]:
         """What the positions of a file may have been meant as, in words, and the positions (N, 3) [m] then."""
-        if self.name in NAMES:
+        if self.name in NAMES or self.absolute:
             return
         home = mechanism.require_home().position
         given = self.positions - home
@@ -88,9 +90,12 @@ def _interpolate(knots: Array, values: Array, times: Array) -> Array:
     return interpolated
 
 
-def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float) -> Target:
+def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float, frames: ActiveFrames | None = None) -> Target:
     """A built-in motion by its name, or the displacements from home in a CSV file, cut to `duration` [s]; in a file whose
     header begins with `from_s` instead of `time_s`, each pose is held until the next one.
+
+    With `frames` a file has poses of the tool in the work frame, if that is one of a file, and a motion displaces the tool from
+    where it is at home, along the axes of the work frame. The target's poses are those of {2} in the root of the work frame.
 
     Raises:
         UnknownNameError: neither a motion nor a file.
@@ -98,11 +103,19 @@ def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float)
             leaves the plane of a planar mechanism.
     """
     check_duration(duration)
-    name = str(name_or_path)
+    name, home = str(name_or_path), mechanism.require_home()
     if name in NAMES:
-        return Target(name, *named_motion(name, mechanism, duration), held=name in HELD)
+        times, positions, rotations = named_motion(name, mechanism, duration)
+        if frames is not None:
+            if name not in MOTIONS:
+                raise InputError(
+                    f"{name} is fitted to the strokes, and not a motion in a frame: leave --frames out, or take another target"
+                )
+            moved = frames.displaced(home, positions - home.position, rotations @ home.rotation.T)
+            positions, rotations = moved.position, moved.rotation
+        return Target(name, times, positions, rotations, held=name in HELD)
     check_target(name)
-    target = _cut(_read_csv(Path(name_or_path), mechanism), duration)
+    target = _cut(_read_csv(Path(name_or_path), home, frames), duration)
     if mechanism.planar:
         _check_in_plane(target, mechanism)
     return target
@@ -116,8 +129,9 @@ def check_target(name: str) -> None:
         )
 
 
-def text_of_target(target: Target, mechanism: Mechanism) -> str:
-    """The CSV text of a target as displacements from a mechanism's home, which `load_target` reads again from a file.
+def text_of_target(target: Target, mechanism: Mechanism, frames: ActiveFrames | None = None) -> str:
+    """The CSV text of a target as displacements from a mechanism's home, or as frames want it, which `load_target` reads again
+    from a file.
 
     Raises:
         InputError: times, positions and rotations are not of one length of at least 2, or not finite.
@@ -128,13 +142,20 @@ def text_of_target(target: Target, mechanism: Mechanism) -> str:
             f"the target {target.name!r} has times {np.shape(target.times)}, positions {np.shape(target.positions)} and "
             f"rotations {np.shape(target.rotations)}; it needs (N,), (N, 3) and (N, 3, 3), N at least 2"
         )
-    quaternions = quaternion_from_rotation(target.rotations @ home.rotation.T)
-    rows = np.column_stack([target.times, target.positions - home.position, quaternions])
+    rows = np.column_stack([target.times, *samples_of(target.positions, target.rotations, home, frames)])
     header = ",".join(HELD_COLUMNS if target.held else COLUMNS)
     return "\n".join([header, *(",".join(map(repr, row)) for row in rows.tolist())]) + "\n"
 
 
-def _read_csv(path: Path, mechanism: Mechanism) -> Target:
+def samples_of(positions: Array, rotations: Array, home: Pose, frames: ActiveFrames | None) -> tuple[Array, Array]:
+    """The positions (N, 3) and quaternions (N, 4) by which a file or a stream tells poses of {2}."""
+    if frames is None:
+        return positions - home.position, quaternion_from_rotation(rotations @ home.rotation.T)
+    positions, rotations = frames.to_target(home, Pose(positions, rotations))
+    return positions, quaternion_from_rotation(rotations)
+
+
+def _read_csv(path: Path, home: Pose, frames: ActiveFrames | None) -> Target:
     columns, table, lines = read_csv(path, COLUMNS, HELD_COLUMNS)
     for i, (time, norm) in enumerate(zip(table[:, 0], np.linalg.norm(table[:, 4:], axis=1), strict=True)):
         if i and time <= table[i - 1, 0]:
@@ -146,14 +167,23 @@ def _read_csv(path: Path, mechanism: Mechanism) -> Target:
     if len(table) < 2:
         raise InputError(f"{path} has {len(table)} samples; a motion needs at least 2")
     quaternions = np.array([checked_unit(quaternion, 4, "quaternion") for quaternion in table[:, 4:]])
-    home = mechanism.require_home()
+    positions, rotations = poses_of(table[:, 1:4], rotations_from_quaternions(quaternions), home, frames)
     return Target(
         name=path.name,
         times=table[:, 0] - table[0, 0],
-        positions=home.position + table[:, 1:4],
-        rotations=rotations_from_quaternions(quaternions) @ home.rotation,
+        positions=positions,
+        rotations=rotations,
         held=columns == HELD_COLUMNS,
+        absolute=frames is not None and frames.absolute,
     )
+
+
+def poses_of(positions: Array, rotations: Array, home: Pose, frames: ActiveFrames | None) -> tuple[Array, Array]:
+    """The positions (..., 3) and rotations (..., 3, 3) of {2} that a file or a stream means."""
+    if frames is None:
+        return home.position + positions, rotations @ home.rotation
+    platform = frames.from_target(home, positions, rotations)
+    return platform.position, platform.rotation
 
 
 def _check_in_plane(target: Target, mechanism: Mechanism) -> None:
@@ -171,4 +201,5 @@ def _check_in_plane(target: Target, mechanism: Mechanism) -> None:
 def _cut(target: Target, duration: float) -> Target:
     """Leave out what comes after the first sample past the duration; the motion is still heading for that sample."""
     last = int(np.searchsorted(target.times, duration + MARGIN_S)) + 1
-    return Target(target.name, target.times[:last], target.positions[:last], target.rotations[:last], target.held)
+    times, positions, rotations = (part[:last] for part in (target.times, target.positions, target.rotations))
+    return replace(target, times=times, positions=positions, rotations=rotations)

@@ -20,6 +20,7 @@ COMMANDS = {
     "run": ("simulate", "run", "replay", "stream-target"),
     "calibrate": ("calibrate",),
     "design": ("classify", "classes", "accuracy", "sensor-sets", "bounds", "detectability", "tune", "tune-fusion", "optimise"),
+    "frames": ("frames",),
     "rigs": ("check-rig", "emulate", "inject"),
     "plant": ("fmu",),
     "study": ("sweep", "compare-fusion", "evaluate-fusion", "faults", "planar", "broad"),

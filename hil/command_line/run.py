@@ -77,7 +77,15 @@ def _resumed_config(options: Namespace, config: SimulationConfig, resumed: "Snap
 
 
 def _print_simulation(summary: dict[str, Any]) -> None:
-    table = Table("", "position RMS [mm]", "max [mm]", "rotation RMS [deg]", "max [deg]")
+    frames = summary.get("frames")
+    errors = summary if frames is None else frames
+    table = Table(
+        "" if frames is None else f"{frames['tool']} in {frames['work']}",
+        "position RMS [mm]",
+        "max [mm]",
+        "rotation RMS [deg]",
+        "max [deg]",
+    )
     rows = [("estimate - reference", "estimated_tracking", ""), ("reference - target", "target", "reference_")]
     if summary["truth_known"]:
         rows[:1] = [
@@ -86,13 +94,13 @@ def _print_simulation(summary: dict[str, Any]) -> None:
             ("truth - target", "target", ""),
         ]
     for label, group, prefix in rows:
-        positions = (mm(summary[group][f"{prefix}position_{kind}"], 4) for kind in ("rms", "max"))
-        rotations = (deg(summary[group][f"{prefix}rotation_{kind}"], 4) for kind in ("rms", "max"))
+        positions = (mm(errors[group][f"{prefix}position_{kind}"], 4) for kind in ("rms", "max"))
+        rotations = (deg(errors[group][f"{prefix}rotation_{kind}"], 4) for kind in ("rms", "max"))
         table.add(label, *positions, *rotations)
     table.print()
     if not summary["truth_known"]:
         print("the truth is not known: the plant does not give its pose")
-    if level := summary["protection"]:
+    if level := errors["protection"]:
         covered = f"; it covers the error in {100 * level['covered']:.3f} % of the cycles" if "covered" in level else ""
         print(
             "protection level p50/p99/max "
@@ -195,6 +203,8 @@ def _print_run(summary: dict[str, Any]) -> None:
         f"first cycle {summary['start_up_s']:.2f} s after the start"
     )
     truth = f"estimate - truth {mm(errors['estimation'])} mm RMS" if errors["known"] else "the truth is not known"
+    if errors["known"] and (frames := summary.get("frames")):
+        truth += f", of {frames['tool']} {mm(errors['tool'])} mm RMS"
     print(f"{truth}; reference - length {mm(errors['tracking'])} mm RMS")
     if level := summary["protection"]:
         print(f"greatest protection level {mm(level['position'])} mm, {deg(level['rotation'])} deg")
@@ -268,6 +278,9 @@ def _address(text: str) -> tuple[str, int]:
         target={"text": "a motion's name, or a CSV file, as for 'gough run'"},
         duration={"text": "duration of the motion"},
         rate={"default": 100.0, "text": "poses per second, at most 10000"},
+        frames={"text": "the frames of the run"},
+        frame={},
+        tool={},
     ),
     cli.setting("--to", "127.0.0.1:47200", "where the run listens", type=_address, metavar="HOST:PORT"),
     *(
@@ -287,7 +300,10 @@ def gough_stream_target(options: Namespace) -> None:
     from plant.mechanism import load_spatial
 
     mechanism = load_spatial(options.mechanism)
-    target = load_target(options.target, mechanism, options.duration)
+    # Whether there is an IMU on the base is the run's affair.
+    frames = SimulationConfig(frames=options.frames, frame=options.frame, tool=options.tool, base_imu=True).active_frames
+    target = load_target(options.target, mechanism, options.duration, frames)
     host, port = options.to
-    sent = send_target(mechanism, target, options.rate, host, port, options.duration, cli.config_of(options, Faults))
+    faults = cli.config_of(options, Faults)
+    sent = send_target(mechanism, target, options.rate, host, port, options.duration, faults, frames)
     print(f"{sent} poses of {target.name} sent to {host}:{port}")

@@ -151,21 +151,26 @@ def _preparing(began: float) -> str:
 
 
 def _view(title: str, state: "RunState", began: float) -> Table:
+    from controller.frames import BASE
     from controller.safety.causes import Cause, Mode
+    from plant.pose import Pose
 
     table = Table(title, "")
     latest: Any = state.latest
     if latest is None:
         table.add("state", _preparing(began))
         return table
-    position, r = 1e3 * latest["position"], latest["rotation"]
+    position, r, of = 1e3 * latest["position"], latest["rotation"], ""
+    if state.frames is not None and state.frames.root == BASE:
+        tool = state.frames.read(Pose(latest["position"], r))
+        position, r, of = 1e3 * tool.position, tool.rotation, f" of {state.frames.text}"
     angles = (atan2(r[2, 1], r[2, 2]), asin(max(-1.0, min(1.0, -r[2, 0]))), atan2(r[1, 0], r[0, 0]))
     errors, histograms = state.errors(), state.timing.histograms
     mode = Mode(int(latest["mode"])).name.lower()
     if latest["stop"]:
         mode += f": {Cause(int(latest['stop'])).text}"
     table.add("state", f"{mode}, {latest['time_ns'] / 1e9:.1f} s")
-    table.add("position [mm]", "  ".join(f"{value:9.3f}" for value in position))
+    table.add(f"position{of} [mm]", "  ".join(f"{value:9.3f}" for value in position))
     table.add("roll, pitch, yaw [deg]", "  ".join(f"{degrees(angle):9.3f}" for angle in angles))
     table.add("estimate - truth, RMS [mm]", mm(errors["estimation"]) if errors["known"] else "the truth is not known")
     table.add("reference - length, RMS [mm]", mm(errors["tracking"]))

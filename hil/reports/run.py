@@ -10,12 +10,13 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
+from controller.frames import Frames
 from hil.reports import view
 from hil.reports.page import AXIS_NAMES, COLORS, FAINT, INK, LAYOUT, LEG_NAMES, LEGEND, figure_html, overview, place, write_page
 from hil.runs.simulation import SimulationResult
 from hil.table import Cell, Table
 from plant.imu_wiring import ALL_IMUS
-from plant.pose import Array, pose_errors
+from plant.pose import Array, pose_errors, vector_from_rotation
 from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS
 
 _QUANTITIES = (("position", "mm", 1e3), ("rotation", "deg", np.degrees(1.0)))
@@ -44,8 +45,11 @@ def write_report(result: SimulationResult, path: Path) -> None:
     summary = result.summary()
     mechanism = figure_html("mechanism", "The mechanism", *_mechanism_view(result), "view")
     remarks = "".join(f"<p>{escape(remark[0].upper() + remark[1:])}.</p>" for remark in result.remarks)
-    body = overview(f"{_error_table(summary).html()}\n{_facts(summary)}{remarks}", mechanism)
+    errors = _error_table(summary.get("frames", summary), _seen(result), result.truth_known)
+    body = overview(f"{errors.html()}\n{_facts(summary)}{remarks}", mechanism)
     body += "".join(figure_html(*figure) for figure in _time_figures(result))
+    if result.frames is not None:
+        body += _frames_section(result.frames.frames)
     title = f"gough: {result.mechanism.name} follows {result.target.name}"
     write_page(path, title, _configuration(result, summary), body, _SHARED_TIME)
 
@@ -62,23 +66,46 @@ def _configuration(result: SimulationResult, summary: dict[str, Any]) -> str:
     ]
     if tuple(config.imus) != ALL_IMUS:
         parts.insert(3, f"only IMUs {', '.join(map(str, config.imus))}")
+    if result.frames is not None:
+        parts.append(result.frames.text)
     if config.plant:
         parts.append(f"plant {config.plant}" + (f" with {config.binding}" if config.binding else ""))
     parts += [each.text for each in config.settings]
     return " · ".join(parts)
 
 
-def _error_table(summary: dict[str, Any]) -> Table:
-    table = Table("", *((f"{name} [{unit}]", kind) for name, unit, _ in _QUANTITIES for kind in ("RMS", "max")))
+def _seen(result: SimulationResult) -> str:
+    """Whose pose is compared in which frame, in words; "" for that of {2} in {1}."""
+    return "" if result.frames is None else result.frames.text
 
-    rows = [("Tracking", "estimate - planned reference; the truth is not known", summary["estimated_tracking"], "")]
-    if summary["truth_known"]:
+
+def _frames_section(frames: Frames) -> str:
+    """The frames as they were in the run."""
+    table = Table("", "stands on", "position [mm]", "rotation vector [deg]", "note")
+    for name, frame in frames.frames.items():
+        position, vector = 1e3 * frame.position, np.degrees(vector_from_rotation(frame.rotation))
+        numbers = (", ".join(f"{value:.3f}" for value in values) for values in (position, vector))
+        enabled = "enabled" if name in (frames.work, frames.tool) else ""
+        table.add(Cell(name, enabled), frame.parent, *numbers, frame.note)
+    pivot = ""
+    if frames.pivot is not None:
+        place = ", ".join(f"{1e3 * value:.3f}" for value in frames.pivot.position)
+        pivot = f"<p>The pivot is at {place} mm in {escape(frames.pivot.parent)}.</p>"
+    return f"<section><h2>Frames</h2>{table.html()}{pivot}</section>"
+
+
+def _error_table(figures: dict[str, Any], seen: str, truth_known: bool) -> Table:
+    """The errors of the groups in `figures`."""
+    table = Table(seen, *((f"{name} [{unit}]", kind) for name, unit, _ in _QUANTITIES for kind in ("RMS", "max")))
+
+    rows = [("Tracking", "estimate - planned reference; the truth is not known", figures["estimated_tracking"], "")]
+    if truth_known:
         rows = [
-            ("Estimation", "estimate - truth", summary["estimation"], ""),
-            ("Tracking", "truth - planned reference", summary["tracking"], ""),
-            ("Against the raw target", "truth - target", summary["target"], ""),
+            ("Estimation", "estimate - truth", figures["estimation"], ""),
+            ("Tracking", "truth - planned reference", figures["tracking"], ""),
+            ("Against the raw target", "truth - target", figures["target"], ""),
         ]
-    rows.append(("Reference", "planned reference - target", summary["target"], "reference_"))
+    rows.append(("Reference", "planned reference - target", figures["target"], "reference_"))
     for name, meaning, errors, prefix in rows:
         keys = ((f"{prefix}{quantity}_{kind}", scale) for quantity, _, scale in _QUANTITIES for kind in ("rms", "max"))
         table.add(Cell(name, meaning), *(f"{scale * errors[key]:.3f}" for key, scale in keys))
@@ -103,9 +130,10 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
     limits, home_pose = result.mechanism.require_limits(), result.mechanism.require_home()
     there = slice(result.mechanism.legs)
     names = LEG_NAMES[there]
-    estimate = (records["position"], records["rotation"])
-    real, *actual = _drawn_poses(result)
-    planned = (result.reference_positions, result.reference_rotations)
+    of_platform = (records["position"], records["rotation"])
+    real, *drawn_poses = _drawn_poses(result)
+    estimate, actual = result.read(*of_platform), result.read(*drawn_poses)
+    planned = result.read(result.reference_positions, result.reference_rotations)
     lengths, currents = (records["truth"][:, part][:, there] for part in (TRUTH_LENGTHS, TRUTH_CURRENTS))
     real_length = "True"
     if not np.isfinite(lengths[:1]).all():
@@ -113,8 +141,12 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
     lengths = 1e3 * lengths
     planned_lengths, rates, accelerations = np.moveaxis(records["reference"][:, there] * [1e3, 1e3, 1.0], 2, 0)
 
-    home = (home_pose.position, home_pose.rotation)
-    drawn, plan = _differences(actual, home), _differences(planned, home)
+    origin, of = (home_pose.position, home_pose.rotation), ""
+    where = "the platform and its planned reference, from home; the rotation vector is in the base's axes"
+    if result.frames is not None:
+        origin, of = (np.zeros(3), result.frames.read(home_pose).rotation), f", of {_seen(result)}"
+        where = f"{_seen(result)} and its planned reference; the rotation is from that at home"
+    drawn, plan = _differences(actual, origin), _differences(planned, origin)
     pose = [
         _Panel(label, AXIS_NAMES, drawn[:, part], plan[:, part])
         for label, part in (("position [mm]", slice(3)), ("rotation vector [deg]", slice(3, 6)))
@@ -144,7 +176,7 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
     level = 1e3 * records["protection"][:, :1].astype(float), np.degrees(records["protection"][:, 1:].astype(float))
     sizes: list[Array] = []
     if result.truth_known:
-        off = _differences(estimate, actual)
+        off = _differences(of_platform, drawn_poses)
         sizes = [np.linalg.norm(off[:, part], axis=1, keepdims=True) for part in (slice(3), slice(3, 6))]
     protection = [
         _Panel(f"{name} [{unit}]", ("level", "error")[: 1 + len(sizes) // 2], np.hstack([level[k], *sizes[k : k + 1]]))
@@ -154,14 +186,14 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
         (
             "pose",
             "Pose",
-            f"{real} pose of the platform and its planned reference, from home; the rotation vector is in the base's axes.",
+            f"{real} pose of {where}.",
             _plot(times, pose),
         ),
         (
             "errors",
             "Estimation and tracking error" if result.truth_known else "Tracking error",
             ("Estimate minus truth, and truth" if result.truth_known else "The truth is not known: estimate")
-            + " minus planned reference. The scales fit the motion: during the hold (grey), while the filters settle, the "
+            + f" minus planned reference{of}. The scales fit the motion: during the hold (grey), while the filters settle, the "
             "estimate may be further off.",
             _plot(times, errors, columns=len(differences), shared_yaxes=True),
         ),
@@ -182,7 +214,8 @@ def _time_figures(result: SimulationResult) -> list[tuple[str, str, str, go.Figu
     ]
     if np.isfinite(level[0]).any():
         caption = "How far the estimate may be off, whatever single fault the readings cannot show"
-        caption += ", and how far it is." if result.truth_known else "."
+        caption += ", and how far it is" if result.truth_known else ""
+        caption += "." if result.frames is None else ": the platform, in the base's frame."
         figures.append(("protection", "Protection level", caption, _plot(times, protection, columns=2)))
     return figures
 

@@ -16,6 +16,7 @@ from plant.imu_disturbances import BASE_PREFIX, Disturbance, disturbance_of_text
 from plant.imu_wiring import ALL_IMUS, RIGHT_WIRING, Wiring, require_imus
 
 if TYPE_CHECKING:
+    from controller.frames import ActiveFrames
     from plant.compiled import Record
 
 FUSIONS = {
@@ -31,7 +32,7 @@ FUSIONS = {
 FUSIONS_ON_A_MOVING_BASE = tuple(name for name in FUSIONS if name not in ("filterpy", "section-5"))
 
 FRAMES = BASE, LEVEL = "base", "level"
-"""The frames of a target: {1}, or one that stays level."""
+"""The frames of a target that need no file: {1}, or one that stays level."""
 
 RIGS = ("fmu", "udp", "canopen", "replay")
 PYTHON_RIG = "python:"
@@ -66,8 +67,8 @@ def imus_from_text(text: str) -> tuple[int, ...]:
 class SimulationConfig:
     """What to simulate, or to run on the clock.
 
-    Where a mechanism, target, IMU, encoder, calibration or binding is named, the object itself will do, too; the field then
-    names a preset, or a file in gough's cache that holds it. Fields that are options say below what they mean; the others:
+    Where a mechanism, target, IMU, encoder, frames, calibration or binding is named, the object itself will do, too; the field
+    then names a preset, or a file in gough's cache that holds it. Fields that are options say below what they mean; the others:
 
     Attributes:
         hold: how long the brakes hold first [s]; None for the time in the mechanism's settings.
@@ -130,10 +131,18 @@ class SimulationConfig:
         metavar="KIND",
     )
     base_imu: bool = option(False, "IMU 7 is on the base, which may move then (docs/moving_base.md)")
-    frame: str = option(
-        BASE,
-        "frame of the target: base, or level, in which the platform keeps its attitude while the base rolls (needs --base-imu)",
-        choices=FRAMES,
+    frames: str | None = option(
+        None, "frames of your own, in which targets, errors and read-outs are (docs/frames.md)", metavar="FILE.toml"
+    )
+    frame: str | None = option(
+        None,
+        "frame of the target: base, level, in which the platform keeps its attitude while the base rolls (needs --base-imu), "
+        "or one of --frames, in which its poses are those of the tool",
+        metavar="NAME",
+        shown="what --frames enables, else base",
+    )
+    tool: str | None = option(
+        None, "what is moved to the target: platform, or a tool of --frames", metavar="NAME", shown="what --frames enables"
     )
     magnetometer: bool = option(False, "the platform's magnetometer gives its heading")
     rig: str = option(
@@ -188,12 +197,38 @@ class SimulationConfig:
                 f"with --base-imu the fusion is one of {', '.join(FUSIONS_ON_A_MOVING_BASE)}, not {self.fusion}: choose one of "
                 "them, or leave --base-imu out"
             )
-        if self.frame not in FRAMES:
-            raise UnknownNameError(f"no frame {self.frame!r}; there are {', '.join(FRAMES)}{nearest(self.frame, FRAMES)}")
-        if self.frame == LEVEL and not self.base_imu:
+        if self.frames is None:
+            if self.tool is not None:
+                raise InputError(f"the tool {self.tool!r} stands in a file of frames: name that with --frames FILE.toml")
+            if self.frame is not None and self.frame not in FRAMES:
+                raise UnknownNameError(
+                    f"no frame {self.frame!r}; there are {', '.join(FRAMES)}{nearest(self.frame, FRAMES)}; others stand in "
+                    "a file: name that with --frames FILE.toml"
+                )
+        if self.levelled and not self.base_imu:
             raise InputError("a target in the level frame needs an IMU on the base: add --base-imu")
         if self.lengths != NO_LENGTHS and self.fusion == "section-5":
             raise InputError("the paper's section 5 takes no lengths: leave --lengths out, or take another --fusion")
+
+    @property
+    def active_frames(self) -> "ActiveFrames | None":
+        """The frames of target and read-outs; None without a file of frames.
+
+        Raises:
+            GoughError: the file cannot be used, or does not have the frame or the tool.
+        """
+        if self.frames is None:
+            return None
+        # It compiles.
+        from controller.frames import load_frames
+
+        return load_frames(self.frames).active(self.frame, self.tool)
+
+    @property
+    def levelled(self) -> bool:
+        """Whether the target is in a frame that stays level."""
+        active = self.active_frames
+        return (self.frame if active is None else active.root) == LEVEL
 
     @property
     def disturbances(self) -> list[Disturbance]:

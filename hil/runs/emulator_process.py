@@ -236,7 +236,7 @@ def ask(address: str, question: str, patience: float = 2.0) -> dict[str, Any]:
 def _rig_of(config: EmulatorConfig, period: float, faults: list[Record]) -> tuple[FmuPlant, Record, Record, Record]:
     simulated = config.simulated
     mechanism = load_spatial(simulated.mechanism)
-    start = load_target(simulated.target, mechanism, 1.0).start
+    start = load_target(simulated.target, mechanism, 1.0, simulated.active_frames).start
     plant = simulated_plant(simulated, mechanism, start)
     imu = imu_state(load_imu(simulated.imu), simulated.seed, period, simulated.wiring, simulated.base_imu)
     encoders = encoder_state(load_encoder(simulated.lengths), simulated.seed, period, legs=mechanism.legs)

@@ -102,7 +102,7 @@ def run(
     records = shared_array(max(_LEAST_RECORDS, round(_BUFFER_S * config.rate)), RECORD)
     link: NDArray[np.int64] = shared_array(LINK_SIZE, np.dtype(np.int64))
     link[Link.SUPERVISOR] = os.getpid()
-    state = RunState()
+    state = RunState(frames=config.active_frames)
     ours, theirs = FORK.Pipe()
     recorders = Recorders(recording, records, link, ours, state.events)
     with _asked_to_stop(link), claimed(recording), _reported(state, recorders), contextlib.ExitStack() as at_end:
@@ -178,7 +178,8 @@ def _receiver(config: SimulationConfig) -> Iterator[Record]:
     host, port = parse_address(config.target.partition(":")[2] or f"{HOST}:{PORT}")
     mechanism = load_spatial(config.mechanism)
     start = mechanism.require_home()
-    planner = StreamPlanner(mechanism, leg_lengths(mechanism, start.position, start.rotation))
+    lengths = leg_lengths(mechanism, start.position, start.rotation)
+    planner = StreamPlanner(mechanism, lengths, config.active_frames)
     with open_socket(host, port) as listener:
         process = started(receive, stream, planner, listener, 1.0 / config.rate)
         try:
@@ -259,6 +260,9 @@ def _prepare_and_follow(
             "parameters": loop.parameters,
             "reference": loop.segments,
         }
+        if loop.frames is not None:
+            # Their file may change later.
+            header["config"]["frame_definitions"] = loop.frames.frames.text()
         rig = make_rig(loop) if make_rig is not None else rig_of(config)
         compiled = rig is None or isinstance(rig, UdpRig)
         if isinstance(rig, UdpRig):
@@ -304,6 +308,7 @@ def _summary(
         "timing_us": timing,
         "over_budget": over_budget(timing, config.fusion),
         "errors_m": state.errors(),
+        **({} if state.frames is None else {"frames": state.frames.described()}),
         "protection": state.level(),
         "start_up_s": since_process_start() - (time.monotonic() - first),
         **{name: getattr(state, name) for name in ("unseen", "refused", "late", "refused_packets", "events")},

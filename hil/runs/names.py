@@ -1,8 +1,8 @@
 """What a configuration names: whether it is there, and objects in place of names.
 
-A program may give what a file describes as an object: mechanism, target, IMU, encoder, calibration or binding. It is written to
-a file in gough's cache, in a folder named after its content, and the file's path is its name. So configurations stay plain:
-they are compared, hashed, recorded, and sent to other machines as those with names are.
+A program may give what a file describes as an object: mechanism, target, IMU, encoder, frames, calibration or binding. It is
+written to a file in gough's cache, in a folder named after its content, and the file's path is its name. So configurations stay
+plain: they are compared, hashed, recorded, and sent to other machines as those with names are.
 """
 
 import hashlib
@@ -50,7 +50,7 @@ def check_names(config: "SimulationConfig") -> None:
     load_encoder(config.lengths)
     if not config.streamed:
         check_target(config.target)
-    for field in ("calibration", "plant", "binding"):
+    for field in ("frames", "calibration", "plant", "binding"):
         name = getattr(config, field)
         if name is not None and not Path(name).exists():
             raise InputError(f"{field} = {name!r}: there is no such file")
@@ -62,7 +62,8 @@ def name_objects(config: Any) -> None:
     Raises:
         InputError: an object that its file cannot hold.
     """
-    for each in fields(config):
+    # What a target's file has depends on the mechanism and on the frames.
+    for each in sorted(fields(config), key=lambda each: each.name == "target"):
         object.__setattr__(config, each.name, name_of(each.name, getattr(config, each.name), config))
 
 
@@ -90,7 +91,7 @@ def _mechanism_file(given: Any, config: Any) -> tuple[str, bytes]:
 
 
 def _target_file(given: Any, config: Any) -> tuple[str, bytes]:
-    """The displacements of a target from the home of the configuration's mechanism."""
+    """The displacements of a target from the home of the configuration's mechanism, or its poses in the frames."""
     from controller.planning.target import Target, text_of_target
     from plant.mechanism import load_in_space
 
@@ -99,7 +100,15 @@ def _target_file(given: Any, config: Any) -> tuple[str, bytes]:
         raise InputError(
             f"the target {given.name!r} has no mechanism from whose home it counts: give a motion or a file by name"
         )
-    return f"{_stem(given.name)}.csv", text_of_target(given, load_in_space(config.mechanism)).encode()
+    return f"{_stem(given.name)}.csv", text_of_target(given, load_in_space(config.mechanism), config.active_frames).encode()
+
+
+def _frames_file(given: Any, config: Any) -> tuple[str, bytes]:
+    del config
+    from controller.frames import Frames
+
+    _check_kind("frames", given, Frames)
+    return "frames.toml", given.text().encode()
 
 
 def _calibration_file(given: Any, config: Any) -> tuple[str, bytes]:
@@ -168,6 +177,7 @@ def _stem(name: str) -> str:
 
 _NAMED: dict[str, Callable[[Any, Any], str | tuple[str, bytes]]] = {
     "mechanism": _mechanism_file,
+    "frames": _frames_file,
     "target": _target_file,
     "imu": _imu_file,
     "lengths": _encoder_file,

@@ -10,6 +10,7 @@ import numpy as np
 
 from controller.calibration.file import Calibration, calibration_for
 from controller.cycle import STATE, cycle_parameters, evidence_remark
+from controller.frames import ActiveFrames
 from controller.imu_set import are_few, encoder_remark, imus_of, integrity_remark
 from controller.inverse_kinematics import leg_lengths
 from controller.loop_margins import margin_remark
@@ -28,7 +29,7 @@ from hil.rigs import Rig
 from hil.rigs.by_name import check_legs, python_rig
 from hil.rigs.udp.link import DEFAULT_ADDRESS
 from hil.rigs.udp.rig import UdpRig
-from hil.runs.config import FUSIONS, LEVEL, PYTHON_RIG, SimulationConfig
+from hil.runs.config import FUSIONS, PYTHON_RIG, SimulationConfig
 from hil.runs.names import check_names
 from hil.runs.plant_start import check_start
 from plant.compiled import Record
@@ -63,6 +64,7 @@ class PreparedLoop(Loop):
     end: int  # the cycle after the last of the motion, if that begins with the end of the hold
     planning_time: float  # [s]
     remarks: tuple[str, ...]  # what a user should know before it runs, a line each
+    frames: ActiveFrames | None = None  # of the target and of read-outs
 
     @property
     def simulated(self) -> FmuPlant:
@@ -109,7 +111,8 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             check_legs(config.rig, nominal)
             _check_planar(config, calibration)
         mechanism = nominal.moved_joints(calibration.joints[:, : nominal.legs])
-        target = load_target("hold" if config.streamed else config.target, mechanism, config.duration)
+        frames = config.active_frames
+        target = load_target("hold" if config.streamed else config.target, mechanism, config.duration, frames)
         model = load_imu(config.imu)
         imu = imu_state(model, config.seed, period, config.wiring, config.base_imu)
         encoder = load_encoder(config.lengths)
@@ -126,7 +129,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         parameters = cycle_parameters(
             mechanism, config.rate, control, fusion, config.imus, FUSIONS[config.fusion], calibration, config.magnetometer,
             config.fusion == "section-5", safety, drives, 0.0 if config.rig == "fmu" else period,
-            config.arm, encoder, config.base_imu, config.frame == LEVEL,
+            config.arm, encoder, config.base_imu, config.levelled,
         )  # fmt: skip
         lead = bool(parameters["encoders"]["lead"])
         remarks = [
@@ -170,6 +173,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             reference=reference,
             planning_time=planning_time,
             remarks=tuple(filter(None, remarks)),
+            frames=frames,
         )
         loop.load(python=config.fusion == "filterpy")
         yield loop
@@ -188,6 +192,8 @@ def _check_planar(config: SimulationConfig, calibration: Calibration) -> None:
         raise InputError(f"fusion {config.fusion!r} is for six legs; for {config.mechanism}, which is planar, take 'compiled'")
     if config.streamed:
         raise InputError(f"a target can be streamed to six legs alone; {config.mechanism} is planar: give a motion or a file")
+    if config.frames is not None:
+        raise InputError(f"frames are for six legs; {config.mechanism} is planar: leave --frames out")
     if calibration.joints.any():
         raise InputError(f"{config.calibration} moves the joints of six legs, and {config.mechanism} has three: leave them out")
 

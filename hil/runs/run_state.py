@@ -5,11 +5,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from controller.frames import ActiveFrames
 from controller.safety.causes import Mode
 from hil.loop.stage_times import Timing
 from hil.recording.mcap import events_of, take
 from plant.compiled import Record
-from plant.truth import TRUTH_POSITION
+from plant.pose import rotations_from_quaternions
+from plant.truth import TRUTH_POSITION, TRUTH_QUATERNION
 
 _MOST_EVENTS = 100
 
@@ -38,6 +40,7 @@ class RunState:
         unseen: number of cycles that were overwritten before the supervisor saw them; no figure includes them.
         events: the loop's, by cycle, and the supervisor's own.
         protection: the greatest protection level (2,) of the motion [m, rad]; NaN until there is one.
+        frames: of the read-outs, if the run has any.
     """
 
     latest: Record | None = None
@@ -49,8 +52,10 @@ class RunState:
     unseen: int = 0
     events: list[str] = field(default_factory=list)
     protection: NDArray[np.float64] = field(default_factory=lambda: np.full(2, np.nan))
+    frames: ActiveFrames | None = None
     _seen: int = 0
     _squares: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    _tool_squares: float = 0.0
     _counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(2, np.int64))
 
     def update(self, records: Record, link: NDArray[np.int64]) -> bool:
@@ -76,6 +81,11 @@ class RunState:
             np.sum((known["position"] - known["truth"][:, TRUTH_POSITION]) ** 2),
             (np.sum(errors**2, axis=1) / np.count_nonzero(posed["lengths"], axis=1)).sum(),
         )
+        if self.frames is not None and len(known):
+            tool = self.frames.tool.position
+            rotations = rotations_from_quaternions(np.ascontiguousarray(known["truth"][:, TRUTH_QUATERNION]))
+            true = known["truth"][:, TRUTH_POSITION] + rotations @ tool
+            self._tool_squares += float(np.sum((known["position"] + known["rotation"] @ tool - true) ** 2))
         self._counts += (len(known), len(posed))
         return True
 
@@ -86,7 +96,8 @@ class RunState:
 
     def errors(self) -> dict[str, float]:
         """RMS errors [m]: `estimation` of the position against the truth, over the `known` cycles that have a truth; `tracking`
-        of a leg's length against the reference.
+        of a leg's length against the reference; with frames also `tool`, as `estimation`, of the tool's position.
         """
         estimation, tracking = np.sqrt(self._squares / np.maximum(self._counts, 1)).tolist()
-        return {"estimation": estimation, "tracking": tracking, "known": int(self._counts[0])}
+        of_tool = {} if self.frames is None else {"tool": float(np.sqrt(self._tool_squares / max(self._counts[0], 1)))}
+        return {"estimation": estimation, "tracking": tracking, **of_tool, "known": int(self._counts[0])}

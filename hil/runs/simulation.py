@@ -1,6 +1,7 @@
 """A closed-loop simulation: a mechanism follows a target on its FMU plant, as fast as the machine can."""
 
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import Any
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.direct_kinematics import poses_from_lengths
+from controller.frames import ActiveFrames, level_from_base
 from controller.planning.offline_planner import Reference
 from controller.planning.pace import required_stretch
 from controller.planning.target import Target
@@ -16,7 +18,7 @@ from controller.safety.causes import Cause
 from hil.loop.records import COMPUTED
 from hil.progress import Progress, Say, no_progress, say_nothing
 from hil.realtime.durations import QUANTILES, percentiles
-from hil.runs.config import LEVEL, SimulationConfig
+from hil.runs.config import SimulationConfig
 from hil.runs.prepare import PreparedLoop, prepared_loop
 from hil.runs.run_state import note_events
 from hil.runs.snapshot import Snapshot, resume_snapshot, take_snapshot
@@ -24,8 +26,11 @@ from plant.compiled import Record
 from plant.dynamics.base_course import attitudes_of, placed
 from plant.errors import GoughError, InputError
 from plant.mechanism import Mechanism
-from plant.pose import Array, pose_errors, rms_figures, rotations_from_quaternions
+from plant.pose import Array, Pose, pose_errors, rms_figures, rotations_from_quaternions
 from plant.truth import TRUTH_POSITION, TRUTH_QUATERNION
+
+Poses = tuple[Array, Array]
+"""Positions (N, 3) [m] and rotations (N, 3, 3)."""
 
 _CHUNK_S = 0.1
 """How long the loop may run before it looks for Ctrl-C [s]."""
@@ -54,6 +59,8 @@ class SimulationResult:
         real_time_factor: simulated time over the time that planning and loop took.
         remarks: what was said before it began.
         parameters: the constants of the cycle, for a recording.
+        frames: of the target and of read-outs, if there are any.
+        attitudes: (N, 3, 3), map {1} to the level frame, if the work frame stands on that.
     """
 
     config: SimulationConfig
@@ -70,6 +77,8 @@ class SimulationResult:
     snapshot: Snapshot | None
     remarks: tuple[str, ...]
     parameters: Record | None = None
+    frames: ActiveFrames | None = None
+    attitudes: Array | None = None
 
     @property
     def moved(self) -> bool:
@@ -93,6 +102,14 @@ class SimulationResult:
         """(N, 3, 3); NaN if the truth is not known."""
         return rotations_from_quaternions(np.ascontiguousarray(self.records["truth"][:, TRUTH_QUATERNION]))
 
+    def read(self, positions: Array, rotations: Array) -> Poses:
+        """The poses of the tool in the work frame, from those (N, 3) and (N, 3, 3) of {2} in {1}; without frames just these."""
+        if self.frames is None:
+            return positions, rotations
+        platform = Pose(positions, rotations)
+        tool = self.frames.read(platform if self.attitudes is None else level_from_base(platform, self.attitudes))
+        return tool.position, tool.rotation
+
     @property
     def events(self) -> list[str]:
         """What happened, by cycle: the first hundred events."""
@@ -103,22 +120,36 @@ class SimulationResult:
     def summary(self) -> dict[str, Any]:
         """The figures, in SI units, over the time of the motion; None for those that need the truth where it is not known.
 
-        What is compared with the reference counts where that is a pose.
+        What is compared with the reference counts where that is a pose. The errors are those of {2} in {1}; with frames,
+        `frames` has the names of the tool and the work frame, and the errors of the one in the other.
         """
         moving = self.times >= 0.0
-        estimate = (self.records["position"][moving], self.records["rotation"][moving])
-        reference = (self.reference_positions[moving], self.reference_rotations[moving])
-        target = (self.target_positions[moving], self.target_rotations[moving])
-        truth = (self.true_positions[moving], self.true_rotations[moving]) if self.truth_known else None
-        known = np.isfinite(reference[0][:, 0])
-        planned = {f"reference_{name}": value for name, value in _figures(reference, target, known).items()}
+        poses = {
+            "estimate": (self.records["position"], self.records["rotation"]),
+            "reference": (self.reference_positions, self.reference_rotations),
+            "target": (self.target_positions, self.target_rotations),
+        }
+        if self.truth_known:
+            poses["truth"] = (self.true_positions, self.true_rotations)
+
+        def chosen(read: Callable[[Array, Array], Poses]) -> dict[str, Poses]:
+            seen = {name: read(*pose) for name, pose in poses.items()}
+            return {name: (positions[moving], rotations[moving]) for name, (positions, rotations) in seen.items()}
+
+        levels = self.records["protection"][moving].astype(float)
+        of_platform = chosen(lambda *pose: pose)
+        frames = {}
+        if self.frames is not None:
+            # A tool is off by the turn times its distance from {2} at most.
+            arm = np.array([[1.0, float(np.linalg.norm(self.frames.tool.position))], [0.0, 1.0]])
+            of_tool = chosen(self.read)
+            described: dict[str, Any] = {**self.frames.described(), **_errors(**of_tool)}
+            frames = {"frames": {**described, "protection": _protection(levels @ arm.T, of_tool)}}
         return {
             "truth_known": self.truth_known,
-            "estimation": None if truth is None else _figures(estimate, truth),
-            "tracking": None if truth is None else _figures(truth, reference, known),
-            "estimated_tracking": _figures(estimate, reference, known),
-            "target": planned if truth is None else _figures(truth, target) | planned,
-            "protection": self._protection(moving, truth and pose_errors(*estimate, *truth)),
+            **_errors(**of_platform),
+            **frames,
+            "protection": _protection(levels, of_platform),
             "limits": {"violations": self.reference.violations},
             "target_stretch": required_stretch(self.mechanism, self.target),
             "real_time_factor": self.real_time_factor,
@@ -128,24 +159,6 @@ class SimulationResult:
             "config": asdict(self.config),
             "version": version("gough"),
         }
-
-    def _protection(self, moving: NDArray[np.bool_], errors: Array | None) -> dict[str, float] | None:
-        """Median, 99th percentile and maximum of the protection level, and in which share of cycles it covers both errors; None
-        without a level.
-        """
-        levels = self.records["protection"][moving].astype(float)
-        known = np.isfinite(levels[:, 0])
-        if not known.any():
-            return None
-        figures = {
-            f"{name}_{label}": float(np.quantile(levels[known, part], share))
-            for part, name in enumerate(("position", "rotation"))
-            for label, share in (("p50", 0.5), ("p99", 0.99), ("max", 1.0))
-        }
-        if errors is None:
-            return figures
-        sizes = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2)
-        return figures | {"covered": float((sizes <= levels)[known].all(axis=1).mean())}
 
 
 def simulate(
@@ -222,18 +235,49 @@ def _result(
     times = (np.arange(first, done) - loop.cycle_at(0.0)) / config.rate
     lengths = records["reference"][:, : loop.mechanism.legs, 0]
     target = loop.target.at(times)
-    if config.frame == LEVEL:
+    moved = None
+    if config.levelled:
         hold = float(loop.parameters["rig"]["hold_cycles"] * loop.parameters["rig"]["period"])
         moved = attitudes_of([placed(each, hold) for each in config.base_motions], 1e-9 * records["time_ns"])
         target = (target[0][:, None] @ moved)[:, 0], np.swapaxes(moved, 1, 2) @ target[1]
     return SimulationResult(
         config, loop.mechanism, loop.target, loop.reference, times, records,
         *poses_from_lengths(loop.mechanism, lengths, loop.target.start, partial=True), *target,
-        (done - first) / config.rate / took, snapshot, loop.remarks, loop.parameters.copy(),
+        (done - first) / config.rate / took, snapshot, loop.remarks, loop.parameters.copy(), loop.frames, moved,
     )  # fmt: skip
 
 
-def _figures(poses: tuple[Array, Array], true: tuple[Array, Array], known: NDArray[np.bool_] | None = None) -> dict[str, float]:
+def _errors(estimate: Poses, reference: Poses, target: Poses, truth: Poses | None = None) -> dict[str, dict[str, float] | None]:
+    """RMS and largest differences of poses (N)."""
+    known = np.isfinite(reference[0][:, 0])
+    planned = {f"reference_{name}": value for name, value in _figures(reference, target, known).items()}
+    return {
+        "estimation": None if truth is None else _figures(estimate, truth),
+        "tracking": None if truth is None else _figures(truth, reference, known),
+        "estimated_tracking": _figures(estimate, reference, known),
+        "target": planned if truth is None else _figures(truth, target) | planned,
+    }
+
+
+def _protection(levels: Array, poses: dict[str, Poses]) -> dict[str, float] | None:
+    """Median, 99th percentile and maximum of protection levels (N, 2) [m, rad], and in which share of cycles they cover both
+    errors of the estimate, if the truth is among the poses; None without a level.
+    """
+    known = np.isfinite(levels[:, 0])
+    if not known.any():
+        return None
+    figures = {
+        f"{name}_{label}": float(np.quantile(levels[known, part], share))
+        for part, name in enumerate(("position", "rotation"))
+        for label, share in (("p50", 0.5), ("p99", 0.99), ("max", 1.0))
+    }
+    if "truth" not in poses:
+        return figures
+    sizes = np.linalg.norm(pose_errors(*poses["estimate"], *poses["truth"]).reshape(-1, 2, 3), axis=2)
+    return figures | {"covered": float((sizes <= levels)[known].all(axis=1).mean())}
+
+
+def _figures(poses: Poses, true: Poses, known: NDArray[np.bool_] | None = None) -> dict[str, float]:
     """RMS and largest errors of poses, positions (N, 3) and rotations (N, 3, 3), of those that are `known`."""
     errors = pose_errors(*poses, *true)
     errors = errors if known is None else errors[known]

@@ -5,8 +5,8 @@
 
 A datagram of version 1 is little-endian and packed, 78 bytes: `GGHT`, version (2 bytes), sequence number (4), time of the pose
 on the sender's clock [ns] (8), displacement from home x, y, z [m] and rotation from home as a unit quaternion, w first (7
-doubles), and the CRC-32 of all these bytes (4). One that begins with `GGHE` instead ends the stream: the platform comes to rest
-at its pose and stays there. A sender that falls silent without it is lost.
+doubles), or those of the tool in the run's work frame, and the CRC-32 of all these bytes (4). One that begins with `GGHE`
+instead ends the stream: the platform comes to rest at its pose and stays there. A sender that falls silent without it is lost.
 
 UDP does not authenticate senders: by default the receiver listens only to this machine, and only to the first sender.
 """
@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from controller.frames import ActiveFrames
 from controller.planning.plan_handover import (
     CAUSE,
     CYCLE,
@@ -37,14 +38,14 @@ from controller.planning.plan_handover import (
     publish_plan,
 )
 from controller.planning.stream_planner import Plan, StreamPlanner, TargetRefusedError
-from controller.planning.target import Target
+from controller.planning.target import Target, samples_of
 from controller.safety.causes import Cause
 from hil.rigs.udp import datagrams
 from hil.rigs.udp.link import bound_socket
 from plant.compiled import Record
 from plant.errors import GoughError, InputError
 from plant.mechanism import Mechanism
-from plant.pose import Array, quaternion_from_rotation
+from plant.pose import Array
 
 HOST, PORT = "127.0.0.1", 47200
 
@@ -233,6 +234,7 @@ def send_target(
     port: int = PORT,
     duration: float | None = None,
     faults: Faults | None = None,
+    frames: ActiveFrames | None = None,
 ) -> int:
     """Stream a target in real time, each pose at its time; returns the number of poses sent.
 
@@ -243,6 +245,7 @@ def send_target(
         host, port: of the receiver.
         duration: of the motion [s]; None for all of it.
         faults: of the sender.
+        frames: those of the run; None if it has none.
 
     Raises:
         InputError: the rate or the duration is not positive and finite, or the rate is above 10 kHz.
@@ -257,7 +260,7 @@ def send_target(
     times = np.arange(math.floor(duration * rate) + 1) / rate
     times = times[times < faults.stop_at]
     positions, rotations = target.at(times)
-    displacements, quaternions = positions - home.position, quaternion_from_rotation(rotations @ home.rotation.T)
+    displacements, quaternions = samples_of(positions, rotations, home, frames)
     displacements[times >= faults.jump_at] += [0.0, 0.0, _JUMP_M]
     displacements[times >= faults.nan_at] = np.nan
     try:

@@ -25,7 +25,7 @@ FIGURES = (
     "estimation.position_rms", "estimation.rotation_rms", "tracking.position_rms", "tracking.rotation_rms",
 )  # fmt: skip
 """Figures of a run that are shown if a study names none."""
-FILES = ("mechanism", "target", "imu", "lengths", "calibration", "plant", "binding")
+FILES = ("mechanism", "target", "imu", "lengths", "frames", "calibration", "plant", "binding")
 """Fields of a run's configuration that may name files."""
 SEED = "seed"
 """The last part of the name of factors that replicate."""
