@@ -9,6 +9,8 @@ from hil.table import Table
 from plant.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from controller.frames import Frames
     from plant.pose import Array, Pose
 
@@ -26,6 +28,9 @@ _HERE = (
         "--pose",
         metavar="X,Y,Z[,QW,QX,QY,QZ]",
         help="where the platform is: its position in the base [m], and the unit quaternion of its orientation",
+    ),
+    cli.argument(
+        "--attitude", metavar="W,X,Y,Z", help="attitude of the base, which maps it to the level frame; for frames on level"
     ),
 )
 _PARENT = cli.argument("--parent", metavar="FRAME", help="what it stands on; needed for a new frame")
@@ -62,14 +67,14 @@ def gough_frames_show(options: Namespace) -> None:
 
     With the place of the platform, also its pose in the base and in the enabled work frame.
     """
+    from controller.frames import BASE
     from plant.pose import quaternion_from_rotation
 
     frames = _read(options.file)
     places: dict[str, Any] = {f"in {each}": frames.pose(options.name, each) for each in frames.chain(options.name)[1:]}
     if (platform := _platform(options, needed=False)) is not None:
-        seen = [name for name in dict.fromkeys(("base", frames.work)) if frames.root(name) == "base"]
-        if frames.root(options.name) != "level":
-            places |= {f"now in {each}": frames.pose(options.name, each, platform) for each in seen}
+        seen = dict.fromkeys((BASE, frames.work))
+        places |= {f"now in {each}": frames.pose(options.name, each, platform, _attitude(options)) for each in seen}
     table = Table(options.name, "position [mm]", "rotation vector [deg]")
     for label, pose in places.items():
         table.add(label, *_numbers(pose))
@@ -126,16 +131,17 @@ def _with_pivot(frames: "Frames", options: Namespace) -> "Frames":
 
 
 def _frame(frames: "Frames", options: Namespace) -> Any:
-    from controller.frames import Frame
+    from controller.frames import BASE, Frame
+    from controller.frames.tree import ROOTS
 
     before = frames.frames.get(options.name)
-    if before is None and options.parent is None:
+    if before is None and options.parent is None and options.name not in ROOTS:
         raise InputError(
             f"there is no frame {options.name!r} yet: say what it stands on with --parent, such as base or platform"
         )
     if options.angles and options.quaternion:
         raise InputError("--angles and --quaternion both turn the frame: keep one of them")
-    entries: dict[str, Any] = {} if before is None else dict(before.entries or {})
+    entries: dict[str, Any] = {"parent": BASE} if before is None else dict(before.entries or {})
     entries |= {name: value for name in ("parent", "note") if (value := getattr(options, name)) is not None}
     if options.position is not None:
         entries["position"] = _given(options.position, (3,), "--position").tolist()
@@ -166,7 +172,7 @@ def gough_frames_zero(options: Namespace) -> None:
     """
     frames, platform = _read(options.file), _platform(options, needed=True)
     assert platform is not None
-    zeroed = frames.zeroed(options.name, platform, None, options.parent, not options.keep_axes)
+    zeroed = frames.zeroed(options.name, platform, _attitude(options), options.parent, not options.keep_axes)
     _save(options.file, zeroed)
     pose = zeroed.frames[options.name]
     position, vector = _numbers(pose.pose)
@@ -231,11 +237,16 @@ def _numbers(pose: "Pose") -> tuple[str, str]:
 
     from plant.pose import vector_from_rotation
 
-    return _millimetres(pose.position), ", ".join(f"{degrees(each):z.6g}" for each in vector_from_rotation(pose.rotation))
+    return _millimetres(pose.position), _joined(map(degrees, vector_from_rotation(pose.rotation)))
 
 
 def _millimetres(position: "Array") -> str:
-    return ", ".join(f"{1e3 * each:z.6g}" for each in position)
+    return _joined(1e3 * position)
+
+
+def _joined(numbers: "Iterable[float]") -> str:
+    """Numbers with three digits after the point at most."""
+    return ", ".join(f"{each:z.3f}".rstrip("0").rstrip(".") for each in numbers)
 
 
 def _given(text: str, shape: tuple[int, ...], name: str) -> "Array":
@@ -266,11 +277,26 @@ def _platform(options: Namespace, needed: bool) -> "Pose | None":
         from plant.mechanism import load_spatial
 
         return load_spatial(options.home).require_home()
-    from plant.pose import Pose, checked_unit, rotation_from_quaternion
+    from plant.pose import Pose, rotation_from_quaternion
 
-    numbers = options.pose.count(",") + 1
-    values = _given(options.pose, (3 if numbers == 3 else 7,), "--pose")
-    return Pose(values[:3], rotation_from_quaternion(checked_unit(values[3:] if numbers != 3 else (1, 0, 0, 0), 4, "--pose")))
+    text = options.pose if options.pose.count(",") != 2 else f"{options.pose},1,0,0,0"
+    values = _given(text, (7,), "--pose")
+    return Pose(values[:3], rotation_from_quaternion(_unit(values[3:], "--pose")))
+
+
+def _attitude(options: Namespace) -> "Array | None":
+    """The attitude (3, 3) of the base."""
+    if options.attitude is None:
+        return None
+    from plant.pose import rotation_from_quaternion
+
+    return rotation_from_quaternion(_unit(_given(options.attitude, (4,), "--attitude"), "--attitude"))
+
+
+def _unit(quaternion: "Array", name: str) -> "Array":
+    from plant.pose import checked_unit
+
+    return checked_unit(quaternion, 4, f"the quaternion of {name}")
 
 
 def _recorded(path: str, at: float | None) -> "Pose":
