@@ -10,13 +10,13 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
-from controller.frames import Frames
+from controller.frames import BASE, Frames, compose
 from hil.reports import view
 from hil.reports.page import AXIS_NAMES, COLORS, FAINT, INK, LAYOUT, LEG_NAMES, LEGEND, figure_html, overview, place, write_page
 from hil.runs.simulation import SimulationResult
 from hil.table import Cell, Table
 from plant.imu_wiring import ALL_IMUS
-from plant.pose import Array, pose_errors, vector_from_rotation
+from plant.pose import Array, Pose, pose_errors, vector_from_rotation
 from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS
 
 _QUANTITIES = (("position", "mm", 1e3), ("rotation", "deg", np.degrees(1.0)))
@@ -314,7 +314,11 @@ def _mechanism_view(result: SimulationResult) -> tuple[str, go.Figure]:
     shown = moving[np.linspace(0, len(moving) - 1, count).astype(int)]
     real, all_positions, all_rotations = _drawn_poses(result)
     positions, rotations = 1e3 * all_positions[shown], all_rotations[shown]
-    path = 1e3 * all_positions[moving[:: -(-len(moving) // _PATH_POINTS)]]
+    tool = Pose(all_positions, all_rotations)
+    if result.frames is not None:
+        tool = compose(tool, result.frames.tool)
+    path = 1e3 * tool.position[moving[:: -(-len(moving) // _PATH_POINTS)]]
+    tips, tip_axes = 1e3 * tool.position[shown], tool.rotation[shown]
     base, platform = 1e3 * mechanism.base_joints, 1e3 * mechanism.platform_joints
     joints = positions[:, None] + platform @ np.swapaxes(rotations, 1, 2)
     platform_ring = view.ring(platform)
@@ -326,7 +330,7 @@ def _mechanism_view(result: SimulationResult) -> tuple[str, go.Figure]:
         """The platform's rim, tubes, rods and axes."""
         legs = joints[k] - base
         ends = base + tube * legs / np.linalg.norm(legs, axis=1, keepdims=True)
-        axes = view.segments(np.broadcast_to(positions[k], (3, 3)), positions[k] + triad * rotations[k].T)
+        axes = view.segments(np.broadcast_to(tips[k], (3, 3)), tips[k] + triad * tip_axes[k].T)
         return [joints[k][platform_ring], view.segments(base, ends), view.segments(ends, joints[k]), axes]
 
     def frame(k: int) -> go.Frame:
@@ -349,6 +353,11 @@ def _mechanism_view(result: SimulationResult) -> tuple[str, go.Figure]:
         frames=[frame(k) for k in range(count)],
     )
     points = np.concatenate([numbers, joints.reshape(-1, 3), path])
+    if result.frames is not None and result.frames.root == BASE:
+        work = result.frames.work
+        origin, ends = 1e3 * work.position, 1e3 * work.position + triad * work.rotation.T
+        figure.add_trace(view.line(view.segments(np.broadcast_to(origin, (3, 3)), ends), view.segment_colors(AXIS_NAMES), 5))
+        points = np.concatenate([points, origin[None], ends])
     figure.update_layout(
         LAYOUT,
         **view.VIEW,
@@ -360,7 +369,8 @@ def _mechanism_view(result: SimulationResult) -> tuple[str, go.Figure]:
     speed = span / count / frame_s
     pace = "in real time" if speed < 1.05 else f"at {speed:.2g} times real speed"
     pace += ", or as fast as the browser draws them"
-    return f"{real} poses {pace}; the path of the origin in grey. Drag to turn, scroll to zoom.", figure
+    of = "the origin" if result.frames is None else result.frames.frames.tool
+    return f"{real} poses {pace}; the path of {of} in grey. Drag to turn, scroll to zoom.", figure
 
 
 def _player(times: Array, frame_s: float) -> dict[str, Any]:
