@@ -142,6 +142,17 @@ class ActiveFrames:
         )
         return self._displaced(platform, axes, shares * translation, turns)
 
+    def rate(self, platform: Pose, move: Move) -> Array:
+        """The twist (6,) of the platform while it makes a move in each second, as when it is jogged: [m/s, rad/s] in the root.
+
+        Raises:
+            UnknownNameError, InputError: the move's axes cannot be used, or it is not finite.
+        """
+        axes = self.axes(platform, move.axes)
+        angular = axes @ checked_array(move.rotation_vector, (3,), "rotation_vector")
+        velocity = axes @ checked_array(move.translation, (3,), "translation")
+        return np.concatenate([velocity + np.cross(angular, platform.position - self.pivot(platform)), angular])
+
     def move_between(self, first: Pose, last: Pose, axes: str | None = None) -> Move:
         """The move from one pose of the platform to another, along the axes of a frame; the turn is at most half a turn.
 

@@ -202,6 +202,11 @@ def test_a_move_shifts_the_pivot_and_turns_about_it(seed):
     again = active.move_between(platform, moved, axes)
     np.testing.assert_allclose(again.translation, translation, atol=ROUNDING)
     np.testing.assert_allclose(again.rotation_vector, vector, atol=1e-9)
+    t = 1e-6
+    before, after = (active.moved(platform, Move(translation, vector, axes), share) for share in (-t, t))
+    turned = Rotation.from_matrix(after.rotation @ before.rotation.T).as_rotvec()
+    rate = np.concatenate([after.position - before.position, turned]) / (2.0 * t)
+    np.testing.assert_allclose(active.rate(platform, Move(translation, vector, axes)), rate, atol=1e-8)
     ways = active.moved(platform, Move(translation, vector, axes), np.linspace(0.0, 1.0, 5))
     assert same(Pose(ways.position[0], ways.rotation[0]), platform)
     assert same(Pose(ways.position[-1], ways.rotation[-1]), moved)
