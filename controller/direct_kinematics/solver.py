@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from controller.direct_kinematics.geometry import SCRATCH
 from controller.direct_kinematics.legs_alone import orthonormalise, pose_from_legs, second_pose_from_legs
 from controller.direct_kinematics.legs_and_attitude import pose_from_rotation, pose_from_vector
-from controller.direct_kinematics.refinement import move_pose, normal_equations, solve_normal_equations
+from controller.direct_kinematics.refinement import information_at, move_pose, right_side
 from controller.direct_kinematics.shared_joints import section_3_1_1, section_4
 from controller.inverse_kinematics import legs_at
-from controller.least_squares import invert_cholesky
+from controller.least_squares import invert_symmetric
 from plant.compiled import Record, kernel, record_dtype
 from plant.mechanism import LEGS
 from plant.pose import UNIT_TOLERANCE, Array
@@ -34,8 +34,10 @@ _DISTINCT, _DISTINCT_SHARE = 25.0, 400.0
 times, or by the second number times the better sum over its degrees of freedom, if the noise is far below the sigmas."""
 
 _SAME_ROTATION = 1e-6
-_MOST_REFINEMENTS = 20
+_MOST_REFINEMENTS = 21
 _REFINED = 1e-14  # square of a step over its variance at which the pose has settled
+_FAST = 1e-4  # share of the square before, up to which the steps get shorter as fast as if each had its own covariance
+_SHORT = 3e-3  # step, over the joints' spread or in radians, after which the same is true
 _TINY = 1e-9  # step, over the joints' spread or in radians, that may be no more than rounding
 
 SOLVED, REFUSED, OPEN, SINGULAR, UNSETTLED, NEGATIVE, AMBIGUOUS = range(7)  # statuses of a row
@@ -92,7 +94,7 @@ WORK = record_dtype(
     predicted=(np.float64, (LEGS, 3)),
     lengths=(np.float64, LEGS),
     information=(np.float64, (6, 6)),
-    factor=(np.float64, (6, 6)),
+    covariance=(np.float64, (6, 6)),
     correction=(np.float64, 6),
 )
 """Memory for one pose: what was measured, the pose, and its fit."""
@@ -234,23 +236,33 @@ def _fit(geometry: Record, refine: bool, work: Record) -> tuple[int, float]:
     """Refine the pose, if wanted, and weigh its residuals; returns a status and their chi-square sum."""
     base_joints, platform_joints = geometry.base_joints, geometry.platform_joints
     position, rotation, vector_weights = work.position, work.rotation, work.vector_weights[: work.vectors]
-    status, before, spread = UNSETTLED if refine else SOLVED, np.inf, geometry.spreads[-1]
+    status, before, fresh, spread = UNSETTLED if refine else SOLVED, np.inf, True, geometry.spreads[-1]
     for _ in range(_MOST_REFINEMENTS if refine else 1):
-        normal_equations(
+        right_side(
             base_joints, platform_joints, work.directions, work.weights, work.in_base, work.in_platform, vector_weights,
-            position, rotation, work.arms, work.predicted, work.lengths, work.information, work.correction,
+            position, rotation, work.arms, work.predicted, work.lengths, work.correction,
         )  # fmt: skip
-        if not solve_normal_equations(work.information, work.correction, work.factor):
-            return SINGULAR, np.inf
+        if fresh:
+            information_at(
+                work.weights, work.in_platform, vector_weights, rotation, work.arms, work.predicted, work.lengths,
+                work.information,
+            )  # fmt: skip
+            if not invert_symmetric(work.information, work.covariance):
+                return SINGULAR, np.inf
         if not refine:
             break
+        square = _step(work.covariance, work.correction)
         move_pose(work.correction, position, rotation)
-        square = _square_over_variance(work.factor, work.correction)
-        if square < _REFINED or (square >= before and _is_tiny(work.correction, spread)):
+        longest = _longest(work.correction, spread)
+        if fresh and (square < _REFINED or (square >= before and longest < _TINY)):
             status = SOLVED
             break
+        # The covariance serves for one more step where it changes much less than the pose, unless that step is the last.
+        first, last = before == np.inf, square * square < _REFINED * before
+        fresh = longest > _SHORT or not (first or (square < _FAST * before and not last))
         before = square
-    legs_at(base_joints, platform_joints, position, rotation, work.arms, work.predicted, work.lengths)
+    if refine:
+        legs_at(base_joints, platform_joints, position, rotation, work.arms, work.predicted, work.lengths)
     chi_square = 0.0
     for k in range(LEGS):
         if work.measured[k] == 0.0:
@@ -305,25 +317,26 @@ def _write(work: Record, chi_square: float, row: int, results: Results) -> None:
         for i in range(3):
             residual = work.directions[k, i] - work.predicted[k, i]
             results.residuals[row, k, i] = residual if work.measured[k] != 0.0 else np.nan
-    invert_cholesky(work.factor, results.covariances[row])
+    for i in range(6):
+        for j in range(6):
+            results.covariances[row, i, j] = work.covariance[i, j]
 
 
 @kernel
-def _is_tiny(step: Array, spread: float) -> bool:
-    """Whether a step is so short that only rounding keeps it from getting shorter."""
-    longest = 0.0
-    for i in range(3):
-        longest = max(longest, abs(step[i]) / spread, abs(step[3 + i]))
-    return longest < _TINY
+def _longest(step: Array, spread: float) -> float:
+    """The greatest component of a step, over the joints' spread or in radians."""
+    moved = max(abs(step[0]), abs(step[1]), abs(step[2])) / spread
+    return max(moved, abs(step[3]), abs(step[4]), abs(step[5]))
 
 
 @kernel
-def _square_over_variance(factor: Array, step: Array) -> float:
-    """step^T A step for a matrix A whose Cholesky factor is the lower triangle of `factor`."""
+def _step(covariance: Array, right: Array) -> float:
+    """Replace the right side (6,) of normal equations by their solution x; returns the square of x over its variance."""
+    r0, r1, r2, r3, r4, r5 = right[0], right[1], right[2], right[3], right[4], right[5]
     square = 0.0
-    for j in range(6):
-        value = 0.0
-        for i in range(j, 6):
-            value += factor[i, j] * step[i]
-        square += value * value
+    for i in range(6):
+        c = covariance[i]
+        x = c[0] * r0 + c[1] * r1 + c[2] * r2 + c[3] * r3 + c[4] * r4 + c[5] * r5
+        square += x * right[i]
+        right[i] = x
     return square

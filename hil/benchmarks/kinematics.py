@@ -130,10 +130,11 @@ def _compare(mechanism: Mechanism, yardstick: Yardstick) -> dict[str, Any]:
     ratio is the median of those to the yardstick's slice of the same round.
     """
     runs = _runs(mechanism)
+    turns: list[Callable[[], Any]] = [yardstick, *runs.values()]
     rounds = []
     for _ in range(_ROUNDS):
         slices = []
-        for run in (yardstick, *runs.values()):
+        for run in turns:
             began = thread_time()
             run()
             slices.append(thread_time() - began)
