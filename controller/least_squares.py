@@ -13,6 +13,14 @@ RANK_TOLERANCE = 1e-9  # ratio of the least to the greatest diagonal element of 
 _LEAST_PIVOT = 1e-13  # of a symmetric matrix, over the element of its diagonal from which elimination leaves it
 
 
+WELL_CONDITIONED = 0.05
+"""Ratio of the last to the first pivot from which on normal equations serve: they lose twice as many digits as QR, but here no
+more than rounding times the square of this ratio's inverse, 1e-13."""
+
+Symmetric = tuple[float, float, float, float, float, float]
+"""The lower triangle of a symmetric matrix (3, 3), row by row."""
+
+
 @kernel
 def solve_least_squares(matrix: Array, right: Array, rows: int, solution: Array, norms: Array, order: Array) -> float:
     """Minimise |matrix @ solution - right| by QR with column pivoting: `solve_truncated` with as many pivots as unknowns.
@@ -55,6 +63,68 @@ def solve_truncated(
             row[int(order[k])] = norms[k] if k < rank else 0.0
         row[int(order[free])] = 1.0
     return conditioning
+
+
+@kernel
+def solve_symmetric(matrix: Array, rank: int, solution: Array, null_space: Array, pivots: Array, order: Array) -> float:
+    """`solve_truncated` from the normal equations, by Cholesky's factors with the same pivots, where it is `WELL_CONDITIONED`.
+
+    Args:
+        matrix: (>= 2 n, >= n + 2); its first n rows are the normal equations, their right side in column n. Overwritten.
+        rank, solution, null_space: as there, with n the size of `solution`.
+        pivots, order: (>= n,) scratch.
+
+    Returns:
+        The ratio of the last to the first pivot of the QR; 0 if it is too small, and nothing is solved.
+    """
+    n = solution.shape[0]
+    for j in range(n):
+        pivots[j], order[j] = matrix[j, j], j
+    ratio = 1.0
+    for k in range(rank):
+        best = 0
+        for j in range(1, n):
+            if pivots[j] > pivots[best]:
+                best = j
+        place = k
+        while int(order[place]) != best:
+            place += 1
+        order[k], order[place] = order[place], order[k]
+        row = n + k
+        for j in range(n + 1):
+            matrix[row, j] = matrix[best, j]
+        for above in range(n, row):
+            factor = matrix[above, best] * matrix[above, n + 1]
+            for j in range(n + 1):
+                matrix[row, j] -= factor * matrix[above, j]
+        ratio = matrix[row, best] / matrix[n, int(order[0])]
+        if not ratio >= WELL_CONDITIONED**2:
+            return 0.0
+        inverse = 1.0 / matrix[row, best]
+        matrix[row, n + 1] = inverse
+        for j in range(n):
+            pivots[j] -= matrix[row, j] * matrix[row, j] * inverse
+        pivots[best] = -np.inf  # once chosen
+    _substitute(matrix, rank, n, 1.0, order, solution)
+    for k in range(rank, n):
+        free = int(order[k])
+        _substitute(matrix, rank, free, -1.0, order, null_space[k - rank])
+        null_space[k - rank, free] = 1.0
+    return float(np.sqrt(ratio))
+
+
+@kernel
+def _substitute(matrix: Array, rank: int, column: int, sign: float, order: Array, solution: Array) -> None:
+    """Solve the triangle of `solve_symmetric` for one of its columns times `sign`; unknowns that were not chosen are 0."""
+    n = solution.shape[0]
+    for j in range(n):
+        solution[j] = 0.0
+    for k in range(rank - 1, -1, -1):
+        value = sign * matrix[n + k, column]
+        for j in range(k + 1, rank):
+            chosen = int(order[j])
+            value -= matrix[n + k, chosen] * solution[chosen]
+        solution[int(order[k])] = value * matrix[n + k, n + 1]
 
 
 @kernel
@@ -211,10 +281,6 @@ def solve_cholesky(factor: Array, right: Array) -> None:
         for k in range(i + 1, n):
             value -= factor[k, i] * right[k]
         right[i] = value / factor[i, i]
-
-
-Symmetric = tuple[float, float, float, float, float, float]
-"""The lower triangle of a symmetric matrix (3, 3), row by row."""
 
 
 @kernel

@@ -48,20 +48,19 @@ def normal_equations(
         information: (6, 6), lower triangle written.
         correction: (6,), the right side, written.
     """
-    right_side(
-        base_joints, platform_joints, directions, weights, in_base, in_platform, vector_weights, position, rotation, arms,
-        predicted, lengths, correction,
+    legs_at(base_joints, platform_joints, position, rotation, arms, predicted, lengths)
+    right_side_at(
+        directions, weights, in_base, in_platform, vector_weights, rotation, arms, predicted, lengths, correction
     )  # fmt: skip
     information_at(weights, in_platform, vector_weights, rotation, arms, predicted, lengths, information)
 
 
 @kernel
-def right_side(
-    base_joints: Array, platform_joints: Array, directions: Array, weights: Array, in_base: Array, in_platform: Array,
-    vector_weights: Array, position: Array, rotation: Array, arms: Array, predicted: Array, lengths: Array, correction: Array,
+def right_side_at(
+    directions: Array, weights: Array, in_base: Array, in_platform: Array, vector_weights: Array, rotation: Array, arms: Array,
+    predicted: Array, lengths: Array, correction: Array,
 ) -> None:  # fmt: skip
-    """The legs at a pose and the right side of `normal_equations`."""
-    legs_at(base_joints, platform_joints, position, rotation, arms, predicted, lengths)
+    """Write the right side of `normal_equations` from the legs at the pose."""
     f0 = f1 = f2 = t0 = t1 = t2 = 0.0
     for k in range(LEGS):
         if weights[k] != 0.0:

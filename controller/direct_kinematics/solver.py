@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.direct_kinematics.geometry import SCRATCH
-from controller.direct_kinematics.legs_alone import orthonormalise, pose_from_legs, second_pose_from_legs
+from controller.direct_kinematics.legs_alone import nearest_rotation, pose_from_legs, second_pose_from_legs
 from controller.direct_kinematics.legs_and_attitude import pose_from_rotation, pose_from_vector
-from controller.direct_kinematics.refinement import information_at, move_pose, right_side
+from controller.direct_kinematics.refinement import information_at, move_pose, right_side_at
 from controller.direct_kinematics.shared_joints import section_3_1_1, section_4
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import invert_symmetric
 from plant.compiled import Record, kernel, record_dtype
 from plant.mechanism import LEGS
 from plant.pose import UNIT_TOLERANCE, Array
-from plant.vectors import Vector, dot, rotate, rotate_back, vector
+from plant.vectors import Vector, dot, rotate, rotate_back, scale, vector
 
 METHODS = ("section-5", "up", "normal", "legs", "section-3.1.1", "section-4")
 """The closed forms: those of the paper's sections, and those from all legs with the vertical, the normal, or nothing else."""
@@ -57,7 +57,7 @@ class Measurements(NamedTuple):
 
 
 class Results(NamedTuple):
-    """The arrays of `Solutions`, NaN where nothing is written, and the status of each row."""
+    """The arrays of `Solutions`, and the status of each row."""
 
     positions: Array
     rotations: Array
@@ -109,13 +109,16 @@ def solve_rows(
     work = work_array[()]
     for row in range(start, stop):
         _read(measurements, row, work)
+        results.methods[row], results.conditionings[row], results.degrees_of_freedom[row] = 0, 0.0, 0
         if work.refused != 0:
             results.statuses[row] = REFUSED
+            _write_nothing(row, results)
             continue
         method, conditioning = _find(geometry, candidates, work)
         results.methods[row], results.conditionings[row] = method, conditioning
         if not conditioning > LEAST_CONDITIONING:
             results.statuses[row] = OPEN
+            _write_nothing(row, results)
             continue
         # If the joints are only nearly coplanar, the closed form that takes them for coplanar is a start, not the pose.
         settle = refine or (method == _LEGS and work.scratch.approximate != 0)
@@ -124,6 +127,8 @@ def solve_rows(
         results.statuses[row] = status
         if status == SOLVED:
             _write(work, chi_square, row, results)
+        else:
+            _write_nothing(row, results)
 
 
 @kernel
@@ -141,10 +146,7 @@ def _read(measurements: Measurements, row: int, work: Record) -> None:
         work.weights[k] = work.measured[k] * measurements.leg_weight
         work.equations += 2 * int(measured)
     if measurements.rotations.shape[0] > 0:
-        # The nearest rotation to the transposed, which the columns are, is the transposed nearest rotation.
-        work.measured_rotation[:] = measurements.rotations[row]
-        if not _is_orthogonal(work.measured_rotation) or orthonormalise(work.measured_rotation.reshape(9), False) < 0.0:
-            work.refused = 1
+        _read_rotation(measurements.rotations, row, work)
         # These weights add up to the yaw's about the vertical, and to the tilt's about every level axis.
         yaw = 0.5 * measurements.yaw_weight
         for i in range(3):
@@ -163,11 +165,23 @@ def _read(measurements: Measurements, row: int, work: Record) -> None:
 
 
 @kernel
+def _read_rotation(rotations: Array, row: int, work: Record) -> None:
+    """Read the rotation nearest to a measured one. Its rows are the columns of the one that is nearest to the transposed."""
+    x, y, z = vector(rotations[row, 0]), vector(rotations[row, 1]), vector(rotations[row, 2])
+    orthogonal = _is_orthogonal(rotations[row])
+    found, x, y, z = nearest_rotation(x, y, z)
+    if not orthogonal or not found:
+        work.refused = 1
+    for i in range(3):
+        work.measured_rotation[0, i], work.measured_rotation[1, i], work.measured_rotation[2, i] = x[i], y[i], z[i]
+
+
+@kernel
 def _unit(given: Vector, work: Record) -> Vector:
     size = np.sqrt(dot(given, given))
     if not abs(size - 1.0) <= UNIT_TOLERANCE:
         work.refused = 1
-    return given[0] / size, given[1] / size, given[2] / size
+    return scale(1.0 / size, given)
 
 
 @kernel
@@ -217,7 +231,7 @@ def _apply(geometry: Record, method: int, work: Record) -> float:
     """Find the pose by a closed form; returns the conditioning."""
     directions, measured, position, rotation = work.directions, work.measured, work.position, work.rotation
     if method == _SECTION_5:
-        rotation[:] = work.measured_rotation
+        _copy_pose(position, work.measured_rotation, position, rotation)
         return pose_from_rotation(geometry, directions, measured, rotation, position, work.scratch)
     if method == _LEGS:
         conditioning = pose_from_legs(geometry, directions, measured, position, rotation, work.scratch)
@@ -238,10 +252,7 @@ def _fit(geometry: Record, refine: bool, work: Record) -> tuple[int, float]:
     position, rotation, vector_weights = work.position, work.rotation, work.vector_weights[: work.vectors]
     status, before, fresh, spread = UNSETTLED if refine else SOLVED, np.inf, True, geometry.spreads[-1]
     for _ in range(_MOST_REFINEMENTS if refine else 1):
-        right_side(
-            base_joints, platform_joints, work.directions, work.weights, work.in_base, work.in_platform, vector_weights,
-            position, rotation, work.arms, work.predicted, work.lengths, work.correction,
-        )  # fmt: skip
+        legs_at(base_joints, platform_joints, position, rotation, work.arms, work.predicted, work.lengths)
         if fresh:
             information_at(
                 work.weights, work.in_platform, vector_weights, rotation, work.arms, work.predicted, work.lengths,
@@ -251,6 +262,10 @@ def _fit(geometry: Record, refine: bool, work: Record) -> tuple[int, float]:
                 return SINGULAR, np.inf
         if not refine:
             break
+        right_side_at(
+            work.directions, work.weights, work.in_base, work.in_platform, vector_weights, rotation, work.arms, work.predicted,
+            work.lengths, work.correction,
+        )  # fmt: skip
         square = _step(work.covariance, work.correction)
         move_pose(work.correction, position, rotation)
         longest = _longest(work.correction, spread)
@@ -320,6 +335,21 @@ def _write(work: Record, chi_square: float, row: int, results: Results) -> None:
     for i in range(6):
         for j in range(6):
             results.covariances[row, i, j] = work.covariance[i, j]
+
+
+@kernel
+def _write_nothing(row: int, results: Results) -> None:
+    """Write NaN for a row without a pose."""
+    results.chi_squares[row] = np.nan
+    for i in range(3):
+        results.positions[row, i] = np.nan
+        for j in range(3):
+            results.rotations[row, i, j] = np.nan
+    for k in range(LEGS):
+        for i in range(3):
+            results.residuals[row, k, i] = np.nan
+        for j in range(6):
+            results.covariances[row, k, j] = np.nan
 
 
 @kernel

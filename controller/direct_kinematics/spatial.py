@@ -241,8 +241,7 @@ def _solve(
         arrays["leg_directions"], arrays.get("rotation", _NO_ROTATIONS), arrays.get("up_in_platform", _NO_VECTORS),
         arrays.get("normal", _NO_VECTORS), _axes_of(mechanism), *weights,
     )  # fmt: skip
-    # Copies take a third of the time, which counts where Python closes a loop.
-    results = Results._make([each.copy() for each in _ONE_ROW]) if count == 1 else _no_results(count)
+    results = _results(count)
 
     def solve_chunk(start: int) -> None:
         stop = min(start + _CHUNK, count)
@@ -270,21 +269,19 @@ def _weight(name: str, sigma: float) -> float:
     return float(value) ** -2
 
 
-def _no_results(count: int) -> Results:
-    """Results of so many rows, before they are found."""
+def _results(count: int) -> Results:
+    """Arrays for so many rows, of which the kernel writes every element."""
+    empty = np.empty
     return Results(
-        *(np.full((count, *shape), np.nan) for shape in ((3,), (3, 3), (6, 6), (LEGS, 3), ())),
-        *(np.zeros(count, kind) for kind in (np.int64, np.int64, np.float64, np.int64)),
-    )
+        empty((count, 3)), empty((count, 3, 3)), empty((count, 6, 6)), empty((count, LEGS, 3)), empty(count),
+        empty(count, np.int64), empty(count, np.int64), empty(count), empty(count, np.int64),
+    )  # fmt: skip
 
 
 def check_spatial(mechanism: Mechanism) -> None:
     """Raise an `InputError` unless the mechanism has six legs."""
     if not isinstance(mechanism, Mechanism):
         raise InputError(f"the mechanism must be a Mechanism of six legs, not a {type(mechanism).__name__}")
-
-
-_ONE_ROW = _no_results(1)
 
 
 class _Memory(threading.local):
