@@ -3,6 +3,8 @@
 The closed forms use QR, because their normal equations would lose half the digits. The refinement's are well scaled.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from plant.compiled import kernel
@@ -65,66 +67,71 @@ def solve_truncated(
     return conditioning
 
 
-@kernel
-def solve_symmetric(matrix: Array, rank: int, solution: Array, null_space: Array, pivots: Array, order: Array) -> float:
-    """`solve_truncated` from the normal equations, by Cholesky's factors with the same pivots, where it is `WELL_CONDITIONED`.
+def _symmetric_solver(n: int) -> Callable[[Array, int, Array, Array, Array, Array], float]:
+    """`solve_five` and `solve_nine`: with a constant size, the compiler unrolls the loops over columns."""
 
-    Args:
-        matrix: (>= 2 n, >= n + 2); its first n rows are the normal equations, their right side in column n. Overwritten.
-        rank, solution, null_space: as there, with n the size of `solution`.
-        pivots, order: (>= n,) scratch.
-
-    Returns:
-        The ratio of the last to the first pivot of the QR; 0 if it is too small, and nothing is solved.
-    """
-    n = solution.shape[0]
-    for j in range(n):
-        pivots[j], order[j] = matrix[j, j], j
-    ratio = 1.0
-    for k in range(rank):
-        best = 0
-        for j in range(1, n):
-            if pivots[j] > pivots[best]:
-                best = j
-        place = k
-        while int(order[place]) != best:
-            place += 1
-        order[k], order[place] = order[place], order[k]
-        row = n + k
-        for j in range(n + 1):
-            matrix[row, j] = matrix[best, j]
-        for above in range(n, row):
-            factor = matrix[above, best] * matrix[above, n + 1]
-            for j in range(n + 1):
-                matrix[row, j] -= factor * matrix[above, j]
-        ratio = matrix[row, best] / matrix[n, int(order[0])]
-        if not ratio >= WELL_CONDITIONED**2:
-            return 0.0
-        inverse = 1.0 / matrix[row, best]
-        matrix[row, n + 1] = inverse
+    @kernel
+    def substitute_back(matrix: Array, rank: int, column: int, sign: float, order: Array, solution: Array) -> None:
+        """Solve the triangle for one of the columns times `sign`; unknowns that were not chosen are 0."""
         for j in range(n):
-            pivots[j] -= matrix[row, j] * matrix[row, j] * inverse
-        pivots[best] = -np.inf  # once chosen
-    _substitute(matrix, rank, n, 1.0, order, solution)
-    for k in range(rank, n):
-        free = int(order[k])
-        _substitute(matrix, rank, free, -1.0, order, null_space[k - rank])
-        null_space[k - rank, free] = 1.0
-    return float(np.sqrt(ratio))
+            solution[j] = 0.0
+        for k in range(rank - 1, -1, -1):
+            value = sign * matrix[n + k, column]
+            for j in range(k + 1, rank):
+                chosen = int(order[j])
+                value -= matrix[n + k, chosen] * solution[chosen]
+            solution[int(order[k])] = value * matrix[n + k, n + 1]
+
+    @kernel
+    def solve_symmetric(matrix: Array, rank: int, solution: Array, null_space: Array, pivots: Array, order: Array) -> float:
+        """`solve_truncated` from normal equations, by Cholesky's factors with the same pivots, where it is `WELL_CONDITIONED`.
+
+        Args:
+            matrix: (>= 2 n, >= n + 2); its first n rows are the normal equations, their right side in column n. Overwritten.
+            rank, solution, null_space: as there, with n unknowns.
+            pivots, order: (>= n,) scratch.
+
+        Returns:
+            The ratio of the last to the first pivot of the QR; 0 if it is too small, and nothing is solved.
+        """
+        for j in range(n):
+            pivots[j], order[j] = matrix[j, j], j
+        ratio = 1.0
+        for k in range(rank):
+            best, greatest = 0, pivots[0]
+            for j in range(1, n):
+                greater = pivots[j] > greatest
+                best, greatest = j if greater else best, pivots[j] if greater else greatest
+            place = k
+            while int(order[place]) != best:
+                place += 1
+            order[k], order[place] = order[place], order[k]
+            row = n + k
+            for j in range(n + 1):
+                matrix[row, j] = matrix[best, j]
+            for above in range(n, row):
+                factor = matrix[above, best] * matrix[above, n + 1]
+                for j in range(n + 1):
+                    matrix[row, j] -= factor * matrix[above, j]
+            ratio = matrix[row, best] / matrix[n, int(order[0])]
+            if not ratio >= WELL_CONDITIONED**2:
+                return 0.0
+            inverse = 1.0 / matrix[row, best]
+            matrix[row, n + 1] = inverse
+            for j in range(n):
+                pivots[j] -= matrix[row, j] * matrix[row, j] * inverse
+            pivots[best] = -np.inf  # once chosen
+        substitute_back(matrix, rank, n, 1.0, order, solution)
+        for k in range(rank, n):
+            free = int(order[k])
+            substitute_back(matrix, rank, free, -1.0, order, null_space[k - rank])
+            null_space[k - rank, free] = 1.0
+        return float(np.sqrt(ratio))
+
+    return solve_symmetric
 
 
-@kernel
-def _substitute(matrix: Array, rank: int, column: int, sign: float, order: Array, solution: Array) -> None:
-    """Solve the triangle of `solve_symmetric` for one of its columns times `sign`; unknowns that were not chosen are 0."""
-    n = solution.shape[0]
-    for j in range(n):
-        solution[j] = 0.0
-    for k in range(rank - 1, -1, -1):
-        value = sign * matrix[n + k, column]
-        for j in range(k + 1, rank):
-            chosen = int(order[j])
-            value -= matrix[n + k, chosen] * solution[chosen]
-        solution[int(order[k])] = value * matrix[n + k, n + 1]
+solve_five, solve_nine = _symmetric_solver(5), _symmetric_solver(9)
 
 
 @kernel

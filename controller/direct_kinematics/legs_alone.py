@@ -16,7 +16,7 @@ from controller.least_squares import (
     WELL_CONDITIONED,
     Symmetric,
     solve_least_squares,
-    solve_symmetric,
+    solve_nine,
     solve_truncated,
 )
 from plant.compiled import Record, kernel
@@ -83,7 +83,7 @@ def _pose_from_legs(
     conditioning = 0.0
     if flat:
         _write_normal_equations(geometry, directions, measured, legs, scratch.matrix)
-        conditioning = solve_symmetric(scratch.matrix, rank, solution, null_space, scratch.norms, scratch.order)
+        conditioning = solve_nine(scratch.matrix, rank, solution, null_space, scratch.norms, scratch.order)
     if conditioning < WELL_CONDITIONED:
         rows = _write_rows(geometry, directions, measured, legs, unknowns, scratch)
         conditioning = solve_truncated(

@@ -16,8 +16,8 @@ from controller.direct_kinematics.geometry import across, across_leg, set_number
 from controller.least_squares import (
     RANK_TOLERANCE,
     WELL_CONDITIONED,
+    solve_five,
     solve_least_squares,
-    solve_symmetric,
     solve_truncated,
 )
 from plant.compiled import Record, kernel
@@ -163,7 +163,7 @@ def pose_from_vector(
     conditioning = 0.0
     if not to_scale:
         _write_normal_equations(geometry, directions, measured, in_base, rotation, scratch.matrix)
-        conditioning = solve_symmetric(scratch.matrix, 5, unknowns, scratch.matrix, scratch.norms, scratch.order)
+        conditioning = solve_five(scratch.matrix, 5, unknowns, scratch.matrix, scratch.norms, scratch.order)
     if conditioning < WELL_CONDITIONED:
         rows = _write_rows(geometry, directions, measured, in_base, rotation, scratch)
         if to_scale:
@@ -220,7 +220,7 @@ def _write_rows(geometry: Record, directions: Array, measured: Array, in_base: A
 def _write_normal_equations(
     geometry: Record, directions: Array, measured: Array, in_base: Array, rotation: Array, matrix: Array
 ) -> None:
-    """Write the normal equations of the same for `solve_symmetric`."""
+    """Write the normal equations of the same for `solve_five`."""
     legs, u = set_number(measured), vector(in_base)
     per_spread = 1.0 / geometry.spreads[legs]
     m00 = m10 = m11 = m20 = m21 = m22 = m30 = m31 = m32 = m33 = m40 = m41 = m42 = m43 = m44 = 0.0
