@@ -9,7 +9,7 @@ from plant.compiled import kernel
 from plant.errors import InputError, SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, Pose, checked_array, checked_rotation, rotation_from_vector
-from plant.vectors import add, cross, dot, rotate, subtract, vector
+from plant.vectors import add, cross, dot, rotate, scale, subtract, vector
 
 _MOST_DRAWS = 500
 
@@ -65,10 +65,9 @@ def legs_at(
     for k in range(LEGS):
         arm = rotate(rotation, vector(platform_joints[k]))
         leg = subtract(add(vector(position), arm), vector(base_joints[k]))
-        lengths[k] = np.sqrt(dot(leg, leg))
-        for i in range(3):
-            arms[k, i] = arm[i]
-            directions[k, i] = leg[i] / lengths[k]
+        lengths[k] = length = np.sqrt(dot(leg, leg))
+        arms[k, 0], arms[k, 1], arms[k, 2] = arm
+        directions[k, 0], directions[k, 1], directions[k, 2] = scale(1.0 / length, leg)
 
 
 @kernel

@@ -3,12 +3,24 @@
 The closed forms use QR, because their normal equations would lose half the digits. The refinement's are well scaled.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from plant.compiled import kernel
 from plant.pose import Array
+from plant.vectors import Vector, dot
 
 RANK_TOLERANCE = 1e-9  # ratio of the least to the greatest diagonal element of R, below which columns count as dependent
+_LEAST_PIVOT = 1e-13  # of a symmetric matrix, over the element of its diagonal from which elimination leaves it
+
+
+WELL_CONDITIONED = 0.05
+"""Ratio of the last to the first pivot from which on normal equations serve: they lose twice as many digits as QR, but here no
+more than rounding times the square of this ratio's inverse, 1e-13."""
+
+Symmetric = tuple[float, float, float, float, float, float]
+"""The lower triangle of a symmetric matrix (3, 3), row by row."""
 
 
 @kernel
@@ -53,6 +65,73 @@ def solve_truncated(
             row[int(order[k])] = norms[k] if k < rank else 0.0
         row[int(order[free])] = 1.0
     return conditioning
+
+
+def _symmetric_solver(n: int) -> Callable[[Array, int, Array, Array, Array, Array], float]:
+    """`solve_five` and `solve_nine`: with a constant size, the compiler unrolls the loops over columns."""
+
+    @kernel
+    def substitute_back(matrix: Array, rank: int, column: int, sign: float, order: Array, solution: Array) -> None:
+        """Solve the triangle for one of the columns times `sign`; unknowns that were not chosen are 0."""
+        for j in range(n):
+            solution[j] = 0.0
+        for k in range(rank - 1, -1, -1):
+            value = sign * matrix[n + k, column]
+            for j in range(k + 1, rank):
+                chosen = int(order[j])
+                value -= matrix[n + k, chosen] * solution[chosen]
+            solution[int(order[k])] = value * matrix[n + k, n + 1]
+
+    @kernel
+    def solve_symmetric(matrix: Array, rank: int, solution: Array, null_space: Array, pivots: Array, order: Array) -> float:
+        """`solve_truncated` from normal equations, by Cholesky's factors with the same pivots, where it is `WELL_CONDITIONED`.
+
+        Args:
+            matrix: (>= 2 n, >= n + 2); its first n rows are the normal equations, their right side in column n. Overwritten.
+            rank, solution, null_space: as there, with n unknowns.
+            pivots, order: (>= n,) scratch.
+
+        Returns:
+            The ratio of the last to the first pivot of the QR; 0 if it is too small, and nothing is solved.
+        """
+        for j in range(n):
+            pivots[j], order[j] = matrix[j, j], j
+        ratio = 1.0
+        for k in range(rank):
+            best, greatest = 0, pivots[0]
+            for j in range(1, n):
+                greater = pivots[j] > greatest
+                best, greatest = j if greater else best, pivots[j] if greater else greatest
+            place = k
+            while int(order[place]) != best:
+                place += 1
+            order[k], order[place] = order[place], order[k]
+            row = n + k
+            for j in range(n + 1):
+                matrix[row, j] = matrix[best, j]
+            for above in range(n, row):
+                factor = matrix[above, best] * matrix[above, n + 1]
+                for j in range(n + 1):
+                    matrix[row, j] -= factor * matrix[above, j]
+            ratio = matrix[row, best] / matrix[n, int(order[0])]
+            if not ratio >= WELL_CONDITIONED**2:
+                return 0.0
+            inverse = 1.0 / matrix[row, best]
+            matrix[row, n + 1] = inverse
+            for j in range(n):
+                pivots[j] -= matrix[row, j] * matrix[row, j] * inverse
+            pivots[best] = -np.inf  # once chosen
+        substitute_back(matrix, rank, n, 1.0, order, solution)
+        for k in range(rank, n):
+            free = int(order[k])
+            substitute_back(matrix, rank, free, -1.0, order, null_space[k - rank])
+            null_space[k - rank, free] = 1.0
+        return float(np.sqrt(ratio))
+
+    return solve_symmetric
+
+
+solve_five, solve_nine = _symmetric_solver(5), _symmetric_solver(9)
 
 
 @kernel
@@ -165,7 +244,7 @@ def factor_cholesky(matrix: Array) -> bool:
             factor = matrix[j, k]
             for i in range(j, n):
                 matrix[i, j] -= matrix[i, k] * factor
-        if not matrix[j, j] > 1e-13 * before:
+        if not matrix[j, j] > _LEAST_PIVOT * before:
             return False
         pivot = np.sqrt(matrix[j, j])
         matrix[j, j] = pivot
@@ -209,3 +288,94 @@ def solve_cholesky(factor: Array, right: Array) -> None:
         for k in range(i + 1, n):
             value -= factor[k, i] * right[k]
         right[i] = value / factor[i, i]
+
+
+@kernel
+def invert_symmetric(matrix: Array, inverse: Array) -> bool:
+    """Write the inverse of a symmetric matrix (6, 6), of which the lower triangle is read; False if it is not positive definite
+    beyond rounding, as `factor_cholesky`.
+
+    By blocks of three and in scalars, without a root: with the upper block L D L^T, rows Y of `L^-1` times the block beside it,
+    and the inverse X of what is left of the lower block, S = lower - Y^T D^-1 Y. Several times as fast as `invert_cholesky`.
+    """
+    fit, triangle, pivots = _factor_three(
+        (matrix[0, 0], matrix[1, 0], matrix[1, 1], matrix[2, 0], matrix[2, 1], matrix[2, 2]),
+        (matrix[0, 0], matrix[1, 1], matrix[2, 2]),
+    )
+    y0, w0, g0 = _eliminate(triangle, pivots, (matrix[3, 0], matrix[3, 1], matrix[3, 2]))
+    y1, w1, g1 = _eliminate(triangle, pivots, (matrix[4, 0], matrix[4, 1], matrix[4, 2]))
+    y2, w2, g2 = _eliminate(triangle, pivots, (matrix[5, 0], matrix[5, 1], matrix[5, 2]))
+    n00, n10, n11, n20, n21, n22 = _inverse_of_three(triangle, pivots)
+    fit_below, triangle, pivots = _factor_three(
+        (
+            matrix[3, 3] - dot(w0, y0), matrix[4, 3] - dot(w1, y0), matrix[4, 4] - dot(w1, y1),
+            matrix[5, 3] - dot(w2, y0), matrix[5, 4] - dot(w2, y1), matrix[5, 5] - dot(w2, y2),
+        ),
+        (matrix[3, 3], matrix[4, 4], matrix[5, 5]),
+    )  # fmt: skip
+    if not (fit and fit_below):
+        return False
+    x00, x10, x11, x20, x21, x22 = _inverse_of_three(triangle, pivots)
+    h0 = _combine(-x00, g0, -x10, g1, -x20, g2)
+    h1 = _combine(-x10, g0, -x11, g1, -x21, g2)
+    h2 = _combine(-x20, g0, -x21, g1, -x22, g2)
+    t00, t10, t20 = _combine(g0[0], h0, g1[0], h1, g2[0], h2)
+    _, t11, t21 = _combine(g0[1], h0, g1[1], h1, g2[1], h2)
+    t22 = g0[2] * h0[2] + g1[2] * h1[2] + g2[2] * h2[2]
+    inverse[0, 0], inverse[0, 1], inverse[0, 2] = n00 - t00, n10 - t10, n20 - t20
+    inverse[1, 0], inverse[1, 1], inverse[1, 2] = n10 - t10, n11 - t11, n21 - t21
+    inverse[2, 0], inverse[2, 1], inverse[2, 2] = n20 - t20, n21 - t21, n22 - t22
+    inverse[3, 0], inverse[3, 1], inverse[3, 2] = h0
+    inverse[4, 0], inverse[4, 1], inverse[4, 2] = h1
+    inverse[5, 0], inverse[5, 1], inverse[5, 2] = h2
+    inverse[0, 3], inverse[1, 3], inverse[2, 3] = h0
+    inverse[0, 4], inverse[1, 4], inverse[2, 4] = h1
+    inverse[0, 5], inverse[1, 5], inverse[2, 5] = h2
+    inverse[3, 3], inverse[3, 4], inverse[3, 5] = x00, x10, x20
+    inverse[4, 3], inverse[4, 4], inverse[4, 5] = x10, x11, x21
+    inverse[5, 3], inverse[5, 4], inverse[5, 5] = x20, x21, x22
+    return True
+
+
+@kernel
+def _factor_three(matrix: Symmetric, before: Vector) -> tuple[bool, Vector, Vector]:
+    """L D L^T of a symmetric matrix: whether its pivots are more than the rounding of the diagonal `before` elimination, the
+    elements 10, 20 and 21 of L, and the inverses of D.
+    """
+    d0, s10, s11, s20, s21, s22 = matrix
+    i0 = 1.0 / d0
+    l10, l20 = s10 * i0, s20 * i0
+    d1, u21 = s11 - l10 * s10, s21 - l10 * s20
+    i1 = 1.0 / d1
+    l21 = u21 * i1
+    d2 = s22 - l20 * s20 - l21 * u21
+    fit = d0 > _LEAST_PIVOT * before[0] and d1 > _LEAST_PIVOT * before[1] and d2 > _LEAST_PIVOT * before[2]
+    return fit, (l10, l20, l21), (i0, i1, 1.0 / d2)
+
+
+@kernel
+def _eliminate(triangle: Vector, pivots: Vector, row: Vector) -> tuple[Vector, Vector, Vector]:
+    """L^-1 `row`, the same times D^-1, and the solution (L D L^T)^-1 `row`."""
+    l10, l20, l21 = triangle
+    y0 = row[0]
+    y1 = row[1] - l10 * y0
+    y2 = row[2] - l20 * y0 - l21 * y1
+    w0, w1, w2 = y0 * pivots[0], y1 * pivots[1], y2 * pivots[2]
+    g1 = w1 - l21 * w2
+    return (y0, y1, y2), (w0, w1, w2), (w0 - l10 * g1 - l20 * w2, g1, w2)
+
+
+@kernel
+def _inverse_of_three(triangle: Vector, pivots: Vector) -> Symmetric:
+    """(L D L^T)^-1."""
+    l10, l20, l21 = triangle
+    i0, i1, i2 = pivots
+    m20 = l10 * l21 - l20
+    x20, x21, y10 = i2 * m20, -i2 * l21, -i1 * l10
+    return i0 - l10 * y10 + m20 * x20, y10 - l21 * x20, i1 - l21 * x21, x20, x21, i2
+
+
+@kernel
+def _combine(a: float, u: Vector, b: float, v: Vector, c: float, w: Vector) -> Vector:
+    """A u + b v + c w."""
+    return a * u[0] + b * v[0] + c * w[0], a * u[1] + b * v[1] + c * w[1], a * u[2] + b * v[2] + c * w[2]

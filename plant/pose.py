@@ -28,12 +28,17 @@ class Pose:
     rotation: Array
 
 
+_FLOAT = np.dtype(np.float64)
+
+
 def numbers(value: ArrayLike, name: str, shape: tuple[int, ...] | str) -> Array:
     """A float copy of `value`; `shape` is the expected shape, for the error message only.
 
     Raises:
         InputError: `value` is not an array of numbers.
     """
+    if type(value) is np.ndarray and value.dtype is _FLOAT:
+        return value.copy()
     try:
         given = np.asarray(value)
     except ValueError:
@@ -146,13 +151,14 @@ def quaternion_from_rotation(rotation: Array) -> Array:
 def rotate_by_vector(rotation: Array, vector: Array) -> None:
     """Replace `rotation` (3, 3) by exp(skew(`vector`)) @ `rotation`, with `vector` (3,) [rad] seen in {1}."""
     angle2 = vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]
-    if angle2 > 1e-8:
+    if angle2 > 1e-3:
         angle = np.sqrt(angle2)
         a = np.sin(angle) / angle
         b = (1.0 - np.cos(angle)) / angle2
     else:
-        a = 1.0 - angle2 / 6.0
-        b = 0.5 - angle2 / 24.0
+        # What the series leave out is less than 3e-18.
+        a = 1.0 - angle2 * (1.0 / 6.0 - angle2 * (1.0 / 120.0 - angle2 / 5040.0))
+        b = 0.5 - angle2 * (1.0 / 24.0 - angle2 * (1.0 / 720.0 - angle2 / 40320.0))
     v0, v1, v2 = vector[0], vector[1], vector[2]
     for j in range(3):
         x, y, z = rotation[0, j], rotation[1, j], rotation[2, j]

@@ -12,7 +12,7 @@ from plant.compiled import Record, kernel, record_dtype
 from plant.mechanism import LEGS, Mechanism, six_rows
 from plant.mechanism.checks import SAME_JOINT_M
 from plant.pose import Array
-from plant.vectors import Vector
+from plant.vectors import Vector, dot, scale, subtract
 
 MOST_FREE = 5  # parameters that the legs' equations may leave open for the equations of a rotation to settle
 ROTATION_EQUATIONS = 20  # that the elements of a rotation obey, quadratic ones
@@ -96,3 +96,9 @@ def across(direction: Array) -> tuple[Vector, Vector]:
     a = -1.0 / (sign + z)
     b = x * y * a
     return (1.0 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+
+
+@kernel
+def across_leg(direction: Vector, v: Vector) -> Vector:
+    """What a vector has across a unit vector, `P v` with P = I - d d^T."""
+    return subtract(v, scale(dot(direction, v), direction))

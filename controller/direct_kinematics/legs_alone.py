@@ -9,13 +9,20 @@ Every function returns the conditioning, as in `legs_and_attitude`.
 
 import numpy as np
 
-from controller.direct_kinematics.geometry import MOST_FREE, ROTATION_EQUATIONS, across, set_number
+from controller.direct_kinematics.geometry import MOST_FREE, ROTATION_EQUATIONS, across, across_leg, set_number
 from controller.direct_kinematics.legs_and_attitude import pose_from_rotation
-from controller.least_squares import RANK_TOLERANCE, solve_least_squares, solve_truncated
+from controller.least_squares import (
+    RANK_TOLERANCE,
+    WELL_CONDITIONED,
+    Symmetric,
+    solve_least_squares,
+    solve_nine,
+    solve_truncated,
+)
 from plant.compiled import Record, kernel
 from plant.mechanism import LEGS
 from plant.pose import Array
-from plant.vectors import add, cross, dot, scale, subtract, vector
+from plant.vectors import Vector, add, cross, dot, scale, subtract, vector
 
 _FLATNESS = 1e-3
 """Platform joints count as coplanar if they leave their plane by less than this share of their spread. The refinement makes
@@ -68,25 +75,20 @@ def _pose_from_legs(
     The unknowns are the joints' centre and columns of R times the spread: those that turn the axes of the joints' plane if the
     joints are coplanar, all three if not.
     """
-    matrix, right, span = scratch.matrix, scratch.right, scratch.span
-    center, axes, per_spread = vector(geometry.centers[legs]), geometry.axes[legs], 1.0 / geometry.spreads[legs]
+    span, per_spread = scratch.span, 1.0 / geometry.spreads[legs]
     unknowns, rank = 9 if flat else 12, geometry.ranks[legs]
     free = unknowns - rank
-    rows = 0
-    for k in range(LEGS):
-        if measured[k] == 0.0:
-            continue
-        arm, base = subtract(vector(geometry.platform_joints[k]), center), vector(geometry.base_joints[k])
-        for w in across(directions[k]):
-            for i in range(unknowns // 3):
-                x = per_spread * dot((axes[0, i - 1], axes[1, i - 1], axes[2, i - 1]), arm) if i > 0 else 1.0
-                for j in range(3):
-                    matrix[rows, 3 * i + j] = x * w[j]
-            right[rows] = dot(w, base)
-            rows += 1
     span[:] = 0.0
     solution, null_space = span[0, :unknowns], span[1:, :unknowns]
-    conditioning = solve_truncated(matrix, right, rows, rank, solution, null_space, scratch.norms, scratch.order)
+    conditioning = 0.0
+    if flat:
+        _write_normal_equations(geometry, directions, measured, legs, scratch.matrix)
+        conditioning = solve_nine(scratch.matrix, rank, solution, null_space, scratch.norms, scratch.order)
+    if conditioning < WELL_CONDITIONED:
+        rows = _write_rows(geometry, directions, measured, legs, unknowns, scratch)
+        conditioning = solve_truncated(
+            scratch.matrix, scratch.right, rows, rank, solution, null_space, scratch.norms, scratch.order
+        )  # fmt: skip
     if conditioning < RANK_TOLERANCE:
         return conditioning
     columns = span[0, 3:]
@@ -106,6 +108,85 @@ def _pose_from_legs(
             return conditioning
     met = _pose_from_columns(geometry, directions, measured, legs, flat, columns, position, rotation, scratch)
     return min(conditioning, met)
+
+
+@kernel
+def _write_rows(geometry: Record, directions: Array, measured: Array, legs: int, unknowns: int, scratch: Record) -> int:
+    """Write the equations of a set of legs for QR; returns how many there are."""
+    matrix, right, rows = scratch.matrix, scratch.right, 0
+    for k in range(LEGS):
+        if measured[k] == 0.0:
+            continue
+        place, base = _place(geometry, k, legs), vector(geometry.base_joints[k])
+        for w in across(directions[k]):
+            for i in range(unknowns // 3):
+                x = place[i - 1] if i > 0 else 1.0
+                for j in range(3):
+                    matrix[rows, 3 * i + j] = x * w[j]
+            right[rows] = dot(w, base)
+            rows += 1
+    return rows
+
+
+@kernel
+def _place(geometry: Record, k: int, legs: int) -> Vector:
+    """Where a platform joint is from the centre of those of a set of legs, along their axes, over their spread."""
+    axes, per_spread = geometry.axes[legs], 1.0 / geometry.spreads[legs]
+    x, y, z = subtract(vector(geometry.platform_joints[k]), vector(geometry.centers[legs]))
+    return (
+        per_spread * (axes[0, 0] * x + axes[1, 0] * y + axes[2, 0] * z),
+        per_spread * (axes[0, 1] * x + axes[1, 1] * y + axes[2, 1] * z),
+        per_spread * (axes[0, 2] * x + axes[1, 2] * y + axes[2, 2] * z),
+    )
+
+
+@kernel
+def _write_normal_equations(geometry: Record, directions: Array, measured: Array, legs: int, matrix: Array) -> None:
+    """Write the normal equations of a set of legs with coplanar joints. A leg to the place x, y from the base joint b counts
+    [1, x, y]^T [1, x, y] in blocks P = I - d d^T, and [1, x, y]^T P b on the right side.
+    """
+    zero = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    one_one = x_one = y_one = x_x = x_y = y_y = zero
+    one_b = x_b = y_b = (0.0, 0.0, 0.0)
+    for k in range(LEGS):
+        if measured[k] == 0.0:
+            continue
+        d0, d1, d2 = direction = vector(directions[k])
+        x, y, _ = _place(geometry, k, legs)
+        b = across_leg(direction, vector(geometry.base_joints[k]))
+        p = 1.0 - d0 * d0, -d1 * d0, 1.0 - d1 * d1, -d2 * d0, -d2 * d1, 1.0 - d2 * d2
+        one_one, x_one, y_one = _plus(one_one, 1.0, p), _plus(x_one, x, p), _plus(y_one, y, p)
+        x_x, x_y, y_y = _plus(x_x, x * x, p), _plus(x_y, x * y, p), _plus(y_y, y * y, p)
+        one_b, x_b, y_b = add(one_b, b), add(x_b, scale(x, b)), add(y_b, scale(y, b))
+    _put(matrix, 0, 0, one_one)
+    _put(matrix, 0, 3, x_one)
+    _put(matrix, 3, 0, x_one)
+    _put(matrix, 0, 6, y_one)
+    _put(matrix, 6, 0, y_one)
+    _put(matrix, 3, 3, x_x)
+    _put(matrix, 3, 6, x_y)
+    _put(matrix, 6, 3, x_y)
+    _put(matrix, 6, 6, y_y)
+    for i in range(3):
+        matrix[i, 9], matrix[3 + i, 9], matrix[6 + i, 9] = one_b[i], x_b[i], y_b[i]
+
+
+@kernel
+def _plus(a: Symmetric, factor: float, b: Symmetric) -> Symmetric:
+    """A + `factor` b."""
+    return (
+        a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2],
+        a[3] + factor * b[3], a[4] + factor * b[4], a[5] + factor * b[5],
+    )  # fmt: skip
+
+
+@kernel
+def _put(matrix: Array, row: int, column: int, block: Symmetric) -> None:
+    """Write a symmetric block (3, 3) into a matrix."""
+    xx, yx, yy, zx, zy, zz = block
+    matrix[row, column], matrix[row, column + 1], matrix[row, column + 2] = xx, yx, zx
+    matrix[row + 1, column], matrix[row + 1, column + 1], matrix[row + 1, column + 2] = yx, yy, zy
+    matrix[row + 2, column], matrix[row + 2, column + 1], matrix[row + 2, column + 2] = zx, zy, zz
 
 
 @kernel
@@ -262,27 +343,31 @@ def orthonormalise(columns: Array, flat: bool) -> float:
         size = np.sqrt(dot(z, z))
         if not size > RANK_TOLERANCE:
             return -1.0
-        z = z[0] / size, z[1] / size, z[2] / size
+        z = scale(1.0 / size, z)
         columns[6], columns[7], columns[8] = z
+    found, x, y, z = nearest_rotation(x, y, z)
+    if not found:
+        return -1.0
+    distance = 0.0
+    for i in range(3):
+        distance += (columns[i] - x[i]) ** 2 + (columns[3 + i] - y[i]) ** 2 + (columns[6 + i] - z[i]) ** 2
+        columns[i], columns[3 + i], columns[6 + i] = x[i], y[i], z[i]
+    return float(np.sqrt(distance))
+
+
+@kernel
+def nearest_rotation(x: Vector, y: Vector, z: Vector) -> tuple[bool, Vector, Vector, Vector]:
+    """The columns of the rotation nearest to a matrix of these columns, by Newton's iteration; and whether there is one."""
     for _ in range(_MOST_POLAR_STEPS):
         # The matrix of cofactors over the determinant is the inverse transposed.
         a, b, c = cross(y, z), cross(z, x), cross(x, y)
         determinant = dot(x, a)
         if not determinant > RANK_TOLERANCE:
-            return -1.0
+            return False, x, y, z
         f = 0.5 / determinant
         dx, dy = subtract(scale(f, a), scale(0.5, x)), subtract(scale(f, b), scale(0.5, y))
         dz = subtract(scale(f, c), scale(0.5, z))
         x, y, z = add(x, dx), add(y, dy), add(z, dz)
-        change = 0.0
-        for step in (dx, dy, dz):
-            for i in range(3):
-                change += step[i] * step[i]
-        if change < _POLAR_TOLERANCE:
+        if dot(dx, dx) + dot(dy, dy) + dot(dz, dz) < _POLAR_TOLERANCE:
             break
-    distance = 0.0
-    for i, column in enumerate((x, y, z)):
-        for j in range(3):
-            distance += (columns[3 * i + j] - column[j]) ** 2
-            columns[3 * i + j] = column[j]
-    return float(np.sqrt(distance))
+    return True, x, y, z

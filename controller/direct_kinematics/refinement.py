@@ -22,16 +22,13 @@ Both were chosen on `gough faults`, seeds 0 to 19 of turned IMUs, of gyroscopes'
 
 
 @kernel
-def _add_leg(right: Array, measured: Vector, direction: Vector, arm: Vector, weight: float) -> None:
-    """Add `weight` J^T P `measured` to a right side (6,), P = I - d d^T and J = [I, -skew(arm)]."""
+def _force(measured: Vector, direction: Vector, weight: float) -> Vector:
+    """`weight` P `measured`, P = I - d d^T: with the torque arm x force it is what a leg adds to a right side (6,)."""
     force = scale(weight, measured)
     # Where legs are nearly parallel, the rounding that one projection leaves along them would outweigh the measurement.
     for _ in range(2):
         force = subtract(force, scale(dot(direction, force), direction))
-    torque = cross(arm, force)
-    for i in range(3):
-        right[i] += force[i]
-        right[3 + i] += torque[i]
+    return force
 
 
 @kernel
@@ -52,42 +49,79 @@ def normal_equations(
         correction: (6,), the right side, written.
     """
     legs_at(base_joints, platform_joints, position, rotation, arms, predicted, lengths)
-    correction[:] = 0.0
-    information[:] = 0.0
+    right_side_at(
+        directions, weights, in_base, in_platform, vector_weights, rotation, arms, predicted, lengths, correction
+    )  # fmt: skip
+    information_at(weights, in_platform, vector_weights, rotation, arms, predicted, lengths, information)
+
+
+@kernel
+def right_side_at(
+    directions: Array, weights: Array, in_base: Array, in_platform: Array, vector_weights: Array, rotation: Array, arms: Array,
+    predicted: Array, lengths: Array, correction: Array,
+) -> None:  # fmt: skip
+    """Write the right side of `normal_equations` from the legs at the pose."""
+    f0 = f1 = f2 = t0 = t1 = t2 = 0.0
+    for k in range(LEGS):
+        if weights[k] != 0.0:
+            arm = vector(arms[k])
+            force = _force(vector(directions[k]), vector(predicted[k]), weights[k] / lengths[k])
+            torque = cross(arm, force)
+            f0, f1, f2 = f0 + force[0], f1 + force[1], f2 + force[2]
+            t0, t1, t2 = t0 + torque[0], t1 + torque[1], t2 + torque[2]
+    for k in range(vector_weights.shape[0]):
+        w = vector_weights[k]
+        if w != 0.0:
+            turn = cross(rotate(rotation, vector(in_platform[k])), vector(in_base[k]))
+            t0, t1, t2 = t0 + w * turn[0], t1 + w * turn[1], t2 + w * turn[2]
+    correction[0], correction[1], correction[2], correction[3], correction[4], correction[5] = f0, f1, f2, t0, t1, t2
+
+
+@kernel
+def information_at(
+    weights: Array, in_platform: Array, vector_weights: Array, rotation: Array, arms: Array, predicted: Array, lengths: Array,
+    information: Array,
+) -> None:  # fmt: skip
+    """Write the lower triangle of the matrix (6, 6) of `normal_equations` from the legs at the pose.
+
+    A leg along d with the arm a counts J^T P J, where P = I - d d^T over the square of its length makes the derivative of a
+    direction, and J = [I, -skew(a)] that of the leg vector. With c = a x d it is
+
+        [I, -skew(a); skew(a), a^2 I - a a^T] - [d; c] [d; c]^T
+    """
+    i00 = i10 = i11 = i20 = i21 = i22 = 0.0
+    i30 = i31 = i32 = i40 = i41 = i42 = i50 = i51 = i52 = 0.0
+    i33 = i43 = i44 = i53 = i54 = i55 = 0.0
     for k in range(LEGS):
         if weights[k] == 0.0:
             continue
-        direction, arm = vector(predicted[k]), vector(arms[k])
-        weight = weights[k] / lengths[k]
-        # P = I - d d^T makes the derivative of a direction P / l; [I, -skew(a)] is that of the leg vector.
-        w = weight / lengths[k]
-        d0, d1, d2 = direction
-        p = (
-            (w * (1.0 - d0 * d0), -w * d0 * d1, -w * d0 * d2),
-            (-w * d0 * d1, w * (1.0 - d1 * d1), -w * d1 * d2),
-            (-w * d0 * d2, -w * d1 * d2, w * (1.0 - d2 * d2)),
-        )
-        c0, c1, c2 = cross(arm, p[0]), cross(arm, p[1]), cross(arm, p[2])
-        for i in range(3):
-            row = c0[i], c1[i], c2[i]
-            turned = cross(arm, row)
-            for j in range(3):
-                information[3 + i, j] += row[j]
-            for j in range(i + 1):
-                information[i, j] += p[i][j]
-                information[3 + i, 3 + j] += turned[j]
-        _add_leg(correction, vector(directions[k]), direction, arm, weight)
+        w = weights[k] / (lengths[k] * lengths[k])
+        d0, d1, d2 = vector(predicted[k])
+        a0, a1, a2 = vector(arms[k])
+        c0, c1, c2 = cross((a0, a1, a2), (d0, d1, d2))
+        w0, w1, w2 = w * d0, w * d1, w * d2
+        i00, i11, i22 = i00 + (w - w0 * d0), i11 + (w - w1 * d1), i22 + (w - w2 * d2)
+        i10, i20, i21 = i10 - w1 * d0, i20 - w2 * d0, i21 - w2 * d1
+        i30, i31, i32 = i30 - w0 * c0, i31 - (w * a2 + w1 * c0), i32 + (w * a1 - w2 * c0)
+        i40, i41, i42 = i40 + (w * a2 - w0 * c1), i41 - w1 * c1, i42 - (w * a0 + w2 * c1)
+        i50, i51, i52 = i50 - (w * a1 + w0 * c2), i51 + (w * a0 - w1 * c2), i52 - w2 * c2
+        i33 += w * (a1 * a1 + a2 * a2 - c0 * c0)
+        i44 += w * (a0 * a0 + a2 * a2 - c1 * c1)
+        i55 += w * (a0 * a0 + a1 * a1 - c2 * c2)
+        i43, i53, i54 = i43 - w * (a1 * a0 + c1 * c0), i53 - w * (a2 * a0 + c2 * c0), i54 - w * (a2 * a1 + c2 * c1)
     for k in range(vector_weights.shape[0]):
         w = vector_weights[k]
-        if w == 0.0:
-            continue
-        v = rotate(rotation, vector(in_platform[k]))
-        turn = cross(v, vector(in_base[k]))
-        for i in range(3):
-            correction[3 + i] += w * turn[i]
-            information[3 + i, 3 + i] += w * (1.0 - v[i] * v[i])
-            for j in range(i):
-                information[3 + i, 3 + j] -= w * v[j] * v[i]
+        if w != 0.0:
+            v0, v1, v2 = rotate(rotation, vector(in_platform[k]))
+            i33, i44, i55 = i33 + w * (1.0 - v0 * v0), i44 + w * (1.0 - v1 * v1), i55 + w * (1.0 - v2 * v2)
+            i43, i53, i54 = i43 - w * v1 * v0, i53 - w * v2 * v0, i54 - w * v2 * v1
+    information[0, 0], information[1, 0], information[1, 1] = i00, i10, i11
+    information[2, 0], information[2, 1], information[2, 2] = i20, i21, i22
+    information[3, 0], information[3, 1], information[3, 2] = i30, i31, i32
+    information[4, 0], information[4, 1], information[4, 2] = i40, i41, i42
+    information[5, 0], information[5, 1], information[5, 2] = i50, i51, i52
+    information[3, 3], information[4, 3], information[4, 4] = i33, i43, i44
+    information[5, 3], information[5, 4], information[5, 5] = i53, i54, i55
 
 
 @kernel
@@ -195,7 +229,11 @@ def find_twist(
     twist[:] = 0.0
     for k in range(LEGS):
         if weights[k] != 0.0:
-            _add_leg(twist, vector(rates[k]), vector(predicted[k]), vector(arms[k]), weights[k] / lengths[k])
+            force = _force(vector(rates[k]), vector(predicted[k]), weights[k] / lengths[k])
+            torque = cross(vector(arms[k]), force)
+            for i in range(3):
+                twist[i] += force[i]
+                twist[3 + i] += torque[i]
     o = vector(angular_velocity)
     for k in range(vector_weights.shape[0]):
         w = vector_weights[k]

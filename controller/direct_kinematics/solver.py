@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.direct_kinematics.geometry import SCRATCH
-from controller.direct_kinematics.legs_alone import orthonormalise, pose_from_legs, second_pose_from_legs
+from controller.direct_kinematics.legs_alone import nearest_rotation, pose_from_legs, second_pose_from_legs
 from controller.direct_kinematics.legs_and_attitude import pose_from_rotation, pose_from_vector
-from controller.direct_kinematics.refinement import move_pose, normal_equations, solve_normal_equations
+from controller.direct_kinematics.refinement import information_at, move_pose, right_side_at
 from controller.direct_kinematics.shared_joints import section_3_1_1, section_4
 from controller.inverse_kinematics import legs_at
-from controller.least_squares import invert_cholesky
+from controller.least_squares import invert_symmetric
 from plant.compiled import Record, kernel, record_dtype
 from plant.mechanism import LEGS
 from plant.pose import UNIT_TOLERANCE, Array
-from plant.vectors import Vector, dot, rotate, rotate_back, vector
+from plant.vectors import Vector, dot, rotate, rotate_back, scale, vector
 
 METHODS = ("section-5", "up", "normal", "legs", "section-3.1.1", "section-4")
 """The closed forms: those of the paper's sections, and those from all legs with the vertical, the normal, or nothing else."""
@@ -34,8 +34,10 @@ _DISTINCT, _DISTINCT_SHARE = 25.0, 400.0
 times, or by the second number times the better sum over its degrees of freedom, if the noise is far below the sigmas."""
 
 _SAME_ROTATION = 1e-6
-_MOST_REFINEMENTS = 20
+_MOST_REFINEMENTS = 21
 _REFINED = 1e-14  # square of a step over its variance at which the pose has settled
+_FAST = 1e-4  # share of the square before, up to which the steps get shorter as fast as if each had its own covariance
+_SHORT = 3e-3  # step, over the joints' spread or in radians, after which the same is true
 _TINY = 1e-9  # step, over the joints' spread or in radians, that may be no more than rounding
 
 SOLVED, REFUSED, OPEN, SINGULAR, UNSETTLED, NEGATIVE, AMBIGUOUS = range(7)  # statuses of a row
@@ -55,17 +57,14 @@ class Measurements(NamedTuple):
 
 
 class Results(NamedTuple):
-    """The arrays of `Solutions`, NaN where nothing is written, and the status of each row."""
+    """The arrays of `Solutions`. They are few, because each costs 0.2 us in a call from Python."""
 
     positions: Array
     rotations: Array
     covariances: Array
     residuals: Array
-    chi_squares: Array
-    degrees_of_freedom: NDArray[np.int64]
-    methods: NDArray[np.int64]
-    conditionings: Array
-    statuses: NDArray[np.int64]
+    numbers: Array  # (2, N), chi-square sums and conditionings
+    integers: NDArray[np.int64]  # (3, N), statuses, degrees of freedom and methods
 
 
 WORK = record_dtype(
@@ -92,7 +91,7 @@ WORK = record_dtype(
     predicted=(np.float64, (LEGS, 3)),
     lengths=(np.float64, LEGS),
     information=(np.float64, (6, 6)),
-    factor=(np.float64, (6, 6)),
+    covariance=(np.float64, (6, 6)),
     correction=(np.float64, 6),
 )
 """Memory for one pose: what was measured, the pose, and its fit."""
@@ -100,28 +99,36 @@ WORK = record_dtype(
 
 @kernel
 def solve_rows(
-    geometry: Record, work_array: Record, measurements: Measurements, candidates: NDArray[np.int64], refine: bool,
+    geometry_array: Record, work_array: Record, measurements: Measurements, candidates: NDArray[np.int64], refine: bool,
     results: Results, start: int, stop: int,
 ) -> None:  # fmt: skip
     """Solve the rows from `start` to `stop`; of a row without a pose, the status says why."""
-    work = work_array[()]
+    geometry, work = geometry_array[()], work_array[()]
+    statuses, degrees_of_freedom, methods = results.integers[0], results.integers[1], results.integers[2]
+    chi_squares, conditionings = results.numbers[0], results.numbers[1]
     for row in range(start, stop):
         _read(measurements, row, work)
+        methods[row], conditionings[row], degrees_of_freedom[row], chi_squares[row] = 0, 0.0, 0, np.nan
         if work.refused != 0:
-            results.statuses[row] = REFUSED
+            statuses[row] = REFUSED
+            _write_nothing(row, results)
             continue
         method, conditioning = _find(geometry, candidates, work)
-        results.methods[row], results.conditionings[row] = method, conditioning
+        methods[row], conditionings[row] = method, conditioning
         if not conditioning > LEAST_CONDITIONING:
-            results.statuses[row] = OPEN
+            statuses[row] = OPEN
+            _write_nothing(row, results)
             continue
         # If the joints are only nearly coplanar, the closed form that takes them for coplanar is a start, not the pose.
         settle = refine or (method == _LEGS and work.scratch.approximate != 0)
         two_roots = settle and method == _LEGS and work.scratch.roots == 2
         status, chi_square = _fit_better(geometry, work) if two_roots else _fit(geometry, settle, work)
-        results.statuses[row] = status
+        statuses[row] = status
         if status == SOLVED:
-            _write(work, chi_square, row, results)
+            chi_squares[row], degrees_of_freedom[row] = chi_square, work.equations - 6
+            _write(work, row, results)
+        else:
+            _write_nothing(row, results)
 
 
 @kernel
@@ -139,10 +146,7 @@ def _read(measurements: Measurements, row: int, work: Record) -> None:
         work.weights[k] = work.measured[k] * measurements.leg_weight
         work.equations += 2 * int(measured)
     if measurements.rotations.shape[0] > 0:
-        # The nearest rotation to the transposed, which the columns are, is the transposed nearest rotation.
-        work.measured_rotation[:] = measurements.rotations[row]
-        if not _is_orthogonal(work.measured_rotation) or orthonormalise(work.measured_rotation.reshape(9), False) < 0.0:
-            work.refused = 1
+        _read_rotation(measurements.rotations, row, work)
         # These weights add up to the yaw's about the vertical, and to the tilt's about every level axis.
         yaw = 0.5 * measurements.yaw_weight
         for i in range(3):
@@ -161,11 +165,23 @@ def _read(measurements: Measurements, row: int, work: Record) -> None:
 
 
 @kernel
+def _read_rotation(rotations: Array, row: int, work: Record) -> None:
+    """Read the rotation nearest to a measured one. Its rows are the columns of the one that is nearest to the transposed."""
+    x, y, z = vector(rotations[row, 0]), vector(rotations[row, 1]), vector(rotations[row, 2])
+    orthogonal = _is_orthogonal(rotations[row])
+    found, x, y, z = nearest_rotation(x, y, z)
+    if not orthogonal or not found:
+        work.refused = 1
+    for i in range(3):
+        work.measured_rotation[0, i], work.measured_rotation[1, i], work.measured_rotation[2, i] = x[i], y[i], z[i]
+
+
+@kernel
 def _unit(given: Vector, work: Record) -> Vector:
     size = np.sqrt(dot(given, given))
     if not abs(size - 1.0) <= UNIT_TOLERANCE:
         work.refused = 1
-    return given[0] / size, given[1] / size, given[2] / size
+    return scale(1.0 / size, given)
 
 
 @kernel
@@ -215,7 +231,7 @@ def _apply(geometry: Record, method: int, work: Record) -> float:
     """Find the pose by a closed form; returns the conditioning."""
     directions, measured, position, rotation = work.directions, work.measured, work.position, work.rotation
     if method == _SECTION_5:
-        rotation[:] = work.measured_rotation
+        _copy_pose(position, work.measured_rotation, position, rotation)
         return pose_from_rotation(geometry, directions, measured, rotation, position, work.scratch)
     if method == _LEGS:
         conditioning = pose_from_legs(geometry, directions, measured, position, rotation, work.scratch)
@@ -234,23 +250,34 @@ def _fit(geometry: Record, refine: bool, work: Record) -> tuple[int, float]:
     """Refine the pose, if wanted, and weigh its residuals; returns a status and their chi-square sum."""
     base_joints, platform_joints = geometry.base_joints, geometry.platform_joints
     position, rotation, vector_weights = work.position, work.rotation, work.vector_weights[: work.vectors]
-    status, before, spread = UNSETTLED if refine else SOLVED, np.inf, geometry.spreads[-1]
+    status, before, fresh, spread = UNSETTLED if refine else SOLVED, np.inf, True, geometry.spreads[-1]
     for _ in range(_MOST_REFINEMENTS if refine else 1):
-        normal_equations(
-            base_joints, platform_joints, work.directions, work.weights, work.in_base, work.in_platform, vector_weights,
-            position, rotation, work.arms, work.predicted, work.lengths, work.information, work.correction,
-        )  # fmt: skip
-        if not solve_normal_equations(work.information, work.correction, work.factor):
-            return SINGULAR, np.inf
+        legs_at(base_joints, platform_joints, position, rotation, work.arms, work.predicted, work.lengths)
+        if fresh:
+            information_at(
+                work.weights, work.in_platform, vector_weights, rotation, work.arms, work.predicted, work.lengths,
+                work.information,
+            )  # fmt: skip
+            if not invert_symmetric(work.information, work.covariance):
+                return SINGULAR, np.inf
         if not refine:
             break
+        right_side_at(
+            work.directions, work.weights, work.in_base, work.in_platform, vector_weights, rotation, work.arms, work.predicted,
+            work.lengths, work.correction,
+        )  # fmt: skip
+        square = _step(work.covariance, work.correction)
         move_pose(work.correction, position, rotation)
-        square = _square_over_variance(work.factor, work.correction)
-        if square < _REFINED or (square >= before and _is_tiny(work.correction, spread)):
+        longest = _longest(work.correction, spread)
+        if fresh and (square < _REFINED or (square >= before and longest < _TINY)):
             status = SOLVED
             break
+        # The covariance serves for one more step where it changes much less than the pose, unless that step is the last.
+        first, last = before == np.inf, square * square < _REFINED * before
+        fresh = longest > _SHORT or not (first or (square < _FAST * before and not last))
         before = square
-    legs_at(base_joints, platform_joints, position, rotation, work.arms, work.predicted, work.lengths)
+    if refine:
+        legs_at(base_joints, platform_joints, position, rotation, work.arms, work.predicted, work.lengths)
     chi_square = 0.0
     for k in range(LEGS):
         if work.measured[k] == 0.0:
@@ -297,33 +324,46 @@ def _fit_better(geometry: Record, work: Record) -> tuple[int, float]:
 
 
 @kernel
-def _write(work: Record, chi_square: float, row: int, results: Results) -> None:
+def _write(work: Record, row: int, results: Results) -> None:
     _copy_pose(work.position, work.rotation, results.positions[row], results.rotations[row])
-    results.chi_squares[row] = chi_square
-    results.degrees_of_freedom[row] = work.equations - 6
     for k in range(LEGS):
         for i in range(3):
             residual = work.directions[k, i] - work.predicted[k, i]
             results.residuals[row, k, i] = residual if work.measured[k] != 0.0 else np.nan
-    invert_cholesky(work.factor, results.covariances[row])
+    for i in range(6):
+        for j in range(6):
+            results.covariances[row, i, j] = work.covariance[i, j]
 
 
 @kernel
-def _is_tiny(step: Array, spread: float) -> bool:
-    """Whether a step is so short that only rounding keeps it from getting shorter."""
-    longest = 0.0
+def _write_nothing(row: int, results: Results) -> None:
+    """Write NaN for a row without a pose."""
     for i in range(3):
-        longest = max(longest, abs(step[i]) / spread, abs(step[3 + i]))
-    return longest < _TINY
+        results.positions[row, i] = np.nan
+        for j in range(3):
+            results.rotations[row, i, j] = np.nan
+    for k in range(LEGS):
+        for i in range(3):
+            results.residuals[row, k, i] = np.nan
+        for j in range(6):
+            results.covariances[row, k, j] = np.nan
 
 
 @kernel
-def _square_over_variance(factor: Array, step: Array) -> float:
-    """step^T A step for a matrix A whose Cholesky factor is the lower triangle of `factor`."""
+def _longest(step: Array, spread: float) -> float:
+    """The greatest component of a step, over the joints' spread or in radians."""
+    moved = max(abs(step[0]), abs(step[1]), abs(step[2])) / spread
+    return max(moved, abs(step[3]), abs(step[4]), abs(step[5]))
+
+
+@kernel
+def _step(covariance: Array, right: Array) -> float:
+    """Replace the right side (6,) of normal equations by their solution x; returns the square of x over its variance."""
+    r0, r1, r2, r3, r4, r5 = right[0], right[1], right[2], right[3], right[4], right[5]
     square = 0.0
-    for j in range(6):
-        value = 0.0
-        for i in range(j, 6):
-            value += factor[i, j] * step[i]
-        square += value * value
+    for i in range(6):
+        c = covariance[i]
+        x = c[0] * r0 + c[1] * r1 + c[2] * r2 + c[3] * r3 + c[4] * r4 + c[5] * r5
+        square += x * right[i]
+        right[i] = x
     return square

@@ -101,16 +101,11 @@ class Solutions:
         row = range(len(self))[operator.index(index)]
         if not self.solved[row]:
             raise self.errors[row]
-        return _solution(self, row)
-
-
-def _solution(found: "Solutions | Results", row: int) -> Solution:
-    """The solution of a row, with views of its arrays."""
-    return Solution(
-        found.positions[row], found.rotations[row], found.covariances[row], found.residuals[row],
-        float(found.chi_squares[row]), int(found.degrees_of_freedom[row]), METHODS[found.methods[row]],
-        float(found.conditionings[row]),
-    )  # fmt: skip
+        return Solution(
+            self.positions[row], self.rotations[row], self.covariances[row], self.residuals[row],
+            float(self.chi_squares[row]), int(self.degrees_of_freedom[row]), METHODS[self.methods[row]],
+            float(self.conditionings[row]),
+        )  # fmt: skip
 
 
 def solve(
@@ -151,12 +146,16 @@ def solve(
     given = _shapes_checked(leg_directions, rotation, normal, up_in_platform)
     arrays = {name: array[None] for name, array in given.items()}
     results = _solve(mechanism, arrays, method, refine, (leg_sigma, tilt_sigma, yaw_sigma), 1)
-    status = results.statuses.item()
+    (status,), (degrees_of_freedom,), (number,) = results.integers.tolist()
     if status == REFUSED:
         raise _refusal(arrays, 0, "")
     if status != SOLVED:
         raise _error(mechanism, arrays, method, status, 0, "")
-    return _solution(results, 0)
+    (chi_square,), (conditioning,) = results.numbers.tolist()
+    return Solution(
+        results.positions[0], results.rotations[0], results.covariances[0], results.residuals[0], chi_square,
+        degrees_of_freedom, METHODS[number], conditioning,
+    )  # fmt: skip
 
 
 def solve_batch(
@@ -187,12 +186,17 @@ def solve_batch(
         workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     where = " of row {row}"
     results = _solve(mechanism, arrays, method, refine, (leg_sigma, tilt_sigma, yaw_sigma), workers)
-    for row in np.flatnonzero(results.statuses == REFUSED)[:1].tolist():
+    statuses, degrees_of_freedom, methods = results.integers
+    for row in np.flatnonzero(statuses == REFUSED)[:1].tolist():
         raise _refusal(arrays, row, where.format(row=row))
-    solved = results.statuses == SOLVED
+    solved = statuses == SOLVED
     unsolved = np.flatnonzero(~solved).tolist()
-    errors = {row: _error(mechanism, arrays, method, results.statuses[row], row, where) for row in unsolved}
-    return Solutions(*results[:-1], solved, errors)
+    errors = {row: _error(mechanism, arrays, method, statuses[row], row, where) for row in unsolved}
+    chi_squares, conditionings = results.numbers
+    return Solutions(
+        results.positions, results.rotations, results.covariances, results.residuals, chi_squares, degrees_of_freedom, methods,
+        conditionings, solved, errors,
+    )  # fmt: skip
 
 
 def pose_difference(first: Solution | Pose, second: Solution | Pose) -> tuple[float, float]:
@@ -241,20 +245,19 @@ def _solve(
         arrays["leg_directions"], arrays.get("rotation", _NO_ROTATIONS), arrays.get("up_in_platform", _NO_VECTORS),
         arrays.get("normal", _NO_VECTORS), _axes_of(mechanism), *weights,
     )  # fmt: skip
-    # Copies take a third of the time, which counts where Python closes a loop.
-    results = Results._make([each.copy() for each in _ONE_ROW]) if count == 1 else _no_results(count)
+    results = _results(count)
+
+    geometry = _geometry_array_of(mechanism)
 
     def solve_chunk(start: int) -> None:
         stop = min(start + _CHUNK, count)
-        solve_rows(geometry_of(mechanism), _memory.work, measurements, candidates, refine, results, start, stop)
+        solve_rows(geometry, _memory.work, measurements, candidates, refine, results, start, stop)
 
-    starts = range(0, count, _CHUNK)
-    if workers == 1 or len(starts) <= 1:
-        for start in starts:
-            solve_chunk(start)
+    if workers == 1 or count <= _CHUNK:
+        solve_rows(geometry, _memory.work, measurements, candidates, refine, results, 0, count)
     else:
         with ThreadPoolExecutor(workers) as pool:
-            list(pool.map(solve_chunk, starts))
+            list(pool.map(solve_chunk, range(0, count, _CHUNK)))
     return results
 
 
@@ -270,21 +273,19 @@ def _weight(name: str, sigma: float) -> float:
     return float(value) ** -2
 
 
-def _no_results(count: int) -> Results:
-    """Results of so many rows, before they are found."""
+def _results(count: int) -> Results:
+    """Arrays for so many rows, of which the kernel writes every element."""
+    empty = np.empty
     return Results(
-        *(np.full((count, *shape), np.nan) for shape in ((3,), (3, 3), (6, 6), (LEGS, 3), ())),
-        *(np.zeros(count, kind) for kind in (np.int64, np.int64, np.float64, np.int64)),
-    )
+        empty((count, 3)), empty((count, 3, 3)), empty((count, 6, 6)), empty((count, LEGS, 3)), empty((2, count)),
+        empty((3, count), np.int64),
+    )  # fmt: skip
 
 
 def check_spatial(mechanism: Mechanism) -> None:
     """Raise an `InputError` unless the mechanism has six legs."""
     if not isinstance(mechanism, Mechanism):
         raise InputError(f"the mechanism must be a Mechanism of six legs, not a {type(mechanism).__name__}")
-
-
-_ONE_ROW = _no_results(1)
 
 
 class _Memory(threading.local):
@@ -310,6 +311,12 @@ def _possible(method: str, measured: tuple[str, ...]) -> NDArray[np.int64]:
     if not given:
         raise InputError(f"the method {method!r} needs {NEEDS[method]}: give it, or choose another method")
     return np.array([METHODS.index(name) for name in given])
+
+
+@lru_cache(maxsize=256)
+def _geometry_array_of(mechanism: Mechanism) -> Record:
+    """Its geometry as an array of shape (), which a kernel takes from Python five times as fast as a record."""
+    return np.array(geometry_of(mechanism))
 
 
 @lru_cache(maxsize=256)

@@ -1,8 +1,13 @@
 """Benchmarks of direct kinematics: time per pose, and success from a cold start."""
 
+import ctypes
+import subprocess
+import tempfile
 from collections.abc import Callable, Sequence
 from functools import partial
-from time import perf_counter
+from importlib import resources
+from pathlib import Path
+from time import perf_counter, thread_time
 from typing import Any
 
 import numpy as np
@@ -11,7 +16,8 @@ from controller.direct_kinematics import METHODS, pose_difference, pose_from_len
 from controller.direct_kinematics.synthetic import draw_measurements, draw_poses, measurements_of
 from controller.inverse_kinematics import leg_lengths, sample_workspace
 from hil.progress import Progress, no_progress
-from plant.errors import SingularConfigurationError
+from plant.errors import SingularConfigurationError, ToolchainError
+from plant.fmu.build import c_compiler
 from plant.mechanism import Mechanism, load_spatial
 from plant.mechanism.classification import draw_mechanism, spatial_classes
 from plant.pose import Array, Pose, rotation_from_vector
@@ -20,6 +26,9 @@ PRESETS = ("hexapod", "6-3-I", "6-3-II", "6-4-I", "6-4-II", "6-5", "genhexkins")
 
 _ROWS = 1000
 _REPEATS = 5
+_ROUNDS = 51
+_YARDSTICK_ROWS = 1000
+_YARDSTICK_M = 1e-9
 _BATCH_ROWS = 100_000
 _MOTION_S = 10.0
 _COLD_STARTS = 1000
@@ -34,10 +43,16 @@ def measure_kinematics(progress: Progress = no_progress) -> dict[str, Any]:
     Returns:
         `solve_us`: by class and method, per pose on one core, compiled: `closed_form`, and `refined` with its covariance.
         `call_us`: one call of `solve` from Python. `batch_per_s`: poses per second on all cores. `newton`: `warm_us` per
-        pose by Newton's method from lengths along a motion at 1 kHz, and the `ratios` of each method to it. `cold_starts`:
-        by preset, over the `workspace` and over `wide` poses (60 deg of tilt, any yaw), the shares of poses found
-        (`success`) and mistaken (`wrong`), by Newton's method from home and from the leg directions.
+        pose by Newton's method from lengths along a motion at 1 kHz, and the `ratios` of each method to it. `newton_in_c`:
+        the same for the `Yardstick`, in slices that take turns; also the `steps` per pose that it took. `cold_starts`: by
+        preset, over the `workspace` and over `wide` poses (60 deg of tilt, any yaw), the shares of poses found (`success`)
+        and mistaken (`wrong`), by Newton's method from home and from the leg directions.
+
+    Raises:
+        ToolchainError: no C compiler, or it failed.
     """
+    hexapod = load_spatial("hexapod")
+    yardstick = Yardstick(hexapod)
     classes = spatial_classes()
     steps = len(classes) + len(PRESETS) + 2
     solve_us: dict[str, Any] = {}
@@ -45,10 +60,10 @@ def measure_kinematics(progress: Progress = no_progress) -> dict[str, Any]:
         mechanism = draw_mechanism(mechanism_class, np.random.default_rng(number))
         solve_us[mechanism_class.label] = _time_methods(mechanism)
         progress((number + 1) / steps)
-    hexapod = load_spatial("hexapod")
     newton = _time_newton(hexapod)
     progress((len(classes) + 1) / steps)
     on_hexapod = _time_methods(hexapod)
+    newton_in_c = _compare(hexapod, yardstick)
     batch, call = _time_batch(hexapod)
     progress((len(classes) + 2) / steps)
     cold = {}
@@ -64,8 +79,72 @@ def measure_kinematics(progress: Progress = no_progress) -> dict[str, Any]:
             "warm_us": newton,
             "ratios": {method: {kind: us / newton for kind, us in times.items()} for method, times in on_hexapod.items()},
         },
+        "newton_in_c": newton_in_c,
         "cold_starts": cold,
     }
+
+
+class Yardstick:
+    """Newton's iteration on lengths in C (`length_newton.c`), compiled by this machine's compiler with -O2: warm from the pose
+    a millisecond ago, to 1e-9 m, along a motion of a mechanism with the identity as the rotation of its home.
+
+    Attributes:
+        poses: (N, 6), x, y, z [m], roll, pitch and yaw [rad] that the last run found.
+        steps: per pose.
+
+    Raises:
+        ToolchainError: no C compiler, or it failed.
+    """
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        self.positions, self.rotations = _motion(mechanism, _YARDSTICK_ROWS)
+        lengths = leg_lengths(mechanism, self.positions, self.rotations)
+        self._arguments = mechanism.base_joints, mechanism.platform_joints, lengths
+        self._start = np.array([*self.positions[0], 0.0, 0.0, 0.0])
+        self.poses, self.steps = np.empty((_YARDSTICK_ROWS, 6)), 0.0
+        with tempfile.TemporaryDirectory(prefix="gough-bench-") as folder:
+            self._follow = ctypes.CDLL(str(_compiled(Path(folder)))).follow_lengths
+        array = np.ctypeslib.ndpointer(np.float64, flags="C_CONTIGUOUS")
+        self._follow.argtypes = [array, array, array, ctypes.c_long, ctypes.c_double, array, array]
+        self._follow.restype = ctypes.c_long
+
+    def __call__(self) -> None:
+        """Find the poses of the motion."""
+        steps = self._follow(*self._arguments, _YARDSTICK_ROWS, _YARDSTICK_M, self._start.copy(), self.poses)
+        self.steps = steps / _YARDSTICK_ROWS
+
+
+def _compiled(folder: Path) -> Path:
+    """The library of the yardstick."""
+    library = folder / "length_newton.so"
+    with resources.as_file(resources.files("hil.benchmarks") / "length_newton.c") as source:
+        command = [*c_compiler(), "-std=c11", "-O2", "-fPIC", "-shared", "-o", str(library), str(source), "-lm"]
+        run = subprocess.run(command, capture_output=True, text=True, check=False)
+    if run.returncode:
+        raise ToolchainError(f"{command[0]} could not compile the yardstick: {run.stderr.strip()}")
+    return library
+
+
+def _compare(mechanism: Mechanism, yardstick: Yardstick) -> dict[str, Any]:
+    """Time every method and the yardstick in turns. A slice is a few milliseconds of this thread's time on the processor; each
+    ratio is the median of those to the yardstick's slice of the same round.
+    """
+    runs = _runs(mechanism)
+    turns: list[Callable[[], Any]] = [yardstick, *runs.values()]
+    rounds = []
+    for _ in range(_ROUNDS):
+        slices = []
+        for run in turns:
+            began = thread_time()
+            run()
+            slices.append(thread_time() - began)
+        rounds.append(slices)
+    times = np.array(rounds)
+    ratios: dict[str, dict[str, float]] = {}
+    medians = np.median(times / times[:, :1], axis=0) * _YARDSTICK_ROWS / _ROWS
+    for (method, kind), ratio in zip(runs, medians[1:], strict=True):
+        ratios.setdefault(method, {})[kind] = float(ratio)
+    return {"warm_us": 1e6 * float(np.median(times[:, 0])) / _YARDSTICK_ROWS, "steps": yardstick.steps, "ratios": ratios}
 
 
 def _median_s(work: Callable[[], object]) -> float:
@@ -80,19 +159,24 @@ def _median_s(work: Callable[[], object]) -> float:
 
 def _time_methods(mechanism: Mechanism) -> dict[str, dict[str, float]]:
     """Microseconds per pose of every method that works on the mechanism."""
+    times: dict[str, dict[str, float]] = {}
+    for (method, kind), run in _runs(mechanism).items():
+        times.setdefault(method, {})[kind] = 1e6 * _median_s(run) / _ROWS
+    return times
+
+
+def _runs(mechanism: Mechanism) -> dict[tuple[str, str], Callable[[], Any]]:
+    """A batch of poses on one core, by method that works on the mechanism and by kind."""
     measurements = _measure(mechanism, _ROWS)
-    times = {}
+    runs: dict[tuple[str, str], Callable[[], Any]] = {}
     for method in METHODS:
-        kinds: dict[str, float] = {}
         for kind, refine in (("closed_form", False), ("refined", True)):
             given = measurements_of(method, measurements)
             run = partial(solve_batch, mechanism, **given, method=method, refine=refine, workers=1)
             # The first run may compile.
             if run().solved.mean() > 0.5:
-                kinds[kind] = 1e6 * _median_s(run) / _ROWS
-        if kinds:
-            times[method] = kinds
-    return times
+                runs[method, kind] = run
+    return runs
 
 
 def _measure(mechanism: Mechanism, count: int) -> dict[str, Array]:
@@ -117,14 +201,18 @@ def _time_batch(mechanism: Mechanism) -> tuple[dict[str, float], float]:
 
 def _time_newton(mechanism: Mechanism) -> float:
     """Microseconds per pose of Newton's method, each started from the pose before."""
-    times = np.arange(0.0, _MOTION_S, 1e-3)
-    home = mechanism.require_home()
-    swings = np.sin(2.0 * np.pi * times[:, None] * [0.9, 0.7, 0.5, 0.8, 0.6, 1.0])
-    positions = home.position + 0.02 * swings[:, :3]
-    rotations = np.array([rotation_from_vector(0.05 * swing) for swing in swings[:, 3:]]) @ home.rotation
+    positions, rotations = _motion(mechanism, round(1e3 * _MOTION_S))
     lengths = leg_lengths(mechanism, positions, rotations)
     run = partial(poses_from_lengths, mechanism, lengths, Pose(positions[0], rotations[0]))
-    return 1e6 * _median_s(run) / len(times)
+    return 1e6 * _median_s(run) / len(positions)
+
+
+def _motion(mechanism: Mechanism, count: int) -> tuple[Array, Array]:
+    """Positions (count, 3) [m] and rotations (count, 3, 3) of a motion from home on, a millisecond apart."""
+    home = mechanism.require_home()
+    swings = np.sin(2e-3 * np.pi * np.arange(count)[:, None] * [0.9, 0.7, 0.5, 0.8, 0.6, 1.0])
+    positions = home.position + 0.02 * swings[:, :3]
+    return positions, np.array([rotation_from_vector(0.05 * swing) for swing in swings[:, 3:]]) @ home.rotation
 
 
 def _start_cold(mechanism: Mechanism, random: np.random.Generator) -> dict[str, Any]:

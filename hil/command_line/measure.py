@@ -169,14 +169,18 @@ def _kinematics(_: Namespace, figures: dict[str, Any]) -> None:
             medians = (median(each[kind] for each in found) for kind in ("closed_form", "refined") if found)
             cells.append(" / ".join(f"{us:.{2 if us < 10.0 else 1}f}" for us in medians) or "-")
         table.add(group, *cells)
-    newton = measured["newton"]
-    times = {name: f"{ratio['closed_form']:.1f} / {ratio['refined']:.1f}" for name, ratio in newton["ratios"].items()}
-    table.add("over Newton", *(times.get(name, "-") for name in names))
+    newton, in_c = measured["newton"], measured["newton_in_c"]
+    for label, ratios in (("over Newton", newton["ratios"]), ("over Newton in C", in_c["ratios"])):
+        times = {name: f"{ratio['closed_form']:.2f} / {ratio['refined']:.2f}" for name, ratio in ratios.items()}
+        table.add(label, *(times.get(name, "-") for name in names))
     table.print()
     print("closed form / refined")
     rates = ", ".join(f"{name} {rate / 1e3:.0f}" for name, rate in measured["batch_per_s"].items())
     print(f"refined poses per second on all cores [thousands]: {rates}; one call from Python {measured['call_us']:.0f} us")
-    print(f"Newton's method from lengths, warm: {newton['warm_us']:.2f} us per pose")
+    print(
+        f"Newton's method from lengths, warm: {newton['warm_us']:.2f} us per pose; in C as LinuxCNC's genhexkins, to 1e-9 m: "
+        f"{in_c['warm_us']:.2f} us, {in_c['steps']:.1f} steps"
+    )
     table = Table("cold starts [%]", "found by Newton", "mistaken", "found from directions", "mistaken")
     for preset, ranges in measured["cold_starts"].items():
         for where, rates in ranges.items():
