@@ -353,7 +353,7 @@ def _write_nothing(row: int, results: Results) -> None:
 def _longest(step: Array, spread: float) -> float:
     """The greatest component of a step, over the joints' spread or in radians."""
     moved = max(abs(step[0]), abs(step[1]), abs(step[2])) / spread
-    return max(moved, abs(step[3]), abs(step[4]), abs(step[5]))
+    return float(max(moved, abs(step[3]), abs(step[4]), abs(step[5])))
 
 
 @kernel
