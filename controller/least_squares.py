@@ -9,6 +9,8 @@ from plant.compiled import kernel
 from plant.pose import Array
 
 RANK_TOLERANCE = 1e-9  # ratio of the least to the greatest diagonal element of R, below which columns count as dependent
+_SQUARE = 1e-13  # cosine between columns that count as square to each other
+_MOST_SWEEPS = 30
 
 
 @kernel
@@ -209,3 +211,59 @@ def solve_cholesky(factor: Array, right: Array) -> None:
         for k in range(i + 1, n):
             value -= factor[k, i] * right[k]
         right[i] = value / factor[i, i]
+
+
+@kernel
+def determinant(matrix: Array, n: int) -> float:
+    """The determinant of the corner (n, n) of `matrix`, by elimination with row pivots; overwrites it."""
+    product = 1.0
+    for k in range(n):
+        best = k
+        for i in range(k + 1, n):
+            if abs(matrix[i, k]) > abs(matrix[best, k]):
+                best = i
+        if best != k:
+            product = -product
+            for j in range(k, n):
+                matrix[k, j], matrix[best, j] = matrix[best, j], matrix[k, j]
+        product *= matrix[k, k]
+        if product == 0.0:
+            return 0.0
+        for i in range(k + 1, n):
+            factor = matrix[i, k] / matrix[k, k]
+            for j in range(k + 1, n):
+                matrix[i, j] -= factor * matrix[k, j]
+    return product
+
+
+@kernel
+def extreme_singular_values(matrix: Array, n: int) -> tuple[float, float]:
+    """The least and the greatest singular value of the corner (n, n) of `matrix`, by one-sided Jacobi turns; overwrites it."""
+    for _ in range(_MOST_SWEEPS):
+        turned = False
+        for p in range(n - 1):
+            for q in range(p + 1, n):
+                first = second = product = 0.0
+                for i in range(n):
+                    first += matrix[i, p] * matrix[i, p]
+                    second += matrix[i, q] * matrix[i, q]
+                    product += matrix[i, p] * matrix[i, q]
+                if not abs(product) > _SQUARE * np.sqrt(first * second):
+                    continue
+                turned = True
+                slope = (second - first) / (2.0 * product)
+                tangent = (1.0 if slope >= 0.0 else -1.0) / (abs(slope) + np.sqrt(1.0 + slope * slope))
+                cosine = 1.0 / np.sqrt(1.0 + tangent * tangent)
+                sine = cosine * tangent
+                for i in range(n):
+                    a, b = matrix[i, p], matrix[i, q]
+                    matrix[i, p], matrix[i, q] = cosine * a - sine * b, sine * a + cosine * b
+        if not turned:
+            break
+    least, greatest = np.inf, 0.0
+    for j in range(n):
+        square = 0.0
+        for i in range(n):
+            square += matrix[i, j] * matrix[i, j]
+        least, greatest = min(least, square), max(greatest, square)
+    return np.sqrt(least), np.sqrt(greatest)

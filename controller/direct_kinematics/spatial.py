@@ -5,10 +5,8 @@ their normal matrix gives the covariance.
 """
 
 import operator
-import os
 import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -22,6 +20,7 @@ from plant.compiled import Record
 from plant.errors import InputError, SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import UNIT_TOLERANCE, Array, Pose, numbers, rotation_angle
+from plant.threads import in_threads
 
 # Standard deviations that `solve` assumes [rad].
 LEG_SIGMA = np.radians(0.05)  # of each component of a leg's direction
@@ -183,8 +182,6 @@ def solve_batch(
     """
     directions = numbers(leg_directions, "leg_directions", "(N, 6, 3)")
     arrays = _shapes_checked(directions, rotation, normal, up_in_platform, len(directions) if directions.ndim else 0)
-    if workers is None:
-        workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     where = " of row {row}"
     results = _solve(mechanism, arrays, method, refine, (leg_sigma, tilt_sigma, yaw_sigma), workers)
     for row in np.flatnonzero(results.statuses == REFUSED)[:1].tolist():
@@ -226,14 +223,12 @@ def _solve(
     method: str,
     refine: bool,
     sigmas: tuple[float, float, float],
-    workers: int,
+    workers: int | None,
 ) -> Results:
     """Solve all rows; an `InputError` if what holds for all of them cannot be used."""
     check_spatial(mechanism)
     if not isinstance(refine, bool | np.bool_):
         raise InputError(f"refine must be True or False, got {refine!r}")
-    if not isinstance(workers, int) or workers < 1:
-        raise InputError(f"workers is {workers!r}; it must be a whole number of threads, 1 at least")
     candidates = _candidates(method, tuple(arrays))
     weights = [_weight(name, sigma) for name, sigma in zip(_SIGMAS, sigmas, strict=True)]
     count = len(arrays["leg_directions"])
@@ -244,17 +239,10 @@ def _solve(
     # Copies take a third of the time, which counts where Python closes a loop.
     results = Results._make([each.copy() for each in _ONE_ROW]) if count == 1 else _no_results(count)
 
-    def solve_chunk(start: int) -> None:
-        stop = min(start + _CHUNK, count)
+    def solve_chunk(start: int, stop: int) -> None:
         solve_rows(geometry_of(mechanism), _memory.work, measurements, candidates, refine, results, start, stop)
 
-    starts = range(0, count, _CHUNK)
-    if workers == 1 or len(starts) <= 1:
-        for start in starts:
-            solve_chunk(start)
-    else:
-        with ThreadPoolExecutor(workers) as pool:
-            list(pool.map(solve_chunk, starts))
+    in_threads(solve_chunk, count, _CHUNK, workers)
     return results
 
 

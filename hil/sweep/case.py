@@ -94,7 +94,7 @@ def measure(case: Case) -> dict[str, float]:
     config = case.local_config()
     figures: dict[str, float] = {}
     if case.geometry:
-        from controller.design.workspace import geometry_figures
+        from controller.workspace import geometry_figures
 
         section_5 = config.fusion == "section-5"
         found = geometry_figures(load_in_space(config.mechanism), config.imus, config.magnetometer, section_5)

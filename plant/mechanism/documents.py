@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from plant.checks import nearest
 from plant.errors import InputError, UnknownNameError
 from plant.files import check_entries, parse_toml, read_text, toml_entries
+from plant.mechanism.bodies import body_tables, swing_entries
 from plant.mechanism.checks import checked_joints
 from plant.mechanism.planar import PlanarMechanism, PlanarPose
 from plant.mechanism.spatial import LEGS, Mechanism
@@ -21,7 +22,7 @@ _JOINTS = ("base_joints", "platform_joints")
 _MUCH_SHORTER = 0.8
 _MOST_MASS_RATIO = 3.0
 _SETTINGS = ("control", "fusion", "safety", "drives")
-_ANY_ENTRY = ("limits", "plant", *_SETTINGS)
+_ANY_ENTRY = ("limits", "joints", "bodies", "plant", *_SETTINGS)
 """Tables whose entries are checked by those who read them."""
 
 _SAME_FRAMES = 1e-9
@@ -115,6 +116,8 @@ def mechanism_from_document(document: dict[str, Any]) -> Mechanism | PlanarMecha
         name=str(document.get("name", "custom")),
         home=home,
         limits=document.get("limits") or None,
+        joints=document.get("joints"),
+        bodies=document.get("bodies"),
         plant=_flattened(document.get("plant", {})),
         settings={name: document.get(name, {}) for name in _SETTINGS},
     )
@@ -151,6 +154,8 @@ def text_of_mechanism(mechanism: Mechanism | PlanarMechanism) -> str:
         "geometry": geometry,
         "home": _home_entries(mechanism.home, planar),
         "limits": {} if mechanism.limits is None else vars(mechanism.limits),
+        "joints": swing_entries(mechanism.joints, planar),
+        **body_tables(mechanism.bodies, planar),
         "plant": mechanism.plant,
         **mechanism.settings,
     }
