@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from controller.inverse_kinematics import jacobian_at
-from controller.least_squares import RANK_TOLERANCE, solve_least_squares
+from controller.least_squares import RANK_TOLERANCE, solve_square
 from plant.compiled import Record, filled, kernel, record_dtype
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array
@@ -36,8 +36,6 @@ STATE = record_dtype(
     force=(np.float64, 6),
     jacobian=(np.float64, (6, 6)),
     transposed=(np.float64, (6, 6)),
-    norms=(np.float64, 6),
-    order=(np.float64, 6),
 )
 """The feed-forward [m/s], the load of each drive [N], an external load (none is known), the static forces on the platform [N],
 and scratch."""
@@ -93,10 +91,9 @@ def find_static_forces(p: Record, s: Record, pose: Record, legs: int, up: Vector
         for i in range(3):
             wrench[i] += push[i]
             wrench[3 + i] += turn[i]
-    conditioning = solve_least_squares(s.transposed, wrench, 6, force, s.norms, s.order)
-    if conditioning < RANK_TOLERANCE:
-        for k in range(legs):
-            force[k] = 0.0
+    conditioning = solve_square(s.transposed, wrench)
+    for k in range(6):
+        force[k] = 0.0 if conditioning < RANK_TOLERANCE else wrench[k]
     return conditioning
 
 

@@ -30,17 +30,19 @@ def segment_distance(first: Vector, to_first: Vector, second: Vector, to_second:
 def disc_distance(start: Vector, end: Vector, center: Vector, normal: Vector, radius: float) -> float:
     """The distance between a segment and a filled disc across a unit normal.
 
-    The distance from the disc is convex along the segment, so that its slope has one root, or the least is at an end.
+    The distance from the disc is convex along the segment, so that its slope has one root, or the least is at an end: soonest
+    told where it is at the start.
     """
     a, d = subtract(start, center), subtract(end, start)
     height, rise = dot(normal, a), dot(normal, d)
     out, grow = subtract(a, scale(height, normal)), subtract(d, scale(rise, normal))
     p, q, r = dot(out, out), dot(out, grow), dot(grow, grow)
     low, high = 0.0, 1.0
-    at_low, at_high = _slope(low, height, rise, p, q, r, radius), _slope(high, height, rise, p, q, r, radius)
+    at_low = _slope(low, height, rise, p, q, r, radius)
     if at_low >= 0.0:
-        high = low
-    elif at_high <= 0.0:
+        return float(np.sqrt(_square(low, height, rise, p, q, r, radius)))
+    at_high = _slope(high, height, rise, p, q, r, radius)
+    if at_high <= 0.0:
         low = high
     else:
         for step in range(_MOST_STEPS):

@@ -104,7 +104,7 @@ def holding_forces(mechanism: Mechanism, positions: Array, rotations: Array) -> 
             raise InputError(
                 f"the mechanism {mechanism.name!r} lacks the plant's {name}, and so has no weight to hold: give it"
             )
-    space = space_of(mechanism, GEOMETRY_ALONE)
+    space = space_of(mechanism, GEOMETRY_ALONE).copy()
     space["gravity"] = float(np.linalg.norm(plant["gravity"]))
     space["weights"]["mass"], space["weights"]["first_moment"] = first_moment_of(plant)
     forces = np.empty((len(positions), mechanism.legs))

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
@@ -99,6 +100,9 @@ class Demands:
         object.__setattr__(self, "load", checked_array(self.load, (6,), "load"))
 
 
+USUAL = Demands()
+"""That motors hold the weights, and good conditioning with all IMUs."""
+
 GEOMETRY_ALONE = Demands(forces=False, conditioning=False)
 """Strokes, swings and clearances."""
 
@@ -145,8 +149,9 @@ SPACE = record_dtype(
 """What the kernels read of a mechanism and of the demands."""
 
 
+@lru_cache(maxsize=256)
 def space_of(mechanism: Mechanism, demands: Demands) -> Record:
-    """What the kernels read (dtype `SPACE`).
+    """What the kernels read (dtype `SPACE`), not to be changed.
 
     Raises:
         InputError: no home, no stroke, or leg ends that leave nothing of a leg.

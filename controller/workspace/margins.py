@@ -25,6 +25,7 @@ from controller.workspace.limits import (
     PLATFORM_SWING,
     SPEED,
     STROKE,
+    USUAL,
     Demands,
     Limit,
     least_conditioning,
@@ -36,7 +37,7 @@ from plant.errors import InputError
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import UNIT_TOLERANCE, Array, Pose, numbers
 from plant.threads import in_threads
-from plant.vectors import Vector, add, dot, rotate, rotate_back, scale, subtract, vector
+from plant.vectors import Vector, add, cross, dot, rotate, rotate_back, scale, subtract, vector
 
 _CHUNK = 1024
 
@@ -49,6 +50,9 @@ WORK = record_dtype(
     tips=(np.float64, (LEGS, 3)),  # and ends
     jacobian=(np.float64, (6, 6)),
     matrix=(np.float64, (6, 6)),
+    squares=(np.float64, (6, 6)),
+    diagonal=(np.float64, 6),
+    beside=(np.float64, 6),
     smallest=np.float64,  # singular value of the Jacobian, with turns at the spread of the joints
     static=STATE,
 )
@@ -116,7 +120,7 @@ def margins(
     Raises:
         InputError: arrays of another shape or not finite, no rotations, a pose outside the plane, no home or stroke.
     """
-    demands = demands or Demands()
+    demands = demands or USUAL
     positions, rotations = checked_poses(mechanism, positions, rotations)
     space = space_of(mechanism, demands)
     values = np.full((len(positions), COUNT), np.inf)
@@ -144,10 +148,8 @@ def checked_poses(mechanism: Mechanism, positions: ArrayLike, rotations: ArrayLi
     at, turned = numbers(positions, "positions", "(N, 3)"), numbers(rotations, "rotations", "(N, 3, 3)")
     if at.ndim != 2 or at.shape[1] != 3 or turned.shape != (len(at), 3, 3):
         raise InputError(f"positions have shape {at.shape} and rotations {turned.shape}; they must be (N, 3) and (N, 3, 3)")
-    off = np.abs(np.swapaxes(turned, 1, 2) @ turned - np.eye(3)).max(axis=(1, 2)) + (np.linalg.det(turned) < 0.0)
-    wrong = np.flatnonzero(~(np.isfinite(at).all(axis=1) & (off <= UNIT_TOLERANCE)))
-    if len(wrong):
-        row = wrong[0]
+    row = first_that_is_none(at, turned)
+    if row >= 0:
         raise InputError(
             f"pose {row} has the position {at[row].tolist()} and the rotation {turned[row].tolist()}: give finite positions "
             "and rotation matrices"
@@ -159,6 +161,22 @@ def checked_poses(mechanism: Mechanism, positions: ArrayLike, rotations: ArrayLi
                 f"pose {int(out.argmax())} leaves the plane of {mechanism.name!r}: it turns about z alone, at z = 0"
             )
     return at, turned
+
+
+@kernel
+def first_that_is_none(positions: Array, rotations: Array) -> int:
+    """The first row whose position is not finite, or whose rotation is none; -1 if there is no such row."""
+    for row in range(positions.shape[0]):
+        rotation, off = rotations[row], 0.0
+        for i in range(3):
+            off = max(off, 0.0 if np.isfinite(positions[row, i]) else np.inf)
+            for j in range(3):
+                product = dot(vector(rotation[i]), vector(rotation[j])) - (1.0 if i == j else 0.0)
+                off = max(off, abs(product)) if np.isfinite(product) else np.inf
+        volume = dot(cross(vector(rotation[0]), vector(rotation[1])), vector(rotation[2]))
+        if not (off <= UNIT_TOLERANCE and volume > 0.0):
+            return row
+    return -1
 
 
 @kernel
@@ -253,7 +271,7 @@ def _find_clearances(space: Record, work: Record, position: Array, rotation: Arr
         center = add(vector(position), rotate(rotation, vector(plate.center)))
         normal = rotate(rotation, vector(plate.normal))
         for k in range(n):
-            apart = disc_distance(vector(work.starts[k]), vector(work.tips[k]), center, normal, plate.radius)
+            apart = disc_distance(vector(work.tips[k]), vector(work.starts[k]), center, normal, plate.radius)
             values[PLATFORM_PLATE + k] = apart - space.radii[k] - plate.gap
 
 
@@ -274,7 +292,7 @@ def _find_conditioning(space: Record, work: Record) -> float:
     scale_jacobian(space, work)
     positive = determinant(work.matrix, n) * space.side > 0.0
     scale_jacobian(space, work)
-    least, greatest = extreme_singular_values(work.matrix, n)
+    least, greatest = extreme_singular_values(work.matrix, n, work.squares, work.diagonal, work.beside)
     work.smallest = least
     ratio = least / greatest
     return float(ratio if positive else -ratio)

@@ -25,6 +25,7 @@ from controller.workspace.limits import (
     PLATFORM_SWING,
     SPEED,
     STROKE,
+    USUAL,
     Demands,
     Limit,
     least_conditioning,
@@ -113,7 +114,7 @@ def travel(
     size = float(np.linalg.norm(chosen))
     if size == 0.0:
         raise InputError("the direction has no length: give a velocity or an angular velocity")
-    demands = demands or Demands()
+    demands = demands or USUAL
     ways, ends = travels(mechanism, pose, chosen[None], demands, pivot=pivot)
     way, end = float(ways[0]), int(ends[0])
     if demands.conditioning:
@@ -146,7 +147,7 @@ def travels(
     outside = np.delete(given, moving_axes(mechanism), axis=1)
     if np.any(outside):
         raise InputError(f"a direction leaves the plane of {mechanism.name!r}: it moves along x and y, and turns about z")
-    space = space_of(mechanism, demands or Demands())
+    space = space_of(mechanism, demands or USUAL)
     position = checked_array(pose.position, (3,), "position")
     path_of_all = np.zeros((), PATH)
     path_of_all["position"], path_of_all["rotation"] = position, checked_rotation(pose.rotation, "rotation")
@@ -398,7 +399,7 @@ def _step_of_jacobian(space: Record, path: Record, values: Array) -> float:
     if space.loaded != 0:
         if space.conditioned == 0:
             scale_jacobian(space, work)
-            work.smallest = extreme_singular_values(work.matrix, n)[0]
+            work.smallest = extreme_singular_values(work.matrix, n, work.squares, work.diagonal, work.beside)[0]
         moment = vector(weights.first_moment)
         weighed += rate * gravity * np.sqrt(dot(moment, moment))
         size, largest, tightest = 0.0, 0.0, np.inf
