@@ -10,16 +10,18 @@ import numpy as np
 from controller.direct_kinematics.geometry import geometry_of
 from controller.direct_kinematics.requirements import length_conditionings
 from controller.estimation.pose_estimator import PARAMETERS, STATE, WORST_CONDITIONING, find_pose
-from controller.inverse_kinematics import inverse_kinematics, sample_workspace
+from controller.inverse_kinematics import inverse_kinematics, legs_at, sample_workspace
 from controller.rig import RIG, field_of
 from controller.settings import FusionSettings
-from plant.compiled import filled
+from plant.compiled import Record, filled, kernel
 from plant.dynamics.variables import TINY
 from plant.encoders import EncoderModel
 from plant.errors import InputError
 from plant.imu_wiring import ALL_IMUS, PLATFORM_IMU
-from plant.mechanism import LEGS, Mechanism, six_rows
+from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array
+from plant.threads import in_threads
+from plant.vectors import rotate_back, vector
 
 _LEAST_FIELD = 5.0
 """Least horizontal magnetic field from which a heading can be taken [uT]."""
@@ -42,6 +44,9 @@ _LEAST_JUDGED = 5
 
 _LEAST_SHARE = 0.08
 """How much of an IMU's error must show in what the pose leaves over."""
+
+_CHUNK = 1024
+"""Poses that a thread takes at once."""
 
 _SINGULAR = 1e-12
 """Directions with a smaller share of the information are those in which a planar mechanism cannot move."""
@@ -309,17 +314,39 @@ def conditionings(
     imus: Collection[int] = ALL_IMUS,
     magnetometer: bool = False,
     section_5: bool = False,
+    workers: int | None = 1,
 ) -> Array:
-    """The conditioning (N,) of direct kinematics with these IMUs at positions (N, 3) [m] and rotations (N, 3, 3); unchecked."""
+    """The conditioning (N,) of direct kinematics with these IMUs at positions (N, 3) [m] and rotations (N, 3, 3); unchecked.
+
+    `workers` are threads; None is one for each core.
+    """
     field = field_of(mechanism)
     rig = filled(RIG, geometry=geometry_of(mechanism), vectors_in_base=field.vectors, planar=mechanism.planar)
-    parameters, pose = filled(PARAMETERS, section_5=section_5), np.zeros((), STATE)
+    parameters = filled(PARAMETERS, section_5=section_5)
     leg_used = np.array([float(leg in imus_of(mechanism, imus)) for leg in range(LEGS)])
     used = (int(PLATFORM_IMU in imus), int(magnetometer))
+    positions, rotations = np.ascontiguousarray(positions, np.float64), np.ascontiguousarray(rotations, np.float64)
     found = np.empty(len(positions))
-    for row, (position, rotation) in enumerate(zip(positions, rotations, strict=True)):
-        legs = position + mechanism.platform_joints @ rotation.T - mechanism.base_joints
-        directions = six_rows(legs / np.linalg.norm(legs, axis=1, keepdims=True))
-        pose["vectors"] = field.vectors @ rotation
-        found[row] = find_pose(parameters[()], pose[()], rig[()], directions, leg_used, *used)
+
+    def find(start: int, stop: int) -> None:
+        pose = np.zeros((), STATE)
+        find_conditionings(parameters, pose, rig, positions, rotations, leg_used, *used, found, start, stop)
+
+    in_threads(find, len(positions), _CHUNK, workers)
     return found
+
+
+@kernel
+def find_conditionings(
+    parameters: Record, pose: Record, rig: Record, positions: Array, rotations: Array, leg_used: Array, platform_used: int,
+    heading_used: int, found: Array, start: int, stop: int,
+) -> None:  # fmt: skip
+    """Write the conditioning of direct kinematics at the rows from `start` to `stop`."""
+    p, s, r = parameters[()], pose[()], rig[()]
+    arms, directions, lengths = np.empty((LEGS, 3)), np.empty((LEGS, 3)), np.empty(LEGS)
+    for row in range(start, stop):
+        rotation = rotations[row]
+        legs_at(r.geometry.base_joints, r.geometry.platform_joints, positions[row], rotation, arms, directions, lengths)
+        for i in range(2):
+            s.vectors[i, 0], s.vectors[i, 1], s.vectors[i, 2] = rotate_back(rotation, vector(r.vectors_in_base[i]))
+        found[row] = find_pose(p, s, r, directions, leg_used, platform_used, heading_used)

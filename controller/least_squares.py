@@ -12,6 +12,8 @@ from plant.pose import Array
 from plant.vectors import Vector, dot
 
 RANK_TOLERANCE = 1e-9  # ratio of the least to the greatest diagonal element of R, below which columns count as dependent
+_SQUARE = 1e-16  # share of its neighbours below which an element beside the diagonal is zero
+_MOST_SWEEPS = 30
 _LEAST_PIVOT = 1e-13  # of a symmetric matrix, over the element of its diagonal from which elimination leaves it
 
 
@@ -379,3 +381,120 @@ def _inverse_of_three(triangle: Vector, pivots: Vector) -> Symmetric:
 def _combine(a: float, u: Vector, b: float, v: Vector, c: float, w: Vector) -> Vector:
     """A u + b v + c w."""
     return a * u[0] + b * v[0] + c * w[0], a * u[1] + b * v[1] + c * w[1], a * u[2] + b * v[2] + c * w[2]
+
+
+@kernel
+def determinant(matrix: Array, n: int) -> float:
+    """The determinant of the corner (n, n) of `matrix`, by elimination with row pivots; overwrites it."""
+    product = 1.0
+    for k in range(n):
+        best = k
+        for i in range(k + 1, n):
+            if abs(matrix[i, k]) > abs(matrix[best, k]):
+                best = i
+        if best != k:
+            product = -product
+            for j in range(k, n):
+                matrix[k, j], matrix[best, j] = matrix[best, j], matrix[k, j]
+        product *= matrix[k, k]
+        if product == 0.0:
+            return 0.0
+        for i in range(k + 1, n):
+            factor = matrix[i, k] / matrix[k, k]
+            for j in range(k + 1, n):
+                matrix[i, j] -= factor * matrix[k, j]
+    return product
+
+
+@kernel
+def extreme_singular_values(matrix: Array, n: int, squares: Array, diagonal: Array, beside: Array) -> tuple[float, float]:
+    """The least and the greatest singular value of the corner (n, n) of `matrix`, to about 1e-16 of the greatest one's square.
+
+    They are the roots of the eigenvalues of its Gram matrix, by Householder's tridiagonal form and QL steps with implicit
+    shifts (Wilkinson 1971, II/3). `squares` (n, n), `diagonal` (n,) and `beside` (n,) are scratch.
+    """
+    for i in range(n):
+        for j in range(i + 1):
+            product = 0.0
+            for k in range(n):
+                product += matrix[k, i] * matrix[k, j]
+            squares[i, j] = squares[j, i] = product
+    _tridiagonalise(squares, n, diagonal, beside)
+    _find_eigenvalues(diagonal, beside, n)
+    least, greatest = np.inf, 0.0
+    for k in range(n):
+        least, greatest = min(least, diagonal[k]), max(greatest, diagonal[k])
+    return np.sqrt(max(least, 0.0)), np.sqrt(greatest)
+
+
+@kernel
+def _tridiagonalise(a: Array, n: int, diagonal: Array, beside: Array) -> None:
+    """Write the diagonal (n,) of a symmetric matrix (n, n) turned to tridiagonal form, and what is beside it, n - 1 numbers."""
+    for k in range(n - 2):
+        tail = 0.0
+        for i in range(k + 1, n):
+            tail += a[i, k] * a[i, k]
+        size = np.sqrt(tail)
+        if size == 0.0:
+            beside[k] = 0.0
+            continue
+        lead = a[k + 1, k]
+        alpha = -size if lead > 0.0 else size
+        beside[k] = alpha
+        # The reflection I - v v^T / h with v = column - alpha e, and the products with it below `beside`.
+        a[k + 1, k] = lead - alpha
+        h = tail - lead * alpha
+        share = 0.0
+        for i in range(k + 1, n):
+            product = 0.0
+            for j in range(k + 1, n):
+                product += a[i, j] * a[j, k]
+            diagonal[i] = product / h
+            share += diagonal[i] * a[i, k]
+        share /= 2.0 * h
+        for i in range(k + 1, n):
+            diagonal[i] -= share * a[i, k]
+        for i in range(k + 1, n):
+            for j in range(k + 1, n):
+                a[i, j] -= a[i, k] * diagonal[j] + diagonal[i] * a[j, k]
+    if n > 1:
+        beside[n - 2] = a[n - 1, n - 2]
+    for k in range(n):
+        diagonal[k] = a[k, k]
+
+
+@kernel
+def _find_eigenvalues(diagonal: Array, beside: Array, n: int) -> None:
+    """Replace the diagonal (n,) of a symmetric tridiagonal matrix by its eigenvalues."""
+    beside[n - 1] = 0.0
+    for first in range(n):
+        for _ in range(_MOST_SWEEPS):
+            last = first
+            while last < n - 1:
+                if abs(beside[last]) <= _SQUARE * (abs(diagonal[last]) + abs(diagonal[last + 1])):
+                    break
+                last += 1
+            if last == first:
+                break
+            g = (diagonal[first + 1] - diagonal[first]) / (2.0 * beside[first])
+            r = np.sqrt(g * g + 1.0)
+            g = diagonal[last] - diagonal[first] + beside[first] / (g + (r if g >= 0.0 else -r))
+            sine, cosine, moved = 1.0, 1.0, 0.0
+            for i in range(last - 1, first - 1, -1):
+                f, b = sine * beside[i], cosine * beside[i]
+                r = np.sqrt(f * f + g * g)
+                beside[i + 1] = r
+                if r == 0.0:
+                    break
+                sine, cosine = f / r, g / r
+                g = diagonal[i + 1] - moved
+                r = (diagonal[i] - g) * sine + 2.0 * cosine * b
+                moved = sine * r
+                diagonal[i + 1] = g + moved
+                g = cosine * r - b
+            if r == 0.0 and last - 1 > first:
+                beside[last] = 0.0
+                continue
+            diagonal[first] -= moved
+            beside[first] = g
+            beside[last] = 0.0

@@ -5,10 +5,8 @@ their normal matrix gives the covariance.
 """
 
 import operator
-import os
 import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -22,6 +20,7 @@ from plant.compiled import Record
 from plant.errors import InputError, SingularConfigurationError
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import UNIT_TOLERANCE, Array, Pose, numbers, rotation_angle
+from plant.threads import in_threads
 
 # Standard deviations that `solve` assumes [rad].
 LEG_SIGMA = np.radians(0.05)  # of each component of a leg's direction
@@ -182,8 +181,6 @@ def solve_batch(
     """
     directions = numbers(leg_directions, "leg_directions", "(N, 6, 3)")
     arrays = _shapes_checked(directions, rotation, normal, up_in_platform, len(directions) if directions.ndim else 0)
-    if workers is None:
-        workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     where = " of row {row}"
     results = _solve(mechanism, arrays, method, refine, (leg_sigma, tilt_sigma, yaw_sigma), workers)
     statuses, degrees_of_freedom, methods = results.integers
@@ -230,14 +227,12 @@ def _solve(
     method: str,
     refine: bool,
     sigmas: tuple[float, float, float],
-    workers: int,
+    workers: int | None,
 ) -> Results:
     """Solve all rows; an `InputError` if what holds for all of them cannot be used."""
     check_spatial(mechanism)
     if not isinstance(refine, bool | np.bool_):
         raise InputError(f"refine must be True or False, got {refine!r}")
-    if not isinstance(workers, int) or workers < 1:
-        raise InputError(f"workers is {workers!r}; it must be a whole number of threads, 1 at least")
     candidates = _candidates(method, tuple(arrays))
     weights = [_weight(name, sigma) for name, sigma in zip(_SIGMAS, sigmas, strict=True)]
     count = len(arrays["leg_directions"])
@@ -249,15 +244,13 @@ def _solve(
 
     geometry = _geometry_array_of(mechanism)
 
-    def solve_chunk(start: int) -> None:
-        stop = min(start + _CHUNK, count)
+    def solve_chunk(start: int, stop: int) -> None:
         solve_rows(geometry, _memory.work, measurements, candidates, refine, results, start, stop)
 
-    if workers == 1 or count <= _CHUNK:
-        solve_rows(geometry, _memory.work, measurements, candidates, refine, results, 0, count)
+    if count == workers == 1:
+        solve_chunk(0, 1)
     else:
-        with ThreadPoolExecutor(workers) as pool:
-            list(pool.map(solve_chunk, range(0, count, _CHUNK)))
+        in_threads(solve_chunk, count, _CHUNK, workers)
     return results
 
 

@@ -1,13 +1,14 @@
 """The commands about mechanisms, sensors and gains: from classify to optimise."""
 
-from argparse import Namespace
+from argparse import ArgumentTypeError, Namespace
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hil.command_line import cli
-from hil.command_line.terminal import deg, engine_at_work, mm, say
+from hil.command_line.terminal import deg, engine_at_work, mm, progress_bar, say
 from hil.engine.settings import EngineSettings
 from hil.runs.config import SimulationConfig
 from hil.studies.config import TuningConfig
@@ -18,8 +19,25 @@ from plant.extras import check_installed
 from plant.files import write_whole
 
 if TYPE_CHECKING:
+    from hil.studies.workspace import Workspace
     from hil.sweep.optimisation import OptimisationResult, Trial
     from hil.sweep.trials import Comparison
+    from plant.pose import Array
+
+
+def _numbers(name: str, metavar: str, count: int, text: str) -> cli.Argument:
+    """An option of so many numbers with commas between them."""
+
+    def read(given: str) -> tuple[float, ...]:
+        try:
+            found = tuple(float(part) for part in given.split(","))
+        except ValueError:
+            found = ()
+        if len(found) != count or not all(map(isfinite, found)):
+            raise ArgumentTypeError(f"{given!r} is no {metavar}: give {count} numbers with commas between them")
+        return found
+
+    return cli.argument(name, type=read, metavar=metavar, help=text)
 
 
 @cli.command(
@@ -123,6 +141,137 @@ def gough_accuracy(options: Namespace) -> None:
         f"{accuracy.mechanism}, class {accuracy.mechanism_class.label}, {accuracy.poses} poses; the bound is Cramer and Rao's; "
         f"NEES is 6 on average, {least:.2f} to {greatest:.2f} in 99 % of such runs, if the covariance is right"
     )
+
+
+@cli.command(
+    cli.options_of(SimulationConfig, "mechanism", "imus", "magnetometer"),
+    cli.argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="ENTRY=VALUE",
+        help="also with another entry of the mechanism's file, in SI units, such as limits.stroke=[-0.05,0.05], "
+        "joints.base_swing=0.6, bodies.leg_diameter=0.03 or geometry.platform_radius=0.15; several change it together",
+    ),
+    _numbers("--at", "X,Y,Z", 3, "where it begins: the platform's position in the base frame [mm] (default: home)"),
+    _numbers("--turned", "RX,RY,RZ", 3, "and its rotation vector from home, in the base frame [deg] (default: 0,0,0)"),
+    _numbers("--twist", "VX,VY,VZ,WX,WY,WZ", 6, "velocity that the platform must make everywhere [mm/s, deg/s]"),
+    _numbers("--load", "FX,FY,FZ,MX,MY,MZ", 6, "force and moment that act on it besides all weights [N, Nm]"),
+    _numbers("--box", "X,Y,Z,RX,RY,RZ", 6, "ratios of the largest box and ellipsoid [mm, deg] (default: 1,1,1,0,0,0)"),
+    cli.flag("--geometry", "strokes, swings and clearances alone, without forces and conditioning"),
+    cli.setting("--points", 81, "points of a slice along an edge"),
+    cli.output("--picture", "FILE.svg", "draw the slices"),
+    cli.report("write a report with tables and slices"),
+    cli.JSON,
+)
+def gough_workspace(options: Namespace) -> None:
+    """Find where a mechanism can go, and what limits it there.
+
+    From home or another pose: the margin of every limit, how far the platform gets along each axis and what ends it, the volume
+    that straight moves reach, the largest box and ellipsoid in which every pose is reached, and slices. What limits: strokes;
+    swings of the joints and clearances between legs and plates, if the mechanism's file has them (docs/workspace.md); motors,
+    which hold all weights; and the conditioning of the Jacobian, and of direct kinematics with the IMUs that there are.
+
+    With --set, all figures also for the mechanism with that change.
+    """
+    import numpy as np
+
+    from controller.workspace import Demands
+    from hil.studies import workspace
+
+    if not 3 <= options.points <= 1001:
+        raise InputError(f"a slice has {options.points} points along an edge; it can have 3 to 1001")
+    units = np.repeat([1e-3, np.radians(1.0)], 3)
+    move = np.append(np.zeros(3), np.radians(options.turned or np.zeros(3)))
+    demands = Demands(
+        twist=None if options.twist is None else units * options.twist,
+        load=np.zeros(6) if options.load is None else np.array(options.load),
+        forces=not options.geometry,
+        conditioning=not options.geometry,
+        imus=options.imus,
+        magnetometer=options.magnetometer,
+    )
+    shape = workspace.shape_from(options.box or (1.0, 1.0, 1.0, 0.0, 0.0, 0.0))
+    cases = [("as it is", []), *([("changed", options.set)] if options.set else [])]
+    mechanisms = [(label, workspace.changed_mechanism(options.mechanism, changes)) for label, changes in cases]
+    found = []
+    with progress_bar("the workspace") as progress:
+        for number, (label, mechanism) in enumerate(mechanisms):
+            progress(number / len(mechanisms))
+            at = None if options.at is None else 1e-3 * np.array(options.at)
+            found.append(workspace.explore(mechanism, label, move, shape, demands, options.points, at))
+    cli.write_json(options.json, workspace.summary(found, demands))
+    tables = workspace_tables(found)
+    if options.picture is not None:
+        from hil.reports.workspace_picture import write_picture
+
+        write_picture(found, options.picture)
+    cli.write_report(options, "workspace", found, tables)
+    for _, table in tables:
+        table.print()
+    if options.set:
+        print(f"changed: {' '.join(options.set)}")
+
+
+def workspace_tables(found: "Sequence[Workspace]") -> list[tuple[str, Table]]:
+    """The figures of workspaces, side by side, as titled tables."""
+    from controller.workspace import KINDS
+    from hil.studies.workspace import by_kind
+
+    headings = [heading for each in found for heading in ((each.label, "margin"), (each.label, "least"))]
+    at_pose = Table("at the pose", *headings)
+    for kind in KINDS:
+        least = [each.least(kind) for each in found]
+        if any(text for _, text in least):
+            at_pose.add(kind, *(cell for value, text in least for cell in (_in_unit(value, kind), text or "no limit")))
+    headings = [heading for each in found for heading in ((each.label, "way"), (each.label, "ended by"))]
+    travels = Table("travel along", *headings)
+    for name in found[0].travels:
+        cells = []
+        for each in found:
+            one = each.travels[name]
+            way = f"{deg(one.angle, 2)} deg" if name[1] == "r" else f"{mm(one.distance, 2)} mm"
+            cells += [way, one.limit.text if one.limit else "a full turn"]
+        travels.add(name, *cells)
+    regions = Table("region about the pose", *(each.label for each in found))
+    flat = found[0].mechanism.planar
+    unit, scale = ("cm2", 1e4) if flat else ("dm3", 1e3)
+    regions.add("straight moves reach", *(f"{scale * each.reach.volume:.4g} {unit}" for each in found))
+    unit = "rad" if flat else "rad3"
+    regions.add("turns in place reach", *(f"{each.turns.volume:.4g} {unit}" for each in found))
+    for name in ("box", "ellipsoid"):
+        regions.add(f"largest {name}, half sizes", *(_sizes(getattr(each, name).half_sizes) for each in found))
+        touched = [getattr(each, name).limit for each in found]
+        regions.add(f"largest {name} touches", *(limit.text if limit else "a full turn" for limit in touched))
+    binds = Table("ends this share of straight moves [%]", *(each.label for each in found))
+    shares = [by_kind(each.reach.shares) for each in found]
+    for kind in dict.fromkeys(kind for each in shares for kind in each):
+        binds.add(kind, *(f"{100.0 * each.get(kind, 0.0):.1f}" for each in shares))
+    titles = ("Margins at the pose", "Travel", "Region", "What ends straight moves")
+    return list(zip(titles, (at_pose, travels, regions, binds), strict=True))
+
+
+def _in_unit(value: float, kind: str) -> str:
+    """A margin in the unit in which it is shown."""
+    if value == float("inf"):
+        return "-"
+    if kind.endswith("swing"):
+        return f"{deg(value, 2)} deg"
+    if kind == "force":
+        return f"{value:.1f} N"
+    if kind == "speed":
+        return f"{mm(value, 1)} mm/s"
+    return f"{value:.3g}" if kind in ("Jacobian", "direct kinematics") else f"{mm(value, 2)} mm"
+
+
+def _sizes(half_sizes: "Array") -> str:
+    """Half sizes along the axes that vary, in mm and deg."""
+    lengths, angles = half_sizes[:3], half_sizes[3:]
+    parts = [" x ".join(mm(each, 2) for each in lengths if each > 0.0)] if lengths.any() else []
+    texts = [f"{parts[0]} mm"] if parts else []
+    if angles.any():
+        texts.append(f"{' x '.join(deg(each, 2) for each in angles if each > 0.0)} deg")
+    return ", ".join(texts)
 
 
 @cli.command(

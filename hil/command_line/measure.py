@@ -12,7 +12,7 @@ from plant.errors import InputError
 @cli.command(
     cli.setting("--duration", 60.0, "duration of the simulated motion [s]"),
     cli.setting("--target", "sines", "motion or CSV file"),
-    cli.argument("--only", choices=("loop", "plant", "kinematics", "clock"), help="one section instead of all"),
+    cli.argument("--only", choices=("loop", "plant", "kinematics", "workspace", "clock"), help="one section instead of all"),
     cli.setting(
         "--clock", 10.0, "time on the clock at 1 kHz, idle and again under load; 4 kHz gets a third [s]", metavar="SECONDS"
     ),
@@ -30,8 +30,8 @@ def gough_bench(options: Namespace) -> None:
 
     The loop on the clock: how late it wakes, beside cyclictest, and how long it computes, idle, under load and with a busy
     supervisor; its speed against real time and the microseconds of each stage; the plant's FMU, from compiled code and through
-    FMPy, and how exact it is; and direct kinematics: microseconds per pose, against Newton's method from lengths, and whether
-    both find the pose from cold.
+    FMPy, and how exact it is; direct kinematics: microseconds per pose, against Newton's method from lengths, and whether
+    both find the pose from cold; and the margins of a pose in the workspace, against inverse kinematics.
     """
     from hil.benchmarks.loop import machine, read_earlier
 
@@ -40,7 +40,8 @@ def gough_bench(options: Namespace) -> None:
             raise InputError(f"{name} is {seconds:g} s; it must be positive and finite")
     earlier = [read_earlier(path) for path in options.history]
     figures: dict[str, Any] = machine()
-    for section, measure in (("clock", _clock), ("loop", _loop), ("plant", _plant), ("kinematics", _kinematics)):
+    sections = {"clock": _clock, "loop": _loop, "plant": _plant, "kinematics": _kinematics, "workspace": _workspace}
+    for section, measure in sections.items():
         if options.only in (None, section):
             measure(options, figures)
     cli.write_json(options.json, figures)
@@ -187,3 +188,16 @@ def _kinematics(_: Namespace, figures: dict[str, Any]) -> None:
             shares = [rates[kind][key] for kind in ("newton", "directions") for key in ("success", "wrong")]
             table.add(f"{preset}, {where}", *(f"{100.0 * share:.1f}" for share in shares))
     table.print()
+
+
+def _workspace(_: Namespace, figures: dict[str, Any]) -> None:
+    from hil.benchmarks.workspace import measure_workspace
+
+    with progress_bar("the workspace"):
+        measured = figures["workspace"] = measure_workspace()
+    table = Table("workspace, one core", "us per pose", "over inverse kinematics")
+    table.add("inverse kinematics with Jacobian", f"{measured['inverse_us']:.3f}", "1.0")
+    for name, us in measured["margins_us"].items():
+        table.add(f"margins {name}", f"{us:.2f}", f"{measured['ratios'][name]:.1f}")
+    table.print()
+    print(f"one travel along a random direction, with all limits: {measured['travel_us']:.0f} us")

@@ -12,10 +12,10 @@ from hil.runs.config import SimulationConfig
 from hil.runs.names import check_names, digest_of, kept_file
 from hil.sweep.function import UserFunction
 from hil.sweep.study import FILES, Study, part_of
-from plant.errors import GoughError, InputError, UnknownNameError
+from plant.errors import GoughError, InputError
 from plant.mechanism import load_in_space
-from plant.mechanism.documents import mechanism_from_text, mechanism_text
-from plant.mechanism.joint_circles import reshaped
+from plant.mechanism.documents import mechanism_from_text, mechanism_text, set_entry
+from plant.mechanism.joint_circles import reshaped_entries
 
 GEOMETRY_FIGURE = "geometry."
 """How the names of figures begin that need no run."""
@@ -94,7 +94,7 @@ def measure(case: Case) -> dict[str, float]:
     config = case.local_config()
     figures: dict[str, float] = {}
     if case.geometry:
-        from controller.design.workspace import geometry_figures
+        from controller.workspace import geometry_figures
 
         section_5 = config.fusion == "section-5"
         found = geometry_figures(load_in_space(config.mechanism), config.imus, config.magnetometer, section_5)
@@ -209,29 +209,11 @@ def _changed_mechanism(name: str, changes: str, shape: str) -> bytes:
     document: Any = tomlkit.parse(mechanism_text(name))
     document["name"] = document.get("name", Path(name).stem)
     for entry, value in json.loads(changes).items():
-        *tables, last = entry.split(".")
-        inner = document
-        for part in tables:
-            in_list = isinstance(inner, list)
-            inner = inner[_index(part, inner, entry)] if in_list else inner.setdefault(part, tomlkit.table())
-        if isinstance(inner, list):
-            inner[_index(last, inner, entry)] = value
-        elif isinstance(inner, dict):
-            inner[last] = value
-        else:
-            raise UnknownNameError(f"the mechanism has no entry {entry}: {'.'.join(tables)} is no table")
+        set_entry(document, entry, value)
     if numbers := json.loads(shape):
-        base, platform, position = reshaped(mechanism_from_text(tomlkit.dumps(document), name), numbers)
-        geometry, home = (document.setdefault(table, tomlkit.table()) for table in ("geometry", "home"))
-        geometry["base_joints"], geometry["platform_joints"] = base.tolist(), platform.tolist()
-        home["position"] = position.tolist()
+        for entry, value in reshaped_entries(mechanism_from_text(tomlkit.dumps(document), name), numbers).items():
+            set_entry(document, entry, value)
     return tomlkit.dumps(document).encode()
-
-
-def _index(part: str, inner: Any, entry: str) -> int:
-    if not part.isdecimal() or int(part) >= len(inner):
-        raise UnknownNameError(f"the mechanism has no entry {entry}: {part!r} is no number from 0 to {len(inner) - 1}")
-    return int(part)
 
 
 def _flat(figures: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:

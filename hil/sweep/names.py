@@ -57,7 +57,8 @@ def check_entry(name: str) -> None:
     if part != "mechanism":
         return
     table, _, rest = entry.partition(".")
-    check_entries({table: None}, ("name", "based_on", "geometry", "home", *_SETTINGS, "plant"), "a mechanism")
+    tables = ("name", "based_on", "geometry", "home", "joints", "bodies", *_SETTINGS, "plant")
+    check_entries({table: None}, tables, "a mechanism")
     if table in _SETTINGS:
         check_entries({rest.partition(".")[0]: None}, sorted(each.name for each in fields(_SETTINGS[table])), f"[{table}]")
     elif table == "plant" and not any(rest == known or rest.startswith(f"{known}.") for known in _PARAMETERS):

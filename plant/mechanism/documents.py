@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from plant.checks import nearest
 from plant.errors import InputError, UnknownNameError
 from plant.files import check_entries, parse_toml, read_text, toml_entries
+from plant.mechanism.bodies import body_tables, swing_entries
 from plant.mechanism.checks import checked_joints
 from plant.mechanism.planar import PlanarMechanism, PlanarPose
 from plant.mechanism.spatial import LEGS, Mechanism
@@ -21,7 +22,7 @@ _JOINTS = ("base_joints", "platform_joints")
 _MUCH_SHORTER = 0.8
 _MOST_MASS_RATIO = 3.0
 _SETTINGS = ("control", "fusion", "safety", "drives")
-_ANY_ENTRY = ("limits", "plant", *_SETTINGS)
+_ANY_ENTRY = ("limits", "plant", *_SETTINGS, "joints", "bodies")
 """Tables whose entries are checked by those who read them."""
 
 _SAME_FRAMES = 1e-9
@@ -115,6 +116,8 @@ def mechanism_from_document(document: dict[str, Any]) -> Mechanism | PlanarMecha
         name=str(document.get("name", "custom")),
         home=home,
         limits=document.get("limits") or None,
+        joints=document.get("joints"),
+        bodies=document.get("bodies"),
         plant=_flattened(document.get("plant", {})),
         settings={name: document.get(name, {}) for name in _SETTINGS},
     )
@@ -151,6 +154,8 @@ def text_of_mechanism(mechanism: Mechanism | PlanarMechanism) -> str:
         "geometry": geometry,
         "home": _home_entries(mechanism.home, planar),
         "limits": {} if mechanism.limits is None else vars(mechanism.limits),
+        "joints": swing_entries(mechanism.joints, planar),
+        **body_tables(mechanism.bodies, planar),
         "plant": mechanism.plant,
         **mechanism.settings,
     }
@@ -178,6 +183,40 @@ def _home_entries(home: Pose | PlanarPose | None, planar: bool) -> dict[str, Any
     if planar:
         return {"position": home.position[:2], "angle": float(np.arctan2(home.rotation[1, 0], home.rotation[0, 0]))}
     return {"position": home.position, "quaternion": quaternion_from_rotation(home.rotation)}
+
+
+def set_entry(document: Any, entry: str, value: Any) -> None:
+    """Set an entry of a document, by its name with dots, such as limits.velocity or geometry.base_joints.0.2.
+
+    Raises:
+        UnknownNameError: the name leads into something that is no table or list, or beyond a list.
+    """
+    *tables, last = entry.split(".")
+    inner = document
+    for part in tables:
+        if isinstance(inner, list):
+            inner = inner[_index(part, inner, entry)]
+            continue
+        _check_table(inner, entry)
+        if part not in inner:
+            inner[part] = {}
+        inner = inner[part]
+    if isinstance(inner, list):
+        inner[_index(last, inner, entry)] = value
+    else:
+        _check_table(inner, entry)
+        inner[last] = value
+
+
+def _index(part: str, inner: list[Any], entry: str) -> int:
+    if not part.isdecimal() or int(part) >= len(inner):
+        raise UnknownNameError(f"the mechanism has no entry {entry}: {part!r} is no number from 0 to {len(inner) - 1}")
+    return int(part)
+
+
+def _check_table(inner: Any, entry: str) -> None:
+    if not isinstance(inner, dict):
+        raise UnknownNameError(f"the mechanism has no entry {entry}: {'.'.join(entry.split('.')[:-1])} is no table")
 
 
 def _preset_names() -> list[str]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -115,6 +116,12 @@ def reshaped(mechanism: Mechanism | PlanarMechanism, shape: Mapping[str, float])
         for side, circle in zip(("base", "platform"), circles, strict=True)
     )
     return base.joints(), platform.joints(), np.append(home[:2], float(shape.get("home_height", home[2])))
+
+
+def reshaped_entries(mechanism: Mechanism | PlanarMechanism, shape: Mapping[str, float]) -> dict[str, list[Any]]:
+    """The same as entries of a mechanism's file, by their names with dots; errors as for `reshaped`."""
+    names = ("geometry.base_joints", "geometry.platform_joints", "home.position")
+    return {name: array.tolist() for name, array in zip(names, reshaped(mechanism, shape), strict=True)}
 
 
 def _circles_and_home(mechanism: Mechanism | PlanarMechanism) -> tuple[tuple[JointCircle, JointCircle], Array]:

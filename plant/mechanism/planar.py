@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from plant.dynamics.variables import PLANAR
 from plant.errors import InputError
+from plant.mechanism.bodies import Bodies, Joints, checked_bodies, checked_swings
 from plant.mechanism.checks import SAME_JOINT_M, Limits, checked_joints, checked_limits, checked_plant, read_only
 from plant.pose import Array, checked_array
 
@@ -47,6 +48,8 @@ class PlanarMechanism:
     limits: Limits | None
     plant: Mapping[str, Array]
     settings: Mapping[str, Mapping[str, Any]]
+    joints: Joints | None = None
+    bodies: Bodies | None = None
 
     @classmethod
     def from_legs(
@@ -59,26 +62,40 @@ class PlanarMechanism:
         limits: Mapping[str, Any] | None = None,
         plant: Mapping[str, ArrayLike] | None = None,
         settings: Mapping[str, Mapping[str, Any]] | None = None,
+        joints: Mapping[str, Any] | None = None,
+        bodies: Mapping[str, Any] | None = None,
     ) -> "PlanarMechanism":
         """Build a mechanism from its two arrays of joints; the joints of a side may lie on one line.
 
         Arguments and errors as for `Mechanism.from_legs`, with joints (3, 2) and a stroke (2,) or (3, 2).
 
         Raises:
-            InputError: joints of a side that are all one point.
+            InputError: joints of a side that are all one point, or cones without a home.
         """
         base, platform = checked_joints(base_joints, platform_joints, (PLANAR_LEGS, 2))
-        for side, joints in (("base", base), ("platform", platform)):
-            apart = float(np.linalg.norm(joints - joints[0], axis=1).max())
+        for side, points in (("base", base), ("platform", platform)):
+            apart = float(np.linalg.norm(points - points[0], axis=1).max())
             if apart < SAME_JOINT_M:
                 raise InputError(
                     f"the {side} joints are all one point, apart by {apart:g} m and not by {SAME_JOINT_M:g} m: move one of them"
                 )
-        made = cls(name, base, platform, home, None, checked_plant(plant, PLANAR), read_only(settings))
+        thick = checked_bodies(bodies, PLANAR_LEGS, planar=True)
+        made = cls(name, base, platform, home, None, checked_plant(plant, PLANAR), read_only(settings), bodies=thick)
+        if joints:
+            made = replace(made, joints=made._checked_joints(joints))
         if limits is None:
             return made
         lengths = None if home is None else made.lengths_at(home.position, home.angle)
         return replace(made, limits=checked_limits(limits, PLANAR_LEGS, lengths))
+
+    def _checked_joints(self, joints: Mapping[str, Any]) -> Joints | None:
+        if self.home is None:
+            raise InputError("[joints] counts from the legs at home, and there is none: give a home pose")
+        legs = self.joints_at(self.home.position, self.home.angle) - self.base_joints
+        directions = np.pad(legs / np.linalg.norm(legs, axis=1, keepdims=True), ((0, 0), (0, 1)))
+        cosine, sine = np.cos(self.home.angle), np.sin(self.home.angle)
+        rotation = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        return checked_swings(joints, directions, rotation, planar=True)
 
     @property
     def stroke(self) -> Array | None:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from plant.checks import checked_seed
 from plant.dynamics.variables import PLANAR, SPATIAL, TINY, VariableTable, checked_parameters
 from plant.errors import InputError, UnreachableError
+from plant.mechanism.bodies import Bodies, Joints, checked_bodies, checked_swings
 from plant.mechanism.checks import (
     DERIVED,
     SAME_JOINT_M,
@@ -71,6 +72,8 @@ class Mechanism:
         limits: the actuators' limits, or None.
         plant: parameters of the dynamics by the names of `plant.dynamics.variables`.
         settings: the tables `control`, `fusion` and `safety`, which the controller reads.
+        joints: how far the joints swing, or None.
+        bodies: legs and plates that must not touch, or None.
     """
 
     name: str
@@ -83,6 +86,8 @@ class Mechanism:
     limits: Limits | None
     plant: Mapping[str, Array]
     settings: Mapping[str, Mapping[str, Any]]
+    joints: Joints | None = None
+    bodies: Bodies | None = None
 
     @classmethod
     def from_legs(
@@ -97,6 +102,8 @@ class Mechanism:
         limits: Mapping[str, Any] | None = None,
         plant: Mapping[str, ArrayLike] | None = None,
         settings: Mapping[str, Mapping[str, Any]] | None = None,
+        joints: Mapping[str, Any] | None = None,
+        bodies: Mapping[str, Any] | None = None,
     ) -> "Mechanism":
         """Build a mechanism from its two arrays of joints; everything else is optional.
 
@@ -106,6 +113,7 @@ class Mechanism:
             base_joint_axes: by default e_z x (home direction).
             home: without it, `nominal_home` defines the default axes but no length.
             limits: the fields of `Limits`; a stroke of (2,) [m] counts from the home lengths, (6, 2) is absolute.
+            joints, bodies: the entries of these tables in a file (docs/mechanism.md).
 
         Raises:
             InputError: geometry, a limit or a parameter that makes no sense, or for a run no room about home or limits
@@ -135,6 +143,8 @@ class Mechanism:
             limits=None if limits is None else checked_limits(limits, LEGS, lengths),
             plant=parameters,
             settings=read_only(settings),
+            joints=checked_swings(joints, directions, np.eye(3) if home is None else home.rotation, planar=False),
+            bodies=checked_bodies(bodies, LEGS, planar=False),
         )._fit_to_run()
 
     @classmethod
@@ -160,11 +170,13 @@ class Mechanism:
             limits=planar.limits,
             plant=planar.plant,
             settings=planar.settings,
+            joints=planar.joints,
+            bodies=planar.bodies,
         )._fit_to_run()
 
     def _fit_to_run(self) -> "Mechanism":
         """This mechanism. If it has all that a run needs, home and limits must leave room, and the drives must reach them."""
-        if self.home is not None and self.limits is not None and not self._lacking():
+        if self.plant_is_complete and self.home is not None and self.limits is not None:
             arms = self.platform_joints @ self.home.rotation.T
             check_room(self.limits, np.linalg.norm(self.home.position + arms - self.base_joints, axis=1))
             check_reach(self)
@@ -281,6 +293,11 @@ class Mechanism:
     @property
     def _table(self) -> VariableTable:
         return PLANAR if self.planar else SPATIAL
+
+    @property
+    def plant_is_complete(self) -> bool:
+        """Whether home, limits and all parameters of the dynamics are given."""
+        return self.home is not None and self.limits is not None and not self._lacking()
 
     def _lacking(self) -> list[str]:
         """The plant's parameters that follow from nothing."""

@@ -7,6 +7,8 @@ from hypothesis import strategies as st
 
 from controller.least_squares import (
     RANK_TOLERANCE,
+    determinant,
+    extreme_singular_values,
     factor_cholesky,
     invert_cholesky,
     solve_cholesky,
@@ -217,3 +219,29 @@ def test_a_rank_that_is_not_there_is_reported():
     args = (solution, null_space, np.zeros(3), np.zeros(3))
     assert solve_truncated(matrix.copy(), matrix[:, 0].copy(), 6, 2, *args) < RANK_TOLERANCE
     assert solve_truncated(matrix.copy(), matrix[:, 0].copy(), 6, 1, *args) == 1.0
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
+def test_singular_values_and_determinant_are_numpys(n):
+    random = np.random.default_rng(n)
+    for number in range(300):
+        matrix = random.normal(size=(6, 6))
+        if number % 3 == 0:
+            matrix[:, :n] *= 10.0 ** random.uniform(-3.0, 1.0, n)
+        if number % 5 == 0:
+            # Twofold singular values.
+            matrix[:n, :n] = np.repeat([1.0, 2.0, 3.0], 2)[:n, None] * np.linalg.qr(random.normal(size=(n, n)))[0]
+        corner = matrix[:n, :n].copy()
+        values, expected = np.linalg.svd(corner, compute_uv=False), np.linalg.det(corner)
+        scratch = np.empty((6, 6)), np.empty(6), np.empty(6)
+        least, greatest = extreme_singular_values(matrix.copy(), n, *scratch)
+        assert greatest == pytest.approx(values[0], rel=1e-13)
+        assert abs(least - values[-1]) * values[-1] < 1e-13 * values[0] ** 2
+        assert determinant(matrix.copy(), n) == pytest.approx(expected, rel=1e-9, abs=1e-12 * values[0] ** n)
+
+
+def test_a_singular_matrix_has_the_singular_value_zero():
+    scratch = np.empty((6, 6)), np.empty(6), np.empty(6)
+    for matrix in (np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 0.0]), np.zeros((6, 6))):
+        assert extreme_singular_values(matrix.copy(), 6, *scratch)[0] == 0.0
+        assert determinant(matrix.copy(), 6) == 0.0

@@ -5,10 +5,10 @@ import pytest
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from controller.design.workspace import geometry_figures, holding_forces, reach, reach_rotation, reach_share
 from controller.direct_kinematics import poses_from_lengths
 from controller.imu_set import check_imus
 from controller.inverse_kinematics import inverse_kinematics, leg_lengths, sample_workspace
+from controller.workspace.figures import geometry_figures, holding_forces, reach, reach_rotation, reach_share
 from plant.errors import InputError
 from plant.mechanism import Mechanism, load_spatial
 from plant.mechanism.joint_circles import reshaped

@@ -1,0 +1,42 @@
+"""Where a mechanism can go: margins of poses, travel along a direction, and the largest region about a pose."""
+
+from controller.workspace.extent import (
+    AXES,
+    Reach,
+    Region,
+    Slice,
+    largest_box,
+    largest_ellipsoid,
+    poses_about,
+    reach_from,
+    slice_about,
+)
+from controller.workspace.figures import geometry_figures
+from controller.workspace.limits import GEOMETRY_ALONE, KINDS, LIMITS, Demands, Limit
+from controller.workspace.margins import Margins, margins, margins_at
+from controller.workspace.travel import Travel, pose_along, travel, travels
+
+__all__ = [
+    "AXES",
+    "GEOMETRY_ALONE",
+    "KINDS",
+    "LIMITS",
+    "Demands",
+    "Limit",
+    "Margins",
+    "Reach",
+    "Region",
+    "Slice",
+    "Travel",
+    "geometry_figures",
+    "largest_box",
+    "largest_ellipsoid",
+    "margins",
+    "margins_at",
+    "pose_along",
+    "poses_about",
+    "reach_from",
+    "slice_about",
+    "travel",
+    "travels",
+]
