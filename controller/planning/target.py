@@ -1,4 +1,4 @@
-"""Target motions: poses over time, from a CSV file or a built-in motion."""
+"""Target motions: poses over time, from a CSV file, a motion file, or a built-in motion."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from controller.planning.motions import HELD, MARGIN_S, NAMES, named_motion
+from controller.planning.motions import HELD, MARGIN_S, NAMES, PlannedMotion, load_motion, named_motion, plan_motion
 from plant.checks import check_duration, nearest
 from plant.csv import read_csv
 from plant.errors import InputError, UnknownNameError
@@ -18,6 +18,9 @@ COLUMNS = ("time_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 
 HELD_COLUMNS = ("from_s", *COLUMNS[1:])
 """Of poses that are held, each from its time on."""
+
+MOTION_SUFFIX = ".toml"
+"""Of the name of a motion file."""
 
 _IN_PLANE_M, _IN_PLANE_RAD = 1e-9, 1e-6
 """Largest deviation from the plane that counts as in the plane."""
@@ -32,6 +35,8 @@ class Target:
     positions: Array  # (N, 3) [m], origin of {2} in {1}
     rotations: Array  # (N, 3, 3), map {2} to {1}
     held: bool = False  # whether each pose is held until the time of the next one; else the platform passes through it
+    segments: Array | None = None  # (n, m, 5), the reference of the actuators, if the poses were planned with it
+    remarks: tuple[str, ...] = ()  # what a user should know of it, a line each
 
     @property
     def start(self) -> Pose:
@@ -54,7 +59,7 @@ class Target:
 
     def other_readings(self, mechanism: Mechanism) -> Iterator[tuple[str, Array]]:
         """What the positions of a file may have been meant as, in words, and the positions (N, 3) [m] then."""
-        if self.name in NAMES:
+        if self.name in NAMES or self.segments is not None:
             return
         home = mechanism.require_home().position
         given = self.positions - home
@@ -90,30 +95,48 @@ def _interpolate(knots: Array, values: Array, times: Array) -> Array:
 
 def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float) -> Target:
     """A built-in motion by its name, or the displacements from home in a CSV file, cut to `duration` [s]; in a file whose
-    header begins with `from_s` instead of `time_s`, each pose is held until the next one.
+    header begins with `from_s` instead of `time_s`, each pose is held until the next one. A motion file (`.toml`) is planned
+    whole, within all limits.
 
     Raises:
         UnknownNameError: neither a motion nor a file.
-        InputError: the file is malformed, not finite, out of order, its quaternions are off unit by more than 1e-3, or it
-            leaves the plane of a planar mechanism.
+        InputError: the file is malformed, not finite, out of order, its quaternions are off unit by more than 1e-3, it
+            leaves the plane of a planar mechanism, or a motion file is too fast.
+        UnreachableError: a motion file needs a leg outside its stroke.
     """
     check_duration(duration)
     name = str(name_or_path)
     if name in NAMES:
         return Target(name, *named_motion(name, mechanism, duration), held=name in HELD)
     check_target(name)
-    target = _cut(_read_csv(Path(name_or_path), mechanism), duration)
+    path = Path(name_or_path)
+    if path.suffix == MOTION_SUFFIX:
+        target = target_of_motion(plan_motion(load_motion(path), mechanism), duration)
+    else:
+        target = _cut(_read_csv(path, mechanism), duration)
     if mechanism.planar:
         _check_in_plane(target, mechanism)
     return target
 
 
+def target_of_motion(motion: PlannedMotion, duration: float) -> Target:
+    """The target of a planned motion, for a run of `duration` [s]."""
+    takes = f"{motion.duration:.3f}"
+    cut = f"{motion.name} takes {takes} s, and the run ends after {duration:g} s: --duration {takes} lets it end"
+    return Target(
+        name=motion.name,
+        times=motion.times,
+        positions=motion.positions,
+        rotations=motion.rotations,
+        segments=motion.segments,
+        remarks=(*motion.remarks, *([cut] if motion.duration > duration + 1e-3 else [])),
+    )
+
+
 def check_target(name: str) -> None:
     """Check that there is a motion or a file of this name, or raise an `UnknownNameError`."""
     if name not in NAMES and not Path(name).is_file():
-        raise UnknownNameError(
-            f"no target {name!r}: neither a motion ({', '.join(NAMES)}) nor a CSV file{nearest(name, NAMES)}"
-        )
+        raise UnknownNameError(f"no target {name!r}: neither a motion ({', '.join(NAMES)}) nor a file{nearest(name, NAMES)}")
 
 
 def text_of_target(target: Target, mechanism: Mechanism) -> str:
