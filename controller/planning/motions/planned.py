@@ -49,6 +49,9 @@ _PACES = (1.0, 0.92, 0.84, 0.74, 0.6, 0.45)
 """Shares of the fastest cruise that are tried for a way: a slower one leaves more acceleration for where the way bends."""
 
 _FITS = 4
+_TOOL_SAMPLES = 8
+"""How often a way is fitted to the limits at each pace, and how many samples of the tool's motion an interval has."""
+
 _MOST_KNOTS = 6000
 _LONGEST_PERIOD_S = 0.1
 
@@ -371,7 +374,8 @@ class _MotionPlanner:
         values = np.hstack(course.at(parameters))
         return spline_at_rest(times, self._lengths(values)), spline_at_rest(times, values)
 
-    def _peaks(self, legs: Array, poses: Array, limits: ToolLimits) -> list[Peak]:
+    def _peaks(self, legs: Array, poses: Array, limits: ToolLimits, samples: int = _TOOL_SAMPLES) -> list[Peak]:
+        """The greatest values of all quantities: those of the actuators exactly, those of the tool by samples."""
         extrema, places = _extrema(legs)
         peaks = []
         for q, (name, unit) in enumerate(_LEG_QUANTITIES):
@@ -379,7 +383,8 @@ class _MotionPlanner:
             value, time = float(extrema[leg, 2 + q]), float(places[leg, 2 + q])
             peaks.append(Peak(f"{name} of leg {leg}", unit, 1 + q, value, float(self._most[q]), time))
         knots = poses[0, :, START]
-        times = np.sort(np.concatenate([knots, 0.5 * (knots[1:] + knots[:-1])]))
+        shares = np.arange(samples) / samples
+        times = np.append((knots[:-1, None] + shares * np.diff(knots)[:, None]).ravel(), knots[-1])
         for (name, unit, order), sizes in zip(_TOOL_QUANTITIES, _tool_sizes(curve_at(poses, times)), strict=True):
             at = int(sizes.argmax())
             peaks.append(
@@ -409,7 +414,7 @@ class _MotionPlanner:
             for _ in range(_FITS):
                 profile = _profile(*most)
                 curves = self._along(course, profile)
-                peaks = self._peaks(*curves, limits)
+                peaks = self._peaks(*curves, limits, 2)
                 shares = np.array([max(peak.share for peak in peaks if peak.order == order) for order in (1, 2, 3)])
                 duration = profile[0, -1, START] * max(peak.stretch for peak in peaks)
                 if found is None or duration < found[0]:
