@@ -48,7 +48,7 @@ def read_toml(path: Path | str) -> dict[str, Any]:
 
 
 def toml_entries(values: Mapping[str, Any]) -> list[str]:
-    """The TOML lines of texts, switches, numbers, and lists or arrays of numbers; a number is read again as it was."""
+    """The TOML lines of texts, switches, numbers, lists, arrays and inline tables of them; a number is read again as it was."""
     return [f"{name} = {_toml(value.tolist() if hasattr(value, 'tolist') else value)}" for name, value in values.items()]
 
 
@@ -57,6 +57,8 @@ def _toml(value: Any) -> str:
         return json.dumps(value, ensure_ascii=False)
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_toml, value))}]"
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(toml_entries(value))}}}"
     return f"{value!r}".lower()
 
 

@@ -7,21 +7,20 @@ arrives in time and every leg can still stop inside its stroke after it. Otherwi
 the stop itself.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from ruckig import ControlInterface, InputParameter, Result, Ruckig, RuckigError, Synchronization, Trajectory
+from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Trajectory
 
 from controller.inverse_kinematics import leg_lengths
-from controller.planning.motions import SAMPLE_PERIOD_S
-from controller.planning.segments import state_after, stop_phases, write_segment
+from controller.planning.motions.built_in import SAMPLE_PERIOD_S
+from controller.planning.segments import segment_extrema, state_after, stop_phases, write_segment
 from controller.planning.target import Target
+from controller.planning.trajectory_generator import calculate, phases_of
 from plant.compiled import kernel
 from plant.errors import PlanningError, UnreachableError
 from plant.mechanism import Limits, Mechanism, six_rows
 from plant.pose import Array
-from plant.vectors import Vector
 
 PREVIEW_S = 0.03
 _LATEST_S = 2.0 * PREVIEW_S
@@ -47,13 +46,15 @@ class Reference:
 
 
 def plan(mechanism: Mechanism, target: Target, duration: float) -> Reference:
-    """Plan a whole recorded motion before it starts, from rest at its first pose.
+    """Plan a whole recorded motion before it starts, from rest at its first pose; one that has its reference already keeps it.
 
     Raises:
         UnreachableError: a target pose needs a leg outside its stroke.
         PlanningError: ruckig found no motion, not even a stop.
     """
     limits = mechanism.require_limits()
+    if target.segments is not None:
+        return Reference(six_rows(target.segments), count_violations(target.segments, duration, limits))
     _check_reach(mechanism, target)
     knots = max(1, int(np.ceil(duration / SAMPLE_PERIOD_S - 1e-9)))
     positions, rates, accelerations = _aims(mechanism, target, knots)
@@ -173,21 +174,6 @@ def ruckig_input(limits: Limits, interface: ControlInterface, minimum_duration: 
     return parameters
 
 
-def calculate(otg: Ruckig, parameters: InputParameter, state: Sequence[list[float]], trajectory: Trajectory) -> bool:
-    """Let ruckig plan from a state, lengths, rates and accelerations (legs,) each; returns whether there is a plan."""
-    parameters.current_position, parameters.current_velocity, parameters.current_acceleration = state
-    try:
-        return otg.calculate(parameters, trajectory) in (Result.Working, Result.Finished)
-    except (RuckigError, ValueError):
-        # ValueError: a result code of ruckig that its own binding does not know.
-        return False
-
-
-def phases_of(trajectory: Trajectory) -> Array:
-    """Durations and jerks (legs, 2, 9) of a plan of ruckig."""
-    return np.array([((*each.brake.t, *each.t), (*each.brake.j, *each.j)) for each in trajectory.profiles[0]])
-
-
 def _aims(mechanism: Mechanism, target: Target, knots: int) -> tuple[Array, Array, Array]:
     """Lengths, rates and accelerations (knots, legs) to aim at, within the limits."""
     limits = mechanism.require_limits()
@@ -246,31 +232,6 @@ def _collect_segments(plans: Array, states: Array, starts: Array, segments: Arra
 
 
 @kernel
-def _segment_extrema(state: Vector, j: float, t: float) -> Vector:
-    """Least and greatest position, and greatest speed, over a cubic segment of jerk j and duration t."""
-    p, v, a = state
-    end, rate, _ = state_after(state, j, t)
-    least, greatest = min(p, end), max(p, end)
-    speed = max(abs(v), abs(rate))
-    # Positions peak where v + a s + j s^2 / 2 = 0, speeds where a + j s = 0.
-    if j == 0.0:
-        first = -v / a if a != 0.0 else -1.0
-        second = -1.0
-    else:
-        root = a * a - 2.0 * j * v
-        root = np.sqrt(root) if root > 0.0 else np.nan
-        first, second = (-a + root) / j, (-a - root) / j
-        s = -a / j
-        if 0.0 < s < t:
-            speed = max(speed, abs(state_after(state, j, s)[1]))
-    for s in (first, second):
-        if 0.0 < s < t:
-            at = state_after(state, j, s)[0]
-            least, greatest = min(least, at), max(greatest, at)
-    return least, greatest, speed
-
-
-@kernel
 def _stops_inside(state: Array, stroke: Array, limits: Array) -> bool:
     """Whether every leg, from its state (3, legs), can stop within the stroke (legs, 2) and the limits of acceleration and
     jerk.
@@ -279,7 +240,7 @@ def _stops_inside(state: Array, stroke: Array, limits: Array) -> bool:
         p, now = state[0, k], (0.0, state[1, k], state[2, k])
         least = greatest = 0.0
         for jerk, duration in stop_phases(now[1], now[2], limits[0], limits[1]):
-            low, high, _ = _segment_extrema(now, jerk, duration)
+            low, high, _ = segment_extrema(now, jerk, duration)
             least, greatest = min(least, low), max(greatest, high)
             now = state_after(now, jerk, duration)
         if p + least < stroke[k, 0] - _STROKE_SLACK or p + greatest > stroke[k, 1] + _STROKE_SLACK:
@@ -300,7 +261,7 @@ def _count_violations(segments: Array, horizon: float, stroke: Array, limits: Ar
                 end = min(end, segments[k, i + 1, 0])
             t = end - start
             p, v, a, j = segments[k, i, 1], segments[k, i, 2], segments[k, i, 3], segments[k, i, 4]
-            least, greatest, speed = _segment_extrema((p, v, a), j, t)
+            least, greatest, speed = segment_extrema((p, v, a), j, t)
             acceleration = max(abs(a), abs(a + t * j))
             # Written so that NaN is a violation.
             inside = (

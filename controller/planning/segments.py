@@ -30,6 +30,31 @@ def state_after(state: Vector, jerk: float, time: float) -> Vector:
 
 
 @kernel
+def segment_extrema(state: Vector, j: float, t: float) -> Vector:
+    """Least and greatest position, and greatest speed, over a cubic segment of jerk j and duration t."""
+    p, v, a = state
+    end, rate, _ = state_after(state, j, t)
+    least, greatest = min(p, end), max(p, end)
+    speed = max(abs(v), abs(rate))
+    # Positions peak where v + a s + j s^2 / 2 = 0, speeds where a + j s = 0.
+    if j == 0.0:
+        first = -v / a if a != 0.0 else -1.0
+        second = -1.0
+    else:
+        root = a * a - 2.0 * j * v
+        root = np.sqrt(root) if root > 0.0 else np.nan
+        first, second = (-a + root) / j, (-a - root) / j
+        s = -a / j
+        if 0.0 < s < t:
+            speed = max(speed, abs(state_after(state, j, s)[1]))
+    for s in (first, second):
+        if 0.0 < s < t:
+            at = state_after(state, j, s)[0]
+            least, greatest = min(least, at), max(greatest, at)
+    return least, greatest, speed
+
+
+@kernel
 def write_segment(segment: Array, start: float, state: Vector, jerk: float) -> None:
     """Write a row of the segments."""
     segment[START], segment[JERK] = start, jerk

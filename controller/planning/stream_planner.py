@@ -15,11 +15,12 @@ from ruckig import ControlInterface, Ruckig, Trajectory
 
 from controller.frames import ActiveFrames
 from controller.inverse_kinematics import leg_lengths
-from controller.planning.offline_planner import PREVIEW_S, calculate, count_violations, phases_of, ruckig_input
+from controller.planning.offline_planner import PREVIEW_S, count_violations, ruckig_input
 from controller.planning.plan_handover import PLAN_SEGMENTS, STREAM_PATIENCE_S, rest
 from controller.planning.segments import LENGTH, START, evaluate_reference, state_after, stop_phases, write_segment
 from controller.planning.target import poses_of
 from controller.planning.target_motion import STILL_M, TargetMotion
+from controller.planning.trajectory_generator import calculate, phases_of
 from controller.safety.causes import Cause
 from plant.compiled import kernel
 from plant.errors import GoughError, InputError

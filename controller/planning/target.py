@@ -1,4 +1,4 @@
-"""Target motions: poses over time, from a CSV file or a built-in motion."""
+"""Target motions: poses over time, from a CSV file, a motion file, or a built-in motion."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -7,7 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from controller.frames import ActiveFrames
-from controller.planning.motions import HELD, MARGIN_S, MOTIONS, NAMES, named_motion
+from controller.planning.motions import (
+    HELD,
+    MARGIN_S,
+    MOTIONS,
+    NAMES,
+    PlannedMotion,
+    load_motion,
+    named_motion,
+    plan_motion,
+)
 from plant.checks import check_duration, nearest
 from plant.csv import read_csv
 from plant.errors import InputError, UnknownNameError
@@ -19,6 +28,9 @@ COLUMNS = ("time_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 
 HELD_COLUMNS = ("from_s", *COLUMNS[1:])
 """Of poses that are held, each from its time on."""
+
+MOTION_SUFFIX = ".toml"
+"""Of the name of a motion file."""
 
 _IN_PLANE_M, _IN_PLANE_RAD = 1e-9, 1e-6
 """Largest deviation from the plane that counts as in the plane."""
@@ -34,6 +46,8 @@ class Target:
     rotations: Array  # (N, 3, 3), map {2} to {1}
     held: bool = False  # whether each pose is held until the time of the next one; else the platform passes through it
     absolute: bool = False  # whether its file has poses in a frame, not displacements from home
+    segments: Array | None = None  # (n, m, 5), the reference of the actuators, if the poses were planned with it
+    remarks: tuple[str, ...] = ()  # what a user should know of it, a line each
 
     @property
     def start(self) -> Pose:
@@ -56,7 +70,7 @@ class Target:
 
     def other_readings(self, mechanism: Mechanism) -> Iterator[tuple[str, Array]]:
         """What the positions of a file may have been meant as, in words, and the positions (N, 3) [m] then."""
-        if self.name in NAMES or self.absolute:
+        if self.name in NAMES or self.absolute or self.segments is not None:
             return
         home = mechanism.require_home().position
         given = self.positions - home
@@ -92,15 +106,17 @@ def _interpolate(knots: Array, values: Array, times: Array) -> Array:
 
 def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float, frames: ActiveFrames | None = None) -> Target:
     """A built-in motion by its name, or the displacements from home in a CSV file, cut to `duration` [s]; in a file whose
-    header begins with `from_s` instead of `time_s`, each pose is held until the next one.
+    header begins with `from_s` instead of `time_s`, each pose is held until the next one. A motion file (`.toml`) is planned
+    whole, within all limits.
 
     With `frames` a file has poses of the tool in the work frame, if that is one of a file, and a motion displaces the tool from
     where it is at home, along the axes of the work frame. The target's poses are those of {2} in the root of the work frame.
 
     Raises:
         UnknownNameError: neither a motion nor a file.
-        InputError: the file is malformed, not finite, out of order, its quaternions are off unit by more than 1e-3, or it
-            leaves the plane of a planar mechanism.
+        InputError: the file is malformed, not finite, out of order, its quaternions are off unit by more than 1e-3, it
+            leaves the plane of a planar mechanism, or a motion file is too fast.
+        UnreachableError: a motion file needs a leg outside its stroke.
     """
     check_duration(duration)
     name, home = str(name_or_path), mechanism.require_home()
@@ -115,18 +131,36 @@ def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float,
             positions, rotations = moved.position, moved.rotation
         return Target(name, times, positions, rotations, held=name in HELD)
     check_target(name)
-    target = _cut(_read_csv(Path(name_or_path), home, frames), duration)
+    path = Path(name_or_path)
+    if path.suffix == MOTION_SUFFIX:
+        if frames is not None:
+            raise InputError(f"{name} is a motion file, whose poses are displacements of {{2}} along {{1}}: leave --frames out")
+        target = target_of_motion(plan_motion(load_motion(path), mechanism), duration)
+    else:
+        target = _cut(_read_csv(path, home, frames), duration)
     if mechanism.planar:
         _check_in_plane(target, mechanism)
     return target
 
 
+def target_of_motion(motion: PlannedMotion, duration: float) -> Target:
+    """The target of a planned motion, for a run of `duration` [s]."""
+    takes = f"{motion.duration:.3f}"
+    cut = f"{motion.name} takes {takes} s, and the run ends after {duration:g} s: --duration {takes} lets it end"
+    return Target(
+        name=motion.name,
+        times=motion.times,
+        positions=motion.positions,
+        rotations=motion.rotations,
+        segments=motion.segments,
+        remarks=(*motion.remarks, *([cut] if motion.duration > duration + 1e-3 else [])),
+    )
+
+
 def check_target(name: str) -> None:
     """Check that there is a motion or a file of this name, or raise an `UnknownNameError`."""
     if name not in NAMES and not Path(name).is_file():
-        raise UnknownNameError(
-            f"no target {name!r}: neither a motion ({', '.join(NAMES)}) nor a CSV file{nearest(name, NAMES)}"
-        )
+        raise UnknownNameError(f"no target {name!r}: neither a motion ({', '.join(NAMES)}) nor a file{nearest(name, NAMES)}")
 
 
 def text_of_target(target: Target, mechanism: Mechanism, frames: ActiveFrames | None = None) -> str:

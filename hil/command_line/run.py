@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 from hil.command_line import cli
 from hil.command_line.apart import go_on_apart
-from hil.command_line.terminal import QUANTILES, deg, live_view, mm, progress_bar, say
+from hil.command_line.terminal import QUANTILES, deg, live_view, mm, number_text, progress_bar, say
 from hil.realtime.scheduling import RealTimeSettings, keep_to_one_thread
 from hil.runs.config import SimulationConfig
 from hil.table import Cell, Table
 from plant.errors import InputError
+from plant.files import write_whole
 
 if TYPE_CHECKING:
     from hil.runs.snapshot import Snapshot
@@ -246,6 +247,48 @@ def _bars(bars: list[list[float]]) -> str:
 
 def _timing_cell(us: float, limit: float) -> Cell:
     return Cell(f"{us:.1f} / {f'{limit:g}' if limit < inf else ' -'}", alarm=us > limit)
+
+
+_MOST_ROWS = 60
+
+
+@cli.command(
+    cli.source("file", "FILE.toml", "the motion (docs/motions.md)"),
+    cli.options_of(SimulationConfig, "mechanism"),
+    cli.output("--csv", "FILE.csv", "write its poses, every 2 ms, as displacements from home: a target for other programs"),
+    cli.JSON,
+)
+def gough_motion(options: Namespace) -> None:
+    """Plan a motion file, and print how long it takes and which limits bind; nothing is moved or simulated."""
+    cli.check_outputs(options, inputs=[options.file])
+    with progress_bar(f"{options.file}"):
+        from controller.planning.motions import load_motion, plan_motion
+        from controller.planning.target import target_of_motion, text_of_target
+        from plant.mechanism import load_in_space
+
+        mechanism = load_in_space(options.mechanism)
+        planned = plan_motion(load_motion(options.file), mechanism)
+        target = target_of_motion(planned, planned.duration)
+    if options.csv is not None:
+        write_whole(options.csv, text_of_target(target, mechanism).encode())
+    cli.write_json(options.json, planned.summary())
+    table = Table("element", "from [s]", "takes [s]", "limit that binds", "reached [%]", "at [s]", left=(0, 3))
+    for part in planned.parts[:_MOST_ROWS]:
+        label = f"{part.label}, rest" if part.binding is None else part.label
+        peak = part.binding
+        binds = ("", "", "") if peak is None else (peak.name, f"{100.0 * peak.share:.1f}", f"{peak.time:.3f}")
+        table.add(label, f"{part.begin:.3f}", f"{part.duration:.3f}", *binds)
+    table.print()
+    if len(planned.parts) > _MOST_ROWS:
+        print(f"and {len(planned.parts) - _MOST_ROWS} more")
+    table = Table("greatest", "value", "limit", "reached [%]", "at [s]", "")
+    for peak in planned.peaks:
+        limit = ("-", "-") if peak.most == inf else (number_text(peak.most), f"{100.0 * peak.share:.1f}")
+        table.add(peak.name, number_text(peak.value), *limit, f"{peak.time:.3f}", peak.unit)
+    table.print()
+    for remark in target.remarks:
+        print(remark)
+    print(f"{planned.name} takes {planned.duration:.3f} s on {options.mechanism}, within all limits")
 
 
 @cli.command(cli.source("files", "FILE.mcap", "files of one run, in their order", nargs="+"), cli.JSON)

@@ -80,8 +80,9 @@ class SimulationConfig:
     mechanism: str = option("hexapod", MECHANISM)
     target: str = option(
         "circle",
-        "hold, circle, sines, steps, near-rests, rests, shaking, probing, or a CSV file of displacements from home "
-        "(time_s,x_m,y_m,z_m,qw,qx,qy,qz); for 'gough run' also stream or stream:HOST:PORT, as 'gough stream-target' sends",
+        "hold, circle, sines, steps, near-rests, rests, shaking, probing, a motion file (docs/motions.md), or a CSV file of "
+        "displacements from home (time_s,x_m,y_m,z_m,qw,qx,qy,qz); for 'gough run' also stream or stream:HOST:PORT, as "
+        "'gough stream-target' sends",
     )
     duration: float = option(10.0, "duration of the motion, after the hold on the brakes", unit="s")
     rate: float = option(1000.0, "cycles per second, 50 to 4000", unit="Hz")

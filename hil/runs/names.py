@@ -91,11 +91,14 @@ def _mechanism_file(given: Any, config: Any) -> tuple[str, bytes]:
 
 
 def _target_file(given: Any, config: Any) -> tuple[str, bytes]:
-    """The displacements of a target from the home of the configuration's mechanism, or its poses in the frames."""
-    from controller.planning.target import Target, text_of_target
+    """A motion, or the displacements of a target from the home of the configuration's mechanism, or its poses in the frames."""
+    from controller.planning.motions import Motion, text_of_motion
+    from controller.planning.target import MOTION_SUFFIX, Target, text_of_target
     from plant.mechanism import load_in_space
 
-    _check_kind("target", given, Target)
+    _check_kind("target", given, Target, Motion)
+    if isinstance(given, Motion):
+        return f"{_stem(given.name)}{MOTION_SUFFIX}", text_of_motion(given).encode()
     if config is None:
         raise InputError(
             f"the target {given.name!r} has no mechanism from whose home it counts: give a motion or a file by name"

@@ -139,6 +139,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             encoder_remark(lead) or integrity_remark(mechanism, fusion, config.imus, config.magnetometer),
             evidence_remark(mechanism, config.rate, config.fusion == "section-5"),
             aliasing_remark(model, config.rate),
+            *target.remarks,
         ]
         count = int(parameters["rig"]["hold_cycles"]) + round(config.duration * config.rate)
         most = count + longest_delay(parameters)

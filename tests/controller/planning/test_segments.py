@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruckig import ControlInterface, Ruckig, Trajectory
 
-from controller.planning.offline_planner import calculate, ruckig_input
+from controller.planning.offline_planner import ruckig_input
 from controller.planning.segments import (
     APPROACH_SEGMENTS,
     STOP_SEGMENTS,
@@ -16,6 +16,7 @@ from controller.planning.segments import (
     plan_stop,
     stop_phases,
 )
+from controller.planning.trajectory_generator import calculate
 from plant.mechanism import Limits
 from tests.controller.planning.sampled_reference import sample_reference
 

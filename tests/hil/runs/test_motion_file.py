@@ -1,0 +1,80 @@
+"""A motion file in the closed loop: with ideal sensors, the platform goes straight where the motion does."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hil.command_line import main
+from hil.runs.config import SimulationConfig
+from hil.runs.simulation import simulate
+
+FIRST, LAST = np.array([0.04, -0.02, 0.01]), np.array([-0.03, 0.03, -0.01])
+FIRST_TURN, LAST_TURN = np.array([4.0, -3.0, 6.0]), np.array([-4.0, 3.0, -6.0])
+MOTION = f"""
+[limits]
+speed = 0.05
+acceleration = 0.2
+jerk = 2
+
+[[elements]]
+kind = "line"
+to = {{position = {FIRST.tolist()}, rotation_deg = {FIRST_TURN.tolist()}}}
+dwell = 1
+
+[[elements]]
+kind = "line"
+to = {{position = {LAST.tolist()}, rotation_deg = {LAST_TURN.tolist()}}}
+dwell = 0.2
+"""
+
+
+@pytest.fixture
+def path(tmp_path):
+    made = tmp_path / "line.toml"
+    made.write_text(MOTION)
+    return made
+
+
+def test_a_command_tells_what_binds(path, tmp_path, capsys):
+    figures, poses = tmp_path / "figures.json", tmp_path / "poses.csv"
+    assert main(["motion", str(path), "--json", str(figures), "--csv", str(poses)]) == 0
+    out = capsys.readouterr().out
+    assert "speed of the tool" in out and "within all limits" in out
+    found = json.loads(figures.read_text())
+    assert [each["binding"] for each in found["elements"]] == ["speed of the tool", None] * 2
+    speed = next(each for each in found["peaks"] if each["name"] == "speed of the tool")
+    assert speed["limit"] == 0.05 and speed["value"] == pytest.approx(0.05, rel=1e-4)
+    table = np.loadtxt(poses, delimiter=",", skiprows=1)
+    reached = table[np.searchsorted(table[:, 0], found["elements"][1]["begin"] + 0.1)]
+    np.testing.assert_allclose(reached[1:4], FIRST, atol=1e-8)
+    assert found["duration"] == pytest.approx(table[-2, 0], abs=0.003)
+
+
+def test_a_motion_out_of_reach_is_refused_in_a_line(path, capsys):
+    path.write_text('[[elements]]\nkind = "line"\nto = {position = [0, 0, 0.3]}\n')
+    assert main(["motion", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("gough: line.toml, element 1 (line), leaves the strokes at") and error.count("\n") == 1
+
+
+def test_a_line_is_straight_in_the_loop(path, hexapod):
+    """Within 0.05 mm and 0.02 deg, once the estimate has settled."""
+    result = simulate(SimulationConfig(target=str(path), imu="ideal", duration=6.0))
+    assert result.reference.violations == 0
+    rest = np.linalg.norm(result.target_positions - hexapod.home.position - FIRST, axis=1) < 1e-9
+    begin = result.times[rest].max()
+    moving = (result.times > begin) & (result.times < begin + np.linalg.norm(LAST - FIRST) / 0.05 + 0.35)
+    first, last = Rotation.from_rotvec(FIRST_TURN, degrees=True), Rotation.from_rotvec(LAST_TURN, degrees=True)
+    along, whole = (LAST - FIRST) / np.linalg.norm(LAST - FIRST), (last * first.inv()).as_rotvec(degrees=True)
+    for positions, rotations, most, most_turn in (
+        (result.reference_positions, result.reference_rotations, 0.02e-3, 0.005),
+        (result.true_positions, result.true_rotations, 0.05e-3, 0.02),
+    ):
+        away = positions[moving] - hexapod.home.position - FIRST
+        assert np.linalg.norm(away[-1] - (LAST - FIRST)) < 1e-4
+        assert np.linalg.norm(away - np.outer(away @ along, along), axis=1).max() < most
+        turns = (Rotation.from_matrix(rotations[moving] @ hexapod.home.rotation.T) * first.inv()).as_rotvec(degrees=True)
+        axis = whole / np.linalg.norm(whole)
+        assert np.linalg.norm(turns - np.outer(turns @ axis, axis), axis=1).max() < most_turn
