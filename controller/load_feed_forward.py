@@ -38,18 +38,19 @@ STATE = record_dtype(
 """The feed-forward [m/s], the load of each drive [N], the static forces on the platform [N], and scratch."""
 
 
-def load_parameters(mechanism: Mechanism, command_delay: float) -> Record:
-    """The constants of the feed-forward (dtype `PARAMETERS`)."""
+def load_parameters(mechanism: Mechanism, command_delay: float, position: bool = False) -> Record:
+    """The constants of the feed-forward (dtype `PARAMETERS`); drives that close a `position` loop do not droop."""
     plant = mechanism.plant_parameters()
     turns = 2.0 * np.pi / plant["motor.screw_lead"]
     force_constant = turns * plant["motor.torque_constant"]
     mass = plant["platform.mass"] + plant["payload.mass"]
     sliding_mass = plant["leg.upper.mass"] + plant["motor.rotor_inertia"] * turns**2
+    droop = plant["drive.nominal_resistance"] * (1.0 - plant["drive.compensation"]) / force_constant**2
     moments = [plant[f"{body}.mass"] * plant[f"{body}.center_of_mass"] for body in ("platform", "payload")]
     return filled(
         PARAMETERS,
         command_delay=command_delay,
-        droop=plant["drive.nominal_resistance"] * (1.0 - plant["drive.compensation"]) / force_constant**2,
+        droop=0.0 if position else droop,
         moving_mass=sliding_mass + mass / mechanism.legs,
         mass=mass,
         first_moment=np.pad(moments[0] + moments[1], (0, 3 - moments[0].size)),
