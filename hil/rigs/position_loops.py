@@ -11,8 +11,8 @@ from plant.compiled import Record, kernel, record_dtype
 from plant.mechanism import LEGS
 from plant.pose import Array
 
-BANDWIDTH = 150.0
-"""Proportional gain of the loop [1/s], 24 Hz."""
+BANDWIDTH = 60.0
+"""Proportional gain of the loop [1/s], 10 Hz."""
 
 LONGEST_STEP_S = 1e-3
 """The loop is closed at least so often [s]."""
@@ -31,6 +31,7 @@ _MOST_UNREAD = 10
 
 POSITION_LOOPS = record_dtype(
     active=(np.int64, LEGS),  # whether the drive closes a position loop
+    bandwidth=np.float64,  # proportional gain [1/s]
     window=(np.float64, LEGS),  # greatest following error [m]
     place=(np.float64, LEGS),  # what the drive's encoder reads now [m]
     offset=(np.float64, LEGS),  # by how much it read more than the motor's length when it was sampled [m]
@@ -45,7 +46,7 @@ POSITION_LOOPS = record_dtype(
 
 def close_loops(loops: Record, active: bool) -> None:
     """Let all drives close position loops, or none."""
-    loops["active"], loops["window"] = active, FOLLOWING_WINDOW
+    loops["active"], loops["bandwidth"], loops["window"] = active, BANDWIDTH, FOLLOWING_WINDOW
 
 
 @kernel
@@ -89,10 +90,10 @@ def follow_goal(loops: Record, k: int, rate: float, moving: float, limit: float,
     """
     error = loops.goal[k] - loops.place[k]
     loops.goal[k] += rate * moving
-    wanted = rate * moving / period + BANDWIDTH * error + loops.integral[k]
+    wanted = rate * moving / period + loops.bandwidth * error + loops.integral[k]
     velocity = min(max(wanted, -limit), limit)
     if velocity == wanted:
-        loops.integral[k] += 0.25 * BANDWIDTH**2 * error * period
+        loops.integral[k] += 0.25 * loops.bandwidth**2 * error * period
     loops.beyond_for[k] = loops.beyond_for[k] + period if abs(error) > loops.window[k] else 0.0
     loops.velocity[k] = velocity
     return float(velocity)

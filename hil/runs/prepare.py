@@ -119,13 +119,15 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         imu = imu_state(model, config.seed, period, config.wiring, config.base_imu)
         encoder = load_encoder(config.lengths)
         control = control_settings(mechanism, **({} if config.hold is None else {"hold": config.hold}))
+        position = closes_position(config)
+        if position:
+            control = control.for_position_drives()
         least, most = HOLD_RANGE_S
         if not least <= control.hold <= most:
             raise InputError(f"hold is {control.hold:g} s; the estimate settles in {least:g} to {most:g} s")
         add_disturbances(imu, (each.later(control.hold) for each in config.disturbances))
         encoder_faults = [each.later(control.hold) for each in config.encoder_faults]
         fusion, safety = sensor_settings(mechanism, model, encoder), safety_settings(mechanism)
-        position = closes_position(config)
         drives = drive_settings(mechanism, are_few(mechanism, config.imus))
         if config.raw_imus:
             safety, drives = safety.for_raw_imus(), drives.for_raw_imus()
