@@ -168,6 +168,7 @@ def cycle_parameters(
     encoder: EncoderModel | None = None,
     on_base: bool = False,
     level: bool = False,
+    position_drives: bool = False,
 ) -> Record:
     """The constants of the cycle (dtype `PARAMETERS`).
 
@@ -188,6 +189,7 @@ def cycle_parameters(
         encoder: the kind of the encoders; None without encoders.
         on_base: whether there is an IMU on the base.
         level: whether the target is in the level frame; that needs that IMU, and six legs.
+        position_drives: whether each drive closes a position loop of its own, whose goal moves at the commanded velocity.
 
     Raises:
         InputError: a rate out of range, an IMU that cannot be, IMUs that do not determine the pose, or a limit of the
@@ -254,9 +256,11 @@ def cycle_parameters(
             fusion, rate, prior, watch_evidence, base_imu.SHARED_NOISE if on_base else 1.0
         ),
         level=level_frame.level_parameters(mechanism, fusion, watched, level),
-        load=load_feed_forward.load_parameters(mechanism, command_delay),
+        load=load_feed_forward.load_parameters(mechanism, command_delay, position_drives),
         pid=pid.pid_parameters(control, limits.velocity),
-        safety=safety_stage.safety_parameters(watched, drive_settings or DriveSettings(), mechanism, rate, to_arm),
+        safety=safety_stage.safety_parameters(
+            watched, drive_settings or DriveSettings(), mechanism, rate, to_arm, position_drives
+        ),
     )
 
 

@@ -41,17 +41,18 @@ STATE = record_dtype(
 and scratch."""
 
 
-def load_parameters(mechanism: Mechanism, command_delay: float) -> Record:
-    """The constants of the feed-forward (dtype `PARAMETERS`)."""
+def load_parameters(mechanism: Mechanism, command_delay: float, position: bool = False) -> Record:
+    """The constants of the feed-forward (dtype `PARAMETERS`); drives that close a `position` loop do not droop."""
     plant = mechanism.plant_parameters()
     turns = 2.0 * np.pi / plant["motor.screw_lead"]
     force_constant = turns * plant["motor.torque_constant"]
     mass, first_moment = first_moment_of(plant)
     sliding_mass = plant["leg.upper.mass"] + plant["motor.rotor_inertia"] * turns**2
+    droop = plant["drive.nominal_resistance"] * (1.0 - plant["drive.compensation"]) / force_constant**2
     return filled(
         PARAMETERS,
         command_delay=command_delay,
-        droop=plant["drive.nominal_resistance"] * (1.0 - plant["drive.compensation"]) / force_constant**2,
+        droop=0.0 if position else droop,
         moving_mass=sliding_mass + mass / mechanism.legs,
         mass=mass,
         first_moment=first_moment,

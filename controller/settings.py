@@ -24,8 +24,8 @@ _ENDLESS_ALLOWED = (
     "slack",
 )
 _ZERO_ALLOWED = (
-    "integral", "derivative", "sensor_delay", "sensor_timing", "most_lost_imus", "watch_imus", "need_platform_imu", "load",
-    "resistance", "friction",
+    "integral", "derivative", "position_integral", "sensor_delay", "sensor_timing", "most_lost_imus", "watch_imus",
+    "need_platform_imu", "load", "resistance", "friction",
 )  # fmt: skip
 
 S = TypeVar("S", "ControlSettings", "FusionSettings", "SafetySettings", "DriveSettings")
@@ -57,6 +57,15 @@ class ControlSettings(_Settings):
     derivative_bandwidth: float = 100.0  # corner of the derivative's low-pass [rad/s]
     hold: float = 0.2  # for which the brakes hold while the estimate settles [s]
     command_reserve: float = 1.4  # largest command, as a multiple of the actuators' velocity limit
+    position_proportional: float = 15.0  # instead of `proportional` where drives close position loops [1/s]
+    position_integral: float = 10.0  # instead of `integral` [1/s^2]
+
+    def for_position_drives(self) -> "ControlSettings":
+        """These settings for drives that close position loops, as load and friction are not left to the feedback.
+
+        An outer loop must be slower than the one within it: gains for drives that follow velocities let stiff ones oscillate.
+        """
+        return replace(self, proportional=self.position_proportional, integral=self.position_integral, derivative=0.0)
 
 
 @dataclass(frozen=True)

@@ -35,16 +35,20 @@ STATE = record_dtype(
 
 
 def safety_parameters(
-    settings: SafetySettings, drive_settings: DriveSettings, mechanism: Mechanism, rate: float, arm: bool
-) -> Record:
-    """The constants (dtype `PARAMETERS`) in cycles of this rate [Hz]; the drives are enabled only if `arm`."""
+    settings: SafetySettings, drive_settings: DriveSettings, mechanism: Mechanism, rate: float, arm: bool,
+    position: bool = False,
+) -> Record:  # fmt: skip
+    """The constants (dtype `PARAMETERS`) in cycles of this rate [Hz].
+
+    The drives are enabled only if `arm`, and close position loops if `position`.
+    """
     limits = mechanism.require_limits()
     return filled(
         PARAMETERS,
         arming=arming.arming_parameters(settings, rate, arm),
         monitor=imu_monitor.monitor_parameters(settings, rate),
         watch=watch.watch_parameters(settings, rate, limits),
-        drives=drives.drive_parameters(drive_settings, mechanism),
+        drives=drives.drive_parameters(drive_settings, mechanism, position),
         encoders=encoder_watch.encoder_watch_parameters(settings, rate),
         stop=stop.stop_parameters(limits, rate),
     )

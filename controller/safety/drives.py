@@ -1,7 +1,8 @@
 """What was commanded, as a second opinion without any sensor: how the drives' model says that the legs have moved.
 
 An encoderless drive with a command u and a load F moves its leg at `u - droop F`, and friction brakes that. Load, resistance
-and friction are known within limits (`DriveSettings`), so the rate lies within an interval [low, high]. For each leg, two
+and friction are known within limits (`DriveSettings`), so the rate lies within an interval [low, high]. A drive that closes a
+position loop moves its leg at u whatever it carries, and the interval is that rate alone. For each leg, two
 cumulative sums say how far the estimated length l has come beyond that (E. S. Page, Continuous inspection schemes, Biometrika
 41, 1954):
 
@@ -40,15 +41,16 @@ STATE = record_dtype(
 """The interval of each leg's rate, and the cumulative sums; zeros before the motion."""
 
 
-def drive_parameters(settings: DriveSettings, mechanism: Mechanism) -> Record:
-    """What is known of the drives of a mechanism (dtype `PARAMETERS`)."""
+def drive_parameters(settings: DriveSettings, mechanism: Mechanism, position: bool = False) -> Record:
+    """What is known of the drives of a mechanism (dtype `PARAMETERS`); with a `position` loop they hold whatever the load."""
     plant = mechanism.plant_parameters()
     force_constant = 2.0 * np.pi / plant["motor.screw_lead"] * plant["motor.torque_constant"]
     uncompensated = 1.0 + settings.resistance * np.array([-1.0, 1.0]) - plant["drive.compensation"]
+    droop = plant["drive.nominal_resistance"] * np.maximum(uncompensated, 0.0) / force_constant**2
     return filled(
         PARAMETERS,
         load=settings.load,
-        droop=plant["drive.nominal_resistance"] * np.maximum(uncompensated, 0.0) / force_constant**2,
+        droop=0.0 * droop if position else droop,
         friction=settings.friction * np.max(plant["friction.coulomb"]),
         lag=plant["drive.current_time_constant"],
         slack=settings.slack,

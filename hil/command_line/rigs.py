@@ -94,6 +94,7 @@ def gough_check_rig(options: Namespace) -> int:
         "mechanism",
         "imu",
         "lengths",
+        "drives",
         "base_imu",
         "plant",
         "binding",

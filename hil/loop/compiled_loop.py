@@ -14,7 +14,16 @@ from controller.safety.causes import EVENT_SLOTS, REACTION, Cause, Request
 from controller.safety.stop import has_stopped, ramp_down
 from hil.loop.records import Link, Stage, StopRequest, TargetStream
 from hil.realtime.clock import FREE, REAL, finish, start, wait
-from hil.rigs import ANSWERED, SILENT
+from hil.rigs import ANSWERED, SILENT, DriveState
+from hil.rigs.position_loops import (
+    LONGEST_STEP_S,
+    are_closed,
+    follow_goal,
+    hold_goal,
+    loop_fault,
+    take_motors,
+    take_readings,
+)
 from hil.rigs.udp.emulator import UdpEmulator, exchange_in_memory
 from hil.rigs.udp.link import UdpLink, exchange_udp, send_command
 from plant.compiled import Record, kernel, shared_kernel, store_release
@@ -40,16 +49,17 @@ _sigpending: Any = types.ExternalFunction("sigpending", types.int32(types.intp))
 
 @shared_kernel
 def exchange_fmu(
-    fmu: Record, imu: Record, encoders: Record, command: Array, request: int, periods: int, period: float, feedback: Record,
-    stage_ns: NDArray[np.int64], timespec: NDArray[np.int64],
+    fmu: Record, imu: Record, encoders: Record, loops: Record, command: Array, request: int, periods: int, period: float,
+    feedback: Record, stage_ns: NDArray[np.int64], timespec: NDArray[np.int64],
 ) -> int:  # fmt: skip
     """Let the plant move with the command for some periods, and read it; returns the status of the exchange."""
     began = now(timespec)
     status = write_drive_mode(fmu, BRAKE if request == Request.BRAKED else VELOCITY)
-    if periods > 0:
+    closed = are_closed(loops)
+    if periods > 0 and not closed:
         status |= write_command(fmu, command)
     for _ in range(periods):
-        status |= advance(fmu, period)
+        status |= _advance_loops(fmu, loops, command, request, period, feedback) if closed else advance(fmu, period)
     stage_ns[Stage.PLANT] = now(timespec) - began
     if status == 0:
         status = read_imus(fmu) | read_truth(fmu)
@@ -63,6 +73,7 @@ def exchange_fmu(
             status |= read_motors(fmu)
             encoders[()].time = m.time
             read_encoders(encoders, fmu[()].motors, feedback.length, feedback.length_rate, feedback.home)
+            take_readings(loops, fmu[()].motors, feedback.length)
         feedback.truth[:] = fmu[()].truth
         for k in range(LEGS):
             feedback.sent[k] = 0.0 if request == Request.BRAKED else command[k]
@@ -78,6 +89,26 @@ def exchange_fmu(
 
 
 @kernel
+def _advance_loops(fmu: Record, loops: Record, command: Array, request: int, period: float, feedback: Record) -> int:
+    """Let the plant move for a period, driven by drives that close position loops; returns FMI's status."""
+    c = fmu[()]
+    count = max(int(np.ceil(period / LONGEST_STEP_S - 1e-9)), 1)
+    step, status = period / count, 0
+    for _ in range(count):
+        status |= read_motors(fmu)
+        take_motors(loops, c.motors)
+        for k in range(LEGS):
+            if request == Request.BRAKED:
+                hold_goal(loops, k)
+            else:
+                follow_goal(loops, k, command[k], step, np.inf, step)
+                if loop_fault(loops, k) != 0:
+                    feedback.drive[k], feedback.drive_code[k] = DriveState.FAULTY, loop_fault(loops, k)
+        status |= write_command(fmu, loops.velocity) | advance(fmu, step)
+    return status
+
+
+@kernel
 def exchange(
     fmu: Record | None, imu: Record | None, encoders: Record | None, udp: UdpLink | None, emulator: UdpEmulator | None,
     parameters: Record, state: Record, work: Record, timespec: NDArray[np.int64],
@@ -89,7 +120,7 @@ def exchange(
     if fmu is not None:
         periods = periods_passed(state)
         status = exchange_fmu(
-            fmu, imu, encoders, s.pid.command, s.safety.request, periods, period, w.feedback, w.stage_ns, timespec
+            fmu, imu, encoders, w.loops, s.pid.command, s.safety.request, periods, period, w.feedback, w.stage_ns, timespec
         )  # fmt: skip
     if udp is not None and emulator is not None:
         at = int(np.rint(1e9 * period * s.time.cycle))

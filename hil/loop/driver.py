@@ -68,6 +68,11 @@ class Loop:
         self._work["feedback"], self._work["sequence"] = new_feedback(), -1
         self._work["base_imu_sequence"] = -1
 
+    @property
+    def loops(self) -> Record:
+        """The position loops of the simulated plant's drives (dtype `POSITION_LOOPS`)."""
+        return self._work["loops"][()]
+
     def run(self, last: int, filters: PythonFilters | None = None) -> int:
         """Run up to, not including, cycle `last`; returns 0, or the cause if the run has ended on the brakes."""
         if filters is None:
@@ -193,7 +198,7 @@ class FmuRig:
         command, work = loop.state["pid"]["command"], (feedback, self._stage_ns, self._timespec)
         load_kernels(
             (periods_passed, loop.state),
-            (exchange_fmu, loop.fmu, loop.imu, loop.encoders, command, 0, 0, 0.0, *work),
+            (exchange_fmu, loop.fmu, loop.imu, loop.encoders, loop.loops, command, 0, 0, 0.0, *work),
             (write_drive_mode, loop.fmu, BRAKE),
         )
 
@@ -209,7 +214,9 @@ class FmuRig:
         loop = self._loop
         periods, period = periods_passed(loop.state), float(loop.parameters["rig"]["period"])
         stage_ns, timespec = self._stage_ns, self._timespec
-        return exchange_fmu(loop.fmu, loop.imu, loop.encoders, command, request, periods, period, feedback, stage_ns, timespec)
+        return exchange_fmu(
+            loop.fmu, loop.imu, loop.encoders, loop.loops, command, request, periods, period, feedback, stage_ns, timespec
+        )  # fmt: skip
 
     def quick_stop(self) -> None:
         """Brake the drives."""

@@ -9,6 +9,7 @@ import numpy as np
 from controller.cycle import MARKS
 from controller.safety.causes import EVENT_SLOTS, Cause
 from hil.rigs import FEEDBACK
+from hil.rigs.position_loops import POSITION_LOOPS
 from plant.compiled import MOST, Limits, Record, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import LEGS
@@ -132,6 +133,7 @@ WORK = record_dtype(
     base_imu_sequence=np.int64,  # the same of the IMU on the base
     base_imu_age=np.int64,
     feedback=FEEDBACK,
+    loops=POSITION_LOOPS,  # of the simulated plant's drives
     factor=(np.float64, (6, 6)),
     covariance=(np.float64, (6, 6)),
     stage_ns=(np.int64, len(STAGES)),

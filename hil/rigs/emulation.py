@@ -14,6 +14,17 @@ from typing import Any
 import numpy as np
 
 from hil.rigs import DriveState, Request
+from hil.rigs.position_loops import (
+    LONGEST_STEP_S,
+    POSITION_LOOPS,
+    are_closed,
+    close_loops,
+    follow_goal,
+    hold_goal,
+    loop_fault,
+    take_motors,
+    take_readings,
+)
 from plant.compiled import Record, filled, kernel, record_dtype, shared_kernel
 from plant.dynamics.base_course import BASE_MOTION, MOST_BASE_MOTIONS, BaseMotionKind, base_motion_of_text, placed
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
@@ -91,6 +102,7 @@ FAULT = record_dtype(
 """A fault."""
 
 MOST_FAULTS = 32
+_LOOP_NS = round(1e9 * LONGEST_STEP_S)
 _FOREVER = np.iinfo(np.int64).max
 
 
@@ -168,10 +180,12 @@ EMULATED = record_dtype(
     added=np.float64,  # payload [kg]
     request=(np.int64, LEGS),  # Request
     target=(np.float64, LEGS),  # velocity [m/s]
+    until_ns=(np.int64, LEGS),  # when the goal of a drive with a position loop stops moving at that velocity
     reset=(np.int64, LEGS),  # whether to clear the drive's fault
     drive=(np.int64, LEGS),  # DriveState
     code=(np.int64, LEGS),  # of the fault
     velocity=(np.float64, LEGS),  # present [m/s]
+    loops=POSITION_LOOPS,  # of drives that close one
     measurement=(np.float64, (3, IMU_COUNT, 3)),  # the last sample [rad/s, m/s^2, uT]
     sample_ns=(np.int64, IMU_COUNT),
     sequence=(np.int64, IMU_COUNT),
@@ -196,7 +210,9 @@ _SPEED_RESERVE = 1.5
 """A drive's largest velocity, over the limit of the mechanism."""
 
 
-def new_emulated(mechanism: Mechanism, step_ns: int, seed: int, faults: Iterable[Record] = ()) -> Record:
+def new_emulated(
+    mechanism: Mechanism, step_ns: int, seed: int, faults: Iterable[Record] = (), position: bool = False
+) -> Record:  # fmt: skip
     """An emulated rig (dtype `EMULATED`) whose drives are ready, with the limits and the payload of a mechanism.
 
     Args:
@@ -204,6 +220,7 @@ def new_emulated(mechanism: Mechanism, step_ns: int, seed: int, faults: Iterable
         step_ns: largest step of the plant [ns].
         seed: of the faults' random numbers.
         faults: each of dtype `FAULT`.
+        position: whether the drives close position loops, whose goals move at the velocities that they are told.
     """
     rig: Record = np.zeros((), EMULATED)
     limits = mechanism.require_limits()
@@ -211,6 +228,8 @@ def new_emulated(mechanism: Mechanism, step_ns: int, seed: int, faults: Iterable
     rig["payload"] = mechanism.plant_parameters()["payload.mass"]
     rig["length"], rig["length_rate"], rig["home"], rig["base_imu"] = np.nan, np.nan, -1, np.nan
     rig["enabled_ns"], rig["drive"], rig["random"] = -1, DriveState.READY, seed + 1
+    rig["until_ns"] = _FOREVER
+    close_loops(rig["loops"], position)
     for each in faults:
         add_fault(rig, each)
     return rig
@@ -281,6 +300,10 @@ def sample(fmu: Record, imu: Record, encoders: Record, rig: Record, now_ns: int)
                     r.base_imu[kind, j] = read
     if encoders[()].legs > 0:
         status |= _read_encoders(fmu, encoders, r)
+    elif are_closed(r.loops):
+        # Their encoders tell the drives alone.
+        status |= read_motors(fmu)
+        take_motors(r.loops, c.motors)
     return status
 
 
@@ -299,6 +322,7 @@ def _read_encoders(fmu: Record, encoders: Record, r: Record) -> int:
             e.fault[e.faults].begin = 1e-9 * (r.enabled_ns + f.begin_ns)
         e.faults += 1
     read_encoders(encoders, fmu[()].motors, r.length, r.length_rate, r.home)
+    take_readings(r.loops, fmu[()].motors, r.length)
     return status
 
 
@@ -306,9 +330,13 @@ def _read_encoders(fmu: Record, encoders: Record, r: Record) -> int:
 def move(fmu: Record, rig: Record, now_ns: int) -> int:
     """Move the plant and the drives on to `now_ns`; returns FMI's status."""
     r, c = rig[()], fmu[()]
-    status = 0
+    status, closed = 0, are_closed(r.loops)
     while r.time_ns < now_ns:
         step = min(r.step_ns, now_ns - r.time_ns)
+        if closed:
+            step = min(step, _LOOP_NS)
+            status |= read_motors(fmu)
+            take_motors(r.loops, c.motors)
         added = 0.0
         for i in range(r.faults):
             if r.fault[i].kind == FaultKind.PAYLOAD_JUMPS and is_active(r.fault[i], r.enabled_ns, r.time_ns):
@@ -318,7 +346,7 @@ def move(fmu: Record, rig: Record, now_ns: int) -> int:
             status |= write_payload_mass(fmu, r.payload + added)
             r.added = added
         for k in range(LEGS):
-            _step_drive(r, k, 1e-9 * step)
+            _step_drive(r, k, step)
             moving = r.drive[k] == DriveState.FOLLOWING or r.drive[k] == DriveState.QUICK_STOPPING or r.velocity[k] != 0.0
             c.mode[k] = VELOCITY if moving else BRAKE
         status |= write_drive_modes(fmu) | write_command(fmu, r.velocity)
@@ -343,8 +371,9 @@ def _set_base(c: Record, r: Record) -> None:
 
 
 @kernel
-def _step_drive(r: Record, k: int, period: float) -> None:
-    """Update a drive's state and velocity for a step of `period` [s]."""
+def _step_drive(r: Record, k: int, step: int) -> None:
+    """Update a drive's state and velocity for a step [ns]."""
+    period = 1e-9 * step
     broken, stuck = find_fault(r, FaultKind.DRIVE_FAULTS, k), find_fault(r, FaultKind.DRIVE_STUCK, k)
     running, ignoring = find_fault(r, FaultKind.DRIVE_RUNS_AWAY, k), find_fault(r, FaultKind.DRIVE_IGNORES, k)
     if find_fault(r, FaultKind.DRIVE_UNPOWERED, k) >= 0:
@@ -366,6 +395,7 @@ def _step_drive(r: Record, k: int, period: float) -> None:
     elif r.request[k] == Request.QUICK_STOP and r.drive[k] == DriveState.FOLLOWING:
         r.drive[k] = DriveState.QUICK_STOPPING
     r.reset[k] = 0
+    wanted = r.target[k] if r.loops.active[k] == 0 else _close_loop(r, k, step)
     if stuck >= 0:
         r.velocity[k] = 0.0
     elif running >= 0 and r.request[k] != Request.BRAKED:
@@ -373,7 +403,7 @@ def _step_drive(r: Record, k: int, period: float) -> None:
     elif ignoring >= 0 and r.request[k] != Request.BRAKED:
         return
     elif r.drive[k] == DriveState.FOLLOWING:
-        r.velocity[k] = min(max(r.target[k], -r.speed_limit), r.speed_limit)
+        r.velocity[k] = min(max(wanted, -r.speed_limit), r.speed_limit)
     elif r.drive[k] == DriveState.READY and r.request[k] == Request.BRAKED:
         r.velocity[k] = 0.0
     else:
@@ -381,6 +411,20 @@ def _step_drive(r: Record, k: int, period: float) -> None:
         r.velocity[k] -= min(max(r.velocity[k], -slower), slower)
         if r.velocity[k] == 0.0 and r.drive[k] == DriveState.QUICK_STOPPING:
             r.drive[k] = DriveState.READY
+
+
+@kernel
+def _close_loop(r: Record, k: int, step: int) -> float:
+    """The velocity of a drive with a position loop for a step [ns]; a fault that the loop finds becomes the drive's."""
+    if r.drive[k] != DriveState.FOLLOWING:
+        hold_goal(r.loops, k)
+        return 0.0
+    moving = min(step, max(r.until_ns[k] - r.time_ns, 0))
+    velocity = follow_goal(r.loops, k, r.target[k], 1e-9 * moving, r.speed_limit, 1e-9 * step)
+    code = loop_fault(r.loops, k)
+    if code != 0:
+        r.drive[k], r.code[k] = DriveState.FAULTY, code
+    return velocity
 
 
 @kernel

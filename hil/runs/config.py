@@ -35,6 +35,9 @@ FRAMES = BASE, LEVEL = "base", "level"
 """The frames of a target that need no file: {1}, or one that stays level."""
 
 RIGS = ("fmu", "udp", "canopen", "replay")
+DRIVES = VELOCITY_DRIVES, POSITION_DRIVES = "velocity", "position"
+"""What the drives close a loop of: nothing, as they turn a velocity into a voltage, or their position."""
+
 PYTHON_RIG = "python:"
 """The prefix of a rig in the user's own Python class, such as python:my_rig:MyRig (module and class)."""
 
@@ -131,6 +134,12 @@ class SimulationConfig:
         "encoders of the legs' lengths: none, incremental, absolute, or a TOML file (docs/encoders.md)",
         metavar="KIND",
     )
+    drives: str = option(
+        VELOCITY_DRIVES,
+        "what the drives do with the commanded velocities: velocity, follow them, and fall short under load; position, "
+        "integrate them and close a position loop around an encoder of their own (docs/encoders.md)",
+        choices=DRIVES,
+    )
     base_imu: bool = option(False, "IMU 7 is on the base, which may move then (docs/moving_base.md)")
     frames: str | None = option(
         None, "frames of your own, in which targets, errors and read-outs are (docs/frames.md)", metavar="FILE.toml"
@@ -208,6 +217,8 @@ class SimulationConfig:
                 )
         if self.levelled and not self.base_imu:
             raise InputError("a target in the level frame needs an IMU on the base: add --base-imu")
+        if self.drives not in DRIVES:
+            raise UnknownNameError(f"no drives {self.drives!r}; there are {', '.join(DRIVES)}{nearest(self.drives, DRIVES)}")
         if self.lengths != NO_LENGTHS and self.fusion == "section-5":
             raise InputError("the paper's section 5 takes no lengths: leave --lengths out, or take another --fusion")
 
@@ -298,6 +309,10 @@ class EmulatorConfig:
     def __post_init__(self) -> None:
         if not 0.0 < self.watchdog < 60.0:
             raise InputError(f"the watchdog is {1e3 * self.watchdog:g} ms; it must be more than 0 and less than a minute")
+        if self.bus == "canopen" and self.simulated.drives == POSITION_DRIVES:
+            raise InputError(
+                "on canopen the controller sets the drives' mode, as [drives] mode of its settings says: leave --drives out"
+            )
 
     def watchdog_for(self, period_us: int) -> float:
         """The watchdog of a session with this period [us]: three periods at least [s]."""

@@ -34,7 +34,7 @@ from hil.rigs.udp.datagrams import (
 )
 from hil.rigs.udp.emulator import UdpEmulator, new_udp_emulator, serve
 from hil.rigs.udp.link import DEFAULT_ADDRESS, address_in, bound_socket, parse_address, socket_address
-from hil.runs.config import EmulatorConfig
+from hil.runs.config import POSITION_DRIVES, EmulatorConfig
 from hil.runs.prepare import simulated_plant
 from plant.compiled import Record
 from plant.encoder_readings import encoder_state
@@ -240,7 +240,8 @@ def _rig_of(config: EmulatorConfig, period: float, faults: list[Record]) -> tupl
     plant = simulated_plant(simulated, mechanism, start)
     imu = imu_state(load_imu(simulated.imu), simulated.seed, period, simulated.wiring, simulated.base_imu)
     encoders = encoder_state(load_encoder(simulated.lengths), simulated.seed, period, legs=mechanism.legs)
-    return plant, imu, encoders, new_emulated(mechanism, _STEP_NS, simulated.seed, faults)
+    position = simulated.drives == POSITION_DRIVES
+    return plant, imu, encoders, new_emulated(mechanism, _STEP_NS, simulated.seed, faults, position)
 
 
 def _load(config: EmulatorConfig) -> None:

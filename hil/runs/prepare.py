@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,9 +28,10 @@ from hil.loop.records import RECORD
 from hil.recording.replay_rig import ReplayRig
 from hil.rigs import Rig
 from hil.rigs.by_name import check_legs, python_rig
+from hil.rigs.position_loops import close_loops
 from hil.rigs.udp.link import DEFAULT_ADDRESS
 from hil.rigs.udp.rig import UdpRig
-from hil.runs.config import FUSIONS, PYTHON_RIG, SimulationConfig
+from hil.runs.config import FUSIONS, POSITION_DRIVES, PYTHON_RIG, SimulationConfig
 from hil.runs.names import check_names
 from hil.runs.plant_start import check_start
 from plant.compiled import Record
@@ -47,6 +49,9 @@ from plant.fmu.plant import FmuPlant, check_number_of_legs, takes_parameters
 from plant.imu import add_disturbances, aliasing_remark, imu_state, load_imu
 from plant.mechanism import Mechanism, load_in_space
 from plant.pose import Pose
+
+if TYPE_CHECKING:
+    from hil.rigs.canopen.settings import CanopenSettings
 
 HOLD_RANGE_S = (0.2, 10.0)
 MOST_RECORD_BYTES = 4 * 2**30
@@ -117,6 +122,9 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         imu = imu_state(model, config.seed, period, config.wiring, config.base_imu)
         encoder = load_encoder(config.lengths)
         control = control_settings(mechanism, **({} if config.hold is None else {"hold": config.hold}))
+        position = closes_position(config)
+        if position:
+            control = control.for_position_drives()
         least, most = HOLD_RANGE_S
         if not least <= control.hold <= most:
             raise InputError(f"hold is {control.hold:g} s; the estimate settles in {least:g} to {most:g} s")
@@ -129,7 +137,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         parameters = cycle_parameters(
             mechanism, config.rate, control, fusion, config.imus, FUSIONS[config.fusion], calibration, config.magnetometer,
             config.fusion == "section-5", safety, drives, 0.0 if config.rig == "fmu" else period,
-            config.arm, encoder, config.base_imu, config.levelled,
+            config.arm, encoder, config.base_imu, config.levelled, position,
         )  # fmt: skip
         lead = bool(parameters["encoders"]["lead"])
         remarks = [
@@ -176,6 +184,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             remarks=tuple(filter(None, remarks)),
             frames=frames,
         )
+        close_loops(loop.loops, position)
         loop.load(python=config.fusion == "filterpy")
         yield loop
 
@@ -279,6 +288,30 @@ def _check_plant(config: SimulationConfig, plant: FmuPlant, nominal: Mechanism) 
         raise InputError(f"{name} has no magnetometer on the platform: bind imu_magnetic_field, or leave out --magnetometer")
 
 
+def closes_position(config: SimulationConfig) -> bool:
+    """Whether the drives of a configuration close position loops; on CANopen, the settings of the bus say so.
+
+    Raises:
+        InputError: both say so, and differ, or those settings cannot be used.
+    """
+    if config.rig != "canopen":
+        return config.drives == POSITION_DRIVES
+    mode = _bus_settings(config).drives.mode
+    if config.drives == POSITION_DRIVES != mode:
+        raise InputError(
+            f"--drives is {config.drives}, and on canopen the settings of the bus set the mode {mode}: leave --drives out, or "
+            f'write mode = "{config.drives}" into the table [drives] of --rig-at FILE.toml'
+        )
+    return mode == POSITION_DRIVES
+
+
+def _bus_settings(config: SimulationConfig) -> "CanopenSettings":
+    with missing_extras_named():
+        from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings
+
+    return canopen_settings(config.rig_at or DEFAULT_FILE, config.base_imu)
+
+
 def rig_of(config: SimulationConfig) -> Rig | None:
     """The rig that a configuration names; None for the plant's FMU.
 
@@ -292,11 +325,8 @@ def rig_of(config: SimulationConfig) -> Rig | None:
     if config.rig == "canopen":
         with missing_extras_named():
             from hil.rigs.canopen.rig import CanopenRig
-            from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings
 
-        return CanopenRig(
-            canopen_settings(config.rig_at or DEFAULT_FILE, config.base_imu), period, lengths=config.lengths != NO_LENGTHS
-        )
+        return CanopenRig(_bus_settings(config), period, lengths=config.lengths != NO_LENGTHS)
     if config.rig == "replay":
         if not config.rig_at:
             raise InputError("a replay needs its recording: name it with --rig-at FILE.mcap")

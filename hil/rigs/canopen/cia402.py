@@ -42,12 +42,12 @@ class Controlword(IntEnum):
     FAULT_RESET = 0x80
 
 
-VOLTAGE_ENABLED, REMOTE, FOLLOWS_TARGET = 1 << 4, 1 << 9, 1 << 12
-"""Bits of the statusword: the power stage is supplied; the drive obeys the controlword; in cyclic synchronous velocity mode,
-the drive follows the target velocity."""
+VOLTAGE_ENABLED, REMOTE, FOLLOWS_TARGET, OFF_TARGET = 1 << 4, 1 << 9, 1 << 12, 1 << 13
+"""Bits of the statusword: the power stage is supplied; the drive obeys the controlword; in a cyclic synchronous mode, the
+drive follows its target; in that of position, its following error is beyond the window."""
 
-VELOCITY_MODE = 9
-"""Mode of operation: cyclic synchronous velocity."""
+POSITION_MODE, VELOCITY_MODE = 8, 9
+"""Modes of operation: cyclic synchronous position and velocity."""
 
 HEARTBEAT_LOST, PDO_LOST = 0x8130, 0x8250
 """Error codes of a drive that misses its controller: no heartbeat, no RPDO in time."""
@@ -63,9 +63,11 @@ def state_of(statusword: int) -> PowerState | None:
     return next((state for state in PowerState if statusword & _STATE_MASKS[state] == _STATE_BITS[state]), None)
 
 
-def statusword(state: PowerState, powered: bool, follows: bool) -> int:
-    """The statusword of a drive in this state whose power stage is `powered` or not, and which `follows` the target or not."""
-    word = _STATE_BITS[state] | REMOTE | (VOLTAGE_ENABLED if powered else 0)
+def statusword(state: PowerState, powered: bool, follows: bool, off_target: bool = False) -> int:
+    """The statusword of a drive in this state whose power stage is `powered` or not, which `follows` the target or not, and
+    whose following error is beyond its window if it is `off_target`.
+    """
+    word = _STATE_BITS[state] | REMOTE | (VOLTAGE_ENABLED if powered else 0) | (OFF_TARGET if off_target else 0)
     if follows and state == PowerState.OPERATION_ENABLED:
         word |= FOLLOWS_TARGET
     return word
@@ -117,8 +119,8 @@ def controlword_towards(request: int, state: PowerState | None) -> Controlword:
     return Controlword.SWITCH_ON if state == PowerState.READY_TO_SWITCH_ON else Controlword.DISABLE_VOLTAGE
 
 
-def drive_state(word: int) -> DriveState:
-    """A drive's state for the loop, by its statusword.
+def drive_state(word: int, position: bool = False) -> DriveState:
+    """A drive's state for the loop, by its statusword; in `position` mode, a following error is a fault.
 
     A drive whose power stage is supplied is ready from Switch on disabled on, because `controlword_towards` leads it further;
     in Operation enabled it is ready until it follows the target velocity.
@@ -128,6 +130,8 @@ def drive_state(word: int) -> DriveState:
         return DriveState.FAULTY
     if state == PowerState.QUICK_STOP_ACTIVE:
         return DriveState.QUICK_STOPPING
+    if position and state == PowerState.OPERATION_ENABLED and word & OFF_TARGET:
+        return DriveState.FAULTY
     if state == PowerState.OPERATION_ENABLED and word & FOLLOWS_TARGET:
         return DriveState.FOLLOWING
     not_ready = state in (None, PowerState.NOT_READY_TO_SWITCH_ON) or not word & VOLTAGE_ENABLED

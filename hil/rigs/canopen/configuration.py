@@ -13,14 +13,15 @@ import canopen
 from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
 
 from hil.rigs import Request, RigError
-from hil.rigs.canopen.cia402 import VELOCITY_MODE, Controlword, PowerState, controlword_towards, state_of
+from hil.rigs.canopen.cia402 import POSITION_MODE, VELOCITY_MODE, Controlword, PowerState, controlword_towards, state_of
 from hil.rigs.canopen.frames import (
+    ANSWER_PDO,
     COMMAND_PDO,
-    DRIVE_PDOS,
     INVALID_COB_ID,
     MAGNETOMETER_PDO,
     POSITION_PDO,
     SYNC_OVERFLOW,
+    TARGET_PDO,
     CobId,
     Object,
     Parameter,
@@ -160,7 +161,8 @@ class RemoteNode(SdoClient):  # type: ignore[misc]
 def configure_drive(node: RemoteNode, drives: DriveSettings, period: float, lengths: bool = False) -> None:
     """Configure a drive for commands every `period` [s], and whether it tells what its encoder reads."""
     units, exponent = interpolation_period(period)
-    for pdo in (*DRIVE_PDOS, POSITION_PDO) if lengths else DRIVE_PDOS:
+    position = drives.holds_positions
+    for pdo in (TARGET_PDO if position else COMMAND_PDO, ANSWER_PDO, *([POSITION_PDO] if lengths or position else [])):
         node.map_pdo(pdo)
     node.configure(Object.PRODUCER_HEARTBEAT, 0, round(drives.heartbeat * 1e3))
     node.configure(Object.QUICK_STOP_OPTION, 0, _QUICK_STOP_RAMP)
@@ -174,13 +176,19 @@ def configure_drive(node: RemoteNode, drives: DriveSettings, period: float, leng
         (Object.INTERPOLATION_PERIOD, 1, units),
         (Object.MAX_MOTOR_SPEED, 0, round(drives.velocity_limit / drives.screw_lead * drives.gear_ratio * 60.0)),
     ):
-        # Not every drive has these.
-        if node.has(index, subindex):
+        # Not every drive has these; a drive that is told positions must know when to be there.
+        if node.has(index, subindex) or (position and index == Object.INTERPOLATION_PERIOD):
             node.configure(index, subindex, value)
     node.configure(Object.QUICK_STOP_DECELERATION, 0, round(drives.quick_stop_deceleration * drives.counts_per_metre))
-    node.write(Object.MODE, 0, VELOCITY_MODE)
-    node.check(Object.MODE_DISPLAY, 0, VELOCITY_MODE, _MODE_TIMEOUT_S)
-    node.write(Object.TARGET_VELOCITY, 0, 0)
+    if position:
+        node.configure(Object.FOLLOWING_WINDOW, 0, round(drives.following_error * drives.counts_per_metre))
+    mode = POSITION_MODE if position else VELOCITY_MODE
+    node.write(Object.MODE, 0, mode)
+    node.check(Object.MODE_DISPLAY, 0, mode, _MODE_TIMEOUT_S)
+    if position:
+        node.write(Object.TARGET_POSITION, 0, node.read(Object.POSITION_ACTUAL))
+    else:
+        node.write(Object.TARGET_VELOCITY, 0, 0)
 
 
 def configure_imu(node: RemoteNode, imu: int, settings: CanopenSettings) -> None:

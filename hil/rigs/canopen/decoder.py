@@ -17,6 +17,7 @@ from hil.rigs.canopen.frames import (
     TRUTH_ID,
     CobId,
     NodeState,
+    int32,
 )
 from hil.rigs.canopen.settings import FD_BYTES, CanopenSettings
 from plant.imu_wiring import BASE_IMU, IMU_COUNT
@@ -140,7 +141,7 @@ class Decoder:
         position, inputs = POSITION.unpack_from(data)
         before = self.positions[drive]
         # The counter wraps at 32 bits.
-        self.positions[drive] = position if before is None else before + (position - before + (1 << 31)) % (1 << 32) - (1 << 31)
+        self.positions[drive] = position if before is None else before + int32(position - before)
         self.homes[drive] = bool(inputs & HOME_INPUT)
         return True
 

@@ -13,22 +13,33 @@ import numpy as np
 from canopen.sdo import SdoAbortedError
 
 from hil.rigs import DriveState, Request
-from hil.rigs.canopen.cia402 import HEARTBEAT_LOST, PDO_LOST, VELOCITY_MODE, PowerState, commanded, settled, statusword
+from hil.rigs.canopen.cia402 import (
+    HEARTBEAT_LOST,
+    PDO_LOST,
+    POSITION_MODE,
+    VELOCITY_MODE,
+    PowerState,
+    commanded,
+    settled,
+    statusword,
+)
 from hil.rigs.canopen.frames import (
     ANSWER,
+    ANSWER_PDO,
     COMMAND_PDO,
-    DRIVE_PDOS,
     HOME_INPUT,
     INVALID_COB_ID,
     MAGNETOMETER_PDO,
     POSITION,
     POSITION_PDO,
+    TARGET_PDO,
     CobId,
     NodeState,
     Object,
     Parameter,
     Pdo,
     imu_pdos,
+    int32,
     new_message,
 )
 from hil.rigs.canopen.settings import CanopenSettings, object_dictionary
@@ -150,14 +161,14 @@ class EmulatedNode:
             raise SdoAbortedError(_TOO_HIGH)
         if od.min is not None and number < od.min:
             raise SdoAbortedError(_TOO_LOW)
-        for pdo in self.pdos:
-            if index == pdo.mapping:
-                self._check_mapping(pdo, subindex, number)
+        if mapped := [pdo for pdo in self.pdos if pdo.mapping == index]:
+            self._check_mapping(mapped, subindex, number)
         if index == Object.PRODUCER_HEARTBEAT:
             self.heartbeat_ns = number * 1_000_000
             self.heartbeat_due = self._clock() + self.heartbeat_ns
 
-    def _check_mapping(self, pdo: Pdo, subindex: int, number: int) -> None:
+    def _check_mapping(self, pdos: list[Pdo], subindex: int, number: int) -> None:
+        pdo = pdos[0]
         if not self.value(pdo.communication, Parameter.COB_ID) & INVALID_COB_ID or self.state == NodeState.OPERATIONAL:
             raise SdoAbortedError(_NOT_NOW)
         if subindex:
@@ -169,7 +180,7 @@ class EmulatedNode:
             objects = self._mapped(pdo, number)
             if sum(each & 0xFF for each in objects) > self._most_bits:
                 raise SdoAbortedError(_TOO_LONG)
-            if objects != pdo.objects:
+            if objects not in [each.objects for each in pdos]:
                 raise SdoAbortedError(_NOT_MAPPABLE)
 
     def _check_mappable(self, entry: int) -> None:
@@ -191,12 +202,15 @@ class EmulatedDrive(EmulatedNode):
         self.answer = new_message(CobId.TPDO + node, dlc=ANSWER.size, is_fd=fd, bitrate_switch=fd)
         self.position_answer = new_message(CobId.TPDO + 0x100 + node, dlc=POSITION.size, is_fd=fd, bitrate_switch=fd)
         self._position = 0
-        super().__init__(node, settings.drives.eds, (*DRIVE_PDOS, POSITION_PDO), fd, network, clock)
+        self.origin = 0  # what the encoder counts at the zero of its readings
+        super().__init__(node, settings.drives.eds, (COMMAND_PDO, TARGET_PDO, ANSWER_PDO, POSITION_PDO), fd, network, clock)
 
     def reset(self) -> None:
         """Return to the values of the EDS, without power."""
         super().reset()
         self.power, self.code, self.controlword, self.target = PowerState.NOT_READY_TO_SWITCH_ON, 0, 0, 0
+        self.target_position, self._told_positions, self._rate = 0, False, 0.0
+        self._loops["active"][self.leg] = 0
         self.command: tuple[int, int] | None = None
         self.timeout_ns = self.controller = self.consumer_ns = self.controller_ns = self.mode = 0
         self.request()
@@ -204,6 +218,7 @@ class EmulatedDrive(EmulatedNode):
     def start(self) -> None:
         """Become operational, without a command."""
         super().start()
+        self._told_positions = self._mapped(TARGET_PDO, self.value(TARGET_PDO.mapping)) == TARGET_PDO.objects
         self.command = None
 
     def stop(self, state: NodeState) -> None:
@@ -231,13 +246,18 @@ class EmulatedDrive(EmulatedNode):
         number = od.decode_raw(data)
         if index == Object.CONTROLWORD:
             self.settle()
-            self.obey(number, self.target)
+            self.obey(number)
         elif index == Object.TARGET_VELOCITY:
             self.target = number
+        elif index == Object.TARGET_POSITION:
+            self.target_position = number
+        elif index == Object.FOLLOWING_WINDOW:
+            self._loops["window"][self.leg] = number / abs(self._scale)
         elif index == Object.MODE:
-            if number != VELOCITY_MODE:
+            if number not in (POSITION_MODE, VELOCITY_MODE):
                 raise SdoAbortedError(_MODE_UNSUPPORTED)
             self.mode = number
+            self._loops["active"][self.leg] = number == POSITION_MODE
         elif (index, subindex) == (Object.CONSUMER_HEARTBEAT, 1):
             self.controller, self.consumer_ns, self.controller_ns = number >> 16 & 0x7F, (number & 0xFFFF) * 1_000_000, 0
         elif (index, subindex) == (COMMAND_PDO.communication, Parameter.EVENT_TIMER):
@@ -246,33 +266,60 @@ class EmulatedDrive(EmulatedNode):
     def statusword(self) -> int:
         """The present statusword."""
         drive = self.machine.rig["drive"][self.leg]
-        return statusword(self.power, bool(drive != DriveState.NOT_READY), bool(drive == DriveState.FOLLOWING))
+        off_target = self._loops["beyond_for"][self.leg] > 0.0
+        follows = drive == DriveState.FOLLOWING
+        return statusword(self.power, bool(drive != DriveState.NOT_READY), bool(follows), bool(off_target))
+
+    @property
+    def _loops(self) -> Record:
+        return self.machine.rig["loops"]
 
     def velocity(self) -> int:
         """[counts/s]."""
-        counts = float(self.machine.rig["velocity"][self.leg]) * self._scale
+        # A drive with a loop measures it.
+        measured = float(self.machine.rig["length_rate"][self.leg]) if self.mode == POSITION_MODE else float("nan")
+        velocity = measured if measured == measured else float(self.machine.rig["velocity"][self.leg])
+        counts = velocity * self._scale
         return round(min(max(counts, -_LARGEST), _LARGEST)) if counts == counts else 0
 
     def position(self) -> int:
         """What the encoder reads [counts], in 32 bits; the last value while it reads nothing."""
-        counts = float(self.machine.rig["length"][self.leg]) * self._scale
+        read, loops = float(self.machine.rig["length"][self.leg]), self._loops[()]
+        if read != read and loops["active"][self.leg] and not loops["unread"][self.leg]:
+            # The machine has no encoders with errors of their own; a drive with a loop reads its motor.
+            read = float(loops["place"][self.leg])
+        counts = read * self._scale
         if counts == counts:
-            self._position = (round(counts) + 2**31) % 2**32 - 2**31
+            self._position = int32(self.origin + round(counts))
         return self._position
 
     def inputs(self) -> int:
         """The digital inputs."""
         return HOME_INPUT if self.machine.rig["home"][self.leg] == 1 else 0
 
-    def obey(self, controlword: int, target: int) -> None:
-        """Let a command take effect."""
+    def obey(self, controlword: int, target: int | None = None) -> None:
+        """Let a command take effect, with another target if there is one."""
         before = self.power
         self.power = commanded(before, controlword, self.controlword)
-        self.controlword, self.target, self.commanded_ns = controlword, target, self._clock()
+        if target is not None and self._told_positions:
+            self.target_position = target
+        elif target is not None:
+            self.target = target
+        self.controlword, self.commanded_ns = controlword, self._clock()
+        if self.mode == POSITION_MODE:
+            self._interpolate()
         if before == PowerState.FAULT and self.power != PowerState.FAULT:
             self.code = 0
             self.machine.reset(self.leg)
         self.request()
+
+    def _interpolate(self) -> None:
+        """Let the goal reach the target position in an interpolation period."""
+        rig, leg = self.machine.rig, self.leg
+        period = self.value(Object.INTERPOLATION_PERIOD, 1) * 10.0 ** self.value(Object.INTERPOLATION_PERIOD, 2)
+        goal = self.origin + round(float(rig["loops"]["goal"][leg]) * self._scale)
+        self._rate = int32(self.target_position - goal) / self._scale / period
+        rig["until_ns"][leg] = rig["time_ns"] + round(1e9 * period)
 
     def settle(self) -> None:
         """Follow what the machine's drive does by itself."""
@@ -317,7 +364,7 @@ class EmulatedDrive(EmulatedNode):
         rig, leg, power, target = self.machine.rig, self.leg, self.power, 0.0
         if power == PowerState.OPERATION_ENABLED:
             rig["request"][leg] = Request.ENABLED
-            target = self.target / self._scale if self.mode == VELOCITY_MODE else 0.0
+            target = self._rate if self.mode == POSITION_MODE else self.target / self._scale if self.mode else 0.0
         else:
             stopping = power in (PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE)
             rig["request"][leg] = Request.QUICK_STOP if stopping else Request.BRAKED

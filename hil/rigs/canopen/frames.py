@@ -60,7 +60,7 @@ TRUTH_ID = 0x1F470001
 """Extended identifier of the frame with an emulated rig's truth, on CAN FD; no hardware sends it."""
 
 COMMAND, ANSWER, POSITION = struct.Struct("<Hi"), struct.Struct("<HiH"), struct.Struct("<iI")
-"""A drive's PDOs: controlword and target velocity [counts/s]; statusword, velocity [counts/s] and error code;
+"""A drive's PDOs: controlword and target [counts/s or counts]; statusword, velocity [counts/s] and error code;
 position [counts] and digital inputs."""
 
 HOME_INPUT = 1 << 2
@@ -94,7 +94,9 @@ class Object(IntEnum):
     MODE = 0x6060
     MODE_DISPLAY = 0x6061
     POSITION_ACTUAL = 0x6064
+    FOLLOWING_WINDOW = 0x6065
     VELOCITY_ACTUAL = 0x606C
+    TARGET_POSITION = 0x607A
     MAX_MOTOR_SPEED = 0x6080
     QUICK_STOP_DECELERATION = 0x6085
     INTERPOLATION_PERIOD = 0x60C2
@@ -133,11 +135,12 @@ _SAMPLE_COUNTER, _LOW_SAMPLE_COUNTER, _SYNC_COUNTER = 0x20100020, 0x20110008, 0x
 _MICROSECONDS, _TENS_OF_MICROSECONDS = 0x20130020, 0x20140010
 
 COMMAND_PDO = Pdo(0x1400, 0x1600, CobId.RPDO, 1, (0x60400010, 0x60FF0020))
+TARGET_PDO = Pdo(0x1400, 0x1600, CobId.RPDO, 1, (0x60400010, 0x607A0020))
+"""The same with a position instead of a velocity."""
+
 ANSWER_PDO = Pdo(0x1800, 0x1A00, CobId.TPDO, 1, (0x60410010, 0x606C0020, 0x603F0010))
 POSITION_PDO = Pdo(0x1801, 0x1A01, CobId.TPDO + 0x100, 1, (0x60640020, 0x60FD0020))
 """What an encoder reads; mapped only where the loop wants to know."""
-
-DRIVE_PDOS = (COMMAND_PDO, ANSWER_PDO)
 
 MAGNETOMETER_PDO = Pdo(0x1802, 0x1A02, CobId.TPDO + 0x200, MAGNETOMETER_INTERVAL, (*_MAGNETOMETER, _SYNC_COUNTER))
 _IMU_PDOS_CLASSIC = (
@@ -156,6 +159,11 @@ _IMU_PDOS_FD = (Pdo(0x1800, 0x1A00, CobId.TPDO, 1, (*_ALL_AXES, _SAMPLE_COUNTER,
 def imu_pdos(fd: bool) -> tuple[Pdo, ...]:
     """The PDOs of an IMU."""
     return _IMU_PDOS_FD if fd else _IMU_PDOS_CLASSIC
+
+
+def int32(counts: int) -> int:
+    """A count as an object of 32 bits has it, which wraps."""
+    return (counts + 2**31) % 2**32 - 2**31
 
 
 def new_message(identifier: int, data: bytes = b"", **flags: Any) -> can.Message:

@@ -1,4 +1,5 @@
-"""The CANopen rig: six CiA 402 drives in cyclic synchronous velocity mode and seven IMUs, on a bus of python-can.
+"""The CANopen rig: six CiA 402 drives in a cyclic synchronous mode, velocity or position, and seven IMUs, on a bus of
+python-can.
 
 The loop produces SYNC, and the heartbeat that the drives watch. `exchange` sends both, so the heartbeat dies with the loop. No
 thread runs beside it. Commands take effect at the SYNC after them.
@@ -15,11 +16,13 @@ import canopen
 import numpy as np
 
 from hil.rigs import ANSWERED, SILENT, DriveState, Identity, Request, RigError
-from hil.rigs.canopen.cia402 import Controlword, controlword_towards, drive_state, state_of
+from hil.rigs.canopen.cia402 import OFF_TARGET, Controlword, controlword_towards, drive_state, state_of
 from hil.rigs.canopen.configuration import BUS_ERRORS, MOST_DRAINED, RemoteNode, configure_drive, configure_imu, switch_on
 from hil.rigs.canopen.decoder import Decoder
-from hil.rigs.canopen.frames import COMMAND, SYNC_OVERFLOW, CobId, NmtCommand, NodeState, Object, new_message
+from hil.rigs.canopen.frames import COMMAND, SYNC_OVERFLOW, CobId, NmtCommand, NodeState, Object, int32, new_message
 from hil.rigs.canopen.settings import CanopenSettings
+from hil.rigs.position_loops import FOLLOWING_ERROR
+from hil.rigs.position_targets import PositionTargets
 from plant.compiled import Record
 from plant.errors import GoughError
 from plant.imu_wiring import BASE_IMU, IMU_COUNT
@@ -64,7 +67,8 @@ class CanopenRig:
         """
         self.command_delay = period
         self.bus_load = settings.check_bus_load(1.0 / period, lengths)  # in the worst case
-        self.decoder, self._lengths = Decoder(settings, lengths), lengths
+        self._lengths, self._told_positions = lengths, settings.drives.holds_positions
+        self.decoder = Decoder(settings, lengths or self._told_positions)
         self._settings, self._open, self._clock = settings, opened or settings.bus.opened, clock
         self._bus: Any = None
         self._nodes: list[RemoteNode] = []
@@ -73,6 +77,7 @@ class CanopenRig:
         self._silence_ns = round(settings.drives.silence * 1e9)
         self._heartbeat_ns, self._heartbeat_due = round(settings.controller.heartbeat * 1e9), 0
         self._scales = settings.drives.scales
+        self._targets = PositionTargets(period, settings.drives.velocity_limit)
         self._misses = [0] * self.decoder.all_frames.bit_length()
         fd = settings.bus.fd
         self._commands = [
@@ -91,7 +96,9 @@ class CanopenRig:
         bus, drives, imus = self._settings.bus, self._settings.drives, self._settings.imus
         try:
             self._bus = self._open()
-            self.decoder, self._misses = Decoder(self._settings, self._lengths), [0] * len(self._misses)
+            self.decoder = Decoder(self._settings, self._lengths or self._told_positions)
+            self._misses = [0] * len(self._misses)
+            self._targets = PositionTargets(self.command_delay, self._settings.drives.velocity_limit)
             network = canopen.Network(self._bus)
             self._nodes = [
                 RemoteNode(f"{name} {number}", node, table.eds, network, self._receive, self._clock)
@@ -247,14 +254,30 @@ class CanopenRig:
 
     def _send_commands(self, command: Array, request: int, feedback: Record) -> None:
         statuswords, limit, sent = self.decoder.statuswords, self._settings.drives.velocity_limit, feedback["sent"]
+        targets = self._next_targets(command, request) if self._told_positions else None
         for drive, message in enumerate(self._commands):
             velocity = float(command[drive]) if request == Request.ENABLED else 0.0
             # NaN is no command.
             velocity = min(max(velocity, -limit), limit) if velocity == velocity else 0.0
-            counts = round(velocity * self._scales[drive])
-            sent[drive] = counts / self._scales[drive]
-            COMMAND.pack_into(message.data, 0, controlword_towards(request, state_of(statuswords[drive])), counts)
+            word = controlword_towards(request, state_of(statuswords[drive]))
+            if targets is None:
+                counts = round(velocity * self._scales[drive])
+                sent[drive] = counts / self._scales[drive]
+            else:
+                counts, sent[drive] = targets[drive], velocity
+                if self.decoder.positions[drive] is None:
+                    # A drive without a position has no target either.
+                    word = controlword_towards(Request.BRAKED, state_of(statuswords[drive]))
+            COMMAND.pack_into(message.data, 0, word, counts)
             self._bus.send(message)
+
+    def _next_targets(self, command: Array, request: int) -> list[int]:
+        """The drives' target positions [counts], in 32 bits."""
+        decoder, scales = self.decoder, np.array(self._scales)
+        read = np.array([np.nan if position is None else position for position in decoder.positions]) / scales
+        following = [drive_state(word, True) == DriveState.FOLLOWING for word in decoder.statuswords]
+        targets = self._targets.advance(command, request, following, read) * scales
+        return [int32(round(target)) if target == target else 0 for target in targets.tolist()]
 
     def _collect(self, deadline: int) -> None:
         """Read the answers to SYNC, until all awaited frames are there or until the deadline."""
@@ -283,12 +306,15 @@ class CanopenRig:
             decoder.write_base_imu(feedback["base_imu"])
             feedback["base_imu_ns"], feedback["base_imu_sequence"] = decoder.sample_ns[BASE_IMU], decoder.sequence[BASE_IMU]
         feedback["drive"] = [
-            drive_state(decoder.statuswords[drive])
+            drive_state(decoder.statuswords[drive], self._told_positions)
             if decoder.nmt[drive] == NodeState.OPERATIONAL and now - decoder.heard_ns[drive] <= self._silence_ns
             else DriveState.NOT_READY
             for drive in range(LEGS)
         ]
-        feedback["drive_code"] = decoder.error_codes
+        feedback["drive_code"] = [
+            code or (FOLLOWING_ERROR if self._told_positions and word & OFF_TARGET else 0)
+            for code, word in zip(decoder.error_codes, decoder.statuswords, strict=True)
+        ]
         if self._lengths:
             self._fill_lengths(feedback)
         feedback["truth"][:13] = decoder.truth
@@ -310,7 +336,8 @@ class CanopenRig:
             return
         frames, request = [], _SDO_CONTROLWORD.pack(0x2B, Object.CONTROLWORD, 0, controlword, 0)
         for message, node in zip(self._commands, self._settings.drives.nodes, strict=True):
-            COMMAND.pack_into(message.data, 0, controlword, 0)
+            target = COMMAND.unpack(message.data)[1] if self._told_positions else 0
+            COMMAND.pack_into(message.data, 0, controlword, target)
             frames += [message, new_message(CobId.SDO_REQUEST + node, request)]
         for frame in (*frames, self._next_sync()):
             with suppress(Exception):

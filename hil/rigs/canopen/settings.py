@@ -5,7 +5,7 @@ import os
 import socket
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from math import ceil, isfinite
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from plant.imu_wiring import IMU_COUNT, SLOTS
 from plant.mechanism import LEGS
 
 DEFAULT_FILE = Path(__file__).with_name("canopen.toml")
+MODES = VELOCITY, POSITION = "velocity", "position"
 INTERFACES = ("socketcan", "udp_multicast", "virtual")
 LARGEST_LOAD = 0.9
 """The largest share of the bus' time for the frames of a cycle in the worst case; the rest is for heartbeats and SDO."""
@@ -39,9 +40,9 @@ Check = Callable[[str, Any], None]
 """Takes an entry's name and value, and raises an `InputError` if the value cannot be used."""
 
 
-def _entry(text: str, check: Check = lambda name, value: None) -> Any:
-    """An entry of a table: its meaning, and a check of its value."""
-    return field(metadata={"text": text, "check": check})
+def _entry(text: str, check: Check = lambda name, value: None, **default: Any) -> Any:
+    """An entry of a table: its meaning, a check of its value, and `default`, if it can be left out."""
+    return field(**default, metadata={"text": text, "check": check})
 
 
 def _must(hold: Callable[[Any], bool], text: str, shown: Callable[[Any], str] = repr) -> Check:
@@ -161,10 +162,12 @@ class DriveSettings:
     heartbeat: float = _entry("interval of the heartbeats [s]", _TIME)
     silence: float = _entry("time after which a silent drive counts as not ready [s]")
     command_timeout: float = _entry("time without SYNC and commands after which a drive stops by itself [s]", _TIME)
+    mode: str = _entry("of operation: cyclic synchronous velocity or position", _one_of(*MODES), default=VELOCITY)
+    following_error: float = _entry("in position mode, beyond which a drive has a fault [m]", _positive, default=0.005)
 
     def __post_init__(self) -> None:
         _within(2.0 * self.heartbeat, _LONGEST_TIME)("[drives] silence", self.silence)
-        for name in ("velocity_limit", "quick_stop_deceleration"):
+        for name in ("velocity_limit", "quick_stop_deceleration", "following_error"):
             if (counts := getattr(self, name) * self.counts_per_metre) > _INT32:
                 raise InputError(
                     f"[drives] {name} is {counts:.3g} counts, more than 32 bits hold: lower it, counts_per_turn or gear_ratio"
@@ -174,6 +177,11 @@ class DriveSettings:
     def counts_per_metre(self) -> float:
         """Counts of the motor per metre of the leg, and so counts per second per m/s."""
         return self.counts_per_turn * self.gear_ratio / self.screw_lead
+
+    @property
+    def holds_positions(self) -> bool:
+        """Whether the drives are told positions, and close a loop around their encoders."""
+        return self.mode == POSITION
 
     @property
     def scales(self) -> list[float]:
@@ -226,8 +234,10 @@ class CanopenSettings:
 
     def bus_load(self, rate: float, lengths: bool = False) -> float:
         """Share of the bus' time that the frames of a cycle take at `rate` [Hz] with the most stuff bits: the PDOs, SYNC and a
-        heartbeat; on classic CAN two frames per IMU and one magnetometer's. With `lengths` each drive has another frame.
+        heartbeat; on classic CAN two frames per IMU and one magnetometer's. With `lengths`, or if it is told positions, each
+        drive has another frame.
         """
+        lengths = lengths or self.drives.holds_positions
         count = len(self.imus.nodes)
         bus, of_drive = self.bus, (COMMAND_BYTES, ANSWER_BYTES, *([ANSWER_BYTES] if lengths else []))
         if bus.fd:
@@ -329,6 +339,9 @@ def _checked(title: str, kind: Any, table: Mapping[str, Any]) -> dict[str, Any]:
     values = {}
     for each in fields(kind):
         name = f"[{title}] {each.name}"
+        if each.name not in table and each.default is not MISSING:
+            values[each.name] = each.default
+            continue
         if each.name not in table:
             raise InputError(f"[{title}] lacks the entry {each.name!r} ({each.metadata['text']})")
         value, wanted = _frozen(table[each.name]), each.type

@@ -34,6 +34,7 @@ from hil.rigs.canopen.emulated_bus import EmulatedBus
 from hil.rigs.canopen.frames import ANSWER, COMMAND_PDO, POSITION, CobId, Object, Parameter, new_message, pack_imu, raw_readings
 from hil.rigs.canopen.rig import CanopenRig
 from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings, classic_bits, fd_duration
+from hil.rigs.position_loops import POSITION_LOOPS
 from plant.errors import InputError
 
 PERIOD = 0.02
@@ -51,7 +52,7 @@ class Kinematic:
         self.frozen, self.truth = np.zeros(7, bool), np.arange(19.0)
         self.now = None
         names = "request drive code target velocity length home measurement sample_ns sequence truth"
-        self.rig = {name: getattr(self, name) for name in names.split()}
+        self.rig = {name: getattr(self, name) for name in names.split()} | {"loops": np.zeros((), POSITION_LOOPS)}
 
     def advance(self, now_ns):
         dt = 0.0 if self.now is None else (now_ns - self.now) * 1e-9
