@@ -44,6 +44,8 @@ _STANDSTILL_S = 0.5
 _MOST_SILENT = 0.1
 _STALE_S = 0.01
 _CLOSED_WITHIN_S = 1.0
+_LONG_PAUSE_S = 0.02
+"""Drives may have stopped by themselves if nothing was exchanged for this time or longer [s]."""
 _REQUESTS = ("to hold on their brakes", "to follow", "to stop quickly")
 _DRIVES = tuple(state.name.lower().replace("_", " ") for state in DriveState)
 _GUARD, _GUARD_BYTES = 0xA5, 64
@@ -97,7 +99,7 @@ class _Examiner:
         self._feedback: Record = inner[0]
         self._before: Record = new_feedback()
         self._durations: list[int] = []
-        self._due = 0.0
+        self._due, self._exchanged, self._longest_pause = 0.0, np.inf, 0.0
         self._silent = 0
         self._commands: list[Array] = []
         self._age, self._stateless = np.zeros(IMU_COUNT, np.int64), np.zeros(LEGS, bool)
@@ -309,8 +311,14 @@ class _Examiner:
         states = ", ".join(_DRIVES[state] if 0 <= state < len(_DRIVES) else str(state) for state in drives)
         codes = ", ".join(f"{int(code):#x}" for code in self._feedback["drive_code"])
         text = f"Asked {_REQUESTS[request]}, the drives are {states} after {count} exchanges (fault codes {codes})."
+        faulty = bool((drives == DriveState.FAULTY).any())
+        if faulty and self._longest_pause > max(_LONG_PAUSE_S, 2.0 * self._period):
+            text += (
+                f" This machine was busy elsewhere for up to {1e3 * self._longest_pause:.0f} ms between two exchanges, and "
+                "drives stop when they hear nothing for longer than their watchdog: end what else runs on it, and try again."
+            )
         self._find("drives", text, str(request))
-        if (drives == DriveState.FAULTY).any():
+        if faulty:
             raise _BrokenOffError
 
     # ------------------------------------------------------------------------------------------------------ exchanges
@@ -330,7 +338,8 @@ class _Examiner:
         self._due += self._period
         feedback, given = self._feedback, command.copy()
         self._before[()] = feedback
-        began = time.perf_counter_ns()
+        now, began = time.monotonic(), time.perf_counter_ns()
+        self._longest_pause, self._exchanged = max(self._longest_pause, now - self._exchanged), now
         try:
             status = self._rig.exchange(given, request, feedback)
         except Exception as error:
