@@ -41,6 +41,17 @@ class Motion(NamedTuple):
     samples: Array  # (N, 3, 7, 3), raw
     start: tuple[Pose, Array]  # pose and twist (6,) at the first sample
     lengths: Array | None = None  # (N, 6) [m], by encoders, NaN for none
+    read: NDArray[np.bool_] | None = None  # (N,), False where a sample only stands for a missed one; None where all were read
+
+    def part(self, samples: slice, start: tuple[Pose, Array]) -> "Motion":
+        """Some of its samples, with pose and twist at the first of them."""
+        lengths, read = (None if each is None else each[samples] for each in (self.lengths, self.read))
+        return Motion(self.samples[samples], start, lengths, read)
+
+    def used(self) -> NDArray[np.int64]:
+        """(N, 7), which IMUs' samples were read."""
+        read = np.ones(len(self.samples), np.int64) if self.read is None else self.read.astype(np.int64)
+        return np.repeat(read[:, None], IMU_COUNT, axis=1)
 
 
 class Track(NamedTuple):
@@ -129,13 +140,12 @@ def calibrate_in_motion(
     plain, inflated = (
         filter_parameters(fusion, rate, "axes", found.covariance, inflation=by, lengths=measured) for by in (1.0, _INFLATION)
     )
-    used = np.ones((len(motion.samples), IMU_COUNT), np.int64)
     geometry = sensor_geometry(mechanism.moved_joints(found.joints), found.tilt)
     calibrated, guide = found.calibration().apply(motion.samples), None
     states = []
     for parameters in (plain, plain, inflated):
         run = track(
-            parameters, geometry, calibrated, used, rate, fusion.sensor_delay, motion.start, guide, motion.lengths
+            parameters, geometry, calibrated, motion.used(), rate, fusion.sensor_delay, motion.start, guide, motion.lengths
         )  # fmt: skip
         if not (np.isfinite(run.state["errors"]).all() and np.isfinite(run.positions).all()):
             raise CalibrationError("the whole-mechanism filter does not follow the motion: check the calibration at rest")

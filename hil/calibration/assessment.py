@@ -94,15 +94,13 @@ def cross_validate(data: CalibrationData, calibration: Calibration, motion: Moti
     middle = len(motion.samples) // 2
     parameters = filter_parameters(data.fusion, data.rate, "axes", calibration.covariance)
     first = calibration.apply(motion.samples[: middle + 1])
-    used = np.ones((middle + 1, IMU_COUNT), np.int64)
+    used = motion.used()[: middle + 1]
     way = track(parameters, data.geometry(calibration), first, used, data.rate, data.fusion.sensor_delay, motion.start)
     there = Pose(way.positions[-1], way.rotations[-1]), way.motions[-1, [VELOCITY, RATE]].ravel()
     poses: dict[str, list[Array]] = {"rests": [], "motion": []}
     for first_rest, samples, begin in ((0, slice(middle), motion.start), (1, slice(middle, None), there)):
         half = data.at_rest(everything[first_rest::2])
-        lengths = None if motion.lengths is None else motion.lengths[samples]
-        half_motion = Motion(motion.samples[samples], begin, lengths)
-        moved, _ = calibrate_in_motion(data.mechanism, half, half_motion, data.rate, data.fusion)
+        moved, _ = calibrate_in_motion(data.mechanism, half, motion.part(samples, begin), data.rate, data.fusion)
         poses["rests"] += _fit(data, half.calibration(), everything)[:2]
         poses["motion"] += _fit(data, moved, everything)[:2]
     figures = {name: rms_figures(pose_errors(*each)) for name, each in poses.items()}

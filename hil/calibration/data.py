@@ -70,6 +70,11 @@ def raw_samples(records: Record) -> Array:
     return np.stack([records["angular_velocity"], records["specific_force"], records["magnetic_field"]], axis=1)
 
 
+def was_read(records: Record) -> NDArray[np.bool_]:
+    """Where records (N,) of every cycle have readings of their own: the period was not missed, and the rig answered in time."""
+    return (np.diff(records["cycle"], prepend=-1) != 0) & (records["silent"] == 0)
+
+
 def _means(values: Array, length: int) -> Array:
     """The means (N // length, ...) of values (N, ...) over so many samples each."""
     whole = values[: len(values) // length * length]
@@ -262,8 +267,10 @@ class CalibrationData:
         calibration = at_rest.calibration()
         mean = calibration.apply(samples[first:last].mean(axis=0))
         pose = fit_pose(self.geometry(calibration), mean[ACCELEROMETER], self.mechanism.require_home())
-        lengths = self._lengths_in(runs[number])
-        return Motion(samples[last:], (Pose(*pose), np.zeros(6)), None if lengths is None else lengths[whole][last:])
+        lengths, read = self._lengths_in(runs[number]), was_read(runs[number])[whole][last:]
+        if lengths is not None:
+            lengths = np.where(read[:, None], lengths[whole][last:], np.nan)
+        return Motion(samples[last:], (Pose(*pose), np.zeros(6)), lengths, read)
 
     def geometry(self, calibration: Calibration) -> Record:
         """Places of the sensors for the joints and the tilt of a calibration."""

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 _DEFAULT_RIG = SimulationConfig(imu="mpu9150")
 """The rig that is driven without any option."""
 
+_MOST_MISSED = 25
+"""Periods missed in a row that are borne by default: a calibration leaves out what was not read, and a stop loses a run."""
+
 
 @cli.command(
     cli.output("output", "FILE.toml", "the calibration to write"),
@@ -69,7 +72,7 @@ _DEFAULT_RIG = SimulationConfig(imu="mpu9150")
         help="the rig measures by how much its lengths change: by its --encoders, or in a simulation without them to 50 um",
     ),
     cli.flag("--known-poses", "write the mounting alone, by comparing with the planned poses, as in the paper's section 7"),
-    cli.options_of(RealTimeSettings),
+    cli.options_of(RealTimeSettings, "priority", "cpu", "strict", most_missed={"default": _MOST_MISSED}),
     cli.report("write a report with plots"),
     cli.output("--picture", "FILE.svg", "draw the accuracy of each stage"),
     cli.JSON,

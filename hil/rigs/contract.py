@@ -44,6 +44,8 @@ _STANDSTILL_S = 0.5
 _MOST_SILENT = 0.1
 _STALE_S = 0.01
 _CLOSED_WITHIN_S = 1.0
+_LONG_PAUSE_S = 0.02
+"""Drives may have stopped by themselves if nothing was exchanged for this time or longer [s]."""
 _REQUESTS = ("to hold on their brakes", "to follow", "to stop quickly")
 _DRIVES = tuple(state.name.lower().replace("_", " ") for state in DriveState)
 _GUARD, _GUARD_BYTES = 0xA5, 64
@@ -97,7 +99,7 @@ class _Examiner:
         self._feedback: Record = inner[0]
         self._before: Record = new_feedback()
         self._durations: list[int] = []
-        self._due = 0.0
+        self._due, self._exchanged, self._longest_pause = 0.0, np.inf, 0.0
         self._silent = 0
         self._commands: list[Array] = []
         self._age, self._stateless = np.zeros(IMU_COUNT, np.int64), np.zeros(LEGS, bool)
@@ -248,6 +250,7 @@ class _Examiner:
         self._begin("gravity", "commands", "gyroscopes", "accelerometers", "encoders")
         for clause, text in self._motions.findings() if self._motions is not None else ():
             self._find(clause, text)
+        self._find_pause("commands")
 
     def _move(self, command: Array, count: int) -> None:
         """Move with a command for some exchanges, unless the IMUs show a motion that it should not make."""
@@ -258,6 +261,7 @@ class _Examiner:
                 self._rest(Request.QUICK_STOP)
                 self._tell_motions()
                 self._find("commands", alarm)
+                self._find_pause("commands")
                 raise _BrokenOffError
 
     def _rest(self, request: int = Request.ENABLED) -> None:
@@ -284,6 +288,7 @@ class _Examiner:
         for leg in np.flatnonzero(abs(moved - due) > 0.5 * due).tolist():
             text = f"Leg {leg} moved by {1e3 * moved[leg]:.3f} mm, commanded were {1e3 * due:.3f} mm: check its sign and scale."
             self._find("motion", text)
+        self._find_pause("motion")
 
     def _check_limit(self, beyond: float) -> None:
         most = 0.0
@@ -311,7 +316,18 @@ class _Examiner:
         text = f"Asked {_REQUESTS[request]}, the drives are {states} after {count} exchanges (fault codes {codes})."
         self._find("drives", text, str(request))
         if (drives == DriveState.FAULTY).any():
+            self._find_pause("drives")
             raise _BrokenOffError
+
+    def _find_pause(self, clause: str) -> None:
+        """Note that this machine was busy elsewhere, if it was, as that may explain the findings of a clause."""
+        if self._result.findings[clause] and self._longest_pause > max(_LONG_PAUSE_S, 2.0 * self._period):
+            self._find(
+                clause,
+                f"That may be because this machine was busy elsewhere, for up to {1e3 * self._longest_pause:.0f} ms between "
+                "two exchanges: drives go on meanwhile, or stop by their watchdog. End what else runs on it, and try again.",
+                "pause",
+            )
 
     # ------------------------------------------------------------------------------------------------------ exchanges
 
@@ -330,7 +346,8 @@ class _Examiner:
         self._due += self._period
         feedback, given = self._feedback, command.copy()
         self._before[()] = feedback
-        began = time.perf_counter_ns()
+        now, began = time.monotonic(), time.perf_counter_ns()
+        self._longest_pause, self._exchanged = max(self._longest_pause, now - self._exchanged), now
         try:
             status = self._rig.exchange(given, request, feedback)
         except Exception as error:

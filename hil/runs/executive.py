@@ -87,11 +87,11 @@ def run(
         say: called with each remark before the loop runs.
 
     Returns:
-        The summary: `cause` of the stop, `cycles`, missed periods by cause, `timing_us` and which of it is `over_budget`,
-        `target_stretch` (`controller.planning.pace`), `errors_m`, the number of cycles `unseen` by these, `usage` of the loop's
-        thread, `start_up_s`, `recording` (files, cycles lost), `remarks`, `refused`, `events`, `config`, `version`; of a rig on
-        a bus `identity`, `late` exchanges, `refused_packets` and `round_trip_bars`; and of a dry run the `obstacle` to arming,
-        "" if there is none.
+        The summary: `cause` of the stop, `cycles`, missed periods by cause and most in a row, `timing_us` and which of it is
+        `over_budget`, `target_stretch` (`controller.planning.pace`), `errors_m`, the number of cycles `unseen` by these,
+        `usage` of the loop's thread, `start_up_s`, `recording` (files, cycles lost), `remarks`, `refused`, `events`, `config`,
+        `version`; of a rig on a bus `identity`, `late` exchanges, `refused_packets` and `round_trip_bars`; and of a dry run the
+        `obstacle` to arming, "" if there is none.
 
     Raises:
         GoughError: something in the configuration or the settings cannot be used; nothing has run.
@@ -289,6 +289,7 @@ def _prepare_and_follow(
             "cause": ": ".join(filter(None, [loop.reason(), loop.failure or getattr(rig, "failure", "")])),
             "cycles": int(link[Link.HEAD]),
             **{name: int(loop.clock[name]) for name in ("missed_late", "missed_own", "missed_host")},
+            "missed_in_a_row": int(loop.clock["most_in_a_row"]),
             "remarks": list(loop.remarks),
             "usage": used,
             "identity": header["config"].get("identity"),

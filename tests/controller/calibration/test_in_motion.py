@@ -109,3 +109,23 @@ def test_joints_that_are_off_are_sought_with_the_rest(hexapod):
     of_imus[: 7 * ERRORS, : 7 * ERRORS] = calibration.covariance
     apart = predicted(known, calibration.tilt, of_imus).reshape(2, 3).sum(axis=1) + calibration.floor**2
     np.testing.assert_allclose(apart, predicted(known, calibration.tilt, covariance).reshape(2, 3).sum(axis=1), rtol=0.1)
+
+
+@pytest.mark.slow
+def test_missed_periods_cost_what_was_not_read_alone(hexapod):
+    """Taken for readings, the samples that stand for missed ones would bend the calibration."""
+    fusion = sensor_settings(hexapod, RAW)
+    readings, _, _ = rests_of(hexapod, 20, 1)
+    found = calibrate_at_rest(hexapod, Rests(readings))
+    _, _, motion = moved(hexapod, 10.0)
+    read = np.arange(len(motion.samples)) % 200 >= 20
+    read[:200] = True
+    last = np.maximum.accumulate(np.where(read, np.arange(len(read)), 0))
+    held = motion._replace(samples=motion.samples[last])
+    others = rests_of(hexapod, 10, 1, poses=sample_workspace(hexapod, 10, seed=999))
+    errors = []
+    for each in (motion, held._replace(read=read), held):
+        calibration, _ = calibrate_in_motion(hexapod, found, each, 1000.0, fusion)
+        errors.append(pose_errors(hexapod, calibration, calibration.tilt, *others)[0])
+    whole, missed, taken = errors
+    assert missed < 1.2 * whole < taken

@@ -8,7 +8,7 @@ import pytest
 from controller.calibration.file import Calibration
 from controller.inverse_kinematics import leg_lengths
 from hil.calibration import data as calibration_data
-from hil.calibration.data import TO_50_UM, CalibrationData, Knowledge, find_rests, is_long, measured_lengths
+from hil.calibration.data import TO_50_UM, CalibrationData, Knowledge, find_rests, is_long, measured_lengths, was_read
 from hil.calibration.procedure import SimulatedRig, every_cycle
 from hil.loop.records import RECORD
 from hil.runs.config import SimulationConfig
@@ -238,4 +238,21 @@ def test_the_gyroscopes_are_zeroed_while_the_brakes_hold():
 def test_the_record_before_stands_for_a_missed_one():
     records = np.zeros(4, RECORD)
     records["cycle"], records["missed"] = [0, 1, 4, 5], [0, 0, 2, 0]
-    assert every_cycle(records)["cycle"].tolist() == [0, 1, 1, 1, 4, 5]
+    filled = every_cycle(records)
+    assert filled["cycle"].tolist() == [0, 1, 1, 1, 4, 5]
+    filled["silent"][5] = 1
+    assert was_read(filled).tolist() == [True, True, False, False, True, False]
+
+
+def test_what_was_not_read_is_none_of_a_motions_readings(monkeypatch):
+    records = phases(1.0, 12.0)
+    records["length"] = 0.5
+    missed = np.r_[2000:2010, 3000]
+    gappy = every_cycle(np.delete(records, missed))
+    motion = longest(monkeypatch, new_data(encoder=PRESETS["absolute"]), [gappy], Calibration())[0]
+    at = missed - (len(records) - len(motion.samples))
+    assert np.flatnonzero(~motion.read).tolist() == at.tolist()
+    assert np.flatnonzero(np.isnan(motion.lengths).any(axis=1)).tolist() == at.tolist()
+    assert motion.used().shape == (len(motion.samples), 7) and (motion.used().sum(axis=1) == 7 * motion.read).all()
+    half = motion.part(slice(int(at[5]), None), motion.start)
+    assert half.read.sum() == motion.read[at[5] :].sum() and len(half.lengths) == len(half.samples)

@@ -22,7 +22,7 @@ from hil.loop.records import RECORD
 from hil.realtime.scheduling import RealTimeSettings
 from hil.recording.mcap import Recorder, read
 from hil.recording.replay_rig import ENDED, FAILED, ReplayRig
-from hil.rigs import ANSWERED, BRAKED, ENABLED, FOLLOWING, READY, SILENT, Identity, RigError, contract, new_feedback
+from hil.rigs import ANSWERED, BRAKED, ENABLED, FAULTY, FOLLOWING, READY, SILENT, Identity, RigError, contract, new_feedback
 from hil.rigs.by_name import python_rig
 from hil.rigs.canopen.rig import CanopenRig
 from hil.rigs.canopen.settings import DEFAULT_FILE, canopen_settings
@@ -245,6 +245,21 @@ class IsSlow(TemplateRig):
         return super().exchange(command, request, feedback)
 
 
+class HearsNothingForLong(TemplateRig):
+    """Whatever holds this machine up for 40 ms in the 130th exchange, the drives' watchdog strikes."""
+
+    count = 0
+
+    def exchange(self, command, request, feedback):
+        self.count += 1
+        if self.count == 130:
+            contract.time.sleep(0.04)
+        status = super().exchange(command, request, feedback)
+        if self.count >= 130:
+            feedback["drive"], feedback["drive_code"] = FAULTY, 0x8130
+        return status
+
+
 class Ignores(TemplateRig):
     def exchange(self, command, request, feedback):
         status = super().exchange(command, request, feedback)
@@ -381,6 +396,11 @@ class DelaysForLong(TemplateRig):
         (TimeGoesBack, "order in time", "time of IMU 0's samples went back"),
         (StandsStill, "sample age", "IMU 2 has no new sample in 4 exchanges"),
         (IsSlow, "period", "longer than the period of 5 ms"),
+        (
+            HearsNothingForLong,
+            "drives",
+            r"faulty.*0x8130[^\0]*busy elsewhere, for up to 40 ms between .* watchdog",
+        ),
         (Ignores, "drives", "Asked to follow, the drives are following, .*, ready, following after 20 exchanges"),
         (IgnoresQuickStop, "drives", "Asked to stop quickly, the drives are following"),
         (ChangesDtype, "exchanges", "exchange raised AttributeError: .*not writable"),
