@@ -45,7 +45,8 @@ class Motion(NamedTuple):
 
     def part(self, samples: slice, start: tuple[Pose, Array]) -> "Motion":
         """Some of its samples, with pose and twist at the first of them."""
-        lengths, read = (None if each is None else each[samples] for each in (self.lengths, self.read))
+        lengths = None if self.lengths is None else self.lengths[samples]
+        read = None if self.read is None else self.read[samples]
         return Motion(self.samples[samples], start, lengths, read)
 
     def used(self) -> NDArray[np.int64]:

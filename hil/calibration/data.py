@@ -72,7 +72,8 @@ def raw_samples(records: Record) -> Array:
 
 def was_read(records: Record) -> NDArray[np.bool_]:
     """Where records (N,) of every cycle have readings of their own: the period was not missed, and the rig answered in time."""
-    return (np.diff(records["cycle"], prepend=-1) != 0) & (records["silent"] == 0)
+    read: NDArray[np.bool_] = (np.diff(records["cycle"], prepend=-1) != 0) & (records["silent"] == 0)
+    return read
 
 
 def _means(values: Array, length: int) -> Array:

@@ -223,7 +223,9 @@ def _find_motion(s: Record) -> None:
     """Write the mean motion of the full window, as the readings are means. Where a plan that follows points jerks to and fro,
     the acceleration of its middle is off by 0.1 m/s^2.
     """
-    s.planned[:] /= s.collected
+    for k in range(LEGS):
+        for i in range(3):
+            s.planned[k, i] /= s.collected
     motion_of_legs(s.arms, s.directions, s.lengths, s.planned, s.factor, s.derivatives)
     motion = s.next_path.motion
     for i in range(3):
