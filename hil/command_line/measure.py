@@ -30,8 +30,8 @@ def gough_bench(options: Namespace) -> None:
 
     The loop on the clock: how late it wakes, beside cyclictest, and how long it computes, idle, under load and with a busy
     supervisor; its speed against real time and the microseconds of each stage; the plant's FMU, from compiled code and through
-    FMPy, and how exact it is; direct kinematics: microseconds per pose, against Newton's method from lengths, here and in C, and
-    whether both find the pose from cold; and the margins of a pose in the workspace, against inverse kinematics.
+    FMPy, and how exact it is; direct kinematics: microseconds per pose, against Newton's method from lengths, here and in C,
+    and whether both find the pose from cold; and the margins of a pose in the workspace, against inverse kinematics.
     """
     from hil.benchmarks.loop import machine, read_earlier
 
