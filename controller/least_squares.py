@@ -98,12 +98,18 @@ def _symmetric_solver(n: int) -> Callable[[Array, int, Array, Array, Array, Arra
         """
         for j in range(n):
             pivots[j], order[j] = matrix[j, j], j
-        ratio = 1.0
+        first = ratio = 1.0
         for k in range(rank):
             best, greatest = 0, pivots[0]
             for j in range(1, n):
                 greater = pivots[j] > greatest
                 best, greatest = j if greater else best, pivots[j] if greater else greatest
+            if k == 0:
+                first = greatest
+            # Neither is what is not a number: then the first column may be the best again, and is in no place.
+            if not greatest >= WELL_CONDITIONED**2 * first or not greatest > 0.0:
+                return 0.0
+            ratio = greatest / first
             place = k
             while int(order[place]) != best:
                 place += 1
@@ -115,9 +121,6 @@ def _symmetric_solver(n: int) -> Callable[[Array, int, Array, Array, Array, Arra
                 factor = matrix[above, best] * matrix[above, n + 1]
                 for j in range(n + 1):
                     matrix[row, j] -= factor * matrix[above, j]
-            ratio = matrix[row, best] / matrix[n, int(order[0])]
-            if not ratio >= WELL_CONDITIONED**2:
-                return 0.0
             inverse = 1.0 / matrix[row, best]
             matrix[row, n + 1] = inverse
             for j in range(n):

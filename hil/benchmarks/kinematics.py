@@ -33,6 +33,7 @@ _BATCH_ROWS = 100_000
 _MOTION_S = 10.0
 _COLD_STARTS = 1000
 _WIDE_TILT = np.radians(60.0)
+Figures = dict[str, dict[str, float]]  # by method and kind
 _SAME_POSE = 1e-6, 1e-6
 """Within this distance [m] and angle [rad], two poses are the same."""
 
@@ -44,7 +45,7 @@ def measure_kinematics(progress: Progress = no_progress) -> dict[str, Any]:
         `solve_us`: by class and method, per pose on one core, compiled: `closed_form`, and `refined` with its covariance.
         `call_us`: one call of `solve` from Python. `batch_per_s`: poses per second on all cores. `newton`: `warm_us` per
         pose by Newton's method from lengths along a motion at 1 kHz, and the `ratios` of each method to it. `newton_in_c`:
-        the same for the `Yardstick`, in slices that take turns; also the `steps` per pose that it took. `cold_starts`: by
+        `warm_us` and `steps` per pose of the `Yardstick`, and by class and on `hexapod` the `ratios` to it. `cold_starts`: by
         preset, over the `workspace` and over `wide` poses (60 deg of tilt, any yaw), the shares of poses found (`success`)
         and mistaken (`wrong`), by Newton's method from home and from the leg directions.
 
@@ -56,14 +57,14 @@ def measure_kinematics(progress: Progress = no_progress) -> dict[str, Any]:
     classes = spatial_classes()
     steps = len(classes) + len(PRESETS) + 2
     solve_us: dict[str, Any] = {}
+    ratios: dict[str, Figures] = {}
     for number, mechanism_class in enumerate(classes):
-        mechanism = draw_mechanism(mechanism_class, np.random.default_rng(number))
-        solve_us[mechanism_class.label] = _time_methods(mechanism)
+        mechanism, label = draw_mechanism(mechanism_class, np.random.default_rng(number)), mechanism_class.label
+        solve_us[label], ratios[label], _ = _time_methods(mechanism, yardstick, _REPEATS)
         progress((number + 1) / steps)
     newton = _time_newton(hexapod)
     progress((len(classes) + 1) / steps)
-    on_hexapod = _time_methods(hexapod)
-    newton_in_c = _compare(hexapod, yardstick)
+    on_hexapod, ratios["hexapod"], newton_in_c = _time_methods(hexapod, yardstick, _ROUNDS)
     batch, call = _time_batch(hexapod)
     progress((len(classes) + 2) / steps)
     cold = {}
@@ -79,7 +80,7 @@ def measure_kinematics(progress: Progress = no_progress) -> dict[str, Any]:
             "warm_us": newton,
             "ratios": {method: {kind: us / newton for kind, us in times.items()} for method, times in on_hexapod.items()},
         },
-        "newton_in_c": newton_in_c,
+        "newton_in_c": {"warm_us": newton_in_c, "steps": yardstick.steps, "ratios": ratios},
         "cold_starts": cold,
     }
 
@@ -125,28 +126,6 @@ def _compiled(folder: Path) -> Path:
     return library
 
 
-def _compare(mechanism: Mechanism, yardstick: Yardstick) -> dict[str, Any]:
-    """Time every method and the yardstick in turns. A slice is a few milliseconds of this thread's time on the processor; each
-    ratio is the median of those to the yardstick's slice of the same round.
-    """
-    runs = _runs(mechanism)
-    turns: list[Callable[[], Any]] = [yardstick, *runs.values()]
-    rounds = []
-    for _ in range(_ROUNDS):
-        slices = []
-        for run in turns:
-            began = thread_time()
-            run()
-            slices.append(thread_time() - began)
-        rounds.append(slices)
-    times = np.array(rounds)
-    ratios: dict[str, dict[str, float]] = {}
-    medians = np.median(times / times[:, :1], axis=0) * _YARDSTICK_ROWS / _ROWS
-    for (method, kind), ratio in zip(runs, medians[1:], strict=True):
-        ratios.setdefault(method, {})[kind] = float(ratio)
-    return {"warm_us": 1e6 * float(np.median(times[:, 0])) / _YARDSTICK_ROWS, "steps": yardstick.steps, "ratios": ratios}
-
-
 def _median_s(work: Callable[[], object]) -> float:
     """Median duration of some work [s]."""
     runs = []
@@ -157,12 +136,31 @@ def _median_s(work: Callable[[], object]) -> float:
     return float(np.median(runs))
 
 
-def _time_methods(mechanism: Mechanism) -> dict[str, dict[str, float]]:
-    """Microseconds per pose of every method that works on the mechanism."""
-    times: dict[str, dict[str, float]] = {}
-    for (method, kind), run in _runs(mechanism).items():
-        times.setdefault(method, {})[kind] = 1e6 * _median_s(run) / _ROWS
-    return times
+def _time_methods(mechanism: Mechanism, yardstick: Yardstick, rounds: int) -> tuple[Figures, Figures, float]:
+    """Time every method that works on a mechanism and the yardstick in turns, by this thread's time on the processor.
+
+    Returns:
+        Microseconds per pose by method and kind, their ratios to the yardstick, each the median of those to its slice of the
+        same round, and the yardstick's microseconds per pose.
+    """
+    runs = _runs(mechanism)
+    turns: list[Callable[[], Any]] = [yardstick, *runs.values()]
+    slices = np.array([[_thread_s(turn) for turn in turns] for _ in range(rounds)])
+    slices *= 1e6 / np.array([_YARDSTICK_ROWS, *[_ROWS] * len(runs)])
+    times: Figures = {}
+    ratios: Figures = {}
+    medians = np.median(slices, axis=0), np.median(slices / slices[:, :1], axis=0)
+    for figures, found in zip((times, ratios), medians, strict=True):
+        for (method, kind), figure in zip(runs, found[1:], strict=True):
+            figures.setdefault(method, {})[kind] = float(figure)
+    return times, ratios, float(medians[0][0])
+
+
+def _thread_s(work: Callable[[], object]) -> float:
+    """Duration of some work [s] without the time that other programs had the processor."""
+    began = thread_time()
+    work()
+    return thread_time() - began
 
 
 def _runs(mechanism: Mechanism) -> dict[tuple[str, str], Callable[[], Any]]:
@@ -204,7 +202,7 @@ def _time_newton(mechanism: Mechanism) -> float:
     positions, rotations = _motion(mechanism, round(1e3 * _MOTION_S))
     lengths = leg_lengths(mechanism, positions, rotations)
     run = partial(poses_from_lengths, mechanism, lengths, Pose(positions[0], rotations[0]))
-    return 1e6 * _median_s(run) / len(positions)
+    return 1e6 * float(np.median([_thread_s(run) for _ in range(_REPEATS)])) / len(positions)
 
 
 def _motion(mechanism: Mechanism, count: int) -> tuple[Array, Array]:

@@ -30,8 +30,8 @@ def gough_bench(options: Namespace) -> None:
 
     The loop on the clock: how late it wakes, beside cyclictest, and how long it computes, idle, under load and with a busy
     supervisor; its speed against real time and the microseconds of each stage; the plant's FMU, from compiled code and through
-    FMPy, and how exact it is; direct kinematics: microseconds per pose, against Newton's method from lengths, and whether
-    both find the pose from cold; and the margins of a pose in the workspace, against inverse kinematics.
+    FMPy, and how exact it is; direct kinematics: microseconds per pose, against Newton's method from lengths, here and in C,
+    and whether both find the pose from cold; and the margins of a pose in the workspace, against inverse kinematics.
     """
     from hil.benchmarks.loop import machine, read_earlier
 
@@ -150,37 +150,40 @@ def _plant(options: Namespace, figures: dict[str, Any]) -> None:
     )
 
 
-def _kinematics(_: Namespace, figures: dict[str, Any]) -> None:
+def _table_of_methods(title: str, figures: dict[str, Any]) -> Table:
+    """Figures of each closed form and its refinement: the median over the classes of a group."""
     from statistics import median
 
-    from hil.benchmarks.kinematics import measure_kinematics
-
-    with progress_bar("direct kinematics") as progress:
-        measured = figures["kinematics"] = measure_kinematics(progress)
     groups: dict[str, list[dict[str, Any]]] = {}
-    for label, methods in measured["solve_us"].items():
-        groups.setdefault(label.rpartition(".")[0], []).append(methods)
-    groups["hexapod"] = [measured["hexapod_us"]]
+    for label, methods in figures.items():
+        groups.setdefault(label.rpartition(".")[0] or label, []).append(methods)
     names = list(dict.fromkeys(name for methods in groups.values() for name in methods[0]))
-    table = Table("us", *names)
+    table = Table(title, *names)
     for group, members in groups.items():
         cells = []
         for name in names:
             found = [methods[name] for methods in members if name in methods]
             medians = (median(each[kind] for each in found) for kind in ("closed_form", "refined") if found)
-            cells.append(" / ".join(f"{us:.{2 if us < 10.0 else 1}f}" for us in medians) or "-")
+            cells.append(" / ".join(f"{figure:.{2 if figure < 10.0 else 1}f}" for figure in medians) or "-")
         table.add(group, *cells)
+    return table
+
+
+def _kinematics(_: Namespace, figures: dict[str, Any]) -> None:
+    from hil.benchmarks.kinematics import measure_kinematics
+
+    with progress_bar("direct kinematics") as progress:
+        measured = figures["kinematics"] = measure_kinematics(progress)
     newton, in_c = measured["newton"], measured["newton_in_c"]
-    for label, ratios in (("over Newton", newton["ratios"]), ("over Newton in C", in_c["ratios"])):
-        times = {name: f"{ratio['closed_form']:.2f} / {ratio['refined']:.2f}" for name, ratio in ratios.items()}
-        table.add(label, *(times.get(name, "-") for name in names))
-    table.print()
+    times = {**measured["solve_us"], "hexapod": measured["hexapod_us"], "over Newton": newton["ratios"]}
+    _table_of_methods("us", times).print()
+    _table_of_methods("over C", in_c["ratios"]).print()
     print("closed form / refined")
     rates = ", ".join(f"{name} {rate / 1e3:.0f}" for name, rate in measured["batch_per_s"].items())
     print(f"refined poses per second on all cores [thousands]: {rates}; one call from Python {measured['call_us']:.0f} us")
     print(
-        f"Newton's method from lengths, warm: {newton['warm_us']:.2f} us per pose; in C as LinuxCNC's genhexkins, to 1e-9 m: "
-        f"{in_c['warm_us']:.2f} us, {in_c['steps']:.1f} steps"
+        f"Newton's method from lengths, warm: {newton['warm_us']:.2f} us per pose; in C (over C) as LinuxCNC's genhexkins, "
+        f"to 1e-9 m: {in_c['warm_us']:.2f} us, {in_c['steps']:.1f} steps"
     )
     table = Table("cold starts [%]", "found by Newton", "mistaken", "found from directions", "mistaken")
     for preset, ranges in measured["cold_starts"].items():

@@ -7,12 +7,16 @@ from hypothesis import strategies as st
 
 from controller.least_squares import (
     RANK_TOLERANCE,
+    WELL_CONDITIONED,
     determinant,
     extreme_singular_values,
     factor_cholesky,
     invert_cholesky,
+    invert_symmetric,
     solve_cholesky,
+    solve_five,
     solve_least_squares,
+    solve_nine,
     solve_square,
     solve_truncated,
 )
@@ -245,3 +249,78 @@ def test_a_singular_matrix_has_the_singular_value_zero():
     for matrix in (np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 0.0]), np.zeros((6, 6))):
         assert extreme_singular_values(matrix.copy(), 6, *scratch)[0] == 0.0
         assert determinant(matrix.copy(), 6) == 0.0
+
+
+def by_qr_and_by_normal_equations(matrix, right, rank):
+    """Conditioning, solution and open directions, by `solve_truncated` and by `solve_five` or `solve_nine`."""
+    rows, n = matrix.shape
+    solution, null_space, norms, order = (np.full(shape, np.nan) for shape in (n, (n, n), n, n))
+    ratio = solve_truncated(matrix.copy(), right.copy(), rows, rank, solution, null_space, norms, order)
+    found, found_space, pivots, found_order = (np.full(shape, np.nan) for shape in (n, (n, n), n, n))
+    equations = np.full((20, 20), np.nan)
+    equations[:n, :n], equations[:n, n] = matrix.T @ matrix, matrix.T @ right
+    solver = {5: solve_five, 9: solve_nine}[n]
+    found_ratio = solver(equations, rank, found, found_space, pivots, found_order)
+    return (ratio, solution, null_space[: n - rank]), (found_ratio, found, found_space[: n - rank])
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from([5, 9]), st.data())
+def test_where_they_are_well_conditioned_normal_equations_give_what_the_qr_gives(n, data):
+    """To rounding over the square of the conditioning, the open directions in the same order."""
+    rank, noise = data.draw(st.integers(n - 2, n)), data.draw(st.sampled_from([0.0, 1e-3]))
+    random = np.random.default_rng(data.draw(seeds))
+    matrix = matrix_of_condition(random, 12, rank, 10.0 ** data.draw(st.floats(0.0, 1.5)))
+    matrix = matrix @ np.linalg.qr(random.normal(size=(n, rank)))[0].T
+    matrix += noise * np.ptp(matrix) * random.normal(size=(12, n))
+    right = random.normal(size=12)
+    qr, found = by_qr_and_by_normal_equations(matrix, right, rank)
+    if qr[0] < WELL_CONDITIONED:
+        assert found[0] == 0.0 or qr[0] > WELL_CONDITIONED * (1.0 - 1e-9)
+        return
+    for one, other in zip(qr, found, strict=True):
+        np.testing.assert_allclose(other, one, rtol=0.0, atol=1e-12 * max(1.0, np.abs(one).max(initial=0.0)))
+    if rank == n:
+        expected = np.linalg.lstsq(matrix, right, rcond=None)[0]
+        np.testing.assert_allclose(found[1], expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("n", [5, 9])
+def test_normal_equations_refuse_dependent_columns_and_nan(n):
+    random = np.random.default_rng(n)
+    matrix = random.normal(size=(12, n))
+    matrix[:, 1] = matrix[:, 0] + 1e-3 * random.normal(size=12)
+    assert by_qr_and_by_normal_equations(matrix, np.ones(12), n)[1][0] == 0.0
+    matrix = random.normal(size=(12, n))
+    for k in range(n):
+        broken = matrix.copy()
+        broken[3, k] = np.nan
+        assert by_qr_and_by_normal_equations(broken, np.ones(12), n)[1][0] == 0.0
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.floats(0.0, 8.0), st.floats(-6.0, 6.0), seeds)
+def test_the_inverse_by_blocks_is_lapacks_and_reads_the_lower_triangle_alone(exponent, scale_exponent, seed):
+    random = np.random.default_rng(seed)
+    root = matrix_of_condition(random, 6, 6, 10.0 ** (0.5 * exponent))
+    matrix = 10.0**scale_exponent * root @ root.T
+    matrix, inverse = (matrix + matrix.T) / 2.0, np.full((6, 6), np.nan)
+    assert invert_symmetric(np.tril(matrix) + np.triu(np.full((6, 6), np.nan), 1), inverse)
+    np.testing.assert_array_equal(inverse, inverse.T)
+    expected = np.linalg.inv(matrix)
+    np.testing.assert_allclose(inverse, expected, rtol=0.0, atol=1e-13 * 10.0**exponent * np.abs(expected).max())
+
+
+def test_the_inverse_by_blocks_refuses_what_cholesky_refuses():
+    random = np.random.default_rng(5)
+    row = random.normal(size=(6, 5))
+    v, _ = np.linalg.qr(random.normal(size=(6, 6)))
+    indefinite = v @ np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1e-3]) @ v.T
+    for matrix in (row @ row.T, indefinite, np.zeros((6, 6)), np.diag([1.0, 1.0, 0.0, 1.0, 1.0, 1.0])):
+        assert not factor_cholesky(matrix.copy())
+        assert not invert_symmetric(matrix, np.zeros((6, 6)))
+    for i in range(6):
+        for j in range(i + 1):
+            broken = np.eye(6)
+            broken[i, j] = np.nan
+            assert not invert_symmetric(broken, np.zeros((6, 6)))

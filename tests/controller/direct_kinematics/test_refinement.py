@@ -7,11 +7,14 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
 from controller.cycle import STATE, cycle_parameters
+from controller.direct_kinematics import solve
 from controller.direct_kinematics.refinement import find_doubts
+from controller.direct_kinematics.spatial import LEG_SIGMA, TILT_SIGMA, YAW_SIGMA
+from controller.direct_kinematics.synthetic import draw_measurements, draw_poses, measurements_of
 from controller.settings import control_settings, fusion_settings
 from plant.pose import pose_errors
 from tests.controller.cycles import refine
-from tests.controller.leg_geometry import leg_directions, leg_vectors, rotation_of, skew
+from tests.controller.leg_geometry import UP, leg_directions, leg_vectors, rotation_of, skew
 
 
 @pytest.mark.parametrize("left_out", [(), (2,), (0, 5)])
@@ -175,3 +178,43 @@ def test_what_is_not_finite_is_not_doubted_for_ever(lost):
     doubts = np.full(7, np.nan)
     find_doubts(np.array([lost, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]), doubts)
     assert np.isfinite(doubts).all() and doubts[0] == 0.0
+
+
+@pytest.mark.parametrize("noise", [0.3, 1.0, 5.0])
+@pytest.mark.parametrize("method", ["section-5", "up", "normal", "legs"])
+def test_the_covariance_is_from_equations_at_the_pose_however_few_steps_renewed_it(hexapod, method, noise):
+    """Twins in NumPy: the inverse of the weighted normal matrix at the pose, and the pose is where their right side is zero."""
+    random = np.random.default_rng(13)
+    measured = draw_measurements(hexapod, *draw_poses(hexapod, 20, random), random, noise)
+    for row in range(20):
+        given = {name: values[row] for name, values in measurements_of(method, measured).items()}
+        found = solve(hexapod, **given, method=method)
+        yaw = 0.5 * YAW_SIGMA**-2
+        known = []  # in {1}, in {2}, weight
+        if method == "section-5":
+            weights = yaw, yaw, TILT_SIGMA**-2 - yaw
+            known = [(axis, given["rotation"].T @ axis, weight) for axis, weight in zip(np.eye(3), weights, strict=True)]
+        elif method == "up":
+            known = [(UP, given["up_in_platform"], TILT_SIGMA**-2)]
+        elif method == "normal":
+            known = [(given["normal"], UP, TILT_SIGMA**-2)]
+        information, right = np.zeros((6, 6)), np.zeros(6)
+        legs = leg_vectors(hexapod, found.position, found.rotation)
+        for direction, leg, joint in zip(given["leg_directions"], legs, hexapod.platform_joints, strict=True):
+            along = leg / np.linalg.norm(leg)
+            jacobian = (
+                (np.eye(3) - np.outer(along, along))
+                / np.linalg.norm(leg)
+                @ np.hstack([np.eye(3), -skew(found.rotation @ joint)])
+            )
+            information += jacobian.T @ jacobian / LEG_SIGMA**2
+            right += jacobian.T @ (direction - along) / LEG_SIGMA**2
+        for in_base, in_platform, weight in known:
+            seen = found.rotation @ in_platform
+            jacobian = np.hstack([np.zeros((3, 3)), -skew(seen)])
+            information += weight * jacobian.T @ jacobian
+            right += weight * jacobian.T @ (in_base - seen)
+        expected = np.linalg.inv(information)
+        deviations = np.sqrt(np.diag(expected))
+        np.testing.assert_allclose((found.covariance - expected) / np.outer(deviations, deviations), 0.0, rtol=0.0, atol=1e-8)
+        assert (np.abs(expected @ right) < 1e-7 * deviations).all()

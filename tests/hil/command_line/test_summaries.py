@@ -438,33 +438,30 @@ def test_plant_and_kinematics_are_printed_in_their_units(monkeypatch, tables, ca
         "call_us": 40.0,
         "batch_per_s": {"legs": 2e6},
         "newton": {"warm_us": 6.0, "ratios": {"legs": {"closed_form": 0.5, "refined": 1.0}}},
-        "newton_in_c": {"warm_us": 2.5, "steps": 2.5, "ratios": {"legs": {"closed_form": 1.2, "refined": 2.4}}},
+        "newton_in_c": {"warm_us": 2.0, "steps": 4.5, "ratios": {"n-6.1": times[2], "hexapod": times[1]}},
         "cold_starts": {"hexapod": {"wide": {"newton": {"success": 0.5, "wrong": 0.25},
                                              "directions": {"success": 1.0, "wrong": 0.0}}}},
     }  # fmt: skip
     monkeypatch.setattr("hil.benchmarks.kinematics.measure_kinematics", lambda progress: kinematics)
     measure._kinematics(SimpleNamespace(), {})
-    assert tables[2][1:] == [
-        ["n-6", "3.00 / 6.00"],
-        ["hexapod", "3.00 / 6.00"],
-        ["over Newton", "0.50 / 1.00"],
-        ["over Newton in C", "1.20 / 2.40"],
-    ]
-    assert tables[3][1:] == [["hexapod, wide", "50.0", "25.0", "100.0", "0.0"]]
+    assert tables[2][1:] == [["n-6", "3.00 / 6.00"], ["hexapod", "3.00 / 6.00"], ["over Newton", "0.50 / 1.00"]]
+    assert tables[3] == [["over C", "legs"], ["n-6", "8.00 / 16.0"], ["hexapod", "3.00 / 6.00"]]
+    assert tables[4][1:] == [["hexapod, wide", "50.0", "25.0", "100.0", "0.0"]]
     printed = capsys.readouterr().out
     assert "[thousands]: legs 2000; one call from Python 40 us" in printed and "warm: 6.00 us per pose" in printed
-    assert "genhexkins, to 1e-9 m: 2.50 us, 2.5 steps" in printed
+    assert "to 1e-9 m: 2.00 us, 4.5 steps" in printed
 
 
 def test_the_table_of_kinematics_fits_100_columns(monkeypatch, capsys):
     times = {name: {"closed_form": 12.34, "refined": 23.45} for name in METHODS}
     kinematics = {
         "solve_us": {"n-4-II.1": times}, "hexapod_us": times, "call_us": 40.0, "batch_per_s": {}, "cold_starts": {},
-        "newton": {"warm_us": 6.0, "ratios": times}, "newton_in_c": {"warm_us": 2.5, "steps": 2.5, "ratios": times},
+        "newton": {"warm_us": 6.0, "ratios": times},
+        "newton_in_c": {"warm_us": 2.0, "steps": 4.5, "ratios": {"n-4-II.1": times, "hexapod": times}},
     }  # fmt: skip
     monkeypatch.setattr("hil.benchmarks.kinematics.measure_kinematics", lambda progress: kinematics)
     measure._kinematics(SimpleNamespace(), {})
     lines = capsys.readouterr().out.splitlines()
-    assert max(map(len, lines[:7])) <= 100
+    assert max(map(len, lines[:12])) <= 100
     assert any(all(name in line for name in METHODS) for line in lines)
-    assert sum(line.count("12.3 / 23.4") == len(METHODS) for line in lines) == 3
+    assert sum(line.count("12.3 / 23.4") == len(METHODS) for line in lines) == 5
