@@ -3,7 +3,7 @@
 A reading is `length + zero`. Encoders tell how a length changes far better than IMUs do, and incremental ones tell nothing of
 where it began, which the IMUs do. So the pose that the IMUs have is moved to the lengths, as if their zeros were exact, and
 these are the mean differences between readings and the IMUs' lengths. The pose's covariance knows that they are no better than
-that. A zero is exact once its home switch has closed; an absolute encoder's is so from the start.
+that. A zero is exact once the leg has passed its home switch; an absolute encoder's is so from the start.
 
 Without a reading, as when an answer of the rig is lost, the last difference from the IMUs counts for a moment: the pose goes on
 from where it is, instead of to that of the IMUs and back.
@@ -42,6 +42,9 @@ _SETTLING_S = 0.25
 _HELD_S = 0.03
 """For so long an encoder without a reading counts by its last one: longer than it takes to tell that the bus is lost [s]."""
 
+_LONGEST_STEP_M = 5e-4
+"""Readings that are farther apart do not tell where the leg passed its home switch [m]."""
+
 _MOST_STEPS = 20
 _SETTLED = 1e-9
 """A step below this ends the iteration from a first guess [m, rad]."""
@@ -71,6 +74,8 @@ STATE = record_dtype(
     home=(np.int64, LEGS),  # last state of the home switch: 1 beyond it, 0 before it, -1 not known
     used=(np.float64, LEGS),  # 1 if the reading is used
     counts=(np.float64, LEGS),  # the same, or whether the last one was, for `_HELD_S`
+    passed_switch=(np.int64, LEGS),  # whether the leg has passed its home switch since the last cycle
+    switch_step=(np.float64, LEGS),  # between the readings before and after the switch: it was passed between these [m]
     excluded=(np.int64, LEGS),  # whether the encoder contradicts the rest
     zero=(np.float64, LEGS),  # what it reads more than the length [m]
     followed_for=(np.float64, LEGS),  # how long the zero has been followed; infinite for one that is known [s]
@@ -120,6 +125,7 @@ def screen_encoders(
         silent: for how many cycles the rig has not answered.
     """
     for k in range(LEGS):
+        before, known = s.carried[k], s.silent_for[k] == 0.0
         s.reading[k] = readings[k]
         if silent == 0 and np.isfinite(readings[k]):
             s.carried[k], s.rate[k], s.silent_for[k] = readings[k], rates[k], 0.0
@@ -128,9 +134,13 @@ def screen_encoders(
             s.silent_for[k] += passed
         good = p.present[k] != 0 and s.silent_for[k] == 0.0 and s.excluded[k] == 0
         s.used[k] = 1.0 if good else 0.0
-        switched = good and home[k] >= 0 and s.home[k] >= 0 and home[k] != s.home[k]
-        if switched and np.isfinite(p.switch[k]):
-            s.zero[k] = readings[k] - p.switch[k]
+        switched = good and home[k] >= 0 and s.home[k] >= 0 and home[k] != s.home[k] and np.isfinite(p.switch[k])
+        # The switch was passed between two readings. If one of them is missing, or they are far apart, the zero is not exact.
+        step = readings[k] - before
+        s.passed_switch[k] = 1 if switched and known and abs(step) < _LONGEST_STEP_M else 0
+        if s.passed_switch[k] != 0:
+            s.switch_step[k] = step
+            s.zero[k] = before + 0.5 * step - p.switch[k]
             s.followed_for[k] = np.inf
         if good:
             s.home[k] = home[k]

@@ -250,6 +250,7 @@ class _Examiner:
         self._begin("gravity", "commands", "gyroscopes", "accelerometers", "encoders")
         for clause, text in self._motions.findings() if self._motions is not None else ():
             self._find(clause, text)
+        self._find_pause("commands")
 
     def _move(self, command: Array, count: int) -> None:
         """Move with a command for some exchanges, unless the IMUs show a motion that it should not make."""
@@ -260,6 +261,7 @@ class _Examiner:
                 self._rest(Request.QUICK_STOP)
                 self._tell_motions()
                 self._find("commands", alarm)
+                self._find_pause("commands")
                 raise _BrokenOffError
 
     def _rest(self, request: int = Request.ENABLED) -> None:
@@ -286,6 +288,7 @@ class _Examiner:
         for leg in np.flatnonzero(abs(moved - due) > 0.5 * due).tolist():
             text = f"Leg {leg} moved by {1e3 * moved[leg]:.3f} mm, commanded were {1e3 * due:.3f} mm: check its sign and scale."
             self._find("motion", text)
+        self._find_pause("motion")
 
     def _check_limit(self, beyond: float) -> None:
         most = 0.0
@@ -311,15 +314,20 @@ class _Examiner:
         states = ", ".join(_DRIVES[state] if 0 <= state < len(_DRIVES) else str(state) for state in drives)
         codes = ", ".join(f"{int(code):#x}" for code in self._feedback["drive_code"])
         text = f"Asked {_REQUESTS[request]}, the drives are {states} after {count} exchanges (fault codes {codes})."
-        faulty = bool((drives == DriveState.FAULTY).any())
-        if faulty and self._longest_pause > max(_LONG_PAUSE_S, 2.0 * self._period):
-            text += (
-                f" This machine was busy elsewhere for up to {1e3 * self._longest_pause:.0f} ms between two exchanges, and "
-                "drives stop when they hear nothing for longer than their watchdog: end what else runs on it, and try again."
-            )
         self._find("drives", text, str(request))
-        if faulty:
+        if (drives == DriveState.FAULTY).any():
+            self._find_pause("drives")
             raise _BrokenOffError
+
+    def _find_pause(self, clause: str) -> None:
+        """Note that this machine was busy elsewhere, if it was, as that may explain the findings of a clause."""
+        if self._result.findings[clause] and self._longest_pause > max(_LONG_PAUSE_S, 2.0 * self._period):
+            self._find(
+                clause,
+                f"That may be because this machine was busy elsewhere, for up to {1e3 * self._longest_pause:.0f} ms between "
+                "two exchanges: drives go on meanwhile, or stop by their watchdog. End what else runs on it, and try again.",
+                "pause",
+            )
 
     # ------------------------------------------------------------------------------------------------------ exchanges
 

@@ -65,6 +65,9 @@ _STANDING = 1e-3
 _PLAY_LASTS_S = 0.5
 """Time constant of what play does to an encoder's reading [s]."""
 
+_SWITCH_SIGMAS = 5.0
+"""A home switch that contradicts what is known of its encoder's zero by more is not taken: it may be elsewhere than is said."""
+
 _LONGEST_CHANGE_S = 0.1
 """Beyond this time between two updates, how fast the readings change is not known [s]."""
 
@@ -91,6 +94,7 @@ def start_filter(p: Record, f: Record, time: float, position: Array, rotation: A
     f.field_used = 0
     f.length_errors[:] = 0.0
     f.length_count[:] = 0.0
+    f.length_passed[:] = 0
     f.base_errors[:] = 0.0
     states, rig = p.states, rig_start(p)
     for i in range(states):
@@ -156,6 +160,12 @@ def accumulate_lengths(f: Record, readings: Array, used: Array, time: float) -> 
             f.length_sum[k] += readings[k]
             f.length_sum_time[k] += time
             f.length_count[k] += 1.0
+
+
+@kernel
+def accumulate_switch(f: Record, k: int, more: float, step: float) -> None:
+    """Keep for the next update what the encoder of leg `k` has read `more` than the length, somewhere within a `step` [m]."""
+    f.length_passed[k], f.length_switched[k], f.length_switched_variance[k] = 1, more, step * step / 12.0
 
 
 @kernel
@@ -342,6 +352,8 @@ def _update_rows(p: Record, geometry: Record, f: Record, last: int) -> None:
 def _update_scalar(p: Record, f: Record, row: int) -> None:
     """Take one scalar of the sample into covariance and change."""
     if row >= ROWS:
+        if f.length_passed[row - ROWS] != 0:
+            _update_switch(p, f, row - ROWS)
         _update_length(p, f, row - ROWS)
         return
     k, m = row // READINGS, row % READINGS
@@ -457,6 +469,21 @@ def _forget_play(p: Record, f: Record, period: float) -> None:
         for i in range(p.states):
             c[i, at] *= left
         c[at, at] += p.length_prior[1] * (1.0 - left * left)
+
+
+@kernel
+def _update_switch(p: Record, f: Record, k: int) -> None:
+    """Take what the home switch of leg `k` has told of its encoder, unless the two contradict what is known."""
+    f.length_passed[k] = 0
+    gain, change, c = f.gain, f.change, f.covariance
+    zero = lengths_start(p) + k
+    play = zero + LEGS
+    for i in range(p.states):
+        gain[i] = c[zero, i] + c[play, i]
+    innovation = f.length_switched[k] - f.length_errors[0, k] - f.length_errors[1, k] - change[zero] - change[play]
+    variance = p.length_variance + f.length_switched_variance[k] + gain[zero] + gain[play]
+    if innovation * innovation <= _SWITCH_SIGMAS**2 * variance:
+        take_scalar(c, gain, change, p.states, innovation, variance)
 
 
 @kernel

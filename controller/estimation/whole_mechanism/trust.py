@@ -18,6 +18,7 @@ from controller.estimation.whole_mechanism.filter import (
     accumulate_field,
     accumulate_lengths,
     accumulate_sample,
+    accumulate_switch,
     extrapolate,
     extrapolate_covariance,
     start_filter,
@@ -130,6 +131,9 @@ def step_mechanism_filter(
             start_filter(p.filter, f, now, pose.position, pose.rotation, pose.twist)
             if p.filter.lengths > 0:
                 start_lengths(f, encoders.zero)
+                for k in range(LEGS):
+                    if encoders.switch_step[k] != 0.0 and encoders.followed_for[k] == np.inf:
+                        accumulate_switch(f, k, encoders.zero[k], encoders.switch_step[k])
             s.due = time.cycle + p.settling_cycles[s.again]
             s.again = 1
             s.disagreement = 0.0
@@ -146,6 +150,9 @@ def step_mechanism_filter(
     accumulate_sample(f, imus.sample, s.weights, now - p.delay)
     if p.filter.lengths > 0:
         accumulate_lengths(f, encoders.reading, encoders.used, now)
+        for k in range(LEGS):
+            if encoders.passed_switch[k] != 0:
+                accumulate_switch(f, k, encoders.zero[k], encoders.switch_step[k])
     if heading.used != 0 and heading.fresh != 0:
         accumulate_field(f, heading.field, now - p.delay)
     f.standing = standing and p.filter.start_share > 1.0

@@ -15,7 +15,7 @@ from controller.estimation.encoders import (
 from controller.inverse_kinematics import inverse_kinematics, leg_lengths, sample_workspace
 from controller.rig import TIME, rig_parameters
 from controller.settings import FusionSettings, sensor_settings
-from plant.encoders import load_encoder
+from plant.encoders import EncoderModel, load_encoder
 from plant.imu import load_imu
 from plant.mechanism import LEGS, load_in_space, six_rows
 from plant.pose import Pose
@@ -137,3 +137,26 @@ def test_a_zero_is_the_mean_of_what_the_imus_say_weighted_by_the_time_before():
         time["cycle"] += 1
     expected = np.average(heights, weights=np.arange(50))
     assert pose["position"][2] - home.position[2] == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_home_switch_makes_a_zero_exact_to_where_it_was_passed():
+    """Between two readings; not where one is missing, where they are far apart, or where the switch was not known before."""
+    mechanism, model = load_in_space("hexapod"), EncoderModel("homed", switches=(0.4,) * LEGS)
+    parameters = encoder_parameters(model, sensor_settings(mechanism, load_imu("ideal"), model), mechanism)
+    encoders = np.zeros((), STATE)
+    encoders["home"] = [0, 0, 0, 0, -1, 0]
+    encoders["carried"], encoders["zero"], encoders["followed_for"] = 0.4998, 0.099, 2.0
+    encoders["silent_for"][2] = 1e-3
+    readings, home = np.full(LEGS, 0.5002), np.array([1, 0, 1, 1, 1, 1])
+    readings[3], encoders["excluded"][5] = 0.501, 1
+    screen_encoders(parameters[()], encoders[()], 1e-3, 0, readings, np.zeros(LEGS), home)
+    assert encoders["passed_switch"].tolist() == [1, 0, 0, 0, 0, 0]
+    np.testing.assert_allclose(encoders["zero"], [0.1, *[0.099] * 5], rtol=1e-12)
+    np.testing.assert_allclose(encoders["switch_step"][0], 4e-4, rtol=1e-9)
+    assert np.isinf(encoders["followed_for"]).tolist() == [True, *[False] * 5]
+    # It tells no more while the leg stays beyond it, and again on the way back.
+    screen_encoders(parameters[()], encoders[()], 1e-3, 0, readings, np.zeros(LEGS), home)
+    assert not encoders["passed_switch"].any()
+    screen_encoders(parameters[()], encoders[()], 1e-3, 0, readings - 2e-4, np.zeros(LEGS), 1 - home)
+    assert encoders["passed_switch"].tolist() == [1, 1, 1, 1, 1, 0]
+    np.testing.assert_allclose(encoders["zero"][:3], 0.1001, rtol=1e-12)

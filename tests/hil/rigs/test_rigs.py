@@ -399,7 +399,7 @@ class DelaysForLong(TemplateRig):
         (
             HearsNothingForLong,
             "drives",
-            r"faulty.*0x8130.*busy elsewhere for up to 40 ms .* watchdog: end what else",
+            r"faulty.*0x8130[^\0]*busy elsewhere, for up to 40 ms between .* watchdog",
         ),
         (Ignores, "drives", "Asked to follow, the drives are following, .*, ready, following after 20 exchanges"),
         (IgnoresQuickStop, "drives", "Asked to stop quickly, the drives are following"),

@@ -10,6 +10,8 @@ from hil.faults.links import run
 from hil.faults.rows import Drawn
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import SimulationStoppedError, simulate
+from plant.encoders import EncoderModel
+from plant.mechanism import LEGS
 from plant.pose import pose_errors, rotations_from_quaternions
 from plant.truth import TRUTH_LENGTHS, TRUTH_POSITION, TRUTH_QUATERNION
 
@@ -142,3 +144,11 @@ def test_encoders_beside_few_imus_are_judged_by_what_these_know():
     """Four legs alone know a length fifteen times less well than all IMUs do, which is no fault of an encoder."""
     result = simulate(replace(SINES, target="hold", duration=2.0, fusion="compiled", imus=(1, 2, 3, 4)))
     assert not (result.records["event_cause"] == Cause.ENCODER_CONTRADICTED).any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fusion", ["compiled", "whole"])
+def test_the_pose_is_as_exact_as_the_encoders_once_the_legs_have_passed_their_switches(fusion):
+    switches = EncoderModel("homed", switches=(0.397,) * LEGS)
+    errors = errors_of(simulate(replace(SINES, lengths=switches, fusion=fusion, duration=4.0, seed=3)).records)
+    assert (rms(errors[-2000:]) < [0.04, 0.008]).all()
