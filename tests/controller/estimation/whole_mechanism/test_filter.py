@@ -9,6 +9,7 @@ from controller.estimation.whole_mechanism.filter import (
     _update_rows,
     accumulate_lengths,
     accumulate_sample,
+    accumulate_switch,
     extrapolate,
     extrapolate_covariance,
     start_filter,
@@ -443,6 +444,35 @@ def test_with_encoders_it_equals_its_twin_whose_states_are_their_readings(hexapo
             difference = (state["covariance"][: len(scale), : len(scale)] - covariance) / np.outer(scale, scale)
             assert np.abs(difference).max() < 1e-4
     assert np.linalg.norm(twin.position - motion.positions[i - window]) < 2e-3
+
+
+def test_a_home_switch_tells_where_the_platform_is(hexapod):
+    """From a pose that is 3 mm and 0.3 deg off; one that is 20 mm from where it is said to be is not believed."""
+    motion, random = impose(hexapod, "1", 0.5, RATE_HZ, 4), np.random.default_rng(5)
+    samples = motion.signals + random.normal(0.0, 1.0, motion.signals.shape) * np.array([0.002, 0.02, 0.0])[:, None, None]
+    zeros = random.normal(0.0, 0.03, 6)
+    readings = leg_lengths(hexapod, motion.positions, motion.rotations) + zeros
+    parameters = filter_parameters(FusionSettings(length_noise=3e-6), RATE_HZ, "gyroscopes", None, lengths=True)
+    turn = (motion.rotations[1] @ motion.rotations[0].T - np.eye(3)) * RATE_HZ
+    velocity = (motion.positions[1] - motion.positions[0]) * RATE_HZ
+    twist = np.array([*velocity, turn[2, 1], turn[0, 2], turn[1, 0]])
+    off, geometry = [], sensor_geometry(hexapod)[()]
+    for told in (None, zeros, zeros + 0.02):
+        state, position, rotation = np.zeros((), FILTER_STATE), np.zeros(3), np.zeros((3, 3))
+        start = motion.positions[0] + 3e-3, rotation_of([0.003, -0.003, 0.003]) @ motion.rotations[0], twist
+        start_filter(parameters[()], state[()], 0.0, *start)
+        start_lengths(state[()], readings[0] - leg_lengths(hexapod, *(each[None] for each in start[:2]))[0])
+        for i in range(1, len(samples)):
+            accumulate_sample(state[()], samples[i], np.ones((2, 7)), i / RATE_HZ)
+            accumulate_lengths(state[()], readings[i], np.ones(6), i / RATE_HZ)
+            for k in range(6 if i == 200 and told is not None else 0):
+                accumulate_switch(state[()], k, told[k], 3e-5)
+            step_filter(parameters[()], geometry, state[()])
+        extrapolate(state[()], i / RATE_HZ, position, rotation, np.zeros(6), np.zeros(6))
+        off.append(np.linalg.norm(position - motion.positions[i]))
+    without, switched, refused = off
+    assert switched < 3e-5 < 0.5 * without
+    assert refused == without and not state["length_passed"].any()
 
 
 def test_what_is_known_grows_less_sure_on_the_way_to_the_present(hexapod):
