@@ -259,7 +259,7 @@ _MOST_ROWS = 60
     cli.JSON,
 )
 def gough_motion(options: Namespace) -> None:
-    """Plan a motion file, and print how long it takes and which limits bind; nothing is moved or simulated."""
+    """Plan a motion file: how long it takes, and which limits bind; nothing moves."""
     cli.check_outputs(options, inputs=[options.file])
     with progress_bar(f"{options.file}"):
         from controller.planning.motions import load_motion, plan_motion
