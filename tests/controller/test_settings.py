@@ -111,7 +111,7 @@ def test_zero_is_allowed_only_where_it_switches_something_off(hexapod):
     known = drive_settings(hexapod, load=0.0, resistance=0.0, friction=0.0)
     assert (known.load, known.resistance, known.friction) == (0.0, 0.0, 0.0)
     switches = {"integral", "derivative", "sensor_delay", "sensor_timing", "most_lost_imus", "watch_imus", "need_platform_imu"}
-    switches |= {"load", "resistance", "friction"}
+    switches |= {"load", "resistance", "friction", "position_integral"}
     for kind, read, _ in KINDS:
         for field in fields(kind):
             if field.name not in switches:
