@@ -275,7 +275,7 @@ class CanopenRig:
         """The drives' target positions [counts], in 32 bits."""
         decoder, scales = self.decoder, np.array(self._scales)
         read = np.array([np.nan if position is None else position for position in decoder.positions]) / scales
-        following = [drive_state(word, True) == DriveState.FOLLOWING for word in decoder.statuswords]
+        following = [drive_state(word) == DriveState.FOLLOWING for word in decoder.statuswords]
         targets = self._targets.advance(command, request, following, read) * scales
         return [int32(round(target)) if target == target else 0 for target in targets.tolist()]
 
