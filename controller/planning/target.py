@@ -12,6 +12,7 @@ from controller.planning.motions import (
     MARGIN_S,
     MOTIONS,
     NAMES,
+    Motion,
     PlannedMotion,
     load_motion,
     named_motion,
@@ -133,14 +134,25 @@ def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float,
     check_target(name)
     path = Path(name_or_path)
     if path.suffix == MOTION_SUFFIX:
-        if frames is not None:
-            raise InputError(f"{name} is a motion file, whose poses are displacements of {{2}} along {{1}}: leave --frames out")
-        target = target_of_motion(plan_motion(load_motion(path), mechanism), duration)
+        target = target_of_motion(plan_in_frames(load_motion(path), mechanism, frames), duration)
     else:
         target = _cut(_read_csv(path, home, frames), duration)
     if mechanism.planar:
         _check_in_plane(target, mechanism)
     return target
+
+
+def plan_in_frames(motion: Motion, mechanism: Mechanism, frames: ActiveFrames | None) -> PlannedMotion:
+    """Plan a motion whose poses are displacements from home, or as in a file with these frames; errors as for `plan_motion`."""
+    if frames is None:
+        return plan_motion(motion, mechanism)
+    home, active = mechanism.require_home(), frames
+    at_home = active.to_target(home, home)
+
+    def platform(positions: Array, rotations: Array) -> tuple[Array, Array]:
+        return poses_of(positions, rotations, home, active)
+
+    return plan_motion(motion, mechanism, platform, Pose(*at_home))
 
 
 def target_of_motion(motion: PlannedMotion, duration: float) -> Target:

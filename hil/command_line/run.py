@@ -254,23 +254,25 @@ _MOST_ROWS = 60
 
 @cli.command(
     cli.source("file", "FILE.toml", "the motion (docs/motions.md)"),
-    cli.options_of(SimulationConfig, "mechanism"),
-    cli.output("--csv", "FILE.csv", "write its poses, every 2 ms, as displacements from home: a target for other programs"),
+    cli.options_of(SimulationConfig, "mechanism", "frames", "frame", "tool"),
+    cli.output("--csv", "FILE.csv", "write its poses, every 2 ms, as a CSV target has them: for other programs"),
     cli.JSON,
 )
 def gough_motion(options: Namespace) -> None:
     """Plan a motion file: how long it takes, and which limits bind; nothing moves."""
     cli.check_outputs(options, inputs=[options.file])
     with progress_bar(f"{options.file}"):
-        from controller.planning.motions import load_motion, plan_motion
-        from controller.planning.target import target_of_motion, text_of_target
+        from controller.planning.motions import load_motion
+        from controller.planning.target import plan_in_frames, target_of_motion, text_of_target
         from plant.mechanism import load_in_space
 
-        mechanism = load_in_space(options.mechanism)
-        planned = plan_motion(load_motion(options.file), mechanism)
+        # A work frame on the level frame needs an IMU on the base, which a plan does not read.
+        config = cli.config_of(options, SimulationConfig, base_imu=True)
+        mechanism, frames = load_in_space(config.mechanism), config.active_frames
+        planned = plan_in_frames(load_motion(options.file), mechanism, frames)
         target = target_of_motion(planned, planned.duration)
     if options.csv is not None:
-        write_whole(options.csv, text_of_target(target, mechanism).encode())
+        write_whole(options.csv, text_of_target(target, mechanism, frames).encode())
     cli.write_json(options.json, planned.summary())
     table = Table("element", "from [s]", "takes [s]", "limit that binds", "reached [%]", "at [s]", left=(0, 3))
     for part in planned.parts[:_MOST_ROWS]:

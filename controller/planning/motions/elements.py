@@ -1,7 +1,8 @@
 """The elements of a motion: lines, arcs, splines, waves, dwells and loops, as a motion file has them and Python makes them.
 
 Poses here are displacements: a position (3,) [m] from home, and the rotation (3, 3) from home's orientation, along and about
-the axes of {1}. Each element begins at rest where the one before has ended, and ends at rest.
+the axes of {1}; with frames of the user's own they are what these say (`controller.frames`). Each element begins at rest where
+the one before has ended, and ends at rest.
 """
 
 from collections.abc import Callable

@@ -39,6 +39,8 @@ from plant.pose import Array, Pose, quaternion_from_rotation, rotations_from_qua
 TARGET_PERIOD_S = 0.002
 """Period of the poses of a motion's target, so dense that what lies between them does not matter."""
 
+_HOME = Pose(np.zeros(3), np.eye(3))
+
 _ROOM = 1e-6
 """Share of each limit that is left for rounding."""
 
@@ -178,14 +180,19 @@ def _excess(peak: Peak) -> str:
 
 
 def plan_motion(
-    motion: Motion, mechanism: Mechanism, platform: Callable[[Array, Array], tuple[Array, Array]] | None = None
+    motion: Motion,
+    mechanism: Mechanism,
+    platform: Callable[[Array, Array], tuple[Array, Array]] | None = None,
+    at_home: Pose = _HOME,
 ) -> PlannedMotion:
     """Plan a motion within the limits of the tool and of all actuators.
 
     Args:
         motion: what to do, in displacements.
         mechanism: its legs, home and limits.
-        platform: gives positions (N, 3) and rotations (N, 3, 3) of {2} in {1} from displacements; by default from home.
+        platform: gives positions (N, 3) and rotations (N, 3, 3) of {2} in {1} from those of the motion, which by default are
+            displacements from home.
+        at_home: what home is in the motion's own poses.
 
     Raises:
         UnreachableError: an actuator would leave its stroke.
@@ -197,17 +204,23 @@ def plan_motion(
     def from_home(positions: Array, rotations: Array) -> tuple[Array, Array]:
         return home.position + positions, rotations @ home.rotation
 
-    planner = _MotionPlanner(motion, mechanism, platform or from_home)
+    planner = _MotionPlanner(motion, mechanism, platform or from_home, at_home)
     return planner.plan()
 
 
 class _MotionPlanner:
-    def __init__(self, motion: Motion, mechanism: Mechanism, platform: Callable[[Array, Array], tuple[Array, Array]]) -> None:
+    def __init__(
+        self,
+        motion: Motion,
+        mechanism: Mechanism,
+        platform: Callable[[Array, Array], tuple[Array, Array]],
+        at_home: Pose,
+    ) -> None:
         limits = mechanism.require_limits()
         self._motion, self._mechanism, self._platform, self._stroke = motion, mechanism, platform, limits.stroke
         self._most = motion.actuator_share * np.array([limits.velocity, limits.acceleration, limits.jerk])
         self._known: dict[tuple[int, bytes], tuple[list[Part], Pose]] = {}
-        self._pose = motion.start.after(Pose(np.zeros(3), np.eye(3)))
+        self._pose = motion.start.after(at_home)
         self._time = 0.0
         # The first error, and the time scale at which none is left.
         self._refused: str | None = None
@@ -331,9 +344,7 @@ class _MotionPlanner:
         reached = ""
         if course is not None and (inside := self._reach(course)) is not None:
             x, y, z = 1e3 * inside[1]
-            reached = (
-                f"; up to {100.0 * inside[0]:.1f} % of it, ({x:.2f}, {y:.2f}, {z:.2f}) mm from home, all are within theirs"
-            )
+            reached = f"; up to {100.0 * inside[0]:.1f} % of it, at ({x:.2f}, {y:.2f}, {z:.2f}) mm, all are within theirs"
         least, most = 1e3 * stroke[leg]
         raise UnreachableError(
             f"{self._motion.name}, element {label}, leaves the strokes at {self._time + times[first]:.3f} s: leg {leg} would "
