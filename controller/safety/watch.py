@@ -43,6 +43,11 @@ _UNEXPLAINED, _UNEXPLAINED_EVALUATIONS = 1.25, 2
 one IMU is wrong, though none of them may be beyond the limit.
 """
 
+_FIRST_UNEXPLAINED = 20
+"""From which evaluation on that counts: until then nothing has been learned, and what a calibration does not know, such as
+clocks of the IMUs' own, is left unexplained, above all at low rates.
+"""
+
 _LASTING, _LASTING_EVALUATIONS = 0.6, 10
 """Evidence against an IMU that cannot be left out may be beyond this share of the limit in fewer evaluations in a row."""
 
@@ -397,7 +402,8 @@ def judge_evidence(
 @kernel
 def _count_evaluations(p: Record, w: Record, e: Record, unexplained: float) -> None:
     """Count the evaluations in a row that leave too much unexplained, and those that are against an IMU that is needed."""
-    w.unexplained_for = w.unexplained_for + 1 if unexplained >= _UNEXPLAINED * p.evidence else 0
+    much = e.evaluations >= _FIRST_UNEXPLAINED and unexplained >= _UNEXPLAINED * p.evidence
+    w.unexplained_for = w.unexplained_for + 1 if much else 0
     lasts = e.best_evidence >= _LASTING * p.evidence and _is_needed(p, e.blamed)
     w.lasting_for = w.lasting_for + 1 if lasts else 0
 
