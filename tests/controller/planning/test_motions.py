@@ -161,7 +161,7 @@ def test_random_motions_leave_no_limit(hexapod, first):
     assert sum(check_random_motion(hexapod, seed) for seed in range(first, first + 20)) >= 14
 
 
-@pytest.mark.slow(seconds=300)
+@pytest.mark.endurance
 @pytest.mark.parametrize("preset", ["hexapod", "6-3-I", "6-3-II", "6-4-II", "genhexkins"])
 def test_a_thousand_random_motions_leave_no_limit(preset):
     mechanism = load_in_space(preset)
@@ -464,7 +464,7 @@ def test_the_time_scale_that_would_pass_passes(hexapod, first):
     assert sum(check_time_scale(hexapod, seed) for seed in range(first, first + 10)) >= 7
 
 
-@pytest.mark.slow(seconds=200)
+@pytest.mark.endurance
 def test_the_time_scale_that_would_pass_passes_in_a_thousand_cases(hexapod):
     assert sum(check_time_scale(hexapod, seed) for seed in range(100, 1100)) >= 700
 

@@ -642,10 +642,11 @@ def evaluations_until_a_stop(parameters, state, most=30):
     return None
 
 
-@pytest.mark.parametrize(("in_all", "expected"), [(10.0, None), (12.0, 2)])
-def test_two_evaluations_that_no_single_imu_explains_end_a_motion_below_the_limit(in_all, expected):
-    """With 6 of 8 sigma against IMU 2, the limit is the root of 1.25 x 64 and 0.35 x 36."""
+@pytest.mark.parametrize(("in_all", "evaluations", "expected"), [(10.0, 20, None), (12.0, 20, 2), (12.0, 19, None)])
+def test_two_evaluations_that_no_single_imu_explains_end_a_motion_below_the_limit(in_all, evaluations, expected):
+    """With 6 of 8 sigma against IMU 2, the limit is the root of 1.25 x 64 and 0.35 x 36. The first two seconds do not count."""
     _, parameters, state = moving()
+    state["integrity"]["evaluations"] = evaluations
     weigh(state, 2, 6.0, in_all)
     assert evaluations_until_a_stop(parameters, state) == expected
     if expected:
@@ -655,6 +656,7 @@ def test_two_evaluations_that_no_single_imu_explains_end_a_motion_below_the_limi
 
 def test_unexplained_evidence_must_come_in_two_evaluations_in_a_row_of_recent_readings():
     _, parameters, state = moving()
+    state["integrity"]["evaluations"] = 20
     for n in range(20):
         weigh(state, 2, 6.0, 12.0 if n % 2 else 7.0)
         assert evaluations_until_a_stop(parameters, state, 2) is None
