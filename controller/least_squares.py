@@ -206,6 +206,19 @@ def _substitute_back(matrix: Array, right: Array, rank: int) -> None:
 
 
 @kernel
+def _bring_up_pivot(matrix: Array, k: int, n: int) -> int:
+    """Exchange row `k` of the corner (n, n) of `matrix` for that with the greatest pivot from there on; returns its number."""
+    best = k
+    for i in range(k + 1, n):
+        if abs(matrix[i, k]) > abs(matrix[best, k]):
+            best = i
+    if best != k:
+        for j in range(k, n):
+            matrix[k, j], matrix[best, j] = matrix[best, j], matrix[k, j]
+    return best
+
+
+@kernel
 def solve_square(matrix: Array, right: Array) -> float:
     """Replace `right` (n,) by the solution of `matrix` (n, n) @ x = right, by elimination with row pivots; overwrites `matrix`.
 
@@ -215,14 +228,9 @@ def solve_square(matrix: Array, right: Array) -> float:
     n = right.shape[0]
     least, greatest = np.inf, 0.0
     for k in range(n):
-        best = k
-        for i in range(k + 1, n):
-            if abs(matrix[i, k]) > abs(matrix[best, k]):
-                best = i
+        best = _bring_up_pivot(matrix, k, n)
         if best != k:
             right[k], right[best] = right[best], right[k]
-            for j in range(k, n):
-                matrix[k, j], matrix[best, j] = matrix[best, j], matrix[k, j]
         pivot = abs(matrix[k, k])
         if not pivot > RANK_TOLERANCE * greatest:
             return 0.0
@@ -391,14 +399,8 @@ def determinant(matrix: Array, n: int) -> float:
     """The determinant of the corner (n, n) of `matrix`, by elimination with row pivots; overwrites it."""
     product = 1.0
     for k in range(n):
-        best = k
-        for i in range(k + 1, n):
-            if abs(matrix[i, k]) > abs(matrix[best, k]):
-                best = i
-        if best != k:
+        if _bring_up_pivot(matrix, k, n) != k:
             product = -product
-            for j in range(k, n):
-                matrix[k, j], matrix[best, j] = matrix[best, j], matrix[k, j]
         product *= matrix[k, k]
         if product == 0.0:
             return 0.0
