@@ -38,7 +38,7 @@ A fault that has just come up is not constant over the memory of the fault filte
 _PATIENT = 1.5
 """How many times the limit evidence may reach while more of it may tell what is wrong."""
 
-_UNEXPLAINED, _UNEXPLAINED_EVALUATIONS = 1.25, 2
+_UNEXPLAINED, _UNEXPLAINED_EVALUATIONS = 1.25, 3
 """Nor may more be left than so many times the limit, and the share above, in so many evaluations in a row: then more than
 one IMU is wrong, though none of them may be beyond the limit.
 """
@@ -349,7 +349,7 @@ def judge_evidence(
     """After an evaluation of the evidence for faults: leave out the IMU that it is against, if it is against no other and the
     rest agrees; take back one that it is no longer against; else stop. Returns whether the set of IMUs has changed.
 
-    Below the limit, stop if two evaluations in a row leave too much unexplained, or if evidence against an IMU that cannot be
+    Below the limit, stop if three evaluations in a row leave too much unexplained, or if evidence against an IMU that cannot be
     left out lasts.
     """
     w, limit, e = s.watch, p.watch.evidence, integrity
