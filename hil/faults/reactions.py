@@ -62,7 +62,8 @@ class Case:
         act: makes a fault that is not the rig's.
         streamed: the fault of a streamed target.
         also: other causes that may end the run.
-        followed: whether it is known where the platform is until the fault is told; it is not if the rig has been killed.
+        followed: whether it is known where the platform is until the fault is told. It is not if the rig has been killed, and
+            the pose then counts until an answer is told to be late.
         lengths: the encoders, as in `SimulationConfig`.
     """
 
@@ -251,7 +252,7 @@ def _pose_cells(each: Outcome) -> tuple[str, ...]:
     cycles = f"{np.median(each.cycles):.0f}, {max(each.cycles)}" if each.cycles else "-"
     positions, angles = 1e3 * np.array(each.position_m), np.degrees(each.rotation_rad)
     errors = f"{np.median(positions):.2f}, {positions.max():.2f}", f"{np.median(angles):.2f}, {angles.max():.2f}"
-    return each.fusion, cycles, *(errors if each.case.followed else ("-", "-"))
+    return each.fusion, cycles, *errors
 
 
 def try_case(case: Case, seed: int, fusion: str) -> Outcome:
@@ -354,13 +355,14 @@ def _judge(outcome: Outcome, seed: int, loop: PreparedLoop, cause: int, onset: i
     off = most(followed["truth"][:, TRUTH_LENGTHS] - followed["reference"][:, :, 0])
     outcome.peak_m.append(off)
     find(off > case.peak, f"a leg was {1e3 * off:.2f} mm off, and {1e3 * case.peak:g} are allowed")
-    figures = judge(records, int(np.searchsorted(records["cycle"], onset)), frozenset(), cause, RATE_HZ)
+    first = int(np.searchsorted(records["cycle"], onset))
+    answered = len(records) if case.followed else first + int((records["silent"][first:] > 0).argmax()) + 1
+    figures = judge(records[:answered], first, frozenset(), cause, RATE_HZ)
     position, rotation = (float(figures[f"{part}_before"] or 0.0) for part in ("position", "rotation"))
     outcome.position_m.append(position)
     outcome.rotation_rad.append(rotation)
-    limited = case.lengths != NO_LENGTHS and case.followed
     find(
-        limited and (position > MOST_OFF_M or rotation > MOST_TURNED_RAD),
+        case.lengths != NO_LENGTHS and (position > MOST_OFF_M or rotation > MOST_TURNED_RAD),
         f"the pose was {1e3 * position:.2f} mm and {np.degrees(rotation):.2f} deg off before it was told, and "
         f"{1e3 * MOST_OFF_M:g} and {np.degrees(MOST_TURNED_RAD):.1f} are allowed",
     )

@@ -93,6 +93,8 @@ def start_filter(p: Record, f: Record, time: float, position: Array, rotation: A
     f.heading_offset = 0.0
     f.field_used = 0
     f.length_errors[:] = 0.0
+    f.length_sum[:] = 0.0
+    f.length_sum_time[:] = 0.0
     f.length_count[:] = 0.0
     f.length_passed[:] = 0
     f.base_errors[:] = 0.0

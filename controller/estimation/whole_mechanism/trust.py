@@ -179,9 +179,13 @@ def step_mechanism_filter(
         pose.position[:] = s.closed_position
         pose.rotation[:] = s.closed_rotation
         _correct(s, rig, time, pose)
-        return True
-    s.alone = s.trusted
-    return bool(s.trusted != 0)
+    else:
+        s.alone = s.trusted
+        if s.trusted == 0:
+            return False
+    # The legs were last found at the filter's pose, which may not be the one that is used.
+    _find_legs(rig, pose)
+    return True
 
 
 @kernel
@@ -263,10 +267,7 @@ def _disagreement(rig: Record, legs: Record, pose: Record) -> float:
     """
     if pose.found == 0:
         return 0.0 if np.isfinite(pose.position.sum() + pose.rotation.sum()) else np.nan
-    legs_at(
-        rig.geometry.base_joints, rig.geometry.platform_joints, pose.position, pose.rotation, pose.arms, pose.directions,
-        pose.lengths,
-    )  # fmt: skip
+    _find_legs(rig, pose)
     total = count = 0.0
     for k in range(LEGS):
         if legs.used[k] != 0.0:
@@ -274,3 +275,11 @@ def _disagreement(rig: Record, legs: Record, pose: Record) -> float:
             for i in range(3):
                 total += (legs.directions[k, i] - pose.directions[k, i]) ** 2
     return total / max(count, 1.0)
+
+
+@kernel
+def _find_legs(rig: Record, pose: Record) -> None:
+    legs_at(
+        rig.geometry.base_joints, rig.geometry.platform_joints, pose.position, pose.rotation, pose.arms, pose.directions,
+        pose.lengths,
+    )  # fmt: skip

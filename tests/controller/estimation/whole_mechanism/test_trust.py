@@ -245,6 +245,23 @@ def test_beside_encoders_a_filter_of_imus_that_hardly_determine_the_pose_must_kn
     assert found["mechanism"]["known"] == pytest.approx((share * fusion.disagreement) ** 2, rel=1e-12)
 
 
+@pytest.mark.parametrize("trusted", [False, True])
+def test_the_legs_are_those_of_the_pose_that_is_used(hexapod, trusted):
+    stage = Stage(hexapod, disagreement=1.0)
+    stage.step()
+    if trusted:
+        stage.trusted()
+    f = stage.trust["filter"]
+    f["position"] += MOVE
+    f["published_position"] += MOVE
+    stage.step()
+    assert stage.stands == (True, trusted)
+    away = np.linalg.norm(stage.pose["position"] - stage.home.position)
+    assert 0.01 * np.linalg.norm(MOVE) < away < np.linalg.norm(MOVE) if trusted else away < 1e-12
+    lengths = leg_lengths(hexapod, stage.pose["position"], stage.pose["rotation"])
+    np.testing.assert_allclose(stage.pose["lengths"], lengths, rtol=0.0, atol=1e-12)
+
+
 def test_a_filter_that_hardly_knows_its_rotation_is_not_trusted_and_once_trusted_it_stays(hexapod):
     stage = Stage(hexapod)
     limit = fusion_settings(hexapod).disagreement
