@@ -414,6 +414,17 @@ def _step_drive(r: Record, k: int, step: int) -> None:
 
 
 @kernel
+def accepted_velocity(r: Record, k: int) -> float:
+    """The command that a drive which follows it has accepted, or its present velocity [m/s].
+
+    That of a position loop is what it makes of the command.
+    """
+    if r.loops.active[k] != 0 and r.drive[k] == DriveState.FOLLOWING:
+        return float(min(max(r.target[k], -r.speed_limit), r.speed_limit))
+    return float(r.velocity[k])
+
+
+@kernel
 def _close_loop(r: Record, k: int, step: int) -> float:
     """The velocity of a drive with a position loop for a step [ns]; a fault that the loop finds becomes the drive's."""
     if r.drive[k] != DriveState.FOLLOWING:

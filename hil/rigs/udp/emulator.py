@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.rigs import ANSWERED, SILENT, DriveState, Request
-from hil.rigs.emulation import disturb, draw, move, sample
+from hil.rigs.emulation import accepted_velocity, disturb, draw, move, sample
 from hil.rigs.udp.datagrams import (
     HELLO_DATAGRAM,
     LONGEST,
@@ -125,7 +125,9 @@ def answer_command(emulator: UdpEmulator, length: int, now_ns: int) -> int:
     a.refused = session.refused
     a.sample_ns[:], a.sample_number[:] = rig.sample_ns, rig.sequence
     a.measurement[:] = rig.measurement
-    a.drive[:], a.code[:], a.velocity[:] = rig.drive, rig.code, rig.velocity
+    a.drive[:], a.code[:] = rig.drive, rig.code
+    for k in range(LEGS):
+        a.velocity[k] = accepted_velocity(rig, k)
     a.crc = crc32(link.answer_bytes, link.answer.itemsize - 4)
     t, written = link.truth[version - VERSION][0], link.answer.itemsize
     if version >= WITH_LENGTHS:

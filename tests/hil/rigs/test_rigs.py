@@ -168,12 +168,14 @@ def test_a_recording_keeps_the_contract(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_udp_rig_keeps_the_contract():
+@pytest.mark.parametrize(("drives", "beyond"), [("velocity", 10.0), ("position", None)])
+def test_the_udp_rig_keeps_the_contract(drives, beyond):
+    """A position loop has a following error, which is a fault of the drive, when it is told what no motor can do."""
     address, nowhere = (f"127.0.0.1:{free_port()}" for _ in range(2))
     period = 0.02
-    with emulator("--at", address, "--rate", "50"):
+    with emulator("--at", address, "--rate", "50", "--drives", drives):
         rig, absent = lambda: UdpRig(address, period), lambda: UdpRig(nowhere, period)
-        assert findings_between_processes(rig, period, beyond=10.0, absent=absent) == []
+        assert findings_between_processes(rig, period, beyond=beyond, absent=absent) == []
 
 
 @pytest.fixture
