@@ -80,11 +80,12 @@ STATE = record_dtype(
     zero=(np.float64, LEGS),  # what it reads more than the length [m]
     followed_for=(np.float64, LEGS),  # how long the zero has been followed; infinite for one that is known [s]
     off=(np.float64, LEGS),  # reading less zero and the IMUs' length [m]; NaN without a reading for `_HELD_S`
+    covariance=(np.float64, (LEGS, LEGS)),  # of these differences, as the IMUs know the pose [m^2]
     information=(np.float64, (6, 6)),  # from here on scratch
     factor=(np.float64, (6, 6)),
     correction=(np.float64, 6),
     row=(np.float64, 6),
-    scratch=(np.float64, 6),
+    rows=(np.float64, (LEGS, 6)),
 )
 """State of the encoders."""
 
@@ -148,7 +149,9 @@ def screen_encoders(
 
 @kernel
 def compare_lengths(p: Record, s: Record, rig: Record, pose: Record) -> None:
-    """Find by how much the encoders' lengths are off those of the pose, which the IMUs have; a zero begins there."""
+    """Find by how much the encoders' lengths are off those of the pose, which the IMUs have, and how well that is known; a zero
+    begins there.
+    """
     legs_at(
         rig.geometry.base_joints, rig.geometry.platform_joints, pose.position, pose.rotation, pose.arms, pose.directions,
         pose.lengths,
@@ -160,6 +163,18 @@ def compare_lengths(p: Record, s: Record, rig: Record, pose: Record) -> None:
             s.off[k] = s.reading[k] - s.zero[k] - pose.lengths[k]
         elif s.followed_for[k] == 0.0 or s.silent_for[k] > _HELD_S:
             s.off[k] = np.nan
+        _find_row(pose, k, s.row)
+        for i in range(6):
+            # With the Cholesky factor L of the pose's information, the covariance is that of L^-1 times the rows.
+            value = s.row[i]
+            for j in range(i):
+                value -= pose.factor[i, j] * s.rows[k, j]
+            s.rows[k, i] = value / pose.factor[i, i]
+        for other in range(k + 1):
+            value = 0.0
+            for i in range(6):
+                value += s.rows[k, i] * s.rows[other, i]
+            s.covariance[k, other] = s.covariance[other, k] = value
 
 
 @kernel
@@ -188,7 +203,7 @@ def move_to_lengths(p: Record, s: Record, rig: Record, time: Record, pose: Recor
         _find_row(pose, k, row)
         if s.silent_for[k] == 0.0:
             _follow_zero(p, s, elapsed(rig, time), k)
-        uncertain = p.zero_variance if s.followed_for[k] == np.inf else _variance_along(row, pose.factor, s.scratch)
+        uncertain = p.zero_variance if s.followed_for[k] == np.inf else s.covariance[k, k]
         weight, known = 1.0 / p.variance, 1.0 / (p.variance + uncertain)
         for i in range(6):
             s.correction[i] += weight * s.off[k] * row[i]
@@ -297,16 +312,3 @@ def _follow_zero(p: Record, s: Record, passed: float, k: int) -> None:
         change = min(1.0, passed / span) * s.off[k]
         s.zero[k] += change
         s.off[k] -= change
-
-
-@kernel
-def _variance_along(row: Array, factor: Array, scratch: Array) -> float:
-    """The variance along a row (6,) of a pose whose information has this Cholesky factor (6, 6)."""
-    variance = 0.0
-    for i in range(6):
-        scratch[i] = row[i]
-        for j in range(i):
-            scratch[i] -= factor[i, j] * scratch[j]
-        scratch[i] /= factor[i, i]
-        variance += scratch[i] * scratch[i]
-    return variance

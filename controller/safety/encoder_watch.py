@@ -1,12 +1,19 @@
 """A second opinion on the encoders: lengths that they read against those that the IMUs have, and the other way round.
 
-A zero is taken from the IMUs, and slow errors of theirs show in the difference. So what counts most is how the difference
-changes within a second. One encoder whose difference changes alone is wrong, and is left out. An IMU that is wrong moves the
-pose, and with it the differences of several legs.
+A zero is taken from the IMUs, and slow errors of theirs show in the differences d of readings and lengths. So what counts most
+is how d changes within a second. An error of the IMUs' pose moves all of d, and with its covariance S the other encoders tell
+most of it. So if encoder k alone is off, this is by
+
+    f = (S^-1 d)_k / (S^-1)_kk,    with the variance 1 / (S^-1)_kk,
+
+which is the greatest likelihood's, and without it d^T S^-1 d is smaller by the square of f over its standard deviation. An
+encoder is wrong that is off by too many of these, if little is left without it, and is left out. An IMU that is wrong moves
+the pose otherwise, and with it the differences of several legs.
 """
 
 import numpy as np
 
+from controller.least_squares import factor_cholesky, invert_cholesky
 from controller.rig import elapsed
 from controller.safety.causes import Cause, Mode, report_event
 from controller.safety.stop import handle_cause
@@ -20,8 +27,8 @@ _CHANGE_S = 1.0
 _LEAST_CHANGE_S = 0.05
 """The same while the filters settle [s]."""
 
-_SLOW = 0.75
-"""Share of the whole difference that counts like a change: an encoder may creep away slowly."""
+_SLOW, _SLOW_ALONE = 0.75, 0.9
+"""Share of the whole difference that counts like a change, of several and of one encoder: it may creep away slowly."""
 
 _SETTLING_S, _UNSETTLED_S, _UNSETTLED = 1.5, 3.0, 1.5
 """After the first time from the start the filters have settled [s]; until the second one the limit is so much wider."""
@@ -29,8 +36,11 @@ _SETTLING_S, _UNSETTLED_S, _UNSETTLED = 1.5, 3.0, 1.5
 _LASTING_S = 0.005
 """For how long a change must last, at least two cycles [s]."""
 
-_ALONE = 2.0
-"""How much more than those of all others together the difference of a wrong encoder changes."""
+_SIGMAS, _LEAST = 2.1, 0.5
+"""An encoder is wrong that is off by so many standard deviations, and by this share of the limit of a change."""
+
+_ALONE = 2.5
+"""How many times as large as what is left without it the square of a wrong encoder's error is, in sigmas."""
 
 _BEYOND = 2.0
 """How far beyond the limit a change ends the run if it is not that of one encoder."""
@@ -52,14 +62,14 @@ PARAMETERS = record_dtype(
 STATE = record_dtype(
     begun=(np.int64, LEGS),  # whether there has been a difference
     mean=(np.float64, LEGS),  # of each difference, low-passed [m]
-    changed_for=np.float64,  # how long the worst change has been beyond its limit [s]
+    changed_for=np.float64,  # how long an encoder or the worst change has been beyond its limit [s]
     watched_for=np.float64,  # how long there have been differences [s]
-    squares=(np.float64, 2),  # sum of the squares of the changes, and of the share of the differences [m^2]
-    most=(np.float64, 2),  # the greatest of them [m]
-    worst=(np.int64, 2),  # and whose it is
+    differences=(np.float64, (2, LEGS)),  # their changes, and a share of all of them, of the encoders that count [m]
     silent_for=(np.float64, LEGS),  # how long each encoder has read nothing [s]
     agreed_for=(np.float64, LEGS),  # how long one that is left out has agreed [s]
     range=(np.float64, (LEGS, 2)),  # shortest and longest that its leg has been meanwhile [m]
+    factor=(np.float64, (LEGS, LEGS)),  # from here on scratch
+    inverse=(np.float64, (LEGS, LEGS)),
 )
 """What lasts."""
 
@@ -80,15 +90,17 @@ def judge_encoders(
     Args:
         lengths: (6,), that the IMUs have [m].
     """
-    w, limit, passed = s.encoders, p.encoders.deviation, elapsed(rig, time)
+    w, passed = s.encoders, elapsed(rig, time)
     w.watched_for += passed
-    limit *= 1.0 if w.watched_for > _UNSETTLED_S else _UNSETTLED
+    wider = 1.0 if w.watched_for > _UNSETTLED_S else _UNSETTLED
     time_constant = max(min(_CHANGE_S, w.watched_for - _SETTLING_S), _LEAST_CHANGE_S, passed)
     settled = w.watched_for > _SETTLING_S
-    w.squares[:], w.most[:] = 0.0, 0.0
+    w.differences[:] = 0.0
+    w.factor[:] = 0.0
     left_out, changed = 0, False
-    for k in range(rig.legs):
-        if encoder_parameters.present[k] == 0:
+    for k in range(LEGS):
+        w.factor[k, k] = 1.0
+        if k >= rig.legs or encoder_parameters.present[k] == 0:
             continue
         _tell_silence(w, s.events, k, encoders, passed)
         if not np.isfinite(encoders.off[k]):
@@ -103,33 +115,73 @@ def judge_encoders(
                 report_event(s.events, Cause.ENCODER_BACK, k, np.nan, np.nan)
                 changed = True
         elif encoders.used[k] != 0.0:
-            _compare(w, 0, k, change)
-            _compare(w, 1, k, _SLOW * encoders.off[k] if settled else 0.0)
-    kind = 0 if w.most[0] > w.most[1] else 1
-    worst, most = w.worst[kind], w.most[kind]
-    w.changed_for = w.changed_for + passed if most > limit else 0.0
-    alone = most * most > _ALONE**2 * (w.squares[kind] - most * most)
-    if most > limit and alone:
+            w.differences[0, k] = change
+            w.differences[1, k] = encoders.off[k] if settled else 0.0
+            for other in range(k):
+                if encoders.used[other] != 0.0:
+                    w.factor[k, other] = encoders.covariance[k, other]
+            w.factor[k, k] = encoders.covariance[k, k] + encoder_parameters.variance
+    worst, error, sigma, alone = _find_wrong(w)
+    limit = wider * max(_SIGMAS * sigma, _LEAST * p.encoders.deviation)
+    wrong = alone and abs(error) > limit
+    leg, most = _find_greatest(w)
+    several = most > _BEYOND * wider * p.encoders.deviation
+    w.changed_for = w.changed_for + passed if wrong or several else 0.0
+    if wrong:
         # Until it is named, it does not move the pose.
         encoders.used[worst] = 0.0
     if w.changed_for < p.encoders.lasting or s.mode != Mode.RUNNING:
         return changed
-    if alone and left_out == 0:
+    if wrong and left_out == 0:
         encoders.excluded[worst] = 1
         w.changed_for = w.agreed_for[worst] = 0.0
-        report_event(s.events, Cause.ENCODER_CONTRADICTED, worst, most, limit)
+        report_event(s.events, Cause.ENCODER_CONTRADICTED, worst, abs(error), limit)
         return True
-    if most > _BEYOND * limit or alone:
-        handle_cause(p, s, rig, time, reference, pid, Cause.ENCODERS_CONTRADICT, worst, most, limit)
+    if wrong:
+        handle_cause(p, s, rig, time, reference, pid, Cause.ENCODERS_CONTRADICT, worst, abs(error), limit)
+    else:
+        handle_cause(
+            p, s, rig, time, reference, pid, Cause.ENCODERS_CONTRADICT, leg, most, _BEYOND * wider * p.encoders.deviation
+        )  # fmt: skip
     return changed
 
 
 @kernel
-def _compare(w: Record, kind: int, k: int, difference: float) -> None:
-    """Take a difference of leg `k` into the sum of the squares and the greatest of its kind."""
-    w.squares[kind] += difference * difference
-    if abs(difference) > w.most[kind]:
-        w.worst[kind], w.most[kind] = k, abs(difference)
+def _find_wrong(w: Record) -> tuple[int, float, float, bool]:
+    """The encoder that is off by most sigmas, by how much and its sigma [m], and whether it explains the differences alone.
+
+    The matrix of the covariances is in `factor`.
+    """
+    worst, error, sigma, square, alone = 0, 0.0, np.inf, 0.0, False
+    if not factor_cholesky(w.factor):
+        return worst, error, sigma, alone
+    invert_cholesky(w.factor, w.inverse)
+    for kind, share in enumerate((1.0, _SLOW_ALONE)):
+        d = w.differences[kind]
+        total, greatest, of, at = 0.0, 0.0, 0.0, 0
+        for k in range(LEGS):
+            weighted = 0.0
+            for i in range(LEGS):
+                weighted += w.inverse[k, i] * d[i]
+            total += d[k] * weighted
+            if weighted * weighted > greatest * w.inverse[k, k]:
+                at, greatest, of = k, weighted * weighted / w.inverse[k, k], weighted / w.inverse[k, k]
+        if share * share * greatest > square:
+            square = share * share * greatest
+            worst, error, sigma = at, share * of, 1.0 / np.sqrt(w.inverse[at, at])
+            alone = greatest > _ALONE * (total - greatest)
+    return worst, error, sigma, alone
+
+
+@kernel
+def _find_greatest(w: Record) -> tuple[int, float]:
+    """The greatest change or share of a whole difference, and its leg."""
+    leg, most = 0, 0.0
+    for k in range(LEGS):
+        size = max(abs(w.differences[0, k]), _SLOW * abs(w.differences[1, k]))
+        if size > most:
+            leg, most = k, size
+    return leg, most
 
 
 @kernel
