@@ -5,14 +5,15 @@ A platform has little room, so it renders fast changes by moving and what lasts 
     d       deviation of the vehicle's specific force from that at rest, scaled
     tilt    low-pass of d -> the tilt whose gravity is d, if not too steep -> speed limit -> smoothing
     turn    tilt + washed-out integral of the scaled, clipped and smoothed angular velocity
-    a       what is left to render at that turn R, R (g up + d) - g up, clipped
-    move    smoothed a -> washed-out double integral
+    a       what is left to render at that turn R, R (g up + smoothed d) - g up, clipped
+    move    washed-out double integral of a
 
 A washout is a high-pass: of second order for angular velocities, s^2 / (s + w)^2, of third order for accelerations,
 s^3 / ((s + w)^2 (s + v)), so that the platform returns to the middle; with v = 0 it is of second order. Written with the
 integrals in it, there is none that could drift: the angle is s / (s + w)^2 times the angular velocity, the displacement
 s / ((s + w)^2 (s + v)) times the acceleration. All are cascades of first-order low-passes, each exact for an input that goes
-straight. Above, `a` is seen in axes that do not turn, so what the tilt renders is not rendered again by moving.
+straight. Above, `a` is seen in axes that do not turn, so what the tilt renders is not rendered again by moving. If the platform
+can lean about one axis alone, the tilt is about that one.
 
 Sources: L. D. Reid and M. A. Nahon, "Flight simulation motion-base drive algorithms, part 1", UTIAS report 296 (1985);
 M. A. Nahon and L. D. Reid, "Simulator motion-drive algorithms: a designer's perspective", J. Guidance 13(2), 356-362 (1990).
@@ -40,7 +41,7 @@ from plant.imu.model import STANDARD_GRAVITY
 from plant.mechanism import Mechanism
 from plant.mechanism.loads import moving_axes
 from plant.pose import Array, Pose, checked_array, quaternion_from_rotation, rotate_by_vector, rotations_from_quaternions
-from plant.vectors import cross, dot, rotate, vector
+from plant.vectors import add, cross, dot, rotate, scale, subtract, vector
 
 Numbers = tuple[float, ...]
 Platform = Callable[[Array, Array], tuple[Array, Array]]
@@ -235,12 +236,9 @@ class Site:
         turn_away = _hertz(washout.turn_washout_frequency, (turn_speeds / (e * (1.0 - _TILT_SHARE) * room[3:])).max())
         tilt_frequency = _hertz(washout.tilt_frequency, away)
         leans = [3 + axis for axis in range(3) if axis != np.abs(self.up).argmax()]
-        leaning = bool(free[leans].all())
         tilt = washout.tilt
-        if not leaning:
-            tilt = 0.0
-        elif tilt is None:
-            tilt = _TILT_SHARE * float(self.room(leans)[leans].min())
+        if tilt is None:
+            tilt = _TILT_SHARE * min(self.room(leans)[axis] for axis in leans if free[axis]) if free[leans].any() else 0.0
         return filled(
             PARAMETERS, step=_COARSE / max(smoothing, away, turn_away, tilt_frequency), scale=washout.scale,
             turn_scale=washout.turn_scale, most_acceleration=accelerations, most_turn_speed=turn_speeds, smoothing=smoothing,
@@ -297,9 +295,9 @@ STATE = record_dtype(
     turned=(np.float64, (4, 3)),  # rate, smoothed and washed out
     turn=(np.float64, 3),  # rotation vector of the platform
     rotation=(np.float64, (3, 3)),
+    smooth=(np.float64, (2, 3)),  # force
     wanted=(np.float64, 3),  # acceleration that is left to render by moving
     left=(np.float64, 3),  # and clipped
-    smooth=(np.float64, (2, 3)),
     washed=(np.float64, (2, 3)),
     returned=(np.float64, 3),
     move=(np.float64, 3),  # displacement of the platform
@@ -391,7 +389,8 @@ def _tilt(p: Record, s: Record, h: float) -> None:
         s.low[0, k] = low_pass(first, s.force[k], s.force[k] + s.force_step[k], h * p.tilt_frequency)
         s.low[1, k] = low_pass(s.low[1, k], first, s.low[0, k], h * p.tilt_frequency)
     # The vertical, seen by the platform, leans along the force: the platform turns about force x vertical.
-    axis = cross(vector(s.low[1]), vector(p.up))
+    x, y, z = cross(vector(s.low[1]), vector(p.up))
+    axis = (p.free[3] * x, p.free[4] * y, p.free[5] * z)
     size = np.sqrt(dot(axis, axis))
     s.wanted_sine = size / p.gravity
     s.gain += s.gain_step
@@ -436,20 +435,19 @@ def _turn(p: Record, s: Record, h: float) -> None:
 def _move(p: Record, s: Record, h: float) -> None:
     """Move by what the turn does not render."""
     for k in range(3):
-        s.force[k] += s.force_step[k]
-    x, y, z = vector(s.force)
-    g0, g1, g2 = p.gravity * p.up[0], p.gravity * p.up[1], p.gravity * p.up[2]
-    seen = rotate(s.rotation, (g0 + x, g1 + y, g2 + z))
-    rest = (g0, g1, g2)
+        before, first = s.force[k], s.smooth[0, k]
+        s.force[k] = before + s.force_step[k]
+        s.smooth[0, k] = low_pass(first, before, s.force[k], h * p.smoothing)
+        s.smooth[1, k] = low_pass(s.smooth[1, k], first, s.smooth[0, k], h * p.smoothing)
+    rest = scale(p.gravity, vector(p.up))
+    seen = subtract(rotate(s.rotation, add(rest, vector(s.smooth[1]))), rest)
+    w = p.washout
     for k in range(3):
-        before, first, second, third = s.left[k], s.smooth[0, k], s.smooth[1, k], s.washed[0, k]
-        w, last = p.washout, s.washed[1, k]
-        s.wanted[k] = p.free[k] * (seen[k] - rest[k])
+        before, first, last = s.left[k], s.washed[0, k], s.washed[1, k]
+        s.wanted[k] = p.free[k] * seen[k]
         s.left[k] = clipped(s.wanted[k], s.gain * p.most_acceleration[k])
-        s.smooth[0, k] = low_pass(first, before, s.left[k], h * p.smoothing)
-        s.smooth[1, k] = low_pass(second, first, s.smooth[0, k], h * p.smoothing)
-        s.washed[0, k] = low_pass(third, second, s.smooth[1, k], h * w)
-        s.washed[1, k] = low_pass(last, third, s.washed[0, k], h * w)
+        s.washed[0, k] = low_pass(first, before, s.left[k], h * w)
+        s.washed[1, k] = low_pass(last, first, s.washed[0, k], h * w)
         s.returned[k] = low_pass(s.returned[k], last, s.washed[1, k], h * p.back)
         s.move[k] = (s.washed[1, k] - s.returned[k]) / (w * w)
 

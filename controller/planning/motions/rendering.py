@@ -28,10 +28,10 @@ _FADE_S = 0.5
 _ALLOWED, _AIM = 0.999, 0.99
 """Share of a limit that may be used, and to which a use beyond is brought back."""
 
-_REACH_S, _WIDER = 0.4, 1.15
+_REACH_S, _WIDER = 0.4, 1.1
 """How far around a moment the motion is scaled, and the factor by which that grows with every trial."""
 
-_MOST_TRIALS = 100
+_MOST_TRIALS = 200
 
 _ONSET_S = 0.1
 """Changes within this time are an onset."""
@@ -204,7 +204,7 @@ class Rendering:
             self._left.append((float(starts[at]), share, names[int(use[:, at].argmax())]))
             away = np.maximum(starts[group[0]] - self.times, self.times - starts[group[-1]]) / self._reach - 1.0
             x = np.clip(1.0 - away, 0.0, 1.0)
-            self._gain *= 1.0 - (1.0 - _AIM / share) * x * x * (3.0 - 2.0 * x)
+            self._gain *= 1.0 - (1.0 - (_AIM / share) ** 0.5) * x * x * (3.0 - 2.0 * x)
         self._reach *= _WIDER
         self._render()
         return True
@@ -237,15 +237,16 @@ class Rendering:
 
     def _clips(self) -> Iterator[Clip]:
         p, rows = self._parameters, self._rows
-        for values, most, gain, what, unit in (
-            (rows["wanted"], p["most_acceleration"], self._gain, "acceleration along", "m/s^2"),
-            (p["turn_scale"] * self._rates, p["most_turn_speed"], 1.0, "angular velocity about", "rad/s"),
+        # All that is rendered is smaller by the gain, and so is what clips it.
+        for values, most, what, unit in (
+            (rows["wanted"] / self._gain[:, None], p["most_acceleration"], "acceleration along", "m/s^2"),
+            (p["turn_scale"] * self._rates, p["most_turn_speed"], "angular velocity about", "rad/s"),
         ):
             for axis, sizes, limit in zip(_AXES, np.abs(values).T, most.tolist(), strict=True):
-                yield from self._spans(f"{what} {axis}", sizes > limit * gain, sizes, limit, unit)
-        sine, steepest = rows["wanted_sine"], float(p["steepest"])
-        tilt, most_tilt = np.arcsin(np.clip(sine, 0.0, 1.0)), float(np.arcsin(steepest))
-        yield from self._spans("tilt", sine > steepest * self._gain, tilt, most_tilt, "rad")
+                yield from self._spans(f"{what} {axis}", sizes > limit * (1.0 + _SLIGHT), sizes, limit, unit)
+        sines, steepest = rows["wanted_sine"] / self._gain, float(p["steepest"])
+        tilts, most_tilt = np.arcsin(np.minimum(sines, 1.0)), float(np.arcsin(steepest))
+        yield from self._spans("tilt", sines > steepest * (1.0 + _SLIGHT), tilts, most_tilt, "rad")
         yield from self._spans("tilt speed", rows["lagging"] > 0.0, rows["goal_speed"], float(p["tilt_speed"]), "rad/s")
 
     def _spans(self, what: str, clipped: NDArray[np.bool_], asked: Array, most: float, unit: str) -> Iterator[Clip]:
