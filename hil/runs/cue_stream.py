@@ -19,8 +19,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from controller.frames import ActiveFrames
-from controller.planning.motions import load_washout
-from controller.planning.motions.cueing import COLUMNS, FORCE_COLUMNS, CueFilter, Site, read_vehicle
+from controller.planning.motions import CueFilter, load_washout, read_vehicle
+from controller.planning.motions.cueing import COLUMNS, FORCE_COLUMNS, Site
 from controller.planning.target import poses_of
 from hil.rigs.udp.link import bound_socket
 from hil.runs.target_stream import StreamError, send_poses

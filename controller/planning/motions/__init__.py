@@ -14,7 +14,8 @@ from controller.planning.motions.built_in import (
     rests,
     shaking,
 )
-from controller.planning.motions.cueing import CueFilter, Vehicle, Washout, read_vehicle
+from controller.planning.motions.cue_filter import CueFilter
+from controller.planning.motions.cueing import Vehicle, Washout, read_vehicle
 from controller.planning.motions.document import load_motion, load_washout, motion_from_text, text_of_motion
 from controller.planning.motions.elements import (
     Arc,

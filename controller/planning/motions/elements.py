@@ -22,8 +22,8 @@ Numbers = tuple[float, ...]
 MOST_DURATION_S = 3600.0
 """The longest motion."""
 
-_PERIOD_S = 0.01
-_SAMPLES_PER_WAVE = 25
+PERIOD_S = 0.01
+SAMPLES_PER_WAVE = 25
 """Knots of the reference: so far apart at most, and so many for each period of the fastest wave."""
 
 _SAME_M, _SAME_RAD = 1e-9, 1e-9
@@ -97,7 +97,7 @@ class Course:
     end: Pose
     breaks: Array
     duration: float | None = None
-    period: float = _PERIOD_S
+    period: float = PERIOD_S
 
 
 def turned_quaternions(vector: Array, quaternion: Array) -> Array:
@@ -112,6 +112,13 @@ def turned_quaternions(vector: Array, quaternion: Array) -> Array:
             w * d + x * c - y * b + z * a,
         ]
     )
+
+
+def blended(x: Array) -> Array:
+    """Shares (N,) that go from 0 to 1 with x, so smoothly that three derivatives vanish at either end."""
+    x = np.clip(x, 0.0, 1.0)
+    shares: Array = x**4 * (35.0 + x * (-84.0 + x * (70.0 - 20.0 * x)))
+    return shares
 
 
 def _turn_between(start: Array, end: Array) -> Array:
@@ -353,13 +360,11 @@ class Wave:
     def course(self, start: Pose) -> Course:
         """Where it leads from a pose."""
         fastest = max(wave.fastest for wave in self.waves)
-        period = min(_PERIOD_S, self.blend / _SAMPLES_PER_WAVE, 1.0 / (_SAMPLES_PER_WAVE * max(fastest, 1e-9)))
+        period = min(PERIOD_S, self.blend / SAMPLES_PER_WAVE, 1.0 / (SAMPLES_PER_WAVE * max(fastest, 1e-9)))
         quaternion = quaternion_from_rotation(start.rotation)
 
         def at(times: Array) -> tuple[Array, Array]:
-            x = np.clip(np.minimum(times, self.duration - times) / self.blend, 0.0, 1.0)
-            # Three derivatives vanish at either end.
-            share = x**4 * (35.0 + x * (-84.0 + x * (70.0 - 20.0 * x)))
+            share = blended(np.minimum(times, self.duration - times) / self.blend)
             moved = share[:, None] * np.sum([wave.at(times) for wave in self.waves], axis=0)
             return start.position + moved[:, :3], turned_quaternions(moved[:, 3:], quaternion)
 

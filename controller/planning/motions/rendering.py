@@ -13,14 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.planning.motions.cueing import ROW, Site, at_rest, quaternions_of, read_vehicle, render
-from controller.planning.motions.elements import MOST_DURATION_S, Course, Cueing, turned_quaternions
+from controller.planning.motions.elements import (
+    MOST_DURATION_S,
+    PERIOD_S,
+    SAMPLES_PER_WAVE,
+    Course,
+    Cueing,
+    blended,
+    turned_quaternions,
+)
 from controller.planning.motions.splines import curve_at, spline_at_rest
 from plant.errors import InputError, PlanningError
 from plant.pose import Array, quaternion_from_rotation, rotations_from_quaternions
-
-_PERIOD_S = 0.01
-_SAMPLES_PER_WAVE = 25
-"""Knots of the reference: so far apart at most, and so many for each period of the smoothing."""
 
 _FADE_S = 0.5
 """Time in which the vehicle's last acceleration fades out."""
@@ -144,7 +148,7 @@ class Rendering:
         if duration > MOST_DURATION_S:
             raise InputError(f"{element.file} takes {self._ends:g} s; a motion takes {MOST_DURATION_S:g} s at most")
         p = self._parameters
-        self._period = min(_PERIOD_S, 2.0 * np.pi / (_SAMPLES_PER_WAVE * float(p["smoothing"])))
+        self._period = min(PERIOD_S, 2.0 * np.pi / (SAMPLES_PER_WAVE * float(p["smoothing"])))
         count = max(8, ceil(duration / self._period))
         self.times = np.linspace(0.0, duration, count + 1)
         fade = np.clip((self._ends + _FADE_S - self.times) / _FADE_S, 0.0, 1.0)[:, None]
@@ -173,9 +177,8 @@ class Rendering:
     def _render(self) -> None:
         self._rows = np.zeros(len(self.times), ROW)
         render(self._parameters, at_rest(), self.times, self._forces, self._rates, self._gain, self._rows)
-        # The platform goes the rest of the way home, with three derivatives that vanish at either end.
-        x = np.clip((self.times[-1] - self.times) / (0.5 * self._settle), 0.0, 1.0)
-        self._moves = self._rows["moves"] * (x**4 * (35.0 + x * (-84.0 + x * (70.0 - 20.0 * x))))[:, None]
+        home = blended((self.times[-1] - self.times) / (0.5 * self._settle))
+        self._moves = self._rows["moves"] * home[:, None]
 
     def reduce(self, use: Array, starts: Array, names: Sequence[str]) -> bool:
         """Scale the vehicle's motion down where a limit is left.
