@@ -81,7 +81,6 @@ def test_a_line_is_straight_in_the_loop(path, hexapod):
         assert np.linalg.norm(turns - np.outer(turns @ axis, axis), axis=1).max() < most_turn
 
 
-@pytest.mark.slow
 def test_a_cue_is_felt_in_the_loop(tmp_path, hexapod):
     """What an accelerometer on the true platform reads is what was planned, and pushes as the vehicle does."""
     path = tmp_path / "brake.csv"
