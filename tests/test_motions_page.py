@@ -1,15 +1,27 @@
 """What docs/motions.md shows must be read and must run, and its tables must have every entry."""
 
+import json
 import re
 import shlex
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
-from controller.planning.motions import Motion, Place, SplinePoint, ToolLimits, motion_from_text, plan_motion
+import pytest
+
+from controller.planning.motions import (
+    Motion,
+    Place,
+    SplinePoint,
+    ToolLimits,
+    Washout,
+    load_washout,
+    motion_from_text,
+    plan_motion,
+)
 from controller.planning.motions.elements import KINDS
 from controller.planning.motions.waves import SHAPES
-from hil.command_line import parse
+from hil.command_line import main, parse
 from plant.mechanism import Mechanism
 
 PAGE = (Path(__file__).parent.parent / "docs" / "motions.md").read_text()
@@ -28,7 +40,7 @@ def check_fields(rows: dict[str, list[str]], kind: Any, *without: str) -> None:
             required = each.default is MISSING and each.default_factory is MISSING
             assert (rows[each.name][3] == "must be given") == required, each.name
             if isinstance(each.default, float) and each.default not in (float("inf"),):
-                assert float(rows[each.name][3]) == each.default
+                assert float(rows[each.name][3]) == pytest.approx(each.default, rel=1e-4)
 
 
 def test_every_entry_is_in_a_table() -> None:
@@ -52,9 +64,32 @@ def test_every_shape_has_all_its_entries() -> None:
     assert shown == {name: {each.name for each in fields(kind)} for name, kind in SHAPES.items()}
 
 
+def test_a_drive_is_made_and_rendered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As the page shows it, with the figures that it names."""
+    monkeypatch.chdir(tmp_path)
+    (file,) = [text for text in re.findall("```toml\n(.*?)```", PAGE, re.DOTALL) if text.startswith("# drive.toml")]
+    Path("drive.toml").write_text(file)
+    Path("washout.toml").touch()
+    made, shown, simulated, *_ = [
+        shlex.split(line, comments=True)[1:]
+        for line in re.findall(r"^gough .*$", PAGE.split("\n## Motion cueing\n")[1], re.MULTILINE)
+    ]
+    assert main(made) == 0 and main([*shown, "--json", "figures.json"]) == 0
+    assert "is clipped" in capsys.readouterr().out
+    figures = json.loads(Path("figures.json").read_text())
+    (element,) = figures["elements"]
+    gains = [f"{100.0 * gain:.0f} %" for gain in element["cue"]["onset_gain"]]
+    assert f"onset gain is {gains[0]} ahead, {gains[1]} to the side and {gains[2]} upwards" in " ".join(PAGE.split())
+    assert simulated[-2:] == ["--duration", f"{figures['duration']:.0f}"]
+    assert load_washout("washout.toml") == Washout()
+
+
 def test_the_commands_are_parsed_and_the_examples_run(hexapod: Mechanism) -> None:
     commands = [shlex.split(line, comments=True)[1:] for line in re.findall(r"^gough .*$", PAGE, re.MULTILINE)]
-    assert [words[0] for words in commands] == ["motion", "motion", "simulate", "run", "stream-target"]
+    targets = ["motion", "motion", "simulate", "run", "stream-target"]
+    assert [words[0] for words in commands] == [*targets, "vehicle", "motion", "simulate", "stream-target", "stream-target"]
     for words in commands:
         parse(words)
     toml, python = (re.findall(f"```{language}\n(.*?)```", PAGE, re.DOTALL) for language in ("toml", "python"))

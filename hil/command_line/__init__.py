@@ -17,7 +17,7 @@ REFUSED, INTERRUPTED = 2, 130
 """Exit statuses for bad input and for Ctrl-C; 1 is for a run that ended early."""
 
 COMMANDS = {
-    "run": ("simulate", "run", "motion", "replay", "stream-target"),
+    "run": ("simulate", "run", "motion", "replay", "stream-target", "vehicle"),
     "calibrate": ("calibrate",),
     "design": (
         "classify",

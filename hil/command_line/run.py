@@ -1,9 +1,10 @@
-"""The commands that run the loop: simulate, run, replay, stream-target."""
+"""The commands that run the loop, and what makes targets: simulate, run, motion, replay, stream-target, vehicle."""
 
 import sys
 from argparse import SUPPRESS, ArgumentTypeError, Namespace
 from dataclasses import fields, replace
 from math import inf
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hil.command_line import cli
@@ -16,6 +17,7 @@ from plant.errors import InputError
 from plant.files import write_whole
 
 if TYPE_CHECKING:
+    from controller.planning.motions import PlannedMotion
     from hil.runs.snapshot import Snapshot
 
 _NOTICED_STRETCH = 1.05
@@ -288,9 +290,22 @@ def gough_motion(options: Namespace) -> None:
         limit = ("-", "-") if peak.most == inf else (number_text(peak.most), f"{100.0 * peak.share:.1f}")
         table.add(peak.name, number_text(peak.value), *limit, f"{peak.time:.3f}", peak.unit)
     table.print()
+    _print_cues(planned)
     for remark in target.remarks:
         print(remark)
     print(f"{planned.name} takes {planned.duration:.3f} s on {options.mechanism}, within all limits")
+
+
+def _print_cues(planned: "PlannedMotion") -> None:
+    table = Table("cue", "axis", "asked RMS [m/s2]", "missing RMS [m/s2]", "at most [m/s2]", "onset gain [%]", left=(0, 1))
+    for part in planned.parts:
+        if part.cue is not None:
+            rows = zip(part.cue.asked, part.cue.error, part.cue.worst_error, part.cue.onset_gain, strict=True)
+            for axis, (asked, error, worst, gain) in zip("xyz", rows, strict=True):
+                onset = "-" if gain != gain else f"{100.0 * gain:.0f}"
+                table.add(part.label, axis, f"{asked:.3f}", f"{error:.3f}", f"{worst:.3f}", onset)
+    if table.rows:
+        table.print()
 
 
 @cli.command(cli.source("files", "FILE.mcap", "files of one run, in their order", nargs="+"), cli.JSON)
@@ -321,34 +336,105 @@ def _address(text: str) -> tuple[str, int]:
         SimulationConfig,
         "mechanism",
         target={"text": "a motion's name, or a CSV file, as for 'gough run'"},
-        duration={"text": "duration of the motion"},
+        duration={
+            "text": "duration of the motion",
+            "default": None,
+            "parse": float,
+            "shown": "10; with --cueing, as long as the vehicle's motion",
+        },
         rate={"default": 100.0, "text": "poses per second, at most 10000"},
         frames={"text": "the frames of the run"},
         frame={},
         tool={},
+    ),
+    cli.argument(
+        "--cueing",
+        type=Path,
+        metavar="FILE.toml",
+        help="instead of a target, render a vehicle's motion by these settings (docs/motions.md)",
+    ),
+    cli.setting(
+        "--vehicle",
+        "-",
+        "with --cueing, where that motion comes from: a CSV file, - for lines on standard input, or "
+        "udp:HOST:PORT for lines in datagrams",
+        metavar="SOURCE",
     ),
     cli.setting("--to", "127.0.0.1:47200", "where the run listens", type=_address, metavar="HOST:PORT"),
     *(
         cli.argument(f"--{name}-at", type=float, default=SUPPRESS, metavar="SECONDS", help=f"{text} from this time on [s]")
         for name, text in (("stop", "fall silent"), ("jump", "jump up by 5 cm"), ("nan", "send what is no number"))
     ),
+    cli.JSON,
 )
 def gough_stream_target(options: Namespace) -> None:
     """Send a target pose by pose to a run that follows a stream.
 
-    Each pose is one UDP datagram, in real time. In the end the sender says so, and the run holds the last pose until its own
-    end; a sender that falls silent without that is lost. The stream can also go wrong on purpose, to show that the run then
-    stops as it should.
+    Each pose is one UDP datagram, in real time. With --cueing, the poses render a vehicle's motion as it comes. In the end the
+    sender says so, and the run holds the last pose until its own end; a sender that falls silent without that is lost. The
+    stream can also go wrong on purpose, to show that the run then stops as it should.
     """
     from controller.planning.target import load_target
+    from hil.runs.cue_stream import send_cues, source_of
     from hil.runs.target_stream import Faults, send_target
     from plant.mechanism import load_spatial
 
     mechanism = load_spatial(options.mechanism)
     # Whether there is an IMU on the base is the run's affair.
     frames = SimulationConfig(frames=options.frames, frame=options.frame, tool=options.tool, base_imu=True).active_frames
-    target = load_target(options.target, mechanism, options.duration, frames)
     host, port = options.to
-    faults = cli.config_of(options, Faults)
-    sent = send_target(mechanism, target, options.rate, host, port, options.duration, faults, frames)
-    print(f"{sent} poses of {target.name} sent to {host}:{port}")
+    faults, duration = cli.config_of(options, Faults), options.duration
+    if options.cueing is not None:
+        if faults != Faults():
+            raise InputError("a cue has no faults on purpose: leave --stop-at, --jump-at and --nan-at out, or --cueing")
+        source = source_of(options.vehicle)
+        figures = send_cues(mechanism, options.cueing, source, options.rate, host, port, duration, frames)
+        print(f"{figures['sent']} poses of {options.vehicle} sent to {host}:{port}")
+        _print_kept(figures)
+    else:
+        duration = SimulationConfig.duration if duration is None else duration
+        target = load_target(options.target, mechanism, duration, frames)
+        figures = {"sent": send_target(mechanism, target, options.rate, host, port, duration, faults, frames)}
+        print(f"{figures['sent']} poses of {target.name} sent to {host}:{port}")
+    cli.write_json(options.json, figures)
+
+
+def _print_kept(figures: dict[str, Any]) -> None:
+    came, kept = figures["vehicle"], figures["kept"]
+    samples = max(kept["samples"], 1)
+    print(", ".join(f"{came[name]} {name}" for name in came) + " of the vehicle's motion")
+    for name, text in (
+        ("clipped", "had an acceleration or angular velocity that was clipped"),
+        ("tilt_clipped", "would have tilted further"),
+        ("tilt_slowed", "would have tilted faster"),
+        ("stroke", f"would have left the strokes, by up to {mm(kept['excess'])} mm at leg {kept['leg']}"),
+        ("slowed", f"would have been too fast, with a leg at up to {kept['speed']:.3f} m/s"),
+    ):
+        if kept[name]:
+            print(f"{100.0 * kept[name] / samples:.1f} % of the poses {text}")
+
+
+@cli.command(
+    cli.argument(
+        "manoeuvres", nargs="+", metavar="MANOEUVRE", help="what the car does, in this order: brake, lane-change, bumps"
+    ),
+    cli.output("--csv", "FILE.csv", "write its accelerations and angular velocities, as motion cueing reads them"),
+    cli.setting("--speed", 14.0, "of the car [m/s]"),
+    cli.setting("--strength", 1.0, "factor on braking, on the acceleration to the side, and on the height of bumps"),
+    cli.JSON,
+)
+def gough_vehicle(options: Namespace) -> None:
+    """Make the motion of a car, to try motion cueing with (docs/motions.md)."""
+    from controller.planning.motions import drive, text_of_vehicle
+
+    vehicle = drive(options.manoeuvres, options.speed, options.strength)
+    if options.csv is not None:
+        write_whole(options.csv, text_of_vehicle(vehicle).encode())
+    forces, rates = (abs(values).max(axis=0).tolist() for values in (vehicle.forces, vehicle.rates))
+    duration = float(vehicle.times[-1])
+    cli.write_json(options.json, {"duration": duration, "greatest_acceleration": forces, "greatest_angular_velocity": rates})
+    table = Table("axis", "acceleration [m/s2]", "angular velocity [deg/s]", left=(0,))
+    for axis, force, rate in zip("xyz", forces, rates, strict=True):
+        table.add(axis, f"{force:.3f}", deg(rate))
+    table.print()
+    print(f"{', '.join(options.manoeuvres)}: {duration:.2f} s")

@@ -17,7 +17,7 @@ import select
 import socket
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from statistics import median
 from typing import Any
@@ -45,7 +45,6 @@ from hil.rigs.udp.link import bound_socket
 from plant.compiled import Record
 from plant.errors import GoughError, InputError
 from plant.mechanism import Mechanism
-from plant.pose import Array
 
 HOST, PORT = "127.0.0.1", 47200
 
@@ -252,8 +251,7 @@ def send_target(
         StreamError: there is no such address.
     """
     duration = float(target.times[-1]) if duration is None else duration
-    if not 0.0 < rate <= 10_000.0:
-        raise InputError(f"the rate is {rate:g} Hz; it must be positive and at most 10000: choose another")
+    _check_rate(rate)
     if not 0.0 < duration < math.inf:
         raise InputError(f"the duration is {duration:g} s; it must be positive and finite")
     home, faults = mechanism.require_home(), faults or Faults()
@@ -263,31 +261,60 @@ def send_target(
     displacements, quaternions = samples_of(positions, rotations, home, frames)
     displacements[times >= faults.jump_at] += [0.0, 0.0, _JUMP_M]
     displacements[times >= faults.nan_at] = np.nan
+    # One that falls silent on purpose does not say so.
+    return send_poses(zip(displacements, quaternions, strict=True), rate, host, port, faults.stop_at >= duration)
+
+
+def send_poses(
+    poses: Iterable[tuple[ArrayLike, ArrayLike]], rate: float, host: str = HOST, port: int = PORT, ends: bool = True
+) -> int:
+    """Stream poses in real time, each made and sent when it is due, and the last one again as the end of the stream if it
+    `ends`; returns how many were sent.
+
+    Args:
+        poses: displacements (3,) [m] and quaternions (4,), as in a datagram.
+        rate: poses per second [Hz].
+        host, port: of the receiver.
+        ends: whether the receiver is told the end.
+
+    Raises:
+        InputError: the rate is not positive, or above 10 kHz.
+        StreamError: there is no such address.
+    """
+    _check_rate(rate)
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         with socket.socket(family, socket.SOCK_DGRAM) as sender:
-            # One that falls silent on purpose does not say so.
-            return _send(sender, address, rate, list(zip(displacements, quaternions, strict=True)), faults.stop_at >= duration)
+            return _send(sender, address, rate, iter(poses), ends)
     except (OSError, OverflowError) as error:
         raise StreamError(f"cannot send a target to {host}:{port}: {error}: choose another address or port") from None
 
 
-def _send(sender: socket.socket, address: Any, rate: float, poses: Sequence[tuple[Array, Array]], ends: bool) -> int:
-    """Send poses, each when it is due, and the last one again as the end of the stream if it `ends`; returns their number."""
-    began, sent, count = time.monotonic_ns(), 0, len(poses)
-    for k in range(count + FAREWELLS * ends):
-        pose, last = poses[min(k, count - 1)], k >= count
-        due = began + round(1e9 * k / rate)
+def _check_rate(rate: float) -> None:
+    if not 0.0 < rate <= 10_000.0:
+        raise InputError(f"the rate is {rate:g} Hz; it must be positive and at most 10000: choose another")
+
+
+def _send(sender: socket.socket, address: Any, rate: float, poses: Iterator[tuple[ArrayLike, ArrayLike]], ends: bool) -> int:
+    began, sent, number, left = time.monotonic_ns(), 0, 0, FAREWELLS if ends else 0
+    pose: tuple[ArrayLike, ArrayLike] | None = None
+    while True:
+        due = began + round(1e9 * number / rate)
         late = time.monotonic_ns() - due
-        if late > 1e9 / rate and not last:
-            # A sender that is held up leaves out the poses whose time is over.
-            continue
         if late < 0:
             time.sleep(-1e-9 * late)
-        try:
-            sender.sendto(encode(k, due, *pose, last), address)
-        except ConnectionRefusedError:
-            # Nobody listens yet, or nobody listens any more.
-            continue
-        sent += not last
-    return sent
+        following = next(poses, None)
+        last = following is None
+        pose = pose if following is None else following
+        if pose is None or (last and left == 0):
+            return sent
+        number += 1
+        left -= last
+        # A sender that is held up leaves out the poses whose time is over.
+        if late <= 1e9 / rate or last:
+            try:
+                sender.sendto(encode(number - 1, due, *pose, last), address)
+            except ConnectionRefusedError:
+                # Nobody listens yet, or nobody listens any more.
+                continue
+            sent += not last

@@ -14,14 +14,30 @@ from controller.planning.motions.built_in import (
     rests,
     shaking,
 )
-from controller.planning.motions.document import load_motion, motion_from_text, text_of_motion
-from controller.planning.motions.elements import Arc, Dwell, Line, Loop, Motion, Place, Spline, SplinePoint, ToolLimits, Wave
+from controller.planning.motions.cue_filter import CueFilter
+from controller.planning.motions.cueing import Vehicle, Washout, read_vehicle
+from controller.planning.motions.document import load_motion, load_washout, motion_from_text, text_of_motion
+from controller.planning.motions.elements import (
+    Arc,
+    Cueing,
+    Dwell,
+    Line,
+    Loop,
+    Motion,
+    Place,
+    Spline,
+    SplinePoint,
+    ToolLimits,
+    Wave,
+)
+from controller.planning.motions.manoeuvres import MANOEUVRES, drive, text_of_vehicle
 from controller.planning.motions.planned import PlannedMotion, plan_motion
 from controller.planning.motions.waves import Chirp, Circle, FigureEight, Noise, Samples, Sine
 
 __all__ = [
     "EVERYWHERE",
     "HELD",
+    "MANOEUVRES",
     "MARGIN_S",
     "MOTIONS",
     "NAMES",
@@ -31,6 +47,8 @@ __all__ = [
     "Box",
     "Chirp",
     "Circle",
+    "CueFilter",
+    "Cueing",
     "Dwell",
     "FigureEight",
     "Line",
@@ -45,12 +63,18 @@ __all__ = [
     "Spline",
     "SplinePoint",
     "ToolLimits",
+    "Vehicle",
+    "Washout",
     "Wave",
+    "drive",
     "load_motion",
+    "load_washout",
     "motion_from_text",
     "named_motion",
     "plan_motion",
+    "read_vehicle",
     "rests",
     "shaking",
     "text_of_motion",
+    "text_of_vehicle",
 ]

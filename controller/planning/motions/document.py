@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from controller.planning.motions.cueing import Washout
 from controller.planning.motions.elements import KINDS, Element, Motion, Place, SplinePoint, ToolLimits
 from controller.planning.motions.waves import AXES, SHAPES, AnyWave
 from plant.checks import nearest
@@ -17,7 +18,10 @@ from plant.pose import checked_array, checked_unit, rotation_from_quaternion, ve
 T = TypeVar("T")
 
 _DEGREES = "_deg"
-_ANGLES = ("rotation", "angle", "phase", "turn_speed", "turn_acceleration", "turn_jerk", "turn_velocity")
+_ANGLES = (
+    "rotation", "angle", "phase", "turn_speed", "turn_acceleration", "turn_jerk", "turn_velocity",
+    "most_turn_speed", "tilt", "tilt_speed",
+)  # fmt: skip
 _SIZES = ("amplitude", "amplitudes", "radius", "rms")
 """Angles, and what is an angle on an axis of turns; each can be given in degrees under its name with `_deg`."""
 
@@ -41,6 +45,16 @@ def motion_from_text(text: str, source: str, folder: Path = Path()) -> Motion:
         return _Reader(folder).motion(parse_toml(text, source), source)
     except InputError as error:
         raise error if str(error).startswith(source) else InputError(f"{source}, {error}") from None
+
+
+def load_washout(path: str | Path) -> Washout:
+    """The settings of a washout from a TOML file, which has the entries of a cueing element but those of its file and end.
+
+    Raises:
+        InputError: the file cannot be read, or is none.
+    """
+    name = Path(path).name
+    return _made(Washout, _in_radians(parse_toml(read_text(path), name), name), name)
 
 
 def text_of_motion(motion: Motion) -> str:
@@ -126,6 +140,7 @@ class _Reader:
                 self._wave(value, f"{title}, wave {k}") for k, value in enumerate(_tables(values, f"{title}, waves"), start=1)
             ),
             limits=lambda own: _made(ToolLimits, own, title),
+            file=self._file,
             **{name: lambda value, name=name: self._place(value, f"{title}, {name}") for name in _PLACES},
         )  # fmt: skip
 
@@ -166,9 +181,11 @@ class _Reader:
             lacks = "lacks a shape" if shape is None else f"has the shape {shape!r}"
             raise InputError(f"{title} {lacks}; there are {', '.join(SHAPES)}{nearest(str(shape), SHAPES)}")
         table = _in_radians({name: value for name, value in given.items() if name != "shape"}, title)
-        return _made(
-            SHAPES[shape], table, f"{title} ({shape})", also=("shape",), file=lambda name: str(self._folder / str(name))
-        )
+        return _made(SHAPES[shape], table, f"{title} ({shape})", also=("shape",), file=self._file)
+
+    def _file(self, name: Any) -> str:
+        """The path of a file beside the document."""
+        return str(self._folder / str(name))
 
 
 def _made(kind: type[T], table: dict[str, Any], title: str, also: Iterable[str] = (), **readers: Any) -> T:

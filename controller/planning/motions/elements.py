@@ -1,4 +1,4 @@
-"""The elements of a motion: lines, arcs, splines, waves, dwells and loops, as a motion file has them and Python makes them.
+"""The elements of a motion: lines, arcs, splines, waves, cues, dwells and loops, as a file has them and Python makes them.
 
 Poses here are displacements: a position (3,) [m] from home, and the rotation (3, 3) from home's orientation, along and about
 the axes of {1}; with frames of the user's own they are what these say (`controller.frames`). Each element begins at rest where
@@ -11,6 +11,7 @@ from math import inf
 
 import numpy as np
 
+from controller.planning.motions.cueing import Washout, quaternions_of, read_vehicle
 from controller.planning.motions.splines import curve_at, natural_spline, quintic_spline, quintic_values, spline_at_rest
 from controller.planning.motions.waves import AnyWave, checked_number
 from plant.errors import InputError
@@ -21,8 +22,8 @@ Numbers = tuple[float, ...]
 MOST_DURATION_S = 3600.0
 """The longest motion."""
 
-_PERIOD_S = 0.01
-_SAMPLES_PER_WAVE = 25
+PERIOD_S = 0.01
+SAMPLES_PER_WAVE = 25
 """Knots of the reference: so far apart at most, and so many for each period of the fastest wave."""
 
 _SAME_M, _SAME_RAD = 1e-9, 1e-9
@@ -96,13 +97,12 @@ class Course:
     end: Pose
     breaks: Array
     duration: float | None = None
-    period: float = _PERIOD_S
+    period: float = PERIOD_S
 
 
-def _products(vector: Array, quaternion: Array) -> Array:
+def turned_quaternions(vector: Array, quaternion: Array) -> Array:
     """The quaternions (N, 4) of turns by rotation vectors (N, 3), after one of `quaternion` (4,)."""
-    half = 0.5 * np.linalg.norm(vector, axis=-1, keepdims=True)
-    w, (x, y, z) = np.cos(half)[:, 0], (0.5 * np.sinc(half / np.pi) * vector).T
+    w, x, y, z = quaternions_of(vector).T
     a, b, c, d = quaternion
     return np.column_stack(
         [
@@ -112,6 +112,13 @@ def _products(vector: Array, quaternion: Array) -> Array:
             w * d + x * c - y * b + z * a,
         ]
     )
+
+
+def blended(x: Array) -> Array:
+    """Shares (N,) that go from 0 to 1 with x, so smoothly that three derivatives vanish at either end."""
+    x = np.clip(x, 0.0, 1.0)
+    shares: Array = x**4 * (35.0 + x * (-84.0 + x * (70.0 - 20.0 * x)))
+    return shares
 
 
 def _turn_between(start: Array, end: Array) -> Array:
@@ -150,7 +157,7 @@ class Line:
         quaternion = quaternion_from_rotation(start.rotation)
 
         def at(s: Array) -> tuple[Array, Array]:
-            return start.position + s[:, None] * move, _products(s[:, None] * turn, quaternion)
+            return start.position + s[:, None] * move, turned_quaternions(s[:, None] * turn, quaternion)
 
         return Course(at, end, np.empty(0))
 
@@ -208,7 +215,7 @@ class Arc:
 
         def at(s: Array) -> tuple[Array, Array]:
             phi = angle * s[:, None]
-            return centre + np.cos(phi) * radius + np.sin(phi) * across, _products(s[:, None] * turn, quaternion)
+            return centre + np.cos(phi) * radius + np.sin(phi) * across, turned_quaternions(s[:, None] * turn, quaternion)
 
         return Course(at, end, np.empty(0))
 
@@ -353,17 +360,31 @@ class Wave:
     def course(self, start: Pose) -> Course:
         """Where it leads from a pose."""
         fastest = max(wave.fastest for wave in self.waves)
-        period = min(_PERIOD_S, self.blend / _SAMPLES_PER_WAVE, 1.0 / (_SAMPLES_PER_WAVE * max(fastest, 1e-9)))
+        period = min(PERIOD_S, self.blend / SAMPLES_PER_WAVE, 1.0 / (SAMPLES_PER_WAVE * max(fastest, 1e-9)))
         quaternion = quaternion_from_rotation(start.rotation)
 
         def at(times: Array) -> tuple[Array, Array]:
-            x = np.clip(np.minimum(times, self.duration - times) / self.blend, 0.0, 1.0)
-            # Three derivatives vanish at either end.
-            share = x**4 * (35.0 + x * (-84.0 + x * (70.0 - 20.0 * x)))
+            share = blended(np.minimum(times, self.duration - times) / self.blend)
             moved = share[:, None] * np.sum([wave.at(times) for wave in self.waves], axis=0)
-            return start.position + moved[:, :3], _products(moved[:, 3:], quaternion)
+            return start.position + moved[:, :3], turned_quaternions(moved[:, 3:], quaternion)
 
         return Course(at, start, np.array([self.blend, self.duration - self.blend]), self.duration, period)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cueing(Washout):
+    """What the platform renders of a vehicle's motion. It ends where it begins."""
+
+    file: str  # of the vehicle's motion
+    settle: float = 10.0  # time after the vehicle's motion to go back to where it begins [s]
+    dwell: float = 0.0  # rest at its end [s]
+    limits: ToolLimits = field(default_factory=ToolLimits)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checked_number(self.settle, "settle", 1.0, MOST_DURATION_S)
+        checked_number(self.dwell, "dwell", 0.0, MOST_DURATION_S)
+        read_vehicle(self.file)
 
 
 @dataclass(frozen=True)
@@ -391,13 +412,14 @@ class Loop:
 
 
 Moving = Line | Arc | Spline | Wave
-Element = Moving | Dwell | Loop
+Element = Moving | Cueing | Dwell | Loop
 
 KINDS: dict[str, type[Element]] = {
     "line": Line,
     "arc": Arc,
     "spline": Spline,
     "wave": Wave,
+    "cueing": Cueing,
     "dwell": Dwell,
     "loop": Loop,
 }

@@ -2,9 +2,9 @@
 
 A way (line, arc, spline without times) is run through by ruckig: its parameter goes from 0 to 1 with limits of its rate,
 acceleration and jerk, which are fitted to what the way needs of tool and actuators. An element with times of its own is
-sampled. In both cases the reference of each actuator is the cubic spline through its lengths, so what the limits are held
+sampled. In all cases the reference of each actuator is the cubic spline through its lengths, so what the limits are held
 against is what the actuators will follow. The time of each element is then scaled: k times longer, velocities are k,
-accelerations k^2 and jerks k^3 times smaller, exactly.
+accelerations k^2 and jerks k^3 times smaller, exactly. A cue has the times of its vehicle: that is scaled instead.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 from ruckig import InputParameter, Ruckig, Trajectory
 
 from controller.inverse_kinematics import leg_lengths
+from controller.planning.motions.cueing import Site
 from controller.planning.motions.elements import (
     KINDS,
     MOST_DURATION_S,
     Course,
+    Cueing,
     Dwell,
     Element,
     Loop,
@@ -29,8 +31,9 @@ from controller.planning.motions.elements import (
     Moving,
     ToolLimits,
 )
+from controller.planning.motions.rendering import Rendered, Rendering
 from controller.planning.motions.splines import curve_at, extrema_of, natural_spline, spline_at_rest, stretched
-from controller.planning.segments import START, state_after, write_segment
+from controller.planning.segments import LENGTH, START, state_after, write_segment
 from controller.planning.trajectory_generator import calculate, phases_of
 from plant.errors import InputError, PlanningError, UnreachableError
 from plant.mechanism import Mechanism
@@ -116,6 +119,7 @@ class Part:
     peaks: tuple[Peak, ...]
     asked: Peak | None = None  # what has slowed it, as it would have been by its own times
     scale: float = 1.0  # by what it is slower than by its own times
+    cue: Rendered | None = None  # what was clipped of a vehicle's motion, and how good the cue is
 
     @property
     def binding(self) -> Peak | None:
@@ -159,6 +163,7 @@ class PlannedMotion:
                 "slowed_by": part.scale,
                 "binding": None if part.binding is None else part.binding.name,
                 "peaks": [peak.plain() for peak in part.peaks],
+                **({} if part.cue is None else {"cue": part.cue.plain()}),
             }
             for part in self.parts
         ]
@@ -167,12 +172,19 @@ class PlannedMotion:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What was slowed, a line each."""
-        return tuple(
+        """What was slowed, clipped or scaled, a line each."""
+        slowed = (
             f"{self.name}, element {part.label}, is {part.scale:.4g} times slower than by its own times: {_excess(part.asked)}"
             for part in self.parts
             if part.asked is not None
         )
+        cued = (
+            f"{self.name}, element {part.label}: {remark}"
+            for part in self.parts
+            if part.cue is not None
+            for remark in part.cue.remarks(part.begin)
+        )
+        return (*slowed, *cued)
 
 
 def _excess(peak: Peak) -> str:
@@ -271,12 +283,14 @@ class _MotionPlanner:
             except InputError as error:
                 raise InputError(f"{self._motion.name}, element {label}: {error}") from None
 
-    def _parts_of(self, element: Moving | Dwell, kind: str, label: str) -> Iterator[Part]:
+    def _parts_of(self, element: Moving | Cueing | Dwell, kind: str, label: str) -> Iterator[Part]:
         key = id(element), np.concatenate([self._pose.position, self._pose.rotation.ravel()]).tobytes()
         if key not in self._known:
             parts = []
             dwell = element.duration if isinstance(element, Dwell) else element.dwell
-            if not isinstance(element, Dwell):
+            if isinstance(element, Cueing):
+                parts.append(self._cued(element, kind, label))
+            elif not isinstance(element, Dwell):
                 parts.append(self._moved(element, kind, label))
             if dwell > 0.0 or not parts:
                 parts.append(self._rested(max(dwell, 1e-3) * self._motion.time_scale, label))
@@ -287,7 +301,7 @@ class _MotionPlanner:
             self._time += part.duration
             yield Part(
                 label, part.kind, began, part.duration, part.legs, part.poses, tuple(peak.later(began) for peak in part.peaks),
-                None if part.asked is None else part.asked.later(began), part.scale,
+                None if part.asked is None else part.asked.later(began), part.scale, part.cue,
             )  # fmt: skip
 
     def _rested(self, duration: float, label: str) -> Part:
@@ -327,6 +341,42 @@ class _MotionPlanner:
         peaks = self._peaks(legs, poses, limits)
         self._pose = course.end
         return Part(label, kind, 0.0, float(legs[0, -1, START]), legs, poses, tuple(peaks), asked, slower)
+
+    def _cued(self, element: Cueing, kind: str, label: str) -> Part:
+        limits = element.limits.over(self._motion.limits)
+        rendering = Rendering(element, Site(self._mechanism, self._pose, self._platform, element.point))
+        while True:
+            course, times = rendering.course, rendering.times
+            legs, poses = self._curves(course, times, times)
+            use, names = self._use(legs, poses, limits)
+            if not rendering.reduce(use, legs[0, :-1, START], names):
+                break
+        self._check_stroke(label, legs, course)
+        peaks = tuple(self._peaks(legs, poses, limits))
+        return Part(label, kind, 0.0, float(times[-1]), legs, poses, peaks, cue=rendering.rendered())
+
+    def _use(self, legs: Array, poses: Array, limits: ToolLimits) -> tuple[Array, list[str]]:
+        """The shares (q, m - 1) of all limits that are used in each interval, and the names of the limits (q).
+
+        That of a stroke is the share of the way from the first length to its end.
+        """
+        times = legs[0, :, START]
+        middles = 0.5 * (times[:-1] + times[1:])
+        values, between = (np.abs(each[1:]).transpose(0, 2, 1) for each in (curve_at(legs, times), curve_at(legs, middles)))
+        sizes = np.maximum(np.maximum(values[..., :-1], values[..., 1:]), between)
+        use, names = [*(sizes / self._most[:, None, None])], [f"{name} of leg" for name, _ in _LEG_QUANTITIES]
+        first = legs[:, :1, LENGTH]
+        room = self._stroke - first
+        lengths = np.stack([legs[:, :-1, LENGTH], curve_at(legs, middles)[0].T, legs[:, 1:, LENGTH]]) - first
+        use.append(np.maximum(lengths.max(axis=0) / room[:, 1:], lengths.min(axis=0) / room[:, :1]))
+        names.append("stroke of leg")
+        most = np.array([getattr(limits, name) for name, _, _ in _TOOL_QUANTITIES])
+        tool = np.array(_tool_sizes(curve_at(poses, times))) / most[:, None]
+        use.append(np.maximum(tool[:, :-1], tool[:, 1:]))
+        return np.concatenate(use), [
+            *(f"{name} {leg}" for name in names for leg in range(len(legs))),
+            *(f"{name.replace('_', ' ')} of the tool" for name, _, _ in _TOOL_QUANTITIES),
+        ]
 
     def _check_stroke(self, label: str, legs: Array, course: Course | None) -> None:
         """Check the lengths (n, m, 5) against the strokes, or raise an `UnreachableError` with the first time outside."""

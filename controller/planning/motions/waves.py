@@ -35,6 +35,22 @@ def checked_number(value: float, name: str, least: float = -inf, most: float = i
     return float(value)
 
 
+def read_samples(path: Path, what: str, least: int, *headers: tuple[str, ...]) -> tuple[tuple[str, ...], Array]:
+    """The columns (m) and rows (N, m) of a CSV file with one of these headers, whose first column is an increasing time.
+
+    Raises:
+        InputError: the file cannot be read, is malformed, out of order, or has less than `least` samples for `what` it is.
+    """
+    columns, table, lines = read_csv(path, *headers)
+    if len(table) < least:
+        raise InputError(f"{path} has {len(table)} samples; {what} needs at least {least}")
+    late = np.flatnonzero(np.diff(table[:, 0]) <= 0.0)
+    if len(late):
+        row = int(late[0]) + 1
+        raise InputError(f"{path}, line {lines[row]}: time {table[row, 0]:g} s does not come after {table[row - 1, 0]:g} s")
+    return columns, table
+
+
 def _axis(name: str) -> int:
     if name not in AXES:
         raise InputError(f"axis is {name!r}; it must be one of {', '.join(AXES)}{nearest(str(name), AXES)}")
@@ -211,15 +227,7 @@ class Samples:
         self._table()
 
     def _table(self) -> Array:
-        path = Path(self.file)
-        _, table, lines = read_csv(path, COLUMNS)
-        if len(table) < 3:
-            raise InputError(f"{path} has {len(table)} samples; a wave needs at least 3")
-        late = np.flatnonzero(np.diff(table[:, 0]) <= 0.0)
-        if len(late):
-            row = int(late[0]) + 1
-            raise InputError(f"{path}, line {lines[row]}: time {table[row, 0]:g} s does not come after {table[row - 1, 0]:g} s")
-        return table
+        return read_samples(Path(self.file), "a wave", 3, COLUMNS)[1]
 
     @property
     def fastest(self) -> float:

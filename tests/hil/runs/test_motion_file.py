@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from controller.planning.motions import Cueing, Motion, drive, plan_motion, text_of_vehicle
 from hil.command_line import main
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import simulate
@@ -78,3 +79,29 @@ def test_a_line_is_straight_in_the_loop(path, hexapod):
         turns = (Rotation.from_matrix(rotations[moving] @ hexapod.home.rotation.T) * first.inv()).as_rotvec(degrees=True)
         axis = whole / np.linalg.norm(whole)
         assert np.linalg.norm(turns - np.outer(turns @ axis, axis), axis=1).max() < most_turn
+
+
+def test_a_cue_is_felt_in_the_loop(tmp_path, hexapod):
+    """What an accelerometer on the true platform reads is what was planned, and pushes as the vehicle does."""
+    path = tmp_path / "brake.csv"
+    path.write_text(text_of_vehicle(drive(["brake"], speed=6.0, rest=1.5)))
+    motion = Motion((Cueing(file=str(path), settle=3.0),))
+    planned = plan_motion(motion, hexapod)
+    result = simulate(SimulationConfig(target=motion, imu="ideal", duration=planned.duration))
+    assert result.reference.violations == 0
+    begin = result.times[0]
+
+    def felt(times, positions, rotations):
+        """Specific force (N, 3) less that at rest, over 50 ms."""
+        accelerations = np.gradient(np.gradient(positions, times, axis=0), times, axis=0)
+        up = 9.81 * np.array([0.0, 0.0, 1.0])
+        forces = np.einsum("nji,nj->ni", rotations, accelerations + up) - up
+        width = round(0.05 / np.diff(times).mean())
+        return np.array([np.convolve(each, np.ones(width) / width, "same") for each in forces.T]).T
+
+    true = felt(result.times, result.true_positions, result.true_rotations)
+    reference = felt(result.times, result.reference_positions, result.reference_rotations)
+    later = result.times > begin + 1.2
+    off = true[later][:-100] - reference[later][:-100]
+    assert np.sqrt((off**2).mean(axis=0)).max() < 0.05
+    assert reference[later][:, 0].min() < -0.5 and true[later][:, 0].min() < -0.5
