@@ -30,14 +30,16 @@ _LEAST_CHANGE_S = 0.05
 _SLOW, _SLOW_ALONE = 0.75, 0.9
 """Share of the whole difference that counts like a change, of several and of one encoder: it may creep away slowly."""
 
+_SIGMAS, _LEAST = 2.1, 0.5
+"""An encoder is wrong that is off by so many standard deviations, and by this share of the limit of a change."""
+
 _SETTLING_S, _UNSETTLED_S, _UNSETTLED = 1.5, 3.0, 1.5
-"""After the first time from the start the filters have settled [s]; until the second one the limit is so much wider."""
+"""After the first time from the start the filters have settled [s]. Until the second one the limit is so much wider, and the
+share above is 1, as the filters take themselves for better than they are.
+"""
 
 _LASTING_S = 0.005
 """For how long a change must last, at least two cycles [s]."""
-
-_SIGMAS, _LEAST = 2.1, 0.5
-"""An encoder is wrong that is off by so many standard deviations, and by this share of the limit of a change."""
 
 _ALONE = 2.5
 """How many times as large as what is left without it the square of a wrong encoder's error is, in sigmas."""
@@ -92,7 +94,7 @@ def judge_encoders(
     """
     w, passed = s.encoders, elapsed(rig, time)
     w.watched_for += passed
-    wider = 1.0 if w.watched_for > _UNSETTLED_S else _UNSETTLED
+    wider, least = (1.0, _LEAST) if w.watched_for > _UNSETTLED_S else (_UNSETTLED, 1.0)
     time_constant = max(min(_CHANGE_S, w.watched_for - _SETTLING_S), _LEAST_CHANGE_S, passed)
     settled = w.watched_for > _SETTLING_S
     w.differences[:] = 0.0
@@ -122,7 +124,7 @@ def judge_encoders(
                     w.factor[k, other] = encoders.covariance[k, other]
             w.factor[k, k] = encoders.covariance[k, k] + encoder_parameters.variance
     worst, error, sigma, alone = _find_wrong(w)
-    limit = wider * max(_SIGMAS * sigma, _LEAST * p.encoders.deviation)
+    limit = wider * max(_SIGMAS * sigma, least * p.encoders.deviation)
     wrong = alone and abs(error) > limit
     leg, most = _find_greatest(w)
     several = most > _BEYOND * wider * p.encoders.deviation
