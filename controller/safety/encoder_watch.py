@@ -94,7 +94,8 @@ def judge_encoders(
     """
     w, passed = s.encoders, elapsed(rig, time)
     w.watched_for += passed
-    wider, least = (1.0, _LEAST) if w.watched_for > _UNSETTLED_S else (_UNSETTLED, 1.0)
+    early = w.watched_for <= _UNSETTLED_S
+    wider, least = (_UNSETTLED, 1.0) if early else (1.0, _LEAST)
     time_constant = max(min(_CHANGE_S, w.watched_for - _SETTLING_S), _LEAST_CHANGE_S, passed)
     settled = w.watched_for > _SETTLING_S
     w.differences[:] = 0.0
@@ -125,8 +126,9 @@ def judge_encoders(
             w.factor[k, k] = encoders.covariance[k, k] + encoder_parameters.variance
     worst, error, sigma, alone = _find_wrong(w)
     limit = wider * max(_SIGMAS * sigma, least * p.encoders.deviation)
-    wrong = alone and abs(error) > limit
     leg, most = _find_greatest(w)
+    # While the filters settle, the pose may be off otherwise than its covariance says, and look like an encoder that is wrong.
+    wrong = alone and abs(error) > limit and (not early or (leg == worst and most > limit))
     several = most > _BEYOND * wider * p.encoders.deviation
     w.changed_for = w.changed_for + passed if wrong or several else 0.0
     if wrong:
