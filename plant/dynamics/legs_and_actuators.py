@@ -6,7 +6,7 @@ symmetric about the leg's axis n = s / l. Since the leg's angular velocity lies 
 the plane's normal, so k and omega_n are zero. All this is seen in {1}, whose own motion is added to it.
 
 Each leg is driven through a screw by a DC motor on an encoderless drive that turns a velocity command u into the voltage
-`n k u + kappa R_nominal i`, n = 2 pi / lead.
+`g n k u + kappa R_nominal i`, n = 2 pi / lead, with a gain g that is 1 where the drive counts as the screw does.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ def row(matrix: SX, k: int) -> SX:
 
 
 _UNCHANGED = (
-    "motor.resistance", "drive.voltage_limit", "drive.current_limit", "friction.coulomb", "friction.viscous",
+    "motor.resistance", "drive.gain", "drive.voltage_limit", "drive.current_limit", "friction.coulomb", "friction.viscous",
     "friction.velocity", "brake.stiffness", "brake.damping", "stop.minimum_length", "stop.maximum_length", "stop.stiffness",
     "stop.damping", "screw.backlash", "joint.clearance", "screw.stiffness", "screw.damping", "leg.lower.mass",
     "leg.lower.center", "leg.lower.inertia", "leg.upper.inertia", "leg.bending_compliance", "leg.guide",
@@ -347,7 +347,7 @@ def actuators_at(legs: list[Leg], x: dict[str, SX], u: dict[str, SX], c: dict[st
         speeds**2 + c["friction.velocity"] ** 2
     )
     back_emf = c["force_constant"] * speeds
-    asked = driven * (c["force_constant"] * u["velocity_command"] + c["compensating_resistance"] * current)
+    asked = driven * (c["drive.gain"] * c["force_constant"] * u["velocity_command"] + c["compensating_resistance"] * current)
     voltage = ca.fmax(ca.fmin(asked, c["drive.voltage_limit"]), -c["drive.voltage_limit"])
     # In an open motor the back-EMF drives no current; a braked motor is short-circuited.
     free = (voltage - c["motor.resistance"] * current - (mode != OPEN) * back_emf) * c["inverse_inductance"]

@@ -215,6 +215,7 @@ def _parameters(legs: int, dimensions: int) -> tuple[Variable, ...]:
         ),
         _fixed("screw.damping", (), "s/m", "damping of the flanks relative to their force", 0, 1e4, 1, default=5.0),
         _fixed("drive.nominal_resistance", (), "Ohm", "winding resistance that the drive assumes", 0, 1e6, 1),
+        _fixed("drive.gain", each, "1", "speed of each leg without load over its command", TINY, 1e3, 1, default=1.0),
         _fixed("drive.compensation", (), "1", "share kappa of the resistive drop that the drive compensates", 0, 10, 1),
         _fixed("drive.voltage_limit", (), "V", "largest voltage of the drive", TINY, 1e5, 10),
         _fixed("drive.current_limit", (), "A", "largest current of the drive", TINY, 1e4, 10),

@@ -228,7 +228,8 @@ class MaximalModel:
         moving, rates = ca.vertcat(q, time), ca.vertcat(coordinate_rates, 1)
         closing_speed = ca.jtimes(closure, moving, rates)
         limit = float(p["drive.voltage_limit"])
-        asked = constant * self._turns * command + float(p["drive.compensation"] * p["drive.nominal_resistance"]) * current
+        asked = p["drive.gain"] * constant * self._turns * command
+        asked += float(p["drive.compensation"] * p["drive.nominal_resistance"]) * current
         voltage = ca.fmax(ca.fmin(asked, limit), -limit)
         current_rates = driven * (voltage - p["motor.resistance"] * current - constant * rotors) / float(p["motor.inductance"])
         joints = ca.jacobian(closing_speed, v)

@@ -398,8 +398,9 @@ def test_stops_in_the_wrong_order_name_their_leg(dynamics: Dynamics, rig: Mechan
 
 def test_the_planar_drives_and_brakes_change_at_their_rates(dynamics: Dynamics, rig: Mechanism) -> None:
     """Each leg in its own mode: an open motor has no back-EMF, a braked one is short-circuited, a driven one follows."""
-    changes = {"motor.resistance": np.array([4.5, 5.0, 5.5]), "drive.compensation": np.array(0.4),
-        "drive.nominal_resistance": np.array(5.0), "drive.current_limit": np.array(50.0)}  # fmt: skip
+    changes = {"motor.resistance": np.array([4.5, 5.0, 5.5]), "drive.gain": np.array([0.9, 1.0, 1.1]),
+        "drive.compensation": np.array(0.4), "drive.nominal_resistance": np.array(5.0),
+        "drive.current_limit": np.array(50.0)}  # fmt: skip
     p = rig.plant_parameters() | changes
     random = np.random.default_rng(8)
     states, inputs = random_state(p, random)
@@ -410,7 +411,8 @@ def test_the_planar_drives_and_brakes_change_at_their_rates(dynamics: Dynamics, 
         held = flat(states, PLANAR.states), flat(inputs, PLANAR.inputs), dynamics.constants(flat(p, PLANAR.parameters))
         rates, outputs = named(dynamics.rates(*held), PLANAR.states), named(dynamics.outputs(*held), PLANAR.outputs)
         speed, current, deflection = outputs["leg_velocity"], states["state.current"], states["state.brake_deflection"]
-        voltage = np.where(mode == VELOCITY, constant * inputs["velocity_command"] + 0.4 * 5.0 * current, 0.0)
+        asked = p["drive.gain"] * constant * inputs["velocity_command"] + 0.4 * 5.0 * current
+        voltage = np.where(mode == VELOCITY, asked, 0.0)
         assert np.abs(voltage).max() < p["drive.voltage_limit"]
         back = np.where(mode == OPEN, 0.0, constant * speed)
         expected = (voltage - p["motor.resistance"] * current - back) / p["motor.inductance"]

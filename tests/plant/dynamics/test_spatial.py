@@ -466,6 +466,7 @@ def odd_drives(p: Values, random: Generator) -> Values:
         "motor.torque_constant": 0.06,
         "motor.screw_lead": 0.004,
         "drive.nominal_resistance": 0.8,
+        "drive.gain": [0.9, 1.1, 1.0, 0.95, 1.05, 1.2],
         "drive.compensation": 0.3,
         "drive.voltage_limit": 15.0,
         "drive.current_limit": 6.0,
@@ -482,8 +483,8 @@ def current_rates(p: Values, mode: Array, current: Array, command: Array, speed:
     constant = 2.0 * np.pi / p["motor.screw_lead"] * p["motor.torque_constant"]
     limit, lag = p["drive.current_limit"], p["drive.current_time_constant"]
     rates, voltages = [], []
-    for i, which, u, v, r in zip(current, mode, command, speed, p["motor.resistance"], strict=True):
-        asked = constant * u + p["drive.compensation"] * p["drive.nominal_resistance"] * i if which == VELOCITY else 0.0
+    for i, which, u, v, r, g in zip(current, mode, command, speed, p["motor.resistance"], p["drive.gain"], strict=True):
+        asked = g * constant * u + p["drive.compensation"] * p["drive.nominal_resistance"] * i if which == VELOCITY else 0.0
         voltage = float(np.clip(asked, -p["drive.voltage_limit"], p["drive.voltage_limit"]))
         back = 0.0 if which == OPEN else constant * v
         rates.append(np.clip((voltage - r * i - back) / p["motor.inductance"], (-limit - i) / lag, (limit - i) / lag))

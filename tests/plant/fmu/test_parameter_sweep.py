@@ -121,6 +121,7 @@ def random_parameters(p: Values, random: Generator, table: VariableTable) -> Val
         "motor.resistance": resistance * random.uniform(0.8, 1.2, legs),
         "drive.nominal_resistance": resistance,
         "drive.compensation": random.uniform(0.0, 0.75),
+        "drive.gain": random.uniform(0.8, 1.2, legs),
         "friction.coulomb": p["friction.coulomb"] * random.choice([0, 1]) * spread(random, 3) * random.uniform(0.5, 1.5, legs),
         "friction.viscous": p["friction.viscous"] * spread(random, 5.0) * random.uniform(0.5, 1.5, legs),
         "magnetic_field": 50.0 * unit(random),
