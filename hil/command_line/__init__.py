@@ -18,7 +18,7 @@ REFUSED, INTERRUPTED = 2, 130
 
 COMMANDS = {
     "run": ("simulate", "run", "motion", "replay", "stream-target", "vehicle"),
-    "calibrate": ("calibrate",),
+    "calibrate": ("calibrate", "identify"),
     "design": (
         "classify",
         "classes",

@@ -1,4 +1,4 @@
-"""The command calibrate."""
+"""The commands calibrate and identify."""
 
 import sys
 from argparse import Namespace
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from functools import partial
-from math import degrees, inf, radians
+from math import degrees, inf, isfinite, radians
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,16 +18,23 @@ from hil.runs.config import SimulationConfig
 from hil.table import Table
 from plant.encoders import load_encoder
 from plant.errors import InputError
+from plant.files import write_whole
 from plant.imu_wiring import ALL_IMUS, BASE_IMU, PLATFORM_IMU
 
 if TYPE_CHECKING:
     from controller.calibration.file import Calibration
+    from controller.design.identification import Identified
     from hil.calibration.data import Knowledge
     from hil.calibration.guided import Step
     from hil.calibration.procedure import RigCalibration
+    from hil.identification.procedure import Identification
 
 _DEFAULT_RIG = SimulationConfig(imu="mpu9150")
 """The rig that is driven without any option."""
+
+_CLEAR = "  Clear the space around the platform, and keep a hand on the emergency stop. Ctrl-C stops gently."
+
+_YES = cli.flag("--yes", "ask nothing before a step: the space is clear, and somebody holds the emergency stop")
 
 _MOST_MISSED = 25
 """Periods missed in a row that are borne by default: a calibration leaves out what was not read, and a stop loses a run."""
@@ -52,7 +59,7 @@ _MOST_MISSED = 25
         help="which force the planned motions may need of a leg at home, by the plant data of the mechanism's file; it does "
         "not limit what a drive does when something is in the way: limit its current for that",
     ),
-    cli.flag("--yes", "ask nothing before a step: the space is clear, and somebody holds the emergency stop"),
+    _YES,
     cli.flag("--resume", "go on from the recordings that an earlier calibration has kept beside the output"),
     cli.flag("--home", "the rig stands exactly at home when it begins"),
     cli.setting("--tilt", 0.05, "by how much the base may be off level [deg]"),
@@ -103,11 +110,7 @@ def gough_calibrate_rig(options: Namespace) -> None:
         config.rig != "fmu" or options.resume or any(each is not None for each in (options.box, options.speed, options.force))
     )
     if options.recording:
-        defaults = asdict(_DEFAULT_RIG)
-        given = [name for name, value in vars(options).items() if name in defaults and value != defaults[name]]
-        if given or guided:
-            names = ", ".join(f"--{name.replace('_', '-')}" for name in given) or "limits and --resume"
-            raise InputError(f"the recordings say what {names} would: leave it out with --recording")
+        _check_told_by_recording(options, _DEFAULT_RIG, "limits and --resume" if guided else "")
     prior = Prior(tilt=radians(options.tilt), joints=1e-3 * options.joints)
     encoder = load_encoder(config.lengths) or (TO_50_UM if options.changes_of_lengths else None)
     knowledge = Knowledge(prior, options.home, encoder, options.known_poses)
@@ -137,6 +140,15 @@ def gough_calibrate_rig(options: Namespace) -> None:
     print(f"written to {options.output}")
 
 
+def _check_told_by_recording(options: Namespace, default: SimulationConfig, also: str = "") -> None:
+    """Check that no option, nor what is `also` given, says what a recording does."""
+    defaults = asdict(default)
+    given = [name for name, value in vars(options).items() if name in defaults and value not in (defaults[name], [])]
+    if given or also:
+        names = ", ".join(f"--{name.replace('_', '-')}" for name in given) or also
+        raise InputError(f"the recordings say what {names} would: leave it out with --recording")
+
+
 def _guided(options: Namespace, config: SimulationConfig, knowledge: "Knowledge") -> "RigCalibration":
     """Lead through the calibration of a rig, or of the simulated plant."""
     from controller.planning.motions import Box
@@ -149,11 +161,8 @@ def _guided(options: Namespace, config: SimulationConfig, knowledge: "Knowledge"
         raise InputError("a replay cannot be driven: give its recording with --recording")
     if options.known_poses:
         raise InputError("--known-poses is for the simulated rig without limits, and for recordings: leave it out")
-    if not (simulated or options.yes or sys.stdin.isatty()):
-        raise InputError(
-            "there is no terminal to ask at before the rig moves: run it in one, or add --yes if the space is clear and "
-            "somebody holds the emergency stop"
-        )
+    if not simulated:
+        _check_terminal(options)
     box = Box() if options.box is None else Box(1e-3 * options.box[0], radians(options.box[1]))
     limits = MotionLimits(
         box, inf if options.speed is None else 1e-3 * options.speed, inf if options.force is None else options.force
@@ -180,11 +189,24 @@ def _announce(simulated: bool, asks: bool, number: int, count: int, step: "Step"
     if simulated:
         return
     if step.moves:
-        say("  Clear the space around the platform, and keep a hand on the emergency stop. Ctrl-C stops gently.")
-    if asks:
-        print("  Type yes to begin: ", end="", file=sys.stderr, flush=True)
-        if sys.stdin.readline().strip().lower() not in ("y", "yes"):
-            raise InputError(f"stopped before step {number}, and nothing moves: go on from here with --resume")
+        say(_CLEAR)
+    if asks and not _agreed():
+        raise InputError(f"stopped before step {number}, and nothing moves: go on from here with --resume")
+
+
+def _agreed() -> bool:
+    """Ask whether to begin, and whether the answer is yes."""
+    print("  Type yes to begin: ", end="", file=sys.stderr, flush=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
+def _check_terminal(options: Namespace) -> None:
+    """Check that somebody can be asked before a rig moves, or need not be."""
+    if not (options.yes or sys.stdin.isatty()):
+        raise InputError(
+            "there is no terminal to ask at before the rig moves: run it in one, or add --yes if the space is clear and "
+            "somebody holds the emergency stop"
+        )
 
 
 def _print_rig_calibration(summary: dict[str, Any]) -> None:
@@ -313,3 +335,108 @@ gough_calibrate = cli.group(
     imu=gough_calibrate_imu,
     magnetometer=gough_calibrate_magnetometer,
 )
+
+
+@cli.command(
+    cli.output("output", "FILE.toml", "the mechanism to write, with the fitted actuators"),
+    cli.options_of(
+        SimulationConfig, "mechanism", "rate", "imu", "seed", "calibration", "imus", "lengths", "joint_error", "settings",
+        "plant", "binding", "rig", "rig_at",
+    ),
+    cli.setting("--duration", 10.0, "duration of the multisine, 5 to 60 [s]"),
+    cli.setting("--share", 0.8, "share of the limits of stroke, velocity, acceleration and jerk that it may use, up to 0.95"),
+    cli.argument(
+        "--fit", metavar="NAME,...",
+        help="what to fit, by names of the mechanism's file: drive.gain, motor.resistance, friction.coulomb, "
+        "motor.inductance, motor.rotor_inertia and delay, that of the commands (default: all these); and, which needs more "
+        "knowledge of the others, friction.viscous and payload.mass",
+    ),
+    cli.source("--recording", "FILE.mcap", "a recording of a motion, from which to take mechanism, IMUs, rate and data"),
+    _YES,
+    cli.options_of(RealTimeSettings, "priority", "cpu", "strict", most_missed={"default": _MOST_MISSED}),
+    cli.JSON,
+)  # fmt: skip
+def gough_identify(options: Namespace) -> None:
+    """Fit the actuators to a motion: gain, delay, lag, droop and friction.
+
+    The machine follows a multisine on all axes, inside the limits of all legs, with the loop closed. Its plant predicts what
+    the IMUs should read along the commands that it was given, and with --lengths the encoders; the actuators are fitted to
+    what they did read, with 95 % intervals. Writes the mechanism's file with the fitted values, for 'gough tune --mechanism'
+    and all other commands, and keeps the recording beside it. Says what cannot be told apart, and what helps.
+
+    Without --rig the simulated plant is the machine, whose actuators --set changes. A rig (--rig udp, canopen or
+    python:MODULE:CLASS) must be calibrated; what it will do is described first, and it asks whether to begin.
+    """
+    keep_to_one_thread()
+    from controller.design.identification import USUAL
+    from hil.identification.procedure import identify_recording
+
+    names = USUAL if options.fit is None else [name.strip() for name in options.fit.split(",")]
+    if options.recording is not None:
+        _check_told_by_recording(options, SimulationConfig())
+        with progress_bar("the actuators are fitted"):
+            result = identify_recording(options.recording, names)
+    else:
+        result = _identified(options, names)
+    write_whole(options.output, result.text.encode())
+    cli.write_json(options.json, result.found.summary())
+    _print_actuators(result.found)
+    print(f"written to {options.output}")
+
+
+def _identified(options: Namespace, names: Sequence[str]) -> "Identification":
+    """Drive the machine of the options, and fit its actuators."""
+    from hil.calibration.machines import machine_on_clock, simulated_machine
+    from hil.identification.procedure import identify, plan_identification
+
+    config = cli.config_of(options, SimulationConfig)
+    if config.rig == "replay":
+        raise InputError("a replay cannot be driven: give its recording with --recording")
+    simulated = config.rig == "fmu"
+    if not simulated:
+        _check_terminal(options)
+    plan = plan_identification(config, options.duration, options.share, names)
+    say(plan.text)
+    recording = options.output.with_suffix(".mcap")
+    if simulated:
+        with progress_bar("the plant follows the multisine") as progress:
+            return identify(plan, simulated_machine(progress), recording)
+    say(_CLEAR)
+    if not options.yes and not _agreed():
+        raise InputError("stopped before anything has moved")
+    machine = machine_on_clock(
+        cli.config_of(options, RealTimeSettings), lambda run: live_view(plan.mechanism.name, "multisine", run.rate)
+    )
+    return identify(plan, machine, recording)
+
+
+_ACTUATOR_UNITS = {
+    "drive.gain": ("", 1.0),
+    "motor.resistance": ("Ohm", 1.0),
+    "friction.coulomb": ("N", 1.0),
+    "friction.viscous": ("N.s/m", 1.0),
+    "motor.inductance": ("mH", 1e3),
+    "motor.rotor_inertia": ("g.cm2", 1e7),
+    "payload.mass": ("kg", 1.0),
+    "delay": ("ms", 1e3),
+    "droop": ("mm/s/N", 1e3),
+    "lag": ("ms", 1e3),
+}
+"""Units of what an actuator is known by, and factors from SI units."""
+
+
+def _print_actuators(found: "Identified") -> None:
+    from plant.imu import STANDARD_GRAVITY
+
+    table = Table("", "value", "95 %", "unit")
+    for each in (*found.values, *found.figures):
+        unit, scale = _ACTUATOR_UNITS[each.name]
+        table.add(each.label, f"{scale * each.value:.5g}", f"+- {scale * each.half:.2g}", unit)
+    table.print()
+    rate, force = found.residual
+    print(
+        f"what remains of the readings: {degrees(rate):.3f} deg/s and {1e3 * force / STANDARD_GRAVITY:.2f} mg RMS"
+        + (f", {found.unexplained:.2f} times the noise at rest" if isfinite(found.unexplained) else "")
+    )
+    for remark in found.remarks:
+        print(remark)
