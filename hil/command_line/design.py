@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from hil.command_line import cli
 from hil.command_line.terminal import deg, engine_at_work, mm, progress_bar, say
 from hil.engine.settings import EngineSettings
-from hil.runs.config import SimulationConfig
+from hil.runs.config import POSITION_DRIVES, SimulationConfig
 from hil.studies.config import TuningConfig
 from hil.studies.detectability.uncertainty import Uncertainty
 from hil.table import Table
@@ -19,6 +19,7 @@ from plant.extras import check_installed
 from plant.files import write_whole
 
 if TYPE_CHECKING:
+    from controller.design.tuning import Design
     from hil.studies.workspace import Workspace
     from hil.sweep.optimisation import OptimisationResult, Trial
     from hil.sweep.trials import Comparison
@@ -430,21 +431,76 @@ def gough_detectability(options: Namespace) -> int:
     return int(measured is not None and any(row.beyond(measured) for row in found))
 
 
-@cli.command(cli.options_of(SimulationConfig, "mechanism", "rate"), cli.JSON)
+@cli.command(
+    cli.options_of(SimulationConfig, "mechanism", "rate", "drives"),
+    cli.options_of(SimulationConfig, imu={"default": "ideal", "text": "kind of IMU, whose low-passes and delay the loop has"}),
+    cli.setting("--delay", 0.0, "from a sample to when the drives take the command computed from it, as of a bus [ms]"),
+    cli.argument("--crossover", type=float, metavar="HZ", help="of the fastest leg at home [Hz] (default: the highest)"),
+    cli.setting("--sensitivity", 2.0, "greatest peak of the sensitivity at home, all loops closed; 1.5 times that elsewhere"),
+    cli.setting("--phase-margin", 65.0, "least phase margin of a leg at home; half of that elsewhere [deg]"),
+    cli.setting("--gain-margin", 12.0, "least gain margin of a leg at home; half of that elsewhere [dB]"),
+    cli.setting("--poses", 40, "number of random poses of the workspace; 0 for home alone"),
+    cli.options_of(SimulationConfig, seed={"text": "seed of the poses"}),
+    cli.output("--write", "FILE.toml", "write the mechanism with these gains, for --mechanism"),
+    cli.report("write a report with Bode, Nyquist and step diagrams and maps of margins"),
+    cli.JSON,
+)
 def gough_tune(options: Namespace) -> None:
     """Design the PID gains and show their margins.
 
-    The gains follow from the linearised plant and filters.
-    """
-    from controller.design.tuning import tune
-    from plant.mechanism import load_spatial
+    The gains follow from the linearised plant, drives, IMUs and filters, at home and at poses of the workspace: the highest, or
+    those with the crossover that is asked for, with which sensitivity peak and margins are kept. Elsewhere half of the margins
+    will do. Coulomb friction is left out, as it is constant for a leg that moves (docs/tuning.md).
 
-    design = tune(load_spatial(options.mechanism), options.rate)
+    Margins are of each leg with the others closed; of all legs together, as when a bus is late; and of all legs at once, each
+    with an error of its own (disk margins). All of them after 10 s, when the filters have settled.
+    """
+    from controller.design.linear_loop import Setup
+    from controller.design.tuning import Rule, tune, tuned_text
+    from hil.rigs.position_loops import BANDWIDTH
+    from plant.imu import load_imu
+    from plant.mechanism import load_in_space
+
+    imu = load_imu(options.imu)
+    setup = Setup(
+        options.rate,
+        1e-3 * options.delay,
+        None if imu.name == "ideal" else imu,
+        BANDWIDTH if options.drives == POSITION_DRIVES else None,
+    )
+    rule = Rule(options.crossover, options.sensitivity, options.phase_margin, options.gain_margin)
+    with progress_bar(f"gains of {options.mechanism}") as progress:
+        design = tune(load_in_space(options.mechanism), setup, rule, options.poses, options.seed, progress)
+    if options.write is not None:
+        write_whole(options.write, tuned_text(options.mechanism, design).encode())
     cli.write_json(options.json, design.summary())
-    table = Table("", "value", "unit")
+    tables = tuning_tables(design)
+    cli.write_report(options, "tuning", design, tables)
+    for _, table in tables:
+        table.print()
+    print(design.remark)
+    if options.write is not None:
+        print(f"written to {options.write}")
+
+
+def tuning_tables(design: "Design") -> list[tuple[str, Table]]:
+    """The figures of a design, as titled tables."""
+    at_home = Table("", "value", "unit")
     for label, value, unit in design.rows():
-        table.add(label, value, unit)
-    table.print()
+        at_home.add(label, value, unit)
+    found = [("Gains, and margins at home", at_home)]
+    if design.workspace:
+        poses = f"{len(design.workspace)} poses of the workspace"
+        everywhere = Table(poses, "at home", "worst", "at x, y, z [mm]", "turned by rx, ry, rz [deg]")
+        for row in design.workspace_rows():
+            everywhere.add(*row)
+        found.append(("Margins in the workspace", everywhere))
+    worst = " (worst)" if design.workspace else ""
+    names = "gain margin [dB]", "phase margin [deg]", "delay margin [ms]", "crossover [Hz]"
+    legs = Table(f"a leg, the others closed, at home{worst}", *names)
+    for cells in design.leg_rows():
+        legs.add(*cells)
+    return [*found, ("Margins by leg", legs)]
 
 
 @cli.command(

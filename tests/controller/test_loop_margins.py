@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller.design.tuning import frequency_response, linear_plant, margins, open_loop
+from controller.design.linear_loop import Setup, linear_plant, open_loop
+from controller.design.stability import Response, margins
 from controller.inverse_kinematics import inverse_kinematics
 from controller.loop_margins import margin_remark, sensitivity_peak
 from controller.settings import ControlSettings, FusionSettings, control_settings
@@ -34,13 +35,13 @@ def times(gains, factor):
 def test_with_exact_lengths_it_is_the_peak_of_the_linearised_plant(name, load, rate, gains):
     """Without the platform's IMU the quick model takes the lengths for exact."""
     mechanism, gains = laden(name, load), ControlSettings(*gains)
-    plant, _ = linear_plant(mechanism, rate)
+    plant, _ = linear_plant(mechanism, Setup(rate), mechanism.home)
     jacobian = inverse_kinematics(mechanism, mechanism.home).jacobian
     lengths = np.hstack([jacobian[:, :3], np.zeros((6, 12)), jacobian[:, 3:]])
     peak = 0.0
     for frequency in np.geomspace(0.05, 0.499 * rate, 1000):
         z = np.exp(2j * np.pi * frequency / rate)
-        response = lengths @ np.linalg.solve(z * np.eye(len(plant.a)) - plant.a, plant.b)
+        response = lengths @ np.linalg.solve(z * np.eye(len(plant.A)) - plant.A, plant.B)
         pid = gains.proportional + gains.integral / rate / (z - 1.0) + gains.derivative * rate * (1.0 - 1.0 / z)
         peak = max(peak, np.linalg.norm(np.linalg.inv(np.eye(6) + pid * response), 2))
     assert sensitivity_peak(mechanism, gains, FUSION, rate, LEG_IMUS) == pytest.approx(peak, rel=0.02)
@@ -61,11 +62,10 @@ def test_with_exact_lengths_it_is_the_peak_of_the_linearised_plant(name, load, r
 )
 def test_it_is_about_the_peak_that_tune_finds(name, load, rate):
     mechanism = laden(name, load)
-    loop = open_loop(mechanism, rate)
-    response = frequency_response(loop, rate)
+    response = Response.of(open_loop(mechanism, Setup(rate)))
     for factor in (0.5, 1.0, 1.5):
         gains = times(control_settings(mechanism), factor)
-        whole = margins(loop, response, gains, rate).sensitivity_peak
+        whole = margins(response, gains).sensitivity_peak
         quick = sensitivity_peak(mechanism, gains, FUSION, rate)
         assert quick == pytest.approx(whole, rel=0.1 if rate >= 1000.0 else 0.3)
 
@@ -93,13 +93,13 @@ def test_gains_that_do_not_suit_are_told_with_their_peak_and_the_remedy():
 def test_a_loop_is_unstable_from_the_gain_on_at_which_its_poles_leave_the_unit_circle():
     """Exact lengths, so that the poles are those of CasADi's plant with its controllers."""
     mechanism, rate = load_spatial("hexapod"), 1000.0
-    plant, _ = linear_plant(mechanism, rate)
+    plant, _ = linear_plant(mechanism, Setup(rate), mechanism.home)
     jacobian = inverse_kinematics(mechanism, mechanism.home).jacobian
     lengths = np.hstack([jacobian[:, :3], np.zeros((6, 12)), jacobian[:, 3:]])
 
     def stable(gains):
         closed = np.block([
-            [plant.a - gains.proportional * plant.b @ lengths, gains.integral * plant.b], [-lengths / rate, np.eye(6)]
+            [plant.A - gains.proportional * plant.B @ lengths, gains.integral * plant.B], [-lengths / rate, np.eye(6)]
         ])  # fmt: skip
         return np.abs(np.linalg.eigvals(closed)).max() < 1.0
 

@@ -145,14 +145,38 @@ def test_fmu_build_writes_an_fmu_that_simulate_takes(tmp_path):
 
 @pytest.mark.slow
 def test_tune_prints_gains_and_margins(tmp_path):
-    run = gough("tune", "--json", "gains.json", cwd=tmp_path)
+    outputs = ("--json", "gains.json", "--write", "tuned.toml", "--report", "tuned.html")
+    run = gough("tune", "--poses", "3", "--delay", "1", "--crossover", "6", *outputs, cwd=tmp_path)
     assert run.returncode == 0, run.stderr
-    for expected in ("proportional", "integral", "gain margin", "phase margin", "deg", "dB"):
+    for expected in (
+        "proportional",
+        "integral",
+        "gain margin",
+        "phase margin",
+        "deg",
+        "dB",
+        "3 poses",
+        "leg 5",
+        "stable with rates",
+    ):
         assert expected in run.stdout
     figures = json.loads((tmp_path / "gains.json").read_text())
     assert figures["margins"]["stable"]
-    assert figures["margins"]["phase_deg"] > 45.0
+    assert figures["margins"]["phase_deg"] >= 65.0
+    assert figures["margins"]["crossover_hz"] == pytest.approx(6.0, rel=0.01)
+    assert figures["delay"] == 1e-3 and len(figures["workspace"]) == 3
+    assert "gains of hexapod" in (tmp_path / "tuned.html").read_text()
+    run = gough("simulate", "--mechanism", "tuned.toml", "--duration", "0.1", "--json", "run.json", cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
+    # With drives that follow exactly there is little to correct, and the gains are their own.
+    run = gough(
+        "tune", "--mechanism", "planar-3rpr", "--poses", "0", "--drives", "position", "--write", "tuned.toml", cwd=tmp_path
+    )
+    assert run.returncode == 0, run.stderr
+    assert "position_proportional = " in (tmp_path / "tuned.toml").read_text()
     refused(gough("tune", "--rate", "0"))
+    assert "at 1000 Hz it must be 0 to 32 ms" in refused(gough("tune", "--delay", "40"))
+    assert "sensitivity is 0.5; it must be 1.05 to 10" in refused(gough("tune", "--sensitivity", "0.5"))
 
 
 @pytest.mark.slow
