@@ -108,7 +108,8 @@ def judge_encoders(
         _tell_silence(w, s.events, k, encoders, passed)
         if not np.isfinite(encoders.off[k]):
             continue
-        if w.begun[k] == 0:
+        if w.begun[k] == 0 or s.mode < Mode.RUNNING:
+            # On the brakes the zero still follows the IMUs' first lengths.
             w.begun[k], w.mean[k] = 1, encoders.off[k]
         change = encoders.off[k] - w.mean[k]
         w.mean[k] += passed / time_constant * change
@@ -124,6 +125,8 @@ def judge_encoders(
                 if encoders.used[other] != 0.0:
                     w.factor[k, other] = encoders.covariance[k, other]
             w.factor[k, k] = encoders.covariance[k, k] + encoder_parameters.variance
+    if s.mode < Mode.RUNNING:
+        return changed
     worst, error, sigma, alone = _find_wrong(w)
     limit = wider * max(_SIGMAS * sigma, least * p.encoders.deviation)
     leg, most = _find_greatest(w)
