@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from controller.planning import STREAM_TARGET
 from hil.option import integers, option
 from hil.runs.names import name_objects
-from plant.checks import check_duration, check_rate, checked_seed, nearest
+from plant.checks import check_duration, check_rate, check_time_scale, checked_seed, nearest
 from plant.encoders import NO_LENGTHS, EncoderFault, encoder_fault
 from plant.encoders import PREFIX as ENCODER_PREFIX
 from plant.errors import InputError, UnknownNameError
@@ -154,6 +154,9 @@ class SimulationConfig:
     tool: str | None = option(
         None, "what is moved to the target: platform, or a tool of --frames", metavar="NAME", shown="what --frames enables"
     )
+    time_scale: float = option(
+        1.0, "factor on the times of the target: 2 is half as fast, as what is too fast is told to take; 0.01 to 1000"
+    )
     magnetometer: bool = option(False, "the platform's magnetometer gives its heading")
     rig: str = option(
         "fmu",
@@ -176,6 +179,7 @@ class SimulationConfig:
         check_rate(self.rate)
         checked_seed(self.seed)
         check_duration(self.duration)
+        check_time_scale(self.time_scale)
         cycles = self.duration * self.rate
         if round(cycles) < 1:
             raise InputError(f"the duration is {self.duration:g} s, less than one cycle of {1.0 / self.rate:g} s")

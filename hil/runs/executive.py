@@ -26,11 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.inverse_kinematics import leg_lengths
-from controller.planning.pace import required_stretch
+from controller.planning.pace import least_time_scale
 from controller.planning.plan_handover import END_PLANNER, STREAM
 from controller.planning.stream_planner import StreamPlanner
 from controller.safety.arming import describe_obstacle
 from controller.safety.causes import Cause, Reaction
+from controller.workspace import PoseGuard
 from hil.loop.driver import Loop, prevent_compilation, stop_quickly
 from hil.loop.records import LINK_SIZE, RECORD, Link, StopRequest, shared_array
 from hil.loop.stage_times import over_budget
@@ -42,7 +43,7 @@ from hil.rigs import Rig
 from hil.rigs.udp.link import parse_address
 from hil.rigs.udp.rig import UdpRig
 from hil.runs.config import SimulationConfig
-from hil.runs.prepare import prepared_loop, rig_of
+from hil.runs.prepare import demands_of, prepared_loop, rig_of
 from hil.runs.recorders import Recorders, claimed
 from hil.runs.run_state import RunState
 from hil.runs.target_stream import HOST, PORT, open_socket, receive
@@ -179,7 +180,7 @@ def _receiver(config: SimulationConfig) -> Iterator[Record]:
     mechanism = load_spatial(config.mechanism)
     start = mechanism.require_home()
     lengths = leg_lengths(mechanism, start.position, start.rotation)
-    planner = StreamPlanner(mechanism, lengths, config.active_frames)
+    planner = StreamPlanner(mechanism, lengths, config.active_frames, PoseGuard(mechanism, demands_of(config, mechanism)))
     with open_socket(host, port) as listener:
         process = started(receive, stream, planner, listener, 1.0 / config.rate)
         try:
@@ -293,7 +294,7 @@ def _prepare_and_follow(
             "remarks": list(loop.remarks),
             "usage": used,
             "identity": header["config"].get("identity"),
-            "target_stretch": 1.0 if config.streamed else required_stretch(loop.mechanism, loop.target),
+            "target_stretch": 1.0 if config.streamed else least_time_scale(loop.mechanism, loop.target, 1.0),
             "obstacle": None if config.arm else describe_obstacle(loop.state),
         }
         pipe.send((cause, int(loop.state["safety"]["stop"]["cycle"]), int(loop.clock["start"]), figures))
