@@ -10,6 +10,7 @@ whenever they end.
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -65,6 +66,15 @@ class TargetRefusedError(GoughError, ValueError):
         self.cause, self.index, self.value, self.limit = cause, index, value, limit
 
 
+class KnownMotion(Protocol):
+    """A motion that is known beforehand, by the lengths of the legs."""
+
+    lengths: Array  # (6,) [m], at its end
+
+    def at(self, ahead: float) -> tuple[Array, Array]:
+        """Lengths [m] and rates [m/s] (6,) after a time [s]; at rest the rates are exactly 0."""
+
+
 @dataclass(frozen=True, eq=False)
 class Plan:
     """A plan, in motion time."""
@@ -107,6 +117,7 @@ class StreamPlanner:
         mechanism.check_lengths(lengths, "the start of the stream")
         self.current = Plan(0.0, rest(lengths, PLAN_SEGMENTS), None)
         self._motion: TargetMotion | None = None
+        self._known: KnownMotion | None = None
         self._sent_s = 0.0  # time stamp of the newest sample
         self._within = lengths, lengths  # least and greatest lengths (6,) at that time that no sample so far makes a jump
         self._otg = Ruckig(LEGS)
@@ -167,6 +178,10 @@ class StreamPlanner:
             motion.add(motion.time + elapsed, lengths)
         self._sent_s = time_s
 
+    def lead(self, motion: KnownMotion) -> None:
+        """Follow a motion that is known, in place of samples: plans are then `ahead_s` after its begin."""
+        self._known = motion
+
     def plan(self, at_s: float, ahead_s: float, ended: bool = False) -> Plan | None:
         """Plan how to follow the target. The plan takes effect only after `follow(plan)`.
 
@@ -185,7 +200,7 @@ class StreamPlanner:
             raise InputError(
                 f"a plan from {at_s:g} s on would begin before the current plan, at {self.current.begin:g} s: plan for later"
             )
-        motion = self._motion
+        motion = self._known or self._motion
         if motion is None:
             raise InputError("there is no sample to plan for: add one first")
         state = np.empty((LEGS, 3))
@@ -208,7 +223,7 @@ class StreamPlanner:
         self.current = plan
         self._near = plan.near or self._near
 
-    def _aim(self, motion: TargetMotion, ahead: float) -> tuple[Array, Array]:
+    def _aim(self, motion: TargetMotion | KnownMotion, ahead: float) -> tuple[Array, Array]:
         """Lengths and rates (6,) of the target `ahead` [s] of its newest sample, within the limits."""
         limits = self._limits
         lengths, rates = motion.at(ahead)

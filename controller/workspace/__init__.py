@@ -1,6 +1,6 @@
 """Where a mechanism can go: margins of poses, travel along a direction, and the largest region about a pose."""
 
-from controller.workspace.check import PoseGuard, TargetCheck, check_against_limits, pose_text
+from controller.workspace.check import Excess, PoseGuard, TargetCheck, check_against_limits, first_excess, pose_text
 from controller.workspace.extent import (
     AXES,
     Reach,
@@ -24,6 +24,7 @@ __all__ = [
     "KINDS",
     "LIMITS",
     "Demands",
+    "Excess",
     "Limit",
     "Margins",
     "Nearest",
@@ -34,6 +35,7 @@ __all__ = [
     "TargetCheck",
     "Travel",
     "check_against_limits",
+    "first_excess",
     "geometry_figures",
     "largest_box",
     "largest_ellipsoid",

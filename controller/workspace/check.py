@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from controller.direct_kinematics import poses_from_lengths
-from controller.frames import ActiveFrames
+from controller.frames import ActiveFrames, Frames
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.motions.planned import Peak
 from controller.planning.offline_planner import Reference, plan
@@ -213,6 +213,15 @@ def check_against_limits(mechanism: Mechanism, target: Target, duration: float, 
     return _result(mechanism, target, duration, tally, peaks, reference)
 
 
+def first_excess(
+    mechanism: Mechanism, times: Array, positions: Array, rotations: Array, demands: Demands | None = None
+) -> Excess | None:
+    """The first limit that poses (N, ...) at times (N,) [s] exceed; None if they are within all."""
+    tally = _Tally(mechanism, demands or USUAL)
+    tally.add(times, positions, rotations)
+    return tally.first
+
+
 def _parts(times: Array) -> Iterable[Array]:
     return (times[k : k + _CHUNK] for k in range(0, len(times), _CHUNK))
 
@@ -282,28 +291,25 @@ def measured(mechanism: Mechanism, demands: Demands, number: int, margin: float,
     if limit.kind == "stroke":
         leg = limit.legs[0]
         length = float(leg_lengths(mechanism, pose.position, pose.rotation)[leg])
-        least, most = space["stroke"][leg].tolist()
-        return length, most if length > 0.5 * (least + most) else least
+        shortest, longest = space["stroke"][leg].tolist()
+        return length, longest if length > 0.5 * (shortest + longest) else shortest
     if limit.kind in ("base swing", "platform swing", "speed", "force"):
         name = "velocity" if limit.kind == "speed" else limit.kind.replace(" ", "_")
         most = float(np.broadcast_to(space[name], LEGS)[limit.legs[0]])
         return most - margin, most
-    least: float = {"Jacobian": LEAST_JACOBIAN, "direct kinematics": least_conditioning(mechanism)}.get(
-        limit.kind, float(space["clearance"])
-    )
+    conditionings = {"Jacobian": LEAST_JACOBIAN, "direct kinematics": least_conditioning(mechanism)}
+    least = conditionings.get(limit.kind, float(space["clearance"]))
     return least + margin, least
 
 
 def pose_text(pose: Pose, home: Pose, frames: ActiveFrames | None = None) -> str:
     """A pose as a target means it, in words: position [mm] and rotation vector [deg]."""
-    if frames is None:
-        position, rotation, what = pose.position - home.position, pose.rotation @ home.rotation.T, "from home"
-    else:
-        position, rotation = frames.to_target(home, pose)
+    what = "from home"
+    if frames is not None:
         what = f"of {frames.text}" if frames.absolute else f"from home along {frames.frames.work}"
-    millimetres, degrees = (1e3 * position).tolist(), np.degrees(vector_from_rotation(rotation)).tolist()
-    places = ", ".join(f"{each:.2f}" for each in millimetres)
-    turns = ", ".join(f"{each:.2f}" for each in degrees)
+    position, rotation = (frames or ActiveFrames(Frames())).to_target(home, pose)
+    places = ", ".join(f"{1e3 * each:.2f}" for each in position)
+    turns = ", ".join(f"{np.degrees(each):.2f}" for each in vector_from_rotation(rotation))
     return f"({places}) mm, ({turns}) deg {what}"
 
 

@@ -31,6 +31,7 @@ COMMANDS = {
         "tune-fusion",
         "optimise",
     ),
+    "operate": ("move", "jog"),
     "frames": ("frames",),
     "rigs": ("check-rig", "emulate", "inject"),
     "plant": ("fmu",),

@@ -496,13 +496,8 @@ class _MotionPlanner:
         most = np.array([getattr(limits, name) for name, _, _ in TOOL_QUANTITIES]).reshape(2, 3)
         # Rows: first to third derivative by the parameter; columns: over the limit of velocity, acceleration, jerk.
         use = np.maximum(legs[:, None] / self._most, (tool[:, :, None] / most[:, None, :]).max(axis=0))
-        use = np.maximum(use, 1e-9)
-        cruise = min(1.0 / use[0, 0], use[1, 1] ** -0.5, use[2, 2] ** (-1.0 / 3.0))
         for pace in _PACES:
-            v = pace * cruise
-            a = max(1.0 - use[1, 1] * v * v, 0.05) / use[0, 1]
-            j = max(1.0 - 3.0 * v * a * use[1, 2] - v**3 * use[2, 2], 0.1) / use[0, 2]
-            yield np.array([v, a, j])
+            yield parameter_limits(use, pace)
 
     def _along(self, course: Course, profile: Array) -> tuple[Array, Array]:
         """Lengths and poses over time, if the parameter goes as the profile (1, m, 5)."""
@@ -518,6 +513,21 @@ class _MotionPlanner:
         parameters = np.clip(curve_at(profile, times)[0][:, 0], 0.0, 1.0)
         parameters[-1] = 1.0
         return self._curves(course, times, parameters)
+
+
+def parameter_limits(use: Array, pace: float) -> Array:
+    """Limits (3,) of the rate, acceleration and jerk of a way's parameter that keep those of what moves along it, as far as one
+    number for the whole way can tell.
+
+    Args:
+        use: (3, 3), the greatest first to third derivative by the parameter over the limits of velocity, acceleration and jerk.
+        pace: share of the fastest cruise.
+    """
+    use = np.maximum(use, 1e-9)
+    v = pace * min(1.0 / use[0, 0], use[1, 1] ** -0.5, use[2, 2] ** (-1.0 / 3.0))
+    a = max(1.0 - use[1, 1] * v * v, 0.05) / use[0, 1]
+    j = max(1.0 - 3.0 * v * a * use[1, 2] - v**3 * use[2, 2], 0.1) / use[0, 2]
+    return np.array([v, a, j])
 
 
 def _extrema(curve: Array) -> tuple[Array, Array]:
