@@ -100,7 +100,7 @@ class OperatedPlatform:
         self._way: StraightWay | None = None
         self._began = self._offered = 0.0
         self._beaten = 0.0
-        self._ended_by = ""
+        self._ended_by = self._over = ""
 
     @property
     def moving(self) -> bool:
@@ -187,8 +187,12 @@ class OperatedPlatform:
     def lose_operator(self) -> None:
         """End the run by a controlled stop if the operator has gone while it jogged."""
         if self.jogging:
-            self.jogging = False
             fail_stream(self._stream, Cause.OPERATOR_LOST, -1, time.monotonic() - self._beaten, DEADMAN_S)
+            self.end(Cause.OPERATOR_LOST.short)
+
+    def end(self, reason: str) -> None:
+        """Note that the run has stopped, and why: nothing moves any more."""
+        self._over, self._way, self.jogging = reason, None, False
 
     def step(self) -> str:
         """Go on with the move; to be called each few milliseconds. Returns what has ended, in words, or ""."""
@@ -197,8 +201,8 @@ class OperatedPlatform:
         if self._way is None:
             return ""
         if self._shared[CAUSE] != Cause.NONE:
-            self._way, self.jogging = None, False
-            return "the run has stopped the move"
+            self.end(Cause(int(self._shared[CAUSE])).short)
+            return f"the run stops: {self._over}"
         note_sample(self._stream, time.monotonic_ns())
         if not self._offers.settle():
             return ""
@@ -233,8 +237,8 @@ class OperatedPlatform:
     def _require_rest(self) -> None:
         if not self._shared[CYCLE]:
             raise RefusedError("the run has not begun to move yet: wait until its mode is running")
-        if self._shared[CAUSE] != Cause.NONE:
-            raise RefusedError(f"the run stops: {Cause(int(self._shared[CAUSE])).text}")
+        if self._over:
+            raise RefusedError(f"the run stops: {self._over}")
         if self._way is not None or not self._offers.settle():
             raise RefusedError("the platform is moving: stop it first, or wait until it rests")
         self._ended_by = ""

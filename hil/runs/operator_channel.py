@@ -304,6 +304,8 @@ class _Channel:
         records, self._seen, _ = take(self._records, self._link, self._seen)
         if len(records):
             self._latest = records[-1].copy()
+            if self._latest["stop"] != Cause.NONE:
+                self._platform.end(Cause(int(self._latest["stop"])).short)
             for eventful in records[records["event_count"] > 0]:
                 for text in events_of(eventful):
                     self._tell({"event": text, "cycle": int(eventful["cycle"])})
