@@ -306,10 +306,11 @@ def pose_text(pose: Pose, home: Pose, frames: ActiveFrames | None = None) -> str
     """A pose as a target means it, in words: position [mm] and rotation vector [deg]."""
     what = "from home"
     if frames is not None:
-        what = f"of {frames.text}" if frames.absolute else f"from home along {frames.frames.work}"
+        what = f"of {frames.text}" if frames.absolute else f"{what} along {frames.frames.work}"
     position, rotation = (frames or ActiveFrames(Frames())).to_target(home, pose)
-    places = ", ".join(f"{1e3 * each:.2f}" for each in position)
-    turns = ", ".join(f"{np.degrees(each):.2f}" for each in vector_from_rotation(rotation))
+    # Rounded first, and without the sign of a zero.
+    places = ", ".join(f"{each:.2f}" for each in np.round(1e3 * position, 2) + 0.0)
+    turns = ", ".join(f"{each:.2f}" for each in np.round(np.degrees(vector_from_rotation(rotation)), 2) + 0.0)
     return f"({places}) mm, ({turns}) deg {what}"
 
 

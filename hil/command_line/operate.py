@@ -1,28 +1,28 @@
-"""The commands that move the platform of a run: move, jog."""
+"""The commands that move the platform of a run, move and jog; and frames, in which they do."""
 
 import re
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Callable
 from contextlib import suppress
-from math import isfinite
+from math import isfinite, nan, radians
 from typing import Any
 
-import numpy as np
-
 from hil.command_line import cli
-from hil.command_line.terminal import deg, mm
-from hil.runs.operator_messages import DEFAULT_CHANNEL, load_token
+from hil.command_line.frames import gough_frames
+from hil.runs.config import OPERATOR_CHANNEL
 from plant.errors import InputError
+
+__all__ = ["gough_frames", "gough_jog", "gough_move"]
 
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 _UNITS = {
-    "": (1e-3, np.radians(1.0)), "um": (1e-6, None), "mm": (1e-3, None), "cm": (1e-2, None), "m": (1.0, None),
-    "mrad": (None, 1e-3), "rad": (None, 1.0), "deg": (None, np.radians(1.0)),
+    "": (1e-3, radians(1.0)), "um": (1e-6, None), "mm": (1e-3, None), "cm": (1e-2, None), "m": (1.0, None),
+    "mrad": (None, 1e-3), "rad": (None, 1.0), "deg": (None, radians(1.0)),
 }  # fmt: skip
 """Units of a step along an axis, and about one, in m and rad."""
 
 _CHANNEL = (
-    cli.setting("--at", DEFAULT_CHANNEL, "the channel of the run", metavar="HOST:PORT"),
+    cli.setting("--at", OPERATOR_CHANNEL, "the channel of the run", metavar="HOST:PORT"),
     cli.argument("--token-file", metavar="FILE", help="the token of the run, if it needs one; also the variable GOUGH_TOKEN"),
     cli.argument("--frame", metavar="NAME", help="frame of the run's --frames (default: that of the run)"),
 )
@@ -34,9 +34,9 @@ def _quantity(text: str, turn: bool, per_second: bool) -> float:
     found = re.fullmatch(r"([+-]?[\d.]+(?:e[+-]?\d+)?)\s*([a-z]*)(/s)?", text)
     scale = _UNITS.get(found[2], (None, None))[turn] if found else None
     try:
-        number = float(found[1]) if found else np.nan
+        number = float(found[1]) if found else nan
     except ValueError:
-        number = np.nan
+        number = nan
     if found is None or scale is None or not isfinite(number) or (found[3] is not None) > per_second:
         example = ("2deg" if turn else "5mm") + ("/s" if per_second else "")
         raise InputError(f"{text!r} is no {'speed' if per_second else 'step'} of this axis: give one such as {example}")
@@ -79,6 +79,7 @@ def _place(text: str) -> tuple[float, ...]:
 def _operated(options: Namespace, do: Callable[[Any], dict[str, Any]]) -> None:
     """Let an operator do something, and print where the platform is then."""
     from hil.runs.operator import Operator, RequestRefusedError
+    from hil.runs.operator_messages import load_token
 
     with Operator(
         options.at, load_token(options.token_file), name=f"gough {options.parser.prog.rpartition(' ')[2]}"
@@ -93,16 +94,15 @@ def _operated(options: Namespace, do: Callable[[Any], dict[str, Any]]) -> None:
             print(f"begun, and takes {telemetry['duration']:.2f} s")
             return
         where = _text(telemetry["commanded"], operator.run["home"])
-    print(f"the platform is commanded to {where} from home")
+    print(f"the platform is commanded to {where}")
 
 
 def _text(there: dict[str, Any], home: dict[str, Any]) -> str:
     """A pose as a displacement from another, both as messages have them."""
-    from plant.pose import rotation_from_vector, vector_from_rotation
+    from controller.workspace import pose_text
+    from hil.runs.operator_messages import pose_in
 
-    moved = np.subtract(there["position"], home["position"])
-    turn = vector_from_rotation(rotation_from_vector(there["rotation"]) @ rotation_from_vector(home["rotation"]).T)
-    return f"({', '.join(mm(each, 2) for each in moved)}) mm, ({', '.join(deg(each, 2) for each in turn)}) deg"
+    return pose_text(pose_in(there), pose_in(home))
 
 
 @cli.command(
@@ -134,7 +134,7 @@ def gough_move(options: Namespace) -> None:
         raise InputError("--relative is for --to: a named point has its own place")
     speeds = {
         "speed": None if options.speed is None else 1e-3 * options.speed,
-        "turn_speed": None if options.turn_speed is None else float(np.radians(options.turn_speed)),
+        "turn_speed": None if options.turn_speed is None else radians(options.turn_speed),
     }
 
     def do(operator: Any) -> dict[str, Any]:
@@ -142,7 +142,7 @@ def gough_move(options: Namespace) -> None:
             moved: dict[str, Any] = operator.move(options.point, options.frame, options.tool, **speeds, wait=options.wait)
             return moved
         position = [1e-3 * each for each in options.to[:3]]
-        rotation = np.radians(options.to[3:]).tolist()
+        rotation = [radians(each) for each in options.to[3:]]
         if options.relative:
             stepped: dict[str, Any] = operator.step(
                 position, rotation or (0.0, 0.0, 0.0), options.frame, **speeds, wait=options.wait
@@ -176,10 +176,10 @@ def gough_jog(options: Namespace) -> None:
         raise InputError("--for is for --hold: a step ends by itself")
     if options.seconds is not None and not options.seconds > 0.0:
         raise InputError(f"--for is {options.seconds:g} s; it must be positive")
-    moves = np.zeros(6)
+    moves = [0.0] * len(_AXES)
     for axis, sign, text in options.steps:
         moves[_AXES.index(axis)] += float(f"{sign}1") * _quantity(text, axis[0] == "r", options.hold)
-    straight, turn = moves[:3].tolist(), moves[3:].tolist()
+    straight, turn = moves[:3], moves[3:]
 
     def do(operator: Any) -> dict[str, Any]:
         if not options.hold:

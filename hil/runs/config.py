@@ -38,6 +38,9 @@ RIGS = ("fmu", "udp", "canopen", "replay")
 DRIVES = VELOCITY_DRIVES, POSITION_DRIVES = "velocity", "position"
 """What the drives close a loop of: nothing, as they turn a velocity into a voltage, or their position."""
 
+OPERATOR_CHANNEL = "127.0.0.1:47300"
+"""Where a run listens for its operator, if its target names no address."""
+
 PYTHON_RIG = "python:"
 """The prefix of a rig in the user's own Python class, such as python:my_rig:MyRig (module and class)."""
 

@@ -46,7 +46,7 @@ from hil.rigs.udp.link import parse_address
 from hil.rigs.udp.rig import UdpRig
 from hil.runs.config import SimulationConfig
 from hil.runs.operated_platform import Workplace
-from hil.runs.operator_messages import DEFAULT_CHANNEL, channel_address, load_token
+from hil.runs.operator_messages import channel_address, load_token
 from hil.runs.prepare import demands_of, prepared_loop, rig_of
 from hil.runs.recorders import Recorders, claimed
 from hil.runs.run_state import RunState
@@ -191,7 +191,7 @@ def _receiver(config: SimulationConfig, records: Record, link: NDArray[np.int64]
             from hil.runs.operator_channel import open_channel, serve_operator
 
             token = load_token(config.token_file)
-            host, port = channel_address(config.target.partition(":")[2] or DEFAULT_CHANNEL, token)
+            host, port = channel_address(config.target.partition(":")[2] or OPERATOR_CHANNEL, token)
             points = {} if config.points is None else load_points(config.points)
             workplace = Workplace(mechanism, config.active_frames or ActiveFrames(Frames()), demands, points)
             listener = opened.enter_context(open_channel(host, port))

@@ -13,7 +13,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self
 
-from hil.runs.operator_messages import DEFAULT_CHANNEL, MOST_LINE, VERSION, ChannelError, channel_address, decode, encode
+from hil.runs.config import OPERATOR_CHANNEL
+from hil.runs.operator_messages import MOST_LINE, VERSION, ChannelError, channel_address, decode, encode
 
 BEAT_S = 0.05
 """Time between the signs of an operator who jogs."""
@@ -54,7 +55,7 @@ class Operator:
 
     def __init__(
         self,
-        address: str = DEFAULT_CHANNEL,
+        address: str = OPERATOR_CHANNEL,
         token: str | None = None,
         role: str = "operator",
         name: str = "gough",

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 
 from hil.rigs.udp.link import parse_address
+from hil.runs.config import OPERATOR_CHANNEL
 from plant.errors import GoughError, InputError
-from plant.pose import Pose, vector_from_rotation
+from plant.pose import Pose, rotation_from_vector, vector_from_rotation
 
 VERSION = 1
-DEFAULT_CHANNEL = "127.0.0.1:47300"
 MOST_LINE = 65536
 TOKEN_VARIABLE = "GOUGH_TOKEN"
 """The variable of the environment that may have the token."""
@@ -74,6 +74,11 @@ def pose_message(pose: Pose) -> dict[str, Any]:
     return {"position": pose.position, "rotation": vector_from_rotation(pose.rotation)}
 
 
+def pose_in(message: Mapping[str, Any]) -> Pose:
+    """The pose of a message; the inverse of `pose_message`."""
+    return Pose(np.array(message["position"], float), rotation_from_vector(message["rotation"]))
+
+
 def load_token(path: str | None) -> str | None:
     """The token in the first line of a file, else in the environment; None if there is neither.
 
@@ -108,6 +113,6 @@ def channel_address(text: str, token: str | None) -> tuple[str, int]:
     if token is None and not ipaddress.IPv4Address(host).is_loopback:
         raise InputError(
             f"the channel at {text} would take orders from other machines: give a token with --token-file FILE, or listen at "
-            f"{DEFAULT_CHANNEL}"
+            f"{OPERATOR_CHANNEL}"
         )
     return host, port
