@@ -233,7 +233,7 @@ def _result(
     if first is not None:
         worst = tally.closest[tally.worst][1]
         try:
-            nearest = nearest_reachable(mechanism, worst.pose, tally.demands, target.start)
+            nearest = nearest_reachable(mechanism, worst.pose, tally.demands)
         except UnreachableError:
             nearest = None
     closest = tuple(excess for _, excess in tally.closest.values())

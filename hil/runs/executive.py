@@ -44,7 +44,7 @@ from hil.realtime.scheduling import RealTimeSettings, real_time, since_process_s
 from hil.rigs import Rig
 from hil.rigs.udp.link import parse_address
 from hil.rigs.udp.rig import UdpRig
-from hil.runs.config import SimulationConfig
+from hil.runs.config import OPERATOR_CHANNEL, SimulationConfig
 from hil.runs.operated_platform import Workplace
 from hil.runs.operator_messages import channel_address, load_token
 from hil.runs.prepare import demands_of, prepared_loop, rig_of
