@@ -11,7 +11,7 @@ from hil.command_line import cli
 from hil.command_line.apart import go_on_apart
 from hil.command_line.terminal import QUANTILES, deg, live_view, mm, number_text, progress_bar, say
 from hil.realtime.scheduling import RealTimeSettings, keep_to_one_thread
-from hil.runs.config import SimulationConfig
+from hil.runs.config import OF_RUNS, SimulationConfig
 from hil.table import Cell, Table
 from plant.errors import InputError
 from plant.files import write_whole
@@ -27,7 +27,7 @@ _NOTICED_STRETCH = 1.05
 
 @cli.command(
     # A resumed run keeps what its snapshot was taken with, and must tell what is given from what is not.
-    cli.options_of(SimulationConfig, *cli.names_of(SimulationConfig, "rig", "rig_at", "arm"), only_given=True),
+    cli.options_of(SimulationConfig, *cli.names_of(SimulationConfig, *OF_RUNS), only_given=True),
     cli.report("write a report with plots and a moving 3-D view"),
     cli.JSON,
     cli.output("--save-state", "FILE", "write a snapshot, from which a run can go on"),

@@ -38,6 +38,9 @@ RIGS = ("fmu", "udp", "canopen", "replay")
 DRIVES = VELOCITY_DRIVES, POSITION_DRIVES = "velocity", "position"
 """What the drives close a loop of: nothing, as they turn a velocity into a voltage, or their position."""
 
+OF_RUNS = ("rig", "rig_at", "arm", "points", "token_file")
+"""Fields that say something to a run on the clock alone, and nothing to a simulation."""
+
 OPERATOR_CHANNEL = "127.0.0.1:47300"
 """Where a run listens for its operator, if its target names no address."""
 
