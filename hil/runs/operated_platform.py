@@ -60,12 +60,32 @@ class RefusedError(GoughError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Workplace:
-    """What moves are made of: the machine, its frames and points, and what is asked of its poses."""
+    """What moves are made of: the machine, its frames and points, and what is asked of its poses.
+
+    Raises:
+        UnknownNameError: a point is in a frame that does not exist.
+        InputError: a point's frame or tool is of the wrong kind, or stands on another root than the run's work frame.
+    """
 
     mechanism: Mechanism
     frames: ActiveFrames
     demands: Demands = field(default_factory=Demands)
     points: Mapping[str, Point] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for point in self.points.values():
+            self.frames_of(point.frame, point.tool)
+
+    def frames_of(self, frame: str | None, tool: str | None) -> ActiveFrames:
+        """The frames of a move; None for those of the run."""
+        if frame is None and tool is None:
+            return self.frames
+        chosen = self.frames.frames.active(frame, tool)
+        if chosen.root != self.frames.root:
+            raise InputError(
+                f"{frame!r} stands on {chosen.root}, and the run's work frame on {self.frames.root}: choose another frame"
+            )
+        return chosen
 
     @property
     def home(self) -> Pose:
@@ -128,12 +148,12 @@ class OperatedPlatform:
         """
         self._require_rest()
         if where == HOME:
-            frames, goal = self._frames(frame, tool), self._place.home
+            frames, goal = self._place.frames_of(frame, tool), self._place.home
         else:
             if isinstance(where, str):
                 point = require_point(self._place.points, where)
                 where, frame, tool = point.place, frame or point.frame, tool or point.tool
-            frames = self._frames(frame, tool)
+            frames = self._place.frames_of(frame, tool)
             there = where.after(Pose(*frames.to_target(self._place.home, self.pose)))
             goal = frames.from_target(self._place.home, there.position, there.rotation)
         return self._begin(frames, frames.move_between(self.pose, goal), limits)
@@ -242,17 +262,6 @@ class OperatedPlatform:
         if self._way is not None or not self._offers.settle():
             raise RefusedError("the platform is moving: stop it first, or wait until it rests")
         self._ended_by = ""
-
-    def _frames(self, frame: str | None, tool: str | None) -> ActiveFrames:
-        frames = self._place.frames
-        if frame is None and tool is None:
-            return frames
-        chosen = frames.frames.active(frame, tool)
-        if chosen.root != frames.root:
-            raise InputError(
-                f"{frame!r} stands on {chosen.root}, and the run's work frame on {frames.root}: choose another frame"
-            )
-        return chosen
 
     def _begin(self, frames: ActiveFrames, move: Move, limits: ToolLimits | None) -> float:
         way = StraightWay(
