@@ -28,6 +28,12 @@ _SPEEDS, _TURN_SPEEDS = ("speed", "acceleration", "jerk"), ("turn_speed", "turn_
 _SHORTEST_M, _SHORTEST_RAD = 1e-7, 1e-6
 
 
+def is_nothing(move: Move) -> bool:
+    """Whether a move leads to where it begins."""
+    far, turned = (float(np.linalg.norm(np.asarray(each, float))) for each in (move.translation, move.rotation_vector))
+    return far <= _SHORTEST_M and turned <= _SHORTEST_RAD
+
+
 class StraightWay:
     """A way of the platform, and how it is run through.
 
@@ -53,7 +59,7 @@ class StraightWay:
         self._frames, self._start, self._move = frames, start, move
         self.far = float(np.linalg.norm(np.asarray(move.translation, float)))
         self.turned = float(np.linalg.norm(np.asarray(move.rotation_vector, float)))
-        if not (self.far > _SHORTEST_M or self.turned > _SHORTEST_RAD):
+        if is_nothing(move):
             raise InputError("the platform is there already: there is nothing to move")
         knots = np.linspace(0.0, 1.0, _KNOTS)
         poses = self.poses(knots)

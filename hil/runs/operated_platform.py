@@ -20,7 +20,7 @@ from controller.planning.motions.elements import Place, ToolLimits
 from controller.planning.plan_handover import CAUSE, CYCLE, fail_stream, note_sample
 from controller.planning.points import HOME, Point, require_point
 from controller.planning.segments import START, lengths_along
-from controller.planning.straight_way import StraightWay
+from controller.planning.straight_way import StraightWay, is_nothing
 from controller.planning.stream_planner import StreamPlanner
 from controller.safety.causes import Cause
 from controller.workspace import Demands, PoseGuard, first_excess, nearest_reachable, pose_text
@@ -140,7 +140,8 @@ class OperatedPlatform:
     def go_to(
         self, where: Place | str, frame: str | None = None, tool: str | None = None, limits: ToolLimits | None = None
     ) -> float:
-        """Begin a straight move to a place in the frames, or to a named point; returns how long it will take [s].
+        """Begin a straight move to a place in the frames, or to a named point; returns how long it will take [s],
+        0 if the platform is there.
 
         Raises:
             RefusedError: a pose on the way exceeds a limit, or the platform cannot move now.
@@ -156,7 +157,8 @@ class OperatedPlatform:
             frames = self._place.frames_of(frame, tool)
             there = where.after(Pose(*frames.to_target(self._place.home, self.pose)))
             goal = frames.from_target(self._place.home, there.position, there.rotation)
-        return self._begin(frames, frames.move_between(self.pose, goal), limits)
+        move = frames.move_between(self.pose, goal)
+        return 0.0 if is_nothing(move) else self._begin(frames, move, limits)
 
     def move_by(
         self, translation: Any, rotation_vector: Any, axes: str | None = None, limits: ToolLimits | None = None

@@ -38,7 +38,7 @@ def operated(folder, *options):
         "--record", folder / "run.mcap", "--json", folder / "run.json", *options,
     )  # fmt: skip
     try:
-        until = time.monotonic() + 240.0
+        until = time.monotonic() + 600.0
         while True:
             assert run.poll() is None and time.monotonic() < until, run.communicate()
             try:

@@ -153,6 +153,7 @@ def test_moves_end_where_they_are_told_to_and_stay_within_all_limits_on_a_straig
     with running(hexapod, points=load_points(path), frames=ActiveFrames(table)) as run, run.operator() as operator:
         begun(operator)
         assert operator.run["points"] == ["home", "left", "corner"] and operator.run["mechanism"] == "hexapod"
+        assert operator.move("home", wait=False)["duration"] == 0.0
         there = operator.move("left", speed=0.1, turn_speed=1.0)["commanded"]
         np.testing.assert_allclose(there["position"], home.position + [-0.01, 0.005, 0.0], atol=1e-9)
         np.testing.assert_allclose(there["rotation"], [0.0, 0.0, np.radians(2.0)], atol=1e-9)
