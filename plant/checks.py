@@ -7,6 +7,9 @@ from plant.errors import InputError
 
 RATE_RANGE_HZ = (50.0, 4000.0)
 
+LEAST_TIME_SCALE, MOST_TIME_SCALE = 0.01, 1000.0
+"""Factors on the times of a target, as in a motion file."""
+
 
 def check_rate(rate: float) -> None:
     """Check a rate [Hz] of the cycle: 50 to 4000 Hz, or an `InputError`."""
@@ -18,6 +21,14 @@ def check_duration(duration: float) -> None:
     """Check a motion's duration [s]: positive and finite, or an `InputError`."""
     if not 0.0 < duration < inf:
         raise InputError(f"the duration is {duration:g} s; it must be positive and finite")
+
+
+def check_time_scale(factor: float) -> None:
+    """Check a factor on the times of a target, or raise an `InputError`."""
+    if not LEAST_TIME_SCALE <= factor <= MOST_TIME_SCALE:
+        raise InputError(
+            f"the time scale is {factor:g}; it must be {LEAST_TIME_SCALE:g} to {MOST_TIME_SCALE:g}: 2 is half as fast"
+        )
 
 
 def checked_seed(seed: int) -> int:

@@ -147,6 +147,14 @@ def quaternion_from_rotation(rotation: Array) -> Array:
     return np.where(quaternion[..., :1] >= 0.0, quaternion, -quaternion)
 
 
+def quaternions_along(rotations: Array) -> Array:
+    """The unit quaternions (N, 4) of rotations (N, 3, 3), each with the sign that is nearer to the one before."""
+    quaternions = quaternion_from_rotation(rotations)
+    flips = np.where(np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0, -1.0, 1.0)
+    quaternions[1:] *= np.cumprod(flips)[:, None]
+    return quaternions
+
+
 @kernel
 def rotate_by_vector(rotation: Array, vector: Array) -> None:
     """Replace `rotation` (3, 3) by exp(skew(`vector`)) @ `rotation`, with `vector` (3,) [rad] seen in {1}."""

@@ -14,6 +14,7 @@ from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Tr
 
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.motions.built_in import SAMPLE_PERIOD_S
+from controller.planning.pace import HALF_WINDOW, window_fits
 from controller.planning.segments import segment_extrema, state_after, stop_phases, write_segment
 from controller.planning.target import Target
 from controller.planning.trajectory_generator import calculate, phases_of
@@ -24,7 +25,6 @@ from plant.pose import Array
 
 PREVIEW_S = 0.03
 _LATEST_S = 2.0 * PREVIEW_S
-_HALF_WINDOW = 3
 _STILL_M = 1e-9
 """A target that moves no leg by more than this within the window stands still."""
 _SLACK = 1e-9
@@ -72,12 +72,8 @@ def _check_reach(mechanism: Mechanism, target: Target) -> None:
     try:
         mechanism.check_lengths(leg_lengths(mechanism, target.positions, target.rotations), f"the target {target.name}")
     except UnreachableError as error:
-        least, most = mechanism.require_limits().stroke.T
-        for reading, positions in target.other_readings(mechanism):
-            lengths = leg_lengths(mechanism, positions, target.rotations)
-            if ((lengths >= least) & (lengths <= most)).all():
-                raise UnreachableError(f"{str(error).rpartition(':')[0]}: {reading}") from None
-        raise
+        reading = target.likely_reading(mechanism)
+        raise UnreachableError(f"{str(error).rpartition(':')[0]}: {reading}") if reading else error from None
 
 
 def count_violations(segments: Array, horizon: float, limits: Limits) -> int:
@@ -181,14 +177,11 @@ def _aims(mechanism: Mechanism, target: Target, knots: int) -> tuple[Array, Arra
         positions = leg_lengths(mechanism, *target.at(np.arange(knots) * SAMPLE_PERIOD_S + 1e-9))
         return positions, np.zeros_like(positions), np.zeros_like(positions)
     # A cubic is fitted to seven samples about each aim: derivatives of the interpolation would make ruckig's plans chatter.
-    window = np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1)
-    fit = np.linalg.pinv(np.vander(window * SAMPLE_PERIOD_S, 4, increasing=True))
     ahead = round(PREVIEW_S / SAMPLE_PERIOD_S)
-    grid = np.arange(ahead - _HALF_WINDOW, knots + ahead + _HALF_WINDOW) * SAMPLE_PERIOD_S
+    grid = np.arange(ahead - HALF_WINDOW, knots + ahead + HALF_WINDOW) * SAMPLE_PERIOD_S
     lengths = np.clip(leg_lengths(mechanism, *target.at(grid)), limits.stroke[:, 0], limits.stroke[:, 1])
-    samples = np.lib.stride_tricks.sliding_window_view(lengths, len(window), axis=0)
-    positions, rates = (samples @ fit[order] for order in (0, 1))
-    accelerations = 2.0 * samples @ fit[2]
+    positions, rates, accelerations, _ = window_fits(lengths, SAMPLE_PERIOD_S)
+    samples = np.lib.stride_tricks.sliding_window_view(lengths, 2 * HALF_WINDOW + 1, axis=0)
     still = (np.ptp(samples, axis=2) < _STILL_M).all(axis=1)
     positions[still], rates[still], accelerations[still] = samples[still, :, -1], 0.0, 0.0
     # A fit through a jump swings out; the samples themselves are inside the stroke.

@@ -77,6 +77,19 @@ def evaluate_reference(segments: Array, time: float, index: Array, reference: Ar
         reference[k, 0], reference[k, 1], reference[k, 2] = state_after(state, segment[JERK], time - segment[START])
 
 
+@kernel
+def lengths_along(segments: Array, times: Array, lengths: Array) -> None:
+    """Write the lengths (N, n) of n actuators at increasing times (N,) [s]."""
+    for k in range(lengths.shape[1]):
+        i = 0
+        for row in range(times.shape[0]):
+            while i + 1 < segments.shape[1] and segments[k, i + 1, START] <= times[row]:
+                i += 1
+            segment = segments[k, i]
+            state = segment[LENGTH], segment[RATE], segment[ACCELERATION]
+            lengths[row, k] = state_after(state, segment[JERK], times[row] - segment[START])[0]
+
+
 Phase = tuple[float, float]
 """A jerk [m/s^3] and its duration [s]."""
 

@@ -7,17 +7,29 @@ plan. If none is accepted, the previous plan goes on, which also ends at rest. S
 whenever they end.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from math import ceil
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 from ruckig import ControlInterface, Ruckig, Trajectory
 
+from controller.direct_kinematics import poses_from_lengths
 from controller.frames import ActiveFrames
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.offline_planner import PREVIEW_S, count_violations, ruckig_input
 from controller.planning.plan_handover import PLAN_SEGMENTS, STREAM_PATIENCE_S, rest
-from controller.planning.segments import LENGTH, START, evaluate_reference, state_after, stop_phases, write_segment
+from controller.planning.segments import (
+    LENGTH,
+    START,
+    evaluate_reference,
+    lengths_along,
+    state_after,
+    stop_phases,
+    write_segment,
+)
 from controller.planning.target import poses_of
 from controller.planning.target_motion import STILL_M, TargetMotion
 from controller.planning.trajectory_generator import calculate, phases_of
@@ -25,7 +37,7 @@ from controller.safety.causes import Cause
 from plant.compiled import kernel
 from plant.errors import GoughError, InputError
 from plant.mechanism import LEGS, Mechanism
-from plant.pose import UNIT_TOLERANCE, Array, rotation_from_quaternion
+from plant.pose import UNIT_TOLERANCE, Array, Pose, rotation_from_quaternion
 
 _PREVIEWS_S = (PREVIEW_S, 0.045, 0.06, 0.08, 0.1, 0.15, 0.25)
 """Times in which a plan may meet the target; the first that the limits allow is chosen."""
@@ -39,6 +51,9 @@ _COAST_S = 0.02
 _JUMP_FACTOR, _JUMP_M = 1.5, 1e-3
 """Between any two samples, a leg may go this many times as far as its velocity limit allows, and this much further."""
 
+_GUARDED_S = 0.01
+"""Time between the poses of a plan that the guard sees."""
+
 _STROKE_SLACK_M = 1e-9
 """Rounding by which a sample may be outside the stroke."""
 
@@ -51,6 +66,15 @@ class TargetRefusedError(GoughError, ValueError):
         self.cause, self.index, self.value, self.limit = cause, index, value, limit
 
 
+class KnownMotion(Protocol):
+    """A motion that is known beforehand, by the lengths of the legs."""
+
+    lengths: Array  # (6,) [m], at its end
+
+    def at(self, ahead: float) -> tuple[Array, Array]:
+        """Lengths [m] and rates [m/s] (6,) after a time [s]; at rest the rates are exactly 0."""
+
+
 @dataclass(frozen=True, eq=False)
 class Plan:
     """A plan, in motion time."""
@@ -58,6 +82,13 @@ class Plan:
     begin: float  # when it takes over from the previous plan [s]
     segments: Array  # (6, 24, 5), as `controller.planning.segments` has them
     goal: Array | None  # (6,) [m], the lengths at which it ends if the target stands still there
+    near: Pose | None = None  # the pose at which it begins, if that has been found
+
+
+Guard = Callable[[Array, Array], tuple[int, int, float, float] | None]
+"""What holds poses, positions (N, 3) and rotations (N, 3, 3), against limits besides the strokes: cause (of
+`controller.safety.causes`), leg, value and limit of the first pose that exceeds one; None if none does.
+"""
 
 
 class StreamPlanner:
@@ -67,6 +98,7 @@ class StreamPlanner:
         mechanism: with home and limits.
         lengths: (6,) [m], at which the legs rest when the motion begins.
         frames: in which the samples are; None for displacements from home in {1}.
+        guard: holds samples, and the poses of every plan to its end, against other limits than strokes and actuators.
 
     Attributes:
         current: the plan that is followed.
@@ -76,12 +108,16 @@ class StreamPlanner:
         InputError: the mechanism has no home or no limits.
     """
 
-    def __init__(self, mechanism: Mechanism, lengths: Array, frames: ActiveFrames | None = None) -> None:
+    def __init__(
+        self, mechanism: Mechanism, lengths: Array, frames: ActiveFrames | None = None, guard: Guard | None = None
+    ) -> None:
         self._mechanism, self._home, self._limits = mechanism, mechanism.require_home(), mechanism.require_limits()
-        self._frames = frames
+        self._frames, self._guard = frames, guard
+        self._near = mechanism.require_home()  # a pose near which those of the next plan are
         mechanism.check_lengths(lengths, "the start of the stream")
         self.current = Plan(0.0, rest(lengths, PLAN_SEGMENTS), None)
         self._motion: TargetMotion | None = None
+        self._known: KnownMotion | None = None
         self._sent_s = 0.0  # time stamp of the newest sample
         self._within = lengths, lengths  # least and greatest lengths (6,) at that time that no sample so far makes a jump
         self._otg = Ruckig(LEGS)
@@ -118,6 +154,8 @@ class StreamPlanner:
         leg = int(excess.argmax())
         if excess[leg] > _STROKE_SLACK_M:
             raise TargetRefusedError(Cause.BEYOND_STROKE, leg, lengths[leg], stroke[leg, int(lengths[leg] > stroke[leg, 1])])
+        if self._guard is not None and (excess_found := self._guard(*(part[None] for part in pose))) is not None:
+            raise TargetRefusedError(*excess_found)
         lengths = np.clip(lengths, stroke[:, 0], stroke[:, 1])
         motion = self._motion
         if motion is None:
@@ -140,6 +178,10 @@ class StreamPlanner:
             motion.add(motion.time + elapsed, lengths)
         self._sent_s = time_s
 
+    def lead(self, motion: KnownMotion) -> None:
+        """Follow a motion that is known, in place of samples: plans are then `ahead_s` after its begin."""
+        self._known = motion
+
     def plan(self, at_s: float, ahead_s: float, ended: bool = False) -> Plan | None:
         """Plan how to follow the target. The plan takes effect only after `follow(plan)`.
 
@@ -158,7 +200,7 @@ class StreamPlanner:
             raise InputError(
                 f"a plan from {at_s:g} s on would begin before the current plan, at {self.current.begin:g} s: plan for later"
             )
-        motion = self._motion
+        motion = self._known or self._motion
         if motion is None:
             raise InputError("there is no sample to plan for: add one first")
         state = np.empty((LEGS, 3))
@@ -179,8 +221,9 @@ class StreamPlanner:
     def follow(self, plan: Plan) -> None:
         """Follow a plan from its begin on; the next plan comes after it."""
         self.current = plan
+        self._near = plan.near or self._near
 
-    def _aim(self, motion: TargetMotion, ahead: float) -> tuple[Array, Array]:
+    def _aim(self, motion: TargetMotion | KnownMotion, ahead: float) -> tuple[Array, Array]:
         """Lengths and rates (6,) of the target `ahead` [s] of its newest sample, within the limits."""
         limits = self._limits
         lengths, rates = motion.at(ahead)
@@ -206,9 +249,21 @@ class StreamPlanner:
         most = np.array([limits.acceleration, limits.jerk])
         for coast in (0.0,) if rates is None else (_COAST_S, 0.0):
             end = _write_plan(phases, begin, self._trajectory.duration, coast, state, most, segments)
-            if not count_violations(segments, end, limits):
-                return Plan(begin, segments, aim if rates is None else None)
+            if not count_violations(segments, end, limits) and (found := self._guarded(segments, begin, end)) is not None:
+                return Plan(begin, segments, aim if rates is None else None, found)
         return None
+
+    def _guarded(self, segments: Array, begin: float, end: float) -> Pose | None:
+        """The pose at which a plan begins, or one near it; None if the guard refuses a pose between its begin and its end."""
+        if self._guard is None:
+            return self._near
+        times = np.linspace(begin, end, max(2, ceil((end - begin) / _GUARDED_S) + 1))
+        lengths = np.empty((len(times), LEGS))
+        lengths_along(segments, times, lengths)
+        positions, rotations = poses_from_lengths(self._mechanism, lengths, self._near, partial=True)
+        if not np.isfinite(positions[-1]).all() or self._guard(positions, rotations) is not None:
+            return None
+        return Pose(positions[0], rotations[0])
 
 
 def _stoppable(room: Array, acceleration: float, jerk: float) -> Array:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from controller.frames import ActiveFrames
+from controller.inverse_kinematics import leg_lengths
 from controller.planning.motions import (
     HELD,
     MARGIN_S,
@@ -18,11 +19,20 @@ from controller.planning.motions import (
     named_motion,
     plan_motion,
 )
-from plant.checks import check_duration, nearest
+from controller.planning.motions.splines import stretched
+from plant.checks import check_duration, check_time_scale, nearest
 from plant.csv import read_csv
 from plant.errors import InputError, UnknownNameError
 from plant.mechanism import Mechanism
-from plant.pose import UNIT_TOLERANCE, Array, Pose, checked_unit, quaternion_from_rotation, rotations_from_quaternions
+from plant.pose import (
+    UNIT_TOLERANCE,
+    Array,
+    Pose,
+    checked_unit,
+    quaternion_from_rotation,
+    quaternions_along,
+    rotations_from_quaternions,
+)
 
 COLUMNS = ("time_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 """Of a motion through poses."""
@@ -55,6 +65,11 @@ class Target:
         """The first pose."""
         return Pose(self.positions[0], self.rotations[0])
 
+    def slower(self, factor: float) -> "Target":
+        """The same poses, with all times multiplied by a factor."""
+        segments = None if self.segments is None else stretched(self.segments, factor)
+        return replace(self, times=factor * self.times, segments=segments)
+
     def at(self, times: Array) -> tuple[Array, Array]:
         """Positions (M, 3) and rotations (M, 3, 3) at times (M,) [s], interpolated by monotone cubics along the shortest turn.
         Before the first and after the last sample, that sample holds.
@@ -62,15 +77,22 @@ class Target:
         if self.held:
             index = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 1)
             return self.positions[index], self.rotations[index]
-        quaternions = quaternion_from_rotation(self.rotations)
-        flips = np.where(np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0, -1.0, 1.0)
-        quaternions[1:] *= np.cumprod(flips)[:, None]
-        between = _interpolate(self.times, np.hstack([self.positions, quaternions]), times)
+        between = _interpolate(self.times, np.hstack([self.positions, quaternions_along(self.rotations)]), times)
         turns = between[:, 3:] / np.linalg.norm(between[:, 3:], axis=1, keepdims=True)
         return between[:, :3], rotations_from_quaternions(turns)
 
-    def other_readings(self, mechanism: Mechanism) -> Iterator[tuple[str, Array]]:
-        """What the positions of a file may have been meant as, in words, and the positions (N, 3) [m] then."""
+    def likely_reading(self, mechanism: Mechanism) -> str:
+        """What the positions of a file that is out of reach were probably meant as, and the remedy, in words; "" if no other
+        reading is within the strokes.
+        """
+        least, most = mechanism.require_limits().stroke.T
+        for reading, positions in self._other_readings(mechanism):
+            lengths = leg_lengths(mechanism, positions, self.rotations)
+            if ((lengths >= least) & (lengths <= most)).all():
+                return reading
+        return ""
+
+    def _other_readings(self, mechanism: Mechanism) -> Iterator[tuple[str, Array]]:
         if self.name in NAMES or self.absolute or self.segments is not None:
             return
         home = mechanism.require_home().position
@@ -105,13 +127,21 @@ def _interpolate(knots: Array, values: Array, times: Array) -> Array:
     return interpolated
 
 
-def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float, frames: ActiveFrames | None = None) -> Target:
+def load_target(
+    name_or_path: str | Path,
+    mechanism: Mechanism,
+    duration: float,
+    frames: ActiveFrames | None = None,
+    time_scale: float = 1.0,
+) -> Target:
     """A built-in motion by its name, or the displacements from home in a CSV file, cut to `duration` [s]; in a file whose
     header begins with `from_s` instead of `time_s`, each pose is held until the next one. A motion file (`.toml`) is planned
     whole, within all limits.
 
     With `frames` a file has poses of the tool in the work frame, if that is one of a file, and a motion displaces the tool from
     where it is at home, along the axes of the work frame. The target's poses are those of {2} in the root of the work frame.
+
+    All times are multiplied by `time_scale`, but what has no times of its own is never faster than its limits allow.
 
     Raises:
         UnknownNameError: neither a motion nor a file.
@@ -120,9 +150,11 @@ def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float,
         UnreachableError: a motion file needs a leg outside its stroke.
     """
     check_duration(duration)
+    check_time_scale(time_scale)
     name, home = str(name_or_path), mechanism.require_home()
+    lasts = duration / time_scale
     if name in NAMES:
-        times, positions, rotations = named_motion(name, mechanism, duration)
+        times, positions, rotations = named_motion(name, mechanism, lasts)
         if frames is not None:
             if name not in MOTIONS:
                 raise InputError(
@@ -130,13 +162,15 @@ def load_target(name_or_path: str | Path, mechanism: Mechanism, duration: float,
                 )
             moved = frames.displaced(home, positions - home.position, rotations @ home.rotation.T)
             positions, rotations = moved.position, moved.rotation
-        return Target(name, times, positions, rotations, held=name in HELD)
+        return Target(name, times, positions, rotations, held=name in HELD).slower(time_scale)
     check_target(name)
     path = Path(name_or_path)
     if path.suffix == MOTION_SUFFIX:
-        target = target_of_motion(plan_in_frames(load_motion(path), mechanism, frames), duration)
+        motion = load_motion(path)
+        motion = replace(motion, time_scale=time_scale * motion.time_scale)
+        target = target_of_motion(plan_in_frames(motion, mechanism, frames), duration)
     else:
-        target = _cut(_read_csv(path, home, frames), duration)
+        target = _cut(_read_csv(path, home, frames), lasts).slower(time_scale)
     if mechanism.planar:
         _check_in_plane(target, mechanism)
     return target

@@ -215,6 +215,12 @@ class Cause(IntEnum):
     )
 
     TWO_FORCES = 74, "two IMUs or more read a force that is no motion", Reaction.QUICK_STOP, "m/s^2"
+    BASE_SWING = 75, "the base joint of leg {} would swing too far for the target", Reaction.STOP, "rad"
+    PLATFORM_SWING = 76, "the platform joint of leg {} would swing too far for the target", Reaction.STOP, "rad"
+    TOO_CLOSE = 77, "the target would bring leg {} too close to another leg or a plate", Reaction.STOP, "m"
+    TOO_HEAVY = 78, "leg {} has too little force to hold the target", Reaction.STOP, "N"
+    SINGULAR = 79, "the target is too near to a singularity", Reaction.STOP
+    OPERATOR_LOST = 80, "the operator has gone while the platform was jogged", Reaction.STOP, "s"
     NO_POSE_FITS = 66, "no pose fits the IMUs, even without the worst of them", Reaction.QUICK_STOP, "sigma RMS"
 
     @property

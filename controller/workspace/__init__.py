@@ -1,5 +1,6 @@
 """Where a mechanism can go: margins of poses, travel along a direction, and the largest region about a pose."""
 
+from controller.workspace.check import Excess, PoseGuard, TargetCheck, check_against_limits, first_excess, pose_text
 from controller.workspace.extent import (
     AXES,
     Reach,
@@ -14,6 +15,7 @@ from controller.workspace.extent import (
 from controller.workspace.figures import geometry_figures
 from controller.workspace.limits import GEOMETRY_ALONE, KINDS, LIMITS, Demands, Limit
 from controller.workspace.margins import Margins, margins, margins_at
+from controller.workspace.nearest import Nearest, nearest_reachable
 from controller.workspace.travel import Travel, pose_along, travel, travels
 
 __all__ = [
@@ -22,18 +24,26 @@ __all__ = [
     "KINDS",
     "LIMITS",
     "Demands",
+    "Excess",
     "Limit",
     "Margins",
+    "Nearest",
+    "PoseGuard",
     "Reach",
     "Region",
     "Slice",
+    "TargetCheck",
     "Travel",
+    "check_against_limits",
+    "first_excess",
     "geometry_figures",
     "largest_box",
     "largest_ellipsoid",
     "margins",
     "margins_at",
+    "nearest_reachable",
     "pose_along",
+    "pose_text",
     "poses_about",
     "reach_from",
     "slice_about",

@@ -1,6 +1,6 @@
 """Everything that limits a pose: the limits by name, and what the kernels read of a mechanism and of what is asked of it."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -10,6 +10,7 @@ from controller import load_feed_forward
 from controller.direct_kinematics.geometry import geometry_of
 from controller.inverse_kinematics import inverse_kinematics
 from controller.load_feed_forward import load_parameters
+from controller.safety.causes import Cause
 from controller.settings import safety_settings
 from plant.compiled import Record, filled, record_dtype
 from plant.dynamics.variables import TINY
@@ -72,6 +73,20 @@ def _all_limits() -> tuple[Limit, ...]:
 LIMITS = _all_limits()
 """The limits in the order of the margins of a pose."""
 
+BEYOND: Mapping[str, Cause] = {
+    "stroke": Cause.BEYOND_STROKE,
+    "base swing": Cause.BASE_SWING,
+    "platform swing": Cause.PLATFORM_SWING,
+    "legs": Cause.TOO_CLOSE,
+    "base plate": Cause.TOO_CLOSE,
+    "platform plate": Cause.TOO_CLOSE,
+    "speed": Cause.TOO_FAST,
+    "force": Cause.TOO_HEAVY,
+    "Jacobian": Cause.SINGULAR,
+    "direct kinematics": Cause.ILL_CONDITIONED,
+}
+"""Why a streamed target that exceeds a limit of each kind is refused."""
+
 
 @dataclass(frozen=True, eq=False)
 class Demands:
@@ -83,14 +98,15 @@ class Demands:
         load: (6,), the force [N] and moment [Nm], in {1}, that act on the origin of {2} besides all weights.
         forces: whether the motors must hold the weights and the load; only where the mechanism has the parameters of a plant.
         conditioning: whether Jacobian and direct kinematics must be well conditioned.
-        imus, magnetometer, section_5: the sensors of direct kinematics, as for `controller.imu_set.conditionings`.
+        imus, magnetometer, section_5: the sensors of direct kinematics, as for `controller.imu_set.conditionings`; with None in
+            place of IMUs the pose comes from elsewhere, and that conditioning does not count.
     """
 
     twist: Array | None = None
     load: Array = field(default_factory=lambda: np.zeros(6))
     forces: bool = True
     conditioning: bool = True
-    imus: Collection[int] = ALL_IMUS
+    imus: Collection[int] | None = ALL_IMUS
     magnetometer: bool = False
     section_5: bool = False
 

@@ -129,7 +129,7 @@ def margins(
         margin_rows(space, np.zeros((), WORK), positions, rotations, values, start, stop)
 
     in_threads(find, len(positions), _CHUNK, workers)
-    if demands.conditioning:
+    if demands.conditioning and demands.imus is not None:
         found = conditionings(
             mechanism, positions, rotations, demands.imus, demands.magnetometer, demands.section_5, workers=workers
         )

@@ -5,6 +5,7 @@ of each limit cannot change faster than the joints move, so that a step by the m
 lead to the first limit that is met; bisection finds where.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,8 +118,8 @@ def travel(
     demands = demands or USUAL
     ways, ends = travels(mechanism, pose, chosen[None], demands, pivot=pivot)
     way, end = float(ways[0]), int(ends[0])
-    if demands.conditioning:
-        way, end = _until_blind(mechanism, pose, chosen, way, end, demands, pivot)
+    if demands.conditioning and demands.imus is not None:
+        way, end = _until_blind(mechanism, pose, chosen, way, end, demands, demands.imus, pivot)
     distance, angle = (way * float(np.linalg.norm(part)) for part in (chosen[:3], chosen[3:]))
     return Travel(way, distance, angle, None if end < 0 else LIMITS[end], pose_along(pose, way * chosen, pivot))
 
@@ -183,7 +184,14 @@ def _check_start(mechanism: Mechanism, space: Record, path: Record) -> None:
 
 
 def _until_blind(
-    mechanism: Mechanism, pose: Pose, direction: Array, way: float, end: int, demands: Demands, pivot: ArrayLike | None
+    mechanism: Mechanism,
+    pose: Pose,
+    direction: Array,
+    way: float,
+    end: int,
+    demands: Demands,
+    imus: Collection[int],
+    pivot: ArrayLike | None,
 ) -> tuple[float, int]:
     """The way until direct kinematics is too badly conditioned, if it is shorter."""
     least = least_conditioning(mechanism)
@@ -191,7 +199,7 @@ def _until_blind(
     def left(ways: Array) -> Array:
         poses = [pose_along(pose, each * direction, pivot) for each in ways]
         positions, rotations = (np.array([getattr(each, name) for each in poses]) for name in ("position", "rotation"))
-        found = conditionings(mechanism, positions, rotations, demands.imus, demands.magnetometer, demands.section_5)
+        found = conditionings(mechanism, positions, rotations, imus, demands.magnetometer, demands.section_5)
         return found - least
 
     far, turned = (max(float(np.linalg.norm(part)), TINY) for part in (direction[:3], direction[3:]))

@@ -31,7 +31,7 @@ COMMANDS = {
         "tune-fusion",
         "optimise",
     ),
-    "frames": ("frames",),
+    "operate": ("move", "jog", "frames"),
     "rigs": ("check-rig", "emulate", "inject"),
     "plant": ("fmu",),
     "study": ("sweep", "compare-fusion", "evaluate-fusion", "faults", "planar", "broad"),

@@ -11,13 +11,15 @@ from hil.command_line import cli
 from hil.command_line.apart import go_on_apart
 from hil.command_line.terminal import QUANTILES, deg, live_view, mm, number_text, progress_bar, say
 from hil.realtime.scheduling import RealTimeSettings, keep_to_one_thread
-from hil.runs.config import SimulationConfig
+from hil.runs.config import OF_RUNS, SimulationConfig
 from hil.table import Cell, Table
 from plant.errors import InputError
 from plant.files import write_whole
 
 if TYPE_CHECKING:
     from controller.planning.motions import PlannedMotion
+    from controller.planning.motions.planned import Peak
+    from controller.workspace import TargetCheck
     from hil.runs.snapshot import Snapshot
 
 _NOTICED_STRETCH = 1.05
@@ -25,7 +27,7 @@ _NOTICED_STRETCH = 1.05
 
 @cli.command(
     # A resumed run keeps what its snapshot was taken with, and must tell what is given from what is not.
-    cli.options_of(SimulationConfig, *cli.names_of(SimulationConfig, "rig", "rig_at", "arm"), only_given=True),
+    cli.options_of(SimulationConfig, *cli.names_of(SimulationConfig, *OF_RUNS), only_given=True),
     cli.report("write a report with plots and a moving 3-D view"),
     cli.JSON,
     cli.output("--save-state", "FILE", "write a snapshot, from which a run can go on"),
@@ -128,8 +130,8 @@ def _print_pace(summary: dict[str, Any]) -> None:
     """Say if the target is too fast."""
     if (stretch := summary["target_stretch"]) > _NOTICED_STRETCH:
         print(
-            f"the target is too fast for the legs' limits, so the reference stays behind it: stretched in time by "
-            f"{stretch:.3g}, it could be followed"
+            f"the target is too fast for the legs' limits, so the reference stays behind it: --time-scale {stretch:.4f} lets "
+            "it be followed"
         )
 
 
@@ -255,27 +257,67 @@ _MOST_ROWS = 60
 
 
 @cli.command(
-    cli.source("file", "FILE.toml", "the motion (docs/motions.md)"),
-    cli.options_of(SimulationConfig, "mechanism", "frames", "frame", "tool"),
+    cli.argument("target", metavar="FILE.toml|FILE.csv|NAME", help="a motion file, a CSV file, or a motion's name"),
+    cli.options_of(
+        SimulationConfig,
+        "mechanism",
+        "imus",
+        "magnetometer",
+        "frames",
+        "frame",
+        "tool",
+        "time_scale",
+        duration={"text": "how much of a CSV file or a named motion is checked"},
+    ),
     cli.output("--csv", "FILE.csv", "write its poses, every 2 ms, as a CSV target has them: for other programs"),
     cli.JSON,
 )
-def gough_motion(options: Namespace) -> None:
-    """Plan a motion file: how long it takes, and which limits bind; nothing moves."""
-    cli.check_outputs(options, inputs=[options.file])
-    with progress_bar(f"{options.file}"):
+def gough_motion(options: Namespace) -> int:
+    """Plan a motion, and hold it against every limit; nothing moves.
+
+    Of a motion file it tells how long it takes, and which limits bind. Of any target: the first limit that a pose exceeds, the
+    nearest pose that does not, how close it comes to each kind of limit (docs/workspace.md), the greatest speeds, accelerations
+    and jerks, and the least time scale that would pass. The exit status is 1 if the target does not pass as it is.
+    """
+    # A named motion may be called as a file is.
+    cli.check_outputs(options, inputs=[Path(options.target)])
+    with progress_bar(options.target):
         from controller.planning.motions import load_motion
-        from controller.planning.target import plan_in_frames, target_of_motion, text_of_target
+        from controller.planning.target import MOTION_SUFFIX, load_target, plan_in_frames, target_of_motion, text_of_target
+        from controller.workspace import check_against_limits
+        from hil.runs.prepare import demands_of
         from plant.mechanism import load_in_space
 
         # A work frame on the level frame needs an IMU on the base, which a plan does not read.
         config = cli.config_of(options, SimulationConfig, base_imu=True)
-        mechanism, frames = load_in_space(config.mechanism), config.active_frames
-        planned = plan_in_frames(load_motion(options.file), mechanism, frames)
-        target = target_of_motion(planned, planned.duration)
+        mechanism, frames, planned = load_in_space(config.mechanism), config.active_frames, None
+        if Path(config.target).suffix == MOTION_SUFFIX and Path(config.target).is_file():
+            motion = load_motion(config.target)
+            motion = replace(motion, time_scale=config.time_scale * motion.time_scale)
+            planned = plan_in_frames(motion, mechanism, frames)
+            target, duration = target_of_motion(planned, planned.duration), planned.duration
+        else:
+            target = load_target(config.target, mechanism, config.duration, frames, config.time_scale)
+            duration = min(config.duration, float(target.times[-1]))
+        checked = check_against_limits(mechanism, target, duration, demands_of(config, mechanism))
     if options.csv is not None:
         write_whole(options.csv, text_of_target(target, mechanism, frames).encode())
-    cli.write_json(options.json, planned.summary())
+    summary = checked.summary()
+    cli.write_json(options.json, {**summary, **({} if planned is None else planned.summary()), "check": summary})
+    if planned is not None:
+        _print_elements(planned)
+        _print_cues(planned)
+    _print_check(checked, [*checked.peaks] if planned is None else planned.peaks)
+    for line in filter(None, [*target.remarks, checked.remark, checked.refusal(frames)]):
+        print(line)
+    if not checked.passes:
+        return 1
+    verb = "takes" if planned is not None else "was checked for"
+    print(f"{target.name} {verb} {duration:.3f} s on {options.mechanism}, within all limits")
+    return 0
+
+
+def _print_elements(planned: "PlannedMotion") -> None:
     table = Table("element", "from [s]", "takes [s]", "limit that binds", "reached [%]", "at [s]", left=(0, 3))
     for part in planned.parts[:_MOST_ROWS]:
         label = f"{part.label}, rest" if part.binding is None else part.label
@@ -285,15 +327,19 @@ def gough_motion(options: Namespace) -> None:
     table.print()
     if len(planned.parts) > _MOST_ROWS:
         print(f"and {len(planned.parts) - _MOST_ROWS} more")
+
+
+def _print_check(checked: "TargetCheck", peaks: "list[Peak]") -> None:
     table = Table("greatest", "value", "limit", "reached [%]", "at [s]", "")
-    for peak in planned.peaks:
+    for peak in peaks:
         limit = ("-", "-") if peak.most == inf else (number_text(peak.most), f"{100.0 * peak.share:.1f}")
         table.add(peak.name, number_text(peak.value), *limit, f"{peak.time:.3f}", peak.unit)
     table.print()
-    _print_cues(planned)
-    for remark in target.remarks:
-        print(remark)
-    print(f"{planned.name} takes {planned.duration:.3f} s on {options.mechanism}, within all limits")
+    table = Table("closest to a limit of the pose", "value", "limit", "at [s]", "")
+    for excess in checked.closest:
+        value, bound, unit = excess.shown
+        table.add(excess.limit.text, number_text(value), number_text(bound), f"{excess.time:.3f}", unit)
+    table.print()
 
 
 def _print_cues(planned: "PlannedMotion") -> None:

@@ -21,7 +21,7 @@ from controller.cycle import (
     react,
     skip_periods,
 )
-from controller.planning import STREAM_TARGET
+from controller.planning import OPERATOR_TARGET, STREAM_TARGET
 from controller.planning.segments import SEGMENT_SIZE
 from controller.safety.causes import Cause
 from controller.safety.stop import ramp_down
@@ -99,7 +99,7 @@ def replay(paths: Sequence[Path | str]) -> Replay:
     constants[()] = parameters
     segments = np.ascontiguousarray(segments)
     again = np.zeros(len(records), RECORD)
-    streamed = str(first.config.get("target")).partition(":")[0] == STREAM_TARGET
+    streamed = str(first.config.get("target")).partition(":")[0] in (STREAM_TARGET, OPERATOR_TARGET)
     count = int(_replay(constants, np.zeros((), STATE), segments, records, again, np.zeros((), MARKS)[()], streamed))
     differs = {name: np.any(_bits(records[name][:count]) != _bits(again[name][:count]), axis=1) for name in COMPARED}
     rows = np.flatnonzero(np.any([*differs.values()], axis=0))

@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from controller.planning import STREAM_TARGET
+from controller.planning import OPERATOR_TARGET, STREAM_TARGET
 from hil.option import integers, option
 from hil.runs.names import name_objects
-from plant.checks import check_duration, check_rate, checked_seed, nearest
+from plant.checks import check_duration, check_rate, check_time_scale, checked_seed, nearest
 from plant.encoders import NO_LENGTHS, EncoderFault, encoder_fault
 from plant.encoders import PREFIX as ENCODER_PREFIX
 from plant.errors import InputError, UnknownNameError
@@ -37,6 +37,12 @@ FRAMES = BASE, LEVEL = "base", "level"
 RIGS = ("fmu", "udp", "canopen", "replay")
 DRIVES = VELOCITY_DRIVES, POSITION_DRIVES = "velocity", "position"
 """What the drives close a loop of: nothing, as they turn a velocity into a voltage, or their position."""
+
+OF_RUNS = ("rig", "rig_at", "arm", "points", "token_file")
+"""Fields that say something to a run on the clock alone, and nothing to a simulation."""
+
+OPERATOR_CHANNEL = "127.0.0.1:47300"
+"""Where a run listens for its operator, if its target names no address."""
 
 PYTHON_RIG = "python:"
 """The prefix of a rig in the user's own Python class, such as python:my_rig:MyRig (module and class)."""
@@ -85,7 +91,7 @@ class SimulationConfig:
         "circle",
         "hold, circle, sines, steps, near-rests, rests, shaking, probing, a motion file (docs/motions.md), or a CSV file of "
         "displacements from home (time_s,x_m,y_m,z_m,qw,qx,qy,qz); for 'gough run' also stream or stream:HOST:PORT, as "
-        "'gough stream-target' sends",
+        "'gough stream-target' sends, and operator or operator:HOST:PORT, which 'gough move' and 'gough jog' move",
     )
     duration: float = option(10.0, "duration of the motion, after the hold on the brakes", unit="s")
     rate: float = option(1000.0, "cycles per second, 50 to 4000", unit="Hz")
@@ -154,6 +160,16 @@ class SimulationConfig:
     tool: str | None = option(
         None, "what is moved to the target: platform, or a tool of --frames", metavar="NAME", shown="what --frames enables"
     )
+    time_scale: float = option(
+        1.0, "factor on the times of the target: 2 is half as fast, as what is too fast is told to take; 0.01 to 1000"
+    )
+    points: str | None = option(None, "with --target operator: named points to go to (docs/operating.md)", metavar="FILE.toml")
+    token_file: str | None = option(
+        None,
+        "with --target operator: the token that clients must give, which an address beyond this machine needs; also the "
+        "variable GOUGH_TOKEN",
+        metavar="FILE",
+    )
     magnetometer: bool = option(False, "the platform's magnetometer gives its heading")
     rig: str = option(
         "fmu",
@@ -176,6 +192,7 @@ class SimulationConfig:
         check_rate(self.rate)
         checked_seed(self.seed)
         check_duration(self.duration)
+        check_time_scale(self.time_scale)
         cycles = self.duration * self.rate
         if round(cycles) < 1:
             raise InputError(f"the duration is {self.duration:g} s, less than one cycle of {1.0 / self.rate:g} s")
@@ -196,6 +213,9 @@ class SimulationConfig:
             raise InputError(
                 f"--fault is for a simulated plant, not for the rig {self.rig}: tell it to 'gough emulate' or 'inject'"
             )
+        if not self.operated and (self.points is not None or self.token_file is not None):
+            name = "--points" if self.points is not None else "--token-file"
+            raise InputError(f"{name} is for a run that an operator moves: add --target operator, or leave it out")
         # Refuses words that none understands.
         self.base_motions  # noqa: B018
         for each in self.disturbances:
@@ -283,9 +303,14 @@ class SimulationConfig:
             raise InputError(f"these values are no configuration of a simulation: {error}") from None
 
     @property
+    def operated(self) -> bool:
+        """Whether an operator moves the platform while the loop runs."""
+        return self.target == OPERATOR_TARGET or self.target.startswith(f"{OPERATOR_TARGET}:")
+
+    @property
     def streamed(self) -> bool:
-        """Whether the target is streamed while the loop runs."""
-        return self.target == STREAM_TARGET or self.target.startswith(f"{STREAM_TARGET}:")
+        """Whether the target comes while the loop runs, from a stream or an operator."""
+        return self.operated or self.target == STREAM_TARGET or self.target.startswith(f"{STREAM_TARGET}:")
 
 
 @dataclass(frozen=True)

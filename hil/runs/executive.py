@@ -25,12 +25,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from controller.frames import ActiveFrames, Frames
 from controller.inverse_kinematics import leg_lengths
-from controller.planning.pace import required_stretch
-from controller.planning.plan_handover import END_PLANNER, STREAM
+from controller.planning.pace import least_time_scale
+from controller.planning.plan_handover import END_PLANNER, STREAM, fail_stream
+from controller.planning.points import load_points
 from controller.planning.stream_planner import StreamPlanner
 from controller.safety.arming import describe_obstacle
 from controller.safety.causes import Cause, Reaction
+from controller.workspace import PoseGuard
 from hil.loop.driver import Loop, prevent_compilation, stop_quickly
 from hil.loop.records import LINK_SIZE, RECORD, Link, StopRequest, shared_array
 from hil.loop.stage_times import over_budget
@@ -41,8 +44,10 @@ from hil.realtime.scheduling import RealTimeSettings, real_time, since_process_s
 from hil.rigs import Rig
 from hil.rigs.udp.link import parse_address
 from hil.rigs.udp.rig import UdpRig
-from hil.runs.config import SimulationConfig
-from hil.runs.prepare import prepared_loop, rig_of
+from hil.runs.config import OPERATOR_CHANNEL, SimulationConfig
+from hil.runs.operated_platform import Workplace
+from hil.runs.operator_messages import channel_address, load_token
+from hil.runs.prepare import demands_of, prepared_loop, rig_of
 from hil.runs.recorders import Recorders, claimed
 from hil.runs.run_state import RunState
 from hil.runs.target_stream import HOST, PORT, open_socket, receive
@@ -107,7 +112,7 @@ def run(
     recorders = Recorders(recording, records, link, ours, state.events)
     with _asked_to_stop(link), claimed(recording), _reported(state, recorders), contextlib.ExitStack() as at_end:
         at_end.callback(recorders.finish)
-        stream = at_end.enter_context(_receiver(config)) if config.streamed else None
+        stream, planner = at_end.enter_context(_receiver(config, records, link)) if config.streamed else (None, None)
         loop = started(_loop_process, theirs, ours, link, config, settings, rig, records, stream)
         theirs.close()
         leftovers: list[Path | None] = []
@@ -127,6 +132,9 @@ def run(
                 state.events.append(f"the loop has not answered for {PATIENCE_S:g} s and was killed: the rig brakes by itself")
                 loop.kill()
             recorders.watch()
+            if stream is not None and planner is not None and not planner.is_alive():
+                # At rest nothing else would tell that nobody can move the platform any more.
+                fail_stream(stream, Cause.TARGET_LOST, -1, np.nan, np.nan)
             show(state)
         cause, cycle, first_cycle_ns, figures = _received(ours, loop)
         state.update(records, link)
@@ -172,18 +180,31 @@ def _asked_to_stop(link: NDArray[np.int64]) -> Iterator[None]:
 
 
 @contextmanager
-def _receiver(config: SimulationConfig) -> Iterator[Record]:
-    """The memory that the process of a streamed target shares with the loop."""
+def _receiver(config: SimulationConfig, records: Record, link: NDArray[np.int64]) -> Iterator[tuple[Record, BaseProcess]]:
+    """The memory that the process of a target which comes while the loop runs shares with the loop, and that process."""
     stream: Record = shared_array(1, STREAM).reshape(())
-    host, port = parse_address(config.target.partition(":")[2] or f"{HOST}:{PORT}")
-    mechanism = load_spatial(config.mechanism)
-    start = mechanism.require_home()
-    lengths = leg_lengths(mechanism, start.position, start.rotation)
-    planner = StreamPlanner(mechanism, lengths, config.active_frames)
-    with open_socket(host, port) as listener:
-        process = started(receive, stream, planner, listener, 1.0 / config.rate)
+    mechanism, period = load_spatial(config.mechanism), 1.0 / config.rate
+    demands = demands_of(config, mechanism)
+    with contextlib.ExitStack() as opened:
+        if config.operated:
+            # Only a run with an operator loads it.
+            from hil.runs.operator_channel import open_channel, serve_operator
+
+            token = load_token(config.token_file)
+            host, port = channel_address(config.target.partition(":")[2] or OPERATOR_CHANNEL, token)
+            points = {} if config.points is None else load_points(config.points)
+            workplace = Workplace(mechanism, config.active_frames or ActiveFrames(Frames()), demands, points)
+            listener = opened.enter_context(open_channel(host, port))
+            process = started(serve_operator, stream, listener, token, workplace, period, records, link)
+        else:
+            host, port = parse_address(config.target.partition(":")[2] or f"{HOST}:{PORT}")
+            start = mechanism.require_home()
+            lengths = leg_lengths(mechanism, start.position, start.rotation)
+            planner = StreamPlanner(mechanism, lengths, config.active_frames, PoseGuard(mechanism, demands))
+            listener = opened.enter_context(open_socket(host, port))
+            process = started(receive, stream, planner, listener, period)
         try:
-            yield stream
+            yield stream, process
         finally:
             stream["shared"][END_PLANNER] = 1
             join_or_kill(process)
@@ -293,7 +314,7 @@ def _prepare_and_follow(
             "remarks": list(loop.remarks),
             "usage": used,
             "identity": header["config"].get("identity"),
-            "target_stretch": 1.0 if config.streamed else required_stretch(loop.mechanism, loop.target),
+            "target_stretch": 1.0 if config.streamed else least_time_scale(loop.mechanism, loop.target, 1.0),
             "obstacle": None if config.arm else describe_obstacle(loop.state),
         }
         pipe.send((cause, int(loop.state["safety"]["stop"]["cycle"]), int(loop.clock["start"]), figures))

@@ -50,7 +50,7 @@ def check_names(config: "SimulationConfig") -> None:
     load_encoder(config.lengths)
     if not config.streamed:
         check_target(config.target)
-    for field in ("frames", "calibration", "plant", "binding"):
+    for field in ("frames", "points", "token_file", "calibration", "plant", "binding"):
         name = getattr(config, field)
         if name is not None and not Path(name).exists():
             raise InputError(f"{field} = {name!r}: there is no such file")

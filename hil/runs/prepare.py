@@ -12,7 +12,7 @@ import numpy as np
 from controller.calibration.file import Calibration, calibration_for
 from controller.cycle import STATE, cycle_parameters, evidence_remark
 from controller.frames import ActiveFrames
-from controller.imu_set import are_few, encoder_remark, imus_of, integrity_remark
+from controller.imu_set import are_few, encoder_remark, imus_of, integrity_remark, lengths_lead
 from controller.inverse_kinematics import leg_lengths
 from controller.loop_margins import margin_remark
 from controller.planning.offline_planner import Reference, plan
@@ -23,6 +23,7 @@ from controller.safety.arming import longest_delay
 from controller.safety.causes import Cause
 from controller.safety.stop import describe_end
 from controller.settings import control_settings, drive_settings, safety_settings, sensor_settings, tables_with
+from controller.workspace import Demands, check_against_limits
 from hil.loop.driver import Loop
 from hil.loop.records import RECORD
 from hil.recording.replay_rig import ReplayRig
@@ -117,7 +118,9 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             _check_planar(config, calibration)
         mechanism = nominal.moved_joints(calibration.joints[:, : nominal.legs])
         frames = config.active_frames
-        target = load_target("hold" if config.streamed else config.target, mechanism, config.duration, frames)
+        target = load_target(
+            "hold" if config.streamed else config.target, mechanism, config.duration, frames, config.time_scale
+        )
         model = load_imu(config.imu)
         imu = imu_state(model, config.seed, period, config.wiring, config.base_imu)
         encoder = load_encoder(config.lengths)
@@ -163,7 +166,9 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             lengths = leg_lengths(mechanism, target.start.position, target.start.rotation)
             reference = Reference(rest(lengths), 0)
         else:
-            reference = plan(mechanism, target, config.duration)
+            checked = check_against_limits(mechanism, target, config.duration, demands_of(config, mechanism))
+            reference = checked.require_reachable(frames)
+            remarks.append(checked.remark)
         planning_time = time.perf_counter() - began
         # A plant can be started only at a pose that the plan has found within the strokes.
         plant = stack.enter_context(simulated_plant(config, nominal, target.start, fmu)) if config.rig == "fmu" else None
@@ -187,6 +192,14 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         close_loops(loop.loops, position)
         loop.load(python=config.fusion == "filterpy")
         yield loop
+
+
+def demands_of(config: SimulationConfig, mechanism: Mechanism) -> Demands:
+    """What a run asks of every pose besides that the legs reach it."""
+    imus: tuple[int, ...] | None = imus_of(mechanism, config.imus)
+    if lengths_lead(mechanism, config.imus, config.magnetometer, load_encoder(config.lengths)):
+        imus = None
+    return Demands(imus=imus, magnetometer=config.magnetometer, section_5=config.fusion == "section-5")
 
 
 def _check_memory(config: SimulationConfig, count: int) -> None:

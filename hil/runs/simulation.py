@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from controller.direct_kinematics import poses_from_lengths
 from controller.frames import ActiveFrames, level_from_base
 from controller.planning.offline_planner import Reference
-from controller.planning.pace import required_stretch
+from controller.planning.pace import least_time_scale
 from controller.planning.target import Target
 from controller.safety.causes import Cause
 from hil.loop.records import COMPUTED
@@ -151,7 +151,7 @@ class SimulationResult:
             **frames,
             "protection": _protection(levels, of_platform),
             "limits": {"violations": self.reference.violations},
-            "target_stretch": required_stretch(self.mechanism, self.target),
+            "target_stretch": least_time_scale(self.mechanism, self.target, 1.0),
             "real_time_factor": self.real_time_factor,
             "cycle_us": percentiles(self.records["stage_ns"][:, COMPUTED].sum(axis=1), tuple(QUANTILES)),
             "remarks": list(self.remarks),

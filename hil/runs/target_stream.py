@@ -119,11 +119,7 @@ def receive(stream: Record, planner: StreamPlanner, receiver: socket.socket, per
         period: of a cycle [s].
     """
     parent = os.getppid()
-    # Loads the kernels before the first sample arrives.
-    scratch = np.zeros((), STREAM)
-    publish_plan(scratch, np.zeros(STREAM["plans"].shape[1:]), 0.0, 0)
-    note_sample(scratch, 1)
-    fail_stream(scratch, Cause.NONE, 0, 0.0, 0.0)
+    load_handover()
     reception = Reception(stream, planner, period)
     while not (stream["shared"][END_PLANNER] or os.getppid() != parent):
         select.select([receiver], [], [], _SETTLE_S if reception.waits else _POLL_S)
@@ -139,23 +135,72 @@ def receive(stream: Record, planner: StreamPlanner, receiver: socket.socket, per
         reception.plan()
 
 
-class Reception:
-    """The sender, its last sample and its clock, and the plan that the loop may still take."""
+def load_handover() -> None:
+    """Load the machine code that hands plans over: between samples there is not enough time."""
+    scratch = np.zeros((), STREAM)
+    publish_plan(scratch, np.zeros(STREAM["plans"].shape[1:]), 0.0, 0)
+    note_sample(scratch, 1)
+    fail_stream(scratch, Cause.NONE, 0, 0.0, 0.0)
+
+
+class PlanOffers:
+    """The plans of a stream, one after the other: each is followed if the loop has taken it.
+
+    Attributes:
+        late: whether the loop could not take the last one in time.
+    """
 
     def __init__(self, stream: Record, planner: StreamPlanner, period: float) -> None:
-        self._stream, self._planner, self._period = stream, planner, period
-        self._shared = stream["shared"]
+        self._stream, self._shared, self._planner, self._period = stream, stream["shared"], planner, period
         self._lead = math.ceil(LEAD_S / period - 1e-9)
-        self._sender: object = None
-        self._number, self._time_ns, self._first_ns, self._at = 0, 0, 0, 0.0
-        self._offsets: deque[float] = deque(maxlen=_CLOCK_SAMPLES)
         self._pending: tuple[int, Plan] | None = None
-        self._fresh = self._ended = False
+        self.late = False
 
     @property
     def waits(self) -> bool:
         """Whether the loop has not decided on a plan yet."""
         return self._pending is not None
+
+    def settle(self) -> bool:
+        """Note the loop's decision on the last plan; returns whether there is one."""
+        self.late = False
+        if self._pending is None:
+            return True
+        number, plan = self._pending
+        if self._shared[SEEN] < number:
+            return False
+        self._pending = None
+        if self._shared[TAKEN] == number:
+            self._planner.follow(plan)
+        else:
+            self._stream["late"] += 1
+            self.late = True
+        return True
+
+    def offer(self, target_began: float, ended: bool = False) -> None:
+        """Make a plan, and offer it to the loop. The target's own time is 0 at `target_began` [s] of the motion."""
+        begin = max((int(self._shared[CYCLE]) + self._lead) * self._period, self._planner.current.begin)
+        made = self._planner.plan(begin, begin - target_began, ended)
+        if made is not None:
+            self._pending = publish_plan(self._stream, made.segments, made.begin, int(self._shared[TAKEN])), made
+            self._stream["planned"] += 1
+
+
+class Reception:
+    """The sender, its last sample and its clock, and the plans that come of it."""
+
+    def __init__(self, stream: Record, planner: StreamPlanner, period: float) -> None:
+        self._stream, self._planner, self._period = stream, planner, period
+        self._shared, self._offers = stream["shared"], PlanOffers(stream, planner, period)
+        self._sender: object = None
+        self._number, self._time_ns, self._first_ns, self._at = 0, 0, 0, 0.0
+        self._offsets: deque[float] = deque(maxlen=_CLOCK_SAMPLES)
+        self._fresh = self._ended = False
+
+    @property
+    def waits(self) -> bool:
+        """Whether the loop has not decided on a plan yet."""
+        return self._offers.waits
 
     def take(self, datagram: bytes, sender: object) -> None:
         """Check a datagram, and keep its sample."""
@@ -194,26 +239,13 @@ class Reception:
 
     def plan(self) -> None:
         """Note the loop's decision on the last plan, and make a plan for the newest sample."""
-        stream, shared = self._stream, self._shared
-        if self._pending is not None:
-            number, plan = self._pending
-            if shared[SEEN] < number:
-                return
-            self._pending = None
-            if shared[TAKEN] == number:
-                self._planner.follow(plan)
-            else:
-                stream["late"] += 1
-                # No further sample would bring another plan.
-                self._fresh |= self._ended
-        if not self._fresh or shared[CAUSE] != Cause.NONE:
+        if not self._offers.settle():
             return
-        self._fresh = False
-        begin = max((int(shared[CYCLE]) + self._lead) * self._period, self._planner.current.begin)
-        made = self._planner.plan(begin, begin - (self._at + median(self._offsets)), self._ended)
-        if made is not None:
-            self._pending = publish_plan(stream, made.segments, made.begin, int(shared[TAKEN])), made
-            stream["planned"] += 1
+        # After the end of a stream no further sample would bring another plan.
+        self._fresh |= self._ended and self._offers.late
+        if self._fresh and self._shared[CAUSE] == Cause.NONE:
+            self._fresh = False
+            self._offers.offer(self._at + median(self._offsets), self._ended)
 
 
 @dataclass(frozen=True)

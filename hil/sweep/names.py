@@ -5,7 +5,7 @@ from dataclasses import fields
 from typing import Any
 
 from controller.settings import ControlSettings, DriveSettings, FusionSettings, SafetySettings
-from hil.runs.config import SimulationConfig
+from hil.runs.config import OF_RUNS, SimulationConfig
 from plant.checks import nearest
 from plant.dynamics.variables import PLANAR, SPATIAL
 from plant.errors import InputError
@@ -27,7 +27,7 @@ def run_fields() -> dict[str, Any]:
     return {
         each.name: each.metadata["option"].parse
         for each in fields(SimulationConfig)
-        if "option" in each.metadata and each.name not in ("settings", "faults", "rig", "rig_at", "arm")
+        if "option" in each.metadata and each.name not in ("settings", "faults", *OF_RUNS)
     } | {"hold": None, "faults": lambda text: tuple(text.split())}
 
 

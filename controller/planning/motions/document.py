@@ -57,6 +57,15 @@ def load_washout(path: str | Path) -> Washout:
     return _made(Washout, _in_radians(parse_toml(read_text(path), name), name), name)
 
 
+def place_of(table: Any, title: str) -> Place:
+    """The place of a table, which messages call `title`.
+
+    Raises:
+        InputError: it is no place.
+    """
+    return _Reader(Path()).place(table, title)
+
+
 def text_of_motion(motion: Motion) -> str:
     """The TOML text of a motion, which `motion_from_text` reads again."""
     tables = _plain(motion)
@@ -96,7 +105,7 @@ class _Reader:
 
     def motion(self, document: dict[str, Any], source: str) -> Motion:
         named = _table(document.get("points", {}), "[points]")
-        self._points = {name: self._place(table, f"[points.{name}]") for name, table in named.items()}
+        self._points = {name: self.place(table, f"[points.{name}]") for name, table in named.items()}
         given = {name: value for name, value in document.items() if name != "points"}
         given.setdefault("name", source)
         if not isinstance(given["name"], str):
@@ -107,7 +116,7 @@ class _Reader:
             "the file",
             also=("points",),
             elements=self._elements,
-            start=lambda value: self._place(value, "[start]"),
+            start=lambda value: self.place(value, "[start]"),
             limits=lambda value: _made(ToolLimits, _in_radians(_table(value, "[limits]"), "[limits]"), "[limits]"),
         )
 
@@ -141,10 +150,11 @@ class _Reader:
             ),
             limits=lambda own: _made(ToolLimits, own, title),
             file=self._file,
-            **{name: lambda value, name=name: self._place(value, f"{title}, {name}") for name in _PLACES},
+            **{name: lambda value, name=name: self.place(value, f"{title}, {name}") for name in _PLACES},
         )  # fmt: skip
 
-    def _place(self, given: Any, title: str) -> Place:
+    def place(self, given: Any, title: str) -> Place:
+        """The place of a table, or of a point's name."""
         if isinstance(given, str):
             if given not in self._points:
                 there = f"there are {', '.join(self._points)}" if self._points else "there is no table [points]"
@@ -165,14 +175,14 @@ class _Reader:
 
     def _spline_point(self, given: Any, title: str) -> SplinePoint:
         if isinstance(given, str):
-            return SplinePoint(self._place(given, title))
+            return SplinePoint(self.place(given, title))
         table = _in_radians(_table(given, title), title)
         where: Any = {name: table.pop(name) for name in _PLACE if name in table}
         if "point" in table:
             if where:
                 raise InputError(f"{title} names a point and has {next(iter(where))}: give one of them")
             where = table.pop("point")
-        table["place"] = self._place(where, title)
+        table["place"] = self.place(where, title)
         return _made(SplinePoint, table, title, also=("point", *_PLACE))
 
     def _wave(self, given: dict[str, Any], title: str) -> AnyWave:

@@ -60,8 +60,8 @@ _TOOL_SAMPLES = 8
 _MOST_KNOTS = 6000
 _LONGEST_PERIOD_S = 0.1
 
-_LEG_QUANTITIES = (("velocity", "m/s"), ("acceleration", "m/s^2"), ("jerk", "m/s^3"))
-_TOOL_QUANTITIES = tuple(
+LEG_QUANTITIES = (("velocity", "m/s"), ("acceleration", "m/s^2"), ("jerk", "m/s^3"))
+TOOL_QUANTITIES = tuple(
     (name, unit, 1 + i % 3)
     for i, (name, unit) in enumerate(
         zip(ToolLimits.__dataclass_fields__, ("m/s", "m/s^2", "m/s^3", "rad/s", "rad/s^2", "rad/s^3"), strict=True)
@@ -364,18 +364,18 @@ class _MotionPlanner:
         middles = 0.5 * (times[:-1] + times[1:])
         values, between = (np.abs(each[1:]).transpose(0, 2, 1) for each in (curve_at(legs, times), curve_at(legs, middles)))
         sizes = np.maximum(np.maximum(values[..., :-1], values[..., 1:]), between)
-        use, names = [*(sizes / self._most[:, None, None])], [f"{name} of leg" for name, _ in _LEG_QUANTITIES]
+        use, names = [*(sizes / self._most[:, None, None])], [f"{name} of leg" for name, _ in LEG_QUANTITIES]
         first = legs[:, :1, LENGTH]
         room = self._stroke - first
         lengths = np.stack([legs[:, :-1, LENGTH], curve_at(legs, middles)[0].T, legs[:, 1:, LENGTH]]) - first
         use.append(np.maximum(lengths.max(axis=0) / room[:, 1:], lengths.min(axis=0) / room[:, :1]))
         names.append("stroke of leg")
-        most = np.array([getattr(limits, name) for name, _, _ in _TOOL_QUANTITIES])
-        tool = np.array(_tool_sizes(curve_at(poses, times))) / most[:, None]
+        most = np.array([getattr(limits, name) for name, _, _ in TOOL_QUANTITIES])
+        tool = np.array(tool_sizes(curve_at(poses, times))) / most[:, None]
         use.append(np.maximum(tool[:, :-1], tool[:, 1:]))
         return np.concatenate(use), [
             *(f"{name} {leg}" for name in names for leg in range(len(legs))),
-            *(f"{name.replace('_', ' ')} of the tool" for name, _, _ in _TOOL_QUANTITIES),
+            *(f"{name.replace('_', ' ')} of the tool" for name, _, _ in TOOL_QUANTITIES),
         ]
 
     def _check_stroke(self, label: str, legs: Array, course: Course | None) -> None:
@@ -439,14 +439,14 @@ class _MotionPlanner:
         """The greatest values of all quantities: those of the actuators exactly, those of the tool by samples."""
         extrema, places = _extrema(legs)
         peaks = []
-        for q, (name, unit) in enumerate(_LEG_QUANTITIES):
+        for q, (name, unit) in enumerate(LEG_QUANTITIES):
             leg = int(extrema[:, 2 + q].argmax())
             value, time = float(extrema[leg, 2 + q]), float(places[leg, 2 + q])
             peaks.append(Peak(f"{name} of leg {leg}", unit, 1 + q, value, float(self._most[q]), time))
         knots = poses[0, :, START]
         shares = np.arange(samples) / samples
         times = np.append((knots[:-1, None] + shares * np.diff(knots)[:, None]).ravel(), knots[-1])
-        for (name, unit, order), sizes in zip(_TOOL_QUANTITIES, _tool_sizes(curve_at(poses, times)), strict=True):
+        for (name, unit, order), sizes in zip(TOOL_QUANTITIES, tool_sizes(curve_at(poses, times)), strict=True):
             at = int(sizes.argmax())
             peaks.append(
                 Peak(
@@ -492,17 +492,12 @@ class _MotionPlanner:
         grid = np.append(grid, 1.0)
         values = np.hstack(course.at(grid))
         legs = np.abs(curve_at(natural_spline(grid, self._lengths(values)), grid)[1:]).max(axis=(1, 2))
-        tool = np.array(_tool_sizes(curve_at(natural_spline(grid, values), grid))).max(axis=1).reshape(2, 3)
-        most = np.array([getattr(limits, name) for name, _, _ in _TOOL_QUANTITIES]).reshape(2, 3)
+        tool = np.array(tool_sizes(curve_at(natural_spline(grid, values), grid))).max(axis=1).reshape(2, 3)
+        most = np.array([getattr(limits, name) for name, _, _ in TOOL_QUANTITIES]).reshape(2, 3)
         # Rows: first to third derivative by the parameter; columns: over the limit of velocity, acceleration, jerk.
         use = np.maximum(legs[:, None] / self._most, (tool[:, :, None] / most[:, None, :]).max(axis=0))
-        use = np.maximum(use, 1e-9)
-        cruise = min(1.0 / use[0, 0], use[1, 1] ** -0.5, use[2, 2] ** (-1.0 / 3.0))
         for pace in _PACES:
-            v = pace * cruise
-            a = max(1.0 - use[1, 1] * v * v, 0.05) / use[0, 1]
-            j = max(1.0 - 3.0 * v * a * use[1, 2] - v**3 * use[2, 2], 0.1) / use[0, 2]
-            yield np.array([v, a, j])
+            yield parameter_limits(use, pace)
 
     def _along(self, course: Course, profile: Array) -> tuple[Array, Array]:
         """Lengths and poses over time, if the parameter goes as the profile (1, m, 5)."""
@@ -518,6 +513,21 @@ class _MotionPlanner:
         parameters = np.clip(curve_at(profile, times)[0][:, 0], 0.0, 1.0)
         parameters[-1] = 1.0
         return self._curves(course, times, parameters)
+
+
+def parameter_limits(use: Array, pace: float) -> Array:
+    """Limits (3,) of the rate, acceleration and jerk of a way's parameter that keep those of what moves along it, as far as one
+    number for the whole way can tell.
+
+    Args:
+        use: (3, 3), the greatest first to third derivative by the parameter over the limits of velocity, acceleration and jerk.
+        pace: share of the fastest cruise.
+    """
+    use = np.maximum(use, 1e-9)
+    v = pace * min(1.0 / use[0, 0], use[1, 1] ** -0.5, use[2, 2] ** (-1.0 / 3.0))
+    a = max(1.0 - use[1, 1] * v * v, 0.05) / use[0, 1]
+    j = max(1.0 - 3.0 * v * a * use[1, 2] - v**3 * use[2, 2], 0.1) / use[0, 2]
+    return np.array([v, a, j])
 
 
 def _extrema(curve: Array) -> tuple[Array, Array]:
@@ -556,7 +566,7 @@ def _profile(rate: float, acceleration: float, jerk: float) -> Array:
     return curve
 
 
-def _tool_sizes(derivatives: Array) -> list[Array]:
+def tool_sizes(derivatives: Array) -> list[Array]:
     """Sizes (N,) of speed, acceleration and jerk, and of those of the turn, from the derivatives (4, N, 7) of poses."""
     positions, (q, q1, q2, q3) = derivatives[1:, :, :3], derivatives[:, :, 3:]
 

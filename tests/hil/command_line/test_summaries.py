@@ -165,8 +165,8 @@ def test_a_run_prints_its_figures(tables, capsys, monkeypatch):
         ({"cause": "asked for"}, "stopped on the brakes: asked for", "went to its end"),
         (
             {"target_stretch": 10.25},
-            "the target is too fast for the legs' limits, so the reference stays behind it: stretched in time by 10.2, it "
-            "could be followed",
+            "the target is too fast for the legs' limits, so the reference stays behind it: --time-scale 10.2500 lets "
+            "it be followed",
             "rig: rig {",
         ),
         ({"identity": {"name": "template", "parts": {}}}, "rig: template", "rig: template;"),

@@ -307,11 +307,11 @@ def test_what_cannot_be_used_is_refused():
 def test_an_unreachable_pose_names_the_leg_and_by_how_much(tmp_path):
     path = tmp_path / "far.csv"
     path.write_text("time_s,x_m,y_m,z_m,qw,qx,qy,qz\n0,0,0,0,1,0,0,0\n1,0,0,0.09,1,0,0,0\n")
-    with pytest.raises(UnreachableError, match=r"leg \d at .* mm, .* mm outside its stroke"):
+    with pytest.raises(UnreachableError, match=r"stroke of leg \d would be .* mm at 0\.\d+ s, and must be at most .* mm; far"):
         simulate(SimulationConfig(target=str(path)))
     # A plant cannot be started out there; the target is refused before.
     path.write_text("time_s,x_m,y_m,z_m,qw,qx,qy,qz\n0,0,0,0.35,1,0,0,0\n1,0,0,0.36,1,0,0,0\n")
-    with pytest.raises(UnreachableError, match=r"the target far\.csv needs leg"):
+    with pytest.raises(UnreachableError, match=r"far\.csv is out of reach: .* displacements from home$"):
         simulate(SimulationConfig(target=str(path)))
 
 

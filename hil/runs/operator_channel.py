@@ -1,0 +1,373 @@
+"""The server of an operator's channel, which runs in a process of its own beside the loop's (`operator_messages`).
+
+    operator --TCP--> channel   checks each request, plans, writes into shared memory and never waits for the loop
+                      loop      takes the plans as they come, as those of a streamed target
+
+Any number of observers may watch; one operator at a time gives orders.
+"""
+
+import asyncio
+import hmac
+import os
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controller.frames import BASE, ActiveFrames, Move
+from controller.planning.motions.document import place_of
+from controller.planning.motions.elements import ToolLimits
+from controller.planning.plan_handover import END_PLANNER
+from controller.planning.points import HOME
+from controller.safety.causes import Cause, Mode
+from hil.loop.records import Link, StopRequest
+from hil.recording.mcap import events_of, take
+from hil.runs.operated_platform import DEADMAN_S, SPEED, TURN_SPEED, OperatedPlatform, RefusedError, Workplace
+from hil.runs.operator_messages import MOST_LINE, VERSION, ChannelError, decode, encode, pose_message
+from plant.checks import printable
+from plant.compiled import Record
+from plant.errors import GoughError, InputError
+from plant.pose import Pose
+
+TELEMETRY_HZ = 30.0
+
+_STEP_S = 0.003
+_HELLO_S = 5.0
+"""How long a client may take to say who it is."""
+
+_MOST_CLIENTS = 16
+_MOST_WAITING = 1 << 18
+"""Bytes that wait for a client that reads too slowly; it gets no telemetry meanwhile."""
+
+_ROLES = OPERATOR, OBSERVER = "operator", "observer"
+_IMUS = 7
+
+
+def open_channel(host: str, port: int) -> socket.socket:
+    """A socket that listens for operators; port 0 takes a free one.
+
+    Raises:
+        ChannelError: the address cannot be used.
+    """
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+        listener.listen(_MOST_CLIENTS)
+    except (OSError, OverflowError) as error:
+        listener.close()
+        raise ChannelError(f"cannot listen for an operator at {host}:{port}: {error}: choose another address") from None
+    return listener
+
+
+def serve_operator(
+    stream: Record,
+    listener: socket.socket,
+    token: str | None,
+    workplace: Workplace,
+    period: float,
+    records: Record,
+    link: NDArray[np.int64],
+) -> None:
+    """Serve operators until `END_PLANNER` is set or the parent process has ended; the body of a process.
+
+    Args:
+        stream: dtype `STREAM`, shared with the loop.
+        listener: from `open_channel`.
+        token: that each client must give; None if none is needed.
+        workplace: the machine, its frames and its points.
+        period: of a cycle [s].
+        records, link: shared with the loop.
+    """
+    platform = OperatedPlatform(stream, workplace, period)
+    asyncio.run(_Channel(stream, platform, workplace, token, records, link).run(listener))
+
+
+@dataclass(eq=False)
+class _Client:
+    writer: asyncio.StreamWriter
+    name: str
+    role: str
+    period: float = np.inf  # of its telemetry [s]
+    due: float = 0.0
+
+    def send(self, message: dict[str, Any]) -> None:
+        self.writer.write(encode(message))
+
+    @property
+    def slow(self) -> bool:
+        """Whether much waits for it."""
+        return self.writer.transport.get_write_buffer_size() > _MOST_WAITING
+
+
+class _Channel:
+    def __init__(
+        self, stream: Record, platform: OperatedPlatform, workplace: Workplace, token: str | None, records: Record,
+        link: NDArray[np.int64],
+    ) -> None:  # fmt: skip
+        self._shared, self._platform, self._place, self._token = stream["shared"], platform, workplace, token
+        self._records, self._link, self._seen = records, link, 0
+        self._latest: Any = None
+        self._clients: list[_Client] = []
+        self._waiting = 0
+        self._doing: dict[str, Callable[[_Client, dict[str, Any]], dict[str, Any]]] = {
+            "move": self._move, "step": self._step_by, "jog": self._jog, "beat": self._beat, "stop": self._stop,
+            "end": self._end, "emergency": self._emergency, "state": self._state, "watch": self._watch,
+        }  # fmt: skip
+
+    async def run(self, listener: socket.socket) -> None:
+        """Serve until the run ends."""
+        parent = os.getppid()
+        server = await asyncio.start_server(self._serve, sock=listener, limit=MOST_LINE)
+        clock = asyncio.get_running_loop()
+        while not (self._shared[END_PLANNER] or os.getppid() != parent):
+            if ended := self._platform.step():
+                self._tell({"event": ended, "pose": pose_message(self._platform.pose)})
+            self._look(clock.time())
+            await asyncio.sleep(_STEP_S)
+        self._look(np.inf)
+        self._tell({"event": "the run has ended"})
+        server.close()
+        for client in self._clients:
+            client.writer.close()
+
+    # ------------------------------------------------------------------------------------------------------------ clients
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if self._waiting + len(self._clients) >= _MOST_CLIENTS:
+            writer.close()
+            return
+        self._waiting += 1
+        try:
+            client = await self._greeted(reader, writer)
+        finally:
+            self._waiting -= 1
+        if client is None:
+            writer.close()
+            return
+        try:
+            while line := await reader.readline():
+                client.send(self._answer(client, line))
+                await writer.drain()
+        except (OSError, ValueError):
+            # It has gone, or its line has no end.
+            pass
+        finally:
+            self._clients.remove(client)
+            if client.role == OPERATOR:
+                self._platform.lose_operator()
+            writer.close()
+
+    async def _greeted(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> _Client | None:
+        """A client that may stay."""
+        kind, error, client = "malformed", "", None
+        try:
+            hello = decode(await asyncio.wait_for(reader.readline(), _HELLO_S))
+            kind, error = self._refusal(hello)
+            if not error:
+                client = _Client(writer, printable(str(hello.get("name", "")))[:80] or "somebody", str(hello["role"]))
+                # Before anything else is waited for, so that there is one operator.
+                self._clients.append(client)
+        except (GoughError, ValueError) as refusal:
+            error = str(refusal)
+        except (OSError, TimeoutError):
+            return None
+        answer = {"gough": VERSION, "ok": client is not None}
+        with suppress(OSError):
+            writer.write(encode(answer | (self._described() if client is not None else {"kind": kind, "error": error})))
+            await writer.drain()
+        if client is not None and client.role == OPERATOR:
+            connection = writer.get_extra_info("socket")
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            # Of an operator whose machine has gone without a word, too, the place becomes free.
+            for option, value in (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 2), ("TCP_KEEPCNT", 3)):
+                connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        return client
+
+    def _refusal(self, hello: dict[str, Any]) -> tuple[str, str]:
+        """Why a client may not stay: kind and words, "" if it may."""
+        if hello.get("gough") != VERSION:
+            return "version", f"this run speaks version {VERSION} of the channel, not {printable(str(hello.get('gough')))[:20]}"
+        given = hello.get("token")
+        if self._token is not None and not hmac.compare_digest(str(given or "").encode(), self._token.encode()):
+            return "token", "the token is wrong: give that of the run, with --token-file FILE or in GOUGH_TOKEN"
+        if hello.get("role") not in _ROLES:
+            return "malformed", f"the role is {printable(str(hello.get('role')))[:20]!r}; it is {' or '.join(_ROLES)}"
+        operator = next((each for each in self._clients if each.role == OPERATOR), None)
+        if hello["role"] == OPERATOR and operator is not None:
+            return (
+                "busy",
+                f"{operator.name} operates this run, and only one may: wait until that has gone, or watch as an observer",
+            )
+        return "", ""
+
+    def _described(self) -> dict[str, Any]:
+        frames = self._place.frames
+        return {
+            "mechanism": self._place.mechanism.name,
+            "frames": {**frames.described(), "names": list(frames.frames)},
+            "points": [HOME, *self._place.points],
+            "home": pose_message(self._place.home),
+            "speed": SPEED,
+            "turn_speed": TURN_SPEED,
+            "deadman": DEADMAN_S,
+            "telemetry_rate": TELEMETRY_HZ,
+        }
+
+    # ----------------------------------------------------------------------------------------------------------- requests
+
+    def _answer(self, client: _Client, line: bytes) -> dict[str, Any]:
+        about: Any = None
+        try:
+            request = decode(line)
+            about = request.get("id")
+            if not (about is None or isinstance(about, int | str)):
+                about = None
+                raise InputError("id must be a number or a text")
+            do = request.get("do")
+            if do not in self._doing:
+                raise InputError(
+                    f"there is nothing to do called {printable(str(do))[:40]!r}; there are {', '.join(self._doing)}"
+                )
+            if client.role != OPERATOR and do not in ("state", "watch"):
+                raise RefusedError("an observer gives no orders: connect as the operator")
+            return {"id": about, "ok": True, **self._doing[do](client, request)}
+        except RefusedError as refusal:
+            near = None if refusal.nearest is None else pose_message(refusal.nearest)
+            return {"id": about, "ok": False, "kind": "refused", "error": str(refusal), "nearest": near}
+        except GoughError as error:
+            return {"id": about, "ok": False, "kind": "malformed", "error": str(error)}
+
+    def _move(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
+        del client
+        to = request.get("to")
+        where = to if isinstance(to, str) else place_of(to, "to")
+        frame, tool = _name_in(request, "frame"), _name_in(request, "tool")
+        return {"duration": self._platform.go_to(where, frame, tool, _limits_in(request))}
+
+    def _step_by(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
+        del client
+        move = _move_in(request, "translation", "rotation")
+        return {"duration": self._platform.move_by(move.translation, move.rotation_vector, move.axes, _limits_in(request))}
+
+    def _jog(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
+        del client
+        rate = _move_in(request, "velocity", "turn_velocity")
+        return {"duration": self._platform.jog(rate.translation, rate.rotation_vector, rate.axes)}
+
+    def _beat(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
+        del client, request
+        self._platform.beat()
+        return {"jogging": self._platform.jogging}
+
+    def _stop(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
+        del client, request
+        self._platform.stop()
+        return {}
+
+    def _end(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
+        del client, request
+        self._platform.stop()
+        self._link[Link.STOP] = max(int(self._link[Link.STOP]), StopRequest.CONTROLLED)
+        return {}
+
+    def _emergency(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
+        del client, request
+        self._link[Link.STOP] = StopRequest.QUICK
+        return {}
+
+    def _state(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
+        del client, request
+        return {"telemetry": self._telemetry()}
+
+    def _watch(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
+        rate = request.get("rate", TELEMETRY_HZ)
+        if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0.0 <= rate <= TELEMETRY_HZ:
+            raise InputError(f"rate is {printable(str(rate))[:20]}; it must be 0 to {TELEMETRY_HZ:g} Hz")
+        client.period = np.inf if rate == 0.0 else 1.0 / rate
+        return {"rate": rate}
+
+    # ---------------------------------------------------------------------------------------------------------- telemetry
+
+    def _tell(self, message: dict[str, Any]) -> None:
+        for client in self._clients:
+            if client.period < np.inf and not client.slow:
+                client.send(message)
+
+    def _look(self, now: float) -> None:
+        """Take the loop's new records, and send what is due."""
+        records, self._seen, _ = take(self._records, self._link, self._seen)
+        if len(records):
+            self._latest = records[-1].copy()
+            if self._latest["stop"] != Cause.NONE:
+                self._platform.end(Cause(int(self._latest["stop"])).short)
+            for eventful in records[records["event_count"] > 0]:
+                for text in events_of(eventful):
+                    self._tell({"event": text, "cycle": int(eventful["cycle"])})
+        due = [each for each in self._clients if each.period < np.inf and now >= each.due]
+        if due:
+            message = {"telemetry": self._telemetry()}
+            for client in due:
+                client.due = now + client.period if client.due < now - client.period else client.due + client.period
+                if not client.slow:
+                    client.send(message)
+
+    def _telemetry(self) -> dict[str, Any]:
+        """What the run does now, in SI units."""
+        platform, latest = self._platform, self._latest
+        told: dict[str, Any] = {
+            "time": platform.now,
+            "moving": platform.moving,
+            "jogging": platform.jogging,
+            "commanded": pose_message(platform.commanded),
+            "mode": "preparing",
+        }
+        if latest is None:
+            return told
+        pose = Pose(latest["position"], latest["rotation"])
+        stop = Cause(int(latest["stop"]))
+        told |= {
+            "mode": Mode(int(latest["mode"])).name.lower(),
+            "stop": None if stop == Cause.NONE else stop.short,
+            "cycle": int(latest["cycle"]),
+            "lengths": latest["lengths"],
+            "rates": latest["reference"][:, 1],
+            "imus": [imu for imu in range(_IMUS) if int(latest["imus"]) >> imu & 1],
+            "conditioning": float(latest["conditioning"]),
+            "protection": latest["protection"].astype(float),
+            "silent": int(latest["silent"]),
+        }
+        if latest["status"] == 0 and np.isfinite(pose.position).all() and np.isfinite(pose.rotation).all():
+            told |= {"pose": pose_message(pose), **_tool_message(self._place.frames, pose)}
+        return told
+
+
+def _tool_message(frames: ActiveFrames, pose: Pose) -> dict[str, Any]:
+    """The tool's pose in the work frame, if that stands on {1}."""
+    return {"tool": pose_message(frames.read(pose))} if frames.root == BASE else {}
+
+
+def _name_in(request: dict[str, Any], name: str) -> str | None:
+    given = request.get(name)
+    if not (given is None or isinstance(given, str)):
+        raise InputError(f"{name} must be a text")
+    return given
+
+
+def _limits_in(request: dict[str, Any]) -> ToolLimits:
+    """The limits of a move; speeds that are not given are the usual ones."""
+    given = {name: request[name] for name in ToolLimits.__dataclass_fields__ if request.get(name) is not None}
+    for name, value in given.items():
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise InputError(f"{name} must be a number")
+    return ToolLimits(**{"speed": SPEED, "turn_speed": TURN_SPEED, **given})
+
+
+def _move_in(request: dict[str, Any], *names: str) -> Move:
+    straight, turn = (request.get(name, (0.0, 0.0, 0.0)) for name in names)
+    return Move(straight, turn, _name_in(request, "axes"))

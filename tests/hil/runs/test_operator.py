@@ -1,0 +1,390 @@
+"""An operator over real sockets: the channel in a process of its own, and a loop on the clock that follows its plans."""
+
+import json
+import multiprocessing
+import os
+import signal
+import socket
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from controller.frames import ActiveFrames, Frames
+from controller.frames.tree import Frame
+from controller.inverse_kinematics import leg_lengths
+from controller.planning.plan_handover import END_PLANNER, STREAM, STREAM_READER, rest, stream_cause, take_plan
+from controller.planning.points import load_points
+from controller.planning.segments import evaluate_reference
+from controller.safety.causes import Cause
+from controller.workspace import Demands, margins
+from hil.loop.records import LINK_SIZE, RECORD, Link, StopRequest, shared_array
+from hil.runs.operated_platform import DEADMAN_S, OperatedPlatform, Workplace
+from hil.runs.operator import Operator, RequestRefusedError
+from hil.runs.operator_channel import open_channel, serve_operator
+from hil.runs.operator_messages import VERSION, ChannelError, channel_address, decode, encode, load_token
+from plant.errors import InputError
+from plant.pose import rotation_from_vector
+
+FORK = multiprocessing.get_context("fork")
+PERIOD = 1e-3
+PATIENCE_NS = 10_000_000_000
+"""A busy machine is not what is tested here."""
+CYCLES = 30_000
+TOKEN = "0123456789abcdef0123"
+
+POINTS = """
+[points.left]
+position = [-0.01, 0.005, 0.0]
+rotation_deg = [0, 0, 2]
+
+[points.corner]
+position = [0.02, -0.01, -0.1]
+frame = "table"
+"""
+
+
+def looped(stream, lengths, references, shared):
+    """A loop at 1 kHz that follows the plans until it is told to end; at a cause it takes no more, and comes to rest."""
+    reader, segments, index = np.zeros((), STREAM_READER), rest(lengths), np.zeros(6, np.int64)
+    cause = (Cause.NONE, 0, np.nan, np.nan)
+    began = time.monotonic_ns()
+    for cycle in range(1, CYCLES):
+        time.sleep(max(0.0, 1e-9 * (began + round(1e9 * PERIOD * cycle) - time.monotonic_ns())))
+        if shared["end"][0]:
+            return
+        if cause[0] == Cause.NONE:
+            take_plan(stream, reader, cycle, PERIOD, segments, index)
+            cause = stream_cause(stream, time.monotonic_ns(), PATIENCE_NS)
+            shared["cause"][0] = cause
+        evaluate_reference(segments, cycle * PERIOD, index, references[cycle])
+        shared["cycle"][0] = cycle
+
+
+class Run:
+    """A run that is operated: its processes, and what the loop was told."""
+
+    def __init__(self, mechanism, token=None, points=None, frames=None, stop_cause=None):
+        self.mechanism, self.token = mechanism, token
+        self.stream = shared_array(1, STREAM).reshape(())
+        self.link, self.records = shared_array(LINK_SIZE, np.dtype(np.int64)), shared_array(8, RECORD)
+        self.kept = shared_array(CYCLES * 18, np.dtype(float)).reshape(CYCLES, 6, 3)
+        self.shared = shared_array(
+            1, np.dtype([("end", "i8"), ("cycle", "i8"), ("cause", [("c", "i8"), ("i", "i8"), ("v", "f8"), ("l", "f8")])])
+        )
+        self.workplace = Workplace(mechanism, frames or ActiveFrames(Frames()), Demands(), points or {})
+        home = mechanism.home
+        self.listener = open_channel("127.0.0.1", 0)
+        self.address = f"127.0.0.1:{self.listener.getsockname()[1]}"
+        lengths = leg_lengths(mechanism, home.position, home.rotation)
+        what = self.stream, self.listener, token, self.workplace, PERIOD, self.records, self.link
+        self.channel = FORK.Process(target=serve_operator, args=what)
+        self.loop = FORK.Process(target=looped, args=(self.stream, lengths, self.kept, self.shared))
+        for process in (self.channel, self.loop):
+            process.start()
+
+    def operator(self, **form):
+        return Operator(self.address, **{"token": self.token, **form})
+
+    @property
+    def cause(self):
+        return tuple(self.shared["cause"][0])
+
+    def references(self):
+        return self.kept[1 : int(self.shared["cycle"][0]) + 1].copy()
+
+    def check(self):
+        """Every cycle within the limits of the legs, and every pose within those of the workspace."""
+        from controller.direct_kinematics import poses_from_lengths
+
+        references, limits = self.references(), self.mechanism.limits
+        assert np.abs(references[:, :, 1]).max() <= limits.velocity * (1.0 + 1e-9)
+        assert np.abs(references[:, :, 2]).max() <= limits.acceleration * (1.0 + 1e-9)
+        assert np.abs(np.diff(references[:, :, 2], axis=0)).max() <= limits.jerk * PERIOD * (1.0 + 1e-6)
+        assert np.abs(np.diff(references[:, :, 0], axis=0)).max() <= limits.velocity * PERIOD * (1.0 + 1e-6)
+        positions, rotations = poses_from_lengths(self.mechanism, references[:, :, 0], self.mechanism.home)
+        assert margins(self.mechanism, positions, rotations).values.min() >= -1e-6
+        return positions, rotations
+
+    def end(self):
+        self.stream["shared"][END_PLANNER] = 1
+        self.shared["end"] = 1
+        for process in (self.channel, self.loop):
+            process.join(5.0)
+            process.kill()
+        self.listener.close()
+
+
+@contextmanager
+def running(mechanism, **form):
+    run = Run(mechanism, **form)
+    try:
+        yield run
+    finally:
+        run.end()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _loaded(hexapod):
+    """What both processes run is loaded before they are on the clock; they are forked from this one."""
+    OperatedPlatform(np.zeros((), STREAM), Workplace(hexapod, ActiveFrames(Frames())), PERIOD)
+    stream, reader, index = np.zeros((), STREAM), np.zeros((), STREAM_READER), np.zeros(6, np.int64)
+    segments, reference = rest(np.ones(6)), np.zeros((6, 3))
+    take_plan(stream, reader, 0, PERIOD, segments, index)
+    stream_cause(stream, 1, PATIENCE_NS)
+    evaluate_reference(segments, 0.0, index, reference)
+    margins(hexapod, hexapod.home.position[None], hexapod.home.rotation[None])
+
+
+def begun(operator):
+    """Wait until the loop runs."""
+    until = time.monotonic() + 20.0
+    while operator.ask("state")["telemetry"]["time"] <= 0.0:
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+def test_moves_end_where_they_are_told_to_and_stay_within_all_limits_on_a_straight_way(hexapod, tmp_path):
+    path = tmp_path / "points.toml"
+    path.write_text(POINTS)
+    table = Frames({"table": Frame("base", np.array([0.0, 0.0, 0.45]), rotation_from_vector([0.0, 0.0, 0.3]))})
+    home = hexapod.home
+    with running(hexapod, points=load_points(path), frames=ActiveFrames(table)) as run, run.operator() as operator:
+        begun(operator)
+        assert operator.run["points"] == ["home", "left", "corner"] and operator.run["mechanism"] == "hexapod"
+        assert operator.move("home", wait=False)["duration"] == 0.0
+        there = operator.move("left", speed=0.1, turn_speed=1.0)["commanded"]
+        np.testing.assert_allclose(there["position"], home.position + [-0.01, 0.005, 0.0], atol=1e-9)
+        np.testing.assert_allclose(there["rotation"], [0.0, 0.0, np.radians(2.0)], atol=1e-9)
+        # A step is along the axes of the work frame; in a frame it is a pose of the tool there.
+        there = operator.step((0.0, 0.0, 0.008), axes="table", speed=0.1)["commanded"]
+        np.testing.assert_allclose(there["position"], home.position + [-0.01, 0.005, 0.008], atol=1e-9)
+        there = operator.move("corner", speed=0.1, turn_speed=1.0)["commanded"]
+        at = np.array([0.0, 0.0, 0.45]) + rotation_from_vector([0.0, 0.0, 0.3]) @ [0.02, -0.01, -0.1]
+        np.testing.assert_allclose(there["position"], at, atol=1e-9)
+        # A point without a rotation keeps it.
+        np.testing.assert_allclose(there["rotation"], [0.0, 0.0, np.radians(2.0)], atol=1e-9)
+        positions, _ = run.check()
+    np.testing.assert_allclose(positions[-1], at, atol=1e-7)
+    # The last way, from where the step ended.
+    start = home.position + [-0.01, 0.005, 0.008]
+    way = positions[int(np.flatnonzero(np.linalg.norm(positions - start, axis=1) < 1e-7)[-1]) :]
+    along = (at - start) / np.linalg.norm(at - start)
+    off = (way - start) - ((way - start) @ along)[:, None] * along
+    assert np.linalg.norm(off, axis=1).max() < 1.5e-4
+    assert np.linalg.norm(np.diff(way, axis=0), axis=1).max() / PERIOD < 0.1 * 1.03
+
+
+def test_what_cannot_be_reached_is_refused_with_the_nearest_pose_which_can(hexapod):
+    with running(hexapod) as run, run.operator() as operator:
+        begun(operator)
+        with pytest.raises(
+            RequestRefusedError, match=r"stroke of leg \d would be .* mm at .* the nearest pose within"
+        ) as refused:
+            operator.move({"position": [0.0, 0.0, 0.3]})
+        assert not operator.ask("state")["telemetry"]["moving"]
+        nearest = refused.value.nearest
+        np.testing.assert_allclose(nearest["position"], hexapod.home.position + [0.0, 0.0, 0.0664], atol=1e-4)
+        place = {"position": (np.array(nearest["position"]) - hexapod.home.position).tolist(), "rotation": nearest["rotation"]}
+        operator.move(place, speed=0.2)
+        run.check()
+        with pytest.raises(RequestRefusedError, match="at a limit that way: stroke of leg"):
+            next(operator.jog((0.0, 0.0, 0.01)))
+        for bad, said in (
+            ({"to": "nowhere"}, "no point 'nowhere'; there are home"),
+            ({"to": {"position": [0, 0]}}, "position must have shape"),
+            ({"to": {"positon": [0, 0, 0]}}, "mean 'position'"),
+            ({"to": "home", "frame": "table"}, "no frame 'table'"),
+            ({"to": "home", "speed": -1}, "speed is -1"),
+            ({"to": "home", "speed": "fast"}, "speed must be a number"),
+        ):
+            with pytest.raises(RequestRefusedError, match=said) as refused:
+                operator.ask("move", **bad)
+            assert refused.value.kind == "malformed"
+        with pytest.raises(RequestRefusedError, match="there is nothing to move"):
+            operator.step()
+
+
+def test_a_stop_on_the_way_stays_on_it_and_only_one_move_goes_on_at_a_time(hexapod):
+    with running(hexapod) as run, run.operator() as operator:
+        begun(operator)
+        operator.move({"position": [0.03, 0.0, 0.0]}, speed=0.03, wait=False)
+        with pytest.raises(RequestRefusedError, match="is moving: stop it first"):
+            operator.move("home")
+        time.sleep(0.4)
+        operator.stop()
+        there = operator.wait(0.0)["commanded"]
+        x, y, z = np.array(there["position"]) - hexapod.home.position
+        assert 0.003 < x < 0.027 and abs(y) < 1e-6 and abs(z) < 1e-6
+        positions, _ = run.check()
+        np.testing.assert_allclose(positions[-1], there["position"], atol=1e-7)
+        assert run.cause[0] == Cause.NONE
+
+
+def test_a_jog_goes_on_while_it_is_held_and_ends_at_the_first_limit(hexapod):
+    with running(hexapod) as run, run.operator() as operator:
+        begun(operator)
+        operator.watch()
+        for _ in operator.jog((0.02, 0.0, 0.0), seconds=0.5):
+            pass
+        x = operator.wait(0.0)["commanded"]["position"][0]
+        assert 0.006 < x < 0.014
+        for _ in operator.jog((0.0, 0.0, 0.2)):
+            pass
+        operator.wait(0.0)
+        operator.listen(0.2)
+        assert any(each["event"].startswith("stopped at a limit: stroke of leg") for each in operator.events)
+        assert operator.telemetry["jogging"] is False
+        positions, rotations = run.check()
+        assert margins(hexapod, positions[-1:], rotations[-1:]).of("stroke").min() < 2e-4
+        assert run.cause[0] == Cause.NONE
+
+
+def jog_until_killed(address):
+    with Operator(address) as operator:
+        for _ in operator.jog((0.03, 0.0, 0.0)):
+            pass
+
+
+@pytest.mark.parametrize("how", ["killed", "silent"])
+def test_an_operator_who_goes_away_while_jogging_is_a_controlled_stop(hexapod, how):
+    """Killed, or alive but without a sign, as when its network is cut."""
+    with running(hexapod) as run:
+        with run.operator() as operator:
+            begun(operator)
+        client = FORK.Process(target=jog_until_killed, args=(run.address,))
+        client.start()
+        until = time.monotonic() + 20.0
+        while not np.abs(run.references()[-1:, :, 1]).max(initial=0.0) > 0.005:
+            assert time.monotonic() < until
+            time.sleep(0.01)
+        os.kill(client.pid, signal.SIGKILL if how == "killed" else signal.SIGSTOP)
+        began = time.monotonic()
+        while run.cause[0] == Cause.NONE:
+            assert time.monotonic() - began < 5.0
+            time.sleep(0.005)
+        cause, index, waited, limit = run.cause
+        assert cause == Cause.OPERATOR_LOST and limit == DEADMAN_S and (how == "killed" or waited > DEADMAN_S)
+        assert Cause(cause).describe(index, waited, limit).startswith("the operator has gone while the platform was jogged (0.")
+        os.kill(client.pid, signal.SIGKILL)
+        client.join()
+        time.sleep(0.5)
+        run.check()
+        assert np.abs(run.references()[-1, :, 1:]).max() < 1e-9
+        # The run is over for the next one, too.
+        with run.operator() as operator, pytest.raises(RequestRefusedError, match="the run stops: the operator has gone"):
+            operator.move("home")
+
+
+def test_a_client_that_leaves_a_move_does_not_stop_it(hexapod):
+    with running(hexapod) as run:
+        with run.operator() as operator:
+            begun(operator)
+            operator.move({"position": [0.01, 0.0, 0.0]}, wait=False)
+        with run.operator() as operator:
+            there = operator.wait(2.0)["commanded"]
+        assert there["position"][0] == pytest.approx(0.01) and run.cause[0] == Cause.NONE
+
+
+def test_one_operator_at_a_time_and_observers_who_give_no_orders(hexapod):
+    with running(hexapod) as run, run.operator(name="panel") as operator:
+        with pytest.raises(ChannelError, match="panel operates this run, and only one may") as refused:
+            run.operator()
+        assert refused.value.kind == "busy"
+        with run.operator(role="observer") as observer:
+            observer.watch(20.0)
+            observer.listen(0.5)
+            assert observer.telemetry["mode"] == "preparing" and observer.telemetry["commanded"]["position"][2] == 0.35
+            for order in ("move", "jog", "stop", "end", "emergency", "beat"):
+                with pytest.raises(RequestRefusedError, match="an observer gives no orders"):
+                    observer.ask(order)
+            assert run.link[Link.STOP] == 0
+        operator.end()
+        assert run.link[Link.STOP] == StopRequest.CONTROLLED
+        operator.emergency()
+        assert run.link[Link.STOP] == StopRequest.QUICK
+        operator.close()
+        time.sleep(0.2)
+        run.operator().close()
+
+
+def said(address, *lines):
+    """What the server answers to raw lines, until it closes or is silent."""
+    host, port = channel_address(address, None)
+    with socket.create_connection((host, port), timeout=1.0) as raw:
+        answer = b""
+        try:
+            for line in lines:
+                raw.sendall(line)
+            while part := raw.recv(65536):
+                answer += part
+        except (TimeoutError, ConnectionResetError, BrokenPipeError):
+            pass
+    return [json.loads(line) for line in answer.splitlines()]
+
+
+def test_a_token_is_asked_for_and_nobody_else_gets_in(hexapod):
+    hello = {"gough": VERSION, "role": "operator"}
+    with running(hexapod, token=TOKEN) as run:
+        for token in (None, "", TOKEN[:-1], TOKEN + "0", "\u00e9" * 20):
+            with pytest.raises(ChannelError, match="the token is wrong") as refused:
+                Operator(run.address, token)
+            assert refused.value.kind == "token"
+        for wrong in (12, ["a"], {"a": 1}):
+            assert said(run.address, encode({**hello, "token": wrong}))[0]["kind"] == "token"
+        assert said(run.address, encode({"gough": 2, "token": TOKEN}))[0]["kind"] == "version"
+        # As a browser's page might send it.
+        for garbage in (b"POST / HTTP/1.1\r\n", b"[1]\n", b"\xff\xfe\n", b"x" * 200_000 + b"\n", b"[" * 60_000 + b"\n"):
+            answers = said(run.address, garbage, encode({**hello, "token": TOKEN}))
+            assert all(not each["ok"] for each in answers) and len(answers) <= 1
+        assert said(run.address, encode({**hello, "token": TOKEN, "role": "king"}))[0]["kind"] == "malformed"
+        answers = said(
+            run.address, encode({**hello, "token": TOKEN}), b"nonsense\n", b'{"id": [1], "do": "state"}\n', b'{"do": 3}\n'
+        )
+        assert [each["ok"] for each in answers] == [True, False, False, False]
+        with run.operator() as operator:
+            assert operator.ask("state")["telemetry"]["moving"] is False
+        assert run.channel.is_alive()
+
+
+def test_beyond_this_machine_a_channel_needs_a_token(tmp_path, monkeypatch):
+    assert channel_address("127.0.0.1:47300", None) == ("127.0.0.1", 47300)
+    with pytest.raises(InputError, match="would take orders from other machines: give a token"):
+        channel_address("192.168.1.5:47300", None)
+    assert channel_address("192.168.1.5:47300", TOKEN) == ("192.168.1.5", 47300)
+    path = tmp_path / "token"
+    monkeypatch.delenv("GOUGH_TOKEN", raising=False)
+    assert load_token(None) is None
+    path.write_text(f"{TOKEN}\n")
+    assert load_token(str(path)) == TOKEN
+    monkeypatch.setenv("GOUGH_TOKEN", TOKEN + "1")
+    assert load_token(None) == TOKEN + "1" and load_token(str(path)) == TOKEN
+    path.write_text("short\n")
+    with pytest.raises(InputError, match="has 5 characters; it needs 16"):
+        load_token(str(path))
+    with pytest.raises(InputError, match="cannot be read"):
+        load_token(str(tmp_path / "none"))
+
+
+def test_messages_are_lines_of_json_in_which_what_is_not_finite_is_null():
+    line = encode({"a": np.array([1.0, np.nan]), "b": (np.float64(np.inf), np.int64(3)), "c": {"d": None}})
+    assert line.endswith(b"\n") and decode(line) == {"a": [1.0, None], "b": [None, 3], "c": {"d": None}}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "has no points"),
+        ("points = 3", "has no points"),
+        ("[points.home]\nposition = [0, 0, 0]", "'home' is the mechanism's own"),
+        ("[points.a]\npositon = [0, 0, 0]", r"\[points.a\].*mean 'position'"),
+        ("[points.a]\nframe = 3", "frame is 3; it must be a text"),
+        ("[points]\na = 3", r"\[points.a\] is 3; it must be a table"),
+    ],
+)
+def test_a_bad_file_of_points_is_refused(tmp_path, text, said):
+    path = tmp_path / "points.toml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=said):
+        load_points(path)
