@@ -126,7 +126,7 @@ def test_droop_and_lag_follow_from_the_physics(found, hexapod):
 
 @pytest.mark.slow
 def test_intervals_hold_with_noise_that_is_correlated(hexapod, commands, ideal, true):
-    names = ("motor.resistance", "friction.coulomb")
+    names = ("motor.resistance", "friction.coulomb", DELAY)
     found = identify_actuators(known(hexapod, true, *names), IMU, measured(commands, ideal, 2, correlation=0.95), names)
     errors = [(each.value - true_value(true, each)) / each.sigma for each in found.values]
     assert worst(found, true) < 4.0 and 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.6

@@ -45,6 +45,7 @@ def poses_of(listener):
     return found
 
 
+@pytest.mark.slow
 def test_a_run_follows_a_recorded_vehicle_in_real_time(hexapod, washout, tmp_path, short_end):
     """Every pose is taken, none is a jump, and all that is planned is within the limits, as the planner checks."""
     path = tmp_path / "drive.csv"
