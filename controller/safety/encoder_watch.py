@@ -34,9 +34,7 @@ _SIGMAS, _LEAST = 2.1, 0.5
 """An encoder is wrong that is off by so many standard deviations, and by this share of the limit of a change."""
 
 _SETTLING_S, _UNSETTLED_S, _UNSETTLED = 1.5, 3.0, 1.5
-"""After the first time from the start the filters have settled [s]. Until the second one the limit is so much wider, and the
-share above is 1, as the filters take themselves for better than they are.
-"""
+"""After the first time from the start the filters have settled [s]; until the second one the limits are so much wider."""
 
 _LASTING_S = 0.005
 """For how long a change must last, at least two cycles [s]."""
@@ -94,8 +92,7 @@ def judge_encoders(
     """
     w, passed = s.encoders, elapsed(rig, time)
     w.watched_for += passed
-    early = w.watched_for <= _UNSETTLED_S
-    wider, least = (_UNSETTLED, 1.0) if early else (1.0, _LEAST)
+    wider = 1.0 if w.watched_for > _UNSETTLED_S else _UNSETTLED
     time_constant = max(min(_CHANGE_S, w.watched_for - _SETTLING_S), _LEAST_CHANGE_S, passed)
     settled = w.watched_for > _SETTLING_S
     w.differences[:] = 0.0
@@ -128,10 +125,9 @@ def judge_encoders(
     if s.mode < Mode.RUNNING:
         return changed
     worst, error, sigma, alone = _find_wrong(w)
-    limit = wider * max(_SIGMAS * sigma, least * p.encoders.deviation)
+    limit = wider * max(_SIGMAS * sigma, _LEAST * p.encoders.deviation)
+    wrong = alone and abs(error) > limit
     leg, most = _find_greatest(w)
-    # While the filters settle, the pose may be off otherwise than its covariance says, and look like an encoder that is wrong.
-    wrong = alone and abs(error) > limit and (not early or (leg == worst and most > limit))
     several = most > _BEYOND * wider * p.encoders.deviation
     w.changed_for = w.changed_for + passed if wrong or several else 0.0
     if wrong:
