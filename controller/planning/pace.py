@@ -26,8 +26,8 @@ _PHASES = 4
 """How often a moment is looked at in each period of the samples, so that a corner counts wherever it lies."""
 
 _DIGITS = 1e4
-_MOST_STEPS = 60
-"""A time scale is rounded up to one part in so many, and found in so many steps."""
+_MOST_STEPS, _PATIENT_STEPS = 60, 40
+"""A time scale is rounded up to one part in so many, and found in so many steps, the last of which are larger."""
 
 
 def window_fits(values: Array, step: float, phases: int = 1) -> Array:
@@ -92,7 +92,7 @@ def least_time_scale(mechanism: Mechanism, target: Target, at_least: float = LEA
         if needed <= 1.0:
             passing = scale
         # What the fits make of corners does not scale with the pace: each factor is tried, with more room the longer it takes.
-        more = 1.0 if needed <= 1.0 else 1.0 + step / _DIGITS
+        more = 1.0 if needed <= 1.0 else 1.0 + (step + max(step - _PATIENT_STEPS, 0) ** 2) / _DIGITS
         tried = max(ceil(_DIGITS * scale * needed * more) / _DIGITS, at_least)
         if tried >= passing:
             break
