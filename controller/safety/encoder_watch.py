@@ -27,8 +27,16 @@ _CHANGE_S = 1.0
 _LEAST_CHANGE_S = 0.05
 """The same while the filters settle [s]."""
 
-_SLOW, _SLOW_ALONE = 0.75, 0.9
-"""Share of the whole difference that counts like a change, of several and of one encoder: it may creep away slowly."""
+_SHARES = 1.0, 0.9, 0.4
+"""Shares of an encoder's error that count: of how its difference changes within a second, of how far it is from its mean since
+the start, as it may creep away slowly, and of all of it, if its zero is known: errors of IMUs and joints last in that.
+"""
+
+_SLOW = 0.75
+"""Share of the last two that counts if several encoders are off."""
+
+_MEMORY_S = 30.0
+"""The longest memory of the mean since the start [s], as that of a zero."""
 
 _SIGMAS, _LEAST = 2.1, 0.5
 """An encoder is wrong that is off by so many standard deviations, and by this share of the limit of a change."""
@@ -60,11 +68,15 @@ PARAMETERS = record_dtype(
 """The limits."""
 
 STATE = record_dtype(
-    begun=(np.int64, LEGS),  # whether there has been a difference
+    begun=(np.int64, LEGS),  # whether there has been a difference: 1 about a zero that is found, 2 about one that is known
     mean=(np.float64, LEGS),  # of each difference, low-passed [m]
+    start=(
+        np.float64,
+        LEGS,
+    ),  # its mean since the start about a zero that is known; one that is found is such a mean [m]
     changed_for=np.float64,  # how long an encoder or the worst change has been beyond its limit [s]
     watched_for=np.float64,  # how long there have been differences [s]
-    differences=(np.float64, (2, LEGS)),  # their changes, and a share of all of them, of the encoders that count [m]
+    differences=(np.float64, (len(_SHARES), LEGS)),  # as `_SHARES` has them, of the encoders that count [m]
     silent_for=(np.float64, LEGS),  # how long each encoder has read nothing [s]
     agreed_for=(np.float64, LEGS),  # how long one that is left out has agreed [s]
     range=(np.float64, (LEGS, 2)),  # shortest and longest that its leg has been meanwhile [m]
@@ -94,6 +106,7 @@ def judge_encoders(
     w.watched_for += passed
     wider = 1.0 if w.watched_for > _UNSETTLED_S else _UNSETTLED
     time_constant = max(min(_CHANGE_S, w.watched_for - _SETTLING_S), _LEAST_CHANGE_S, passed)
+    memory = max(min(_MEMORY_S, w.watched_for), passed)
     settled = w.watched_for > _SETTLING_S
     w.differences[:] = 0.0
     w.factor[:] = 0.0
@@ -105,11 +118,18 @@ def judge_encoders(
         _tell_silence(w, s.events, k, encoders, passed)
         if not np.isfinite(encoders.off[k]):
             continue
-        if w.begun[k] == 0 or s.mode < Mode.RUNNING:
+        zero = 2 if encoders.followed_for[k] == np.inf else 1
+        if w.begun[k] != zero or s.mode < Mode.RUNNING:
             # On the brakes the zero still follows the IMUs' first lengths.
-            w.begun[k], w.mean[k] = 1, encoders.off[k]
+            w.begun[k], w.mean[k], w.start[k] = zero, encoders.off[k], encoders.off[k]
         change = encoders.off[k] - w.mean[k]
         w.mean[k] += passed / time_constant * change
+        if zero == 1:
+            w.start[k] = 0.0
+        elif not settled:
+            w.start[k] = w.mean[k]
+        else:
+            w.start[k] += passed / memory * (encoders.off[k] - w.start[k])
         left_out += encoders.excluded[k]
         if encoders.excluded[k] != 0:
             if _agrees_again(p, w, encoder_parameters, encoders, k, change, lengths[k], passed):
@@ -117,7 +137,9 @@ def judge_encoders(
                 changed = True
         elif encoders.used[k] != 0.0:
             w.differences[0, k] = change
-            w.differences[1, k] = encoders.off[k] if settled else 0.0
+            if settled:
+                w.differences[1, k] = encoders.off[k] - w.start[k]
+                w.differences[2, k] = encoders.off[k] if zero == 2 else 0.0
             for other in range(k):
                 if encoders.used[other] != 0.0:
                     w.factor[k, other] = encoders.covariance[k, other]
@@ -159,7 +181,7 @@ def _find_wrong(w: Record) -> tuple[int, float, float, bool]:
     if not factor_cholesky(w.factor):
         return worst, error, sigma, alone
     invert_cholesky(w.factor, w.inverse)
-    for kind, share in enumerate((1.0, _SLOW_ALONE)):
+    for kind, share in enumerate(_SHARES):
         d = w.differences[kind]
         total, greatest, of, at = 0.0, 0.0, 0.0, 0
         for k in range(LEGS):
@@ -178,10 +200,10 @@ def _find_wrong(w: Record) -> tuple[int, float, float, bool]:
 
 @kernel
 def _find_greatest(w: Record) -> tuple[int, float]:
-    """The greatest change or share of a whole difference, and its leg."""
+    """The greatest change, or share of a slow one, and its leg."""
     leg, most = 0, 0.0
     for k in range(LEGS):
-        size = max(abs(w.differences[0, k]), _SLOW * abs(w.differences[1, k]))
+        size = max(abs(w.differences[0, k]), _SLOW * max(abs(w.differences[1, k]), abs(w.differences[2, k])))
         if size > most:
             leg, most = k, size
     return leg, most
