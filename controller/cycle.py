@@ -337,6 +337,7 @@ def run_stages(
         leg_filter.step_leg_filters(p.legs, s.legs, rig, time, s.imus)
         t = _mark(m, CycleStage.LEGS, t)
     if first <= CycleStage.PLATFORM < last:
+        pose_estimator.follow_plan(s.pose, rig, s.reference.motion)
         platform_filter.step_platform_filter(p.platform, s.platform, rig, time, s.imus, s.pose)
     if first <= CycleStage.HEADING < last:
         heading_filter.step_heading_filter(p.heading, s.heading, rig, time, s.imus, s.platform)

@@ -86,7 +86,9 @@ def jacobian_at(arms: Array, directions: Array, legs: int, jacobian: Array) -> N
 
 
 @kernel
-def motion_of_legs(arms: Array, directions: Array, lengths: Array, legs: Array, jacobian: Array, right: Array) -> bool:
+def motion_of_legs(
+    arms: Array, directions: Array, lengths: Array, count: int, legs: Array, jacobian: Array, right: Array
+) -> bool:  # fmt: skip
     """Write into `right` (2, 6) the twist and the acceleration of the platform at which the legs have their rates.
 
     With r the direction of a leg, a its arm, v + omega x a the velocity of its joint, and l its length,
@@ -95,6 +97,7 @@ def motion_of_legs(arms: Array, directions: Array, lengths: Array, legs: Array, 
 
     Args:
         arms, directions, lengths: (6, 3), (6, 3), (6,), of the legs.
+        count: number of legs; a planar mechanism has three, and moves in its plane.
         legs: (6, 3), length, rate and acceleration of each leg.
         jacobian: (6, 6), scratch.
 
@@ -102,8 +105,9 @@ def motion_of_legs(arms: Array, directions: Array, lengths: Array, legs: Array, 
         Whether the Jacobian can be inverted; if not, `right` is zero.
     """
     for order in range(2):
-        jacobian_at(arms, directions, LEGS, jacobian)
-        for k in range(LEGS):
+        jacobian_at(arms, directions, count, jacobian)
+        right[order, count:] = 0.0
+        for k in range(count):
             right[order, k] = legs[k, 1 + order]
             if order == 1:
                 omega, arm = vector(right[0, 3:]), vector(arms[k])

@@ -198,7 +198,7 @@ def _find_target(s: Record, rig: Record, base: Record, legs: Array) -> bool:
     if not find_pose(geometry, s.wanted, s.position, s.rotation, s.arms, s.directions, s.lengths, s.jacobian) < 1e-9:
         return False
     legs_at(geometry.base_joints, geometry.platform_joints, s.position, s.rotation, s.arms, s.directions, s.lengths)
-    if not motion_of_legs(s.arms, s.directions, s.lengths, legs, s.jacobian, s.twist):
+    if not motion_of_legs(s.arms, s.directions, s.lengths, rig.legs, legs, s.jacobian, s.twist):
         return False
     w, angular_acceleration = subtract(vector(base.fitted[0]), vector(s.bias)), vector(base.fitted[1])
     place = rotate_back(b, vector(s.position))

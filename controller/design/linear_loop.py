@@ -39,7 +39,7 @@ _LONGEST_STEP_S = 1e-3
 _SMALL_STEP, _CHANGE = 1e-3, 1e-6
 _SIGNALS = 2 * IMU_COUNT * 3
 _STEPPED = ("time", "imus", "legs", "platform", "heading", "pose")
-_ESTIMATOR_STATE = (("legs", "x"), ("platform", "x"), ("pose", "smooth_twist"), ("pose", "acceleration"))
+_ESTIMATOR_STATE = (("legs", "x"), ("platform", "x"), ("pose", "smooth_twist"), ("pose", "unplanned"))
 
 
 @dataclass(frozen=True, eq=False)

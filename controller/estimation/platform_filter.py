@@ -1,10 +1,10 @@
 """The platform's roll-pitch filter: a Kalman filter for the vertical seen in {2}.
 
-The vertical u turns with `u' = u x (rate - bias)`. Once the acceleration that is known from the legs is taken out, the
-accelerometer measures `g u`, its noise, and what is unknown of the platform's acceleration. The latter is no white noise: its
-integral, a velocity, stays small. So the filter integrates what the accelerometer shows along two level axes, and measures that
-this velocity is zero, with a noise as large as the velocity is seen to be (`excess`). If the acceleration is known, that noise
-is zero, and the filter takes each reading for gravity. If it is not, the filter averages over seconds.
+The vertical u turns with `u' = u x (rate - bias)`. Once the acceleration that is planned or known from the legs is taken out,
+the accelerometer measures `g u`, its noise, and what is unknown of the platform's acceleration. The latter is no white noise:
+its integral, a velocity, stays small. So the filter integrates what the accelerometer shows along two level axes, and measures
+that this velocity is zero, with a noise as large as the velocity is seen to be (`excess`). If the acceleration is known, that
+noise is zero, and the filter takes each reading for gravity. If it is not, the filter averages over seconds.
 
 While the gyroscope's reading is clipped, the rate goes on beyond the range, unseen. A constant angular acceleration a from
 there on leaves the vertical off by a t^2 / 2 after the time t. So its variance is a^2 t^4 / 4, which grows by a^2 t^3 dt, and
@@ -119,15 +119,15 @@ def platform_parameters(fusion: FusionSettings, rate: float, jerk: float = 0.0) 
         weight=1.0 / fusion.tilt_sigma**2,
         delay=fusion.sensor_delay,
         settling_cycles=round(SETTLING_S * rate),
-        # The known acceleration lags, and the platform may jerk twice as much as its legs.
+        # An acceleration that is not planned is known late, and the platform may jerk twice as much as its legs.
         acceleration_variance=max(ACCELERATION_SIGMA, 2.0 * jerk * fusion.acceleration_time) ** 2,
     )
 
 
 @kernel
 def step_platform_filter(p: Record, s: Record, rig: Record, time: Record, imus: Record, pose: Record) -> None:
-    """Step the filter, with the platform's own acceleration taken out of the reading: that of the last cycle's `pose`, known
-    from the legs.
+    """Step the filter, with the platform's own acceleration taken out of the reading: that of `pose`, as it is planned and as
+    the legs have shown.
     """
     if not begin_platform_step(p, s, rig, time, imus, pose):
         return

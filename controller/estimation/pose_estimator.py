@@ -1,6 +1,7 @@
 """From leg directions and the platform's vertical to the pose: a closed form without a first guess, then its refinement.
 
-The twist follows from the refinement's normal equations, and the acceleration is the twist's derivative.
+The twist follows from the refinement's normal equations. Of the acceleration, the reference has what is planned, without delay;
+what the twist's derivative has beyond that is low-passed.
 """
 
 import numpy as np
@@ -18,6 +19,7 @@ from controller.direct_kinematics.refinement import (
     solve_normal_equations,
     stay_in_plane,
 )
+from controller.inverse_kinematics import motion_of_legs
 from controller.rig import elapsed
 from controller.settings import FusionSettings
 from plant.compiled import Record, filled, kernel, record_dtype, shared_kernel
@@ -40,7 +42,8 @@ STATE = record_dtype(
     rotation=(np.float64, (3, 3)),
     twist=(np.float64, 6),  # velocity and angular velocity in {1} [m/s, rad/s]
     smooth_twist=(np.float64, 6),  # the twist, low-passed
-    acceleration=(np.float64, 6),  # derivative of the twist
+    unplanned=(np.float64, 6),  # how its derivative differs from what is planned, low-passed [m/s^2, rad/s^2]
+    acceleration=(np.float64, 6),  # derivative of the twist: what is planned, and what is not
     conditioning=np.float64,  # of the closed form
     found=np.int64,  # whether the measurements determine the pose
     information=(np.float64, (6, 6)),  # inverse of the refined pose's covariance, lower triangle
@@ -57,6 +60,8 @@ STATE = record_dtype(
     weights=(np.float64, LEGS + 2),  # the reduced ones
     angular_velocity=(np.float64, 3),  # from here on scratch
     correction=(np.float64, 6),
+    planned=(np.float64, (2, 6)),  # twist and acceleration
+    jacobian=(np.float64, (6, 6)),
     scratch=SCRATCH,
 )
 """The estimated pose."""
@@ -155,12 +160,21 @@ def refine_pose(p: Record, s: Record, rig: Record, time: Record, legs: Record, p
 
 @kernel
 def follow_twist(p: Record, s: Record, rig: Record, time: Record) -> None:
-    """Low-pass the twist of this cycle; the acceleration is its derivative."""
+    """Low-pass the twist of this cycle, carried on as planned; what is left of its derivative is not planned."""
     if time.cycle == 0:
         s.smooth_twist[:] = s.twist
     # A period that is longer than the time constant takes the whole change of the twist.
     period = elapsed(rig, time)
     share, rate = min(1.0, period * p.acceleration_rate), min(p.acceleration_rate, 1.0 / period)
     for i in range(6):
-        s.acceleration[i] = (s.twist[i] - s.smooth_twist[i]) * rate
+        s.smooth_twist[i] += period * s.planned[1, i]
+        s.unplanned[i] = (s.twist[i] - s.smooth_twist[i]) * rate
         s.smooth_twist[i] += share * (s.twist[i] - s.smooth_twist[i])
+
+
+@kernel
+def follow_plan(s: Record, rig: Record, legs: Array) -> None:
+    """Find the acceleration from that of the reference, `legs` (6, 3): length, rate and acceleration of each leg."""
+    motion_of_legs(s.arms, s.directions, s.lengths, rig.legs, legs, s.jacobian, s.planned)
+    for i in range(6):
+        s.acceleration[i] = s.planned[1, i] + s.unplanned[i]

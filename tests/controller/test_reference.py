@@ -85,4 +85,4 @@ def test_a_reference_that_was_prepared_is_not_used_after_missed_periods(hexapod,
     assert cycle(parameters, state, signals, segments) == Cause.NONE
     expected = home + SPEEDS * PERIOD_S * (5 + missed)
     np.testing.assert_allclose(state["reference"]["motion"][:, 0], expected, rtol=1e-14)
-    np.testing.assert_allclose(state["pid"]["error"], expected - home, rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(state["pid"]["error"], expected - state["pose"]["lengths"], rtol=0.0, atol=1e-15)

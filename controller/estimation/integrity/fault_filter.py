@@ -226,7 +226,7 @@ def _find_motion(s: Record) -> None:
     for k in range(LEGS):
         for i in range(3):
             s.planned[k, i] /= s.collected
-    motion_of_legs(s.arms, s.directions, s.lengths, s.planned, s.factor, s.derivatives)
+    motion_of_legs(s.arms, s.directions, s.lengths, LEGS, s.planned, s.factor, s.derivatives)
     motion = s.next_path.motion
     for i in range(3):
         motion[VELOCITY, i] = s.derivatives[0, i]

@@ -173,7 +173,6 @@ def step_mechanism_filter(
         s.trusted = 0
     if s.trusted != 0:
         pose.twist[:] = s.twist
-        pose.acceleration[:] = s.acceleration
     if found:
         _find_step(s.closed_position, s.closed_rotation, pose.position, pose.rotation, s.step)
         pose.position[:] = s.closed_position

@@ -9,7 +9,8 @@ from controller.estimation.filterpy_filters import FilterpyFilters
 from controller.estimation.heading_filter import heading_parameters
 from controller.estimation.leg_filter import STATES, leg_direction, leg_parameters, start_leg
 from controller.estimation.platform_filter import platform_parameters
-from controller.estimation.pose_estimator import pose_parameters
+from controller.estimation.pose_estimator import follow_plan, follow_twist, pose_parameters
+from controller.inverse_kinematics import leg_lengths, legs_at
 from controller.rig import MagneticField, field_of
 from controller.settings import FusionSettings, control_settings, fusion_settings
 from plant.dynamics.variables import PLATFORM_IMU
@@ -258,7 +259,7 @@ def test_the_acceleration_of_the_platforms_imu_is_that_of_its_place_on_the_platf
     rotation, acceleration = rotation_of(random.normal(size=3)), random.uniform(-2.0, 2.0, 3)
     turn, turning = random.uniform(-2.0, 2.0, 3), random.uniform(-9.0, 9.0, 3)
     bias, place = np.array([0.03, -0.02, 0.05]), np.array([0.10, -0.15, 0.12])
-    state["pose"]["rotation"], state["pose"]["acceleration"] = rotation, [*acceleration, *turning]
+    state["pose"]["rotation"], state["pose"]["unplanned"] = rotation, [*acceleration, *turning]
     state["platform"]["x"][3:6] = bias
     state["imus"]["sample"][GYROSCOPE, PLATFORM_IMU] = rotation.T @ turn + bias
     step(parameters, state, first=CycleStage.PLATFORM, last=CycleStage.HEADING)
@@ -362,7 +363,8 @@ def test_the_stages_on_filterpy_do_the_same_over_failures_and_new_starts(incline
             if k % 50 == 25:
                 state["imus"]["shaking"]["passed"] = np.linspace(0.1, 30.0, 7)
             state["pose"]["twist"] = 0.1
-            state["pose"]["acceleration"] = random.normal(size=6) if state is compiled else compiled["pose"]["acceleration"]
+            state["pose"]["unplanned"] = random.normal(size=6) if state is compiled else compiled["pose"]["unplanned"]
+            state["pose"]["acceleration"] = compiled["pose"]["unplanned"]
         step(parameters, compiled, last=CycleStage.HEADING)
         filters.step_legs(twin)
         filters.step_platform(twin)
@@ -396,8 +398,50 @@ def test_the_acceleration_follows_the_twist_over_missed_periods_by_no_more_than_
     step(parameters, state, missed=missed, last=CycleStage.MECHANISM)
     pose = state["pose"]
     time = max(0.025, (1 + missed) * PERIOD_S)
-    np.testing.assert_allclose(pose["acceleration"], (pose["twist"] - smooth) / time, rtol=1e-12)
+    np.testing.assert_allclose(pose["unplanned"], (pose["twist"] - smooth) / time, rtol=1e-12)
     np.testing.assert_allclose(pose["smooth_twist"], smooth + share * (pose["twist"] - smooth), rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["hexapod", "planar-3rpr"])
+def test_a_planned_acceleration_is_known_at_once(name):
+    """The legs are planned to go as on a path of the platform, whose second differences are the acceleration."""
+    mechanism, h = load_in_space(name), 1e-4
+    parameters, state = stages(mechanism, magnetometer=False)
+    velocity, acceleration = np.array([0.1, 0.2, 0.0]), np.array([1.0, -2.0, 0.0, 0.0, 0.0, 3.0])
+    turn = np.array([0.0, 0.0, 0.6])
+    if name == "hexapod":
+        velocity, acceleration = np.array([0.1, -0.05, 0.2]), np.array([0.5, 1.0, -2.0, 3.0, -2.0, 1.0])
+        turn = np.array([0.6, -0.4, 0.3])
+
+    def at(t):
+        position = mechanism.home.position + t * velocity + 0.5 * t**2 * acceleration[:3]
+        return position, rotation_of(t * turn + 0.5 * t**2 * acceleration[3:]) @ mechanism.home.rotation
+
+    lengths = np.array([leg_lengths(mechanism, *at(t)) for t in (-h, 0.0, h)])
+    legs, pose = np.zeros((6, 3)), state["pose"]
+    legs[: mechanism.legs] = np.stack(
+        [lengths[1], (lengths[2] - lengths[0]) / (2.0 * h), np.diff(lengths, 2, axis=0)[0] / h**2]
+    ).T
+    geometry = parameters["rig"]["geometry"]
+    legs_at(
+        geometry["base_joints"], geometry["platform_joints"], *at(0.0), pose["arms"], pose["directions"], pose["lengths"]
+    )  # fmt: skip
+    pose["unplanned"] = unplanned = 0.1 * acceleration
+    follow_plan(pose[()], parameters["rig"][()], legs)
+    np.testing.assert_allclose(pose["planned"], [[*velocity, *turn], acceleration], rtol=0.0, atol=2e-5)
+    np.testing.assert_allclose(pose["acceleration"], acceleration + unplanned, rtol=0.0, atol=2e-5)
+
+
+def test_what_goes_as_planned_leaves_no_acceleration_unplanned(inclined):
+    """The twist grows as planned, and its low-pass with it, without a delay."""
+    parameters, state = stages(inclined)
+    pose, planned = state["pose"], np.array([0.5, -0.3, 0.2, 1.0, 2.0, -3.0])
+    for k in range(50):
+        pose["twist"] = k * PERIOD_S * planned
+        pose["planned"][1] = planned if k else 0.0
+        follow_twist(parameters["pose"][()], pose[()], parameters["rig"][()], state["time"][()])
+        np.testing.assert_allclose(pose["unplanned"], 0.0, atol=1e-12)
+        state["time"]["cycle"] += 1
 
 
 def test_in_the_first_cycle_there_is_no_acceleration(inclined):

@@ -31,6 +31,9 @@ dwell = 0.2
 """
 
 
+AT_FULL_SPEED = MOTION.replace("[limits]\nspeed = 0.05\nacceleration = 0.2\njerk = 2\n", "").replace("dwell = 1", "dwell = 9")
+
+
 @pytest.fixture
 def path(tmp_path):
     made = tmp_path / "line.toml"
@@ -60,13 +63,23 @@ def test_a_motion_out_of_reach_is_refused_in_a_line(path, capsys):
     assert error.startswith("gough: line.toml, element 1 (line), leaves the strokes at") and error.count("\n") == 1
 
 
-def test_a_line_is_straight_in_the_loop(path, hexapod):
-    """Within 0.05 mm and 0.02 deg, once the estimate has settled."""
-    result = simulate(SimulationConfig(target=str(path), imu="ideal", duration=6.0))
+@pytest.mark.parametrize(
+    ("text", "fusion", "duration"),
+    [
+        (MOTION, "compiled", 6.0),
+        pytest.param(AT_FULL_SPEED, "compiled", 13.0, marks=pytest.mark.slow),
+        pytest.param(AT_FULL_SPEED, "whole", 13.0, marks=pytest.mark.slow),
+    ],
+)
+def test_a_line_is_straight_in_the_loop(path, hexapod, text, fusion, duration):
+    """Within 0.05 mm and 0.02 deg, once the estimate has settled, also at the actuators' full speed and acceleration."""
+    path.write_text(text)
+    result = simulate(SimulationConfig(target=str(path), imu="ideal", duration=duration, fusion=fusion))
     assert result.reference.violations == 0
     rest = np.linalg.norm(result.target_positions - hexapod.home.position - FIRST, axis=1) < 1e-9
     begin = result.times[rest].max()
-    moving = (result.times > begin) & (result.times < begin + np.linalg.norm(LAST - FIRST) / 0.05 + 0.35)
+    there = np.linalg.norm(result.target_positions - hexapod.home.position - LAST, axis=1) < 1e-9
+    moving = (result.times > begin) & (result.times < result.times[there & (result.times > begin)].min() + 0.1)
     first, last = Rotation.from_rotvec(FIRST_TURN, degrees=True), Rotation.from_rotvec(LAST_TURN, degrees=True)
     along, whole = (LAST - FIRST) / np.linalg.norm(LAST - FIRST), (last * first.inv()).as_rotvec(degrees=True)
     for positions, rotations, most, most_turn in (

@@ -196,7 +196,6 @@ def test_the_filter_starts_with_the_first_pose_and_is_trusted_when_it_has_settle
     assert stage.step()
     assert stage.stands == (True, True)
     np.testing.assert_array_equal(stage.pose["twist"], stage.trust["twist"])
-    np.testing.assert_array_equal(stage.pose["acceleration"], stage.trust["acceleration"])
     np.testing.assert_allclose(stage.pose["twist"], 0.0, atol=1e-3)
 
 
