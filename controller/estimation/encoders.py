@@ -81,6 +81,7 @@ STATE = record_dtype(
     followed_for=(np.float64, LEGS),  # how long the zero has been followed; infinite for one that is known [s]
     off=(np.float64, LEGS),  # reading less zero and the IMUs' length [m]; NaN without a reading for `_HELD_S`
     covariance=(np.float64, (LEGS, LEGS)),  # of these differences, as the IMUs know the pose [m^2]
+    unseen=(np.float64, LEGS),  # by how much the reading could be off unseen, if its zero is known [m]
     information=(np.float64, (6, 6)),  # from here on scratch
     factor=(np.float64, (6, 6)),
     correction=(np.float64, 6),
@@ -218,7 +219,24 @@ def move_to_lengths(p: Record, s: Record, rig: Record, time: Record, pose: Recor
     if not solve_normal_equations(s.information, s.correction, s.factor):
         return False
     move_pose(s.correction, pose.position, pose.rotation)
+    _find_bent(p, s, rig, pose)
     return True
+
+
+@kernel
+def _find_bent(p: Record, s: Record, rig: Record, pose: Record) -> None:
+    """Write how far the encoder that could move the pose the most could do so unseen."""
+    pose.bent[:] = 0.0
+    for k in range(rig.legs):
+        if s.counts[k] == 0.0 or s.unseen[k] == 0.0:
+            continue
+        _find_row(pose, k, s.correction)
+        solve_cholesky(s.factor, s.correction)
+        for part in range(2):
+            squared = 0.0
+            for i in range(3 * part, 3 * part + 3):
+                squared += s.correction[i] ** 2
+            pose.bent[part] = max(pose.bent[part], s.unseen[k] / p.variance * np.sqrt(squared))
 
 
 @kernel

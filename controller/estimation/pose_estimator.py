@@ -50,6 +50,7 @@ STATE = record_dtype(
     factor=(np.float64, (6, 6)),  # Cholesky factor of the information
     misfit=np.float64,  # of the measurements about the refined pose, 1 on average if their covariances are right
     rest_misfit=np.float64,  # the same without the worst of the measurements; 0 with few measurements
+    bent=(np.float64, 2),  # by how much an encoder could move it unseen, position [m] and rotation [rad]
     arms=(np.float64, (LEGS, 3)),  # the turned platform joints at the pose [m]
     directions=(np.float64, (LEGS, 3)),  # of the legs at the pose, unit
     lengths=(np.float64, LEGS),  # of the legs at the pose [m]

@@ -53,6 +53,9 @@ _ALONE = 2.5
 _BEYOND = 2.0
 """How far beyond the limit a change ends the run if it is not that of one encoder."""
 
+_UNSEEN = 2.0
+"""How many standard deviations an encoder could be off beyond what it seems to be."""
+
 _AGREED, _AGREED_S, _MOVED_M = 0.3, 5.0, 0.005
 """An encoder is used again when its difference has changed by less than this share of the limit for so long [s], while its leg
 has moved so far [m].
@@ -110,6 +113,7 @@ def judge_encoders(
     settled = w.watched_for > _SETTLING_S
     w.differences[:] = 0.0
     w.factor[:] = 0.0
+    encoders.unseen[:] = 0.0
     left_out, changed = 0, False
     for k in range(LEGS):
         w.factor[k, k] = 1.0
@@ -146,7 +150,7 @@ def judge_encoders(
             w.factor[k, k] = encoders.covariance[k, k] + encoder_parameters.variance
     if s.mode < Mode.RUNNING:
         return changed
-    worst, error, sigma, alone = _find_wrong(w)
+    worst, error, sigma, alone = _find_wrong(w, encoders)
     limit = wider * max(_SIGMAS * sigma, _LEAST * p.encoders.deviation)
     wrong = alone and abs(error) > limit
     leg, most = _find_greatest(w)
@@ -172,8 +176,9 @@ def judge_encoders(
 
 
 @kernel
-def _find_wrong(w: Record) -> tuple[int, float, float, bool]:
-    """The encoder that is off by most sigmas, by how much and its sigma [m], and whether it explains the differences alone.
+def _find_wrong(w: Record, encoders: Record) -> tuple[int, float, float, bool]:
+    """The encoder that is off by most sigmas, by how much and its sigma [m], and whether it explains the differences alone;
+    writes by how much each could be off unseen.
 
     The matrix of the covariances is in `factor`.
     """
@@ -189,6 +194,8 @@ def _find_wrong(w: Record) -> tuple[int, float, float, bool]:
             for i in range(LEGS):
                 weighted += w.inverse[k, i] * d[i]
             total += d[k] * weighted
+            if kind == 2 and d[k] != 0.0:
+                encoders.unseen[k] = abs(weighted) / w.inverse[k, k] + _UNSEEN / np.sqrt(w.inverse[k, k])
             if weighted * weighted > greatest * w.inverse[k, k]:
                 at, greatest, of = k, weighted * weighted / w.inverse[k, k], weighted / w.inverse[k, k]
         if share * share * greatest > square:

@@ -14,7 +14,7 @@ The 8 is for faults that grow: such a fault is larger at the end of the filter's
 the pose before, and goes on until the next evaluation. A fault since the loop began has had little time to move the pose: these
 terms grow over the first four seconds.
 
-The level is the root of the sum of the squares of four terms:
+The level is the root of the sum of the squares of five terms:
 
 1. The greatest of these.
 2. The standard deviation of the pose, both that of the closed form and that of the pose's own source if that is less: no filter
@@ -22,14 +22,16 @@ The level is the root of the sum of the squares of four terms:
 3. The standard deviation of the closed form again, by how much its measurements contradict each other: so joints that are off
    show themselves, and other errors that nothing models.
 4. What `parity` and `shaking` tell: forces that are no motion may have moved the pose.
+5. How far an encoder whose zero is known could move the pose unseen, as `encoders` has it.
 
-Terms 3 and 4 are renewed in every cycle.
+Terms 3 to 5 are renewed in every cycle.
 """
 
 import numpy as np
 
 from controller.least_squares import factor_cholesky, solve_cholesky
 from plant.compiled import Record, kernel, record_dtype
+from plant.pose import Array
 
 POSE = 6
 _CHANCE = 1.0
@@ -172,7 +174,7 @@ def end_level(s: Record, age: float) -> None:
 
 
 @kernel
-def publish_level(s: Record, misfit: float, duration: float, steady: float, shaken: float) -> None:
+def publish_level(s: Record, misfit: float, duration: float, steady: float, shaken: float, bent: Array) -> None:
     """Publish the level of a cycle, with what has come up since the last evaluation.
 
     Args:
@@ -181,9 +183,10 @@ def publish_level(s: Record, misfit: float, duration: float, steady: float, shak
         duration: since the last cycle [s].
         steady: greatest mean force that is no motion [m/s^2], `parity.STATE`.
         shaken: greatest mean square of vibration [m^2/s^4], `shaking.STATE`.
+        bent: (2,), by how much an encoder could move position [m] and rotation [rad] unseen.
     """
     s.misfit += min(1.0, duration / _MISFIT_S) * (misfit - s.misfit)
     beyond = _OF_MISFIT**2 * max(s.misfit - _USUAL_MISFIT, 0.0)
     force = min(max(steady - _SOUND, 0.0) + _SHAKEN * np.sqrt(shaken), _MOST)
     for part, moved in enumerate(_MOVED):
-        s.level[part] = np.sqrt(s.evaluated[part] + beyond * s.closed[part] + (moved * force) ** 2)
+        s.level[part] = np.sqrt(s.evaluated[part] + beyond * s.closed[part] + (moved * force) ** 2 + bent[part] ** 2)

@@ -136,7 +136,9 @@ def step_integrity(
             or s.parity.two != 0
         )
     if s.evaluations > 0:
-        protection.publish_level(s.protection, pose.misfit, elapsed(rig, time), s.parity.steady, imus.shaking.mean.max())
+        protection.publish_level(
+            s.protection, pose.misfit, elapsed(rig, time), s.parity.steady, imus.shaking.mean.max(), pose.bent
+        )  # fmt: skip
     if s.waits > 0:
         s.waits -= 1
         if s.waits == 0:

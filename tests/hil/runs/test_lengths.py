@@ -154,6 +154,21 @@ def test_errors_of_imus_and_joints_that_last_are_no_fault_of_an_absolute_encoder
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("fusion", ["compiled", "whole"])
+def test_the_protection_level_covers_an_absolute_encoder_that_creeps(fusion):
+    """Until it is named, it moves the pose, and the IMUs see little of that."""
+    creeping = replace(
+        SINES, lengths="absolute", fusion=fusion, duration=8.0, faults=("encoder-creeps:2,size_mm_per_s=0.3,at=4",)
+    )
+    records = simulate(creeping).records
+    errors = errors_of(records).reshape(-1, 2, 3)
+    level = records["protection"][records["mode"] == Mode.RUNNING] * [1e3, np.degrees(1.0)]
+    sizes = np.linalg.norm(errors, axis=2)
+    assert sizes[:, 0].max() > 0.1
+    assert (sizes <= level).all(axis=1).mean() > 0.999
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("fusion", "limits"), [("compiled", (0.06, 0.01)), ("whole", (0.03, 0.006))])
 def test_the_pose_is_as_exact_as_the_encoders_once_the_legs_have_passed_their_switches(fusion, limits):
     """The absolute errors are then below the limits of the relative ones without a switch."""

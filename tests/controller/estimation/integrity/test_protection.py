@@ -13,11 +13,11 @@ OWN = np.array([np.diag([4e-8, 1e-8, 9e-8, 1e-6, 4e-6, 1e-6]), np.diag([1e-8, 2e
 """Covariances of the pose, in closed form and of its source."""
 
 
-def ended(level, age=50.0, steady=0.0, shaken=0.0, own=OWN, misfit=0.0):
+def ended(level, age=50.0, steady=0.0, shaken=0.0, own=OWN, misfit=0.0, bent=(0.0, 0.0)):
     """The level (2,) at the end of an evaluation, with a misfit that lasts."""
     level["covariance"], level["misfit"] = own, misfit
     end_level(level[()], age)
-    publish_level(level[()], misfit, 0.01, steady, shaken)
+    publish_level(level[()], misfit, 0.01, steady, shaken, np.array(bent))
     return level["level"].copy()
 
 
@@ -103,6 +103,7 @@ def test_forces_that_are_no_motion_raise_the_level_between_evaluations():
     np.testing.assert_allclose(ended(level, steady=0.3), np.hypot(sound, [0.004, 0.006]))
     np.testing.assert_allclose(ended(level, shaken=4.0), np.hypot(sound, [0.024, 0.036]))
     np.testing.assert_allclose(ended(level, steady=5.0, shaken=9.0), np.hypot(sound, [0.04, 0.06]))
+    np.testing.assert_allclose(ended(level, bent=(2e-4, 3e-3)), np.hypot(sound, [2e-4, 3e-3]))
 
 
 def test_measurements_that_contradict_each_other_raise_the_level_between_evaluations():
@@ -114,7 +115,7 @@ def test_measurements_that_contradict_each_other_raise_the_level_between_evaluat
     np.testing.assert_allclose(ended(level, misfit=2.4), np.sqrt(calm**2 + 4.0 * 2.0 * closed))
     # A misfit that has just come up counts by its share of the average.
     level["misfit"] = 0.4
-    publish_level(level[()], 2.4, 0.01, 0.0, 0.0)
+    publish_level(level[()], 2.4, 0.01, 0.0, 0.0, np.zeros(2))
     np.testing.assert_allclose(level["level"], np.sqrt(calm**2 + 4.0 * 0.2 * closed))
     assert np.isinf(ended(level, own=np.full_like(OWN, np.inf), misfit=2.3)).all()
 
