@@ -191,6 +191,7 @@ def _count(s: Record, k: int) -> bool:
 @kernel
 def move_to_lengths(p: Record, s: Record, rig: Record, time: Record, pose: Record) -> bool:
     """Move the pose that has just been compared to the encoders' lengths; False if that has no solution."""
+    pose.bent[:] = 0.0
     for i in range(6):
         s.correction[i] = 0.0
         for j in range(i + 1):
@@ -226,7 +227,6 @@ def move_to_lengths(p: Record, s: Record, rig: Record, time: Record, pose: Recor
 @kernel
 def _find_bent(p: Record, s: Record, rig: Record, pose: Record) -> None:
     """Write how far the encoder that could move the pose the most could do so unseen."""
-    pose.bent[:] = 0.0
     for k in range(rig.legs):
         if s.counts[k] == 0.0 or s.unseen[k] == 0.0:
             continue

@@ -31,6 +31,7 @@ from controller.estimation.platform_filter import (
     end_platform_step,
 )
 from controller.estimation.platform_filter import STATE as PLATFORM
+from controller.estimation.pose_estimator import follow_plan
 from controller.rig import elapsed
 from plant.compiled import Record
 from plant.dynamics.variables import PLATFORM_IMU
@@ -274,6 +275,7 @@ class FilterpyFilters:
         """Step the platform's filter, as `platform_filter.step_platform_filter` does."""
         p, s = self._parameters, state[()]
         imus, platform = s["imus"], s["platform"]
+        follow_plan(s["pose"], p["rig"], s["reference"]["motion"])
         if begin_platform_step(p["platform"], platform, p["rig"], s["time"], imus, s["pose"]):
             self._platform.take_over(platform)
             force = imus["sample"][ACCELEROMETER, PLATFORM_IMU]

@@ -43,7 +43,7 @@ STATE = record_dtype(
     twist=(np.float64, 6),  # velocity and angular velocity in {1} [m/s, rad/s]
     smooth_twist=(np.float64, 6),  # the twist, low-passed
     unplanned=(np.float64, 6),  # how its derivative differs from what is planned, low-passed [m/s^2, rad/s^2]
-    acceleration=(np.float64, 6),  # derivative of the twist: what is planned, and what is not
+    acceleration=(np.float64, 6),  # what is planned, and what is not
     conditioning=np.float64,  # of the closed form
     found=np.int64,  # whether the measurements determine the pose
     information=(np.float64, (6, 6)),  # inverse of the refined pose's covariance, lower triangle
@@ -59,9 +59,9 @@ STATE = record_dtype(
     misfits=(np.float64, LEGS + 2),  # of each leg's direction and each vector
     doubts=(np.float64, LEGS + 2),  # by which their weights were reduced
     weights=(np.float64, LEGS + 2),  # the reduced ones
+    planned=(np.float64, (2, 6)),  # twist and acceleration of the reference
     angular_velocity=(np.float64, 3),  # from here on scratch
     correction=(np.float64, 6),
-    planned=(np.float64, (2, 6)),  # twist and acceleration
     jacobian=(np.float64, (6, 6)),
     scratch=SCRATCH,
 )
@@ -121,7 +121,7 @@ def find_pose(
 
 @kernel
 def refine_pose(p: Record, s: Record, rig: Record, time: Record, legs: Record, platform_rate: Array) -> bool:
-    """Two Gauss-Newton steps for the pose; the twist comes with them, and the acceleration is its derivative.
+    """Two Gauss-Newton steps for the pose; the twist comes with them, and what of its derivative is not planned.
 
     What disagreed with the pose of the last cycle has less weight.
 

@@ -73,10 +73,9 @@ PARAMETERS = record_dtype(
 STATE = record_dtype(
     begun=(np.int64, LEGS),  # whether there has been a difference: 1 about a zero that is found, 2 about one that is known
     mean=(np.float64, LEGS),  # of each difference, low-passed [m]
-    start=(
-        np.float64,
-        LEGS,
-    ),  # its mean since the start about a zero that is known; one that is found is such a mean [m]
+    # mean since the start of a difference about a known zero [m]; 0 about one that is found, as that is such a mean itself
+    start=(np.float64, LEGS),
+    started_for=(np.float64, LEGS),  # how long that mean has been taken [s]
     changed_for=np.float64,  # how long an encoder or the worst change has been beyond its limit [s]
     watched_for=np.float64,  # how long there have been differences [s]
     differences=(np.float64, (len(_SHARES), LEGS)),  # as `_SHARES` has them, of the encoders that count [m]
@@ -109,14 +108,14 @@ def judge_encoders(
     w.watched_for += passed
     wider = 1.0 if w.watched_for > _UNSETTLED_S else _UNSETTLED
     time_constant = max(min(_CHANGE_S, w.watched_for - _SETTLING_S), _LEAST_CHANGE_S, passed)
-    memory = max(min(_MEMORY_S, w.watched_for), passed)
     settled = w.watched_for > _SETTLING_S
     w.differences[:] = 0.0
     w.factor[:] = 0.0
-    encoders.unseen[:] = 0.0
     left_out, changed = 0, False
     for k in range(LEGS):
         w.factor[k, k] = 1.0
+        if encoders.silent_for[k] == 0.0 or encoders.excluded[k] != 0:
+            encoders.unseen[k] = 0.0
         if k >= rig.legs or encoder_parameters.present[k] == 0:
             continue
         _tell_silence(w, s.events, k, encoders, passed)
@@ -125,15 +124,16 @@ def judge_encoders(
         zero = 2 if encoders.followed_for[k] == np.inf else 1
         if w.begun[k] != zero or s.mode < Mode.RUNNING:
             # On the brakes the zero still follows the IMUs' first lengths.
-            w.begun[k], w.mean[k], w.start[k] = zero, encoders.off[k], encoders.off[k]
+            w.begun[k], w.mean[k], w.started_for[k] = zero, encoders.off[k], 0.0
         change = encoders.off[k] - w.mean[k]
         w.mean[k] += passed / time_constant * change
+        w.started_for[k] = w.started_for[k] + passed if settled else 0.0
         if zero == 1:
             w.start[k] = 0.0
-        elif not settled:
+        elif w.started_for[k] <= passed:
             w.start[k] = w.mean[k]
         else:
-            w.start[k] += passed / memory * (encoders.off[k] - w.start[k])
+            w.start[k] += passed / min(w.started_for[k], _MEMORY_S) * (encoders.off[k] - w.start[k])
         left_out += encoders.excluded[k]
         if encoders.excluded[k] != 0:
             if _agrees_again(p, w, encoder_parameters, encoders, k, change, lengths[k], passed):
@@ -141,19 +141,18 @@ def judge_encoders(
                 changed = True
         elif encoders.used[k] != 0.0:
             w.differences[0, k] = change
-            if settled:
-                w.differences[1, k] = encoders.off[k] - w.start[k]
-                w.differences[2, k] = encoders.off[k] if zero == 2 else 0.0
+            w.differences[1, k] = encoders.off[k] - w.start[k]
+            w.differences[2, k] = encoders.off[k] if zero == 2 else 0.0
             for other in range(k):
                 if encoders.used[other] != 0.0:
                     w.factor[k, other] = encoders.covariance[k, other]
             w.factor[k, k] = encoders.covariance[k, k] + encoder_parameters.variance
+    worst, error, sigma, alone = _find_wrong(w, encoders, settled)
     if s.mode < Mode.RUNNING:
         return changed
-    worst, error, sigma, alone = _find_wrong(w, encoders)
     limit = wider * max(_SIGMAS * sigma, _LEAST * p.encoders.deviation)
     wrong = alone and abs(error) > limit
-    leg, most = _find_greatest(w)
+    leg, most = _find_greatest(w, settled)
     several = most > _BEYOND * wider * p.encoders.deviation
     w.changed_for = w.changed_for + passed if wrong or several else 0.0
     if wrong:
@@ -176,9 +175,9 @@ def judge_encoders(
 
 
 @kernel
-def _find_wrong(w: Record, encoders: Record) -> tuple[int, float, float, bool]:
+def _find_wrong(w: Record, encoders: Record, settled: bool) -> tuple[int, float, float, bool]:
     """The encoder that is off by most sigmas, by how much and its sigma [m], and whether it explains the differences alone;
-    writes by how much each could be off unseen.
+    writes by how much each could be off unseen. Before the filters have settled, only changes count.
 
     The matrix of the covariances is in `factor`.
     """
@@ -198,7 +197,7 @@ def _find_wrong(w: Record, encoders: Record) -> tuple[int, float, float, bool]:
                 encoders.unseen[k] = abs(weighted) / w.inverse[k, k] + _UNSEEN / np.sqrt(w.inverse[k, k])
             if weighted * weighted > greatest * w.inverse[k, k]:
                 at, greatest, of = k, weighted * weighted / w.inverse[k, k], weighted / w.inverse[k, k]
-        if share * share * greatest > square:
+        if share * share * greatest > square and (settled or kind == 0):
             square = share * share * greatest
             worst, error, sigma = at, share * of, 1.0 / np.sqrt(w.inverse[at, at])
             alone = greatest > _ALONE * (total - greatest)
@@ -206,11 +205,12 @@ def _find_wrong(w: Record, encoders: Record) -> tuple[int, float, float, bool]:
 
 
 @kernel
-def _find_greatest(w: Record) -> tuple[int, float]:
+def _find_greatest(w: Record, settled: bool) -> tuple[int, float]:
     """The greatest change, or share of a slow one, and its leg."""
     leg, most = 0, 0.0
     for k in range(LEGS):
-        size = max(abs(w.differences[0, k]), _SLOW * max(abs(w.differences[1, k]), abs(w.differences[2, k])))
+        slow = max(abs(w.differences[1, k]), abs(w.differences[2, k])) if settled else 0.0
+        size = max(abs(w.differences[0, k]), _SLOW * slow)
         if size > most:
             leg, most = k, size
     return leg, most
@@ -246,4 +246,5 @@ def _agrees_again(
         encoders.zero[k] += w.mean[k]
         encoders.followed_for[k] = min(encoders.followed_for[k], _AGREED_S)
         w.mean[k] = 0.0
+    w.started_for[k] = 0.0
     return True

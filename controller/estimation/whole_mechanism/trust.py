@@ -182,6 +182,8 @@ def step_mechanism_filter(
         s.alone = s.trusted
         if s.trusted == 0:
             return False
+        for i in range(6):
+            pose.smooth_twist[i], pose.unplanned[i] = s.twist[i], s.acceleration[i] - pose.planned[1, i]
     # The legs were last found at the filter's pose, which may not be the one that is used.
     _find_legs(rig, pose)
     return True

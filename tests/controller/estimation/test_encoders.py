@@ -18,7 +18,7 @@ from controller.settings import FusionSettings, sensor_settings
 from plant.encoders import EncoderModel, load_encoder
 from plant.imu import load_imu
 from plant.mechanism import LEGS, load_in_space, six_rows
-from plant.pose import Pose
+from plant.pose import Pose, vector_from_rotation
 
 FUSION, NO_HOME = FusionSettings(), np.full(LEGS, -1)
 
@@ -137,6 +137,34 @@ def test_a_zero_is_the_mean_of_what_the_imus_say_weighted_by_the_time_before():
         time["cycle"] += 1
     expected = np.average(heights, weights=np.arange(50))
     assert pose["position"][2] - home.position[2] == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["hexapod", "planar-3rpr"])
+def test_how_far_an_unseen_error_moves_the_pose(name):
+    """As far as the pose goes when one reading is off by that; the encoder that moves it the most counts."""
+    mechanism, encoder = load_in_space(name), load_encoder("absolute")
+    parameters = encoder_parameters(encoder, sensor_settings(mechanism, load_imu("ideal"), encoder), mechanism)
+    rig, home, legs = rig_parameters(mechanism, 1000.0, 0.2, np.zeros(2)), mechanism.home, range(mechanism.legs)
+    time, lengths, unseen = np.zeros((), TIME), np.zeros(LEGS), np.linspace(1e-5, 3e-5, LEGS)
+    lengths[: mechanism.legs] = leg_lengths(mechanism, home.position, home.rotation)
+
+    def moved(readings):
+        encoders, pose = np.zeros((), STATE), np.zeros((), pose_estimator.STATE)
+        pose["information"], pose["factor"] = np.eye(6), np.eye(6)
+        pose["position"], pose["rotation"], pose["bent"] = home.position, home.rotation, 9.0
+        screen_encoders(parameters[()], encoders[()], 1e-3, 0, readings, np.zeros(LEGS), NO_HOME)
+        compare_lengths(parameters[()], encoders[()], rig[()], pose[()])
+        encoders["unseen"] = unseen
+        assert move_to_lengths(parameters[()], encoders[()], rig[()], time[()], pose[()])
+        shift = pose["position"] - home.position, vector_from_rotation(pose["rotation"] @ home.rotation.T)
+        return pose["bent"], np.linalg.norm(shift, axis=1)
+
+    bent, still = moved(lengths)
+    np.testing.assert_allclose(still, 0.0, atol=1e-12)
+    steps = np.array([moved(lengths + unseen * (np.arange(LEGS) == k))[1] for k in legs])
+    np.testing.assert_allclose(bent, steps.max(axis=0), rtol=1e-3)
+    nothing, _ = moved(np.full(LEGS, np.nan))
+    np.testing.assert_array_equal(nothing, 0.0)
 
 
 def test_a_home_switch_makes_a_zero_exact_to_where_it_was_passed():

@@ -364,7 +364,6 @@ def test_the_stages_on_filterpy_do_the_same_over_failures_and_new_starts(incline
                 state["imus"]["shaking"]["passed"] = np.linspace(0.1, 30.0, 7)
             state["pose"]["twist"] = 0.1
             state["pose"]["unplanned"] = random.normal(size=6) if state is compiled else compiled["pose"]["unplanned"]
-            state["pose"]["acceleration"] = compiled["pose"]["unplanned"]
         step(parameters, compiled, last=CycleStage.HEADING)
         filters.step_legs(twin)
         filters.step_platform(twin)

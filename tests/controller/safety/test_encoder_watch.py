@@ -32,7 +32,7 @@ def test_the_encoder_and_its_error_are_those_of_the_best_fit(seed, kind):
     rows = random.normal(size=(LEGS, LEGS)) * 3e-4
     covariance, d = rows @ rows.T + 1e-10 * np.eye(LEGS), random.normal(0.0, 4e-4, LEGS)
     encoders = np.zeros((), ENCODERS)
-    worst, error, sigma, alone = _find_wrong(state_with(covariance, d, kind)[()], encoders[()])
+    worst, error, sigma, alone = _find_wrong(state_with(covariance, d, kind)[()], encoders[()], True)
     fits = [fitted(covariance, d, k) for k in range(LEGS)]
     best = min(range(LEGS), key=lambda k: fits[k][2])
     assert worst == best
@@ -49,12 +49,12 @@ def test_an_encoder_is_told_from_an_error_of_the_pose(k):
     shared = np.full(LEGS, 1e-3)
     covariance = np.outer(shared, shared) + (5e-5) ** 2 * np.eye(LEGS)
     changes = 2.0 * shared + 2e-4 * (np.arange(LEGS) == k)
-    worst, error, sigma, alone = _find_wrong(state_with(covariance, changes)[()], np.zeros((), ENCODERS)[()])
+    worst, error, sigma, alone = _find_wrong(state_with(covariance, changes)[()], np.zeros((), ENCODERS)[()], True)
     assert (worst, alone) == (k, True)
     assert error == pytest.approx(2e-4, rel=0.05) and sigma == pytest.approx(5e-5 * np.sqrt(1.2), rel=0.01)
-    assert not _find_wrong(state_with(covariance, 2.0 * shared)[()], np.zeros((), ENCODERS)[()])[3]
+    assert not _find_wrong(state_with(covariance, 2.0 * shared)[()], np.zeros((), ENCODERS)[()], True)[3]
 
 
 def test_without_a_covariance_none_is_wrong():
     for covariance in (np.zeros((LEGS, LEGS)), np.full((LEGS, LEGS), np.nan)):
-        assert not _find_wrong(state_with(covariance, np.ones(LEGS))[()], np.zeros((), ENCODERS)[()])[3]
+        assert not _find_wrong(state_with(covariance, np.ones(LEGS))[()], np.zeros((), ENCODERS)[()], True)[3]

@@ -104,8 +104,12 @@ def test_lost_answers_move_neither_the_pose_nor_the_commands(changes):
     assert steps.max() < 0.1e-3 and np.abs(np.diff(moving["command"], axis=0)).max() < 8e-3
 
 
-def test_an_encoder_that_has_lost_counts_is_used_again_with_a_new_zero():
-    result = simulate(replace(SINES, duration=12.0, fusion="compiled", faults=("encoder-jumps:4,size_mm=3,at=3",)))
+@pytest.mark.parametrize(
+    ("lengths", "fault"), [("incremental", "encoder-jumps:4,size_mm=3,at=3"), ("absolute", "encoder-frozen:4,at=3,for=0.5")]
+)
+def test_an_encoder_that_agrees_again_is_used_again(lengths, fault):
+    """One that has lost counts, with a new zero, and an absolute one that stood still, with its own."""
+    result = simulate(replace(SINES, lengths=lengths, duration=16.0, fusion="compiled", faults=(fault,)))
     told = [
         (Cause(int(cause)), int(index))
         for row, indices in zip(result.records["event_cause"], result.records["event_index"], strict=True)
