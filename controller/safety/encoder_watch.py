@@ -133,7 +133,7 @@ def judge_encoders(
         elif w.started_for[k] <= passed:
             w.start[k] = w.mean[k]
         else:
-            w.start[k] += passed / min(w.started_for[k], _MEMORY_S) * (encoders.off[k] - w.start[k])
+            w.start[k] += passed / min(_SETTLING_S + w.started_for[k], _MEMORY_S) * (encoders.off[k] - w.start[k])
         left_out += encoders.excluded[k]
         if encoders.excluded[k] != 0:
             if _agrees_again(p, w, encoder_parameters, encoders, k, change, lengths[k], passed):
