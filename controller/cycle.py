@@ -28,6 +28,7 @@ from controller.calibration.file import Calibration
 from controller.direct_kinematics.geometry import LINEAR_RANK
 from controller.estimation import (
     base_imu,
+    base_motion,
     encoders,
     heading_filter,
     imu_health,
@@ -67,7 +68,7 @@ from plant.mechanism import LEGS, Mechanism
 from plant.mechanism.planar import PLANAR_LEGS
 from plant.pose import Array
 from plant.stopwatch import now
-from plant.vectors import vector
+from plant.vectors import subtract, vector
 
 _LEAST_GRAVITY = 0.1
 _LEAST_EVIDENCE_HZ = 125.0
@@ -169,6 +170,7 @@ def cycle_parameters(
     on_base: bool = False,
     level: bool = False,
     position_drives: bool = False,
+    heave_period: float = 0.0,
 ) -> Record:
     """The constants of the cycle (dtype `PARAMETERS`).
 
@@ -190,6 +192,7 @@ def cycle_parameters(
         on_base: whether there is an IMU on the base.
         level: whether the target is in the level frame; that needs that IMU, and six legs.
         position_drives: whether each drive closes a position loop of its own, whose goal moves at the commanded velocity.
+        heave_period: mean period of the base's heave, in which a target in the level frame takes no part; 0 if it does [s].
 
     Raises:
         InputError: a rate out of range, an IMU that cannot be, IMUs that do not determine the pose, or a limit of the
@@ -212,6 +215,7 @@ def cycle_parameters(
         raise InputError(
             "the field of the earth turns in the frame of a base that moves: leave out --magnetometer or --base-imu"
         )
+    of_base = fusion
     if on_base:
         fusion = base_imu.with_its_noise(fusion)
     rig, covariance = rig_parameters(mechanism, rate, control.hold, calibration.tilt), calibration.covariance
@@ -255,7 +259,7 @@ def cycle_parameters(
         integrity=integrity.integrity_parameters(
             fusion, rate, prior, watch_evidence, base_imu.SHARED_NOISE if on_base else 1.0
         ),
-        level=level_frame.level_parameters(mechanism, fusion, watched, level),
+        level=level_frame.level_parameters(mechanism, of_base, watched, level, heave_period),
         load=load_feed_forward.load_parameters(mechanism, command_delay, position_drives),
         pid=pid.pid_parameters(control, limits.velocity),
         safety=safety_stage.safety_parameters(
@@ -325,9 +329,12 @@ def run_stages(
             p.imus, s.imus, rig, time, s.safety.watch.silent, measurement, s.reference.motion, s.safety.events
         )  # fmt: skip
         if p.level.active != 0 and s.base.begun != 0:
-            level_frame.follow_attitude(
-                p.level, s.level, s.base.rate, s.base.force, vector(rig.sensors.up_in_base[0]), rig.sensors.gravity,
-                elapsed(rig, time),
+            force = vector(s.base.force)
+            if s.mechanism.trusted != 0:
+                force = subtract(force, vector(s.mechanism.filter.base_errors[3:]))
+            base_motion.follow_base(
+                p.level.motion, s.level.base, s.base.rate, s.base.fitted[1], force, vector(rig.sensors.up_in_base[0]),
+                rig.sensors.gravity, elapsed(rig, time),
             )  # fmt: skip
         if p.base.present != 0:
             base_imu.remove_base_motion(p.base, s.base, rig, time, s.imus, s.legs, p.platform, s.platform, s.pose)

@@ -1,38 +1,24 @@
 """A target in the level frame: the platform keeps its attitude on the earth while the base rolls.
 
-The level frame has the axes that {1} has while the base is level, and the origin of {1}. The base's attitude B, which turns {1}
-to it, follows the gyroscope of the base's IMU, less its bias b. The accelerometer corrects both as a Kalman filter does. With a
-small error d of B, seen in the level frame,
+`controller.estimation.base_motion` tells the base's attitude B, which turns {1} to the level frame, and its heave h. With the
+heave, the level frame has its origin where that of {1} is without it; otherwise the two origins are one.
 
-    d' = c,   c = B (b - its truth),   B f x up / g = d + noise
-
-The noise is that of a base that is accelerated to and fro, so that a sample counts for tens of seconds. Nothing tells the
-heading. It is taken to be that at the start, with the same noise: the platform keeps its heading while the base yaws to and
-fro, and turns with a base that goes on turning.
-
-A target pose p, R in the level frame is B^T p, B^T R in {1}. Its rate and acceleration there follow from those of the base. The
-reference of a leg follows that, within the limits of its drive and its stroke; where it cannot, that is told.
+A target pose p, R in the level frame is B^T (p - h up), B^T R in {1}. Its rate and acceleration there follow from those of the
+base. The reference of a leg follows that, within the limits of its drive and its stroke; where it cannot, that is told.
 """
 
 import numpy as np
 
 from controller.direct_kinematics.lengths import find_pose
+from controller.estimation import base_motion
+from controller.estimation.base_motion import heave
 from controller.inverse_kinematics import legs_at, motion_of_legs
 from controller.safety.causes import Cause, Mode, Request, report_event
 from controller.settings import FusionSettings, SafetySettings
 from plant.compiled import Record, filled, kernel, record_dtype, shared_kernel
 from plant.mechanism import LEGS, Mechanism
-from plant.pose import Array, rotate_by_vector
-from plant.vectors import Vector, add, cross, dot, rotate, rotate_back, scale, subtract, vector
-
-_SWAY = 0.02
-"""Density of the accelerations of a base in waves, as noise of its vertical [m/s^2/sqrt(Hz)]."""
-
-_BIAS_WALK = 3e-6
-"""Of the gyroscope on the base, while nothing but a swaying vertical tells it [rad/s/sqrt(s)]."""
-
-_FIRST_TILT = 0.1
-"""Uncertainty of the tilt after the first sample [rad]."""
+from plant.pose import Array
+from plant.vectors import add, cross, dot, rotate_back, scale, subtract, vector
 
 _BANDWIDTH = 20.0
 """Of the reference that follows the target [rad/s]."""
@@ -51,19 +37,14 @@ PARAMETERS = record_dtype(
     velocity=np.float64,  # limits of a leg [m/s, m/s^2, m]
     acceleration=np.float64,
     stroke=(np.float64, (LEGS, 2)),
-    rate_density=np.float64,  # spectral density of the gyroscope's noise [rad^2/s]
-    tilt_variance=np.float64,  # of a sample of the vertical, per second between samples [rad^2 s]
-    bias_variance=np.float64,  # of the bias at the start [rad^2/s^2]
+    motion=base_motion.PARAMETERS,
     position=(np.float64, 3),  # where the target begins
     rotation=(np.float64, (3, 3)),
 )
 """Constants."""
 
 STATE = record_dtype(
-    begun=np.int64,  # whether there is an attitude
-    attitude=(np.float64, (3, 3)),  # B
-    bias=(np.float64, 3),  # b [rad/s]
-    covariance=(np.float64, 3),  # of an angle, with its bias, and of the bias
+    base=base_motion.STATE,
     running_for=np.float64,  # how long the reference has followed [s]
     due_cycle=np.int64,  # of the reference that has been found last
     offset=(np.float64, LEGS),  # of the first reference from the target [m]
@@ -77,17 +58,17 @@ STATE = record_dtype(
     wanted=(np.float64, LEGS),
     jacobian=(np.float64, (6, 6)),
     twist=(np.float64, (2, 6)),
-    turn=(np.float64, 3),
     seen_position=(np.float64, 3),
     seen_rotation=(np.float64, (3, 3)),
 )
 """State."""
 
 
-def level_parameters(mechanism: Mechanism, fusion: FusionSettings, safety: SafetySettings, active: bool) -> Record:
-    """The constants (dtype `PARAMETERS`) of a mechanism with limits."""
+def level_parameters(
+    mechanism: Mechanism, fusion: FusionSettings, safety: SafetySettings, active: bool, heave_period: float
+) -> Record:  # fmt: skip
+    """The constants (dtype `PARAMETERS`) of a mechanism with limits; `heave_period` as in `base_motion_parameters`."""
     limits, home = mechanism.require_limits(), mechanism.require_home()
-    gravity = float(np.linalg.norm(mechanism.plant_parameters()["gravity"]))
     stroke = np.zeros((LEGS, 2))
     stroke[: mechanism.legs] = limits.stroke + safety.stroke_margin * np.array([1.0, -1.0])
     return filled(
@@ -96,57 +77,10 @@ def level_parameters(mechanism: Mechanism, fusion: FusionSettings, safety: Safet
         velocity=_RESERVE * limits.velocity,
         acceleration=_RESERVE * limits.acceleration,
         stroke=stroke,
-        rate_density=fusion.gyroscope_noise**2,
-        tilt_variance=(_SWAY / gravity) ** 2,
-        bias_variance=fusion.bias_sigma**2,
+        motion=base_motion.base_motion_parameters(mechanism, fusion, heave_period),
         position=home.position,
         rotation=home.rotation,
     )
-
-
-@kernel
-def follow_attitude(p: Record, s: Record, rate: Array, force: Array, up: Vector, gravity: float, period: float) -> None:
-    """Carry the attitude of the base on by `period` [s], and correct it.
-
-    Args:
-        rate, force: (3,), of the base's IMU in {1} [rad/s, m/s^2].
-        up: the vertical in the level frame.
-        gravity: [m/s^2].
-    """
-    b, c = s.attitude, s.covariance
-    if s.begun == 0:
-        s.begun = 1
-        for i in range(3):
-            for j in range(3):
-                b[i, j] = 1.0 if i == j else 0.0
-        c[0], c[1], c[2] = _FIRST_TILT**2, 0.0, p.bias_variance
-        # The force is taken for gravity.
-        felt = vector(force)
-        turn = cross(scale(1.0 / np.sqrt(dot(felt, felt)), felt), up)
-        sine = np.sqrt(dot(turn, turn))
-        _rotate(s, b, scale(np.arcsin(min(sine, 1.0)) / max(sine, 1e-12), turn))
-        return
-    _rotate(s, b, scale(period, rotate(b, subtract(vector(rate), vector(s.bias)))))
-    c[0] += period * (2.0 * c[1] + period * c[2] + p.rate_density)
-    c[1] += period * c[2]
-    c[2] += period * _BIAS_WALK**2
-    heading = 0.5 * dot(up, (b[2, 1] - b[1, 2], b[0, 2] - b[2, 0], b[1, 0] - b[0, 1]))
-    off = subtract(scale(1.0 / gravity, cross(rotate(b, vector(force)), up)), scale(heading, up))
-    whole = c[0] + p.tilt_variance / period
-    of_angle, of_bias = c[0] / whole, c[1] / whole
-    c[2] -= of_bias * c[1]
-    c[1] -= of_bias * c[0]
-    c[0] -= of_angle * c[0]
-    learned = rotate_back(b, scale(of_bias, off))
-    for i in range(3):
-        s.bias[i] -= learned[i]
-    _rotate(s, b, scale(of_angle, off))
-
-
-@kernel
-def _rotate(s: Record, rotation: Array, turn: Vector) -> None:
-    s.turn[0], s.turn[1], s.turn[2] = turn
-    rotate_by_vector(rotation, s.turn)
 
 
 @shared_kernel
@@ -156,7 +90,7 @@ def follow_level_target(p: Record, s: Record, rig: Record, safety: Record, base:
     Until the drives follow, and in a stop, the reference stays as it is.
     """
     planned, motion = reference.motion, s.motion
-    following = safety.mode == Mode.RUNNING and safety.request == Request.ENABLED and s.begun != 0
+    following = safety.mode == Mode.RUNNING and safety.request == Request.ENABLED and s.base.begun != 0
     if not following:
         s.running_for = 0.0
         motion[:] = planned
@@ -168,7 +102,7 @@ def follow_level_target(p: Record, s: Record, rig: Record, safety: Record, base:
         s.position[:] = p.position
         s.rotation[:] = p.rotation
     t = (reference.due_cycle - s.due_cycle) * rig.period
-    if t > 0.0 and _find_target(s, rig, base, planned):
+    if t > 0.0 and _find_target(p, s, rig, base, planned):
         s.due_cycle = reference.due_cycle
         for k in range(LEGS):
             if first:
@@ -188,11 +122,11 @@ def follow_level_target(p: Record, s: Record, rig: Record, safety: Record, base:
 
 
 @kernel
-def _find_target(s: Record, rig: Record, base: Record, legs: Array) -> bool:
+def _find_target(p: Record, s: Record, rig: Record, base: Record, legs: Array) -> bool:
     """Replace the motion (6, 3) of the legs at a target in the level frame by that at the same target seen in {1}; returns
     whether there is one.
     """
-    geometry, b = rig.geometry, s.attitude
+    geometry, b = rig.geometry, s.base.attitude
     for k in range(LEGS):
         s.wanted[k] = legs[k, 0]
     if not find_pose(geometry, s.wanted, s.position, s.rotation, s.arms, s.directions, s.lengths, s.jacobian) < 1e-9:
@@ -200,12 +134,13 @@ def _find_target(s: Record, rig: Record, base: Record, legs: Array) -> bool:
     legs_at(geometry.base_joints, geometry.platform_joints, s.position, s.rotation, s.arms, s.directions, s.lengths)
     if not motion_of_legs(s.arms, s.directions, s.lengths, rig.legs, legs, s.jacobian, s.twist):
         return False
-    w, angular_acceleration = subtract(vector(base.fitted[0]), vector(s.bias)), vector(base.fitted[1])
-    place = rotate_back(b, vector(s.position))
+    w, angular_acceleration = subtract(vector(base.fitted[0]), vector(s.base.bias)), vector(base.fitted[1])
+    up, (height, rising, lifted) = vector(rig.sensors.up_in_base[0]), heave(p.motion, s.base)
+    place = rotate_back(b, subtract(vector(s.position), scale(height, up)))
     turning = subtract(rotate_back(b, vector(s.twist[0, 3:])), w)
-    speed = subtract(rotate_back(b, vector(s.twist[0])), cross(w, place))
+    speed = subtract(rotate_back(b, subtract(vector(s.twist[0]), scale(rising, up))), cross(w, place))
     carried = add(cross(angular_acceleration, place), cross(w, add(cross(w, place), scale(2.0, speed))))
-    acceleration = subtract(rotate_back(b, vector(s.twist[1])), carried)
+    acceleration = subtract(rotate_back(b, subtract(vector(s.twist[1]), scale(lifted, up))), carried)
     angular = subtract(rotate_back(b, vector(s.twist[1, 3:])), add(angular_acceleration, cross(w, turning)))
     s.seen_position[0], s.seen_position[1], s.seen_position[2] = place
     for j in range(3):

@@ -34,6 +34,8 @@ FUSIONS_ON_A_MOVING_BASE = tuple(name for name in FUSIONS if name not in ("filte
 FRAMES = BASE, LEVEL = "base", "level"
 """The frames of a target that need no file: {1}, or one that stays level."""
 
+_HEAVE_PERIODS_S = (2.0, 30.0)
+
 RIGS = ("fmu", "udp", "canopen", "replay")
 DRIVES = VELOCITY_DRIVES, POSITION_DRIVES = "velocity", "position"
 """What the drives close a loop of: nothing, as they turn a velocity into a voltage, or their position."""
@@ -160,6 +162,11 @@ class SimulationConfig:
     tool: str | None = option(
         None, "what is moved to the target: platform, or a tool of --frames", metavar="NAME", shown="what --frames enables"
     )
+    heave_period: float = option(
+        0.0,
+        "mean period of the base's heave, in which the platform then takes no part; with a target in the level frame; 2 to "
+        "30 s, and 0 for a platform that rises and falls with its base [s]",
+    )
     time_scale: float = option(
         1.0, "factor on the times of the target: 2 is half as fast, as what is too fast is told to take; 0.01 to 1000"
     )
@@ -237,6 +244,11 @@ class SimulationConfig:
                 )
         if self.levelled and not self.base_imu:
             raise InputError("a target in the level frame needs an IMU on the base: add --base-imu")
+        if self.heave_period != 0.0 and not self.levelled:
+            raise InputError("heave_period is of a target in the level frame: add --frame level, or leave it out")
+        if self.heave_period != 0.0 and not _HEAVE_PERIODS_S[0] <= self.heave_period <= _HEAVE_PERIODS_S[1]:
+            least, most = _HEAVE_PERIODS_S
+            raise InputError(f"heave_period is {self.heave_period:g} s; it must be {least:g} to {most:g} s, or 0 for none")
         if self.drives not in DRIVES:
             raise UnknownNameError(f"no drives {self.drives!r}; there are {', '.join(DRIVES)}{nearest(self.drives, DRIVES)}")
         if self.lengths != NO_LENGTHS and self.fusion == "section-5":

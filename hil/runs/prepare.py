@@ -140,7 +140,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
         parameters = cycle_parameters(
             mechanism, config.rate, control, fusion, config.imus, FUSIONS[config.fusion], calibration, config.magnetometer,
             config.fusion == "section-5", safety, drives, 0.0 if config.rig == "fmu" else period,
-            config.arm, encoder, config.base_imu, config.levelled, position,
+            config.arm, encoder, config.base_imu, config.levelled, position, config.heave_period,
         )  # fmt: skip
         lead = bool(parameters["encoders"]["lead"])
         remarks = [

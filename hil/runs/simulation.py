@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from typing import Any
 
@@ -23,7 +23,7 @@ from hil.runs.prepare import PreparedLoop, prepared_loop
 from hil.runs.run_state import note_events
 from hil.runs.snapshot import Snapshot, resume_snapshot, take_snapshot
 from plant.compiled import Record
-from plant.dynamics.base_course import attitudes_of, placed
+from plant.dynamics.base_course import attitudes_of, displacements_of, placed
 from plant.errors import GoughError, InputError
 from plant.mechanism import Mechanism
 from plant.pose import Array, Pose, pose_errors, rms_figures, rotations_from_quaternions
@@ -60,7 +60,7 @@ class SimulationResult:
         remarks: what was said before it began.
         parameters: the constants of the cycle, for a recording.
         frames: of the target and of read-outs, if there are any.
-        attitudes: (N, 3, 3), map {1} to the level frame, if the work frame stands on that.
+        attitudes, heaves: (N, 3, 3) and (N, 3) [m], map {1} to the level frame, if the target stands in that or on it.
     """
 
     config: SimulationConfig
@@ -79,6 +79,7 @@ class SimulationResult:
     parameters: Record | None = None
     frames: ActiveFrames | None = None
     attitudes: Array | None = None
+    heaves: Array | None = None
 
     @property
     def moved(self) -> bool:
@@ -107,7 +108,10 @@ class SimulationResult:
         if self.frames is None:
             return positions, rotations
         platform = Pose(positions, rotations)
-        tool = self.frames.read(platform if self.attitudes is None else level_from_base(platform, self.attitudes))
+        if self.attitudes is not None and self.heaves is not None:
+            platform = level_from_base(platform, self.attitudes)
+            platform = replace(platform, position=platform.position + self.heaves)
+        tool = self.frames.read(platform)
         return tool.position, tool.rotation
 
     @property
@@ -235,16 +239,27 @@ def _result(
     times = (np.arange(first, done) - loop.cycle_at(0.0)) / config.rate
     lengths = records["reference"][:, : loop.mechanism.legs, 0]
     target = loop.target.at(times)
-    moved = None
+    attitudes = heaves = None
     if config.levelled:
-        hold = float(loop.parameters["rig"]["hold_cycles"] * loop.parameters["rig"]["period"])
-        moved = attitudes_of([placed(each, hold) for each in config.base_motions], 1e-9 * records["time_ns"])
-        target = (target[0][:, None] @ moved)[:, 0], np.swapaxes(moved, 1, 2) @ target[1]
+        attitudes, heaves = _motion_of_base(config, loop, 1e-9 * records["time_ns"])
+        back = np.swapaxes(attitudes, 1, 2)
+        target = (back @ (target[0] - heaves)[..., None])[..., 0], back @ target[1]
     return SimulationResult(
         config, loop.mechanism, loop.target, loop.reference, times, records,
         *poses_from_lengths(loop.mechanism, lengths, loop.target.start, partial=True), *target,
-        (done - first) / config.rate / took, snapshot, loop.remarks, loop.parameters.copy(), loop.frames, moved,
+        (done - first) / config.rate / took, snapshot, loop.remarks, loop.parameters.copy(), loop.frames, attitudes, heaves,
     )  # fmt: skip
+
+
+def _motion_of_base(config: SimulationConfig, loop: PreparedLoop, times: Array) -> tuple[Array, Array]:
+    """The true attitudes (N, 3, 3), and the heaves (N, 3) [m] in which the platform takes no part, at times (N,) [s]."""
+    rig = loop.parameters["rig"]
+    motions = [placed(each, float(rig["hold_cycles"] * rig["period"])) for each in config.base_motions]
+    heaves = np.zeros((len(times), 3))
+    if config.heave_period > 0.0:
+        up = rig["sensors"]["up_in_base"][0]
+        heaves = np.outer(displacements_of(motions, times) @ up, up)
+    return attitudes_of(motions, times), heaves
 
 
 def _errors(estimate: Poses, reference: Poses, target: Poses, truth: Poses | None = None) -> dict[str, dict[str, float] | None]:

@@ -228,3 +228,18 @@ def attitudes_of(motions: Sequence[Record], times: Array) -> Array:
     for attitude, motion in zip(attitudes, base_motions_at(motions, times), strict=True):
         attitude[:] = rotation_from_vector(motion[:3])
     return attitudes
+
+
+def displacements_of(motions: Sequence[Record], times: Array) -> Array:
+    """Where a base is (N, 3) [m] under such motions at even times (N,) [s], on the axes that {1} has at rest.
+
+    A steady speed, a mean place and a mean acceleration are taken off: what an unknown start gives, and no sensor tells.
+    """
+    moved = base_motions_at(motions, times)
+    attitudes = attitudes_of(motions, times)
+    accelerations = (attitudes @ moved[:, 9:, None])[..., 0]
+    period = float(times[1] - times[0]) if len(times) > 1 else 0.0
+    places = period**2 * np.cumsum(np.cumsum(accelerations, axis=0), axis=0)
+    powers = np.vander(np.linspace(-1.0, 1.0, len(times)), 3)
+    displacements: Array = places - powers @ np.linalg.lstsq(powers, places, rcond=None)[0]
+    return displacements

@@ -14,6 +14,7 @@ from plant.dynamics.base_course import (
     base_motion,
     base_motion_at,
     base_motion_of_text,
+    displacements_of,
     level,
     placed,
 )
@@ -122,3 +123,16 @@ def test_times_count_from_an_origin_or_from_the_start() -> None:
 def test_what_is_no_motion_of_a_base_is_told(text: str, message: str) -> None:
     with pytest.raises(GoughError, match=message):
         base_motion_of_text(text)
+
+
+def test_a_base_is_displaced_as_its_accelerations_say() -> None:
+    """Along the axes of a base that leans; what it moves steadily, and where it began, is taken off."""
+    times, lean = np.arange(0.0, 400.0, 0.02), np.radians(30.0)
+    moves = [
+        base_motion("acceleration", axis="z", size_m_per_s2=0.1, sine_hz=0.25),
+        base_motion("tilt", axis="x", size_deg=30.0),
+    ]
+    found = displacements_of(list(motions(*moves)), times)
+    waves = -0.1 / (0.5 * np.pi) ** 2 * np.sin(0.5 * np.pi * times)
+    np.testing.assert_allclose(found, np.outer(waves, [0.0, -np.sin(lean), np.cos(lean)]), atol=2.5e-3)
+    assert displacements_of(list(motions(*moves)), times[:1]).shape == (1, 3)
