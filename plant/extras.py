@@ -20,6 +20,7 @@ EXTRAS = {
     "pyarrow": "sweep",
     "scipy": "calibrate",
     "tomlkit": "studies",
+    "viser": "panel",
     "vqf": "studies",
     "xarray": "sweep",
     "ziglang": "cross",

@@ -31,7 +31,7 @@ COMMANDS = {
         "tune-fusion",
         "optimise",
     ),
-    "operate": ("move", "jog", "frames"),
+    "operate": ("move", "jog", "panel", "frames"),
     "rigs": ("check-rig", "emulate", "inject"),
     "plant": ("fmu",),
     "study": ("sweep", "compare-fusion", "evaluate-fusion", "faults", "planar", "broad"),

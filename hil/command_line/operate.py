@@ -1,4 +1,4 @@
-"""The commands that move the platform of a run, move and jog; and frames, in which they do."""
+"""The commands that move the platform of a run, move, jog and panel; and frames, in which they do."""
 
 import re
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
@@ -9,10 +9,11 @@ from typing import Any
 
 from hil.command_line import cli
 from hil.command_line.frames import gough_frames
+from hil.command_line.panel import gough_panel
 from hil.runs.config import OPERATOR_CHANNEL
 from plant.errors import InputError
 
-__all__ = ["gough_frames", "gough_jog", "gough_move"]
+__all__ = ["gough_frames", "gough_jog", "gough_move", "gough_panel"]
 
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 _UNITS = {

@@ -10,7 +10,7 @@ import os
 import resource
 import struct
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -95,6 +95,12 @@ def real_time(settings: RealTimeSettings) -> Iterator[list[str]]:
         if refused and settings.strict:
             raise RefusedError(f"this machine refuses {'; '.join(refused)}; or run without --strict")
         yield refused
+
+
+def come_before_others() -> None:
+    """Let this process, which plans for a loop, come before all that is not real-time, as far as the machine allows it."""
+    with suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY_RANGE[0]))
 
 
 def _lock_memory() -> Callable[[], Any]:

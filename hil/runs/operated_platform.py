@@ -33,8 +33,13 @@ from plant.pose import Array, Pose
 SPEED, TURN_SPEED = 0.05, 0.2
 """Speeds of moves that name none [m/s, rad/s]."""
 
-DEADMAN_S = 0.25
-"""How long a jog goes on without a sign of its operator [s]."""
+DEADMAN_S, MOST_DEADMAN_S = 0.25, 1.0
+"""How long a jog goes on without a sign of its operator, unless that asks for another time, and at most [s]."""
+
+_STALL_NS = round(1e9 * DEADMAN_S)
+"""How much longer than a stream's process the channel's may stand still while the platform moves: every plan ends at rest."""
+
+_STALLED_S = 0.05
 
 _FARTHEST_M, _FARTHEST_RAD = 1.0, np.pi
 """A jog ends here, if no limit ends it before."""
@@ -119,7 +124,8 @@ class OperatedPlatform:
         self.pose, self.jogging = workplace.home, False
         self._way: StraightWay | None = None
         self._began = self._offered = 0.0
-        self._beaten = 0.0
+        self._beaten = self._stepped = 0.0
+        self._deadman = DEADMAN_S
         self._ended_by = self._over = ""
 
     @property
@@ -167,15 +173,17 @@ class OperatedPlatform:
         self._require_rest()
         return self._begin(self._place.frames, Move(translation, rotation_vector, axes), limits)
 
-    def jog(self, velocity: Any, turn_velocity: Any, axes: str | None = None) -> float:
-        """Begin to move at a velocity (3,) [m/s] and a rate of turn (3,) [rad/s], as far as the limits allow; `beat` keeps it
-        going. Returns how long it can go on [s].
+    def jog(self, velocity: Any, turn_velocity: Any, axes: str | None = None, deadman: float = DEADMAN_S) -> float:
+        """Begin to move at a velocity (3,) [m/s] and a rate of turn (3,) [rad/s], as far as the limits allow; a `beat` within
+        each `deadman` [s] keeps it going. Returns how long it can go on [s].
 
         Raises:
             RefusedError: a limit is so near that it cannot move, or it cannot move now.
             GoughError: the request itself cannot be used.
         """
         self._require_rest()
+        if not 0.0 < deadman <= MOST_DEADMAN_S:
+            raise InputError(f"deadman is {deadman:g} s; it must be positive, and {MOST_DEADMAN_S:g} s at most")
         rate = Move(velocity, turn_velocity, axes)
         self._place.frames.rate(self.pose, rate)
         speeds = [float(np.linalg.norm(np.asarray(each, float))) for each in (velocity, turn_velocity)]
@@ -191,7 +199,7 @@ class OperatedPlatform:
         self._ended_by = limit
         limits = ToolLimits(speed=speeds[0] or inf, turn_speed=speeds[1] or inf)
         duration = self._begin(self._place.frames, _scaled(rate, share * lasts), limits)
-        self.jogging = True
+        self.jogging, self._deadman = True, deadman
         self.beat()
         return duration
 
@@ -209,7 +217,7 @@ class OperatedPlatform:
     def lose_operator(self) -> None:
         """End the run by a controlled stop if the operator has gone while it jogged."""
         if self.jogging:
-            fail_stream(self._stream, Cause.OPERATOR_LOST, -1, time.monotonic() - self._beaten, DEADMAN_S)
+            fail_stream(self._stream, Cause.OPERATOR_LOST, -1, time.monotonic() - self._beaten, self._deadman)
             self.end(Cause.OPERATOR_LOST.short)
 
     def end(self, reason: str) -> None:
@@ -218,14 +226,17 @@ class OperatedPlatform:
 
     def step(self) -> str:
         """Go on with the move; to be called each few milliseconds. Returns what has ended, in words, or ""."""
-        if self.jogging and time.monotonic() - self._beaten > DEADMAN_S:
+        now = time.monotonic()
+        # After a stall of this process the signs of the operator may still wait to be read.
+        stalled, self._stepped = now - self._stepped > _STALLED_S, now
+        if self.jogging and not stalled and now - self._beaten > self._deadman:
             self.lose_operator()
         if self._way is None:
             return ""
         if self._shared[CAUSE] != Cause.NONE:
             self.end(Cause(int(self._shared[CAUSE])).short)
             return f"the run stops: {self._over}"
-        note_sample(self._stream, time.monotonic_ns())
+        note_sample(self._stream, time.monotonic_ns() + _STALL_NS)
         if not self._offers.settle():
             return ""
         now, plan = self.now, self._planner.current
@@ -274,7 +285,7 @@ class OperatedPlatform:
         self._offered = -inf
         self._planner.lead(way)
         self._way = way
-        note_sample(self._stream, time.monotonic_ns())
+        note_sample(self._stream, time.monotonic_ns() + _STALL_NS)
         return way.duration
 
     def _ahead(self) -> float:

@@ -18,24 +18,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.frames import BASE, ActiveFrames, Move
+from controller.frames import Move
 from controller.planning.motions.document import place_of
 from controller.planning.motions.elements import ToolLimits
 from controller.planning.plan_handover import END_PLANNER
 from controller.planning.points import HOME
-from controller.safety.causes import Cause, Mode
+from controller.safety.causes import Cause
 from hil.loop.records import Link, StopRequest
+from hil.realtime.scheduling import come_before_others
 from hil.recording.mcap import events_of, take
 from hil.runs.operated_platform import DEADMAN_S, SPEED, TURN_SPEED, OperatedPlatform, RefusedError, Workplace
 from hil.runs.operator_messages import MOST_LINE, VERSION, ChannelError, decode, encode, pose_message
+from hil.runs.telemetry import machine_message, state_message, timing_message
 from plant.checks import printable
 from plant.compiled import Record
 from plant.errors import GoughError, InputError
-from plant.pose import Pose
 
 TELEMETRY_HZ = 30.0
 
 _STEP_S = 0.003
+_TIMING_S = 1.0
+"""Of how many seconds the timing is told."""
+
 _HELLO_S = 5.0
 """How long a client may take to say who it is."""
 
@@ -44,7 +48,6 @@ _MOST_WAITING = 1 << 18
 """Bytes that wait for a client that reads too slowly; it gets no telemetry meanwhile."""
 
 _ROLES = OPERATOR, OBSERVER = "operator", "observer"
-_IMUS = 7
 
 
 def open_channel(host: str, port: int) -> socket.socket:
@@ -84,7 +87,8 @@ def serve_operator(
         records, link: shared with the loop.
     """
     platform = OperatedPlatform(stream, workplace, period)
-    asyncio.run(_Channel(stream, platform, workplace, token, records, link).run(listener))
+    come_before_others()
+    asyncio.run(_Channel(stream, platform, workplace, token, period, records, link).run(listener))
 
 
 @dataclass(eq=False)
@@ -106,9 +110,10 @@ class _Client:
 
 class _Channel:
     def __init__(
-        self, stream: Record, platform: OperatedPlatform, workplace: Workplace, token: str | None, records: Record,
-        link: NDArray[np.int64],
+        self, stream: Record, platform: OperatedPlatform, workplace: Workplace, token: str | None, period: float,
+        records: Record, link: NDArray[np.int64],
     ) -> None:  # fmt: skip
+        self._period = period
         self._shared, self._platform, self._place, self._token = stream["shared"], platform, workplace, token
         self._records, self._link, self._seen = records, link, 0
         self._latest: Any = None
@@ -210,6 +215,7 @@ class _Channel:
         frames = self._place.frames
         return {
             "mechanism": self._place.mechanism.name,
+            "machine": machine_message(self._place.mechanism),
             "frames": {**frames.described(), "names": list(frames.frames)},
             "points": [HOME, *self._place.points],
             "home": pose_message(self._place.home),
@@ -258,7 +264,10 @@ class _Channel:
     def _jog(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
         del client
         rate = _move_in(request, "velocity", "turn_velocity")
-        return {"duration": self._platform.jog(rate.translation, rate.rotation_vector, rate.axes)}
+        deadman = request.get("deadman", DEADMAN_S)
+        if isinstance(deadman, bool) or not isinstance(deadman, int | float):
+            raise InputError("deadman must be a number")
+        return {"duration": self._platform.jog(rate.translation, rate.rotation_vector, rate.axes, deadman)}
 
     def _beat(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
         del client, request
@@ -329,27 +338,10 @@ class _Channel:
         }
         if latest is None:
             return told
-        pose = Pose(latest["position"], latest["rotation"])
-        stop = Cause(int(latest["stop"]))
-        told |= {
-            "mode": Mode(int(latest["mode"])).name.lower(),
-            "stop": None if stop == Cause.NONE else stop.short,
-            "cycle": int(latest["cycle"]),
-            "lengths": latest["lengths"],
-            "rates": latest["reference"][:, 1],
-            "imus": [imu for imu in range(_IMUS) if int(latest["imus"]) >> imu & 1],
-            "conditioning": float(latest["conditioning"]),
-            "protection": latest["protection"].astype(float),
-            "silent": int(latest["silent"]),
-        }
-        if latest["status"] == 0 and np.isfinite(pose.position).all() and np.isfinite(pose.rotation).all():
-            told |= {"pose": pose_message(pose), **_tool_message(self._place.frames, pose)}
-        return told
-
-
-def _tool_message(frames: ActiveFrames, pose: Pose) -> dict[str, Any]:
-    """The tool's pose in the work frame, if that stands on {1}."""
-    return {"tool": pose_message(frames.read(pose))} if frames.root == BASE else {}
+        size, done = len(self._records), self._seen
+        count = min(round(_TIMING_S / self._period), done, size // 2)
+        timing = timing_message(self._records, np.arange(done - count, done) % size, self._period)
+        return told | state_message(latest, self._place.frames) | {"timing": timing}
 
 
 def _name_in(request: dict[str, Any], name: str) -> str | None:

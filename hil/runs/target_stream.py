@@ -40,6 +40,7 @@ from controller.planning.plan_handover import (
 from controller.planning.stream_planner import Plan, StreamPlanner, TargetRefusedError
 from controller.planning.target import Target, samples_of
 from controller.safety.causes import Cause
+from hil.realtime.scheduling import come_before_others
 from hil.rigs.udp import datagrams
 from hil.rigs.udp.link import bound_socket
 from plant.compiled import Record
@@ -120,6 +121,7 @@ def receive(stream: Record, planner: StreamPlanner, receiver: socket.socket, per
     """
     parent = os.getppid()
     load_handover()
+    come_before_others()
     reception = Reception(stream, planner, period)
     while not (stream["shared"][END_PLANNER] or os.getppid() != parent):
         select.select([receiver], [], [], _SETTLE_S if reception.waits else _POLL_S)

@@ -1,0 +1,353 @@
+"""A panel that is attached to a run: it watches as an observer, and gives orders for one browser at a time.
+
+    browser --websocket--> callbacks, in order --queue--> worker --channel--> run
+
+A button that is held sends a sign of life twenty times a second, and the worker one of its own to the run. A page that is
+closed while it jogs, or this process if it dies, is an operator who goes away: the run ends by a controlled stop. A button that
+is released, and a page that freezes, let the platform come to rest.
+"""
+
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from math import radians
+from typing import Any
+
+import viser
+
+from hil.panel.readings import Readings, set_text, status
+from hil.panel.scene import Machine, Scene
+from hil.runs.operator import BEAT_S, Operator, RequestRefusedError
+from hil.runs.operator_messages import ChannelError
+from plant.errors import GoughError
+
+HOLD_HZ = 20.0
+"""Signs of life while a button is held."""
+
+RELEASED_S = 0.4
+"""A button counts as released when the browser, which is there, has sent no sign of life for so long."""
+
+_DEADMAN_S = 0.8
+"""How long a jog goes on without a sign of life from this process: on a busy machine it may wait for its turn."""
+
+_AXES = ("x", "y", "z", "rx", "ry", "rz")
+_EVENTS = 8
+_LISTEN_S = 0.05
+_SLIDER_MM, _SLIDER_DEG = 50.0, 15.0
+
+
+class _NoControlError(GoughError):
+    """A browser that does not have control gives an order."""
+
+
+class LivePanel:
+    """The page of a run.
+
+    Args:
+        server: of the page.
+        address, token: of the run's channel.
+
+    Raises:
+        ChannelError: no run answers, or it refuses.
+    """
+
+    def __init__(self, server: viser.ViserServer, address: str, token: str | None) -> None:
+        self._server, self._address, self._token = server, address, token
+        self._watching = Operator(address, token, role="observer", name="gough panel")
+        self._run = self._watching.run
+        self.machine = Machine.of_message(self._run["machine"])
+        self._scene = Scene(server, self.machine)
+        self._orders = _Orders(server, address, token, self._show_operator)
+        self._events: deque[str] = deque(maxlen=_EVENTS)
+        self._build()
+        server.on_client_disconnect(self._orders.leave)
+
+    def run(self, over: threading.Event) -> None:
+        """Show the run until `over` is set; when it has ended, its last state stays."""
+        self._watching.watch()
+        while not over.is_set():
+            try:
+                self._watching.listen(_LISTEN_S)
+            except ChannelError:
+                set_text(self._status, f"{self._status.content}\n\n**The run has ended.**")
+                print("the run has ended; Ctrl-C closes the panel", flush=True)
+                over.wait()
+                return
+            self._take_events()
+            if self._watching.telemetry:
+                self._show(self._watching.telemetry)
+
+    def close(self) -> None:
+        """Leave the run."""
+        self._orders.close()
+        self._watching.close()
+
+    # --------------------------------------------------------------------------------------------------------------- page
+
+    def _build(self) -> None:
+        gui = self._server.gui
+        gui.configure_theme(control_layout="collapsible", control_width="medium", show_logo=False, show_share_button=False)
+        self._status = gui.add_markdown("preparing")
+        self._operating = gui.add_markdown("nobody operates from this panel")
+        self._control = self._button("Take control", lambda client: self._orders.take(client), color="blue")
+        self._button("Stop the motion", self._ordered(lambda operator: operator.stop()), color="orange")
+        with gui.add_folder("End the run"):
+            self._button("Controlled stop", self._ended(lambda operator: operator.end()), color="orange")
+            self._button(
+                "Software quick stop (no emergency stop)", self._ended(lambda operator: operator.emergency()), color="red"
+            )
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Jog"):
+            self._build_jog()
+        with tabs.add_tab("Go to"):
+            self._build_moves()
+        with tabs.add_tab("Sliders"):
+            self._build_sliders()
+        with tabs.add_tab("Readings"):
+            self._readings = Readings(self._server, self.machine, self._scene, self._run["frames"])
+
+    def _build_jog(self) -> None:
+        gui = self._server.gui
+        axis = gui.add_dropdown("Axis", _AXES)
+        frame = gui.add_dropdown("Along", ("work frame", *self._run["frames"]["names"]))
+        step = gui.add_number("Step [mm, deg]", 1.0, min=0.001, max=100.0, step=0.001)
+        speed = gui.add_number("Speed, held [mm/s, deg/s]", 5.0, min=0.01, max=100.0, step=0.01)
+
+        def along(size: float) -> tuple[list[float], list[float], str | None]:
+            place, turn = [0.0] * 3, [0.0] * 3
+            at = _AXES.index(axis.value)
+            if at < 3:
+                place[at] = 1e-3 * size
+            else:
+                turn[at - 3] = radians(size)
+            return place, turn, None if frame.value == "work frame" else frame.value
+
+        self._button("Step +", self._ordered(lambda operator: operator.step(*along(step.value), wait=False)))
+        self._button("Step -", self._ordered(lambda operator: operator.step(*along(-step.value), wait=False)))
+        for sign, label in ((1.0, "+"), (-1.0, "-")):
+            held = gui.add_button(f"Hold to jog {label}", color="teal")
+
+            async def hold(event: Any, sign: float = sign) -> None:
+                place, turn, axes = along(sign * speed.value)
+                self._orders.hold(event.client, {"velocity": place, "turn_velocity": turn, "axes": axes})
+
+            async def release(event: Any) -> None:
+                self._orders.release(event.client)
+
+            held.on_hold(hold, callback_hz=HOLD_HZ)
+            held.on_click(release)
+
+    def _build_moves(self) -> None:
+        gui = self._server.gui
+        point = gui.add_dropdown("Point", tuple(self._run["points"]))
+        self._button("Go to the point", self._ordered(lambda operator: operator.move(point.value, wait=False)))
+        place = gui.add_vector3("Place from home [mm]", (0.0, 0.0, 0.0), step=0.1)
+        turn = gui.add_vector3("Turn [deg]", (0.0, 0.0, 0.0), step=0.1)
+
+        def go(operator: Operator) -> None:
+            position, rotation = [1e-3 * each for each in place.value], [radians(each) for each in turn.value]
+            operator.move({"position": position, "rotation": rotation}, wait=False)
+
+        self._button("Go to the place", self._ordered(go))
+
+    def _build_sliders(self) -> None:
+        """The platform goes where the sliders are; while it moves, the newest place waits."""
+        gui = self._server.gui
+        gui.add_markdown("The platform follows the sliders, displacements from home, while this browser has control.")
+        sliders = [
+            gui.add_slider(f"{name} [mm]", -_SLIDER_MM, _SLIDER_MM, 0.1, 0.0) for name in _AXES[:3]
+        ] + [gui.add_slider(f"{name} [deg]", -_SLIDER_DEG, _SLIDER_DEG, 0.1, 0.0) for name in _AXES[3:]]  # fmt: skip
+
+        async def moved(event: Any) -> None:
+            if event.client is not None:
+                values = [slider.value for slider in sliders]
+                place = {"position": [1e-3 * each for each in values[:3]], "rotation": [radians(each) for each in values[3:]]}
+                self._orders.follow(event.client, place)
+
+        for slider in sliders:
+            slider.on_update(moved)
+
+    def _button(self, label: str, do: Callable[[Any], None], color: Any = None) -> Any:
+        button = self._server.gui.add_button(label, color=color)
+
+        async def clicked(event: Any) -> None:
+            do(event.client)
+
+        button.on_click(clicked)
+        return button
+
+    def _ordered(self, do: Callable[[Operator], Any]) -> Callable[[Any], None]:
+        return lambda client: self._orders.give(client, do)
+
+    def _ended(self, do: Callable[[Operator], Any]) -> Callable[[Any], None]:
+        return lambda client: self._orders.end(client, do)
+
+    # ---------------------------------------------------------------------------------------------------------- telemetry
+
+    def _take_events(self) -> None:
+        events = self._watching.events
+        while events:
+            event = events.popleft()
+            self._events.append(f"cycle {event['cycle']}: {event['event']}" if "cycle" in event else str(event["event"]))
+
+    def _show(self, state: dict[str, Any]) -> None:
+        self._scene.show(state)
+        set_text(self._status, status(state))
+        self._readings.show(state, self._events)
+
+    def _show_operator(self, who: int | None) -> None:
+        text = "nobody operates from this panel" if who is None else f"browser {who} operates the run"
+        self._control.label = "Take control" if who is None else f"Give up control (browser {who})"
+        set_text(self._operating, text)
+
+
+class _Orders:
+    """The orders of the browser that has control, given to the run in their order by a thread of its own.
+
+    Any browser may end the run.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, address: str, token: str | None, shown: Callable[[int | None], None]
+    ) -> None:  # fmt: skip
+        self._server, self._channel, self._shown = server, (address, token), shown
+        self._operator: Operator | None = None
+        self._who: int | None = None
+        self._held_at = self._beaten = 0.0
+        self._client: Any = None
+        self._jogging = False
+        self._place: dict[str, Any] | None = None
+        self._lock = threading.Lock()
+        self._queue: queue.SimpleQueue[tuple[Any, Callable[[Any], Any]] | None] = queue.SimpleQueue()
+        threading.Thread(target=self._work, daemon=True).start()
+
+    def take(self, client: Any) -> None:
+        """Take control for a browser, or give it up if it has it."""
+        self._queue.put((client, self._take))
+
+    def give(self, client: Any, do: Callable[[Operator], Any]) -> None:
+        """Give an order for a browser that has control."""
+        self._place = None
+        self._queue.put((client, lambda client: do(self._operator_of(client))))
+
+    def end(self, client: Any, do: Callable[[Operator], Any]) -> None:
+        """End the run, whoever has control."""
+        self._queue.put((client, lambda _: self._end(do)))
+
+    def hold(self, client: Any, jog: dict[str, Any]) -> None:
+        """A sign of life of a button that is held; the first one begins the jog."""
+        self._place = None
+        self._queue.put((client, lambda client: self._hold(client, jog)))
+
+    def release(self, client: Any) -> None:
+        """The button is no longer held."""
+        self._queue.put((client, self._release))
+
+    def follow(self, client: Any, place: dict[str, Any]) -> None:
+        """Go to a place, as soon as the platform rests; a newer one takes its turn."""
+        self._place = place
+        self._queue.put((client, self._follow))
+
+    def leave(self, client: Any) -> None:
+        """The browser has gone: the run sees it at once, and ends by a controlled stop if it jogged."""
+        if client.client_id == self._who:
+            self._drop()
+
+    def close(self) -> None:
+        """Give up control, and end the thread."""
+        self._drop()
+        self._queue.put(None)
+
+    def _work(self) -> None:
+        while True:
+            with suppress(queue.Empty):
+                if (order := self._queue.get(timeout=BEAT_S)) is None:
+                    return
+                self._do(*order)
+            if self._jogging:
+                self._do(self._client, self._beat)
+
+    def _do(self, client: Any, do: Callable[[Any], Any]) -> None:
+        try:
+            do(client)
+        except RequestRefusedError as error:
+            self._refuse(client, str(error))
+        except (ChannelError, _NoControlError) as error:
+            self._refuse(client, str(error))
+            if isinstance(error, ChannelError):
+                self.leave(client)
+
+    def _operator_of(self, client: Any) -> Operator:
+        operator = self._operator
+        if operator is None or client.client_id != self._who:
+            who = "nobody" if self._who is None else f"browser {self._who}"
+            raise _NoControlError(f"{who} operates the run: take control first")
+        return operator
+
+    def _take(self, client: Any) -> None:
+        if self._who == client.client_id:
+            self._drop()
+            return
+        if self._who is not None:
+            raise _NoControlError(f"browser {self._who} operates the run, and only one may")
+        self._operator, self._who = Operator(*self._channel, name="gough panel"), client.client_id
+        self._shown(self._who)
+        if client.client_id not in self._server.get_clients():
+            self._drop()
+
+    def _end(self, do: Callable[[Operator], Any]) -> None:
+        if self._operator is not None:
+            do(self._operator)
+            return
+        with Operator(*self._channel, name="gough panel") as operator:
+            do(operator)
+
+    def _hold(self, client: Any, jog: dict[str, Any]) -> None:
+        operator, now = self._operator_of(client), time.monotonic()
+        begins = now - self._held_at > RELEASED_S
+        self._held_at = now
+        if begins:
+            operator.ask("jog", **jog, deadman=_DEADMAN_S)
+            self._client, self._jogging = client, True
+
+    def _beat(self, client: Any) -> None:
+        """A sign of life to the run, as long as the browser sends some; one that is there and sends none has let go."""
+        now = time.monotonic()
+        if now - self._held_at > RELEASED_S:
+            self._release(client)
+        elif now - self._beaten > BEAT_S:
+            self._beaten = now
+            # It may have come to a limit; then it begins no other one before the button is released.
+            self._jogging = self._operator_of(client).ask("beat")["jogging"]
+
+    def _release(self, client: Any) -> None:
+        self._held_at = 0.0
+        if self._jogging:
+            self._jogging = False
+            self._operator_of(client).stop()
+
+    def _follow(self, client: Any) -> None:
+        operator = self._operator_of(client)
+        if self._place is None:
+            return
+        if operator.ask("state")["telemetry"]["moving"]:
+            time.sleep(_LISTEN_S)
+            self._queue.put((client, self._follow))
+            return
+        place, self._place = self._place, None
+        operator.move(place, wait=False)
+
+    def _drop(self) -> None:
+        with self._lock:
+            operator, self._operator, self._who = self._operator, None, None
+        self._jogging, self._held_at, self._place = False, 0.0, None
+        if operator is not None:
+            operator.close()
+            self._shown(None)
+
+    def _refuse(self, client: Any, text: str) -> None:
+        if client.client_id in self._server.get_clients():
+            client.add_notification("Not done", text, color="red", auto_close_seconds=8.0)
