@@ -39,9 +39,13 @@ class MotionLimits:
     force: float = inf
 
     def __post_init__(self) -> None:
-        for name, value in (("--box", min(self.box)), ("--speed", self.speed), ("--force", self.force)):
+        given = (
+            ("--box", 1e3 * self.box[0], "mm"), ("--box", np.degrees(self.box[1]), "deg"),
+            ("--speed", 1e3 * self.speed, "mm/s"), ("--force", self.force, "N"),
+        )  # fmt: skip
+        for name, value, unit in given:
             if not value > 0.0:
-                raise InputError(f"{name} is {value:g}; it must be positive")
+                raise InputError(f"{name} is {value:g} {unit}; it must be positive")
 
 
 @dataclass(frozen=True, eq=False)

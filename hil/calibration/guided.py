@@ -250,13 +250,19 @@ class _Steps:
             self._guide.tell(f"step {self._number} of {count} was done: {file} is taken")
         try:
             yield step, due
+        except KeyboardInterrupt:
+            self._guide.tell(
+                f"step {self._number} of {count}, {step.name}, was interrupted; drives to which nothing comes stop by "
+                "themselves. Bring the platform near home, and go on from this step with --resume"
+            )
+            raise
         except GoughError as error:
             if not due:
                 raise FailedCalibrationError(f"{file}: {error}; remove it to do step {self._number} again") from None
             where = f"; what it did is in {failed}" if failed.exists() else ""
             raise FailedCalibrationError(
-                f"step {self._number} of {count}, {step.name}, failed: {error}{where}; mend it, bring the platform near home, "
-                "and go on from this step with --resume"
+                f"step {self._number} of {count}, {step.name}, failed: {error}{where}; "
+                "when the cause is mended, bring the platform near home, and go on from this step with --resume"
             ) from None
         if due:
             # Only what has succeeded is taken by the next calibration.
@@ -271,6 +277,8 @@ class _Steps:
         recording = complete(path, read(path))
         for name in ("mechanism", "imu", "rate"):
             if (was := recording.config[name]) != (now := getattr(self.config, name)):
+                if name == "mechanism":
+                    name, was, now = "mechanism, or --box, --speed or --force,", "another one", "not that"
                 raise InputError(f"its {name} is {was}, and this calibration's is {now}: give the same options as before")
         records = every_cycle(recording.records)
         # A bus may need some cycles for the first samples.

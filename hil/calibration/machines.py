@@ -40,7 +40,8 @@ def machine_on_clock(settings: RealTimeSettings, watched: Watched) -> Machine:
         except RunStoppedError as error:
             raise CalibrationError(f"{error}{_advice(error.summary, config.rate)}") from None
         if summary["cause"] != Cause.END_OF_MOTION.text:
-            raise CalibrationError(f"the run has not come to its end: {summary['cause']}")
+            by = "you have stopped it" if summary["cause"] == Cause.STOP_REQUESTED.short else summary["cause"]
+            raise CalibrationError(f"the run has not come to its end: {by}")
 
     def try_legs(config: SimulationConfig) -> Sequence[str]:
         slow = replace(config, rate=min(config.rate, _TRYING_HZ))

@@ -78,7 +78,7 @@ def test_a_box_costs_accuracy_and_one_that_is_too_small_is_refused(hexapod: Mech
         mechanism = gentle_mechanism(hexapod, limits)
         with pytest.raises(InputError, match=message):
             check_useful(mechanism, calibration_targets(mechanism, limits.box))
-    with pytest.raises(InputError, match="--speed is 0; it must be positive"):
+    with pytest.raises(InputError, match="--speed is 0 mm/s; it must be positive"):
         MotionLimits(speed=0.0)
 
 

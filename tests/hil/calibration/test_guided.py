@@ -105,6 +105,20 @@ def test_a_kept_recording_of_another_rig_is_refused(plan, tmp_path: Path) -> Non
     other = plan_calibration(SimulationConfig(imu="bmi088", rate=200.0), MotionLimits())
     with pytest.raises(FailedCalibrationError, match=r"its imu is mpu9150, and this calibration's is bmi088.*remove it"):
         Bench(plan.mechanism).calibrate(other, output, resume=True)
+    slower = plan_calibration(CONFIG, MotionLimits(speed=0.1))
+    with pytest.raises(FailedCalibrationError, match="its mechanism, or --box, --speed or --force, is another one"):
+        Bench(plan.mechanism).calibrate(slower, output, resume=True)
+
+
+def test_ctrl_c_between_runs_says_how_to_go_on(plan, tmp_path: Path) -> None:
+    def interrupted(config):
+        raise KeyboardInterrupt
+
+    bench = Bench(plan.mechanism)
+    bench.machine = Machine(bench.run, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        bench.calibrate(plan, tmp_path / "rig.toml")
+    assert "step 2 of 6, legs, was interrupted" in bench.told[-1] and "--resume" in bench.told[-1]
 
 
 def test_a_wrong_sign_at_rest_or_in_a_leg_ends_it_before_the_next_step(plan, tmp_path: Path) -> None:
@@ -138,7 +152,7 @@ def test_every_step_says_what_will_happen_how_far_and_how_fast(plan) -> None:
         (("--rig", "udp"), "there is no terminal to ask at before the rig moves"),
         (("--rig", "replay", "--yes"), "a replay cannot be driven: give its recording with --recording"),
         (("--box", "5", "1"), "--box is too small"),
-        (("--speed", "-1"), "--speed is -0.001; it must be positive"),
+        (("--speed", "-1"), "--speed is -1 mm/s; it must be positive"),
         (("--rig", "udp", "--yes", "--known-poses"), "leave it out"),
         (("--recording", "a.mcap", "--resume"), "limits and --resume"),
     ],
