@@ -66,11 +66,13 @@ class Rule:
     gain_db: float = 12.0
 
     def __post_init__(self) -> None:
-        ranges = {"crossover_hz": (0.05, 500.0), "sensitivity": (1.05, 10.0), "phase_deg": (1.0, 90.0), "gain_db": (0.5, 60.0)}
-        for name, (least, most) in ranges.items():
-            value = getattr(self, name)
+        ranges = (
+            ("crossover", self.crossover_hz, " Hz", 0.05, 500.0), ("sensitivity", self.sensitivity, "", 1.05, 10.0),
+            ("phase margin", self.phase_deg, " deg", 1.0, 90.0), ("gain margin", self.gain_db, " dB", 0.5, 60.0),
+        )  # fmt: skip
+        for name, value, unit, least, most in ranges:
             if value is not None and not least <= value <= most:
-                raise InputError(f"{name} is {value:g}; it must be {least:g} to {most:g}")
+                raise InputError(f"the {name} is {value:g}{unit}; it must be {least:g} to {most:g}{unit}")
 
     def broken_by(self, peak: float, legs: Sequence[LoopMargins], at_home: bool = True) -> str:
         """How a sensitivity peak, and margins of the legs, break the rule; "" if they do not."""
