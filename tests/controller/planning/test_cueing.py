@@ -263,7 +263,7 @@ def test_no_manoeuvre_leaves_a_limit(tmp_path_factory, data):
 
 
 @pytest.mark.slow
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(st.data())
 def test_none_of_many_manoeuvres_leaves_a_limit(tmp_path_factory, data):
     check_plan(tmp_path_factory.mktemp("cue"), data)

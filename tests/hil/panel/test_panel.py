@@ -22,7 +22,8 @@ _FLAGS = [
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
     "--disable-sync", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
 ]  # fmt: skip
-DESK, PHONE = {"width": 1100, "height": 720}, {"width": 400, "height": 800}
+DESK, PHONE = {"width": 760, "height": 560}, {"width": 380, "height": 640}
+"""Small, as software draws them."""
 
 
 def free_port():
