@@ -27,10 +27,10 @@ from plant.errors import GoughError
 HOLD_HZ = 20.0
 """Signs of life while a button is held."""
 
-RELEASED_S = 0.4
+RELEASED_S = 0.5
 """A button counts as released when the browser, which is there, has sent no sign of life for so long."""
 
-_DEADMAN_S = 0.8
+_DEADMAN_S = 1.0
 """How long a jog goes on without a sign of life from this process: on a busy machine it may wait for its turn."""
 
 _AXES = ("x", "y", "z", "rx", "ry", "rz")

@@ -42,7 +42,7 @@ def state_of(address):
         return observer.ask("state")["telemetry"]
 
 
-def waited(what, seconds=60.0):
+def waited(what, seconds=180.0):
     """What becomes true in time."""
     until = time.monotonic() + seconds
     while not (found := what()):
@@ -80,7 +80,7 @@ def run(*arguments):
             except ChannelError:
                 return False
 
-        waited(running, 180.0)
+        waited(running, 300.0)
         yield address
 
 
@@ -111,7 +111,7 @@ def chromium(tmp_path_factory):
 def opened(browser, address, viewport=DESK):
     """A page; one that is left open would go on to draw."""
     page = browser.new_page(viewport=viewport)
-    page.set_default_timeout(60_000)
+    page.set_default_timeout(180_000)
     page.goto(address)
     yield page
     page.close()
@@ -166,18 +166,25 @@ def test_a_browser_operates_a_run_and_a_second_one_does_not(chromium, tmp_path):
 
 
 def test_a_page_that_is_closed_while_it_jogs_ends_the_run_by_a_controlled_stop(chromium):
-    with run() as address, panel("--at", address) as page_address, opened(chromium, page_address) as page:
-        take_control(page)
-        page.get_by_role("button", name="Hold to jog -", exact=True).hover()
-        page.mouse.down()
-        with Operator(address, role="observer") as observer:
-            observer.watch()
-            waited(lambda: observer.ask("state")["telemetry"]["jogging"])
-            page.close()
-            last = waited(lambda: (state := observer.ask("state")["telemetry"])["stop"] and state)
-            assert last["stop"] == "the operator has gone while the platform was jogged"
-            stroke, lengths = np.array(observer.run["machine"]["stroke"]), np.array(last["lengths"])
-            assert (lengths > stroke[:, 0]).all() and (lengths < stroke[:, 1]).all()
+    """On a busy machine the button may count as released just before; then it is tried again."""
+    with run() as address, panel("--at", address) as page_address, Operator(address, role="observer") as observer:
+
+        def state():
+            return observer.ask("state")["telemetry"]
+
+        for number in range(4):
+            with opened(chromium, page_address) as page:
+                take_control(page, number)
+                page.get_by_role("button", name="Hold to jog -", exact=True).hover()
+                page.mouse.down()
+                waited(lambda: state()["jogging"])
+            waited(lambda: state()["stop"] or not state()["moving"])
+            if state()["stop"]:
+                break
+        last = state()
+        assert last["stop"] == "the operator has gone while the platform was jogged"
+        stroke, lengths = np.array(observer.run["machine"]["stroke"]), np.array(last["lengths"])
+        assert (lengths > stroke[:, 0]).all() and (lengths < stroke[:, 1]).all()
 
 
 def test_a_recording_of_a_planar_mechanism_plays(chromium, tmp_path):
@@ -189,10 +196,10 @@ def test_a_recording_of_a_planar_mechanism_plays(chromium, tmp_path):
     play(chromium, recording, tmp_path)
 
 
-def take_control(page):
+def take_control(page, number=0):
     page.get_by_text("running", exact=True).wait_for()
     press(page, "Take control")
-    page.get_by_text("browser 0 operates the run").wait_for()
+    page.get_by_text(f"browser {number} operates the run").wait_for()
 
 
 def rests_at(address, begin, displacement):
