@@ -9,9 +9,9 @@ import webbrowser
 from argparse import REMAINDER, Namespace
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType
 
 from hil.command_line import cli
+from hil.realtime.processes import signals_handled
 from hil.runs.config import OPERATOR_CHANNEL
 from plant.errors import GoughError, InputError
 
@@ -54,7 +54,7 @@ def gough_panel(options: Namespace) -> None:
     token = None if options.page_token_file is None else load_token(options.page_token_file)
     host, port = panel_address(options.listen, token)
     over = threading.Event()
-    with _ended_by_signals(over):
+    with signals_handled((signal.SIGINT, signal.SIGTERM), lambda number, frame: over.set()):
         if options.recording is not None:
             from hil.panel.playback import Playback, recorded_run
 
@@ -85,20 +85,6 @@ def _announce(options: Namespace, host: str, port: int, token: str | None) -> No
         print("nothing is encrypted: whoever can read the network can read the token, and move the platform", file=sys.stderr)
     if not options.no_browser and sys.stdout.isatty():
         webbrowser.open(address)
-
-
-@contextmanager
-def _ended_by_signals(over: threading.Event) -> Iterator[None]:
-    def end(number: int, frame: FrameType | None) -> None:
-        del number, frame
-        over.set()
-
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager

@@ -2,7 +2,8 @@
 
 import multiprocessing
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
 from typing import Any
 
@@ -28,6 +29,17 @@ def _run(target: Callable[..., None], *arguments: Any) -> None:
     # A signal that is ignored would be pending, and so heard, if it were blocked, too.
     signal.pthread_sigmask(signal.SIG_BLOCK, [each for each in _ENDING if signal.getsignal(each) != signal.SIG_IGN])
     target(*arguments)
+
+
+@contextmanager
+def signals_handled(numbers: Iterable[int], handle: Callable[[int, Any], None]) -> Iterator[None]:
+    """Handle signals while the context lasts, and as before after it."""
+    before = {number: signal.signal(number, handle) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def join_or_kill(process: BaseProcess) -> None:

@@ -39,7 +39,7 @@ from hil.loop.records import LINK_SIZE, RECORD, Link, StopRequest, shared_array
 from hil.loop.stage_times import over_budget
 from hil.progress import Say, say_nothing
 from hil.realtime.clock import REAL, new_clock
-from hil.realtime.processes import FORK, PATIENCE_S, join_or_kill, started
+from hil.realtime.processes import FORK, PATIENCE_S, join_or_kill, signals_handled, started
 from hil.realtime.scheduling import RealTimeSettings, real_time, since_process_start, usage
 from hil.rigs import Rig
 from hil.rigs.udp.link import parse_address
@@ -171,12 +171,8 @@ def _asked_to_stop(link: NDArray[np.int64]) -> Iterator[None]:
 
     # What is to be ignored stays ignored, but an emergency stop is always heard.
     heard = (signal.SIGQUIT, *(each for each in _STOPPING if each.name not in ignored_signals()))
-    before = {each: signal.signal(each, ask) for each in heard}
-    try:
+    with signals_handled(heard, ask):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager
